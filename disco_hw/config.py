@@ -1,0 +1,195 @@
+"""robot.toml -> frozen, validated structs; every error is one line that names the file, the field and the remedy."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from pathlib import Path
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec import Meta
+
+Positive = Annotated[float, Meta(gt=0.0)]
+NonNegative = Annotated[float, Meta(ge=0.0)]
+Probability = Annotated[float, Meta(gt=0.0, lt=1.0)]
+Range = tuple[float, float]
+
+
+class ConfigError(Exception):
+    """Bad configuration; the message is one line for the user: file, field, what is wrong, what to write."""
+
+
+class _Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Base of all sections: frozen, unknown fields refused."""
+
+
+class Robot(_Section):
+    """Nominal geometry and encoder of the robot (metres, radians)."""
+
+    name: Annotated[str, Meta(min_length=1, max_length=64)]
+    wheel_radius_m: Annotated[float, Meta(gt=0.0, le=2.0)]
+    axial_distance_m: Annotated[float, Meta(gt=0.0, le=5.0)]
+    x_icr_m: Annotated[float, Meta(ge=-2.0, le=2.0)] = 0.0
+    ticks_per_rev: Annotated[int, Meta(ge=1, le=65535)]
+    max_wheel_speed_rad_s: Annotated[float, Meta(gt=0.0, le=65.5)]
+    max_wheel_acceleration_rad_s2: Annotated[float, Meta(gt=0.0, le=655.0)] = 20.0
+
+
+class Prior(_Section):
+    """Uniform ranges of the model's base parameters; the defaults are the paper's (appendix, skid-steer table)."""
+
+    x_icr_m: Range = (0.0, 0.5)
+    wheel_radius_m: Range = (0.0, 0.5)
+    axial_distance_m: Range = (0.1, 0.5)
+
+
+class Link(_Section):
+    """How the robot is reached."""
+
+    driver: Literal["reference"] = "reference"
+    kind: Literal["can", "serial"] = "can"
+    interface: str = "socketcan"
+    channel: str = "can0"
+    bitrate: Annotated[int, Meta(ge=10_000, le=1_000_000)] = 500_000
+    port: str = "/dev/ttyUSB0"
+    baud: Annotated[int, Meta(ge=9600, le=4_000_000)] = 921_600
+
+
+class Control(_Section):
+    """The loop and the planner."""
+
+    rate_hz: Annotated[float, Meta(ge=20.0, le=100.0)] = 50.0
+    mode: Literal["default", "paper"] = "default"
+    uncertainty: Literal["ut", "mc", "point"] = "ut"
+    samples: Annotated[int, Meta(ge=8, le=1_000_000)] = 400
+    horizon: Annotated[int, Meta(ge=2, le=500)] = 50
+    step_s: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.1
+    seed: Annotated[int, Meta(ge=0)] = 1
+    command_valid_for_s: Annotated[float, Meta(ge=0.02, le=0.1)] = 0.1
+    plan_tail_s: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.2
+    telemetry_zero_s: Annotated[float, Meta(ge=0.01, le=0.5)] = 0.05
+    telemetry_disarm_s: Annotated[float, Meta(ge=0.02, le=1.0)] = 0.15
+
+
+class Estimation(_Section):
+    """Fusion of wheel odometry and pose."""
+
+    slip_std_m_per_sqrt_m: Positive = 0.02
+    slip_std_rad_per_sqrt_m: Positive = 0.02
+    slip_std_rad_per_sqrt_rad: Positive = 0.05
+    gate_probability: Probability = 0.999
+    gate_lockout_count: Annotated[int, Meta(ge=2, le=1000)] = 10
+    pose_timeout_s: Positive = 1.0
+    history_s: Annotated[float, Meta(gt=0.0, le=10.0)] = 1.0
+    pose_required: bool = True
+
+
+class CircleTask(_Section, tag="circle", tag_field="kind"):
+    """Follow a circle counter-clockwise at a constant speed (paper, section V-B)."""
+
+    center_x_m: float = 0.0
+    center_y_m: float = 0.0
+    radius_m: Positive = 0.75
+    speed_m_s: Positive = 0.2
+
+
+class ModelFile(_Section):
+    """Where the model with its posterior is; without a file the nominal geometry and the prior are used."""
+
+    file: str | None = None
+
+
+class Log(_Section):
+    """Where runs are recorded."""
+
+    directory: str = "logs"
+    enabled: bool = True
+
+
+class Daemon(_Section):
+    """The daemon's local side."""
+
+    control_socket: str | None = None
+    realtime_priority: Annotated[int, Meta(ge=0, le=98)] = 80
+
+
+class RobotConfig(_Section):
+    """The whole of robot.toml."""
+
+    robot: Robot
+    prior: Prior = Prior()
+    link: Link = Link()
+    control: Control = Control()
+    estimation: Estimation = Estimation()
+    task: CircleTask = CircleTask()
+    model: ModelFile = ModelFile()
+    log: Log = Log()
+    daemon: Daemon = Daemon()
+
+
+def load_robot_config(path: Path) -> RobotConfig:
+    """Read and validate robot.toml.
+
+    Raises ConfigError with one line naming file, field and remedy.
+    """
+    try:
+        raw = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read ({error.strerror}); give the path of a robot.toml") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: not valid TOML ({error}); mend that line") from None
+    try:
+        config = msgspec.convert(raw, RobotConfig)
+    except msgspec.ValidationError as error:
+        raise ConfigError(f"{path}: {_in_words(str(error))}") from None
+    _check(path, config)
+    return config
+
+
+def _in_words(message: str) -> str:
+    """Turn msgspec's message into field, fault and remedy."""
+    text, _, where = message.partition(" - at `$")
+    field = where.rstrip("`").lstrip(".")
+    if text.startswith("Object contains unknown field"):
+        name = text.split("`")[1]
+        section = f"[{field}] " if field else ""
+        return f"{section}{name}: no such field; check the spelling or remove it (docs/robot.md lists every field)"
+    if text.startswith("Object missing required field"):
+        name = text.split("`")[1]
+        section = f"[{field}] " if field else ""
+        return f"{section}{name}: missing; add it (docs/robot.md says what it means)"
+    return f"{field or 'top level'}: {text[0].lower()}{text[1:]}; correct the value"
+
+
+def _check(path: Path, config: RobotConfig) -> None:
+    """Refuse what no single field shows."""
+
+    def refuse(field: str, fault: str, remedy: str) -> None:
+        raise ConfigError(f"{path}: {field}: {fault}; {remedy}")
+
+    for section_name in config.__struct_fields__:
+        section = getattr(config, section_name)
+        for field in section.__struct_fields__:
+            value = getattr(section, field)
+            if isinstance(value, float) and not math.isfinite(value):
+                refuse(f"{section_name}.{field}", "not a finite number", "write a finite value")
+    for field in config.prior.__struct_fields__:
+        low, high = getattr(config.prior, field)
+        if not (math.isfinite(low) and math.isfinite(high) and low < high):
+            refuse(f"prior.{field}", f"[{low}, {high}] is not a range", "write [low, high] with low < high")
+    control = config.control
+    if control.command_valid_for_s < 1.5 / control.rate_hz:
+        refuse(
+            "control.command_valid_for_s",
+            f"{control.command_valid_for_s} s is shorter than 1.5 control periods",
+            f"write at least {1.5 / control.rate_hz:.3f} or raise rate_hz",
+        )
+    if control.telemetry_disarm_s <= control.telemetry_zero_s:
+        refuse("control.telemetry_disarm_s", "not above telemetry_zero_s", "write a larger value")
+    if config.task.speed_m_s > config.robot.max_wheel_speed_rad_s * config.robot.wheel_radius_m:
+        refuse(
+            "task.speed_m_s",
+            f"{config.task.speed_m_s} m/s is above what the wheels can do",
+            "lower it, or raise robot.max_wheel_speed_rad_s within the firmware's limit",
+        )

@@ -1,0 +1,1 @@
+"""What talks to hardware: transports and one driver for each motor controller."""

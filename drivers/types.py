@@ -1,0 +1,293 @@
+"""What every driver speaks: frames on the link, samples from the robot, commands to it.
+
+SI units; left before right; positive wheel speed drives forward; x forward, y left, yaw counter-clockwise.
+Time stamps are nanoseconds of the host's monotonic clock unless the name says otherwise.
+"""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """One classic CAN data frame with an 11-bit identifier; serial links tunnel the same frame."""
+
+    can_id: int
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class ReceivedFrame:
+    """A frame as it came in, with the host time of its reception (from the kernel where the medium gives one)."""
+
+    t_ns: int
+    frame: Frame
+
+
+@dataclass(frozen=True, slots=True)
+class OutgoingFrame:
+    """A frame to send, and the host time after which it must be dropped instead of sent late."""
+
+    frame: Frame
+    deadline_ns: int
+
+
+class LinkState(enum.Enum):
+    """Whether a transport can carry frames now."""
+
+    CLOSED = "closed"
+    CONNECTING = "connecting"
+    UP = "up"
+
+
+@dataclass(frozen=True, slots=True)
+class TransportStats:
+    """Counters of one transport since it was made; nothing is dropped without being counted here."""
+
+    frames_sent: int = 0
+    frames_received: int = 0
+    bytes_received: int = 0
+    send_errors: int = 0
+    receive_errors: int = 0
+    expired: int = 0
+    transmit_queue_full: int = 0
+    receive_overflow: int = 0
+    malformed: int = 0
+    bus_errors: int = 0
+    bus_off: int = 0
+    reconnects: int = 0
+
+
+class Transport(Protocol):
+    """A medium that carries frames; it reconnects by itself with back-off and never raises on what the peer sends."""
+
+    @property
+    def name(self) -> str:
+        """Medium and address, for messages to a person."""
+
+    @property
+    def state(self) -> LinkState:
+        """Whether frames can be carried now."""
+
+    @property
+    def generation(self) -> int:
+        """Number of times the link has come up; a change means that everything agreed with the peer is void."""
+
+    @property
+    def stats(self) -> TransportStats:
+        """A snapshot of the counters."""
+
+    @property
+    def last_error(self) -> str | None:
+        """The newest error in words, or None if there was none since the link last came up."""
+
+    def open(self) -> None:
+        """Start the receive thread and the first connection attempt; return at once."""
+
+    def send(self, outgoing: OutgoingFrame, now_ns: int) -> bool:
+        """Send without blocking; False (and a counter) if it expired, did not fit or the link is down."""
+
+    def receive(self) -> Sequence[ReceivedFrame]:
+        """All frames received since the last call, oldest first, without blocking."""
+
+    def close(self) -> None:
+        """Stop the thread and release the medium; safe to call twice."""
+
+
+@dataclass(frozen=True, slots=True)
+class WheelCommand:
+    """Wheel speeds to hold for at most `valid_for_s` after reception."""
+
+    left_rad_s: float
+    right_rad_s: float
+    valid_for_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class WheelSample:
+    """Wheel angles and speeds of one instant; angles are cumulative and do not wrap."""
+
+    t_ns: int
+    received_ns: int
+    left_angle_rad: float
+    right_angle_rad: float
+    left_speed_rad_s: float
+    right_speed_rad_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class PoseSample:
+    """A measured pose in the world frame; `t_ns` is when it was true, `received_ns` when it arrived."""
+
+    t_ns: int
+    received_ns: int
+    x_m: float
+    y_m: float
+    yaw_rad: float
+    position_std_m: float
+    yaw_std_rad: float
+
+
+@dataclass(frozen=True, slots=True)
+class MotorSample:
+    """Motor currents and temperatures."""
+
+    t_ns: int
+    left_current_a: float
+    right_current_a: float
+    left_temperature_c: float
+    right_temperature_c: float
+
+
+@dataclass(frozen=True, slots=True)
+class PowerSample:
+    """Battery voltage, current and temperature."""
+
+    t_ns: int
+    voltage_v: float
+    current_a: float
+    temperature_c: float
+
+
+@dataclass(frozen=True, slots=True)
+class RobotStatus:
+    """What the robot's controller says of itself; names are those of the DBC's value tables."""
+
+    t_ns: int
+    state: str
+    fault_code: int
+    fault: str
+    estop_source: str
+    stop_cause: str
+    session: int
+    rejected_count: int
+    reject_reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class RobotLinkHealth:
+    """The robot's own count of trouble on the link."""
+
+    t_ns: int
+    tx_error_count: int
+    rx_error_count: int
+    bus_off_count: int
+    crc_error_count: int
+    sequence_error_count: int
+    watchdog_count: int
+
+
+@dataclass(frozen=True, slots=True)
+class Capabilities:
+    """What the robot said of itself in the handshake; the limits are enforced by its firmware."""
+
+    protocol_major: int
+    protocol_minor: int
+    firmware_version: str
+    dbc_hash: int
+    board_id: int
+    max_wheel_speed_rad_s: float
+    max_wheel_acceleration_rad_s2: float
+    ticks_per_rev: int
+    command_timeout_s: float
+    drive_off_timeout_s: float
+    stop_deceleration_rad_s2: float
+
+
+@dataclass(frozen=True, slots=True)
+class Readings:
+    """Everything that one batch of received frames meant, oldest first."""
+
+    wheels: tuple[WheelSample, ...] = ()
+    poses: tuple[PoseSample, ...] = ()
+    motors: tuple[MotorSample, ...] = ()
+    power: tuple[PowerSample, ...] = ()
+    status: tuple[RobotStatus, ...] = ()
+    link_health: tuple[RobotLinkHealth, ...] = ()
+    events: tuple[str, ...] = ()
+
+
+class DriverState(enum.Enum):
+    """Where a driver is with its robot."""
+
+    DISCONNECTED = "disconnected"
+    HANDSHAKE = "handshake"
+    REFUSED = "refused"
+    STANDBY = "standby"
+    READY = "ready"
+    ARMING = "arming"
+    ARMED = "armed"
+    STOPPING = "stopping"
+    FAULT = "fault"
+    ESTOP = "estop"
+
+
+class Request(enum.Enum):
+    """What the host asks of a driver: stay still, open a session, allow motion, clear a latched fault or e-stop."""
+
+    STANDBY = "standby"
+    READY = "ready"
+    ARM = "arm"
+    RESET = "reset"
+
+
+@dataclass(frozen=True, slots=True)
+class DriverStats:
+    """Counters of one driver since it was made."""
+
+    frames_accepted: int = 0
+    rejected_crc: int = 0
+    rejected_sequence: int = 0
+    rejected_length: int = 0
+    unknown_id: int = 0
+    lost_frames: int = 0
+    implausible_ticks: int = 0
+    implausible_values: int = 0
+    commands_sent: int = 0
+    sessions: int = 0
+
+
+class Driver(Protocol):
+    """One motor controller's protocol as a pure state machine: no thread, clock or I/O; malformed input never raises."""
+
+    @property
+    def state(self) -> DriverState:
+        """Where the driver is with its robot."""
+
+    @property
+    def detail(self) -> str:
+        """One sentence for a person: why the state is what it is and what to do about it."""
+
+    @property
+    def capabilities(self) -> Capabilities | None:
+        """What the robot said in the handshake; None before it is complete."""
+
+    @property
+    def stats(self) -> DriverStats:
+        """A snapshot of the counters."""
+
+    @property
+    def clock_offset_ns(self) -> int | None:
+        """Host time minus device time, as estimated now; None before the first estimate."""
+
+    def link_up(self, now_ns: int) -> None:
+        """The medium has come up (again): start the handshake; any session is void."""
+
+    def link_down(self, now_ns: int) -> None:
+        """The medium is gone: any session is void."""
+
+    def receive(self, now_ns: int, frames: Sequence[ReceivedFrame]) -> Readings:
+        """Take in received frames and return what they meant."""
+
+    def request(self, request: Request) -> None:
+        """Set what the host wants; held until changed. ARM is consumed: it never re-arms by itself after a stop."""
+
+    def transmit(self, now_ns: int, command: WheelCommand | None) -> tuple[OutgoingFrame, ...]:
+        """Frames due now: the command (only while armed; zeros while arming) and house-keeping."""
+
+    def estop(self, now_ns: int) -> tuple[OutgoingFrame, ...]:
+        """Frames that stop the robot in any state."""

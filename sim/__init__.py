@@ -1,0 +1,1 @@
+"""What replaces the robot: plant, mock CAN bus, virtual robot."""
