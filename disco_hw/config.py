@@ -20,11 +20,7 @@ class ConfigError(Exception):
     """Bad configuration; the message is one line for the user: file, field, what is wrong, what to write."""
 
 
-class _Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Base of all sections: frozen, unknown fields refused."""
-
-
-class Robot(_Section):
+class Robot(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Nominal geometry and encoder of the robot (metres, radians)."""
 
     name: Annotated[str, Meta(min_length=1, max_length=64)]
@@ -36,7 +32,7 @@ class Robot(_Section):
     max_wheel_acceleration_rad_s2: Annotated[float, Meta(gt=0.0, le=655.0)] = 20.0
 
 
-class Prior(_Section):
+class Prior(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Uniform ranges of the model's base parameters; the defaults are the paper's (appendix, skid-steer table)."""
 
     x_icr_m: Range = (0.0, 0.5)
@@ -44,7 +40,7 @@ class Prior(_Section):
     axial_distance_m: Range = (0.1, 0.5)
 
 
-class Link(_Section):
+class Link(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """How the robot is reached."""
 
     driver: Literal["reference"] = "reference"
@@ -56,7 +52,7 @@ class Link(_Section):
     baud: Annotated[int, Meta(ge=9600, le=4_000_000)] = 921_600
 
 
-class Control(_Section):
+class Control(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The loop and the planner."""
 
     rate_hz: Annotated[float, Meta(ge=20.0, le=100.0)] = 50.0
@@ -72,7 +68,7 @@ class Control(_Section):
     telemetry_disarm_s: Annotated[float, Meta(ge=0.02, le=1.0)] = 0.15
 
 
-class Estimation(_Section):
+class Estimation(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Fusion of wheel odometry and pose."""
 
     slip_std_m_per_sqrt_m: Positive = 0.02
@@ -85,7 +81,7 @@ class Estimation(_Section):
     pose_required: bool = True
 
 
-class CircleTask(_Section, tag="circle", tag_field="kind"):
+class CircleTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, tag="circle", tag_field="kind"):
     """Follow a circle counter-clockwise at a constant speed (paper, section V-B)."""
 
     center_x_m: float = 0.0
@@ -94,27 +90,27 @@ class CircleTask(_Section, tag="circle", tag_field="kind"):
     speed_m_s: Positive = 0.2
 
 
-class ModelFile(_Section):
+class ModelFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Where the model with its posterior is; without a file the nominal geometry and the prior are used."""
 
     file: str | None = None
 
 
-class Log(_Section):
+class Log(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Where runs are recorded."""
 
     directory: str = "logs"
     enabled: bool = True
 
 
-class Daemon(_Section):
+class Daemon(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The daemon's local side."""
 
     control_socket: str | None = None
     realtime_priority: Annotated[int, Meta(ge=0, le=98)] = 80
 
 
-class RobotConfig(_Section):
+class RobotConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The whole of robot.toml."""
 
     robot: Robot

@@ -252,7 +252,10 @@ class DriverStats:
 
 
 class Driver(Protocol):
-    """One motor controller's protocol as a pure state machine: no thread, clock or I/O; malformed input never raises."""
+    """One motor controller's protocol as a pure state machine; no thread, clock or I/O.
+
+    Malformed input never raises.
+    """
 
     @property
     def state(self) -> DriverState:

@@ -1,0 +1,86 @@
+"""robot.toml: what is accepted, and the one line that a mistake gets."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from disco_hw.config import ConfigError, load_robot_config
+
+GOOD = """
+[robot]
+name = "wombot"
+wheel_radius_m = 0.06
+axial_distance_m = 0.31
+ticks_per_rev = 2048
+max_wheel_speed_rad_s = 8.0
+"""
+
+
+def load(tmp_path: Path, text: str):
+    path = tmp_path / "robot.toml"
+    path.write_text(text, encoding="utf-8")
+    return load_robot_config(path)
+
+
+def test_minimal_file_gets_the_papers_defaults(tmp_path):
+    config = load(tmp_path, GOOD)
+    assert config.robot.wheel_radius_m == 0.06
+    assert config.prior.axial_distance_m == (0.1, 0.5)
+    assert config.task.radius_m == 0.75
+    assert config.task.speed_m_s == 0.2
+
+
+def test_shipped_robot_file_is_valid():
+    import disco_hw
+
+    config = load_robot_config(Path(disco_hw.__file__).parent / "robots" / "wombot.toml")
+    assert config.link.interface == "unixcan"
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (("wheel_radius_m = 0.06\n", ""), ["wheel_radius_m", "missing", "add"]),
+        (("wheel_radius_m", "weel_radius_m"), ["weel_radius_m", "no such field", "spelling"]),
+        (("wheel_radius_m = 0.06", "wheel_radius_m = -1.0"), ["robot.wheel_radius_m", "> 0.0"]),
+        (("wheel_radius_m = 0.06", "wheel_radius_m = nan"), ["wheel_radius_m"]),
+        (("wheel_radius_m = 0.06", 'wheel_radius_m = "six"'), ["robot.wheel_radius_m", "str", "float"]),
+        (("ticks_per_rev = 2048", "ticks_per_rev = 20.5"), ["robot.ticks_per_rev", "int"]),
+        (("[robot]", "[robott]"), ["robott", "no such field"]),
+        (("[robot]", "[robot"), ["not valid TOML", "line"]),
+        (("max_wheel_speed_rad_s = 8.0", "max_wheel_speed_rad_s = 2.0"), ["task.speed_m_s", "wheels"]),
+    ],
+)
+def test_a_mistake_gets_one_line_with_file_and_field(tmp_path, change, words):
+    with pytest.raises(ConfigError) as caught:
+        load(tmp_path, GOOD.replace(*change))
+    message = str(caught.value)
+    assert "\n" not in message
+    assert message.startswith(str(tmp_path / "robot.toml"))
+    for word in words:
+        assert word in message
+
+
+@pytest.mark.parametrize(
+    ("extra", "field"),
+    [
+        ("[prior]\nx_icr_m = [0.5, 0.0]\n", "prior.x_icr_m"),
+        ("[prior]\nx_icr_m = [0.0, inf]\n", "prior.x_icr_m"),
+        ("[control]\nrate_hz = 500.0\n", "control.rate_hz"),
+        ("[control]\nrate_hz = 20.0\ncommand_valid_for_s = 0.05\n", "control.command_valid_for_s"),
+        ("[control]\ntelemetry_zero_s = 0.2\n", "control.telemetry_disarm_s"),
+        ('[link]\nkind = "wifi"\n', "link.kind"),
+        ('[task]\nkind = "square"\n', "task"),
+        ("[estimation]\npose_timeout_s = inf\n", "estimation.pose_timeout_s"),
+    ],
+)
+def test_ranges_and_relations_are_checked(tmp_path, extra, field):
+    with pytest.raises(ConfigError, match=field.replace(".", r"\.")):
+        load(tmp_path, GOOD + extra)
+
+
+def test_unreadable_file(tmp_path):
+    with pytest.raises(ConfigError, match="cannot be read"):
+        load_robot_config(tmp_path / "none.toml")
