@@ -1,0 +1,202 @@
+"""Packs and unpacks the frames of `disco_robot.dbc`, their end-to-end header included."""
+
+import enum
+import math
+import struct
+from typing import NamedTuple
+
+import msgspec
+
+from firmware_protocol import e2e
+from firmware_protocol.dbc import MessageLayout, SignalLayout, load_protocol, packaged_dbc
+
+_FLOAT = struct.Struct("<f")
+_MAX_DATA = 8
+
+PROTOCOL = load_protocol(packaged_dbc())
+PROTOCOL_MAJOR = PROTOCOL.major
+PROTOCOL_MINOR = PROTOCOL.minor
+
+
+class EncodedFrame(NamedTuple):
+    """A frame ready for any medium."""
+
+    can_id: int
+    data: bytes
+
+
+class Decoded(msgspec.Struct, frozen=True, gc=False):
+    """A frame that is well-formed; physical values in the DBC's units, `counter` -1 where the frame carries none."""
+
+    name: str
+    can_id: int
+    counter: int
+    values: dict[str, float]
+
+
+class FaultReason(enum.Enum):
+    """Why a frame could not be decoded."""
+
+    UNKNOWN_ID = "unknown_id"
+    LENGTH = "length"
+    CRC = "crc"
+    PAGE = "page"
+
+
+class DecodeFault(msgspec.Struct, frozen=True, gc=False):
+    """A frame that must not be used; `name` is empty for an identifier that is not in the DBC."""
+
+    reason: FaultReason
+    name: str
+    can_id: int
+
+
+class _Plan(msgspec.Struct, frozen=True):
+    """What decoding one message needs, worked out beforehand: per page, (name, shift, mask, sign bit, scale) rows."""
+
+    layout: MessageLayout
+    crc_suffix: bytes
+    page_shift: int
+    page_mask: int
+    rows: dict[int, tuple[tuple[str, int, int, int, float], ...]]
+    float_rows: tuple[tuple[str, int], ...]
+
+
+class Codec:
+    """The packaged DBC as an encoder and a decoder; it has no state between frames."""
+
+    __slots__ = ("_by_id", "_by_name", "dbc_hash")
+
+    def __init__(self) -> None:
+        self.dbc_hash = PROTOCOL.dbc_hash
+        self._by_id = {layout.can_id: _plan(layout) for layout in PROTOCOL.messages}
+        self._by_name = {layout.name: layout for layout in PROTOCOL.messages}
+
+    def can_id(self, name: str) -> int:
+        """Return the CAN identifier of a message. Raises ValueError for a name that is not in the DBC."""
+        return self._layout(name).can_id
+
+    def choice_name(self, message: str, signal: str, value: float) -> str:
+        """Return the name of a value in a signal's value table, or "UNKNOWN(value)" if the table does not have it."""
+        return self._signal(message, signal).choices.get(int(value), f"UNKNOWN({int(value)})")
+
+    def choice_value(self, message: str, signal: str, name: str) -> int:
+        """Return the value of a name in a signal's value table. Raises ValueError if the table does not have it."""
+        return _choice_value(self._signal(message, signal), name)
+
+    def encode(self, name: str, counter: int = 0, **signals: float | str) -> EncodedFrame:
+        """Pack physical values (or names of a value table) and fill in the E2E header where the message has one.
+
+        Every signal of the message (of the chosen page, where there are pages) must be given. Raises ValueError for an
+        unknown message, a missing or unknown signal, and a value that is not finite or out of the DBC's range:
+        nothing is clipped here.
+        """
+        layout = self._layout(name)
+        page = signals.get(layout.page_signal) if layout.page_signal else None
+        remaining = dict(signals)
+        bits = 0
+        for signal in layout.signals:
+            if signal.page is not None and signal.page != page:
+                continue
+            if layout.data_id is not None and signal.name in {"crc", "counter"}:
+                continue
+            try:
+                value = remaining.pop(signal.name)
+            except KeyError:
+                raise ValueError(f"{name}: signal {signal.name} is missing") from None
+            bits |= _raw(name, signal, value) << signal.shift
+        if remaining:
+            raise ValueError(f"{name}: no such signal: {', '.join(remaining)}")
+        if layout.data_id is None:
+            return EncodedFrame(layout.can_id, bits.to_bytes(layout.length, "little"))
+        protected = (bits >> 8 | counter % e2e.COUNTER_MODULUS).to_bytes(layout.length - 1, "little")
+        return EncodedFrame(layout.can_id, bytes((e2e.crc8(protected, layout.data_id),)) + protected)
+
+    def decode(self, can_id: int, data: bytes) -> Decoded | DecodeFault:
+        """Unpack one received frame; whatever the wire brings, the answer is a value and never an exception.
+
+        A message without E2E header (the emergency stop) is accepted with any length; missing bytes read as zero.
+        The counter is returned, not judged: that is `e2e.E2EReceiver`'s part.
+        """
+        plan = self._by_id.get(can_id)
+        if plan is None:
+            return DecodeFault(FaultReason.UNKNOWN_ID, "", can_id)
+        layout = plan.layout
+        counter = -1
+        if plan.crc_suffix:
+            if len(data) != layout.length:
+                return DecodeFault(FaultReason.LENGTH, layout.name, can_id)
+            if e2e.crc8h2f(data[1:] + plan.crc_suffix) != data[0]:
+                return DecodeFault(FaultReason.CRC, layout.name, can_id)
+            counter = data[1] & 0x0F
+        elif len(data) > _MAX_DATA:
+            return DecodeFault(FaultReason.LENGTH, layout.name, can_id)
+        bits = int.from_bytes(data, "little")
+        rows = plan.rows.get(bits >> plan.page_shift & plan.page_mask)
+        if rows is None:
+            return DecodeFault(FaultReason.PAGE, layout.name, can_id)
+        values: dict[str, float] = {
+            name: (((bits >> shift & mask) ^ sign) - sign) * scale for name, shift, mask, sign, scale in rows
+        }
+        for name, offset in plan.float_rows:
+            values[name] = _FLOAT.unpack_from(data, offset)[0]
+        return Decoded(layout.name, can_id, counter, values)
+
+    def _layout(self, name: str) -> MessageLayout:
+        try:
+            return self._by_name[name]
+        except KeyError:
+            raise ValueError(f"no message {name!r} in the DBC") from None
+
+    def _signal(self, message: str, signal: str) -> SignalLayout:
+        for layout in self._layout(message).signals:
+            if layout.name == signal:
+                return layout
+        raise ValueError(f"{message}: no such signal: {signal}")
+
+
+def _plan(layout: MessageLayout) -> _Plan:
+    page_signal = next((signal for signal in layout.signals if signal.name == layout.page_signal), None)
+    pages = sorted({signal.page for signal in layout.signals if signal.page is not None}) or [0]
+    protected = layout.data_id is not None
+    return _Plan(
+        layout=layout,
+        crc_suffix=layout.data_id.to_bytes(2, "little") if layout.data_id is not None else b"",
+        page_shift=page_signal.shift if page_signal else 0,
+        page_mask=(1 << page_signal.width) - 1 if page_signal else 0,
+        rows={
+            page: tuple(
+                (signal.name, signal.shift, (1 << signal.width) - 1, signal.signed << (signal.width - 1), signal.scale)
+                for signal in layout.signals
+                if signal.page in (None, page)
+                and not signal.is_float
+                and not (protected and signal.name in {"crc", "counter"})
+            )
+            for page in pages
+        },
+        float_rows=tuple((signal.name, signal.shift // 8) for signal in layout.signals if signal.is_float),
+    )
+
+
+def _choice_value(signal: SignalLayout, name: str) -> int:
+    for value, known in signal.choices.items():
+        if known == name:
+            return value
+    raise ValueError(f"signal {signal.name} has no value named {name!r}")
+
+
+def _raw(message: str, signal: SignalLayout, value: float | str) -> int:
+    """Return the signal's bits, unshifted; rounds halves up, as the C core does."""
+    number = _choice_value(signal, value) if isinstance(value, str) else value
+    if not math.isfinite(number):
+        raise ValueError(f"{message}.{signal.name}: {number} is not finite")
+    if signal.is_float:
+        if not signal.minimum <= number <= signal.maximum:
+            raise ValueError(f"{message}.{signal.name}: {number} is not within {signal.minimum} to {signal.maximum}")
+        return int.from_bytes(_FLOAT.pack(number), "little")
+    raw = math.floor(number / signal.scale + 0.5)
+    if not round(signal.minimum / signal.scale) <= raw <= round(signal.maximum / signal.scale):
+        raise ValueError(
+            f"{message}.{signal.name}: {number} {signal.unit} is not within {signal.minimum} to {signal.maximum}"
+        )
+    return raw & ((1 << signal.width) - 1)
