@@ -32,6 +32,8 @@ def make_ffi() -> FFI:
         sources=[f"firmware_protocol/firmware/{source}" for source in SOURCES],
         include_dirs=["firmware_protocol/firmware"],
         extra_compile_args=["-std=c99", "-O2"],
+        # One file name however it is built, so that no stale extension can shadow a fresh one.
+        py_limited_api=True,
     )
     return builder
 

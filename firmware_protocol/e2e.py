@@ -48,7 +48,7 @@ def crc8h2f(data: bytes) -> int:
 
 
 def challenge_answer(challenge: int, session: int, dbc_hash: int) -> int:
-    """Return what a host must answer to arm: CRC-16/CCITT-FALSE over challenge u16, session u8, hash u32, little-endian.
+    """Return a host's answer to arm: CRC-16/CCITT-FALSE over challenge u16, session u8, hash u32, all little-endian.
 
     It is no secret: it proves that this very arming was meant, by an end that speaks this very DBC.
     """
