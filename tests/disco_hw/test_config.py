@@ -84,3 +84,21 @@ def test_ranges_and_relations_are_checked(tmp_path, extra, field):
 def test_unreadable_file(tmp_path):
     with pytest.raises(ConfigError, match="cannot be read"):
         load_robot_config(tmp_path / "none.toml")
+
+
+def test_every_field_is_documented():
+    from disco_hw.config import RobotConfig
+
+    text = (Path(__file__).parents[2] / "docs" / "robot.md").read_text(encoding="utf-8")
+    for section in RobotConfig.__struct_fields__:
+        assert f"[{section}]" in text
+        for field in _fields_of(section):
+            assert f"\n{field} = " in text, f"[{section}] {field}"
+
+
+def _fields_of(section: str) -> tuple[str, ...]:
+    import typing
+
+    from disco_hw.config import RobotConfig
+
+    return typing.get_type_hints(RobotConfig)[section].__struct_fields__
