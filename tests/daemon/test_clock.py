@@ -1,0 +1,54 @@
+import time
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from disco_hw.daemon.clock import MonotonicClock, SimulatedClock
+
+
+@pytest.mark.parametrize("spin_s", [0.0, 0.001])
+def test_monotonic_clock_never_returns_before_the_deadline(spin_s):
+    clock = MonotonicClock(spin_s)
+    for offset_ns in (5_000_000, 200_000, 1, 0, -10_000_000):
+        deadline_ns = clock.now_ns() + offset_ns
+        clock.sleep_until_ns(deadline_ns)
+        assert clock.now_ns() >= deadline_ns
+
+
+def test_monotonic_clock_is_the_hosts_monotonic_clock():
+    before_ns = time.monotonic_ns()
+    now_ns = MonotonicClock().now_ns()
+    assert before_ns <= now_ns <= time.monotonic_ns()
+
+
+def test_monotonic_clock_gives_the_cpu_away_while_it_waits():
+    clock = MonotonicClock(0.001)
+    cpu_before_s = time.thread_time()
+    clock.sleep_until_ns(clock.now_ns() + 100_000_000)
+    assert time.thread_time() - cpu_before_s < 0.05
+
+
+@pytest.mark.parametrize("spin_s", [-0.001, 0.1, float("nan")])
+def test_absurd_spin_is_refused(spin_s):
+    with pytest.raises(ValueError, match="spin_s"):
+        MonotonicClock(spin_s)
+
+
+@given(st.lists(st.tuples(st.booleans(), st.integers(0, 10**12))))
+def test_simulated_clock_moves_only_when_told_and_never_back(moves):
+    clock = SimulatedClock(7)
+    expected_ns = 7
+    for is_sleep, value_ns in moves:
+        if is_sleep:
+            clock.sleep_until_ns(value_ns)
+            expected_ns = max(expected_ns, value_ns)
+        else:
+            clock.advance_ns(value_ns)
+            expected_ns += value_ns
+        assert clock.now_ns() == expected_ns
+
+
+def test_simulated_clock_refuses_to_run_backwards():
+    with pytest.raises(ValueError, match="backwards"):
+        SimulatedClock().advance_ns(-1)
