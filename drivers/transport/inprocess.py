@@ -1,0 +1,121 @@
+"""A link inside one process, without threads or a clock: what tests and simulated time use in place of a medium."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+
+from drivers.transport.counters import Counters
+from drivers.types import LinkState, OutgoingFrame, ReceivedFrame, TransportStats
+
+QUEUE_CAPACITY = 4096
+
+
+class InProcessTransport:
+    """One end of a pair; what one end sends the other receives at once, stamped with the sender's `now_ns`.
+
+    Satisfies `drivers.types.Transport`. `connect_pair` makes the two ends; the link is up while both are open and it is
+    plugged in.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._counters = Counters()
+        self._peer: InProcessTransport | None = None
+        self._open = False
+        self._plugged = True
+        self._state = LinkState.CLOSED
+        self._generation = 0
+        self._last_error: str | None = None
+        self._incoming: deque[ReceivedFrame] = deque()
+
+    @property
+    def name(self) -> str:
+        """The name given."""
+        return self._name
+
+    @property
+    def state(self) -> LinkState:
+        """Whether frames can be carried now."""
+        return self._state
+
+    @property
+    def generation(self) -> int:
+        """Number of times the link has come up."""
+        return self._generation
+
+    @property
+    def stats(self) -> TransportStats:
+        """A snapshot of the counters."""
+        return self._counters.snapshot()
+
+    @property
+    def last_error(self) -> str | None:
+        """The newest error in words, or None if there was none since the link last came up."""
+        return self._last_error
+
+    def open(self) -> None:
+        """Connect as soon as the other end is open too."""
+        self._open = True
+        self._settle_both()
+
+    def close(self) -> None:
+        """Disconnect; safe to call twice."""
+        self._open = False
+        self._settle_both()
+
+    def plug(self, plugged: bool) -> None:
+        """Pull the cable out or put it back in; what was under way is lost."""
+        for end in (self, self._peer):
+            if end is not None:
+                end._plugged = plugged
+        self._settle_both()
+
+    def send(self, outgoing: OutgoingFrame, now_ns: int) -> bool:
+        """Pass a frame to the other end; False (and a counter) if it expired or the link is down."""
+        if outgoing.deadline_ns < now_ns:
+            self._counters.add(expired=1)
+            return False
+        if self._state is not LinkState.UP or self._peer is None:
+            self._counters.add(send_errors=1)
+            return False
+        self._counters.add(frames_sent=1)
+        self._peer._take(ReceivedFrame(now_ns, outgoing.frame))
+        return True
+
+    def receive(self) -> Sequence[ReceivedFrame]:
+        """All frames received since the last call, oldest first."""
+        received = tuple(self._incoming)
+        self._incoming.clear()
+        return received
+
+    def _take(self, received: ReceivedFrame) -> None:
+        if len(self._incoming) >= QUEUE_CAPACITY:
+            self._incoming.popleft()
+            self._counters.add(receive_overflow=1)
+        self._incoming.append(received)
+        self._counters.add(frames_received=1, bytes_received=len(received.frame.data))
+
+    def _settle_both(self) -> None:
+        for end in (self, self._peer):
+            if end is not None:
+                end._settle()
+
+    def _settle(self) -> None:
+        up = self._open and self._plugged and self._peer is not None and self._peer._open
+        if up and self._state is not LinkState.UP:
+            self._generation += 1
+            self._last_error = None
+            self._counters.add(reconnects=int(self._generation > 1))
+        if not up:
+            self._incoming.clear()
+            if self._state is LinkState.UP and self._open:
+                self._last_error = f"{self._name}: unplugged"
+        self._state = LinkState.UP if up else LinkState.CONNECTING if self._open else LinkState.CLOSED
+
+
+def connect_pair(first: str = "host", second: str = "robot") -> tuple[InProcessTransport, InProcessTransport]:
+    """Return the two ends of one link, both closed."""
+    a, b = InProcessTransport(first), InProcessTransport(second)
+    a._peer, b._peer = b, a
+    return a, b

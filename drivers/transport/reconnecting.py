@@ -1,0 +1,273 @@
+"""Two threads that keep a link alive: one connects, receives and reconnects, the other sends.
+
+The threads inherit the scheduling policy and priority of the thread that calls `open`: a daemon that wants them in real
+time sets its own policy first. They are the only place where a medium may block; the control loop never does.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Sequence
+from typing import Protocol
+
+from drivers.transport.backoff import BackoffPolicy, next_delay_s
+from drivers.transport.counters import Counters
+from drivers.transport.transmit_queue import TransmitQueue
+from drivers.types import Frame, LinkState, OutgoingFrame, ReceivedFrame, TransportStats
+from firmware_protocol.serial_framing import MAX_CAN_ID, MAX_DATA
+
+RECEIVE_CAPACITY = 4096
+TRANSMIT_CAPACITY = 64
+_BUSY_RETRY_S = 0.001
+_DRAIN_S = 0.1
+_JOIN_S = 1.0
+
+
+class TransmitBusyError(Exception):
+    """The medium has no room for a frame now; the frame was not sent and may be tried again."""
+
+
+class LinkLostError(Exception):
+    """The medium said that it is gone; the message is for a person."""
+
+
+class Connection(Protocol):
+    """A medium that is connected. One thread reads while another writes; errors mean that the link is lost."""
+
+    def read(self) -> Sequence[ReceivedFrame]:
+        """Wait about 0.1 s at most for frames; raises anything when the link is lost."""
+
+    def write(self, frame: Frame) -> None:
+        """Send one frame in bounded time; raises TransmitBusyError if there is no room, anything else if lost."""
+
+    def close(self) -> None:
+        """Release the medium; may raise."""
+
+
+class Medium(Protocol):
+    """How to connect to one address of one kind of medium."""
+
+    @property
+    def name(self) -> str:
+        """Medium and address, for messages to a person."""
+
+    def connect(self, counters: Counters) -> Connection:
+        """Connect in bounded time, counting malformed input and bus errors in `counters`; raises if it cannot."""
+
+    def explain(self, error: Exception) -> str:
+        """Say in one line what the error means and what to do."""
+
+
+class ReconnectingTransport:
+    """A `drivers.types.Transport` over any medium, which it connects again with back-off whenever it is lost.
+
+    Whatever waits to be sent when the link is lost is dropped: nothing old is ever sent on a new link. A frame leaves
+    in the order of CAN identifiers, and is dropped when its deadline has passed or when it does not fit the queue.
+    """
+
+    def __init__(self, medium: Medium, *, backoff: BackoffPolicy = BackoffPolicy()) -> None:  # noqa: B008
+        self._medium = medium
+        self._backoff = backoff
+        self._counters = Counters()
+        self._changed = threading.Condition()
+        self._writing = threading.Lock()
+        self._state = LinkState.CLOSED
+        self._generation = 0
+        self._last_error: str | None = None
+        self._connection: Connection | None = None
+        self._outgoing = TransmitQueue(TRANSMIT_CAPACITY)
+        self._incoming: deque[ReceivedFrame] = deque()
+        self._stop = threading.Event()
+        self._lost = threading.Event()
+        self._threads: tuple[threading.Thread, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """Medium and address, for messages to a person."""
+        return self._medium.name
+
+    @property
+    def state(self) -> LinkState:
+        """Whether frames can be carried now."""
+        return self._state
+
+    @property
+    def generation(self) -> int:
+        """Number of times the link has come up."""
+        return self._generation
+
+    @property
+    def stats(self) -> TransportStats:
+        """A snapshot of the counters."""
+        return self._counters.snapshot()
+
+    @property
+    def last_error(self) -> str | None:
+        """The newest error with its remedy, or None if there was none since the link last came up."""
+        return self._last_error
+
+    def open(self) -> None:
+        """Start both threads and the first connection attempt; return at once.
+
+        Does nothing the second time; a closed transport stays closed.
+        """
+        if self._threads or self._stop.is_set():
+            return
+        self._state = LinkState.CONNECTING
+        self._threads = (
+            threading.Thread(target=self._run_receiver, name=f"{self.name} receive", daemon=True),
+            threading.Thread(target=self._run_sender, name=f"{self.name} send", daemon=True),
+        )
+        for thread in self._threads:
+            thread.start()
+
+    def send(self, outgoing: OutgoingFrame, now_ns: int) -> bool:
+        """Hand a frame to the sending thread; False (and a counter) if it expired, did not fit or the link is down.
+
+        Raises ValueError for what is no classic CAN frame with an 11-bit identifier.
+        """
+        if not 0 <= outgoing.frame.can_id <= MAX_CAN_ID or len(outgoing.frame.data) > MAX_DATA:
+            raise ValueError(f"not a classic CAN frame: {outgoing.frame}")
+        if outgoing.deadline_ns < now_ns:
+            self._counters.add(expired=1)
+            return False
+        with self._changed:
+            if self._state is not LinkState.UP:
+                self._counters.add(send_errors=1)
+                return False
+            dropped = self._outgoing.push(outgoing)
+            self._changed.notify_all()
+        if dropped is not None:
+            self._counters.add(transmit_queue_full=1)
+        return dropped is not outgoing
+
+    def receive(self) -> Sequence[ReceivedFrame]:
+        """All frames received since the last call, oldest first, without blocking."""
+        with self._changed:
+            received = tuple(self._incoming)
+            self._incoming.clear()
+        return received
+
+    def close(self) -> None:
+        """Send what is queued (for 0.1 s at most), stop the threads and release the medium; safe to call twice."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._connection is None or not self._outgoing, timeout=_DRAIN_S)
+            self._stop.set()
+            self._changed.notify_all()
+        for thread in self._threads:
+            thread.join(_JOIN_S)
+        self._threads = ()
+        self._state = LinkState.CLOSED
+
+    def _run_receiver(self) -> None:
+        delay_s: float | None = None
+        while not self._stop.is_set():
+            up_for_s = 0.0
+            try:
+                connection = self._medium.connect(self._counters)
+            except Exception as error:  # whatever a backend raises, this thread must outlive it
+                self._note(error)
+            else:
+                came_up_ns = time.monotonic_ns()
+                self._come_up(connection)
+                self._pump(connection)
+                self._go_down(connection)
+                up_for_s = (time.monotonic_ns() - came_up_ns) * 1e-9
+            delay_s = next_delay_s(self._backoff, delay_s, up_for_s)
+            self._stop.wait(delay_s)
+
+    def _pump(self, connection: Connection) -> None:
+        while not (self._stop.is_set() or self._lost.is_set()):
+            try:
+                frames = connection.read()
+            except Exception as error:  # whatever a backend raises, this thread must outlive it
+                self._counters.add(receive_errors=1)
+                self._note(error)
+                return
+            if frames:
+                self._deliver(frames)
+
+    def _deliver(self, frames: Sequence[ReceivedFrame]) -> None:
+        with self._changed:
+            self._incoming.extend(frames)
+            overflow = max(0, len(self._incoming) - RECEIVE_CAPACITY)
+            for _ in range(overflow):
+                # A reader that has fallen behind is served better by what is true now.
+                self._incoming.popleft()
+        self._counters.add(
+            frames_received=len(frames),
+            bytes_received=sum(len(received.frame.data) for received in frames),
+            receive_overflow=overflow,
+        )
+
+    def _come_up(self, connection: Connection) -> None:
+        with self._changed:
+            self._lost.clear()
+            self._incoming.clear()
+            self._outgoing.clear()
+            self._connection = connection
+            self._last_error = None
+            self._generation += 1
+            self._state = LinkState.UP
+            self._changed.notify_all()
+        if self._generation > 1:
+            self._counters.add(reconnects=1)
+
+    def _go_down(self, connection: Connection) -> None:
+        with self._changed:
+            self._state = LinkState.CONNECTING
+            self._connection = None
+            dropped = self._outgoing.clear()
+            self._changed.notify_all()
+        self._counters.add(send_errors=dropped)
+        with self._writing:
+            try:
+                connection.close()
+            except Exception as error:  # a device that is gone cannot be closed properly either
+                self._note(error)
+
+    def _run_sender(self) -> None:
+        refused: OutgoingFrame | None = None
+        while not self._stop.is_set():
+            with self._changed:
+                self._changed.wait_for(lambda: self._stop.is_set() or self._ready_to_send())
+                connection = self._connection
+                self._counters.add(expired=self._outgoing.expire(time.monotonic_ns()))
+                outgoing = self._outgoing.peek()
+            if connection is None or outgoing is None:
+                continue
+            if self._write(connection, outgoing):
+                with self._changed:
+                    self._outgoing.remove(outgoing)
+                    self._changed.notify_all()
+                continue
+            if refused is not outgoing:
+                refused = outgoing
+                self._counters.add(transmit_queue_full=1)
+            self._stop.wait(_BUSY_RETRY_S)
+
+    def _ready_to_send(self) -> bool:
+        return self._connection is not None and not self._lost.is_set() and len(self._outgoing) > 0
+
+    def _write(self, connection: Connection, outgoing: OutgoingFrame) -> bool:
+        """Send one frame; False if it should be tried again."""
+        with self._writing:
+            if self._connection is not connection:
+                return True
+            try:
+                connection.write(outgoing.frame)
+            except TransmitBusyError as error:
+                self._note(error)
+                return False
+            except Exception as error:  # whatever a backend raises, this thread must outlive it
+                self._counters.add(send_errors=1)
+                self._note(error)
+                self._lost.set()
+                return True
+        self._counters.add(frames_sent=1)
+        return True
+
+    def _note(self, error: Exception) -> None:
+        self._last_error = self._medium.explain(error)

@@ -1,0 +1,98 @@
+"""A serial line (UART, USB adapter, pseudo-terminal) that tunnels CAN frames with COBS framing."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import serial
+
+from drivers.transport.counters import Counters
+from drivers.transport.explain import explain_port
+from drivers.transport.reconnecting import TransmitBusyError
+from drivers.types import Frame, ReceivedFrame
+from firmware_protocol.serial_framing import FrameDecoder, encode_frame
+
+READ_TIMEOUT_S = 0.1
+WRITE_TIMEOUT_S = 0.05
+_DELIMITER = b"\0"
+
+
+@dataclass(frozen=True, slots=True)
+class SerialMedium:
+    """A serial port by its device name or pyserial URL, at `baud` bit/s, 8 data bits, no parity, 1 stop bit."""
+
+    port: str
+    baud: int
+
+    @property
+    def name(self) -> str:
+        """Port and speed."""
+        return f"serial {self.port} at {self.baud} Bd"
+
+    def connect(self, counters: Counters) -> SerialConnection:
+        """Open the port for this process alone. Raises what pyserial raises."""
+        port = serial.serial_for_url(
+            self.port,
+            baudrate=self.baud,
+            timeout=READ_TIMEOUT_S,
+            write_timeout=WRITE_TIMEOUT_S,
+            exclusive=True,
+        )
+        _ask_for_low_latency(port)
+        return SerialConnection(port, counters)
+
+    def explain(self, error: Exception) -> str:
+        """Say in one line what the error means and what to do."""
+        return explain_port(self.port, error)
+
+
+class SerialConnection:
+    """An open serial port; satisfies `drivers.transport.reconnecting.Connection`."""
+
+    def __init__(self, port: serial.Serial, counters: Counters) -> None:
+        self._port = port
+        self._counters = counters
+        self._decoder = FrameDecoder()
+        self._malformed = 0
+        # The other end may hold half a frame of whoever wrote before; the delimiter ends it.
+        self._line_is_clean = False
+
+    def read(self) -> Sequence[ReceivedFrame]:
+        """Wait 0.1 s at most for bytes; a frame's time stamp is when its last byte was read. Raises when unplugged."""
+        received = self._port.read(max(1, self._port.in_waiting))
+        t_ns = time.monotonic_ns()
+        if not received:
+            return ()
+        frames = self._decoder.feed(received)
+        malformed = self._decoder.stats.malformed
+        self._counters.add(malformed=malformed - self._malformed)
+        self._malformed = malformed
+        return [ReceivedFrame(t_ns, Frame(can_id, data)) for can_id, data in frames]
+
+    def write(self, frame: Frame) -> None:
+        """Send one frame, waiting 0.05 s at most; raises TransmitBusyError if the line takes no more."""
+        encoded = encode_frame(frame.can_id, frame.data)
+        try:
+            self._port.write(encoded if self._line_is_clean else _DELIMITER + encoded)
+        except serial.SerialTimeoutException as error:
+            self._line_is_clean = False
+            raise TransmitBusyError("the line takes no more bytes; is the other end reading?") from error
+        self._line_is_clean = True
+
+    def close(self) -> None:
+        """Close the port."""
+        self._port.close()
+
+
+def _ask_for_low_latency(port: serial.Serial) -> None:
+    """Ask for delivery byte by byte: FTDI adapters otherwise hold received bytes back for 16 ms."""
+    ask = getattr(port, "set_low_latency_mode", None)
+    if ask is None:
+        return
+    try:
+        ask(True)
+    except (ValueError, OSError):
+        # Pseudo-terminals, CDC-ACM and network ports have no such mode, and no latency timer either.
+        return
