@@ -14,7 +14,7 @@ from collections import deque
 from dataclasses import dataclass
 from pathlib import Path
 
-from sim.can_wire import FRAME_BYTES
+from sim.can_frame import FRAME_BYTES
 
 
 class HubError(Exception):

@@ -1,4 +1,4 @@
-"""A classic CAN frame: as a value, as SocketCAN bytes, as bits on the wire and as a candump line."""
+"""A classic CAN frame as a value, as SocketCAN bytes and as a candump line."""
 
 from __future__ import annotations
 
@@ -6,13 +6,9 @@ import struct
 from typing import NamedTuple
 
 FRAME_BYTES = 16
+"""Length of Linux `struct can_frame`."""
 ECHO_OWN_FRAMES = b"\x01"
-
-ERROR_CONTROLLER = 0x004
-ERROR_BUS_OFF = 0x040
-ERROR_RESTARTED = 0x100
-ERROR_COUNTERS = 0x200
-RECEIVE_OVERFLOW = 0x01
+"""Packet by which a client of the hub asks for its own frames as well."""
 
 _EXTENDED_FLAG = 0x8000_0000
 _REMOTE_FLAG = 0x4000_0000
@@ -65,3 +61,37 @@ def unpack_frame(packet: bytes) -> CanFrame | None:
         return CanFrame(can_id & _EXTENDED_MASK, b"", extended, True, error, length)
     mask = _EXTENDED_MASK if extended or error else _STANDARD_MASK
     return CanFrame(can_id & mask, data[:length], extended, False, error)
+
+
+def candump_line(t_ns: int, channel: str, frame: CanFrame) -> str:
+    """The frame as `candump -L` writes it, for example `(0.000270) can0 110#8D300000`; `t_ns` is printed in seconds."""
+    width = 8 if frame.extended or frame.error else 3
+    can_id = frame.can_id | _ERROR_FLAG if frame.error else frame.can_id
+    body = f"R{frame.remote_length}" if frame.remote else frame.data.hex().upper()
+    seconds, rest_ns = divmod(t_ns, 1_000_000_000)
+    return f"({seconds}.{rest_ns // 1000:06d}) {channel} {can_id:0{width}X}#{body}"
+
+
+def controller_error_frame(tec: int, rec: int, state: int) -> CanFrame:
+    """Error frame CAN_ERR_CRTL | CAN_ERR_CNT: `state` is the CAN_ERR_CRTL_* bits, the counters go to bytes 6 and 7."""
+    return CanFrame(0x204, bytes((0, state, 0, 0, 0, 0, min(tec, 255), min(rec, 255))), error=True)
+
+
+def bus_off_frame() -> CanFrame:
+    """Error frame CAN_ERR_BUSOFF: this node has left the bus."""
+    return CanFrame(0x040, bytes(8), error=True)
+
+
+def restarted_frame() -> CanFrame:
+    """Error frame CAN_ERR_RESTARTED: this node has come back from bus-off."""
+    return CanFrame(0x100, bytes(8), error=True)
+
+
+def protocol_error_frame() -> CanFrame:
+    """Error frame CAN_ERR_PROT | CAN_ERR_BUSERROR: a frame was destroyed on the wire."""
+    return CanFrame(0x088, bytes(8), error=True)
+
+
+def receive_overflow_frame() -> CanFrame:
+    """Error frame CAN_ERR_CRTL with CAN_ERR_CRTL_RX_OVERFLOW: this reader was too slow and frames are lost."""
+    return CanFrame(0x004, bytes((0, 0x01, 0, 0, 0, 0, 0, 0)), error=True)
