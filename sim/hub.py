@@ -1,157 +1,306 @@
-"""The CAN bus between processes: whatever connects to a Unix socket is a node."""
+"""The simulated CAN bus between processes, in real time: whoever connects to a Unix socket is a node on it.
+
+Each packet on the socket is one Linux `struct can_frame`. Without threads: the owner waits on `fileno()` and
+`next_event_ns()` and calls `pump`.
+"""
 
 from __future__ import annotations
 
 import argparse
-import errno
-import os
 import select
-import signal
 import socket
-import stat
+import sys
 import time
 from collections import deque
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
 
-from sim.can_frame import FRAME_BYTES
+from sim.bus import BusFault, CanBus, Delivery
+from sim.bus_node import BusNode, TransmitOrder
+from sim.can_frame import ECHO_OWN_FRAMES, FRAME_BYTES, CanFrame, pack_frame, receive_overflow_frame, unpack_frame
+from sim.stop_signal import StopSignal
+from sim.unix_listener import SocketPathError, bind_private
 
-
-class HubError(Exception):
-    """The hub cannot listen; the message is one line for the user."""
+CLIENT_TRANSMIT_QUEUE = 32
+READER_QUEUE = 1024
+"""Frames kept for a client that does not read, beyond the kernel's 280 or so; more are dropped and counted."""
+READER_QUEUE_PAUSE = 256
+"""Unpaced only: with more than this waiting for a reader that still reads, nobody may send."""
+READER_STALL_NS = 100_000_000
+"""Unpaced only: a reader that took nothing for so long holds up nobody."""
 
 
 @dataclass(slots=True)
+class HubStats:
+    """Counters since the hub was made; nothing is dropped without being counted here."""
+
+    connections: int = 0
+    frames_in: int = 0
+    frames_out: int = 0
+    reader_overflow: int = 0
+    malformed: int = 0
+
+
+@dataclass(slots=True, eq=False)
 class _Client:
     connection: socket.socket
-    waiting: deque[bytes]
+    node: BusNode
+    events: int = select.EPOLLIN
+    unread: deque[bytes] = field(default_factory=deque)
+    lost_unread: int = 0
+    unsent: int = 0
+    last_read_ns: int = 0
 
 
 class Hub:
-    """Carries each frame of a connected process to all others."""
+    """The bus, the clients' nodes on it, and the socket through which clients come and go.
 
-    def __init__(self, path: Path, *, bitrate: int = 500_000, pacing: bool = True) -> None:
+    `pacing` makes each frame take its time on the wire at `bitrate`; without it a frame takes none, and readers slow
+    the senders down instead of losing frames. Clients send in the order in which they wrote. A silent node acknowledges
+    all frames, so that a lone node is not without an answer. Raises SocketPathError if it cannot listen at `path`.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        now_ns: int,
+        *,
+        bitrate: int = 500_000,
+        pacing: bool = True,
+        fault: BusFault | None = None,
+        log: Callable[[str], object] | None = None,
+    ) -> None:
         self.path = path
-        self._listener = _listen(path)
+        self.bus = CanBus(bitrate if pacing else None, fault=fault, log=log, start_ns=now_ns)
+        self.bus.attach("monitor")
+        self.stats = HubStats()
+        self._pacing = pacing
+        self._now_ns = now_ns
         self._epoll = select.epoll()
-        self._epoll.register(self._listener, select.EPOLLIN)
+        self._listener: socket.socket | None = None
+        self._plug_in_ns: int | None = None
         self._clients: dict[int, _Client] = {}
+        self._by_node: dict[BusNode, _Client] = {}
+        self._leaving: list[_Client] = []
+        self._inbox: deque[tuple[_Client, CanFrame]] = deque()
+        self._listen()
 
     def fileno(self) -> int:
-        """Descriptor that is readable when `pump` has something to do."""
+        """Descriptor that is readable when a client has done something."""
         return self._epoll.fileno()
 
-    def next_wake_ns(self) -> int | None:
-        """Monotonic time of the next due event, or None."""
-        return None
+    def next_event_ns(self) -> int | None:
+        """When `pump` is due even if no client does anything; None if never."""
+        times = [t for t in (self.bus.next_event_ns(), self._plug_in_ns) if t is not None]
+        times.extend(client.last_read_ns + READER_STALL_NS for client in self._held_up_by())
+        return min(times) if times else None
 
-    def pump(self, now_ns: int) -> None:
-        """Take in and pass on what is due; never blocks."""
-        for descriptor, _ in self._epoll.poll(0):
-            if descriptor == self._listener.fileno():
-                connection, _ = self._listener.accept()
-                connection.setblocking(False)
-                self._clients[connection.fileno()] = _Client(connection, deque())
-                self._epoll.register(connection, select.EPOLLIN)
+    def pump(self, now_ns: int) -> list[Delivery]:
+        """Take in what clients wrote, let the bus run up to `now_ns`, and hand out what was received; never blocks.
+
+        Returns the deliveries, for nodes that the owner has attached to `bus` itself.
+        """
+        self.collect(now_ns)
+        return self.advance(now_ns)
+
+    def collect(self, now_ns: int) -> int:
+        """Serve the sockets; return how many frames of clients now wait to be let onto the bus."""
+        self._now_ns = now_ns
+        if self._plug_in_ns is not None and now_ns >= self._plug_in_ns:
+            self._plug_in_ns = None
+            self._listen()
+        for descriptor, events in self._epoll.poll(0):
+            client = self._clients.get(descriptor)
+            if client is None:
+                self._accept()
                 continue
-            client = self._clients[descriptor]
-            while client.waiting:
-                try:
-                    client.connection.send(client.waiting[0])
-                except OSError:
-                    break
-                client.waiting.popleft()
-            if not client.waiting:
-                self._epoll.modify(descriptor, select.EPOLLIN)
-            for _ in range(64):
-                try:
-                    packet = client.connection.recv(FRAME_BYTES + 1)
-                except BlockingIOError:
-                    break
-                except OSError:
-                    packet = b""
-                if not packet:
-                    self._epoll.unregister(descriptor)
-                    self._clients.pop(descriptor).connection.close()
-                    break
-                for other in self._clients.values():
-                    if other is not client:
-                        self._send(other, packet)
+            if events & select.EPOLLOUT:
+                self._flush(client)
+            if events & (select.EPOLLIN | select.EPOLLHUP | select.EPOLLERR):
+                self._read(client)
+        self._set_events()
+        return len(self._inbox)
 
-    def _send(self, client: _Client, packet: bytes) -> None:
-        if not client.waiting:
-            try:
-                client.connection.send(packet)
-                return
-            except BlockingIOError:
-                self._epoll.modify(client.connection, select.EPOLLIN | select.EPOLLOUT)
-            except OSError:
-                return
-        client.waiting.append(packet)
+    def advance(self, now_ns: int, admit: int | None = None) -> list[Delivery]:
+        """Let the oldest `admit` waiting frames (None: all) onto the bus and run it up to `now_ns`."""
+        deliveries = self.bus.advance(now_ns)
+        for _ in range(len(self._inbox) if admit is None else admit):
+            client, frame = self._inbox.popleft()
+            client.unsent -= 1
+            self.bus.send(client.node, frame)
+        deliveries.extend(self.bus.advance(now_ns))
+        for delivery in deliveries:
+            self._hand_out(delivery.frame, delivery.receivers)
+        for client in [client for client in self._leaving if not client.unsent and not client.node.pending]:
+            self._leaving.remove(client)
+            self.bus.detach(client.node)
+        self._set_events()
+        return deliveries
+
+    def unplug(self, until_ns: int) -> None:
+        """Cut off all clients, with what they have not sent yet, and refuse new ones until `until_ns`."""
+        for client in tuple(self._clients.values()):
+            self._drop(client)
+        for client in self._leaving:
+            self.bus.detach(client.node)
+        self._leaving.clear()
+        self._inbox.clear()
+        if self._listener is not None:
+            self._epoll.unregister(self._listener)
+            self._listener.close()
+            self._listener = None
+            self.path.unlink(missing_ok=True)
+        self._plug_in_ns = until_ns
+
+    def force_clients_bus_off(self) -> None:
+        """Put the controller of each client into bus-off; a client gets a new one by connecting anew."""
+        for client in self._clients.values():
+            self.bus.force_bus_off(client.node)
+
+    def request_clients_recovery(self) -> None:
+        """Ask for the recovery of all clients that are bus-off, as `ip link set can0 type can restart` does."""
+        for client in self._clients.values():
+            self.bus.request_recovery(client.node)
 
     def close(self) -> None:
-        """Close all connections and remove the socket."""
-        for client in self._clients.values():
-            client.connection.close()
-        self._clients.clear()
-        self._epoll.close()
-        self._listener.close()
-        self.path.unlink(missing_ok=True)
+        """Close all connections and remove the socket; safe to call twice."""
+        if not self._epoll.closed:
+            self.unplug(self._now_ns)
+            self._epoll.close()
 
+    def _listen(self) -> None:
+        self._listener = bind_private(self.path, socket.SOCK_SEQPACKET)
+        self._epoll.register(self._listener, select.EPOLLIN)
 
-def _listen(path: Path) -> socket.socket:
-    if path.exists() or path.is_symlink():
-        _remove_stale(path)
-    listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    try:
-        listener.bind(str(path))
-        # Before listen() nobody can connect, so there is no moment at which the socket is open to others.
-        path.chmod(0o600)
-        listener.listen(64)
-    except OSError as error:
-        listener.close()
-        raise HubError(f"{path}: cannot listen here ({error.strerror or error}); choose another path") from None
-    listener.setblocking(False)
-    return listener
+    def _accept(self) -> None:
+        if self._listener is None:
+            return
+        try:
+            connection, _ = self._listener.accept()
+        except (BlockingIOError, ConnectionAbortedError):
+            # The client gave up while it waited; there is nothing to serve and nothing lost.
+            return
+        connection.setblocking(False)
+        self.stats.connections += 1
+        node = self.bus.attach(
+            f"client{self.stats.connections}", capacity=CLIENT_TRANSMIT_QUEUE, order=TransmitOrder.FIFO
+        )
+        client = _Client(connection, node)
+        self._clients[connection.fileno()] = client
+        self._by_node[node] = client
+        self._epoll.register(connection, select.EPOLLIN)
 
+    def _read(self, client: _Client) -> None:
+        """Take in frames of one client as far as its transmit queue has room: the rest waits with the sender."""
+        while client.unsent + client.node.pending < CLIENT_TRANSMIT_QUEUE:
+            try:
+                packet = client.connection.recv(FRAME_BYTES + 1)
+            except BlockingIOError:
+                return
+            except OSError:
+                packet = b""
+            if not packet:
+                self._drop(client)
+                return
+            if packet == ECHO_OWN_FRAMES:
+                client.node.echo = True
+                continue
+            frame = unpack_frame(packet)
+            if frame is None:
+                self.stats.malformed += 1
+                continue
+            self.stats.frames_in += 1
+            if frame.error:
+                # No controller sends these; a test that writes one wants the others to read it.
+                self._hand_out(frame, tuple(node for node in self._by_node if node is not client.node))
+                continue
+            client.unsent += 1
+            self._inbox.append((client, frame))
 
-def _remove_stale(path: Path) -> None:
-    if not stat.S_ISSOCK(path.lstat().st_mode):
-        raise HubError(f"{path}: exists and is not a socket; choose another path")
-    probe = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    try:
-        probe.connect(str(path))
-    except OSError as error:
-        if error.errno != errno.ECONNREFUSED:
-            raise HubError(f"{path}: in use ({error.strerror}); choose another path") from None
-    else:
-        raise HubError(f"{path}: another hub listens here; stop it or choose another path")
-    finally:
-        probe.close()
-    path.unlink()
+    def _hand_out(self, frame: CanFrame, receivers: tuple[BusNode, ...]) -> None:
+        packet = pack_frame(frame)
+        for node in receivers:
+            client = self._by_node.get(node)
+            if client is None:
+                continue
+            if len(client.unread) >= READER_QUEUE:
+                client.lost_unread += 1
+                self.stats.reader_overflow += 1
+                continue
+            if client.lost_unread:
+                client.unread.append(pack_frame(receive_overflow_frame()))
+                client.lost_unread = 0
+            client.unread.append(packet)
+            if len(client.unread) == 1:
+                client.last_read_ns = self._now_ns
+                self._flush(client)
+
+    def _flush(self, client: _Client) -> None:
+        while client.unread:
+            try:
+                client.connection.send(client.unread[0])
+            except BlockingIOError:
+                return
+            except OSError:
+                # The client is gone; its hang-up event follows and ends it there.
+                client.unread.clear()
+                return
+            client.unread.popleft()
+            client.last_read_ns = self._now_ns
+            self.stats.frames_out += 1
+
+    def _held_up_by(self) -> list[_Client]:
+        """The readers for whom senders wait."""
+        if self._pacing:
+            return []
+        return [
+            client
+            for client in self._clients.values()
+            if len(client.unread) > READER_QUEUE_PAUSE and self._now_ns - client.last_read_ns < READER_STALL_NS
+        ]
+
+    def _set_events(self) -> None:
+        """Listen only to what can be served now, or a level-triggered poll would spin."""
+        held_up = bool(self._held_up_by())
+        for descriptor, client in self._clients.items():
+            room = client.unsent + client.node.pending < CLIENT_TRANSMIT_QUEUE
+            events = select.EPOLLIN if room and not held_up else 0
+            if client.unread:
+                events |= select.EPOLLOUT
+            if events != client.events:
+                client.events = events
+                self._epoll.modify(descriptor, events)
+
+    def _drop(self, client: _Client) -> None:
+        self._epoll.unregister(client.connection)
+        del self._clients[client.connection.fileno()]
+        del self._by_node[client.node]
+        client.connection.close()
+        self._leaving.append(client)
 
 
 def main() -> int:
     """Serve a hub alone until SIGTERM or SIGINT: `python -m sim.hub PATH`."""
-    parser = argparse.ArgumentParser(prog="python -m sim.hub")
-    parser.add_argument("path", type=Path)
-    parser.add_argument("--bitrate", type=int, default=500_000)
-    parser.add_argument("--no-pacing", action="store_true")
+    parser = argparse.ArgumentParser(prog="python -m sim.hub", description="A CAN bus on a Unix socket.")
+    parser.add_argument("path", type=Path, help="socket to listen on")
+    parser.add_argument("--bitrate", type=int, default=500_000, help="bit/s")
+    parser.add_argument("--no-pacing", action="store_true", help="frames take no time")
     arguments = parser.parse_args()
-    wake_read, wake_write = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
-    signal.set_wakeup_fd(wake_write)
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: None)
-    hub = Hub(arguments.path, bitrate=arguments.bitrate, pacing=not arguments.no_pacing)
+    stop = StopSignal()
+    try:
+        hub = Hub(arguments.path, time.monotonic_ns(), bitrate=arguments.bitrate, pacing=not arguments.no_pacing)
+    except SocketPathError as error:
+        print(error, file=sys.stderr)
+        return 2
     print(f"ready {arguments.path}", flush=True)
-    while True:
-        wake_ns = hub.next_wake_ns()
-        timeout_s = None if wake_ns is None else max(0.0, (wake_ns - time.monotonic_ns()) * 1e-9)
-        readable, _, _ = select.select((hub.fileno(), wake_read), (), (), timeout_s)
-        if wake_read in readable:
-            break
+    while not stop.requested:
+        due_ns = hub.next_event_ns()
+        timeout_s = None if due_ns is None else max(0.0, (due_ns - time.monotonic_ns()) * 1e-9)
+        select.select((hub.fileno(), stop.fileno()), (), (), timeout_s)
         hub.pump(time.monotonic_ns())
     hub.close()
+    print(hub.stats, file=sys.stderr)
     return 0
 
 
