@@ -1,0 +1,121 @@
+"""What these functions change is the whole process, so each test looks at a process of its own."""
+
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+
+from disco_hw.daemon.realtime import can_lock_memory, can_use_fifo
+
+FIFO_ALLOWED = pytest.mark.skipif(not can_use_fifo(), reason="this user may not use SCHED_FIFO")
+REPORT = """
+import gc, json, os, sys, threading
+def locked_kib():
+    return int(next(line.split()[1] for line in open("/proc/self/status") if line.startswith("VmLck")))
+def report(steps, **more):
+    print(json.dumps({
+        "steps": [[step.name, step.done, str(step)] for step in steps],
+        "policy": os.sched_getscheduler(0), "priority": os.sched_getparam(0).sched_priority,
+        "gc": gc.isenabled(), "frozen": gc.get_freeze_count(), "switch_s": sys.getswitchinterval(),
+        "locked_kib": locked_kib(), "cpus": sorted(os.sched_getaffinity(0)), **more}))
+"""
+AS_NOBODY = "import os; os.setgroups([]); os.setgid(65534); os.setuid(65534)\n"
+
+
+def run(script, **environment):
+    result = subprocess.run(
+        [sys.executable, "-c", REPORT + script],
+        env={**os.environ, **environment},
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert result.returncode == 0, result.stderr
+    return json.loads(result.stdout)
+
+
+@FIFO_ALLOWED
+@pytest.mark.skipif(not can_lock_memory(), reason="this user may not lock memory")
+def test_everything_allowed_is_done_and_said():
+    seen = run("from disco_hw.daemon import realtime\nreport(realtime.enter(80))")
+    assert all(done for _, done, _ in seen["steps"])
+    assert [name for name, _, _ in seen["steps"]] == ["threads", "garbage collector", "memory", "scheduler"]
+    assert (seen["policy"], seen["priority"]) == (os.SCHED_FIFO, 70)
+    assert seen["locked_kib"] > 1000
+    assert seen["gc"] is False
+    assert seen["frozen"] > 1000
+    assert seen["switch_s"] == pytest.approx(0.0005)
+
+
+@FIFO_ALLOWED
+def test_threads_made_later_inherit_and_the_loop_thread_goes_above_them():
+    seen = run("""
+from disco_hw.daemon import realtime
+steps = realtime.enter(80)
+inherited = []
+thread = threading.Thread(target=lambda: inherited.append(os.sched_getparam(0).sched_priority))
+thread.start(); thread.join()
+report([*steps, realtime.raise_loop_thread(80)], inherited=inherited)
+""")
+    assert seen["inherited"] == [70]
+    assert seen["priority"] == 80
+
+
+@FIFO_ALLOWED
+@pytest.mark.parametrize("priority", [1, 5])
+def test_a_low_priority_still_makes_a_valid_one_for_the_threads(priority):
+    seen = run(f"from disco_hw.daemon import realtime\nreport(realtime.enter({priority}))")
+    assert (seen["policy"], seen["priority"]) == (os.SCHED_FIFO, 1)
+
+
+def test_priority_zero_leaves_scheduler_and_memory_alone_and_says_so():
+    seen = run("from disco_hw.daemon import realtime\nreport(realtime.enter(0))")
+    assert seen["policy"] == os.SCHED_OTHER
+    assert seen["locked_kib"] == 0
+    assert seen["steps"][-1][1:] == [False, "scheduler: left alone, as daemon.realtime_priority is 0"]
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="needs root to become another user")
+def test_what_is_refused_is_said_with_the_remedy_and_the_rest_is_still_done():
+    script = """
+import resource
+from disco_hw.daemon import realtime
+resource.setrlimit(resource.RLIMIT_MEMLOCK, (8 << 20, 8 << 20))
+resource.setrlimit(resource.RLIMIT_RTPRIO, (0, 0))
+"""
+    ending = "report([*realtime.enter(80), realtime.raise_loop_thread(80)], able=[realtime.can_use_fifo(), realtime.can_lock_memory()])"
+    seen = run(script + AS_NOBODY + ending)
+    texts = {name: text for name, done, text in seen["steps"] if not done}
+    assert set(texts) == {"memory", "scheduler", "loop thread"}
+    assert "LimitMEMLOCK" in texts["memory"]
+    assert "LimitRTPRIO" in texts["scheduler"]
+    assert seen["policy"] == os.SCHED_OTHER
+    assert seen["locked_kib"] == 0
+    assert seen["gc"] is False
+    assert seen["able"] == [False, False]
+
+
+def test_cpus_are_set_or_the_refusal_is_said():
+    cpu = min(os.sched_getaffinity(0))
+    assert run(f"from disco_hw.daemon import realtime\nreport(realtime.enter(0, [{cpu}]))")["cpus"] == [cpu]
+    steps = run("from disco_hw.daemon import realtime\nreport(realtime.enter(0, [100000]))")["steps"]
+    assert next(step[:2] for step in steps if step[0] == "cpus") == ["cpus", False]
+
+
+def test_thread_pools_are_held_to_one_before_and_after_the_import():
+    script = "from disco_hw.daemon import realtime\n{before}step = realtime.limit_thread_pools()\nimport numba, torch\n"
+    ending = "report([step], torch=torch.get_num_threads(), numba=numba.get_num_threads())"
+    for before in ("", "import numba, torch\ntorch.set_num_threads(2)\n"):
+        seen = run(script.format(before=before) + ending, OPENBLAS_NUM_THREADS="1", OMP_NUM_THREADS="2")
+        assert (seen["torch"], seen["numba"]) == (1, 1)
+        assert seen["steps"][0][1] is True
+
+
+def test_a_blas_that_is_loaded_too_early_is_said():
+    script = "import numpy\nfrom disco_hw.daemon import realtime\nreport([realtime.limit_thread_pools()])"
+    name, done, text = run(script, OPENBLAS_NUM_THREADS="2")["steps"][0]
+    assert (name, done) == ("threads", False)
+    assert "OPENBLAS_NUM_THREADS=1" in text
