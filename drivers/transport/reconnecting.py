@@ -78,6 +78,7 @@ class ReconnectingTransport:
         self._last_error: str | None = None
         self._connection: Connection | None = None
         self._outgoing = TransmitQueue(TRANSMIT_CAPACITY)
+        self._sending = False
         self._incoming: deque[ReceivedFrame] = deque()
         self._stop = threading.Event()
         self._lost = threading.Event()
@@ -153,7 +154,7 @@ class ReconnectingTransport:
     def close(self) -> None:
         """Send what is queued (for 0.1 s at most), stop the threads and release the medium; safe to call twice."""
         with self._changed:
-            self._changed.wait_for(lambda: self._connection is None or not self._outgoing, timeout=_DRAIN_S)
+            self._changed.wait_for(lambda: self._connection is None or self._all_sent(), timeout=_DRAIN_S)
             self._stop.set()
             self._changed.notify_all()
         for thread in self._threads:
@@ -206,7 +207,6 @@ class ReconnectingTransport:
         with self._changed:
             self._lost.clear()
             self._incoming.clear()
-            self._outgoing.clear()
             self._connection = connection
             self._last_error = None
             self._generation += 1
@@ -235,36 +235,43 @@ class ReconnectingTransport:
                 self._changed.wait_for(lambda: self._stop.is_set() or self._ready_to_send())
                 connection = self._connection
                 self._counters.add(expired=self._outgoing.expire(time.monotonic_ns()))
-                outgoing = self._outgoing.peek()
+                outgoing = self._outgoing.pop() if connection is not None else None
+                self._sending = outgoing is not None
             if connection is None or outgoing is None:
                 continue
-            if self._write(connection, outgoing):
-                with self._changed:
-                    self._outgoing.remove(outgoing)
-                    self._changed.notify_all()
-                continue
-            if refused is not outgoing:
-                refused = outgoing
-                self._counters.add(transmit_queue_full=1)
-            self._stop.wait(_BUSY_RETRY_S)
+            done = self._write(connection, outgoing)
+            with self._changed:
+                if not done and self._connection is connection:
+                    self._outgoing.put_back(outgoing)
+                self._sending = False
+                self._changed.notify_all()
+            if not done:
+                if refused is not outgoing:
+                    refused = outgoing
+                    self._counters.add(transmit_queue_full=1)
+                self._stop.wait(_BUSY_RETRY_S)
+
+    def _all_sent(self) -> bool:
+        return not self._sending and len(self._outgoing) == 0
 
     def _ready_to_send(self) -> bool:
         return self._connection is not None and not self._lost.is_set() and len(self._outgoing) > 0
 
     def _write(self, connection: Connection, outgoing: OutgoingFrame) -> bool:
-        """Send one frame; False if it should be tried again."""
+        """Send one frame; False if there was no room for it now."""
         with self._writing:
-            if self._connection is not connection:
-                return True
             try:
+                if self._connection is not connection:
+                    raise LinkLostError("the link went down before the frame was sent")
                 connection.write(outgoing.frame)
             except TransmitBusyError as error:
                 self._note(error)
                 return False
             except Exception as error:  # whatever a backend raises, this thread must outlive it
                 self._counters.add(send_errors=1)
-                self._note(error)
-                self._lost.set()
+                if self._connection is connection:
+                    self._note(error)
+                    self._lost.set()
                 return True
         self._counters.add(frames_sent=1)
         return True

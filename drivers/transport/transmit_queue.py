@@ -13,12 +13,13 @@ class TransmitQueue:
     When it is full a more urgent frame takes the place of the least urgent one, so that an emergency stop always fits.
     """
 
-    __slots__ = ("_capacity", "_heap", "_sequence")
+    __slots__ = ("_capacity", "_front", "_heap", "_sequence")
 
     def __init__(self, capacity: int) -> None:
         self._capacity = capacity
         self._heap: list[tuple[int, int, OutgoingFrame]] = []
         self._sequence = 0
+        self._front = 0
 
     def __len__(self) -> int:
         return len(self._heap)
@@ -37,17 +38,14 @@ class TransmitQueue:
         heapq.heapify(self._heap)
         return last[2]
 
-    def peek(self) -> OutgoingFrame | None:
-        """Return the frame to send next without taking it out, or None."""
-        return self._heap[0][2] if self._heap else None
+    def pop(self) -> OutgoingFrame | None:
+        """Take out the frame to send next, or None."""
+        return heapq.heappop(self._heap)[2] if self._heap else None
 
-    def remove(self, outgoing: OutgoingFrame) -> None:
-        """Take out this frame object, wherever it is now; nothing happens if it is gone."""
-        for index, (_, _, queued) in enumerate(self._heap):
-            if queued is outgoing:
-                del self._heap[index]
-                heapq.heapify(self._heap)
-                return
+    def put_back(self, outgoing: OutgoingFrame) -> None:
+        """Return the frame taken out last: it stays the first of its identifier and counts against no limit."""
+        self._front -= 1
+        heapq.heappush(self._heap, (outgoing.frame.can_id, self._front, outgoing))
 
     def expire(self, now_ns: int) -> int:
         """Drop the frames whose deadline has passed; return how many."""

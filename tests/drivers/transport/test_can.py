@@ -1,0 +1,253 @@
+"""The CAN transport on real buses: python-can's virtual one, our hub between processes, slcan on a pseudo-terminal."""
+
+import errno
+import itertools
+import os
+import subprocess
+import sys
+import time
+
+import can
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers.transport.backoff import BackoffPolicy
+from drivers.transport.can import GARBAGE_LIMIT, CanMedium, is_busy, monotonic_stamp_ns
+from drivers.transport.reconnecting import ReconnectingTransport
+from drivers.types import Frame, LinkState
+from tests.drivers.transport.pseudo_terminal import PseudoTerminal
+from tests.drivers.waiting import collect, median_send_s, outgoing, send, wait_until
+
+FAST = BackoffPolicy(first_s=0.01, longest_s=0.05, steady_s=0.1)
+CHANNELS = (f"can-test-{number}" for number in itertools.count())
+
+
+def opened(interface, channel, bitrate=500_000):
+    transport = ReconnectingTransport(CanMedium(interface, channel, bitrate), backoff=FAST)
+    transport.open()
+    return transport
+
+
+def up(transport, generation=1):
+    wait_until(lambda: transport.state is LinkState.UP and transport.generation >= generation)
+
+
+@pytest.fixture
+def virtual():
+    channel = next(CHANNELS)
+    other = can.Bus(interface="virtual", channel=channel, ignore_config=True)
+    transport = opened("virtual", channel)
+    up(transport)
+    yield transport, other
+    transport.close()
+    other.shutdown()
+
+
+def message(can_id=0x110, data=b"\x01\x02", **options):
+    return can.Message(arbitration_id=can_id, data=data, is_extended_id=options.pop("is_extended_id", False), **options)
+
+
+def test_frames_both_ways_with_monotonic_stamps_and_no_echo(virtual):
+    transport, other = virtual
+    before_ns = time.monotonic_ns()
+    other.send(message(0x110, b"\x01\x02", is_rx=False))
+    (received,) = collect(transport, 1)
+    assert received.frame == Frame(0x110, b"\x01\x02")
+    assert before_ns - 1_000_000 <= received.t_ns <= time.monotonic_ns()
+    send(transport, outgoing(0x7FF, b""))
+    echoed = other.recv(5.0)
+    assert (echoed.arbitration_id, bytes(echoed.data), echoed.is_extended_id) == (0x7FF, b"", False)
+    other.send(message(0x111))
+    assert [frame.frame.can_id for frame in collect(transport, 1)] == [0x111], "our own frame does not come back"
+
+
+def test_what_is_no_classic_11_bit_data_frame_is_counted_and_dropped(virtual):
+    transport, other = virtual
+    other.send(message(0x110, is_extended_id=True))
+    other.send(message(0x110, b"", is_remote_frame=True, dlc=2))
+    other.send(message(0x110, bytes(16), is_fd=True, dlc=16))
+    other.send(message(0x110, bytes(8), is_fd=True))
+    other.send(message(0x112))
+    assert [received.frame.can_id for received in collect(transport, 1)] == [0x112]
+    assert transport.stats.malformed == 4
+    assert transport.generation == 1
+
+
+def test_error_frames_are_counted_and_bus_off_is_a_lost_link(virtual):
+    transport, other = virtual
+    for error_class, data in ((0xA8, "0000001900000000"), (0x204, "0001000000006064"), (0x100, "")):
+        other.send(can.Message(arbitration_id=error_class, is_error_frame=True, data=bytes.fromhex(data)))
+    other.send(message())
+    collect(transport, 1)
+    assert transport.stats.bus_errors == 2
+    assert transport.stats.receive_overflow == 1
+    other.send(can.Message(arbitration_id=0x40, is_error_frame=True, data=bytes(8)))
+    up(transport, generation=2)
+    assert transport.stats.bus_off == 1
+    assert transport.stats.reconnects == 1
+    other.send(message(0x113))
+    assert [received.frame.can_id for received in collect(transport, 1)] == [0x113]
+
+
+@pytest.fixture
+def hub(tmp_path):
+    """A hub in a process of its own; call to start, call the result to stop it."""
+    path = tmp_path / "bus"
+    processes = []
+
+    def start():
+        process = subprocess.Popen([sys.executable, "-m", "sim.hub", str(path)], stdout=subprocess.PIPE, text=True)
+        processes.append(process)
+        assert "ready" in process.stdout.readline()
+        return process
+
+    yield path, start
+    for process in processes:
+        process.kill()
+        process.wait()
+        process.stdout.close()
+
+
+def test_between_processes_through_the_hub_that_dies_and_comes_back(hub):
+    path, start = hub
+    transport = opened("unixcan", str(path))
+    try:
+        wait_until(lambda: transport.last_error)
+        assert "start the other end first" in transport.last_error
+        process = start()
+        for generation in (1, 2):
+            up(transport, generation)
+            with can.Bus(interface="unixcan", channel=str(path), ignore_config=True) as other:
+                before_ns = time.monotonic_ns()
+                other.send(message(0x110, b"\x05"))
+                (received,) = collect(transport, 1)
+                assert received.frame == Frame(0x110, b"\x05")
+                assert before_ns - 1_000_000 <= received.t_ns <= time.monotonic_ns()
+                send(transport, outgoing(0x100, b"\x06"))
+                assert bytes(other.recv(5.0).data) == b"\x06"
+            if generation == 1:
+                process.kill()
+                process.wait()
+                wait_until(lambda: transport.state is LinkState.CONNECTING)
+                assert not transport.send(outgoing(), time.monotonic_ns())
+                start()
+    finally:
+        transport.close()
+
+
+@pytest.fixture
+def adapter():
+    """An slcan adapter: the far end of a pseudo-terminal that takes commands and frames as lines."""
+    terminal = PseudoTerminal()
+    transport = opened("slcan", str(terminal.path), bitrate=250_000)
+    wait_until(lambda: terminal.lines and terminal.lines[-1] == b"O")
+    up(transport)
+    yield transport, terminal
+    transport.close()
+    terminal.remove()
+
+
+def test_slcan_sets_the_bit_rate_and_carries_frames(adapter):
+    transport, terminal = adapter
+    assert b"S5" in terminal.lines
+    before_ns = time.monotonic_ns()
+    terminal.write(b"t11021122\rt0800\r")
+    assert [received.frame for received in collect(transport, 2)] == [Frame(0x110, b"\x11\x22"), Frame(0x080, b"")]
+    assert transport.receive() == ()
+    assert before_ns < time.monotonic_ns()
+    send(transport, outgoing(0x100, b"\xab\xcd"))
+    wait_until(lambda: b"t1002ABCD" in terminal.lines)
+
+
+@pytest.mark.parametrize(
+    "garbage",
+    [
+        b"\xff\x80\r",
+        b"t1\r",
+        b"tzz\r",
+        b"t1234aabb\r",
+        b"t110900112233445566778\r",
+        b"tFFF0\r",
+        b"T000001100\r",
+        b"\x07\r",
+    ],
+)
+def test_slcan_survives_a_garbled_line(adapter, garbage):
+    transport, terminal = adapter
+    terminal.write(garbage)
+    if garbage != b"\x07\r":
+        wait_until(lambda: transport.stats.malformed)
+    time.sleep(0.05)
+    terminal.write(b"t11015a\r")
+    assert collect(transport, 1)[-1].frame == Frame(0x110, b"\x5a")
+    assert transport.generation == 1, "a garbled line does not cost the session"
+
+
+def test_slcan_that_sends_nothing_but_garbage_is_opened_again(adapter):
+    transport, terminal = adapter
+    for _ in range(20 * GARBAGE_LIMIT):
+        terminal.write(b"t1\r")
+        if transport.generation > 1:
+            break
+        time.sleep(0.002)
+    up(transport, generation=2)
+    assert transport.stats.malformed >= GARBAGE_LIMIT
+
+
+def test_slcan_adapter_unplugged_and_plugged_in_again_leaks_nothing(adapter):
+    transport, terminal = adapter
+    descriptors = len(os.listdir("/proc/self/fd"))
+    for generation in (2, 3, 4):
+        terminal.unplug()
+        wait_until(lambda: transport.state is LinkState.CONNECTING and transport.last_error)
+        wait_until(lambda: "no such device" in transport.last_error)
+        terminal.plug()
+        up(transport, generation)
+        terminal.write(b"t110101\r")
+        assert collect(transport, 1)[-1].frame == Frame(0x110, b"\x01")
+    wait_until(lambda: len(os.listdir("/proc/self/fd")) <= descriptors)
+
+
+def test_slcan_adapter_that_reads_nothing_blocks_nobody_and_frames_expire():
+    terminal = PseudoTerminal()
+    transport = opened("slcan", str(terminal.path))
+    try:
+        up(transport)
+        terminal.stop_reading()
+        wait_until(lambda: median_send_s(transport) and transport.stats.expired)
+        assert median_send_s(transport) < 0.01, "shorter by far than one write that waits for room"
+        assert transport.stats.transmit_queue_full
+        assert transport.state is LinkState.UP
+    finally:
+        transport.close()
+        terminal.remove()
+
+
+@given(age_ns=st.integers(0, 999_000_000), wall_ns=st.integers(1_500_000_000, 4_000_000_000).map(lambda s: s * 10**9))
+def test_a_wall_clock_stamp_becomes_monotonic(age_ns, wall_ns):
+    now_ns = 5_000_000_000
+    t_ns = monotonic_stamp_ns((wall_ns - age_ns) * 1e-9, wall_ns, now_ns)
+    assert abs(t_ns - (now_ns - age_ns)) < 1_000, "a double of the wall clock resolves a quarter of a microsecond"
+
+
+@pytest.mark.parametrize("timestamp_s", [0.0, 123.4, 1.7e9 + 3600.0, 1.7e9 - 3600.0, 1.7e9 + 1e-3])
+def test_a_stamp_of_another_clock_counts_as_the_reception(timestamp_s):
+    assert monotonic_stamp_ns(timestamp_s, 1_700_000_000_000_000_000, 5_000) == 5_000
+
+
+def test_want_of_room_is_told_from_a_dead_line():
+    assert is_busy(can.CanOperationError("no room", errno.ENOBUFS))
+    assert is_busy(can.CanOperationError("Transmit buffer full"))
+    assert is_busy(can.CanTimeoutError())
+    assert not is_busy(can.CanOperationError("down", errno.ENETDOWN))
+    assert not is_busy(BrokenPipeError(errno.EPIPE, "broken"))
+
+
+def test_socketcan_says_what_is_missing():
+    transport = opened("socketcan", "can_absent")
+    try:
+        wait_until(lambda: transport.last_error)
+        assert "sudo ip link set can_absent up type can bitrate 500000" in transport.last_error
+    finally:
+        transport.close()

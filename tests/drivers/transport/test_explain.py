@@ -1,0 +1,53 @@
+import errno
+
+import can
+import pytest
+import serial
+
+from drivers.transport.explain import error_number, explain_can, explain_port
+
+
+def caused(error, cause):
+    error.__cause__ = cause
+    return error
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (serial.SerialException(errno.ENOENT, "could not open"), "no such device"),
+        (serial.SerialException(errno.EACCES, "could not open"), "usermod -aG dialout"),
+        (serial.SerialException("Could not exclusively lock port /dev/ttyUSB0"), "in use by another program"),
+        (OSError(errno.EIO, "Input/output error"), "no such device"),
+        (ValueError("odd"), "/dev/ttyUSB0: odd"),
+    ],
+)
+def test_serial_port(error, words):
+    assert words in explain_port("/dev/ttyUSB0", error)
+
+
+@pytest.mark.parametrize(
+    ("interface", "error", "words"),
+    [
+        ("socketcan", OSError(errno.ENODEV, "No such device"), "sudo ip link set can0 up type can bitrate 250000"),
+        ("socketcan", can.CanOperationError("down", errno.ENETDOWN), "the interface is down"),
+        ("socketcan", OSError(errno.EAFNOSUPPORT, "no"), "modprobe can_raw"),
+        ("socketcan", can.CanOperationError("full", errno.ENOBUFS), "transmit queue full"),
+        ("unixcan", can.CanInitializationError("no hub", errno.ENOENT), "start the other end first"),
+        ("slcan", caused(can.CanInitializationError("x"), OSError(errno.EACCES, "no")), "usermod -aG dialout"),
+        ("slcan", ValueError("Invalid bitrate"), "slcan can0: Invalid bitrate"),
+        ("virtual", caused(can.CanOperationError("Cannot"), ValueError("why")), "virtual can0: Cannot (why)"),
+        ("virtual", KeyError(), "virtual can0: KeyError"),
+    ],
+)
+def test_can_bus(interface, error, words):
+    text = explain_can(interface, "can0", 250_000, error)
+    assert words in text
+    assert "\n" not in text
+
+
+def test_the_number_is_found_where_the_libraries_hide_it():
+    assert error_number(can.CanOperationError("x", 105)) == 105
+    assert error_number(OSError(5, "x")) == 5
+    assert error_number(caused(can.CanError("x"), caused(RuntimeError("y"), OSError(19, "z")))) == 19
+    assert error_number(ValueError("x")) is None

@@ -1,0 +1,45 @@
+import pytest
+
+from drivers.transport import TransportSettingsError, open_transport
+from drivers.types import LinkState
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"kind": "can", "interface": "sockercan"}, 'link.interface: python-can has no interface "sockercan"'),
+        ({"kind": "usb"}, 'link.kind: "usb"'),
+        ({"kind": "can", "interface": "slcan", "bitrate": 123_456}, "link.bitrate: slcan has no 123456 bit/s"),
+    ],
+)
+def test_settings_that_no_device_can_satisfy_are_one_clear_line(settings, words):
+    with pytest.raises(TransportSettingsError) as caught:
+        open_transport(**settings)
+    assert words in str(caught.value)
+    assert "write one of" in str(caught.value) or 'write "can"' in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_an_interface_name_is_known_to_include_ours():
+    with pytest.raises(TransportSettingsError, match="unixcan"):
+        open_transport("can", interface="nonsense")
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"kind": "serial", "port": "/dev/does-not-exist"},
+        {"kind": "can", "interface": "socketcan", "channel": "can_absent"},
+        {"kind": "can", "interface": "slcan", "channel": "/dev/does-not-exist"},
+        {"kind": "can", "interface": "unixcan", "channel": "/does/not/exist"},
+    ],
+)
+def test_an_absent_device_is_waited_for(settings):
+    transport = open_transport(**settings)
+    try:
+        assert transport.state is LinkState.CONNECTING
+    finally:
+        transport.close()
+    assert transport.state is LinkState.CLOSED
+    assert transport.generation == 0
+    assert transport.last_error

@@ -1,0 +1,242 @@
+"""The two threads, against a medium that fails where and when a test says; it stands for hardware."""
+
+import queue
+import threading
+import time
+
+import pytest
+
+from drivers.transport import reconnecting
+from drivers.transport.backoff import BackoffPolicy
+from drivers.transport.reconnecting import LinkLostError, ReconnectingTransport, TransmitBusyError
+from drivers.types import Frame, LinkState, OutgoingFrame, ReceivedFrame
+from tests.drivers.waiting import collect, outgoing, send, wait_until
+
+FAST = BackoffPolicy(first_s=0.001, longest_s=0.01, steady_s=0.05)
+
+
+class ScriptedMedium:
+    """Connections that obey: put a frame to receive it, put an exception to lose the link."""
+
+    name = "scripted"
+
+    def __init__(self):
+        self.incoming = queue.Queue()
+        self.refusals = []
+        self.attempts = 0
+        self.connections = []
+        self.write_error = None
+        self.may_write = threading.Event()
+        self.may_write.set()
+
+    def connect(self, counters):
+        self.attempts += 1
+        if self.refusals:
+            raise self.refusals.pop(0)
+        self.connections.append(ScriptedConnection(self))
+        return self.connections[-1]
+
+    def explain(self, error):
+        return f"scripted: {error}"
+
+    @property
+    def sent(self):
+        return [frame for connection in self.connections for frame in connection.sent]
+
+
+class ScriptedConnection:
+    def __init__(self, medium):
+        self.medium = medium
+        self.sent = []
+        self.closed = False
+
+    def read(self):
+        try:
+            item = self.medium.incoming.get(timeout=0.01)
+        except queue.Empty:
+            return ()
+        if isinstance(item, BaseException):
+            raise item
+        return item
+
+    def write(self, frame):
+        assert not self.closed
+        self.medium.may_write.wait(5.0)
+        if self.medium.write_error is not None:
+            raise self.medium.write_error
+        self.sent.append(frame)
+
+    def close(self):
+        self.closed = True
+        raise OSError("a device that is gone cannot be closed")
+
+
+@pytest.fixture
+def medium():
+    return ScriptedMedium()
+
+
+@pytest.fixture
+def transport(medium):
+    transport = ReconnectingTransport(medium, backoff=FAST)
+    yield transport
+    medium.may_write.set()
+    transport.close()
+
+
+def up(transport, generation=1):
+    transport.open()
+    wait_until(lambda: transport.state is LinkState.UP and transport.generation == generation)
+
+
+def test_carries_frames_both_ways(transport, medium):
+    assert transport.state is LinkState.CLOSED
+    up(transport)
+    send(transport, outgoing(0x101, b"\x07"))
+    wait_until(lambda: medium.sent == [Frame(0x101, b"\x07")])
+    frame = ReceivedFrame(5, Frame(0x110, b"\x01\x02"))
+    medium.incoming.put([frame, frame])
+    assert collect(transport, 2) == [frame, frame]
+    assert transport.receive() == ()
+    wait_until(lambda: transport.stats.frames_sent == 1)
+    assert transport.stats.frames_received == 2
+    assert transport.stats.bytes_received == 4
+
+
+def test_keeps_trying_until_the_device_is_there(transport, medium):
+    medium.refusals = [OSError("not there"), RuntimeError("odd"), KeyError("odder")]
+    up(transport)
+    assert medium.attempts == 4
+    assert transport.last_error is None
+    assert transport.stats.reconnects == 0
+
+
+@pytest.mark.parametrize("error", [OSError("unplugged"), IndexError("bug in a backend"), LinkLostError("bus-off")])
+def test_any_error_while_receiving_is_counted_and_the_link_made_anew(transport, medium, error):
+    up(transport)
+    medium.incoming.put(error)
+    up(transport, generation=2)
+    assert transport.stats.receive_errors == 1
+    assert transport.stats.reconnects == 1
+    assert medium.connections[0].closed
+    medium.incoming.put([ReceivedFrame(1, Frame(1, b""))])
+    assert len(collect(transport, 1)) == 1
+
+
+def test_an_error_while_sending_makes_the_link_anew(transport, medium):
+    """Some backends report a dead line only when sending; receiving would be silent for ever."""
+    up(transport)
+    medium.write_error = BrokenPipeError("server gone")
+    send(transport, outgoing())
+    wait_until(lambda: transport.generation >= 2)
+    medium.write_error = None
+    assert transport.stats.send_errors >= 1
+
+
+def test_nothing_old_is_sent_on_a_new_link(transport, medium):
+    up(transport)
+    medium.may_write.clear()
+    send(transport, outgoing(data=b"a"), outgoing(data=b"b"))
+    medium.incoming.put(OSError("unplugged"))
+    wait_until(lambda: transport.state is LinkState.CONNECTING)
+    medium.may_write.set()
+    wait_until(lambda: transport.generation == 2)
+    send(transport, outgoing(data=b"new"))
+    wait_until(lambda: medium.connections[1].sent)
+    assert medium.connections[1].sent == [Frame(0x100, b"new")]
+
+
+def test_frames_received_on_the_old_link_are_not_delivered_on_the_new(transport, medium):
+    up(transport)
+    medium.incoming.put([ReceivedFrame(1, Frame(1, b"old"))])
+    wait_until(lambda: transport.stats.frames_received == 1)
+    medium.incoming.put(OSError("unplugged"))
+    wait_until(lambda: transport.generation == 2)
+    assert transport.receive() == ()
+
+
+def test_no_sending_while_the_link_is_down(transport, medium):
+    medium.refusals = [OSError("not there")] * 100_000
+    transport.open()
+    wait_until(lambda: transport.last_error == "scripted: not there")
+    assert not transport.send(outgoing(), time.monotonic_ns())
+    assert transport.stats.send_errors == 1
+
+
+def test_a_late_frame_is_never_sent(transport, medium):
+    up(transport)
+    assert not transport.send(OutgoingFrame(Frame(1, b""), 999), 1_000)
+    assert transport.stats.expired == 1
+    medium.may_write.clear()
+    send(transport, outgoing(0x200, b"first"))
+    time.sleep(0.02)
+    send(transport, outgoing(0x100, b"late", valid_for_s=0.01), outgoing(0x101, b"good"))
+    time.sleep(0.03)
+    medium.may_write.set()
+    wait_until(lambda: len(medium.sent) == 2)
+    assert [frame.data for frame in medium.sent] == [b"first", b"good"]
+    assert transport.stats.expired == 2
+
+
+def test_a_stalled_medium_never_blocks_the_caller_and_an_emergency_stop_still_fits(transport, medium):
+    up(transport)
+    medium.may_write.clear()
+    send(transport, outgoing(0x300))
+    wait_until(transport._writing.locked)
+    started = time.monotonic()
+    taken = sum(transport.send(outgoing(0x200), time.monotonic_ns()) for _ in range(200))
+    assert time.monotonic() - started < 1.0
+    assert taken == reconnecting.TRANSMIT_CAPACITY
+    assert transport.stats.transmit_queue_full == 200 - taken
+    send(transport, outgoing(0x080))
+    medium.may_write.set()
+    wait_until(lambda: len(medium.sent) >= 2)
+    assert medium.sent[1].can_id == 0x080
+
+
+def test_no_room_on_the_medium_is_counted_once_a_frame_and_tried_again(transport, medium):
+    up(transport)
+    medium.write_error = TransmitBusyError("ENOBUFS")
+    send(transport, outgoing(0x100, b"kept"))
+    wait_until(lambda: transport.stats.transmit_queue_full)
+    assert transport.last_error == "scripted: ENOBUFS"
+    time.sleep(0.02)
+    medium.write_error = None
+    wait_until(lambda: medium.sent == [Frame(0x100, b"kept")])
+    assert transport.stats.transmit_queue_full == 1
+    assert transport.generation == 1
+
+
+def test_a_reader_that_falls_behind_gets_the_newest_and_the_loss_is_counted(transport, medium):
+    up(transport)
+    total = reconnecting.RECEIVE_CAPACITY + 10
+    medium.incoming.put([ReceivedFrame(number, Frame(1, b"")) for number in range(total)])
+    wait_until(lambda: transport.stats.receive_overflow == 10)
+    received = transport.receive()
+    assert (received[0].t_ns, received[-1].t_ns) == (10, total - 1)
+
+
+def test_closing_sends_what_is_queued_and_ends_the_threads(transport, medium):
+    up(transport)
+    frames = [outgoing(0x080, bytes((number,))) for number in range(20)]
+    send(transport, *frames)
+    transport.close()
+    assert medium.sent == [frame.frame for frame in frames]
+    assert transport.state is LinkState.CLOSED
+    assert not [thread for thread in threading.enumerate() if thread.name.startswith("scripted")]
+    transport.close()
+    transport.open()
+    assert transport.state is LinkState.CLOSED, "a closed transport stays closed"
+
+
+def test_opening_twice_starts_one_pair_of_threads(transport, medium):
+    up(transport)
+    transport.open()
+    assert len([thread for thread in threading.enumerate() if thread.name.startswith("scripted")]) == 2
+
+
+@pytest.mark.parametrize("frame", [Frame(0x800, b""), Frame(-1, b""), Frame(1, bytes(9))])
+def test_what_is_no_can_frame_is_the_callers_error(transport, frame):
+    up(transport)
+    with pytest.raises(ValueError, match="not a classic CAN frame"):
+        transport.send(OutgoingFrame(frame, 10), 1)

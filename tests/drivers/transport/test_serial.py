@@ -1,0 +1,113 @@
+"""The serial transport on pseudo-terminals."""
+
+import termios
+import time
+
+import pytest
+
+from drivers.transport.backoff import BackoffPolicy
+from drivers.transport.reconnecting import ReconnectingTransport
+from drivers.transport.serial import SerialMedium
+from drivers.types import Frame, LinkState
+from firmware_protocol.serial_framing import FrameDecoder, encode_frame
+from tests.drivers.transport.pseudo_terminal import PseudoTerminal
+from tests.drivers.waiting import collect, median_send_s, outgoing, send, wait_until
+
+FAST = BackoffPolicy(first_s=0.01, longest_s=0.05, steady_s=0.1)
+FRAME = Frame(0x110, bytes(range(8)))
+LINE = encode_frame(FRAME.can_id, FRAME.data)
+
+
+@pytest.fixture
+def terminal():
+    terminal = PseudoTerminal()
+    yield terminal
+    terminal.remove()
+
+
+@pytest.fixture
+def transport(terminal):
+    transport = ReconnectingTransport(SerialMedium(str(terminal.path), 115_200), backoff=FAST)
+    transport.open()
+    wait_until(lambda: transport.state is LinkState.UP)
+    yield transport
+    transport.close()
+
+
+def decoded(terminal):
+    return FrameDecoder().feed(bytes(terminal.received))
+
+
+def test_frames_both_ways(transport, terminal):
+    before_ns = time.monotonic_ns()
+    terminal.write(LINE)
+    (received,) = collect(transport, 1)
+    assert received.frame == FRAME
+    assert before_ns <= received.t_ns <= time.monotonic_ns()
+    send(transport, outgoing(0x080, b""), outgoing(0x100, b"\x00\xff\x00"))
+    wait_until(lambda: decoded(terminal) == [(0x080, b""), (0x100, b"\x00\xff\x00")])
+
+
+def test_the_line_is_set_up_as_asked(transport, terminal):
+    attributes = termios.tcgetattr(terminal._master)
+    assert attributes[4] == attributes[5] == termios.B115200
+    assert attributes[2] & termios.CSIZE == termios.CS8
+    assert not attributes[2] & (termios.PARENB | termios.CSTOPB | termios.CRTSCTS)
+
+
+@pytest.mark.parametrize("cut", range(1, len(LINE)))
+def test_a_frame_cut_anywhere(transport, terminal, cut):
+    terminal.write(LINE[:cut])
+    time.sleep(0.002)
+    terminal.write(LINE[cut:] + LINE)
+    assert [received.frame for received in collect(transport, 2)] == [FRAME, FRAME]
+    assert transport.stats.malformed == 0
+
+
+def test_garbage_is_counted_and_the_next_frame_is_whole(transport, terminal):
+    corrupt = bytearray(LINE)
+    corrupt[4] ^= 0x10
+    terminal.write(b"\xff\x80\xfe" * 100 + b"\0" + bytes(corrupt) + LINE[3:] + LINE)
+    assert [received.frame for received in collect(transport, 1)] == [FRAME]
+    assert transport.stats.malformed == 3
+    assert transport.generation == 1
+
+
+def test_half_a_frame_of_an_earlier_program_does_not_spoil_our_first(terminal):
+    """The receiving end holds what was written before; our first byte on a new line ends it."""
+    transport = ReconnectingTransport(SerialMedium(str(terminal.path), 115_200), backoff=FAST)
+    terminal.received.extend(LINE[:6])
+    transport.open()
+    try:
+        wait_until(lambda: transport.state is LinkState.UP)
+        send(transport, outgoing(0x100, b"\x01"))
+        wait_until(lambda: decoded(terminal) == [(0x100, b"\x01")])
+    finally:
+        transport.close()
+
+
+@pytest.mark.parametrize("cut", [0, 1, len(LINE) // 2, len(LINE) - 1])
+def test_unplugged_within_a_frame_and_plugged_in_again(transport, terminal, cut):
+    for generation in (2, 3):
+        terminal.write(LINE[:cut])
+        terminal.unplug()
+        wait_until(lambda: transport.state is LinkState.CONNECTING and transport.last_error)
+        assert not transport.send(outgoing(), time.monotonic_ns())
+        wait_until(lambda: "no such device" in transport.last_error)
+        terminal.plug()
+        wait_until(lambda: transport.state is LinkState.UP and transport.generation == generation)  # noqa: B023
+        terminal.write(LINE[cut:] + LINE)
+        assert collect(transport, 1)[-1].frame == FRAME
+        send(transport, outgoing(0x100, b"\x02"))
+        wait_until(lambda: decoded(terminal) == [(0x100, b"\x02")])
+    assert transport.stats.reconnects == 2
+    assert transport.stats.receive_errors >= 2
+
+
+def test_a_device_that_reads_nothing_blocks_nobody(transport, terminal):
+    terminal.stop_reading()
+    wait_until(lambda: median_send_s(transport) and transport.stats.expired)
+    assert median_send_s(transport) < 0.01, "shorter by far than one write that waits for room"
+    assert transport.stats.transmit_queue_full
+    assert "takes no more bytes" in transport.last_error
+    assert transport.state is LinkState.UP
