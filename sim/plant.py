@@ -1,0 +1,181 @@
+"""The physical robot: wheel-speed setpoints in, encoder ticks, poses and motor readings out; the truth for scoring.
+
+Command -> wheels -> encoders and body -> pose sensor, each in a module of its own, integrated on an absolute time grid
+of `integration_step_us`. Everything random comes from the seed; the trajectory does not depend on how a run is cut
+into calls of `step`.
+"""
+
+from __future__ import annotations
+
+import bisect
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from sim.body_dynamics import Body, Pose
+from sim.disturbances import CELLS, Disturbances
+from sim.effects import HiddenEffects
+from sim.electrics import Battery, Electrics
+from sim.encoders import Encoders
+from sim.plant_parameters import PlantParameters
+from sim.pose_sensor import PoseMeasurement, PoseSensor, wrapped
+from sim.wheel_dynamics import Wheels
+
+ELECTRICS_STEP_US = 10_000
+
+
+@dataclass(frozen=True, slots=True)
+class TrueState:
+    """What is so at plant time `t_us`, known to nobody on board.
+
+    Pose of the tracked point in the world frame (m, rad; yaw in (-pi, pi]); wheel speeds (rad/s); velocity of the
+    tracked point in the body frame: forward, left (m/s), yaw rate (rad/s).
+    """
+
+    t_us: int
+    x_m: float
+    y_m: float
+    yaw_rad: float
+    left_speed_rad_s: float
+    right_speed_rad_s: float
+    speed_m_s: float
+    lateral_speed_m_s: float
+    yaw_rate_rad_s: float
+
+
+class Plant:
+    """A skid-steer robot with hidden effects.
+
+    `effects`: from `sim.effects.hidden_effects`. `seed` decides all disturbances and noise. Plant time starts at 0 us
+    with the robot at rest at `start`.
+    """
+
+    def __init__(
+        self,
+        parameters: PlantParameters | None = None,
+        effects: HiddenEffects | None = None,
+        seed: int = 0,
+        start: Pose | None = None,
+    ) -> None:
+        self.parameters = parameters or PlantParameters()
+        self.effects = effects or HiddenEffects()
+        disturbance_seed, pose_seed = np.random.SeedSequence(seed).spawn(2)
+        self._disturbances = Disturbances(self.parameters, disturbance_seed)
+        self._wheels = Wheels(self.parameters, self.effects, capacity=CELLS)
+        self._encoders = Encoders(self.parameters, self.effects)
+        self._body = Body(self.parameters, self.effects, start or Pose())
+        self._pose_sensor = PoseSensor(self.parameters, self.effects, pose_seed)
+        self._electrics = Electrics(self.parameters, self.effects)
+        self._step_us = self.parameters.integration_step_us
+        self._delay_us = round(self.effects.values("command_delay")[0] * 1e6)
+        self._now_us = 0
+        self._asked = (0.0, 0.0)
+        self._in_force = (0.0, 0.0)
+        self._delayed: deque[tuple[int, tuple[float, float]]] = deque()
+        self._poses: list[PoseMeasurement] = []
+
+    @property
+    def now_us(self) -> int:
+        """Plant time, us."""
+        return self._now_us
+
+    @property
+    def encoder_ticks(self) -> tuple[int, int]:
+        """Cumulative encoder ticks, left and right; never wrapped here."""
+        return self._encoders.ticks
+
+    @property
+    def measured_wheel_speeds_rad_s(self) -> tuple[float, float]:
+        """Wheel speeds that the controller makes of the ticks, left and right."""
+        return self._encoders.speeds_rad_s
+
+    @property
+    def motor_currents_a(self) -> tuple[float, float]:
+        """Motor currents, left and right; positive drives forward."""
+        return self._electrics.motor_currents_a
+
+    @property
+    def motor_temperatures_c(self) -> tuple[float, float]:
+        """Motor temperatures, left and right."""
+        return self._electrics.motor_temperatures_c
+
+    @property
+    def battery(self) -> Battery:
+        """Voltage, current and temperature of the battery."""
+        return self._electrics.battery
+
+    @property
+    def truth(self) -> TrueState:
+        """The true state now."""
+        pose = self._body.pose
+        left, right = self._wheels.speeds_rad_s
+        speed, lateral, yaw_rate = self._body.velocity
+        return TrueState(self._now_us, pose.x_m, pose.y_m, wrapped(pose.yaw_rad), left, right, speed, lateral, yaw_rate)
+
+    def step(
+        self,
+        until_us: int,
+        left_setpoint_rad_s: float,
+        right_setpoint_rad_s: float,
+        enabled: bool = True,
+        brake: bool = False,
+    ) -> list[PoseMeasurement]:
+        """Move on to plant time `until_us` with these wheel-speed setpoints held.
+
+        Without `enabled` the wheels coast; `brake` shorts the motors and wins over `enabled`. Returns the poses that
+        have become available, by the time they did. Raises ValueError if time would go backwards.
+        """
+        if until_us < self._now_us:
+            raise ValueError(f"plant time is {self._now_us} us and cannot go back to {until_us} us")
+        self._ask((left_setpoint_rad_s, right_setpoint_rad_s))
+        while self._now_us < until_us:
+            self._advance(self._apply_due(until_us), enabled, brake)
+        ready = bisect.bisect_right(self._poses, until_us, key=_available_us)
+        poses, self._poses[:ready] = self._poses[:ready], []
+        return poses
+
+    def kidnap(self, dx_m: float, dy_m: float, dyaw_rad: float) -> None:
+        """Carry the robot off: a step in the world frame and a turn about the tracked point, wheels untouched."""
+        self._body.displace(dx_m, dy_m, dyaw_rad)
+
+    def _ask(self, setpoints: tuple[float, float]) -> None:
+        if setpoints != self._asked:
+            self._asked = setpoints
+            self._delayed.append((self._now_us + self._delay_us, setpoints))
+
+    def _apply_due(self, until_us: int) -> int:
+        """Put the command in force that is due now; return until when nothing changes."""
+        while self._delayed and self._delayed[0][0] <= self._now_us:
+            self._in_force = self._delayed.popleft()[1]
+        next_us = self._delayed[0][0] if self._delayed else until_us
+        electrics_us = (self._now_us // ELECTRICS_STEP_US + 1) * ELECTRICS_STEP_US
+        cell = self._now_us // self._step_us
+        self._disturbances.move_to(cell)
+        block_us = (self._disturbances.first_cell + CELLS) * self._step_us
+        return min(until_us, next_us, electrics_us, block_us)
+
+    def _advance(self, until_us: int, enabled: bool, brake: bool) -> None:
+        now_us = self._now_us
+        noise = self._disturbances
+        wheels = self._wheels
+        left, right = self._in_force
+        count = wheels.advance(now_us, until_us, left, right, enabled, brake, noise.wheel, noise.first_cell)
+        self._encoders.advance(now_us, wheels.pieces, count)
+        sensor = self._pose_sensor
+        piece = 0
+        while piece < count:
+            piece = self._body.advance(
+                wheels.pieces, piece, count, sensor.next_true_us, noise.slip, noise.first_cell, self._step_us
+            )
+            while sensor.next_true_us <= self._body.now_us:
+                measurement = sensor.sample(self._body.pose_at(sensor.next_true_us))
+                if measurement is not None:
+                    bisect.insort(self._poses, measurement, key=_available_us)
+        if until_us % ELECTRICS_STEP_US == 0:
+            self._electrics.advance(until_us * 1e-6, ELECTRICS_STEP_US * 1e-6, wheels.torques_nm, wheels.speeds_rad_s)
+        self._now_us = until_us
+
+
+def _available_us(measurement: PoseMeasurement) -> int:
+    return measurement.available_us

@@ -1,0 +1,197 @@
+"""What a plant is made of: geometry, motors, sensors, battery, disturbances; and plants drawn from a posterior."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+import numpy.typing as npt
+
+DRAWN_FIELDS = ("x_icr_m", "wheel_radius_m", "axial_distance_m")
+SMALLEST_DRAWN = (-1.0, 0.01, 0.05)
+LARGEST_DRAWN = (1.0, 1.0, 2.0)
+MAX_DRAWS = 10_000
+
+_MAY_BE_ZERO_OR_LESS = frozenset({"x_icr_m", "ambient_temperature_c"})
+_MUST_BE_POSITIVE = frozenset(
+    {
+        "wheel_radius_m",
+        "axial_distance_m",
+        "ticks_per_rev",
+        "integration_step_us",
+        "max_motor_acceleration_rad_s2",
+        "wheel_inertia_kg_m2",
+        "max_motor_torque_nm",
+        "motor_torque_constant_nm_per_a",
+        "brake_time_constant_s",
+        "speed_observer_bandwidth_rad_s",
+        "wheel_disturbance_correlation_s",
+        "wheel_wander_correlation_s",
+        "slip_correlation_s",
+        "volatility_correlation_s",
+        "pose_rate_hz",
+        "battery_voltage_v",
+        "battery_capacity_ah",
+        "motor_thermal_resistance_k_per_w",
+        "motor_thermal_capacity_j_per_k",
+    }
+)
+_MAY_BE_INFINITE = frozenset({"max_motor_acceleration_rad_s2", "max_motor_torque_nm"})
+_PROBABILITIES = frozenset({"pose_dropout_probability", "pose_outlier_probability"})
+
+
+class DrawError(ValueError):
+    """A posterior from which no physical plant can be drawn; the message is one line."""
+
+
+@dataclass(frozen=True, slots=True)
+class PlantParameters:
+    """The true robot; the geometry's defaults are the posterior mean of the paper's appendix (skid-steer table).
+
+    Geometry: the tracked point is the origin of the body frame, x forward, y left; it lies `x_icr_m` behind the line
+    on which the instantaneous centre of rotation moves. Standard deviations are of stationary processes; a probability
+    is per pose sample. `speed_loop_time_constant_s` = 0 means wheels that follow their command at once.
+    Raises ValueError naming the field that is out of its physical range.
+    """
+
+    wheel_radius_m: float = 0.061
+    axial_distance_m: float = 0.415
+    x_icr_m: float = 0.238
+    integration_step_us: int = 1000
+
+    # Motors: a speed profile (first-order, limited acceleration) followed by a PI loop with limited torque.
+    speed_loop_time_constant_s: float = 0.06
+    max_motor_acceleration_rad_s2: float = 60.0
+    wheel_inertia_kg_m2: float = 0.03
+    viscous_friction_nm_s: float = 0.02
+    dry_friction_nm: float = 0.15
+    turning_load_nm: float = 0.25
+    max_motor_torque_nm: float = 5.0
+    tracking_gain_nm_s: float = 1.5
+    tracking_integral_gain_nm: float = 30.0
+    brake_time_constant_s: float = 0.04
+    standstill_hold_rad_s: float = 0.02
+    motor_torque_constant_nm_per_a: float = 0.25
+
+    # Encoders and the wheel speed that a controller makes of them.
+    ticks_per_rev: int = 2048
+    encoder_start_left_ticks: int = 0
+    encoder_start_right_ticks: int = 0
+    speed_observer_bandwidth_rad_s: float = 100.0
+
+    # Disturbances: of wheel speed relative to itself (fast and slow), of the body's velocity while it moves.
+    wheel_disturbance_std: float = 0.015
+    wheel_disturbance_correlation_s: float = 0.15
+    wheel_wander_std: float = 0.0
+    wheel_wander_correlation_s: float = 20.0
+    slip_std_x_m_s: float = 0.005
+    slip_std_y_m_s: float = 0.004
+    slip_std_yaw_rad_s: float = 0.018
+    slip_correlation_s: float = 0.3
+    volatility: float = 0.0
+    volatility_correlation_s: float = 1.0
+
+    # Pose sensor.
+    pose_rate_hz: float = 25.0
+    pose_position_std_m: float = 0.005
+    pose_yaw_std_rad: float = 0.0087
+    pose_noise_correlation_s: float = 0.0
+    pose_noise_volatility: float = 0.0
+    pose_sample_jitter_s: float = 0.0
+    pose_delay_s: float = 0.03
+    pose_delay_jitter_s: float = 0.002
+    pose_dropout_probability: float = 0.0
+    pose_gap_interval_s: float = 0.0
+    pose_gap_length_s: float = 1.2
+    pose_outlier_probability: float = 0.0
+    pose_outlier_m: float = 0.2
+    pose_outlier_yaw_rad: float = 0.1
+
+    # Battery and heat.
+    battery_voltage_v: float = 25.2
+    battery_resistance_ohm: float = 0.08
+    battery_capacity_ah: float = 5.0
+    idle_current_a: float = 0.5
+    motor_resistance_ohm: float = 0.3
+    motor_thermal_resistance_k_per_w: float = 3.0
+    motor_thermal_capacity_j_per_k: float = 60.0
+    ambient_temperature_c: float = 22.0
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            self._check(field.name, getattr(self, field.name))
+
+    def noiseless(self) -> PlantParameters:
+        """The same robot in a world without disturbances, sensor noise, jitter and losses (ticks stay whole)."""
+        return replace(
+            self,
+            wheel_disturbance_std=0.0,
+            wheel_wander_std=0.0,
+            slip_std_x_m_s=0.0,
+            slip_std_y_m_s=0.0,
+            slip_std_yaw_rad_s=0.0,
+            pose_position_std_m=0.0,
+            pose_yaw_std_rad=0.0,
+            pose_sample_jitter_s=0.0,
+            pose_delay_jitter_s=0.0,
+            pose_dropout_probability=0.0,
+            pose_gap_interval_s=0.0,
+            pose_outlier_probability=0.0,
+        )
+
+    def with_ideal_motors(self) -> PlantParameters:
+        """The same robot with wheels that turn exactly as commanded: only a hidden effect lags or limits them."""
+        return replace(
+            self,
+            speed_loop_time_constant_s=0.0,
+            max_motor_acceleration_rad_s2=math.inf,
+            max_motor_torque_nm=math.inf,
+            turning_load_nm=0.0,
+            standstill_hold_rad_s=0.0,
+        )
+
+    def _check(self, name: str, value: float) -> None:
+        if math.isinf(value) and value > 0.0 and name in _MAY_BE_INFINITE:
+            return
+        low = -math.inf if name in _MAY_BE_ZERO_OR_LESS or name.startswith("encoder_start") else 0.0
+        high = 1.0 if name in _PROBABILITIES else math.inf
+        if not math.isfinite(value) or not low <= value <= high or (value == 0.0 and name in _MUST_BE_POSITIVE):
+            raise ValueError(f"PlantParameters.{name} = {value:g} is impossible")
+
+
+def draw_plant_parameters(
+    mean: npt.ArrayLike,
+    covariance: npt.ArrayLike,
+    seed: int,
+    base: PlantParameters | None = None,
+) -> PlantParameters:
+    """Draw a robot from a Gaussian over (x_icr, wheel radius, axial distance), in metres and this order.
+
+    mean: shape (3,); covariance: shape (3, 3). Draws outside `SMALLEST_DRAWN`..`LARGEST_DRAWN` are drawn again, so the
+    distribution is the truncated Gaussian; everything else is taken from `base`. Raises DrawError if the covariance is
+    not symmetric positive semi-definite, or if `MAX_DRAWS` draws give nothing physical.
+    """
+    centre = np.asarray(mean, dtype=np.float64)
+    spread = np.asarray(covariance, dtype=np.float64)
+    size = len(DRAWN_FIELDS)
+    if centre.shape != (size,) or spread.shape != (size, size):
+        raise DrawError(f"{', '.join(DRAWN_FIELDS)}: the mean needs shape ({size},), the covariance ({size}, {size})")
+    if not (np.all(np.isfinite(centre)) and np.all(np.isfinite(spread)) and np.allclose(spread, spread.T)):
+        raise DrawError("mean and covariance must be finite and the covariance symmetric")
+    variances, axes = np.linalg.eigh(spread)
+    if variances[0] < -1e-9 * max(variances[-1], 0.0):
+        raise DrawError("the covariance is not positive semi-definite")
+    root = axes * np.sqrt(np.maximum(variances, 0.0))
+    generator = np.random.default_rng(seed)
+    for _ in range(MAX_DRAWS):
+        drawn = centre + root @ generator.standard_normal(size)
+        if np.all(drawn >= SMALLEST_DRAWN) and np.all(drawn <= LARGEST_DRAWN):
+            x_icr_m, wheel_radius_m, axial_distance_m = (float(number) for number in drawn)
+            return replace(
+                base or PlantParameters(),
+                x_icr_m=x_icr_m,
+                wheel_radius_m=wheel_radius_m,
+                axial_distance_m=axial_distance_m,
+            )
+    raise DrawError(f"{MAX_DRAWS} draws gave no physical robot; the Gaussian lies outside the physical range")
