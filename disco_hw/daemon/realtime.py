@@ -96,7 +96,7 @@ def can_lock_memory() -> bool:
 
 def _set_switch_interval() -> Step:
     sys.setswitchinterval(_SWITCH_INTERVAL_S)
-    return Step("threads", True, f"a thread gives way within {_SWITCH_INTERVAL_S * 1e3:g} ms")
+    return Step("interpreter", True, f"a thread gives way within {_SWITCH_INTERVAL_S * 1e3:g} ms")
 
 
 def _freeze_garbage() -> Step:
@@ -109,9 +109,8 @@ def _freeze_garbage() -> Step:
 def _lock_memory() -> Step:
     if not can_lock_memory():
         # Under a finite limit the lock may succeed now and make a later allocation fail in mid-run.
-        return Step(
-            "memory", False, "not locked: the limit is finite; set LimitMEMLOCK=infinity or `ulimit -l unlimited`"
-        )
+        remedy = "set LimitMEMLOCK=infinity in the service, or a memlock line in /etc/security/limits.conf"
+        return Step("memory", False, f"not locked, as the limit is finite; {remedy}")
     libc = ctypes.CDLL(None, use_errno=True)
 
     def lock() -> None:
@@ -139,7 +138,7 @@ def _try(name: str, action: Callable[[], None], done: str, remedy: str) -> Step:
 
 
 def _has_capability(number: int) -> bool:
-    for line in Path("/proc/self/status").read_text(encoding="ascii").splitlines():
+    for line in Path("/proc/self/status").read_text(encoding="utf-8").splitlines():
         if line.startswith("CapEff:"):
             return bool(int(line.split()[1], 16) >> number & 1)
     return False

@@ -42,7 +42,7 @@ def run(script, **environment):
 def test_everything_allowed_is_done_and_said():
     seen = run("from disco_hw.daemon import realtime\nreport(realtime.enter(80))")
     assert all(done for _, done, _ in seen["steps"])
-    assert [name for name, _, _ in seen["steps"]] == ["threads", "garbage collector", "memory", "scheduler"]
+    assert [name for name, _, _ in seen["steps"]] == ["interpreter", "garbage collector", "memory", "scheduler"]
     assert (seen["policy"], seen["priority"]) == (os.SCHED_FIFO, 70)
     assert seen["locked_kib"] > 1000
     assert seen["gc"] is False
@@ -86,7 +86,8 @@ from disco_hw.daemon import realtime
 resource.setrlimit(resource.RLIMIT_MEMLOCK, (8 << 20, 8 << 20))
 resource.setrlimit(resource.RLIMIT_RTPRIO, (0, 0))
 """
-    ending = "report([*realtime.enter(80), realtime.raise_loop_thread(80)], able=[realtime.can_use_fifo(), realtime.can_lock_memory()])"
+    able = "[realtime.can_use_fifo(), realtime.can_lock_memory()]"
+    ending = f"report([*realtime.enter(80), realtime.raise_loop_thread(80)], able={able})"
     seen = run(script + AS_NOBODY + ending)
     texts = {name: text for name, done, text in seen["steps"] if not done}
     assert set(texts) == {"memory", "scheduler", "loop thread"}
