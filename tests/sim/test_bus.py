@@ -1,0 +1,391 @@
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sim.bus import CanBus, FrameFate
+from sim.bus_node import ErrorState, TransmitOrder
+from sim.can_bits import frame_bits, stuffed_bits
+from sim.can_frame import CanFrame
+
+BIT_NS = 2000  # 500 kbit/s
+LONG_NS = 10**10
+FRAME = CanFrame(0x110, bytes.fromhex("8d306902b4fb2c01"))
+
+
+def fates(*given_fates):
+    """A fault that deals out one fate after the other, then leaves frames alone."""
+
+    class Fates:
+        def __init__(self):
+            self.left = list(given_fates)
+            self.asked = []
+
+        def fate(self, now_ns, sender, frame):
+            self.asked.append((now_ns, sender, frame))
+            return self.left.pop(0) if self.left else FrameFate()
+
+    return Fates()
+
+
+def data_of(deliveries):
+    return [d for d in deliveries if not d.frame.error]
+
+
+def test_a_frame_arrives_at_its_end_at_all_others():
+    bus = CanBus()
+    a, b, c = (bus.attach(name) for name in "abc")
+    bus.advance(5_000)
+    assert bus.send(a, FRAME)
+    end_ns = 5_000 + (frame_bits(FRAME) - 3) * BIT_NS
+    assert bus.advance(end_ns - 1) == []
+    (delivery,) = bus.advance(end_ns)
+    assert delivery == (end_ns, a, FRAME, (b, c))
+    assert (a.sent, a.received, b.received, c.received) == (1, 0, 1, 1)
+
+
+def test_frames_follow_after_the_intermission():
+    bus = CanBus()
+    a, _ = bus.attach("a"), bus.attach("b")
+    for _ in range(3):
+        bus.send(a, FRAME)
+    times = [d.t_ns for d in bus.advance(LONG_NS)]
+    length_ns = frame_bits(FRAME) * BIT_NS
+    assert times == [length_ns * (i + 1) - 3 * BIT_NS for i in range(3)]
+    assert bus.busy_ns == 3 * length_ns
+
+
+@pytest.mark.parametrize("bitrate", [125_000, 83_333, 1_000_000])
+def test_bit_rate(bitrate):
+    bus = CanBus(bitrate)
+    a, _ = bus.attach("a"), bus.attach("b")
+    bus.send(a, FRAME)
+    (delivery,) = bus.advance(LONG_NS)
+    assert delivery.t_ns == pytest.approx((frame_bits(FRAME) - 3) * 1e9 / bitrate, abs=1.0)
+
+
+def test_the_lowest_identifier_wins_and_the_loser_follows():
+    bus = CanBus()
+    a, b, _ = (bus.attach(name) for name in "abc")
+    bus.send(a, CanFrame(0x200))
+    bus.send(b, CanFrame(0x100))
+    assert [(d.sender, d.frame.can_id) for d in bus.advance(LONG_NS)] == [(b, 0x100), (a, 0x200)]
+    assert (a.arbitrations_lost, b.arbitrations_lost) == (1, 0)
+
+
+def test_a_frame_on_the_wire_is_not_interrupted():
+    bus = CanBus()
+    a, b = bus.attach("a"), bus.attach("b")
+    bus.send(a, CanFrame(0x700))
+    bus.advance(10 * BIT_NS)
+    bus.send(b, CanFrame(0x001))
+    bus.send(a, CanFrame(0x002))
+    assert [d.frame.can_id for d in bus.advance(LONG_NS)] == [0x700, 0x001, 0x002]
+
+
+@settings(max_examples=60)
+@given(
+    st.lists(st.tuples(st.integers(0, 2), st.integers(0, 0x7FF), st.binary(max_size=8)), max_size=60),
+    st.sampled_from(TransmitOrder),
+    st.integers(20_000, 2_000_000),
+)
+def test_nothing_is_lost_or_reordered_and_the_wire_is_never_used_twice(sends, order, stride_ns):
+    """FIFO keeps a sender's order, PRIORITY that of equal identifiers; ends are a frame apart, whatever the stride."""
+    bus = CanBus()
+    nodes = [bus.attach(str(i), order=order, capacity=100) for i in range(3)]
+    expected = {0: [], 1: [], 2: []}
+    for index, can_id, data in sends:
+        # Distinct identifiers for each node, as the CAN specification asks.
+        frame = CanFrame(can_id // 3 * 3 % 0x7FB + index, data)
+        expected[index].append(frame)
+        assert bus.send(nodes[index], frame)
+    out, now_ns = [], 0
+    while any(node.pending for node in nodes):
+        now_ns += stride_ns
+        out.extend(bus.advance(now_ns))
+    for index, node in enumerate(nodes):
+        got = [d.frame for d in out if d.sender is node]
+        if order is TransmitOrder.FIFO:
+            assert got == expected[index]
+        else:
+            assert got == sorted(expected[index], key=lambda frame: frame.can_id)
+    ends = [d.t_ns for d in out]
+    for before, after, delivery in zip(ends, ends[1:], out[1:], strict=False):
+        assert after - before >= frame_bits(delivery.frame) * BIT_NS
+
+
+def test_own_frames_come_back_only_if_asked():
+    bus = CanBus()
+    a, b = bus.attach("a", echo=True), bus.attach("b")
+    bus.send(a, FRAME)
+    bus.send(b, CanFrame(0x700))
+    assert [d.receivers for d in bus.advance(LONG_NS)] == [(b, a), (a,)]
+
+
+def test_a_full_queue_refuses():
+    bus = CanBus()
+    a, _ = bus.attach("a", capacity=2), bus.attach("b")
+    assert [bus.send(a, FRAME) for _ in range(3)] == [True, True, False]
+    assert a.refused_full == 1
+    assert len(bus.advance(LONG_NS)) == 2
+    assert bus.send(a, FRAME)
+
+
+def test_a_destroyed_frame_is_sent_again_after_an_error_frame():
+    bus = CanBus(fault=fates(FrameFate(wire_error_bit=30)))
+    a, b = bus.attach("a"), bus.attach("b")
+    bus.send(a, FRAME)
+    (delivery,) = bus.advance(LONG_NS)
+    error_ns = (30 + 1 + 6 + 6 + 8 + 3) * BIT_NS
+    assert delivery.t_ns == error_ns + (frame_bits(FRAME) - 3) * BIT_NS
+    assert (a.tec, b.rec, a.transmit_errors, bus.error_frames) == (7, 0, 1, 1)  # +8 then -1; +1 then -1
+
+
+def test_a_frame_destroyed_for_ever_ends_in_bus_off_and_the_bus_is_free_again():
+    bus = CanBus(fault=fates(*[FrameFate(wire_error_bit=20)] * 32))
+    a, b = bus.attach("a"), bus.attach("b")
+    bus.send(a, FRAME)
+    bus.send(a, FRAME)
+    out = bus.advance(LONG_NS)
+    assert data_of(out) == []
+    assert (a.state, a.bus_off_count, a.lost_by_bus_off, b.rec) == (ErrorState.BUS_OFF, 1, 2, 32)
+    assert [d.frame.can_id for d in out if a in d.receivers] == [0x204, 0x204, 0x040]
+    assert not bus.send(a, FRAME)
+    c = bus.attach("c")
+    bus.send(b, FRAME)
+    (delivery,) = bus.advance(2 * LONG_NS)
+    assert delivery.receivers == (c,)
+
+
+def test_an_error_passive_sender_waits_eight_bits_before_it_sends_again():
+    bus = CanBus(fault=fates(*[FrameFate(wire_error_bit=20)] * 16))
+    a, b = bus.attach("a"), bus.attach("b")
+    bus.send(a, CanFrame(0x100))
+    bus.advance(16 * (20 + 1 + 6 + 6 + 8 + 3) * BIT_NS)
+    assert a.state is ErrorState.PASSIVE
+    bus.send(b, CanFrame(0x700))
+    assert [d.frame.can_id for d in data_of(bus.advance(LONG_NS))] == [0x700, 0x100]
+
+
+def test_a_lone_node_repeats_for_ever_and_stays_error_passive():
+    bus = CanBus()
+    a = bus.attach("a", capacity=3)
+    for _ in range(4):
+        bus.send(a, FRAME)
+    assert data_of(bus.advance(10**8)) == []
+    assert (a.state, a.tec, a.pending, a.refused_full) == (ErrorState.PASSIVE, 128, 3, 1)
+    bus.attach("b")
+    assert len(data_of(bus.advance(2 * 10**8))) == 3
+
+
+def test_a_missing_acknowledgement_takes_the_frame_up_to_its_slot_and_an_error_flag():
+    bus = CanBus()
+    a = bus.attach("a")
+    bus.send(a, FRAME)
+    bus.advance(0)
+    assert bus.next_event_ns() == (frame_bits(FRAME) - 3 - 9 + 1 + 6 + 8) * BIT_NS
+
+
+def test_recovery_from_bus_off_takes_128_times_11_recessive_bits_after_the_request():
+    bus = CanBus()
+    a, _ = bus.attach("a"), bus.attach("b")
+    bus.force_bus_off(a)
+    bus.advance(LONG_NS)
+    assert a.state is ErrorState.BUS_OFF
+    bus.request_recovery(a)
+    due_ns = LONG_NS + 128 * 11 * BIT_NS
+    assert bus.next_event_ns() == due_ns
+    assert bus.advance(due_ns - 1) == []
+    (restarted,) = bus.advance(due_ns)
+    assert restarted == (due_ns, a, CanFrame(0x100, bytes(8), error=True), (a,))
+    assert a.state is ErrorState.ACTIVE
+    assert bus.send(a, FRAME)
+
+
+def test_on_a_busy_bus_each_frame_counts_once_towards_recovery():
+    bus = CanBus()
+    a, b, _ = (bus.attach(name, capacity=1000) for name in "abc")
+    bus.force_bus_off(a)
+    bus.request_recovery(a)
+    for _ in range(200):
+        bus.send(b, FRAME)
+    deliveries = bus.advance(LONG_NS)
+    restarted = next(d for d in deliveries if d.frame.error and d.frame.can_id == 0x100)
+    assert len([d for d in deliveries if not d.frame.error and d.t_ns <= restarted.t_ns]) == 128
+
+
+@pytest.mark.parametrize("bitrate", [83_333, 125_000, None])
+def test_recovery_completes_at_any_bit_rate(bitrate):
+    bus = CanBus(bitrate)
+    a, _ = bus.attach("a"), bus.attach("b")
+    bus.advance(12_345)
+    bus.force_bus_off(a)
+    bus.request_recovery(a)
+    bus.advance(LONG_NS)
+    assert a.state is ErrorState.ACTIVE
+
+
+def test_recovery_needs_bus_off():
+    bus = CanBus()
+    a = bus.attach("a")
+    bus.request_recovery(a)
+    assert bus.next_event_ns() is None
+
+
+def test_lost_frame_is_acknowledged_and_reaches_nobody():
+    bus = CanBus(fault=fates(FrameFate(lost=True)))
+    a, b = bus.attach("a"), bus.attach("b")
+    bus.send(a, FRAME)
+    assert bus.advance(LONG_NS) == []
+    assert (a.sent, a.tec, b.received) == (1, 0, 0)
+
+
+def test_one_way_loss():
+    bus = CanBus(fault=fates(FrameFate(lost_at=("b",)), FrameFate(lost_at=("b",))))
+    a, b, c = (bus.attach(name) for name in "abc")
+    bus.send(a, FRAME)
+    bus.send(b, CanFrame(0x700))
+    assert [d.receivers for d in bus.advance(LONG_NS)] == [(c,), (a, c)]
+
+
+def test_duplicate():
+    bus = CanBus(fault=fates(FrameFate(copies=2)))
+    a, b = bus.attach("a"), bus.attach("b")
+    bus.send(a, FRAME)
+    assert [d.frame for d in bus.advance(LONG_NS)] == [FRAME, FRAME]
+    assert (a.sent, b.received) == (1, 2)
+
+
+def test_delay_reorders():
+    bus = CanBus(fault=fates(FrameFate(delay_ns=1_000_000)))
+    a, _ = bus.attach("a", order=TransmitOrder.FIFO), bus.attach("b")
+    bus.send(a, CanFrame(1))
+    bus.send(a, CanFrame(2))
+    late_ns = (frame_bits(CanFrame(1)) - 3) * BIT_NS + 1_000_000
+    assert [d.frame.can_id for d in bus.advance(late_ns - 1)] == [2]
+    assert bus.next_event_ns() == late_ns
+    assert [(d.t_ns, d.frame.can_id) for d in bus.advance(late_ns)] == [(late_ns, 1)]
+
+
+def test_deliveries_are_in_order_of_time_even_over_a_long_stride():
+    bus = CanBus(fault=fates(FrameFate(delay_ns=1_000_000)))
+    a, _ = bus.attach("a"), bus.attach("b")
+    bus.send(a, CanFrame(1))
+    bus.advance(0)
+    for can_id in range(2, 30):
+        bus.send(a, CanFrame(can_id))
+    times = [d.t_ns for d in bus.advance(LONG_NS)]
+    assert len(times) == 29
+    assert times == sorted(times)
+
+
+@pytest.mark.parametrize("data", [b"", b"\x01", bytes(7), bytes.fromhex("8d306902b4fb2c02")])
+def test_payload_corrupted_behind_the_crc(data):
+    bus = CanBus(fault=fates(FrameFate(data=data)))
+    a, _ = bus.attach("a"), bus.attach("b")
+    bus.send(a, FRAME)
+    (delivery,) = bus.advance(LONG_NS)
+    assert (delivery.frame.can_id, delivery.frame.data) == (0x110, data)
+    assert a.tec == 0
+
+
+def test_faults_are_asked_with_time_sender_and_frame():
+    fault = fates()
+    bus = CanBus(fault=fault)
+    a, _ = bus.attach("a"), bus.attach("b")
+    bus.advance(700)
+    bus.send(a, FRAME)
+    bus.advance(LONG_NS)
+    assert fault.asked == [(700, "a", FRAME)]
+
+
+def test_equal_frames_at_the_same_time_merge():
+    bus = CanBus()
+    a, b, c = (bus.attach(name) for name in "abc")
+    bus.send(a, FRAME)
+    bus.send(b, FRAME)
+    assert [d.receivers for d in bus.advance(LONG_NS)] == [(c,)]
+    assert (a.sent, b.sent) == (1, 1)
+
+
+def test_two_nodes_with_one_identifier_destroy_each_other():
+    """The classic mistake: both win arbitration, differ in the data, and drive each other to bus-off."""
+    bus = CanBus()
+    a, b, _ = (bus.attach(name) for name in "abc")
+    one, other = CanFrame(0x100, b"\x00\xff"), CanFrame(0x100, b"\x00\xfe")
+    bus.send(a, one)
+    bus.send(b, other)
+    bus.advance(0)
+    differs = next(i for i, (x, y) in enumerate(zip(stuffed_bits(one), stuffed_bits(other), strict=False)) if x != y)
+    assert bus.next_event_ns() == (differs + 1 + 6 + 6 + 8) * BIT_NS
+    out = bus.advance(LONG_NS)
+    assert data_of(out) == []
+    assert (a.state, b.state) == (ErrorState.BUS_OFF, ErrorState.BUS_OFF)
+
+
+def test_a_babbling_node_starves_higher_identifiers_only():
+    bus = CanBus()
+    babbler, low, high, _ = (bus.attach(name, capacity=4) for name in "abcd")
+    got = []
+    bus.send(high, CanFrame(0x700))
+    for step in range(100):
+        while bus.send(babbler, CanFrame(0x100, bytes(8))):
+            pass
+        if step % 10 == 0:
+            bus.send(low, CanFrame(0x080))
+        got.extend(d.frame.can_id for d in bus.advance(step * 500_000))
+    assert got.count(0x080) >= 9
+    assert got.count(0x700) == 0
+
+
+def test_log_is_candump():
+    lines = []
+    bus = CanBus(fault=fates(FrameFate(wire_error_bit=0)), log=lines.append)
+    a, _ = bus.attach("a"), bus.attach("b")
+    bus.send(a, FRAME)
+    bus.advance(LONG_NS)
+    assert lines == [
+        f"(0.{(1 + 6 + 6 + 8) * 2:06d}) can0 20000088#0000000000000000",
+        f"(0.{(1 + 6 + 6 + 8 + frame_bits(FRAME)) * 2:06d}) can0 110#8D306902B4FB2C01",
+    ]
+
+
+def test_a_detached_node_is_gone():
+    bus = CanBus()
+    a, b = bus.attach("a"), bus.attach("b")
+    bus.send(b, FRAME)
+    bus.detach(b)
+    assert bus.advance(LONG_NS) == []
+    assert bus.nodes == (a,)
+
+
+def test_a_node_detached_in_recovery_is_forgotten():
+    bus = CanBus()
+    a, _ = bus.attach("a"), bus.attach("b")
+    bus.force_bus_off(a)
+    bus.request_recovery(a)
+    bus.detach(a)
+    bus.advance(1)
+    assert bus.next_event_ns() is None
+
+
+def test_without_a_bit_rate_a_frame_takes_no_time():
+    bus = CanBus(None)
+    a, _ = bus.attach("a"), bus.attach("b")
+    bus.advance(77)
+    for can_id in (3, 1, 2):
+        bus.send(a, CanFrame(can_id))
+    assert [(d.t_ns, d.frame.can_id) for d in bus.advance(77)] == [(77, 1), (77, 2), (77, 3)]
+
+
+def test_time_does_not_go_back():
+    bus = CanBus()
+    bus.advance(10)
+    with pytest.raises(ValueError, match="cannot go back"):
+        bus.advance(9)
+
+
+def test_error_frames_cannot_be_sent():
+    bus = CanBus()
+    a = bus.attach("a")
+    with pytest.raises(ValueError, match="error frame"):
+        bus.send(a, CanFrame(0x40, bytes(8), error=True))

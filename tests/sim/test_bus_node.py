@@ -1,0 +1,155 @@
+import pytest
+
+from sim.bus_node import BusNode, ErrorState, TransmitOrder
+from sim.can_frame import CanFrame
+
+
+@pytest.fixture
+def node():
+    return BusNode("a", capacity=4, order=TransmitOrder.PRIORITY, echo=False)
+
+
+def fail_transmission(node, times, acknowledged=True):
+    reports = []
+    for _ in range(times):
+        if node.queue:
+            node.start()
+        reports.append(node.count_transmit_error(acknowledged))
+    return [report for report in reports if report is not None]
+
+
+def sent_ids(node):
+    ids = []
+    while node.queue:
+        ids.append(node.start().can_id)
+        node.count_sent()
+    return ids
+
+
+def test_priority_sends_the_lowest_identifier_first_and_equals_in_order(node):
+    for sequence, (can_id, data) in enumerate([(0x200, b"1"), (0x100, b"2"), (0x300, b"3"), (0x100, b"4")]):
+        assert node.push(sequence, CanFrame(can_id, data))
+    first, second = node.start(), None
+    node.count_sent()
+    second = node.start()
+    node.count_sent()
+    assert (first, second) == (CanFrame(0x100, b"2"), CanFrame(0x100, b"4"))
+    assert sent_ids(node) == [0x200, 0x300]
+
+
+def test_fifo_sends_in_order():
+    node = BusNode("a", capacity=4, order=TransmitOrder.FIFO, echo=False)
+    for sequence, can_id in enumerate([0x200, 0x100, 0x300]):
+        node.push(sequence, CanFrame(can_id))
+    assert sent_ids(node) == [0x200, 0x100, 0x300]
+
+
+def test_a_full_queue_refuses_and_counts_including_the_frame_on_the_wire(node):
+    for sequence in range(4):
+        assert node.push(sequence, CanFrame(1))
+    assert not node.push(9, CanFrame(1))
+    node.start()
+    assert node.pending == 4
+    assert not node.push(10, CanFrame(1))
+    assert node.refused_full == 2
+    node.count_sent()
+    assert node.push(11, CanFrame(1))
+
+
+def test_a_destroyed_frame_keeps_its_place(node):
+    node.push(1, CanFrame(5, b"first"))
+    node.push(2, CanFrame(5, b"later"))
+    node.start()
+    node.count_transmit_error(acknowledged=True)
+    assert node.start().data == b"first"
+
+
+def test_transmit_errors_lead_over_warning_and_passive_to_bus_off(node):
+    node.push(1, CanFrame(5))
+    states = []
+    for _ in range(32):
+        fail_transmission(node, 1)
+        states.append(node.state)
+    assert states.index(ErrorState.WARNING) == 96 // 8 - 1
+    assert states.index(ErrorState.PASSIVE) == 128 // 8 - 1
+    assert states.index(ErrorState.BUS_OFF) == 256 // 8 - 1
+    assert node.bus_off_count == 1
+    assert node.pending == 0
+    assert node.lost_by_bus_off == 1
+
+
+def test_changes_of_state_are_reported_as_socketcan_error_frames(node):
+    node.push(1, CanFrame(5))
+    reports = fail_transmission(node, 32)
+    assert [(report.can_id, report.data[1], report.data[6]) for report in reports] == [
+        (0x204, 0x08, 96),
+        (0x204, 0x20, 128),
+        (0x040, 0, 0),
+    ]
+
+
+def test_bus_off_refuses_frames_and_counts_them(node):
+    node.force_bus_off()
+    assert not node.push(1, CanFrame(1))
+    assert (node.refused_bus_off, node.refused_full, node.pending) == (1, 0, 0)
+
+
+def test_bus_off_during_a_frame_stays_bus_off_whatever_becomes_of_the_frame(node):
+    for outcome in (node.count_sent, lambda: node.count_transmit_error(True)):
+        node.push(1, CanFrame(1))
+        node.start()
+        node.force_bus_off()
+        outcome()
+        assert node.state is ErrorState.BUS_OFF
+        assert node.pending == 0
+        node.recover()
+
+
+def test_recovery_clears_the_counters(node):
+    node.rec = 40
+    node.force_bus_off()
+    report = node.recover()
+    assert report.can_id == 0x100
+    assert (node.tec, node.rec, node.state) == (0, 0, ErrorState.ACTIVE)
+
+
+def test_success_wins_back_one_error_in_eight(node):
+    node.push(1, CanFrame(5))
+    fail_transmission(node, 16)
+    assert (node.tec, node.state) == (128, ErrorState.PASSIVE)
+    node.start()
+    report = node.count_sent()
+    assert (node.tec, node.state) == (127, ErrorState.WARNING)
+    assert report.data[1] == 0x08
+    for sequence in range(32):
+        node.push(sequence, CanFrame(5))
+        node.start()
+        report = node.count_sent()
+    assert (node.tec, node.state) == (95, ErrorState.ACTIVE)
+    assert report.data[1] == 0x40
+
+
+def test_a_missing_acknowledgement_never_leads_to_bus_off(node):
+    node.push(1, CanFrame(5))
+    fail_transmission(node, 100, acknowledged=False)
+    assert (node.tec, node.state) == (128, ErrorState.PASSIVE)
+    assert node.transmit_errors == 100
+
+
+def test_receive_errors_lead_to_passive_only(node):
+    for _ in range(400):
+        node.count_receive_error()
+    assert (node.rec, node.state) == (255, ErrorState.PASSIVE)
+    node.count_received()
+    assert node.rec == 120
+    for _ in range(130):
+        node.count_received()
+    assert (node.rec, node.state) == (0, ErrorState.ACTIVE)
+
+
+def test_success_without_errors_reports_nothing(node):
+    node.push(1, CanFrame(5))
+    node.start()
+    assert node.count_sent() is None
+    assert node.count_received() is None
+    assert (node.tec, node.rec, node.sent) == (0, 0, 1)
