@@ -1,0 +1,169 @@
+"""The filter as a pure function of its state: initialisation, motion, gated correction, recovery from lock-out."""
+
+from __future__ import annotations
+
+import msgspec
+
+from disco_hw.config import Estimation
+from disco_hw.estimation.belief import Belief, belief_at, motion_model, predict
+from disco_hw.estimation.correction import PoseCorrector, Triple
+from disco_hw.estimation.gate import Measurement, PoseReason, gate_limit
+from disco_hw.estimation.odometry import OdometryParameters, Pose, arc
+from disco_hw.estimation.wheels import WheelReading
+
+# Without newer samples the wheels are taken to keep their speeds for so long, then to stand.
+MAX_EXTRAPOLATION_S = 0.2
+# Standard deviation of motion that was not measured, as a part of its length: a wheel's turn since its last sample, and
+# the shape of the path between two samples with a gap in between.
+UNMEASURED_PART = 0.25
+
+
+class Judgement(msgspec.Struct, frozen=True, gc=False):
+    """What became of a pose; the numbers are those of PoseUpdate, None where there was nothing to compare with."""
+
+    reason: PoseReason
+    innovation: Triple | None = None
+    innovation_variance: Triple | None = None
+    distance2: float | None = None
+    test_ratio: float | None = None
+
+
+class FilterState(msgspec.Struct, frozen=True, gc=False):
+    """Everything that the future depends on, at one instant.
+
+    `belief` is None before there is any. `candidate` is the pose that the last rejected measurements agree on, and
+    `candidate_count` how many in a row do. `pose_t_ns` is the stamp of the last accepted pose, None before the first.
+    `judgement` is that of the pose at this very instant, None after wheel motion.
+    """
+
+    t_ns: int
+    left_rad: float
+    right_rad: float
+    belief: Belief | None
+    candidate: Belief | None
+    candidate_count: int
+    pose_t_ns: int | None
+    reinitialisations: int
+    judgement: Judgement | None
+
+
+class PoseFilter:
+    """Kalman filter on the pose with a gate, as transitions from one immutable state to the next."""
+
+    def __init__(self, settings: Estimation, parameters: OdometryParameters) -> None:
+        self.parameters = parameters
+        self._model = motion_model(settings, parameters)
+        self._limit = gate_limit(settings.gate_probability)
+        self._lockout_count = settings.gate_lockout_count
+        self._pose_required = settings.pose_required
+        self._corrector = PoseCorrector()
+
+    def begin(self, wheels: WheelReading) -> FilterState:
+        """The state at the first wheel sample: no belief, or the origin where no pose is required."""
+        origin = belief_at(Pose(0.0, 0.0, 0.0), 1e-6, 1e-6, self._model)
+        belief = None if self._pose_required else origin
+        return FilterState(wheels.t_ns, wheels.left_rad, wheels.right_rad, belief, None, 0, None, 0, None)
+
+    def move(self, state: FilterState, t_ns: int, left_rad: float, right_rad: float, in_gap: bool) -> FilterState:
+        """Follow the wheels to measured angles."""
+        rolled_m = 0.0
+        if in_gap:
+            turned_rad = abs(left_rad - state.left_rad) + abs(right_rad - state.right_rad)
+            rolled_m = 0.5 * self.parameters.wheel_radius_m * turned_rad
+        return self._moved(state, t_ns, left_rad, right_rad, (UNMEASURED_PART * rolled_m) ** 2, 0.0)
+
+    def extrapolate(self, state: FilterState, wheels: WheelReading, t_ns: int) -> FilterState:
+        """Follow the wheels beyond their newest sample; `t_ns` is not before the state."""
+        since_s, until_s = (state.t_ns - wheels.t_ns) * 1e-9, (t_ns - wheels.t_ns) * 1e-9
+        coasting_s = min(until_s, MAX_EXTRAPOLATION_S)
+        left, right = wheels.left_speed_rad_s, wheels.right_speed_rad_s
+        radius = self.parameters.wheel_radius_m
+        # Squares of the time since the sample, so that stopping on the way adds nothing.
+        growth = (UNMEASURED_PART * radius) ** 2 * (until_s * until_s - since_s * since_s)
+        return self._moved(
+            state,
+            t_ns,
+            wheels.left_rad + left * coasting_s,
+            wheels.right_rad + right * coasting_s,
+            0.25 * growth * (abs(left) + abs(right)) ** 2,
+            growth * (left * left + right * right) / self.parameters.axial_distance_m**2,
+        )
+
+    def fuse(self, state: FilterState, measurement: Measurement) -> FilterState:
+        """Judge a pose at the state's instant, and correct the belief by it if it passes.
+
+        The first pose sets the belief. A pose outside the gate is compared with where the rejected poses before it
+        would be now: if `gate_lockout_count` in a row agree with one another, the robot is where they say.
+        """
+        if state.belief is None or state.pose_t_ns is None:
+            return self._after(state, measurement, self._fresh(measurement), Judgement(PoseReason.INITIALISED))
+        correction = self._corrector.correct(state.belief, measurement)
+        accepted = correction.distance2 <= self._limit
+        candidate, count = None, 0
+        if not accepted:
+            candidate, count = self._candidate(state, measurement)
+        moved_away = count >= self._lockout_count
+        judgement = Judgement(
+            PoseReason.ACCEPTED if accepted else PoseReason.REINITIALISED if moved_away else PoseReason.GATED,
+            correction.innovation,
+            correction.innovation_variance,
+            correction.distance2,
+            correction.distance2 / self._limit,
+        )
+        if accepted:
+            return self._after(state, measurement, correction.belief, judgement)
+        if moved_away and candidate is not None:
+            return self._after(state, measurement, candidate, judgement)
+        return msgspec.structs.replace(state, candidate=candidate, candidate_count=count, judgement=judgement)
+
+    def _fresh(self, measurement: Measurement) -> Belief:
+        return belief_at(measurement.pose, measurement.position_variance, measurement.yaw_variance, self._model)
+
+    def _candidate(self, state: FilterState, measurement: Measurement) -> tuple[Belief, int]:
+        if state.candidate is not None:
+            correction = self._corrector.correct(state.candidate, measurement)
+            if correction.distance2 <= self._limit:
+                return correction.belief, state.candidate_count + 1
+        return self._fresh(measurement), 1
+
+    def _after(self, state: FilterState, measurement: Measurement, belief: Belief, judgement: Judgement) -> FilterState:
+        return FilterState(
+            state.t_ns,
+            state.left_rad,
+            state.right_rad,
+            belief,
+            None,
+            0,
+            measurement.t_ns,
+            state.reinitialisations + (judgement.reason is PoseReason.REINITIALISED),
+            judgement,
+        )
+
+    def _moved(
+        self,
+        state: FilterState,
+        t_ns: int,
+        left_rad: float,
+        right_rad: float,
+        position_variance: float,
+        yaw_variance: float,
+    ) -> FilterState:
+        belief, candidate = state.belief, state.candidate
+        left_turn, right_turn = left_rad - state.left_rad, right_rad - state.right_rad
+        if left_turn or right_turn or position_variance or yaw_variance:
+            motion = arc(self.parameters, left_turn, right_turn)
+            if belief is not None:
+                belief = predict(belief, self._model, motion, position_variance, yaw_variance)
+            if candidate is not None:
+                candidate = predict(candidate, self._model, motion, position_variance, yaw_variance)
+        return FilterState(
+            t_ns,
+            left_rad,
+            right_rad,
+            belief,
+            candidate,
+            state.candidate_count,
+            state.pose_t_ns,
+            state.reinitialisations,
+            None,
+        )

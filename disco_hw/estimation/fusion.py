@@ -1,0 +1,212 @@
+"""Fusion of wheel odometry and measured pose: what the pipeline feeds and asks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+from disco_hw.config import Estimation
+from disco_hw.estimation.belief import MAX_POSITION_VARIANCE, MAX_YAW_VARIANCE
+from disco_hw.estimation.correction import Triple
+from disco_hw.estimation.filter import Judgement, PoseFilter
+from disco_hw.estimation.gate import PoseReason, screen
+from disco_hw.estimation.history import RewindBuffer
+from disco_hw.estimation.odometry import Matrix3, OdometryParameters, Pose
+from disco_hw.estimation.wheels import FUTURE_TOLERANCE_NS, WheelReason, WheelTracker
+from drivers.types import PoseSample, WheelSample
+
+_UNKNOWN: Matrix3 = ((MAX_POSITION_VARIANCE, 0.0, 0.0), (0.0, MAX_POSITION_VARIANCE, 0.0), (0.0, 0.0, MAX_YAW_VARIANCE))
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """Where the tracked body point is at `t_ns`, and how well this is known.
+
+    World frame; `covariance` of (x, y, yaw) is 3x3, rows of floats, m and rad, symmetric and positive definite.
+    `speed_m_s` is forward, of the centre of rotation; the tracked point also moves sideways by -yaw_rate * x_icr.
+    Ages are those of the newest wheel sample and the newest accepted pose, None before the first. `pose_ok`: a pose was
+    accepted within the timeout, otherwise the estimate is prediction only. `wheels_ok`: the same for wheel samples.
+    Before `initialised`, pose and covariance say nothing (zeros, largest variances). `reinitialisations` counts how
+    often the estimate has jumped to where agreeing poses say; a change means that a path through it is no motion.
+    """
+
+    t_ns: int
+    x_m: float
+    y_m: float
+    yaw_rad: float
+    covariance: Matrix3
+    speed_m_s: float
+    yaw_rate_rad_s: float
+    left_speed_rad_s: float
+    right_speed_rad_s: float
+    wheel_age_s: float | None
+    pose_age_s: float | None
+    initialised: bool
+    wheels_ok: bool
+    pose_ok: bool
+    reinitialisations: int
+
+    @property
+    def pose(self) -> Pose:
+        """The mean."""
+        return Pose(self.x_m, self.y_m, self.yaw_rad)
+
+    @property
+    def ok(self) -> bool:
+        """Whether it rests on fresh wheel samples and fresh poses."""
+        return self.initialised and self.wheels_ok and self.pose_ok
+
+
+@dataclass(frozen=True, slots=True)
+class PoseUpdate:
+    """What a measured pose did.
+
+    `innovation` is measured minus predicted (x m, y m, yaw rad), `innovation_variance` the diagonal of its covariance
+    S, `distance2` its squared Mahalanobis distance, `test_ratio` that over the gate's limit (above 1: outside). They
+    are None where there was nothing to compare with. `age_s` is how long ago the pose was true.
+    """
+
+    t_ns: int
+    age_s: float
+    reason: PoseReason
+    innovation: Triple | None = None
+    innovation_variance: Triple | None = None
+    distance2: float | None = None
+    test_ratio: float | None = None
+
+    @property
+    def accepted(self) -> bool:
+        """Whether the pose took part in the estimate."""
+        return self.reason.accepted
+
+
+@dataclass(frozen=True, slots=True)
+class FusionStats:
+    """Counters since the start; each sample is in exactly one of `wheels_...` and `poses_...`, as judged on arrival.
+
+    The last three are in addition: samples taken although something about them was mended.
+    """
+
+    wheels_accepted: int = 0
+    wheels_not_finite: int = 0
+    wheels_out_of_range: int = 0
+    wheels_future: int = 0
+    wheels_out_of_order: int = 0
+    poses_accepted: int = 0
+    poses_initialised: int = 0
+    poses_reinitialised: int = 0
+    poses_gated: int = 0
+    poses_not_finite: int = 0
+    poses_out_of_range: int = 0
+    poses_future: int = 0
+    poses_too_old: int = 0
+    poses_duplicate: int = 0
+    poses_no_odometry: int = 0
+    poses_overflow: int = 0
+    wheel_gaps: int = 0
+    wheel_restarts: int = 0
+    pose_std_floored: int = 0
+
+
+class PoseFusion:
+    """Estimates the pose from wheel angles and measured poses, each taken at its own time stamp.
+
+    No clock: time comes in with samples and queries, and the same calls give the same results bit for bit. Nothing that
+    a sample holds raises; what is refused is counted. Cost of a call: see RewindBuffer.
+    """
+
+    def __init__(self, settings: Estimation, parameters: OdometryParameters, wheel_timeout_s: float) -> None:
+        self._filter = PoseFilter(settings, parameters)
+        self._history_s = settings.history_s
+        self._pose_timeout_s = settings.pose_timeout_s
+        self._wheel_timeout_s = wheel_timeout_s
+        self._buffer: RewindBuffer | None = None
+        self._tracker = WheelTracker()
+        self._counts = {field.name: 0 for field in fields(FusionStats)}
+
+    @property
+    def stats(self) -> FusionStats:
+        """A snapshot of the counters."""
+        return FusionStats(**self._counts)
+
+    def add_wheels(self, sample: WheelSample) -> None:
+        """Take in a wheel sample; it must be newer than all before, otherwise it is dropped and counted."""
+        reading = self._tracker.take(sample)
+        if isinstance(reading, WheelReason):
+            self._counts[f"wheels_{reading.value}"] += 1
+            return
+        self._counts["wheels_accepted"] += 1
+        self._counts["wheel_gaps"] += reading.after_gap
+        self._counts["wheel_restarts"] += reading.restarted
+        if self._buffer is None:
+            self._buffer = RewindBuffer(self._filter, reading, self._history_s)
+        else:
+            self._buffer.add_wheels(reading)
+
+    def add_pose(self, sample: PoseSample, now_ns: int) -> PoseUpdate:
+        """Take in a measured pose at its own stamp, and say what it did as far as is known by now."""
+        outcome = self._judge(sample, now_ns)
+        if isinstance(outcome, PoseReason):
+            outcome = Judgement(outcome)
+        self._counts[f"poses_{outcome.reason.value}"] += 1
+        return PoseUpdate(
+            t_ns=sample.t_ns,
+            age_s=(now_ns - sample.t_ns) * 1e-9,
+            reason=outcome.reason,
+            innovation=outcome.innovation,
+            innovation_variance=outcome.innovation_variance,
+            distance2=outcome.distance2,
+            test_ratio=outcome.test_ratio,
+        )
+
+    def estimate(self, now_ns: int) -> Estimate:
+        """Estimate the pose at `now_ns`.
+
+        Beyond the newest sample the wheels are taken to keep their speeds for 0.2 s and then to stand; the uncertainty
+        goes on growing. A time before the newest sample gets the pose of the newest sample.
+        """
+        if self._buffer is None:
+            return Estimate(now_ns, 0.0, 0.0, 0.0, _UNKNOWN, 0.0, 0.0, 0.0, 0.0, None, None, False, False, False, 0)
+        wheels, state = self._buffer.newest_wheels, self._buffer.head()
+        if now_ns > state.t_ns:
+            state = self._filter.extrapolate(state, wheels, now_ns)
+        x_m, y_m, yaw_rad, covariance = 0.0, 0.0, 0.0, _UNKNOWN
+        if state.belief is not None:
+            x_m, y_m, yaw_rad = state.belief.x_m, state.belief.y_m, state.belief.yaw_rad
+            covariance = state.belief.covariance
+        parameters = self._filter.parameters
+        left, right = wheels.left_speed_rad_s, wheels.right_speed_rad_s
+        wheel_age_s = _age_s(now_ns, wheels.t_ns)
+        pose_age_s = None if state.pose_t_ns is None else _age_s(now_ns, state.pose_t_ns)
+        return Estimate(
+            t_ns=now_ns,
+            x_m=x_m,
+            y_m=y_m,
+            yaw_rad=yaw_rad,
+            covariance=covariance,
+            speed_m_s=0.5 * parameters.wheel_radius_m * (left + right),
+            yaw_rate_rad_s=parameters.wheel_radius_m * (right - left) / parameters.axial_distance_m,
+            left_speed_rad_s=left,
+            right_speed_rad_s=right,
+            wheel_age_s=wheel_age_s,
+            pose_age_s=pose_age_s,
+            initialised=state.belief is not None,
+            wheels_ok=wheel_age_s <= self._wheel_timeout_s,
+            pose_ok=pose_age_s is not None and pose_age_s <= self._pose_timeout_s,
+            reinitialisations=state.reinitialisations,
+        )
+
+    def _judge(self, sample: PoseSample, now_ns: int) -> Judgement | PoseReason:
+        measurement = screen(sample)
+        if isinstance(measurement, PoseReason):
+            return measurement
+        if sample.t_ns > now_ns + FUTURE_TOLERANCE_NS:
+            return PoseReason.FUTURE
+        if self._buffer is None:
+            return PoseReason.NO_ODOMETRY
+        outcome = self._buffer.add_pose(measurement)
+        self._counts["pose_std_floored"] += measurement.floored and isinstance(outcome, Judgement)
+        return outcome
+
+
+def _age_s(now_ns: int, t_ns: int) -> float:
+    return max(0, now_ns - t_ns) * 1e-9
