@@ -50,7 +50,9 @@ def limit_thread_pools(environment: MutableMapping[str, str] = os.environ) -> St
     """
     numpy_is_late = "numpy" in sys.modules and environment.get("OPENBLAS_NUM_THREADS") != "1"
     for name in _THREAD_COUNT_VARIABLES:
-        environment[name] = "1"
+        # Numba reads its variable again at each compilation and raises if it then differs from the threads it has.
+        if not (name.startswith("NUMBA") and "numba" in sys.modules):
+            environment[name] = "1"
     for module_name, function in (("torch", "set_num_threads"), ("numba", "set_num_threads")):
         module = sys.modules.get(module_name)
         if module is not None:

@@ -109,7 +109,8 @@ def test_cpus_are_set_or_the_refusal_is_said():
 def test_thread_pools_are_held_to_one_before_and_after_the_import():
     script = "from disco_hw.daemon import realtime\n{before}step = realtime.limit_thread_pools()\nimport numba, torch\n"
     ending = "report([step], torch=torch.get_num_threads(), numba=numba.get_num_threads())"
-    for before in ("", "import numba, torch\ntorch.set_num_threads(2)\n"):
+    ending = "assert numba.njit(lambda x: x + 1)(1) == 2\n" + ending
+    for before in ("", "import numba, torch\nnumba.set_num_threads(numba.get_num_threads())\n"):
         seen = run(script.format(before=before) + ending, OPENBLAS_NUM_THREADS="1", OMP_NUM_THREADS="2")
         assert (seen["torch"], seen["numba"]) == (1, 1)
         assert seen["steps"][0][1] is True
