@@ -137,6 +137,7 @@ def test_nothing_old_is_sent_on_a_new_link(transport, medium):
     up(transport)
     medium.may_write.clear()
     send(transport, outgoing(data=b"a"), outgoing(data=b"b"))
+    wait_until(transport._writing.locked)
     medium.incoming.put(OSError("unplugged"))
     wait_until(lambda: transport.state is LinkState.CONNECTING)
     medium.may_write.set()
