@@ -228,11 +228,12 @@ class Hub:
                 client.lost_unread += 1
                 self.stats.reader_overflow += 1
                 continue
+            was_read = not client.unread
             if client.lost_unread:
                 client.unread.append(pack_frame(receive_overflow_frame()))
                 client.lost_unread = 0
             client.unread.append(packet)
-            if len(client.unread) == 1:
+            if was_read:
                 client.last_read_ns = self._now_ns
                 self._flush(client)
 

@@ -95,9 +95,11 @@ class UnixCanBus(can.BusABC):
                 continue
             except OSError as error:
                 raise can.CanOperationError(f"receive on {self._channel}: {error.strerror}", error.errno) from error
+            if not packet:
+                raise can.CanOperationError(f"receive on {self._channel}: the hub has closed", errno.EPIPE)
             frame = unpack_frame(packet)
             if frame is None:
-                raise can.CanOperationError(f"receive on {self._channel}: the hub has closed", errno.EPIPE)
+                raise can.CanOperationError(f"receive on {self._channel}: {packet!r} is no CAN frame", errno.EBADMSG)
             return (
                 can.Message(
                     # python-can stamps with the wall clock; whoever needs the monotonic clock reads it on reception.

@@ -185,6 +185,24 @@ def test_a_missing_acknowledgement_takes_the_frame_up_to_its_slot_and_an_error_f
     assert bus.next_event_ns() == (frame_bits(FRAME) - 3 - 9 + 1 + 6 + 8) * BIT_NS
 
 
+def test_a_bus_off_node_acknowledges_nothing():
+    bus = CanBus()
+    a, b = bus.attach("a"), bus.attach("b")
+    bus.force_bus_off(b)
+    bus.send(a, FRAME)
+    assert data_of(bus.advance(10**8)) == []
+    assert a.state is ErrorState.PASSIVE
+
+
+def test_forced_bus_off_is_reported_at_once():
+    bus = CanBus()
+    a, _ = bus.attach("a"), bus.attach("b")
+    bus.advance(9_000)
+    bus.force_bus_off(a)
+    assert bus.next_event_ns() == 9_000
+    assert bus.advance(9_000) == [(9_000, a, CanFrame(0x040, bytes(8), error=True), (a,))]
+
+
 def test_recovery_from_bus_off_takes_128_times_11_recessive_bits_after_the_request():
     bus = CanBus()
     a, _ = bus.attach("a"), bus.attach("b")
@@ -211,6 +229,17 @@ def test_on_a_busy_bus_each_frame_counts_once_towards_recovery():
     deliveries = bus.advance(LONG_NS)
     restarted = next(d for d in deliveries if d.frame.error and d.frame.can_id == 0x100)
     assert len([d for d in deliveries if not d.frame.error and d.t_ns <= restarted.t_ns]) == 128
+
+
+def test_idle_bits_before_a_frame_count_towards_recovery():
+    bus = CanBus()
+    a, b, _ = (bus.attach(name) for name in "abc")
+    bus.force_bus_off(a)
+    bus.request_recovery(a)
+    bus.advance(100 * 11 * BIT_NS)
+    bus.send(b, FRAME)
+    bus.advance(bus.now_ns + frame_bits(FRAME) * BIT_NS)
+    assert bus.next_event_ns() == bus.now_ns + 27 * 11 * BIT_NS
 
 
 @pytest.mark.parametrize("bitrate", [83_333, 125_000, None])
