@@ -1,0 +1,356 @@
+"""The MCAP container, read so that a cut, damaged or hostile file costs its own bytes and nothing else.
+
+The framing is walked here: every length is checked against the file before a byte of content is taken, so whole
+records are found up to where the file breaks off. The content of records is parsed by the mcap library.
+(MCAP specification 1.0: magic, then records of opcode u8, length u64, content.)
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+import zlib
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass, field
+from io import BytesIO
+from typing import Any, NamedTuple, TypeVar
+
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import (
+    Attachment,
+    AttachmentIndex,
+    Channel,
+    Chunk,
+    ChunkIndex,
+    Footer,
+    Metadata,
+    MetadataIndex,
+    Schema,
+    Statistics,
+)
+
+from disco_hw.log.errors import LogError
+
+MAGIC = b"\x89MCAP0\r\n"
+
+_HEAD = struct.Struct("<BQ")
+_MESSAGE = struct.Struct("<HIQQ")
+_FOOTER_BYTES = _HEAD.size + 8 + 8 + 4
+_LARGEST_OFFSET = 2**63 - 1
+_LARGEST = 256 * 1024 * 1024
+_SEARCH_BYTES = 1024 * 1024
+_CHUNK_MARK = b"\x04\x00\x00\x00zstd"
+_CHUNK_MARK_AT = _HEAD.size + 8 + 8 + 8 + 4
+_FRONT_MATTER = (Opcode.ATTACHMENT, Opcode.METADATA, Opcode.HEADER)
+_PARSE_ERRORS = (McapError, struct.error, ValueError, KeyError, OverflowError, zstandard.ZstdError)
+_T = TypeVar("_T")
+
+
+class DamagedError(Exception):
+    """A record is not what it should be; the message says how."""
+
+
+class Message(NamedTuple):
+    """One message of a chunk; times in wall ns."""
+
+    channel_id: int
+    sequence: int
+    log_time: int
+    publish_time: int
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class ChunkRef:
+    """Where a chunk's content lies, and the log times of its first and last message (wall ns)."""
+
+    offset: int
+    length: int
+    start_time: int
+    end_time: int
+
+
+@dataclass(frozen=True, slots=True)
+class AttachmentRef:
+    """Where an attachment's record lies, and what it is."""
+
+    offset: int
+    length: int
+    log_time: int
+    name: str
+    media_type: str
+    size: int
+
+
+@dataclass(slots=True)
+class Contents:
+    """What a file holds.
+
+    `complete` is False when the index at the end is missing or unusable; then every chunk listed has been checked, and
+    the data ends at `whole_bytes`. `damage` says in words what was passed over.
+    """
+
+    size: int
+    complete: bool = False
+    whole_bytes: int = 0
+    schemas: dict[int, Schema] = field(default_factory=dict)
+    channels: dict[int, Channel] = field(default_factory=dict)
+    chunks: list[ChunkRef] = field(default_factory=list)
+    attachments: list[AttachmentRef] = field(default_factory=list)
+    metadata: list[Metadata] = field(default_factory=list)
+    counts: Counter[int] = field(default_factory=Counter)
+    damage: list[str] = field(default_factory=list)
+
+
+def read_contents(fd: int, name: str) -> Contents:
+    """Read the index, or without one the whole file; raises LogError if it is no MCAP file at all."""
+    size = os.fstat(fd).st_size
+    if size == 0:
+        raise LogError(f"{name}: empty file; nothing was recorded in it")
+    if _read(fd, 0, len(MAGIC)) != MAGIC:
+        raise LogError(f"{name}: not an MCAP file; give a log that disco-hw has recorded")
+    try:
+        return _indexed(fd, size)
+    except DamagedError as damage:
+        contents = _scanned(fd, size)
+        if contents.whole_bytes == size:
+            contents.damage.append(f"the index at the end is unusable: {damage}")
+        return contents
+
+
+def _scanned(fd: int, size: int) -> Contents:
+    """Contents from walking the file, with every chunk checked; after damage it goes on with the next whole chunk."""
+    contents = Contents(size=size)
+    offset = len(MAGIC)
+    while True:
+        contents.whole_bytes = offset
+        head = _read(fd, offset, _HEAD.size)
+        opcode, length = _HEAD.unpack(head) if len(head) == _HEAD.size else (0, 0)
+        content = offset + _HEAD.size
+        if opcode == Opcode.DATA_END:
+            contents.whole_bytes = size
+            return contents
+        follows = content + length
+        trouble = ""
+        if not Opcode.HEADER <= opcode <= Opcode.DATA_END or follows > size:
+            trouble = "no record"
+        else:
+            try:
+                _take(fd, contents, opcode, content, length)
+            except DamagedError as damage:
+                trouble = str(damage)
+        if trouble and (opcode not in _FRONT_MATTER or follows > size):
+            # Of a damaged chunk the length is in doubt as well.
+            found = _next_chunk(fd, offset + 1, size)
+            if found is None:
+                contents.damage.append(_broken_end(size - offset))
+                return contents
+            follows = found
+        if trouble:
+            contents.damage.append(f"at byte {offset}: {trouble}; {follows - offset} bytes are lost")
+        offset = follows
+
+
+def _broken_end(missing: int) -> str:
+    why = "the end is missing: the writer was killed or is still at work, or the file was cut"
+    return f"{why}; the last {missing} bytes are an unfinished record" if missing else why
+
+
+def _next_chunk(fd: int, start: int, size: int) -> int | None:
+    """Where the next chunk record seems to begin at or after `start`: its content has a name of compression in it."""
+    at = start + _CHUNK_MARK_AT
+    while at < size:
+        block = _read(fd, at, _SEARCH_BYTES)
+        found = block.find(_CHUNK_MARK)
+        while found >= 0:
+            candidate = at + found - _CHUNK_MARK_AT
+            if _read(fd, candidate, 1) == bytes([Opcode.CHUNK]):
+                return candidate
+            found = block.find(_CHUNK_MARK, found + 1)
+        at += _SEARCH_BYTES - len(_CHUNK_MARK) + 1
+    return None
+
+
+def read_chunk(fd: int, chunk: ChunkRef) -> bytes:
+    """The records inside a chunk, checked against its CRC; raises DamagedError."""
+    record = _parse(Chunk, _content(fd, chunk.offset, chunk.length))
+    if record.uncompressed_size > _LARGEST:
+        raise DamagedError(f"a chunk that claims {record.uncompressed_size} bytes")
+    try:
+        data = _decompress(record)
+    except _PARSE_ERRORS as error:
+        raise DamagedError(f"a chunk that cannot be decompressed ({error})") from None
+    if len(data) != record.uncompressed_size:
+        raise DamagedError("a chunk of the wrong size")
+    if record.uncompressed_crc and zlib.crc32(data) != record.uncompressed_crc:
+        raise DamagedError("a chunk with a wrong checksum")
+    return data
+
+
+def read_attachment(fd: int, attachment: AttachmentRef) -> bytes:
+    """The bytes of an attachment, checked against its CRC; raises DamagedError."""
+    return bytes(_checked_attachment(_content(fd, attachment.offset, attachment.length)).data)
+
+
+def _checked_attachment(content: bytes) -> Attachment:
+    record = _parse(Attachment, content)
+    crc = int.from_bytes(content[-4:], "little")
+    if crc and zlib.crc32(content[:-4]) != crc:
+        raise DamagedError(f"the attachment {record.name} has a wrong checksum")
+    return record
+
+
+def messages(chunk_data: bytes, wanted: Collection[int] | None = None) -> Iterator[Message]:
+    """The messages in a chunk's data, of the wanted channels or of all, in file order; raises DamagedError."""
+    for opcode, start, end in _inner(chunk_data):
+        if opcode != Opcode.MESSAGE:
+            continue
+        if end - start < _MESSAGE.size:
+            raise DamagedError("a message that is too short")
+        channel_id, sequence, log_time, publish_time = _MESSAGE.unpack_from(chunk_data, start)
+        if wanted is None or channel_id in wanted:
+            yield Message(channel_id, sequence, log_time, publish_time, chunk_data[start + _MESSAGE.size : end])
+
+
+def _inner(data: bytes) -> Iterator[tuple[int, int, int]]:
+    """Opcode, start and end of the content of each record."""
+    offset, size = 0, len(data)
+    while offset < size:
+        if size - offset < _HEAD.size:
+            raise DamagedError("a record that is cut off")
+        opcode, length = _HEAD.unpack_from(data, offset)
+        start = offset + _HEAD.size
+        if length > size - start:
+            raise DamagedError("a record that reaches beyond its chunk")
+        offset = start + length
+        yield opcode, start, offset
+
+
+def _indexed(fd: int, size: int) -> Contents:
+    """Contents from the index at the end of a complete file; raises DamagedError if there is none to rely on."""
+    tail = _read(fd, max(0, size - _FOOTER_BYTES - len(MAGIC)), _FOOTER_BYTES + len(MAGIC))
+    if len(tail) < _FOOTER_BYTES + len(MAGIC) or tail[-len(MAGIC) :] != MAGIC:
+        raise DamagedError("no end mark")
+    opcode, length = _HEAD.unpack_from(tail)
+    footer_at = size - _FOOTER_BYTES - len(MAGIC)
+    if opcode != Opcode.FOOTER or length != _FOOTER_BYTES - _HEAD.size:
+        raise DamagedError("no footer")
+    footer = _parse(Footer, tail[_HEAD.size : -len(MAGIC)])
+    if not len(MAGIC) <= footer.summary_start <= footer_at:
+        raise DamagedError("no index")
+    summary = _content(fd, footer.summary_start, footer_at - footer.summary_start)
+    if footer.summary_crc and zlib.crc32(summary + tail[: _FOOTER_BYTES - 4]) != footer.summary_crc:
+        raise DamagedError("an index with a wrong checksum")
+    contents = Contents(size=size, complete=True, whole_bytes=size)
+    statistics: Statistics | None = None
+    for opcode, start, end in _inner(summary):
+        content = summary[start:end]
+        if opcode == Opcode.SCHEMA:
+            schema = _parse(Schema, content)
+            contents.schemas[schema.id] = schema
+        elif opcode == Opcode.CHANNEL:
+            channel = _parse(Channel, content)
+            contents.channels[channel.id] = channel
+        elif opcode == Opcode.STATISTICS:
+            statistics = _parse(Statistics, content)
+        elif opcode == Opcode.CHUNK_INDEX:
+            chunk = _parse(ChunkIndex, content)
+            offset, length = chunk.chunk_start_offset + _HEAD.size, chunk.chunk_length - _HEAD.size
+            contents.chunks.append(ChunkRef(offset, length, chunk.message_start_time, chunk.message_end_time))
+        elif opcode == Opcode.ATTACHMENT_INDEX:
+            kept = _parse(AttachmentIndex, content)
+            offset, length = kept.offset + _HEAD.size, kept.length - _HEAD.size
+            contents.attachments.append(
+                AttachmentRef(offset, length, kept.log_time, kept.name, kept.media_type, kept.data_size)
+            )
+        elif opcode == Opcode.METADATA_INDEX:
+            about = _parse(MetadataIndex, content)
+            contents.metadata.append(
+                _parse(Metadata, _content(fd, about.offset + _HEAD.size, about.length - _HEAD.size))
+            )
+    if statistics is None or not contents.chunks:
+        raise DamagedError("an index without chunks")
+    contents.counts.update(statistics.channel_message_counts)
+    return contents
+
+
+def _take(fd: int, contents: Contents, opcode: int, offset: int, length: int) -> None:
+    """Note one top-level record; raises DamagedError."""
+    if opcode == Opcode.CHUNK:
+        _take_chunk(fd, contents, offset, length)
+    elif opcode == Opcode.ATTACHMENT:
+        record = _checked_attachment(_content(fd, offset, length))
+        contents.attachments.append(
+            AttachmentRef(offset, length, record.log_time, record.name, record.media_type, len(record.data))
+        )
+    elif opcode == Opcode.METADATA:
+        contents.metadata.append(_parse(Metadata, _content(fd, offset, length)))
+
+
+def _take_chunk(fd: int, contents: Contents, offset: int, length: int) -> None:
+    chunk = ChunkRef(offset, length, 0, 0)
+    data = read_chunk(fd, chunk)
+    schemas: dict[int, Schema] = {}
+    channels: dict[int, Channel] = {}
+    for opcode, start, end in _inner(data):
+        if opcode == Opcode.SCHEMA:
+            schema = _parse(Schema, data[start:end])
+            schemas[schema.id] = schema
+        elif opcode == Opcode.CHANNEL:
+            channel = _parse(Channel, data[start:end])
+            channels[channel.id] = channel
+    counts = Counter[int]()
+    first, last = 0, 0
+    for message in messages(data):
+        first = message.log_time if not counts else first
+        last = message.log_time
+        counts[message.channel_id] += 1
+    contents.schemas.update(schemas)
+    contents.channels.update(channels)
+    contents.counts.update(counts)
+    contents.chunks.append(ChunkRef(offset, length, first, last))
+
+
+def _decompress(record: Chunk) -> bytes:
+    if record.compression == "zstd":
+        size = zstandard.frame_content_size(record.data)
+        if size not in (-1, record.uncompressed_size):
+            raise DamagedError("a chunk of the wrong size")
+        return zstandard.decompress(record.data, max_output_size=max(1, record.uncompressed_size))
+    if record.compression == "":
+        return bytes(record.data)
+    raise DamagedError(f"a chunk compressed with {record.compression!r}, which is not known here")
+
+
+def _content(fd: int, offset: int, length: int) -> bytes:
+    if not 0 <= length <= _LARGEST:
+        raise DamagedError(f"a record of {length} bytes")
+    data = _read(fd, offset, length)
+    if len(data) != length:
+        raise DamagedError("a record that reaches beyond the file")
+    return data
+
+
+def _read(fd: int, offset: int, length: int) -> bytes:
+    """Up to `length` bytes; fewer only at the end of the file."""
+    parts = []
+    while length > 0:
+        part = os.pread(fd, length, offset) if offset <= _LARGEST_OFFSET else b""
+        if not part:
+            break
+        parts.append(part)
+        offset += len(part)
+        length -= len(part)
+    return b"".join(parts)
+
+
+def _parse(record: type[_T], content: bytes) -> _T:
+    read: Callable[[Any], _T] = record.read  # type: ignore[attr-defined]
+    try:
+        return read(ReadDataStream(BytesIO(content)))
+    except _PARSE_ERRORS as error:
+        raise DamagedError(f"a {record.__name__.lower()} record that cannot be read ({error})") from None

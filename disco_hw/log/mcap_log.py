@@ -1,0 +1,180 @@
+"""Batches of records -> an MCAP file: channels, schemas, times, attachments. No clock, no socket.
+
+Log time is the wall time of the tick that recorded a message, the same for all of a tick and never decreasing;
+publish time is the wall time of the record's own `t_ns`. The sequence number is that of the tick, so a gap in it
+counts the ticks that were lost on the way.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import IO, Protocol, cast
+
+import msgspec
+from mcap.well_known import MessageEncoding, SchemaEncoding
+from mcap.writer import CompressionType, Writer
+from mcap_protobuf.schema import build_file_descriptor_set
+
+from disco_hw.log.encoding import encode_json, json_schema
+from disco_hw.log.foxglove import VIEWS, views
+from disco_hw.log.link import Batch, BatchDecoder, Start
+from disco_hw.log.records import TOPICS
+
+PROFILE = ""
+LIBRARY = "disco-hw"
+METADATA = "disco-hw"
+RECOVERY = "disco-hw-recovery"
+FORMAT = "1"
+CHUNK_BYTES = 64 * 1024
+
+_NO_LIMIT = 2**62
+_MESSAGE_OVERHEAD = 31
+_MAX_TIME_NS = 2**64 - 1
+
+
+class ByteSink(Protocol):
+    """What a log is written to: append-only bytes."""
+
+    def write(self, data: bytes) -> int:
+        """Append all of the bytes; raises OSError if that fails."""
+
+    def tell(self) -> int:
+        """The number of bytes written."""
+
+    def flush(self) -> None:
+        """Hand everything on to the operating system."""
+
+
+@dataclass(frozen=True, slots=True)
+class Metadata:
+    """What the log says of itself: wall-clock time is monotonic time plus `wall_offset_ns`."""
+
+    robot: str
+    version: str
+    part: int
+    start_ns: int
+    wall_offset_ns: int
+
+    def as_text(self) -> dict[str, str]:
+        """The form kept in the file."""
+        return {
+            "format": FORMAT,
+            "robot": self.robot,
+            "version": self.version,
+            "part": str(self.part),
+            "start_ns": str(self.start_ns),
+            "wall_offset_ns": str(self.wall_offset_ns),
+        }
+
+    @staticmethod
+    def from_text(text: dict[str, str]) -> Metadata:
+        """Read what `as_text` wrote; raises KeyError or ValueError on anything else."""
+        return Metadata(
+            robot=text["robot"],
+            version=text["version"],
+            part=int(text["part"]),
+            start_ns=int(text["start_ns"]),
+            wall_offset_ns=int(text["wall_offset_ns"]),
+        )
+
+
+class McapLog:
+    """An MCAP file in the making; raises OSError from the sink.
+
+    A record that cannot be decoded is refused and counted, never raised: the rest of its tick is kept. A tick is never
+    split between chunks, so whatever cuts the file short, a tick is in it whole or not at all.
+    """
+
+    def __init__(self, sink: ByteSink, start: Start) -> None:
+        # The library's annotation asks for a whole file; it uses the three calls of ByteSink.
+        self._writer = Writer(cast("IO[bytes]", sink), chunk_size=_NO_LIMIT, compression=CompressionType.ZSTD)
+        self._decoder = BatchDecoder()
+        self._offset_ns = start.wall_offset_ns
+        self._pending_bytes = 0
+        self._records = 0
+        self._refused = 0
+        self._last_refusal = ""
+        self._writer.start(profile=PROFILE, library=LIBRARY)
+        wall_ns = start.start_ns + start.wall_offset_ns
+        metadata = Metadata(start.robot, start.version, start.part, start.start_ns, start.wall_offset_ns)
+        self._writer.add_metadata(METADATA, metadata.as_text())
+        for attachment in start.attachments:
+            self._writer.add_attachment(wall_ns, wall_ns, attachment.name, attachment.media_type, attachment.data)
+        self._channels = tuple(self._json_channel(topic.name, topic.record) for topic in TOPICS)
+        self._view_channels = self._register_views()
+        self._writer.flush()  # type: ignore[no-untyped-call]
+
+    @property
+    def records(self) -> int:
+        """Records written."""
+        return self._records
+
+    @property
+    def refused(self) -> int:
+        """Records and whole messages that were not what they should be, and are not in the file."""
+        return self._refused
+
+    @property
+    def last_refusal(self) -> str:
+        """The newest refusal in words, or empty."""
+        return self._last_refusal
+
+    def write(self, message: bytes) -> None:
+        """Write the records of one message of the recorder."""
+        try:
+            batch = self._decoder.batch(message)
+        except msgspec.MsgspecError as error:
+            self._refuse(f"a message of {len(message)} bytes: {error}")
+            return
+        log_time = batch.now_ns + self._offset_ns
+        if not 0 <= log_time <= _MAX_TIME_NS:
+            self._refuse(f"a tick at the impossible time {batch.now_ns}")
+            return
+        for topic_index, data in batch.records:
+            self._write_record(batch, log_time, topic_index, data)
+        if self._pending_bytes > CHUNK_BYTES:
+            self.flush()
+
+    def flush(self) -> None:
+        """End the chunk and hand it on, so that a reader can have everything written so far."""
+        self._writer.flush()  # type: ignore[no-untyped-call]
+        self._pending_bytes = 0
+
+    def finish(self) -> None:
+        """Write the index; nothing can be written after it."""
+        self._writer.finish()  # type: ignore[no-untyped-call]
+
+    def _write_record(self, batch: Batch, log_time: int, topic_index: int, data: msgspec.Raw) -> None:
+        try:
+            record = self._decoder.record(topic_index, data)
+        except msgspec.MsgspecError as error:
+            self._refuse(f"topic {topic_index}: {error}")
+            return
+        publish_time = min(max(record.t_ns + self._offset_ns, 0), _MAX_TIME_NS)
+        payloads = [(self._channels[topic_index], encode_json(record))]
+        payloads += [(self._view_channels[topic], payload) for topic, payload in views(record, publish_time)]
+        for channel, payload in payloads:
+            self._writer.add_message(channel, log_time, payload, publish_time, batch.sequence & 0xFFFFFFFF)
+            self._pending_bytes += len(payload) + _MESSAGE_OVERHEAD
+        self._records += 1
+
+    def _refuse(self, why: str) -> None:
+        self._refused += 1
+        self._last_refusal = why
+
+    def _json_channel(self, topic: str, record: type) -> int:
+        schema = self._writer.register_schema(
+            f"disco_hw.{record.__name__}", SchemaEncoding.JSONSchema, json_schema(record)
+        )
+        return self._writer.register_channel(topic, MessageEncoding.JSON, schema)
+
+    def _register_views(self) -> dict[str, int]:
+        schemas: dict[str, int] = {}
+        channels: dict[str, int] = {}
+        for topic, message_class in VIEWS:
+            name = message_class.DESCRIPTOR.full_name
+            if name not in schemas:
+                descriptor = build_file_descriptor_set(message_class).SerializeToString()
+                schemas[name] = self._writer.register_schema(name, SchemaEncoding.Protobuf, descriptor)
+            channels[topic] = self._writer.register_channel(topic, MessageEncoding.Protobuf, schemas[name])
+        return channels

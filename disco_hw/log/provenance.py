@@ -1,0 +1,42 @@
+"""What a log says about where it comes from: the software's version, and copies of the files it ran with."""
+
+from __future__ import annotations
+
+import subprocess
+from importlib import metadata
+from pathlib import Path
+
+from disco_hw.log.errors import LogError
+from disco_hw.log.link import Attachment
+
+ROBOT_TOML = "robot.toml"
+MODEL_TOML = "model.toml"
+DBC = "disco_robot.dbc"
+
+_MEDIA_TYPES = {".toml": "application/toml", ".json": "application/json"}
+
+
+def software_version() -> str:
+    """The package's version, with the commit when it runs from a checkout: "0.1.0+g1a2b3c4" or "...-dirty"."""
+    try:
+        version = metadata.version("disco-hw")
+    except metadata.PackageNotFoundError:
+        version = "unknown"
+    root = Path(__file__).parents[2]
+    if not (root / ".git").exists():
+        return version
+    describe = ["git", "-C", str(root), "describe", "--always", "--dirty", "--exclude=*"]
+    try:
+        commit = subprocess.run(describe, capture_output=True, text=True, timeout=5.0, check=True).stdout.strip()
+    except (OSError, subprocess.SubprocessError):
+        return version
+    return f"{version}+g{commit}"
+
+
+def attachment(path: Path, name: str | None = None) -> Attachment:
+    """A copy of a file for the log, under its own name or another; raises LogError if it cannot be read."""
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise LogError(f"{path}: cannot be read ({error.strerror}); it is kept in every log") from None
+    return Attachment(name or path.name, _MEDIA_TYPES.get(path.suffix, "text/plain"), data)

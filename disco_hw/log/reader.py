@@ -1,0 +1,265 @@
+"""Opens a log, whole or cut short, and gives its records back typed and in the order in which they were recorded."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Collection, Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+from types import TracebackType
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from disco_hw.log.columns import to_columns
+from disco_hw.log.container import (
+    ChunkRef,
+    Contents,
+    DamagedError,
+    Message,
+    messages,
+    read_attachment,
+    read_chunk,
+    read_contents,
+)
+from disco_hw.log.encoding import JsonDecoder
+from disco_hw.log.errors import LogError
+from disco_hw.log.mcap_log import METADATA, RECOVERY, Metadata
+from disco_hw.log.records import TOPIC_BY_NAME, Record
+
+_RECOVER = "run `disco-hw log recover` and use the mended log"
+
+
+class Entry(NamedTuple):
+    """One record as it was recorded: in the tick at `now_ns` (monotonic), the `tick`-th that the recorder was given."""
+
+    topic: str
+    now_ns: int
+    tick: int
+    record: Record
+
+
+class TopicSummary(msgspec.Struct, frozen=True):
+    """How much of one topic there is."""
+
+    count: int
+    rate_hz: float
+
+
+class LogSummary(msgspec.Struct, frozen=True):
+    """What a log holds; `missing_ticks` were dropped on the way to the file, `damage` says what of the file is lost."""
+
+    path: str
+    bytes: int
+    complete: bool
+    robot: str
+    version: str
+    part: int
+    start: str
+    duration_s: float
+    ticks: int
+    missing_ticks: int
+    topics: dict[str, TopicSummary]
+    attachments: dict[str, int]
+    damage: tuple[str, ...]
+
+
+class Log:
+    """An open log; use it in a `with` statement. Times are monotonic ns unless the name says wall.
+
+    Reading raises LogError on a damaged chunk of a log that is complete otherwise; of a log without its index the
+    damaged chunks have been left out already, and `damage` says so.
+    """
+
+    def __init__(self, path: Path) -> None:
+        try:
+            self._fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+        except OSError as error:
+            raise LogError(f"{path}: cannot be opened ({error.strerror}); give the path of a log") from None
+        self._path = path
+        try:
+            self._contents = _contents(self._fd, path)
+            self._metadata = _metadata(self._contents, path)
+        except BaseException:
+            self.close()
+            raise
+        self._decoder = JsonDecoder()
+        self._topics = {
+            channel.id: channel.topic
+            for channel in self._contents.channels.values()
+            if channel.topic in TOPIC_BY_NAME and channel.message_encoding == "json"
+        }
+
+    def __enter__(self) -> Log:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the file; safe to call twice."""
+        if self._fd >= 0:
+            os.close(self._fd)
+            self._fd = -1
+
+    @property
+    def path(self) -> Path:
+        """The file."""
+        return self._path
+
+    @property
+    def complete(self) -> bool:
+        """Whether the log was ended properly."""
+        return self._contents.complete
+
+    @property
+    def damage(self) -> tuple[str, ...]:
+        """What is lost, in words; of a mended log, what was lost when it was mended."""
+        recovered = [record.metadata.get("lost", "") for record in self._contents.metadata if record.name == RECOVERY]
+        return (*self._contents.damage, *(line for text in recovered for line in text.splitlines()))
+
+    @property
+    def metadata(self) -> Metadata:
+        """What the log says of itself."""
+        return self._metadata
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Number of records of each topic that has any."""
+        counts = self._contents.counts
+        return {topic: counts[channel] for channel, topic in self._topics.items() if counts[channel]}
+
+    def records(
+        self, topics: Collection[str] | None = None, start_ns: int | None = None, end_ns: int | None = None
+    ) -> Iterator[Entry]:
+        """Records of these topics (all if None) from ticks at start_ns <= now_ns < end_ns, in recorded order.
+
+        Raises LogError for a topic that no log has, and for damage.
+        """
+        offset = self._metadata.wall_offset_ns
+        decode = self._decoder.decode
+        names = self._topics
+        for message in self._messages(topics, start_ns, end_ns):
+            topic = names[message.channel_id]
+            try:
+                record = decode(topic, message.data)
+            except msgspec.MsgspecError as error:
+                raise LogError(f"{self._path}: a record of {topic} cannot be read ({error}); {_RECOVER}") from None
+            yield Entry(topic, message.log_time - offset, message.sequence, record)
+
+    def columns(
+        self, topic: str, start_ns: int | None = None, end_ns: int | None = None
+    ) -> dict[str, NDArray[np.generic]]:
+        """All records of a topic as one array a field, shape (N, ...), and the tick's time as `now_ns`.
+
+        Tuples of one length become (N, k) arrays, of different lengths arrays of objects; a mapping gives one array
+        `field.key` for each key.
+        """
+        now_ns: list[int] = []
+        records: list[Record] = []
+        for entry in self.records((topic,), start_ns, end_ns):
+            now_ns.append(entry.now_ns)
+            records.append(entry.record)
+        return to_columns(TOPIC_BY_NAME[topic].record, now_ns, records)
+
+    def attachment_names(self) -> tuple[str, ...]:
+        """Names of the files kept in the log."""
+        return tuple(ref.name for ref in self._contents.attachments)
+
+    def attachment(self, name: str) -> bytes:
+        """The content of a file kept in the log; raises LogError if it is not there or damaged."""
+        for ref in self._contents.attachments:
+            if ref.name == name:
+                try:
+                    return read_attachment(self._fd, ref)
+                except DamagedError as damage:
+                    raise LogError(f"{self._path}: {damage}; {_RECOVER}") from None
+        raise LogError(f"{self._path}: holds no {name}; it holds {', '.join(self.attachment_names()) or 'no files'}")
+
+    def summary(self) -> LogSummary:
+        """What the log holds; reads the whole file once. Raises LogError for damage."""
+        ticks, missing = 0, 0
+        first, last = 0, 0
+        # Ticks are numbered from 1 on, in all parts of a log together.
+        previous = 0 if self._metadata.part == 1 else None
+        for message in self._messages(None, None, None):
+            if ticks and message.sequence == previous:
+                continue
+            if previous is not None:
+                missing += (message.sequence - previous - 1) & 0xFFFFFFFF
+            previous = message.sequence
+            first = first if ticks else message.log_time
+            last = message.log_time
+            ticks += 1
+        duration_s = (last - first) * 1e-9
+        return LogSummary(
+            path=str(self._path),
+            bytes=self._contents.size,
+            complete=self.complete,
+            robot=self._metadata.robot,
+            version=self._metadata.version,
+            part=self._metadata.part,
+            start=_iso(self._metadata.start_ns + self._metadata.wall_offset_ns),
+            duration_s=duration_s,
+            ticks=ticks,
+            missing_ticks=missing,
+            topics={
+                topic: TopicSummary(count, count / duration_s if duration_s > 0.0 else 0.0)
+                for topic, count in self.counts.items()
+            },
+            attachments={ref.name: ref.size for ref in self._contents.attachments},
+            damage=self.damage,
+        )
+
+    def _messages(self, topics: Collection[str] | None, start_ns: int | None, end_ns: int | None) -> Iterator[Message]:
+        unknown = [topic for topic in topics or () if topic not in TOPIC_BY_NAME]
+        if unknown:
+            raise LogError(f"{unknown[0]}: no such topic; there are {', '.join(TOPIC_BY_NAME)}")
+        wanted = {channel for channel, topic in self._topics.items() if topics is None or topic in topics}
+        offset = self._metadata.wall_offset_ns
+        start = None if start_ns is None else start_ns + offset
+        end = None if end_ns is None else end_ns + offset
+        for chunk in self._contents.chunks:
+            if (start is not None and chunk.end_time < start) or (end is not None and chunk.start_time >= end):
+                continue
+            for message in self._chunk_messages(chunk, wanted):
+                if (start is None or message.log_time >= start) and (end is None or message.log_time < end):
+                    yield message
+
+    def _chunk_messages(self, chunk: ChunkRef, wanted: Collection[int]) -> Iterator[Message]:
+        try:
+            yield from messages(read_chunk(self._fd, chunk), wanted)
+        except DamagedError as damage:
+            raise LogError(f"{self._path}: at byte {chunk.offset}: {damage}; {_RECOVER}") from None
+
+
+def open_log(path: Path) -> Log:
+    """Open a log of ours; raises LogError, with one line for the user, if it is none."""
+    return Log(path)
+
+
+def _contents(fd: int, path: Path) -> Contents:
+    try:
+        return read_contents(fd, str(path))
+    except OSError as error:
+        raise LogError(f"{path}: cannot be read ({error.strerror})") from None
+
+
+def _metadata(contents: Contents, path: Path) -> Metadata:
+    for record in contents.metadata:
+        if record.name == METADATA:
+            try:
+                return Metadata.from_text(record.metadata)
+            except (KeyError, ValueError):
+                break
+    if contents.chunks:
+        raise LogError(f"{path}: an MCAP file, but not a log of disco-hw; see `disco-hw import`")
+    raise LogError(f"{path}: nothing of the log is left but its first bytes; there is nothing to read")
+
+
+def _iso(wall_ns: int) -> str:
+    return datetime.fromtimestamp(wall_ns * 1e-9, UTC).isoformat(timespec="milliseconds")

@@ -1,0 +1,203 @@
+"""What a log holds: one frozen record type for each topic, the one source of its content and of its schema.
+
+Every record carries `t_ns`, the monotonic host time at which it was true. Left before right, x forward, y left, yaw
+counter-clockwise; SI units. Fields are plain on purpose (numbers, text, flat tuples, string-keyed counts): viewers
+read the schema made from them without a plug-in. Adding a field with a default keeps old logs readable.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from math import nan
+from types import MappingProxyType
+from typing import Literal
+
+import msgspec
+
+from drivers.types import MotorSample, PoseSample, PowerSample, RobotLinkHealth, RobotStatus, WheelSample
+
+Level = Literal["debug", "info", "warning", "error", "fatal"]
+
+
+class FrameIn(msgspec.Struct, frozen=True, gc=False):
+    """A frame as it came in at `t_ns`."""
+
+    t_ns: int
+    can_id: int
+    data: bytes
+
+
+class FrameOut(msgspec.Struct, frozen=True, gc=False):
+    """A frame handed to the link at `t_ns`; `sent` is False if the link refused it or it was too late to send."""
+
+    t_ns: int
+    can_id: int
+    data: bytes
+    deadline_ns: int
+    sent: bool = True
+
+
+class Estimate(msgspec.Struct, frozen=True, gc=False):
+    """Fused pose and motion in the world frame; `covariance` is 3 x 3 of (x, y, yaw), row-major, in m and rad."""
+
+    t_ns: int
+    x_m: float
+    y_m: float
+    yaw_rad: float
+    covariance: tuple[float, ...]
+    speed_m_s: float
+    yaw_rate_rad_s: float
+    left_speed_rad_s: float
+    right_speed_rad_s: float
+    wheels_healthy: bool = True
+    pose_healthy: bool = True
+
+
+class Innovation(msgspec.Struct, frozen=True, gc=False):
+    """What the filter made of one measured pose.
+
+    `innovation` is measured minus predicted (x, y, yaw), `variance` the diagonal of its covariance S, `test_ratio` the
+    squared Mahalanobis distance over the gate (accepted at or below 1), `reason` why the pose was not used.
+    """
+
+    t_ns: int
+    innovation: tuple[float, ...]
+    variance: tuple[float, ...]
+    test_ratio: float
+    accepted: bool
+    reason: str = ""
+
+
+class Plan(msgspec.Struct, frozen=True, gc=False):
+    """A plan made at `t_ns`: wheel speeds from `t0_ns` on, each held for `step_s`; the predicted path may be empty."""
+
+    t_ns: int
+    t0_ns: int
+    step_s: float
+    left_rad_s: tuple[float, ...]
+    right_rad_s: tuple[float, ...]
+    effective_samples: float = nan
+    temperature: float = nan
+    min_cost: float = nan
+    mean_cost: float = nan
+    instant_cost: float = nan
+    path_x_m: tuple[float, ...] = ()
+    path_y_m: tuple[float, ...] = ()
+    path_yaw_rad: tuple[float, ...] = ()
+
+
+class Command(msgspec.Struct, frozen=True, gc=False):
+    """The wheel command of one tick as it was asked for and as it was sent.
+
+    `source` says who asked (plan, tail of an old plan, ramp, manual, ...), `limits` what changed it on the way, and
+    `in_force` is False while the robot is not armed, when nothing is commanded. `plan_age_ns` is -1 without a plan.
+    """
+
+    t_ns: int
+    requested_left_rad_s: float
+    requested_right_rad_s: float
+    left_rad_s: float
+    right_rad_s: float
+    valid_for_s: float
+    in_force: bool
+    source: str = ""
+    limits: tuple[str, ...] = ()
+    plan_age_ns: int = -1
+
+
+class LoopTiming(msgspec.Struct, frozen=True, gc=False):
+    """Timing of one tick: `t_ns` is the planned wake-up; overruns and skipped periods are totals since the start."""
+
+    t_ns: int
+    tick: int
+    woke_ns: int
+    lateness_ns: int
+    stages_ns: dict[str, int]
+    overruns: int = 0
+    skipped: int = 0
+
+
+class DaemonState(msgspec.Struct, frozen=True, gc=False):
+    """A change of the daemon's state, and why."""
+
+    t_ns: int
+    state: str
+    previous: str
+    reason: str = ""
+
+
+class Event(msgspec.Struct, frozen=True, gc=False):
+    """Something a person should know; `code` is stable for machines, `text` is one sentence."""
+
+    t_ns: int
+    level: Level
+    code: str
+    text: str
+
+
+class Counters(msgspec.Struct, frozen=True, gc=False):
+    """Every counter of the stack, about once a second: totals since the start by name, grouped by who counts."""
+
+    t_ns: int
+    transport: dict[str, int] = {}
+    driver: dict[str, int] = {}
+    fusion: dict[str, int] = {}
+    recorder: dict[str, int] = {}
+    loop: dict[str, int] = {}
+
+
+Record = (
+    FrameIn
+    | FrameOut
+    | WheelSample
+    | PoseSample
+    | MotorSample
+    | PowerSample
+    | RobotStatus
+    | RobotLinkHealth
+    | Estimate
+    | Innovation
+    | Plan
+    | Command
+    | LoopTiming
+    | DaemonState
+    | Event
+    | Counters
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """A name in the log and the one record type found under it."""
+
+    name: str
+    record: type[Record]
+
+
+TOPICS: tuple[Topic, ...] = (
+    Topic("/can/rx", FrameIn),
+    Topic("/can/tx", FrameOut),
+    Topic("/wheels", WheelSample),
+    Topic("/pose", PoseSample),
+    Topic("/motor", MotorSample),
+    Topic("/power", PowerSample),
+    Topic("/robot/status", RobotStatus),
+    Topic("/robot/link", RobotLinkHealth),
+    Topic("/estimate", Estimate),
+    Topic("/estimate/innovation", Innovation),
+    Topic("/plan", Plan),
+    Topic("/command", Command),
+    Topic("/loop", LoopTiming),
+    Topic("/daemon/state", DaemonState),
+    Topic("/event", Event),
+    Topic("/counters", Counters),
+)
+
+TOPIC_INDEX: Mapping[type, int] = MappingProxyType({topic.record: index for index, topic in enumerate(TOPICS)})
+TOPIC_BY_NAME: Mapping[str, Topic] = MappingProxyType({topic.name: topic for topic in TOPICS})
+
+
+def topic_of(record_type: type[Record]) -> str:
+    """The topic under which records of this type are found; KeyError if the type is none of ours."""
+    return TOPICS[TOPIC_INDEX[record_type]].name
