@@ -1,0 +1,164 @@
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from disco_hw.daemon.clock import MonotonicClock, SimulatedClock
+from disco_hw.daemon.loop import Loop
+
+PERIOD_NS = 20_000_000
+MS_NS = 1_000_000
+
+
+class Run:
+    """A loop at 50 Hz on a simulated clock whose ticks last as long as told, then nothing."""
+
+    def __init__(self, durations_ns, wake_late_ns=()):
+        self.clock = LateClock(wake_late_ns)
+        self.loop = Loop(self.clock, 50.0)
+        self.durations_ns = list(durations_ns)
+        self.starts_ns = []
+        self.loop.run(self.tick, lambda: not self.durations_ns)
+        self.stats = self.loop.stats
+
+    def tick(self, now_ns):
+        assert now_ns == self.clock.now_ns()
+        self.starts_ns.append(now_ns)
+        self.clock.advance_ns(self.durations_ns.pop(0))
+
+
+class LateClock(SimulatedClock):
+    """Wakes up late by the given times, then on time."""
+
+    def __init__(self, wake_late_ns):
+        super().__init__()
+        self.wake_late_ns = list(wake_late_ns)
+
+    def sleep_until_ns(self, deadline_ns):
+        super().sleep_until_ns(deadline_ns)
+        if self.wake_late_ns:
+            self.advance_ns(self.wake_late_ns.pop(0))
+
+
+def test_ticks_lie_on_the_grid_whatever_they_take():
+    run = Run([3 * MS_NS, 0, 19 * MS_NS, 20 * MS_NS, 1] * 20)
+    assert run.starts_ns == [k * PERIOD_NS for k in range(100)]
+    assert run.stats.ticks == 100
+    assert (run.stats.overruns, run.stats.skipped_periods) == (0, 0)
+    assert run.stats.lateness.max_ns == 0
+    assert run.stats.duration.max_ns == 20 * MS_NS
+    assert run.stats.period.max_ns == PERIOD_NS
+
+
+def test_late_wake_ups_do_not_accumulate():
+    run = Run([MS_NS] * 100, [5 * MS_NS] * 100)
+    assert run.starts_ns == [k * PERIOD_NS + 5 * MS_NS for k in range(100)]
+    assert run.stats.lateness.mean_ns == 5 * MS_NS
+    assert run.stats.last_lateness_ns == 5 * MS_NS
+
+
+def test_a_short_overrun_is_served_late_and_the_grid_is_kept():
+    run = Run([25 * MS_NS, MS_NS, MS_NS])
+    assert run.starts_ns == [0, 25 * MS_NS, 40 * MS_NS]
+    assert (run.stats.overruns, run.stats.skipped_periods) == (1, 0)
+
+
+def test_a_long_overrun_skips_whole_periods_without_a_burst():
+    run = Run([95 * MS_NS, MS_NS, MS_NS])
+    # 20 to 80 ms are missed by more than half a period; 100 ms is next.
+    assert run.starts_ns == [0, 100 * MS_NS, 120 * MS_NS]
+    assert (run.stats.overruns, run.stats.skipped_periods) == (1, 4)
+
+
+def test_a_stopped_process_skips_and_counts():
+    run = Run([MS_NS, MS_NS, MS_NS], [0, 10_000 * MS_NS])
+    assert run.starts_ns == [0, 10_020 * MS_NS, 10_040 * MS_NS]
+    assert run.stats.skipped_periods == 500
+    assert run.stats.overruns == 1
+
+
+@given(
+    st.lists(st.integers(0, 5 * PERIOD_NS) | st.integers(0, PERIOD_NS // 10), min_size=1, max_size=60),
+    st.lists(st.integers(0, 3 * PERIOD_NS) | st.just(0), max_size=60),
+)
+def test_whatever_is_late_there_is_no_burst_and_every_period_is_accounted_for(durations_ns, wake_late_ns):
+    run = Run(durations_ns, wake_late_ns)
+    gaps_ns = [after - before for before, after in zip(run.starts_ns, run.starts_ns[1:], strict=False)]
+    assert all(gap_ns >= PERIOD_NS // 2 for gap_ns in gaps_ns)
+    # The last tick that started served the deadline number ticks - 1 + skipped, less what was skipped after it.
+    served_deadline_ns = run.starts_ns[-1] - run.stats.last_lateness_ns
+    assert served_deadline_ns % PERIOD_NS == 0
+    last_skips = run.stats.skipped_periods - (served_deadline_ns // PERIOD_NS - (run.stats.ticks - 1))
+    assert last_skips >= 0
+    assert run.stats.ticks == len(durations_ns)
+
+
+def test_stopping_is_asked_after_the_sleep_so_no_tick_follows_the_request():
+    clock = SimulatedClock()
+    starts_ns = []
+    Loop(clock, 50.0).run(starts_ns.append, lambda: clock.now_ns() >= 2 * PERIOD_NS)
+    assert starts_ns == [0, PERIOD_NS]
+
+
+def test_an_exception_ends_the_loop_and_reaches_the_caller():
+    loop = Loop(SimulatedClock(), 50.0)
+
+    def tick(now_ns):
+        if now_ns == 3 * PERIOD_NS:
+            raise RuntimeError("broken plan")
+
+    with pytest.raises(RuntimeError, match="broken plan"):
+        loop.run(tick, lambda: False)
+    assert loop.stats.ticks == 3
+
+
+def test_stages_are_timed_from_mark_to_mark():
+    clock = SimulatedClock()
+    loop = Loop(clock, 50.0)
+    seen = []
+
+    def tick(now_ns):
+        clock.advance_ns(1 * MS_NS)
+        loop.stages.mark("receive")
+        clock.advance_ns(7 * MS_NS)
+        loop.stages.mark("plan")
+        if now_ns == 0:
+            clock.advance_ns(2 * MS_NS)
+            loop.stages.mark("status")
+        seen.append(loop.stages.last_ns())
+
+    loop.run(tick, lambda: len(seen) == 2)
+    assert seen[0] == {"receive": MS_NS, "plan": 7 * MS_NS, "status": 2 * MS_NS}
+    assert seen[1] == {"receive": MS_NS, "plan": 7 * MS_NS, "status": 0}
+    assert loop.stages.summary_s()["plan"]["max_s"] == 0.007
+
+
+def test_a_stage_marked_twice_adds_up():
+    clock = SimulatedClock()
+    timer = Loop(clock, 50.0).stages
+    timer.begin(clock.now_ns())
+    for _ in range(2):
+        clock.advance_ns(3 * MS_NS)
+        timer.mark("send")
+    assert timer.last_ns() == {"send": 6 * MS_NS}
+
+
+def test_summary_holds_every_figure_in_seconds():
+    summary = Run([25 * MS_NS, MS_NS]).stats.summary()
+    assert (summary["ticks"], summary["overruns"], summary["skipped_periods"]) == (2, 1, 0)
+    assert summary["duration"]["max_s"] == 0.025
+    assert set(summary) == {"ticks", "overruns", "skipped_periods", "lateness", "duration", "period"}
+
+
+@pytest.mark.parametrize("rate_hz", [0.0, -1.0, float("nan"), float("inf")])
+def test_absurd_rates_are_refused(rate_hz):
+    with pytest.raises(ValueError, match="rate_hz"):
+        Loop(SimulatedClock(), rate_hz)
+
+
+def test_on_the_wall_clock_the_deadlines_stay_on_the_grid():
+    loop = Loop(MonotonicClock(), 100.0)
+    deadlines_ns = []
+    loop.run(lambda now_ns: deadlines_ns.append(now_ns - loop.stats.last_lateness_ns), lambda: len(deadlines_ns) == 30)
+    assert all((deadline_ns - deadlines_ns[0]) % 10_000_000 == 0 for deadline_ns in deadlines_ns)
+    assert len(set(deadlines_ns)) == 30
+    assert deadlines_ns[-1] - deadlines_ns[0] == (29 + loop.stats.skipped_periods) * 10_000_000
