@@ -1,0 +1,201 @@
+"""The command `disco-hw`: each verb parses its arguments and calls one function.
+
+Verbs import what they need when they run, so that `estop` and `--help` need nothing else to be healthy.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from disco_hw.errors import InputError, WorkError
+
+app = typer.Typer(
+    name="disco-hw",
+    help="Driver stack for a skid-steer robot: fusion, DISCO stochastic MPC, virtual robot, recording.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+RobotFile = Annotated[Path, typer.Argument(metavar="ROBOT.toml", help="The robot's configuration (docs/robot.md).")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object for machines.")]
+ModelOption = Annotated[Path | None, typer.Option("--model", help="Use this model.toml instead of robot.toml's.")]
+
+
+def _print(result: dict[str, Any], as_json: bool, text: str) -> None:
+    print(json.dumps(result) if as_json else text)
+
+
+@app.command()
+def demo(
+    link: Annotated[str, typer.Option(help="can (mock bus) or serial (pseudo-terminal).")] = "can",
+    out: Annotated[Path, typer.Option(help="Directory for the log, the picture and the figures.")] = Path("out/demo"),
+    laps: Annotated[float, typer.Option(min=0.5, max=100.0, help="Laps to drive.")] = 1.5,
+    plant_seed: Annotated[int, typer.Option(min=0, help="Seed of the virtual robot's true parameters.")] = 1,
+    uncertainty: Annotated[str, typer.Option(help="ut, mc or point.")] = "ut",
+    as_json: AsJson = False,
+) -> None:
+    """Drive the paper's circle with a virtual robot in real time, end to end, and print the figures."""
+    from disco_hw.demo import DemoOptions, run_demo
+
+    result = run_demo(
+        DemoOptions(
+            link=link, out=out, laps=laps, plant_seed=plant_seed, uncertainty=uncertainty, show_progress=not as_json
+        )
+    )
+    if as_json:
+        print(json.dumps(result.as_dict()))
+    if not result.success:
+        raise typer.Exit(1)
+
+
+@app.command()
+def run(
+    robot: RobotFile,
+    model: ModelOption = None,
+    link: Annotated[str | None, typer.Option(help="Use this link instead of robot.toml's: can or serial.")] = None,
+    log_file: Annotated[Path | None, typer.Option("--log", help="Record to this file.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Run the on-robot daemon: connect, estimate, record; arm and start only when told to (`disco-hw ctl`)."""
+    from disco_hw.daemon.daemon import DaemonOptions, run_daemon
+
+    raise typer.Exit(run_daemon(DaemonOptions(robot=robot, model=model, link=link, log_file=log_file, as_json=as_json)))
+
+
+@app.command()
+def sim(
+    robot: RobotFile,
+    hide: Annotated[list[str] | None, typer.Option(metavar="EFFECT=VALUE", help="Give the plant this effect.")] = None,
+    model: ModelOption = None,
+    link: Annotated[str | None, typer.Option(help="Use this link instead of robot.toml's: can or serial.")] = None,
+    plant_seed: Annotated[
+        int | None, typer.Option(min=0, help="Draw the true parameters from the model's posterior with this seed.")
+    ] = None,
+    start: Annotated[
+        tuple[float, float, float] | None, typer.Option(metavar="X Y YAW", help="Start pose (m, m, rad).")
+    ] = None,
+    truth: Annotated[Path | None, typer.Option(help="Write the true motion to this CSV file.")] = None,
+    inject: Annotated[Path | None, typer.Option(help="Listen for faults to inject on this Unix socket.")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the sensors' and the ground's noise.")] = 1,
+    list_effects: Annotated[bool, typer.Option("--list-effects", help="List the effects and exit.")] = False,
+) -> None:
+    """Run the virtual robot alone, behind a CAN bus or a serial line."""
+    from disco_hw.virtual import SimOptions, effects_table, run_sim
+
+    if list_effects:
+        print(effects_table())
+        return
+    raise typer.Exit(
+        run_sim(
+            SimOptions(
+                robot=robot,
+                model=model,
+                link=link,
+                hide=tuple(hide or ()),
+                plant_seed=plant_seed,
+                start=start,
+                truth=truth,
+                inject=inject,
+                seed=seed,
+            )
+        )
+    )
+
+
+@app.command()
+def ctl(
+    robot: RobotFile,
+    do: Annotated[str, typer.Argument(help="arm, start, stop, disarm, reset, estop, status or quit.")],
+    as_json: AsJson = False,
+) -> None:
+    """Tell the running daemon what to do, or ask how it is."""
+    from disco_hw.daemon.client import ask, in_words
+
+    reply = ask(robot, do)
+    _print(reply, as_json, in_words(reply))
+    if not reply.get("ok", False):
+        raise typer.Exit(1)
+
+
+@app.command()
+def check(
+    robot: RobotFile,
+    link: Annotated[str | None, typer.Option(help="Use this link instead of robot.toml's: can or serial.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Preflight: link, firmware match, latency, bus load, real-time settings, limits. Nothing moves."""
+    from disco_hw.check import run_check
+
+    report = run_check(robot, link)
+    _print(report.as_dict(), as_json, report.as_text())
+    if not report.ok:
+        raise typer.Exit(1)
+
+
+@app.command()
+def estop(
+    robot: RobotFile,
+    link: Annotated[str | None, typer.Option(help="Use this link instead of robot.toml's: can or serial.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Stop the robot now, whatever state anything else is in."""
+    from disco_hw.emergency import stop_robot
+
+    outcome = stop_robot(robot, link)
+    _print(outcome.as_dict(), as_json, outcome.as_text())
+    if not outcome.sent:
+        raise typer.Exit(1)
+
+
+log_app = typer.Typer(help="Look into a log, mend it, hand it on.", no_args_is_help=True)
+app.add_typer(log_app, name="log")
+
+
+@log_app.command()
+def info(log: Annotated[Path, typer.Argument(metavar="LOG")], as_json: AsJson = False) -> None:
+    """Say what a log holds and whether anything was lost."""
+    from disco_hw.log.commands import info as log_info
+
+    print(log_info(log, as_json))
+
+
+@log_app.command()
+def recover(
+    log: Annotated[Path, typer.Argument(metavar="LOG")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="Where to write the mended log.")],
+    as_json: AsJson = False,
+) -> None:
+    """Copy everything whole from a damaged log into a new one."""
+    from disco_hw.log.commands import recover as log_recover
+
+    print(log_recover(log, out, as_json))
+
+
+@log_app.command()
+def export(
+    log: Annotated[Path, typer.Argument(metavar="LOG")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="Where to write the CSV file.")],
+    as_json: AsJson = False,
+) -> None:
+    """Write commands, encoders and poses as CSV."""
+    from disco_hw.log.commands import export as log_export
+
+    print(log_export(log, out, as_json))
+
+
+def main() -> None:
+    """Entry point: bad input prints one line and exits with 2, failed work with 1."""
+    try:
+        app()
+    except InputError as error:
+        print(f"disco-hw: {error}", file=sys.stderr)
+        raise SystemExit(2) from None
+    except WorkError as error:
+        print(f"disco-hw: {error}", file=sys.stderr)
+        raise SystemExit(1) from None

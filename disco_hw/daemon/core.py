@@ -1,0 +1,180 @@
+"""The daemon without clock, thread or process: one tick from received frames to sent frames.
+
+The real-time shell and the harness in simulated time run this same object.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from disco_hw.config import RobotConfig
+from disco_hw.daemon import records_of_tick
+from disco_hw.daemon.lap_counter import LapCounter
+from disco_hw.daemon.supervisor import Inputs, Output, Reply, Supervisor, UserRequest
+from disco_hw.log import records
+from disco_hw.log.recorder import Recorder
+from disco_hw.pipeline import FollowTask, Motion, Off, Pipeline, Stages, Stand, Tick
+from drivers.types import Driver, DriverState, LinkState, Readings, RobotStatus, Transport, WheelCommand, WheelSample
+
+
+@dataclass(frozen=True, slots=True)
+class CoreTick:
+    """What one tick did: the supervisor's verdict, the pipeline's work, the command sent (None if none was)."""
+
+    output: Output
+    pipeline: Tick
+    command: WheelCommand | None
+    events: tuple[str, ...]
+
+    @property
+    def replies(self) -> tuple[Reply, ...]:
+        """Answers to this tick's requests."""
+        return self.output.replies
+
+
+class DaemonCore:
+    """Transport, driver, supervisor, pipeline and recorder in one tick.
+
+    `preflight(driver)` is called once for each handshake; the sentences it returns keep the robot from being armed.
+    """
+
+    def __init__(
+        self,
+        config: RobotConfig,
+        transport: Transport,
+        driver: Driver,
+        supervisor: Supervisor,
+        pipeline: Pipeline,
+        recorder: Recorder,
+        preflight: Callable[[Driver], tuple[str, ...]],
+    ) -> None:
+        self.config = config
+        self.transport = transport
+        self.driver = driver
+        self.pipeline = pipeline
+        self.recorder = recorder
+        self.laps = LapCounter(config.task)
+        self.newest_wheels: WheelSample | None = None
+        self.robot_status: RobotStatus | None = None
+        self.last: CoreTick | None = None
+        self._supervisor = supervisor
+        self._preflight = preflight
+        self._preflight_errors: tuple[str, ...] = ()
+        self._preflight_done = False
+        self._generation = 0
+        self._link_up = False
+        self._planner_failing = False
+
+    def tick(
+        self,
+        now_ns: int,
+        stages: Stages,
+        requests: Sequence[UserRequest] = (),
+        extra_records: Sequence[records.Record] = (),
+    ) -> CoreTick:
+        """Advance by one tick: receive, decide, estimate, plan, command, record.
+
+        `extra_records` are recorded with the tick. Times the stages "receive", "send" and "record" besides those of the
+        pipeline. Never raises on what the robot sent.
+        """
+        with stages["receive"]:
+            self._follow_link(now_ns)
+            frames = self.transport.receive()
+            readings = self.driver.receive(now_ns, frames)
+            self._remember(readings)
+            output = self._supervisor.step(now_ns, self._inputs(now_ns, requests))
+        result = self.pipeline.step(now_ns, readings, _motion(output), stages)
+        command = self._command(output, result)
+        with stages["send"]:
+            sent = self._send(now_ns, output, command)
+        events = (*readings.events, *output.events, *self._planner_events(result))
+        self._count_laps(output, result)
+        with stages["record"]:
+            self.recorder.put(
+                now_ns,
+                [
+                    *records_of_tick.frames_in(frames),
+                    *records_of_tick.samples(readings),
+                    *records_of_tick.tick(result, command, self.config.control.command_valid_for_s),
+                    *sent,
+                    *(records.Event(now_ns, "info", "daemon", text) for text in events),
+                    *extra_records,
+                ],
+            )
+        self.last = CoreTick(output, result, command, events)
+        return self.last
+
+    def _follow_link(self, now_ns: int) -> None:
+        """Tell the driver when the link comes and goes; a link renewed between two ticks is both."""
+        up = self.transport.state is LinkState.UP
+        renewed = self.transport.generation != self._generation
+        if self._link_up and (not up or renewed):
+            self.driver.link_down(now_ns)
+            self._preflight_done, self._preflight_errors = False, ()
+            self._link_up = False
+        if up and not self._link_up:
+            self._generation = self.transport.generation
+            self.driver.link_up(now_ns)
+            self._link_up = True
+
+    def _remember(self, readings: Readings) -> None:
+        if readings.wheels:
+            self.newest_wheels = readings.wheels[-1]
+        if readings.status:
+            self.robot_status = readings.status[-1]
+        if not self._preflight_done and self.driver.capabilities is not None:
+            self._preflight_errors = self._preflight(self.driver)
+            self._preflight_done = True
+
+    def _inputs(self, now_ns: int, requests: Sequence[UserRequest]) -> Inputs:
+        wheels = self.newest_wheels
+        speed = 0.0 if wheels is None else max(abs(wheels.left_speed_rad_s), abs(wheels.right_speed_rad_s))
+        return Inputs(
+            link_state=self.transport.state,
+            link_generation=self.transport.generation,
+            driver_state=self.driver.state,
+            driver_detail=self.driver.detail,
+            telemetry_age_s=None if wheels is None else (now_ns - wheels.t_ns) * 1e-9,
+            wheel_speed_rad_s=speed,
+            pose_ok=self.last is not None and self.last.pipeline.estimate.pose_ok,
+            preflight_errors=self._preflight_errors,
+            requests=tuple(requests),
+        )
+
+    def _command(self, output: Output, result: Tick) -> WheelCommand | None:
+        """The command to send; while the robot is arming the driver sends the zeros that this takes."""
+        may_command = output.motion_allowed or output.zero_only
+        if not may_command or self.driver.state is not DriverState.ARMED:
+            return None
+        governed = result.command
+        return WheelCommand(governed.left_rad_s, governed.right_rad_s, self.config.control.command_valid_for_s)
+
+    def _send(self, now_ns: int, output: Output, command: WheelCommand | None) -> list[records.Record]:
+        """Hand this tick's frames to the link; the e-stop goes before everything else."""
+        if output.driver_request is not None:
+            self.driver.request(output.driver_request)
+        outgoing = self.driver.transmit(now_ns, command)
+        if output.send_estop:
+            outgoing = (*self.driver.estop(now_ns), *outgoing)
+        return [records_of_tick.frame_out(now_ns, frame, self.transport.send(frame, now_ns)) for frame in outgoing]
+
+    def _planner_events(self, result: Tick) -> tuple[str, ...]:
+        """Say when the planner begins and ceases to fail, not in every tick."""
+        failing = result.planner_failure is not None
+        changed, self._planner_failing = failing != self._planner_failing, failing
+        if not changed:
+            return ()
+        return (f"planner: {result.planner_failure}",) if failing else ("planner: recovered",)
+
+    def _count_laps(self, output: Output, result: Tick) -> None:
+        if output.running:
+            self.laps.add(result.estimate.x_m, result.estimate.y_m)
+        else:
+            self.laps.pause()
+
+
+def _motion(output: Output) -> Motion:
+    if output.motion_allowed:
+        return FollowTask()
+    return Stand() if output.zero_only else Off()

@@ -1,0 +1,254 @@
+"""The demonstration: virtual robot and daemon as processes of their own, driven round the circle and judged.
+
+This process plays the operator: it starts both, talks to the daemon's control socket, and reads the log and the
+simulator's truth afterwards. Nothing here reaches into either process.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.live import Live
+from rich.progress import BarColumn, Progress, TextColumn
+
+import disco_hw
+from disco_hw.circle_report import CircleReport, load_circle_report
+from disco_hw.config import load_robot_config
+from disco_hw.daemon.control_socket import send_request
+from disco_hw.errors import InputError, WorkError
+
+_START_TIMEOUT_S = 90.0
+_POLL_S = 0.1
+_STOP_TIMEOUT_S = 10.0
+
+
+@dataclass(frozen=True, slots=True)
+class DemoOptions:
+    """What to demonstrate; `laps` are counter-clockwise turns around the circle's centre."""
+
+    link: str = "can"
+    out: Path = Path("out/demo")
+    laps: float = 1.5
+    plant_seed: int = 1
+    uncertainty: str = "ut"
+    show_progress: bool = True
+
+
+def run_demo(options: DemoOptions) -> CircleReport:
+    """Drive the circle with a virtual robot and return the figures; prints progress, a table and the files written.
+
+    Raises InputError for wrong options and WorkError when a process fails or the lap is not completed in time.
+    """
+    if options.link not in {"can", "serial"}:
+        raise InputError(f"--link {options.link}: no such link; write can or serial")
+    if options.uncertainty not in {"ut", "mc", "point"}:
+        raise InputError(f"--uncertainty {options.uncertainty}: no such choice; write ut, mc or point")
+    options.out.mkdir(parents=True, exist_ok=True)
+    console = Console(stderr=not options.show_progress)
+    with tempfile.TemporaryDirectory(prefix="disco-hw-demo-") as scratch:
+        robot_file = _write_robot_file(Path(scratch), options)
+        files = _Files(
+            robot=robot_file,
+            socket=Path(scratch) / "control.sock",
+            log=options.out / "demo.mcap",
+            truth=options.out / "truth.csv",
+            simulator_output=options.out / "sim.txt",
+            daemon_output=options.out / "daemon.txt",
+        )
+        for old in (files.log, files.truth):
+            old.unlink(missing_ok=True)
+        stopped = _drive(options, files, console)
+    report = load_circle_report(files.log, files.truth, load_robot_config(_shipped_robot()).task, options.laps, stopped)
+    picture = options.out / "circle.png"
+    report.draw(picture)
+    console.print(report.table())
+    console.print(f"log {files.log}   picture {picture}   truth {files.truth}")
+    return report
+
+
+@dataclass(frozen=True, slots=True)
+class _Files:
+    robot: Path
+    socket: Path
+    log: Path
+    truth: Path
+    simulator_output: Path
+    daemon_output: Path
+
+
+def _shipped_robot() -> Path:
+    return Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
+
+
+def _write_robot_file(scratch: Path, options: DemoOptions) -> Path:
+    """Copy the shipped robot with addresses of its own, so that two demonstrations never meet."""
+    shipped = _shipped_robot()
+    model = shipped.with_name("wombot_model.toml")
+    text = shipped.read_text(encoding="utf-8")
+    replaced = {
+        'kind = "can"': f'kind = "{options.link}"',
+        'channel = "/tmp/disco-hw-wombot.can"': f'channel = "{scratch / "bus"}"',
+        'port = "/tmp/disco-hw-wombot.tty"': f'port = "{scratch / "tty"}"',
+        'file = "wombot_model.toml"': f'file = "{model}"',
+        "[control]\n": f'[control]\nuncertainty = "{options.uncertainty}"\n',
+    }
+    for old, new in replaced.items():
+        if text.count(old) != 1:
+            raise WorkError(f"{shipped}: expected exactly one line '{old.strip()}'")
+        text = text.replace(old, new)
+    text += f'\n[daemon]\ncontrol_socket = "{scratch / "control.sock"}"\n'
+    path = scratch / "robot.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+@contextmanager
+def _process(arguments: list[str], output: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """A `disco-hw` process; SIGTERM at the end, SIGKILL if that is ignored."""
+    with output.open("wb") as sink:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "disco_hw", *arguments],
+            stdout=sink,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+        )
+    try:
+        yield process
+    finally:
+        if process.poll() is None:
+            process.send_signal(signal.SIGTERM)
+            try:
+                process.wait(_STOP_TIMEOUT_S)
+            except subprocess.TimeoutExpired:
+                os.killpg(process.pid, signal.SIGKILL)
+                process.wait()
+
+
+def _drive(options: DemoOptions, files: _Files, console: Console) -> bool:
+    """Drive and stop; returns whether daemon and robot both said that the robot stands, disarmed."""
+    config = load_robot_config(files.robot)
+    lap_s = 2.0 * 3.141592653589793 * config.task.radius_m / config.task.speed_m_s
+    simulator = [
+        "sim", str(files.robot), "--plant-seed", str(options.plant_seed), "--truth", str(files.truth),
+        "--start", str(config.task.center_x_m + config.task.radius_m), str(config.task.center_y_m), "1.5707963",
+    ]  # fmt: skip
+    with (
+        _process(simulator, files.simulator_output) as robot,
+        _process(["run", str(files.robot), "--log", str(files.log)], files.daemon_output) as daemon,
+    ):
+        operator = _Operator(files, {"virtual robot": robot, "daemon": daemon})
+        console.print(f"virtual robot pid {robot.pid}, daemon pid {daemon.pid}, link {options.link}")
+        operator.wait_for("READY", _START_TIMEOUT_S)
+        operator.tell("arm")
+        operator.wait_for("ARMED", 5.0)
+        operator.tell("start")
+        _watch_laps(operator, options, 3.0 * lap_s * options.laps + 10.0, console)
+        operator.tell("stop")
+        operator.wait_for_standstill(5.0)
+        operator.tell("disarm")
+        status = operator.wait_for("READY", 5.0)
+        stopped = abs(status["wheels"][0]) < 0.05 and abs(status["wheels"][1]) < 0.05
+        operator.tell("quit")
+        code = daemon.wait(_STOP_TIMEOUT_S)
+        if code != 0:
+            raise WorkError(f"the daemon ended with exit code {code}; see {files.daemon_output}")
+    return stopped
+
+
+def _watch_laps(operator: _Operator, options: DemoOptions, limit_s: float, console: Console) -> None:
+    """Show progress until the laps are driven; raises WorkError when it takes longer than `limit_s`."""
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(bar_width=30),
+        TextColumn("{task.completed:.2f} of {task.total:.2f} laps"),
+        TextColumn("{task.fields[figures]}"),
+    )
+    progress = Progress(*columns, console=console)
+    task = progress.add_task("circle", total=options.laps, figures="")
+    deadline = time.monotonic() + limit_s
+    next_line = 0.0
+    with Live(progress, console=console, refresh_per_second=4) if console.is_terminal else _nothing():
+        while True:
+            status = operator.status()
+            if status["state"] != "ARMED":
+                raise WorkError(f"the daemon left ARMED for {status['state']}: {status['detail']}")
+            laps = float(status["task"]["laps"])
+            figures = (
+                f"d {status['task']['distance_m'] * 1e3:4.0f} mm  v {status['task']['speed_m_s']:.3f} m/s  "
+                f"ess {status['plan']['ess']:4.1f}  late p99 {status['loop']['lateness_us']['p99']:.0f} us"
+            )
+            progress.update(task, completed=min(max(laps, 0.0), options.laps), figures=figures)
+            if not console.is_terminal and laps >= next_line:
+                console.print(f"laps {laps:5.2f}  {figures}")
+                next_line = max(next_line, 0.0) + 0.1
+            if laps >= options.laps:
+                return
+            if time.monotonic() > deadline:
+                raise WorkError(f"only {laps:.2f} of {options.laps} laps were driven in {limit_s:.0f} s")
+            time.sleep(_POLL_S)
+
+
+@contextmanager
+def _nothing() -> Iterator[None]:
+    yield
+
+
+class _Operator:
+    """The person at the control socket."""
+
+    def __init__(self, files: _Files, processes: dict[str, subprocess.Popen[bytes]]) -> None:
+        self._files = files
+        self._processes = processes
+
+    def status(self) -> dict[str, Any]:
+        for name, process in self._processes.items():
+            if process.poll() is not None:
+                output = self._files.daemon_output if name == "daemon" else self._files.simulator_output
+                words = output.read_text(encoding="utf-8", errors="replace").strip().splitlines()[-1:]
+                raise WorkError(f"the {name} ended with exit code {process.returncode}: {' '.join(words)}")
+        return send_request(self._files.socket, {"do": "status"}, timeout_s=2.0)
+
+    def tell(self, what: str) -> None:
+        reply = send_request(self._files.socket, {"do": what}, timeout_s=2.0)
+        if not reply.get("ok"):
+            raise WorkError(f"the daemon refused to {what}: {reply.get('error')}")
+
+    def wait_for(self, state: str, timeout_s: float) -> dict[str, Any]:
+        deadline = time.monotonic() + timeout_s
+        words = "no answer yet"
+        while time.monotonic() < deadline:
+            if not self._files.socket.exists():
+                self._check_alive()
+                time.sleep(_POLL_S)
+                continue
+            status = self.status()
+            if status["state"] == state:
+                return status
+            words = f"{status['state']}: {status['detail']}"
+            time.sleep(_POLL_S)
+        raise WorkError(f"the daemon did not reach {state} in {timeout_s:.0f} s ({words})")
+
+    def wait_for_standstill(self, timeout_s: float) -> None:
+        deadline = time.monotonic() + timeout_s
+        while time.monotonic() < deadline:
+            left, right = self.status()["wheels"]
+            if abs(left) < 0.05 and abs(right) < 0.05:
+                return
+            time.sleep(_POLL_S)
+        raise WorkError(f"the wheels still turn {timeout_s:.0f} s after the stop")
+
+    def _check_alive(self) -> None:
+        for name, process in self._processes.items():
+            if process.poll() is not None:
+                raise WorkError(f"the {name} ended with exit code {process.returncode} before it was ready")

@@ -1,0 +1,180 @@
+"""Stop the robot from outside, with as little as possible in the way.
+
+The frame goes out on the link by a connection of its own, beside the daemon's, and the daemon is asked as well; each
+way is tried whatever became of the other. A robot.toml whose other sections are broken still says where the link is.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import time
+import tomllib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import serial
+
+from disco_hw.config import Link
+from disco_hw.daemon.control_socket import default_socket_path, send_request
+from disco_hw.errors import InputError
+from drivers.transport import open_transport
+from drivers.types import Frame, LinkState, OutgoingFrame
+from firmware_protocol.codec import Codec, Decoded
+from firmware_protocol.serial_framing import FrameDecoder, encode_frame
+
+_REPEATS = 3
+_CONNECT_S = 1.0
+_CONFIRM_S = 0.5
+_FRAME_LIFE_NS = 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class EstopOutcome:
+    """What became of each way to stop the robot, and whether the robot said that it is in e-stop."""
+
+    link: str
+    link_error: str | None
+    daemon_error: str | None
+    confirmed: bool
+
+    @property
+    def sent(self) -> bool:
+        """Whether at least one way worked."""
+        return self.link_error is None or self.daemon_error is None
+
+    def as_dict(self) -> dict[str, Any]:
+        """The outcome for machines."""
+        return {
+            "sent": self.sent,
+            "confirmed": self.confirmed,
+            "link": self.link,
+            "link_error": self.link_error,
+            "daemon_error": self.daemon_error,
+        }
+
+    def as_text(self) -> str:
+        """The outcome for a person."""
+        lines = [
+            f"{self.link}: {self.link_error or 'e-stop sent'}",
+            f"daemon: {self.daemon_error or 'e-stop accepted'}",
+        ]
+        if self.confirmed:
+            lines.append("the robot reports ESTOP; it stays latched until `disco-hw ctl ROBOT.toml reset`")
+        elif self.sent:
+            lines.append("sent, but the robot has not confirmed: look at the robot, use its button")
+        else:
+            lines.append("NOT SENT: use the robot's own e-stop button, now")
+        return "\n".join(lines)
+
+
+def stop_robot(robot: Path, link: str | None = None) -> EstopOutcome:
+    """Send the e-stop on the link and through the daemon, and wait half a second for the robot to confirm.
+
+    `link` overrides robot.toml's kind. Raises InputError only when the file does not even say where the link is.
+    """
+    raw = _read(robot)
+    settings = _link_settings(robot, raw, link)
+    frame_id, data = Codec().encode("ESTOP", reason=1)
+    frame = Frame(frame_id, data)
+    way = _stop_over_serial if settings.kind == "serial" else _stop_over_can
+    address = settings.port if settings.kind == "serial" else f"{settings.interface} {settings.channel}"
+    confirmed, link_error = False, None
+    try:
+        confirmed = way(settings, frame)
+    except Exception as error:  # whatever the medium raises, the daemon is asked as well
+        link_error = str(error) or type(error).__name__
+    daemon_confirmed, daemon_error = _ask_daemon(_socket_path(raw))
+    return EstopOutcome(address, link_error, daemon_error, confirmed or daemon_confirmed)
+
+
+def _read(robot: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(robot.read_text(encoding="utf-8"))
+    except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{robot}: cannot be read ({error}); use the robot's own e-stop button, now") from None
+
+
+def _link_settings(robot: Path, raw: dict[str, Any], kind: str | None) -> Link:
+    section = raw.get("link", {})
+    if not isinstance(section, dict):
+        raise InputError(f"{robot}: link: not a section; use the robot's own e-stop button, now")
+    if kind is not None:
+        section = {**section, "kind": kind}
+    try:
+        return msgspec.convert(section, Link)
+    except msgspec.ValidationError as error:
+        raise InputError(f"{robot}: [link]: {error}; use the robot's own e-stop button, now") from None
+
+
+def _socket_path(raw: dict[str, Any]) -> Path | None:
+    with contextlib.suppress(AttributeError, KeyError, TypeError):
+        configured = raw.get("daemon", {}).get("control_socket")
+        return Path(configured) if configured else default_socket_path(raw["robot"]["name"])
+    return None
+
+
+def _stop_over_can(settings: Link, frame: Frame) -> bool:
+    transport = open_transport(
+        kind="can", interface=settings.interface, channel=settings.channel, bitrate=settings.bitrate
+    )
+    try:
+        deadline_ns = time.monotonic_ns() + round(_CONNECT_S * 1e9)
+        while transport.state is not LinkState.UP:
+            if time.monotonic_ns() > deadline_ns:
+                raise ConnectionError(transport.last_error or "the link did not come up")
+            time.sleep(0.002)
+        for _ in range(_REPEATS):
+            now_ns = time.monotonic_ns()
+            if not transport.send(OutgoingFrame(frame, now_ns + _FRAME_LIFE_NS), now_ns):
+                raise ConnectionError(transport.last_error or "the frame could not be queued")
+        return _confirmed(lambda: [(r.frame.can_id, r.frame.data) for r in transport.receive()])
+    finally:
+        transport.close()
+
+
+def _stop_over_serial(settings: Link, frame: Frame) -> bool:
+    # Not exclusive: the daemon may hold the port, and must not be able to keep the stop from the robot.
+    with serial.serial_for_url(settings.port, baudrate=settings.baud, timeout=0.01, write_timeout=0.5) as port:
+        # The delimiter ends whatever frame another sender may be in the middle of.
+        port.write(b"\0" + _REPEATS * encode_frame(frame.can_id, frame.data))
+        port.flush()
+        decoder = FrameDecoder()
+        return _confirmed(lambda: decoder.feed(port.read(max(1, port.in_waiting))))
+
+
+def _confirmed(receive: Callable[[], list[tuple[int, bytes]]]) -> bool:
+    """Whether the robot reports ESTOP within the waiting time."""
+    codec = Codec()
+    deadline_ns = time.monotonic_ns() + round(_CONFIRM_S * 1e9)
+    while time.monotonic_ns() < deadline_ns:
+        if any(_says_estop(codec, can_id, data) for can_id, data in receive()):
+            return True
+        time.sleep(0.002)
+    return False
+
+
+def _says_estop(codec: Codec, can_id: int, data: bytes) -> bool:
+    decoded = codec.decode(can_id, data)
+    if not isinstance(decoded, Decoded) or decoded.name != "SYSTEM_STATE":
+        return False
+    return codec.choice_name("SYSTEM_STATE", "state", decoded.values["state"]) == "ESTOP"
+
+
+def _ask_daemon(socket_path: Path | None) -> tuple[bool, str | None]:
+    if socket_path is None or not socket_path.exists():
+        return False, "not running"
+    try:
+        reply = send_request(socket_path, {"do": "estop"}, timeout_s=0.5)
+        if not reply.get("ok"):
+            return False, str(reply.get("error"))
+        deadline_ns = time.monotonic_ns() + round(_CONFIRM_S * 1e9)
+        while time.monotonic_ns() < deadline_ns:
+            if send_request(socket_path, {"do": "status"}, timeout_s=0.5).get("robot_state") == "ESTOP":
+                return True, None
+            time.sleep(0.02)
+    except Exception as error:  # a hung or dying daemon must not look like a failure of the link
+        return False, str(error) or type(error).__name__
+    return False, None

@@ -1,0 +1,9 @@
+"""What a user did wrong, as opposed to what failed."""
+
+
+class InputError(Exception):
+    """Bad input: the message is one line that names the file, the field and the remedy; commands exit with 2."""
+
+
+class WorkError(Exception):
+    """The work itself failed: the message is one line that says what and why; commands exit with 1."""
