@@ -10,8 +10,33 @@ from pathlib import Path
 from cffi import FFI
 
 PACKAGE = Path(__file__).resolve().parent
-HEADERS = ("disco_robot.h",)
-SOURCES = ("disco_robot.c",)
+HEADERS = (
+    "disco_robot.h",
+    "e2e.h",
+    "wheel_limits.h",
+    "robot_config.h",
+    "states.h",
+    "faults.h",
+    "transmit.h",
+    "firmware.h",
+)
+SOURCES = (
+    "disco_robot.c",
+    "e2e.c",
+    "wheel_limits.c",
+    "robot_config.c",
+    "states.c",
+    "faults.c",
+    "transmit.c",
+    "reception.c",
+    "host.c",
+    "command.c",
+    "supervisor.c",
+    "drive.c",
+    "parameters.c",
+    "telemetry.c",
+    "firmware.c",
+)
 _WRAPPER = re.compile(r"^(#.*|extern \"C\" \{|\})$", re.MULTILINE)
 _COMMENT = re.compile(r"/\*.*?\*/", re.DOTALL)
 
@@ -31,7 +56,8 @@ def make_ffi() -> FFI:
         "\n".join(f'#include "{header}"' for header in HEADERS),
         sources=[f"firmware_protocol/firmware/{source}" for source in SOURCES],
         include_dirs=["firmware_protocol/firmware"],
-        extra_compile_args=["-std=c99", "-O2"],
+        depends=[f"firmware_protocol/firmware/{header}" for header in (*HEADERS, "core.h", "protocol_constants.h")],
+        extra_compile_args=["-std=c99"],
         # One file name however it is built, so that no stale extension can shadow a fresh one.
         py_limited_api=True,
     )

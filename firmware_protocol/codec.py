@@ -80,6 +80,10 @@ class Codec:
         """Return the name of a value in a signal's value table, or "UNKNOWN(value)" if the table does not have it."""
         return self._signal(message, signal).choices.get(int(value), f"UNKNOWN({int(value)})")
 
+    def choices(self, message: str, signal: str) -> dict[int, str]:
+        """Return a signal's value table."""
+        return dict(self._signal(message, signal).choices)
+
     def choice_value(self, message: str, signal: str, name: str) -> int:
         """Return the value of a name in a signal's value table. Raises ValueError if the table does not have it."""
         return _choice_value(self._signal(message, signal), name)

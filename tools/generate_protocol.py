@@ -43,17 +43,19 @@ def _constants(protocol: Protocol) -> str:
         f"#define DISCO_PROTOCOL_MINOR ({protocol.minor}u)",
         f"#define DISCO_DBC_HASH (0x{protocol.dbc_hash:08X}u)",
         "",
-        "/* Data ids of the end-to-end CRC. */",
+        "/* Data ids of the end-to-end CRC; the handshake's are the same for every major version. */",
     ]
-    lines += [
-        f"#define DISCO_{message.name}_DATA_ID (0x{message.data_id:04X}u)"
-        for message in protocol.messages
-        if message.data_id is not None
-    ]
+    lines += [_data_id(message) for message in protocol.messages if message.data_id is not None]
     lines += ["", "/* Physical value of one raw unit. */"]
     for message in protocol.messages:
         lines += _scales(message)
-    return "\n".join([*lines, "", "#endif", ""])
+    return "\n".join([*lines, *_value_tables(protocol), "", "#endif", ""])
+
+
+def _data_id(message: MessageLayout) -> str:
+    any_major = message.data_id == message.can_id
+    value = f"0x{message.can_id:03X}u" if any_major else f"(0x{message.can_id:03X}u ^ ((uint32_t)(major) << 11))"
+    return f"#define DISCO_{message.name}_DATA_ID(major) ((uint16_t){value})"
 
 
 def _scales(message: MessageLayout) -> list[str]:
@@ -63,6 +65,19 @@ def _scales(message: MessageLayout) -> list[str]:
         for signal in message.signals
         if signal.scale != 1
     ]
+
+
+def _value_tables(protocol: Protocol) -> list[str]:
+    """Return each value table once, named by its signal; a signal name has the same table in every message."""
+    tables: dict[str, dict[int, str]] = {}
+    for signal in (signal for message in protocol.messages for signal in message.signals if signal.choices):
+        if tables.setdefault(signal.name, signal.choices) != signal.choices:
+            raise ValueError(f"signal {signal.name} has two different value tables")
+    lines = []
+    for name, choices in tables.items():
+        lines += ["", f"/* {name} */"]
+        lines += [f"#define DISCO_{name.upper()}_{choice} ({value}u)" for value, choice in choices.items()]
+    return lines
 
 
 def main() -> int:

@@ -4,28 +4,28 @@
 
 #define DISCO_PROTOCOL_MAJOR (1u)
 #define DISCO_PROTOCOL_MINOR (0u)
-#define DISCO_DBC_HASH (0xAA0F7AFBu)
+#define DISCO_DBC_HASH (0xAA028CFDu)
 
-/* Data ids of the end-to-end CRC. */
-#define DISCO_WHEEL_COMMAND_DATA_ID (0x0900u)
-#define DISCO_HOST_STATE_DATA_ID (0x0901u)
-#define DISCO_HELLO_REQUEST_DATA_ID (0x0102u)
-#define DISCO_WHEEL_SPEED_DATA_ID (0x0910u)
-#define DISCO_WHEEL_TICKS_DATA_ID (0x0911u)
-#define DISCO_POSE_POSITION_DATA_ID (0x0918u)
-#define DISCO_POSE_HEADING_DATA_ID (0x0919u)
-#define DISCO_MOTOR_DATA_ID (0x0920u)
-#define DISCO_SYSTEM_STATE_DATA_ID (0x0930u)
-#define DISCO_POWER_DATA_ID (0x0931u)
-#define DISCO_LINK_HEALTH_DATA_ID (0x0932u)
-#define DISCO_SESSION_STATE_DATA_ID (0x0933u)
-#define DISCO_HELLO_DATA_ID (0x0140u)
-#define DISCO_BUILD_DATA_ID (0x0941u)
-#define DISCO_LIMITS_DATA_ID (0x0942u)
-#define DISCO_TIME_REQUEST_DATA_ID (0x0950u)
-#define DISCO_TIME_RESPONSE_DATA_ID (0x0951u)
-#define DISCO_PARAM_REQUEST_DATA_ID (0x0960u)
-#define DISCO_PARAM_RESPONSE_DATA_ID (0x0961u)
+/* Data ids of the end-to-end CRC; the handshake's are the same for every major version. */
+#define DISCO_WHEEL_COMMAND_DATA_ID(major) ((uint16_t)(0x100u ^ ((uint32_t)(major) << 11)))
+#define DISCO_HOST_STATE_DATA_ID(major) ((uint16_t)(0x101u ^ ((uint32_t)(major) << 11)))
+#define DISCO_HELLO_REQUEST_DATA_ID(major) ((uint16_t)0x102u)
+#define DISCO_WHEEL_SPEED_DATA_ID(major) ((uint16_t)(0x110u ^ ((uint32_t)(major) << 11)))
+#define DISCO_WHEEL_TICKS_DATA_ID(major) ((uint16_t)(0x111u ^ ((uint32_t)(major) << 11)))
+#define DISCO_POSE_POSITION_DATA_ID(major) ((uint16_t)(0x118u ^ ((uint32_t)(major) << 11)))
+#define DISCO_POSE_HEADING_DATA_ID(major) ((uint16_t)(0x119u ^ ((uint32_t)(major) << 11)))
+#define DISCO_MOTOR_DATA_ID(major) ((uint16_t)(0x120u ^ ((uint32_t)(major) << 11)))
+#define DISCO_SYSTEM_STATE_DATA_ID(major) ((uint16_t)(0x130u ^ ((uint32_t)(major) << 11)))
+#define DISCO_POWER_DATA_ID(major) ((uint16_t)(0x131u ^ ((uint32_t)(major) << 11)))
+#define DISCO_LINK_HEALTH_DATA_ID(major) ((uint16_t)(0x132u ^ ((uint32_t)(major) << 11)))
+#define DISCO_SESSION_STATE_DATA_ID(major) ((uint16_t)(0x133u ^ ((uint32_t)(major) << 11)))
+#define DISCO_HELLO_DATA_ID(major) ((uint16_t)0x140u)
+#define DISCO_BUILD_DATA_ID(major) ((uint16_t)(0x141u ^ ((uint32_t)(major) << 11)))
+#define DISCO_LIMITS_DATA_ID(major) ((uint16_t)(0x142u ^ ((uint32_t)(major) << 11)))
+#define DISCO_TIME_REQUEST_DATA_ID(major) ((uint16_t)(0x150u ^ ((uint32_t)(major) << 11)))
+#define DISCO_TIME_RESPONSE_DATA_ID(major) ((uint16_t)(0x151u ^ ((uint32_t)(major) << 11)))
+#define DISCO_PARAM_REQUEST_DATA_ID(major) ((uint16_t)(0x160u ^ ((uint32_t)(major) << 11)))
+#define DISCO_PARAM_RESPONSE_DATA_ID(major) ((uint16_t)(0x161u ^ ((uint32_t)(major) << 11)))
 
 /* Physical value of one raw unit. */
 #define DISCO_WHEEL_COMMAND_LEFT_SPEED_SCALE (0.002) /* rad/s */
@@ -49,5 +49,128 @@
 #define DISCO_LIMITS_MAX_WHEEL_ACCELERATION_SCALE (0.01) /* rad/s^2 */
 #define DISCO_LIMITS_DRIVE_OFF_TIMEOUT_SCALE (0.001) /* s */
 #define DISCO_LIMITS_STOP_DECELERATION_SCALE (0.01) /* rad/s^2 */
+
+/* reason */
+#define DISCO_REASON_UNSPECIFIED (0u)
+#define DISCO_REASON_OPERATOR (1u)
+#define DISCO_REASON_HOST_FAULT (2u)
+#define DISCO_REASON_HOST_STOPPED (3u)
+
+/* mode */
+#define DISCO_MODE_HOLD_ZERO (0u)
+#define DISCO_MODE_SPEED (1u)
+#define DISCO_MODE_BRAKE (2u)
+#define DISCO_MODE_COAST (3u)
+
+/* request */
+#define DISCO_REQUEST_STANDBY (0u)
+#define DISCO_REQUEST_READY (1u)
+#define DISCO_REQUEST_ARM (2u)
+#define DISCO_REQUEST_RESET (3u)
+
+/* state */
+#define DISCO_STATE_BOOT (0u)
+#define DISCO_STATE_STANDBY (1u)
+#define DISCO_STATE_READY (2u)
+#define DISCO_STATE_ARMED (3u)
+#define DISCO_STATE_STOPPING (4u)
+#define DISCO_STATE_FAULT (5u)
+#define DISCO_STATE_ESTOP (6u)
+
+/* fault */
+#define DISCO_FAULT_NONE (0u)
+#define DISCO_FAULT_UNDER_VOLTAGE (4097u)
+#define DISCO_FAULT_OVER_VOLTAGE (4098u)
+#define DISCO_FAULT_OVER_TEMPERATURE_LEFT (8193u)
+#define DISCO_FAULT_OVER_TEMPERATURE_RIGHT (8194u)
+#define DISCO_FAULT_OVER_CURRENT_LEFT (10241u)
+#define DISCO_FAULT_OVER_CURRENT_RIGHT (10242u)
+#define DISCO_FAULT_STALL_LEFT (10243u)
+#define DISCO_FAULT_STALL_RIGHT (10244u)
+#define DISCO_FAULT_ENCODER_MISSING_LEFT (14337u)
+#define DISCO_FAULT_ENCODER_MISSING_RIGHT (14338u)
+#define DISCO_FAULT_ENCODER_JUMP_LEFT (14339u)
+#define DISCO_FAULT_ENCODER_JUMP_RIGHT (14340u)
+#define DISCO_FAULT_WRONG_DIRECTION_LEFT (14341u)
+#define DISCO_FAULT_WRONG_DIRECTION_RIGHT (14342u)
+#define DISCO_FAULT_BUS_OFF (16385u)
+#define DISCO_FAULT_DBC_HASH_MISMATCH (24577u)
+#define DISCO_FAULT_PROTOCOL_MAJOR_MISMATCH (24578u)
+#define DISCO_FAULT_CONFIG_INVALID (27649u)
+#define DISCO_FAULT_WATCHDOG_RESET (30721u)
+#define DISCO_FAULT_BROWN_OUT_RESET (30722u)
+#define DISCO_FAULT_SELF_TEST_FAILED (31745u)
+
+/* estop_source */
+#define DISCO_ESTOP_SOURCE_NONE (0u)
+#define DISCO_ESTOP_SOURCE_FRAME (1u)
+#define DISCO_ESTOP_SOURCE_BUTTON (2u)
+#define DISCO_ESTOP_SOURCE_LINE (3u)
+
+/* reject_reason */
+#define DISCO_REJECT_REASON_NONE (0u)
+#define DISCO_REJECT_REASON_LENGTH (1u)
+#define DISCO_REJECT_REASON_CRC (2u)
+#define DISCO_REJECT_REASON_REPEATED (3u)
+#define DISCO_REJECT_REASON_SEQUENCE (4u)
+#define DISCO_REJECT_REASON_NOT_QUALIFIED (5u)
+#define DISCO_REJECT_REASON_SESSION (6u)
+#define DISCO_REJECT_REASON_STATE (7u)
+#define DISCO_REJECT_REASON_MODE (8u)
+#define DISCO_REJECT_REASON_VALIDITY (9u)
+#define DISCO_REJECT_REASON_NONZERO_BEFORE_ARMED (10u)
+#define DISCO_REJECT_REASON_CHALLENGE (11u)
+#define DISCO_REJECT_REASON_HANDSHAKE (12u)
+
+/* stop_cause */
+#define DISCO_STOP_CAUSE_NONE (0u)
+#define DISCO_STOP_CAUSE_REQUESTED (1u)
+#define DISCO_STOP_CAUSE_COMMAND_TIMEOUT (2u)
+#define DISCO_STOP_CAUSE_COMMAND_EXPIRED (3u)
+#define DISCO_STOP_CAUSE_E2E_DISQUALIFIED (4u)
+#define DISCO_STOP_CAUSE_HOST_FAULT (5u)
+#define DISCO_STOP_CAUSE_HOST_SILENT (6u)
+#define DISCO_STOP_CAUSE_FAULT (7u)
+#define DISCO_STOP_CAUSE_ESTOP (8u)
+#define DISCO_STOP_CAUSE_SESSION_CHANGED (9u)
+
+/* blockers */
+#define DISCO_BLOCKERS_FAULT (1u)
+#define DISCO_BLOCKERS_ESTOP (2u)
+#define DISCO_BLOCKERS_WHEELS_MOVING (4u)
+#define DISCO_BLOCKERS_HANDSHAKE (8u)
+#define DISCO_BLOCKERS_HOST_STATE (16u)
+#define DISCO_BLOCKERS_SESSION (32u)
+#define DISCO_BLOCKERS_CHALLENGE (64u)
+#define DISCO_BLOCKERS_ZERO_COMMANDS (128u)
+
+/* capabilities */
+#define DISCO_CAPABILITIES_POSE (1u)
+#define DISCO_CAPABILITIES_MOTOR_CURRENT (2u)
+#define DISCO_CAPABILITIES_MOTOR_TEMPERATURE (4u)
+#define DISCO_CAPABILITIES_POWER (8u)
+#define DISCO_CAPABILITIES_BRAKE (16u)
+#define DISCO_CAPABILITIES_ESTOP_BUTTON (32u)
+
+/* operation */
+#define DISCO_OPERATION_READ (0u)
+#define DISCO_OPERATION_WRITE (1u)
+
+/* key */
+#define DISCO_KEY_OVER_CURRENT (1u)
+#define DISCO_KEY_OVER_TEMPERATURE (2u)
+#define DISCO_KEY_UNDER_VOLTAGE (3u)
+#define DISCO_KEY_STOP_DECELERATION (4u)
+#define DISCO_KEY_MAX_WHEEL_SPEED (5u)
+#define DISCO_KEY_MAX_WHEEL_ACCELERATION (6u)
+
+/* status */
+#define DISCO_STATUS_OK (0u)
+#define DISCO_STATUS_UNKNOWN_KEY (1u)
+#define DISCO_STATUS_REFUSED_ARMED (2u)
+#define DISCO_STATUS_OUT_OF_RANGE (3u)
+#define DISCO_STATUS_NOT_FINITE (4u)
+#define DISCO_STATUS_READ_ONLY (5u)
+#define DISCO_STATUS_UNKNOWN_OPERATION (6u)
 
 #endif

@@ -1,0 +1,142 @@
+/* The reference firmware core: frames and measurements in, wheel setpoints and frames out. No I/O, clock or allocation.
+ *
+ * Call disco_firmware_receive for each frame from the bus and disco_firmware_step at 1 kHz, both with the same
+ * monotonic microsecond clock, from one context; then send what disco_firmware_pop gives.
+ */
+#ifndef DISCO_FIRMWARE_H
+#define DISCO_FIRMWARE_H
+
+#include <stdbool.h>
+#include <stdint.h>
+
+#include "robot_config.h"
+#include "e2e.h"
+#include "faults.h"
+#include "wheel_limits.h"
+#include "transmit.h"
+
+enum { DISCO_REJECT_REASONS = 16, DISCO_PERIODIC = 6 };
+
+typedef struct {
+    float left_setpoint;  /* rad/s, after all limits; 0 while the driver is off */
+    float right_setpoint; /* rad/s */
+    bool driver_enabled;
+    bool brake;
+    bool limited;         /* the setpoint is not (yet) what was asked for */
+    uint8_t state;
+    uint8_t session;
+    uint8_t estop_source;
+    uint8_t stop_cause;
+    uint8_t blockers;
+    uint8_t last_command_counter;
+    uint16_t fault;
+    uint32_t accepted_commands;
+    uint32_t rejected_frames;
+    uint32_t watchdog_events;
+    uint32_t queued_frames;
+} disco_outputs_t;
+
+/* The other end, as far as it has proved itself. */
+typedef struct {
+    disco_e2e_receiver_t e2e;
+    uint64_t last_state_us;
+    uint64_t last_frame_us;
+    uint16_t fault;
+    uint8_t request;
+    uint8_t session;
+    bool accepted;
+    bool hash_mismatch;
+    bool major_mismatch;
+    bool hello_requested;
+    bool reset_pending;
+} disco_host_t;
+
+typedef struct {
+    uint16_t challenge;
+    uint32_t entries; /* makes each challenge another one */
+    uint32_t seed;
+    uint8_t current;  /* 0: none */
+    uint8_t last;
+    bool challenge_answered;
+} disco_session_t;
+
+typedef struct {
+    disco_e2e_receiver_t e2e;
+    uint64_t last_accepted_us;
+    uint64_t last_motion_us; /* when motion was last asked for, accepted or not */
+    uint32_t valid_for_us;
+    uint32_t accepted_count;
+    disco_wheels_t target;
+    uint8_t mode;
+    uint8_t counter;
+    uint8_t zero_count;
+} disco_command_t;
+
+typedef struct {
+    disco_wheels_t setpoint;
+    uint64_t stop_since_us;
+    bool enabled;
+    bool brake;
+    bool limited;
+    bool stopping; /* was driven since the last time the driver went off for good */
+} disco_drive_t;
+
+typedef struct {
+    uint64_t due_us[DISCO_PERIODIC];
+    uint64_t hello_us;
+    uint16_t shown_fault;
+    uint16_t shown_challenge;
+    uint8_t shown_state;
+    uint8_t shown_session;
+    uint8_t shown_estop_source;
+    uint8_t shown_stop_cause;
+    bool shown_accepted;
+    bool limits_changed;
+    bool introduced;
+} disco_telemetry_t;
+
+typedef struct {
+    disco_config_t config;
+    disco_inputs_t inputs;
+    disco_faults_t faults;
+    disco_host_t host;
+    disco_session_t session;
+    disco_command_t command;
+    disco_drive_t drive;
+    disco_telemetry_t telemetry;
+    disco_transmit_t transmit;
+    uint64_t now_us;
+    uint64_t last_step_us;
+    uint32_t rejected[DISCO_REJECT_REASONS];
+    uint32_t rejected_total;
+    uint32_t crc_errors;
+    uint32_t sequence_errors;
+    uint32_t watchdog_events;
+    uint32_t bus_off_events;
+    uint32_t unknown_frames;
+    uint8_t state;
+    uint8_t estop_source;
+    uint8_t stop_cause;
+    uint8_t reject_reason;
+    bool config_valid;
+    bool self_test_passed;
+    bool bus_off;
+    bool inputs_known;
+} disco_firmware_t;
+
+/* `entropy` seeds the challenges; anything that differs from start to start will do. */
+void disco_firmware_init(disco_firmware_t *core, const disco_config_t *config, uint32_t entropy);
+
+void disco_firmware_receive(disco_firmware_t *core, uint64_t now_us, uint32_t can_id, const uint8_t *data,
+                            uint8_t length);
+
+void disco_firmware_step(disco_firmware_t *core, uint64_t now_us, const disco_inputs_t *inputs,
+                         disco_outputs_t *outputs);
+
+/* Queues one measured pose: metres, radians, the time when it was true, standard deviations. */
+void disco_firmware_pose(disco_firmware_t *core, double x, double y, double yaw, uint64_t sample_us,
+                         double position_std, double yaw_std);
+
+bool disco_firmware_pop(disco_firmware_t *core, disco_frame_t *frame);
+
+#endif

@@ -1,0 +1,78 @@
+#include "states.h"
+
+#include <stdbool.h>
+
+#include "protocol_constants.h"
+
+#define IN(state) ((uint16_t)(1u << (state)))
+#define BOOT IN(DISCO_STATE_BOOT)
+#define STANDBY IN(DISCO_STATE_STANDBY)
+#define READY IN(DISCO_STATE_READY)
+#define ARMED IN(DISCO_STATE_ARMED)
+#define STOPPING IN(DISCO_STATE_STOPPING)
+#define FAULT IN(DISCO_STATE_FAULT)
+#define ESTOP IN(DISCO_STATE_ESTOP)
+
+#define NO_MOTION_ALLOWED                                                                                  \
+    (DISCO_WHEN_FAULT | DISCO_WHEN_ESTOP_LATCHED | DISCO_WHEN_ESTOP_INPUT | DISCO_WHEN_HOST_FAULT)
+
+static const disco_transition_t transitions[] = {
+    /* Stop needs no proof. */
+    {STANDBY | READY | ARMED | STOPPING | FAULT, DISCO_STATE_ESTOP, DISCO_STOP_CAUSE_ESTOP,
+     DISCO_WHEN_ESTOP_LATCHED, 0u, 0u},
+    {BOOT | STANDBY | READY | ARMED | STOPPING, DISCO_STATE_FAULT, DISCO_STOP_CAUSE_FAULT,
+     DISCO_WHEN_FAULT_LATCHED, 0u, 0u},
+
+    {BOOT, DISCO_STATE_STANDBY, DISCO_STOP_CAUSE_NONE, DISCO_WHEN_SELF_TEST_PASSED, 0u, 0u},
+    {FAULT, DISCO_STATE_STANDBY, DISCO_STOP_CAUSE_NONE,
+     DISCO_WHEN_RESET | DISCO_WHEN_HOST_QUALIFIED, 0u, DISCO_WHEN_FAULT_LATCHED},
+    {ESTOP, DISCO_STATE_STANDBY, DISCO_STOP_CAUSE_NONE,
+     DISCO_WHEN_RESET | DISCO_WHEN_HOST_QUALIFIED | DISCO_WHEN_NO_MOTION_ASKED | DISCO_WHEN_WHEELS_STILL, 0u,
+     DISCO_WHEN_ESTOP_INPUT},
+
+    /* Motion needs all proof. */
+    {READY, DISCO_STATE_STANDBY, DISCO_STOP_CAUSE_NONE, 0u,
+     DISCO_WHEN_REQUEST_STOP | DISCO_WHEN_HOST_SILENT | DISCO_WHEN_HOST_DISQUALIFIED | DISCO_WHEN_SESSION_CHANGED |
+         NO_MOTION_ALLOWED,
+     0u},
+    {STANDBY, DISCO_STATE_READY, DISCO_STOP_CAUSE_NONE,
+     DISCO_WHEN_HOST_ACCEPTED | DISCO_WHEN_HOST_QUALIFIED | DISCO_WHEN_REQUEST_READY | DISCO_WHEN_SESSION_FRESH |
+         DISCO_WHEN_WHEELS_STILL,
+     0u, NO_MOTION_ALLOWED},
+    {READY, DISCO_STATE_ARMED, DISCO_STOP_CAUSE_NONE,
+     DISCO_WHEN_HOST_ACCEPTED | DISCO_WHEN_HOST_QUALIFIED | DISCO_WHEN_REQUEST_ARM | DISCO_WHEN_CHALLENGE_ANSWERED |
+         DISCO_WHEN_ZERO_COMMANDS | DISCO_WHEN_WHEELS_STILL,
+     0u, NO_MOTION_ALLOWED | DISCO_WHEN_COMMANDS_DISQUALIFIED},
+
+    {ARMED, DISCO_STATE_STOPPING, DISCO_STOP_CAUSE_FAULT, DISCO_WHEN_FAULT, 0u, 0u},
+    {ARMED, DISCO_STATE_STOPPING, DISCO_STOP_CAUSE_E2E_DISQUALIFIED, 0u,
+     DISCO_WHEN_COMMANDS_DISQUALIFIED | DISCO_WHEN_HOST_DISQUALIFIED, 0u},
+    {ARMED, DISCO_STATE_STOPPING, DISCO_STOP_CAUSE_COMMAND_EXPIRED, DISCO_WHEN_COMMAND_EXPIRED, 0u, 0u},
+    {ARMED, DISCO_STATE_STOPPING, DISCO_STOP_CAUSE_COMMAND_TIMEOUT, DISCO_WHEN_COMMAND_TIMEOUT, 0u, 0u},
+    {ARMED, DISCO_STATE_STOPPING, DISCO_STOP_CAUSE_HOST_FAULT, DISCO_WHEN_HOST_FAULT, 0u, 0u},
+    {ARMED, DISCO_STATE_STOPPING, DISCO_STOP_CAUSE_HOST_SILENT, DISCO_WHEN_HOST_SILENT, 0u, 0u},
+    {ARMED, DISCO_STATE_STOPPING, DISCO_STOP_CAUSE_SESSION_CHANGED, DISCO_WHEN_SESSION_CHANGED, 0u, 0u},
+    {ARMED, DISCO_STATE_STOPPING, DISCO_STOP_CAUSE_REQUESTED, DISCO_WHEN_REQUEST_STOP, 0u, 0u},
+
+    {STOPPING, DISCO_STATE_STANDBY, DISCO_STOP_CAUSE_NONE, 0u, DISCO_WHEN_STOPPED | DISCO_WHEN_STOP_TIMEOUT, 0u},
+};
+
+const disco_transition_t *disco_transitions(size_t *count)
+{
+    *count = sizeof(transitions) / sizeof(transitions[0]);
+    return transitions;
+}
+
+const disco_transition_t *disco_next_transition(uint8_t state, uint32_t conditions)
+{
+    for (size_t i = 0u; i < (sizeof(transitions) / sizeof(transitions[0])); i++) {
+        const disco_transition_t *row = &transitions[i];
+        const bool leaves = (row->from & (1u << state)) != 0u;
+        const bool all = (conditions & row->needs_all) == row->needs_all;
+        const bool any = (row->needs_any == 0u) || ((conditions & row->needs_any) != 0u);
+        if (leaves && all && any && ((conditions & row->blocked_by) == 0u)) {
+            return row;
+        }
+    }
+    return NULL;
+}

@@ -1,0 +1,250 @@
+"""The C firmware core as a Python object: what the virtual robot runs and what the tests hold to account."""
+
+import enum
+from dataclasses import dataclass
+from typing import Any
+
+import msgspec
+
+from firmware_protocol import _firmware
+from firmware_protocol.codec import PROTOCOL, PROTOCOL_MAJOR, Codec
+
+_lib: Any = _firmware.lib
+_ffi: Any = _firmware.ffi
+_TICKS_MASK = 0xFFFF_FFFF
+
+
+class ResetCause(enum.IntEnum):
+    """Why the controller started."""
+
+    POWER_ON = 0
+    WATCHDOG = 1
+    BROWN_OUT = 2
+
+
+@dataclass(frozen=True, slots=True)
+class FirmwareConfig:
+    """What differs between robots; a value out of the bounds of `robot_config.c` makes the core refuse to leave FAULT.
+
+    `capabilities` is the sum of the bits in the DBC's value table; `dbc_hash` and `protocol_major` are other than the
+    packaged DBC's only to play a robot that speaks another one.
+    """
+
+    ticks_per_rev: int
+    max_wheel_speed_rad_s: float
+    max_wheel_acceleration_rad_s2: float = 20.0
+    stop_deceleration_rad_s2: float = 20.0
+    still_speed_rad_s: float = 0.05
+    command_timeout_s: float = 0.1
+    drive_off_timeout_s: float = 0.5
+    stop_timeout_s: float = 1.0
+    host_state_timeout_s: float = 0.5
+    host_forget_timeout_s: float = 5.0
+    reset_quiet_s: float = 0.5
+    under_voltage_v: float = 20.0
+    over_voltage_v: float = 30.0
+    over_current_a: float = 30.0
+    over_temperature_c: float = 80.0
+    stall_current_a: float = 15.0
+    encoder_check_current_a: float = 0.5
+    encoder_check_speed_rad_s: float = 1.0
+    voltage_debounce_s: float = 0.2
+    current_debounce_s: float = 0.1
+    temperature_debounce_s: float = 1.0
+    encoder_debounce_s: float = 0.3
+    fault_hold_s: float = 0.5
+    board_id: int = 1
+    firmware_version: tuple[int, int, int] = (0, 1, 0)
+    capabilities: int = 63
+    dbc_hash: int = PROTOCOL.dbc_hash
+    protocol_major: int = PROTOCOL_MAJOR
+
+
+class FirmwareInputs(msgspec.Struct, frozen=True, gc=False, kw_only=True):
+    """What the board measures in one cycle; ticks are cumulative, a transmit error count over 255 means bus-off."""
+
+    left_ticks: int
+    right_ticks: int
+    left_speed_rad_s: float
+    right_speed_rad_s: float
+    left_current_a: float = 0.0
+    right_current_a: float = 0.0
+    left_temperature_c: float = 25.0
+    right_temperature_c: float = 25.0
+    left_encoder_valid: bool = True
+    right_encoder_valid: bool = True
+    voltage_v: float = 24.0
+    battery_current_a: float = 0.0
+    battery_temperature_c: float = 25.0
+    tx_error_count: int = 0
+    rx_error_count: int = 0
+    estop_button: bool = False
+    estop_line: bool = False
+    self_test_failed: bool = False
+    reset_cause: ResetCause = ResetCause.POWER_ON
+
+
+class FirmwareOutputs(msgspec.Struct, frozen=True, gc=False):
+    """What the core wants of the motor driver, and what it shows; setpoints are after all limits, 0 with driver off.
+
+    `accepted_commands` counts the wheel commands ever accepted, `blockers` is the sum of the bits in the DBC's table of
+    what keeps the controller from the next step towards motion.
+    """
+
+    left_setpoint_rad_s: float
+    right_setpoint_rad_s: float
+    driver_enabled: bool
+    brake: bool
+    limited: bool
+    state: str
+    fault: int
+    session: int
+    estop_source: str
+    stop_cause: str
+    blockers: int
+    accepted_commands: int
+    last_command_counter: int
+    rejected_frames: int
+    watchdog_events: int
+
+
+def _microseconds(seconds: float) -> int:
+    return round(seconds * 1e6)
+
+
+def _fill_config(target: Any, config: FirmwareConfig) -> None:
+    for name in ("protocol_major", "capabilities", "firmware_version", "board_id", "dbc_hash", "ticks_per_rev"):
+        setattr(target, name, getattr(config, name))
+    for name, unit in (
+        ("max_wheel_speed", "rad_s"),
+        ("max_wheel_acceleration", "rad_s2"),
+        ("stop_deceleration", "rad_s2"),
+        ("still_speed", "rad_s"),
+        ("under_voltage", "v"),
+        ("over_voltage", "v"),
+        ("over_current", "a"),
+        ("over_temperature", "c"),
+        ("stall_current", "a"),
+        ("encoder_check_current", "a"),
+        ("encoder_check_speed", "rad_s"),
+    ):
+        setattr(target, name, getattr(config, f"{name}_{unit}"))
+    for name in (
+        "command_timeout",
+        "drive_off_timeout",
+        "stop_timeout",
+        "host_state_timeout",
+        "host_forget_timeout",
+        "reset_quiet",
+        "voltage_debounce",
+        "current_debounce",
+        "temperature_debounce",
+        "encoder_debounce",
+        "fault_hold",
+    ):
+        setattr(target, f"{name}_us", _microseconds(getattr(config, f"{name}_s")))
+
+
+class FirmwareCore:
+    """One controller: frames and measurements in, setpoints and frames out; time is passed in, in microseconds."""
+
+    __slots__ = ("_core", "_estop_sources", "_frame", "_inputs", "_outputs", "_reasons", "_states", "_stop_causes")
+
+    def __init__(self, config: FirmwareConfig, entropy: int = 0) -> None:
+        """`entropy` seeds the arming challenges. Raises OverflowError for a value that its C field cannot hold."""
+        codec = Codec()
+        self._states = _names(codec, "state")
+        self._stop_causes = _names(codec, "stop_cause")
+        self._estop_sources = _names(codec, "estop_source")
+        self._reasons = codec.choices("SYSTEM_STATE", "reject_reason")
+        self._core = _ffi.new("disco_firmware_t *")
+        self._inputs = _ffi.new("disco_inputs_t *")
+        self._outputs = _ffi.new("disco_outputs_t *")
+        self._frame = _ffi.new("disco_frame_t *")
+        c_config = _ffi.new("disco_config_t *")
+        _fill_config(c_config, config)
+        _lib.disco_firmware_init(self._core, c_config, entropy & 0xFFFF_FFFF)
+
+    def receive(self, now_us: int, can_id: int, data: bytes) -> None:
+        """Take in one frame from the bus; anything may come."""
+        _lib.disco_firmware_receive(self._core, now_us, can_id & 0xFFFF_FFFF, data, len(data) & 0xFF)
+
+    def step(self, now_us: int, inputs: FirmwareInputs) -> FirmwareOutputs:
+        """Run one cycle, meant for 1 kHz."""
+        c = self._inputs
+        c.ticks[0] = inputs.left_ticks & _TICKS_MASK
+        c.ticks[1] = inputs.right_ticks & _TICKS_MASK
+        c.wheel_speed[0] = inputs.left_speed_rad_s
+        c.wheel_speed[1] = inputs.right_speed_rad_s
+        c.current[0] = inputs.left_current_a
+        c.current[1] = inputs.right_current_a
+        c.temperature[0] = inputs.left_temperature_c
+        c.temperature[1] = inputs.right_temperature_c
+        c.encoder_valid[0] = inputs.left_encoder_valid
+        c.encoder_valid[1] = inputs.right_encoder_valid
+        c.voltage = inputs.voltage_v
+        c.battery_current = inputs.battery_current_a
+        c.battery_temperature = inputs.battery_temperature_c
+        c.tx_error_count = inputs.tx_error_count
+        c.rx_error_count = inputs.rx_error_count
+        c.estop_button = inputs.estop_button
+        c.estop_line = inputs.estop_line
+        c.self_test_failed = inputs.self_test_failed
+        c.reset_cause = inputs.reset_cause
+        out = self._outputs
+        _lib.disco_firmware_step(self._core, now_us, c, out)
+        return FirmwareOutputs(
+            out.left_setpoint,
+            out.right_setpoint,
+            out.driver_enabled,
+            out.brake,
+            out.limited,
+            self._states[out.state],
+            out.fault,
+            out.session,
+            self._estop_sources[out.estop_source],
+            self._stop_causes[out.stop_cause],
+            out.blockers,
+            out.accepted_commands,
+            out.last_command_counter,
+            out.rejected_frames,
+            out.watchdog_events,
+        )
+
+    def pose(
+        self, x_m: float, y_m: float, yaw_rad: float, sample_us: int, position_std_m: float, yaw_std_rad: float
+    ) -> None:
+        """Queue one measured pose, true at `sample_us`; one that does not fit the frame is sent as not valid."""
+        _lib.disco_firmware_pose(self._core, x_m, y_m, yaw_rad, sample_us, position_std_m, yaw_std_rad)
+
+    def drain(self) -> list[tuple[int, bytes]]:
+        """Return the frames to send (CAN id, data), oldest first, and forget them."""
+        frames = []
+        frame = self._frame
+        while _lib.disco_firmware_pop(self._core, frame):
+            frames.append((frame.can_id, bytes(frame.data)))
+        return frames
+
+    @property
+    def challenge(self) -> int:
+        """The arming challenge in force."""
+        return int(self._core.session.challenge)
+
+    @property
+    def rejections(self) -> dict[str, int]:
+        """How many frames were rejected for each reason of the DBC's table."""
+        return {name: self._core.rejected[reason] for reason, name in self._reasons.items() if reason}
+
+    @property
+    def overflowed_frames(self) -> int:
+        """How many frames did not fit into the transmit queue."""
+        return int(self._core.transmit.overflow_count)
+
+    @property
+    def unknown_frames(self) -> int:
+        """How many frames had an identifier that is not for this controller."""
+        return int(self._core.unknown_frames)
+
+
+def _names(codec: Codec, signal: str) -> tuple[str, ...]:
+    return tuple(codec.choice_name("SYSTEM_STATE", signal, value) for value in range(16))
