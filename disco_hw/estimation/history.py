@@ -75,6 +75,7 @@ class RewindBuffer:
         self._poses += 1
         self._outdate(index)
         judgement = self._run(index).judgement
+        self._trim()
         if judgement is None:
             raise AssertionError("the state at a pose holds its judgement")
         return judgement
@@ -118,7 +119,7 @@ class RewindBuffer:
         return event
 
     def _trim(self) -> None:
-        """Drop what is older than the buffer, but for the newest such event: the state to start from."""
+        """Drop what is too much or older than the buffer, but for the newest such event: the state to start from."""
         oldest_ns = self._newest_wheels.t_ns - self._history_ns
         count = max(0, len(self._events) - self._max_events)
         while count + 1 < len(self._events) and self._events[count + 1].t_ns <= oldest_ns:

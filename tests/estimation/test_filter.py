@@ -1,0 +1,166 @@
+"""Initialisation, gate and recovery from lock-out, one state transition at a time."""
+
+import math
+
+import numpy as np
+import pytest
+
+from disco_hw.config import Estimation
+from disco_hw.estimation.filter import MAX_EXTRAPOLATION_S, PoseFilter
+from disco_hw.estimation.gate import Measurement, PoseReason, gate_limit
+from disco_hw.estimation.odometry import OdometryParameters, Pose, advance
+from disco_hw.estimation.wheels import WheelReading
+
+PARAMETERS = OdometryParameters(0.061, 0.415, 0.238)
+SETTINGS = Estimation(gate_lockout_count=5)
+STEP_NS = 40_000_000
+
+
+def measured(t_ns, x, y, yaw, std=0.01):
+    return Measurement(t_ns, Pose(x, y, yaw), std**2, (2 * std) ** 2, False)
+
+
+def started(settings=SETTINGS):
+    pose_filter = PoseFilter(settings, PARAMETERS)
+    return pose_filter, pose_filter.begin(WheelReading(0, 0.0, 0.0, 0.0, 0.0))
+
+
+def initialised(settings=SETTINGS):
+    pose_filter, state = started(settings)
+    return pose_filter, pose_filter.fuse(state, measured(0, 0.0, 0.0, 0.0))
+
+
+def reasons_of(pose_filter, state, poses):
+    """Feed poses STEP_NS apart without motion."""
+    reasons = []
+    for pose in poses:
+        t_ns = state.t_ns + STEP_NS
+        state = pose_filter.move(state, t_ns, state.left_rad, state.right_rad, False)
+        state = pose_filter.fuse(state, measured(t_ns, *pose))
+        reasons.append(state.judgement.reason)
+    return state, reasons
+
+
+def test_the_first_pose_sets_the_belief():
+    pose_filter, state = started()
+    assert state.belief is None
+    state = pose_filter.fuse(state, measured(0, 3.0, 4.0, 2.0))
+    assert state.judgement.reason is PoseReason.INITIALISED
+    assert state.belief.pose == Pose(3.0, 4.0, 2.0)
+    np.testing.assert_allclose(state.belief.covariance, np.diag([1e-4, 1e-4, 4e-4]))
+    assert (state.pose_t_ns, state.reinitialisations) == (0, 0)
+
+
+def test_where_no_pose_is_required_odometry_starts_at_the_origin_until_the_first_pose():
+    pose_filter, state = started(Estimation(pose_required=False))
+    state = pose_filter.move(state, 10**9, 10.0, 10.0, False)
+    assert state.belief.x_m == pytest.approx(0.61)
+    assert state.pose_t_ns is None
+    state = pose_filter.fuse(state, measured(10**9, 5.0, 5.0, 1.0))
+    assert state.judgement.reason is PoseReason.INITIALISED
+    assert state.belief.pose == Pose(5.0, 5.0, 1.0)
+
+
+def test_the_gate_opens_at_its_limit():
+    pose_filter, state = initialised()
+    # S = 2e-4 in x: d^2 = dx^2 / 2e-4.
+    edge = math.sqrt(gate_limit(0.999) * 2e-4)
+    inside = pose_filter.fuse(state, measured(0, 0.999 * edge, 0.0, 0.0))
+    outside = pose_filter.fuse(state, measured(0, 1.001 * edge, 0.0, 0.0))
+    assert inside.judgement.reason is PoseReason.ACCEPTED
+    assert inside.judgement.test_ratio == pytest.approx(0.999**2, rel=1e-4)
+    assert outside.judgement.reason is PoseReason.GATED
+    assert outside.judgement.test_ratio == pytest.approx(1.001**2, rel=1e-4)
+    assert outside.judgement.distance2 == pytest.approx(1.001**2 * gate_limit(0.999), rel=1e-4)
+    assert outside.belief == state.belief
+    assert outside.pose_t_ns == 0
+
+
+def test_outliers_that_disagree_never_move_the_belief():
+    pose_filter, state = initialised()
+    outliers = [(0.5 * (i % 7) + 0.4, (-1) ** i * 0.8, 0.3 * i) for i in range(40)]
+    after, reasons = reasons_of(pose_filter, state, outliers)
+    assert set(reasons) == {PoseReason.GATED}
+    assert after.belief == state.belief
+    assert after.candidate_count == 1
+
+
+def test_fewer_agreeing_outliers_than_the_count_do_not_move_the_belief():
+    pose_filter, state = initialised()
+    jumped = [(0.5, 0.0, 0.0)] * 4
+    _, reasons = reasons_of(pose_filter, state, [*jumped, (0.0, 0.0, 0.0), *jumped, (0.0, 0.0, 0.0)])
+    assert reasons == ([PoseReason.GATED] * 4 + [PoseReason.ACCEPTED]) * 2
+
+
+def test_agreeing_outliers_in_a_row_move_it_to_where_they_are():
+    pose_filter, state = initialised()
+    rng = np.random.default_rng(0)
+    poses = [(0.5 + dx, dy, dyaw) for dx, dy, dyaw in rng.normal(size=(5, 3)) * (0.01, 0.01, 0.02)]
+    after, reasons = reasons_of(pose_filter, state, poses)
+    assert reasons == [PoseReason.GATED] * 4 + [PoseReason.REINITIALISED]
+    assert after.reinitialisations == 1
+    assert after.candidate is None
+    assert after.judgement.test_ratio > 1.0
+    # At the mean of the five, which is better than any one of them.
+    np.testing.assert_allclose([after.belief.x_m, after.belief.y_m], np.mean(poses, axis=0)[:2], atol=1e-4)
+    assert math.sqrt(after.belief.xx) == pytest.approx(0.01 / math.sqrt(5), rel=0.01)
+
+
+def test_an_outlier_that_disagrees_starts_the_count_anew():
+    pose_filter, state = initialised()
+    jumped, stray = (0.5, 0.0, 0.0), (-0.5, 0.0, 0.0)
+    _, reasons = reasons_of(pose_filter, state, [jumped] * 4 + [stray] + [jumped] * 5)
+    assert reasons == [PoseReason.GATED] * 9 + [PoseReason.REINITIALISED]
+
+
+def test_agreement_is_judged_with_the_motion_in_between():
+    # Driving at 0.3 m/s the rejected poses move 12 mm a step: those that move along agree, those that stand do not.
+    def last_reason(follow):
+        pose_filter, state = initialised()
+        pose = Pose(0.0, 1.0, 0.0)
+        for i in range(1, 6):
+            turn = 0.3 / 0.061 * 0.04 * i * 10
+            pose = advance(PARAMETERS, pose, [(0.3 / 0.061, 0.3 / 0.061, 0.4)]) if follow else pose
+            state = pose_filter.move(state, i * STEP_NS, turn, turn, False)
+            state = pose_filter.fuse(state, measured(i * STEP_NS, pose.x_m, pose.y_m, 0.0))
+        return state.judgement.reason
+
+    assert last_reason(follow=True) is PoseReason.REINITIALISED
+    assert last_reason(follow=False) is PoseReason.GATED
+
+
+def test_standing_wheels_leave_the_belief_as_it_is():
+    pose_filter, state = initialised()
+    assert pose_filter.move(state, 10**9, 0.0, 0.0, False).belief is state.belief
+
+
+def test_a_gap_keeps_the_distance_and_opens_the_covariance_by_a_quarter_of_it():
+    pose_filter, state = initialised()
+    turn = 2.0 / 0.061
+    known = pose_filter.move(state, 10**9, turn, turn, False).belief
+    gap = pose_filter.move(state, 10**9, turn, turn, True).belief
+    assert gap.pose == known.pose == Pose(pytest.approx(2.0), 0.0, 0.0)
+    np.testing.assert_allclose(np.array(gap.covariance) - known.covariance, np.diag([0.25, 0.25, 0.0]), atol=1e-12)
+
+
+def test_extrapolation_keeps_the_speed_for_a_bounded_time_and_doubts_it_for_longer():
+    pose_filter, state = initialised()
+    wheels = WheelReading(0, 0.0, 0.0, 5.0, 6.0)
+    near = pose_filter.extrapolate(state, wheels, 100_000_000)
+    expected = advance(PARAMETERS, Pose(0.0, 0.0, 0.0), [(5.0, 6.0, 0.1)])
+    assert (near.belief.x_m, near.belief.yaw_rad) == pytest.approx((expected.x_m, expected.yaw_rad))
+    held = pose_filter.extrapolate(state, wheels, round(MAX_EXTRAPOLATION_S * 1e9))
+    later = pose_filter.extrapolate(state, wheels, 2 * 10**9)
+    assert later.belief.pose == held.belief.pose
+    # Without the slip of the moved part, a quarter of all the path there may have been: 0.061 * 5.5 * 2 s.
+    assert math.sqrt(later.belief.xx) == pytest.approx(0.25 * 0.061 * 5.5 * 2.0, rel=0.02)
+    assert math.sqrt(later.belief.tt) == pytest.approx(0.25 * 0.061 / 0.415 * math.hypot(5.0, 6.0) * 2.0, rel=0.02)
+
+
+def test_extrapolating_in_two_steps_adds_no_doubt():
+    pose_filter, state = initialised()
+    wheels = WheelReading(0, 0.0, 0.0, 5.0, 5.0)
+    once = pose_filter.extrapolate(state, wheels, 10**9)
+    twice = pose_filter.extrapolate(pose_filter.extrapolate(state, wheels, 150_000_000), wheels, 10**9)
+    assert (twice.left_rad, twice.t_ns) == (once.left_rad, once.t_ns)
+    np.testing.assert_allclose(np.array(twice.belief.covariance)[0, 0], once.belief.xx, rtol=1e-9)

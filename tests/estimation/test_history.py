@@ -1,0 +1,186 @@
+"""The rewind buffer: order, exactness, bounds."""
+
+import itertools
+import random
+
+import pytest
+
+from disco_hw.config import Estimation
+from disco_hw.estimation.filter import Judgement, PoseFilter
+from disco_hw.estimation.gate import Measurement, PoseReason
+from disco_hw.estimation.history import RewindBuffer
+from disco_hw.estimation.odometry import OdometryParameters, Pose
+from disco_hw.estimation.wheels import WheelReading
+
+PARAMETERS = OdometryParameters(0.061, 0.415, 0.238)
+MS = 1_000_000
+SETTINGS = Estimation(gate_lockout_count=3)
+
+
+def reading(t_ms, gap=False):
+    t = t_ms * 1e-3
+    return WheelReading(round(t_ms * MS), 3.0 * t, 3.5 * t + t * t, 3.0, 3.5 + 2 * t, gap)
+
+
+def measured(t_ms, x=0.0, y=0.0, yaw=0.0):
+    return Measurement(round(t_ms * MS), Pose(x, y, yaw), 1e-4, 4e-4, False)
+
+
+def near(t_ms):
+    """A pose about where the readings lead, so that it passes the gate."""
+    t = t_ms * 1e-3
+    wobble = 0.01 * ((t_ms * 7919) % 13 - 6) / 6
+    return measured(t_ms, 0.061 * (3.25 * t + t * t / 2) + wobble, -wobble, 0.061 / 0.415 * (0.5 * t + t * t))
+
+
+def buffer_with(wheels_ms, history_s=1.0):
+    first, *rest = wheels_ms
+    buffer = RewindBuffer(PoseFilter(SETTINGS, PARAMETERS), reading(first), history_s)
+    for t_ms in rest:
+        buffer.add_wheels(reading(t_ms))
+    return buffer
+
+
+def run(events, first=0):
+    """Feed (wheel time or Measurement) in this order; the final state."""
+    buffer = buffer_with([first])
+    for event in events:
+        if isinstance(event, Measurement):
+            assert isinstance(buffer.add_pose(event), Judgement)
+        else:
+            buffer.add_wheels(reading(event))
+    return buffer.head()
+
+
+def test_every_order_of_arrival_gives_the_same_bits():
+    poses = [near(5), near(20), near(23), near(27), near(40.5)]
+    wheels = [10, 20, 30, 40, 50]
+    in_order = run(sorted([*poses, *wheels], key=lambda e: e.t_ns / MS if isinstance(e, Measurement) else e - 1e-3))
+    assert in_order.pose_t_ns == poses[-1].t_ns
+    for permutation in itertools.permutations(poses):
+        assert run([*wheels, *permutation]) == in_order
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_random_delays_with_outliers_and_a_lockout_give_the_same_bits(seed):
+    rng = random.Random(seed)
+    wheels = [10 * k for k in range(1, 90)]
+    poses = []
+    for k in range(22):
+        t_ms = 40 * k + rng.uniform(0.0, 39.0)
+        pose = near(t_ms)
+        if rng.random() < 0.2 or 10 <= k < 16:
+            pose = measured(t_ms, pose.pose.x_m + (0.5 if k >= 10 else rng.uniform(1, 2)), 0.3, 0.1)
+        poses.append(pose)
+
+    def arrivals(delay):
+        timed = [(t_ms * MS, 0, t_ms) for t_ms in wheels] + [(p.t_ns + delay(), 1, p) for p in poses]
+        return [event for *_, event in sorted(timed, key=lambda item: item[:2])]
+
+    ordered = run(arrivals(lambda: 0))
+    assert ordered.reinitialisations >= 1
+    assert run(arrivals(lambda: 30 * MS)) == ordered
+    for _ in range(3):
+        assert run(arrivals(lambda: rng.uniform(0.0, 400.0) * MS)) == ordered
+
+
+def test_a_pose_between_wheel_readings_sees_interpolated_angles():
+    buffer = buffer_with([0, 10, 20])
+    buffer.add_pose(near(0.0))
+    buffer.add_pose(near(12.5))
+    state = buffer._states[-1]
+    assert state.t_ns == 12.5 * MS
+    assert state.left_rad == pytest.approx(0.75 * reading(10).left_rad + 0.25 * reading(20).left_rad)
+    assert state.right_rad == pytest.approx(0.75 * reading(10).right_rad + 0.25 * reading(20).right_rad)
+
+
+def test_a_pose_beyond_the_newest_reading_is_run_again_on_measured_wheels():
+    early = buffer_with([0, 10])
+    early.add_pose(near(0.0))
+    early.add_pose(near(18.0))
+    extrapolated = early.head()
+    early.add_wheels(reading(20))
+    late = buffer_with([0, 10, 20])
+    late.add_pose(near(0.0))
+    late.add_pose(near(18.0))
+    assert early.head() == late.head()
+    assert extrapolated.right_rad != late._states[-2].right_rad
+
+
+def test_a_pose_older_than_the_buffer_is_refused():
+    buffer = buffer_with([10 * k for k in range(251)])
+    assert buffer.add_pose(measured(1499.0)) is PoseReason.TOO_OLD
+    assert isinstance(buffer.add_pose(measured(1500.0)), Judgement)
+
+
+def test_a_pose_at_the_far_end_of_the_buffer_gives_the_same_bits():
+    wheels = [10 * k for k in range(1, 230)]
+    on_time = run([*wheels[:130], near(1300.0), near(1310.0), *wheels[130:]])
+    late = run([*wheels[:130], near(1310.0), *wheels[130:], near(1300.0)])
+    assert on_time == late
+
+
+def test_a_repeated_stamp_is_refused():
+    buffer = buffer_with([0, 10, 20])
+    buffer.add_pose(near(10.0))
+    before = buffer.head()
+    assert buffer.add_pose(measured(10.0, 5.0)) is PoseReason.DUPLICATE
+    assert buffer.head() == before
+
+
+def test_poses_far_beyond_the_newest_reading_have_no_odometry():
+    buffer = buffer_with([0, 10])
+    assert isinstance(buffer.add_pose(measured(1010.0)), Judgement)
+    assert buffer.add_pose(measured(1011.0)) is PoseReason.NO_ODOMETRY
+
+
+def test_length_is_bounded_whatever_the_rates():
+    buffer = buffer_with([0.0])
+    for k in range(1, 3000):
+        buffer.add_wheels(reading(k * 0.5))
+        buffer.add_pose(measured(k * 0.5 - 0.25))
+        assert len(buffer) <= buffer.capacity
+    assert buffer.capacity == 301
+    assert isinstance(buffer.head().t_ns, int)
+
+
+def test_a_flood_of_poses_is_refused_and_passes_with_time():
+    buffer = buffer_with([0])
+    outcomes = [buffer.add_pose(measured(1.0 + k * 0.001)) for k in range(150)]
+    assert [isinstance(outcome, Judgement) for outcome in outcomes] == [True] * 100 + [False] * 50
+    assert outcomes[-1] is PoseReason.OVERFLOW
+    buffer.add_wheels(reading(1500))
+    assert isinstance(buffer.add_pose(measured(1499.0)), Judgement)
+
+
+def test_a_gap_longer_than_the_buffer_loses_no_distance():
+    buffer = buffer_with([0, 10])
+    buffer.add_pose(near(10.0))
+    buffer.add_wheels(reading(5000, gap=True))
+    straight = buffer_with([0, 10])
+    straight.add_pose(near(10.0))
+    state = straight._filter.move(straight.head(), 5000 * MS, reading(5000).left_rad, reading(5000).right_rad, True)
+    assert buffer.head() == state
+    assert len(buffer) == 2
+
+
+class CountingFilter(PoseFilter):
+    calls = 0
+
+    def move(self, *args):
+        self.calls += 1
+        return super().move(*args)
+
+
+def test_a_call_runs_no_event_twice_and_an_ordered_batch_costs_one_pass():
+    counting = CountingFilter(SETTINGS, PARAMETERS)
+    buffer = RewindBuffer(counting, reading(0), 1.0)
+    for k in range(1, 101):
+        buffer.add_wheels(reading(10 * k))
+        buffer.head()
+    assert counting.calls == 100
+    # Late by 0.9 s: what follows is run again once, with the poses, when the newest state is asked for.
+    for t_ms in (101.0, 301.0, 501.0):
+        buffer.add_pose(near(t_ms))
+    buffer.head()
+    assert counting.calls == 100 + 90 + 3
