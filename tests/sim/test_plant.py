@@ -1,0 +1,280 @@
+"""The whole chain: channels stay apart, nothing depends on how time is cut, known motions come out."""
+
+import ast
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import sim
+from sim.body_dynamics import Pose
+from sim.effects import EFFECTS, hidden_effects
+from sim.plant import Plant
+from sim.plant_parameters import PlantParameters
+
+NOISY = PlantParameters()
+STILL = NOISY.noiseless()
+IDEAL = STILL.with_ideal_motors()
+
+# Straight, both turns, a slow reverse, a rest, a fast spin: two seconds in which every effect can show.
+DRIVE = ((5.0, 5.0), (6.5, 2.0), (2.0, 6.5), (-0.4, -1.0), (0.0, 0.0), (-7.0, 7.0), (3.0, 4.0))
+SIZES = {name: [value.realistic[1] for value in spec.values] for name, spec in EFFECTS.items()}
+SIZES["surface_change"] = [0.15, 0.5, 0.04]
+SIZES["x_carpet_patch"] = [0.2, 0.0, 0.0, 1.0]
+SIZES["slope"] = [0.02, 0.5]
+SIZES["speed_limit"] = [5.0]
+
+
+def recorded(parameters=NOISY, seed=3, drive=DRIVE, **effects):
+    """Drive; return per-step wheel speeds, ticks, true poses, and the poses that were measured."""
+    plant = Plant(parameters, hidden_effects(effects), seed)
+    speeds, ticks, truth, poses = [], [], [], []
+    for left, right in drive:
+        for _ in range(300):
+            poses += plant.step(plant.now_us + 1000, left, right)
+            state = plant.truth
+            speeds.append((state.left_speed_rad_s, state.right_speed_rad_s))
+            ticks.append(plant.encoder_ticks)
+            truth.append((state.x_m, state.y_m, state.yaw_rad))
+    return np.array(speeds), np.array(ticks), np.array(truth), poses
+
+
+@pytest.fixture(scope="module")
+def baseline():
+    return recorded()
+
+
+@pytest.mark.parametrize("name", EFFECTS)
+def test_an_effect_shows_in_its_own_channel_and_leaves_what_comes_before_bit_identical(name, baseline):
+    speeds, ticks, truth, poses = recorded(**{name: SIZES[name]})
+    same = (
+        np.array_equal(speeds, baseline[0]),
+        np.array_equal(ticks, baseline[1]),
+        np.array_equal(truth, baseline[2]),
+        poses == baseline[3],
+    )
+    if name == "encoder_scale":
+        assert same == (True, False, True, True)
+    elif EFFECTS[name].channel == "command_to_wheel":
+        assert not same[0]
+        assert not same[2]
+    elif EFFECTS[name].channel == "wheel_to_body":
+        assert same == (True, True, False, False)
+    else:
+        assert same == (True, True, True, False)
+
+
+def test_effects_of_size_nothing_leave_the_trajectory_bit_identical(baseline):
+    nothing = {
+        name: [0.0 if math.isinf(value.neutral) and value.name == "time_s" else value.neutral for value in spec.values]
+        for name, spec in EFFECTS.items()
+        if not math.isinf(spec.values[0].neutral) and name != "motor_lag"
+    }
+    speeds, ticks, truth, poses = recorded(**nothing)
+    assert np.array_equal(speeds, baseline[0])
+    assert np.array_equal(ticks, baseline[1])
+    assert np.array_equal(truth, baseline[2])
+    assert poses == baseline[3]
+
+
+def test_pose_latency_shifts_the_measured_path_by_itself():
+    quick, late = recorded(STILL)[3], recorded(STILL, pose_latency=0.12)[3]
+    for now, then in zip(late[3:], quick, strict=False):
+        assert now.sample_us - then.sample_us == 120_000
+        assert (now.x_m, now.y_m, now.yaw_rad) == (then.x_m, then.y_m, then.yaw_rad)
+
+
+def test_pose_latency_keeps_stamps_and_noise():
+    quick, late = recorded(NOISY)[3], recorded(NOISY, pose_latency=0.04)[3]
+    assert [(m.sample_us, m.available_us) for m in quick] == [(m.sample_us, m.available_us) for m in late]
+
+
+@pytest.mark.parametrize("delay_s", [0.04, 0.0403])
+def test_a_delayed_command_takes_effect_exactly_then(delay_s):
+    prompt, late = Plant(IDEAL), Plant(IDEAL, hidden_effects({"command_delay": delay_s}))
+    prompt.step(100_000, 0.0, 0.0)
+    prompt.step(400_000, 4.0, 2.0)
+    late.step(100_000, 0.0, 0.0)
+    late.step(100_000 + round(delay_s * 1e6), 4.0, 2.0)
+    assert late.truth.left_speed_rad_s == late.truth.x_m == 0.0
+    late.step(400_000 + round(delay_s * 1e6), 4.0, 2.0)
+    for name in ("x_m", "y_m", "yaw_rad", "left_speed_rad_s"):
+        assert getattr(late.truth, name) == pytest.approx(getattr(prompt.truth, name), abs=1e-12)
+
+
+def test_every_delayed_command_comes_through_in_order():
+    plant = Plant(IDEAL, hidden_effects({"command_delay": 0.0505}))
+    seen = []
+    for k in range(400):
+        plant.step((k + 1) * 1000, float(k // 10), 0.0)
+        seen.append(plant.truth.left_speed_rad_s)
+    expected = [max(0, (k * 1000 + 999 - 50_500) // 10_000) for k in range(400)]
+    assert seen == expected
+
+
+def test_the_circle_has_the_radius_of_the_kinematics():
+    plant = Plant(IDEAL)
+    path = []
+    for _ in range(4000):
+        plant.step(plant.now_us + 5000, 2.5, 4.0)
+        path.append((plant.truth.x_m, plant.truth.y_m))
+    v, omega = 0.061 * 3.25, 0.061 * 1.5 / 0.415
+    radii = np.hypot(np.array(path)[:, 0] - 0.238, np.array(path)[:, 1] - v / omega)
+    np.testing.assert_allclose(radii, math.hypot(v / omega, 0.238), rtol=1e-9)
+
+
+def test_a_straight_line_is_straight_with_real_motors_and_ends_where_the_ticks_say():
+    plant = Plant(STILL)
+    plant.step(5_000_000, 5.0, 5.0)
+    plant.step(6_000_000, 0.0, 0.0)
+    state = plant.truth
+    assert state.y_m == state.yaw_rad == state.speed_m_s == 0.0
+    left, right = plant.encoder_ticks
+    assert left == right == math.floor(state.x_m / (2 * math.pi * 0.061) * 2048)
+
+
+def test_a_measured_pose_is_the_true_one_at_its_stamp():
+    plant = Plant(STILL)
+    truth, poses = {}, []
+    for _ in range(2000):
+        poses += plant.step(plant.now_us + 1000, 3.0, 5.0)
+        truth[plant.now_us] = plant.truth
+    assert len(poses) == 49
+    for pose in poses:
+        state = truth[pose.sample_us]
+        assert (pose.x_m, pose.y_m, pose.yaw_rad) == pytest.approx((state.x_m, state.y_m, state.yaw_rad), abs=1e-12)
+
+
+def test_a_pose_between_two_integration_steps_is_that_of_its_own_instant():
+    plant = Plant(replace(IDEAL, pose_rate_hz=30.0))
+    poses = plant.step(2_000_000, 4.0, 4.0)
+    assert len(poses) == 59
+    assert [pose.sample_us for pose in poses[:3]] == [33_333, 66_667, 100_000]
+    for pose in poses:
+        assert pose.x_m == pytest.approx(4.0 * 0.061 * pose.sample_us * 1e-6, abs=1e-12)
+
+
+def test_poses_come_out_when_they_are_available_and_not_before():
+    plant = Plant(replace(NOISY, pose_delay_s=0.1, pose_delay_jitter_s=0.06))
+    out_of_order = 0
+    last_us = 0
+    for _ in range(3000):
+        before_us = plant.now_us
+        poses = plant.step(plant.now_us + 1000, 3.0, 5.0)
+        assert all(before_us < pose.available_us <= plant.now_us for pose in poses)
+        for pose in poses:
+            out_of_order += pose.sample_us < last_us
+            last_us = max(last_us, pose.sample_us)
+    assert out_of_order > 3
+
+
+@settings(max_examples=15, deadline=None)
+@given(cuts=st.lists(st.integers(1, 80), min_size=1, max_size=40))
+def test_how_a_run_is_cut_into_steps_changes_nothing(cuts):
+    whole, cut = Plant(seed=5), Plant(seed=5)
+    until_us = 1000 * sum(cuts)
+    poses = whole.step(until_us, 3.0, 5.0)
+    pieces = [pose for milliseconds in cuts for pose in cut.step(cut.now_us + 1000 * milliseconds, 3.0, 5.0)]
+    assert cut.truth == whole.truth
+    assert cut.encoder_ticks == whole.encoder_ticks
+    assert cut.battery == whole.battery
+    assert pieces == poses
+
+
+def test_the_seed_decides_everything():
+    first, again, other = recorded(seed=1), recorded(seed=1), recorded(seed=2)
+    assert np.array_equal(first[2], again[2])
+    assert first[3] == again[3]
+    assert not np.array_equal(first[2], other[2])
+
+
+def final_pose(parameters, step_us, **effects):
+    plant = Plant(replace(parameters, integration_step_us=step_us), hidden_effects(effects))
+    for left, right in DRIVE:
+        plant.step(plant.now_us + 320_000, left, right)
+    return np.array([plant.truth.x_m, plant.truth.y_m, plant.truth.yaw_rad])
+
+
+def errors_by_step(parameters, **effects):
+    """Distance of the final pose from the one of a 25 us step, for 4, 2 and 1 ms."""
+    limit = final_pose(parameters, 25, **effects)
+    return [np.abs(final_pose(parameters, step_us, **effects) - limit).max() for step_us in (4000, 2000, 1000)]
+
+
+@pytest.mark.parametrize("effects", [{"motor_lag": 0.08}, {"x_second_order_motor": 15.0}], ids=lambda e: next(iter(e)))
+def test_the_integrator_is_of_second_order(effects):
+    coarse, middle, fine = errors_by_step(IDEAL, **effects)
+    assert middle < 0.3 * coarse
+    assert fine < 0.3 * middle
+
+
+def test_limits_and_dry_friction_leave_the_integrator_convergent():
+    coarse, _, fine = errors_by_step(STILL)
+    assert fine < 0.5 * coarse
+    assert fine < 5e-6
+
+
+def test_kidnapping_moves_the_body_and_not_the_wheels():
+    plant = Plant(STILL, start=Pose(1.0, 1.0, 0.5))
+    plant.step(500_000, 3.0, 3.0)
+    before, ticks = plant.truth, plant.encoder_ticks
+    plant.kidnap(0.5, -0.2, 4.0)
+    after = plant.truth
+    assert (after.x_m - before.x_m, after.y_m - before.y_m) == pytest.approx((0.5, -0.2))
+    assert after.yaw_rad == pytest.approx(before.yaw_rad + 4.0 - 2 * math.pi)
+    assert plant.encoder_ticks == ticks
+    assert (after.left_speed_rad_s, after.t_us) == (before.left_speed_rad_s, before.t_us)
+    poses = plant.step(600_000, 0.0, 0.0)
+    assert abs(poses[-1].x_m - after.x_m) < 0.05
+
+
+def test_disabled_and_braked_wheels_come_to_rest():
+    plant = Plant(STILL)
+    plant.step(1_000_000, 5.0, 5.0)
+    plant.step(4_000_000, 5.0, 5.0, enabled=False)
+    assert plant.truth.left_speed_rad_s == plant.truth.speed_m_s == 0.0
+    plant.step(5_000_000, 5.0, 5.0)
+    plant.step(5_300_000, 5.0, 5.0, brake=True)
+    assert plant.truth.left_speed_rad_s == 0.0
+
+
+def test_readings_follow_what_the_motors_do():
+    plant = Plant(STILL)
+    resting_v = plant.battery.voltage_v
+    plant.step(3_000_000, -6.0, 6.0)
+    left_a, right_a = plant.motor_currents_a
+    assert left_a < -1.0 < 1.0 < right_a
+    assert plant.battery.voltage_v < resting_v
+    assert min(plant.motor_temperatures_c) > 22.0
+    assert plant.measured_wheel_speeds_rad_s == pytest.approx((-6.0, 6.0), abs=0.1)
+
+
+def test_time_cannot_go_back():
+    plant = Plant()
+    plant.step(5000, 0.0, 0.0)
+    with pytest.raises(ValueError, match="5000 us"):
+        plant.step(4000, 0.0, 0.0)
+
+
+def test_wheel_disturbance_shows_in_ticks_and_pose_alike():
+    plant = Plant(replace(STILL, wheel_disturbance_std=0.015).with_ideal_motors(), seed=4)
+    speeds = []
+    for _ in range(4000):
+        plant.step(plant.now_us + 10_000, 5.0, 5.0)
+        speeds.append((plant.truth.left_speed_rad_s, plant.truth.right_speed_rad_s))
+    np.testing.assert_allclose(np.std(speeds, axis=0), 0.015 * 5.0, rtol=0.15)
+    travelled = np.array(plant.encoder_ticks) / 2048 * 2 * math.pi * 0.061
+    assert plant.truth.yaw_rad == pytest.approx((travelled[1] - travelled[0]) / 0.415, abs=2e-3)
+
+
+def test_the_plant_knows_nothing_of_what_thinks():
+    for source in Path(sim.__file__).parent.glob("*.py"):
+        for node in ast.walk(ast.parse(source.read_text())):
+            modules = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            if isinstance(node, ast.ImportFrom):
+                modules = [node.module or ""]
+            assert not any(module.split(".")[0] == "disco_hw" for module in modules), source.name
