@@ -1,0 +1,133 @@
+"""The robot as the host sees it: the plant, the reference firmware core on its controller, and the controller's clock.
+
+Pure: call `VirtualRobot.step` at 1 kHz of robot time and carry the frames to and fro.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from drivers.types import Frame
+from firmware_protocol.firmware_core import FirmwareConfig, FirmwareCore, FirmwareInputs, FirmwareOutputs, ResetCause
+from sim.plant import Plant, TrueState
+
+STEP_US = 1000
+
+_RELEASED = FirmwareOutputs(0.0, 0.0, False, True, False, "BOOT", 0, 0, "NONE", "NONE", 0, 0, 0, 0, 0)
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceClock:
+    """The controller's microsecond counter: `start_us` at robot time 0, `skew_ppm` too fast."""
+
+    start_us: int = 1_234_567_890
+    skew_ppm: float = 40.0
+
+    def at(self, robot_us: int) -> int:
+        """What the counter shows at robot time `robot_us`."""
+        return self.start_us + robot_us + round(robot_us * self.skew_ppm * 1e-6)
+
+
+class VirtualRobot:
+    """A plant driven by the firmware core, seen through frames.
+
+    Robot time is true microseconds since the robot was switched on, the plant's time. The motor driver takes the
+    firmware's setpoints, its enable and its brake one cycle later. `estop_button` is the state of the button on the
+    robot. `seed` decides the arming challenges.
+    """
+
+    def __init__(self, plant: Plant, config: FirmwareConfig, clock: DeviceClock | None = None, seed: int = 0) -> None:
+        self.plant = plant
+        self.estop_button = False
+        self._config = config
+        self._clock = clock or DeviceClock()
+        self._clock_start_us = 0
+        self._seed = seed
+        self._reset_cause = ResetCause.POWER_ON
+        self._firmware = FirmwareCore(config, entropy=seed)
+        self._outputs = _RELEASED
+
+    @property
+    def now_us(self) -> int:
+        """Robot time of the last step."""
+        return self.plant.now_us
+
+    @property
+    def outputs(self) -> FirmwareOutputs:
+        """What the firmware wanted in the last cycle."""
+        return self._outputs
+
+    @property
+    def firmware(self) -> FirmwareCore:
+        """The controller's program, for its counters."""
+        return self._firmware
+
+    @property
+    def truth(self) -> TrueState:
+        """The plant's true state at the last step."""
+        return self.plant.truth
+
+    def device_us(self, robot_us: int) -> int:
+        """What the controller's clock shows at robot time `robot_us`."""
+        return self._clock.at(robot_us - self._clock_start_us)
+
+    def receive(self, now_us: int, frame: Frame) -> None:
+        """One frame from the link, at robot time `now_us`."""
+        self._firmware.receive(self.device_us(now_us), frame.can_id, frame.data)
+
+    def step(self, now_us: int, error_counters: tuple[int, int] = (0, 0)) -> Sequence[Frame]:
+        """Move on to robot time `now_us` and run one firmware cycle; return the frames that it sends, in order.
+
+        error_counters: transmit and receive error counter of the link's controller. Raises ValueError if time would go
+        backwards.
+        """
+        plant = self.plant
+        outputs = self._outputs
+        poses = plant.step(
+            now_us, outputs.left_setpoint_rad_s, outputs.right_setpoint_rad_s, outputs.driver_enabled, outputs.brake
+        )
+        for pose in poses:
+            if pose.sample_us < self._clock_start_us:
+                # The controller's clock has no name for a time before it started.
+                continue
+            self._firmware.pose(
+                pose.x_m, pose.y_m, pose.yaw_rad, self.device_us(pose.sample_us), pose.position_std_m, pose.yaw_std_rad
+            )
+        left_ticks, right_ticks = plant.encoder_ticks
+        left_speed, right_speed = plant.measured_wheel_speeds_rad_s
+        left_current, right_current = plant.motor_currents_a
+        left_temperature, right_temperature = plant.motor_temperatures_c
+        battery = plant.battery
+        inputs = FirmwareInputs(
+            left_ticks=left_ticks,
+            right_ticks=right_ticks,
+            left_speed_rad_s=left_speed,
+            right_speed_rad_s=right_speed,
+            left_current_a=left_current,
+            right_current_a=right_current,
+            left_temperature_c=left_temperature,
+            right_temperature_c=right_temperature,
+            voltage_v=battery.voltage_v,
+            battery_current_a=battery.current_a,
+            battery_temperature_c=battery.temperature_c,
+            tx_error_count=error_counters[0],
+            rx_error_count=error_counters[1],
+            estop_button=self.estop_button,
+            reset_cause=self._reset_cause,
+        )
+        self._outputs = self._firmware.step(self.device_us(now_us), inputs)
+        return [Frame(can_id, data) for can_id, data in self._firmware.drain()]
+
+    def kidnap(self, dx_m: float, dy_m: float, dyaw_rad: float) -> None:
+        """Carry the robot off: a step in the world frame and a turn about the tracked point, wheels untouched."""
+        self.plant.kidnap(dx_m, dy_m, dyaw_rad)
+
+    def reboot(self, cause: ResetCause = ResetCause.POWER_ON) -> None:
+        """Restart the controller: it forgets everything, its clock begins anew, the wheels brake until it is up."""
+        self._seed += 1
+        self._reset_cause = cause
+        self._clock_start_us = self.plant.now_us
+        self._clock = DeviceClock(0, self._clock.skew_ppm)
+        self._firmware = FirmwareCore(self._config, entropy=self._seed)
+        self._outputs = _RELEASED

@@ -1,0 +1,213 @@
+"""In simulated time, with the real plant, the real C core and the real codec on both ends of a simulated CAN bus."""
+
+import math
+
+import pytest
+
+from drivers.types import Frame
+from firmware_protocol.firmware_core import FirmwareConfig, ResetCause
+from sim.bus import CanBus
+from sim.can_frame import CanFrame
+from sim.plant import Plant
+from sim.plant_parameters import PlantParameters
+from sim.virtual_robot import DeviceClock, VirtualRobot
+from tests.sim.minimal_host import MinimalHost
+
+CONFIG = FirmwareConfig(ticks_per_rev=2048, max_wheel_speed_rad_s=8.0, max_wheel_acceleration_rad_s2=20.0)
+
+
+class Setup:
+    """Host, bus and robot; one `run` millisecond is one robot step and one look of the host."""
+
+    def __init__(self, **options):
+        self.bus = CanBus()
+        self.host_node = self.bus.attach("host", capacity=64)
+        self.robot_node = self.bus.attach("robot", capacity=64)
+        plant = Plant(options.pop("parameters", None) or PlantParameters().noiseless(), seed=1)
+        self.robot = VirtualRobot(plant, CONFIG, **options)
+        self.host = MinimalHost()
+        self.now_ms = 0
+        self.frames = []
+
+    def run(self, milliseconds, until=None):
+        for _ in range(milliseconds):
+            self.now_ms += 1
+            for delivery in self.bus.advance(self.now_ms * 1_000_000):
+                frame = Frame(delivery.frame.can_id, delivery.frame.data)
+                if delivery.sender is self.robot_node:
+                    self.frames.append((delivery.t_ns, frame))
+                    self.host.receive(frame)
+                else:
+                    self.robot.receive(delivery.t_ns // 1000, frame)
+            for frame in self.robot.step(self.now_ms * 1000):
+                assert self.bus.send(self.robot_node, CanFrame(*_parts(frame)))
+            for frame in self.host.due(self.now_ms):
+                assert self.bus.send(self.host_node, CanFrame(*_parts(frame)))
+            if until is not None and until():
+                return
+        assert until is None, "it did not come to it"
+
+    def arm(self):
+        self.host.wanted = "READY"
+        self.run(2000, until=lambda: self.host.robot_state == "READY")
+        self.host.wanted = "ARM"
+        self.run(2000, until=lambda: self.host.robot_state == "ARMED")
+
+    def wheel_speed(self):
+        truth = self.robot.truth
+        return max(abs(truth.left_speed_rad_s), abs(truth.right_speed_rad_s))
+
+
+def _parts(frame):
+    return frame.can_id, frame.data
+
+
+@pytest.fixture
+def setup():
+    return Setup()
+
+
+def test_handshake_arm_drive_stop(setup):
+    setup.run(50)
+    assert setup.host.robot_state == "STANDBY"
+    assert setup.wheel_speed() == 0.0
+    setup.arm()
+    assert setup.wheel_speed() < 0.01
+    setup.host.speeds = (2.0, 3.0)
+    setup.run(1500)
+    truth = setup.robot.truth
+    assert truth.left_speed_rad_s == pytest.approx(2.0, abs=0.02)
+    assert truth.right_speed_rad_s == pytest.approx(3.0, abs=0.02)
+    assert setup.host.latest["WHEEL_SPEED"]["left_speed"] == pytest.approx(2.0, abs=0.1)
+    assert truth.yaw_rad > 0.0
+    setup.host.wanted = "STANDBY"
+    setup.run(1000, until=lambda: setup.host.robot_state == "STANDBY")
+    setup.run(300)
+    assert setup.wheel_speed() < 0.01
+
+
+def test_silence_stops_the_wheels_in_time(setup):
+    setup.arm()
+    setup.host.speeds = (4.0, 4.0)
+    setup.run(1000)
+    assert setup.wheel_speed() == pytest.approx(4.0, abs=0.05)
+    setup.host.silent = True
+    decelerating_s = 4.0 / CONFIG.stop_deceleration_rad_s2
+    lag_s = 5.0 * PlantParameters().speed_loop_time_constant_s
+    setup.run(round(1000 * (0.1 + decelerating_s + lag_s)) + 20)
+    assert setup.wheel_speed() < 0.05
+    setup.run(1000)
+    assert not setup.robot.outputs.driver_enabled
+    assert setup.robot.outputs.brake
+    assert setup.robot.outputs.state != "ARMED"
+
+
+def test_the_estop_button_stops_and_latches(setup):
+    setup.arm()
+    setup.host.speeds = (4.0, 4.0)
+    setup.run(500)
+    setup.robot.estop_button = True
+    setup.run(700)
+    assert setup.wheel_speed() < 0.01
+    assert setup.host.robot_state == "ESTOP"
+    setup.robot.estop_button = False
+    setup.run(500)
+    assert setup.host.robot_state == "ESTOP"
+    assert setup.wheel_speed() == 0.0
+
+
+def test_ticks_and_pose_tell_what_the_plant_does(setup):
+    setup.arm()
+    setup.host.speeds = (3.0, 3.0)
+    setup.run(2000)
+    setup.host.speeds = (0.0, 0.0)
+    setup.run(1000)
+    truth, ticks = setup.robot.truth, setup.host.latest["WHEEL_TICKS"]
+    distance_m = ticks["left_ticks"] / 2048 * 2 * math.pi * setup.robot.plant.parameters.wheel_radius_m
+    assert math.hypot(truth.x_m, truth.y_m) == pytest.approx(distance_m, rel=0.02)
+    assert setup.host.latest["POSE_POSITION"]["x"] == pytest.approx(truth.x_m, abs=1e-3)
+    assert setup.host.latest["POSE_HEADING"]["yaw"] == pytest.approx(truth.yaw_rad, abs=1e-3)
+
+
+def test_poses_come_at_their_rate_and_late_with_the_device_time_of_the_sample(setup):
+    setup.arm()
+    setup.host.speeds = (3.0, 3.0)
+    setup.frames.clear()
+    setup.run(1000)
+    codec = setup.host.codec
+    headings = [
+        (t_ns, codec.decode(frame.can_id, frame.data).values)
+        for t_ns, frame in setup.frames
+        if frame.can_id == codec.can_id("POSE_HEADING")
+    ]
+    assert len(headings) == pytest.approx(25, abs=1)
+    for t_ns, values in headings:
+        device_us = setup.robot.device_us(t_ns // 1000)
+        age_us = (device_us - values["sample_time"]) % 6_553_600
+        assert 30_000 <= age_us <= 33_000
+
+
+def test_the_device_clock_has_its_own_start_and_speed():
+    clock = DeviceClock(start_us=5_000_000, skew_ppm=40.0)
+    assert clock.at(0) == 5_000_000
+    assert clock.at(1_000_000_000) == 5_000_000 + 1_000_040_000
+    setup = Setup(clock=clock)
+    setup.run(20_000)
+    times_us = setup.host.times
+    assert len(times_us) == 20
+    assert times_us[0] == pytest.approx(5_000_000 + 7_000, abs=1000)
+    assert (times_us[-1] - times_us[0]) / 19e6 - 1.0 == pytest.approx(40e-6, abs=20e-6)
+
+
+def test_error_counters_of_the_link_reach_the_firmware(setup):
+    setup.run(100)
+    setup.robot.step(setup.robot.now_us + 1000, (256, 3))
+    assert setup.robot.outputs.fault == setup.host.codec.choice_value("SYSTEM_STATE", "fault", "BUS_OFF")
+
+
+def test_kidnapping_moves_the_pose_and_not_the_ticks(setup):
+    setup.run(100)
+    before = setup.robot.plant.encoder_ticks
+    setup.robot.kidnap(0.5, -0.25, 1.0)
+    setup.run(200)
+    assert setup.robot.plant.encoder_ticks == before
+    assert setup.host.latest["POSE_POSITION"] == pytest.approx({"valid": 1, "x": 0.5, "y": -0.25}, abs=1e-3)
+
+
+def test_a_restart_forgets_the_session_and_stands_still(setup):
+    setup.arm()
+    setup.host.speeds = (4.0, 4.0)
+    setup.run(500)
+    position = setup.robot.truth.x_m
+    setup.robot.reboot()
+    setup.run(1)
+    assert setup.robot.outputs.state in {"BOOT", "STANDBY"}
+    assert setup.robot.device_us(setup.robot.now_us) == 1000
+    setup.run(1000)
+    assert setup.wheel_speed() < 0.01
+    assert setup.robot.truth.x_m >= position
+    assert setup.robot.outputs.session == 0
+
+
+def test_a_watchdog_reset_is_a_fault(setup):
+    setup.run(10)
+    setup.robot.reboot(ResetCause.WATCHDOG)
+    setup.run(10)
+    assert setup.robot.outputs.fault == setup.host.codec.choice_value("SYSTEM_STATE", "fault", "WATCHDOG_RESET")
+
+
+def test_two_runs_with_one_seed_are_equal():
+    runs = []
+    for _ in range(2):
+        setup = Setup(parameters=PlantParameters())
+        setup.arm()
+        setup.host.speeds = (3.0, 2.0)
+        setup.run(500)
+        runs.append((setup.frames, setup.robot.truth))
+    assert runs[0] == runs[1]
+
+
+def test_time_does_not_go_back(setup):
+    setup.run(10)
+    with pytest.raises(ValueError, match="cannot go back"):
+        setup.robot.step(9000)
