@@ -150,7 +150,7 @@ class PoseFusion:
         self._counts[f"poses_{outcome.reason.value}"] += 1
         return PoseUpdate(
             t_ns=sample.t_ns,
-            age_s=(now_ns - sample.t_ns) * 1e-9,
+            age_s=(now_ns - sample.t_ns) / 1e9,
             reason=outcome.reason,
             innovation=outcome.innovation,
             innovation_variance=outcome.innovation_variance,
@@ -209,4 +209,4 @@ class PoseFusion:
 
 
 def _age_s(now_ns: int, t_ns: int) -> float:
-    return max(0, now_ns - t_ns) * 1e-9
+    return max(0, now_ns - t_ns) / 1e9

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from disco_hw.config import Estimation
@@ -135,6 +135,7 @@ def test_variances_have_a_ceiling_and_stay_definite():
         assert np.linalg.eigvalsh(covariance)[0] > 0.0
 
 
+@settings(deadline=None)
 @given(st.lists(st.tuples(st.floats(-100, 100), st.floats(-100, 100)), max_size=30), st.booleans())
 def test_any_drive_keeps_the_covariance_positive_definite(turns, known):
     parameters = KNOWN if known else UNCERTAIN

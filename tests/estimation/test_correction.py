@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from disco_hw.estimation.belief import Belief
@@ -99,6 +99,7 @@ def test_one_corrector_serves_many_beliefs_without_memory():
     assert [used.correct(*case) for case in cases] == [PoseCorrector().correct(*case) for case in cases]
 
 
+@settings(deadline=None)
 @given(
     st.lists(st.floats(-8, 4), min_size=3, max_size=3),
     st.tuples(st.floats(-1000, 1000), st.floats(-1000, 1000), st.floats(-10, 10)),

@@ -4,7 +4,7 @@ import itertools
 import math
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from disco_hw.estimation.wheels import MAX_WHEEL_SPEED_RAD_S, WheelReading, WheelReason, WheelTracker
@@ -80,6 +80,7 @@ def test_the_bound_of_a_jump_grows_with_the_time_and_allows_for_jitter():
 numbers = st.floats(allow_nan=True, allow_infinity=True)
 
 
+@settings(deadline=None)
 @given(st.lists(st.tuples(st.integers(-(2**63), 2**63), numbers, numbers, numbers, numbers)))
 def test_any_stream_gives_finite_readings_in_order(values):
     tracker, readings = WheelTracker(), []
