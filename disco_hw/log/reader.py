@@ -41,6 +41,13 @@ class Entry(NamedTuple):
     record: Record
 
 
+class Gap(NamedTuple):
+    """Ticks that were dropped on their way to the file: how many, and when the first one after them was."""
+
+    before_ns: int
+    ticks: int
+
+
 class TopicSummary(msgspec.Struct, frozen=True):
     """How much of one topic there is."""
 
@@ -182,19 +189,12 @@ class Log:
 
     def summary(self) -> LogSummary:
         """What the log holds; reads the whole file once. Raises LogError for damage."""
-        ticks, missing = 0, 0
-        first, last = 0, 0
-        # Ticks are numbered from 1 on, in all parts of a log together.
-        previous = 0 if self._metadata.part == 1 else None
-        for message in self._messages(None, None, None):
-            if ticks and message.sequence == previous:
-                continue
-            if previous is not None:
-                missing += (message.sequence - previous - 1) & 0xFFFFFFFF
-            previous = message.sequence
-            first = first if ticks else message.log_time
-            last = message.log_time
+        ticks, missing, first, last = 0, 0, 0, 0
+        for now_ns, lost in self._ticks():
+            first = first if ticks else now_ns
+            last = now_ns
             ticks += 1
+            missing += lost
         duration_s = (last - first) * 1e-9
         return LogSummary(
             path=str(self._path),
@@ -214,6 +214,23 @@ class Log:
             attachments={ref.name: ref.size for ref in self._contents.attachments},
             damage=self.damage,
         )
+
+    def gaps(self) -> tuple[Gap, ...]:
+        """Where ticks are missing; reads the whole file once. Raises LogError for damage."""
+        return tuple(Gap(now_ns, lost) for now_ns, lost in self._ticks() if lost)
+
+    def _ticks(self) -> Iterator[tuple[int, int]]:
+        """Time of each tick and the number of ticks missing just before it."""
+        # Ticks are numbered from 1 on, in all parts of a log together.
+        previous = 0 if self._metadata.part == 1 else None
+        any_yet = False
+        for message in self._messages(None, None, None):
+            if any_yet and message.sequence == previous:
+                continue
+            lost = 0 if previous is None else (message.sequence - previous - 1) & 0xFFFFFFFF
+            yield message.log_time - self._metadata.wall_offset_ns, lost
+            previous = message.sequence
+            any_yet = True
 
     def _messages(self, topics: Collection[str] | None, start_ns: int | None, end_ns: int | None) -> Iterator[Message]:
         unknown = [topic for topic in topics or () if topic not in TOPIC_BY_NAME]

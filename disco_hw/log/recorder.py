@@ -158,7 +158,11 @@ class ProcessRecorder:
             raise LogError(
                 f"{self._runtime}: cannot hold a socket ({error.strerror}); set XDG_RUNTIME_DIR to a short path"
             ) from None
-        self._launch()
+        try:
+            self._launch()
+        except LogError:
+            self._release()
+            raise
 
     @property
     def path(self) -> Path:

@@ -218,6 +218,8 @@ def _fail(status: StatusLine, code: int, message: str, written: int) -> int:
 def main() -> int:
     """Read the start file named on the command line, remove it, and record."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # The recorder's process may block signals that it takes another way; that would have been inherited.
+    signal.pthread_sigmask(signal.SIG_SETMASK, ())
     if len(sys.argv) != 2:
         print("usage: python -m disco_hw.log.writer START_FILE (it is started by the recorder)", file=sys.stderr)
         return 2

@@ -1,0 +1,57 @@
+"""What `disco-hw log info`, `recover` and `export` do; each returns the text to print."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import msgspec
+
+from disco_hw.log.csv_export import write_csv
+from disco_hw.log.mcap_drive import drive_from_log, ticks_per_rev
+from disco_hw.log.reader import LogSummary, open_log
+from disco_hw.log.recovery import recover as recover_log
+
+
+def info(path: Path, as_json: bool) -> str:
+    """What a log holds and what of it is lost; raises LogError."""
+    with open_log(path) as log:
+        summary = log.summary()
+    return msgspec.json.encode(summary).decode() if as_json else _in_words(summary)
+
+
+def recover(path: Path, out: Path, as_json: bool) -> str:
+    """Copy everything whole from a damaged log into a new one; raises LogError."""
+    recovered = recover_log(path, out)
+    if as_json:
+        return json.dumps({"out": str(out)} | asdict(recovered))
+    lines = [f"{out}: {recovered.messages} messages in {recovered.chunks} chunks, {recovered.attachments} attachments"]
+    lines += [f"lost: {loss}" for loss in recovered.lost] or ["nothing was lost"]
+    return "\n".join(lines)
+
+
+def export(path: Path, out: Path, as_json: bool) -> str:
+    """Write commands, encoders and poses of a log as CSV; raises LogError."""
+    with open_log(path) as log:
+        drive = drive_from_log(log)
+        rows = write_csv(drive, out, ticks_per_rev(log))
+    if as_json:
+        return json.dumps({"out": str(out), "rows": rows, "segments": drive.segments, "notes": drive.notes})
+    return "\n".join([f"{out}: {rows} rows, {drive.segments} segments", *drive.notes])
+
+
+def _in_words(summary: LogSummary) -> str:
+    size_mb = summary.bytes / 1e6
+    ended = "ended properly" if summary.complete else "not ended properly"
+    lines = [
+        f"{summary.path}: {summary.robot}, {summary.duration_s:.1f} s from {summary.start}, {size_mb:.2f} MB",
+        f"recorded by disco-hw {summary.version or 'of unknown version'}, part {summary.part}",
+        f"{summary.ticks} ticks, {summary.missing_ticks} missing; {ended}",
+    ]
+    lines += [
+        f"  {topic:<24} {item.count:>9}  {item.rate_hz:8.1f} Hz" for topic, item in sorted(summary.topics.items())
+    ]
+    lines += [f"  attached: {name}, {size} bytes" for name, size in summary.attachments.items()]
+    lines += [f"lost: {loss}" for loss in summary.damage]
+    return "\n".join(lines)

@@ -1,0 +1,241 @@
+"""The CSV of logged drives -> the arrays of a drive.
+
+Header row, columns by name in any order: `t_s`, `cmd_left_rad_s`, `cmd_right_rad_s`, either `enc_*_rad_s` or
+cumulative `enc_*_ticks` or both, `pose_x_m`, `pose_y_m`, `pose_yaw_rad`, optional `imu_wz_rad_s`, optional `segment`.
+An empty cell is "no sample at that time".
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from disco_hw.log.drive import (
+    Array,
+    Commands,
+    DriveLog,
+    Gyro,
+    Index,
+    Poses,
+    Wheels,
+    differentiate_angle,
+    integrate_angle,
+)
+from disco_hw.log.errors import LogError
+from disco_hw.log.plausible import length_fault, time_fault, yaw_fault
+
+COMMAND = ("cmd_left_rad_s", "cmd_right_rad_s")
+SPEED = ("enc_left_rad_s", "enc_right_rad_s")
+TICKS = ("enc_left_ticks", "enc_right_ticks")
+POSE = ("pose_x_m", "pose_y_m", "pose_yaw_rad")
+GYRO = ("imu_wz_rad_s",)
+TIME = "t_s"
+SEGMENT = "segment"
+
+Mask = NDArray[np.bool_]
+
+_GROUPS = (COMMAND, SPEED, TICKS, POSE, GYRO)
+_LONGEST_HOLD_S = 0.5
+_LARGEST_STEP_REV = 10.0
+
+
+class _Sheet(NamedTuple):
+    """A file's columns: times (N,), segments (N,), and cells (N,) with NaN where they are empty."""
+
+    name: str
+    t_s: Array
+    segment: Index
+    cells: dict[str, Array]
+    ignored: tuple[str, ...]
+
+
+def read_csv(path: Path, ticks_per_rev: float | None = None, wheel_radius_m: float | None = None) -> DriveLog:
+    """Read one CSV file; `ticks_per_rev` is needed for ticks, the nominal `wheel_radius_m` only sharpens the checks.
+
+    A command holds through empty cells for half a second at most, after that it counts as unknown. Raises LogError with
+    one line naming file, line, column and remedy: nothing in it, missing columns, cells that are no finite number, a
+    clock that goes backwards, or units that cannot be.
+    """
+    sheet = _read(path)
+    notes = [f"{path}: ignored columns: {', '.join(sheet.ignored)}"] if sheet.ignored else []
+    t_s, segment = sheet.t_s, sheet.segment
+
+    def refuse(fault: str | None) -> None:
+        if fault is not None:
+            raise LogError(f"{path}: {fault}")
+
+    refuse(time_fault(t_s))
+    commands = _commands(sheet)
+    wheels = _wheels(sheet, ticks_per_rev)
+    pose, there = _group(sheet, POSE)
+    x_m, y_m, yaw_rad = pose[there].T
+    refuse(yaw_fault(t_s[there], yaw_rad, segment[there], wheels, commands))
+    poses = Poses(t_s[there], x_m, y_m, _wrapped(yaw_rad), segment[there])
+    if not np.array_equal(poses.yaw_rad, yaw_rad):
+        notes.append(f"{path}: pose_yaw_rad was wrapped to (-pi, pi]")
+    refuse(length_fault(poses, wheels, commands, wheel_radius_m))
+    rate, turning = _group(sheet, GYRO)
+    gyro = Gyro(t_s[turning], rate[turning, 0], segment[turning])
+    if not (np.isfinite(commands.left_rad_s).any() or wheels.t_s.size or poses.t_s.size):
+        raise LogError(f"{path}: no row has a command, an encoder sample or a pose; nothing was driven in it")
+    return DriveLog((str(path),), commands, wheels, poses, gyro, tuple(notes))
+
+
+def _read(path: Path) -> _Sheet:
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            rows = list(csv.reader(file))
+    except OSError as error:
+        raise LogError(f"{path}: cannot be read ({error.strerror}); give the path of a CSV file") from None
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise LogError(f"{path}: not a CSV file ({error}); give an MCAP log or a CSV file") from None
+    if not rows:
+        raise LogError(f"{path}: empty file; it needs a header row and samples")
+    header = [name.strip() for name in rows[0]]
+    known = {TIME, SEGMENT, *(name for group in _GROUPS for name in group)}
+    _check_header(path, header)
+    columns: dict[str, list[str]] = {name: [] for name in header if name in known}
+    places = [(header.index(name), column) for name, column in columns.items()]
+    for line, row in enumerate(rows[1:], start=2):
+        if not row:
+            continue
+        if len(row) != len(header):
+            raise LogError(f"{path}: line {line}: {len(row)} cells under {len(header)} columns; mend that line")
+        for place, column in places:
+            column.append(row[place])
+    lines = [line for line, row in enumerate(rows[1:], start=2) if row]
+    if not lines:
+        raise LogError(f"{path}: a header and no rows; nothing was recorded in it")
+    t_s = _numbers(path, TIME, columns[TIME], lines)
+    _check_clock(path, t_s, lines)
+    segment = _segments(columns.get(SEGMENT), len(lines))
+    cells = {
+        name: _numbers(path, name, column, lines) for name, column in columns.items() if name not in (TIME, SEGMENT)
+    }
+    return _Sheet(str(path), t_s - t_s[0], segment, cells, tuple(name for name in header if name not in known))
+
+
+def _check_header(path: Path, header: Sequence[str]) -> None:
+    doubled = sorted({name for name in header if header.count(name) > 1})
+    if doubled:
+        raise LogError(f"{path}: column {doubled[0]} is there twice; keep one")
+    missing = [name for name in (TIME, *COMMAND) if name not in header]
+    for group in (SPEED, TICKS, POSE):
+        if any(name in header for name in group):
+            missing += [name for name in group if name not in header]
+    if missing:
+        raise LogError(
+            f"{path}: no column {', '.join(missing)}; the header must name t_s, {', '.join(COMMAND)} and pairs"
+        )
+    if not any(name in header for name in (*SPEED, *TICKS, *POSE)):
+        raise LogError(f"{path}: neither encoder nor pose columns; add {', '.join(SPEED)} or {', '.join(POSE)}")
+
+
+def _check_clock(path: Path, t_s: Array, lines: Sequence[int]) -> None:
+    if np.isnan(t_s).any():
+        raise LogError(f"{path}: line {lines[int(np.argmax(np.isnan(t_s)))]}: t_s is empty; every row needs its time")
+    backwards = np.flatnonzero(np.diff(t_s) <= 0.0)
+    if backwards.size:
+        at = int(backwards[0])
+        what = "stands still" if t_s[at + 1] == t_s[at] else "goes backwards"
+        raise LogError(
+            f"{path}: line {lines[at + 1]}: the clock {what} (t_s {t_s[at]:.9g}, then {t_s[at + 1]:.9g}); "
+            "sort the rows, one for each time"
+        )
+
+
+def _numbers(path: Path, name: str, column: Sequence[str], lines: Sequence[int]) -> Array:
+    values = np.empty(len(column))
+    for at, text in enumerate(column):
+        try:
+            value = float(text) if text.strip() else math.nan
+            good = math.isfinite(value) or not text.strip()
+        except ValueError:
+            good = False
+        if not good:
+            raise LogError(
+                f"{path}: line {lines[at]}: {name} is {text!r}, not a finite number; leave a cell without sample empty"
+            )
+        values[at] = value
+    return values
+
+
+def _segments(column: Sequence[str] | None, count: int) -> Index:
+    """Numbered from 0 in order of appearance; an empty cell continues."""
+    segment = np.zeros(count, dtype=np.int64)
+    if column is None:
+        return segment
+    number, present = 0, column[0].strip()
+    for at, text in enumerate(column):
+        label = text.strip()
+        if label and label != present:
+            number += bool(present)
+            present = label
+        segment[at] = number
+    return segment
+
+
+def _commands(sheet: _Sheet) -> Commands:
+    t_s = sheet.t_s
+    values, given = _group(sheet, COMMAND)
+    kept = given.copy()
+    rows = np.flatnonzero(given)
+    before = np.concatenate([np.zeros(1, dtype=bool), given[:-1]])
+    for start in np.flatnonzero(~given & (before | (np.arange(t_s.size) == 0))):
+        following = int(np.searchsorted(rows, start))
+        holds = start > 0 and following < rows.size and t_s[rows[following]] - t_s[start - 1] <= _LONGEST_HOLD_S
+        # One row of NaN says that from here on no command is known.
+        kept[start] = not holds
+    return Commands(t_s[kept], values[kept, 0], values[kept, 1], sheet.segment[kept])
+
+
+def _wheels(sheet: _Sheet, ticks_per_rev: float | None) -> Wheels:
+    speeds, has_speed = _group(sheet, SPEED)
+    ticks, has_ticks = _group(sheet, TICKS)
+    if not has_ticks.any():
+        t_s, segment = sheet.t_s[has_speed], sheet.segment[has_speed]
+        left, right = speeds[has_speed].T
+        left_angle, right_angle = integrate_angle(t_s, left, segment), integrate_angle(t_s, right, segment)
+        return Wheels(t_s, left_angle, right_angle, left, right, segment, False, bool(t_s.size))
+    if ticks_per_rev is None:
+        raise LogError(f"{sheet.name}: {TICKS[0]} needs the ticks of a revolution; give --robot ROBOT.toml")
+    both = bool(has_speed.any())
+    there = has_ticks & has_speed if both else has_ticks
+    t_s, segment = sheet.t_s[there], sheet.segment[there]
+    left_angle, right_angle = ticks[there].T * (2.0 * math.pi / ticks_per_rev)
+    _check_angle(sheet.name, t_s, left_angle, segment)
+    _check_angle(sheet.name, t_s, right_angle, segment)
+    if both:
+        left, right = speeds[there].T
+    else:
+        left, right = differentiate_angle(t_s, left_angle, segment), differentiate_angle(t_s, right_angle, segment)
+    return Wheels(t_s, left_angle, right_angle, left, right, segment, True, both)
+
+
+def _check_angle(name: str, t_s: Array, angle_rad: Array, segment: Index) -> None:
+    jumps = (np.abs(np.diff(angle_rad)) > 2.0 * math.pi * _LARGEST_STEP_REV) & (np.diff(segment) == 0)
+    if jumps.any():
+        raise LogError(
+            f"{name}: an encoder jumps by more than {_LARGEST_STEP_REV:.0f} revolutions at "
+            f"t_s {t_s[1:][jumps][0]:.9g}; ticks must be cumulative and must not wrap"
+        )
+
+
+def _group(sheet: _Sheet, names: Sequence[str]) -> tuple[Array, Mask]:
+    """The columns of a group side by side, (N, k), and where all of them have a value, (N,)."""
+    empty = np.full(sheet.t_s.size, np.nan)
+    values = np.column_stack([sheet.cells.get(name, empty) for name in names])
+    there: Mask = np.isfinite(values).all(axis=1)
+    return values, there
+
+
+def _wrapped(yaw: Array) -> Array:
+    wrapped = np.pi - np.mod(np.pi - yaw, 2.0 * np.pi)
+    # What is in range already stays as it was, to the last bit.
+    return np.where((yaw > -np.pi) & (yaw <= np.pi), yaw, wrapped)
