@@ -5,7 +5,6 @@ import zlib
 from dataclasses import dataclass
 from importlib import resources
 
-import cantools
 import cantools.database.can
 
 from firmware_protocol.e2e import data_id
@@ -75,11 +74,16 @@ def dbc_hash(text: str) -> int:
 
 
 def load_protocol(text: str) -> Protocol:
-    """Read a DBC into tables. Raises ValueError for what this protocol does not use: big-endian signals or offsets."""
-    database = cantools.database.load_string(text, database_format="dbc")
-    if not isinstance(database, cantools.database.can.Database) or database.dbc is None:
-        raise ValueError("not a CAN database")
-    attributes = database.dbc.attributes
+    """Read a DBC into tables.
+
+    Raises ValueError for a DBC without protocol version, and for what this protocol does not use: big-endian signals
+    and offsets.
+    """
+    database = cantools.database.can.Database()
+    database.add_dbc_string(text)
+    attributes = database.dbc.attributes if database.dbc is not None else {}
+    if not {"ProtocolMajor", "ProtocolMinor"} <= attributes.keys():
+        raise ValueError("the DBC has no attributes ProtocolMajor and ProtocolMinor")
     major = int(attributes["ProtocolMajor"].value)
     return Protocol(
         major=major,

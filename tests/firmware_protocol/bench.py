@@ -1,0 +1,123 @@
+"""A controller on a bench: the real C core, ideal wheels, and a host that says what it is told to, at 1 kHz."""
+
+import math
+
+from firmware_protocol import _firmware
+from firmware_protocol.codec import Codec, Decoded
+from firmware_protocol.e2e import challenge_answer, data_id
+from firmware_protocol.firmware_core import FirmwareConfig, FirmwareCore, FirmwareInputs
+
+MS = 1000
+CODEC = Codec()
+CONFIG = FirmwareConfig(ticks_per_rev=2048, max_wheel_speed_rad_s=8.0)
+FAULTS = {name: value for value, name in CODEC.choices("SYSTEM_STATE", "fault").items()}
+BLOCKERS = {name: value for value, name in CODEC.choices("SESSION_STATE", "blockers").items()}
+
+
+def sealed(can_id: int, body: bytes, major: int = 1) -> bytes:
+    """Seven bytes with the CRC in front, made with the C core's function."""
+    return bytes((_firmware.lib.disco_e2e_crc(b"\0" + body, data_id(can_id, major)),)) + body
+
+
+class Bench:
+    def __init__(self, config: FirmwareConfig = CONFIG, entropy: int = 1) -> None:
+        self.config = config
+        self.core = FirmwareCore(config, entropy)
+        self.now_us = 0
+        self.counters: dict[str, int] = {}
+        self.inputs: dict[str, object] = {}
+        self.wheels_follow = True
+        self.speeds = [0.0, 0.0]
+        self.ticks = [0.0, 0.0]
+        self.sent: list[tuple[int, Decoded]] = []
+        self.request: dict[str, object] | None = None
+        self.command: dict[str, object] | None = None
+        self.answers = True
+        self.out = self.step()
+
+    def next_counter(self, name: str) -> int:
+        self.counters[name] = (self.counters.get(name, -1) + 1) % 16
+        return self.counters[name]
+
+    def send(self, name: str, **signals: object) -> None:
+        self.core.receive(self.now_us, *CODEC.encode(name, self.next_counter(name), **signals))
+
+    def hello(self, **changes: object) -> None:
+        self.send("HELLO_REQUEST", **{"protocol_major": 1, "protocol_minor": 0, "dbc_hash": CODEC.dbc_hash} | changes)
+
+    def host_state(self, **changes: object) -> None:
+        signals = {"request": "STANDBY", "session": 0, "challenge_answer": 0, "host_fault": 0} | changes
+        self.send("HOST_STATE", **signals)
+
+    def wheel_command(self, left: float = 0.0, right: float = 0.0, **changes: object) -> None:
+        session = self.request["session"] if self.request else 0
+        signals = {"mode": "SPEED", "left_speed": left, "right_speed": right, "valid_for": 0.1, "session": session}
+        self.send("WHEEL_COMMAND", **signals | changes)
+
+    def step(self, elapsed_us: int = MS):
+        """One cycle; before it, what the host has due: its state every 50 ms, its command every 20 ms."""
+        self.now_us += elapsed_us
+        if self.request is not None and self.now_us % (50 * MS) == 0:
+            request = dict(self.request)
+            if request["request"] == "ARM" and self.answers:
+                request["challenge_answer"] = challenge_answer(self.core.challenge, request["session"], CODEC.dbc_hash)
+            self.host_state(**request)
+        if self.command is not None and self.now_us % (20 * MS) == 0:
+            self.wheel_command(**self.command)
+        if self.wheels_follow and hasattr(self, "out"):
+            self.speeds = [self.out.left_setpoint_rad_s, self.out.right_setpoint_rad_s]
+        per_us = self.config.ticks_per_rev / (2e6 * math.pi)
+        self.ticks = [
+            ticks + speed * per_us * elapsed_us if math.isfinite(speed) else ticks
+            for ticks, speed in zip(self.ticks, self.speeds, strict=True)
+        ]
+        measured = {
+            "left_ticks": int(self.ticks[0]),
+            "right_ticks": int(self.ticks[1]),
+            "left_speed_rad_s": self.speeds[0],
+            "right_speed_rad_s": self.speeds[1],
+        }
+        self.out = self.core.step(self.now_us, FirmwareInputs(**measured | self.inputs))
+        for can_id, data in self.core.drain():
+            decoded = CODEC.decode(can_id, data)
+            assert isinstance(decoded, Decoded), decoded
+            self.sent.append((self.now_us, decoded))
+        return self.out
+
+    def run(self, milliseconds: int):
+        for _ in range(milliseconds):
+            self.step()
+        return self.out
+
+    def run_until(self, *states: str, within_ms: int = 3000):
+        for _ in range(within_ms):
+            if self.step().state in states:
+                return self.out
+        raise AssertionError(f"still {self.out.state}, not {states}; rejections {self.core.rejections}")
+
+    def ask(self, request: str, session: int = 7, **changes: object) -> None:
+        self.request = {"request": request, "session": session} | changes
+
+    def to_ready(self, session: int = 7):
+        self.hello()
+        self.ask("READY", session)
+        return self.run_until("READY")
+
+    def to_armed(self, session: int = 7):
+        self.to_ready(session)
+        self.ask("ARM", session)
+        self.command = {}
+        return self.run_until("ARMED")
+
+    def to_driving(self, left: float = 4.0, right: float = 2.0):
+        self.to_armed()
+        self.command = {"left": left, "right": right}
+        self.run(400)
+        assert (self.out.left_setpoint_rad_s, self.out.right_setpoint_rad_s) == (left, right)
+        return self.out
+
+    def messages(self, name: str, since_us: int = 0) -> list[Decoded]:
+        return [decoded for t_us, decoded in self.sent if decoded.name == name and t_us >= since_us]
+
+    def blockers(self) -> set[str]:
+        return {name for name, bit in BLOCKERS.items() if self.out.blockers & bit}

@@ -1,0 +1,291 @@
+"""One scenario for each row of the table, on the running core, and the table's own properties."""
+
+import dataclasses
+
+import pytest
+
+from firmware_protocol import _firmware
+from tests.firmware_protocol.bench import CODEC, CONFIG, FAULTS, Bench
+
+ffi, lib = _firmware.ffi, _firmware.lib
+STATES = CODEC.choices("SYSTEM_STATE", "state")
+CAUSES = CODEC.choices("SYSTEM_STATE", "stop_cause")
+ALL_BUT_BOOT_AND_ESTOP = ("STANDBY", "READY", "ARMED", "STOPPING", "FAULT")
+
+
+def table():
+    count = ffi.new("size_t *")
+    rows = lib.disco_transitions(count)
+    return [
+        (
+            tuple(name for state, name in STATES.items() if rows[i].__getattribute__("from") >> state & 1),
+            STATES[rows[i].to],
+            CAUSES[rows[i].stop_cause],
+        )
+        for i in range(count[0])
+    ]
+
+
+def bring_to(state: str) -> Bench:
+    bench = Bench(CONFIG)
+    if state == "READY":
+        bench.to_ready()
+    elif state == "ARMED":
+        bench.to_driving()
+    elif state == "STOPPING":
+        bench.to_driving()
+        bench.ask("STANDBY")
+        bench.run_until("STOPPING")
+    elif state == "FAULT":
+        bench.inputs["left_current_a"] = 100.0
+        bench.run_until("FAULT")
+    assert bench.out.state == state
+    return bench
+
+
+def self_test(_state):
+    bench = Bench()
+    return bench, "BOOT"
+
+
+def estop_frame(state):
+    bench = bring_to(state)
+    bench.core.receive(bench.now_us, 0x080, b"")
+    bench.step()
+    return bench, state
+
+
+def latched_fault(state):
+    if state == "BOOT":
+        bench = Bench(dataclasses.replace(CONFIG, ticks_per_rev=0))
+        return bench, state
+    bench = bring_to(state)
+    bench.inputs["right_current_a"] = -100.0
+    bench.run(110)
+    return bench, state
+
+
+def reset_fault(_state):
+    bench = bring_to("FAULT")
+    bench.inputs.clear()
+    bench.ask("STANDBY")
+    bench.run(300)
+    assert bench.out.state == "FAULT"
+    bench.ask("RESET")
+    bench.run(60)
+    return bench, "FAULT"
+
+
+def reset_estop(_state):
+    bench, _ = estop_frame("STANDBY")
+    bench.ask("STANDBY")
+    bench.run(700)
+    assert bench.out.state == "ESTOP"
+    bench.ask("RESET")
+    bench.run(60)
+    return bench, "ESTOP"
+
+
+def ready_given_up(_state):
+    bench = bring_to("READY")
+    bench.ask("STANDBY")
+    bench.run(60)
+    return bench, "READY"
+
+
+def ready(_state):
+    bench = bring_to("STANDBY")
+    bench.to_ready()
+    return bench, "STANDBY"
+
+
+def armed(_state):
+    bench = bring_to("READY")
+    bench.ask("ARM")
+    bench.command = {}
+    bench.run_until("ARMED")
+    return bench, "READY"
+
+
+def passing_fault(_state):
+    bench = bring_to("ARMED")
+    bench.inputs["voltage_v"] = 10.0
+    bench.run_until("STOPPING")
+    return bench, "ARMED"
+
+
+def bad_commands(_state):
+    bench = bring_to("ARMED")
+    for _ in range(5):
+        bench.core.receive(bench.now_us, 0x100, bytes(8))
+    bench.step()
+    return bench, "ARMED"
+
+
+def expired_command(_state):
+    bench = bring_to("ARMED")
+    bench.command = None
+    bench.wheel_command(4.0, 2.0, valid_for=0.03)
+    bench.run_until("STOPPING", within_ms=31)
+    return bench, "ARMED"
+
+
+def silent_commands(_state):
+    bench = bring_to("ARMED")
+    bench.command = None
+    bench.run_until("STOPPING", within_ms=101)
+    return bench, "ARMED"
+
+
+def host_fault(_state):
+    bench = bring_to("ARMED")
+    bench.ask("ARM", host_fault=3)
+    bench.run_until("STOPPING", within_ms=60)
+    return bench, "ARMED"
+
+
+def silent_host(_state):
+    bench = bring_to("ARMED")
+    bench.request = None
+    bench.command = {"left": 4.0, "right": 2.0, "session": 7}
+    bench.run_until("STOPPING", within_ms=560)
+    return bench, "ARMED"
+
+
+def changed_session(_state):
+    bench = bring_to("ARMED")
+    bench.ask("ARM", session=8)
+    bench.command = {"left": 4.0, "right": 2.0, "session": 7}
+    bench.run_until("STOPPING", within_ms=60)
+    return bench, "ARMED"
+
+
+def requested(_state):
+    bench = bring_to("ARMED")
+    bench.ask("STANDBY")
+    bench.run_until("STOPPING", within_ms=60)
+    return bench, "ARMED"
+
+
+def stopped(_state):
+    bench = bring_to("STOPPING")
+    bench.run_until("STANDBY", within_ms=300)
+    return bench, "STOPPING"
+
+
+SCENARIOS = {
+    (ALL_BUT_BOOT_AND_ESTOP, "ESTOP", "ESTOP"): estop_frame,
+    (("BOOT", "STANDBY", "READY", "ARMED", "STOPPING"), "FAULT", "FAULT"): latched_fault,
+    (("BOOT",), "STANDBY", "NONE"): self_test,
+    (("FAULT",), "STANDBY", "NONE"): reset_fault,
+    (("ESTOP",), "STANDBY", "NONE"): reset_estop,
+    (("READY",), "STANDBY", "NONE"): ready_given_up,
+    (("STANDBY",), "READY", "NONE"): ready,
+    (("READY",), "ARMED", "NONE"): armed,
+    (("ARMED",), "STOPPING", "FAULT"): passing_fault,
+    (("ARMED",), "STOPPING", "E2E_DISQUALIFIED"): bad_commands,
+    (("ARMED",), "STOPPING", "COMMAND_EXPIRED"): expired_command,
+    (("ARMED",), "STOPPING", "COMMAND_TIMEOUT"): silent_commands,
+    (("ARMED",), "STOPPING", "HOST_FAULT"): host_fault,
+    (("ARMED",), "STOPPING", "HOST_SILENT"): silent_host,
+    (("ARMED",), "STOPPING", "SESSION_CHANGED"): changed_session,
+    (("ARMED",), "STOPPING", "REQUESTED"): requested,
+    (("STOPPING",), "STANDBY", "NONE"): stopped,
+}
+CASES = [(row, state) for row in SCENARIOS for state in row[0]]
+
+
+def test_every_row_of_the_table_has_a_scenario():
+    assert table() == list(SCENARIOS)
+
+
+@pytest.mark.parametrize(("row", "state"), CASES, ids=[f"{state}-{row[1]}-{row[2]}" for row, state in CASES])
+def test_row(row, state):
+    _, to, cause = row
+    bench, left = SCENARIOS[row](state)
+    assert bench.out.state == to
+    if left == "ARMED":
+        assert bench.out.stop_cause == cause
+
+
+def test_a_row_that_leaves_any_other_state_keeps_the_cause_of_the_stop():
+    bench = bring_to("STOPPING")
+    bench.core.receive(bench.now_us, 0x080, b"")
+    bench.step()
+    assert (bench.out.state, bench.out.stop_cause) == ("ESTOP", "REQUESTED")
+
+
+def condition(name: str) -> int:
+    return int(getattr(lib, f"DISCO_WHEN_{name}"))
+
+
+def next_state(state: str, conditions: int) -> str:
+    code = next(value for value, name in STATES.items() if name == state)
+    row = lib.disco_next_transition(code, conditions)
+    return state if row == ffi.NULL else STATES[row.to]
+
+
+MAY_READY = ("HOST_ACCEPTED", "HOST_QUALIFIED", "REQUEST_READY", "SESSION_FRESH", "WHEELS_STILL")
+MAY_ARM = ("HOST_ACCEPTED", "HOST_QUALIFIED", "REQUEST_ARM", "CHALLENGE_ANSWERED", "ZERO_COMMANDS", "WHEELS_STILL")
+NO_MOTION = ("FAULT", "ESTOP_INPUT", "HOST_FAULT")
+
+
+@pytest.mark.parametrize(("state", "to", "needs"), [("STANDBY", "READY", MAY_READY), ("READY", "ARMED", MAY_ARM)])
+def test_motion_needs_every_proof(state, to, needs):
+    complete = sum(condition(name) for name in needs)
+    assert next_state(state, complete) == to
+    for name in needs:
+        assert next_state(state, complete & ~condition(name)) == state, name
+    for name in NO_MOTION:
+        assert next_state(state, complete | condition(name)) != to, name
+
+
+def test_arming_needs_commands_that_still_qualify():
+    complete = sum(condition(name) for name in MAY_ARM)
+    assert next_state("READY", complete | condition("COMMANDS_DISQUALIFIED")) == "READY"
+
+
+@pytest.mark.parametrize(
+    "condition_name",
+    ["REQUEST_STOP", "HOST_SILENT", "HOST_DISQUALIFIED", "SESSION_CHANGED", "FAULT", "ESTOP_INPUT", "HOST_FAULT"],
+)
+def test_ready_is_given_up_for_any_doubt(condition_name):
+    complete = sum(condition(name) for name in MAY_ARM)
+    assert next_state("READY", complete | condition(condition_name)) == "STANDBY"
+
+
+@pytest.mark.parametrize("missing", ["RESET", "HOST_QUALIFIED", "NO_MOTION_ASKED", "WHEELS_STILL"])
+def test_estop_is_left_only_with_every_proof(missing):
+    names = ("RESET", "HOST_QUALIFIED", "NO_MOTION_ASKED", "WHEELS_STILL")
+    complete = sum(condition(name) for name in names)
+    assert next_state("ESTOP", complete) == "STANDBY"
+    assert next_state("ESTOP", complete & ~condition(missing)) == "ESTOP"
+    assert next_state("ESTOP", complete | condition("ESTOP_INPUT")) == "ESTOP"
+
+
+def test_nothing_leads_into_armed_but_ready_and_nothing_into_ready_but_standby():
+    into = {state: {name for froms, to, _ in table() if to == state for name in froms} for state in ("ARMED", "READY")}
+    assert into == {"ARMED": {"READY"}, "READY": {"STANDBY"}}
+
+
+def test_estop_comes_before_everything_and_a_fault_before_all_else():
+    everything = 2**25 - 1
+    for state in ALL_BUT_BOOT_AND_ESTOP:
+        assert next_state(state, everything) == "ESTOP"
+    for state in ("BOOT", "STANDBY", "READY", "ARMED", "STOPPING"):
+        assert next_state(state, everything & ~condition("ESTOP_LATCHED")) == "FAULT"
+
+
+def test_a_stop_that_takes_too_long_ends_in_standby_all_the_same():
+    assert next_state("STOPPING", condition("STOP_TIMEOUT")) == "STANDBY"
+    assert next_state("STOPPING", 0) == "STOPPING"
+
+
+def test_passing_fault_returns_to_standby_by_itself():
+    bench, _ = passing_fault("ARMED")
+    assert bench.out.fault == FAULTS["UNDER_VOLTAGE"]
+    bench.run_until("STANDBY")
+    assert bench.out.fault == FAULTS["UNDER_VOLTAGE"]
+    bench.inputs.clear()
+    bench.run(510)
+    assert bench.out.fault == FAULTS["NONE"]

@@ -1,0 +1,138 @@
+import random
+
+import pytest
+from cobs import cobs
+from hypothesis import given
+from hypothesis import strategies as st
+
+from firmware_protocol.serial_framing import MAX_FRAME, FrameDecoder, crc16, encode_frame
+
+FRAMES = [(0x010, bytes.fromhex("0201020300")), (0x080, b""), (0x100, bytes(8)), (0x7FF, b"\xff" * 8), (0, b"\0")]
+
+
+def decode(*pieces):
+    decoder = FrameDecoder()
+    return [frame for piece in pieces for frame in decoder.feed(piece)], decoder.stats
+
+
+def raw_frame(body):
+    return cobs.encode(body + crc16(body).to_bytes(2, "little")) + b"\0"
+
+
+def test_check_value_and_vector():
+    assert crc16(b"123456789") == 0x29B1
+    assert encode_frame(*FRAMES[0]) == bytes.fromhex("030110050201020303924800")
+
+
+@pytest.mark.parametrize(("can_id", "data"), FRAMES)
+def test_every_split_point(can_id, data):
+    line = encode_frame(can_id, data) * 2
+    for cut in range(len(line) + 1):
+        for second in range(cut, len(line) + 1):
+            frames, stats = decode(line[:cut], line[cut:second], line[second:])
+            assert frames == [(can_id, data)] * 2
+            assert (stats.frames, stats.malformed, stats.bytes) == (2, 0, len(line))
+
+
+def test_byte_by_byte():
+    line = b"".join(encode_frame(*frame) for frame in FRAMES)
+    frames, stats = decode(*(line[i : i + 1] for i in range(len(line))))
+    assert frames == FRAMES
+    assert stats.malformed == 0
+
+
+@pytest.mark.parametrize(("can_id", "data"), FRAMES)
+def test_every_single_byte_corruption_is_found_and_costs_no_later_frame(can_id, data):
+    good = encode_frame(can_id, data)
+    for position in range(len(good)):
+        for value in range(256):
+            if value == good[position]:
+                continue
+            corrupt = good[:position] + bytes((value,)) + good[position + 1 :]
+            frames, stats = decode(good, corrupt, good, good)
+            # A corrupted delimiter joins two frames; every other corruption harms only its own.
+            expected = 2 if position == len(good) - 1 else 3
+            assert frames == [(can_id, data)] * expected
+            assert stats.malformed >= 1
+
+
+def test_every_lost_byte_is_found_and_costs_at_most_the_next_frame():
+    good = encode_frame(0x110, bytes.fromhex("8D306902B4FB2C01"))
+    for position in range(len(good)):
+        frames, _ = decode(good[:position] + good[position + 1 :], good, good)
+        assert frames in ([(0x110, bytes.fromhex("8D306902B4FB2C01"))] * n for n in (1, 2))
+
+
+@given(st.lists(st.tuples(st.integers(0, 0x7FF), st.binary(max_size=8))), st.integers(0, 2**32))
+def test_round_trip_in_pieces_of_any_size(frames, seed):
+    generator = random.Random(seed)
+    line = b"".join(encode_frame(*frame) for frame in frames)
+    decoder, received = FrameDecoder(), []
+    while line:
+        size = generator.randint(1, 20)
+        received += decoder.feed(line[:size])
+        line = line[size:]
+    assert received == frames
+
+
+@given(st.lists(st.binary(max_size=200)))
+def test_garbage_gives_no_frame_and_no_exception_and_after_a_delimiter_all_is_well(pieces):
+    decoder = FrameDecoder()
+    for piece in pieces:
+        assert decoder.feed(piece) == []
+    decoder.feed(b"\0")
+    assert decoder.feed(encode_frame(0x100, b"\1\2")) == [(0x100, b"\1\2")]
+
+
+def test_garbage_between_frames_is_counted():
+    good = encode_frame(0x100, b"\1\2")
+    frames, stats = decode(good, b"\x11garbage\0", good)
+    assert len(frames) == 2
+    assert stats.stuffing_errors == 1
+
+
+def test_an_endless_frame_is_dropped_and_takes_no_memory():
+    decoder = FrameDecoder()
+    for _ in range(1000):
+        decoder.feed(b"\x01" * 100)
+        assert len(decoder._pending) < MAX_FRAME
+    assert decoder.feed(b"\0" + encode_frame(1, b"")) == [(1, b"")]
+    assert decoder.stats.length_errors == 1
+
+
+def test_longest_frame_has_a_place():
+    assert len(encode_frame(0x7FF, b"\xff" * 8)) <= MAX_FRAME
+
+
+@pytest.mark.parametrize(
+    ("body", "counter"),
+    [
+        (b"\2\x10\0abc", "unknown_kind"),
+        (b"\1\0\x08", "length_errors"),
+        (b"\1\x10\0" + bytes(9), "length_errors"),
+        (b"\1\x10", "length_errors"),
+        (bytes(70), "length_errors"),
+    ],
+    ids=["kind", "29-bit id", "9 bytes", "no header", "too long"],
+)
+def test_well_sealed_nonsense_is_counted(body, counter):
+    frames, stats = decode(raw_frame(body))
+    assert frames == []
+    assert stats.malformed == getattr(stats, counter) == 1
+
+
+def test_wrong_crc_is_counted():
+    frames, stats = decode(cobs.encode(b"\1\x10\0abc\0\0") + b"\0")
+    assert (frames, stats.crc_errors, stats.malformed) == ([], 1, 1)
+
+
+def test_delimiters_alone_are_silence():
+    frames, stats = decode(b"\0" * 100)
+    assert (frames, stats.malformed, stats.bytes) == ([], 0, 100)
+
+
+def test_what_is_no_can_frame_is_not_encoded():
+    with pytest.raises(ValueError, match="0x800"):
+        encode_frame(0x800, b"")
+    with pytest.raises(ValueError, match="9 bytes"):
+        encode_frame(0x100, bytes(9))
