@@ -1,0 +1,278 @@
+"""The daemon's local control socket: one JSON object a line in, one out, over a Unix socket for its owner alone.
+
+Polled from the control loop: no call blocks, every buffer is bounded, and the work of one poll is bounded too, so a
+client that floods, sends garbage or never reads its replies costs the loop some microseconds and then its connection.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import re
+import socket
+import stat
+import struct
+from collections import deque
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from disco_hw.errors import InputError
+
+_MAX_CLIENTS = 8
+_ACCEPTS_PER_POLL = 4
+_BYTES_PER_POLL = 1024
+_MAX_LINE_BYTES = 4096
+_REQUESTS_PER_POLL = 4
+_MAX_WAITING = 16
+_MAX_UNREAD_BYTES = 65536
+_ESTOP = "estop"
+_REMEDY = "set daemon.control_socket to a path in a directory of your own"
+
+
+@dataclass(frozen=True, slots=True)
+class ControlMessage:
+    """One request of one client: `{"do": action, ...arguments}`."""
+
+    client: int
+    action: str
+    arguments: dict[str, Any]
+
+
+@dataclass(slots=True)
+class ControlStats:
+    """Counters of the socket since it was opened."""
+
+    connections: int = 0
+    foreign_users: int = 0
+    evicted: int = 0
+    refused: int = 0
+    unread: int = 0
+
+
+@dataclass(slots=True)
+class _Client:
+    connection: socket.socket
+    last_active: int
+    incoming: bytearray = field(default_factory=bytearray)
+    waiting: deque[ControlMessage] = field(default_factory=deque)
+    outgoing: bytearray = field(default_factory=bytearray)
+    finished: bool = False
+
+
+def default_socket_path(name: str) -> Path:
+    """Return where the socket of the robot called `name` is, in a directory that only this user can enter.
+
+    $XDG_RUNTIME_DIR/disco-hw/NAME.sock, or /tmp/disco-hw-UID/NAME.sock where that variable is not set.
+    """
+    file_name = re.sub(r"[^A-Za-z0-9_-]", "_", name) + ".sock"
+    runtime = os.environ.get("XDG_RUNTIME_DIR")
+    if runtime and Path(runtime).is_dir():
+        return Path(runtime) / "disco-hw" / file_name
+    return Path(f"/tmp/disco-hw-{os.geteuid()}") / file_name
+
+
+class ControlServer:
+    """The daemon's end. `poll()` for requests in each tick, e-stop first; `reply()` to each.
+
+    Raises InputError if another daemon serves this socket, or the path cannot be used. What a dead daemon left behind
+    is replaced: whether one lives is told by a record lock, which the kernel drops with the process, however it ends.
+    """
+
+    def __init__(self, path: Path, actions: Collection[str], allowed_uids: Collection[int] | None = None) -> None:
+        self.path = path
+        self.stats = ControlStats()
+        self._actions = frozenset(actions)
+        self._allowed_uids = frozenset({os.geteuid(), 0} if allowed_uids is None else allowed_uids)
+        self._clients: dict[int, _Client] = {}
+        self._activity = 0
+        _make_private_directory(path.parent)
+        self._lock_fd = _lock(path)
+        try:
+            self._listener = _listen(path)
+        except BaseException:
+            os.close(self._lock_fd)
+            raise
+
+    def poll(self) -> list[ControlMessage]:
+        """Accept, read and send what is possible at once; return the requests to act on, e-stops first.
+
+        At most 4 requests of each client in one poll, but all e-stops that have arrived; the rest waits.
+        """
+        self._accept()
+        for number, client in list(self._clients.items()):
+            self._read(number, client)
+        urgent: list[ControlMessage] = []
+        others: list[ControlMessage] = []
+        for client in self._clients.values():
+            urgent += [message for message in client.waiting if message.action == _ESTOP]
+            client.waiting = deque(message for message in client.waiting if message.action != _ESTOP)
+            for _ in range(min(_REQUESTS_PER_POLL, len(client.waiting))):
+                others.append(client.waiting.popleft())
+        in_hand = {message.client for message in (*urgent, *others)}
+        for number, client in list(self._clients.items()):
+            self._send(number, client)
+            if client.finished and number not in in_hand and not client.waiting and not client.outgoing:
+                self._drop(number)
+        return urgent + others
+
+    def reply(self, message: ControlMessage, body: Mapping[str, Any]) -> None:
+        """Answer `message` with `body` as JSON, plus its action as `do`; nothing happens if the client has gone."""
+        client = self._clients.get(message.client)
+        if client is not None:
+            client.outgoing += msgspec.json.encode({"do": message.action, **body}) + b"\n"
+            self._send(message.client, client)
+
+    def close(self) -> None:
+        """Disconnect all clients and remove the socket; safe to call twice."""
+        for number in list(self._clients):
+            self._drop(number)
+        if self._listener.fileno() != -1:
+            self._listener.close()
+            self.path.unlink(missing_ok=True)
+            # The lock's file stays: removing it would let a third process lock a new file while a second holds this.
+            os.close(self._lock_fd)
+
+    def _accept(self) -> None:
+        for _ in range(_ACCEPTS_PER_POLL):
+            try:
+                connection, _ = self._listener.accept()
+            except OSError:
+                return
+            if _peer_uid(connection) not in self._allowed_uids:
+                self.stats.foreign_users += 1
+                connection.close()
+                continue
+            connection.setblocking(False)
+            if len(self._clients) >= _MAX_CLIENTS:
+                # Idle connections must not keep an e-stop out.
+                self._drop(min(self._clients, key=lambda number: self._clients[number].last_active))
+                self.stats.evicted += 1
+            self.stats.connections += 1
+            self._activity += 1
+            self._clients[self.stats.connections] = _Client(connection, self._activity)
+
+    def _read(self, number: int, client: _Client) -> None:
+        if client.finished:
+            return
+        try:
+            data = client.connection.recv(_BYTES_PER_POLL)
+        except BlockingIOError:
+            return
+        except OSError:
+            self._drop(number)
+            return
+        client.finished = not data
+        *lines, rest = (bytes(client.incoming) + data).split(b"\n")
+        client.incoming = bytearray(rest)
+        for line in lines:
+            if line.strip():
+                self._take_line(number, client, line)
+            if client.finished:
+                return
+        if len(rest) > _MAX_LINE_BYTES:
+            self._refuse(client, f"a request may have {_MAX_LINE_BYTES} bytes")
+
+    def _take_line(self, number: int, client: _Client, line: bytes) -> None:
+        try:
+            request = msgspec.json.decode(line, type=dict[str, Any])
+        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+            self._refuse(client, 'not a JSON object; send one a line, as {"do": "status"}')
+            return
+        action = request.pop("do", None)
+        if not isinstance(action, str) or action not in self._actions:
+            self._refuse(client, f'"do" must be one of {", ".join(sorted(self._actions))}')
+            return
+        if len(client.waiting) >= _MAX_WAITING:
+            self._refuse(client, f"more than {_MAX_WAITING} requests at once; wait for the replies")
+            return
+        self._activity += 1
+        client.last_active = self._activity
+        client.waiting.append(ControlMessage(number, action, request))
+
+    def _refuse(self, client: _Client, reason: str) -> None:
+        """Say what is wrong and hang up after what is waiting: who sends garbage or floods would go on doing so."""
+        self.stats.refused += 1
+        client.outgoing += msgspec.json.encode({"ok": False, "error": reason}) + b"\n"
+        client.finished = True
+
+    def _send(self, number: int, client: _Client) -> None:
+        if not client.outgoing:
+            return
+        try:
+            sent = client.connection.send(client.outgoing)
+            del client.outgoing[:sent]
+        except BlockingIOError:
+            pass
+        except OSError:
+            self._drop(number)
+            return
+        if len(client.outgoing) > _MAX_UNREAD_BYTES:
+            self.stats.unread += 1
+            self._drop(number)
+
+    def _drop(self, number: int) -> None:
+        client = self._clients.pop(number, None)
+        if client is not None:
+            client.connection.close()
+
+
+def _make_private_directory(directory: Path) -> None:
+    """Create the directory for its owner alone; refuse one in which others could swap the socket."""
+    try:
+        with contextlib.suppress(FileExistsError):
+            directory.mkdir(mode=0o700, parents=True)
+        status = directory.lstat()
+    except OSError as error:
+        raise InputError(f"{directory}: cannot hold the control socket ({error.strerror}); {_REMEDY}") from None
+    if not stat.S_ISDIR(status.st_mode):
+        raise InputError(f"{directory}: a link or not a directory; {_REMEDY}")
+    if status.st_uid not in {os.geteuid(), 0} or status.st_mode & 0o022:
+        raise InputError(f"{directory}: others can write to it; {_REMEDY}")
+
+
+def _lock(path: Path) -> int:
+    """Return the descriptor of the socket's lock file, locked and holding this process's id."""
+    lock_path = path.with_name(path.name + ".lock")
+    try:
+        descriptor = os.open(lock_path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+    except OSError as error:
+        raise InputError(f"{lock_path}: cannot be opened ({error.strerror}); {_REMEDY}") from None
+    try:
+        # A record lock, as a child made by fork() does not hold it on when the daemon dies.
+        fcntl.lockf(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        owner = os.read(descriptor, 32).decode(errors="replace").strip() or "unknown"
+        os.close(descriptor)
+        raise InputError(f"{path}: a daemon serves this socket already (process {owner}); stop it first") from None
+    os.ftruncate(descriptor, 0)
+    os.pwrite(descriptor, f"{os.getpid()}\n".encode(), 0)
+    return descriptor
+
+
+def _listen(path: Path) -> socket.socket:
+    """Return a listening socket at `path` with mode 600, in place of one that a dead daemon left."""
+    if path.is_socket():
+        path.unlink()
+    elif os.path.lexists(path):
+        raise InputError(f"{path}: not a socket; remove it, or {_REMEDY}")
+    listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    try:
+        # On Linux the mode of the unbound socket becomes that of the file, so it is never open to others.
+        os.fchmod(listener.fileno(), 0o600)
+        listener.bind(str(path))
+        listener.listen(_MAX_CLIENTS)
+        listener.setblocking(False)
+    except OSError as error:
+        listener.close()
+        raise InputError(f"{path}: cannot be made ({error.strerror or error}); {_REMEDY}") from None
+    return listener
+
+
+def _peer_uid(connection: socket.socket) -> int:
+    credentials = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i"))
+    return int(struct.unpack("3i", credentials)[1])
