@@ -9,32 +9,39 @@ from disco_hw.daemon.histogram import Histogram
 
 
 class StageTimer:
-    """How long the named parts of a tick take: each lasts from the mark before it, or the tick's start, to its own."""
+    """How long the named parts of a tick take: each lasts from the mark before it, or the tick's start, to its own.
+
+    A name that is marked more than once in a tick adds up.
+    """
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
         self._since_ns = clock.now_ns()
+        self._present_ns: dict[str, int] = {}
         self._last_ns: dict[str, int] = {}
         self._histograms: dict[str, Histogram] = {}
 
     def begin(self, now_ns: int) -> None:
-        """Start a tick: the first stage begins now; stages that are not marked in it took no time."""
+        """Start a tick: its first stage begins now."""
         self._since_ns = now_ns
-        for name in self._last_ns:
-            self._last_ns[name] = 0
+        self._present_ns.clear()
 
     def mark(self, name: str) -> None:
-        """End the stage of that name; a name marked twice in a tick adds up for `last_ns`."""
+        """End the stage of that name here."""
         now_ns = self._clock.now_ns()
-        elapsed_ns = now_ns - self._since_ns
+        self._present_ns[name] = self._present_ns.get(name, 0) + now_ns - self._since_ns
         self._since_ns = now_ns
-        if name not in self._histograms:
-            self._histograms[name] = Histogram()
-        self._histograms[name].record(elapsed_ns)
-        self._last_ns[name] = self._last_ns.get(name, 0) + elapsed_ns
+
+    def complete(self) -> None:
+        """End the tick: what was marked becomes `last_ns` and is counted."""
+        for name, duration_ns in self._present_ns.items():
+            if name not in self._histograms:
+                self._histograms[name] = Histogram()
+            self._histograms[name].record(duration_ns)
+        self._last_ns, self._present_ns = self._present_ns, self._last_ns
 
     def last_ns(self) -> dict[str, int]:
-        """Return how long each stage took in this tick so far."""
+        """Return how long each stage of the last complete tick took."""
         return dict(self._last_ns)
 
     def summary_s(self) -> dict[str, dict[str, float]]:
@@ -107,6 +114,7 @@ class Loop:
             previous_start_ns = start_ns
             self.stages.begin(start_ns)
             tick(start_ns)
+            self.stages.complete()
             end_ns = clock.now_ns()
             stats.ticks += 1
             stats.last_duration_ns = end_ns - start_ns

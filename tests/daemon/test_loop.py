@@ -111,7 +111,7 @@ def test_an_exception_ends_the_loop_and_reaches_the_caller():
     assert loop.stats.ticks == 3
 
 
-def test_stages_are_timed_from_mark_to_mark():
+def test_stages_last_from_mark_to_mark_and_show_the_last_complete_tick():
     clock = SimulatedClock()
     loop = Loop(clock, 50.0)
     seen = []
@@ -119,27 +119,36 @@ def test_stages_are_timed_from_mark_to_mark():
     def tick(now_ns):
         clock.advance_ns(1 * MS_NS)
         loop.stages.mark("receive")
+        seen.append(loop.stages.last_ns())
         clock.advance_ns(7 * MS_NS)
         loop.stages.mark("plan")
+        clock.advance_ns(2 * MS_NS)
+        loop.stages.mark("receive")
         if now_ns == 0:
-            clock.advance_ns(2 * MS_NS)
+            clock.advance_ns(4 * MS_NS)
             loop.stages.mark("status")
+
+    loop.run(tick, lambda: len(seen) == 3)
+    assert seen == [
+        {},
+        {"receive": 3 * MS_NS, "plan": 7 * MS_NS, "status": 4 * MS_NS},
+        {"receive": 3 * MS_NS, "plan": 7 * MS_NS},
+    ]
+    summary = loop.stages.summary_s()
+    assert (summary["receive"]["max_s"], summary["status"]["max_s"]) == (0.003, 0.004)
+
+
+def test_the_time_between_ticks_belongs_to_no_stage():
+    clock = SimulatedClock()
+    loop = Loop(clock, 50.0)
+    seen = []
+
+    def tick(_now_ns):
+        loop.stages.mark("receive")
         seen.append(loop.stages.last_ns())
 
-    loop.run(tick, lambda: len(seen) == 2)
-    assert seen[0] == {"receive": MS_NS, "plan": 7 * MS_NS, "status": 2 * MS_NS}
-    assert seen[1] == {"receive": MS_NS, "plan": 7 * MS_NS, "status": 0}
-    assert loop.stages.summary_s()["plan"]["max_s"] == 0.007
-
-
-def test_a_stage_marked_twice_adds_up():
-    clock = SimulatedClock()
-    timer = Loop(clock, 50.0).stages
-    timer.begin(clock.now_ns())
-    for _ in range(2):
-        clock.advance_ns(3 * MS_NS)
-        timer.mark("send")
-    assert timer.last_ns() == {"send": 6 * MS_NS}
+    loop.run(tick, lambda: len(seen) == 3)
+    assert seen[1:] == [{"receive": 0}, {"receive": 0}]
 
 
 def test_summary_holds_every_figure_in_seconds():
