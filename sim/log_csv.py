@@ -1,0 +1,255 @@
+"""Run a plant under a drive in simulated time and write what a host would have logged, as CSV.
+
+One row per event, sorted by time stamp; empty cells mean "no sample at that time". The truth stays out of the log.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import math
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from sim.drives import DRIVES, Drive, Vehicle, make_drive
+from sim.effects import HiddenEffects, effects_table, parse_hidden_effects
+from sim.plant import Plant
+from sim.plant_parameters import PlantParameters
+from sim.pose_sensor import PoseMeasurement
+
+COLUMNS = (
+    "t_s",
+    "cmd_left_rad_s",
+    "cmd_right_rad_s",
+    "enc_left_ticks",
+    "enc_right_ticks",
+    "pose_x_m",
+    "pose_y_m",
+    "pose_yaw_rad",
+)
+LARGEST_JITTER_PERIODS = 0.4
+SETTLING_S = 0.5
+
+Row = tuple[float, tuple[str, ...]]
+
+
+@dataclass(frozen=True, slots=True)
+class LogOptions:
+    """How the host samples and stamps.
+
+    `lateness_s`: mean (exponential) of how late commands and encoder readings happen; `stamp_jitter_s`: standard
+    deviation of the error of every time stamp.
+    """
+
+    encoder_rate_hz: float = 50.0
+    lateness_s: float = 0.0005
+    stamp_jitter_s: float = 0.0003
+
+
+def dirty_log_options() -> LogOptions:
+    """A busy host: time stamps off by milliseconds."""
+    return LogOptions(lateness_s=0.002, stamp_jitter_s=0.004)
+
+
+def dirty_parameters(parameters: PlantParameters) -> PlantParameters:
+    """The same robot in a worse world: bursts and wander in the disturbances, poses that jump, drop out and jitter."""
+    return replace(
+        parameters,
+        volatility=0.5,
+        wheel_wander_std=0.01,
+        pose_noise_correlation_s=0.1,
+        pose_noise_volatility=0.4,
+        pose_sample_jitter_s=0.005,
+        pose_dropout_probability=0.02,
+        pose_gap_interval_s=60.0,
+        pose_outlier_probability=0.005,
+    )
+
+
+def varied_parameters(parameters: PlantParameters, seed: int) -> PlantParameters:
+    """A robot off its drawing: radius by 2 %, axial distance by 4 % (standard deviation), x_icr by 30 mm."""
+    radius, axial, x_icr = np.random.default_rng(seed).standard_normal(3).clip(-2.5, 2.5)
+    return replace(
+        parameters,
+        wheel_radius_m=parameters.wheel_radius_m * (1.0 + 0.02 * float(radius)),
+        axial_distance_m=parameters.axial_distance_m * (1.0 + 0.04 * float(axial)),
+        x_icr_m=parameters.x_icr_m + 0.03 * float(x_icr),
+    )
+
+
+def simulated_log(
+    drive: Drive,
+    parameters: PlantParameters | None = None,
+    effects: HiddenEffects | None = None,
+    seed: int = 0,
+    options: LogOptions | None = None,
+) -> list[Row]:
+    """Rows of the log, sorted by time stamp: (t_s, cells in the order of `COLUMNS`).
+
+    Encoder counters start anywhere. `seed` decides the plant's noise and the time stamps, not the drive.
+    """
+    options = options or LogOptions()
+    plant_seed, host_seed = (int(child.generate_state(1)[0]) for child in np.random.SeedSequence(seed).spawn(2))
+    generator = np.random.default_rng(host_seed)
+    left_start, right_start = (int(start) for start in generator.integers(-(2**20), 2**20, size=2))
+    parameters = replace(
+        parameters or PlantParameters(), encoder_start_left_ticks=left_start, encoder_start_right_ticks=right_start
+    )
+    plant = Plant(parameters, effects, plant_seed)
+    command_s = _late(drive.t_s, drive.period_s, options, generator)
+    reading_period_s = 1.0 / options.encoder_rate_hz
+    reading_s = _late(np.arange(0.0, drive.duration_s, reading_period_s), reading_period_s, options, generator)
+    rows = [
+        _row(stamp, command=(left, right))
+        for stamp, left, right in zip(
+            _stamped(command_s, drive.period_s, options, generator), drive.left_rad_s, drive.right_rad_s, strict=True
+        )
+    ]
+    ticks, poses = _run(plant, drive, command_s, reading_s)
+    reading_stamps = _stamped(reading_s, reading_period_s, options, generator)
+    rows += [_row(stamp, ticks=pair) for stamp, pair in zip(reading_stamps, ticks, strict=True)]
+    pose_s = np.array([pose.sample_us for pose in poses], dtype=np.float64) * 1e-6
+    pose_stamps = _stamped(pose_s, 1.0 / parameters.pose_rate_hz, options, generator)
+    rows += [_row(stamp, pose=pose) for stamp, pose in zip(pose_stamps, poses, strict=True)]
+    return sorted(rows, key=lambda row: row[0])
+
+
+def write_csv(path: Path, rows: Sequence[Row]) -> None:
+    """Write rows under a header of `COLUMNS`. Raises OSError."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(COLUMNS)
+        writer.writerows(cells for _, cells in rows)
+
+
+def _run(
+    plant: Plant, drive: Drive, command_s: npt.NDArray[np.float64], reading_s: npt.NDArray[np.float64]
+) -> tuple[list[tuple[int, int]], list[PoseMeasurement]]:
+    """Give each command at its time, read the encoders at theirs; collect ticks and poses."""
+    command_us = np.round(command_s * 1e6).astype(np.int64).tolist()
+    events = [(t_us, k) for k, t_us in enumerate(command_us)]
+    events += [(round(t_s * 1e6), -1) for t_s in reading_s.tolist()]
+    commands = list(zip(drive.left_rad_s.tolist(), drive.right_rad_s.tolist(), strict=True))
+    left, right = 0.0, 0.0
+    ticks: list[tuple[int, int]] = []
+    poses: list[PoseMeasurement] = []
+    for t_us, command in sorted(events):
+        poses += plant.step(t_us, left, right)
+        if command < 0:
+            ticks.append(plant.encoder_ticks)
+        else:
+            left, right = commands[command]
+    last_us = round(drive.duration_s * 1e6)
+    poses += plant.step(max(last_us, plant.now_us) + round(SETTLING_S * 1e6), left, right)
+    return ticks, [pose for pose in poses if pose.sample_us <= last_us]
+
+
+def _late(
+    t_s: npt.NDArray[np.float64], period_s: float, options: LogOptions, generator: np.random.Generator
+) -> npt.NDArray[np.float64]:
+    """When things due at t_s really happen."""
+    late_s = generator.exponential(options.lateness_s, size=len(t_s)) if options.lateness_s > 0.0 else 0.0
+    return t_s + np.minimum(late_s, LARGEST_JITTER_PERIODS * period_s)
+
+
+def _stamped(
+    t_s: npt.NDArray[np.float64], period_s: float, options: LogOptions, generator: np.random.Generator
+) -> list[float]:
+    """Time stamps of what happened at t_s; never before 0."""
+    most_s = LARGEST_JITTER_PERIODS * period_s
+    error_s = np.clip(options.stamp_jitter_s * generator.standard_normal(len(t_s)), -most_s, most_s)
+    stamps: list[float] = np.maximum(t_s + error_s, 0.0).tolist()
+    return stamps
+
+
+def _row(
+    t_s: float,
+    command: tuple[float, float] | None = None,
+    ticks: tuple[int, int] | None = None,
+    pose: PoseMeasurement | None = None,
+) -> Row:
+    command_cells = ("", "") if command is None else (f"{command[0]:.5f}", f"{command[1]:.5f}")
+    tick_cells = ("", "") if ticks is None else (str(ticks[0]), str(ticks[1]))
+    pose_cells = ("", "", "") if pose is None else (f"{pose.x_m:.5f}", f"{pose.y_m:.5f}", f"{pose.yaw_rad:.6f}")
+    return t_s, (f"{t_s:.6f}", *command_cells, *tick_cells, *pose_cells)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Command line of this module; returns the exit code (2 on bad input)."""
+    options = _parser().parse_args(arguments)
+    try:
+        effects = parse_hidden_effects(options.hide)
+        drive = make_drive(options.drive, options.seed, Vehicle(options.max_wheel_speed))
+        parameters = _parameters(options)
+    except ValueError as error:
+        print(f"log_csv: {error}", file=sys.stderr)
+        return 2
+    log_options = dirty_log_options() if options.dirty else LogOptions()
+    rows = simulated_log(drive, parameters, effects, options.seed, log_options)
+    try:
+        write_csv(options.output, rows)
+        if options.truth is not None:
+            options.truth.write_text(_truth(parameters, effects), encoding="utf-8")
+    except OSError as error:
+        print(f"log_csv: {error.filename}: cannot be written ({error.strerror}); give another path", file=sys.stderr)
+        return 2
+    print(f"{options.output}: {len(rows)} rows, {drive.duration_s:.0f} s of {drive.name}")
+    return 0
+
+
+def _truth(parameters: PlantParameters, effects: HiddenEffects) -> str:
+    """What is true, as JSON; a limit that does not exist is null."""
+    finite = {name: value if math.isfinite(value) else None for name, value in asdict(parameters).items()}
+    return json.dumps({"effects": dict(effects.items), "parameters": finite}, indent=1)
+
+
+def _parameters(options: argparse.Namespace) -> PlantParameters:
+    parameters = PlantParameters(
+        wheel_radius_m=options.wheel_radius, axial_distance_m=options.axial_distance, x_icr_m=options.x_icr
+    )
+    if options.vary:
+        parameters = varied_parameters(parameters, options.seed)
+    if options.motors == "ideal":
+        parameters = parameters.with_ideal_motors()
+    return dirty_parameters(parameters) if options.dirty else parameters
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m sim.log_csv",
+        description=(__doc__ or "").split("\n\n", maxsplit=1)[0],
+        epilog=f"effects for --hide (NAME=VALUE or NAME=VALUE,VALUE):\n\n{effects_table()}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    nominal = PlantParameters()
+    parser.add_argument("output", type=Path, help="CSV file to write")
+    parser.add_argument("--drive", default="rich", metavar="NAME", help=f"one of {', '.join(DRIVES)} (rich)")
+    parser.add_argument("--seed", type=int, default=0, help="decides drive, disturbances, noise and time stamps (0)")
+    parser.add_argument("--hide", action="append", default=[], metavar="EFFECT=VALUE", help="hidden effect; repeatable")
+    parser.add_argument(
+        "--motors",
+        choices=("ideal", "real"),
+        default="ideal",
+        help="ideal: wheels turn as commanded, so that nothing is hidden but what --hide says; real: with the lag, "
+        "limits and load of the simulated motors (ideal)",
+    )
+    parser.add_argument("--dirty", action="store_true", help="outliers, lost poses, bursts, wander, bad time stamps")
+    parser.add_argument("--vary", action="store_true", help="a robot off its drawing: geometry drawn around the given")
+    parser.add_argument("--wheel-radius", type=float, default=nominal.wheel_radius_m, help="m (%(default)s)")
+    parser.add_argument("--axial-distance", type=float, default=nominal.axial_distance_m, help="m (%(default)s)")
+    parser.add_argument("--x-icr", type=float, default=nominal.x_icr_m, help="m (%(default)s)")
+    parser.add_argument(
+        "--max-wheel-speed", type=float, default=8.0, help="what the drive may ask, rad/s (%(default)s)"
+    )
+    parser.add_argument("--truth", type=Path, metavar="FILE", help="write what is true to this JSON file, for scoring")
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())
