@@ -1,0 +1,287 @@
+"""Which wheel commands are accepted, and the watchdog that only an accepted one feeds."""
+
+import dataclasses
+
+import pytest
+
+from firmware_protocol.firmware_core import FirmwareInputs
+from tests.firmware_protocol.bench import CODEC, CONFIG, MS, Bench, sealed
+
+
+def rejected(bench, act):
+    """What `act` adds to the counters of rejections, and whether any command was accepted."""
+    before, accepted = bench.core.rejections, bench.out.accepted_commands
+    act()
+    after = bench.core.rejections
+    bench.step()
+    assert bench.out.accepted_commands == accepted
+    return {name: after[name] - before[name] for name in after if after[name] != before[name]}
+
+
+def driving():
+    bench = Bench()
+    bench.to_driving()
+    bench.command = None
+    return bench
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"session": 8}, "SESSION"),
+        ({"session": 0}, "SESSION"),
+        ({"mode": 4}, "MODE"),
+        ({"mode": 15}, "MODE"),
+        ({"mode": "HOLD_ZERO"}, "MODE"),
+        ({"mode": "BRAKE"}, "MODE"),
+        ({"mode": "COAST"}, "MODE"),
+        ({"valid_for": 0.0}, "VALIDITY"),
+    ],
+)
+def test_armed_rejects(changes, reason):
+    bench = driving()
+    assert rejected(bench, lambda: bench.wheel_command(5.0, 5.0, **changes)) == {reason: 1}
+
+
+def test_armed_accepts_and_follows():
+    bench = driving()
+    before = bench.out.accepted_commands
+    bench.wheel_command(4.1, 2.1)
+    bench.run(30)
+    assert bench.out.accepted_commands == before + 1
+    assert (bench.out.left_setpoint_rad_s, bench.out.right_setpoint_rad_s) == pytest.approx((4.1, 2.1))
+    assert bench.out.last_command_counter == bench.counters["WHEEL_COMMAND"]
+
+
+def test_wrong_length_is_rejected():
+    bench = driving()
+    data = CODEC.encode("WHEEL_COMMAND", 0, mode=1, left_speed=1, right_speed=1, valid_for=0.1, session=7).data
+    for length in range(8):
+        assert rejected(bench, lambda n=length: bench.core.receive(bench.now_us, 0x100, data[:n])) == {"LENGTH": 1}
+
+
+def test_wrong_crc_is_rejected_whatever_bit_is_wrong():
+    data = CODEC.encode("WHEEL_COMMAND", 0, mode=1, left_speed=1, right_speed=1, valid_for=0.1, session=7).data
+    for bit in range(64):
+        bench = Bench() if bit else driving()
+        flipped = (int.from_bytes(data, "little") ^ 1 << bit).to_bytes(8, "little")
+        assert rejected(bench, lambda b=bench, d=flipped: b.core.receive(b.now_us, 0x100, d)) == {"CRC": 1}
+
+
+def test_replayed_counter_is_rejected():
+    bench = driving()
+    bench.counters["WHEEL_COMMAND"] -= 1
+    assert rejected(bench, lambda: bench.wheel_command(5.0, 5.0)) == {"REPEATED": 1}
+
+
+def test_a_replayed_run_of_old_frames_is_rejected_at_its_first_frame_and_by_its_session_for_ever():
+    bench = Bench()
+    bench.to_armed()
+    recorded = []
+    for _ in range(20):
+        values = {"mode": "SPEED", "left_speed": 6.0, "right_speed": 6.0, "valid_for": 0.5, "session": 7}
+        recorded.append(CODEC.encode("WHEEL_COMMAND", bench.next_counter("WHEEL_COMMAND"), **values))
+    bench.command = None
+    bench.run_until("STANDBY")
+    bench.to_armed(session=9)
+    bench.command = None
+    accepted = bench.out.accepted_commands
+    for frame in recorded:
+        bench.core.receive(bench.now_us, *frame)
+        bench.step()
+        assert bench.out.left_setpoint_rad_s == 0.0
+    assert bench.out.accepted_commands == accepted
+
+
+@pytest.mark.parametrize("step", range(4, 16))
+def test_wrong_sequence_is_rejected(step):
+    bench = driving()
+    bench.counters["WHEEL_COMMAND"] = (bench.counters["WHEEL_COMMAND"] + step - 1) % 16
+    assert rejected(bench, lambda: bench.wheel_command(5.0, 5.0)) == {"SEQUENCE": 1}
+
+
+@pytest.mark.parametrize("step", [1, 2, 3])
+def test_up_to_two_lost_frames_are_accepted(step):
+    bench = driving()
+    before = bench.out.accepted_commands
+    bench.counters["WHEEL_COMMAND"] = (bench.counters["WHEEL_COMMAND"] + step - 1) % 16
+    bench.wheel_command(4.0, 2.0)
+    assert bench.step().accepted_commands == before + 1
+
+
+def test_another_majors_command_is_a_wrong_crc():
+    bench = driving()
+    body = CODEC.encode("WHEEL_COMMAND", 0, mode=1, left_speed=1, right_speed=1, valid_for=0.1, session=7).data[1:]
+    assert rejected(bench, lambda: bench.core.receive(bench.now_us, 0x100, sealed(0x100, body, major=2))) == {"CRC": 1}
+
+
+def test_before_qualification_nothing_is_accepted():
+    bench = Bench()
+    bench.to_ready()
+    for expected in ({"NOT_QUALIFIED": 1},) * 3:
+        assert rejected(bench, bench.wheel_command) == expected
+    bench.wheel_command()
+    assert bench.step().accepted_commands == 1
+
+
+@pytest.mark.parametrize("state", ["STANDBY", "READY"])
+def test_nonzero_command_before_armed_is_rejected(state):
+    bench = Bench()
+    if state == "READY":
+        bench.to_ready()
+    bench.command = {}
+    bench.run(200)
+    bench.command = None
+    assert rejected(bench, lambda: bench.wheel_command(0.0, 0.002)) == {"NONZERO_BEFORE_ARMED": 1}
+
+
+def test_standby_rejects_even_zero():
+    bench = Bench()
+    bench.command = {}
+    bench.run(200)
+    bench.command = None
+    assert rejected(bench, bench.wheel_command) == {"STATE": 1}
+
+
+@pytest.mark.parametrize("state", ["STOPPING", "FAULT", "ESTOP"])
+def test_stopped_states_reject_everything(state):
+    bench = driving()
+    if state == "STOPPING":
+        bench.ask("STANDBY")
+        bench.run_until("STOPPING")
+    elif state == "FAULT":
+        bench.command = {"left": 4.0, "right": 2.0}
+        bench.inputs["left_current_a"] = 100.0
+        bench.run_until("FAULT")
+    else:
+        bench.core.receive(bench.now_us, 0x080, b"")
+    bench.command = None
+    assert rejected(bench, lambda: bench.wheel_command(4.0, 2.0)) == {"STATE": 1}
+    assert rejected(bench, lambda: bench.wheel_command(0.0, 0.0)) == {"STATE": 1}
+
+
+def ready_with(bench, commands):
+    """Bring to READY with qualified commands of which these are the last; then ask to arm."""
+    bench.to_ready()
+    for _ in range(3):
+        bench.wheel_command()
+        bench.step()
+    for command in commands:
+        bench.wheel_command(**command)
+        bench.step()
+    bench.request = {"request": "ARM", "session": 7}
+    bench.now_us += 50 * MS - bench.now_us % (50 * MS) - MS
+    return bench.step().state
+
+
+def test_arming_takes_five_zero_commands_in_a_row():
+    zero, other = {}, {"left": 1.0}
+    assert ready_with(Bench(), [zero] * 4) == "READY"
+    assert ready_with(Bench(), [zero] * 5) == "ARMED"
+    assert ready_with(Bench(), [zero] * 4 + [other] + [zero] * 4) == "READY"
+    assert ready_with(Bench(), [zero] * 4 + [other] + [zero] * 5) == "ARMED"
+    assert ready_with(Bench(), [zero] * 4 + [{"session": 8}] + [zero] * 4) == "READY"
+
+
+def test_zero_commands_that_stopped_do_not_arm():
+    bench = Bench()
+    bench.to_ready()
+    bench.command = {}
+    bench.run(300)
+    bench.command = None
+    bench.run(101)
+    bench.ask("ARM")
+    bench.run(100)
+    assert bench.out.state == "READY"
+    assert "ZERO_COMMANDS" in bench.blockers()
+
+
+def stop_time_us(bench):
+    """Time from now until the core leaves ARMED."""
+    start = bench.now_us
+    bench.run_until("STOPPING", "STANDBY", within_ms=1000)
+    return bench.now_us - start
+
+
+def test_the_watchdog_runs_from_the_instant_of_arming():
+    bench = Bench()
+    bench.to_ready()
+    bench.command = {}
+    bench.ask("ARM")
+    while bench.step().state != "ARMED":
+        pass
+    bench.command = None
+    assert stop_time_us(bench) == 100 * MS
+    assert bench.out.stop_cause == "COMMAND_TIMEOUT"
+    assert bench.out.watchdog_events == 1
+
+
+@pytest.mark.parametrize(
+    "feed",
+    [
+        lambda bench: None,
+        lambda bench: bench.hello(),
+        lambda bench: bench.send("TIME_REQUEST", sequence=1),
+        lambda bench: bench.send("PARAM_REQUEST", operation="READ", key=1, value=0.0),
+        lambda bench: bench.core.receive(bench.now_us, 0x110, bytes(8)),
+        lambda bench: bench.wheel_command(4.0, 2.0, session=8),
+        lambda bench: bench.wheel_command(4.0, 2.0, valid_for=0.0),
+    ],
+    ids=["silence", "hello", "time", "parameter", "telemetry", "old session", "not valid"],
+)
+def test_only_an_accepted_command_feeds_the_watchdog(feed):
+    bench = driving()
+    bench.wheel_command(4.0, 2.0)
+    start = bench.now_us
+    while bench.step().state == "ARMED":
+        if bench.now_us % (10 * MS) == 0:
+            feed(bench)
+    assert bench.now_us - start == 100 * MS
+    assert bench.out.stop_cause == "COMMAND_TIMEOUT"
+
+
+@pytest.mark.parametrize(
+    ("valid_for_s", "expected_ms", "cause"),
+    [
+        (0.002, 2, "COMMAND_EXPIRED"),
+        (0.04, 40, "COMMAND_EXPIRED"),
+        (0.098, 98, "COMMAND_EXPIRED"),
+        (0.1, 100, "COMMAND_TIMEOUT"),
+        (0.51, 100, "COMMAND_TIMEOUT"),
+    ],
+)
+def test_a_command_holds_no_longer_than_it_says_nor_than_the_firmware_allows(valid_for_s, expected_ms, cause):
+    bench = driving()
+    bench.wheel_command(4.0, 2.0, valid_for=valid_for_s)
+    assert stop_time_us(bench) == expected_ms * MS
+    assert bench.out.stop_cause == cause
+
+
+def test_a_late_command_finds_the_watchdog_expired_even_if_no_cycle_ran_in_between():
+    bench = driving()
+    bench.wheel_command(4.0, 2.0)
+    accepted = bench.step().accepted_commands
+    bench.now_us += 150 * MS
+    bench.wheel_command(4.0, 2.0)
+    bench.step()
+    assert bench.out.state == "STOPPING"
+    assert bench.out.accepted_commands == accepted
+
+
+def test_a_clock_that_steps_back_neither_trips_nor_extends_the_watchdog():
+    bench = driving()
+    bench.wheel_command(4.0, 2.0)
+    bench.run(50)
+    inputs = FirmwareInputs(
+        left_ticks=int(bench.ticks[0]), right_ticks=int(bench.ticks[1]), left_speed_rad_s=4.0, right_speed_rad_s=2.0
+    )
+    assert bench.core.step(0, inputs).state == "ARMED"
+    assert stop_time_us(bench) == 50 * MS
+
+
+def test_timeouts_are_those_of_the_configuration():
+    bench = Bench(dataclasses.replace(CONFIG, command_timeout_s=0.06))
+    bench.to_driving()
+    bench.command = None
+    bench.wheel_command(4.0, 2.0)
+    assert stop_time_us(bench) == 60 * MS

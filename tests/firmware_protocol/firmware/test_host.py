@@ -1,0 +1,397 @@
+"""Handshake, requests, sessions and challenges."""
+
+import dataclasses
+import itertools
+
+import pytest
+
+from firmware_protocol.e2e import challenge_answer
+from firmware_protocol.firmware_core import FirmwareCore, FirmwareInputs
+from tests.firmware_protocol.bench import CODEC, CONFIG, FAULTS, Bench, sealed
+
+
+def test_without_a_handshake_nothing_gets_ready():
+    bench = Bench()
+    bench.ask("READY")
+    bench.run(500)
+    assert bench.out.state == "STANDBY"
+    assert bench.blockers() == {"HANDSHAKE", "CHALLENGE", "ZERO_COMMANDS"}
+
+
+def test_another_dbc_is_refused_and_named_and_the_right_one_accepted_afterwards():
+    bench = Bench()
+    bench.hello(dbc_hash=CODEC.dbc_hash ^ 1)
+    bench.ask("READY")
+    bench.run(300)
+    assert bench.out.state == "STANDBY"
+    assert bench.out.fault == FAULTS["DBC_HASH_MISMATCH"]
+    assert {"HANDSHAKE", "FAULT"} <= bench.blockers()
+    assert bench.core.rejections["HANDSHAKE"] == 1
+    assert bench.messages("BUILD")[-1].values["dbc_hash"] == CODEC.dbc_hash
+    bench.hello()
+    bench.run_until("READY")
+    assert bench.out.fault == FAULTS["NONE"]
+
+
+def test_another_dbc_stops_motion():
+    bench = Bench()
+    bench.to_driving()
+    bench.hello(dbc_hash=1)
+    bench.run(2)
+    assert (bench.out.state, bench.out.stop_cause) == ("STOPPING", "FAULT")
+
+
+@pytest.mark.parametrize("major", [0, 2, 255])
+def test_a_host_of_another_major_is_heard_refused_and_answered(major):
+    bench = Bench()
+    bench.run(100)
+    before = len(bench.messages("HELLO"))
+    bench.hello(protocol_major=major)
+    bench.ask("READY")
+    bench.run(300)
+    assert bench.out.state == "STANDBY"
+    assert bench.out.fault == FAULTS["PROTOCOL_MAJOR_MISMATCH"]
+    assert len(bench.messages("HELLO")) == before + 1
+
+
+def test_firmware_of_another_major_is_understood_as_such_and_nothing_else_of_it_is():
+    core = FirmwareCore(dataclasses.replace(CONFIG, protocol_major=2))
+    core.step(1000, FirmwareInputs(left_ticks=0, right_ticks=0, left_speed_rad_s=0.0, right_speed_rad_s=0.0))
+    decoded = {can_id: CODEC.decode(can_id, data) for can_id, data in core.drain()}
+    assert decoded.pop(0x140).values["protocol_major"] == 2
+    assert {fault.reason.value for fault in decoded.values()} == {"crc"}
+
+
+def test_another_minor_is_accepted():
+    bench = Bench()
+    bench.hello(protocol_minor=9)
+    bench.step()
+    assert "HANDSHAKE" not in bench.blockers()
+
+
+def test_a_host_silent_for_long_must_introduce_itself_again():
+    bench = Bench()
+    bench.hello()
+    bench.run(5000)
+    assert "HANDSHAKE" not in bench.blockers()
+    bench.step()
+    assert "HANDSHAKE" in bench.blockers()
+
+
+def test_any_sound_frame_keeps_the_acquaintance():
+    bench = Bench()
+    bench.hello()
+    bench.run(4000)
+    bench.send("TIME_REQUEST", sequence=1)
+    bench.run(4000)
+    assert "HANDSHAKE" not in bench.blockers()
+
+
+def test_host_state_counts_only_once_qualified():
+    bench = Bench()
+    bench.hello()
+    for _ in range(3):
+        bench.host_state(request="READY", session=7)
+        assert bench.step().state == "STANDBY"
+    bench.host_state(request="READY", session=7)
+    assert bench.step().state == "READY"
+
+
+def test_unknown_request_changes_nothing():
+    bench = Bench()
+    bench.to_driving()
+    bench.host_state(request=4, session=7)
+    bench.run(2)
+    assert bench.out.state == "ARMED"
+    assert bench.core.rejections["MODE"] == 1
+
+
+def test_wrong_crc_and_repeated_host_states_are_not_used():
+    bench = Bench()
+    bench.to_driving()
+    body = CODEC.encode(
+        "HOST_STATE", bench.counters["HOST_STATE"] + 1, request="STANDBY", session=7, challenge_answer=0, host_fault=0
+    ).data
+    bench.core.receive(bench.now_us, 0x101, bytes((body[0] ^ 1,)) + body[1:])
+    bench.counters["HOST_STATE"] -= 1
+    bench.host_state(request="STANDBY", session=7)
+    bench.run(2)
+    assert bench.out.state == "ARMED"
+
+
+def test_a_host_that_babbles_is_disqualified_and_motion_stops():
+    bench = Bench()
+    bench.to_driving()
+    for _ in range(5):
+        bench.core.receive(bench.now_us, 0x101, sealed(0x101, bytes(7), major=3))
+    bench.run(2)
+    assert (bench.out.state, bench.out.stop_cause) == ("STOPPING", "E2E_DISQUALIFIED")
+
+
+@pytest.mark.parametrize("session", [0, 7])
+def test_session_zero_and_the_last_session_are_refused(session):
+    bench = Bench()
+    bench.to_ready(session=7)
+    bench.ask("STANDBY")
+    bench.run_until("STANDBY")
+    bench.ask("READY", session=session)
+    bench.run(300)
+    assert bench.out.state == "STANDBY"
+    assert "SESSION" in bench.blockers()
+    bench.ask("READY", session=8)
+    bench.run_until("READY")
+    assert bench.out.session == 8
+
+
+def test_session_dies_with_ready_and_armed():
+    bench = Bench()
+    bench.to_driving()
+    assert bench.out.session == 7
+    bench.command = None
+    bench.run_until("STOPPING")
+    assert bench.out.session == 0
+
+
+def test_it_never_arms_again_by_itself():
+    bench = Bench()
+    bench.to_driving()
+    command, bench.command = bench.command, None
+    bench.run_until("STANDBY")
+    bench.command = command
+    for request in ("ARM", "READY", "ARM"):
+        bench.ask(request)
+        bench.run(1000)
+        assert bench.out.state == "STANDBY"
+    bench.command = {}
+    bench.run(1000)
+    assert bench.out.state == "STANDBY"
+
+
+def test_a_new_session_in_ready_goes_through_standby_with_a_new_challenge():
+    bench = Bench()
+    bench.to_ready(session=7)
+    challenge = bench.core.challenge
+    bench.ask("READY", session=8)
+    bench.run(60)
+    assert (bench.out.state, bench.out.session) == ("READY", 8)
+    assert bench.core.challenge != challenge
+
+
+def test_every_entry_of_standby_and_ready_has_a_new_challenge_never_zero():
+    bench = Bench()
+    seen = []
+    bench.hello()
+    for session in range(1, 60):
+        bench.ask("READY", session=session)
+        bench.run_until("READY")
+        seen.append(bench.core.challenge)
+        bench.ask("STANDBY", session=session)
+        bench.run_until("STANDBY")
+        seen.append(bench.core.challenge)
+    assert all(a != b for a, b in itertools.pairwise(seen))
+    assert len(set(seen)) > 110
+    assert 0 not in seen
+
+
+def test_challenges_depend_on_the_entropy():
+    assert len({Bench(entropy=seed).core.challenge for seed in range(50)}) > 45
+
+
+def arm_with(answer):
+    bench = Bench()
+    bench.to_ready()
+    bench.command = {}
+    bench.answers = False
+    bench.ask("ARM", challenge_answer=answer(bench))
+    bench.run(400)
+    return bench
+
+
+def test_right_answer_arms():
+    assert arm_with(lambda b: challenge_answer(b.core.challenge, 7, CODEC.dbc_hash)).out.state == "ARMED"
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        lambda b: 0,
+        lambda b: b.core.challenge,
+        lambda b: challenge_answer(b.core.challenge, 8, CODEC.dbc_hash),
+        lambda b: challenge_answer(b.core.challenge, 7, CODEC.dbc_hash ^ 1),
+        lambda b: challenge_answer(b.core.challenge ^ 1, 7, CODEC.dbc_hash),
+    ],
+)
+def test_wrong_answer_does_not(answer):
+    bench = arm_with(answer)
+    assert bench.out.state == "READY"
+    assert bench.core.rejections["CHALLENGE"] > 0
+    assert bench.blockers() == {"CHALLENGE"}
+
+
+def test_the_answer_to_an_old_challenge_does_not_arm():
+    bench = Bench()
+    bench.to_ready(session=7)
+    old = challenge_answer(bench.core.challenge, 9, CODEC.dbc_hash)
+    bench.ask("READY", session=9)
+    bench.run(60)
+    assert bench.out.session == 9
+    bench.command, bench.answers = {}, False
+    bench.ask("ARM", session=9, challenge_answer=old)
+    bench.run(400)
+    assert bench.out.state == "READY"
+
+
+def test_answer_given_in_standby_is_no_answer():
+    bench = Bench()
+    bench.hello()
+    bench.command = {}
+    bench.ask("ARM")
+    bench.run(400)
+    assert bench.out.state == "STANDBY"
+    bench.answers = False
+    bench.ask("READY")
+    bench.run_until("READY")
+    bench.ask("ARM")
+    bench.run(300)
+    assert bench.out.state == "READY"
+
+
+def test_arming_waits_for_wheels_that_stand():
+    bench = Bench()
+    bench.to_ready()
+    bench.wheels_follow = False
+    bench.speeds = [0.0, -0.06]
+    bench.command = {}
+    bench.ask("ARM")
+    bench.run(400)
+    assert bench.out.state == "READY"
+    assert bench.blockers() == {"WHEELS_MOVING"}
+    bench.speeds = [0.0, -0.04]
+    bench.run(2)
+    assert bench.out.state == "ARMED"
+    assert bench.out.blockers == 0
+
+
+def estopped():
+    bench = Bench()
+    bench.to_driving()
+    bench.core.receive(bench.now_us, 0x080, b"")
+    bench.command = None
+    bench.ask("ARM")
+    bench.run(800)
+    assert bench.out.state == "ESTOP"
+    return bench
+
+
+def test_reset_clears_an_estop_but_starts_nothing():
+    bench = estopped()
+    bench.ask("RESET")
+    bench.run_until("STANDBY")
+    bench.command = {"left": 1.0, "right": 1.0}
+    bench.ask("ARM")
+    for _ in range(1000):
+        assert bench.step().state == "STANDBY"
+        assert not bench.out.driver_enabled
+
+
+def test_a_reset_asked_for_before_the_stop_does_not_clear_it():
+    bench = Bench()
+    bench.ask("RESET")
+    bench.run(300)
+    bench.core.receive(bench.now_us, 0x080, b"")
+    bench.run(1500)
+    assert bench.out.state == "ESTOP"
+    bench.ask("STANDBY")
+    bench.run(100)
+    bench.ask("RESET")
+    bench.run(60)
+    assert bench.out.state == "STANDBY"
+
+
+def test_a_reset_waits_for_stillness_and_is_void_when_the_stop_comes_again():
+    bench = estopped()
+    bench.wheels_follow = False
+    bench.speeds = [1.0, 1.0]
+    bench.ask("RESET")
+    bench.run(300)
+    assert bench.out.state == "ESTOP"
+    bench.core.receive(bench.now_us, 0x080, b"")
+    bench.speeds = [0.0, 0.0]
+    bench.run(1000)
+    assert bench.out.state == "ESTOP"
+
+
+@pytest.mark.parametrize("end", ["another request", "silence"])
+def test_a_reset_no_longer_asked_for_is_void(end):
+    bench = estopped()
+    bench.wheels_follow = False
+    bench.speeds = [1.0, 1.0]
+    bench.ask("RESET")
+    bench.run(100)
+    bench.request = None
+    if end == "another request":
+        bench.ask("STANDBY")
+    bench.run(700)
+    bench.speeds = [0.0, 0.0]
+    bench.run(300)
+    assert bench.out.state == "ESTOP"
+
+
+@pytest.mark.parametrize("source", ["estop_button", "estop_line"])
+def test_a_pressed_button_cannot_be_reset_nor_does_its_release_reset(source):
+    bench = Bench()
+    bench.to_driving()
+    bench.inputs[source] = True
+    bench.run(700)
+    assert (bench.out.state, bench.out.estop_source) == ("ESTOP", source.removeprefix("estop_").upper())
+    bench.command = None
+    bench.ask("RESET")
+    bench.run(700)
+    assert bench.out.state == "ESTOP"
+    bench.inputs.clear()
+    bench.run(1000)
+    assert bench.out.state == "ESTOP"
+    bench.ask("STANDBY")
+    bench.run(100)
+    bench.ask("RESET")
+    bench.run_until("STANDBY", within_ms=60)
+    assert bench.out.estop_source == "NONE"
+
+
+def test_motion_asked_for_delays_a_reset():
+    bench = estopped()
+    bench.command = {"left": 0.002, "right": 0.0, "session": 7}
+    bench.ask("RESET")
+    bench.run(1000)
+    assert bench.out.state == "ESTOP"
+    bench.command = {"session": 7}
+    bench.run(490)
+    assert bench.out.state == "ESTOP"
+    bench.run(30)
+    assert bench.out.state == "STANDBY"
+
+
+def test_the_first_source_of_an_estop_is_kept():
+    bench = estopped()
+    bench.inputs["estop_button"] = True
+    bench.step()
+    assert bench.out.estop_source == "FRAME"
+
+
+def test_host_fault_blocks_ready():
+    bench = Bench()
+    bench.hello()
+    bench.ask("READY", host_fault=5)
+    bench.run(300)
+    assert bench.out.state == "STANDBY"
+    assert "HOST_STATE" in bench.blockers()
+
+
+def test_silent_host_loses_ready():
+    bench = Bench()
+    bench.to_ready()
+    last = bench.now_us
+    bench.request = None
+    bench.run_until("STANDBY")
+    assert bench.now_us - last == 501_000
+    assert "HOST_STATE" in bench.blockers()

@@ -1,0 +1,60 @@
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from firmware_protocol import _firmware
+
+ffi, lib = _firmware.ffi, _firmware.lib
+speeds = st.floats(-1e6, 1e6, width=32)
+limits = st.floats(0.125, 100.0, width=32)
+
+
+def wheels(left, right):
+    return ffi.new("disco_wheels_t *", (left, right))[0]
+
+
+@given(speeds, speeds, limits)
+def test_clamped_speed_is_within_the_limit_and_keeps_the_ratio(left, right, limit):
+    clamped = lib.disco_clamp_speed(wheels(left, right), limit)
+    assert max(abs(clamped.left), abs(clamped.right)) <= limit
+    assert clamped.left * right == pytest.approx(clamped.right * left, rel=1e-5, abs=1e-3)
+    if max(abs(left), abs(right)) <= limit:
+        assert (clamped.left, clamped.right) == (left, right)
+    else:
+        assert max(abs(clamped.left), abs(clamped.right)) == pytest.approx(limit, rel=1e-5)
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_what_is_not_a_number_is_standstill(bad):
+    for pair in ((bad, 1.0), (1.0, bad), (bad, bad)):
+        clamped = lib.disco_clamp_speed(wheels(*pair), 8.0)
+        assert (clamped.left, clamped.right) == (0.0, 0.0)
+
+
+moderate = st.floats(-100.0, 100.0, width=32)
+
+
+@given(moderate, moderate, moderate, moderate, st.floats(0.001, 10.0))
+def test_approach_keeps_to_the_step_and_to_the_straight_line(left, right, to_left, to_right, step):
+    result = lib.disco_approach(wheels(left, right), wheels(to_left, to_right), step)
+    moved = (result.left - left, result.right - right)
+    wanted = (to_left - left, to_right - right)
+    assert max(map(abs, moved)) <= step * (1 + 1e-5) + 1e-5
+    assert moved[0] * wanted[1] == pytest.approx(moved[1] * wanted[0], rel=1e-3, abs=0.01)
+    if max(map(abs, wanted)) <= step:
+        assert (result.left, result.right) == (to_left, to_right)
+
+
+def test_approach_with_no_step_stays():
+    result = lib.disco_approach(wheels(1.0, 2.0), wheels(3.0, 3.0), 0.0)
+    assert (result.left, result.right) == (1.0, 2.0)
+
+
+def test_largest_and_equal():
+    assert lib.disco_largest(wheels(-3.0, 2.0)) == 3.0
+    assert lib.disco_largest(wheels(math.nan, 2.0)) == math.inf
+    assert lib.disco_wheels_equal(wheels(1.0, 2.0), wheels(1.0, 2.0))
+    assert not lib.disco_wheels_equal(wheels(1.0, 2.0), wheels(2.0, 2.0))
+    assert not lib.disco_wheels_equal(wheels(1.0, 2.0), wheels(1.0, 1.0))
