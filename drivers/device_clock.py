@@ -39,13 +39,18 @@ class DeviceClock:
 
     def __init__(self) -> None:
         self._window: deque[_Exchange] = deque(maxlen=WINDOW)
-        self._filter: _OffsetFilter | None = None
         self._base_host_ns = 0
         self._base_us = 0
-        self._count = 0
         self._last_ns = 0
-        self._slew_ns = 0.0
         self._slew_from_ns = 0
+        self.forget()
+
+    def forget(self) -> None:
+        """Start afresh with the next exchange."""
+        self._window.clear()
+        self._filter: _OffsetFilter | None = None
+        self._count = 0
+        self._slew_ns = 0.0
 
     def add(self, sent_ns: int, received_ns: int, device_us: int) -> bool:
         """Take in one exchange: host times of request and response, device time of the request's reception.
@@ -100,11 +105,9 @@ class DeviceClock:
         return None if offset_ns is None else ((now_ns - offset_ns) / 1000) % DEVICE_CLOCK_MODULUS_US
 
     def _start(self, host_ns: int, device_us: int) -> None:
-        self._window.clear()
+        self.forget()
         self._filter = _OffsetFilter(host_ns)
         self._base_host_ns, self._base_us = host_ns, device_us
-        self._count = 0
-        self._slew_ns = 0.0
 
     def _deviation(self, host_ns: int, device_us: int) -> float:
         """Offset of one exchange relative to that of the first; the device's clock may have wrapped since."""

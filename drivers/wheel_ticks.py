@@ -15,7 +15,7 @@ class WheelTicks:
 
     Two readings differ by the shortest way round the ring, and by no more than the wheels can turn in the time between:
     one and a half times `max_speed_rad_s`, and a few ticks. What is more is implausible and dropped; after five such
-    readings in a row the counters are taken as they are, with no motion in between.
+    readings in a row the counters are taken as they are, with no motion in between. The first reading is `start`.
     """
 
     __slots__ = (
@@ -24,12 +24,14 @@ class WheelTicks:
         "_max_ticks_per_us",
         "_rejected",
         "_right",
+        "_start",
         "_t_us",
         "_ticks_left",
         "_ticks_right",
     )
 
-    def __init__(self, ticks_per_rev: int, max_speed_rad_s: float) -> None:
+    def __init__(self, ticks_per_rev: int, max_speed_rad_s: float, start: tuple[float, float] = (0.0, 0.0)) -> None:
+        self._start = start
         self._angle_per_tick = 2.0 * math.pi / ticks_per_rev
         self._max_ticks_per_us = SPEED_MARGIN * max_speed_rad_s / self._angle_per_tick * 1e-6
         self._left = 0
@@ -59,7 +61,13 @@ class WheelTicks:
                     return None
         self._rejected = 0
         self._ticks_left, self._ticks_right, self._t_us = ticks_left, ticks_right, t_us
-        return self._left * self._angle_per_tick, self._right * self._angle_per_tick
+        return self.angles
+
+    @property
+    def angles(self) -> tuple[float, float]:
+        """Both angles after the last accepted reading."""
+        left, right = self._start
+        return left + self._left * self._angle_per_tick, right + self._right * self._angle_per_tick
 
 
 def _shortest(difference: int) -> int:

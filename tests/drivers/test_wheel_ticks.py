@@ -78,3 +78,8 @@ def test_after_forgetting_the_angles_go_on_from_where_they_are():
     ticks.update(20, 10, PERIOD_US)
     ticks.forget()
     assert ticks.update(9_000_000, 77, 2 * PERIOD_US) == (20 * PER_TICK, 10 * PER_TICK)
+
+
+def test_a_start_is_added():
+    ticks = WheelTicks(TICKS_PER_REV, MAX_SPEED, start=(3.0, -4.0))
+    assert ticks.update(7, 7, 0) == ticks.angles == (3.0, -4.0)

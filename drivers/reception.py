@@ -1,0 +1,84 @@
+"""Judges received frames: which of them may be believed."""
+
+from __future__ import annotations
+
+from drivers.types import ReceivedFrame
+from firmware_protocol.codec import PROTOCOL, Codec, Decoded, DecodeFault, FaultReason
+from firmware_protocol.e2e import COUNTER_MODULUS, E2EReceiver, E2EStatus
+
+TIMEOUT_NS = 500_000_000
+SLOW_TIMEOUT_NS = 5_000_000_000
+_SLOW = frozenset({"POWER", "LINK_HEALTH"})
+# Asked for one by one, so that there is no row of good frames to wait for; each says by itself what it answers.
+_ANSWERS = frozenset({"HELLO", "BUILD", "LIMITS", "TIME_RESPONSE", "PARAM_RESPONSE"})
+_SENDERS = {layout.name: layout.sender for layout in PROTOCOL.messages}
+_USABLE = (E2EStatus.OK, E2EStatus.OK_SOME_LOST)
+
+
+class FrameReception:
+    """Decodes frames, checks their end-to-end protection per identifier and counts all that is not used."""
+
+    def __init__(self, codec: Codec) -> None:
+        self._codec = codec
+        self._receivers: dict[str, E2EReceiver] = {}
+        self._counters: dict[str, int] = {}
+        self.accepted = 0
+        self.rejected_crc = 0
+        self.rejected_sequence = 0
+        self.rejected_length = 0
+        self.unknown_id = 0
+        self.lost = 0
+        self.foreign: str | None = None
+
+    def reset(self) -> None:
+        """Forget the senders, as at a new link; the counts stay."""
+        self._receivers.clear()
+        self._counters.clear()
+        self.foreign = None
+
+    def accept(self, received: ReceivedFrame) -> Decoded | None:
+        """Return the decoded frame if it may be believed, None otherwise; whatever the wire brings, nothing is raised.
+
+        `foreign` names the last message seen that only a host sends: somebody else commands this robot.
+        """
+        decoded = self._codec.decode(received.frame.can_id, received.frame.data)
+        if isinstance(decoded, DecodeFault):
+            self._count(decoded, received.t_ns)
+            return None
+        if _SENDERS[decoded.name] != "ROBOT":
+            self.foreign = decoded.name
+            self.unknown_id += 1
+            return None
+        receiver = self._receiver(decoded.name)
+        status = receiver.check(decoded.counter, True, received.t_ns)
+        self._count_lost(decoded, status)
+        if status in (E2EStatus.REPEATED, E2EStatus.WRONG_SEQUENCE):
+            self.rejected_sequence += 1
+        if decoded.name in _ANSWERS:
+            believed = status is not E2EStatus.REPEATED
+        else:
+            believed = receiver.qualified and status in _USABLE
+        self.accepted += believed
+        return decoded if believed else None
+
+    def _receiver(self, name: str) -> E2EReceiver:
+        receiver = self._receivers.get(name)
+        if receiver is None:
+            receiver = self._receivers[name] = E2EReceiver(SLOW_TIMEOUT_NS if name in _SLOW else TIMEOUT_NS)
+        return receiver
+
+    def _count(self, fault: DecodeFault, received_ns: int) -> None:
+        match fault.reason:
+            case FaultReason.UNKNOWN_ID:
+                self.unknown_id += 1
+            case FaultReason.CRC:
+                self.rejected_crc += 1
+                self._receiver(fault.name).check(0, False, received_ns)
+            case FaultReason.LENGTH | FaultReason.PAGE:
+                self.rejected_length += 1
+
+    def _count_lost(self, decoded: Decoded, status: E2EStatus) -> None:
+        previous = self._counters.get(decoded.name)
+        self._counters[decoded.name] = decoded.counter
+        if previous is not None and status in (E2EStatus.OK_SOME_LOST, E2EStatus.WRONG_SEQUENCE):
+            self.lost += (decoded.counter - previous) % COUNTER_MODULUS - 1

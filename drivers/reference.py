@@ -1,0 +1,386 @@
+"""The driver of this project's own wheel controller, which speaks firmware_protocol/disco_robot.dbc."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from drivers import telemetry, words
+from drivers.arming import Arming, HostState
+from drivers.device_clock import DeviceClock
+from drivers.handshake import MESSAGES as HANDSHAKE_MESSAGES
+from drivers.handshake import Handshake
+from drivers.reception import FrameReception
+from drivers.transmission import FrameTransmission
+from drivers.types import (
+    Capabilities,
+    DriverState,
+    DriverStats,
+    OutgoingFrame,
+    Readings,
+    ReceivedFrame,
+    Request,
+    RobotStatus,
+    WheelCommand,
+)
+from firmware_protocol.codec import PROTOCOL_MAJOR, PROTOCOL_MINOR, Codec, Decoded
+
+SILENCE_NS = 500_000_000
+REFUSED_SILENCE_NS = 3_000_000_000
+# A little under 10 Hz, so that a loop whose ticks come early by some jitter does not skip one.
+HOST_STATE_PERIOD_NS = 90_000_000
+HELLO_PERIOD_NS = 200_000_000
+REFUSED_HELLO_PERIOD_NS = 1_000_000_000
+FAST_TIME_PERIOD_NS = 200_000_000
+TIME_PERIOD_NS = 1_000_000_000
+FAST_TIME_COUNT = 10
+ZERO_VALID_FOR_S = 0.1
+ESTOP_REPEATS = 3
+SHORTEST_VALID_FOR_S = 0.002
+_HOUSE_KEEPING_NS = 100_000_000
+_ESTOP_DEADLINE_NS = 1_000_000_000
+_PENDING_TIMES = 8
+_STATES = {
+    "BOOT": DriverState.HANDSHAKE,
+    "STANDBY": DriverState.STANDBY,
+    "READY": DriverState.STANDBY,
+    "ARMED": DriverState.STOPPING,
+    "STOPPING": DriverState.STOPPING,
+    "FAULT": DriverState.FAULT,
+    "ESTOP": DriverState.ESTOP,
+}
+
+
+class ReferenceDriver:
+    """Satisfies `drivers.types.Driver`; pure: no clock, thread or I/O, and no frame makes it raise.
+
+    `request(ARM)` leads from STANDBY or READY through a new session to ARMED; it is ignored, with the reason in
+    `detail`, before the handshake is complete. `transmit` raises ValueError for a command that is not finite or out of
+    the wire's range (callers clip first): it never reaches the wire.
+    """
+
+    def __init__(self, codec: Codec, draw_session: Callable[[], int]) -> None:
+        """`draw_session` returns any non-negative integer, best at random: session ids are made of it."""
+        self._codec = codec
+        self._reception = FrameReception(codec)
+        self._transmission = FrameTransmission(codec)
+        self._clock = DeviceClock()
+        self._telemetry = telemetry.Telemetry(self._clock)
+        self._arming = Arming(codec.dbc_hash, draw_session)
+        self._handshake = self._new_handshake()
+        self._blocker_bits = codec.choices("SESSION_STATE", "blockers")
+        self._status: RobotStatus | None = None
+        self._link_is_up = False
+        self._host_accepted = False
+        self._told: HostState | None = None
+        self._time_sequence = 0
+        self._time_requests: dict[int, int] = {}
+        self._commands_sent = 0
+        self._last_heard_ns = 0
+        self._events: list[str] = []
+        self._foreign_told = False
+        self._now_ns = 0
+
+    @property
+    def state(self) -> DriverState:
+        """Where the driver is with its robot."""
+        if not self._link_is_up:
+            return DriverState.DISCONNECTED
+        if self._handshake.refusal is not None:
+            return DriverState.REFUSED
+        if self.capabilities is None or self._status is None:
+            return DriverState.HANDSHAKE
+        state = _STATES.get(self._status.state, DriverState.HANDSHAKE)
+        if self._arming.armed:
+            return DriverState.ARMED
+        if state is DriverState.STANDBY and self._arming.wanted is Request.ARM:
+            return DriverState.ARMING
+        return DriverState.READY if self._arming.ready else state
+
+    @property
+    def detail(self) -> str:
+        """One sentence for a person: why the state is what it is and what to do about it."""
+        status, note = self._status, self._arming.note
+        match self.state:
+            case DriverState.DISCONNECTED:
+                return note or "the link is down"
+            case DriverState.REFUSED:
+                return self._handshake.refusal or ""
+            case DriverState.HANDSHAKE:
+                return self._handshake_detail()
+            case DriverState.FAULT if status is not None:
+                return f"the robot reports {words.fault(status.fault)}"
+            case DriverState.ESTOP if status is not None:
+                return words.estop(status.estop_source)
+            case DriverState.STOPPING if status is not None and status.state == "ARMED":
+                return note or "the robot is armed, but not by us or no longer wanted: it is being stopped"
+            case DriverState.ARMING:
+                return "arming"
+            case DriverState.ARMED:
+                return "armed"
+        return note or f"the robot is in {status.state if status is not None else 'an unknown state'}"
+
+    @property
+    def capabilities(self) -> Capabilities | None:
+        """What the robot said in the handshake; None before it is complete."""
+        return self._handshake.capabilities
+
+    @property
+    def stats(self) -> DriverStats:
+        """A snapshot of the counters."""
+        reception = self._reception
+        return DriverStats(
+            frames_accepted=reception.accepted,
+            rejected_crc=reception.rejected_crc,
+            rejected_sequence=reception.rejected_sequence,
+            rejected_length=reception.rejected_length,
+            unknown_id=reception.unknown_id,
+            lost_frames=reception.lost,
+            implausible_ticks=self._telemetry.implausible_ticks,
+            implausible_values=self._telemetry.implausible_values,
+            commands_sent=self._commands_sent,
+            sessions=self._arming.sessions,
+        )
+
+    @property
+    def clock_offset_ns(self) -> int | None:
+        """Host time minus device time, as estimated now; None before the first estimate."""
+        return self._clock.offset_ns(self._now_ns)
+
+    @property
+    def synced(self) -> bool:
+        """Whether samples are stamped with the device's time of measurement; before, with their reception."""
+        return self._clock.synced(self._now_ns)
+
+    def link_up(self, now_ns: int) -> None:
+        """The medium has come up (again): start the handshake; any session is void."""
+        self._restart(now_ns, "the link was interrupted")
+        self._link_is_up = True
+
+    def link_down(self, now_ns: int) -> None:
+        """The medium is gone: any session is void."""
+        self._restart(now_ns, "the link is down")
+        self._link_is_up = False
+
+    def request(self, request: Request) -> None:
+        """Set what the host wants; held until changed. ARM and RESET are consumed, see `drivers.arming.Arming`."""
+        if request is Request.ARM and self.state not in (DriverState.STANDBY, DriverState.READY, DriverState.STOPPING):
+            if self._arming.wanted is not Request.ARM:
+                self._arming.note = f"not arming: {self.detail}"
+            return
+        self._arming.request(request)
+
+    def receive(self, now_ns: int, frames: Sequence[ReceivedFrame]) -> Readings:
+        """Take in received frames and return what they meant; frames that come while the link is down are ignored."""
+        self._now_ns = now_ns
+        collected: dict[str, list[Any]] = {}
+        for received in frames if self._link_is_up else ():
+            decoded = self._reception.accept(received)
+            if decoded is None:
+                continue
+            self._last_heard_ns = received.t_ns
+            self._take(decoded, received.t_ns, collected)
+        self._mind_trust(now_ns)
+        if self._reception.foreign is not None and not self._foreign_told:
+            self._foreign_told = True
+            self._events.append(f"another host is on the link: it sends {self._reception.foreign}; disconnect it")
+        events, self._events = tuple(self._events), []
+        return Readings(**{kind: tuple(samples) for kind, samples in collected.items()}, events=events)
+
+    def transmit(self, now_ns: int, command: WheelCommand | None) -> tuple[OutgoingFrame, ...]:
+        """Frames due now: the command (only while armed; zeros while arming) and house-keeping.
+
+        Raises ValueError for a command that is not finite, out of the wire's range, or valid for no time.
+        """
+        self._now_ns = now_ns
+        if command is not None:
+            _check(command)
+        if not self._link_is_up:
+            return ()
+        self._mind_trust(now_ns)
+        self._arming.step(now_ns)
+        frames = []
+        if self._arming.armed and command is not None:
+            frames.append(self._wheel_command(now_ns, "SPEED", command))
+        elif self._arming.needs_zeros:
+            frames.append(self._wheel_command(now_ns, "HOLD_ZERO", WheelCommand(0.0, 0.0, ZERO_VALID_FOR_S)))
+        return (*frames, *self._house_keeping(now_ns))
+
+    def estop(self, now_ns: int) -> tuple[OutgoingFrame, ...]:
+        """Frames that stop the robot in any state; whatever was wanted is dropped."""
+        self._arming.request(Request.STANDBY)
+        frame = self._transmission.frame("ESTOP", now_ns, _ESTOP_DEADLINE_NS, reason="UNSPECIFIED")
+        return (frame,) * ESTOP_REPEATS
+
+    def _wheel_command(self, now_ns: int, mode: str, command: WheelCommand) -> OutgoingFrame:
+        self._commands_sent += 1
+        return self._transmission.frame(
+            "WHEEL_COMMAND",
+            now_ns,
+            # Half of its validity may pass on the way; the firmware counts the whole from the reception.
+            round(0.5e9 * command.valid_for_s),
+            mode=mode,
+            left_speed=command.left_rad_s,
+            right_speed=command.right_rad_s,
+            valid_for=command.valid_for_s,
+            session=self._arming.session,
+        )
+
+    def _house_keeping(self, now_ns: int) -> list[OutgoingFrame]:
+        frames = []
+        transmission = self._transmission
+        refused = self._handshake.refusal is not None
+        introduced = self._host_accepted and self.capabilities is not None
+        hello_period_ns = REFUSED_HELLO_PERIOD_NS if refused else HELLO_PERIOD_NS
+        if not introduced and transmission.due("HELLO_REQUEST", now_ns, hello_period_ns):
+            frames.append(
+                transmission.frame(
+                    "HELLO_REQUEST",
+                    now_ns,
+                    _HOUSE_KEEPING_NS,
+                    protocol_major=PROTOCOL_MAJOR,
+                    protocol_minor=PROTOCOL_MINOR,
+                    dbc_hash=self._codec.dbc_hash,
+                )
+            )
+        state = self._arming.host_state()
+        if state != self._told or transmission.due("HOST_STATE", now_ns, HOST_STATE_PERIOD_NS):
+            self._told = state
+            frames.append(
+                transmission.frame(
+                    "HOST_STATE",
+                    now_ns,
+                    _HOUSE_KEEPING_NS,
+                    request=state.request,
+                    session=state.session,
+                    challenge_answer=state.challenge_answer,
+                    host_fault=0,
+                )
+            )
+        time_period_ns = FAST_TIME_PERIOD_NS if self._clock.count < FAST_TIME_COUNT else TIME_PERIOD_NS
+        if transmission.due("TIME_REQUEST", now_ns, time_period_ns):
+            self._time_sequence = (self._time_sequence + 1) % 256
+            self._time_requests[self._time_sequence] = now_ns
+            if len(self._time_requests) > _PENDING_TIMES:
+                del self._time_requests[next(iter(self._time_requests))]
+            frames.append(transmission.frame("TIME_REQUEST", now_ns, _HOUSE_KEEPING_NS, sequence=self._time_sequence))
+        return frames
+
+    def _take(self, decoded: Decoded, received_ns: int, collected: dict[str, list[Any]]) -> None:
+        name = decoded.name
+        sample: tuple[str, Any] | None = None
+        if name in telemetry.WHEEL_MESSAGES:
+            sample = ("wheels", self._telemetry.wheels(decoded, received_ns))
+        elif name in telemetry.POSE_MESSAGES:
+            sample = ("poses", self._telemetry.pose(decoded, received_ns))
+        elif name in HANDSHAKE_MESSAGES:
+            self._take_handshake(decoded)
+        else:
+            match name:
+                case "SYSTEM_STATE":
+                    sample = ("status", self._take_status(decoded, received_ns))
+                case "SESSION_STATE":
+                    self._take_session(decoded, received_ns)
+                case "TIME_RESPONSE":
+                    self._take_time(decoded, received_ns)
+                case "MOTOR":
+                    sample = ("motors", telemetry.motor(decoded, received_ns))
+                case "POWER":
+                    sample = ("power", telemetry.power(decoded, received_ns))
+                case "LINK_HEALTH":
+                    sample = ("link_health", telemetry.link_health(decoded, received_ns))
+        if sample is not None and sample[1] is not None:
+            collected.setdefault(sample[0], []).append(sample[1])
+
+    def _take_handshake(self, decoded: Decoded) -> None:
+        before, refusal = self.capabilities, self._handshake.refusal
+        self._handshake.take(decoded)
+        capabilities = self.capabilities
+        if capabilities is not None and capabilities != before:
+            self._telemetry.configure(capabilities)
+            self._events.append(f"handshake complete: {capabilities}")
+        if self._handshake.refusal not in (None, refusal):
+            self._arming.reset("the handshake was refused")
+            self._events.append(f"handshake refused: {self._handshake.refusal}")
+
+    def _take_status(self, decoded: Decoded, received_ns: int) -> RobotStatus:
+        values = decoded.values
+        names = {
+            signal: self._codec.choice_name("SYSTEM_STATE", signal, values[signal])
+            for signal in ("state", "fault", "estop_source", "stop_cause", "reject_reason")
+        }
+        status = RobotStatus(
+            t_ns=received_ns,
+            fault_code=int(values["fault"]),
+            session=int(values["session"]),
+            rejected_count=int(values["rejected_count"]),
+            **names,
+        )
+        before, self._status = self._status, status
+        if before is None or (before.state, before.fault) != (status.state, status.fault):
+            fault = f", fault {words.fault(status.fault)}" if status.fault_code else ""
+            came_from = before.state if before is not None else "unknown"
+            self._events.append(f"robot {came_from} -> {status.state}{fault}")
+        self._arming.take_status(status.state, status.session, status.stop_cause, status.reject_reason)
+        return status
+
+    def _take_session(self, decoded: Decoded, received_ns: int) -> None:
+        values = decoded.values
+        self._host_accepted = bool(values["host_accepted"])
+        bits = int(values["blockers"])
+        blockers = tuple(name for bit, name in self._blocker_bits.items() if bits & bit)
+        self._arming.take_session(int(values["challenge"]), int(values["session"]), blockers, received_ns)
+
+    def _take_time(self, decoded: Decoded, received_ns: int) -> None:
+        sent_ns = self._time_requests.pop(int(decoded.values["sequence"]), None)
+        if sent_ns is None:
+            return
+        if self._clock.add(sent_ns, received_ns, int(decoded.values["receive_time"])):
+            self._restart(received_ns, "the robot has restarted")
+            self._events.append("the robot has restarted: its clock was set back")
+
+    def _mind_trust(self, now_ns: int) -> None:
+        """Start afresh with a robot that has fallen silent, or whose sample times contradict its clock."""
+        refused = self._handshake.refusal is not None
+        known = refused or self._status is not None or self.capabilities is not None
+        if known and now_ns - self._last_heard_ns > (REFUSED_SILENCE_NS if refused else SILENCE_NS):
+            self._restart(now_ns, "the robot fell silent")
+            self._events.append("the robot fell silent: new handshake")
+        if self._telemetry.distrusts_clock:
+            self._clock.forget()
+            self._telemetry.restart()
+            self._events.append("sample times contradict the robot's clock: synchronising anew")
+
+    def _restart(self, now_ns: int, why: str) -> None:
+        self._handshake = self._new_handshake()
+        self._reception.reset()
+        self._transmission.forget()
+        self._arming.reset(why)
+        self._telemetry.restart()
+        self._clock.forget()
+        self._time_requests.clear()
+        self._status = None
+        self._host_accepted = False
+        self._told = None
+        self._foreign_told = False
+        self._last_heard_ns = self._now_ns = now_ns
+
+    def _new_handshake(self) -> Handshake:
+        return Handshake(PROTOCOL_MAJOR, PROTOCOL_MINOR, self._codec.dbc_hash)
+
+    def _handshake_detail(self) -> str:
+        missing = self._handshake.missing
+        if len(missing) == 3:
+            return "no answer from the robot; is it switched on, and does it use the same bit rate?"
+        if missing:
+            return f"waiting for the robot's {', '.join(missing)}"
+        if self._status is None:
+            return "waiting for the robot's SYSTEM_STATE"
+        return f"the robot is in {self._status.state}"
+
+
+def _check(command: WheelCommand) -> None:
+    speeds = (command.left_rad_s, command.right_rad_s)
+    if not all(math.isfinite(speed) for speed in speeds) or not command.valid_for_s >= SHORTEST_VALID_FOR_S:
+        raise ValueError(f"not a wheel command: {command}")
