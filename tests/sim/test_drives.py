@@ -62,6 +62,7 @@ def test_the_rich_drive_contains_what_tells_effects_apart(seed):
             assert np.all(sign * (wheels[:, 1] - wheels[:, 0]) > 0.5)
     phases = list(drive.phase)
     assert sum(a != "start" and b == "start" for a, b in itertools.pairwise(phases)) == 8
+    assert speeds(drive, "start").min() < -4.0 < 4.0 < speeds(drive, "start").max()
     assert phases.count("free") >= 30 * 50
     weave = speeds(drive, "fast steering")
     turns = np.sign(weave[:, 1] - weave[:, 0])
