@@ -90,13 +90,12 @@ class AttachmentRef:
 class Contents:
     """What a file holds.
 
-    `complete` is False when the index at the end is missing or unusable; then every chunk listed has been checked, and
-    the data ends at `whole_bytes`. `damage` says in words what was passed over.
+    `complete` is False when the index at the end is missing or unusable; then every chunk listed has been checked.
+    `damage` says in words what was passed over.
     """
 
     size: int
     complete: bool = False
-    whole_bytes: int = 0
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
     chunks: list[ChunkRef] = field(default_factory=list)
@@ -116,48 +115,43 @@ def read_contents(fd: int, name: str) -> Contents:
     try:
         return _indexed(fd, size)
     except DamagedError as damage:
-        contents = _scanned(fd, size)
-        if contents.whole_bytes == size:
+        contents, ended = _walked(fd, size)
+        if ended:
             contents.damage.append(f"the index at the end is unusable: {damage}")
         return contents
 
 
-def _scanned(fd: int, size: int) -> Contents:
-    """Contents from walking the file, with every chunk checked; after damage it goes on with the next whole chunk."""
+def _walked(fd: int, size: int) -> tuple[Contents, bool]:
+    """Contents from walking the file, with every chunk checked, and whether its data came to their end.
+
+    After damage it goes on with the next whole chunk.
+    """
     contents = Contents(size=size)
     offset = len(MAGIC)
-    while True:
-        contents.whole_bytes = offset
+    while offset < size:
         head = _read(fd, offset, _HEAD.size)
         opcode, length = _HEAD.unpack(head) if len(head) == _HEAD.size else (0, 0)
-        content = offset + _HEAD.size
+        follows = offset + _HEAD.size + length
         if opcode == Opcode.DATA_END:
-            contents.whole_bytes = size
-            return contents
-        follows = content + length
+            return contents, True
         trouble = ""
-        if not Opcode.HEADER <= opcode <= Opcode.DATA_END or follows > size:
+        if not Opcode.HEADER <= opcode <= Opcode.DATA_END:
             trouble = "no record"
+        elif follows > size:
+            trouble = "an unfinished record"
         else:
             try:
-                _take(fd, contents, opcode, content, length)
+                _take(fd, contents, opcode, offset + _HEAD.size, length)
             except DamagedError as damage:
                 trouble = str(damage)
         if trouble and (opcode not in _FRONT_MATTER or follows > size):
             # Of a damaged chunk the length is in doubt as well.
-            found = _next_chunk(fd, offset + 1, size)
-            if found is None:
-                contents.damage.append(_broken_end(size - offset))
-                return contents
-            follows = found
+            follows = _next_chunk(fd, offset + 1, size) or size
         if trouble:
             contents.damage.append(f"at byte {offset}: {trouble}; {follows - offset} bytes are lost")
         offset = follows
-
-
-def _broken_end(missing: int) -> str:
-    why = "the end is missing: the writer was killed or is still at work, or the file was cut"
-    return f"{why}; the last {missing} bytes are an unfinished record" if missing else why
+    contents.damage.append("the end is missing: the writer was killed or is still at work, or the file was cut")
+    return contents, False
 
 
 def _next_chunk(fd: int, start: int, size: int) -> int | None:
@@ -245,7 +239,7 @@ def _indexed(fd: int, size: int) -> Contents:
     summary = _content(fd, footer.summary_start, footer_at - footer.summary_start)
     if footer.summary_crc and zlib.crc32(summary + tail[: _FOOTER_BYTES - 4]) != footer.summary_crc:
         raise DamagedError("an index with a wrong checksum")
-    contents = Contents(size=size, complete=True, whole_bytes=size)
+    contents = Contents(size=size, complete=True)
     statistics: Statistics | None = None
     for opcode, start, end in _inner(summary):
         content = summary[start:end]

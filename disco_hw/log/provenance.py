@@ -16,21 +16,21 @@ DBC = "disco_robot.dbc"
 _MEDIA_TYPES = {".toml": "application/toml", ".json": "application/json"}
 
 
-def software_version() -> str:
+def version() -> str:
     """The package's version, with the commit when it runs from a checkout: "0.1.0+g1a2b3c4" or "...-dirty"."""
     try:
-        version = metadata.version("disco-hw")
+        package = metadata.version("disco-hw")
     except metadata.PackageNotFoundError:
-        version = "unknown"
+        package = "unknown"
     root = Path(__file__).parents[2]
     if not (root / ".git").exists():
-        return version
+        return package
     describe = ["git", "-C", str(root), "describe", "--always", "--dirty", "--exclude=*"]
     try:
         commit = subprocess.run(describe, capture_output=True, text=True, timeout=5.0, check=True).stdout.strip()
     except (OSError, subprocess.SubprocessError):
-        return version
-    return f"{version}+g{commit}"
+        return package
+    return f"{package}+g{commit}"
 
 
 def attachment(path: Path, name: str | None = None) -> Attachment:

@@ -1,0 +1,218 @@
+import io
+import os
+import struct
+
+import pytest
+import zstandard
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.opcode import Opcode
+from mcap.writer import CompressionType, Writer
+
+from disco_hw.log.container import MAGIC, DamagedError, messages, read_attachment, read_chunk, read_contents
+from disco_hw.log.errors import LogError
+from tests.log.samples import ATTACHMENTS, drive_ticks, log_bytes
+
+WHOLE = log_bytes(drive_ticks(120), flush_every=10)
+KILLED = log_bytes(drive_ticks(120), flush_every=10, finish=False)
+
+
+class Opened:
+    def __init__(self, data):
+        self.fd = os.memfd_create("log")
+        os.write(self.fd, data)
+
+    def __enter__(self):
+        return self.fd
+
+    def __exit__(self, *_):
+        os.close(self.fd)
+
+
+def contents_of(data):
+    with Opened(data) as fd:
+        return read_contents(fd, "x.mcap")
+
+
+def sequences(data):
+    """Numbers of the ticks that can be read."""
+    with Opened(data) as fd:
+        contents = read_contents(fd, "x.mcap")
+        return sorted({message.sequence for chunk in contents.chunks for message in messages(read_chunk(fd, chunk))})
+
+
+def test_a_complete_file_is_read_by_its_index():
+    contents = contents_of(WHOLE)
+    assert contents.complete
+    assert contents.damage == []
+    assert len(contents.chunks) == 12
+    assert sequences(WHOLE) == list(range(1, 121))
+
+
+def test_a_file_without_its_end_is_walked_and_says_so():
+    contents = contents_of(KILLED)
+    assert not contents.complete
+    assert len(contents.damage) == 1
+    assert "the end is missing" in contents.damage[0]
+    assert sequences(KILLED) == list(range(1, 121))
+
+
+def test_index_and_walk_agree():
+    indexed, walked = contents_of(WHOLE), contents_of(KILLED)
+    assert indexed.chunks == walked.chunks
+    assert indexed.counts == walked.counts
+    assert indexed.attachments == walked.attachments
+    assert indexed.metadata == walked.metadata
+    assert indexed.channels == walked.channels
+    assert indexed.schemas == walked.schemas
+
+
+@pytest.mark.parametrize("tenth", range(1, 10))
+def test_whatever_tenth_is_left_all_its_whole_chunks_are(tenth):
+    cut = len(WHOLE) * tenth // 10
+    whole_chunks = sum(chunk.offset + chunk.length <= cut for chunk in contents_of(WHOLE).chunks)
+    assert sequences(WHOLE[:cut]) == list(range(1, 10 * whole_chunks + 1))
+    assert not contents_of(WHOLE[:cut]).complete
+
+
+def test_cut_anywhere_it_reads_or_is_refused():
+    data = log_bytes(drive_ticks(3), attachments=())
+    for cut in [*range(40), *range(40, len(data) - 300, 61), *range(len(data) - 300, len(data))]:
+        try:
+            contents = contents_of(data[:cut])
+        except LogError:
+            assert cut < len(MAGIC)
+        else:
+            assert not contents.complete
+            assert contents.damage
+
+
+@pytest.mark.parametrize("data", [WHOLE, KILLED], ids=["indexed", "walked"])
+def test_a_damaged_chunk_costs_itself_only(data):
+    chunk = contents_of(WHOLE).chunks[4]
+    at = chunk.offset + chunk.length // 2
+    damaged = bytearray(data)
+    damaged[at] ^= 0x40
+    with Opened(damaged) as fd:
+        contents = read_contents(fd, "x")
+        readable = []
+        for found in contents.chunks:
+            try:
+                readable += [message.sequence for message in messages(read_chunk(fd, found))]
+            except DamagedError:
+                assert found == chunk
+    assert sorted(set(readable)) == [*range(1, 41), *range(51, 121)]
+    if not contents.complete:
+        assert any(f"byte {chunk.offset - 9}" in text and "are lost" in text for text in contents.damage)
+
+
+@pytest.mark.parametrize("length", [0, 5, 2**40, 2**64 - 1])
+def test_a_chunk_whose_length_is_wrong_costs_itself_only(length):
+    chunk = contents_of(WHOLE).chunks[4]
+    damaged = bytearray(KILLED)
+    damaged[chunk.offset - 8 : chunk.offset] = struct.pack("<Q", length)
+    assert sequences(damaged) == [*range(1, 41), *range(51, 121)]
+
+
+def test_a_hole_of_zeros_costs_what_it_covers_only():
+    chunks = contents_of(WHOLE).chunks
+    damaged = bytearray(KILLED)
+    start, end = chunks[3].offset + 20, chunks[6].offset - 30
+    damaged[start:end] = bytes(end - start)
+    assert sequences(damaged) == [*range(1, 31), *range(61, 121)]
+
+
+def test_an_unusable_index_is_walked_around():
+    damaged = bytearray(WHOLE)
+    damaged[-200] ^= 1
+    contents = contents_of(damaged)
+    assert "index at the end is unusable" in contents.damage[-1]
+    assert sequences(damaged) == list(range(1, 121))
+
+
+def test_a_damaged_attachment_is_left_out():
+    at = KILLED.index(ATTACHMENTS[0].data)
+    damaged = bytearray(KILLED)
+    damaged[at] ^= 1
+    contents = contents_of(damaged)
+    assert [kept.name for kept in contents.attachments] == [ATTACHMENTS[1].name]
+    assert "wrong checksum" in contents.damage[0]
+    assert sequences(damaged) == list(range(1, 121))
+    indexed = bytearray(WHOLE)
+    indexed[at] ^= 1
+    with Opened(indexed) as fd, pytest.raises(DamagedError, match="wrong checksum"):
+        read_attachment(fd, read_contents(fd, "x").attachments[0])
+
+
+def test_a_chunk_that_claims_to_be_enormous_is_not_unpacked():
+    body = zstandard.compress(bytes(2**20))
+    content = struct.pack("<QQQI", 0, 0, 2**40, 0) + b"\x04\0\0\0zstd" + struct.pack("<Q", len(body)) + body
+    record = bytes([Opcode.CHUNK]) + struct.pack("<Q", len(content)) + content
+    contents = contents_of(MAGIC + record)
+    assert contents.chunks == []
+    assert "claims" in contents.damage[0]
+
+
+def test_a_chunk_that_unpacks_to_more_than_it_says_is_refused():
+    body = zstandard.compress(bytes(2**28))
+    content = struct.pack("<QQQI", 0, 0, 100, 0) + b"\x04\0\0\0zstd" + struct.pack("<Q", len(body)) + body
+    record = bytes([Opcode.CHUNK]) + struct.pack("<Q", len(content)) + content
+    assert contents_of(MAGIC + record).chunks == []
+
+
+@pytest.mark.parametrize("data", [b"", b"hello", b"t_s,cmd\n", MAGIC[:-1], bytes(100)])
+def test_what_is_no_mcap_file_is_refused_in_one_line(data):
+    with pytest.raises(LogError) as refused:
+        contents_of(data)
+    assert str(refused.value).startswith("x.mcap: ")
+    assert "\n" not in str(refused.value)
+
+
+def test_the_files_of_other_writers_are_read():
+    for compression in (CompressionType.ZSTD, CompressionType.NONE):
+        sink = io.BytesIO()
+        writer = Writer(sink, chunk_size=1000, compression=compression)
+        writer.start()
+        channel = writer.register_channel("/other", "json", writer.register_schema("x", "jsonschema", b"{}"))
+        for k in range(100):
+            writer.add_message(channel, k, b"{}" * 20, k, k)
+        writer.finish()
+        assert sequences(sink.getvalue()) == list(range(100))
+
+
+def read_all(data):
+    with Opened(data) as fd:
+        contents = read_contents(fd, "x")
+        for chunk in contents.chunks:
+            try:
+                for _ in messages(read_chunk(fd, chunk)):
+                    pass
+            except DamagedError:
+                assert contents.complete
+        for attachment in contents.attachments:
+            try:
+                read_attachment(fd, attachment)
+            except DamagedError:
+                assert contents.complete
+
+
+SMALL = log_bytes(drive_ticks(20), flush_every=5)
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.lists(st.tuples(st.integers(0, len(SMALL) - 1), st.binary(min_size=1, max_size=9)), min_size=1, max_size=4))
+def test_no_corruption_gets_more_than_one_error_out_of_it(changes):
+    data = bytearray(SMALL)
+    for at, new in changes:
+        data[at : at + len(new)] = new
+    try:
+        read_all(data)
+    except LogError:
+        assert data[:8] != MAGIC
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.lists(st.tuples(st.integers(0, 20), st.integers(0, 2**64 - 1) | st.integers(0, 80), st.binary(max_size=80))))
+def test_no_made_up_records_get_anything_out_of_it(records):
+    read_all(MAGIC + b"".join(bytes([op]) + struct.pack("<Q", length) + content for op, length, content in records))
+    read_all(MAGIC + b"".join(bytes([op]) + struct.pack("<Q", len(body)) + body for op, _, body in records))

@@ -1,0 +1,63 @@
+import math
+import typing
+
+import pytest
+
+from disco_hw.log.foxglove import VIEWS, views
+from disco_hw.log.records import Command, Estimate, Event, Level, Plan
+from drivers.types import PoseSample
+
+WALL_NS = 1_700_000_000_123_456_789
+CLASSES = dict(VIEWS)
+
+
+def shown(record):
+    found = {}
+    for topic, data in views(record, WALL_NS):
+        found[topic] = CLASSES[topic]()
+        found[topic].ParseFromString(data)
+    return found
+
+
+def estimate(x_m=1.0, y_m=2.0, yaw_rad=0.5):
+    return Estimate(1, x_m, y_m, yaw_rad, (0.0,) * 9, 0.0, 0.0, 0.0, 0.0)
+
+
+def test_an_estimate_is_a_pose_and_a_transform_at_wall_time():
+    found = shown(estimate())
+    pose, transform = found["/view/estimate"], found["/view/transform"]
+    assert (pose.timestamp.seconds, pose.timestamp.nanos) == (1_700_000_000, 123_456_789)
+    assert (pose.frame_id, transform.parent_frame_id, transform.child_frame_id) == ("world", "world", "robot")
+    assert (pose.pose.position.x, pose.pose.position.y, pose.pose.position.z) == (1.0, 2.0, 0.0)
+    assert (transform.translation.x, transform.translation.y) == (1.0, 2.0)
+    for rotation in (pose.pose.orientation, transform.rotation):
+        assert 2.0 * math.atan2(rotation.z, rotation.w) == pytest.approx(0.5)
+        assert (rotation.x, rotation.y) == (0.0, 0.0)
+
+
+def test_a_measured_pose_and_a_plan_are_poses():
+    found = shown(PoseSample(1, 2, 3.0, 4.0, -1.0, 0.01, 0.02)) | shown(
+        Plan(1, 1, 0.1, (), (), path_x_m=(0.0, 1.0), path_y_m=(2.0, 3.0), path_yaw_rad=(0.0, 0.5))
+    )
+    measured, plan = found["/view/measured_pose"], found["/view/plan"]
+    assert (measured.pose.position.x, measured.pose.position.y) == (3.0, 4.0)
+    assert [(pose.position.x, pose.position.y) for pose in plan.poses] == [(0.0, 2.0), (1.0, 3.0)]
+
+
+@pytest.mark.parametrize("level", typing.get_args(Level))
+def test_every_level_of_an_event_has_its_own(level):
+    log = shown(Event(1, level, "bus-off", "the bus is off"))["/view/log"]
+    assert CLASSES["/view/log"].Level.Name(log.level) == level.upper()
+    assert (log.name, log.message) == ("bus-off", "the bus is off")
+
+
+@pytest.mark.parametrize("broken", [math.nan, math.inf, -math.inf])
+def test_a_broken_estimate_is_shown_as_broken(broken):
+    pose = shown(estimate(x_m=broken, yaw_rad=broken))["/view/estimate"].pose
+    assert not math.isfinite(pose.position.x)
+    assert math.isnan(pose.orientation.w)
+
+
+def test_nothing_is_shown_of_a_plan_without_path_or_a_command():
+    assert views(Plan(1, 1, 0.1, (1.0,), (1.0,)), WALL_NS) == []
+    assert views(Command(1, 0.0, 0.0, 0.0, 0.0, 0.1, True), WALL_NS) == []

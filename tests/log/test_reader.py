@@ -1,0 +1,177 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from disco_hw.log.errors import LogError
+from disco_hw.log.reader import Gap, open_log
+from disco_hw.log.records import Counters, Estimate, Event, Innovation, Plan
+from tests.log.samples import (
+    ANY_RECORD,
+    ATTACHMENTS,
+    PERIOD_NS,
+    ROBOT_TOML,
+    WALL_OFFSET_NS,
+    bits,
+    drive_ticks,
+    log_bytes,
+    tick,
+    write_log,
+)
+
+
+@pytest.fixture
+def log_file(tmp_path):
+    return write_log(tmp_path / "run.mcap", drive_ticks(200), flush_every=20)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.lists(st.lists(ANY_RECORD, min_size=1, max_size=5), min_size=1, max_size=5))
+def test_ticks_come_back_to_the_last_bit_in_order(tmp_path_factory, ticks):
+    path = tmp_path_factory.mktemp("log") / "any.mcap"
+    write_log(path, [(10 * number, records) for number, records in enumerate(ticks, start=1)])
+    with open_log(path) as log:
+        entries = list(log.records())
+    expected = [(10 * number, number, record) for number, records in enumerate(ticks, start=1) for record in records]
+    assert bits([(entry.now_ns, entry.tick, entry.record) for entry in entries]) == bits(expected)
+
+
+def test_records_by_topic_and_time(log_file):
+    with open_log(log_file) as log:
+        entries = list(log.records(("/estimate", "/plan"), start_ns=50 * PERIOD_NS, end_ns=60 * PERIOD_NS))
+        assert {type(entry.record) for entry in entries} == {Estimate, Plan}
+        assert [entry.tick for entry in entries] == [k for k in range(50, 60) for _ in range(2)]
+        assert list(log.records(("/motor",))) == []
+        assert list(log.records((), 0, 10**12)) == []
+        assert log.counts["/pose"] == 40
+        assert "/motor" not in log.counts
+
+
+def test_a_topic_that_no_log_has_is_refused(log_file):
+    with open_log(log_file) as log, pytest.raises(LogError, match="no such topic"):
+        list(log.records(("/wheel",)))
+
+
+def test_columns_of_numbers_tuples_and_mappings(log_file):
+    with open_log(log_file) as log:
+        estimate = log.columns("/estimate")
+        assert estimate["covariance"].shape == (200, 9)
+        assert np.array_equal(estimate["x_m"], [0.002 * k for k in range(1, 201)])
+        assert np.array_equal(estimate["now_ns"], PERIOD_NS * np.arange(1, 201))
+        assert np.array_equal(log.columns("/loop")["stages_ns.plan"], np.full(200, 3_000_000))
+        assert log.columns("/command", 0, 10 * PERIOD_NS)["limits"].tolist() == [("acceleration",)] * 9
+
+
+def test_attachments_and_metadata(log_file):
+    with open_log(log_file) as log:
+        assert log.attachment_names() == tuple(kept.name for kept in ATTACHMENTS)
+        assert log.attachment("robot.toml") == ROBOT_TOML
+        assert (log.metadata.robot, log.metadata.wall_offset_ns) == ("wombot", WALL_OFFSET_NS)
+        with pytest.raises(LogError, match=r"holds no model\.toml"):
+            log.attachment("model.toml")
+
+
+def test_the_summary_counts_what_was_dropped_on_the_way(tmp_path):
+    path = tmp_path / "gaps.mcap"
+    ticks = drive_ticks(100)
+    write_log(path, ticks)
+    with open_log(path) as log:
+        assert log.summary().missing_ticks == 0
+        assert log.gaps() == ()
+    path.unlink()
+    write_log(path, [entry for entry in ticks if entry[0] // PERIOD_NS not in (1, 2, 50)], numbers=True)
+    with open_log(path) as log:
+        summary = log.summary()
+        assert log.gaps() == (Gap(3 * PERIOD_NS, 2), Gap(51 * PERIOD_NS, 1))
+    assert (summary.ticks, summary.missing_ticks) == (97, 3)
+    assert summary.duration_s == pytest.approx(97 * PERIOD_NS * 1e-9)
+    assert summary.topics["/wheels"].count == 97
+    assert summary.topics["/wheels"].rate_hz == pytest.approx(50.0, rel=0.02)
+    assert summary.attachments == {kept.name: len(kept.data) for kept in ATTACHMENTS}
+    assert summary.start.startswith("2023-11-14T22:13:20")
+
+
+@pytest.mark.parametrize("tenth", range(1, 10))
+def test_cut_at_every_tenth_the_log_reads_and_says_what_is_lost(tmp_path, tenth):
+    whole = log_bytes(drive_ticks(300), flush_every=10)
+    path = tmp_path / "cut.mcap"
+    path.write_bytes(whole[: len(whole) * tenth // 10])
+    with open_log(path) as log:
+        ticks = [entry.tick for entry in log.records(("/wheels",))]
+        summary = log.summary()
+    assert ticks == list(range(1, len(ticks) + 1))
+    assert len(ticks) >= 300 * tenth // 10 - 60
+    assert not summary.complete
+    assert any(words in summary.damage[-1] for words in ("the end is missing", "the index at the end is unusable"))
+
+
+def test_a_damaged_chunk_of_a_complete_log_is_an_error_with_the_remedy(tmp_path):
+    whole = bytearray(log_bytes(drive_ticks(300)))
+    whole[len(whole) // 2] ^= 1
+    path = tmp_path / "bad.mcap"
+    path.write_bytes(whole)
+    with open_log(path) as log, pytest.raises(LogError, match=r"log recover") as refused:
+        list(log.records())
+    assert str(refused.value).count("\n") == 0
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"", "empty file"),
+        (b"t_s,cmd_left_rad_s\n", "not an MCAP file"),
+        (b"\x89MCAP0\r\n", "nothing of the log is left"),
+    ],
+)
+def test_what_is_no_log_is_refused_in_one_line(tmp_path, content, words):
+    path = tmp_path / "x.mcap"
+    path.write_bytes(content)
+    with pytest.raises(LogError, match=words):
+        open_log(path)
+
+
+def test_a_missing_file_a_directory_and_a_foreign_log_are_refused(tmp_path):
+    with pytest.raises(LogError, match="cannot be opened"):
+        open_log(tmp_path / "none.mcap")
+    with pytest.raises(LogError, match="cannot be"):
+        open_log(tmp_path)
+    foreign = tmp_path / "foreign.mcap"
+    foreign.write_bytes(log_bytes(drive_ticks(3)).replace(b"disco-hw", b"other-hw"))
+    with pytest.raises(LogError, match="not a log of disco-hw"):
+        open_log(foreign)
+
+
+def test_an_empty_log_reads_as_empty(tmp_path):
+    with open_log(write_log(tmp_path / "e.mcap", [])) as log:
+        assert list(log.records()) == []
+        assert log.columns("/estimate")["x_m"].size == 0
+        assert log.summary().duration_s == 0.0
+
+
+def test_an_open_log_is_closed_twice_without_harm(log_file):
+    log = open_log(log_file)
+    log.close()
+    log.close()
+
+
+def test_records_of_every_kind_of_column(tmp_path):
+    ticks = [
+        (1, [Innovation(1, (1.0, 2.0), (0.1, 0.2), 0.5, True), Counters(1, loop={"a": 1}), Event(1, "info", "a", "b")]),
+        (2, [Innovation(2, (), (), float("nan"), False, "gate"), Counters(2, loop={"b": 2})]),
+    ]
+    with open_log(write_log(tmp_path / "c.mcap", ticks)) as log:
+        innovation = log.columns("/estimate/innovation")
+        assert [value.tolist() for value in innovation["innovation"]] == [[1.0, 2.0], []]
+        assert innovation["accepted"].tolist() == [True, False]
+        assert np.isnan(innovation["test_ratio"][1])
+        counters = log.columns("/counters")
+        assert bits(counters["loop.a"].tolist()) == bits([1.0, float("nan")])
+        assert log.columns("/event")["text"].tolist() == ["b"]
+
+
+def test_a_log_still_being_written_reads_as_far_as_it_goes(tmp_path):
+    path = tmp_path / "live.mcap"
+    path.write_bytes(log_bytes([(1, tick(1)), (2, tick(2))], finish=False))
+    with open_log(path) as log:
+        assert [entry.tick for entry in log.records(("/loop",))] == [1, 2]
+        assert not log.complete

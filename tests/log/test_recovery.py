@@ -1,0 +1,80 @@
+import io
+
+import pytest
+from mcap.reader import make_reader
+
+from disco_hw.log.errors import LogError
+from disco_hw.log.reader import open_log
+from disco_hw.log.recovery import recover
+from tests.log.samples import ATTACHMENTS, bits, drive_ticks, log_bytes
+
+WHOLE = log_bytes(drive_ticks(300), flush_every=10)
+
+
+def entries(path):
+    with open_log(path) as log:
+        return [(entry.topic, entry.now_ns, entry.tick, bits(entry.record)) for entry in log.records()]
+
+
+@pytest.mark.parametrize("tenth", range(1, 11))
+def test_every_whole_chunk_comes_over_and_the_loss_is_named(tmp_path, tenth):
+    source, target = tmp_path / "cut.mcap", tmp_path / "mended.mcap"
+    source.write_bytes(WHOLE[: len(WHOLE) * tenth // 10])
+    recovered = recover(source, target)
+    assert entries(target) == entries(source)
+    assert recovered.chunks * 10 == len({tick for _, _, tick, _ in entries(target)})
+    assert recovered.attachments == len(ATTACHMENTS)
+    assert bool(recovered.lost) == (tenth < 10)
+    with open_log(source) as damaged, open_log(target) as mended:
+        assert mended.complete
+        assert mended.damage == damaged.damage == recovered.lost
+        assert mended.metadata == damaged.metadata
+        assert mended.attachment("robot.toml") == damaged.attachment("robot.toml")
+
+
+def test_a_recovered_log_is_whole_for_other_readers_too(tmp_path):
+    source, target = tmp_path / "cut.mcap", tmp_path / "mended.mcap"
+    source.write_bytes(WHOLE[: len(WHOLE) // 2])
+    recovered = recover(source, target)
+    reader = make_reader(io.BytesIO(target.read_bytes()), validate_crcs=True)
+    messages = list(reader.iter_messages())
+    assert len(messages) == recovered.messages == reader.get_summary().statistics.message_count
+    assert all(schema is not None for schema, _, _ in messages)
+
+
+def test_damage_inside_a_complete_log_costs_the_chunk(tmp_path):
+    source, target = tmp_path / "bad.mcap", tmp_path / "mended.mcap"
+    damaged = bytearray(WHOLE)
+    damaged[len(WHOLE) // 2] ^= 1
+    source.write_bytes(damaged)
+    recovered = recover(source, target)
+    assert len(recovered.lost) == 1
+    assert len({tick for _, _, tick, _ in entries(target)}) == 290
+    with open_log(target) as log:
+        assert log.summary().missing_ticks == 10
+
+
+def test_the_source_is_not_touched_and_nothing_is_overwritten(tmp_path):
+    source = tmp_path / "cut.mcap"
+    source.write_bytes(WHOLE[:20_000])
+    with pytest.raises(LogError, match="already exists"):
+        recover(source, source)
+    assert source.read_bytes() == WHOLE[:20_000]
+
+
+@pytest.mark.parametrize("content", [b"", b"no log"])
+def test_what_is_no_log_leaves_no_target_behind(tmp_path, content):
+    source, target = tmp_path / "x", tmp_path / "y"
+    source.write_bytes(content)
+    with pytest.raises(LogError):
+        recover(source, target)
+    assert not target.exists()
+
+
+def test_places_that_cannot_be_read_or_written_are_named(tmp_path):
+    with pytest.raises(LogError, match="cannot be opened"):
+        recover(tmp_path / "none", tmp_path / "y")
+    source = tmp_path / "cut.mcap"
+    source.write_bytes(WHOLE)
+    with pytest.raises(LogError, match="No such file"):
+        recover(source, tmp_path / "no directory" / "y")
