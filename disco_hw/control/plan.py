@@ -1,0 +1,88 @@
+"""What the planner takes and gives: the state it starts from and a plan as a function of time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+class NoValidControl(Exception):  # noqa: N818
+    """No command sequence with a finite cost was found, after every retry; the message says what was tried."""
+
+
+@dataclass(frozen=True, slots=True)
+class SentCommand:
+    """Wheel speeds (rad/s) commanded from `t_ns` on."""
+
+    t_ns: int
+    left_rad_s: float
+    right_rad_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class PlannerState:
+    """Pose in the world frame and measured wheel speeds at `t_ns`, and the commands sent up to now, oldest first."""
+
+    t_ns: int
+    x_m: float
+    y_m: float
+    yaw_rad: float
+    left_speed_rad_s: float
+    right_speed_rad_s: float
+    sent: tuple[SentCommand, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Diagnostics:
+    """How the optimisation went.
+
+    `ess` effective sample size; `temperature`; `cost_min`, `cost_mean` of the samples and `cost_nominal` of the
+    sequence they vary; `retries` made; `valid_samples` with a finite cost.
+    """
+
+    ess: float
+    temperature: float
+    cost_min: float
+    cost_mean: float
+    cost_nominal: float
+    retries: int
+    valid_samples: int
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Plan:
+    """Wheel speeds from `t0_ns` on, as a function of time.
+
+    `wheel_speeds` (T, 2) rad/s, left and right: the mean over each step of `step_s`. `trajectory` (T + 1, 3): the pose
+    x, y, yaw that the model predicts at the steps' ends, from the pose at `t0_ns`.
+    """
+
+    t0_ns: int
+    step_s: float
+    wheel_speeds: Array
+    trajectory: Array
+    diagnostics: Diagnostics
+
+    def at(self, t_ns: int) -> tuple[float, float]:
+        """Wheel speeds (left, right) at a time: linear between the middles of the steps, constant beyond the ends."""
+        position = (t_ns - self.t0_ns) * 1e-9 / self.step_s - 0.5
+        last = self.wheel_speeds.shape[0] - 1
+        index = min(max(int(position), 0), max(last - 1, 0))
+        fraction = min(max(position - index, 0.0), 1.0)
+        (left, right), (left_next, right_next) = self.wheel_speeds[index], self.wheel_speeds[min(index + 1, last)]
+        return (
+            float(left + fraction * (left_next - left)),
+            float(right + fraction * (right_next - right)),
+        )
+
+    def age_s(self, now_ns: int) -> float:
+        """Seconds since the plan's start; negative before it."""
+        return (now_ns - self.t0_ns) * 1e-9
+
+    def expired(self, now_ns: int) -> bool:
+        """Whether the plan's horizon is over."""
+        return bool(self.age_s(now_ns) > self.step_s * len(self.wheel_speeds))

@@ -1,0 +1,127 @@
+"""Counter-based random numbers: every normal deviate is a pure function of (seed, step, sample, index).
+
+Philox 4x32-10 (Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC 2011) gives the bits, Box-Muller the
+normal deviates. There is no state to save: a plan can be drawn again bit for bit from its seed and step number.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from disco_hw.control.blocks import BLOCK, PAIR, U
+from disco_hw.model.jit import (
+    bits_of_float,
+    block_function,
+    float32,
+    float_from_bits,
+    int32,
+    prefer_wide_vectors,
+    scalar_function,
+    uint32,
+)
+
+_M0, _M1 = np.uint64(0xD2511F53), np.uint64(0xCD9E8D57)
+_W0, _W1 = np.uint32(0x9E3779B9), np.uint32(0xBB67AE85)
+_LOW = np.uint64(0xFFFFFFFF)
+_SHIFT = np.uint64(32)
+
+_LN2 = np.float32(math.log(2.0))
+_SQRT_HALF_BITS = np.int32(0x3F3504F3)
+_MANTISSA_BITS = np.int32(23)
+_PI = np.float32(math.pi)
+_TO_UNIT = np.float32(2.0**-24)
+_TO_HALF_TURNS = np.float32(2.0**-31)
+
+
+@scalar_function
+def philox(c0: Any, c1: Any, c2: Any, c3: Any, k0: Any, k1: Any) -> Any:
+    """Philox 4x32-10: four uniform uint32 from a counter of four and a key of two uint32."""
+    for _ in range(10):
+        product0 = _M0 * np.uint64(c0)
+        product1 = _M1 * np.uint64(c2)
+        c0, c1, c2, c3 = (
+            uint32(product1 >> _SHIFT) ^ c1 ^ k0,
+            uint32(product1 & _LOW),
+            uint32(product0 >> _SHIFT) ^ c3 ^ k1,
+            uint32(product0 & _LOW),
+        )
+        k0 = uint32(k0 + _W0)
+        k1 = uint32(k1 + _W1)
+    return c0, c1, c2, c3
+
+
+@scalar_function
+def natural_log(value: Any) -> Any:
+    """Logarithm of a positive normal float32, relative error below 2e-7; branch-free, so that it vectorises."""
+    bits = bits_of_float(value)
+    # Exponent such that the mantissa lies in [sqrt(1/2), sqrt(2)).
+    shifted = int32(bits - _SQRT_HALF_BITS)
+    exponent = int32(shifted >> _MANTISSA_BITS)
+    mantissa = float_from_bits(int32(bits - int32(exponent << _MANTISSA_BITS)))
+    # ln m = 2 artanh(s) with s = (m - 1) / (m + 1), |s| < 0.172.
+    s = (mantissa - float32(1.0)) / (mantissa + float32(1.0))
+    q = s * s
+    series = float32(2 / 3) + q * (float32(2 / 5) + q * (float32(2 / 7) + q * float32(2 / 9)))
+    return float32(exponent) * _LN2 + s * (float32(2.0) + q * series)
+
+
+@scalar_function
+def cos_sin_half_turns(half_turns: float) -> Any:
+    """Cosine and sine of pi * half_turns for half_turns in [-1, 1), absolute error below 3e-7."""
+    # Polynomials in the half angle, which stays within a quarter turn, then doubled.
+    angle = half_turns * (_PI * float32(0.5))
+    q = angle * angle
+    sine = angle * (
+        float32(1.0)
+        + q
+        * (
+            float32(-1 / 6)
+            + q * (float32(1 / 120) + q * (float32(-1 / 5040) + q * (float32(1 / 362880) - q * float32(1 / 39916800))))
+        )
+    )
+    cosine = float32(1.0) + q * (
+        float32(-1 / 2)
+        + q
+        * (
+            float32(1 / 24)
+            + q
+            * (float32(-1 / 720) + q * (float32(1 / 40320) + q * (float32(-1 / 3628800) + q * float32(1 / 479001600))))
+        )
+    )
+    return float32(1.0) - float32(2.0) * sine * sine, float32(2.0) * sine * cosine
+
+
+@scalar_function
+def box_muller(bits0: Any, bits1: Any) -> Any:
+    """Two independent standard normal deviates (float32) from two uniform uint32; magnitude at most 5.8."""
+    # 24 bits are exact in float32; the offset keeps zero out of the logarithm.
+    uniform = (float32(int32(bits0 >> np.uint32(8))) + float32(0.5)) * _TO_UNIT
+    radius = math.sqrt(float32(-2.0) * natural_log(uniform))
+    cosine, sine = cos_sin_half_turns(float32(int32(bits1)) * _TO_HALF_TURNS)
+    return radius * cosine, radius * sine
+
+
+@block_function
+def fill_normal_block(knots: Any, rows: int, block: int, step: int, seed: int, scale: float) -> None:
+    """Fill block `block` of `knots` (blocks, rows, 2, BLOCK) float32, flat, with normal deviates; `rows` is even.
+
+    `scale` is their standard deviation. A deviate depends on nothing but (seed, step, sample, row).
+    """
+    prefer_wide_vectors()
+    k0, k1 = uint32(seed & 0xFFFFFFFF), uint32((seed >> 32) & 0xFFFFFFFF)
+    c2, c3 = uint32(step & 0xFFFFFFFF), uint32((step >> 32) & 0xFFFFFFFF)
+    first = U(block) * BLOCK
+    at = U(block * rows) * PAIR
+    for pair in range(rows // 2):
+        for b in range(BLOCK):
+            b0, b1, b2, b3 = philox(uint32(first + b), uint32(pair), c2, c3, k0, k1)
+            n0, n1 = box_muller(b0, b1)
+            n2, n3 = box_muller(b2, b3)
+            knots[at + b] = n0 * scale
+            knots[at + BLOCK + b] = n1 * scale
+            knots[at + PAIR + b] = n2 * scale
+            knots[at + PAIR + BLOCK + b] = n3 * scale
+        at += U(2) * PAIR

@@ -1,0 +1,113 @@
+"""How functions are compiled: one set of options, constants of the caller's precision, a cache key of all sources."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from types import CellType, FunctionType
+from typing import Any
+
+import numpy as np
+from llvmlite import ir  # type: ignore[import-untyped]
+from numba import njit, types
+from numba.extending import intrinsic, overload
+
+# No `nnan`, `ninf` (non-finite costs must stay visible) and no `reassoc` (sums keep their order, so a run replays).
+FAST_MATH = {"contract", "nsz", "arcp"}
+
+INLINED: dict[str, Any] = {"fastmath": FAST_MATH, "error_model": "numpy", "forceinline": True}
+
+scalar_function: Callable[..., Any] = njit(**INLINED)
+_intrinsic: Any = intrinsic
+
+# A function with loops of its own, too large to be worth a copy in every caller.
+block_function: Callable[..., Any] = njit(fastmath=FAST_MATH, error_model="numpy")
+
+# The compiler's scalar types, as casts.
+int32: Any = types.int32
+uint32: Any = types.uint32
+float32: Any = types.float32
+
+
+def specialise(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Register compiled forms of `function`, chosen by the types of its arguments."""
+    options: Any = INLINED
+    decorator: Callable[..., Any] = overload(function, jit_options=options, strict=False)
+    return decorator
+
+
+@cache
+def sources_fingerprint() -> str:
+    """Hash of all Python sources that compiled code can come from."""
+    package = Path(__file__).parents[1]
+    digest = hashlib.sha256()
+    for folder in ("model", "control"):
+        for path in sorted((package / folder).rglob("*.py")):
+            digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+def kernel_function(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Compile an entry point: as `scalar_function`, but a function of its own, kept on disk between runs.
+
+    numba's cache looks at the entry point's own file only; here it is tied to all sources, through a free variable that
+    the function never reads, because free variables are part of numba's key.
+    """
+    assert isinstance(function, FunctionType)
+    code = function.__code__.replace(co_freevars=("sources",))
+    keyed = FunctionType(code, function.__globals__, function.__name__, None, (CellType(sources_fingerprint()),))
+    keyed.__qualname__, keyed.__module__, keyed.__doc__ = function.__qualname__, function.__module__, function.__doc__
+    compiled: Callable[..., Any] = njit(cache=True, fastmath=FAST_MATH, error_model="numpy")(keyed)
+    return compiled
+
+
+@_intrinsic
+def prefer_wide_vectors(_context: Any) -> tuple[Any, Callable[..., Any]]:
+    """Let the loops of the calling function use 512-bit vectors where the processor has them.
+
+    LLVM holds back to 256 bits on the processors whose early kinds slowed down for the wide ones. Here every loop is
+    long enough to gain.
+    """
+
+    def generate(context: Any, builder: Any, _signature: Any, _arguments: Any) -> Any:
+        # llvmlite knows no attributes with values; the set takes them all the same.
+        set.add(builder.function.attributes, '"prefer-vector-width"="512"')
+        return context.get_dummy_value()
+
+    return types.void(), generate
+
+
+@_intrinsic
+def float_from_bits(_context: Any, _bits: Any) -> tuple[Any, Callable[..., Any]]:
+    """Reinterpret int32 bits as a float32."""
+
+    def generate(_c: Any, builder: Any, _s: Any, arguments: Any) -> Any:
+        return builder.bitcast(arguments[0], ir.FloatType())
+
+    return types.float32(types.int32), generate
+
+
+@_intrinsic
+def bits_of_float(_context: Any, _value: Any) -> tuple[Any, Callable[..., Any]]:
+    """Reinterpret a float32 as its int32 bits."""
+
+    def generate(_c: Any, builder: Any, _s: Any, arguments: Any) -> Any:
+        return builder.bitcast(arguments[0], ir.IntType(32))
+
+    return types.int32(types.float32), generate
+
+
+def cast_like(value: float, like: float) -> Any:
+    """Return `value` in the floating-point type of `like`; in compiled code it costs nothing.
+
+    A literal is float64 to the compiler and would pull single-precision arithmetic up with it.
+    """
+    return np.asarray(like).dtype.type(value)
+
+
+@specialise(cast_like)
+def _cast_like(value: Any, like: Any) -> Callable[..., Any]:
+    target = like if isinstance(like, types.Float) else float32
+    return lambda value, like: target(value)
