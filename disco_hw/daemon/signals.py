@@ -5,17 +5,22 @@ from __future__ import annotations
 import signal
 from collections.abc import Sequence
 from types import FrameType, TracebackType
+from typing import Any
 
 # A terminal that closes must not end the process before it has stopped the wheels, hence SIGHUP.
 STOP_SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 
 
 class StopSignals:
-    """Catches the signals while entered, in the main thread; the former handlers come back on exit."""
+    """Catches the signals while entered, in the main thread; the former handlers come back on exit.
+
+    To be entered around the stop path too: the second signal of somebody impatient must not break it off. A signal
+    that is ignored already stays ignored, as by nohup.
+    """
 
     def __init__(self, signals: Sequence[signal.Signals] = STOP_SIGNALS) -> None:
         self._signals = tuple(signals)
-        self._former: dict[signal.Signals, object] = {}
+        self._former: dict[signal.Signals, Any] = {}
         self._received: signal.Signals | None = None
 
     @property
@@ -25,15 +30,16 @@ class StopSignals:
 
     def __enter__(self) -> StopSignals:
         for number in self._signals:
-            self._former[number] = signal.signal(number, self._note)
+            if signal.getsignal(number) is not signal.SIG_IGN:
+                self._former[number] = signal.signal(number, self._note)
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         for number, handler in self._former.items():
-            # A handler that was not set from Python is given as None; the default is the nearest to it.
-            signal.signal(number, handler if callable(handler) or isinstance(handler, int) else signal.SIG_DFL)
+            # A handler that was not set from Python is known as None only and cannot be put back.
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)
         self._former.clear()
 
     def _note(self, number: int, _frame: FrameType | None) -> None:

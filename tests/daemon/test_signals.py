@@ -1,0 +1,79 @@
+import os
+import signal
+import subprocess
+import sys
+
+import pytest
+
+from disco_hw.daemon.signals import STOP_SIGNALS, StopSignals
+
+DAEMON = """
+import time
+from disco_hw.daemon.clock import MonotonicClock
+from disco_hw.daemon.loop import Loop
+from disco_hw.daemon.signals import StopSignals
+from disco_hw.daemon.stop_path import StopPath
+
+def stop_wheels():
+    print("stopping", flush=True)
+    time.sleep(0.3)
+    print("wheels stand", flush=True)
+
+path = StopPath()
+path.add("log", lambda: print("log closed", flush=True))
+path.add("wheels", stop_wheels)
+loop = Loop(MonotonicClock(), 50.0)
+def tick(now_ns):
+    if loop.stats.ticks == 0:
+        print("running", flush=True)
+with StopSignals() as signals:
+    loop.run(tick, lambda: signals.received is not None)
+    path.run()
+print(signals.received.name, flush=True)
+"""
+
+
+def start():
+    process = subprocess.Popen([sys.executable, "-c", DAEMON], stdout=subprocess.PIPE, text=True)
+    assert process.stdout.readline() == "running\n"
+    return process
+
+
+@pytest.mark.parametrize("number", STOP_SIGNALS)
+def test_a_signal_stops_the_loop_and_the_stop_path_runs_in_order(number):
+    process = start()
+    process.send_signal(number)
+    output, _ = process.communicate(timeout=10)
+    assert output.splitlines() == ["stopping", "wheels stand", "log closed", number.name]
+    assert process.returncode == 0
+
+
+@pytest.mark.parametrize("second", STOP_SIGNALS)
+def test_a_second_signal_does_not_break_the_stop_path_off(second):
+    process = start()
+    process.send_signal(signal.SIGTERM)
+    assert process.stdout.readline() == "stopping\n"
+    process.send_signal(second)
+    output, _ = process.communicate(timeout=10)
+    assert output.splitlines() == ["wheels stand", "log closed", "SIGTERM"]
+    assert process.returncode == 0
+
+
+def test_the_former_handlers_come_back():
+    before = [signal.getsignal(number) for number in STOP_SIGNALS]
+    with StopSignals() as signals:
+        assert [signal.getsignal(number) for number in STOP_SIGNALS] != before
+        os.kill(os.getpid(), signal.SIGTERM)
+    assert signals.received is signal.SIGTERM
+    assert [signal.getsignal(number) for number in STOP_SIGNALS] == before
+
+
+def test_an_ignored_signal_stays_ignored():
+    former = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with StopSignals() as signals:
+            os.kill(os.getpid(), signal.SIGHUP)
+            assert signals.received is None
+        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, former)

@@ -1,0 +1,131 @@
+import os
+import socket
+import subprocess
+import sys
+from importlib.resources import files
+
+import pytest
+
+from disco_hw.daemon.systemd import Notifier
+
+UNIT = files("disco_hw") / "daemon" / "systemd" / "disco-hw@.service"
+SECOND_NS = 1_000_000_000
+
+
+@pytest.fixture(params=["path", "abstract"])
+def manager(request, tmp_path):
+    """A service manager's end: a real datagram socket and the environment that names it."""
+    name = str(tmp_path / "notify") if request.param == "path" else f"@disco-hw-test-{os.getpid()}"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listener:
+        listener.bind(name.replace("@", "\0"))
+        listener.settimeout(5.0)
+        yield listener, {"NOTIFY_SOCKET": name}
+
+
+def received(listener):
+    listener.setblocking(False)
+    messages = []
+    try:
+        while True:
+            messages.append(listener.recv(4096).decode())
+    except BlockingIOError:
+        return messages
+
+
+def test_messages_arrive_over_path_and_abstract_sockets(manager):
+    listener, environment = manager
+    notifier = Notifier(environment)
+    notifier.ready()
+    notifier.status("ARMED:\nholding zero")
+    notifier.stopping()
+    assert received(listener) == ["READY=1", "STATUS=ARMED: holding zero", "STOPPING=1"]
+    assert notifier.unsent == 0
+    notifier.close()
+    notifier.close()
+    notifier.ready()
+    assert received(listener) == []
+
+
+def test_the_watchdog_is_fed_at_half_its_interval(manager):
+    listener, environment = manager
+    notifier = Notifier({**environment, "WATCHDOG_USEC": "1000000", "WATCHDOG_PID": str(os.getpid())})
+    fed_at_s = []
+    for tick in range(101):
+        notifier.watchdog(tick * SECOND_NS // 50)
+        if received(listener) == ["WATCHDOG=1"]:
+            fed_at_s.append(tick / 50)
+    assert fed_at_s == [0.0, 0.5, 1.0, 1.5, 2.0]
+    notifier.close()
+
+
+@pytest.mark.parametrize(
+    "variables",
+    [
+        {},
+        {"WATCHDOG_USEC": "1000000", "WATCHDOG_PID": "1"},
+        {"WATCHDOG_USEC": "0"},
+        {"WATCHDOG_USEC": "soon"},
+        {"WATCHDOG_USEC": "1000000", "WATCHDOG_PID": "me"},
+    ],
+)
+def test_no_watchdog_is_fed_that_is_off_or_another_process_s(manager, variables):
+    listener, environment = manager
+    notifier = Notifier({**environment, **variables})
+    notifier.watchdog(0)
+    assert received(listener) == []
+    notifier.close()
+
+
+@pytest.mark.parametrize("environment", [{}, {"NOTIFY_SOCKET": ""}, {"NOTIFY_SOCKET": "vsock:2:1"}])
+def test_without_a_service_manager_nothing_happens(environment):
+    notifier = Notifier(environment)
+    notifier.ready()
+    notifier.watchdog(0)
+    assert notifier.unsent == 0
+
+
+def test_a_manager_that_has_gone_or_does_not_read_is_counted_and_never_waited_for(tmp_path):
+    environment = {"NOTIFY_SOCKET": str(tmp_path / "notify")}
+    gone = Notifier(environment)
+    gone.ready()
+    assert gone.unsent == 1
+    gone.close()
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listener:
+        listener.bind(environment["NOTIFY_SOCKET"])
+        deaf = Notifier(environment)
+        for _ in range(2000):
+            deaf.status("x" * 500)
+        assert deaf.unsent > 0
+        deaf.close()
+
+
+def test_a_process_started_like_a_service_reports_ready(tmp_path):
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listener:
+        listener.bind(str(tmp_path / "notify"))
+        listener.settimeout(10.0)
+        script = "from disco_hw.daemon.systemd import Notifier\nNotifier().ready()"
+        environment = {**os.environ, "NOTIFY_SOCKET": str(tmp_path / "notify")}
+        subprocess.run([sys.executable, "-c", script], env=environment, check=True)
+        assert listener.recv(64) == b"READY=1"
+
+
+def settings():
+    lines = [line for line in UNIT.read_text(encoding="utf-8").splitlines() if "=" in line and line[0] != "#"]
+    return [tuple(line.split("=", 1)) for line in lines]
+
+
+def test_the_unit_restarts_watches_stops_and_does_not_arm():
+    unit = settings()
+    for expected in (
+        ("Type", "notify"),
+        ("WatchdogSec", "1"),
+        ("Restart", "on-failure"),
+        ("RestartPreventExitStatus", "2"),
+        ("ExecStart", "/opt/disco-hw/.venv/bin/disco-hw run /etc/disco-hw/%i.toml"),
+        ("ExecStopPost", "/opt/disco-hw/.venv/bin/disco-hw estop /etc/disco-hw/%i.toml"),
+        ("LimitRTPRIO", "99"),
+        ("LimitMEMLOCK", "infinity"),
+    ):
+        assert expected in unit
+    commands = [value for key, value in unit if key.startswith("Exec")]
+    assert not any(word in command for command in commands for word in (" arm", " ctl ", " start"))
