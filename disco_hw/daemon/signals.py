@@ -8,7 +8,7 @@ from types import FrameType, TracebackType
 from typing import Any
 
 # A terminal that closes must not end the process before it has stopped the wheels, hence SIGHUP.
-STOP_SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
+_STOP_SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 
 
 class StopSignals:
@@ -18,7 +18,7 @@ class StopSignals:
     that is ignored already stays ignored, as by nohup.
     """
 
-    def __init__(self, signals: Sequence[signal.Signals] = STOP_SIGNALS) -> None:
+    def __init__(self, signals: Sequence[signal.Signals] = _STOP_SIGNALS) -> None:
         self._signals = tuple(signals)
         self._former: dict[signal.Signals, Any] = {}
         self._received: signal.Signals | None = None

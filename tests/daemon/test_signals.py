@@ -5,8 +5,9 @@ import sys
 
 import pytest
 
-from disco_hw.daemon.signals import STOP_SIGNALS, StopSignals
+from disco_hw.daemon.signals import StopSignals
 
+STOP_SIGNALS = [signal.SIGTERM, signal.SIGINT, signal.SIGHUP]
 DAEMON = """
 import time
 from disco_hw.daemon.clock import MonotonicClock
