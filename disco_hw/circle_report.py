@@ -7,15 +7,16 @@ from dataclasses import asdict, dataclass
 from pathlib import Path as FilePath
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from rich.table import Table
 
 from disco_hw.config import CircleTask
 from disco_hw.errors import WorkError
 from disco_hw.log.reader import Log, open_log
-from disco_hw.metrics import CircleFigures, EstimationFigures, Path, circle_figures, estimation_figures
+from disco_hw.log.records import Counters
+from disco_hw.metrics import Array, CircleFigures, EstimationFigures, Path, circle_figures, estimation_figures
 
 PERCENTILES = (50.0, 99.0, 99.9, 100.0)
 _COMPLETED_TOLERANCE_LAPS = 0.02
@@ -88,7 +89,7 @@ class CircleReport:
 
     def draw(self, path: FilePath) -> None:
         """Write a PNG of the circle with the driven and the estimated path; needs no display."""
-        figure = mpl.figure.Figure(figsize=(6.4, 6.4), layout="constrained")
+        figure = Figure(figsize=(6.4, 6.4), layout="constrained")
         axes = figure.add_subplot()
         angle = np.linspace(0.0, 2.0 * np.pi, 361)
         axes.plot(
@@ -124,7 +125,10 @@ def load_circle_report(
     truth = _between(_read_truth(truth_file), first_ns * 1e-9, last_ns * 1e-9)
     columns = log.columns("/estimate")
     estimate = _between(
-        Path(columns["t_ns"] * 1e-9, columns["x_m"], columns["y_m"], columns["yaw_rad"], columns["speed_m_s"]),
+        Path(
+            _floats(columns["t_ns"]) * 1e-9,
+            *(_floats(columns[name]) for name in ("x_m", "y_m", "yaw_rad", "speed_m_s")),
+        ),
         first_ns * 1e-9,
         last_ns * 1e-9,
     )
@@ -142,16 +146,16 @@ def load_circle_report(
 
 
 def _read_truth(path: FilePath) -> Path:
-    """Read the simulator's CSV (columns t_ns, x_m, y_m, yaw_rad, v_m_s among others)."""
+    """Read the simulator's CSV (columns t_ns, x_m, y_m, yaw_rad, speed_m_s among others)."""
     with path.open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
 
-    def column(name: str) -> NDArray[np.float64]:
+    def column(name: str) -> Array:
         return np.array([float(row[name]) for row in rows])
 
     if not rows:
         raise WorkError(f"{path}: no truth was recorded")
-    return Path(column("t_ns") * 1e-9, column("x_m"), column("y_m"), column("yaw_rad"), column("v_m_s"))
+    return Path(column("t_ns") * 1e-9, column("x_m"), column("y_m"), column("yaw_rad"), column("speed_m_s"))
 
 
 def _between(path: Path, first_s: float, last_s: float) -> Path:
@@ -160,23 +164,26 @@ def _between(path: Path, first_s: float, last_s: float) -> Path:
 
 
 def _loop_figures(log: Log, first_ns: int, last_ns: int) -> LoopFigures:
-    columns = log.columns("/loop")
-    inside = (columns["t_ns"] >= first_ns) & (columns["t_ns"] <= last_ns)
-    woke = columns["woke_ns"][inside]
+    columns = log.columns("/loop", first_ns, last_ns)
+    overruns, skipped = _floats(columns["overruns"]), _floats(columns["skipped"])
     return LoopFigures(
-        period_us=_percentiles(np.diff(woke) * 1e-3),
-        lateness_us=_percentiles(columns["lateness_ns"][inside] * 1e-3),
-        overruns=int(columns["overruns"][inside][-1] - columns["overruns"][inside][0]),
-        skipped=int(columns["skipped"][inside][-1] - columns["skipped"][inside][0]),
+        period_us=_percentiles(np.diff(_floats(columns["woke_ns"])) * 1e-3),
+        lateness_us=_percentiles(_floats(columns["lateness_ns"]) * 1e-3),
+        overruns=int(overruns[-1] - overruns[0]),
+        skipped=int(skipped[-1] - skipped[0]),
     )
 
 
-def _percentiles(values: NDArray[np.float64]) -> tuple[float, ...]:
+def _floats(values: NDArray[np.generic]) -> Array:
+    return values.astype(np.float64)
+
+
+def _percentiles(values: Array) -> tuple[float, ...]:
     return tuple(float(np.percentile(values, p)) for p in PERCENTILES)
 
 
 def _frame_counts(log: Log) -> dict[str, int]:
-    counters = list(log.records("/counters"))
+    counters = [entry.record for entry in log.records(("/counters",)) if isinstance(entry.record, Counters)]
     if not counters:
         return {}
     last = counters[-1]

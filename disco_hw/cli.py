@@ -63,6 +63,10 @@ def run(
     as_json: AsJson = False,
 ) -> None:
     """Run the on-robot daemon: connect, estimate, record; arm and start only when told to (`disco-hw ctl`)."""
+    from disco_hw.daemon.realtime import limit_thread_pools
+
+    # Before the numeric libraries are loaded: a pool of threads in them costs the loop its deadlines.
+    limit_thread_pools()
     from disco_hw.daemon.daemon import DaemonOptions, run_daemon
 
     raise typer.Exit(run_daemon(DaemonOptions(robot=robot, model=model, link=link, log_file=log_file, as_json=as_json)))
@@ -82,11 +86,13 @@ def sim(
     ] = None,
     truth: Annotated[Path | None, typer.Option(help="Write the true motion to this CSV file.")] = None,
     inject: Annotated[Path | None, typer.Option(help="Listen for faults to inject on this Unix socket.")] = None,
+    bus_log: Annotated[Path | None, typer.Option(help="Write every frame to this file, as candump does.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the sensors' and the ground's noise.")] = 1,
     list_effects: Annotated[bool, typer.Option("--list-effects", help="List the effects and exit.")] = False,
 ) -> None:
     """Run the virtual robot alone, behind a CAN bus or a serial line."""
-    from disco_hw.virtual import SimOptions, effects_table, run_sim
+    from disco_hw.virtual import SimOptions, run_sim
+    from sim.effects import effects_table
 
     if list_effects:
         print(effects_table())
@@ -102,6 +108,7 @@ def sim(
                 start=start,
                 truth=truth,
                 inject=inject,
+                bus_log=bus_log,
                 seed=seed,
             )
         )

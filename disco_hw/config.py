@@ -10,13 +10,15 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
+from disco_hw.errors import InputError
+
 Positive = Annotated[float, Meta(gt=0.0)]
 NonNegative = Annotated[float, Meta(ge=0.0)]
 Probability = Annotated[float, Meta(gt=0.0, lt=1.0)]
 Range = tuple[float, float]
 
 
-class ConfigError(Exception):
+class ConfigError(InputError):
     """Bad configuration; the message is one line for the user: file, field, what is wrong, what to write."""
 
 

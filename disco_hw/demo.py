@@ -25,7 +25,7 @@ from rich.progress import BarColumn, Progress, TextColumn
 import disco_hw
 from disco_hw.circle_report import CircleReport, load_circle_report
 from disco_hw.config import load_robot_config
-from disco_hw.daemon.control_socket import send_request
+from disco_hw.daemon.control_client import send_request
 from disco_hw.errors import InputError, WorkError
 
 _START_TIMEOUT_S = 90.0
@@ -158,7 +158,7 @@ def _drive(options: DemoOptions, files: _Files, console: Console) -> bool:
         operator.wait_for_standstill(5.0)
         operator.tell("disarm")
         status = operator.wait_for("READY", 5.0)
-        stopped = abs(status["wheels"][0]) < 0.05 and abs(status["wheels"][1]) < 0.05
+        stopped = bool(abs(status["wheels"][0]) < 0.05 and abs(status["wheels"][1]) < 0.05)
         operator.tell("quit")
         code = daemon.wait(_STOP_TIMEOUT_S)
         if code != 0:
@@ -186,7 +186,7 @@ def _watch_laps(operator: _Operator, options: DemoOptions, limit_s: float, conso
             laps = float(status["task"]["laps"])
             figures = (
                 f"d {status['task']['distance_m'] * 1e3:4.0f} mm  v {status['task']['speed_m_s']:.3f} m/s  "
-                f"ess {status['plan']['ess']:4.1f}  late p99 {status['loop']['lateness_us']['p99']:.0f} us"
+                f"late p99 {status['loop']['lateness_us']['p99'] or 0.0:.0f} us"
             )
             progress.update(task, completed=min(max(laps, 0.0), options.laps), figures=figures)
             if not console.is_terminal and laps >= next_line:

@@ -18,7 +18,8 @@ import msgspec
 import serial
 
 from disco_hw.config import Link
-from disco_hw.daemon.control_socket import default_socket_path, send_request
+from disco_hw.daemon.control_client import send_request
+from disco_hw.daemon.control_socket import default_socket_path
 from disco_hw.errors import InputError
 from drivers.transport import open_transport
 from drivers.types import Frame, LinkState, OutgoingFrame

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import enum
 from collections import deque
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -85,19 +85,8 @@ class Tick:
     command: Governed
 
 
-class Stages(Protocol):
-    """Stopwatches by name: `with stages["plan"]: ...`."""
-
-    def __getitem__(self, name: str) -> AbstractContextManager[None]:
-        """The stopwatch of a stage."""
-
-
-class Untimed:
-    """Times nothing: the stages of callers without a clock."""
-
-    def __getitem__(self, name: str) -> AbstractContextManager[None]:
-        """A stopwatch that does nothing."""
-        return nullcontext()
+def untimed(_stage: str) -> None:
+    """Time nothing: for callers without a clock."""
 
 
 class Pipeline:
@@ -123,24 +112,24 @@ class Pipeline:
         """The estimator, for its counters."""
         return self._fusion
 
-    def step(self, now_ns: int, readings: Readings, motion: Motion, stages: Stages) -> Tick:
-        """Advance by one tick; times the stages "estimate" and "plan".
+    def step(self, now_ns: int, readings: Readings, motion: Motion, mark: Callable[[str], None] = untimed) -> Tick:
+        """Advance by one tick; `mark(stage)` is called at the end of the stages "estimate" and "plan".
 
         Never raises on what the robot sent; a planner without a valid control is reported in the tick.
         """
-        with stages["estimate"]:
-            for wheels in readings.wheels:
-                self._fusion.add_wheels(wheels)
-            updates = tuple(self._fusion.add_pose(pose, now_ns) for pose in readings.poses)
-            estimate = self._fusion.estimate(now_ns)
+        for wheels in readings.wheels:
+            self._fusion.add_wheels(wheels)
+        updates = tuple(self._fusion.add_pose(pose, now_ns) for pose in readings.poses)
+        estimate = self._fusion.estimate(now_ns)
+        mark("estimate")
         plan, failure = None, None
         if isinstance(motion, FollowTask):
-            with stages["plan"]:
-                plan, failure = self._replan(now_ns, estimate)
+            plan, failure = self._replan(now_ns, estimate)
         else:
             self._plan, self._following = None, False
         source, requested = self._wanted(now_ns, motion, plan)
         command = self._govern(now_ns, source, requested)
+        mark("plan")
         return Tick(
             t_ns=now_ns,
             pose_updates=updates,

@@ -14,7 +14,7 @@ from disco_hw.daemon.lap_counter import LapCounter
 from disco_hw.daemon.supervisor import Inputs, Output, Reply, Supervisor, UserRequest
 from disco_hw.log import records
 from disco_hw.log.recorder import Recorder
-from disco_hw.pipeline import FollowTask, Motion, Off, Pipeline, Stages, Stand, Tick
+from disco_hw.pipeline import FollowTask, Motion, Off, Pipeline, Stand, Tick, untimed
 from drivers.types import Driver, DriverState, LinkState, Readings, RobotStatus, Transport, WheelCommand, WheelSample
 
 
@@ -69,39 +69,39 @@ class DaemonCore:
     def tick(
         self,
         now_ns: int,
-        stages: Stages,
         requests: Sequence[UserRequest] = (),
         extra_records: Sequence[records.Record] = (),
+        mark: Callable[[str], None] = untimed,
     ) -> CoreTick:
         """Advance by one tick: receive, decide, estimate, plan, command, record.
 
-        `extra_records` are recorded with the tick. Times the stages "receive", "send" and "record" besides those of the
-        pipeline. Never raises on what the robot sent.
+        `extra_records` are recorded with the tick; `mark(stage)` is called at the end of each stage. Never raises on
+        what the robot sent.
         """
-        with stages["receive"]:
-            self._follow_link(now_ns)
-            frames = self.transport.receive()
-            readings = self.driver.receive(now_ns, frames)
-            self._remember(readings)
-            output = self._supervisor.step(now_ns, self._inputs(now_ns, requests))
-        result = self.pipeline.step(now_ns, readings, _motion(output), stages)
+        self._follow_link(now_ns)
+        frames = self.transport.receive()
+        readings = self.driver.receive(now_ns, frames)
+        self._remember(readings)
+        output = self._supervisor.step(now_ns, self._inputs(now_ns, requests))
+        mark("receive")
+        result = self.pipeline.step(now_ns, readings, _motion(output), mark)
         command = self._command(output, result)
-        with stages["send"]:
-            sent = self._send(now_ns, output, command)
+        sent = self._send(now_ns, output, command)
+        mark("send")
         events = (*readings.events, *output.events, *self._planner_events(result))
         self._count_laps(output, result)
-        with stages["record"]:
-            self.recorder.put(
-                now_ns,
-                [
-                    *records_of_tick.frames_in(frames),
-                    *records_of_tick.samples(readings),
-                    *records_of_tick.tick(result, command, self.config.control.command_valid_for_s),
-                    *sent,
-                    *(records.Event(now_ns, "info", "daemon", text) for text in events),
-                    *extra_records,
-                ],
-            )
+        self.recorder.put(
+            now_ns,
+            [
+                *records_of_tick.frames_in(frames),
+                *records_of_tick.samples(readings),
+                *records_of_tick.tick(result, command, self.config.control.command_valid_for_s),
+                *sent,
+                *(records.Event(now_ns, "info", "daemon", text) for text in events),
+                *extra_records,
+            ],
+        )
+        mark("record")
         self.last = CoreTick(output, result, command, events)
         return self.last
 

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
+import numpy as np
+from numpy.typing import NDArray
+
 from disco_hw.daemon.governor import Limited
 from disco_hw.estimation import PoseUpdate
 from disco_hw.log import records
@@ -53,20 +56,20 @@ def tick(result: Tick, command: WheelCommand | None, valid_for_s: float) -> Iter
     for update in result.pose_updates:
         yield _innovation(update)
     if result.plan is not None:
-        plan = result.plan
+        plan, found = result.plan, result.plan.diagnostics
         yield records.Plan(
             t_ns=result.t_ns,
             t0_ns=plan.t0_ns,
             step_s=plan.step_s,
-            left_rad_s=plan.wheel_speeds_rad_s[:, 0],
-            right_rad_s=plan.wheel_speeds_rad_s[:, 1],
-            effective_samples=plan.ess,
-            temperature=plan.temperature,
-            min_cost=plan.min_cost,
-            mean_cost=plan.mean_cost,
-            path_x_m=plan.path[:, 0],
-            path_y_m=plan.path[:, 1],
-            path_yaw_rad=plan.path[:, 2],
+            left_rad_s=_plain(plan.wheel_speeds[:, 0]),
+            right_rad_s=_plain(plan.wheel_speeds[:, 1]),
+            effective_samples=found.ess,
+            temperature=found.temperature,
+            min_cost=found.cost_min,
+            mean_cost=found.cost_mean,
+            path_x_m=_plain(plan.trajectory[:, 0]),
+            path_y_m=_plain(plan.trajectory[:, 1]),
+            path_yaw_rad=_plain(plan.trajectory[:, 2]),
         )
     governed = result.command
     yield records.Command(
@@ -91,3 +94,7 @@ def _innovation(update: PoseUpdate) -> records.Record:
         accepted=update.accepted,
         reason=update.reason.value,
     )
+
+
+def _plain(values: NDArray[np.float64]) -> tuple[float, ...]:
+    return tuple(values.tolist())

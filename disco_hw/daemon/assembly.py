@@ -1,0 +1,87 @@
+"""Puts the daemon's parts together from robot.toml and the model; the tests and the harness assemble the same way."""
+
+from __future__ import annotations
+
+import secrets
+
+from disco_hw import control
+from disco_hw.config import RobotConfig
+from disco_hw.daemon.core import DaemonCore
+from disco_hw.daemon.governor import Governor, WheelLimits
+from disco_hw.daemon.supervisor import Supervisor, SupervisorSettings
+from disco_hw.estimation import OdometryParameters, PoseFusion
+from disco_hw.log.recorder import Recorder
+from disco_hw.model import Model
+from disco_hw.pipeline import Pipeline, Planner
+from disco_hw.robot_setup import geometry
+from drivers.limits import check_limits
+from drivers.reference import ReferenceDriver
+from drivers.types import Driver, Transport
+from firmware_protocol.codec import Codec
+
+
+def make_planner(config: RobotConfig, model: Model) -> control.Disco:
+    """DISCO for this robot's task, compiled and warmed up: takes seconds."""
+    planner = control.Disco(
+        model,
+        control.Circle.from_config(config.task),
+        control.DiscoSettings.from_config(config.control),
+        control.WheelLimits.of_robot(config.robot),
+        config.control.seed,
+    )
+    planner.warm_up()
+    return planner
+
+
+def make_pipeline(config: RobotConfig, model: Model, planner: Planner) -> Pipeline:
+    """Estimator, planner and governor with the limits of robot.toml."""
+    limits = WheelLimits(
+        max_speed_rad_s=config.robot.max_wheel_speed_rad_s,
+        max_acceleration_rad_s2=config.robot.max_wheel_acceleration_rad_s2,
+        max_deceleration_rad_s2=config.robot.max_wheel_acceleration_rad_s2,
+    )
+    return Pipeline(
+        fusion=PoseFusion(config.estimation, odometry_parameters(model), config.control.telemetry_zero_s),
+        planner=planner,
+        governor=Governor(limits, 1.0 / config.control.rate_hz),
+        plan_tail_s=config.control.plan_tail_s,
+    )
+
+
+def odometry_parameters(model: Model) -> OdometryParameters:
+    """Mean and covariance of the geometry, as the estimator wants them."""
+    (wheel_radius_m, axial_distance_m, x_icr_m), covariance = geometry(model)
+    return OdometryParameters(wheel_radius_m, axial_distance_m, x_icr_m, covariance)
+
+
+def make_driver() -> ReferenceDriver:
+    """The driver of the reference protocol; session ids are unpredictable, so that no old one fits by accident."""
+    return ReferenceDriver(Codec(), draw_session=lambda: secrets.randbits(16))
+
+
+def assemble_core(
+    config: RobotConfig, transport: Transport, driver: Driver, pipeline: Pipeline, recorder: Recorder
+) -> DaemonCore:
+    """The daemon's tick over these parts."""
+    supervisor = Supervisor(
+        SupervisorSettings(
+            telemetry_zero_s=config.control.telemetry_zero_s,
+            telemetry_disarm_s=config.control.telemetry_disarm_s,
+            pose_required=config.estimation.pose_required,
+        )
+    )
+    return DaemonCore(config, transport, driver, supervisor, pipeline, recorder, lambda robot: preflight(config, robot))
+
+
+def preflight(config: RobotConfig, driver: Driver) -> tuple[str, ...]:
+    """What robot.toml asks that the robot's firmware does not allow, in words; empty if they agree."""
+    if driver.capabilities is None:
+        return ()
+    return tuple(
+        check_limits(
+            driver.capabilities,
+            max_wheel_speed_rad_s=config.robot.max_wheel_speed_rad_s,
+            max_wheel_acceleration_rad_s2=config.robot.max_wheel_acceleration_rad_s2,
+            ticks_per_rev=config.robot.ticks_per_rev,
+        )
+    )

@@ -1,0 +1,48 @@
+"""`disco-hw ctl`: one request to the running daemon, and its answer in words."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from disco_hw.config import RobotConfig, load_robot_config
+from disco_hw.daemon.control_client import send_request
+from disco_hw.daemon.control_socket import default_socket_path
+from disco_hw.errors import InputError
+
+ACTIONS = ("arm", "start", "stop", "disarm", "estop", "reset", "status", "quit")
+
+
+def socket_path(config: RobotConfig) -> Path:
+    """Where the daemon of this robot listens."""
+    configured = config.daemon.control_socket
+    return Path(configured) if configured is not None else default_socket_path(config.robot.name)
+
+
+def ask(robot: Path, action: str) -> dict[str, Any]:
+    """Send one request to the daemon of `robot`.
+
+    Raises InputError for an unknown action and WorkError without a daemon.
+    """
+    if action not in ACTIONS:
+        raise InputError(f"{action}: no such request; write one of {', '.join(ACTIONS)}")
+    return send_request(socket_path(load_robot_config(robot)), {"do": action})
+
+
+def in_words(reply: dict[str, Any]) -> str:
+    """A reply for a person."""
+    if not reply.get("ok"):
+        return f"refused: {reply.get('error')}"
+    if reply.get("do") != "status":
+        return str(reply.get("text", "done"))
+    task, loop = reply["task"], reply["loop"]
+    lines = [
+        f"{reply['state']}: {reply['detail']}",
+        f"robot {reply['robot_state']}, fault {reply['fault']}, link {reply['link']}",
+        f"laps {task['laps']:.2f}, distance {task['distance_m'] * 1e3:.0f} mm, speed {task['speed_m_s']:.3f} m/s",
+        f"loop lateness p99 {loop['lateness_us']['p99']:.0f} us, max {loop['lateness_us']['max']:.0f} us, "
+        f"overruns {loop['overruns']}, skipped {loop['skipped']}",
+    ]
+    if reply["recorder"]["last_error"]:
+        lines.append(f"recording: {reply['recorder']['last_error']}")
+    return "\n".join(lines)

@@ -1,0 +1,260 @@
+"""The on-robot daemon: the loop in real time around the core, and a stop before anything else ends."""
+
+from __future__ import annotations
+
+import gc
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from disco_hw.daemon import realtime
+from disco_hw.daemon.assembly import assemble_core, make_driver, make_pipeline, make_planner
+from disco_hw.daemon.client import ACTIONS, socket_path
+from disco_hw.daemon.clock import Clock, MonotonicClock
+from disco_hw.daemon.control_socket import ControlMessage, ControlServer
+from disco_hw.daemon.core import DaemonCore
+from disco_hw.daemon.loop import Loop
+from disco_hw.daemon.signals import StopSignals
+from disco_hw.daemon.states import State
+from disco_hw.daemon.status import counters, loop_figures, status
+from disco_hw.daemon.stop_path import StopPath
+from disco_hw.daemon.supervisor import Reply, UserRequest
+from disco_hw.daemon.systemd import Notifier
+from disco_hw.log import records
+from disco_hw.log.link import Attachment
+from disco_hw.log.provenance import DBC, MODEL_TOML, ROBOT_TOML, attachment, version
+from disco_hw.log.recorder import NullRecorder, ProcessRecorder, Recorder, Recording
+from disco_hw.robot_setup import Setup, load_setup
+from drivers.transport import open_transport
+from drivers.types import Request
+from firmware_protocol.dbc import packaged_dbc
+
+_SECOND_NS = 1_000_000_000
+_COLLECT_NS = 5 * _SECOND_NS
+_STOP_LIMIT_NS = 1_500_000_000
+
+Say = Callable[[str, str], None]
+
+
+@dataclass(frozen=True, slots=True)
+class DaemonOptions:
+    """What `disco-hw run` was asked; None leaves what robot.toml says."""
+
+    robot: Path
+    model: Path | None = None
+    link: str | None = None
+    log_file: Path | None = None
+    as_json: bool = False
+
+
+def run_daemon(options: DaemonOptions) -> int:
+    """Run until SIGTERM, SIGINT or a quit request; returns the exit code, with the robot told to stop.
+
+    Raises InputError, before anything is opened, if a file or an option is wrong. An exception in the loop is told, the
+    robot stopped, and the exception passed on.
+    """
+    say: Say = _say_json if options.as_json else _say_text
+    setup = load_setup(options.robot, options.model, options.link)
+    stop = StopPath()
+    with StopSignals() as signals:
+        try:
+            return _start(setup, options, signals, stop, say).run()
+        finally:
+            # Whatever is interrupted here, the wheels come first: they were added last.
+            for outcome in stop.run():
+                if not outcome.ok:
+                    say("stop", f"{outcome.name}: {outcome.error}")
+
+
+def _start(setup: Setup, options: DaemonOptions, signals: StopSignals, stop: StopPath, say: Say) -> Daemon:
+    """Make everything, in the order that real time needs, and add to the stop path what must be undone."""
+    config, link = setup.config, setup.config.link
+    pipeline = make_pipeline(config, setup.model, make_planner(config, setup.model))
+    # The planner was compiled before: whoever finds the socket gets an answer.
+    server = ControlServer(socket_path(config), ACTIONS)
+    stop.add("control socket", server.close)
+    recorder = _make_recorder(setup, options.log_file)
+    stop.add("recorder", lambda: _close_recorder(recorder, say))
+    for step in realtime.enter(config.daemon.realtime_priority):
+        say("real time", str(step))
+    transport = open_transport(
+        link.kind,
+        interface=link.interface,
+        channel=link.channel,
+        bitrate=link.bitrate,
+        port=link.port,
+        baud=link.baud,
+    )
+    stop.add("link", transport.close)
+    core = assemble_core(config, transport, make_driver(), pipeline, recorder)
+    daemon = Daemon(core, server, recorder, MonotonicClock(), signals, say)
+    stop.add("wheels", daemon.stop_wheels)
+    if config.daemon.realtime_priority:
+        say("real time", str(realtime.raise_loop_thread(config.daemon.realtime_priority)))
+    say("daemon", f"{transport.name}, control socket {server.path}")
+    return daemon
+
+
+class Daemon:
+    """The loop around the core: requests from the control socket, once-a-second housekeeping, the service manager."""
+
+    def __init__(
+        self, core: DaemonCore, server: ControlServer, recorder: Recorder, clock: Clock, signals: StopSignals, say: Say
+    ) -> None:
+        self._core = core
+        self._server = server
+        self._recorder = recorder
+        self._clock = clock
+        self._say = say
+        self._loop = Loop(clock, core.config.control.rate_hz)
+        self._loop_figures = loop_figures(self._loop.stats)
+        self._recorder_stats = recorder.poll()
+        self._notifier = Notifier()
+        self._signals = signals
+        self._quit = False
+        self._failed = False
+        self._next_second_ns = 0
+        self._next_collect_ns = 0
+        self._told_ready = False
+
+    def run(self) -> int:
+        """Run the loop until told to stop; returns the exit code. An exception ends it and is told, never swallowed."""
+        try:
+            self._loop.run(self._tick, lambda: self._quit or self._signals.received is not None)
+        except Exception as error:
+            self._failed = True
+            self._say("failed", f"{type(error).__name__}: {error}; stopping the robot")
+            raise
+        if self._signals.received is not None:
+            self._say("daemon", f"{self._signals.received.name}: stopping")
+        return 0
+
+    def stop_wheels(self) -> None:
+        """Bring the robot to a stand and disarm it, within 1.5 s; after a failure by the shortest way there is.
+
+        Whatever this achieves, the robot's own watchdog stops it when the frames cease.
+        """
+        self._notifier.stopping()
+        if self._failed:
+            self._send_stop()
+            return
+        deadline_ns = self._clock.now_ns() + _STOP_LIMIT_NS
+        period_ns = round(1e9 / self._core.config.control.rate_hz)
+        requests: tuple[UserRequest, ...] = (UserRequest.DISARM,)
+        while (now_ns := self._clock.now_ns()) < deadline_ns:
+            try:
+                tick = self._core.tick(now_ns, requests)
+            except Exception:
+                self._send_stop()
+                raise
+            requests = ()
+            if tick.output.state not in {State.ARMED, State.STOPPING}:
+                return
+            self._clock.sleep_until_ns(now_ns + period_ns)
+        self._send_stop()
+
+    def _send_stop(self) -> None:
+        """Ask for standby by the driver alone, and by the e-stop if the driver cannot."""
+        core, now_ns = self._core, self._clock.now_ns()
+        try:
+            core.driver.request(Request.STANDBY)
+            frames = core.driver.transmit(now_ns, None)
+        except Exception:
+            for frame in core.driver.estop(now_ns):
+                core.transport.send(frame, now_ns)
+            raise
+        for frame in frames:
+            core.transport.send(frame, now_ns)
+
+    def _tick(self, now_ns: int) -> None:
+        mark = self._loop.stages.mark
+        messages = self._server.poll()
+        requests = tuple(UserRequest(message.action) for message in messages if message.action in _REQUESTS)
+        mark("control")
+        tick = self._core.tick(now_ns, requests, (self._timing(now_ns), *self._every_second(now_ns)), mark)
+        self._answer(messages, tick.replies)
+        for text in tick.events:
+            self._say("event", text)
+        state = tick.output.state
+        if not self._told_ready:
+            self._notifier.ready()
+            self._told_ready = True
+        self._notifier.watchdog(now_ns)
+        if state is not State.ARMED and now_ns >= self._next_collect_ns:
+            # The collector is off; what cycles there are go while nobody depends on the loop.
+            gc.collect()
+            self._next_collect_ns = now_ns + _COLLECT_NS
+
+    def _timing(self, now_ns: int) -> records.Record:
+        stats = self._loop.stats
+        return records.LoopTiming(
+            t_ns=now_ns - stats.last_lateness_ns,
+            tick=stats.ticks,
+            woke_ns=now_ns,
+            lateness_ns=stats.last_lateness_ns,
+            stages_ns=self._loop.stages.last_ns(),
+            overruns=stats.overruns,
+            skipped=stats.skipped_periods,
+        )
+
+    def _every_second(self, now_ns: int) -> tuple[records.Record, ...]:
+        if now_ns < self._next_second_ns:
+            return ()
+        self._next_second_ns = now_ns + _SECOND_NS
+        before = self._recorder_stats
+        self._recorder_stats = self._recorder.poll()
+        if self._recorder_stats.last_error and self._recorder_stats.last_error != before.last_error:
+            self._say("recording", self._recorder_stats.last_error)
+        self._loop_figures = loop_figures(self._loop.stats)
+        last = self._core.last
+        if last is not None:
+            self._notifier.status(f"{last.output.state.name}: {last.output.detail}")
+        return (counters(self._core, self._loop.stats, self._recorder_stats, now_ns),)
+
+    def _answer(self, messages: list[ControlMessage], replies: tuple[Reply, ...]) -> None:
+        """Answer every request: those to the supervisor with its words, the others here."""
+        remaining = list(replies)
+        for message in messages:
+            if message.action in _REQUESTS:
+                reply = remaining.pop(0)
+                body: dict[str, Any] = {"ok": reply.accepted}
+                body["text" if reply.accepted else "error"] = reply.text
+            elif message.action == "quit":
+                self._quit = True
+                body = {"ok": True, "text": "stopping the robot and ending"}
+            else:
+                body = status(self._core, self._loop_figures, self._recorder_stats)
+            self._server.reply(message, body)
+
+
+_REQUESTS = frozenset(request.value for request in UserRequest)
+
+
+def _make_recorder(setup: Setup, log_file: Path | None) -> Recorder:
+    config = setup.config
+    if log_file is None and not config.log.enabled:
+        return NullRecorder()
+    if log_file is None:
+        stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
+        log_file = Path(config.log.directory) / f"{config.robot.name}-{stamp}.mcap"
+    attachments = [attachment(setup.robot_file, ROBOT_TOML), Attachment(DBC, "text/plain", packaged_dbc().encode())]
+    if setup.model_file is not None:
+        attachments.append(attachment(setup.model_file, MODEL_TOML))
+    return ProcessRecorder(Recording(log_file, config.robot.name, version=version(), attachments=tuple(attachments)))
+
+
+def _close_recorder(recorder: Recorder, say: Say) -> None:
+    stats = recorder.close()
+    if stats.dropped_ticks or stats.refused:
+        say("recording", f"{stats.dropped_ticks} ticks dropped, {stats.refused} records refused")
+
+
+def _say_text(topic: str, text: str) -> None:
+    print(f"{topic}: {text}", flush=True)
+
+
+def _say_json(topic: str, text: str) -> None:
+    print(json.dumps({"topic": topic, "text": text}), flush=True)

@@ -1,0 +1,77 @@
+"""The daemon's state as one JSON object for the control socket."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict
+from typing import Any
+
+from disco_hw.daemon.core import DaemonCore
+from disco_hw.daemon.loop import LoopStats
+from disco_hw.log import records
+from disco_hw.log.recorder import RecorderStats
+
+
+def loop_figures(loop: LoopStats) -> dict[str, Any]:
+    """Lateness and duration in microseconds, overruns and skipped periods; costs about a millisecond."""
+    return {
+        "lateness_us": _microseconds(loop.lateness.summary_s()),
+        "duration_us": _microseconds(loop.duration.summary_s()),
+        "overruns": loop.overruns,
+        "skipped": loop.skipped_periods,
+    }
+
+
+def status(core: DaemonCore, loop: dict[str, Any], recorder: RecorderStats) -> dict[str, Any]:
+    """Everything that a person or a page wants to know now; what does not exist is None.
+
+    `loop` is from `loop_figures`.
+    """
+    tick = core.last
+    if tick is None:
+        return {"ok": False, "error": "the loop has not started yet"}
+    estimate, robot, wheels = tick.pipeline.estimate, core.robot_status, core.newest_wheels
+    circle = core.config.task
+    distance = math.hypot(estimate.x_m - circle.center_x_m, estimate.y_m - circle.center_y_m) - circle.radius_m
+    plan = tick.pipeline.plan
+    return {
+        "ok": True,
+        "state": tick.output.state.name,
+        "detail": tick.output.detail,
+        "running": tick.output.running,
+        "estop": tick.output.estop,
+        "link": core.transport.state.value,
+        "link_error": core.transport.last_error,
+        "driver_state": core.driver.state.name,
+        "robot_state": "UNKNOWN" if robot is None else robot.state,
+        "fault": "UNKNOWN" if robot is None else robot.fault,
+        "stop_cause": "UNKNOWN" if robot is None else robot.stop_cause,
+        "pose": [estimate.x_m, estimate.y_m, estimate.yaw_rad],
+        "pose_ok": estimate.pose_ok,
+        "wheels": None if wheels is None else [wheels.left_speed_rad_s, wheels.right_speed_rad_s],
+        "command": [tick.pipeline.command.left_rad_s, tick.pipeline.command.right_rad_s],
+        "source": tick.pipeline.source.value,
+        "task": {"laps": core.laps.laps, "distance_m": distance, "speed_m_s": estimate.speed_m_s},
+        "plan": None if plan is None else {"ess": plan.diagnostics.ess, "temperature": plan.diagnostics.temperature},
+        "loop": loop,
+        "transport": asdict(core.transport.stats),
+        "driver": asdict(core.driver.stats),
+        "fusion": asdict(core.pipeline.fusion.stats),
+        "recorder": asdict(recorder),
+    }
+
+
+def _microseconds(summary: dict[str, float]) -> dict[str, float]:
+    return {name.removesuffix("_s"): value * 1e6 for name, value in summary.items()}
+
+
+def counters(core: DaemonCore, loop: LoopStats, recorder: RecorderStats, now_ns: int) -> records.Counters:
+    """Every counter of the stack as one record for the log."""
+    return records.Counters(
+        t_ns=now_ns,
+        transport=asdict(core.transport.stats),
+        driver=asdict(core.driver.stats),
+        fusion=asdict(core.pipeline.fusion.stats),
+        recorder={name: value for name, value in asdict(recorder).items() if type(value) is int},
+        loop={"ticks": loop.ticks, "overruns": loop.overruns, "skipped": loop.skipped_periods},
+    )

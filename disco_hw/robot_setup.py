@@ -1,0 +1,57 @@
+"""The files of one robot, read and checked together: robot.toml and the model it names."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+
+from disco_hw.config import RobotConfig, load_robot_config
+from disco_hw.errors import InputError
+from disco_hw.model import Model, load_model
+
+LINK_KINDS = ("can", "serial")
+Matrix3 = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
+
+
+@dataclass(frozen=True, slots=True)
+class Setup:
+    """The files of one robot, read and checked; `model_file` is None where robot.toml names none."""
+
+    robot_file: Path
+    model_file: Path | None
+    config: RobotConfig
+    model: Model
+
+
+def load_setup(robot: Path, model: Path | None = None, link: str | None = None) -> Setup:
+    """Read robot.toml and the model; `model` and `link` override what robot.toml says. Raises InputError."""
+    config = load_robot_config(robot)
+    if link is not None:
+        if link not in LINK_KINDS:
+            raise InputError(f"--link {link}: no such kind of link; write one of {', '.join(LINK_KINDS)}")
+        config = msgspec.structs.replace(config, link=msgspec.structs.replace(config.link, kind=link))
+    model_file = model
+    if model_file is None and config.model.file is not None:
+        model_file = robot.parent / config.model.file
+    loaded = Model.nominal(config.robot, config.prior) if model_file is None else load_model(model_file)
+    return Setup(robot, model_file, config, loaded)
+
+
+def geometry(model: Model) -> tuple[tuple[float, float, float], Matrix3]:
+    """Mean (m) and covariance (m^2) of (wheel_radius_m, axial_distance_m, x_icr_m); zero where a value is exact."""
+    names = ("wheel_radius_m", "axial_distance_m", "x_icr_m")
+    mean = dict(zip(model.parameter_names, model.point().tolist(), strict=True))
+    covariance = {(a, b): 0.0 for a in names for b in names}
+    belief = model.belief
+    if belief is not None:
+        mean |= dict(zip(belief.names, belief.mean().tolist(), strict=True))
+        for row, values in zip(belief.names, belief.covariance().tolist(), strict=True):
+            covariance |= {(row, column): value for column, value in zip(belief.names, values, strict=True)}
+    r, a, x = names
+    return (mean[r], mean[a], mean[x]), (
+        (covariance[r, r], covariance[r, a], covariance[r, x]),
+        (covariance[a, r], covariance[a, a], covariance[a, x]),
+        (covariance[x, r], covariance[x, a], covariance[x, x]),
+    )
