@@ -167,7 +167,7 @@ class FirmwareCore:
 
     def receive(self, now_us: int, can_id: int, data: bytes) -> None:
         """Take in one frame from the bus; anything may come."""
-        _lib.disco_firmware_receive(self._core, now_us, can_id & 0xFFFF_FFFF, data, len(data) & 0xFF)
+        _lib.disco_firmware_receive(self._core, now_us, can_id & 0xFFFF_FFFF, data, min(len(data), 0xFF))
 
     def step(self, now_us: int, inputs: FirmwareInputs) -> FirmwareOutputs:
         """Run one cycle, meant for 1 kHz."""

@@ -113,8 +113,11 @@ static bool wrong_direction(disco_faults_t *faults, const disco_config_t *config
     const bool opposed = ((setpoint > proof) && (speed < -proof)) || ((setpoint < -proof) && (speed > proof));
     if (!opposed) {
         faults->opposed_since_us[wheel] = now_us;
-        faults->opposed_speed[wheel] = fabsf(speed);
+        faults->opposed_speed[wheel] = 0.0f;
         return false;
+    }
+    if (faults->opposed_speed[wheel] <= 0.0f) {
+        faults->opposed_speed[wheel] = fabsf(speed);
     }
     if ((now_us - faults->opposed_since_us[wheel]) < config->encoder_debounce_us) {
         return false;

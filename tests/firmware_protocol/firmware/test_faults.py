@@ -1,0 +1,260 @@
+"""Detection, debounce, latching and clearing of every fault."""
+
+import dataclasses
+import math
+
+import pytest
+
+from firmware_protocol.firmware_core import FirmwareInputs, ResetCause
+from tests.firmware_protocol.bench import CONFIG, FAULTS, MS, Bench
+
+SIDES = ("left", "right")
+
+
+def name_of(code):
+    return next(name for name, value in FAULTS.items() if value == code)
+
+
+def wait_for_fault(bench, within_ms=2000):
+    start = bench.now_us
+    for _ in range(within_ms):
+        if bench.step().fault:
+            return name_of(bench.out.fault), (bench.now_us - start) // MS
+    return None, None
+
+
+THRESHOLDS = [
+    ("voltage_v", 19.99, 20.0, "UNDER_VOLTAGE", 200),
+    ("voltage_v", 30.01, 30.0, "OVER_VOLTAGE", 200),
+    ("left_current_a", 30.01, 30.0, "OVER_CURRENT_LEFT", 100),
+    ("right_current_a", -30.01, -30.0, "OVER_CURRENT_RIGHT", 100),
+    ("left_temperature_c", 80.1, 80.0, "OVER_TEMPERATURE_LEFT", 1000),
+    ("right_temperature_c", 80.1, 80.0, "OVER_TEMPERATURE_RIGHT", 1000),
+    ("voltage_v", math.nan, 25.0, "UNDER_VOLTAGE", 200),
+    ("left_current_a", math.nan, 0.0, "OVER_CURRENT_LEFT", 100),
+    ("right_temperature_c", math.nan, 25.0, "OVER_TEMPERATURE_RIGHT", 1000),
+    ("left_encoder_valid", False, True, "ENCODER_MISSING_LEFT", 300),
+    ("right_encoder_valid", False, True, "ENCODER_MISSING_RIGHT", 300),
+    ("left_speed_rad_s", math.nan, 0.0, "ENCODER_MISSING_LEFT", 300),
+    ("right_speed_rad_s", math.inf, 0.0, "ENCODER_MISSING_RIGHT", 300),
+    ("tx_error_count", 256, 255, "BUS_OFF", 0),
+]
+
+
+@pytest.mark.parametrize(("field", "bad", "good", "fault", "debounce_ms"), THRESHOLDS)
+def test_threshold_and_debounce(field, bad, good, fault, debounce_ms):
+    bench = Bench()
+    bench.inputs[field] = good
+    assert bench.run(1500).fault == 0
+    bench.inputs[field] = bad
+    assert wait_for_fault(bench) == (fault, max(debounce_ms, 1))
+
+
+@pytest.mark.parametrize(("field", "bad", "good", "fault", "debounce_ms"), [row for row in THRESHOLDS if row[-1]])
+def test_a_shorter_disturbance_is_no_fault(field, bad, good, fault, debounce_ms):
+    bench = Bench()
+    for _ in range(3):
+        bench.inputs[field] = bad
+        bench.run(debounce_ms - 1)
+        bench.inputs[field] = good
+        assert bench.run(2).fault == 0, fault
+
+
+def driving_with(side, **inputs):
+    bench = Bench()
+    bench.to_driving(4.0, 4.0)
+    bench.wheels_follow = False
+    bench.inputs.update({f"{side}_{name}": value for name, value in inputs.items()})
+    return bench
+
+
+@pytest.mark.parametrize("side", SIDES)
+def test_current_without_ticks_is_a_missing_encoder(side):
+    bench = driving_with(side, current_a=2.0)
+    bench.inputs[f"{side}_ticks"] = int(bench.ticks[SIDES.index(side)])
+    assert wait_for_fault(bench) == (f"ENCODER_MISSING_{side.upper()}", 300)
+    assert (bench.out.state, bench.out.driver_enabled) == ("FAULT", False)
+
+
+@pytest.mark.parametrize("side", SIDES)
+def test_much_current_without_ticks_is_a_stall(side):
+    bench = driving_with(side, current_a=-16.0)
+    bench.inputs[f"{side}_ticks"] = int(bench.ticks[SIDES.index(side)])
+    assert wait_for_fault(bench) == (f"STALL_{side.upper()}", 300)
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda bench: bench.inputs.update(left_current_a=0.4),
+        lambda bench: setattr(bench, "command", {"left": 0.9, "right": 4.0}),
+        lambda bench: bench.inputs.pop("left_ticks"),
+    ],
+    ids=["no current", "hardly commanded", "ticks come"],
+)
+def test_what_is_no_missing_encoder(spoil):
+    bench = driving_with("left", current_a=2.0)
+    bench.inputs["left_ticks"] = int(bench.ticks[0])
+    spoil(bench)
+    assert wait_for_fault(bench) == (None, None)
+
+
+def test_few_ticks_a_turn_are_given_their_time():
+    coarse = dataclasses.replace(CONFIG, ticks_per_rev=20)
+    bench = Bench(coarse)
+    bench.to_driving(2.0, 2.0)
+    bench.inputs["left_current_a"] = 2.0
+    assert bench.run(2000).fault == 0
+    bench.inputs["left_ticks"] = int(bench.ticks[0])
+    three_ticks_at_check_speed_ms = 3 * 2 * math.pi / 20 * 1000
+    fault, after_ms = wait_for_fault(bench)
+    assert fault == "ENCODER_MISSING_LEFT"
+    assert after_ms == pytest.approx(three_ticks_at_check_speed_ms, abs=160)
+
+
+@pytest.mark.parametrize("side", SIDES)
+@pytest.mark.parametrize("jump", [1000, -1000, 1 << 31])
+def test_ticks_that_no_wheel_can_make_are_a_jump(side, jump):
+    bench = driving_with(side)
+    bench.ticks[SIDES.index(side)] += jump
+    assert wait_for_fault(bench) == (f"ENCODER_JUMP_{side.upper()}", 1)
+
+
+def test_ticks_may_wrap():
+    bench = Bench()
+    bench.ticks = [2.0**32 - 500, -(2.0**32)]
+    bench.core = Bench().core.__class__(CONFIG)
+    bench.to_driving(4.0, -4.0)
+    assert bench.run(1000).fault == 0
+    assert bench.ticks[0] > 2**32
+
+
+def test_the_fastest_turn_by_hand_is_no_jump():
+    bench = Bench()
+    bench.wheels_follow = False
+    bench.speeds = [20.0, -20.0]
+    assert bench.run(200).fault == 0
+
+
+def test_ticks_made_up_for_a_pause_are_no_jump():
+    bench = Bench()
+    bench.to_driving(6.0, 6.0)
+    bench.step(elapsed_us=90 * MS)
+    assert name_of(bench.step().fault) == "NONE"
+
+
+@pytest.mark.parametrize("side", SIDES)
+@pytest.mark.parametrize("sign", [1, -1])
+def test_turning_against_the_setpoint_is_wrong_direction(side, sign):
+    bench = Bench()
+    bench.to_driving(4.0 * sign, 4.0 * sign)
+    bench.wheels_follow = False
+    bench.speeds[SIDES.index(side)] = -3.0 * sign
+    assert wait_for_fault(bench) == (f"WRONG_DIRECTION_{side.upper()}", 300)
+
+
+def test_a_wheel_that_is_only_late_in_turning_round_is_not():
+    bench = Bench()
+    bench.to_driving(4.0, 4.0)
+    bench.wheels_follow = False
+    bench.command = {"left": -4.0, "right": -4.0}
+    opposed_ms = 0
+    for _ in range(3000):
+        bench.speeds = [speed + (setpoint(bench) - speed) * 0.001 for speed in bench.speeds]
+        assert bench.step().fault == 0
+        opposed_ms += bench.speeds[0] > 1.0 and setpoint(bench) < -1.0
+    assert opposed_ms > 300
+    assert bench.speeds[0] < -3.0
+
+
+def setpoint(bench):
+    return bench.out.left_setpoint_rad_s
+
+
+def test_wrong_direction_asks_for_an_enabled_driver():
+    bench = Bench()
+    bench.wheels_follow = False
+    bench.speeds = [-3.0, 3.0]
+    assert wait_for_fault(bench) == (None, None)
+
+
+@pytest.mark.parametrize(("cause", "fault"), [("WATCHDOG", "WATCHDOG_RESET"), ("BROWN_OUT", "BROWN_OUT_RESET")])
+def test_reset_causes_latch_once_and_clear(cause, fault):
+    bench = Bench()
+    core = bench.core.__class__(CONFIG)
+    inputs = FirmwareInputs(
+        left_ticks=0, right_ticks=0, left_speed_rad_s=0.0, right_speed_rad_s=0.0, reset_cause=ResetCause[cause]
+    )
+    assert name_of(core.step(1000, inputs).fault) == fault
+    bench.core, bench.inputs["reset_cause"] = core, ResetCause[cause]
+    reset(bench)
+    assert (bench.out.state, bench.out.fault) == ("STANDBY", 0)
+
+
+def reset(bench):
+    bench.ask("STANDBY")
+    bench.run(250)
+    bench.ask("RESET")
+    bench.run(60)
+
+
+@pytest.mark.parametrize("fault", ["SELF_TEST_FAILED", "CONFIG_INVALID"])
+def test_permanent_faults_are_not_reset(fault):
+    bench = Bench(CONFIG if fault == "SELF_TEST_FAILED" else dataclasses.replace(CONFIG, command_timeout_s=0.0))
+    bench.inputs["self_test_failed"] = fault == "SELF_TEST_FAILED"
+    bench.run(2)
+    bench.inputs.clear()
+    reset(bench)
+    assert (bench.out.state, name_of(bench.out.fault)) == ("FAULT", fault)
+
+
+def test_a_latched_fault_outlives_its_cause_and_a_reset_waits_for_the_cause_to_go():
+    bench = Bench()
+    bench.inputs["left_current_a"] = 50.0
+    bench.run_until("FAULT")
+    reset(bench)
+    assert bench.out.state == "FAULT"
+    bench.inputs.clear()
+    bench.run(2)
+    assert (bench.out.state, bench.out.fault) == ("STANDBY", 0)
+    bench.inputs["left_current_a"] = 50.0
+    bench.run_until("FAULT")
+    bench.inputs.clear()
+    bench.run(1000)
+    assert (bench.out.state, name_of(bench.out.fault)) == ("FAULT", "OVER_CURRENT_LEFT")
+
+
+def test_a_passing_fault_blocks_ready_while_it_is_held():
+    bench = Bench()
+    bench.hello()
+    bench.inputs["voltage_v"] = 12.0
+    bench.run(300)
+    bench.ask("READY")
+    bench.run(1000)
+    assert bench.out.state == "STANDBY"
+    bench.inputs.clear()
+    bench.run(400)
+    assert (bench.out.state, name_of(bench.out.fault)) == ("STANDBY", "UNDER_VOLTAGE")
+    bench.run(200)
+    assert (bench.out.state, bench.out.fault) == ("READY", 0)
+
+
+def test_the_graver_fault_is_shown():
+    bench = Bench()
+    bench.inputs.update(voltage_v=10.0, left_temperature_c=100.0, tx_error_count=300)
+    bench.run(1100)
+    assert name_of(bench.out.fault) == "UNDER_VOLTAGE"
+    bench.inputs["right_current_a"] = 99.0
+    bench.run(200)
+    assert name_of(bench.out.fault) == "OVER_CURRENT_RIGHT"
+    bench.inputs["self_test_failed"] = True
+    bench.run(2)
+    assert name_of(bench.out.fault) == "SELF_TEST_FAILED"
+
+
+def test_every_fault_of_the_table_is_raised_somewhere():
+    raised = {row[3] for row in THRESHOLDS}
+    raised |= {f"{name}_{side.upper()}" for name in ("STALL", "ENCODER_JUMP", "WRONG_DIRECTION") for side in SIDES}
+    raised |= {"WATCHDOG_RESET", "BROWN_OUT_RESET", "SELF_TEST_FAILED", "CONFIG_INVALID", "NONE"}
+    raised |= {"DBC_HASH_MISMATCH", "PROTOCOL_MAJOR_MISMATCH"}
+    assert raised == set(FAULTS)

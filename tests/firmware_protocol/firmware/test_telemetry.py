@@ -1,0 +1,341 @@
+import dataclasses
+import itertools
+import math
+
+import pytest
+
+from firmware_protocol.codec import PROTOCOL_MAJOR, PROTOCOL_MINOR
+from firmware_protocol.firmware_core import FirmwareInputs
+from tests.firmware_protocol.bench import CODEC, CONFIG, MS, Bench
+
+PERIODS_MS = {
+    "WHEEL_SPEED": 10,
+    "WHEEL_TICKS": 10,
+    "MOTOR": 50,
+    "SYSTEM_STATE": 100,
+    "SESSION_STATE": 100,
+    "POWER": 500,
+    "LINK_HEALTH": 1000,
+    "HELLO": 1000,
+    "BUILD": 1000,
+}
+
+
+def last(bench, name):
+    return bench.messages(name)[-1].values
+
+
+@pytest.mark.parametrize("name", PERIODS_MS)
+def test_period(name):
+    bench = Bench()
+    bench.run(4000)
+    times = [t_us for t_us, message in bench.sent if message.name == name and t_us > 100 * MS]
+    gaps = {b - a for a, b in itertools.pairwise(times)}
+    assert gaps == {PERIODS_MS[name] * MS}
+
+
+@pytest.mark.parametrize("name", [*PERIODS_MS, "LIMITS"])
+def test_counters_go_up_by_one_for_each_frame(name):
+    bench = Bench()
+    bench.run(20 * PERIODS_MS.get(name, 500))
+    counters = [message.counter for message in bench.messages(name)]
+    assert len(counters) > 16
+    assert all((b - a) % 16 == 1 for a, b in itertools.pairwise(counters))
+
+
+def test_wheel_frames_of_one_sample_have_one_counter_and_one_instant():
+    bench = Bench()
+    bench.to_driving()
+    speeds = [(t, m.counter, m.values) for t, m in bench.sent if m.name == "WHEEL_SPEED"]
+    ticks = [(t, m.counter, m.values) for t, m in bench.sent if m.name == "WHEEL_TICKS"]
+    assert [sample[:2] for sample in speeds] == [sample[:2] for sample in ticks]
+    for t_us, _, values in speeds:
+        assert values["sample_time"] == t_us // 20 % 65536 * 20
+
+
+def test_wheel_values():
+    bench = Bench()
+    bench.wheels_follow = False
+    bench.inputs = {
+        "left_ticks": (1 << 24) + 5,
+        "right_ticks": -1,
+        "left_speed_rad_s": 1.2345,
+        "right_speed_rad_s": -99.0,
+    }
+    core = bench.core = Bench().core.__class__(CONFIG)
+    bench.now_us = 0
+    bench.step()
+    assert core is bench.core
+    assert last(bench, "WHEEL_TICKS") == {"left_ticks": 5, "right_ticks": (1 << 24) - 1}
+    speed = last(bench, "WHEEL_SPEED")
+    assert speed["left_speed"] == pytest.approx(1.234)
+    assert speed["right_speed"] == -65.536
+    assert (speed["left_valid"], speed["right_valid"]) == (1, 1)
+    assert (speed["driver_enabled"], speed["limited"]) == (0, 0)
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_a_speed_that_is_not_known_is_not_valid(side, bad):
+    bench = Bench()
+    bench.inputs[f"{side}_speed_rad_s"] = bad
+    bench.run(20)
+    values = last(bench, "WHEEL_SPEED")
+    other = "right" if side == "left" else "left"
+    assert (values[f"{side}_valid"], values[f"{other}_valid"]) == (0, 1)
+    assert values["left_speed" if side == "left" else "right_speed"] == (0.0 if math.isnan(bad) else 65.534)
+    bench.inputs = {f"{side}_encoder_valid": False}
+    bench.run(20)
+    assert last(bench, "WHEEL_SPEED")[f"{side}_valid"] == 0
+
+
+def test_driver_and_limited_bits():
+    bench = Bench()
+    bench.to_armed()
+    bench.command = {"left": 40.0, "right": 40.0}
+    bench.run(100)
+    values = last(bench, "WHEEL_SPEED")
+    assert (values["driver_enabled"], values["limited"]) == (1, 1)
+
+
+def test_motor_and_power_values():
+    bench = Bench()
+    bench.inputs.update(
+        left_current_a=-1.239,
+        right_current_a=400.0,
+        left_temperature_c=-200.0,
+        right_temperature_c=25.6,
+        voltage_v=24.567,
+        battery_current_a=-2.5,
+        battery_temperature_c=300.0,
+    )
+    bench.run(600)
+    motor = last(bench, "MOTOR")
+    assert motor == pytest.approx(
+        {"left_current": -1.24, "right_current": 327.67, "left_temperature": -128, "right_temperature": 26}
+    )
+    assert last(bench, "POWER") == pytest.approx({"voltage": 24.57, "current": -2.5, "temperature": 127})
+
+
+def test_system_state_tells_every_change_at_once():
+    bench = Bench()
+    bench.run(105)
+    before = len(bench.messages("SYSTEM_STATE"))
+    bench.core.receive(bench.now_us, 0x080, b"")
+    bench.step()
+    assert len(bench.messages("SYSTEM_STATE")) == before + 1
+    values = last(bench, "SYSTEM_STATE")
+    assert CODEC.choice_name("SYSTEM_STATE", "state", values["state"]) == "ESTOP"
+    assert CODEC.choice_name("SYSTEM_STATE", "estop_source", values["estop_source"]) == "FRAME"
+
+
+def test_system_state_follows_session_fault_and_stop_cause():
+    bench = Bench()
+    bench.to_driving()
+    assert last(bench, "SYSTEM_STATE")["session"] == 7
+    bench.command = None
+    bench.run_until("STANDBY")
+    assert CODEC.choice_name("SYSTEM_STATE", "stop_cause", last(bench, "SYSTEM_STATE")["stop_cause"]) == (
+        "COMMAND_TIMEOUT"
+    )
+    bench.inputs["tx_error_count"] = 256
+    bench.step()
+    assert CODEC.choice_name("SYSTEM_STATE", "fault", last(bench, "SYSTEM_STATE")["fault"]) == "BUS_OFF"
+
+
+def test_rejections_are_counted_modulo_256_with_the_newest_reason():
+    bench = Bench()
+    bench.run(50)
+    for _ in range(300):
+        bench.core.receive(bench.now_us, 0x100, b"\0")
+    bench.run(100)
+    values = last(bench, "SYSTEM_STATE")
+    assert values["rejected_count"] == 300 % 256
+    assert CODEC.choice_name("SYSTEM_STATE", "reject_reason", values["reject_reason"]) == "LENGTH"
+    assert bench.out.rejected_frames == 300
+
+
+def test_last_command_counter_is_that_of_the_last_accepted_command():
+    bench = Bench()
+    bench.to_driving()
+    accepted = bench.counters["WHEEL_COMMAND"]
+    bench.command = None
+    bench.wheel_command(4.0, 2.0, session=9)
+    bench.ask("STANDBY")
+    bench.run_until("STOPPING")
+    assert last(bench, "SYSTEM_STATE")["last_command_counter"] == accepted
+
+
+def test_session_state_tells_challenge_session_acceptance_and_blockers():
+    bench = Bench()
+    bench.run(105)
+    before = len(bench.messages("SESSION_STATE"))
+    bench.hello()
+    bench.step()
+    assert len(bench.messages("SESSION_STATE")) == before + 1
+    assert last(bench, "SESSION_STATE")["host_accepted"] == 1
+    bench.to_ready()
+    values = last(bench, "SESSION_STATE")
+    assert (values["session"], values["challenge"]) == (7, bench.core.challenge)
+    assert values["blockers"] == bench.out.blockers
+
+
+def test_link_health():
+    bench = Bench()
+    bench.inputs.update(tx_error_count=300, rx_error_count=130)
+    bench.run(10)
+    bench.inputs.update(tx_error_count=90)
+    bench.run(10)
+    bench.inputs.update(tx_error_count=256)
+    for _ in range(3):
+        bench.core.receive(bench.now_us, 0x100, bytes(8))
+    bench.host_state()
+    bench.counters["HOST_STATE"] -= 1
+    bench.host_state()
+    bench.run(1000)
+    assert last(bench, "LINK_HEALTH") == {
+        "tx_error_count": 255,
+        "rx_error_count": 130,
+        "bus_off_count": 2,
+        "crc_error_count": 3,
+        "sequence_error_count": 1,
+        "watchdog_count": 0,
+    }
+
+
+def test_handshake_is_offered_until_accepted_and_answered_ever_after():
+    bench = Bench()
+    assert len(bench.messages("HELLO")) == 1
+    bench.run(2500)
+    assert len(bench.messages("HELLO")) == 3
+    bench.hello()
+    bench.run(1)
+    assert len(bench.messages("HELLO")) == 4
+    bench.request = {"request": "STANDBY", "session": 0}
+    bench.run(4000)
+    assert len(bench.messages("HELLO")) == 4
+
+
+def test_what_the_handshake_says():
+    bench = Bench(
+        dataclasses.replace(CONFIG, board_id=77, firmware_version=(3, 4, 5), capabilities=9, command_timeout_s=0.08)
+    )
+    assert last(bench, "HELLO") == {
+        "protocol_major": PROTOCOL_MAJOR,
+        "protocol_minor": PROTOCOL_MINOR,
+        "firmware_major": 3,
+        "firmware_minor": 4,
+        "firmware_patch": 5,
+        "capabilities": 9,
+    }
+    assert last(bench, "BUILD") == {"dbc_hash": CODEC.dbc_hash, "board_id": 77}
+    first, second = (message.values for message in bench.messages("LIMITS"))
+    assert first == pytest.approx(
+        {"page": 0, "max_wheel_speed": 8.0, "max_wheel_acceleration": 20.0, "ticks_per_rev": 2048}
+    )
+    assert second == pytest.approx(
+        {"page": 1, "command_timeout": 0.08, "drive_off_timeout": 0.5, "stop_deceleration": 20.0}
+    )
+
+
+def test_a_flood_of_hellos_gets_an_answer_every_20_ms():
+    bench = Bench()
+    bench.run(100)
+    before = len(bench.messages("HELLO"))
+    for _ in range(200):
+        bench.hello()
+        bench.step()
+    assert len(bench.messages("HELLO")) - before == pytest.approx(10, abs=1)
+
+
+def test_time_is_that_of_reception():
+    bench = Bench()
+    bench.run(10)
+    bench.now_us += 321
+    bench.send("TIME_REQUEST", sequence=200)
+    bench.now_us += 500
+    bench.step()
+    assert last(bench, "TIME_RESPONSE") == {"sequence": 200, "receive_time": 10 * MS + MS + 321}
+
+
+def test_time_wraps_at_40_bits():
+    bench = Bench()
+    bench.now_us = (1 << 40) + 1234
+    bench.send("TIME_REQUEST", sequence=0)
+    bench.step()
+    assert last(bench, "TIME_RESPONSE")["receive_time"] == 1234
+
+
+def pose(*arguments):
+    bench = Bench()
+    bench.core.pose(*arguments)
+    bench.step()
+    position, heading = bench.messages("POSE_POSITION")[-1], bench.messages("POSE_HEADING")[-1]
+    assert position.counter == heading.counter
+    assert position.values["valid"] == heading.values["valid"]
+    return position.values | heading.values
+
+
+def test_pose_values():
+    assert pose(1.23456, -800.0, -3.14159, 6_700_049, 0.0104, 0.0206) == pytest.approx(
+        {
+            "valid": 1,
+            "x": 1.2346,
+            "y": -800.0,
+            "yaw": -3.1416,
+            "sample_time": 6_700_000 % 6_553_600,
+            "position_std": 0.010,
+            "yaw_std": 0.021,
+        }
+    )
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        (math.nan, 0.0, 0.0, 0, 0.0, 0.0),
+        (0.0, math.inf, 0.0, 0, 0.0, 0.0),
+        (0.0, 0.0, math.nan, 0, 0.0, 0.0),
+        (839.0, 0.0, 0.0, 0, 0.0, 0.0),
+        (0.0, -839.0, 0.0, 0, 0.0, 0.0),
+        (0.0, 0.0, 3.2768, 0, 0.0, 0.0),
+        (0.0, 0.0, 0.0, 0, -0.001, 0.0),
+        (0.0, 0.0, 0.0, 0, 0.0, math.nan),
+    ],
+)
+def test_a_pose_that_does_not_fit_is_not_valid(arguments):
+    assert pose(*arguments)["valid"] == 0
+
+
+def test_a_large_deviation_saturates():
+    assert pose(0.0, 0.0, 0.0, 0, 5.0, 5.0)["position_std"] == pytest.approx(0.255)
+
+
+def test_pose_counters():
+    bench = Bench()
+    for _ in range(20):
+        bench.core.pose(0.0, 0.0, 0.0, 0, 0.0, 0.0)
+        bench.step()
+    assert [message.counter for message in bench.messages("POSE_HEADING")] == [n % 16 for n in range(20)]
+
+
+def test_after_a_pause_nothing_is_caught_up_in_a_burst():
+    bench = Bench()
+    bench.run(10)
+    bench.now_us += 5_000 * MS
+    bench.step()
+    start = bench.now_us
+    assert len(bench.messages("WHEEL_SPEED", since_us=start)) == 1
+    bench.run(20)
+    assert len(bench.messages("WHEEL_SPEED", since_us=start)) == 3
+
+
+def test_a_queue_that_nobody_empties_counts_what_it_drops():
+    core = Bench().core
+    inputs = FirmwareInputs(left_ticks=0, right_ticks=0, left_speed_rad_s=0.0, right_speed_rad_s=0.0)
+    for ms in range(2, 1000):
+        core.step(ms * MS, inputs)
+    assert core.overflowed_frames > 100
+    frames = core.drain()
+    assert len(frames) == 48
+    assert core.drain() == []

@@ -1,0 +1,25 @@
+from pathlib import Path
+
+from firmware_protocol import build_firmware
+
+FIRMWARE = Path(build_firmware.PACKAGE) / "firmware"
+
+
+def test_declarations_are_what_is_left_of_a_header():
+    header = (
+        '#ifndef A\n/* gone;\n */\nextern "C" {\nint kept(void);\n#define LONG \\\n  1\n}\nstruct s {\n int a;\n};\n'
+    )
+    assert " ".join(build_firmware.declarations(header).split()) == "int kept(void); struct s { int a; };"
+
+
+def test_every_source_and_header_is_built():
+    assert {path.name for path in FIRMWARE.glob("*.c")} == set(build_firmware.SOURCES)
+    private = {"core.h", "protocol_constants.h"}
+    assert {path.name for path in FIRMWARE.glob("*.h")} == set(build_firmware.HEADERS) | private
+
+
+def test_paths_are_relative_as_setuptools_wants_them():
+    _, _, _, options = build_firmware.ffi._assigned_source
+    for path in (*options["sources"], *options["include_dirs"], *options["depends"]):
+        assert not Path(path).is_absolute()
+        assert (build_firmware.PACKAGE.parent / path).exists()

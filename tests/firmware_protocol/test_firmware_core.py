@@ -1,0 +1,123 @@
+"""The Python object around the C core; what the core does is tested part by part in firmware/."""
+
+import dataclasses
+
+import msgspec
+import pytest
+
+from firmware_protocol.firmware_core import FirmwareConfig, FirmwareCore, FirmwareInputs, FirmwareOutputs, ResetCause
+from tests.firmware_protocol.bench import CODEC, CONFIG, FAULTS, Bench
+
+STILL = FirmwareInputs(left_ticks=0, right_ticks=0, left_speed_rad_s=0.0, right_speed_rad_s=0.0)
+
+
+def test_first_cycle():
+    assert FirmwareCore(CONFIG).step(1000, STILL) == FirmwareOutputs(
+        left_setpoint_rad_s=0.0,
+        right_setpoint_rad_s=0.0,
+        driver_enabled=False,
+        brake=True,
+        limited=False,
+        state="STANDBY",
+        fault=0,
+        session=0,
+        estop_source="NONE",
+        stop_cause="NONE",
+        blockers=0b1111_1000,
+        accepted_commands=0,
+        last_command_counter=0,
+        rejected_frames=0,
+        watchdog_events=0,
+    )
+
+
+def test_two_cores_share_nothing():
+    first, second = FirmwareCore(CONFIG), FirmwareCore(CONFIG)
+    first.receive(0, 0x080, b"")
+    first.step(1000, STILL)
+    assert first.step(2000, STILL).state == "ESTOP"
+    assert second.step(2000, STILL).state == "STANDBY"
+
+
+def test_the_configuration_is_copied_and_every_value_arrives():
+    config = FirmwareConfig(ticks_per_rev=100, max_wheel_speed_rad_s=3.0, command_timeout_s=0.0204)
+    core = FirmwareCore(config)
+    c_config = core._core.config
+    assert c_config.command_timeout_us == 20_400
+    for field in dataclasses.fields(FirmwareConfig):
+        value = getattr(config, field.name)
+        if isinstance(value, float) and not field.name.endswith("_s"):
+            name = field.name.rsplit("_", 1)[0].removesuffix("_rad")
+            assert getattr(c_config, name) == pytest.approx(value), field.name
+
+
+def test_every_input_arrives():
+    core = FirmwareCore(CONFIG)
+    values = {
+        "left_ticks": 11,
+        "right_ticks": -1,
+        "left_speed_rad_s": 0.5,
+        "right_speed_rad_s": -0.25,
+        "left_current_a": 1.0,
+        "right_current_a": 2.0,
+        "left_temperature_c": 3.0,
+        "right_temperature_c": 4.0,
+        "left_encoder_valid": False,
+        "right_encoder_valid": True,
+        "voltage_v": 24.5,
+        "battery_current_a": 5.0,
+        "battery_temperature_c": 6.0,
+        "tx_error_count": 7,
+        "rx_error_count": 8,
+        "estop_button": True,
+        "estop_line": False,
+        "self_test_failed": True,
+        "reset_cause": ResetCause.BROWN_OUT,
+    }
+    assert set(values) == set(FirmwareInputs.__struct_fields__)
+    core.step(1000, FirmwareInputs(**values))
+    c = core._core.inputs
+    assert list(c.ticks) == [11, 2**32 - 1]
+    assert [*c.wheel_speed, *c.current, *c.temperature] == [0.5, -0.25, 1.0, 2.0, 3.0, 4.0]
+    assert [*c.encoder_valid, c.estop_button, c.estop_line, c.self_test_failed] == [False, True, True, False, True]
+    assert [c.voltage, c.battery_current, c.battery_temperature] == [24.5, 5.0, 6.0]
+    assert [c.tx_error_count, c.rx_error_count, c.reset_cause] == [7, 8, 2]
+
+
+def test_drain_gives_what_was_queued_once():
+    core = FirmwareCore(CONFIG)
+    core.step(1000, STILL)
+    frames = core.drain()
+    assert [CODEC.decode(*frame).name for frame in frames[:4]] == ["HELLO", "BUILD", "LIMITS", "LIMITS"]
+    assert core.drain() == []
+
+
+def test_counters_are_there_by_name():
+    core = FirmwareCore(CONFIG)
+    core.receive(0, 0x100, b"")
+    core.receive(0, 0x7FF, b"")
+    assert core.rejections == dict.fromkeys(core.rejections, 0) | {"LENGTH": 1}
+    assert (core.unknown_frames, core.overflowed_frames) == (1, 0)
+    assert core.challenge == 0
+
+
+def test_more_than_a_can_frame_and_odd_identifiers_are_taken_in():
+    core = FirmwareCore(CONFIG)
+    core.receive(0, 0x100, bytes(256 + 8))
+    core.receive(0, 0x101, bytes(9))
+    core.receive(0, -1, b"")
+    core.receive(0, 2**40, b"")
+    assert core.rejections["LENGTH"] == 2
+
+
+def test_outputs_and_inputs_are_values():
+    with pytest.raises(AttributeError):
+        STILL.left_ticks = 1
+    assert msgspec.structs.replace(STILL, left_ticks=5).left_ticks == 5
+
+
+def test_names_are_the_dbcs():
+    bench = Bench()
+    bench.inputs["left_current_a"] = 100.0
+    bench.run_until("FAULT")
+    assert bench.out.fault == FAULTS["OVER_CURRENT_LEFT"]

@@ -1,0 +1,46 @@
+import sys
+
+import pytest
+
+from firmware_protocol.dbc import load_protocol, packaged_dbc
+from tools import generate_protocol
+from tools.generate_protocol import FIRMWARE, generated_files, main
+
+
+def test_committed_files_are_current():
+    for name, text in generated_files(packaged_dbc()).items():
+        assert (FIRMWARE / name).read_text("utf-8") == text, f"{name}: run python -m tools.generate_protocol"
+
+
+def test_generated_files_do_not_depend_on_the_day_or_on_the_tools_version():
+    for text in generated_files(packaged_dbc()).values():
+        assert "version" not in text.split("*/", 1)[0]
+
+
+def test_a_stale_file_is_found_then_written_then_current(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(generate_protocol, "FIRMWARE", tmp_path)
+    monkeypatch.setattr(sys, "argv", ["generate_protocol", "--check"])
+    assert main() == 1
+    assert "disco_robot.h, disco_robot.c, protocol_constants.h" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+    monkeypatch.setattr(sys, "argv", ["generate_protocol"])
+    assert main() == 0
+    monkeypatch.setattr(sys, "argv", ["generate_protocol", "--check"])
+    assert main() == 0
+    (tmp_path / "disco_robot.c").write_text("")
+    assert main() == 1
+
+
+def test_constants_say_what_the_dbc_says():
+    constants = generated_files(packaged_dbc())["protocol_constants.h"]
+    protocol = load_protocol(packaged_dbc())
+    assert f"#define DISCO_DBC_HASH (0x{protocol.dbc_hash:08X}u)\n" in constants
+    assert "#define DISCO_WHEEL_COMMAND_LEFT_SPEED_SCALE (0.002) /* rad/s */\n" in constants
+    assert "#define DISCO_STATE_ARMED (3u)\n" in constants
+    assert "#define DISCO_HELLO_DATA_ID(major) ((uint16_t)0x140u)\n" in constants
+
+
+def test_two_tables_under_one_name_are_refused():
+    changed = packaged_dbc().replace('VAL_ 353 key 1 "OVER_CURRENT"', 'VAL_ 353 key 1 "OTHER"')
+    with pytest.raises(ValueError, match="signal key has two different value tables"):
+        generated_files(changed)
