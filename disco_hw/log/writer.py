@@ -199,9 +199,15 @@ def run(start: Start) -> int:
         socket.close()
         context.term()
     if os.getppid() != start.parent_pid:
-        with contextlib.suppress(OSError):
-            Path(start.endpoint.removeprefix("ipc://")).parent.rmdir()
+        _remove_runtime_directory(Path(start.endpoint.removeprefix("ipc://")))
     return 0
+
+
+def _remove_runtime_directory(socket_file: Path) -> None:
+    """Clear up after a recorder that cannot any more."""
+    with contextlib.suppress(OSError):
+        socket_file.unlink(missing_ok=True)
+        socket_file.parent.rmdir()
 
 
 def _reason(error: OSError | zmq.ZMQError) -> str:

@@ -1,0 +1,82 @@
+"""Recording processes to kill: a process that records like the daemon does, and waiting for what it brings about."""
+
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+from disco_hw.log.recorder import Recording
+from tests.log.samples import ATTACHMENTS, tick
+
+_RECORD = """
+import sys, time
+from pathlib import Path
+from disco_hw.log.recorder import ProcessRecorder
+from tests.log.processes import recording
+from tests.log.samples import tick
+recorder = ProcessRecorder(recording(Path(sys.argv[1])))
+print(recorder.writer_pid, flush=True)
+for k in range(1, 100_000):
+    now_ns = time.monotonic_ns()
+    recorder.put(now_ns, tick(k, now_ns))
+    time.sleep(0.005)
+"""
+
+
+def recording(path, **changes):
+    given = {"path": path, "robot": "wombot", "attachments": ATTACHMENTS, "flush_s": 0.05}
+    return Recording(**(given | changes))
+
+
+def wait_until(condition, timeout_s=15.0):
+    deadline = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < deadline, "waited in vain"
+        time.sleep(0.01)
+
+
+def alive(pid):
+    """Whether a process runs; one that has ended but was not reaped does not."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[0] != "Z"
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+
+
+def size(path):
+    return path.stat().st_size if path.exists() else 0
+
+
+def drive(recorder, first, count, period_s=0.0):
+    """Put ticks numbered from `first`; return the times at which they were put."""
+    times = []
+    for k in range(first, first + count):
+        times.append(time.monotonic_ns())
+        recorder.put(times[-1], tick(k, times[-1]))
+        time.sleep(period_s)
+    return times
+
+
+class RecordingProcess:
+    """A process that records until it is killed."""
+
+    def __init__(self, path):
+        root = str(Path(__file__).parents[2])
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", _RECORD, str(path)],
+            stdout=subprocess.PIPE,
+            text=True,
+            cwd=root,
+            env=os.environ | {"PYTHONPATH": root},
+        )
+        self.writer_pid = int(self.process.stdout.readline())
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.process.kill()
+        self.process.wait()
+        self.process.stdout.close()
+        wait_until(lambda: not alive(self.writer_pid))
