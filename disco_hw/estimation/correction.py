@@ -60,7 +60,7 @@ class PoseCorrector:
             part = (np.eye(3) - ekf.K) @ np.array(belief.sensitivity).reshape(3, 3)
             covariance = covariance - part @ part.T
             sensitivity = _flat(part)
-        (xx, xy, xt), (yx, yy, yt), (tx, ty, tt) = covariance.tolist()
+        (xx, xy, xt), (_, yy, yt), (_, _, tt) = covariance.tolist()
         innovation_x, innovation_y, innovation_yaw = ekf.y.tolist()
         variance_x, variance_y, variance_yaw = ekf.S.diagonal().tolist()
         return Correction(
@@ -69,10 +69,10 @@ class PoseCorrector:
                 y,
                 wrap(yaw),
                 xx + FLOOR_VARIANCE,
-                0.5 * (xy + yx),
-                0.5 * (xt + tx),
+                xy,
+                xt,
                 yy + FLOOR_VARIANCE,
-                0.5 * (yt + ty),
+                yt,
                 tt + FLOOR_VARIANCE,
                 sensitivity,
             ),

@@ -6,7 +6,7 @@ import msgspec
 
 from disco_hw.config import Estimation
 from disco_hw.estimation.belief import Belief, belief_at, motion_model, predict
-from disco_hw.estimation.correction import PoseCorrector, Triple
+from disco_hw.estimation.correction import Correction, PoseCorrector, Triple
 from disco_hw.estimation.gate import Measurement, PoseReason, gate_limit
 from disco_hw.estimation.odometry import OdometryParameters, Pose, arc
 from disco_hw.estimation.wheels import WheelReading
@@ -98,23 +98,22 @@ class PoseFilter:
         if state.belief is None or state.pose_t_ns is None:
             return self._after(state, measurement, self._fresh(measurement), Judgement(PoseReason.INITIALISED))
         correction = self._corrector.correct(state.belief, measurement)
-        accepted = correction.distance2 <= self._limit
-        candidate, count = None, 0
-        if not accepted:
-            candidate, count = self._candidate(state, measurement)
-        moved_away = count >= self._lockout_count
-        judgement = Judgement(
-            PoseReason.ACCEPTED if accepted else PoseReason.REINITIALISED if moved_away else PoseReason.GATED,
+        if correction.distance2 <= self._limit:
+            return self._after(state, measurement, correction.belief, self._judged(PoseReason.ACCEPTED, correction))
+        candidate, count = self._candidate(state, measurement)
+        if count >= self._lockout_count:
+            return self._after(state, measurement, candidate, self._judged(PoseReason.REINITIALISED, correction))
+        judgement = self._judged(PoseReason.GATED, correction)
+        return msgspec.structs.replace(state, candidate=candidate, candidate_count=count, judgement=judgement)
+
+    def _judged(self, reason: PoseReason, correction: Correction) -> Judgement:
+        return Judgement(
+            reason,
             correction.innovation,
             correction.innovation_variance,
             correction.distance2,
             correction.distance2 / self._limit,
         )
-        if accepted:
-            return self._after(state, measurement, correction.belief, judgement)
-        if moved_away and candidate is not None:
-            return self._after(state, measurement, candidate, judgement)
-        return msgspec.structs.replace(state, candidate=candidate, candidate_count=count, judgement=judgement)
 
     def _fresh(self, measurement: Measurement) -> Belief:
         return belief_at(measurement.pose, measurement.position_variance, measurement.yaw_variance, self._model)

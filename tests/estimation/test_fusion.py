@@ -189,7 +189,7 @@ def test_each_sample_is_counted_once():
         pose(14, 2000.0),
         pose(15, math.nan),
         pose(900),
-        pose(-1),
+        pose(-1, std=0.0),
     ]
     for sample in poses:
         fusion.add_pose(sample, 500 * MS)

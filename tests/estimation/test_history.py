@@ -107,6 +107,19 @@ def test_a_pose_beyond_the_newest_reading_is_run_again_on_measured_wheels():
     assert extrapolated.right_rad != late._states[-2].right_rad
 
 
+def test_a_pose_at_the_stamp_of_a_reading_comes_after_it_whichever_arrives_first():
+    assert run([10, near(5.0), near(20.0), 20, 30]) == run([10, near(5.0), 20, near(20.0), 30])
+
+
+def test_a_pose_inside_a_gap_shares_its_doubt():
+    buffer = buffer_with([0, 10])
+    buffer.add_pose(near(10.0))
+    buffer.add_wheels(reading(1010, gap=True))
+    update = buffer.add_pose(near(510.0))
+    half_m = 0.061 * (3.25 * 0.5 + 0.505**2)
+    assert update.innovation_variance[0] > (0.25 * half_m * 0.9) ** 2
+
+
 def test_a_pose_older_than_the_buffer_is_refused():
     buffer = buffer_with([10 * k for k in range(251)])
     assert buffer.add_pose(measured(1499.0)) is PoseReason.TOO_OLD
@@ -126,6 +139,9 @@ def test_a_repeated_stamp_is_refused():
     before = buffer.head()
     assert buffer.add_pose(measured(10.0, 5.0)) is PoseReason.DUPLICATE
     assert buffer.head() == before
+    assert isinstance(buffer.add_pose(near(30.0)), Judgement)
+    buffer.add_wheels(reading(30))
+    assert buffer.add_pose(near(30.0)) is PoseReason.DUPLICATE
 
 
 def test_poses_far_beyond_the_newest_reading_have_no_odometry():
