@@ -87,8 +87,8 @@ class Arming:
 
     def reset(self, why: str) -> None:
         """Void everything agreed with the robot: the link or the robot is another one."""
-        if self.wanted is not Request.STANDBY or self._opened:
-            self.note = why
+        if self.wanted is Request.ARM:
+            self.note = f"disarmed: {why}"
         self._void_session()
         self._set_standby()
         self._robot_state, self._robot_session = "BOOT", 0
@@ -107,7 +107,7 @@ class Arming:
         if self.armed:
             self._was_armed = True
         elif self._was_armed or (self.wanted is Request.ARM and state in _LATCHED):
-            self._give_up(f"the robot left ARMED: {words.stop_cause(stop_cause)}" if self._was_armed else "")
+            self._give_up(f"the robot disarmed itself: {words.stop_cause(stop_cause)}" if self._was_armed else "")
         if self.wanted is Request.RESET and before in _LATCHED and state not in _LATCHED:
             self._set_standby()
 

@@ -9,7 +9,7 @@ from firmware_protocol.e2e import COUNTER_MODULUS, E2EReceiver, E2EStatus
 TIMEOUT_NS = 500_000_000
 SLOW_TIMEOUT_NS = 5_000_000_000
 _SLOW = frozenset({"POWER", "LINK_HEALTH"})
-# Asked for one by one, so that there is no row of good frames to wait for; each says by itself what it answers.
+# Asked for one by one, so that there is no row of good frames to wait for; hearing one twice does no harm.
 _ANSWERS = frozenset({"HELLO", "BUILD", "LIMITS", "TIME_RESPONSE", "PARAM_RESPONSE"})
 _SENDERS = {layout.name: layout.sender for layout in PROTOCOL.messages}
 _USABLE = (E2EStatus.OK, E2EStatus.OK_SOME_LOST)
@@ -49,17 +49,16 @@ class FrameReception:
             self.foreign = decoded.name
             self.unknown_id += 1
             return None
-        receiver = self._receiver(decoded.name)
-        status = receiver.check(decoded.counter, True, received.t_ns)
-        self._count_lost(decoded, status)
-        if status in (E2EStatus.REPEATED, E2EStatus.WRONG_SEQUENCE):
-            self.rejected_sequence += 1
-        if decoded.name in _ANSWERS:
-            believed = status is not E2EStatus.REPEATED
-        else:
-            believed = receiver.qualified and status in _USABLE
-        self.accepted += believed
-        return decoded if believed else None
+        if decoded.name not in _ANSWERS:
+            receiver = self._receiver(decoded.name)
+            status = receiver.check(decoded.counter, True, received.t_ns)
+            self._count_lost(decoded, status)
+            if status in (E2EStatus.REPEATED, E2EStatus.WRONG_SEQUENCE):
+                self.rejected_sequence += 1
+            if not (receiver.qualified and status in _USABLE):
+                return None
+        self.accepted += 1
+        return decoded
 
     def _receiver(self, name: str) -> E2EReceiver:
         receiver = self._receivers.get(name)

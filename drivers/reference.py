@@ -104,7 +104,7 @@ class ReferenceDriver:
         status, note = self._status, self._arming.note
         match self.state:
             case DriverState.DISCONNECTED:
-                return note or "the link is down"
+                return f"the link is down; {note}" if note else "the link is down"
             case DriverState.REFUSED:
                 return self._handshake.refusal or ""
             case DriverState.HANDSHAKE:
@@ -155,12 +155,12 @@ class ReferenceDriver:
 
     def link_up(self, now_ns: int) -> None:
         """The medium has come up (again): start the handshake; any session is void."""
-        self._restart(now_ns, "the link was interrupted")
+        self._restart(now_ns, "the link was lost")
         self._link_is_up = True
 
     def link_down(self, now_ns: int) -> None:
         """The medium is gone: any session is void."""
-        self._restart(now_ns, "the link is down")
+        self._restart(now_ns, "the link was lost")
         self._link_is_up = False
 
     def request(self, request: Request) -> None:
@@ -231,7 +231,7 @@ class ReferenceDriver:
         frames = []
         transmission = self._transmission
         refused = self._handshake.refusal is not None
-        introduced = self._host_accepted and self.capabilities is not None
+        introduced = self._host_accepted and self.capabilities is not None and not refused
         hello_period_ns = REFUSED_HELLO_PERIOD_NS if refused else HELLO_PERIOD_NS
         if not introduced and transmission.due("HELLO_REQUEST", now_ns, hello_period_ns):
             frames.append(
@@ -299,7 +299,10 @@ class ReferenceDriver:
         capabilities = self.capabilities
         if capabilities is not None and capabilities != before:
             self._telemetry.configure(capabilities)
-            self._events.append(f"handshake complete: {capabilities}")
+            self._events.append(
+                f"handshake complete: firmware {capabilities.firmware_version}, board {capabilities.board_id}, "
+                f"protocol {capabilities.protocol_major}.{capabilities.protocol_minor}, DBC {capabilities.dbc_hash:08x}"
+            )
         if self._handshake.refusal not in (None, refusal):
             self._arming.reset("the handshake was refused")
             self._events.append(f"handshake refused: {self._handshake.refusal}")

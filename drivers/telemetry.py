@@ -17,6 +17,7 @@ POSE_TIME_MODULUS_US = 100 << 16
 OLDEST_WHEEL_US = 300_000.0
 OLDEST_POSE_US = 3_000_000.0
 DISTRUST_CLOCK_AFTER = 20
+RECEPTION_JITTER_US = 50_000.0
 
 
 class Telemetry:
@@ -65,7 +66,7 @@ class Telemetry:
             self.implausible_values += 1
             return None
         sample_us = speed["sample_time"]
-        t_us = self._unwrapped_us(sample_us, received_ns)
+        t_us = self._plausible_us(sample_us, received_ns)
         angles = self._ticks.update(int(ticks["left_ticks"]), int(ticks["right_ticks"]), t_us)
         if angles is None:
             self.implausible_ticks += 1
@@ -98,16 +99,21 @@ class Telemetry:
             yaw_std_rad=heading["yaw_std"],
         )
 
-    def _unwrapped_us(self, sample_us: float, received_ns: int) -> int:
-        """Device time of wheel samples without wraps, relative to the first; receptions tell how many wraps passed."""
+    def _plausible_us(self, sample_us: float, received_ns: int) -> int:
+        """Time of a wheel sample, relative to the first, for judging its motion; it does not wrap.
+
+        It advances as the sample times say, but no more than the receptions allow: the sample times of a device that
+        has restarted say anything.
+        """
         if self._wheel_time is None:
             self._wheel_time = (0, received_ns, sample_us)
             return 0
         last_us, last_received_ns, last_sample_us = self._wheel_time
-        difference_us = (sample_us - last_sample_us) % WHEEL_TIME_MODULUS_US
+        elapsed_us = (sample_us - last_sample_us) % WHEEL_TIME_MODULUS_US
         since_us = (received_ns - last_received_ns) / 1000
-        wraps = max(0, round((since_us - difference_us) / WHEEL_TIME_MODULUS_US))
-        t_us = last_us + round(difference_us) + wraps * WHEEL_TIME_MODULUS_US
+        wraps = max(0, round((since_us - elapsed_us) / WHEEL_TIME_MODULUS_US))
+        elapsed_us = min(elapsed_us + wraps * WHEEL_TIME_MODULUS_US, since_us + RECEPTION_JITTER_US)
+        t_us = last_us + round(max(elapsed_us, 0.0))
         self._wheel_time = (t_us, received_ns, sample_us)
         return t_us
 

@@ -20,8 +20,8 @@ class ReferenceRobot:
         self.speed = [0.0, 0.0]
         self.first_ticks = first_ticks
         self.inputs = {}
+        self.pushed = 0.0
         self.outputs = None
-        self.sample_times = {}
         self._last_ns = None
 
     @property
@@ -61,7 +61,10 @@ class ReferenceRobot:
                 **self.inputs,
             ),
         )
-        self.speed = [self.outputs.left_setpoint_rad_s, self.outputs.right_setpoint_rad_s]
+        self.speed = [
+            self.outputs.left_setpoint_rad_s + self.pushed,
+            self.outputs.right_setpoint_rad_s + self.pushed,
+        ]
 
     def drain(self):
         return [Frame(can_id, data) for can_id, data in self.core.drain()]

@@ -1,0 +1,208 @@
+import itertools
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers.arming import ARMING_TIMEOUT_NS, SESSION_REFUSED_AFTER_NS, Arming, challenge_answer
+from drivers.types import Request
+
+HASH = 0xCAFE1234
+
+
+def arming(draw=None):
+    return Arming(HASH, draw or itertools.count(10).__next__)
+
+
+def report(arming, state, session=None, stop_cause="NONE", reject_reason="NONE"):
+    arming.take_status(state, arming.session if session is None else session, stop_cause, reject_reason)
+
+
+def armed():
+    """An arming that has gone all the way."""
+    one = arming()
+    report(one, "STANDBY", 0)
+    one.request(Request.ARM)
+    one.step(0)
+    report(one, "READY")
+    one.take_session(0x1234, one.session, (), 0)
+    report(one, "ARMED")
+    assert one.armed
+    return one
+
+
+def test_the_way_up_step_by_step():
+    one = arming()
+    report(one, "STANDBY", 0)
+    assert one.host_state().request == "STANDBY"
+    assert one.session == 0, "no session before one is wanted"
+    one.request(Request.ARM)
+    one.step(0)
+    assert (one.host_state().request, one.host_state().session) == ("READY", one.session)
+    assert one.session != 0
+    assert not one.needs_zeros
+    report(one, "READY")
+    assert one.host_state().request == "READY", "no ARM without an answer to the challenge"
+    one.take_session(0x1234, one.session, ("CHALLENGE", "ZERO_COMMANDS"), 0)
+    assert one.host_state().request == "ARM"
+    assert one.host_state().challenge_answer == challenge_answer(0x1234, one.session, HASH)
+    assert one.needs_zeros
+    assert not one.armed
+    report(one, "ARMED")
+    assert one.armed
+    assert not one.needs_zeros
+
+
+def test_the_answer_to_the_challenge_is_the_firmwares():
+    """CRC-16/CCITT-FALSE over 34 12 07 34 12 fe ca, by a bitwise register of its own."""
+    register = 0xFFFF
+    for byte in bytes.fromhex("3412073412feca"):
+        register ^= byte << 8
+        for _ in range(8):
+            register = (register << 1 ^ (0x1021 if register & 0x8000 else 0)) & 0xFFFF
+    assert challenge_answer(0x1234, 7, HASH) == register
+
+
+def test_a_challenge_of_another_session_is_not_answered():
+    one = arming()
+    report(one, "STANDBY", 0)
+    one.request(Request.ARM)
+    one.step(0)
+    one.take_session(0x1234, one.session + 1, (), 0)
+    report(one, "READY")
+    assert one.host_state().request == "READY"
+
+
+@pytest.mark.parametrize("request_", [Request.STANDBY, Request.READY, Request.RESET])
+def test_asking_for_less_ends_the_session_at_once(request_):
+    one = armed()
+    spent = one.session
+    one.request(request_)
+    assert not one.armed
+    assert one.host_state().request == "STANDBY"
+    assert one.host_state().session == spent, "so that the robot's stop cause is the request, not a changed session"
+    one.request(Request.ARM)
+    assert not one.armed, "the old session cannot be taken up again"
+    assert one.host_state().request == "STANDBY"
+    report(one, "STOPPING", 0)
+    report(one, "STANDBY", 0)
+    one.step(0)
+    assert one.session not in (0, spent)
+    assert one.host_state().request == "READY"
+
+
+@pytest.mark.parametrize("state", ["STOPPING", "STANDBY", "FAULT", "ESTOP", "BOOT", "READY"])
+def test_arm_is_consumed_when_the_robot_leaves_armed(state):
+    one = armed()
+    report(one, state, 0, stop_cause="COMMAND_TIMEOUT")
+    assert one.wanted is Request.STANDBY
+    assert "no wheel command arrived in time" in one.note
+    for later in ("STANDBY", "READY", "ARMED"):
+        report(one, later, 0)
+        one.step(0)
+        assert one.host_state().request == "STANDBY"
+        assert not one.armed
+        assert not one.needs_zeros
+
+
+def test_arm_is_consumed_when_the_link_or_robot_is_another_one():
+    one = armed()
+    one.reset("the link was lost")
+    assert one.wanted is Request.STANDBY
+    assert one.session == 0
+    assert one.note == "disarmed: the link was lost"
+    report(one, "ARMED", 17)
+    assert not one.armed
+    report(one, "STANDBY", 0)
+    assert one.host_state().request == "STANDBY"
+
+
+def test_a_robot_armed_in_another_session_is_not_ours():
+    one = arming()
+    report(one, "ARMED", 99)
+    one.request(Request.ARM)
+    one.step(0)
+    assert not one.armed
+    assert one.host_state().session == 0
+
+
+def test_arming_that_takes_too_long_is_given_up_with_the_robots_reason():
+    one = arming()
+    report(one, "STANDBY", 0)
+    one.request(Request.ARM)
+    one.step(0)
+    report(one, "READY", reject_reason="CHALLENGE")
+    one.take_session(1, one.session, ("CHALLENGE", "WHEELS_MOVING"), 0)
+    one.step(ARMING_TIMEOUT_NS)
+    assert one.wanted is Request.ARM
+    one.step(ARMING_TIMEOUT_NS + 1)
+    assert one.wanted is Request.STANDBY
+    for words in ("not armed within 1.5 s", "challenge is not answered", "wheels are turning", "was wrong"):
+        assert words in one.note
+    report(one, "ARMED")
+    assert not one.armed, "an arming that comes too late is not taken"
+    assert one.host_state().request == "STANDBY"
+
+
+@pytest.mark.parametrize("state", ["FAULT", "ESTOP"])
+def test_reset_is_held_until_the_robot_has_left_its_latch(state):
+    one = arming()
+    report(one, state, 0)
+    one.request(Request.RESET)
+    report(one, state, 0)
+    assert one.host_state().request == "RESET"
+    report(one, "STANDBY", 0)
+    assert one.wanted is Request.STANDBY
+    report(one, state, 0)
+    assert one.host_state().request == "STANDBY", "a later stop is not reset by an earlier request"
+
+
+@pytest.mark.parametrize("state", ["FAULT", "ESTOP"])
+def test_arm_is_consumed_by_a_latch(state):
+    one = arming()
+    report(one, "STANDBY", 0)
+    one.request(Request.ARM)
+    report(one, state, 0)
+    assert one.wanted is Request.STANDBY
+
+
+@given(st.lists(st.integers(0, 2**64), min_size=1, max_size=40), st.integers(0, 255))
+def test_a_session_is_never_zero_nor_the_last_nor_the_robots(draws, foreign):
+    one = arming(itertools.cycle(draws).__next__)
+    last = 0
+    for _ in range(20):
+        report(one, "READY", foreign)
+        one.request(Request.READY)
+        one.step(0)
+        assert 1 <= one.session <= 255
+        assert one.session not in (last, foreign)
+        last = one.session
+        one.reset("")
+
+
+def test_a_session_that_the_robot_has_had_before_is_replaced():
+    one = arming()
+    report(one, "STANDBY", 0)
+    one.request(Request.READY)
+    one.step(0)
+    refused = one.session
+    one.take_session(1, 0, ("SESSION",), SESSION_REFUSED_AFTER_NS)
+    assert one.session == refused
+    one.take_session(1, 0, ("SESSION",), SESSION_REFUSED_AFTER_NS + 1)
+    one.step(SESSION_REFUSED_AFTER_NS + 1)
+    assert one.session not in (0, refused)
+
+
+def test_a_ready_session_serves_the_arming_that_follows():
+    one = arming()
+    report(one, "STANDBY", 0)
+    one.request(Request.READY)
+    one.step(0)
+    report(one, "READY")
+    assert one.ready
+    session = one.session
+    one.request(Request.READY)
+    one.request(Request.ARM)
+    one.step(0)
+    assert one.session == session
+    assert one.needs_zeros

@@ -1,0 +1,116 @@
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers.reception import SLOW_TIMEOUT_NS, TIMEOUT_NS, FrameReception
+from drivers.types import Frame, ReceivedFrame
+from firmware_protocol.codec import PROTOCOL, Codec
+
+CODEC = Codec()
+MS = 1_000_000
+
+
+def ticks(counter, t_ns=0):
+    encoded = CODEC.encode("WHEEL_TICKS", counter, left_ticks=1, right_ticks=2)
+    return ReceivedFrame(t_ns, Frame(encoded.can_id, encoded.data))
+
+
+def received(name, counter=0, t_ns=0, **signals):
+    encoded = CODEC.encode(name, counter, **signals)
+    return ReceivedFrame(t_ns, Frame(encoded.can_id, encoded.data))
+
+
+def qualified():
+    reception = FrameReception(CODEC)
+    for counter in range(4):
+        reception.accept(ticks(counter))
+    return reception
+
+
+def test_a_sender_is_believed_after_three_good_frames_in_a_row():
+    reception = FrameReception(CODEC)
+    believed = [reception.accept(ticks(counter)) is not None for counter in range(5)]
+    assert believed == [False, False, False, True, True]
+    assert reception.accepted == 2
+
+
+def test_answers_are_believed_at_once_whatever_their_counter():
+    """A controller flashed meanwhile counts from zero again; its answer must not pass for a repetition."""
+    reception = FrameReception(CODEC)
+    hello = received("BUILD", dbc_hash=1, board_id=2)
+    assert reception.accept(hello).values["board_id"] == 2
+    assert reception.accept(hello) is not None
+    assert reception.rejected_sequence == 0
+
+
+def test_lost_repeated_and_out_of_sequence():
+    reception = qualified()
+    assert reception.accept(ticks(6)) is not None
+    assert reception.lost == 2
+    assert reception.accept(ticks(6)) is None
+    assert reception.accept(ticks(12)) is None
+    assert reception.rejected_sequence == 2
+    assert reception.lost == 7
+    assert reception.accept(ticks(13)) is not None
+
+
+def test_a_damaged_frame_is_counted_and_many_cost_the_trust():
+    reception = qualified()
+    good = ticks(4)
+    damaged = ReceivedFrame(0, Frame(good.frame.can_id, good.frame.data[:-1] + b"\xff"))
+    for _ in range(5):
+        assert reception.accept(damaged) is None
+    assert reception.rejected_crc == 5
+    assert [reception.accept(ticks(counter)) is not None for counter in range(4, 8)] == [False, False, True, True]
+
+
+def test_wrong_length_unknown_page_and_unknown_identifier():
+    reception = FrameReception(CODEC)
+    reception.accept(ReceivedFrame(0, Frame(CODEC.can_id("WHEEL_TICKS"), bytes(7))))
+    reception.accept(ReceivedFrame(0, Frame(0x7FF, bytes(8))))
+    assert reception.rejected_length == 1
+    assert reception.unknown_id == 1
+
+
+def test_what_only_a_host_sends_betrays_another_host():
+    reception = FrameReception(CODEC)
+    assert reception.foreign is None
+    assert reception.accept(received("TIME_REQUEST", sequence=1)) is None
+    assert reception.foreign == "TIME_REQUEST"
+    reception.accept(ReceivedFrame(0, Frame(CODEC.can_id("ESTOP"), b"")))
+    assert reception.foreign == "ESTOP"
+    reception.reset()
+    assert reception.foreign is None
+
+
+def test_trust_ends_with_silence_and_at_a_new_link():
+    reception = qualified()
+    assert reception.accept(ticks(4, TIMEOUT_NS)) is not None
+    assert reception.accept(ticks(5, 2 * TIMEOUT_NS + 1)) is None
+    reception = qualified()
+    reception.reset()
+    assert reception.accept(ticks(4)) is None
+
+
+def test_slow_messages_may_be_silent_for_longer():
+    reception = FrameReception(CODEC)
+    values = {"voltage": 24.0, "current": 1.0, "temperature": 20}
+    frames = [received("POWER", n, n * SLOW_TIMEOUT_NS // 2, **values) for n in range(4)]
+    assert [reception.accept(frame) is not None for frame in frames] == [False, False, False, True]
+
+
+@given(
+    st.lists(
+        st.tuples(
+            st.one_of(st.integers(0, 0x7FF), st.sampled_from([layout.can_id for layout in PROTOCOL.messages])),
+            st.binary(max_size=64),
+        ),
+        max_size=30,
+    )
+)
+def test_nothing_that_arrives_makes_it_raise_and_everything_is_counted(frames):
+    reception = FrameReception(CODEC)
+    for can_id, data in frames:
+        reception.accept(ReceivedFrame(0, Frame(can_id, data)))
+    counted = reception.rejected_crc + reception.rejected_length + reception.unknown_id
+    assert counted + reception.rejected_sequence + reception.accepted <= len(frames)
+    assert counted >= sum(can_id not in {layout.can_id for layout in PROTOCOL.messages} for can_id, _ in frames)

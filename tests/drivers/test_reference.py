@@ -1,0 +1,315 @@
+"""What is particular to the reference driver; the rest is in the conformance suite."""
+
+import itertools
+from collections import Counter
+from dataclasses import replace
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from drivers.reference import ESTOP_REPEATS, ReferenceDriver
+from drivers.types import DriverState, Frame, ReceivedFrame, Request, WheelCommand
+from firmware_protocol import e2e
+from firmware_protocol.codec import PROTOCOL, Codec
+from tests.drivers.bench import MS, START_NS, Bench
+from tests.drivers.reference_robot import CONFIG, ReferenceRobot
+
+CODEC = Codec()
+STILL = (DriverState.STANDBY, DriverState.READY)
+
+
+def make_driver():
+    return ReferenceDriver(CODEC, itertools.count(3).__next__)
+
+
+def make_bench(robot=None, **options):
+    return Bench(make_driver(), robot or ReferenceRobot(), **options)
+
+
+def test_says_what_it_waits_for():
+    driver = make_driver()
+    assert driver.detail == "the link is down"
+    assert driver.transmit(0, None) == ()
+    driver.link_up(0)
+    assert driver.state is DriverState.HANDSHAKE
+    assert "no answer from the robot" in driver.detail
+    driver.request(Request.ARM)
+    bench = make_bench()
+    bench.driver = driver
+    bench.run_until(*STILL)
+    assert "not arming: no answer from the robot" in driver.detail
+    bench.run(1.0)
+    assert not bench.robot.armed, "a request made too early is not remembered"
+
+
+def test_another_major_version_is_refused():
+    bench = make_bench(ReferenceRobot(replace(CONFIG, protocol_major=2)))
+    bench.run_until(DriverState.REFUSED)
+    assert "the robot speaks protocol 2.0, this host 1.0" in bench.driver.detail
+    bench.driver.request(Request.ARM)
+    bench.run(3.0, (1.0, 1.0))
+    assert bench.driver.state is DriverState.REFUSED
+    assert bench.largest_speed == 0.0
+
+
+def test_another_dbc_is_refused_but_telemetry_is_shown():
+    bench = make_bench(ReferenceRobot(replace(CONFIG, dbc_hash=0x0BADCAFE)))
+    bench.run_until(DriverState.REFUSED)
+    assert "0badcafe" in bench.driver.detail
+    assert f"{CODEC.dbc_hash:08x}" in bench.driver.detail
+    bench.driver.request(Request.ARM)
+    bench.run(3.0, (1.0, 1.0))
+    assert bench.driver.state is DriverState.REFUSED
+    assert bench.largest_speed == 0.0
+    assert len(bench.wheels) > 100
+    assert any("handshake refused" in event for event in bench.events)
+
+
+def test_a_robot_flashed_meanwhile_is_taken():
+    bench = make_bench(ReferenceRobot(replace(CONFIG, dbc_hash=0x0BADCAFE)))
+    bench.run_until(DriverState.REFUSED)
+    bench.robot = ReferenceRobot(boot_ns=bench.now_ns)
+    bench.run_until(*STILL, timeout_s=6.0)
+
+
+@pytest.mark.parametrize("rate_hz", [20, 50, 100])
+def test_arms_at_every_control_rate(rate_hz):
+    bench = make_bench(rate_hz=rate_hz)
+    bench.arm()
+    bench.run(2.0, (3.0, 2.0))
+    assert bench.driver.state is DriverState.ARMED
+    assert bench.robot.core.rejections["STATE"] <= 2
+
+
+def test_each_arming_has_a_session_of_its_own():
+    bench = make_bench()
+    sessions = []
+    for _ in range(4):
+        bench.arm()
+        sessions.append(bench.robot.session)
+        bench.driver.request(Request.STANDBY)
+        bench.run(0.3)
+    assert 0 not in sessions
+    assert len(set(sessions)) == 4
+
+
+@pytest.mark.parametrize("jitter_ms", [0.0, 3.0])
+@pytest.mark.parametrize("skew", [0.0, 80e-6, -80e-6])
+def test_samples_carry_the_time_of_their_measurement(jitter_ms, skew):
+    """Over a link that delays every frame by 2 ms and some; the robot samples in each of its 1 ms cycles."""
+
+    def delay_ns(generator):
+        return 2 * MS + generator.expovariate(1.0) * jitter_ms * MS
+
+    robot = ReferenceRobot(boot_ns=START_NS - 123_456_789, skew=skew)
+    bench = make_bench(robot, delay_ns=delay_ns)
+    bench.arm()
+    bench.command = WheelCommand(4.0, -4.0, 0.1)
+    bench.run(4.0)
+    bench.readings.clear()
+    true_angle = {}
+    for number in range(3000):
+        if number % 40 == 0:
+            latency_ms = 150
+            sample_us = robot.us(bench.now_ns - latency_ms * MS)
+            robot.core.pose(1.0, 2.0, 0.5, sample_us, 0.01, 0.02)
+        true_angle[bench.now_ns] = robot.angle[0]
+        bench.step()
+    assert bench.driver.state is DriverState.ARMED
+    assert bench.driver.synced
+    tolerance_ns = (0.7 + 0.7 * jitter_ms) * MS
+    offset = bench.wheels[0].left_angle_rad - true_angle[round(bench.wheels[0].t_ns / MS) * MS]
+    resolution = 2 * 3.15 / CONFIG.ticks_per_rev
+    for sample in bench.wheels:
+        truth = true_angle.get(round(sample.t_ns / MS) * MS)
+        if truth is not None:
+            assert sample.left_angle_rad - offset == pytest.approx(
+                truth, abs=4.0 * tolerance_ns * 1e-9 + 3 * resolution
+            )
+    assert len(bench.poses) > 60
+    for pose in bench.poses:
+        age_ns = (pose.t_ns - START_NS) % (40 * MS)
+        sent_ns = (bench.poses[0].t_ns - START_NS) % (40 * MS)
+        assert min(abs(age_ns - sent_ns), 40 * MS - abs(age_ns - sent_ns)) < 2 * tolerance_ns
+        assert 150 * MS < pose.received_ns - pose.t_ns < 165 * MS + 12 * jitter_ms * MS
+
+
+def test_a_restarted_robot_is_noticed_and_moves_nothing():
+    bench = make_bench(ReferenceRobot(boot_ns=START_NS - 10**9))
+    bench.arm()
+    bench.run(3.0, (3.0, 3.0))
+    angle = bench.wheels[-1].left_angle_rad
+    bench.robot = ReferenceRobot(boot_ns=bench.now_ns)
+    bench.largest_speed = 0.0
+    bench.run(3.0)
+    assert bench.driver.state in STILL
+    assert bench.largest_speed == 0.0
+    assert any("restarted" in event or "contradict" in event for event in bench.events)
+    assert bench.wheels[-1].left_angle_rad == pytest.approx(angle, abs=0.05), "the encoder's new zero is no motion"
+    assert bench.driver.synced
+    bench.arm()
+
+
+def test_a_robot_that_falls_silent_starts_a_new_handshake():
+    bench = make_bench()
+    bench.arm()
+    bench.run(1.0, (3.0, 3.0))
+    bench.loses = lambda _: True
+    bench.run_until(DriverState.HANDSHAKE, timeout_s=0.6)
+    assert bench.driver.capabilities is None
+    bench.loses = None
+    bench.largest_speed = 0.0
+    bench.run_until(*STILL)
+    assert bench.driver.detail == "disarmed: the robot fell silent"
+    bench.run(2.0)
+    assert bench.largest_speed == 0.0
+
+
+def test_a_lossy_link_does_not_disarm():
+    """Three frames in a row may not be lost at 50 Hz: the fourth is out of sequence and the fifth comes too late."""
+    bench = make_bench(loses=lambda generator: generator.random() < 0.03)
+    bench.arm()
+    bench.run(10.0, (3.0, 2.0))
+    assert bench.driver.state is DriverState.ARMED
+    assert bench.driver.stats.lost_frames > 30
+    assert bench.driver.stats.implausible_ticks == 0
+    assert bench.wheels[-1].left_angle_rad == pytest.approx(bench.robot.angle[0], abs=0.2)
+
+
+def test_arming_is_given_up_with_the_robots_own_reason():
+    bench = make_bench()
+    bench.run_until(*STILL)
+    bench.robot.pushed = 1.0
+    bench.driver.request(Request.ARM)
+    assert bench.driver.state is DriverState.ARMING
+    bench.run_until(*STILL, timeout_s=1.6)
+    assert "not armed within 1.5 s" in bench.driver.detail
+    assert "the wheels are turning" in bench.driver.detail
+    bench.robot.pushed = 0.0
+    bench.run(2.0)
+    assert not bench.robot.armed
+
+
+def test_a_second_host_is_pointed_out_once():
+    bench = make_bench()
+    bench.run_until(*STILL)
+    other = CODEC.encode("TIME_REQUEST", 0, sequence=1)
+    for _ in range(3):
+        bench.inject_to_host(*other)
+        bench.run(0.1)
+    assert [event for event in bench.events if "another host" in event] == [
+        "another host is on the link: it sends TIME_REQUEST; disconnect it"
+    ]
+
+
+def test_a_second_host_that_commands_motion_stops_the_robot_but_never_drives_it():
+    bench = make_bench()
+    bench.arm()
+    bench.run(0.5, (1.0, 1.0))
+    for counter in range(400):
+        foreign = CODEC.encode(
+            "WHEEL_COMMAND", counter, mode="SPEED", left_speed=8, right_speed=8, valid_for=0.1, session=200
+        )
+        bench.inject_to_robot(*foreign)
+        bench.inject_to_host(*foreign)
+        bench.run(0.005)
+    assert bench.largest_speed < 1.01
+    assert bench.driver.state is not DriverState.ARMED
+    assert "another host is on the link: it sends WHEEL_COMMAND; disconnect it" in bench.events
+
+
+def names(frames):
+    return [CODEC.decode(outgoing.frame.can_id, outgoing.frame.data).name for outgoing in frames]
+
+
+def test_house_keeping_is_sent_as_often_as_it_should():
+    driver, robot = make_driver(), ReferenceRobot()
+    counts = []
+    bench = Bench(driver, robot)
+    transmit = driver.transmit
+    sent = []
+    bench.driver = type("Spy", (), {"__getattr__": lambda _, name: getattr(driver, name)})()
+    bench.driver.transmit = lambda now_ns, command: sent.extend(frames := transmit(now_ns, command)) or frames
+    for _ in range(4):
+        sent.clear()
+        bench.run(1.0)
+        counts.append(Counter(names(sent)))
+    assert counts[0]["TIME_REQUEST"] == 5
+    assert counts[3]["TIME_REQUEST"] == 1
+    assert counts[0]["HELLO_REQUEST"] in (1, 2)
+    assert counts[3]["HELLO_REQUEST"] == 0
+    assert all(10 <= count["HOST_STATE"] <= 13 for count in counts)
+    assert all(count["WHEEL_COMMAND"] == 0 for count in counts)
+
+
+def test_emergency_stop_frames():
+    driver = make_driver()
+    frames = driver.estop(1_000)
+    assert len(frames) == ESTOP_REPEATS == 3
+    assert {outgoing.frame.can_id for outgoing in frames} == {0x080}
+    assert all(outgoing.deadline_ns > 1_000 + 100 * MS for outgoing in frames)
+
+
+def test_a_command_leaves_in_time_or_not_at_all():
+    bench = make_bench()
+    bench.arm()
+    (command,) = (
+        outgoing
+        for outgoing in bench.driver.transmit(bench.now_ns, WheelCommand(1.0, 1.0, 0.1))
+        if outgoing.frame.can_id == CODEC.can_id("WHEEL_COMMAND")
+    )
+    assert command.deadline_ns == bench.now_ns + 50 * MS
+    values = CODEC.decode(command.frame.can_id, command.frame.data).values
+    assert values["valid_for"] == pytest.approx(0.1)
+    assert values["session"] == bench.robot.session
+    with pytest.raises(ValueError, match="left_speed"):
+        bench.driver.transmit(bench.now_ns, WheelCommand(70.0, 0.0, 0.1))
+
+
+def protected(can_id, payload):
+    """A frame with a right checksum and any content."""
+    (layout,) = [layout for layout in PROTOCOL.messages if layout.can_id == can_id]
+    if layout.data_id is None:
+        return Frame(can_id, payload[:1])
+    body = payload[1:]
+    return Frame(can_id, bytes((e2e.crc8(body, layout.data_id),)) + body)
+
+
+CAN_IDS = [layout.can_id for layout in PROTOCOL.messages]
+ANY_FRAME = st.builds(Frame, st.integers(0, 0x7FF), st.binary(max_size=64))
+PROTECTED_FRAME = st.builds(protected, st.sampled_from(CAN_IDS), st.binary(min_size=8, max_size=8))
+ACTION = st.one_of(
+    st.tuples(st.just("receive"), st.lists(st.one_of(ANY_FRAME, PROTECTED_FRAME), max_size=10)),
+    st.tuples(st.just("request"), st.sampled_from(Request)),
+    st.tuples(st.just("transmit"), st.sampled_from([None, WheelCommand(1.0, -1.0, 0.1)])),
+    st.tuples(st.just("link"), st.booleans()),
+    st.tuples(st.just("wait"), st.integers(0, 5_000 * MS)),
+)
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.lists(ACTION, max_size=60))
+def test_whatever_comes_nothing_is_raised_and_nothing_moves_unless_armed(actions):
+    driver = make_driver()
+    now_ns = START_NS
+    driver.link_up(now_ns)
+    for action, value in actions:
+        match action:
+            case "receive":
+                driver.receive(now_ns, [ReceivedFrame(now_ns, frame) for frame in value])
+            case "request":
+                driver.request(value)
+            case "transmit":
+                moving = driver.state is DriverState.ARMED
+                for outgoing in driver.transmit(now_ns, value):
+                    decoded = CODEC.decode(outgoing.frame.can_id, outgoing.frame.data)
+                    if decoded.name == "WHEEL_COMMAND" and decoded.values["left_speed"]:
+                        assert moving
+            case "link":
+                (driver.link_up if value else driver.link_down)(now_ns)
+            case "wait":
+                now_ns += value
+        assert driver.detail
+        assert driver.state in DriverState
+        assert driver.stats.frames_accepted >= 0

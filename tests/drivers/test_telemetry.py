@@ -1,0 +1,172 @@
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers import telemetry
+from drivers.device_clock import DeviceClock
+from drivers.telemetry import DISTRUST_CLOCK_AFTER, WHEEL_TIME_MODULUS_US, Telemetry
+from drivers.types import Capabilities
+from firmware_protocol.codec import Decoded
+
+MS = 1_000_000
+BOOT_NS = 777 * MS
+CAPABILITIES = Capabilities(1, 0, "0.1.0", 0x1234, 1, 8.0, 20.0, 2048, 0.1, 0.5, 20.0)
+
+
+def synced_clock(now_ns):
+    clock = DeviceClock()
+    for number in range(4):
+        t_ns = now_ns - (4 - number) * MS
+        clock.add(t_ns - 1000, t_ns + 1000, (t_ns - BOOT_NS) // 1000)
+    return clock
+
+
+def make(now_ns=None):
+    made = Telemetry(synced_clock(now_ns) if now_ns is not None else DeviceClock())
+    made.configure(CAPABILITIES)
+    return made
+
+
+def wheels(to, counter, t_ns, received_ns, ticks=(0, 0), valid=(1, 1)):
+    """Feed one wheel sample measured at host time `t_ns`."""
+    device_us = (t_ns - BOOT_NS) // 1000
+    speed = {
+        "left_valid": valid[0],
+        "right_valid": valid[1],
+        "left_speed": 1.0,
+        "right_speed": -2.0,
+        "sample_time": device_us % WHEEL_TIME_MODULUS_US // 20 * 20,
+    }
+    assert to.wheels(Decoded("WHEEL_SPEED", 0, counter, speed), received_ns) is None
+    values = {"left_ticks": ticks[0] % 2**24, "right_ticks": ticks[1] % 2**24}
+    return to.wheels(Decoded("WHEEL_TICKS", 0, counter, values), received_ns)
+
+
+def pose(to, t_ns, received_ns, *, valid=1, yaw=0.5):
+    device_us = (t_ns - BOOT_NS) // 1000
+    position = {"valid": valid, "x": 1.5, "y": -2.5}
+    sample_time = device_us % telemetry.POSE_TIME_MODULUS_US // 100 * 100
+    heading = {"valid": 1, "yaw": yaw, "sample_time": sample_time, "position_std": 0.01, "yaw_std": 0.02}
+    assert to.pose(Decoded("POSE_POSITION", 0, 3, position), received_ns) is None
+    return to.pose(Decoded("POSE_HEADING", 0, 3, heading), received_ns)
+
+
+@given(now_ms=st.integers(10_000, 10**9), age_ms=st.integers(0, 250))
+def test_a_sample_is_stamped_with_its_measurement_whatever_its_delay(now_ms, age_ms):
+    now_ns = now_ms * MS
+    sample = wheels(make(now_ns), 0, now_ns - age_ms * MS, now_ns)
+    assert sample.t_ns == pytest.approx(now_ns - age_ms * MS, abs=25_000)
+    assert sample.received_ns == now_ns
+    measured = pose(make(now_ns), now_ns - age_ms * MS, now_ns)
+    assert measured.t_ns == pytest.approx(now_ns - age_ms * MS, abs=105_000)
+
+
+def test_before_the_clock_is_known_the_reception_counts():
+    assert wheels(make(), 0, 9_000 * MS, 9_100 * MS).t_ns == 9_100 * MS
+    assert pose(make(), 9_000 * MS, 9_100 * MS).t_ns == 9_100 * MS
+
+
+def test_no_sample_is_of_the_future():
+    now_ns = 9_000 * MS
+    assert wheels(make(now_ns), 0, now_ns + 5 * MS, now_ns).t_ns == now_ns
+
+
+def test_stamps_that_contradict_the_clock_are_counted_and_end_the_trust_in_it():
+    now_ns = 9_000 * MS
+    made = make(now_ns)
+    for counter in range(DISTRUST_CLOCK_AFTER):
+        assert not made.distrusts_clock
+        t_ns = now_ns + counter * 10 * MS
+        assert wheels(made, counter % 16, t_ns - 700 * MS, t_ns).t_ns == t_ns
+    assert made.distrusts_clock
+    assert made.implausible_values == DISTRUST_CLOCK_AFTER
+    made.restart()
+    assert not made.distrusts_clock
+
+
+def test_angles_and_speeds():
+    made = make()
+    wheels(made, 0, 9_000 * MS, 9_000 * MS, ticks=(2**24 - 3, 5))
+    sample = wheels(made, 1, 9_010 * MS, 9_010 * MS, ticks=(2**24 + 7, -5))
+    per_tick = 2 * math.pi / 2048
+    assert (sample.left_angle_rad, sample.right_angle_rad) == pytest.approx((10 * per_tick, -10 * per_tick))
+    assert (sample.left_speed_rad_s, sample.right_speed_rad_s) == (1.0, -2.0)
+
+
+def test_a_gap_longer_than_the_sample_times_wrap_allows_the_motion_of_its_length():
+    """2.9 s at 8 rad/s; by the sample times alone it could have been 0.28 s."""
+    made = make()
+    wheels(made, 0, 9_000 * MS, 9_000 * MS)
+    moved = int(8.0 * 2.9 / (2 * math.pi) * 2048)
+    assert wheels(made, 1, 11_900 * MS, 11_900 * MS, ticks=(moved, moved)) is not None
+    assert made.implausible_ticks == 0
+
+
+def test_receptions_in_a_batch_do_not_make_motion_implausible():
+    """A loop that was held up reads five samples at once; their own times tell how far apart they are."""
+    made = make()
+    for counter in range(5):
+        step = int(8.0 * 0.01 / (2 * math.pi) * 2048)
+        sample = wheels(made, counter, (9_000 + 10 * counter) * MS, 9_050 * MS, ticks=(counter * step, 0))
+        assert sample is not None
+
+
+@pytest.mark.parametrize("restarted_after_ms", range(30, 1300, 90))
+def test_the_ticks_of_a_device_that_has_restarted_are_no_motion(restarted_after_ms):
+    """Its sample times jump as well; they must not make room for the jump of the ticks."""
+    made = make()
+    wheels(made, 0, 9_000 * MS, 9_000 * MS, ticks=(2000, 2000))
+    for number in range(1, 7):
+        received_ns = (9_000 + 10 * number) * MS
+        sample = wheels(made, number, received_ns + restarted_after_ms * MS, received_ns)
+        assert sample is None or (sample.left_angle_rad, sample.right_angle_rad) == (0.0, 0.0)
+    assert sample is not None
+
+
+def test_implausible_ticks_and_invalid_halves_are_counted_and_dropped():
+    made = make()
+    wheels(made, 0, 9_000 * MS, 9_000 * MS)
+    assert wheels(made, 1, 9_010 * MS, 9_010 * MS, ticks=(5000, 0)) is None
+    assert made.implausible_ticks == 1
+    assert wheels(made, 2, 9_020 * MS, 9_020 * MS, valid=(1, 0)) is None
+    assert wheels(made, 3, 9_030 * MS, 9_030 * MS, valid=(0, 1)) is None
+    assert pose(made, 9_000 * MS, 9_030 * MS, valid=0) is None
+    assert made.implausible_values == 3
+    assert wheels(made, 4, 9_040 * MS, 9_040 * MS, ticks=(1, 1)) is not None
+
+
+def test_nothing_is_known_of_angles_before_the_handshake():
+    made = Telemetry(DeviceClock())
+    assert wheels(made, 0, 9_000 * MS, 9_000 * MS) is None
+
+
+def test_angles_go_on_through_an_interruption_and_other_limits():
+    made = make()
+    wheels(made, 0, 9_000 * MS, 9_000 * MS)
+    before = wheels(made, 1, 9_010 * MS, 9_010 * MS, ticks=(20, 20))
+    made.restart()
+    made.configure(Capabilities(1, 0, "0.1.0", 0x1234, 1, 4.0, 20.0, 1024, 0.1, 0.5, 20.0))
+    after = wheels(made, 2, 9_020 * MS, 9_020 * MS, ticks=(900_000, 3))
+    assert (after.left_angle_rad, after.right_angle_rad) == (before.left_angle_rad, before.right_angle_rad)
+
+
+@pytest.mark.parametrize(
+    ("wire", "wrapped"),
+    [(0.5, 0.5), (-3.1415, -3.1415), (3.2, 3.2 - 2 * math.pi), (-3.2, 2 * math.pi - 3.2), (math.pi, math.pi)],
+)
+def test_yaw_is_wrapped(wire, wrapped):
+    assert pose(make(), 0, 0, yaw=wire).yaw_rad == pytest.approx(wrapped)
+
+
+def test_slow_telemetry():
+    values = {"left_current": 1.5, "right_current": -0.5, "left_temperature": 40, "right_temperature": 41}
+    motor = telemetry.motor(Decoded("MOTOR", 0, 0, values), 5)
+    assert (motor.t_ns, motor.left_current_a, motor.right_temperature_c) == (5, 1.5, 41)
+    power = telemetry.power(Decoded("POWER", 0, 0, {"voltage": 24.1, "current": 2.0, "temperature": 20}), 6)
+    assert (power.t_ns, power.voltage_v, power.current_a, power.temperature_c) == (6, 24.1, 2.0, 20)
+    names = ("tx_error", "rx_error", "bus_off", "crc_error", "sequence_error", "watchdog")
+    counts = {f"{name}_count": number for number, name in enumerate(names)}
+    health = telemetry.link_health(Decoded("LINK_HEALTH", 0, 0, counts), 7)
+    assert (health.t_ns, health.tx_error_count, health.watchdog_count) == (7, 0, 5)
