@@ -14,6 +14,7 @@ _LONGEST_PERIOD_S = 2.0
 _SHORTEST_PERIOD_S = 1e-4
 _WHEEL_RADIUS_M = (0.005, 1.5)
 _AGAINST_NOMINAL = 4.0
+_STANDS_STILL = 100.0
 _CHORD_ROLL_RAD = 2.0
 _ENOUGH_CHORDS = 5
 _LARGEST_TURN_RATIO = 3.0
@@ -74,7 +75,8 @@ def length_fault(poses: Poses, wheels: Wheels, commands: Commands, wheel_radius_
     low, high = _WHEEL_RADIUS_M
     if wheel_radius_m is not None:
         low, high = wheel_radius_m / _AGAINST_NOMINAL, wheel_radius_m * _AGAINST_NOMINAL
-    if low <= radius_m <= high:
+    # Poses that do not move at all are lifted wheels or a dead sensor, not a unit.
+    if low <= radius_m <= high or radius_m < low / _STANDS_STILL:
         return None
     fault = f"{path_m:.3g} m of path for {roll_rad:.3g} rad of wheel would be a wheel radius of {radius_m:.2g} m"
     return f"pose_x_m, pose_y_m against the wheels: {fault}; write metres, rad/s and the encoder's true ticks_per_rev"

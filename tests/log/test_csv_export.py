@@ -1,0 +1,86 @@
+import csv
+import math
+
+import numpy as np
+import pytest
+
+from disco_hw.log.csv_export import write_csv
+from disco_hw.log.csv_import import read_csv
+from disco_hw.log.errors import LogError
+from disco_hw.log.mcap_drive import drive_from_log
+from disco_hw.log.reader import open_log
+from disco_hw.log.records import Command
+from drivers.types import PoseSample, WheelSample
+from tests.log.samples import PERIOD_NS, write_log
+
+TICKS = 2048
+NUMBERS = np.random.default_rng(3).random((400, 8))
+
+
+def driven_ticks():
+    """Ticks 30 to 35 went missing; in ticks 20 to 24 the robot was not armed."""
+    for k in range(1, 400):
+        if 30 <= k < 36:
+            continue
+        t_ns, a = k * PERIOD_NS, NUMBERS[k].tolist()
+        angle = round(0.04 * k * TICKS / (2.0 * math.pi)) * (2.0 * math.pi / TICKS)
+        records = [
+            WheelSample(t_ns - 10**6, t_ns, angle, angle, 2.0 + a[0] * 1e-3, 2.0 + a[1] * 1e-3),
+            Command(t_ns, 9.0, 9.0, 2.0 + a[2], 2.0 + a[3], 0.1, not 20 <= k < 25),
+        ]
+        if k % 5 == 0:
+            records.append(PoseSample(t_ns - 7 * 10**6, t_ns, 0.0024 * k + a[4] * 1e-3, a[5] * 1e-3, a[6], 0.0, 0.0))
+        yield t_ns, records
+
+
+@pytest.fixture
+def drive(tmp_path):
+    with open_log(write_log(tmp_path / "run.mcap", driven_ticks(), numbers=True)) as log:
+        return drive_from_log(log)
+
+
+def test_what_is_exported_comes_back_to_the_last_bit(drive, tmp_path):
+    path = tmp_path / "run.csv"
+    count = write_csv(drive, path, TICKS)
+    back = read_csv(path, ticks_per_rev=TICKS, wheel_radius_m=0.06)
+    for name in ("t_s", "left_speed_rad_s", "right_speed_rad_s", "segment"):
+        assert np.array_equal(getattr(back.wheels, name), getattr(drive.wheels, name)), name
+    assert np.array_equal(back.wheels.left_angle_rad, drive.wheels.left_angle_rad)
+    for name in ("t_s", "x_m", "y_m", "yaw_rad", "segment"):
+        assert np.array_equal(getattr(back.poses, name), getattr(drive.poses, name)), name
+    assert drive.segments == back.segments == 2
+    assert count == np.unique(np.concatenate([drive.commands.t_s, drive.wheels.t_s, drive.poses.t_s])).size
+
+
+def test_the_command_in_force_is_the_same_at_every_time(drive, tmp_path):
+    path = tmp_path / "run.csv"
+    write_csv(drive, path, TICKS)
+    back = read_csv(path, ticks_per_rev=TICKS)
+
+    def in_force(commands, t_s):
+        return commands.left_rad_s[np.searchsorted(commands.t_s, t_s, side="right") - 1]
+
+    for t_s in drive.commands.t_s[drive.commands.t_s < 0.36]:
+        assert in_force(back.commands, t_s) == in_force(drive.commands, t_s)
+
+
+def test_nothing_is_written_where_nothing_was_in_force(drive, tmp_path):
+    path = tmp_path / "run.csv"
+    write_csv(drive, path, None)
+    with path.open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert "enc_left_ticks" not in rows[0]
+    silent = [row for row in rows if 0.385 < float(row["t_s"]) < 0.475]
+    assert silent
+    assert all(row["cmd_left_rad_s"] == "" for row in silent)
+    assert any(row["pose_x_m"] == "" for row in rows)
+
+
+def test_nothing_is_overwritten_and_a_bad_place_is_named(drive, tmp_path):
+    path = tmp_path / "run.csv"
+    path.write_text("precious", encoding="utf-8")
+    with pytest.raises(LogError, match="already exists"):
+        write_csv(drive, path, None)
+    with pytest.raises(LogError, match="cannot be written"):
+        write_csv(drive, tmp_path / "none" / "x.csv", None)
+    assert path.read_text(encoding="utf-8") == "precious"

@@ -1,0 +1,52 @@
+import numpy as np
+import pytest
+
+from disco_hw.log.csv_export import write_csv
+from disco_hw.log.errors import LogError
+from disco_hw.log.load import load_drive
+from tests.log.samples import drive_ticks, log_bytes, write_log
+
+
+@pytest.fixture
+def mcap(tmp_path):
+    # The name says nothing: what a file is, its content tells.
+    return write_log(tmp_path / "log.dat", drive_ticks(100))
+
+
+@pytest.fixture
+def table(mcap, tmp_path):
+    path = tmp_path / "table.dat"
+    write_csv(load_drive(mcap), path, None)
+    return path
+
+
+def test_both_kinds_give_the_same_drive(mcap, table):
+    one, other = load_drive(mcap), load_drive([table])
+    assert np.array_equal(one.wheels.t_s, other.wheels.t_s)
+    assert np.array_equal(one.wheels.left_speed_rad_s, other.wheels.left_speed_rad_s)
+    assert np.array_equal(one.poses.x_m, other.poses.x_m)
+
+
+def test_several_logs_are_one_drive_in_segments(mcap, table):
+    drive = load_drive([mcap, table])
+    assert drive.sources == (str(mcap), str(table))
+    assert drive.segments == 2
+    assert drive.poses.t_s.size == 40
+    assert (np.diff(drive.poses.t_s) > 0.0).all()
+
+
+def test_a_cut_log_is_loaded_as_far_as_it_goes(tmp_path):
+    path = tmp_path / "cut.mcap"
+    data = log_bytes(drive_ticks(100), flush_every=10)
+    path.write_bytes(data[: len(data) // 2])
+    assert 10 <= load_drive(path).wheels.t_s.size < 100
+
+
+def test_bad_ones_are_refused(tmp_path, mcap):
+    with pytest.raises(LogError, match="no log given"):
+        load_drive([])
+    with pytest.raises(LogError, match="cannot be opened"):
+        load_drive([mcap, tmp_path / "none"])
+    (tmp_path / "x").write_text("a,b\n1,2\n", encoding="utf-8")
+    with pytest.raises(LogError, match="no column"):
+        load_drive(tmp_path / "x")

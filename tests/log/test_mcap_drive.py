@@ -1,0 +1,101 @@
+import math
+
+import numpy as np
+import pytest
+
+from disco_hw.log.errors import LogError
+from disco_hw.log.link import Attachment
+from disco_hw.log.mcap_drive import drive_from_log, ticks_per_rev
+from disco_hw.log.reader import open_log
+from disco_hw.log.records import Command, Event
+from drivers.types import PoseSample, WheelSample
+from tests.log.samples import PERIOD_NS, drive_ticks, write_log
+
+
+def drive_of(path, ticks, **changes):
+    with open_log(write_log(path / "run.mcap", ticks, **changes)) as log:
+        return drive_from_log(log)
+
+
+def wheel(t_ns, angle=0.0):
+    return WheelSample(t_ns, t_ns, angle, angle, 0.0, 0.0)
+
+
+def command(t_ns, speed=1.0, in_force=True):
+    return Command(t_ns, 9.0, 9.0, speed, speed, 0.1, in_force)
+
+
+def test_what_was_executed_measured_and_seen(tmp_path):
+    drive = drive_of(tmp_path, drive_ticks(100))
+    assert drive.segments == 1
+    assert drive.notes == ()
+    assert drive.commands.left_rad_s.tolist() == [2.0] * 100
+    assert drive.commands.right_rad_s.tolist() == [2.2] * 100
+    assert np.array_equal(drive.wheels.left_angle_rad, 0.04 * np.arange(1, 101))
+    assert drive.wheels.angle_measured
+    assert drive.wheels.speed_measured
+    assert np.array_equal(drive.poses.x_m, 0.002 * np.arange(5, 101, 5))
+    assert min(drive.commands.t_s[0], drive.wheels.t_s[0], drive.poses.t_s[0]) == 0.0
+    assert drive.commands.t_s[0] - drive.wheels.t_s[0] == pytest.approx(0.001, abs=1e-12)
+    assert np.allclose(np.diff(drive.wheels.t_s), 0.02)
+
+
+def test_while_nothing_is_in_force_no_command_is_known(tmp_path):
+    drive = drive_of(tmp_path, [(k, [command(k, in_force=k != 2)]) for k in (1, 2, 3)])
+    assert np.isnan(drive.commands.left_rad_s).tolist() == [False, True, False]
+    assert not drive.wheels.angle_measured
+
+
+def test_missing_ticks_start_a_new_segment_in_every_array(tmp_path):
+    ticks = [tick for tick in drive_ticks(100) if not 40 <= tick[0] // PERIOD_NS < 50]
+    drive = drive_of(tmp_path, ticks, numbers=True)
+    assert drive.segments == 2
+    assert "10 ticks are missing" in drive.notes[0]
+    assert np.count_nonzero(drive.commands.segment) == 51
+    assert 50 <= np.count_nonzero(drive.wheels.segment) <= 51
+    assert np.count_nonzero(drive.poses.segment) in (10, 11)
+
+
+def test_silent_wheels_start_a_new_segment(tmp_path):
+    times = [0, 10**8, 2 * 10**8, 10**9, 11 * 10**8]
+    drive = drive_of(tmp_path, [(k, [wheel(t_ns)]) for k, t_ns in enumerate(times, start=1)])
+    assert drive.wheels.segment.tolist() == [0, 0, 0, 1, 1]
+
+
+def test_late_poses_are_put_in_order_and_doubles_and_broken_ones_left_out(tmp_path):
+    def pose(t_ns, x_m):
+        return PoseSample(t_ns, t_ns + 5, x_m, 0.0, 0.0, 0.1, 0.1)
+
+    times = [(10**7, 1.0), (3 * 10**7, 3.0), (2 * 10**7, 2.0), (3 * 10**7, 99.0), (4 * 10**7, math.nan)]
+    drive = drive_of(tmp_path, [(k, [pose(t_ns, x_m)]) for k, (t_ns, x_m) in enumerate(times, start=1)])
+    assert drive.poses.x_m.tolist() == [1.0, 2.0, 3.0]
+    assert np.allclose(drive.poses.t_s, [0.0, 0.01, 0.02])
+    assert any("not finite" in note for note in drive.notes)
+    assert any("have the time of another" in note for note in drive.notes)
+
+
+def test_a_log_in_which_nothing_was_driven_is_refused(tmp_path):
+    with pytest.raises(LogError, match="nothing was driven"):
+        drive_of(tmp_path, [(1, [Event(1, "info", "a", "b")])])
+
+
+@pytest.mark.parametrize(
+    ("content", "expected"),
+    [
+        (b"[robot]\nticks_per_rev = 2048\n", 2048),
+        (b"[robot]\n", None),
+        (b"robot = 3\n", None),
+        (b"[robot]\nticks_per_rev = -1\n", None),
+        (b'[robot]\nticks_per_rev = "x"\n', None),
+        (b"\xff\xfe[", None),
+    ],
+)
+def test_the_ticks_of_a_revolution_come_from_the_configuration_in_the_log(tmp_path, content, expected):
+    kept = (Attachment("robot.toml", "application/toml", content),)
+    with open_log(write_log(tmp_path / "run.mcap", drive_ticks(1), attachments=kept)) as log:
+        assert ticks_per_rev(log) == expected
+
+
+def test_without_a_configuration_the_ticks_are_unknown(tmp_path):
+    with open_log(write_log(tmp_path / "run.mcap", drive_ticks(1), attachments=())) as log:
+        assert ticks_per_rev(log) is None
