@@ -1,0 +1,215 @@
+"""The virtual robot as a process: real time, a link that others can open, faults at run time, the truth on record."""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import os
+import select
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO, Literal
+
+import can
+
+from drivers.types import ReceivedFrame
+from firmware_protocol.firmware_core import FirmwareConfig
+from sim.body_dynamics import Pose
+from sim.command_socket import CommandSocket
+from sim.effects import HiddenEffectError, hidden_effects
+from sim.hub_link import HubLink
+from sim.injection import Injection
+from sim.plant import Plant
+from sim.plant_parameters import PlantParameters
+from sim.python_can_link import PythonCanLink
+from sim.robot_link import RobotLink
+from sim.serial_line import SerialLine, SerialPathError
+from sim.stop_signal import StopSignal
+from sim.truth import TruthRecorder
+from sim.unix_listener import SocketPathError
+from sim.virtual_robot import STEP_US, DeviceClock, VirtualRobot
+
+STEP_NS = STEP_US * 1000
+TRUTH_STEPS = 10
+WARM_UP_STEPS = 200
+MOST_STEPS_AT_ONCE = 200
+"""After a pause the backlog is worked off in pieces of so many steps, so that signals and sockets are still served."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VirtualRobotOptions:
+    """How to run the virtual robot.
+
+    With kind "can" and interface "unixcan" the process serves a bus of its own at the socket `channel`, with frames
+    taking their time on the wire if `pacing`; any other `interface` is joined through python-can. With kind "serial" it
+    makes a pseudo-terminal, and a symbolic link to it at `port` unless that is None.
+
+    `start`: pose of the tracked point at the start. `effects`: hidden effects by name (see `sim.effects`). `seed`: all
+    disturbances and noise. `truth_file`: CSV of `sim.truth.COLUMNS` at 100 Hz. `bus_log`: every frame on the own bus,
+    as candump writes them. `inject`: socket for the commands of `sim.injection`. `ready_fd`: descriptor that gets the
+    ready line too, and is then closed. `realtime_priority`: SCHED_FIFO priority where the system allows it; 0 for none.
+    """
+
+    kind: Literal["can", "serial"] = "can"
+    interface: str = "unixcan"
+    channel: str = "disco-robot.sock"
+    bitrate: int = 500_000
+    pacing: bool = True
+    port: str | None = None
+    baud: int = 921_600
+    start: Pose = field(default_factory=Pose)
+    plant: PlantParameters = field(default_factory=PlantParameters)
+    effects: Mapping[str, float | Sequence[float]] = field(default_factory=dict)
+    seed: int = 0
+    firmware: FirmwareConfig | None = None
+    clock: DeviceClock = field(default_factory=DeviceClock)
+    truth_file: Path | None = None
+    bus_log: Path | None = None
+    inject: Path | None = None
+    ready_fd: int | None = None
+    realtime_priority: int = 40
+
+
+def run_virtual_robot(options: VirtualRobotOptions) -> int:
+    """Run the virtual robot until SIGTERM or SIGINT; main thread only.
+
+    Prints one line that begins with "ready" when a host can open the link. Returns 0 after a clean stop, 2 with one
+    line on stderr if an option cannot be used.
+    """
+    stop = StopSignal()
+    with contextlib.ExitStack() as resources:
+        try:
+            process = _set_up(options, resources)
+        except (SocketPathError, SerialPathError, HiddenEffectError) as error:
+            print(error, file=sys.stderr)
+            return 2
+        except (can.CanError, OSError, ValueError) as error:
+            print(f"{_what_failed(options, error)}: {error}", file=sys.stderr)
+            return 2
+        scheduling = _schedule(options.realtime_priority)
+        _announce(f"ready {process.link.address} ({scheduling})", options.ready_fd)
+        process.start()
+        while not stop.requested:
+            select.select((*process.filenos(), stop.fileno()), (), (), process.timeout_s())
+            process.work()
+        print(f"stopped after {process.robot.now_us / 1e6:.3f} s: {process.link.summary()}", file=sys.stderr)
+    return 0
+
+
+class _Process:
+    """Keeps the robot's time on the monotonic clock and carries frames between it and the link."""
+
+    def __init__(
+        self,
+        robot: VirtualRobot,
+        link: RobotLink,
+        commands: CommandSocket | None,
+        recorder: TruthRecorder | None,
+    ) -> None:
+        self.robot = robot
+        self.link = link
+        self._injection = Injection(robot, link)
+        self._commands = commands
+        self._recorder = recorder
+        self._start_ns = 0
+        self._steps = 0
+
+    def start(self) -> None:
+        """Let robot time 0 be now."""
+        self._start_ns = time.monotonic_ns()
+
+    def filenos(self) -> list[int]:
+        return [*self.link.filenos(), *([] if self._commands is None else [self._commands.fileno()])]
+
+    def timeout_s(self) -> float:
+        """How long nothing is due."""
+        due_ns = self._start_ns + (self._steps + 1) * STEP_NS
+        link_ns = self.link.next_event_ns()
+        if link_ns is not None:
+            due_ns = min(due_ns, link_ns)
+        return max(0.0, (due_ns - time.monotonic_ns()) * 1e-9)
+
+    def work(self) -> None:
+        """Do what is due: all steps of the robot up to now, the link, commands."""
+        now_ns = time.monotonic_ns()
+        link, robot = self.link, self.robot
+        behind = (now_ns - self._start_ns) // STEP_NS - self._steps
+        due = min(behind, MOST_STEPS_AT_ONCE)
+        waiting = link.collect(now_ns)
+        for step in range(due):
+            self._steps += 1
+            t_ns = self._start_ns + self._steps * STEP_NS
+            # After a pause, frames that came during it are let in as if they had come evenly over it.
+            self._receive(link.advance(t_ns, waiting * (step + 1) // behind - waiting * step // behind))
+            link.send(robot.step(self._steps * STEP_US, link.error_counters))
+            self._injection.step(t_ns)
+            if self._recorder is not None and self._steps % TRUTH_STEPS == 0:
+                self._recorder.record(robot, t_ns)
+        if due == behind:
+            self._receive(link.advance(now_ns))
+        if self._commands is not None:
+            self._commands.serve(lambda text: self._injection.execute(text, now_ns))
+
+    def _receive(self, frames: list[ReceivedFrame]) -> None:
+        for received in frames:
+            self.robot.receive((received.t_ns - self._start_ns) // 1000, received.frame)
+
+
+def _set_up(options: VirtualRobotOptions, resources: contextlib.ExitStack) -> _Process:
+    firmware = options.firmware or FirmwareConfig(ticks_per_rev=options.plant.ticks_per_rev, max_wheel_speed_rad_s=8.0)
+    effects = hidden_effects(options.effects)
+    # The first steps of a process load or compile machine code, which must not happen while a host waits.
+    warm_up = VirtualRobot(Plant(options.plant, effects, options.seed, options.start), firmware)
+    for step in range(1, WARM_UP_STEPS + 1):
+        warm_up.step(step * STEP_US)
+    plant = Plant(options.plant, effects, options.seed, options.start)
+    robot = VirtualRobot(plant, firmware, options.clock, options.seed)
+    recorder = None if options.truth_file is None else TruthRecorder(options.truth_file)
+    if recorder is not None:
+        resources.callback(recorder.close)
+    log = None if options.bus_log is None else resources.enter_context(options.bus_log.open("w", encoding="utf-8"))
+    link = _open_link(options, log)
+    resources.callback(link.close)
+    commands = None if options.inject is None else CommandSocket(options.inject)
+    if commands is not None:
+        resources.callback(commands.close)
+    # Nothing made so far will go away: the collector need not look at it again.
+    gc.freeze()
+    return _Process(robot, link, commands, recorder)
+
+
+def _open_link(options: VirtualRobotOptions, log: IO[str] | None) -> RobotLink:
+    now_ns = time.monotonic_ns()
+    if options.kind == "serial":
+        path = None if options.port is None else Path(options.port)
+        return SerialLine(path, now_ns, baud=options.baud, pacing=options.pacing)
+    if options.interface == "unixcan":
+        return HubLink(Path(options.channel), now_ns, bitrate=options.bitrate, pacing=options.pacing, log=log)
+    return PythonCanLink(options.interface, options.channel, now_ns, bitrate=options.bitrate)
+
+
+def _what_failed(options: VirtualRobotOptions, error: Exception) -> str:
+    if isinstance(error, OSError) and error.filename is not None:
+        return "cannot open a file"
+    return f"{options.interface} {options.channel}" if options.kind == "can" else f"serial {options.port}"
+
+
+def _schedule(priority: int) -> str:
+    """Ask for SCHED_FIFO; say what was granted. Late steps would look to a host like a robot that misses commands."""
+    if priority <= 0:
+        return "no real-time priority asked for"
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+    except OSError:
+        return "no real-time priority allowed"
+    return f"SCHED_FIFO {priority}"
+
+
+def _announce(line: str, ready_fd: int | None) -> None:
+    print(line, flush=True)
+    if ready_fd is not None:
+        os.write(ready_fd, line.encode() + b"\n")
+        os.close(ready_fd)

@@ -1,0 +1,112 @@
+"""The virtual robot on the simulated CAN bus that its own process serves to others."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import IO
+
+from drivers.types import Frame, ReceivedFrame
+from sim.bus import Delivery
+from sim.bus_node import ErrorState
+from sim.can_frame import CanFrame
+from sim.hub import Hub
+from sim.robot_link import LinkFaultError
+
+ROBOT_QUEUE = 64
+BABBLER_QUEUE = 32
+RESTART_DELAY_NS = 200_000_000
+"""After bus-off the robot's controller asks for recovery so much later, as can-dev does with restart-ms 200."""
+
+
+class HubLink:
+    """A hub at `path` with the robot as a node; satisfies `sim.robot_link.RobotLink`.
+
+    `log` gets every frame on the bus in candump format. Raises SocketPathError if the hub cannot listen.
+    """
+
+    def __init__(
+        self, path: Path, now_ns: int, *, bitrate: int = 500_000, pacing: bool = True, log: IO[str] | None = None
+    ) -> None:
+        write_line = None if log is None else lambda line: log.write(line + "\n")
+        self.hub = Hub(path, now_ns, bitrate=bitrate, pacing=pacing, log=write_line)
+        self.robot = self.hub.bus.attach("robot", capacity=ROBOT_QUEUE)
+        self._babbler = self.hub.bus.attach("babbler", capacity=BABBLER_QUEUE)
+        self._restart_ns: int | None = None
+
+    @property
+    def address(self) -> str:
+        """The hub's socket."""
+        return f"unixcan {self.hub.path}"
+
+    @property
+    def error_counters(self) -> tuple[int, int]:
+        """Error counters of the robot's node; the first is 256 at bus-off."""
+        return self.robot.tec, self.robot.rec
+
+    def filenos(self) -> list[int]:
+        """The hub's epoll descriptor."""
+        return [self.hub.fileno()]
+
+    def next_event_ns(self) -> int | None:
+        """When a frame ends, a restart is due, or clients may come back."""
+        times = [t for t in (self.hub.next_event_ns(), self._restart_ns) if t is not None]
+        return min(times) if times else None
+
+    def collect(self, now_ns: int) -> int:
+        """Serve the sockets."""
+        return self.hub.collect(now_ns)
+
+    def advance(self, now_ns: int, admit: int | None = None) -> list[ReceivedFrame]:
+        """Run the bus up to `now_ns`; return the data frames that the robot's controller has received."""
+        deliveries = self.hub.advance(now_ns, admit)
+        if self.robot.state is ErrorState.BUS_OFF and self.robot.recessive_sequences is None:
+            if self._restart_ns is None:
+                self._restart_ns = now_ns + RESTART_DELAY_NS
+            elif now_ns >= self._restart_ns:
+                self._restart_ns = None
+                self.hub.bus.request_recovery(self.robot)
+        return [
+            ReceivedFrame(delivery.t_ns, Frame(delivery.frame.can_id, delivery.frame.data))
+            for delivery in deliveries
+            if self.robot in delivery.receivers and _is_for_robots(delivery)
+        ]
+
+    def send(self, frames: Sequence[Frame]) -> None:
+        """Queue the robot's frames; the node counts those that do not fit."""
+        for frame in frames:
+            self.hub.bus.send(self.robot, CanFrame(frame.can_id, frame.data))
+
+    def unplug(self, until_ns: int) -> None:
+        """Cut off all clients and refuse new ones until then."""
+        self.hub.unplug(until_ns)
+
+    def force_bus_off(self, who: str) -> None:
+        """Put all clients ("host") or the robot's controller ("robot") into bus-off."""
+        if who == "host":
+            self.hub.force_clients_bus_off()
+        elif who == "robot":
+            self.hub.bus.force_bus_off(self.robot)
+        else:
+            raise LinkFaultError(f"bus_off {who}: say host or robot")
+
+    def babble(self, frame: Frame) -> None:
+        """Send `frame` from a third node; if its queue is full it is on the bus as often as the bus allows."""
+        self.hub.bus.send(self._babbler, CanFrame(frame.can_id, frame.data))
+
+    def summary(self) -> str:
+        """Counters in one line."""
+        robot = self.robot
+        return (
+            f"{self.hub.stats} robot: sent={robot.sent} received={robot.received} full={robot.refused_full} "
+            f"bus_off={robot.bus_off_count} error_frames={self.hub.bus.error_frames}"
+        )
+
+    def close(self) -> None:
+        """Close the hub and remove its socket."""
+        self.hub.close()
+
+
+def _is_for_robots(delivery: Delivery) -> bool:
+    frame = delivery.frame
+    return not (frame.error or frame.remote or frame.extended)

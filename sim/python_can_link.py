@@ -1,0 +1,158 @@
+"""The virtual robot on any bus that python-can can open: a virtual CAN interface, an adapter, another hub."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+from collections import deque
+from collections.abc import Sequence
+from typing import Any
+
+import can
+
+from drivers.types import Frame, ReceivedFrame
+from sim.robot_link import LinkFaultError
+
+RETRY_NS = 500_000_000
+MAX_FRAMES_PER_READ = 64
+
+
+class PythonCanLink:
+    """A node on `interface` `channel`; satisfies `sim.robot_link.RobotLink`. It opens the bus again when that breaks.
+
+    A frame counts as received when it is read. Raises `can.CanError`, OSError or ValueError if it cannot be opened.
+    """
+
+    def __init__(self, interface: str, channel: str, now_ns: int, *, bitrate: int = 500_000) -> None:
+        self._interface = interface
+        self._channel = channel
+        self._bitrate = bitrate
+        self._now_ns = now_ns
+        self._retry_ns: int | None = None
+        self._waiting: deque[Frame] = deque()
+        self.frames_in = 0
+        self.frames_out = 0
+        self.ignored = 0
+        self.errors = 0
+        self.send_failures = 0
+        self._bus: can.BusABC | None = self._open()
+
+    @property
+    def address(self) -> str:
+        """Interface and channel."""
+        return f"{self._interface} {self._channel}"
+
+    @property
+    def error_counters(self) -> tuple[int, int]:
+        """Not known through python-can."""
+        return 0, 0
+
+    def filenos(self) -> list[int]:
+        """The bus's descriptor where it has one; without it the bus is looked at in every step."""
+        with contextlib.suppress(NotImplementedError, can.CanError, OSError):
+            if self._bus is not None:
+                descriptor = self._bus.fileno()
+                return [descriptor] if descriptor >= 0 else []
+        return []
+
+    def next_event_ns(self) -> int | None:
+        """When the bus is opened again."""
+        return self._retry_ns
+
+    def collect(self, now_ns: int) -> int:
+        """Read what has come."""
+        self._now_ns = now_ns
+        if self._retry_ns is not None and now_ns >= self._retry_ns:
+            self._reopen(now_ns)
+        for _ in range(MAX_FRAMES_PER_READ):
+            message = self._receive()
+            if message is None:
+                break
+            if message.is_error_frame or message.is_extended_id or message.is_remote_frame or message.is_fd:
+                self.ignored += 1
+                continue
+            self.frames_in += 1
+            self._waiting.append(Frame(message.arbitration_id, bytes(message.data)))
+        return len(self._waiting)
+
+    def advance(self, now_ns: int, admit: int | None = None) -> list[ReceivedFrame]:
+        """Hand over the oldest `admit` frames (None: all)."""
+        self._now_ns = now_ns
+        count = len(self._waiting) if admit is None else admit
+        return [ReceivedFrame(now_ns, self._waiting.popleft()) for _ in range(count)]
+
+    def send(self, frames: Sequence[Frame]) -> None:
+        """Send without waiting; what the bus does not take is counted and lost."""
+        for frame in frames:
+            if self._bus is None:
+                self.send_failures += 1
+                continue
+            try:
+                self._bus.send(
+                    can.Message(arbitration_id=frame.can_id, data=frame.data, is_extended_id=False), timeout=0
+                )
+                self.frames_out += 1
+            except (can.CanError, OSError) as error:
+                self.send_failures += 1
+                if "buffer" not in str(error).lower():
+                    self._lose(error)
+
+    def unplug(self, until_ns: int) -> None:
+        """Leave the bus until then."""
+        self._shut_down()
+        self._waiting.clear()
+        self._retry_ns = until_ns
+
+    def force_bus_off(self, who: str) -> None:
+        """A controller cannot be told to fail through python-can."""
+        raise LinkFaultError(f"bus_off {who}: only on the simulator's own bus (interface unixcan)")
+
+    def babble(self, frame: Frame) -> None:
+        """Send `frame` as if it came from another node."""
+        self.send((frame,))
+
+    def summary(self) -> str:
+        """Counters in one line."""
+        return (
+            f"in={self.frames_in} out={self.frames_out} ignored={self.ignored} errors={self.errors} "
+            f"send_failures={self.send_failures}"
+        )
+
+    def close(self) -> None:
+        """Leave the bus."""
+        self._shut_down()
+
+    def _open(self) -> can.BusABC:
+        options: dict[str, Any] = {} if self._interface == "socketcan" else {"bitrate": self._bitrate}
+        return can.Bus(interface=self._interface, channel=self._channel, ignore_config=True, **options)
+
+    def _reopen(self, now_ns: int) -> None:
+        try:
+            self._bus = self._open()
+            self._retry_ns = None
+        except (can.CanError, OSError, ValueError):
+            self.errors += 1
+            self._retry_ns = now_ns + RETRY_NS
+
+    def _receive(self) -> can.Message | None:
+        if self._bus is None:
+            return None
+        try:
+            return self._bus.recv(0)
+        except (can.CanError, OSError, ValueError, IndexError) as error:
+            self._lose(error)
+            return None
+
+    def _lose(self, error: Exception) -> None:
+        self.errors += 1
+        print(f"{self.address}: {error}; opening it again", file=sys.stderr)
+        self._shut_down()
+        self._retry_ns = self._now_ns + RETRY_NS
+
+    def _shut_down(self) -> None:
+        bus, self._bus = self._bus, None
+        if bus is not None:
+            try:
+                bus.shutdown()
+            except (can.CanError, OSError):
+                self.errors += 1

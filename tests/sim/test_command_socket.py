@@ -1,0 +1,69 @@
+import socket
+import threading
+
+import pytest
+
+from sim.command_socket import CommandSocket, send_command
+from sim.unix_listener import SocketPathError
+
+
+@pytest.fixture
+def commands(tmp_path):
+    served = CommandSocket(tmp_path / "commands")
+    yield served
+    served.close()
+
+
+def serve_once(commands, execute):
+    import select
+
+    def run():
+        select.select([commands], [], [], 5)
+        commands.serve(execute)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    return thread
+
+
+def test_a_command_is_executed_and_answered(tmp_path, commands):
+    seen = []
+    thread = serve_once(commands, lambda text: (seen.append(text), f"done {text}")[1])
+    assert send_command(tmp_path / "commands", "  estop_button on\n") == "done estop_button on"
+    thread.join()
+    assert seen == ["estop_button on"]
+
+
+def test_without_a_command_nothing_happens(commands):
+    commands.serve(lambda text: pytest.fail("nothing was sent"))
+
+
+def test_who_wants_no_answer_gets_none(tmp_path, commands):
+    seen = []
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as client:
+        client.sendto(b"a", str(tmp_path / "commands"))
+        client.sendto(b"\xff", str(tmp_path / "commands"))
+    commands.serve(lambda text: (seen.append(text), "ok")[1])
+    assert seen == ["a", "\N{REPLACEMENT CHARACTER}"]
+    assert commands.lost_replies == 0
+
+
+def test_an_answer_that_nobody_takes_is_counted(tmp_path, commands):
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as client:
+        client.bind(str(tmp_path / "client"))
+        client.sendto(b"a", str(tmp_path / "commands"))
+    commands.serve(lambda text: "ok")
+    assert commands.lost_replies == 1
+
+
+def test_a_taken_path_is_reported(tmp_path, commands):
+    with pytest.raises(SocketPathError):
+        CommandSocket(tmp_path / "commands")
+
+
+def test_close_removes_the_socket_and_may_be_repeated(tmp_path, commands):
+    commands.close()
+    commands.close()
+    assert not (tmp_path / "commands").exists()
+    with pytest.raises(OSError, match="No such file"):
+        send_command(tmp_path / "commands", "state")
