@@ -88,8 +88,6 @@ typedef struct {
     uint16_t shown_challenge;
     uint8_t shown_state;
     uint8_t shown_session;
-    uint8_t shown_estop_source;
-    uint8_t shown_stop_cause;
     bool shown_accepted;
     bool limits_changed;
     bool introduced;

@@ -267,8 +267,7 @@ static void send_changes(disco_firmware_t *core)
     disco_telemetry_t *shown = &core->telemetry;
     const uint16_t fault = disco_faults_code(&core->faults);
     if ((shown->shown_state != core->state) || (shown->shown_fault != fault) ||
-        (shown->shown_session != core->session.current) || (shown->shown_estop_source != core->estop_source) ||
-        (shown->shown_stop_cause != core->stop_cause)) {
+        (shown->shown_session != core->session.current)) {
         send_system_state(core);
     }
     if ((shown->shown_session != core->session.current) || (shown->shown_challenge != core->session.challenge) ||
@@ -278,8 +277,6 @@ static void send_changes(disco_firmware_t *core)
     shown->shown_state = core->state;
     shown->shown_fault = fault;
     shown->shown_session = core->session.current;
-    shown->shown_estop_source = core->estop_source;
-    shown->shown_stop_cause = core->stop_cause;
     shown->shown_challenge = core->session.challenge;
     shown->shown_accepted = core->host.accepted;
 }

@@ -197,6 +197,25 @@ def test_challenges_depend_on_the_entropy():
     assert len({Bench(entropy=seed).core.challenge for seed in range(50)}) > 45
 
 
+@pytest.mark.parametrize("entry", [1, 2])
+def test_a_hash_of_zero_is_passed_over(entry):
+    """The hash is (entropy xor entry) * 2654435761; this entropy makes its upper half zero at the given entry."""
+    bench = Bench(entropy=5 * pow(2654435761, -1, 2**32) % 2**32 ^ entry)
+    first = bench.core.challenge
+    bench.to_ready()
+    assert 0 not in {first, bench.core.challenge}
+
+
+def test_arming_another_session_than_the_one_that_is_ready_starts_over():
+    bench = Bench()
+    bench.to_ready(session=7)
+    bench.ask("ARM", session=8)
+    bench.command = {}
+    bench.run(400)
+    assert (bench.out.state, bench.out.session) == ("STANDBY", 0)
+    assert bench.core.rejections["CHALLENGE"] == 0
+
+
 def arm_with(answer):
     bench = Bench()
     bench.to_ready()

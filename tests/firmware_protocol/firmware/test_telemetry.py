@@ -143,6 +143,17 @@ def test_system_state_follows_session_fault_and_stop_cause():
     assert CODEC.choice_name("SYSTEM_STATE", "fault", last(bench, "SYSTEM_STATE")["fault"]) == "BUS_OFF"
 
 
+def test_a_session_that_changes_within_one_cycle_is_told():
+    bench = Bench()
+    bench.to_ready(session=7)
+    bench.run(5)
+    bench.host_state(request="READY", session=8)
+    before = len(bench.messages("SYSTEM_STATE"))
+    bench.step()
+    assert (bench.out.state, bench.out.session) == ("READY", 8)
+    assert len(bench.messages("SYSTEM_STATE")) == before + 1
+
+
 def test_rejections_are_counted_modulo_256_with_the_newest_reason():
     bench = Bench()
     bench.run(50)
