@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import enum
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 from disco_hw.daemon.states import PROBLEM, Condition, State, Transition, next_transition
 from drivers.types import DriverState, LinkState, Request
 
-_TALKING = frozenset(
-    {DriverState.STANDBY, DriverState.READY, DriverState.ARMING, DriverState.ARMED, DriverState.STOPPING}
-)
+_IDLE = frozenset({DriverState.STANDBY, DriverState.READY})
 _MAY_MOVE = frozenset({DriverState.ARMING, DriverState.ARMED, DriverState.STOPPING})
 _ROBOT_TROUBLE = Condition.ROBOT_ESTOP | Condition.ROBOT_FAULT | Condition.ROBOT_REFUSED
 
@@ -147,23 +146,23 @@ class Supervisor:
         """Return the conditions that the inputs alone decide."""
         robot, age_s = inputs.driver_state, inputs.telemetry_age_s
         link_up = inputs.link_state is LinkState.UP
-        flags = {
-            Condition.LINK_UP: link_up,
-            Condition.LINK_RENEWED: link_up and inputs.link_generation != self._generation,
-            Condition.ROBOT_TALKS: robot in _TALKING,
-            Condition.ROBOT_IDLE: robot in _TALKING - _MAY_MOVE,
-            Condition.ROBOT_ARMED: robot is DriverState.ARMED,
-            Condition.ROBOT_MAY_MOVE: robot in _MAY_MOVE,
-            Condition.ROBOT_REFUSED: robot is DriverState.REFUSED,
-            Condition.ROBOT_FAULT: robot is DriverState.FAULT,
-            Condition.ROBOT_ESTOP: robot is DriverState.ESTOP,
+        flags = (
+            (Condition.LINK_UP, link_up),
+            (Condition.LINK_RENEWED, link_up and inputs.link_generation != self._generation),
+            (Condition.ROBOT_TALKS, robot in _IDLE | _MAY_MOVE),
+            (Condition.ROBOT_IDLE, robot in _IDLE),
+            (Condition.ROBOT_ARMED, robot is DriverState.ARMED),
+            (Condition.ROBOT_MAY_MOVE, robot in _MAY_MOVE),
+            (Condition.ROBOT_REFUSED, robot is DriverState.REFUSED),
+            (Condition.ROBOT_FAULT, robot is DriverState.FAULT),
+            (Condition.ROBOT_ESTOP, robot is DriverState.ESTOP),
             # Written so that an age or a speed that is not a number counts as no telemetry and as moving.
-            Condition.TELEMETRY_FRESH: age_s is not None and age_s <= self._settings.telemetry_zero_s,
-            Condition.TELEMETRY_LOST: age_s is None or not age_s <= self._settings.telemetry_disarm_s,
-            Condition.WHEELS_STILL: inputs.wheel_speed_rad_s < self._settings.still_rad_s,
-            Condition.PREFLIGHT_ERROR: bool(inputs.preflight_errors),
-            Condition.DAEMON_ERROR: inputs.daemon_error is not None,
-        }
+            (Condition.TELEMETRY_FRESH, age_s is not None and age_s <= self._settings.telemetry_zero_s),
+            (Condition.TELEMETRY_LOST, age_s is None or not age_s <= self._settings.telemetry_disarm_s),
+            (Condition.WHEELS_STILL, inputs.wheel_speed_rad_s < self._settings.still_rad_s),
+            (Condition.PREFLIGHT_ERROR, bool(inputs.preflight_errors)),
+            (Condition.DAEMON_ERROR, inputs.daemon_error is not None),
+        )
         if link_up:
             self._generation = inputs.link_generation
         return _union(flags)
@@ -171,12 +170,12 @@ class Supervisor:
     def _asked(self) -> Condition:
         """Return the conditions that requests have set."""
         return _union(
-            {
-                Condition.ARM_PENDING: self._arming is not None,
-                Condition.DISARM_ASKED: self._disarm_asked,
-                Condition.ESTOP_ASKED: self._estop_asked,
-                Condition.RESET_PENDING: self._resetting is not None,
-            }
+            (
+                (Condition.ARM_PENDING, self._arming is not None),
+                (Condition.DISARM_ASKED, self._disarm_asked),
+                (Condition.ESTOP_ASKED, self._estop_asked),
+                (Condition.RESET_PENDING, self._resetting is not None),
+            )
         )
 
     def _answer(self, now_ns: int, request: UserRequest, estop_now: bool, inputs: Inputs, seen: Condition) -> Reply:
@@ -359,9 +358,5 @@ def _once(pending: _Pending, request: Request) -> Request | None:
     return request
 
 
-def _union(flags: dict[Condition, bool]) -> Condition:
-    result = Condition.NONE
-    for flag, holds in flags.items():
-        if holds:
-            result |= flag
-    return result
+def _union(flags: Iterable[tuple[Condition, bool]]) -> Condition:
+    return Condition(sum(flag.value for flag, holds in flags if holds))
