@@ -6,17 +6,13 @@ simulator's truth afterwards. Nothing here reaches into either process.
 
 from __future__ import annotations
 
-import os
-import signal
-import subprocess
-import sys
+import math
 import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 from rich.live import Live
@@ -25,8 +21,8 @@ from rich.progress import BarColumn, Progress, TextColumn
 import disco_hw
 from disco_hw.circle_report import CircleReport, load_circle_report
 from disco_hw.config import load_robot_config
-from disco_hw.daemon.control_client import send_request
 from disco_hw.errors import InputError, WorkError
+from disco_hw.operator import Operator, disco_hw_process, stands
 
 _START_TIMEOUT_S = 90.0
 _POLL_S = 0.1
@@ -113,42 +109,20 @@ def _write_robot_file(scratch: Path, options: DemoOptions) -> Path:
     return path
 
 
-@contextmanager
-def _process(arguments: list[str], output: Path) -> Iterator[subprocess.Popen[bytes]]:
-    """A `disco-hw` process; SIGTERM at the end, SIGKILL if that is ignored."""
-    with output.open("wb") as sink:
-        process = subprocess.Popen(
-            [sys.executable, "-m", "disco_hw", *arguments],
-            stdout=sink,
-            stderr=subprocess.STDOUT,
-            start_new_session=True,
-        )
-    try:
-        yield process
-    finally:
-        if process.poll() is None:
-            process.send_signal(signal.SIGTERM)
-            try:
-                process.wait(_STOP_TIMEOUT_S)
-            except subprocess.TimeoutExpired:
-                os.killpg(process.pid, signal.SIGKILL)
-                process.wait()
-
-
 def _drive(options: DemoOptions, files: _Files, console: Console) -> bool:
     """Drive and stop; returns whether daemon and robot both said that the robot stands, disarmed."""
     config = load_robot_config(files.robot)
-    lap_s = 2.0 * 3.141592653589793 * config.task.radius_m / config.task.speed_m_s
+    lap_s = 2.0 * math.pi * config.task.radius_m / config.task.speed_m_s
     simulator = [
         "sim", str(files.robot), "--plant-seed", str(options.plant_seed), "--truth", str(files.truth),
         "--start", str(config.task.center_x_m + config.task.radius_m), str(config.task.center_y_m), "1.5707963",
     ]  # fmt: skip
     with (
-        _process(simulator, files.simulator_output) as robot,
-        _process(["run", str(files.robot), "--log", str(files.log)], files.daemon_output) as daemon,
+        disco_hw_process("virtual robot", simulator, files.simulator_output) as robot,
+        disco_hw_process("daemon", ["run", str(files.robot), "--log", str(files.log)], files.daemon_output) as daemon,
     ):
-        operator = _Operator(files, {"virtual robot": robot, "daemon": daemon})
-        console.print(f"virtual robot pid {robot.pid}, daemon pid {daemon.pid}, link {options.link}")
+        operator = Operator(files.socket, (robot, daemon))
+        console.print(f"virtual robot pid {robot.process.pid}, daemon pid {daemon.process.pid}, link {options.link}")
         operator.wait_for("READY", _START_TIMEOUT_S)
         operator.tell("arm")
         operator.wait_for("ARMED", 5.0)
@@ -157,16 +131,15 @@ def _drive(options: DemoOptions, files: _Files, console: Console) -> bool:
         operator.tell("stop")
         operator.wait_for_standstill(5.0)
         operator.tell("disarm")
-        status = operator.wait_for("READY", 5.0)
-        stopped = bool(abs(status["wheels"][0]) < 0.05 and abs(status["wheels"][1]) < 0.05)
+        stopped = stands(operator.wait_for("READY", 5.0))
         operator.tell("quit")
-        code = daemon.wait(_STOP_TIMEOUT_S)
+        code = daemon.process.wait(_STOP_TIMEOUT_S)
         if code != 0:
-            raise WorkError(f"the daemon ended with exit code {code}; see {files.daemon_output}")
+            raise WorkError(f"the daemon ended with exit code {code}: {daemon.last_words()}")
     return stopped
 
 
-def _watch_laps(operator: _Operator, options: DemoOptions, limit_s: float, console: Console) -> None:
+def _watch_laps(operator: Operator, options: DemoOptions, limit_s: float, console: Console) -> None:
     """Show progress until the laps are driven; raises WorkError when it takes longer than `limit_s`."""
     columns = (
         TextColumn("{task.description}"),
@@ -202,53 +175,3 @@ def _watch_laps(operator: _Operator, options: DemoOptions, limit_s: float, conso
 @contextmanager
 def _nothing() -> Iterator[None]:
     yield
-
-
-class _Operator:
-    """The person at the control socket."""
-
-    def __init__(self, files: _Files, processes: dict[str, subprocess.Popen[bytes]]) -> None:
-        self._files = files
-        self._processes = processes
-
-    def status(self) -> dict[str, Any]:
-        for name, process in self._processes.items():
-            if process.poll() is not None:
-                output = self._files.daemon_output if name == "daemon" else self._files.simulator_output
-                words = output.read_text(encoding="utf-8", errors="replace").strip().splitlines()[-1:]
-                raise WorkError(f"the {name} ended with exit code {process.returncode}: {' '.join(words)}")
-        return send_request(self._files.socket, {"do": "status"}, timeout_s=2.0)
-
-    def tell(self, what: str) -> None:
-        reply = send_request(self._files.socket, {"do": what}, timeout_s=2.0)
-        if not reply.get("ok"):
-            raise WorkError(f"the daemon refused to {what}: {reply.get('error')}")
-
-    def wait_for(self, state: str, timeout_s: float) -> dict[str, Any]:
-        deadline = time.monotonic() + timeout_s
-        words = "no answer yet"
-        while time.monotonic() < deadline:
-            if not self._files.socket.exists():
-                self._check_alive()
-                time.sleep(_POLL_S)
-                continue
-            status = self.status()
-            if status["state"] == state:
-                return status
-            words = f"{status['state']}: {status['detail']}"
-            time.sleep(_POLL_S)
-        raise WorkError(f"the daemon did not reach {state} in {timeout_s:.0f} s ({words})")
-
-    def wait_for_standstill(self, timeout_s: float) -> None:
-        deadline = time.monotonic() + timeout_s
-        while time.monotonic() < deadline:
-            left, right = self.status()["wheels"]
-            if abs(left) < 0.05 and abs(right) < 0.05:
-                return
-            time.sleep(_POLL_S)
-        raise WorkError(f"the wheels still turn {timeout_s:.0f} s after the stop")
-
-    def _check_alive(self) -> None:
-        for name, process in self._processes.items():
-            if process.poll() is not None:
-                raise WorkError(f"the {name} ended with exit code {process.returncode} before it was ready")
