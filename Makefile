@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 SOURCES := pyproject.toml setup.py constraints.txt firmware_protocol/build_firmware.py firmware_protocol/disco_robot.dbc \
 	$(wildcard firmware_protocol/firmware/*.c firmware_protocol/firmware/*.h)
 
-.PHONY: venv demo test bench clean
+.PHONY: venv demo test bench firmware-check clean
 
 venv: $(STAMP)
 
@@ -30,6 +30,9 @@ test: $(STAMP)
 
 bench: $(STAMP)
 	$(BIN)/python -m tools.bench
+
+firmware-check: $(STAMP)
+	$(BIN)/python -m tools.firmware_check
 
 clean:
 	rm -rf $(VENV) build *.egg-info firmware_protocol/_firmware*

@@ -1,0 +1,98 @@
+"""The page for whoever writes the other end says what the code does."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from firmware_protocol import _firmware
+from firmware_protocol.build_firmware import PACKAGE
+from firmware_protocol.codec import PROTOCOL, Codec
+from firmware_protocol.e2e import challenge_answer, crc8
+from firmware_protocol.serial_framing import encode_frame
+
+TEXT = (Path(PACKAGE) / "README.md").read_text("utf-8")
+CODEC = Codec()
+ffi, lib = _firmware.ffi, _firmware.lib
+
+
+def rows(heading):
+    section = TEXT.split(f"\n## {heading}\n")[1].split("\n## ")[0]
+    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in section.splitlines() if line[:1] == "|"]
+    return [row for row in cells if not set("".join(row)) <= {"-"}][1:]
+
+
+def test_frames_are_those_of_the_dbc():
+    documented = [(int(row[0], 16), row[1].strip("`"), row[2].upper()) for row in rows("Frames")]
+    assert documented == [(message.can_id, message.name, message.sender) for message in PROTOCOL.messages]
+
+
+def test_states_are_those_of_the_c_table():
+    states = CODEC.choices("SYSTEM_STATE", "state")
+    count = ffi.new("size_t *")
+    table = lib.disco_transitions(count)
+    expected = [
+        (
+            [name for state, name in states.items() if getattr(table[i], "from") >> state & 1],
+            states[table[i].to],
+            CODEC.choice_name("SYSTEM_STATE", "stop_cause", table[i].stop_cause),
+        )
+        for i in range(count[0])
+    ]
+    assert [(row[0].split(", "), row[1], row[2]) for row in rows("States")] == expected
+
+
+VECTORS = {
+    "WHEEL_SPEED, counter 0, major 1": lambda: (
+        CODEC.encode(
+            "WHEEL_SPEED",
+            0,
+            left_valid=1,
+            right_valid=1,
+            driver_enabled=0,
+            limited=0,
+            left_speed=1.234,
+            right_speed=-2.2,
+            sample_time=6000,
+        ).data
+    ),
+    "WHEEL_COMMAND, counter 3": lambda: (
+        CODEC.encode("WHEEL_COMMAND", 3, mode="SPEED", left_speed=1.5, right_speed=-0.75, valid_for=0.1, session=7).data
+    ),
+    "HELLO_REQUEST, counter 0": lambda: (
+        CODEC.encode("HELLO_REQUEST", 0, protocol_major=1, protocol_minor=0, dbc_hash=0x12345678).data
+    ),
+    "HOST_STATE, counter 5": lambda: (
+        CODEC.encode(
+            "HOST_STATE",
+            5,
+            request="ARM",
+            session=7,
+            challenge_answer=challenge_answer(0xBEEF, 7, 0x12345678),
+            host_fault=0,
+        ).data
+    ),
+    "serial, id 0x010, data 02 01 02 03 00": lambda: encode_frame(0x010, bytes.fromhex("0201020300")),
+}
+
+
+def documented(label):
+    return bytes.fromhex(re.search(rf"^{re.escape(label)}\s\s+([0-9A-F ]+)$", TEXT, re.MULTILINE).group(1))
+
+
+@pytest.mark.parametrize("label", VECTORS)
+def test_vectors(label):
+    assert documented(label) == VECTORS[label]()
+
+
+@pytest.mark.parametrize(
+    "label", ["data id 0x0110 (no major version), counter 0", "the same, counter 1", "the same, counter 15"]
+)
+def test_vectors_without_major(label):
+    data = documented(label)
+    assert data[0] == crc8(data[1:], 0x0110)
+
+
+def test_linked_files_exist():
+    for target in re.findall(r"\]\(([^)]+)\)", TEXT):
+        assert (Path(PACKAGE) / target).exists(), target
