@@ -106,14 +106,28 @@ def test_cpus_are_set_or_the_refusal_is_said():
     assert next(step[:2] for step in steps if step[0] == "cpus") == ["cpus", False]
 
 
-def test_thread_pools_are_held_to_one_before_and_after_the_import():
-    script = "from disco_hw.daemon import realtime\n{before}step = realtime.limit_thread_pools()\nimport numba, torch\n"
-    ending = "report([step], torch=torch.get_num_threads(), numba=numba.get_num_threads())"
-    ending = "assert numba.njit(lambda x: x + 1)(1) == 2\n" + ending
-    for before in ("", "import numba, torch\nnumba.set_num_threads(numba.get_num_threads())\n"):
-        seen = run(script.format(before=before) + ending, OPENBLAS_NUM_THREADS="1", OMP_NUM_THREADS="2")
-        assert (seen["torch"], seen["numba"]) == (1, 1)
-        assert seen["steps"][0][1] is True
+def test_libraries_not_loaded_yet_are_held_to_one_thread_by_the_environment():
+    script = (
+        "from disco_hw.daemon import realtime\nreport([realtime.limit_thread_pools()], environment=dict(os.environ))"
+    )
+    seen = run(script, OMP_NUM_THREADS="4")
+    assert seen["steps"][0][1] is True
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
+        assert seen["environment"][name] == "1"
+
+
+def test_libraries_loaded_already_are_held_to_one_thread_and_still_work():
+    script = """
+import numba, torch
+from disco_hw.daemon import realtime
+numba.set_num_threads(numba.get_num_threads())
+step = realtime.limit_thread_pools()
+assert numba.njit(lambda x: x + 1)(1) == 2
+report([step], torch=torch.get_num_threads(), numba=numba.get_num_threads())
+"""
+    seen = run(script, OPENBLAS_NUM_THREADS="1", OMP_NUM_THREADS="2")
+    assert (seen["torch"], seen["numba"]) == (1, 1)
+    assert seen["steps"][0][1] is True
 
 
 def test_a_blas_that_is_loaded_too_early_is_said():
