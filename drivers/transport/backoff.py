@@ -14,6 +14,9 @@ class BackoffPolicy:
     steady_s: float = 1.0
 
 
+DEFAULT_BACKOFF = BackoffPolicy()
+
+
 def next_delay_s(policy: BackoffPolicy, previous_s: float | None, up_for_s: float) -> float:
     """Return the delay before the next attempt, in seconds.
 

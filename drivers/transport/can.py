@@ -46,7 +46,7 @@ class CanMedium:
         """Open the bus. Raises what python-can raises, LinkLostError for a socketcan interface that cannot work yet."""
         options: dict[str, Any] = {}
         if self.interface == "socketcan":
-            _require_working_interface(self.channel)
+            require_working_interface(self.channel)
         else:
             options["bitrate"] = self.bitrate
         if self.interface == "slcan":
@@ -175,8 +175,12 @@ def is_busy(error: Exception) -> bool:
     return False
 
 
-def _require_working_interface(channel: str, sysfs: Path = Path("/sys/class/net")) -> None:
-    """Refuse a network interface on which sending and receiving would only fail or, after bus-off, be swallowed."""
+def require_working_interface(channel: str, sysfs: Path = Path("/sys/class/net")) -> None:
+    """Refuse a socketcan interface on which nothing can be sent: one that is absent, down, or in bus-off.
+
+    After bus-off the kernel swallows what is sent without an error, so an open socket there says nothing.
+    Raises OSError (ENODEV, ENETDOWN) or LinkLostError.
+    """
     try:
         socket.if_nametoindex(channel)
     except OSError:

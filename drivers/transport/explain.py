@@ -40,13 +40,14 @@ def explain_can(interface: str, channel: str, bitrate: int, error: BaseException
             return explain_port(channel, error)
         return f"{where}: {_plain(error)}"
     if interface == "socketcan":
+        virtual = channel.startswith("vcan")
+        bring_up = f"sudo ip link set {channel} up" + ("" if virtual else f" type can bitrate {bitrate}")
+        if number == errno.ENODEV and virtual:
+            return f"{where}: no such CAN interface; run: sudo ip link add dev {channel} type vcan && {bring_up}"
         if number == errno.ENODEV:
-            return (
-                f"{where}: no such CAN interface; plug the adapter in and run: "
-                f"sudo ip link set {channel} up type can bitrate {bitrate}"
-            )
+            return f"{where}: no such CAN interface; plug the adapter in and run: {bring_up}"
         if number == errno.ENETDOWN:
-            return f"{where}: the interface is down; run: sudo ip link set {channel} up type can bitrate {bitrate}"
+            return f"{where}: the interface is down; run: {bring_up}"
         if number == errno.EAFNOSUPPORT:
             return f"{where}: this kernel has no CAN; load it with: sudo modprobe can_raw, or use another interface"
         if number == errno.ENOBUFS:

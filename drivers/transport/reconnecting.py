@@ -12,7 +12,7 @@ from collections import deque
 from collections.abc import Sequence
 from typing import Protocol
 
-from drivers.transport.backoff import BackoffPolicy, next_delay_s
+from drivers.transport.backoff import DEFAULT_BACKOFF, BackoffPolicy, next_delay_s
 from drivers.transport.counters import Counters
 from drivers.transport.transmit_queue import TransmitQueue
 from drivers.types import Frame, LinkState, OutgoingFrame, ReceivedFrame, TransportStats
@@ -67,7 +67,7 @@ class ReconnectingTransport:
     in the order of CAN identifiers, and is dropped when its deadline has passed or when it does not fit the queue.
     """
 
-    def __init__(self, medium: Medium, *, backoff: BackoffPolicy = BackoffPolicy()) -> None:  # noqa: B008
+    def __init__(self, medium: Medium, *, backoff: BackoffPolicy = DEFAULT_BACKOFF) -> None:
         self._medium = medium
         self._backoff = backoff
         self._counters = Counters()

@@ -13,8 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.transport.backoff import BackoffPolicy
-from drivers.transport.can import GARBAGE_LIMIT, CanMedium, is_busy, monotonic_stamp_ns
-from drivers.transport.reconnecting import ReconnectingTransport
+from drivers.transport.can import GARBAGE_LIMIT, CanMedium, is_busy, monotonic_stamp_ns, require_working_interface
+from drivers.transport.reconnecting import LinkLostError, ReconnectingTransport
 from drivers.types import Frame, LinkState
 from tests.drivers.transport.pseudo_terminal import PseudoTerminal
 from tests.drivers.waiting import collect, median_send_s, outgoing, send, wait_until
@@ -242,6 +242,27 @@ def test_want_of_room_is_told_from_a_dead_line():
     assert is_busy(can.CanTimeoutError())
     assert not is_busy(can.CanOperationError("down", errno.ENETDOWN))
     assert not is_busy(BrokenPipeError(errno.EPIPE, "broken"))
+
+
+@pytest.mark.parametrize(
+    ("flags", "carrier", "error", "words"),
+    [
+        ("0x80", "0", OSError, "interface is down"),
+        ("0x81", "0", LinkLostError, "bus-off"),
+        ("0x81", "1", None, ""),
+        ("gibberish", "1", None, ""),
+    ],
+)
+def test_an_interface_on_which_sending_would_be_swallowed_is_not_used(tmp_path, flags, carrier, error, words):
+    """What the kernel shows in sysfs; "lo" lends its name, since every machine has it."""
+    (tmp_path / "lo").mkdir()
+    (tmp_path / "lo" / "flags").write_text(flags + "\n")
+    (tmp_path / "lo" / "carrier").write_text(carrier + "\n")
+    if error is None:
+        require_working_interface("lo", tmp_path)
+        return
+    with pytest.raises(error, match=words):
+        require_working_interface("lo", tmp_path)
 
 
 def test_socketcan_says_what_is_missing():

@@ -46,6 +46,13 @@ def test_can_bus(interface, error, words):
     assert "\n" not in text
 
 
+def test_a_virtual_interface_has_no_bit_rate():
+    absent = explain_can("socketcan", "vcan0", 500_000, OSError(errno.ENODEV, "No such device"))
+    assert absent.endswith("sudo ip link add dev vcan0 type vcan && sudo ip link set vcan0 up")
+    down = explain_can("socketcan", "vcan0", 500_000, OSError(errno.ENETDOWN, "down"))
+    assert down.endswith("run: sudo ip link set vcan0 up")
+
+
 def test_the_number_is_found_where_the_libraries_hide_it():
     assert error_number(can.CanOperationError("x", 105)) == 105
     assert error_number(OSError(5, "x")) == 5
