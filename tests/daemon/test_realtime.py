@@ -107,10 +107,8 @@ def test_cpus_are_set_or_the_refusal_is_said():
 
 
 def test_libraries_not_loaded_yet_are_held_to_one_thread_by_the_environment():
-    script = (
-        "from disco_hw.daemon import realtime\nreport([realtime.limit_thread_pools()], environment=dict(os.environ))"
-    )
-    seen = run(script, OMP_NUM_THREADS="4")
+    script = "from disco_hw.daemon import realtime\nstep = realtime.limit_thread_pools()\n"
+    seen = run(script + "report([step], environment=dict(os.environ))", OMP_NUM_THREADS="4")
     assert seen["steps"][0][1] is True
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
         assert seen["environment"][name] == "1"
