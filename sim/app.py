@@ -9,7 +9,7 @@ import select
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import IO, Literal
 
@@ -39,6 +39,10 @@ MOST_STEPS_AT_ONCE = 200
 """After a pause the backlog is worked off in pieces of so many steps, so that signals and sockets are still served."""
 
 
+class OptionError(Exception):
+    """An option that cannot be used; the message is one line for the user."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VirtualRobotOptions:
     """How to run the virtual robot.
@@ -47,10 +51,11 @@ class VirtualRobotOptions:
     taking their time on the wire if `pacing`; any other `interface` is joined through python-can. With kind "serial" it
     makes a pseudo-terminal, and a symbolic link to it at `port` unless that is None.
 
-    `start`: pose of the tracked point at the start. `effects`: hidden effects by name (see `sim.effects`). `seed`: all
-    disturbances and noise. `truth_file`: CSV of `sim.truth.COLUMNS` at 100 Hz. `bus_log`: every frame on the own bus,
-    as candump writes them. `inject`: socket for the commands of `sim.injection`. `ready_fd`: descriptor that gets the
-    ready line too, and is then closed. `realtime_priority`: SCHED_FIFO priority where the system allows it; 0 for none.
+    `firmware`: limits and identity of the controller. `start`: pose of the tracked point at the start. `effects`:
+    hidden effects by name (see `sim.effects`). `seed`: all disturbances and noise. `truth_file`: CSV of
+    `sim.truth.COLUMNS` at 100 Hz. `bus_log`: every frame on the own bus, as candump writes them. `inject`: socket for
+    the commands of `sim.injection`. `ready_fd`: descriptor that gets the ready line too, and is then closed.
+    `realtime_priority`: SCHED_FIFO priority where the system allows it; 0 for none.
     """
 
     kind: Literal["can", "serial"] = "can"
@@ -72,6 +77,13 @@ class VirtualRobotOptions:
     ready_fd: int | None = None
     realtime_priority: int = 40
 
+    @property
+    def firmware_config(self) -> FirmwareConfig:
+        """`firmware`, or a configuration that fits the plant."""
+        if self.firmware is not None:
+            return self.firmware
+        return FirmwareConfig(ticks_per_rev=self.plant.ticks_per_rev, max_wheel_speed_rad_s=8.0)
+
 
 def run_virtual_robot(options: VirtualRobotOptions) -> int:
     """Run the virtual robot until SIGTERM or SIGINT; main thread only.
@@ -83,11 +95,8 @@ def run_virtual_robot(options: VirtualRobotOptions) -> int:
     with contextlib.ExitStack() as resources:
         try:
             process = _set_up(options, resources)
-        except (SocketPathError, SerialPathError, HiddenEffectError) as error:
+        except (OptionError, SocketPathError, SerialPathError, HiddenEffectError) as error:
             print(error, file=sys.stderr)
-            return 2
-        except (can.CanError, OSError, ValueError) as error:
-            print(f"{_what_failed(options, error)}: {error}", file=sys.stderr)
             return 2
         scheduling = _schedule(options.realtime_priority)
         _announce(f"ready {process.link.address} ({scheduling})", options.ready_fd)
@@ -159,42 +168,71 @@ class _Process:
 
 
 def _set_up(options: VirtualRobotOptions, resources: contextlib.ExitStack) -> _Process:
-    firmware = options.firmware or FirmwareConfig(ticks_per_rev=options.plant.ticks_per_rev, max_wheel_speed_rad_s=8.0)
-    effects = hidden_effects(options.effects)
-    # The first steps of a process load or compile machine code, which must not happen while a host waits.
-    warm_up = VirtualRobot(Plant(options.plant, effects, options.seed, options.start), firmware)
-    for step in range(1, WARM_UP_STEPS + 1):
-        warm_up.step(step * STEP_US)
-    plant = Plant(options.plant, effects, options.seed, options.start)
-    robot = VirtualRobot(plant, firmware, options.clock, options.seed)
-    recorder = None if options.truth_file is None else TruthRecorder(options.truth_file)
-    if recorder is not None:
-        resources.callback(recorder.close)
-    log = None if options.bus_log is None else resources.enter_context(options.bus_log.open("w", encoding="utf-8"))
+    robot = _make_robot(options)
+    recorder = None
+    log = None
+    try:
+        if options.truth_file is not None:
+            recorder = TruthRecorder(options.truth_file)
+            resources.callback(recorder.close)
+        if options.bus_log is not None:
+            log = resources.enter_context(options.bus_log.open("w", encoding="utf-8"))
+    except OSError as error:
+        raise OptionError(f"{error.filename}: {error.strerror}; choose another file") from None
     link = _open_link(options, log)
     resources.callback(link.close)
     commands = None if options.inject is None else CommandSocket(options.inject)
     if commands is not None:
         resources.callback(commands.close)
+    _rehearse(options)
     # Nothing made so far will go away: the collector need not look at it again.
     gc.freeze()
     return _Process(robot, link, commands, recorder)
 
 
+def _make_robot(options: VirtualRobotOptions) -> VirtualRobot:
+    plant = Plant(options.plant, hidden_effects(options.effects), options.seed, options.start)
+    try:
+        return VirtualRobot(plant, options.firmware_config, options.clock, options.seed)
+    except OverflowError as error:
+        raise OptionError(f"{_given(options.firmware_config)}: {error}; give a smaller value") from None
+
+
+def _rehearse(options: VirtualRobotOptions) -> None:
+    """Load or compile the machine code, which must not happen while a host waits; see that the firmware starts."""
+    robot = _make_robot(options)
+    for step in range(1, WARM_UP_STEPS + 1):
+        robot.step(step * STEP_US)
+    if robot.outputs.state == "FAULT":
+        raise OptionError(f"{_given(options.firmware_config)}: out of the firmware's range; correct the value")
+
+
+def _given(config: FirmwareConfig) -> str:
+    """The fields of a configuration that someone has chosen."""
+    chosen = [
+        f"{field.name}={getattr(config, field.name)}"
+        for field in fields(config)
+        if getattr(config, field.name) != field.default
+    ]
+    return f"firmware {', '.join(chosen)}"
+
+
 def _open_link(options: VirtualRobotOptions, log: IO[str] | None) -> RobotLink:
     now_ns = time.monotonic_ns()
     if options.kind == "serial":
+        if options.baud <= 0:
+            raise OptionError(f"baud {options.baud}: not positive; give the line's rate in bit/s")
         path = None if options.port is None else Path(options.port)
         return SerialLine(path, now_ns, baud=options.baud, pacing=options.pacing)
+    if options.bitrate <= 0:
+        raise OptionError(f"bitrate {options.bitrate}: not positive; give the bus's rate in bit/s")
     if options.interface == "unixcan":
         return HubLink(Path(options.channel), now_ns, bitrate=options.bitrate, pacing=options.pacing, log=log)
-    return PythonCanLink(options.interface, options.channel, now_ns, bitrate=options.bitrate)
-
-
-def _what_failed(options: VirtualRobotOptions, error: Exception) -> str:
-    if isinstance(error, OSError) and error.filename is not None:
-        return "cannot open a file"
-    return f"{options.interface} {options.channel}" if options.kind == "can" else f"serial {options.port}"
+    try:
+        return PythonCanLink(options.interface, options.channel, now_ns, bitrate=options.bitrate)
+    except (can.CanError, OSError, ValueError, NotImplementedError) as error:
+        name = f"{options.interface} {options.channel}"
+        raise OptionError(f"{name}: cannot be opened ({error}); check interface and channel") from None
 
 
 def _schedule(priority: int) -> str:

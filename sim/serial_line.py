@@ -51,10 +51,12 @@ class SerialLine:
 
     `path` becomes a symbolic link to the port that a host opens; None leaves the port under its own name (`port`).
     `baud` is the robot's rate in bit/s (8 data bits, no parity, 1 stop bit); `pacing` off makes bytes take no time.
-    Raises SerialPathError if `path` is taken by anything but a link to a terminal.
+    Raises SerialPathError if `path` is taken by anything but a link to a terminal, ValueError for an impossible rate.
     """
 
     def __init__(self, path: Path | None, now_ns: int, *, baud: int = 921_600, pacing: bool = True) -> None:
+        if baud <= 0:
+            raise ValueError(f"baud must be positive, not {baud}")
         self.stats = SerialLineStats()
         self._path = path
         self._baud = baud

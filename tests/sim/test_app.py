@@ -1,0 +1,306 @@
+"""The process as it is: started, driven over its link in real time, hurt, and stopped with real signals."""
+
+import csv
+import io
+import itertools
+import os
+import select
+import signal
+import stat
+import subprocess
+import sys
+import time
+
+import can
+import pytest
+import serial
+
+from drivers.types import Frame
+from firmware_protocol.serial_framing import FrameDecoder, encode_frame
+from sim.__main__ import main
+from sim.command_socket import send_command
+from sim.truth import COLUMNS
+from sim.unixcan import UnixCanBus
+from tests.sim.minimal_host import MinimalHost
+
+
+class Robot:
+    def __init__(self, directory, *options):
+        self.directory = directory
+        self.channel = directory / "bus"
+        self.port = directory / "tty"
+        self.process = subprocess.Popen(
+            [
+                *(sys.executable, "-m", "sim", "--channel", str(self.channel), "--inject", str(directory / "inject")),
+                *("--truth", str(directory / "truth.csv"), *options),
+            ],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        self.ready = self.process.stdout.readline()
+
+    def command(self, text):
+        return send_command(self.directory / "inject", text)
+
+    def state(self):
+        row = dict(zip(COLUMNS, self.command("state").split(","), strict=True))
+        return {name: value if name == "state" else float(value) for name, value in row.items()}
+
+    def wheel_speed(self):
+        state = self.state()
+        return max(abs(state["left_speed_rad_s"]), abs(state["right_speed_rad_s"]))
+
+    def truth(self):
+        rows = csv.DictReader(io.StringIO((self.directory / "truth.csv").read_text()))
+        return [{name: value if name == "state" else float(value) for name, value in row.items()} for row in rows]
+
+    def stop(self, number=signal.SIGTERM):
+        self.process.send_signal(number)
+        _, errors = self.process.communicate(timeout=20)
+        return self.process.returncode, errors
+
+
+@pytest.fixture
+def start(tmp_path):
+    robots = []
+
+    def start(*options):
+        directory = tmp_path / str(len(robots))
+        directory.mkdir()
+        robots.append(Robot(directory, *options))
+        assert robots[-1].ready.startswith("ready "), robots[-1].process.communicate()
+        return robots[-1]
+
+    yield start
+    for robot in robots:
+        robot.process.kill()
+        robot.process.communicate()
+
+
+class CanPort:
+    def __init__(self, robot):
+        self.bus = UnixCanBus(str(robot.channel))
+
+    def read(self):
+        frames = []
+        while (message := self.bus.recv(0.001)) is not None and len(frames) < 20:
+            if not message.is_error_frame:
+                frames.append(Frame(message.arbitration_id, bytes(message.data)))
+        return frames
+
+    def write(self, frame):
+        self.bus.send(can.Message(arbitration_id=frame.can_id, data=frame.data, is_extended_id=False), timeout=1)
+
+    def close(self):
+        self.bus.shutdown()
+
+
+class SerialPort:
+    def __init__(self, robot):
+        self.port = serial.Serial(str(robot.port), 921_600, timeout=0.001)
+        self.decoder = FrameDecoder()
+
+    def read(self):
+        return [Frame(*parts) for parts in self.decoder.feed(self.port.read(max(1, self.port.in_waiting)))]
+
+    def write(self, frame):
+        self.port.write(encode_frame(frame.can_id, frame.data))
+
+    def close(self):
+        self.port.close()
+
+
+def drive(port, host, seconds, until=lambda: False):
+    """Let the host run on its own millisecond clock; True as soon as `until` holds."""
+    start_s, sent_ms = time.monotonic(), host.now_ms
+    while True:
+        for frame in port.read():
+            host.receive(frame)
+        now_ms = sent_ms + int((time.monotonic() - start_s) * 1000)
+        while host.now_ms < now_ms:
+            host.now_ms += 1
+            for frame in host.due(host.now_ms):
+                port.write(frame)
+        if until():
+            return True
+        if time.monotonic() - start_s > seconds:
+            return False
+
+
+def arm(port, host):
+    host.wanted = "READY"
+    assert drive(port, host, 5, lambda: host.robot_state == "READY"), host.latest
+    host.wanted = "ARM"
+    assert drive(port, host, 5, lambda: host.robot_state == "ARMED"), host.latest
+
+
+@pytest.fixture
+def host():
+    host = MinimalHost()
+    host.now_ms = 0
+    return host
+
+
+def test_drive_it_over_can_and_let_go(start, host):
+    robot = start()
+    port = CanPort(robot)
+    arm(port, host)
+    host.speeds = (2.0, 3.0)
+    assert drive(port, host, 5, lambda: robot.wheel_speed() > 2.9)
+    assert host.latest["WHEEL_SPEED"]["right_speed"] > 2.0
+    # The pause is the simulator's, not the host's: what came meanwhile is let in as if it had come in time.
+    robot.process.send_signal(signal.SIGSTOP)
+    drive(port, host, 0.3)
+    robot.process.send_signal(signal.SIGCONT)
+    drive(port, host, 0.3)
+    assert robot.state()["state"] == "ARMED"
+    vanish_and_see_it_stop(robot, port)
+
+
+def test_drive_it_over_a_serial_line_and_let_go(start, host, tmp_path):
+    robot = start("--kind", "serial", "--port", str(tmp_path / "0" / "tty"))
+    assert robot.ready.startswith(f"ready serial {robot.port} at 921600 Bd")
+    port = SerialPort(robot)
+    arm(port, host)
+    host.speeds = (2.0, 3.0)
+    assert drive(port, host, 5, lambda: robot.wheel_speed() > 2.9)
+    assert robot.command("unplug 0.2") == "ok"
+    with pytest.raises(OSError, match=r"."):
+        drive(port, host, 5)
+    vanish_and_see_it_stop(robot, port)
+    again = SerialPort(robot)
+    assert drive(again, host, 5, lambda: host.robot_state == "STANDBY")
+    again.close()
+    assert robot.stop()[0] == 0
+    assert not os.path.lexists(robot.port)
+
+
+def vanish_and_see_it_stop(robot, port):
+    """The host goes without a word: its descriptors are closed, as when it is killed."""
+    port.close()
+    time.sleep(0.1 + 3.0 / 20.0 + 0.5)
+    assert robot.wheel_speed() < 0.05
+    assert robot.state()["state"] != "ARMED"
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_ends_it_cleanly(start, number):
+    robot = start()
+    for name in ("bus", "inject"):
+        assert stat.S_IMODE((robot.directory / name).stat().st_mode) == 0o600
+    with UnixCanBus(str(robot.channel)) as bus:
+        assert bus.recv(5) is not None
+        code, errors = robot.stop(number)
+        assert code == 0
+        assert errors.startswith("stopped after ")
+        assert "Traceback" not in errors
+        assert isinstance(read_to_the_end(bus), can.CanOperationError)
+    assert sorted(path.name for path in robot.directory.iterdir()) == ["truth.csv"]
+
+
+def read_to_the_end(bus):
+    try:
+        while bus.recv(1):
+            pass
+    except can.CanError as error:
+        return error
+    return None
+
+
+def test_the_record_has_no_gap_whatever_happens_to_the_process(start, tmp_path):
+    before_ns = time.monotonic_ns()
+    robot = start("--start", "1", "-2", "0.5", "--bus-log", str(tmp_path / "bus.log"))
+    time.sleep(1.2)
+    assert len(robot.truth()) >= 90
+    robot.process.send_signal(signal.SIGSTOP)
+    time.sleep(0.5)
+    robot.process.send_signal(signal.SIGCONT)
+    time.sleep(0.3)
+    robot.stop()
+    rows = robot.truth()
+    times = [row["t_ns"] for row in rows]
+    assert {int(after - before) for before, after in itertools.pairwise(times)} == {10_000_000}
+    assert before_ns < times[0] < times[-1] < time.monotonic_ns()
+    assert time.monotonic_ns() - times[-1] < 2e9
+    assert (rows[0]["x_m"], rows[0]["y_m"], rows[0]["yaw_rad"]) == pytest.approx((1.0, -2.0, 0.5), abs=1e-4)
+    messages = list(can.LogReader(tmp_path / "bus.log"))
+    assert len(messages) > 300
+    assert {message.channel for message in messages} == {"can0"}
+
+
+def test_faults_at_run_time(start):
+    robot = start()
+    with UnixCanBus(str(robot.channel)) as bus:
+        assert robot.command("bus_off") == "ok"
+        assert any(message.is_error_frame for message in iter(lambda: bus.recv(1), None))
+        assert robot.command("unplug 0.3") == "ok"
+        assert isinstance(read_to_the_end(bus), can.CanOperationError)
+        with pytest.raises(can.CanInitializationError):
+            UnixCanBus(str(robot.channel))
+    time.sleep(0.4)
+    assert robot.command("kidnap 0.5 0 0") == "ok"
+    assert robot.state()["x_m"] == pytest.approx(0.5, abs=0.01)
+    assert robot.command("estop_button on") == "ok"
+    time.sleep(0.1)
+    assert robot.state()["state"] == "ESTOP"
+    assert robot.command("nonsense").startswith("error: 'nonsense' is no command")
+    assert robot.command("babble 0x100 200") == "ok"
+    with UnixCanBus(str(robot.channel), can_filters=[{"can_id": 0x100, "can_mask": 0x7FF}]) as bus:
+        assert bus.recv(1) is not None
+
+
+def test_ready_descriptor(tmp_path):
+    read_end, write_end = os.pipe()
+    with subprocess.Popen(
+        [sys.executable, "-m", "sim", "--channel", str(tmp_path / "bus"), "--ready-fd", str(write_end)],
+        pass_fds=[write_end],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    ) as process:
+        os.close(write_end)
+        assert select.select([read_end], [], [], 60)[0]
+        with os.fdopen(read_end) as ready:
+            assert ready.read().startswith(f"ready unixcan {tmp_path / 'bus'}")
+        process.terminate()
+        assert process.wait(10) == 0
+
+
+@pytest.fixture
+def signals():
+    """The process takes over the signals; here that is the test's own."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
+    yield
+    signal.set_wakeup_fd(-1)
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+@pytest.mark.usefixtures("signals")
+@pytest.mark.parametrize(
+    ("options", "line"),
+    [
+        (("--hide", "moonlight=1"), "moonlight"),
+        (("--hide", "turn_slip=x"), "turn_slip: 'x' is not a number"),
+        (("--wheel-radius-m", "-1"), "wheel_radius_m = -1 is impossible"),
+        (("--channel", "/nonexistent/bus"), "/nonexistent/bus: cannot listen here"),
+        (("--kind", "serial", "--port", "/nonexistent/tty"), "/nonexistent/tty: cannot be made"),
+        (("--interface", "socketcan", "--channel", "nocan0"), "socketcan nocan0: cannot be opened"),
+        (("--interface", "moon"), "cannot be opened (CAN interface 'moon' not supported)"),
+        (("--truth", "/nonexistent/truth.csv"), "/nonexistent/truth.csv: No such file or directory"),
+        (("--bus-log", "/nonexistent/bus.log"), "/nonexistent/bus.log: No such file or directory"),
+        (("--inject", "/nonexistent/inject"), "/nonexistent/inject: cannot listen here"),
+        (("--bitrate", "0"), "bitrate 0: not positive"),
+        (("--baud", "0", "--kind", "serial"), "baud 0: not positive"),
+        (("--max-wheel-speed-rad-s", "nan"), "max_wheel_speed_rad_s=nan: out of the firmware's range"),
+        (("--ticks-per-rev", "100000"), "ticks_per_rev=100000"),
+    ],
+)
+def test_a_bad_option_is_one_clear_line_and_exit_code_2(tmp_path, capsys, options, line):
+    code = main(["--channel", str(tmp_path / "bus"), *options])
+    output, errors = capsys.readouterr()
+    assert code == 2
+    assert line in errors
+    assert errors.count("\n") == 1
+    assert output == ""
+    assert list(tmp_path.iterdir()) == []

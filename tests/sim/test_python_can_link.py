@@ -1,0 +1,106 @@
+"""On python-can's virtual bus, and on a real hub that dies and comes back."""
+
+import can
+import pytest
+
+from drivers.types import Frame
+from sim.hub import Hub
+from sim.python_can_link import RETRY_NS, PythonCanLink
+from sim.robot_link import LinkFaultError
+
+FRAME = Frame(0x100, bytes(range(8)))
+
+
+@pytest.fixture
+def bus():
+    with can.Bus(interface="virtual", channel="robot") as bus:
+        yield bus
+
+
+@pytest.fixture
+def link():
+    link = PythonCanLink("virtual", "robot", 0)
+    yield link
+    link.close()
+
+
+def test_frames_pass_both_ways(link, bus):
+    link.send([FRAME])
+    message = bus.recv(1)
+    assert (message.arbitration_id, bytes(message.data), message.is_extended_id) == (0x100, FRAME.data, False)
+    bus.send(message)
+    assert link.collect(7) == 1
+    assert [(r.t_ns, r.frame) for r in link.advance(7)] == [(7, FRAME)]
+
+
+def test_waiting_frames_can_be_let_in_a_few_at_a_time(link, bus):
+    for number in range(3):
+        bus.send(can.Message(arbitration_id=number, is_extended_id=False))
+    assert link.collect(1) == 3
+    assert [r.frame.can_id for r in link.advance(1, admit=1)] == [0]
+    assert link.collect(2) == 2
+    assert [r.frame.can_id for r in link.advance(2)] == [1, 2]
+
+
+def test_frames_that_are_not_for_robots_are_counted_and_left_out(link, bus):
+    bus.send(can.Message(arbitration_id=1, is_extended_id=True))
+    bus.send(can.Message(arbitration_id=1, is_extended_id=False, is_remote_frame=True))
+    bus.send(can.Message(arbitration_id=1, is_extended_id=False, is_error_frame=True))
+    assert link.collect(1) == 0
+    assert link.ignored == 3
+
+
+def test_unplug_and_back(link, bus):
+    link.unplug(100)
+    link.send([FRAME])
+    assert bus.recv(0) is None
+    assert link.send_failures == 1
+    assert link.next_event_ns() == 100
+    link.collect(100)
+    link.send([FRAME])
+    assert bus.recv(1) is not None
+
+
+def test_a_bus_that_breaks_is_opened_again(tmp_path, capsys):
+    path = tmp_path / "hub"
+    hub = Hub(path, 0, pacing=False)
+    link = PythonCanLink("unixcan", str(path), 0)
+    assert link.filenos()
+    hub.close()
+    assert link.collect(1) == 0
+    assert link.errors == 1
+    assert "opening it again" in capsys.readouterr().err
+    link.send([FRAME])
+    assert link.send_failures == 1
+    link.collect(1 + RETRY_NS)
+    assert link.errors == 2
+    hub = Hub(path, 0, pacing=False)
+    link.collect(1 + 2 * RETRY_NS)
+    hub.pump(1)
+    link.send([FRAME])
+    hub.pump(2)
+    assert hub.stats.frames_in == 1
+    link.close()
+    hub.close()
+
+
+def test_a_full_bus_is_counted_and_left_open(tmp_path):
+    hub = Hub(tmp_path / "hub", 0)
+    link = PythonCanLink("unixcan", str(tmp_path / "hub"), 0)
+    link.send([FRAME] * 500)
+    assert link.send_failures > 300
+    assert link.errors == 0
+    link.close()
+    hub.close()
+
+
+def test_faults_of_the_own_bus_are_refused(link, bus):
+    with pytest.raises(LinkFaultError, match="only on the simulator's own bus"):
+        link.force_bus_off("host")
+    link.babble(FRAME)
+    assert bus.recv(1).arbitration_id == 0x100
+
+
+def test_what_cannot_be_opened_raises():
+    with pytest.raises((can.CanError, OSError)):
+        PythonCanLink("unixcan", "/nonexistent/hub", 0)
