@@ -23,6 +23,7 @@ from disco_hw.daemon.status import counters, loop_figures, status
 from disco_hw.daemon.stop_path import StopPath
 from disco_hw.daemon.supervisor import Reply, UserRequest
 from disco_hw.daemon.systemd import Notifier
+from disco_hw.daemon.warm_up import warm_up
 from disco_hw.log import records
 from disco_hw.log.link import Attachment
 from disco_hw.log.provenance import DBC, MODEL_TOML, ROBOT_TOML, attachment, version
@@ -72,7 +73,9 @@ def run_daemon(options: DaemonOptions) -> int:
 def _start(setup: Setup, options: DaemonOptions, signals: StopSignals, stop: StopPath, say: Say) -> Daemon:
     """Make everything, in the order that real time needs, and add to the stop path what must be undone."""
     config, link = setup.config, setup.config.link
-    pipeline = make_pipeline(config, setup.model, make_planner(config, setup.model))
+    planner = make_planner(config, setup.model)
+    warm_up(make_pipeline(config, setup.model, make_planner(config, setup.model)))
+    pipeline = make_pipeline(config, setup.model, planner)
     # The planner was compiled before: whoever finds the socket gets an answer.
     server = ControlServer(socket_path(config), ACTIONS)
     stop.add("control socket", server.close)

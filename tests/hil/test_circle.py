@@ -1,0 +1,34 @@
+"""The paper's circle, driven by the real daemon with the paper's posterior on a plant drawn from it."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+pytestmark = pytest.mark.hil
+
+
+@pytest.mark.parametrize(("link", "plant_seed"), [("can", 3), ("serial", 4)])
+def test_demo_follows_the_circle(tmp_path, link, plant_seed):
+    result = subprocess.run(
+        [
+            sys.executable, "-m", "disco_hw", "demo", "--json", "--link", link, "--laps", "1.0",
+            "--plant-seed", str(plant_seed), "--out", str(tmp_path),
+        ],
+        capture_output=True,
+        text=True,
+        timeout=110,
+        check=False,
+    )  # fmt: skip
+    assert result.returncode == 0, result.stderr
+    figures = json.loads(result.stdout)
+    assert figures["success"]
+    assert figures["circle"]["laps"] >= 0.98
+    assert figures["circle"]["settled_rms_distance_m"] < 0.05
+    assert figures["estimation"]["rms_position_m"] < 0.02
+    assert figures["frames"]["rejected"] == 0
+    assert (tmp_path / "demo.mcap").stat().st_size > 100_000
+    assert (tmp_path / "circle.png").read_bytes().startswith(b"\x89PNG")

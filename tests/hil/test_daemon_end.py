@@ -1,0 +1,124 @@
+"""However the daemon ends, the wheels come first."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from disco_hw.log.reader import open_log
+from disco_hw.operator import Child
+from tests.hil.stack import STILL_RAD_S, running_stack
+
+pytestmark = pytest.mark.hil
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
+def test_a_signal_stops_the_wheels_before_the_process_ends(tmp_path, number):
+    with running_stack(tmp_path) as stack:
+        stack.drive()
+        os.kill(stack.daemon.process.pid, number)
+        code = stack.daemon.process.wait(8.0)
+        ended_s = time.monotonic()
+        time.sleep(0.3)
+        rows = stack.truth()
+    assert code == 0
+    before = [row for row in rows if row.t_s < ended_s]
+    assert max(row.fastest for row in before) > 5.0
+    assert before[-1].fastest < STILL_RAD_S
+    assert before[-1].state in {"STANDBY", "READY"}
+    with open_log(tmp_path / "run.mcap") as log:
+        assert log.summary().complete
+
+
+def test_quit_stops_the_wheels_too(tmp_path):
+    with running_stack(tmp_path) as stack:
+        stack.drive()
+        stack.operator.tell("quit")
+        assert stack.daemon.process.wait(8.0) == 0
+        ended_s = time.monotonic()
+        rows = stack.truth()
+    assert next(row for row in reversed(rows) if row.t_s < ended_s).fastest < STILL_RAD_S
+
+
+FAILING = """
+import sys
+from disco_hw.control import Disco
+plan, count = Disco.plan, 0
+def failing(self, now_ns, state):
+    global count
+    count += 1
+    if count > 60:
+        raise {error}("planted")
+    return plan(self, now_ns, state)
+Disco.plan = failing
+from disco_hw.cli import main
+sys.argv = ["disco-hw", "run", *sys.argv[1:]]
+main()
+"""
+
+
+@contextmanager
+def daemon_that_fails(monkeypatch, error: str):
+    """Start the daemon from a script in which planning fails after 60 plans."""
+    import subprocess
+    import sys
+
+    import disco_hw.operator as operator_module
+
+    popen = subprocess.Popen
+
+    def start(arguments, **options):
+        if arguments[3] == "run":
+            arguments = [sys.executable, "-c", FAILING.format(error=error), *arguments[4:]]
+        return popen(arguments, **options)
+
+    monkeypatch.setattr(operator_module.subprocess, "Popen", start)
+    yield
+    monkeypatch.undo()
+
+
+@pytest.mark.parametrize("error", ["RuntimeError", "MemoryError"])
+def test_an_exception_in_the_loop_stops_the_wheels_and_is_told(tmp_path, monkeypatch, error):
+    with daemon_that_fails(monkeypatch, error), running_stack(tmp_path) as stack:
+        stack.drive(until_rad_s=5.0)
+        code = stack.daemon.process.wait(8.0)
+        time.sleep(1.2)
+        rows = stack.truth()
+        output = (tmp_path / "daemon.txt").read_text()
+    assert code == 1
+    assert f"{error}: planted" in output
+    assert max(row.fastest for row in rows) > 5.0
+    last_command = next(row for row in rows if row.accepted == rows[-1].accepted)
+    assert all(row.fastest < STILL_RAD_S for row in rows if row.t_s > last_command.t_s + 0.75)
+
+
+def test_a_planner_without_a_valid_control_follows_the_tail_then_ramps_down(tmp_path, monkeypatch):
+    with daemon_that_fails(monkeypatch, "__import__('disco_hw.control').control.NoValidControl"):
+        with running_stack(tmp_path) as stack:
+            stack.drive(until_rad_s=5.0)
+            stack.operator.wait_until("ramping", lambda s: s["source"] == "ramp", 5.0)
+            status = stack.operator.wait_for_standstill(3.0)
+            assert status["state"] == "ARMED"
+            stack.truth()
+    sources = sources_in(tmp_path / "run.mcap")
+    first, last = sources.index("tail"), len(sources) - 1 - sources[::-1].index("tail")
+    assert "plan" in sources[:first]
+    # 0.2 s at 50 Hz, one more or less for a tick that came early or late.
+    assert 9 <= last - first + 1 <= 11
+    assert sources[last + 1] == "ramp"
+
+
+def sources_in(path: Path) -> list[str]:
+    with open_log(path) as log:
+        return [str(source) for source in log.columns("/command")["source"]]
+
+
+def test_child_helper_reports_last_words(tmp_path):
+    output = tmp_path / "out.txt"
+    output.write_text("one\ntwo\n")
+    assert Child("x", None, output).last_words() == "two"

@@ -1,0 +1,77 @@
+"""`disco-hw estop` stops the robot whatever state the daemon is in; the stop latches until a person resets it."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from disco_hw.errors import WorkError
+from tests.hil.stack import STILL_RAD_S, running_stack
+
+pytestmark = pytest.mark.hil
+
+
+def estop(robot_file, *arguments: str) -> tuple[int, str]:
+    result = subprocess.run(
+        [sys.executable, "-m", "disco_hw", "estop", str(robot_file), *arguments],
+        capture_output=True,
+        text=True,
+        timeout=20,
+        check=False,
+    )
+    return result.returncode, result.stdout + result.stderr
+
+
+@pytest.mark.parametrize("link", ["can", "serial"])
+@pytest.mark.parametrize("daemon", ["healthy", "frozen"])
+def test_estop_stops_and_latches(tmp_path, link, daemon):
+    with running_stack(tmp_path, link=link) as stack:
+        stack.drive()
+        if daemon == "frozen":
+            # Frozen, but fed by nobody: the firmware's watchdog stops the robot, and the e-stop must latch all the same.
+            os.kill(stack.daemon.process.pid, signal.SIGSTOP)
+        code, output = estop(stack.robot_file, "--json")
+        told_s = time.monotonic()
+        if daemon == "frozen":
+            os.kill(stack.daemon.process.pid, signal.SIGCONT)
+        assert code == 0, output
+        outcome = json.loads(output)
+        assert outcome["link_error"] is None
+        assert outcome["confirmed"]
+        stack.operator.wait_for("FAULT", 3.0)
+        with pytest.raises(WorkError, match="refused to arm"):
+            stack.operator.tell("arm")
+        time.sleep(0.6)
+        stack.operator.tell("reset")
+        stack.operator.wait_for("READY", 5.0)
+        rows = stack.truth()
+    stopped = [row for row in rows if row.t_s > told_s + 0.5]
+    assert any(row.state == "ESTOP" for row in rows)
+    assert max(row.fastest for row in stopped) < STILL_RAD_S
+
+
+def test_estop_needs_no_more_of_robot_toml_than_the_link(tmp_path):
+    with running_stack(tmp_path) as stack:
+        stack.drive()
+        broken = tmp_path / "broken.toml"
+        text = stack.robot_file.read_text().replace("wheel_radius_m = 0.06", 'wheel_radius_m = "round"')
+        broken.write_text(text)
+        code, output = estop(broken)
+        assert code == 0, output
+        assert "ESTOP" in output
+        stack.operator.wait_for("FAULT", 3.0)
+
+
+def test_estop_without_a_robot_says_so_and_fails(tmp_path):
+    from tests.hil.stack import write_robot_file
+
+    code, output = estop(write_robot_file(tmp_path))
+    assert code == 1
+    assert "NOT SENT" in output
+    assert "Traceback" not in output
