@@ -1,9 +1,10 @@
 """DISCO: the planner, its tasks, and the plan as a function of time."""
 
 from disco_hw.control.disco import Disco
-from disco_hw.control.plan import Diagnostics, NoValidControl, Plan, PlannerState, SentCommand
-from disco_hw.control.settings import DiscoSettings, WheelLimits
+from disco_hw.control.plan import Diagnostics, NoValidControl, Outcome, Plan, PlannerState, Rollouts, SentCommand
+from disco_hw.control.settings import DiscoSettings, Sampler, WheelLimits
 from disco_hw.control.tasks.circle import Circle
+from disco_hw.control.tasks.task import Task
 
 __all__ = [
     "Circle",
@@ -11,8 +12,12 @@ __all__ = [
     "Disco",
     "DiscoSettings",
     "NoValidControl",
+    "Outcome",
     "Plan",
     "PlannerState",
+    "Rollouts",
+    "Sampler",
     "SentCommand",
+    "Task",
     "WheelLimits",
 ]

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 # flat with rows at constant distances, which spares the compiler most checks for overlap.
 U = np.uintp
 BLOCK = U(80)
-PAIR = U(2) * BLOCK
+
+STATE_ROWS = 12
 
 _CACHE_LINE = 64
 

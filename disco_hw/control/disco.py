@@ -6,150 +6,263 @@ import math
 
 import numpy as np
 
-from disco_hw.control.blocks import BLOCK, aligned_zeros, block_count
-from disco_hw.control.parameter_points import parameter_points
-from disco_hw.control.plan import Array, Diagnostics, NoValidControl, Plan, PlannerState
-from disco_hw.control.replan import Sampling, Workspace, replan
-from disco_hw.control.rollout import STATE_SIZE, Basis, Limits, Start
+from disco_hw.control.optimiser import Optimiser
+from disco_hw.control.parameter_points import drawn_points, mean_point, point_estimate, unscented_points
+from disco_hw.control.past import past_commands
+from disco_hw.control.plan import Array, Diagnostics, NoValidControl, Outcome, Plan, PlannerState, Rollouts
 from disco_hw.control.settings import DiscoSettings, WheelLimits
-from disco_hw.control.spline import spline_basis
-from disco_hw.control.tasks.circle import Circle
+from disco_hw.control.skid_steer import SkidSteer
+from disco_hw.control.tasks.task import Task
 from disco_hw.model import Model
-from disco_hw.model.free_run import free_run
+from disco_hw.model.free_run import FreeRun
 from disco_hw.model.model import coefficient_tables
 from disco_hw.model.step import integration_of
 
 NARROW_TURN_RAD = 0.4
+TURNING_EFFECTS = ("wheel_gain", "wheel_radius_asymmetry", "surface_change", "turn_slip")
+SHORTEST_GAP_S = 1e-6
+CHANNELS = 2
 
 
 class Disco:
-    """Plans wheel speeds for a task. Pure: the same seed, calls and states give the same plans bit for bit."""
+    """Plans wheel speeds for a task.
 
-    def __init__(self, model: Model, task: Circle, settings: DiscoSettings, limits: WheelLimits, seed: int = 1) -> None:
-        self._model = model
-        self._task = task
-        self._settings = settings
-        self._limits = limits
-        self._seed = seed
-        self._step = 0
-        self._t0_ns: int | None = None
+    Pure: no clock, no thread, and the same seed, calls and states give the same plans bit for bit. The first call
+    compiles; `warm_up` does that beforehand.
+    """
 
-        s, f32 = settings, np.float32
-        theta, weights = parameter_points(model, s, seed)
-        self._point_weights = weights.astype(f32)
-        self._base, self._effects = coefficient_tables(model, theta, s.step_s, f32)
-        mean = model.complete(weights[None] @ theta, model.parameter_names)
-        self._mean_base, self._mean_effects = coefficient_tables(model, mean, s.step_s)
-        turn = float(np.max(theta[:, 0] / theta[:, 1])) * 2.0 * limits.speed_rad_s * s.step_s
-        self._integration = integration_of(s.step_s, turn > NARROW_TURN_RAD, f32)
-        self._mean_integration = integration_of(s.step_s, True)
-        self._history = 0
-
-        if s.knots is None:
-            rows = s.horizon
-            self._basis = Basis(np.arange(s.horizon), None)
-        else:
-            first, basis_weights = spline_basis(s.knots, s.horizon)
-            rows, self._basis = s.knots, Basis(first, basis_weights.astype(f32))
-        self._rows = rows + rows % 2
-        blocks = block_count(s.samples)
-        padded, pair = blocks * int(BLOCK), 2 * int(BLOCK)
-        self._work = Workspace(
-            nominal=np.zeros((s.horizon, 2), f32),
-            updated=np.zeros((s.horizon, 2), f32),
-            knots=aligned_zeros(blocks * self._rows * pair),
-            commands=aligned_zeros((self._history + s.horizon) * pair),
-            state=aligned_zeros(STATE_SIZE),
-            point_costs=aligned_zeros(weights.size * padded),
-            costs=aligned_zeros(padded),
-            weights=aligned_zeros(padded),
-            sums=aligned_zeros(s.horizon * pair),
-            report=np.array([0.0, 0.1, 0.0, 0.0, 0.0, 0.0]),
+    def __init__(self, model: Model, task: Task, settings: DiscoSettings, limits: WheelLimits, seed: int = 1) -> None:
+        sampler, step_s = settings.sampler, settings.step_s
+        self._model, self._task, self._settings, self._limits, self._seed = model, task, settings, limits, seed
+        self._own_draws = settings.uncertainty == "joint" or (
+            settings.uncertainty == "mc" and not settings.common_draws
         )
-        self._blocks = blocks
+        theta, weights = self._first_points()
+        self._mean_theta = mean_point(model)
+        self._mean = FreeRun(model, self._mean_theta, step_s)
+        self._points = FreeRun(model, theta, step_s)
+        self._weights = weights.astype(np.float32)
+
+        self._response_s = self._value(self._mean_theta, "motor_lag.tau_s") + self._value(
+            self._mean_theta, "command_delay.delay_s"
+        )
+        delay_steps = max(self._value(each, "command_delay.delay_s") for each in (theta, self._mean_theta)) / step_s
+        self._history = 0 if delay_steps == 0.0 else math.floor(delay_steps) + 1
+        self._tables = coefficient_tables(model, theta, step_s, np.float32)
+        turn_rad = 2.0 * limits.speed_rad_s * step_s * float((theta[:, 0] / theta[:, 1]).max())
+        may_turn_more = settings.uncertainty in ("mc", "joint") or any(s.name in TURNING_EFFECTS for s in model.effects)
+        self._integration = integration_of(step_s, may_turn_more or turn_rad > NARROW_TURN_RAD, np.float32)
+        self._start = np.zeros(8, np.float32)
+        self._optimiser = Optimiser(
+            sampler,
+            CHANNELS,
+            weights.size,
+            self._history,
+            limits.speed_rad_s,
+            limits.acceleration_rad_s2 * step_s,
+            seed,
+        )
+        self._begun_ns: int | None = None
+        self._t0_ns: int | None = None
+        self._failing_since_ns: int | None = None
+        self._memory: float | None = None
+        self._planned_from, self._elapsed_s, self._past = np.zeros(5), 0.0, np.zeros((self._history, CHANNELS))
+
+    def _first_points(self) -> tuple[Array, Array]:
+        settings, model = self._settings, self._model
+        match settings.uncertainty:
+            case "ut":
+                return unscented_points(model, settings.ut_alpha)
+            case "point":
+                return point_estimate(model)
+            case "mc":
+                count = settings.draws
+            case "joint":
+                count = 1
+        return drawn_points(model, count, self._seed, 0), np.full(count, 1.0 / count)
+
+    def _value(self, theta: Array, name: str) -> float:
+        """Largest value of a parameter in points (L, P); 0 if the model does not have it."""
+        names = self._model.parameter_names
+        return float(theta[:, names.index(name)].max()) if name in names else 0.0
 
     @property
-    def task(self) -> Circle:
+    def task(self) -> Task:
         """What is planned for."""
         return self._task
 
+    @property
+    def settings(self) -> DiscoSettings:
+        """How it is planned."""
+        return self._settings
+
     def reset(self) -> None:
         """Forget the last plan, as at a new start; the random numbers go on."""
-        self._work.nominal[:] = 0.0
-        self._work.report[1] = 0.1
-        self._t0_ns = None
+        self._optimiser.reset()
+        self._begun_ns = self._t0_ns = self._failing_since_ns = self._memory = None
 
     def warm_up(self) -> None:
-        """Compile everything that `plan` calls; leaves the planner as after `reset`."""
-        step = self._step
+        """Compile everything that `plan` calls, or load it from disk; leaves the planner as after `reset`."""
+        number = self._optimiser.step_number
+        self.reset()
         self.plan(0, PlannerState(0, 0.0, 0.0, 0.0, 0.0, 0.0))
-        self._step = step
+        self._optimiser.step_number = number
         self.reset()
 
     def plan(self, now_ns: int, state: PlannerState) -> Plan:
-        """Plan from the state; raises NoValidControl if no sampled sequence has a finite cost."""
-        s, f32, work = self._settings, np.float32, self._work
-        shift_steps = 0.0 if self._t0_ns is None else (now_ns - self._t0_ns) * 1e-9 / s.step_s
-        self._t0_ns = now_ns
-        origin_x, origin_y = self._task.origin_m
-        start = Start(
-            f32(state.x_m - origin_x),
-            f32(state.y_m - origin_y),
-            f32(math.cos(state.yaw_rad)),
-            f32(math.sin(state.yaw_rad)),
-            f32(state.left_speed_rad_s),
-            f32(state.right_speed_rad_s),
-            f32(0.0),
-        )
-        before = (
-            (state.sent[-1].left_rad_s, state.sent[-1].right_rad_s)
-            if state.sent
-            else (state.left_speed_rad_s, state.right_speed_rad_s)
-        )
-        limits = Limits(
-            f32(self._limits.speed_rad_s),
-            f32(min(self._limits.acceleration_rad_s2 * s.step_s, 2.0 * self._limits.speed_rad_s)),
-            f32(before[0]),
-            f32(before[1]),
-        )
-        task, memory = self._task.terms(0.0, state.x_m, state.y_m, s.step_s, s.horizon, f32)
-        sampling = Sampling(
-            self._seed, self._step, s.samples, self._blocks, self._rows, f32(s.noise_std_rad_s),
-            f32(s.temperature or 0.0), f32(s.target_ess),
-        )  # fmt: skip
-        self._step += 1
-        valid = replan(
-            work, sampling, self._history, shift_steps, self._basis, limits, start, self._base, self._effects,
-            self._point_weights, self._integration, task, f32(memory),
-        )  # fmt: skip
-        if not valid:
-            self.reset()
-            raise NoValidControl(
-                "no sampled command sequence has a finite cost; check the state estimate and the model"
-            )
-        wheel_speeds = work.nominal.astype(np.float64)
-        wheel_speeds.setflags(write=False)
-        report = work.report
+        """Plan from the state, predicted to when a command made from it acts.
+
+        A step without a valid result is tried again, then planned anew from standstill, then answered with a ramp to
+        zero for `decay_s`; after that NoValidControl is raised. Plans and commands are finite in any case.
+        """
+        settings = self._settings
+        t0_ns = now_ns + round(settings.latency_s * 1e9)
+        before = self._anchor(state)
+        first = self._t0_ns is None
+        begun_ns = now_ns if self._begun_ns is None else self._begun_ns
+        self._begun_ns = begun_ns
+        elapsed_s = (t0_ns - begun_ns) * 1e-9 if state.elapsed_s is None else state.elapsed_s + settings.latency_s
+        start = self._predicted(state, t0_ns, elapsed_s)
+        system = self._system(state, start, t0_ns, (t0_ns - begun_ns) * 1e-9, elapsed_s)
+        shift_steps = 0.0 if self._t0_ns is None else (t0_ns - self._t0_ns) * 1e-9 / settings.step_s
+        self._t0_ns = t0_ns
+        outcome, retries = self._improve(max(shift_steps, 0.0), before, system, first)
+        if outcome is Outcome.STOPPING:
+            self._stop(now_ns, before)
+        else:
+            self._failing_since_ns = None
+        wheel_speeds = self._optimiser.nominal()
+        self._planned_from, self._elapsed_s = start, elapsed_s
         return Plan(
-            t0_ns=now_ns,
-            step_s=s.step_s,
+            t0_ns=t0_ns,
+            step_s=settings.step_s,
             wheel_speeds=wheel_speeds,
-            trajectory=self._predict(state, wheel_speeds),
+            trajectory=self._trajectory(self._mean, wheel_speeds, 0),
             diagnostics=Diagnostics(
-                ess=float(report[0]),
-                temperature=float(report[1]),
-                cost_min=float(report[2]),
-                cost_mean=float(report[3]),
-                cost_nominal=float(report[4]),
-                retries=0,
-                valid_samples=int(report[5]),
+                **self._optimiser.report(),  # type: ignore[arg-type]
+                retries=retries,
+                collapsed=self._optimiser.ess < settings.min_ess,
+                outcome=outcome,
             ),
         )
 
-    def _predict(self, state: PlannerState, wheel_speeds: Array) -> Array:
-        states = np.empty((wheel_speeds.shape[0] + 1, 5))
-        states[0] = (state.x_m, state.y_m, state.yaw_rad, state.left_speed_rad_s, state.right_speed_rad_s)
-        free_run(states, wheel_speeds, 0, 0, self._mean_base, self._mean_effects, self._mean_integration)
-        trajectory = states[:, :3]
-        trajectory.setflags(write=False)
-        return trajectory
+    def _improve(
+        self, shift_steps: float, before: tuple[float, float], system: SkidSteer, first: bool
+    ) -> tuple[Outcome, int]:
+        """Climb the ladder until a step is valid; returns how it went and the attempts beyond the first."""
+        settings, optimiser = self._settings, self._optimiser
+        retries = 0
+        usable = optimiser.step(shift_steps, before, system, self._weights)
+        while retries < settings.retries and not (usable and optimiser.ess >= settings.min_ess):
+            retries += 1
+            usable = optimiser.step(0.0, before, system, self._weights) or usable
+        outcome = Outcome.RETRIED if retries else Outcome.PLANNED
+        if not usable:
+            optimiser.reset()
+            outcome = Outcome.RESTARTED
+            retries += 1
+            usable = optimiser.step(0.0, before, system, self._weights)
+        if not usable:
+            return Outcome.STOPPING, retries
+        if first or outcome is Outcome.RESTARTED:
+            for _ in range(settings.iterations_at_start - 1):
+                optimiser.step(0.0, before, system, self._weights)
+        return outcome, retries
+
+    def _stop(self, now_ns: int, before: tuple[float, float]) -> None:
+        """Put a ramp to zero in the plan's place; raises NoValidControl when that has gone on for too long."""
+        if self._failing_since_ns is None:
+            self._failing_since_ns = now_ns
+        if (now_ns - self._failing_since_ns) * 1e-9 >= self._settings.decay_s:
+            self._optimiser.reset()
+            raise NoValidControl(
+                f"no command sequence had a finite cost for {self._settings.decay_s} s, in spite of retries and a "
+                "restart; check the pose, the wheel speeds and the model"
+            )
+        steps = np.arange(1, self._settings.sampler.horizon + 1)[:, None]
+        change = self._limits.acceleration_rad_s2 * self._settings.step_s
+        start = np.nan_to_num(np.clip(np.array(before), -self._limits.speed_rad_s, self._limits.speed_rad_s))
+        size = np.maximum(np.abs(start) - np.minimum(change, np.abs(start)) * steps, 0.0)
+        self._optimiser.set_nominal(np.sign(start) * size)
+
+    def _anchor(self, state: PlannerState) -> tuple[float, float]:
+        """Commands that the plan's first change is limited from.
+
+        The last ones sent; but no further from the measured wheel speeds than the wheels could be behind them, so that
+        a plan does not run away from wheels that are held back.
+        """
+        measured = (state.left_speed_rad_s, state.right_speed_rad_s)
+        if not state.sent:
+            return measured
+        last = state.sent[-1]
+        slack = self._limits.acceleration_rad_s2 * (self._settings.step_s + self._response_s)
+        left, right = (
+            min(max(sent, speed - slack), speed + slack)
+            for sent, speed in zip((last.left_rad_s, last.right_rad_s), measured, strict=True)
+        )
+        return left, right
+
+    def _predicted(self, state: PlannerState, t0_ns: int, elapsed_s: float) -> Array:
+        """State (5,) at `t0_ns`: x, y, yaw, wheel speeds, under the mean parameters and the commands already sent."""
+        start = np.array([state.x_m, state.y_m, state.yaw_rad, state.left_speed_rad_s, state.right_speed_rad_s])
+        gap_s = (t0_ns - state.t_ns) * 1e-9
+        if gap_s < SHORTEST_GAP_S:
+            return start
+        count = math.ceil(gap_s / self._settings.step_s)
+        run = FreeRun(self._model, self._mean_theta, gap_s / count)
+        past = past_commands(state.sent, t0_ns, gap_s / count, run.past_rows + count, (start[3], start[4]))
+        states = run.states(start, past, run.past_rows, elapsed_s - gap_s)
+        return np.asarray(states[-1])
+
+    def _system(self, state: PlannerState, start: Array, t0_ns: int, task_s: float, elapsed_s: float) -> SkidSteer:
+        origin_x, origin_y = self._task.origin_m
+        x, y, yaw, left, right = start.tolist()
+        task, self._memory = self._task.terms(
+            task_s, x, y, self._memory, self._settings.step_s, self._settings.sampler.horizon
+        )
+        self._start[:] = (
+            x - origin_x,
+            y - origin_y,
+            math.cos(yaw),
+            math.sin(yaw),
+            left,
+            right,
+            elapsed_s,
+            self._memory,
+        )
+        if self._history:
+            self._past = past_commands(state.sent, t0_ns, self._settings.step_s, self._history, (left, right))
+            self._optimiser.set_past(self._past)
+        if self._settings.uncertainty in ("mc", "joint"):
+            self._draw_points()
+        base, effects = self._tables
+        each = True if self._own_draws else None
+        return SkidSteer(self._start, base, effects, each, self._integration, task, self._history)
+
+    def _draw_points(self) -> None:
+        """Fresh draws of the belief for this step."""
+        optimiser, model = self._optimiser, self._model
+        count = self._weights.size * (optimiser.padded_samples if self._own_draws else 1)
+        theta = drawn_points(model, count, self._seed, optimiser.step_number)
+        self._tables = coefficient_tables(model, theta, self._settings.step_s, np.float32)
+
+    def _with_past(self, wheel_speeds: Array) -> Array:
+        """Commands from before the plan, then the plan: (history + T, 2)."""
+        return np.vstack([self._past, wheel_speeds])
+
+    def sampled_rollouts(self, limit: int = 50) -> Rollouts:
+        """The last plan's `limit` sequences of the largest weight, rolled out under the mean parameters."""
+        commands, weights = self._optimiser.sampled_commands(limit)
+        trajectories = [self._trajectory(self._mean, one, 0) for one in commands]
+        return Rollouts(commands, np.array(trajectories).reshape(len(commands), -1, 3), weights)
+
+    def point_trajectories(self) -> Array:
+        """The last plan under each parameter point (sigma point or draw) that is shared: (L, T + 1, 3) x, y, yaw."""
+        wheel_speeds = self._optimiser.nominal()
+        count = self._weights.size
+        return np.array([self._trajectory(self._points, wheel_speeds, point) for point in range(count)])
+
+    def _trajectory(self, run: FreeRun, wheel_speeds: Array, point: int) -> Array:
+        return run.states(self._planned_from, self._with_past(wheel_speeds), self._history, self._elapsed_s, point)[
+            :, :3
+        ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import enum
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,7 +26,10 @@ class SentCommand:
 
 @dataclass(frozen=True, slots=True)
 class PlannerState:
-    """Pose in the world frame and measured wheel speeds at `t_ns`, and the commands sent up to now, oldest first."""
+    """Pose in the world frame and measured wheel speeds at `t_ns`, and the commands sent up to now, oldest first.
+
+    `elapsed_s`: time since the drive began, for effects that depend on it; None counts from the planner's start.
+    """
 
     t_ns: int
     x_m: float
@@ -34,14 +38,25 @@ class PlannerState:
     left_speed_rad_s: float
     right_speed_rad_s: float
     sent: tuple[SentCommand, ...] = ()
+    elapsed_s: float | None = None
+
+
+class Outcome(enum.Enum):
+    """How a plan came about: at once, after a retry, from scratch, or as a ramp to zero because nothing helped."""
+
+    PLANNED = "planned"
+    RETRIED = "retried"
+    RESTARTED = "restarted"
+    STOPPING = "stopping"
 
 
 @dataclass(frozen=True, slots=True)
 class Diagnostics:
     """How the optimisation went.
 
-    `ess` effective sample size; `temperature`; `cost_min`, `cost_mean` of the samples and `cost_nominal` of the
-    sequence they vary; `retries` made; `valid_samples` with a finite cost.
+    `ess` effective sample size, `collapsed` whether it is below the alarm; `temperature`; `cost_min`, `cost_mean` of
+    the samples and `cost_nominal` of sample 0, which is the plan that they vary; `valid_samples` with a finite cost;
+    `retries` made and the `outcome`.
     """
 
     ess: float
@@ -49,8 +64,10 @@ class Diagnostics:
     cost_min: float
     cost_mean: float
     cost_nominal: float
-    retries: int
     valid_samples: int
+    retries: int = 0
+    collapsed: bool = False
+    outcome: Outcome = Outcome.PLANNED
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -70,14 +87,11 @@ class Plan:
     def at(self, t_ns: int) -> tuple[float, float]:
         """Wheel speeds (left, right) at a time: linear between the middles of the steps, constant beyond the ends."""
         position = (t_ns - self.t0_ns) * 1e-9 / self.step_s - 0.5
-        last = self.wheel_speeds.shape[0] - 1
-        index = min(max(int(position), 0), max(last - 1, 0))
+        last = len(self.wheel_speeds) - 1
+        index = min(max(int(position), 0), last - 1)
         fraction = min(max(position - index, 0.0), 1.0)
-        (left, right), (left_next, right_next) = self.wheel_speeds[index], self.wheel_speeds[min(index + 1, last)]
-        return (
-            float(left + fraction * (left_next - left)),
-            float(right + fraction * (right_next - right)),
-        )
+        (left, right), (left_next, right_next) = self.wheel_speeds[index : index + 2].tolist()
+        return left + fraction * (left_next - left), right + fraction * (right_next - right)
 
     def age_s(self, now_ns: int) -> float:
         """Seconds since the plan's start; negative before it."""
@@ -86,3 +100,15 @@ class Plan:
     def expired(self, now_ns: int) -> bool:
         """Whether the plan's horizon is over."""
         return bool(self.age_s(now_ns) > self.step_s * len(self.wheel_speeds))
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Rollouts:
+    """Some of the sequences that the last plan was made from.
+
+    `wheel_speeds` (n, T, 2) rad/s, `trajectories` (n, T + 1, 3) x, y, yaw, `weights` (n,) of all that sum to one.
+    """
+
+    wheel_speeds: Array
+    trajectories: Array
+    weights: Array

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from disco_hw.control.blocks import BLOCK, PAIR, U
+from disco_hw.control.blocks import BLOCK, U
 from disco_hw.model.jit import (
     bits_of_float,
     block_function,
@@ -105,23 +105,24 @@ def box_muller(bits0: Any, bits1: Any) -> Any:
 
 
 @block_function
-def fill_normal_block(knots: Any, rows: int, block: int, step: int, seed: int, scale: float) -> None:
-    """Fill block `block` of `knots` (blocks, rows, 2, BLOCK) float32, flat, with normal deviates; `rows` is even.
+def fill_normal_block(noise: Any, rows: int, block: int, step: int, seed: int, scale: float) -> None:
+    """Fill block `block` of `noise` (blocks, rows, BLOCK) float32, flat, with normal deviates.
 
-    `scale` is their standard deviation. A deviate depends on nothing but (seed, step, sample, row).
+    `rows` is a multiple of four, `scale` the standard deviation. A deviate depends on nothing but (seed, step, sample,
+    row): seed is the key, and step, sample and row are the counter.
     """
     prefer_wide_vectors()
     k0, k1 = uint32(seed & 0xFFFFFFFF), uint32((seed >> 32) & 0xFFFFFFFF)
     c2, c3 = uint32(step & 0xFFFFFFFF), uint32((step >> 32) & 0xFFFFFFFF)
     first = U(block) * BLOCK
-    at = U(block * rows) * PAIR
-    for pair in range(rows // 2):
+    at = U(block * rows) * BLOCK
+    for four in range(rows // 4):
         for b in range(BLOCK):
-            b0, b1, b2, b3 = philox(uint32(first + b), uint32(pair), c2, c3, k0, k1)
+            b0, b1, b2, b3 = philox(uint32(first + b), uint32(four), c2, c3, k0, k1)
             n0, n1 = box_muller(b0, b1)
             n2, n3 = box_muller(b2, b3)
-            knots[at + b] = n0 * scale
-            knots[at + BLOCK + b] = n1 * scale
-            knots[at + PAIR + b] = n2 * scale
-            knots[at + PAIR + BLOCK + b] = n3 * scale
-        at += U(2) * PAIR
+            noise[at + b] = n0 * scale
+            noise[at + BLOCK + b] = n1 * scale
+            noise[at + U(2) * BLOCK + b] = n2 * scale
+            noise[at + U(3) * BLOCK + b] = n3 * scale
+        at += U(4) * BLOCK

@@ -5,148 +5,187 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
-from disco_hw.control.blocks import BLOCK, PAIR, U
+from disco_hw.control.blocks import BLOCK, U
+from disco_hw.control.commands import add_control_cost, add_weighted, expand
 from disco_hw.control.random_numbers import fill_normal_block
-from disco_hw.control.rollout import expand, roll_block
-from disco_hw.control.weighting import refuse_invalid, temperature_for, weigh
-from disco_hw.model.jit import block_function, float32, kernel_function, prefer_wide_vectors
+from disco_hw.control.risk import mean_over_points, worst_over_points
+from disco_hw.control.rollout import roll_block
+from disco_hw.control.weighting import INVALID, refuse_invalid, temperature_for, weigh
+from disco_hw.model.jit import block_function, cast_like, float32, kernel_function
+
+ESS, TEMPERATURE, LEAST, MEAN, NOMINAL, VALID = range(6)
 
 
 class Workspace(NamedTuple):
-    """Buffers of the step, float32 and flat unless said.
+    """Buffers of the step, float32 and flat unless said; C channels, R rows of noise, K' = blocks * BLOCK samples.
 
-    `nominal` (T, 2), `updated` (T, 2), `knots` (blocks, R, 2, BLOCK), `commands` (H + T, 2, BLOCK), `state`,
-    `point_costs` (L, K'), `costs` (K'), `weights` (K'), `sums` (T, 2, BLOCK), with K' = blocks * BLOCK;
-    `report` (6,) float64: ess, temperature, least, mean and nominal cost, number of finite costs.
+    `nominal`, `updated`, `before_update` (T, C); `noise` (blocks, R, BLOCK); `commands` ((H + T) * C, BLOCK); `state`
+    (STATE_ROWS, BLOCK); `point_costs` (L, K'); `costs`, `weights` (K',); `sums` (T * C, BLOCK); `order` (L,) int64;
+    `report` (6,) float64: effective sample size, temperature, least, mean and nominal cost, number of finite costs.
     """
 
     nominal: Any
     updated: Any
-    knots: Any
+    before_update: Any
+    noise: Any
     commands: Any
     state: Any
     point_costs: Any
     costs: Any
     weights: Any
     sums: Any
+    order: Any
     report: Any
 
 
 class Sampling(NamedTuple):
-    """What is sampled: seed and step number, samples, blocks, rows of knots, noise, temperature or 0, target ESS."""
+    """How is sampled and weighed.
+
+    `seed`; `samples`; `blocks`; `rows` of noise; `noise_std`; `with_nominal`: whether sample 0 is the nominal;
+    `hold`: whether a shifted plan ends in its last command, else in zero; `drawn`: whether the update is made from the
+    noise as drawn, else as applied; `temperature` or 0 for `target_ess`; `control_cost`: weight over variance, or 0;
+    `worst_part`: of the parameter points' weight that the cost is the mean of.
+    """
 
     seed: Any
-    step: Any
     samples: Any
     blocks: Any
     rows: Any
     noise_std: Any
+    with_nominal: Any
+    hold: Any
+    drawn: Any
     temperature: Any
     target_ess: Any
+    control_cost: Any
+    worst_part: Any
 
 
 @block_function
-def shift(nominal: Any, scratch: Any, steps: float) -> None:
-    """Move the sequence (T, 2) on by a fraction of steps; what is beyond its end holds the last command."""
+def shift(nominal: Any, scratch: Any, steps: float, hold: bool) -> None:
+    """Move the sequence (T, C) on by a fraction of steps; beyond its end it holds the last command or is zero."""
+    horizon, channels = nominal.shape
+    for t in range(horizon):
+        for c in range(channels):
+            position = t + steps
+            index = int(min(position, float(horizon)))
+            fraction = float32(position - index)
+            at = min(index, horizon - 1)
+            after = min(index + 1, horizon - 1)
+            first, second = nominal[at, c], nominal[after, c]
+            if not hold:
+                first = first if index < horizon else float32(0.0)
+                second = second if index + 1 < horizon else float32(0.0)
+            scratch[t, c] = first + min(fraction, float32(1.0)) * (second - first)
+    for t in range(horizon):
+        for c in range(channels):
+            nominal[t, c] = scratch[t, c]
+
+
+@block_function
+def sample_and_roll(
+    work: Any, sampling: Any, step: int, history: int, basis: Any, limits: Any, free: Any, system: Any, points: int
+) -> None:
+    """Draw all samples and cost them: writes `noise`, `point_costs` and, as far as the control cost goes, `costs`."""
+    nominal = work.nominal
     horizon = nominal.shape[0]
-    for t in range(horizon):
-        position = min(t + steps, float(horizon - 1))
-        index = min(int(position), horizon - 2)
-        fraction = float32(position - index)
-        for side in range(2):
-            scratch[t, side] = nominal[index, side] + fraction * (nominal[index + 1, side] - nominal[index, side])
-    for t in range(horizon):
-        for side in range(2):
-            nominal[t, side] = scratch[t, side]
-
-
-@block_function
-def mean_over_points(costs: Any, point_costs: Any, point_weights: Any, samples: int) -> None:
-    """Costs of the samples as weighted means over the parameter points."""
-    prefer_wide_vectors()
-    for k in range(U(samples)):
-        costs[k] = point_weights[0] * point_costs[k]
-    for i in range(1, point_weights.size):
-        weight = point_weights[i]
-        first = U(i * samples)
-        for k in range(U(samples)):
-            costs[k] += weight * point_costs[first + k]
-
-
-@block_function
-def add_weighted(sums: Any, weights: Any, first: Any, commands: Any, history: int, horizon: int) -> None:
-    """Add one block's commands times its weights to `sums`."""
-    prefer_wide_vectors()
-    for j in range(U(2 * horizon)):
-        to, source = j * BLOCK, U(history) * PAIR + j * BLOCK
+    padded = sampling.blocks * int(BLOCK)
+    for block in range(sampling.blocks):
+        fill_normal_block(work.noise, sampling.rows, block, step, sampling.seed, sampling.noise_std)
+        first_noise, first = U(block * sampling.rows) * BLOCK, U(block) * BLOCK
+        if block == 0 and sampling.with_nominal:
+            for j in range(U(sampling.rows)):
+                work.noise[j * BLOCK] = float32(0.0)
         for b in range(BLOCK):
-            sums[to + b] += weights[first + b] * commands[source + b]
+            work.costs[first + b] = float32(0.0)
+        if sampling.drawn and sampling.control_cost > float32(0.0):
+            expand(work.commands, work.state, history, nominal, work.noise, first_noise, basis, free)
+            add_control_cost(work.costs, first, work.commands, history, nominal, sampling.control_cost)
+        expand(work.commands, work.state, history, nominal, work.noise, first_noise, basis, limits)
+        if sampling.control_cost > float32(0.0) and not sampling.drawn:
+            add_control_cost(work.costs, first, work.commands, history, nominal, sampling.control_cost)
+        roll_block(system, work.point_costs, points, padded, block, horizon, work.commands, work.state)
 
 
-@kernel_function
-def replan(  # noqa: PLR0912
-    workspace: Any, sampling: Any, history: int, shift_steps: float, basis: Any, limits: Any, start: Any, base: Any,
-    effects: Any, point_weights: Any, integration: Any, task: Any, memory: float,
-) -> bool:  # fmt: skip
-    """One step of DISCO on `workspace.nominal`; False (and no update) if no sample has a finite cost."""
-    nominal, horizon = workspace.nominal, workspace.nominal.shape[0]
-    blocks = sampling.blocks
-    padded = blocks * int(BLOCK)
-    points = point_weights.size
-    shift(nominal, workspace.updated, shift_steps)
-    for block in range(blocks):
-        fill_normal_block(workspace.knots, sampling.rows, block, sampling.step, sampling.seed, sampling.noise_std)
-        first_knot = U(block * sampling.rows) * PAIR
-        if block == 0:
-            for j in range(U(2 * sampling.rows)):
-                workspace.knots[j * BLOCK] = float32(0.0)
-        expand(workspace.commands, workspace.state, history, nominal, workspace.knots, first_knot, basis, limits)
-        roll_block(
-            workspace.point_costs, points, padded, block, horizon, workspace.commands, workspace.state, history,
-            start, base, effects, integration, task, memory,
-        )  # fmt: skip
-    costs = workspace.costs
-    mean_over_points(costs, workspace.point_costs, point_weights, padded)
-    report = workspace.report
-    report[4] = costs[0]
+@block_function
+def weigh_all(work: Any, sampling: Any) -> Any:
+    """Weights from costs; fills the report. Returns the sum of the weights, or 0 if no cost is finite."""
+    costs, report = work.costs, work.report
+    report[NOMINAL] = costs[0]
     least, valid = refuse_invalid(costs, sampling.samples)
-    report[5] = valid
+    report[VALID] = valid
     if valid == 0:
-        return False
+        return float32(0.0)
     total_cost = 0.0
     for k in range(U(sampling.samples)):
-        if costs[k] < float32(1e30):
+        if costs[k] < INVALID:
             total_cost += costs[k]
     if sampling.temperature > float32(0.0):
         temperature = sampling.temperature
-        total, size = weigh(workspace.weights, workspace.state, costs, blocks, sampling.samples, least, temperature)
+        total, size = weigh(work.weights, work.state, costs, sampling.blocks, sampling.samples, least, temperature)
     else:
         target = min(sampling.target_ess, float32(valid))
         temperature, total, size = temperature_for(
-            target, workspace.weights, workspace.state, costs, blocks, sampling.samples, least, report[1]
+            target, work.weights, work.state, costs, sampling.blocks, sampling.samples, least, report[TEMPERATURE]
         )
-    report[0], report[1], report[2], report[3] = size, temperature, least, total_cost / valid
+    report[ESS], report[TEMPERATURE], report[LEAST], report[MEAN] = size, temperature, least, total_cost / valid
+    return total
 
-    sums = workspace.sums
-    for j in range(U(horizon) * PAIR):
+
+@block_function
+def update(work: Any, sampling: Any, history: int, basis: Any, limits: Any, total: float) -> Any:
+    """Set `nominal` to the weighted mean of the samples' commands; False and no change if that is not finite."""
+    nominal, sums = work.nominal, work.sums
+    horizon, channels = nominal.shape
+    rows = horizon * channels
+    for j in range(U(rows) * BLOCK):
         sums[j] = float32(0.0)
-    for block in range(blocks):
-        first_knot = U(block * sampling.rows) * PAIR
-        expand(workspace.commands, workspace.state, history, nominal, workspace.knots, first_knot, basis, limits)
-        add_weighted(sums, workspace.weights, U(block) * BLOCK, workspace.commands, history, horizon)
+    for block in range(sampling.blocks):
+        first_noise = U(block * sampling.rows) * BLOCK
+        expand(work.commands, work.state, history, nominal, work.noise, first_noise, basis, limits)
+        add_weighted(sums, work.weights, U(block) * BLOCK, work.commands, U(history * channels), rows)
     finite = True
     for t in range(horizon):
-        for side in range(2):
-            row = U(2 * t + side) * BLOCK
+        for c in range(channels):
+            row = U(t * channels + c) * BLOCK
             value = float32(0.0)
             for b in range(BLOCK):
                 value += sums[row + b]
             value /= total
-            workspace.updated[t, side] = value
+            work.updated[t, c] = value
             finite &= math.isfinite(value)
-    if not finite:
+    if finite:
+        for t in range(horizon):
+            for c in range(channels):
+                work.before_update[t, c] = nominal[t, c]
+                nominal[t, c] = work.updated[t, c]
+    return finite
+
+
+@kernel_function
+def replan(
+    work: Any, sampling: Any, step: int, history: int, shift_steps: float, basis: Any, limits: Any, free: Any,
+    system: Any, point_weights: Any,
+) -> Any:  # fmt: skip
+    """One step of DISCO on `work.nominal`; False, and the shifted plan stays, if nothing valid came out.
+
+    `limits` bound the commands of the rollouts, `free` are limits without bounds; `system` is what is rolled out.
+    """
+    shift(work.nominal, work.updated, shift_steps, sampling.hold)
+    sample_and_roll(work, sampling, step, history, basis, limits, free, system, point_weights.size)
+    if sampling.worst_part < float32(1.0):
+        worst_over_points(work.costs, work.point_costs, point_weights, sampling.blocks, sampling.worst_part, work.order)
+    else:
+        mean_over_points(work.costs, work.point_costs, point_weights, sampling.blocks)
+    total = weigh_all(work, sampling)
+    if not total > cast_like(0.0, total):
         return False
+    if not sampling.drawn:
+        return update(work, sampling, history, basis, limits, total)
+    if not update(work, sampling, history, basis, free, total):
+        return False
+    horizon, channels = work.nominal.shape
     for t in range(horizon):
-        for side in range(2):
-            nominal[t, side] = workspace.updated[t, side]
+        for c in range(channels):
+            work.nominal[t, c] = min(max(work.nominal[t, c], -limits.largest), limits.largest)
     return True

@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from disco_hw import config
 
 ROTATION = 2.0 * math.pi
 
-Uncertainty = Literal["ut", "mc", "point"]
+Uncertainty = Literal["ut", "mc", "joint", "point"]
+Risk = Literal["mean", "cvar", "worst"]
+
+
+def _require(holds: bool, field: str, remedy: str) -> None:
+    if not holds:
+        raise ValueError(f"{field}: must be {remedy}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,34 +33,114 @@ class WheelLimits:
 
 
 @dataclass(frozen=True, slots=True)
-class DiscoSettings:
-    """Settings of DISCO; the defaults are what the robot runs.
+class Sampler:
+    """How command sequences are sampled, weighed and carried on; units of a command are the system's.
 
-    samples: command sequences tried in a step (K). horizon: steps of `step_s` each plan covers (T).
-    noise_std_rad_s: standard deviation of the noise on one knot.
+    samples: sequences tried in a step (K). horizon: steps a plan covers (T).
+    noise_std: standard deviation of the noise on one knot.
     knots: cubic spline knots over the horizon, or None for white noise, one deviate a step.
-    uncertainty: `ut` sigma points of the belief, `mc` `draws` of it, `point` the model's point values.
-    ut_alpha: spread of the sigma points; 1 keeps all weights non-negative.
+    with_nominal: whether the plan itself is among the samples.
     temperature: of the softmax, or None to hold the effective sample size at `target_ess`.
     control_cost_weight: of the paper's term u' Sigma^-1 eps.
+    update_from: the noise as `applied`, within the limits, or as `drawn`.
+    beyond_end: what a shifted plan ends in: `hold` its last command or `zero`.
+    risk: what is made of the costs under the parameter points: their `mean`, the mean of the worst `worst_part` of
+    their weight (`cvar`), or the `worst`.
     """
 
     samples: int = 400
     horizon: int = 50
-    step_s: float = 0.1
-    noise_std_rad_s: float = 0.25 * ROTATION
+    noise_std: float = 0.25 * ROTATION
     knots: int | None = 8
-    uncertainty: Uncertainty = "ut"
-    draws: int = 7
-    ut_alpha: float = 1.0
+    with_nominal: bool = True
     temperature: float | None = None
     target_ess: float = 20.0
     control_cost_weight: float = 0.0
+    update_from: Literal["applied", "drawn"] = "applied"
+    beyond_end: Literal["hold", "zero"] = "hold"
+    risk: Risk = "mean"
+    worst_part: float = 0.25
+
+    def __post_init__(self) -> None:
+        _require(self.samples >= 2, "samples", "at least 2")
+        _require(self.horizon >= 2, "horizon", "at least 2")
+        _require(self.noise_std > 0.0, "noise_std", "above 0")
+        _require(self.knots is None or self.knots >= 4, "knots", "at least 4, or None")
+        _require(self.temperature is None or self.temperature > 0.0, "temperature", "above 0, or None")
+        _require(self.target_ess >= 1.0, "target_ess", "at least 1")
+        _require(self.control_cost_weight >= 0.0, "control_cost_weight", "0 or more")
+        _require(0.0 < self.worst_part <= 1.0, "worst_part", "in (0, 1]")
+
+
+@dataclass(frozen=True, slots=True)
+class DiscoSettings:
+    """Settings of DISCO; the defaults are what the robot runs.
+
+    sampler: how sequences are sampled; its commands are wheel speeds in rad/s. step_s: length of a step.
+    uncertainty: what every sequence is rolled out under: `ut` sigma points of the belief; `mc` `draws` of it, fresh
+    ones in every step; `joint` one draw a sequence, so that weights are over pairs of sequence and parameters (the
+    paper's control law); `point` the model's point values.
+    common_draws: whether the draws of `mc` are shared by all sequences of a step (less noise in their order) or every
+    sequence has its own, as in the paper's Algorithm 1.
+    ut_alpha: spread of the sigma points; 1 keeps all weights non-negative.
+    latency_s: from the state to when a command made from it acts, beyond the model's command delay.
+    iterations_at_start: optimisation steps for the first plan after a reset.
+    min_ess: effective sample size below which a step counts as collapsed: it is tried again, and reported.
+    retries: further attempts after a step without a valid result; then the plan is dropped and planned anew.
+    decay_s: how long the planner answers with a ramp to zero when nothing helps, before it raises NoValidControl.
+    """
+
+    sampler: Sampler = Sampler()
+    step_s: float = 0.1
+    uncertainty: Uncertainty = "ut"
+    draws: int = 7
+    common_draws: bool = True
+    ut_alpha: float = 1.0
     latency_s: float = 0.0
+    iterations_at_start: int = 5
+    min_ess: float = 3.0
+    retries: int = 2
+    decay_s: float = 0.5
+
+    def __post_init__(self) -> None:
+        _require(self.step_s > 0.0, "step_s", "above 0")
+        _require(self.draws >= 1, "draws", "at least 1")
+        _require(self.ut_alpha > 0.0, "ut_alpha", "above 0")
+        _require(self.latency_s >= 0.0, "latency_s", "0 or more")
+        _require(self.iterations_at_start >= 1, "iterations_at_start", "at least 1")
+        if self.uncertainty == "ut" and self.ut_alpha < 1.0 and self.sampler.risk != "mean":
+            raise ValueError("ut_alpha: below 1 the weight of the mean is negative, so only risk 'mean' has a meaning")
+
+    @classmethod
+    def paper(cls, uncertainty: Uncertainty = "ut") -> DiscoSettings:
+        """The paper's skid-steer experiment (appendix): white noise, control cost, UT with alpha = 0.5, Algorithm 1.
+
+        K = 400, T = 50, temperature 0.1, control authority 0.25 (rotations per second)^2.
+        """
+        temperature = 0.1
+        sampler = Sampler(
+            samples=400,
+            horizon=50,
+            noise_std=math.sqrt(0.25) * ROTATION,
+            knots=None,
+            with_nominal=False,
+            temperature=temperature,
+            control_cost_weight=temperature,
+            update_from="drawn",
+            beyond_end="zero",
+        )
+        return cls(
+            sampler=sampler,
+            uncertainty=uncertainty,
+            common_draws=False,
+            ut_alpha=0.5,
+            iterations_at_start=1,
+            min_ess=0.0,
+        )
 
     @classmethod
     def from_config(cls, control: config.Control) -> DiscoSettings:
         """The settings that robot.toml asks for."""
-        return cls(
-            samples=control.samples, horizon=control.horizon, step_s=control.step_s, uncertainty=control.uncertainty
-        )
+        settings = cls.paper() if control.mode == "paper" else cls()
+        sampler = replace(settings.sampler, samples=control.samples, horizon=control.horizon)
+        return replace(settings, sampler=sampler, step_s=control.step_s, uncertainty=control.uncertainty)

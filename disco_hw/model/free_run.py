@@ -1,41 +1,67 @@
-"""Free run: the model from a known state through given commands, in the precision of its arrays."""
+"""Free run: the model from a known state through given commands, in double precision."""
 
 from __future__ import annotations
 
 import math
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from disco_hw.model.effects import command_delay
 from disco_hw.model.jit import kernel_function
-from disco_hw.model.step import body_velocity, move, wheel_step
+from disco_hw.model.model import Model, coefficient_tables
+from disco_hw.model.step import axle_of, integration_of, step, tracked_of
 from disco_hw.model.tables import base_point, effect_point
+
+Array = NDArray[np.float64]
+
+
+class FreeRun:
+    """The model at L parameter points `theta` (L, P), in steps of `step_s`, ready to run."""
+
+    def __init__(self, model: Model, theta: Array, step_s: float) -> None:
+        self._base, self._effects = coefficient_tables(model, theta, step_s)
+        self._integration = integration_of(step_s, wide=True)
+        delay = self._effects.command_delay
+        self.past_rows = 0 if delay is None else int(delay[0].max()) + 1
+
+    def states(self, start: Array, commands: Array, history: int, time_s: float = 0.0, point: int = 0) -> Array:
+        """States (N + 1, 5) from `start` (5,): x, y (m), yaw (rad, not wrapped), wheel speeds (rad/s).
+
+        `commands` (history + N, 2) rad/s, each held for a step; the first `history` rows were sent before and must be
+        at least `past_rows`. `time_s`: the time at the start, for effects that depend on it. `point`: which of theta.
+        """
+        states = np.empty((commands.shape[0] - history + 1, 5))
+        states[0] = start
+        run_states(
+            states, np.ascontiguousarray(commands), history, float(time_s), point, self._base, self._effects,
+            self._integration,
+        )  # fmt: skip
+        return states
 
 
 @kernel_function
-def free_run(states: Any, commands: Any, history: int, point: int, base: Any, effects: Any, integration: Any) -> None:
-    """Run the model from `states[0]`; writes `states[1:]`.
-
-    `states` (N + 1, 5): x, y, yaw (not wrapped), left and right wheel speed. `commands` (history + N, 2) rad/s, held
-    over one step each; the first `history` rows are what was commanded before. `base`, `effects`: coefficient tables
-    of which row `point` is used.
-    """
-    here, effects_here = base_point(base, point), effect_point(effects, point)
+def run_states(
+    states: Any, commands: Any, history: int, time_s: float, point: int, base: Any, effects: Any, integration: Any
+) -> None:
+    """Fill `states[1:]` from `states[0]`; as `FreeRun.states`."""
+    here, acting = base_point(base, point), effect_point(effects, point)
     x, y, yaw = states[0, 0], states[0, 1], states[0, 2]
     wheel_left, wheel_right = states[0, 3], states[0, 4]
     cos_yaw, sin_yaw = math.cos(yaw), math.sin(yaw)
-    axle_x = x + here.x_icr_m * cos_yaw
-    axle_y = y + here.x_icr_m * sin_yaw
-    late = history - command_delay.whole_steps(effects_here.command_delay)
+    axle_x, axle_y = axle_of(x, y, cos_yaw, sin_yaw, here)
+    late = history - command_delay.whole_steps(acting.command_delay)
     for t in range(states.shape[0] - 1):
         recent, older = max(t + late, 0), max(t + late - 1, 0)
-        left = command_delay.blend(commands[recent, 0], commands[older, 0], effects_here.command_delay)
-        right = command_delay.blend(commands[recent, 1], commands[older, 1], effects_here.command_delay)
-        wheel_left, wheel_right, mean_left, mean_right = wheel_step(left, right, wheel_left, wheel_right, effects_here)
-        forward, lateral, turn = body_velocity(mean_left, mean_right, here, effects_here)
-        axle_x, axle_y, cos_yaw, sin_yaw = move(axle_x, axle_y, cos_yaw, sin_yaw, forward, lateral, turn, integration)
+        left = command_delay.blend(commands[recent, 0], commands[older, 0], acting.command_delay)
+        right = command_delay.blend(commands[recent, 1], commands[older, 1], acting.command_delay)
+        axle_x, axle_y, cos_yaw, sin_yaw, wheel_left, wheel_right, _, turn = step(
+            axle_x, axle_y, cos_yaw, sin_yaw, wheel_left, wheel_right, left, right,
+            time_s + t * integration.step_s, here, acting, integration,
+        )  # fmt: skip
         yaw = yaw + (turn + turn) * integration.step_s
-        states[t + 1, 0] = axle_x - here.x_icr_m * cos_yaw
-        states[t + 1, 1] = axle_y - here.x_icr_m * sin_yaw
+        states[t + 1, 0], states[t + 1, 1] = tracked_of(axle_x, axle_y, cos_yaw, sin_yaw, here)
         states[t + 1, 2] = yaw
         states[t + 1, 3] = wheel_left
         states[t + 1, 4] = wheel_right

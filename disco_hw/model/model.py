@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw import config
 from disco_hw.model.belief import Belief, Uniform
-from disco_hw.model.effects import REGISTRY, Effect
+from disco_hw.model.effects import MOTION_EFFECTS, REGISTRY, Effect
 from disco_hw.model.parameter import BASE_PARAMETERS, Parameter
 from disco_hw.model.step import Base, Effects
 
@@ -143,7 +144,7 @@ class Model:
         return replace(self, effects=effects, **base)
 
 
-def coefficient_tables(model: Model, theta: Array, step_s: float, dtype: type = np.float64) -> tuple[Base, Effects]:
+def coefficient_tables(model: Model, theta: Array, step_s: float, dtype: type = np.float64) -> tuple[Base, Any]:
     """Work out what the compiled step needs, for L parameter points.
 
     `theta` (L, P) in the order of `model.parameter_names`. Gives Base and Effects of arrays (L,); None if absent.
@@ -154,11 +155,12 @@ def coefficient_tables(model: Model, theta: Array, step_s: float, dtype: type = 
 
     radius, axial, x_icr = theta[:, 0], theta[:, 1], theta[:, 2]
     base = Base(table(0.5 * radius), table(0.5 * radius / axial), table(x_icr))
-    tables: dict[str, tuple[NDArray[np.floating], ...] | None] = dict.fromkeys(REGISTRY)
+    tables: dict[str, tuple[NDArray[np.floating], ...] | None] = dict.fromkeys(MOTION_EFFECTS)
     column = len(BASE_PARAMETERS)
     for setting in model.effects:
         width = len(setting.effect.parameters)
         values = theta[:, column : column + width]
         column += width
-        tables[setting.name] = tuple(map(table, setting.effect.coefficients(values, theta[:, :3], step_s)))
+        if setting.effect.moves:
+            tables[setting.name] = tuple(map(table, setting.effect.coefficients(values, theta[:, :3], step_s)))
     return base, Effects(**tables)

@@ -14,11 +14,28 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from disco_hw.model.effects import REGISTRY, motor_lag
+from disco_hw.model.effects import (
+    MOTION_EFFECTS,
+    acceleration_slip,
+    battery_sag,
+    deadband,
+    lateral_icr,
+    motor_lag,
+    side_slip,
+    slope,
+    speed_limit,
+    stiction,
+    surface_change,
+    turn_slip,
+    wheel_gain,
+    wheel_radius_asymmetry,
+    yaw_rate_limit,
+)
 from disco_hw.model.jit import cast_like, scalar_function
 
-# A field for every effect: None where absent, else what the effect's `coefficients` returned.
-Effects = namedtuple("Effects", list(REGISTRY))  # type: ignore[misc]
+# A field for every effect that moves the robot: None where absent, else what the effect's `coefficients` returned.
+effects_type: Any = namedtuple
+Effects = effects_type("Effects", MOTION_EFFECTS)
 
 
 class Base(NamedTuple):
@@ -65,23 +82,44 @@ def integration_of(step_s: float, wide: bool, dtype: type = np.float64) -> Integ
 @scalar_function
 def follows_wheels(effects: Any) -> Any:
     """Whether the state must carry wheel speeds; a constant to the compiler."""
-    return effects.motor_lag is not None
+    return (effects.motor_lag is not None) or (effects.stiction is not None) or (effects.acceleration_slip is not None)
 
 
 @scalar_function
-def wheel_step(left: float, right: float, wheel_left: float, wheel_right: float, effects: Any) -> Any:
-    """Wheel speeds at the end of a step and their means over it, from commands and the speeds at its start (rad/s)."""
+def wheel_step(left: Any, right: Any, wheel_left: Any, wheel_right: Any, time_s: Any, effects: Any) -> Any:
+    """Wheel speeds at the end of a step and their means over it, left and right (rad/s).
+
+    From the commands (after the command delay), the wheel speeds at the start of the step and its time.
+    """
+    left = deadband.term(left, effects.deadband)
+    right = deadband.term(right, effects.deadband)
+    left, right = yaw_rate_limit.term(left, right, effects.yaw_rate_limit)
+    left = speed_limit.term(left, effects.speed_limit)
+    right = speed_limit.term(right, effects.speed_limit)
+    left, right = wheel_gain.term(left, right, effects.wheel_gain)
+    left, right = battery_sag.term(left, right, time_s, effects.battery_sag)
+    left = stiction.term(left, wheel_left, effects.stiction)
+    right = stiction.term(right, wheel_right, effects.stiction)
     end_left, mean_left = motor_lag.term(left, wheel_left, effects.motor_lag)
     end_right, mean_right = motor_lag.term(right, wheel_right, effects.motor_lag)
     return end_left, end_right, mean_left, mean_right
 
 
 @scalar_function
-def body_velocity(mean_left: float, mean_right: float, base: Any, effects: Any) -> Any:
-    """Longitudinal speed (m/s), lateral speed of the axle (m/s) or None, and half the yaw rate (rad/s)."""
+def body_velocity(mean_left: Any, mean_right: Any, wheel_change: Any, time_s: Any, base: Any, effects: Any) -> Any:
+    """Forward speed (m/s), lateral speed of the axle (m/s) or None, and half the yaw rate (rad/s).
+
+    From the mean wheel speeds over a step, the change of their sum (rad/s), and the time at its start.
+    """
+    mean_left, mean_right = wheel_radius_asymmetry.term(mean_left, mean_right, effects.wheel_radius_asymmetry)
     forward = base.half_radius_m * (mean_left + mean_right)
     turn = base.half_turn_ratio * (mean_right - mean_left)
-    return forward, None, turn
+    forward, turn = surface_change.term(forward, turn, time_s, effects.surface_change)
+    turn = turn_slip.term(turn, effects.turn_slip)
+    forward = acceleration_slip.term(forward, wheel_change, effects.acceleration_slip)
+    lateral = side_slip.term(forward, turn, effects.side_slip)
+    forward = lateral_icr.term(forward, turn, effects.lateral_icr)
+    return forward, lateral, turn
 
 
 @scalar_function
@@ -123,3 +161,37 @@ def move(
     along = forward * chord
     x, y = sideways(lateral, chord, x + along * cos_mid, y + along * sin_mid, cos_mid, sin_mid)
     return x, y, cos_mid * cosine - sin_mid * sine, sin_mid * cosine + cos_mid * sine
+
+
+@scalar_function
+def axle_of(x: Any, y: Any, cos_yaw: Any, sin_yaw: Any, base: Any) -> Any:
+    """Point of the axle, x_icr ahead of the tracked point, that rolls without sliding sideways.
+
+    It moves as a unicycle whatever x_icr is, so the step is worked out for it.
+    """
+    return x + base.x_icr_m * cos_yaw, y + base.x_icr_m * sin_yaw
+
+
+@scalar_function
+def tracked_of(axle_x: Any, axle_y: Any, cos_yaw: Any, sin_yaw: Any, base: Any) -> Any:
+    """The tracked point, from the axle's point."""
+    return axle_x - base.x_icr_m * cos_yaw, axle_y - base.x_icr_m * sin_yaw
+
+
+@scalar_function
+def step(
+    axle_x: Any, axle_y: Any, cos_yaw: Any, sin_yaw: Any, wheel_left: Any, wheel_right: Any, left: Any, right: Any,
+    time_s: Any, base: Any, effects: Any, integration: Any,
+) -> Any:  # fmt: skip
+    """One step of f_theta.
+
+    State: the axle's point (m), cosine and sine of yaw, wheel speeds (rad/s); controls: the commands in force over the
+    step (rad/s), after the command delay; the time at its start (s). Returns the state after it, the forward speed over
+    it (m/s) and half the yaw rate over it (rad/s).
+    """
+    end_left, end_right, mean_left, mean_right = wheel_step(left, right, wheel_left, wheel_right, time_s, effects)
+    change = (end_left + end_right) - (wheel_left + wheel_right)
+    forward, lateral, turn = body_velocity(mean_left, mean_right, change, time_s, base, effects)
+    axle_x, axle_y, cos_yaw, sin_yaw = move(axle_x, axle_y, cos_yaw, sin_yaw, forward, lateral, turn, integration)
+    axle_x, axle_y = slope.term(axle_x, axle_y, mean_left, mean_right, effects.slope)
+    return axle_x, axle_y, cos_yaw, sin_yaw, end_left, end_right, forward, turn

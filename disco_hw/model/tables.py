@@ -1,4 +1,4 @@
-"""Picking one parameter point out of tables of coefficients, inside compiled code."""
+"""Picking parameter points out of tables of coefficients, inside compiled code."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 from numba import types
 
-from disco_hw.model.effects import REGISTRY
+from disco_hw.model.effects import MOTION_EFFECTS
 from disco_hw.model.jit import scalar_function, specialise
 from disco_hw.model.step import Base, Effects
 
@@ -43,9 +43,42 @@ def effect_point(effects: Any, i: int) -> Any:
 
 @specialise(effect_point)
 def _effect_point(effects: Any, i: Any) -> Callable[..., Any]:
-    # A tuple of mixed types cannot be looped over in compiled code, so the call is written out from the registry.
-    picks = ", ".join(f"entry(effects.{name}, i)" for name in REGISTRY)
+    # A tuple of mixed types cannot be looped over in compiled code, so the call is written out for every effect.
+    picks = ", ".join(f"entry(effects.{name}, i)" for name in MOTION_EFFECTS)
     scope: dict[str, Any] = {"Effects": Effects, "entry": entry}
     exec(f"def pick(effects, i):\n    return Effects({picks})", scope)
     pick: Callable[..., Any] = scope["pick"]
     return pick
+
+
+def lane_base(base: Any, i: int) -> Any:
+    """Base coefficients of a sample: the point itself, or entry i of a table with a point for every sample."""
+    return base_point(base, i)
+
+
+@specialise(lane_base)
+def _lane_base(base: Any, i: Any) -> Callable[..., Any]:
+    if isinstance(base.types[0], types.Array):
+
+        def pick(base: Any, i: Any) -> Any:
+            return base_point(base, i)
+
+        return pick
+    return lambda base, i: base
+
+
+def lane_effects(effects: Any, i: int) -> Any:
+    """Coefficients of all effects for a sample: the point itself, or entry i of a table."""
+    return effect_point(effects, i)
+
+
+@specialise(lane_effects)
+def _lane_effects(effects: Any, i: Any) -> Callable[..., Any]:
+    present = [kind for kind in effects.types if not isinstance(kind, types.NoneType)]
+    if present and isinstance(present[0].types[0], types.Array):
+
+        def pick(effects: Any, i: Any) -> Any:
+            return effect_point(effects, i)
+
+        return pick
+    return lambda effects, i: effects

@@ -30,7 +30,7 @@ def drive(planner: Disco, seconds: float, period_s: float = 0.1):
             x += dt * (v * math.cos(yaw) + omega * x_icr * math.sin(yaw))
             y += dt * (v * math.sin(yaw) - omega * x_icr * math.cos(yaw))
             yaw += dt * omega
-        costs.append(planner.task.instant_cost(x, y, v))
+        costs.append(planner.task.instant_cost(0.0, x, y, v))
         now_ns += round(period_s * 1e9)
     return np.array(costs)
 

@@ -54,18 +54,21 @@ class Circle:
         """World position that rollouts are relative to."""
         return self.center_x_m, self.center_y_m
 
-    def terms(self, t0_s: float, x_m: float, y_m: float, step_s: float, horizon: int, dtype: type) -> tuple[Any, float]:
-        """Terms for the kernel in the given precision, and the memory at the start."""
+    def terms(
+        self, time_s: float, x_m: float, y_m: float, memory: float | None, step_s: float, horizon: int
+    ) -> tuple[Any, float]:
+        """Terms for the kernel; nothing depends on time or place, and a circle needs no memory."""
+        f32 = np.float32
         return CircleTerms(
-            dtype(self.radius_m),
-            dtype(self.speed_m_s),
-            dtype(self.speed_m_s / self.radius_m),
-            dtype(self.progress_weight) if self.progress_weight > 0.0 else None,
-            dtype(1.0 / (step_s * self.radius_m)),
+            f32(self.radius_m),
+            f32(self.speed_m_s),
+            f32(self.speed_m_s / self.radius_m),
+            f32(self.progress_weight) if self.progress_weight > 0.0 else None,
+            f32(1.0 / (step_s * self.radius_m)),
         ), 0.0
 
-    def instant_cost(self, x_m: float, y_m: float, forward_m_s: float) -> float:
-        """The paper's instant cost of a state, for figures and displays."""
+    def instant_cost(self, time_s: float, x_m: float, y_m: float, forward_m_s: float) -> float:
+        """The paper's instant cost of a state."""
         distance = math.hypot(x_m - self.center_x_m, y_m - self.center_y_m) - self.radius_m
         return math.hypot(distance, forward_m_s - self.speed_m_s)
 

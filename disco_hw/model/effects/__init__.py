@@ -9,7 +9,7 @@ from types import MappingProxyType
 
 from disco_hw.model.effects.effect import Channel, Effect
 
-__all__ = ["REGISTRY", "Channel", "Effect"]
+__all__ = ["MOTION_EFFECTS", "REGISTRY", "Channel", "Effect"]
 
 
 def _discover() -> dict[str, Effect]:
@@ -19,3 +19,4 @@ def _discover() -> dict[str, Effect]:
 
 
 REGISTRY: Mapping[str, Effect] = MappingProxyType(_discover())
+MOTION_EFFECTS: tuple[str, ...] = tuple(name for name, effect in REGISTRY.items() if effect.moves)

@@ -16,6 +16,7 @@ class CommandDelay:
 
     name = "command_delay"
     channel = Channel.COMMAND_TO_WHEEL
+    moves = True
     parameters = (Parameter("delay_s", "s", 0.0, 1.0, 0.05, starts=(0.02, 0.15, 0.3)),)
     excitation = "steps of the wheel command: start-stops and fast steering"
     sentence = "the wheels act on commands {delay_s:.3f} s late"

@@ -36,6 +36,10 @@ class Effect(Protocol):
         """Where it acts."""
 
     @property
+    def moves(self) -> bool:
+        """Whether it changes motion; if not, it only changes what is measured."""
+
+    @property
     def parameters(self) -> tuple[Parameter, ...]:
         """Its parameters, in the order of all arrays."""
 

@@ -16,6 +16,7 @@ class MotorLag:
 
     name = "motor_lag"
     channel = Channel.COMMAND_TO_WHEEL
+    moves = True
     parameters = (Parameter("tau_s", "s", 0.0, 2.0, 0.1, starts=(0.03, 0.3)),)
     excitation = "steps of the wheel command: start-stops and fast steering"
     sentence = "the wheels follow their command with a time constant of {tau_s:.3f} s"

@@ -1,0 +1,162 @@
+"""The sampling optimiser behind DISCO: owns the plan and the buffers, knows nothing of the system it optimises."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from disco_hw.control.blocks import BLOCK, STATE_ROWS, aligned_zeros, block_count
+from disco_hw.control.commands import Basis, Limits
+from disco_hw.control.replan import ESS, TEMPERATURE, Sampling, Workspace, replan
+from disco_hw.control.settings import Sampler
+from disco_hw.control.spline import spline_basis
+
+Array = NDArray[np.float64]
+FIRST_TEMPERATURE = 0.1
+
+
+class Optimiser:
+    """Improves a command sequence (T, C) by sampling around it; all randomness is in `seed` and the step number.
+
+    `points`: parameter points that every sample is costed under. `history`: steps of commands from before the plan that
+    the system looks back on. `largest`, `change`: bound of a command and of its change in a step.
+    """
+
+    def __init__(
+        self, sampler: Sampler, channels: int, points: int, history: int, largest: float, change: float, seed: int
+    ) -> None:
+        horizon, f32 = sampler.horizon, np.float32
+        if sampler.knots is None:
+            knots, self._basis = horizon, Basis(np.arange(horizon), None)
+        else:
+            first, weights = spline_basis(sampler.knots, horizon)
+            knots, self._basis = sampler.knots, Basis(first, weights.astype(f32))
+        rows = -(-knots * channels // 4) * 4
+        blocks = block_count(sampler.samples)
+        padded = blocks * int(BLOCK)
+        variance = sampler.noise_std**2
+        self.step_number = 0
+        self._history = history
+        self._before = np.zeros(channels, f32)
+        self._limits = Limits(f32(largest), f32(min(change, 4.0 * largest)), self._before)
+        self._free = Limits(f32(np.inf), f32(np.inf), self._before)
+        self._sampling = Sampling(
+            seed=seed,
+            samples=sampler.samples,
+            blocks=blocks,
+            rows=rows,
+            noise_std=f32(sampler.noise_std),
+            with_nominal=sampler.with_nominal,
+            hold=sampler.beyond_end == "hold",
+            drawn=sampler.update_from == "drawn",
+            temperature=f32(sampler.temperature or 0.0),
+            target_ess=f32(sampler.target_ess),
+            control_cost=f32(sampler.control_cost_weight / variance),
+            worst_part=f32({"mean": 1.0, "cvar": sampler.worst_part, "worst": 1e-6}[sampler.risk]),
+        )
+        self._work = Workspace(
+            nominal=np.zeros((horizon, channels), f32),
+            updated=np.zeros((horizon, channels), f32),
+            before_update=np.zeros((horizon, channels), f32),
+            noise=aligned_zeros(blocks * rows * int(BLOCK)),
+            commands=aligned_zeros((history + horizon) * channels * int(BLOCK)),
+            state=aligned_zeros(STATE_ROWS * int(BLOCK)),
+            point_costs=aligned_zeros(points * padded),
+            costs=aligned_zeros(padded),
+            weights=aligned_zeros(padded),
+            sums=aligned_zeros(horizon * channels * int(BLOCK)),
+            order=np.zeros(points, np.int64),
+            report=np.zeros(6),
+        )
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the plan; the random numbers go on."""
+        self._work.nominal[:] = 0.0
+        self._work.report[TEMPERATURE] = FIRST_TEMPERATURE
+
+    @property
+    def work(self) -> Workspace:
+        """The buffers, as the last step left them."""
+        return self._work
+
+    @property
+    def padded_samples(self) -> int:
+        """Samples with the idle ones of the last block: K'."""
+        return int(self._work.costs.size)
+
+    def nominal(self) -> Array:
+        """A read-only copy of the plan, (T, C)."""
+        copy: Array = self._work.nominal.astype(np.float64)
+        copy.setflags(write=False)
+        return copy
+
+    def set_nominal(self, commands: Array) -> None:
+        """Continue from this plan, (T, C)."""
+        self._work.nominal[:] = commands
+
+    def set_past(self, past: Array) -> None:
+        """Set the commands before the plan, (history, C)."""
+        rows = self._work.commands.reshape(-1, int(BLOCK))
+        rows[: past.size] = past.reshape(-1, 1)
+
+    def step(self, shift_steps: float, before: tuple[float, ...], system: Any, point_weights: NDArray[Any]) -> bool:
+        """One step: the plan moves on by `shift_steps` and is improved; False if nothing valid came out.
+
+        `before`: the commands that limits of change start from. `point_weights` (L,) float32.
+        """
+        self._before[:] = before
+        number = self.step_number
+        self.step_number += 1
+        valid: bool = replan(
+            self._work, self._sampling, number, self._history, shift_steps, self._basis, self._limits, self._free,
+            system, point_weights,
+        )  # fmt: skip
+        return valid
+
+    @property
+    def ess(self) -> float:
+        """Effective sample size of the last step."""
+        return float(self._work.report[ESS])
+
+    def report(self) -> dict[str, float]:
+        """Figures of the last step: ess, temperature, cost_min, cost_mean, cost_nominal, valid_samples."""
+        ess, temperature, least, mean, nominal, valid = self._work.report.tolist()
+        return {
+            "ess": ess,
+            "temperature": temperature,
+            "cost_min": least,
+            "cost_mean": mean,
+            "cost_nominal": nominal,
+            "valid_samples": int(valid),
+        }
+
+    def sampled_commands(self, limit: int) -> tuple[Array, Array]:
+        """Up to `limit` of the last step's samples of the largest weight: commands (n, T, C), weights (n,)."""
+        work, sampling = self._work, self._sampling
+        weights = np.asarray(work.weights[: sampling.samples], dtype=np.float64)
+        chosen = np.argsort(-weights, kind="stable")[:limit]
+        noise = work.noise.reshape(sampling.blocks, sampling.rows, int(BLOCK))
+        commands = np.empty((chosen.size, *work.nominal.shape))
+        for row, k in enumerate(chosen):
+            commands[row] = self._one_sample(noise[k // int(BLOCK), :, k % int(BLOCK)])
+        return commands, weights[chosen] / max(weights.sum(), 1e-300)
+
+    def _one_sample(self, knots: NDArray[Any]) -> Array:
+        horizon, channels = self._work.nominal.shape
+        by_knot = knots[: knots.size // channels * channels].reshape(-1, channels).astype(np.float64)
+        first, weights = self._basis
+        if weights is None:
+            noise = by_knot[first]
+        else:
+            noise = np.einsum("tj,tjc->tc", weights, by_knot[first[:, None] + np.arange(4)])
+        limits, previous = self._limits, self._before.astype(np.float64)
+        commands = np.empty((horizon, channels))
+        for t in range(horizon):
+            wanted = self._work.before_update[t] + noise[t]
+            wanted = np.clip(wanted, previous - limits.change, previous + limits.change)
+            previous = np.clip(wanted, -limits.largest, limits.largest)
+            commands[t] = previous
+        return commands

@@ -1,0 +1,39 @@
+"""Acceleration slip: wheels run ahead of the body when it speeds up and behind it when it brakes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from disco_hw.model.effects.effect import Array, Channel
+from disco_hw.model.jit import cast_like, scalar_function
+from disco_hw.model.parameter import Parameter
+
+LARGEST_SLIP = 0.6
+
+
+class AccelerationSlip:
+    """v -> v - k |v| dv/dt, at most 60 % of it."""
+
+    name = "acceleration_slip"
+    channel = Channel.WHEEL_TO_BODY
+    moves = True
+    parameters = (Parameter("k_s2_m", "s^2/m", -5.0, 5.0, 0.1),)
+    excitation = "start-stops on a straight, forward and back"
+    sentence = "speeding up slips: {k_s2_m:.1%} of the speed is lost for every m/s^2"
+
+    def coefficients(self, values: Array, base: Array, step_s: float) -> tuple[Array, ...]:
+        """Slip per change of the two wheel speeds' sum over a step, (L,)."""
+        return (values[:, 0] * 0.5 * base[:, 0] / step_s,)
+
+
+@scalar_function
+def term(forward: Any, change: Any, coefficients: Any) -> Any:
+    """Forward speed (m/s) while the sum of the wheel speeds changes by `change` (rad/s) over the step."""
+    if coefficients is None:
+        return forward
+    (k,) = coefficients
+    largest = cast_like(LARGEST_SLIP, forward)
+    return forward - abs(forward) * min(max(k * change, -largest), largest)
+
+
+EFFECT = AccelerationSlip()

@@ -1,0 +1,40 @@
+"""Battery sag: wheel speed falls as the battery empties."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from disco_hw.model.effects.effect import Array, Channel
+from disco_hw.model.jit import cast_like, scalar_function
+from disco_hw.model.parameter import Parameter
+
+REFERENCE_S = 150.0
+LARGEST_LOSS = 0.9
+
+
+class BatterySag:
+    """u -> u (1 - loss t / 150 s): wheel speed falls linearly with the time since the start, to a tenth at least."""
+
+    name = "battery_sag"
+    channel = Channel.COMMAND_TO_WHEEL
+    moves = True
+    parameters = (Parameter("loss", "1 in 150 s", 0.0, 0.9, 0.05, starts=(0.02, 0.15)),)
+    excitation = "the same manoeuvre early and late in a drive of minutes"
+    sentence = "the wheels lose {loss:.1%} of their speed in every 150 s of driving"
+
+    def coefficients(self, values: Array, base: Array, step_s: float) -> tuple[Array, ...]:
+        """Loss per second, (L,)."""
+        return (values[:, 0] / REFERENCE_S,)
+
+
+@scalar_function
+def term(left: Any, right: Any, time_s: Any, coefficients: Any) -> Any:
+    """Wheel speeds that are left at this time (rad/s)."""
+    if coefficients is None:
+        return left, right
+    (loss_per_s,) = coefficients
+    lost = min(max(loss_per_s * time_s, cast_like(0.0, time_s)), cast_like(LARGEST_LOSS, time_s))
+    return left - left * lost, right - right * lost
+
+
+EFFECT = BatterySag()

@@ -1,0 +1,31 @@
+"""Heading bias: the measured yaw is off by a constant."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from disco_hw.model.effects.effect import Array, Channel
+from disco_hw.model.parameter import Parameter
+
+
+class HeadingBias:
+    """The measured yaw is the true one plus this."""
+
+    name = "heading_bias"
+    channel = Channel.POSE_SENSOR
+    moves = False
+    parameters = (Parameter("bias_rad", "rad", -3.2, 3.2, 0.0),)
+    excitation = "straights and fast steering"
+    sentence = "the measured yaw is {bias_rad:+.4f} rad off"
+
+    def coefficients(self, values: Array, base: Array, step_s: float) -> tuple[Array, ...]:
+        """None: it moves nothing."""
+        return ()
+
+
+def measured(yaw: Array, values: Array) -> Array:
+    """Yaw as the sensor tells it (rad, not wrapped); `values` (1,)."""
+    return np.asarray(yaw + values[0])
+
+
+EFFECT = HeadingBias()

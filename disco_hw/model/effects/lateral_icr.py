@@ -1,0 +1,36 @@
+"""Lateral ICR: the centre of rotation lies off the middle line."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from disco_hw.model.effects.effect import Array, Channel
+from disco_hw.model.jit import scalar_function
+from disco_hw.model.parameter import Parameter
+
+
+class LateralIcr:
+    """v_x -> v_x + offset omega: the instantaneous centre of rotation lies this far to the left."""
+
+    name = "lateral_icr"
+    channel = Channel.WHEEL_TO_BODY
+    moves = True
+    parameters = (Parameter("offset_m", "m", -1.0, 1.0, 0.0),)
+    excitation = "turning on the spot, both ways"
+    sentence = "the robot turns about a point {offset_m:+.3f} m to the left of its middle line"
+
+    def coefficients(self, values: Array, base: Array, step_s: float) -> tuple[Array, ...]:
+        """Forward speed per half of the yaw rate, (L,)."""
+        return (2.0 * values[:, 0],)
+
+
+@scalar_function
+def term(forward: Any, turn: Any, coefficients: Any) -> Any:
+    """Forward speed (m/s) at half the yaw rate `turn` (rad/s)."""
+    if coefficients is None:
+        return forward
+    (offset,) = coefficients
+    return forward + offset * turn
+
+
+EFFECT = LateralIcr()

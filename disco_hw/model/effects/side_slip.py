@@ -1,0 +1,36 @@
+"""Side slip: the body is carried outwards in a turn."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from disco_hw.model.effects.effect import Array, Channel
+from disco_hw.model.jit import scalar_function
+from disco_hw.model.parameter import Parameter
+
+
+class SideSlip:
+    """v_y -> v_y - k v omega."""
+
+    name = "side_slip"
+    channel = Channel.WHEEL_TO_BODY
+    moves = True
+    parameters = (Parameter("k_s", "s", -2.0, 2.0, 0.05),)
+    excitation = "circles at two speeds, both ways"
+    sentence = "in a turn the body slides outwards with {k_s:.3f} s times speed and yaw rate"
+
+    def coefficients(self, values: Array, base: Array, step_s: float) -> tuple[Array, ...]:
+        """Lateral speed per forward speed and half of the yaw rate, (L,)."""
+        return (-2.0 * values[:, 0],)
+
+
+@scalar_function
+def term(forward: Any, turn: Any, coefficients: Any) -> Any:
+    """Lateral speed of the axle (m/s), or None without the effect."""
+    if coefficients is None:
+        return None
+    (k,) = coefficients
+    return k * forward * turn
+
+
+EFFECT = SideSlip()

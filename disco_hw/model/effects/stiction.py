@@ -1,0 +1,39 @@
+"""Stiction: a wheel at rest needs a push to start."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from disco_hw.model.effects.effect import Array, Channel
+from disco_hw.model.jit import cast_like, scalar_function
+from disco_hw.model.parameter import Parameter
+
+REST_RAD_S = 0.02
+
+
+class Stiction:
+    """A wheel at rest stays at rest until |u| exceeds the threshold; a turning wheel feels nothing."""
+
+    name = "stiction"
+    channel = Channel.COMMAND_TO_WHEEL
+    moves = True
+    parameters = (Parameter("threshold_rad_s", "rad/s", 0.0, 5.0, 0.7, starts=(0.3, 1.2)),)
+    excitation = "slow ramps of the wheel command from rest"
+    sentence = "a wheel at rest starts to turn only above {threshold_rad_s:.2f} rad/s"
+
+    def coefficients(self, values: Array, base: Array, step_s: float) -> tuple[Array, ...]:
+        """The threshold, (L,)."""
+        return (values[:, 0],)
+
+
+@scalar_function
+def term(target: Any, speed: Any, coefficients: Any) -> Any:
+    """Target of a wheel that turns with `speed` at the start of the step (rad/s)."""
+    if coefficients is None:
+        return target
+    (threshold,) = coefficients
+    stuck = (abs(speed) < cast_like(REST_RAD_S, speed)) & (abs(target) <= threshold)
+    return cast_like(0.0, target) if stuck else target
+
+
+EFFECT = Stiction()
