@@ -1,0 +1,292 @@
+"""The two channels that are cut where they are measured: command to wheel, and wheel to pose.
+
+Each gives whitened residuals of a free run for any parameter vector; the pose sensor's effects live in the second one's
+data.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from disco_hw.gap.body_noise import BodyGains, BodyNoise, Motion, body_gains, whiten_body
+from disco_hw.gap.free_runs import BODY, BODY_NEUTRAL, WHEEL, WHEEL_NEUTRAL, pose_residual, read_angles, run_body, run_wheels
+from disco_hw.gap.timeline import CELL_S, Samples, Timeline
+from disco_hw.gap.wheel_noise import WheelGains, WheelNoise, wheel_gains, whiten_wheels
+
+WINDOW_S = 3.0
+ONSET_M_S = 0.05
+DRIFT_ONSET_M_S = 0.02
+_SHORTEST_WINDOW = 12
+_LONGEST_POSE_GAP_S = 2.0
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+
+class Channel(Protocol):
+    """What fitting and selecting need of a channel; n is the number of its residuals."""
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Names of the parameter vector's entries."""
+
+    @property
+    def neutral(self) -> Array:
+        """The parameter vector without any effect, at the nominal geometry."""
+
+    @property
+    def block(self) -> Index:
+        """Block of time of each residual, (n,)."""
+
+    @property
+    def count(self) -> int:
+        """Number of residuals that are used."""
+
+    def residual(self, p: Array, extra: Array | None = None) -> Array:
+        """Whitened residuals (n,) at a parameter vector; `extra` (M, k) is an unnamed term at the nodes."""
+
+
+@dataclass(frozen=True)
+class WheelChannel:
+    """Commands in, wheel angles out; `weight` (E, 2) tames stretches that are noisier than the rest."""
+
+    timeline: Timeline
+    gains: WheelGains
+    weight: Array
+    noise: WheelNoise
+
+    @classmethod
+    def build(cls, line: Timeline, noise: WheelNoise, use: Mask | None = None) -> WheelChannel:
+        """The channel with a noise model; samples where no command is known are left out."""
+        place = line.encoder
+        known = np.isfinite(line.command_rad_s[:, 0])
+        # One known cell before is not enough: the run begins anew after unknown commands.
+        good = known[place.node] & known[np.maximum(place.node - 1, 0)]
+        if use is not None:
+            good &= use
+        dt = np.diff(place.t_s, prepend=place.t_s[0])
+        first_of_run = np.zeros(place.t_s.size, dtype=bool)
+        starts = np.flatnonzero(line.first)
+        first_of_run[np.searchsorted(place.node, starts)] = True
+        resumed = good & ~np.concatenate([[False], known[place.node][:-1]])
+        jumps = np.concatenate([[0.0], np.cumsum(line.command_change)])
+        between = np.diff(jumps[place.node + 1], prepend=0.0)
+        speed = line.speed_rad_s[place.node]
+        gains = wheel_gains(noise, np.maximum(dt, 0.0), speed, np.maximum(between, 0.0), first_of_run | resumed, good)
+        return cls(line, gains, np.ones((place.t_s.size, 2)), noise)
+
+    def with_noise(self, noise: WheelNoise) -> WheelChannel:
+        """The same data under another noise model, weights reset."""
+        return WheelChannel.build(self.timeline, noise, self.gains.use)
+
+    def weighted(self, weight: Array) -> WheelChannel:
+        """The same with other weights (E, 2)."""
+        return replace(self, weight=weight)
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Names of the parameter vector's entries."""
+        return WHEEL
+
+    @property
+    def neutral(self) -> Array:
+        """The parameter vector without any effect."""
+        return WHEEL_NEUTRAL
+
+    @property
+    def block(self) -> Index:
+        """Block of time of each residual, (2 E,)."""
+        return np.repeat(self.timeline.encoder.block, 2)
+
+    @property
+    def count(self) -> int:
+        """Number of residuals that are used."""
+        return 2 * int(self.gains.use.sum())
+
+    def angles(self, p: Array, extra: Array | None = None) -> Array:
+        """Free-running wheel angles at the nodes, (M, 2)."""
+        line = self.timeline
+        out = np.empty_like(line.angle_rad)
+        push = np.zeros_like(out) if extra is None else extra
+        run_wheels(p, line.command_rad_s, push, line.first, line.t_s, line.speed_rad_s, out)
+        return out
+
+    def raw_residual(self, p: Array, extra: Array | None = None) -> Array:
+        """Measured minus predicted wheel angles at the samples, (E, 2)."""
+        place = self.timeline.encoder
+        predicted = np.empty((place.t_s.size, 2))
+        read_angles(self.angles(p, extra), place.node, place.fraction, predicted)
+        return self.timeline.encoder_angle_rad - predicted
+
+    def whitened(self, p: Array, extra: Array | None = None) -> Array:
+        """Residuals of unit variance, not weighted, (E, 2)."""
+        return whiten_wheels(self.raw_residual(p, extra), self.gains)
+
+    def residual(self, p: Array, extra: Array | None = None) -> Array:
+        """Whitened residuals, (2 E,)."""
+        return (self.whitened(p, extra) * self.weight).ravel()
+
+
+@dataclass(frozen=True)
+class BodyChannel:
+    """Measured wheel angles in, poses out, in windows of `WINDOW_S` whose start pose is unknown."""
+
+    timeline: Timeline
+    samples: Samples
+    measured: Array
+    window: Index
+    first_node: Index
+    last_node: Index
+    moving_s: Array
+    use: Mask
+    gains: BodyGains
+    weight: Array
+    noise: BodyNoise
+    geometry: Array
+
+    @classmethod
+    def build(cls, line: Timeline, noise: BodyNoise, geometry: Array, use: Mask | None = None) -> BodyChannel:
+        """The channel with a noise model; `geometry` (15,) is the parameter vector that describes the motion roughly.
+
+        `use` (P,) leaves single poses of the timeline out.
+        """
+        window, keep = _windows(line)
+        samples = line.pose.pick(keep)
+        measured = line.pose_values[keep]
+        chosen = np.ones(samples.t_s.size, dtype=bool) if use is None else use[keep]
+        starts = np.flatnonzero(line.first)
+        ends = np.append(starts[1:], line.t_s.size) - 1
+        run = np.searchsorted(starts, samples.node, side="right") - 1
+        rim = np.abs(line.speed_rad_s).max(axis=1) * geometry[0]
+        moving_s = np.cumsum(np.minimum(rim / DRIFT_ONSET_M_S, 1.0)) * CELL_S
+        channel = cls(
+            line,
+            samples,
+            measured,
+            window,
+            starts[run],
+            ends[run],
+            moving_s,
+            chosen,
+            body_gains(noise, _no_motion(samples)),
+            np.ones((samples.t_s.size, 3)),
+            noise,
+            geometry,
+        )
+        return replace(channel, gains=body_gains(noise, channel.motion(rim)))
+
+    def motion(self, rim_m_s: Array) -> Motion:
+        """How the robot moved between the pose samples, from the wheels and the rough geometry."""
+        line, samples, p = self.timeline, self.samples, self.geometry
+        speeds = line.speed_rad_s[samples.node]
+        v = 0.5 * p[0] * (speeds[:, 0] + speeds[:, 1])
+        omega = p[0] / p[1] * (speeds[:, 1] - speeds[:, 0])
+        restart = np.concatenate([[True], np.diff(self.window) != 0])
+        predicted = self.measured - self.raw_residual(p)
+        step = np.diff(predicted, axis=0, prepend=predicted[:1])
+        step[restart] = 0.0
+        dt = np.diff(samples.t_s, prepend=samples.t_s[0])
+        dt[restart] = 0.0
+        moving = np.minimum(rim_m_s[samples.node] / ONSET_M_S, 1.0)
+        return Motion(dt, step[:, 0], step[:, 1], predicted[:, 2], moving, v, omega, restart, self.use)
+
+    def with_noise(self, noise: BodyNoise, geometry: Array | None = None, use: Mask | None = None) -> BodyChannel:
+        """The same data under another noise model, weights reset; `use` is over this channel's samples."""
+        changed = replace(
+            self,
+            noise=noise,
+            geometry=self.geometry if geometry is None else geometry,
+            use=self.use if use is None else use,
+        )
+        rim = np.abs(self.timeline.speed_rad_s).max(axis=1) * changed.geometry[0]
+        return replace(
+            changed, gains=body_gains(noise, changed.motion(rim)), weight=np.ones((self.samples.t_s.size, 3))
+        )
+
+    def weighted(self, weight: Array) -> BodyChannel:
+        """The same with other weights (P, 3)."""
+        return replace(self, weight=weight)
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Names of the parameter vector's entries."""
+        return BODY
+
+    @property
+    def neutral(self) -> Array:
+        """The parameter vector without any effect, at the given geometry."""
+        return np.concatenate([self.geometry[:3], BODY_NEUTRAL[3:]])
+
+    @property
+    def block(self) -> Index:
+        """Block of time of each residual, (3 P,)."""
+        return np.repeat(self.samples.block, 3)
+
+    @property
+    def count(self) -> int:
+        """Number of residuals that are used, less the unknown starts."""
+        return 3 * int(self.use.sum()) - 3 * int(self.window[-1] + 1)
+
+    def track(self, p: Array, extra: Array | None = None) -> Array:
+        """Path at the nodes from the measured wheel angles, (M, 3)."""
+        line = self.timeline
+        out = np.empty((line.t_s.size, 3))
+        push = np.zeros_like(out) if extra is None else extra
+        run_body(p, line.angle_rad, line.speed_rad_s, push, line.first, line.t_s, out)
+        return out
+
+    def raw_residual(self, p: Array, extra: Array | None = None) -> Array:
+        """Measured minus predicted poses (P, 3) in the world, each window laid on its measurements."""
+        out = np.empty_like(self.measured)
+        pose_residual(
+            p,
+            self.track(p, extra),
+            self.moving_s,
+            self.samples.node,
+            self.samples.fraction,
+            self.window,
+            self.first_node,
+            self.last_node,
+            self.use,
+            self.measured,
+            out,
+        )
+        return out
+
+    def whitened(self, p: Array, extra: Array | None = None) -> Array:
+        """Residuals of unit variance, not weighted, (P, 3)."""
+        return whiten_body(self.raw_residual(p, extra), self.gains)
+
+    def residual(self, p: Array, extra: Array | None = None) -> Array:
+        """Whitened residuals, (3 P,)."""
+        return (self.whitened(p, extra) * self.weight).ravel()
+
+
+def _windows(line: Timeline) -> tuple[Index, Mask]:
+    """Window of each kept pose, numbered from 0, and which poses are kept (those in windows that are too thin are not).
+
+    A window ends after `WINDOW_S`, with its run, and where poses fail to come for long.
+    """
+    t, node = line.pose.t_s, line.pose.node
+    run = np.searchsorted(np.flatnonzero(line.first), node, side="right")
+    number = np.zeros(t.size, dtype=np.int64)
+    current, begin = 0, 0
+    for k in range(1, t.size):
+        if run[k] != run[k - 1] or t[k] - t[begin] > WINDOW_S or t[k] - t[k - 1] > _LONGEST_POSE_GAP_S:
+            current, begin = current + 1, k
+        number[k] = current
+    sizes = np.bincount(number, minlength=current + 1)
+    keep = sizes[number] >= min(_SHORTEST_WINDOW, int(np.median(sizes)))
+    _, renumbered = np.unique(number[keep], return_inverse=True)
+    return renumbered.astype(np.int64), keep
+
+
+def _no_motion(samples: Samples) -> Motion:
+    still = np.zeros(samples.t_s.size)
+    flags = np.zeros(samples.t_s.size, dtype=bool)
+    return Motion(still, still, still, still, still, still, still, ~flags, ~flags)

@@ -1,0 +1,86 @@
+"""How much a log speaks for an effect: gain on held-out blocks, penalised evidence, both honest about noise models.
+
+A noise model is never quite true. The scores of blocks of several lengths say how much more the estimate scatters than
+the model believes (a sandwich variance); the evidence is divided by that factor before it is judged.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from disco_hw.gap.channels import Channel
+from disco_hw.gap.fit import Fit, by_block, inverse
+
+Array = NDArray[np.float64]
+
+_FOLD_BLOCKS = 3
+_BLOCK_LENGTHS = (1, 3, 9)
+_FEWEST_BLOCKS = 5
+_RESAMPLES = 1000
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """For one set of effects against a smaller one.
+
+    `gain` in nats of the fit; `held_out` in nats on blocks left out; `p_value` that the held-out gain is not positive;
+    `inflation` of the variance; `score` = 2 gain / inflation - parameters ln(n), the difference of BIC.
+    """
+
+    gain: float
+    held_out: float
+    p_value: float
+    inflation: float
+    score: float
+
+
+def held_out_by_block(found: Fit, channel: Channel) -> Array:
+    """Half squares on each block (B,) with parameters fitted without it and its neighbours, to second order."""
+    cost = 0.5 * np.bincount(
+        np.unique(channel.block, return_inverse=True)[1], weights=found.residual**2
+    )
+    if not found.active:
+        return cost
+    normal, gradient = by_block(found, channel.block)
+    total = normal.sum(axis=0)
+    out = cost.copy()
+    for begin in range(0, cost.size, _FOLD_BLOCKS):
+        fold = slice(begin, min(begin + _FOLD_BLOCKS, cost.size))
+        step = inverse(total - normal[fold].sum(axis=0)) @ gradient[fold].sum(axis=0)
+        out[fold] += gradient[fold] @ step + 0.5 * np.einsum("i,bij,j->b", step, normal[fold], step)
+    return out
+
+
+def inflation(found: Fit, channel: Channel, added: tuple[int, ...]) -> float:
+    """Largest ratio over block lengths of the sandwich variance to the model's, for the added entries; at least 1."""
+    places = [found.active.index(index) for index in added if index in found.active]
+    if not places:
+        return 1.0
+    covariance = found.covariance()
+    inner = covariance[np.ix_(places, places)]
+    largest = 1.0
+    for length in _BLOCK_LENGTHS:
+        _, gradient = by_block(found, channel.block, length)
+        if gradient.shape[0] < _FEWEST_BLOCKS:
+            continue
+        moved = gradient @ covariance[:, places]
+        sandwich = moved.T @ moved * gradient.shape[0] / (gradient.shape[0] - 1.0)
+        ratio = float(np.trace(np.linalg.solve(inner, sandwich))) / len(places)
+        largest = max(largest, ratio)
+    return largest
+
+
+def compare(small: Fit, big: Fit, channel: Channel, parameters: int) -> Evidence:
+    """Evidence for `big` against `small`, which lacks `parameters` of its parameters."""
+    added = tuple(index for index in big.active if index not in small.active)
+    factor = inflation(big, channel, added)
+    gain = small.cost - big.cost
+    blocks = held_out_by_block(small, channel) - held_out_by_block(big, channel)
+    draws = np.random.default_rng(0).integers(0, blocks.size, (_RESAMPLES, blocks.size))
+    p_value = float((blocks[draws].sum(axis=1) <= 0.0).mean())
+    score = 2.0 * gain / factor - parameters * math.log(max(channel.count, 2))
+    return Evidence(gain, float(blocks.sum()), p_value, factor, score)

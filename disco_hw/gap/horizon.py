@@ -1,0 +1,59 @@
+"""Predictions some seconds ahead from a known pose, as displacement in the frame of the start."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from disco_hw.gap.timeline import CELL_S
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _displace(p: Any, track: Any, moving_s: Any, start: Any, heading: Any, ahead: int, out: Any) -> None:
+    late = p[13] / CELL_S
+    top = track.shape[0] - 2
+    for k in range(start.shape[0]):
+        a = max(start[k] - late, 0.0)
+        b = max(start[k] + ahead - late, 0.0)
+        i, j = min(int(math.floor(a)), top), min(int(math.floor(b)), top)
+        f, g = a - i, b - j
+        x = track[j, 0] + g * (track[j + 1, 0] - track[j, 0]) - track[i, 0] - f * (track[i + 1, 0] - track[i, 0])
+        y = track[j, 1] + g * (track[j + 1, 1] - track[j, 1]) - track[i, 1] - f * (track[i + 1, 1] - track[i, 1])
+        yaw_start = track[i, 2] + f * (track[i + 1, 2] - track[i, 2])
+        yaw = track[j, 2] + g * (track[j + 1, 2] - track[j, 2])
+        # The measured heading is the true one plus the bias: displacement is told in the measured frame.
+        turned = yaw_start + p[14]
+        cosine, sine = math.cos(turned), math.sin(turned)
+        moved = moving_s[min(start[k] + ahead, top)] - moving_s[start[k]]
+        c, s = math.cos(heading[k]), math.sin(heading[k])
+        out[k, 0] = cosine * x + sine * y + (c * p[8] + s * p[9]) * moved
+        out[k, 1] = -sine * x + cosine * y + (-s * p[8] + c * p[9]) * moved
+        out[k, 2] = yaw - yaw_start
+
+
+def displacement(p: Array, track: Array, moving_s: Array, start: Index, heading_rad: Array, ahead_s: float) -> Array:
+    """Forward, left and yaw (K, 3) that a pose sensor would see from each start node to `ahead_s` later.
+
+    `p` in the order of `BODY`; `track` (M, 3) a free run of the body; `heading_rad` (K,) measured at the starts.
+    """
+    out = np.empty((start.size, 3))
+    _displace(p, track, moving_s, start, heading_rad, round(ahead_s / CELL_S), out)
+    return out
+
+
+def starts_of(first: NDArray[np.bool_], usable: NDArray[np.bool_], ahead_s: float, every_s: float = 0.2) -> Index:
+    """Nodes (K,), `every_s` apart, from which a prediction stays within its run and on usable nodes."""
+    ahead, stride = round(ahead_s / CELL_S), round(every_s / CELL_S)
+    begins = np.flatnonzero(first)
+    ends = np.append(begins[1:], first.size)
+    bad = np.concatenate([[0], np.cumsum(~usable)])
+    found = [np.arange(lo + stride, hi - ahead - 1, stride) for lo, hi in zip(begins, ends, strict=True)]
+    start = np.concatenate(found) if found else np.empty(0, dtype=np.int64)
+    return start[bad[start + ahead + 1] == bad[start]]

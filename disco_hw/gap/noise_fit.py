@@ -1,0 +1,128 @@
+"""The noise of a channel, learnt from what the richest model leaves of this log, then held for every comparison."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from disco_hw.gap.body_noise import BodyNoise, body_gains, whiten_body
+from disco_hw.gap.channels import BodyChannel, WheelChannel
+from disco_hw.gap.wheel_noise import WheelNoise, wheel_gains, whiten_wheels
+
+Array = NDArray[np.float64]
+
+_HUBER = 3.0
+_PRIOR_SD = 2.0
+_OUTLIER = 5.0
+_SMOOTH_SAMPLES = 25
+_LOCAL_EXCESS = 1.4
+
+
+def _huber(squares: Array) -> float:
+    """Sum of squares that grows linearly beyond `_HUBER`."""
+    size = np.sqrt(squares)
+    return float(np.where(size <= _HUBER, squares, 2.0 * _HUBER * size - _HUBER**2).sum())
+
+
+def _minimise(objective, start: Array, low: Array, high: Array, most: int) -> Array:  # type: ignore[no-untyped-def]
+    found = minimize(
+        objective,
+        start,
+        method="L-BFGS-B",
+        bounds=list(zip(low, high, strict=True)),
+        options={"maxiter": most, "eps": 2e-2, "ftol": 3e-6},
+    )
+    return np.asarray(found.x)
+
+
+def fit_wheel_noise(channel: WheelChannel, p: Array) -> WheelNoise:
+    """Noise of the wheels by maximum likelihood at a parameter vector."""
+    raw = channel.raw_residual(p)
+    gains = channel.gains
+    line = channel.timeline
+    dt = np.maximum(np.diff(line.encoder.t_s, prepend=line.encoder.t_s[0]), 0.0)
+    jumps = np.concatenate([[0.0], np.cumsum(line.command_change)])
+    between = np.maximum(np.diff(jumps[line.encoder.node + 1], prepend=0.0), 0.0)
+    speed = line.speed_rad_s[line.encoder.node]
+    start = channel.noise.vector()
+    counted = gains.use & ~gains.restart
+
+    def objective(logs: Array) -> float:
+        trial = wheel_gains(WheelNoise.from_vector(logs), dt, speed, between, gains.restart, gains.use)
+        white = whiten_wheels(raw, trial)[counted]
+        return 0.5 * _huber(white**2) - float(np.log(trial.scale[counted]).sum()) + _pull(logs, start)
+
+    return WheelNoise.from_vector(_minimise(objective, start, start - 5.0, start + 5.0, 25))
+
+
+def _pull(logs: Array, start: Array) -> float:
+    """A weak prior that keeps parameters the log says nothing about where they are."""
+    return 0.5 * float((((logs - start) / _PRIOR_SD) ** 2).sum())
+
+
+def fit_body_noise(channel: BodyChannel, p: Array) -> BodyNoise:
+    """Noise of poses and body by maximum likelihood at a parameter vector."""
+    raw = channel.raw_residual(p)
+    rim = np.abs(channel.timeline.speed_rad_s).max(axis=1) * channel.geometry[0]
+    motion = channel.motion(rim)
+    start = channel.noise.vector()
+    counted = motion.use & ~motion.restart
+
+    def objective(logs: Array) -> float:
+        trial = body_gains(BodyNoise.from_vector(logs), motion)
+        white = whiten_body(raw, trial)[counted]
+        return 0.5 * _huber(white**2) - float(trial.log_scale[counted].sum()) + _pull(logs, start)
+
+    return BodyNoise.from_vector(_minimise(objective, start, start - 5.0, start + 5.0, 20))
+
+
+def without_outliers(channel: BodyChannel, p: Array) -> BodyChannel:
+    """The channel without poses that no noise of this size explains; found again until none is left."""
+    for _ in range(3):
+        white = channel.whitened(p)
+        wild = channel.use & (np.abs(white).max(axis=1) > _OUTLIER)
+        # A pose that jumps makes its successors look wild too: only the first of a row goes, then look again.
+        wild &= ~np.concatenate([[False], wild[:-1]])
+        if not wild.any() or wild.sum() > 0.1 * channel.use.sum():
+            break
+        channel = channel.with_noise(channel.noise, use=channel.use & ~wild)
+    return channel
+
+
+def local_weight(white: Array, use: NDArray[np.bool_]) -> Array:
+    """Weights that bring stretches and samples with larger residuals than the noise model's down to its size.
+
+    `white` (S, k) whitened, not weighted; the local scale is the mean square over `2 _SMOOTH_SAMPLES + 1` samples.
+    """
+    clipped = np.minimum(white**2, 16.0) * use[:, None]
+    window = np.ones(2 * _SMOOTH_SAMPLES + 1)
+    amount = np.convolve(use.astype(float), window, "same")
+    weights = np.empty_like(white)
+    for side in range(white.shape[1]):
+        local = np.convolve(clipped[:, side], window, "same") / np.maximum(amount, 1.0)
+        weights[:, side] = 1.0 / np.sqrt(np.maximum(local / _LOCAL_EXCESS, 1.0))
+    tamed = np.abs(white) * weights
+    return np.asarray(weights * np.minimum(1.0, _HUBER / np.maximum(tamed, 1e-9)))
+
+
+def learn_wheel_noise(channel: WheelChannel, p: Array) -> WheelChannel:
+    """The channel with the noise that is left at `p`, and weights for what is noisier still."""
+    channel = channel.with_noise(fit_wheel_noise(channel, p))
+    white = channel.whitened(p)
+    wild = channel.gains.use & (np.abs(white).max(axis=1) > 2.0 * _OUTLIER)
+    if 0 < wild.sum() < 0.02 * wild.size:
+        channel = WheelChannel.build(channel.timeline, channel.noise, channel.gains.use & ~wild)
+        white = channel.whitened(p)
+    return channel.weighted(local_weight(white, channel.gains.use))
+
+
+def learn_body_noise(channel: BodyChannel, p: Array) -> BodyChannel:
+    """The channel with the noise that is left at `p`, without outliers, and weights for what is noisier still."""
+    geometry = p.copy()
+    channel = without_outliers(replace(channel, geometry=geometry).with_noise(channel.noise), p)
+    channel = channel.with_noise(fit_body_noise(channel, p))
+    channel = without_outliers(channel, p)
+    return channel.weighted(local_weight(channel.whitened(p), channel.use))

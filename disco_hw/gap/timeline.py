@@ -1,0 +1,199 @@
+"""A drive on an even time grid: what the free runs of the channels read, prepared once.
+
+The grid's nodes are `CELL_S` apart within a run; a run is a stretch of one segment in which the wheels were measured
+and, for the command channel, the commands were known. Runs follow each other in the same arrays.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from disco_hw.log.drive import Commands, DriveLog
+
+CELL_S = 0.01
+BLOCK_S = 3.0
+_SHORTEST_RUN_S = 1.0
+_LONGEST_SILENCE_S = 1.5
+_SPEED_SPAN_S = 0.03
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class Samples:
+    """Where measurements lie on the grid, all (S,): node before, fraction of a cell after it, time, block of time."""
+
+    node: Index
+    fraction: Array
+    t_s: Array
+    block: Index
+
+    def pick(self, chosen: Mask | Index) -> Samples:
+        """Some of them."""
+        return Samples(self.node[chosen], self.fraction[chosen], self.t_s[chosen], self.block[chosen])
+
+
+@dataclass(frozen=True, slots=True)
+class Timeline:
+    """A drive on the grid.
+
+    Nodes (M,): `t_s`, `first` (begins a run), `command_rad_s` (M, 2) mean over the cell that starts there, NaN where no
+    command is known; `angle_rad`, `speed_rad_s` (M, 2) measured. `encoder`: wheel samples with `encoder_angle_rad`
+    (E, 2); `pose`: pose samples with `pose` (P, 3) x, y, yaw not wrapped within a run.
+    """
+
+    t_s: Array
+    first: Mask
+    command_rad_s: Array
+    command_change: Array
+    angle_rad: Array
+    speed_rad_s: Array
+    encoder: Samples
+    encoder_angle_rad: Array
+    encoder_period_s: float
+    quantum_rad: float
+    pose: Samples
+    pose_values: Array
+    notes: tuple[str, ...] = ()
+
+    @property
+    def has_commands(self) -> bool:
+        """Whether enough commands are known to judge the wheels."""
+        return bool(np.isfinite(self.command_rad_s[:, 0]).mean() > 0.02) and self.encoder.t_s.size > 200
+
+    @property
+    def has_poses(self) -> bool:
+        """Whether enough poses were measured to judge the body."""
+        return self.pose.t_s.size > 60
+
+    @property
+    def duration_s(self) -> float:
+        """Time covered by the grid."""
+        return float(self.t_s.size * CELL_S)
+
+
+def timeline(log: DriveLog) -> Timeline:
+    """Lay a drive on the grid; a log without wheel samples has an empty one."""
+    wheels, poses = log.wheels, log.poses
+    notes: list[str] = []
+    nodes_t, nodes_first, commands, changes, angles, speeds = [], [], [], [], [], []
+    encoder_at, encoder_angle, pose_at, pose_values = [], [], [], []
+    offset = 0
+    for lo, hi in _runs(wheels.t_s, wheels.segment):
+        t = wheels.t_s[lo:hi]
+        angle = np.column_stack([wheels.left_angle_rad[lo:hi], wheels.right_angle_rad[lo:hi]])
+        angle = angle - angle[0]
+        segment = int(wheels.segment[lo])
+        grid = t[0] + CELL_S * np.arange(int((t[-1] - t[0]) / CELL_S) + 1)
+        at = np.column_stack([np.interp(grid, t, angle[:, side]) for side in (0, 1)])
+        command, change = _command_cells(log.commands, segment, grid)
+        nodes_t.append(grid)
+        nodes_first.append(np.arange(grid.size) == 0)
+        commands.append(command)
+        changes.append(change)
+        angles.append(at)
+        speeds.append(_speeds(grid, t, angle))
+        inside = t <= grid[-1]
+        encoder_at.append(_locate(t[inside], grid, offset))
+        encoder_angle.append(angle[inside])
+        here = (poses.segment == segment) & (poses.t_s >= grid[0] + 0.02) & (poses.t_s <= grid[-1] - CELL_S)
+        pose_at.append(_locate(poses.t_s[here], grid, offset))
+        yaw = np.unwrap(poses.yaw_rad[here]) if here.any() else np.empty(0)
+        pose_values.append(np.column_stack([poses.x_m[here], poses.y_m[here], yaw]))
+        offset += grid.size
+    if not nodes_t:
+        return _empty()
+    encoder = _joined(encoder_at)
+    measured = np.concatenate(encoder_angle)
+    return Timeline(
+        t_s=np.concatenate(nodes_t),
+        first=np.concatenate(nodes_first),
+        command_rad_s=np.concatenate(commands),
+        command_change=np.concatenate(changes),
+        angle_rad=np.concatenate(angles),
+        speed_rad_s=np.concatenate(speeds),
+        encoder=encoder,
+        encoder_angle_rad=measured,
+        encoder_period_s=float(np.median(np.diff(encoder.t_s))),
+        quantum_rad=_quantum(measured) if wheels.angle_measured else 0.0,
+        pose=_joined(pose_at),
+        pose_values=np.concatenate(pose_values),
+        notes=tuple(notes),
+    )
+
+
+def _runs(t_s: Array, segment: Index) -> list[tuple[int, int]]:
+    """Stretches of one segment without silence, as half-open index ranges."""
+    if t_s.size < 2:
+        return []
+    breaks = np.flatnonzero((np.diff(segment) != 0) | (np.diff(t_s) > _LONGEST_SILENCE_S)) + 1
+    edges = [0, *breaks.tolist(), t_s.size]
+    pairs = zip(edges[:-1], edges[1:], strict=True)
+    return [(lo, hi) for lo, hi in pairs if hi - lo > 2 and t_s[hi - 1] - t_s[lo] >= _SHORTEST_RUN_S]
+
+
+def _locate(t_s: Array, grid: Array, offset: int) -> Samples:
+    """Positions of times on a run's grid whose first node has index `offset`."""
+    place = (t_s - grid[0]) / CELL_S
+    node = np.clip(np.floor(place).astype(np.int64), 0, grid.size - 2)
+    return Samples(node + offset, place - node, t_s, np.floor(t_s / BLOCK_S).astype(np.int64))
+
+
+def _joined(parts: list[Samples]) -> Samples:
+    return Samples(
+        np.concatenate([part.node for part in parts]),
+        np.concatenate([part.fraction for part in parts]),
+        np.concatenate([part.t_s for part in parts]),
+        np.concatenate([part.block for part in parts]),
+    )
+
+
+def _command_cells(commands: Commands, segment: int, grid: Array) -> tuple[Array, Array]:
+    """Mean command over each cell (M, 2), exact for commands held until the next, and the squared jumps in it (M,)."""
+    inside = commands.segment == segment
+    t, values = commands.t_s[inside], np.column_stack([commands.left_rad_s[inside], commands.right_rad_s[inside]])
+    if not t.size:
+        return np.full((grid.size, 2), np.nan), np.zeros(grid.size)
+    known = np.isfinite(values[:, 0])
+    filled = np.nan_to_num(values)
+    edges = np.append(grid, grid[-1] + CELL_S)
+    ends = np.append(t[1:], max(edges[-1], t[-1]) + 1.0)
+    integral = np.concatenate([np.zeros((1, 2)), np.cumsum(filled * (ends - t)[:, None], axis=0)])
+    knots = np.append(t, ends[-1])
+    means = np.column_stack([np.diff(np.interp(edges, knots, integral[:, side])) for side in (0, 1)]) / CELL_S
+    unknown = np.concatenate([[0.0], np.cumsum((~known) * (ends - t))])
+    lost = np.diff(np.interp(edges, knots, unknown)) > 1e-9
+    means[lost | (grid < t[0] - 1e-9)] = np.nan
+    jumps = np.zeros(grid.size)
+    steps = (np.diff(filled, axis=0) ** 2).mean(axis=1)
+    where = np.clip(((t[1:] - grid[0]) / CELL_S).astype(np.int64), 0, grid.size - 1)
+    np.add.at(jumps, where, steps)
+    return means, jumps
+
+
+def _speeds(grid: Array, t: Array, angle: Array) -> Array:
+    """Speeds at the nodes from differences of the angle over `2 _SPEED_SPAN_S` or the sampling period, (M, 2)."""
+    span = max(_SPEED_SPAN_S, float(np.median(np.diff(t))))
+    low, high = np.maximum(grid - span, t[0]), np.minimum(grid + span, t[-1])
+    columns = [np.interp(high, t, angle[:, side]) - np.interp(low, t, angle[:, side]) for side in (0, 1)]
+    return np.column_stack(columns) / (high - low)[:, None]
+
+
+def _quantum(angle: Array) -> float:
+    """The smallest step of the angle, rad; 0 if it has none."""
+    steps = np.abs(np.diff(angle, axis=0)).ravel()
+    steps = steps[steps > 1e-9]
+    return float(np.quantile(steps, 0.001)) if steps.size > 100 else 0.0
+
+
+def _empty() -> Timeline:
+    nothing, pairs = np.empty(0), np.empty((0, 2))
+    samples = Samples(np.empty(0, np.int64), nothing, nothing, np.empty(0, np.int64))
+    return Timeline(
+        nothing, np.empty(0, bool), pairs, nothing, pairs, pairs, samples, pairs, 0.0, 0.0, samples, np.empty((0, 3))
+    )

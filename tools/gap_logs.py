@@ -1,0 +1,95 @@
+"""Simulated logs for judging the search for missing effects; what is true stays here, only the log is handed on."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from disco_hw.log.drive import Commands, DriveLog, Gyro, Poses, Wheels, differentiate_angle
+from sim.drives import make_drive
+from sim.effects import EFFECTS, HiddenEffects, hidden_effects
+from sim.log_csv import LogOptions, dirty_log_options, dirty_parameters, simulated_log, varied_parameters
+from sim.plant_parameters import PlantParameters
+
+NAMED = tuple(name for name in EFFECTS if not name.startswith("x_"))
+
+
+def simulated_drive(
+    hide: dict[str, float | tuple[float, ...]] | None = None,
+    seed: int = 0,
+    drive: str = "rich",
+    dirty: bool = False,
+    motors: str = "ideal",
+) -> DriveLog:
+    """A log of a robot off its drawing with these effects hidden in it."""
+    parameters = varied_parameters(PlantParameters(), seed)
+    if motors == "ideal":
+        parameters = parameters.with_ideal_motors()
+    options = LogOptions()
+    if dirty:
+        parameters, options = dirty_parameters(parameters), dirty_log_options()
+    effects: HiddenEffects = hidden_effects(hide or {})
+    rows = simulated_log(make_drive(drive, seed), parameters, effects, seed, options)
+    times = np.array([t_s for t_s, _ in rows])
+    cells = np.array([[float(cell) if cell else math.nan for cell in row] for _, row in rows])[:, 1:]
+    return as_drive(times - times[0], cells, parameters.ticks_per_rev)
+
+
+def as_drive(t_s: np.ndarray, cells: np.ndarray, ticks_per_rev: int) -> DriveLog:
+    """Rows of a log (N,), (N, 7) as a drive; the columns are those of `sim.log_csv` after the time."""
+
+    def group(first: int, last: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        there = np.isfinite(cells[:, first])
+        times, index = np.unique(t_s[there], return_index=True)
+        return times, cells[there][index, first:last], np.zeros(times.size, dtype=np.int64)
+
+    command_s, command, command_segment = group(0, 2)
+    wheel_s, ticks, wheel_segment = group(2, 4)
+    pose_s, pose, pose_segment = group(4, 7)
+    angle = ticks * (2.0 * math.pi / ticks_per_rev)
+    speeds = [differentiate_angle(wheel_s, angle[:, side], wheel_segment) for side in (0, 1)]
+    nothing = np.empty(0)
+    return DriveLog(
+        ("simulated",),
+        Commands(command_s, command[:, 0], command[:, 1], command_segment),
+        Wheels(wheel_s, angle[:, 0], angle[:, 1], speeds[0], speeds[1], wheel_segment, True, False),
+        Poses(pose_s, pose[:, 0], pose[:, 1], pose[:, 2], pose_segment),
+        Gyro(nothing, nothing, np.empty(0, dtype=np.int64)),
+    )
+
+
+def realistic(name: str, seed: int, share: float = 1.0) -> dict[str, float | tuple[float, ...]]:
+    """An effect of realistic size, either sign where it has one; `share` makes it smaller."""
+    generator = np.random.default_rng([seed, sorted(EFFECTS).index(name)])
+    spec = EFFECTS[name]
+    drawn = {value.name: float(generator.uniform(*value.realistic)) for value in spec.values}
+    sign = float(generator.choice([-1.0, 1.0]))
+    signed = name in {
+        "wheel_gain",
+        "encoder_scale",
+        "wheel_radius_asymmetry",
+        "lateral_icr",
+        "pose_offset",
+        "heading_bias",
+        "surface_change",
+    }
+    if name == "surface_change":
+        return {name: (share * sign * drawn["track"], drawn["time_s"], share * -drawn["radius"])}
+    if name == "slope":
+        return {name: (share * drawn["drift_m_s"], float(generator.uniform(-math.pi, math.pi)))}
+    if name in {"speed_limit", "yaw_rate_limit"}:
+        top = 7.6 if name == "speed_limit" else 1.5
+        return {name: top - share * (top - drawn["limit_rad_s"])}
+    if name == "x_slew_limited_motor":
+        return {name: drawn["limit_rad_s2"]}
+    if name == "x_second_order_motor":
+        return {name: (drawn["natural_frequency_rad_s"], drawn["damping"])}
+    if name == "x_saturating_turn_slip":
+        return {name: (drawn["k_s"], drawn["omega_0_rad_s"])}
+    if name == "x_carpet_patch":
+        return {name: (drawn["track"],)}
+    value = drawn[spec.values[spec.lone[0]].name]
+    return {name: share * value * (sign if signed else 1.0)}
+
+
