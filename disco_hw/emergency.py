@@ -143,7 +143,14 @@ def _stop_over_serial(settings: Link, frame: Frame) -> bool:
         port.write(b"\0" + _REPEATS * encode_frame(frame.can_id, frame.data))
         port.flush()
         decoder = FrameDecoder()
-        return _confirmed(lambda: decoder.feed(port.read(max(1, port.in_waiting))))
+
+        def receive() -> list[tuple[int, bytes]]:
+            # Two readers of one port take bytes from each other, which pyserial reports as a lost device.
+            with contextlib.suppress(serial.SerialException):
+                return decoder.feed(port.read(max(1, port.in_waiting)))
+            return []
+
+        return _confirmed(receive)
 
 
 def _confirmed(receive: Callable[[], list[tuple[int, bytes]]]) -> bool:

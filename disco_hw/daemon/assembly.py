@@ -8,13 +8,13 @@ from disco_hw import control
 from disco_hw.config import RobotConfig
 from disco_hw.daemon.core import DaemonCore
 from disco_hw.daemon.governor import Governor, WheelLimits
+from disco_hw.daemon.preflight import check_firmware_limits, failures
 from disco_hw.daemon.supervisor import Supervisor, SupervisorSettings
 from disco_hw.estimation import OdometryParameters, PoseFusion
 from disco_hw.log.recorder import Recorder
 from disco_hw.model import Model
 from disco_hw.pipeline import Pipeline, Planner
 from disco_hw.robot_setup import geometry
-from drivers.limits import check_limits
 from drivers.reference import ReferenceDriver
 from drivers.types import Driver, Transport
 from firmware_protocol.codec import Codec
@@ -77,11 +77,4 @@ def preflight(config: RobotConfig, driver: Driver) -> tuple[str, ...]:
     """What robot.toml asks that the robot's firmware does not allow, in words; empty if they agree."""
     if driver.capabilities is None:
         return ()
-    return tuple(
-        check_limits(
-            driver.capabilities,
-            max_wheel_speed_rad_s=config.robot.max_wheel_speed_rad_s,
-            max_wheel_acceleration_rad_s2=config.robot.max_wheel_acceleration_rad_s2,
-            ticks_per_rev=config.robot.ticks_per_rev,
-        )
-    )
+    return failures(check_firmware_limits(config.robot, driver.capabilities))

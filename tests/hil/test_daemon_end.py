@@ -98,13 +98,13 @@ def test_an_exception_in_the_loop_stops_the_wheels_and_is_told(tmp_path, monkeyp
 
 
 def test_a_planner_without_a_valid_control_follows_the_tail_then_ramps_down(tmp_path, monkeypatch):
-    with daemon_that_fails(monkeypatch, "__import__('disco_hw.control').control.NoValidControl"):
-        with running_stack(tmp_path) as stack:
-            stack.drive(until_rad_s=5.0)
-            stack.operator.wait_until("ramping", lambda s: s["source"] == "ramp", 5.0)
-            status = stack.operator.wait_for_standstill(3.0)
-            assert status["state"] == "ARMED"
-            stack.truth()
+    no_valid_control = "__import__('disco_hw.control').control.NoValidControl"
+    with daemon_that_fails(monkeypatch, no_valid_control), running_stack(tmp_path) as stack:
+        stack.drive(until_rad_s=5.0)
+        stack.operator.wait_until("ramping", lambda s: s["source"] == "ramp", 5.0)
+        status = stack.operator.wait_for_standstill(3.0)
+        assert status["state"] == "ARMED"
+        stack.truth()
     sources = sources_in(tmp_path / "run.mcap")
     first, last = sources.index("tail"), len(sources) - 1 - sources[::-1].index("tail")
     assert "plan" in sources[:first]

@@ -34,7 +34,7 @@ def test_estop_stops_and_latches(tmp_path, link, daemon):
     with running_stack(tmp_path, link=link) as stack:
         stack.drive()
         if daemon == "frozen":
-            # Frozen, but fed by nobody: the firmware's watchdog stops the robot, and the e-stop must latch all the same.
+            # The firmware's watchdog stops the robot by itself then; the e-stop must latch all the same.
             os.kill(stack.daemon.process.pid, signal.SIGSTOP)
         code, output = estop(stack.robot_file, "--json")
         told_s = time.monotonic()

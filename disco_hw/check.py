@@ -1,0 +1,221 @@
+"""`disco-hw check`: is everything ready to drive? Looks and asks; nothing moves and nothing is armed."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from disco_hw.config import Link, RobotConfig
+from disco_hw.daemon.assembly import make_driver
+from disco_hw.daemon.client import socket_path
+from disco_hw.daemon.control_client import send_request
+from disco_hw.daemon.preflight import (
+    Check,
+    Level,
+    check_command_timing,
+    check_firmware_limits,
+    check_link_load,
+    check_realtime,
+    check_round_trip,
+)
+from disco_hw.daemon.realtime import can_lock_memory, can_use_fifo
+from disco_hw.errors import WorkError
+from disco_hw.robot_setup import Setup, load_setup
+from drivers.transport import open_transport
+from drivers.types import Capabilities, DriverState, LinkState, OutgoingFrame, ReceivedFrame, Transport
+from firmware_protocol.codec import Codec, Decoded
+from firmware_protocol.dbc import packaged_dbc
+
+_LINK_TIMEOUT_S = 2.0
+_LISTEN_S = 3.0
+_STEP_S = 0.002
+
+
+@dataclass(frozen=True, slots=True)
+class CheckReport:
+    """The checks in the order in which they were made."""
+
+    checks: tuple[Check, ...]
+
+    @property
+    def ok(self) -> bool:
+        """Whether no check failed; warnings do not count."""
+        return all(check.level is not Level.FAIL for check in self.checks)
+
+    def as_dict(self) -> dict[str, Any]:
+        """The report for machines."""
+        return {
+            "ok": self.ok,
+            "checks": [{"name": check.name, "level": check.level.value, "text": check.text} for check in self.checks],
+        }
+
+    def as_text(self) -> str:
+        """The report for a person, one line a check."""
+        return "\n".join(f"{check.level.value:4}  {check.name}: {check.text}" for check in self.checks)
+
+
+def run_check(robot: Path, link: str | None = None) -> CheckReport:
+    """Check files, link, firmware, timing and this computer; takes about three seconds.
+
+    Raises InputError if a file is wrong, WorkError while a daemon drives this robot: the two would speak at once.
+    """
+    setup = load_setup(robot, None, link)
+    _refuse_beside_a_daemon(setup.config)
+    checks = [_model_check(setup), check_link_load(setup.config.link, setup.config.control, packaged_dbc())]
+    control = setup.config.control
+    priority = setup.config.daemon.realtime_priority
+    checks += check_realtime(priority, can_use_fifo(), can_lock_memory(), os.cpu_count() or 1)
+    transport = _open(setup.config.link)
+    try:
+        checks.append(_link_check(transport))
+        if checks[-1].level is Level.OK:
+            found = _ask_robot(transport)
+            checks.append(_firmware_check(found))
+            checks.append(check_round_trip(found.round_trips_s, 1.0 / control.rate_hz))
+            checks.append(_telemetry_check(found))
+            if found.capabilities is not None:
+                checks += check_firmware_limits(setup.config.robot, found.capabilities)
+                checks.append(check_command_timing(control, found.capabilities))
+    finally:
+        transport.close()
+    return CheckReport(tuple(checks))
+
+
+@dataclass(frozen=True, slots=True)
+class _Found:
+    """What the robot answered."""
+
+    state: DriverState
+    detail: str
+    capabilities: Capabilities | None
+    clock_synchronised: bool
+    wheel_samples: int
+    pose_samples: int
+    rejected: int
+    round_trips_s: tuple[float, ...]
+
+
+def _refuse_beside_a_daemon(config: RobotConfig) -> None:
+    path = socket_path(config)
+    if not path.exists():
+        return
+    try:
+        send_request(path, {"do": "status"}, timeout_s=1.0)
+    except WorkError:
+        return
+    raise WorkError(
+        f"{path}: a daemon drives this robot; ask it with `disco-hw ctl ROBOT.toml status`, or stop it first"
+    )
+
+
+def _open(link: Link) -> Transport:
+    return open_transport(
+        link.kind,
+        interface=link.interface,
+        channel=link.channel,
+        bitrate=link.bitrate,
+        port=link.port,
+        baud=link.baud,
+    )
+
+
+def _model_check(setup: Setup) -> Check:
+    if setup.model_file is None:
+        return Check("model", Level.WARNING, "none is named: plans use the nominal geometry and the whole prior")
+    effects = ", ".join(effect.name for effect in setup.model.effects) or "none"
+    return Check("model", Level.OK, f"{setup.model_file}, effects: {effects}")
+
+
+def _link_check(transport: Transport) -> Check:
+    deadline = time.monotonic() + _LINK_TIMEOUT_S
+    while transport.state is not LinkState.UP:
+        if time.monotonic() > deadline:
+            return Check("link", Level.FAIL, f"{transport.name}: {transport.last_error or 'did not come up'}")
+        time.sleep(_STEP_S)
+    return Check("link", Level.OK, transport.name)
+
+
+def _ask_robot(transport: Transport) -> _Found:
+    """Shake hands, listen for three seconds and time the answers to the driver's own clock requests."""
+    driver = make_driver()
+    stopwatch = _Stopwatch()
+    wheels = poses = 0
+    driver.link_up(time.monotonic_ns())
+    end_ns = time.monotonic_ns() + round(_LISTEN_S * 1e9)
+    while (now_ns := time.monotonic_ns()) < end_ns:
+        frames = transport.receive()
+        stopwatch.received(frames)
+        readings = driver.receive(now_ns, frames)
+        wheels += len(readings.wheels)
+        poses += len(readings.poses)
+        for outgoing in driver.transmit(now_ns, None):
+            if transport.send(outgoing, now_ns):
+                stopwatch.sent(outgoing)
+        time.sleep(_STEP_S)
+    stats = driver.stats
+    return _Found(
+        state=driver.state,
+        detail=driver.detail,
+        capabilities=driver.capabilities,
+        clock_synchronised=driver.clock_offset_ns is not None,
+        wheel_samples=wheels,
+        pose_samples=poses,
+        rejected=stats.rejected_crc + stats.rejected_sequence + stats.rejected_length + transport.stats.malformed,
+        round_trips_s=tuple(stopwatch.round_trips_s),
+    )
+
+
+class _Stopwatch:
+    """Round trips of the clock requests that pass by."""
+
+    def __init__(self) -> None:
+        self._codec = Codec()
+        self._sent_ns: dict[float, int] = {}
+        self.round_trips_s: list[float] = []
+
+    def sent(self, outgoing: OutgoingFrame) -> None:
+        decoded = self._codec.decode(outgoing.frame.can_id, outgoing.frame.data)
+        if isinstance(decoded, Decoded) and decoded.name == "TIME_REQUEST":
+            self._sent_ns[decoded.values["sequence"]] = time.monotonic_ns()
+
+    def received(self, frames: Sequence[ReceivedFrame]) -> None:
+        for received in frames:
+            decoded = self._codec.decode(received.frame.can_id, received.frame.data)
+            if isinstance(decoded, Decoded) and decoded.name == "TIME_RESPONSE":
+                sent_ns = self._sent_ns.pop(decoded.values["sequence"], None)
+                if sent_ns is not None:
+                    self.round_trips_s.append((received.t_ns - sent_ns) * 1e-9)
+
+
+def _firmware_check(found: _Found) -> Check:
+    name = "firmware"
+    if found.capabilities is None:
+        return Check(name, Level.FAIL, found.detail)
+    if found.state in {DriverState.REFUSED, DriverState.FAULT, DriverState.ESTOP}:
+        return Check(name, Level.FAIL, f"{found.state.value}: {found.detail}")
+    capabilities = found.capabilities
+    clock = "clock synchronised" if found.clock_synchronised else "clock NOT synchronised"
+    version = f"{capabilities.firmware_version}, protocol {capabilities.protocol_major}.{capabilities.protocol_minor}"
+    return Check(name, Level.OK, f"{version}, DBC {capabilities.dbc_hash:08x} matches, {found.state.value}, {clock}")
+
+
+def _telemetry_check(found: _Found) -> Check:
+    name = "telemetry"
+    rates = (
+        f"{found.wheel_samples / _LISTEN_S:.0f} wheel and {found.pose_samples / _LISTEN_S:.0f} pose samples a second"
+    )
+    if not found.wheel_samples:
+        return Check(name, Level.FAIL, f"{rates}; check the encoders and the firmware")
+    if not found.pose_samples:
+        return Check(
+            name, Level.WARNING, f"{rates}; without a pose the task does not start if estimation.pose_required"
+        )
+    if found.rejected:
+        return Check(
+            name, Level.WARNING, f"{rates}, {found.rejected} frames rejected; check the cable and other senders"
+        )
+    return Check(name, Level.OK, f"{rates}, none rejected")

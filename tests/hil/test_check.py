@@ -1,0 +1,79 @@
+"""`disco-hw check` and `ctl` against a real virtual robot."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+from disco_hw.operator import disco_hw_process
+from tests.hil.stack import READY_TIMEOUT_S, running_stack, write_robot_file
+
+pytestmark = pytest.mark.hil
+
+
+def disco(*arguments: str) -> tuple[int, str]:
+    result = subprocess.run(
+        [sys.executable, "-m", "disco_hw", *arguments], capture_output=True, text=True, timeout=60, check=False
+    )
+    return result.returncode, result.stdout + result.stderr
+
+
+@pytest.mark.parametrize("link", ["can", "serial"])
+def test_check_passes_with_a_robot_and_says_what_it_measured(tmp_path, link):
+    robot_file = write_robot_file(tmp_path, link=link)
+    with disco_hw_process("virtual robot", ["sim", str(robot_file)], tmp_path / "sim.txt"):
+        wait_for_line(tmp_path / "sim.txt", "ready")
+        code, output = disco("check", str(robot_file), "--json")
+    report = json.loads(output)
+    assert code == 0, output
+    levels = {check["name"]: check["level"] for check in report["checks"]}
+    assert levels["link"] == "ok"
+    assert levels["firmware"] == "ok"
+    assert levels["firmware limits"] == "ok"
+    assert levels["link load"] == "ok"
+    assert "median" in next(check["text"] for check in report["checks"] if check["name"] == "round trip")
+    assert "100 wheel and 25 pose" in next(check["text"] for check in report["checks"] if check["name"] == "telemetry")
+
+
+def test_check_fails_without_a_robot_and_says_what_to_do(tmp_path):
+    code, output = disco("check", str(write_robot_file(tmp_path)))
+    assert code == 1
+    assert "fail  link" in output
+
+
+def test_check_keeps_out_of_a_running_daemons_way(tmp_path):
+    with running_stack(tmp_path) as stack:
+        stack.operator.wait_for("READY", READY_TIMEOUT_S)
+        code, output = disco("check", str(stack.robot_file))
+        assert code == 1
+        assert "a daemon drives this robot" in output
+        code, output = disco("ctl", str(stack.robot_file), "status")
+        assert code == 0
+        assert output.startswith("READY")
+        code, output = disco("ctl", str(stack.robot_file), "start")
+        assert code == 1
+        assert "arm first" in output
+        code, output = disco("ctl", str(stack.robot_file), "jump")
+        assert code == 2
+
+
+def test_a_second_daemon_is_refused(tmp_path):
+    with running_stack(tmp_path) as stack:
+        stack.operator.wait_for("READY", READY_TIMEOUT_S)
+        code, output = disco("run", str(stack.robot_file))
+        assert code == 2
+        assert "a daemon serves this socket already" in output
+
+
+def wait_for_line(path, word: str, timeout_s: float = 30.0) -> None:
+    import time
+
+    deadline = time.monotonic() + timeout_s
+    while time.monotonic() < deadline:
+        if word in path.read_text():
+            return
+        time.sleep(0.05)
+    raise AssertionError(f"no {word!r} in {path.read_text()!r}")

@@ -1,0 +1,218 @@
+"""What must not move the robot: wrong files, wrong firmware, garbage and forgeries on the link."""
+
+from __future__ import annotations
+
+import os
+import pty
+import random
+import struct
+import subprocess
+import sys
+import threading
+import time
+import tty
+from pathlib import Path
+
+import can
+import pytest
+
+from disco_hw.errors import WorkError
+from disco_hw.operator import Operator, disco_hw_process
+from firmware_protocol.codec import Codec
+from tests.hil.stack import READY_TIMEOUT_S, STILL_RAD_S, running_stack, write_robot_file
+
+pytestmark = pytest.mark.hil
+
+
+def disco(*arguments: str, timeout_s: float = 40.0) -> tuple[int, str]:
+    result = subprocess.run(
+        [sys.executable, "-m", "disco_hw", *arguments], capture_output=True, text=True, timeout=timeout_s, check=False
+    )
+    return result.returncode, result.stdout + result.stderr
+
+
+@pytest.mark.parametrize("verb", ["run", "check", "ctl", "sim"])
+@pytest.mark.parametrize(
+    ("old", "new", "field"),
+    [
+        ("ticks_per_rev = 2048\n", "", "ticks_per_rev"),
+        ("wheel_radius_m", "weel_radius_m", "weel_radius_m"),
+        ("rate_hz = 50.0", "rate_hz = 5000.0", "control.rate_hz"),
+        ('kind = "can"', "kind = 3", "link.kind"),
+    ],
+)
+def test_a_wrong_robot_file_gets_one_line_and_exit_code_2(tmp_path, verb, old, new, field):
+    if verb != "run" and field != "ticks_per_rev":
+        pytest.skip("every field is tried with one verb, every verb with one field")
+    path = write_robot_file(tmp_path)
+    path.write_text(path.read_text().replace(old, new, 1))
+    code, output = disco(verb, str(path), *(["status"] if verb == "ctl" else []))
+    assert code == 2, output
+    assert len(output.strip().splitlines()) == 1
+    assert str(path) in output
+    assert field in output
+
+
+OTHER_FIRMWARE = """
+import sys
+from dataclasses import replace
+from pathlib import Path
+from firmware_protocol.firmware_core import FirmwareConfig
+from sim.app import VirtualRobotOptions, run_virtual_robot
+firmware = replace(FirmwareConfig(ticks_per_rev=2048, max_wheel_speed_rad_s=8.0), {change})
+sys.exit(run_virtual_robot(VirtualRobotOptions(
+    channel=sys.argv[1], firmware=firmware, truth_file=Path(sys.argv[2]), inject=Path(sys.argv[3]))))
+"""
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ("protocol_major=2", ["protocol", "2"]),
+        ("dbc_hash=0x12345678", ["12345678"]),
+        ("max_wheel_speed_rad_s=4.0", ["max_wheel_speed_rad_s", "4"]),
+        ("ticks_per_rev=1024", ["ticks_per_rev", "1024"]),
+    ],
+)
+def test_a_firmware_that_does_not_fit_is_refused_in_words(tmp_path, change, words):
+    robot_file = write_robot_file(tmp_path)
+    script = OTHER_FIRMWARE.format(change=change)
+    arguments = [sys.executable, "-c", script, str(tmp_path / "bus"), str(tmp_path / "truth.csv"), str(tmp_path / "i")]
+    with subprocess.Popen(arguments, stdout=subprocess.DEVNULL) as robot:
+        try:
+            with disco_hw_process("daemon", ["run", str(robot_file)], tmp_path / "daemon.txt") as daemon:
+                operator = Operator(tmp_path / "control.sock", (daemon,))
+                status = operator.wait_for("FAULT", READY_TIMEOUT_S)
+                for word in words:
+                    assert word in status["detail"]
+                with pytest.raises(WorkError, match="refused to arm"):
+                    operator.tell("arm")
+            code, output = disco("check", str(robot_file))
+            assert code == 1
+            for word in words:
+                assert word in output
+        finally:
+            robot.terminate()
+
+
+def forge(codec: Codec, rng: random.Random, session: int, counter: int) -> tuple[int, bytes]:
+    """A wheel command that is wrong in one way, or any frame at all."""
+    kind = rng.randrange(6)
+    right = codec.encode(
+        "WHEEL_COMMAND", counter, mode="SPEED", left_speed=7.0, right_speed=-7.0, valid_for=0.5, session=session
+    )
+    data = bytearray(right.data)
+    match kind:
+        case 0:
+            data[0] ^= 1 << rng.randrange(8)
+        case 1:
+            data[rng.randrange(2, 8)] ^= 1 << rng.randrange(8)
+        case 2:
+            data = data[: rng.randrange(8)]
+        case 3:
+            other = codec.encode(
+                "WHEEL_COMMAND", counter, mode="SPEED", left_speed=7.0, right_speed=-7.0, valid_for=0.5,
+                session=(session + 1 + rng.randrange(250)) % 256,
+            )  # fmt: skip
+            data = bytearray(other.data)
+        case 4:
+            return rng.randrange(0x800), rng.randbytes(rng.randrange(9))
+        case 5:
+            return 0x101, rng.randbytes(8)
+    return right.can_id, bytes(data)
+
+
+@pytest.mark.parametrize("armed", [False, True])
+def test_forgeries_on_the_bus_never_turn_a_wheel(tmp_path, armed):
+    rng = random.Random(5)
+    codec = Codec()
+    with running_stack(tmp_path) as stack:
+        stack.operator.wait_for("READY", READY_TIMEOUT_S)
+        if armed:
+            stack.operator.tell("arm")
+            stack.operator.wait_for("ARMED", 5.0)
+        session = int(stack.inject("state").split(",")[13])
+        with can.Bus(interface="unixcan", channel=str(tmp_path / "bus")) as bus:
+            for n in range(1500):
+                can_id, data = forge(codec, rng, session, n % 16)
+                if can_id == 0x080:
+                    continue
+                bus.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False), timeout=1.0)
+                time.sleep(0.001)
+            while bus.recv(0.0):
+                pass
+        time.sleep(0.5)
+        rows = stack.truth()
+    assert max(row.asked for row in rows) == 0.0
+    assert max(row.fastest for row in rows) < STILL_RAD_S
+
+
+def test_a_replayed_session_never_turns_a_wheel(tmp_path):
+    """Record all that the daemon sent while it drove, and play it back after the end."""
+    recorded: list[can.Message] = []
+    with running_stack(tmp_path) as stack:
+        stack.operator.wait_for("READY", READY_TIMEOUT_S)
+        bus = can.Bus(interface="unixcan", channel=str(tmp_path / "bus"))
+        done = threading.Event()
+
+        def record() -> None:
+            while not done.is_set():
+                message = bus.recv(0.1)
+                if message is not None and message.arbitration_id in {0x100, 0x101, 0x102}:
+                    recorded.append(message)
+
+        thread = threading.Thread(target=record)
+        thread.start()
+        try:
+            stack.drive()
+            stack.operator.tell("disarm")
+            stack.operator.wait_for("READY", 5.0)
+            stack.operator.tell("quit")
+            stack.daemon.process.wait(8.0)
+        finally:
+            done.set()
+            thread.join()
+        stopped_s = time.monotonic()
+        assert len([m for m in recorded if m.arbitration_id == 0x100]) > 20
+        for _ in range(2):
+            for message in recorded:
+                bus.send(message, timeout=1.0)
+                time.sleep(0.005)
+        bus.shutdown()
+        rows = stack.truth()
+    assert max(row.fastest for row in rows) > 5.0
+    after = [row for row in rows if row.t_s > stopped_s]
+    assert max(row.asked for row in after) == 0.0
+    assert max(row.fastest for row in after) < STILL_RAD_S
+
+
+def test_garbage_on_a_serial_line_leaves_the_daemon_waiting(tmp_path):
+    """A line on which somebody shouts: the daemon counts it, says so, ends cleanly and never reaches READY."""
+    robot_file = write_robot_file(tmp_path, link="serial")
+    master, slave = pty.openpty()
+    tty.setraw(slave)
+    Path(tmp_path / "tty").symlink_to(os.ttyname(slave))
+    rng = random.Random(1)
+    stop = threading.Event()
+
+    def shout() -> None:
+        while not stop.is_set():
+            os.write(master, rng.randbytes(64) + struct.pack("B", 0))
+            time.sleep(0.002)
+
+    thread = threading.Thread(target=shout)
+    thread.start()
+    try:
+        with disco_hw_process("daemon", ["run", str(robot_file)], tmp_path / "daemon.txt") as daemon:
+            operator = Operator(tmp_path / "control.sock", (daemon,))
+            status = operator.wait_until("counting", lambda s: s["transport"]["malformed"] > 200, READY_TIMEOUT_S)
+            assert status["state"] == "HANDSHAKE"
+            with pytest.raises(WorkError, match="refused to arm"):
+                operator.tell("arm")
+            operator.tell("quit")
+            assert daemon.process.wait(10.0) == 0
+    finally:
+        stop.set()
+        thread.join()
+        os.close(master)
+        os.close(slave)
