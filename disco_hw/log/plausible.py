@@ -40,7 +40,7 @@ def yaw_fault(t_s: Array, yaw_rad: Array, segment: Index, wheels: Wheels, comman
     if not yaw_rad.size or np.abs(yaw_rad).max() <= np.pi + 0.01:
         return None
     steps = np.diff(yaw_rad)
-    usual = (np.diff(segment) == 0) & (np.abs(steps) < 180.0)
+    usual = np.diff(segment) == 0
     turned = float(np.abs(steps[usual]).sum())
     _, roll = _roll(wheels, commands)
     if roll.size:

@@ -17,9 +17,11 @@ from tests.log.processes import recording
 from tests.log.samples import tick
 recorder = ProcessRecorder(recording(Path(sys.argv[1])))
 print(recorder.writer_pid, flush=True)
+first, last = int(sys.argv[2]), int(sys.argv[3])
 for k in range(1, 100_000):
     now_ns = time.monotonic_ns()
-    recorder.put(now_ns, tick(k, now_ns))
+    recorder.put(now_ns, tick(k, now_ns)[first:last])
+    print(k, flush=True)
     time.sleep(0.005)
 """
 
@@ -59,12 +61,12 @@ def drive(recorder, first, count, period_s=0.0):
 
 
 class RecordingProcess:
-    """A process that records until it is killed."""
+    """A process that records [first:last] of each sample tick, and prints its number, until it is killed."""
 
-    def __init__(self, path):
+    def __init__(self, path, first=0, last=99):
         root = str(Path(__file__).parents[2])
         self.process = subprocess.Popen(
-            [sys.executable, "-c", _RECORD, str(path)],
+            [sys.executable, "-c", _RECORD, str(path), str(first), str(last)],
             stdout=subprocess.PIPE,
             text=True,
             cwd=root,

@@ -1,6 +1,7 @@
 import io
 import os
 import struct
+import tracemalloc
 
 import pytest
 import zstandard
@@ -106,6 +107,44 @@ def test_a_damaged_chunk_costs_itself_only(data):
         assert any(f"byte {chunk.offset - 9}" in text and "are lost" in text for text in contents.damage)
 
 
+def test_an_unfinished_record_is_called_so():
+    last = contents_of(WHOLE).chunks[-1]
+    cut = KILLED[: last.offset + 100]
+    assert contents_of(cut).damage[0] == f"at byte {last.offset - 9}: an unfinished record; 109 bytes are lost"
+
+
+def test_a_wrong_checksum_is_noticed_where_everything_else_fits():
+    chunk = contents_of(WHOLE).chunks[4]
+    damaged = bytearray(KILLED)
+    damaged[chunk.offset + 24] ^= 1
+    assert sequences(damaged) == [*range(1, 41), *range(51, 121)]
+    assert "wrong checksum" in contents_of(damaged).damage[0]
+
+
+def chunk_record(data, claims=None):
+    body = zstandard.compress(data)
+    size = len(data) if claims is None else claims
+    content = struct.pack("<QQQI", 0, 0, size, 0) + b"\x04\0\0\0zstd" + struct.pack("<Q", len(body)) + body
+    return bytes([Opcode.CHUNK]) + struct.pack("<Q", len(content)) + content
+
+
+@pytest.mark.parametrize(
+    "inner",
+    [
+        bytes([Opcode.MESSAGE]) + struct.pack("<Q", 1000) + bytes(30),
+        bytes([Opcode.MESSAGE]) + struct.pack("<Q", 5) + bytes(5),
+        bytes([Opcode.MESSAGE]) + b"\0\0",
+        bytes([Opcode.SCHEMA]) + struct.pack("<Q", 3) + bytes(3),
+        bytes([Opcode.CHANNEL]) + struct.pack("<Q", 4) + b"\xff\xff\xff\xff",
+    ],
+    ids=["too long", "too short", "cut off", "schema", "channel"],
+)
+def test_nonsense_inside_a_chunk_costs_the_chunk(inner):
+    contents = contents_of(MAGIC + chunk_record(inner))
+    assert contents.chunks == []
+    assert len(contents.damage) == 2
+
+
 @pytest.mark.parametrize("length", [0, 5, 2**40, 2**64 - 1])
 def test_a_chunk_whose_length_is_wrong_costs_itself_only(length):
     chunk = contents_of(WHOLE).chunks[4]
@@ -145,19 +184,20 @@ def test_a_damaged_attachment_is_left_out():
 
 
 def test_a_chunk_that_claims_to_be_enormous_is_not_unpacked():
-    body = zstandard.compress(bytes(2**20))
-    content = struct.pack("<QQQI", 0, 0, 2**40, 0) + b"\x04\0\0\0zstd" + struct.pack("<Q", len(body)) + body
-    record = bytes([Opcode.CHUNK]) + struct.pack("<Q", len(content)) + content
-    contents = contents_of(MAGIC + record)
+    contents = contents_of(MAGIC + chunk_record(bytes(2**20), claims=2**40))
     assert contents.chunks == []
     assert "claims" in contents.damage[0]
 
 
-def test_a_chunk_that_unpacks_to_more_than_it_says_is_refused():
-    body = zstandard.compress(bytes(2**28))
-    content = struct.pack("<QQQI", 0, 0, 100, 0) + b"\x04\0\0\0zstd" + struct.pack("<Q", len(body)) + body
-    record = bytes([Opcode.CHUNK]) + struct.pack("<Q", len(content)) + content
-    assert contents_of(MAGIC + record).chunks == []
+def test_a_chunk_that_unpacks_to_more_than_it_says_takes_no_memory():
+    data = MAGIC + chunk_record(bytes(2**27), claims=100)
+    tracemalloc.start()
+    try:
+        assert contents_of(data).chunks == []
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak < 2**24
 
 
 @pytest.mark.parametrize("data", [b"", b"hello", b"t_s,cmd\n", MAGIC[:-1], bytes(100)])

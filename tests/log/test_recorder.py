@@ -56,19 +56,18 @@ def test_a_stopped_writer_blocks_nothing_and_what_is_dropped_is_counted_and_seen
     wait_until(lambda: recorder.poll().written > 0)
     os.kill(recorder.writer_pid, signal.SIGSTOP)
     try:
-        drive(recorder, 11, 3000)
+        drive(recorder, 11, 1000)
         stats = recorder.poll()
     finally:
         os.kill(recorder.writer_pid, signal.SIGCONT)
     assert stats.writer_alive
-    assert stats.dropped_ticks > 1000
-    assert stats.ticks + stats.dropped_ticks == 3010
-    recorder.put(1, [])
+    assert stats.dropped_ticks > 500
+    assert stats.ticks + stats.dropped_ticks == 1010
     wait_until(lambda: recorder.poll().written == stats.records)
-    drive(recorder, 3011, 5)
+    drive(recorder, 1011, 5)
     final = recorder.close()
     ticks = recorded_ticks(path)
-    assert ticks[-5:] == [3011, 3012, 3013, 3014, 3015]
+    assert ticks[-5:] == [1011, 1012, 1013, 1014, 1015]
     assert ticks == sorted(set(ticks))
     assert len(ticks) == final.ticks == stats.ticks + 5
     with open_log(path) as log:

@@ -1,4 +1,5 @@
 import io
+import resource
 
 import pytest
 from mcap.reader import make_reader
@@ -68,6 +69,18 @@ def test_what_is_no_log_leaves_no_target_behind(tmp_path, content):
     source.write_bytes(content)
     with pytest.raises(LogError):
         recover(source, target)
+    assert not target.exists()
+
+
+def test_a_disk_full_on_the_way_leaves_no_target_behind(tmp_path):
+    source, target = tmp_path / "cut.mcap", tmp_path / "mended.mcap"
+    source.write_bytes(WHOLE[:-1000])
+    resource.prlimit(0, resource.RLIMIT_FSIZE, (20_000, resource.RLIM_INFINITY))
+    try:
+        with pytest.raises(LogError, match="File too large"):
+            recover(source, target)
+    finally:
+        resource.prlimit(0, resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
     assert not target.exists()
 
 

@@ -58,6 +58,18 @@ def test_when_the_recording_process_is_killed_the_file_is_finished(path):
     assert len(ticks_of(path)) > 20
 
 
+def test_what_was_still_on_its_way_when_the_recording_process_was_killed_is_not_lost(path):
+    with RecordingProcess(path, 6, 7) as recording_process:
+        wait_until(lambda: size(path) > 2000)
+        os.kill(recording_process.writer_pid, signal.SIGSTOP)
+        time.sleep(1.0)
+        recording_process.process.kill()
+        last_put = int(recording_process.process.stdout.readlines()[-1])
+        os.kill(recording_process.writer_pid, signal.SIGCONT)
+        wait_until(lambda: not alive(recording_process.writer_pid))
+    assert ticks_of(path)[-1] > last_put - 20
+
+
 def test_nothing_is_left_in_the_runtime_directory_of_a_killed_process(path, tmp_path, monkeypatch):
     root = tmp_path / "runtime"
     root.mkdir()
