@@ -73,13 +73,10 @@ void disco_host_expire(disco_firmware_t *core)
 {
     disco_host_t *host = &core->host;
     const disco_config_t *config = &core->config;
-    if (!disco_e2e_expire(&host->e2e, core->now_us)) {
-        host->reset_pending = false;
-    }
+    (void)disco_e2e_expire(&host->e2e, core->now_us);
     if ((core->now_us - host->last_state_us) > config->host_state_timeout_us) {
         host->request = DISCO_REQUEST_STANDBY;
         host->reset_pending = false;
-        host->fault = 0u;
     }
     if ((core->now_us - host->last_frame_us) > config->host_forget_timeout_us) {
         host->accepted = false;

@@ -131,7 +131,7 @@ uint8_t disco_blockers(const disco_firmware_t *core)
     if (core->state != DISCO_STATE_ARMED) {
         const uint32_t estop = DISCO_WHEN_ESTOP_LATCHED | DISCO_WHEN_ESTOP_INPUT;
         const bool host_unfit = ((now & DISCO_WHEN_HOST_QUALIFIED) == 0u) || ((now & DISCO_WHEN_HOST_FAULT) != 0u);
-        blockers |= ((now & DISCO_WHEN_FAULT) != 0u) ? DISCO_BLOCKERS_FAULT : 0u;
+        blockers = ((now & DISCO_WHEN_FAULT) != 0u) ? DISCO_BLOCKERS_FAULT : 0u;
         blockers |= ((now & estop) != 0u) ? DISCO_BLOCKERS_ESTOP : 0u;
         blockers |= ((now & DISCO_WHEN_WHEELS_STILL) == 0u) ? DISCO_BLOCKERS_WHEELS_MOVING : 0u;
         blockers |= ((now & DISCO_WHEN_HOST_ACCEPTED) == 0u) ? DISCO_BLOCKERS_HANDSHAKE : 0u;

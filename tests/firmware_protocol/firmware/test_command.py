@@ -183,6 +183,23 @@ def test_arming_takes_five_zero_commands_in_a_row():
     assert ready_with(Bench(), [zero] * 4 + [{"session": 8}] + [zero] * 4) == "READY"
 
 
+@pytest.mark.parametrize("broken", ["crc", "repeated"])
+def test_an_unusable_frame_breaks_the_row_of_zeros(broken):
+    bench = Bench()
+    bench.to_ready()
+    for _ in range(3 + 4):
+        bench.wheel_command()
+        bench.step()
+    if broken == "crc":
+        bench.core.receive(bench.now_us, 0x100, bytes(8))
+    else:
+        bench.counters["WHEEL_COMMAND"] -= 1
+        bench.wheel_command()
+    bench.wheel_command()
+    bench.step()
+    assert "ZERO_COMMANDS" in bench.blockers()
+
+
 def test_zero_commands_that_stopped_do_not_arm():
     bench = Bench()
     bench.to_ready()
@@ -255,6 +272,15 @@ def test_a_command_holds_no_longer_than_it_says_nor_than_the_firmware_allows(val
     bench.wheel_command(4.0, 2.0, valid_for=valid_for_s)
     assert stop_time_us(bench) == expected_ms * MS
     assert bench.out.stop_cause == cause
+    assert bench.out.watchdog_events == 1
+
+
+def test_a_stop_for_another_reason_is_no_watchdog_event():
+    bench = driving()
+    bench.ask("STANDBY")
+    bench.command = {"left": 4.0, "right": 2.0}
+    bench.run_until("STOPPING")
+    assert bench.out.watchdog_events == 0
 
 
 def test_a_late_command_finds_the_watchdog_expired_even_if_no_cycle_ran_in_between():

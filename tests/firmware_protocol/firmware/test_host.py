@@ -78,6 +78,16 @@ def test_a_host_silent_for_long_must_introduce_itself_again():
     assert "HANDSHAKE" in bench.blockers()
 
 
+@pytest.mark.parametrize("wrong", [{"protocol_major": 2}, {"dbc_hash": 1}])
+def test_a_refused_host_is_forgotten_too(wrong):
+    bench = Bench()
+    bench.hello(**wrong)
+    bench.run(5000)
+    assert bench.out.fault != 0
+    bench.run(502)
+    assert bench.out.fault == 0
+
+
 def test_any_sound_frame_keeps_the_acquaintance():
     bench = Bench()
     bench.hello()
@@ -383,11 +393,11 @@ def test_motion_asked_for_delays_a_reset():
     bench.ask("RESET")
     bench.run(1000)
     assert bench.out.state == "ESTOP"
-    bench.command = {"session": 7}
-    bench.run(490)
-    assert bench.out.state == "ESTOP"
-    bench.run(30)
-    assert bench.out.state == "STANDBY"
+    start = bench.now_us
+    bench.command = None
+    bench.wheel_command(0.002, 0.0, session=7)
+    bench.run_until("STANDBY")
+    assert bench.now_us - start == 500_000
 
 
 def test_the_first_source_of_an_estop_is_kept():
