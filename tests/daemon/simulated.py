@@ -1,0 +1,65 @@
+"""The daemon's core and the virtual robot in one process and in simulated time, over an in-process link."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import disco_hw
+from disco_hw.daemon.assembly import assemble_core, make_driver, make_pipeline, make_planner
+from disco_hw.daemon.core import CoreTick, DaemonCore
+from disco_hw.daemon.supervisor import UserRequest
+from disco_hw.log.recorder import MemoryRecorder
+from disco_hw.pipeline import Planner
+from disco_hw.robot_setup import load_setup
+from drivers.transport import connect_pair
+from drivers.types import OutgoingFrame
+from firmware_protocol.firmware_core import FirmwareConfig
+from sim.body_dynamics import Pose
+from sim.plant import Plant
+from sim.plant_parameters import PlantParameters
+from sim.virtual_robot import STEP_US, VirtualRobot
+
+FOREVER_NS = 1 << 62
+START = Pose(0.75, 0.0, 1.5707963)
+
+
+@dataclass
+class SimulatedStack:
+    """Everything of one run; `run` moves time on and keeps every tick."""
+
+    core: DaemonCore
+    robot: VirtualRobot
+    recorder: MemoryRecorder
+    robot_end: object
+    now_us: int = 0
+
+    def run(self, duration_s: float, *requests: UserRequest) -> list[CoreTick]:
+        """Let time pass; the requests come with the first tick."""
+        ticks = []
+        period_us = round(1e6 / self.core.config.control.rate_hz)
+        end_us = self.now_us + round(duration_s * 1e6)
+        while self.now_us < end_us:
+            self.now_us += STEP_US
+            for received in self.robot_end.receive():
+                self.robot.receive(self.now_us, received.frame)
+            for frame in self.robot.step(self.now_us):
+                self.robot_end.send(OutgoingFrame(frame, FOREVER_NS), self.now_us * 1000)
+            if self.now_us % period_us == 0:
+                ticks.append(self.core.tick(self.now_us * 1000, requests))
+                requests = ()
+        return ticks
+
+
+def simulated_stack(planner: Planner | None = None, seed: int = 1, **changes: float) -> SimulatedStack:
+    """The shipped robot with a plant at the posterior's mean; `changes` are fields of PlantParameters."""
+    setup = load_setup(Path(disco_hw.__file__).parent / "robots" / "wombot.toml")
+    host_end, robot_end = connect_pair()
+    recorder = MemoryRecorder()
+    pipeline = make_pipeline(setup.config, setup.model, planner or make_planner(setup.config, setup.model))
+    core = assemble_core(setup.config, host_end, make_driver(), pipeline, recorder)
+    plant = Plant(replace(PlantParameters(), **changes), None, seed, START)
+    robot = VirtualRobot(plant, FirmwareConfig(ticks_per_rev=2048, max_wheel_speed_rad_s=8.0), seed=seed)
+    host_end.open()
+    robot_end.open()
+    return SimulatedStack(core, robot, recorder, robot_end)
