@@ -1,43 +1,55 @@
-"""The named effects as they compete: which entries of a channel's parameter vector each frees, and where to start."""
+"""The named effects as they compete: what each frees of a channel's parameter vector, and where its fit starts.
+
+An effect of the registry competes with all its parameters, from its own start values. Listed here is only what is
+different: parameters in which the residual is not smooth, and effects with the equations of another.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.gap.channels import BodyChannel, Channel, WheelChannel
-from disco_hw.gap.free_runs import BODY, WHEEL
+from disco_hw.gap.layout import BASE_COUNT, WHEEL
+from disco_hw.model.effects import REGISTRY
+from disco_hw.model.effects import Channel as Place
 
 Array = NDArray[np.float64]
 Starts = tuple[tuple[float, ...], ...]
+
+# Indistinguishable from another effect, or from two at once: decided after the others, in `classes`.
+DECIDED_LATER = ("pose_offset", "encoder_scale")
+
+
+@dataclass(frozen=True, slots=True)
+class Profile:
+    """An entry that is searched over values: its name, the values for a channel, and how close to search."""
+
+    column: str
+    values: Callable[[Channel], tuple[float, ...]]
+    refine: float
 
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
     """An effect in the competition.
 
-    `columns` are fitted, `profiled` (one or none) is searched over values because the residual is not smooth in it;
-    `values` gives those. `starts` gives start values of the columns for a channel.
+    `columns` are fitted from each of the `starts`, none of which means from neutral, where the effect is smooth.
     """
 
     name: str
     columns: tuple[str, ...]
-    starts: Callable[[Channel], Starts]
-    profiled: str | None = None
-    values: Callable[[Channel], tuple[float, ...]] | None = None
-    refine: float = 0.0
+    starts: Callable[[Channel], Starts] | None = None
+    profile: Profile | None = None
 
     @property
     def parameters(self) -> int:
         """Number of parameters that its evidence must pay for."""
-        return len(self.columns) + (self.profiled is not None)
-
-
-def _fixed(*starts: tuple[float, ...]) -> Callable[[Channel], Starts]:
-    return lambda channel: starts
+        return len(self.columns) + (self.profile is not None)
 
 
 def _below_largest(turning: bool) -> Callable[[Channel], Starts]:
@@ -49,9 +61,9 @@ def _below_largest(turning: bool) -> Callable[[Channel], Starts]:
         command = command[np.isfinite(command[:, 0])]
         size = np.abs(0.5 * (command[:, 1] - command[:, 0])) if turning else np.abs(command).max(axis=1)
         largest = float(size.max()) if size.size else 0.0
-        if largest < 0.2:
-            return ()
-        return tuple((share * largest,) for share in (0.92, 0.75, 0.5))
+        if turning:
+            largest *= 2.0 * channel.geometry[0] / channel.geometry[1]
+        return tuple((share * largest,) for share in (0.92, 0.75, 0.5)) if largest > 0.1 else ()
 
     return starts
 
@@ -68,58 +80,47 @@ def _change_times(channel: Channel) -> tuple[float, ...]:
     return tuple(np.arange(first + 10.0, last - 10.0, max(4.0, (last - first) / 40.0)).tolist())
 
 
-WHEEL_CANDIDATES: Mapping[str, Candidate] = {
-    candidate.name: candidate
-    for candidate in (
-        Candidate("motor_lag", ("tau_s",), _fixed((0.05,), (0.25,))),
-        Candidate("command_delay", ("delay_s",), _fixed((0.03,), (0.12,), (0.3,))),
-        Candidate("deadband", ("deadband_rad_s",), _fixed((0.2,))),
-        Candidate("stiction", (), _fixed(()), "stiction_rad_s", _stiction_values, 0.02),
-        Candidate("speed_limit", ("speed_limit_rad_s",), _below_largest(False)),
-        Candidate("yaw_rate_limit", ("turn_limit_rad_s",), _below_largest(True)),
-        Candidate("battery_sag", ("sag_per_s",), _fixed((0.0,))),
-        Candidate("wheel_gain", ("gain_left", "gain_right"), _fixed((0.0, 0.0))),
-    )
-}
-
-BODY_CANDIDATES: Mapping[str, Candidate] = {
-    candidate.name: candidate
-    for candidate in (
-        Candidate("wheel_radius_asymmetry", ("asymmetry",), _fixed((0.0,))),
-        Candidate("turn_slip", ("turn_slip_s",), _fixed((0.0,))),
-        Candidate("acceleration_slip", ("acceleration_slip_s2_m",), _fixed((0.0,))),
-        Candidate("side_slip", ("side_slip_s",), _fixed((0.0,))),
-        Candidate("lateral_icr", ("lateral_icr_m",), _fixed((0.0,))),
-        Candidate("slope", ("drift_x_m_s", "drift_y_m_s"), _fixed((0.0, 0.0))),
-        Candidate(
-            "surface_change",
-            ("change_track", "change_radius"),
-            _fixed((0.0, 0.0)),
-            "change_time_s",
-            _change_times,
-            0.25,
-        ),
-        Candidate("pose_latency", ("latency_s",), _fixed((0.0,))),
-        Candidate("heading_bias", ("heading_bias_rad",), _fixed((0.0,))),
-    )
-}
-
-BODY_BASE = (0, 1, 2)
+_SPECIAL = (
+    Candidate("motor_lag", ("motor_lag.tau_s",), lambda channel: ((0.05,), (0.25,))),
+    Candidate("command_delay", ("command_delay.delay_s",), lambda channel: ((0.03,), (0.12,), (0.3,))),
+    Candidate("deadband", ("deadband.width_rad_s",), lambda channel: ((0.2,),)),
+    Candidate("stiction", (), None, Profile("stiction.threshold_rad_s", _stiction_values, 0.02)),
+    Candidate("speed_limit", ("speed_limit.limit_rad_s",), _below_largest(False)),
+    Candidate("yaw_rate_limit", ("yaw_rate_limit.limit_rad_s",), _below_largest(True)),
+    Candidate(
+        "surface_change",
+        ("surface_change.track", "surface_change.radius"),
+        None,
+        Profile("surface_change.time_s", _change_times, 0.25),
+    ),
+)
 
 
-def candidates_of(channel: Channel) -> Mapping[str, Candidate]:
-    """The named effects of a channel."""
-    return WHEEL_CANDIDATES if channel.columns == WHEEL else BODY_CANDIDATES
+def _competing() -> dict[str, Candidate]:
+    special = {candidate.name: candidate for candidate in _SPECIAL}
+    return {
+        name: special.get(name) or Candidate(name, tuple(f"{name}.{p.name}" for p in effect.parameters))
+        for name, effect in REGISTRY.items()
+        if name not in DECIDED_LATER
+    }
 
 
-def base_of(channel: Channel) -> tuple[int, ...]:
-    """Entries of the parameter vector that are always free."""
-    return () if channel.columns == WHEEL else BODY_BASE
+CANDIDATES: Mapping[str, Candidate] = MappingProxyType(_competing())
+
+
+def candidates_of(channel: Channel) -> tuple[str, ...]:
+    """Names of the effects that compete in a channel."""
+    wheels = channel.layout is WHEEL
+    return tuple(name for name in CANDIDATES if (REGISTRY[name].channel is Place.COMMAND_TO_WHEEL) == wheels)
+
+
+def parameters_of(names: tuple[str, ...]) -> int:
+    """Number of parameters of a set of effects."""
+    return sum(CANDIDATES[name].parameters for name in names)
 
 
 def indices(channel: Channel, names: tuple[str, ...]) -> tuple[int, ...]:
-    """Places in the parameter vector of the entries that a set of effects frees, with the base."""
-    order = WHEEL if channel.columns == WHEEL else BODY
-    candidates = candidates_of(channel)
-    freed = [order.index(column) for name in names for column in candidates[name].columns]
-    return (*base_of(channel), *freed)
+    """Places in the parameter vector of what a set of effects frees, after the base parameters."""
+    layout = channel.layout
+    base = range(0 if layout is WHEEL else BASE_COUNT)
+    return (*base, *(layout.place[column] for name in names for column in CANDIDATES[name].columns))

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.gap.body_noise import BodyGains, BodyNoise, Motion, body_gains, whiten_body
-from disco_hw.gap.free_runs import BODY, BODY_NEUTRAL, WHEEL, WHEEL_NEUTRAL, pose_residual, read_angles, run_body, run_wheels
+from disco_hw.gap.free_runs import pose_residual, read_angles, run_body, run_wheels
+from disco_hw.gap.layout import BASE_COUNT, BODY, WHEEL, Layout
 from disco_hw.gap.timeline import CELL_S, Samples, Timeline
 from disco_hw.gap.wheel_noise import WheelGains, WheelNoise, wheel_gains, whiten_wheels
 
@@ -32,8 +33,8 @@ class Channel(Protocol):
     """What fitting and selecting need of a channel; n is the number of its residuals."""
 
     @property
-    def columns(self) -> tuple[str, ...]:
-        """Names of the parameter vector's entries."""
+    def layout(self) -> Layout:
+        """What the parameter vector's entries are."""
 
     @property
     def neutral(self) -> Array:
@@ -59,10 +60,14 @@ class WheelChannel:
     gains: WheelGains
     weight: Array
     noise: WheelNoise
+    geometry: Array
 
     @classmethod
-    def build(cls, line: Timeline, noise: WheelNoise, use: Mask | None = None) -> WheelChannel:
-        """The channel with a noise model; samples where no command is known are left out."""
+    def build(cls, line: Timeline, noise: WheelNoise, geometry: Array, use: Mask | None = None) -> WheelChannel:
+        """The channel with a noise model; samples where no command is known are left out.
+
+        `geometry` (3,): wheel radius, axial distance, x_icr, for effects that speak of the robot's motion.
+        """
         place = line.encoder
         known = np.isfinite(line.command_rad_s[:, 0])
         # One known cell before is not enough: the run begins anew after unknown commands.
@@ -78,25 +83,25 @@ class WheelChannel:
         between = np.diff(jumps[place.node + 1], prepend=0.0)
         speed = line.speed_rad_s[place.node]
         gains = wheel_gains(noise, np.maximum(dt, 0.0), speed, np.maximum(between, 0.0), first_of_run | resumed, good)
-        return cls(line, gains, np.ones((place.t_s.size, 2)), noise)
+        return cls(line, gains, np.ones((place.t_s.size, 2)), noise, geometry)
 
     def with_noise(self, noise: WheelNoise) -> WheelChannel:
         """The same data under another noise model, weights reset."""
-        return WheelChannel.build(self.timeline, noise, self.gains.use)
+        return WheelChannel.build(self.timeline, noise, self.geometry, self.gains.use)
 
     def weighted(self, weight: Array) -> WheelChannel:
         """The same with other weights (E, 2)."""
         return replace(self, weight=weight)
 
     @property
-    def columns(self) -> tuple[str, ...]:
-        """Names of the parameter vector's entries."""
+    def layout(self) -> Layout:
+        """What the parameter vector's entries are."""
         return WHEEL
 
     @property
     def neutral(self) -> Array:
         """The parameter vector without any effect."""
-        return WHEEL_NEUTRAL
+        return WHEEL.neutral
 
     @property
     def block(self) -> Index:
@@ -111,10 +116,8 @@ class WheelChannel:
     def angles(self, p: Array, extra: Array | None = None) -> Array:
         """Free-running wheel angles at the nodes, (M, 2)."""
         line = self.timeline
-        out = np.empty_like(line.angle_rad)
-        push = np.zeros_like(out) if extra is None else extra
-        run_wheels(p, line.command_rad_s, push, line.first, line.t_s, line.speed_rad_s, out)
-        return out
+        push = np.zeros_like(line.angle_rad) if extra is None else extra
+        return run_wheels(p, self.geometry, line.command_rad_s, push, line.first, line.t_s, line.speed_rad_s)
 
     def raw_residual(self, p: Array, extra: Array | None = None) -> Array:
         """Measured minus predicted wheel angles at the samples, (E, 2)."""
@@ -151,7 +154,7 @@ class BodyChannel:
 
     @classmethod
     def build(cls, line: Timeline, noise: BodyNoise, geometry: Array, use: Mask | None = None) -> BodyChannel:
-        """The channel with a noise model; `geometry` (15,) is the parameter vector that describes the motion roughly.
+        """The channel with a noise model; `geometry` is the parameter vector that describes the motion roughly.
 
         `use` (P,) leaves single poses of the timeline out.
         """
@@ -163,7 +166,8 @@ class BodyChannel:
         ends = np.append(starts[1:], line.t_s.size) - 1
         run = np.searchsorted(starts, samples.node, side="right") - 1
         rim = np.abs(line.speed_rad_s).max(axis=1) * geometry[0]
-        moving_s = np.cumsum(np.minimum(rim / DRIFT_ONSET_M_S, 1.0)) * CELL_S
+        rolling = np.abs(line.speed_rad_s).mean(axis=1) * geometry[0]
+        moving_s = np.cumsum(np.minimum(rolling / DRIFT_ONSET_M_S, 1.0)) * CELL_S
         channel = cls(
             line,
             samples,
@@ -213,14 +217,14 @@ class BodyChannel:
         return replace(self, weight=weight)
 
     @property
-    def columns(self) -> tuple[str, ...]:
-        """Names of the parameter vector's entries."""
+    def layout(self) -> Layout:
+        """What the parameter vector's entries are."""
         return BODY
 
     @property
     def neutral(self) -> Array:
         """The parameter vector without any effect, at the given geometry."""
-        return np.concatenate([self.geometry[:3], BODY_NEUTRAL[3:]])
+        return np.concatenate([self.geometry[:BASE_COUNT], BODY.neutral[BASE_COUNT:]])
 
     @property
     def block(self) -> Index:
@@ -235,15 +239,12 @@ class BodyChannel:
     def track(self, p: Array, extra: Array | None = None) -> Array:
         """Path at the nodes from the measured wheel angles, (M, 3)."""
         line = self.timeline
-        out = np.empty((line.t_s.size, 3))
-        push = np.zeros_like(out) if extra is None else extra
-        run_body(p, line.angle_rad, line.speed_rad_s, push, line.first, line.t_s, out)
-        return out
+        push = np.zeros((line.t_s.size, 3)) if extra is None else extra
+        return run_body(p, line.angle_rad, line.speed_rad_s, push, line.first, line.t_s)
 
     def raw_residual(self, p: Array, extra: Array | None = None) -> Array:
         """Measured minus predicted poses (P, 3) in the world, each window laid on its measurements."""
-        out = np.empty_like(self.measured)
-        pose_residual(
+        return pose_residual(
             p,
             self.track(p, extra),
             self.moving_s,
@@ -254,9 +255,7 @@ class BodyChannel:
             self.last_node,
             self.use,
             self.measured,
-            out,
         )
-        return out
 
     def whitened(self, p: Array, extra: Array | None = None) -> Array:
         """Residuals of unit variance, not weighted, (P, 3)."""

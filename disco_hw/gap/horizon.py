@@ -9,6 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from disco_hw.gap.layout import BODY
 from disco_hw.gap.timeline import CELL_S
 
 Array = NDArray[np.float64]
@@ -17,7 +18,7 @@ Index = NDArray[np.int64]
 
 @njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _displace(p: Any, track: Any, moving_s: Any, start: Any, heading: Any, ahead: int, out: Any) -> None:
-    late = p[13] / CELL_S
+    late = p[0] / CELL_S
     top = track.shape[0] - 2
     for k in range(start.shape[0]):
         a = max(start[k] - late, 0.0)
@@ -29,22 +30,30 @@ def _displace(p: Any, track: Any, moving_s: Any, start: Any, heading: Any, ahead
         yaw_start = track[i, 2] + f * (track[i + 1, 2] - track[i, 2])
         yaw = track[j, 2] + g * (track[j + 1, 2] - track[j, 2])
         # The measured heading is the true one plus the bias: displacement is told in the measured frame.
-        turned = yaw_start + p[14]
+        turned = yaw_start + p[1]
         cosine, sine = math.cos(turned), math.sin(turned)
         moved = moving_s[min(start[k] + ahead, top)] - moving_s[start[k]]
         c, s = math.cos(heading[k]), math.sin(heading[k])
-        out[k, 0] = cosine * x + sine * y + (c * p[8] + s * p[9]) * moved
-        out[k, 1] = -sine * x + cosine * y + (-s * p[8] + c * p[9]) * moved
+        out[k, 0] = cosine * x + sine * y + (c * p[2] + s * p[3]) * moved
+        out[k, 1] = -sine * x + cosine * y + (-s * p[2] + c * p[3]) * moved
         out[k, 2] = yaw - yaw_start
 
 
 def displacement(p: Array, track: Array, moving_s: Array, start: Index, heading_rad: Array, ahead_s: float) -> Array:
     """Forward, left and yaw (K, 3) that a pose sensor would see from each start node to `ahead_s` later.
 
-    `p` in the order of `BODY`; `track` (M, 3) a free run of the body; `heading_rad` (K,) measured at the starts.
+    `p` in the order of `BODY.columns`; `track` (M, 3) a free run of the body; `heading_rad` (K,) measured at the starts.
     """
     out = np.empty((start.size, 3))
-    _displace(p, track, moving_s, start, heading_rad, round(ahead_s / CELL_S), out)
+    world = np.array(
+        [
+            BODY.at(p, "pose_latency.latency_s"),
+            BODY.at(p, "heading_bias.bias_rad"),
+            BODY.at(p, "slope.drift_x_m_s"),
+            BODY.at(p, "slope.drift_y_m_s"),
+        ]
+    )
+    _displace(world, track, moving_s, start, heading_rad, round(ahead_s / CELL_S), out)
     return out
 
 

@@ -63,7 +63,7 @@ def _pull(logs: Array, start: Array) -> float:
     return 0.5 * float((((logs - start) / _PRIOR_SD) ** 2).sum())
 
 
-def fit_body_noise(channel: BodyChannel, p: Array) -> BodyNoise:
+def fit_body_noise(channel: BodyChannel, p: Array, iterations: int = 15) -> BodyNoise:
     """Noise of poses and body by maximum likelihood at a parameter vector."""
     raw = channel.raw_residual(p)
     rim = np.abs(channel.timeline.speed_rad_s).max(axis=1) * channel.geometry[0]
@@ -76,7 +76,7 @@ def fit_body_noise(channel: BodyChannel, p: Array) -> BodyNoise:
         white = whiten_body(raw, trial)[counted]
         return 0.5 * _huber(white**2) - float(trial.log_scale[counted].sum()) + _pull(logs, start)
 
-    return BodyNoise.from_vector(_minimise(objective, start, start - 5.0, start + 5.0, 20))
+    return BodyNoise.from_vector(_minimise(objective, start, start - 5.0, start + 5.0, iterations))
 
 
 def without_outliers(channel: BodyChannel, p: Array) -> BodyChannel:
@@ -114,15 +114,15 @@ def learn_wheel_noise(channel: WheelChannel, p: Array) -> WheelChannel:
     white = channel.whitened(p)
     wild = channel.gains.use & (np.abs(white).max(axis=1) > 2.0 * _OUTLIER)
     if 0 < wild.sum() < 0.02 * wild.size:
-        channel = WheelChannel.build(channel.timeline, channel.noise, channel.gains.use & ~wild)
+        channel = WheelChannel.build(channel.timeline, channel.noise, channel.geometry, channel.gains.use & ~wild)
         white = channel.whitened(p)
     return channel.weighted(local_weight(white, channel.gains.use))
 
 
-def learn_body_noise(channel: BodyChannel, p: Array) -> BodyChannel:
+def learn_body_noise(channel: BodyChannel, p: Array, iterations: int = 15) -> BodyChannel:
     """The channel with the noise that is left at `p`, without outliers, and weights for what is noisier still."""
     geometry = p.copy()
     channel = without_outliers(replace(channel, geometry=geometry).with_noise(channel.noise), p)
-    channel = channel.with_noise(fit_body_noise(channel, p))
+    channel = channel.with_noise(fit_body_noise(channel, p, iterations))
     channel = without_outliers(channel, p)
     return channel.weighted(local_weight(channel.whitened(p), channel.use))

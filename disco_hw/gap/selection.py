@@ -8,15 +8,17 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.gap.candidates import Candidate, candidates_of, indices
+from disco_hw.gap.candidates import CANDIDATES, Candidate, candidates_of, indices, parameters_of
 from disco_hw.gap.channels import Channel
 from disco_hw.gap.evidence import Evidence, compare
-from disco_hw.gap.fit import Fit, fit
+from disco_hw.gap.fit import Fit, fit, sensitivity, solve
 
 Array = NDArray[np.float64]
 Names = tuple[str, ...]
 
 _MOST_EFFECTS = 6
+_WORTH_FITTING = 8.0
+_LOCAL_SEARCHES = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,83 +32,119 @@ class Thresholds:
 
 @dataclass
 class Selector:
-    """Fits sets of effects of one channel, each once; `moves` tells how far a fit moves the prediction of another."""
+    """Fits sets of effects of one channel, each once; `moves` tells how far a fit moves the prediction of another.
+
+    `extra` (M, k) is an unnamed term that is held.
+    """
 
     channel: Channel
     moves: Callable[[Fit, Fit], float]
     thresholds: Thresholds = Thresholds()
     extra: Array | None = None
     fits: dict[frozenset[str], Fit] = field(default_factory=dict)
+    proofs: dict[tuple[frozenset[str], frozenset[str]], Evidence] = field(default_factory=dict)
 
     def fit(self, names: Names) -> Fit:
         """The best fit of a set, started from the best smaller ones known."""
         key = frozenset(names)
         if key not in self.fits:
-            parents = [self.fits[key - {name}] for name in names if key - {name} in self.fits]
             if not names:
                 self.fits[key] = fit(self.channel, self.channel.neutral, indices(self.channel, ()), self.extra)
             else:
                 new = [name for name in names if key - {name} in self.fits] or [names[-1]]
-                parents = parents or [self.fit(names[:-1])]
                 options = [
-                    self._with(parent, names, candidates_of(self.channel)[name])
-                    for parent, name in zip(parents, new, strict=True)
+                    self._with(self.fit(tuple(other for other in names if other != name)), names, CANDIDATES[name])
+                    for name in new
                 ]
                 self.fits[key] = min(options, key=lambda option: option.cost)
         return self.fits[key]
 
     def _with(self, parent: Fit, names: Names, new: Candidate) -> Fit:
         """Fit `names` from `parent`, which lacks `new`."""
-        channel, columns = self.channel, self.channel.columns
+        channel, layout = self.channel, self.channel.layout
         active = indices(channel, names)
-        start = parent.vector.copy()
-        if new.profiled is not None:
-            assert new.values is not None
-            return self._profile(start, active, new, new.values(channel))
-        best: Fit | None = None
+        if new.profile is not None:
+            return self._profiled(parent, active, new)
+        if new.starts is None:
+            return fit(channel, parent.vector, active, self.extra)
+        tried = []
+        places = [layout.place[column] for column in new.columns]
         for values in new.starts(channel):
-            vector = start.copy()
-            vector[[columns.index(column) for column in new.columns]] = values
-            found = fit(channel, vector, active, self.extra, 2 if len(new.starts(channel)) > 1 else 12)
-            best = found if best is None or found.cost < best.cost else best
-        if best is None:
-            return fit(channel, start, active, self.extra)
-        return fit(channel, best.vector, active, self.extra) if len(new.starts(channel)) > 1 else best
-
-    def _profile(self, start: Array, active: tuple[int, ...], new: Candidate, values: tuple[float, ...]) -> Fit:
-        """Search the profiled entry over its values, then closer around the best, refitting the others."""
-        channel = self.channel
-        place = channel.columns.index(new.profiled or "")
-        tried: dict[float, Fit] = {}
-
-        def attempt(value: float, iterations: int) -> None:
-            vector = start.copy()
-            vector[place] = value
-            tried[value] = fit(channel, vector, active, self.extra, iterations)
-
-        for value in values:
-            attempt(value, 1)
+            vector = parent.vector.copy()
+            vector[places] = values
+            tried.append(fit(channel, vector, active, self.extra, 2))
         if not tried:
-            return fit(channel, start, active, self.extra)
+            return fit(channel, parent.vector, active, self.extra)
+        return fit(channel, min(tried, key=lambda option: option.cost).vector, active, self.extra)
+
+    def _profiled(self, parent: Fit, active: tuple[int, ...], new: Candidate) -> Fit:
+        """Search the profiled entry by its linear gain, then closer around the best, then refit everything."""
+        assert new.profile is not None
+        values = new.profile.values(self.channel)
+        if not values:
+            return fit(self.channel, parent.vector, active, self.extra)
+        gains = {value: self._linear_gain(parent, new, value) for value in values}
         spacing = values[1] - values[0]
-        while spacing > new.refine:
-            spacing *= 0.5
-            best = min(tried, key=lambda value: tried[value].cost)
-            for value in (best - spacing, best + spacing):
-                attempt(value, 1)
-        best = min(tried, key=lambda value: tried[value].cost)
-        return fit(channel, tried[best].vector, active, self.extra)
+
+        def closer(gain_at: Callable[[float], float], spacing: float) -> None:
+            while spacing > new.profile.refine:  # type: ignore[union-attr]
+                spacing *= 0.5
+                best = max(gains, key=gains.__getitem__)
+                for value in (best - spacing, best + spacing):
+                    if value not in gains:
+                        gains[value] = gain_at(value)
+
+        closer(lambda value: self._linear_gain(parent, new, value), spacing)
+        best = max(gains, key=gains.__getitem__)
+        found = self._at(parent.vector, active, new, best)
+        if parent.cost - found.cost < _WORTH_FITTING:
+            return found
+        refined = {best: found}
+        step = new.profile.refine
+        for _ in range(_LOCAL_SEARCHES):
+            centre = min(refined, key=lambda value: refined[value].cost)
+            for value in (centre - step, centre + step):
+                if value not in refined:
+                    refined[value] = self._at(refined[centre].vector, active, new, value, 2)
+        return min(refined.values(), key=lambda option: option.cost)
+
+    def _at(self, start: Array, active: tuple[int, ...], new: Candidate, value: float, iterations: int = 12) -> Fit:
+        assert new.profile is not None
+        vector = start.copy()
+        vector[self.channel.layout.place[new.profile.column]] = value
+        return fit(self.channel, vector, active, self.extra, iterations)
+
+    def _linear_gain(self, parent: Fit, new: Candidate, value: float | None = None) -> float:
+        """Gain in nats that the candidate promises to first order, from the parent's fit."""
+        channel, layout = self.channel, self.channel.layout
+        vector, residual = parent.vector, parent.residual
+        if value is not None and new.profile is not None:
+            vector = vector.copy()
+            vector[layout.place[new.profile.column]] = value
+            residual = channel.residual(vector, self.extra)
+        places = tuple(layout.place[column] for column in new.columns)
+        columns = sensitivity(channel, vector, places, residual, self.extra)
+        slope = np.column_stack([parent.jacobian, columns])
+        if not slope.shape[1]:
+            return parent.cost - 0.5 * float(residual @ residual)
+        gradient = slope.T @ residual
+        return parent.cost - 0.5 * float(residual @ residual) + 0.5 * float(gradient @ solve(slope, gradient))
 
     def evidence(self, smaller: Names, larger: Names) -> Evidence:
         """Evidence for the larger set against the smaller one."""
-        known = candidates_of(self.channel)
-        parameters = sum(known[n].parameters for n in larger) - sum(known[n].parameters for n in smaller)
-        return compare(self.fit(smaller), self.fit(larger), self.channel, parameters)
+        key = (frozenset(smaller), frozenset(larger))
+        if key not in self.proofs:
+            parameters = parameters_of(larger) - parameters_of(smaller)
+            self.proofs[key] = compare(self.fit(smaller), self.fit(larger), self.channel, parameters)
+        return self.proofs[key]
 
     def acceptable(self, smaller: Names, larger: Names) -> bool:
         """Whether what the larger set has more is accepted."""
-        proof = self.evidence(smaller, larger)
         limits = self.thresholds
+        gain = self.fit(smaller).cost - self.fit(larger).cost
+        if 2.0 * gain < limits.score:
+            return False
+        proof = self.evidence(smaller, larger)
         return (
             proof.score > limits.score
             and proof.held_out > 0.0
@@ -114,14 +152,40 @@ class Selector:
             and self.moves(self.fit(smaller), self.fit(larger)) > limits.moves_m
         )
 
+    def promise(self, accepted: Names, name: str) -> float:
+        """Gain in nats of one more effect, less half its parameters' price; fitted only if it may be worth it."""
+        candidate = CANDIDATES[name]
+        price = 0.5 * candidate.parameters * np.log(self.channel.count)
+        smooth = candidate.starts is None and candidate.profile is None
+        if smooth and frozenset((*accepted, name)) not in self.fits:
+            gain = self._linear_gain(self.fit(accepted), candidate)
+            if gain < _WORTH_FITTING:
+                return float(gain - price)
+        return float(self.fit(accepted).cost - self.fit((*accepted, name)).cost - price)
+
+    def ranked(self, accepted: Names) -> list[str]:
+        """Candidates that are not in yet, the most promising first."""
+        rest = [name for name in candidates_of(self.channel) if name not in accepted]
+        promises = {name: self.promise(accepted, name) for name in rest}
+        return sorted((name for name in rest if promises[name] > 0.0), key=lambda name: -promises[name])
+
+    def greedy(self) -> Names:
+        """Forward steps only."""
+        accepted: Names = ()
+        while len(accepted) < _MOST_EFFECTS:
+            ranked = self.ranked(accepted)
+            new = next((name for name in ranked if self.acceptable(accepted, (*accepted, name))), None)
+            if new is None:
+                break
+            accepted = (*accepted, new)
+        return accepted
+
     def select(self) -> Names:
         """Forward, swap, backward, until nothing changes."""
         accepted: Names = ()
         visited = {frozenset(accepted)}
-        known = candidates_of(self.channel)
         while len(accepted) < _MOST_EFFECTS:
-            rest = [name for name in known if name not in accepted]
-            ranked = sorted(rest, key=lambda name: -self.evidence(accepted, (*accepted, name)).score)
+            ranked = self.ranked(accepted)
             new = next((name for name in ranked if self.acceptable(accepted, (*accepted, name))), None)
             if new is None:
                 break
@@ -133,19 +197,16 @@ class Selector:
         return accepted
 
     def _swapped(self, accepted: Names) -> Names:
-        """Replace single effects as long as that fits better at no more parameters' worth."""
-        known = candidates_of(self.channel)
+        """Replace single effects as long as that fits better by more than the parameters' price."""
         for _ in range(len(accepted)):
-            best, score = accepted, 0.0
+            best, score = accepted, 2.0
             for place, old in enumerate(accepted):
-                for name in known:
-                    if name in accepted:
-                        continue
-                    trial = (*accepted[:place], name, *accepted[place + 1 :])
-                    change = 2.0 * (self.fit(accepted).cost - self.fit(trial).cost)
-                    change -= (known[name].parameters - known[old].parameters) * np.log(self.channel.count)
-                    if change > max(score, 2.0):
-                        best, score = trial, change
+                rest = (*accepted[:place], *accepted[place + 1 :])
+                worth = self.fit(rest).cost - self.fit(accepted).cost
+                worth -= 0.5 * CANDIDATES[old].parameters * np.log(self.channel.count)
+                for name in candidates_of(self.channel):
+                    if name not in accepted and self.promise(rest, name) - worth > score:
+                        best, score = (*accepted[:place], name, *accepted[place + 1 :]), self.promise(rest, name) - worth
             if best == accepted:
                 break
             accepted = best
@@ -158,5 +219,3 @@ class Selector:
             if len(accepted) > 1 and not self.acceptable(rest, accepted):
                 return self._backward(rest)
         return accepted
-
-

@@ -1,0 +1,110 @@
+"""The parameter vector of each channel: every parameter of every effect in the registry, by full name.
+
+At its neutral value an effect changes nothing, so one vector and one compiled free run serve every set of effects.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from disco_hw.gap.timeline import CELL_S
+from disco_hw.model.effects import MOTION_EFFECTS, REGISTRY, Channel
+from disco_hw.model.parameter import BASE_PARAMETERS, Parameter
+from disco_hw.model.step import Base, Effects
+
+Array = NDArray[np.float64]
+
+BASE_COUNT = len(BASE_PARAMETERS)
+
+# Difference steps by unit: well above rounding, well below what a log resolves.
+_STEPS: Mapping[str, float] = {"s": 2e-3, "rad/s": 2e-2, "m": 1e-4, "m/s": 1e-4, "rad": 1e-3, "1": 2e-4}
+_OTHER_STEP = 1e-3
+# A host that stamps commands or encoders late shows as a negative delay; better told than hidden in noise.
+_EARLIEST_DELAY_S = -0.05
+_UNLIMITED = 1e6
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Columns of a channel's vector, its neutral point, and how each is varied."""
+
+    columns: tuple[str, ...]
+    neutral: Array
+    step: Array
+    low: Array
+    high: Array
+    place: Mapping[str, int]
+
+    def at(self, p: Array, name: str) -> float:
+        """One entry of a vector."""
+        return float(p[self.place[name]])
+
+
+def _layout(parameters: Mapping[str, Parameter], base: int) -> Layout:
+    columns = tuple(parameters)
+    neutral = np.array([min(p.neutral, _UNLIMITED) for p in parameters.values()])
+    low = np.array([p.low for p in parameters.values()])
+    low[[name == "command_delay.delay_s" for name in columns]] = _EARLIEST_DELAY_S
+    return Layout(
+        columns=columns,
+        neutral=neutral,
+        step=np.array([1e-4 if k < base else _STEPS.get(p.unit, _OTHER_STEP) for k, p in enumerate(parameters.values())]),
+        low=low,
+        high=np.array([max(p.high, p.neutral if p.neutral < np.inf else _UNLIMITED) for p in parameters.values()]),
+        place=MappingProxyType({name: k for k, name in enumerate(columns)}),
+    )
+
+
+def _of_channels(*channels: Channel) -> dict[str, Parameter]:
+    return {
+        f"{name}.{parameter.name}": parameter
+        for name, effect in REGISTRY.items()
+        if effect.channel in channels or (name == "encoder_scale")
+        for parameter in effect.parameters
+    }
+
+
+WHEEL = _layout(_of_channels(Channel.COMMAND_TO_WHEEL), 0)
+BODY = _layout(
+    {p.name: p for p in BASE_PARAMETERS} | _of_channels(Channel.WHEEL_TO_BODY, Channel.POSE_SENSOR), BASE_COUNT
+)
+
+
+def _coefficients(layout: Layout, p: Array, name: str, base: Array) -> tuple[float, ...]:
+    effect = REGISTRY[name]
+    values = np.array([[layout.at(p, f"{name}.{parameter.name}") for parameter in effect.parameters]])
+    return tuple(float(column[0]) for column in effect.coefficients(values, base, CELL_S))
+
+
+# The command delay is the free run's own affair, the slope that of the world frame.
+_NOT_IN_STEP = ("command_delay", "slope")
+WHEEL_MOTION = tuple(
+    name for name in MOTION_EFFECTS if REGISTRY[name].channel is Channel.COMMAND_TO_WHEEL and name not in _NOT_IN_STEP
+)
+BODY_MOTION = tuple(
+    name for name in MOTION_EFFECTS if REGISTRY[name].channel is Channel.WHEEL_TO_BODY and name not in _NOT_IN_STEP
+)
+
+
+def wheel_effects(p: Array, geometry: Array) -> Any:
+    """What the model's wheel step needs at a vector of the wheel channel; `geometry` (3,) serves yaw-rate limits."""
+    base = geometry[None, :BASE_COUNT]
+    given = {name: _coefficients(WHEEL, p, name, base) for name in WHEEL_MOTION}
+    return Effects(**{name: given.get(name) for name in MOTION_EFFECTS})
+
+
+def body_effects(p: Array) -> tuple[Base, Any]:
+    """What the model's body velocity needs at a vector of the body channel."""
+    base = p[None, :BASE_COUNT]
+    given = {name: _coefficients(BODY, p, name, base) for name in BODY_MOTION}
+    radius, axial, x_icr = p[:BASE_COUNT].tolist()
+    return (
+        Base(0.5 * radius, 0.5 * radius / axial, x_icr),
+        Effects(**{name: given.get(name) for name in MOTION_EFFECTS}),
+    )
