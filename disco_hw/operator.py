@@ -86,7 +86,11 @@ class Operator:
         while time.monotonic() < deadline:
             self._check_alive()
             if self._socket.exists():
-                status = self.status()
+                try:
+                    status = send_request(self._socket, {"do": "status"}, timeout_s=2.0)
+                except WorkError as error:
+                    words = str(error)
+                    continue
                 if status.get("ok") and condition(status):
                     return status
                 words = f"{status.get('state')}: {status.get('detail')}"
