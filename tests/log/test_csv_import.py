@@ -135,7 +135,7 @@ def test_ticks_that_wrap_are_refused(tmp_path):
 
 
 def test_segments_are_numbered_in_order_and_nothing_is_integrated_across(tmp_path):
-    labels = ["7", "7", "", "3", "3", "9", "9", "9", "3"]
+    labels = ["", "7", "", "3", "3", "9", "9", "9", "3"]
     lines = [f"{0.1 * k:.1f},1,1,1,1,{0.009 * k},0,0.1,{label}" for k, label in enumerate(labels)]
     content = HEADER + ",segment\n" + "\n".join(lines) + "\n"
     drive = read_csv(write(tmp_path, content))

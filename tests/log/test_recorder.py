@@ -75,6 +75,16 @@ def test_a_stopped_writer_blocks_nothing_and_what_is_dropped_is_counted_and_seen
         assert missing == log.summary().missing_ticks == final.dropped_ticks == stats.dropped_ticks
 
 
+def test_a_tick_without_records_is_not_one_that_is_missing(path):
+    recorder = ProcessRecorder(recording(path))
+    for t_ns in (1, 2, 3):
+        recorder.put(t_ns, [])
+        recorder.put(t_ns, tick(t_ns))
+    assert recorder.close().ticks == 3
+    with open_log(path) as log:
+        assert (log.summary().ticks, log.summary().missing_ticks) == (3, 0)
+
+
 def test_a_record_that_cannot_be_encoded_costs_itself_only(path):
     recorder = ProcessRecorder(recording(path))
     bad = [Event(2**70, "info", "a", "b"), Event(1, "info", "a", object()), object()]
