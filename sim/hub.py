@@ -145,7 +145,6 @@ class Hub:
         for client in self._leaving:
             self.bus.detach(client.node)
         self._leaving.clear()
-        self._inbox.clear()
         if self._listener is not None:
             self._epoll.unregister(self._listener)
             self._listener.close()

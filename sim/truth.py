@@ -23,6 +23,7 @@ COLUMNS = (
     "brake",
     "session",
     "accepted_commands",
+    "fault",
 )
 FLUSH_NS = 1_000_000_000
 
@@ -35,7 +36,7 @@ def truth_row(robot: VirtualRobot, t_ns: int) -> str:
         f"{truth.left_speed_rad_s:.5f},{truth.right_speed_rad_s:.5f},"
         f"{outputs.left_setpoint_rad_s:.5f},{outputs.right_setpoint_rad_s:.5f},"
         f"{truth.speed_m_s:.6f},{truth.yaw_rate_rad_s:.6f},{outputs.state},"
-        f"{int(outputs.driver_enabled)},{int(outputs.brake)},{outputs.session},{outputs.accepted_commands}"
+        f"{int(outputs.driver_enabled)},{int(outputs.brake)},{outputs.session},{outputs.accepted_commands},{outputs.fault}"
     )
 
 

@@ -15,6 +15,7 @@ class MinimalHost:
         self.session = session
         self.wanted = "STANDBY"
         self.speeds = (0.0, 0.0)
+        self.mode = "SPEED"
         self.silent = False
         self.latest = {}
         self.times = []
@@ -62,7 +63,7 @@ class MinimalHost:
             frames.append(
                 self._encode(
                     "WHEEL_COMMAND",
-                    mode="SPEED",
+                    mode=self.mode,
                     left_speed=left,
                     right_speed=right,
                     valid_for=0.1,

@@ -16,6 +16,7 @@ import pytest
 import serial
 
 from drivers.types import Frame
+from firmware_protocol.codec import Codec
 from firmware_protocol.serial_framing import FrameDecoder, encode_frame
 from sim.__main__ import main
 from sim.command_socket import send_command
@@ -239,6 +240,9 @@ def test_faults_at_run_time(start):
         with pytest.raises(can.CanInitializationError):
             UnixCanBus(str(robot.channel))
     time.sleep(0.4)
+    assert robot.command("bus_off robot") == "ok"
+    time.sleep(0.05)
+    assert robot.state()["fault"] == Codec().choice_value("SYSTEM_STATE", "fault", "BUS_OFF")
     assert robot.command("kidnap 0.5 0 0") == "ok"
     assert robot.state()["x_m"] == pytest.approx(0.5, abs=0.01)
     assert robot.command("estop_button on") == "ok"
@@ -247,7 +251,7 @@ def test_faults_at_run_time(start):
     assert robot.command("nonsense").startswith("error: 'nonsense' is no command")
     assert robot.command("babble 0x100 200") == "ok"
     with UnixCanBus(str(robot.channel), can_filters=[{"can_id": 0x100, "can_mask": 0x7FF}]) as bus:
-        assert bus.recv(1) is not None
+        assert [bus.recv(1).arbitration_id for _ in range(20)] == [0x100] * 20
 
 
 def test_ready_descriptor(tmp_path):

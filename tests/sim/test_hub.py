@@ -326,6 +326,26 @@ def test_unplugged_clients_are_cut_off_and_refused_for_a_while(hub):
     assert c.received() == [CanFrame(1)]
 
 
+def test_unplugging_loses_what_was_not_yet_on_the_bus(hub):
+    robot = hub.bus.attach("robot")
+    a = Client(hub)
+    a.send(FRAME)
+    assert hub.collect(T0) == 1
+    hub.unplug(T0 + 500)
+    assert [d for d in hub.pump(T0 + LONG_NS) if robot in d.receivers] == []
+
+
+def test_when_the_bus_has_room_again_waiting_senders_wake_the_owner(make_hub):
+    hub = make_hub(pacing=False)
+    a, b = Client(hub), Client(hub)
+    a.send(*[FRAME] * 40)
+    hub.pump(T0)
+    assert select.select([hub.fileno()], [], [], 0)[0] == [hub.fileno()]
+    hub.pump(T0)
+    assert select.select([hub.fileno()], [], [], 0)[0] == []
+    assert len(b.received()) == 40
+
+
 def test_frames_that_waited_can_be_let_in_a_few_at_a_time(hub):
     """An owner that was held up lets a backlog in over the time it must catch up with."""
     robot = hub.bus.attach("robot")

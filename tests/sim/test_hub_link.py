@@ -92,7 +92,9 @@ def test_the_robot_comes_back_from_bus_off_by_itself(link, bus):
     send(bus)
     assert len(run(link, RESTART_DELAY_NS + 10 * MS, RESTART_DELAY_NS + 20 * MS)) == 1
     link.force_bus_off("robot")
-    run(link, RESTART_DELAY_NS + 20 * MS, 3 * RESTART_DELAY_NS)
+    run(link, RESTART_DELAY_NS + 20 * MS, 2 * RESTART_DELAY_NS + 10 * MS)
+    assert link.error_counters == (256, 0)
+    run(link, 2 * RESTART_DELAY_NS + 10 * MS, 3 * RESTART_DELAY_NS)
     assert link.error_counters == (0, 0)
 
 

@@ -80,6 +80,8 @@ def test_handshake_arm_drive_stop(setup):
     assert truth.right_speed_rad_s == pytest.approx(3.0, abs=0.02)
     assert setup.host.latest["WHEEL_SPEED"]["left_speed"] == pytest.approx(2.0, abs=0.1)
     assert truth.yaw_rad > 0.0
+    ticks = setup.host.latest["WHEEL_TICKS"]
+    assert ticks["left_ticks"] / ticks["right_ticks"] == pytest.approx(2 / 3, abs=0.02)
     setup.host.wanted = "STANDBY"
     setup.run(1000, until=lambda: setup.host.robot_state == "STANDBY")
     setup.run(300)
@@ -100,6 +102,22 @@ def test_silence_stops_the_wheels_in_time(setup):
     assert not setup.robot.outputs.driver_enabled
     assert setup.robot.outputs.brake
     assert setup.robot.outputs.state != "ARMED"
+
+
+def test_coasting_wheels_roll_on_and_braked_ones_stop(setup):
+    setup.arm()
+    setup.host.speeds = (4.0, 4.0)
+    setup.run(1000)
+    setup.host.mode, setup.host.speeds = "COAST", (0.0, 0.0)
+    setup.run(200)
+    assert not setup.robot.outputs.driver_enabled
+    assert not setup.robot.outputs.brake
+    assert setup.wheel_speed() > 2.0
+    setup.robot.reboot()
+    assert setup.robot.outputs.brake
+    assert not setup.robot.outputs.driver_enabled
+    setup.run(200)
+    assert setup.wheel_speed() < 0.05
 
 
 def test_the_estop_button_stops_and_latches(setup):
@@ -180,6 +198,7 @@ def test_a_restart_forgets_the_session_and_stands_still(setup):
     setup.run(500)
     position = setup.robot.truth.x_m
     setup.robot.reboot()
+    assert setup.robot.outputs.left_setpoint_rad_s == 0.0
     setup.run(1)
     assert setup.robot.outputs.state in {"BOOT", "STANDBY"}
     assert setup.robot.device_us(setup.robot.now_us) == 1000
