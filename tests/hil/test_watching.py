@@ -1,0 +1,50 @@
+"""Other people's tools watch the virtual robot's bus while it runs, as they would watch a real one."""
+
+from __future__ import annotations
+
+import os
+import pty
+import re
+import select
+import subprocess
+import sys
+import time
+
+import pytest
+
+from disco_hw.operator import disco_hw_process
+from tests.hil.stack import write_robot_file
+from tests.hil.test_check import wait_for_line
+
+pytestmark = pytest.mark.hil
+
+
+def test_python_cans_logger_writes_what_the_bus_carries(tmp_path):
+    robot_file = write_robot_file(tmp_path)
+    with disco_hw_process("virtual robot", ["sim", str(robot_file)], tmp_path / "sim.txt"):
+        wait_for_line(tmp_path / "sim.txt", "ready")
+        log = tmp_path / "bus.log"
+        logger = [sys.executable, "-m", "can.logger", "-i", "unixcan", "-c", str(tmp_path / "bus"), "-f", str(log)]
+        with subprocess.Popen(logger, stdout=subprocess.DEVNULL) as process:
+            time.sleep(2.5)
+            process.terminate()
+    lines = log.read_text().splitlines()
+    assert len(lines) > 200
+    assert sum(1 for line in lines if re.search(r" 110#[0-9A-F]{16}", line)) > 50
+
+
+def test_python_cans_viewer_shows_the_frames_in_a_terminal(tmp_path):
+    robot_file = write_robot_file(tmp_path)
+    with disco_hw_process("virtual robot", ["sim", str(robot_file)], tmp_path / "sim.txt"):
+        wait_for_line(tmp_path / "sim.txt", "ready")
+        master, slave = pty.openpty()
+        viewer = [sys.executable, "-m", "can.viewer", "-i", "unixcan", "-c", str(tmp_path / "bus")]
+        environment = {**os.environ, "TERM": "xterm", "LINES": "40", "COLUMNS": "120"}
+        with subprocess.Popen(viewer, stdin=slave, stdout=slave, stderr=slave, env=environment) as process:
+            shown = b""
+            deadline = time.monotonic() + 10.0
+            while time.monotonic() < deadline and not {b"0x110", b"0x111"} <= set(re.findall(rb"0x\d{3}", shown)):
+                if select.select((master,), (), (), 0.1)[0]:
+                    shown += os.read(master, 65536)
+            process.terminate()
+    assert {b"0x110", b"0x111"} <= set(re.findall(rb"0x\d{3}", shown))
