@@ -29,6 +29,7 @@ from disco_hw.log.link import Attachment
 from disco_hw.log.provenance import DBC, MODEL_TOML, ROBOT_TOML, attachment, version
 from disco_hw.log.recorder import NullRecorder, ProcessRecorder, Recorder, Recording
 from disco_hw.robot_setup import Setup, load_setup
+from disco_hw.viewer.feed import ViewerFeed, WatchedRecorder, feed_path
 from drivers.transport import open_transport
 from drivers.types import Request
 from firmware_protocol.dbc import packaged_dbc
@@ -79,7 +80,9 @@ def _start(setup: Setup, options: DaemonOptions, signals: StopSignals, stop: Sto
     # The planner was compiled before: whoever finds the socket gets an answer.
     server = ControlServer(socket_path(config), ACTIONS)
     stop.add("control socket", server.close)
-    recorder = _make_recorder(setup, options.log_file)
+    feed = ViewerFeed(feed_path(server.path))
+    stop.add("page feed", feed.close)
+    recorder = WatchedRecorder(_make_recorder(setup, options.log_file), feed)
     stop.add("recorder", lambda: _close_recorder(recorder, say))
     for step in realtime.enter(config.daemon.realtime_priority):
         say("real time", str(step))

@@ -1,0 +1,127 @@
+"""The daemon's side of the page: publishes what is recorded, some times a second, and never waits for who looks.
+
+Nobody looking costs one non-blocking receive a batch. Who does not keep up misses batches, sees that by their numbers,
+and holds up neither the loop nor the other pages.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import zmq
+
+from disco_hw.errors import InputError
+from disco_hw.log.link import ENCODE_ERRORS, batch_encoder
+from disco_hw.log.recorder import Recorder, RecorderStats
+from disco_hw.log.records import FrameIn, FrameOut, Plan, Record
+
+PERIOD_S = 0.05
+_QUEUED_BATCHES = 40
+_MOST_RECORDS = 400
+
+
+def feed_path(control_socket: Path) -> Path:
+    """Where the feed of the daemon with this control socket is, in the same private directory."""
+    return control_socket.with_name(control_socket.name + ".view")
+
+
+class ViewerFeed:
+    """Publishes batches of records at `path` every `period_s` while somebody is connected.
+
+    Frames are left out, and of the plans of one batch all but the newest. Raises InputError if the socket cannot be
+    made; nothing else raises. The directory must be its owner's alone.
+    """
+
+    def __init__(self, path: Path, period_s: float = PERIOD_S) -> None:
+        self.sent = 0
+        self.refused = 0
+        self._path = path
+        self._period_ns = round(period_s * 1e9)
+        self._encode = batch_encoder()
+        self._pending: list[Record] = []
+        self._plan: Plan | None = None
+        self._next_ns = 0
+        self._watched = False
+        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        self._socket = self._context.socket(zmq.XPUB)
+        self._socket.setsockopt(zmq.SNDHWM, _QUEUED_BATCHES)
+        self._socket.setsockopt(zmq.LINGER, 0)
+        mask = os.umask(0o177)
+        try:
+            self._socket.bind(f"ipc://{path}")
+        except zmq.ZMQError as error:
+            self._socket.close()
+            self._context.term()
+            raise InputError(
+                f"{path}: the page's feed cannot be made ({error.strerror}); shorten daemon.control_socket"
+            ) from None
+        finally:
+            os.umask(mask)
+
+    def put(self, now_ns: int, records: Sequence[Record]) -> None:
+        """Take the records of one tick, and publish what has gathered if it is time."""
+        if self._watched:
+            self._gather(records)
+        if now_ns < self._next_ns:
+            return
+        self._next_ns = now_ns + self._period_ns
+        self._notice_watchers()
+        if self._watched and (self._pending or self._plan is not None):
+            self._publish(now_ns)
+
+    def close(self) -> None:
+        """Disconnect everybody and remove the socket; safe to call twice."""
+        if not self._socket.closed:
+            self._socket.close()
+            self._context.term()
+            self._path.unlink(missing_ok=True)
+
+    def _gather(self, records: Sequence[Record]) -> None:
+        for record in records:
+            if type(record) is Plan:
+                self._plan = record
+            elif type(record) is not FrameIn and type(record) is not FrameOut:
+                self._pending.append(record)
+        if len(self._pending) > _MOST_RECORDS:
+            self.refused += len(self._pending) - _MOST_RECORDS
+            del self._pending[:-_MOST_RECORDS]
+
+    def _notice_watchers(self) -> None:
+        """A first page subscribes, the last one leaves: the socket tells of both."""
+        with contextlib.suppress(zmq.Again):
+            while True:
+                self._watched = self._socket.recv(zmq.NOBLOCK)[:1] == b"\x01"
+
+    def _publish(self, now_ns: int) -> None:
+        batch = self._pending if self._plan is None else [*self._pending, self._plan]
+        self._pending, self._plan = [], None
+        try:
+            self._socket.send(self._encode(self.sent + 1, now_ns, batch), zmq.NOBLOCK)
+        except (*ENCODE_ERRORS, zmq.ZMQError):
+            self.refused += len(batch)
+        else:
+            self.sent += 1
+
+
+class WatchedRecorder:
+    """A recorder whose records go to the page as well."""
+
+    def __init__(self, recorder: Recorder, feed: ViewerFeed) -> None:
+        self._recorder = recorder
+        self._feed = feed
+
+    def put(self, now_ns: int, records: Sequence[Record]) -> None:
+        """Record the tick, then show it."""
+        self._recorder.put(now_ns, records)
+        self._feed.put(now_ns, records)
+
+    def poll(self) -> RecorderStats:
+        """The recorder's counters."""
+        return self._recorder.poll()
+
+    def close(self, timeout_s: float = 5.0) -> RecorderStats:
+        """End the log; the feed is closed by who made it."""
+        return self._recorder.close(timeout_s)

@@ -1,0 +1,20 @@
+"""Checkboxes that show and hide the layers of a scene."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import viser
+
+from disco_hw.viewer.scene import LAYERS, Scene
+
+
+def add_layers(gui: viser.GuiApi, scene: Scene) -> None:
+    """One checkbox a layer; the next snapshot is drawn with what is ticked then."""
+    with gui.add_folder("Layers", expand_by_default=False):
+        for name, label in LAYERS.items():
+            box = gui.add_checkbox(label, scene.layers[name])
+
+            @box.on_update
+            def _(event: Any, name: str = name) -> None:
+                scene.layers[name] = bool(event.target.value)

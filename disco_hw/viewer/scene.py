@@ -1,0 +1,220 @@
+"""The drawn scene: everything of a snapshot that has a place in the world. Live page, replay and export share it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from disco_hw.viewer import shapes
+from disco_hw.viewer.snapshot import Snapshot
+from disco_hw.viewer.stage import Stage
+from disco_hw.viewer.uncertainty import ParameterPoints
+
+Array = NDArray[np.float64]
+
+TASK_COLOUR = (40, 110, 230)
+BODY_COLOUR = (200, 60, 160)
+WHEEL_COLOUR = (45, 45, 50)
+PLAN_COLOUR = (250, 140, 0)
+POINTS_COLOUR = (150, 110, 200)
+POSES_COLOUR = (20, 150, 150)
+ELLIPSE_COLOUR = (120, 40, 200)
+CENTRE_COLOUR = (0, 0, 0)
+
+TRAIL_FULL_M = 0.1
+"""Distance to the task at which the trail is wholly red."""
+
+LAYERS = {
+    "task": "Task",
+    "robot": "Robot",
+    "trail": "Driven trail",
+    "plan": "Planned trajectory",
+    "points": "Plan under sigma points",
+    "ellipse": "95 % of the position",
+    "poses": "Measured poses, 3 s",
+    "centre": "Turning centre (ICR)",
+}
+_GROUND_M = 0.002
+_CENTRE_LIMIT_M = 5.0
+_WHEEL_PARTS = (("front", 0.5), ("rear", -0.5))
+
+
+class Scene:
+    """Draws snapshots on a viser server; `layers` says which of LAYERS are shown.
+
+    `show` moves what moves in every call and redraws long lines only where `everything` is True.
+    """
+
+    def __init__(self, server: viser.ViserServer, stage: Stage) -> None:
+        self.layers = dict.fromkeys(LAYERS, True)
+        self._server = server
+        self._stage = stage
+        self._points = ParameterPoints(stage.model)
+        self._wheel_radius = max(stage.wheel_radius_m, 0.01)
+        self._add_ground()
+        self._robot, self._wheels = self._add_robot()
+        empty = np.zeros((1, 2, 3))
+        self._lines = {
+            name: server.scene.add_line_segments(f"/{name}", empty, colour, thickness=thickness, visible=False)
+            for name, colour, thickness in (
+                ("points", POINTS_COLOUR, 0.004),
+                ("plan", PLAN_COLOUR, 0.012),
+                ("ellipse", ELLIPSE_COLOUR, 0.006),
+                ("centre", CENTRE_COLOUR, 0.004),
+                ("poses", POSES_COLOUR, 0.008),
+            )
+        }
+        self._trail = server.scene.add_line_segments(
+            "/trail", empty, np.zeros((1, 2, 3), np.uint8), thickness=0.012, visible=False
+        )
+        self._task.visible = True
+
+    def show(self, snapshot: Snapshot, everything: bool = True) -> None:
+        """Draw this instant."""
+        layers = self.layers
+        with self._server.atomic():
+            self._task.visible = layers["task"]
+            self._robot.visible = layers["robot"] and snapshot.pose is not None
+            if snapshot.pose is not None:
+                x_m, y_m, yaw_rad = snapshot.pose
+                self._robot.position = (x_m, y_m, 0.0)
+                self._robot.wxyz = shapes.about_z(yaw_rad)
+            for wheel, angle_rad in zip(self._wheels, snapshot.wheel_angles * 2, strict=True):
+                wheel.wxyz = shapes.about_y(angle_rad)
+            self._draw("ellipse", self._ellipse(snapshot))
+            self._draw("centre", self._centre(snapshot))
+            if not everything:
+                return
+            plan = snapshot.plan
+            path = np.empty((0, 2)) if plan is None else np.column_stack((plan.path_x_m, plan.path_y_m))
+            self._draw("plan", shapes.segments(path, 0.012))
+            self._draw("points", self._points_paths(snapshot))
+            self._draw("poses", _pose_marks(snapshot.poses))
+            self._draw_trail(snapshot.trail)
+
+    def _add_ground(self) -> None:
+        task, scene = self._stage.task, self._server.scene
+        size_m = max(4.0, 2.0 * math.ceil(1.5 * task.radius_m + 1.0))
+        scene.set_up_direction("+z")
+        scene.add_grid(
+            "/ground",
+            width=size_m,
+            height=size_m,
+            cell_size=0.1 if size_m <= 4.0 else 0.5,
+            section_size=1.0,
+            cell_color=(225, 225, 225),
+            section_color=(170, 170, 170),
+            shadow_opacity=0.0,
+            position=(task.center_x_m, task.center_y_m, 0.0),
+        )
+        circle = shapes.circle_points(task.center_x_m, task.center_y_m, task.radius_m)
+        self._task = scene.add_line_segments(
+            "/task", shapes.segments(circle, _GROUND_M), TASK_COLOUR, thickness=max(0.015, 0.015 * task.radius_m)
+        )
+        away = 1.0 + 1.3 * task.radius_m
+        camera = self._server.initial_camera
+        camera.look_at = (task.center_x_m, task.center_y_m, 0.0)
+        camera.position = (task.center_x_m - 0.35 * away, task.center_y_m - 0.9 * away, 1.25 * away)
+
+    def _add_robot(self) -> tuple[viser.FrameHandle, list[viser.FrameHandle]]:
+        scene, radius = self._server.scene, self._wheel_radius
+        length = width = self._stage.axial_distance_m
+        robot = scene.add_frame("/robot", show_axes=False, visible=False)
+        scene.add_box(
+            "/robot/body",
+            color=BODY_COLOUR,
+            dimensions=(1.25 * length, 0.75 * width, radius),
+            position=(0.0, 0.0, 1.5 * radius),
+        )
+        # The nose, so that forward can be told from backward.
+        scene.add_box(
+            "/robot/nose",
+            color=(255, 220, 60),
+            dimensions=(0.15 * length, 0.3 * width, 0.5 * radius),
+            position=(0.55 * length, 0.0, 2.1 * radius),
+        )
+        wheels = []
+        for part, along in _WHEEL_PARTS:
+            for side, across in (("left", 0.5), ("right", -0.5)):
+                name = f"/robot/{part}_{side}"
+                wheel = scene.add_frame(name, show_axes=False, position=(along * length, across * width, radius))
+                scene.add_cylinder(
+                    f"{name}/tyre",
+                    radius=radius,
+                    height=0.6 * radius,
+                    color=WHEEL_COLOUR,
+                    wxyz=(math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0),
+                )
+                scene.add_box(
+                    f"{name}/spoke", color=(235, 235, 235), dimensions=(1.7 * radius, 0.66 * radius, 0.25 * radius)
+                )
+                wheels.append(wheel)
+        return robot, wheels
+
+    def _draw(self, layer: str, lines: Array) -> None:
+        node = self._lines[layer]
+        if self.layers[layer] and len(lines):
+            node.points = lines.astype(np.float32)
+            node.visible = True
+        elif node.visible:
+            node.visible = False
+
+    def _draw_trail(self, trail: Array) -> None:
+        visible = self.layers["trail"] and len(trail) >= 2
+        if visible:
+            task = self._stage.task
+            distance = np.hypot(trail[:, 0] - task.center_x_m, trail[:, 1] - task.center_y_m) - task.radius_m
+            colours = shapes.distance_colours(distance, TRAIL_FULL_M)
+            points = shapes.segments(trail, 2.0 * _GROUND_M)
+            # Added anew, since points and colours must change together.
+            self._trail = self._server.scene.add_line_segments(
+                "/trail", points, np.stack((colours[:-1], colours[1:]), axis=1), thickness=0.012
+            )
+        elif self._trail.visible:
+            self._trail.visible = False
+
+    def _ellipse(self, snapshot: Snapshot) -> Array:
+        if snapshot.pose is None:
+            return np.empty((0, 2, 3))
+        points = shapes.ellipse_points(snapshot.pose[0], snapshot.pose[1], snapshot.covariance[:2, :2])
+        return shapes.segments(points, 3.5 * self._wheel_radius)
+
+    def _centre(self, snapshot: Snapshot) -> Array:
+        centre = None
+        if snapshot.pose is not None:
+            centre = shapes.instant_centre(
+                snapshot.pose, snapshot.speed_m_s, snapshot.yaw_rate_rad_s, self._stage.x_icr_m, _CENTRE_LIMIT_M
+            )
+        if snapshot.pose is None or centre is None:
+            return np.empty((0, 2, 3))
+        ray = shapes.segments(np.array((snapshot.pose[:2], centre)), 0.01)
+        return np.concatenate((ray, _crosses(np.array((centre,)), 0.04, 0.01)))
+
+    def _points_paths(self, snapshot: Snapshot) -> Array:
+        if snapshot.plan is None or snapshot.pose is None or not self.layers["points"]:
+            return np.empty((0, 2, 3))
+        wheels = snapshot.wheel_speeds or (0.0, 0.0)
+        paths = self._points.trajectories(snapshot.plan, wheels)
+        return np.concatenate([shapes.segments(path, 0.008) for path in paths]) if len(paths) else np.empty((0, 2, 3))
+
+
+def _pose_marks(poses: Array) -> Array:
+    """A short stroke along the heading for each measured pose (N, 3)."""
+    if not len(poses):
+        return np.empty((0, 2, 3))
+    ahead = 0.03 * np.stack((np.cos(poses[:, 2]), np.sin(poses[:, 2])), axis=1)
+    height = np.full((len(poses), 1), 0.006)
+    start, end = np.hstack((poses[:, :2] - ahead, height)), np.hstack((poses[:, :2] + ahead, height))
+    return np.stack((start, end), axis=1)
+
+
+def _crosses(points: Array, arm_m: float, height_m: float) -> Array:
+    """Two strokes for each point (N, 2)."""
+    height = np.full((len(points), 1), height_m)
+    strokes = []
+    for arm in (np.array((arm_m, arm_m)), np.array((arm_m, -arm_m))):
+        strokes.append(np.stack((np.hstack((points - arm, height)), np.hstack((points + arm, height))), axis=1))
+    return np.concatenate(strokes)

@@ -1,0 +1,152 @@
+"""The page's server: viser, closed to everybody but the operator.
+
+By itself viser listens to the whole network, takes another port when its own is in use, lets any web page open in the
+operator's browser press its buttons, and opens a public tunnel for any client that asks for one.
+"""
+
+from __future__ import annotations
+
+import functools
+import hmac
+import http
+import io
+import secrets
+import socket
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, redirect_stdout
+from dataclasses import dataclass
+from http.cookies import CookieError, SimpleCookie
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+import viser
+import websockets.asyncio.server
+from websockets.datastructures import Headers
+from websockets.http11 import Request, Response
+
+from disco_hw.errors import InputError
+
+LOOPBACK = "127.0.0.1"
+DEFAULT_PORT = 8080
+_LOOPBACK_NAMES = frozenset({"127.0.0.1", "localhost"})
+_COOKIE = "disco-hw-token"
+Answer = Callable[[Any, Request], Response | None]
+
+
+@dataclass(slots=True)
+class Guard:
+    """Decides which requests reach the page.
+
+    Without a `token` only pages and browsers of this machine do: the name asked for must be a loopback one, which also
+    defeats a foreign name that resolves to it. With one, the first request must carry it and gets a cookie. A
+    WebSocket must come from a page of this same server. `open` is False until the page is whole.
+    """
+
+    token: str | None = None
+    open: bool = False
+
+    def refusal(self, path: str, headers: Headers, upgrade: bool) -> Response | None:
+        """The answer to a request that must not go on, or None."""
+        if not self.open:
+            return _plain(http.HTTPStatus.SERVICE_UNAVAILABLE, "the page is being made; load it again")
+        host = headers.get("Host", "")
+        if self.token is None and urlsplit(f"//{host}").hostname not in _LOOPBACK_NAMES:
+            return _plain(http.HTTPStatus.FORBIDDEN, "this page is for this machine only")
+        if upgrade and headers.get("Origin") not in {f"http://{host}", f"https://{host}"}:
+            return _plain(http.HTTPStatus.FORBIDDEN, "only this server's own page may connect")
+        if self.token is None or self._same(_cookie(headers)):
+            return None
+        if not upgrade and self._same(parse_qs(urlsplit(path).query).get("token", [""])[0]):
+            cookie = f"{_COOKIE}={self.token}; HttpOnly; SameSite=Strict; Path=/"
+            return _answer(http.HTTPStatus.SEE_OTHER, "welcome", {"Location": "/", "Set-Cookie": cookie})
+        return _plain(
+            http.HTTPStatus.FORBIDDEN, "open the address with its token, as printed where the page was started"
+        )
+
+    def _same(self, offered: str) -> bool:
+        return self.token is not None and hmac.compare_digest(offered.encode(), self.token.encode())
+
+
+@dataclass(frozen=True, slots=True)
+class Page:
+    """A running server and the address to open."""
+
+    server: viser.ViserServer
+    url: str
+
+
+@contextmanager
+def serving(label: str, host: str = LOOPBACK, port: int = DEFAULT_PORT) -> Iterator[Page]:
+    """Serve a page until the block ends; port 0 takes a free one.
+
+    Any host but 127.0.0.1 makes a token, which is part of the printed address. Raises InputError if the port is taken
+    or the host is none of this machine's.
+    """
+    _check_free(host, port)
+    guard = Guard(None if host == LOOPBACK else secrets.token_urlsafe(16))
+    with _guarded(guard), redirect_stdout(io.StringIO()):
+        server = viser.ViserServer(host=host, port=port, label=label, verbose=False)
+    try:
+        # Looked up when a client asks for it, so this is enough to keep the tunnel shut.
+        server.request_share_url = lambda verbose=True: None  # type: ignore[method-assign]
+        taken = server.get_port()
+        if port not in {0, taken}:
+            raise InputError(f"--port {port}: another program took it just now; give another one")
+        server.gui.configure_theme(show_share_button=False, show_logo=False, dark_mode=False)
+        guard.open = True
+        suffix = "" if guard.token is None else f"?token={guard.token}"
+        yield Page(server, f"http://{host}:{taken}/{suffix}")
+    finally:
+        with redirect_stdout(io.StringIO()):
+            server.stop()
+
+
+@contextmanager
+def _guarded(guard: Guard) -> Iterator[None]:
+    """Put the guard before every request of the server made inside the block."""
+    serve = websockets.asyncio.server.serve
+
+    def guarded_serve(*arguments: Any, process_request: Answer, **options: Any) -> Any:
+        @functools.wraps(process_request)
+        def process(connection: Any, request: Request) -> Response | None:
+            upgrade = request.headers.get("Upgrade", "").lower() == "websocket"
+            refusal = guard.refusal(request.path, request.headers, upgrade)
+            return process_request(connection, request) if refusal is None else refusal
+
+        return serve(*arguments, process_request=process, **options)
+
+    websockets.asyncio.server.serve = guarded_serve  # type: ignore[assignment,misc]
+    try:
+        yield
+    finally:
+        websockets.asyncio.server.serve = serve  # type: ignore[misc]
+
+
+def _check_free(host: str, port: int) -> None:
+    try:
+        with socket.create_server((host, port), reuse_port=False):
+            pass
+    except OSError as error:
+        raise InputError(
+            f"--host {host} --port {port}: cannot be listened to ({error.strerror}); give another"
+        ) from None
+
+
+def _cookie(headers: Headers) -> str:
+    try:
+        jar = SimpleCookie("; ".join(headers.get_all("Cookie")))
+    except CookieError:
+        return ""
+    return jar[_COOKIE].value if _COOKIE in jar else ""
+
+
+def _plain(status: http.HTTPStatus, text: str) -> Response:
+    return _answer(status, text, {})
+
+
+def _answer(status: http.HTTPStatus, text: str, extra: dict[str, str]) -> Response:
+    body = (text + "\n").encode()
+    headers = Headers(
+        {"Content-Type": "text/plain; charset=utf-8", "Content-Length": str(len(body)), "Connection": "close", **extra}
+    )
+    return Response(status.value, status.phrase, headers, body)

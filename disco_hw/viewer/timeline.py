@@ -1,0 +1,181 @@
+"""What is known of a run up to now, in columns that can be cut at any time; live page and replay fill the same one."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Iterator
+from typing import Generic, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from disco_hw.log import records
+from drivers.types import PoseSample, PowerSample, RobotLinkHealth, RobotStatus, WheelSample
+
+Array = NDArray[np.float64]
+Times = NDArray[np.int64]
+Item = TypeVar("Item")
+_FIRST_ROWS = 256
+
+
+class Series:
+    """Rows of numbers with the tick in which each became known (ns), in that order."""
+
+    def __init__(self, columns: tuple[str, ...]) -> None:
+        self.columns = columns
+        self._times = np.empty(_FIRST_ROWS, np.int64)
+        self._rows = np.empty((_FIRST_ROWS, len(columns)))
+        self._count = 0
+
+    def __len__(self) -> int:
+        return self._count
+
+    def append(self, now_ns: int, row: tuple[float, ...]) -> None:
+        """Add a row of as many numbers as there are columns."""
+        if self._count == len(self._times):
+            self._times = np.concatenate((self._times, np.empty_like(self._times)))
+            self._rows = np.concatenate((self._rows, np.empty_like(self._rows)))
+        self._times[self._count] = now_ns
+        self._rows[self._count] = row
+        self._count += 1
+
+    def rows(self, first_ns: int, last_ns: int) -> tuple[Times, Array]:
+        """Times (N,) and rows (N, columns) with first_ns <= time <= last_ns; views, not copies."""
+        times = self._times[: self._count]
+        first, last = np.searchsorted(times, first_ns, "left"), np.searchsorted(times, last_ns, "right")
+        return times[first:last], self._rows[first:last]
+
+    def last(self, at_ns: int) -> tuple[int, Array] | None:
+        """The newest row known at `at_ns` and its time; None before the first."""
+        index = int(np.searchsorted(self._times[: self._count], at_ns, "right")) - 1
+        return None if index < 0 else (int(self._times[index]), self._rows[index])
+
+    def forget_before(self, oldest_ns: int) -> None:
+        """Drop rows from before `oldest_ns`, once they are at least half of all."""
+        first = int(np.searchsorted(self._times[: self._count], oldest_ns, "left"))
+        if 2 * first >= self._count > 0:
+            self._times = self._times[first : max(self._count, first + _FIRST_ROWS)].copy()
+            self._rows = self._rows[first : max(self._count, first + _FIRST_ROWS)].copy()
+            self._count -= first
+
+
+class Items(Generic[Item]):
+    """Records that are not rows of numbers, with the tick in which each became known."""
+
+    def __init__(self) -> None:
+        self._times: list[int] = []
+        self._items: list[Item] = []
+
+    def __len__(self) -> int:
+        return len(self._items)
+
+    def __iter__(self) -> Iterator[tuple[int, Item]]:
+        return iter(zip(self._times, self._items, strict=True))
+
+    def append(self, now_ns: int, item: Item) -> None:
+        """Add a record."""
+        self._times.append(now_ns)
+        self._items.append(item)
+
+    def last(self, at_ns: int) -> Item | None:
+        """The newest one known at `at_ns`; None before the first."""
+        index = bisect_right(self._times, at_ns) - 1
+        return None if index < 0 else self._items[index]
+
+    def latest(self, at_ns: int, count: int) -> list[tuple[int, Item]]:
+        """The last `count` known at `at_ns`, oldest first."""
+        end = bisect_right(self._times, at_ns)
+        first = max(0, end - count)
+        return list(zip(self._times[first:end], self._items[first:end], strict=True))
+
+    def forget_before(self, oldest_ns: int) -> None:
+        """Drop those from before `oldest_ns`, but never the newest."""
+        first = min(bisect_right(self._times, oldest_ns), max(len(self._times) - 1, 0))
+        del self._times[:first], self._items[:first]
+
+
+ESTIMATE = ("x_m", "y_m", "yaw_rad", "speed_m_s", "yaw_rate_rad_s", "wheels_healthy", "pose_healthy")
+COVARIANCE = tuple(f"cov{row}{column}" for row in range(3) for column in range(3))
+WHEELS = ("left_angle_rad", "right_angle_rad", "left_speed_rad_s", "right_speed_rad_s")
+COMMAND = ("requested_left_rad_s", "requested_right_rad_s", "left_rad_s", "right_rad_s", "in_force")
+POSE = ("x_m", "y_m", "yaw_rad")
+INNOVATION = ("x_m", "y_m", "yaw_rad", "variance_x", "variance_y", "variance_yaw", "test_ratio", "accepted")
+PLANNER = ("effective_samples", "temperature", "min_cost", "mean_cost")
+LOOP = ("lateness_ns", "overruns", "skipped")
+POWER = ("voltage_v", "current_a", "temperature_c")
+
+
+class Timeline:
+    """Every series of a run; `plans` holds whole plans, which a replay leaves out and reads when it needs one."""
+
+    def __init__(self) -> None:
+        self.first_ns: int | None = None
+        self.last_ns: int | None = None
+        self.estimate = Series((*ESTIMATE, *COVARIANCE))
+        self.wheels = Series(WHEELS)
+        self.command = Series(COMMAND)
+        self.pose = Series(POSE)
+        self.innovation = Series(INNOVATION)
+        self.planner = Series(PLANNER)
+        self.loop = Series(LOOP)
+        self.power = Series(POWER)
+        self.plans: Items[records.Plan] = Items()
+        self.status: Items[RobotStatus] = Items()
+        self.link: Items[RobotLinkHealth] = Items()
+        self.state: Items[records.DaemonState] = Items()
+        self.source: Items[str] = Items()
+        self.events: Items[records.Event] = Items()
+        self.counters: Items[records.Counters] = Items()
+
+    def add(self, now_ns: int, record: records.Record) -> None:  # noqa: PLR0912
+        """Take in one record of the tick at `now_ns`; ticks come in order. Frames are not kept."""
+        self.first_ns = now_ns if self.first_ns is None else self.first_ns
+        self.last_ns = now_ns
+        match record:
+            case records.Estimate() as it:
+                healthy = (float(it.wheels_healthy), float(it.pose_healthy))
+                motion = (it.x_m, it.y_m, it.yaw_rad, it.speed_m_s, it.yaw_rate_rad_s)
+                self.estimate.append(now_ns, (*motion, *healthy, *it.covariance))
+            case WheelSample() as it:
+                angles = (it.left_angle_rad, it.right_angle_rad)
+                self.wheels.append(now_ns, (*angles, it.left_speed_rad_s, it.right_speed_rad_s))
+            case records.Command() as it:
+                requested = (it.requested_left_rad_s, it.requested_right_rad_s)
+                self.command.append(now_ns, (*requested, it.left_rad_s, it.right_rad_s, float(it.in_force)))
+                if self.source.last(now_ns) != it.source:
+                    self.source.append(now_ns, it.source)
+            case PoseSample() as it:
+                self.pose.append(now_ns, (it.x_m, it.y_m, it.yaw_rad))
+            case records.Innovation() as it:
+                row = (*it.innovation, *it.variance, it.test_ratio, float(it.accepted))
+                self.innovation.append(now_ns, row)
+            case records.Plan() as it:
+                self.planner.append(now_ns, (it.effective_samples, it.temperature, it.min_cost, it.mean_cost))
+                self.plans.append(now_ns, it)
+            case records.LoopTiming() as it:
+                self.loop.append(now_ns, (float(it.lateness_ns), float(it.overruns), float(it.skipped)))
+            case PowerSample() as it:
+                self.power.append(now_ns, (it.voltage_v, it.current_a, it.temperature_c))
+            case RobotStatus() as it:
+                self.status.append(now_ns, it)
+            case RobotLinkHealth() as it:
+                self.link.append(now_ns, it)
+            case records.DaemonState() as it:
+                self.state.append(now_ns, it)
+            case records.Event() as it:
+                self.events.append(now_ns, it)
+            case records.Counters() as it:
+                self.counters.append(now_ns, it)
+            case _:
+                pass
+
+    def forget_before(self, oldest_ns: int) -> None:
+        """Drop what is older, so that a page that stays open does not grow."""
+        for series in (
+            self.estimate, self.wheels, self.command, self.pose, self.innovation, self.planner, self.loop, self.power
+        ):  # fmt: skip
+            series.forget_before(oldest_ns)
+        for items in (
+            self.plans, self.status, self.link, self.state, self.source, self.events, self.counters
+        ):  # fmt: skip
+            items.forget_before(oldest_ns)
