@@ -52,7 +52,7 @@ class Arming:
         self._robot_session = 0
         self._reject_reason = "NONE"
         self._blockers: tuple[str, ...] = ()
-        self._challenge: tuple[int, int] | None = None
+        self._challenge = (0, 0)
 
     @property
     def armed(self) -> bool:
@@ -92,8 +92,6 @@ class Arming:
         self._void_session()
         self._set_standby()
         self._robot_state, self._robot_session = "BOOT", 0
-        self._challenge = None
-        self._blockers = ()
 
     def take_status(self, state: str, session: int, stop_cause: str, reject_reason: str) -> None:
         """Take in SYSTEM_STATE, by the names of the DBC's value tables."""
@@ -133,20 +131,15 @@ class Arming:
 
     def host_state(self) -> HostState:
         """Return what to tell the robot now."""
-        request, answer = "STANDBY", 0
-        if self._spent:
-            request = "STANDBY"
-        elif self.wanted is Request.RESET:
-            request = "RESET"
-        elif self.wanted is Request.READY:
-            request = "READY"
-        elif self.wanted is Request.ARM:
-            request = "READY"
-            if self._ours and self._robot_state in _OPEN and self._challenge is not None:
-                challenge, session = self._challenge
-                if session == self.session:
-                    request, answer = "ARM", challenge_answer(challenge, session, self._dbc_hash)
-        return HostState(request, self.session, answer)
+        if self._spent or self.wanted is Request.STANDBY:
+            return HostState("STANDBY", self.session, 0)
+        if self.wanted is Request.RESET:
+            return HostState("RESET", self.session, 0)
+        challenge, session = self._challenge
+        may_answer = self._ours and session == self.session and self._robot_state in _OPEN
+        if self.wanted is Request.ARM and may_answer:
+            return HostState("ARM", session, challenge_answer(challenge, session, self._dbc_hash))
+        return HostState("READY", self.session, 0)
 
     def _choose_session(self, now_ns: int) -> None:
         session = 1 + self._draw_session() % _SESSIONS
@@ -167,7 +160,6 @@ class Arming:
 
     def _set_standby(self) -> None:
         self.wanted = Request.STANDBY
-        self._asked_ns = None
         self._was_armed = False
 
     def _why_not(self) -> str:

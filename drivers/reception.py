@@ -33,7 +33,6 @@ class FrameReception:
     def reset(self) -> None:
         """Forget the senders, as at a new link; the counts stay."""
         self._receivers.clear()
-        self._counters.clear()
         self.foreign = None
 
     def accept(self, received: ReceivedFrame) -> Decoded | None:

@@ -44,7 +44,6 @@ class WheelTicks:
     def forget(self) -> None:
         """Take the next reading as it is: the angles go on from where they are."""
         self._ticks_left = None
-        self._rejected = 0
 
     def update(self, ticks_left: int, ticks_right: int, t_us: int) -> tuple[float, float] | None:
         """Take in a reading of device time `t_us` (which does not wrap); return both angles, None if implausible."""

@@ -63,6 +63,49 @@ def test_the_answer_to_the_challenge_is_the_firmwares():
     assert challenge_answer(0x1234, 7, HASH) == register
 
 
+def test_ready_alone_opens_a_session_and_asks_for_no_more():
+    one = arming()
+    report(one, "STANDBY", 0)
+    one.request(Request.READY)
+    one.step(0)
+    assert one.host_state().request == "READY"
+    assert not one.ready
+    report(one, "READY", one.session + 1)
+    assert not one.ready, "that session is another host's"
+    report(one, "READY")
+    assert one.ready
+    one.take_session(0x1234, one.session, (), 0)
+    one.step(10 * ARMING_TIMEOUT_NS)
+    assert one.host_state().request == "READY"
+    assert not one.needs_zeros
+    one.request(Request.STANDBY)
+    assert not one.ready
+    one.request(Request.READY)
+    assert one.host_state().request == "STANDBY", "a session given up is closed first"
+
+
+def test_no_session_is_no_session_of_ours():
+    one = arming()
+    one.request(Request.ARM)
+    for state in ("READY", "ARMED"):
+        report(one, state, 0)
+        assert not one.armed
+        assert not one.needs_zeros
+
+
+def test_armed_for_long_stays_armed():
+    one = armed()
+    one.step(100 * ARMING_TIMEOUT_NS)
+    assert one.armed
+
+
+def test_a_stopping_robot_that_still_shows_our_session_has_closed_it():
+    one = armed()
+    spent = one.session
+    report(one, "STOPPING", spent)
+    assert one.session == 0
+
+
 def test_a_challenge_of_another_session_is_not_answered():
     one = arming()
     report(one, "STANDBY", 0)
@@ -98,7 +141,8 @@ def test_arm_is_consumed_when_the_robot_leaves_armed(state):
     assert one.wanted is Request.STANDBY
     assert "no wheel command arrived in time" in one.note
     for later in ("STANDBY", "READY", "ARMED"):
-        report(one, later, 0)
+        report(one, later, 0, stop_cause="ESTOP")
+        assert "no wheel command arrived in time" in one.note
         one.step(0)
         assert one.host_state().request == "STANDBY"
         assert not one.armed
@@ -111,6 +155,10 @@ def test_arm_is_consumed_when_the_link_or_robot_is_another_one():
     assert one.wanted is Request.STANDBY
     assert one.session == 0
     assert one.note == "disarmed: the link was lost"
+    one.request(Request.READY)
+    one.step(0)
+    assert one.session == 0, "no session before the robot has been heard"
+    one.request(Request.STANDBY)
     report(one, "ARMED", 17)
     assert not one.armed
     report(one, "STANDBY", 0)
@@ -142,6 +190,23 @@ def test_arming_that_takes_too_long_is_given_up_with_the_robots_reason():
     report(one, "ARMED")
     assert not one.armed, "an arming that comes too late is not taken"
     assert one.host_state().request == "STANDBY"
+    one.request(Request.ARM)
+    assert not one.armed
+    assert one.host_state().request == "STANDBY", "its session is spent"
+
+
+def test_a_new_request_to_arm_has_all_the_time_again():
+    one = arming()
+    report(one, "STANDBY", 0)
+    one.request(Request.ARM)
+    one.step(0)
+    one.request(Request.READY)
+    one.request(Request.ARM)
+    one.step(10 * ARMING_TIMEOUT_NS)
+    assert one.wanted is Request.ARM
+    one.step(11 * ARMING_TIMEOUT_NS + 1)
+    assert one.wanted is Request.STANDBY
+    assert "the robot gave no reason" in one.note
 
 
 @pytest.mark.parametrize("state", ["FAULT", "ESTOP"])
@@ -184,13 +249,20 @@ def test_a_session_that_the_robot_has_had_before_is_replaced():
     one = arming()
     report(one, "STANDBY", 0)
     one.request(Request.READY)
-    one.step(0)
+    start_ns = 10**15
+    one.step(start_ns)
     refused = one.session
-    one.take_session(1, 0, ("SESSION",), SESSION_REFUSED_AFTER_NS)
+    one.take_session(1, 0, ("SESSION",), start_ns + SESSION_REFUSED_AFTER_NS)
     assert one.session == refused
-    one.take_session(1, 0, ("SESSION",), SESSION_REFUSED_AFTER_NS + 1)
-    one.step(SESSION_REFUSED_AFTER_NS + 1)
+    later_ns = start_ns + SESSION_REFUSED_AFTER_NS + 1
+    one.take_session(1, 0, ("CHALLENGE",), later_ns)
+    assert one.session == refused
+    one.take_session(1, 0, ("SESSION",), later_ns)
+    one.step(later_ns)
     assert one.session not in (0, refused)
+    report(one, "READY")
+    one.take_session(1, one.session, ("SESSION",), 2 * later_ns)
+    assert one.ready, "open sessions are not refused"
 
 
 def test_a_ready_session_serves_the_arming_that_follows():

@@ -29,5 +29,6 @@ def test_a_lost_half_costs_its_own_sample_only():
 
 def test_the_same_counter_a_lap_later_is_another_sample():
     pairs = FramePairs("A")
-    pairs.add(A1, 0)
-    assert pairs.add(B1, LONGEST_APART_NS + 1) is None
+    pairs.add(A1, 10**15)
+    assert pairs.add(B1, 10**15 + LONGEST_APART_NS + 1) is None
+    assert pairs.add(A1, 10**15 + 2 * LONGEST_APART_NS + 1) == (A1, B1)

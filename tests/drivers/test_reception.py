@@ -76,6 +76,7 @@ def test_what_only_a_host_sends_betrays_another_host():
     assert reception.foreign is None
     assert reception.accept(received("TIME_REQUEST", sequence=1)) is None
     assert reception.foreign == "TIME_REQUEST"
+    assert reception.unknown_id == 1
     reception.accept(ReceivedFrame(0, Frame(CODEC.can_id("ESTOP"), b"")))
     assert reception.foreign == "ESTOP"
     reception.reset()

@@ -65,6 +65,15 @@ def test_counters_that_stay_elsewhere_are_believed_after_a_while_without_motion(
     assert ticks.update(5_000_011, 1, 7 * PERIOD_US) == (11 * PER_TICK, -9 * PER_TICK)
 
 
+def test_only_readings_in_a_row_make_the_counters_believed():
+    ticks = wheel_ticks()
+    ticks.update(0, 0, 0)
+    for number in range(1, 20):
+        odd = number % REANCHOR_AFTER
+        angles = ticks.update(8_000_000 if odd else 0, 0, number * PERIOD_US)
+        assert angles == (None if odd else (0.0, 0.0))
+
+
 def test_more_time_since_the_last_good_reading_allows_more_motion():
     ticks = wheel_ticks()
     ticks.update(0, 0, 0)

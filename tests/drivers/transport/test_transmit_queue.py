@@ -34,6 +34,16 @@ def test_a_frame_never_outlives_its_deadline():
     assert queue.pop().frame.can_id == 2
 
 
+@given(st.lists(st.tuples(st.integers(0, 20), st.booleans()), max_size=40))
+def test_what_has_not_expired_keeps_its_order(frames):
+    queue = TransmitQueue(64)
+    for number, (can_id, late) in enumerate(frames):
+        queue.push(frame(can_id, number, deadline_ns=10 if late else 100))
+    assert queue.expire(50) == sum(late for _, late in frames)
+    sent = [(outgoing.frame.can_id, outgoing.frame.data[0]) for outgoing in drain(queue)]
+    assert sent == sorted((can_id, number) for number, (can_id, late) in enumerate(frames) if not late)
+
+
 def test_full_queue_refuses_the_least_urgent_frame():
     queue = TransmitQueue(2)
     queue.push(frame(0x100, 0))
@@ -56,6 +66,12 @@ def test_a_frame_put_back_stays_before_its_equals():
     queue.push(urgent)
     queue.put_back(first)
     assert drain(queue) == [urgent, first, second]
+    queue.push(first)
+    queue.push(second)
+    taken = [queue.pop(), queue.pop()]
+    for outgoing in reversed(taken):
+        queue.put_back(outgoing)
+    assert drain(queue) == [first, second]
     queue.push(first)
     assert queue.clear() == 1
     assert len(queue) == 0
