@@ -117,7 +117,18 @@ def simulated_log(
     pose_s = np.array([pose.sample_us for pose in poses], dtype=np.float64) * 1e-6
     pose_stamps = _stamped(pose_s, 1.0 / parameters.pose_rate_hz, options, generator)
     rows += [_row(stamp, pose=pose) for stamp, pose in zip(pose_stamps, poses, strict=True)]
-    return sorted(rows, key=lambda row: row[0])
+    return _one_at_a_time(sorted(rows, key=lambda row: row[0]))
+
+
+def _one_at_a_time(rows: Sequence[Row]) -> list[Row]:
+    """Sorted rows with those moved on by a microsecond that would be written with the time of the row before."""
+    separate: list[Row] = []
+    last_us = -1
+    for t_s, cells in rows:
+        stamp_us = max(round(t_s * 1e6), last_us + 1)
+        separate.append((stamp_us * 1e-6, (f"{stamp_us * 1e-6:.6f}", *cells[1:])))
+        last_us = stamp_us
+    return separate
 
 
 def write_csv(path: Path, rows: Sequence[Row]) -> None:
