@@ -146,6 +146,20 @@ def check(
 
 
 @app.command()
+def replay(log: Annotated[Path, typer.Argument(metavar="LOG")], as_json: AsJson = False) -> None:
+    """Run estimator, planner and governor again on a log's samples and compare every output bit for bit."""
+    from disco_hw.daemon.realtime import limit_thread_pools
+
+    limit_thread_pools()
+    from disco_hw.replay import replay as replay_log
+
+    report = replay_log(log)
+    _print(report.as_dict(), as_json, report.as_text())
+    if not report.ok:
+        raise typer.Exit(1)
+
+
+@app.command()
 def estop(
     robot: RobotFile,
     link: Annotated[str | None, typer.Option(help="Use this link instead of robot.toml's: can or serial.")] = None,
