@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import struct
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -99,12 +100,12 @@ def replay(path: Path) -> ReplayReport:
 
 def _setup(log: Log) -> Setup:
     """Robot and model as they were attached to the log."""
-    if ROBOT_TOML not in log.attachment_names:
+    if ROBOT_TOML not in log.attachment_names():
         raise InputError(f"{log.path}: carries no {ROBOT_TOML}; only logs of `disco-hw run` can be replayed")
     with tempfile.TemporaryDirectory() as directory:
         robot, model = Path(directory) / ROBOT_TOML, Path(directory) / MODEL_TOML
         robot.write_bytes(log.attachment(ROBOT_TOML))
-        has_model = MODEL_TOML in log.attachment_names
+        has_model = MODEL_TOML in log.attachment_names()
         if has_model:
             model.write_bytes(log.attachment(MODEL_TOML))
         return load_setup(robot, model if has_model else None)
@@ -159,7 +160,7 @@ def _values(old: Record, new: Record) -> Iterator[tuple[str, Any, Any]]:
 def _bits(value: Any) -> Any:
     """Something that is equal exactly if the values are: -0.0 differs from 0.0, NaN equals NaN."""
     if isinstance(value, float):
-        return "nan" if value != value else _FLOAT.pack(value)
+        return "nan" if math.isnan(value) else _FLOAT.pack(value)
     if isinstance(value, tuple):
         return tuple(map(_bits, value))
     return value
