@@ -233,6 +233,21 @@ def test_the_watchdog_runs_from_the_instant_of_arming():
     assert bench.out.watchdog_events == 1
 
 
+def test_no_command_from_before_arming_outlives_it():
+    """Neither its mode, nor its time of validity, nor its age."""
+    bench = Bench()
+    bench.to_ready()
+    for _ in range(3 + 5):
+        bench.wheel_command(mode="COAST", valid_for=0.002)
+        bench.step()
+    bench.run(40)
+    bench.ask("ARM")
+    bench.run_until("ARMED", within_ms=50)
+    assert bench.out.driver_enabled
+    assert stop_time_us(bench) == 100 * MS
+    assert bench.out.stop_cause == "COMMAND_TIMEOUT"
+
+
 @pytest.mark.parametrize(
     "feed",
     [

@@ -373,6 +373,7 @@ def test_a_pressed_button_cannot_be_reset_nor_does_its_release_reset(source):
     bench.inputs[source] = True
     bench.run(700)
     assert (bench.out.state, bench.out.estop_source) == ("ESTOP", source.removeprefix("estop_").upper())
+    assert "ESTOP" in bench.blockers()
     bench.command = None
     bench.ask("RESET")
     bench.run(700)

@@ -263,6 +263,25 @@ def test_estop_is_left_only_with_every_proof(missing):
     assert next_state("ESTOP", complete | condition("ESTOP_INPUT")) == "ESTOP"
 
 
+@pytest.mark.parametrize("missing", ["RESET", "HOST_QUALIFIED"])
+def test_fault_is_left_only_with_every_proof(missing):
+    complete = condition("RESET") | condition("HOST_QUALIFIED")
+    assert next_state("FAULT", complete) == "STANDBY"
+    assert next_state("FAULT", complete & ~condition(missing)) == "FAULT"
+    assert next_state("FAULT", complete | condition("FAULT_LATCHED")) == "FAULT"
+
+
+def test_the_cause_of_a_stop_is_shown_until_the_next_arming():
+    bench = Bench()
+    bench.to_driving()
+    bench.command = None
+    bench.run_until("STANDBY")
+    bench.to_ready(session=8)
+    assert bench.out.stop_cause == "COMMAND_TIMEOUT"
+    bench.to_armed(session=9)
+    assert bench.out.stop_cause == "NONE"
+
+
 def test_nothing_leads_into_armed_but_ready_and_nothing_into_ready_but_standby():
     into = {state: {name for froms, to, _ in table() if to == state for name in froms} for state in ("ARMED", "READY")}
     assert into == {"ARMED": {"READY"}, "READY": {"STANDBY"}}
