@@ -278,7 +278,7 @@ def test_the_cause_of_a_stop_is_shown_until_the_next_arming():
     bench.run_until("STANDBY")
     bench.to_ready(session=8)
     assert bench.out.stop_cause == "COMMAND_TIMEOUT"
-    bench.to_armed(session=9)
+    bench.to_armed(session=8)
     assert bench.out.stop_cause == "NONE"
 
 
