@@ -32,3 +32,11 @@ def test_demo_follows_the_circle(tmp_path, link, plant_seed):
     assert figures["frames"]["rejected"] == 0
     assert (tmp_path / "demo.mcap").stat().st_size > 100_000
     assert (tmp_path / "circle.png").read_bytes().startswith(b"\x89PNG")
+    replayed = subprocess.run(
+        [sys.executable, "-m", "disco_hw", "replay", "--json", str(tmp_path / "demo.mcap")],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert replayed.returncode == 0, replayed.stdout + replayed.stderr
