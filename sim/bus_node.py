@@ -124,7 +124,7 @@ class BusNode:
 
     def force_bus_off(self) -> CanFrame | None:
         """Leave the bus as if the transmit error counter had run over."""
-        self.tec = max(self.tec, BUS_OFF_LIMIT)
+        self.tec = BUS_OFF_LIMIT
         return self._confine()
 
     def recover(self) -> CanFrame:

@@ -137,8 +137,8 @@ def test_a_missing_acknowledgement_never_leads_to_bus_off(node):
 
 
 def test_receive_errors_lead_to_passive_only(node):
-    for _ in range(400):
-        node.count_receive_error()
+    reports = [node.count_receive_error() for _ in range(400)]
+    assert [(report.data[1], report.data[7]) for report in reports if report] == [(0x04, 96), (0x10, 128)]
     assert (node.rec, node.state) == (255, ErrorState.PASSIVE)
     node.count_received()
     assert node.rec == 120
