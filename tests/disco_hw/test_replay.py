@@ -81,14 +81,13 @@ def test_one_changed_bit_in_the_log_is_found(tmp_path, ticks):
 
     from disco_hw.log.records import Command
 
-    changed = []
-    for number, (now_ns, records) in enumerate(ticks):
-        if number == 150:
-            records = tuple(
-                msgspec.structs.replace(r, left_rad_s=r.left_rad_s + 2.0**-40) if isinstance(r, Command) else r
-                for r in records
-            )
-        changed.append((now_ns, records))
+    def shifted(record):
+        if not isinstance(record, Command):
+            return record
+        return msgspec.structs.replace(record, left_rad_s=record.left_rad_s + 2.0**-40)
+
+    changed = list(ticks)
+    changed[150] = (ticks[150][0], tuple(map(shifted, ticks[150][1])))
     report = replay(write_log(tmp_path / "run.mcap", changed))
     assert not report.ok
     assert report.difference.field == "Command.left_rad_s"
