@@ -17,29 +17,27 @@ from disco_hw.gap.fit import Fit, by_block, inverse
 
 Array = NDArray[np.float64]
 
-_FOLD_BLOCKS = 3
 _BLOCK_LENGTHS = (1, 3, 9)
 _FEWEST_BLOCKS = 5
-_RESAMPLES = 1000
 
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
     """For one set of effects against a smaller one.
 
-    `gain` in nats of the fit; `held_out` in nats on blocks left out; `p_value` that the held-out gain is not positive;
-    `inflation` of the variance; `score` = 2 gain / inflation - parameters ln(n), the difference of BIC.
+    `gain` in nats of the fit; `held_out` in nats on blocks left out, `repeated` the same without the block that speaks
+    most for it; `inflation` of the variance; `score` = 2 gain / inflation - parameters ln(n), the difference of BIC.
     """
 
     gain: float
     held_out: float
-    p_value: float
+    repeated: float
     inflation: float
     score: float
 
 
 def held_out_by_block(found: Fit, channel: Channel) -> Array:
-    """Half squares on each block (B,) with parameters fitted without it and its neighbours, to second order."""
+    """Half squares on each block (B,) with parameters fitted without it, to second order."""
     cost = 0.5 * np.bincount(
         np.unique(channel.block, return_inverse=True)[1], weights=found.residual**2
     )
@@ -48,10 +46,11 @@ def held_out_by_block(found: Fit, channel: Channel) -> Array:
     normal, gradient = by_block(found, channel.block)
     total = normal.sum(axis=0)
     out = cost.copy()
-    for begin in range(0, cost.size, _FOLD_BLOCKS):
-        fold = slice(begin, min(begin + _FOLD_BLOCKS, cost.size))
-        step = inverse(total - normal[fold].sum(axis=0)) @ gradient[fold].sum(axis=0)
-        out[fold] += gradient[fold] @ step + 0.5 * np.einsum("i,bij,j->b", step, normal[fold], step)
+    for b in range(cost.size):
+        step = inverse(total - normal[b]) @ gradient[b]
+        # A parameter of which only this block knows stays where it is: leaving out cannot judge it.
+        step = np.where(np.isfinite(step), step, 0.0)
+        out[b] += gradient[b] @ step + 0.5 * step @ normal[b] @ step
     return out
 
 
@@ -80,7 +79,6 @@ def compare(small: Fit, big: Fit, channel: Channel, parameters: int) -> Evidence
     factor = inflation(big, channel, added)
     gain = small.cost - big.cost
     blocks = held_out_by_block(small, channel) - held_out_by_block(big, channel)
-    draws = np.random.default_rng(0).integers(0, blocks.size, (_RESAMPLES, blocks.size))
-    p_value = float((blocks[draws].sum(axis=1) <= 0.0).mean())
+    held_out = float(blocks.sum())
     score = 2.0 * gain / factor - parameters * math.log(max(channel.count, 2))
-    return Evidence(gain, float(blocks.sum()), p_value, factor, score)
+    return Evidence(gain, held_out, held_out - float(blocks.max(initial=0.0)), factor, score)

@@ -22,7 +22,7 @@ from disco_hw.gap.wheel_noise import WheelNoise
 Array = NDArray[np.float64]
 
 AHEAD_S = 2.0
-_ROUGH = Thresholds(score=20.0, p_value=0.2, moves_m=0.0)
+_ROUGH = Thresholds(score=20.0, moves_m=0.0)
 _SMOOTH_WHEEL = ("motor_lag", "command_delay", "deadband", "battery_sag", "wheel_gain")
 _SMOOTH_BODY = (
     "wheel_radius_asymmetry",

@@ -23,10 +23,9 @@ _LOCAL_SEARCHES = 3
 
 @dataclass(frozen=True, slots=True)
 class Thresholds:
-    """When an effect is accepted: evidence score, chance that its held-out gain is none, shift of a 2 s prediction."""
+    """When an effect is accepted: evidence score and shift of a 2 s prediction."""
 
     score: float = 20.0
-    p_value: float = 0.01
     moves_m: float = 0.0005
 
 
@@ -147,8 +146,7 @@ class Selector:
         proof = self.evidence(smaller, larger)
         return (
             proof.score > limits.score
-            and proof.held_out > 0.0
-            and proof.p_value < limits.p_value
+            and proof.repeated > 0.0
             and self.moves(self.fit(smaller), self.fit(larger)) > limits.moves_m
         )
 
