@@ -51,7 +51,6 @@ class Telemetry:
 
     def restart(self) -> None:
         """Take the next samples as they are, as after an interruption: the angles go on from where they are."""
-        self._wheel_time = None
         self._odd_stamps = 0
         if self._ticks is not None:
             self._ticks.forget()

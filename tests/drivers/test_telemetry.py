@@ -142,14 +142,61 @@ def test_nothing_is_known_of_angles_before_the_handshake():
     assert wheels(made, 0, 9_000 * MS, 9_000 * MS) is None
 
 
-def test_angles_go_on_through_an_interruption_and_other_limits():
+def ticks_of(speed_rad_s, elapsed_ms):
+    return int(speed_rad_s * elapsed_ms * 1e-3 / (2 * math.pi) * CAPABILITIES.ticks_per_rev)
+
+
+@given(
+    start_ms=st.integers(0, 10**7),
+    steps=st.lists(st.tuples(st.integers(10, 4000), st.integers(0, 40)), min_size=1, max_size=20),
+)
+def test_motion_at_full_speed_is_plausible_over_any_gap_and_twice_that_is_not(start_ms, steps):
+    """Samples 10 ms to 4 s apart, each received up to 40 ms late; their times on the wire wrap every 1.3 s."""
+    made = make()
+    t_ms, ticks = start_ms, 0
+    wheels(made, 0, t_ms * MS, t_ms * MS)
+    for counter, (gap_ms, late_ms) in enumerate(steps, 1):
+        t_ms += gap_ms
+        received_ns = (t_ms + late_ms) * MS
+        too_far = ticks + ticks_of(2.0 * 8.0, gap_ms + 90) + 10
+        assert wheels(made, counter % 16, t_ms * MS, received_ns, ticks=(too_far, ticks)) is None
+        ticks += ticks_of(8.0, gap_ms)
+        assert wheels(made, (counter + 8) % 16, t_ms * MS, received_ns, ticks=(ticks, ticks)) is not None
+
+
+def test_a_stamp_that_fits_again_restores_the_trust_in_the_clock():
+    now_ns = 9_000 * MS
+    made = make(now_ns)
+    for number in range(3 * DISTRUST_CLOCK_AFTER):
+        t_ns = now_ns + number * 10 * MS
+        wheels(made, number % 16, t_ns - (700 * MS if number % 5 else 0), t_ns)
+    assert not made.distrusts_clock
+
+
+def test_angles_go_on_through_an_interruption():
     made = make()
     wheels(made, 0, 9_000 * MS, 9_000 * MS)
     before = wheels(made, 1, 9_010 * MS, 9_010 * MS, ticks=(20, 20))
     made.restart()
+    made.configure(CAPABILITIES)
+    after = wheels(made, 2, 9_020 * MS, 9_020 * MS, ticks=(900_000, 3))
+    assert (after.left_angle_rad, after.right_angle_rad) == (before.left_angle_rad, before.right_angle_rad)
+
+
+def test_angles_go_on_when_other_limits_are_told():
+    made = make()
+    wheels(made, 0, 9_000 * MS, 9_000 * MS)
+    before = wheels(made, 1, 9_010 * MS, 9_010 * MS, ticks=(20, 20))
     made.configure(Capabilities(1, 0, "0.1.0", 0x1234, 1, 4.0, 20.0, 1024, 0.1, 0.5, 20.0))
     after = wheels(made, 2, 9_020 * MS, 9_020 * MS, ticks=(900_000, 3))
     assert (after.left_angle_rad, after.right_angle_rad) == (before.left_angle_rad, before.right_angle_rad)
+
+
+def test_the_same_limits_told_again_lose_no_motion():
+    made = make()
+    wheels(made, 0, 9_000 * MS, 9_000 * MS)
+    made.configure(CAPABILITIES)
+    assert wheels(made, 1, 9_010 * MS, 9_010 * MS, ticks=(20, 20)).left_angle_rad > 0
 
 
 @pytest.mark.parametrize(
