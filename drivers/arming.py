@@ -108,6 +108,7 @@ class Arming:
             self._give_up(f"the robot disarmed itself: {words.stop_cause(stop_cause)}" if self._was_armed else "")
         if self.wanted is Request.RESET and before in _LATCHED and state not in _LATCHED:
             self._set_standby()
+            self.note = ""
 
     def take_session(self, challenge: int, session: int, blockers: tuple[str, ...], now_ns: int) -> None:
         """Take in SESSION_STATE; `blockers` by the names of the DBC's value table."""

@@ -12,6 +12,8 @@ class Handshake:
     """Gathers HELLO, BUILD and both pages of LIMITS, and judges them.
 
     Another major version is refused. The same major version with another DBC hash may be read, but never armed.
+    `refusal` says why the robot must not be armed and what to do about it, None if nothing speaks against it so far;
+    `capabilities` is what the robot said of itself, None until it is complete or if its limits make no sense.
     """
 
     def __init__(self, major: int, minor: int, dbc_hash: int) -> None:
@@ -21,6 +23,8 @@ class Handshake:
         self._hello: dict[str, float] | None = None
         self._build: dict[str, float] | None = None
         self._pages: dict[int, dict[str, float]] = {}
+        self.refusal: str | None = None
+        self.capabilities: Capabilities | None = None
 
     def take(self, decoded: Decoded) -> None:
         """Take in a frame of one of `MESSAGES`."""
@@ -31,6 +35,8 @@ class Handshake:
                 self._build = decoded.values
             case _:
                 self._pages[int(decoded.values["page"])] = decoded.values
+        self.refusal = self._judge()
+        self.capabilities = self._gather()
 
     @property
     def missing(self) -> tuple[str, ...]:
@@ -38,9 +44,7 @@ class Handshake:
         names = {"HELLO": self._hello, "BUILD": self._build, "LIMITS": len(self._pages) == 2 or None}
         return tuple(name for name, value in names.items() if value is None)
 
-    @property
-    def refusal(self) -> str | None:
-        """Why the robot must not be armed and what to do about it; None if nothing speaks against it so far."""
+    def _judge(self) -> str | None:
         if self._hello is not None and int(self._hello["protocol_major"]) != self._major:
             theirs = f"{int(self._hello['protocol_major'])}.{int(self._hello['protocol_minor'])}"
             return (
@@ -57,9 +61,7 @@ class Handshake:
             return "the robot reports limits that make no sense (a zero among them); correct its configuration"
         return None
 
-    @property
-    def capabilities(self) -> Capabilities | None:
-        """What the robot said of itself; None until it is complete or if its limits make no sense."""
+    def _gather(self) -> Capabilities | None:
         hello, build = self._hello, self._build
         if hello is None or build is None or self.missing or not self._limits_make_sense():
             return None

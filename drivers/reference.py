@@ -50,6 +50,13 @@ _STATES = {
     "FAULT": DriverState.FAULT,
     "ESTOP": DriverState.ESTOP,
 }
+_MAY_ARM = frozenset(DriverState) - {
+    DriverState.DISCONNECTED,
+    DriverState.HANDSHAKE,
+    DriverState.REFUSED,
+    DriverState.FAULT,
+    DriverState.ESTOP,
+}
 
 
 class ReferenceDriver:
@@ -165,11 +172,10 @@ class ReferenceDriver:
 
     def request(self, request: Request) -> None:
         """Set what the host wants; held until changed. ARM and RESET are consumed, see `drivers.arming.Arming`."""
-        if request is Request.ARM and self.state not in (DriverState.STANDBY, DriverState.READY, DriverState.STOPPING):
-            if self._arming.wanted is not Request.ARM:
-                self._arming.note = f"not arming: {self.detail}"
-            return
-        self._arming.request(request)
+        if request is Request.ARM and self.state not in _MAY_ARM:
+            self._arming.note = f"not arming: {self.detail}"
+        elif request is not Request.READY or self._handshake.refusal is None:
+            self._arming.request(request)
 
     def receive(self, now_ns: int, frames: Sequence[ReceivedFrame]) -> Readings:
         """Take in received frames and return what they meant; frames that come while the link is down are ignored."""
@@ -179,7 +185,7 @@ class ReferenceDriver:
             decoded = self._reception.accept(received)
             if decoded is None:
                 continue
-            self._last_heard_ns = received.t_ns
+            self._last_heard_ns = min(received.t_ns, now_ns)
             self._take(decoded, received.t_ns, collected)
         self._mind_trust(now_ns)
         if self._reception.foreign is not None and not self._foreign_told:

@@ -213,11 +213,13 @@ def test_a_new_request_to_arm_has_all_the_time_again():
 def test_reset_is_held_until_the_robot_has_left_its_latch(state):
     one = arming()
     report(one, state, 0)
+    one.note = "not arming: the robot has a fault"
     one.request(Request.RESET)
     report(one, state, 0)
     assert one.host_state().request == "RESET"
     report(one, "STANDBY", 0)
     assert one.wanted is Request.STANDBY
+    assert one.note == "", "what was said of the fault is over"
     report(one, state, 0)
     assert one.host_state().request == "STANDBY", "a later stop is not reset by an earlier request"
 

@@ -35,6 +35,7 @@ def test_says_what_it_waits_for():
     assert driver.state is DriverState.HANDSHAKE
     assert "no answer from the robot" in driver.detail
     driver.request(Request.ARM)
+    assert driver.detail == "no answer from the robot; is it switched on, and does it use the same bit rate?"
     bench = make_bench()
     bench.driver = driver
     bench.run_until(*STILL)
@@ -58,9 +59,11 @@ def test_another_dbc_is_refused_but_telemetry_is_shown():
     bench.run_until(DriverState.REFUSED)
     assert "0badcafe" in bench.driver.detail
     assert f"{CODEC.dbc_hash:08x}" in bench.driver.detail
-    bench.driver.request(Request.ARM)
-    bench.run(3.0, (1.0, 1.0))
+    for request in (Request.READY, Request.ARM):
+        bench.driver.request(request)
+        bench.run(2.0, (1.0, 1.0))
     assert bench.driver.state is DriverState.REFUSED
+    assert bench.driver.stats.sessions == 0
     assert bench.largest_speed == 0.0
     assert len(bench.wheels) > 100
     assert any("handshake refused" in event for event in bench.events)
