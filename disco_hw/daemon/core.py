@@ -65,6 +65,7 @@ class DaemonCore:
         self._generation = 0
         self._link_up = False
         self._planner_failing = False
+        self._state = supervisor.state
 
     def tick(
         self,
@@ -97,6 +98,7 @@ class DaemonCore:
                 *records_of_tick.samples(readings),
                 *records_of_tick.tick(result, command, self.config.control.command_valid_for_s),
                 *sent,
+                *self._state_change(now_ns, output),
                 *(records.Event(now_ns, "info", "daemon", text) for text in events),
                 *extra_records,
             ],
@@ -166,6 +168,13 @@ class DaemonCore:
         if not changed:
             return ()
         return (f"planner: {result.planner_failure}",) if failing else ("planner: recovered",)
+
+    def _state_change(self, now_ns: int, output: Output) -> list[records.Record]:
+        """The record of a change of state, in the tick in which it happens."""
+        before, self._state = self._state, output.state
+        if output.state is before:
+            return []
+        return [records.DaemonState(now_ns, output.state.name, before.name, output.detail)]
 
     def _count_laps(self, output: Output, result: Tick) -> None:
         if output.running:

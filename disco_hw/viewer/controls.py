@@ -14,7 +14,7 @@ from disco_hw.errors import InputError, WorkError
 
 ESTOP_COLOUR = (205, 20, 20)
 ESTOP_LABEL = "E-STOP"
-BUTTONS = (("Arm", "arm"), ("Start", "start"), ("Stop", "stop"), ("Disarm", "disarm"), ("Reset", "reset"))
+BUTTONS = {"Arm": "arm", "Start": "start", "Stop": "stop", "Disarm": "disarm", "Reset": "reset"}
 _TIMEOUT_S = 1.0
 _ESTOP_TIMEOUT_S = 0.5
 
@@ -64,13 +64,9 @@ def in_words(action: str, reply: dict[str, Any]) -> str:
 
 
 def add_estop(gui: viser.GuiApi, ask: Ask, show: Callable[[str], None]) -> None:
-    """A red button in a panel of its own, which neither scrolls away nor can be closed; the main panel must be docked."""
-    panel = gui.add_panel(order=-1.0)
-    with panel.add_tab(ESTOP_LABEL):
-        gui.add_html(_LARGE)
-        button = gui.add_button(ESTOP_LABEL, color=ESTOP_COLOUR, hint="Stop the robot now; the stop latches")
-    # Not in the top left corner, where the page puts its notices over everything.
-    panel.dock_above(gui.main_panel)
+    """A large red button above all else in the panel that is being filled."""
+    gui.add_html(_LARGE)
+    button = gui.add_button(ESTOP_LABEL, color=ESTOP_COLOUR, hint="Stop the robot now; the stop latches")
 
     @button.on_click
     def _(_: Any) -> None:
@@ -79,9 +75,8 @@ def add_estop(gui: viser.GuiApi, ask: Ask, show: Callable[[str], None]) -> None:
 
 def add_buttons(gui: viser.GuiApi, ask: Ask, show: Callable[[str], None]) -> None:
     """Arm, start, stop, disarm and reset."""
-    for label, action in BUTTONS:
-        button = gui.add_button(label)
+    group = gui.add_button_group("", tuple(BUTTONS))
 
-        @button.on_click
-        def _(_: Any, action: str = action) -> None:
-            show(ask(action))
+    @group.on_click
+    def _(event: Any) -> None:
+        show(ask(BUTTONS[event.target.value]))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import viser
@@ -9,8 +10,8 @@ import viser
 from disco_hw.viewer.scene import LAYERS, Scene
 
 
-def add_layers(gui: viser.GuiApi, scene: Scene) -> None:
-    """One checkbox a layer; the next snapshot is drawn with what is ticked then."""
+def add_layers(gui: viser.GuiApi, scene: Scene, changed: Callable[[], None]) -> None:
+    """One checkbox a layer; `changed` is called after each click, the next snapshot is drawn with what is ticked."""
     with gui.add_folder("Layers", expand_by_default=False):
         for name, label in LAYERS.items():
             box = gui.add_checkbox(label, scene.layers[name])
@@ -18,3 +19,4 @@ def add_layers(gui: viser.GuiApi, scene: Scene) -> None:
             @box.on_update
             def _(event: Any, name: str = name) -> None:
                 scene.layers[name] = bool(event.target.value)
+                changed()

@@ -12,11 +12,12 @@ import viser
 
 from disco_hw.daemon.control_client import send_request
 from disco_hw.errors import WorkError
-from disco_hw.log.records import Plan, Record
+from disco_hw.log.records import Record
 from disco_hw.viewer import controls
 from disco_hw.viewer.feed import feed_path
 from disco_hw.viewer.layers import add_layers
-from disco_hw.viewer.panel import escaped, events_text, live_text
+from disco_hw.viewer.panel import escaped, events_text, live_details, live_head
+from disco_hw.viewer.plots import Plots
 from disco_hw.viewer.scene import Scene
 from disco_hw.viewer.snapshot import Snapshot, snapshot_at
 from disco_hw.viewer.stage import Stage
@@ -52,21 +53,25 @@ class LivePage:
         self._server = server
         self._socket = socket
         self._subscriber = FeedSubscriber(feed_path(socket))
-        self._plan: Plan | None = None
         self._status: dict[str, Any] | None = None
         self._error = ""
         self._move, self._redraw, self._ask = _Due(MOVE_S), _Due(REDRAW_S), _Due(STATUS_S)
         gui = server.gui
         gui.main_panel.dock_right()
-        controls.add_estop(gui, controls.estop_asking(socket, robot_file), self._answered)
-        self._answer = gui.add_markdown("")
-        self._state = gui.add_markdown("### connecting")
-        with gui.add_folder("Control"):
+        top = gui.add_panel()
+        with top.add_tab("Robot"):
+            controls.add_estop(gui, controls.estop_asking(socket, robot_file), self._answered)
             controls.add_buttons(gui, controls.asking(socket), self._answered)
+            self._answer = gui.add_markdown("")
+            self._head = gui.add_markdown("### connecting")
+        # Of its own, so that the e-stop does not scroll away; and not in the corner where the page puts its notices.
+        top.dock_above(gui.main_panel)
+        self._details = gui.add_markdown("")
+        self._plots = Plots(gui, stage)
         with gui.add_folder("Events"):
             self._events = gui.add_markdown("nothing yet")
         self.scene = Scene(server, stage)
-        add_layers(gui, self.scene)
+        add_layers(gui, self.scene, lambda: None)
 
     def step(self) -> None:
         """Wait at most a tenth of a second for records, then draw what is due."""
@@ -83,8 +88,6 @@ class LivePage:
         """Take in records of the feed."""
         for now_ns, record in received:
             self.timeline.add(now_ns, record)
-            if isinstance(record, Plan):
-                self._plan = record
         if received:
             self.timeline.forget_before(received[-1][0] - round(KEEP_S * 1e9))
 
@@ -94,8 +97,11 @@ class LivePage:
         if snapshot is not None:
             self.scene.show(snapshot, everything)
         if everything:
-            _set(self._state, live_text(self._status, self._error, snapshot, self._subscriber.missed))
+            _set(self._head, live_head(self._status, self._error))
+            _set(self._details, live_details(self._status, snapshot, self._subscriber.missed))
             _set(self._events, events_text(snapshot, self.timeline.first_ns))
+            if snapshot is not None:
+                self._plots.show(self.timeline, snapshot.t_ns)
 
     def close(self) -> None:
         """Leave the feed."""
@@ -103,7 +109,7 @@ class LivePage:
 
     def _snapshot(self) -> Snapshot | None:
         newest = self.timeline.last_ns
-        return None if newest is None else snapshot_at(self.timeline, newest, self._plan)
+        return None if newest is None else snapshot_at(self.timeline, newest, self.timeline.plans.last(newest))
 
     def _ask_status(self) -> None:
         try:

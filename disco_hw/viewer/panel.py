@@ -15,15 +15,28 @@ _NO_NUMBER = "—"
 Rows = list[tuple[str, str]]
 
 
-def live_text(status: Mapping[str, Any] | None, error: str, snapshot: Snapshot | None, missed: int) -> str:
-    """Markdown for a live page: the daemon's own words first; `error` says why there is no status."""
+def live_head(status: Mapping[str, Any] | None, error: str) -> str:
+    """Markdown of the daemon's state in its own words; `error` says why there is no status."""
     if status is None or not status.get("ok"):
         why = error or (status or {}).get("error") or "not asked yet"
         return f"### no daemon\n\n{escaped(str(why))}"
-    task, loop = status["task"], status["loop"]
     lines = [f"### {status['state']}{' · running' if status['running'] else ''}", "", escaped(str(status["detail"]))]
     if status["estop"] or status["robot_state"] == "ESTOP":
         lines += ["", LATCHED]
+    return "\n".join(lines)
+
+
+def live_details(status: Mapping[str, Any] | None, snapshot: Snapshot | None, missed: int) -> str:
+    """Markdown of the figures: robot, link, loop, motion; `missed` batches of the feed did not reach this page."""
+    rows: Rows = [] if status is None or not status.get("ok") else _status_rows(status)
+    rows.append(("batches missed here", str(missed)))
+    if snapshot is not None:
+        rows += motion_rows(snapshot)
+    return _table(rows)
+
+
+def _status_rows(status: Mapping[str, Any]) -> Rows:
+    task, loop = status["task"], status["loop"]
     robot = f"{status['robot_state']}, fault {status['fault']}, last stop {status['stop_cause']}"
     link = status["link"] + (f": {status['link_error']}" if status["link_error"] else "")
     transport, driver = status["transport"], status["driver"]
@@ -36,14 +49,11 @@ def live_text(status: Mapping[str, Any] | None, error: str, snapshot: Snapshot |
         ("laps", f"{task['laps']:.2f}"),
         ("loop late p99, max", f"{number(loop['lateness_us']['p99'], 0)}, {number(loop['lateness_us']['max'], 0)} us"),
         ("overruns, skipped", f"{loop['overruns']}, {loop['skipped']}"),
-        ("batches missed here", str(missed)),
     ]
     recorder = status["recorder"]
     if recorder["last_error"]:
         rows.append(("recording", str(recorder["last_error"])))
-    if snapshot is not None:
-        rows += motion_rows(snapshot)
-    return "\n".join([*lines, "", _table(rows)])
+    return rows
 
 
 def replay_text(snapshot: Snapshot, first_ns: int, task: CircleTask) -> str:

@@ -126,6 +126,7 @@ class Scene:
         scene.add_box(
             "/robot/body",
             color=BODY_COLOUR,
+            cast_shadow=False,
             dimensions=(1.25 * length, 0.75 * width, radius),
             position=(0.0, 0.0, 1.5 * radius),
         )
@@ -133,6 +134,7 @@ class Scene:
         scene.add_box(
             "/robot/nose",
             color=(255, 220, 60),
+            cast_shadow=False,
             dimensions=(0.15 * length, 0.3 * width, 0.5 * radius),
             position=(0.55 * length, 0.0, 2.1 * radius),
         )
@@ -146,10 +148,14 @@ class Scene:
                     radius=radius,
                     height=0.6 * radius,
                     color=WHEEL_COLOUR,
+                    cast_shadow=False,
                     wxyz=(math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0),
                 )
                 scene.add_box(
-                    f"{name}/spoke", color=(235, 235, 235), dimensions=(1.7 * radius, 0.66 * radius, 0.25 * radius)
+                    f"{name}/spoke",
+                    color=(235, 235, 235),
+                    cast_shadow=False,
+                    dimensions=(1.7 * radius, 0.66 * radius, 0.25 * radius),
                 )
                 wheels.append(wheel)
         return robot, wheels

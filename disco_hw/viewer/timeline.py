@@ -106,9 +106,10 @@ POWER = ("voltage_v", "current_a", "temperature_c")
 
 
 class Timeline:
-    """Every series of a run; `plans` holds whole plans, which a replay leaves out and reads when it needs one."""
+    """Every series of a run; with `keep_plans` whole plans too, which a replay reads from its log when it needs one."""
 
-    def __init__(self) -> None:
+    def __init__(self, keep_plans: bool = True) -> None:
+        self._keep_plans = keep_plans
         self.first_ns: int | None = None
         self.last_ns: int | None = None
         self.estimate = Series((*ESTIMATE, *COVARIANCE))
@@ -151,7 +152,8 @@ class Timeline:
                 self.innovation.append(now_ns, row)
             case records.Plan() as it:
                 self.planner.append(now_ns, (it.effective_samples, it.temperature, it.min_cost, it.mean_cost))
-                self.plans.append(now_ns, it)
+                if self._keep_plans:
+                    self.plans.append(now_ns, it)
             case records.LoopTiming() as it:
                 self.loop.append(now_ns, (float(it.lateness_ns), float(it.overruns), float(it.skipped)))
             case PowerSample() as it:

@@ -1,0 +1,87 @@
+"""The page's plots: curves of the last seconds, and what is believed of the model's parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+import viser
+
+from disco_hw.viewer import curves
+from disco_hw.viewer.curves import Curves
+from disco_hw.viewer.stage import Stage
+from disco_hw.viewer.timeline import Timeline
+
+WINDOW_NS = 20_000_000_000
+_HEIGHT = 170
+_COLOURS = ("#1c6dd0", "#e07b00", "#1e9650", "#b0308c")
+Cut = Callable[[Timeline, int, int], Curves]
+
+
+@dataclass(frozen=True, slots=True)
+class _Plot:
+    handle: viser.GuiUplotHandle
+    cut: Cut
+
+
+class Plots:
+    """Curves of the 20 s before an instant; a folder that is closed costs what an open one does, so all are drawn."""
+
+    def __init__(self, gui: viser.GuiApi, stage: Stage) -> None:
+        task = stage.task
+        self._plots: list[_Plot] = []
+        with gui.add_folder("Plots"):
+            self._add(gui, "Distance to the circle (m)", partial(curves.distance, task))
+            self._add(gui, "Speed (m/s)", partial(curves.speed, task))
+            self._add(gui, "Wheels (rad/s)", curves.wheels)
+            self._add(gui, "Planner", curves.planner, ("temperature",))
+        with gui.add_folder("Innovations", expand_by_default=False):
+            for axis, title in (("x_m", "x (m)"), ("y_m", "y (m)"), ("yaw_rad", "yaw (rad)")):
+                self._add(gui, title, partial(curves.innovation, axis))
+        with gui.add_folder("Belief", expand_by_default=False):
+            for name in stage.model.parameter_names:
+                density = curves.marginal(stage.model, name)
+                if density is not None:
+                    _add_uplot(gui, name, density, ())
+
+    def show(self, timeline: Timeline, at_ns: int) -> None:
+        """Draw the curves up to an instant."""
+        for plot in self._plots:
+            found = plot.cut(timeline, at_ns - WINDOW_NS, at_ns)
+            columns = _columns(found)
+            if len(columns[0]) >= 2:
+                plot.handle.data = columns
+
+    def _add(self, gui: viser.GuiApi, title: str, cut: Cut, right: tuple[str, ...] = ()) -> None:
+        empty = cut(Timeline(), 0, 0)
+        blank = Curves(np.array((0.0, 1.0)), {name: np.zeros(2) for name in empty.values})
+        self._plots.append(_Plot(_add_uplot(gui, title, blank, right), cut))
+
+
+def _add_uplot(gui: viser.GuiApi, title: str, drawn: Curves, right: tuple[str, ...]) -> viser.GuiUplotHandle:
+    series: list[dict[str, object]] = [{"label": "s"}]
+    for name, colour in zip(drawn.values, _COLOURS, strict=False):
+        scale = {"scale": "right"} if name in right else {}
+        series.append({"label": name, "stroke": colour, "width": 1.5, "spanGaps": False, **scale})
+    axes: list[dict[str, object]] = [{}, {"size": 55}]
+    scales: dict[str, dict[str, object]] = {"x": {"time": False}}
+    if right:
+        axes.append({"scale": "right", "side": 1, "size": 50, "grid": {"show": False}})
+        scales["right"] = {}
+    return gui.add_uplot(
+        data=_columns(drawn),
+        series=tuple(series),  # type: ignore[arg-type]
+        title=title,
+        axes=tuple(axes),  # type: ignore[arg-type]
+        scales=scales,  # type: ignore[arg-type]
+        legend={"show": len(drawn.values) > 1},
+        height=_HEIGHT,
+    )
+
+
+def _columns(drawn: Curves) -> tuple[np.ndarray, ...]:
+    """Times and values without the rows in which a value is missing: the page's plots do not scale with them."""
+    whole = np.all(np.isfinite(np.stack(tuple(drawn.values.values()))), axis=0)
+    return (drawn.t_s[whole], *(values[whole] for values in drawn.values.values()))
