@@ -1,0 +1,225 @@
+"""Mixture density network: statistics -> a mixture of full-covariance Gaussians over the parameters.
+
+An ensemble of networks is trained side by side as one stack of matrices; the members differ in their start, their
+split into training and validation, and the order of their batches. Each keeps the weights of its best validation.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+_LARGEST_FEATURE = 8.0
+_BATCH = 128
+_VALIDATION_SHARE = 0.15
+_RIDGE = 1e-3
+_CLIP_NORM = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class NetworkSettings:
+    """Size and training. `patience`: epochs without a better validation before a member counts as done."""
+
+    members: int = 4
+    components: int = 3
+    hidden: int = 48
+    epochs: int = 150
+    patience: int = 20
+    rate: float = 3e-3
+
+
+@dataclass(frozen=True, slots=True)
+class Scaling:
+    """Standardisation of statistics, (S,) each; features beyond 8 standard deviations are held there."""
+
+    mean: Array
+    scale: Array
+
+    def __call__(self, statistics: Array) -> Array:
+        """Features (n, S) of statistics (n, S)."""
+        return np.clip((statistics - self.mean) / self.scale, -_LARGEST_FEATURE, _LARGEST_FEATURE)
+
+
+@dataclass(frozen=True, slots=True)
+class Mixtures:
+    """n mixtures of C Gaussians in P dimensions: `log_weight` (n, C), `mean` (n, C, P), `factor` (n, C, P, P).
+
+    `factor` is lower triangular and maps a deviation to a standard normal vector: covariance = (F' F)^-1.
+    """
+
+    log_weight: Array
+    mean: Array
+    factor: Array
+
+    def log_density(self, points: Array) -> Array:
+        """Log density (n, m) of points (n, m, P), mixture i at its own points."""
+        deviation = points[:, :, None, :] - self.mean[:, None]
+        normal = np.einsum("ncij,nmcj->nmci", self.factor, deviation)
+        diagonal = np.log(np.diagonal(self.factor, axis1=2, axis2=3)).sum(axis=2)
+        size = points.shape[2]
+        parts = self.log_weight[:, None] + diagonal[:, None] - 0.5 * (normal**2).sum(axis=3)
+        top = parts.max(axis=2)
+        total: Array = top + np.log(np.exp(parts - top[..., None]).sum(axis=2)) - 0.5 * size * math.log(2.0 * math.pi)
+        return total
+
+    def draw(self, count: int, rng: np.random.Generator) -> Array:
+        """Draws (n, count, P)."""
+        n, components, size = self.mean.shape
+        cumulative = np.cumsum(np.exp(self.log_weight), axis=1)
+        uniform = rng.random((n, count)) * cumulative[:, -1:]
+        which = np.minimum((uniform[:, :, None] > cumulative[:, None, :]).sum(axis=2), components - 1)
+        rows = np.arange(n)[:, None]
+        inverse = np.linalg.inv(self.factor)
+        normal = rng.standard_normal((n, count, size))
+        drawn: Array = self.mean[rows, which] + np.einsum("nmij,nmj->nmi", inverse[rows, which], normal)
+        return drawn
+
+
+class _Stack(torch.nn.Module):
+    """E networks with two hidden layers and a linear path from the features to the means."""
+
+    def __init__(self, features: int, size: int, settings: NetworkSettings, skip: torch.Tensor, spread: torch.Tensor):
+        super().__init__()
+        members, components, hidden = settings.members, settings.components, settings.hidden
+        self.size, self.components = size, components
+        self.outputs = components * (1 + size + size * (size + 1) // 2)
+
+        def layer(inputs: int, outputs: int, gain: float) -> torch.nn.Parameter:
+            return torch.nn.Parameter(gain * torch.randn(members, inputs, outputs) / math.sqrt(inputs))
+
+        def zeros(outputs: int) -> torch.nn.Parameter:
+            return torch.nn.Parameter(torch.zeros(members, 1, outputs))
+
+        self.first, self.first_bias = layer(features, hidden, 1.0), zeros(hidden)
+        self.second, self.second_bias = layer(hidden, hidden, 1.0), zeros(hidden)
+        self.last, self.last_bias = layer(hidden, self.outputs, 0.05), zeros(self.outputs)
+        # Least squares is a good network already where the posterior is narrow; training only has to improve on it.
+        self.skip = torch.nn.Parameter(skip[None].repeat(members, 1, 1))
+        with torch.no_grad():
+            means = self.last_bias[:, 0, components : components * (1 + size)].view(members, components, size)
+            means += 0.3 * spread * torch.randn(members, components, size)
+            self.last_bias[:, 0, components * (1 + size) :].view(members, components, -1)[..., :size] -= spread.log()
+        self.below = tuple(torch.tril_indices(size, size, -1))
+
+    def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Log weights (E, n, C), means (E, n, C, P), factors (E, n, C, P, P) for features (E, n, S)."""
+        hidden = torch.tanh(torch.baddbmm(self.first_bias, x, self.first))
+        hidden = torch.tanh(torch.baddbmm(self.second_bias, hidden, self.second))
+        out = torch.baddbmm(self.last_bias, hidden, self.last)
+        members, n = x.shape[:2]
+        size, components = self.size, self.components
+        log_weight = torch.log_softmax(out[..., :components], dim=-1)
+        mean = out[..., components : components * (1 + size)].reshape(members, n, components, size)
+        mean = mean + torch.bmm(torch.cat([x, torch.ones_like(x[..., :1])], dim=-1), self.skip)[:, :, None, :]
+        rest = out[..., components * (1 + size) :].reshape(members, n, components, -1)
+        diagonal = rest[..., :size].clamp(-4.0, 9.0).exp()
+        factor = torch.diag_embed(diagonal)
+        rows, columns = self.below
+        factor[..., rows, columns] = rest[..., size:] * diagonal[..., rows]
+        return log_weight, mean, factor
+
+    def log_density(self, x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
+        """Log density (E, n) of targets (E, n, P)."""
+        log_weight, mean, factor = self(x)
+        normal = torch.matmul(factor, (y[:, :, None, :] - mean)[..., None])[..., 0]
+        diagonal = factor.diagonal(dim1=-2, dim2=-1).log().sum(dim=-1)
+        parts = log_weight + diagonal - 0.5 * normal.square().sum(dim=-1)
+        return torch.logsumexp(parts, dim=-1) - 0.5 * self.size * math.log(2.0 * math.pi)
+
+
+@dataclass(frozen=True)
+class DensityNetwork:
+    """A trained ensemble; all members count alike."""
+
+    scaling: Scaling
+    stack: _Stack
+    validation_log_density: float
+
+    def mixtures(self, statistics: Array) -> Mixtures:
+        """Mixtures of all members together for statistics (n, S)."""
+        features = torch.as_tensor(self.scaling(statistics), dtype=torch.float32)
+        members = self.stack.first.shape[0]
+        with torch.no_grad():
+            parts = self.stack(features[None].expand(members, -1, -1))
+        log_weight, mean, factor = (part.transpose(0, 1).flatten(1, 2).double().numpy() for part in parts)
+        return Mixtures(log_weight - math.log(members), mean, factor)
+
+
+def train(
+    statistics: Array, targets: Array, settings: NetworkSettings, seed: int, scaling: Scaling | None = None
+) -> DensityNetwork:
+    """Fit an ensemble to pairs of statistics (n, S) and targets (n, P), the targets of order one."""
+    if scaling is None:
+        spread = statistics.std(axis=0)
+        scaling = Scaling(statistics.mean(axis=0), np.where(spread > 1e-12, spread, 1.0))
+    features = scaling(statistics)
+    skip, residual = _least_squares(features, targets)
+    # Matrices this small are slower on several threads than on one.
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            x, y = torch.as_tensor(features, dtype=torch.float32), torch.as_tensor(targets, dtype=torch.float32)
+            stack = _Stack(
+                x.shape[1],
+                y.shape[1],
+                settings,
+                torch.as_tensor(skip, dtype=torch.float32),
+                torch.as_tensor(residual, dtype=torch.float32),
+            )
+            validation = _fit(stack, x, y, settings)
+    finally:
+        torch.set_num_threads(threads)
+    return DensityNetwork(scaling, stack, validation)
+
+
+def _least_squares(features: Array, targets: Array) -> tuple[Array, Array]:
+    """Coefficients (S + 1, P), the last row constant, and standard deviations of what is left (P,)."""
+    columns = np.column_stack([features, np.ones(features.shape[0])])
+    gram = columns.T @ columns / features.shape[0] + _RIDGE * np.diag([1.0] * features.shape[1] + [0.0])
+    skip = np.linalg.solve(gram, columns.T @ targets / features.shape[0])
+    return skip, np.maximum((targets - columns @ skip).std(axis=0), 1e-3)
+
+
+def _fit(stack: _Stack, x: torch.Tensor, y: torch.Tensor, settings: NetworkSettings) -> float:
+    """Train in place with early stopping; returns the mean validation log density of the members."""
+    members, count = settings.members, x.shape[0]
+    held = max(8, round(_VALIDATION_SHARE * count))
+    order = torch.stack([torch.randperm(count) for _ in range(members)])
+    validation, training = order[:, :held], order[:, held:]
+    valid_x, valid_y = x[validation], y[validation]
+    batches = max(1, training.shape[1] // _BATCH)
+    optimiser = torch.optim.Adam(stack.parameters(), lr=settings.rate)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, settings.epochs)
+    best = torch.full((members,), -math.inf)
+    since = torch.zeros(members)
+    kept = [parameter.detach().clone() for parameter in stack.parameters()]
+    for _ in range(settings.epochs):
+        shuffled = torch.stack([row[torch.randperm(row.shape[0])] for row in training])
+        for batch in shuffled.tensor_split(batches, dim=1):
+            optimiser.zero_grad(set_to_none=True)
+            loss = -stack.log_density(x[batch], y[batch]).mean(dim=1).sum()
+            loss.backward()  # type: ignore[no-untyped-call]
+            torch.nn.utils.clip_grad_norm_(stack.parameters(), _CLIP_NORM * math.sqrt(members))
+            optimiser.step()
+        schedule.step()
+        with torch.no_grad():
+            score = stack.log_density(valid_x, valid_y).mean(dim=1)
+        better = score > best
+        best = torch.where(better, score, best)
+        since = torch.where(better, torch.zeros_like(since), since + 1)
+        for copy, parameter in zip(kept, stack.parameters(), strict=True):
+            copy[better] = parameter.detach()[better]
+        if bool((since >= settings.patience).all()):
+            break
+    with torch.no_grad():
+        for copy, parameter in zip(kept, stack.parameters(), strict=True):
+            parameter.copy_(copy)
+    return float(best.mean())

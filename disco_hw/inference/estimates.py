@@ -1,0 +1,138 @@
+"""Summary statistics that carry the information: closed-form estimates of the parameters.
+
+The change of yaw is linear in kappa = r_w / a_w; given yaw, displacement between two poses is linear in r_w and x_icr:
+
+    dyaw = kappa (roll_R - roll_L)
+    dp = r_w (roll_L + roll_R)/2 (cos yaw, sin yaw) - x_icr 2 sin(kappa (roll_R - roll_L)/2) (-sin yaw, cos yaw)
+
+Yaw is the measured one in the middle between the poses; the turn that x_icr multiplies is the wheels', because what is
+measured of it is mostly noise from one pose to the next.
+
+Noise of the sensor makes neighbouring displacements correlated (-R), slip adds q dt to each variance, so the weights of
+least squares come from a tridiagonal covariance, whose bidiagonal Cholesky factor whitens any series in one pass.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from disco_hw.inference.compiled import parallel_kernel
+from disco_hw.inference.excitation import Excitation
+from disco_hw.inference.noise import Noise
+
+Array = NDArray[np.float64]
+
+STATISTICS = ("r", "kappa", "a", "x_icr", "log r", "log kappa")
+_SMALLEST = 1e-3
+_LARGEST_AXIAL_M = 3.0
+# Standard deviations of a vague prior on (r, x_icr, kappa), which keeps estimates finite where nothing moves.
+_VAGUE = (0.5, 0.5, 3.0)
+
+
+class Whitening(NamedTuple):
+    """Bidiagonal factor, (P,) each: diagonal, and how much of the whitened value before is taken off."""
+
+    diagonal: Array
+    carry: Array
+
+
+def whitening(drive: Excitation, sensor: float, slip: float) -> Whitening:
+    """Factor for increments with the sensor's standard deviation and the slip per square root of second in motion."""
+    variance = 2.0 * sensor**2 + slip**2 * drive.moving_s
+    diagonal, carry = np.ones(variance.size), np.zeros(variance.size)
+    starts = drive.starts
+    begins = True
+    for k in range(variance.size):
+        if starts[k]:
+            begins = True
+            continue
+        carry[k] = 0.0 if begins else -(sensor**2) / diagonal[k - 1]
+        diagonal[k] = math.sqrt(variance[k] - carry[k] ** 2)
+        begins = False
+    return Whitening(diagonal, carry)
+
+
+@parallel_kernel
+def estimate_kernel(
+    poses: Any, roll: Any, run_pose: Any, position: Any, yaw_whitening: Any, vague: Any, out: Any
+) -> None:
+    """Estimates (n, 3) of wheel radius, x_icr, kappa from poses (n, P, 3)."""
+    for i in range(poses.shape[0]):
+        d, e = 0.0, vague[2] ** -2
+        for run in range(run_pose.shape[0] - 1):
+            u = v = 0.0
+            for k in range(run_pose[run] + 1, run_pose[run + 1]):
+                diagonal, carry = yaw_whitening.diagonal[k], yaw_whitening.carry[k]
+                u = (roll[k, 1] - carry * u) / diagonal
+                v = (poses[i, k, 2] - poses[i, k - 1, 2] - carry * v) / diagonal
+                d += u * v
+                e += u * u
+        kappa = d / e
+        a, b, c = vague[0] ** -2, 0.0, vague[1] ** -2
+        p = q = 0.0
+        for run in range(run_pose.shape[0] - 1):
+            rx = ry = sx = sy = tx = ty = 0.0
+            for k in range(run_pose[run] + 1, run_pose[run + 1]):
+                middle = 0.5 * (poses[i, k, 2] + poses[i, k - 1, 2])
+                cosine, sine = math.cos(middle), math.sin(middle)
+                chord = 2.0 * math.sin(0.5 * kappa * roll[k, 1])
+                diagonal, carry = position.diagonal[k], position.carry[k]
+                rx = (roll[k, 0] * cosine - carry * rx) / diagonal
+                ry = (roll[k, 0] * sine - carry * ry) / diagonal
+                sx = (chord * sine - carry * sx) / diagonal
+                sy = (-chord * cosine - carry * sy) / diagonal
+                tx = (poses[i, k, 0] - poses[i, k - 1, 0] - carry * tx) / diagonal
+                ty = (poses[i, k, 1] - poses[i, k - 1, 1] - carry * ty) / diagonal
+                a += rx * rx + ry * ry
+                b += rx * sx + ry * sy
+                c += sx * sx + sy * sy
+                p += rx * tx + ry * ty
+                q += sx * tx + sy * ty
+        determinant = a * c - b * b
+        out[i, 0] = (c * p - b * q) / determinant
+        out[i, 1] = (a * q - b * p) / determinant
+        out[i, 2] = kappa
+
+
+@dataclass(frozen=True, slots=True)
+class Estimates:
+    """The statistics of one drive; call it with poses (n, P, 3) for (n, 6) in the order of `STATISTICS`."""
+
+    roll_rad: Array
+    run_pose: NDArray[np.int64]
+    position: Whitening
+    yaw: Whitening
+
+    def __call__(self, poses: Array) -> Array:
+        """Statistics (n, 6), finite for every finite pose."""
+        radius, x_icr, kappa = self.raw(poses).T
+        axial = np.clip(radius / np.where(np.abs(kappa) < _SMALLEST, _SMALLEST, kappa), 0.0, _LARGEST_AXIAL_M)
+        logs = [np.log(np.maximum(value, _SMALLEST)) for value in (radius, kappa)]
+        return np.column_stack([radius, kappa, axial, x_icr, *logs])
+
+    def raw(self, poses: Array) -> Array:
+        """Wheel radius, x_icr, kappa (n, 3) by generalised least squares."""
+        out = np.empty((poses.shape[0], 3))
+        estimate_kernel(poses, self.roll_rad, self.run_pose, self.position, self.yaw, np.array(_VAGUE), out)
+        return out
+
+    def theta(self, poses: Array) -> Array:
+        """Point estimates (n, 3) of x_icr, wheel radius, axial distance."""
+        radius, x_icr, kappa = self.raw(poses).T
+        return np.column_stack([x_icr, radius, radius / np.where(np.abs(kappa) < _SMALLEST, _SMALLEST, kappa)])
+
+
+def estimates(drive: Excitation, noise: Noise) -> Estimates:
+    """The statistics of a drive, weighted for its noise."""
+    slip_m = math.sqrt(0.5 * (noise.slip_forward_m_sqrt_s**2 + noise.slip_left_m_sqrt_s**2))
+    return Estimates(
+        drive.roll_rad,
+        drive.run_pose,
+        whitening(drive, noise.position_m, slip_m),
+        whitening(drive, noise.yaw_rad, noise.slip_yaw_rad_sqrt_s),
+    )

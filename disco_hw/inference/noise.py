@@ -1,0 +1,141 @@
+"""The log's own noise: of the pose sensor, and of the slip that no parameter explains."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from disco_hw.inference.excitation import Excitation
+
+Array = NDArray[np.float64]
+
+_LAGS_S = (0.0, 0.1, 0.2, 0.4, 0.8, 1.6, 3.0)
+_FEWEST_WINDOWS = 12
+_SMALLEST = np.array([2e-4, 2e-4, 2e-4, 2e-4, 5e-4])
+_LARGEST = np.array([0.3, 0.5, 0.5, 0.5, 1.0])
+# Of a standard normal variable: the median of its square, and the mean of its square held at 9.
+_MEDIAN_OF_SQUARE = 0.4549
+_MEAN_OF_HELD_SQUARE = 0.995
+
+
+@dataclass(frozen=True, slots=True)
+class Noise:
+    """Standard deviations: of a measured position (m, per axis) and yaw (rad), independent from sample to sample; of
+    the slip of a moving body forward, left (m per sqrt(s)) and in yaw (rad per sqrt(s)), a random walk.
+    """
+
+    position_m: float
+    yaw_rad: float
+    slip_forward_m_sqrt_s: float
+    slip_left_m_sqrt_s: float
+    slip_yaw_rad_sqrt_s: float
+
+    def vector(self) -> Array:
+        """The five numbers in order, (5,)."""
+        return np.array(
+            [
+                self.position_m,
+                self.yaw_rad,
+                self.slip_forward_m_sqrt_s,
+                self.slip_left_m_sqrt_s,
+                self.slip_yaw_rad_sqrt_s,
+            ]
+        )
+
+
+USUAL = Noise(0.005, 0.01, 0.005, 0.005, 0.015)
+
+
+def measured_noise(drive: Excitation, theta: Array) -> Noise:
+    """The noise in what a geometry leaves unexplained; `theta` (3,) is x_icr, wheel radius, axial distance (m).
+
+    Errors of predicted displacement over several lags: sensor noise adds the same variance to each, slip one that grows
+    with the time in motion (structure function). Errors beyond three standard deviations are held there, so that jumps
+    of the sensor do not count.
+    """
+    error = _errors(drive, theta)
+    moved = np.concatenate([np.cumsum(drive.moving_s[lo:hi]) for lo, hi in _bounds(drive)])
+    rows: list[tuple[float, Array]] = []
+    period_s = float(np.median(np.diff(drive.t_s)[~drive.starts[1:]]))
+    for lag in sorted({max(1, round(lag_s / period_s)) for lag_s in _LAGS_S}):
+        squares, moving = _windows(drive, error, moved, lag)
+        length_s = lag * period_s
+        for chosen in (moving < 0.05 * length_s, moving > 0.9 * length_s):
+            if np.count_nonzero(chosen) >= _FEWEST_WINDOWS:
+                rows.append((float(np.mean(moving[chosen])), _variance(squares[chosen])))
+    if len(rows) < 3:
+        return USUAL
+    time_s = np.array([row[0] for row in rows])
+    variances = np.array([row[1] for row in rows])
+    forward, left, yaw = (_two_terms(time_s, variances[:, axis]) for axis in range(3))
+    position = 0.5 * (forward[0] + left[0])
+    found = np.sqrt([position, yaw[0], forward[1], left[1], yaw[1]])
+    return Noise(*np.clip(found, _SMALLEST, _LARGEST).tolist())
+
+
+def _variance(squares: Array) -> Array:
+    """Variances (axes,) from squared errors (W, axes), those beyond three standard deviations held there."""
+    rough = np.median(squares, axis=0) / _MEDIAN_OF_SQUARE
+    held: Array = np.minimum(squares, 9.0 * rough).mean(axis=0) / _MEAN_OF_HELD_SQUARE
+    return held
+
+
+def _two_terms(time_s: Array, variance: Array) -> tuple[float, float]:
+    """Sensor variance R and slip variance q per second in `variance = 2 R + q time`, both not negative.
+
+    Errors are relative: each row is weighted by its own variance.
+    """
+    scale = 1.0 / np.maximum(variance, 1e-12)
+    best, best_cost = (0.0, 0.0), np.inf
+    for use in ((True, True), (True, False), (False, True)):
+        columns = np.column_stack([np.full(time_s.size, 2.0), time_s])[:, use]
+        solution, *_ = np.linalg.lstsq(columns * scale[:, None], variance * scale, rcond=None)
+        cost = float(np.sum((columns @ solution * scale - 1.0) ** 2))
+        if (solution >= 0.0).all() and cost < best_cost:
+            full = np.zeros(2)
+            full[list(use)] = solution
+            best, best_cost = (float(full[0]), float(full[1])), cost
+    return best
+
+
+def _bounds(drive: Excitation) -> list[tuple[int, int]]:
+    return list(pairwise(drive.run_pose.tolist()))
+
+
+def _errors(drive: Excitation, theta: Array) -> Array:
+    """Measured minus predicted path, summed up within each run: world x, y (m), and yaw (rad), (P, 3)."""
+    x_icr, radius, axial = theta
+    parts = []
+    for lo, hi in _bounds(drive):
+        pose, roll = drive.pose[lo:hi], drive.roll_rad[lo + 1 : hi]
+        yaw = pose[:, 2]
+        middle = 0.5 * (yaw[1:] + yaw[:-1])
+        turn = radius / axial * roll[:, 1]
+        forward, left = radius * roll[:, 0], -x_icr * 2.0 * np.sin(0.5 * turn)
+        cosine, sine = np.cos(middle), np.sin(middle)
+        steps = np.column_stack([forward * cosine - left * sine, forward * sine + left * cosine, turn])
+        predicted = np.vstack([np.zeros(3), np.cumsum(steps, axis=0)])
+        parts.append(pose - pose[0] - predicted)
+    return np.concatenate(parts)
+
+
+def _windows(drive: Excitation, error: Array, moved_s: Array, lag: int) -> tuple[Array, Array]:
+    """Squared errors over windows of `lag` poses: forward, left, yaw (W, 3); and the time in motion (W,)."""
+    squares, moving = [], []
+    stride = max(1, lag // 2)
+    for lo, hi in _bounds(drive):
+        if hi - lo <= lag:
+            continue
+        start = np.arange(lo, hi - lag, stride)
+        step = error[start + lag] - error[start]
+        yaw = drive.pose[start + lag // 2, 2]
+        cosine, sine = np.cos(yaw), np.sin(yaw)
+        forward, left = step[:, 0] * cosine + step[:, 1] * sine, step[:, 1] * cosine - step[:, 0] * sine
+        squares.append(np.column_stack([forward, left, step[:, 2]]) ** 2)
+        moving.append(moved_s[start + lag] - moved_s[start])
+    if not squares:
+        return np.empty((0, 3)), np.empty(0)
+    return np.concatenate(squares), np.concatenate(moving)

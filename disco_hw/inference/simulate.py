@@ -1,0 +1,145 @@
+"""Simulated logs: a drive's wheel speeds through the model at many parameter points, with the log's own noise."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from disco_hw.inference.compiled import parallel_kernel
+from disco_hw.inference.excitation import Excitation
+from disco_hw.inference.noise import Noise
+from disco_hw.model.model import Model, coefficient_tables
+from disco_hw.model.parameter import BASE_PARAMETERS
+from disco_hw.model.step import axle_of, integration_of, step, tracked_of
+from disco_hw.model.tables import base_point, effect_point
+
+Array = NDArray[np.float64]
+Seeds = NDArray[np.uint32]
+Summary = Callable[[Array], Array]
+
+NAMES = ("x_icr_m", "wheel_radius_m", "axial_distance_m")
+_CHUNK = 32
+
+
+@parallel_kernel
+def simulate_kernel(
+    seeds: Any,
+    base: Any,
+    effects: Any,
+    integration: Any,
+    noise: Any,
+    wheel: Any,
+    moving: Any,
+    node: Any,
+    fraction: Any,
+    starts: Any,
+    run_node: Any,
+    run_pose: Any,
+    out: Any,
+) -> None:
+    """Measured poses (n, P, 3) of n simulations, one for each row of `base` and `effects` and each of `seeds`.
+
+    Every run starts at its pose of `starts` (runs, 3). Slip is added after every step of a moving robot: forward, to
+    the left, and in yaw about the tracked point, so that where random turning has its centre says nothing of x_icr;
+    `noise` (5,) as `Noise.vector`.
+    """
+    root = math.sqrt(integration.step_s)
+    slip_forward, slip_left, slip_yaw = noise[2] * root, noise[3] * root, noise[4] * root
+    for i in range(seeds.shape[0]):
+        np.random.seed(seeds[i])
+        here, effects_here = base_point(base, i), effect_point(effects, i)
+        for run in range(run_node.shape[0] - 1):
+            x, y, yaw = starts[run, 0], starts[run, 1], starts[run, 2]
+            cos_yaw, sin_yaw = math.cos(yaw), math.sin(yaw)
+            axle_x, axle_y = axle_of(x, y, cos_yaw, sin_yaw, here)
+            wheel_left, wheel_right = wheel[run_node[run], 0], wheel[run_node[run], 1]
+            sample, last = run_pose[run], run_pose[run + 1]
+            for k in range(run_node[run], run_node[run + 1]):
+                before_x, before_y, before_yaw = x, y, yaw
+                axle_x, axle_y, cos_yaw, sin_yaw, wheel_left, wheel_right, _, turn = step(
+                    axle_x, axle_y, cos_yaw, sin_yaw, wheel_left, wheel_right, wheel[k, 0], wheel[k, 1],
+                    k * integration.step_s, here, effects_here, integration,
+                )  # fmt: skip
+                yaw = yaw + (turn + turn) * integration.step_s
+                x, y = tracked_of(axle_x, axle_y, cos_yaw, sin_yaw, here)
+                if moving[k] > 0.0:
+                    along, across = slip_forward * np.random.standard_normal(), slip_left * np.random.standard_normal()
+                    x += along * cos_yaw - across * sin_yaw
+                    y += along * sin_yaw + across * cos_yaw
+                    yaw += slip_yaw * np.random.standard_normal()
+                    cos_yaw, sin_yaw = math.cos(yaw), math.sin(yaw)
+                    axle_x, axle_y = axle_of(x, y, cos_yaw, sin_yaw, here)
+                while sample < last and node[sample] == k:
+                    part = fraction[sample]
+                    out[i, sample, 0] = before_x + part * (x - before_x) + noise[0] * np.random.standard_normal()
+                    out[i, sample, 1] = before_y + part * (y - before_y) + noise[0] * np.random.standard_normal()
+                    out[i, sample, 2] = before_yaw + part * (yaw - before_yaw) + noise[1] * np.random.standard_normal()
+                    sample += 1
+
+
+@dataclass(frozen=True, slots=True)
+class Simulator:
+    """Simulations of one drive; pure: the same points and seeds give the same poses, however they are shared out."""
+
+    model: Model
+    drive: Excitation
+    noise: Noise
+
+    def poses(self, theta: Array, seeds: Seeds) -> Array:
+        """Measured poses (n, P, 3), yaw not wrapped; `theta` (n, 3) in the order of `NAMES`, `seeds` (n,)."""
+        drive = self.drive
+        out = np.empty((theta.shape[0], drive.t_s.size, 3))
+        full = np.tile(self.model.point(), (theta.shape[0], 1))
+        order = [self.model.parameter_names.index(name) for name in NAMES]
+        full[:, order] = theta
+        base, effects = coefficient_tables(self.model, full, drive.step_s)
+        simulate_kernel(
+            seeds,
+            base,
+            effects,
+            integration_of(drive.step_s, wide=True),
+            self.noise.vector(),
+            drive.wheel_rad_s,
+            drive.moving,
+            drive.node,
+            drive.fraction,
+            drive.pose[drive.run_pose[:-1]],
+            drive.run_node,
+            drive.run_pose,
+            out,
+        )
+        return out
+
+    def summaries(
+        self, theta: Array, seeds: Seeds, summary: Summary, done: Callable[[int], None] | None = None
+    ) -> Array:
+        """Summary statistics (n, S) of n simulations, on all cores this process may use; `done` hears of each chunk."""
+
+        def chunk(first: int) -> Array:
+            part = slice(first, first + _CHUNK)
+            result = summary(self.poses(theta[part], seeds[part]))
+            if done is not None:
+                done(result.shape[0])
+            return result
+
+        with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+            return np.concatenate(list(pool.map(chunk, range(0, theta.shape[0], _CHUNK))))
+
+
+def physical_range() -> tuple[Array, Array]:
+    """Lowest and highest possible values in the order of `NAMES`, (3,) each."""
+    ranges = {parameter.name: (parameter.low, parameter.high) for parameter in BASE_PARAMETERS}
+    low, high = np.array([ranges[name] for name in NAMES]).T
+    return low, high
+
+
+def draw_seeds(count: int, rng: np.random.Generator) -> Seeds:
+    """Seeds for `count` simulations."""
+    return rng.integers(0, 2**32, size=count, dtype=np.uint32)
