@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.gap.channels import BodyChannel, Channel, WheelChannel
-from disco_hw.gap.layout import BASE_COUNT, WHEEL
+from disco_hw.gap.layout import BASE_COUNT, WHEEL, Layout
 from disco_hw.model.effects import REGISTRY
 from disco_hw.model.effects import Channel as Place
 
@@ -108,9 +108,9 @@ def _competing() -> dict[str, Candidate]:
 CANDIDATES: Mapping[str, Candidate] = MappingProxyType(_competing())
 
 
-def candidates_of(channel: Channel) -> tuple[str, ...]:
-    """Names of the effects that compete in a channel."""
-    wheels = channel.layout is WHEEL
+def candidates_of(layout: Layout) -> tuple[str, ...]:
+    """Names of the effects that compete in the channel of a layout."""
+    wheels = layout is WHEEL
     return tuple(name for name in CANDIDATES if (REGISTRY[name].channel is Place.COMMAND_TO_WHEEL) == wheels)
 
 

@@ -12,7 +12,6 @@ from disco_hw.gap.body_noise import BodyNoise
 from disco_hw.gap.candidates import indices
 from disco_hw.gap.channels import BodyChannel, WheelChannel
 from disco_hw.gap.fit import Fit, fit
-from disco_hw.gap.layout import BASE_COUNT, BODY
 from disco_hw.gap.horizon import displacement, starts_of
 from disco_hw.gap.noise_fit import learn_body_noise, learn_wheel_noise
 from disco_hw.gap.selection import Names, Selector, Thresholds
@@ -90,27 +89,30 @@ def body_moves(channel: BodyChannel) -> Callable[[Fit, Fit], float]:
     return moves
 
 
-def search_wheels(line: Timeline, geometry: Array) -> Found:
-    """Effects between command and wheel; `geometry` (3,) tells how far they move the robot."""
+def search_wheels(line: Timeline, geometry: Array, start: Array, given: Names = ()) -> Found:
+    """Effects between command and wheel.
+
+    `geometry` (3,) tells how far they move the robot; `start` is the vector without what is missing, in which effects
+    `given` are known already.
+    """
     channel = WheelChannel.build(line, WheelNoise(reading_rad=max(line.quantum_rad, 2e-4)), geometry)
     moves = wheel_moves(channel, geometry)
-    rough = Selector(channel, moves, _ROUGH)
+    rough = Selector(channel, moves, _ROUGH, given=given, start=start)
     names = rough.greedy()
     rich = (*names, *(name for name in _SMOOTH_WHEEL if name not in names))
     channel = learn_wheel_noise(channel, fit(channel, rough.fit(names).vector, indices(channel, rich)).vector)
-    selector = Selector(channel, moves)
+    selector = Selector(channel, moves, given=given, start=rough.fit(given).vector)
     return Found(selector, selector.select())
 
 
-def search_body(line: Timeline, geometry: Array) -> Found:
-    """Effects between measured wheel angles and measured poses."""
-    start = np.concatenate([geometry[:BASE_COUNT], BODY.neutral[BASE_COUNT:]])
+def search_body(line: Timeline, start: Array, given: Names = ()) -> Found:
+    """Effects between measured wheel angles and measured poses; `start` and `given` as for the wheels."""
     channel = BodyChannel.build(line, BodyNoise(), start)
-    nominal = fit(channel, start, indices(channel, ()))
+    nominal = fit(channel, start, indices(channel, given))
     channel = learn_body_noise(channel, nominal.vector, 4)
-    rough = Selector(channel, body_moves(channel), _ROUGH)
+    rough = Selector(channel, body_moves(channel), _ROUGH, given=given, start=nominal.vector)
     names = rough.greedy()
     rich = (*names, *(name for name in _SMOOTH_BODY if name not in names))
     channel = learn_body_noise(channel, fit(channel, rough.fit(names).vector, indices(channel, rich)).vector)
-    selector = Selector(channel, body_moves(channel))
+    selector = Selector(channel, body_moves(channel), given=given, start=rough.fit(given).vector)
     return Found(selector, selector.select())

@@ -33,13 +33,15 @@ class Thresholds:
 class Selector:
     """Fits sets of effects of one channel, each once; `moves` tells how far a fit moves the prediction of another.
 
-    `extra` (M, k) is an unnamed term that is held.
+    `extra` (M, k) is an unnamed term that is held. Effects `given` are in from the beginning, with values of `start`.
     """
 
     channel: Channel
     moves: Callable[[Fit, Fit], float]
     thresholds: Thresholds = Thresholds()
     extra: Array | None = None
+    given: Names = ()
+    start: Array | None = None
     fits: dict[frozenset[str], Fit] = field(default_factory=dict)
     proofs: dict[tuple[frozenset[str], frozenset[str]], Evidence] = field(default_factory=dict)
 
@@ -47,8 +49,9 @@ class Selector:
         """The best fit of a set, started from the best smaller ones known."""
         key = frozenset(names)
         if key not in self.fits:
-            if not names:
-                self.fits[key] = fit(self.channel, self.channel.neutral, indices(self.channel, ()), self.extra)
+            if key <= frozenset(self.given):
+                begin = self.channel.neutral if self.start is None else self.start
+                self.fits[key] = fit(self.channel, begin, indices(self.channel, names), self.extra)
             else:
                 new = [name for name in names if key - {name} in self.fits] or [names[-1]]
                 options = [
@@ -163,13 +166,13 @@ class Selector:
 
     def ranked(self, accepted: Names) -> list[str]:
         """Candidates that are not in yet, the most promising first."""
-        rest = [name for name in candidates_of(self.channel) if name not in accepted]
+        rest = [name for name in candidates_of(self.channel.layout) if name not in accepted]
         promises = {name: self.promise(accepted, name) for name in rest}
         return sorted((name for name in rest if promises[name] > 0.0), key=lambda name: -promises[name])
 
     def greedy(self) -> Names:
         """Forward steps only."""
-        accepted: Names = ()
+        accepted = self.given
         while len(accepted) < _MOST_EFFECTS:
             ranked = self.ranked(accepted)
             new = next((name for name in ranked if self.acceptable(accepted, (*accepted, name))), None)
@@ -180,7 +183,7 @@ class Selector:
 
     def select(self) -> Names:
         """Forward, swap, backward, until nothing changes."""
-        accepted: Names = ()
+        accepted = self.given
         visited = {frozenset(accepted)}
         while len(accepted) < _MOST_EFFECTS:
             ranked = self.ranked(accepted)
@@ -199,10 +202,12 @@ class Selector:
         for _ in range(len(accepted)):
             best, score = accepted, 2.0
             for place, old in enumerate(accepted):
+                if old in self.given:
+                    continue
                 rest = (*accepted[:place], *accepted[place + 1 :])
                 worth = self.fit(rest).cost - self.fit(accepted).cost
                 worth -= 0.5 * CANDIDATES[old].parameters * np.log(self.channel.count)
-                for name in candidates_of(self.channel):
+                for name in candidates_of(self.channel.layout):
                     if name not in accepted and self.promise(rest, name) - worth > score:
                         best, score = (*accepted[:place], name, *accepted[place + 1 :]), self.promise(rest, name) - worth
             if best == accepted:
@@ -213,6 +218,8 @@ class Selector:
     def _backward(self, accepted: Names) -> Names:
         """Drop effects that the others have made unnecessary."""
         for name in accepted:
+            if name in self.given:
+                continue
             rest = tuple(other for other in accepted if other != name)
             if len(accepted) > 1 and not self.acceptable(rest, accepted):
                 return self._backward(rest)

@@ -1,0 +1,143 @@
+"""What a log could not have shown: for each effect that was not found, the smallest size that would have been seen."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from disco_hw.gap.candidates import CANDIDATES, candidates_of
+from disco_hw.gap.channels import Channel, WheelChannel
+from disco_hw.gap.fit import Fit, inverse, sensitivity
+from disco_hw.gap.search import Found
+from disco_hw.model.effects import REGISTRY
+
+Array = NDArray[np.float64]
+
+# A size that real robots show; an effect whose smallest visible size is above it is one this log is blind to.
+REALISTIC: Mapping[str, float] = MappingProxyType(
+    {
+        "motor_lag.tau_s": 0.05,
+        "command_delay.delay_s": 0.04,
+        "deadband.width_rad_s": 0.25,
+        "stiction.threshold_rad_s": 0.5,
+        "battery_sag.loss": 0.05,
+        "wheel_gain.left": 0.02,
+        "encoder_scale.left": 0.015,
+        "wheel_radius_asymmetry.ratio": 0.008,
+        "turn_slip.k_s": 0.04,
+        "acceleration_slip.k_s2_m": 0.08,
+        "side_slip.k_s": 0.06,
+        "lateral_icr.offset_m": 0.015,
+        "pose_offset.left_m": 0.015,
+        "slope.drift_x_m_s": 0.008,
+        "surface_change.track": 0.06,
+        "pose_latency.latency_s": 0.04,
+        "heading_bias.bias_rad": 0.026,
+    }
+)
+_LIMITS = ("speed_limit", "yaw_rate_limit")
+_EXACT_ALIKE = {"pose_offset": "lateral_icr", "encoder_scale": "wheel_gain"}
+_SCORE = 20.0
+_USUAL_INFLATION = 1.5
+
+
+@dataclass(frozen=True, slots=True)
+class BlindSpot:
+    """An effect that was not found: the parameter that measures it, its smallest visible size, None if none is.
+
+    For a limit it is the largest that would have been seen. `blind` if realistic sizes would have stayed hidden.
+    """
+
+    name: str
+    parameter: str
+    unit: str
+    smallest_visible: float | None
+    blind: bool
+    experiment: str
+
+
+def blind_spots(found: Found) -> tuple[BlindSpot, ...]:
+    """Blind spots of one channel, one for each of its effects that was not accepted."""
+    channel, best = found.selector.channel, found.fit
+    spots = [_spot(channel, best, name) for name in candidates_of(channel.layout) if name not in found.names]
+    for spot in tuple(spots):
+        for other, like in _EXACT_ALIKE.items():
+            if spot.name == like:
+                parameter = next(key for key in REALISTIC if key.startswith(other)).split(".")[1]
+                size = spot.smallest_visible
+                blind = size is None or size > REALISTIC[f"{other}.{parameter}"]
+                spots.append(
+                    BlindSpot(other, parameter, spot.unit, size, blind, REGISTRY[other].excitation)
+                )
+    return tuple(spots)
+
+
+def _spot(channel: Channel, best: Fit, name: str) -> BlindSpot:
+    effect, candidate = REGISTRY[name], CANDIDATES[name]
+    parameter = effect.parameters[0]
+    column = f"{name}.{parameter.name}"
+    if name in _LIMITS:
+        largest = _largest(channel, name)
+        return BlindSpot(name, parameter.name, parameter.unit, largest, largest is None, effect.excitation)
+    size = _size(channel, best, name, column, candidate.columns)
+    realistic = REALISTIC.get(column, math.inf)
+    return BlindSpot(
+        name, parameter.name, parameter.unit, size, size is None or size > realistic, effect.excitation
+    )
+
+
+def _largest(channel: Channel, name: str) -> float | None:
+    """The largest limit that cuts at least half a second of the commands."""
+    assert isinstance(channel, WheelChannel)
+    command = channel.timeline.command_rad_s
+    command = command[np.isfinite(command[:, 0])]
+    if name == "speed_limit":
+        size = np.abs(command).max(axis=1)
+    else:
+        size = np.abs(command[:, 1] - command[:, 0]) * channel.geometry[0] / channel.geometry[1]
+    if size.size < 200 or size.max() < 1e-3:
+        return None
+    return float(0.97 * np.sort(size)[-50])
+
+
+def _size(channel: Channel, best: Fit, name: str, column: str, columns: tuple[str, ...]) -> float | None:
+    """Size at which the expected evidence reaches the threshold, the other free parameters projected out."""
+    layout = channel.layout
+    candidate = CANDIDATES[name]
+    threshold = _SCORE + candidate.parameters * math.log(max(channel.count, 2))
+    if candidate.profile is not None and column == candidate.profile.column:
+        return _by_trial(channel, best, column, threshold)
+    vector = best.vector.copy()
+    if candidate.profile is not None:
+        values = candidate.profile.values(channel)
+        if not values:
+            return None
+        vector[layout.place[candidate.profile.column]] = values[len(values) // 2]
+    places = tuple(layout.place[name] for name in columns)
+    base = channel.residual(vector)
+    slope = np.column_stack([best.jacobian, sensitivity(channel, vector, places, base)])
+    first = best.jacobian.shape[1]
+    information = slope.T @ slope
+    if information[first, first] <= 1e-9:
+        return None
+    variance = float(inverse(information)[first, first])
+    size = math.sqrt(threshold * _USUAL_INFLATION * variance)
+    limit = max(abs(layout.low[places[0]]), abs(layout.high[places[0]]))
+    return size if size < limit else None
+
+
+def _by_trial(channel: Channel, best: Fit, column: str, threshold: float) -> float | None:
+    """Smallest of a row of sizes whose prediction differs from the one without by the threshold."""
+    place = channel.layout.place[column]
+    for size in (0.05, 0.1, 0.2, 0.3, 0.5, 0.75, 1.0, 1.5, 2.0):
+        vector = best.vector.copy()
+        vector[place] = size
+        difference = channel.residual(vector) - best.residual
+        if float(difference @ difference) > threshold * _USUAL_INFLATION:
+            return size
+    return None

@@ -1,0 +1,54 @@
+"""What a log cannot tell apart, by algebra: effects with the same equations, and one cause seen in two channels."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+
+from disco_hw.gap.intervals import Estimates
+
+_SIGMAS = 3.0
+
+LATERAL = "lateral_icr"
+SENSOR = "pose_offset"
+GAIN = "wheel_gain"
+ASYMMETRY = "wheel_radius_asymmetry"
+ENCODER = "encoder_scale"
+
+# What decides between the members of a class lies outside such logs.
+OUTSIDE_TESTS: Mapping[frozenset[str], str] = MappingProxyType(
+    {
+        frozenset((LATERAL, SENSOR)): "measure the pose sensor's mount with a ruler, or move the payload and drive again",
+        frozenset((GAIN, ENCODER)): "turn each wheel ten times by hand and count ticks",
+    }
+)
+
+
+def one_encoder(wheels: Estimates, body: Estimates, asymmetry_deviation: float) -> tuple[bool, bool]:
+    """Whether an encoder that counts wrong explains the wheels' gains, and whether it is the only explanation.
+
+    An encoder's scale shows as a gain of its wheel and, with the opposite sign, as an asymmetry of half the difference;
+    `asymmetry_deviation` is the asymmetry's standard deviation where the asymmetry itself was not accepted.
+    """
+    gains = [wheels.by_name.get(f"{GAIN}.{side}") for side in ("left", "right")]
+    if gains[0] is None or gains[1] is None:
+        return False, False
+    left, right = gains[0].value, gains[1].value
+    expected = (left - right) / (2.0 + left + right)
+    spread = 0.5 * (gains[0].deviation + gains[1].deviation)
+    seen = body.by_name.get(f"{ASYMMETRY}.ratio")
+    value, deviation = (seen.value, seen.deviation) if seen else (0.0, asymmetry_deviation)
+    tolerance = _SIGMAS * (deviation**2 + spread**2) ** 0.5
+    possible = abs(value - expected) < tolerance
+    return possible, possible and seen is not None
+
+
+def alike(names: tuple[str, ...], encoder_possible: bool) -> dict[str, tuple[str, ...]]:
+    """For each accepted effect, the named ones that no drive can tell from it."""
+    found: dict[str, tuple[str, ...]] = {}
+    for name in names:
+        if name == LATERAL:
+            found[name] = (SENSOR,)
+        elif name == GAIN and encoder_possible:
+            found[name] = (ENCODER,)
+    return found

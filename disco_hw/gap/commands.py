@@ -1,0 +1,56 @@
+"""What `disco-hw gap` does: read logs and model, find the gap, write report, amended model and pictures."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from disco_hw.config import load_robot_config
+from disco_hw.errors import WorkError
+from disco_hw.gap.find import find_gap
+from disco_hw.gap.report import GapReport
+from disco_hw.log.load import load_drive
+from disco_hw.model import Model, load_model, save_model
+
+
+@dataclass(frozen=True)
+class GapResult:
+    """A report and the directory it was written to."""
+
+    report: GapReport
+    directory: Path
+
+    def as_dict(self) -> dict[str, Any]:
+        """The content of report.json."""
+        return self.report.as_dict()
+
+    def as_text(self) -> str:
+        """For a terminal."""
+        return f"{self.report.as_text()}\n\nwritten: {self.directory}/report.json, model.toml"
+
+
+def gap(
+    logs: Sequence[Path],
+    robot: Path,
+    out: Path,
+    model: Path | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> GapResult:
+    """Find what a model misses in logs and write everything to the directory `out`.
+
+    Raises InputError for files that cannot be used, WorkError if `out` cannot be written.
+    """
+    config = load_robot_config(robot)
+    start = load_model(model) if model is not None else Model.nominal(config.robot)
+    drive = load_drive(list(logs), config.robot.ticks_per_rev, config.robot.wheel_radius_m)
+    report = find_gap(drive, start, progress)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        (out / "report.json").write_text(json.dumps(report.as_dict(), indent=1), encoding="utf-8")
+        save_model(report.model, out / "model.toml")
+    except OSError as error:
+        raise WorkError(f"{out}: cannot be written ({error.strerror}); give another directory") from None
+    return GapResult(report, out)

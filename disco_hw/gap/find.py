@@ -1,0 +1,88 @@
+"""One call: logs and a model in, the report out."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from disco_hw.gap.amend import amended_model
+from disco_hw.gap.candidates import candidates_of
+from disco_hw.gap.layout import BASE_COUNT, BODY, WHEEL, Layout
+from disco_hw.gap.outcome import Outcome
+from disco_hw.gap.report import GapReport
+from disco_hw.gap.search import search_body, search_wheels
+from disco_hw.gap.timeline import timeline
+from disco_hw.log.drive import DriveLog, concatenate
+from disco_hw.log.errors import LogError
+from disco_hw.model import Model
+
+Array = NDArray[np.float64]
+Progress = Callable[[str], None]
+
+
+def find_gap(logs: DriveLog | Sequence[DriveLog], model: Model, progress: Progress | None = None) -> GapReport:
+    """Find where logs and model disagree, name what is missing, amend the model and show the gap shrink.
+
+    `logs`: one drive or several of one robot. `model`: nominal geometry, with the effects that are known already;
+    those are refitted, not reported. `progress` is told what is being done. Raises LogError if the logs hold too
+    little to judge either channel.
+    """
+    began = time.perf_counter()
+    say = progress or (lambda text: None)
+    log = logs if isinstance(logs, DriveLog) else concatenate(logs)
+    line = timeline(log)
+    if not (line.has_poses or line.has_commands):
+        raise LogError(
+            f"{', '.join(log.sources)}: too little to judge: it needs wheel samples with poses, or with commands, "
+            "for at least some seconds of driving"
+        )
+    nominal_body, nominal_wheels = _vector(BODY, model), _vector(WHEEL, model)
+    geometry = nominal_body[:BASE_COUNT]
+    body = wheels = None
+    notes: list[str] = []
+    if line.has_poses:
+        say("wheel to body: which effects are missing")
+        body = search_body(line, nominal_body, _given(model, BODY))
+        geometry = body.fit.vector[:BASE_COUNT]
+    else:
+        notes.append("no poses: only the way from command to wheel is judged")
+    if line.has_commands:
+        say("command to wheel: which effects are missing")
+        wheels = search_wheels(line, geometry, nominal_wheels, _given(model, WHEEL))
+    else:
+        notes.append("no commands: the way from command to wheel is not judged")
+    say("intervals, blind spots and the gap on held-out data")
+    outcome = Outcome(line, nominal_body, nominal_wheels, body, wheels)
+    effects = outcome.effects()
+    amended, remarks = amended_model(
+        model, {effect.name: effect.parameters for effect in outcome.effects(given=True)}, outcome.parts()
+    )
+    return GapReport(
+        sources=log.sources,
+        channels=outcome.channels(effects),
+        effects=effects,
+        unnamed=(),
+        blind_spots=outcome.blind_spots(effects),
+        gap=outcome.gap() if body is not None else {},
+        model=amended,
+        seconds=time.perf_counter() - began,
+        residue=outcome.residue(),
+        notes=(*log.notes, *notes, *remarks),
+    )
+
+
+def _vector(layout: Layout, model: Model) -> Array:
+    """The model's parameters as a channel's vector."""
+    vector = layout.neutral.copy()
+    for name, value in zip(model.parameter_names, model.point(), strict=True):
+        if name in layout.place:
+            vector[layout.place[name]] = value
+    return vector
+
+
+def _given(model: Model, layout: Layout) -> tuple[str, ...]:
+    """Effects of the model that compete in a channel."""
+    return tuple(setting.name for setting in model.effects if setting.name in candidates_of(layout))

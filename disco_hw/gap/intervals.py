@@ -1,0 +1,82 @@
+"""95 % intervals and the joint covariance of what was fitted, widened where blocks scatter more than the noise model."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from disco_hw.gap.candidates import CANDIDATES, indices
+from disco_hw.gap.evidence import inflation
+from disco_hw.gap.fit import fit
+from disco_hw.gap.search import Found
+
+Array = NDArray[np.float64]
+
+_Z95 = 1.96
+_RISE = 0.5 * _Z95**2
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """A parameter with its 95 % interval."""
+
+    value: float
+    low: float
+    high: float
+
+    @property
+    def deviation(self) -> float:
+        """Standard deviation that the interval stands for."""
+        return max((self.high - self.low) / (2.0 * _Z95), 1e-9)
+
+
+@dataclass(frozen=True)
+class Estimates:
+    """Parameters of a channel by full name, and the covariance (A, A) of the fitted ones in order of `fitted`."""
+
+    by_name: dict[str, Estimate]
+    fitted: tuple[str, ...]
+    covariance: Array
+
+
+def estimates(found: Found) -> Estimates:
+    """Intervals of all parameters that a channel's accepted set frees."""
+    best, channel = found.fit, found.selector.channel
+    columns = channel.layout.columns
+    factors = np.array([inflation(best, channel, (index,)) for index in best.active])
+    covariance = best.covariance() * np.sqrt(np.outer(factors, factors))
+    deviations = np.sqrt(np.diag(covariance))
+    by_name = {
+        columns[index]: Estimate(float(best.vector[index]), *_around(float(best.vector[index]), float(deviation)))
+        for index, deviation in zip(best.active, deviations, strict=True)
+    }
+    for name in found.names:
+        profile = CANDIDATES[name].profile
+        if profile is not None:
+            by_name[profile.column] = _profiled(found, profile.column, profile.refine)
+    return Estimates(by_name, tuple(columns[index] for index in best.active), covariance)
+
+
+def _around(value: float, deviation: float) -> tuple[float, float]:
+    return value - _Z95 * deviation, value + _Z95 * deviation
+
+
+def _profiled(found: Found, column: str, step: float) -> Estimate:
+    """Interval in which the profile of the cost rises by no more than 1.92 nats."""
+    selector, best = found.selector, found.fit
+    channel = selector.channel
+    place = channel.layout.place[column]
+    active = indices(channel, found.names)
+    edges = []
+    for sign in (-1.0, 1.0):
+        reach = step
+        while True:
+            vector = best.vector.copy()
+            vector[place] += sign * reach
+            if fit(channel, vector, active, selector.extra, 1).cost > best.cost + _RISE or reach > 64.0 * step:
+                break
+            reach *= 2.0
+        edges.append(float(best.vector[place] + sign * reach))
+    return Estimate(float(best.vector[place]), edges[0], edges[1])

@@ -1,0 +1,222 @@
+"""From what the searches of the channels found to the parts of the report."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from disco_hw.gap.blind_spots import BlindSpot, blind_spots
+from disco_hw.gap.candidates import indices
+from disco_hw.gap.channels import BodyChannel, WheelChannel
+from disco_hw.gap.classes import ASYMMETRY, ENCODER, GAIN, OUTSIDE_TESTS, alike, one_encoder
+from disco_hw.gap.fit import Fit, fit, inverse, sensitivity
+from disco_hw.gap.held_out import Chain, Errors, errors_of, floor_errors, fold_vectors, per_horizon, smoothed_poses
+from disco_hw.gap.intervals import Estimates, estimates
+from disco_hw.gap.report import ChannelFinding, EffectFinding
+from disco_hw.gap.search import Found
+from disco_hw.gap.timeline import Timeline
+from disco_hw.gap.where import in_words, left_over, regimes
+from disco_hw.model.effects import REGISTRY, Channel
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What was found in the channels of one timeline; a channel that could not be judged is None.
+
+    `nominal_body`, `nominal_wheels` are the vectors of the model as given.
+    """
+
+    line: Timeline
+    nominal_body: Array
+    nominal_wheels: Array
+    body: Found | None
+    wheels: Found | None
+
+    @cached_property
+    def _estimates(self) -> tuple[Estimates | None, Estimates | None]:
+        return (
+            None if self.body is None else estimates(self.body),
+            None if self.wheels is None else estimates(self.wheels),
+        )
+
+    @cached_property
+    def _encoder(self) -> tuple[bool, bool]:
+        """Whether wrong encoder counts are possible, and whether they are the one cause of two findings."""
+        body, wheels = self._estimates
+        if body is None or wheels is None or self.body is None or self.wheels is None:
+            return GAIN in (self.wheels.names if self.wheels else ()), False
+        if GAIN not in self.wheels.names or GAIN in self.wheels.selector.given:
+            return False, False
+        return one_encoder(wheels, body, self._asymmetry_deviation(self.body))
+
+    @staticmethod
+    def _asymmetry_deviation(found: Found) -> float:
+        channel, best = found.selector.channel, found.fit
+        place = channel.layout.place[f"{ASYMMETRY}.ratio"]
+        slope = np.column_stack([best.jacobian, sensitivity(channel, best.vector, (place,), best.residual)])
+        return float(np.sqrt(inverse(slope.T @ slope)[-1, -1]))
+
+    @cached_property
+    def _final_body(self) -> tuple[Fit, Estimates] | None:
+        """The body's fit; where an encoder is the cause, with its scale in place of the asymmetry."""
+        estimated = self._estimates[0]
+        if self.body is None or estimated is None:
+            return None
+        if not self._encoder[1] or self.wheels is None:
+            return self.body.fit, estimated
+        names = tuple(name for name in self.body.names if name != ASYMMETRY)
+        channel = self.body.selector.channel
+        vector = self.body.fit.vector.copy()
+        vector[channel.layout.place[f"{ASYMMETRY}.ratio"]] = 0.0
+        wheels = self.wheels.fit.vector
+        for side in ("left", "right"):
+            gain = wheels[self.wheels.selector.channel.layout.place[f"{GAIN}.{side}"]]
+            vector[channel.layout.place[f"{ENCODER}.{side}"]] = gain
+        refitted = fit(channel, vector, indices(channel, names))
+        selector = replace(self.body.selector, fits={frozenset(names): refitted}, proofs={})
+        return refitted, estimates(Found(selector, names))
+
+    def parts(self) -> tuple[Estimates, ...]:
+        """Estimates of the channels, for the amended model."""
+        body, wheels = self._final_body, self._estimates[1]
+        return tuple(part for part in (body[1] if body else None, wheels) if part is not None)
+
+    def effects(self, given: bool = False) -> tuple[EffectFinding, ...]:
+        """The effects that are missing, in order of evidence; with those `given` in the model, if asked."""
+        possible, only = self._encoder
+        found: list[EffectFinding] = []
+        for channel, estimated in ((self.body, self._estimates[0]), (self.wheels, self._estimates[1])):
+            if channel is None or estimated is None:
+                continue
+            same = alike(channel.names, possible)
+            for name in channel.names:
+                if name in channel.selector.given and not given:
+                    continue
+                if only and name in (GAIN, ASYMMETRY):
+                    continue
+                found.append(self._finding(name, channel, estimated, same.get(name, ())))
+        if only and self.wheels is not None and self._estimates[1] is not None:
+            found.append(self._encoder_finding(self.wheels, self._estimates[1]))
+        return tuple(sorted(found, key=lambda effect: -effect.evidence))
+
+    def _finding(self, name: str, found: Found, estimated: Estimates, same: tuple[str, ...]) -> EffectFinding:
+        values = {
+            parameter.name: estimated.by_name[f"{name}.{parameter.name}"] for parameter in REGISTRY[name].parameters
+        }
+        test = next((text for members, text in OUTSIDE_TESTS.items() if {name, *same} <= members and same), None)
+        return EffectFinding(name, REGISTRY[name].channel.value, values, _evidence(found, name), same, test)
+
+    def _encoder_finding(self, wheels: Found, estimated: Estimates) -> EffectFinding:
+        values = {side: estimated.by_name[f"{GAIN}.{side}"] for side in ("left", "right")}
+        return EffectFinding(ENCODER, REGISTRY[ENCODER].channel.value, values, _evidence(wheels, GAIN))
+
+    def channels(self, effects: Iterable[EffectFinding], unnamed: Iterable[str] = ()) -> tuple[ChannelFinding, ...]:
+        """Which channels disagree, and where."""
+        guilty = {effect.channel for effect in effects} | set(unnamed)
+        out = []
+        for place, found in ((Channel.COMMAND_TO_WHEEL, self.wheels), (Channel.WHEEL_TO_BODY, self.body)):
+            where = "not measured in this log" if found is None else in_words(self._regimes(found))
+            out.append(ChannelFinding(place.value, place.value in guilty, where))
+        sensor = Channel.POSE_SENSOR.value
+        out.append(ChannelFinding(sensor, sensor in guilty, out[-1].where))
+        return tuple(out)
+
+    @staticmethod
+    def _regimes(found: Found):  # type: ignore[no-untyped-def]
+        channel = found.selector.channel
+        assert isinstance(channel, WheelChannel | BodyChannel)
+        return regimes(channel, found.selector.fit(found.selector.given), found.fit, found.selector.extra)
+
+    def residue(self) -> tuple[str, ...]:
+        """What is still missing after naming, by regime."""
+        out: list[str] = []
+        for found in (self.wheels, self.body):
+            if found is not None:
+                channel = found.selector.channel
+                assert isinstance(channel, WheelChannel | BodyChannel)
+                out += left_over(channel, self._regimes(found), self.line)
+        return tuple(out)
+
+    def blind_spots(self, effects: Iterable[EffectFinding]) -> tuple[BlindSpot, ...]:
+        """Every effect that was not found, with the smallest size that would have been; blind ones first."""
+        named = {effect.name for effect in effects}
+        spots: list[BlindSpot] = []
+        for found in (self.wheels, self.body):
+            if found is not None:
+                spots += [spot for spot in blind_spots(found) if spot.name not in named]
+        seen = {spot.name for spot in spots} | named
+        for name, effect in REGISTRY.items():
+            judged = self.wheels if effect.channel is Channel.COMMAND_TO_WHEEL else self.body
+            if name not in seen and judged is None:
+                first = effect.parameters[0]
+                spots.append(BlindSpot(name, first.name, first.unit, None, True, effect.excitation))
+        return tuple(sorted(spots, key=lambda spot: not spot.blind))
+
+    def gap(self) -> dict[str, dict[float, Errors]]:
+        """Errors of prediction by stage and horizon on held-out data."""
+        assert self.body is not None
+        assert self._final_body is not None
+        body = self.body.selector.channel
+        assert isinstance(body, BodyChannel)
+        final = self._final_body[0]
+        wheels = None if self.wheels is None else self.wheels.selector.channel
+        assert wheels is None or isinstance(wheels, WheelChannel)
+        poses = smoothed_poses(body, final.vector)
+        base = self.body.selector.fit(self.body.selector.given)
+        refitted = fold_vectors(base, body.block)
+        amended = fold_vectors(final, body.block)
+        wheels_base = {0: self.nominal_wheels, 1: self.nominal_wheels}
+        wheels_full = wheels_base
+        if self.wheels is not None and wheels is not None:
+            wheels_base = fold_vectors(self.wheels.selector.fit(self.wheels.selector.given), wheels.block)
+            wheels_full = fold_vectors(self.wheels.fit, wheels.block)
+        whole = Chain(final.vector, self.wheels.fit.vector if self.wheels else None)
+        if self._encoder[1] and wheels is not None:
+            whole, wheels_full = self._without_gain(whole, wheels_full, wheels)
+
+        def chains(of_body: dict[int, Array], of_wheels: dict[int, Array]) -> dict[int, Chain]:
+            return {held: Chain(of_body[held], None if wheels is None else of_wheels[held]) for held in (0, 1)}
+
+        nominal = {0: self.nominal_body, 1: self.nominal_body}
+        stages = {
+            "nominal": chains(nominal, {0: self.nominal_wheels, 1: self.nominal_wheels}),
+            "refitted": chains(refitted, wheels_base),
+            "amended": chains(amended, wheels_full),
+        }
+        table = {
+            stage: per_horizon(lambda ahead_s, of=of: errors_of(body, wheels, of, ahead_s, poses))  # type: ignore[misc]
+            for stage, of in stages.items()
+        }
+        table["floor"] = per_horizon(lambda ahead_s: floor_errors(body, wheels, whole, ahead_s, poses))
+        return table
+
+    @staticmethod
+    def _without_gain(
+        whole: Chain, folds: dict[int, Array], wheels: WheelChannel
+    ) -> tuple[Chain, dict[int, Array]]:
+        """Wheels that turn as commanded, where it is the encoders that count wrong."""
+        places = [wheels.layout.place[f"{GAIN}.{side}"] for side in ("left", "right")]
+
+        def cleared(vector: Array) -> Array:
+            out = vector.copy()
+            out[places] = 0.0
+            return out
+
+        assert whole.wheels is not None
+        return Chain(whole.body, cleared(whole.wheels)), {held: cleared(vector) for held, vector in folds.items()}
+
+
+def _evidence(found: Found, name: str) -> float:
+    """Evidence score of one accepted effect, the others kept."""
+    rest = tuple(other for other in found.names if other != name)
+    if name in found.selector.given:
+        return 0.0
+    return found.selector.evidence(rest, found.names).score
+
+

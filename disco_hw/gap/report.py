@@ -1,0 +1,180 @@
+"""The answer: verdict, effects with intervals, what is unnamed, what could not be seen, and the gap on held-out data."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from disco_hw.gap.blind_spots import BlindSpot
+from disco_hw.gap.held_out import Errors
+from disco_hw.gap.intervals import Estimate
+from disco_hw.model import Model
+from disco_hw.model.effects import REGISTRY
+
+REPORTED_HORIZON_S = 2.0
+STAGES = ("nominal", "refitted", "amended", "floor")
+
+
+@dataclass(frozen=True, slots=True)
+class ChannelFinding:
+    """Whether simulation and data disagree in a channel, and in which regimes most."""
+
+    name: str
+    significant: bool
+    where: str
+
+
+@dataclass(frozen=True)
+class EffectFinding:
+    """An effect that is missing: its parameters, evidence (score), and what cannot be told from it."""
+
+    name: str
+    channel: str
+    parameters: dict[str, Estimate]
+    evidence: float
+    indistinguishable_from: tuple[str, ...] = ()
+    experiment: str | None = None
+
+    def sentence(self) -> str:
+        """What it does, in words."""
+        return REGISTRY[self.name].sentence.format(**{name: e.value for name, e in self.parameters.items()})
+
+
+@dataclass(frozen=True)
+class UnnamedFinding:
+    """Something missing that is none of the named effects: its form, and the share of the channel's misfit it closes."""
+
+    channel: str
+    form: str
+    evidence: float
+    closes: float
+
+
+@dataclass(frozen=True)
+class GapReport:
+    """What `find_gap` returns; `model` is the amended one."""
+
+    sources: tuple[str, ...]
+    channels: tuple[ChannelFinding, ...]
+    effects: tuple[EffectFinding, ...]
+    unnamed: tuple[UnnamedFinding, ...]
+    blind_spots: tuple[BlindSpot, ...]
+    gap: dict[str, dict[float, Errors]]
+    model: Model
+    seconds: float
+    residue: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+    pictures: dict[str, bytes] = field(default_factory=dict, repr=False)
+
+    @property
+    def verdict(self) -> str:
+        """`effects_found`, `nothing_missing` or `unexplained`."""
+        if self.effects:
+            return "effects_found"
+        return "unexplained" if self.unnamed or self.residue else "nothing_missing"
+
+    def as_dict(self) -> dict[str, Any]:
+        """The content of report.json."""
+        return {
+            "verdict": self.verdict,
+            "channels": [
+                {"name": channel.name, "significant": channel.significant, "where": channel.where}
+                for channel in self.channels
+            ],
+            "effects": [
+                {
+                    "name": effect.name,
+                    "channel": effect.channel,
+                    "parameters": {
+                        name: {"value": e.value, "ci95": [e.low, e.high]} for name, e in effect.parameters.items()
+                    },
+                    "evidence": effect.evidence,
+                    "indistinguishable_from": list(effect.indistinguishable_from),
+                    "experiment": effect.experiment,
+                }
+                for effect in self.effects
+            ],
+            "unnamed": [
+                {"channel": term.channel, "form": term.form, "evidence": term.evidence, "closes": term.closes}
+                for term in self.unnamed
+            ],
+            "residue": list(self.residue),
+            "blind_spots": [
+                {
+                    "name": spot.name,
+                    "parameter": spot.parameter,
+                    "unit": spot.unit,
+                    "smallest_visible": spot.smallest_visible,
+                    "blind": spot.blind,
+                    "experiment": spot.experiment,
+                }
+                for spot in self.blind_spots
+            ],
+            "gap": self._gap_dict(),
+            "notes": list(self.notes),
+            "seconds": self.seconds,
+        }
+
+    def _gap_dict(self) -> dict[str, Any]:
+        if not self.gap:
+            return {"horizon_s": REPORTED_HORIZON_S, "held_out": True}
+        stages = {stage: _errors_dict(self.gap[stage][REPORTED_HORIZON_S]) for stage in STAGES}
+        horizons = [
+            {"horizon_s": horizon, **{stage: _errors_dict(self.gap[stage][horizon]) for stage in STAGES}}
+            for horizon in self.gap["nominal"]
+        ]
+        return {"horizon_s": REPORTED_HORIZON_S, "held_out": True, **stages, "horizons": horizons}
+
+    def answer(self) -> list[str]:
+        """The answer in at most three lines."""
+        if self.effects:
+            first = "; ".join(effect.sentence() for effect in self.effects) + "."
+        elif self.unnamed:
+            first = f"Something is missing that has no name: {self.unnamed[0].form}."
+        elif self.residue:
+            first = "Something is missing that none of the known effects explains."
+        else:
+            first = "Nothing is missing that this log could show."
+        lines = [first[0].upper() + first[1:]]
+        if self.gap:
+            mm = {stage: 1e3 * self.gap[stage][REPORTED_HORIZON_S].position_m for stage in STAGES}
+            added = "adding it takes" if len(self.effects) + len(self.unnamed) == 1 else "the amended model takes"
+            lines.append(
+                f"{added[0].upper()}{added[1:]} the {REPORTED_HORIZON_S:g} s position error from "
+                f"{mm['refitted']:.0f} mm (nominal {mm['nominal']:.0f} mm) to {mm['amended']:.0f} mm; "
+                f"noise alone gives {mm['floor']:.0f} mm."
+            )
+        blind = [spot.name for spot in self.blind_spots if spot.blind]
+        if blind:
+            lines.append(f"This log could not have shown {', '.join(blind)} of realistic size.")
+        return lines
+
+    def as_text(self) -> str:
+        """For a terminal."""
+        lines = [*self.answer(), ""]
+        for effect in self.effects:
+            values = ", ".join(f"{n} {e.value:.4g} [{e.low:.4g}, {e.high:.4g}]" for n, e in effect.parameters.items())
+            also = f" (not to be told from {', '.join(effect.indistinguishable_from)})"
+            lines.append(f"{effect.channel}: {effect.name}: {values}{also if effect.indistinguishable_from else ''}")
+        lines += [f"{term.channel}: unnamed: {term.form}" for term in self.unnamed]
+        lines += list(self.residue)
+        if self.gap:
+            lines += ["", f"{'ahead':>6} " + " ".join(f"{stage:>20}" for stage in STAGES)]
+            for horizon in self.gap["nominal"]:
+                cells = (
+                    f"{1e3 * self.gap[stage][horizon].position_m:9.1f} mm {self.gap[stage][horizon].yaw_rad:6.3f} rad"
+                    for stage in STAGES
+                )
+                lines.append(f"{horizon:4g} s  " + " ".join(f"{cell:>20}" for cell in cells))
+        return "\n".join(lines)
+
+
+def _errors_dict(errors: Errors) -> dict[str, Any]:
+    return {
+        "position_rmse_m": errors.position_m,
+        "position_ci95_m": list(errors.position_ci),
+        "yaw_rmse_rad": errors.yaw_rad,
+        "yaw_ci95_rad": list(errors.yaw_ci),
+        "wheel_rmse_rad_s": errors.wheel_rad_s,
+        "by_regime_m": errors.by_regime_m,
+    }
