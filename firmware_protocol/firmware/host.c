@@ -75,7 +75,6 @@ void disco_host_expire(disco_firmware_t *core)
     const disco_config_t *config = &core->config;
     (void)disco_e2e_expire(&host->e2e, core->now_us);
     if ((core->now_us - host->last_state_us) > config->host_state_timeout_us) {
-        host->request = DISCO_REQUEST_STANDBY;
         host->reset_pending = false;
     }
     if ((core->now_us - host->last_frame_us) > config->host_forget_timeout_us) {

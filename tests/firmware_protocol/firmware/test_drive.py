@@ -168,6 +168,7 @@ def test_stopping_keeps_curvature_and_ends_in_standby():
     bench.ask("STANDBY")
     bench.run_until("STOPPING")
     start = bench.now_us
+    assert bench.out.limited
     while bench.step().state == "STOPPING":
         left, right = setpoints(bench)
         assert left == pytest.approx(-4 * right, abs=1e-4)

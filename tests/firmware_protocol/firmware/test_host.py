@@ -337,6 +337,19 @@ def test_a_reset_asked_for_before_the_stop_does_not_clear_it():
     assert bench.out.state == "STANDBY"
 
 
+def test_a_reset_that_was_asked_for_before_a_silence_does_not_clear_what_came_in_it():
+    bench = Bench()
+    bench.ask("RESET")
+    bench.run(300)
+    bench.request = None
+    bench.run(300)
+    bench.core.receive(bench.now_us, 0x080, b"")
+    bench.run(700)
+    bench.ask("RESET")
+    bench.run(1000)
+    assert bench.out.state == "ESTOP"
+
+
 def test_a_reset_waits_for_stillness_and_is_void_when_the_stop_comes_again():
     bench = estopped()
     bench.wheels_follow = False
