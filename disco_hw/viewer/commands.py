@@ -1,13 +1,21 @@
-"""What `disco-hw view` does: one function for the live page, one for each use of a log."""
+"""What `disco-hw view` does: the live page, and each use of a log."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+
+from rich.console import Console
+from rich.progress import Progress
 
 from disco_hw.config import load_robot_config
 from disco_hw.daemon.client import socket_path
 from disco_hw.daemon.signals import StopSignals
+from disco_hw.errors import InputError
+from disco_hw.viewer.export import export_html
 from disco_hw.viewer.live import LivePage, run_live
+from disco_hw.viewer.picture import draw_clip, draw_picture
 from disco_hw.viewer.recording import Recording
 from disco_hw.viewer.replay import ReplayPage, run_replay
 from disco_hw.viewer.server import DEFAULT_PORT, LOOPBACK, serving
@@ -42,3 +50,40 @@ def view_log(log: Path, robot: Path | None = None, host: str = LOOPBACK, port: i
         print(f"page: {page.url}", flush=True)
         run_replay(replay, lambda: signals.received is not None)
     return 0
+
+
+def snapshot_log(log: Path, out: Path, at_s: float | None = None, robot: Path | None = None) -> None:
+    """Write a picture of the log's instant `at_s` seconds from its start, or of its end; needs no display.
+
+    Raises InputError for a bad file or an ending that is no kind of picture.
+    """
+    with Recording(log, robot) as recording:
+        _check_folder(out)
+        draw_picture(recording, recording.duration_s if at_s is None else at_s, out)
+
+
+def video_log(log: Path, out: Path, speed: float = 1.0, robot: Path | None = None) -> None:
+    """Write the log as a clip, `speed` times as fast as it was; needs no display. Raises InputError as `draw_clip`."""
+    with Recording(log, robot) as recording, _progress(f"writing {out.name}") as progress:
+        _check_folder(out)
+        draw_clip(recording, out, speed, progress)
+
+
+def export_log(log: Path, out: Path, robot: Path | None = None) -> None:
+    """Write the log as one HTML file that plays without Python. Raises InputError for a bad file."""
+    with Recording(log, robot) as recording, _progress(f"writing {out.name}") as progress:
+        _check_folder(out)
+        export_html(recording, out, progress)
+
+
+def _check_folder(out: Path) -> None:
+    if not out.parent.is_dir():
+        raise InputError(f"{out.parent}: no such directory; make it first")
+
+
+@contextmanager
+def _progress(title: str) -> Iterator[Callable[[float], None]]:
+    """A bar on standard error for the part done."""
+    with Progress(console=Console(stderr=True), transient=True) as bars:
+        task = bars.add_task(title, total=1.0)
+        yield lambda part: bars.update(task, completed=part)

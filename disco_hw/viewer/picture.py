@@ -1,0 +1,151 @@
+"""A picture or a clip of a log without a browser or a display: the page's top view and its main curves."""
+
+from __future__ import annotations
+
+import math
+import shutil
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from matplotlib.animation import AbstractMovieWriter, FFMpegWriter, PillowWriter
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from disco_hw.errors import InputError
+from disco_hw.viewer import curves, scene, shapes
+from disco_hw.viewer.curves import Curves
+from disco_hw.viewer.plots import WINDOW_NS
+from disco_hw.viewer.recording import Recording
+from disco_hw.viewer.snapshot import Snapshot
+from disco_hw.viewer.stage import Stage
+from disco_hw.viewer.timeline import Timeline
+from disco_hw.viewer.uncertainty import ParameterPoints
+
+Array = NDArray[np.float64]
+FRAMES_PER_S = 10
+_PICTURE_DPI = 110
+_CLIP_DPI = 70
+_LONGEST_S = 600.0
+_CLIP_FORMATS = {".gif": "gif", ".webp": "webp", ".apng": "apng", ".mp4": "mp4"}
+Progress = Callable[[float], None]
+
+
+def draw_picture(recording: Recording, t_s: float, path: Path) -> None:
+    """Write the instant at `t_s` as PNG (or what the file's ending says); raises InputError for an unknown ending."""
+    figure = _figure()
+    supported = figure.canvas.get_supported_filetypes()
+    if path.suffix.lstrip(".").lower() not in supported:
+        raise InputError(f"{path}: no such kind of picture; end the name in .png, .svg or .pdf")
+    _draw(figure, recording, t_s, ParameterPoints(recording.stage.model))
+    figure.savefig(path, dpi=_PICTURE_DPI)
+
+
+def draw_clip(recording: Recording, path: Path, speed: float, progress: Progress) -> None:
+    """Write the whole log as a clip of 10 pictures a second, `speed` times as fast as it was.
+
+    .gif, .webp and .apng need nothing; .mp4 needs ffmpeg. `progress` gets the part done. Raises InputError for another
+    ending, a missing ffmpeg, or a clip of more than 10 minutes.
+    """
+    writer = _writer(path)
+    length_s = recording.duration_s / speed
+    if length_s > _LONGEST_S:
+        raise InputError(f"{path}: the clip would take {length_s:.0f} s; raise --speed to at least "
+                         f"{math.ceil(recording.duration_s / _LONGEST_S)}")  # fmt: skip
+    figure = _figure()
+    points = ParameterPoints(recording.stage.model)
+    count = max(1, round(length_s * FRAMES_PER_S))
+    with writer.saving(figure, str(path), _CLIP_DPI):
+        for number in range(count + 1):
+            figure.clear()
+            _draw(figure, recording, recording.duration_s * number / count, points)
+            writer.grab_frame()
+            progress(number / count)
+
+
+def _writer(path: Path) -> AbstractMovieWriter:
+    ending = path.suffix.lower()
+    if ending not in _CLIP_FORMATS:
+        raise InputError(f"{path}: no such kind of clip; end the name in {', '.join(_CLIP_FORMATS)}")
+    if ending != ".mp4":
+        return PillowWriter(fps=FRAMES_PER_S)
+    if shutil.which("ffmpeg") is None:
+        raise InputError(f"{path}: writing .mp4 needs ffmpeg; install it, or end the name in .gif or .webp")
+    return FFMpegWriter(fps=FRAMES_PER_S)
+
+
+def _figure() -> Figure:
+    return Figure(figsize=(11.2, 6.4))
+
+
+def _draw(figure: Figure, recording: Recording, t_s: float, points: ParameterPoints) -> None:
+    snapshot, stage, timeline = recording.at(t_s), recording.stage, recording.timeline
+    grid = figure.add_gridspec(
+        3, 2, width_ratios=(1.6, 1.0), left=0.07, right=0.98, bottom=0.08, top=0.95, hspace=0.4, wspace=0.12
+    )
+    top = figure.add_subplot(grid[:, 0])
+    _draw_scene(top, snapshot, stage, points)
+    top.set_title(f"{stage.name}, {t_s:.2f} s", loc="left")
+    cuts: tuple[tuple[str, Callable[[Timeline, int, int], Curves]], ...] = (
+        ("distance to the circle (m)", partial(curves.distance, stage.task)),
+        ("speed (m/s)", partial(curves.speed, stage.task)),
+        ("wheels (rad/s)", curves.wheels),
+    )
+    for row, (title, cut) in enumerate(cuts):
+        axes = figure.add_subplot(grid[row, 1])
+        found = cut(timeline, snapshot.t_ns - WINDOW_NS, snapshot.t_ns)
+        for name, values in found.values.items():
+            axes.plot(found.t_s, values, linewidth=1.0, label=name)
+        axes.set_title(title, loc="left", fontsize=9)
+        axes.tick_params(labelsize=8)
+        axes.grid(alpha=0.3)
+        if len(found.values) > 1:
+            axes.legend(fontsize=7, loc="lower right", ncols=2)
+
+
+def _draw_scene(axes: Axes, snapshot: Snapshot, stage: Stage, points: ParameterPoints) -> None:
+    task = stage.task
+    axes.plot(
+        *shapes.circle_points(task.center_x_m, task.center_y_m, task.radius_m).T,
+        color=_web(scene.TASK_COLOUR), linewidth=2.5,
+    )  # fmt: skip
+    trail = snapshot.trail
+    if len(trail) >= 2:
+        away = np.hypot(trail[:, 0] - task.center_x_m, trail[:, 1] - task.center_y_m) - task.radius_m
+        colours = shapes.distance_colours(away, scene.TRAIL_FULL_M) / 255.0
+        axes.add_collection(LineCollection(list(np.stack((trail[:-1], trail[1:]), axis=1)), colors=colours[1:], lw=1.5))
+    if len(snapshot.poses):
+        axes.plot(*snapshot.poses[:, :2].T, ".", color=_web(scene.POSES_COLOUR), markersize=3)
+    if snapshot.plan is not None:
+        for path in points.trajectories(snapshot.plan, snapshot.wheel_speeds or (0.0, 0.0)):
+            axes.plot(*path.T, color=_web(scene.POINTS_COLOUR), linewidth=0.8)
+        axes.plot(snapshot.plan.path_x_m, snapshot.plan.path_y_m, color=_web(scene.PLAN_COLOUR), linewidth=2.0)
+    if snapshot.pose is not None:
+        body, nose = _outline(snapshot.pose, stage.axial_distance_m)
+        axes.fill(*body.T, color=_web(scene.BODY_COLOUR), alpha=0.8)
+        axes.fill(*nose.T, color="gold")
+        ellipse = shapes.ellipse_points(*snapshot.pose[:2], snapshot.covariance[:2, :2])
+        axes.plot(*ellipse.T, color=_web(scene.ELLIPSE_COLOUR), linewidth=1.2)
+    reach = 1.5 * task.radius_m + 0.3
+    axes.set(
+        xlim=(task.center_x_m - reach, task.center_x_m + reach),
+        ylim=(task.center_y_m - reach, task.center_y_m + reach),
+        aspect="equal", xlabel="x (m)", ylabel="y (m)",
+    )  # fmt: skip
+    axes.grid(alpha=0.3)
+
+
+def _outline(pose: tuple[float, float, float], size_m: float) -> tuple[Array, Array]:
+    """Corners (4, 2) of the body and (3, 2) of its nose in the world."""
+    x_m, y_m, yaw_rad = pose
+    turn = np.array(((math.cos(yaw_rad), math.sin(yaw_rad)), (-math.sin(yaw_rad), math.cos(yaw_rad))))
+    body = size_m * np.array(((0.62, 0.5), (-0.62, 0.5), (-0.62, -0.5), (0.62, -0.5)))
+    nose = size_m * np.array(((0.62, 0.0), (0.4, 0.2), (0.4, -0.2)))
+    return body @ turn + (x_m, y_m), nose @ turn + (x_m, y_m)
+
+
+def _web(colour: tuple[int, int, int]) -> str:
+    return "#{:02x}{:02x}{:02x}".format(*colour)
