@@ -26,6 +26,13 @@ RobotFile = Annotated[Path, typer.Argument(metavar="ROBOT.toml", help="The robot
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object for machines.")]
 ModelOption = Annotated[Path | None, typer.Option("--model", help="Use this model.toml instead of robot.toml's.")]
 
+Logs = Annotated[list[Path], typer.Argument(metavar="LOG...", help="Logs of driving: MCAP or CSV.")]
+RobotOption = Annotated[Path, typer.Option("--robot", help="The robot's configuration (docs/robot.md).")]
+
+
+def _progress_line(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
+
 
 def _print(result: dict[str, Any], as_json: bool, text: str) -> None:
     print(json.dumps(result) if as_json else text)
@@ -172,6 +179,69 @@ def estop(
     _print(outcome.as_dict(), as_json, outcome.as_text())
     if not outcome.sent:
         raise typer.Exit(1)
+
+
+@app.command()
+def infer(
+    logs: Logs,
+    robot: RobotOption,
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="Write the model with its posterior here.")] = None,
+    paper: Annotated[bool, typer.Option("--paper", help="The paper's statistics and 1000 simulations.")] = False,
+    simulations: Annotated[int | None, typer.Option(min=100, help="Simulations in all.")] = None,
+    seed: Annotated[int, typer.Option(min=0)] = 1,
+    as_json: AsJson = False,
+) -> None:
+    """Infer the robot's parameters from logs of driving (BayesSim) and write a model with its posterior."""
+    from disco_hw.inference.commands import infer_command
+
+    result = infer_command(logs, robot, out, paper, simulations, seed, _progress_line)
+    _print(result.as_dict(), as_json, result.as_text())
+
+
+@app.command()
+def gap(
+    logs: Logs,
+    robot: RobotOption,
+    out: Annotated[Path, typer.Option("-o", "--out", help="Directory for report, pictures and amended model.")],
+    model: ModelOption = None,
+    as_json: AsJson = False,
+) -> None:
+    """Find where simulation and logs disagree, name the missing effect, write the amended model, show the shrink."""
+    from disco_hw.gap.commands import gap as find_gap
+
+    result = find_gap(logs, robot, out, model, _progress_line)
+    _print(result.as_dict(), as_json, result.as_text())
+
+
+@app.command()
+def view(
+    log: Annotated[Path | None, typer.Argument(metavar="[LOG]", help="The log to replay.")] = None,
+    live: Annotated[bool, typer.Option("--live", help="Show the running daemon of --robot.")] = False,
+    robot: Annotated[Path | None, typer.Option(help="robot.toml; for a log, instead of the one it carries.")] = None,
+    model: ModelOption = None,
+    snapshot: Annotated[Path | None, typer.Option(help="Write a picture of the log's end instead.")] = None,
+    video: Annotated[Path | None, typer.Option(help="Write a clip of the log instead.")] = None,
+    export: Annotated[Path | None, typer.Option(help="Write one HTML file that plays without Python instead.")] = None,
+    port: Annotated[int | None, typer.Option(min=1, max=65535, help="Port of the page.")] = None,
+) -> None:
+    """Show the page: a log, or the running daemon."""
+    from disco_hw.viewer import commands
+    from disco_hw.viewer.server import DEFAULT_PORT
+
+    if live:
+        if robot is None or log is not None:
+            raise InputError("view --live: needs --robot ROBOT.toml and no LOG")
+        raise typer.Exit(commands.view_live(robot, model, port=port or DEFAULT_PORT))
+    if log is None:
+        raise InputError("view: give a LOG, or --live with --robot ROBOT.toml")
+    if snapshot is not None:
+        commands.snapshot_log(log, snapshot, robot=robot)
+    if video is not None:
+        commands.video_log(log, video, robot=robot)
+    if export is not None:
+        commands.export_log(log, export, robot=robot)
+    if snapshot is None and video is None and export is None:
+        raise typer.Exit(commands.view_log(log, robot, port=port or DEFAULT_PORT))
 
 
 log_app = typer.Typer(help="Look into a log, mend it, hand it on.", no_args_is_help=True)
