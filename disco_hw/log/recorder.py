@@ -143,8 +143,8 @@ class ProcessRecorder:
         self._process: subprocess.Popen[bytes] | None = None
         _prepare(recording.path)
         # mkdtemp makes the directory 0700: the socket is its owner's alone.
-        self._runtime = Path(tempfile.mkdtemp(prefix="disco-hw-log-", dir=_runtime_root()))
-        self._endpoint = f"ipc://{self._runtime}/batches"
+        self._runtime = Path(tempfile.mkdtemp(prefix="disco-hw-", dir=_runtime_root()))
+        self._endpoint = f"ipc://{self._runtime}/log"
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._socket = self._context.socket(zmq.PUSH)
         self._socket.setsockopt(zmq.SNDHWM, recording.queue_ticks)
