@@ -70,7 +70,6 @@ class Scene:
         self._trail = server.scene.add_line_segments(
             "/trail", empty, np.zeros((1, 2, 3), np.uint8), thickness=0.012, visible=False
         )
-        self._task.visible = True
 
     def show(self, snapshot: Snapshot, everything: bool = True) -> None:
         """Draw this instant."""
@@ -114,7 +113,7 @@ class Scene:
         self._task = scene.add_line_segments(
             "/task", shapes.segments(circle, _GROUND_M), TASK_COLOUR, thickness=max(0.015, 0.015 * task.radius_m)
         )
-        away = 1.0 + 1.3 * task.radius_m
+        away = 0.8 + 1.1 * task.radius_m
         camera = self._server.initial_camera
         camera.look_at = (task.center_x_m, task.center_y_m, 0.0)
         camera.position = (task.center_x_m - 0.35 * away, task.center_y_m - 0.9 * away, 1.25 * away)
@@ -174,11 +173,10 @@ class Scene:
             task = self._stage.task
             distance = np.hypot(trail[:, 0] - task.center_x_m, trail[:, 1] - task.center_y_m) - task.radius_m
             colours = shapes.distance_colours(distance, TRAIL_FULL_M)
-            points = shapes.segments(trail, 2.0 * _GROUND_M)
-            # Added anew, since points and colours must change together.
-            self._trail = self._server.scene.add_line_segments(
-                "/trail", points, np.stack((colours[:-1], colours[1:]), axis=1), thickness=0.012
-            )
+            points = shapes.segments(trail, 4.0 * _GROUND_M)
+            self._trail.points = points.astype(np.float32)
+            self._trail.colors = np.stack((colours[:-1], colours[1:]), axis=1)
+            self._trail.visible = True
         elif self._trail.visible:
             self._trail.visible = False
 
