@@ -142,8 +142,7 @@ class ProcessRecorder:
         self._status_rest = b""
         self._process: subprocess.Popen[bytes] | None = None
         _prepare(recording.path)
-        # mkdtemp makes the directory 0700: the socket is its owner's alone.
-        self._runtime = Path(tempfile.mkdtemp(prefix="disco-hw-", dir=_runtime_root()))
+        self._runtime = _runtime_directory()
         self._endpoint = f"ipc://{self._runtime}/log"
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._socket = self._context.socket(zmq.PUSH)
@@ -280,7 +279,10 @@ class ProcessRecorder:
             silence_s=recording.silence_s,
         )
         start_file = self._runtime / f"start{self._part}"
-        start_file.write_bytes(msgspec.msgpack.encode(start))
+        try:
+            start_file.write_bytes(msgspec.msgpack.encode(start))
+        except OSError as error:
+            raise LogError(f"{start_file}: cannot be written ({error.strerror}); make room there") from None
         command = [sys.executable, "-m", "disco_hw.log.writer", str(start_file)]
         self._status = WriterStatus("recording", 0, 0, 0)
         self._status_rest = b""
@@ -291,8 +293,9 @@ class ProcessRecorder:
         with contextlib.suppress(BlockingIOError):
             while data := os.read(process.stdout.fileno(), _STATUS_BYTES):
                 *lines, self._status_rest = (self._status_rest + data).split(b"\n")
-                if lines:
-                    self._status = self._decode_status(lines[-1])
+                for line in lines[-1:]:
+                    with contextlib.suppress(msgspec.MsgspecError):
+                        self._status = self._decode_status(line)
         if self._status.error:
             self._last_error = self._status.error
 
@@ -300,6 +303,8 @@ class ProcessRecorder:
         assert process.stdout is not None
         process.stdout.close()
         self._process = None
+        self._refused += self._status.refused
+        self._status = msgspec.structs.replace(self._status, refused=0)
         if self._status.state == "finished":
             if not self._closing:
                 self._deaths += 1
@@ -332,7 +337,12 @@ def _prepare(path: Path) -> None:
         raise LogError(f"{path.parent}: cannot be written to; give another directory or mend its permissions")
 
 
-def _runtime_root() -> str:
-    """Where sockets of this user live."""
+def _runtime_directory() -> Path:
+    """A new directory for the socket, where sockets of this user live; mkdtemp makes it 0700, its owner's alone."""
     root = os.environ.get("XDG_RUNTIME_DIR", "")
-    return root if root and os.access(root, os.W_OK | os.X_OK) else tempfile.gettempdir()
+    if not (root and os.access(root, os.W_OK | os.X_OK)):
+        root = tempfile.gettempdir()
+    try:
+        return Path(tempfile.mkdtemp(prefix="disco-hw-", dir=root))
+    except OSError as error:
+        raise LogError(f"{root}: no directory can be made in it ({error.strerror}); set XDG_RUNTIME_DIR") from None

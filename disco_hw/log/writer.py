@@ -25,6 +25,7 @@ from disco_hw.log.mcap_log import McapLog
 _RECEIVE_HIGH_WATER = 256
 _LARGEST_BURST = 64
 _ORPHAN_DRAIN_S = 0.1
+_LONGEST_ERROR = 300
 
 
 class LogFile:
@@ -80,7 +81,8 @@ class StatusLine:
         os.set_blocking(fd, False)
 
     def send(self, status: WriterStatus) -> None:
-        """Write one line, or drop it."""
+        """Write one line, or drop it; a long error is cut, so that a line is written whole or not at all."""
+        status = msgspec.structs.replace(status, error=status.error[:_LONGEST_ERROR])
         with contextlib.suppress(BlockingIOError, BrokenPipeError):
             os.write(self._fd, msgspec.json.encode(status) + b"\n")
 

@@ -99,9 +99,10 @@ def test_a_record_that_cannot_be_encoded_costs_itself_only(path):
 
 def test_a_record_that_the_writer_refuses_is_counted_and_named(path):
     recorder = ProcessRecorder(recording(path))
-    recorder.put(5, [Event(1, "loud", "a", "b"), Event(1, "info", "a", "kept")])
+    recorder.put(5, [Event(1, "loud" * 5000, "a", "b"), Event(1, "info", "a", "kept")])
     stats = recorder.close()
     assert (stats.refused, stats.written) == (1, 1)
+    assert len(stats.last_error) < 1000
     assert "loud" in stats.last_error
     assert stats.writer_deaths == 0
 
@@ -109,7 +110,8 @@ def test_a_record_that_the_writer_refuses_is_counted_and_named(path):
 def test_a_writer_killed_is_noticed_counted_and_replaced_by_another_part(path):
     recorder = ProcessRecorder(recording(path))
     drive(recorder, 1, 50)
-    wait_until(lambda: recorder.poll().written > 0)
+    recorder.put(51, [Event(1, "loud", "a", "b")])
+    wait_until(lambda: recorder.poll().refused > 0)
     assert not recorder.restart()
     os.kill(recorder.writer_pid, signal.SIGKILL)
     wait_until(lambda: not recorder.poll().writer_alive)
@@ -117,15 +119,16 @@ def test_a_writer_killed_is_noticed_counted_and_replaced_by_another_part(path):
     assert stats.writer_deaths == 1
     assert "signal 9" in stats.last_error
     assert recorder.writer_pid is None
-    drive(recorder, 51, 10)
+    drive(recorder, 52, 10)
     assert recorder.poll().dropped_ticks == 10
+    assert recorder.poll().refused == 1
     assert recorder.restart()
     assert recorder.path == path.with_name("run.part2.mcap")
-    drive(recorder, 61, 20)
+    drive(recorder, 62, 20)
     final = recorder.close()
-    assert final.writer_deaths == 1
+    assert (final.writer_deaths, final.refused) == (1, 1)
     assert recorded_ticks(path) == list(range(1, 51))
-    assert recorded_ticks(recorder.path)[-20:] == list(range(61, 81))
+    assert recorded_ticks(recorder.path)[-20:] == list(range(62, 82))
     with open_log(recorder.path) as log:
         assert (log.metadata.part, log.summary().missing_ticks) == (2, 0)
 
