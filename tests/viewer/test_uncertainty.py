@@ -1,0 +1,43 @@
+import numpy as np
+
+from disco_hw.control.parameter_points import unscented_points
+from disco_hw.log import records
+from disco_hw.model import Model, load_model
+from disco_hw.model.free_run import FreeRun
+from disco_hw.viewer.uncertainty import ParameterPoints
+from tests.viewer.run import MODEL_FILE, plan_at
+
+
+def test_paths_are_those_of_the_compiled_model():
+    model = load_model(MODEL_FILE)
+    plan = plan_at(0)
+    paths = ParameterPoints(model).trajectories(plan, (1.0, 2.0))
+    points, _ = unscented_points(model, 1.0)
+    runs = FreeRun(model, points, plan.step_s)
+    start = np.array([plan.path_x_m[0], plan.path_y_m[0], plan.path_yaw_rad[0], 1.0, 2.0])
+    commands = np.column_stack((plan.left_rad_s, plan.right_rad_s))
+    assert paths.shape == (len(points), 11, 2)
+    assert len(points) == 7
+    for index, path in enumerate(paths):
+        expected = runs.states(start, commands, 0, 0.0, index)[:, :2]
+        assert np.abs(path - expected).max() < 1e-9
+
+
+def test_a_point_estimate_gives_one_path():
+    model = Model(0.06, 0.3, 0.1)
+    assert ParameterPoints(model).trajectories(plan_at(0), (0.0, 0.0)).shape == (1, 11, 2)
+
+
+def test_no_path_of_a_plan_without_one():
+    plan = records.Plan(0, 0, 0.1, (1.0,), (1.0,))
+    assert ParameterPoints(Model(0.06, 0.3)).trajectories(plan, (0.0, 0.0)).shape == (0, 0, 2)
+
+
+def test_a_uniform_prior_fans_out(recording):
+    from disco_hw.model.belief import Uniform
+
+    names = ("wheel_radius_m", "axial_distance_m", "x_icr_m")
+    prior = Uniform(names, np.array((0.02, 0.1, 0.0)), np.array((0.1, 0.5, 0.5)))
+    ends = ParameterPoints(Model(0.06, 0.3, belief=prior)).trajectories(plan_at(0), (0.0, 0.0))[:, -1]
+    exact = ParameterPoints(recording.stage.model).trajectories(plan_at(0), (0.0, 0.0))[:, -1]
+    assert np.ptp(ends, axis=0).max() > 2.0 * np.ptp(exact, axis=0).max()
