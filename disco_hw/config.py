@@ -29,7 +29,7 @@ class Robot(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     wheel_radius_m: Annotated[float, Meta(gt=0.0, le=2.0)]
     axial_distance_m: Annotated[float, Meta(gt=0.0, le=5.0)]
     x_icr_m: Annotated[float, Meta(ge=-2.0, le=2.0)] = 0.0
-    ticks_per_rev: Annotated[int, Meta(ge=1, le=65535)]
+    ticks_per_rev: Annotated[float, Meta(ge=1.0, le=65535.0)]
     max_wheel_speed_rad_s: Annotated[float, Meta(gt=0.0, le=65.5)]
     max_wheel_acceleration_rad_s2: Annotated[float, Meta(gt=0.0, le=655.0)] = 20.0
 

@@ -39,6 +39,7 @@ def run_sim(options: SimOptions) -> int:
         effects = dict(parse_hidden_effects(options.hide).items)
     except HiddenEffectError as error:
         raise InputError(f"--hide: {error}") from None
+    ticks_per_rev = _whole_ticks(setup)
     task = config.task
     x_m, y_m, yaw_rad = options.start or (task.center_x_m + task.radius_m, task.center_y_m, 1.5707963267948966)
     plant = true_parameters(setup, options.plant_seed)
@@ -61,7 +62,7 @@ def run_sim(options: SimOptions) -> int:
             effects=effects,
             seed=options.seed,
             firmware=FirmwareConfig(
-                ticks_per_rev=config.robot.ticks_per_rev,
+                ticks_per_rev=ticks_per_rev,
                 max_wheel_speed_rad_s=config.robot.max_wheel_speed_rad_s,
                 max_wheel_acceleration_rad_s2=config.robot.max_wheel_acceleration_rad_s2,
             ),
@@ -76,7 +77,7 @@ def true_parameters(setup: Setup, plant_seed: int | None) -> PlantParameters:
     """The plant at the model's mean, or drawn from the model's belief with this seed."""
     mean, covariance = geometry(setup.model)
     radius, axial, x_icr = mean
-    base = PlantParameters(ticks_per_rev=setup.config.robot.ticks_per_rev)
+    base = PlantParameters(ticks_per_rev=_whole_ticks(setup))
     if plant_seed is None:
         return replace(base, wheel_radius_m=radius, axial_distance_m=axial, x_icr_m=x_icr)
     order = (2, 0, 1)
@@ -86,3 +87,13 @@ def true_parameters(setup: Setup, plant_seed: int | None) -> PlantParameters:
         )
     except DrawError as error:
         raise InputError(f"{setup.model_file or setup.robot_file}: {error}") from None
+
+
+def _whole_ticks(setup: Setup) -> int:
+    """Ticks of the virtual robot's encoder, which counts whole ones as its firmware's LIMITS message does."""
+    ticks = setup.config.robot.ticks_per_rev
+    if ticks != round(ticks):
+        raise InputError(
+            f"{setup.robot_file}: robot.ticks_per_rev: {ticks} is not a whole number; the virtual robot needs one"
+        )
+    return round(ticks)

@@ -12,7 +12,7 @@ def check_limits(
     capabilities: Capabilities,
     max_wheel_speed_rad_s: float,
     max_wheel_acceleration_rad_s2: float,
-    ticks_per_rev: int,
+    ticks_per_rev: float,
 ) -> list[str]:
     """Compare robot.toml's limits with the firmware's; return a line for each that does not fit, none if all do.
 
@@ -35,7 +35,7 @@ def check_limits(
         )
     if ticks_per_rev != capabilities.ticks_per_rev:
         errors.append(
-            f"robot.ticks_per_rev: {ticks_per_rev} differs from the firmware's {capabilities.ticks_per_rev}; "
+            f"robot.ticks_per_rev: {ticks_per_rev:g} differs from the firmware's {capabilities.ticks_per_rev}; "
             f"write {capabilities.ticks_per_rev}, or flash the firmware for this encoder"
         )
     return errors

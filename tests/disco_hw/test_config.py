@@ -47,7 +47,7 @@ def test_shipped_robot_file_is_valid():
         (("wheel_radius_m = 0.06", "wheel_radius_m = -1.0"), ["robot.wheel_radius_m", "> 0.0"]),
         (("wheel_radius_m = 0.06", "wheel_radius_m = nan"), ["wheel_radius_m"]),
         (("wheel_radius_m = 0.06", 'wheel_radius_m = "six"'), ["robot.wheel_radius_m", "str", "float"]),
-        (("ticks_per_rev = 2048", "ticks_per_rev = 20.5"), ["robot.ticks_per_rev", "int"]),
+        (("ticks_per_rev = 2048", "ticks_per_rev = true"), ["robot.ticks_per_rev", "bool", "float"]),
         (("[robot]", "[robott]"), ["robott", "no such field"]),
         (("[robot]", "[robot"), ["not valid TOML", "line"]),
         (("max_wheel_speed_rad_s = 8.0", "max_wheel_speed_rad_s = 2.0"), ["task.speed_m_s", "wheels"]),
