@@ -26,10 +26,14 @@ test: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -m 'not hil' -n 2
+	$(BIN)/python -m pytest -m hil
 
 bench: $(STAMP)
 	$(BIN)/python -m tools.bench
+
+firmware-check: $(STAMP)
+	$(BIN)/python -m tools.firmware_check
 
 firmware-check: $(STAMP)
 	$(BIN)/python -m tools.firmware_check
