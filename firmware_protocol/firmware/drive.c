@@ -65,14 +65,15 @@ static void obey_command(disco_firmware_t *core, float elapsed_s)
     drive->limited = drive->enabled && !disco_wheels_equal(drive->setpoint, core->command.target);
 }
 
-/* A controlled stop ends when it is done, or when it has taken too long, or when the loop cannot be trusted. */
+/* A controlled stop ends when it is done, or when it has taken too long, or when the loop cannot be trusted. The brake
+ * is on whenever the robot was not driven before, so no stop can begin from rest. */
 static bool may_decelerate(const disco_firmware_t *core)
 {
     const bool in_stop = (core->state == DISCO_STATE_STOPPING) || (core->state == DISCO_STATE_ESTOP);
     const uint64_t since_stop_us = core->now_us - core->drive.stop_since_us;
     const uint64_t since_command_us = core->now_us - core->command.last_accepted_us;
     const bool done = disco_wheels_equal(core->drive.setpoint, standstill) && disco_wheels_still(core);
-    return in_stop && core->drive.stopping && !core->drive.brake && !done && (core->faults.latched == 0u) &&
+    return in_stop && !core->drive.brake && !done && (core->faults.latched == 0u) &&
            (since_stop_us < core->config.stop_timeout_us) && (since_command_us < core->config.drive_off_timeout_us);
 }
 
@@ -81,13 +82,11 @@ void disco_drive_step(disco_firmware_t *core, float elapsed_s)
     disco_drive_t *drive = &core->drive;
     drive->limited = false;
     if (core->state == DISCO_STATE_ARMED) {
-        drive->stopping = true;
         obey_command(core, elapsed_s);
     } else if (may_decelerate(core)) {
         drive->limited = true;
         follow(core, standstill, core->config.stop_deceleration * elapsed_s);
     } else {
-        drive->stopping = false;
         off(drive, true);
     }
 }

@@ -78,7 +78,6 @@ typedef struct {
     bool enabled;
     bool brake;
     bool limited;
-    bool stopping; /* was driven since the last time the driver went off for good */
 } disco_drive_t;
 
 typedef struct {
