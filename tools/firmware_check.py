@@ -41,7 +41,14 @@ def warnings_of(name: str) -> str:
 
 
 def run_instrumented(tree: Path, flags: str) -> bool:
-    for part in ("firmware_protocol", "tests/firmware_protocol", "tools", "pyproject.toml", "setup.py"):
+    for part in (
+        "firmware_protocol",
+        "tests/firmware_protocol",
+        "tests/conftest.py",
+        "tools",
+        "pyproject.toml",
+        "setup.py",
+    ):
         source, target = ROOT / part, tree / part
         if source.is_dir():
             shutil.copytree(source, target, ignore=shutil.ignore_patterns("*.so", "*.o", "__pycache__", "_firmware.c"))
