@@ -93,13 +93,14 @@ def _spot(channel: Channel, best: Fit, name: str) -> BlindSpot:
 
 def _largest(channel: Channel, name: str) -> float | None:
     """The largest limit that cuts at least half a second of the commands."""
-    assert isinstance(channel, WheelChannel)
-    command = channel.timeline.command_rad_s
+    wheels = channel.inner
+    assert isinstance(wheels, WheelChannel)
+    command = wheels.timeline.command_rad_s
     command = command[np.isfinite(command[:, 0])]
     if name == "speed_limit":
         size = np.abs(command).max(axis=1)
     else:
-        size = np.abs(command[:, 1] - command[:, 0]) * channel.geometry[0] / channel.geometry[1]
+        size = np.abs(command[:, 1] - command[:, 0]) * wheels.geometry[0] / wheels.geometry[1]
     if size.size < 200 or size.max() < 1e-3:
         return None
     return float(0.97 * np.sort(size)[-50])

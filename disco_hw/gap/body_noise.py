@@ -39,7 +39,7 @@ class BodyNoise:
     slip_yaw_rad_s: float = 0.02
     slip_correlation_s: float = 0.3
     relative: float = 0.003
-    noise_correlation_s: float = 1e-3
+    noise_correlation_s: float = 0.02
 
     def vector(self) -> Array:
         """Logarithms, (9,)."""

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.gap.channels import BodyChannel, Channel, WheelChannel
-from disco_hw.gap.layout import BASE_COUNT, WHEEL, Layout
+from disco_hw.gap.layout import Layout
 from disco_hw.model.effects import REGISTRY
 from disco_hw.model.effects import Channel as Place
 
@@ -56,13 +56,14 @@ def _below_largest(turning: bool) -> Callable[[Channel], Starts]:
     """Limits start where they cut a part of what was commanded."""
 
     def starts(channel: Channel) -> Starts:
-        assert isinstance(channel, WheelChannel)
-        command = channel.timeline.command_rad_s
+        wheels = channel.inner
+        assert isinstance(wheels, WheelChannel)
+        command = wheels.timeline.command_rad_s
         command = command[np.isfinite(command[:, 0])]
         size = np.abs(0.5 * (command[:, 1] - command[:, 0])) if turning else np.abs(command).max(axis=1)
         largest = float(size.max()) if size.size else 0.0
         if turning:
-            largest *= 2.0 * channel.geometry[0] / channel.geometry[1]
+            largest *= 2.0 * wheels.geometry[0] / wheels.geometry[1]
         return tuple((share * largest,) for share in (0.92, 0.75, 0.5)) if largest > 0.1 else ()
 
     return starts
@@ -73,8 +74,9 @@ def _stiction_values(channel: Channel) -> tuple[float, ...]:
 
 
 def _change_times(channel: Channel) -> tuple[float, ...]:
-    assert isinstance(channel, BodyChannel)
-    first, last = float(channel.samples.t_s[0]), float(channel.samples.t_s[-1])
+    body = channel.inner
+    assert isinstance(body, BodyChannel)
+    first, last = float(body.samples.t_s[0]), float(body.samples.t_s[-1])
     if last - first < 30.0:
         return ()
     return tuple(np.arange(first + 10.0, last - 10.0, max(4.0, (last - first) / 40.0)).tolist())
@@ -110,8 +112,9 @@ CANDIDATES: Mapping[str, Candidate] = MappingProxyType(_competing())
 
 def candidates_of(layout: Layout) -> tuple[str, ...]:
     """Names of the effects that compete in the channel of a layout."""
-    wheels = layout is WHEEL
-    return tuple(name for name in CANDIDATES if (REGISTRY[name].channel is Place.COMMAND_TO_WHEEL) == wheels)
+    return tuple(
+        name for name in CANDIDATES if (REGISTRY[name].channel is Place.COMMAND_TO_WHEEL) == layout.of_wheels
+    )
 
 
 def parameters_of(names: tuple[str, ...]) -> int:
@@ -120,7 +123,6 @@ def parameters_of(names: tuple[str, ...]) -> int:
 
 
 def indices(channel: Channel, names: tuple[str, ...]) -> tuple[int, ...]:
-    """Places in the parameter vector of what a set of effects frees, after the base parameters."""
-    layout = channel.layout
-    base = range(0 if layout is WHEEL else BASE_COUNT)
-    return (*base, *(layout.place[column] for name in names for column in CANDIDATES[name].columns))
+    """Places in the parameter vector of what a set of effects frees, after those that are always free."""
+    place = channel.layout.place
+    return (*channel.free, *(place[column] for name in names for column in CANDIDATES[name].columns))

@@ -41,6 +41,14 @@ class Channel(Protocol):
         """The parameter vector without any effect, at the nominal geometry."""
 
     @property
+    def inner(self) -> WheelChannel | BodyChannel:
+        """The channel itself, without unnamed terms."""
+
+    @property
+    def free(self) -> tuple[int, ...]:
+        """Entries of the vector that are fitted whatever the effects."""
+
+    @property
     def block(self) -> Index:
         """Block of time of each residual, (n,)."""
 
@@ -48,8 +56,11 @@ class Channel(Protocol):
     def count(self) -> int:
         """Number of residuals that are used."""
 
-    def residual(self, p: Array, extra: Array | None = None) -> Array:
-        """Whitened residuals (n,) at a parameter vector; `extra` (M, k) is an unnamed term at the nodes."""
+    def residual(self, p: Array) -> Array:
+        """Whitened residuals (n,) at a parameter vector."""
+
+    def split(self, p: Array) -> tuple[Array, Array | None]:
+        """Entries of effects and base alone, and what unnamed terms add at the nodes, if any."""
 
 
 @dataclass(frozen=True)
@@ -102,6 +113,20 @@ class WheelChannel:
     def neutral(self) -> Array:
         """The parameter vector without any effect."""
         return WHEEL.neutral
+
+    @property
+    def inner(self) -> WheelChannel:
+        """The channel itself."""
+        return self
+
+    @property
+    def free(self) -> tuple[int, ...]:
+        """Entries of the vector that are fitted whatever the effects."""
+        return ()
+
+    def split(self, p: Array) -> tuple[Array, Array | None]:
+        """The vector; there are no unnamed terms in it."""
+        return p, None
 
     @property
     def block(self) -> Index:
@@ -225,6 +250,20 @@ class BodyChannel:
     def neutral(self) -> Array:
         """The parameter vector without any effect, at the given geometry."""
         return np.concatenate([self.geometry[:BASE_COUNT], BODY.neutral[BASE_COUNT:]])
+
+    @property
+    def inner(self) -> BodyChannel:
+        """The channel itself."""
+        return self
+
+    @property
+    def free(self) -> tuple[int, ...]:
+        """Entries of the vector that are fitted whatever the effects."""
+        return tuple(range(BASE_COUNT))
+
+    def split(self, p: Array) -> tuple[Array, Array | None]:
+        """The vector; there are no unnamed terms in it."""
+        return p, None
 
     @property
     def block(self) -> Index:

@@ -73,8 +73,8 @@ def inflation(found: Fit, channel: Channel, added: tuple[int, ...]) -> float:
     return largest
 
 
-def compare(small: Fit, big: Fit, channel: Channel, parameters: int) -> Evidence:
-    """Evidence for `big` against `small`, which lacks `parameters` of its parameters."""
+def compare(small: Fit, big: Fit, channel: Channel, parameters: float) -> Evidence:
+    """Evidence for `big` against `small`, which lacks `parameters` of its parameters (more for one chosen among many)."""
     added = tuple(index for index in big.active if index not in small.active)
     factor = inflation(big, channel, added)
     gain = small.cost - big.cost

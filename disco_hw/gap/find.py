@@ -56,15 +56,15 @@ def find_gap(logs: DriveLog | Sequence[DriveLog], model: Model, progress: Progre
         notes.append("no commands: the way from command to wheel is not judged")
     say("intervals, blind spots and the gap on held-out data")
     outcome = Outcome(line, nominal_body, nominal_wheels, body, wheels)
-    effects = outcome.effects()
+    effects, unnamed = outcome.effects(), outcome.unnamed()
     amended, remarks = amended_model(
         model, {effect.name: effect.parameters for effect in outcome.effects(given=True)}, outcome.parts()
     )
     return GapReport(
         sources=log.sources,
-        channels=outcome.channels(effects),
+        channels=outcome.channels(effects, (term.channel for term in unnamed)),
         effects=effects,
-        unnamed=(),
+        unnamed=unnamed,
         blind_spots=outcome.blind_spots(effects),
         gap=outcome.gap() if body is not None else {},
         model=amended,

@@ -64,11 +64,9 @@ def jacobian(
     return out
 
 
-def sensitivity(
-    channel: Channel, vector: Array, places: tuple[int, ...], residual: Array, extra: Array | None = None
-) -> Array:
+def sensitivity(channel: Channel, vector: Array, places: tuple[int, ...], residual: Array) -> Array:
     """Derivative of a channel's residual with respect to some entries, (n, len(places))."""
-    return jacobian(lambda trial: channel.residual(trial, extra), vector, places, channel.layout, residual)
+    return jacobian(channel.residual, vector, places, channel.layout, residual)
 
 
 def solve(slope: Array, gradient: Array) -> Array:
@@ -80,17 +78,13 @@ def fit(
     channel: Channel,
     start: Array,
     active: tuple[int, ...],
-    extra: Array | None = None,
     iterations: int = _MOST_ITERATIONS,
 ) -> Fit:
-    """Fit the `active` entries from `start`; `extra` is an unnamed term that is held."""
+    """Fit the `active` entries from `start`."""
     layout = channel.layout
     chosen = list(active)
     low, high = layout.low[chosen], layout.high[chosen]
-
-    def residual(vector: Array) -> Array:
-        return channel.residual(vector, extra)
-
+    residual = channel.residual
     vector = start.copy()
     now = residual(vector)
     cost = 0.5 * float(now @ now)

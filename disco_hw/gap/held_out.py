@@ -14,6 +14,7 @@ from disco_hw.gap.fit import Fit, by_block, inverse
 from disco_hw.gap.free_runs import read_angles, run_body
 from disco_hw.gap.horizon import displacement, starts_of
 from disco_hw.gap.timeline import BLOCK_S, CELL_S
+from disco_hw.gap.wheel_noise import WANDER_S
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -54,10 +55,15 @@ class Starts:
 
 @dataclass(frozen=True)
 class Chain:
-    """Both channels with one parameter vector each: commands in, poses out; without wheels the measured ones."""
+    """Both channels with one parameter vector each: commands in, poses out; without wheels the measured ones.
+
+    The pushes are what unnamed terms add at the nodes.
+    """
 
     body: Array
     wheels: Array | None
+    body_push: Array | None = None
+    wheels_push: Array | None = None
 
 
 def smoothed_poses(channel: BodyChannel, p: Array) -> tuple[Array, Array]:
@@ -139,12 +145,14 @@ def chain_track(body: BodyChannel, wheels: WheelChannel | None, chain: Chain, ex
     p = chain.body.copy()
     scale = [body.layout.place[f"encoder_scale.{side}"] for side in ("left", "right")]
     push = np.zeros((line.t_s.size, 3)) if extra is None else extra
+    if chain.body_push is not None:
+        push = push + chain.body_push
     if wheels is None or chain.wheels is None:
         return run_body(p, line.angle_rad, line.speed_rad_s, push, line.first, line.t_s), line.speed_rad_s
     q = chain.wheels.copy()
     q[[wheels.layout.place[f"encoder_scale.{side}"] for side in ("left", "right")]] = 0.0
     p[scale] = 0.0
-    angle = wheels.angles(q)
+    angle = wheels.angles(q, chain.wheels_push)
     speed = np.gradient(angle, CELL_S, axis=0)
     speed[line.first] = 0.0
     return run_body(p, angle, speed, push, line.first, line.t_s), speed
@@ -270,7 +278,9 @@ def _disturbance(
     )
     if wheels is None:
         return extra, np.zeros(count)
-    error = _correlated(generator, count, 2, wheels.noise.correlation_s) * wheels.noise.relative * line.speed_rad_s
+    quick = _correlated(generator, count, 2, wheels.noise.correlation_s) * wheels.noise.relative
+    slow = _correlated(generator, count, 2, WANDER_S) * wheels.noise.wander
+    error = (quick + slow) * line.speed_rad_s
     extra[:, 0] += 0.5 * p[0] * error.sum(axis=1)
     extra[:, 2] += p[0] / p[1] * (error[:, 1] - error[:, 0])
     return extra, error.mean(axis=1)

@@ -75,7 +75,7 @@ def _profiled(found: Found, column: str, step: float) -> Estimate:
         while True:
             vector = best.vector.copy()
             vector[place] += sign * reach
-            if fit(channel, vector, active, selector.extra, 1).cost > best.cost + _RISE or reach > 64.0 * step:
+            if fit(channel, vector, active, 1).cost > best.cost + _RISE or reach > 64.0 * step:
                 break
             reach *= 2.0
         edges.append(float(best.vector[place] + sign * reach))

@@ -32,8 +32,9 @@ _UNLIMITED = 1e6
 
 @dataclass(frozen=True)
 class Layout:
-    """Columns of a channel's vector, its neutral point, and how each is varied."""
+    """Columns of a channel's vector, its neutral point, and how each is varied; `of_wheels` tells the channels apart."""
 
+    of_wheels: bool
     columns: tuple[str, ...]
     neutral: Array
     step: Array
@@ -52,6 +53,7 @@ def _layout(parameters: Mapping[str, Parameter], base: int) -> Layout:
     low = np.array([p.low for p in parameters.values()])
     low[[name == "command_delay.delay_s" for name in columns]] = _EARLIEST_DELAY_S
     return Layout(
+        of_wheels=base == 0,
         columns=columns,
         neutral=neutral,
         step=np.array([1e-4 if k < base else _STEPS.get(p.unit, _OTHER_STEP) for k, p in enumerate(parameters.values())]),

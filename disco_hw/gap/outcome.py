@@ -16,7 +16,7 @@ from disco_hw.gap.classes import ASYMMETRY, ENCODER, GAIN, OUTSIDE_TESTS, alike,
 from disco_hw.gap.fit import Fit, fit, inverse, sensitivity
 from disco_hw.gap.held_out import Chain, Errors, errors_of, floor_errors, fold_vectors, per_horizon, smoothed_poses
 from disco_hw.gap.intervals import Estimates, estimates
-from disco_hw.gap.report import ChannelFinding, EffectFinding
+from disco_hw.gap.report import ChannelFinding, EffectFinding, UnnamedFinding
 from disco_hw.gap.search import Found
 from disco_hw.gap.timeline import Timeline
 from disco_hw.gap.where import in_words, left_over, regimes
@@ -80,7 +80,7 @@ class Outcome:
             vector[channel.layout.place[f"{ENCODER}.{side}"]] = gain
         refitted = fit(channel, vector, indices(channel, names))
         selector = replace(self.body.selector, fits={frozenset(names): refitted}, proofs={})
-        return refitted, estimates(Found(selector, names))
+        return refitted, estimates(replace(self.body, selector=selector, names=names))
 
     def parts(self) -> tuple[Estimates, ...]:
         """Estimates of the channels, for the amended model."""
@@ -116,6 +116,15 @@ class Outcome:
         values = {side: estimated.by_name[f"{GAIN}.{side}"] for side in ("left", "right")}
         return EffectFinding(ENCODER, REGISTRY[ENCODER].channel.value, values, _evidence(wheels, GAIN))
 
+    def unnamed(self) -> tuple[UnnamedFinding, ...]:
+        """What is missing and none of the named effects."""
+        out = []
+        for place, found in ((Channel.COMMAND_TO_WHEEL, self.wheels), (Channel.WHEEL_TO_BODY, self.body)):
+            if found is None:
+                continue
+            out += [UnnamedFinding(place.value, term.form, term.evidence.score) for term in found.unnamed]
+        return tuple(out)
+
     def channels(self, effects: Iterable[EffectFinding], unnamed: Iterable[str] = ()) -> tuple[ChannelFinding, ...]:
         """Which channels disagree, and where."""
         guilty = {effect.channel for effect in effects} | set(unnamed)
@@ -129,18 +138,14 @@ class Outcome:
 
     @staticmethod
     def _regimes(found: Found):  # type: ignore[no-untyped-def]
-        channel = found.selector.channel
-        assert isinstance(channel, WheelChannel | BodyChannel)
-        return regimes(channel, found.selector.fit(found.selector.given), found.fit, found.selector.extra)
+        return regimes(found.channel, found.base.vector, *found.selector.split(found.names))
 
     def residue(self) -> tuple[str, ...]:
         """What is still missing after naming, by regime."""
         out: list[str] = []
         for found in (self.wheels, self.body):
             if found is not None:
-                channel = found.selector.channel
-                assert isinstance(channel, WheelChannel | BodyChannel)
-                out += left_over(channel, self._regimes(found), self.line)
+                out += left_over(found.channel, self._regimes(found), self.line)
         return tuple(out)
 
     def blind_spots(self, effects: Iterable[EffectFinding]) -> tuple[BlindSpot, ...]:
@@ -162,26 +167,23 @@ class Outcome:
         """Errors of prediction by stage and horizon on held-out data."""
         assert self.body is not None
         assert self._final_body is not None
-        body = self.body.selector.channel
+        body = self.body.channel
         assert isinstance(body, BodyChannel)
         final = self._final_body[0]
-        wheels = None if self.wheels is None else self.wheels.selector.channel
+        wheels = None if self.wheels is None else self.wheels.channel
         assert wheels is None or isinstance(wheels, WheelChannel)
         poses = smoothed_poses(body, final.vector)
-        base = self.body.selector.fit(self.body.selector.given)
-        refitted = fold_vectors(base, body.block)
+        refitted = fold_vectors(self.body.base, body.block)
         amended = fold_vectors(final, body.block)
         wheels_base = {0: self.nominal_wheels, 1: self.nominal_wheels}
         wheels_full = wheels_base
         if self.wheels is not None and wheels is not None:
-            wheels_base = fold_vectors(self.wheels.selector.fit(self.wheels.selector.given), wheels.block)
+            wheels_base = fold_vectors(self.wheels.base, wheels.block)
             wheels_full = fold_vectors(self.wheels.fit, wheels.block)
-        whole = Chain(final.vector, self.wheels.fit.vector if self.wheels else None)
-        if self._encoder[1] and wheels is not None:
-            whole, wheels_full = self._without_gain(whole, wheels_full, wheels)
+        whole = self._chain(final.vector, self.wheels.fit.vector if self.wheels else None)
 
         def chains(of_body: dict[int, Array], of_wheels: dict[int, Array]) -> dict[int, Chain]:
-            return {held: Chain(of_body[held], None if wheels is None else of_wheels[held]) for held in (0, 1)}
+            return {held: self._chain(of_body[held], None if wheels is None else of_wheels[held]) for held in (0, 1)}
 
         nominal = {0: self.nominal_body, 1: self.nominal_body}
         stages = {
@@ -196,20 +198,25 @@ class Outcome:
         table["floor"] = per_horizon(lambda ahead_s: floor_errors(body, wheels, whole, ahead_s, poses))
         return table
 
-    @staticmethod
-    def _without_gain(
-        whole: Chain, folds: dict[int, Array], wheels: WheelChannel
-    ) -> tuple[Chain, dict[int, Array]]:
-        """Wheels that turn as commanded, where it is the encoders that count wrong."""
-        places = [wheels.layout.place[f"{GAIN}.{side}"] for side in ("left", "right")]
+    def _chain(self, body: Array, wheels: Array | None) -> Chain:
+        """A chain of two vectors; where it is the encoders that count wrong, the wheels turn as commanded."""
+        assert self.body is not None
+        core, push = _split(self.body, body)
+        if self.wheels is None or wheels is None:
+            return Chain(core, None, push)
+        wheels_core, wheels_push = _split(self.wheels, wheels)
+        if self._encoder[1]:
+            places = [self.wheels.channel.layout.place[f"{GAIN}.{side}"] for side in ("left", "right")]
+            wheels_core = wheels_core.copy()
+            wheels_core[places] = 0.0
+        return Chain(core, wheels_core, push, wheels_push)
 
-        def cleared(vector: Array) -> Array:
-            out = vector.copy()
-            out[places] = 0.0
-            return out
 
-        assert whole.wheels is not None
-        return Chain(whole.body, cleared(whole.wheels)), {held: cleared(vector) for held, vector in folds.items()}
+def _split(found: Found, vector: Array) -> tuple[Array, Array | None]:
+    """Entries of effects and what terms add; a vector without terms is whole already."""
+    if vector.size == len(found.channel.layout.columns):
+        return vector, None
+    return found.selector.channel.split(vector)
 
 
 def _evidence(found: Found, name: str) -> float:

@@ -42,12 +42,11 @@ class EffectFinding:
 
 @dataclass(frozen=True)
 class UnnamedFinding:
-    """Something missing that is none of the named effects: its form, and the share of the channel's misfit it closes."""
+    """Something missing that is none of the named effects, as a term of the model."""
 
     channel: str
     form: str
     evidence: float
-    closes: float
 
 
 @dataclass(frozen=True)
@@ -95,7 +94,7 @@ class GapReport:
                 for effect in self.effects
             ],
             "unnamed": [
-                {"channel": term.channel, "form": term.form, "evidence": term.evidence, "closes": term.closes}
+                {"channel": term.channel, "form": term.form, "evidence": term.evidence}
                 for term in self.unnamed
             ],
             "residue": list(self.residue),

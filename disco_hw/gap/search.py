@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,16 +13,21 @@ from numpy.typing import NDArray
 from disco_hw.gap.body_noise import BodyNoise
 from disco_hw.gap.candidates import indices
 from disco_hw.gap.channels import BodyChannel, WheelChannel
-from disco_hw.gap.fit import Fit, fit
+from disco_hw.gap.evidence import Evidence, compare
+from disco_hw.gap.fit import Fit, fit, inverse
 from disco_hw.gap.horizon import displacement, starts_of
+from disco_hw.gap.layout import WHEEL
 from disco_hw.gap.noise_fit import learn_body_noise, learn_wheel_noise
-from disco_hw.gap.selection import Names, Selector, Thresholds
+from disco_hw.gap.selection import Names, Selector, Split, Thresholds
+from disco_hw.gap.terms import Term, WithTerms, body_terms, places, wheel_terms
 from disco_hw.gap.timeline import CELL_S, Timeline
 from disco_hw.gap.wheel_noise import WheelNoise
 
 Array = NDArray[np.float64]
 
 AHEAD_S = 2.0
+_MOST_TERMS = 3
+_WORTH_TRYING = 18.0
 _ROUGH = Thresholds(score=20.0, moves_m=0.0)
 _SMOOTH_WHEEL = ("motor_lag", "command_delay", "deadband", "battery_sag", "wheel_gain")
 _SMOOTH_BODY = (
@@ -36,29 +43,46 @@ _SMOOTH_BODY = (
 
 
 @dataclass(frozen=True)
+class UnnamedTerm:
+    """An accepted unnamed term: how it is written, with its coefficient, and its evidence."""
+
+    form: str
+    evidence: Evidence
+
+
+@dataclass(frozen=True)
 class Found:
-    """What a channel's search ended with: its selector (noise held, all fits kept) and the accepted effects."""
+    """What a channel's search ended with: its selector (noise held, all fits kept), accepted effects and terms."""
 
     selector: Selector
     names: Names
+    channel: WheelChannel | BodyChannel
+    unnamed: tuple[UnnamedTerm, ...] = ()
+    plain: Selector | None = None
 
     @property
     def fit(self) -> Fit:
-        """The fit of the accepted effects."""
+        """The fit of the accepted effects and terms."""
         return self.selector.fit(self.names)
 
+    @property
+    def base(self) -> Fit:
+        """The fit without anything that is missing."""
+        selector = self.plain or self.selector
+        return selector.fit(selector.given)
 
-def wheel_moves(channel: WheelChannel, geometry: Array) -> Callable[[Fit, Fit], float]:
+
+def wheel_moves(channel: WheelChannel, geometry: Array) -> Callable[[Split, Split], float]:
     """How far two fits of the wheels lie apart `AHEAD_S` ahead, m (root mean square, lever arm of half the way)."""
     line = channel.timeline
     usable = np.isfinite(line.command_rad_s[:, 0])
     start = starts_of(line.first, usable, AHEAD_S)
     ahead = round(AHEAD_S / CELL_S)
 
-    def moves(small: Fit, big: Fit) -> float:
+    def moves(small: Split, big: Split) -> float:
         if not start.size:
             return 0.0
-        difference = channel.angles(big.vector) - channel.angles(small.vector)
+        difference = channel.angles(*big) - channel.angles(*small)
         step = difference[start + ahead] - difference[start]
         way = line.angle_rad[start + ahead] - line.angle_rad[start]
         forward = 0.5 * geometry[0] * step.sum(axis=1)
@@ -69,19 +93,18 @@ def wheel_moves(channel: WheelChannel, geometry: Array) -> Callable[[Fit, Fit], 
     return moves
 
 
-def body_moves(channel: BodyChannel) -> Callable[[Fit, Fit], float]:
+def body_moves(channel: BodyChannel) -> Callable[[Split, Split], float]:
     """How far two fits of the body lie apart `AHEAD_S` ahead, m (root mean square)."""
     line = channel.timeline
     start = starts_of(line.first, np.ones(line.t_s.size, dtype=bool), AHEAD_S)
     heading = np.interp(line.t_s[start], channel.samples.t_s, channel.measured[:, 2])
 
-    def moves(small: Fit, big: Fit) -> float:
+    def moves(small: Split, big: Split) -> float:
         if not start.size:
             return 0.0
-        ends = [
-            displacement(found.vector, channel.track(found.vector), channel.moving_s, start, heading, AHEAD_S)
-            for found in (small, big)
-        ]
+        ends = []
+        for p, extra in (small, big):
+            ends.append(displacement(p, channel.track(p, extra), channel.moving_s, start, heading, AHEAD_S))
         apart = ends[1] - ends[0]
         lever = 0.5 * np.hypot(ends[1][:, 0], ends[1][:, 1])
         return float(np.sqrt(np.mean(apart[:, 0] ** 2 + apart[:, 1] ** 2 + (lever * apart[:, 2]) ** 2)))
@@ -102,7 +125,7 @@ def search_wheels(line: Timeline, geometry: Array, start: Array, given: Names = 
     rich = (*names, *(name for name in _SMOOTH_WHEEL if name not in names))
     channel = learn_wheel_noise(channel, fit(channel, rough.fit(names).vector, indices(channel, rich)).vector)
     selector = Selector(channel, moves, given=given, start=rough.fit(given).vector)
-    return Found(selector, selector.select())
+    return with_unnamed(Found(selector, selector.select(), channel), _wheel_options)
 
 
 def search_body(line: Timeline, start: Array, given: Names = ()) -> Found:
@@ -115,4 +138,77 @@ def search_body(line: Timeline, start: Array, given: Names = ()) -> Found:
     rich = (*names, *(name for name in _SMOOTH_BODY if name not in names))
     channel = learn_body_noise(channel, fit(channel, rough.fit(names).vector, indices(channel, rich)).vector)
     selector = Selector(channel, body_moves(channel), given=given, start=rough.fit(given).vector)
-    return Found(selector, selector.select())
+    return with_unnamed(Found(selector, selector.select(), channel), _body_options)
+
+
+def _wheel_options(found: Found) -> Iterator[Term]:
+    assert isinstance(found.channel, WheelChannel)
+    return wheel_terms(found.channel, WHEEL.at(found.fit.vector, "command_delay.delay_s"))
+
+
+def _body_options(found: Found) -> Iterator[Term]:
+    assert isinstance(found.channel, BodyChannel)
+    p = found.fit.vector
+    return chain(body_terms(found.channel, p), places(found.channel, p))
+
+
+def with_unnamed(found: Found, options: Callable[[Found], Iterator[Term]]) -> Found:
+    """Add unnamed terms as long as the best one is worth its price and that of the choice among all.
+
+    After each, the named effects are selected anew: one that only stood in for the term is not needed any more.
+    """
+    terms: tuple[Term, ...] = ()
+    accepted: tuple[UnnamedTerm, ...] = ()
+    plain = found.selector
+    while len(terms) < _MOST_TERMS:
+        best, tried = best_term(found, options(found))
+        if best is None:
+            break
+        channel = WithTerms.of(found.channel, (*terms, best))
+        small = found.fit
+        start = np.append(small.vector, 0.0)
+        selector = Selector(channel, found.selector.moves, given=found.selector.given, start=_extended(plain, channel))
+        selector.fits[frozenset(found.names)] = big = fit(channel, start, indices(channel, found.names))
+        parameters = 1.0 + 2.0 * math.log(tried) / math.log(channel.count)
+        proof = compare(small, big, channel, parameters)
+        moved = selector.moves(found.selector.channel.split(small.vector), channel.split(big.vector))
+        limits = plain.thresholds
+        if proof.score < limits.score or proof.repeated <= 0.0 or moved < limits.moves_m:
+            break
+        terms = (*terms, best)
+        names = selector.select()
+        coefficient = float(selector.fit(names).vector[-1])
+        accepted = (*accepted, UnnamedTerm(best.form.format(coefficient), proof))
+        found = Found(selector, names, found.channel, accepted, plain)
+    return found
+
+
+def _extended(plain: Selector, channel: WithTerms) -> Array:
+    """Where the fits of a channel with terms begin."""
+    start = plain.fit(plain.given).vector
+    return np.append(start, np.zeros(channel.neutral.size - start.size))
+
+
+def best_term(found: Found, options: Iterator[Term]) -> tuple[Term | None, int]:
+    """The term that promises most to first order, if it may be worth its price, and how many were tried."""
+    best, most, tried = None, _WORTH_TRYING, 0
+    small = found.fit
+    core, held = found.selector.channel.split(small.vector)
+    base = found.channel.residual(core, held)
+    normal, gradient = small.information(), small.jacobian.T @ small.residual
+    solved = inverse(normal)
+    for term in options:
+        tried += 1
+        size = float(np.sqrt((term.push**2).mean()))
+        if size < 1e-9:
+            continue
+        epsilon = 1e-3 / size
+        push = epsilon * term.push if held is None else held + epsilon * term.push
+        column = (found.channel.residual(core, push) - base) / epsilon
+        across = small.jacobian.T @ column
+        own = float(column @ column - across @ solved @ across)
+        pull = float(column @ small.residual - across @ solved @ gradient)
+        gain = 0.5 * pull * pull / own if own > 1e-9 * float(column @ column) else 0.0
+        if gain > most:
+            best, most = term, gain
+    return best, max(tried, 2)

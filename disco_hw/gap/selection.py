@@ -15,6 +15,7 @@ from disco_hw.gap.fit import Fit, fit, sensitivity, solve
 
 Array = NDArray[np.float64]
 Names = tuple[str, ...]
+Split = tuple[Array, Array | None]
 
 _MOST_EFFECTS = 6
 _WORTH_FITTING = 8.0
@@ -33,13 +34,12 @@ class Thresholds:
 class Selector:
     """Fits sets of effects of one channel, each once; `moves` tells how far a fit moves the prediction of another.
 
-    `extra` (M, k) is an unnamed term that is held. Effects `given` are in from the beginning, with values of `start`.
+    Effects `given` are in from the beginning, with values of `start`.
     """
 
     channel: Channel
-    moves: Callable[[Fit, Fit], float]
+    moves: Callable[[Split, Split], float]
     thresholds: Thresholds = Thresholds()
-    extra: Array | None = None
     given: Names = ()
     start: Array | None = None
     fits: dict[frozenset[str], Fit] = field(default_factory=dict)
@@ -51,7 +51,7 @@ class Selector:
         if key not in self.fits:
             if key <= frozenset(self.given):
                 begin = self.channel.neutral if self.start is None else self.start
-                self.fits[key] = fit(self.channel, begin, indices(self.channel, names), self.extra)
+                self.fits[key] = fit(self.channel, begin, indices(self.channel, names))
             else:
                 new = [name for name in names if key - {name} in self.fits] or [names[-1]]
                 options = [
@@ -61,6 +61,10 @@ class Selector:
                 self.fits[key] = min(options, key=lambda option: option.cost)
         return self.fits[key]
 
+    def split(self, names: Names) -> Split:
+        """Vector of effects of a set's fit, and what its unnamed terms add."""
+        return self.channel.split(self.fit(names).vector)
+
     def _with(self, parent: Fit, names: Names, new: Candidate) -> Fit:
         """Fit `names` from `parent`, which lacks `new`."""
         channel, layout = self.channel, self.channel.layout
@@ -68,23 +72,23 @@ class Selector:
         if new.profile is not None:
             return self._profiled(parent, active, new)
         if new.starts is None:
-            return fit(channel, parent.vector, active, self.extra)
+            return fit(channel, parent.vector, active)
         tried = []
         places = [layout.place[column] for column in new.columns]
         for values in new.starts(channel):
             vector = parent.vector.copy()
             vector[places] = values
-            tried.append(fit(channel, vector, active, self.extra, 2))
+            tried.append(fit(channel, vector, active, 2))
         if not tried:
-            return fit(channel, parent.vector, active, self.extra)
-        return fit(channel, min(tried, key=lambda option: option.cost).vector, active, self.extra)
+            return fit(channel, parent.vector, active)
+        return fit(channel, min(tried, key=lambda option: option.cost).vector, active)
 
     def _profiled(self, parent: Fit, active: tuple[int, ...], new: Candidate) -> Fit:
         """Search the profiled entry by its linear gain, then closer around the best, then refit everything."""
         assert new.profile is not None
         values = new.profile.values(self.channel)
         if not values:
-            return fit(self.channel, parent.vector, active, self.extra)
+            return fit(self.channel, parent.vector, active)
         gains = {value: self._linear_gain(parent, new, value) for value in values}
         spacing = values[1] - values[0]
 
@@ -114,7 +118,7 @@ class Selector:
         assert new.profile is not None
         vector = start.copy()
         vector[self.channel.layout.place[new.profile.column]] = value
-        return fit(self.channel, vector, active, self.extra, iterations)
+        return fit(self.channel, vector, active, iterations)
 
     def _linear_gain(self, parent: Fit, new: Candidate, value: float | None = None) -> float:
         """Gain in nats that the candidate promises to first order, from the parent's fit."""
@@ -123,9 +127,9 @@ class Selector:
         if value is not None and new.profile is not None:
             vector = vector.copy()
             vector[layout.place[new.profile.column]] = value
-            residual = channel.residual(vector, self.extra)
+            residual = channel.residual(vector)
         places = tuple(layout.place[column] for column in new.columns)
-        columns = sensitivity(channel, vector, places, residual, self.extra)
+        columns = sensitivity(channel, vector, places, residual)
         slope = np.column_stack([parent.jacobian, columns])
         if not slope.shape[1]:
             return parent.cost - 0.5 * float(residual @ residual)
@@ -150,7 +154,7 @@ class Selector:
         return (
             proof.score > limits.score
             and proof.repeated > 0.0
-            and self.moves(self.fit(smaller), self.fit(larger)) > limits.moves_m
+            and self.moves(self.split(smaller), self.split(larger)) > limits.moves_m
         )
 
     def promise(self, accepted: Names, name: str) -> float:

@@ -1,7 +1,7 @@
 """What is left of the wheels' angles when the model is right: quantisation, time stamps, wandering wheel speed.
 
-A Kalman filter per wheel with two states, drift of the angle and relative error of the speed, turns angle residuals
-into independent ones of unit variance. Its gains depend on the measured speed only, so whitening is linear.
+A Kalman filter per wheel with three states, drift of the angle, quick and slow relative error of the speed, turns angle
+residuals into independent ones of unit variance. Its gains depend on the measured speed only, so whitening is linear.
 """
 
 from __future__ import annotations
@@ -16,13 +16,15 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+WANDER_S = 20.0
 _START_VARIANCE = 0.04
 
 
 @dataclass(frozen=True, slots=True)
 class WheelNoise:
     """Relative speed error (1) and its correlation time (s); reading error (rad); jitter of the encoder's and of the
-    command's time stamps (s); drift of the angle (rad per square root of s).
+    command's time stamps (s); drift of the angle (rad per square root of s); slow relative speed error (1), which
+    wanders with `WANDER_S`.
     """
 
     relative: float = 0.015
@@ -31,9 +33,10 @@ class WheelNoise:
     stamp_s: float = 5e-4
     command_stamp_s: float = 1e-3
     drift_rad_sqrt_s: float = 1e-3
+    wander: float = 1e-3
 
     def vector(self) -> Array:
-        """Logarithms, (6,)."""
+        """Logarithms, (7,)."""
         values = (
             self.relative,
             self.correlation_s,
@@ -41,6 +44,7 @@ class WheelNoise:
             self.stamp_s,
             self.command_stamp_s,
             self.drift_rad_sqrt_s,
+            self.wander,
         )
         return np.log(np.array(values))
 
@@ -79,38 +83,40 @@ def _gains(
     gain: Array,
     scale: Array,
 ) -> None:
-    relative, correlation, reading, stamp, command_stamp, drift = (
-        math.exp(logs[0]),
-        math.exp(logs[1]),
-        math.exp(logs[2]),
-        math.exp(logs[3]),
-        math.exp(logs[4]),
-        math.exp(logs[5]),
-    )
+    relative, correlation, reading = math.exp(logs[0]), math.exp(logs[1]), math.exp(logs[2])
+    stamp, command_stamp, drift, wander = math.exp(logs[3]), math.exp(logs[4]), math.exp(logs[5]), math.exp(logs[6])
     for side in range(2):
-        a = b = c = 0.0
+        # Covariance of angle drift (a), quick (q) and slow (s) error of the speed.
+        aa = aq = as_ = qq = qs = ss = 0.0
         for k in range(dt.shape[0]):
             fast = abs(speed[k, side])
-            keep = math.exp(-dt[k] / correlation)
-            decay[k] = keep
+            keep, hold = math.exp(-dt[k] / correlation), math.exp(-dt[k] / WANDER_S)
+            decay[k, 0], decay[k, 1] = keep, hold
             reach[k, side] = fast * dt[k]
             if restart[k]:
-                a, b, c = _START_VARIANCE, 0.0, relative * relative
+                aa, aq, as_, qs = _START_VARIANCE, 0.0, 0.0, 0.0
+                qq, ss = relative * relative, wander * wander
             else:
                 go = reach[k, side]
-                a = a + 2.0 * go * b + go * go * c + drift * drift * dt[k] + command_stamp * command_stamp * jumps[k]
-                b = keep * (b + go * c)
-                c = keep * keep * c + relative * relative * (1.0 - keep * keep)
-            s = a + reading * reading + stamp * stamp * fast * fast
-            scale[k, side] = 1.0 / math.sqrt(s)
+                aa += 2.0 * go * (aq + as_) + go * go * (qq + 2.0 * qs + ss)
+                aa += drift * drift * dt[k] + command_stamp * command_stamp * jumps[k]
+                aq, as_ = keep * (aq + go * (qq + qs)), hold * (as_ + go * (qs + ss))
+                qq = keep * keep * qq + relative * relative * (1.0 - keep * keep)
+                ss = hold * hold * ss + wander * wander * (1.0 - hold * hold)
+                qs *= keep * hold
+            variance = aa + reading * reading + stamp * stamp * fast * fast
+            scale[k, side] = 1.0 / math.sqrt(variance)
             if not use[k]:
-                gain[k, side, 0] = gain[k, side, 1] = 0.0
+                gain[k, side, 0] = gain[k, side, 1] = gain[k, side, 2] = 0.0
                 continue
-            k0, k1 = a / s, b / s
-            gain[k, side, 0], gain[k, side, 1] = k0, k1
-            c -= k1 * b
-            b -= k1 * a
-            a -= k0 * a
+            ka, kq, ks = aa / variance, aq / variance, as_ / variance
+            gain[k, side, 0], gain[k, side, 1], gain[k, side, 2] = ka, kq, ks
+            qq -= kq * aq
+            qs -= kq * as_
+            ss -= ks * as_
+            aq -= ka * aq
+            as_ -= ka * as_
+            aa -= ka * aa
 
 
 @_compiled
@@ -125,13 +131,14 @@ def _whiten(
     out: Array,
 ) -> None:
     for side in range(2):
-        drift = error = 0.0
+        drift = quick = slow = 0.0
         for k in range(residual.shape[0]):
             if restart[k]:
-                drift, error = 0.0, 0.0
+                drift = quick = slow = 0.0
             else:
-                drift += reach[k, side] * error
-                error *= decay[k]
+                drift += reach[k, side] * (quick + slow)
+                quick *= decay[k, 0]
+                slow *= decay[k, 1]
             if not use[k]:
                 out[k, side] = 0.0
                 continue
@@ -139,7 +146,8 @@ def _whiten(
             # The first sample after a restart only says where the angle starts.
             out[k, side] = 0.0 if restart[k] else surprise * scale[k, side]
             drift += gain[k, side, 0] * surprise
-            error += gain[k, side, 1] * surprise
+            quick += gain[k, side, 1] * surprise
+            slow += gain[k, side, 2] * surprise
 
 
 def wheel_gains(
@@ -152,8 +160,8 @@ def wheel_gains(
 ) -> WheelGains:
     """Gains for samples `dt_s` apart (E,) at measured speeds (E, 2), with squared command jumps between them (E,)."""
     count = dt_s.size
-    decay, reach = np.empty(count), np.empty((count, 2))
-    gain, scale = np.empty((count, 2, 2)), np.empty((count, 2))
+    decay, reach = np.empty((count, 2)), np.empty((count, 2))
+    gain, scale = np.empty((count, 2, 3)), np.empty((count, 2))
     _gains(noise.vector(), dt_s, speed_rad_s, jumps, restart, use, decay, reach, gain, scale)
     return WheelGains(decay, reach, gain, scale, restart, use)
 

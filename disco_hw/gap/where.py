@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.gap.channels import BodyChannel, WheelChannel
-from disco_hw.gap.fit import Fit
 from disco_hw.gap.timeline import Samples, Timeline
 
 Array = NDArray[np.float64]
@@ -22,8 +21,8 @@ _FEWEST = 40
 # Mean squares of whitened residuals are one; a regime says something from here on.
 _EXCESS = 1.5
 _CLEAR_SIGMAS = 5.0
-_LARGEST_COMMAND_JITTER_S = 0.004
-_JITTER_RATIO = 3.0
+_LARGEST_COMMAND_JITTER_S = 0.005
+_JITTER_RATIO = 6.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,12 +68,14 @@ def masks(line: Timeline, samples: Samples) -> Mapping[str, Mask]:
     return {name: mask[samples.node] for name, mask in at_node.items()}
 
 
-def regimes(channel: WheelChannel | BodyChannel, before: Fit, after: Fit, extra: Array | None = None) -> list[Regime]:
-    """Every regime with enough samples, the one that improves most first."""
+def regimes(
+    channel: WheelChannel | BodyChannel, before: Array, after: Array, extra: Array | None = None
+) -> list[Regime]:
+    """Every regime with enough samples, from the vectors before and after, the one that improves most first."""
     samples = channel.timeline.encoder if isinstance(channel, WheelChannel) else channel.samples
     use = channel.gains.use if isinstance(channel, WheelChannel) else channel.use
-    first = (channel.whitened(before.vector) ** 2).mean(axis=1)
-    last = (channel.whitened(after.vector, extra) ** 2).mean(axis=1)
+    first = (channel.whitened(before) ** 2).mean(axis=1)
+    last = (channel.whitened(after, extra) ** 2).mean(axis=1)
     found = []
     for name, mask in masks(channel.timeline, samples).items():
         inside = mask & use
