@@ -34,7 +34,6 @@ class ReplayPage:
     def __init__(self, server: viser.ViserServer, recording: Recording) -> None:
         self.t_s = 0.0
         self.playing = False
-        self.drawn_in_s = 0.0
         self._recording = recording
         self._speed = 1.0
         self._lock = threading.Lock()
@@ -74,18 +73,17 @@ class ReplayPage:
             self._draw(t_s)
 
     def _draw(self, t_s: float) -> None:
-        begun_s = time.perf_counter()
+        now_s = time.monotonic()
         snapshot = self._recording.at(t_s)
-        everything = not self.playing or begun_s >= self._next_redraw_s
+        everything = not self.playing or now_s >= self._next_redraw_s
         self.scene.show(snapshot, everything)
         self._slider.value = round(t_s, 3)  # type: ignore[misc]
         if everything:
-            self._next_redraw_s = begun_s + REDRAW_S
+            self._next_redraw_s = now_s + REDRAW_S
             first_ns = self._recording.first_ns
             self._state.content = replay_text(snapshot, first_ns, self._recording.stage.task)
             self._events.content = events_text(snapshot, first_ns)
             self._plots.show(self._recording.timeline, snapshot.t_ns)
-        self.drawn_in_s = time.perf_counter() - begun_s
 
     def _redraw(self) -> None:
         with self._lock:

@@ -1,0 +1,53 @@
+"""The system's Chromium, headless, driven through Playwright; without either of them tests say so and are skipped."""
+
+import os
+import shutil
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+# Software rendering by name, since falling back to it is going away; no name but this machine's resolves.
+_ARGUMENTS = [
+    "--no-sandbox", "--disable-gpu", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-quic",
+    "--no-first-run", "--disable-background-networking", "--disable-component-update", "--disable-sync",
+    "--host-resolver-rules=MAP * ~NOTFOUND , EXCLUDE 127.0.0.1",
+]  # fmt: skip
+_NAMES = ("chromium", "chromium-browser", "google-chrome")
+ARTIFACTS = Path(os.environ.get("DISCO_HW_ARTIFACTS", "out/screenshots"))
+
+
+@contextmanager
+def chromium():
+    """A browser, for the block."""
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    found = next((path for path in map(shutil.which, _NAMES) if path), None)
+    if found is None:
+        pytest.skip("no Chromium on this machine: apt-get install chromium")
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=found, headless=True, args=_ARGUMENTS)
+        try:
+            yield browser
+        finally:
+            browser.close()
+
+
+@contextmanager
+def opened(browser, url, width=1000, height=700):
+    """A page of the address, and what its console said is kept in `page.said`."""
+    page = browser.new_page(viewport={"width": width, "height": height})
+    page.set_default_timeout(60_000)
+    page.said = []
+    page.on("console", lambda message: page.said.append(message.text))
+    page.on("request", lambda request: page.said.append(f"request {request.url}"))
+    page.goto(url)
+    try:
+        yield page
+    finally:
+        page.close()
+
+
+def keep(page, name):
+    """Keep a screenshot for a person to look at."""
+    ARTIFACTS.mkdir(parents=True, exist_ok=True)
+    page.screenshot(path=str(ARTIFACTS / f"{name}.png"))

@@ -1,0 +1,89 @@
+"""Pictures, clips and exported pages of a log, and the pages as processes."""
+
+import signal
+import subprocess
+import sys
+import urllib.request
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from disco_hw.errors import InputError
+from disco_hw.viewer import picture, scene
+from disco_hw.viewer.commands import export_log, snapshot_log, video_log
+
+
+def count_of(image, colour, tolerance=12):
+    near = np.abs(np.asarray(image.convert("RGB")).astype(int) - colour).max(axis=2) <= tolerance
+    return int(near.sum())
+
+
+def test_a_snapshot_shows_circle_and_robot(log_file, tmp_path):
+    snapshot_log(log_file, tmp_path / "end.png")
+    snapshot_log(log_file, tmp_path / "start.png", at_s=0.0)
+    end, start = (Image.open(tmp_path / f"{name}.png") for name in ("end", "start"))
+    assert count_of(end, scene.TASK_COLOUR) > 500
+    assert count_of(end, scene.PLAN_COLOUR) > 50
+    assert np.abs(np.asarray(end).astype(int) - np.asarray(start)).max() > 100, "nothing moved"
+
+
+def test_a_clip_moves(log_file, tmp_path):
+    video_log(log_file, tmp_path / "clip.gif", speed=20.0)
+    clip = Image.open(tmp_path / "clip.gif")
+    assert clip.n_frames == 3
+    first = np.asarray(clip.convert("RGB")).astype(int)
+    clip.seek(2)
+    assert np.abs(np.asarray(clip.convert("RGB")) - first).max() > 100
+
+
+def test_an_exported_page_is_whole(log_file, tmp_path):
+    export_log(log_file, tmp_path / "run.html")
+    text = (tmp_path / "run.html").read_text(encoding="utf-8")
+    assert text.lstrip().lower().startswith("<!doctype html")
+    assert 'src="http' not in text
+    assert len(text) > 500_000
+
+
+@pytest.mark.parametrize(
+    ("write", "name", "words"),
+    [
+        (snapshot_log, "a.txt", "no such kind of picture"),
+        (snapshot_log, "none/a.png", "no such directory"),
+        (video_log, "a.avi", "no such kind of clip"),
+        (video_log, "none/a.gif", "no such directory"),
+        (export_log, "none/a.html", "no such directory"),
+    ],
+)
+def test_a_name_that_cannot_be_written_is_told(log_file, tmp_path, write, name, words):
+    with pytest.raises(InputError, match=words):
+        write(log_file, tmp_path / name)
+
+
+def test_mp4_needs_ffmpeg(log_file, tmp_path, monkeypatch):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(InputError, match="ffmpeg"):
+        video_log(log_file, tmp_path / "a.mp4")
+
+
+def test_a_clip_without_end_is_refused(recording, tmp_path, monkeypatch):
+    monkeypatch.setattr(picture, "_LONGEST_S", 1.0)
+    with pytest.raises(InputError, match="--speed to at least 4"):
+        picture.draw_clip(recording, tmp_path / "a.gif", 1.0, lambda part: None)
+
+
+def test_a_page_is_served_until_it_is_told_to_end(log_file):
+    code = "import sys; from pathlib import Path; from disco_hw.viewer.commands import view_log\n"
+    code += f"sys.exit(view_log(Path({str(log_file)!r}), port=0))"
+    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    try:
+        line = process.stdout.readline()
+        assert line.startswith("page: http://127.0.0.1:")
+        with urllib.request.urlopen(line.split()[1], timeout=10) as answer:
+            assert answer.status == 200
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(10) == 0
+        assert process.stdout.read() == ""
+    finally:
+        process.kill()
+        process.wait()

@@ -1,0 +1,36 @@
+from disco_hw.log import records
+from disco_hw.viewer.marks import EVENT, FAULT, GATED, OVERRUN, REJECTED_FRAMES, marks_of
+from disco_hw.viewer.timeline import Timeline
+from tests.viewer.run import FAULT_TICK, GATED_TICK, OVERRUN_TICK, PERIOD_NS, REJECTED_TICK, START_NS
+
+
+def test_every_kind_is_found_at_its_tick(timeline):
+    found = {(mark.kind, (mark.t_ns - START_NS) // PERIOD_NS) for mark in marks_of(timeline)}
+    assert found == {
+        (EVENT, 10),
+        (FAULT, FAULT_TICK),
+        (GATED, GATED_TICK),
+        (OVERRUN, OVERRUN_TICK),
+        (REJECTED_FRAMES, REJECTED_TICK),
+    }
+
+
+def test_marks_are_in_order_and_say_what_happened(timeline):
+    marks = marks_of(timeline)
+    assert [mark.t_ns for mark in marks] == sorted(mark.t_ns for mark in marks)
+    words = {mark.kind: mark.text for mark in marks}
+    assert "OVERCURRENT" in words[FAULT]
+    assert "3.0 times the gate" in words[GATED]
+    assert words[REJECTED_FRAMES].startswith("3 frames")
+
+
+def test_what_goes_on_and_on_is_marked_once_in_half_a_second():
+    line = Timeline()
+    for tick in range(100):
+        t_ns = tick * PERIOD_NS
+        line.add(t_ns, records.Innovation(t_ns, (9.0,) * 3, (1.0,) * 3, 50.0, False))
+    assert [mark.t_ns for mark in marks_of(line)] == [0, 520_000_000, 1_040_000_000, 1_560_000_000]
+
+
+def test_an_empty_run_has_none():
+    assert marks_of(Timeline()) == ()

@@ -1,0 +1,119 @@
+"""The pages in a real browser: what is drawn, what the buttons do, what the page asks of the network."""
+
+import math
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from disco_hw.viewer import scene
+from disco_hw.viewer.commands import export_log
+from disco_hw.viewer.replay import ReplayPage, run_replay
+from disco_hw.viewer.server import serving
+from tests.viewer.browser import chromium, keep, opened
+from tests.viewer.run import RADIUS_M, pose_at
+
+HEIGHT_M, FIELD_OF_VIEW, SIZE = 2.5, math.radians(60.0), 480
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with chromium() as started:
+        yield started
+
+
+@pytest.fixture
+def replay(recording):
+    """A replay page that is running, and its address."""
+    with serving("test", port=0) as served:
+        page = ReplayPage(served.server, recording)
+        ending = threading.Event()
+        thread = threading.Thread(target=run_replay, args=(page, ending.is_set))
+        thread.start()
+        yield page, served
+        ending.set()
+        thread.join()
+
+
+def wait_for(page, condition, timeout_s=30.0):
+    """Let the browser work until something is so."""
+    deadline = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < deadline, "waited in vain"
+        page.wait_for_timeout(50)
+
+
+def from_above(page, server):
+    """What the browser draws of the scene, seen from above the origin: x to the right, y up."""
+    client = next(iter(server.get_clients().values()))
+    picture = []
+    position, down = (0.0, 0.0, HEIGHT_M), (0.0, 1.0, 0.0, 0.0)
+
+    def render():
+        picture.append(client.get_render(SIZE, SIZE, wxyz=down, position=position, fov=FIELD_OF_VIEW))
+
+    thread = threading.Thread(target=render)
+    thread.start()
+    wait_for(page, lambda: not thread.is_alive())
+    return picture[0][:, :, :3].astype(int)
+
+
+def pixel(x_m, y_m, z_m=0.0):
+    """Row and column of a point of the world."""
+    scale = 0.5 * SIZE / math.tan(0.5 * FIELD_OF_VIEW) / (HEIGHT_M - z_m)
+    return round(0.5 * SIZE - scale * y_m), round(0.5 * SIZE + scale * x_m)
+
+
+def hue_near(picture, row, column, reach=5):
+    """The most colourful pixel near a place."""
+    part = picture[row - reach : row + reach + 1, column - reach : column + reach + 1].reshape(-1, 3)
+    return part[np.argmax(np.ptp(part, axis=1))]
+
+
+def like(colour, wanted):
+    """Whether the order of the channels is that of the wanted colour, clearly."""
+    return np.argmax(colour) == np.argmax(wanted) and np.argmin(colour) == np.argmin(wanted) and np.ptp(colour) > 60
+
+
+def test_circle_and_robot_are_drawn_at_their_places_and_replay_is_sought(browser, replay):
+    page, served = replay
+    with opened(browser, served.url) as tab:
+        tab.get_by_role("button", name="Play").wait_for()
+        wait_for(tab, lambda: len(served.server.get_clients()) == 1)
+        tab.wait_for_timeout(1000)
+        for tick in (0, 150):
+            page.go_to(tick * 0.02)
+            tab.get_by_text(f"{tick * 0.02:.3f} s", exact=True).wait_for()
+            tab.wait_for_timeout(500)
+            picture = from_above(tab, served.server)
+            x_m, y_m, yaw_rad = pose_at(tick)
+            # Behind the middle, clear of the ellipse that is drawn above the body.
+            body = picture[pixel(x_m - 0.1 * math.cos(yaw_rad), y_m - 0.1 * math.sin(yaw_rad), 0.12)]
+            assert like(body, scene.BODY_COLOUR), body
+        for degrees in (100, 190, 280):
+            x_m, y_m = (RADIUS_M * part(math.radians(degrees)) for part in (math.cos, math.sin))
+            line = hue_near(picture, *pixel(x_m, y_m))
+            assert like(line, scene.TASK_COLOUR), (degrees, line)
+        assert not like(picture[pixel(0.0, 0.0)], scene.TASK_COLOUR)
+        keep(tab, "replay")
+        tab.get_by_role("button", name="+1", exact=True).click()
+        wait_for(tab, lambda: page.t_s == pytest.approx(3.02))
+        tab.get_by_role("button", name="Play").click()
+        wait_for(tab, lambda: page.t_s > 3.1)
+        slider = tab.get_by_role("slider").first
+        slider.focus()
+        slider.press("Home")
+        wait_for(tab, lambda: page.t_s == 0.0 and not page.playing)
+        elsewhere = [text for text in tab.said if text.startswith("request http") and served.url not in text]
+        assert elsewhere == []
+
+
+def test_an_exported_page_plays_from_the_file_alone(browser, log_file, tmp_path):
+    export_log(log_file, tmp_path / "run.html")
+    with opened(browser, (tmp_path / "run.html").as_uri()) as tab:
+        tab.locator("canvas").first.wait_for()
+        wait_for(tab, lambda: any("Embedded data loaded" in text for text in tab.said))
+        keep(tab, "export")
+        asked = [text for text in tab.said if text.startswith("request") and "http" in text]
+        assert asked == []

@@ -1,0 +1,84 @@
+import math
+
+import pytest
+
+from disco_hw.config import CircleTask
+from disco_hw.viewer.panel import escaped, events_text, live_details, live_head, number, replay_text
+from disco_hw.viewer.snapshot import snapshot_at
+from disco_hw.viewer.timeline import Timeline
+from tests.viewer.run import PERIOD_NS, START_NS, plan_at
+
+STATUS = {
+    "ok": True, "state": "ARMED", "detail": "running the task", "running": True, "estop": False, "link": "up",
+    "link_error": None, "robot_state": "ARMED", "fault": "NONE", "stop_cause": "NONE",
+    "task": {"laps": 1.5}, "transport": {"frames_received": 10, "frames_sent": 4, "malformed": 1},
+    "driver": {"rejected_crc": 2, "rejected_sequence": 3, "lost_frames": 5}, "recorder": {"last_error": ""},
+    "loop": {"lateness_us": {"p99": 100.4, "max": 900.0}, "overruns": 7, "skipped": 8},
+}  # fmt: skip
+
+
+def test_the_head_says_the_state_in_the_daemons_words():
+    text = live_head(STATUS, "")
+    assert "ARMED" in text
+    assert "running the task" in text
+    assert "latched" not in text
+
+
+@pytest.mark.parametrize("change", [{"estop": True}, {"robot_state": "ESTOP"}])
+def test_a_latched_stop_says_how_to_clear_it(change):
+    text = live_head(STATUS | change, "")
+    assert "latched" in text
+    assert "Reset" in text
+
+
+@pytest.mark.parametrize(
+    ("status", "error", "expected"),
+    [(None, "no daemon listens", "no daemon listens"), ({"ok": False, "error": "not started"}, "", "not started")],
+)
+def test_without_a_status_it_says_why(status, error, expected):
+    assert expected in live_head(status, error)
+    assert "| batches missed here | 3 |" in live_details(status, None, 3)
+
+
+def test_the_details_add_up_what_went_wrong(timeline):
+    text = live_details(STATUS, snapshot_at(timeline, START_NS + 50 * PERIOD_NS, plan_at(50)), 0)
+    assert "| rejected, lost | 6, 5 |" in text
+    assert "| loop late p99, max | 100, 900 us |" in text
+    assert "| overruns, skipped | 7, 8 |" in text
+    assert "| battery | 24.5 V |" in text
+    assert "rad/s (plan)" in text
+
+
+def test_a_replay_shows_the_same_motion_and_the_distance(timeline):
+    text = replay_text(snapshot_at(timeline, START_NS + 70 * PERIOD_NS, None), START_NS, CircleTask(radius_m=0.5))
+    assert text.startswith("### ARMED")
+    assert "| time | 1.400 s |" in text
+    assert "| distance | 250 mm |" in text
+    assert "OVERCURRENT" in text
+
+
+def test_an_empty_instant_can_be_shown():
+    shot = snapshot_at(Timeline(), 5, None)
+    assert "state not recorded" in replay_text(shot, 5, CircleTask())
+    assert "—" in replay_text(shot, 5, CircleTask())
+    assert events_text(None, None) == events_text(shot, 5) == "nothing yet"
+
+
+def test_events_are_listed_newest_first(timeline):
+    text = events_text(snapshot_at(timeline, START_NS + 50 * PERIOD_NS, None), START_NS)
+    assert "0.20 s" in text
+    assert "armed on request" in text
+
+
+def test_text_from_elsewhere_is_no_markup():
+    hostile = "<img src=x onerror=alert(1)>\n# [a](javascript:b) `c` | d"
+    text = escaped(hostile)
+    assert "<" not in text
+    assert "\n" not in text
+    for letter in "[`|#":
+        assert text.replace(f"\\{letter}", "").count(letter) == 0
+
+
+def test_numbers_that_are_none_become_a_dash():
+    assert number(None, 2) == number(math.nan, 2) == number(math.inf, 2) == "—"
+    assert number(1.005, 1) == "1.0"

@@ -1,0 +1,56 @@
+import pytest
+
+from disco_hw.errors import InputError
+from disco_hw.log.errors import LogError
+from disco_hw.log.recorder import ProcessRecorder
+from disco_hw.log.recorder import Recording as Written
+from disco_hw.viewer.recording import Recording
+from tests.viewer.run import ROBOT_FILE, plan_at, pose_at, tick_records
+
+
+def test_a_log_is_shown_as_it_was_recorded(recording, timeline):
+    assert recording.stage.name == "wombot"
+    assert recording.stage.model.belief is not None
+    assert recording.duration_s == pytest.approx(3.98)
+    assert len(recording.ticks) == 200
+    shot = recording.at(1.0)
+    assert shot.pose == pytest.approx(pose_at(50))
+    assert shot.plan == plan_at(50)
+    for name in ("estimate", "wheels", "command", "pose", "innovation", "planner", "loop", "power"):
+        got, expected = getattr(recording.timeline, name), getattr(timeline, name)
+        assert got.rows(0, 1 << 62)[1].tolist() == expected.rows(0, 1 << 62)[1].tolist(), name
+
+
+@pytest.mark.parametrize(
+    ("t_s", "tick"), [(-5.0, 0), (0.0, 0), (0.0199, 0), (0.02, 1), (0.03, 1), (3.98, 199), (99.0, 199)]
+)
+def test_an_instant_is_that_of_the_tick_before(recording, t_s, tick):
+    assert recording.tick_at(t_s) == tick
+    assert recording.at(t_s).pose == pytest.approx(pose_at(tick))
+    assert recording.seconds_of(tick) == pytest.approx(0.02 * tick)
+
+
+def test_a_log_without_its_robot_needs_one(tmp_path):
+    recorder = ProcessRecorder(Written(tmp_path / "bare.mcap", "x"))
+    recorder.put(*tick_records(0))
+    recorder.close()
+    with pytest.raises(InputError, match="--robot"):
+        Recording(tmp_path / "bare.mcap")
+    with Recording(tmp_path / "bare.mcap", ROBOT_FILE) as opened:
+        assert opened.stage.name == "wombot"
+        assert opened.duration_s == 0.0
+
+
+def test_a_log_without_estimates_is_told(tmp_path):
+    recorder = ProcessRecorder(Written(tmp_path / "empty.mcap", "x"))
+    recorder.put(1, tick_records(0)[1][:2])
+    recorder.close()
+    with pytest.raises(InputError, match="no estimates"):
+        Recording(tmp_path / "empty.mcap", ROBOT_FILE)
+
+
+def test_what_is_no_log_is_told(tmp_path):
+    with pytest.raises(LogError):
+        Recording(tmp_path / "missing.mcap")
+    with pytest.raises(LogError):
+        Recording(ROBOT_FILE)

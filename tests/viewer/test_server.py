@@ -1,0 +1,131 @@
+"""The guard in front of the page, with a real server and real requests."""
+
+import http.client
+import socket
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import pytest
+import viser
+import websockets.asyncio.server
+from websockets.datastructures import Headers
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
+
+from disco_hw.errors import InputError
+from disco_hw.viewer.server import Guard, serving
+
+SUBPROTOCOL = f"viser-v{viser.__version__}"
+
+
+@pytest.fixture(scope="module")
+def page():
+    with serving("test", port=0) as served:
+        yield served
+
+
+def get(port, path="/", host=None, **headers):
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
+    connection.request("GET", path, headers={"Host": host or f"127.0.0.1:{port}", **headers})
+    response = connection.getresponse()
+    body = response.read()
+    connection.close()
+    return response, body
+
+
+def upgrade(port, origin, headers=None):
+    address = f"ws://127.0.0.1:{port}/"
+    return connect(address, origin=origin, subprotocols=[SUBPROTOCOL], additional_headers=headers, open_timeout=10)
+
+
+def port_of(page):
+    return urlsplit(page.url).port
+
+
+def test_the_own_page_is_served_and_may_connect(page):
+    port = port_of(page)
+    response, body = get(port)
+    assert response.status == 200
+    assert b"<html" in body
+    for name in ("127.0.0.1", "localhost"):
+        assert get(port, host=f"{name}:{port}")[0].status == 200
+    with upgrade(port, f"http://127.0.0.1:{port}") as client:
+        assert client.recv(timeout=10)
+
+
+@pytest.mark.parametrize("origin", ["http://evil.example", "http://127.0.0.1:1", "null", None])
+def test_a_foreign_page_may_not_connect(page, origin):
+    with pytest.raises(InvalidStatus) as refused, upgrade(port_of(page), origin):
+        pass
+    assert refused.value.response.status_code == 403
+
+
+def test_a_foreign_name_for_this_machine_is_refused(page):
+    response, body = get(port_of(page), host="evil.example")
+    assert response.status == 403
+    assert b"this machine only" in body
+
+
+def test_it_listens_on_the_loopback_alone(page):
+    port = port_of(page)
+    listening = [line.split() for line in Path("/proc/net/tcp").read_text(encoding="ascii").splitlines()[1:]]
+    addresses = {row[1].split(":")[0] for row in listening if row[3] == "0A" and int(row[1].split(":")[1], 16) == port}
+    assert addresses == {"0100007F"}
+
+
+def test_nobody_gets_a_public_tunnel(page):
+    assert page.server.request_share_url() is None
+
+
+def test_a_taken_port_is_an_error_and_not_the_next_one():
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(InputError, match=f"--port {port}"), serving("test", port=port):
+            pass
+
+
+def test_a_host_of_another_machine_is_an_error():
+    with pytest.raises(InputError, match=r"192\.0\.2\.1"), serving("test", host="192.0.2.1", port=0):
+        pass
+
+
+def test_the_library_is_left_as_it_was(page):
+    assert websockets.asyncio.server.serve.__module__.startswith("websockets")
+
+
+def test_another_address_needs_its_token():
+    with serving("test", host="0.0.0.0", port=0) as served:
+        address = urlsplit(served.url)
+        port, token = address.port, address.query.removeprefix("token=")
+        assert len(token) >= 16
+        assert get(port)[0].status == 403
+        assert get(port, "/?token=wrong")[0].status == 403
+        assert get(port, host=f"robot.local:{port}", path="/?token=" + token[:-1])[0].status == 403
+        welcome, _ = get(port, f"/?token={token}")
+        assert welcome.status == 303
+        cookie = welcome.getheader("Set-Cookie")
+        assert "HttpOnly" in cookie
+        assert "SameSite=Strict" in cookie
+        pair = cookie.split(";")[0]
+        assert get(port, Cookie=pair)[0].status == 200
+        own = f"http://127.0.0.1:{port}"
+        with pytest.raises(InvalidStatus), upgrade(port, own):
+            pass
+        with pytest.raises(InvalidStatus), upgrade(port, "http://evil.example", headers={"Cookie": pair}):
+            pass
+        with upgrade(port, own, headers={"Cookie": pair}) as client:
+            assert client.recv(timeout=10)
+
+
+def test_a_page_in_the_making_answers_nobody():
+    guard = Guard()
+    headers = Headers({"Host": "127.0.0.1:8080", "Origin": "http://127.0.0.1:8080"})
+    assert guard.refusal("/", headers, upgrade=True).status_code == 503
+    guard.open = True
+    assert guard.refusal("/", headers, upgrade=True) is None
+
+
+@pytest.mark.parametrize("cookie", ["disco-hw-token=", "disco-hw-token", "=;;=", '"', "disco-hw-token=ö"])
+def test_odd_cookies_are_no_token(cookie):
+    guard = Guard(token="secret", open=True)
+    assert guard.refusal("/", Headers({"Host": "a", "Cookie": cookie}), upgrade=False).status_code == 403
