@@ -108,25 +108,25 @@ class ReferenceDriver:
     @property
     def detail(self) -> str:
         """One sentence for a person: why the state is what it is and what to do about it."""
-        status, note = self._status, self._arming.note
-        match self.state:
-            case DriverState.DISCONNECTED:
-                return f"the link is down; {note}" if note else "the link is down"
-            case DriverState.REFUSED:
-                return self._handshake.refusal or ""
-            case DriverState.HANDSHAKE:
-                return self._handshake_detail()
-            case DriverState.FAULT if status is not None:
+        state, status, note = self.state, self._status, self._arming.note
+        if state is DriverState.DISCONNECTED:
+            return f"the link is down; {note}" if note else "the link is down"
+        if self._handshake.refusal is not None:
+            return self._handshake.refusal
+        if state is DriverState.HANDSHAKE or status is None:
+            return self._handshake_detail()
+        match state:
+            case DriverState.FAULT:
                 return f"the robot reports {words.fault(status.fault)}"
-            case DriverState.ESTOP if status is not None:
+            case DriverState.ESTOP:
                 return words.estop(status.estop_source)
-            case DriverState.STOPPING if status is not None and status.state == "ARMED":
-                return note or "the robot is armed, but not by us or no longer wanted: it is being stopped"
             case DriverState.ARMING:
                 return "arming"
             case DriverState.ARMED:
                 return "armed"
-        return note or f"the robot is in {status.state if status is not None else 'an unknown state'}"
+            case DriverState.STOPPING if status.state == "ARMED":
+                return note or "the robot is armed, but not by us or no longer wanted: it is being stopped"
+        return note or f"the robot is in {status.state}"
 
     @property
     def capabilities(self) -> Capabilities | None:
@@ -162,12 +162,14 @@ class ReferenceDriver:
 
     def link_up(self, now_ns: int) -> None:
         """The medium has come up (again): start the handshake; any session is void."""
-        self._restart(now_ns, "the link was lost")
+        self._now_ns = now_ns
+        self._restart("the link was lost")
         self._link_is_up = True
 
     def link_down(self, now_ns: int) -> None:
         """The medium is gone: any session is void."""
-        self._restart(now_ns, "the link was lost")
+        self._now_ns = now_ns
+        self._restart("the link was lost")
         self._link_is_up = False
 
     def request(self, request: Request) -> None:
@@ -346,7 +348,7 @@ class ReferenceDriver:
         if sent_ns is None:
             return
         if self._clock.add(sent_ns, received_ns, int(decoded.values["receive_time"])):
-            self._restart(received_ns, "the robot has restarted")
+            self._restart("the robot has restarted")
             self._events.append("the robot has restarted: its clock was set back")
 
     def _mind_trust(self, now_ns: int) -> None:
@@ -354,14 +356,14 @@ class ReferenceDriver:
         refused = self._handshake.refusal is not None
         known = refused or self._status is not None or self.capabilities is not None
         if known and now_ns - self._last_heard_ns > (REFUSED_SILENCE_NS if refused else SILENCE_NS):
-            self._restart(now_ns, "the robot fell silent")
+            self._restart("the robot fell silent")
             self._events.append("the robot fell silent: new handshake")
         if self._telemetry.distrusts_clock:
             self._clock.forget()
             self._telemetry.restart()
             self._events.append("sample times contradict the robot's clock: synchronising anew")
 
-    def _restart(self, now_ns: int, why: str) -> None:
+    def _restart(self, why: str) -> None:
         self._handshake = self._new_handshake()
         self._reception.reset()
         self._transmission.forget()
@@ -371,9 +373,7 @@ class ReferenceDriver:
         self._time_requests.clear()
         self._status = None
         self._host_accepted = False
-        self._told = None
         self._foreign_told = False
-        self._last_heard_ns = self._now_ns = now_ns
 
     def _new_handshake(self) -> Handshake:
         return Handshake(PROTOCOL_MAJOR, PROTOCOL_MINOR, self._codec.dbc_hash)

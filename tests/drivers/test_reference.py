@@ -148,10 +148,36 @@ def test_a_restarted_robot_is_noticed_and_moves_nothing():
     bench.run(3.0)
     assert bench.driver.state in STILL
     assert bench.largest_speed == 0.0
-    assert any("restarted" in event or "contradict" in event for event in bench.events)
+    assert bench.events.count("sample times contradict the robot's clock: synchronising anew") == 1
     assert bench.wheels[-1].left_angle_rad == pytest.approx(angle, abs=0.05), "the encoder's new zero is no motion"
     assert bench.driver.synced
     bench.arm()
+
+
+def test_a_restart_that_only_the_clock_shows_is_noticed():
+    """Three laps of the sample times later to the microsecond, so that these go on as if nothing had happened."""
+    bench = make_bench(ReferenceRobot(boot_ns=START_NS - 10**10))
+    bench.run(4.0)
+    bench.robot = ReferenceRobot(boot_ns=START_NS - 10**10 + 3 * 1_310_720_000)
+    bench.run(3.0)
+    assert bench.events.count("the robot has restarted: its clock was set back") == 1
+    assert not any("contradict" in event for event in bench.events)
+    assert bench.driver.synced
+    assert bench.driver.state in STILL
+
+
+def test_the_ticks_of_another_robot_on_a_new_link_are_no_motion():
+    bench = make_bench()
+    bench.arm()
+    bench.run(1.0, (3.0, 3.0))
+    angle = bench.wheels[-1].left_angle_rad
+    bench.host_end.plug(False)
+    bench.run(0.1)
+    bench.robot = ReferenceRobot(boot_ns=START_NS, first_ticks=(123_456, 5))
+    bench.host_end.plug(True)
+    bench.run(2.0)
+    assert bench.wheels[-1].left_angle_rad == angle
+    assert bench.driver.stats.implausible_ticks == 0
 
 
 def test_a_robot_that_falls_silent_starts_a_new_handshake():
@@ -194,16 +220,23 @@ def test_arming_is_given_up_with_the_robots_own_reason():
     assert not bench.robot.armed
 
 
-def test_a_second_host_is_pointed_out_once():
+def test_a_second_host_is_pointed_out_once_a_link():
     bench = make_bench()
     bench.run_until(*STILL)
     other = CODEC.encode("TIME_REQUEST", 0, sequence=1)
+    told = "another host is on the link: it sends TIME_REQUEST; disconnect it"
     for _ in range(3):
         bench.inject_to_host(*other)
         bench.run(0.1)
-    assert [event for event in bench.events if "another host" in event] == [
-        "another host is on the link: it sends TIME_REQUEST; disconnect it"
-    ]
+    assert bench.events.count(told) == 1
+    bench.host_end.plug(False)
+    bench.run(0.1)
+    bench.host_end.plug(True)
+    bench.run(0.5)
+    assert bench.events.count(told) == 1
+    bench.inject_to_host(*other)
+    bench.run(0.1)
+    assert bench.events.count(told) == 2
 
 
 def test_a_second_host_that_commands_motion_stops_the_robot_but_never_drives_it():
@@ -220,6 +253,147 @@ def test_a_second_host_that_commands_motion_stops_the_robot_but_never_drives_it(
     assert bench.largest_speed < 1.01
     assert bench.driver.state is not DriverState.ARMED
     assert "another host is on the link: it sends WHEEL_COMMAND; disconnect it" in bench.events
+
+
+def test_a_new_link_voids_everything_even_if_its_loss_went_unseen():
+    bench = make_bench()
+    bench.arm()
+    bench.run(2.0, (1.0, 1.0))
+    driver = bench.driver
+    bench.host_end.receive()
+    for renew in (driver.link_up, driver.link_down):
+        renew(bench.now_ns)
+        assert driver.capabilities is None
+        assert driver.clock_offset_ns is None
+        assert not driver.synced
+    driver.link_up(bench.now_ns)
+    assert driver.state is DriverState.HANDSHAKE
+    assert set(names(driver.transmit(bench.now_ns, WheelCommand(1.0, 1.0, 0.1)))) == {
+        "HELLO_REQUEST",
+        "HOST_STATE",
+        "TIME_REQUEST",
+    }
+
+
+def answer(name, counter=0, **signals):
+    return ReceivedFrame(START_NS, Frame(*CODEC.encode(name, counter, **signals)))
+
+
+def limits(page):
+    if page == 0:
+        return answer("LIMITS", page=0, max_wheel_speed=8, max_wheel_acceleration=20, ticks_per_rev=2048)
+    return answer("LIMITS", page=1, command_timeout=0.1, drive_off_timeout=0.5, stop_deceleration=20)
+
+
+def hello():
+    return answer(
+        "HELLO",
+        protocol_major=1,
+        protocol_minor=0,
+        firmware_major=0,
+        firmware_minor=1,
+        firmware_patch=0,
+        capabilities=0,
+    )
+
+
+def test_says_which_part_of_the_handshake_is_missing():
+    driver = make_driver()
+    driver.link_up(START_NS)
+    driver.receive(START_NS, [hello(), limits(0)])
+    assert driver.detail == "waiting for the robot's BUILD, LIMITS"
+    driver.receive(START_NS, [answer("BUILD", dbc_hash=CODEC.dbc_hash, board_id=1), limits(1)])
+    assert driver.capabilities is not None
+    assert driver.detail == "waiting for the robot's SYSTEM_STATE"
+    later_ns = START_NS + 400 * MS
+    assert "HELLO_REQUEST" in names(driver.transmit(later_ns, None)), "until the robot says that it has accepted us"
+
+
+def test_a_response_to_a_request_of_the_last_link_teaches_nothing():
+    driver = make_driver()
+    driver.link_up(START_NS)
+    driver.transmit(START_NS, None)
+    driver.link_up(START_NS)
+    driver.receive(START_NS, [answer("TIME_RESPONSE", sequence=1, receive_time=5)])
+    assert driver.clock_offset_ns is None
+    driver.transmit(START_NS, None)
+    driver.receive(START_NS, [answer("TIME_RESPONSE", sequence=2, receive_time=5)])
+    assert driver.clock_offset_ns == START_NS - 5_000
+
+
+@pytest.mark.parametrize("call", ["receive", "transmit"])
+def test_silence_is_noticed_by_each_half_of_a_tick(call):
+    bench = make_bench()
+    bench.run_until(*STILL)
+    driver, later_ns = bench.driver, bench.now_ns + 501 * MS
+    if call == "receive":
+        assert "the robot fell silent: new handshake" in driver.receive(later_ns, ()).events
+    else:
+        driver.transmit(later_ns, None)
+    assert driver.state is DriverState.HANDSHAKE
+
+
+def test_a_robot_that_turns_out_to_be_another_is_commanded_no_more():
+    bench = make_bench()
+    bench.arm()
+    bench.run(0.5, (1.0, 1.0))
+    bench.inject_to_host(*CODEC.encode("BUILD", 0, dbc_hash=0x0BADCAFE, board_id=1))
+    bench.run_until(DriverState.REFUSED)
+    assert "WHEEL_COMMAND" not in names(bench.driver.transmit(bench.now_ns, WheelCommand(1.0, 1.0, 0.1)))
+    bench.run(1.0)
+    assert bench.robot.speed_rad_s == 0.0
+
+
+def test_an_emergency_stop_of_ours_ends_the_wish_to_be_armed():
+    bench = make_bench()
+    bench.arm()
+    bench.driver.estop(bench.now_ns)
+    assert bench.driver.state is DriverState.STOPPING
+    assert "no longer wanted" in bench.driver.detail
+    bench.run(1.0, (1.0, 1.0))
+    assert not bench.robot.armed, "even if the frames themselves are lost"
+
+
+def test_faults_and_emergency_stops_are_told_in_words():
+    bench = make_bench()
+    bench.arm()
+    bench.robot.press_estop(True)
+    bench.run_until(DriverState.ESTOP)
+    assert bench.driver.detail == "emergency stop button pressed; release it, then reset"
+    bench = make_bench()
+    bench.run_until(*STILL)
+    bench.robot.break_down(True)
+    bench.run_until(DriverState.FAULT)
+    assert bench.driver.detail == "the robot reports OVER_CURRENT_LEFT: look for what blocks the left wheels"
+    assert any(event == f"robot STANDBY -> FAULT, fault {bench.driver.detail[18:]}" for event in bench.events)
+
+
+def test_each_event_is_told_once():
+    bench = make_bench()
+    bench.arm()
+    bench.run(2.0)
+    told = [event for event in bench.events if not event.startswith("handshake complete: firmware 0.1.0, board 1")]
+    assert told == ["robot unknown -> STANDBY", "robot STANDBY -> READY", "robot READY -> ARMED"]
+    assert len(bench.events) == 4
+
+
+def test_slow_telemetry_is_handed_on():
+    bench = make_bench()
+    bench.run(6.0)
+    kinds = {
+        kind for readings in bench.readings for kind in ("motors", "power", "link_health") if getattr(readings, kind)
+    }
+    assert kinds == {"motors", "power", "link_health"}
+    *_, status = (status for readings in bench.readings for status in readings.status)
+    assert (status.state, status.fault, status.fault_code) == ("STANDBY", "NONE", 0)
+
+
+def test_commands_are_counted():
+    bench = make_bench()
+    bench.arm()
+    before = bench.driver.stats.commands_sent
+    bench.run(1.0, (1.0, 1.0))
+    assert bench.driver.stats.commands_sent - before == 50
 
 
 def names(frames):
