@@ -22,8 +22,14 @@ from disco_hw.viewer.server import DEFAULT_PORT, LOOPBACK, serving
 from disco_hw.viewer.stage import stage_of_robot
 
 
-def view_live(robot: Path, model: Path | None = None, host: str = LOOPBACK, port: int = DEFAULT_PORT) -> int:
-    """Serve the live page of this robot's daemon until SIGTERM or SIGINT; returns the exit code.
+def view_live(
+    robot: Path,
+    model: Path | None = None,
+    host: str = LOOPBACK,
+    port: int = DEFAULT_PORT,
+    ended: Callable[[], bool] = lambda: False,
+) -> int:
+    """Serve the live page of this robot's daemon until SIGTERM, SIGINT or `ended()`; returns the exit code.
 
     The daemon may come and go. Raises InputError for a bad file, or a host or port that cannot be listened to.
     """
@@ -32,7 +38,7 @@ def view_live(robot: Path, model: Path | None = None, host: str = LOOPBACK, port
     with StopSignals() as signals, serving(f"disco-hw: {stage.name}", host, port) as page:
         live = LivePage(page.server, stage, socket, robot)
         print(f"page: {page.url}", flush=True)
-        run_live(live, lambda: signals.received is not None)
+        run_live(live, lambda: signals.received is not None or ended())
     return 0
 
 

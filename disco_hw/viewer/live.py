@@ -62,8 +62,8 @@ class LivePage:
         with top.add_tab("Robot"):
             controls.add_estop(gui, controls.estop_asking(socket, robot_file), self._answered)
             controls.add_buttons(gui, controls.asking(socket), self._answered)
-            self._answer = gui.add_markdown("")
             self._head = gui.add_markdown("### connecting")
+            self._answer = gui.add_markdown("")
         # Of its own, so that the e-stop does not scroll away; and not in the corner where the page puts its notices.
         top.dock_above(gui.main_panel)
         self._details = gui.add_markdown("")
@@ -118,7 +118,7 @@ class LivePage:
             self._status, self._error = None, str(error)
 
     def _answered(self, text: str) -> None:
-        self._answer.content = f"> {escaped(text)}"
+        self._answer.content = f"*{escaped(text)}*"
 
 
 def run_live(page: LivePage, should_stop: Callable[[], bool]) -> None:

@@ -68,7 +68,7 @@ class Scene:
             )
         }
         self._trail = server.scene.add_line_segments(
-            "/trail", empty, np.zeros((1, 2, 3), np.uint8), thickness=0.012, visible=False
+            "/trail", empty, np.zeros((1, 2, 3), np.uint8), thickness=0.014, visible=False
         )
 
     def show(self, snapshot: Snapshot, everything: bool = True) -> None:
@@ -111,7 +111,7 @@ class Scene:
         )
         circle = shapes.circle_points(task.center_x_m, task.center_y_m, task.radius_m)
         self._task = scene.add_line_segments(
-            "/task", shapes.segments(circle, _GROUND_M), TASK_COLOUR, thickness=max(0.015, 0.015 * task.radius_m)
+            "/task", shapes.segments(circle, _GROUND_M), TASK_COLOUR, thickness=max(0.012, 0.006 * task.radius_m)
         )
         away = 0.8 + 1.1 * task.radius_m
         camera = self._server.initial_camera

@@ -1,0 +1,85 @@
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from disco_hw.viewer.beside import page_beside
+from tests.viewer.run import ROBOT_FILE
+
+_PARENT = """
+import sys, time
+from pathlib import Path
+from disco_hw.viewer.beside import page_beside
+with page_beside(Path(sys.argv[1]), None, "127.0.0.1", int(sys.argv[2])) as page:
+    print(page.pid, flush=True)
+    time.sleep(60)
+"""
+
+
+def free_port():
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        return taken.getsockname()[1]
+
+
+def wait_until(condition, timeout_s=20.0):
+    deadline = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < deadline, "waited in vain"
+        time.sleep(0.02)
+
+
+def listens(port):
+    with socket.socket() as probe:
+        return probe.connect_ex(("127.0.0.1", port)) == 0
+
+
+def gone(pid):
+    stat = Path(f"/proc/{pid}/stat")
+    return not stat.exists() or stat.read_text().rpartition(")")[2].split()[0] == "Z"
+
+
+def test_the_page_lives_as_long_as_the_block():
+    port = free_port()
+    with page_beside(ROBOT_FILE, None, "127.0.0.1", port) as page:
+        wait_until(lambda: listens(port))
+        assert os.getsid(page.pid) == page.pid
+    assert page.returncode == 0
+    assert not listens(port)
+
+
+def test_the_page_ends_when_its_parent_is_killed():
+    port = free_port()
+    parent = subprocess.Popen(
+        [sys.executable, "-c", _PARENT, str(ROBOT_FILE), str(port)], stdout=subprocess.PIPE, text=True
+    )
+    pid = int(parent.stdout.readline())
+    wait_until(lambda: listens(port))
+    parent.send_signal(signal.SIGKILL)
+    parent.wait()
+    wait_until(lambda: gone(pid))
+
+
+def test_a_page_that_cannot_start_does_not_matter(tmp_path, capfd):
+    with page_beside(tmp_path / "none.toml", None, "127.0.0.1", 0) as page:
+        assert page.wait(20) == 2
+    assert "none.toml" in capfd.readouterr().err
+
+
+def test_a_page_that_hangs_is_ended_all_the_same():
+    port = free_port()
+    with page_beside(ROBOT_FILE, None, "127.0.0.1", port) as page:
+        # From here on it would end in order.
+        wait_until(lambda: listens(port))
+        os.kill(page.pid, signal.SIGSTOP)
+    assert page.returncode == -signal.SIGKILL
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError])
+def test_what_the_block_raises_is_passed_on(error):
+    with pytest.raises(error), page_beside(ROBOT_FILE, None, "127.0.0.1", free_port()):
+        raise error
