@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -12,10 +12,14 @@ import numpy as np
 
 from disco_hw.config import load_robot_config
 from disco_hw.errors import WorkError
+from disco_hw.inference.calibration import LEVELS
+from disco_hw.inference.checks import CHECKS
 from disco_hw.inference.infer import Inference, InferOptions, infer
+from disco_hw.inference.report import report_html
 from disco_hw.inference.simulate import NAMES
 from disco_hw.log.load import load_drive
-from disco_hw.model import Model, save_model
+from disco_hw.model import Model
+from disco_hw.model.file import model_text
 
 _SHOWN = ("wheel_radius_m", "axial_distance_m", "x_icr_m")
 
@@ -32,8 +36,13 @@ class InferResult:
         """For `--json`."""
         return {
             "posterior": posterior_figures(self.inference),
-            "undetermined": [],
-            "outside_simulated": False,
+            "undetermined": list(self.inference.undetermined),
+            "outside_simulated": self.inference.predictive.outside_simulated,
+            "disagreements": [
+                {"check": check.name, "deviation": deviation, "effects": list(check.effects)}
+                for check, deviation in self.inference.predictive.disagreements
+            ],
+            "diagnostics": diagnostics(self.inference),
             "seconds": round(self.seconds, 3),
             "model": None if self.model_path is None else str(self.model_path),
         }
@@ -44,7 +53,51 @@ class InferResult:
         for name, figures in posterior_figures(self.inference).items():
             low, high = figures["ci90"]
             lines.append(f"{name:<18} {figures['mean']:.4f}   90 % between {low:.4f} and {high:.4f}")
+        lines += [f"undetermined: {sentence}" for sentence in self.inference.undetermined]
+        lines += warnings(self.inference)
+        lines += [f"note: {note}" for note in self.inference.drive.notes]
+        if self.model_path is not None:
+            lines.append(f"{self.model_path}: written in {self.seconds:.1f} s")
         return "\n".join(lines)
+
+
+def diagnostics(inference: Inference) -> dict[str, Any]:
+    """What a sceptic asks for, as numbers."""
+    calibration = inference.calibration
+    return {
+        "simulations": inference.fitted.simulations,
+        "effective_simulations": round(inference.effective_simulations, 1),
+        "sbc_p": dict(zip(NAMES, calibration.p_values.tolist(), strict=True)),
+        "coverage": {f"{level:g}": share for level, share in zip(LEVELS, calibration.coverage.tolist(), strict=True)},
+        "predictive_deviations": dict(
+            zip((check.name for check in CHECKS), inference.predictive.deviations.tolist(), strict=True)
+        ),
+        "outside_region": inference.outside_region,
+        "noise": asdict(inference.noise),
+        "driven_by": inference.drive.source,
+        "poses": int(inference.drive.t_s.size),
+        "duration_s": inference.drive.duration_s,
+    }
+
+
+def warnings(inference: Inference) -> list[str]:
+    """Sentences for whoever would trust the posterior too early."""
+    check = inference.predictive
+    lines = [
+        f"warning: {one.name}: {one.meaning}, {abs(deviation):.0f} standard deviations from every simulation "
+        f"(as {' or '.join(one.effects)} would do)"
+        for one, deviation in check.disagreements
+    ]
+    lines += [
+        f"warning: the posterior of {name} is pressed against the prior's edge; widen prior.{name} in robot.toml"
+        for name in check.edge
+    ]
+    if check.outside_simulated:
+        lines.append(
+            "warning: the log lies outside what was simulated, so the parameters may have absorbed what the "
+            "model lacks; run `disco-hw gap` on it next"
+        )
+    return lines
 
 
 def posterior_figures(inference: Inference) -> dict[str, dict[str, Any]]:
@@ -64,16 +117,27 @@ def infer_command(
     paper: bool = False,
     simulations: int | None = None,
     seed: int = 1,
+    report: Path | None = None,
     say: Callable[[str], None] = lambda _: None,
 ) -> InferResult:
-    """Infer the geometry from logs and write the model to `out`; raises InputError for what the user can mend."""
+    """Infer the geometry from logs; write the model to `out` and, if asked for, a page with pictures to `report`.
+
+    Raises InputError for what the user can mend and WorkError for files that cannot be written.
+    """
     began = perf_counter()
     config = load_robot_config(robot)
     drive = load_drive(list(logs), config.robot.ticks_per_rev, config.robot.wheel_radius_m)
     result = infer(drive, config, InferOptions(paper, simulations, seed), say)
     if out is not None:
-        try:
-            save_model(result.model(Model.nominal(config.robot)), out)
-        except OSError as error:
-            raise WorkError(f"{out}: cannot be written ({error.strerror}); give another path") from None
+        _write(out, model_text(result.model(Model.nominal(config.robot))))
+    if report is not None:
+        _write(report, report_html(result, posterior_figures(result), warnings(result)))
     return InferResult(result, out, perf_counter() - began)
+
+
+def _write(path: Path, text: str) -> None:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise WorkError(f"{path}: cannot be written ({error.strerror}); give another path") from None

@@ -27,7 +27,7 @@ from disco_hw.inference.noise import Noise
 
 Array = NDArray[np.float64]
 
-STATISTICS = ("r", "kappa", "a", "x_icr", "log r", "log kappa")
+STATISTICS = ("r", "kappa", "a", "x_icr")
 _SMALLEST = 1e-3
 _LARGEST_AXIAL_M = 3.0
 # Standard deviations of a vague prior on (r, x_icr, kappa), which keeps estimates finite where nothing moves.
@@ -101,7 +101,7 @@ def estimate_kernel(
 
 @dataclass(frozen=True, slots=True)
 class Estimates:
-    """The statistics of one drive; call it with poses (n, P, 3) for (n, 6) in the order of `STATISTICS`."""
+    """The statistics of one drive; call it with poses (n, P, 3) for (n, 4) in the order of `STATISTICS`."""
 
     roll_rad: Array
     run_pose: NDArray[np.int64]
@@ -109,11 +109,10 @@ class Estimates:
     yaw: Whitening
 
     def __call__(self, poses: Array) -> Array:
-        """Statistics (n, 6), finite for every finite pose."""
+        """Statistics (n, 4), finite for every finite pose."""
         radius, x_icr, kappa = self.raw(poses).T
         axial = np.clip(radius / np.where(np.abs(kappa) < _SMALLEST, _SMALLEST, kappa), 0.0, _LARGEST_AXIAL_M)
-        logs = [np.log(np.maximum(value, _SMALLEST)) for value in (radius, kappa)]
-        return np.column_stack([radius, kappa, axial, x_icr, *logs])
+        return np.column_stack([radius, kappa, axial, x_icr])
 
     def raw(self, poses: Array) -> Array:
         """Wheel radius, x_icr, kappa (n, 3) by generalised least squares."""

@@ -11,34 +11,39 @@ from numpy.typing import NDArray
 
 from disco_hw.config import RobotConfig
 from disco_hw.errors import InputError
+from disco_hw.inference.calibration import Calibration, calibrate, effective_simulations
 from disco_hw.inference.density_network import NetworkSettings
 from disco_hw.inference.estimates import estimates
 from disco_hw.inference.excitation import Excitation, excitation
 from disco_hw.inference.mixture_belief import belief_of
 from disco_hw.inference.noise import USUAL, Noise, measured_noise
 from disco_hw.inference.paper_statistics import paper_statistics
+from disco_hw.inference.predictive import Predictive, predictive
 from disco_hw.inference.region import Region
 from disco_hw.inference.rounds import Fitted, RoundSettings, run_rounds
 from disco_hw.inference.simulate import NAMES, Seeds, Simulator, Summary, physical_range
+from disco_hw.inference.undetermined import undetermined
 from disco_hw.log.drive import DriveLog
 from disco_hw.model import Mixture, Model
 
 Array = NDArray[np.float64]
 
 POSTERIOR_DRAWS = 4000
-DEFAULT_SIMULATIONS = 2000
+PREDICTIVE_SIMULATIONS = 120
+CALIBRATION_SIMULATIONS = 300
+DEFAULT_SIMULATIONS = 3000
 PAPER_SIMULATIONS = 1000
 _FEWEST_SIMULATIONS = 200
 _NOISE_PASSES = 3
 
 DEFAULT_ROUNDS = RoundSettings()
 # One round over the whole prior, as the paper has it; five components, as its pendulum's posterior.
-PAPER_ROUNDS = RoundSettings(shares=(1.0,), network=NetworkSettings(components=5))
+PAPER_ROUNDS = RoundSettings(shares=(1.0,), network=NetworkSettings(components=5, hidden=48))
 
 
 @dataclass(frozen=True, slots=True)
 class InferOptions:
-    """`paper`: the paper's statistics, commands as input, one round; `simulations`: over all rounds, None for 2000
+    """`paper`: the paper's statistics, commands as input, one round; `simulations`: over all rounds, None for 3000
     (paper: 1000).
     """
 
@@ -52,7 +57,7 @@ class Inference:
     """What the log says: posterior `draws` (D, 3) in the order of `NAMES`, the same as a belief, and how it came about.
 
     `observed` (S,) are the log's statistics; `outside_region` is the share of the network's posterior that fell outside
-    the region it was trained on.
+    the region it was trained on; `effective_simulations` is how many the posterior rests on.
     """
 
     drive: Excitation
@@ -66,6 +71,10 @@ class Inference:
     outside_region: float
     belief: Mixture
     options: InferOptions
+    predictive: Predictive
+    calibration: Calibration
+    effective_simulations: float
+    undetermined: tuple[str, ...]
     seconds: float
 
     def model(self, nominal: Model) -> Model:
@@ -102,6 +111,11 @@ def infer(
     draws, outside = fitted.draw(observed[None], POSTERIOR_DRAWS, rng)
     mixtures = fitted.network.mixtures(observed[None])
     belief = belief_of(mixtures, fitted.region, prior.low, prior.high, NAMES, rng)
+    say("posterior predictive check")
+    few = draws[0, :PREDICTIVE_SIMULATIONS]
+    check = predictive(drive, noise, simulator, few, prior.low, prior.high, options.seed + 2)
+    say("calibration")
+    calibration = calibrate(fitted, simulate, CALIBRATION_SIMULATIONS, options.seed + 3)
     return Inference(
         drive,
         noise,
@@ -114,6 +128,10 @@ def infer(
         float(outside[0]),
         belief,
         options,
+        check,
+        calibration,
+        effective_simulations(fitted, observed),
+        tuple(undetermined(draws[0], prior.low, prior.high, drive, options.paper)),
         perf_counter() - began,
     )
 

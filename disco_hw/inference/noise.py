@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import pairwise, product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,9 @@ from disco_hw.inference.excitation import Excitation
 Array = NDArray[np.float64]
 
 _LAGS_S = (0.0, 0.1, 0.2, 0.4, 0.8, 1.6, 3.0)
+_CORRELATIONS_S = (1e-3, 0.1, 0.2, 0.3, 0.5)
 _FEWEST_WINDOWS = 12
+_LEAST_RATIO = 0.5
 _SMALLEST = np.array([2e-4, 2e-4, 2e-4, 2e-4, 5e-4])
 _LARGEST = np.array([0.3, 0.5, 0.5, 0.5, 1.0])
 # Of a standard normal variable: the median of its square, and the mean of its square held at 9.
@@ -58,20 +60,26 @@ def measured_noise(drive: Excitation, theta: Array) -> Noise:
     """
     error = _errors(drive, theta)
     moved = np.concatenate([np.cumsum(drive.moving_s[lo:hi]) for lo, hi in _bounds(drive)])
-    rows: list[tuple[float, Array]] = []
+    rows: list[tuple[float, float, Array]] = []
     period_s = float(np.median(np.diff(drive.t_s)[~drive.starts[1:]]))
     for lag in sorted({max(1, round(lag_s / period_s)) for lag_s in _LAGS_S}):
         squares, moving = _windows(drive, error, moved, lag)
         length_s = lag * period_s
         for chosen in (moving < 0.05 * length_s, moving > 0.9 * length_s):
             if np.count_nonzero(chosen) >= _FEWEST_WINDOWS:
-                rows.append((float(np.mean(moving[chosen])), _variance(squares[chosen])))
+                # Windows overlap by half.
+                independent = 0.5 * np.count_nonzero(chosen) if lag > 1 else float(np.count_nonzero(chosen))
+                rows.append((float(np.mean(moving[chosen])), independent, _variance(squares[chosen])))
     if len(rows) < 3:
         return USUAL
     time_s = np.array([row[0] for row in rows])
-    variances = np.array([row[1] for row in rows])
-    forward, left, yaw = (_two_terms(time_s, variances[:, axis]) for axis in range(3))
+    counts = np.array([row[1] for row in rows])
+    variances = np.array([row[2] for row in rows])
+    forward, left, yaw = (_two_terms(time_s, counts, variances[:, axis]) for axis in range(3))
     position = 0.5 * (forward[0] + left[0])
+    # Short drives say little of the smaller one; wheels that slip one way on a floor slip the other way too.
+    least = _LEAST_RATIO**2 * max(forward[1], left[1])
+    forward, left = (forward[0], max(forward[1], least)), (left[0], max(left[1], least))
     found = np.sqrt([position, yaw[0], forward[1], left[1], yaw[1]])
     return Noise(*np.clip(found, _SMALLEST, _LARGEST).tolist())
 
@@ -83,17 +91,20 @@ def _variance(squares: Array) -> Array:
     return held
 
 
-def _two_terms(time_s: Array, variance: Array) -> tuple[float, float]:
+def _two_terms(time_s: Array, counts: Array, variance: Array) -> tuple[float, float]:
     """Sensor variance R and slip variance q per second in `variance = 2 R + q time`, both not negative.
 
-    Errors are relative: each row is weighted by its own variance.
+    Slip that keeps its direction for a while grows slower at first, as time - tau (1 - exp(-time / tau)); its rate later
+    on is what parameters feel. Errors are relative to the variance and fall with the number of windows.
     """
-    scale = 1.0 / np.maximum(variance, 1e-12)
+    precision = np.sqrt(counts)
+    scale = precision / np.maximum(variance, 1e-12)
     best, best_cost = (0.0, 0.0), np.inf
-    for use in ((True, True), (True, False), (False, True)):
-        columns = np.column_stack([np.full(time_s.size, 2.0), time_s])[:, use]
+    for tau_s, use in product(_CORRELATIONS_S, ((True, True), (True, False), (False, True))):
+        grown = time_s + tau_s * np.expm1(-time_s / tau_s)
+        columns = np.column_stack([np.full(time_s.size, 2.0), grown])[:, use]
         solution, *_ = np.linalg.lstsq(columns * scale[:, None], variance * scale, rcond=None)
-        cost = float(np.sum((columns @ solution * scale - 1.0) ** 2))
+        cost = float(np.sum((columns @ solution * scale - variance * scale) ** 2))
         if (solution >= 0.0).all() and cost < best_cost:
             full = np.zeros(2)
             full[list(use)] = solution

@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 Simulate = Callable[[Array, Seeds], Array]
 Say = Callable[[str], None]
 
-SCOUT = NetworkSettings(members=2, components=2, epochs=60, patience=8)
+SCOUT = NetworkSettings(members=2, epochs=60, patience=8)
 FULL = NetworkSettings()
 
 _DRAWS = 4000
@@ -31,8 +31,8 @@ class RoundSettings:
     all rounds but the last: it only has to find the region.
     """
 
-    shares: tuple[float, ...] = (0.2, 0.2, 0.2, 0.4)
-    deviations: float = 5.0
+    shares: tuple[float, ...] = (0.15, 0.15, 0.2, 0.5)
+    deviations: float = 4.5
     scout: NetworkSettings = SCOUT
     network: NetworkSettings = FULL
 

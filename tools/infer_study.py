@@ -1,0 +1,122 @@
+"""Recovery study of `infer`: robots drawn from the prior's plausible part, errors and coverage; pictures on request.
+
+python -m tools.infer_study --plants 20 --drive rich --out out/infer
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from disco_hw.config import Robot, RobotConfig
+from disco_hw.inference.infer import InferOptions, infer
+from disco_hw.inference.simulate import NAMES
+from sim.drives import make_drive
+from sim.log_csv import simulated_log
+from sim.plant_parameters import PlantParameters
+from tools.gap_logs import as_drive
+
+PLAUSIBLE = {"x_icr_m": (0.0, 0.3), "wheel_radius_m": (0.04, 0.10), "axial_distance_m": (0.2, 0.5)}
+LEVEL = 0.9
+
+
+def config() -> RobotConfig:
+    return RobotConfig(
+        robot=Robot(
+            name="study", wheel_radius_m=0.06, axial_distance_m=0.4, ticks_per_rev=2048, max_wheel_speed_rad_s=8.0
+        )
+    )
+
+
+def plant(seed: int) -> PlantParameters:
+    """A robot of the study, with sensor noise, disturbances and quantised encoders."""
+    rng = np.random.default_rng([seed, 77])
+    drawn = {name: float(rng.uniform(*span)) for name, span in PLAUSIBLE.items()}
+    return PlantParameters(**drawn).with_ideal_motors()
+
+
+def recover(seed: int, drive: str, simulations: int | None = None) -> dict[str, object]:
+    """Infer one robot from one drive of it."""
+    parameters = plant(seed)
+    rows = simulated_log(make_drive(drive, seed), parameters, None, seed)
+    times = np.array([t_s for t_s, _ in rows])
+    cells = np.array([[float(cell) if cell else np.nan for cell in row] for _, row in rows])[:, 1:]
+    result = infer(
+        as_drive(times - times[0], cells, parameters.ticks_per_rev),
+        config(),
+        InferOptions(simulations=simulations, seed=seed),
+    )
+    truth = np.array([getattr(parameters, name) for name in NAMES])
+    low, high = np.quantile(result.draws, [0.5 - LEVEL / 2, 0.5 + LEVEL / 2], axis=0)
+    return {
+        "seed": seed,
+        "truth": truth.tolist(),
+        "mean": result.draws.mean(axis=0).tolist(),
+        "sd": result.draws.std(axis=0).tolist(),
+        "rank": (result.draws < truth).mean(axis=0).tolist(),
+        "inside": ((low <= truth) & (truth <= high)).tolist(),
+        "sbc_p": result.calibration.p_values.tolist(),
+        "outside_simulated": result.predictive.outside_simulated,
+        "seconds": result.seconds,
+    }
+
+
+def figures(results: list[dict[str, object]]) -> dict[str, float]:
+    """The study in figures."""
+    truth, mean, sd = (np.array([one[key] for one in results]) for key in ("truth", "mean", "sd"))
+    error = np.abs(mean - truth)
+    inside = np.array([one["inside"] for one in results])
+    found: dict[str, float] = {
+        "x_icr.median_error_m": float(np.median(error[:, 0])),
+        "wheel_radius.median_error": float(np.median(error[:, 1] / truth[:, 1])),
+        "axial_distance.median_error": float(np.median(error[:, 2] / truth[:, 2])),
+    }
+    for index, name in enumerate(NAMES):
+        found[f"{name}.coverage90"] = float(inside[:, index].mean())
+        found[f"{name}.rms_z"] = float(np.sqrt(np.mean(((mean - truth) / sd)[:, index] ** 2)))
+    found["outside_simulated"] = float(np.mean([one["outside_simulated"] for one in results]))
+    found["seconds.median"] = float(np.median([one["seconds"] for one in results]))
+    return found
+
+
+def picture(results: list[dict[str, object]], path: Path) -> None:
+    """Errors with 90 % bars over the truth."""
+    figure = Figure(figsize=(9.0, 3.0), layout="constrained")
+    truth, mean, sd = (np.array([one[key] for one in results]) for key in ("truth", "mean", "sd"))
+    for index, (axis, name) in enumerate(zip(figure.subplots(1, 3), NAMES, strict=True)):
+        error_mm = 1e3 * (mean - truth)[:, index]
+        axis.errorbar(truth[:, index], error_mm, yerr=1.645e3 * sd[:, index], fmt="o", ms=3, color="#1f6f8b")
+        axis.axhline(0.0, color="#888", lw=0.8)
+        axis.set_xlabel(f"true {name}")
+        axis.set_ylabel("error (mm)")
+    figure.savefig(path, dpi=110)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n", maxsplit=1)[0])
+    parser.add_argument("--plants", type=int, default=20)
+    parser.add_argument("--first", type=int, default=0, help="seed of the first robot")
+    parser.add_argument("--drive", default="rich")
+    parser.add_argument("--out", type=Path, default=Path("out/infer"))
+    options = parser.parse_args()
+    options.out.mkdir(parents=True, exist_ok=True)
+    results = []
+    for seed in range(options.first, options.first + options.plants):
+        results.append(recover(seed, options.drive))
+        print(json.dumps(results[-1]), flush=True)
+    picture(results, options.out / f"recovery_{options.drive}.png")
+    found = figures(results)
+    (options.out / f"recovery_{options.drive}.json").write_text(
+        json.dumps({"figures": found, "robots": results}, indent=1), encoding="utf-8"
+    )
+    for key, value in found.items():
+        print(f"{key} {value:.4g}")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
