@@ -5,13 +5,10 @@ from collections import Counter
 from dataclasses import replace
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from drivers.reference import ESTOP_REPEATS, ReferenceDriver
 from drivers.types import DriverState, Frame, ReceivedFrame, Request, WheelCommand
-from firmware_protocol import e2e
-from firmware_protocol.codec import PROTOCOL, Codec
+from firmware_protocol.codec import Codec
 from tests.drivers.bench import MS, START_NS, Bench
 from tests.drivers.reference_robot import CONFIG, ReferenceRobot
 
@@ -95,89 +92,6 @@ def test_each_arming_has_a_session_of_its_own():
         bench.run(0.3)
     assert 0 not in sessions
     assert len(set(sessions)) == 4
-
-
-@pytest.mark.parametrize("jitter_ms", [0.0, 3.0])
-@pytest.mark.parametrize("skew", [0.0, 80e-6, -80e-6])
-def test_samples_carry_the_time_of_their_measurement(jitter_ms, skew):
-    """Over a link that delays every frame by 2 ms and some; the robot samples in each of its 1 ms cycles."""
-
-    def delay_ns(generator):
-        return 2 * MS + generator.expovariate(1.0) * jitter_ms * MS
-
-    robot = ReferenceRobot(boot_ns=START_NS - 123_456_789, skew=skew)
-    bench = make_bench(robot, delay_ns=delay_ns)
-    bench.arm()
-    bench.command = WheelCommand(4.0, -4.0, 0.1)
-    bench.run(4.0)
-    bench.readings.clear()
-    true_angle = {}
-    for number in range(3000):
-        if number % 40 == 0:
-            latency_ms = 150
-            sample_us = robot.us(bench.now_ns - latency_ms * MS)
-            robot.core.pose(1.0, 2.0, 0.5, sample_us, 0.01, 0.02)
-        true_angle[bench.now_ns] = robot.angle[0]
-        bench.step()
-    assert bench.driver.state is DriverState.ARMED
-    assert bench.driver.synced
-    tolerance_ns = (0.7 + 0.7 * jitter_ms) * MS
-    offset = bench.wheels[0].left_angle_rad - true_angle[round(bench.wheels[0].t_ns / MS) * MS]
-    resolution = 2 * 3.15 / CONFIG.ticks_per_rev
-    for sample in bench.wheels:
-        truth = true_angle.get(round(sample.t_ns / MS) * MS)
-        if truth is not None:
-            assert sample.left_angle_rad - offset == pytest.approx(
-                truth, abs=4.0 * tolerance_ns * 1e-9 + 3 * resolution
-            )
-    assert len(bench.poses) > 60
-    for pose in bench.poses:
-        age_ns = (pose.t_ns - START_NS) % (40 * MS)
-        sent_ns = (bench.poses[0].t_ns - START_NS) % (40 * MS)
-        assert min(abs(age_ns - sent_ns), 40 * MS - abs(age_ns - sent_ns)) < 2 * tolerance_ns
-        assert 150 * MS < pose.received_ns - pose.t_ns < 165 * MS + 12 * jitter_ms * MS
-
-
-def test_a_restarted_robot_is_noticed_and_moves_nothing():
-    bench = make_bench(ReferenceRobot(boot_ns=START_NS - 10**9))
-    bench.arm()
-    bench.run(3.0, (3.0, 3.0))
-    angle = bench.wheels[-1].left_angle_rad
-    bench.robot = ReferenceRobot(boot_ns=bench.now_ns)
-    bench.largest_speed = 0.0
-    bench.run(3.0)
-    assert bench.driver.state in STILL
-    assert bench.largest_speed == 0.0
-    assert bench.events.count("sample times contradict the robot's clock: synchronising anew") == 1
-    assert bench.wheels[-1].left_angle_rad == pytest.approx(angle, abs=0.05), "the encoder's new zero is no motion"
-    assert bench.driver.synced
-    bench.arm()
-
-
-def test_a_restart_that_only_the_clock_shows_is_noticed():
-    """Three laps of the sample times later to the microsecond, so that these go on as if nothing had happened."""
-    bench = make_bench(ReferenceRobot(boot_ns=START_NS - 10**10))
-    bench.run(4.0)
-    bench.robot = ReferenceRobot(boot_ns=START_NS - 10**10 + 3 * 1_310_720_000)
-    bench.run(3.0)
-    assert bench.events.count("the robot has restarted: its clock was set back") == 1
-    assert not any("contradict" in event for event in bench.events)
-    assert bench.driver.synced
-    assert bench.driver.state in STILL
-
-
-def test_the_ticks_of_another_robot_on_a_new_link_are_no_motion():
-    bench = make_bench()
-    bench.arm()
-    bench.run(1.0, (3.0, 3.0))
-    angle = bench.wheels[-1].left_angle_rad
-    bench.host_end.plug(False)
-    bench.run(0.1)
-    bench.robot = ReferenceRobot(boot_ns=START_NS, first_ticks=(123_456, 5))
-    bench.host_end.plug(True)
-    bench.run(2.0)
-    assert bench.wheels[-1].left_angle_rad == angle
-    assert bench.driver.stats.implausible_ticks == 0
 
 
 def test_a_robot_that_falls_silent_starts_a_new_handshake():
@@ -442,51 +356,3 @@ def test_a_command_leaves_in_time_or_not_at_all():
     assert values["session"] == bench.robot.session
     with pytest.raises(ValueError, match="left_speed"):
         bench.driver.transmit(bench.now_ns, WheelCommand(70.0, 0.0, 0.1))
-
-
-def protected(can_id, payload):
-    """A frame with a right checksum and any content."""
-    (layout,) = [layout for layout in PROTOCOL.messages if layout.can_id == can_id]
-    if layout.data_id is None:
-        return Frame(can_id, payload[:1])
-    body = payload[1:]
-    return Frame(can_id, bytes((e2e.crc8(body, layout.data_id),)) + body)
-
-
-CAN_IDS = [layout.can_id for layout in PROTOCOL.messages]
-ANY_FRAME = st.builds(Frame, st.integers(0, 0x7FF), st.binary(max_size=64))
-PROTECTED_FRAME = st.builds(protected, st.sampled_from(CAN_IDS), st.binary(min_size=8, max_size=8))
-ACTION = st.one_of(
-    st.tuples(st.just("receive"), st.lists(st.one_of(ANY_FRAME, PROTECTED_FRAME), max_size=10)),
-    st.tuples(st.just("request"), st.sampled_from(Request)),
-    st.tuples(st.just("transmit"), st.sampled_from([None, WheelCommand(1.0, -1.0, 0.1)])),
-    st.tuples(st.just("link"), st.booleans()),
-    st.tuples(st.just("wait"), st.integers(0, 5_000 * MS)),
-)
-
-
-@settings(max_examples=300, deadline=None)
-@given(st.lists(ACTION, max_size=60))
-def test_whatever_comes_nothing_is_raised_and_nothing_moves_unless_armed(actions):
-    driver = make_driver()
-    now_ns = START_NS
-    driver.link_up(now_ns)
-    for action, value in actions:
-        match action:
-            case "receive":
-                driver.receive(now_ns, [ReceivedFrame(now_ns, frame) for frame in value])
-            case "request":
-                driver.request(value)
-            case "transmit":
-                moving = driver.state is DriverState.ARMED
-                for outgoing in driver.transmit(now_ns, value):
-                    decoded = CODEC.decode(outgoing.frame.can_id, outgoing.frame.data)
-                    if decoded.name == "WHEEL_COMMAND" and decoded.values["left_speed"]:
-                        assert moving
-            case "link":
-                (driver.link_up if value else driver.link_down)(now_ns)
-            case "wait":
-                now_ns += value
-        assert driver.detail
-        assert driver.state in DriverState
-        assert driver.stats.frames_accepted >= 0
