@@ -123,6 +123,48 @@ def sim(
 
 
 @app.command()
+def drive(
+    robot: RobotFile,
+    gamepad: Annotated[bool, typer.Option("--gamepad", help="Drive with a gamepad instead of the keyboard.")] = False,
+    script: Annotated[
+        str | None, typer.Option(help="Drive by itself while the deadman is held: circle, steps or excite.")
+    ] = None,
+    unattended: Annotated[
+        bool, typer.Option("--unattended", help="Let the script hold the deadman: for virtual robots.")
+    ] = False,
+    seconds: Annotated[float | None, typer.Option(min=0.1, help="Break the script off after so long.")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the random steps.")] = 1,
+    model: ModelOption = None,
+    link: Annotated[str | None, typer.Option(help="Use this link instead of robot.toml's: can or serial.")] = None,
+    log_file: Annotated[Path | None, typer.Option("--log", help="Record to this file.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Drive by keyboard, gamepad or script, and record it for `infer` and `gap` (docs/drive.md)."""
+    from disco_hw.daemon.realtime import limit_thread_pools
+
+    limit_thread_pools()
+    from disco_hw.drive.commands import DriveOptions, run_drive
+
+    result = run_drive(
+        DriveOptions(
+            robot=robot,
+            model=model,
+            link=link,
+            log_file=log_file,
+            gamepad=gamepad,
+            script=script,
+            unattended=unattended,
+            seconds=seconds,
+            seed=seed,
+            as_json=as_json,
+        )
+    )
+    _print(result.as_dict(), as_json, result.as_text())
+    if not result.completed:
+        raise typer.Exit(1)
+
+
+@app.command()
 def ctl(
     robot: RobotFile,
     do: Annotated[str, typer.Argument(help="arm, start, stop, disarm, reset, estop, status or quit.")],

@@ -15,6 +15,7 @@ from disco_hw.errors import InputError
 Positive = Annotated[float, Meta(gt=0.0)]
 NonNegative = Annotated[float, Meta(ge=0.0)]
 Probability = Annotated[float, Meta(gt=0.0, lt=1.0)]
+Share = Annotated[float, Meta(gt=0.0, le=1.0)]
 Range = tuple[float, float]
 
 
@@ -112,6 +113,19 @@ class Daemon(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     realtime_priority: Annotated[int, Meta(ge=0, le=98)] = 80
 
 
+class Drive(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Driving by hand or script: speeds as shares of the robot's limits, and what the gamepad's axes and button do."""
+
+    speed_share: Share = 0.8
+    turn_share: Share = 0.6
+    gamepad_device: str = ""
+    gamepad_forward_axis: str = "-ABS_Y"
+    gamepad_left_axis: str = "-ABS_X"
+    gamepad_deadman: str = "BTN_TL"
+    gamepad_dead_zone: Annotated[float, Meta(ge=0.0, le=0.5)] = 0.1
+    gamepad_silence_s: NonNegative = 2.0
+
+
 class RobotConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The whole of robot.toml."""
 
@@ -124,6 +138,7 @@ class RobotConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     model: ModelFile = ModelFile()
     log: Log = Log()
     daemon: Daemon = Daemon()
+    drive: Drive = Drive()
 
 
 def load_robot_config(path: Path) -> RobotConfig:

@@ -29,6 +29,17 @@ class Planner(Protocol):
         """Forget the last plan, as at a new start."""
 
 
+class NoPlanner:
+    """In the place of a planner where the robot is driven by hand: it never has a plan."""
+
+    def plan(self, _now_ns: int, _state: PlannerState) -> Plan:
+        """Raise NoValidControl."""
+        raise NoValidControl("there is no planner: the robot is driven by hand")
+
+    def reset(self) -> None:
+        """Nothing is kept."""
+
+
 @dataclass(frozen=True, slots=True)
 class Off:
     """Nothing is sent to the wheels."""

@@ -17,6 +17,8 @@ from disco_hw.log.recorder import Recorder
 from disco_hw.pipeline import FollowTask, Motion, Off, Pipeline, Stand, Tick, untimed
 from drivers.types import Driver, DriverState, LinkState, Readings, RobotStatus, Transport, WheelCommand, WheelSample
 
+_FOLLOW_TASK = FollowTask()
+
 
 @dataclass(frozen=True, slots=True)
 class CoreTick:
@@ -73,11 +75,12 @@ class DaemonCore:
         requests: Sequence[UserRequest] = (),
         extra_records: Sequence[records.Record] = (),
         mark: Callable[[str], None] = untimed,
+        motion: Motion = _FOLLOW_TASK,
     ) -> CoreTick:
         """Advance by one tick: receive, decide, estimate, plan, command, record.
 
-        `extra_records` are recorded with the tick; `mark(stage)` is called at the end of each stage. Never raises on
-        what the robot sent.
+        `extra_records` are recorded with the tick; `mark(stage)` is called at the end of each stage; `motion` is what
+        the robot does if the supervisor allows motion. Never raises on what the robot sent.
         """
         self._follow_link(now_ns)
         frames = self.transport.receive()
@@ -85,7 +88,7 @@ class DaemonCore:
         self._remember(readings)
         output = self._supervisor.step(now_ns, self._inputs(now_ns, requests))
         mark("receive")
-        result = self.pipeline.step(now_ns, readings, _motion(output), mark)
+        result = self.pipeline.step(now_ns, readings, _motion(output, motion), mark)
         command = self._command(output, result)
         sent = self._send(now_ns, output, command)
         mark("send")
@@ -183,7 +186,7 @@ class DaemonCore:
             self.laps.pause()
 
 
-def _motion(output: Output) -> Motion:
+def _motion(output: Output, wanted: Motion) -> Motion:
     if output.motion_allowed:
-        return FollowTask()
+        return wanted
     return Stand() if output.zero_only else Off()

@@ -17,6 +17,7 @@ from disco_hw.daemon.clock import Clock, MonotonicClock
 from disco_hw.daemon.control_socket import ControlMessage, ControlServer
 from disco_hw.daemon.core import DaemonCore
 from disco_hw.daemon.loop import Loop
+from disco_hw.daemon.pilot import Pilot, TaskPilot
 from disco_hw.daemon.signals import StopSignals
 from disco_hw.daemon.states import State
 from disco_hw.daemon.status import counters, loop_figures, status
@@ -28,6 +29,7 @@ from disco_hw.log import records
 from disco_hw.log.link import Attachment
 from disco_hw.log.provenance import DBC, MODEL_TOML, ROBOT_TOML, attachment, version
 from disco_hw.log.recorder import NullRecorder, ProcessRecorder, Recorder, Recording
+from disco_hw.pipeline import NoPlanner, Planner
 from disco_hw.robot_setup import Setup, load_setup
 from disco_hw.viewer.feed import ViewerFeed, WatchedRecorder, feed_path
 from drivers.transport import open_transport
@@ -60,10 +62,21 @@ def run_daemon(options: DaemonOptions) -> int:
     """
     say: Say = _say_json if options.as_json else _say_text
     setup = load_setup(options.robot, options.model, options.link)
+    return serve(setup, options.log_file, say, TaskPilot(), lambda: make_planner(setup.config, setup.model))
+
+
+def serve(
+    setup: Setup, log_file: Path | None, say: Say, pilot: Pilot, new_planner: Callable[[], Planner] = NoPlanner
+) -> int:
+    """Run until SIGTERM, SIGINT, a quit request or the pilot's end, as `run_daemon`; returns the exit code.
+
+    `pilot` decides what the robot does while motion is allowed; `new_planner` is called twice, as one planner is used
+    up in the warm-up. Raises InputError.
+    """
     stop = StopPath()
     with StopSignals() as signals:
         try:
-            return _start(setup, options, signals, stop, say).run()
+            return _start(setup, log_file, signals, stop, say, pilot, new_planner).run()
         finally:
             # Whatever is interrupted here, the wheels come first: they were added last.
             for outcome in stop.run():
@@ -71,18 +84,26 @@ def run_daemon(options: DaemonOptions) -> int:
                     say("stop", f"{outcome.name}: {outcome.error}")
 
 
-def _start(setup: Setup, options: DaemonOptions, signals: StopSignals, stop: StopPath, say: Say) -> Daemon:
+def _start(
+    setup: Setup,
+    log_file: Path | None,
+    signals: StopSignals,
+    stop: StopPath,
+    say: Say,
+    pilot: Pilot,
+    new_planner: Callable[[], Planner],
+) -> Daemon:
     """Make everything, in the order that real time needs, and add to the stop path what must be undone."""
     config, link = setup.config, setup.config.link
-    planner = make_planner(config, setup.model)
-    warm_up(make_pipeline(config, setup.model, make_planner(config, setup.model)))
+    planner = new_planner()
+    warm_up(make_pipeline(config, setup.model, new_planner()))
     pipeline = make_pipeline(config, setup.model, planner)
     # The planner was compiled before: whoever finds the socket gets an answer.
     server = ControlServer(socket_path(config), ACTIONS)
     stop.add("control socket", server.close)
     feed = ViewerFeed(feed_path(server.path))
     stop.add("page feed", feed.close)
-    recorder = WatchedRecorder(_make_recorder(setup, options.log_file), feed)
+    recorder = WatchedRecorder(_make_recorder(setup, log_file), feed)
     stop.add("recorder", lambda: _close_recorder(recorder, say))
     for step in realtime.enter(config.daemon.realtime_priority):
         say("real time", str(step))
@@ -96,7 +117,7 @@ def _start(setup: Setup, options: DaemonOptions, signals: StopSignals, stop: Sto
     )
     stop.add("link", transport.close)
     core = assemble_core(config, transport, make_driver(), pipeline, recorder)
-    daemon = Daemon(core, server, recorder, MonotonicClock(), signals, say)
+    daemon = Daemon(core, server, recorder, MonotonicClock(), signals, say, pilot)
     stop.add("wheels", daemon.stop_wheels)
     if config.daemon.realtime_priority:
         say("real time", str(realtime.raise_loop_thread(config.daemon.realtime_priority)))
@@ -108,7 +129,14 @@ class Daemon:
     """The loop around the core: requests from the control socket, once-a-second housekeeping, the service manager."""
 
     def __init__(
-        self, core: DaemonCore, server: ControlServer, recorder: Recorder, clock: Clock, signals: StopSignals, say: Say
+        self,
+        core: DaemonCore,
+        server: ControlServer,
+        recorder: Recorder,
+        clock: Clock,
+        signals: StopSignals,
+        say: Say,
+        pilot: Pilot,
     ) -> None:
         self._core = core
         self._server = server
@@ -120,6 +148,7 @@ class Daemon:
         self._recorder_stats = recorder.poll()
         self._notifier = Notifier()
         self._signals = signals
+        self._pilot = pilot
         self._quit = False
         self._failed = False
         self._next_second_ns = 0
@@ -129,7 +158,7 @@ class Daemon:
     def run(self) -> int:
         """Run the loop until told to stop; returns the exit code. An exception ends it and is told, never swallowed."""
         try:
-            self._loop.run(self._tick, lambda: self._quit or self._signals.received is not None)
+            self._loop.run(self._tick, lambda: self._quit or self._signals.received is not None or self._pilot.done)
         except Exception as error:
             self._failed = True
             self._say("failed", f"{type(error).__name__}: {error}; stopping the robot")
@@ -179,9 +208,20 @@ class Daemon:
         mark = self._loop.stages.mark
         messages = self._server.poll()
         requests = tuple(UserRequest(message.action) for message in messages if message.action in _REQUESTS)
+        wanted = self._pilot.step(now_ns, self._core.last)
+        told = tuple(records.Event(now_ns, "info", "drive", text) for text in wanted.events)
         mark("control")
-        tick = self._core.tick(now_ns, requests, (self._timing(now_ns), *self._every_second(now_ns)), mark)
+        tick = self._core.tick(
+            now_ns,
+            (*requests, *wanted.requests),
+            (self._timing(now_ns), *self._every_second(now_ns), *told),
+            mark,
+            wanted.motion,
+        )
         self._answer(messages, tick.replies)
+        self._pilot.learn(now_ns, tick, tick.replies[len(requests) :])
+        for text in wanted.events:
+            self._say("drive", text)
         for text in tick.events:
             self._say("event", text)
         state = tick.output.state
@@ -232,7 +272,7 @@ class Daemon:
                 self._quit = True
                 body = {"ok": True, "text": "stopping the robot and ending"}
             else:
-                body = status(self._core, self._loop_figures, self._recorder_stats)
+                body = status(self._core, self._loop_figures, self._recorder_stats) | self._pilot.status()
             self._server.reply(message, body)
 
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import disco_hw
 from disco_hw.daemon.assembly import assemble_core, make_driver, make_pipeline, make_planner
 from disco_hw.daemon.core import CoreTick, DaemonCore
+from disco_hw.daemon.pilot import Pilot, TaskPilot
 from disco_hw.daemon.supervisor import UserRequest
 from disco_hw.log.recorder import MemoryRecorder
 from disco_hw.pipeline import Planner
@@ -32,6 +33,7 @@ class SimulatedStack:
     robot: VirtualRobot
     recorder: MemoryRecorder
     robot_end: object
+    pilot: Pilot = field(default_factory=TaskPilot)
     now_us: int = 0
 
     def run(self, duration_s: float, *requests: UserRequest) -> list[CoreTick]:
@@ -46,7 +48,11 @@ class SimulatedStack:
             for frame in self.robot.step(self.now_us):
                 self.robot_end.send(OutgoingFrame(frame, FOREVER_NS), self.now_us * 1000)
             if self.now_us % period_us == 0:
-                ticks.append(self.core.tick(self.now_us * 1000, requests))
+                now_ns = self.now_us * 1000
+                wanted = self.pilot.step(now_ns, self.core.last)
+                tick = self.core.tick(now_ns, (*requests, *wanted.requests), motion=wanted.motion)
+                self.pilot.learn(now_ns, tick, tick.replies[len(requests) :])
+                ticks.append(tick)
                 requests = ()
         return ticks
 

@@ -1,0 +1,1 @@
+"""Driving by hand or by script, through the daemon's own loop."""

@@ -1,0 +1,187 @@
+"""What `disco-hw drive` does: the daemon with a person or a script in the planner's place."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections import deque
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from disco_hw.config import RobotConfig
+from disco_hw.daemon.client import socket_path
+from disco_hw.daemon.clock import MonotonicClock
+from disco_hw.daemon.daemon import serve
+from disco_hw.drive.coverage import Coverage
+from disco_hw.drive.gamepad_source import GamepadSource
+from disco_hw.drive.hand_pilot import HandPilot
+from disco_hw.drive.keyboard import Keyboard
+from disco_hw.drive.keys import KeyHold
+from disco_hw.drive.script import Script, in_table, room_needed
+from disco_hw.drive.scripted import ScriptSource, Unattended
+from disco_hw.drive.scripts import make_script
+from disco_hw.drive.source import ManualSource
+from disco_hw.errors import InputError
+from disco_hw.robot_setup import Setup, load_setup
+from drivers.gamepad import Gamepad, GamepadError, GamepadMapping, open_gamepad
+
+_DISPLAY_TIMEOUT_S = 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class DriveOptions:
+    """What `disco-hw drive` was asked; None leaves what robot.toml says, `seconds` breaks a script off."""
+
+    robot: Path
+    model: Path | None = None
+    link: str | None = None
+    log_file: Path | None = None
+    gamepad: bool = False
+    script: str | None = None
+    unattended: bool = False
+    seconds: float | None = None
+    seed: int = 1
+    as_json: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class DriveResult:
+    """How a drive went: its log, what was excited, why it ended, and whether that was as wanted."""
+
+    log: Path
+    ended: str
+    completed: bool
+    coverage: dict[str, Any]
+    coverage_words: str
+
+    def as_dict(self) -> dict[str, Any]:
+        """The result for machines."""
+        return {**asdict(self), "log": str(self.log)}
+
+    def as_text(self) -> str:
+        """The result for a person."""
+        return f"{self.ended}\n{self.coverage_words}\nlog {self.log}"
+
+
+def run_drive(options: DriveOptions) -> DriveResult:
+    """Drive by keyboard, gamepad or script until that ends, and record it.
+
+    Runs the daemon's loop with its governor, supervisor and recorder; there is no planner, and no pose is needed.
+    Raises InputError for wrong options, files and devices.
+    """
+    setup = _without_pose(load_setup(options.robot, options.model, options.link))
+    config = setup.config
+    script = _script(options, config)
+    log_file = options.log_file or _new_log(config)
+    top_rad_s = config.drive.speed_share * config.robot.max_wheel_speed_rad_s
+    source = _source(options, config, script, top_rad_s)
+    try:
+        if script is not None and not options.as_json:
+            room = room_needed(script.at, script.duration_s, config.robot)
+            print("\n".join([*in_table(script), f"{script.duration_s:.0f} s, needs {room.in_words()}"]), flush=True)
+        coverage = Coverage(top_rad_s)
+        with _display(socket_path(config), shown=not options.as_json) as say:
+            serve(setup, log_file, say, HandPilot(source, coverage))
+    finally:
+        source.close()
+    return DriveResult(
+        log=log_file,
+        ended=source.ended or "stopped on request",
+        completed=source.completed,
+        coverage=coverage.as_dict(),
+        coverage_words=coverage.in_words(),
+    )
+
+
+def _without_pose(setup: Setup) -> Setup:
+    """Driving by hand needs no pose: the person sees the robot."""
+    estimation = msgspec.structs.replace(setup.config.estimation, pose_required=False)
+    return Setup(
+        setup.robot_file, setup.model_file, msgspec.structs.replace(setup.config, estimation=estimation), setup.model
+    )
+
+
+def _script(options: DriveOptions, config: RobotConfig) -> Script | None:
+    if options.script is None:
+        if options.unattended or options.seconds is not None:
+            raise InputError("--unattended and --seconds belong to a script; add --script circle, steps or excite")
+        return None
+    script = make_script(options.script, config.robot, config.task, config.drive.speed_share, options.seed)
+    return script if options.seconds is None else script.cut(options.seconds)
+
+
+def _source(options: DriveOptions, config: RobotConfig, script: Script | None, top_rad_s: float) -> ManualSource:
+    if options.unattended and options.gamepad:
+        raise InputError("--unattended and --gamepad: one deadman only; leave one of them out")
+    held: ManualSource
+    if options.unattended:
+        held = Unattended()
+    elif options.gamepad:
+        held = _gamepad(config, top_rad_s)
+    else:
+        held = Keyboard(sys.stdin.fileno(), KeyHold(top_rad_s))
+    return held if script is None else ScriptSource(script, held)
+
+
+def _gamepad(config: RobotConfig, top_rad_s: float) -> GamepadSource:
+    wanted = config.drive
+    mapping = GamepadMapping(
+        forward_axis=wanted.gamepad_forward_axis,
+        left_axis=wanted.gamepad_left_axis,
+        deadman_button=wanted.gamepad_deadman,
+        dead_zone=wanted.gamepad_dead_zone,
+    )
+
+    def open_pad(now_ns: int) -> Gamepad:
+        return open_gamepad(mapping, now_ns, wanted.gamepad_device)
+
+    try:
+        pad = open_pad(MonotonicClock().now_ns())
+    except GamepadError as error:
+        raise InputError(f"--gamepad: {error}") from None
+    return GamepadSource(pad, open_pad, top_rad_s, wanted.turn_share, wanted.gamepad_silence_s)
+
+
+def _new_log(config: RobotConfig) -> Path:
+    stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
+    return Path(config.log.directory) / f"{config.robot.name}-drive-{stamp}.mcap"
+
+
+@contextmanager
+def _display(socket: Path, shown: bool) -> Iterator[Any]:
+    """Show the drive in a process of its own; yields what the daemon says its sentences to.
+
+    In a terminal the table has the newest of them, so they are printed once it is gone.
+    """
+    if not shown:
+        yield lambda topic, text: print(f"{topic}: {text}", file=sys.stderr, flush=True)
+        return
+    later: deque[str] = deque(maxlen=20)
+    in_terminal = sys.stdout.isatty()
+
+    def say(topic: str, text: str) -> None:
+        if in_terminal:
+            later.append(f"{topic}: {text}")
+        else:
+            print(f"{topic}: {text}", flush=True)
+
+    # Started before the daemon takes on real time, and in a session of its own: Ctrl-C is for the daemon alone.
+    process = subprocess.Popen(
+        [sys.executable, "-m", "disco_hw.drive.display", str(socket)], start_new_session=True, stdin=subprocess.DEVNULL
+    )
+    try:
+        yield say
+    finally:
+        try:
+            process.wait(_DISPLAY_TIMEOUT_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+        for text in later:
+            print(text)

@@ -1,0 +1,192 @@
+"""What a drive has excited so far, and what is still missing for inference and the search for gaps; pure.
+
+The list is what separates pairs of parameters and effects that look alike otherwise: both turning directions, two
+speeds, backwards, starts and stops, steering, slow ramps through zero, rests.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+_STILL = 0.02
+_MOVING = 0.08
+_FAST = 0.5
+_STRAIGHT = 0.08
+_LONGEST_SAMPLE_S = 0.1
+_LAUNCH_S = 0.7
+_LAUNCH = 0.3
+_SWING = 0.12
+_SWING_S = 1.6
+_SLOW_CROSSING_S = 0.25
+
+
+@dataclass(frozen=True, slots=True)
+class Item:
+    """One thing to excite: how much of it there is and should be, in `unit` (s or times)."""
+
+    name: str
+    purpose: str
+    unit: str
+    wanted: float
+    found: float = 0.0
+
+    @property
+    def covered(self) -> bool:
+        """Whether there is enough."""
+        return self.found >= self.wanted
+
+    def in_words(self) -> str:
+        """Name and amounts."""
+        unit = "" if self.unit == "times" else f" {self.unit}"
+        return f"{self.name} {min(self.found, self.wanted):.0f}/{self.wanted:.0f}{unit}"
+
+
+_SECONDS = (
+    ("straight slow", "wheel radius", 3.0),
+    ("straight fast", "wheel radius apart from what grows with speed", 2.0),
+    ("reverse slow", "offsets that change sign with the direction", 3.0),
+    ("reverse fast", "offsets apart from what grows with speed", 2.0),
+    ("turn left slow", "axial distance", 3.0),
+    ("turn left fast", "axial distance apart from slip in turns", 2.0),
+    ("turn right slow", "left apart from right", 3.0),
+    ("turn right fast", "left apart from right, slip in turns", 2.0),
+    ("curve left slow", "x_icr", 3.0),
+    ("curve left fast", "x_icr apart from side slip", 3.0),
+    ("curve right slow", "pose latency apart from a heading bias", 3.0),
+    ("curve right fast", "pose latency apart from a heading bias", 3.0),
+    ("rest", "noise of the poses", 5.0),
+)
+_TIMES = (
+    ("hard start", "lag and delay, slip under acceleration", 6.0),
+    ("hard stop", "lag and delay, slip under braking", 6.0),
+    ("quick steering", "delay apart from lag", 6.0),
+    ("slow crossing of zero", "deadband apart from stiction", 2.0),
+)
+
+
+class Coverage:
+    """Counts from the commands executed; thresholds are shares of the fastest wheel speed that is driven, `top_rad_s`.
+
+    Starts and stops count when they take less than 0.7 s between rest and 0.3 of it; swings when the turn changes sides
+    within 1.6 s; crossings of zero when a wheel takes more than 0.25 s through +-0.08 of it without resting there.
+    """
+
+    def __init__(self, top_rad_s: float) -> None:
+        self._top_rad_s = top_rad_s
+        self._found: dict[str, float] = dict.fromkeys([name for name, *_ in (*_SECONDS, *_TIMES)], 0.0)
+        self._t_ns: int | None = None
+        self._still_ns: int | None = None
+        self._quick_ns: int | None = None
+        self._swing: tuple[int, int] | None = None
+        self._crossing: list[tuple[int, int] | None] = [None, None]
+        self._rested_ns = [0, 0]
+        self.driven_s = 0.0
+
+    def add(self, t_ns: int, left_rad_s: float, right_rad_s: float) -> None:
+        """Take in wheel speeds in force from a time on; what is older than the last or no number changes nothing."""
+        if self._t_ns is not None and t_ns <= self._t_ns:
+            return
+        left, right = left_rad_s / self._top_rad_s, right_rad_s / self._top_rad_s
+        size = max(abs(left), abs(right))
+        if not size < 1e3:
+            return
+        dt_s = 0.0 if self._t_ns is None else min((t_ns - self._t_ns) * 1e-9, _LONGEST_SAMPLE_S)
+        self._t_ns = t_ns
+        self.driven_s += dt_s
+        forward, turn = 0.5 * (left + right), 0.5 * (right - left)
+        regime = _regime(forward, turn, size)
+        if regime is not None:
+            self._found[regime] += dt_s
+        self._count_launches(t_ns, size)
+        self._count_swings(t_ns, turn)
+        for wheel, speed in enumerate((left, right)):
+            self._count_crossings(t_ns, dt_s, wheel, speed)
+
+    def pause(self) -> None:
+        """Driving stops here: nothing is counted across the pause."""
+        self._t_ns = self._still_ns = self._quick_ns = self._swing = None
+        self._crossing = [None, None]
+
+    def items(self) -> tuple[Item, ...]:
+        """Everything that counts, covered or not."""
+        seconds = (Item(name, purpose, "s", wanted, self._found[name]) for name, purpose, wanted in _SECONDS)
+        times = (Item(name, purpose, "times", wanted, self._found[name]) for name, purpose, wanted in _TIMES)
+        return (*seconds, *times)
+
+    def missing(self) -> tuple[Item, ...]:
+        """What there is too little of."""
+        return tuple(item for item in self.items() if not item.covered)
+
+    def in_words(self) -> str:
+        """One line for a person: how much is done, and the first things that are missing."""
+        items, missing = self.items(), self.missing()
+        done = f"{self.driven_s:.0f} s driven, {len(items) - len(missing)} of {len(items)} excited"
+        if not missing:
+            return f"{done}; nothing is missing"
+        more = f" and {len(missing) - 4} more" if len(missing) > 4 else ""
+        return f"{done}; missing: {', '.join(item.in_words() for item in missing[:4])}{more}"
+
+    def as_dict(self) -> dict[str, Any]:
+        """Everything for machines; `missing` holds names."""
+        return {
+            "driven_s": round(self.driven_s, 3),
+            "items": [
+                {
+                    "name": item.name,
+                    "purpose": item.purpose,
+                    "unit": item.unit,
+                    "found": round(item.found, 3),
+                    "wanted": item.wanted,
+                    "covered": item.covered,
+                }
+                for item in self.items()
+            ],
+            "missing": [item.name for item in self.missing()],
+        }
+
+    def _count_launches(self, t_ns: int, size: float) -> None:
+        if size <= _STILL:
+            if self._quick_ns is not None and t_ns - self._quick_ns <= _LAUNCH_S * 1e9:
+                self._found["hard stop"] += 1.0
+            self._still_ns, self._quick_ns = t_ns, None
+        elif size >= _LAUNCH:
+            if self._still_ns is not None and t_ns - self._still_ns <= _LAUNCH_S * 1e9:
+                self._found["hard start"] += 1.0
+            self._still_ns, self._quick_ns = None, t_ns
+
+    def _count_swings(self, t_ns: int, turn: float) -> None:
+        if abs(turn) < _SWING:
+            return
+        side = 1 if turn > 0.0 else -1
+        if self._swing is not None and self._swing[0] != side and t_ns - self._swing[1] <= _SWING_S * 1e9:
+            self._found["quick steering"] += 1.0
+        if self._swing is None or self._swing[0] != side:
+            self._swing = (side, t_ns)
+
+    def _count_crossings(self, t_ns: int, dt_s: float, wheel: int, speed: float) -> None:
+        """A crossing begins where a wheel was last beyond the band on one side and ends beyond it on the other."""
+        if abs(speed) < _MOVING:
+            self._rested_ns[wheel] += round(dt_s * 1e9) if abs(speed) <= _STILL else 0
+            return
+        side = 1 if speed > 0.0 else -1
+        before, self._crossing[wheel] = self._crossing[wheel], (side, t_ns)
+        rested_ns, self._rested_ns[wheel] = self._rested_ns[wheel], 0
+        if before is None or before[0] == side:
+            return
+        took_ns = t_ns - before[1]
+        if took_ns >= _SLOW_CROSSING_S * 1e9 and rested_ns < 0.5 * took_ns:
+            self._found["slow crossing of zero"] += 1.0
+
+
+def _regime(forward: float, turn: float, size: float) -> str | None:
+    """The kind of motion; None for creeping, which counts for nothing."""
+    if size <= _STILL:
+        return "rest"
+    if size < _MOVING:
+        return None
+    pace = "fast" if size >= _FAST else "slow"
+    if abs(turn) <= _STRAIGHT * abs(forward):
+        return f"{'straight' if forward > 0.0 else 'reverse'} {pace}"
+    side = "left" if turn > 0.0 else "right"
+    return f"{'turn' if abs(forward) <= _STRAIGHT * abs(turn) else 'curve'} {side} {pace}"

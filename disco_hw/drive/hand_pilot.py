@@ -1,0 +1,79 @@
+"""The pilot that drives by hand or script: source, deadman and coverage in one tick; pure."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from typing import Any
+
+from disco_hw.daemon.core import CoreTick
+from disco_hw.daemon.pilot import PilotTick
+from disco_hw.daemon.states import State
+from disco_hw.daemon.supervisor import Reply
+from disco_hw.drive.coverage import Coverage
+from disco_hw.drive.deadman import Deadman
+from disco_hw.drive.source import ManualSource, RobotView
+from disco_hw.pipeline import Source
+
+_MESSAGES = 5
+
+
+class HandPilot:
+    """Drives as its source says, while its deadman is held."""
+
+    def __init__(self, source: ManualSource, coverage: Coverage) -> None:
+        self._source = source
+        self._coverage = coverage
+        self._deadman = Deadman()
+        self._driving = False
+        self._task = ""
+        self._told: deque[str] = deque()
+        self._messages: deque[str] = deque(maxlen=_MESSAGES)
+
+    @property
+    def done(self) -> bool:
+        """Whether the source has ended."""
+        return self._source.ended is not None
+
+    def step(self, now_ns: int, last: CoreTick | None) -> PilotTick:
+        """Poll the source once and judge what it says."""
+        state = State.DISCONNECTED if last is None else last.output.state
+        newest = self._source.poll(now_ns, RobotView(state, self._driving))
+        verdict = self._deadman.step(now_ns, newest, state)
+        if self._source.ended is not None:
+            self._told.append(self._source.ended)
+        elif verdict.event is not None:
+            self._told.append(verdict.event)
+        if self._driving and self._source.task not in {"", self._task}:
+            self._task = self._source.task
+            self._told.append(self._task)
+        events = tuple(self._told)
+        self._told.clear()
+        self._messages += events
+        return PilotTick(verdict.requests, verdict.motion, events)
+
+    def learn(self, now_ns: int, tick: CoreTick, replies: Sequence[Reply]) -> None:
+        """Count what was excited; take in that arming was refused."""
+        refusals = [reply.text for reply in replies if not reply.accepted]
+        if refusals:
+            self._told.append(self._deadman.refused(refusals[0]))
+        self._messages += tick.events
+        command = tick.command
+        self._driving = command is not None and tick.pipeline.source is Source.MANUAL
+        if command is not None and self._driving:
+            self._coverage.add(tick.pipeline.t_ns, command.left_rad_s, command.right_rad_s)
+        else:
+            self._coverage.pause()
+
+    def status(self) -> dict[str, Any]:
+        """What the source is at, the coverage and the newest messages, as `drive`."""
+        return {
+            "drive": {
+                "driving": self._driving,
+                "words": self._source.words,
+                "task": self._source.task,
+                "messages": list(self._messages),
+                "coverage": self._coverage.as_dict(),
+                "coverage_words": self._coverage.in_words(),
+            }
+        }

@@ -1,0 +1,143 @@
+"""The scripts of `disco-hw drive`, as functions of the robot's limits; the same seed draws the same drive.
+
+`circle` is the paper's drive. `steps` follows the protocol of norlab-ulaval's DRIVE: wheel speeds drawn uniformly
+within the limits, 6 s each. `excite` takes two minutes to show what inference and the search for gaps need to tell
+parameters and effects from each other.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Callable
+
+from disco_hw.config import CircleTask, Robot
+from disco_hw.drive.script import Manoeuvre, Script, Wheels
+from disco_hw.errors import InputError
+
+SCRIPTS = ("circle", "steps", "excite")
+STEP_S = 6.0
+STEPS = 20
+_LAPS = 2.0
+_REST_S = 0.6
+
+Profile = Callable[[float], tuple[float, float]]
+
+
+def make_script(name: str, robot: Robot, task: CircleTask, speed_share: float, seed: int = 1) -> Script:
+    """The script of that name with wheel speeds up to `speed_share` of the robot's limit.
+
+    Raises InputError for an unknown name, and for a circle that is too fast for the wheels.
+    """
+    top_rad_s = speed_share * robot.max_wheel_speed_rad_s
+    match name:
+        case "circle":
+            return circle(robot, task)
+        case "steps":
+            return steps(top_rad_s, seed)
+        case "excite":
+            return excite(top_rad_s)
+        case _:
+            raise InputError(f"--script {name}: no such script; write one of {', '.join(SCRIPTS)}")
+
+
+def circle(robot: Robot, task: CircleTask) -> Script:
+    """Two laps of the task's circle, counter-clockwise at constant wheel speeds, from rest to rest."""
+    yaw_rate_rad_s = task.speed_m_s / task.radius_m
+    half_m = 0.5 * robot.axial_distance_m
+    left = (task.speed_m_s - yaw_rate_rad_s * half_m) / robot.wheel_radius_m
+    right = (task.speed_m_s + yaw_rate_rad_s * half_m) / robot.wheel_radius_m
+    if max(abs(left), abs(right)) > robot.max_wheel_speed_rad_s:
+        raise InputError(
+            f"--script circle: the outer wheel would need {right:.2f} rad/s, robot.max_wheel_speed_rad_s is "
+            f"{robot.max_wheel_speed_rad_s:g}; lower task.speed_m_s or raise task.radius_m"
+        )
+    laps_s = _LAPS * 2.0 * math.pi / yaw_rate_rad_s
+    purpose = "the paper's drive; cannot tell the wheel radius from slip, nor left from right"
+    return Script("circle", (_rest(1.0), Manoeuvre("circle to the left", purpose, laps_s, _held(left, right)), _rest()))
+
+
+def steps(top_rad_s: float, seed: int, count: int = STEPS) -> Script:
+    """Wheel speeds drawn evenly from the square within +-`top_rad_s`, 6 s each."""
+    draw = random.Random(seed)
+    manoeuvres = []
+    for number in range(1, count + 1):
+        left, right = draw.uniform(-top_rad_s, top_rad_s), draw.uniform(-top_rad_s, top_rad_s)
+        name = f"step {number}: {left:+.1f} {right:+.1f} rad/s"
+        purpose = "steady motion anywhere within the limits, and the step to it"
+        manoeuvres.append(Manoeuvre(name, purpose, STEP_S, _held(left, right)))
+    return Script("steps", (*manoeuvres, _rest()))
+
+
+def excite(top_rad_s: float) -> Script:
+    """A short drive after which nearly all parameters and effects can be told apart; it ends near its start.
+
+    Shares below are of `top_rad_s`: (forward, turn to the left).
+    """
+
+    def play(name: str, purpose: str, duration_s: float, profile: Profile) -> Manoeuvre:
+        return Manoeuvre(name, purpose, duration_s, lambda t_s: _wheels(*profile(t_s), top_rad_s))
+
+    def hold(name: str, purpose: str, duration_s: float, forward: float, turn: float) -> Manoeuvre:
+        return play(name, purpose, duration_s, lambda _t_s: (forward, turn))
+
+    found: list[Manoeuvre] = [_rest(2.0, "noise of the poses at standstill")]
+    radius = "wheel radius, and what grows with speed: gain, slip, pose latency"
+    for name, forward, duration_s in (
+        ("slow straight", 0.4, 4.0),
+        ("slow reverse", -0.4, 4.0),
+        ("fast straight", 0.95, 3.0),
+        ("fast reverse", -0.95, 3.0),
+    ):
+        found += [hold(name, radius, duration_s, forward, 0.0), _rest()]
+    axle = "axial distance; two rates tell it from slip in turns, both ways tell latency from a heading bias"
+    for name, turn, duration_s in (
+        ("slow turn left", 0.3, 5.0),
+        ("slow turn right", -0.3, 5.0),
+        ("fast turn left", 0.75, 4.0),
+        ("fast turn right", -0.75, 4.0),
+    ):
+        found += [hold(name, axle, duration_s, 0.0, turn), _rest()]
+    icr = "x_icr and side slip, which need speed and turning at once; latency changes sign with the side"
+    for name, forward, turn, duration_s in (
+        ("slow curve left", 0.3, 0.14, 6.0),
+        ("slow curve right", 0.3, -0.14, 6.0),
+        ("fast curve left", 0.65, 0.3, 5.0),
+        ("fast curve right", 0.65, -0.3, 5.0),
+        ("reverse curve left", -0.45, 0.2, 4.0),
+        ("reverse curve right", -0.45, -0.2, 4.0),
+    ):
+        found += [hold(name, icr, duration_s, forward, turn), _rest()]
+    lag = "lag and delay from command to wheel, slip under acceleration"
+    for number in range(8):
+        forward = 0.7 if number % 2 == 0 else -0.7
+        found += [hold(f"start and stop {number + 1}", lag, 1.0, forward, 0.0), _rest(0.8)]
+    steering = "delay told from lag, build-up of turning under load"
+    found += [
+        play("steering at 0.5 Hz", steering, 12.0, lambda t_s: (0.4, 0.35 * math.cos(math.pi * t_s))),
+        _rest(),
+    ]
+    zero = "deadband told from stiction, slowly through zero"
+    found += [
+        play("ramp through zero", zero, 10.0, lambda t_s: (0.25 * _triangle(t_s / 10.0), 0.0)),
+        play("turning ramp through zero", zero, 10.0, lambda t_s: (0.0, 0.25 * _triangle(t_s / 10.0))),
+        _rest(2.0, "noise of the poses at standstill, elsewhere"),
+    ]
+    return Script("excite", tuple(found))
+
+
+def _wheels(forward: float, turn: float, top_rad_s: float) -> Wheels:
+    return (forward - turn) * top_rad_s, (forward + turn) * top_rad_s
+
+
+def _held(left_rad_s: float, right_rad_s: float) -> Callable[[float], Wheels]:
+    return lambda _t_s: (left_rad_s, right_rad_s)
+
+
+def _rest(duration_s: float = _REST_S, purpose: str = "separates what comes before from what comes after") -> Manoeuvre:
+    return Manoeuvre("rest", purpose, duration_s, _held(0.0, 0.0))
+
+
+def _triangle(share: float) -> float:
+    """0, 1, 0, -1, 0 at shares 0, 1/4, 1/2, 3/4, 1 of the period, straight in between."""
+    return 2.0 / math.pi * math.asin(math.sin(2.0 * math.pi * share))

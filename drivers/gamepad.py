@@ -1,0 +1,207 @@
+"""Gamepads on Linux, through evdev: two axes and the deadman's button, without ever waiting.
+
+A gamepad sends changes only, so what is held is what the kernel holds; a device that is unplugged, or whose receiver
+takes it away, is noticed at the next poll.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+_EV_SYN, _EV_KEY, _EV_ABS = 0, 1, 3
+_SYN_REPORT, _SYN_DROPPED = 0, 3
+
+
+class GamepadError(Exception):
+    """No usable gamepad; the message is one line that says what to do."""
+
+
+class Event(Protocol):
+    """One input event as evdev has it."""
+
+    type: int
+    code: int
+    value: int
+
+
+class AxisInfo(Protocol):
+    """Present value and range of an axis."""
+
+    value: int
+    min: int
+    max: int
+
+
+class EventDevice(Protocol):
+    """What is used of evdev.InputDevice."""
+
+    name: str
+
+    def read(self) -> Iterable[Event]:
+        """Events since the last call; raises BlockingIOError for none, another OSError when the device is gone."""
+
+    def absinfo(self, axis_num: int) -> AxisInfo:
+        """The axis now."""
+
+    def active_keys(self) -> list[int]:
+        """Codes of the buttons held now."""
+
+    def close(self) -> None:
+        """Close the device."""
+
+
+@dataclass(frozen=True, slots=True)
+class GamepadMapping:
+    """Which axes and button are used, by evdev's names; an axis with a minus before it is reversed.
+
+    Within `dead_zone` of its middle, as a share of half its range, an axis counts as 0.
+    """
+
+    forward_axis: str = "-ABS_Y"
+    left_axis: str = "-ABS_X"
+    deadman_button: str = "BTN_TL"
+    dead_zone: float = 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class GamepadState:
+    """What is held: forward and left in [-1, 1], the deadman, and when the newest event came (host time)."""
+
+    event_ns: int
+    forward: float
+    left: float
+    deadman: bool
+
+
+class Gamepad:
+    """A gamepad that is open; `poll()` it in each tick.
+
+    Raises GamepadError for a mapping with names that the device does not have.
+    """
+
+    def __init__(self, device: EventDevice, mapping: GamepadMapping, now_ns: int) -> None:
+        self._device = device
+        self._dead_zone = mapping.dead_zone
+        self._forward = (_axis(mapping.forward_axis), _sign(mapping.forward_axis))
+        self._left = (_axis(mapping.left_axis), _sign(mapping.left_axis))
+        self._button = _code(mapping.deadman_button, "BTN_")
+        self._range: dict[int, tuple[int, int]] = {}
+        self._raw: dict[int, float] = {}
+        self._deadman = False
+        self._event_ns = now_ns
+        self._dropping = False
+        self._gone = False
+        try:
+            self._read_state()
+        except OSError as error:
+            raise GamepadError(f"{device.name}: cannot be read ({error.strerror}); plug it in again") from None
+
+    @property
+    def name(self) -> str:
+        """What the device calls itself."""
+        return self._device.name
+
+    def poll(self, now_ns: int) -> GamepadState | None:
+        """Take in what came since the last poll; None once the device is gone."""
+        if self._gone:
+            return None
+        try:
+            events = list(self._device.read())
+            self._gone = not events
+            for event in events:
+                self._take(event)
+                self._event_ns = now_ns
+        except BlockingIOError:
+            pass
+        except OSError:
+            self._gone = True
+        if self._gone:
+            return None
+        return GamepadState(self._event_ns, self._value(self._forward), self._value(self._left), self._deadman)
+
+    def close(self) -> None:
+        """Close the device."""
+        self._device.close()
+
+    def _take(self, event: Event) -> None:
+        if event.type == _EV_SYN:
+            if self._dropping and event.code == _SYN_REPORT:
+                self._dropping = False
+                self._read_state()
+            # The kernel's queue ran over: what comes until the next report is of no use.
+            self._dropping = self._dropping or event.code == _SYN_DROPPED
+        elif self._dropping:
+            return
+        elif event.type == _EV_KEY and event.code == self._button:
+            self._deadman = event.value != 0
+        elif event.type == _EV_ABS and event.code in self._raw:
+            self._raw[event.code] = self._share(event.code, event.value)
+
+    def _read_state(self) -> None:
+        for code, _ in (self._forward, self._left):
+            info = self._device.absinfo(code)
+            self._range[code] = (info.min, info.max)
+            self._raw[code] = self._share(code, info.value)
+        self._deadman = self._button in self._device.active_keys()
+
+    def _share(self, code: int, value: int) -> float:
+        """An axis' value as a share of half its range, from the middle."""
+        low, high = self._range[code]
+        return 0.0 if high <= low else min(1.0, max(-1.0, (value - low) / (0.5 * (high - low)) - 1.0))
+
+    def _value(self, axis: tuple[int, float]) -> float:
+        code, sign = axis
+        share = self._raw[code]
+        beyond = (abs(share) - self._dead_zone) / (1.0 - self._dead_zone)
+        return 0.0 if beyond <= 0.0 else sign * (beyond if share > 0.0 else -beyond)
+
+
+def open_gamepad(mapping: GamepadMapping, now_ns: int, path: str = "") -> Gamepad:
+    """Open the gamepad at `path`, or the first one that has the axes and the button; raises GamepadError."""
+    evdev = _evdev()
+    axes, button = {_axis(mapping.forward_axis), _axis(mapping.left_axis)}, _code(mapping.deadman_button, "BTN_")
+    for candidate in [path] if path else evdev.list_devices(writable=False):
+        try:
+            device = evdev.InputDevice(candidate)
+        except OSError as error:
+            if path:
+                raise GamepadError(
+                    f"{path}: cannot be opened ({error.strerror}); is it plugged in, and yours?"
+                ) from None
+            continue
+        found = device.capabilities(absinfo=False)
+        if axes <= set(found.get(_EV_ABS, ())) and button in found.get(_EV_KEY, ()):
+            return Gamepad(device, mapping, now_ns)
+        device.close()
+    if path:
+        raise GamepadError(
+            f"{path}: has not {mapping.forward_axis}, {mapping.left_axis} and {mapping.deadman_button}; "
+            "change the [drive] section of robot.toml"
+        )
+    raise GamepadError("no gamepad found; plug one in, and let its user read /dev/input (group input)")
+
+
+def _evdev() -> Any:
+    try:
+        # Linux alone has it, so it is an extra.
+        import evdev  # noqa: PLC0415
+    except ImportError:
+        raise GamepadError("gamepads need evdev, on Linux: pip install 'disco-hw[gamepad]'") from None
+    return evdev
+
+
+def _axis(name: str) -> int:
+    return _code(name.removeprefix("-"), "ABS_")
+
+
+def _sign(name: str) -> float:
+    return -1.0 if name.startswith("-") else 1.0
+
+
+def _code(name: str, prefix: str) -> int:
+    codes = _evdev().ecodes.ecodes
+    if not name.startswith(prefix) or name not in codes:
+        raise GamepadError(f"{name}: evdev knows no such name with {prefix}; see the [drive] section in docs/robot.md")
+    return int(codes[name])

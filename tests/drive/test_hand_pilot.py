@@ -1,0 +1,142 @@
+"""Driving by hand in simulated time: the real tick, the real firmware, a finger of the test's."""
+
+from __future__ import annotations
+
+import pytest
+
+from disco_hw.daemon.states import State
+from disco_hw.daemon.supervisor import Reply, UserRequest
+from disco_hw.drive.coverage import Coverage
+from disco_hw.drive.hand_pilot import HandPilot
+from disco_hw.drive.source import ManualInput
+from disco_hw.log import records
+from disco_hw.pipeline import NoPlanner, Source
+from tests.daemon.simulated import simulated_stack
+
+
+class Hand:
+    """What a person does, set by the test."""
+
+    def __init__(self):
+        self.wheels, self.held, self.gone, self.silent_since_ns = (3.0, 5.0), False, False, None
+        self.ended, self.completed, self.words, self.task = None, True, "words", ""
+
+    def poll(self, now_ns, robot):
+        self.robot = robot
+        if self.gone:
+            return None
+        return ManualInput(self.silent_since_ns or now_ns, *self.wheels, self.held)
+
+    def close(self):
+        pass
+
+
+class Bench:
+    def __init__(self):
+        self.stack = simulated_stack(NoPlanner())
+        self.hand, self.coverage = Hand(), Coverage(8.0)
+        self.stack.pilot = HandPilot(self.hand, self.coverage)
+
+    def run(self, seconds, **changes):
+        for name, value in changes.items():
+            setattr(self.hand, name, value)
+        return self.stack.run(seconds)
+
+    def driving(self):
+        self.run(1.5)
+        assert self.stack.core.last.output.state is State.READY
+        self.run(1.5, held=True)
+        assert self.stack.robot.truth.right_speed_rad_s == pytest.approx(5.0, abs=0.3)
+        return self
+
+    def asked(self):
+        return max(
+            abs(self.stack.robot.outputs.left_setpoint_rad_s), abs(self.stack.robot.outputs.right_setpoint_rad_s)
+        )
+
+
+def test_what_is_held_is_driven_and_recorded_as_executed():
+    bench = Bench().driving()
+    commands = [r for _, tick in bench.stack.recorder.ticks for r in tick if isinstance(r, records.Command)]
+    driven = [command for command in commands if command.in_force and command.source == "manual"]
+    assert driven
+    assert (driven[-1].left_rad_s, driven[-1].right_rad_s) == (3.0, 5.0)
+    # The governor's ramp is what was executed, the step what was asked.
+    assert driven[0].requested_right_rad_s == 5.0
+    assert 0.0 < driven[0].right_rad_s < 0.7
+    assert {item.name for item in bench.coverage.items() if item.found > 0.5} == {"curve left fast"}
+
+
+@pytest.mark.parametrize("loss", [{"held": False}, {"gone": True}])
+def test_release_and_loss_stop_and_disarm(loss):
+    bench = Bench().driving()
+    ticks = bench.run(0.02, **loss)
+    assert ticks[0].output.state is State.STOPPING
+    assert ticks[0].pipeline.source is Source.HOLD
+    bench.run(0.4)
+    assert bench.asked() == 0.0
+    bench.run(1.0)
+    assert bench.stack.core.last.output.state is State.READY
+    assert max(abs(bench.stack.robot.truth.left_speed_rad_s), abs(bench.stack.robot.truth.right_speed_rad_s)) < 0.05
+
+
+def test_silence_stops_200_ms_after_the_last_input_and_nothing_arms_again():
+    bench = Bench().driving()
+    bench.hand.silent_since_ns = bench.stack.now_us * 1000
+    ticks = bench.run(0.3)
+    moving = [tick for tick in ticks if tick.pipeline.source is Source.MANUAL]
+    assert len(moving) == 10
+    bench.run(1.5)
+    assert bench.stack.core.last.output.state is State.READY
+    bench.run(2.0, silent_since_ns=None)
+    assert bench.stack.core.last.output.state is State.READY
+    bench.run(0.1, held=False)
+    bench.run(1.0, held=True)
+    assert bench.stack.core.last.output.state is State.ARMED
+
+
+def test_no_number_is_a_stop():
+    bench = Bench().driving()
+    bench.run(0.6, wheels=(float("nan"), 5.0))
+    assert bench.asked() == 0.0
+
+
+def test_the_status_says_what_is_going_on():
+    bench = Bench().driving()
+    told = bench.stack.pilot.status()["drive"]
+    assert told["driving"]
+    assert told["words"] == "words"
+    assert any("deadman pressed" in text for text in told["messages"])
+    assert told["coverage"]["missing"]
+    bench.run(0.1, held=False)
+    assert any("released" in text for text in bench.stack.pilot.status()["drive"]["messages"])
+
+
+def test_a_press_while_not_ready_is_told_and_sends_nothing():
+    bench = Bench()
+    bench.run(1.5)
+    bench.stack.robot_end.plug(False)
+    bench.run(0.1)
+    ticks = bench.run(0.5, held=True)
+    assert all(tick.command is None for tick in ticks)
+    assert any("not ready" in text for text in told(bench))
+
+
+def test_a_refusal_is_told_and_needs_a_new_press():
+    bench = Bench().driving()
+    bench.stack.pilot.learn(0, bench.stack.core.last, [Reply(UserRequest.ARM, False, "no fresh wheel samples")])
+    assert bench.run(0.02)[0].output.state is State.STOPPING
+    assert any("no fresh wheel samples" in text for text in told(bench))
+    assert bench.run(1.5)[-1].output.state is State.READY
+
+
+def told(bench):
+    return bench.stack.pilot.status()["drive"]["messages"]
+
+
+def test_the_end_of_the_source_is_the_pilots():
+    bench = Bench().driving()
+    assert not bench.stack.pilot.done
+    bench.run(0.02, ended="the end", held=False)
+    assert bench.stack.pilot.done
+    assert "the end" in bench.stack.pilot.status()["drive"]["messages"]

@@ -1,0 +1,145 @@
+"""Keys of a terminal: bytes to keys, and what counts as held."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from disco_hw.drive.keys import DIRECTIONS, KeyEvent, KeyHold, parse, wheel_speeds
+
+MS = 1_000_000
+UP, LEFT = b"\x1b[A", b"\x1b[D"
+
+
+class Typist:
+    """A hold and a clock; `hold` is a key held on a terminal with this delay before it repeats at 30 Hz."""
+
+    def __init__(self, top_rad_s=8.0):
+        self.keys = KeyHold(top_rad_s)
+        self.now_ns = 0
+        self.keys.at(0)
+        self.wait(1000)
+
+    def wait(self, ms):
+        seen = []
+        for _ in range(ms // 10):
+            self.now_ns += 10 * MS
+            seen.append(self.keys.at(self.now_ns))
+        return seen
+
+    def press(self, key):
+        self.keys.press(KeyEvent(self.now_ns, key))
+
+    def hold(self, key, ms, delay_ms=180):
+        self.press(key)
+        seen = self.wait(min(ms, delay_ms))
+        spent = delay_ms
+        while spent < ms:
+            self.press(key)
+            seen += self.wait(30)
+            spent += 30
+        return seen
+
+
+def held(seen):
+    return [moment.deadman for moment in seen]
+
+
+def test_a_held_key_drives_until_200_ms_after_its_last_repeat():
+    typist = Typist()
+    seen = typist.hold(UP, 1000)
+    assert not any(held(seen[:17]))
+    assert all(held(seen[20:]))
+    assert seen[-1].left_rad_s == seen[-1].right_rad_s == pytest.approx(4.0)
+    after = typist.wait(400)
+    # The newest input carries its own time, so that whoever judges its age can.
+    assert all(moment.t_ns <= typist.now_ns - 400 * MS for moment in after if moment.deadman)
+    assert sum(held(after)) * 10 <= 200
+    assert after[-1].left_rad_s == 0.0
+
+
+def test_a_tap_holds_nothing():
+    typist = Typist()
+    typist.press(UP)
+    assert not any(held(typist.wait(2000)))
+
+
+def test_a_late_first_repeat_is_waited_for():
+    assert any(held(Typist().hold(UP, 1000, delay_ms=660)))
+
+
+def test_another_key_takes_over_without_a_break_where_repeats_begin_early():
+    typist = Typist()
+    typist.hold(UP, 600)
+    seen = typist.hold(LEFT, 600, delay_ms=180)
+    assert all(held(seen))
+    assert seen[-1].left_rad_s < 0.0 < seen[-1].right_rad_s
+
+
+def test_another_key_ends_the_hold_where_repeats_begin_late():
+    typist = Typist()
+    typist.hold(UP, 600)
+    seen = typist.hold(LEFT, 1500, delay_ms=400)
+    assert not any(held(seen[30:]))
+
+
+def test_a_stutter_of_the_connection_does_not_hold_again():
+    typist = Typist()
+    typist.hold(UP, 600)
+    typist.wait(300)
+    assert not any(held(typist.hold(UP, 2000, delay_ms=30)))
+    typist.wait(600)
+    assert any(held(typist.hold(UP, 1000)))
+
+
+def test_any_other_key_stops():
+    typist = Typist()
+    typist.hold(UP, 600)
+    typist.press(b"\x1b")
+    assert not any(held(typist.hold(UP, 1000, delay_ms=30)))
+
+
+def test_digits_choose_the_speed_and_stop():
+    typist = Typist()
+    typist.hold(UP, 600)
+    typist.press(b"9")
+    assert not any(held(typist.wait(600)))
+    assert typist.hold(UP, 600)[-1].left_rad_s == pytest.approx(8.0)
+    assert typist.keys.speed_share == 1.0
+
+
+@given(st.lists(st.tuples(st.integers(0, 1500), st.sampled_from([*DIRECTIONS, b"5", b"?"])), max_size=60))
+def test_never_held_more_than_200_ms_after_a_driving_key(story):
+    typist = Typist()
+    last_ns = None
+    for wait_ms, key in story:
+        for moment in typist.wait(wait_ms):
+            if moment.deadman:
+                assert last_ns is not None
+                assert moment.t_ns == last_ns
+            assert max(abs(moment.left_rad_s), abs(moment.right_rad_s)) <= 8.0
+        typist.press(key)
+        last_ns = typist.now_ns
+
+
+@given(st.binary(max_size=60))
+def test_parsing_loses_no_byte_and_never_raises(data):
+    assert b"".join(parse(data)) == data
+
+
+def test_parsing_keeps_control_sequences_whole():
+    assert parse(b"w\x1b[A\x1b[1;5C \x1bOD\x1b") == [b"w", UP, b"\x1b[1;5C", b" ", b"\x1bOD", b"\x1b"]
+
+
+@given(st.floats(-1, 1), st.floats(-1, 1), st.floats(0.1, 60))
+def test_wheel_speeds_keep_the_limit_and_the_sense_of_turning(forward, turn, top):
+    left, right = wheel_speeds(forward, turn, top)
+    assert max(abs(left), abs(right)) <= top * (1 + 1e-12)
+    assert (right - left) * turn >= 0.0
+    assert (right + left) * forward >= -1e-9
+
+
+def test_pushing_left_turns_left():
+    assert wheel_speeds(0.0, 1.0, 8.0) == (-8.0, 8.0)
+    assert wheel_speeds(1.0, 0.5, 9.0) == (3.0, 9.0)

@@ -1,0 +1,127 @@
+"""A script as a source, and the deadman that holds itself."""
+
+from __future__ import annotations
+
+import pytest
+
+from disco_hw.daemon.states import State
+from disco_hw.drive.script import Manoeuvre, Script
+from disco_hw.drive.scripted import ScriptSource, Unattended
+from disco_hw.drive.source import ManualInput, RobotView
+
+TICK = 20_000_000
+READY = RobotView(State.READY, driving=False)
+DRIVING = RobotView(State.ARMED, driving=True)
+HOLDING = RobotView(State.ARMED, driving=False)
+
+
+class Finger:
+    """A deadman in the test's hand."""
+
+    def __init__(self):
+        self.held, self.gone, self.ended, self.completed = True, False, None, True
+        self.words, self.task, self.closed = "hold it", "", False
+
+    def poll(self, now_ns, _robot):
+        return None if self.gone else ManualInput(now_ns - 7, 9.0, 9.0, self.held)
+
+    def close(self):
+        self.closed = True
+
+
+class Bench:
+    def __init__(self):
+        steps = tuple(Manoeuvre(f"m{k}", f"for {k}", 1.0, lambda t_s, k=k: (float(k), t_s)) for k in (1, 2))
+        self.finger = Finger()
+        self.source = ScriptSource(Script("s", steps), self.finger)
+        self.now_ns = 0
+
+    def run(self, robot, ticks):
+        for _ in range(ticks):
+            self.now_ns += TICK
+            self.last = self.source.poll(self.now_ns, robot)
+        return self.last
+
+
+def test_time_runs_while_driving_only():
+    bench = Bench()
+    assert bench.run(READY, 100).left_rad_s == 1.0
+    bench.run(DRIVING, 25)
+    assert bench.last.right_rad_s == 0.5
+    bench.run(HOLDING, 100)
+    assert bench.run(DRIVING, 1).right_rad_s == 0.52
+    assert "m1" in bench.source.task
+
+
+def test_deadman_and_time_are_the_other_sources():
+    bench = Bench()
+    assert bench.run(DRIVING, 1).t_ns == bench.now_ns - 7
+    bench.finger.held = False
+    assert bench.run(DRIVING, 1).deadman is False
+    bench.finger.gone = True
+    assert bench.run(DRIVING, 1) is None
+
+
+def test_what_was_broken_off_begins_anew():
+    bench = Bench()
+    bench.run(DRIVING, 75)
+    assert bench.last.left_rad_s == 2.0
+    bench.run(READY, 5)
+    bench.run(DRIVING, 1)
+    assert (bench.last.left_rad_s, bench.last.right_rad_s) == (2.0, pytest.approx(0.02))
+
+
+def test_the_end_opens_the_deadman():
+    bench = Bench()
+    bench.run(DRIVING, 101)
+    assert bench.source.ended == "script s completed"
+    assert bench.source.completed
+    assert bench.last == ManualInput(bench.now_ns, 0.0, 0.0, deadman=False)
+    assert bench.run(READY, 1).deadman is False
+
+
+def test_the_end_of_the_deadman_is_the_end():
+    bench = Bench()
+    bench.finger.ended = "the terminal has closed"
+    assert bench.source.ended == "the terminal has closed"
+    assert not bench.source.completed
+    bench.source.close()
+    assert bench.finger.closed
+
+
+def test_a_stalled_loop_skips_nothing():
+    bench = Bench()
+    bench.run(DRIVING, 1)
+    bench.now_ns += 5_000_000_000
+    assert bench.run(DRIVING, 1).left_rad_s == 1.0
+
+
+def held(source, robot, ticks, start_ns=0):
+    return [source.poll(start_ns + k * TICK, robot).deadman for k in range(1, ticks + 1)]
+
+
+def test_unattended_presses_once_the_robot_is_ready_and_was_seen_open():
+    source = Unattended()
+    assert held(source, RobotView(State.HANDSHAKE, driving=False), 3) == [False] * 3
+    assert held(source, READY, 3, 3 * TICK) == [False, True, True]
+    assert held(source, DRIVING, 3, 6 * TICK) == [True] * 3
+
+
+def test_unattended_never_presses_again():
+    source = Unattended()
+    held(source, READY, 2)
+    held(source, DRIVING, 2, 2 * TICK)
+    assert held(source, HOLDING, 1, 4 * TICK) == [True]
+    source.poll(5 * TICK, RobotView(State.STOPPING, driving=False))
+    assert "disarmed before" in source.ended
+    assert held(source, READY, 100, 6 * TICK) == [False] * 100
+
+
+def test_unattended_gives_up():
+    source = Unattended(ready_within_s=1.0)
+    held(source, RobotView(State.HANDSHAKE, driving=False), 52)
+    assert "not ready within 1 s" in source.ended
+    source = Unattended(driving_within_s=1.0)
+    held(source, READY, 60)
+    assert "did not start" in source.ended
+    assert not source.completed

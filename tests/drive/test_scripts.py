@@ -1,0 +1,68 @@
+"""The scripts of `disco-hw drive`: within the limits, seeded, and driving what they say."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from disco_hw.config import CircleTask, Robot
+from disco_hw.drive.script import room_needed
+from disco_hw.drive.scripts import SCRIPTS, STEP_S, STEPS, make_script
+from disco_hw.errors import InputError
+
+
+def robot(top=8.0):
+    return Robot(name="r", wheel_radius_m=0.06, axial_distance_m=0.31, ticks_per_rev=2048, max_wheel_speed_rad_s=top)
+
+
+@given(st.sampled_from(["steps", "excite"]), st.floats(0.5, 60.0), st.floats(0.05, 1.0), st.integers(0, 1000))
+def test_wheels_stay_within_the_share_of_the_limit(name, top, share, seed):
+    script = make_script(name, robot(top), CircleTask(), share, seed)
+    for k in range(0, math.ceil(script.duration_s * 5)):
+        assert max(map(abs, script.at(k * 0.2))) <= top * share * (1 + 1e-12)
+
+
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_scripts_end_at_rest_and_say_what_for(name):
+    script = make_script(name, robot(), CircleTask(), 0.8)
+    assert script.at(script.duration_s - 0.01) == (0.0, 0.0)
+    assert all(manoeuvre.purpose for manoeuvre in script.manoeuvres)
+
+
+def test_the_circle_is_the_tasks_circle():
+    task = CircleTask(radius_m=0.75, speed_m_s=0.2)
+    script = make_script("circle", robot(), task, 0.8)
+    room = room_needed(script.at, script.duration_s, robot())
+    assert room.x_m == pytest.approx((-0.75, 0.75), abs=0.01)
+    assert room.y_m == pytest.approx((0.0, 1.5), abs=0.01)
+
+
+def test_a_circle_beyond_the_wheels_is_refused():
+    with pytest.raises(InputError, match=r"max_wheel_speed_rad_s.*lower"):
+        make_script("circle", robot(), CircleTask(radius_m=0.05, speed_m_s=0.3), 0.8)
+
+
+def test_steps_are_drawn_from_the_seed_and_spread_over_the_square():
+    first, again, other = (make_script("steps", robot(), CircleTask(), 1.0, seed) for seed in (1, 1, 2))
+    wheels = [first.at((k + 0.5) * STEP_S) for k in range(STEPS)]
+    assert wheels == [again.at((k + 0.5) * STEP_S) for k in range(STEPS)]
+    assert wheels != [other.at((k + 0.5) * STEP_S) for k in range(STEPS)]
+    assert first.at(0.0) == first.at(5.99) != first.at(6.01)
+    quadrants = {(left > 0.0, right > 0.0) for left, right in wheels}
+    assert len(quadrants) == 4
+
+
+def test_excite_takes_about_two_minutes_and_little_room():
+    script = make_script("excite", robot(), CircleTask(), 0.8)
+    assert 100.0 < script.duration_s < 150.0
+    room = room_needed(script.at, script.duration_s, robot())
+    assert room.x_m[1] - room.x_m[0] < 4.0
+    assert room.y_m[1] - room.y_m[0] < 4.0
+
+
+def test_an_unknown_script_is_refused_with_the_names_there_are():
+    with pytest.raises(InputError, match="circle, steps, excite"):
+        make_script("dance", robot(), CircleTask(), 0.8)
