@@ -99,14 +99,15 @@ def test_what_is_no_missing_encoder(spoil):
     assert wait_for_fault(bench) == (None, None)
 
 
-def test_few_ticks_a_turn_are_given_their_time():
-    coarse = dataclasses.replace(CONFIG, ticks_per_rev=20)
+@pytest.mark.parametrize("check_speed", [0.8, 1.6])
+def test_few_ticks_a_turn_are_given_their_time(check_speed):
+    coarse = dataclasses.replace(CONFIG, ticks_per_rev=20, encoder_check_speed_rad_s=check_speed)
     bench = Bench(coarse)
     bench.to_driving(2.0, 2.0)
     bench.inputs["left_current_a"] = 2.0
     assert bench.run(2000).fault == 0
     bench.inputs["left_ticks"] = int(bench.ticks[0])
-    three_ticks_at_check_speed_ms = 3 * 2 * math.pi / 20 * 1000
+    three_ticks_at_check_speed_ms = 3 * 2 * math.pi / 20 * 1000 / check_speed
     fault, after_ms = wait_for_fault(bench)
     assert fault == "ENCODER_MISSING_LEFT"
     assert after_ms == pytest.approx(three_ticks_at_check_speed_ms, abs=160)

@@ -191,6 +191,17 @@ def test_session_state_tells_challenge_session_acceptance_and_blockers():
     assert values["blockers"] == bench.out.blockers
 
 
+def test_a_session_that_ends_is_told_at_once():
+    bench = Bench()
+    bench.to_ready()
+    bench.run(5)
+    before = len(bench.messages("SESSION_STATE"))
+    bench.core.receive(bench.now_us, 0x080, b"")
+    bench.step()
+    assert len(bench.messages("SESSION_STATE")) == before + 1
+    assert last(bench, "SESSION_STATE")["session"] == 0
+
+
 def test_link_health():
     bench = Bench()
     bench.inputs.update(tx_error_count=300, rx_error_count=130)
