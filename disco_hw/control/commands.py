@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from disco_hw.control.blocks import BLOCK, U
-from disco_hw.model.jit import block_function, prefer_wide_vectors, scalar_function
+from disco_hw.model.jit import block_function, scalar_function, tune_loops
 
 
 class Basis(NamedTuple):
@@ -61,30 +61,34 @@ def expand(
     Writes `commands` from row history * C on; the block's noise begins at index `first` of `noise`. Uses row 0 of
     `state`.
     """
-    prefer_wide_vectors()
+    tune_loops()
     horizon, channels = nominal.shape
     stride = U(channels) * BLOCK
     change, largest = limits.change, limits.largest
     for c in range(channels):
+        kept = U(c) * BLOCK
         before = limits.before[c]
         for b in range(BLOCK):
-            state[b] = before
-        for t in range(horizon):
+            state[kept + b] = before
+    for t in range(horizon):
+        weights = _weights(basis.weights, t)
+        first_knot = first + U(basis.first[t]) * stride
+        first_row = U(history + t) * stride
+        for c in range(channels):
             middle = nominal[t, c]
-            weights = _weights(basis.weights, t)
-            knot = first + U(basis.first[t] * channels + c) * BLOCK
-            row = U((history + t) * channels + c) * BLOCK
+            kept = U(c) * BLOCK
             for b in range(BLOCK):
-                value = middle + _noise(noise, knot + b, stride, weights)
-                value = clip(clip(value, state[b] - change, state[b] + change), -largest, largest)
-                commands[row + b] = value
-                state[b] = value
+                previous = state[kept + b]
+                value = middle + _noise(noise, first_knot + kept + b, stride, weights)
+                value = clip(clip(value, previous - change, previous + change), -largest, largest)
+                commands[first_row + kept + b] = value
+                state[kept + b] = value
 
 
 @block_function
 def add_control_cost(costs: Any, first: Any, commands: Any, history: int, nominal: Any, scale: float) -> None:
     """Add scale * sum_t u_t (v_t - u_t) of one block's commands v about the nominal u to `costs[first:]`."""
-    prefer_wide_vectors()
+    tune_loops()
     horizon, channels = nominal.shape
     for t in range(horizon):
         for c in range(channels):
@@ -97,7 +101,7 @@ def add_control_cost(costs: Any, first: Any, commands: Any, history: int, nomina
 @block_function
 def add_weighted(sums: Any, weights: Any, first: Any, commands: Any, skip: Any, rows: int) -> None:
     """Add the block's commands, from row `skip` on, times its weights to the rows of `sums`."""
-    prefer_wide_vectors()
+    tune_loops()
     for j in range(U(rows)):
         to, source = j * BLOCK, (skip + j) * BLOCK
         for b in range(BLOCK):

@@ -6,14 +6,16 @@ import math
 
 import numpy as np
 
+from disco_hw.control.blocks import BLOCK, aligned_zeros
 from disco_hw.control.optimiser import Optimiser
 from disco_hw.control.parameter_points import drawn_points, mean_point, point_estimate, unscented_points
 from disco_hw.control.past import past_commands
 from disco_hw.control.plan import Array, Diagnostics, NoValidControl, Outcome, Plan, PlannerState, Rollouts
 from disco_hw.control.settings import DiscoSettings, WheelLimits
-from disco_hw.control.skid_steer import SkidSteer
+from disco_hw.control.skid_steer import WHEEL_ROWS, SkidSteer
 from disco_hw.control.tasks.task import Task
 from disco_hw.model import Model
+from disco_hw.model.effects import Channel
 from disco_hw.model.free_run import FreeRun
 from disco_hw.model.model import coefficient_tables
 from disco_hw.model.step import integration_of
@@ -53,6 +55,8 @@ class Disco:
         may_turn_more = settings.uncertainty in ("mc", "joint") or any(s.name in TURNING_EFFECTS for s in model.effects)
         self._integration = integration_of(step_s, may_turn_more or turn_rad > NARROW_TURN_RAD, np.float32)
         self._start = np.zeros(8, np.float32)
+        self._wheels = aligned_zeros(sampler.horizon * WHEEL_ROWS * int(BLOCK))
+        self._wheels_differ = self._do_wheels_differ(theta)
         self._optimiser = Optimiser(
             sampler,
             CHANNELS,
@@ -85,6 +89,15 @@ class Disco:
         """Largest value of a parameter in points (L, P); 0 if the model does not have it."""
         names = self._model.parameter_names
         return float(theta[:, names.index(name)].max()) if name in names else 0.0
+
+    def _do_wheels_differ(self, theta: Array) -> bool:
+        """Whether the points (L, P) differ in a parameter between command and wheel."""
+        differing = {name for name, column in zip(self._model.parameter_names, theta.T, strict=True) if np.ptp(column)}
+        wheel_effects = [s for s in self._model.effects if s.effect.channel is Channel.COMMAND_TO_WHEEL]
+        names = {f"{setting.name}.{key}" for setting in wheel_effects for key in setting.values}
+        if any(setting.name == "yaw_rate_limit" for setting in wheel_effects):
+            names |= {"wheel_radius_m", "axial_distance_m"}
+        return bool(names & differing)
 
     @property
     def task(self) -> Task:
@@ -237,7 +250,9 @@ class Disco:
             self._draw_points()
         base, effects = self._tables
         each = True if self._own_draws else None
-        return SkidSteer(self._start, base, effects, each, self._integration, task, self._history)
+        return SkidSteer(
+            self._start, base, effects, each, self._integration, task, self._history, self._wheels, self._wheels_differ
+        )
 
     def _draw_points(self) -> None:
         """Fresh draws of the belief for this step."""

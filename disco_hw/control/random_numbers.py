@@ -18,8 +18,8 @@ from disco_hw.model.jit import (
     float32,
     float_from_bits,
     int32,
-    prefer_wide_vectors,
     scalar_function,
+    tune_loops,
     uint32,
 )
 
@@ -111,7 +111,7 @@ def fill_normal_block(noise: Any, rows: int, block: int, step: int, seed: int, s
     `rows` is a multiple of four, `scale` the standard deviation. A deviate depends on nothing but (seed, step, sample,
     row): seed is the key, and step, sample and row are the counter.
     """
-    prefer_wide_vectors()
+    tune_loops()
     k0, k1 = uint32(seed & 0xFFFFFFFF), uint32((seed >> 32) & 0xFFFFFFFF)
     c2, c3 = uint32(step & 0xFFFFFFFF), uint32((step >> 32) & 0xFFFFFFFF)
     first = U(block) * BLOCK

@@ -5,13 +5,13 @@ from __future__ import annotations
 from typing import Any
 
 from disco_hw.control.blocks import BLOCK, U
-from disco_hw.model.jit import block_function, cast_like, prefer_wide_vectors
+from disco_hw.model.jit import block_function, cast_like, tune_loops
 
 
 @block_function
 def mean_over_points(costs: Any, point_costs: Any, weights: Any, blocks: int) -> None:
     """Add the weighted mean over the points, `point_costs` (L, K'), to `costs` (K',)."""
-    prefer_wide_vectors()
+    tune_loops()
     padded = blocks * int(BLOCK)
     for i in range(weights.size):
         weight = weights[i]

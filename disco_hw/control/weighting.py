@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from disco_hw.control.blocks import BLOCK, U
-from disco_hw.model.jit import block_function, float32, float_from_bits, int32, prefer_wide_vectors, scalar_function
+from disco_hw.model.jit import block_function, float32, float_from_bits, int32, scalar_function, tune_loops
 
 _LOG2_E = np.float32(math.log2(math.e))
 _LN2_HIGH = np.float32(0.693359375)
@@ -59,7 +59,7 @@ def weigh(weights: Any, scratch: Any, costs: Any, blocks: int, samples: int, lea
 
     `scratch` holds two rows of BLOCK. Idle lanes of the last block get weight zero.
     """
-    prefer_wide_vectors()
+    tune_loops()
     zero = float32(0.0)
     scale = float32(-1.0) / temperature
     for b in range(BLOCK):

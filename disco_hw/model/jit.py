@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -64,16 +65,17 @@ def kernel_function(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 @_intrinsic
-def prefer_wide_vectors(_context: Any) -> tuple[Any, Callable[..., Any]]:
-    """Let the loops of the calling function use 512-bit vectors where the processor has them.
+def tune_loops(_context: Any) -> tuple[Any, Callable[..., Any]]:
+    """Let the loops of the calling function use the processor's widest vectors and its estimates of reciprocal roots.
 
-    LLVM holds back to 256 bits on the processors whose early kinds slowed down for the wide ones. Here every loop is
-    long enough to gain.
+    LLVM holds back to 256 bits on processors whose early kinds slowed down for 512; here every loop is long enough to
+    gain. An estimate is refined by one Newton step, to 2e-7, and is what makes `quick_sqrt` quick.
     """
 
     def generate(context: Any, builder: Any, _signature: Any, _arguments: Any) -> Any:
         # llvmlite knows no attributes with values; the set takes them all the same.
         set.add(builder.function.attributes, '"prefer-vector-width"="512"')
+        set.add(builder.function.attributes, '"reciprocal-estimates"="vec-sqrtf:1"')
         return context.get_dummy_value()
 
     return types.void(), generate
@@ -111,3 +113,10 @@ def cast_like(value: float, like: float) -> Any:
 def _cast_like(value: Any, like: Any) -> Callable[..., Any]:
     target = like if isinstance(like, types.Float) else float32
     return lambda value, like: target(value)
+
+
+@scalar_function
+def quick_norm(x: Any, y: Any) -> Any:
+    """Length of a vector by way of the reciprocal root, which a loop with `tune_loops` estimates; of zero, 1e-15."""
+    square = x * x + (y * y + cast_like(1e-30, x))
+    return square * (cast_like(1.0, x) / math.sqrt(square))

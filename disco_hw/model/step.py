@@ -47,16 +47,18 @@ class Base(NamedTuple):
 
 
 class Integration(NamedTuple):
-    """Length of a step as its series need it (powers over factorials), and `wide`: 1/16 if a step may turn far.
+    """Length of a step, and what the sine and cosine of half a step's turn need.
 
-    sin(z)/z and cos(z) of half a step's turn, z = rate * step, are polynomials in rate^2. `wide` is None if no step
-    turns the robot by more than 0.4 rad.
+    With z = turn * step, step * sin(z) / z and cos(z) are polynomials in turn^2: `chord0` (the step) to `chord3`, 1 and
+    `cos1` to `cos3`. They are good for 0.2 rad; `wide` is 1/16 step to work on a sixteenth of z and double four times,
+    for 4 rad and more, or None.
     """
 
     step_s: Any
-    sinc1: Any
-    sinc2: Any
-    sinc3: Any
+    chord0: Any
+    chord1: Any
+    chord2: Any
+    chord3: Any
     cos1: Any
     cos2: Any
     cos3: Any
@@ -69,9 +71,10 @@ def integration_of(step_s: float, wide: bool, dtype: type = np.float64) -> Integ
     h2 = h * h
     return Integration(
         dtype(step_s),
-        dtype(-h2 / 6),
-        dtype(h2**2 / 120),
-        dtype(-(h2**3) / 5040),
+        dtype(step_s),
+        dtype(-step_s * h2 / 6),
+        dtype(step_s * h2**2 / 120),
+        dtype(-step_s * h2**3 / 5040),
         dtype(-h2 / 2),
         dtype(h2**2 / 24),
         dtype(-(h2**3) / 720),
@@ -80,9 +83,9 @@ def integration_of(step_s: float, wide: bool, dtype: type = np.float64) -> Integ
 
 
 @scalar_function
-def follows_wheels(effects: Any) -> Any:
-    """Whether the state must carry wheel speeds; a constant to the compiler."""
-    return (effects.motor_lag is not None) or (effects.stiction is not None) or (effects.acceleration_slip is not None)
+def needs_change(effects: Any) -> Any:
+    """Whether the body's motion depends on the change of the wheel speeds; a constant to the compiler."""
+    return effects.acceleration_slip is not None
 
 
 @scalar_function
@@ -106,37 +109,42 @@ def wheel_step(left: Any, right: Any, wheel_left: Any, wheel_right: Any, time_s:
 
 
 @scalar_function
-def body_velocity(mean_left: Any, mean_right: Any, wheel_change: Any, time_s: Any, base: Any, effects: Any) -> Any:
+def body_velocity(wheel_sum: Any, difference: Any, change: Any, time_s: Any, base: Any, effects: Any) -> Any:
     """Forward speed (m/s), lateral speed of the axle (m/s) or None, and half the yaw rate (rad/s).
 
-    From the mean wheel speeds over a step, the change of their sum (rad/s), and the time at its start.
+    From the mean wheel speeds over a step, left plus right and right minus left, the change of their sum over it
+    (rad/s), and the time at its start (s).
     """
-    mean_left, mean_right = wheel_radius_asymmetry.term(mean_left, mean_right, effects.wheel_radius_asymmetry)
-    forward = base.half_radius_m * (mean_left + mean_right)
-    turn = base.half_turn_ratio * (mean_right - mean_left)
+    wheel_sum, difference = wheel_radius_asymmetry.term(wheel_sum, difference, effects.wheel_radius_asymmetry)
+    forward = base.half_radius_m * wheel_sum
+    turn = base.half_turn_ratio * difference
     forward, turn = surface_change.term(forward, turn, time_s, effects.surface_change)
     turn = turn_slip.term(turn, effects.turn_slip)
-    forward = acceleration_slip.term(forward, wheel_change, effects.acceleration_slip)
+    forward = acceleration_slip.term(forward, change, effects.acceleration_slip)
     lateral = side_slip.term(forward, turn, effects.side_slip)
     forward = lateral_icr.term(forward, turn, effects.lateral_icr)
     return forward, lateral, turn
 
 
 @scalar_function
-def half_turn(turn: float, wide: Any, series: Any) -> Any:
-    """Sine over angle, and cosine, of the turn in half a step; `turn` is half the yaw rate (rad/s)."""
+def half_turn(turn: Any, wide: Any, series: Any) -> Any:
+    """Chord of a step over its speed (s), and cosine of the turn in half a step; `turn` is half the yaw rate (rad/s).
+
+    The sine of the turn in half a step is `turn` times the chord.
+    """
     q = turn * turn
     one = cast_like(1.0, q)
     if wide is None:
-        return one + q * (series.sinc1 + q * series.sinc2), one + q * (series.cos1 + q * series.cos2)
-    sinc = one + q * (series.sinc1 + q * (series.sinc2 + q * series.sinc3))
+        chord = series.chord0 + q * (series.chord1 + q * series.chord2)
+        return chord, one + q * (series.cos1 + q * series.cos2)
+    chord = series.chord0 + q * (series.chord1 + q * (series.chord2 + q * series.chord3))
     cosine = one + q * (series.cos1 + q * (series.cos2 + q * series.cos3))
     # Doubled four times, by way of sine and 1 - cosine, which lose no precision near zero.
     two = cast_like(2.0, q)
-    sine = turn * wide * sinc
+    sine = turn * chord * cast_like(1 / 16, q)
     for _ in range(4):
-        sinc, sine, cosine = sinc * cosine, two * sine * cosine, one - two * sine * sine
-    return sinc, cosine
+        chord, sine, cosine = chord * cosine, two * sine * cosine, one - two * sine * sine
+    return chord, cosine
 
 
 @scalar_function
@@ -153,14 +161,15 @@ def move(
     x: float, y: float, cos_yaw: float, sin_yaw: float, forward: float, lateral: Any, turn: float, integration: Any
 ) -> Any:
     """Move the axle's centre along the exact arc of a constant body velocity; returns x, y, cos(yaw), sin(yaw)."""
-    sinc, cosine = half_turn(turn, integration.wide, integration)
-    chord = integration.step_s * sinc
+    chord, cosine = half_turn(turn, integration.wide, integration)
     sine = turn * chord
     cos_mid = cos_yaw * cosine - sin_yaw * sine
     sin_mid = sin_yaw * cosine + cos_yaw * sine
     along = forward * chord
     x, y = sideways(lateral, chord, x + along * cos_mid, y + along * sin_mid, cos_mid, sin_mid)
-    return x, y, cos_mid * cosine - sin_mid * sine, sin_mid * cosine + cos_mid * sine
+    # exp(2iz) = 2 cos(z) exp(iz) - 1
+    twice = cosine + cosine
+    return x, y, twice * cos_mid - cos_yaw, twice * sin_mid - sin_yaw
 
 
 @scalar_function
@@ -179,6 +188,20 @@ def tracked_of(axle_x: Any, axle_y: Any, cos_yaw: Any, sin_yaw: Any, base: Any) 
 
 
 @scalar_function
+def body_step(
+    axle_x: Any, axle_y: Any, cos_yaw: Any, sin_yaw: Any, wheel_sum: Any, difference: Any, change: Any, time_s: Any,
+    base: Any, effects: Any, integration: Any,
+) -> Any:  # fmt: skip
+    """The body's half of a step: the axle's point (m), cosine and sine of yaw after it; forward speed (m/s) and half
+    the yaw rate (rad/s) over it. Wheel speeds as for `body_velocity`.
+    """
+    forward, lateral, turn = body_velocity(wheel_sum, difference, change, time_s, base, effects)
+    axle_x, axle_y, cos_yaw, sin_yaw = move(axle_x, axle_y, cos_yaw, sin_yaw, forward, lateral, turn, integration)
+    axle_x, axle_y = slope.term(axle_x, axle_y, wheel_sum, difference, effects.slope)
+    return axle_x, axle_y, cos_yaw, sin_yaw, forward, turn
+
+
+@scalar_function
 def step(
     axle_x: Any, axle_y: Any, cos_yaw: Any, sin_yaw: Any, wheel_left: Any, wheel_right: Any, left: Any, right: Any,
     time_s: Any, base: Any, effects: Any, integration: Any,
@@ -191,7 +214,8 @@ def step(
     """
     end_left, end_right, mean_left, mean_right = wheel_step(left, right, wheel_left, wheel_right, time_s, effects)
     change = (end_left + end_right) - (wheel_left + wheel_right)
-    forward, lateral, turn = body_velocity(mean_left, mean_right, change, time_s, base, effects)
-    axle_x, axle_y, cos_yaw, sin_yaw = move(axle_x, axle_y, cos_yaw, sin_yaw, forward, lateral, turn, integration)
-    axle_x, axle_y = slope.term(axle_x, axle_y, mean_left, mean_right, effects.slope)
+    axle_x, axle_y, cos_yaw, sin_yaw, forward, turn = body_step(
+        axle_x, axle_y, cos_yaw, sin_yaw, mean_left + mean_right, mean_right - mean_left, change, time_s,
+        base, effects, integration,
+    )  # fmt: skip
     return axle_x, axle_y, cos_yaw, sin_yaw, end_left, end_right, forward, turn

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from disco_hw.config import CircleTask
 from disco_hw.control.tasks.terms import has_memory, stage_cost, terminal_cost
-from disco_hw.model.jit import cast_like, scalar_function, specialise
+from disco_hw.model.jit import cast_like, quick_norm, scalar_function, specialise
+from disco_hw.model.reference import State
 
 
 class CircleTerms(NamedTuple):
@@ -72,6 +73,19 @@ class Circle:
         distance = math.hypot(x_m - self.center_x_m, y_m - self.center_y_m) - self.radius_m
         return math.hypot(distance, forward_m_s - self.speed_m_s)
 
+    def reference_cost(self, step_s: float) -> Callable[..., Any]:
+        """The stage cost in numpy, for `disco_hw.control.reference`: of states before and after, speed and step."""
+
+        def cost(old: State, new: State, forward: Any, t: int) -> Any:
+            x_old, y_old = old.x - self.center_x_m, old.y - self.center_y_m
+            x, y = new.x - self.center_x_m, new.y - self.center_y_m
+            rho = np.hypot(x, y)
+            progress = (x_old * y - y_old * x) / step_s / self.radius_m
+            lost = np.maximum(self.speed_m_s * rho / self.radius_m - progress, 0.0)
+            return np.hypot(rho - self.radius_m, forward - self.speed_m_s) + self.progress_weight * lost
+
+        return cost
+
     def picture(self) -> NDArray[np.float64]:
         """The path to follow as a closed polyline in the world frame, shape (N, 2)."""
         angle = np.linspace(0.0, 2.0 * np.pi, 181)
@@ -112,7 +126,7 @@ def _stage_cost(
         sin_yaw: Any,
         forward: Any,
     ) -> Any:
-        rho = math.sqrt(x * x + y * y)
+        rho = quick_norm(x, y)
         off_edge = rho - task.radius_m
         off_speed = forward - task.speed_m_s
         cost = math.sqrt(off_edge * off_edge + off_speed * off_speed)

@@ -30,12 +30,13 @@ class Slope:
 
 
 @scalar_function
-def term(x: Any, y: Any, left: Any, right: Any, coefficients: Any) -> Any:
-    """Position after a step's drift at these mean wheel speeds (m, rad/s)."""
+def term(x: Any, y: Any, wheel_sum: Any, difference: Any, coefficients: Any) -> Any:
+    """Position (m) after a step's drift; of the wheel speeds sum and difference (rad/s)."""
     if coefficients is None:
         return x, y
     drift_x, drift_y, scale = coefficients
-    part = min(scale * (abs(left) + abs(right)), cast_like(1.0, x))
+    # |left| + |right| is the larger of |left + right| and |left - right|.
+    part = min(scale * max(abs(wheel_sum), abs(difference)), cast_like(1.0, x))
     return x + part * drift_x, y + part * drift_y
 
 

@@ -20,17 +20,17 @@ class WheelRadiusAsymmetry:
     sentence = "the right wheels are {ratio:+.2%} larger than the mean and the left ones as much smaller"
 
     def coefficients(self, values: Array, base: Array, step_s: float) -> tuple[Array, ...]:
-        """Factors of the left and right rim speed, each (L,)."""
-        return 1.0 - values[:, 0], 1.0 + values[:, 0]
+        """The ratio, (L,)."""
+        return (values[:, 0],)
 
 
 @scalar_function
-def term(left: Any, right: Any, coefficients: Any) -> Any:
-    """Wheel speeds that equal wheels would need for the same rim speeds (rad/s)."""
+def term(wheel_sum: Any, difference: Any, coefficients: Any) -> Any:
+    """Sum and difference (right minus left) of the wheel speeds that equal wheels would need (rad/s)."""
     if coefficients is None:
-        return left, right
-    factor_left, factor_right = coefficients
-    return left * factor_left, right * factor_right
+        return wheel_sum, difference
+    (ratio,) = coefficients
+    return wheel_sum + ratio * difference, difference + ratio * wheel_sum
 
 
 EFFECT = WheelRadiusAsymmetry()
