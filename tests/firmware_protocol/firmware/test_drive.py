@@ -160,6 +160,7 @@ def test_estop_decelerates_from_the_very_next_cycle_then_brakes(how):
     assert all(left == pytest.approx(2 * right, abs=1e-4) for left, right in trace)
     assert bench.now_us - start == pytest.approx(200 * MS, abs=3 * MS)
     assert (bench.out.state, bench.out.brake, setpoints(bench)) == ("ESTOP", True, (0.0, 0.0))
+    assert not bench.out.limited
 
 
 def test_stopping_keeps_curvature_and_ends_in_standby():

@@ -123,7 +123,7 @@ def test_ticks_that_no_wheel_can_make_are_a_jump(side, jump):
 
 def test_ticks_may_wrap():
     bench = Bench()
-    bench.ticks = [2.0**32 - 500, -(2.0**32)]
+    bench.ticks = [2.0**32 - 500, -(2.0**31)]
     bench.core = Bench().core.__class__(CONFIG)
     bench.to_driving(4.0, -4.0)
     assert bench.run(1000).fault == 0

@@ -329,6 +329,10 @@ def test_a_pose_that_does_not_fit_is_not_valid(arguments):
     assert pose(*arguments)["valid"] == 0
 
 
+def test_a_pose_without_deviation_is_valid():
+    assert pose(0.0, 0.0, 0.0, 0, 0.0, 0.0)["valid"] == 1
+
+
 def test_a_large_deviation_saturates():
     assert pose(0.0, 0.0, 0.0, 0, 5.0, 5.0)["position_std"] == pytest.approx(0.255)
 
