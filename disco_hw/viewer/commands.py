@@ -1,4 +1,7 @@
-"""What `disco-hw view` does: the live page, and each use of a log."""
+"""What `disco-hw view` does: the live page, and each use of a log.
+
+What a page does not need is imported where it is used: the plotting library alone takes half a second.
+"""
 
 from __future__ import annotations
 
@@ -13,9 +16,7 @@ from disco_hw.config import load_robot_config
 from disco_hw.daemon.client import socket_path
 from disco_hw.daemon.signals import StopSignals
 from disco_hw.errors import InputError
-from disco_hw.viewer.export import export_html
 from disco_hw.viewer.live import LivePage, run_live
-from disco_hw.viewer.picture import draw_clip, draw_picture
 from disco_hw.viewer.recording import Recording
 from disco_hw.viewer.replay import ReplayPage, run_replay
 from disco_hw.viewer.server import DEFAULT_PORT, LOOPBACK, serving
@@ -63,6 +64,8 @@ def snapshot_log(log: Path, out: Path, at_s: float | None = None, robot: Path | 
 
     Raises InputError for a bad file or an ending that is no kind of picture.
     """
+    from disco_hw.viewer.picture import draw_picture  # noqa: PLC0415
+
     with Recording(log, robot) as recording:
         _check_folder(out)
         draw_picture(recording, recording.duration_s if at_s is None else at_s, out)
@@ -70,6 +73,8 @@ def snapshot_log(log: Path, out: Path, at_s: float | None = None, robot: Path | 
 
 def video_log(log: Path, out: Path, speed: float = 1.0, robot: Path | None = None) -> None:
     """Write the log as a clip, `speed` times as fast as it was; needs no display. Raises InputError as `draw_clip`."""
+    from disco_hw.viewer.picture import draw_clip  # noqa: PLC0415
+
     with Recording(log, robot) as recording, _progress(f"writing {out.name}") as progress:
         _check_folder(out)
         draw_clip(recording, out, speed, progress)
@@ -77,6 +82,8 @@ def video_log(log: Path, out: Path, speed: float = 1.0, robot: Path | None = Non
 
 def export_log(log: Path, out: Path, robot: Path | None = None) -> None:
     """Write the log as one HTML file that plays without Python. Raises InputError for a bad file."""
+    from disco_hw.viewer.export import export_html  # noqa: PLC0415
+
     with Recording(log, robot) as recording, _progress(f"writing {out.name}") as progress:
         _check_folder(out)
         export_html(recording, out, progress)

@@ -98,7 +98,8 @@ class LivePage:
             self.scene.show(snapshot, everything)
         if everything:
             _set(self._head, live_head(self._status, self._error))
-            _set(self._details, live_details(self._status, snapshot, self._subscriber.missed))
+            behind_ms = None if snapshot is None else (time.monotonic_ns() - snapshot.t_ns) * 1e-6
+            _set(self._details, live_details(self._status, snapshot, self._subscriber.missed, behind_ms))
             _set(self._events, events_text(snapshot, self.timeline.first_ns))
             if snapshot is not None:
                 self._plots.show(self.timeline, snapshot.t_ns)

@@ -26,10 +26,15 @@ def live_head(status: Mapping[str, Any] | None, error: str) -> str:
     return "\n".join(lines)
 
 
-def live_details(status: Mapping[str, Any] | None, snapshot: Snapshot | None, missed: int) -> str:
-    """Markdown of the figures: robot, link, loop, motion; `missed` batches of the feed did not reach this page."""
+def live_details(
+    status: Mapping[str, Any] | None, snapshot: Snapshot | None, missed: int, behind_ms: float | None
+) -> str:
+    """Markdown of the figures: robot, link, loop, motion.
+
+    `missed` batches of the feed did not reach this page; what it shows is `behind_ms` old.
+    """
     rows: Rows = [] if status is None or not status.get("ok") else _status_rows(status)
-    rows.append(("batches missed here", str(missed)))
+    rows.append(("page is behind", f"{number(behind_ms, 0)} ms, {missed} batches missed"))
     if snapshot is not None:
         rows += motion_rows(snapshot)
     return _table(rows)

@@ -2,6 +2,7 @@
 
 import os
 import signal
+import socket
 import time
 from pathlib import Path
 
@@ -26,7 +27,8 @@ def address(output: Path, timeout_s: float = 30.0) -> str:
 
 
 def test_the_page_changes_nothing_while_it_is_stopped_and_its_estop_stops_the_wheels(tmp_path):
-    view = ["view", "--live", "--port", "8137", "--robot"]
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        view = ["view", "--live", "--port", str(taken.getsockname()[1]), "--robot"]
     with chromium() as browser, running_stack(tmp_path) as stack:
         page_file = tmp_path / "page.txt"
         with disco_hw_process("page", [*view, str(stack.robot_file)], page_file) as page:

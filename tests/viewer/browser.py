@@ -33,7 +33,7 @@ def chromium():
 
 
 @contextmanager
-def opened(browser, url, width=1000, height=700):
+def opened(browser, url, width=800, height=540):
     """A page of the address, and what its console said is kept in `page.said`."""
     page = browser.new_page(viewport={"width": width, "height": height})
     page.set_default_timeout(60_000)

@@ -37,11 +37,11 @@ def test_a_latched_stop_says_how_to_clear_it(change):
 )
 def test_without_a_status_it_says_why(status, error, expected):
     assert expected in live_head(status, error)
-    assert "| batches missed here | 3 |" in live_details(status, None, 3)
+    assert "| page is behind | 12 ms, 3 batches missed |" in live_details(status, None, 3, 12.4)
 
 
 def test_the_details_add_up_what_went_wrong(timeline):
-    text = live_details(STATUS, snapshot_at(timeline, START_NS + 50 * PERIOD_NS, plan_at(50)), 0)
+    text = live_details(STATUS, snapshot_at(timeline, START_NS + 50 * PERIOD_NS, plan_at(50)), 0, None)
     assert "| rejected, lost | 6, 5 |" in text
     assert "| loop late p99, max | 100, 900 us |" in text
     assert "| overruns, skipped | 7, 8 |" in text

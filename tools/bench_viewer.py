@@ -1,0 +1,179 @@
+"""What the page costs: the loop that feeds it, its own process, the way from the robot to the page, and a replay."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import viser
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import ClientConnection, connect
+from websockets.typing import Origin, Subprotocol
+
+from disco_hw.log.reader import open_log
+from disco_hw.operator import disco_hw_process
+from disco_hw.viewer.feed import ViewerFeed, feed_path
+from disco_hw.viewer.recording import Recording
+from disco_hw.viewer.replay import ReplayPage
+from disco_hw.viewer.server import serving
+from disco_hw.viewer.subscriber import FeedSubscriber
+from drivers.types import WheelSample
+from tests.hil.stack import running_stack
+from tests.viewer.run import PERIOD_NS, tick_records, write_log
+
+LONG_S = 600.0
+DRIVE_S = 15.0
+PORT = 8139
+_CAMERA = {
+    "type": "ViewerCameraMessage", "wxyz": (1.0, 0.0, 0.0, 0.0), "position": (0.0, 0.0, 3.0), "fov": 1.3, "near": 0.01,
+    "far": 100.0, "image_height": 800, "image_width": 1280, "look_at": (0.0, 0.0, 0.0), "up_direction": (0.0, 0.0, 1.0),
+}  # fmt: skip
+
+
+def run() -> dict[str, float]:
+    with tempfile.TemporaryDirectory(prefix="disco-hw-bench-") as scratch:
+        directory = Path(scratch)
+        return {**_feed(directory), **_replay(directory), **_live(directory)}
+
+
+def _feed(directory: Path) -> dict[str, float]:
+    """CPU time of `put` in the loop's thread, with nobody looking and with one page."""
+    feed = ViewerFeed(directory / "feed")
+    unwatched = _put_all(feed, 0)
+    subscriber = FeedSubscriber(directory / "feed")
+    tick = 3000
+    while not subscriber.receive(0.01):
+        feed.put(*tick_records(tick))
+        tick += 1
+    watched = _put_all(feed, tick, subscriber)
+    subscriber.close()
+    feed.close()
+    return {
+        "viewer.feed_unwatched_cpu_us_p99": float(np.quantile(unwatched, 0.99)),
+        "viewer.feed_watched_cpu_us_p50": float(np.quantile(watched, 0.5)),
+        "viewer.feed_watched_cpu_us_p99": float(np.quantile(watched, 0.99)),
+    }
+
+
+def _put_all(feed: ViewerFeed, first: int, subscriber: FeedSubscriber | None = None) -> list[float]:
+    taken_us = []
+    for now_ns, got in map(tick_records, range(first, first + 3000)):
+        begin = time.thread_time()
+        feed.put(now_ns, got)
+        taken_us.append((time.thread_time() - begin) * 1e6)
+        if subscriber is not None:
+            subscriber.receive(0.0)
+    return taken_us
+
+
+def _replay(directory: Path) -> dict[str, float]:
+    """Opening a log of ten minutes, and going to places in it until they have been handed to the browser's link."""
+    log = write_log(directory / "long.mcap", round(LONG_S * 1e9 / PERIOD_NS))
+    begin = time.perf_counter()
+    with Recording(log) as opened, serving("bench", port=0) as page:
+        replay = ReplayPage(page.server, opened)
+        replay.step(0.0)
+        open_s = time.perf_counter() - begin
+        seeks_s = []
+        for place in np.random.default_rng(1).uniform(0.0, LONG_S, 60):
+            begin = time.perf_counter()
+            replay.go_to(float(place))
+            replay.step(0.0)
+            seeks_s.append(time.perf_counter() - begin)
+    return {
+        "viewer.open_ten_minutes_ms": open_s * 1e3,
+        "viewer.seek_ms_p50": float(np.quantile(seeks_s, 0.5)) * 1e3,
+        "viewer.seek_ms_max": max(seeks_s) * 1e3,
+    }
+
+
+def _live(directory: Path) -> dict[str, float]:
+    """The whole stack driving: without a page, then with a page and a browser's connection that reads everything."""
+    view = ["view", "--live", "--port", str(PORT), "--robot"]
+    spans = {}
+    with running_stack(directory) as stack:
+        stack.drive()
+        time.sleep(2.0)
+        begin_ns = time.monotonic_ns()
+        time.sleep(DRIVE_S)
+        spans["without"] = (begin_ns, time.monotonic_ns())
+        with disco_hw_process("page", [*view, str(stack.robot_file)], directory / "page.txt") as page, _browser():
+            time.sleep(2.0)
+            cpu_s, begin_ns = _cpu_s(page.process.pid), time.monotonic_ns()
+            ages_ms = _ages_ms(feed_path(directory / "control.sock"))
+            spans["with"] = (begin_ns, time.monotonic_ns())
+            cpu_s = _cpu_s(page.process.pid) - cpu_s
+        stack.operator.tell("quit")
+        stack.daemon.process.wait(10.0)
+    figures = {
+        "viewer.page_cpu_percent": 100.0 * cpu_s / DRIVE_S,
+        "viewer.sample_to_page_ms_p50": float(np.quantile(ages_ms, 0.5)),
+        "viewer.sample_to_page_ms_p99": float(np.quantile(ages_ms, 0.99)),
+    }
+    with open_log(directory / "run.mcap") as log:
+        for name, span in spans.items():
+            lateness_us = log.columns("/loop", *span)["lateness_ns"].astype(np.float64) * 1e-3
+            figures[f"viewer.lateness_{name}_page_us_p50"] = float(np.quantile(lateness_us, 0.5))
+            figures[f"viewer.lateness_{name}_page_us_p99"] = float(np.quantile(lateness_us, 0.99))
+    return figures
+
+
+def _ages_ms(feed: Path) -> list[float]:
+    """Age of every wheel sample when it arrives in the page's process, from its time stamp on, over the drive."""
+    ages_ms: list[float] = []
+    subscriber = FeedSubscriber(feed)
+    end_s = time.monotonic() + DRIVE_S
+    while time.monotonic() < end_s:
+        received = subscriber.receive(0.1)
+        now_ns = time.monotonic_ns()
+        ages_ms += [(now_ns - record.t_ns) * 1e-6 for _, record in received if isinstance(record, WheelSample)]
+    subscriber.close()
+    return ages_ms
+
+
+@contextmanager
+def _browser() -> Iterator[None]:
+    """What a browser does to the page's process: connect, and read all that comes."""
+    address = f"127.0.0.1:{PORT}"
+    deadline_s = time.monotonic() + 30.0
+    while True:
+        try:
+            client = connect(
+                f"ws://{address}/", origin=Origin(f"http://{address}"), max_size=None,
+                subprotocols=[Subprotocol(f"viser-v{viser.__version__}")],
+            )  # fmt: skip
+            break
+        except (OSError, InvalidStatus):
+            if time.monotonic() > deadline_s:
+                raise
+            time.sleep(0.1)
+    client.send(msgspec.msgpack.encode(_CAMERA))
+    reader = threading.Thread(target=_read_all, args=(client,))
+    reader.start()
+    try:
+        yield
+    finally:
+        client.close()
+        reader.join()
+
+
+def _read_all(client: ClientConnection) -> None:
+    for _ in client:
+        pass
+
+
+def _cpu_s(pid: int) -> float:
+    fields = Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+if __name__ == "__main__":
+    for key, value in run().items():
+        print(f"{key:<40} {value:10.3f}")
