@@ -155,14 +155,26 @@ def test_arm_is_consumed_when_the_link_or_robot_is_another_one():
     assert one.wanted is Request.STANDBY
     assert one.session == 0
     assert one.note == "disarmed: the link was lost"
-    one.request(Request.READY)
-    one.step(0)
-    assert one.session == 0, "no session before the robot has been heard"
-    one.request(Request.STANDBY)
     report(one, "ARMED", 17)
     assert not one.armed
     report(one, "STANDBY", 0)
     assert one.host_state().request == "STANDBY"
+
+
+def test_no_session_before_the_robot_has_been_heard_again():
+    one = arming()
+    report(one, "STANDBY", 0)
+    one.request(Request.READY)
+    one.step(0)
+    report(one, "READY")
+    one.reset("the link was lost")
+    assert one.note == "", "nothing was taken away from anybody"
+    one.request(Request.READY)
+    one.step(0)
+    assert one.session == 0
+    report(one, "STANDBY", 0)
+    one.step(0)
+    assert one.session != 0
 
 
 def test_a_robot_armed_in_another_session_is_not_ours():
@@ -177,13 +189,16 @@ def test_a_robot_armed_in_another_session_is_not_ours():
 def test_arming_that_takes_too_long_is_given_up_with_the_robots_reason():
     one = arming()
     report(one, "STANDBY", 0)
+    one.note = "of an earlier attempt"
     one.request(Request.ARM)
-    one.step(0)
+    assert one.note == ""
+    start_ns = 10**15
+    one.step(start_ns)
     report(one, "READY", reject_reason="CHALLENGE")
-    one.take_session(1, one.session, ("CHALLENGE", "WHEELS_MOVING"), 0)
-    one.step(ARMING_TIMEOUT_NS)
+    one.take_session(1, one.session, ("CHALLENGE", "WHEELS_MOVING"), start_ns)
+    one.step(start_ns + ARMING_TIMEOUT_NS)
     assert one.wanted is Request.ARM
-    one.step(ARMING_TIMEOUT_NS + 1)
+    one.step(start_ns + ARMING_TIMEOUT_NS + 1)
     assert one.wanted is Request.STANDBY
     for words in ("not armed within 1.5 s", "challenge is not answered", "wheels are turning", "was wrong"):
         assert words in one.note
