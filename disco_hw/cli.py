@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import sys
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -28,6 +29,14 @@ ModelOption = Annotated[Path | None, typer.Option("--model", help="Use this mode
 
 Logs = Annotated[list[Path], typer.Argument(metavar="LOG...", help="Logs of driving: MCAP or CSV.")]
 RobotOption = Annotated[Path, typer.Option("--robot", help="The robot's configuration (docs/robot.md).")]
+View = Annotated[bool, typer.Option("--view", help="Serve the page beside it, for this host only.")]
+
+
+def _page(view: bool, robot: Path, model: Path | None) -> AbstractContextManager[object]:
+    from disco_hw.viewer.address import DEFAULT_PORT, LOOPBACK
+    from disco_hw.viewer.beside import page_beside
+
+    return page_beside(robot, model, LOOPBACK, DEFAULT_PORT) if view else nullcontext()
 
 
 def _progress_line(text: str) -> None:
@@ -45,6 +54,7 @@ def demo(
     laps: Annotated[float, typer.Option(min=0.5, max=100.0, help="Laps to drive.")] = 1.5,
     plant_seed: Annotated[int, typer.Option(min=0, help="Seed of the virtual robot's true parameters.")] = 1,
     uncertainty: Annotated[str, typer.Option(help="ut, mc or point.")] = "ut",
+    view: View = False,
     as_json: AsJson = False,
 ) -> None:
     """Drive the paper's circle with a virtual robot in real time, end to end, and print the figures."""
@@ -52,7 +62,13 @@ def demo(
 
     result = run_demo(
         DemoOptions(
-            link=link, out=out, laps=laps, plant_seed=plant_seed, uncertainty=uncertainty, show_progress=not as_json
+            link=link,
+            out=out,
+            laps=laps,
+            plant_seed=plant_seed,
+            uncertainty=uncertainty,
+            view=view,
+            show_progress=not as_json,
         )
     )
     if as_json:
@@ -67,6 +83,7 @@ def run(
     model: ModelOption = None,
     link: Annotated[str | None, typer.Option(help="Use this link instead of robot.toml's: can or serial.")] = None,
     log_file: Annotated[Path | None, typer.Option("--log", help="Record to this file.")] = None,
+    view: View = False,
     as_json: AsJson = False,
 ) -> None:
     """Run the on-robot daemon: connect, estimate, record; arm and start only when told to (`disco-hw ctl`)."""
@@ -76,7 +93,9 @@ def run(
     limit_thread_pools()
     from disco_hw.daemon.daemon import DaemonOptions, run_daemon
 
-    raise typer.Exit(run_daemon(DaemonOptions(robot=robot, model=model, link=link, log_file=log_file, as_json=as_json)))
+    with _page(view, robot, model):
+        code = run_daemon(DaemonOptions(robot=robot, model=model, link=link, log_file=log_file, as_json=as_json))
+    raise typer.Exit(code)
 
 
 @app.command()
@@ -137,6 +156,7 @@ def drive(
     model: ModelOption = None,
     link: Annotated[str | None, typer.Option(help="Use this link instead of robot.toml's: can or serial.")] = None,
     log_file: Annotated[Path | None, typer.Option("--log", help="Record to this file.")] = None,
+    view: View = False,
     as_json: AsJson = False,
 ) -> None:
     """Drive by keyboard, gamepad or script, and record it for `infer` and `gap` (docs/drive.md)."""
@@ -145,20 +165,21 @@ def drive(
     limit_thread_pools()
     from disco_hw.drive.commands import DriveOptions, run_drive
 
-    result = run_drive(
-        DriveOptions(
-            robot=robot,
-            model=model,
-            link=link,
-            log_file=log_file,
-            gamepad=gamepad,
-            script=script,
-            unattended=unattended,
-            seconds=seconds,
-            seed=seed,
-            as_json=as_json,
+    with _page(view, robot, model):
+        result = run_drive(
+            DriveOptions(
+                robot=robot,
+                model=model,
+                link=link,
+                log_file=log_file,
+                gamepad=gamepad,
+                script=script,
+                unattended=unattended,
+                seconds=seconds,
+                seed=seed,
+                as_json=as_json,
+            )
         )
-    )
     _print(result.as_dict(), as_json, result.as_text())
     if not result.completed:
         raise typer.Exit(1)
@@ -268,7 +289,7 @@ def view(
 ) -> None:
     """Show the page: a log, or the running daemon."""
     from disco_hw.viewer import commands
-    from disco_hw.viewer.server import DEFAULT_PORT
+    from disco_hw.viewer.address import DEFAULT_PORT
 
     if live:
         if robot is None or log is not None:

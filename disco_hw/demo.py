@@ -23,6 +23,7 @@ from disco_hw.circle_report import CircleReport, load_circle_report
 from disco_hw.config import load_robot_config
 from disco_hw.errors import InputError, WorkError
 from disco_hw.operator import Operator, disco_hw_process, stands
+from disco_hw.viewer.address import DEFAULT_PORT, LOOPBACK
 
 _START_TIMEOUT_S = 90.0
 _POLL_S = 0.1
@@ -38,6 +39,7 @@ class DemoOptions:
     laps: float = 1.5
     plant_seed: int = 1
     uncertainty: str = "ut"
+    view: bool = False
     show_progress: bool = True
 
 
@@ -117,12 +119,15 @@ def _drive(options: DemoOptions, files: _Files, console: Console) -> bool:
         "sim", str(files.robot), "--plant-seed", str(options.plant_seed), "--truth", str(files.truth),
         "--start", str(config.task.center_x_m + config.task.radius_m), str(config.task.center_y_m), "1.5707963",
     ]  # fmt: skip
+    daemon_arguments = ["run", str(files.robot), "--log", str(files.log), *(["--view"] if options.view else [])]
     with (
         disco_hw_process("virtual robot", simulator, files.simulator_output) as robot,
-        disco_hw_process("daemon", ["run", str(files.robot), "--log", str(files.log)], files.daemon_output) as daemon,
+        disco_hw_process("daemon", daemon_arguments, files.daemon_output) as daemon,
     ):
         operator = Operator(files.socket, (robot, daemon))
         console.print(f"virtual robot pid {robot.process.pid}, daemon pid {daemon.process.pid}, link {options.link}")
+        if options.view:
+            console.print(f"page http://{LOOPBACK}:{DEFAULT_PORT}")
         operator.wait_for("READY", _START_TIMEOUT_S)
         operator.tell("arm")
         operator.wait_for("ARMED", 5.0)

@@ -25,9 +25,8 @@ from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
 from disco_hw.errors import InputError
+from disco_hw.viewer.address import DEFAULT_PORT, LOOPBACK
 
-LOOPBACK = "127.0.0.1"
-DEFAULT_PORT = 8080
 _LOOPBACK_NAMES = frozenset({"127.0.0.1", "localhost"})
 _COOKIE = "disco-hw-token"
 Answer = Callable[[Any, Request], Response | None]
