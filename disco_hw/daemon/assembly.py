@@ -60,14 +60,19 @@ def make_driver() -> ReferenceDriver:
 
 
 def assemble_core(
-    config: RobotConfig, transport: Transport, driver: Driver, pipeline: Pipeline, recorder: Recorder
+    config: RobotConfig,
+    transport: Transport,
+    driver: Driver,
+    pipeline: Pipeline,
+    recorder: Recorder,
+    needs_pose: bool = True,
 ) -> DaemonCore:
-    """The daemon's tick over these parts."""
+    """The daemon's tick over these parts; without `needs_pose` motion needs no pose, whatever robot.toml says."""
     supervisor = Supervisor(
         SupervisorSettings(
             telemetry_zero_s=config.control.telemetry_zero_s,
             telemetry_disarm_s=config.control.telemetry_disarm_s,
-            pose_required=config.estimation.pose_required,
+            pose_required=needs_pose and config.estimation.pose_required,
         )
     )
     return DaemonCore(config, transport, driver, supervisor, pipeline, recorder, lambda robot: preflight(config, robot))

@@ -116,7 +116,7 @@ def _start(
         baud=link.baud,
     )
     stop.add("link", transport.close)
-    core = assemble_core(config, transport, make_driver(), pipeline, recorder)
+    core = assemble_core(config, transport, make_driver(), pipeline, recorder, pilot.needs_pose)
     daemon = Daemon(core, server, recorder, MonotonicClock(), signals, say, pilot)
     stop.add("wheels", daemon.stop_wheels)
     if config.daemon.realtime_priority:

@@ -24,6 +24,10 @@ class Pilot(Protocol):
     """Asked once before and told once after each tick; it never waits and never raises on what a person does."""
 
     @property
+    def needs_pose(self) -> bool:
+        """Whether motion needs a pose where robot.toml requires one."""
+
+    @property
     def done(self) -> bool:
         """Whether nothing more is wanted: the daemon then stops the robot and ends."""
 
@@ -39,6 +43,11 @@ class Pilot(Protocol):
 
 class TaskPilot:
     """Leaves everything to the task and to the requests on the control socket."""
+
+    @property
+    def needs_pose(self) -> bool:
+        """A task cannot be followed without."""
+        return True
 
     @property
     def done(self) -> bool:

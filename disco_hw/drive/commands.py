@@ -12,8 +12,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-import msgspec
-
 from disco_hw.config import RobotConfig
 from disco_hw.daemon.client import socket_path
 from disco_hw.daemon.clock import MonotonicClock
@@ -22,16 +20,17 @@ from disco_hw.drive.coverage import Coverage
 from disco_hw.drive.gamepad_source import GamepadSource
 from disco_hw.drive.hand_pilot import HandPilot
 from disco_hw.drive.keyboard import Keyboard
-from disco_hw.drive.keys import KeyHold
+from disco_hw.drive.keys import HELP, KeyHold
 from disco_hw.drive.script import Script, in_table, room_needed
 from disco_hw.drive.scripted import ScriptSource, Unattended
 from disco_hw.drive.scripts import make_script
 from disco_hw.drive.source import ManualSource
 from disco_hw.errors import InputError
-from disco_hw.robot_setup import Setup, load_setup
+from disco_hw.robot_setup import load_setup
 from drivers.gamepad import Gamepad, GamepadError, GamepadMapping, open_gamepad
 
 _DISPLAY_TIMEOUT_S = 2.0
+_STANDARD_INPUT = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,16 +74,15 @@ def run_drive(options: DriveOptions) -> DriveResult:
     Runs the daemon's loop with its governor, supervisor and recorder; there is no planner, and no pose is needed.
     Raises InputError for wrong options, files and devices.
     """
-    setup = _without_pose(load_setup(options.robot, options.model, options.link))
+    setup = load_setup(options.robot, options.model, options.link)
     config = setup.config
     script = _script(options, config)
     log_file = options.log_file or _new_log(config)
     top_rad_s = config.drive.speed_share * config.robot.max_wheel_speed_rad_s
     source = _source(options, config, script, top_rad_s)
     try:
-        if script is not None and not options.as_json:
-            room = room_needed(script.at, script.duration_s, config.robot)
-            print("\n".join([*in_table(script), f"{script.duration_s:.0f} s, needs {room.in_words()}"]), flush=True)
+        if not options.as_json:
+            print("\n".join(_announcement(options, config, script)), flush=True)
         coverage = Coverage(top_rad_s)
         with _display(socket_path(config), shown=not options.as_json) as say:
             serve(setup, log_file, say, HandPilot(source, coverage))
@@ -99,14 +97,6 @@ def run_drive(options: DriveOptions) -> DriveResult:
     )
 
 
-def _without_pose(setup: Setup) -> Setup:
-    """Driving by hand needs no pose: the person sees the robot."""
-    estimation = msgspec.structs.replace(setup.config.estimation, pose_required=False)
-    return Setup(
-        setup.robot_file, setup.model_file, msgspec.structs.replace(setup.config, estimation=estimation), setup.model
-    )
-
-
 def _script(options: DriveOptions, config: RobotConfig) -> Script | None:
     if options.script is None:
         if options.unattended or options.seconds is not None:
@@ -114,6 +104,17 @@ def _script(options: DriveOptions, config: RobotConfig) -> Script | None:
         return None
     script = make_script(options.script, config.robot, config.task, config.drive.speed_share, options.seed)
     return script if options.seconds is None else script.cut(options.seconds)
+
+
+def _announcement(options: DriveOptions, config: RobotConfig, script: Script | None) -> list[str]:
+    """What is said before anything moves."""
+    lines = []
+    if script is not None:
+        room = room_needed(script.at, script.duration_s, config.robot)
+        lines += [*in_table(script), f"{script.duration_s:.0f} s, needs {room.in_words()}"]
+    if not (options.gamepad or options.unattended):
+        lines.append(HELP)
+    return lines
 
 
 def _source(options: DriveOptions, config: RobotConfig, script: Script | None, top_rad_s: float) -> ManualSource:
@@ -125,7 +126,7 @@ def _source(options: DriveOptions, config: RobotConfig, script: Script | None, t
     elif options.gamepad:
         held = _gamepad(config, top_rad_s)
     else:
-        held = Keyboard(sys.stdin.fileno(), KeyHold(top_rad_s))
+        held = Keyboard(_STANDARD_INPUT, KeyHold(top_rad_s))
     return held if script is None else ScriptSource(script, held)
 
 

@@ -45,7 +45,7 @@ class GamepadSource:
         """What to hold, or to plug in."""
         if self._pad is None:
             return f"{self._name} is gone; plug it in again"
-        return f"{self._name}: hold the deadman's button and steer.  Ctrl-C ends."
+        return f"{self._name}: hold the deadman's button; Ctrl-C ends"
 
     @property
     def task(self) -> str:

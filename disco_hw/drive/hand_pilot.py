@@ -31,6 +31,11 @@ class HandPilot:
         self._messages: deque[str] = deque(maxlen=_MESSAGES)
 
     @property
+    def needs_pose(self) -> bool:
+        """The person sees the robot."""
+        return False
+
+    @property
     def done(self) -> bool:
         """Whether the source has ended."""
         return self._source.ended is not None

@@ -8,7 +8,7 @@ import select
 import termios
 from typing import Any
 
-from disco_hw.drive.keys import DIRECTIONS, HELP, KeyEvent, KeyHold, parse
+from disco_hw.drive.keys import DIRECTIONS, KeyEvent, KeyHold, parse
 from disco_hw.drive.source import ManualInput, RobotView
 from disco_hw.errors import InputError
 
@@ -52,8 +52,8 @@ class Keyboard:
 
     @property
     def words(self) -> str:
-        """The keys."""
-        return f"{HELP}  Ctrl-D ends.  Speed {self._hold.speed_share:.0%}."
+        """The speed chosen, and what keeps a held key from counting."""
+        return self._hold.words
 
     @property
     def task(self) -> str:

@@ -23,7 +23,7 @@ DIRECTIONS = {
     b"q": (1.0, 0.5), b"e": (1.0, -0.5), b"z": (-1.0, -0.5), b"c": (-1.0, 0.5),
     b" ": (0.0, 0.0), b"s": (0.0, 0.0),
 }  # fmt: skip
-HELP = "hold: arrows or w x a d to go and turn, q e z c for curves, space to stand; 1-9 speed; any other key stops."
+HELP = "Hold arrows or w x a d to go and turn, q e z c for curves, space to stand; 1-9 speed; others stop; Ctrl-D ends."
 
 
 def parse(data: bytes) -> list[bytes]:
@@ -82,6 +82,12 @@ class KeyHold:
         self._last_ns: int | None = None
 
     @property
+    def words(self) -> str:
+        """The speed that is chosen, and what to do where a held key does not count."""
+        lapsed = "; release all keys for half a second" if self._state is _Hold.LAPSED else ""
+        return f"keyboard, {self._share:.0%} speed{lapsed}"
+
+    @property
     def speed_share(self) -> float:
         """Share of the top speed that the arrows ask for."""
         return self._share
@@ -103,6 +109,8 @@ class KeyHold:
             self._last_ns = now_ns
         if self._state is _Hold.HELD and now_ns - self._last_ns > self._limit_ns:
             self._state = _Hold.LAPSED
+        if self._state is _Hold.LAPSED and now_ns - self._last_ns >= _RELEASE_NS:
+            self._state = _Hold.OPEN
         if self._state is not _Hold.HELD:
             return ManualInput(now_ns, 0.0, 0.0, deadman=False)
         forward, turn = self._direction

@@ -130,6 +130,16 @@ def test_a_refusal_is_told_and_needs_a_new_press():
     assert bench.run(1.5)[-1].output.state is State.READY
 
 
+def test_without_a_planner_a_task_does_nothing():
+    stack = simulated_stack(NoPlanner())
+    stack.run(1.5)
+    stack.run(0.5, UserRequest.ARM)
+    ticks = stack.run(1.0, UserRequest.START)
+    assert {tick.pipeline.source for tick in ticks} == {Source.RAMP}
+    assert "planner: there is no planner: the robot is driven by hand" in ticks[0].events
+    assert all(tick.command.left_rad_s == tick.command.right_rad_s == 0.0 for tick in ticks)
+
+
 def told(bench):
     return bench.stack.pilot.status()["drive"]["messages"]
 

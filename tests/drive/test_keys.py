@@ -89,7 +89,9 @@ def test_a_stutter_of_the_connection_does_not_hold_again():
     typist.hold(UP, 600)
     typist.wait(300)
     assert not any(held(typist.hold(UP, 2000, delay_ms=30)))
+    assert "release all keys" in typist.keys.words
     typist.wait(600)
+    assert "release" not in typist.keys.words
     assert any(held(typist.hold(UP, 1000)))
 
 

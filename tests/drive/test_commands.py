@@ -1,0 +1,66 @@
+"""`disco-hw drive`: what is refused before anything is opened, and how a drive is summed up."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from pathlib import Path
+
+import pytest
+
+from disco_hw.drive.commands import DriveOptions, DriveResult, run_drive
+from disco_hw.errors import InputError
+from tests.hil.stack import write_robot_file
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"script": "dance"}, "--script dance: no such script; write one of circle, steps, excite"),
+        ({"unattended": True}, "--unattended and --seconds belong to a script"),
+        ({"seconds": 3.0}, "--unattended and --seconds belong to a script"),
+        ({"script": "steps", "unattended": True, "gamepad": True}, "one deadman only"),
+        ({"link": "wifi"}, "--link wifi"),
+    ],
+)
+def test_wrong_options_get_one_line(tmp_path, options, words):
+    with pytest.raises(InputError, match=re.escape(words)) as caught:
+        run_drive(DriveOptions(write_robot_file(tmp_path), **options))
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "control.sock").exists()
+
+
+def test_without_a_terminal_one_line_says_what_to_use(tmp_path, monkeypatch):
+    with (tmp_path / "nothing").open("w+b") as file:
+        monkeypatch.setattr("disco_hw.drive.commands._STANDARD_INPUT", file.fileno())
+        with pytest.raises(InputError, match="no terminal; use a terminal, --gamepad or --script with --unattended"):
+            run_drive(DriveOptions(write_robot_file(tmp_path)))
+
+
+def test_a_gamepad_that_is_not_there_gets_one_line(tmp_path):
+    robot = write_robot_file(tmp_path)
+    robot.write_text(robot.read_text() + f'[drive]\ngamepad_device = "{tmp_path / "event0"}"\n')
+    with pytest.raises(InputError, match=r"--gamepad: .*event0: cannot be opened"):
+        run_drive(DriveOptions(robot, gamepad=True))
+
+
+def test_the_terminal_is_put_back_when_the_daemon_cannot_start(tmp_path, monkeypatch):
+    import termios
+
+    master, slave = os.openpty()
+    before = termios.tcgetattr(slave)
+    monkeypatch.setattr("disco_hw.drive.commands._STANDARD_INPUT", slave)
+    robot = write_robot_file(tmp_path)
+    (tmp_path / "control.sock").write_text("in the way")
+    with pytest.raises(InputError, match="not a socket"):
+        run_drive(DriveOptions(robot, as_json=True))
+    assert termios.tcgetattr(slave) == before
+    os.close(master)
+    os.close(slave)
+
+
+def test_the_result_is_for_people_and_machines():
+    result = DriveResult(Path("a.mcap"), "script circle completed", True, {"missing": ["rest"]}, "1 of 2")
+    assert result.as_text() == "script circle completed\n1 of 2\nlog a.mcap"
+    assert json.loads(json.dumps(result.as_dict()))["log"] == "a.mcap"

@@ -1,0 +1,76 @@
+"""What is shown, and that the display ends with the daemon."""
+
+from __future__ import annotations
+
+import io
+import threading
+
+import pytest
+from rich.console import Console
+
+from disco_hw.daemon.control_socket import ControlServer
+from disco_hw.drive.coverage import Coverage
+from disco_hw.drive.display import line, show, table
+
+COVERAGE = Coverage(8.0)
+for _tick in range(251):
+    COVERAGE.add(_tick * 20_000_000, 2.0, 2.0)
+STATUS = {
+    "ok": True,
+    "state": "ARMED",
+    "detail": "running the task",
+    "wheels": [1.0, -2.0],
+    "command": [1.5, -2.5],
+    "drive": {
+        "driving": True,
+        "words": "hold [this] key",
+        "task": "straight: radius",
+        "messages": ["deadman pressed: arming"],
+        "coverage": COVERAGE.as_dict(),
+        "coverage_words": COVERAGE.in_words(),
+    },
+}
+
+
+def printed(thing):
+    console = Console(file=io.StringIO(), width=160)
+    console.print(thing)
+    return console.file.getvalue()
+
+
+def test_the_table_shows_all_there_is():
+    text = printed(table(STATUS))
+    for word in ("ARMED", "command +1.5 -2.5", "wheels +1.0 -2.0", "hold [this] key", "deadman pressed", "radius"):
+        assert word in text
+    assert "done     straight slow" in text
+    assert "missing  reverse fast" in text
+
+
+def test_the_table_does_without_wheels():
+    assert "wheels none" in printed(table(STATUS | {"wheels": None}))
+
+
+def test_the_line_is_one_line():
+    text = line(STATUS)
+    assert "\n" not in text
+    assert text.startswith("ARMED: hold [this] key | 5 s driven, 1 of 17 excited; missing: straight fast 0/2 s")
+
+
+@pytest.mark.parametrize("terminal", [False, True])
+def test_it_shows_the_daemon_and_ends_with_it(tmp_path, terminal):
+    server = ControlServer(tmp_path / "s" / "control.sock", {"status"})
+    console = Console(file=io.StringIO(), force_terminal=terminal, width=160)
+    shown = threading.Thread(target=show, args=(server.path, console))
+    shown.start()
+    try:
+        answered = 0
+        while answered < 3:
+            for message in server.poll():
+                server.reply(message, STATUS)
+                answered += 1
+        server.poll()
+    finally:
+        server.close()
+        shown.join(10.0)
+    assert not shown.is_alive()
+    assert "5 s driven" in console.file.getvalue()

@@ -1,0 +1,134 @@
+"""The keyboard on a real pseudo-terminal."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import termios
+import time
+
+import pytest
+
+from disco_hw.daemon.states import State
+from disco_hw.drive.keyboard import Keyboard
+from disco_hw.drive.keys import KeyHold
+from disco_hw.drive.source import RobotView
+from disco_hw.errors import InputError
+
+MS = 1_000_000
+VIEW = RobotView(State.READY, driving=False)
+
+
+class Terminal:
+    """A pseudo-terminal, a keyboard on it, and time that the test moves."""
+
+    def __init__(self):
+        self.master, self.slave = os.openpty()
+        self.before = termios.tcgetattr(self.slave)
+        os.write(self.master, b"w" * 50)
+        assert os.read(self.master, 100) == b"w" * 50, "a terminal echoes"
+        self.keyboard = Keyboard(self.slave, KeyHold(8.0))
+        self.now_ns = 0
+        self.poll(1000)
+
+    def poll(self, ms=20):
+        """Move time on in steps of 20 ms, polling; the last answer."""
+        for _ in range(ms // 20):
+            self.now_ns += 20 * MS
+            self.last = self.keyboard.poll(self.now_ns, VIEW)
+        return self.last
+
+    def type(self, keys):
+        os.write(self.master, keys)
+        # The line discipline hands it over at once, but the kernel's worker may be late.
+        deadline = time.monotonic() + 5.0
+        while not _readable(self.slave):
+            assert time.monotonic() < deadline
+        return self.poll()
+
+    def close(self):
+        self.keyboard.close()
+        for descriptor in (self.master, self.slave):
+            with contextlib.suppress(OSError):
+                os.close(descriptor)
+
+
+def _readable(descriptor):
+    return bool(select.select([descriptor], [], [], 0.1)[0])
+
+
+@pytest.fixture
+def terminal():
+    made = Terminal()
+    yield made
+    made.close()
+
+
+def test_what_was_typed_before_is_not_for_us(terminal):
+    assert not terminal.last.deadman
+
+
+def test_a_held_arrow_drives_and_its_end_stops(terminal):
+    for _ in range(10):
+        terminal.type(b"\x1b[A")
+    assert terminal.last.deadman
+    assert terminal.last.left_rad_s == terminal.last.right_rad_s == pytest.approx(4.0)
+    assert terminal.poll(200).deadman
+    assert not terminal.poll(20).deadman
+
+
+def test_nothing_waits_for_enter_and_nothing_is_echoed(terminal):
+    terminal.type(b"w")
+    terminal.type(b"w")
+    assert terminal.last.deadman
+    assert not _readable(terminal.master)
+
+
+def test_pasted_text_holds_nothing(terminal):
+    terminal.type(b"w" * 1000)
+    assert not terminal.last.deadman
+    assert not terminal.poll(2000).deadman
+
+
+def test_another_key_among_repeats_stops(terminal):
+    for _ in range(5):
+        terminal.type(b"w")
+    assert not terminal.type(b"w?w").deadman
+
+
+def test_ctrl_d_ends(terminal):
+    for _ in range(5):
+        terminal.type(b"w")
+    assert not terminal.type(b"\x04").deadman
+    assert terminal.keyboard.ended == "ended from the keyboard"
+    assert terminal.keyboard.completed
+    assert not terminal.type(b"w").deadman
+
+
+def test_a_terminal_that_closes_is_a_device_that_is_gone(terminal):
+    for _ in range(5):
+        terminal.type(b"w")
+    os.close(terminal.master)
+    assert terminal.poll() is None
+    assert terminal.keyboard.ended == "the terminal has closed"
+    assert not terminal.keyboard.completed
+    assert terminal.poll() is None
+
+
+def test_the_terminal_is_put_back(terminal):
+    assert termios.tcgetattr(terminal.slave) != terminal.before
+    terminal.keyboard.close()
+    assert termios.tcgetattr(terminal.slave) == terminal.before
+    terminal.keyboard.close()
+
+
+def test_ctrl_c_still_is_a_signal_and_output_looks_as_before(terminal):
+    now = termios.tcgetattr(terminal.slave)
+    assert now[3] & termios.ISIG
+    assert now[1] == terminal.before[1]
+
+
+def test_what_is_no_terminal_is_refused(tmp_path):
+    with (tmp_path / "file").open("w+b") as file, pytest.raises(InputError, match="no terminal; use"):
+        Keyboard(file.fileno(), KeyHold(8.0))

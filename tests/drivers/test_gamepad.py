@@ -1,0 +1,175 @@
+"""The gamepad through evdev's own reader, fed with the kernel's event structures through a pipe or by uinput."""
+
+from __future__ import annotations
+
+import os
+import struct
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+if not sys.platform.startswith("linux"):
+    pytest.skip("evdev is Linux only", allow_module_level=True)
+
+import evdev
+from evdev import ecodes
+from evdev.device import AbsInfo
+from evdev.eventio import EventIO
+
+from drivers.gamepad import Gamepad, GamepadError, GamepadMapping, open_gamepad
+
+EVENT = struct.Struct("@llHHi")
+LOW, HIGH = -32768, 32767
+
+
+class PipedPad(EventIO):
+    """Stands for the device node: evdev's own reader on a pipe; what needs ioctl is answered here."""
+
+    name = "piped pad"
+
+    def __init__(self):
+        self.fd, self.feed = os.pipe2(os.O_NONBLOCK)
+        self.axes = {ecodes.ABS_X: 0, ecodes.ABS_Y: 0}
+        self.keys = []
+
+    def absinfo(self, code):
+        return AbsInfo(self.axes[code], LOW, HIGH, 0, 0, 0)
+
+    def active_keys(self):
+        return list(self.keys)
+
+    def send(self, *events):
+        os.write(self.feed, b"".join(EVENT.pack(0, 0, *event) for event in (*events, (ecodes.EV_SYN, 0, 0))))
+
+    def unplug(self):
+        os.close(self.feed)
+
+    def close(self):
+        if self.fd >= 0:
+            os.close(self.fd)
+            self.fd = -1
+
+
+@pytest.fixture
+def device():
+    made = PipedPad()
+    yield made
+    made.close()
+
+
+def stick(code, value):
+    return (ecodes.EV_ABS, code, value)
+
+
+def button(value, code=ecodes.BTN_TL):
+    return (ecodes.EV_KEY, code, value)
+
+
+def test_sticks_and_deadman_are_held_until_they_change(device):
+    pad = Gamepad(device, GamepadMapping(dead_zone=0.0), now_ns=5)
+    assert pad.poll(10).event_ns == 5
+    device.send(stick(ecodes.ABS_Y, LOW), stick(ecodes.ABS_X, HIGH), button(1))
+    state = pad.poll(20)
+    assert (state.event_ns, state.deadman) == (20, True)
+    assert state.forward == pytest.approx(1.0)
+    assert state.left == pytest.approx(-1.0)
+    assert pad.poll(30) == state
+    device.send(button(0))
+    assert pad.poll(40).deadman is False
+
+
+def test_what_is_held_at_the_start_is_known(device):
+    device.keys, device.axes[ecodes.ABS_Y] = [ecodes.BTN_TL], LOW
+    state = Gamepad(device, GamepadMapping(), 0).poll(1)
+    assert state.deadman
+    assert state.forward == pytest.approx(1.0)
+
+
+def test_a_tap_within_one_poll_leaves_the_deadman_open(device):
+    pad = Gamepad(device, GamepadMapping(), 0)
+    device.send(button(1), button(0))
+    assert pad.poll(1).deadman is False
+
+
+def test_the_dead_zone_is_zero_and_the_rest_begins_there(device):
+    pad = Gamepad(device, GamepadMapping(dead_zone=0.2), 0)
+    for value, forward in ((-0.19, 0.0), (-0.6, 0.5), (-1.0, 1.0), (0.6, -0.5)):
+        device.send(stick(ecodes.ABS_Y, round(value * HIGH)))
+        assert pad.poll(1).forward == pytest.approx(forward, abs=1e-3)
+
+
+def test_other_axes_and_buttons_are_of_no_matter(device):
+    pad = Gamepad(device, GamepadMapping(), 0)
+    device.send(stick(ecodes.ABS_RZ, 255), button(1, ecodes.BTN_SOUTH))
+    state = pad.poll(1)
+    assert (state.forward, state.left, state.deadman) == (0.0, 0.0, False)
+
+
+def test_an_overrun_of_the_kernels_queue_is_made_good_from_the_device(device):
+    pad = Gamepad(device, GamepadMapping(), 0)
+    device.send(button(1))
+    assert pad.poll(1).deadman
+    # The release was lost in the overrun: only the device knows.
+    device.keys, device.axes[ecodes.ABS_X] = [], LOW
+    device.send((ecodes.EV_SYN, ecodes.SYN_DROPPED, 0), button(1))
+    state = pad.poll(2)
+    assert state.deadman is False
+    assert state.left == pytest.approx(1.0)
+
+
+def test_a_device_that_goes_is_noticed_and_stays_gone(device):
+    pad = Gamepad(device, GamepadMapping(), 0)
+    device.send(button(1))
+    assert pad.poll(1).deadman
+    device.unplug()
+    assert pad.poll(2) is None
+    assert pad.poll(3) is None
+
+
+def test_an_error_of_the_device_is_a_device_gone(device):
+    pad = Gamepad(device, GamepadMapping(), 0)
+    device.close()
+    assert pad.poll(1) is None
+
+
+@pytest.mark.parametrize(
+    "mapping",
+    [GamepadMapping(forward_axis="ABS_NONE"), GamepadMapping(left_axis="X"), GamepadMapping(deadman_button="KEY_A")],
+)
+def test_unknown_names_are_refused_by_name(device, mapping):
+    with pytest.raises(GamepadError, match=r"evdev knows no such name.*\[drive\]"):
+        Gamepad(device, mapping, 0)
+
+
+def test_without_a_device_one_line_says_what_to_do(tmp_path):
+    with pytest.raises(GamepadError, match="cannot be opened"):
+        open_gamepad(GamepadMapping(), 0, str(tmp_path / "event0"))
+    if not evdev.list_devices():
+        with pytest.raises(GamepadError, match="no gamepad found"):
+            open_gamepad(GamepadMapping(), 0)
+
+
+@pytest.mark.skipif(
+    not os.access("/dev/uinput", os.W_OK), reason="needs /dev/uinput, to make an input device of the kernel's"
+)
+def test_a_device_of_the_kernel_is_found_read_and_missed():
+    axes = [(code, AbsInfo(0, LOW, HIGH, 0, 0, 0)) for code in (ecodes.ABS_X, ecodes.ABS_Y)]
+    made = evdev.UInput({ecodes.EV_ABS: axes, ecodes.EV_KEY: [ecodes.BTN_TL, ecodes.BTN_SOUTH]}, name="made pad")
+    deadline = time.monotonic() + 5.0
+    while not (made.device and Path(made.device.path).exists()):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    pad = open_gamepad(GamepadMapping(), 0, made.device.path)
+    made.write(*stick(ecodes.ABS_Y, LOW))
+    made.write(*button(1))
+    made.syn()
+    time.sleep(0.1)
+    state = pad.poll(1)
+    assert state.deadman
+    assert state.forward == pytest.approx(1.0)
+    made.close()
+    time.sleep(0.1)
+    assert pad.poll(2) is None
+    pad.close()
