@@ -14,6 +14,7 @@ from typing import Annotated, Any
 import typer
 
 from disco_hw.errors import InputError, WorkError
+from disco_hw.viewer.address import DEFAULT_PORT, LOOPBACK
 
 app = typer.Typer(
     name="disco-hw",
@@ -33,7 +34,6 @@ View = Annotated[bool, typer.Option("--view", help="Serve the page beside it, fo
 
 
 def _page(view: bool, robot: Path, model: Path | None) -> AbstractContextManager[object]:
-    from disco_hw.viewer.address import DEFAULT_PORT, LOOPBACK
     from disco_hw.viewer.beside import page_beside
 
     return page_beside(robot, model, LOOPBACK, DEFAULT_PORT) if view else nullcontext()
@@ -251,13 +251,14 @@ def infer(
     out: Annotated[Path | None, typer.Option("-o", "--out", help="Write the model with its posterior here.")] = None,
     paper: Annotated[bool, typer.Option("--paper", help="The paper's statistics and 1000 simulations.")] = False,
     simulations: Annotated[int | None, typer.Option(min=100, help="Simulations in all.")] = None,
-    seed: Annotated[int, typer.Option(min=0)] = 1,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of simulations and networks.")] = 1,
+    report: Annotated[Path | None, typer.Option(help="Write diagnostics with pictures to this HTML file.")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Infer the robot's parameters from logs of driving (BayesSim) and write a model with its posterior."""
     from disco_hw.inference.commands import infer_command
 
-    result = infer_command(logs, robot, out, paper, simulations, seed, _progress_line)
+    result = infer_command(logs, robot, out, paper, simulations, seed, report, _progress_line)
     _print(result.as_dict(), as_json, result.as_text())
 
 
@@ -285,16 +286,18 @@ def view(
     snapshot: Annotated[Path | None, typer.Option(help="Write a picture of the log's end instead.")] = None,
     video: Annotated[Path | None, typer.Option(help="Write a clip of the log instead.")] = None,
     export: Annotated[Path | None, typer.Option(help="Write one HTML file that plays without Python instead.")] = None,
-    port: Annotated[int | None, typer.Option(min=1, max=65535, help="Port of the page.")] = None,
+    host: Annotated[
+        str, typer.Option(help="Address to listen on; any but this host's own needs the token that is printed.")
+    ] = LOOPBACK,
+    port: Annotated[int, typer.Option(min=1, max=65535, help="Port of the page.")] = DEFAULT_PORT,
 ) -> None:
     """Show the page: a log, or the running daemon."""
     from disco_hw.viewer import commands
-    from disco_hw.viewer.address import DEFAULT_PORT
 
     if live:
         if robot is None or log is not None:
             raise InputError("view --live: needs --robot ROBOT.toml and no LOG")
-        raise typer.Exit(commands.view_live(robot, model, port=port or DEFAULT_PORT))
+        raise typer.Exit(commands.view_live(robot, model, host, port))
     if log is None:
         raise InputError("view: give a LOG, or --live with --robot ROBOT.toml")
     if snapshot is not None:
@@ -304,7 +307,7 @@ def view(
     if export is not None:
         commands.export_log(log, export, robot=robot)
     if snapshot is None and video is None and export is None:
-        raise typer.Exit(commands.view_log(log, robot, port=port or DEFAULT_PORT))
+        raise typer.Exit(commands.view_log(log, robot, host, port))
 
 
 log_app = typer.Typer(help="Look into a log, mend it, hand it on.", no_args_is_help=True)
