@@ -22,9 +22,11 @@ from firmware_protocol.codec import Codec
 
 def make_planner(config: RobotConfig, model: Model) -> control.Disco:
     """DISCO for this robot's task, compiled and warmed up: takes seconds."""
+    # The paper's cost has no progress term.
+    task = control.Circle.from_config(config.task, 0.0 if config.control.mode == "paper" else 1.0)
     planner = control.Disco(
         model,
-        control.Circle.from_config(config.task),
+        task,
         control.DiscoSettings.from_config(config.control),
         control.WheelLimits.of_robot(config.robot),
         config.control.seed,
