@@ -43,14 +43,14 @@ static int32_t raw(double value, double scale, int32_t minimum, int32_t maximum)
 {
     const double rounded = floor((value / scale) + 0.5);
     int32_t result = 0;
-    if (isnan(rounded)) {
-        result = 0;
-    } else if (rounded <= (double)minimum) {
+    if (rounded <= (double)minimum) {
         result = minimum;
     } else if (rounded >= (double)maximum) {
         result = maximum;
-    } else {
+    } else if (!isnan(rounded)) {
         result = (int32_t)rounded;
+    } else {
+        /* not a number */
     }
     return result;
 }

@@ -154,6 +154,18 @@ def test_turning_against_the_setpoint_is_wrong_direction(side, sign):
     assert wait_for_fault(bench) == (f"WRONG_DIRECTION_{side.upper()}", 300)
 
 
+def test_each_time_the_wheel_turns_against_its_setpoint_is_judged_by_itself():
+    bench = Bench()
+    bench.to_driving(4.0, 4.0)
+    bench.wheels_follow = False
+    bench.speeds[0] = -7.0
+    bench.run(100)
+    bench.speeds[0] = 4.0
+    bench.run(10)
+    bench.speeds[0] = -3.0
+    assert wait_for_fault(bench) == ("WRONG_DIRECTION_LEFT", 300)
+
+
 def test_a_wheel_that_is_only_late_in_turning_round_is_not():
     bench = Bench()
     bench.to_driving(4.0, 4.0)
