@@ -35,8 +35,5 @@ bench: $(STAMP)
 firmware-check: $(STAMP)
 	$(BIN)/python -m tools.firmware_check
 
-firmware-check: $(STAMP)
-	$(BIN)/python -m tools.firmware_check
-
 clean:
 	rm -rf $(VENV) build *.egg-info firmware_protocol/_firmware*
