@@ -11,6 +11,7 @@ from typing import Any
 from disco_hw.config import load_robot_config
 from disco_hw.errors import WorkError
 from disco_hw.gap.find import find_gap
+from disco_hw.gap.html import page
 from disco_hw.gap.report import GapReport
 from disco_hw.log.load import load_drive
 from disco_hw.model import Model, load_model, save_model
@@ -29,7 +30,7 @@ class GapResult:
 
     def as_text(self) -> str:
         """For a terminal."""
-        return f"{self.report.as_text()}\n\nwritten: {self.directory}/report.json, model.toml"
+        return f"{self.report.as_text()}\n\nwritten: {self.directory}/report.html, report.json, model.toml"
 
 
 def gap(
@@ -46,11 +47,14 @@ def gap(
     config = load_robot_config(robot)
     start = load_model(model) if model is not None else Model.nominal(config.robot)
     drive = load_drive(list(logs), config.robot.ticks_per_rev, config.robot.wheel_radius_m)
-    report = find_gap(drive, start, progress)
+    report = find_gap(drive, start, progress, pictures=True)
     try:
         out.mkdir(parents=True, exist_ok=True)
         (out / "report.json").write_text(json.dumps(report.as_dict(), indent=1), encoding="utf-8")
+        (out / "report.html").write_text(page(report), encoding="utf-8")
         save_model(report.model, out / "model.toml")
+        for name, picture in report.pictures.items():
+            (out / f"{name}.png").write_bytes(picture)
     except OSError as error:
         raise WorkError(f"{out}: cannot be written ({error.strerror}); give another directory") from None
     return GapResult(report, out)

@@ -23,11 +23,14 @@ Array = NDArray[np.float64]
 Progress = Callable[[str], None]
 
 
-def find_gap(logs: DriveLog | Sequence[DriveLog], model: Model, progress: Progress | None = None) -> GapReport:
+def find_gap(
+    logs: DriveLog | Sequence[DriveLog], model: Model, progress: Progress | None = None, pictures: bool = False
+) -> GapReport:
     """Find where logs and model disagree, name what is missing, amend the model and show the gap shrink.
 
     `logs`: one drive or several of one robot. `model`: nominal geometry, with the effects that are known already;
-    those are refitted, not reported. `progress` is told what is being done. Raises LogError if the logs hold too
+    those are refitted, not reported. `progress` is told what is being done; `pictures` draws
+    them too. Raises LogError if the logs hold too
     little to judge either channel.
     """
     began = time.perf_counter()
@@ -60,17 +63,20 @@ def find_gap(logs: DriveLog | Sequence[DriveLog], model: Model, progress: Progre
     amended, remarks = amended_model(
         model, {effect.name: effect.parameters for effect in outcome.effects(given=True)}, outcome.parts()
     )
+    gap = outcome.gap() if body is not None else {}
     return GapReport(
         sources=log.sources,
         channels=outcome.channels(effects, (term.channel for term in unnamed)),
         effects=effects,
         unnamed=unnamed,
         blind_spots=outcome.blind_spots(effects),
-        gap=outcome.gap() if body is not None else {},
+        gap=gap,
         model=amended,
-        seconds=time.perf_counter() - began,
         residue=outcome.residue(),
         notes=(*log.notes, *notes, *remarks),
+        candidates=outcome.candidates(),
+        pictures=outcome.pictures(gap) if pictures else {},
+        seconds=time.perf_counter() - began,
     )
 
 

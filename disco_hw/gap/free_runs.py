@@ -14,11 +14,9 @@ from numpy.typing import NDArray
 from disco_hw.gap.layout import BODY, WHEEL, body_effects, wheel_effects
 from disco_hw.gap.timeline import CELL_S
 from disco_hw.model.jit import kernel_function, scalar_function
-from disco_hw.model.step import axle_of, integration_of, step, tracked_of, wheel_step
+from disco_hw.model.step import body_velocity, wheel_step
 
 Array = NDArray[np.float64]
-
-_INTEGRATION = integration_of(CELL_S, wide=False)
 
 
 @scalar_function
@@ -64,33 +62,27 @@ def _run_wheels(
 
 @kernel_function
 def _run_body(
-    base: Any, effects: Any, integration: Any, scale: Any, angle: Array, speed: Array, extra: Array, first: Array,
-    t_s: Array, track: Array,
-) -> None:  # fmt: skip
+    base: Any, effects: Any, scale: Any, angle: Array, speed: Array, extra: Array, first: Array, t_s: Array, track: Array
+) -> None:
     x = y = yaw = 0.0
-    cosine, sine = 1.0, 0.0
     for i in range(angle.shape[0]):
         if first[i]:
             x = y = yaw = 0.0
-            cosine, sine = 1.0, 0.0
         else:
-            # Wheels that turned as measured: no wheel effect acts, and the change of speed is the measured one.
             left = (angle[i, 0] - angle[i - 1, 0]) * scale[0] / CELL_S
             right = (angle[i, 1] - angle[i - 1, 1]) * scale[1] / CELL_S
-            before_left = left - scale[0] * (speed[i, 0] - speed[i - 1, 0])
-            before_right = right - scale[1] * (speed[i, 1] - speed[i - 1, 1])
-            x, y = axle_of(x, y, cosine, sine, base)
-            x, y, cosine, sine, _, _, _, half_rate = step(
-                x, y, cosine, sine, before_left, before_right, left, right, t_s[i - 1], base, effects, integration
+            change = scale[0] * (speed[i, 0] - speed[i - 1, 0]) + scale[1] * (speed[i, 1] - speed[i - 1, 1])
+            forward, lateral, half_rate = body_velocity(
+                left + right, right - left, change, t_s[i - 1], base, effects
             )
-            x, y = tracked_of(x, y, cosine, sine, base)
-            yaw += 2.0 * half_rate * CELL_S
-            ahead, across, turn = extra[i - 1, 0] * CELL_S, extra[i - 1, 1] * CELL_S, extra[i - 1, 2] * CELL_S
-            if ahead != 0.0 or across != 0.0 or turn != 0.0:
-                x += cosine * ahead - sine * across
-                y += sine * ahead + cosine * across
-                yaw += turn
-                cosine, sine = math.cos(yaw), math.sin(yaw)
+            turn = 2.0 * half_rate * CELL_S
+            along = (forward + extra[i - 1, 0]) * CELL_S
+            across = (lateral + extra[i - 1, 1]) * CELL_S - base.x_icr_m * turn
+            turn += extra[i - 1, 2] * CELL_S
+            cosine, sine = math.cos(yaw + 0.5 * turn), math.sin(yaw + 0.5 * turn)
+            x += cosine * along - sine * across
+            y += sine * along + cosine * across
+            yaw += turn
         track[i, 0], track[i, 1], track[i, 2] = x, y, yaw
 
 
@@ -118,7 +110,7 @@ def run_body(p: Array, angle: Array, speed: Array, extra: Array, first: Array, t
     track = np.empty((angle.shape[0], 3))
     base, effects = body_effects(p)
     scale = (1.0 / (1.0 + BODY.at(p, "encoder_scale.left")), 1.0 / (1.0 + BODY.at(p, "encoder_scale.right")))
-    _run_body(base, effects, _INTEGRATION, scale, angle, speed, extra, first, t_s, track)
+    _run_body(base, effects, scale, angle, speed, extra, first, t_s, track)
     left, forward = BODY.at(p, "pose_offset.left_m"), BODY.at(p, "pose_offset.forward_m")
     if left != 0.0 or forward != 0.0:
         cosine, sine = np.cos(track[:, 2]), np.sin(track[:, 2])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -10,15 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.gap.blind_spots import BlindSpot, blind_spots
-from disco_hw.gap.candidates import indices
+from disco_hw.gap import figures
+from disco_hw.gap.candidates import candidates_of, indices, parameters_of
 from disco_hw.gap.channels import BodyChannel, WheelChannel
 from disco_hw.gap.classes import ASYMMETRY, ENCODER, GAIN, OUTSIDE_TESTS, alike, one_encoder
 from disco_hw.gap.fit import Fit, fit, inverse, sensitivity
 from disco_hw.gap.held_out import Chain, Errors, errors_of, floor_errors, fold_vectors, per_horizon, smoothed_poses
 from disco_hw.gap.intervals import Estimates, estimates
-from disco_hw.gap.report import ChannelFinding, EffectFinding, UnnamedFinding
+from disco_hw.gap.report import CandidateEvidence, ChannelFinding, EffectFinding, UnnamedFinding
 from disco_hw.gap.search import Found
-from disco_hw.gap.timeline import Timeline
+from disco_hw.gap.timeline import CELL_S, Timeline
 from disco_hw.gap.where import in_words, left_over, regimes
 from disco_hw.model.effects import REGISTRY, Channel
 
@@ -115,6 +117,57 @@ class Outcome:
     def _encoder_finding(self, wheels: Found, estimated: Estimates) -> EffectFinding:
         values = {side: estimated.by_name[f"{GAIN}.{side}"] for side in ("left", "right")}
         return EffectFinding(ENCODER, REGISTRY[ENCODER].channel.value, values, _evidence(wheels, GAIN))
+
+    def candidates(self) -> tuple[CandidateEvidence, ...]:
+        """Evidence of every named effect: of the accepted ones against their absence, of the others on top."""
+        out = []
+        for found in (self.body, self.wheels):
+            if found is None:
+                continue
+            selector = found.selector
+            for name in candidates_of(found.channel.layout):
+                if name in found.names:
+                    rest = tuple(other for other in found.names if other != name)
+                    gain, verdict = selector.fit(rest).cost - found.fit.cost, "accepted"
+                    score = 0.0 if name in selector.given else selector.evidence(rest, found.names).score
+                else:
+                    price = 0.5 * parameters_of((name,)) * math.log(max(found.channel.count, 2))
+                    promise = selector.promise(found.names, name)
+                    gain, score, verdict = promise + price, 2.0 * promise, "not needed"
+                out.append(CandidateEvidence(REGISTRY[name].channel.value, name, gain, score, verdict))
+        return tuple(sorted(out, key=lambda candidate: -candidate.score))
+
+    def pictures(self, gap: dict[str, dict[float, Errors]]) -> dict[str, bytes]:
+        """PNGs by name."""
+        out: dict[str, bytes] = {}
+        if gap:
+            out["gap_by_horizon"] = figures.gap_by_horizon(gap)
+            out["gap_by_regime"] = figures.gap_by_regime(gap)
+        for name, title, found in (
+            ("command_to_wheel", "command to wheel", self.wheels),
+            ("wheel_to_body", "wheel to body and pose sensor", self.body),
+        ):
+            if found is not None:
+                out[f"where_{name}"] = figures.disagreement(title, self._regimes(found))
+        if self.wheels is not None:
+            out["worst_stretch"] = self._worst_stretch(self.wheels)
+        return out
+
+    @staticmethod
+    def _worst_stretch(wheels: Found) -> bytes:
+        """Wheel speed over the six seconds in which the model as it was is furthest off."""
+        channel = wheels.channel
+        assert isinstance(channel, WheelChannel)
+        line = channel.timeline
+        angles = (channel.angles(wheels.base.vector), channel.angles(*wheels.selector.split(wheels.names)))
+        before, after = (np.gradient(angle, CELL_S, axis=0) for angle in angles)
+        size = np.where(np.isfinite(line.command_rad_s[:, 0]), np.abs(before - line.speed_rad_s).mean(axis=1), 0.0)
+        width = min(600, size.size)
+        begin = int(np.argmax(np.convolve(size, np.ones(width), "valid")))
+        part = slice(begin, begin + width)
+        return figures.stretch(
+            line.t_s[part], line.speed_rad_s[part, 0], before[part, 0], after[part, 0], "left wheel, rad/s"
+        )
 
     def unnamed(self) -> tuple[UnnamedFinding, ...]:
         """What is missing and none of the named effects."""

@@ -49,6 +49,17 @@ class UnnamedFinding:
     evidence: float
 
 
+@dataclass(frozen=True, slots=True)
+class CandidateEvidence:
+    """What a candidate's fit promised on top of what was accepted, or, if accepted, is worth."""
+
+    channel: str
+    name: str
+    gain: float
+    score: float
+    verdict: str
+
+
 @dataclass(frozen=True)
 class GapReport:
     """What `find_gap` returns; `model` is the amended one."""
@@ -63,6 +74,7 @@ class GapReport:
     seconds: float
     residue: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
+    candidates: tuple[CandidateEvidence, ...] = ()
     pictures: dict[str, bytes] = field(default_factory=dict, repr=False)
 
     @property

@@ -28,6 +28,10 @@ Array = NDArray[np.float64]
 AHEAD_S = 2.0
 _MOST_TERMS = 3
 _WORTH_TRYING = 18.0
+_GAUSSIAN_KURTOSIS = 3.0
+_CLIPPED_AT = 6.0
+_HEAVIEST = 2.0
+_NO_INFORMATION = 1e-3
 _ROUGH = Thresholds(score=20.0, moves_m=0.0)
 _SMOOTH_WHEEL = ("motor_lag", "command_delay", "deadband", "battery_sag", "wheel_gain")
 _SMOOTH_BODY = (
@@ -123,8 +127,10 @@ def search_wheels(line: Timeline, geometry: Array, start: Array, given: Names = 
     rough = Selector(channel, moves, _ROUGH, given=given, start=start)
     names = rough.greedy()
     rich = (*names, *(name for name in _SMOOTH_WHEEL if name not in names))
-    channel = learn_wheel_noise(channel, fit(channel, rough.fit(names).vector, indices(channel, rich)).vector)
-    selector = Selector(channel, moves, given=given, start=rough.fit(given).vector)
+    vector = fit(channel, rough.fit(names).vector, indices(channel, rich)).vector
+    channel = learn_wheel_noise(channel, vector)
+    limits = _thresholds(channel.whitened(vector), channel.gains.use)
+    selector = Selector(channel, moves, limits, given=given, start=rough.fit(given).vector)
     return with_unnamed(Found(selector, selector.select(), channel), _wheel_options)
 
 
@@ -136,9 +142,25 @@ def search_body(line: Timeline, start: Array, given: Names = ()) -> Found:
     rough = Selector(channel, body_moves(channel), _ROUGH, given=given, start=nominal.vector)
     names = rough.greedy()
     rich = (*names, *(name for name in _SMOOTH_BODY if name not in names))
-    channel = learn_body_noise(channel, fit(channel, rough.fit(names).vector, indices(channel, rich)).vector)
-    selector = Selector(channel, body_moves(channel), given=given, start=rough.fit(given).vector)
+    vector = fit(channel, rough.fit(names).vector, indices(channel, rich)).vector
+    channel = learn_body_noise(channel, vector)
+    limits = _thresholds(channel.whitened(vector), channel.use)
+    selector = Selector(channel, body_moves(channel), limits, given=given, start=rough.fit(given).vector)
     return with_unnamed(Found(selector, selector.select(), channel), _body_options)
+
+
+def _thresholds(white: Array, use: NDArray[np.bool_]) -> Thresholds:
+    """Thresholds for a channel: the heavier the tails of its noise, the more evidence it takes.
+
+    Noise that comes in bursts wanders too, more slowly than any block that could show it.
+    """
+    sound = white[use]
+    sound = sound[np.abs(sound).max(axis=1) > _NO_INFORMATION]
+    if not sound.size:
+        return Thresholds()
+    sound = np.clip(sound / np.sqrt((sound**2).mean()), -_CLIPPED_AT, _CLIPPED_AT)
+    heavy = float((sound**4).mean()) / _GAUSSIAN_KURTOSIS
+    return Thresholds(score=Thresholds().score * min(max(heavy, 1.0), _HEAVIEST) ** 2)
 
 
 def _wheel_options(found: Found) -> Iterator[Term]:

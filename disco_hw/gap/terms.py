@@ -24,6 +24,8 @@ AXES = ("v_x", "v_y", "omega")
 _SPAN_NODES = 8
 _DISC_RADII_M = (0.5, 0.75, 1.0, 1.3)
 _DISC_SPACING_M = 0.4
+_LARGEST_FLOOR_M2 = 60.0
+_LONGEST_S = 400.0
 
 
 @dataclass(frozen=True)
@@ -130,7 +132,7 @@ def places(channel: BodyChannel, p: Array) -> Iterator[Term]:
     y = np.interp(line.t_s, channel.samples.t_s, channel.measured[:, 1])
     w = p[0] / p[1] * (line.speed_rad_s[:, 1] - line.speed_rad_s[:, 0])
     low_x, high_x, low_y, high_y = (*np.quantile(x, (0.02, 0.98)), *np.quantile(y, (0.02, 0.98)))
-    if (high_x - low_x) * (high_y - low_y) > 100.0:
+    if (high_x - low_x) * (high_y - low_y) > _LARGEST_FLOOR_M2 or line.t_s.size * CELL_S > _LONGEST_S:
         return
     turned = float(np.abs(w).sum())
     for centre_x in np.arange(low_x, high_x + 1e-9, _DISC_SPACING_M):

@@ -33,7 +33,7 @@ class WheelNoise:
     stamp_s: float = 5e-4
     command_stamp_s: float = 1e-3
     drift_rad_sqrt_s: float = 1e-3
-    wander: float = 1e-3
+    wander: float = 6e-3
 
     def vector(self) -> Array:
         """Logarithms, (7,)."""

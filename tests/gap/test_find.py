@@ -1,0 +1,117 @@
+"""The whole search on logs of a robot in which something is hidden; the truth never reaches the search."""
+
+import json
+from functools import cache
+
+import numpy as np
+import pytest
+
+from disco_hw.gap import find_gap
+from disco_hw.gap.html import page
+from disco_hw.log.drive import DriveLog
+from disco_hw.log.errors import LogError
+from disco_hw.model import Model, load_model, save_model
+from tools.gap_logs import simulated_drive
+
+MODEL = Model(0.061, 0.415, 0.238)
+
+
+@cache
+def report_of(*hidden, seed=902, drive="rich", dirty=False):
+    return find_gap(simulated_drive(dict(hidden), seed=seed, drive=drive, dirty=dirty), MODEL, pictures=True)
+
+
+def test_nothing_is_missing_in_a_log_with_nothing_hidden():
+    report = report_of(seed=900)
+    assert report.verdict == "nothing_missing"
+    assert not report.effects
+    assert not report.unnamed
+    assert {spot.name for spot in report.blind_spots} >= {"turn_slip", "motor_lag", "pose_offset", "encoder_scale"}
+
+
+@pytest.mark.parametrize(
+    ("name", "size", "parameter"), [("motor_lag", 0.12, "tau_s"), ("turn_slip", 0.09, "k_s")]
+)
+def test_exactly_the_hidden_effect_is_named_and_the_gap_closes(name, size, parameter):
+    report = report_of((name, size))
+    assert [effect.name for effect in report.effects] == [name]
+    estimate = report.effects[0].parameters[parameter]
+    assert estimate.value == pytest.approx(size, rel=0.12)
+    assert estimate.low < estimate.value < estimate.high
+    stages = {stage: errors[2.0].position_m for stage, errors in report.gap.items()}
+    assert stages["amended"] < stages["refitted"]
+    assert stages["refitted"] - stages["amended"] > 0.8 * (stages["refitted"] - stages["floor"])
+
+
+def test_two_effects_of_different_channels_are_both_named():
+    report = report_of(("yaw_rate_limit", 1.0), ("pose_latency", 0.1))
+    assert {effect.name for effect in report.effects} == {"yaw_rate_limit", "pose_latency"}
+
+
+def test_what_has_no_name_is_unnamed_with_its_form():
+    report = report_of(("x_motor_droop", 0.01))
+    assert not report.effects
+    assert report.verdict == "unexplained"
+    assert "u |u|" in report.unnamed[0].form
+    assert report.gap["amended"][2.0].position_m < 0.7 * report.gap["refitted"][2.0].position_m
+
+
+def test_an_encoder_that_counts_wrong_is_one_cause_not_two():
+    report = report_of(("encoder_scale", 0.04))
+    assert [effect.name for effect in report.effects] == ["encoder_scale"]
+    assert report.effects[0].parameters["right"].value == pytest.approx(0.04, abs=0.006)
+
+
+def test_a_sensor_mounted_aside_is_reported_as_a_class():
+    report = report_of(("pose_offset", 0.04))
+    assert len(report.effects) == 1
+    assert {report.effects[0].name, *report.effects[0].indistinguishable_from} == {"lateral_icr", "pose_offset"}
+    assert report.effects[0].experiment
+
+
+def test_a_steady_circle_is_blind_to_what_it_cannot_show():
+    report = report_of(("turn_slip", 0.1), drive="circle")
+    assert not report.effects
+    blind = {spot.name for spot in report.blind_spots if spot.blind}
+    assert {"turn_slip", "side_slip", "wheel_radius_asymmetry", "heading_bias"} <= blind
+
+
+def test_known_effects_of_the_model_are_not_reported_again():
+    amended = report_of(("motor_lag", 0.12)).model
+    again = find_gap(simulated_drive({"motor_lag": 0.12}, seed=902), amended)
+    assert not again.effects
+    assert again.model.effects[0].values["tau_s"] == pytest.approx(0.12, rel=0.05)
+
+
+def test_report_and_model_can_be_written_and_read(tmp_path):
+    report = report_of(("motor_lag", 0.12))
+    content = json.loads(json.dumps(report.as_dict()))
+    assert content["effects"][0]["channel"] == "command_to_wheel"
+    assert set(content["gap"]) >= {"horizon_s", "held_out", "nominal", "refitted", "amended", "floor"}
+    save_model(report.model, tmp_path / "model.toml")
+    assert load_model(tmp_path / "model.toml").parameter_names == report.model.parameter_names
+    html = page(report)
+    assert "0.12" in html
+    assert "http" not in html
+    assert html.count("data:image/png;base64,") == len(report.pictures) >= 4
+
+
+def test_a_log_with_nothing_to_judge_is_refused():
+    whole = simulated_drive(seed=900, drive="poor")
+    few = slice(0, 20)
+    wheels = whole.wheels
+    cut = type(wheels)(
+        *(getattr(wheels, name)[few] for name in wheels.__slots__[:6]), wheels.angle_measured, wheels.speed_measured
+    )
+    poses = type(whole.poses)(*(getattr(whole.poses, name)[few] for name in whole.poses.__slots__))
+    with pytest.raises(LogError, match="too little"):
+        find_gap(DriveLog(whole.sources, whole.commands, cut, poses, whole.gyro), MODEL)
+
+
+def test_the_amended_belief_is_a_joint_gaussian():
+    model = report_of(("turn_slip", 0.09)).model
+    covariance = model.belief.covariance()
+    assert np.linalg.eigvalsh(covariance).min() > 0.0
+    names = model.belief.names
+    axial, slip = names.index("axial_distance_m"), names.index("turn_slip.k_s")
+    assert abs(covariance[axial, slip]) > 0.0
