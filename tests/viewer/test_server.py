@@ -2,9 +2,11 @@
 
 import http.client
 import socket
+import time
 from pathlib import Path
 from urllib.parse import urlsplit
 
+import msgspec
 import pytest
 import viser
 import websockets.asyncio.server
@@ -73,8 +75,17 @@ def test_it_listens_on_the_loopback_alone(page):
     assert addresses == {"0100007F"}
 
 
-def test_nobody_gets_a_public_tunnel(page):
-    assert page.server.request_share_url() is None
+def test_a_client_that_asks_for_a_public_tunnel_gets_none(page, monkeypatch):
+    dug = []
+    monkeypatch.setattr(viser._viser, "ViserTunnel", lambda *arguments, **named: dug.append(arguments))
+    port = port_of(page)
+    with upgrade(port, f"http://127.0.0.1:{port}") as client:
+        client.recv(timeout=10)
+        client.send(msgspec.msgpack.encode({"type": "ShareUrlRequest"}))
+        # Whatever it makes of the request happens in a thread of its own.
+        time.sleep(0.5)
+    assert dug == []
+    assert page.server._share_tunnel is None
 
 
 def test_a_taken_port_is_an_error_and_not_the_next_one():
