@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 U = np.uintp
 BLOCK = U(80)
 
-STATE_ROWS = 12
+STATE_ROWS = 17
 
 _CACHE_LINE = 64
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from disco_hw.control.blocks import BLOCK, aligned_zeros
 from disco_hw.control.optimiser import Optimiser
-from disco_hw.control.parameter_points import drawn_points, mean_point, point_estimate, unscented_points
+from disco_hw.control.parameter_points import drawn_points, mean_point, point_estimate, twins, unscented_points
 from disco_hw.control.past import past_commands
 from disco_hw.control.plan import Array, Diagnostics, NoValidControl, Outcome, Plan, PlannerState, Rollouts
 from disco_hw.control.settings import DiscoSettings, WheelLimits
@@ -18,7 +18,7 @@ from disco_hw.model import Model
 from disco_hw.model.effects import Channel
 from disco_hw.model.free_run import FreeRun
 from disco_hw.model.model import coefficient_tables
-from disco_hw.model.step import integration_of
+from disco_hw.model.step import integration_series
 
 NARROW_TURN_RAD = 0.4
 TURNING_EFFECTS = ("wheel_gain", "wheel_radius_asymmetry", "surface_change", "turn_slip")
@@ -53,7 +53,9 @@ class Disco:
         self._tables = coefficient_tables(model, theta, step_s, np.float32)
         turn_rad = 2.0 * limits.speed_rad_s * step_s * float((theta[:, 0] / theta[:, 1]).max())
         may_turn_more = settings.uncertainty in ("mc", "joint") or any(s.name in TURNING_EFFECTS for s in model.effects)
-        self._integration = integration_of(step_s, may_turn_more or turn_rad > NARROW_TURN_RAD, np.float32)
+        self._wide = True if may_turn_more or turn_rad > NARROW_TURN_RAD else None
+        self._series = integration_series(step_s, self._wide is not None, np.float32)
+        self._twins = twins(model, theta)
         self._start = np.zeros(8, np.float32)
         self._wheels = aligned_zeros(sampler.horizon * WHEEL_ROWS * int(BLOCK))
         self._wheels_differ = self._do_wheels_differ(theta)
@@ -251,8 +253,9 @@ class Disco:
         base, effects = self._tables
         each = True if self._own_draws else None
         return SkidSteer(
-            self._start, base, effects, each, self._integration, task, self._history, self._wheels, self._wheels_differ
-        )
+            self._start, base, effects, each, self._twins, self._series, self._wide, task, self._history, self._wheels,
+            self._wheels_differ,
+        )  # fmt: skip
 
     def _draw_points(self) -> None:
         """Fresh draws of the belief for this step."""

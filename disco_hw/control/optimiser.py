@@ -9,12 +9,14 @@ from numpy.typing import NDArray
 
 from disco_hw.control.blocks import BLOCK, STATE_ROWS, aligned_zeros, block_count
 from disco_hw.control.commands import Basis, Limits
-from disco_hw.control.replan import ESS, TEMPERATURE, Sampling, Workspace, replan
+from disco_hw.control.replan import ESS, SAMPLING, TEMPERATURE, Workspace, replan
 from disco_hw.control.settings import Sampler
 from disco_hw.control.spline import spline_basis
 
 Array = NDArray[np.float64]
 FIRST_TEMPERATURE = 0.1
+# Commands of all samples are kept for the update while they fit the second-level cache (numbers of four bytes).
+MOST_KEPT = 131_072
 
 
 class Optimiser:
@@ -36,32 +38,34 @@ class Optimiser:
         rows = -(-knots * channels // 4) * 4
         blocks = block_count(sampler.samples)
         padded = blocks * int(BLOCK)
-        variance = sampler.noise_std**2
         self.step_number = 0
-        self._history = history
         self._before = np.zeros(channels, f32)
         self._limits = Limits(f32(largest), f32(min(change, 4.0 * largest)), self._before)
-        self._free = Limits(f32(np.inf), f32(np.inf), self._before)
-        self._sampling = Sampling(
-            seed=seed,
-            samples=sampler.samples,
-            blocks=blocks,
-            rows=rows,
-            noise_std=f32(sampler.noise_std),
-            with_nominal=sampler.with_nominal,
-            hold=sampler.beyond_end == "hold",
-            drawn=sampler.update_from == "drawn",
-            temperature=f32(sampler.temperature or 0.0),
-            target_ess=f32(sampler.target_ess),
-            control_cost=f32(sampler.control_cost_weight / variance),
-            worst_part=f32({"mean": 1.0, "cvar": sampler.worst_part, "worst": 1e-6}[sampler.risk]),
+        commands_size = (history + horizon) * channels * int(BLOCK)
+        self._samplings = np.zeros(1, SAMPLING)
+        self._samplings[0] = (
+            seed,
+            sampler.samples,
+            blocks,
+            rows,
+            history,
+            blocks * commands_size <= MOST_KEPT,
+            sampler.with_nominal,
+            sampler.beyond_end == "hold",
+            sampler.update_from == "drawn",
+            sampler.noise_std,
+            sampler.temperature or 0.0,
+            sampler.target_ess,
+            sampler.control_cost_weight / sampler.noise_std**2,
+            {"mean": 1.0, "cvar": sampler.worst_part, "worst": 1e-6}[sampler.risk],
         )
+        kept = blocks if self._samplings["kept"][0] else 1
         self._work = Workspace(
             nominal=np.zeros((horizon, channels), f32),
             updated=np.zeros((horizon, channels), f32),
             before_update=np.zeros((horizon, channels), f32),
             noise=aligned_zeros(blocks * rows * int(BLOCK)),
-            commands=aligned_zeros((history + horizon) * channels * int(BLOCK)),
+            commands=aligned_zeros(kept * commands_size).reshape(kept, commands_size),
             state=aligned_zeros(STATE_ROWS * int(BLOCK)),
             point_costs=aligned_zeros(points * padded),
             costs=aligned_zeros(padded),
@@ -70,6 +74,7 @@ class Optimiser:
             order=np.zeros(points, np.int64),
             report=np.zeros(6),
         )
+        self._sampler = sampler
         self.reset()
 
     def reset(self) -> None:
@@ -99,8 +104,8 @@ class Optimiser:
 
     def set_past(self, past: Array) -> None:
         """Set the commands before the plan, (history, C)."""
-        rows = self._work.commands.reshape(-1, int(BLOCK))
-        rows[: past.size] = past.reshape(-1, 1)
+        blocks = self._work.commands
+        blocks.reshape(len(blocks), -1, int(BLOCK))[:, : past.size] = past.reshape(-1, 1)
 
     def step(self, shift_steps: float, before: tuple[float, ...], system: Any, point_weights: NDArray[Any]) -> bool:
         """One step: the plan moves on by `shift_steps` and is improved; False if nothing valid came out.
@@ -111,9 +116,8 @@ class Optimiser:
         number = self.step_number
         self.step_number += 1
         valid: bool = replan(
-            self._work, self._sampling, number, self._history, shift_steps, self._basis, self._limits, self._free,
-            system, point_weights,
-        )  # fmt: skip
+            self._work, self._samplings, number, shift_steps, self._basis, self._limits, system, point_weights
+        )
         return valid
 
     @property
@@ -135,10 +139,10 @@ class Optimiser:
 
     def sampled_commands(self, limit: int) -> tuple[Array, Array]:
         """Up to `limit` of the last step's samples of the largest weight: commands (n, T, C), weights (n,)."""
-        work, sampling = self._work, self._sampling
-        weights = np.asarray(work.weights[: sampling.samples], dtype=np.float64)
+        work = self._work
+        weights = np.asarray(work.weights[: self._sampler.samples], dtype=np.float64)
         chosen = np.argsort(-weights, kind="stable")[:limit]
-        noise = work.noise.reshape(sampling.blocks, sampling.rows, int(BLOCK))
+        noise = work.noise.reshape(work.weights.size // int(BLOCK), -1, int(BLOCK))
         commands = np.empty((chosen.size, *work.nominal.shape))
         for row, k in enumerate(chosen):
             commands[row] = self._one_sample(noise[k // int(BLOCK), :, k % int(BLOCK)])

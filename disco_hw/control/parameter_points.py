@@ -8,16 +8,21 @@ from numpy.typing import NDArray
 from disco_hw.control.sigma_points import sigma_points
 from disco_hw.model import Belief, Mixture, Model
 from disco_hw.model.effects import REGISTRY
-from disco_hw.model.parameter import BASE_PARAMETERS
+from disco_hw.model.parameter import BASE_PARAMETERS, X_ICR
 
 Array = NDArray[np.float64]
 DOMINANT_WEIGHT = 0.9
 
 
 def moving_names(belief: Belief) -> tuple[str, ...]:
-    """Those parameters of a belief that change motion."""
+    """Those parameters of a belief that change motion, x_icr last.
+
+    Then the sigma points along the last column of the square root differ from the mean in x_icr alone, and the rollout
+    of the three is shared.
+    """
     base = {parameter.name for parameter in BASE_PARAMETERS}
-    return tuple(name for name in belief.names if name in base or REGISTRY[name.split(".")[0]].moves)
+    moving = [name for name in belief.names if name in base or REGISTRY[name.split(".")[0]].moves]
+    return tuple(sorted(moving, key=lambda name: name == X_ICR.name))
 
 
 def moments(belief: Belief) -> tuple[Array, Array]:
@@ -69,3 +74,18 @@ def mean_point(model: Model) -> Array:
     if model.belief is None:
         return model.point()[None]
     return model.complete(model.belief.mean()[None], model.belief.names)
+
+
+def twins(model: Model, points: Array) -> NDArray[np.int64]:
+    """For points (L, P), those that differ from one in x_icr alone: (L, 2), -1 for none, -2 for being such a twin.
+
+    Only pairs of twins count, as the unscented transform makes them.
+    """
+    found = np.full((len(points), 2), -1)
+    others = np.delete(points, model.parameter_names.index(X_ICR.name), axis=1)
+    for i, row in enumerate(others):
+        alike = [j for j in range(i + 1, len(points)) if found[j, 0] == -1 and np.array_equal(others[j], row)]
+        if found[i, 0] == -1 and len(alike) >= 2:
+            found[i] = alike[:2]
+            found[alike[:2]] = -2
+    return found

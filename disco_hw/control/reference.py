@@ -6,15 +6,15 @@ Shapes: K samples, T steps, L parameter points. Algorithm 1 of the paper in its 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from disco_hw.control.tasks.circle import Circle
 from disco_hw.model import reference as model
 
 Array = NDArray[np.float64]
-StageCost = Callable[[model.State, model.State, Any, int], Any]
+SequenceCost = Callable[[Array, Array, Array, Array], Array]
 
 
 def limited(nominal: Array, noise: Array, before: Array, speed: float, change: float) -> Array:
@@ -31,20 +31,36 @@ def limited(nominal: Array, noise: Array, before: Array, speed: float, change: f
     return commands
 
 
+def circle_cost(circle: Circle, step_s: float) -> SequenceCost:
+    """Cost of paths x, y, yaw (T + 1, K) and forward speeds (T, K) round a circle; see `Circle`."""
+
+    def cost(x: Array, y: Array, yaw: Array, forward: Array) -> Array:
+        x, y = x - circle.center_x_m, y - circle.center_y_m
+        off_edge = np.hypot(x[1:], y[1:]) - circle.radius_m
+        paper = np.hypot(off_edge, forward - circle.speed_m_s).sum(axis=0)
+        progress = (x[:-1] * y[1:] - y[:-1] * x[1:]) / (step_s * circle.radius_m)
+        missing = circle.progress_part * circle.speed_m_s * len(forward) - progress.sum(axis=0)
+        return np.asarray(paper + circle.progress_weight * np.maximum(missing, 0.0))
+
+    return cost
+
+
 def point_costs(
-    theta: model.Theta, start: model.State, commands: Array, past: Array, step_s: float, stage_cost: StageCost,
+    theta: model.Theta, start: model.State, commands: Array, past: Array, step_s: float, cost: SequenceCost,
     time_s: float = 0.0,
 ) -> Array:  # fmt: skip
     """Costs (K,) of command sequences (K, T, 2) under one parameter point; `past` (H, 2) are the commands before."""
     count, horizon = commands.shape[:2]
     all_commands = np.concatenate([np.broadcast_to(past[:, None], (past.shape[0], count, 2)), commands.swapaxes(0, 1)])
     in_force = model.delayed(all_commands, past.shape[0], theta, step_s)
-    state, total = start, np.zeros(count)
+    states, speeds = [start], []
     for t in range(horizon):
-        moved, forward, _ = model.step(theta, state, in_force[t, :, 0], in_force[t, :, 1], step_s, time_s + t * step_s)
-        total = total + stage_cost(state, moved, forward, t)
-        state = moved
-    return total
+        now_s = time_s + t * step_s
+        state, forward, _ = model.step(theta, states[-1], in_force[t, :, 0], in_force[t, :, 1], step_s, now_s)
+        states.append(state)
+        speeds.append(forward)
+    x, y, yaw = (np.stack([np.broadcast_to(getattr(s, name), (count,)) for s in states]) for name in ("x", "y", "yaw"))
+    return cost(x, y, yaw, np.stack(speeds))
 
 
 def control_cost(nominal: Array, noise: Array, noise_std: float, weight: float) -> Array:

@@ -5,13 +5,15 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from disco_hw.control.blocks import BLOCK, U
-from disco_hw.control.commands import add_control_cost, add_weighted, expand
+from disco_hw.control.commands import Limits, add_control_cost, add_weighted, expand
 from disco_hw.control.random_numbers import fill_normal_block
 from disco_hw.control.risk import mean_over_points, worst_over_points
 from disco_hw.control.rollout import roll_block
 from disco_hw.control.weighting import INVALID, refuse_invalid, temperature_for, weigh
-from disco_hw.model.jit import block_function, cast_like, float32, kernel_function
+from disco_hw.model.jit import block_function, float32, kernel_function, scalar_function
 
 ESS, TEMPERATURE, LEAST, MEAN, NOMINAL, VALID = range(6)
 
@@ -19,9 +21,10 @@ ESS, TEMPERATURE, LEAST, MEAN, NOMINAL, VALID = range(6)
 class Workspace(NamedTuple):
     """Buffers of the step, float32 and flat unless said; C channels, R rows of noise, K' = blocks * BLOCK samples.
 
-    `nominal`, `updated`, `before_update` (T, C); `noise` (blocks, R, BLOCK); `commands` ((H + T) * C, BLOCK); `state`
-    (STATE_ROWS, BLOCK); `point_costs` (L, K'); `costs`, `weights` (K',); `sums` (T * C, BLOCK); `order` (L,) int64;
-    `report` (6,) float64: effective sample size, temperature, least, mean and nominal cost, number of finite costs.
+    `nominal`, `updated`, `before_update` (T, C); `noise` (blocks, R, BLOCK); `commands` (blocks or 1,
+    (H + T) * C * BLOCK); `state` (STATE_ROWS, BLOCK); `point_costs` (L, K'); `costs`, `weights` (K',); `sums`
+    (T * C, BLOCK); `order` (L,) int64; `report` (6,) float64: effective sample size, temperature, least, mean and
+    nominal cost, number of finite costs.
     """
 
     nominal: Any
@@ -38,27 +41,29 @@ class Workspace(NamedTuple):
     report: Any
 
 
-class Sampling(NamedTuple):
-    """How is sampled and weighed.
-
-    `seed`; `samples`; `blocks`; `rows` of noise; `noise_std`; `with_nominal`: whether sample 0 is the nominal;
-    `hold`: whether a shifted plan ends in its last command, else in zero; `drawn`: whether the update is made from the
-    noise as drawn, else as applied; `temperature` or 0 for `target_ess`; `control_cost`: weight over variance, or 0;
-    `worst_part`: of the parameter points' weight that the cost is the mean of.
-    """
-
-    seed: Any
-    samples: Any
-    blocks: Any
-    rows: Any
-    noise_std: Any
-    with_nominal: Any
-    hold: Any
-    drawn: Any
-    temperature: Any
-    target_ess: Any
-    control_cost: Any
-    worst_part: Any
+# How is sampled and weighed. `with_nominal`: sample 0 is the nominal. `hold`: a shifted plan ends in its last command,
+# else in zero. `drawn`: the update is made from the noise as drawn, else as applied. `temperature` is 0 for
+# `target_ess`. `control_cost`: weight over variance. `worst_part`: of the points' weight that the cost is the mean of.
+# `kept`: all blocks' commands are kept from the rollout for the update, else worked out again.
+SAMPLING = np.dtype(
+    [
+        ("seed", "i8"),
+        ("samples", "i8"),
+        ("blocks", "i8"),
+        ("rows", "i8"),
+        ("history", "i8"),
+        ("kept", "?"),
+        ("with_nominal", "?"),
+        ("hold", "?"),
+        ("drawn", "?"),
+        ("noise_std", "f4"),
+        ("temperature", "f4"),
+        ("target_ess", "f4"),
+        ("control_cost", "f4"),
+        ("worst_part", "f4"),
+    ],
+    align=True,
+)
 
 
 @block_function
@@ -82,29 +87,35 @@ def shift(nominal: Any, scratch: Any, steps: float, hold: bool) -> None:
             nominal[t, c] = scratch[t, c]
 
 
+@scalar_function
+def _unlimited(limits: Any) -> Any:
+    """Limits that bind nothing."""
+    infinite = float32(np.inf)
+    return Limits(infinite, infinite, limits.before)
+
+
 @block_function
-def sample_and_roll(
-    work: Any, sampling: Any, step: int, history: int, basis: Any, limits: Any, free: Any, system: Any, points: int
-) -> None:
+def sample_and_roll(work: Any, sampling: Any, step: int, basis: Any, limits: Any, system: Any, points: int) -> None:
     """Draw all samples and cost them: writes `noise`, `point_costs` and, as far as the control cost goes, `costs`."""
-    nominal = work.nominal
+    nominal, history = work.nominal, sampling.history
     horizon = nominal.shape[0]
     padded = sampling.blocks * int(BLOCK)
     for block in range(sampling.blocks):
         fill_normal_block(work.noise, sampling.rows, block, step, sampling.seed, sampling.noise_std)
         first_noise, first = U(block * sampling.rows) * BLOCK, U(block) * BLOCK
+        commands = work.commands[block if sampling.kept else 0]
         if block == 0 and sampling.with_nominal:
             for j in range(U(sampling.rows)):
                 work.noise[j * BLOCK] = float32(0.0)
         for b in range(BLOCK):
             work.costs[first + b] = float32(0.0)
         if sampling.drawn and sampling.control_cost > float32(0.0):
-            expand(work.commands, work.state, history, nominal, work.noise, first_noise, basis, free)
-            add_control_cost(work.costs, first, work.commands, history, nominal, sampling.control_cost)
-        expand(work.commands, work.state, history, nominal, work.noise, first_noise, basis, limits)
+            expand(commands, work.state, history, nominal, work.noise, first_noise, basis, _unlimited(limits))
+            add_control_cost(work.costs, first, commands, history, nominal, sampling.control_cost)
+        expand(commands, work.state, history, nominal, work.noise, first_noise, basis, limits)
         if sampling.control_cost > float32(0.0) and not sampling.drawn:
-            add_control_cost(work.costs, first, work.commands, history, nominal, sampling.control_cost)
-        roll_block(system, work.point_costs, points, padded, block, horizon, work.commands, work.state)
+            add_control_cost(work.costs, first, commands, history, nominal, sampling.control_cost)
+        roll_block(system, work.point_costs, points, padded, block, horizon, commands, work.state)
 
 
 @block_function
@@ -133,17 +144,20 @@ def weigh_all(work: Any, sampling: Any) -> Any:
 
 
 @block_function
-def update(work: Any, sampling: Any, history: int, basis: Any, limits: Any, total: float) -> Any:
+def update(work: Any, sampling: Any, basis: Any, limits: Any, total: float) -> Any:
     """Set `nominal` to the weighted mean of the samples' commands; False and no change if that is not finite."""
-    nominal, sums = work.nominal, work.sums
+    nominal, sums, history = work.nominal, work.sums, sampling.history
     horizon, channels = nominal.shape
     rows = horizon * channels
     for j in range(U(rows) * BLOCK):
         sums[j] = float32(0.0)
     for block in range(sampling.blocks):
-        first_noise = U(block * sampling.rows) * BLOCK
-        expand(work.commands, work.state, history, nominal, work.noise, first_noise, basis, limits)
-        add_weighted(sums, work.weights, U(block) * BLOCK, work.commands, U(history * channels), rows)
+        commands = work.commands[block if sampling.kept else 0]
+        if sampling.drawn or not sampling.kept:
+            first_noise = U(block * sampling.rows) * BLOCK
+            bounds = _unlimited(limits) if sampling.drawn else limits
+            expand(commands, work.state, history, nominal, work.noise, first_noise, basis, bounds)
+        add_weighted(sums, work.weights, U(block) * BLOCK, commands, U(history * channels), rows)
     finite = True
     for t in range(horizon):
         for c in range(channels):
@@ -152,7 +166,7 @@ def update(work: Any, sampling: Any, history: int, basis: Any, limits: Any, tota
             for b in range(BLOCK):
                 value += sums[row + b]
             value /= total
-            work.updated[t, c] = value
+            work.updated[t, c] = min(max(value, -limits.largest), limits.largest)
             finite &= math.isfinite(value)
     if finite:
         for t in range(horizon):
@@ -164,28 +178,18 @@ def update(work: Any, sampling: Any, history: int, basis: Any, limits: Any, tota
 
 @kernel_function
 def replan(
-    work: Any, sampling: Any, step: int, history: int, shift_steps: float, basis: Any, limits: Any, free: Any,
-    system: Any, point_weights: Any,
-) -> Any:  # fmt: skip
+    work: Any, samplings: Any, step: int, shift_steps: float, basis: Any, limits: Any, system: Any, point_weights: Any
+) -> Any:
     """One step of DISCO on `work.nominal`; False, and the shifted plan stays, if nothing valid came out.
 
-    `limits` bound the commands of the rollouts, `free` are limits without bounds; `system` is what is rolled out.
+    `samplings` (1,) of SAMPLING; `limits` bound the commands; `system` is what is rolled out.
     """
+    sampling = samplings[0]
     shift(work.nominal, work.updated, shift_steps, sampling.hold)
-    sample_and_roll(work, sampling, step, history, basis, limits, free, system, point_weights.size)
+    sample_and_roll(work, sampling, step, basis, limits, system, point_weights.size)
     if sampling.worst_part < float32(1.0):
         worst_over_points(work.costs, work.point_costs, point_weights, sampling.blocks, sampling.worst_part, work.order)
     else:
         mean_over_points(work.costs, work.point_costs, point_weights, sampling.blocks)
     total = weigh_all(work, sampling)
-    if not total > cast_like(0.0, total):
-        return False
-    if not sampling.drawn:
-        return update(work, sampling, history, basis, limits, total)
-    if not update(work, sampling, history, basis, free, total):
-        return False
-    horizon, channels = work.nominal.shape
-    for t in range(horizon):
-        for c in range(channels):
-            work.nominal[t, c] = min(max(work.nominal[t, c], -limits.largest), limits.largest)
-    return True
+    return total > float32(0.0) and update(work, sampling, basis, limits, total)

@@ -14,17 +14,20 @@ from disco_hw.control.rollout import roll_block
 from disco_hw.control.tasks.terms import has_memory, stage_cost, terminal_cost
 from disco_hw.model.effects import command_delay
 from disco_hw.model.jit import block_function, cast_like, scalar_function, specialise, tune_loops
-from disco_hw.model.step import axle_of, body_step, needs_change, tracked_of, wheel_step
+from disco_hw.model.step import axle_of, body_step, integration_from, needs_change, tracked_of, wheel_step
 from disco_hw.model.tables import base_point, effect_point, lane_base, lane_effects
 
-# Rows of a block's state; one flat buffer at fixed offsets spares the compiler all checks for overlap.
-_AXLE_X, _AXLE_Y, _COS, _SIN, _FORWARD, _X, _Y, _MEMORY, _TOTAL = (U(row) * BLOCK for row in range(9))
+# Rows of a block's state; one flat buffer at fixed offsets spares the compiler all checks for overlap. Three sets of
+# rows for what differs between points that share the axle's motion.
+_AXLE_X, _AXLE_Y, _COS, _SIN, _FORWARD = (U(row) * BLOCK for row in range(5))
 _LEFT, _RIGHT = U(0) * BLOCK, BLOCK
+_OWN, _FIRST_TWIN, _SECOND_TWIN = U(5) * BLOCK, U(9) * BLOCK, U(13) * BLOCK
+_X, _Y, _MEMORY, _TOTAL = (U(row) * BLOCK for row in range(4))
 _CHANNELS = 2
-# Rows of the wheels' motion for every step: sum, right minus left, change of the sum.
-_SUM, _DIFFERENCE, _CHANGE = (U(row) * BLOCK for row in range(3))
+# The wheels' motion: for every step a row of their sum and one of right minus left; then a row of the sum's change.
+_SUM, _DIFFERENCE = U(0) * BLOCK, BLOCK
+_WHEEL_STRIDE = U(2) * BLOCK
 WHEEL_ROWS = 3
-_WHEEL_STRIDE = U(WHEEL_ROWS) * BLOCK
 
 
 class SkidSteer(NamedTuple):
@@ -32,15 +35,19 @@ class SkidSteer(NamedTuple):
 
     `start` (8,): x, y relative to the task's origin (m), cos and sin of yaw, left and right wheel speed (rad/s), time
     (s), the task's memory. `base`, `effects`: coefficient tables of L points; `each` is None, or anything else if the
-    tables hold points for every sample, (L, K'). `history`: rows of commands from before the plan. `wheels`: buffer of
-    the wheels' motion, (T, WHEEL_ROWS, BLOCK); `wheels_differ`: whether the points differ in how the wheels turn.
+    tables hold points for every sample, (L, K'). `twins` (L, 2) int: points that differ from a point in x_icr alone,
+    -1 for none, -2 for a point that is itself a twin. `series` (8,), `wide`: how a step is integrated. `history`: rows
+    of commands from before the plan. `wheels`: buffer of the wheels' motion, T * WHEEL_ROWS * BLOCK; `wheels_differ`:
+    whether the points differ in how the wheels turn.
     """
 
     start: Any
     base: Any
     effects: Any
     each: Any
-    integration: Any
+    twins: Any
+    series: Any
+    wide: Any
     task: Any
     history: Any
     wheels: Any
@@ -60,7 +67,7 @@ def _turn_wheels(
         time_s = start[6] + cast_like(t, step_s) * step_s
         recent = U((t + late) * _CHANNELS) * BLOCK
         older = U(max(t + late - 1, 0) * _CHANNELS) * BLOCK
-        row = U(t) * _WHEEL_STRIDE
+        row, change_row = U(t) * _WHEEL_STRIDE, U(2 * horizon + t) * BLOCK
         for b in range(BLOCK):
             acting = lane_effects(effects, at + b)
             left = command_delay.blend(commands[recent + b], commands[older + b], acting.command_delay)
@@ -72,15 +79,17 @@ def _turn_wheels(
             wheels[row + _SUM + b] = mean_left + mean_right
             wheels[row + _DIFFERENCE + b] = mean_right - mean_left
             if needs_change(acting):
-                wheels[row + _CHANGE + b] = (end_left + end_right) - (was_left + was_right)
+                wheels[change_row + b] = (end_left + end_right) - (was_left + was_right)
 
 
 @scalar_function
-def _move(state: Any, b: Any, wheels: Any, row: Any, time_s: Any, base: Any, effects: Any, integration: Any) -> None:
+def _move(
+    state: Any, b: Any, wheels: Any, row: Any, change_row: Any, time_s: Any, base: Any, effects: Any, integration: Any
+) -> None:
     """Move sample b on by one step."""
     axle_x, axle_y, cos_yaw, sin_yaw, forward, _ = body_step(
         state[_AXLE_X + b], state[_AXLE_Y + b], state[_COS + b], state[_SIN + b],
-        wheels[row + _SUM + b], wheels[row + _DIFFERENCE + b], wheels[row + _CHANGE + b], time_s,
+        wheels[row + _SUM + b], wheels[row + _DIFFERENCE + b], wheels[change_row + b], time_s,
         base, effects, integration,
     )  # fmt: skip
     state[_AXLE_X + b] = axle_x
@@ -91,77 +100,126 @@ def _move(state: Any, b: Any, wheels: Any, row: Any, time_s: Any, base: Any, eff
 
 
 @scalar_function
-def _cost(state: Any, b: Any, t: int, base: Any, task: Any) -> None:
-    """Add the cost of step t, which sample b has just made."""
+def _begin(state: Any, own: Any, b: Any, start: Any) -> None:
+    """Set the rows from `own` on to the start."""
+    state[own + _X + b] = start[0]
+    state[own + _Y + b] = start[1]
+    state[own + _MEMORY + b] = start[7]
+    state[own + _TOTAL + b] = cast_like(0.0, start[0])
+
+
+@scalar_function
+def _cost(state: Any, own: Any, b: Any, t: int, axle_x: Any, axle_y: Any, base: Any, task: Any) -> None:
+    """Add the cost of step t, which sample b has just made, to the rows from `own` on."""
     cos_yaw, sin_yaw = state[_COS + b], state[_SIN + b]
-    x, y = tracked_of(state[_AXLE_X + b], state[_AXLE_Y + b], cos_yaw, sin_yaw, base)
+    x, y = tracked_of(axle_x, axle_y, cos_yaw, sin_yaw, base)
     cost, memory = stage_cost(
-        task, state[_MEMORY + b], t, state[_X + b], state[_Y + b], x, y, cos_yaw, sin_yaw, state[_FORWARD + b]
-    )
-    state[_X + b] = x
-    state[_Y + b] = y
-    state[_TOTAL + b] += cost
+        task, state[own + _MEMORY + b], t, state[own + _X + b], state[own + _Y + b], x, y, cos_yaw, sin_yaw,
+        state[_FORWARD + b],
+    )  # fmt: skip
+    state[own + _X + b] = x
+    state[own + _Y + b] = y
+    state[own + _TOTAL + b] += cost
     if has_memory(task):
-        state[_MEMORY + b] = memory
+        state[own + _MEMORY + b] = memory
+
+
+@scalar_function
+def _cost_twin(state: Any, own: Any, b: Any, t: int, base: Any, twin: Any, start: Any, task: Any) -> None:
+    """As `_cost`, for a twin of the point `base`: its axle moves alike from another place. None has no cost."""
+    if twin is None:
+        return
+    ahead = twin.x_icr_m - base.x_icr_m
+    _cost(state, own, b, t, state[_AXLE_X + b] + ahead * start[2], state[_AXLE_Y + b] + ahead * start[3], twin, task)
+
+
+@scalar_function
+def _end(costs: Any, at: Any, state: Any, own: Any, b: Any, task: Any) -> None:
+    """Write the cost of the rows from `own` on."""
+    costs[at + b] = state[own + _TOTAL + b] + terminal_cost(
+        task, state[own + _MEMORY + b], state[own + _X + b], state[own + _Y + b], state[_COS + b], state[_SIN + b]
+    )
+
+
+@scalar_function
+def _end_twin(costs: Any, at: Any, state: Any, own: Any, b: Any, twin: Any, task: Any) -> None:
+    """As `_end`, for a twin; nothing for None."""
+    if twin is not None:
+        _end(costs, at, state, own, b, task)
 
 
 @block_function
 def _roll(
-    costs: Any, at: Any, horizon: int, wheels: Any, state: Any, start: Any, base: Any, effects: Any, integration: Any,
-    task: Any,
+    costs: Any, at: Any, first_at: Any, second_at: Any, horizon: int, wheels: Any, state: Any, start: Any, base: Any,
+    first_twin: Any, second_twin: Any, effects: Any, integration: Any, task: Any,
 ) -> None:  # fmt: skip
     """Roll the block out from `start` with its wheels turning as in `wheels`; writes `costs[at:at + BLOCK]`.
 
-    `base` and `effects` hold numbers, or arrays whose entries from `at` on belong to the block's samples. A step is
-    costed together with the next one's motion: neither waits for the other, which saves a sixth of the time.
+    `base` and `effects` hold numbers, or arrays whose entries from `at` on belong to the block's samples. Twins differ
+    from `base` in x_icr alone and are costed along with it, at `first_at` and `second_at`; or None. A step is costed
+    together with the next one's motion: neither waits for the other, which saves a sixth of the time.
     """
     tune_loops()
     x, y, cos_yaw, sin_yaw = start[0], start[1], start[2], start[3]
     for b in range(BLOCK):
         state[_AXLE_X + b], state[_AXLE_Y + b] = axle_of(x, y, cos_yaw, sin_yaw, lane_base(base, at + b))
-        state[_X + b] = x
-        state[_Y + b] = y
         state[_COS + b] = cos_yaw
         state[_SIN + b] = sin_yaw
-        state[_MEMORY + b] = start[7]
-        state[_TOTAL + b] = cast_like(0.0, x)
+        _begin(state, _OWN, b, start)
+        _begin(state, _FIRST_TWIN, b, start)
+        _begin(state, _SECOND_TWIN, b, start)
     for t in range(horizon):
         time_s = start[6] + cast_like(t, x) * integration.step_s
-        row = U(t) * _WHEEL_STRIDE
+        row, change_row = U(t) * _WHEEL_STRIDE, U(2 * horizon + t) * BLOCK
         if t == 0:
             for b in range(BLOCK):
                 here, acting = lane_base(base, at + b), lane_effects(effects, at + b)
-                _move(state, b, wheels, row, time_s, here, acting, integration)
+                _move(state, b, wheels, row, change_row, time_s, here, acting, integration)
         else:
             for b in range(BLOCK):
                 here, acting = lane_base(base, at + b), lane_effects(effects, at + b)
-                _cost(state, b, t - 1, here, task)
-                _move(state, b, wheels, row, time_s, here, acting, integration)
+                _cost(state, _OWN, b, t - 1, state[_AXLE_X + b], state[_AXLE_Y + b], here, task)
+                _cost_twin(state, _FIRST_TWIN, b, t - 1, here, first_twin, start, task)
+                _cost_twin(state, _SECOND_TWIN, b, t - 1, here, second_twin, start, task)
+                _move(state, b, wheels, row, change_row, time_s, here, acting, integration)
     for b in range(BLOCK):
-        _cost(state, b, horizon - 1, lane_base(base, at + b), task)
-        costs[at + b] = state[_TOTAL + b] + terminal_cost(
-            task, state[_MEMORY + b], state[_X + b], state[_Y + b], state[_COS + b], state[_SIN + b]
-        )
+        here = lane_base(base, at + b)
+        _cost(state, _OWN, b, horizon - 1, state[_AXLE_X + b], state[_AXLE_Y + b], here, task)
+        _cost_twin(state, _FIRST_TWIN, b, horizon - 1, here, first_twin, start, task)
+        _cost_twin(state, _SECOND_TWIN, b, horizon - 1, here, second_twin, start, task)
+        _end(costs, at, state, _OWN, b, task)
+        _end_twin(costs, first_at, state, _FIRST_TWIN, b, first_twin, task)
+        _end_twin(costs, second_at, state, _SECOND_TWIN, b, second_twin, task)
 
 
 @block_function
 def _roll_points(
     each: Any, system: Any, costs: Any, points: int, padded: int, block: int, horizon: int, commands: Any, state: Any
 ) -> None:
-    step_s = system.integration.step_s
+    integration = integration_from(system.series, system.wide)
+    start, wheels, task = system.start, system.wheels, system.task
     for i in range(points):
         at = U(i * padded) + U(block) * BLOCK
         here, acting = base_point(system.base, i), effect_point(system.effects, i)
         late = system.history - command_delay.whole_steps(acting.command_delay)
         if each is None:
+            first, second = system.twins[i, 0], system.twins[i, 1]
             if i == 0 or system.wheels_differ:
-                _turn_wheels(system.wheels, at, horizon, commands, state, system.start, acting, late, step_s)
-            _roll(costs, at, horizon, system.wheels, state, system.start, here, acting, system.integration, system.task)
+                _turn_wheels(wheels, at, horizon, commands, state, start, acting, late, integration.step_s)
+            if first >= 0:
+                first_at = U(first * padded) + U(block) * BLOCK
+                second_at = U(second * padded) + U(block) * BLOCK
+                _roll(
+                    costs, at, first_at, second_at, horizon, wheels, state, start, here,
+                    base_point(system.base, first), base_point(system.base, second), acting, integration, task,
+                )  # fmt: skip
+            elif first == -1:
+                _roll(costs, at, at, at, horizon, wheels, state, start, here, None, None, acting, integration, task)
         else:
-            _turn_wheels(system.wheels, at, horizon, commands, state, system.start, system.effects, late, step_s)
+            _turn_wheels(wheels, at, horizon, commands, state, start, system.effects, late, integration.step_s)
             _roll(
-                costs, at, horizon, system.wheels, state, system.start, system.base, system.effects,
-                system.integration, system.task,
+                costs, at, at, at, horizon, wheels, state, start, system.base, None, None, system.effects, integration,
+                task,
             )  # fmt: skip
 
 

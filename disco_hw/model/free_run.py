@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from disco_hw.model.effects import command_delay
 from disco_hw.model.jit import kernel_function
 from disco_hw.model.model import Model, coefficient_tables
-from disco_hw.model.step import axle_of, integration_of, step, tracked_of
+from disco_hw.model.step import axle_of, integration_from, integration_series, step, tracked_of
 from disco_hw.model.tables import base_point, effect_point
 
 Array = NDArray[np.float64]
@@ -22,7 +22,7 @@ class FreeRun:
 
     def __init__(self, model: Model, theta: Array, step_s: float) -> None:
         self._base, self._effects = coefficient_tables(model, theta, step_s)
-        self._integration = integration_of(step_s, wide=True)
+        self._series = integration_series(step_s, wide=True)
         delay = self._effects.command_delay
         self.past_rows = 0 if delay is None else int(delay[0].max()) + 1
 
@@ -36,16 +36,17 @@ class FreeRun:
         states[0] = start
         run_states(
             states, np.ascontiguousarray(commands), history, float(time_s), point, self._base, self._effects,
-            self._integration,
+            self._series,
         )  # fmt: skip
         return states
 
 
 @kernel_function
 def run_states(
-    states: Any, commands: Any, history: int, time_s: float, point: int, base: Any, effects: Any, integration: Any
+    states: Any, commands: Any, history: int, time_s: float, point: int, base: Any, effects: Any, series: Any
 ) -> None:
     """Fill `states[1:]` from `states[0]`; as `FreeRun.states`."""
+    integration = integration_from(series, True)
     here, acting = base_point(base, point), effect_point(effects, point)
     x, y, yaw = states[0, 0], states[0, 1], states[0, 2]
     wheel_left, wheel_right = states[0, 3], states[0, 4]

@@ -13,6 +13,7 @@ from collections import namedtuple
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from disco_hw.model.effects import (
     MOTION_EFFECTS,
@@ -50,8 +51,8 @@ class Integration(NamedTuple):
     """Length of a step, and what the sine and cosine of half a step's turn need.
 
     With z = turn * step, step * sin(z) / z and cos(z) are polynomials in turn^2: `chord0` (the step) to `chord3`, 1 and
-    `cos1` to `cos3`. They are good for 0.2 rad; `wide` is 1/16 step to work on a sixteenth of z and double four times,
-    for 4 rad and more, or None.
+    `cos1` to `cos3`. They are good for 0.2 rad; `wide` is None, or anything else to work on a sixteenth of z
+    and double it four times, which is good for 4 rad.
     """
 
     step_s: Any
@@ -65,21 +66,18 @@ class Integration(NamedTuple):
     wide: Any
 
 
-def integration_of(step_s: float, wide: bool, dtype: type = np.float64) -> Integration:
-    """Series of the exact arc for steps of `step_s`: good to 1e-7 for turns of 0.4 rad a step, `wide` for 8 rad."""
+def integration_series(step_s: float, wide: bool, dtype: type = np.float64) -> NDArray[np.floating]:
+    """Series of the exact arc for steps of `step_s`, (8,): to 1e-7 for turns of 0.4 rad a step, `wide` for 8."""
     h = step_s / 16.0 if wide else step_s
     h2 = h * h
-    return Integration(
-        dtype(step_s),
-        dtype(step_s),
-        dtype(-step_s * h2 / 6),
-        dtype(step_s * h2**2 / 120),
-        dtype(-step_s * h2**3 / 5040),
-        dtype(-h2 / 2),
-        dtype(h2**2 / 24),
-        dtype(-(h2**3) / 720),
-        dtype(h) if wide else None,
-    )
+    chord = (step_s, -step_s * h2 / 6, step_s * h2**2 / 120, -step_s * h2**3 / 5040)
+    return np.array([step_s, *chord, -h2 / 2, h2**2 / 24, -(h2**3) / 720], dtype=dtype)
+
+
+@scalar_function
+def integration_from(series: Any, wide: Any) -> Any:
+    """What a step needs, from `integration_series`; `wide` is None or anything else."""
+    return Integration(series[0], series[1], series[2], series[3], series[4], series[5], series[6], series[7], wide)
 
 
 @scalar_function

@@ -1,7 +1,6 @@
 """The fused kernel against the numpy reference: costs, weights and update, over random parameters, effects, states."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -58,9 +57,7 @@ def model_of(base, effects=None):
 
 
 def state_of(values, commands):
-    sent = tuple(
-        SentCommand(20_000_000 * i, left, right) for i, (left, right) in enumerate(commands)
-    )
+    sent = tuple(SentCommand(20_000_000 * i, left, right) for i, (left, right) in enumerate(commands))
     return PlannerState(20_000_000 * len(commands), *values, sent=sent, elapsed_s=3.0)
 
 
@@ -86,14 +83,12 @@ def check_against_reference(model, state, task, plan_settings, seed):
 
     theta, point_weights = unscented_points(model, plan_settings.ut_alpha)
     past = past_commands(state.sent, now_ns, STEP_S, 8, (state.left_speed_rad_s, state.right_speed_rad_s))
-    start = physics.State(
-        state.x_m, state.y_m, state.yaw_rad, state.left_speed_rad_s, state.right_speed_rad_s
-    )
+    start = physics.State(state.x_m, state.y_m, state.yaw_rad, state.left_speed_rad_s, state.right_speed_rad_s)
     expected = np.array(
         [
             reference.point_costs(
                 physics.theta_of(model.parameter_names, point), start, commands, past, STEP_S,
-                task.reference_cost(STEP_S), time_s=state.elapsed_s,
+                reference.circle_cost(task, STEP_S), time_s=state.elapsed_s,
             )
             for point in theta
         ]

@@ -5,38 +5,41 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
+from numba import types
 from numpy.typing import NDArray
 
 from disco_hw.config import CircleTask
 from disco_hw.control.tasks.terms import has_memory, stage_cost, terminal_cost
 from disco_hw.model.jit import cast_like, quick_norm, scalar_function, specialise
-from disco_hw.model.reference import State
 
 
 class CircleTerms(NamedTuple):
     """What the kernel needs of a circle.
 
-    Radius (m), speed (m/s), speed over radius (1/s), weight of lost progress or None, and 1 / (step * radius).
+    Radius (m), speed (m/s); weight of lost progress or None, progress wanted by the end of the horizon (m/s times
+    steps), and the progress of sweeping 1 m^2 twice over, 1 / (step * radius).
     """
 
     radius_m: Any
     speed_m_s: Any
-    turn_rate_rad_s: Any
     progress_weight: Any
-    progress_scale: Any
+    wanted: Any
+    per_swept: Any
 
 
 @dataclass(frozen=True, slots=True)
 class Circle:
-    """Follow a circle counter-clockwise: c = sqrt(d^2 + (s - s0)^2) + w max(0, s0 rho / R - progress).
+    """Follow a circle counter-clockwise: sum of c = sqrt(d^2 + (s - s0)^2) over the steps, plus lost progress.
 
-    d is the distance to the circle's edge, s the longitudinal speed, rho the distance to the centre and progress the
-    areal velocity over R. The first term is the paper's (section V-B). It alone is 0.2 for standing still and less for
-    spinning about an offset centre of rotation; the second, zero for a robot that drives round the circle fast enough,
-    takes the reward from both. `progress_weight` = 0 is the paper's cost.
+    d is the distance to the circle's edge, s the longitudinal speed: the paper's cost (section V-B). It alone is 0.2
+    for standing still and less for spinning about an offset centre of rotation. Progress takes the reward from both: it
+    is the speed at which area is swept about the centre, over R / 2; what the steps together miss of `progress_part`
+    of s0 costs `progress_weight` times as much as the same miss of speed. A robot that drives round pays nothing, and
+    `progress_weight` = 0 is the paper's cost.
     """
 
     center_x_m: float = 0.0
@@ -44,6 +47,7 @@ class Circle:
     radius_m: float = 0.75
     speed_m_s: float = 0.2
     progress_weight: float = 1.0
+    progress_part: float = 0.8
 
     @classmethod
     def from_config(cls, task: CircleTask, progress_weight: float = 1.0) -> Circle:
@@ -58,33 +62,13 @@ class Circle:
     def terms(
         self, time_s: float, x_m: float, y_m: float, memory: float | None, step_s: float, horizon: int
     ) -> tuple[Any, float]:
-        """Terms for the kernel; nothing depends on time or place, and a circle needs no memory."""
-        f32 = np.float32
-        return CircleTerms(
-            f32(self.radius_m),
-            f32(self.speed_m_s),
-            f32(self.speed_m_s / self.radius_m),
-            f32(self.progress_weight) if self.progress_weight > 0.0 else None,
-            f32(1.0 / (step_s * self.radius_m)),
-        ), 0.0
+        """Terms for the kernel; nothing depends on time or place. The memory is twice the area swept (m^2)."""
+        return _terms(self, step_s, horizon), 0.0
 
     def instant_cost(self, time_s: float, x_m: float, y_m: float, forward_m_s: float) -> float:
         """The paper's instant cost of a state."""
         distance = math.hypot(x_m - self.center_x_m, y_m - self.center_y_m) - self.radius_m
         return math.hypot(distance, forward_m_s - self.speed_m_s)
-
-    def reference_cost(self, step_s: float) -> Callable[..., Any]:
-        """The stage cost in numpy, for `disco_hw.control.reference`: of states before and after, speed and step."""
-
-        def cost(old: State, new: State, forward: Any, t: int) -> Any:
-            x_old, y_old = old.x - self.center_x_m, old.y - self.center_y_m
-            x, y = new.x - self.center_x_m, new.y - self.center_y_m
-            rho = np.hypot(x, y)
-            progress = (x_old * y - y_old * x) / step_s / self.radius_m
-            lost = np.maximum(self.speed_m_s * rho / self.radius_m - progress, 0.0)
-            return np.hypot(rho - self.radius_m, forward - self.speed_m_s) + self.progress_weight * lost
-
-        return cost
 
     def picture(self) -> NDArray[np.float64]:
         """The path to follow as a closed polyline in the world frame, shape (N, 2)."""
@@ -94,17 +78,37 @@ class Circle:
         )
 
 
+@lru_cache(maxsize=16)
+def _terms(circle: Circle, step_s: float, horizon: int) -> CircleTerms:
+    f32 = np.float32
+    return CircleTerms(
+        f32(circle.radius_m),
+        f32(circle.speed_m_s),
+        f32(circle.progress_weight) if circle.progress_weight > 0.0 else None,
+        f32(circle.progress_part * circle.speed_m_s * horizon),
+        f32(1.0 / (step_s * circle.radius_m)),
+    )
+
+
 def _is_circle(task: Any) -> bool:
     return getattr(task, "instance_class", None) is CircleTerms
 
 
 @scalar_function
-def lost_progress(weight: Any, rho: float, swept: float, task: Any) -> Any:
-    """Cost of progress below the wanted: `swept` is twice the area swept about the centre in the step (m^2)."""
+def _swept(weight: Any, memory: Any, x_old: Any, y_old: Any, x: Any, y: Any) -> Any:
+    """Twice the area swept about the centre so far (m^2)."""
     if weight is None:
-        return cast_like(0.0, rho)
-    lost = task.turn_rate_rad_s * rho - swept * task.progress_scale
-    return weight * max(lost, cast_like(0.0, rho))
+        return memory
+    return memory + (x_old * y - y_old * x)
+
+
+@scalar_function
+def _lost(weight: Any, memory: Any, task: Any) -> Any:
+    """Cost of the progress that is missing at the end."""
+    zero = cast_like(0.0, memory)
+    if weight is None:
+        return zero
+    return weight * max(task.wanted - memory * task.per_swept, zero)
 
 
 @specialise(stage_cost)
@@ -126,11 +130,10 @@ def _stage_cost(
         sin_yaw: Any,
         forward: Any,
     ) -> Any:
-        rho = quick_norm(x, y)
-        off_edge = rho - task.radius_m
+        off_edge = quick_norm(x, y) - task.radius_m
         off_speed = forward - task.speed_m_s
-        cost = math.sqrt(off_edge * off_edge + off_speed * off_speed)
-        return cost + lost_progress(task.progress_weight, rho, x_old * y - y_old * x, task), memory
+        swept = _swept(task.progress_weight, memory, x_old, y_old, x, y)
+        return math.sqrt(off_edge * off_edge + off_speed * off_speed), swept
 
     return cost
 
@@ -141,11 +144,14 @@ def _terminal_cost(task: Any, memory: Any, x: Any, y: Any, cos_yaw: Any, sin_yaw
         return None
 
     def cost(task: Any, memory: Any, x: Any, y: Any, cos_yaw: Any, sin_yaw: Any) -> Any:
-        return cast_like(0.0, x)
+        return _lost(task.progress_weight, memory, task)
 
     return cost
 
 
 @specialise(has_memory)
 def _has_memory(task: Any) -> Callable[..., Any] | None:
-    return (lambda task: False) if _is_circle(task) else None
+    if not _is_circle(task):
+        return None
+    pays_for_progress = not isinstance(task.types[CircleTerms._fields.index("progress_weight")], types.NoneType)
+    return (lambda task: True) if pays_for_progress else (lambda task: False)
