@@ -221,6 +221,18 @@ def test_permanent_faults_are_not_reset(fault):
     assert (bench.out.state, name_of(bench.out.fault)) == ("FAULT", fault)
 
 
+def test_a_later_fault_does_not_make_an_earlier_one_forgotten():
+    bench = Bench()
+    bench.inputs["self_test_failed"] = True
+    bench.run(2)
+    bench.inputs.clear()
+    bench.inputs["left_current_a"] = 50.0
+    bench.run(200)
+    bench.inputs.clear()
+    reset(bench)
+    assert (bench.out.state, name_of(bench.out.fault)) == ("FAULT", "SELF_TEST_FAILED")
+
+
 def test_a_latched_fault_outlives_its_cause_and_a_reset_waits_for_the_cause_to_go():
     bench = Bench()
     bench.inputs["left_current_a"] = 50.0
