@@ -126,7 +126,7 @@ def _source(options: DriveOptions, config: RobotConfig, script: Script | None, t
     elif options.gamepad:
         held = _gamepad(config, top_rad_s)
     else:
-        held = Keyboard(_STANDARD_INPUT, KeyHold(top_rad_s))
+        held = Keyboard(_STANDARD_INPUT, KeyHold(top_rad_s), MonotonicClock())
     return held if script is None else ScriptSource(script, held)
 
 

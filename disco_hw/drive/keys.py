@@ -15,6 +15,8 @@ from disco_hw.drive.source import INPUT_LIMIT_NS, ManualInput
 _FIRST_REPEAT_NS = 1_000_000_000
 # Shorter than this between two holds may be a stutter of the connection, and must not arm again.
 _RELEASE_NS = 500_000_000
+# No hand and no terminal repeats faster; pasted text does.
+_SHORTEST_REPEAT_NS = 10_000_000
 
 DIRECTIONS = {
     b"\x1b[A": (1.0, 0.0), b"\x1b[B": (-1.0, 0.0), b"\x1b[D": (0.0, 1.0), b"\x1b[C": (0.0, -1.0),
@@ -58,7 +60,7 @@ class _Hold(enum.Enum):
 
 @dataclass(frozen=True, slots=True)
 class KeyEvent:
-    """The newest key of one read; several in one read count once, so that pasted text holds nothing."""
+    """The newest key of those that came together, and when."""
 
     t_ns: int
     key: bytes
@@ -68,9 +70,9 @@ class KeyHold:
     """Turns key events into wheel speeds and a deadman.
 
     Held: an event of a driving key less than 200 ms after the one before. The first repeat may come later, so a tap
-    holds nothing. After a hold has ended, half a second without any key must pass before the next one counts. Holding
-    another key changes the direction; where the terminal waits longer than 200 ms before it repeats that one, the
-    hold ends.
+    holds nothing, nor does pasted text, which comes faster than any repeat. After a hold has ended, half a second
+    without any key must pass before the next one counts. Holding another key changes the direction; where the terminal
+    waits longer than 200 ms before it repeats that one, the hold ends.
     """
 
     def __init__(self, top_rad_s: float, limit_ns: int = INPUT_LIMIT_NS) -> None:
@@ -121,6 +123,8 @@ class KeyHold:
         """The state after a driving key at `t_ns`."""
         gap_ns = _FIRST_REPEAT_NS if self._last_ns is None else t_ns - self._last_ns
         match self._state:
+            case _Hold.PRESSED if gap_ns < _SHORTEST_REPEAT_NS:
+                return _Hold.PRESSED
             case _Hold.HELD | _Hold.PRESSED if gap_ns <= self._limit_ns:
                 return _Hold.HELD
             case _Hold.PRESSED:

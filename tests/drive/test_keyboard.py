@@ -6,10 +6,12 @@ import contextlib
 import os
 import select
 import termios
+import threading
 import time
 
 import pytest
 
+from disco_hw.daemon.clock import SimulatedClock
 from disco_hw.daemon.states import State
 from disco_hw.drive.keyboard import Keyboard
 from disco_hw.drive.keys import KeyHold
@@ -28,24 +30,28 @@ class Terminal:
         self.before = termios.tcgetattr(self.slave)
         os.write(self.master, b"w" * 50)
         assert os.read(self.master, 100) == b"w" * 50, "a terminal echoes"
-        self.keyboard = Keyboard(self.slave, KeyHold(8.0))
-        self.now_ns = 0
+        self.clock = SimulatedClock()
+        self.keyboard = Keyboard(self.slave, KeyHold(8.0), self.clock)
         self.poll(1000)
 
     def poll(self, ms=20):
         """Move time on in steps of 20 ms, polling; the last answer."""
         for _ in range(ms // 20):
-            self.now_ns += 20 * MS
-            self.last = self.keyboard.poll(self.now_ns, VIEW)
+            self.clock.advance_ns(20 * MS)
+            self.last = self.keyboard.poll(self.clock.now_ns(), VIEW)
         return self.last
 
     def type(self, keys):
         os.write(self.master, keys)
-        # The line discipline hands it over at once, but the kernel's worker may be late.
-        deadline = time.monotonic() + 5.0
-        while not _readable(self.slave):
-            assert time.monotonic() < deadline
+        self.arrived()
         return self.poll()
+
+    def arrived(self):
+        """Wait for the reader, which lives in real time."""
+        deadline = time.monotonic() + 5.0
+        while not self.keyboard._arrived:
+            assert time.monotonic() < deadline
+            time.sleep(0.001)
 
     def close(self):
         self.keyboard.close()
@@ -74,7 +80,8 @@ def test_a_held_arrow_drives_and_its_end_stops(terminal):
         terminal.type(b"\x1b[A")
     assert terminal.last.deadman
     assert terminal.last.left_rad_s == terminal.last.right_rad_s == pytest.approx(4.0)
-    assert terminal.poll(200).deadman
+    # The last repeat came 20 ms before the poll that took it.
+    assert terminal.poll(180).deadman
     assert not terminal.poll(20).deadman
 
 
@@ -103,13 +110,25 @@ def test_ctrl_d_ends(terminal):
     assert not terminal.type(b"\x04").deadman
     assert terminal.keyboard.ended == "ended from the keyboard"
     assert terminal.keyboard.completed
-    assert not terminal.type(b"w").deadman
+    os.write(terminal.master, b"w")
+    assert not terminal.poll(100).deadman
+
+
+def test_keys_count_from_when_they_came_not_from_when_they_are_polled(terminal):
+    for _ in range(5):
+        terminal.type(b"w")
+    os.write(terminal.master, b"w")
+    terminal.arrived()
+    # The loop was held up for 300 ms with a key waiting.
+    terminal.clock.advance_ns(300 * MS)
+    assert not terminal.poll().deadman
 
 
 def test_a_terminal_that_closes_is_a_device_that_is_gone(terminal):
     for _ in range(5):
         terminal.type(b"w")
     os.close(terminal.master)
+    terminal.arrived()
     assert terminal.poll() is None
     assert terminal.keyboard.ended == "the terminal has closed"
     assert not terminal.keyboard.completed
@@ -120,6 +139,7 @@ def test_the_terminal_is_put_back(terminal):
     assert termios.tcgetattr(terminal.slave) != terminal.before
     terminal.keyboard.close()
     assert termios.tcgetattr(terminal.slave) == terminal.before
+    assert not [thread for thread in threading.enumerate() if thread.name == "keyboard"]
     terminal.keyboard.close()
 
 
@@ -131,4 +151,4 @@ def test_ctrl_c_still_is_a_signal_and_output_looks_as_before(terminal):
 
 def test_what_is_no_terminal_is_refused(tmp_path):
     with (tmp_path / "file").open("w+b") as file, pytest.raises(InputError, match="no terminal; use"):
-        Keyboard(file.fileno(), KeyHold(8.0))
+        Keyboard(file.fileno(), KeyHold(8.0), SimulatedClock())

@@ -65,6 +65,14 @@ def test_a_tap_holds_nothing():
     assert not any(held(typist.wait(2000)))
 
 
+def test_what_comes_faster_than_any_repeat_holds_nothing():
+    typist = Typist()
+    for _ in range(100):
+        typist.now_ns += 9 * MS
+        typist.press(UP)
+        assert not typist.keys.at(typist.now_ns).deadman
+
+
 def test_a_late_first_repeat_is_waited_for():
     assert any(held(Typist().hold(UP, 1000, delay_ms=660)))
 

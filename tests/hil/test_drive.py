@@ -18,6 +18,7 @@ from disco_hw.drive.source import INPUT_LIMIT_NS
 from disco_hw.log.load import load_drive
 from disco_hw.log.reader import open_log
 from disco_hw.operator import Operator, disco_hw_process
+from disco_hw.pipeline import NoPlanner
 from disco_hw.replay import replay
 from tests.hil.stack import DECELERATION_RAD_S2, MOTOR_SETTLING_S, STILL_RAD_S, write_robot_file
 
@@ -109,7 +110,7 @@ def assert_stands_in_time(t_s, wheels, silent_s):
     assert late.max() < STILL_RAD_S, f"{late.max()} rad/s"
 
 
-def test_a_script_is_driven_unattended_and_recorded_as_executed(tmp_path):
+def test_a_script_is_driven_unattended_and_recorded_as_executed(tmp_path, monkeypatch):
     with bench(tmp_path) as made:
         arguments = ["--script", "steps", "--seed", "1", "--seconds", "7.5", "--unattended", "--json"]
         process = made.drive(*arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
@@ -130,6 +131,8 @@ def test_a_script_is_driven_unattended_and_recorded_as_executed(tmp_path):
     given = commands[np.isfinite(commands).all(axis=1)]
     assert np.abs(np.diff(given, axis=0)).max() <= 20.0 * 0.03 + 1e-9
     assert np.abs(wheels[-1]).max() < STILL_RAD_S
+    # No plan was made, so the replay needs no planner either, which takes long to compile.
+    monkeypatch.setattr("disco_hw.replay.make_planner", lambda *_: NoPlanner())
     assert replay(made.log).ok
     with open_log(made.log) as log:
         assert {"off", "hold", "manual"} == set(log.columns("/command")["source"])
