@@ -283,8 +283,10 @@ def view(
     live: Annotated[bool, typer.Option("--live", help="Show the running daemon of --robot.")] = False,
     robot: Annotated[Path | None, typer.Option(help="robot.toml; for a log, instead of the one it carries.")] = None,
     model: ModelOption = None,
-    snapshot: Annotated[Path | None, typer.Option(help="Write a picture of the log's end instead.")] = None,
+    snapshot: Annotated[Path | None, typer.Option(help="Write a picture of the log instead.")] = None,
+    at: Annotated[float | None, typer.Option(metavar="SECONDS", help="Where in the log; its end if not given.")] = None,
     video: Annotated[Path | None, typer.Option(help="Write a clip of the log instead.")] = None,
+    speed: Annotated[float, typer.Option(min=0.1, max=1000.0, help="How much faster the clip runs.")] = 1.0,
     export: Annotated[Path | None, typer.Option(help="Write one HTML file that plays without Python instead.")] = None,
     host: Annotated[
         str, typer.Option(help="Address to listen on; any but this host's own needs the token that is printed.")
@@ -301,9 +303,9 @@ def view(
     if log is None:
         raise InputError("view: give a LOG, or --live with --robot ROBOT.toml")
     if snapshot is not None:
-        commands.snapshot_log(log, snapshot, robot=robot)
+        commands.snapshot_log(log, snapshot, at, robot)
     if video is not None:
-        commands.video_log(log, video, robot=robot)
+        commands.video_log(log, video, speed, robot)
     if export is not None:
         commands.export_log(log, export, robot=robot)
     if snapshot is None and video is None and export is None:

@@ -1,0 +1,34 @@
+import numpy as np
+import pytest
+
+from disco_hw.viewer.curves import Curves
+from disco_hw.viewer.plots import Plots, _columns
+from disco_hw.viewer.server import serving
+from disco_hw.viewer.timeline import Timeline
+
+
+@pytest.fixture
+def plots(recording):
+    with serving("test", port=0) as page:
+        yield Plots(page.server.gui, recording.stage)
+
+
+def test_rows_in_which_a_value_is_missing_are_left_out():
+    t_s, first, second = _columns(
+        Curves(np.arange(4.0), {"a": np.array((np.nan, 1.0, 2.0, 3.0)), "b": np.array((0.0, 1.0, np.inf, 3.0))})
+    )
+    assert t_s.tolist() == first.tolist() == second.tolist() == [1.0, 3.0]
+
+
+def test_all_curves_are_drawn_up_to_the_instant(plots, timeline):
+    plots.show(timeline, timeline.last_ns)
+    assert len(plots._plots) == 7
+    for plot in plots._plots:
+        assert plot.handle.data[0][-1] >= 3.9, plot.handle.title
+        assert len({len(column) for column in plot.handle.data}) == 1
+
+
+def test_nothing_known_leaves_the_plots_as_they_are(plots):
+    before = [plot.handle.data for plot in plots._plots]
+    plots.show(Timeline(), 10)
+    assert all(np.array_equal(a, b) for a, b in zip(before, (p.handle.data for p in plots._plots), strict=True))
