@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -15,10 +16,11 @@ from matplotlib.figure import Figure
 from disco_hw.config import Robot, RobotConfig
 from disco_hw.inference.infer import InferOptions, infer
 from disco_hw.inference.simulate import NAMES
+from disco_hw.log.drive import DriveLog
+from disco_hw.log.load import load_drive
 from sim.drives import make_drive
-from sim.log_csv import simulated_log
+from sim.log_csv import simulated_log, write_csv
 from sim.plant_parameters import PlantParameters
-from tools.gap_logs import as_drive
 
 PLAUSIBLE = {"x_icr_m": (0.0, 0.3), "wheel_radius_m": (0.04, 0.10), "axial_distance_m": (0.2, 0.5)}
 LEVEL = 0.9
@@ -39,17 +41,18 @@ def plant(seed: int) -> PlantParameters:
     return PlantParameters(**drawn).with_ideal_motors()
 
 
+def logged(parameters: PlantParameters, drive: str, seed: int) -> DriveLog:
+    """One drive of a robot, by way of a CSV file."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "log.csv"
+        write_csv(path, simulated_log(make_drive(drive, seed), parameters, None, seed))
+        return load_drive(path, parameters.ticks_per_rev)
+
+
 def recover(seed: int, drive: str, simulations: int | None = None) -> dict[str, object]:
     """Infer one robot from one drive of it."""
     parameters = plant(seed)
-    rows = simulated_log(make_drive(drive, seed), parameters, None, seed)
-    times = np.array([t_s for t_s, _ in rows])
-    cells = np.array([[float(cell) if cell else np.nan for cell in row] for _, row in rows])[:, 1:]
-    result = infer(
-        as_drive(times - times[0], cells, parameters.ticks_per_rev),
-        config(),
-        InferOptions(simulations=simulations, seed=seed),
-    )
+    result = infer(logged(parameters, drive, seed), config(), InferOptions(simulations=simulations, seed=seed))
     truth = np.array([getattr(parameters, name) for name in NAMES])
     low, high = np.quantile(result.draws, [0.5 - LEVEL / 2, 0.5 + LEVEL / 2], axis=0)
     return {

@@ -110,7 +110,10 @@ def infer(
     rng = np.random.default_rng([options.seed, 1])
     draws, outside = fitted.draw(observed[None], POSTERIOR_DRAWS, rng)
     mixtures = fitted.network.mixtures(observed[None])
-    belief = belief_of(mixtures, fitted.region, prior.low, prior.high, NAMES, rng)
+    try:
+        belief = belief_of(mixtures, fitted.region, prior.low, prior.high, NAMES, rng)
+    except ValueError:
+        raise _outside_prior(estimates(drive, noise).theta(drive.pose[None])[0], prior) from None
     say("posterior predictive check")
     few = draws[0, :PREDICTIVE_SIMULATIONS]
     check = predictive(drive, noise, simulator, few, prior.low, prior.high, options.seed + 2)
@@ -145,6 +148,16 @@ def prior_region(robot: RobotConfig) -> Region:
         if lowest >= highest:
             raise InputError(f"robot.toml: prior.{name}: {given} is physically impossible; write a possible range")
     return Region.box(low, high)
+
+
+def _outside_prior(estimate: Array, prior: Region) -> InputError:
+    """What to say when the prior excludes what the log shows; `estimate` (3,) is a plain fit."""
+    off = np.maximum(prior.low - estimate, estimate - prior.high) / (prior.high - prior.low)
+    worst = int(np.argmax(off))
+    return InputError(
+        f"robot.toml: prior.{NAMES[worst]}: the log points to {estimate[worst]:.3g}, outside "
+        f"[{prior.low[worst]:g}, {prior.high[worst]:g}]; widen it"
+    )
 
 
 def noise_of(drive: Excitation) -> Noise:

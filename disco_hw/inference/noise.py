@@ -94,8 +94,8 @@ def _variance(squares: Array) -> Array:
 def _two_terms(time_s: Array, counts: Array, variance: Array) -> tuple[float, float]:
     """Sensor variance R and slip variance q per second in `variance = 2 R + q time`, both not negative.
 
-    Slip that keeps its direction for a while grows slower at first, as time - tau (1 - exp(-time / tau)); its rate later
-    on is what parameters feel. Errors are relative to the variance and fall with the number of windows.
+    Slip that keeps its direction for a while grows slower at first, as time - tau (1 - exp(-time / tau)); its rate
+    later on is what parameters feel. Errors are relative to the variance and fall with the number of windows.
     """
     precision = np.sqrt(counts)
     scale = precision / np.maximum(variance, 1e-12)

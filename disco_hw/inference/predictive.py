@@ -17,7 +17,8 @@ Array = NDArray[np.float64]
 
 # On logs of robots without any difference the largest of all values stays below this (tools/infer_study.py).
 LARGEST_DEVIATION = 5.0
-_EDGE_SHARE = 0.01
+_EDGE_DEVIATIONS = 1.5
+_OUTSIDE_SHARE = 0.01
 _EDGE_WIDTH = 0.1
 
 
@@ -54,14 +55,20 @@ def predictive(
     simulated, fits = _simulated(simulator, draws, seed, scores, weights)
     deviations = _deviations(scores(drive.pose), simulated)
     fit_deviations = _deviations(weights.raw(drive.pose[None])[0], fits)
-    return Predictive(deviations, fit_deviations, edge_parameters(draws, low, high))
+    return Predictive(deviations, fit_deviations, edge_parameters(draws, low, high, weights.theta(drive.pose[None])[0]))
 
 
-def edge_parameters(draws: Array, low: Array, high: Array) -> tuple[str, ...]:
-    """Parameters determined well (sd below a tenth of the range) with half of the draws within 1 % of an edge."""
+def edge_parameters(draws: Array, low: Array, high: Array, estimate: Array) -> tuple[str, ...]:
+    """Parameters determined well (sd below a tenth of the range) that the prior cuts off.
+
+    Their mean is within 1.5 sd of an edge (the half of a Gaussian that an edge leaves has its mean 1.3 of its own sd
+    away from it), or the plain `estimate` (3,) is outside by a hundredth of the range.
+    """
     span = high - low
-    near = np.minimum(draws - low, high - draws) < _EDGE_SHARE * span
-    pressed = (near.mean(axis=0) > 0.5) & (draws.std(axis=0) < _EDGE_WIDTH * span)
+    mean, sd = draws.mean(axis=0), draws.std(axis=0)
+    pressed = np.minimum(mean - low, high - mean) < _EDGE_DEVIATIONS * sd
+    pressed |= np.minimum(estimate - low, high - estimate) < -_OUTSIDE_SHARE * span
+    pressed &= sd < _EDGE_WIDTH * span
     return tuple(name for name, flag in zip(NAMES, pressed.tolist(), strict=True) if flag)
 
 

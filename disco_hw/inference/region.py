@@ -15,6 +15,8 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _LARGEST_TRIES = 400
+# Of the box: keeps a region open where all draws press against an edge.
+_SMALLEST_DEVIATION = 1e-5
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +67,7 @@ class Region:
     def shrunk(self, draws: Array, deviations: float) -> Region:
         """The part of this region within `deviations` standard deviations of draws (n, P), along their main axes."""
         scale = self.high - self.low
-        covariance = np.cov((draws / scale).T) + 1e-14 * np.eye(scale.size)
+        covariance = np.cov((draws / scale).T) + _SMALLEST_DEVIATION**2 * np.eye(scale.size)
         variances, axes = np.linalg.eigh(covariance)
         factor = scale[:, None] * axes * (deviations * np.sqrt(variances))
         return Region(self.low, self.high, draws.mean(axis=0), factor, self)

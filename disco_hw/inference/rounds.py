@@ -31,7 +31,7 @@ class RoundSettings:
     all rounds but the last: it only has to find the region.
     """
 
-    shares: tuple[float, ...] = (0.15, 0.15, 0.2, 0.5)
+    shares: tuple[float, ...] = (0.1, 0.1, 0.15, 0.15, 0.5)
     deviations: float = 4.5
     scout: NetworkSettings = SCOUT
     network: NetworkSettings = FULL

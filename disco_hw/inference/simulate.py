@@ -17,7 +17,7 @@ from disco_hw.inference.excitation import Excitation
 from disco_hw.inference.noise import Noise
 from disco_hw.model.model import Model, coefficient_tables
 from disco_hw.model.parameter import BASE_PARAMETERS
-from disco_hw.model.step import axle_of, integration_of, step, tracked_of
+from disco_hw.model.step import axle_of, integration_from, integration_series, step, tracked_of
 from disco_hw.model.tables import base_point, effect_point
 
 Array = NDArray[np.float64]
@@ -33,7 +33,7 @@ def simulate_kernel(
     seeds: Any,
     base: Any,
     effects: Any,
-    integration: Any,
+    series: Any,
     noise: Any,
     wheel: Any,
     moving: Any,
@@ -50,6 +50,7 @@ def simulate_kernel(
     the left, and in yaw about the tracked point, so that where random turning has its centre says nothing of x_icr;
     `noise` (5,) as `Noise.vector`.
     """
+    integration = integration_from(series, True)
     root = math.sqrt(integration.step_s)
     slip_forward, slip_left, slip_yaw = noise[2] * root, noise[3] * root, noise[4] * root
     for i in range(seeds.shape[0]):
@@ -104,7 +105,7 @@ class Simulator:
             seeds,
             base,
             effects,
-            integration_of(drive.step_s, wide=True),
+            integration_series(drive.step_s, wide=True),
             self.noise.vector(),
             drive.wheel_rad_s,
             drive.moving,

@@ -1,0 +1,45 @@
+"""Logs of simulated robots for the tests of inference."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from disco_hw.config import Prior, Robot, RobotConfig
+from disco_hw.log.drive import DriveLog
+from disco_hw.log.load import load_drive
+from sim.drives import make_drive
+from sim.effects import hidden_effects
+from sim.log_csv import simulated_log, write_csv
+from sim.plant_parameters import PlantParameters
+
+TRUTH = {"x_icr_m": 0.12, "wheel_radius_m": 0.06, "axial_distance_m": 0.45}
+TICKS_PER_REV = 2048
+
+
+def robot_config(**prior):
+    robot = Robot(
+        name="test",
+        wheel_radius_m=0.055,
+        axial_distance_m=0.4,
+        ticks_per_rev=TICKS_PER_REV,
+        max_wheel_speed_rad_s=8.0,
+    )
+    return RobotConfig(robot=robot, prior=Prior(**prior))
+
+
+def write_log(path: Path, drive: str = "circle", seed: int = 1, hide: dict | None = None, **parameters: float) -> Path:
+    plant = PlantParameters(**(TRUTH | parameters)).with_ideal_motors()
+    write_csv(path, simulated_log(make_drive(drive, seed), plant, hidden_effects(hide or {}), seed))
+    return path
+
+
+@cache
+def logged(drive: str = "circle", seed: int = 1, hidden: tuple = (), noiseless: bool = False) -> DriveLog:
+    plant = PlantParameters(**TRUTH).with_ideal_motors()
+    plant = plant.noiseless() if noiseless else plant
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "log.csv"
+        write_csv(path, simulated_log(make_drive(drive, seed), plant, hidden_effects(dict(hidden)), seed))
+        return load_drive(path, TICKS_PER_REV)

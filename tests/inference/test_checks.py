@@ -1,0 +1,38 @@
+import numpy as np
+import pytest
+
+from disco_hw.inference.checks import CHECKS, Scores
+from disco_hw.inference.estimates import estimates
+from disco_hw.inference.excitation import excitation
+from disco_hw.inference.infer import noise_of
+from tests.inference.drives import logged
+
+
+def scores(hidden=(), drive="rich"):
+    laid = excitation(logged(drive, 5, hidden))
+    values = Scores(laid, estimates(laid, noise_of(laid)))(laid.pose)
+    return dict(zip((check.name for check in CHECKS), values, strict=True))
+
+
+def test_nothing_hidden_leaves_no_pattern():
+    assert np.abs(list(scores().values())).max() < 4.5
+
+
+@pytest.mark.parametrize(
+    ("effect", "value", "name"),
+    [
+        ("turn_slip", 0.08, "less turn at speed"),
+        ("side_slip", 0.12, "sideways in fast turns"),
+        ("pose_latency", 0.08, "late positions"),
+        ("wheel_radius_asymmetry", 0.015, "turns on straights"),
+        ("lateral_icr", 0.03, "forward with turning"),
+    ],
+)
+def test_a_hidden_effect_stands_out_in_its_check(effect, value, name):
+    found = scores(((effect, value),))
+    assert abs(found[name]) > 6.0
+    assert abs(found[name]) == max(abs(score) for score in found.values())
+
+
+def test_a_drive_that_cannot_show_it_scores_no_false_alarm():
+    assert np.isfinite(list(scores(drive="circle").values())).all()

@@ -1,0 +1,114 @@
+import json
+
+import pytest
+
+from disco_hw.errors import InputError, WorkError
+from disco_hw.inference.commands import infer_command
+from disco_hw.model import load_model
+from tests.inference.drives import TICKS_PER_REV, TRUTH, write_log
+
+ROBOT = f"""
+[robot]
+name = "test"
+wheel_radius_m = 0.055
+axial_distance_m = 0.4
+ticks_per_rev = {TICKS_PER_REV}
+max_wheel_speed_rad_s = 8.0
+"""
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory):
+    path = tmp_path_factory.mktemp("robot") / "robot.toml"
+    path.write_text(ROBOT)
+    return path
+
+
+@pytest.fixture(scope="module")
+def inferred(robot):
+    folder = robot.parent
+    log = write_log(folder / "circle.csv")
+    said = []
+    result = infer_command(
+        [log], robot, folder / "model.toml", simulations=600, seed=2, report=folder / "report.html", say=said.append
+    )
+    return folder, result, said
+
+
+def test_the_json_has_the_promised_shape(inferred):
+    _, result, _ = inferred
+    found = json.loads(json.dumps(result.as_dict()))
+    for name, truth in TRUTH.items():
+        one = found["posterior"][name]
+        assert one["ci90"][0] < one["mean"] < one["ci90"][1]
+        assert one["mean"] == pytest.approx(truth, rel=0.05)
+    assert found["outside_simulated"] is False
+    assert any("steady circle" in sentence for sentence in found["undetermined"])
+    assert found["seconds"] > 0.0
+    assert 600 <= found["diagnostics"]["simulations"] < 640
+    assert set(found["diagnostics"]["sbc_p"]) == set(TRUTH)
+
+
+def test_the_model_file_loads_and_holds_the_posterior(inferred):
+    folder, result, _ = inferred
+    model = load_model(folder / "model.toml")
+    assert set(model.belief.names) == set(TRUTH)
+    assert model.belief.mean() == pytest.approx(result.inference.belief.mean())
+    assert model.name == "test"
+
+
+def test_the_report_is_whole_in_one_file(inferred):
+    folder, _, _ = inferred
+    page = (folder / "report.html").read_text()
+    assert page.count('src="data:image/png;base64,') == 3
+    assert 'src="http' not in page
+    assert "steady circle" in page
+
+
+def test_the_text_names_every_parameter_and_progress_is_told(inferred):
+    _, result, said = inferred
+    text = result.as_text()
+    assert all(name in text for name in TRUTH)
+    assert "written in" in text
+    assert said[0].startswith("round 1 of 5")
+
+
+def test_a_missing_effect_is_warned_of_with_the_next_step(robot, tmp_path):
+    log = write_log(tmp_path / "late.csv", "rich", 5, {"pose_latency": 0.1})
+    text = infer_command([log], robot, None, simulations=300).as_text()
+    assert "pose_latency" in text
+    assert "run `disco-hw gap` on it next" in text
+
+
+def test_several_logs_count_together(robot, tmp_path, inferred):
+    _, result, _ = inferred
+    logs = [write_log(tmp_path / f"{seed}.csv", "poor", seed) for seed in (1, 2)]
+    together = infer_command(logs, robot, None, simulations=300).inference
+    assert len(together.drive.run_pose) == 3
+    assert together.drive.duration_s == pytest.approx(2 * 13.0, abs=4.0)
+    assert result.inference.drive.run_pose.size == 2
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "empty file"),
+        ("t_s,cmd_left_rad_s,cmd_right_rad_s,enc_left_ticks,enc_right_ticks\n0,1,1,0,0\n1,1,1,5,5\n", "0 poses"),
+        ("t_s,cmd_left_rad_s,cmd_right_rad_s,pose_x_m,pose_y_m,pose_yaw_rad\n0,1,1,0,0,0\n0,1,1,nan,0,0\n", "."),
+        ("t_s,cmd_left_rad_s,cmd_right_rad_s,pose_x_m,pose_y_m,pose_yaw_rad\n1,1,1,0,0,0\n0,1,1,0,0,0\n", "backwards"),
+    ],
+)
+def test_a_bad_log_gets_one_line_and_no_model(robot, tmp_path, text, message):
+    log = tmp_path / "bad.csv"
+    log.write_text(text)
+    with pytest.raises(InputError, match=message) as caught:
+        infer_command([log], robot, tmp_path / "model.toml")
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "model.toml").exists()
+
+
+def test_a_model_that_cannot_be_written_is_an_error_of_the_work(robot, tmp_path):
+    log = write_log(tmp_path / "log.csv", "poor")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(WorkError, match="cannot be written"):
+        infer_command([log], robot, tmp_path / "file" / "model.toml", simulations=300)

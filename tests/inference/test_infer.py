@@ -1,0 +1,109 @@
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from disco_hw.config import Prior, Robot, RobotConfig
+from disco_hw.errors import InputError
+from disco_hw.inference.infer import InferOptions, infer, prior_region
+from disco_hw.inference.simulate import NAMES
+from disco_hw.log.drive import Wheels
+from disco_hw.log.load import load_drive
+from disco_hw.model import Model
+from tests.inference.drives import TRUTH, logged, robot_config
+
+REAL_LOGS = os.environ.get("DISCO_HW_REAL_LOGS")
+THETA = np.array([TRUTH[name] for name in NAMES])
+FEW = InferOptions(simulations=600, seed=3)
+
+
+@pytest.fixture(scope="module")
+def circle():
+    return infer(logged("circle"), robot_config(), FEW)
+
+
+def test_the_truth_lies_in_the_posterior_of_a_circle(circle):
+    mean, sd = circle.draws.mean(axis=0), circle.draws.std(axis=0)
+    assert mean == pytest.approx(THETA, rel=0.03)
+    assert np.all(np.abs(mean - THETA) < 4.0 * sd)
+    assert np.all(sd < 0.02 * np.array([0.5, 0.5, 0.4]))
+    assert not circle.predictive.outside_simulated
+
+
+def test_the_belief_has_the_moments_of_the_draws_and_goes_into_a_model(circle):
+    assert circle.belief.mean() == pytest.approx(circle.draws.mean(axis=0), rel=0.01)
+    assert np.sqrt(np.diag(circle.belief.covariance())) == pytest.approx(circle.draws.std(axis=0), rel=0.15)
+    model = circle.model(Model(0.055, 0.4, name="test"))
+    assert model.wheel_radius_m == pytest.approx(circle.belief.mean()[NAMES.index("wheel_radius_m")])
+    assert model.belief is circle.belief
+    assert model.name == "test"
+
+
+def test_the_same_seed_gives_the_same_posterior(circle):
+    again = infer(logged("circle"), robot_config(), FEW)
+    assert np.array_equal(again.draws, circle.draws)
+
+
+def test_a_log_without_encoders_is_driven_by_its_commands():
+    log = logged("circle")
+    nothing, none = np.empty(0), np.empty(0, dtype=np.int64)
+    blind = replace(log, wheels=Wheels(nothing, nothing, nothing, nothing, nothing, none, False, False))
+    found = infer(blind, robot_config(), FEW)
+    assert found.drive.source == "commands"
+    assert found.draws.mean(axis=0) == pytest.approx(THETA, rel=0.05)
+
+
+def test_the_papers_way_leaves_the_wheel_radius_as_wide_as_the_prior():
+    found = infer(logged("circle"), robot_config(), InferOptions(paper=True, seed=3))
+    assert found.drive.source == "commands"
+    assert found.observed.shape == (4,)
+    assert found.fitted.simulations == 1000
+    sd = found.draws.std(axis=0)
+    assert sd[NAMES.index("wheel_radius_m")] > 0.6 * 0.5 / np.sqrt(12.0)
+    assert any("wheel radius" in sentence for sentence in found.undetermined)
+
+
+def test_a_robot_outside_the_prior_is_said_to_be():
+    found = infer(logged("circle"), robot_config(wheel_radius_m=(0.0, 0.05)), FEW)
+    assert found.predictive.outside_simulated
+    assert found.predictive.edge == ("wheel_radius_m",)
+    assert np.all(found.draws[:, NAMES.index("wheel_radius_m")] <= 0.05)
+
+
+def test_too_few_simulations_are_refused():
+    with pytest.raises(InputError, match="--simulations 20: too few"):
+        infer(logged("circle"), robot_config(), InferOptions(simulations=20))
+
+
+def test_an_impossible_prior_is_refused():
+    with pytest.raises(InputError, match=r"prior\.wheel_radius_m.*impossible"):
+        prior_region(robot_config(wheel_radius_m=(-1.0, 0.001)))
+
+
+@pytest.mark.skipif(REAL_LOGS is None, reason="set DISCO_HW_REAL_LOGS to a folder with measured logs")
+@pytest.mark.parametrize("run", ["circular_20201223_0121_run01", "square_20200623_2042_run01"])
+def test_a_real_differential_drive_is_recovered(run):
+    robot = Robot(
+        name="small", wheel_radius_m=0.042, axial_distance_m=0.2, ticks_per_rev=2797, max_wheel_speed_rad_s=20.0
+    )
+    log = load_drive(Path(REAL_LOGS) / "optiodom" / f"{run}.csv", 2796.8, 0.042)
+    found = infer(log, RobotConfig(robot=robot, prior=Prior(x_icr_m=(-0.1, 0.1))))
+    _, radius, axial = found.draws.mean(axis=0)
+    assert radius == pytest.approx(0.0419, rel=0.02)
+    assert axial == pytest.approx(0.2018, rel=0.02)
+
+
+@pytest.mark.skipif(REAL_LOGS is None, reason="set DISCO_HW_REAL_LOGS to a folder with measured logs")
+def test_a_real_skid_steer_robot_is_recovered_and_said_to_differ_from_the_model():
+    robot = Robot(
+        name="large", wheel_radius_m=0.162, axial_distance_m=0.481, ticks_per_rev=7800, max_wheel_speed_rad_s=10.0
+    )
+    prior = Prior(x_icr_m=(-0.5, 0.5), wheel_radius_m=(0.05, 0.5), axial_distance_m=(0.2, 2.0))
+    found = infer(
+        load_drive(Path(REAL_LOGS) / "husky" / "husky_tile_deflated_20231212.csv"),
+        RobotConfig(robot=robot, prior=prior),
+    )
+    assert found.draws[:, NAMES.index("axial_distance_m")].mean() == pytest.approx(0.98, rel=0.05)
+    assert found.predictive.outside_simulated

@@ -1,0 +1,49 @@
+import numpy as np
+import pytest
+
+from disco_hw.inference.estimates import estimates
+from disco_hw.inference.excitation import excitation
+from disco_hw.inference.noise import USUAL, Noise, measured_noise
+from disco_hw.inference.simulate import NAMES, Simulator
+from disco_hw.model import Model
+from tests.inference.drives import TRUTH, logged
+
+THETA = np.array([TRUTH[name] for name in NAMES])
+TRUE = Noise(0.008, 0.004, 0.01, 0.006, 0.03)
+
+
+def simulated(seed):
+    drive = excitation(logged("rich"))
+    poses = Simulator(Model(0.06, 0.4), drive, TRUE).poses(THETA[None], np.array([seed], dtype=np.uint32))[0]
+    return drive, poses
+
+
+def with_poses(drive, poses):
+    fields = {name: getattr(drive, name) for name in drive.__slots__}
+    return type(drive)(**(fields | {"pose": poses}))
+
+
+def test_the_noise_of_a_simulated_log_is_found():
+    found = []
+    for seed in range(4):
+        drive, poses = simulated(seed)
+        found.append(measured_noise(with_poses(drive, poses), THETA).vector())
+    assert np.mean(found, axis=0) == pytest.approx(TRUE.vector(), rel=0.25)
+
+
+def test_jumps_of_the_sensor_do_not_count():
+    drive, poses = simulated(1)
+    clean = measured_noise(with_poses(drive, poses), THETA).vector()
+    jumpy = poses.copy()
+    jumpy[::97, 0] += 0.5
+    assert measured_noise(with_poses(drive, jumpy), THETA).vector() == pytest.approx(clean, rel=0.5)
+
+
+def test_the_plants_noise_is_found_at_its_own_estimate():
+    drive = excitation(logged("rich"))
+    theta = estimates(drive, USUAL).theta(drive.pose[None])[0]
+    noise = measured_noise(drive, theta)
+    assert noise.position_m == pytest.approx(0.005, rel=0.15)
+    assert noise.yaw_rad == pytest.approx(0.0087, rel=0.15)
+    # Of an Ornstein-Uhlenbeck velocity of standard deviation s and correlation time tau: s sqrt(2 tau).
+    assert noise.slip_yaw_rad_sqrt_s == pytest.approx(0.018 * np.sqrt(0.6), rel=0.35)

@@ -1,0 +1,68 @@
+import numpy as np
+import pytest
+
+from disco_hw.inference.excitation import excitation
+from disco_hw.inference.noise import Noise
+from disco_hw.inference.simulate import NAMES, Simulator, draw_seeds, physical_range
+from disco_hw.model import Model
+from tests.inference.drives import TRUTH, logged
+
+SILENT = Noise(0.0, 0.0, 0.0, 0.0, 0.0)
+THETA = np.array([[TRUTH[name] for name in NAMES]])
+
+
+def simulator(noise=SILENT, drive="poor", noiseless=False):
+    return Simulator(Model(0.06, 0.4), excitation(logged(drive, noiseless=noiseless)), noise)
+
+
+def test_without_noise_the_true_parameters_repeat_a_noiseless_log():
+    sim = simulator(noiseless=True)
+    poses = sim.poses(THETA, np.zeros(1, dtype=np.uint32))[0]
+    error = poses - sim.drive.pose
+    assert np.abs(error[:, :2]).max() < 3e-3
+    assert np.abs(error[:, 2]).max() < 5e-3
+
+
+def test_wrong_parameters_do_not():
+    sim = simulator(noiseless=True)
+    poses = sim.poses(THETA * [1.0, 1.1, 1.0], np.zeros(1, dtype=np.uint32))[0]
+    assert np.abs(poses - sim.drive.pose)[:, :2].max() > 0.02
+
+
+def test_the_same_seeds_give_the_same_poses_however_they_are_shared_out():
+    sim = simulator(Noise(0.005, 0.01, 0.004, 0.004, 0.014))
+    seeds = draw_seeds(70, np.random.default_rng(0))
+    theta = np.repeat(THETA, 70, axis=0)
+
+    def last(poses):
+        return poses[:, -1]
+
+    together = sim.summaries(theta, seeds, last)
+    alone = np.concatenate([sim.poses(theta[i : i + 1], seeds[i : i + 1])[:, -1] for i in range(70)])
+    assert np.array_equal(together, alone)
+    assert np.unique(together[:, 0]).size == 70
+
+
+def test_noise_has_the_size_it_says():
+    noise = Noise(0.02, 0.03, 0.004, 0.006, 0.014)
+    sim = simulator(noise)
+    poses = sim.poses(np.repeat(THETA, 400, axis=0), draw_seeds(400, np.random.default_rng(1)))
+    assert poses[:, 0, :2].std(axis=0) == pytest.approx([0.02, 0.02], rel=0.15)
+    assert poses[:, 0, 2].std() == pytest.approx(0.03, rel=0.15)
+    yaw_sd = np.sqrt(0.03**2 + 0.014**2 * sim.drive.moving_s.sum())
+    assert poses[:, -1, 2].std() == pytest.approx(yaw_sd, rel=0.15)
+
+
+def test_progress_is_told_of_every_simulation():
+    done = []
+    sim = simulator()
+    sim.summaries(
+        np.repeat(THETA, 50, axis=0), draw_seeds(50, np.random.default_rng(1)), lambda p: p[:, 0], done.append
+    )
+    assert sum(done) == 50
+
+
+def test_the_physical_range_is_in_the_order_of_the_names():
+    low, high = physical_range()
+    assert low[NAMES.index("wheel_radius_m")] > 0.0
+    assert low[NAMES.index("x_icr_m")] < 0.0 < high[NAMES.index("x_icr_m")]

@@ -1,0 +1,69 @@
+"""Inference on simulated drives of about two minutes: time, error, width and calibration."""
+
+from __future__ import annotations
+
+from time import perf_counter
+
+import numpy as np
+
+from disco_hw.inference.estimates import estimates
+from disco_hw.inference.excitation import excitation
+from disco_hw.inference.infer import infer, noise_of
+from disco_hw.inference.simulate import NAMES, Simulator, draw_seeds
+from disco_hw.log.drive import DriveLog
+from disco_hw.model import Model
+from tools.infer_study import config, logged, plant
+
+SEED = 5
+SIMULATIONS = 300
+
+
+def run() -> dict[str, float]:
+    """A rich drive (150 s) and a steady circle (60 s) of one robot; seconds are from log to posterior, all checks in.
+
+    `width`: posterior sd over that of a local Gaussian reference, from the scatter of the estimates at the truth.
+    """
+    found: dict[str, float] = {}
+    for drive in ("rich", "circle"):
+        parameters = plant(SEED)
+        log = logged(parameters, drive, SEED)
+        truth = np.array([getattr(parameters, name) for name in NAMES])
+        began = perf_counter()
+        result = infer(log, config())
+        key = f"inference.{drive}"
+        found[f"{key}.seconds"] = perf_counter() - began
+        found[f"{key}.effective_simulations"] = result.effective_simulations
+        found[f"{key}.coverage90"] = float(result.calibration.coverage[2])
+        reference = reference_sd(log, truth)
+        for index, name in enumerate(NAMES):
+            found[f"{key}.{name}.error"] = float(abs(result.draws[:, index].mean() - truth[index]))
+            found[f"{key}.{name}.width"] = float(result.draws[:, index].std() / reference[index])
+            found[f"{key}.{name}.sbc_p"] = float(result.calibration.p_values[index])
+    return found
+
+
+def reference_sd(log: DriveLog, truth: np.ndarray) -> np.ndarray:
+    """Standard deviations (3,) of a synthetic likelihood around the truth: statistics linear in the parameters there,
+    with the covariance that simulations at the truth have.
+    """
+    drive = excitation(log)
+    noise = noise_of(drive)
+    statistics = estimates(drive, noise)
+    simulator = Simulator(Model(0.06, 0.4), drive, noise)
+    rng = np.random.default_rng(0)
+    seeds = draw_seeds(SIMULATIONS, rng)
+    here = simulator.summaries(np.tile(truth, (SIMULATIONS, 1)), seeds, statistics.raw)
+    slopes = []
+    for index in range(truth.size):
+        step = np.zeros(truth.size)
+        step[index] = 0.01 * truth[index]
+        there = simulator.summaries(np.tile(truth + step, (SIMULATIONS, 1)), seeds, statistics.raw)
+        slopes.append((there - here).mean(axis=0) / step[index])
+    jacobian = np.array(slopes).T
+    precision = jacobian.T @ np.linalg.inv(np.cov(here.T)) @ jacobian
+    return np.sqrt(np.diag(np.linalg.inv(precision)))
+
+
+if __name__ == "__main__":
+    for name, value in run().items():
+        print(f"{name} {value:.4g}")
