@@ -8,6 +8,7 @@ import sys
 import time
 
 import can
+import can.interfaces.virtual as virtual_bus
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -68,8 +69,8 @@ def test_what_is_no_classic_11_bit_data_frame_is_counted_and_dropped(virtual):
     other.send(message(0x110, b"", is_remote_frame=True, dlc=2))
     other.send(message(0x110, bytes(16), is_fd=True, dlc=16))
     other.send(message(0x110, bytes(8), is_fd=True))
-    other.send(message(0x112))
-    assert [received.frame.can_id for received in collect(transport, 1)] == [0x112]
+    other.send(message(0x7FF, bytes(8)))
+    assert [received.frame for received in collect(transport, 1)] == [Frame(0x7FF, bytes(8))]
     assert transport.stats.malformed == 4
     assert transport.generation == 1
 
@@ -88,6 +89,7 @@ def test_error_frames_are_counted_and_bus_off_is_a_lost_link(virtual):
     assert transport.stats.reconnects == 1
     other.send(message(0x113))
     assert [received.frame.can_id for received in collect(transport, 1)] == [0x113]
+    assert len(virtual_bus.channels[other.channel_id]) == 2, "the lost bus has been shut down"
 
 
 @pytest.fixture
@@ -193,6 +195,18 @@ def test_slcan_that_sends_nothing_but_garbage_is_opened_again(adapter):
         time.sleep(0.002)
     up(transport, generation=2)
     assert transport.stats.malformed >= GARBAGE_LIMIT
+
+
+def test_slcan_with_good_frames_between_the_garbage_is_kept(adapter):
+    transport, terminal = adapter
+    for number in range(1, GARBAGE_LIMIT + 10):
+        terminal.write(b"t1\r")
+        wait_until(lambda: transport.stats.malformed == number)  # noqa: B023
+        if number % 10 == 0:
+            time.sleep(0.01)
+            terminal.write(b"t110101\r")
+            collect(transport, 1)
+    assert transport.generation == 1
 
 
 def test_slcan_adapter_unplugged_and_plugged_in_again_leaks_nothing(adapter):
