@@ -32,6 +32,9 @@ test: $(STAMP)
 bench: $(STAMP)
 	$(BIN)/python -m tools.bench
 
+gap-study: $(STAMP)
+	$(BIN)/python -m tools.gap_study
+
 firmware-check: $(STAMP)
 	$(BIN)/python -m tools.firmware_check
 

@@ -91,5 +91,3 @@ def realistic(name: str, seed: int, share: float = 1.0) -> dict[str, float | tup
         return {name: (drawn["track"],)}
     value = drawn[spec.values[spec.lone[0]].name]
     return {name: share * value * (sign if signed else 1.0)}
-
-

@@ -45,9 +45,9 @@ def amended_model(
         return bare, tuple(notes)
     point = dict(zip(bare.parameter_names, bare.point(), strict=True))
     belief = Gaussian(names, np.array([point[name] for name in names]), covariance)
-    return Model(
-        bare.wheel_radius_m, bare.axial_distance_m, bare.x_icr_m, bare.effects, belief, bare.name
-    ), tuple(notes)
+    return Model(bare.wheel_radius_m, bare.axial_distance_m, bare.x_icr_m, bare.effects, belief, bare.name), tuple(
+        notes
+    )
 
 
 def _joint(
@@ -56,7 +56,7 @@ def _joint(
     estimates: Mapping[str, Estimate],
     parts: tuple[Estimates, ...],
 ) -> tuple[tuple[str, ...], Array]:
-    """Names and covariance: joint within a channel, independent between channels, by interval where only that is known."""
+    """Names and covariance: joint within a channel, independent between channels."""
     full = {f"{effect}.{key}": estimate for effect, values in effects.items() for key, estimate in values.items()}
     known = {p.name: estimates[p.name] for p in BASE_PARAMETERS if p.name in estimates} | full
     names = tuple(name for name in bare.parameter_names if name in known)

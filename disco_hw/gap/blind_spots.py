@@ -71,9 +71,7 @@ def blind_spots(found: Found) -> tuple[BlindSpot, ...]:
                 parameter = next(key for key in REALISTIC if key.startswith(other)).split(".")[1]
                 size = spot.smallest_visible
                 blind = size is None or size > REALISTIC[f"{other}.{parameter}"]
-                spots.append(
-                    BlindSpot(other, parameter, spot.unit, size, blind, REGISTRY[other].excitation)
-                )
+                spots.append(BlindSpot(other, parameter, spot.unit, size, blind, REGISTRY[other].excitation))
     return tuple(spots)
 
 
@@ -86,9 +84,7 @@ def _spot(channel: Channel, best: Fit, name: str) -> BlindSpot:
         return BlindSpot(name, parameter.name, parameter.unit, largest, largest is None, effect.excitation)
     size = _size(channel, best, name, column, candidate.columns)
     realistic = REALISTIC.get(column, math.inf)
-    return BlindSpot(
-        name, parameter.name, parameter.unit, size, size is None or size > realistic, effect.excitation
-    )
+    return BlindSpot(name, parameter.name, parameter.unit, size, size is None or size > realistic, effect.excitation)
 
 
 def _largest(channel: Channel, name: str) -> float | None:

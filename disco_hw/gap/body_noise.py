@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from disco_hw.model.jit import kernel_function
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -54,7 +54,7 @@ class BodyNoise:
             self.relative,
             self.noise_correlation_s,
         )
-        return np.log(np.array(values))
+        return np.asarray(np.log(np.array(values)))
 
     @classmethod
     def from_vector(cls, logs: Array) -> BodyNoise:
@@ -93,12 +93,8 @@ class BodyGains:
     use: Mask
 
 
-def _compiled(function: Any) -> Any:
-    return njit(cache=True, error_model="numpy", fastmath={"contract", "nsz", "arcp"})(function)
-
-
-@_compiled
-def _gains(
+@kernel_function
+def _gains(  # noqa: PLR0912, PLR0915 - one recursion; cut in pieces it would only be slower
     logs: Array,
     dt: Array,
     dx: Array,
@@ -214,13 +210,13 @@ def _gains(
             gain[k, i, 2] = lower[2, 2] * w2
         for i in range(9):
             for j in range(9):
-                covariance[i, j] -= (
-                    moved[i, 0] * moved[j, 0] + moved[i, 1] * moved[j, 1] + moved[i, 2] * moved[j, 2]
-                )
+                covariance[i, j] -= moved[i, 0] * moved[j, 0] + moved[i, 1] * moved[j, 1] + moved[i, 2] * moved[j, 2]
 
 
-@_compiled
-def _whiten(residual: Array, transition: Array, gain: Array, scale: Array, restart: Array, use: Array, out: Array) -> None:
+@kernel_function
+def _whiten(
+    residual: Array, transition: Array, gain: Array, scale: Array, restart: Array, use: Array, out: Array
+) -> None:
     e = np.zeros(9)
     for k in range(residual.shape[0]):
         if restart[k]:

@@ -112,9 +112,7 @@ CANDIDATES: Mapping[str, Candidate] = MappingProxyType(_competing())
 
 def candidates_of(layout: Layout) -> tuple[str, ...]:
     """Names of the effects that compete in the channel of a layout."""
-    return tuple(
-        name for name in CANDIDATES if (REGISTRY[name].channel is Place.COMMAND_TO_WHEEL) == layout.of_wheels
-    )
+    return tuple(name for name in CANDIDATES if (REGISTRY[name].channel is Place.COMMAND_TO_WHEEL) == layout.of_wheels)
 
 
 def parameters_of(names: tuple[str, ...]) -> int:

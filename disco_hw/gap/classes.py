@@ -18,7 +18,9 @@ ENCODER = "encoder_scale"
 # What decides between the members of a class lies outside such logs.
 OUTSIDE_TESTS: Mapping[frozenset[str], str] = MappingProxyType(
     {
-        frozenset((LATERAL, SENSOR)): "measure the pose sensor's mount with a ruler, or move the payload and drive again",
+        frozenset(
+            (LATERAL, SENSOR)
+        ): "measure the pose sensor's mount with a ruler, or move the payload and drive again",
         frozenset((GAIN, ENCODER)): "turn each wheel ten times by hand and count ticks",
     }
 )

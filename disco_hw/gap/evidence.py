@@ -25,8 +25,8 @@ _FEWEST_BLOCKS = 5
 class Evidence:
     """For one set of effects against a smaller one.
 
-    `gain` in nats of the fit; `held_out` in nats on blocks left out, `repeated` the same without the block that speaks
-    most for it; `inflation` of the variance; `score` = 2 gain / inflation - parameters ln(n), the difference of BIC.
+    `gain` in nats of the fit; `held_out` in nats on blocks left out, `repeated` the same without the block that says
+    most; `inflation` of the variance; `score` = 2 gain / inflation - parameters ln(n), the difference of BIC.
     """
 
     gain: float
@@ -38,9 +38,8 @@ class Evidence:
 
 def held_out_by_block(found: Fit, channel: Channel) -> Array:
     """Half squares on each block (B,) with parameters fitted without it, to second order."""
-    cost = 0.5 * np.bincount(
-        np.unique(channel.block, return_inverse=True)[1], weights=found.residual**2
-    )
+    label = np.unique(channel.block, return_inverse=True)[1]
+    cost = np.asarray(0.5 * np.bincount(label, weights=found.residual**2), dtype=np.float64)
     if not found.active:
         return cost
     normal, gradient = by_block(found, channel.block)
@@ -74,7 +73,7 @@ def inflation(found: Fit, channel: Channel, added: tuple[int, ...]) -> float:
 
 
 def compare(small: Fit, big: Fit, channel: Channel, parameters: float) -> Evidence:
-    """Evidence for `big` against `small`, which lacks `parameters` of its parameters (more for one chosen among many)."""
+    """Evidence for `big` against `small`, which lacks `parameters` of its parameters."""
     added = tuple(index for index in big.active if index not in small.active)
     factor = inflation(big, channel, added)
     gain = small.cost - big.cost

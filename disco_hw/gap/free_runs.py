@@ -17,13 +17,15 @@ from disco_hw.model.jit import kernel_function, scalar_function
 from disco_hw.model.step import body_velocity, wheel_step
 
 Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+Mask = NDArray[np.bool_]
 
 
 @scalar_function
-def _at(command: Array, node: int, begin: int, late_cells: float, side: int) -> float:
+def _at(command: Any, node: int, begin: int, late_cells: float, side: int) -> Any:
     """Command of the cell at `node`, `late_cells` earlier; before the run's first it is that one."""
     place = node - late_cells
-    below = int(math.floor(place))
+    below = math.floor(place)
     part = place - below
     low = min(max(below, begin), command.shape[0] - 1)
     if part == 0.0:
@@ -34,7 +36,7 @@ def _at(command: Array, node: int, begin: int, late_cells: float, side: int) -> 
 
 @kernel_function
 def _run_wheels(
-    effects: Any, late: float, command: Array, extra: Array, first: Array, t_s: Array, start: Array, angle: Array
+    effects: Any, late: float, command: Array, extra: Array, first: Mask, t_s: Array, start: Array, angle: Array
 ) -> None:
     begin = 0
     left_speed, right_speed = 0.0, 0.0
@@ -62,7 +64,15 @@ def _run_wheels(
 
 @kernel_function
 def _run_body(
-    base: Any, effects: Any, scale: Any, angle: Array, speed: Array, extra: Array, first: Array, t_s: Array, track: Array
+    base: Any,
+    effects: Any,
+    scale: Any,
+    angle: Array,
+    speed: Array,
+    extra: Array,
+    first: Mask,
+    t_s: Array,
+    track: Array,
 ) -> None:
     x = y = yaw = 0.0
     for i in range(angle.shape[0]):
@@ -72,9 +82,7 @@ def _run_body(
             left = (angle[i, 0] - angle[i - 1, 0]) * scale[0] / CELL_S
             right = (angle[i, 1] - angle[i - 1, 1]) * scale[1] / CELL_S
             change = scale[0] * (speed[i, 0] - speed[i - 1, 0]) + scale[1] * (speed[i, 1] - speed[i - 1, 1])
-            forward, lateral, half_rate = body_velocity(
-                left + right, right - left, change, t_s[i - 1], base, effects
-            )
+            forward, lateral, half_rate = body_velocity(left + right, right - left, change, t_s[i - 1], base, effects)
             turn = 2.0 * half_rate * CELL_S
             along = (forward + extra[i - 1, 0]) * CELL_S
             across = (lateral + extra[i - 1, 1]) * CELL_S - base.x_icr_m * turn
@@ -86,9 +94,7 @@ def _run_body(
         track[i, 0], track[i, 1], track[i, 2] = x, y, yaw
 
 
-def run_wheels(
-    p: Array, geometry: Array, command: Array, extra: Array, first: Array, t_s: Array, start: Array
-) -> Array:
+def run_wheels(p: Array, geometry: Array, command: Array, extra: Array, first: Mask, t_s: Array, start: Array) -> Array:
     """Measured wheel angles (M, 2) that the commands alone make.
 
     `p` in the order of `WHEEL.columns`; `command` (M, 2) rad/s per cell, NaN begins anew; `extra` (M, 2) is added to
@@ -101,7 +107,7 @@ def run_wheels(
     return angle
 
 
-def run_body(p: Array, angle: Array, speed: Array, extra: Array, first: Array, t_s: Array) -> Array:
+def run_body(p: Array, angle: Array, speed: Array, extra: Array, first: Mask, t_s: Array) -> Array:
     """Path x, y, yaw (M, 3) of the tracked point from measured wheel angles and speeds (M, 2), each run from 0.
 
     `p` in the order of `BODY.columns`; `extra` (M, 3) is added to forward, left (m/s) and yaw rate (rad/s). Drift in
@@ -120,7 +126,7 @@ def run_body(p: Array, angle: Array, speed: Array, extra: Array, first: Array, t
 
 
 @kernel_function
-def read_angles(angle: Array, node: Array, fraction: Array, out: Array) -> None:
+def read_angles(angle: Array, node: Index, fraction: Array, out: Array) -> None:
     """Values (S, columns) between nodes, on straight lines."""
     for k in range(node.shape[0]):
         low, part = node[k], fraction[k]
@@ -130,8 +136,8 @@ def read_angles(angle: Array, node: Array, fraction: Array, out: Array) -> None:
 
 @kernel_function
 def _lay(
-    late: float, bias: float, drift_x: float, drift_y: float, track: Array, moving_s: Array, node: Array,
-    fraction: Array, window: Array, first_node: Array, last_node: Array, use: Array, measured: Array, out: Array,
+    late: float, bias: float, drift_x: float, drift_y: float, track: Array, moving_s: Array, node: Index,
+    fraction: Array, window: Index, first_node: Index, last_node: Index, use: Mask, measured: Array, out: Array,
 ) -> None:  # fmt: skip
     count = node.shape[0]
     begin = 0
@@ -140,7 +146,7 @@ def _lay(
         turned = used = 0.0
         while end < count and window[end] == window[begin]:
             place = min(max(node[end] + fraction[end] - late, float(first_node[end])), last_node[end] - 1e-6)
-            low = int(math.floor(place))
+            low = math.floor(place)
             part = place - low
             for column in range(3):
                 out[end, column] = track[low, column] + part * (track[low + 1, column] - track[low, column])
@@ -154,7 +160,7 @@ def _lay(
         mean_x = mean_y = 0.0
         for k in range(begin, end):
             place = min(max(node[k] + fraction[k] - late, float(first_node[k])), last_node[k] - 1e-6)
-            low = int(math.floor(place))
+            low = math.floor(place)
             moved = moving_s[low] + (place - low) * (moving_s[low + 1] - moving_s[low])
             x = cosine * out[k, 0] - sine * out[k, 1] + drift_x * moved
             y = sine * out[k, 0] + cosine * out[k, 1] + drift_y * moved
@@ -170,8 +176,8 @@ def _lay(
 
 
 def pose_residual(
-    p: Array, track: Array, moving_s: Array, node: Array, fraction: Array, window: Array, first_node: Array,
-    last_node: Array, use: Array, measured: Array,
+    p: Array, track: Array, moving_s: Array, node: Index, fraction: Array, window: Index, first_node: Index,
+    last_node: Index, use: Mask, measured: Array,
 ) -> Array:  # fmt: skip
     """Measured minus predicted pose (P, 3) in the world frame, each window laid on its measurements.
 

@@ -139,7 +139,9 @@ def _regimes(channel: BodyChannel, node: Index, ahead: int) -> list[str]:
     return out
 
 
-def chain_track(body: BodyChannel, wheels: WheelChannel | None, chain: Chain, extra: Array | None = None) -> tuple[Array, Array]:
+def chain_track(
+    body: BodyChannel, wheels: WheelChannel | None, chain: Chain, extra: Array | None = None
+) -> tuple[Array, Array]:
     """Free run from commands to the path (M, 3), and wheel speeds (M, 2) on the way."""
     line = body.timeline
     p = chain.body.copy()
@@ -235,7 +237,7 @@ def floor_errors(
 ) -> Errors:
     """What the amended model would err if it were exactly right, by simulating the noise that was estimated."""
     starts = find_starts(body, poses, ahead_s)
-    line, noise = body.timeline, body.noise
+    noise = body.noise
     clean, _ = chain_track(body, wheels, chain)
     still = displacement(chain.body, clean, body.moving_s, starts.node, starts.pose[:, 2], ahead_s)
     generator = np.random.default_rng(1)
@@ -259,9 +261,7 @@ def floor_errors(
     return summarise(root, np.sqrt((np.stack(speeds) ** 2).mean(axis=0)), starts)
 
 
-def _disturbance(
-    body: BodyChannel, wheels: WheelChannel | None, generator: np.random.Generator
-) -> tuple[Array, Array]:
+def _disturbance(body: BodyChannel, wheels: WheelChannel | None, generator: np.random.Generator) -> tuple[Array, Array]:
     """Velocities (M, 3) forward, left, yaw rate that wheels and ground add at random, and mean wheel speed error."""
     line, noise, p = body.timeline, body.noise, body.geometry
     count = line.t_s.size

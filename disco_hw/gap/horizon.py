@@ -6,24 +6,24 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from disco_hw.gap.layout import BODY
 from disco_hw.gap.timeline import CELL_S
+from disco_hw.model.jit import kernel_function
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel_function
 def _displace(p: Any, track: Any, moving_s: Any, start: Any, heading: Any, ahead: int, out: Any) -> None:
     late = p[0] / CELL_S
     top = track.shape[0] - 2
     for k in range(start.shape[0]):
         a = max(start[k] - late, 0.0)
         b = max(start[k] + ahead - late, 0.0)
-        i, j = min(int(math.floor(a)), top), min(int(math.floor(b)), top)
+        i, j = min(math.floor(a), top), min(math.floor(b), top)
         f, g = a - i, b - j
         x = track[j, 0] + g * (track[j + 1, 0] - track[j, 0]) - track[i, 0] - f * (track[i + 1, 0] - track[i, 0])
         y = track[j, 1] + g * (track[j + 1, 1] - track[j, 1]) - track[i, 1] - f * (track[i + 1, 1] - track[i, 1])
@@ -42,7 +42,7 @@ def _displace(p: Any, track: Any, moving_s: Any, start: Any, heading: Any, ahead
 def displacement(p: Array, track: Array, moving_s: Array, start: Index, heading_rad: Array, ahead_s: float) -> Array:
     """Forward, left and yaw (K, 3) that a pose sensor would see from each start node to `ahead_s` later.
 
-    `p` in the order of `BODY.columns`; `track` (M, 3) a free run of the body; `heading_rad` (K,) measured at the starts.
+    `p` in the order of `BODY.columns`; `track` (M, 3) a free run of the body; `heading_rad` (K,) measured there.
     """
     out = np.empty((start.size, 3))
     world = np.array(
@@ -65,4 +65,4 @@ def starts_of(first: NDArray[np.bool_], usable: NDArray[np.bool_], ahead_s: floa
     bad = np.concatenate([[0], np.cumsum(~usable)])
     found = [np.arange(lo + stride, hi - ahead - 1, stride) for lo, hi in zip(begins, ends, strict=True)]
     start = np.concatenate(found) if found else np.empty(0, dtype=np.int64)
-    return start[bad[start + ahead + 1] == bad[start]]
+    return np.asarray(start[bad[start + ahead + 1] == bad[start]])

@@ -65,7 +65,14 @@ def _effects(report: GapReport) -> str:
     rows += [("unnamed", term.channel, term.form, f"{term.evidence:.0f}", "", "") for term in report.unnamed]
     if not rows:
         return "<p>Nothing that this log shows.</p>"
-    head = ("effect", "channel", "parameters with 95 % intervals", "evidence", "not to be told from", "what would decide")
+    head = (
+        "effect",
+        "channel",
+        "parameters with 95 % intervals",
+        "evidence",
+        "not to be told from",
+        "what would decide",
+    )
     return _table(head, rows)
 
 

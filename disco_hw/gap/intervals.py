@@ -1,4 +1,4 @@
-"""95 % intervals and the joint covariance of what was fitted, widened where blocks scatter more than the noise model."""
+"""95 % intervals and the joint covariance of what was fitted, widened where the noise model is too narrow."""
 
 from __future__ import annotations
 

@@ -32,7 +32,7 @@ _UNLIMITED = 1e6
 
 @dataclass(frozen=True)
 class Layout:
-    """Columns of a channel's vector, its neutral point, and how each is varied; `of_wheels` tells the channels apart."""
+    """Columns of a channel's vector, its neutral point, how each varies; `of_wheels` tells the channels apart."""
 
     of_wheels: bool
     columns: tuple[str, ...]
@@ -56,7 +56,9 @@ def _layout(parameters: Mapping[str, Parameter], base: int) -> Layout:
         of_wheels=base == 0,
         columns=columns,
         neutral=neutral,
-        step=np.array([1e-4 if k < base else _STEPS.get(p.unit, _OTHER_STEP) for k, p in enumerate(parameters.values())]),
+        step=np.array(
+            [1e-4 if k < base else _STEPS.get(p.unit, _OTHER_STEP) for k, p in enumerate(parameters.values())]
+        ),
         low=low,
         high=np.array([max(p.high, p.neutral if p.neutral < np.inf else _UNLIMITED) for p in parameters.values()]),
         place=MappingProxyType({name: k for k, name in enumerate(columns)}),

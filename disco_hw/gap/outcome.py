@@ -10,8 +10,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.gap.blind_spots import BlindSpot, blind_spots
 from disco_hw.gap import figures
+from disco_hw.gap.blind_spots import BlindSpot, blind_spots
 from disco_hw.gap.candidates import candidates_of, indices, parameters_of
 from disco_hw.gap.channels import BodyChannel, WheelChannel
 from disco_hw.gap.classes import ASYMMETRY, ENCODER, GAIN, OUTSIDE_TESTS, alike, one_encoder
@@ -278,5 +278,3 @@ def _evidence(found: Found, name: str) -> float:
     if name in found.selector.given:
         return 0.0
     return found.selector.evidence(rest, found.names).score
-
-

@@ -1,4 +1,4 @@
-"""The answer: verdict, effects with intervals, what is unnamed, what could not be seen, and the gap on held-out data."""
+"""The answer: verdict, effects with intervals, what is unnamed, what could not be seen, and the held-out gap."""
 
 from __future__ import annotations
 
@@ -106,8 +106,7 @@ class GapReport:
                 for effect in self.effects
             ],
             "unnamed": [
-                {"channel": term.channel, "form": term.form, "evidence": term.evidence}
-                for term in self.unnamed
+                {"channel": term.channel, "form": term.form, "evidence": term.evidence} for term in self.unnamed
             ],
             "residue": list(self.residue),
             "blind_spots": [

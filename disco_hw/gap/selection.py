@@ -213,7 +213,10 @@ class Selector:
                 worth -= 0.5 * CANDIDATES[old].parameters * np.log(self.channel.count)
                 for name in candidates_of(self.channel.layout):
                     if name not in accepted and self.promise(rest, name) - worth > score:
-                        best, score = (*accepted[:place], name, *accepted[place + 1 :]), self.promise(rest, name) - worth
+                        best, score = (
+                            (*accepted[:place], name, *accepted[place + 1 :]),
+                            self.promise(rest, name) - worth,
+                        )
             if best == accepted:
                 break
             accepted = best

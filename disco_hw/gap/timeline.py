@@ -7,6 +7,7 @@ and, for the command channel, the commands were known. Runs follow each other in
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,8 @@ from disco_hw.log.drive import Commands, DriveLog
 
 CELL_S = 0.01
 BLOCK_S = 3.0
+LONGEST_S = 320.0
+_STRETCH_S = 20.0
 _SHORTEST_RUN_S = 1.0
 _LONGEST_SILENCE_S = 1.5
 _SPEED_SPAN_S = 0.03
@@ -64,7 +67,8 @@ class Timeline:
     @property
     def has_commands(self) -> bool:
         """Whether enough commands are known to judge the wheels."""
-        return bool(np.isfinite(self.command_rad_s[:, 0]).mean() > 0.02) and self.encoder.t_s.size > 200
+        known = np.count_nonzero(np.isfinite(self.command_rad_s[:, 0]))
+        return known > 0.02 * self.t_s.size and self.encoder.t_s.size > 200
 
     @property
     def has_poses(self) -> bool:
@@ -84,7 +88,12 @@ def timeline(log: DriveLog) -> Timeline:
     nodes_t, nodes_first, commands, changes, angles, speeds = [], [], [], [], [], []
     encoder_at, encoder_angle, pose_at, pose_values = [], [], [], []
     offset = 0
-    for lo, hi in _runs(wheels.t_s, wheels.segment):
+    runs = _runs(wheels.t_s, wheels.segment)
+    driven_s = sum(float(wheels.t_s[hi - 1] - wheels.t_s[lo]) for lo, hi in runs)
+    if driven_s > LONGEST_S:
+        runs = _spread(wheels.t_s, runs, driven_s)
+        notes.append(f"{driven_s:.0f} s of driving: {LONGEST_S:.0f} s of it, evenly spread, are judged")
+    for lo, hi in runs:
         t = wheels.t_s[lo:hi]
         angle = np.column_stack([wheels.left_angle_rad[lo:hi], wheels.right_angle_rad[lo:hi]])
         angle = angle - angle[0]
@@ -133,8 +142,20 @@ def _runs(t_s: Array, segment: Index) -> list[tuple[int, int]]:
         return []
     breaks = np.flatnonzero((np.diff(segment) != 0) | (np.diff(t_s) > _LONGEST_SILENCE_S)) + 1
     edges = [0, *breaks.tolist(), t_s.size]
-    pairs = zip(edges[:-1], edges[1:], strict=True)
+    pairs = pairwise(edges)
     return [(lo, hi) for lo, hi in pairs if hi - lo > 2 and t_s[hi - 1] - t_s[lo] >= _SHORTEST_RUN_S]
+
+
+def _spread(t_s: Array, runs: list[tuple[int, int]], driven_s: float) -> list[tuple[int, int]]:
+    """Stretches of `_STRETCH_S`, evenly spread over the runs, that add up to about `LONGEST_S`."""
+    stretches = []
+    for lo, hi in runs:
+        edges = np.arange(t_s[lo], t_s[hi - 1], _STRETCH_S)
+        cuts = [*np.searchsorted(t_s[lo:hi], edges).tolist(), hi - lo]
+        stretches += [(lo + a, lo + b) for a, b in pairwise(cuts) if b - a > 2]
+    kept = np.unique(np.linspace(0, len(stretches) - 1, max(int(len(stretches) * LONGEST_S / driven_s), 1)).astype(int))
+    pieces = [stretches[k] for k in kept]
+    return [(lo, hi) for lo, hi in pieces if t_s[hi - 1] - t_s[lo] >= _SHORTEST_RUN_S]
 
 
 def _locate(t_s: Array, grid: Array, offset: int) -> Samples:
@@ -181,7 +202,7 @@ def _speeds(grid: Array, t: Array, angle: Array) -> Array:
     span = max(_SPEED_SPAN_S, float(np.median(np.diff(t))))
     low, high = np.maximum(grid - span, t[0]), np.minimum(grid + span, t[-1])
     columns = [np.interp(high, t, angle[:, side]) - np.interp(low, t, angle[:, side]) for side in (0, 1)]
-    return np.column_stack(columns) / (high - low)[:, None]
+    return np.asarray(np.column_stack(columns) / (high - low)[:, None])
 
 
 def _quantum(angle: Array) -> float:

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from disco_hw.model.jit import kernel_function
 
 Array = NDArray[np.float64]
 
@@ -46,7 +46,7 @@ class WheelNoise:
             self.drift_rad_sqrt_s,
             self.wander,
         )
-        return np.log(np.array(values))
+        return np.asarray(np.log(np.array(values)))
 
     @classmethod
     def from_vector(cls, logs: Array) -> WheelNoise:
@@ -66,11 +66,7 @@ class WheelGains:
     use: NDArray[np.bool_]
 
 
-def _compiled(function: Any) -> Any:
-    return njit(cache=True, error_model="numpy", fastmath={"contract", "nsz", "arcp"})(function)
-
-
-@_compiled
+@kernel_function
 def _gains(
     logs: Array,
     dt: Array,
@@ -119,7 +115,7 @@ def _gains(
             aa -= ka * aa
 
 
-@_compiled
+@kernel_function
 def _whiten(
     residual: Array,
     decay: Array,

@@ -107,7 +107,7 @@ def left_over(channel: WheelChannel | BodyChannel, found: list[Regime], line: Ti
         if channel.noise.command_stamp_s > max(_LARGEST_COMMAND_JITTER_S, _JITTER_RATIO * stamps):
             out.append(
                 f"{name}: speeding up and braking still disagree: as if commands came "
-                f"{1e3 * channel.noise.command_stamp_s:.0f} ms early or late at random, while the encoder's time stamps "
+                f"{1e3 * channel.noise.command_stamp_s:.0f} ms early or late at random, the encoder's time stamps "
                 f"scatter by {1e3 * stamps:.1f} ms"
             )
     return out

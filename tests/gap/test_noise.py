@@ -36,9 +36,7 @@ def test_wheel_residuals_become_white():
 def test_whitening_is_linear():
     rng = np.random.default_rng(1)
     speed = rng.uniform(0, 5, (300, 2))
-    gains = wheel_gains(
-        WheelNoise(), np.full(300, 0.02), speed, np.zeros(300), np.arange(300) == 0, np.ones(300, bool)
-    )
+    gains = wheel_gains(WheelNoise(), np.full(300, 0.02), speed, np.zeros(300), np.arange(300) == 0, np.ones(300, bool))
     a, b = rng.standard_normal((2, 300, 2))
     np.testing.assert_allclose(
         whiten_wheels(a + 2 * b, gains), whiten_wheels(a, gains) + 2 * whiten_wheels(b, gains), atol=1e-9
