@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 SOURCES := pyproject.toml setup.py constraints.txt firmware_protocol/build_firmware.py firmware_protocol/disco_robot.dbc \
 	$(wildcard firmware_protocol/firmware/*.c firmware_protocol/firmware/*.h)
 
-.PHONY: venv demo test bench firmware-check clean
+.PHONY: venv demo test bench gap-study firmware-check clean
 
 venv: $(STAMP)
 
