@@ -70,3 +70,8 @@ def test_a_component_all_outside_goes_and_a_mixture_all_outside_is_refused():
     assert found.mean() == pytest.approx([0.2, 0.06, 0.4], abs=1e-3)
     with pytest.raises(ValueError, match="outside the prior"):
         belief((1.0, [0.9, 0.06, 0.4], 0.01))
+
+
+def test_a_component_counts_by_what_of_it_is_inside():
+    found = belief((0.5, [0.3, 0.06, 0.4], 0.005), (0.5, [0.0, 0.3, 0.2], 0.005))
+    assert found.weights == pytest.approx([2.0 / 3.0, 1.0 / 3.0], abs=0.02)
