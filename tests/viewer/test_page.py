@@ -3,6 +3,7 @@
 import math
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -36,7 +37,7 @@ def replay(recording):
         thread.join()
 
 
-def wait_for(page, condition, timeout_s=30.0):
+def wait_for(page, condition, timeout_s=60.0):
     """Let the browser work until something is so."""
     deadline = time.monotonic() + timeout_s
     while not condition():
@@ -44,19 +45,19 @@ def wait_for(page, condition, timeout_s=30.0):
         page.wait_for_timeout(50)
 
 
-def from_above(page, server):
+def from_above(page, server, attempts=3):
     """What the browser draws of the scene, seen from above the origin: x to the right, y up."""
-    client = next(iter(server.get_clients().values()))
-    picture = []
     position, down = (0.0, 0.0, HEIGHT_M), (0.0, 1.0, 0.0, 0.0)
-
-    def render():
-        picture.append(client.get_render(SIZE, SIZE, wxyz=down, position=position, fov=FIELD_OF_VIEW))
-
-    thread = threading.Thread(target=render)
-    thread.start()
-    wait_for(page, lambda: not thread.is_alive())
-    return picture[0][:, :, :3].astype(int)
+    for _ in range(attempts):
+        wait_for(page, lambda: len(server.get_clients()) == 1)
+        client = next(iter(server.get_clients().values()))
+        with ThreadPoolExecutor(1) as pool:
+            drawn = pool.submit(client.get_render, SIZE, SIZE, wxyz=down, position=position, fov=FIELD_OF_VIEW)
+            wait_for(page, drawn.done)
+        # A browser that is starved of its processor loses the connection and makes a new one.
+        if drawn.exception() is None:
+            return drawn.result()[:, :, :3].astype(int)
+    raise drawn.exception()
 
 
 def pixel(x_m, y_m, z_m=0.0):

@@ -1,8 +1,9 @@
 import numpy as np
+import pytest
 
 from disco_hw.control.parameter_points import unscented_points
 from disco_hw.log import records
-from disco_hw.model import Model, load_model
+from disco_hw.model import Gaussian, Model, load_model
 from disco_hw.model.free_run import FreeRun
 from disco_hw.viewer.uncertainty import ParameterPoints
 from tests.viewer.run import MODEL_FILE, plan_at
@@ -33,11 +34,12 @@ def test_no_path_of_a_plan_without_one():
     assert ParameterPoints(Model(0.06, 0.3)).trajectories(plan, (0.0, 0.0)).shape == (0, 0, 2)
 
 
-def test_a_uniform_prior_fans_out(recording):
-    from disco_hw.model.belief import Uniform
-
+def test_three_times_the_uncertainty_fans_out_three_times_as_far():
+    means, covariance = np.array((0.06, 0.3, 0.1)), np.diag((1e-6, 1e-5, 1e-5))
     names = ("wheel_radius_m", "axial_distance_m", "x_icr_m")
-    prior = Uniform(names, np.array((0.02, 0.1, 0.0)), np.array((0.1, 0.5, 0.5)))
-    ends = ParameterPoints(Model(0.06, 0.3, belief=prior)).trajectories(plan_at(0), (0.0, 0.0))[:, -1]
-    exact = ParameterPoints(recording.stage.model).trajectories(plan_at(0), (0.0, 0.0))[:, -1]
-    assert np.ptp(ends, axis=0).max() > 2.0 * np.ptp(exact, axis=0).max()
+
+    def spread(scale):
+        model = Model(0.06, 0.3, 0.1, belief=Gaussian(names, means, scale**2 * covariance))
+        return np.ptp(ParameterPoints(model).trajectories(plan_at(0), (0.0, 0.0))[:, -1], axis=0)
+
+    assert spread(3.0) == pytest.approx(3.0 * spread(1.0), rel=0.05)
