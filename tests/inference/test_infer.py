@@ -82,6 +82,7 @@ def test_an_impossible_prior_is_refused():
         prior_region(robot_config(wheel_radius_m=(-1.0, 0.001)))
 
 
+@pytest.mark.timeout(600)
 @pytest.mark.skipif(REAL_LOGS is None, reason="set DISCO_HW_REAL_LOGS to a folder with measured logs")
 @pytest.mark.parametrize("run", ["circular_20201223_0121_run01", "square_20200623_2042_run01"])
 def test_a_real_differential_drive_is_recovered(run):
@@ -89,12 +90,13 @@ def test_a_real_differential_drive_is_recovered(run):
         name="small", wheel_radius_m=0.042, axial_distance_m=0.2, ticks_per_rev=2797, max_wheel_speed_rad_s=20.0
     )
     log = load_drive(Path(REAL_LOGS) / "optiodom" / f"{run}.csv", 2796.8, 0.042)
-    found = infer(log, RobotConfig(robot=robot, prior=Prior(x_icr_m=(-0.1, 0.1))))
+    found = infer(log, RobotConfig(robot=robot, prior=Prior(x_icr_m=(-0.1, 0.1))), FEW)
     _, radius, axial = found.draws.mean(axis=0)
     assert radius == pytest.approx(0.0419, rel=0.02)
     assert axial == pytest.approx(0.2018, rel=0.02)
 
 
+@pytest.mark.timeout(600)
 @pytest.mark.skipif(REAL_LOGS is None, reason="set DISCO_HW_REAL_LOGS to a folder with measured logs")
 def test_a_real_skid_steer_robot_is_recovered_and_said_to_differ_from_the_model():
     robot = Robot(
@@ -104,6 +106,7 @@ def test_a_real_skid_steer_robot_is_recovered_and_said_to_differ_from_the_model(
     found = infer(
         load_drive(Path(REAL_LOGS) / "husky" / "husky_tile_deflated_20231212.csv"),
         RobotConfig(robot=robot, prior=prior),
+        FEW,
     )
     assert found.draws[:, NAMES.index("axial_distance_m")].mean() == pytest.approx(0.98, rel=0.05)
     assert found.predictive.outside_simulated
