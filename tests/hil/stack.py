@@ -56,13 +56,17 @@ class Stack:
 
     def drive(self, until_rad_s: float = 6.0, timeout_s: float = 10.0) -> None:
         """Arm, start, and wait until the faster wheel has come up to speed."""
+        self.start()
+        self.operator.wait_until(
+            "at speed", lambda s: s["wheels"] is not None and max(map(abs, s["wheels"])) > until_rad_s, timeout_s
+        )
+
+    def start(self) -> None:
+        """Arm and start the task."""
         self.operator.wait_for("READY", READY_TIMEOUT_S)
         self.operator.tell("arm")
         self.operator.wait_for("ARMED", 5.0)
         self.operator.tell("start")
-        self.operator.wait_until(
-            "at speed", lambda s: s["wheels"] is not None and max(map(abs, s["wheels"])) > until_rad_s, timeout_s
-        )
 
     def inject(self, command: str) -> str:
         """Do something to the robot or its link; returns the simulator's answer."""

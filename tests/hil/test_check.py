@@ -48,7 +48,7 @@ def test_check_fails_without_a_robot_and_says_what_to_do(tmp_path):
     assert "fail  link" in output
 
 
-def test_check_keeps_out_of_a_running_daemons_way(tmp_path):
+def test_check_and_a_second_daemon_keep_out_of_a_running_daemons_way(tmp_path):
     with running_stack(tmp_path) as stack:
         stack.operator.wait_for("READY", READY_TIMEOUT_S)
         code, output = disco("check", str(stack.robot_file))
@@ -62,11 +62,6 @@ def test_check_keeps_out_of_a_running_daemons_way(tmp_path):
         assert "arm first" in output
         code, output = disco("ctl", str(stack.robot_file), "jump")
         assert code == 2
-
-
-def test_a_second_daemon_is_refused(tmp_path):
-    with running_stack(tmp_path) as stack:
-        stack.operator.wait_for("READY", READY_TIMEOUT_S)
         code, output = disco("run", str(stack.robot_file))
         assert code == 2
         assert "a daemon serves this socket already" in output
