@@ -250,7 +250,7 @@ def infer(
     robot: RobotOption,
     out: Annotated[Path | None, typer.Option("-o", "--out", help="Write the model with its posterior here.")] = None,
     paper: Annotated[bool, typer.Option("--paper", help="The paper's statistics and 1000 simulations.")] = False,
-    simulations: Annotated[int | None, typer.Option(min=100, help="Simulations in all.")] = None,
+    simulations: Annotated[int | None, typer.Option(min=200, help="Simulations in all.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of simulations and networks.")] = 1,
     report: Annotated[Path | None, typer.Option(help="Write diagnostics with pictures to this HTML file.")] = None,
     as_json: AsJson = False,
