@@ -167,21 +167,22 @@ class Disco:
         """Climb the ladder until a step is valid; returns how it went and the attempts beyond the first."""
         settings, optimiser = self._settings, self._optimiser
         retries = 0
-        usable = optimiser.step(shift_steps, before, system, self._weights)
+        gain = 1.0 if first or not settings.gain_by_time else min(shift_steps, 1.0)
+        usable = optimiser.step(shift_steps, gain, before, system, self._weights)
         while retries < settings.retries and not (usable and optimiser.ess >= settings.min_ess):
             retries += 1
-            usable = optimiser.step(0.0, before, system, self._weights) or usable
+            usable = optimiser.step(0.0, gain, before, system, self._weights) or usable
         outcome = Outcome.RETRIED if retries else Outcome.PLANNED
         if not usable:
             optimiser.reset()
             outcome = Outcome.RESTARTED
             retries += 1
-            usable = optimiser.step(0.0, before, system, self._weights)
+            usable = optimiser.step(0.0, 1.0, before, system, self._weights)
         if not usable:
             return Outcome.STOPPING, retries
         if first or outcome is Outcome.RESTARTED:
             for _ in range(settings.iterations_at_start - 1):
-                optimiser.step(0.0, before, system, self._weights)
+                optimiser.step(0.0, 1.0, before, system, self._weights)
         return outcome, retries
 
     def _stop(self, now_ns: int, before: tuple[float, float]) -> None:

@@ -107,8 +107,12 @@ class Optimiser:
         blocks = self._work.commands
         blocks.reshape(len(blocks), -1, int(BLOCK))[:, : past.size] = past.reshape(-1, 1)
 
-    def step(self, shift_steps: float, before: tuple[float, ...], system: Any, point_weights: NDArray[Any]) -> bool:
+    def step(
+        self, shift_steps: float, gain: float, before: tuple[float, ...], system: Any, point_weights: NDArray[Any]
+    ) -> bool:
         """One step: the plan moves on by `shift_steps` and is improved; False if nothing valid came out.
+
+        `gain`: how far the plan moves towards the weighted mean of the samples, 0 to 1.
 
         `before`: the commands that limits of change start from. `point_weights` (L,) float32.
         """
@@ -116,7 +120,7 @@ class Optimiser:
         number = self.step_number
         self.step_number += 1
         valid: bool = replan(
-            self._work, self._samplings, number, shift_steps, self._basis, self._limits, system, point_weights
+            self._work, self._samplings, number, shift_steps, gain, self._basis, self._limits, system, point_weights
         )
         return valid
 

@@ -144,8 +144,8 @@ def weigh_all(work: Any, sampling: Any) -> Any:
 
 
 @block_function
-def update(work: Any, sampling: Any, basis: Any, limits: Any, total: float) -> Any:
-    """Set `nominal` to the weighted mean of the samples' commands; False and no change if that is not finite."""
+def update(work: Any, sampling: Any, basis: Any, limits: Any, total: float, gain: float) -> Any:
+    """Move `nominal` by `gain` towards the weighted mean of the samples' commands; False if that is not finite."""
     nominal, sums, history = work.nominal, work.sums, sampling.history
     horizon, channels = nominal.shape
     rows = horizon * channels
@@ -166,6 +166,7 @@ def update(work: Any, sampling: Any, basis: Any, limits: Any, total: float) -> A
             for b in range(BLOCK):
                 value += sums[row + b]
             value /= total
+            value = nominal[t, c] + gain * (value - nominal[t, c])
             work.updated[t, c] = min(max(value, -limits.largest), limits.largest)
             finite &= math.isfinite(value)
     if finite:
@@ -178,7 +179,15 @@ def update(work: Any, sampling: Any, basis: Any, limits: Any, total: float) -> A
 
 @kernel_function
 def replan(
-    work: Any, samplings: Any, step: int, shift_steps: float, basis: Any, limits: Any, system: Any, point_weights: Any
+    work: Any,
+    samplings: Any,
+    step: int,
+    shift_steps: float,
+    gain: float,
+    basis: Any,
+    limits: Any,
+    system: Any,
+    point_weights: Any,
 ) -> Any:
     """One step of DISCO on `work.nominal`; False, and the shifted plan stays, if nothing valid came out.
 
@@ -192,4 +201,4 @@ def replan(
     else:
         mean_over_points(work.costs, work.point_costs, point_weights, sampling.blocks)
     total = weigh_all(work, sampling)
-    return total > float32(0.0) and update(work, sampling, basis, limits, total)
+    return total > float32(0.0) and update(work, sampling, basis, limits, total, float32(gain))
