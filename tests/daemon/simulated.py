@@ -57,13 +57,15 @@ class SimulatedStack:
         return ticks
 
 
-def simulated_stack(planner: Planner | None = None, seed: int = 1, **changes: float) -> SimulatedStack:
+def simulated_stack(
+    planner: Planner | None = None, seed: int = 1, needs_pose: bool = True, **changes: float
+) -> SimulatedStack:
     """The shipped robot with a plant at the posterior's mean; `changes` are fields of PlantParameters."""
     setup = load_setup(Path(disco_hw.__file__).parent / "robots" / "wombot.toml")
     host_end, robot_end = connect_pair()
     recorder = MemoryRecorder()
     pipeline = make_pipeline(setup.config, setup.model, planner or make_planner(setup.config, setup.model))
-    core = assemble_core(setup.config, host_end, make_driver(), pipeline, recorder)
+    core = assemble_core(setup.config, host_end, make_driver(), pipeline, recorder, needs_pose)
     plant = Plant(replace(PlantParameters(), **changes), None, seed, START)
     robot = VirtualRobot(plant, FirmwareConfig(ticks_per_rev=2048, max_wheel_speed_rad_s=8.0), seed=seed)
     host_end.open()

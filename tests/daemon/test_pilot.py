@@ -2,9 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import msgspec
+import pytest
+
 from disco_hw.daemon.pilot import PilotTick, TaskPilot
+from disco_hw.daemon.states import State
 from disco_hw.daemon.supervisor import UserRequest
-from disco_hw.pipeline import FollowTask, Manual, Source
+from disco_hw.pipeline import FollowTask, Manual, NoPlanner, Source
+from disco_hw.robot_setup import load_setup
+from tests.daemon import simulated
 from tests.daemon.simulated import simulated_stack
 
 
@@ -41,3 +49,21 @@ def test_what_a_pilot_wants_counts_only_where_the_supervisor_allows_motion():
     assert running[-1].command.left_rad_s == 3.0
     # Replies to others are none of the pilot's.
     assert stack.pilot.replies == ()
+
+
+@pytest.mark.parametrize("needs_pose", [True, False])
+def test_only_who_needs_a_pose_waits_for_one(monkeypatch, needs_pose):
+    def without_pose(path):
+        setup = load_setup(path)
+        estimation = msgspec.structs.replace(setup.config.estimation, pose_timeout_s=1e-9)
+        return replace(setup, config=msgspec.structs.replace(setup.config, estimation=estimation))
+
+    monkeypatch.setattr(simulated, "load_setup", without_pose)
+    stack = simulated_stack(NoPlanner(), needs_pose=needs_pose)
+    stack.pilot = Eager()
+    stack.run(1.5)
+    stack.run(0.5, UserRequest.ARM)
+    assert stack.core.last.output.state is State.ARMED
+    last = stack.run(0.5, UserRequest.START)[-1]
+    assert not last.pipeline.estimate.pose_ok
+    assert (last.command.left_rad_s == 3.0) is not needs_pose

@@ -65,6 +65,13 @@ def test_a_tap_holds_nothing():
     assert not any(held(typist.wait(2000)))
 
 
+def test_slow_taps_hold_nothing():
+    typist = Typist()
+    for _ in range(10):
+        typist.press(UP)
+        assert not any(held(typist.wait(300)))
+
+
 def test_what_comes_faster_than_any_repeat_holds_nothing():
     typist = Typist()
     for _ in range(100):

@@ -119,6 +119,12 @@ def test_an_overrun_of_the_kernels_queue_is_made_good_from_the_device(device):
     assert state.left == pytest.approx(1.0)
 
 
+def test_nothing_counts_between_an_overrun_and_the_next_report(device):
+    pad = Gamepad(device, GamepadMapping(), 0)
+    os.write(device.feed, EVENT.pack(0, 0, ecodes.EV_SYN, ecodes.SYN_DROPPED, 0) + EVENT.pack(0, 0, *button(1)))
+    assert pad.poll(1).deadman is False
+
+
 def test_a_device_that_goes_is_noticed_and_stays_gone(device):
     pad = Gamepad(device, GamepadMapping(), 0)
     device.send(button(1))
