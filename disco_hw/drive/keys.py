@@ -89,11 +89,6 @@ class KeyHold:
         lapsed = "; release all keys for half a second" if self._state is _Hold.LAPSED else ""
         return f"keyboard, {self._share:.0%} speed{lapsed}"
 
-    @property
-    def speed_share(self) -> float:
-        """Share of the top speed that the arrows ask for."""
-        return self._share
-
     def press(self, event: KeyEvent) -> None:
         """Take in a key."""
         if event.key in DIRECTIONS:
