@@ -15,6 +15,8 @@ from disco_hw.model.jit import kernel_function
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
+_LEAD_S = 1.0
+
 
 @kernel_function
 def _displace(p: Any, track: Any, moving_s: Any, start: Any, heading: Any, ahead: int, out: Any) -> None:
@@ -60,9 +62,11 @@ def displacement(p: Array, track: Array, moving_s: Array, start: Index, heading_
 def starts_of(first: NDArray[np.bool_], usable: NDArray[np.bool_], ahead_s: float, every_s: float = 0.2) -> Index:
     """Nodes (K,), `every_s` apart, from which a prediction stays within its run and on usable nodes."""
     ahead, stride = round(ahead_s / CELL_S), round(every_s / CELL_S)
+    # What was commanded before a run is not known, and late wheels still follow it.
+    lead = round(_LEAD_S / CELL_S)
     begins = np.flatnonzero(first)
     ends = np.append(begins[1:], first.size)
     bad = np.concatenate([[0], np.cumsum(~usable)])
-    found = [np.arange(lo + stride, hi - ahead - 1, stride) for lo, hi in zip(begins, ends, strict=True)]
+    found = [np.arange(lo + lead, hi - ahead - 1, stride) for lo, hi in zip(begins, ends, strict=True)]
     start = np.concatenate(found) if found else np.empty(0, dtype=np.int64)
     return np.asarray(start[bad[start + ahead + 1] == bad[start]])

@@ -19,6 +19,7 @@ _PRIOR_SD = 2.0
 _OUTLIER = 5.0
 _SMOOTH_SAMPLES = 25
 _LOCAL_EXCESS = 1.4
+_LARGEST_WHEEL_NOISE = (0.05, 1.0, 0.1, 0.05, 0.1, 0.1, 0.02)
 
 
 def _huber(squares: Array) -> float:
@@ -55,7 +56,10 @@ def fit_wheel_noise(channel: WheelChannel, p: Array) -> WheelNoise:
         white = whiten_wheels(raw, trial)[counted]
         return 0.5 * _huber(white**2) - float(np.log(trial.scale[counted]).sum()) + _pull(logs, start)
 
-    return WheelNoise.from_vector(_minimise(objective, start, start - 5.0, start + 5.0, 25))
+    # A speed that may be wrong by any amount for any time would explain wheels that do not turn at all.
+    most = np.minimum(start + 5.0, WheelNoise(*_LARGEST_WHEEL_NOISE).vector())
+    begin = np.minimum(start, most)
+    return WheelNoise.from_vector(_minimise(objective, begin, begin - 5.0, most, 25))
 
 
 def _pull(logs: Array, start: Array) -> float:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.gap.body_noise import BodyNoise
-from disco_hw.gap.candidates import indices
+from disco_hw.gap.candidates import CANDIDATES, indices
 from disco_hw.gap.channels import BodyChannel, WheelChannel
 from disco_hw.gap.evidence import Evidence, compare
 from disco_hw.gap.fit import Fit, fit, inverse
@@ -26,7 +26,11 @@ from disco_hw.gap.wheel_noise import WheelNoise
 Array = NDArray[np.float64]
 
 AHEAD_S = 2.0
-_MOST_TERMS = 3
+_MOST_TERMS = 2
+# A term that what is fitted already does nine tenths of would only pull against it.
+_LEAST_OWN = 0.1
+_RESPONSE = ("motor_lag", "command_delay")
+_RESPONSES_S = ((0.02, 0.02), (0.15, 0.1), (0.4, 0.3))
 _WORTH_TRYING = 18.0
 _GAUSSIAN_KURTOSIS = 3.0
 _CLIPPED_AT = 6.0
@@ -125,13 +129,33 @@ def search_wheels(line: Timeline, geometry: Array, start: Array, given: Names = 
     channel = WheelChannel.build(line, WheelNoise(reading_rad=max(line.quantum_rad, 2e-4)), geometry)
     moves = wheel_moves(channel, geometry)
     rough = Selector(channel, moves, _ROUGH, given=given, start=start)
-    names = rough.greedy()
+    _responding(rough)
+    names = rough.greedy(tuple(dict.fromkeys((*given, *_RESPONSE))))
     rich = (*names, *(name for name in _SMOOTH_WHEEL if name not in names))
     vector = fit(channel, rough.fit(names).vector, indices(channel, rich)).vector
     channel = learn_wheel_noise(channel, vector)
     limits = _thresholds(channel.whitened(vector), channel.gains.use)
     selector = Selector(channel, moves, limits, given=given, start=rough.fit(given).vector)
-    return with_unnamed(Found(selector, selector.select(), channel), _wheel_options)
+    begin = rough.fit(names).vector
+    selector.fits[frozenset(names)] = fit(channel, begin, indices(channel, names))
+    return with_unnamed(Found(selector, selector.select(names), channel), _wheel_options)
+
+
+def _responding(selector: Selector) -> None:
+    """Fit lag and delay together from slow and quick responses.
+
+    One at a time they may lose to effects that merely stop the wheels: on a slow robot neither is much without the
+    other.
+    """
+    channel, names = selector.channel, (*selector.given, *_RESPONSE)
+    active = indices(channel, names)
+    places = [channel.layout.place[column] for name in _RESPONSE for column in CANDIDATES[name].columns]
+    options = []
+    for response_s in _RESPONSES_S:
+        vector = selector.fit(selector.given).vector.copy()
+        vector[places] = response_s
+        options.append(fit(channel, vector, active))
+    selector.fits[frozenset(names)] = min(options, key=lambda option: option.cost)
 
 
 def search_body(line: Timeline, start: Array, given: Names = ()) -> Found:
@@ -230,7 +254,7 @@ def best_term(found: Found, options: Iterator[Term]) -> tuple[Term | None, int]:
         across = small.jacobian.T @ column
         own = float(column @ column - across @ solved @ across)
         pull = float(column @ small.residual - across @ solved @ gradient)
-        gain = 0.5 * pull * pull / own if own > 1e-9 * float(column @ column) else 0.0
+        gain = 0.5 * pull * pull / own if own > _LEAST_OWN * float(column @ column) else 0.0
         if gain > most:
             best, most = term, gain
     return best, max(tried, 2)

@@ -174,9 +174,9 @@ class Selector:
         promises = {name: self.promise(accepted, name) for name in rest}
         return sorted((name for name in rest if promises[name] > 0.0), key=lambda name: -promises[name])
 
-    def greedy(self) -> Names:
-        """Forward steps only."""
-        accepted = self.given
+    def greedy(self, begin: Names = ()) -> Names:
+        """Forward steps only, from a set that is kept."""
+        accepted = begin or self.given
         while len(accepted) < _MOST_EFFECTS:
             ranked = self.ranked(accepted)
             new = next((name for name in ranked if self.acceptable(accepted, (*accepted, name))), None)
@@ -185,9 +185,9 @@ class Selector:
             accepted = (*accepted, new)
         return accepted
 
-    def select(self) -> Names:
-        """Forward, swap, backward, until nothing changes."""
-        accepted = self.given
+    def select(self, begin: Names = ()) -> Names:
+        """Forward, swap, backward, until nothing changes; from what is needed of a set to begin with."""
+        accepted = self._backward(begin) if begin else self.given
         visited = {frozenset(accepted)}
         while len(accepted) < _MOST_EFFECTS:
             ranked = self.ranked(accepted)
@@ -228,6 +228,6 @@ class Selector:
             if name in self.given:
                 continue
             rest = tuple(other for other in accepted if other != name)
-            if len(accepted) > 1 and not self.acceptable(rest, accepted):
+            if not self.acceptable(rest, accepted):
                 return self._backward(rest)
         return accepted

@@ -11,6 +11,7 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from disco_hw.log.drive import Commands, DriveLog
 
@@ -21,6 +22,10 @@ _STRETCH_S = 20.0
 _SHORTEST_RUN_S = 1.0
 _LONGEST_SILENCE_S = 1.5
 _SPEED_SPAN_S = 0.03
+_LONGEST_RESPONSE_S = 1.5
+_NO_COMMAND_RAD_S = 0.05
+_TURNING_RAD_S = 0.3
+_LOUD_RAD_S = 2.0
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -68,7 +73,7 @@ class Timeline:
     def has_commands(self) -> bool:
         """Whether enough commands are known to judge the wheels."""
         known = np.count_nonzero(np.isfinite(self.command_rad_s[:, 0]))
-        return known > 0.02 * self.t_s.size and self.encoder.t_s.size > 200
+        return bool(known > 0.02 * self.t_s.size and self.encoder.t_s.size > 200)
 
     @property
     def has_poses(self) -> bool:
@@ -87,7 +92,7 @@ def timeline(log: DriveLog) -> Timeline:
     notes: list[str] = []
     nodes_t, nodes_first, commands, changes, angles, speeds = [], [], [], [], [], []
     encoder_at, encoder_angle, pose_at, pose_values = [], [], [], []
-    offset = 0
+    offset, foreign_s = 0, 0.0
     runs = _runs(wheels.t_s, wheels.segment)
     driven_s = sum(float(wheels.t_s[hi - 1] - wheels.t_s[lo]) for lo, hi in runs)
     if driven_s > LONGEST_S:
@@ -101,12 +106,16 @@ def timeline(log: DriveLog) -> Timeline:
         grid = t[0] + CELL_S * np.arange(int((t[-1] - t[0]) / CELL_S) + 1)
         at = np.column_stack([np.interp(grid, t, angle[:, side]) for side in (0, 1)])
         command, change = _command_cells(log.commands, segment, grid)
+        speed = _speeds(grid, t, angle)
+        foreign = _foreign(command, speed)
+        command[foreign] = np.nan
+        foreign_s += CELL_S * int(foreign.sum())
         nodes_t.append(grid)
         nodes_first.append(np.arange(grid.size) == 0)
         commands.append(command)
         changes.append(change)
         angles.append(at)
-        speeds.append(_speeds(grid, t, angle))
+        speeds.append(speed)
         inside = t <= grid[-1]
         encoder_at.append(_locate(t[inside], grid, offset))
         encoder_angle.append(angle[inside])
@@ -117,6 +126,8 @@ def timeline(log: DriveLog) -> Timeline:
         offset += grid.size
     if not nodes_t:
         return _empty()
+    if foreign_s > 0.0:
+        notes.append(f"{foreign_s:.0f} s in which wheels and commands have nothing to do with each other are left out")
     encoder = _joined(encoder_at)
     measured = np.concatenate(encoder_angle)
     return Timeline(
@@ -195,6 +206,18 @@ def _command_cells(commands: Commands, segment: int, grid: Array) -> tuple[Array
     where = np.clip(((t[1:] - grid[0]) / CELL_S).astype(np.int64), 0, grid.size - 1)
     np.add.at(jumps, where, steps)
     return means, jumps
+
+
+def _foreign(command: Array, speed: Array) -> Mask:
+    """Cells (M,) in which wheels turn long after the last command or rest under a large one: another master drives."""
+    asked = np.nan_to_num(np.abs(command).max(axis=1), nan=np.inf)
+    turning = np.abs(speed).max(axis=1)
+    span = round(_LONGEST_RESPONSE_S / CELL_S)
+    most = maximum_filter1d(asked, span, origin=(span - 1) // 2)
+    least = minimum_filter1d(asked, span, origin=(span - 1) // 2)
+    unasked = (most < _NO_COMMAND_RAD_S) & (turning > _TURNING_RAD_S)
+    unheard = (least > _LOUD_RAD_S) & np.isfinite(asked) & (turning < _NO_COMMAND_RAD_S)
+    return np.asarray(maximum_filter1d((unasked | unheard).astype(np.uint8), 2 * span) > 0)
 
 
 def _speeds(grid: Array, t: Array, angle: Array) -> Array:
