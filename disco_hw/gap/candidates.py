@@ -86,7 +86,7 @@ _SPECIAL = (
     Candidate("motor_lag", ("motor_lag.tau_s",), lambda channel: ((0.05,), (0.25,))),
     Candidate("command_delay", ("command_delay.delay_s",), lambda channel: ((0.03,), (0.12,), (0.3,))),
     Candidate("deadband", ("deadband.width_rad_s",), lambda channel: ((0.2,),)),
-    Candidate("stiction", (), None, Profile("stiction.threshold_rad_s", _stiction_values, 0.02)),
+    Candidate("stiction", (), None, Profile("stiction.threshold_rad_s", _stiction_values, 0.002)),
     Candidate("speed_limit", ("speed_limit.limit_rad_s",), _below_largest(False)),
     Candidate("yaw_rate_limit", ("yaw_rate_limit.limit_rad_s",), _below_largest(True)),
     Candidate(

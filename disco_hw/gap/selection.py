@@ -19,7 +19,7 @@ Split = tuple[Array, Array | None]
 
 _MOST_EFFECTS = 6
 _WORTH_FITTING = 8.0
-_LOCAL_SEARCHES = 3
+_LOCAL_SEARCHES = 4
 
 
 @dataclass(frozen=True, slots=True)
