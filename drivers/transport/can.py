@@ -129,15 +129,15 @@ class CanConnection:
                 port.close()
 
     def _take_garbage(self, error: Exception) -> None:
+        flush = getattr(self._bus, "flush", None)
+        if flush is not None:
+            flush()
         self._counters.add(malformed=1)
         self._garbage += 1
         if self._garbage >= GARBAGE_LIMIT:
             raise LinkLostError(
                 f"nothing but garbage arrives ({error}); check the adapter's firmware and serial speed"
             ) from error
-        flush = getattr(self._bus, "flush", None)
-        if flush is not None:
-            flush()
 
     def _take_error_frame(self, message: can.Message) -> None:
         bus_error = decode_error_frame(message.arbitration_id, bytes(message.data))

@@ -226,7 +226,8 @@ class ReconnectingTransport:
             try:
                 connection.close()
             except Exception as error:  # a device that is gone cannot be closed properly either
-                self._note(error)
+                if self._last_error is None:
+                    self._note(error)
 
     def _run_sender(self) -> None:
         refused: OutgoingFrame | None = None

@@ -40,7 +40,7 @@ class SerialMedium:
             write_timeout=WRITE_TIMEOUT_S,
             exclusive=True,
         )
-        _ask_for_low_latency(port)
+        ask_for_low_latency(port)
         return SerialConnection(port, counters)
 
     def explain(self, error: Exception) -> str:
@@ -86,13 +86,13 @@ class SerialConnection:
         self._port.close()
 
 
-def _ask_for_low_latency(port: serial.Serial) -> None:
+def ask_for_low_latency(port: serial.Serial) -> None:
     """Ask for delivery byte by byte: FTDI adapters otherwise hold received bytes back for 16 ms."""
     ask = getattr(port, "set_low_latency_mode", None)
     if ask is None:
         return
     try:
         ask(True)
-    except (ValueError, OSError):
+    except (ValueError, OSError, NotImplementedError):
         # Pseudo-terminals, CDC-ACM and network ports have no such mode, and no latency timer either.
         return

@@ -30,9 +30,7 @@ class PseudoTerminal:
         tty.setraw(slave)
         self.path.symlink_to(os.ttyname(slave))
         self.received.clear()
-        self._reading.set()
-        self._reader = threading.Thread(target=self._read, args=(self._master, slave), daemon=True)
-        self._reader.start()
+        self._start_reading(slave)
 
     def unplug(self):
         """Vanish: the name and the line."""
@@ -54,13 +52,23 @@ class PseudoTerminal:
         self._reading.clear()
         self._reader.join()
 
+    def read_on(self):
+        """Take from the line again."""
+        self._start_reading(None)
+
+    def _start_reading(self, slave):
+        self._reading.set()
+        self._reader = threading.Thread(target=self._read, args=(self._master, slave), daemon=True)
+        self._reader.start()
+
     def _read(self, master, slave):
         os.set_blocking(master, False)
         pause = threading.Event()
         while self._reading.is_set():
             try:
                 self.received.extend(os.read(master, 4096))
-            except BlockingIOError:
+            except OSError:  # nothing to read, or nobody has the line open
                 pause.wait(0.002)
-        # Held until now, so that the line exists before the driver has opened it.
-        os.close(slave)
+        if slave is not None:
+            # Held until now, so that the line exists before the driver has opened it.
+            os.close(slave)

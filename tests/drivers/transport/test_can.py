@@ -180,7 +180,6 @@ def test_slcan_survives_a_garbled_line(adapter, garbage):
     terminal.write(garbage)
     if garbage != b"\x07\r":
         wait_until(lambda: transport.stats.malformed)
-    time.sleep(0.05)
     terminal.write(b"t11015a\r")
     assert collect(transport, 1)[-1].frame == Frame(0x110, b"\x5a")
     assert transport.generation == 1, "a garbled line does not cost the session"
@@ -203,7 +202,6 @@ def test_slcan_with_good_frames_between_the_garbage_is_kept(adapter):
         terminal.write(b"t1\r")
         wait_until(lambda: transport.stats.malformed == number)  # noqa: B023
         if number % 10 == 0:
-            time.sleep(0.01)
             terminal.write(b"t110101\r")
             collect(transport, 1)
     assert transport.generation == 1

@@ -129,8 +129,61 @@ def test_an_error_while_sending_makes_the_link_anew(transport, medium):
     medium.write_error = BrokenPipeError("server gone")
     send(transport, outgoing())
     wait_until(lambda: transport.generation >= 2)
-    medium.write_error = None
     assert transport.stats.send_errors >= 1
+    medium.write_error = None
+    wait_until(lambda: transport.state is LinkState.UP)
+    send(transport, outgoing(data=b"again"))
+    wait_until(lambda: Frame(0x100, b"again") in medium.sent)
+    generation = transport.generation
+    time.sleep(0.05)
+    assert transport.generation == generation, "the new link is kept"
+
+
+@pytest.mark.parametrize("way", ["read", "write"])
+def test_the_loss_is_told_in_the_mediums_words(medium, way):
+    transport = ReconnectingTransport(medium, backoff=BackoffPolicy(first_s=5.0))
+    try:
+        up(transport)
+        if way == "read":
+            medium.incoming.put(OSError("unplugged"))
+        else:
+            medium.write_error = OSError("unplugged")
+            send(transport, outgoing())
+        wait_until(lambda: transport.state is LinkState.CONNECTING and medium.connections[0].closed)
+        assert transport.last_error == "scripted: unplugged"
+    finally:
+        transport.close()
+
+
+@pytest.mark.parametrize("flaps", [False, True])
+def test_a_device_that_is_absent_or_flaps_is_tried_less_and_less_often(medium, flaps):
+    if flaps:
+        medium.write_error = OSError("always")
+        for _ in range(10_000):
+            medium.incoming.put(OSError("gone at once"))
+    else:
+        medium.refusals = [OSError("not there")] * 10_000
+    transport = ReconnectingTransport(medium, backoff=BackoffPolicy(first_s=0.01, longest_s=10.0, steady_s=5.0))
+    started = time.monotonic()
+    transport.open()
+    wait_until(lambda: medium.attempts >= 5)
+    elapsed_s = time.monotonic() - started
+    transport.close()
+    assert elapsed_s >= 0.01 + 0.02 + 0.04 + 0.08
+
+
+def test_an_idle_link_costs_nothing(transport):
+    up(transport)
+    before_s = time.process_time()
+    time.sleep(0.3)
+    assert time.process_time() - before_s < 0.15
+
+
+@pytest.mark.parametrize("frame", [Frame(0, b""), Frame(0x7FF, bytes(8))])
+def test_the_first_and_the_last_identifier_and_the_longest_frame(transport, medium, frame):
+    up(transport)
+    send(transport, OutgoingFrame(frame, time.monotonic_ns() + 5 * 10**9))
+    wait_until(lambda: medium.sent == [frame])
 
 
 def test_nothing_old_is_sent_on_a_new_link(transport, medium):
@@ -142,6 +195,7 @@ def test_nothing_old_is_sent_on_a_new_link(transport, medium):
     wait_until(lambda: transport.state is LinkState.CONNECTING)
     medium.may_write.set()
     wait_until(lambda: transport.generation == 2)
+    assert transport.stats.send_errors == 1, "what was dropped is counted"
     send(transport, outgoing(data=b"new"))
     wait_until(lambda: medium.connections[1].sent)
     assert medium.connections[1].sent == [Frame(0x100, b"new")]

@@ -7,7 +7,7 @@ import pytest
 
 from drivers.transport.backoff import BackoffPolicy
 from drivers.transport.reconnecting import ReconnectingTransport
-from drivers.transport.serial import SerialMedium
+from drivers.transport.serial import SerialMedium, ask_for_low_latency
 from drivers.types import Frame, LinkState
 from firmware_protocol.serial_framing import FrameDecoder, encode_frame
 from tests.drivers.transport.pseudo_terminal import PseudoTerminal
@@ -70,6 +70,9 @@ def test_garbage_is_counted_and_the_next_frame_is_whole(transport, terminal):
     terminal.write(b"\xff\x80\xfe" * 100 + b"\0" + bytes(corrupt) + LINE[3:] + LINE)
     assert [received.frame for received in collect(transport, 1)] == [FRAME]
     assert transport.stats.malformed == 3
+    terminal.write(b"\x01\x02\0" + LINE)
+    collect(transport, 1)
+    assert transport.stats.malformed == 4
     assert transport.generation == 1
 
 
@@ -82,6 +85,8 @@ def test_half_a_frame_of_an_earlier_program_does_not_spoil_our_first(terminal):
         wait_until(lambda: transport.state is LinkState.UP)
         send(transport, outgoing(0x100, b"\x01"))
         wait_until(lambda: decoded(terminal) == [(0x100, b"\x01")])
+        send(transport, outgoing(0x100, b"\x02"))
+        wait_until(lambda: terminal.received.endswith(encode_frame(0x100, b"\x01") + encode_frame(0x100, b"\x02")))
     finally:
         transport.close()
 
@@ -111,3 +116,34 @@ def test_a_device_that_reads_nothing_blocks_nobody(transport, terminal):
     assert transport.stats.transmit_queue_full
     assert "takes no more bytes" in transport.last_error
     assert transport.state is LinkState.UP
+    time.sleep(0.1)
+    terminal.received.clear()
+    terminal.read_on()
+    wait_until(lambda: terminal.received)
+    send(transport, outgoing(0x100, b"first after the jam"[:8]))
+    wait_until(lambda: decoded(terminal)[-1] == (0x100, b"first after the jam"[:8]))
+
+
+class FtdiPort:
+    """Stands for an adapter that can hold received bytes back, or for one that says in some way that it cannot."""
+
+    def __init__(self, error=None):
+        self.low_latency = False
+        self.error = error
+
+    def set_low_latency_mode(self, wanted):
+        if self.error is not None:
+            raise self.error
+        self.low_latency = wanted
+
+
+def test_an_adapter_that_holds_bytes_back_is_told_not_to():
+    port = FtdiPort()
+    ask_for_low_latency(port)
+    assert port.low_latency
+
+
+@pytest.mark.parametrize("error", [ValueError("no such mode"), OSError(25, "ENOTTY"), NotImplementedError("not here")])
+def test_a_port_without_low_latency_is_used_as_it_is(error):
+    ask_for_low_latency(FtdiPort(error))
+    ask_for_low_latency(object())
