@@ -40,7 +40,8 @@ def circle_cost(circle: Circle, step_s: float) -> SequenceCost:
         paper = np.hypot(off_edge, forward - circle.speed_m_s).sum(axis=0)
         progress = (x[:-1] * y[1:] - y[:-1] * x[1:]) / (step_s * circle.radius_m)
         missing = circle.progress_part * circle.speed_m_s * len(forward) - progress.sum(axis=0)
-        return np.asarray(paper + circle.progress_weight * np.maximum(missing, 0.0))
+        last = circle.terminal_s / step_s * np.abs(off_edge[-1])
+        return np.asarray(paper + circle.progress_weight * np.maximum(missing, 0.0) + last)
 
     return cost
 

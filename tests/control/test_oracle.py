@@ -17,6 +17,7 @@ from disco_hw.model import reference as physics
 
 SAMPLES, HORIZON, STEP_S = 160, 50, 0.1
 SAMPLER = Sampler(samples=SAMPLES, horizon=HORIZON)
+PLAN_SETTINGS = DiscoSettings(sampler=SAMPLER, iterations_at_start=1, retries=0, gain_by_time=False)
 LIMITS = WheelLimits(8.0, 20.0)
 
 BASE = st.tuples(st.floats(0.02, 0.12), st.floats(0.2, 0.8), st.floats(-0.3, 0.4))
@@ -108,12 +109,10 @@ def check_against_reference(model, state, task, plan_settings, seed):
 @settings(max_examples=60, deadline=None)
 @given(BASE, STATES, COMMANDS, st.integers(0, 2**63 - 1))
 def test_costs_and_update_of_the_bare_model(base, values, commands, seed):
-    plan_settings = DiscoSettings(sampler=SAMPLER, iterations_at_start=1, retries=0)
-    check_against_reference(model_of(base), state_of(values, commands), Circle(), plan_settings, seed)
+    check_against_reference(model_of(base), state_of(values, commands), Circle(), PLAN_SETTINGS, seed)
 
 
 @settings(max_examples=60, deadline=None)
 @given(BASE, EFFECTS, STATES, COMMANDS, st.integers(0, 2**63 - 1))
 def test_costs_and_update_with_all_effects(base, effects, values, commands, seed):
-    plan_settings = DiscoSettings(sampler=SAMPLER, iterations_at_start=1, retries=0)
-    check_against_reference(model_of(base, effects), state_of(values, commands), Circle(), plan_settings, seed)
+    check_against_reference(model_of(base, effects), state_of(values, commands), Circle(), PLAN_SETTINGS, seed)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -21,7 +21,7 @@ class CircleTerms(NamedTuple):
     """What the kernel needs of a circle.
 
     Radius (m), speed (m/s); weight of lost progress or None, progress wanted by the end of the horizon (m/s times
-    steps), and the progress of sweeping 1 m^2 twice over, 1 / (step * radius).
+    steps), the progress of sweeping 1 m^2 twice over, 1 / (step * radius); weight of the last distance.
     """
 
     radius_m: Any
@@ -29,6 +29,7 @@ class CircleTerms(NamedTuple):
     progress_weight: Any
     wanted: Any
     per_swept: Any
+    terminal_steps: Any
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,8 +39,9 @@ class Circle:
     d is the distance to the circle's edge, s the longitudinal speed: the paper's cost (section V-B). It alone is 0.2
     for standing still and less for spinning about an offset centre of rotation. Progress takes the reward from both: it
     is the speed at which area is swept about the centre, over R / 2; what the steps together miss of `progress_part`
-    of s0 costs `progress_weight` times as much as the same miss of speed. A robot that drives round pays nothing, and
-    `progress_weight` = 0 is the paper's cost.
+    of s0 costs `progress_weight` times as much as the same miss of speed. A robot that drives round pays nothing. The
+    last d counts as much as it would over `terminal_s` more: the way back to the edge begins with a loss, as turning in
+    pushes the tracked point out, and would else not pay within the horizon. `Circle.paper` has neither.
     """
 
     center_x_m: float = 0.0
@@ -48,11 +50,17 @@ class Circle:
     speed_m_s: float = 0.2
     progress_weight: float = 1.0
     progress_part: float = 0.8
+    terminal_s: float = 1.0
 
     @classmethod
-    def from_config(cls, task: CircleTask, progress_weight: float = 1.0) -> Circle:
-        """The circle of robot.toml."""
-        return cls(task.center_x_m, task.center_y_m, task.radius_m, task.speed_m_s, progress_weight)
+    def from_config(cls, task: CircleTask, mode: str = "default") -> Circle:
+        """The circle of robot.toml, with the cost of the control mode."""
+        circle = cls(task.center_x_m, task.center_y_m, task.radius_m, task.speed_m_s)
+        return circle.paper() if mode == "paper" else circle
+
+    def paper(self) -> Circle:
+        """The same circle with the paper's cost alone."""
+        return replace(self, progress_weight=0.0, terminal_s=0.0)
 
     @property
     def origin_m(self) -> tuple[float, float]:
@@ -87,6 +95,7 @@ def _terms(circle: Circle, step_s: float, horizon: int) -> CircleTerms:
         f32(circle.progress_weight) if circle.progress_weight > 0.0 else None,
         f32(circle.progress_part * circle.speed_m_s * horizon),
         f32(1.0 / (step_s * circle.radius_m)),
+        f32(circle.terminal_s / step_s),
     )
 
 
@@ -144,7 +153,8 @@ def _terminal_cost(task: Any, memory: Any, x: Any, y: Any, cos_yaw: Any, sin_yaw
         return None
 
     def cost(task: Any, memory: Any, x: Any, y: Any, cos_yaw: Any, sin_yaw: Any) -> Any:
-        return _lost(task.progress_weight, memory, task)
+        off_edge = quick_norm(x, y) - task.radius_m
+        return _lost(task.progress_weight, memory, task) + task.terminal_steps * abs(off_edge)
 
     return cost
 

@@ -1,0 +1,107 @@
+"""Follow way-points by time: be at each place when its time has come."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from disco_hw.control.tasks.terms import has_memory, stage_cost, terminal_cost
+from disco_hw.control.tasks.waypoints import Waypoints
+from disco_hw.model.jit import cast_like, quick_norm, specialise
+
+Array = NDArray[np.float64]
+
+
+class TimedPathTerms(NamedTuple):
+    """Where to be at the end of each step: `x`, `y` (T,) m."""
+
+    x: Any
+    y: Any
+
+
+@dataclass(frozen=True, eq=False)
+class TimedPath:
+    """Follow way-points with times: c is the distance to where the robot should be now.
+
+    The place moves on by itself, so nothing but following it is cheap. Before the first time it is the first way-point,
+    after the last the last one. Raises ValueError for way-points without times.
+    """
+
+    waypoints: Waypoints
+
+    def __post_init__(self) -> None:
+        if self.waypoints.times_s is None:
+            raise ValueError("the way-points have no times")
+
+    @property
+    def origin_m(self) -> tuple[float, float]:
+        """World position that rollouts are relative to: the first way-point."""
+        x, y = self.waypoints.places_m[0].tolist()
+        return x, y
+
+    def _where(self, time_s: NDArray[np.floating]) -> tuple[Array, Array]:
+        times, places = self.waypoints.times_s, self.waypoints.places_m
+        assert times is not None
+        x, y = (np.interp(time_s, times, column) for column in places.T)
+        return np.asarray(x), np.asarray(y)
+
+    def terms(
+        self, time_s: float, x_m: float, y_m: float, memory: float | None, step_s: float, horizon: int
+    ) -> tuple[Any, float]:
+        """Terms for the kernel; there is no memory."""
+        x, y = self._where(time_s + step_s * np.arange(1, horizon + 1))
+        origin_x, origin_y = self.origin_m
+        return TimedPathTerms((x - origin_x).astype(np.float32), (y - origin_y).astype(np.float32)), 0.0
+
+    def instant_cost(self, time_s: float, x_m: float, y_m: float, forward_m_s: float) -> float:
+        """Distance to where the robot should be."""
+        x, y = self._where(np.array(time_s))
+        return float(np.hypot(x - x_m, y - y_m))
+
+    def picture(self) -> Array:
+        """The path as a polyline in the world frame, (N, 2)."""
+        return self.waypoints.places_m
+
+
+def _is_timed_path(task: Any) -> bool:
+    return getattr(task, "instance_class", None) is TimedPathTerms
+
+
+@specialise(stage_cost)
+def _stage_cost(
+    task: Any, memory: Any, step: Any, x_old: Any, y_old: Any, x: Any, y: Any, cos_yaw: Any, sin_yaw: Any, forward: Any
+) -> Callable[..., Any] | None:
+    if not _is_timed_path(task):
+        return None
+
+    def cost(
+        task: Any,
+        memory: Any,
+        step: Any,
+        x_old: Any,
+        y_old: Any,
+        x: Any,
+        y: Any,
+        cos_yaw: Any,
+        sin_yaw: Any,
+        forward: Any,
+    ) -> Any:
+        return quick_norm(x - task.x[step], y - task.y[step]), memory
+
+    return cost
+
+
+@specialise(terminal_cost)
+def _terminal_cost(task: Any, memory: Any, x: Any, y: Any, cos_yaw: Any, sin_yaw: Any) -> Callable[..., Any] | None:
+    if not _is_timed_path(task):
+        return None
+    return lambda task, memory, x, y, cos_yaw, sin_yaw: cast_like(0.0, x)
+
+
+@specialise(has_memory)
+def _has_memory(task: Any) -> Callable[..., Any] | None:
+    return (lambda task: False) if _is_timed_path(task) else None
