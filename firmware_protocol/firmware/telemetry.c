@@ -90,7 +90,7 @@ static void send_wheels(disco_firmware_t *core)
         .limited = core->drive.limited,
         .left_speed = raw_i16(in->wheel_speed[0], DISCO_WHEEL_SPEED_LEFT_SPEED_SCALE),
         .right_speed = raw_i16(in->wheel_speed[1], DISCO_WHEEL_SPEED_RIGHT_SPEED_SCALE),
-        .sample_time = (uint16_t)(core->now_us / (uint64_t)DISCO_WHEEL_SPEED_SAMPLE_TIME_SCALE),
+        .sample_time = (uint16_t)((core->now_us & TIME_MASK) / (uint64_t)DISCO_WHEEL_SPEED_SAMPLE_TIME_SCALE),
     };
     struct disco_robot_wheel_ticks_t ticks = {
         .left_ticks = in->ticks[0] & TICKS_MASK,
@@ -226,7 +226,7 @@ void disco_firmware_pose(disco_firmware_t *core, double x, double y, double yaw,
     struct disco_robot_pose_heading_t heading = {
         .valid = valid,
         .yaw = raw_i16(yaw, DISCO_POSE_HEADING_YAW_SCALE),
-        .sample_time = (uint16_t)(sample_us / (uint64_t)DISCO_POSE_HEADING_SAMPLE_TIME_SCALE),
+        .sample_time = (uint16_t)((sample_us & TIME_MASK) / (uint64_t)DISCO_POSE_HEADING_SAMPLE_TIME_SCALE),
         .position_std = raw_u8(position_std, DISCO_POSE_HEADING_POSITION_STD_SCALE),
         .yaw_std = raw_u8(yaw_std, DISCO_POSE_HEADING_YAW_STD_SCALE),
     };
