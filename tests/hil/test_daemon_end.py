@@ -92,7 +92,8 @@ def test_an_exception_in_the_loop_stops_the_wheels_and_is_told(tmp_path, monkeyp
         output = (tmp_path / "daemon.txt").read_text()
     assert code == 1
     assert f"{error}: planted" in output
-    assert max(row.fastest for row in rows) > 5.0
+    # 60 plans are 1.2 s; how fast it has become by then is not this test's matter.
+    assert max(row.fastest for row in rows) > 2.0
     last_command = next(row for row in rows if row.accepted == rows[-1].accepted)
     assert all(row.fastest < STILL_RAD_S for row in rows if row.t_s > last_command.t_s + 0.75)
 
