@@ -37,8 +37,5 @@ gap-study: $(STAMP)
 firmware-check: $(STAMP)
 	$(BIN)/python -m tools.firmware_check
 
-gap-study: $(STAMP)
-	$(BIN)/python -m tools.gap_study single weak none dirty pairs outside forms circle
-
 clean:
 	rm -rf $(VENV) build *.egg-info firmware_protocol/_firmware*

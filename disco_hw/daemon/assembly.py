@@ -22,8 +22,7 @@ from firmware_protocol.codec import Codec
 
 def make_planner(config: RobotConfig, model: Model) -> control.Disco:
     """DISCO for this robot's task, compiled and warmed up: takes seconds."""
-    # The paper's cost has no progress term.
-    task = control.Circle.from_config(config.task, 0.0 if config.control.mode == "paper" else 1.0)
+    task = control.Circle.from_config(config.task, config.control.mode)
     planner = control.Disco(
         model,
         task,
