@@ -1,0 +1,224 @@
+"""The paper's circle experiment, in simulation: what knowing the parameters' distribution is worth (second figure).
+
+The plant's parameters are drawn from the posterior. The paper does not tell the control period, the wheel limits, the
+lag or the noise of its robot: they are options here, and part of the result.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from disco_hw import config
+from disco_hw.control.disco import Disco
+from disco_hw.control.experiments.plant import Plant
+from disco_hw.control.plan import PlannerState, SentCommand
+from disco_hw.control.settings import ROTATION, DiscoSettings, WheelLimits
+from disco_hw.control.tasks.circle import Circle
+from disco_hw.errors import InputError
+from disco_hw.model import Model, Uniform
+from disco_hw.model.parameter import BASE_PARAMETERS
+
+Array = NDArray[np.float64]
+Progress = Callable[[str], None]
+Command = Callable[[int, PlannerState], tuple[float, float]]
+
+POINT_ESTIMATE = {"x_icr_m": 0.12, "wheel_radius_m": 0.06, "axial_distance_m": 0.47}
+CURVES = ("prior", "posterior", "point estimate", "true parameters")
+MEMORY_S = 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class CircleOptions:
+    """What the paper leaves open.
+
+    Seeds 0 to `seeds` - 1 draw plant and noise. `rate_hz` of replanning; `largest_rot_s` and `largest_rot_s2` bound a
+    wheel's command; `lag_s` and `wheel_noise` are the plant's; it starts on the circle, along it, at rest.
+    """
+
+    seeds: int = 8
+    duration_s: float = 40.0
+    rate_hz: float = 10.0
+    largest_rot_s: float = 1.0
+    largest_rot_s2: float = math.inf
+    lag_s: float = 0.1
+    wheel_noise: float = 0.05
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Run:
+    """One drive, N control periods: the plant's pose after each (N, 3), speed (N,) m/s, commands (N, 2) rad/s."""
+
+    poses: Array
+    forward_m_s: Array
+    commands_rad_s: Array
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class CircleResult:
+    """Runs of each curve over the seeds, by name."""
+
+    options: CircleOptions
+    circle: Circle
+    mode: str
+    runs: dict[str, list[Run]]
+
+    def costs(self, name: str) -> Array:
+        """Instant costs (seeds, N) of a curve."""
+        return np.array(
+            [
+                [
+                    self.circle.instant_cost(0.0, x, y, v)
+                    for (x, y, _), v in zip(run.poses, run.forward_m_s, strict=True)
+                ]
+                for run in self.runs[name]
+            ]
+        )
+
+    def rows(self) -> list[dict[str, float | str]]:
+        """For each curve: mean cost, its standard deviation over seeds, mean cost of the last half, command change.
+
+        `command_change_rot_s` is the mean change of a wheel's command over 0.1 s.
+        """
+        apart = max(1, round(0.1 * self.options.rate_hz))
+        found: list[dict[str, float | str]] = []
+        for name, runs in self.runs.items():
+            costs = self.costs(name)
+            changes = [np.abs(run.commands_rad_s[apart:] - run.commands_rad_s[:-apart]).mean() for run in runs]
+            found.append(
+                {
+                    "controller": name,
+                    "mean_cost": float(costs.mean()),
+                    "std_over_seeds": float(costs.mean(axis=1).std(ddof=1)) if len(runs) > 1 else math.nan,
+                    "steady_cost": float(costs[:, costs.shape[1] // 2 :].mean()),
+                    "command_change_rot_s": float(np.mean(changes)) / ROTATION,
+                }
+            )
+        return found
+
+    def table(self) -> str:
+        """The rows and the options as text."""
+        lines = [f"{'controller':18s} {'mean cost':>10s} {'std':>8s} {'steady cost':>12s} {'du (rot/s)':>11s}"]
+        lines += [
+            f"{row['controller']:18s} {row['mean_cost']:10.4f} {row['std_over_seeds']:8.4f} {row['steady_cost']:12.4f} "
+            f"{row['command_change_rot_s']:11.4f}"
+            for row in self.rows()
+        ]
+        options = ", ".join(f"{key} = {value:g}" for key, value in asdict(self.options).items())
+        lines.append(f"mode {self.mode}; {options}; steady: last half; du: mean change of a command in 0.1 s")
+        return "\n".join(lines)
+
+    def write_csv(self, path: Path) -> None:
+        """Time, and for each curve the mean over seeds of the running mean of the instant cost."""
+        means = {name: _running_mean(self.costs(name)).mean(axis=0) for name in self.runs}
+        with path.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file)
+            writer.writerow(["t_s", *means])
+            for step, values in enumerate(zip(*means.values(), strict=True)):
+                writer.writerow([f"{(step + 1) / self.options.rate_hz:.3f}", *(f"{value:.6g}" for value in values)])
+
+    def write_png(self, path: Path) -> None:
+        """Running mean of the instant cost over time, and the paths of the first seed."""
+        from matplotlib.figure import Figure  # noqa: PLC0415  (slow to import, needed only here)
+
+        figure = Figure(figsize=(11.0, 5.0), layout="constrained")
+        left, right = figure.subplots(1, 2)
+        picture = self.circle.picture()
+        right.plot(picture[:, 0], picture[:, 1], color="0.6", linestyle="--", label="circle")
+        for name, runs in self.runs.items():
+            mean = _running_mean(self.costs(name)).mean(axis=0)
+            left.plot((np.arange(mean.size) + 1) / self.options.rate_hz, mean, label=name)
+            right.plot(runs[0].poses[:, 0], runs[0].poses[:, 1], label=name, linewidth=1.0)
+        left.set(xlabel="time (s)", ylabel="mean instant cost so far", title=f"Circle, mode {self.mode}")
+        right.set(xlabel="x (m)", ylabel="y (m)", title="Paths of the first seed", aspect="equal")
+        left.legend()
+        right.legend()
+        figure.savefig(path, dpi=120)
+
+
+def run_circle(
+    model: Model, mode: str = "default", options: CircleOptions | None = None, progress: Progress | None = None
+) -> CircleResult:
+    """Drive the circle with each curve's knowledge, over all seeds; `progress` is told after each curve.
+
+    `model` holds the posterior that the plants are drawn from; the prior is the paper's. Raises InputError for a model
+    without a belief over the three base parameters.
+    """
+    options = options or CircleOptions()
+    base = {parameter.name for parameter in BASE_PARAMETERS}
+    if model.belief is None or set(model.belief.names) != base:
+        raise InputError("the model has no belief over wheel radius, axial distance and x_icr; name a file that does")
+    circle = Circle()
+    task = circle.paper() if mode == "paper" else circle
+    settings = DiscoSettings.paper() if mode == "paper" else DiscoSettings()
+    runs: dict[str, list[Run]] = {}
+    for name in CURVES:
+        runs[name] = [
+            drive(planner_command(_knowing(name, model, theta), task, settings, options, seed), theta, options, seed)
+            for seed, theta in enumerate(plants(model, options.seeds))
+        ]
+        result = CircleResult(options, circle, mode, {name: runs[name]})
+        if progress is not None:
+            progress(f"{name}: mean cost {result.rows()[0]['mean_cost']:.4f}")
+    return CircleResult(options, circle, mode, runs)
+
+
+def plants(model: Model, count: int) -> list[dict[str, float]]:
+    """Parameters of `count` plants drawn from the model's belief, within physical ranges."""
+    assert model.belief is not None
+    draws = model.belief.draw(count, np.random.default_rng(0))
+    full = model.complete(draws, model.belief.names)
+    return [dict(zip(model.parameter_names, row, strict=True)) for row in full.tolist()]
+
+
+def _knowing(name: str, model: Model, theta: dict[str, float]) -> Model:
+    """The controller's model for a curve."""
+    bare = replace(model, belief=None)
+    match name:
+        case "prior":
+            prior = config.Prior()
+            low, high = np.array([getattr(prior, parameter.name) for parameter in BASE_PARAMETERS]).T
+            return replace(model, belief=Uniform(tuple(p.name for p in BASE_PARAMETERS), low, high))
+        case "posterior":
+            return model
+        case "point estimate":
+            return bare.with_point(POINT_ESTIMATE)
+        case _:
+            return bare.with_point(theta)
+
+
+def planner_command(model: Model, task: Circle, settings: DiscoSettings, options: CircleOptions, seed: int) -> Command:
+    """DISCO as a function from time (ns) and state to wheel speeds."""
+    limits = WheelLimits(options.largest_rot_s * ROTATION, options.largest_rot_s2 * ROTATION)
+    planner = Disco(model, task, settings, limits, seed)
+    return lambda now_ns, state: planner.plan(now_ns, state).at(now_ns)
+
+
+def drive(command: Command, theta: dict[str, float], options: CircleOptions, seed: int) -> Run:
+    """Drive a plant with these parameters by a controller for the whole duration."""
+    circle, period_s = Circle(), 1.0 / options.rate_hz
+    plant = Plant(theta, (circle.radius_m, 0.0, math.pi / 2), options.lag_s, options.wheel_noise, seed)
+    count = round(options.duration_s * options.rate_hz)
+    poses, speeds, commands = np.empty((count, 3)), np.empty(count), np.empty((count, 2))
+    sent: list[SentCommand] = []
+    for step in range(count):
+        now_ns = round(step * period_s * 1e9)
+        state = PlannerState(now_ns, plant.x_m, plant.y_m, plant.yaw_rad, *plant.wheels, sent=tuple(sent))
+        left, right = command(now_ns, state)
+        commands[step] = left, right
+        sent.append(SentCommand(now_ns, left, right))
+        del sent[: -max(1, round(MEMORY_S * options.rate_hz))]
+        plant.advance(left, right, period_s)
+        poses[step], speeds[step] = (plant.x_m, plant.y_m, plant.yaw_rad), plant.forward_m_s
+    return Run(poses, speeds, commands)
+
+
+def _running_mean(costs: Array) -> Array:
+    """Mean so far along the last axis."""
+    return np.asarray(np.cumsum(costs, axis=-1) / np.arange(1, costs.shape[-1] + 1))
