@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-VERBS = ["demo", "run", "sim", "ctl", "check", "replay", "estop", "infer", "gap", "view", "log"]
+VERBS = ["demo", "run", "sim", "drive", "ctl", "check", "replay", "estop", "infer", "gap", "view", "experiment", "log"]
 
 
 def disco(*arguments: str) -> subprocess.CompletedProcess[str]:
