@@ -71,15 +71,10 @@ class CircleResult:
 
     def costs(self, name: str) -> Array:
         """Instant costs (seeds, N) of a curve."""
-        return np.array(
-            [
-                [
-                    self.circle.instant_cost(0.0, x, y, v)
-                    for (x, y, _), v in zip(run.poses, run.forward_m_s, strict=True)
-                ]
-                for run in self.runs[name]
-            ]
-        )
+        x, y, _ = np.array([run.poses for run in self.runs[name]]).transpose(2, 0, 1)
+        forward = np.array([run.forward_m_s for run in self.runs[name]])
+        distance = np.hypot(x - self.circle.center_x_m, y - self.circle.center_y_m) - self.circle.radius_m
+        return np.asarray(np.hypot(distance, forward - self.circle.speed_m_s))
 
     def rows(self) -> list[dict[str, float | str]]:
         """For each curve: mean cost, its standard deviation over seeds, mean cost of the last half, command change.

@@ -1,0 +1,85 @@
+"""Parameter points: from beliefs to what every sequence is rolled out under."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from disco_hw.control.parameter_points import drawn_points, mean_point, moments, point_estimate, twins, unscented_points
+from disco_hw.model import EffectSetting, Gaussian, Mixture, Model, load_model
+
+PAPER = load_model(Path(__file__).parents[2] / "disco_hw/robots/wombot_model.toml")
+LAG = EffectSetting("motor_lag", {"tau_s": 0.1})
+BIAS = EffectSetting("heading_bias", {"bias_rad": 0.1})
+
+
+def test_unscented_points_carry_the_beliefs_moments_over_all_parameters():
+    points, weights = unscented_points(PAPER, 1.0)
+    order = [PAPER.parameter_names.index(name) for name in PAPER.belief.names]
+    np.testing.assert_allclose((weights @ points)[order], PAPER.belief.mean())
+    offsets = points[:, order] - PAPER.belief.mean()
+    np.testing.assert_allclose(
+        np.einsum("l,li,lj->ij", weights, offsets, offsets), PAPER.belief.covariance(), atol=1e-12
+    )
+
+
+def test_two_points_differ_from_the_mean_in_x_icr_alone():
+    points, _ = unscented_points(PAPER, 0.5)
+    found = twins(PAPER, points)
+    np.testing.assert_array_equal(found[0], [3, 6])
+    np.testing.assert_array_equal(found[[3, 6]], np.full((2, 2), -2))
+    np.testing.assert_array_equal(found[[1, 2, 4, 5]], np.full((4, 2), -1))
+    np.testing.assert_array_equal(points[[3, 6], :2], points[[0, 0], :2])
+    assert points[3, 2] > points[0, 2] > points[6, 2]
+
+
+def test_without_twins_there_are_none():
+    model = Model(0.06, 0.4, belief=Gaussian(("wheel_radius_m",), np.array([0.06]), np.array([[1e-5]])))
+    np.testing.assert_array_equal(twins(model, unscented_points(model, 1.0)[0]), np.full((3, 2), -1))
+
+
+def test_points_are_kept_in_their_physical_range():
+    belief = Gaussian(("wheel_radius_m", "motor_lag.tau_s"), np.array([0.06, 0.05]), np.diag([0.01, 0.01]))
+    model = Model(0.06, 0.4, effects=(LAG,), belief=belief)
+    for points in (unscented_points(model, 1.0)[0], drawn_points(model, 500, 1, 0)):
+        assert points[:, 0].min() == 0.005
+        assert points[:, 3].min() == 0.0
+
+
+def test_parameters_that_only_measure_make_no_points():
+    names = ("wheel_radius_m", "heading_bias.bias_rad")
+    belief = Gaussian(names, np.array([0.06, 0.1]), np.diag([1e-5, 0.01]))
+    assert unscented_points(Model(0.06, 0.4, effects=(BIAS,), belief=belief), 1.0)[0].shape == (3, 4)
+    only = Gaussian(names[1:], np.array([0.1]), np.array([[0.01]]))
+    assert unscented_points(Model(0.06, 0.4, effects=(BIAS,), belief=only), 1.0)[0].shape == (1, 4)
+
+
+@pytest.mark.parametrize(("weight", "mean"), [(0.95, 0.06), (0.6, 0.6 * 0.06 + 0.4 * 0.1)])
+def test_a_mixture_counts_by_its_dominant_component_or_as_a_whole(weight, mean):
+    one = Gaussian(("wheel_radius_m",), np.array([0.06]), np.array([[1e-5]]))
+    other = Gaussian(("wheel_radius_m",), np.array([0.1]), np.array([[1e-5]]))
+    mixture = Mixture(np.array([weight, 1.0 - weight]), (one, other))
+    assert moments(mixture)[0][0] == pytest.approx(mean)
+
+
+def test_draws_are_a_function_of_seed_and_step():
+    one, same = (drawn_points(PAPER, 50, 7, 3) for _ in range(2))
+    np.testing.assert_array_equal(one, same)
+    assert not np.any(drawn_points(PAPER, 50, 7, 4)[:, 0] == one[:, 0])
+    assert not np.any(drawn_points(PAPER, 50, 8, 3)[:, 0] == one[:, 0])
+
+
+def test_the_command_delay_is_drawn_at_its_mean():
+    names = ("wheel_radius_m", "command_delay.delay_s")
+    belief = Gaussian(names, np.array([0.06, 0.1]), np.diag([1e-5, 1e-3]))
+    model = Model(0.06, 0.4, effects=(EffectSetting("command_delay", {"delay_s": 0.2}),), belief=belief)
+    draws = drawn_points(model, 20, 1, 0)
+    np.testing.assert_array_equal(draws[:, 3], 0.1)
+    assert np.ptp(draws[:, 0]) > 0.0
+
+
+def test_point_and_mean():
+    model = replace(PAPER, wheel_radius_m=0.07)
+    np.testing.assert_allclose(point_estimate(model)[0], [[0.07, 0.415, 0.238]])
+    np.testing.assert_allclose(mean_point(model), [[0.061, 0.415, 0.238]])

@@ -1,0 +1,59 @@
+"""From costs under each parameter point to one cost: mean, mean of the worst part, worst."""
+
+import numpy as np
+import pytest
+from numba import njit
+
+from disco_hw.control import reference
+from disco_hw.control.blocks import BLOCK, aligned_zeros
+from disco_hw.control.risk import mean_over_points, worst_over_points
+
+B = int(BLOCK)
+
+
+@njit
+def run_mean(costs, point_costs, weights, blocks):
+    mean_over_points(costs, point_costs, weights, blocks)
+
+
+@njit
+def run_worst(costs, point_costs, weights, blocks, part, order):
+    worst_over_points(costs, point_costs, weights, blocks, part, order)
+
+
+@pytest.fixture
+def case():
+    rng = np.random.default_rng(3)
+    weights = rng.uniform(0.1, 1.0, 7)
+    return rng.gamma(2.0, size=(7, B)).astype(np.float32), (weights / weights.sum()).astype(np.float32)
+
+
+def test_mean_adds_to_what_is_there(case):
+    point_costs, weights = case
+    costs = aligned_zeros(B)
+    costs[:] = 1.0
+    run_mean(costs, point_costs.ravel(), weights, 1)
+    np.testing.assert_allclose(costs, 1.0 + reference.mean_risk(point_costs, weights), rtol=1e-5)
+
+
+@pytest.mark.parametrize("part", [0.05, 0.25, 0.6, 0.99])
+def test_cvar_is_the_mean_of_the_worst_part(case, part):
+    point_costs, weights = case
+    costs = aligned_zeros(B)
+    run_worst(costs, point_costs.ravel(), weights, 1, np.float32(part), np.zeros(7, np.int64))
+    np.testing.assert_allclose(costs, reference.cvar_risk(point_costs, weights, part), rtol=1e-5)
+
+
+def test_a_vanishing_part_is_the_worst_point(case):
+    point_costs, weights = case
+    costs = aligned_zeros(B)
+    run_worst(costs, point_costs.ravel(), weights, 1, np.float32(1e-6), np.zeros(7, np.int64))
+    np.testing.assert_allclose(costs, point_costs.max(axis=0), rtol=1e-6)
+
+
+def test_points_of_weight_zero_do_not_count(case):
+    point_costs, weights = case
+    weights[0], point_costs[0] = 0.0, 1e3
+    costs = aligned_zeros(B)
+    run_worst(costs, point_costs.ravel(), weights, 1, np.float32(1e-6), np.zeros(7, np.int64))
+    np.testing.assert_allclose(costs, point_costs[1:].max(axis=0), rtol=1e-6)

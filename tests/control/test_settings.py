@@ -1,0 +1,57 @@
+"""Settings: the paper's, those of robot.toml, and what is refused."""
+
+import math
+
+import pytest
+
+from disco_hw.config import Control, Robot
+from disco_hw.control import DiscoSettings, Sampler, WheelLimits
+from disco_hw.control.settings import ROTATION
+
+
+def test_paper_mode_is_the_appendix_table():
+    settings = DiscoSettings.paper()
+    sampler = settings.sampler
+    assert (sampler.samples, sampler.horizon, sampler.temperature, settings.ut_alpha) == (400, 50, 0.1, 0.5)
+    assert (sampler.noise_std / ROTATION) ** 2 == pytest.approx(0.25)
+    assert sampler.control_cost_weight == sampler.temperature
+    assert sampler.knots is None
+    assert (sampler.update_from, sampler.beyond_end, sampler.with_nominal) == ("drawn", "zero", False)
+
+
+def test_from_config_takes_size_mode_and_uncertainty():
+    settings = DiscoSettings.from_config(Control(samples=64, horizon=20, step_s=0.2, uncertainty="mc"))
+    assert (settings.sampler.samples, settings.sampler.horizon, settings.step_s) == (64, 20, 0.2)
+    assert settings.uncertainty == "mc"
+    assert settings.sampler.knots == 8
+    assert DiscoSettings.from_config(Control(mode="paper")).sampler.knots is None
+
+
+def test_limits_of_the_robot():
+    robot = Robot(name="r", wheel_radius_m=0.06, axial_distance_m=0.3, ticks_per_rev=1, max_wheel_speed_rad_s=7.0)
+    assert WheelLimits.of_robot(robot) == WheelLimits(7.0, 20.0)
+    assert WheelLimits(7.0).acceleration_rad_s2 == math.inf
+
+
+@pytest.mark.parametrize(
+    ("values", "fault"),
+    [
+        ({"samples": 1}, "samples: must be at least 2"),
+        ({"horizon": 1}, "horizon"),
+        ({"noise_std": 0.0}, "noise_std: must be above 0"),
+        ({"knots": 3}, "knots: must be at least 4, or None"),
+        ({"temperature": 0.0}, "temperature"),
+        ({"target_ess": 0.5}, "target_ess"),
+        ({"worst_part": 0.0}, "worst_part"),
+        ({"control_cost_weight": -1.0}, "control_cost_weight"),
+    ],
+)
+def test_samplers_that_make_no_sense_are_refused(values, fault):
+    with pytest.raises(ValueError, match=fault):
+        Sampler(**values)
+
+
+def test_negative_weights_have_no_worst_part():
+    with pytest.raises(ValueError, match="only risk 'mean' has a meaning"):
+        DiscoSettings(sampler=Sampler(risk="cvar"), ut_alpha=0.5)
+    DiscoSettings(sampler=Sampler(risk="cvar"), ut_alpha=1.0)

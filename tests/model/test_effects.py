@@ -1,0 +1,182 @@
+"""Every effect: registered, described, does what it says in kernel and reference, and nothing when neutral."""
+
+import math
+
+import numpy as np
+import pytest
+
+from disco_hw.model import EffectSetting, Model, reference
+from disco_hw.model.effects import (
+    MOTION_EFFECTS,
+    REGISTRY,
+    Channel,
+    encoder_scale,
+    heading_bias,
+    pose_latency,
+    pose_offset,
+)
+from disco_hw.model.free_run import FreeRun
+
+NAMES = {
+    Channel.COMMAND_TO_WHEEL: {
+        "motor_lag", "command_delay", "deadband", "stiction", "speed_limit", "yaw_rate_limit", "battery_sag",
+        "wheel_gain",
+    },
+    Channel.WHEEL_TO_BODY: {
+        "encoder_scale", "wheel_radius_asymmetry", "turn_slip", "acceleration_slip", "side_slip", "lateral_icr",
+        "slope", "surface_change",
+    },
+    Channel.POSE_SENSOR: {"pose_latency", "pose_offset", "heading_bias"},
+}  # fmt: skip
+BASE = (0.06, 0.4, 0.1)
+STEP_S = 0.1
+
+
+def neutral(effect):
+    """Values at which an effect does nothing."""
+    return {p.name: p.high if math.isinf(p.neutral) else p.neutral for p in effect.parameters}
+
+
+def free_run(effects, commands, start=(0.0, 0.0, 0.0, 0.0, 0.0), time_s=0.0):
+    # All effects are there, the others at their neutral values: one kernel to compile, and neutral must be neutral.
+    values = {name: neutral(REGISTRY[name]) for name in MOTION_EFFECTS} | effects
+    model = Model(*BASE, effects=tuple(EffectSetting(name, given) for name, given in values.items()))
+    past = np.zeros((3, 2))
+    run = FreeRun(model, model.point()[None], STEP_S)
+    return run.states(np.array(start), np.vstack([past, commands]), 3, time_s)
+
+
+def by_reference(effects, commands, start=(0.0, 0.0, 0.0, 0.0, 0.0), time_s=0.0):
+    model = Model(*BASE, effects=tuple(EffectSetting(name, values) for name, values in effects.items()))
+    theta = reference.theta_of(model.parameter_names, model.point())
+    in_force = reference.delayed(np.vstack([np.zeros((3, 2)), commands]), 3, theta, STEP_S)
+    states = [reference.State(*start)]
+    for t, (left, right) in enumerate(in_force):
+        states.append(reference.step(theta, states[-1], left, right, STEP_S, time_s + t * STEP_S)[0])
+    return np.array([[s.x, s.y, s.yaw, s.wheel_left, s.wheel_right] for s in states])
+
+
+STRAIGHT = np.full((20, 2), 4.0)
+SPIN = np.tile([-4.0, 4.0], (20, 1))
+TURN = np.tile([2.0, 5.0], (20, 1))
+START_STOP = np.repeat([[0.0, 0.0], [5.0, 5.0], [0.0, 0.0], [-3.0, -4.0]], 5, axis=0)
+
+
+def test_all_names_are_registered_in_their_channels():
+    for channel, names in NAMES.items():
+        assert {name for name, effect in REGISTRY.items() if effect.channel is channel} == names
+    assert set(MOTION_EFFECTS) == {name for name, effect in REGISTRY.items() if effect.moves}
+
+
+@pytest.mark.parametrize("effect", REGISTRY.values(), ids=lambda effect: effect.name)
+def test_effects_describe_themselves(effect):
+    assert effect.parameters
+    for parameter in effect.parameters:
+        assert parameter.low < parameter.high
+        for start in (parameter.start, *parameter.starts):
+            assert parameter.low <= start <= parameter.high
+    sentence = effect.sentence.format(**{p.name: p.start for p in effect.parameters})
+    assert sentence[0].islower()
+    assert "{" not in sentence
+    assert effect.excitation
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "commands"),
+    [
+        ("motor_lag", {"tau_s": 0.15}, START_STOP),
+        ("command_delay", {"delay_s": 0.23}, START_STOP),
+        ("deadband", {"width_rad_s": 0.7}, START_STOP),
+        ("stiction", {"threshold_rad_s": 4.5}, START_STOP),
+        ("speed_limit", {"limit_rad_s": 3.0}, START_STOP),
+        ("yaw_rate_limit", {"limit_rad_s": 0.6}, SPIN),
+        ("battery_sag", {"loss": 0.5}, START_STOP),
+        ("wheel_gain", {"left": -0.1, "right": 0.05}, TURN),
+        ("wheel_radius_asymmetry", {"ratio": 0.03}, STRAIGHT),
+        ("turn_slip", {"k_s": 0.2}, SPIN),
+        ("acceleration_slip", {"k_s2_m": 0.2}, START_STOP),
+        ("side_slip", {"k_s": 0.15}, TURN),
+        ("lateral_icr", {"offset_m": 0.05}, SPIN),
+        ("slope", {"drift_x_m_s": 0.02, "drift_y_m_s": -0.01}, START_STOP),
+        ("surface_change", {"track": 0.15, "time_s": 60.65, "radius": -0.03}, TURN),
+    ],
+)
+def test_kernel_and_reference_agree_and_the_effect_shows(name, values, commands):
+    got = free_run({name: values}, commands, time_s=60.0)
+    np.testing.assert_allclose(got, by_reference({name: values}, commands, time_s=60.0), atol=1e-9)
+    assert np.abs(got - free_run({}, commands))[:, :3].max() > 2e-3
+
+
+def test_lag_and_delay_and_limits_act_on_the_wheels():
+    lagged = free_run({"motor_lag": {"tau_s": 0.1}}, STRAIGHT)[:, 3]
+    np.testing.assert_allclose(lagged, 4.0 * (1.0 - np.exp(-np.arange(21))), atol=1e-12)
+    delayed = free_run({"command_delay": {"delay_s": 0.15}}, STRAIGHT)[1:, 3]
+    np.testing.assert_allclose(delayed, [0.0, 2.0, *[4.0] * 18], atol=1e-12)
+    assert free_run({"speed_limit": {"limit_rad_s": 3.0}}, STRAIGHT)[-1, 3] == pytest.approx(3.0)
+    assert free_run({"deadband": {"width_rad_s": 0.5}}, -STRAIGHT)[-1, 3] == pytest.approx(-3.5)
+    assert free_run({"battery_sag": {"loss": 0.15}}, STRAIGHT, time_s=100.0)[1, 3] == pytest.approx(3.6)
+    left, right = free_run({"wheel_gain": {"left": 0.1, "right": -0.1}}, STRAIGHT)[-1, 3:]
+    assert (left, right) == pytest.approx((4.4, 3.6))
+
+
+def test_yaw_rate_limit_keeps_the_mean_and_cuts_the_turn():
+    states = free_run({"yaw_rate_limit": {"limit_rad_s": 0.3}}, TURN)
+    assert states[-1, 2] / 2.0 == pytest.approx(0.3)
+    assert states[-1, 3:].mean() == pytest.approx(3.5)
+
+
+def test_stiction_holds_a_wheel_at_rest_but_not_a_turning_one():
+    weak = np.full((10, 2), 0.5)
+    held = free_run({"stiction": {"threshold_rad_s": 0.7}}, weak)
+    turning = free_run({"stiction": {"threshold_rad_s": 0.7}}, weak, start=(0.0, 0.0, 0.0, 2.0, 2.0))
+    assert held[-1, 3] == 0.0
+    assert turning[-1, 3] == pytest.approx(0.5)
+
+
+def test_body_effects_act_on_the_velocities_they_name():
+    asymmetric = free_run({"wheel_radius_asymmetry": {"ratio": 0.02}}, STRAIGHT)
+    assert asymmetric[-1, 2] == pytest.approx(0.06 * 4.0 * 0.04 / 0.4 * 2.0)
+    omega = 0.06 * 8.0 / 0.4
+    assert free_run({"turn_slip": {"k_s": 0.1}}, SPIN)[-1, 2] == pytest.approx(omega * (1.0 - 0.1 * omega) * 2.0)
+    assert free_run({"turn_slip": {"k_s": 2.0}}, SPIN)[-1, 2] == pytest.approx(omega)
+    first = free_run({"lateral_icr": {"offset_m": 0.05}}, SPIN)[1]
+    plain = free_run({}, SPIN)[1]
+    assert first[0] - plain[0] == pytest.approx(0.05 * math.sin(omega * 0.1))
+    half = 0.06 * 3.0 / 0.4 / 2.0 * 0.1
+    slid = free_run({"side_slip": {"k_s": 0.2}}, TURN)[1, :2] - free_run({}, TURN)[1, :2]
+    across = -slid[0] * math.sin(half) + slid[1] * math.cos(half)
+    assert across == pytest.approx(-0.2 * (0.06 * 3.5) * (0.06 * 3.0 / 0.4) * 0.1, rel=1e-3)
+    slipping = free_run({"acceleration_slip": {"k_s2_m": 0.1}}, STRAIGHT)
+    acceleration = 0.06 * 4.0 / 0.1
+    assert slipping[1, 0] == pytest.approx(0.06 * 4.0 * 0.1 * (1.0 - 0.1 * acceleration))
+    assert slipping[2, 0] - slipping[1, 0] == pytest.approx(0.06 * 4.0 * 0.1)
+
+
+def test_a_slope_moves_only_a_robot_whose_wheels_turn():
+    values = {"slope": {"drift_x_m_s": 0.02, "drift_y_m_s": 0.01}}
+    np.testing.assert_array_equal(free_run(values, np.zeros((10, 2)))[-1, :2], [0.0, 0.0])
+    moved = free_run(values, STRAIGHT)[-1, :2] - free_run({}, STRAIGHT)[-1, :2]
+    np.testing.assert_allclose(moved, [0.04, 0.02], atol=1e-12)
+
+
+def test_a_surface_changes_at_its_time():
+    states = free_run({"surface_change": {"track": 0.5, "time_s": 1.0, "radius": 0.0}}, SPIN)
+    rates = np.diff(states[:, 2]) / STEP_S
+    np.testing.assert_allclose(rates[:10], 1.2, rtol=1e-7)
+    np.testing.assert_allclose(rates[10:], 0.8, rtol=1e-7)
+
+
+def test_measurement_effects_change_what_is_measured():
+    left, right = encoder_scale.measured(np.array([2.0]), np.array([4.0]), np.array([0.1, -0.05]))
+    assert (left[0], right[0]) == pytest.approx((2.2, 3.8))
+    x, y = pose_offset.measured(np.array([1.0]), np.array([2.0]), np.array([math.pi / 2]), np.array([0.3, 0.1]))
+    assert (x[0], y[0]) == pytest.approx((0.9, 2.3))
+    assert heading_bias.measured(np.array([1.0]), np.array([0.2]))[0] == pytest.approx(1.2)
+    assert pose_latency.true_time_s(np.array([5.0]), np.array([0.15]))[0] == pytest.approx(4.85)
+
+
+def test_an_unknown_effect_or_parameter_is_refused():
+    with pytest.raises(ValueError, match="unknown effect 'slip'"):
+        EffectSetting("slip", {})
+    with pytest.raises(ValueError, match=r"turn_slip\.k: no such parameter; turn_slip has k_s"):
+        EffectSetting("turn_slip", {"k": 0.1})
