@@ -236,16 +236,8 @@ class Disco:
         task, self._memory = self._task.terms(
             task_s, x, y, self._memory, self._settings.step_s, self._settings.sampler.horizon
         )
-        self._start[:] = (
-            x - origin_x,
-            y - origin_y,
-            math.cos(yaw),
-            math.sin(yaw),
-            left,
-            right,
-            elapsed_s,
-            self._memory,
-        )
+        direction = (math.cos(yaw), math.sin(yaw)) if math.isfinite(yaw) else (math.nan, math.nan)
+        self._start[:] = (x - origin_x, y - origin_y, *direction, left, right, elapsed_s, self._memory)
         if self._history:
             self._past = past_commands(state.sent, t0_ns, self._settings.step_s, self._history, (left, right))
             self._optimiser.set_past(self._past)

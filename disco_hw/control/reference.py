@@ -38,8 +38,9 @@ def circle_cost(circle: Circle, step_s: float) -> SequenceCost:
         x, y = x - circle.center_x_m, y - circle.center_y_m
         off_edge = np.hypot(x[1:], y[1:]) - circle.radius_m
         paper = np.hypot(off_edge, forward - circle.speed_m_s).sum(axis=0)
-        progress = (x[:-1] * y[1:] - y[:-1] * x[1:]) / (step_s * circle.radius_m)
-        missing = circle.progress_part * circle.speed_m_s * len(forward) - progress.sum(axis=0)
+        closest = np.maximum(x[1:] ** 2 + y[1:] ** 2, (circle.radius_m / 2.0) ** 2)
+        angle = (x[:-1] * y[1:] - y[:-1] * x[1:]) / closest
+        missing = circle.progress_part * circle.speed_m_s * len(forward) - circle.radius_m / step_s * angle.sum(axis=0)
         last = circle.terminal_s / step_s * np.abs(off_edge[-1])
         return np.asarray(paper + circle.progress_weight * np.maximum(missing, 0.0) + last)
 

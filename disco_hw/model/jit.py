@@ -116,7 +116,15 @@ def _cast_like(value: Any, like: Any) -> Callable[..., Any]:
 
 
 @scalar_function
-def quick_norm(x: Any, y: Any) -> Any:
-    """Length of a vector by way of the reciprocal root, which a loop with `tune_loops` estimates; of zero, 1e-15."""
+def quick_norm_and_inverse(x: Any, y: Any) -> Any:
+    """Length of a vector and its reciprocal, which a loop with `tune_loops` estimates; of zero, 1e-15 and 1e15."""
     square = x * x + (y * y + cast_like(1e-30, x))
-    return square * (cast_like(1.0, x) / math.sqrt(square))
+    inverse = cast_like(1.0, x) / math.sqrt(square)
+    return square * inverse, inverse
+
+
+@scalar_function
+def quick_norm(x: Any, y: Any) -> Any:
+    """Length of a vector, as of `quick_norm_and_inverse`."""
+    norm, _ = quick_norm_and_inverse(x, y)
+    return norm

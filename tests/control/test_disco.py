@@ -1,77 +1,252 @@
-"""The planner as a whole: it drives the circle, repeats itself bit for bit and answers as a function of time."""
+"""The planner as a whole: it drives the circle, repeats itself bit for bit, and falls soft when nothing works."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from disco_hw.control import Circle, Disco, DiscoSettings, PlannerState, SentCommand, WheelLimits
-from disco_hw.model import load_model
+from disco_hw.control import (
+    Circle,
+    Disco,
+    DiscoSettings,
+    NoValidControl,
+    Outcome,
+    PlannerState,
+    Sampler,
+    SentCommand,
+    WheelLimits,
+)
+from disco_hw.control.experiments.plant import Plant
+from disco_hw.model import EffectSetting, Gaussian, load_model
 
 MODEL = load_model(Path(__file__).parents[2] / "disco_hw/robots/wombot_model.toml")
+MEAN = {"wheel_radius_m": 0.061, "axial_distance_m": 0.415, "x_icr_m": 0.238}
 LIMITS = WheelLimits(8.0, 20.0)
 TANGENT = PlannerState(0, 0.75, 0.0, math.pi / 2, 0.0, 0.0)
+PERIOD_NS = 100_000_000
 
 
-def drive(planner: Disco, seconds: float, period_s: float = 0.1):
-    """Drive the paper's unicycle with a wheel lag of 0.1 s; returns the instant costs."""
-    radius, axial, x_icr = 0.061, 0.415, 0.238
-    x, y, yaw, wheels = TANGENT.x_m, TANGENT.y_m, TANGENT.yaw_rad, np.zeros(2)
-    costs, sent, now_ns = [], (), 0
-    for _ in range(round(seconds / period_s)):
-        plan = planner.plan(now_ns, PlannerState(now_ns, x, y, yaw, wheels[0], wheels[1], sent))
-        command = plan.at(now_ns)
-        sent = (SentCommand(now_ns, *command),)
-        for _ in range(20):
-            dt = period_s / 20
-            wheels = wheels + (np.array(command) - wheels) * dt / 0.1
-            v, omega = radius * wheels.mean(), radius * (wheels[1] - wheels[0]) / axial
-            x += dt * (v * math.cos(yaw) + omega * x_icr * math.sin(yaw))
-            y += dt * (v * math.sin(yaw) - omega * x_icr * math.cos(yaw))
-            yaw += dt * omega
-        costs.append(planner.task.instant_cost(0.0, x, y, v))
-        now_ns += round(period_s * 1e9)
-    return np.array(costs)
+def planner(model=MODEL, task=None, seed=3, limits=LIMITS, **changes):
+    return Disco(model, task or Circle(), replace(DiscoSettings(), **changes), limits, seed)
 
 
-@pytest.fixture(scope="module")
-def planner():
-    disco = Disco(MODEL, Circle(), DiscoSettings(), LIMITS, seed=3)
-    disco.warm_up()
-    return disco
+def drive(disco, seconds, start=(0.75, 0.0, math.pi / 2), period_s=0.1, wheel_noise=0.0, lag_s=0.1):
+    """Drive a plant with the posterior's mean; returns instant costs and commands."""
+    plant = Plant(MEAN, start, lag_s, wheel_noise, 1)
+    costs, commands, sent = [], [], ()
+    for step in range(round(seconds / period_s)):
+        now_ns = round(step * period_s * 1e9)
+        state = PlannerState(now_ns, plant.x_m, plant.y_m, plant.yaw_rad, *plant.wheels, sent=sent)
+        command = disco.plan(now_ns, state).at(now_ns)
+        sent = (*sent[-20:], SentCommand(now_ns, *command))
+        plant.advance(*command, period_s)
+        costs.append(disco.task.instant_cost(0.0, plant.x_m, plant.y_m, plant.forward_m_s))
+        commands.append(command)
+    return np.array(costs), np.array(commands)
 
 
-def test_drives_the_circle_from_rest(planner):
-    planner.reset()
-    costs = drive(planner, 20.0)
-    assert costs[100:].mean() < 0.04
+def test_drives_the_circle_smoothly_from_rest():
+    costs, commands = drive(planner(), 20.0, wheel_noise=0.05)
+    assert costs[100:].mean() < 0.03
+    assert np.abs(np.diff(commands, axis=0)).mean() / (2.0 * math.pi) < 0.03
+
+
+def test_replanning_faster_does_not_make_the_command_restless():
+    _, slow = drive(planner(), 15.0, period_s=0.1, wheel_noise=0.05)
+    _, fast = drive(planner(), 15.0, period_s=0.02, wheel_noise=0.05)
+    steady_slow, steady_fast = slow[50:], fast[250:]
+    in_a_tenth = [np.abs(steady_slow[1:] - steady_slow[:-1]).mean(), np.abs(steady_fast[5:] - steady_fast[:-5]).mean()]
+    assert in_a_tenth[1] < in_a_tenth[0]
+    travel = [np.abs(np.diff(steady_slow, axis=0)).mean() * 10.0, np.abs(np.diff(steady_fast, axis=0)).mean() * 50.0]
+    assert travel[1] < 1.1 * travel[0]
 
 
 def test_the_same_seed_and_states_give_the_same_plans_bit_for_bit():
     plans = []
     for _ in range(2):
-        disco = Disco(MODEL, Circle(), DiscoSettings(), LIMITS, seed=5)
-        plans.append([disco.plan(t * 20_000_000, TANGENT) for t in range(5)])
+        disco = planner(seed=5)
+        plans.append([disco.plan(t * PERIOD_NS, TANGENT) for t in range(5)])
     for one, other in zip(*plans, strict=True):
         np.testing.assert_array_equal(one.wheel_speeds, other.wheel_speeds)
         np.testing.assert_array_equal(one.trajectory, other.trajectory)
         assert one.diagnostics == other.diagnostics
-    other_seed = Disco(MODEL, Circle(), DiscoSettings(), LIMITS, seed=6).plan(0, TANGENT)
-    assert not np.array_equal(other_seed.wheel_speeds, plans[0][0].wheel_speeds)
+    assert not np.array_equal(planner(seed=6).plan(0, TANGENT).wheel_speeds, plans[0][0].wheel_speeds)
 
 
-def test_warming_up_changes_no_plan(planner):
-    cold = Disco(MODEL, Circle(), DiscoSettings(), LIMITS, seed=9)
-    warm = Disco(MODEL, Circle(), DiscoSettings(), LIMITS, seed=9)
+def test_warming_up_changes_no_plan():
+    cold, warm = planner(seed=9), planner(seed=9)
     warm.warm_up()
     np.testing.assert_array_equal(cold.plan(0, TANGENT).wheel_speeds, warm.plan(0, TANGENT).wheel_speeds)
 
 
 def test_commands_stay_within_speed_and_acceleration():
-    disco = Disco(MODEL, Circle(speed_m_s=3.0), DiscoSettings(), WheelLimits(2.0, 1.0), seed=1)
+    disco = planner(task=Circle(speed_m_s=3.0), limits=WheelLimits(2.0, 1.0))
     for t in range(20):
-        plan = disco.plan(t * 100_000_000, TANGENT)
+        plan = disco.plan(t * PERIOD_NS, TANGENT)
         assert np.abs(plan.wheel_speeds).max() <= 2.0 + 1e-5
         steps = np.diff(np.vstack([[0.0, 0.0], plan.wheel_speeds]), axis=0)
         assert np.abs(steps).max() <= 0.1 + 1e-5
+
+
+def test_the_first_command_is_tied_to_what_was_sent_and_to_the_measured_wheels():
+    disco = planner(task=Circle(speed_m_s=3.0), limits=WheelLimits(8.0, 5.0))
+    sent = (SentCommand(-PERIOD_NS, 4.0, 4.0),)
+    rolling = disco.plan(0, replace(TANGENT, left_speed_rad_s=4.0, right_speed_rad_s=4.0, sent=sent))
+    assert np.all(np.abs(rolling.wheel_speeds[0] - 4.0) <= 0.5 + 1e-5)
+    disco.reset()
+    blocked = disco.plan(0, replace(TANGENT, sent=sent))
+    assert np.all(blocked.wheel_speeds[0] <= 1.0 + 1e-5)
+
+
+def test_shifting_by_fractions_continues_the_plan():
+    disco = planner(gain_by_time=True)
+    first = disco.plan(0, TANGENT)
+    second = disco.plan(20_000_000, replace(TANGENT, t_ns=20_000_000))
+    at = np.array([second.at(t) for t in range(100_000_000, 4_000_000_000, 100_000_000)])
+    before = np.array([first.at(t) for t in range(100_000_000, 4_000_000_000, 100_000_000)])
+    assert np.abs(at - before).max() < 0.5
+    again = disco.plan(20_000_000, replace(TANGENT, t_ns=20_000_000))
+    np.testing.assert_allclose(again.wheel_speeds, second.wheel_speeds, atol=1e-6)
+
+
+def test_the_predicted_path_starts_at_the_state_and_follows_the_mean_model():
+    plan = planner().plan(0, TANGENT)
+    assert plan.trajectory.shape == (51, 3)
+    np.testing.assert_allclose(plan.trajectory[0], [0.75, 0.0, math.pi / 2])
+    left, right = plan.wheel_speeds[0]
+    turned = plan.trajectory[1, 2] - plan.trajectory[0, 2]
+    assert turned == pytest.approx(0.061 * (right - left) / 0.415 * 0.1, rel=1e-6)
+
+
+def test_a_state_from_before_is_predicted_to_the_plans_start():
+    sent = (SentCommand(0, 4.0, 4.0),)
+    rolling = PlannerState(0, 0.0, 0.0, 0.0, 4.0, 4.0, sent=sent)
+    plan = planner(latency_s=0.05).plan(20_000_000, rolling)
+    assert plan.t0_ns == 70_000_000
+    np.testing.assert_allclose(plan.trajectory[0], [0.061 * 4.0 * 0.07, 0.0, 0.0], atol=1e-9)
+
+
+def test_commands_on_their_way_are_in_the_prediction():
+    delayed = replace(MODEL, belief=None, effects=(EffectSetting("command_delay", {"delay_s": 0.25}),))
+    sent = (SentCommand(-1_000_000_000, 0.0, 0.0), SentCommand(-100_000_000, 5.0, 5.0))
+    plan = planner(delayed).plan(0, PlannerState(0, 0.0, 0.0, 0.0, 0.0, 0.0, sent=sent))
+    x = plan.trajectory[:, 0]
+    np.testing.assert_allclose(np.diff(x)[:2], [0.0, 0.061 * 5.0 * 0.05], atol=1e-9)
+
+
+def test_delay_and_lag_in_the_model_help_a_plant_that_has_them():
+    effects = (EffectSetting("motor_lag", {"tau_s": 0.1}), EffectSetting("command_delay", {"delay_s": 0.3}))
+    knowing, ignorant = planner(replace(MODEL, effects=effects)), planner()
+    costs = []
+    for disco in (knowing, ignorant):
+        plant = Plant(MEAN, (0.75, 0.0, math.pi / 2), 0.1, 0.0, 1)
+        sent, queue, found = (), [(0.0, 0.0)] * 3, []
+        for step in range(200):
+            now_ns = step * PERIOD_NS
+            state = PlannerState(now_ns, plant.x_m, plant.y_m, plant.yaw_rad, *plant.wheels, sent=sent)
+            command = disco.plan(now_ns, state).at(now_ns)
+            sent = (*sent[-20:], SentCommand(now_ns, *command))
+            queue.append(command)
+            plant.advance(*queue.pop(0), 0.1)
+            found.append(disco.task.instant_cost(0.0, plant.x_m, plant.y_m, plant.forward_m_s))
+        costs.append(np.mean(found[100:]))
+    assert costs[0] < 0.04
+    assert costs[0] < costs[1]
+
+
+@pytest.mark.parametrize("uncertainty", ["mc", "joint", "point"])
+def test_every_form_of_uncertainty_drives(uncertainty):
+    costs, _ = drive(planner(uncertainty=uncertainty), 15.0)
+    assert costs[75:].mean() < 0.06
+
+
+@pytest.mark.parametrize("risk", ["cvar", "worst"])
+def test_risk_averse_plans_drive(risk):
+    costs, _ = drive(planner(sampler=Sampler(risk=risk)), 15.0)
+    assert costs[75:].mean() < 0.06
+
+
+def test_own_draws_repeat_bit_for_bit():
+    one, other = (planner(uncertainty="mc", common_draws=False, draws=3) for _ in range(2))
+    np.testing.assert_array_equal(one.plan(0, TANGENT).wheel_speeds, other.plan(0, TANGENT).wheel_speeds)
+
+
+def test_paper_mode_stands_still_and_chatters_as_the_published_code_does():
+    disco = Disco(MODEL, Circle().paper(), DiscoSettings.paper(), WheelLimits(2.0 * math.pi), 1)
+    costs, commands = drive(disco, 20.0, wheel_noise=0.05)
+    assert costs[100:].mean() == pytest.approx(0.203, abs=0.02)
+    assert np.abs(np.diff(commands, axis=0)).mean() / (2.0 * math.pi) == pytest.approx(0.62, abs=0.05)
+
+
+def test_what_was_sampled_can_be_looked_at():
+    disco = planner()
+    plan = disco.plan(0, TANGENT)
+    rollouts = disco.sampled_rollouts(30)
+    assert rollouts.wheel_speeds.shape == (30, 50, 2)
+    assert rollouts.trajectories.shape == (30, 51, 3)
+    assert np.all(np.diff(rollouts.weights) <= 0.0)
+    assert 0.5 < rollouts.weights.sum() <= 1.0 + 1e-6
+    every = disco.sampled_rollouts(400)
+    np.testing.assert_allclose(every.weights.sum(), 1.0, rtol=1e-5)
+    np.testing.assert_allclose(np.einsum("n,ntc->tc", every.weights, every.wheel_speeds), plan.wheel_speeds, atol=1e-3)
+    points = disco.point_trajectories()
+    assert points.shape == (7, 51, 3)
+    np.testing.assert_allclose(points[0], plan.trajectory, atol=1e-9)
+    assert np.abs(points[1] - points[0])[-1].max() > 0.01
+
+
+def test_a_collapse_is_tried_again_and_told():
+    disco = planner(sampler=Sampler(temperature=1e-4), retries=2)
+    found = disco.plan(0, TANGENT).diagnostics
+    assert found.ess < 3.0
+    assert (found.collapsed, found.retries, found.outcome) == (True, 2, Outcome.RETRIED)
+
+
+def test_a_healthy_step_is_neither_retried_nor_collapsed():
+    found = planner().plan(0, TANGENT).diagnostics
+    assert (found.collapsed, found.retries, found.outcome) == (False, 0, Outcome.PLANNED)
+    assert found.ess == pytest.approx(20.0, rel=0.02)
+    assert found.valid_samples == 400
+    assert found.cost_min <= found.cost_mean
+
+
+@pytest.mark.parametrize("broken", [{"x_m": math.nan}, {"yaw_rad": math.inf}, {"x_m": math.inf}])
+def test_without_a_valid_control_it_ramps_to_zero_then_says_so_then_recovers(broken):
+    disco = planner(limits=WheelLimits(8.0, 10.0))
+    sent = (SentCommand(-PERIOD_NS, 3.0, -2.0),)
+    good = replace(TANGENT, left_speed_rad_s=3.0, right_speed_rad_s=-2.0, sent=sent)
+    disco.plan(0, good)
+    bad = replace(good, **broken)
+    for t in (1, 3, 5):
+        plan = disco.plan(t * PERIOD_NS, bad)
+        assert plan.diagnostics.outcome is Outcome.STOPPING
+        assert plan.diagnostics.valid_samples == 0
+        assert np.isfinite(plan.wheel_speeds).all()
+        assert np.abs(plan.wheel_speeds).max() <= 3.0
+        assert not plan.wheel_speeds[4:].any()
+    with pytest.raises(NoValidControl, match=r"no command sequence had a finite cost for 0\.5 s"):
+        disco.plan(7 * PERIOD_NS, bad)
+    assert disco.plan(8 * PERIOD_NS, good).diagnostics.outcome is not Outcome.STOPPING
+
+
+def test_a_broken_plan_is_planned_anew():
+    disco = planner()
+    disco.plan(0, TANGENT)
+    disco._optimiser.work.nominal[:] = np.nan
+    plan = disco.plan(PERIOD_NS, TANGENT)
+    assert plan.diagnostics.outcome is Outcome.RESTARTED
+    assert np.isfinite(plan.wheel_speeds).all()
+
+
+def test_effects_under_the_belief_become_sigma_points():
+    names = (*MODEL.belief.names, "motor_lag.tau_s")
+    covariance = np.zeros((4, 4))
+    covariance[:3, :3] = MODEL.belief.covariance()
+    covariance[3, 3] = 0.02**2
+    belief = Gaussian(names, np.append(MODEL.belief.mean(), 0.15), covariance)
+    model = replace(MODEL, effects=(EffectSetting("motor_lag", {"tau_s": 0.15}),), belief=belief)
+    disco = planner(model)
+    disco.plan(0, TANGENT)
+    assert disco.point_trajectories().shape[0] == 9

@@ -14,21 +14,25 @@ from numpy.typing import NDArray
 
 from disco_hw.config import CircleTask
 from disco_hw.control.tasks.terms import has_memory, stage_cost, terminal_cost
-from disco_hw.model.jit import cast_like, quick_norm, scalar_function, specialise
+from disco_hw.model.jit import cast_like, quick_norm, quick_norm_and_inverse, scalar_function, specialise
+
+# The radius over the distance from the centre below which progress stops growing.
+NEAR_CENTRE = 2.0
 
 
 class CircleTerms(NamedTuple):
     """What the kernel needs of a circle.
 
     Radius (m), speed (m/s); weight of lost progress or None, progress wanted by the end of the horizon (m/s times
-    steps), the progress of sweeping 1 m^2 twice over, 1 / (step * radius); weight of the last distance.
+    steps), progress of a radian (m/s), largest reciprocal square of the radius; weight of the last distance.
     """
 
     radius_m: Any
     speed_m_s: Any
     progress_weight: Any
     wanted: Any
-    per_swept: Any
+    per_rad: Any
+    closest: Any
     terminal_steps: Any
 
 
@@ -38,8 +42,9 @@ class Circle:
 
     d is the distance to the circle's edge, s the longitudinal speed: the paper's cost (section V-B). It alone is 0.2
     for standing still and less for spinning about an offset centre of rotation. Progress takes the reward from both: it
-    is the speed at which area is swept about the centre, over R / 2; what the steps together miss of `progress_part`
-    of s0 costs `progress_weight` times as much as the same miss of speed. A robot that drives round pays nothing. The
+    is R times the angle by which the tracked point moves on about the centre, zero in sum for any loop beside it; what
+    the steps together miss of `progress_part` of s0 costs `progress_weight` times as much as the same miss of speed. A
+    robot that drives round pays nothing. The
     last d counts as much as it would over `terminal_s` more: the way back to the edge begins with a loss, as turning in
     pushes the tracked point out, and would else not pay within the horizon. `Circle.paper` has neither.
     """
@@ -70,7 +75,7 @@ class Circle:
     def terms(
         self, time_s: float, x_m: float, y_m: float, memory: float | None, step_s: float, horizon: int
     ) -> tuple[Any, float]:
-        """Terms for the kernel; nothing depends on time or place. The memory is twice the area swept (m^2)."""
+        """Terms for the kernel; nothing depends on time or place. The memory is the angle swept (rad)."""
         return _terms(self, step_s, horizon), 0.0
 
     def instant_cost(self, time_s: float, x_m: float, y_m: float, forward_m_s: float) -> float:
@@ -94,7 +99,8 @@ def _terms(circle: Circle, step_s: float, horizon: int) -> CircleTerms:
         f32(circle.speed_m_s),
         f32(circle.progress_weight) if circle.progress_weight > 0.0 else None,
         f32(circle.progress_part * circle.speed_m_s * horizon),
-        f32(1.0 / (step_s * circle.radius_m)),
+        f32(circle.radius_m / step_s),
+        f32((NEAR_CENTRE / circle.radius_m) ** 2),
         f32(circle.terminal_s / step_s),
     )
 
@@ -104,11 +110,11 @@ def _is_circle(task: Any) -> bool:
 
 
 @scalar_function
-def _swept(weight: Any, memory: Any, x_old: Any, y_old: Any, x: Any, y: Any) -> Any:
-    """Twice the area swept about the centre so far (m^2)."""
+def _swept(weight: Any, memory: Any, x_old: Any, y_old: Any, x: Any, y: Any, inverse: Any, task: Any) -> Any:
+    """Angle swept about the centre so far (rad); steps near the centre count less than their angle."""
     if weight is None:
         return memory
-    return memory + (x_old * y - y_old * x)
+    return memory + (x_old * y - y_old * x) * min(inverse * inverse, task.closest)
 
 
 @scalar_function
@@ -117,7 +123,7 @@ def _lost(weight: Any, memory: Any, task: Any) -> Any:
     zero = cast_like(0.0, memory)
     if weight is None:
         return zero
-    return weight * max(task.wanted - memory * task.per_swept, zero)
+    return weight * max(task.wanted - memory * task.per_rad, zero)
 
 
 @specialise(stage_cost)
@@ -139,9 +145,10 @@ def _stage_cost(
         sin_yaw: Any,
         forward: Any,
     ) -> Any:
-        off_edge = quick_norm(x, y) - task.radius_m
+        rho, inverse = quick_norm_and_inverse(x, y)
+        off_edge = rho - task.radius_m
         off_speed = forward - task.speed_m_s
-        swept = _swept(task.progress_weight, memory, x_old, y_old, x, y)
+        swept = _swept(task.progress_weight, memory, x_old, y_old, x, y, inverse, task)
         return math.sqrt(off_edge * off_edge + off_speed * off_speed), swept
 
     return cost

@@ -1,0 +1,42 @@
+"""A path by time: being at each place when its time has come."""
+
+from pathlib import Path as FilePath
+
+import numpy as np
+import pytest
+
+from disco_hw.control import Disco, DiscoSettings, PlannerState, WheelLimits
+from disco_hw.control.experiments.plant import Plant
+from disco_hw.control.tasks.timed_path import TimedPath
+from disco_hw.control.tasks.waypoints import Waypoints
+from disco_hw.model import load_model
+
+MODEL = load_model(FilePath(__file__).parents[3] / "disco_hw/robots/wombot_model.toml")
+MEAN = {"wheel_radius_m": 0.061, "axial_distance_m": 0.415, "x_icr_m": 0.238}
+ANGLE = np.linspace(0.0, 2.0 * np.pi, 100)
+ROUND = Waypoints(np.column_stack([np.sin(ANGLE), 1.0 - np.cos(ANGLE)]), 5.0 + 4.0 * ANGLE)
+
+
+def test_places_are_reached_at_their_times_after_waiting_for_the_first():
+    task = TimedPath(ROUND)
+    plant = Plant(MEAN, (0.0, 0.0, 0.3), 0.1, 0.0, 1)
+    disco = Disco(MODEL, task, DiscoSettings(), WheelLimits(8.0, 20.0), 2)
+    off = []
+    for step in range(350):
+        now_ns = 10**12 + step * 100_000_000
+        state = PlannerState(now_ns, plant.x_m, plant.y_m, plant.yaw_rad, *plant.wheels)
+        plant.advance(*disco.plan(now_ns, state).at(now_ns), 0.1)
+        off.append(task.instant_cost((step + 1) * 0.1, plant.x_m, plant.y_m, plant.forward_m_s))
+    assert np.mean(off[60:]) < 0.05
+    assert np.max(off[100:]) < 0.12
+
+
+def test_instant_cost_is_the_distance_to_where_the_robot_should_be():
+    task = TimedPath(ROUND)
+    assert task.instant_cost(0.0, 0.0, 0.0, 1.0) == pytest.approx(0.0)
+    assert task.instant_cost(5.0 + 4.0 * np.pi, 0.0, 0.0, 0.0) == pytest.approx(2.0, abs=1e-3)
+
+
+def test_times_are_needed():
+    with pytest.raises(ValueError, match="have no times"):
+        TimedPath(Waypoints(np.zeros((2, 2))))
