@@ -28,7 +28,12 @@ test: $(STAMP)
 	$(BIN)/mypy
 	$(BIN)/python -m pytest -n 2 --dist worksteal
 
-bench: $(STAMP)
+# The peers that our figures stand beside; nothing else needs them.
+$(VENV)/.peers: $(STAMP)
+	PIP_CONSTRAINT=constraints.txt $(BIN)/python -m pip install --disable-pip-version-check --quiet -e '.[bench]'
+	@touch $@
+
+bench: $(VENV)/.peers
 	$(BIN)/python -m tools.bench
 
 gap-study: $(STAMP)

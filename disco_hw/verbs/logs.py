@@ -1,0 +1,46 @@
+"""Verbs on log files: log info, recover, export."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from disco_hw.verbs.options import (
+    AsJson,
+)
+
+log_app = typer.Typer(help="Look into a log, mend it, hand it on.", no_args_is_help=True)
+
+
+@log_app.command()
+def info(log: Annotated[Path, typer.Argument(metavar="LOG")], as_json: AsJson = False) -> None:
+    """Say what a log holds and whether anything was lost."""
+    from disco_hw.log.commands import info as log_info
+
+    print(log_info(log, as_json))
+
+
+@log_app.command()
+def recover(
+    log: Annotated[Path, typer.Argument(metavar="LOG")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="Where to write the mended log.")],
+    as_json: AsJson = False,
+) -> None:
+    """Copy everything whole from a damaged log into a new one."""
+    from disco_hw.log.commands import recover as log_recover
+
+    print(log_recover(log, out, as_json))
+
+
+@log_app.command()
+def export(
+    log: Annotated[Path, typer.Argument(metavar="LOG")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="Where to write the CSV file.")],
+    as_json: AsJson = False,
+) -> None:
+    """Write commands, encoders and poses as CSV."""
+    from disco_hw.log.commands import export as log_export
+
+    print(log_export(log, out, as_json))

@@ -1,0 +1,29 @@
+"""What several verbs share: their arguments, and how they print."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+RobotFile = Annotated[Path, typer.Argument(metavar="ROBOT.toml", help="The robot's configuration (docs/robot.md).")]
+RobotOption = Annotated[Path, typer.Option("--robot", help="The robot's configuration (docs/robot.md).")]
+ModelOption = Annotated[Path | None, typer.Option("--model", help="Use this model.toml instead of robot.toml's.")]
+LinkOption = Annotated[str | None, typer.Option("--link", help="Use this link instead of robot.toml's: can or serial.")]
+LogFileOption = Annotated[Path | None, typer.Option("--log", help="Record to this file.")]
+Logs = Annotated[list[Path], typer.Argument(metavar="LOG...", help="Logs of driving: MCAP or CSV.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object for machines.")]
+View = Annotated[bool, typer.Option("--view", help="Serve the page beside it, for this host only.")]
+
+
+def progress_line(text: str) -> None:
+    """Write one line of progress to standard error, which leaves standard output to the result."""
+    print(text, file=sys.stderr, flush=True)
+
+
+def print_result(result: dict[str, Any], as_json: bool, text: str) -> None:
+    """Print the result once: as one JSON object, or as text."""
+    print(json.dumps(result) if as_json else text)

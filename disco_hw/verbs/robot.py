@@ -1,0 +1,131 @@
+"""Verbs for whoever stands beside the robot: run, drive, ctl, check, estop."""
+
+from __future__ import annotations
+
+from contextlib import AbstractContextManager, nullcontext
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from disco_hw.verbs.options import (
+    AsJson,
+    LinkOption,
+    LogFileOption,
+    ModelOption,
+    RobotFile,
+    View,
+    print_result,
+)
+from disco_hw.viewer.address import DEFAULT_PORT, LOOPBACK
+
+
+def _page(view: bool, robot: Path, model: Path | None) -> AbstractContextManager[object]:
+    from disco_hw.viewer.beside import page_beside
+
+    return page_beside(robot, model, LOOPBACK, DEFAULT_PORT) if view else nullcontext()
+
+
+def run(
+    robot: RobotFile,
+    model: ModelOption = None,
+    link: LinkOption = None,
+    log_file: LogFileOption = None,
+    view: View = False,
+    as_json: AsJson = False,
+) -> None:
+    """Run the on-robot daemon: connect, estimate, record; arm and start only when told to (`disco-hw ctl`)."""
+    from disco_hw.daemon.realtime import limit_thread_pools
+
+    # Before the numeric libraries are loaded: a pool of threads in them costs the loop its deadlines.
+    limit_thread_pools()
+    from disco_hw.daemon.daemon import DaemonOptions, run_daemon
+
+    with _page(view, robot, model):
+        code = run_daemon(DaemonOptions(robot=robot, model=model, link=link, log_file=log_file, as_json=as_json))
+    raise typer.Exit(code)
+
+
+def drive(
+    robot: RobotFile,
+    gamepad: Annotated[bool, typer.Option("--gamepad", help="Drive with a gamepad instead of the keyboard.")] = False,
+    script: Annotated[
+        str | None, typer.Option(help="Drive by itself while the deadman is held: circle, steps or excite.")
+    ] = None,
+    unattended: Annotated[
+        bool, typer.Option("--unattended", help="Let the script hold the deadman: for virtual robots.")
+    ] = False,
+    seconds: Annotated[float | None, typer.Option(min=0.1, help="Break the script off after so long.")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the random steps.")] = 1,
+    model: ModelOption = None,
+    link: LinkOption = None,
+    log_file: LogFileOption = None,
+    view: View = False,
+    as_json: AsJson = False,
+) -> None:
+    """Drive by keyboard, gamepad or script, and record it for `infer` and `gap` (docs/drive.md)."""
+    from disco_hw.daemon.realtime import limit_thread_pools
+
+    limit_thread_pools()
+    from disco_hw.drive.commands import DriveOptions, run_drive
+
+    with _page(view, robot, model):
+        result = run_drive(
+            DriveOptions(
+                robot=robot,
+                model=model,
+                link=link,
+                log_file=log_file,
+                gamepad=gamepad,
+                script=script,
+                unattended=unattended,
+                seconds=seconds,
+                seed=seed,
+                as_json=as_json,
+            )
+        )
+    print_result(result.as_dict(), as_json, result.as_text())
+    if not result.completed:
+        raise typer.Exit(1)
+
+
+def ctl(
+    robot: RobotFile,
+    do: Annotated[str, typer.Argument(help="arm, start, stop, disarm, reset, estop, status or quit.")],
+    as_json: AsJson = False,
+) -> None:
+    """Tell the running daemon what to do, or ask how it is."""
+    from disco_hw.daemon.client import ask, in_words
+
+    reply = ask(robot, do)
+    print_result(reply, as_json, in_words(reply))
+    if not reply.get("ok", False):
+        raise typer.Exit(1)
+
+
+def check(
+    robot: RobotFile,
+    link: LinkOption = None,
+    as_json: AsJson = False,
+) -> None:
+    """Preflight: link, firmware match, latency, bus load, real-time settings, limits. Nothing moves."""
+    from disco_hw.check import run_check
+
+    report = run_check(robot, link)
+    print_result(report.as_dict(), as_json, report.as_text())
+    if not report.ok:
+        raise typer.Exit(1)
+
+
+def estop(
+    robot: RobotFile,
+    link: LinkOption = None,
+    as_json: AsJson = False,
+) -> None:
+    """Stop the robot now, whatever state anything else is in."""
+    from disco_hw.emergency import stop_robot
+
+    outcome = stop_robot(robot, link)
+    print_result(outcome.as_dict(), as_json, outcome.as_text())
+    if not outcome.sent:
+        raise typer.Exit(1)

@@ -1,0 +1,88 @@
+"""Verbs that need no robot: demo, sim."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from disco_hw.verbs.options import (
+    AsJson,
+    LinkOption,
+    ModelOption,
+    RobotFile,
+    View,
+)
+
+
+def demo(
+    link: Annotated[str, typer.Option(help="can (mock bus) or serial (pseudo-terminal).")] = "can",
+    out: Annotated[Path, typer.Option(help="Directory for the log, the picture and the figures.")] = Path("out/demo"),
+    laps: Annotated[float, typer.Option(min=0.5, max=100.0, help="Laps to drive.")] = 1.5,
+    plant_seed: Annotated[int, typer.Option(min=0, help="Seed of the virtual robot's true parameters.")] = 1,
+    uncertainty: Annotated[str, typer.Option(help="ut, mc or point.")] = "ut",
+    view: View = False,
+    as_json: AsJson = False,
+) -> None:
+    """Drive the paper's circle with a virtual robot in real time, end to end, and print the figures."""
+    from disco_hw.demo import DemoOptions, run_demo
+
+    result = run_demo(
+        DemoOptions(
+            link=link,
+            out=out,
+            laps=laps,
+            plant_seed=plant_seed,
+            uncertainty=uncertainty,
+            view=view,
+            show_progress=not as_json,
+        )
+    )
+    if as_json:
+        print(json.dumps(result.as_dict()))
+    if not result.success:
+        raise typer.Exit(1)
+
+
+def sim(
+    robot: RobotFile,
+    hide: Annotated[list[str] | None, typer.Option(metavar="EFFECT=VALUE", help="Give the plant this effect.")] = None,
+    model: ModelOption = None,
+    link: LinkOption = None,
+    plant_seed: Annotated[
+        int | None, typer.Option(min=0, help="Draw the true parameters from the model's posterior with this seed.")
+    ] = None,
+    start: Annotated[
+        tuple[float, float, float] | None, typer.Option(metavar="X Y YAW", help="Start pose (m, m, rad).")
+    ] = None,
+    truth: Annotated[Path | None, typer.Option(help="Write the true motion to this CSV file.")] = None,
+    inject: Annotated[Path | None, typer.Option(help="Listen for faults to inject on this Unix socket.")] = None,
+    bus_log: Annotated[Path | None, typer.Option(help="Write every frame to this file, as candump does.")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the sensors' and the ground's noise.")] = 1,
+    list_effects: Annotated[bool, typer.Option("--list-effects", help="List the effects and exit.")] = False,
+) -> None:
+    """Run the virtual robot alone, behind a CAN bus or a serial line."""
+    from disco_hw.virtual import SimOptions, run_sim
+    from sim.effects import effects_table
+
+    if list_effects:
+        print(effects_table())
+        return
+    raise typer.Exit(
+        run_sim(
+            SimOptions(
+                robot=robot,
+                model=model,
+                link=link,
+                hide=tuple(hide or ()),
+                plant_seed=plant_seed,
+                start=start,
+                truth=truth,
+                inject=inject,
+                bus_log=bus_log,
+                seed=seed,
+            )
+        )
+    )

@@ -1,0 +1,63 @@
+"""Verbs over what was recorded or is running: view, replay."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from disco_hw.errors import InputError
+from disco_hw.verbs.options import (
+    AsJson,
+    ModelOption,
+    print_result,
+)
+from disco_hw.viewer.address import DEFAULT_PORT, LOOPBACK
+
+
+def view(
+    log: Annotated[Path | None, typer.Argument(metavar="[LOG]", help="The log to replay.")] = None,
+    live: Annotated[bool, typer.Option("--live", help="Show the running daemon of --robot.")] = False,
+    robot: Annotated[Path | None, typer.Option(help="robot.toml; for a log, instead of the one it carries.")] = None,
+    model: ModelOption = None,
+    snapshot: Annotated[Path | None, typer.Option(help="Write a picture of the log instead.")] = None,
+    at: Annotated[float | None, typer.Option(metavar="SECONDS", help="Where in the log; its end if not given.")] = None,
+    video: Annotated[Path | None, typer.Option(help="Write a clip of the log instead.")] = None,
+    speed: Annotated[float, typer.Option(min=0.1, max=1000.0, help="How much faster the clip runs.")] = 1.0,
+    export: Annotated[Path | None, typer.Option(help="Write one HTML file that plays without Python instead.")] = None,
+    host: Annotated[
+        str, typer.Option(help="Address to listen on; any but this host's own needs the token that is printed.")
+    ] = LOOPBACK,
+    port: Annotated[int, typer.Option(min=1, max=65535, help="Port of the page.")] = DEFAULT_PORT,
+) -> None:
+    """Show the page: a log, or the running daemon."""
+    from disco_hw.viewer import commands
+
+    if live:
+        if robot is None or log is not None:
+            raise InputError("view --live: needs --robot ROBOT.toml and no LOG")
+        raise typer.Exit(commands.view_live(robot, model, host, port))
+    if log is None:
+        raise InputError("view: give a LOG, or --live with --robot ROBOT.toml")
+    if snapshot is not None:
+        commands.snapshot_log(log, snapshot, at, robot)
+    if video is not None:
+        commands.video_log(log, video, speed, robot)
+    if export is not None:
+        commands.export_log(log, export, robot=robot)
+    if snapshot is None and video is None and export is None:
+        raise typer.Exit(commands.view_log(log, robot, host, port))
+
+
+def replay(log: Annotated[Path, typer.Argument(metavar="LOG")], as_json: AsJson = False) -> None:
+    """Run estimator, planner and governor again on a log's samples and compare every output bit for bit."""
+    from disco_hw.daemon.realtime import limit_thread_pools
+
+    limit_thread_pools()
+    from disco_hw.replay import replay as replay_log
+
+    report = replay_log(log)
+    print_result(report.as_dict(), as_json, report.as_text())
+    if not report.ok:
+        raise typer.Exit(1)
