@@ -75,11 +75,13 @@ class Optimiser:
             report=np.zeros(6),
         )
         self._sampler = sampler
+        self._valid = False
         self.reset()
 
     def reset(self) -> None:
         """Forget the plan; the random numbers go on."""
         self._work.nominal[:] = 0.0
+        self._valid = False
         self._work.report[TEMPERATURE] = FIRST_TEMPERATURE
 
     @property
@@ -119,10 +121,10 @@ class Optimiser:
         self._before[:] = before
         number = self.step_number
         self.step_number += 1
-        valid: bool = replan(
+        self._valid = replan(
             self._work, self._samplings, number, shift_steps, gain, self._basis, self._limits, system, point_weights
         )
-        return valid
+        return self._valid
 
     @property
     def ess(self) -> float:
@@ -142,29 +144,34 @@ class Optimiser:
         }
 
     def sampled_commands(self, limit: int) -> tuple[Array, Array]:
-        """Up to `limit` of the last step's samples of the largest weight: commands (n, T, C), weights (n,)."""
-        work = self._work
-        weights = np.asarray(work.weights[: self._sampler.samples], dtype=np.float64)
-        chosen = np.argsort(-weights, kind="stable")[:limit]
-        noise = work.noise.reshape(work.weights.size // int(BLOCK), -1, int(BLOCK))
-        commands = np.empty((chosen.size, *work.nominal.shape))
-        for row, k in enumerate(chosen):
-            commands[row] = self._one_sample(noise[k // int(BLOCK), :, k % int(BLOCK)])
-        return commands, weights[chosen] / max(weights.sum(), 1e-300)
+        """Up to `limit` of the last step's samples of the largest weight: commands (n, T, C), weights (n,).
 
-    def _one_sample(self, knots: NDArray[Any]) -> Array:
+        Worked out again from the noise and the plan that it was added to; changes nothing. None, if the last step was
+        not valid.
+        """
+        work, samples = self._work, self._sampler.samples
+        if not self._valid:
+            return np.empty((0, *work.nominal.shape)), np.empty(0)
+        weights = np.asarray(work.weights[:samples], dtype=np.float64)
+        chosen = np.argsort(-weights, kind="stable")[:limit]
+        block, lane = np.divmod(chosen, int(BLOCK))
+        noise = work.noise.reshape(work.weights.size // int(BLOCK), -1, int(BLOCK))[block, :, lane]
+        return self._applied(noise.astype(np.float64)), weights[chosen] / weights.sum()
+
+    def _applied(self, noise: Array) -> Array:
+        """Commands (n, T, C) within the limits, from the noise (n, R) of n samples."""
         horizon, channels = self._work.nominal.shape
-        by_knot = knots[: knots.size // channels * channels].reshape(-1, channels).astype(np.float64)
         first, weights = self._basis
+        by_knot = noise[:, : noise.shape[1] // channels * channels].reshape(len(noise), -1, channels)
         if weights is None:
-            noise = by_knot[first]
+            over_time = by_knot[:, first]
         else:
-            noise = np.einsum("tj,tjc->tc", weights, by_knot[first[:, None] + np.arange(4)])
-        limits, previous = self._limits, self._before.astype(np.float64)
-        commands = np.empty((horizon, channels))
+            over_time = np.einsum("tj,ntjc->ntc", weights, by_knot[:, first[:, None] + np.arange(4)])
+        commands = np.asarray(self._work.before_update + over_time)
+        change, largest = float(self._limits.change), float(self._limits.largest)
+        previous = np.broadcast_to(self._before.astype(np.float64), commands[:, 0].shape)
         for t in range(horizon):
-            wanted = self._work.before_update[t] + noise[t]
-            wanted = np.clip(wanted, previous - limits.change, previous + limits.change)
-            previous = np.clip(wanted, -limits.largest, limits.largest)
-            commands[t] = previous
+            wanted = np.minimum(np.maximum(commands[:, t], previous - change), previous + change)
+            previous = np.minimum(np.maximum(wanted, -largest), largest)
+            commands[:, t] = previous
         return commands

@@ -19,6 +19,7 @@ from disco_hw.control import (
     WheelLimits,
 )
 from disco_hw.control.experiments.plant import Plant
+from disco_hw.control.replan import replan
 from disco_hw.model import EffectSetting, Gaussian, load_model
 
 MODEL = load_model(Path(__file__).parents[2] / "disco_hw/robots/wombot_model.toml")
@@ -250,3 +251,81 @@ def test_effects_under_the_belief_become_sigma_points():
     disco = planner(model)
     disco.plan(0, TANGENT)
     assert disco.point_trajectories().shape[0] == 9
+
+
+def test_looking_changes_no_plan():
+    watched, alone = planner(seed=4), planner(seed=4)
+    for t in range(4):
+        one, other = watched.plan(t * PERIOD_NS, TANGENT), alone.plan(t * PERIOD_NS, TANGENT)
+        np.testing.assert_array_equal(one.wheel_speeds, other.wheel_speeds)
+        watched.sampled_rollouts(20)
+        watched.point_trajectories()
+
+
+def test_there_is_nothing_to_look_at_without_a_plan():
+    disco = planner()
+    assert len(disco.sampled_rollouts().weights) == 0
+    disco.plan(0, TANGENT)
+    assert len(disco.sampled_rollouts(7).weights) == 7
+    assert disco.plan(PERIOD_NS, replace(TANGENT, x_m=math.nan)).diagnostics.outcome is Outcome.STOPPING
+    assert len(disco.sampled_rollouts().weights) == 0
+
+
+LEARNT = Gaussian(MODEL.belief.names, MODEL.belief.mean() * [1.05, 0.97, 1.02], 0.25 * MODEL.belief.covariance())
+
+
+@pytest.mark.parametrize("uncertainty", ["ut", "mc", "joint"])
+def test_a_belief_set_is_as_good_as_a_belief_begun_with(uncertainty):
+    begun = planner(replace(MODEL, belief=LEARNT), uncertainty=uncertainty)
+    swapped = planner(uncertainty=uncertainty)
+    swapped.set_belief(LEARNT)
+    one, other = begun.plan(0, TANGENT), swapped.plan(0, TANGENT)
+    np.testing.assert_array_equal(one.wheel_speeds, other.wheel_speeds)
+    np.testing.assert_array_equal(one.trajectory, other.trajectory)
+    assert not np.array_equal(planner(uncertainty=uncertainty).plan(0, TANGENT).wheel_speeds, one.wheel_speeds)
+
+
+def test_a_belief_set_between_plans_keeps_the_plan_compiles_nothing_and_repeats():
+    runs = []
+    for _ in range(2):
+        disco = planner()
+        plans = [disco.plan(0, TANGENT)]
+        compiled = len(replan.signatures)
+        disco.set_belief(LEARNT)
+        plans.append(disco.plan(20_000_000, replace(TANGENT, t_ns=20_000_000)))
+        assert len(replan.signatures) == compiled
+        assert plans[1].diagnostics.outcome is Outcome.PLANNED
+        assert np.abs(plans[1].wheel_speeds - plans[0].wheel_speeds).max() < 1.0
+        runs.append(plans[1].wheel_speeds)
+    np.testing.assert_array_equal(*runs)
+
+
+def test_a_belief_may_name_its_parameters_in_another_order():
+    turned = Gaussian(LEARNT.names[::-1], LEARNT.mean()[::-1], LEARNT.covariance()[::-1, ::-1])
+    plans = []
+    for belief in (LEARNT, turned):
+        disco = planner(sampler=Sampler(temperature=1.0))
+        disco.set_belief(belief)
+        plans.append(disco.plan(0, TANGENT))
+    np.testing.assert_allclose(plans[0].trajectory, plans[1].trajectory, atol=0.02)
+
+
+def test_beliefs_that_the_planner_was_not_laid_out_for_are_refused_and_the_old_one_kept():
+    disco, same = planner(), planner()
+    faults = {
+        "laid out for": Gaussian(("wheel_radius_m",), np.array([0.06]), np.array([[1e-5]])),
+        "turn the robot": Gaussian(LEARNT.names, np.array([0.2, 0.12, 0.2]), LEARNT.covariance()),
+    }
+    for said, belief in faults.items():
+        with pytest.raises(ValueError, match=said):
+            disco.set_belief(belief)
+    np.testing.assert_array_equal(disco.plan(0, TANGENT).wheel_speeds, same.plan(0, TANGENT).wheel_speeds)
+    names = ("wheel_radius_m", "command_delay.delay_s")
+    delay = EffectSetting("command_delay", {"delay_s": 0.1})
+    late = replace(MODEL, effects=(delay,), belief=Gaussian(names, np.array([0.06, 0.1]), np.diag([1e-5, 1e-4])))
+    disco = planner(late)
+    disco.set_belief(Gaussian(names, np.array([0.06, 0.2]), np.diag([1e-5, 1e-4])))
+    with pytest.raises(ValueError, match="longer than the"):
+        disco.set_belief(Gaussian(names, np.array([0.06, 0.9]), np.diag([1e-5, 1e-4])))
+    with pytest.raises(ValueError, match="laid out for one over None"):
+        planner(replace(MODEL, belief=None)).set_belief(LEARNT)
