@@ -39,6 +39,16 @@ def load_setup(robot: Path, model: Path | None = None, link: str | None = None) 
     return Setup(robot, model_file, config, loaded)
 
 
+def refuse_missing_effects(setup: Setup) -> None:
+    """Raise InputError if the model is marked as one whose parameters may have absorbed an effect it lacks."""
+    if setup.model.missing_effects:
+        raise InputError(
+            f"{setup.model_file}: missing_effects: {', '.join(setup.model.missing_effects)} was found in the log and is "
+            "not in the model, whose parameters may have absorbed it; write the model with `disco-hw gap`, or give "
+            "--accept-missing-effects"
+        )
+
+
 def geometry(model: Model) -> tuple[tuple[float, float, float], Matrix3]:
     """Mean (m) and covariance (m^2) of (wheel_radius_m, axial_distance_m, x_icr_m); zero where a value is exact."""
     names = ("wheel_radius_m", "axial_distance_m", "x_icr_m")

@@ -30,7 +30,7 @@ from disco_hw.log.link import Attachment
 from disco_hw.log.provenance import DBC, MODEL_TOML, ROBOT_TOML, attachment, version
 from disco_hw.log.recorder import NullRecorder, ProcessRecorder, Recorder, Recording
 from disco_hw.pipeline import NoPlanner, Planner
-from disco_hw.robot_setup import Setup, load_setup
+from disco_hw.robot_setup import Setup, load_setup, refuse_missing_effects
 from disco_hw.viewer.feed import ViewerFeed, WatchedRecorder, feed_path
 from drivers.transport import open_transport
 from drivers.types import Request
@@ -52,6 +52,7 @@ class DaemonOptions:
     link: str | None = None
     log_file: Path | None = None
     as_json: bool = False
+    accept_missing_effects: bool = False
 
 
 def run_daemon(options: DaemonOptions) -> int:
@@ -62,6 +63,8 @@ def run_daemon(options: DaemonOptions) -> int:
     """
     say: Say = _say_json if options.as_json else _say_text
     setup = load_setup(options.robot, options.model, options.link)
+    if not options.accept_missing_effects:
+        refuse_missing_effects(setup)
     return serve(setup, options.log_file, say, TaskPilot(), lambda: make_planner(setup.config, setup.model))
 
 

@@ -52,6 +52,7 @@ class _File(msgspec.Struct, forbid_unknown_fields=True):
     format: Literal[1]
     base: _BaseSection
     name: Annotated[str, Meta(min_length=1, max_length=64)] = "robot"
+    missing_effects: list[str] = []
     effects: list[dict[str, Any]] = []
     belief: _BeliefSection | None = None
 
@@ -89,6 +90,7 @@ def _model(content: _File) -> Model:
         effects=effects,
         belief=_belief(content.belief),
         name=content.name,
+        missing_effects=tuple(content.missing_effects),
     )
 
 
@@ -142,6 +144,7 @@ def model_text(model: Model) -> str:
     lines = [
         f"format = {FORMAT}",
         f"name = {msgspec.json.encode(model.name).decode()}",
+        *([f"missing_effects = {list(model.missing_effects)!r}"] if model.missing_effects else []),
         "",
         "[base]",
         f"wheel_radius_m = {model.wheel_radius_m!r}",

@@ -61,8 +61,9 @@ class Model:
     """The transition function's parameters and what is believed of them.
 
     `base` and `effects` hold the point values; `belief` is a joint distribution over any of `parameter_names`, and
-    parameters it does not name are known exactly. Raises ValueError for repeated effects, values outside their physical
-    range or a belief over parameters that the model does not have.
+    parameters it does not name are known exactly. `missing_effects` names effects of the robot that the model is known
+    to lack, so that its parameters may have absorbed them. Raises ValueError for repeated effects, values outside their
+    physical range, a belief over parameters that the model does not have, or a missing effect that is unknown or there.
     """
 
     wheel_radius_m: float
@@ -71,6 +72,7 @@ class Model:
     effects: tuple[EffectSetting, ...] = ()
     belief: Belief | None = None
     name: str = "robot"
+    missing_effects: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         for parameter in BASE_PARAMETERS:
@@ -79,6 +81,11 @@ class Model:
         for effect in names:
             if names.count(effect) > 1:
                 raise ValueError(f"effect {effect!r} is listed twice; keep one")
+        for effect in self.missing_effects:
+            if effect not in REGISTRY:
+                raise ValueError(f"missing_effects: unknown effect {effect!r}; known are {', '.join(REGISTRY)}")
+            if effect in names:
+                raise ValueError(f"missing_effects: {effect!r} is among the effects; take it out of one of them")
         if self.belief is not None:
             for believed in self.belief.names:
                 if believed not in self.parameter_names:

@@ -32,6 +32,9 @@ def run(
     link: LinkOption = None,
     log_file: LogFileOption = None,
     view: View = False,
+    accept_missing_effects: Annotated[
+        bool, typer.Option("--accept-missing-effects", help="Use a model that is marked as lacking an effect.")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Run the on-robot daemon: connect, estimate, record; arm and start only when told to (`disco-hw ctl`)."""
@@ -42,7 +45,7 @@ def run(
     from disco_hw.daemon.daemon import DaemonOptions, run_daemon
 
     with _page(view, robot, model):
-        code = run_daemon(DaemonOptions(robot=robot, model=model, link=link, log_file=log_file, as_json=as_json))
+        code = run_daemon(DaemonOptions(robot, model, link, log_file, as_json, accept_missing_effects))
     raise typer.Exit(code)
 
 

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import disco_hw
+from disco_hw.daemon import daemon
+from disco_hw.daemon.daemon import DaemonOptions, run_daemon
 from disco_hw.errors import InputError
-from disco_hw.model import EffectSetting, Gaussian, Model
+from disco_hw.model import EffectSetting, Gaussian, Model, load_model, save_model
 from disco_hw.robot_setup import geometry, load_setup
 
 ROBOT = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
@@ -48,3 +51,13 @@ def test_what_the_belief_does_not_name_is_exact():
     mean, covariance = geometry(Model(0.05, 0.3, 0.0, (lag,), belief))
     assert mean == (0.05, 0.3, 0.2)
     assert np.array(covariance) == pytest.approx(np.diag([0.0, 0.0, 4e-4]))
+
+
+def test_a_model_marked_as_lacking_an_effect_is_run_only_when_told_to(tmp_path, monkeypatch):
+    marked = tmp_path / "model.toml"
+    save_model(replace(load_model(ROBOT.parent / "wombot_model.toml"), missing_effects=("turn_slip",)), marked)
+    monkeypatch.setattr(daemon, "serve", lambda *_: 0)
+    with pytest.raises(InputError, match=r"model\.toml: missing_effects: turn_slip.*--accept-missing-effects"):
+        run_daemon(DaemonOptions(robot=ROBOT, model=marked))
+    assert run_daemon(DaemonOptions(robot=ROBOT, model=marked, accept_missing_effects=True)) == 0
+    assert run_daemon(DaemonOptions(robot=ROBOT)) == 0

@@ -1,5 +1,6 @@
 """The model file: what is written is read back bit for bit, and every fault is one line with file, field and remedy."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -115,3 +116,16 @@ def test_unreadable_files_are_told(tmp_path):
         load_model(tmp_path / "missing.toml")
     with pytest.raises(InputError, match="not valid TOML"):
         read(tmp_path, "format = = 1")
+
+
+def test_the_mark_of_missing_effects_is_kept(tmp_path):
+    whole = read(tmp_path, GOOD)
+    assert whole.missing_effects == ()
+    save_model(replace(whole, missing_effects=("turn_slip", "slope")), tmp_path / "marked.toml")
+    assert load_model(tmp_path / "marked.toml").missing_effects == ("turn_slip", "slope")
+
+
+@pytest.mark.parametrize(("name", "fault"), [("wind", "unknown effect 'wind'"), ("motor_lag", "is among the effects")])
+def test_a_mark_must_name_an_effect_that_the_model_lacks(tmp_path, name, fault):
+    with pytest.raises(InputError, match=f"missing_effects: .*{fault}"):
+        read(tmp_path, GOOD.replace("format = 1", f'format = 1\nmissing_effects = ["{name}"]'))
