@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
-from disco_hw.control import NoValidControl, Plan, PlannerState, SentCommand
+from disco_hw.control import NoValidControl, Plan, PlannerState, SentCommand, Task
 from disco_hw.daemon.governor import Governed, Governor
 from disco_hw.estimation import Estimate, PoseFusion, PoseUpdate
 from drivers.types import Readings
@@ -28,6 +28,9 @@ class Planner(Protocol):
     def reset(self) -> None:
         """Forget the last plan, as at a new start."""
 
+    def set_task(self, task: Task) -> None:
+        """Plan for another task of the same kind from the next reset on."""
+
 
 class NoPlanner:
     """In the place of a planner where the robot is driven by hand: it never has a plan."""
@@ -38,6 +41,9 @@ class NoPlanner:
 
     def reset(self) -> None:
         """Nothing is kept."""
+
+    def set_task(self, _task: Task) -> None:
+        """A person decides."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,6 +128,11 @@ class Pipeline:
     def fusion(self) -> PoseFusion:
         """The estimator, for its counters."""
         return self._fusion
+
+    def set_task(self, task: Task) -> None:
+        """Follow another task of the same kind; what is planned for the present one is dropped."""
+        self._planner.set_task(task)
+        self._plan, self._following = None, False
 
     def step(self, now_ns: int, readings: Readings, motion: Motion, mark: Callable[[str], None] = untimed) -> Tick:
         """Advance by one tick; `mark(stage)` is called at the end of the stages "estimate" and "plan".

@@ -11,6 +11,9 @@ from disco_hw.daemon.control_socket import default_socket_path
 from disco_hw.errors import InputError
 
 ACTIONS = ("arm", "start", "stop", "disarm", "estop", "reset", "status", "quit")
+PAGE_ACTIONS = ("task", "drive")
+"""What takes arguments: another circle, and a hand on the page's pad."""
+SERVED = (*ACTIONS, *PAGE_ACTIONS)
 
 
 def socket_path(config: RobotConfig) -> Path:

@@ -8,10 +8,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from disco_hw.config import RobotConfig
+from disco_hw.config import CircleTask, RobotConfig
+from disco_hw.control import Circle
 from disco_hw.daemon import records_of_tick
 from disco_hw.daemon.lap_counter import LapCounter
 from disco_hw.daemon.supervisor import Inputs, Output, Reply, Supervisor, UserRequest
+from disco_hw.daemon.task_change import record_of
 from disco_hw.log import records
 from disco_hw.log.recorder import Recorder
 from disco_hw.pipeline import FollowTask, Motion, Off, Pipeline, Stand, Tick, untimed
@@ -56,6 +58,7 @@ class DaemonCore:
         self.driver = driver
         self.pipeline = pipeline
         self.recorder = recorder
+        self.task = config.task
         self.laps = LapCounter(config.task)
         self.newest_wheels: WheelSample | None = None
         self.robot_status: RobotStatus | None = None
@@ -68,6 +71,13 @@ class DaemonCore:
         self._link_up = False
         self._planner_failing = False
         self._state = supervisor.state
+        self._task_changed = False
+
+    def set_task(self, task: CircleTask) -> None:
+        """Follow another circle from the next tick on, in which it is recorded."""
+        self.task, self.laps = task, LapCounter(task)
+        self.pipeline.set_task(Circle.from_config(task, self.config.control.mode))
+        self._task_changed = True
 
     def tick(
         self,
@@ -102,6 +112,7 @@ class DaemonCore:
                 *records_of_tick.tick(result, command, self.config.control.command_valid_for_s),
                 *sent,
                 *self._state_change(now_ns, output),
+                *self._task_change(now_ns),
                 *(records.Event(now_ns, "info", "daemon", text) for text in events),
                 *extra_records,
             ],
@@ -178,6 +189,11 @@ class DaemonCore:
         if output.state is before:
             return []
         return [records.DaemonState(now_ns, output.state.name, before.name, output.detail)]
+
+    def _task_change(self, now_ns: int) -> list[records.Record]:
+        """The record of another task, in the first tick that it holds for."""
+        changed, self._task_changed = self._task_changed, False
+        return [record_of(now_ns, self.task)] if changed else []
 
     def _count_laps(self, output: Output, result: Tick) -> None:
         if output.running:

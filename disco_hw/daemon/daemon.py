@@ -12,7 +12,7 @@ from typing import Any
 
 from disco_hw.daemon import realtime
 from disco_hw.daemon.assembly import assemble_core, make_driver, make_pipeline, make_planner
-from disco_hw.daemon.client import ACTIONS, socket_path
+from disco_hw.daemon.client import PAGE_ACTIONS, SERVED, socket_path
 from disco_hw.daemon.clock import Clock, MonotonicClock
 from disco_hw.daemon.control_socket import ControlMessage, ControlServer
 from disco_hw.daemon.core import DaemonCore
@@ -24,6 +24,7 @@ from disco_hw.daemon.status import counters, loop_figures, status
 from disco_hw.daemon.stop_path import StopPath
 from disco_hw.daemon.supervisor import Reply, UserRequest
 from disco_hw.daemon.systemd import Notifier
+from disco_hw.daemon.task_change import TaskRefused, changed_task
 from disco_hw.daemon.warm_up import warm_up
 from disco_hw.log import records
 from disco_hw.log.link import Attachment
@@ -102,7 +103,7 @@ def _start(
     warm_up(make_pipeline(config, setup.model, new_planner()))
     pipeline = make_pipeline(config, setup.model, planner)
     # The planner was compiled before: whoever finds the socket gets an answer.
-    server = ControlServer(socket_path(config), ACTIONS)
+    server = ControlServer(socket_path(config), SERVED)
     stop.add("control socket", server.close)
     feed = ViewerFeed(feed_path(server.path))
     stop.add("page feed", feed.close)
@@ -211,6 +212,11 @@ class Daemon:
         mark = self._loop.stages.mark
         messages = self._server.poll()
         requests = tuple(UserRequest(message.action) for message in messages if message.action in _REQUESTS)
+        for message in messages:
+            if message.action == "drive":
+                self._steer(now_ns, message)
+            elif message.action == "task":
+                self._change_task(message)
         wanted = self._pilot.step(now_ns, self._core.last)
         told = tuple(records.Event(now_ns, "info", "drive", text) for text in wanted.events)
         mark("control")
@@ -263,10 +269,33 @@ class Daemon:
             self._notifier.status(f"{last.output.state.name}: {last.output.detail}")
         return (counters(self._core, self._loop.stats, self._recorder_stats, now_ns),)
 
+    def _steer(self, now_ns: int, message: ControlMessage) -> None:
+        """Hand what a page wants to the pilot; the reply's stamp is what its next request must carry."""
+        refusal = self._pilot.steer(now_ns, message.client, message.arguments)
+        body: dict[str, Any] = {"ok": refusal is None, "stamp": str(now_ns)}
+        self._server.reply(message, body if refusal is None else {**body, "error": refusal})
+
+    def _change_task(self, message: ControlMessage) -> None:
+        """Follow another circle, if this state and the robot's limits allow it."""
+        last = self._core.last
+        state = State.DISCONNECTED if last is None else last.output.state
+        try:
+            task = changed_task(self._core.task, message.arguments, self._core.config.robot, state)
+        except TaskRefused as refused:
+            self._server.reply(message, {"ok": False, "error": str(refused)})
+            return
+        self._core.set_task(task)
+        centre = f"({task.center_x_m:g}, {task.center_y_m:g}) m"
+        text = f"circle of {task.radius_m:g} m about {centre} at {task.speed_m_s:g} m/s"
+        self._say("task", text)
+        self._server.reply(message, {"ok": True, "text": text})
+
     def _answer(self, messages: list[ControlMessage], replies: tuple[Reply, ...]) -> None:
-        """Answer every request: those to the supervisor with its words, the others here."""
+        """Answer what is not answered yet: requests to the supervisor with its words, the others here."""
         remaining = list(replies)
         for message in messages:
+            if message.action in PAGE_ACTIONS:
+                continue
             if message.action in _REQUESTS:
                 reply = remaining.pop(0)
                 body: dict[str, Any] = {"ok": reply.accepted}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -37,6 +37,9 @@ class Pilot(Protocol):
     def learn(self, now_ns: int, tick: CoreTick, replies: Sequence[Reply]) -> None:
         """Take in what became of it: the replies to its own requests."""
 
+    def steer(self, now_ns: int, page: int, wanted: Mapping[str, Any]) -> str | None:
+        """Take in how a page, known by a number, wants to drive; returns why that does not count, in words."""
+
     def status(self) -> dict[str, Any]:
         """What the daemon's status says in addition."""
 
@@ -60,6 +63,10 @@ class TaskPilot:
 
     def learn(self, now_ns: int, tick: CoreTick, replies: Sequence[Reply]) -> None:
         """Nothing is learnt."""
+
+    def steer(self, now_ns: int, page: int, wanted: Mapping[str, Any]) -> str | None:
+        """A task is followed."""
+        return "this daemon follows its task; stop it and start `disco-hw drive ROBOT.toml --page`"
 
     def status(self) -> dict[str, Any]:
         """Nothing is added."""

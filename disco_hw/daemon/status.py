@@ -6,8 +6,11 @@ import math
 from dataclasses import asdict
 from typing import Any
 
+import msgspec
+
 from disco_hw.daemon.core import DaemonCore
 from disco_hw.daemon.loop import LoopStats
+from disco_hw.daemon.task_change import limits
 from disco_hw.log import records
 from disco_hw.log.recorder import RecorderStats
 
@@ -31,7 +34,7 @@ def status(core: DaemonCore, loop: dict[str, Any], recorder: RecorderStats) -> d
     if tick is None:
         return {"ok": False, "error": "the loop has not started yet"}
     estimate, robot, wheels = tick.pipeline.estimate, core.robot_status, core.newest_wheels
-    circle = core.config.task
+    circle = core.task
     distance = math.hypot(estimate.x_m - circle.center_x_m, estimate.y_m - circle.center_y_m) - circle.radius_m
     plan = tick.pipeline.plan
     return {
@@ -51,7 +54,13 @@ def status(core: DaemonCore, loop: dict[str, Any], recorder: RecorderStats) -> d
         "wheels": None if wheels is None else [wheels.left_speed_rad_s, wheels.right_speed_rad_s],
         "command": [tick.pipeline.command.left_rad_s, tick.pipeline.command.right_rad_s],
         "source": tick.pipeline.source.value,
-        "task": {"laps": core.laps.laps, "distance_m": distance, "speed_m_s": estimate.speed_m_s},
+        "task": {
+            "laps": core.laps.laps,
+            "distance_m": distance,
+            "speed_m_s": estimate.speed_m_s,
+            "asked": msgspec.to_builtins(circle),
+            "limits": limits(core.config.robot, circle),
+        },
         "plan": None if plan is None else {"ess": plan.diagnostics.ess, "temperature": plan.diagnostics.temperature},
         "loop": loop,
         "transport": asdict(core.transport.stats),

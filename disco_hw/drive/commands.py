@@ -21,6 +21,7 @@ from disco_hw.drive.gamepad_source import GamepadSource
 from disco_hw.drive.hand_pilot import HandPilot
 from disco_hw.drive.keyboard import Keyboard
 from disco_hw.drive.keys import HELP, KeyHold
+from disco_hw.drive.page_source import PageSource
 from disco_hw.drive.script import Script, in_table, room_needed
 from disco_hw.drive.scripted import ScriptSource, Unattended
 from disco_hw.drive.scripts import make_script
@@ -42,6 +43,7 @@ class DriveOptions:
     link: str | None = None
     log_file: Path | None = None
     gamepad: bool = False
+    page: bool = False
     script: str | None = None
     unattended: bool = False
     seconds: float | None = None
@@ -79,13 +81,14 @@ def run_drive(options: DriveOptions) -> DriveResult:
     script = _script(options, config)
     log_file = options.log_file or _new_log(config)
     top_rad_s = config.drive.speed_share * config.robot.max_wheel_speed_rad_s
-    source = _source(options, config, script, top_rad_s)
+    page = PageSource(top_rad_s, config.drive.turn_share) if options.page else None
+    source = _source(options, config, script, top_rad_s, page)
     try:
         if not options.as_json:
             print("\n".join(_announcement(options, config, script)), flush=True)
         coverage = Coverage(top_rad_s)
         with _display(socket_path(config), shown=not options.as_json) as say:
-            serve(setup, log_file, say, HandPilot(source, coverage))
+            serve(setup, log_file, say, HandPilot(source, coverage, page))
     finally:
         source.close()
     return DriveResult(
@@ -112,17 +115,23 @@ def _announcement(options: DriveOptions, config: RobotConfig, script: Script | N
     if script is not None:
         room = room_needed(script.at, script.duration_s, config.robot)
         lines += [*in_table(script), f"{script.duration_s:.0f} s, needs {room.in_words()}"]
-    if not (options.gamepad or options.unattended):
+    if not (options.gamepad or options.page or options.unattended):
         lines.append(HELP)
     return lines
 
 
-def _source(options: DriveOptions, config: RobotConfig, script: Script | None, top_rad_s: float) -> ManualSource:
-    if options.unattended and options.gamepad:
-        raise InputError("--unattended and --gamepad: one deadman only; leave one of them out")
+def _source(
+    options: DriveOptions, config: RobotConfig, script: Script | None, top_rad_s: float, page: PageSource | None
+) -> ManualSource:
+    deadmen = {"--unattended": options.unattended, "--gamepad": options.gamepad, "--page": options.page}
+    chosen = [name for name, given in deadmen.items() if given]
+    if len(chosen) > 1:
+        raise InputError(f"{' and '.join(chosen)}: one deadman only; leave one of them out")
     held: ManualSource
     if options.unattended:
         held = Unattended()
+    elif page is not None:
+        held = page
     elif options.gamepad:
         held = _gamepad(config, top_rad_s)
     else:

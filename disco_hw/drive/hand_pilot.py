@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from disco_hw.daemon.core import CoreTick
@@ -12,6 +12,7 @@ from disco_hw.daemon.states import State
 from disco_hw.daemon.supervisor import Reply
 from disco_hw.drive.coverage import Coverage
 from disco_hw.drive.deadman import Deadman
+from disco_hw.drive.page_source import PageSource, steering_from
 from disco_hw.drive.source import ManualSource, RobotView
 from disco_hw.pipeline import Source
 
@@ -21,8 +22,10 @@ _MESSAGES = 5
 class HandPilot:
     """Drives as its source says, while its deadman is held."""
 
-    def __init__(self, source: ManualSource, coverage: Coverage) -> None:
+    def __init__(self, source: ManualSource, coverage: Coverage, page: PageSource | None = None) -> None:
+        """`page` is what hears the page: the source itself, or the deadman of its script."""
         self._source = source
+        self._page = page
         self._coverage = coverage
         self._deadman = Deadman()
         self._driving = False
@@ -70,11 +73,21 @@ class HandPilot:
         else:
             self._coverage.pause()
 
+    def steer(self, now_ns: int, page: int, wanted: Mapping[str, Any]) -> str | None:
+        """Pass on what a page wants, if pages drive."""
+        if self._page is None:
+            return "this drive does not listen to the page; start it with --page"
+        try:
+            return self._page.steer(now_ns, page, steering_from(wanted))
+        except ValueError as error:
+            return str(error)
+
     def status(self) -> dict[str, Any]:
         """What the source is at, the coverage and the newest messages, as `drive`."""
         return {
             "drive": {
                 "driving": self._driving,
+                "by_page": self._page is not None,
                 "words": self._source.words,
                 "task": self._source.task,
                 "messages": list(self._messages),

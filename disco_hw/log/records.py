@@ -147,6 +147,16 @@ class Counters(msgspec.Struct, frozen=True, gc=False):
     loop: dict[str, int] = {}
 
 
+class Task(msgspec.Struct, frozen=True, gc=False):
+    """The circle to follow from `t_ns` on, where it is another than robot.toml's; counter-clockwise, m and m/s."""
+
+    t_ns: int
+    center_x_m: float
+    center_y_m: float
+    radius_m: float
+    speed_m_s: float
+
+
 Record = (
     FrameIn
     | FrameOut
@@ -164,6 +174,7 @@ Record = (
     | DaemonState
     | Event
     | Counters
+    | Task
 )
 
 
@@ -192,6 +203,7 @@ TOPICS: tuple[Topic, ...] = (
     Topic("/daemon/state", DaemonState),
     Topic("/event", Event),
     Topic("/counters", Counters),
+    Topic("/task", Task),
 )
 
 TOPIC_INDEX: Mapping[type, int] = MappingProxyType({topic.record: index for index, topic in enumerate(TOPICS)})

@@ -52,6 +52,7 @@ def run(
 def drive(
     robot: RobotFile,
     gamepad: Annotated[bool, typer.Option("--gamepad", help="Drive with a gamepad instead of the keyboard.")] = False,
+    page: Annotated[bool, typer.Option("--page", help="Drive from the page, which --view then serves.")] = False,
     script: Annotated[
         str | None, typer.Option(help="Drive by itself while the deadman is held: circle, steps or excite.")
     ] = None,
@@ -72,7 +73,7 @@ def drive(
     limit_thread_pools()
     from disco_hw.drive.commands import DriveOptions, run_drive
 
-    with _page(view, robot, model):
+    with _page(view or page, robot, model):
         result = run_drive(
             DriveOptions(
                 robot=robot,
@@ -80,6 +81,7 @@ def drive(
                 link=link,
                 log_file=log_file,
                 gamepad=gamepad,
+                page=page,
                 script=script,
                 unattended=unattended,
                 seconds=seconds,
