@@ -12,6 +12,7 @@ from firmware_protocol.firmware_core import FirmwareConfig
 from sim.app import VirtualRobotOptions, run_virtual_robot
 from sim.body_dynamics import Pose
 from sim.effects import HiddenEffectError, parse_hidden_effects
+from sim.fault_schedule import FaultFileError, load_schedule
 from sim.plant_parameters import DrawError, PlantParameters, draw_plant_parameters
 
 
@@ -28,6 +29,7 @@ class SimOptions:
     truth: Path | None = None
     inject: Path | None = None
     bus_log: Path | None = None
+    faults: Path | None = None
     seed: int = 1
 
 
@@ -39,6 +41,10 @@ def run_sim(options: SimOptions) -> int:
         effects = dict(parse_hidden_effects(options.hide).items)
     except HiddenEffectError as error:
         raise InputError(f"--hide: {error}") from None
+    try:
+        faults = None if options.faults is None else load_schedule(options.faults)
+    except FaultFileError as error:
+        raise InputError(str(error)) from None
     ticks_per_rev = _whole_ticks(setup)
     task = config.task
     x_m, y_m, yaw_rad = options.start or (task.center_x_m + task.radius_m, task.center_y_m, 1.5707963267948966)
@@ -69,6 +75,7 @@ def run_sim(options: SimOptions) -> int:
             truth_file=options.truth,
             bus_log=options.bus_log,
             inject=options.inject,
+            faults=faults,
         )
     )
 

@@ -19,7 +19,10 @@ from drivers.types import ReceivedFrame
 from firmware_protocol.firmware_core import FirmwareConfig
 from sim.body_dynamics import Pose
 from sim.command_socket import CommandSocket
+from sim.cpu_hogs import CpuHogs
 from sim.effects import HiddenEffectError, hidden_effects
+from sim.fault_player import BUS_ONLY, FaultPlayer
+from sim.fault_schedule import FaultSchedule, Room
 from sim.hub_link import HubLink
 from sim.injection import Injection
 from sim.plant import Plant
@@ -55,6 +58,7 @@ class VirtualRobotOptions:
     hidden effects by name (see `sim.effects`). `seed`: all disturbances and noise. `truth_file`: CSV of
     `sim.truth.COLUMNS` at 100 Hz. `bus_log`: every frame on the own bus, as candump writes them. `inject`: socket for
     the commands of `sim.injection`. `ready_fd`: descriptor that gets the ready line too, and is then closed.
+    `faults`: what goes wrong, from the ready line on; of the faults of processes only `cpu_hog`.
     `realtime_priority`: SCHED_FIFO priority where the system allows it; 0 for none.
     """
 
@@ -75,6 +79,7 @@ class VirtualRobotOptions:
     bus_log: Path | None = None
     inject: Path | None = None
     ready_fd: int | None = None
+    faults: FaultSchedule | None = None
     realtime_priority: int = 40
 
     @property
@@ -100,7 +105,7 @@ def run_virtual_robot(options: VirtualRobotOptions) -> int:
             return 2
         scheduling = _schedule(options.realtime_priority)
         _announce(f"ready {process.link.address} ({scheduling})", options.ready_fd)
-        process.start()
+        process.start(options.faults, resources)
         while not stop.requested:
             select.select((*process.filenos(), stop.fileno()), (), (), process.timeout_s())
             process.work()
@@ -123,12 +128,16 @@ class _Process:
         self._injection = Injection(robot, link)
         self._commands = commands
         self._recorder = recorder
+        self._player: FaultPlayer | None = None
         self._start_ns = 0
         self._steps = 0
 
-    def start(self) -> None:
-        """Let robot time 0 be now."""
+    def start(self, faults: FaultSchedule | None, resources: contextlib.ExitStack) -> None:
+        """Let robot time 0, and that of the faults, be now; `resources` ends what faults leave behind."""
         self._start_ns = time.monotonic_ns()
+        if faults is not None:
+            hogs = resources.enter_context(CpuHogs())
+            self._player = FaultPlayer(faults, self.robot, self.link, self._start_ns, _tell, hogs)
 
     def filenos(self) -> list[int]:
         return [*self.link.filenos(), *([] if self._commands is None else [self._commands.fileno()])]
@@ -155,6 +164,8 @@ class _Process:
             self._receive(link.advance(t_ns, waiting * (step + 1) // behind - waiting * step // behind))
             link.send(robot.step(self._steps * STEP_US, link.error_counters))
             self._injection.step(t_ns)
+            if self._player is not None:
+                self._player.step(t_ns)
             if self._recorder is not None and self._steps % TRUTH_STEPS == 0:
                 self._recorder.record(robot, t_ns)
         if due == behind:
@@ -168,6 +179,8 @@ class _Process:
 
 
 def _set_up(options: VirtualRobotOptions, resources: contextlib.ExitStack) -> _Process:
+    if options.faults is not None:
+        _check_faults(options.faults, options.kind, options.interface)
     robot = _make_robot(options)
     recorder = None
     log = None
@@ -188,6 +201,18 @@ def _set_up(options: VirtualRobotOptions, resources: contextlib.ExitStack) -> _P
     # Nothing made so far will go away: the collector need not look at it again.
     gc.freeze()
     return _Process(robot, link, commands, recorder)
+
+
+def _check_faults(schedule: FaultSchedule, kind: str, interface: str) -> None:
+    """Refuse what this process, or this kind of link, cannot do."""
+    if kind == "can" and interface != "unixcan":
+        raise OptionError(f"faults: not on {interface}; only on the simulator's own bus (unixcan) or a serial line")
+    for fault in schedule.faults:
+        name = fault.kind.name
+        if fault.kind.room is Room.PROCESS and name != "cpu_hog":
+            raise OptionError(f"fault {fault.number}: {name}: other processes are not the simulator's; use tests/hil")
+        if kind == "serial" and name in BUS_ONLY:
+            raise OptionError(f"fault {fault.number}: {name}: a serial line has none; take it out or use a CAN bus")
 
 
 def _make_robot(options: VirtualRobotOptions) -> VirtualRobot:
@@ -251,3 +276,7 @@ def _announce(line: str, ready_fd: int | None) -> None:
     if ready_fd is not None:
         os.write(ready_fd, line.encode() + b"\n")
         os.close(ready_fd)
+
+
+def _tell(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)

@@ -35,7 +35,8 @@ class FrameFate:
 
     `wire_error_bit` inverts that bit of the stuffed frame: an error frame follows, and the sender tries again. All
     others happen behind the receivers' CRC check, so the sender never learns of them: `lost` for all or `lost_at` the
-    named nodes, `copies` of it, a delay, and `data` (of any length up to 8) in place of what was sent.
+    named nodes, `copies` of it, a delay, and `data` (of any length up to 8) in place of what was sent. `cut` with
+    `wire_error_bit`: the line breaks there; on a bus the same, on a serial line the rest of the frame is missing.
     """
 
     wire_error_bit: int | None = None
@@ -44,6 +45,7 @@ class FrameFate:
     copies: int = 1
     delay_ns: int = 0
     data: bytes | None = None
+    cut: bool = False
 
 
 class BusFault(Protocol):

@@ -7,16 +7,10 @@ from pathlib import Path
 from typing import IO
 
 from drivers.types import Frame, ReceivedFrame
-from sim.bus import Delivery
-from sim.bus_node import ErrorState
-from sim.can_frame import CanFrame
+from sim.bus import BusFault
 from sim.hub import Hub
 from sim.robot_link import LinkFaultError
-
-ROBOT_QUEUE = 64
-BABBLER_QUEUE = 32
-RESTART_DELAY_NS = 200_000_000
-"""After bus-off the robot's controller asks for recovery so much later, as can-dev does with restart-ms 200."""
+from sim.robot_node import RobotNode
 
 
 class HubLink:
@@ -30,9 +24,8 @@ class HubLink:
     ) -> None:
         write_line = None if log is None else lambda line: log.write(line + "\n")
         self.hub = Hub(path, now_ns, bitrate=bitrate, pacing=pacing, log=write_line)
-        self.robot = self.hub.bus.attach("robot", capacity=ROBOT_QUEUE)
-        self._babbler = self.hub.bus.attach("babbler", capacity=BABBLER_QUEUE)
-        self._restart_ns: int | None = None
+        self._robot = RobotNode(self.hub.bus)
+        self.robot = self._robot.node
 
     @property
     def address(self) -> str:
@@ -42,7 +35,7 @@ class HubLink:
     @property
     def error_counters(self) -> tuple[int, int]:
         """Error counters of the robot's node; the first is 256 at bus-off."""
-        return self.robot.tec, self.robot.rec
+        return self._robot.error_counters
 
     def filenos(self) -> list[int]:
         """The hub's epoll descriptor."""
@@ -50,7 +43,7 @@ class HubLink:
 
     def next_event_ns(self) -> int | None:
         """When a frame ends, a restart is due, or clients may come back."""
-        times = [t for t in (self.hub.next_event_ns(), self._restart_ns) if t is not None]
+        times = [t for t in (self.hub.next_event_ns(), self._robot.restart_ns) if t is not None]
         return min(times) if times else None
 
     def collect(self, now_ns: int) -> int:
@@ -59,23 +52,11 @@ class HubLink:
 
     def advance(self, now_ns: int, admit: int | None = None) -> list[ReceivedFrame]:
         """Run the bus up to `now_ns`; return the data frames that the robot's controller has received."""
-        deliveries = self.hub.advance(now_ns, admit)
-        if self.robot.state is ErrorState.BUS_OFF and self.robot.recessive_sequences is None:
-            if self._restart_ns is None:
-                self._restart_ns = now_ns + RESTART_DELAY_NS
-            elif now_ns >= self._restart_ns:
-                self._restart_ns = None
-                self.hub.bus.request_recovery(self.robot)
-        return [
-            ReceivedFrame(delivery.t_ns, Frame(delivery.frame.can_id, delivery.frame.data))
-            for delivery in deliveries
-            if self.robot in delivery.receivers and _is_for_robots(delivery)
-        ]
+        return self._robot.take(now_ns, self.hub.advance(now_ns, admit))
 
     def send(self, frames: Sequence[Frame]) -> None:
         """Queue the robot's frames; the node counts those that do not fit."""
-        for frame in frames:
-            self.hub.bus.send(self.robot, CanFrame(frame.can_id, frame.data))
+        self._robot.send(frames)
 
     def unplug(self, until_ns: int) -> None:
         """Cut off all clients and refuse new ones until then."""
@@ -92,7 +73,11 @@ class HubLink:
 
     def babble(self, frame: Frame) -> None:
         """Send `frame` from a third node; if its queue is full it is on the bus as often as the bus allows."""
-        self.hub.bus.send(self._babbler, CanFrame(frame.can_id, frame.data))
+        self._robot.babble(frame)
+
+    def tamper(self, fault: BusFault) -> None:
+        """Let `fault` decide what becomes of each frame."""
+        self.hub.bus.fault = fault
 
     def summary(self) -> str:
         """Counters in one line."""
@@ -105,8 +90,3 @@ class HubLink:
     def close(self) -> None:
         """Close the hub and remove its socket."""
         self.hub.close()
-
-
-def _is_for_robots(delivery: Delivery) -> bool:
-    frame = delivery.frame
-    return not (frame.error or frame.remote or frame.extended)

@@ -11,6 +11,7 @@ from typing import Any
 import can
 
 from drivers.types import Frame, ReceivedFrame
+from sim.bus import BusFault
 from sim.robot_link import LinkFaultError
 
 RETRY_NS = 500_000_000
@@ -110,6 +111,10 @@ class PythonCanLink:
     def babble(self, frame: Frame) -> None:
         """Send `frame` as if it came from another node."""
         self.send((frame,))
+
+    def tamper(self, fault: BusFault) -> None:
+        """The frames of somebody else's bus cannot be changed."""
+        raise LinkFaultError("faults: only on the simulator's own bus (interface unixcan) or a serial line")
 
     def summary(self) -> str:
         """Counters in one line."""

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Protocol
 
 from drivers.types import Frame, ReceivedFrame
+from sim.bus import BusFault
 
 
 class LinkFaultError(Exception):
@@ -46,6 +47,9 @@ class RobotLink(Protocol):
 
     def babble(self, frame: Frame) -> None:
         """Let a further, faulty node send `frame` once. Raises LinkFaultError if this link cannot."""
+
+    def tamper(self, fault: BusFault) -> None:
+        """Let `fault` decide what becomes of each frame. Raises LinkFaultError if the link is not its own."""
 
     def summary(self) -> str:
         """Counters in one line."""

@@ -2,6 +2,7 @@
 
 Linux pseudo-terminals carry bytes at once whatever baud rate is set; here a frame arrives when its last bit has passed,
 one that the host does not take in time is lost, and with different baud rates at the two ends only garbage arrives.
+A frame from the host in which a fault turns a bit is counted as garbled and lost, as the framing's CRC-16 sees it.
 """
 
 from __future__ import annotations
@@ -19,6 +20,9 @@ from pathlib import Path
 
 from drivers.types import Frame, ReceivedFrame
 from firmware_protocol.serial_framing import FrameDecoder, encode_frame
+from sim.bus import BusFault, FrameFate
+from sim.can_frame import CanFrame
+from sim.faults import ROBOT_NODE
 from sim.robot_link import LinkFaultError
 
 BITS_PER_BYTE = 10
@@ -28,6 +32,7 @@ READ_BYTES = 4096
 _BAUD_OF_CODE = {
     getattr(termios, name): int(name[1:]) for name in dir(termios) if name.startswith("B") and name[1:].isdigit()
 }
+_UNHARMED = FrameFate()
 _HANG_UP = select.POLLHUP | select.POLLERR
 
 
@@ -70,6 +75,7 @@ class SerialLine:
         self._to_host: deque[tuple[int, bytes]] = deque()
         self._master = -1
         self._connected = False
+        self._fault: BusFault | None = None
         self._poll = select.poll()
         self.port = ""
         self._plug_in()
@@ -120,8 +126,15 @@ class SerialLine:
         """Let frames pass in both directions up to `now_ns`."""
         for _ in range(len(self._waiting) if admit is None else admit):
             frame, size = self._waiting.popleft()
-            begin_ns = max(now_ns, self._to_robot[-1].t_ns) if self._to_robot else now_ns
-            self._to_robot.append(ReceivedFrame(begin_ns + size * self._byte_ns, frame))
+            fate = self._fate("host", frame)
+            if fate.wire_error_bit is not None:
+                self.stats.garbled_bytes += 1
+                continue
+            if fate.data is not None:
+                frame = Frame(frame.can_id, fate.data)
+            for _ in range(0 if fate.lost or ROBOT_NODE in fate.lost_at else fate.copies):
+                begin_ns = max(now_ns, self._to_robot[-1].t_ns) if self._to_robot else now_ns
+                self._to_robot.append(ReceivedFrame(begin_ns + fate.delay_ns + size * self._byte_ns, frame))
         self._now_ns = now_ns
         while self._to_host and self._to_host[0][0] <= now_ns:
             self._write(self._to_host.popleft()[1])
@@ -135,9 +148,12 @@ class SerialLine:
         if not self._connected:
             return
         for frame in frames:
-            encoded = encode_frame(frame.can_id, frame.data)
-            begin_ns = max(self._now_ns, self._to_host[-1][0]) if self._to_host else self._now_ns
-            self._to_host.append((begin_ns + len(encoded) * self._byte_ns, encoded))
+            fate = self._fate(ROBOT_NODE, frame)
+            data = frame.data if fate.data is None else fate.data
+            encoded = _damaged(encode_frame(frame.can_id, data), fate)
+            for _ in range(0 if fate.lost else fate.copies):
+                begin_ns = max(self._now_ns, self._to_host[-1][0]) if self._to_host else self._now_ns
+                self._to_host.append((begin_ns + fate.delay_ns + len(encoded) * self._byte_ns, encoded))
             self.stats.frames_out += 1
 
     def unplug(self, until_ns: int) -> None:
@@ -159,6 +175,10 @@ class SerialLine:
         """Nobody else is on a serial line."""
         raise LinkFaultError(f"babble {frame.can_id:#x}: a serial line has two ends only")
 
+    def tamper(self, fault: BusFault) -> None:
+        """Let `fault` decide what becomes of each frame; a delayed one holds up those behind it."""
+        self._fault = fault
+
     def summary(self) -> str:
         """Counters in one line."""
         return f"{self.stats} {self._decoder.stats}"
@@ -166,6 +186,11 @@ class SerialLine:
     def close(self) -> None:
         """Remove the port and the link to it."""
         self.unplug(self._now_ns)
+
+    def _fate(self, sender: str, frame: Frame) -> FrameFate:
+        if self._fault is None:
+            return _UNHARMED
+        return self._fault.fate(self._now_ns, sender, CanFrame(frame.can_id, frame.data))
 
     def _plug_in(self) -> None:
         self._plug_in_ns = None
@@ -242,3 +267,15 @@ class SerialLine:
     def _remove_link(self) -> None:
         if self._path is not None and self._path.is_symlink() and os.readlink(self._path) == self.port:
             self._path.unlink()
+
+
+def _damaged(encoded: bytes, fate: FrameFate) -> bytes:
+    """What of an encoded frame reaches the other end: all, one bit turned, or its beginning."""
+    if fate.wire_error_bit is None:
+        return encoded
+    place = fate.wire_error_bit % (8 * len(encoded))
+    if fate.cut:
+        return encoded[: place // 8]
+    damaged = bytearray(encoded)
+    damaged[place // 8] ^= 1 << place % 8
+    return bytes(damaged)

@@ -11,8 +11,11 @@ from dataclasses import dataclass
 from drivers.types import Frame
 from firmware_protocol.firmware_core import FirmwareConfig, FirmwareCore, FirmwareInputs, FirmwareOutputs, ResetCause
 from sim.plant import Plant, TrueState
+from sim.pose_sensor import PoseMeasurement
+from sim.robot_faults import RobotFaults
 
 STEP_US = 1000
+EARLIEST_JUMP_US = 10_000_000
 
 _RELEASED = FirmwareOutputs(0.0, 0.0, False, True, False, "BOOT", 0, 0, "NONE", "NONE", 0, 0, 0, 0, 0)
 
@@ -34,12 +37,13 @@ class VirtualRobot:
 
     Robot time is true microseconds since the robot was switched on, the plant's time. The motor driver takes the
     firmware's setpoints, its enable and its brake one cycle later. `estop_button` is the state of the button on the
-    robot. `seed` decides the arming challenges.
+    robot; `faults`, if there is one, stands between plant and firmware. `seed` decides the arming challenges.
     """
 
     def __init__(self, plant: Plant, config: FirmwareConfig, clock: DeviceClock | None = None, seed: int = 0) -> None:
         self.plant = plant
         self.estop_button = False
+        self.faults: RobotFaults | None = None
         self._config = config
         self._clock = clock or DeviceClock()
         self._clock_start_us = 0
@@ -83,10 +87,13 @@ class VirtualRobot:
         backwards.
         """
         plant = self.plant
-        outputs = self._outputs
-        poses = plant.step(
-            now_us, outputs.left_setpoint_rad_s, outputs.right_setpoint_rad_s, outputs.driver_enabled, outputs.brake
-        )
+        outputs, faults = self._outputs, self.faults
+        asked = turned = (outputs.left_setpoint_rad_s, outputs.right_setpoint_rad_s)
+        if faults is not None:
+            turned = faults.setpoints(*asked)
+        poses: Sequence[PoseMeasurement] = plant.step(now_us, *turned, outputs.driver_enabled, outputs.brake)
+        if faults is not None:
+            poses = faults.poses(now_us, poses)
         for pose in poses:
             if pose.sample_us < self._clock_start_us:
                 # The controller's clock has no name for a time before it started.
@@ -116,12 +123,19 @@ class VirtualRobot:
             estop_button=self.estop_button,
             reset_cause=self._reset_cause,
         )
+        if faults is not None:
+            inputs = faults.inputs(inputs, asked, outputs.driver_enabled)
         self._outputs = self._firmware.step(self.device_us(now_us), inputs)
         return [Frame(can_id, data) for can_id, data in self._firmware.drain()]
 
     def kidnap(self, dx_m: float, dy_m: float, dyaw_rad: float) -> None:
         """Carry the robot off: a step in the world frame and a turn about the tracked point, wheels untouched."""
         self.plant.kidnap(dx_m, dy_m, dyaw_rad)
+
+    def jump_clock(self, step_us: int) -> None:
+        """Set the controller's clock forward, or back, though never to before its tenth second."""
+        largest_us = max(0, self.device_us(self.now_us) - EARLIEST_JUMP_US)
+        self._clock = DeviceClock(self._clock.start_us + max(step_us, -largest_us), self._clock.skew_ppm)
 
     def reboot(self, cause: ResetCause = ResetCause.POWER_ON) -> None:
         """Restart the controller: it forgets everything, its clock begins anew, the wheels brake until it is up."""

@@ -60,13 +60,19 @@ def sim(
     truth: Annotated[Path | None, typer.Option(help="Write the true motion to this CSV file.")] = None,
     inject: Annotated[Path | None, typer.Option(help="Listen for faults to inject on this Unix socket.")] = None,
     bus_log: Annotated[Path | None, typer.Option(help="Write every frame to this file, as candump does.")] = None,
+    faults: Annotated[Path | None, typer.Option(help="Let go wrong what this TOML schedule says.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the sensors' and the ground's noise.")] = 1,
     list_effects: Annotated[bool, typer.Option("--list-effects", help="List the effects and exit.")] = False,
+    list_faults: Annotated[bool, typer.Option("--list-faults", help="List the kinds of faults and exit.")] = False,
 ) -> None:
     """Run the virtual robot alone, behind a CAN bus or a serial line."""
     from disco_hw.virtual import SimOptions, run_sim
     from sim.effects import effects_table
+    from sim.fault_schedule import kinds_table
 
+    if list_faults:
+        print(kinds_table())
+        return
     if list_effects:
         print(effects_table())
         return
@@ -82,6 +88,7 @@ def sim(
                 truth=truth,
                 inject=inject,
                 bus_log=bus_log,
+                faults=faults,
                 seed=seed,
             )
         )

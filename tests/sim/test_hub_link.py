@@ -5,8 +5,9 @@ import pytest
 
 from drivers.types import Frame
 from sim.bus_node import ErrorState
-from sim.hub_link import RESTART_DELAY_NS, HubLink
+from sim.hub_link import HubLink
 from sim.robot_link import LinkFaultError
+from sim.robot_node import RESTART_DELAY_NS
 from sim.unixcan import UnixCanBus
 
 MS = 1_000_000

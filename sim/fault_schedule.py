@@ -1,0 +1,312 @@
+"""What goes wrong and when, as data: the kinds of faults, a schedule in TOML, and schedules drawn from a seed."""
+
+from __future__ import annotations
+
+import enum
+import random
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+MAX_TIME_S = 1e6
+
+
+class FaultFileError(Exception):
+    """A schedule that cannot be used; the message is one line that names file, field and remedy."""
+
+
+class Room(enum.Enum):
+    """Where a fault strikes."""
+
+    FRAMES = "frames"
+    LINK = "link"
+    SENSORS = "sensors"
+    ROBOT = "robot"
+    PROCESS = "process"
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """One parameter of a kind: a number within bounds, a whole one if `whole`, or one of `choices`."""
+
+    name: str
+    default: float | str
+    least: float = 0.0
+    most: float = 0.0
+    choices: tuple[str, ...] = ()
+    whole: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """A kind of fault. `lasts`: it has a duration `for_s`; otherwise it happens at `at_s` and is over."""
+
+    name: str
+    room: Room
+    summary: str
+    parameters: tuple[Parameter, ...] = ()
+    lasts: bool = True
+
+
+def _number(name: str, default: float, least: float, most: float, *, whole: bool = False) -> Parameter:
+    return Parameter(name, default, least, most, whole=whole)
+
+
+_TO = Parameter("to", "both", choices=("robot", "host", "both"))
+_ONE_SIDE = Parameter("to", "robot", choices=("robot", "host"))
+_ID = _number("id", -1, -1, 0x7FF, whole=True)
+_SOME = _number("probability", 0.3, 1e-6, 1.0)
+_LATE = _number("delay_s", 0.3, 1e-3, 10.0)
+_CORES = _number("cores", 2, 1, 1024, whole=True)
+_DROP = _number("drop_v", 6.0, 0.1, 100.0)
+_WHEEL = Parameter("wheel", "left", choices=("left", "right"))
+_PROCESS = Parameter("process", "daemon", choices=("daemon", "robot", "recorder", "viewer"))
+_FRAMES = (_TO, _ID, _SOME)
+
+KINDS: Mapping[str, Kind] = MappingProxyType(
+    {
+        kind.name: kind
+        for kind in (
+            Kind("drop", Room.FRAMES, "frames are lost", _FRAMES),
+            Kind("duplicate", Room.FRAMES, "frames come twice", _FRAMES),
+            Kind("delay", Room.FRAMES, "frames come late", (*_FRAMES, _number("delay_s", 0.05, 1e-4, 10.0))),
+            Kind("reorder", Room.FRAMES, "frames overtake", (*_FRAMES, _number("window_s", 0.03, 1e-4, 1.0))),
+            Kind("flip_before_crc", Room.FRAMES, "a bit is wrong on the wire: the link's own check sees it", _FRAMES),
+            Kind("flip_after_crc", Room.FRAMES, "a bit is wrong behind the link's check: only E2E can see it", _FRAMES),
+            Kind("wrong_length", Room.FRAMES, "frames are cut short or padded behind the link's check", _FRAMES),
+            Kind(
+                "babble", Room.LINK, "another node sends zeros under an identifier",
+                (_number("id", 0x100, 0, 0x7FF, whole=True), _number("rate_hz", 400.0, 0.1, 100_000.0)),
+            ),
+            Kind(
+                "bus_off", Room.LINK, "a controller leaves the bus",
+                (Parameter("who", "host", choices=("host", "robot")),), lasts=False,
+            ),
+            Kind("one_way", Room.LINK, "nothing arrives on one side", (_ONE_SIDE,)),
+            Kind("unplug", Room.LINK, "the line is pulled out and put back in"),
+            Kind("unplug_mid_frame", Room.LINK, "the same, in the middle of a frame"),
+            Kind("encoder_stuck", Room.SENSORS, "an encoder does not count", (_WHEEL,)),
+            Kind(
+                "encoder_jump", Room.SENSORS, "an encoder's count jumps",
+                (_WHEEL, _number("ticks", 5000, -(1 << 31), 1 << 31, whole=True)), lasts=False,
+            ),
+            Kind(
+                "encoder_wrap", Room.SENSORS, "an encoder's count has so many bits only",
+                (_WHEEL, _number("bits", 10, 4, 31, whole=True)),
+            ),
+            Kind("encoder_reversed", Room.SENSORS, "an encoder counts backwards", (_WHEEL,)),
+            Kind("pose_frozen", Room.SENSORS, "the pose sensor repeats its last pose under new stamps"),
+            Kind(
+                "pose_jump", Room.SENSORS, "measured poses are elsewhere",
+                (_number("dx_m", 2.0, -1e3, 1e3), _number("dy_m", 0.0, -1e3, 1e3), _number("dyaw_rad", 0.0, -3.2, 3.2)),
+            ),
+            Kind("pose_late", Room.SENSORS, "poses come later, with their true stamps", (_LATE,)),
+            Kind("pose_swapped", Room.SENSORS, "x and y of measured poses are exchanged"),
+            Kind("pose_nan", Room.SENSORS, "measured poses are not numbers"),
+            Kind("pose_silent", Room.SENSORS, "no poses are measured"),
+            Kind(
+                "clock_jump", Room.ROBOT, "the controller's clock jumps", (_number("step_s", 1.0, -3600.0, 3600.0),),
+                lasts=False,
+            ),
+            Kind("brown_out", Room.ROBOT, "the controller loses power for a moment", lasts=False),
+            Kind(
+                "reboot", Room.ROBOT, "the controller restarts",
+                (Parameter("cause", "power_on", choices=("power_on", "watchdog")),), lasts=False,
+            ),
+            Kind("motor_stall", Room.ROBOT, "a wheel is blocked and draws 18 A", (_WHEEL,)),
+            Kind("battery_sag", Room.ROBOT, "the battery's voltage falls", (_DROP,)),
+            Kind("estop_button", Room.ROBOT, "the button on the robot is held down"),
+            Kind("cpu_hog", Room.PROCESS, "busy processes on so many cores", (_CORES,)),
+            Kind("disk_full", Room.PROCESS, "nothing more can be written to the log"),
+            Kind("sigstop", Room.PROCESS, "a process is frozen (SIGSTOP, then SIGCONT)", (_PROCESS,)),
+            Kind("sigkill", Room.PROCESS, "a process is killed (SIGKILL) and started again afterwards", (_PROCESS,)),
+        )
+    }
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """One fault of a schedule: from `begin_ns` to `end_ns` of the schedule's time, with its parameters by name."""
+
+    number: int
+    kind: Kind
+    begin_ns: int
+    end_ns: int
+    values: Mapping[str, float | str] = field(default_factory=dict)
+
+    def __getitem__(self, name: str) -> Any:
+        return self.values[name]
+
+    def __str__(self) -> str:
+        told = "".join(f" {name}={_short(value)}" for name, value in self.values.items())
+        return f"{self.kind.name}{told}"
+
+
+@dataclass(frozen=True, slots=True)
+class FaultSchedule:
+    """Faults in the order in which they begin; `seed` decides whatever in them is left to chance."""
+
+    seed: int
+    faults: tuple[Fault, ...]
+
+
+def load_schedule(path: Path) -> FaultSchedule:
+    """Read a schedule; raises FaultFileError for a file that is none.
+
+    The file: `seed` (0 if absent) and a table `[[fault]]` for each fault with `kind`, `at_s`, `for_s` (only kinds that
+    last) and the kind's parameters.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise FaultFileError(f"{path}: {error.strerror}; choose another file") from None
+    except UnicodeDecodeError:
+        raise FaultFileError(f"{path}: not a text file; give a fault schedule in TOML") from None
+    return parse_schedule(text, str(path))
+
+
+def parse_schedule(text: str, name: str = "schedule") -> FaultSchedule:
+    """Parse the text of a schedule, see `load_schedule`; `name` stands for the file in messages."""
+    try:
+        table = tomllib.loads(text)
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        raise FaultFileError(f"{name}: not TOML ({' '.join(str(error).split())}); correct that place") from None
+    unknown = set(table) - {"seed", "fault"}
+    if unknown:
+        raise FaultFileError(f"{name}: {min(unknown)}: unknown; a schedule has seed and [[fault]] only")
+    seed = table.get("seed", 0)
+    if type(seed) is not int or not 0 <= seed < 1 << 63:
+        raise FaultFileError(f"{name}: seed: {seed!r} is not a whole number from 0 up; correct it")
+    entries = table.get("fault", [])
+    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
+        raise FaultFileError(f"{name}: fault: write each fault as a table [[fault]]")
+    return FaultSchedule(seed, in_order([_fault(entry, f"{name}: fault {i}") for i, entry in enumerate(entries, 1)]))
+
+
+def in_order(faults: Sequence[Fault]) -> tuple[Fault, ...]:
+    """The faults by their beginnings, numbered from 1 in that order."""
+    ordered = sorted(faults, key=lambda fault: (fault.begin_ns, fault.end_ns, fault.kind.name))
+    return tuple(Fault(i, f.kind, f.begin_ns, f.end_ns, f.values) for i, f in enumerate(ordered, 1))
+
+
+def write_schedule(schedule: FaultSchedule) -> str:
+    """The schedule as TOML that `parse_schedule` reads back."""
+    lines = [f"seed = {schedule.seed}"]
+    for fault in schedule.faults:
+        lines += ["", "[[fault]]", f'kind = "{fault.kind.name}"', f"at_s = {fault.begin_ns * 1e-9!r}"]
+        if fault.kind.lasts:
+            lines.append(f"for_s = {(fault.end_ns - fault.begin_ns) * 1e-9!r}")
+        for name, value in fault.values.items():
+            lines.append(f'{name} = "{value}"' if isinstance(value, str) else f"{name} = {value!r}")
+    return "\n".join(lines) + "\n"
+
+
+def kinds_table() -> str:
+    """One line for each kind: its name, what happens, its parameters with their defaults."""
+    width = max(map(len, KINDS))
+    return "\n".join(
+        f"{kind.name:{width}}  {kind.summary}" + "".join(f"; {p.name} = {_short(p.default)}" for p in kind.parameters)
+        for kind in KINDS.values()
+    )
+
+
+def _fault(entry: dict[str, Any], where: str) -> Fault:
+    kind = KINDS.get(entry.get("kind", "")) if isinstance(entry.get("kind"), str) else None
+    if kind is None:
+        raise FaultFileError(f"{where}: kind: {entry.get('kind')!r} is none; say one of {', '.join(KINDS)}")
+    where = f"{where}: {kind.name}"
+    known = {parameter.name: parameter for parameter in kind.parameters}
+    unknown = set(entry) - set(known) - {"kind", "at_s"} - ({"for_s"} if kind.lasts else set())
+    if unknown:
+        names = ", ".join(["at_s", *(["for_s"] if kind.lasts else []), *known])
+        raise FaultFileError(f"{where}: {min(unknown)}: unknown; it has {names}")
+    at_s = _bounded(entry.get("at_s"), f"{where}: at_s", 0.0, MAX_TIME_S)
+    for_s = _bounded(entry.get("for_s"), f"{where}: for_s", 0.0, MAX_TIME_S) if kind.lasts else 0.0
+    values = {name: _value(entry.get(name, p.default), p, f"{where}: {name}") for name, p in known.items()}
+    begin_ns = round(at_s * 1e9)
+    return Fault(0, kind, begin_ns, begin_ns + round(for_s * 1e9), values)
+
+
+def _value(value: Any, parameter: Parameter, where: str) -> float | str:
+    if parameter.choices:
+        if value not in parameter.choices:
+            raise FaultFileError(f"{where}: {value!r} is none; say one of {', '.join(parameter.choices)}")
+        return str(value)
+    number = _bounded(value, where, parameter.least, parameter.most)
+    if parameter.whole and number != int(number):
+        raise FaultFileError(f"{where}: {value!r} is not a whole number; round it")
+    return int(number) if parameter.whole else number
+
+
+def _bounded(value: Any, where: str, least: float, most: float) -> float:
+    if value is None:
+        raise FaultFileError(f"{where}: missing; give a number from {least:g} to {most:g}")
+    if type(value) not in (int, float) or not least <= value <= most:
+        raise FaultFileError(f"{where}: {value!r} is not within {least:g} to {most:g}; correct it")
+    return float(value)
+
+
+def _short(value: float | str) -> str:
+    return value if isinstance(value, str) else f"{value:g}"
+
+
+def random_schedule(
+    seed: int,
+    duration_s: float,
+    *,
+    kinds: Sequence[str] = tuple(KINDS),
+    quiet_s: tuple[float, float] = (4.0, 12.0),
+    lasting_s: tuple[float, float] = (0.05, 3.0),
+) -> FaultSchedule:
+    """Draw faults of `kinds`, one after the other, until `duration_s`.
+
+    Each lasts a log-uniform time within `lasting_s` and is followed by a uniform pause within `quiet_s`; parameters are
+    drawn over ranges in which a robot may or may not go on. The same seed gives the same schedule on any machine.
+    """
+    chance = random.Random(seed)
+    faults: list[Fault] = []
+    now_s = chance.uniform(*quiet_s)
+    while now_s < duration_s:
+        kind = KINDS[chance.choice(list(kinds))]
+        ratio = lasting_s[1] / lasting_s[0]
+        for_s = lasting_s[0] * ratio ** chance.random() if kind.lasts else 0.0
+        begin_ns = round(now_s * 1e6) * 1000
+        values = {p.name: _drawn(kind.name, p, chance) for p in kind.parameters}
+        faults.append(Fault(0, kind, begin_ns, begin_ns + round(for_s * 1e6) * 1000, values))
+        now_s += for_s + chance.uniform(*quiet_s)
+    return FaultSchedule(seed, in_order(faults))
+
+
+_DRAWN: Mapping[tuple[str, str], tuple[float, ...]] = MappingProxyType(
+    {
+        ("delay", "delay_s"): (0.005, 0.3),
+        ("reorder", "window_s"): (0.005, 0.1),
+        ("babble", "rate_hz"): (50.0, 3000.0),
+        ("encoder_jump", "ticks"): (-100_000, 100_000),
+        ("encoder_wrap", "bits"): (6, 14),
+        ("pose_jump", "dx_m"): (-3.0, 3.0),
+        ("pose_jump", "dy_m"): (-3.0, 3.0),
+        ("pose_jump", "dyaw_rad"): (-3.1, 3.1),
+        ("pose_late", "delay_s"): (0.05, 1.5),
+        ("clock_jump", "step_s"): (-100.0, 100.0),
+        ("battery_sag", "drop_v"): (1.0, 12.0),
+        ("cpu_hog", "cores"): (1, 2),
+    }
+)
+_FRAME_IDS = (-1, -1, -1, 0x100, 0x101, 0x110, 0x111, 0x118, 0x119, 0x130, 0x133)
+_BABBLED_IDS = (0x000, 0x080, 0x100, 0x101, 0x110, 0x130, 0x7FF)
+
+
+def _drawn(kind: str, parameter: Parameter, chance: random.Random) -> float | str:
+    if parameter.choices:
+        return chance.choice(parameter.choices)
+    if parameter.name == "id":
+        return chance.choice(_BABBLED_IDS if kind == "babble" else _FRAME_IDS)
+    if parameter.name == "probability":
+        return chance.choice((0.02, 0.2, 0.5, 1.0))
+    least, most = _DRAWN[kind, parameter.name]
+    return chance.randint(int(least), int(most)) if parameter.whole else round(chance.uniform(least, most), 6)
