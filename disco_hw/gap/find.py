@@ -36,6 +36,37 @@ def find_gap(
     began = time.perf_counter()
     say = progress or (lambda text: None)
     log = logs if isinstance(logs, DriveLog) else concatenate(logs)
+    outcome, notes = _searched(log, model, say)
+    say("intervals, blind spots and the gap on held-out data")
+    effects, unnamed = outcome.effects(), outcome.unnamed()
+    amended, remarks = amended_model(
+        model, {effect.name: effect.parameters for effect in outcome.effects(given=True)}, outcome.parts()
+    )
+    gap = outcome.gap() if outcome.body is not None else {}
+    return GapReport(
+        sources=log.sources,
+        channels=outcome.channels(effects, (term.channel for term in unnamed)),
+        effects=effects,
+        unnamed=unnamed,
+        blind_spots=outcome.blind_spots(effects),
+        gap=gap,
+        model=amended,
+        residue=outcome.residue(),
+        notes=(*log.notes, *notes, *remarks),
+        candidates=outcome.candidates(),
+        pictures=outcome.pictures(gap) if pictures else {},
+        seconds=time.perf_counter() - began,
+    )
+
+
+def missing_effects(log: DriveLog, model: Model) -> tuple[str, ...]:
+    """Only the names of what a log shows and a model lacks, the surest first; raises LogError as `find_gap`."""
+    outcome, _ = _searched(log, model, lambda text: None)
+    return tuple(effect.name for effect in outcome.effects())
+
+
+def _searched(log: DriveLog, model: Model, say: Progress) -> tuple[Outcome, list[str]]:
+    """Both channels searched; and notes on what could not be judged."""
     line = timeline(log)
     if not (line.has_poses or line.has_commands):
         raise LogError(
@@ -57,27 +88,7 @@ def find_gap(
         wheels = search_wheels(line, geometry, nominal_wheels, _given(model, WHEEL))
     else:
         notes.append("no commands: the way from command to wheel is not judged")
-    say("intervals, blind spots and the gap on held-out data")
-    outcome = Outcome(line, nominal_body, nominal_wheels, body, wheels)
-    effects, unnamed = outcome.effects(), outcome.unnamed()
-    amended, remarks = amended_model(
-        model, {effect.name: effect.parameters for effect in outcome.effects(given=True)}, outcome.parts()
-    )
-    gap = outcome.gap() if body is not None else {}
-    return GapReport(
-        sources=log.sources,
-        channels=outcome.channels(effects, (term.channel for term in unnamed)),
-        effects=effects,
-        unnamed=unnamed,
-        blind_spots=outcome.blind_spots(effects),
-        gap=gap,
-        model=amended,
-        residue=outcome.residue(),
-        notes=(*log.notes, *notes, *remarks),
-        candidates=outcome.candidates(),
-        pictures=outcome.pictures(gap) if pictures else {},
-        seconds=time.perf_counter() - began,
-    )
+    return Outcome(line, nominal_body, nominal_wheels, body, wheels), notes
 
 
 def _vector(layout: Layout, model: Model) -> Array:

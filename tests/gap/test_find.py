@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from disco_hw.gap import find_gap
+from disco_hw.gap.find import missing_effects
 from disco_hw.gap.html import page
 from disco_hw.log.drive import DriveLog
 from disco_hw.log.errors import LogError
@@ -113,3 +114,9 @@ def test_the_amended_belief_is_a_joint_gaussian():
     names = model.belief.names
     axial, slip = names.index("axial_distance_m"), names.index("turn_slip.k_s")
     assert abs(covariance[axial, slip]) > 0.0
+
+
+def test_the_names_alone_are_those_of_the_report():
+    log = simulated_drive({"pose_latency": 0.1, "motor_lag": 0.12}, seed=902, drive="poor")
+    report = find_gap(log, MODEL)
+    assert missing_effects(log, MODEL) == tuple(effect.name for effect in report.effects) != ()
