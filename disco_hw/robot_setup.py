@@ -43,9 +43,8 @@ def refuse_missing_effects(setup: Setup) -> None:
     """Raise InputError if the model is marked as one whose parameters may have absorbed an effect it lacks."""
     if setup.model.missing_effects:
         raise InputError(
-            f"{setup.model_file}: missing_effects: {', '.join(setup.model.missing_effects)} was found in the log and is "
-            "not in the model, whose parameters may have absorbed it; write the model with `disco-hw gap`, or give "
-            "--accept-missing-effects"
+            f"{setup.model_file}: missing_effects: the model lacks {', '.join(setup.model.missing_effects)}, which its "
+            "parameters may have absorbed; write it with `disco-hw gap`, or give --accept-missing-effects"
         )
 
 
