@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -19,6 +20,8 @@ _PRIOR_SD = 2.0
 _OUTLIER = 5.0
 _SMOOTH_SAMPLES = 25
 _LOCAL_EXCESS = 1.4
+_REST_RAD_S = 0.05
+_READING = 2
 _LARGEST_WHEEL_NOISE = (0.05, 1.0, 0.1, 0.05, 0.1, 0.1, 0.02)
 
 
@@ -49,7 +52,8 @@ def fit_wheel_noise(channel: WheelChannel, p: Array) -> WheelNoise:
     between = np.maximum(np.diff(jumps[line.encoder.node + 1], prepend=0.0), 0.0)
     speed = line.speed_rad_s[line.encoder.node]
     start = channel.noise.vector()
-    counted = gains.use & ~gains.restart
+    # A wheel at rest reads the same however coarse its encoder is, and would speak for readings without error.
+    counted = gains.use & ~gains.restart & (np.abs(speed).max(axis=1) > _REST_RAD_S)
 
     def objective(logs: Array) -> float:
         trial = wheel_gains(WheelNoise.from_vector(logs), dt, speed, between, gains.restart, gains.use)
@@ -59,7 +63,10 @@ def fit_wheel_noise(channel: WheelChannel, p: Array) -> WheelNoise:
     # A speed that may be wrong by any amount for any time would explain wheels that do not turn at all.
     most = np.minimum(start + 5.0, WheelNoise(*_LARGEST_WHEEL_NOISE).vector())
     begin = np.minimum(start, most)
-    return WheelNoise.from_vector(_minimise(objective, begin, begin - 5.0, most, 25))
+    least = begin - 5.0
+    if line.quantum_rad > 0.0:
+        least[_READING] = max(least[_READING], math.log(line.quantum_rad / math.sqrt(12.0)))
+    return WheelNoise.from_vector(_minimise(objective, np.maximum(begin, least), least, most, 25))
 
 
 def _pull(logs: Array, start: Array) -> float:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
+from disco_hw.gap.held import without_repeats
 from disco_hw.log.drive import Commands, DriveLog
 
 CELL_S = 0.01
@@ -88,7 +89,7 @@ class Timeline:
 
 def timeline(log: DriveLog) -> Timeline:
     """Lay a drive on the grid; a log without wheel samples has an empty one."""
-    wheels, poses = log.wheels, log.poses
+    wheels, poses = without_repeats(log.wheels), log.poses
     notes: list[str] = []
     nodes_t, nodes_first, commands, changes, angles, speeds = [], [], [], [], [], []
     encoder_at, encoder_angle, pose_at, pose_values = [], [], [], []
