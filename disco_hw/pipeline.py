@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
-from disco_hw.control import NoValidControl, Plan, PlannerState, SentCommand, Task
+from disco_hw.control import NoValidControl, Plan, PlannerState, Rollouts, SentCommand, Task
 from disco_hw.daemon.governor import Governed, Governor
 from disco_hw.estimation import Estimate, PoseFusion, PoseUpdate
 from drivers.types import Readings
@@ -31,6 +31,9 @@ class Planner(Protocol):
     def set_task(self, task: Task) -> None:
         """Plan for another task of the same kind from the next reset on."""
 
+    def sampled_rollouts(self, count: int) -> Rollouts:
+        """The weightiest sequences of the last plan; changes nothing."""
+
 
 class NoPlanner:
     """In the place of a planner where the robot is driven by hand: it never has a plan."""
@@ -44,6 +47,10 @@ class NoPlanner:
 
     def set_task(self, _task: Task) -> None:
         """A person decides."""
+
+    def sampled_rollouts(self, _count: int) -> Rollouts:
+        """Raise NoValidControl."""
+        raise NoValidControl("there is no planner")
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,6 +140,13 @@ class Pipeline:
         """Follow another task of the same kind; what is planned for the present one is dropped."""
         self._planner.set_task(task)
         self._plan, self._following = None, False
+
+    def rollouts(self, count: int) -> Rollouts | None:
+        """What the plan in force was weighed from, the `count` of the largest weight; None without one.
+
+        A look from outside: no later tick is changed by it.
+        """
+        return None if self._plan is None else self._planner.sampled_rollouts(count)
 
     def step(self, now_ns: int, readings: Readings, motion: Motion, mark: Callable[[str], None] = untimed) -> Tick:
         """Advance by one tick; `mark(stage)` is called at the end of the stages "estimate" and "plan".

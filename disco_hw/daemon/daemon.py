@@ -10,7 +10,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from disco_hw.daemon import realtime
+from disco_hw.daemon import realtime, records_of_tick
 from disco_hw.daemon.assembly import assemble_core, make_driver, make_pipeline, make_planner
 from disco_hw.daemon.client import PAGE_ACTIONS, SERVED, socket_path
 from disco_hw.daemon.clock import Clock, MonotonicClock
@@ -40,6 +40,9 @@ from firmware_protocol.dbc import packaged_dbc
 _SECOND_NS = 1_000_000_000
 _COLLECT_NS = 5 * _SECOND_NS
 _STOP_LIMIT_NS = 1_500_000_000
+_FAN_NS = _SECOND_NS
+_WATCHED_FAN_NS = _SECOND_NS // 2
+_FAN_PATHS = 16
 
 Say = Callable[[str, str], None]
 
@@ -136,7 +139,7 @@ class Daemon:
         self,
         core: DaemonCore,
         server: ControlServer,
-        recorder: Recorder,
+        recorder: WatchedRecorder,
         clock: Clock,
         signals: StopSignals,
         say: Say,
@@ -157,6 +160,8 @@ class Daemon:
         self._failed = False
         self._next_second_ns = 0
         self._next_collect_ns = 0
+        self._next_fan_ns = 0
+        self._fan: tuple[records.Record, ...] = ()
         self._told_ready = False
 
     def run(self) -> int:
@@ -223,11 +228,12 @@ class Daemon:
         tick = self._core.tick(
             now_ns,
             (*requests, *wanted.requests),
-            (self._timing(now_ns), *self._every_second(now_ns), *told),
+            (self._timing(now_ns), *self._every_second(now_ns), *self._fan, *told),
             mark,
             wanted.motion,
         )
         self._answer(messages, tick.replies)
+        self._fan = self._look_at_samples(now_ns) if tick.pipeline.plan is not None else ()
         self._pilot.learn(now_ns, tick, tick.replies[len(requests) :])
         for text in wanted.events:
             self._say("drive", text)
@@ -254,6 +260,20 @@ class Daemon:
             overruns=stats.overruns,
             skipped=stats.skipped_periods,
         )
+
+    def _look_at_samples(self, now_ns: int) -> tuple[records.Record, ...]:
+        """What the plan was weighed from, once or twice a second, for the next tick's record.
+
+        After the command has gone out, and only if most of the period is left: it can never make a command late.
+        """
+        period_ns = round(1e9 / self._core.config.control.rate_hz)
+        if now_ns < self._next_fan_ns or self._clock.now_ns() - now_ns > period_ns // 2:
+            return ()
+        rollouts = self._core.pipeline.rollouts(_FAN_PATHS)
+        if rollouts is None or not len(rollouts.weights):
+            return ()
+        self._next_fan_ns = now_ns + (_WATCHED_FAN_NS if self._recorder.watched else _FAN_NS)
+        return (records_of_tick.fan(now_ns, rollouts),)
 
     def _every_second(self, now_ns: int) -> tuple[records.Record, ...]:
         if now_ns < self._next_second_ns:

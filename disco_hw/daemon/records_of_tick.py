@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from disco_hw.control import Rollouts
 from disco_hw.daemon.governor import Limited
 from disco_hw.estimation import PoseUpdate
 from disco_hw.log import records
@@ -14,6 +15,8 @@ from disco_hw.pipeline import Source, Tick
 from drivers.types import OutgoingFrame, Readings, ReceivedFrame, WheelCommand
 
 _NO_NUMBERS = (float("nan"),) * 3
+_FAN_POINTS = 11
+_FAN_DIGITS = 3
 
 
 def frames_in(frames: Sequence[ReceivedFrame]) -> Iterator[records.Record]:
@@ -83,6 +86,14 @@ def tick(result: Tick, command: WheelCommand | None, valid_for_s: float) -> Iter
         source=result.source.value,
         limits=tuple(flag.name or "" for flag in Limited if flag in governed.limited),
     )
+
+
+def fan(t_ns: int, rollouts: Rollouts) -> records.Fan:
+    """The rollouts of the plan made at `t_ns`, each thinned to 11 points from its first to its last."""
+    steps = rollouts.trajectories.shape[1]
+    kept = np.unique(np.linspace(0, steps - 1, min(_FAN_POINTS, steps)).astype(int))
+    places = np.round(rollouts.trajectories[:, kept, :2], _FAN_DIGITS)
+    return records.Fan(t_ns, _plain(rollouts.weights), _plain(places[:, :, 0].ravel()), _plain(places[:, :, 1].ravel()))
 
 
 def _innovation(update: PoseUpdate) -> records.Record:

@@ -145,6 +145,52 @@ class Counters(msgspec.Struct, frozen=True, gc=False):
     fusion: dict[str, int] = {}
     recorder: dict[str, int] = {}
     loop: dict[str, int] = {}
+    adaptation: dict[str, int] = {}
+
+
+class BeliefChange(msgspec.Struct, frozen=True, gc=False):
+    """The belief over parameters that planner and estimator use from this tick on.
+
+    `source` is "adapted" for one learnt from the running drive, or "model" for the model file's again, with empty
+    arrays. `covariance` is row-major in the order of `names`, SI units.
+    """
+
+    t_ns: int
+    source: str
+    names: tuple[str, ...] = ()
+    mean: tuple[float, ...] = ()
+    covariance: tuple[float, ...] = ()
+    reason: str = ""
+
+
+class Adaptation(msgspec.Struct, frozen=True, gc=False):
+    """What became of one report of the adapter: `outcome` for machines, `text` for a person.
+
+    published, confirming, agrees, refused: of a proposal, whose `mean` and `std` are given; idle: there was none;
+    reverted: back to the model file; lost: no adapter. `data_s` of driving that the proposal rests on.
+    """
+
+    t_ns: int
+    outcome: str
+    text: str
+    estimator: str = ""
+    names: tuple[str, ...] = ()
+    mean: tuple[float, ...] = ()
+    std: tuple[float, ...] = ()
+    data_s: float = 0.0
+
+
+class Fan(msgspec.Struct, frozen=True, gc=False):
+    """Some of the sequences that the plan made at `t_ns` was weighed from, rolled out under the mean parameters.
+
+    One path for each of `weights`, which are shares of all samples' total, the largest first. `x_m` and `y_m` hold the
+    paths one after the other, of equally many points each, to the millimetre.
+    """
+
+    t_ns: int
+    weights: tuple[float, ...]
+    x_m: tuple[float, ...]
+    y_m: tuple[float, ...]
 
 
 class Task(msgspec.Struct, frozen=True, gc=False):
@@ -174,7 +220,10 @@ Record = (
     | DaemonState
     | Event
     | Counters
+    | BeliefChange
+    | Adaptation
     | Task
+    | Fan
 )
 
 
@@ -204,6 +253,9 @@ TOPICS: tuple[Topic, ...] = (
     Topic("/event", Event),
     Topic("/counters", Counters),
     Topic("/task", Task),
+    Topic("/plan/rollouts", Fan),
+    Topic("/belief", BeliefChange),
+    Topic("/adapt", Adaptation),
 )
 
 TOPIC_INDEX: Mapping[type, int] = MappingProxyType({topic.record: index for index, topic in enumerate(TOPICS)})

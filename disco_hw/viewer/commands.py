@@ -6,7 +6,7 @@ What a page does not need is imported where it is used: the plotting library alo
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 from rich.console import Console
@@ -17,6 +17,7 @@ from disco_hw.daemon.client import socket_path
 from disco_hw.daemon.signals import StopSignals
 from disco_hw.errors import InputError
 from disco_hw.viewer.address import DEFAULT_PORT, LOOPBACK
+from disco_hw.viewer.desk import Desk
 from disco_hw.viewer.live import LivePage, run_live
 from disco_hw.viewer.recording import Recording
 from disco_hw.viewer.replay import ReplayPage, run_replay
@@ -37,8 +38,13 @@ def view_live(
     """
     stage = stage_of_robot(robot, model)
     socket = socket_path(load_robot_config(robot))
-    with StopSignals() as signals, serving(f"disco-hw: {stage.name}", host, port) as page:
-        live = LivePage(page.server, stage, socket, robot)
+    desk = Desk(socket, robot)
+    with (
+        StopSignals() as signals,
+        closing(desk),
+        serving(f"disco-hw: {stage.name}", host, port, desk) as page,
+    ):
+        live = LivePage(page.server, stage, socket, desk)
         print(f"page: {page.url}", flush=True)
         run_live(live, lambda: signals.received is not None or ended())
     return 0

@@ -61,6 +61,11 @@ class ViewerFeed:
         finally:
             os.umask(mask)
 
+    @property
+    def watched(self) -> bool:
+        """Whether somebody is connected."""
+        return self._watched
+
     def put(self, now_ns: int, records: Sequence[Record]) -> None:
         """Take the records of one tick, and publish what has gathered if it is time."""
         if self._watched:
@@ -112,6 +117,11 @@ class WatchedRecorder:
     def __init__(self, recorder: Recorder, feed: ViewerFeed) -> None:
         self._recorder = recorder
         self._feed = feed
+
+    @property
+    def watched(self) -> bool:
+        """Whether somebody looks."""
+        return self._feed.watched
 
     def put(self, now_ns: int, records: Sequence[Record]) -> None:
         """Record the tick, then show it."""

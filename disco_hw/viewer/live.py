@@ -1,4 +1,4 @@
-"""The live page: the daemon's feed drawn some times a second, and buttons that go through its control socket."""
+"""The live page's scene: the daemon's feed drawn some times a second, beside the desk that has the buttons."""
 
 from __future__ import annotations
 
@@ -8,15 +8,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import viser
 
-from disco_hw.daemon.control_client import send_request
-from disco_hw.errors import WorkError
+from disco_hw.config import CircleTask
+from disco_hw.daemon.task_change import record_of, task_of
 from disco_hw.log.records import Record
-from disco_hw.viewer import controls
+from disco_hw.viewer.desk import Desk
 from disco_hw.viewer.feed import feed_path
 from disco_hw.viewer.layers import add_layers
-from disco_hw.viewer.panel import escaped, events_text, live_details, live_head
+from disco_hw.viewer.panel import events_text, live_details, live_head
 from disco_hw.viewer.plots import Plots
 from disco_hw.viewer.scene import Scene
 from disco_hw.viewer.snapshot import Snapshot, snapshot_at
@@ -26,9 +27,8 @@ from disco_hw.viewer.timeline import Timeline
 
 MOVE_S = 0.1
 REDRAW_S = 0.5
-STATUS_S = 0.5
 KEEP_S = 300.0
-_STATUS_TIMEOUT_S = 0.3
+_STATUS_OLDER_NS = 2_000_000_000
 
 
 @dataclass(slots=True)
@@ -48,24 +48,16 @@ class _Due:
 class LivePage:
     """Everything on the live page; `step` waits for the feed and draws what has come."""
 
-    def __init__(self, server: viser.ViserServer, stage: Stage, socket: Path, robot_file: Path) -> None:
+    def __init__(self, server: viser.ViserServer, stage: Stage, socket: Path, desk: Desk) -> None:
         self.timeline = Timeline()
         self._server = server
-        self._socket = socket
+        self._stage = stage
+        self._desk = desk
         self._subscriber = FeedSubscriber(feed_path(socket))
-        self._status: dict[str, Any] | None = None
-        self._error = ""
-        self._move, self._redraw, self._ask = _Due(MOVE_S), _Due(REDRAW_S), _Due(STATUS_S)
+        self._move, self._redraw = _Due(MOVE_S), _Due(REDRAW_S)
         gui = server.gui
         gui.main_panel.dock_right()
-        top = gui.add_panel()
-        with top.add_tab("Robot"):
-            controls.add_estop(gui, controls.estop_asking(socket, robot_file), self._answered)
-            controls.add_buttons(gui, controls.asking(socket), self._answered)
-            self._head = gui.add_markdown("### connecting")
-            self._answer = gui.add_markdown("")
-        # Of its own, so that the e-stop does not scroll away; and not in the corner where the page puts its notices.
-        top.dock_above(gui.main_panel)
+        self._head = gui.add_markdown("### connecting")
         self._details = gui.add_markdown("")
         self._plots = Plots(gui, stage)
         with gui.add_folder("Events"):
@@ -79,8 +71,6 @@ class LivePage:
         now_s = time.monotonic()
         if not self._server.get_clients():
             return
-        if self._ask(now_s):
-            self._ask_status()
         if self._move(now_s):
             self.draw(self._redraw(now_s))
 
@@ -93,16 +83,18 @@ class LivePage:
 
     def draw(self, everything: bool) -> None:
         """Draw the newest instant; the panel and long lines only if `everything`."""
+        status = self._desk.status
+        self._learn_task(status)
         snapshot = self._snapshot()
         if snapshot is not None:
             self.scene.show(snapshot, everything)
         if everything:
-            _set(self._head, live_head(self._status, self._error))
+            _set(self._head, live_head(status, self._desk.error))
             behind_ms = None if snapshot is None else (time.monotonic_ns() - snapshot.t_ns) * 1e-6
-            _set(self._details, live_details(self._status, snapshot, self._subscriber.missed, behind_ms))
+            _set(self._details, live_details(status, snapshot, self._subscriber.missed, behind_ms))
             _set(self._events, events_text(snapshot, self.timeline.first_ns))
             if snapshot is not None:
-                self._plots.show(self.timeline, snapshot.t_ns)
+                self._plots.show(self.timeline, snapshot.t_ns, snapshot.task or self._stage.task)
 
     def close(self) -> None:
         """Leave the feed."""
@@ -112,14 +104,17 @@ class LivePage:
         newest = self.timeline.last_ns
         return None if newest is None else snapshot_at(self.timeline, newest, self.timeline.plans.last(newest))
 
-    def _ask_status(self) -> None:
-        try:
-            self._status, self._error = send_request(self._socket, {"do": "status"}, _STATUS_TIMEOUT_S), ""
-        except WorkError as error:
-            self._status, self._error = None, str(error)
-
-    def _answered(self, text: str) -> None:
-        self._answer.content = f"*{escaped(text)}*"
+    def _learn_task(self, status: dict[str, Any] | None) -> None:
+        """Take over the daemon's task: it may have been changed before this page was opened."""
+        newest = self.timeline.last_ns
+        if newest is None or status is None or not status.get("ok"):
+            return
+        asked = msgspec.convert(status["task"]["asked"], CircleTask)
+        told = self.timeline.tasks.last(newest)
+        if told is not None and newest - told.t_ns < _STATUS_OLDER_NS:
+            return
+        if (self._stage.task if told is None else task_of(told)) != asked:
+            self.timeline.add(newest, record_of(newest, asked))
 
 
 def run_live(page: LivePage, should_stop: Callable[[], bool]) -> None:

@@ -89,9 +89,10 @@ def _draw(figure: Figure, recording: Recording, t_s: float, points: ParameterPoi
     top = figure.add_subplot(grid[:, 0])
     _draw_scene(top, snapshot, stage, points)
     top.set_title(f"{stage.name}, {t_s:.2f} s", loc="left")
+    task = snapshot.task or stage.task
     cuts: tuple[tuple[str, Callable[[Timeline, int, int], Curves]], ...] = (
-        ("distance to the circle (m)", partial(curves.distance, stage.task)),
-        ("speed (m/s)", partial(curves.speed, stage.task)),
+        ("distance to the circle (m)", partial(curves.distance, task)),
+        ("speed (m/s)", partial(curves.speed, task)),
         ("wheels (rad/s)", curves.wheels),
     )
     for row, (title, cut) in enumerate(cuts):
@@ -107,7 +108,7 @@ def _draw(figure: Figure, recording: Recording, t_s: float, points: ParameterPoi
 
 
 def _draw_scene(axes: Axes, snapshot: Snapshot, stage: Stage, points: ParameterPoints) -> None:
-    task = stage.task
+    task = snapshot.task or stage.task
     axes.plot(
         *shapes.circle_points(task.center_x_m, task.center_y_m, task.radius_m).T,
         color=_web(scene.TASK_COLOUR), linewidth=2.5,
@@ -119,6 +120,11 @@ def _draw_scene(axes: Axes, snapshot: Snapshot, stage: Stage, points: ParameterP
         axes.add_collection(LineCollection(list(np.stack((trail[:-1], trail[1:]), axis=1)), colors=colours[1:], lw=1.5))
     if len(snapshot.poses):
         axes.plot(*snapshot.poses[:, :2].T, ".", color=_web(scene.POSES_COLOUR), markersize=3)
+    if snapshot.fan is not None:
+        paths = shapes.fan_paths(snapshot.fan.weights, snapshot.fan.x_m, snapshot.fan.y_m)
+        shades = shapes.weight_colours(snapshot.fan.weights, scene.FAN_COLOUR, scene.FAN_PALEST) / 255.0
+        for path, shade in zip(paths[::-1], shades[::-1], strict=True):
+            axes.plot(*path.T, color=tuple(shade), linewidth=0.7)
     if snapshot.plan is not None:
         for path in points.trajectories(snapshot.plan, snapshot.wheel_speeds or (0.0, 0.0)):
             axes.plot(*path.T, color=_web(scene.POINTS_COLOUR), linewidth=0.8)

@@ -9,6 +9,7 @@ from functools import partial
 import numpy as np
 import viser
 
+from disco_hw.config import CircleTask
 from disco_hw.viewer import curves
 from disco_hw.viewer.curves import Curves
 from disco_hw.viewer.stage import Stage
@@ -17,7 +18,7 @@ from disco_hw.viewer.timeline import Timeline
 WINDOW_NS = 20_000_000_000
 _HEIGHT = 170
 _COLOURS = ("#1c6dd0", "#e07b00", "#1e9650", "#b0308c")
-Cut = Callable[[Timeline, int, int], Curves]
+Cut = Callable[[CircleTask, Timeline, int, int], Curves]
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,34 +31,37 @@ class Plots:
     """Curves of the 20 s before an instant; a folder that is closed costs what an open one does, so all are drawn."""
 
     def __init__(self, gui: viser.GuiApi, stage: Stage) -> None:
-        task = stage.task
         self._plots: list[_Plot] = []
         with gui.add_folder("Plots"):
-            self._add(gui, "Distance to the circle (m)", partial(curves.distance, task))
-            self._add(gui, "Speed (m/s)", partial(curves.speed, task))
-            self._add(gui, "Wheels (rad/s)", curves.wheels)
-            self._add(gui, "Planner", curves.planner, ("temperature",))
+            self._add(gui, "Distance to the circle (m)", curves.distance)
+            self._add(gui, "Speed (m/s)", curves.speed)
+            self._add(gui, "Wheels (rad/s)", _any_task(curves.wheels))
+            self._add(gui, "Planner", _any_task(curves.planner), ("temperature",))
         with gui.add_folder("Innovations", expand_by_default=False):
             for axis, title in (("x_m", "x (m)"), ("y_m", "y (m)"), ("yaw_rad", "yaw (rad)")):
-                self._add(gui, title, partial(curves.innovation, axis))
+                self._add(gui, title, _any_task(partial(curves.innovation, axis)))
         with gui.add_folder("Belief", expand_by_default=False):
             for name in stage.model.parameter_names:
                 density = curves.marginal(stage.model, name)
                 if density is not None:
                     _add_uplot(gui, name, density, ())
 
-    def show(self, timeline: Timeline, at_ns: int) -> None:
-        """Draw the curves up to an instant."""
+    def show(self, timeline: Timeline, at_ns: int, task: CircleTask) -> None:
+        """Draw the curves up to an instant, those of the task for the one that is in force then."""
         for plot in self._plots:
-            found = plot.cut(timeline, at_ns - WINDOW_NS, at_ns)
+            found = plot.cut(task, timeline, at_ns - WINDOW_NS, at_ns)
             columns = _columns(found)
             if len(columns[0]) >= 2:
                 plot.handle.data = columns
 
     def _add(self, gui: viser.GuiApi, title: str, cut: Cut, right: tuple[str, ...] = ()) -> None:
-        empty = cut(Timeline(), 0, 0)
+        empty = cut(CircleTask(), Timeline(), 0, 0)
         blank = Curves(np.array((0.0, 1.0)), {name: np.zeros(2) for name in empty.values})
         self._plots.append(_Plot(_add_uplot(gui, title, blank, right), cut))
+
+
+def _any_task(cut: Callable[[Timeline, int, int], Curves]) -> Cut:
+    return lambda _task, timeline, first_ns, last_ns: cut(timeline, first_ns, last_ns)
 
 
 def _add_uplot(gui: viser.GuiApi, title: str, drawn: Curves, right: tuple[str, ...]) -> viser.GuiUplotHandle:

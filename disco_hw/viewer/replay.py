@@ -81,9 +81,10 @@ class ReplayPage:
         if everything:
             self._next_redraw_s = now_s + REDRAW_S
             first_ns = self._recording.first_ns
-            self._state.content = replay_text(snapshot, first_ns, self._recording.stage.task)
+            task = snapshot.task or self._recording.stage.task
+            self._state.content = replay_text(snapshot, first_ns, task)
             self._events.content = events_text(snapshot, first_ns)
-            self._plots.show(self._recording.timeline, snapshot.t_ns)
+            self._plots.show(self._recording.timeline, snapshot.t_ns, task)
 
     def _redraw(self) -> None:
         with self._lock:

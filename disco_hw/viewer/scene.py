@@ -8,6 +8,8 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from disco_hw.config import CircleTask
+from disco_hw.log import records
 from disco_hw.viewer import shapes
 from disco_hw.viewer.snapshot import Snapshot
 from disco_hw.viewer.stage import Stage
@@ -20,6 +22,7 @@ BODY_COLOUR = (200, 60, 160)
 WHEEL_COLOUR = (45, 45, 50)
 PLAN_COLOUR = (250, 140, 0)
 POINTS_COLOUR = (150, 110, 200)
+FAN_COLOUR = (0, 105, 125)
 POSES_COLOUR = (20, 150, 150)
 ELLIPSE_COLOUR = (120, 40, 200)
 CENTRE_COLOUR = (0, 0, 0)
@@ -32,6 +35,7 @@ LAYERS = {
     "robot": "Robot",
     "trail": "Driven trail",
     "plan": "Planned trajectory",
+    "fan": "Sampled rollouts by weight",
     "points": "Plan under sigma points",
     "ellipse": "95 % of the position",
     "poses": "Measured poses, 3 s",
@@ -39,6 +43,7 @@ LAYERS = {
 }
 _GROUND_M = 0.002
 _CENTRE_LIMIT_M = 5.0
+FAN_PALEST = 0.12
 _WHEEL_PARTS = (("front", 0.5), ("rear", -0.5))
 
 
@@ -70,11 +75,16 @@ class Scene:
         self._trail = server.scene.add_line_segments(
             "/trail", empty, np.zeros((1, 2, 3), np.uint8), thickness=0.014, visible=False
         )
+        self._fan = server.scene.add_line_segments(
+            "/fan", empty, np.zeros((1, 2, 3), np.uint8), thickness=0.005, visible=False
+        )
+        self._drawn_fan: records.Fan | None = None
 
     def show(self, snapshot: Snapshot, everything: bool = True) -> None:
         """Draw this instant."""
         layers = self.layers
         with self._server.atomic():
+            self._draw_task(snapshot.task or self._stage.task)
             self._task.visible = layers["task"]
             self._robot.visible = layers["robot"] and snapshot.pose is not None
             if snapshot.pose is not None:
@@ -92,7 +102,8 @@ class Scene:
             self._draw("plan", shapes.segments(path, 0.012))
             self._draw("points", self._points_paths(snapshot))
             self._draw("poses", _pose_marks(snapshot.poses))
-            self._draw_trail(snapshot.trail)
+            self._draw_fan(snapshot.fan)
+            self._draw_trail(snapshot)
 
     def _add_ground(self) -> None:
         task, scene = self._stage.task, self._server.scene
@@ -109,10 +120,10 @@ class Scene:
             shadow_opacity=0.0,
             position=(task.center_x_m, task.center_y_m, 0.0),
         )
-        circle = shapes.circle_points(task.center_x_m, task.center_y_m, task.radius_m)
         self._task = scene.add_line_segments(
-            "/task", shapes.segments(circle, _GROUND_M), TASK_COLOUR, thickness=max(0.012, 0.006 * task.radius_m)
+            "/task", _circle(task), TASK_COLOUR, thickness=max(0.012, 0.006 * task.radius_m)
         )
+        self._drawn_task = task
         away = 0.8 + 1.1 * task.radius_m
         camera = self._server.initial_camera
         camera.look_at = (task.center_x_m, task.center_y_m, 0.0)
@@ -167,10 +178,34 @@ class Scene:
         elif node.visible:
             node.visible = False
 
-    def _draw_trail(self, trail: Array) -> None:
+    def _draw_task(self, task: CircleTask) -> None:
+        if task != self._drawn_task:
+            self._task.points = _circle(task).astype(np.float32)
+            self._drawn_task = task
+
+    def _draw_fan(self, fan: records.Fan | None) -> None:
+        paths = np.empty((0, 0, 2))
+        if fan is not None and self.layers["fan"]:
+            paths = shapes.fan_paths(fan.weights, fan.x_m, fan.y_m)
+        if not len(paths):
+            self._drawn_fan = None
+            if self._fan.visible:
+                self._fan.visible = False
+            return
+        if fan is self._drawn_fan or fan is None:
+            return
+        colours = shapes.weight_colours(fan.weights, FAN_COLOUR, FAN_PALEST)
+        # The weightiest on top of the others.
+        heights = np.linspace(0.0075, 0.004, len(paths))
+        lines = [shapes.segments(path, height) for path, height in zip(paths, heights, strict=True)]
+        self._fan.points = np.concatenate(lines).astype(np.float32)
+        self._fan.colors = np.repeat(np.repeat(colours[:, None], paths.shape[1] - 1, axis=0), 2, axis=1)
+        self._fan.visible, self._drawn_fan = True, fan
+
+    def _draw_trail(self, snapshot: Snapshot) -> None:
+        trail, task = snapshot.trail, snapshot.task or self._stage.task
         visible = self.layers["trail"] and len(trail) >= 2
         if visible:
-            task = self._stage.task
             distance = np.hypot(trail[:, 0] - task.center_x_m, trail[:, 1] - task.center_y_m) - task.radius_m
             colours = shapes.distance_colours(distance, TRAIL_FULL_M)
             points = shapes.segments(trail, 4.0 * _GROUND_M)
@@ -203,6 +238,10 @@ class Scene:
         wheels = snapshot.wheel_speeds or (0.0, 0.0)
         paths = self._points.trajectories(snapshot.plan, wheels)
         return np.concatenate([shapes.segments(path, 0.008) for path in paths]) if len(paths) else np.empty((0, 2, 3))
+
+
+def _circle(task: CircleTask) -> Array:
+    return shapes.segments(shapes.circle_points(task.center_x_m, task.center_y_m, task.radius_m), _GROUND_M)
 
 
 def _pose_marks(poses: Array) -> Array:

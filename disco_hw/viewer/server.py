@@ -12,7 +12,7 @@ import http
 import io
 import secrets
 import socket
-from collections.abc import Callable, Iterator
+from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass
 from http.cookies import CookieError, SimpleCookie
@@ -26,10 +26,13 @@ from websockets.http11 import Request, Response
 
 from disco_hw.errors import InputError
 from disco_hw.viewer.address import DEFAULT_PORT, LOOPBACK
+from disco_hw.viewer.desk import Desk
 
 _LOOPBACK_NAMES = frozenset({"127.0.0.1", "localhost"})
 _COOKIE = "disco-hw-token"
+_DESK_PATH = "/desk"
 Answer = Callable[[Any, Request], Response | None]
+Handler = Callable[[Any], Awaitable[None]]
 
 
 @dataclass(slots=True)
@@ -75,15 +78,15 @@ class Page:
 
 
 @contextmanager
-def serving(label: str, host: str = LOOPBACK, port: int = DEFAULT_PORT) -> Iterator[Page]:
-    """Serve a page until the block ends; port 0 takes a free one.
+def serving(label: str, host: str = LOOPBACK, port: int = DEFAULT_PORT, desk: Desk | None = None) -> Iterator[Page]:
+    """Serve a page until the block ends; port 0 takes a free one. With a desk that is what opens, with the scene in it.
 
     Any host but 127.0.0.1 makes a token, which is part of the printed address. Raises InputError if the port is taken
     or the host is none of this machine's.
     """
     _check_free(host, port)
     guard = Guard(None if host == LOOPBACK else secrets.token_urlsafe(16))
-    with _guarded(guard), redirect_stdout(io.StringIO()):
+    with _guarded(guard, desk), redirect_stdout(io.StringIO()):
         server = viser.ViserServer(host=host, port=port, label=label, verbose=False)
     try:
         # Looked up when a client asks for it, so this is enough to keep the tunnel shut.
@@ -101,24 +104,57 @@ def serving(label: str, host: str = LOOPBACK, port: int = DEFAULT_PORT) -> Itera
 
 
 @contextmanager
-def _guarded(guard: Guard) -> Iterator[None]:
-    """Put the guard before every request of the server made inside the block."""
+def _guarded(guard: Guard, desk: Desk | None) -> Iterator[None]:
+    """Put the guard before every request of the server made inside the block, and the desk beside its page."""
     serve = websockets.asyncio.server.serve
+    instance = secrets.token_hex(8)
 
-    def guarded_serve(*arguments: Any, process_request: Answer, **options: Any) -> Any:
+    def guarded_serve(handler: Handler, *arguments: Any, process_request: Answer, **options: Any) -> Any:
         @functools.wraps(process_request)
         def process(connection: Any, request: Request) -> Response | None:
             upgrade = request.headers.get("Upgrade", "").lower() == "websocket"
-            refusal = guard.refusal(request.path, request.headers, upgrade)
-            return process_request(connection, request) if refusal is None else refusal
+            response = guard.refusal(request.path, request.headers, upgrade)
+            if response is None and desk is not None and not upgrade:
+                response = _desk_answer(desk, instance, request)
+            if response is None:
+                response = process_request(connection, request)
+            if response is not None:
+                response.headers["Content-Security-Policy"] = f"frame-ancestors {_framers(request)}"
+            return response
 
-        return serve(*arguments, process_request=process, **options)
+        async def handle(connection: Any) -> None:
+            if desk is not None and connection.request.path == _DESK_PATH:
+                await desk.serve(connection)
+            else:
+                await handler(connection)
+
+        return serve(handle, *arguments, process_request=process, **options)
 
     websockets.asyncio.server.serve = guarded_serve  # type: ignore[assignment,misc]
     try:
         yield
     finally:
         websockets.asyncio.server.serve = serve  # type: ignore[misc]
+
+
+def _desk_answer(desk: Desk, instance: str, request: Request) -> Response | None:
+    """The desk's own pages; None for what belongs to the scene in it."""
+    path = urlsplit(request.path).path
+    if path == "/":
+        return _answer(http.HTTPStatus.OK, "", {"Cache-Control": "no-store"}, desk.page(instance))
+    if path == "/instance":
+        origin = request.headers.get("Origin", "")
+        own = urlsplit(origin).hostname in _LOOPBACK_NAMES
+        return _answer(http.HTTPStatus.OK, instance, {"Access-Control-Allow-Origin": origin} if own else {})
+    return None
+
+
+def _framers(request: Request) -> str:
+    """Who may show an answer in a frame: the desk its scene, under any name of this machine; nobody the desk itself."""
+    if urlsplit(request.path).path != "/index.html":
+        return "'none'"
+    port = urlsplit(f"//{request.headers.get('Host', '')}").port
+    return "'self' " + " ".join(f"http://{name}:{port}" for name in sorted(_LOOPBACK_NAMES))
 
 
 def _check_free(host: str, port: int) -> None:
@@ -143,9 +179,10 @@ def _plain(status: http.HTTPStatus, text: str) -> Response:
     return _answer(status, text, {})
 
 
-def _answer(status: http.HTTPStatus, text: str, extra: dict[str, str]) -> Response:
-    body = (text + "\n").encode()
+def _answer(status: http.HTTPStatus, text: str, extra: dict[str, str], page: bytes | None = None) -> Response:
+    body = (text + "\n").encode() if page is None else page
+    kind = "text/plain" if page is None else "text/html"
     headers = Headers(
-        {"Content-Type": "text/plain; charset=utf-8", "Content-Length": str(len(body)), "Connection": "close", **extra}
+        {"Content-Type": f"{kind}; charset=utf-8", "Content-Length": str(len(body)), "Connection": "close", **extra}
     )
     return Response(status.value, status.phrase, headers, body)

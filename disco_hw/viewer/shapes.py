@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +44,22 @@ def distance_colours(distance_m: Array, full_m: float) -> Bytes:
     red = np.interp(part, (0.0, 0.5, 1.0), (30.0, 235.0, 220.0))
     green = np.interp(part, (0.0, 0.5, 1.0), (170.0, 190.0, 30.0))
     return np.stack((red, green, np.full(len(part), 40.0)), axis=1).astype(np.uint8)
+
+
+def fan_paths(weights: Sequence[float], x_m: Sequence[float], y_m: Sequence[float]) -> Array:
+    """Paths (n, points, 2) of a fan that is recorded one path after the other; (0, 0, 2) if it does not divide."""
+    count = len(weights)
+    if not count or len(x_m) % count or len(x_m) != len(y_m) or len(x_m) < 2 * count:
+        return np.empty((0, 0, 2))
+    return np.stack((np.reshape(x_m, (count, -1)), np.reshape(y_m, (count, -1))), axis=-1)
+
+
+def weight_colours(weights: Sequence[float], colour: tuple[int, int, int], palest: float) -> Bytes:
+    """Colours (n, 3) by share of the largest weight: `colour` for that one, mixed with white down to `palest` of it."""
+    share = np.asarray(weights, np.float64)
+    largest = share.max(initial=0.0)
+    part = palest + (1.0 - palest) * (share / largest if largest > 0.0 else np.zeros_like(share))
+    return np.asarray(255.0 - part[:, None] * (255.0 - np.array(colour)), np.uint8)
 
 
 def instant_centre(

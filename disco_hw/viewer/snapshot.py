@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from disco_hw.config import CircleTask
+from disco_hw.daemon.task_change import task_of
 from disco_hw.log import records
 from disco_hw.viewer.timeline import COVARIANCE, ESTIMATE, Timeline
 from drivers.types import RobotLinkHealth, RobotStatus
@@ -14,6 +16,7 @@ from drivers.types import RobotLinkHealth, RobotStatus
 Array = NDArray[np.float64]
 
 PLAN_AGE_NS = 500_000_000
+FAN_AGE_NS = 1_100_000_000
 POSES_NS = 3_000_000_000
 TRAIL_POINTS = 1500
 _POSES = 100
@@ -26,7 +29,8 @@ class Snapshot:
 
     `pose` (x, y, yaw) m and rad, its `covariance` (3, 3); `speed_m_s`, `yaw_rate_rad_s`; `wheel_angles`,
     `wheel_speeds`, `command` (left, right) rad and rad/s; `plan` not older than half a second; `poses` (N, 3) measured
-    in the last 3 s; `trail` (N, 2) of estimated positions.
+    in the last 3 s; `trail` (N, 2) of estimated positions; `fan` not older than 1.1 s; `task` where it is not the
+    robot.toml's.
     """
 
     t_ns: int
@@ -53,6 +57,8 @@ class Snapshot:
     skipped: int
     voltage_v: float
     events: tuple[tuple[int, records.Event], ...]
+    fan: records.Fan | None
+    task: CircleTask | None
 
 
 def snapshot_at(timeline: Timeline, t_ns: int, plan: records.Plan | None) -> Snapshot:
@@ -87,7 +93,14 @@ def snapshot_at(timeline: Timeline, t_ns: int, plan: records.Plan | None) -> Sna
         skipped=0 if loop is None else int(loop[1][2]),
         voltage_v=np.nan if power is None else float(power[1][0]),
         events=tuple(timeline.events.latest(t_ns, _EVENTS)),
+        fan=_fresh_fan(timeline, t_ns),
+        task=None if (told := timeline.tasks.last(t_ns)) is None else task_of(told),
     )
+
+
+def _fresh_fan(timeline: Timeline, t_ns: int) -> records.Fan | None:
+    fan = timeline.fans.last(t_ns)
+    return fan if fan is not None and t_ns - fan.t_ns <= FAN_AGE_NS else None
 
 
 def _positions(timeline: Timeline, t_ns: int) -> Array:

@@ -127,6 +127,8 @@ class Timeline:
         self.source: Items[str] = Items()
         self.events: Items[records.Event] = Items()
         self.counters: Items[records.Counters] = Items()
+        self.fans: Items[records.Fan] = Items()
+        self.tasks: Items[records.Task] = Items()
 
     def add(self, now_ns: int, record: records.Record) -> None:  # noqa: PLR0912
         """Take in one record of the tick at `now_ns`; ticks come in order. Frames are not kept."""
@@ -168,6 +170,10 @@ class Timeline:
                 self.events.append(now_ns, it)
             case records.Counters() as it:
                 self.counters.append(now_ns, it)
+            case records.Fan() as it:
+                self.fans.append(now_ns, it)
+            case records.Task() as it:
+                self.tasks.append(now_ns, it)
             case _:
                 pass
 
@@ -178,6 +184,7 @@ class Timeline:
         ):  # fmt: skip
             series.forget_before(oldest_ns)
         for items in (
-            self.plans, self.status, self.link, self.state, self.source, self.events, self.counters
+            self.plans, self.status, self.link, self.state, self.source, self.events, self.counters, self.fans,
+            self.tasks,
         ):  # fmt: skip
             items.forget_before(oldest_ns)

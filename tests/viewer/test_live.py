@@ -2,6 +2,7 @@ import time
 
 import pytest
 
+from disco_hw.viewer.desk import Desk
 from disco_hw.viewer.feed import ViewerFeed, feed_path
 from disco_hw.viewer.live import KEEP_S, LivePage, _Due
 from disco_hw.viewer.server import serving
@@ -13,9 +14,11 @@ from tests.viewer.run import ROBOT_FILE, pose_at, tick_records
 def page(tmp_path):
     socket = tmp_path / "control.sock"
     with serving("test", port=0) as served:
-        made = LivePage(served.server, stage_of_robot(ROBOT_FILE), socket, ROBOT_FILE)
+        desk = Desk(socket, ROBOT_FILE)
+        made = LivePage(served.server, stage_of_robot(ROBOT_FILE), socket, desk)
         yield made, socket
         made.close()
+        desk.close()
 
 
 def ticks(first, last):
@@ -36,10 +39,9 @@ def test_the_newest_instant_is_drawn(page):
 
 def test_before_anything_is_known_it_says_so(page):
     live, _ = page
-    live._ask_status()
     live.draw(everything=True)
     assert "no daemon" in live._head.content
-    assert "disco-hw run" in live._head.content
+    assert "not asked yet" in live._head.content
     assert not live.scene._robot.visible
 
 

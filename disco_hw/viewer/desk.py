@@ -1,0 +1,240 @@
+"""The operator's desk around the live page: e-stop, buttons, the task, the pad for driving by hand.
+
+A page of its own with a connection of its own, and the drawn scene in a frame: what is busy drawing, here or in the
+browser, does not stand in the way of the e-stop. Every word goes to the daemon's control socket, which decides.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import Awaitable, Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import msgspec
+from websockets.asyncio.server import ServerConnection
+from websockets.exceptions import ConnectionClosed
+
+from disco_hw.daemon.control_client import send_request
+from disco_hw.emergency import stop_robot
+from disco_hw.errors import InputError, WorkError
+from disco_hw.viewer.advice import advice, next_step
+
+REQUESTS = ("arm", "start", "stop", "disarm", "reset", "task")
+STATUS_S = 0.25
+_STATUS_TIMEOUT_S = 0.5
+_REQUEST_TIMEOUT_S = 1.0
+_ESTOP_TIMEOUT_S = 0.5
+_DRIVE_TIMEOUT_S = 0.5
+_MOST_BYTES = 4096
+
+_OPEN = {"do": "drive", "forward": 0, "left": 0, "held": False, "stamp": "0"}
+
+Send = Callable[[Mapping[str, Any]], Awaitable[None]]
+
+
+class Desk:
+    """Serves any number of browsers on the event loop of the page's server; `status` is the newest of the daemon.
+
+    `robot_file` is needed to stop the robot on its link when the daemon does not answer.
+    """
+
+    def __init__(self, socket: Path, robot_file: Path) -> None:
+        self.status: dict[str, Any] | None = None
+        self.error = "not asked yet"
+        self._socket = socket
+        self._robot_file = robot_file
+        self._asking = ThreadPoolExecutor(4, "desk")
+        # Of its own, so that no other request can be before it in a queue.
+        self._stopping = ThreadPoolExecutor(2, "desk e-stop")
+        self._watching = ThreadPoolExecutor(1, "desk status")
+        self._watchers = 0
+        self._watch: asyncio.Task[None] | None = None
+
+    def page(self, instance: str) -> bytes:
+        """The desk as HTML; `instance` is what this server tells of itself under any of its names."""
+        text = files("disco_hw.viewer").joinpath("desk.html").read_text(encoding="utf-8")
+        return text.replace("@@INSTANCE@@", instance).encode()
+
+    async def serve(self, connection: ServerConnection) -> None:
+        """Serve one browser until it leaves."""
+
+        async def send(message: Mapping[str, Any]) -> None:
+            await connection.send(json.dumps(message))
+
+        drive = _DriveLine(self._socket, send)
+        telling = asyncio.create_task(self._tell(send))
+        self._begin_watching()
+        replies: set[asyncio.Task[None]] = set()
+        try:
+            async for message in connection:
+                request = _request(message)
+                if request is None:
+                    await connection.close(1003, "not a request")
+                elif request["do"] == "drive":
+                    await drive.ask(request)
+                else:
+                    task = asyncio.create_task(self._ask(request, send))
+                    replies.add(task)
+                    task.add_done_callback(replies.discard)
+        except ConnectionClosed:
+            pass
+        finally:
+            telling.cancel()
+            self._end_watching()
+            await drive.let_go()
+
+    def close(self) -> None:
+        """End the threads; safe to call twice."""
+        for pool in (self._asking, self._stopping, self._watching):
+            pool.shutdown(wait=False, cancel_futures=True)
+
+    async def _ask(self, request: dict[str, Any], send: Send) -> None:
+        loop = asyncio.get_running_loop()
+        if request["do"] == "estop":
+            reply = await loop.run_in_executor(self._stopping, self.estop)
+        elif request["do"] in REQUESTS:
+            reply = await loop.run_in_executor(self._asking, self.request, request)
+        else:
+            reply = {"do": request["do"], "ok": False, "error": "this page has no such request"}
+        try:
+            await send({**reply, "kind": "reply"})
+        except ConnectionClosed:
+            return
+
+    def request(self, request: Mapping[str, Any]) -> dict[str, Any]:
+        """Send one request to the daemon; the answer says what went wrong, nothing is raised."""
+        try:
+            return send_request(self._socket, request, _REQUEST_TIMEOUT_S)
+        except WorkError as error:
+            return {"do": request["do"], "ok": False, "error": str(error)}
+
+    def estop(self) -> dict[str, Any]:
+        """Have the daemon stop; where it does not confirm that, stop the robot on its link as well. Never raises."""
+        try:
+            reply = send_request(self._socket, {"do": "estop"}, _ESTOP_TIMEOUT_S)
+            if reply.get("ok"):
+                return reply
+            refused = str(reply.get("error"))
+        except WorkError as error:
+            refused = str(error)
+        try:
+            outcome = stop_robot(self._robot_file)
+        except InputError as error:
+            return {"do": "estop", "ok": False, "error": f"{refused}; NOT SENT: {error}"}
+        words = "text" if outcome.sent else "error"
+        return {"do": "estop", "ok": outcome.sent, words: f"{refused}; {outcome.as_text()}"}
+
+    def _begin_watching(self) -> None:
+        self._watchers += 1
+        if self._watch is None:
+            self._watch = asyncio.create_task(self._keep_watching())
+
+    def _end_watching(self) -> None:
+        self._watchers -= 1
+        if not self._watchers and self._watch is not None:
+            self._watch.cancel()
+            self._watch = None
+
+    async def _keep_watching(self) -> None:
+        loop = asyncio.get_running_loop()
+        while True:
+            self.status, self.error = await loop.run_in_executor(self._watching, self._ask_status)
+            await asyncio.sleep(STATUS_S)
+
+    def _ask_status(self) -> tuple[dict[str, Any] | None, str]:
+        try:
+            return send_request(self._socket, {"do": "status"}, _STATUS_TIMEOUT_S), ""
+        except WorkError as error:
+            return None, str(error)
+
+    async def _tell(self, send: Send) -> None:
+        """Tell the browser how things are; also how it notices that nobody is here any more."""
+        while True:
+            try:
+                await send(shown(self.status, self.error))
+            except ConnectionClosed:
+                return
+            await asyncio.sleep(STATUS_S)
+
+
+def shown(status: Mapping[str, Any] | None, error: str) -> dict[str, Any]:
+    """What of a status the desk shows; `error` says why there is none."""
+    if status is None or not status.get("ok"):
+        why = error or str((status or {}).get("error") or "the daemon has not started its loop yet")
+        return {"kind": "status", "ok": False, "state": "NO DAEMON", "detail": why}
+    drive = status.get("drive")
+    return {
+        "kind": "status",
+        "ok": True,
+        "state": status["state"],
+        "detail": status["detail"],
+        "running": status["running"],
+        "estop": status["estop"] or status["robot_state"] == "ESTOP",
+        "advice": advice(status),
+        "next": next_step(status),
+        "task": {"asked": status["task"]["asked"], "limits": status["task"]["limits"]},
+        "drive": None if drive is None else {"by_page": drive["by_page"], "driving": drive["driving"]},
+    }
+
+
+class _DriveLine:
+    """One page's line to the daemon for driving: made when first needed, and again after it broke."""
+
+    def __init__(self, socket: Path, send: Send) -> None:
+        self._socket = socket
+        self._send = send
+        self._writer: asyncio.StreamWriter | None = None
+        self._reading: asyncio.Task[None] | None = None
+
+    async def ask(self, request: Mapping[str, Any]) -> None:
+        """Pass on what the pad says; the answer goes to the browser when it comes."""
+        try:
+            if self._writer is None:
+                async with asyncio.timeout(_DRIVE_TIMEOUT_S):
+                    reader, self._writer = await asyncio.open_unix_connection(str(self._socket))
+                self._reading = asyncio.create_task(self._read(reader))
+            self._writer.write(json.dumps(dict(request)).encode() + b"\n")
+            async with asyncio.timeout(_DRIVE_TIMEOUT_S):
+                await self._writer.drain()
+        except (OSError, TimeoutError):
+            await self.close()
+            await self._send({"kind": "drive", "ok": False, "error": "no daemon hears the pad"})
+
+    async def let_go(self) -> None:
+        """Open the pad of a page that has gone, and hang up."""
+        if self._writer is not None:
+            self._writer.write(json.dumps(_OPEN).encode() + b"\n")
+        await self.close()
+
+    async def close(self) -> None:
+        """Hang up; safe to call twice."""
+        if self._reading is not None:
+            self._reading.cancel()
+        if self._writer is not None:
+            self._writer.close()
+        self._reading = self._writer = None
+
+    async def _read(self, reader: asyncio.StreamReader) -> None:
+        try:
+            while line := await reader.readline():
+                await self._send({**json.loads(line), "kind": "drive"})
+        except (OSError, ValueError, ConnectionClosed):
+            pass
+        if self._writer is not None:
+            self._writer.close()
+            self._writer = None
+
+
+def _request(message: str | bytes) -> dict[str, Any] | None:
+    """A browser's message as a request, or None if it is none."""
+    if len(message) > _MOST_BYTES:
+        return None
+    try:
+        request = msgspec.json.decode(message, type=dict[str, Any])
+    except (msgspec.DecodeError, RecursionError):
+        return None
+    return request if isinstance(request.get("do"), str) else None
