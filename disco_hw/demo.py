@@ -40,6 +40,7 @@ class DemoOptions:
     plant_seed: int = 1
     uncertainty: str = "ut"
     view: bool = False
+    port: int = DEFAULT_PORT
     show_progress: bool = True
 
 
@@ -119,7 +120,7 @@ def _drive(options: DemoOptions, files: _Files, console: Console) -> bool:
         "sim", str(files.robot), "--plant-seed", str(options.plant_seed), "--truth", str(files.truth),
         "--start", str(config.task.center_x_m + config.task.radius_m), str(config.task.center_y_m), "1.5707963",
     ]  # fmt: skip
-    daemon_arguments = ["run", str(files.robot), "--log", str(files.log), *(["--view"] if options.view else [])]
+    daemon_arguments = ["run", str(files.robot), "--log", str(files.log), *_page(options)]
     with (
         disco_hw_process("virtual robot", simulator, files.simulator_output) as robot,
         disco_hw_process("daemon", daemon_arguments, files.daemon_output) as daemon,
@@ -127,7 +128,7 @@ def _drive(options: DemoOptions, files: _Files, console: Console) -> bool:
         operator = Operator(files.socket, (robot, daemon))
         console.print(f"virtual robot pid {robot.process.pid}, daemon pid {daemon.process.pid}, link {options.link}")
         if options.view:
-            console.print(f"page http://{LOOPBACK}:{DEFAULT_PORT}")
+            console.print(f"page http://{LOOPBACK}:{options.port}")
         operator.wait_for("READY", _START_TIMEOUT_S)
         operator.tell("arm")
         operator.wait_for("ARMED", 5.0)
@@ -142,6 +143,10 @@ def _drive(options: DemoOptions, files: _Files, console: Console) -> bool:
         if code != 0:
             raise WorkError(f"the daemon ended with exit code {code}: {daemon.last_words()}")
     return stopped
+
+
+def _page(options: DemoOptions) -> list[str]:
+    return ["--view", "--port", str(options.port)] if options.view else []
 
 
 def _watch_laps(operator: Operator, options: DemoOptions, limit_s: float, console: Console) -> None:

@@ -19,11 +19,13 @@ from disco_hw.verbs.options import (
 )
 from disco_hw.viewer.address import DEFAULT_PORT, LOOPBACK
 
+PagePort = Annotated[int, typer.Option("--port", min=1, max=65535, help="Port of the page.")]
 
-def _page(view: bool, robot: Path, model: Path | None) -> AbstractContextManager[object]:
+
+def _page(view: bool, robot: Path, model: Path | None, port: int) -> AbstractContextManager[object]:
     from disco_hw.viewer.beside import page_beside
 
-    return page_beside(robot, model, LOOPBACK, DEFAULT_PORT) if view else nullcontext()
+    return page_beside(robot, model, LOOPBACK, port) if view else nullcontext()
 
 
 def run(
@@ -32,6 +34,7 @@ def run(
     link: LinkOption = None,
     log_file: LogFileOption = None,
     view: View = False,
+    port: PagePort = DEFAULT_PORT,
     accept_missing_effects: Annotated[
         bool, typer.Option("--accept-missing-effects", help="Use a model that is marked as lacking an effect.")
     ] = False,
@@ -44,7 +47,7 @@ def run(
     limit_thread_pools()
     from disco_hw.daemon.daemon import DaemonOptions, run_daemon
 
-    with _page(view, robot, model):
+    with _page(view, robot, model, port):
         code = run_daemon(DaemonOptions(robot, model, link, log_file, as_json, accept_missing_effects))
     raise typer.Exit(code)
 
@@ -65,6 +68,7 @@ def drive(
     link: LinkOption = None,
     log_file: LogFileOption = None,
     view: View = False,
+    port: PagePort = DEFAULT_PORT,
     as_json: AsJson = False,
 ) -> None:
     """Drive by keyboard, gamepad or script, and record it for `infer` and `gap` (docs/drive.md)."""
@@ -73,7 +77,7 @@ def drive(
     limit_thread_pools()
     from disco_hw.drive.commands import DriveOptions, run_drive
 
-    with _page(view or page, robot, model):
+    with _page(view or page, robot, model, port):
         result = run_drive(
             DriveOptions(
                 robot=robot,

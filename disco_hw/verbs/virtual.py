@@ -15,6 +15,7 @@ from disco_hw.verbs.options import (
     RobotFile,
     View,
 )
+from disco_hw.viewer.address import DEFAULT_PORT
 
 
 def demo(
@@ -24,6 +25,7 @@ def demo(
     plant_seed: Annotated[int, typer.Option(min=0, help="Seed of the virtual robot's true parameters.")] = 1,
     uncertainty: Annotated[str, typer.Option(help="ut, mc or point.")] = "ut",
     view: View = False,
+    port: Annotated[int, typer.Option(min=1, max=65535, help="Port of the page.")] = DEFAULT_PORT,
     as_json: AsJson = False,
 ) -> None:
     """Drive the paper's circle with a virtual robot in real time, end to end, and print the figures."""
@@ -37,6 +39,7 @@ def demo(
             plant_seed=plant_seed,
             uncertainty=uncertainty,
             view=view,
+            port=port,
             show_progress=not as_json,
         )
     )

@@ -17,7 +17,7 @@ from disco_hw.log.records import Record
 from disco_hw.viewer.desk import Desk
 from disco_hw.viewer.feed import feed_path
 from disco_hw.viewer.layers import add_layers
-from disco_hw.viewer.panel import events_text, live_details, live_head
+from disco_hw.viewer.panel import events_text, live_details
 from disco_hw.viewer.plots import Plots
 from disco_hw.viewer.scene import Scene
 from disco_hw.viewer.snapshot import Snapshot, snapshot_at
@@ -57,7 +57,6 @@ class LivePage:
         self._move, self._redraw = _Due(MOVE_S), _Due(REDRAW_S)
         gui = server.gui
         gui.main_panel.dock_right()
-        self._head = gui.add_markdown("### connecting")
         self._details = gui.add_markdown("")
         self._plots = Plots(gui, stage)
         with gui.add_folder("Events"):
@@ -89,7 +88,6 @@ class LivePage:
         if snapshot is not None:
             self.scene.show(snapshot, everything)
         if everything:
-            _set(self._head, live_head(status, self._desk.error))
             behind_ms = None if snapshot is None else (time.monotonic_ns() - snapshot.t_ns) * 1e-6
             _set(self._details, live_details(status, snapshot, self._subscriber.missed, behind_ms))
             _set(self._events, events_text(snapshot, self.timeline.first_ns))

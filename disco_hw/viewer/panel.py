@@ -10,20 +10,8 @@ from typing import Any
 from disco_hw.config import CircleTask
 from disco_hw.viewer.snapshot import Snapshot
 
-LATCHED = "**E-STOP is latched.** Make the place safe, release the robot's own button, then press *Reset*."
 _NO_NUMBER = "—"
 Rows = list[tuple[str, str]]
-
-
-def live_head(status: Mapping[str, Any] | None, error: str) -> str:
-    """Markdown of the daemon's state in its own words; `error` says why there is no status."""
-    if status is None or not status.get("ok"):
-        why = error or (status or {}).get("error") or "not asked yet"
-        return f"### no daemon\n\n{escaped(str(why))}"
-    lines = [f"### {status['state']}{' · running' if status['running'] else ''}", "", escaped(str(status["detail"]))]
-    if status["estop"] or status["robot_state"] == "ESTOP":
-        lines += ["", LATCHED]
-    return "\n".join(lines)
 
 
 def live_details(

@@ -11,7 +11,7 @@ import pytest
 _ARGUMENTS = [
     "--no-sandbox", "--disable-gpu", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-quic",
     "--no-first-run", "--disable-background-networking", "--disable-component-update", "--disable-sync",
-    "--host-resolver-rules=MAP * ~NOTFOUND , EXCLUDE 127.0.0.1",
+    "--host-resolver-rules=MAP * ~NOTFOUND , EXCLUDE 127.0.0.1 , EXCLUDE localhost",
 ]  # fmt: skip
 _NAMES = ("chromium", "chromium-browser", "google-chrome")
 ARTIFACTS = Path(os.environ.get("DISCO_HW_ARTIFACTS", "out/screenshots"))

@@ -2,12 +2,14 @@ import time
 
 import pytest
 
+from disco_hw.config import CircleTask
+from disco_hw.log import records
 from disco_hw.viewer.desk import Desk
 from disco_hw.viewer.feed import ViewerFeed, feed_path
 from disco_hw.viewer.live import KEEP_S, LivePage, _Due
 from disco_hw.viewer.server import serving
 from disco_hw.viewer.stage import stage_of_robot
-from tests.viewer.run import ROBOT_FILE, pose_at, tick_records
+from tests.viewer.run import PERIOD_NS, ROBOT_FILE, START_NS, pose_at, tick_records
 
 
 @pytest.fixture
@@ -40,8 +42,7 @@ def test_the_newest_instant_is_drawn(page):
 def test_before_anything_is_known_it_says_so(page):
     live, _ = page
     live.draw(everything=True)
-    assert "no daemon" in live._head.content
-    assert "not asked yet" in live._head.content
+    assert "| page is behind | — ms" in live._details.content
     assert not live.scene._robot.visible
 
 
@@ -60,9 +61,36 @@ def test_records_come_over_the_feed(page):
 def test_a_page_that_stays_open_does_not_grow(page):
     live, _ = page
     count = round(KEEP_S * 50)
+    estimate = next(record for _, record in ticks(0, 1) if isinstance(record, records.Estimate))
     for number in range(0, 3 * count, 500):
-        live.take([entry for entry in ticks(number, number + 500) if type(entry[1]).__name__ == "Estimate"])
+        live.take([(START_NS + tick * PERIOD_NS, estimate) for tick in range(number, number + 500)])
     assert count <= len(live.timeline.estimate) <= 2 * count + 500
+
+
+def status_with(**task):
+    asked = {"kind": "circle", "center_x_m": 0.0, "center_y_m": 0.0, "radius_m": 0.75, "speed_m_s": 0.2} | task
+    return {"ok": False} if task == {"none": True} else {"ok": True, "task": {"asked": asked}}
+
+
+def test_a_task_that_was_changed_before_the_page_was_opened_is_taken_over(page):
+    live, _ = page
+    live.take(ticks(0, 51))
+    live._learn_task(status_with(none=True))
+    live._learn_task(status_with())
+    assert not len(live.timeline.tasks)
+    live._learn_task(status_with(radius_m=0.5))
+    assert live._snapshot().task == CircleTask(radius_m=0.5)
+
+
+def test_a_task_on_the_feed_is_newer_than_a_status_from_before_it(page):
+    live, _ = page
+    live.take(ticks(0, 51))
+    live.take([(live.timeline.last_ns, records.Task(live.timeline.last_ns, 1.0, 0.0, 0.5, 0.1))])
+    live._learn_task(status_with(radius_m=0.75))
+    assert live._snapshot().task.radius_m == 0.5
+    live.take(ticks(51, 200))
+    live._learn_task(status_with(radius_m=0.75))
+    assert live._snapshot().task.radius_m == 0.75
 
 
 def test_what_is_due_is_due_once_a_period():

@@ -1,0 +1,57 @@
+"""Every fault and state of the protocol is told with what to do about it."""
+
+import cantools
+import pytest
+
+from disco_hw.daemon.states import State
+from disco_hw.viewer.advice import FAULTS, advice, in_words, next_step
+from firmware_protocol.dbc import packaged_dbc
+
+STATUS = {"estop": False, "robot_state": "READY", "fault": "NONE", "state": "READY", "running": False}
+
+
+def test_every_fault_of_the_protocol_has_its_sentence():
+    database = cantools.database.load_string(packaged_dbc(), "dbc")
+    signal = database.get_message_by_name("SYSTEM_STATE").get_signal_by_name("fault")
+    assert set(FAULTS) == {str(name) for name in signal.choices.values()} - {"NONE"}
+
+
+@pytest.mark.parametrize("state", State)
+def test_every_state_says_what_to_do(state):
+    said = advice({**STATUS, "state": state.name})
+    assert len(said) == 1
+    assert said[0].endswith(".")
+
+
+@pytest.mark.parametrize(
+    ("state", "running", "button"),
+    [("READY", False, "arm"), ("ARMED", False, "start"), ("ARMED", True, "stop"), ("FAULT", False, "reset"),
+     ("STOPPING", False, ""), ("DISCONNECTED", False, "")],
+)  # fmt: skip
+def test_the_button_that_leads_on(state, running, button):
+    assert next_step({**STATUS, "state": state, "running": running}) == button
+
+
+def test_a_fault_and_a_latched_stop_come_before_everything_else():
+    said = advice({**STATUS, "state": "FAULT", "fault": "STALL_LEFT"})
+    assert said == (f"Stall left. {FAULTS['STALL_LEFT']}",)
+    both = advice({**STATUS, "state": "FAULT", "fault": "STALL_LEFT", "estop": True})
+    assert len(both) == 2
+    assert "latched" in both[0]
+    assert "Reset" in both[0]
+    assert advice({**STATUS, "robot_state": "ESTOP"}) == both[:1]
+
+
+def test_a_fault_that_is_not_known_here_is_told_all_the_same():
+    assert advice({**STATUS, "fault": "NEW_TROUBLE"})[0].startswith("New trouble. Look it up")
+
+
+def test_driving_by_hand_has_its_own_words():
+    status = {**STATUS, "drive": {"words": "hold the pad"}}
+    assert advice(status) == ("hold the pad",)
+    assert next_step(status) == ""
+    assert advice({**status, "state": "FAULT", "fault": "BUS_OFF"})[0].startswith("Bus off.")
+
+
+def test_codes_in_words():
+    assert in_words("OVER_CURRENT_RIGHT") == "Over current right"

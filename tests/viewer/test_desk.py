@@ -1,0 +1,253 @@
+"""The desk's way to the daemon, over a real page server and a real control socket."""
+
+import json
+import threading
+import time
+from contextlib import contextmanager
+from urllib.parse import urlsplit
+
+import pytest
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import connect
+
+from disco_hw.daemon.client import SERVED
+from disco_hw.daemon.control_socket import ControlServer
+from disco_hw.viewer import desk as desk_module
+from disco_hw.viewer.desk import Desk, shown
+from disco_hw.viewer.server import serving
+from tests.viewer.run import ROBOT_FILE
+from tests.viewer.test_server import get
+
+STATUS = {
+    "ok": True, "state": "READY", "detail": "ready to be armed", "running": False, "estop": False, "fault": "NONE",
+    "robot_state": "READY", "task": {"asked": {"radius_m": 0.75}, "limits": {"radius_m": [0.1, 50.0]}},
+}  # fmt: skip
+
+
+class Daemon:
+    """A control socket that accepts everything but `arm`, and keeps what it was asked; it can be made to hang."""
+
+    def __init__(self, directory):
+        directory.mkdir(mode=0o700)
+        self.server = ControlServer(directory / "control.sock", SERVED)
+        self.asked, self.hangs, self._ending = [], False, threading.Event()
+        self._thread = threading.Thread(target=self._serve)
+        self._thread.start()
+
+    def _serve(self):
+        while not self._ending.is_set():
+            for message in [] if self.hangs else self.server.poll():
+                self.asked.append((message.action, message.arguments))
+                self.server.reply(message, self._answer(message))
+            time.sleep(0.002)
+
+    def _answer(self, message):
+        if message.action == "status":
+            return STATUS
+        if message.action == "drive":
+            return {"ok": True, "stamp": str(1_000 + len(self.asked))}
+        return {"ok": message.action != "arm", "text": "done it", "error": "not now"}
+
+    def actions(self, *but):
+        return [action for action, _ in self.asked if action not in but]
+
+    def close(self):
+        self._ending.set()
+        self._thread.join()
+        self.server.close()
+
+
+@pytest.fixture
+def daemon(tmp_path):
+    made = Daemon(tmp_path / "run")
+    yield made
+    made.close()
+
+
+@contextmanager
+def desk_of(socket, robot=ROBOT_FILE):
+    """A served desk, and its port."""
+    desk = Desk(socket, robot)
+    with serving("test", port=0, desk=desk) as page:
+        yield desk, urlsplit(page.url).port
+    desk.close()
+
+
+@contextmanager
+def line_to(port, origin=None):
+    with connect(f"ws://127.0.0.1:{port}/desk", origin=origin or f"http://127.0.0.1:{port}", open_timeout=10) as line:
+        yield line
+
+
+def told(line, kind, timeout_s=10.0):
+    """The next message of that kind."""
+    deadline = time.monotonic() + timeout_s
+    while True:
+        message = json.loads(line.recv(timeout=max(deadline - time.monotonic(), 0.01)))
+        if message["kind"] == kind:
+            return message
+
+
+def hung_up(line):
+    """Whether the other end closes the line before it replies."""
+    try:
+        return told(line, "reply") is None
+    except ConnectionClosed:
+        return True
+
+
+def ask(line, **request):
+    line.send(json.dumps(request))
+    return told(line, "drive" if request["do"] == "drive" else "reply")
+
+
+def test_every_button_asks_the_daemon_and_tells_its_answer(daemon):
+    with desk_of(daemon.server.path) as (_, port), line_to(port) as line:
+        for action in desk_module.REQUESTS:
+            reply = ask(line, do=action)
+            assert reply["do"] == action
+            assert reply["ok"] is (action != "arm")
+            assert "not now" in reply["error"]
+    assert daemon.actions("status", "drive") == list(desk_module.REQUESTS)
+
+
+def test_the_task_goes_through_with_its_numbers(daemon):
+    with desk_of(daemon.server.path) as (_, port), line_to(port) as line:
+        ask(line, do="task", radius_m=0.5, speed_m_s=0.1)
+    assert ("task", {"radius_m": 0.5, "speed_m_s": 0.1}) in daemon.asked
+
+
+def test_what_is_no_request_of_the_page_does_not_reach_the_daemon(daemon):
+    with desk_of(daemon.server.path) as (_, port):
+        with line_to(port) as line:
+            assert "no such request" in ask(line, do="quit")["error"]
+        for garbage in ("", "[1]", '{"do": 1}', "{" * 100_000, b"\xff"):
+            with line_to(port) as line:
+                line.send(garbage)
+                assert hung_up(line)
+    assert daemon.actions("status", "drive") == []
+
+
+def test_the_estop_asks_the_daemon_first(daemon, tmp_path):
+    with desk_of(daemon.server.path, tmp_path / "none.toml") as (_, port), line_to(port) as line:
+        assert ask(line, do="estop")["text"] == "done it"
+    assert daemon.actions("status", "drive") == ["estop"]
+
+
+def robot_elsewhere(directory):
+    """A robot.toml whose link and daemon are nowhere."""
+    robot = directory / "robot.toml"
+    text = ROBOT_FILE.read_text().replace("/tmp/disco-hw-wombot.can", str(directory / "no-bus"))
+    robot.write_text(text + f'\n[daemon]\ncontrol_socket = "{directory / "none.sock"}"\n')
+    return robot
+
+
+def test_without_a_daemon_the_estop_takes_the_link_and_says_if_that_failed(tmp_path):
+    with desk_of(tmp_path / "none.sock", robot_elsewhere(tmp_path)) as (_, port), line_to(port) as line:
+        reply = ask(line, do="estop")
+        assert not reply["ok"]
+        assert "NOT SENT: use the robot's own e-stop button" in reply["error"]
+        assert "disco-hw run" in ask(line, do="arm")["error"]
+    with desk_of(tmp_path / "none.sock", tmp_path / "none.toml") as (_, port), line_to(port) as line:
+        assert "NOT SENT" in ask(line, do="estop")["error"]
+
+
+def test_the_estop_is_not_behind_requests_that_hang(daemon, monkeypatch):
+    """All threads for other requests wait for a daemon that hangs; the stop does not wait for them."""
+    stopped = threading.Event()
+    monkeypatch.setattr(Desk, "estop", lambda self: stopped.set() or {"do": "estop", "ok": True, "text": "stopped"})
+    with desk_of(daemon.server.path) as (_, port), line_to(port) as line:
+        daemon.hangs = True
+        for _ in range(20):
+            line.send(json.dumps({"do": "start"}))
+        begin = time.monotonic()
+        line.send(json.dumps({"do": "estop"}))
+        assert stopped.wait(0.9)
+        assert time.monotonic() - begin < 0.9
+        daemon.hangs = False
+
+
+def test_the_pad_has_a_line_of_its_own_and_is_opened_when_the_page_goes(daemon):
+    hold = {"do": "drive", "forward": 0.5, "left": 0.0, "held": True}
+    with desk_of(daemon.server.path) as (_, port):
+        with line_to(port) as line:
+            first = ask(line, stamp="0", **hold)
+            assert ask(line, stamp=first["stamp"], **hold)["ok"]
+        deadline = time.monotonic() + 5.0
+        while daemon.actions("status")[-1:] != ["drive"] or daemon.asked[-1][1].get("held", True):
+            assert time.monotonic() < deadline, daemon.asked[-3:]
+            time.sleep(0.01)
+    drives = [arguments for action, arguments in daemon.asked if action == "drive"]
+    assert [drive["held"] for drive in drives] == [True, True, False]
+    assert drives[1]["stamp"] == first["stamp"]
+
+
+def test_a_pad_without_a_daemon_is_told_so_and_tries_again(tmp_path):
+    with desk_of(tmp_path / "run" / "control.sock") as (_, port), line_to(port) as line:
+        request = {"do": "drive", "forward": 0, "left": 0, "held": False, "stamp": "0"}
+        assert "no daemon" in ask(line, **request)["error"]
+        made = Daemon(tmp_path / "run")
+        assert ask(line, **request)["ok"]
+        made.close()
+
+
+def test_two_pages_see_the_same_robot(daemon):
+    with desk_of(daemon.server.path) as (desk, port), line_to(port) as one, line_to(port) as other:
+        for line in (one, other):
+            deadline = time.monotonic() + 5.0
+            while (status := told(line, "status"))["state"] != "READY":
+                assert time.monotonic() < deadline
+        assert status["next"] == "arm"
+        assert status["task"]["limits"]["radius_m"] == [0.1, 50.0]
+        assert desk.status["state"] == "READY"
+
+
+def test_nobody_there_asks_nothing_of_the_daemon(daemon):
+    with desk_of(daemon.server.path) as (_, port):
+        with line_to(port) as line:
+            told(line, "status")
+        time.sleep(0.5)
+        asked = len(daemon.asked)
+        time.sleep(0.6)
+        assert len(daemon.asked) == asked
+
+
+@pytest.mark.parametrize("origin", ["http://evil.example", "null"])
+def test_a_foreign_page_gets_no_line(daemon, origin):
+    with desk_of(daemon.server.path) as (_, port), pytest.raises(InvalidStatus), line_to(port, origin):
+        pass
+    assert daemon.asked == []
+
+
+def test_the_desk_is_what_opens_and_nobody_else_may_frame_it(daemon):
+    with desk_of(daemon.server.path) as (_, port):
+        response, body = get(port)
+        assert b"E-STOP" in body
+        assert b"@@" not in body
+        assert response.getheader("Content-Security-Policy") == "frame-ancestors 'none'"
+        response, scene = get(port, "/index.html")
+        assert b"E-STOP" not in scene
+        assert f"http://127.0.0.1:{port}" in response.getheader("Content-Security-Policy")
+        own, instance = get(port, "/instance", Origin=f"http://localhost:{port}")
+        assert instance.strip() in body
+        assert own.getheader("Access-Control-Allow-Origin") == f"http://localhost:{port}"
+        foreign, _ = get(port, "/instance", Origin="http://evil.example")
+        assert foreign.getheader("Access-Control-Allow-Origin") is None
+
+
+@pytest.mark.parametrize(
+    ("status", "error", "words"),
+    [(None, "no daemon listens", "no daemon listens"), ({"ok": False, "error": "not started"}, "", "not started"),
+     ({"ok": False}, "", "not started its loop")],
+)  # fmt: skip
+def test_without_a_status_it_says_why(status, error, words):
+    said = shown(status, error)
+    assert not said["ok"]
+    assert words in said["detail"]
+
+
+def test_a_latched_stop_and_a_drive_by_page_are_shown():
+    said = shown({**STATUS, "robot_state": "ESTOP", "drive": {"by_page": True, "driving": False, "words": "w"}}, "")
+    assert said["estop"]
+    assert "latched" in said["advice"][0]
+    assert said["drive"] == {"by_page": True, "driving": False}
