@@ -24,7 +24,7 @@ from disco_hw.daemon.preflight import (
 )
 from disco_hw.daemon.realtime import can_lock_memory, can_use_fifo
 from disco_hw.errors import WorkError
-from disco_hw.robot_setup import Setup, load_setup
+from disco_hw.robot_setup import Setup, link_key, load_setup
 from drivers.transport import open_transport
 from drivers.types import Capabilities, DriverState, LinkState, OutgoingFrame, ReceivedFrame, Transport
 from firmware_protocol.codec import Codec, Decoded
@@ -64,6 +64,7 @@ def run_check(robot: Path, link: str | None = None) -> CheckReport:
     Raises InputError if a file is wrong, WorkError while a daemon drives this robot: the two would speak at once.
     """
     setup = load_setup(robot, None, link)
+    key = link_key(setup)
     _refuse_beside_a_daemon(setup.config)
     checks = [_model_check(setup), check_link_load(setup.config.link, setup.config.control, packaged_dbc())]
     control = setup.config.control
@@ -73,7 +74,7 @@ def run_check(robot: Path, link: str | None = None) -> CheckReport:
     try:
         checks.append(_link_check(transport))
         if checks[-1].level is Level.OK:
-            found = _ask_robot(transport)
+            found = _ask_robot(transport, key)
             checks.append(_firmware_check(found))
             checks.append(check_round_trip(found.round_trips_s, 1.0 / control.rate_hz))
             checks.append(_telemetry_check(found))
@@ -139,9 +140,9 @@ def _link_check(transport: Transport) -> Check:
     return Check("link", Level.OK, transport.name)
 
 
-def _ask_robot(transport: Transport) -> _Found:
+def _ask_robot(transport: Transport, key: bytes | None) -> _Found:
     """Shake hands, listen for three seconds and time the answers to the driver's own clock requests."""
-    driver = make_driver()
+    driver = make_driver(key)
     stopwatch = _Stopwatch()
     wheels = poses = 0
     driver.link_up(time.monotonic_ns())

@@ -53,6 +53,7 @@ class Link(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
     bitrate: Annotated[int, Meta(ge=10_000, le=1_000_000)] = 500_000
     port: str = "/dev/ttyUSB0"
     baud: Annotated[int, Meta(ge=9600, le=4_000_000)] = 921_600
+    key_file: str | None = None
 
 
 class Control(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -10,6 +10,7 @@ import msgspec
 from disco_hw.config import RobotConfig, load_robot_config
 from disco_hw.errors import InputError
 from disco_hw.model import Model, load_model
+from drivers.key_file import KeyFileError, read_key_file
 
 LINK_KINDS = ("can", "serial")
 Matrix3 = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
@@ -46,6 +47,17 @@ def refuse_missing_effects(setup: Setup) -> None:
             f"{setup.model_file}: missing_effects: the model lacks {', '.join(setup.model.missing_effects)}, which its "
             "parameters may have absorbed; write it with `disco-hw gap`, or give --accept-missing-effects"
         )
+
+
+def link_key(setup: Setup) -> bytes | None:
+    """The key of authenticated mode from the file that robot.toml names, None if it names none. Raises InputError."""
+    name = setup.config.link.key_file
+    if name is None:
+        return None
+    try:
+        return read_key_file(setup.robot_file.parent / name)
+    except KeyFileError as error:
+        raise InputError(f"{setup.robot_file}: link.key_file: {error}") from None
 
 
 def geometry(model: Model) -> tuple[tuple[float, float, float], Matrix3]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from disco_hw.errors import InputError
-from disco_hw.robot_setup import Setup, geometry, load_setup
+from disco_hw.robot_setup import Setup, geometry, link_key, load_setup
 from firmware_protocol.firmware_core import FirmwareConfig
 from sim.app import VirtualRobotOptions, run_virtual_robot
 from sim.body_dynamics import Pose
@@ -71,6 +71,7 @@ def run_sim(options: SimOptions) -> int:
                 ticks_per_rev=ticks_per_rev,
                 max_wheel_speed_rad_s=config.robot.max_wheel_speed_rad_s,
                 max_wheel_acceleration_rad_s2=config.robot.max_wheel_acceleration_rad_s2,
+                key=link_key(setup) or b"",
             ),
             truth_file=options.truth,
             bus_log=options.bus_log,

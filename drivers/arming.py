@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 
 from drivers import words
 from drivers.types import Request
-from firmware_protocol.serial_framing import crc16
+from firmware_protocol.e2e import challenge_answer
 
 ARMING_TIMEOUT_NS = 1_500_000_000
 SESSION_REFUSED_AFTER_NS = 300_000_000
@@ -169,8 +168,3 @@ class Arming:
             rejected = words.reject_reason(self._reject_reason)
             return f"{reasons} (last rejection: {rejected})" if rejected else reasons
         return words.reject_reason(self._reject_reason) or "the robot gave no reason"
-
-
-def challenge_answer(challenge: int, session: int, dbc_hash: int) -> int:
-    """Return the proof that HOST_STATE carries: CRC-16 over challenge, session and DBC hash, little-endian."""
-    return crc16(struct.pack("<HBI", challenge, session, dbc_hash))

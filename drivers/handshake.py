@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from drivers.types import Capabilities
-from firmware_protocol.codec import Decoded
+from firmware_protocol.codec import Codec, Decoded
 
 MESSAGES = frozenset({"HELLO", "BUILD", "LIMITS"})
+_AUTHENTICATION = Codec().choice_value("HELLO", "capabilities", "AUTHENTICATION")
 
 
 class Handshake:
@@ -16,7 +17,9 @@ class Handshake:
     `capabilities` is what the robot said of itself, None until it is complete or if its limits make no sense.
     """
 
-    def __init__(self, major: int, minor: int, dbc_hash: int) -> None:
+    def __init__(self, major: int, minor: int, dbc_hash: int, *, has_key: bool = False) -> None:
+        """`has_key`: whether this host proves its commands; a robot of the other mind is refused."""
+        self._has_key = has_key
         self._major = major
         self._minor = minor
         self._dbc_hash = dbc_hash
@@ -57,6 +60,13 @@ class Handshake:
                 f"telemetry only; flash the firmware built from this host's disco_robot.dbc, "
                 f"or install the host that matches the firmware"
             )
+        if self._hello is not None and bool(int(self._hello["capabilities"]) & _AUTHENTICATION) != self._has_key:
+            if self._has_key:
+                return (
+                    "the robot takes commands from anybody, and this host has a key: "
+                    "give the robot's firmware the key, or take link.key_file out of robot.toml"
+                )
+            return "the robot obeys only who holds its key: write link.key_file in robot.toml, the file with that key"
         if len(self._pages) == 2 and not self._limits_make_sense():
             return "the robot reports limits that make no sense (a zero among them); correct its configuration"
         return None

@@ -10,7 +10,7 @@ TIMEOUT_NS = 500_000_000
 SLOW_TIMEOUT_NS = 5_000_000_000
 _SLOW = frozenset({"POWER", "LINK_HEALTH"})
 # Asked for one by one, so that there is no row of good frames to wait for; hearing one twice does no harm.
-_ANSWERS = frozenset({"HELLO", "BUILD", "LIMITS", "TIME_RESPONSE", "PARAM_RESPONSE"})
+_ANSWERS = frozenset({"HELLO", "BUILD", "LIMITS", "TIME_RESPONSE", "PARAM_RESPONSE", "MAC_CHALLENGE"})
 _SENDERS = {layout.name: layout.sender for layout in PROTOCOL.messages}
 _USABLE = (E2EStatus.OK, E2EStatus.OK_SOME_LOST)
 

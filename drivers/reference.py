@@ -67,11 +67,15 @@ class ReferenceDriver:
     the wire's range (callers clip first): it never reaches the wire.
     """
 
-    def __init__(self, codec: Codec, draw_session: Callable[[], int]) -> None:
-        """`draw_session` returns any non-negative integer, best at random: session ids are made of it."""
+    def __init__(self, codec: Codec, draw_session: Callable[[], int], key: bytes | None = None) -> None:
+        """`draw_session` returns any non-negative integer, best at random: session ids are made of it.
+
+        With a `key` (16 bytes) commands are proved with it, and a robot that asks for no proof is refused.
+        """
         self._codec = codec
+        self._has_key = key is not None
         self._reception = FrameReception(codec)
-        self._transmission = FrameTransmission(codec)
+        self._transmission = FrameTransmission(codec, key)
         self._clock = DeviceClock()
         self._telemetry = telemetry.Telemetry(self._clock)
         self._arming = Arming(codec.dbc_hash, draw_session)
@@ -213,7 +217,7 @@ class ReferenceDriver:
             frames.append(self._wheel_command(now_ns, "SPEED", command))
         elif self._arming.needs_zeros:
             frames.append(self._wheel_command(now_ns, "HOLD_ZERO", WheelCommand(0.0, 0.0, ZERO_VALID_FOR_S)))
-        return (*frames, *self._house_keeping(now_ns))
+        return self._transmission.proved((*frames, *self._house_keeping(now_ns)))
 
     def estop(self, now_ns: int) -> tuple[OutgoingFrame, ...]:
         """Frames that stop the robot in any state; whatever was wanted is dropped."""
@@ -292,6 +296,8 @@ class ReferenceDriver:
                     self._take_session(decoded, received_ns)
                 case "TIME_RESPONSE":
                     self._take_time(decoded, received_ns)
+                case "MAC_CHALLENGE":
+                    self._transmission.challenge(int(decoded.values["nonce"]))
                 case "MOTOR":
                     sample = ("motors", telemetry.motor(decoded, received_ns))
                 case "POWER":
@@ -376,7 +382,7 @@ class ReferenceDriver:
         self._foreign_told = False
 
     def _new_handshake(self) -> Handshake:
-        return Handshake(PROTOCOL_MAJOR, PROTOCOL_MINOR, self._codec.dbc_hash)
+        return Handshake(PROTOCOL_MAJOR, PROTOCOL_MINOR, self._codec.dbc_hash, has_key=self._has_key)
 
     def _handshake_detail(self) -> str:
         missing = self._handshake.missing

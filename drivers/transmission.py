@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from drivers.types import Frame, OutgoingFrame
-from firmware_protocol.codec import Codec
+from firmware_protocol.authentication import Prover
+from firmware_protocol.codec import Codec, EncodedFrame
 from firmware_protocol.e2e import COUNTER_MODULUS
 
 
 class FrameTransmission:
-    """Encodes frames and remembers when each message was last sent."""
+    """Encodes frames, proves them if there is a key (16 bytes), and remembers when each message was last sent."""
 
-    def __init__(self, codec: Codec) -> None:
+    def __init__(self, codec: Codec, key: bytes | None = None) -> None:
         self._codec = codec
+        self._prover = Prover(key, codec) if key is not None else None
         self._counters: dict[str, int] = {}
         self._sent_ns: dict[str, int] = {}
 
@@ -23,6 +27,28 @@ class FrameTransmission:
     def forget(self) -> None:
         """Make every cyclic message due; the counters go on, so that no old frame can pass for a new one."""
         self._sent_ns.clear()
+        if self._prover is not None:
+            self._prover.forget()
+
+    def challenge(self, nonce: int) -> None:
+        """Take in the robot's nonce, to which proofs are bound."""
+        if self._prover is not None:
+            self._prover.challenge(nonce)
+
+    def proved(self, frames: Sequence[OutgoingFrame]) -> tuple[OutgoingFrame, ...]:
+        """Put its proof before each frame that needs one; what cannot be proved yet is left out."""
+        prover = self._prover
+        if prover is None:
+            return tuple(frames)
+        proved = []
+        for outgoing in frames:
+            frame = EncodedFrame(outgoing.frame.can_id, outgoing.frame.data)
+            if prover.needs_proof(frame.can_id):
+                if not prover.ready:
+                    continue
+                proved.append(OutgoingFrame(Frame(*prover.prove(frame)), outgoing.deadline_ns))
+            proved.append(outgoing)
+        return tuple(proved)
 
     def frame(self, name: str, now_ns: int, valid_for_ns: int, **signals: float | str) -> OutgoingFrame:
         """Return a frame that must have left `valid_for_ns` from now. Raises ValueError as `Codec.encode` does."""

@@ -51,6 +51,7 @@ _REJECT_REASONS = {
     "NONZERO_BEFORE_ARMED": "a command asked for motion before arming; is a second host connected?",
     "CHALLENGE": "the answer to its challenge was wrong; do both ends use the same DBC?",
     "HANDSHAKE": "the handshake was refused; do both ends use the same DBC?",
+    "AUTHENTICATION": "a command was not proved with the robot's key; is it the same in link.key_file?",
 }
 
 _BLOCKERS = {

@@ -13,6 +13,8 @@ PACKAGE = Path(__file__).resolve().parent
 HEADERS = (
     "disco_robot.h",
     "e2e.h",
+    "cmac.h",
+    "authentication.h",
     "wheel_limits.h",
     "robot_config.h",
     "states.h",
@@ -23,6 +25,8 @@ HEADERS = (
 SOURCES = (
     "disco_robot.c",
     "e2e.c",
+    "cmac.c",
+    "authentication.c",
     "wheel_limits.c",
     "robot_config.c",
     "states.c",

@@ -1,7 +1,7 @@
 """The C firmware core as a Python object: what the virtual robot runs and what the tests hold to account."""
 
 import enum
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import msgspec
@@ -27,7 +27,8 @@ class FirmwareConfig:
     """What differs between robots; a value out of the bounds of `robot_config.c` makes the core refuse to leave FAULT.
 
     `capabilities` is the sum of the bits in the DBC's value table; `dbc_hash` and `protocol_major` are other than the
-    packaged DBC's only to play a robot that speaks another one.
+    packaged DBC's only to play a robot that speaks another one. With a `key` (16 bytes) commands need a proof made
+    with it; empty: none.
     """
 
     ticks_per_rev: int
@@ -58,6 +59,7 @@ class FirmwareConfig:
     capabilities: int = 63
     dbc_hash: int = PROTOCOL.dbc_hash
     protocol_major: int = PROTOCOL_MAJOR
+    key: bytes = field(default=b"", repr=False)
 
 
 class FirmwareInputs(msgspec.Struct, frozen=True, gc=False, kw_only=True):
@@ -113,6 +115,9 @@ def _microseconds(seconds: float) -> int:
 
 
 def _fill_config(target: Any, config: FirmwareConfig) -> None:
+    if config.key:
+        target.authenticated = True
+        target.key = tuple(config.key)
     for name in ("protocol_major", "capabilities", "firmware_version", "board_id", "dbc_hash", "ticks_per_rev"):
         setattr(target, name, getattr(config, name))
     for name, unit in (
@@ -151,7 +156,10 @@ class FirmwareCore:
     __slots__ = ("_core", "_estop_sources", "_frame", "_inputs", "_outputs", "_reasons", "_states", "_stop_causes")
 
     def __init__(self, config: FirmwareConfig, entropy: int = 0) -> None:
-        """`entropy` seeds the arming challenges. Raises OverflowError for a value that its C field cannot hold."""
+        """`entropy` (64 bits) seeds challenges and nonces: never the same twice under one key.
+
+        Raises OverflowError for a value that its C field cannot hold.
+        """
         codec = Codec()
         self._states = _names(codec, "state")
         self._stop_causes = _names(codec, "stop_cause")
@@ -163,7 +171,7 @@ class FirmwareCore:
         self._frame = _ffi.new("disco_frame_t *")
         c_config = _ffi.new("disco_config_t *")
         _fill_config(c_config, config)
-        _lib.disco_firmware_init(self._core, c_config, entropy & 0xFFFF_FFFF)
+        _lib.disco_firmware_init(self._core, c_config, entropy & 0xFFFF_FFFF_FFFF_FFFF)
 
     def receive(self, now_us: int, can_id: int, data: bytes) -> None:
         """Take in one frame from the bus; anything may come."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import gc
 import os
+import secrets
 import select
 import sys
 import time
@@ -218,7 +219,9 @@ def _check_faults(schedule: FaultSchedule, kind: str, interface: str) -> None:
 def _make_robot(options: VirtualRobotOptions) -> VirtualRobot:
     plant = Plant(options.plant, hidden_effects(options.effects), options.seed, options.start)
     try:
-        return VirtualRobot(plant, options.firmware_config, options.clock, options.seed)
+        # A nonce must never come again under one key, not even in another process with the same seed.
+        seed = secrets.randbits(64) if options.firmware_config.key else options.seed
+        return VirtualRobot(plant, options.firmware_config, options.clock, seed)
     except OverflowError as error:
         raise OptionError(f"{_given(options.firmware_config)}: {error}; give a smaller value") from None
 
@@ -237,7 +240,7 @@ def _given(config: FirmwareConfig) -> str:
     chosen = [
         f"{field.name}={getattr(config, field.name)}"
         for field in fields(config)
-        if getattr(config, field.name) != field.default
+        if field.repr and getattr(config, field.name) != field.default
     ]
     return f"firmware {', '.join(chosen)}"
 

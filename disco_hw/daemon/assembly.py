@@ -55,9 +55,12 @@ def odometry_parameters(model: Model) -> OdometryParameters:
     return OdometryParameters(wheel_radius_m, axial_distance_m, x_icr_m, covariance)
 
 
-def make_driver() -> ReferenceDriver:
-    """The driver of the reference protocol; session ids are unpredictable, so that no old one fits by accident."""
-    return ReferenceDriver(Codec(), draw_session=lambda: secrets.randbits(16))
+def make_driver(key: bytes | None = None) -> ReferenceDriver:
+    """The driver of the reference protocol; session ids are unpredictable, so that no old one fits by accident.
+
+    `key`: of authenticated mode, 16 bytes.
+    """
+    return ReferenceDriver(Codec(), lambda: secrets.randbits(16), key)
 
 
 def assemble_core(

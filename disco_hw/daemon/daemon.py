@@ -31,7 +31,7 @@ from disco_hw.log.link import Attachment
 from disco_hw.log.provenance import DBC, MODEL_TOML, ROBOT_TOML, attachment, version
 from disco_hw.log.recorder import NullRecorder, ProcessRecorder, Recorder, Recording
 from disco_hw.pipeline import NoPlanner, Planner
-from disco_hw.robot_setup import Setup, load_setup, refuse_missing_effects
+from disco_hw.robot_setup import Setup, link_key, load_setup, refuse_missing_effects
 from disco_hw.viewer.feed import ViewerFeed, WatchedRecorder, feed_path
 from drivers.transport import open_transport
 from drivers.types import Request
@@ -102,6 +102,7 @@ def _start(
 ) -> Daemon:
     """Make everything, in the order that real time needs, and add to the stop path what must be undone."""
     config, link = setup.config, setup.config.link
+    key = link_key(setup)
     planner = new_planner()
     warm_up(make_pipeline(config, setup.model, new_planner()))
     pipeline = make_pipeline(config, setup.model, planner)
@@ -123,7 +124,7 @@ def _start(
         baud=link.baud,
     )
     stop.add("link", transport.close)
-    core = assemble_core(config, transport, make_driver(), pipeline, recorder, pilot.needs_pose)
+    core = assemble_core(config, transport, make_driver(key), pipeline, recorder, pilot.needs_pose)
     daemon = Daemon(core, server, recorder, MonotonicClock(), signals, say, pilot)
     stop.add("wheels", daemon.stop_wheels)
     if config.daemon.realtime_priority:

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import cantools.database.can
 
-_COMMAND = "WHEEL_COMMAND"
+_COMMANDS = ("WHEEL_COMMAND", "WHEEL_COMMAND_MAC")
+_AUTHENTICATION = ("WHEEL_COMMAND_MAC", "HOST_STATE_MAC", "MAC_CHALLENGE")
 _SERIAL_BITS_PER_BYTE = 10
 _SERIAL_OVERHEAD_BYTES = 7
 
@@ -22,18 +23,18 @@ class CyclicFrame:
     rate_hz: float
 
 
-def cyclic_frames(dbc: str, command_rate_hz: float) -> tuple[CyclicFrame, ...]:
+def cyclic_frames(dbc: str, command_rate_hz: float, *, authenticated: bool = False) -> tuple[CyclicFrame, ...]:
     """Return all frames with a cycle time (GenMsgCycleTime, ms) in the DBC's text, each page of a multiplexed one.
 
-    The wheel command counts at the rate of the control loop.
+    The wheel command counts at the rate of the control loop; proofs and their challenge only if `authenticated`.
     """
     database = cantools.database.can.Database()
     database.add_dbc_string(dbc)
     frames = []
     for message in database.messages:
-        if message.cycle_time:
+        if message.cycle_time and (authenticated or message.name not in _AUTHENTICATION):
             pages = {page for signal in message.signals for page in signal.multiplexer_ids or ()}
-            rate_hz = command_rate_hz if message.name == _COMMAND else 1000.0 / message.cycle_time
+            rate_hz = command_rate_hz if message.name in _COMMANDS else 1000.0 / message.cycle_time
             frames.append(CyclicFrame(message.name, message.senders[0], message.length, rate_hz * max(1, len(pages))))
     return tuple(frames)
 

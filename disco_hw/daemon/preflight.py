@@ -42,7 +42,7 @@ def failures(checks: Iterable[Check]) -> tuple[str, ...]:
 
 def check_link_load(link: Link, control: Control, dbc: str) -> Check:
     """Compare the load of the link by the cyclic frames of the DBC (its text) with a budget of 40 %."""
-    frames = cyclic_frames(dbc, control.rate_hz)
+    frames = cyclic_frames(dbc, control.rate_hz, authenticated=link.key_file is not None)
     if link.kind == "can":
         load = can_load(frames, link.bitrate)
         found = f"{load:.1%} of the bus at {link.bitrate / 1e3:g} kbit/s with the most stuff bits"

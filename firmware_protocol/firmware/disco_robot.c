@@ -196,6 +196,231 @@ bool disco_robot_estop_reason_is_in_phys_range(double value)
     return ((value >= 0.0) && (value <= 255.0));
 }
 
+int disco_robot_wheel_command_mac_pack(
+    uint8_t *dst_p,
+    const struct disco_robot_wheel_command_mac_t *src_p,
+    size_t size)
+{
+    if (size < 8u) {
+        return (-EINVAL);
+    }
+
+    memset(&dst_p[0], 0, 8);
+
+    dst_p[0] |= pack_left_shift_u16(src_p->freshness, 0u, 0xffu);
+    dst_p[1] |= pack_right_shift_u16(src_p->freshness, 8u, 0xffu);
+    dst_p[2] |= pack_left_shift_u64(src_p->mac, 0u, 0xffu);
+    dst_p[3] |= pack_right_shift_u64(src_p->mac, 8u, 0xffu);
+    dst_p[4] |= pack_right_shift_u64(src_p->mac, 16u, 0xffu);
+    dst_p[5] |= pack_right_shift_u64(src_p->mac, 24u, 0xffu);
+    dst_p[6] |= pack_right_shift_u64(src_p->mac, 32u, 0xffu);
+    dst_p[7] |= pack_right_shift_u64(src_p->mac, 40u, 0xffu);
+
+    return (8);
+}
+
+int disco_robot_wheel_command_mac_unpack(
+    struct disco_robot_wheel_command_mac_t *dst_p,
+    const uint8_t *src_p,
+    size_t size)
+{
+    if (size < 8u) {
+        return (-EINVAL);
+    }
+
+    dst_p->freshness = unpack_right_shift_u16(src_p[0], 0u, 0xffu);
+    dst_p->freshness |= unpack_left_shift_u16(src_p[1], 8u, 0xffu);
+    dst_p->mac = unpack_right_shift_u64(src_p[2], 0u, 0xffu);
+    dst_p->mac |= unpack_left_shift_u64(src_p[3], 8u, 0xffu);
+    dst_p->mac |= unpack_left_shift_u64(src_p[4], 16u, 0xffu);
+    dst_p->mac |= unpack_left_shift_u64(src_p[5], 24u, 0xffu);
+    dst_p->mac |= unpack_left_shift_u64(src_p[6], 32u, 0xffu);
+    dst_p->mac |= unpack_left_shift_u64(src_p[7], 40u, 0xffu);
+
+    return (0);
+}
+
+int disco_robot_wheel_command_mac_init(struct disco_robot_wheel_command_mac_t *msg_p)
+{
+    if (msg_p == NULL) return -1;
+
+    memset(msg_p, 0, sizeof(struct disco_robot_wheel_command_mac_t));
+
+    return 0;
+}
+
+bool disco_robot_wheel_command_mac_freshness_is_in_range(uint16_t value)
+{
+    (void)value;
+
+    return (true);
+}
+
+bool disco_robot_wheel_command_mac_freshness_is_in_phys_range(double value)
+{
+    return ((value >= 0.0) && (value <= 65535.0));
+}
+
+bool disco_robot_wheel_command_mac_mac_is_in_range(uint64_t value)
+{
+    return (value <= 281474976710655ull);
+}
+
+bool disco_robot_wheel_command_mac_mac_is_in_phys_range(double value)
+{
+    return ((value >= 0.0) && (value <= 281474976710655.0));
+}
+
+int disco_robot_host_state_mac_pack(
+    uint8_t *dst_p,
+    const struct disco_robot_host_state_mac_t *src_p,
+    size_t size)
+{
+    if (size < 8u) {
+        return (-EINVAL);
+    }
+
+    memset(&dst_p[0], 0, 8);
+
+    dst_p[0] |= pack_left_shift_u16(src_p->freshness, 0u, 0xffu);
+    dst_p[1] |= pack_right_shift_u16(src_p->freshness, 8u, 0xffu);
+    dst_p[2] |= pack_left_shift_u64(src_p->mac, 0u, 0xffu);
+    dst_p[3] |= pack_right_shift_u64(src_p->mac, 8u, 0xffu);
+    dst_p[4] |= pack_right_shift_u64(src_p->mac, 16u, 0xffu);
+    dst_p[5] |= pack_right_shift_u64(src_p->mac, 24u, 0xffu);
+    dst_p[6] |= pack_right_shift_u64(src_p->mac, 32u, 0xffu);
+    dst_p[7] |= pack_right_shift_u64(src_p->mac, 40u, 0xffu);
+
+    return (8);
+}
+
+int disco_robot_host_state_mac_unpack(
+    struct disco_robot_host_state_mac_t *dst_p,
+    const uint8_t *src_p,
+    size_t size)
+{
+    if (size < 8u) {
+        return (-EINVAL);
+    }
+
+    dst_p->freshness = unpack_right_shift_u16(src_p[0], 0u, 0xffu);
+    dst_p->freshness |= unpack_left_shift_u16(src_p[1], 8u, 0xffu);
+    dst_p->mac = unpack_right_shift_u64(src_p[2], 0u, 0xffu);
+    dst_p->mac |= unpack_left_shift_u64(src_p[3], 8u, 0xffu);
+    dst_p->mac |= unpack_left_shift_u64(src_p[4], 16u, 0xffu);
+    dst_p->mac |= unpack_left_shift_u64(src_p[5], 24u, 0xffu);
+    dst_p->mac |= unpack_left_shift_u64(src_p[6], 32u, 0xffu);
+    dst_p->mac |= unpack_left_shift_u64(src_p[7], 40u, 0xffu);
+
+    return (0);
+}
+
+int disco_robot_host_state_mac_init(struct disco_robot_host_state_mac_t *msg_p)
+{
+    if (msg_p == NULL) return -1;
+
+    memset(msg_p, 0, sizeof(struct disco_robot_host_state_mac_t));
+
+    return 0;
+}
+
+bool disco_robot_host_state_mac_freshness_is_in_range(uint16_t value)
+{
+    (void)value;
+
+    return (true);
+}
+
+bool disco_robot_host_state_mac_freshness_is_in_phys_range(double value)
+{
+    return ((value >= 0.0) && (value <= 65535.0));
+}
+
+bool disco_robot_host_state_mac_mac_is_in_range(uint64_t value)
+{
+    return (value <= 281474976710655ull);
+}
+
+bool disco_robot_host_state_mac_mac_is_in_phys_range(double value)
+{
+    return ((value >= 0.0) && (value <= 281474976710655.0));
+}
+
+int disco_robot_param_request_mac_pack(
+    uint8_t *dst_p,
+    const struct disco_robot_param_request_mac_t *src_p,
+    size_t size)
+{
+    if (size < 8u) {
+        return (-EINVAL);
+    }
+
+    memset(&dst_p[0], 0, 8);
+
+    dst_p[0] |= pack_left_shift_u16(src_p->freshness, 0u, 0xffu);
+    dst_p[1] |= pack_right_shift_u16(src_p->freshness, 8u, 0xffu);
+    dst_p[2] |= pack_left_shift_u64(src_p->mac, 0u, 0xffu);
+    dst_p[3] |= pack_right_shift_u64(src_p->mac, 8u, 0xffu);
+    dst_p[4] |= pack_right_shift_u64(src_p->mac, 16u, 0xffu);
+    dst_p[5] |= pack_right_shift_u64(src_p->mac, 24u, 0xffu);
+    dst_p[6] |= pack_right_shift_u64(src_p->mac, 32u, 0xffu);
+    dst_p[7] |= pack_right_shift_u64(src_p->mac, 40u, 0xffu);
+
+    return (8);
+}
+
+int disco_robot_param_request_mac_unpack(
+    struct disco_robot_param_request_mac_t *dst_p,
+    const uint8_t *src_p,
+    size_t size)
+{
+    if (size < 8u) {
+        return (-EINVAL);
+    }
+
+    dst_p->freshness = unpack_right_shift_u16(src_p[0], 0u, 0xffu);
+    dst_p->freshness |= unpack_left_shift_u16(src_p[1], 8u, 0xffu);
+    dst_p->mac = unpack_right_shift_u64(src_p[2], 0u, 0xffu);
+    dst_p->mac |= unpack_left_shift_u64(src_p[3], 8u, 0xffu);
+    dst_p->mac |= unpack_left_shift_u64(src_p[4], 16u, 0xffu);
+    dst_p->mac |= unpack_left_shift_u64(src_p[5], 24u, 0xffu);
+    dst_p->mac |= unpack_left_shift_u64(src_p[6], 32u, 0xffu);
+    dst_p->mac |= unpack_left_shift_u64(src_p[7], 40u, 0xffu);
+
+    return (0);
+}
+
+int disco_robot_param_request_mac_init(struct disco_robot_param_request_mac_t *msg_p)
+{
+    if (msg_p == NULL) return -1;
+
+    memset(msg_p, 0, sizeof(struct disco_robot_param_request_mac_t));
+
+    return 0;
+}
+
+bool disco_robot_param_request_mac_freshness_is_in_range(uint16_t value)
+{
+    (void)value;
+
+    return (true);
+}
+
+bool disco_robot_param_request_mac_freshness_is_in_phys_range(double value)
+{
+    return ((value >= 0.0) && (value <= 65535.0));
+}
+
+bool disco_robot_param_request_mac_mac_is_in_range(uint64_t value)
+{
+    return (value <= 281474976710655ull);
+}
+
+bool disco_robot_param_request_mac_mac_is_in_phys_range(double value)
+{
+    return ((value >= 0.0) && (value <= 281474976710655.0));
+}
+
 int disco_robot_wheel_command_pack(
     uint8_t *dst_p,
     const struct disco_robot_wheel_command_t *src_p,
@@ -1796,6 +2021,91 @@ bool disco_robot_session_state_blockers_is_in_range(uint8_t value)
 bool disco_robot_session_state_blockers_is_in_phys_range(double value)
 {
     return ((value >= 0.0) && (value <= 255.0));
+}
+
+int disco_robot_mac_challenge_pack(
+    uint8_t *dst_p,
+    const struct disco_robot_mac_challenge_t *src_p,
+    size_t size)
+{
+    if (size < 8u) {
+        return (-EINVAL);
+    }
+
+    memset(&dst_p[0], 0, 8);
+
+    dst_p[0] |= pack_left_shift_u8(src_p->crc, 0u, 0xffu);
+    dst_p[1] |= pack_left_shift_u8(src_p->counter, 0u, 0x0fu);
+    dst_p[2] |= pack_left_shift_u64(src_p->nonce, 0u, 0xffu);
+    dst_p[3] |= pack_right_shift_u64(src_p->nonce, 8u, 0xffu);
+    dst_p[4] |= pack_right_shift_u64(src_p->nonce, 16u, 0xffu);
+    dst_p[5] |= pack_right_shift_u64(src_p->nonce, 24u, 0xffu);
+    dst_p[6] |= pack_right_shift_u64(src_p->nonce, 32u, 0xffu);
+    dst_p[7] |= pack_right_shift_u64(src_p->nonce, 40u, 0xffu);
+
+    return (8);
+}
+
+int disco_robot_mac_challenge_unpack(
+    struct disco_robot_mac_challenge_t *dst_p,
+    const uint8_t *src_p,
+    size_t size)
+{
+    if (size < 8u) {
+        return (-EINVAL);
+    }
+
+    dst_p->crc = unpack_right_shift_u8(src_p[0], 0u, 0xffu);
+    dst_p->counter = unpack_right_shift_u8(src_p[1], 0u, 0x0fu);
+    dst_p->nonce = unpack_right_shift_u64(src_p[2], 0u, 0xffu);
+    dst_p->nonce |= unpack_left_shift_u64(src_p[3], 8u, 0xffu);
+    dst_p->nonce |= unpack_left_shift_u64(src_p[4], 16u, 0xffu);
+    dst_p->nonce |= unpack_left_shift_u64(src_p[5], 24u, 0xffu);
+    dst_p->nonce |= unpack_left_shift_u64(src_p[6], 32u, 0xffu);
+    dst_p->nonce |= unpack_left_shift_u64(src_p[7], 40u, 0xffu);
+
+    return (0);
+}
+
+int disco_robot_mac_challenge_init(struct disco_robot_mac_challenge_t *msg_p)
+{
+    if (msg_p == NULL) return -1;
+
+    memset(msg_p, 0, sizeof(struct disco_robot_mac_challenge_t));
+
+    return 0;
+}
+
+bool disco_robot_mac_challenge_crc_is_in_range(uint8_t value)
+{
+    (void)value;
+
+    return (true);
+}
+
+bool disco_robot_mac_challenge_crc_is_in_phys_range(double value)
+{
+    return ((value >= 0.0) && (value <= 255.0));
+}
+
+bool disco_robot_mac_challenge_counter_is_in_range(uint8_t value)
+{
+    return (value <= 15u);
+}
+
+bool disco_robot_mac_challenge_counter_is_in_phys_range(double value)
+{
+    return ((value >= 0.0) && (value <= 15.0));
+}
+
+bool disco_robot_mac_challenge_nonce_is_in_range(uint64_t value)
+{
+    return (value <= 281474976710655ull);
+}
+
+bool disco_robot_mac_challenge_nonce_is_in_phys_range(double value)
+{
+    return ((value >= 0.0) && (value <= 281474976710655.0));
 }
 
 int disco_robot_hello_pack(

@@ -46,6 +46,9 @@ extern "C" {
 
 /* Frame ids. */
 #define DISCO_ROBOT_ESTOP_FRAME_ID (0x80u)
+#define DISCO_ROBOT_WHEEL_COMMAND_MAC_FRAME_ID (0xf0u)
+#define DISCO_ROBOT_HOST_STATE_MAC_FRAME_ID (0xf1u)
+#define DISCO_ROBOT_PARAM_REQUEST_MAC_FRAME_ID (0xf2u)
 #define DISCO_ROBOT_WHEEL_COMMAND_FRAME_ID (0x100u)
 #define DISCO_ROBOT_HOST_STATE_FRAME_ID (0x101u)
 #define DISCO_ROBOT_HELLO_REQUEST_FRAME_ID (0x102u)
@@ -58,6 +61,7 @@ extern "C" {
 #define DISCO_ROBOT_POWER_FRAME_ID (0x131u)
 #define DISCO_ROBOT_LINK_HEALTH_FRAME_ID (0x132u)
 #define DISCO_ROBOT_SESSION_STATE_FRAME_ID (0x133u)
+#define DISCO_ROBOT_MAC_CHALLENGE_FRAME_ID (0x134u)
 #define DISCO_ROBOT_HELLO_FRAME_ID (0x140u)
 #define DISCO_ROBOT_BUILD_FRAME_ID (0x141u)
 #define DISCO_ROBOT_LIMITS_FRAME_ID (0x142u)
@@ -68,6 +72,9 @@ extern "C" {
 
 /* Frame lengths in bytes. */
 #define DISCO_ROBOT_ESTOP_LENGTH (1u)
+#define DISCO_ROBOT_WHEEL_COMMAND_MAC_LENGTH (8u)
+#define DISCO_ROBOT_HOST_STATE_MAC_LENGTH (8u)
+#define DISCO_ROBOT_PARAM_REQUEST_MAC_LENGTH (8u)
 #define DISCO_ROBOT_WHEEL_COMMAND_LENGTH (8u)
 #define DISCO_ROBOT_HOST_STATE_LENGTH (8u)
 #define DISCO_ROBOT_HELLO_REQUEST_LENGTH (8u)
@@ -80,6 +87,7 @@ extern "C" {
 #define DISCO_ROBOT_POWER_LENGTH (8u)
 #define DISCO_ROBOT_LINK_HEALTH_LENGTH (8u)
 #define DISCO_ROBOT_SESSION_STATE_LENGTH (8u)
+#define DISCO_ROBOT_MAC_CHALLENGE_LENGTH (8u)
 #define DISCO_ROBOT_HELLO_LENGTH (8u)
 #define DISCO_ROBOT_BUILD_LENGTH (8u)
 #define DISCO_ROBOT_LIMITS_LENGTH (8u)
@@ -90,6 +98,9 @@ extern "C" {
 
 /* Extended or standard frame types. */
 #define DISCO_ROBOT_ESTOP_IS_EXTENDED (0)
+#define DISCO_ROBOT_WHEEL_COMMAND_MAC_IS_EXTENDED (0)
+#define DISCO_ROBOT_HOST_STATE_MAC_IS_EXTENDED (0)
+#define DISCO_ROBOT_PARAM_REQUEST_MAC_IS_EXTENDED (0)
 #define DISCO_ROBOT_WHEEL_COMMAND_IS_EXTENDED (0)
 #define DISCO_ROBOT_HOST_STATE_IS_EXTENDED (0)
 #define DISCO_ROBOT_HELLO_REQUEST_IS_EXTENDED (0)
@@ -102,6 +113,7 @@ extern "C" {
 #define DISCO_ROBOT_POWER_IS_EXTENDED (0)
 #define DISCO_ROBOT_LINK_HEALTH_IS_EXTENDED (0)
 #define DISCO_ROBOT_SESSION_STATE_IS_EXTENDED (0)
+#define DISCO_ROBOT_MAC_CHALLENGE_IS_EXTENDED (0)
 #define DISCO_ROBOT_HELLO_IS_EXTENDED (0)
 #define DISCO_ROBOT_BUILD_IS_EXTENDED (0)
 #define DISCO_ROBOT_LIMITS_IS_EXTENDED (0)
@@ -111,6 +123,8 @@ extern "C" {
 #define DISCO_ROBOT_PARAM_RESPONSE_IS_EXTENDED (0)
 
 /* Frame cycle times in milliseconds. */
+#define DISCO_ROBOT_WHEEL_COMMAND_MAC_CYCLE_TIME_MS (20u)
+#define DISCO_ROBOT_HOST_STATE_MAC_CYCLE_TIME_MS (100u)
 #define DISCO_ROBOT_WHEEL_COMMAND_CYCLE_TIME_MS (20u)
 #define DISCO_ROBOT_HOST_STATE_CYCLE_TIME_MS (100u)
 #define DISCO_ROBOT_WHEEL_SPEED_CYCLE_TIME_MS (10u)
@@ -122,6 +136,7 @@ extern "C" {
 #define DISCO_ROBOT_POWER_CYCLE_TIME_MS (500u)
 #define DISCO_ROBOT_LINK_HEALTH_CYCLE_TIME_MS (1000u)
 #define DISCO_ROBOT_SESSION_STATE_CYCLE_TIME_MS (100u)
+#define DISCO_ROBOT_MAC_CHALLENGE_CYCLE_TIME_MS (100u)
 #define DISCO_ROBOT_HELLO_CYCLE_TIME_MS (1000u)
 #define DISCO_ROBOT_BUILD_CYCLE_TIME_MS (1000u)
 #define DISCO_ROBOT_LIMITS_CYCLE_TIME_MS (1000u)
@@ -193,6 +208,7 @@ extern "C" {
 #define DISCO_ROBOT_SYSTEM_STATE_REJECT_REASON_NONZERO_BEFORE_ARMED_CHOICE (10u)
 #define DISCO_ROBOT_SYSTEM_STATE_REJECT_REASON_CHALLENGE_CHOICE (11u)
 #define DISCO_ROBOT_SYSTEM_STATE_REJECT_REASON_HANDSHAKE_CHOICE (12u)
+#define DISCO_ROBOT_SYSTEM_STATE_REJECT_REASON_AUTHENTICATION_CHOICE (13u)
 
 #define DISCO_ROBOT_SYSTEM_STATE_STOP_CAUSE_NONE_CHOICE (0u)
 #define DISCO_ROBOT_SYSTEM_STATE_STOP_CAUSE_REQUESTED_CHOICE (1u)
@@ -220,6 +236,7 @@ extern "C" {
 #define DISCO_ROBOT_HELLO_CAPABILITIES_POWER_CHOICE (8u)
 #define DISCO_ROBOT_HELLO_CAPABILITIES_BRAKE_CHOICE (16u)
 #define DISCO_ROBOT_HELLO_CAPABILITIES_ESTOP_BUTTON_CHOICE (32u)
+#define DISCO_ROBOT_HELLO_CAPABILITIES_AUTHENTICATION_CHOICE (64u)
 
 #define DISCO_ROBOT_PARAM_REQUEST_OPERATION_READ_CHOICE (0u)
 #define DISCO_ROBOT_PARAM_REQUEST_OPERATION_WRITE_CHOICE (1u)
@@ -248,6 +265,9 @@ extern "C" {
 
 /* Frame Names. */
 #define DISCO_ROBOT_ESTOP_NAME "ESTOP"
+#define DISCO_ROBOT_WHEEL_COMMAND_MAC_NAME "WHEEL_COMMAND_MAC"
+#define DISCO_ROBOT_HOST_STATE_MAC_NAME "HOST_STATE_MAC"
+#define DISCO_ROBOT_PARAM_REQUEST_MAC_NAME "PARAM_REQUEST_MAC"
 #define DISCO_ROBOT_WHEEL_COMMAND_NAME "WHEEL_COMMAND"
 #define DISCO_ROBOT_HOST_STATE_NAME "HOST_STATE"
 #define DISCO_ROBOT_HELLO_REQUEST_NAME "HELLO_REQUEST"
@@ -260,6 +280,7 @@ extern "C" {
 #define DISCO_ROBOT_POWER_NAME "POWER"
 #define DISCO_ROBOT_LINK_HEALTH_NAME "LINK_HEALTH"
 #define DISCO_ROBOT_SESSION_STATE_NAME "SESSION_STATE"
+#define DISCO_ROBOT_MAC_CHALLENGE_NAME "MAC_CHALLENGE"
 #define DISCO_ROBOT_HELLO_NAME "HELLO"
 #define DISCO_ROBOT_BUILD_NAME "BUILD"
 #define DISCO_ROBOT_LIMITS_NAME "LIMITS"
@@ -270,6 +291,12 @@ extern "C" {
 
 /* Signal Names. */
 #define DISCO_ROBOT_ESTOP_REASON_NAME "reason"
+#define DISCO_ROBOT_WHEEL_COMMAND_MAC_FRESHNESS_NAME "freshness"
+#define DISCO_ROBOT_WHEEL_COMMAND_MAC_MAC_NAME "mac"
+#define DISCO_ROBOT_HOST_STATE_MAC_FRESHNESS_NAME "freshness"
+#define DISCO_ROBOT_HOST_STATE_MAC_MAC_NAME "mac"
+#define DISCO_ROBOT_PARAM_REQUEST_MAC_FRESHNESS_NAME "freshness"
+#define DISCO_ROBOT_PARAM_REQUEST_MAC_MAC_NAME "mac"
 #define DISCO_ROBOT_WHEEL_COMMAND_CRC_NAME "crc"
 #define DISCO_ROBOT_WHEEL_COMMAND_COUNTER_NAME "counter"
 #define DISCO_ROBOT_WHEEL_COMMAND_MODE_NAME "mode"
@@ -348,6 +375,9 @@ extern "C" {
 #define DISCO_ROBOT_SESSION_STATE_SESSION_NAME "session"
 #define DISCO_ROBOT_SESSION_STATE_HOST_ACCEPTED_NAME "host_accepted"
 #define DISCO_ROBOT_SESSION_STATE_BLOCKERS_NAME "blockers"
+#define DISCO_ROBOT_MAC_CHALLENGE_CRC_NAME "crc"
+#define DISCO_ROBOT_MAC_CHALLENGE_COUNTER_NAME "counter"
+#define DISCO_ROBOT_MAC_CHALLENGE_NONCE_NAME "nonce"
 #define DISCO_ROBOT_HELLO_CRC_NAME "crc"
 #define DISCO_ROBOT_HELLO_COUNTER_NAME "counter"
 #define DISCO_ROBOT_HELLO_PROTOCOL_MAJOR_NAME "protocol_major"
@@ -401,6 +431,75 @@ struct disco_robot_estop_t {
      * Offset: 0
      */
     uint8_t reason;
+};
+
+/**
+ * Signals in message WHEEL_COMMAND_MAC.
+ *
+ * Proves the WHEEL_COMMAND that follows, where the controller has a key: low 16 bits of the freshness counter, first 48 bits of the AES-CMAC, in the order of its bytes.
+ *
+ * All signal values are as on the CAN bus.
+ */
+struct disco_robot_wheel_command_mac_t {
+    /**
+     * Range: 0..65535 (0..65535 -)
+     * Scale: 1
+     * Offset: 0
+     */
+    uint16_t freshness;
+
+    /**
+     * Range: 0..281474976710655 (0..281474976710655 -)
+     * Scale: 1
+     * Offset: 0
+     */
+    uint64_t mac;
+};
+
+/**
+ * Signals in message HOST_STATE_MAC.
+ *
+ * Proves the HOST_STATE that follows.
+ *
+ * All signal values are as on the CAN bus.
+ */
+struct disco_robot_host_state_mac_t {
+    /**
+     * Range: 0..65535 (0..65535 -)
+     * Scale: 1
+     * Offset: 0
+     */
+    uint16_t freshness;
+
+    /**
+     * Range: 0..281474976710655 (0..281474976710655 -)
+     * Scale: 1
+     * Offset: 0
+     */
+    uint64_t mac;
+};
+
+/**
+ * Signals in message PARAM_REQUEST_MAC.
+ *
+ * Proves the PARAM_REQUEST that follows.
+ *
+ * All signal values are as on the CAN bus.
+ */
+struct disco_robot_param_request_mac_t {
+    /**
+     * Range: 0..65535 (0..65535 -)
+     * Scale: 1
+     * Offset: 0
+     */
+    uint16_t freshness;
+
+    /**
+     * Range: 0..281474976710655 (0..281474976710655 -)
+     * Scale: 1
+     * Offset: 0
+     */
+    uint64_t mac;
 };
 
 /**
@@ -1054,6 +1153,36 @@ struct disco_robot_session_state_t {
 };
 
 /**
+ * Signals in message MAC_CHALLENGE.
+ *
+ * The number that every MAC is bound to, where the controller has a key; a new one with each return to STANDBY and each HELLO_REQUEST outside a session.
+ *
+ * All signal values are as on the CAN bus.
+ */
+struct disco_robot_mac_challenge_t {
+    /**
+     * Range: 0..255 (0..255 -)
+     * Scale: 1
+     * Offset: 0
+     */
+    uint8_t crc;
+
+    /**
+     * Range: 0..15 (0..15 -)
+     * Scale: 1
+     * Offset: 0
+     */
+    uint8_t counter;
+
+    /**
+     * Range: 0..281474976710655 (0..281474976710655 -)
+     * Scale: 1
+     * Offset: 0
+     */
+    uint64_t nonce;
+};
+
+/**
  * Signals in message HELLO.
  *
  * Protected like HELLO_REQUEST without the major version in the data id, so that ends of different majors can tell why they refuse each other.
@@ -1432,6 +1561,249 @@ bool disco_robot_estop_reason_is_in_range(uint8_t value);
  * @return true if in range, false otherwise.
  */
 bool disco_robot_estop_reason_is_in_phys_range(double value);
+
+/**
+ * Pack message WHEEL_COMMAND_MAC.
+ *
+ * @param[out] dst_p Buffer to pack the message into.
+ * @param[in] src_p Data to pack.
+ * @param[in] size Size of dst_p.
+ *
+ * @return Size of packed data, or negative error code.
+ */
+int disco_robot_wheel_command_mac_pack(
+    uint8_t *dst_p,
+    const struct disco_robot_wheel_command_mac_t *src_p,
+    size_t size);
+
+/**
+ * Unpack message WHEEL_COMMAND_MAC.
+ *
+ * @param[out] dst_p Object to unpack the message into.
+ * @param[in] src_p Message to unpack.
+ * @param[in] size Size of src_p.
+ *
+ * @return zero(0) or negative error code.
+ */
+int disco_robot_wheel_command_mac_unpack(
+    struct disco_robot_wheel_command_mac_t *dst_p,
+    const uint8_t *src_p,
+    size_t size);
+
+/**
+ * Init message fields to default values from WHEEL_COMMAND_MAC.
+ *
+ * @param[in] msg_p Message to init.
+ *
+ * @return zero(0) on success or (-1) in case of nullptr argument.
+ */
+int disco_robot_wheel_command_mac_init(struct disco_robot_wheel_command_mac_t *msg_p);
+
+/**
+ * Check that given signal is in allowed range.
+ *
+ * @param[in] value Signal to check.
+ *
+ * @return true if in range, false otherwise.
+ */
+bool disco_robot_wheel_command_mac_freshness_is_in_range(uint16_t value);
+
+/**
+ * Check that given physical value is in allowed range before encoding.
+ *
+ * Use this BEFORE calling _encode() to avoid silent integer overflow:
+ *   encode(-1.0) on a [0,100] signal wraps to 255 and passes is_in_range().
+ *   is_in_phys_range(-1.0) correctly returns false.
+ *
+ * @param[in] value Physical signal value to check.
+ *
+ * @return true if in range, false otherwise.
+ */
+bool disco_robot_wheel_command_mac_freshness_is_in_phys_range(double value);
+
+/**
+ * Check that given signal is in allowed range.
+ *
+ * @param[in] value Signal to check.
+ *
+ * @return true if in range, false otherwise.
+ */
+bool disco_robot_wheel_command_mac_mac_is_in_range(uint64_t value);
+
+/**
+ * Check that given physical value is in allowed range before encoding.
+ *
+ * Use this BEFORE calling _encode() to avoid silent integer overflow:
+ *   encode(-1.0) on a [0,100] signal wraps to 255 and passes is_in_range().
+ *   is_in_phys_range(-1.0) correctly returns false.
+ *
+ * @param[in] value Physical signal value to check.
+ *
+ * @return true if in range, false otherwise.
+ */
+bool disco_robot_wheel_command_mac_mac_is_in_phys_range(double value);
+
+/**
+ * Pack message HOST_STATE_MAC.
+ *
+ * @param[out] dst_p Buffer to pack the message into.
+ * @param[in] src_p Data to pack.
+ * @param[in] size Size of dst_p.
+ *
+ * @return Size of packed data, or negative error code.
+ */
+int disco_robot_host_state_mac_pack(
+    uint8_t *dst_p,
+    const struct disco_robot_host_state_mac_t *src_p,
+    size_t size);
+
+/**
+ * Unpack message HOST_STATE_MAC.
+ *
+ * @param[out] dst_p Object to unpack the message into.
+ * @param[in] src_p Message to unpack.
+ * @param[in] size Size of src_p.
+ *
+ * @return zero(0) or negative error code.
+ */
+int disco_robot_host_state_mac_unpack(
+    struct disco_robot_host_state_mac_t *dst_p,
+    const uint8_t *src_p,
+    size_t size);
+
+/**
+ * Init message fields to default values from HOST_STATE_MAC.
+ *
+ * @param[in] msg_p Message to init.
+ *
+ * @return zero(0) on success or (-1) in case of nullptr argument.
+ */
+int disco_robot_host_state_mac_init(struct disco_robot_host_state_mac_t *msg_p);
+
+/**
+ * Check that given signal is in allowed range.
+ *
+ * @param[in] value Signal to check.
+ *
+ * @return true if in range, false otherwise.
+ */
+bool disco_robot_host_state_mac_freshness_is_in_range(uint16_t value);
+
+/**
+ * Check that given physical value is in allowed range before encoding.
+ *
+ * Use this BEFORE calling _encode() to avoid silent integer overflow:
+ *   encode(-1.0) on a [0,100] signal wraps to 255 and passes is_in_range().
+ *   is_in_phys_range(-1.0) correctly returns false.
+ *
+ * @param[in] value Physical signal value to check.
+ *
+ * @return true if in range, false otherwise.
+ */
+bool disco_robot_host_state_mac_freshness_is_in_phys_range(double value);
+
+/**
+ * Check that given signal is in allowed range.
+ *
+ * @param[in] value Signal to check.
+ *
+ * @return true if in range, false otherwise.
+ */
+bool disco_robot_host_state_mac_mac_is_in_range(uint64_t value);
+
+/**
+ * Check that given physical value is in allowed range before encoding.
+ *
+ * Use this BEFORE calling _encode() to avoid silent integer overflow:
+ *   encode(-1.0) on a [0,100] signal wraps to 255 and passes is_in_range().
+ *   is_in_phys_range(-1.0) correctly returns false.
+ *
+ * @param[in] value Physical signal value to check.
+ *
+ * @return true if in range, false otherwise.
+ */
+bool disco_robot_host_state_mac_mac_is_in_phys_range(double value);
+
+/**
+ * Pack message PARAM_REQUEST_MAC.
+ *
+ * @param[out] dst_p Buffer to pack the message into.
+ * @param[in] src_p Data to pack.
+ * @param[in] size Size of dst_p.
+ *
+ * @return Size of packed data, or negative error code.
+ */
+int disco_robot_param_request_mac_pack(
+    uint8_t *dst_p,
+    const struct disco_robot_param_request_mac_t *src_p,
+    size_t size);
+
+/**
+ * Unpack message PARAM_REQUEST_MAC.
+ *
+ * @param[out] dst_p Object to unpack the message into.
+ * @param[in] src_p Message to unpack.
+ * @param[in] size Size of src_p.
+ *
+ * @return zero(0) or negative error code.
+ */
+int disco_robot_param_request_mac_unpack(
+    struct disco_robot_param_request_mac_t *dst_p,
+    const uint8_t *src_p,
+    size_t size);
+
+/**
+ * Init message fields to default values from PARAM_REQUEST_MAC.
+ *
+ * @param[in] msg_p Message to init.
+ *
+ * @return zero(0) on success or (-1) in case of nullptr argument.
+ */
+int disco_robot_param_request_mac_init(struct disco_robot_param_request_mac_t *msg_p);
+
+/**
+ * Check that given signal is in allowed range.
+ *
+ * @param[in] value Signal to check.
+ *
+ * @return true if in range, false otherwise.
+ */
+bool disco_robot_param_request_mac_freshness_is_in_range(uint16_t value);
+
+/**
+ * Check that given physical value is in allowed range before encoding.
+ *
+ * Use this BEFORE calling _encode() to avoid silent integer overflow:
+ *   encode(-1.0) on a [0,100] signal wraps to 255 and passes is_in_range().
+ *   is_in_phys_range(-1.0) correctly returns false.
+ *
+ * @param[in] value Physical signal value to check.
+ *
+ * @return true if in range, false otherwise.
+ */
+bool disco_robot_param_request_mac_freshness_is_in_phys_range(double value);
+
+/**
+ * Check that given signal is in allowed range.
+ *
+ * @param[in] value Signal to check.
+ *
+ * @return true if in range, false otherwise.
+ */
+bool disco_robot_param_request_mac_mac_is_in_range(uint64_t value);
+
+/**
+ * Check that given physical value is in allowed range before encoding.
+ *
+ * Use this BEFORE calling _encode() to avoid silent integer overflow:
+ *   encode(-1.0) on a [0,100] signal wraps to 255 and passes is_in_range().
+ *   is_in_phys_range(-1.0) correctly returns false.
+ *
+ * @param[in] value Physical signal value to check.
+ *
+ * @return true if in range, false otherwise.
+ */
+bool disco_robot_param_request_mac_mac_is_in_phys_range(double value);
 
 /**
  * Pack message WHEEL_COMMAND.
@@ -3592,6 +3964,109 @@ bool disco_robot_session_state_blockers_is_in_range(uint8_t value);
  * @return true if in range, false otherwise.
  */
 bool disco_robot_session_state_blockers_is_in_phys_range(double value);
+
+/**
+ * Pack message MAC_CHALLENGE.
+ *
+ * @param[out] dst_p Buffer to pack the message into.
+ * @param[in] src_p Data to pack.
+ * @param[in] size Size of dst_p.
+ *
+ * @return Size of packed data, or negative error code.
+ */
+int disco_robot_mac_challenge_pack(
+    uint8_t *dst_p,
+    const struct disco_robot_mac_challenge_t *src_p,
+    size_t size);
+
+/**
+ * Unpack message MAC_CHALLENGE.
+ *
+ * @param[out] dst_p Object to unpack the message into.
+ * @param[in] src_p Message to unpack.
+ * @param[in] size Size of src_p.
+ *
+ * @return zero(0) or negative error code.
+ */
+int disco_robot_mac_challenge_unpack(
+    struct disco_robot_mac_challenge_t *dst_p,
+    const uint8_t *src_p,
+    size_t size);
+
+/**
+ * Init message fields to default values from MAC_CHALLENGE.
+ *
+ * @param[in] msg_p Message to init.
+ *
+ * @return zero(0) on success or (-1) in case of nullptr argument.
+ */
+int disco_robot_mac_challenge_init(struct disco_robot_mac_challenge_t *msg_p);
+
+/**
+ * Check that given signal is in allowed range.
+ *
+ * @param[in] value Signal to check.
+ *
+ * @return true if in range, false otherwise.
+ */
+bool disco_robot_mac_challenge_crc_is_in_range(uint8_t value);
+
+/**
+ * Check that given physical value is in allowed range before encoding.
+ *
+ * Use this BEFORE calling _encode() to avoid silent integer overflow:
+ *   encode(-1.0) on a [0,100] signal wraps to 255 and passes is_in_range().
+ *   is_in_phys_range(-1.0) correctly returns false.
+ *
+ * @param[in] value Physical signal value to check.
+ *
+ * @return true if in range, false otherwise.
+ */
+bool disco_robot_mac_challenge_crc_is_in_phys_range(double value);
+
+/**
+ * Check that given signal is in allowed range.
+ *
+ * @param[in] value Signal to check.
+ *
+ * @return true if in range, false otherwise.
+ */
+bool disco_robot_mac_challenge_counter_is_in_range(uint8_t value);
+
+/**
+ * Check that given physical value is in allowed range before encoding.
+ *
+ * Use this BEFORE calling _encode() to avoid silent integer overflow:
+ *   encode(-1.0) on a [0,100] signal wraps to 255 and passes is_in_range().
+ *   is_in_phys_range(-1.0) correctly returns false.
+ *
+ * @param[in] value Physical signal value to check.
+ *
+ * @return true if in range, false otherwise.
+ */
+bool disco_robot_mac_challenge_counter_is_in_phys_range(double value);
+
+/**
+ * Check that given signal is in allowed range.
+ *
+ * @param[in] value Signal to check.
+ *
+ * @return true if in range, false otherwise.
+ */
+bool disco_robot_mac_challenge_nonce_is_in_range(uint64_t value);
+
+/**
+ * Check that given physical value is in allowed range before encoding.
+ *
+ * Use this BEFORE calling _encode() to avoid silent integer overflow:
+ *   encode(-1.0) on a [0,100] signal wraps to 255 and passes is_in_range().
+ *   is_in_phys_range(-1.0) correctly returns false.
+ *
+ * @param[in] value Physical signal value to check.
+ *
+ * @return true if in range, false otherwise.
+ */
+bool disco_robot_mac_challenge_nonce_is_in_phys_range(double value);
 
 /**
  * Pack message HELLO.

@@ -6,15 +6,16 @@
 #define LONGEST_CYCLE_US (10000u)
 #define BUS_OFF_ABOVE (255u)
 
-void disco_firmware_init(disco_firmware_t *core, const disco_config_t *config, uint32_t entropy)
+void disco_firmware_init(disco_firmware_t *core, const disco_config_t *config, uint64_t entropy)
 {
     *core = (disco_firmware_t){
         .config = *config,
         .state = DISCO_STATE_BOOT,
         .config_valid = disco_config_valid(config),
-        .session = {.seed = entropy},
+        .session = {.seed = (uint32_t)entropy},
         .drive = {.brake = true},
     };
+    disco_authentication_init(&core->authentication, config->authenticated, config->key, entropy);
     disco_faults_init(&core->faults);
     disco_transmit_init(&core->transmit);
     disco_e2e_init(&core->host.e2e, config->host_state_timeout_us);

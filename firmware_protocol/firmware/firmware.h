@@ -10,12 +10,13 @@
 #include <stdint.h>
 
 #include "robot_config.h"
+#include "authentication.h"
 #include "e2e.h"
 #include "faults.h"
 #include "wheel_limits.h"
 #include "transmit.h"
 
-enum { DISCO_REJECT_REASONS = 16, DISCO_PERIODIC = 6 };
+enum { DISCO_REJECT_REASONS = 16, DISCO_PERIODIC = 7 };
 
 typedef struct {
     float left_setpoint;  /* rad/s, after all limits; 0 while the driver is off */
@@ -98,6 +99,7 @@ typedef struct {
     disco_faults_t faults;
     disco_host_t host;
     disco_session_t session;
+    disco_authentication_t authentication;
     disco_command_t command;
     disco_drive_t drive;
     disco_telemetry_t telemetry;
@@ -121,8 +123,10 @@ typedef struct {
     bool inputs_known;
 } disco_firmware_t;
 
-/* `entropy` seeds the challenges; anything that differs from start to start will do. */
-void disco_firmware_init(disco_firmware_t *core, const disco_config_t *config, uint32_t entropy);
+/* `entropy` seeds the challenges; anything that differs from start to start will do. With a key it must never be the
+ * same twice: take it from a hardware generator, or count the starts in flash.
+ */
+void disco_firmware_init(disco_firmware_t *core, const disco_config_t *config, uint64_t entropy);
 
 void disco_firmware_receive(disco_firmware_t *core, uint64_t now_us, uint32_t can_id, const uint8_t *data,
                             uint8_t length);

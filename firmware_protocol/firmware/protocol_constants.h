@@ -4,7 +4,7 @@
 
 #define DISCO_PROTOCOL_MAJOR (1u)
 #define DISCO_PROTOCOL_MINOR (0u)
-#define DISCO_DBC_HASH (0xAA028CFDu)
+#define DISCO_DBC_HASH (0xD6CF6DC1u)
 
 /* Data ids of the end-to-end CRC; the handshake's are the same for every major version. */
 #define DISCO_WHEEL_COMMAND_DATA_ID(major) ((uint16_t)(0x100u ^ ((uint32_t)(major) << 11)))
@@ -19,6 +19,7 @@
 #define DISCO_POWER_DATA_ID(major) ((uint16_t)(0x131u ^ ((uint32_t)(major) << 11)))
 #define DISCO_LINK_HEALTH_DATA_ID(major) ((uint16_t)(0x132u ^ ((uint32_t)(major) << 11)))
 #define DISCO_SESSION_STATE_DATA_ID(major) ((uint16_t)(0x133u ^ ((uint32_t)(major) << 11)))
+#define DISCO_MAC_CHALLENGE_DATA_ID(major) ((uint16_t)(0x134u ^ ((uint32_t)(major) << 11)))
 #define DISCO_HELLO_DATA_ID(major) ((uint16_t)0x140u)
 #define DISCO_BUILD_DATA_ID(major) ((uint16_t)(0x141u ^ ((uint32_t)(major) << 11)))
 #define DISCO_LIMITS_DATA_ID(major) ((uint16_t)(0x142u ^ ((uint32_t)(major) << 11)))
@@ -121,6 +122,7 @@
 #define DISCO_REJECT_REASON_NONZERO_BEFORE_ARMED (10u)
 #define DISCO_REJECT_REASON_CHALLENGE (11u)
 #define DISCO_REJECT_REASON_HANDSHAKE (12u)
+#define DISCO_REJECT_REASON_AUTHENTICATION (13u)
 
 /* stop_cause */
 #define DISCO_STOP_CAUSE_NONE (0u)
@@ -151,6 +153,7 @@
 #define DISCO_CAPABILITIES_POWER (8u)
 #define DISCO_CAPABILITIES_BRAKE (16u)
 #define DISCO_CAPABILITIES_ESTOP_BUTTON (32u)
+#define DISCO_CAPABILITIES_AUTHENTICATION (64u)
 
 /* operation */
 #define DISCO_OPERATION_READ (0u)

@@ -51,6 +51,15 @@ static bool crc_holds(disco_firmware_t *core, const uint8_t *data, uint16_t data
     return holds;
 }
 
+static bool proved(disco_firmware_t *core, disco_proof_index_t index, uint32_t can_id, const uint8_t *data)
+{
+    const bool holds = disco_authentication_holds(&core->authentication, index, can_id, data);
+    if (!holds) {
+        disco_reject(core, DISCO_REJECT_REASON_AUTHENTICATION);
+    }
+    return holds;
+}
+
 static void time_request(disco_firmware_t *core, const uint8_t *data)
 {
     struct disco_robot_time_request_t request;
@@ -61,12 +70,28 @@ static void time_request(disco_firmware_t *core, const uint8_t *data)
 static void dispatch(disco_firmware_t *core, uint32_t can_id, const uint8_t *data)
 {
     const uint8_t major = core->config.protocol_major;
+    bool sound = false;
     switch (can_id) {
+    case DISCO_ROBOT_WHEEL_COMMAND_MAC_FRAME_ID:
+        disco_authentication_offer(&core->authentication, DISCO_PROOF_WHEEL_COMMAND, data);
+        break;
+    case DISCO_ROBOT_HOST_STATE_MAC_FRAME_ID:
+        disco_authentication_offer(&core->authentication, DISCO_PROOF_HOST_STATE, data);
+        break;
+    case DISCO_ROBOT_PARAM_REQUEST_MAC_FRAME_ID:
+        disco_authentication_offer(&core->authentication, DISCO_PROOF_PARAM_REQUEST, data);
+        break;
     case DISCO_ROBOT_WHEEL_COMMAND_FRAME_ID:
-        disco_command_receive(core, data, crc_holds(core, data, DISCO_WHEEL_COMMAND_DATA_ID(major)));
+        sound = crc_holds(core, data, DISCO_WHEEL_COMMAND_DATA_ID(major));
+        if (!sound || proved(core, DISCO_PROOF_WHEEL_COMMAND, can_id, data)) {
+            disco_command_receive(core, data, sound);
+        }
         break;
     case DISCO_ROBOT_HOST_STATE_FRAME_ID:
-        disco_host_state(core, data, crc_holds(core, data, DISCO_HOST_STATE_DATA_ID(major)));
+        sound = crc_holds(core, data, DISCO_HOST_STATE_DATA_ID(major));
+        if (!sound || proved(core, DISCO_PROOF_HOST_STATE, can_id, data)) {
+            disco_host_state(core, data, sound);
+        }
         break;
     case DISCO_ROBOT_HELLO_REQUEST_FRAME_ID:
         if (crc_holds(core, data, DISCO_HELLO_REQUEST_DATA_ID(major))) {
@@ -80,7 +105,8 @@ static void dispatch(disco_firmware_t *core, uint32_t can_id, const uint8_t *dat
         break;
     case DISCO_ROBOT_PARAM_REQUEST_FRAME_ID:
     default:
-        if (crc_holds(core, data, DISCO_PARAM_REQUEST_DATA_ID(major))) {
+        if (crc_holds(core, data, DISCO_PARAM_REQUEST_DATA_ID(major)) &&
+            proved(core, DISCO_PROOF_PARAM_REQUEST, can_id, data)) {
             disco_parameter_request(core, data);
         }
         break;
@@ -91,7 +117,8 @@ static bool is_for_us(uint32_t can_id)
 {
     return (can_id == DISCO_ROBOT_WHEEL_COMMAND_FRAME_ID) || (can_id == DISCO_ROBOT_HOST_STATE_FRAME_ID) ||
            (can_id == DISCO_ROBOT_HELLO_REQUEST_FRAME_ID) || (can_id == DISCO_ROBOT_TIME_REQUEST_FRAME_ID) ||
-           (can_id == DISCO_ROBOT_PARAM_REQUEST_FRAME_ID);
+           (can_id == DISCO_ROBOT_PARAM_REQUEST_FRAME_ID) || (can_id == DISCO_ROBOT_WHEEL_COMMAND_MAC_FRAME_ID) ||
+           (can_id == DISCO_ROBOT_HOST_STATE_MAC_FRAME_ID) || (can_id == DISCO_ROBOT_PARAM_REQUEST_MAC_FRAME_ID);
 }
 
 void disco_firmware_receive(disco_firmware_t *core, uint64_t now_us, uint32_t can_id, const uint8_t *data,

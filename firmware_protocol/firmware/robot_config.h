@@ -37,6 +37,9 @@ typedef struct {
     uint32_t temperature_debounce_us;
     uint32_t encoder_debounce_us;
     uint32_t fault_hold_us; /* a fault that clears by itself is shown at least this long */
+
+    bool authenticated;     /* whether commands need a proof made with `key` (AES-128) */
+    uint8_t key[16];
 } disco_config_t;
 
 /* Whether every value is finite and within its bounds. */

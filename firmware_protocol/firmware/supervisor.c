@@ -96,6 +96,7 @@ static void enter(disco_firmware_t *core, uint8_t state)
     case DISCO_STATE_STANDBY:
         core->host.reset_pending = false;
         disco_session_new_challenge(core);
+        disco_authentication_renew(&core->authentication);
         break;
     case DISCO_STATE_READY:
         disco_session_open(core);

@@ -25,7 +25,8 @@ enum {
     BUILD,
     LIMITS,
     TIME_RESPONSE,
-    PARAM_RESPONSE
+    PARAM_RESPONSE,
+    MAC_CHALLENGE
 };
 
 /* Packs `frame`, a generated struct of the message, and queues it. */
@@ -138,6 +139,19 @@ static void send_session_state(disco_firmware_t *core)
     SEND(core, SESSION_STATE, session_state, session);
 }
 
+static void send_mac_challenge(disco_firmware_t *core)
+{
+    disco_authentication_t *authentication = &core->authentication;
+    struct disco_robot_mac_challenge_t challenge = {.nonce = 0u};
+    authentication->nonce_shown = true;
+    if (authentication->required) {
+        for (uint8_t i = 0u; i < (uint8_t)DISCO_NONCE_LENGTH; i++) {
+            challenge.nonce |= (uint64_t)authentication->nonce[i] << (8u * i);
+        }
+        SEND(core, MAC_CHALLENGE, mac_challenge, challenge);
+    }
+}
+
 static void send_power(disco_firmware_t *core)
 {
     const disco_inputs_t *in = &core->inputs;
@@ -190,7 +204,7 @@ static void send_hello(disco_firmware_t *core)
         .firmware_major = config->firmware_version[0],
         .firmware_minor = config->firmware_version[1],
         .firmware_patch = config->firmware_version[2],
-        .capabilities = config->capabilities,
+        .capabilities = (uint8_t)(config->capabilities | (config->authenticated ? DISCO_CAPABILITIES_AUTHENTICATION : 0u)),
     };
     struct disco_robot_build_t build = {.dbc_hash = config->dbc_hash, .board_id = config->board_id};
     SEND(core, HELLO, hello, hello);
@@ -244,6 +258,7 @@ static const periodic_t periodic[DISCO_PERIODIC] = {
     {send_motor, DISCO_ROBOT_MOTOR_CYCLE_TIME_MS * US_PER_MS},
     {send_system_state, DISCO_ROBOT_SYSTEM_STATE_CYCLE_TIME_MS * US_PER_MS},
     {send_session_state, DISCO_ROBOT_SESSION_STATE_CYCLE_TIME_MS * US_PER_MS},
+    {send_mac_challenge, DISCO_ROBOT_MAC_CHALLENGE_CYCLE_TIME_MS * US_PER_MS},
     {send_power, DISCO_ROBOT_POWER_CYCLE_TIME_MS * US_PER_MS},
     {send_link_health, DISCO_ROBOT_LINK_HEALTH_CYCLE_TIME_MS * US_PER_MS},
 };
@@ -274,6 +289,9 @@ static void send_changes(disco_firmware_t *core)
         (shown->shown_accepted != core->host.accepted)) {
         send_session_state(core);
     }
+    if (!core->authentication.nonce_shown) {
+        send_mac_challenge(core);
+    }
     shown->shown_state = core->state;
     shown->shown_fault = fault;
     shown->shown_session = core->session.current;
@@ -290,6 +308,10 @@ static void introduce(disco_firmware_t *core)
     if (!telemetry->introduced || unknown || asked) {
         telemetry->introduced = true;
         telemetry->hello_us = core->now_us;
+        if (core->host.hello_requested && (core->session.current == 0u)) {
+            /* A host that begins anew does not know how far the freshness counters have come. */
+            disco_authentication_renew(&core->authentication);
+        }
         core->host.hello_requested = false;
         telemetry->limits_changed = false;
         send_hello(core);

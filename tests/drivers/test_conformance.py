@@ -1,11 +1,12 @@
 """The conformance suite for the reference driver, against the real C firmware core."""
 
 import itertools
+from dataclasses import replace
 
 from drivers.reference import ReferenceDriver
 from firmware_protocol.codec import Codec
 from tests.drivers.conformance import DriverConformance
-from tests.drivers.reference_robot import ReferenceRobot
+from tests.drivers.reference_robot import CONFIG, ReferenceRobot
 
 
 class TestReferenceDriver(DriverConformance):
@@ -19,3 +20,15 @@ class TestReferenceDriver(DriverConformance):
 
     def near_the_wrap(self):
         return (2**24 - 300, 300)
+
+
+class TestAuthenticatedReferenceDriver(TestReferenceDriver):
+    """The same with a key on both ends."""
+
+    key = bytes(range(16))
+
+    def make_driver(self):
+        return ReferenceDriver(Codec(), itertools.count(41).__next__, self.key)
+
+    def make_robot(self, first_ticks=(0, 0)):
+        return ReferenceRobot(replace(CONFIG, key=self.key), first_ticks=first_ticks)

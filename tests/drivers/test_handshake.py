@@ -11,7 +11,7 @@ HELLO = {
     "firmware_major": 2,
     "firmware_minor": 0,
     "firmware_patch": 7,
-    "capabilities": 255,
+    "capabilities": 255 - 64,
 }
 BUILD = {"dbc_hash": 0xCAFE1234, "board_id": 9}
 PAGE0 = {"page": 0, "max_wheel_speed": 8.0, "max_wheel_acceleration": 20.0, "ticks_per_rev": 2048}
@@ -68,3 +68,14 @@ def test_limits_that_make_no_sense_are_refused(page, name):
     handshake = take(Handshake(1, 0, 0xCAFE1234), *broken)
     assert handshake.capabilities is None
     assert "make no sense" in handshake.refusal
+
+
+@pytest.mark.parametrize(
+    ("has_key", "bits", "refusal"), [(False, 64, "obeys only who holds"), (True, 63, "takes commands from anybody")]
+)
+def test_a_key_on_one_end_alone_is_refused_in_words(has_key, bits, refusal):
+    frames = [(name, {**values, "capabilities": bits} if name == "HELLO" else values) for name, values in FRAMES]
+    handshake = take(Handshake(1, 0, 0xCAFE1234, has_key=has_key), *frames)
+    assert refusal in handshake.refusal
+    assert "link.key_file" in handshake.refusal
+    assert take(Handshake(1, 0, 0xCAFE1234, has_key=not has_key), *frames).refusal is None

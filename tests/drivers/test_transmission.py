@@ -35,3 +35,29 @@ def test_due_after_a_period_or_when_forgotten():
     assert transmission.due("TIME_REQUEST", 150, 50)
     transmission.forget()
     assert transmission.due("TIME_REQUEST", 101, 50)
+
+
+def outgoing_ids(frames):
+    return [outgoing.frame.can_id for outgoing in frames]
+
+
+def test_with_a_key_a_proof_goes_before_each_frame_that_needs_one_with_the_same_deadline():
+    transmission = FrameTransmission(Codec(), bytes(16))
+    frames = [
+        transmission.frame("WHEEL_COMMAND", 0, 7, **COMMAND),
+        transmission.frame("TIME_REQUEST", 0, 9, sequence=0),
+    ]
+    assert outgoing_ids(transmission.proved(frames)) == [0x150], "nothing unproved before the robot's nonce is known"
+    transmission.challenge(5)
+    proved = transmission.proved(frames)
+    assert outgoing_ids(proved) == [0x0F0, 0x100, 0x150]
+    assert [outgoing.deadline_ns for outgoing in proved] == [7, 7, 9]
+    transmission.forget()
+    assert outgoing_ids(transmission.proved(frames)) == [0x150]
+
+
+def test_without_a_key_frames_stay_as_they_are():
+    transmission = FrameTransmission(Codec())
+    frames = (transmission.frame("WHEEL_COMMAND", 0, 7, **COMMAND),)
+    transmission.challenge(5)
+    assert transmission.proved(frames) == frames

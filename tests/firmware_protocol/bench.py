@@ -3,6 +3,7 @@
 import math
 
 from firmware_protocol import _firmware
+from firmware_protocol.authentication import PROVED, Prover
 from firmware_protocol.codec import Codec, Decoded
 from firmware_protocol.e2e import challenge_answer, data_id
 from firmware_protocol.firmware_core import FirmwareConfig, FirmwareCore, FirmwareInputs
@@ -33,6 +34,7 @@ class Bench:
         self.request: dict[str, object] | None = None
         self.command: dict[str, object] | None = None
         self.answers = True
+        self.prover = Prover(config.key, CODEC) if config.key else None
         self.out = self.step()
 
     def next_counter(self, name: str) -> int:
@@ -40,7 +42,10 @@ class Bench:
         return self.counters[name]
 
     def send(self, name: str, **signals: object) -> None:
-        self.core.receive(self.now_us, *CODEC.encode(name, self.next_counter(name), **signals))
+        frame = CODEC.encode(name, self.next_counter(name), **signals)
+        if self.prover is not None and self.prover.ready and name in PROVED:
+            self.core.receive(self.now_us, *self.prover.prove(frame))
+        self.core.receive(self.now_us, *frame)
 
     def hello(self, **changes: object) -> None:
         self.send("HELLO_REQUEST", **{"protocol_major": 1, "protocol_minor": 0, "dbc_hash": CODEC.dbc_hash} | changes)
@@ -82,6 +87,8 @@ class Bench:
             decoded = CODEC.decode(can_id, data)
             assert isinstance(decoded, Decoded), decoded
             self.sent.append((self.now_us, decoded))
+            if self.prover is not None and decoded.name == "MAC_CHALLENGE":
+                self.prover.challenge(int(decoded.values["nonce"]))
         return self.out
 
     def run(self, milliseconds: int):

@@ -6,8 +6,9 @@ from pathlib import Path
 import pytest
 
 from firmware_protocol import _firmware
+from firmware_protocol.authentication import Prover
 from firmware_protocol.build_firmware import PACKAGE
-from firmware_protocol.codec import PROTOCOL, Codec
+from firmware_protocol.codec import PROTOCOL, Codec, EncodedFrame
 from firmware_protocol.e2e import challenge_answer, crc8
 from firmware_protocol.serial_framing import encode_frame
 
@@ -42,6 +43,12 @@ def test_states_are_those_of_the_c_table():
     assert [(row[0].split(", "), row[1], row[2]) for row in rows("States")] == expected
 
 
+def host_state_mac():
+    prover = Prover(bytes(range(16)), CODEC)
+    prover.challenge(int.from_bytes(bytes(range(0xA0, 0xA6)), "little"))
+    return prover.prove(EncodedFrame(0x101, VECTORS["HOST_STATE, counter 5"]())).data
+
+
 VECTORS = {
     "WHEEL_SPEED, counter 0, major 1": lambda: (
         CODEC.encode(
@@ -72,6 +79,7 @@ VECTORS = {
             host_fault=0,
         ).data
     ),
+    "HOST_STATE_MAC of that HOST_STATE": host_state_mac,
     "serial, id 0x010, data 02 01 02 03 00": lambda: encode_frame(0x010, bytes.fromhex("0201020300")),
 }
 

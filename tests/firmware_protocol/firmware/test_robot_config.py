@@ -33,7 +33,7 @@ BOUNDS = {
     "encoder_debounce_s": (0.001, 1.0),
     "fault_hold_s": (0.0, 10.0),
 }
-FREE = {"board_id", "firmware_version", "capabilities", "dbc_hash", "protocol_major"}
+FREE = {"board_id", "firmware_version", "capabilities", "dbc_hash", "protocol_major", "key"}
 
 
 def valid(**changes):

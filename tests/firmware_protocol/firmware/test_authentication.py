@@ -1,0 +1,252 @@
+"""The core in authenticated mode: who has not the key stops the robot and does nothing else."""
+
+from dataclasses import replace
+
+import pytest
+
+from firmware_protocol.authentication import Prover
+from tests.firmware_protocol.bench import CODEC, CONFIG, Bench
+
+KEY = bytes(range(16))
+LOCKED = replace(CONFIG, key=KEY)
+AUTHENTICATION = 64
+
+
+def refused(bench):
+    return bench.core.rejections["AUTHENTICATION"]
+
+
+def driving():
+    bench = Bench(LOCKED)
+    bench.to_driving()
+    assert refused(bench) == 0
+    return bench
+
+
+def test_who_holds_the_key_arms_and_drives():
+    bench = driving()
+    bench.ask("STANDBY")
+    bench.command = None
+    bench.run_until("STANDBY")
+    assert refused(bench) == 0
+
+
+def test_it_says_that_it_wants_proof_and_gives_a_nonce():
+    bench = Bench(LOCKED)
+    bench.run(250)
+    assert int(bench.messages("HELLO")[0].values["capabilities"]) == CONFIG.capabilities | AUTHENTICATION
+    nonces = bench.messages("MAC_CHALLENGE")
+    assert len({decoded.values["nonce"] for decoded in nonces}) == 1
+    assert len(nonces) == 4, "when it is drawn, and at 10 Hz"
+
+
+def test_without_a_key_nothing_of_it_is_seen():
+    bench = Bench()
+    bench.to_driving()
+    assert int(bench.messages("HELLO")[0].values["capabilities"]) == CONFIG.capabilities
+    assert not bench.messages("MAC_CHALLENGE")
+    for can_id in (0x0F0, 0x0F1, 0x0F2):
+        bench.core.receive(bench.now_us, can_id, bytes(8))
+    assert bench.run(50).state == "ARMED"
+    assert (refused(bench), bench.core.unknown_frames) == (0, 0)
+
+
+@pytest.mark.parametrize("key", [None, bytes(16)], ids=["no key", "another key"])
+def test_without_the_key_not_even_ready(key):
+    bench = Bench(LOCKED)
+    bench.prover = Prover(key, CODEC) if key else None
+    bench.hello()
+    bench.ask("READY")
+    bench.command = {}
+    bench.run(2000)
+    assert bench.out.state == "STANDBY"
+    assert refused(bench) > 100
+    assert bench.messages("SYSTEM_STATE")[-1].values["reject_reason"] == 13
+    assert {"HOST_STATE", "ZERO_COMMANDS"} <= bench.blockers()
+
+
+def test_the_emergency_stop_needs_no_key():
+    bench = driving()
+    bench.core.receive(bench.now_us, 0x080, b"")
+    assert bench.step().state == "ESTOP"
+
+
+def test_to_leave_the_emergency_stop_takes_the_key():
+    bench = driving()
+    bench.core.receive(bench.now_us, 0x080, b"")
+    bench.command = None
+    bench.ask("STANDBY")
+    bench.run(1500)
+    proves, bench.prover = bench.prover, None
+    bench.ask("RESET")
+    bench.run(500)
+    assert bench.out.state == "ESTOP"
+    bench.prover = proves
+    bench.run_until("STANDBY")
+
+
+def test_an_unproved_standby_neither_stops_nor_takes_a_request_back():
+    """Were it heard, a reset that is being held would count as asked for anew after a later emergency stop."""
+    bench = driving()
+    bench.core.receive(bench.now_us, 0x080, b"")
+    bench.command = None
+    bench.ask("RESET")
+    bench.run(1500)
+    assert bench.out.state == "STANDBY"
+    bench.core.receive(bench.now_us, 0x080, b"")
+    bench.step()
+    counter = bench.next_counter("HOST_STATE")
+    standby = {"request": "STANDBY", "session": 0, "challenge_answer": 0, "host_fault": 0}
+    bench.core.receive(bench.now_us, *CODEC.encode("HOST_STATE", counter, **standby))
+    assert bench.run(1500).state == "ESTOP"
+
+
+def test_commands_without_proof_do_not_feed_the_watchdog():
+    bench = driving()
+    bench.prover = None
+    bench.run(101)
+    assert bench.out.state == "STOPPING"
+    assert bench.out.stop_cause == "COMMAND_TIMEOUT"
+
+
+def test_a_stranger_who_shouts_neither_steers_nor_stops():
+    """Well-sealed commands of the right session at full speed, three for each of the host's."""
+    bench = driving()
+    accepted = bench.out.accepted_commands
+    for counter in range(300):
+        bench.run(5)
+        foreign = {"mode": "SPEED", "left_speed": -8.0, "right_speed": 8.0, "valid_for": 0.5, "session": 7}
+        bench.core.receive(bench.now_us, *CODEC.encode("WHEEL_COMMAND", counter % 16, **foreign))
+        assert bench.out.state == "ARMED"
+        assert (bench.out.left_setpoint_rad_s, bench.out.right_setpoint_rad_s) == pytest.approx((4.0, 2.0))
+    assert bench.out.accepted_commands == accepted + 75
+    assert refused(bench) == 300
+
+
+class Recorder:
+    """Between host and robot: everything that the host sends is kept."""
+
+    def __init__(self, bench):
+        self.frames = []
+        core, receive = bench.core, bench.core.receive
+        bench.core = self
+        self._core = core
+
+        def keep(now_us, can_id, data):
+            self.frames.append((can_id, data))
+            receive(now_us, can_id, data)
+
+        self.receive = keep
+
+    def __getattr__(self, name):
+        return getattr(self._core, name)
+
+
+def recorded_run(entropy=1):
+    bench = Bench(LOCKED, entropy)
+    recorder = Recorder(bench)
+    bench.to_driving()
+    return bench, list(recorder.frames)
+
+
+def test_a_recorded_run_played_to_another_start_does_nothing():
+    _, frames = recorded_run(entropy=1)
+    bench = Bench(LOCKED, entropy=2)
+    for can_id, data in frames:
+        bench.core.receive(bench.now_us, can_id, data)
+        bench.run(5)
+        assert bench.out.state == "STANDBY"
+        assert not bench.out.driver_enabled
+    assert refused(bench) > 20
+    assert bench.out.accepted_commands == 0
+
+
+def test_a_recorded_run_played_again_later_in_the_same_start_does_nothing():
+    bench, frames = recorded_run()
+    bench.ask("STANDBY")
+    bench.command = None
+    bench.run_until("STANDBY")
+    bench.request = None
+    bench.run(1000)
+    before = refused(bench)
+    for can_id, data in frames:
+        bench.core.receive(bench.now_us, can_id, data)
+        assert bench.run(5).state == "STANDBY"
+    assert refused(bench) > before + 20
+
+
+def test_a_frame_played_again_in_its_session_is_refused():
+    bench, frames = recorded_run()
+    commands = [data for can_id, data in frames if can_id == 0x100]
+    proofs = [data for can_id, data in frames if can_id == 0x0F0]
+    accepted = bench.out.accepted_commands
+    for proof, command in zip(proofs[-3:], commands[-3:], strict=True):
+        bench.core.receive(bench.now_us, 0x0F0, proof)
+        bench.core.receive(bench.now_us, 0x100, command)
+    assert bench.step().accepted_commands == accepted
+    assert refused(bench) == 3
+
+
+def test_the_nonce_is_new_in_every_session_and_for_every_host():
+    bench = driving()
+    armed = bench.prover._nonce
+    bench.hello()
+    bench.run(100)
+    assert bench.prover._nonce == armed, "none but the host's own end changes it within a session"
+    assert bench.out.state == "ARMED"
+    bench.ask("STANDBY")
+    bench.command = None
+    bench.run_until("STANDBY")
+    bench.step()
+    standby = bench.prover._nonce
+    assert standby != armed
+    bench.run(30)
+    bench.hello()
+    bench.run(2)
+    assert bench.prover._nonce != standby
+
+
+def test_a_host_that_starts_anew_is_heard():
+    bench = Bench(LOCKED)
+    bench.to_ready()
+    bench.ask("STANDBY")
+    bench.run_until("STANDBY")
+    bench.run(500)
+    bench.prover = Prover(KEY, CODEC)
+    bench.run(600)
+    bench.hello()
+    bench.ask("READY", 9)
+    bench.run_until("READY")
+
+
+def test_parameters_are_read_and_written_with_the_key_alone():
+    bench = Bench(LOCKED)
+    bench.run(5)
+    write = {"operation": "WRITE", "key": 4, "value": 5.0}
+    bench.core.receive(bench.now_us, *CODEC.encode("PARAM_REQUEST", 0, **write))
+    bench.run(5)
+    assert not bench.messages("PARAM_RESPONSE")
+    assert refused(bench) == 1
+    bench.send("PARAM_REQUEST", **write)
+    bench.run(5)
+    assert [decoded.values["status"] for decoded in bench.messages("PARAM_RESPONSE")] == [0]
+
+
+@pytest.mark.parametrize("can_id", [0x0F0, 0x0F1, 0x0F2])
+@pytest.mark.parametrize("length", [*range(8), 9])
+def test_a_proof_of_wrong_length_is_refused(can_id, length):
+    bench = Bench(LOCKED)
+    bench.core.receive(bench.now_us, can_id, bytes(length))
+    assert bench.core.rejections["LENGTH"] == 1
+
+
+def test_damaged_commands_still_count_against_the_sender():
+    bench = driving()
+    bench.command = None
+    for counter in range(5):
+        damaged = bytearray(CODEC.encode("WHEEL_COMMAND", counter, mode="SPEED", left_speed=0.0, right_speed=0.0,
+                                         valid_for=0.1, session=7).data)  # fmt: skip
+        damaged[0] ^= 1
+        bench.core.receive(bench.now_us, 0x100, bytes(damaged))
+    assert bench.step().stop_cause == "E2E_DISQUALIFIED"
+    assert (refused(bench), bench.core.rejections["CRC"]) == (0, 5)

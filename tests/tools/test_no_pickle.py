@@ -1,0 +1,65 @@
+"""Nothing that this project reads can run code: no pickle is loaded anywhere, by whatever name."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+PACKAGES = ("disco_hw", "drivers", "firmware_protocol", "sim", "tools")
+FILES = [path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))]
+MODULES = {"pickle", "cPickle", "_pickle", "dill", "cloudpickle", "joblib", "shelve", "marshal"}
+CALLS = {"torch.load", "torch.jit.load", "pandas.read_pickle", "pd.read_pickle", "yaml.load"}
+
+
+def offences(source):
+    """What of a module's text loads, or could load, objects instead of data."""
+    found = []
+    for node in ast.walk(ast.parse(source)):
+        names = []
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            names = [node.module or ""]
+        found += [name for name in names if name.split(".")[0] in MODULES]
+        if isinstance(node, ast.Call):
+            called = ast.unparse(node.func)
+            if called in CALLS or (called == "__import__"):
+                found.append(called)
+            found += [
+                f"{called}({keyword.arg}=...)"
+                for keyword in node.keywords
+                if keyword.arg == "allow_pickle" and not (
+                    isinstance(keyword.value, ast.Constant) and keyword.value.value is False
+                )
+            ]  # fmt: skip
+            if called in {"np.load", "numpy.load"} and not any(
+                keyword.arg == "allow_pickle" for keyword in node.keywords
+            ):
+                found.append(f"{called} without allow_pickle=False")
+    return found
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_no_module_loads_objects(path):
+    assert not offences(path.read_text("utf-8"))
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "import pickle",
+        "from pickle import loads",
+        "import torch\ntorch.load('x')",
+        "np.load('x')",
+        "np.load('x', allow_pickle=True)",
+        "np.load('x', allow_pickle=flag)",
+        "def f():\n    import joblib.numpy_pickle",
+    ],
+)
+def test_what_would_be_found(source):
+    assert offences(source)
+
+
+def test_what_is_data_is_let_be():
+    assert not offences("import numpy as np\nnp.load('x', allow_pickle=False)\njson.loads('1')\ntree.eval()")
