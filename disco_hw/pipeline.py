@@ -13,7 +13,8 @@ from typing import Protocol
 
 from disco_hw.control import NoValidControl, Plan, PlannerState, Rollouts, SentCommand, Task
 from disco_hw.daemon.governor import Governed, Governor
-from disco_hw.estimation import Estimate, PoseFusion, PoseUpdate
+from disco_hw.estimation import Estimate, OdometryParameters, PoseFusion, PoseUpdate
+from disco_hw.model import Belief
 from drivers.types import Readings
 
 HISTORY_NS = 2_000_000_000
@@ -31,6 +32,9 @@ class Planner(Protocol):
     def set_task(self, task: Task) -> None:
         """Plan for another task of the same kind from the next reset on."""
 
+    def set_belief(self, belief: Belief) -> None:
+        """Plan under this belief from the next plan on; raises ValueError, and keeps the old one, if it cannot."""
+
     def sampled_rollouts(self, count: int) -> Rollouts:
         """The weightiest sequences of the last plan; changes nothing."""
 
@@ -47,6 +51,9 @@ class NoPlanner:
 
     def set_task(self, _task: Task) -> None:
         """A person decides."""
+
+    def set_belief(self, _belief: Belief) -> None:
+        """Nothing is planned."""
 
     def sampled_rollouts(self, _count: int) -> Rollouts:
         """Raise NoValidControl."""
@@ -140,6 +147,14 @@ class Pipeline:
         """Follow another task of the same kind; what is planned for the present one is dropped."""
         self._planner.set_task(task)
         self._plan, self._following = None, False
+
+    def set_belief(self, belief: Belief, odometry: OdometryParameters) -> None:
+        """Plan and estimate with another geometry from the next step on; plan and estimate in force stay.
+
+        Raises ValueError, with everything as it was, if the planner cannot take the belief.
+        """
+        self._planner.set_belief(belief)
+        self._fusion.set_parameters(odometry)
 
     def rollouts(self, count: int) -> Rollouts | None:
         """What the plan in force was weighed from, the `count` of the largest weight; None without one.

@@ -13,19 +13,20 @@ from typing import Any
 
 import msgspec
 
+from disco_hw.adapt.adaptable import geometry_of
 from disco_hw.control import Circle
 from disco_hw.daemon import records_of_tick
-from disco_hw.daemon.assembly import make_pipeline, make_planner
+from disco_hw.daemon.assembly import make_pipeline, make_planner, put_in_force
 from disco_hw.daemon.task_change import task_of
 from disco_hw.errors import InputError
 from disco_hw.log.provenance import MODEL_TOML, ROBOT_TOML
 from disco_hw.log.reader import Entry, Log, open_log
-from disco_hw.log.records import Command, Estimate, Innovation, Plan, Record, Task
+from disco_hw.log.records import BeliefChange, Command, Estimate, Innovation, Plan, Record, Task
 from disco_hw.pipeline import FollowTask, Manual, Motion, Off, Pipeline, Source, Stand
 from disco_hw.robot_setup import Setup, load_setup
 from drivers.types import PoseSample, Readings, WheelSample
 
-_TOPICS = ("/wheels", "/pose", "/estimate", "/estimate/innovation", "/plan", "/command", "/task")
+_TOPICS = ("/wheels", "/pose", "/estimate", "/estimate/innovation", "/plan", "/command", "/task", "/belief")
 _COMPARED = (Estimate, Innovation, Plan, Command)
 # Whether a command went out is the driver's part, which is not replayed.
 _NOT_REPLAYED = {(Command, "in_force"), (Command, "valid_for_s")}
@@ -91,6 +92,8 @@ def replay(path: Path) -> ReplayReport:
             recorded = list(entries)
             for task in (entry.record for entry in recorded if isinstance(entry.record, Task)):
                 pipeline.set_task(Circle.from_config(task_of(task), setup.config.control.mode))
+            for change in (entry.record for entry in recorded if isinstance(entry.record, BeliefChange)):
+                put_in_force(pipeline, setup.model, geometry_of(change))
             outcome = _replay_tick(pipeline, recorded)
             ticks += 1
             compared, difference = _compare(tick, recorded[0].now_ns, recorded, outcome)

@@ -5,6 +5,10 @@ from __future__ import annotations
 import secrets
 
 from disco_hw import control
+from disco_hw.adapt.adaptable import believed_geometry, check_adaptable, possible_range, with_geometry
+from disco_hw.adapt.adaptation import Adaptation, CheckedAdaptation
+from disco_hw.adapt.guard import BeliefGuard, Geometry
+from disco_hw.adapt.link import AdapterLink
 from disco_hw.config import RobotConfig
 from disco_hw.daemon.core import DaemonCore
 from disco_hw.daemon.governor import Governor, WheelLimits
@@ -14,7 +18,7 @@ from disco_hw.estimation import OdometryParameters, PoseFusion
 from disco_hw.log.recorder import Recorder
 from disco_hw.model import Model
 from disco_hw.pipeline import Pipeline, Planner
-from disco_hw.robot_setup import geometry
+from disco_hw.robot_setup import Setup, geometry
 from drivers.reference import ReferenceDriver
 from drivers.types import Driver, Transport
 from firmware_protocol.codec import Codec
@@ -49,6 +53,26 @@ def make_pipeline(config: RobotConfig, model: Model, planner: Planner) -> Pipeli
     )
 
 
+def make_adaptation(setup: Setup, pipeline: Pipeline, link: AdapterLink) -> CheckedAdaptation:
+    """Adaptation of this robot's belief over its geometry; raises InputError where the model does not allow it."""
+    check_adaptable(setup.model, setup.config.control.uncertainty)
+    believed = believed_geometry(setup.model)
+    return CheckedAdaptation(
+        link,
+        BeliefGuard(believed, *possible_range(setup.config.prior)),
+        believed,
+        lambda geometry: put_in_force(pipeline, setup.model, geometry),
+    )
+
+
+def put_in_force(pipeline: Pipeline, model: Model, learnt: Geometry | None) -> None:
+    """Plan and estimate with this geometry, or with the model file's for None; raises ValueError if that cannot be."""
+    adapted = model if learnt is None else with_geometry(model, learnt)
+    if adapted.belief is None:
+        raise ValueError("the model has no belief")
+    pipeline.set_belief(adapted.belief, odometry_parameters(adapted))
+
+
 def odometry_parameters(model: Model) -> OdometryParameters:
     """Mean and covariance of the geometry, as the estimator wants them."""
     (wheel_radius_m, axial_distance_m, x_icr_m), covariance = geometry(model)
@@ -70,6 +94,7 @@ def assemble_core(
     pipeline: Pipeline,
     recorder: Recorder,
     needs_pose: bool = True,
+    adaptation: Adaptation | None = None,
 ) -> DaemonCore:
     """The daemon's tick over these parts; without `needs_pose` motion needs no pose, whatever robot.toml says."""
     supervisor = Supervisor(
@@ -79,7 +104,9 @@ def assemble_core(
             pose_required=needs_pose and config.estimation.pose_required,
         )
     )
-    return DaemonCore(config, transport, driver, supervisor, pipeline, recorder, lambda robot: preflight(config, robot))
+    return DaemonCore(
+        config, transport, driver, supervisor, pipeline, recorder, lambda robot: preflight(config, robot), adaptation
+    )
 
 
 def preflight(config: RobotConfig, driver: Driver) -> tuple[str, ...]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+from disco_hw.adapt.adaptation import Adaptation, NoAdaptation
 from disco_hw.config import CircleTask, RobotConfig
 from disco_hw.control import Circle
 from disco_hw.daemon import records_of_tick
@@ -52,12 +53,14 @@ class DaemonCore:
         pipeline: Pipeline,
         recorder: Recorder,
         preflight: Callable[[Driver], tuple[str, ...]],
+        adaptation: Adaptation | None = None,
     ) -> None:
         self.config = config
         self.transport = transport
         self.driver = driver
         self.pipeline = pipeline
         self.recorder = recorder
+        self.adaptation = adaptation or NoAdaptation()
         self.task = config.task
         self.laps = LapCounter(config.task)
         self.newest_wheels: WheelSample | None = None
@@ -98,11 +101,12 @@ class DaemonCore:
         self._remember(readings)
         output = self._supervisor.step(now_ns, self._inputs(now_ns, requests))
         mark("receive")
+        learnt = self.adaptation.step(now_ns)
         result = self.pipeline.step(now_ns, readings, _motion(output, motion), mark)
         command = self._command(output, result)
         sent = self._send(now_ns, output, command)
         mark("send")
-        events = (*readings.events, *output.events, *self._planner_events(result))
+        events = (*readings.events, *output.events, *learnt.events, *self._planner_events(result))
         self._count_laps(output, result)
         self.recorder.put(
             now_ns,
@@ -113,10 +117,12 @@ class DaemonCore:
                 *sent,
                 *self._state_change(now_ns, output),
                 *self._task_change(now_ns),
+                *learnt.records,
                 *(records.Event(now_ns, "info", "daemon", text) for text in events),
                 *extra_records,
             ],
         )
+        self.adaptation.feed(now_ns, readings)
         mark("record")
         self.last = CoreTick(output, result, command, events)
         return self.last

@@ -94,6 +94,13 @@ def belief_at(pose: Pose, position_variance: float, yaw_variance: float, model: 
     return Belief(x, y, yaw, position_variance, 0.0, 0.0, position_variance, 0.0, yaw_variance, sensitivity)
 
 
+def rebased(belief: Belief, model: MotionModel) -> Belief:
+    """The same belief under other parameters, whose error has nothing to do with what those before have caused."""
+    (xx, xy, xt), (_, yy, yt), (_, _, tt) = belief.covariance
+    sensitivity: Flat9 | None = None if model.parameter_root is None else (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    return Belief(belief.x_m, belief.y_m, belief.yaw_rad, xx, xy, xt, yy, yt, tt, sensitivity)
+
+
 def predict(
     belief: Belief,
     model: MotionModel,

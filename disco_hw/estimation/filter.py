@@ -5,7 +5,7 @@ from __future__ import annotations
 import msgspec
 
 from disco_hw.config import Estimation
-from disco_hw.estimation.belief import Belief, belief_at, motion_model, predict
+from disco_hw.estimation.belief import Belief, belief_at, motion_model, predict, rebased
 from disco_hw.estimation.correction import Correction, PoseCorrector, Triple
 from disco_hw.estimation.gate import Measurement, PoseReason, gate_limit
 from disco_hw.estimation.odometry import OdometryParameters, Pose, arc
@@ -63,6 +63,14 @@ class PoseFilter:
         origin = belief_at(Pose(0.0, 0.0, 0.0), 1e-6, 1e-6, self._model)
         belief = None if self._pose_required else origin
         return FilterState(wheels.t_ns, wheels.left_rad, wheels.right_rad, belief, None, 0, None, 0, None)
+
+    def adopt(self, state: FilterState) -> FilterState:
+        """A state of a filter with other parameters, as one of this filter."""
+        return msgspec.structs.replace(
+            state,
+            belief=None if state.belief is None else rebased(state.belief, self._model),
+            candidate=None if state.candidate is None else rebased(state.candidate, self._model),
+        )
 
     def move(self, state: FilterState, t_ns: int, left_rad: float, right_rad: float, in_gap: bool) -> FilterState:
         """Follow the wheels to measured angles."""

@@ -115,6 +115,7 @@ class PoseFusion:
     """
 
     def __init__(self, settings: Estimation, parameters: OdometryParameters, wheel_timeout_s: float) -> None:
+        self._settings = settings
         self._filter = PoseFilter(settings, parameters)
         self._history_s = settings.history_s
         self._pose_timeout_s = settings.pose_timeout_s
@@ -127,6 +128,12 @@ class PoseFusion:
     def stats(self) -> FusionStats:
         """A snapshot of the counters."""
         return FusionStats(**self._counts)
+
+    def set_parameters(self, parameters: OdometryParameters) -> None:
+        """Follow the wheels with another geometry from now on; the present estimate and its uncertainty stay."""
+        self._filter = PoseFilter(self._settings, parameters)
+        if self._buffer is not None:
+            self._buffer.set_filter(self._filter)
 
     def add_wheels(self, sample: WheelSample) -> None:
         """Take in a wheel sample; it must be newer than all before, otherwise it is dropped and counted."""

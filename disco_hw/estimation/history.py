@@ -49,6 +49,11 @@ class RewindBuffer:
     def __len__(self) -> int:
         return len(self._events)
 
+    def set_filter(self, pose_filter: PoseFilter) -> None:
+        """Go on with a filter of other parameters: what is run again from now on, late poses included, is run by it."""
+        self._filter = pose_filter
+        self._states = [pose_filter.adopt(state) for state in self._states]
+
     def add_wheels(self, reading: WheelReading) -> None:
         """Append a reading newer than all before."""
         index = self._index_after(reading.t_ns, include_equal=False)

@@ -6,16 +6,18 @@ import contextlib
 import os
 import subprocess
 import threading
+from collections.abc import Sequence
 
 from disco_hw.log.errors import LogError
 
 
-def spawn_at_normal_priority(command: list[str]) -> subprocess.Popen[bytes]:
+def spawn_at_normal_priority(command: list[str], pass_fds: Sequence[int] = ()) -> subprocess.Popen[bytes]:
     """Start a process that never runs in the real-time class, whatever the caller's is; its output can be read.
 
     A child inherits the scheduling of the thread that makes it, and a child at the loop's priority would take its core
     from the loop while it starts; so a thread made for it gives the priority up first. Its own session keeps the
-    terminal's Ctrl-C from it. Standard output is a pipe that does not block its reader. Raises LogError.
+    terminal's Ctrl-C from it; it keeps the descriptors `pass_fds`. Standard output is a pipe that does not block its
+    reader. Raises LogError.
     """
     made: list[subprocess.Popen[bytes]] = []
     failed: list[OSError] = []
@@ -27,7 +29,13 @@ def spawn_at_normal_priority(command: list[str]) -> subprocess.Popen[bytes]:
                 os.setpriority(os.PRIO_PROCESS, 0, 0)
         try:
             made.append(
-                subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, start_new_session=True)
+                subprocess.Popen(
+                    command,
+                    stdin=subprocess.DEVNULL,
+                    stdout=subprocess.PIPE,
+                    start_new_session=True,
+                    pass_fds=tuple(pass_fds),
+                )
             )
         except OSError as error:
             failed.append(error)

@@ -56,3 +56,28 @@ def circle(
     result.write_csv(out / "circle.csv")
     result.write_png(out / "circle.png")
     print_result({"curves": result.rows()}, as_json, result.table())
+
+
+@experiment_app.command()
+def adapt(
+    robot: Annotated[
+        Path | None, typer.Option(help="robot.toml whose model to use; the shipped robot's if none.")
+    ] = None,
+    change: Annotated[
+        float, typer.Option(min=-0.3, max=0.3, help="By how much of its size the parameter changes.")
+    ] = 0.15,
+    seeds: Annotated[int, typer.Option(min=1, help="Runs of each.")] = 3,
+    out: Annotated[Path, typer.Option("-o", "--out", help="Directory for CSV and PNG.")] = Path("out/adapt"),
+    as_json: AsJson = False,
+) -> None:
+    """Let wheel radius or axial distance change on the way, and see what adaptation wins back."""
+    import disco_hw
+    from disco_hw.adapt.experiment import AdaptOptions, run_adapt
+    from disco_hw.robot_setup import load_setup
+
+    setup = load_setup(robot or Path(disco_hw.__file__).parent / "robots" / "wombot.toml")
+    result = run_adapt(setup, AdaptOptions(change=change, seeds=seeds), progress_line)
+    out.mkdir(parents=True, exist_ok=True)
+    result.write_csv(out / "adapt.csv")
+    result.write_png(out / "adapt.png")
+    print_result({"changes": result.rows()}, as_json, result.table())

@@ -1,0 +1,1 @@
+"""Adaptation: the geometry learnt again while the robot drives, checked, and given to planner and estimator."""
