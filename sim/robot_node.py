@@ -51,7 +51,11 @@ class RobotNode:
             self._bus.send(self.node, CanFrame(frame.can_id, frame.data))
 
     def babble(self, frame: Frame) -> None:
-        """Send `frame` from the faulty node; if its queue is full it is on the bus as often as the bus allows."""
+        """Send `frame` from the faulty node; if its queue is full it is on the bus as often as the bus allows.
+
+        Thrown off the bus by what it collides with, it comes back as soon as the bus allows.
+        """
+        self._bus.request_recovery(self._babbler)
         self._bus.send(self._babbler, CanFrame(frame.can_id, frame.data))
 
 

@@ -1,0 +1,401 @@
+"""The whole stack in simulated time: robot, firmware core, CAN bus, driver and the daemon's core, under faults.
+
+The same objects as in real time, without processes, threads or a clock; what the monitors find is in the outcome.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import random
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+import disco_hw
+from disco_hw.control import Plan, PlannerState
+from disco_hw.control.plan import Diagnostics
+from disco_hw.daemon.assembly import assemble_core, make_pipeline
+from disco_hw.daemon.core import CoreTick, DaemonCore
+from disco_hw.daemon.loop import LoopStats
+from disco_hw.daemon.states import State
+from disco_hw.daemon.status import counters
+from disco_hw.daemon.supervisor import UserRequest
+from disco_hw.log import records
+from disco_hw.log.recorder import RecorderStats
+from disco_hw.pipeline import Planner
+from disco_hw.robot_setup import load_setup
+from drivers.reference import ReferenceDriver
+from drivers.types import RobotLinkHealth, RobotStatus
+from firmware_protocol.codec import Codec
+from firmware_protocol.firmware_core import FirmwareConfig
+from sim.body_dynamics import Pose
+from sim.fault_player import FaultPlayer
+from sim.fault_schedule import Fault, FaultSchedule
+from sim.plant import Plant
+from sim.plant_parameters import PlantParameters
+from sim.simulated_can import SimulatedCan
+from sim.virtual_robot import VirtualRobot
+from tests.hil.wheel_monitor import WheelMonitor
+
+ROBOT_FILE = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
+SETTLED_S = 2.5
+"""A fault's consequences are looked for until so long after its end."""
+WRAP_SOON_TICKS = (1 << 24) - 20_000
+LOST_M = 0.5
+LOST_RAD = 0.5
+LOST_FOR_S = 1.5
+"""Longest that the robot may move with an estimate that is wrong by more than the two above.
+
+While its one pose sensor lies, the robot cannot know: poses that agree with each other and not with the wheels are what
+a robot sees that was carried off. It waits, counts them, and then believes them.
+"""
+LIES = ("pose_jump", "pose_swapped", "pose_frozen")
+# Counters that rise while all is well.
+_USUAL = frozenset(
+    {
+        *(f"transport.{n}" for n in ("frames_sent", "frames_received", "bytes_received")),
+        *(f"driver.{n}" for n in ("frames_accepted", "commands_sent", "sessions")),
+        *(f"fusion.{n}" for n in ("wheels_accepted", "poses_accepted", "poses_initialised")),
+        "loop.ticks",
+        *("robot.t_ns", "robot.tx_error_count", "robot.rx_error_count"),
+    }
+)
+
+
+class CirclingPlanner:
+    """In the place of DISCO where the planner is not what is tried: goes round the task's circle, for microseconds."""
+
+    STEPS = 10
+    LOOK_AHEAD_RAD = 0.35
+
+    def __init__(self, config, model_geometry) -> None:
+        self._task = config.task
+        self._radius_m, self._axial_m, self._x_icr_m = model_geometry
+        self._top = config.robot.max_wheel_speed_rad_s
+
+    def plan(self, now_ns: int, state: PlannerState) -> Plan:
+        task = self._task
+        bearing = math.atan2(state.y_m - task.center_y_m, state.x_m - task.center_x_m) + self.LOOK_AHEAD_RAD
+        x_m, y_m = (
+            task.center_x_m + task.radius_m * math.cos(bearing),
+            task.center_y_m + task.radius_m * math.sin(bearing),
+        )
+        error = math.remainder(math.atan2(y_m - state.y_m, x_m - state.x_m) - state.yaw_rad, 2.0 * math.pi)
+        turn = max(-1.5, min(1.5, 2.0 * error))
+        speed = task.speed_m_s * max(0.2, math.cos(error))
+        left = (speed - 0.5 * self._axial_m * turn) / self._radius_m
+        right = (speed + 0.5 * self._axial_m * turn) / self._radius_m
+        speeds = np.empty((self.STEPS, 2))
+        speeds[:] = (left, right)
+        found = Diagnostics(1.0, 1.0, 0.0, 0.0, 0.0, 1)
+        return Plan(now_ns, 0.05, speeds, np.zeros((self.STEPS + 1, 3)), found)
+
+    def reset(self) -> None:
+        pass
+
+    def set_task(self, task) -> None:
+        pass
+
+
+class Attendant:
+    """A person beside the robot: resets, arms and starts it again, never more than one request in 0.4 s."""
+
+    def __init__(self) -> None:
+        self._last_ns = 0
+
+    def requests(self, now_ns: int, last: CoreTick | None) -> tuple[UserRequest, ...]:
+        if last is None or now_ns - self._last_ns < 400_000_000:
+            return ()
+        match last.output.state:
+            case State.FAULT:
+                wanted = UserRequest.RESET
+            case State.READY:
+                wanted = UserRequest.ARM
+            case State.ARMED if not last.output.running:
+                wanted = UserRequest.START
+            case _:
+                return ()
+        self._last_ns = now_ns
+        return (wanted,)
+
+
+class LogReader:
+    """Takes the place of the recorder and keeps, of what is recorded, what tells of trouble."""
+
+    def __init__(self) -> None:
+        self.counts: dict[str, int] = {}
+        self.told: list[tuple[int, str]] = []
+        self.ticks = 0
+        self._robot: dict[str, int] = {}
+        self._sums: dict[str, int] = {}
+
+    def put(self, now_ns: int, recorded: Sequence[records.Record]) -> None:
+        self.ticks += 1
+        for record in recorded:
+            kind = type(record)
+            if kind is records.Event:
+                self.told.append((now_ns, record.text))
+            elif kind is records.DaemonState:
+                self.told.append((now_ns, f"{record.previous} -> {record.state}: {record.reason}"))
+            elif kind is records.Counters:
+                for group in ("transport", "driver", "fusion", "loop"):
+                    for name, value in getattr(record, group).items():
+                        self.counts[f"{group}.{name}"] = value
+            elif kind is RobotLinkHealth:
+                self._take_robot({f.name: getattr(record, f.name) for f in dataclasses.fields(record)})
+            elif kind is RobotStatus:
+                self._take_robot({"rejected_count": record.rejected_count})
+
+    def _take_robot(self, values: dict[str, int]) -> None:
+        for name, value in values.items():
+            before = self._robot.get(name, value)
+            self._robot[name] = value
+            key = f"robot.{name}"
+            # They wrap at 256 and begin anew when the robot restarts: any change is one.
+            self.counts[key] = self.counts.get(key, 0) + (value != before)
+
+    def poll(self) -> RecorderStats:
+        return RecorderStats()
+
+    def close(self, timeout_s: float = 5.0) -> RecorderStats:
+        return RecorderStats()
+
+
+@dataclass
+class FaultOutcome:
+    """What became of one fault: `stopped_s` from its beginning to zero setpoints if the robot left ARMED."""
+
+    fault: Fault
+    armed_before: bool
+    struck: bool = True
+    stopped_s: float | None = None
+    counters: tuple[str, ...] = ()
+    told: tuple[str, ...] = ()
+
+
+@dataclass
+class Outcome:
+    """What one run showed."""
+
+    simulated_s: float = 0.0
+    moving_s: float = 0.0
+    commands_seen: int = 0
+    commands_accepted: int = 0
+    faults: list[FaultOutcome] = field(default_factory=list)
+    violations: list[str] = field(default_factory=list)
+
+
+@dataclass
+class _Open:
+    outcome: FaultOutcome
+    counts: dict[str, int]
+    told: int
+    left_armed: bool = False
+
+
+class SimulatedRun:
+    """One robot and one daemon. `run` moves time on; `outcome` is what the monitors saw so far.
+
+    `cycle_us`: period of the robot's controller (1 ms on a board; 5 ms is what campaigns use, which makes its times
+    coarser by as much). `planner`: DISCO, or `CirclingPlanner` if None. Seeds decide plant, sessions and faults.
+    """
+
+    def __init__(
+        self,
+        schedule: FaultSchedule,
+        *,
+        seed: int = 0,
+        cycle_us: int = 1000,
+        planner: Planner | None = None,
+        plant: PlantParameters | None = None,
+    ) -> None:
+        setup = load_setup(ROBOT_FILE)
+        self.config = setup.config
+        self._setup = setup
+        self._planner = planner
+        self._chance = random.Random(seed)
+        self._cycle_us = cycle_us
+        self._period_us = round(1e6 / self.config.control.rate_hz)
+        self.can = SimulatedCan()
+        parameters = plant or PlantParameters(
+            encoder_start_left_ticks=WRAP_SOON_TICKS, encoder_start_right_ticks=WRAP_SOON_TICKS
+        )
+        task = self.config.task
+        start = Pose(task.center_x_m + task.radius_m, task.center_y_m, 0.5 * math.pi)
+        parameters = replace(parameters, wheel_radius_m=0.061, axial_distance_m=0.415, x_icr_m=0.238)
+        self.robot = VirtualRobot(
+            Plant(parameters, None, seed, start),
+            FirmwareConfig(ticks_per_rev=2048, max_wheel_speed_rad_s=8.0),
+            seed=seed,
+        )
+        self.log = LogReader()
+        self.monitor = WheelMonitor()
+        self.core: DaemonCore | None = None
+        self._attendant = Attendant()
+        self._loop = LoopStats()
+        self._player = FaultPlayer(schedule, self.robot, self.can, 0, processes=self)
+        self.now_us = 0
+        self._next_tick_us = 0
+        self._next_second_ns = 0
+        self._frozen = False
+        self._hogged = False
+        self._open: list[_Open] = []
+        self._closing: list[tuple[int, _Open]] = []
+        self._lost_since_us: int | None = None
+        self._thawed_us = 0
+        self.outcome = Outcome(violations=self.monitor.violations)
+        self._start_daemon()
+
+    def run(self, duration_s: float) -> Outcome:
+        """Let time pass."""
+        end_us = self.now_us + round(duration_s * 1e6)
+        can, robot, player, monitor, cycle_us = self.can, self.robot, self._player, self.monitor, self._cycle_us
+        wheels = (0.0, 0.0)
+        while self.now_us < end_us:
+            self.now_us += cycle_us
+            now_us = self.now_us
+            now_ns = now_us * 1000
+            received = can.advance(now_ns)
+            for frame in received:
+                robot.receive(frame.t_ns // 1000, frame.frame)
+            firmware = robot.firmware
+            can.send(robot.step(now_us, can.error_counters))
+            monitor.see(now_us, [r.frame for r in received], robot.outputs, wheels)
+            armed = robot.outputs.state == "ARMED"
+            begun, ended = player.step(now_ns)
+            if begun or ended:
+                self._mind_faults(begun, ended, armed)
+            if robot.firmware is not firmware:
+                monitor.restarted()
+            if now_us >= self._next_tick_us:
+                truth = robot.truth
+                wheels = (truth.left_speed_rad_s, truth.right_speed_rad_s)
+                self._loop.ticks += 1
+                self._tick_if_able(now_ns)
+                self._mind_estimate(truth)
+                self._mind_telemetry(now_us)
+                self._mind_outcomes(now_us)
+        self.outcome.simulated_s = self.now_us * 1e-6
+        self.outcome.commands_seen = monitor.commands_seen
+        self.outcome.commands_accepted = monitor.commands_accepted
+        return self.outcome
+
+    def begin(self, fault: Fault) -> None:
+        """Do to the daemon what befalls its process."""
+        name, process = fault.kind.name, fault.values.get("process")
+        if name == "cpu_hog":
+            self._hogged = True
+        elif process == "daemon" and name == "sigstop":
+            self._frozen = True
+        elif process == "daemon" and name == "sigkill":
+            self.core = None
+            self.can.host.close()
+        elif process == "robot" and name == "sigkill":
+            self.robot.reboot()
+
+    def end(self, fault: Fault) -> None:
+        """Let it go on, or start it again."""
+        name, process = fault.kind.name, fault.values.get("process")
+        if name == "cpu_hog":
+            self._hogged = False
+        elif process == "daemon" and name == "sigstop":
+            self._frozen = False
+            self._thawed_us = self.now_us + 2 * self._period_us
+        elif process == "daemon" and name == "sigkill":
+            self._start_daemon()
+
+    def _start_daemon(self) -> None:
+        setup, config = self._setup, self.config
+        planner = self._planner or CirclingPlanner(config, (0.061, 0.415, 0.238))
+        driver = ReferenceDriver(Codec(), draw_session=lambda: self._chance.getrandbits(16))
+        self.core = assemble_core(config, self.can.host, driver, make_pipeline(config, setup.model, planner), self.log)
+        self.can.host.open()
+        if self.now_us:
+            self.log.told.append((self.now_us * 1000, "the daemon was started"))
+
+    def _tick_if_able(self, now_ns: int) -> None:
+        self._next_tick_us += self._period_us
+        if self._hogged and self._chance.random() < 0.3:
+            # Late by up to three periods: the loop skips what it has missed.
+            self._next_tick_us += self._cycle_us * self._chance.randrange(1, 3 * self._period_us // self._cycle_us)
+            self._loop.skipped_periods += 1
+        core = self.core
+        if core is None:
+            return
+        if self._frozen:
+            self._loop.skipped_periods += 1
+            return
+        extra = ()
+        if now_ns >= self._next_second_ns:
+            self._next_second_ns = now_ns + 1_000_000_000
+            extra = (counters(core, self._loop, RecorderStats(), now_ns),)
+        core.tick(now_ns, self._attendant.requests(now_ns, core.last), extra)
+
+    def _mind_faults(self, begun: Sequence[Fault], ended: Sequence[Fault], armed: bool) -> None:
+        for fault in begun:
+            self._open.append(_Open(FaultOutcome(fault, armed), dict(self.log.counts), len(self.log.told)))
+        for fault in ended:
+            opened = next(o for o in self._open if o.outcome.fault is fault)
+            self._closing.append((self.now_us + round(SETTLED_S * 1e6), opened))
+
+    def _mind_estimate(self, truth) -> None:
+        """The robot may not go on for long with a wrong idea of where it is."""
+        lied_to = any(o.outcome.fault.kind.name in LIES for o in self._open)
+        moving = max(abs(truth.left_speed_rad_s), abs(truth.right_speed_rad_s)) > 0.05
+        self.outcome.moving_s += moving * self._period_us * 1e-6
+        last = None if self.core is None else self.core.last
+        lost = False
+        if moving and not lied_to and last is not None and last.output.motion_allowed and not self._frozen:
+            found = last.pipeline.estimate
+            lost = (
+                math.hypot(found.x_m - truth.x_m, found.y_m - truth.y_m) > LOST_M
+                or abs(math.remainder(found.yaw_rad - truth.yaw_rad, 2.0 * math.pi)) > LOST_RAD
+            )
+        if not lost:
+            self._lost_since_us = None
+        elif self._lost_since_us is None:
+            self._lost_since_us = self.now_us
+        elif self.now_us - self._lost_since_us > LOST_FOR_S * 1e6:
+            struck = ", ".join(str(o.outcome.fault) for o in self._open) or "no fault"
+            self.monitor.violations.append(f"{self.now_us * 1e-6:.2f} s: moving on a wrong estimate under {struck}")
+            self._lost_since_us = self.now_us + 10_000_000
+
+    def _mind_telemetry(self, now_us: int) -> None:
+        """A daemon that no longer hears of the wheels takes the motion away."""
+        core = self.core
+        blind = core is not None and core.newest_wheels is not None and not self._frozen and not self._hogged
+        if blind and core.last is not None and core.last.output.state is State.ARMED:
+            age_s = now_us * 1e-6 - core.newest_wheels.t_ns * 1e-9
+            blind = age_s > self.config.control.telemetry_disarm_s + 2.5e-6 * self._period_us
+            if blind and now_us > self._thawed_us:
+                self.monitor.violations.append(f"{now_us * 1e-6:.2f} s: armed on wheel samples {age_s:.2f} s old")
+                self._thawed_us = now_us + 10_000_000
+
+    def _mind_outcomes(self, now_us: int) -> None:
+        if not self._open:
+            return
+        outputs = self.robot.outputs
+        stands = outputs.left_setpoint_rad_s == outputs.right_setpoint_rad_s == 0.0
+        for opened in self._open:
+            opened.left_armed = opened.left_armed or outputs.state != "ARMED"
+            if opened.left_armed and stands and opened.outcome.stopped_s is None:
+                opened.outcome.stopped_s = (now_us - opened.outcome.fault.begin_ns // 1000) * 1e-6
+        while self._closing and self._closing[0][0] <= now_us:
+            opened = self._closing.pop(0)[1]
+            self._open.remove(opened)
+            self._finish(opened)
+
+    def _finish(self, opened: _Open) -> None:
+        outcome, log = opened.outcome, self.log
+        fault = outcome.fault
+        if fault.kind.room.value == "frames" or fault.kind.name == "one_way":
+            outcome.struck = self._player.frames.struck.get(fault.number, 0) > 0
+        elif fault.values.get("process", "daemon") not in ("daemon", "robot"):
+            outcome.struck = False
+        changed = {n for n, v in log.counts.items() if v != opened.counts.get(n, 0) and n not in _USUAL}
+        outcome.counters = tuple(sorted(changed))
+        outcome.told = tuple(text for _, text in log.told[opened.told :])
+        self.outcome.faults.append(outcome)

@@ -1,0 +1,198 @@
+"""Watches the wheels of a virtual robot and what reaches its controller; shares no code with what it watches.
+
+Its proofs are written from firmware_protocol/README.md: CRC-8H2F bit by bit, the layout of WHEEL_COMMAND, the rules for
+motion. `see` is called once per cycle of the controller.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass, field
+
+WHEEL_COMMAND = 0x100
+MAJOR = 1
+SPEED_MODE = 1
+MAY_TURN = ("ARMED", "STOPPING", "ESTOP")
+TINY = 1e-4
+ENOUGH_VIOLATIONS = 20
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What the robot was built with."""
+
+    max_speed_rad_s: float = 8.0
+    max_acceleration_rad_s2: float = 20.0
+    command_timeout_s: float = 0.1
+    drive_off_s: float = 0.5
+    # From 8 rad/s the plant's wheels, with a lag of 0.06 s, need this long to stand once zero is asked for.
+    settling_s: float = 0.6
+    still_rad_s: float = 0.05
+
+
+@dataclass(frozen=True)
+class Command:
+    """A WHEEL_COMMAND as this monitor reads it."""
+
+    counter: int
+    mode: int
+    speeds: tuple[float, float]
+    session: int
+
+
+@dataclass
+class WheelMonitor:
+    """Collects violations as sentences; an empty list is what must come out."""
+
+    limits: Limits = field(default_factory=Limits)
+    violations: list[str] = field(default_factory=list)
+    commands_seen: int = 0
+    commands_accepted: int = 0
+    commands_refused: int = 0
+    _last: object = None
+    _last_us: int = 0
+    _targets: tuple[tuple[float, float], ...] = ((0.0, 0.0),)
+    _accepted_us: int | None = None
+    _zero_since_us: int | None = None
+    _last_counter: int | None = None
+    _falling_bound: float | None = None
+    _ended_sessions: dict[int, int] = field(default_factory=dict)
+
+    def restarted(self) -> None:
+        """The controller was restarted: it has forgotten everything."""
+        self._last = None
+        self._accepted_us = None
+        self._last_counter = None
+        self._falling_bound = None
+
+    def see(self, now_us, frames, outputs, wheel_speeds) -> None:
+        """One cycle: the frames that reached the controller since the last one, its outputs after it, true speeds."""
+        before = self._last
+        if before is None:
+            self._last, self._last_us = outputs, now_us
+            self._zero_since_us = now_us
+            return
+        dt_s = (now_us - self._last_us) * 1e-6
+        good = [c for c in (read_command(f.can_id, f.data) for f in frames if f.can_id == WHEEL_COMMAND) if c]
+        self.commands_seen += sum(f.can_id == WHEEL_COMMAND for f in frames)
+        accepted = outputs.accepted_commands - before.accepted_commands
+        if accepted:
+            self._mind_accepted(now_us, accepted, good, before, outputs)
+        if good:
+            self._last_counter = good[-1].counter
+        setpoints = (outputs.left_setpoint_rad_s, outputs.right_setpoint_rad_s)
+        earlier = (before.left_setpoint_rad_s, before.right_setpoint_rad_s)
+        if before.state in ("READY", "ARMED") and outputs.state not in ("READY", "ARMED") and before.session:
+            self._ended_sessions[before.session] = now_us
+        if before.session != outputs.session and outputs.session:
+            self._ended_sessions.pop(outputs.session, None)
+        self._mind_limits(now_us, dt_s, setpoints, earlier, before, outputs)
+        self._mind_time(now_us, dt_s, setpoints, earlier, outputs)
+        self._mind_wheels(now_us, setpoints, wheel_speeds)
+        self._last, self._last_us = outputs, now_us
+
+    def _mind_accepted(self, now_us, accepted, good, before, outputs) -> None:
+        self.commands_accepted += accepted
+        fitting = [c for c in good if c.session in (before.session, outputs.session)]
+        if len(fitting) < accepted:
+            self._tell(now_us, f"{accepted} commands accepted, {len(fitting)} of those that came have a proof")
+            return
+        for command in fitting:
+            if command.session in self._ended_sessions:
+                self._tell(now_us, f"a command of the ended session {command.session} was accepted")
+            if command.counter == self._last_counter:
+                self._tell(now_us, "a repeated command was accepted")
+        states = (before.state, outputs.state)
+        if "ARMED" not in states and any(c.mode == SPEED_MODE and any(c.speeds) for c in fitting[-accepted:]):
+            self._tell(now_us, f"a command to move was accepted in {before.state}")
+        # Of more commands in a cycle than were accepted, any may have been the last that was.
+        self._targets = tuple(self._scaled(c) for c in (fitting if len(fitting) > accepted else fitting[-1:]))
+        self._accepted_us = now_us
+
+    def _scaled(self, command: Command) -> tuple[float, float]:
+        """What the command comes to within the limits."""
+        if command.mode != SPEED_MODE:
+            return (0.0, 0.0)
+        scale = min(1.0, self.limits.max_speed_rad_s / max(*map(abs, command.speeds), 1e-9))
+        return (command.speeds[0] * scale, command.speeds[1] * scale)
+
+    def _mind_limits(self, now_us, dt_s, setpoints, earlier, before, outputs) -> None:
+        limits = self.limits
+        for side, name in enumerate(("left", "right")):
+            value, last, targets = setpoints[side], earlier[side], [target[side] for target in self._targets]
+            if not abs(value) <= limits.max_speed_rad_s + TINY:
+                self._tell(now_us, f"{name} setpoint {value} rad/s is beyond {limits.max_speed_rad_s}")
+            if value == last:
+                continue
+            if not outputs.driver_enabled and value == 0.0:
+                continue
+            if not abs(value - last) <= limits.max_acceleration_rad_s2 * dt_s + TINY:
+                self._tell(now_us, f"{name} setpoint went from {last} to {value} rad/s in {dt_s} s")
+            # Towards the last command that had a proof, or towards standstill; never past, never elsewhere.
+            towards_target = min(last, *targets) - TINY <= value <= max(last, *targets) + TINY
+            towards_zero = min(last, 0.0) - TINY <= value <= max(last, 0.0) + TINY
+            armed = "ARMED" in (before.state, outputs.state)
+            if not (towards_zero or (armed and towards_target)):
+                self._tell(now_us, f"{name} setpoint {last} -> {value} rad/s in {outputs.state}; asked was {targets}")
+        if any(setpoints) and outputs.state not in MAY_TURN:
+            self._tell(now_us, f"setpoints {setpoints} in {outputs.state}")
+        if any(setpoints) and not outputs.driver_enabled:
+            self._tell(now_us, f"setpoints {setpoints} with the driver off")
+
+    def _mind_time(self, now_us, dt_s, setpoints, earlier, outputs) -> None:
+        limits = self.limits
+        age_s = float("inf") if self._accepted_us is None else (now_us - self._accepted_us) * 1e-6
+        if outputs.state == "ARMED" and age_s > limits.command_timeout_s + 2.0 * dt_s:
+            self._tell(now_us, f"ARMED {age_s:.3f} s after the last accepted command")
+        if outputs.driver_enabled and age_s > limits.drive_off_s + 2.0 * dt_s:
+            self._tell(now_us, f"the driver is on {age_s:.3f} s after the last accepted command")
+        fastest = max(map(abs, setpoints))
+        if outputs.state == "ARMED" or fastest == 0.0:
+            self._falling_bound = None
+        else:
+            bound = max(map(abs, earlier)) if self._falling_bound is None else self._falling_bound
+            # The wheels are slowed down together, so the faster one sets the pace; one cycle of grace.
+            if self._falling_bound is None:
+                bound += limits.max_acceleration_rad_s2 * dt_s
+            bound = max(0.0, bound - limits.max_acceleration_rad_s2 * dt_s)
+            if fastest > bound + 0.02 + limits.max_acceleration_rad_s2 * dt_s:
+                self._tell(now_us, f"setpoint {fastest} rad/s in {outputs.state} where {bound:.2f} is due")
+            self._falling_bound = bound
+
+    def _mind_wheels(self, now_us, setpoints, wheel_speeds) -> None:
+        if any(setpoints):
+            self._zero_since_us = None
+        elif self._zero_since_us is None:
+            self._zero_since_us = now_us
+        zero_s = 0.0 if self._zero_since_us is None else (now_us - self._zero_since_us) * 1e-6
+        fastest = max(map(abs, wheel_speeds))
+        if zero_s > self.limits.settling_s and fastest > self.limits.still_rad_s:
+            self._tell(now_us, f"the wheels turn at {fastest:.3f} rad/s {zero_s:.2f} s after zero was asked for")
+
+    def _tell(self, now_us: int, text: str) -> None:
+        if len(self.violations) < ENOUGH_VIOLATIONS:
+            self.violations.append(f"{now_us * 1e-6:.3f} s: {text}")
+
+
+def read_command(can_id: int, data: bytes) -> Command | None:
+    """Return the WHEEL_COMMAND in these bytes, or None if its length or its proof is wrong."""
+    if can_id != WHEEL_COMMAND or len(data) != 8:
+        return None
+    if crc8h2f(data[1:] + struct.pack("<H", can_id ^ (MAJOR << 11))) != data[0]:
+        return None
+    left, right = struct.unpack_from("<hh", data, 2)
+    return Command(data[1] & 0x0F, data[1] >> 4, (left * SPEED_LSB, right * SPEED_LSB), data[7])
+
+
+SPEED_LSB = 0.002
+
+
+def crc8h2f(data: bytes) -> int:
+    """CRC-8H2F (AUTOSAR): polynomial 0x2F, initial value and final xor 0xFF; 0xDF over b"123456789"."""
+    crc = 0xFF
+    for byte in data:
+        crc ^= byte
+        for _ in range(8):
+            crc = (crc << 1) ^ 0x2F if crc & 0x80 else crc << 1
+            crc &= 0xFF
+    return crc ^ 0xFF
