@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,7 +14,7 @@ from disco_hw.adapt.noise import RunningNoise
 from disco_hw.adapt.recursive import Judged, RecursiveGeometry
 from disco_hw.adapt.samples import SampleWindow
 from disco_hw.inference.excitation import UnusableDriveError
-from disco_hw.inference.infer import noise_of
+from disco_hw.inference.noise import measured_noise
 
 Array = NDArray[np.float64]
 
@@ -101,7 +103,7 @@ class Adapter:
             return
         if float(drive.moving_s.sum()) > _SETTLED_S * _LEAST_MOVING:
             self._noise_s = now_s
-            self._noise.add(noise_of(drive))
+            self._noise.add(measured_noise(drive, judged.mean))
 
     def _judge_in_force(self, seen: Evidence) -> None:
         """Score the newest driving under the belief in force and under the model file's; what is older counts less."""
@@ -115,7 +117,7 @@ class Adapter:
             return
         information, score = seen.information[new].sum(axis=0), seen.score[new].sum(axis=0)
         gain = _log_evidence(self._in_force, information, score) - _log_evidence(self._model, information, score)
-        self._advantage = self._advantage * np.exp(-moving_s / _JUDGED_S) + gain
+        self._advantage = self._advantage * math.exp(-moving_s / _JUDGED_S) + gain
         self._scored_s = newest_s
 
 

@@ -10,8 +10,14 @@ from numpy.typing import NDArray
 
 from disco_hw.adapt.coordinates import NAMES
 from disco_hw.adapt.messages import Proposal
+from disco_hw.model.parameter import BASE_PARAMETERS
 
 Array = NDArray[np.float64]
+
+
+_RANGES = {parameter.name: parameter for parameter in BASE_PARAMETERS}
+_PHYSICAL_LOW = np.array([_RANGES[name].low for name in NAMES])
+_PHYSICAL_HIGH = np.array([_RANGES[name].high for name in NAMES])
 
 
 class Outcome(Enum):
@@ -65,7 +71,7 @@ class Verdict:
 class BeliefGuard:
     """Judges proposals one after the other against the belief in force.
 
-    `low`, `high` (3,) bound what is possible (physical range and prior). A belief that is refused leaves everything as
+    `low`, `high` (3,) bound the mean: the prior. A belief that is refused leaves everything as
     it was. Nothing here raises on what a proposal holds.
     """
 
@@ -121,13 +127,14 @@ class BeliefGuard:
             return proposal.doubt
         if not abs(now_ns - proposal.t_ns) <= self._settings.stale_s * 1e9:
             return f"rests on driving {(now_ns - proposal.t_ns) * 1e-9:.0f} s ago"
-        outside = (mean - 2.0 * scale < self._low) | (mean + 2.0 * scale > self._high)
+        outside = (mean < self._low) | (mean > self._high)
         if outside.any():
             worst = int(np.argmax(outside))
-            return (
-                f"{NAMES[worst]} {mean[worst]:.4g} +- {scale[worst]:.2g} reaches outside "
-                f"[{self._low[worst]:g}, {self._high[worst]:g}]"
-            )
+            return f"{NAMES[worst]} {mean[worst]:.4g} is outside [{self._low[worst]:g}, {self._high[worst]:g}]"
+        impossible = (mean - 2.0 * scale < _PHYSICAL_LOW) | (mean + 2.0 * scale > _PHYSICAL_HIGH)
+        if impossible.any():
+            worst = int(np.argmax(impossible))
+            return f"{NAMES[worst]} {mean[worst]:.4g} +- {scale[worst]:.2g} reaches what is physically impossible"
         return ""
 
     def _jump(self, now_ns: int, t_ns: int, new: Geometry, worst: int) -> Verdict:

@@ -10,7 +10,9 @@ from disco_hw.daemon.control_client import send_request
 from disco_hw.daemon.control_socket import default_socket_path
 from disco_hw.errors import InputError
 
-ACTIONS = ("arm", "start", "stop", "disarm", "estop", "reset", "status", "quit")
+ADAPT_ACTIONS = ("revert", "adapt")
+"""Back to the belief of the model file, and learning again."""
+ACTIONS = ("arm", "start", "stop", "disarm", "estop", "reset", "status", "quit", *ADAPT_ACTIONS)
 PAGE_ACTIONS = ("task", "drive")
 """What takes arguments: another circle, and a hand on the page's pad."""
 SERVED = (*ACTIONS, *PAGE_ACTIONS)
@@ -46,6 +48,17 @@ def in_words(reply: dict[str, Any]) -> str:
         f"loop lateness p99 {loop['lateness_us']['p99']:.0f} us, max {loop['lateness_us']['max']:.0f} us, "
         f"overruns {loop['overruns']}, skipped {loop['skipped']}",
     ]
+    adaptation = reply.get("adaptation")
+    if adaptation is not None:
+        paused = ", paused" if adaptation["paused"] else ""
+        lines.append(
+            f"belief of the {'running drive' if adaptation['belief'] == 'adapted' else 'model file'}{paused}: "
+            + ", ".join(
+                f"{name.removesuffix('_m')} {value:.4f} +- {adaptation['std'][name]:.4f} m"
+                for name, value in adaptation["mean"].items()
+            )
+        )
+        lines.append(f"adaptation: {adaptation['text']}")
     if reply["recorder"]["last_error"]:
         lines.append(f"recording: {reply['recorder']['last_error']}")
     return "\n".join(lines)

@@ -10,9 +10,11 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from disco_hw.adapt.adaptable import check_adaptable
+from disco_hw.adapt.link import ProcessLink
 from disco_hw.daemon import realtime, records_of_tick
-from disco_hw.daemon.assembly import assemble_core, make_driver, make_pipeline, make_planner
-from disco_hw.daemon.client import PAGE_ACTIONS, SERVED, socket_path
+from disco_hw.daemon.assembly import assemble_core, make_adaptation, make_driver, make_pipeline, make_planner
+from disco_hw.daemon.client import ADAPT_ACTIONS, PAGE_ACTIONS, SERVED, socket_path
 from disco_hw.daemon.clock import Clock, MonotonicClock
 from disco_hw.daemon.control_socket import ControlMessage, ControlServer
 from disco_hw.daemon.core import DaemonCore
@@ -57,6 +59,7 @@ class DaemonOptions:
     log_file: Path | None = None
     as_json: bool = False
     accept_missing_effects: bool = False
+    adapt: bool = False
 
 
 def run_daemon(options: DaemonOptions) -> int:
@@ -69,21 +72,30 @@ def run_daemon(options: DaemonOptions) -> int:
     setup = load_setup(options.robot, options.model, options.link)
     if not options.accept_missing_effects:
         refuse_missing_effects(setup)
-    return serve(setup, options.log_file, say, TaskPilot(), lambda: make_planner(setup.config, setup.model))
+    if options.adapt:
+        check_adaptable(setup.model, setup.config.control.uncertainty)
+    return serve(
+        setup, options.log_file, say, TaskPilot(), lambda: make_planner(setup.config, setup.model), options.adapt
+    )
 
 
 def serve(
-    setup: Setup, log_file: Path | None, say: Say, pilot: Pilot, new_planner: Callable[[], Planner] = NoPlanner
+    setup: Setup,
+    log_file: Path | None,
+    say: Say,
+    pilot: Pilot,
+    new_planner: Callable[[], Planner] = NoPlanner,
+    adapt: bool = False,
 ) -> int:
     """Run until SIGTERM, SIGINT, a quit request or the pilot's end, as `run_daemon`; returns the exit code.
 
     `pilot` decides what the robot does while motion is allowed; `new_planner` is called twice, as one planner is used
-    up in the warm-up. Raises InputError.
+    up in the warm-up. `adapt`: learn the geometry on the way, in a process of its own. Raises InputError.
     """
     stop = StopPath()
     with StopSignals() as signals:
         try:
-            return _start(setup, log_file, signals, stop, say, pilot, new_planner).run()
+            return _start(setup, log_file, signals, stop, say, pilot, new_planner, adapt).run()
         finally:
             # Whatever is interrupted here, the wheels come first: they were added last.
             for outcome in stop.run():
@@ -99,6 +111,7 @@ def _start(
     say: Say,
     pilot: Pilot,
     new_planner: Callable[[], Planner],
+    adapt: bool,
 ) -> Daemon:
     """Make everything, in the order that real time needs, and add to the stop path what must be undone."""
     config, link = setup.config, setup.config.link
@@ -113,6 +126,9 @@ def _start(
     stop.add("page feed", feed.close)
     recorder = WatchedRecorder(_make_recorder(setup, log_file), feed)
     stop.add("recorder", lambda: _close_recorder(recorder, say))
+    adaptation = make_adaptation(setup, pipeline, ProcessLink()) if adapt else None
+    if adaptation is not None:
+        stop.add("adapter", adaptation.close)
     for step in realtime.enter(config.daemon.realtime_priority):
         say("real time", str(step))
     transport = open_transport(
@@ -124,7 +140,7 @@ def _start(
         baud=link.baud,
     )
     stop.add("link", transport.close)
-    core = assemble_core(config, transport, make_driver(key), pipeline, recorder, pilot.needs_pose)
+    core = assemble_core(config, transport, make_driver(key), pipeline, recorder, pilot.needs_pose, adaptation)
     daemon = Daemon(core, server, recorder, MonotonicClock(), signals, say, pilot)
     stop.add("wheels", daemon.stop_wheels)
     if config.daemon.realtime_priority:
@@ -248,6 +264,7 @@ class Daemon:
         if state is not State.ARMED and now_ns >= self._next_collect_ns:
             # The collector is off; what cycles there are go while nobody depends on the loop.
             gc.collect()
+            self._core.adaptation.tend()
             self._next_collect_ns = now_ns + _COLLECT_NS
 
     def _timing(self, now_ns: int) -> records.Record:
@@ -321,6 +338,9 @@ class Daemon:
                 reply = remaining.pop(0)
                 body: dict[str, Any] = {"ok": reply.accepted}
                 body["text" if reply.accepted else "error"] = reply.text
+            elif message.action in ADAPT_ACTIONS:
+                obeyed, text = self._core.adaptation.ask(message.action)
+                body = {"ok": obeyed, "text" if obeyed else "error": text}
             elif message.action == "quit":
                 self._quit = True
                 body = {"ok": True, "text": "stopping the robot and ending"}

@@ -67,6 +67,7 @@ def status(core: DaemonCore, loop: dict[str, Any], recorder: RecorderStats) -> d
         "driver": asdict(core.driver.stats),
         "fusion": asdict(core.pipeline.fusion.stats),
         "recorder": asdict(recorder),
+        "adaptation": core.adaptation.status(),
     }
 
 
@@ -83,4 +84,5 @@ def counters(core: DaemonCore, loop: LoopStats, recorder: RecorderStats, now_ns:
         fusion=asdict(core.pipeline.fusion.stats),
         recorder={name: value for name, value in asdict(recorder).items() if type(value) is int},
         loop={"ticks": loop.ticks, "overruns": loop.overruns, "skipped": loop.skipped_periods},
+        adaptation=core.adaptation.counts(),
     )

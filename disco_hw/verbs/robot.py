@@ -35,6 +35,7 @@ def run(
     log_file: LogFileOption = None,
     view: View = False,
     port: PagePort = DEFAULT_PORT,
+    adapt: Annotated[bool, typer.Option("--adapt", help="Learn the geometry on the way (docs/adapt.md).")] = False,
     accept_missing_effects: Annotated[
         bool, typer.Option("--accept-missing-effects", help="Use a model that is marked as lacking an effect.")
     ] = False,
@@ -48,7 +49,7 @@ def run(
     from disco_hw.daemon.daemon import DaemonOptions, run_daemon
 
     with _page(view, robot, model, port):
-        code = run_daemon(DaemonOptions(robot, model, link, log_file, as_json, accept_missing_effects))
+        code = run_daemon(DaemonOptions(robot, model, link, log_file, as_json, accept_missing_effects, adapt))
     raise typer.Exit(code)
 
 
@@ -100,7 +101,7 @@ def drive(
 
 def ctl(
     robot: RobotFile,
-    do: Annotated[str, typer.Argument(help="arm, start, stop, disarm, reset, estop, status or quit.")],
+    do: Annotated[str, typer.Argument(help="arm, start, stop, disarm, reset, estop, status, revert, adapt or quit.")],
     as_json: AsJson = False,
 ) -> None:
     """Tell the running daemon what to do, or ask how it is."""
