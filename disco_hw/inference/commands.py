@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -14,21 +15,32 @@ from disco_hw.config import load_robot_config
 from disco_hw.errors import WorkError
 from disco_hw.inference.calibration import LEVELS
 from disco_hw.inference.checks import CHECKS
+from disco_hw.inference.dask_workers import dask_workers
+from disco_hw.inference.excitation import excitation
+from disco_hw.inference.gap_check import GapCheck, gap_check_beside
 from disco_hw.inference.infer import Inference, InferOptions, infer
+from disco_hw.inference.progress import Tell
 from disco_hw.inference.report import report_html
 from disco_hw.inference.simulate import NAMES
+from disco_hw.inference.workers import LocalWorkers, Workers
+from disco_hw.log.drive import DriveLog
 from disco_hw.log.load import load_drive
 from disco_hw.model import Model
 from disco_hw.model.file import model_text
+
+Search = Callable[[DriveLog, Model], AbstractContextManager[Callable[[], GapCheck]]]
 
 _SHOWN = ("wheel_radius_m", "axial_distance_m", "x_icr_m")
 
 
 @dataclass(frozen=True)
 class InferResult:
-    """The outcome for the user."""
+    """The outcome for the user; `model_path` is None if no model was asked for."""
 
     inference: Inference
+    gap: GapCheck
+    logs: tuple[Path, ...]
+    robot: Path
     model_path: Path | None
     seconds: float
 
@@ -38,6 +50,8 @@ class InferResult:
             "posterior": posterior_figures(self.inference),
             "undetermined": list(self.inference.undetermined),
             "outside_simulated": self.inference.predictive.outside_simulated,
+            "missing_effects": list(self.gap.missing),
+            "gap_not_judged": self.gap.not_judged,
             "disagreements": [
                 {"check": check.name, "deviation": deviation, "effects": list(check.effects)}
                 for check, deviation in self.inference.predictive.disagreements
@@ -54,11 +68,29 @@ class InferResult:
             low, high = figures["ci90"]
             lines.append(f"{name:<18} {figures['mean']:.4f}   90 % between {low:.4f} and {high:.4f}")
         lines += [f"undetermined: {sentence}" for sentence in self.inference.undetermined]
-        lines += warnings(self.inference)
+        lines += self.warnings()
         lines += [f"note: {note}" for note in self.inference.drive.notes]
         if self.model_path is not None:
-            lines.append(f"{self.model_path}: written in {self.seconds:.1f} s")
+            marked = "; `disco-hw run` refuses it without --accept-missing-effects" if self.gap.missing else ""
+            lines.append(f"{self.model_path}: written in {self.seconds:.1f} s{marked}")
         return "\n".join(lines)
+
+    def warnings(self) -> list[str]:
+        """Sentences for whoever would trust the posterior too early, the next step last."""
+        lines = _disagreements(self.inference)
+        if self.gap.missing:
+            lines.append(
+                f"warning: the robot shows {', '.join(self.gap.missing)}, which the model lacks; fitted alone, the "
+                "parameters absorb it"
+            )
+        if self.gap.not_judged is not None:
+            lines.append(f"warning: whether an effect is missing was not judged: {self.gap.not_judged}")
+        elif self.gap.missing or self.inference.predictive.outside_simulated:
+            logs = " ".join(map(str, self.logs))
+            lines.append(
+                f"next: disco-hw gap {logs} --robot {self.robot} -o gap    (its gap/model.toml has what is missing)"
+            )
+        return lines
 
 
 def diagnostics(inference: Inference) -> dict[str, Any]:
@@ -80,8 +112,7 @@ def diagnostics(inference: Inference) -> dict[str, Any]:
     }
 
 
-def warnings(inference: Inference) -> list[str]:
-    """Sentences for whoever would trust the posterior too early."""
+def _disagreements(inference: Inference) -> list[str]:
     check = inference.predictive
     lines = [
         f"warning: {one.name}: {one.meaning}, {abs(deviation):.0f} standard deviations from every simulation "
@@ -94,8 +125,7 @@ def warnings(inference: Inference) -> list[str]:
     ]
     if check.outside_simulated:
         lines.append(
-            "warning: the log lies outside what was simulated, so the parameters may have absorbed what the "
-            "model lacks; run `disco-hw gap` on it next"
+            "warning: the log lies outside what was simulated, so the parameters may have absorbed what the model lacks"
         )
     return lines
 
@@ -113,26 +143,43 @@ def posterior_figures(inference: Inference) -> dict[str, dict[str, Any]]:
 def infer_command(
     logs: Sequence[Path],
     robot: Path,
-    out: Path | None,
-    paper: bool = False,
-    simulations: int | None = None,
-    seed: int = 1,
+    out: Path | None = None,
     report: Path | None = None,
-    say: Callable[[str], None] = lambda _: None,
+    options: InferOptions | None = None,
+    dask: str | None = None,
+    tell: Tell = lambda *_: None,
+    search: Search = gap_check_beside,
 ) -> InferResult:
     """Infer the geometry from logs; write the model to `out` and, if asked for, a page with pictures to `report`.
 
-    Raises InputError for what the user can mend and WorkError for files that cannot be written.
+    `dask` is the address of a cluster to work on. `search` looks for effects that the nominal model lacks, while the
+    inference runs; the model is marked with what it finds. Raises InputError for what the user can mend and WorkError
+    for files that cannot be written and a cluster that is lost.
     """
     began = perf_counter()
     config = load_robot_config(robot)
     drive = load_drive(list(logs), config.robot.ticks_per_rev, config.robot.wheel_radius_m)
-    result = infer(drive, config, InferOptions(paper, simulations, seed), say)
+    nominal = Model.nominal(config.robot)
+    excitation(drive)
+    with search(drive, nominal) as searched, _workers(dask) as workers:
+        inference = infer(drive, config, options, tell, workers)
+        tell("search for missing effects", 1.0)
+        found = searched()
+    result = InferResult(inference, found, tuple(logs), robot, out, perf_counter() - began)
     if out is not None:
-        _write(out, model_text(result.model(Model.nominal(config.robot))))
+        _write(out, model_text(replace(inference.model(nominal), missing_effects=found.missing)))
     if report is not None:
-        _write(report, report_html(result, posterior_figures(result), warnings(result)))
-    return InferResult(result, out, perf_counter() - began)
+        _write(report, report_html(inference, posterior_figures(inference), result.warnings()))
+    return result
+
+
+@contextmanager
+def _workers(dask: str | None) -> Iterator[Workers]:
+    if dask is None:
+        yield LocalWorkers()
+        return
+    with dask_workers(dask) as workers:
+        yield workers
 
 
 def _write(path: Path, text: str) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from time import perf_counter
 
@@ -19,10 +18,12 @@ from disco_hw.inference.mixture_belief import belief_of
 from disco_hw.inference.noise import USUAL, Noise, measured_noise
 from disco_hw.inference.paper_statistics import paper_statistics
 from disco_hw.inference.predictive import Predictive, predictive
+from disco_hw.inference.progress import Tally, Tell
 from disco_hw.inference.region import Region
 from disco_hw.inference.rounds import Fitted, RoundSettings, run_rounds
 from disco_hw.inference.simulate import NAMES, Seeds, Simulator, Summary, physical_range
 from disco_hw.inference.undetermined import undetermined
+from disco_hw.inference.workers import Workers
 from disco_hw.log.drive import DriveLog
 from disco_hw.model import Mixture, Model
 
@@ -84,10 +85,15 @@ class Inference:
 
 
 def infer(
-    log: DriveLog, robot: RobotConfig, options: InferOptions | None = None, say: Callable[[str], None] = lambda _: None
+    log: DriveLog,
+    robot: RobotConfig,
+    options: InferOptions | None = None,
+    tell: Tell = lambda *_: None,
+    workers: Workers | None = None,
 ) -> Inference:
     """Infer x_icr, wheel radius and axial distance from a drive; pure for a given seed, but for the time it takes.
 
+    `workers` run simulations and fits, by default on all cores; the result is the same. `tell` hears how far it is.
     Raises InputError for a drive or options from which nothing can be inferred.
     """
     began = perf_counter()
@@ -101,12 +107,13 @@ def infer(
     summary: Summary = paper_statistics(drive) if options.paper else estimates(drive, noise)
     simulator = Simulator(Model.nominal(robot.robot), drive, noise)
     observed = summary(drive.pose[None])[0]
+    tally = Tally(simulations + PREDICTIVE_SIMULATIONS + CALIBRATION_SIMULATIONS, tell)
 
     def simulate(theta: Array, seeds: Seeds) -> Array:
-        return simulator.summaries(theta, seeds, summary)
+        return simulator.summaries(theta, seeds, summary, workers, tally.add)
 
     settings = PAPER_ROUNDS if options.paper else DEFAULT_ROUNDS
-    fitted = run_rounds(simulate, observed, prior, simulations, settings, options.seed, say)
+    fitted = run_rounds(simulate, observed, prior, simulations, settings, options.seed, tally.stage, workers)
     rng = np.random.default_rng([options.seed, 1])
     draws, outside = fitted.draw(observed[None], POSTERIOR_DRAWS, rng)
     mixtures = fitted.network.mixtures(observed[None])
@@ -114,10 +121,12 @@ def infer(
         belief = belief_of(mixtures, fitted.region, prior.low, prior.high, NAMES, rng)
     except ValueError:
         raise _outside_prior(estimates(drive, noise).theta(drive.pose[None])[0], prior) from None
-    say("posterior predictive check")
+    tally.stage("posterior predictive check")
     few = draws[0, :PREDICTIVE_SIMULATIONS]
-    check = predictive(drive, noise, simulator, few, prior.low, prior.high, options.seed + 2)
-    say("calibration")
+    check = predictive(
+        drive, noise, simulator, few, prior.low, prior.high, options.seed + 2, workers=workers, done=tally.add
+    )
+    tally.stage("calibration")
     calibration = calibrate(fitted, simulate, CALIBRATION_SIMULATIONS, options.seed + 3)
     return Inference(
         drive,

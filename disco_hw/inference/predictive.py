@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.inference.checks import CHECKS, Check, Scores
-from disco_hw.inference.estimates import Estimates, estimates
+from disco_hw.inference.estimates import estimates
 from disco_hw.inference.excitation import Excitation
 from disco_hw.inference.noise import Noise
 from disco_hw.inference.simulate import NAMES, Simulator, draw_seeds
+from disco_hw.inference.workers import Workers
 
 Array = NDArray[np.float64]
 
@@ -47,12 +49,28 @@ class Predictive:
 
 
 def predictive(
-    drive: Excitation, noise: Noise, simulator: Simulator, draws: Array, low: Array, high: Array, seed: int
+    drive: Excitation,
+    noise: Noise,
+    simulator: Simulator,
+    draws: Array,
+    low: Array,
+    high: Array,
+    seed: int,
+    workers: Workers | None = None,
+    done: Callable[[int], None] = lambda _: None,
 ) -> Predictive:
-    """Compare a log with simulations at posterior `draws` (n, 3), one each; `low`, `high` (3,) bound the prior."""
+    """Compare a log with simulations at posterior `draws` (n, 3), one each; `low`, `high` (3,) bound the prior.
+
+    `workers` and `done` as for `Simulator.summaries`.
+    """
     weights = estimates(drive, noise)
     scores = Scores(drive, weights)
-    simulated, fits = _simulated(simulator, draws, seed, scores, weights)
+    seeds = draw_seeds(draws.shape[0], np.random.default_rng(seed))
+
+    def both(poses: Array) -> Array:
+        return np.column_stack([np.array([scores(one) for one in poses]), weights.raw(poses)])
+
+    simulated, fits = np.split(simulator.summaries(draws, seeds, both, workers, done), [len(CHECKS)], axis=1)
     deviations = _deviations(scores(drive.pose), simulated)
     fit_deviations = _deviations(weights.raw(drive.pose[None])[0], fits)
     return Predictive(deviations, fit_deviations, edge_parameters(draws, low, high, weights.theta(drive.pose[None])[0]))
@@ -70,18 +88,6 @@ def edge_parameters(draws: Array, low: Array, high: Array, estimate: Array) -> t
     pressed |= np.minimum(estimate - low, high - estimate) < -_OUTSIDE_SHARE * span
     pressed &= sd < _EDGE_WIDTH * span
     return tuple(name for name, flag in zip(NAMES, pressed.tolist(), strict=True) if flag)
-
-
-def _simulated(
-    simulator: Simulator, draws: Array, seed: int, scores: Scores, weights: Estimates
-) -> tuple[Array, Array]:
-    seeds = draw_seeds(draws.shape[0], np.random.default_rng(seed))
-
-    def both(poses: Array) -> Array:
-        return np.column_stack([np.array([scores(one) for one in poses]), weights.raw(poses)])
-
-    values = simulator.summaries(draws, seeds, both)
-    return values[:, : len(CHECKS)], values[:, len(CHECKS) :]
 
 
 def _deviations(observed: Array, simulated: Array) -> Array:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from disco_hw.inference.density_network import DensityNetwork, Mixtures, NetworkSettings, train
 from disco_hw.inference.region import Region
 from disco_hw.inference.simulate import Seeds, draw_seeds
+from disco_hw.inference.workers import LocalWorkers, Workers
 
 Array = NDArray[np.float64]
 Simulate = Callable[[Array, Seeds], Array]
@@ -88,8 +89,13 @@ def run_rounds(
     settings: RoundSettings,
     seed: int,
     say: Say = lambda _: None,
+    workers: Workers | None = None,
 ) -> Fitted:
-    """Infer from observed statistics (S,); `simulate` gives statistics (n, S) of points (n, P) and seeds (n,)."""
+    """Infer from observed statistics (S,); `simulate` gives statistics (n, S) of points (n, P) and seeds (n,).
+
+    The networks are trained by `workers`, by default here.
+    """
+    workers = workers or LocalWorkers()
     rng = np.random.default_rng(seed)
     region = prior
     theta, statistics = np.empty((0, prior.centre.size)), np.empty((0, observed.size))
@@ -104,7 +110,8 @@ def run_rounds(
         # Draws of earlier rounds that fall inside were uniform there too.
         used = region.contains(theta)
         size = settings.network if number == len(settings.shares) else settings.scout
-        network = train(statistics[used], region.unit(theta[used]), size, int(rng.integers(2**31)))
+        targets = region.unit(theta[used])
+        network = workers.call(train, statistics[used], targets, size, int(rng.integers(2**31)))
         fitted = Fitted(region, network, theta[used], statistics[used], theta.shape[0])
         if number < len(settings.shares):
             draws, _ = fitted.draw(observed[None], _DRAWS, rng)

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,6 +13,7 @@ from numpy.typing import NDArray
 from disco_hw.inference.compiled import parallel_kernel
 from disco_hw.inference.excitation import Excitation
 from disco_hw.inference.noise import Noise
+from disco_hw.inference.workers import LocalWorkers, Workers
 from disco_hw.model.model import Model, coefficient_tables
 from disco_hw.model.parameter import BASE_PARAMETERS
 from disco_hw.model.step import axle_of, integration_from, integration_series, step, tracked_of
@@ -119,19 +118,26 @@ class Simulator:
         return out
 
     def summaries(
-        self, theta: Array, seeds: Seeds, summary: Summary, done: Callable[[int], None] | None = None
+        self,
+        theta: Array,
+        seeds: Seeds,
+        summary: Summary,
+        workers: Workers | None = None,
+        done: Callable[[int], None] = lambda _: None,
     ) -> Array:
-        """Summary statistics (n, S) of n simulations, on all cores this process may use; `done` hears of each chunk."""
+        """Summary statistics (n, S) of n simulations, by default on all cores; `done` hears of each chunk, in order."""
+        chunks = [slice(first, first + _CHUNK) for first in range(0, theta.shape[0], _CHUNK)]
+        items = [(theta[chunk], seeds[chunk]) for chunk in chunks]
+        found = []
+        for part in (workers or LocalWorkers()).map(_summarised, (self, summary), items):
+            found.append(part)
+            done(part.shape[0])
+        return np.concatenate(found)
 
-        def chunk(first: int) -> Array:
-            part = slice(first, first + _CHUNK)
-            result = summary(self.poses(theta[part], seeds[part]))
-            if done is not None:
-                done(result.shape[0])
-            return result
 
-        with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
-            return np.concatenate(list(pool.map(chunk, range(0, theta.shape[0], _CHUNK))))
+def _summarised(shared: tuple[Simulator, Summary], item: tuple[Array, Seeds]) -> Array:
+    simulator, summary = shared
+    return summary(simulator.poses(*item))
 
 
 def physical_range() -> tuple[Array, Array]:

@@ -13,6 +13,7 @@ from disco_hw.verbs.options import (
     ModelOption,
     RobotOption,
     print_result,
+    progress_bar,
     progress_line,
 )
 
@@ -25,12 +26,21 @@ def infer(
     simulations: Annotated[int | None, typer.Option(min=200, help="Simulations in all.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of simulations and networks.")] = 1,
     report: Annotated[Path | None, typer.Option(help="Write diagnostics with pictures to this HTML file.")] = None,
+    dask: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="Simulate and fit on the Dask cluster of this scheduler.")
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Infer the robot's parameters from logs of driving (BayesSim) and write a model with its posterior."""
-    from disco_hw.inference.commands import infer_command
+    from disco_hw.daemon.realtime import limit_thread_pools
 
-    result = infer_command(logs, robot, out, paper, simulations, seed, report, progress_line)
+    # Before the numeric libraries are loaded: on small matrices their pools of threads cost more than the work.
+    limit_thread_pools()
+    from disco_hw.inference.commands import infer_command
+    from disco_hw.inference.infer import InferOptions
+
+    with progress_bar() as tell:
+        result = infer_command(logs, robot, out, report, InferOptions(paper, simulations, seed), dask, tell)
     print_result(result.as_dict(), as_json, result.as_text())
 
 
@@ -42,6 +52,9 @@ def gap(
     as_json: AsJson = False,
 ) -> None:
     """Find where simulation and logs disagree, name the missing effect, write the amended model, show the shrink."""
+    from disco_hw.daemon.realtime import limit_thread_pools
+
+    limit_thread_pools()
     from disco_hw.gap.commands import gap as find_gap
 
     result = find_gap(logs, robot, out, model, progress_line)

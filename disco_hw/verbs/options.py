@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
 RobotFile = Annotated[Path, typer.Argument(metavar="ROBOT.toml", help="The robot's configuration (docs/robot.md).")]
 RobotOption = Annotated[Path, typer.Option("--robot", help="The robot's configuration (docs/robot.md).")]
@@ -22,6 +26,25 @@ View = Annotated[bool, typer.Option("--view", help="Serve the page beside it, fo
 def progress_line(text: str) -> None:
     """Write one line of progress to standard error, which leaves standard output to the result."""
     print(text, file=sys.stderr, flush=True)
+
+
+@contextmanager
+def progress_bar() -> Iterator[Callable[[str, float], None]]:
+    """Show how far a work is on standard error, stage and share in [0, 1]: a bar in a terminal, else a line a stage."""
+    console = Console(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        work = bar.add_task("", total=1.0)
+        told = ""
+
+        def tell(stage: str, share: float) -> None:
+            nonlocal told
+            bar.update(work, description=stage, completed=share)
+            if stage != told and not console.is_terminal:
+                progress_line(stage)
+            told = stage
+
+        yield tell
 
 
 def print_result(result: dict[str, Any], as_json: bool, text: str) -> None:

@@ -1,9 +1,13 @@
 import json
+from contextlib import nullcontext
 
 import pytest
 
 from disco_hw.errors import InputError, WorkError
+from disco_hw.inference import commands
 from disco_hw.inference.commands import infer_command
+from disco_hw.inference.gap_check import GapCheck
+from disco_hw.inference.infer import InferOptions
 from disco_hw.model import load_model
 from tests.inference.drives import TICKS_PER_REV, TRUTH, write_log
 
@@ -15,6 +19,14 @@ axial_distance_m = 0.4
 ticks_per_rev = {TICKS_PER_REV}
 max_wheel_speed_rad_s = 8.0
 """
+
+
+FEW = InferOptions(simulations=300)
+
+
+def finds(*missing, not_judged=None):
+    """A search for missing effects that finds these."""
+    return lambda log, model: nullcontext(lambda: GapCheck(missing, not_judged))
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +42,12 @@ def inferred(robot):
     log = write_log(folder / "circle.csv")
     said = []
     result = infer_command(
-        [log], robot, folder / "model.toml", simulations=600, seed=2, report=folder / "report.html", say=said.append
+        [log],
+        robot,
+        folder / "model.toml",
+        folder / "report.html",
+        InferOptions(simulations=600, seed=2),
+        tell=lambda stage, share: said.append((stage, share)),
     )
     return folder, result, said
 
@@ -45,6 +62,8 @@ def test_the_json_has_the_promised_shape(inferred):
     assert found["outside_simulated"] is False
     assert any("steady circle" in sentence for sentence in found["undetermined"])
     assert found["seconds"] > 0.0
+    assert found["missing_effects"] == []
+    assert found["gap_not_judged"] is None
     assert 600 <= found["diagnostics"]["simulations"] < 640
     assert set(found["diagnostics"]["sbc_p"]) == set(TRUTH)
 
@@ -55,6 +74,7 @@ def test_the_model_file_loads_and_holds_the_posterior(inferred):
     assert set(model.belief.names) == set(TRUTH)
     assert model.belief.mean() == pytest.approx(result.inference.belief.mean())
     assert model.name == "test"
+    assert model.missing_effects == ()
 
 
 def test_the_report_is_whole_in_one_file(inferred):
@@ -70,20 +90,50 @@ def test_the_text_names_every_parameter_and_progress_is_told(inferred):
     text = result.as_text()
     assert all(name in text for name in TRUTH)
     assert "written in" in text
-    assert said[0].startswith("round 1 of 5")
+    assert "next: disco-hw gap" not in text
+    assert said[0] == ("round 1 of 5: 64 simulations", 0.0)
+    shares = [share for _, share in said]
+    assert shares == sorted(shares)
+    assert shares[-1] == 1.0
 
 
-def test_a_missing_effect_is_warned_of_with_the_next_step(robot, tmp_path):
-    log = write_log(tmp_path / "late.csv", "rich", 5, {"pose_latency": 0.1})
-    text = infer_command([log], robot, None, simulations=300).as_text()
+@pytest.fixture
+def known(inferred, monkeypatch):
+    """The inference is that of the circle, whatever the log."""
+    monkeypatch.setattr(commands, "infer", lambda *_: inferred[1].inference)
+
+
+def test_a_log_unlike_the_simulations_is_warned_of_with_the_next_step(robot, tmp_path):
+    log = write_log(tmp_path / "late.csv", "poor", 5, {"pose_latency": 0.2})
+    text = infer_command([log], robot, options=FEW, search=finds()).as_text()
     assert "pose_latency" in text
-    assert "run `disco-hw gap` on it next" in text
+    assert f"next: disco-hw gap {log} --robot {robot} -o gap" in text
+
+
+def test_a_model_that_lacks_a_found_effect_is_marked_and_says_so(known, robot, tmp_path):
+    log = write_log(tmp_path / "log.csv", "poor")
+    model, report = tmp_path / "model.toml", tmp_path / "report.html"
+    result = infer_command([log], robot, model, report, FEW, search=finds("motor_lag", "slope"))
+    assert load_model(model).missing_effects == ("motor_lag", "slope")
+    assert result.as_dict()["missing_effects"] == ["motor_lag", "slope"]
+    assert "the robot shows motor_lag, slope, which the model lacks" in report.read_text()
+    assert "`disco-hw run` refuses it without --accept-missing-effects" in result.as_text()
+    assert f"next: disco-hw gap {log}" in result.as_text()
+
+
+def test_a_log_that_the_search_cannot_judge_gives_a_model_with_a_warning(known, robot, tmp_path):
+    log = write_log(tmp_path / "log.csv", "poor")
+    search = finds(not_judged="too little to judge")
+    result = infer_command([log], robot, tmp_path / "model.toml", options=FEW, search=search)
+    assert load_model(tmp_path / "model.toml").missing_effects == ()
+    assert "was not judged: too little to judge" in result.as_text()
+    assert "next: disco-hw gap" not in result.as_text()
 
 
 def test_several_logs_count_together(robot, tmp_path, inferred):
     _, result, _ = inferred
     logs = [write_log(tmp_path / f"{seed}.csv", "poor", seed) for seed in (1, 2)]
-    together = infer_command(logs, robot, None, simulations=300).inference
+    together = infer_command(logs, robot, options=FEW, search=finds()).inference
     assert len(together.drive.run_pose) == 3
     assert together.drive.duration_s == pytest.approx(2 * 13.0, abs=4.0)
     assert result.inference.drive.run_pose.size == 2
@@ -107,8 +157,8 @@ def test_a_bad_log_gets_one_line_and_no_model(robot, tmp_path, text, message):
     assert not (tmp_path / "model.toml").exists()
 
 
-def test_a_model_that_cannot_be_written_is_an_error_of_the_work(robot, tmp_path):
+def test_a_model_that_cannot_be_written_is_an_error_of_the_work(known, robot, tmp_path):
     log = write_log(tmp_path / "log.csv", "poor")
     (tmp_path / "file").write_text("")
     with pytest.raises(WorkError, match="cannot be written"):
-        infer_command([log], robot, tmp_path / "file" / "model.toml", simulations=300)
+        infer_command([log], robot, tmp_path / "file" / "model.toml", options=FEW, search=finds())

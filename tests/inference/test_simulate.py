@@ -56,9 +56,8 @@ def test_noise_has_the_size_it_says():
 def test_progress_is_told_of_every_simulation():
     done = []
     sim = simulator()
-    sim.summaries(
-        np.repeat(THETA, 50, axis=0), draw_seeds(50, np.random.default_rng(1)), lambda p: p[:, 0], done.append
-    )
+    seeds = draw_seeds(50, np.random.default_rng(1))
+    sim.summaries(np.repeat(THETA, 50, axis=0), seeds, lambda p: p[:, 0], done=done.append)
     assert sum(done) == 50
 
 

@@ -1,0 +1,54 @@
+import os
+import time
+
+import pytest
+
+from disco_hw.errors import WorkError
+from disco_hw.inference import gap_check
+from disco_hw.inference.gap_check import gap_check_beside
+from disco_hw.model import Model
+from tests.inference.drives import logged, robot_config
+
+NOMINAL = Model.nominal(robot_config().robot)
+
+
+def test_an_effect_that_the_log_shows_is_named_by_a_process_beside():
+    with gap_check_beside(logged("poor", hidden=(("pose_latency", 0.15),)), NOMINAL) as searched:
+        assert searched().missing == ("pose_latency",)
+
+
+def test_a_log_that_cannot_be_searched_is_not_judged(monkeypatch):
+    nothing = logged("poor")
+    short = type(nothing)(
+        ("short",), *(cut(part) for part in (nothing.commands, nothing.wheels, nothing.poses)), nothing.gyro
+    )
+    found = gap_check.gap_check(short, NOMINAL)
+    assert found.missing == ()
+    assert "too little to judge" in found.not_judged
+
+
+def cut(part):
+    fields = {name: getattr(part, name) for name in part.__slots__}
+    return type(part)(**{name: value if isinstance(value, bool) else value[:3] for name, value in fields.items()})
+
+
+def die(send, log, model):
+    os._exit(3)
+
+
+def test_a_search_that_breaks_off_is_an_error_of_the_work(monkeypatch):
+    monkeypatch.setattr(gap_check, "_search", die)
+    with gap_check_beside(logged("poor"), NOMINAL) as searched, pytest.raises(WorkError, match="broke off"):
+        searched()
+
+
+def sleep(send, log, model):
+    time.sleep(60.0)
+
+
+def test_leaving_early_ends_the_search(monkeypatch):
+    monkeypatch.setattr(gap_check, "_search", sleep)
+    began = time.monotonic()
+    with pytest.raises(KeyboardInterrupt), gap_check_beside(logged("poor"), NOMINAL):
+        raise KeyboardInterrupt
+    assert time.monotonic() - began < 30.0
