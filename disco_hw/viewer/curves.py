@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from disco_hw.config import CircleTask
 from disco_hw.model import Model
-from disco_hw.model.belief import Gaussian, Mixture, Uniform
+from disco_hw.model.belief import Belief, Gaussian, Mixture, Uniform
 from disco_hw.viewer.timeline import COMMAND, ESTIMATE, INNOVATION, PLANNER, WHEELS, Series, Timeline
 
 Array = NDArray[np.float64]
@@ -77,27 +77,38 @@ def innovation(axis: str, timeline: Timeline, first_ns: int, last_ns: int) -> Cu
     return Curves(t_s, {axis: rows[:, INNOVATION.index(axis)], "+99 %": bound, "-99 %": -bound})
 
 
-def marginal(model: Model, name: str, count: int = 120) -> Curves | None:
-    """Density of one believed parameter over its values (in `t_s`), within 4 standard deviations; None if exact."""
-    belief = model.belief
-    if belief is None or name not in belief.names:
-        return None
+def marginals(file: Model, in_force: Model, name: str, count: int = 160) -> Curves | None:
+    """Densities of one believed parameter over its values (in `t_s`), within 4 standard deviations; None if exact.
+
+    Of the model file, and of the belief in force, which is another one after it was adapted.
+    """
+    beliefs = {"model file": file.belief, "in force": in_force.belief}
+    spans = []
+    for belief in beliefs.values():
+        if belief is None or name not in belief.names:
+            return None
+        index = belief.names.index(name)
+        mean, std = belief.mean()[index], float(np.sqrt(belief.covariance()[index, index]))
+        spans += [mean - 4.0 * std, mean + 4.0 * std]
+    x = np.linspace(min(spans), max(spans), count)
+    return Curves(x, {label: _density(belief, name, x) for label, belief in beliefs.items() if belief is not None})
+
+
+def _density(belief: Belief, name: str, x: Array) -> Array:
     index = belief.names.index(name)
-    mean, std = belief.mean()[index], float(np.sqrt(belief.covariance()[index, index]))
-    x = np.linspace(mean - 4.0 * std, mean + 4.0 * std, count)
     match belief:
         case Gaussian():
-            density = _normal(x, belief.means[index], belief.covariances[index, index])
+            return _normal(x, belief.means[index], belief.covariances[index, index])
         case Mixture():
-            density = np.zeros(count)
+            density = np.zeros(len(x))
             for weight, part in zip(belief.weights, belief.components, strict=True):
                 density += weight * _normal(x, part.means[index], part.covariances[index, index])
+            return density
         case Uniform():
             inside = (x >= belief.low[index]) & (x <= belief.high[index])
-            density = inside / (belief.high[index] - belief.low[index])
+            return np.asarray(inside / (belief.high[index] - belief.low[index]))
         case _:
-            return None
-    return Curves(x, {"density": density})
+            return np.full(len(x), np.nan)
 
 
 def _normal(x: Array, mean: float, variance: float) -> Array:

@@ -171,7 +171,7 @@ def shown(status: Mapping[str, Any] | None, error: str) -> dict[str, Any]:
         "kind": "status",
         "ok": True,
         "state": status["state"],
-        "detail": status["detail"],
+        "detail": "driven by hand" if drive is not None and drive["driving"] else status["detail"],
         "running": status["running"],
         "estop": status["estop"] or status["robot_state"] == "ESTOP",
         "advice": advice(status),

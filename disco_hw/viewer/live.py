@@ -17,7 +17,7 @@ from disco_hw.log.records import Record
 from disco_hw.viewer.desk import Desk
 from disco_hw.viewer.feed import feed_path
 from disco_hw.viewer.layers import add_layers
-from disco_hw.viewer.panel import events_text, live_details
+from disco_hw.viewer.panel import coverage_text, events_text, live_details
 from disco_hw.viewer.plots import Plots
 from disco_hw.viewer.scene import Scene
 from disco_hw.viewer.snapshot import Snapshot, snapshot_at
@@ -58,6 +58,8 @@ class LivePage:
         gui = server.gui
         gui.main_panel.dock_right()
         self._details = gui.add_markdown("")
+        with gui.add_folder("Excited so far", visible=False) as self._excited:
+            self._coverage = gui.add_markdown("")
         self._plots = Plots(gui, stage)
         with gui.add_folder("Events"):
             self._events = gui.add_markdown("nothing yet")
@@ -90,9 +92,10 @@ class LivePage:
         if everything:
             behind_ms = None if snapshot is None else (time.monotonic_ns() - snapshot.t_ns) * 1e-6
             _set(self._details, live_details(status, snapshot, self._subscriber.missed, behind_ms))
+            self._show_coverage(status)
             _set(self._events, events_text(snapshot, self.timeline.first_ns))
             if snapshot is not None:
-                self._plots.show(self.timeline, snapshot.t_ns, snapshot.task or self._stage.task)
+                self._plots.show(self.timeline, snapshot.t_ns, snapshot.task or self._stage.task, snapshot.belief)
 
     def close(self) -> None:
         """Leave the feed."""
@@ -101,6 +104,13 @@ class LivePage:
     def _snapshot(self) -> Snapshot | None:
         newest = self.timeline.last_ns
         return None if newest is None else snapshot_at(self.timeline, newest, self.timeline.plans.last(newest))
+
+    def _show_coverage(self, status: dict[str, Any] | None) -> None:
+        drive = (status or {}).get("drive")
+        if self._excited.visible != (drive is not None):
+            self._excited.visible = drive is not None
+        if drive is not None:
+            _set(self._coverage, coverage_text(drive["coverage"]["items"]))
 
     def _learn_task(self, status: dict[str, Any] | None) -> None:
         """Take over the daemon's task: it may have been changed before this page was opened."""

@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 from disco_hw.viewer.timeline import INNOVATION, LOOP, Timeline
 
 FAULT, EVENT, OVERRUN, REJECTED_FRAMES, GATED = "fault", "event", "overrun", "rejected frames", "pose rejected"
-KINDS = (FAULT, EVENT, OVERRUN, REJECTED_FRAMES, GATED)
+ADAPTED = "adaptation"
+KINDS = (FAULT, ADAPTED, EVENT, OVERRUN, REJECTED_FRAMES, GATED)
+_TELLING = frozenset({"refused", "reverted", "lost"})
 _APART_NS = 500_000_000
 
 
@@ -31,6 +33,8 @@ def marks_of(timeline: Timeline) -> tuple[Mark, ...]:
         *_growth(*timeline.loop.rows(0, 1 << 62), LOOP.index("overruns"), OVERRUN),
         *_rejected_frames(timeline),
         *_gated(timeline),
+        *(Mark(t_ns, ADAPTED, f"belief {change.source}: {change.reason}") for t_ns, change in timeline.beliefs),
+        *_spaced([Mark(t_ns, ADAPTED, it.text) for t_ns, it in timeline.adaptations if it.outcome in _TELLING]),
     ]
     return tuple(sorted(marks, key=lambda mark: mark.t_ns))
 

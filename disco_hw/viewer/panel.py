@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import html
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from disco_hw.config import CircleTask
+from disco_hw.viewer.advice import FAULTS, in_words
 from disco_hw.viewer.snapshot import Snapshot
 
 _NO_NUMBER = "—"
@@ -24,13 +25,13 @@ def live_details(
     rows: Rows = [] if status is None or not status.get("ok") else _status_rows(status)
     rows.append(("page is behind", f"{number(behind_ms, 0)} ms, {missed} batches missed"))
     if snapshot is not None:
-        rows += motion_rows(snapshot)
+        rows += [*health_rows(snapshot), *motion_rows(snapshot)]
     return _table(rows)
 
 
 def _status_rows(status: Mapping[str, Any]) -> Rows:
     task, loop = status["task"], status["loop"]
-    robot = f"{status['robot_state']}, fault {status['fault']}, last stop {status['stop_cause']}"
+    robot = _robot(status["robot_state"], status["fault"], status["stop_cause"])
     link = status["link"] + (f": {status['link_error']}" if status["link_error"] else "")
     transport, driver = status["transport"], status["driver"]
     rejected = sum(count for name, count in driver.items() if name.startswith("rejected"))
@@ -40,6 +41,7 @@ def _status_rows(status: Mapping[str, Any]) -> Rows:
         ("frames", f"{transport['frames_received']} in, {transport['frames_sent']} out"),
         ("rejected, lost", f"{rejected + transport['malformed']}, {driver['lost_frames']}"),
         ("laps", f"{task['laps']:.2f}"),
+        ("distance", f"{number(task['distance_m'] * 1e3, 0)} mm"),
         ("loop late p99, max", f"{number(loop['lateness_us']['p99'], 0)}, {number(loop['lateness_us']['max'], 0)} us"),
         ("overruns, skipped", f"{loop['overruns']}, {loop['skipped']}"),
     ]
@@ -56,9 +58,11 @@ def replay_text(snapshot: Snapshot, first_ns: int, task: CircleTask) -> str:
     lines = [f"### {head}", ""]
     if state is not None and state.reason:
         lines += [escaped(state.reason), ""]
+    if status is not None and status.fault != "NONE":
+        lines += [f"**{escaped(in_words(status.fault))}.** {escaped(FAULTS.get(status.fault, ''))}", ""]
     rows: Rows = [("time", f"{(snapshot.t_ns - first_ns) * 1e-9:.3f} s")]
     if status is not None:
-        rows.append(("robot", f"{status.state}, fault {status.fault}, last stop {status.stop_cause}"))
+        rows.append(("robot", _robot(status.state, status.fault, status.stop_cause)))
     rows += [
         ("loop late", f"{number(snapshot.lateness_us, 0)} us"),
         ("overruns, skipped", f"{snapshot.overruns}, {snapshot.skipped}"),
@@ -66,7 +70,7 @@ def replay_text(snapshot: Snapshot, first_ns: int, task: CircleTask) -> str:
     if snapshot.pose is not None:
         distance = math.hypot(snapshot.pose[0] - task.center_x_m, snapshot.pose[1] - task.center_y_m) - task.radius_m
         rows.append(("distance", f"{number(distance * 1e3, 0)} mm"))
-    rows += motion_rows(snapshot)
+    rows += [*health_rows(snapshot), *motion_rows(snapshot)]
     return "\n".join([*lines, _table(rows)])
 
 
@@ -85,8 +89,37 @@ def motion_rows(snapshot: Snapshot) -> Rows:
         plan = snapshot.plan
         rows.append(("effective samples", number(plan.effective_samples, 1)))
         rows.append(("temperature", number(plan.temperature, 4)))
-    rows.append(("battery", f"{number(snapshot.voltage_v, 1)} V"))
     return rows
+
+
+def health_rows(snapshot: Snapshot) -> Rows:
+    """What a snapshot says of battery, link and belief."""
+    current, warmth = number(snapshot.current_a, 1), number(snapshot.battery_c, 0)
+    rows: Rows = [("battery", f"{number(snapshot.voltage_v, 1)} V, {current} A, {warmth} °C")]
+    if snapshot.link is not None:
+        it = snapshot.link
+        rows.append(
+            ("bus errors", f"{it.tx_error_count} sent, {it.rx_error_count} received, {it.bus_off_count} bus-off")
+        )
+        rows.append(
+            ("robot refused", f"{it.crc_error_count} CRC, {it.sequence_error_count} sequence, {it.watchdog_count} late")
+        )
+    if snapshot.belief is not None:
+        rows.append(("belief", "adapted" if snapshot.belief.source == "adapted" else "model file's again"))
+    if snapshot.adaptation is not None:
+        rows.append(("adaptation", snapshot.adaptation.text))
+    return rows
+
+
+def coverage_text(items: Sequence[Mapping[str, Any]]) -> str:
+    """Markdown of what a drive has excited, what is missing first."""
+    rows = []
+    for item in sorted(items, key=lambda item: bool(item["covered"])):
+        found = f"{min(item['found'], item['wanted']):.0f} of {item['wanted']:.0f} {item['unit']}"
+        rows.append((f"{'✔' if item['covered'] else '○'} {item['name']}", found))
+    missing = sum(not item["covered"] for item in items)
+    head = f"{missing} of {len(items)} still missing" if missing else "nothing is missing"
+    return f"**{head}**\n\n{_table(rows)}"
 
 
 def events_text(snapshot: Snapshot | None, first_ns: int | None) -> str:
@@ -107,6 +140,11 @@ def escaped(text: str) -> str:
     """Text from elsewhere, so that it can be no markup of the page."""
     plain = html.escape(" ".join(text.split()), quote=False)
     return "".join(f"\\{letter}" if letter in "\\`*_[]{}#|!~$" else letter for letter in plain)
+
+
+def _robot(state: str, fault: str, stop_cause: str) -> str:
+    fault_words = "no fault" if fault == "NONE" else f"fault: {in_words(fault).lower()}"
+    return f"{state}, {fault_words}" + ("" if stop_cause == "NONE" else f", last stop: {in_words(stop_cause).lower()}")
 
 
 def _pair(values: tuple[float, float] | None) -> str:

@@ -21,7 +21,7 @@ from disco_hw.viewer.curves import Curves
 from disco_hw.viewer.plots import WINDOW_NS
 from disco_hw.viewer.recording import Recording
 from disco_hw.viewer.snapshot import Snapshot
-from disco_hw.viewer.stage import Stage
+from disco_hw.viewer.stage import Stage, model_in_force
 from disco_hw.viewer.timeline import Timeline
 from disco_hw.viewer.uncertainty import ParameterPoints
 
@@ -40,7 +40,7 @@ def draw_picture(recording: Recording, t_s: float, path: Path) -> None:
     supported = figure.canvas.get_supported_filetypes()
     if path.suffix.lstrip(".").lower() not in supported:
         raise InputError(f"{path}: no such kind of picture; end the name in .png, .svg or .pdf")
-    _draw(figure, recording, t_s, ParameterPoints(recording.stage.model))
+    _draw(figure, recording, t_s)
     figure.savefig(path, dpi=_PICTURE_DPI)
 
 
@@ -56,12 +56,11 @@ def draw_clip(recording: Recording, path: Path, speed: float, progress: Progress
         raise InputError(f"{path}: the clip would take {length_s:.0f} s; raise --speed to at least "
                          f"{math.ceil(recording.duration_s / _LONGEST_S)}")  # fmt: skip
     figure = _figure()
-    points = ParameterPoints(recording.stage.model)
     count = max(1, round(length_s * FRAMES_PER_S))
     with writer.saving(figure, str(path), _CLIP_DPI):
         for number in range(count + 1):
             figure.clear()
-            _draw(figure, recording, recording.duration_s * number / count, points)
+            _draw(figure, recording, recording.duration_s * number / count)
             writer.grab_frame()
             progress(number / count)
 
@@ -81,13 +80,13 @@ def _figure() -> Figure:
     return Figure(figsize=(11.2, 6.4))
 
 
-def _draw(figure: Figure, recording: Recording, t_s: float, points: ParameterPoints) -> None:
+def _draw(figure: Figure, recording: Recording, t_s: float) -> None:
     snapshot, stage, timeline = recording.at(t_s), recording.stage, recording.timeline
     grid = figure.add_gridspec(
         3, 2, width_ratios=(1.6, 1.0), left=0.07, right=0.98, bottom=0.08, top=0.95, hspace=0.4, wspace=0.12
     )
     top = figure.add_subplot(grid[:, 0])
-    _draw_scene(top, snapshot, stage, points)
+    _draw_scene(top, snapshot, stage)
     top.set_title(f"{stage.name}, {t_s:.2f} s", loc="left")
     task = snapshot.task or stage.task
     cuts: tuple[tuple[str, Callable[[Timeline, int, int], Curves]], ...] = (
@@ -107,7 +106,7 @@ def _draw(figure: Figure, recording: Recording, t_s: float, points: ParameterPoi
             axes.legend(fontsize=7, loc="lower right", ncols=2)
 
 
-def _draw_scene(axes: Axes, snapshot: Snapshot, stage: Stage, points: ParameterPoints) -> None:
+def _draw_scene(axes: Axes, snapshot: Snapshot, stage: Stage) -> None:
     task = snapshot.task or stage.task
     axes.plot(
         *shapes.circle_points(task.center_x_m, task.center_y_m, task.radius_m).T,
@@ -126,6 +125,7 @@ def _draw_scene(axes: Axes, snapshot: Snapshot, stage: Stage, points: ParameterP
         for path, shade in zip(paths[::-1], shades[::-1], strict=True):
             axes.plot(*path.T, color=tuple(shade), linewidth=0.7)
     if snapshot.plan is not None:
+        points = ParameterPoints(model_in_force(stage.model, snapshot.belief))
         for path in points.trajectories(snapshot.plan, snapshot.wheel_speeds or (0.0, 0.0)):
             axes.plot(*path.T, color=_web(scene.POINTS_COLOUR), linewidth=0.8)
         axes.plot(snapshot.plan.path_x_m, snapshot.plan.path_y_m, color=_web(scene.PLAN_COLOUR), linewidth=2.0)

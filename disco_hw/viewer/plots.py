@@ -10,9 +10,11 @@ import numpy as np
 import viser
 
 from disco_hw.config import CircleTask
+from disco_hw.log.records import BeliefChange
+from disco_hw.model import Model
 from disco_hw.viewer import curves
 from disco_hw.viewer.curves import Curves
-from disco_hw.viewer.stage import Stage
+from disco_hw.viewer.stage import Stage, model_in_force
 from disco_hw.viewer.timeline import Timeline
 
 WINDOW_NS = 20_000_000_000
@@ -31,7 +33,10 @@ class Plots:
     """Curves of the 20 s before an instant; a folder that is closed costs what an open one does, so all are drawn."""
 
     def __init__(self, gui: viser.GuiApi, stage: Stage) -> None:
+        self._model = stage.model
         self._plots: list[_Plot] = []
+        self._marginals: dict[str, viser.GuiUplotHandle] = {}
+        self._belief: BeliefChange | None = None
         with gui.add_folder("Plots"):
             self._add(gui, "Distance to the circle (m)", curves.distance)
             self._add(gui, "Speed (m/s)", curves.speed)
@@ -42,17 +47,26 @@ class Plots:
                 self._add(gui, title, _any_task(partial(curves.innovation, axis)))
         with gui.add_folder("Belief", expand_by_default=False):
             for name in stage.model.parameter_names:
-                density = curves.marginal(stage.model, name)
+                density = curves.marginals(stage.model, stage.model, name)
                 if density is not None:
-                    _add_uplot(gui, name, density, ())
+                    self._marginals[name] = _add_uplot(gui, name, density, ())
 
-    def show(self, timeline: Timeline, at_ns: int, task: CircleTask) -> None:
-        """Draw the curves up to an instant, those of the task for the one that is in force then."""
+    def show(self, timeline: Timeline, at_ns: int, task: CircleTask, belief: BeliefChange | None) -> None:
+        """Draw the curves up to an instant, with the task and the belief that are in force then."""
         for plot in self._plots:
             found = plot.cut(task, timeline, at_ns - WINDOW_NS, at_ns)
             columns = _columns(found)
             if len(columns[0]) >= 2:
                 plot.handle.data = columns
+        if belief is not self._belief:
+            self._belief = belief
+            self._show_belief(model_in_force(self._model, belief))
+
+    def _show_belief(self, in_force: Model) -> None:
+        for name, handle in self._marginals.items():
+            density = curves.marginals(self._model, in_force, name)
+            if density is not None:
+                handle.data = _columns(density)
 
     def _add(self, gui: viser.GuiApi, title: str, cut: Cut, right: tuple[str, ...] = ()) -> None:
         empty = cut(CircleTask(), Timeline(), 0, 0)

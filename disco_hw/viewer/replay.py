@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 import viser
 
+from disco_hw.viewer.excited import Excited
 from disco_hw.viewer.layers import add_layers
 from disco_hw.viewer.marks import KINDS, Mark, marks_of
-from disco_hw.viewer.panel import events_text, replay_text
+from disco_hw.viewer.panel import coverage_text, events_text, replay_text
 from disco_hw.viewer.plots import Plots
 from disco_hw.viewer.recording import Recording
 from disco_hw.viewer.scene import Scene
@@ -44,7 +45,12 @@ class ReplayPage:
         gui.main_panel.dock_right()
         self._add_controls(gui)
         self._state = gui.add_markdown("")
-        self._plots = Plots(gui, recording.stage)
+        stage = recording.stage
+        self._excited = Excited(recording.timeline, stage.drive_top_rad_s)
+        if self._excited.driven:
+            with gui.add_folder("Excited so far"):
+                self._coverage = gui.add_markdown("")
+        self._plots = Plots(gui, stage)
         with gui.add_folder("Events"):
             self._events = gui.add_markdown("")
         self.scene = Scene(server, recording.stage)
@@ -83,8 +89,10 @@ class ReplayPage:
             first_ns = self._recording.first_ns
             task = snapshot.task or self._recording.stage.task
             self._state.content = replay_text(snapshot, first_ns, task)
+            if self._excited.driven:
+                self._coverage.content = coverage_text(self._excited.items(snapshot.t_ns))
             self._events.content = events_text(snapshot, first_ns)
-            self._plots.show(self._recording.timeline, snapshot.t_ns, task)
+            self._plots.show(self._recording.timeline, snapshot.t_ns, task, snapshot.belief)
 
     def _redraw(self) -> None:
         with self._lock:

@@ -12,10 +12,11 @@ from disco_hw.config import CircleTask
 from disco_hw.log import records
 from disco_hw.viewer import shapes
 from disco_hw.viewer.snapshot import Snapshot
-from disco_hw.viewer.stage import Stage
+from disco_hw.viewer.stage import Stage, model_in_force
 from disco_hw.viewer.uncertainty import ParameterPoints
 
 Array = NDArray[np.float64]
+Point = tuple[float, float, float]
 
 TASK_COLOUR = (40, 110, 230)
 BODY_COLOUR = (200, 60, 160)
@@ -47,6 +48,13 @@ FAN_PALEST = 0.12
 _WHEEL_PARTS = (("front", 0.5), ("rear", -0.5))
 
 
+def first_camera(task: CircleTask) -> tuple[Point, Point]:
+    """Where the page's camera is at first, and what it looks at: all of the circle, from the south and above."""
+    away = 0.8 + 1.1 * task.radius_m
+    eye = (task.center_x_m - 0.35 * away, task.center_y_m - 0.9 * away, 1.25 * away)
+    return eye, (task.center_x_m, task.center_y_m, 0.0)
+
+
 class Scene:
     """Draws snapshots on a viser server; `layers` says which of LAYERS are shown.
 
@@ -58,6 +66,7 @@ class Scene:
         self._server = server
         self._stage = stage
         self._points = ParameterPoints(stage.model)
+        self._belief: records.BeliefChange | None = None
         self._wheel_radius = max(stage.wheel_radius_m, 0.01)
         self._add_ground()
         self._robot, self._wheels = self._add_robot()
@@ -124,10 +133,8 @@ class Scene:
             "/task", _circle(task), TASK_COLOUR, thickness=max(0.012, 0.006 * task.radius_m)
         )
         self._drawn_task = task
-        away = 0.8 + 1.1 * task.radius_m
         camera = self._server.initial_camera
-        camera.look_at = (task.center_x_m, task.center_y_m, 0.0)
-        camera.position = (task.center_x_m - 0.35 * away, task.center_y_m - 0.9 * away, 1.25 * away)
+        camera.position, camera.look_at = first_camera(task)
 
     def _add_robot(self) -> tuple[viser.FrameHandle, list[viser.FrameHandle]]:
         scene, radius = self._server.scene, self._wheel_radius
@@ -235,6 +242,9 @@ class Scene:
     def _points_paths(self, snapshot: Snapshot) -> Array:
         if snapshot.plan is None or snapshot.pose is None or not self.layers["points"]:
             return np.empty((0, 2, 3))
+        if snapshot.belief is not self._belief:
+            self._points = ParameterPoints(model_in_force(self._stage.model, snapshot.belief))
+            self._belief = snapshot.belief
         wheels = snapshot.wheel_speeds or (0.0, 0.0)
         paths = self._points.trajectories(snapshot.plan, wheels)
         return np.concatenate([shapes.segments(path, 0.008) for path in paths]) if len(paths) else np.empty((0, 2, 3))

@@ -30,7 +30,7 @@ class Snapshot:
     `pose` (x, y, yaw) m and rad, its `covariance` (3, 3); `speed_m_s`, `yaw_rate_rad_s`; `wheel_angles`,
     `wheel_speeds`, `command` (left, right) rad and rad/s; `plan` not older than half a second; `poses` (N, 3) measured
     in the last 3 s; `trail` (N, 2) of estimated positions; `fan` not older than 1.1 s; `task` where it is not the
-    robot.toml's.
+    robot.toml's, `belief` where another one than the model file's was in force.
     """
 
     t_ns: int
@@ -56,9 +56,13 @@ class Snapshot:
     overruns: int
     skipped: int
     voltage_v: float
+    current_a: float
+    battery_c: float
     events: tuple[tuple[int, records.Event], ...]
     fan: records.Fan | None
     task: CircleTask | None
+    belief: records.BeliefChange | None
+    adaptation: records.Adaptation | None
 
 
 def snapshot_at(timeline: Timeline, t_ns: int, plan: records.Plan | None) -> Snapshot:
@@ -92,9 +96,13 @@ def snapshot_at(timeline: Timeline, t_ns: int, plan: records.Plan | None) -> Sna
         overruns=0 if loop is None else int(loop[1][1]),
         skipped=0 if loop is None else int(loop[1][2]),
         voltage_v=np.nan if power is None else float(power[1][0]),
+        current_a=np.nan if power is None else float(power[1][1]),
+        battery_c=np.nan if power is None else float(power[1][2]),
         events=tuple(timeline.events.latest(t_ns, _EVENTS)),
         fan=_fresh_fan(timeline, t_ns),
         task=None if (told := timeline.tasks.last(t_ns)) is None else task_of(told),
+        belief=timeline.beliefs.last(t_ns),
+        adaptation=timeline.adaptations.last(t_ns),
     )
 
 

@@ -129,6 +129,8 @@ class Timeline:
         self.counters: Items[records.Counters] = Items()
         self.fans: Items[records.Fan] = Items()
         self.tasks: Items[records.Task] = Items()
+        self.beliefs: Items[records.BeliefChange] = Items()
+        self.adaptations: Items[records.Adaptation] = Items()
 
     def add(self, now_ns: int, record: records.Record) -> None:  # noqa: PLR0912
         """Take in one record of the tick at `now_ns`; ticks come in order. Frames are not kept."""
@@ -174,6 +176,10 @@ class Timeline:
                 self.fans.append(now_ns, it)
             case records.Task() as it:
                 self.tasks.append(now_ns, it)
+            case records.BeliefChange() as it:
+                self.beliefs.append(now_ns, it)
+            case records.Adaptation() as it:
+                self.adaptations.append(now_ns, it)
             case _:
                 pass
 
@@ -185,6 +191,6 @@ class Timeline:
             series.forget_before(oldest_ns)
         for items in (
             self.plans, self.status, self.link, self.state, self.source, self.events, self.counters, self.fans,
-            self.tasks,
+            self.tasks, self.beliefs, self.adaptations,
         ):  # fmt: skip
             items.forget_before(oldest_ns)

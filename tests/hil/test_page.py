@@ -1,52 +1,75 @@
-"""The live page of a running robot: its e-stop stops the wheels, and nothing that befalls it touches the loop."""
+"""The live page of a running robot: it draws what is so, stops and drives the wheels, and cannot touch the loop."""
 
+import math
 import os
 import signal
 import socket
 import time
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 import pytest
 
-from disco_hw.operator import disco_hw_process
-from tests.hil.stack import STILL_RAD_S, running_stack
+from disco_hw.config import load_robot_config
+from disco_hw.daemon.control_client import send_request
+from disco_hw.drive.source import INPUT_LIMIT_NS
+from disco_hw.operator import disco_hw_process, stands
+from disco_hw.viewer import scene
+from tests.hil.stack import DECELERATION_RAD_S2, STILL_RAD_S, running_stack
+from tests.hil.test_drive import Bench
 from tests.viewer.browser import chromium, keep, opened
+from tests.viewer.camera import project, screenshot, shows
 from tests.viewer.test_page import wait_for
 
 pytestmark = pytest.mark.hil
+# Ticks, the link, and a machine that has other things to do.
+MARGIN_S = 0.1
 
 
-def address(output: Path, timeout_s: float = 30.0) -> str:
+def address(output: Path, timeout_s: float = 60.0) -> str:
     deadline = time.monotonic() + timeout_s
     while time.monotonic() < deadline:
-        for line in output.read_text().splitlines():
+        for line in output.read_text().splitlines() if output.exists() else []:
             if line.startswith("page: "):
                 return line.split()[1]
         time.sleep(0.05)
     raise AssertionError(f"no page: {output.read_text()}")
 
 
-def test_the_page_changes_nothing_while_it_is_stopped_and_its_estop_stops_the_wheels(tmp_path):
+def free_port() -> str:
     with socket.create_server(("127.0.0.1", 0)) as taken:
-        view = ["view", "--live", "--port", str(taken.getsockname()[1]), "--robot"]
+        return str(taken.getsockname()[1])
+
+
+@contextmanager
+def page_of(robot_file, output):
+    """A live page in a process of its own, and its address."""
+    view = ["view", "--live", "--port", free_port(), "--robot", str(robot_file)]
+    with disco_hw_process("page", view, output) as page:
+        yield page.process, address(output)
+
+
+@pytest.mark.timeout(300)
+def test_the_page_draws_the_robot_survives_being_stopped_and_its_estop_stops_the_wheels(tmp_path):
     with chromium() as browser, running_stack(tmp_path) as stack:
-        page_file = tmp_path / "page.txt"
-        with disco_hw_process("page", [*view, str(stack.robot_file)], page_file) as page:
-            with opened(browser, address(page_file)) as tab:
-                stack.drive()
-                tab.get_by_text("ARMED · running").wait_for()
-                wait_for(tab, lambda: "rad/s (plan)" in tab.inner_text("body"))
-                keep(tab, "live")
-                stop_the_page_for_a_while(stack, page.process.pid)
-                tab.get_by_role("button", name="E-STOP").click()
-                stack.operator.wait_for("FAULT", 10.0)
-                stopped_s = time.monotonic()
-                tab.get_by_text("E-STOP is latched.").wait_for()
-                keep(tab, "estop")
-                tab.get_by_role("button", name="Reset").click()
-                stack.operator.wait_for("READY", 10.0)
-            os.kill(page.process.pid, signal.SIGTERM)
-            assert page.process.wait(10) == 0
+        with page_of(stack.robot_file, tmp_path / "page.txt") as (page, url), opened(browser, url, 1000, 640) as tab:
+            stack.drive()
+            tab.get_by_text("ARMED · running").wait_for()
+            drawn = tab.frame_locator("#scene")
+            wait_for(tab, lambda: "rad/s (plan)" in drawn.locator("body").inner_text())
+            keep(tab, "live")
+            stop_the_page_for_a_while(stack, page.pid)
+            tab.get_by_role("button", name="E-STOP").click()
+            stack.operator.wait_for("FAULT", 10.0)
+            stopped_s = time.monotonic()
+            tab.get_by_text("The stop is latched.").wait_for()
+            keep(tab, "estop")
+            assert_drawn(tab, stack)
+            tab.get_by_role("button", name="Reset").click()
+            stack.operator.wait_for("READY", 10.0)
+            set_the_task(tab, stack)
+            os.kill(page.pid, signal.SIGTERM)
+            assert page.wait(10) == 0
         rows = stack.truth()
     assert any(row.fastest > 5.0 for row in rows)
     later = [row.fastest for row in rows if row.t_s > stopped_s + 0.5]
@@ -65,3 +88,153 @@ def stop_the_page_for_a_while(stack, pid):
     assert after["task"]["laps"] > before["task"]["laps"] + 0.02
     assert after["driver"]["commands_sent"] > before["driver"]["commands_sent"] + 50
     assert after["recorder"]["dropped_ticks"] == 0
+
+
+def assert_drawn(tab, stack):
+    """Robot and circle have their colours where they are in the world, seen from the page's first camera."""
+    task = load_robot_config(stack.robot_file).task
+    status = stack.operator.wait_until("standing still", stands, 5.0)
+    x_m, y_m, _ = status["pose"]
+    canvas = tab.frame_locator("#scene").locator("canvas").first.bounding_box()
+    eye, look_at = scene.first_camera(task)
+
+    def place(*point):
+        column, row = project(point, eye, look_at, canvas["width"], canvas["height"])
+        return column + canvas["x"], row + canvas["y"]
+
+    # Clear of the trail, which ends at the robot.
+    sweep = math.atan2(y_m - task.center_y_m, x_m - task.center_x_m)
+    ahead = [sweep + math.radians(degrees) for degrees in (60, 110, 160, 210)]
+    on_circle = [
+        place(task.center_x_m + task.radius_m * math.cos(a), task.center_y_m + task.radius_m * math.sin(a), 0.0)
+        for a in ahead
+    ]
+
+    def everything_is_there():
+        picture = screenshot(tab)
+        right, bottom = canvas["x"] + canvas["width"], canvas["y"] + canvas["height"]
+        on_screen = [(column, row) for column, row in on_circle if column < right and row < bottom]
+        return (
+            len(on_screen) >= 3
+            and all(shows(picture, c, r, scene.TASK_COLOUR, 3) for c, r in on_screen)
+            and shows(picture, *place(x_m, y_m, 0.1), scene.BODY_COLOUR, 4)
+            and not shows(picture, *place(task.center_x_m, task.center_y_m, 0.0), scene.TASK_COLOUR, 3)
+        )
+
+    # What is drawn fades in, and slowly without a graphics card.
+    wait_for(tab, everything_is_there)
+
+
+def set_the_task(tab, stack):
+    """Another circle, from the page: within the limits, and only within."""
+    tab.get_by_role("button", name="Task…").click()
+    tab.get_by_label("Radius (m)").fill("2.5")
+    tab.get_by_label("Speed (m/s)").fill("0.3")
+    keep(tab, "task")
+    tab.get_by_role("button", name="Set the task").click()
+    tab.get_by_text("circle of 2.5 m").wait_for()
+    assert stack.operator.status()["task"]["asked"]["radius_m"] == 2.5
+    tab.get_by_label("Speed (m/s)").fill("5")
+    tab.get_by_role("button", name="Set the task").click()
+    tab.get_by_text("task refused").wait_for()
+    assert stack.operator.status()["task"]["asked"]["speed_m_s"] == 0.3
+
+
+@pytest.mark.timeout(300)
+def test_the_pad_drives_while_it_is_held_and_seen(tmp_path):
+    with chromium() as browser, ExitStack() as stack, (tmp_path / "drive.txt").open("wb") as output:
+        bench = Bench(tmp_path, stack)
+        drive = bench.drive("--page", "--port", free_port(), stdout=output, stderr=output)
+        url = address(tmp_path / "drive.txt")
+        with opened(browser, url, 700, 620, scene=False) as tab:
+            pad = tab.get_by_label("Pad: hold")
+            pad.wait_for()
+            bench.operator.wait_for("READY", 60.0)
+            ends = [
+                release(tab, pad, bench),
+                hide(tab, pad, bench),
+                leave(tab, pad, bench),
+            ]
+        with opened(browser, url, 700, 620, scene=False) as tab:
+            ends.append(lose(tab, tab.get_by_label("Pad: hold"), bench, drive))
+        assert send_request(tmp_path / "control.sock", {"do": "quit"})["ok"]
+        assert drive.wait(20) == 0
+        t_s, wheels = bench.truth()
+    fastest = abs(wheels).max(axis=1)
+    for name, ended_s, limit_s in ends:
+        before = fastest[(t_s > ended_s - 0.3) & (t_s < ended_s)]
+        assert before.max() > 1.0, f"{name}: nothing moved"
+        still_s = ended_s + limit_s + before.max() / DECELERATION_RAD_S2 + 0.15 + MARGIN_S
+        after = fastest[(t_s > still_s) & (t_s < still_s + 0.3)]
+        assert after.max() < STILL_RAD_S, f"{name}: {after.max()} rad/s {limit_s} s later"
+
+
+def hold(tab, pad, bench):
+    """Press the pad and pull it forward until the wheels turn."""
+    box = pad.bounding_box()
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    for _ in range(5):
+        bench.operator.wait_for("READY", 20.0)
+        tab.mouse.move(x, y)
+        tab.wait_for_timeout(250)
+        tab.mouse.down()
+        tab.mouse.move(x, y - 40, steps=2)
+        deadline = time.monotonic() + 4.0
+        while time.monotonic() < deadline:
+            tab.wait_for_timeout(50)
+            if (wheels := bench.operator.status()["wheels"]) is not None and min(wheels) > 1.5:
+                return
+        # A browser that is starved of its processor loses the hold, as it should.
+        tab.mouse.up()
+    raise AssertionError(f"never drove: {bench.operator.status()['drive']}")
+
+
+def release(tab, pad, bench):
+    hold(tab, pad, bench)
+    keep(tab, "drive")
+    tab.mouse.up()
+    return "released", time.monotonic(), 0.0
+
+
+def hide(tab, pad, bench):
+    hold(tab, pad, bench)
+    tab.evaluate("Object.defineProperty(document, 'hidden', {value: true, configurable: true});"
+                 "document.dispatchEvent(new Event('visibilitychange'))")  # fmt: skip
+    ended_s = time.monotonic()
+    tab.wait_for_timeout(700)
+    tab.mouse.up()
+    tab.evaluate("delete document.hidden")
+    return "hidden", ended_s, 0.0
+
+
+def leave(tab, pad, bench):
+    hold(tab, pad, bench)
+    tab.goto("about:blank")
+    ended_s = time.monotonic()
+    time.sleep(0.7)
+    return "left", ended_s, INPUT_LIMIT_NS * 1e-9
+
+
+def lose(tab, pad, bench, drive):
+    """The page's process falls silent: nothing says that the pad was let go."""
+    pad.wait_for()
+    hold(tab, pad, bench)
+    page = page_beside(drive.pid)
+    os.kill(page, signal.SIGSTOP)
+    ended_s = time.monotonic()
+    time.sleep(1.5)
+    os.kill(page, signal.SIGCONT)
+    time.sleep(1.0)
+    assert bench.operator.status()["state"] == "READY"
+    tab.mouse.up()
+    return "lost", ended_s, INPUT_LIMIT_NS * 1e-9
+
+
+def page_beside(pid):
+    """The process of the page that this one has started."""
+    for each in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):
+            parent = (each / "stat").read_text().rpartition(")")[2].split()[1]
+            if int(parent) == pid and b"disco_hw.viewer.beside" in (each / "cmdline").read_bytes():
+                return int(each.name)
+    raise AssertionError("no page beside the drive")

@@ -33,13 +33,18 @@ def chromium():
 
 
 @contextmanager
-def opened(browser, url, width=800, height=540):
-    """A page of the address, and what its console said is kept in `page.said`."""
+def opened(browser, url, width=800, height=540, scene=True):
+    """A page of the address, and what its console said is kept in `page.said`.
+
+    Without its `scene` a desk is as quick as with a graphics card; with it a mouse that moves waits for frames.
+    """
     page = browser.new_page(viewport={"width": width, "height": height})
     page.set_default_timeout(60_000)
     page.said = []
     page.on("console", lambda message: page.said.append(message.text))
     page.on("request", lambda request: page.said.append(f"request {request.url}"))
+    if not scene:
+        page.route("**/index.html", lambda route: route.abort())
     page.goto(url)
     try:
         yield page

@@ -57,12 +57,25 @@ def test_a_long_window_is_thinned(timeline, monkeypatch):
     ],
 )
 def test_a_marginal_is_a_density_with_the_beliefs_mean(belief):
-    drawn = curves.marginal(Model(0.06, 0.3, belief=belief), "wheel_radius_m", 4000)
-    density, x = drawn.values["density"], drawn.t_s
+    model = Model(0.06, 0.3, belief=belief)
+    drawn = curves.marginals(model, model, "wheel_radius_m", 4000)
+    density, x = drawn.values["in force"], drawn.t_s
+    assert (density == drawn.values["model file"]).all()
     step = x[1] - x[0]
     assert density.sum() * step == pytest.approx(1.0, abs=0.01)
     assert (x * density).sum() * step == pytest.approx(belief.mean()[0], rel=0.01)
 
 
 def test_what_is_known_exactly_has_no_marginal():
-    assert curves.marginal(Model(0.06, 0.3), "wheel_radius_m") is None
+    assert curves.marginals(Model(0.06, 0.3), Model(0.06, 0.3), "wheel_radius_m") is None
+
+
+def test_an_adapted_belief_is_drawn_beside_the_model_files():
+    file, learnt = (
+        Model(0.06, 0.3, belief=Gaussian(("wheel_radius_m",), np.array((mean,)), np.array(((1e-6,),))))
+        for mean in (0.06, 0.07)
+    )
+    drawn = curves.marginals(file, learnt, "wheel_radius_m", 4000)
+    peaks = {name: drawn.t_s[np.argmax(density)] for name, density in drawn.values.items()}
+    assert peaks["model file"] == pytest.approx(0.06, abs=1e-4)
+    assert peaks["in force"] == pytest.approx(0.07, abs=1e-4)

@@ -1,5 +1,5 @@
 from disco_hw.log import records
-from disco_hw.viewer.marks import EVENT, FAULT, GATED, OVERRUN, REJECTED_FRAMES, marks_of
+from disco_hw.viewer.marks import ADAPTED, EVENT, FAULT, GATED, OVERRUN, REJECTED_FRAMES, marks_of
 from disco_hw.viewer.timeline import Timeline
 from tests.viewer.run import FAULT_TICK, GATED_TICK, OVERRUN_TICK, PERIOD_NS, REJECTED_TICK, START_NS
 
@@ -30,6 +30,19 @@ def test_what_goes_on_and_on_is_marked_once_in_half_a_second():
         t_ns = tick * PERIOD_NS
         line.add(t_ns, records.Innovation(t_ns, (9.0,) * 3, (1.0,) * 3, 50.0, False))
     assert [mark.t_ns for mark in marks_of(line)] == [0, 520_000_000, 1_040_000_000, 1_560_000_000]
+
+
+def test_what_adaptation_did_is_marked():
+    line = Timeline()
+    line.add(10, records.BeliefChange(10, "adapted", reason="the wheels are worn"))
+    for t_ns, outcome in ((20, "confirming"), (30, "refused"), (40, "agrees"), (900_000_000, "reverted")):
+        line.add(t_ns, records.Adaptation(t_ns, outcome, f"it {outcome}"))
+    told = [(mark.t_ns, mark.kind, mark.text) for mark in marks_of(line)]
+    assert told == [
+        (10, ADAPTED, "belief adapted: the wheels are worn"),
+        (30, ADAPTED, "it refused"),
+        (900_000_000, ADAPTED, "it reverted"),
+    ]
 
 
 def test_an_empty_run_has_none():

@@ -1,15 +1,26 @@
 import math
 
 from disco_hw.config import CircleTask
-from disco_hw.viewer.panel import escaped, events_text, live_details, number, replay_text
+from disco_hw.log import records
+from disco_hw.viewer.advice import FAULTS
+from disco_hw.viewer.panel import (
+    coverage_text,
+    escaped,
+    events_text,
+    health_rows,
+    live_details,
+    number,
+    replay_text,
+)
 from disco_hw.viewer.snapshot import snapshot_at
 from disco_hw.viewer.timeline import Timeline
+from drivers.types import RobotStatus
 from tests.viewer.run import PERIOD_NS, START_NS, plan_at
 
 STATUS = {
     "ok": True, "state": "ARMED", "detail": "running the task", "running": True, "estop": False, "link": "up",
     "link_error": None, "robot_state": "ARMED", "fault": "NONE", "stop_cause": "NONE",
-    "task": {"laps": 1.5}, "transport": {"frames_received": 10, "frames_sent": 4, "malformed": 1},
+    "task": {"laps": 1.5, "distance_m": 0.012}, "transport": {"frames_received": 10, "frames_sent": 4, "malformed": 1},
     "driver": {"rejected_crc": 2, "rejected_sequence": 3, "lost_frames": 5}, "recorder": {"last_error": ""},
     "loop": {"lateness_us": {"p99": 100.4, "max": 900.0}, "overruns": 7, "skipped": 8},
 }  # fmt: skip
@@ -24,7 +35,8 @@ def test_the_details_add_up_what_went_wrong(timeline):
     assert "| rejected, lost | 6, 5 |" in text
     assert "| loop late p99, max | 100, 900 us |" in text
     assert "| overruns, skipped | 7, 8 |" in text
-    assert "| battery | 24.5 V |" in text
+    assert "| battery | 24.5 V, 1.0 A, 30 °C |" in text
+    assert "| bus errors | 0 sent, 0 received, 0 bus-off |" in text
     assert "rad/s (plan)" in text
 
 
@@ -33,7 +45,35 @@ def test_a_replay_shows_the_same_motion_and_the_distance(timeline):
     assert text.startswith("### ARMED")
     assert "| time | 1.400 s |" in text
     assert "| distance | 250 mm |" in text
-    assert "OVERCURRENT" in text
+    assert "Overcurrent" in text
+
+
+def test_a_fault_is_told_in_words_with_what_to_do():
+    line = Timeline()
+    line.add(5, RobotStatus(5, "FAULT", 0, "STALL_LEFT", "FAULT", "NONE", 1, 0, "NONE"))
+    text = replay_text(snapshot_at(line, 5, None), 5, CircleTask())
+    assert "Stall left" in text
+    assert FAULTS["STALL_LEFT"] in text.replace("\\", "")
+
+
+def test_what_is_in_force_of_adaptation_is_told():
+    line = Timeline()
+    line.add(5, records.BeliefChange(5, "adapted", reason="worn"))
+    line.add(6, records.Adaptation(6, "agrees", "nothing new"))
+    rows = dict(health_rows(snapshot_at(line, 7, None)))
+    assert rows["belief"] == "adapted"
+    assert rows["adaptation"] == "nothing new"
+
+
+def test_what_is_missing_of_the_excitation_comes_first():
+    items = [
+        {"name": "rest", "found": 9.0, "wanted": 5.0, "unit": "s", "covered": True},
+        {"name": "hard start", "found": 1.0, "wanted": 6.0, "unit": "times", "covered": False},
+    ]
+    text = coverage_text(items)
+    assert text.startswith("**1 of 2 still missing**")
+    assert text.index("○ hard start | 1 of 6 times") < text.index("✔ rest | 5 of 5 s")
+    assert "nothing is missing" in coverage_text(items[:1])
 
 
 def test_an_empty_instant_can_be_shown():

@@ -22,7 +22,7 @@ def test_rows_in_which_a_value_is_missing_are_left_out():
 
 
 def test_all_curves_are_drawn_up_to_the_instant(plots, timeline):
-    plots.show(timeline, timeline.last_ns, CircleTask())
+    plots.show(timeline, timeline.last_ns, CircleTask(), None)
     assert len(plots._plots) == 7
     for plot in plots._plots:
         assert plot.handle.data[0][-1] >= 3.9, plot.handle.title
@@ -31,5 +31,5 @@ def test_all_curves_are_drawn_up_to_the_instant(plots, timeline):
 
 def test_nothing_known_leaves_the_plots_as_they_are(plots):
     before = [plot.handle.data for plot in plots._plots]
-    plots.show(Timeline(), 10, CircleTask())
+    plots.show(Timeline(), 10, CircleTask(), None)
     assert all(np.array_equal(a, b) for a, b in zip(before, (p.handle.data for p in plots._plots), strict=True))
