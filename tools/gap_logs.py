@@ -6,8 +6,9 @@ import math
 
 import numpy as np
 
+from disco_hw.drive.script import Script
 from disco_hw.log.drive import Commands, DriveLog, Gyro, Poses, Wheels, differentiate_angle
-from sim.drives import make_drive
+from sim.drives import Drive, make_drive
 from sim.effects import EFFECTS, HiddenEffects, hidden_effects
 from sim.log_csv import LogOptions, dirty_log_options, dirty_parameters, simulated_log, varied_parameters
 from sim.plant_parameters import PlantParameters
@@ -21,19 +22,33 @@ def simulated_drive(
     drive: str = "rich",
     dirty: bool = False,
     motors: str = "ideal",
+    robot: int | None = None,
+    script: Script | None = None,
 ) -> DriveLog:
-    """A log of a robot off its drawing with these effects hidden in it."""
-    parameters = varied_parameters(PlantParameters(), seed)
+    """A log of a robot off its drawing with these effects hidden in it.
+
+    `seed` decides drive, noise and robot; `robot` is a seed for the robot's geometry alone. `script`: a script of
+    `disco-hw drive` in place of the drive.
+    """
+    parameters = varied_parameters(PlantParameters(), seed if robot is None else robot)
     if motors == "ideal":
         parameters = parameters.with_ideal_motors()
     options = LogOptions()
     if dirty:
         parameters, options = dirty_parameters(parameters), dirty_log_options()
     effects: HiddenEffects = hidden_effects(hide or {})
-    rows = simulated_log(make_drive(drive, seed), parameters, effects, seed, options)
+    driven = make_drive(drive, seed) if script is None else scripted(script)
+    rows = simulated_log(driven, parameters, effects, seed, options)
     times = np.array([t_s for t_s, _ in rows])
     cells = np.array([[float(cell) if cell else math.nan for cell in row] for _, row in rows])[:, 1:]
     return as_drive(times - times[0], cells, parameters.ticks_per_rev)
+
+
+def scripted(script: Script, rate_hz: float = 50.0) -> Drive:
+    """A script as the commands that `disco-hw drive` sends."""
+    t_s = np.arange(0.0, script.duration_s, 1.0 / rate_hz)
+    wheels = np.array([script.at(float(t)) for t in t_s])
+    return Drive(script.name, 1.0 / rate_hz, t_s, wheels[:, 0], wheels[:, 1], ("scripted",) * t_s.size)
 
 
 def as_drive(t_s: np.ndarray, cells: np.ndarray, ticks_per_rev: int) -> DriveLog:

@@ -47,7 +47,9 @@ class Disco:
         self._weights = weights.astype(np.float32)
         delay_is_believed = model.belief is not None and DELAY in model.belief.names
         self._history = self._history_for(model, theta) + (SPARE_HISTORY if delay_is_believed else 0)
-        may_turn_more = settings.uncertainty in ("mc", "joint") or any(s.name in TURNING_EFFECTS for s in model.effects)
+        may_turn_more = settings.uncertainty in ("mc", "joint") or any(
+            s.name in TURNING_EFFECTS or s.name.startswith("omega +=") for s in model.effects
+        )
         self._wide = True if may_turn_more or self._largest_turn_rad(theta) > NARROW_TURN_RAD else None
         self._series = integration_series(step_s, self._wide is not None, np.float32)
         self._take_points(model, theta)

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from disco_hw.control.sigma_points import sigma_points
 from disco_hw.model import Belief, Mixture, Model
-from disco_hw.model.effects import REGISTRY
 from disco_hw.model.parameter import BASE_PARAMETERS, X_ICR
+from disco_hw.model.terms import effect_of
 
 Array = NDArray[np.float64]
 DOMINANT_WEIGHT = 0.9
@@ -21,7 +21,7 @@ def moving_names(belief: Belief) -> tuple[str, ...]:
     of the three is shared.
     """
     base = {parameter.name for parameter in BASE_PARAMETERS}
-    moving = [name for name in belief.names if name in base or REGISTRY[name.split(".")[0]].moves]
+    moving = [name for name in belief.names if name in base or effect_of(name.split(".")[0]).moves]
     return tuple(sorted(moving, key=lambda name: name == X_ICR.name))
 
 

@@ -12,9 +12,10 @@ from typing import Any, NamedTuple
 from disco_hw.control.blocks import BLOCK, U
 from disco_hw.control.rollout import roll_block
 from disco_hw.control.tasks.terms import has_memory, stage_cost, terminal_cost
+from disco_hw.model.compose import needs_change
 from disco_hw.model.effects import command_delay
 from disco_hw.model.jit import block_function, cast_like, scalar_function, specialise, tune_loops
-from disco_hw.model.step import axle_of, body_step, integration_from, needs_change, tracked_of, wheel_step
+from disco_hw.model.step import axle_of, body_step, integration_from, tracked_of, wheel_step
 from disco_hw.model.tables import base_point, effect_point, lane_base, lane_effects
 
 # Rows of a block's state; one flat buffer at fixed offsets spares the compiler all checks for overlap. Three sets of

@@ -1,53 +1,103 @@
-"""The amended model: nominal geometry refitted, missing effects added, joint uncertainty of old and new parameters."""
+"""The amended model: nominal geometry refitted, what is missing added, joint uncertainty of old and new parameters."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.gap.intervals import Estimate, Estimates
+from disco_hw.gap.search import UnnamedTerm
 from disco_hw.model import EffectSetting, Gaussian, Model
-from disco_hw.model.effects import REGISTRY
 from disco_hw.model.parameter import BASE_PARAMETERS
+from disco_hw.model.terms import TERMS, effect_of
 
 Array = NDArray[np.float64]
 
+_Z95 = 1.96
+
+
+def with_terms_named(part: Estimates, unnamed: Sequence[UnnamedTerm], geometry: tuple[float, float]) -> Estimates:
+    """A channel's estimates with the numbers of its unnamed terms under their names in a model.
+
+    They are put in units of the speeds that wheels of the final `geometry` (radius, axial distance, m) make.
+    """
+    names, factors = list(part.fitted), np.ones(len(part.fitted))
+    by_name = dict(part.by_name)
+    for number, found in enumerate(unnamed):
+        name, column = found.term.model_name, f"term{number}"
+        if name is None or column not in names:
+            continue
+        place = names.index(column)
+        old_radius, old_axial = found.term.geometry
+        factor = TERMS[name].rescaled(geometry[0] / old_radius, geometry[1] / old_axial)
+        names[place], factors[place] = f"{name}.k", factor
+        old = by_name.pop(column)
+        by_name[f"{name}.k"] = Estimate(old.value * factor, old.low * factor, old.high * factor)
+    return Estimates(by_name, tuple(names), part.covariance * np.outer(factors, factors))
+
 
 def amended_model(
-    model: Model, effects: Mapping[str, Mapping[str, Estimate]], parts: tuple[Estimates, ...]
+    model: Model,
+    effects: Mapping[str, Mapping[str, Estimate]],
+    terms: Sequence[str],
+    parts: tuple[Estimates, ...],
 ) -> tuple[Model, tuple[str, ...]]:
-    """The model with base parameters of `parts`, `effects` added, and their joint Gaussian; and notes for a person.
+    """The model with base parameters of `parts`, `effects` and `terms` added, and their joint Gaussian; and notes.
 
-    Values outside an effect's physical range are put at its end, with a note.
+    Terms that the model has already stay, with what was believed of them. Values outside an effect's physical range are
+    put at its end, with a note.
     """
     notes: list[str] = []
     estimates = {name: estimate for part in parts for name, estimate in part.by_name.items()}
+    base = {p.name: estimates[p.name].value for p in BASE_PARAMETERS if p.name in estimates}
+    known = _known_terms(model, base)
+    for name in terms:
+        found, before = estimates[f"{name}.k"], known[name].value if name in known else 0.0
+        known[name] = Estimate(before + found.value, before + found.low, before + found.high)
+    wanted = {**effects, **{name: {"k": estimate} for name, estimate in known.items()}}
     settings = []
-    for name, values in effects.items():
-        known = {parameter.name: parameter for parameter in REGISTRY[name].parameters}
+    for name, values in wanted.items():
         inside = {}
-        for key, parameter in known.items():
+        for parameter in effect_of(name).parameters:
+            key = parameter.name
             value = values[key].value if key in values else parameter.neutral
             inside[key] = min(max(value, parameter.low), parameter.high)
             if inside[key] != value:
                 notes.append(f"{name}.{key}: {value:.4g} is outside what the model takes; {inside[key]:.4g} is written")
         settings.append(EffectSetting(name, inside))
-    base = {p.name: estimates[p.name].value for p in BASE_PARAMETERS if p.name in estimates}
     bare = Model(
         **{p.name: base.get(p.name, getattr(model, p.name)) for p in BASE_PARAMETERS},
         effects=tuple(settings),
         name=model.name,
     )
-    names, covariance = _joint(bare, effects, estimates, parts)
+    names, covariance = _joint(bare, wanted, estimates, parts)
     if not names:
         return bare, tuple(notes)
     point = dict(zip(bare.parameter_names, bare.point(), strict=True))
     belief = Gaussian(names, np.array([point[name] for name in names]), covariance)
-    return Model(bare.wheel_radius_m, bare.axial_distance_m, bare.x_icr_m, bare.effects, belief, bare.name), tuple(
-        notes
-    )
+    return replace(bare, belief=belief), tuple(notes)
+
+
+def _known_terms(model: Model, base: Mapping[str, float]) -> dict[str, Estimate]:
+    """The terms that a model has, with their intervals, in units of the refitted `base`."""
+    ratios = [
+        base.get(name, getattr(model, name)) / getattr(model, name) for name in ("wheel_radius_m", "axial_distance_m")
+    ]
+    found = {}
+    for setting in model.effects:
+        if setting.name not in TERMS:
+            continue
+        factor, key = TERMS[setting.name].rescaled(*ratios), f"{setting.name}.k"
+        deviation = 0.0
+        if model.belief is not None and key in model.belief.names:
+            place = model.belief.names.index(key)
+            deviation = abs(factor) * float(model.belief.covariance()[place, place]) ** 0.5
+        value = setting.values["k"] * factor
+        found[setting.name] = Estimate(value, value - _Z95 * deviation, value + _Z95 * deviation)
+    return found
 
 
 def _joint(

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
-from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,31 +13,10 @@ from disco_hw.gap.channels import Channel, WheelChannel
 from disco_hw.gap.fit import Fit, inverse, sensitivity
 from disco_hw.gap.search import Found
 from disco_hw.model.effects import REGISTRY
+from disco_hw.model.parameter import Parameter
 
 Array = NDArray[np.float64]
 
-# A size that real robots show; an effect whose smallest visible size is above it is one this log is blind to.
-REALISTIC: Mapping[str, float] = MappingProxyType(
-    {
-        "motor_lag.tau_s": 0.05,
-        "command_delay.delay_s": 0.04,
-        "deadband.width_rad_s": 0.25,
-        "stiction.threshold_rad_s": 0.5,
-        "battery_sag.loss": 0.05,
-        "wheel_gain.left": 0.02,
-        "encoder_scale.left": 0.015,
-        "wheel_radius_asymmetry.ratio": 0.008,
-        "turn_slip.k_s": 0.04,
-        "acceleration_slip.k_s2_m": 0.08,
-        "side_slip.k_s": 0.06,
-        "lateral_icr.offset_m": 0.015,
-        "pose_offset.left_m": 0.015,
-        "slope.drift_x_m_s": 0.008,
-        "surface_change.track": 0.06,
-        "pose_latency.latency_s": 0.04,
-        "heading_bias.bias_rad": 0.026,
-    }
-)
 _LIMITS = ("speed_limit", "yaw_rate_limit")
 _EXACT_ALIKE = {"pose_offset": "lateral_icr", "encoder_scale": "wheel_gain"}
 _SCORE = 20.0
@@ -68,10 +45,10 @@ def blind_spots(found: Found) -> tuple[BlindSpot, ...]:
     for spot in tuple(spots):
         for other, like in _EXACT_ALIKE.items():
             if spot.name == like:
-                parameter = next(key for key in REALISTIC if key.startswith(other)).split(".")[1]
+                parameter = next(p for p in REGISTRY[other].parameters if p.realistic is not None)
                 size = spot.smallest_visible
-                blind = size is None or size > REALISTIC[f"{other}.{parameter}"]
-                spots.append(BlindSpot(other, parameter, spot.unit, size, blind, REGISTRY[other].excitation))
+                blind = size is None or size > _realistic(parameter)
+                spots.append(BlindSpot(other, parameter.name, spot.unit, size, blind, experiment_of(other)))
     return tuple(spots)
 
 
@@ -81,10 +58,21 @@ def _spot(channel: Channel, best: Fit, name: str) -> BlindSpot:
     column = f"{name}.{parameter.name}"
     if name in _LIMITS:
         largest = _largest(channel, name)
-        return BlindSpot(name, parameter.name, parameter.unit, largest, largest is None, effect.excitation)
+        return BlindSpot(name, parameter.name, parameter.unit, largest, largest is None, experiment_of(name))
     size = _size(channel, best, name, column, candidate.columns)
-    realistic = REALISTIC.get(column, math.inf)
-    return BlindSpot(name, parameter.name, parameter.unit, size, size is None or size > realistic, effect.excitation)
+    blind = size is None or size > _realistic(parameter)
+    return BlindSpot(name, parameter.name, parameter.unit, size, blind, experiment_of(name))
+
+
+def _realistic(parameter: Parameter) -> float:
+    """A size that real robots show; an effect whose smallest visible size is above it is one this log is blind to."""
+    return math.inf if parameter.realistic is None else parameter.realistic
+
+
+def experiment_of(name: str) -> str:
+    """The drive that shows an effect, as it is typed, and what it is."""
+    effect = REGISTRY[name]
+    return f"disco-hw drive --script {effect.script}: {effect.excitation}"
 
 
 def _largest(channel: Channel, name: str) -> float | None:

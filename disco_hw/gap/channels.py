@@ -141,7 +141,7 @@ class WheelChannel:
     def angles(self, p: Array, extra: Array | None = None) -> Array:
         """Free-running wheel angles at the nodes, (M, 2)."""
         line = self.timeline
-        push = np.zeros_like(line.angle_rad) if extra is None else extra
+        push = total_push(line, 2, line.known_command, extra)
         return run_wheels(p, self.geometry, line.command_rad_s, push, line.first, line.t_s, line.speed_rad_s)
 
     def raw_residual(self, p: Array, extra: Array | None = None) -> Array:
@@ -278,7 +278,7 @@ class BodyChannel:
     def track(self, p: Array, extra: Array | None = None) -> Array:
         """Path at the nodes from the measured wheel angles, (M, 3)."""
         line = self.timeline
-        push = np.zeros((line.t_s.size, 3)) if extra is None else extra
+        push = total_push(line, 3, line.known_motion, extra)
         return run_body(p, line.angle_rad, line.speed_rad_s, push, line.first, line.t_s)
 
     def raw_residual(self, p: Array, extra: Array | None = None) -> Array:
@@ -303,6 +303,11 @@ class BodyChannel:
     def residual(self, p: Array, extra: Array | None = None) -> Array:
         """Whitened residuals, (3 P,)."""
         return (self.whitened(p, extra) * self.weight).ravel()
+
+
+def total_push(line: Timeline, width: int, *pushes: Array | None) -> Array:
+    """Sum (M, width) of what is added at the nodes by those that are there."""
+    return np.asarray(sum((push for push in pushes if push is not None), np.zeros((line.t_s.size, width))))
 
 
 def _windows(line: Timeline) -> tuple[Index, Mask]:

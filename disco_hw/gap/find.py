@@ -14,6 +14,7 @@ from disco_hw.gap.layout import BASE_COUNT, BODY, WHEEL, Layout
 from disco_hw.gap.outcome import Outcome
 from disco_hw.gap.report import GapReport
 from disco_hw.gap.search import search_body, search_wheels
+from disco_hw.gap.terms import with_known_terms
 from disco_hw.gap.timeline import timeline
 from disco_hw.log.drive import DriveLog, concatenate
 from disco_hw.log.errors import LogError
@@ -39,9 +40,8 @@ def find_gap(
     outcome, notes = _searched(log, model, say)
     say("intervals, blind spots and the gap on held-out data")
     effects, unnamed = outcome.effects(), outcome.unnamed()
-    amended, remarks = amended_model(
-        model, {effect.name: effect.parameters for effect in outcome.effects(given=True)}, outcome.parts()
-    )
+    named = {effect.name: effect.parameters for effect in outcome.effects(given=True)}
+    amended, remarks = amended_model(model, named, outcome.terms(), outcome.parts())
     gap = outcome.gap() if outcome.body is not None else {}
     return GapReport(
         sources=log.sources,
@@ -74,6 +74,7 @@ def _searched(log: DriveLog, model: Model, say: Progress) -> tuple[Outcome, list
             "for at least some seconds of driving"
         )
     nominal_body, nominal_wheels = _vector(BODY, model), _vector(WHEEL, model)
+    line = with_known_terms(line, model.effects, nominal_body, WHEEL.at(nominal_wheels, "command_delay.delay_s"))
     geometry = nominal_body[:BASE_COUNT]
     body = wheels = None
     notes: list[str] = []

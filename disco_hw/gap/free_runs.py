@@ -83,10 +83,9 @@ def _run_body(
             right = (angle[i, 1] - angle[i - 1, 1]) * scale[1] / CELL_S
             change = scale[0] * (speed[i, 0] - speed[i - 1, 0]) + scale[1] * (speed[i, 1] - speed[i - 1, 1])
             forward, lateral, half_rate = body_velocity(left + right, right - left, change, t_s[i - 1], base, effects)
-            turn = 2.0 * half_rate * CELL_S
+            turn = (2.0 * half_rate + extra[i - 1, 2]) * CELL_S
             along = (forward + extra[i - 1, 0]) * CELL_S
             across = (lateral + extra[i - 1, 1]) * CELL_S - base.x_icr_m * turn
-            turn += extra[i - 1, 2] * CELL_S
             cosine, sine = math.cos(yaw + 0.5 * turn), math.sin(yaw + 0.5 * turn)
             x += cosine * along - sine * across
             y += sine * along + cosine * across

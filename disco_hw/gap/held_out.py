@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from disco_hw.gap.channels import BodyChannel, WheelChannel
+from disco_hw.gap.channels import BodyChannel, WheelChannel, total_push
 from disco_hw.gap.fit import Fit, by_block, inverse
 from disco_hw.gap.free_runs import read_angles, run_body
 from disco_hw.gap.horizon import displacement, starts_of
@@ -146,9 +146,7 @@ def chain_track(
     line = body.timeline
     p = chain.body.copy()
     scale = [body.layout.place[f"encoder_scale.{side}"] for side in ("left", "right")]
-    push = np.zeros((line.t_s.size, 3)) if extra is None else extra
-    if chain.body_push is not None:
-        push = push + chain.body_push
+    push = total_push(line, 3, line.known_motion, chain.body_push, extra)
     if wheels is None or chain.wheels is None:
         return run_body(p, line.angle_rad, line.speed_rad_s, push, line.first, line.t_s), line.speed_rad_s
     q = chain.wheels.copy()

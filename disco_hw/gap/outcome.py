@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.gap import figures
-from disco_hw.gap.blind_spots import BlindSpot, blind_spots
+from disco_hw.gap.amend import with_terms_named
+from disco_hw.gap.blind_spots import BlindSpot, blind_spots, experiment_of
 from disco_hw.gap.candidates import candidates_of, indices, parameters_of
 from disco_hw.gap.channels import BodyChannel, WheelChannel
 from disco_hw.gap.classes import ASYMMETRY, ENCODER, GAIN, OUTSIDE_TESTS, alike, one_encoder
@@ -87,7 +88,18 @@ class Outcome:
     def parts(self) -> tuple[Estimates, ...]:
         """Estimates of the channels, for the amended model."""
         body, wheels = self._final_body, self._estimates[1]
-        return tuple(part for part in (body[1] if body else None, wheels) if part is not None)
+        geometry = (1.0, 1.0) if body is None else (float(body[0].vector[0]), float(body[0].vector[1]))
+        both = ((self.body, None if body is None else body[1]), (self.wheels, wheels))
+        return tuple(
+            with_terms_named(part, found.unnamed, geometry)
+            for found, part in both
+            if found is not None and part is not None
+        )
+
+    def terms(self) -> tuple[str, ...]:
+        """Names of the accepted unnamed terms that a model can carry."""
+        found = [found for found in (self.body, self.wheels) if found is not None]
+        return tuple(one.term.model_name for each in found for one in each.unnamed if one.term.model_name is not None)
 
     def effects(self, given: bool = False) -> tuple[EffectFinding, ...]:
         """The effects that are missing, in order of evidence; with those `given` in the model, if asked."""
@@ -213,7 +225,7 @@ class Outcome:
             judged = self.wheels if effect.channel is Channel.COMMAND_TO_WHEEL else self.body
             if name not in seen and judged is None:
                 first = effect.parameters[0]
-                spots.append(BlindSpot(name, first.name, first.unit, None, True, effect.excitation))
+                spots.append(BlindSpot(name, first.name, first.unit, None, True, experiment_of(name)))
         return tuple(sorted(spots, key=lambda spot: not spot.blind))
 
     def gap(self) -> dict[str, dict[float, Errors]]:

@@ -52,10 +52,11 @@ _SMOOTH_BODY = (
 
 @dataclass(frozen=True)
 class UnnamedTerm:
-    """An accepted unnamed term: how it is written, with its coefficient, and its evidence."""
+    """An accepted unnamed term: how it is written, with its coefficient, its evidence, and the term itself."""
 
     form: str
     evidence: Evidence
+    term: Term
 
 
 @dataclass(frozen=True)
@@ -204,7 +205,7 @@ def with_unnamed(found: Found, options: Callable[[Found], Iterator[Term]]) -> Fo
     After each, the named effects are selected anew: one that only stood in for the term is not needed any more.
     """
     terms: tuple[Term, ...] = ()
-    accepted: tuple[UnnamedTerm, ...] = ()
+    proofs: tuple[Evidence, ...] = ()
     plain = found.selector
     while len(terms) < _MOST_TERMS:
         best, tried = best_term(found, options(found))
@@ -223,8 +224,12 @@ def with_unnamed(found: Found, options: Callable[[Found], Iterator[Term]]) -> Fo
             break
         terms = (*terms, best)
         names = selector.select()
-        coefficient = float(selector.fit(names).vector[-1])
-        accepted = (*accepted, UnnamedTerm(best.form.format(coefficient), proof))
+        proofs = (*proofs, proof)
+        coefficients = selector.fit(names).vector[-len(terms) :].tolist()
+        accepted = tuple(
+            UnnamedTerm(term.form.format(coefficient), evidence, term)
+            for term, coefficient, evidence in zip(terms, coefficients, proofs, strict=True)
+        )
         found = Found(selector, names, found.channel, accepted, plain)
     return found
 

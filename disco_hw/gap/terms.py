@@ -7,7 +7,7 @@ their effect goes through the free run: nothing is differentiated but the wheels
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,12 +15,13 @@ from numpy.typing import NDArray
 
 from disco_hw.gap.channels import BodyChannel, WheelChannel
 from disco_hw.gap.layout import Layout
-from disco_hw.gap.timeline import CELL_S
+from disco_hw.gap.timeline import CELL_S, Timeline
+from disco_hw.model import EffectSetting
+from disco_hw.model.terms import BODY_FEATURES, BODY_TARGETS, COMMAND, COMMAND_FEATURES, TERMS, term_name
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-AXES = ("v_x", "v_y", "omega")
 _SPAN_NODES = 8
 _DISC_RADII_M = (0.5, 0.75, 1.0, 1.3)
 _DISC_SPACING_M = 0.4
@@ -32,97 +33,95 @@ _LONGEST_S = 400.0
 class Term:
     """A feature at the nodes, (M, 2) in rad/s of command or (M, 3) in m/s, m/s, rad/s of motion, and how it is written.
 
-    `form` has a place for the coefficient.
+    `form` has a place for the coefficient. `model_name`: the term of `disco_hw.model.terms` that it is; None if a model
+    cannot carry it, because it depends on what a model's state does not hold. `geometry`: wheel radius and axial
+    distance (m) that the speeds in it are made with.
     """
 
     form: str
     push: Array
+    model_name: str | None = None
+    geometry: tuple[float, float] = (1.0, 1.0)
 
 
 def wheel_terms(channel: WheelChannel, late_s: float) -> Iterator[Term]:
     """What may be added to both wheels' commands; `late_s` is the dead time that was found."""
     line = channel.timeline
-    raw = np.nan_to_num(line.command_rad_s)
-    late = max(round(late_s / CELL_S), 0)
-    u = np.concatenate([np.repeat(raw[:1], late, axis=0), raw[: raw.shape[0] - late]])
-    other = u[:, ::-1]
-    sign, size = np.tanh(u / 0.05), np.abs(u)
+    u = late_commands(line, late_s)
+    other, t = u[:, ::-1], line.t_s[:, None]
+    for form, feature in COMMAND_FEATURES.items():
+        name = term_name(COMMAND, form)
+        yield Term(_with_place(name), feature(u, other, t), name)
     growth = np.gradient(u, CELL_S, axis=0)
+    sign = COMMAND_FEATURES["sign(u)"](u, other, t)
     angle = line.angle_rad
-    t = (line.t_s - line.t_s[0])[:, None]
     features = {
-        "u |u|": u * size,
-        "u^3": u**3,
-        "sign(u)": sign,
-        "|u|": size,
-        "u^2": u**2,
-        "|u_other| sign(u)": np.abs(other) * sign,
-        "u_other": other,
-        "u_other |u|": other * size,
-        "|u_other| u": np.abs(other) * u,
-        "u_other^2 sign(u)": other**2 * sign,
-        "|u - u_other| sign(u)": np.abs(u - other) * sign,
-        "u / (1 + |u|)": u / (1.0 + size),
         "du/dt": growth,
         "|du/dt| sign(u)": np.abs(growth) * sign,
         "u |du/dt|": u * np.abs(growth),
-        "t u": t * u / 100.0,
-        "t sign(u)": t * sign / 100.0,
         "u sin(wheel angle)": u * np.sin(angle),
         "u cos(wheel angle)": u * np.cos(angle),
     }
-    for form, feature in features.items():
-        yield Term(f"command {{:+.4g}} {form}", feature)
+    for form, push in features.items():
+        yield Term(_with_place(term_name(COMMAND, form)), push)
+
+
+def late_commands(line: Timeline, late_s: float) -> Array:
+    """Commands at the nodes (M, 2) that are in force after a dead time; zero where none is known."""
+    raw = np.nan_to_num(line.command_rad_s)
+    late = max(round(late_s / CELL_S), 0)
+    return np.concatenate([np.repeat(raw[:1], late, axis=0), raw[: raw.shape[0] - late]])
+
+
+def motion(line: Timeline, p: Array) -> tuple[Array, Array, Array]:
+    """Forward speed (m/s), yaw rate (rad/s) and acceleration (m/s^2) that the wheels tell, (M,) each."""
+    speed = line.speed_rad_s
+    v = 0.5 * p[0] * speed.sum(axis=1)
+    return v, p[0] / p[1] * (speed[:, 1] - speed[:, 0]), np.gradient(_smoothed(v), CELL_S)
 
 
 def body_terms(channel: BodyChannel, p: Array) -> Iterator[Term]:
     """What may be added to the body's velocity; `p` is the vector of the channel."""
     line = channel.timeline
-    speed = line.speed_rad_s
-    v = 0.5 * p[0] * speed.sum(axis=1)
-    w = p[0] / p[1] * (speed[:, 1] - speed[:, 0])
-    smooth = _smoothed(v)
-    a, dw = np.gradient(smooth, CELL_S), np.gradient(_smoothed(w), CELL_S)
-    left, right = speed[:, 0] * p[0] / 2.0, speed[:, 1] * p[0] / 2.0
+    v, w, a = motion(line, p)
+    dw = np.gradient(_smoothed(w), CELL_S)
+    moving = np.minimum(np.abs(line.speed_rad_s).max(axis=1) * p[0] / 0.05, 1.0)
+    beyond = {"moving": moving, "domega/dt": dw, "v domega/dt": v * dw}
+    for axis, target in enumerate(BODY_TARGETS):
+        for form, feature in BODY_FEATURES.items():
+            name = term_name(target, form)
+            yield Term(_with_place(name), _on(axis, feature(v, w, a, line.t_s)), name, (float(p[0]), float(p[1])))
+        for form, push in beyond.items():
+            yield Term(_with_place(term_name(target, form)), _on(axis, push))
+    left, right = line.speed_rad_s[:, 0] * p[0] / 2.0, line.speed_rad_s[:, 1] * p[0] / 2.0
     angle = line.angle_rad
-    t = (line.t_s - line.t_s[0]) / 100.0
-    moving = np.minimum(np.abs(speed).max(axis=1) * p[0] / 0.05, 1.0)
-    features = {
-        "moving": moving,
-        "v": v,
-        "|v|": np.abs(v),
-        "v |v|": v * np.abs(v),
-        "v^2": v * v,
-        "v^3": v**3,
-        "omega": w,
-        "|omega|": np.abs(w),
-        "omega |omega|": w * np.abs(w),
-        "omega^2": w * w,
-        "omega^3": w**3,
-        "sign(omega)": np.tanh(w / 0.05),
-        "sign(v)": np.tanh(v / 0.02),
-        "omega / (1 + |omega| / 0.4)": w / (1.0 + np.abs(w) / 0.4),
-        "v omega": v * w,
-        "v |omega|": v * np.abs(w),
-        "|v| omega": np.abs(v) * w,
-        "v^2 omega": v * v * w,
-        "v omega^2": v * w * w,
-        "a": a,
-        "|v| a": np.abs(v) * a,
-        "v |a|": v * np.abs(a),
-        "omega a": w * a,
-        "domega/dt": dw,
-        "v domega/dt": v * dw,
-        "t v": t * v,
-        "t omega": t * w,
-    }
-    for axis, name in enumerate(AXES):
-        for form, feature in features.items():
-            yield Term(f"{name} {{:+.4g}} {form}", _on(axis, feature))
     for wave, turn in (("sin", np.sin), ("cos", np.cos)):
         rim = (left * turn(angle[:, 0]), right * turn(angle[:, 1]))
         push = np.column_stack([rim[0] + rim[1], np.zeros_like(v), 2.0 * (rim[1] - rim[0]) / p[1]])
-        yield Term(f"rim speed {{:+.4g}} {wave}(wheel angle) of itself", push)
+        yield Term(f"rim speed += {{:.4g}} {wave}(wheel angle) of itself", push)
+
+
+def with_known_terms(line: Timeline, effects: Iterable[EffectSetting], p: Array, late_s: float) -> Timeline:
+    """The timeline with what the terms among a given model's effects add; `p` is its vector of the body."""
+    u, (v, w, a) = late_commands(line, late_s), motion(line, p)
+    command = motion_push = None
+    for setting in effects:
+        term = TERMS.get(setting.name)
+        if term is None:
+            continue
+        if term.target == COMMAND:
+            push = setting.values["k"] * COMMAND_FEATURES[term.feature](u, u[:, ::-1], line.t_s[:, None])
+            command = push if command is None else command + push
+        else:
+            push = setting.values["k"] * BODY_FEATURES[term.feature](v, w, a, line.t_s)
+            push = _on(BODY_TARGETS.index(term.target), push)
+            motion_push = push if motion_push is None else motion_push + push
+    return replace(line, known_command=command, known_motion=motion_push)
+
+
+def _with_place(name: str) -> str:
+    """A term's equation with a place for the number in place of the k."""
+    return name.replace("+= k ", "+= {:.4g} ")
 
 
 def places(channel: BodyChannel, p: Array) -> Iterator[Term]:
@@ -141,7 +140,7 @@ def places(channel: BodyChannel, p: Array) -> Iterator[Term]:
                 inside = np.hypot(x - centre_x, y - centre_y) < radius
                 if 0.1 < float(np.abs(w[inside]).sum()) / max(turned, 1e-9) < 0.8:
                     where = f"within {radius:g} m of ({centre_x:.2f}, {centre_y:.2f}) m"
-                    yield Term(f"omega {{:+.4g}} omega {where}", _on(2, np.where(inside, w, 0.0)))
+                    yield Term(f"omega += {{:.4g}} omega {where}", _on(2, np.where(inside, w, 0.0)))
 
 
 def _on(axis: int, feature: Array) -> Array:

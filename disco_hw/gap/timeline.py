@@ -53,7 +53,8 @@ class Timeline:
 
     Nodes (M,): `t_s`, `first` (begins a run), `command_rad_s` (M, 2) mean over the cell that starts there, NaN where no
     command is known; `angle_rad`, `speed_rad_s` (M, 2) measured. `encoder`: wheel samples with `encoder_angle_rad`
-    (E, 2); `pose`: pose samples with `pose` (P, 3) x, y, yaw not wrapped within a run.
+    (E, 2); `pose`: pose samples with `pose` (P, 3) x, y, yaw not wrapped within a run. `known_command` (M, 2) rad/s and
+    `known_motion` (M, 3) m/s, m/s, rad/s: what the terms without a name that a given model has add; None without.
     """
 
     t_s: Array
@@ -69,6 +70,8 @@ class Timeline:
     pose: Samples
     pose_values: Array
     notes: tuple[str, ...] = ()
+    known_command: Array | None = None
+    known_motion: Array | None = None
 
     @property
     def has_commands(self) -> bool:

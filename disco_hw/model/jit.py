@@ -15,6 +15,8 @@ from llvmlite import ir  # type: ignore[import-untyped]
 from numba import njit, types
 from numba.extending import intrinsic, overload
 
+from disco_hw.model.plugins import plugin_sources
+
 # No `nnan`, `ninf` (non-finite costs must stay visible) and no `reassoc` (sums keep their order, so a run replays).
 FAST_MATH = {"contract", "nsz", "arcp"}
 
@@ -47,6 +49,8 @@ def sources_fingerprint() -> str:
     for folder in ("model", "control"):
         for path in sorted((package / folder).rglob("*.py")):
             digest.update(path.read_bytes())
+    for path in plugin_sources():
+        digest.update(path.read_bytes())
     return digest.hexdigest()
 
 

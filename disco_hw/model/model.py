@@ -15,6 +15,7 @@ from disco_hw.model.belief import Belief, Uniform
 from disco_hw.model.effects import MOTION_EFFECTS, REGISTRY, Effect
 from disco_hw.model.parameter import BASE_PARAMETERS, Parameter
 from disco_hw.model.step import Base, Effects
+from disco_hw.model.terms import COMMAND, TERMS, effect_of, table_entry
 
 Array = NDArray[np.float64]
 
@@ -30,8 +31,10 @@ class EffectSetting:
     values: Mapping[str, float]
 
     def __post_init__(self) -> None:
-        if self.name not in REGISTRY:
-            raise ValueError(f"unknown effect {self.name!r}; known are {', '.join(REGISTRY)}")
+        if self.name not in REGISTRY and self.name not in TERMS:
+            raise ValueError(
+                f"unknown effect {self.name!r}; known are {', '.join(REGISTRY)}, and terms such as 'v_x += k v^3'"
+            )
         expected = [parameter.name for parameter in self.effect.parameters]
         for given in self.values:
             if given not in expected:
@@ -46,7 +49,7 @@ class EffectSetting:
     @property
     def effect(self) -> Effect:
         """The effect itself."""
-        return REGISTRY[self.name]
+        return effect_of(self.name)
 
 
 def _check_range(name: str, parameter: Parameter, value: float) -> None:
@@ -163,11 +166,15 @@ def coefficient_tables(model: Model, theta: Array, step_s: float, dtype: type = 
     radius, axial, x_icr = theta[:, 0], theta[:, 1], theta[:, 2]
     base = Base(table(0.5 * radius), table(0.5 * radius / axial), table(x_icr))
     tables: dict[str, tuple[NDArray[np.floating], ...] | None] = dict.fromkeys(MOTION_EFFECTS)
+    terms: dict[bool, list[Any]] = {True: [], False: []}
     column = len(BASE_PARAMETERS)
     for setting in model.effects:
         width = len(setting.effect.parameters)
         values = theta[:, column : column + width]
         column += width
-        if setting.effect.moves:
-            tables[setting.name] = tuple(map(table, setting.effect.coefficients(values, theta[:, :3], step_s)))
-    return base, Effects(**tables)
+        columns = tuple(map(table, setting.effect.coefficients(values, theta[:, :3], step_s)))
+        if setting.name in TERMS:
+            terms[TERMS[setting.name].target == COMMAND].append(table_entry(setting.name, columns))
+        elif setting.effect.moves:
+            tables[setting.name] = columns
+    return base, Effects(**tables, command_terms=tuple(terms[True]) or None, body_terms=tuple(terms[False]) or None)

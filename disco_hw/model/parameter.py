@@ -10,7 +10,8 @@ class Parameter:
     """One number of theta.
 
     `low` and `high` bound what is physically possible; `start` is a plausible value to begin a fit from and `starts`
-    are further ones for parameters whose likelihood has several hills; `neutral` is the value without any effect.
+    are further ones for parameters whose likelihood has several hills; `neutral` is the value without any effect;
+    `realistic` is the smallest size that real robots show, None where that says nothing.
     """
 
     name: str
@@ -20,6 +21,7 @@ class Parameter:
     start: float
     neutral: float = 0.0
     starts: tuple[float, ...] = ()
+    realistic: float | None = None
 
 
 WHEEL_RADIUS = Parameter("wheel_radius_m", "m", 0.005, 2.0, 0.06, neutral=0.06)

@@ -6,7 +6,7 @@ of parameters ("wheel_radius_m", "motor_lag.tau_s", ...) to values; an effect ac
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -42,8 +42,68 @@ def delayed(commands: Any, history: int, theta: Theta, step_s: float) -> Any:
     return (1.0 - fraction) * commands[recent] + fraction * commands[older]
 
 
+def _sign(x: Any, rest: float) -> Any:
+    """The sign of x, faded out below `rest`."""
+    return np.sign(x) * x**2 / (x**2 + rest**2)
+
+
+# The features of terms without a name, as `disco_hw.model.terms` has them.
+COMMAND_FEATURES: Mapping[str, Callable[[Any, Any, Any], Any]] = {
+    "u |u|": lambda u, other, t: np.sign(u) * u**2,
+    "u^3": lambda u, other, t: u**3,
+    "sign(u)": lambda u, other, t: _sign(u, 0.05),
+    "|u|": lambda u, other, t: np.abs(u),
+    "u^2": lambda u, other, t: u**2,
+    "|u_other| sign(u)": lambda u, other, t: np.abs(other) * _sign(u, 0.05),
+    "u_other": lambda u, other, t: other,
+    "u_other |u|": lambda u, other, t: other * np.abs(u),
+    "|u_other| u": lambda u, other, t: np.abs(other) * u,
+    "u_other^2 sign(u)": lambda u, other, t: other**2 * _sign(u, 0.05),
+    "|u - u_other| sign(u)": lambda u, other, t: np.abs(u - other) * _sign(u, 0.05),
+    "u / (1 + |u|)": lambda u, other, t: u / (1.0 + np.abs(u)),
+    "t/100 u": lambda u, other, t: t / 100.0 * u,
+    "t/100 sign(u)": lambda u, other, t: t / 100.0 * _sign(u, 0.05),
+}
+BODY_FEATURES: Mapping[str, Callable[[Any, Any, Any, Any], Any]] = {
+    "v": lambda v, w, a, t: v,
+    "|v|": lambda v, w, a, t: np.abs(v),
+    "v |v|": lambda v, w, a, t: np.sign(v) * v**2,
+    "v^2": lambda v, w, a, t: v**2,
+    "v^3": lambda v, w, a, t: v**3,
+    "omega": lambda v, w, a, t: w,
+    "|omega|": lambda v, w, a, t: np.abs(w),
+    "omega |omega|": lambda v, w, a, t: np.sign(w) * w**2,
+    "omega^2": lambda v, w, a, t: w**2,
+    "omega^3": lambda v, w, a, t: w**3,
+    "sign(omega)": lambda v, w, a, t: _sign(w, 0.05),
+    "sign(v)": lambda v, w, a, t: _sign(v, 0.02),
+    "omega / (2 + 5 |omega|)": lambda v, w, a, t: w / (2.0 + 5.0 * np.abs(w)),
+    "v omega": lambda v, w, a, t: v * w,
+    "v |omega|": lambda v, w, a, t: v * np.abs(w),
+    "|v| omega": lambda v, w, a, t: np.abs(v) * w,
+    "v^2 omega": lambda v, w, a, t: v**2 * w,
+    "v omega^2": lambda v, w, a, t: v * w**2,
+    "a": lambda v, w, a, t: a,
+    "|v| a": lambda v, w, a, t: np.abs(v) * a,
+    "v |a|": lambda v, w, a, t: v * np.abs(a),
+    "omega a": lambda v, w, a, t: w * a,
+    "t/100 v": lambda v, w, a, t: t / 100.0 * v,
+    "t/100 omega": lambda v, w, a, t: t / 100.0 * w,
+}
+
+
+def _terms(theta: Theta, target: str) -> list[tuple[str, Any]]:
+    """Features and coefficients of the terms that act on `target`; they are named `target += k feature`."""
+    parted = [(name.removesuffix(".k").partition(" += k "), value) for name, value in theta.items()]
+    return [(feature, value) for (acted_on, _, feature), value in parted if feature and acted_on == target]
+
+
 def wheel_targets(theta: Theta, state: State, left: Any, right: Any, time_s: float) -> tuple[Any, Any]:
     """Wheel speeds that the drive aims for (rad/s), from commands and the wheel speeds of the state."""
+    u_left, u_right = left, right
+    for feature, k in _terms(theta, "command"):
+        left = left + k * COMMAND_FEATURES[feature](u_left, u_right, time_s)
+        right = right + k * COMMAND_FEATURES[feature](u_right, u_left, time_s)
     if "deadband.width_rad_s" in theta:
         width = theta["deadband.width_rad_s"]
         left, right = (np.sign(u) * np.maximum(np.abs(u) - width, 0.0) for u in (left, right))
@@ -84,6 +144,7 @@ def body_velocity(
     From the mean wheel speeds over a step and the change of their sum over it (rad/s).
     """
     radius, axial = theta["wheel_radius_m"], theta["axial_distance_m"]
+    rolling = (radius * (right + left) / 2.0, radius * (right - left) / axial, radius * change / 2.0 / step_s, time_s)
     if "wheel_radius_asymmetry.ratio" in theta:
         ratio = theta["wheel_radius_asymmetry.ratio"]
         left, right = left * (1.0 - ratio), right * (1.0 + ratio)
@@ -99,9 +160,12 @@ def body_velocity(
     if "acceleration_slip.k_s2_m" in theta:
         acceleration = theta["wheel_radius_m"] * change / 2.0 / step_s
         v = v - np.abs(v) * np.clip(theta["acceleration_slip.k_s2_m"] * acceleration, -0.6, 0.6)
-    v_lateral = -omega * theta["x_icr_m"] - theta.get("side_slip.k_s", 0.0) * v * omega
+    across = -theta.get("side_slip.k_s", 0.0) * v * omega
     v = v + theta.get("lateral_icr.offset_m", 0.0) * omega
-    return v, v_lateral, omega
+    v = v + sum(k * BODY_FEATURES[feature](*rolling) for feature, k in _terms(theta, "v_x"))
+    across = across + sum(k * BODY_FEATURES[feature](*rolling) for feature, k in _terms(theta, "v_y"))
+    omega = omega + sum(k * BODY_FEATURES[feature](*rolling) for feature, k in _terms(theta, "omega"))
+    return v, across - omega * theta["x_icr_m"], omega
 
 
 def step(

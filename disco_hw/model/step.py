@@ -15,28 +15,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.model.effects import (
-    MOTION_EFFECTS,
-    acceleration_slip,
-    battery_sag,
-    deadband,
-    lateral_icr,
-    motor_lag,
-    side_slip,
-    slope,
-    speed_limit,
-    stiction,
-    surface_change,
-    turn_slip,
-    wheel_gain,
-    wheel_radius_asymmetry,
-    yaw_rate_limit,
-)
+from disco_hw.model.compose import body_terms, wheel_terms, world_terms
+from disco_hw.model.effects import MOTION_EFFECTS
 from disco_hw.model.jit import cast_like, scalar_function
+from disco_hw.model.terms import add_to_commands, add_to_velocity
 
-# A field for every effect that moves the robot: None where absent, else what the effect's `coefficients` returned.
+# A field for every effect that moves the robot: None where absent, else what the effect's `coefficients` returned; and
+# one each for the terms without a name that act on commands and on the body.
 effects_type: Any = namedtuple
-Effects = effects_type("Effects", MOTION_EFFECTS)
+Effects = effects_type("Effects", (*MOTION_EFFECTS, "command_terms", "body_terms"), defaults=(None, None))
 
 
 class Base(NamedTuple):
@@ -81,29 +68,13 @@ def integration_from(series: Any, wide: Any) -> Any:
 
 
 @scalar_function
-def needs_change(effects: Any) -> Any:
-    """Whether the body's motion depends on the change of the wheel speeds; a constant to the compiler."""
-    return effects.acceleration_slip is not None
-
-
-@scalar_function
 def wheel_step(left: Any, right: Any, wheel_left: Any, wheel_right: Any, time_s: Any, effects: Any) -> Any:
     """Wheel speeds at the end of a step and their means over it, left and right (rad/s).
 
     From the commands (after the command delay), the wheel speeds at the start of the step and its time.
     """
-    left = deadband.term(left, effects.deadband)
-    right = deadband.term(right, effects.deadband)
-    left, right = yaw_rate_limit.term(left, right, effects.yaw_rate_limit)
-    left = speed_limit.term(left, effects.speed_limit)
-    right = speed_limit.term(right, effects.speed_limit)
-    left, right = wheel_gain.term(left, right, effects.wheel_gain)
-    left, right = battery_sag.term(left, right, time_s, effects.battery_sag)
-    left = stiction.term(left, wheel_left, effects.stiction)
-    right = stiction.term(right, wheel_right, effects.stiction)
-    end_left, mean_left = motor_lag.term(left, wheel_left, effects.motor_lag)
-    end_right, mean_right = motor_lag.term(right, wheel_right, effects.motor_lag)
-    return end_left, end_right, mean_left, mean_right
+    left, right = add_to_commands(left, right, time_s, effects.command_terms)
+    return wheel_terms(left, right, wheel_left, wheel_right, time_s, effects)
 
 
 @scalar_function
@@ -113,15 +84,10 @@ def body_velocity(wheel_sum: Any, difference: Any, change: Any, time_s: Any, bas
     From the mean wheel speeds over a step, left plus right and right minus left, the change of their sum over it
     (rad/s), and the time at its start (s).
     """
-    wheel_sum, difference = wheel_radius_asymmetry.term(wheel_sum, difference, effects.wheel_radius_asymmetry)
-    forward = base.half_radius_m * wheel_sum
-    turn = base.half_turn_ratio * difference
-    forward, turn = surface_change.term(forward, turn, time_s, effects.surface_change)
-    turn = turn_slip.term(turn, effects.turn_slip)
-    forward = acceleration_slip.term(forward, change, effects.acceleration_slip)
-    lateral = side_slip.term(forward, turn, effects.side_slip)
-    forward = lateral_icr.term(forward, turn, effects.lateral_icr)
-    return forward, lateral, turn
+    forward, lateral, turn = body_terms(wheel_sum, difference, change, time_s, base, effects)
+    return add_to_velocity(
+        forward, lateral, turn, wheel_sum, difference, change, time_s, base, effects.body_terms
+    )  # fmt: skip
 
 
 @scalar_function
@@ -195,7 +161,7 @@ def body_step(
     """
     forward, lateral, turn = body_velocity(wheel_sum, difference, change, time_s, base, effects)
     axle_x, axle_y, cos_yaw, sin_yaw = move(axle_x, axle_y, cos_yaw, sin_yaw, forward, lateral, turn, integration)
-    axle_x, axle_y = slope.term(axle_x, axle_y, wheel_sum, difference, effects.slope)
+    axle_x, axle_y = world_terms(axle_x, axle_y, wheel_sum, difference, time_s, effects)
     return axle_x, axle_y, cos_yaw, sin_yaw, forward, turn
 
 

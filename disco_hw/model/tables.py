@@ -10,6 +10,7 @@ from numba import types
 from disco_hw.model.effects import MOTION_EFFECTS
 from disco_hw.model.jit import scalar_function, specialise
 from disco_hw.model.step import Base, Effects
+from disco_hw.model.terms import terms_point
 
 
 @scalar_function
@@ -38,14 +39,16 @@ def _entry(table: Any, i: Any) -> Callable[..., Any] | None:
 
 def effect_point(effects: Any, i: int) -> Any:
     """Coefficients of all effects at point i."""
-    return Effects(*(entry(table, i) for table in effects))
+    named = (entry(getattr(effects, name), i) for name in MOTION_EFFECTS)
+    return Effects(*named, terms_point(effects.command_terms, i), terms_point(effects.body_terms, i))
 
 
 @specialise(effect_point)
 def _effect_point(effects: Any, i: Any) -> Callable[..., Any]:
     # A tuple of mixed types cannot be looped over in compiled code, so the call is written out for every effect.
-    picks = ", ".join(f"entry(effects.{name}, i)" for name in MOTION_EFFECTS)
-    scope: dict[str, Any] = {"Effects": Effects, "entry": entry}
+    calls = [f"entry(effects.{name}, i)" for name in MOTION_EFFECTS]
+    picks = ", ".join([*calls, "terms_point(effects.command_terms, i)", "terms_point(effects.body_terms, i)"])
+    scope: dict[str, Any] = {"Effects": Effects, "entry": entry, "terms_point": terms_point}
     exec(f"def pick(effects, i):\n    return Effects({picks})", scope)
     pick: Callable[..., Any] = scope["pick"]
     return pick
@@ -67,6 +70,13 @@ def _lane_base(base: Any, i: Any) -> Callable[..., Any]:
     return lambda base, i: base
 
 
+def _first_number(kind: Any) -> Any:
+    """The type of the first number, or array of numbers, in tuples within tuples."""
+    while hasattr(kind, "types"):
+        kind = kind.types[0]
+    return kind
+
+
 def lane_effects(effects: Any, i: int) -> Any:
     """Coefficients of all effects for a sample: the point itself, or entry i of a table."""
     return effect_point(effects, i)
@@ -75,7 +85,7 @@ def lane_effects(effects: Any, i: int) -> Any:
 @specialise(lane_effects)
 def _lane_effects(effects: Any, i: Any) -> Callable[..., Any]:
     present = [kind for kind in effects.types if not isinstance(kind, types.NoneType)]
-    if present and isinstance(present[0].types[0], types.Array):
+    if present and isinstance(_first_number(present[0]), types.Array):
 
         def pick(effects: Any, i: Any) -> Any:
             return effect_point(effects, i)

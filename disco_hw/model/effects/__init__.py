@@ -1,22 +1,36 @@
-"""The effects a model can gain, one file each; a module of this package with an `EFFECT` is found by itself."""
+"""The effects a model can gain, one file each; a module of this package with an `EFFECT` is found by itself.
+
+So is one of another package that names it in the entry-point group `disco_hw.effects`.
+"""
 
 from __future__ import annotations
 
 import pkgutil
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from importlib import import_module
 from types import MappingProxyType
+from typing import Any
 
-from disco_hw.model.effects.effect import Channel, Effect
+from disco_hw.model.effects.effect import Channel, Effect, Stage
+from disco_hw.model.plugins import plugin_modules
 
-__all__ = ["MOTION_EFFECTS", "REGISTRY", "Channel", "Effect"]
-
-
-def _discover() -> dict[str, Effect]:
-    modules = (import_module(f"{__name__}.{found.name}") for found in pkgutil.iter_modules(__path__))
-    effects = [module.EFFECT for module in modules if hasattr(module, "EFFECT")]
-    return {effect.name: effect for effect in sorted(effects, key=lambda effect: effect.name)}
+__all__ = ["MOTION_EFFECTS", "REGISTRY", "STEP_TERMS", "Channel", "Effect", "Stage"]
 
 
-REGISTRY: Mapping[str, Effect] = MappingProxyType(_discover())
+def _discover() -> dict[str, tuple[Effect, Any]]:
+    names = (*(f"{__name__}.{found.name}" for found in pkgutil.iter_modules(__path__)), *plugin_modules())
+    modules = [module for module in map(import_module, names) if hasattr(module, "EFFECT")]
+    return {module.EFFECT.name: (module.EFFECT, module) for module in sorted(modules, key=lambda m: str(m.EFFECT.name))}
+
+
+_FOUND = _discover()
+REGISTRY: Mapping[str, Effect] = MappingProxyType({name: effect for name, (effect, _) in _FOUND.items()})
 MOTION_EFFECTS: tuple[str, ...] = tuple(name for name, effect in REGISTRY.items() if effect.moves)
+# The compiled functions that make up a step, in the order in which they act.
+STEP_TERMS: Mapping[str, Callable[..., Any]] = MappingProxyType(
+    {
+        name: module.term
+        for name, (effect, module) in sorted(_FOUND.items(), key=lambda item: item[1][0].order)
+        if effect.stage is not Stage.ELSEWHERE
+    }
+)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from disco_hw.model.effects.effect import Array, Channel
+from disco_hw.model.effects.effect import Array, Channel, Stage
 from disco_hw.model.jit import cast_like, scalar_function
 from disco_hw.model.parameter import Parameter
 
@@ -17,8 +17,11 @@ class AccelerationSlip:
     name = "acceleration_slip"
     channel = Channel.WHEEL_TO_BODY
     moves = True
-    parameters = (Parameter("k_s2_m", "s^2/m", -5.0, 5.0, 0.1),)
+    stage = Stage.FORWARD
+    order = 140
+    parameters = (Parameter("k_s2_m", "s^2/m", -5.0, 5.0, 0.1, realistic=0.08),)
     excitation = "start-stops on a straight, forward and back"
+    script = "starts"
     sentence = "speeding up slips: {k_s2_m:.1%} of the speed is lost for every m/s^2"
 
     def coefficients(self, values: Array, base: Array, step_s: float) -> tuple[Array, ...]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from disco_hw.model.effects.effect import Array, Channel
+from disco_hw.model.effects.effect import Array, Channel, Stage
 from disco_hw.model.jit import cast_like, scalar_function
 from disco_hw.model.parameter import Parameter
 
@@ -18,8 +18,11 @@ class BatterySag:
     name = "battery_sag"
     channel = Channel.COMMAND_TO_WHEEL
     moves = True
-    parameters = (Parameter("loss", "1 in 150 s", 0.0, 0.9, 0.05, starts=(0.02, 0.15)),)
+    stage = Stage.COMMAND
+    order = 50
+    parameters = (Parameter("loss", "1 in 150 s", 0.0, 0.9, 0.05, starts=(0.02, 0.15), realistic=0.05),)
     excitation = "the same manoeuvre early and late in a drive of minutes"
+    script = "straights"
     sentence = "the wheels lose {loss:.1%} of their speed in every 150 s of driving"
 
     def coefficients(self, values: Array, base: Array, step_s: float) -> tuple[Array, ...]:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from disco_hw.model.effects.effect import Array, Channel
+from disco_hw.model.effects.effect import Array, Channel, Stage
 from disco_hw.model.jit import scalar_function
 from disco_hw.model.parameter import Parameter
 
@@ -17,8 +17,11 @@ class CommandDelay:
     name = "command_delay"
     channel = Channel.COMMAND_TO_WHEEL
     moves = True
-    parameters = (Parameter("delay_s", "s", 0.0, 1.0, 0.05, starts=(0.02, 0.15, 0.3)),)
+    stage = Stage.ELSEWHERE
+    order = 0
+    parameters = (Parameter("delay_s", "s", 0.0, 1.0, 0.05, starts=(0.02, 0.15, 0.3), realistic=0.04),)
     excitation = "steps of the wheel command: start-stops and fast steering"
+    script = "starts"
     sentence = "the wheels act on commands {delay_s:.3f} s late"
 
     def coefficients(self, values: Array, base: Array, step_s: float) -> tuple[Array, ...]:

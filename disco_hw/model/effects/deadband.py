@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from disco_hw.model.effects.effect import Array, Channel
+from disco_hw.model.effects.effect import Array, Channel, Stage
 from disco_hw.model.jit import scalar_function
 from disco_hw.model.parameter import Parameter
 
@@ -15,8 +15,11 @@ class Deadband:
     name = "deadband"
     channel = Channel.COMMAND_TO_WHEEL
     moves = True
-    parameters = (Parameter("width_rad_s", "rad/s", 0.0, 5.0, 0.3, starts=(0.1, 0.8)),)
+    stage = Stage.COMMAND
+    order = 10
+    parameters = (Parameter("width_rad_s", "rad/s", 0.0, 5.0, 0.3, starts=(0.1, 0.8), realistic=0.25),)
     excitation = "slow ramps of the wheel command through zero"
+    script = "ramps"
     sentence = "the wheels ignore the first {width_rad_s:.2f} rad/s of every command"
 
     def coefficients(self, values: Array, base: Array, step_s: float) -> tuple[Array, ...]:

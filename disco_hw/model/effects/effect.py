@@ -21,8 +21,27 @@ class Channel(enum.Enum):
     POSE_SENSOR = "pose_sensor"
 
 
+class Stage(enum.Enum):
+    """What of a step an effect's `term` changes, that is what it returns.
+
+    A `term` names what it needs: of the wheels `left`, `right` (commands, rad/s) or `command` and `speed` of one wheel
+    at a time, `time_s`; of the body `wheel_sum`, `difference` (of right and left, rad/s), `change` (of the sum over the
+    step), `forward` (m/s), `turn` (half the yaw rate, rad/s), `time_s`; and `coefficients`, None where it is absent.
+    """
+
+    COMMAND = "the commands left and right, or the one of a wheel"
+    RESPONSE = "wheel speed at the end of the step and its mean"
+    ROLLING = "wheel_sum and difference"
+    VELOCITY = "forward and turn"
+    FORWARD = "forward"
+    TURN = "turn"
+    LATERAL = "lateral speed that comes on top (m/s), None where the effect is absent"
+    WORLD = "x and y (m) after the step"
+    ELSEWHERE = "nothing: what it changes lies outside the step"
+
+
 class Effect(Protocol):
-    """One effect; its file also holds `term`, the compiled scalar function that `disco_hw.model.step` calls.
+    """One effect; its file also holds `term`, the compiled scalar function that the step calls where `stage` says.
 
     `excitation` is the manoeuvre that shows it; `sentence` describes it for a report, with `{parameter}` fields.
     """
@@ -40,12 +59,24 @@ class Effect(Protocol):
         """Whether it changes motion; if not, it only changes what is measured."""
 
     @property
+    def stage(self) -> Stage:
+        """What its term changes."""
+
+    @property
+    def order(self) -> int:
+        """Place of its term among those of a step, ascending; 70 is the motors' response, 100 on is the body."""
+
+    @property
     def parameters(self) -> tuple[Parameter, ...]:
         """Its parameters, in the order of all arrays."""
 
     @property
     def excitation(self) -> str:
         """The manoeuvre that shows it."""
+
+    @property
+    def script(self) -> str:
+        """The script of `disco-hw drive --script` that drives this manoeuvre."""
 
     @property
     def sentence(self) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from disco_hw.model.effects.effect import Array, Channel
+from disco_hw.model.effects.effect import Array, Channel, Stage
 from disco_hw.model.parameter import Parameter
 
 
@@ -12,8 +12,11 @@ class EncoderScale:
     name = "encoder_scale"
     channel = Channel.WHEEL_TO_BODY
     moves = False
-    parameters = (Parameter("left", "1", -0.9, 2.0, 0.0), Parameter("right", "1", -0.9, 2.0, 0.0))
+    stage = Stage.ELSEWHERE
+    order = 0
+    parameters = (Parameter("left", "1", -0.9, 2.0, 0.0, realistic=0.015), Parameter("right", "1", -0.9, 2.0, 0.0))
     excitation = "straights and turns at several speeds, with poses"
+    script = "straights"
     sentence = "the left encoder counts {left:+.1%} and the right encoder {right:+.1%} from what the wheel turns"
 
     def coefficients(self, values: Array, base: Array, step_s: float) -> tuple[Array, ...]:

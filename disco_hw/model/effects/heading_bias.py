@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from disco_hw.model.effects.effect import Array, Channel
+from disco_hw.model.effects.effect import Array, Channel, Stage
 from disco_hw.model.parameter import Parameter
 
 
@@ -14,8 +14,11 @@ class HeadingBias:
     name = "heading_bias"
     channel = Channel.POSE_SENSOR
     moves = False
-    parameters = (Parameter("bias_rad", "rad", -3.2, 3.2, 0.0),)
+    stage = Stage.ELSEWHERE
+    order = 0
+    parameters = (Parameter("bias_rad", "rad", -3.2, 3.2, 0.0, realistic=0.026),)
     excitation = "straights and fast steering"
+    script = "curves"
     sentence = "the measured yaw is {bias_rad:+.4f} rad off"
 
     def coefficients(self, values: Array, base: Array, step_s: float) -> tuple[Array, ...]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from disco_hw.model.effects.effect import Array, Channel
+from disco_hw.model.effects.effect import Array, Channel, Stage
 from disco_hw.model.jit import scalar_function
 from disco_hw.model.parameter import Parameter
 
@@ -15,8 +15,11 @@ class LateralIcr:
     name = "lateral_icr"
     channel = Channel.WHEEL_TO_BODY
     moves = True
-    parameters = (Parameter("offset_m", "m", -1.0, 1.0, 0.0),)
+    stage = Stage.FORWARD
+    order = 160
+    parameters = (Parameter("offset_m", "m", -1.0, 1.0, 0.0, realistic=0.015),)
     excitation = "turning on the spot, both ways"
+    script = "spins"
     sentence = "the robot turns about a point {offset_m:+.3f} m to the left of its middle line"
 
     def coefficients(self, values: Array, base: Array, step_s: float) -> tuple[Array, ...]:

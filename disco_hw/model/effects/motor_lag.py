@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from disco_hw.model.effects.effect import Array, Channel
+from disco_hw.model.effects.effect import Array, Channel, Stage
 from disco_hw.model.jit import scalar_function
 from disco_hw.model.parameter import Parameter
 
@@ -17,8 +17,11 @@ class MotorLag:
     name = "motor_lag"
     channel = Channel.COMMAND_TO_WHEEL
     moves = True
-    parameters = (Parameter("tau_s", "s", 0.0, 2.0, 0.1, starts=(0.03, 0.3)),)
+    stage = Stage.RESPONSE
+    order = 70
+    parameters = (Parameter("tau_s", "s", 0.0, 2.0, 0.1, starts=(0.03, 0.3), realistic=0.05),)
     excitation = "steps of the wheel command: start-stops and fast steering"
+    script = "starts"
     sentence = "the wheels follow their command with a time constant of {tau_s:.3f} s"
 
     def coefficients(self, values: Array, base: Array, step_s: float) -> tuple[Array, ...]:
@@ -29,13 +32,13 @@ class MotorLag:
 
 
 @scalar_function
-def term(target: float, speed: float, coefficients: Any) -> Any:
+def term(command: float, speed: float, coefficients: Any) -> Any:
     """Wheel speed at the end of the step and its mean over the step (rad/s)."""
     if coefficients is None:
-        return target, target
+        return command, command
     left_at_end, left_in_mean = coefficients
-    error = speed - target
-    return target + error * left_at_end, target + error * left_in_mean
+    error = speed - command
+    return command + error * left_at_end, command + error * left_in_mean
 
 
 EFFECT = MotorLag()

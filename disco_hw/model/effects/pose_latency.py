@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from disco_hw.model.effects.effect import Array, Channel
+from disco_hw.model.effects.effect import Array, Channel, Stage
 from disco_hw.model.parameter import Parameter
 
 
@@ -14,8 +14,11 @@ class PoseLatency:
     name = "pose_latency"
     channel = Channel.POSE_SENSOR
     moves = False
-    parameters = (Parameter("latency_s", "s", -0.5, 2.0, 0.05, starts=(0.0, 0.2)),)
+    stage = Stage.ELSEWHERE
+    order = 0
+    parameters = (Parameter("latency_s", "s", -0.5, 2.0, 0.05, starts=(0.0, 0.2), realistic=0.04),)
     excitation = "fast steering and start-stops"
+    script = "starts"
     sentence = "poses are {latency_s:.3f} s older than their time stamps"
 
     def coefficients(self, values: Array, base: Array, step_s: float) -> tuple[Array, ...]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from disco_hw.model.effects.effect import Array, Channel
+from disco_hw.model.effects.effect import Array, Channel, Stage
 from disco_hw.model.parameter import Parameter
 
 
@@ -14,8 +14,14 @@ class PoseOffset:
     name = "pose_offset"
     channel = Channel.POSE_SENSOR
     moves = False
-    parameters = (Parameter("forward_m", "m", -1.0, 1.0, 0.0), Parameter("left_m", "m", -1.0, 1.0, 0.0))
+    stage = Stage.ELSEWHERE
+    order = 0
+    parameters = (
+        Parameter("forward_m", "m", -1.0, 1.0, 0.0),
+        Parameter("left_m", "m", -1.0, 1.0, 0.0, realistic=0.015),
+    )
     excitation = "turning on the spot, both ways"
+    script = "spins"
     sentence = "the pose sensor sits {forward_m:+.3f} m forward and {left_m:+.3f} m to the left of the tracked point"
 
     def coefficients(self, values: Array, base: Array, step_s: float) -> tuple[Array, ...]:

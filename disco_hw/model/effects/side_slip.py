@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from disco_hw.model.effects.effect import Array, Channel
+from disco_hw.model.effects.effect import Array, Channel, Stage
 from disco_hw.model.jit import scalar_function
 from disco_hw.model.parameter import Parameter
 
@@ -15,8 +15,11 @@ class SideSlip:
     name = "side_slip"
     channel = Channel.WHEEL_TO_BODY
     moves = True
-    parameters = (Parameter("k_s", "s", -2.0, 2.0, 0.05),)
+    stage = Stage.LATERAL
+    order = 150
+    parameters = (Parameter("k_s", "s", -2.0, 2.0, 0.05, realistic=0.06),)
     excitation = "circles at two speeds, both ways"
+    script = "curves"
     sentence = "in a turn the body slides outwards with {k_s:.3f} s times speed and yaw rate"
 
     def coefficients(self, values: Array, base: Array, step_s: float) -> tuple[Array, ...]:

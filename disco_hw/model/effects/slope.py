@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from disco_hw.model.effects.effect import Array, Channel
+from disco_hw.model.effects.effect import Array, Channel, Stage
 from disco_hw.model.jit import cast_like, scalar_function
 from disco_hw.model.parameter import Parameter
 
@@ -17,11 +17,14 @@ class Slope:
     name = "slope"
     channel = Channel.WHEEL_TO_BODY
     moves = True
+    stage = Stage.WORLD
+    order = 170
     parameters = (
-        Parameter("drift_x_m_s", "m/s", -1.0, 1.0, 0.0),
+        Parameter("drift_x_m_s", "m/s", -1.0, 1.0, 0.0, realistic=0.008),
         Parameter("drift_y_m_s", "m/s", -1.0, 1.0, 0.0),
     )
     excitation = "straights and turns in all directions"
+    script = "straights"
     sentence = "a moving robot drifts with ({drift_x_m_s:+.3f}, {drift_y_m_s:+.3f}) m/s in the world frame"
 
     def coefficients(self, values: Array, base: Array, step_s: float) -> tuple[Array, ...]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from disco_hw.model.effects.effect import Array, Channel
+from disco_hw.model.effects.effect import Array, Channel, Stage
 from disco_hw.model.jit import scalar_function
 from disco_hw.model.parameter import Parameter
 
@@ -16,8 +16,11 @@ class SpeedLimit:
     name = "speed_limit"
     channel = Channel.COMMAND_TO_WHEEL
     moves = True
+    stage = Stage.COMMAND
+    order = 30
     parameters = (Parameter("limit_rad_s", "rad/s", 0.1, 100.0, 6.0, neutral=math.inf, starts=(3.0, 10.0)),)
     excitation = "straights and turns at full speed"
+    script = "straights"
     sentence = "no wheel turns faster than {limit_rad_s:.2f} rad/s"
 
     def coefficients(self, values: Array, base: Array, step_s: float) -> tuple[Array, ...]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from disco_hw.model.effects.effect import Array, Channel
+from disco_hw.model.effects.effect import Array, Channel, Stage
 from disco_hw.model.jit import cast_like, scalar_function
 from disco_hw.model.parameter import Parameter
 
@@ -17,8 +17,11 @@ class Stiction:
     name = "stiction"
     channel = Channel.COMMAND_TO_WHEEL
     moves = True
-    parameters = (Parameter("threshold_rad_s", "rad/s", 0.0, 5.0, 0.7, starts=(0.3, 1.2)),)
+    stage = Stage.COMMAND
+    order = 60
+    parameters = (Parameter("threshold_rad_s", "rad/s", 0.0, 5.0, 0.7, starts=(0.3, 1.2), realistic=0.5),)
     excitation = "slow ramps of the wheel command from rest"
+    script = "ramps"
     sentence = "a wheel at rest starts to turn only above {threshold_rad_s:.2f} rad/s"
 
     def coefficients(self, values: Array, base: Array, step_s: float) -> tuple[Array, ...]:
@@ -27,13 +30,13 @@ class Stiction:
 
 
 @scalar_function
-def term(target: Any, speed: Any, coefficients: Any) -> Any:
-    """Target of a wheel that turns with `speed` at the start of the step (rad/s)."""
+def term(command: Any, speed: Any, coefficients: Any) -> Any:
+    """Command that moves a wheel that turns with `speed` at the start of the step (rad/s)."""
     if coefficients is None:
-        return target
+        return command
     (threshold,) = coefficients
-    stuck = (abs(speed) < cast_like(REST_RAD_S, speed)) & (abs(target) <= threshold)
-    return cast_like(0.0, target) if stuck else target
+    stuck = (abs(speed) < cast_like(REST_RAD_S, speed)) & (abs(command) <= threshold)
+    return cast_like(0.0, command) if stuck else command
 
 
 EFFECT = Stiction()

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from disco_hw.model.effects.effect import Array, Channel
+from disco_hw.model.effects.effect import Array, Channel, Stage
 from disco_hw.model.jit import cast_like, scalar_function
 from disco_hw.model.parameter import Parameter
 
@@ -18,12 +18,15 @@ class SurfaceChange:
     name = "surface_change"
     channel = Channel.WHEEL_TO_BODY
     moves = True
+    stage = Stage.VELOCITY
+    order = 120
     parameters = (
-        Parameter("track", "1", -0.8, 3.0, 0.0),
+        Parameter("track", "1", -0.8, 3.0, 0.0, realistic=0.06),
         Parameter("time_s", "s", 0.0, 1e5, 60.0, neutral=math.inf),
         Parameter("radius", "1", -0.8, 3.0, 0.0),
     )
     excitation = "the same turns early and late in the drive"
+    script = "spins"
     sentence = "from {time_s:.1f} s on the axial distance is {track:+.1%} and the wheel radius {radius:+.1%} different"
 
     def coefficients(self, values: Array, base: Array, step_s: float) -> tuple[Array, ...]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from disco_hw.model.effects.effect import Array, Channel
+from disco_hw.model.effects.effect import Array, Channel, Stage
 from disco_hw.model.jit import cast_like, scalar_function
 from disco_hw.model.parameter import Parameter
 
@@ -17,8 +17,11 @@ class TurnSlip:
     name = "turn_slip"
     channel = Channel.WHEEL_TO_BODY
     moves = True
-    parameters = (Parameter("k_s", "s/rad", -2.0, 2.0, 0.05, starts=(-0.05,)),)
+    stage = Stage.TURN
+    order = 130
+    parameters = (Parameter("k_s", "s/rad", -2.0, 2.0, 0.05, starts=(-0.05,), realistic=0.04),)
     excitation = "turning on the spot at two rates, both ways"
+    script = "spins"
     sentence = "turning slips: {k_s:.1%} of the turn is lost for every rad/s of it"
 
     def coefficients(self, values: Array, base: Array, step_s: float) -> tuple[Array, ...]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from disco_hw.model.effects.effect import Array, Channel
+from disco_hw.model.effects.effect import Array, Channel, Stage
 from disco_hw.model.jit import scalar_function
 from disco_hw.model.parameter import Parameter
 
@@ -15,8 +15,11 @@ class WheelGain:
     name = "wheel_gain"
     channel = Channel.COMMAND_TO_WHEEL
     moves = True
-    parameters = (Parameter("left", "1", -0.9, 2.0, 0.0), Parameter("right", "1", -0.9, 2.0, 0.0))
+    stage = Stage.COMMAND
+    order = 40
+    parameters = (Parameter("left", "1", -0.9, 2.0, 0.0, realistic=0.02), Parameter("right", "1", -0.9, 2.0, 0.0))
     excitation = "straights and turns at several speeds"
+    script = "straights"
     sentence = "the left wheel turns {left:+.1%} and the right wheel {right:+.1%} from what was commanded"
 
     def coefficients(self, values: Array, base: Array, step_s: float) -> tuple[Array, ...]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from disco_hw.model.effects.effect import Array, Channel
+from disco_hw.model.effects.effect import Array, Channel, Stage
 from disco_hw.model.jit import scalar_function
 from disco_hw.model.parameter import Parameter
 
@@ -15,8 +15,11 @@ class WheelRadiusAsymmetry:
     name = "wheel_radius_asymmetry"
     channel = Channel.WHEEL_TO_BODY
     moves = True
-    parameters = (Parameter("ratio", "1", -0.5, 0.5, 0.0),)
+    stage = Stage.ROLLING
+    order = 110
+    parameters = (Parameter("ratio", "1", -0.5, 0.5, 0.0, realistic=0.008),)
     excitation = "long straights, forward and back"
+    script = "straights"
     sentence = "the right wheels are {ratio:+.2%} larger than the mean and the left ones as much smaller"
 
     def coefficients(self, values: Array, base: Array, step_s: float) -> tuple[Array, ...]:

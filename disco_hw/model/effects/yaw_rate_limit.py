@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from disco_hw.model.effects.effect import Array, Channel
+from disco_hw.model.effects.effect import Array, Channel, Stage
 from disco_hw.model.jit import cast_like, scalar_function
 from disco_hw.model.parameter import Parameter
 
@@ -16,8 +16,11 @@ class YawRateLimit:
     name = "yaw_rate_limit"
     channel = Channel.COMMAND_TO_WHEEL
     moves = True
+    stage = Stage.COMMAND
+    order = 20
     parameters = (Parameter("limit_rad_s", "rad/s", 0.05, 20.0, 1.0, neutral=math.inf, starts=(0.5, 2.0)),)
     excitation = "turning on the spot, fast"
+    script = "spins"
     sentence = "the robot never turns faster than {limit_rad_s:.2f} rad/s, whatever the command"
 
     def coefficients(self, values: Array, base: Array, step_s: float) -> tuple[Array, ...]:

@@ -1,0 +1,97 @@
+"""What has no name goes into the model: the free run errs less, and DISCO plans with it."""
+
+import math
+from functools import cache
+
+import numpy as np
+import pytest
+
+from disco_hw.control import Circle, Disco, DiscoSettings, PlannerState, Sampler, SentCommand, WheelLimits
+from disco_hw.gap import find_gap
+from disco_hw.model import Model, load_model, save_model
+from disco_hw.model.free_run import FreeRun
+from tools.gap_logs import simulated_drive
+
+MODEL = Model(0.061, 0.415, 0.238)
+AHEAD_S, STEP_S = 2.0, 0.02
+
+
+@cache
+def report_of(name, size, seed=902):
+    return find_gap(simulated_drive({name: size}, seed=seed), MODEL)
+
+
+def rms_error_m(model, log):
+    """Error of free runs of the whole model from the commands alone, 2 s ahead, by the model's own step (FreeRun)."""
+    run = FreeRun(model, model.point()[None], STEP_S)
+    ahead, squares = round(AHEAD_S / STEP_S), []
+    for t0 in np.arange(3.0, log.poses.t_s[-1] - AHEAD_S - 1.0, 1.0):
+        grid = t0 + STEP_S * np.arange(-50, ahead)
+        index = np.clip(np.searchsorted(log.commands.t_s, grid + 1e-3, side="right") - 1, 0, None)
+        commands = np.column_stack([log.commands.left_rad_s[index], log.commands.right_rad_s[index]])
+        before, after = (int(np.argmin(np.abs(log.poses.t_s - t))) for t in (t0, t0 + AHEAD_S))
+        wheel = int(np.argmin(np.abs(log.wheels.t_s - t0)))
+        start = [
+            log.poses.x_m[before], log.poses.y_m[before], log.poses.yaw_rad[before],
+            log.wheels.left_speed_rad_s[wheel], log.wheels.right_speed_rad_s[wheel],
+        ]  # fmt: skip
+        states = run.states(np.array(start), commands, 50, float(t0))
+        at = (log.poses.t_s[after] - log.poses.t_s[before]) / STEP_S
+        end = [np.interp(at, np.arange(states.shape[0]), states[:, axis]) for axis in (0, 1)]
+        squares.append((end[0] - log.poses.x_m[after]) ** 2 + (end[1] - log.poses.y_m[after]) ** 2)
+    return math.sqrt(np.mean(squares))
+
+
+@pytest.mark.parametrize(
+    ("name", "size", "term"),
+    [("x_speed_squared_drag", 0.6, "v_x += k v^3"), ("x_motor_droop", 0.012, "command += k u |u|")],
+)
+def test_the_form_that_was_found_closes_the_gap_on_another_drive(name, size, term, tmp_path):
+    report = report_of(name, size)
+    assert [setting.name for setting in report.model.effects] == [term]
+    save_model(report.model, tmp_path / "model.toml")
+    amended = load_model(tmp_path / "model.toml")
+    other = simulated_drive({name: size}, seed=903, robot=902)
+    plain = Model(amended.wheel_radius_m, amended.axial_distance_m, amended.x_icr_m)
+    # The same robot without the effect: what the noise alone makes.
+    floor = rms_error_m(plain, simulated_drive({}, seed=903, robot=902))
+    before, after = rms_error_m(plain, other), rms_error_m(amended, other)
+    assert before - after >= 0.7 * (before - floor), (before, after, floor)
+
+
+def test_all_parameters_are_believed_jointly():
+    belief = report_of("x_speed_squared_drag", 0.6).model.belief
+    names = belief.names
+    assert names == ("wheel_radius_m", "axial_distance_m", "x_icr_m", "v_x += k v^3.k")
+    covariance = belief.covariance()
+    assert np.linalg.eigvalsh(covariance).min() > 0.0
+    # More drag and larger wheels look alike.
+    correlation = covariance[0, 3] / math.sqrt(covariance[0, 0] * covariance[3, 3])
+    assert correlation < -0.3
+
+
+def test_a_term_that_the_model_has_already_is_not_found_again():
+    amended = report_of("x_speed_squared_drag", 0.6).model
+    again = find_gap(simulated_drive({"x_speed_squared_drag": 0.6}, seed=902), amended)
+    assert not again.unnamed
+    assert not again.effects
+    assert again.gap["nominal"][2.0].position_m < 1.1 * again.gap["amended"][2.0].position_m
+    assert again.model.effects[0].values["k"] == pytest.approx(amended.effects[0].values["k"], rel=0.05)
+    assert "v_x += k v^3.k" in again.model.belief.names
+
+
+def test_disco_plans_with_it_and_commands_what_the_term_takes_away():
+    model = report_of("x_motor_droop", 0.012).model
+    settings = DiscoSettings(sampler=Sampler(samples=160, horizon=30), retries=0)
+    planned = {}
+    for name, used in (
+        ("amended", model),
+        ("bare", Model(model.wheel_radius_m, model.axial_distance_m, model.x_icr_m)),
+    ):
+        disco = Disco(used, Circle(), settings, WheelLimits(8.0, 20.0), 1)
+        state = PlannerState(0, 0.75, 0.0, math.pi / 2, 5.0, 7.0, sent=(SentCommand(0, 5.0, 7.0),), elapsed_s=3.0)
+        for k in range(6):
+            plan = disco.plan(k * 50_000_000, state)
+        planned[name] = np.asarray(plan.wheel_speeds)[5:15].mean()
+        assert np.isfinite(disco.point_trajectories()).all()
+    assert planned["amended"] > 1.02 * planned["bare"]

@@ -1,0 +1,84 @@
+"""Terms without a name: what they add, in the compiled step and in the reference; nothing where there are none."""
+
+import numpy as np
+import pytest
+
+from disco_hw.model import EffectSetting, Gaussian, Model, load_model, reference, save_model
+from disco_hw.model.free_run import FreeRun
+from disco_hw.model.terms import BODY_FEATURES, COMMAND_FEATURES, TERMS
+
+BASE = (0.06, 0.4, 0.1)
+STEP_S = 0.05
+DRIVE = np.repeat([[4.0, 4.0], [-3.0, 2.0], [6.0, 1.0], [0.0, 0.5], [-5.0, -4.0]], 6, axis=0)
+
+
+def compiled(effects, time_s=60.0):
+    model = Model(*BASE, effects=effects)
+    return FreeRun(model, model.point()[None], STEP_S).states(np.zeros(5), DRIVE, 0, time_s)
+
+
+def by_reference(effects, time_s=60.0):
+    model = Model(*BASE, effects=effects)
+    theta = reference.theta_of(model.parameter_names, model.point())
+    states = [reference.State(0.0, 0.0, 0.0, 0.0, 0.0)]
+    for t, (left, right) in enumerate(DRIVE):
+        states.append(reference.step(theta, states[-1], left, right, STEP_S, time_s + t * STEP_S)[0])
+    return np.array([[s.x, s.y, s.yaw, s.wheel_left, s.wheel_right] for s in states])
+
+
+def every_term(target, features):
+    return tuple(
+        EffectSetting(f"{target} += k {feature}", {"k": 0.003 * (1 + n)}) for n, feature in enumerate(features)
+    )
+
+
+@pytest.mark.parametrize("target", ["command", "v_x", "v_y", "omega"])
+def test_every_feature_agrees_with_the_reference(target):
+    features = COMMAND_FEATURES if target == "command" else BODY_FEATURES
+    effects = (EffectSetting("motor_lag", {"tau_s": 0.1}), *every_term(target, features))
+    np.testing.assert_allclose(compiled(effects), by_reference(effects), atol=1e-9)
+
+
+def test_each_single_term_adds_what_it_says():
+    # Features one by one by hand: two plain libraries could share a slip in the pairing of names and formulas.
+    u, other = np.array([2.0, -3.0]), np.array([-3.0, 2.0])
+    assert COMMAND_FEATURES["u |u|"](u, other, 0.0) == pytest.approx([4.0, -9.0])
+    assert COMMAND_FEATURES["|u_other| sign(u)"](u, other, 0.0) == pytest.approx([3.0, -2.0], rel=1e-3)
+    assert BODY_FEATURES["v^3"](-0.5, 9.0, 9.0, 9.0) == pytest.approx(-0.125)
+    assert BODY_FEATURES["|v| omega"](-0.5, 2.0, 9.0, 9.0) == pytest.approx(1.0)
+    assert BODY_FEATURES["omega / (2 + 5 |omega|)"](0.0, -2.0, 0.0, 0.0) == pytest.approx(-1.0 / 6.0)
+    assert BODY_FEATURES["v |a|"](-0.5, 0.0, -2.0, 0.0) == pytest.approx(-1.0)
+    drag = (EffectSetting("v_x += k v^3", {"k": -0.4}),)
+    v = 0.06 * 4.0
+    assert compiled(drag)[6, 0] == pytest.approx((v - 0.4 * v**3) * 0.3)
+    droop = (EffectSetting("command += k u |u|", {"k": -0.01}),)
+    assert compiled(droop)[6, 3:] == pytest.approx([3.84, 3.84])
+    assert compiled(droop)[12, 3:] == pytest.approx([-2.91, 1.96])
+
+
+def test_a_term_on_the_yaw_rate_turns_about_the_axle():
+    spun = compiled((EffectSetting("omega += k omega", {"k": 0.5}),))
+    wider = Model(0.06, 0.4 / 1.5, 0.1)
+    same = FreeRun(wider, wider.point()[None], STEP_S).states(np.zeros(5), DRIVE, 0, 60.0)
+    np.testing.assert_allclose(spun, same, atol=1e-9)
+
+
+def test_terms_stand_in_a_model_file_and_its_belief(tmp_path):
+    name = "v_x += k v^3"
+    names = ("wheel_radius_m", "axial_distance_m", f"{name}.k")
+    belief = Gaussian(names, np.array([0.06, 0.4, -0.4]), np.diag([1e-6, 1e-4, 1e-3]))
+    model = Model(*BASE, effects=(EffectSetting(name, {"k": -0.4}),), belief=belief)
+    save_model(model, tmp_path / "model.toml")
+    again = load_model(tmp_path / "model.toml")
+    assert again.parameter_names == model.parameter_names
+    np.testing.assert_array_equal(again.belief.covariance(), model.belief.covariance())
+    with pytest.raises(ValueError, match=r"unknown effect 'v_x \+= k v\^4'"):
+        EffectSetting("v_x += k v^4", {"k": 1.0})
+
+
+def test_coefficients_keep_their_meaning_on_other_wheels():
+    term = TERMS["omega += k v^2 omega"]
+    # v^2 omega of wheels 2 % larger on an axle 10 % longer is 1.02^3 / 1.1 times the old.
+    assert term.rescaled(1.02, 1.1) == pytest.approx(1.1 / 1.02**3)
+    assert TERMS["v_x += k v |a|"].rescaled(1.02, 1.1) == pytest.approx(1.0 / 1.02**2)
+    assert TERMS["command += k u^3"].rescaled(1.02, 1.1) == 1.0
