@@ -11,7 +11,7 @@ import numpy as np
 from disco_hw.adapt.coordinates import NAMES
 from disco_hw.adapt.guard import BeliefGuard, Geometry, Outcome
 from disco_hw.adapt.link import AdapterLink
-from disco_hw.adapt.messages import InForce, Pose, Proposal, Report, Samples, Wheels
+from disco_hw.adapt.messages import InForce, Pose, Proposal, Range, Report, Samples, Wheels
 from disco_hw.log import records
 from drivers.types import Readings
 
@@ -88,7 +88,8 @@ class CheckedAdaptation:
     """Adaptation through a link to an adapter.
 
     `put_in_force` makes planner and estimator use a geometry, None for the model file's; it raises ValueError for one
-    that they cannot take. What goes into force is recorded in the same tick, before that tick plans.
+    that they cannot take. `wheel_rad_s` is the wheels' largest speed. What goes into force is recorded in the same
+    tick, before that tick plans.
     """
 
     def __init__(
@@ -97,8 +98,10 @@ class CheckedAdaptation:
         guard: BeliefGuard,
         model: Geometry,
         put_in_force: Callable[[Geometry | None], None],
+        wheel_rad_s: float,
     ) -> None:
         self._link, self._guard, self._model, self._put_in_force = link, guard, model, put_in_force
+        self._wheel_rad_s = wheel_rad_s
         self._paused = False
         self._asked: str | None = None
         self._counts = dict.fromkeys(("published", "confirming", "agrees", "refused", "reverted", "losses"), 0)
@@ -113,7 +116,7 @@ class CheckedAdaptation:
         """Take in what was learnt, and put in force what passed the checks."""
         if self._begun_ns is None:
             self._begun_ns = now_ns
-            self._tell(now_ns, self._model, adapted=False)
+            self._begin(now_ns)
         found: list[records.Record] = []
         events: list[str] = []
         asked, self._asked = self._asked, None
@@ -176,6 +179,14 @@ class CheckedAdaptation:
     def close(self) -> None:
         """End the adapter."""
         self._link.close()
+
+    def _begin(self, now_ns: int) -> None:
+        """Tell an adapter that knows nothing yet what it is about."""
+        mean, low, high = (tuple(values.tolist()) for values in (self._model.mean, self._guard.low, self._guard.high))
+        self._link.send(Range(mean, low, high, self._wheel_rad_s))
+        self._tell(now_ns, self._model, adapted=False)
+        if self._guard.adapted:
+            self._tell(now_ns, self._guard.in_force, adapted=True, relearn=True)
 
     def _take(self, now_ns: int, report: Report, found: list[records.Record], events: list[str]) -> None:
         self._text, self._advantage = report.text, report.advantage

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,10 @@ from disco_hw.adapt.samples import SampleWindow
 from disco_hw.inference.excitation import UnusableDriveError
 from disco_hw.inference.noise import measured_noise
 
+if TYPE_CHECKING:
+    # Importing it loads torch, which takes seconds: who trains a network does so in a thread of its own.
+    from disco_hw.adapt.network import WindowNetwork
+
 Array = NDArray[np.float64]
 
 PERIOD_S = 1.0
@@ -24,10 +29,20 @@ CHANGE_LIMIT = 30.0
 WIDEST = np.array([0.03, 0.04, 0.08])
 """Wider than this (x_icr in m, the others by their size) the drive says too little to plan by."""
 
+INFERENCE_S = 4.0
+"""Between two conditionings of the network."""
+
+USUAL_WIDENING = np.array([1.2, 1.2, 1.2])
+"""Of the closed form's standard deviations, before the network has said how much it takes for honest ones."""
+
+LARGEST_WIDENING = 2.0
+DISAGREEMENT = 4.0
+
 _MARGIN_S = 2.0
 _NEWEST_S = 3.0
 _LEAST_MOVING = 0.5
 _LEAST_DATA_S = 2.5
+_SHORTEST_S = 3.0
 _QUIET_CHANGE = 15.0
 _SUSPICIOUS_CHANGE = 20.0
 _NOISE_PERIOD_S = 20.0
@@ -39,7 +54,8 @@ _SCORED_S = 0.9
 class Adapter:
     """Learns the geometry from the running drive. Pure: the same messages give the same reports."""
 
-    def __init__(self) -> None:
+    def __init__(self, network: WindowNetwork | None = None) -> None:
+        self._network = network
         self._window = SampleWindow(WINDOW_S + _MARGIN_S)
         self._noise = RunningNoise()
         self._recursive: RecursiveGeometry | None = None
@@ -49,11 +65,19 @@ class Adapter:
         self._noise_s = -np.inf
         self._scored_s = -np.inf
         self._advantage = 0.0
+        self._next_inference_s = -np.inf
+        self._widening = USUAL_WIDENING
+        self._doubt = ""
+
+    def equip(self, network: WindowNetwork) -> None:
+        """Condition this network from now on."""
+        self._network = network
 
     def take(self, message: ToAdapter) -> Report | None:
         """Take in one message; a report if it is time for one."""
         if isinstance(message, InForce):
             self._drive_by(message)
+        if not isinstance(message, Samples):
             return None
         self._window.add(message)
         if message.now_ns < self._next_ns or self._recursive is None:
@@ -90,7 +114,36 @@ class Adapter:
         fault = _undetermined(judged)
         if fault:
             return Report(now_ns, fault, advantage=self._advantage)
-        return Report(now_ns, _words(judged), (_proposal(window.newest_ns(), judged),), self._advantage)
+        t_ns = window.newest_ns()
+        inferred = self._infer(t_ns, newest_s, seen, judged)
+        return Report(now_ns, _words(judged), (*inferred, self._proposal(t_ns, judged)), self._advantage)
+
+    def _infer(self, t_ns: int, now_s: float, seen: Evidence, judged: Judged) -> tuple[Proposal, ...]:
+        """Condition the network on the window since the last change, if it is time to."""
+        if self._network is None or now_s < self._next_inference_s:
+            return ()
+        part = seen.part(seen.t_s > judged.since_s)
+        moving_s = float(part.moving_s.sum())
+        if moving_s < _SHORTEST_S:
+            return ()
+        self._next_inference_s = now_s + INFERENCE_S
+        found = self._network.condition(part)
+        self._doubt = found.doubt
+        if found.doubt:
+            return ()
+        apart = np.abs(found.mean - judged.mean)
+        if bool((apart > DISAGREEMENT * np.sqrt(np.diag(found.covariance) + np.diag(judged.covariance))).any()):
+            self._doubt = "density network and recursive estimate disagree"
+            return ()
+        self._widening = np.clip(found.widening, 1.0, LARGEST_WIDENING)
+        return (_proposal(t_ns, "network", found.mean, found.covariance, moving_s, ""),)
+
+    def _proposal(self, t_ns: int, judged: Judged) -> Proposal:
+        """The recursive estimate, as wide as the network has shown such estimates to be."""
+        suspected = judged.changed_s is None and judged.largest_change > _SUSPICIOUS_CHANGE
+        doubt = "the robot may just have changed" if suspected else self._doubt
+        covariance = judged.covariance * np.outer(self._widening, self._widening)
+        return _proposal(t_ns, "recursive", judged.mean, covariance, judged.data_s, doubt)
 
     def _learn_noise(self, judged: Judged, now_s: float) -> None:
         """Measure the noise where the geometry has been one for long, so that no change counts as slip."""
@@ -150,13 +203,7 @@ def _words(judged: Judged) -> str:
     return f"{changed}{judged.data_s:.0f} s of driving agree (worst split: chi-square {judged.largest_change:.1f})"
 
 
-def _proposal(t_ns: int, judged: Judged) -> Proposal:
-    suspected = judged.changed_s is None and judged.largest_change > _SUSPICIOUS_CHANGE
-    return Proposal(
-        t_ns,
-        "recursive",
-        tuple(judged.mean.tolist()),
-        tuple(judged.covariance.ravel().tolist()),
-        judged.data_s,
-        "the robot may just have changed" if suspected else "",
-    )
+def _proposal(t_ns: int, estimator: str, mean: Array, covariance: Array, data_s: float, doubt: str) -> Proposal:
+    x_icr, radius, axial = mean.tolist()
+    a, b, c, d, e, f, g, h, i = covariance.ravel().tolist()
+    return Proposal(t_ns, estimator, (x_icr, radius, axial), (a, b, c, d, e, f, g, h, i), data_s, doubt)

@@ -36,6 +36,17 @@ class Evidence:
     values: Array
     moving_s: Array
 
+    def part(self, chosen: NDArray[np.bool_]) -> Evidence:
+        """The evidence of some of the poses."""
+        return Evidence(
+            self.t_s[chosen],
+            self.information[chosen],
+            self.score[chosen],
+            self.square[chosen],
+            self.values[chosen],
+            self.moving_s[chosen],
+        )
+
 
 def evidence(drive: Excitation, noise: Noise) -> Evidence:
     """The evidence of each pose of a drive under this noise."""

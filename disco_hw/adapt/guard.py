@@ -76,7 +76,7 @@ class BeliefGuard:
     """
 
     def __init__(self, model: Geometry, low: Array, high: Array, settings: GuardSettings | None = None) -> None:
-        self._model, self._low, self._high = model, low, high
+        self._model, self.low, self.high = model, low, high
         self._settings = settings or GuardSettings()
         self.in_force = model
         self.adapted = False
@@ -127,10 +127,10 @@ class BeliefGuard:
             return proposal.doubt
         if not abs(now_ns - proposal.t_ns) <= self._settings.stale_s * 1e9:
             return f"rests on driving {(now_ns - proposal.t_ns) * 1e-9:.0f} s ago"
-        outside = (mean < self._low) | (mean > self._high)
+        outside = (mean < self.low) | (mean > self.high)
         if outside.any():
             worst = int(np.argmax(outside))
-            return f"{NAMES[worst]} {mean[worst]:.4g} is outside [{self._low[worst]:g}, {self._high[worst]:g}]"
+            return f"{NAMES[worst]} {mean[worst]:.4g} is outside [{self.low[worst]:g}, {self.high[worst]:g}]"
         impossible = (mean - 2.0 * scale < _PHYSICAL_LOW) | (mean + 2.0 * scale > _PHYSICAL_HIGH)
         if impossible.any():
             worst = int(np.argmax(impossible))

@@ -33,6 +33,15 @@ class Samples(msgspec.Struct, frozen=True, tag="samples", gc=False):
     poses: tuple[Pose, ...] = ()
 
 
+class Range(msgspec.Struct, frozen=True, tag="range", gc=False):
+    """What the network is to be trained for: geometry between `low` and `high` about `mean`, wheels up to a speed."""
+
+    mean: Triple
+    low: Triple
+    high: Triple
+    wheel_rad_s: float
+
+
 class InForce(msgspec.Struct, frozen=True, tag="in_force", gc=False):
     """The belief over the geometry (order of `coordinates.NAMES`) that the robot drives by from `now_ns` on.
 
@@ -70,5 +79,5 @@ class Report(msgspec.Struct, frozen=True, tag="report", gc=False):
     advantage: float = 0.0
 
 
-ToAdapter = Samples | InForce
+ToAdapter = Samples | InForce | Range
 FromAdapter = Report

@@ -61,13 +61,13 @@ class RecursiveGeometry:
 
     def judge(self, window: Evidence, fold_before_s: float) -> Judged:
         """Take in the window's evidence; what is older than `fold_before_s` need not come again."""
-        part = _later(window, self._folded_s)
+        part = window.part(window.t_s > self._folded_s)
         split_s, worst = self._worst_split(part)
         changed_s = None
         if worst > self._change_limit and split_s is not None:
             changed_s = split_s
             self._open(split_s)
-            part = _later(window, self._folded_s)
+            part = window.part(window.t_s > self._folded_s)
         mean, covariance = self._with(part)
         misfit = _misfit(part, mean)
         theta, spread = from_linear(mean, covariance)
@@ -113,7 +113,7 @@ class RecursiveGeometry:
         return mean, 0.5 * (covariance + covariance.T) + _LEAST_VARIANCE * np.eye(3)
 
     def _fold(self, part: Evidence, before_s: float) -> None:
-        old = _between(part, before_s)
+        old = part.part(part.t_s <= before_s)
         if not old.t_s.size:
             return
         self._mean, covariance = self._with(old)
@@ -124,25 +124,6 @@ class RecursiveGeometry:
         self._covariance = covariance + drift
         self._folded_s = float(old.t_s[-1])
         self._data_s += moved_s
-
-
-def _later(window: Evidence, than_s: float) -> Evidence:
-    return _part(window, window.t_s > than_s)
-
-
-def _between(window: Evidence, before_s: float) -> Evidence:
-    return _part(window, window.t_s <= before_s)
-
-
-def _part(window: Evidence, chosen: NDArray[np.bool_]) -> Evidence:
-    return Evidence(
-        window.t_s[chosen],
-        window.information[chosen],
-        window.score[chosen],
-        window.square[chosen],
-        window.values[chosen],
-        window.moving_s[chosen],
-    )
 
 
 def _moving_s(part: Evidence) -> float:

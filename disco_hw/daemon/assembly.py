@@ -62,6 +62,7 @@ def make_adaptation(setup: Setup, pipeline: Pipeline, link: AdapterLink) -> Chec
         BeliefGuard(believed, *possible_range(setup.config.prior)),
         believed,
         lambda geometry: put_in_force(pipeline, setup.model, geometry),
+        setup.config.robot.max_wheel_speed_rad_s,
     )
 
 
