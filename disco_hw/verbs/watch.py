@@ -30,6 +30,7 @@ def view(
         str, typer.Option(help="Address to listen on; any but this host's own needs the token that is printed.")
     ] = LOOPBACK,
     port: Annotated[int, typer.Option(min=1, max=65535, help="Port of the page.")] = DEFAULT_PORT,
+    as_json: AsJson = False,
 ) -> None:
     """Show the page: a log, or the running daemon."""
     from disco_hw.viewer import commands
@@ -37,7 +38,7 @@ def view(
     if live:
         if robot is None or log is not None:
             raise InputError("view --live: needs --robot ROBOT.toml and no LOG")
-        raise typer.Exit(commands.view_live(robot, model, host, port))
+        raise typer.Exit(commands.view_live(robot, model, host, port, as_json=as_json))
     if log is None:
         raise InputError("view: give a LOG, or --live with --robot ROBOT.toml")
     if snapshot is not None:
@@ -46,8 +47,11 @@ def view(
         commands.video_log(log, video, speed, robot)
     if export is not None:
         commands.export_log(log, export, robot=robot)
-    if snapshot is None and video is None and export is None:
-        raise typer.Exit(commands.view_log(log, robot, host, port))
+    written = [str(path) for path in (snapshot, video, export) if path is not None]
+    if not written:
+        raise typer.Exit(commands.view_log(log, robot, host, port, as_json))
+    if as_json:
+        print_result({"written": written}, as_json, "")
 
 
 def replay(log: Annotated[Path, typer.Argument(metavar="LOG")], as_json: AsJson = False) -> None:

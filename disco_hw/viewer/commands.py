@@ -5,9 +5,11 @@ What a page does not need is imported where it is used: the plotting library alo
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import json
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 from rich.progress import Progress
@@ -19,6 +21,7 @@ from disco_hw.errors import InputError
 from disco_hw.viewer.address import DEFAULT_PORT, LOOPBACK
 from disco_hw.viewer.desk import Desk
 from disco_hw.viewer.live import LivePage, run_live
+from disco_hw.viewer.marks import marks_of
 from disco_hw.viewer.recording import Recording
 from disco_hw.viewer.replay import ReplayPage, run_replay
 from disco_hw.viewer.server import serving
@@ -31,6 +34,7 @@ def view_live(
     host: str = LOOPBACK,
     port: int = DEFAULT_PORT,
     ended: Callable[[], bool] = lambda: False,
+    as_json: bool = False,
 ) -> int:
     """Serve the live page of this robot's daemon until SIGTERM, SIGINT or `ended()`; returns the exit code.
 
@@ -45,12 +49,14 @@ def view_live(
         serving(f"disco-hw: {stage.name}", host, port, desk) as page,
     ):
         live = LivePage(page.server, stage, socket, desk)
-        print(f"page: {page.url}", flush=True)
+        _tell({"page": page.url}, as_json)
         run_live(live, lambda: signals.received is not None or ended())
     return 0
 
 
-def view_log(log: Path, robot: Path | None = None, host: str = LOOPBACK, port: int = DEFAULT_PORT) -> int:
+def view_log(
+    log: Path, robot: Path | None = None, host: str = LOOPBACK, port: int = DEFAULT_PORT, as_json: bool = False
+) -> int:
     """Serve the replay of a log until SIGTERM or SIGINT; returns the exit code.
 
     `robot` replaces the robot.toml kept in the log. Raises InputError for a bad file, host or port.
@@ -61,9 +67,21 @@ def view_log(log: Path, robot: Path | None = None, host: str = LOOPBACK, port: i
         serving(f"disco-hw: {log.name}", host, port) as page,
     ):
         replay = ReplayPage(page.server, recording)
-        print(f"page: {page.url}", flush=True)
+        _tell({"page": page.url, **in_figures(recording)}, as_json)
         run_replay(replay, lambda: signals.received is not None)
     return 0
+
+
+def in_figures(recording: Recording) -> dict[str, Any]:
+    """What a log shows, for machines: its length, its ticks, and every mark with its time and words."""
+    marks = marks_of(recording.timeline)
+    return {
+        "duration_s": recording.duration_s,
+        "ticks": len(recording.ticks),
+        "marks": [
+            {"t_s": (mark.t_ns - recording.first_ns) * 1e-9, "kind": mark.kind, "text": mark.text} for mark in marks
+        ],
+    }
 
 
 def snapshot_log(log: Path, out: Path, at_s: float | None = None, robot: Path | None = None) -> None:
@@ -94,6 +112,11 @@ def export_log(log: Path, out: Path, robot: Path | None = None) -> None:
     with Recording(log, robot) as recording, _progress(f"writing {out.name}") as progress:
         _check_folder(out)
         export_html(recording, out, progress)
+
+
+def _tell(served: Mapping[str, Any], as_json: bool) -> None:
+    """Say where the page is, at once: whoever started it waits for the line."""
+    print(json.dumps(served) if as_json else f"page: {served['page']}", flush=True)
 
 
 def _check_folder(out: Path) -> None:

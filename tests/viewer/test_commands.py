@@ -1,5 +1,7 @@
 """Pictures, clips and exported pages of a log, and the pages as processes."""
 
+import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -11,7 +13,8 @@ from PIL import Image
 
 from disco_hw.errors import InputError
 from disco_hw.viewer import picture, scene
-from disco_hw.viewer.commands import export_log, snapshot_log, video_log
+from disco_hw.viewer.commands import export_log, in_figures, snapshot_log, video_log
+from tests.viewer.run import FAULT_TICK
 
 
 def count_of(image, colour, tolerance=12):
@@ -64,6 +67,37 @@ def test_mp4_needs_ffmpeg(log_file, tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(InputError, match="ffmpeg"):
         video_log(log_file, tmp_path / "a.mp4")
+
+
+@pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="ffmpeg is not installed: apt-get install ffmpeg")
+def test_an_mp4_is_written(log_file, tmp_path):
+    video_log(log_file, tmp_path / "a.mp4", speed=20.0)
+    assert (tmp_path / "a.mp4").read_bytes()[4:8] == b"ftyp"
+
+
+def test_a_log_in_figures_has_every_mark(recording):
+    figures = in_figures(recording)
+    assert figures["ticks"] == 200
+    assert figures["duration_s"] == pytest.approx(3.98)
+    found = {mark["kind"]: mark["t_s"] for mark in figures["marks"]}
+    assert found["fault"] == pytest.approx(FAULT_TICK * 0.02)
+    assert set(found) == {"event", "fault", "overrun", "rejected frames", "pose rejected"}
+    json.dumps(figures)
+
+
+def run_view(*arguments):
+    return subprocess.run(
+        [sys.executable, "-m", "disco_hw", "view", *map(str, arguments)], capture_output=True, text=True, check=False
+    )
+
+
+def test_json_is_one_object_on_standard_output(log_file, tmp_path):
+    done = run_view(log_file, "--snapshot", tmp_path / "a.png", "--json")
+    assert json.loads(done.stdout) == {"written": [str(tmp_path / "a.png")]}
+    bad = run_view(log_file, "--video", tmp_path / "a.avi", "--json")
+    assert bad.returncode == 2
+    assert bad.stdout == ""
+    assert len(bad.stderr.strip().splitlines()) == 1
 
 
 def test_a_clip_without_end_is_refused(recording, tmp_path, monkeypatch):
