@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 SOURCES := pyproject.toml setup.py constraints.txt firmware_protocol/build_firmware.py firmware_protocol/disco_robot.dbc \
 	$(wildcard firmware_protocol/firmware/*.c firmware_protocol/firmware/*.h)
 
-.PHONY: venv demo test bench gap-study firmware-check clean
+.PHONY: venv demo chromium test bench gap-study firmware-check clean
 
 venv: $(STAMP)
 
@@ -22,7 +22,17 @@ $(STAMP): $(SOURCES) | $(BIN)/python
 demo: $(STAMP)
 	$(BIN)/disco-hw demo
 
-test: $(STAMP)
+# The page's tests need a browser and are skipped without one. CHROMIUM=install (and CI) installs it on Debian, as root.
+CHROMIUM ?= $(if $(CI),install)
+
+chromium:
+ifeq ($(CHROMIUM),install)
+	@command -v chromium >/dev/null || { [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null && \
+		timeout 300 sh -c 'apt-get -qq update && apt-get -qq -y --no-install-recommends install chromium fonts-dejavu-core' >/dev/null; } || \
+		echo "Chromium could not be installed (Debian, root and its mirrors are needed); the page's tests are skipped"
+endif
+
+test: $(STAMP) chromium
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
