@@ -31,7 +31,10 @@ class SignalLayout:
 
 @dataclass(frozen=True, slots=True)
 class MessageLayout:
-    """One message; `data_id` is None where it carries no E2E header, `page_signal` names the multiplexer if any."""
+    """One message; `data_id` is None where it carries no E2E header, `page_signal` names the multiplexer if any.
+
+    `period_s` is None for what is sent only when there is something to say.
+    """
 
     name: str
     can_id: int
@@ -39,6 +42,7 @@ class MessageLayout:
     sender: str
     data_id: int | None
     page_signal: str | None
+    period_s: float | None
     signals: tuple[SignalLayout, ...]
 
 
@@ -105,6 +109,7 @@ def _message_layout(message: cantools.database.can.Message, major: int) -> Messa
         sender=message.senders[0],
         data_id=data_id(message.frame_id, data_id_major) if {"crc", "counter"} <= names else None,
         page_signal=multiplexers[0] if multiplexers else None,
+        period_s=message.cycle_time / 1000.0 if message.cycle_time else None,
         signals=tuple(_signal_layout(signal) for signal in message.signals),
     )
 

@@ -1,7 +1,29 @@
-"""Settings of the whole suite."""
+"""Settings of the whole suite; `--robot ROBOT.toml` runs the protocol's conformance suite on a robot instead of it."""
 
+from pathlib import Path
+
+import pytest
 from hypothesis import settings
 
 # The machine's load is not a property of the code: no example fails for being slow.
 settings.register_profile("project", deadline=None, print_blob=True)
 settings.load_profile("project")
+
+ROBOT_TESTS = Path(__file__).parent / "robot"
+
+
+def pytest_ignore_collect(collection_path, config):
+    """With a robot only its tests are run, without one all others."""
+    of_robot = collection_path == ROBOT_TESTS or ROBOT_TESTS in collection_path.parents
+    on_the_way = collection_path in ROBOT_TESTS.parents
+    if of_robot or not on_the_way:
+        return of_robot != bool(config.getoption("--robot")) or None
+    return None
+
+
+def pytest_collection_modifyitems(config, items):
+    if config.getoption("--robot") and not config.getoption("--allow-motion"):
+        still = pytest.mark.skip(reason="turns the wheels; lift them off the ground and give --allow-motion")
+        for item in items:
+            if item.get_closest_marker("motion"):
+                item.add_marker(still)

@@ -5,6 +5,9 @@
 #include "firmware.h"
 #include "protocol_constants.h"
 
+/* firmware.c */
+void disco_advance(disco_firmware_t *core, uint64_t clock_us);
+
 /* reception.c */
 void disco_reject(disco_firmware_t *core, uint8_t reason);
 bool disco_e2e_usable(disco_firmware_t *core, disco_e2e_status_t status, bool qualified);

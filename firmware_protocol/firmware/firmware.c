@@ -4,6 +4,7 @@
 
 /* A longer pause between two cycles must not become one big step of the setpoint. */
 #define LONGEST_CYCLE_US (10000u)
+#define NOMINAL_CYCLE_US (1000u)
 #define BUS_OFF_ABOVE (255u)
 
 void disco_firmware_init(disco_firmware_t *core, const disco_config_t *config, uint64_t entropy)
@@ -70,12 +71,24 @@ static void report(const disco_firmware_t *core, disco_outputs_t *outputs)
     };
 }
 
+void disco_advance(disco_firmware_t *core, uint64_t clock_us)
+{
+    if (clock_us > core->clock_us) {
+        core->now_us += clock_us - core->clock_us;
+        core->clock_us = clock_us;
+    }
+}
+
 void disco_firmware_step(disco_firmware_t *core, uint64_t now_us, const disco_inputs_t *inputs,
                          disco_outputs_t *outputs)
 {
-    if (now_us > core->now_us) {
-        core->now_us = now_us;
+    if (now_us > core->cycle_us) {
+        disco_advance(core, now_us);
+    } else {
+        core->clock_us = now_us;
+        core->now_us += NOMINAL_CYCLE_US;
     }
+    core->cycle_us = now_us;
     uint64_t elapsed_us = core->now_us - core->last_step_us;
     elapsed_us = (elapsed_us < LONGEST_CYCLE_US) ? elapsed_us : LONGEST_CYCLE_US;
     core->last_step_us = core->now_us;

@@ -1,7 +1,8 @@
 /* The reference firmware core: frames and measurements in, wheel setpoints and frames out. No I/O, clock or allocation.
  *
  * Call disco_firmware_receive for each frame from the bus and disco_firmware_step at 1 kHz, both with the same
- * monotonic microsecond clock, from one context; then send what disco_firmware_pop gives.
+ * monotonic microsecond clock, from one context; then send what disco_firmware_pop gives. Should the clock stand or go
+ * back all the same, each cycle counts as a millisecond: no watchdog waits for a broken clock.
  */
 #ifndef DISCO_FIRMWARE_H
 #define DISCO_FIRMWARE_H
@@ -104,7 +105,9 @@ typedef struct {
     disco_drive_t drive;
     disco_telemetry_t telemetry;
     disco_transmit_t transmit;
-    uint64_t now_us;
+    uint64_t now_us;   /* the core's own time, which only goes forwards */
+    uint64_t clock_us; /* the caller's clock, when it last told */
+    uint64_t cycle_us; /* the same, at the last cycle */
     uint64_t last_step_us;
     uint32_t rejected[DISCO_REJECT_REASONS];
     uint32_t rejected_total;

@@ -16,6 +16,9 @@ bool disco_e2e_usable(disco_firmware_t *core, disco_e2e_status_t status, bool qu
     switch (status) {
     case DISCO_E2E_OK:
     case DISCO_E2E_OK_SOME_LOST:
+        if (status == DISCO_E2E_OK_SOME_LOST) {
+            core->sequence_errors++;
+        }
         usable = qualified;
         if (!usable) {
             disco_reject(core, DISCO_REJECT_REASON_NOT_QUALIFIED);
@@ -124,9 +127,7 @@ static bool is_for_us(uint32_t can_id)
 void disco_firmware_receive(disco_firmware_t *core, uint64_t now_us, uint32_t can_id, const uint8_t *data,
                             uint8_t length)
 {
-    if (now_us > core->now_us) {
-        core->now_us = now_us;
-    }
+    disco_advance(core, now_us);
     /* A command that comes too late must find the watchdog expired, even if no cycle ran in between. */
     disco_supervise(core);
     if (can_id == DISCO_ROBOT_ESTOP_FRAME_ID) {

@@ -227,6 +227,7 @@ void disco_telemetry_parameter(disco_firmware_t *core, uint8_t status, uint16_t 
 void disco_firmware_pose(disco_firmware_t *core, double x, double y, double yaw, uint64_t sample_us,
                          double position_std, double yaw_std)
 {
+    const uint64_t own_us = sample_us + (core->now_us - core->clock_us);
     const double largest_x = DISCO_POSE_POSITION_X_SCALE * 0x7FFFFF;
     const double largest_yaw = DISCO_POSE_HEADING_YAW_SCALE * INT16_MAX;
     /* Written so that what is not a number is not valid. */
@@ -240,7 +241,7 @@ void disco_firmware_pose(disco_firmware_t *core, double x, double y, double yaw,
     struct disco_robot_pose_heading_t heading = {
         .valid = valid,
         .yaw = raw_i16(yaw, DISCO_POSE_HEADING_YAW_SCALE),
-        .sample_time = (uint16_t)((sample_us & TIME_MASK) / (uint64_t)DISCO_POSE_HEADING_SAMPLE_TIME_SCALE),
+        .sample_time = (uint16_t)((own_us & TIME_MASK) / (uint64_t)DISCO_POSE_HEADING_SAMPLE_TIME_SCALE),
         .position_std = raw_u8(position_std, DISCO_POSE_HEADING_POSITION_STD_SCALE),
         .yaw_std = raw_u8(yaw_std, DISCO_POSE_HEADING_YAW_STD_SCALE),
     };

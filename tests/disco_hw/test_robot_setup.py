@@ -13,7 +13,7 @@ from disco_hw.daemon import daemon
 from disco_hw.daemon.daemon import DaemonOptions, run_daemon
 from disco_hw.errors import InputError
 from disco_hw.model import EffectSetting, Gaussian, Model, load_model, save_model
-from disco_hw.robot_setup import geometry, load_setup
+from disco_hw.robot_setup import geometry, link_key, load_setup
 
 ROBOT = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
 
@@ -61,3 +61,17 @@ def test_a_model_marked_as_lacking_an_effect_is_run_only_when_told_to(tmp_path, 
         run_daemon(DaemonOptions(robot=ROBOT, model=marked))
     assert run_daemon(DaemonOptions(robot=ROBOT, model=marked, accept_missing_effects=True)) == 0
     assert run_daemon(DaemonOptions(robot=ROBOT)) == 0
+
+
+def test_the_key_is_read_from_beside_robot_toml_and_a_bad_one_named_in_a_line(tmp_path):
+    text = ROBOT.read_text(encoding="utf-8").replace('file = "wombot_model.toml"', "")
+    robot_file = tmp_path / "robot.toml"
+    robot_file.write_text(text)
+    assert link_key(load_setup(robot_file)) is None
+    robot_file.write_text(text.replace("[link]\n", '[link]\nkey_file = "key"\n'))
+    (tmp_path / "key").write_text("000102030405060708090a0b0c0d0e0f")
+    (tmp_path / "key").chmod(0o644)
+    with pytest.raises(InputError, match=r"robot.toml: link.key_file: .*others may read the key"):
+        link_key(load_setup(robot_file))
+    (tmp_path / "key").chmod(0o600)
+    assert link_key(load_setup(robot_file)) == bytes(range(16))

@@ -121,3 +121,44 @@ def test_names_are_the_dbcs():
     bench.inputs["left_current_a"] = 100.0
     bench.run_until("FAULT")
     assert bench.out.fault == FAULTS["OVER_CURRENT_LEFT"]
+
+
+@pytest.mark.parametrize("step_back_s", [0.0, 0.001, 5.0, 100.0])
+def test_a_clock_that_stands_or_goes_back_stops_no_watchdog(step_back_s):
+    """The wheels stand as soon as with a sound clock, which counts a cycle as a millisecond."""
+    bench = Bench()
+    bench.now_us = 200_000_000
+    bench.to_driving()
+    bench.request = bench.command = None
+    bench.now_us -= round(step_back_s * 1e6)
+    states = [bench.step(1000 if step_back_s else 0).state for _ in range(700)]
+    assert states.index("STOPPING") <= 100
+    assert bench.out.state == "STANDBY"
+    assert (bench.out.left_setpoint_rad_s, bench.out.driver_enabled) == (0.0, False)
+
+
+def test_after_the_clock_went_back_time_goes_on_at_its_rate():
+    bench = Bench()
+    bench.run(1000)
+    before = bench.core._core.now_us
+    bench.now_us -= 600_000
+    bench.run(500)
+    assert bench.core._core.now_us - before == 500_000
+    bench.core.receive(bench.now_us - 400_000, 0x7FF, b"")
+    bench.run(1)
+    assert bench.core._core.now_us - before == 501_000, "a frame stamped before the last cycle changes no clock"
+    bench.core.pose(1.0, 2.0, 0.5, bench.now_us - 20_000, 0.01, 0.01)
+    bench.run(1)
+    heading = bench.messages("POSE_HEADING")[-1]
+    expected = (before + 501_000 - 20_000) % 6_553_600
+    assert heading.values["sample_time"] == pytest.approx(expected, abs=100)
+
+
+def test_lost_commands_are_counted():
+    bench = Bench()
+    bench.to_driving()
+    errors = bench.core._core.sequence_errors
+    bench.next_counter("WHEEL_COMMAND")
+    bench.run(100)
+    assert bench.core._core.sequence_errors == errors + 1
+    assert bench.out.state == "ARMED"

@@ -1,0 +1,407 @@
+"""What every controller that speaks this protocol must do, seen through its frames alone: inherit it, say who answers.
+
+Tests marked `motion` turn the wheels, at 1.5 rad/s at most.
+"""
+
+import math
+
+import pytest
+
+from firmware_protocol.authentication import Prover
+from firmware_protocol.codec import PROTOCOL
+from tests.firmware_protocol.protocol_host import CODEC, ProtocolHost
+
+NEVER_CYCLIC = {"HELLO", "BUILD", "LIMITS", "TIME_RESPONSE", "PARAM_RESPONSE", "POSE_POSITION", "POSE_HEADING"}
+OPTIONAL = {"MOTOR": 2 | 4, "POWER": 8}
+PERIODS_S = {
+    message.name: message.period_s
+    for message in PROTOCOL.messages
+    if message.sender == "ROBOT" and message.period_s and message.name not in NEVER_CYCLIC
+}
+STILL_RAD_S = 0.05
+
+
+class FirmwareConformance:
+    """The suite; `key` is that of authenticated mode. A whole class talks to one robot, which is never restarted."""
+
+    key: bytes | None = None
+
+    @classmethod
+    def make_end(cls, config):
+        """Return who answers; `config` is pytest's."""
+        raise AssertionError("say who answers")
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def talk(cls, request):
+        end = cls.make_end(request.config)
+        yield ProtocolHost(end, cls.key, first_session=end.now_ns // 1000 % 255)
+        end.close()
+
+    @pytest.fixture
+    def host(self, talk):
+        talk.settle()
+        return talk
+
+    @pytest.fixture
+    def slack_s(self, talk):
+        return talk.end.slack_s
+
+    # What it says of itself.
+
+    def test_introduces_itself_when_asked(self, host):
+        host.hello()
+        host.run(0.2)
+        hello, build = host.messages("HELLO")[-1][1].values, host.messages("BUILD")[-1][1].values
+        assert (hello["protocol_major"], build["dbc_hash"]) == (PROTOCOL.major, PROTOCOL.dbc_hash)
+        assert {int(decoded.values["page"]) for _, decoded in host.messages("LIMITS")} == {0, 1}
+        assert all(value > 0 for name, value in host.limits.items() if name != "page"), host.limits
+        assert host.limits["drive_off_timeout"] >= host.limits["command_timeout"]
+        assert bool(int(hello["capabilities"]) & 64) == (self.key is not None), "both ends have a key, or neither"
+
+    def test_answers_a_flood_of_requests_at_most_every_20_ms(self, host):
+        for _ in range(100):
+            host.hello()
+            host.step()
+        host.run(0.1)
+        assert 1 <= len(host.messages("HELLO")) <= (0.2 + 2 * host.end.slack_s) / 0.02 + 2
+
+    def test_telemetry_comes_at_its_periods_with_counters_in_order(self, host):
+        host.run(2.1)
+        capabilities = int(host.latest["HELLO"]["capabilities"])
+        for name, period_s in PERIODS_S.items():
+            if not capabilities & OPTIONAL.get(name, 255) or (name == "MAC_CHALLENGE" and self.key is None):
+                continue
+            frames = host.messages(name)
+            assert 0.8 * 2.1 / period_s - 1 <= len(frames) <= 1.25 * 2.1 / period_s + 2, name
+            counters = [decoded.counter for _, decoded in frames]
+            expected = [(counters[0] + i) % 16 for i in range(len(counters))]
+            assert counters == expected, name
+        assert host.damaged == 0
+
+    def test_speed_and_ticks_of_one_sample_share_their_counter(self, host):
+        host.run(0.5)
+        speeds = [decoded.counter for _, decoded in host.messages("WHEEL_SPEED")]
+        ticks = [decoded.counter for _, decoded in host.messages("WHEEL_TICKS")]
+        assert speeds[: len(ticks)] == ticks[: len(speeds)] or speeds[1:][: len(ticks)] == ticks[: len(speeds) - 1]
+
+    def test_the_clock_answers_and_keeps_time(self, host, slack_s):
+        times = []
+        for sequence in (7, 201):
+            host.send("TIME_REQUEST", sequence=sequence)
+            sent_ns = host.end.now_ns
+            host.wait_for("TIME_RESPONSE", lambda: host.latest.get("TIME_RESPONSE", {}).get("sequence") == sequence)  # noqa: B023
+            times.append((sent_ns, host.latest["TIME_RESPONSE"]["receive_time"]))
+            host.run(1.0)
+        (first_ns, first_us), (second_ns, second_us) = times
+        passed_s = (second_us - first_us) % 2**40 * 1e-6
+        assert passed_s == pytest.approx((second_ns - first_ns) * 1e-9, abs=slack_s + 0.001)
+
+    def test_samples_are_stamped_with_that_clock(self, host, slack_s):
+        host.send("TIME_REQUEST", sequence=99)
+        host.wait_for("TIME_RESPONSE", lambda: host.latest.get("TIME_RESPONSE", {}).get("sequence") == 99)
+        host.run(0.02 + slack_s)
+        sampled_us = host.latest["WHEEL_SPEED"]["sample_time"]
+        behind_us = (sampled_us - host.latest["TIME_RESPONSE"]["receive_time"]) % (65536 * 20)
+        assert behind_us < (0.05 + 2 * slack_s) * 1e6
+
+    # What it refuses.
+
+    def test_damaged_frames_are_counted_and_change_nothing(self, host):
+        before = host.rejected
+        frame = CODEC.encode("HELLO_REQUEST", 0, protocol_major=1, protocol_minor=0, dbc_hash=1)
+        for position in range(1, 8):
+            damaged = bytearray(frame.data)
+            damaged[position] ^= 0x10
+            host.end.send(frame.can_id, bytes(damaged))
+        host.run(0.25)
+        assert (host.rejected - before) % 256 == 7
+        assert host.reject_reason == "CRC"
+        assert (host.state, host.accepted, host.fault) == ("STANDBY", True, "NONE")
+
+    def test_frames_of_wrong_length_are_counted_and_change_nothing(self, host):
+        before = host.rejected
+        for length in range(8):
+            host.end.send(0x101, bytes(length))
+        host.run(0.25)
+        assert ((host.rejected - before) % 256, host.reject_reason) == (8, "LENGTH")
+        assert host.state == "STANDBY"
+
+    def test_frames_that_are_not_for_it_are_not_its_business(self, host):
+        before = host.rejected
+        for can_id in (0x081, 0x0FF, 0x110, 0x130, 0x7FF):
+            host.end.send(can_id, bytes(8))
+        host.run(0.25)
+        assert (host.rejected, host.state) == (before, "STANDBY")
+
+    @pytest.mark.parametrize(
+        ("changes", "fault"),
+        [
+            ({"dbc_hash": PROTOCOL.dbc_hash ^ 1}, "DBC_HASH_MISMATCH"),
+            ({"protocol_major": 99}, "PROTOCOL_MAJOR_MISMATCH"),
+        ],
+    )
+    def test_a_host_of_another_protocol_is_refused_until_one_of_its_own_comes(self, host, changes, fault):
+        host.hello(**changes)
+        host.wait_for(fault, lambda: host.fault == fault and not host.accepted)
+        host.ask("READY", host.new_session())
+        host.run(0.5)
+        assert host.state == "STANDBY"
+        assert {"FAULT", "HANDSHAKE"} <= host.blockers
+        host.hello()
+        host.wait_for("READY with the right protocol", lambda: host.state == "READY" and host.fault == "NONE")
+
+    def test_parameters_can_be_read_and_nonsense_is_refused(self, host):
+        def ask(**request):
+            host.latest.pop("PARAM_RESPONSE", None)
+            host.send("PARAM_REQUEST", **request)
+            host.wait_for("PARAM_RESPONSE", lambda: "PARAM_RESPONSE" in host.latest)
+            answer = host.latest["PARAM_RESPONSE"]
+            return CODEC.choice_name("PARAM_RESPONSE", "status", answer["status"]), answer["value"]
+
+        status, speed = ask(operation="READ", key=5, value=0.0)
+        assert (status, speed) == ("OK", pytest.approx(host.limits["max_wheel_speed"], abs=0.002))
+        assert ask(operation="READ", key=999, value=0.0)[0] == "UNKNOWN_KEY"
+        assert ask(operation="WRITE", key=5, value=1e6)[0] == "READ_ONLY"
+        assert ask(operation="WRITE", key=4, value=1e6)[0] == "OUT_OF_RANGE"
+        assert ask(operation=7, key=5, value=0.0)[0] == "UNKNOWN_OPERATION"
+        assert ask(operation="READ", key=5, value=0.0) == ("OK", speed)
+
+    # Sessions.
+
+    def test_ready_opens_a_session_with_a_new_challenge_and_standby_closes_it(self, host):
+        before = host.challenge
+        session = host.to_ready()
+        host.wait_for("the session", lambda: host.session == session and host.challenge not in (0, before))
+        host.ask("STANDBY")
+        host.wait_for("STANDBY", lambda: (host.state, host.session) == ("STANDBY", 0))
+
+    @pytest.mark.parametrize("which", ["none", "the last one"])
+    def test_a_session_needs_a_number_that_is_new(self, host, which):
+        used = host.to_ready()
+        host.ask("STANDBY")
+        host.wait_for_state("STANDBY")
+        host.ask("READY", 0 if which == "none" else used)
+        host.run(0.5)
+        assert host.state == "STANDBY"
+        assert "SESSION" in host.blockers
+
+    def test_ready_is_given_up_when_the_host_falls_silent(self, host, slack_s):
+        host.to_ready()
+        host.request = None
+        assert host.wait_for_state("STANDBY", within_s=2.5) <= 2.0 + slack_s
+
+    def test_commands_for_motion_are_refused_before_arming(self, host):
+        session = host.to_ready()
+        for _ in range(15):
+            host.wheel_command(1.0, 1.0, session=session)
+            host.run(0.02)
+        host.run(0.15)
+        assert host.reject_reason == "NONZERO_BEFORE_ARMED"
+        assert host.state == "READY"
+        assert host.fastest < STILL_RAD_S
+
+    def test_no_arming_without_zero_commands(self, host):
+        session = host.to_ready()
+        host.ask("ARM", session)
+        host.run(1.0)
+        assert host.state == "READY"
+        assert "ZERO_COMMANDS" in host.blockers
+
+    def test_no_arming_with_a_wrong_answer_to_the_challenge(self, host):
+        session = host.to_ready()
+        host.command = {}
+        host.run(0.3)
+        host.ask("ARM", session, answer=0)
+        host.run(0.7)
+        assert host.state == "READY"
+        assert host.reject_reason == "CHALLENGE"
+        assert "CHALLENGE" in host.blockers
+
+    def test_repeated_and_jumping_counters_are_refused(self, host):
+        host.run(0.3)
+        state = {"request": "STANDBY", "session": 0, "challenge_answer": 0, "host_fault": 0}
+        before = host.rejected
+        host._counters["HOST_STATE"] -= 1
+        host.send("HOST_STATE", **state)
+        host.run(0.02)
+        host.wait_for("REPEATED", lambda: host.reject_reason == "REPEATED", 0.5)
+        host._counters["HOST_STATE"] += 6
+        host.send("HOST_STATE", **state)
+        host.wait_for("SEQUENCE", lambda: host.reject_reason == "SEQUENCE", 0.5)
+        assert (host.rejected - before) % 256 >= 2
+
+    # Stops.
+
+    @pytest.mark.parametrize("length", [0, 1, 8])
+    def test_the_emergency_stop_latches_whatever_its_length(self, host, slack_s, length):
+        host.end.send(0x080, b"\xa5" * length)
+        assert host.wait_for_state("ESTOP", within_s=1.0) <= 0.1 + slack_s
+        assert CODEC.choice_name("SYSTEM_STATE", "estop_source", host.latest["SYSTEM_STATE"]["estop_source"]) == "FRAME"
+        host.ask("READY", host.new_session())
+        host.run(0.3)
+        assert host.state == "ESTOP"
+
+    def test_a_reset_that_was_already_asked_for_undoes_no_later_stop(self, host):
+        host.ask("RESET")
+        host.run(0.3)
+        host.end.send(0x080, b"")
+        host.run(1.2)
+        assert host.state == "ESTOP"
+        host.ask("STANDBY")
+        host.run(0.2)
+        host.ask("RESET")
+        host.wait_for_state("STANDBY")
+
+    # With a key.
+
+    def test_nothing_is_heard_without_proof(self, host):
+        if self.key is None:
+            pytest.skip("no key")
+        before = host.rejected
+        host.proves = False
+        host.ask("READY", host.new_session())
+        host.run(0.8)
+        assert host.state == "STANDBY"
+        assert host.rejected != before
+        assert host.reject_reason == "AUTHENTICATION"
+
+    def test_the_proof_of_another_key_is_none(self, host):
+        if self.key is None:
+            pytest.skip("no key")
+        right = host.prover
+        host.prover = Prover(bytes(byte ^ 1 for byte in self.key), CODEC)
+        host.prover.challenge(int(host.latest["MAC_CHALLENGE"]["nonce"]))
+        host.ask("READY", host.new_session())
+        host.run(0.8)
+        host.prover = right
+        assert (host.state, host.reject_reason) == ("STANDBY", "AUTHENTICATION")
+
+    def test_a_proved_frame_is_heard_once(self, host):
+        if self.key is None:
+            pytest.skip("no key")
+        host.request = None
+        frame = CODEC.encode("HOST_STATE", host.counter("HOST_STATE"), request="STANDBY", session=0, challenge_answer=0,
+                             host_fault=0)  # fmt: skip
+        proof = host.prover.prove(frame)
+        before = host.rejected
+        for _ in range(3):
+            host.end.send(*proof)
+            host.end.send(*frame)
+            host.run(0.01)
+        host.run(0.15)
+        assert ((host.rejected - before) % 256, host.reject_reason) == (2, "AUTHENTICATION")
+
+    # Motion.
+
+    @pytest.mark.motion
+    def test_armed_it_stands_until_told_and_then_follows(self, host):
+        host.to_armed()
+        host.run(0.5)
+        assert host.fastest < STILL_RAD_S
+        ticks = dict(host.latest["WHEEL_TICKS"])
+        host.heard.clear()
+        host.command = {"left": 1.5, "right": -1.0}
+        host.run(1.5)
+        assert host.speeds == pytest.approx((1.5, -1.0), rel=0.1, abs=0.05)
+        turn = 2 * math.pi / host.limits["ticks_per_rev"]
+        for side, sign in (("left", 1), ("right", -1)):
+            moved = (host.latest["WHEEL_TICKS"][f"{side}_ticks"] - ticks[f"{side}_ticks"] + 2**23) % 2**24 - 2**23
+            times = [t_ns for t_ns, _ in host.messages("WHEEL_SPEED")]
+            speeds = [decoded.values[f"{side}_speed"] for _, decoded in host.messages("WHEEL_SPEED")]
+            driven = sum(speeds) / len(speeds) * (times[-1] - times[0]) * 1e-9
+            assert moved * turn == pytest.approx(driven, rel=0.1, abs=0.1)
+            assert moved * sign > 0
+        assert host.latest["WHEEL_SPEED"]["driver_enabled"] == 1
+
+    def stops(self, host, cause, within_s):
+        took_s = host.wait_for("stop", lambda: host.state not in ("ARMED", "READY"), within_s)
+        assert host.stop_cause == cause
+        host.wait_for("standing wheels", lambda: host.fastest < STILL_RAD_S, 2.0)
+        host.wait_for_state("STANDBY", "ESTOP", "FAULT")
+        host.run(0.5)
+        assert host.fastest < STILL_RAD_S
+        assert host.state != "ARMED", "nothing arms again by itself"
+        return took_s
+
+    @pytest.mark.motion
+    def test_silence_stops_it_in_time(self, host, slack_s):
+        host.to_driving()
+        host.request = host.command = None
+        timeout_s = host.limits["command_timeout"]
+        assert self.stops(host, "COMMAND_TIMEOUT", 1.0) <= timeout_s + slack_s
+        host.run(host.limits["drive_off_timeout"])
+        assert host.latest["WHEEL_SPEED"]["driver_enabled"] == 0
+
+    @pytest.mark.motion
+    def test_a_command_holds_no_longer_than_it_says(self, host, slack_s):
+        host.to_driving()
+        host.command = None
+        host.wheel_command(1.5, 1.0, valid_for=0.04)
+        assert self.stops(host, "COMMAND_EXPIRED", 1.0) <= 0.04 + slack_s
+
+    @pytest.mark.motion
+    def test_house_keeping_does_not_feed_the_watchdog(self, host, slack_s):
+        host.to_driving()
+        host.command = None
+        assert self.stops(host, "COMMAND_TIMEOUT", 1.0) <= host.limits["command_timeout"] + slack_s
+
+    @pytest.mark.motion
+    def test_commands_of_another_session_are_not_obeyed(self, host):
+        session = host.to_driving()
+        host.command = {"left": -1.5, "right": -1.0, "session": session % 255 + 1}
+        self.stops(host, "COMMAND_TIMEOUT", 1.0)
+
+    @pytest.mark.motion
+    @pytest.mark.parametrize(
+        ("changes", "cause"),
+        [({"request": "STANDBY"}, "REQUESTED"), ({"host_fault": 5}, "HOST_FAULT"), ({"session": 0}, "SESSION_CHANGED")],
+    )
+    def test_the_host_can_end_it(self, host, slack_s, changes, cause):
+        session = host.to_driving()
+        host.ask(**{"request": "ARM", "session": session} | changes)
+        assert self.stops(host, cause, 1.0) <= 0.05 + slack_s
+
+    @pytest.mark.motion
+    def test_a_host_that_commands_but_says_nothing_else_is_stopped(self, host):
+        host.to_driving()
+        host.request = None
+        host.command["session"] = host.session
+        self.stops(host, "HOST_SILENT", 2.5)
+
+    @pytest.mark.motion
+    def test_damaged_commands_stop_it(self, host):
+        session = host.to_driving()
+        signals = {"mode": "SPEED", "left_speed": 1.5, "right_speed": 1.0, "valid_for": 0.1, "session": session}
+        frame = CODEC.encode("WHEEL_COMMAND", 0, **signals)
+        for _ in range(12):
+            host.end.send(frame.can_id, bytes((frame.data[0] ^ 1,)) + frame.data[1:])
+        self.stops(host, "E2E_DISQUALIFIED", 0.5)
+
+    @pytest.mark.motion
+    def test_the_emergency_stop_ends_motion(self, host, slack_s):
+        host.to_driving()
+        host.end.send(0x080, b"")
+        assert self.stops(host, "ESTOP", 0.5) <= 0.02 + slack_s
+
+    @pytest.mark.motion
+    def test_what_was_sent_once_moves_nothing_when_sent_again(self, host):
+        sent = []
+        send = host.end.send
+        host.end.send = lambda can_id, data: (sent.append((can_id, data)), send(can_id, data))
+        try:
+            host.to_driving()
+        finally:
+            host.end.send = send
+        host.ask("STANDBY")
+        host.command = None
+        host.wait_for_state("STANDBY")
+        host.request = None
+        host.run(0.7)
+        fastest = 0.0
+        for can_id, data in sent:
+            host.end.send(can_id, data)
+            host.run(0.01)
+            fastest = max(fastest, host.fastest)
+            assert host.state in ("STANDBY", "READY")
+        assert fastest < STILL_RAD_S

@@ -1,0 +1,208 @@
+"""The host that the conformance suite plays: by the book, or against it, as a test wants."""
+
+import itertools
+
+from firmware_protocol.authentication import PROVED, Prover
+from firmware_protocol.codec import PROTOCOL_MAJOR, PROTOCOL_MINOR, Codec, Decoded
+from firmware_protocol.e2e import challenge_answer
+
+STATE_PERIOD_NS = 50_000_000
+COMMAND_PERIOD_NS = 20_000_000
+CODEC = Codec()
+_BLOCKERS = CODEC.choices("SESSION_STATE", "blockers")
+
+
+class ProtocolHost:
+    """Sends `request` (a HOST_STATE's signals) every 50 ms and `command` (a WHEEL_COMMAND's) every 20 ms, if not None.
+
+    `heard` keeps what came since it was cleared last: (time in ns, decoded frame). `proves`: whether commands are
+    proved where there is a key. `damaged` counts what came and could not be decoded.
+    """
+
+    def __init__(self, end, key=None, first_session=1):
+        self.end = end
+        self.prover = Prover(key, CODEC) if key is not None else None
+        self.proves = True
+        self.request = None
+        self.command = None
+        self.heard = []
+        self.damaged = 0
+        self.latest = {}
+        self.limits = {}
+        self._sessions = itertools.cycle(range(1, 256))
+        for _ in range(first_session):
+            next(self._sessions)
+        self._counters = {}
+        self._due = {"request": 0, "command": 0}
+
+    @property
+    def state(self):
+        return self._choice("SYSTEM_STATE", "state")
+
+    @property
+    def fault(self):
+        return self._choice("SYSTEM_STATE", "fault")
+
+    @property
+    def stop_cause(self):
+        return self._choice("SYSTEM_STATE", "stop_cause")
+
+    @property
+    def reject_reason(self):
+        return self._choice("SYSTEM_STATE", "reject_reason")
+
+    @property
+    def rejected(self):
+        return int(self.latest["SYSTEM_STATE"]["rejected_count"])
+
+    @property
+    def session(self):
+        return int(self.latest["SYSTEM_STATE"]["session"])
+
+    @property
+    def challenge(self):
+        return int(self.latest["SESSION_STATE"]["challenge"])
+
+    @property
+    def accepted(self):
+        return bool(self.latest["SESSION_STATE"]["host_accepted"])
+
+    @property
+    def blockers(self):
+        bits = int(self.latest["SESSION_STATE"]["blockers"])
+        return {name for bit, name in _BLOCKERS.items() if bits & bit}
+
+    @property
+    def speeds(self):
+        speed = self.latest["WHEEL_SPEED"]
+        return speed["left_speed"], speed["right_speed"]
+
+    @property
+    def fastest(self):
+        return max(map(abs, self.speeds))
+
+    def new_session(self):
+        return next(self._sessions)
+
+    def counter(self, name):
+        """The counter of the next frame of this message, which is used up."""
+        self._counters[name] = (self._counters.get(name, -1) + 1) % 16
+        return self._counters[name]
+
+    def send(self, name, **signals):
+        """Send one frame as it should be."""
+        frame = CODEC.encode(name, self.counter(name), **signals)
+        if self.prover is not None and self.proves and name in PROVED:
+            if not self.prover.ready:
+                return
+            self.end.send(*self.prover.prove(frame))
+        self.end.send(*frame)
+
+    def hello(self, **changes):
+        ours = {"protocol_major": PROTOCOL_MAJOR, "protocol_minor": PROTOCOL_MINOR, "dbc_hash": CODEC.dbc_hash}
+        self.send("HELLO_REQUEST", **ours | changes)
+
+    def host_state(self, request, session=0, answer=None, host_fault=0):
+        if answer is None:
+            answer = challenge_answer(self.challenge, session, CODEC.dbc_hash) if request == "ARM" else 0
+        self.send("HOST_STATE", request=request, session=session, challenge_answer=answer, host_fault=host_fault)
+
+    def wheel_command(self, left=0.0, right=0.0, mode="SPEED", valid_for=0.1, session=None):
+        session = session if session is not None else (self.request or {}).get("session", 0)
+        self.send("WHEEL_COMMAND", mode=mode, left_speed=left, right_speed=right, valid_for=valid_for, session=session)
+
+    def ask(self, request, session=0, **changes):
+        """Go on sending this request, beginning now."""
+        self.request = {"request": request, "session": session} | changes
+        self._due["request"] = 0
+
+    def step(self):
+        """What is due goes out, a millisecond passes, what came is taken in."""
+        now_ns = self.end.now_ns
+        if self.request is not None and now_ns >= self._due["request"]:
+            self._due["request"] = now_ns + STATE_PERIOD_NS
+            self.host_state(**self.request)
+        if self.command is not None and now_ns >= self._due["command"]:
+            self._due["command"] = now_ns + COMMAND_PERIOD_NS
+            self.wheel_command(**self.command)
+        for t_ns, can_id, data in self.end.step():
+            decoded = CODEC.decode(can_id, data)
+            if not isinstance(decoded, Decoded):
+                self.damaged += 1
+                continue
+            self.heard.append((t_ns, decoded))
+            self.latest[decoded.name] = decoded.values
+            if decoded.name == "LIMITS":
+                self.limits.update(decoded.values)
+            elif decoded.name == "MAC_CHALLENGE" and self.prover is not None:
+                self.prover.challenge(int(decoded.values["nonce"]))
+
+    def run(self, seconds):
+        end_ns = self.end.now_ns + round(seconds * 1e9)
+        while self.end.now_ns < end_ns:
+            self.step()
+
+    def wait_for(self, what, holds, within_s=3.0):
+        """Run until something holds; return how long that took in seconds; fail the test if it takes too long."""
+        start_ns = self.end.now_ns
+        while not holds():
+            passed_s = (self.end.now_ns - start_ns) * 1e-9
+            said = {name: self.latest.get(name) for name in ("SYSTEM_STATE", "SESSION_STATE")}
+            assert passed_s < within_s, f"no {what} within {within_s} s; the robot said {said}"
+            self.step()
+        return (self.end.now_ns - start_ns) * 1e-9
+
+    def wait_for_state(self, *states, within_s=3.0):
+        return self.wait_for(" or ".join(states), lambda: self.state in states, within_s)
+
+    def messages(self, name):
+        """What was heard of one message since `heard` was cleared: (time in ns, decoded)."""
+        return [(t_ns, decoded) for t_ns, decoded in self.heard if decoded.name == name]
+
+    def settle(self):
+        """Bring the robot to STANDBY, accepted, still, without fault or emergency stop, whatever was before."""
+        self.proves, self.command = True, None
+        self.ask("STANDBY")
+        self.wait_for("SYSTEM_STATE and SESSION_STATE", lambda: {"SYSTEM_STATE", "SESSION_STATE"} <= self.latest.keys())
+        if not self.accepted or len(self.limits) < 6 or (self.prover is not None and not self.prover.ready):
+            self.hello()
+        for _ in range(4):
+            if self.state in ("ESTOP", "FAULT"):
+                self.run(0.6)
+                self.ask("RESET")
+                self.run(0.4)
+                self.ask("STANDBY")
+            self.run(0.1)
+            if self.state == "STANDBY" and self.accepted and len(self.limits) >= 6:
+                break
+            self.run(0.4)
+        assert self.state == "STANDBY", f"the robot stays in {self.state}: {self.fault}, {self.blockers}"
+        assert self.accepted
+        # SYSTEM_STATE comes at 10 Hz: let it tell of all that went before.
+        self.run(0.12)
+        self.heard.clear()
+
+    def to_ready(self):
+        """Open a new session; return its number."""
+        session = self.new_session()
+        self.ask("READY", session)
+        self.wait_for_state("READY")
+        return session
+
+    def to_armed(self):
+        session = self.to_ready()
+        self.command = {}
+        self.run(0.2)
+        self.ask("ARM", session)
+        self.wait_for_state("ARMED")
+        return session
+
+    def to_driving(self, left=1.5, right=1.0):
+        session = self.to_armed()
+        self.command = {"left": left, "right": right}
+        self.wait_for("wheels at speed", lambda: self.speeds[0] > 0.8 * left and self.speeds[1] > 0.8 * right)
+        return session
+
+    def _choice(self, message, signal):
+        values = self.latest.get(message)
+        return CODEC.choice_name(message, signal, values[signal]) if values is not None else None

@@ -1,0 +1,46 @@
+"""`pytest --robot=ROBOT.toml` as the writer of a board would run it, here against the virtual robot."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from disco_hw.operator import disco_hw_process
+from tests.drivers.waiting import wait_until
+from tests.hil.stack import READY_TIMEOUT_S, write_robot_file
+
+pytestmark = pytest.mark.hil
+ROOT = Path(__file__).resolve().parents[2]
+KEY = "000102030405060708090a0b0c0d0e0f\n"
+
+
+def conform(robot_file, *arguments):
+    command = [sys.executable, "-m", "pytest", f"--robot={robot_file}", "-p", "no:cacheprovider", *arguments]
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=110, check=False)
+    found = {word: int(count) for count, word in re.findall(r"(\d+) (passed|failed|skipped|error)", result.stdout)}
+    return result.returncode, found, result.stdout + result.stderr
+
+
+@pytest.mark.parametrize(
+    ("link", "key", "chosen", "least"),
+    [
+        ("can", KEY, "introduces or heard or another_key or length_0 or 0] or follows or silence_stops", 7),
+        ("serial", None, "introduces or telemetry or damaged or opens or follows", 6),
+    ],
+)
+def test_the_virtual_robot_conforms(tmp_path, link, key, chosen, least):
+    robot_file = write_robot_file(tmp_path, link)
+    if key is not None:
+        (tmp_path / "key").write_text(key)
+        (tmp_path / "key").chmod(0o600)
+        robot_file.write_text(robot_file.read_text().replace("[link]\n", '[link]\nkey_file = "key"\n'))
+    with disco_hw_process("virtual robot", ["sim", str(robot_file)], tmp_path / "sim.txt"):
+        wait_until(lambda: "ready" in (tmp_path / "sim.txt").read_text(), READY_TIMEOUT_S)
+        code, found, output = conform(robot_file, "--allow-motion", "-k", chosen)
+        assert code == 0, output
+        assert found["passed"] >= least, output
+        if key is None:
+            code, found, output = conform(robot_file, "-k", "follows or introduces")
+            assert (code, found) == (0, {"passed": 1, "skipped": 1}), output
