@@ -28,7 +28,7 @@ def simulated_drive(
     """A log of a robot off its drawing with these effects hidden in it.
 
     `seed` decides drive, noise and robot; `robot` is a seed for the robot's geometry alone. `script`: a script of
-    `disco-hw drive` in place of the drive.
+    `disco-hw drive` that is driven after the drive.
     """
     parameters = varied_parameters(PlantParameters(), seed if robot is None else robot)
     if motors == "ideal":
@@ -37,18 +37,27 @@ def simulated_drive(
     if dirty:
         parameters, options = dirty_parameters(parameters), dirty_log_options()
     effects: HiddenEffects = hidden_effects(hide or {})
-    driven = make_drive(drive, seed) if script is None else scripted(script)
+    driven = make_drive(drive, seed)
+    if script is not None:
+        driven = then_scripted(driven, script)
     rows = simulated_log(driven, parameters, effects, seed, options)
     times = np.array([t_s for t_s, _ in rows])
     cells = np.array([[float(cell) if cell else math.nan for cell in row] for _, row in rows])[:, 1:]
     return as_drive(times - times[0], cells, parameters.ticks_per_rev)
 
 
-def scripted(script: Script, rate_hz: float = 50.0) -> Drive:
-    """A script as the commands that `disco-hw drive` sends."""
-    t_s = np.arange(0.0, script.duration_s, 1.0 / rate_hz)
+def then_scripted(drive: Drive, script: Script) -> Drive:
+    """A drive, and then a script as the commands that `disco-hw drive` sends."""
+    t_s = np.arange(0.0, script.duration_s, drive.period_s)
     wheels = np.array([script.at(float(t)) for t in t_s])
-    return Drive(script.name, 1.0 / rate_hz, t_s, wheels[:, 0], wheels[:, 1], ("scripted",) * t_s.size)
+    return Drive(
+        f"{drive.name} and {script.name}",
+        drive.period_s,
+        np.concatenate([drive.t_s, drive.duration_s + t_s]),
+        np.concatenate([drive.left_rad_s, wheels[:, 0]]),
+        np.concatenate([drive.right_rad_s, wheels[:, 1]]),
+        (*drive.phase, *("scripted",) * t_s.size),
+    )
 
 
 def as_drive(t_s: np.ndarray, cells: np.ndarray, ticks_per_rev: int) -> DriveLog:

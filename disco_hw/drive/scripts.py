@@ -2,7 +2,8 @@
 
 `circle` is the paper's drive. `steps` follows the protocol of norlab-ulaval's DRIVE: wheel speeds drawn uniformly
 within the limits, 6 s each. `excite` takes two minutes to show what inference and the search for gaps need to tell
-parameters and effects from each other.
+parameters and effects from each other. Those of `disco_hw.drive.separating` show in a minute what another drive could
+not.
 """
 
 from __future__ import annotations
@@ -12,16 +13,15 @@ import random
 from collections.abc import Callable
 
 from disco_hw.config import CircleTask, Robot
-from disco_hw.drive.script import Manoeuvre, Script, Wheels
+from disco_hw.drive.pieces import Pieces, rest
+from disco_hw.drive.script import Manoeuvre, Script
+from disco_hw.drive.separating import SEPARATING, separating
 from disco_hw.errors import InputError
 
-SCRIPTS = ("circle", "steps", "excite")
+SCRIPTS = ("circle", "steps", "excite", *SEPARATING)
 STEP_S = 6.0
 STEPS = 20
 _LAPS = 2.0
-_REST_S = 0.6
-
-Profile = Callable[[float], tuple[float, float]]
 
 
 def make_script(name: str, robot: Robot, task: CircleTask, speed_share: float, seed: int = 1) -> Script:
@@ -37,6 +37,8 @@ def make_script(name: str, robot: Robot, task: CircleTask, speed_share: float, s
             return steps(top_rad_s, seed)
         case "excite":
             return excite(top_rad_s)
+        case _ if name in SEPARATING:
+            return separating(name, top_rad_s)
         case _:
             raise InputError(f"--script {name}: no such script; write one of {', '.join(SCRIPTS)}")
 
@@ -54,7 +56,7 @@ def circle(robot: Robot, task: CircleTask) -> Script:
         )
     laps_s = _LAPS * 2.0 * math.pi / yaw_rate_rad_s
     purpose = "the paper's drive; cannot tell the wheel radius from slip, nor left from right"
-    return Script("circle", (_rest(1.0), Manoeuvre("circle to the left", purpose, laps_s, _held(left, right)), _rest()))
+    return Script("circle", (rest(1.0), Manoeuvre("circle to the left", purpose, laps_s, _held(left, right)), rest()))
 
 
 def steps(top_rad_s: float, seed: int, count: int = STEPS) -> Script:
@@ -66,7 +68,7 @@ def steps(top_rad_s: float, seed: int, count: int = STEPS) -> Script:
         name = f"step {number}: {left:+.1f} {right:+.1f} rad/s"
         purpose = "steady motion anywhere within the limits, and the step to it"
         manoeuvres.append(Manoeuvre(name, purpose, STEP_S, _held(left, right)))
-    return Script("steps", (*manoeuvres, _rest()))
+    return Script("steps", (*manoeuvres, rest()))
 
 
 def excite(top_rad_s: float) -> Script:
@@ -75,13 +77,9 @@ def excite(top_rad_s: float) -> Script:
     Shares below are of `top_rad_s`: (forward, turn to the left).
     """
 
-    def play(name: str, purpose: str, duration_s: float, profile: Profile) -> Manoeuvre:
-        return Manoeuvre(name, purpose, duration_s, lambda t_s: _wheels(*profile(t_s), top_rad_s))
-
-    def hold(name: str, purpose: str, duration_s: float, forward: float, turn: float) -> Manoeuvre:
-        return play(name, purpose, duration_s, lambda _t_s: (forward, turn))
-
-    found: list[Manoeuvre] = [_rest(2.0, "noise of the poses at standstill")]
+    pieces = Pieces(top_rad_s)
+    play, hold = pieces.play, pieces.hold
+    found: list[Manoeuvre] = [rest(2.0, "noise of the poses at standstill")]
     radius = "wheel radius, and what grows with speed: gain, slip, pose latency"
     for name, forward, duration_s in (
         ("slow straight", 0.4, 4.0),
@@ -89,7 +87,7 @@ def excite(top_rad_s: float) -> Script:
         ("fast straight", 0.95, 3.0),
         ("fast reverse", -0.95, 3.0),
     ):
-        found += [hold(name, radius, duration_s, forward, 0.0), _rest()]
+        found += [hold(name, radius, duration_s, forward, 0.0), rest()]
     axle = "axial distance; two rates tell it from slip in turns, both ways tell latency from a heading bias"
     for name, turn, duration_s in (
         ("slow turn left", 0.3, 5.0),
@@ -97,7 +95,7 @@ def excite(top_rad_s: float) -> Script:
         ("fast turn left", 0.75, 4.0),
         ("fast turn right", -0.75, 4.0),
     ):
-        found += [hold(name, axle, duration_s, 0.0, turn), _rest()]
+        found += [hold(name, axle, duration_s, 0.0, turn), rest()]
     icr = "x_icr and side slip, which need speed and turning at once; latency changes sign with the side"
     for name, forward, turn, duration_s in (
         ("slow curve left", 0.3, 0.14, 6.0),
@@ -107,35 +105,27 @@ def excite(top_rad_s: float) -> Script:
         ("reverse curve left", -0.45, 0.2, 4.0),
         ("reverse curve right", -0.45, -0.2, 4.0),
     ):
-        found += [hold(name, icr, duration_s, forward, turn), _rest()]
+        found += [hold(name, icr, duration_s, forward, turn), rest()]
     lag = "lag and delay from command to wheel, slip under acceleration"
     for number in range(8):
         forward = 0.7 if number % 2 == 0 else -0.7
-        found += [hold(f"start and stop {number + 1}", lag, 1.0, forward, 0.0), _rest(0.8)]
+        found += [hold(f"start and stop {number + 1}", lag, 1.0, forward, 0.0), rest(0.8)]
     steering = "delay told from lag, build-up of turning under load"
     found += [
         play("steering at 0.5 Hz", steering, 12.0, lambda t_s: (0.4, 0.35 * math.cos(math.pi * t_s))),
-        _rest(),
+        rest(),
     ]
     zero = "deadband told from stiction, slowly through zero"
     found += [
         play("ramp through zero", zero, 10.0, lambda t_s: (0.25 * _triangle(t_s / 10.0), 0.0)),
         play("turning ramp through zero", zero, 10.0, lambda t_s: (0.0, 0.25 * _triangle(t_s / 10.0))),
-        _rest(2.0, "noise of the poses at standstill, elsewhere"),
+        rest(2.0, "noise of the poses at standstill, elsewhere"),
     ]
     return Script("excite", tuple(found))
 
 
-def _wheels(forward: float, turn: float, top_rad_s: float) -> Wheels:
-    return (forward - turn) * top_rad_s, (forward + turn) * top_rad_s
-
-
-def _held(left_rad_s: float, right_rad_s: float) -> Callable[[float], Wheels]:
+def _held(left_rad_s: float, right_rad_s: float) -> Callable[[float], tuple[float, float]]:
     return lambda _t_s: (left_rad_s, right_rad_s)
-
-
-def _rest(duration_s: float = _REST_S, purpose: str = "separates what comes before from what comes after") -> Manoeuvre:
-    return Manoeuvre("rest", purpose, duration_s, _held(0.0, 0.0))
 
 
 def _triangle(share: float) -> float:

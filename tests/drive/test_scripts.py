@@ -11,14 +11,18 @@ from hypothesis import strategies as st
 from disco_hw.config import CircleTask, Robot
 from disco_hw.drive.script import room_needed
 from disco_hw.drive.scripts import SCRIPTS, STEP_S, STEPS, make_script
+from disco_hw.drive.separating import SEPARATING
 from disco_hw.errors import InputError
+from disco_hw.model.effects import REGISTRY
 
 
 def robot(top=8.0):
     return Robot(name="r", wheel_radius_m=0.06, axial_distance_m=0.31, ticks_per_rev=2048, max_wheel_speed_rad_s=top)
 
 
-@given(st.sampled_from(["steps", "excite"]), st.floats(0.5, 60.0), st.floats(0.05, 1.0), st.integers(0, 1000))
+@given(
+    st.sampled_from(["steps", "excite", *SEPARATING]), st.floats(0.5, 60.0), st.floats(0.05, 1.0), st.integers(0, 1000)
+)
 def test_wheels_stay_within_the_share_of_the_limit(name, top, share, seed):
     script = make_script(name, robot(top), CircleTask(), share, seed)
     for k in range(0, math.ceil(script.duration_s * 5)):
@@ -66,3 +70,12 @@ def test_excite_takes_about_two_minutes_and_little_room():
 def test_an_unknown_script_is_refused_with_the_names_there_are():
     with pytest.raises(InputError, match="circle, steps, excite"):
         make_script("dance", robot(), CircleTask(), 0.8)
+
+
+@pytest.mark.parametrize("name", SEPARATING)
+def test_a_drive_that_a_report_asks_for_takes_a_minute_at_most(name):
+    assert make_script(name, robot(), CircleTask(), 0.8).duration_s <= 60.0
+
+
+def test_every_effect_names_a_script_that_can_be_driven():
+    assert {effect.script for effect in REGISTRY.values()} <= set(SCRIPTS)

@@ -1,0 +1,112 @@
+"""The study: a small part of it, and that it counts, keeps and resumes; real searches of a few logs only."""
+
+import dataclasses
+import math
+
+import pytest
+from dask.distributed import LocalCluster
+from rich.console import Console
+
+from disco_hw.gap.intervals import Estimate
+from tools import gap_jobs, gap_study, gap_tables
+from tools.gap_jobs import Job, Result, jobs
+
+QUIET = Console(quiet=True)
+
+
+def result(kind="single", hidden=("motor_lag",), named=("motor_lag",), seed=1, **changes):
+    plain = Result(kind, list(hidden), seed, list(named), [], 0, [], 40.0, 15.0, 14.0, [0.02], [True], 5.0)
+    return dataclasses.replace(plain, **changes)
+
+
+def echo(job):
+    return result(job.kind, job.hidden, job.hidden, job.seed)
+
+
+@pytest.mark.parametrize(
+    "job",
+    [Job("single", {"turn_slip": 0.09}, 31), Job("none", {}, 32)],
+    ids=lambda job: job.key,
+)
+def test_a_part_of_the_study(job):
+    found = gap_jobs.work(job)
+    assert found.right, found
+    if job.hidden:
+        assert found.closed > 0.8
+        assert max(found.errors) < 0.15
+
+
+def test_what_counts_as_right_depends_on_the_kind():
+    assert result().right
+    assert not result(named=()).right
+    assert not result(named=("motor_lag", "deadband")).right
+    assert not result(unnamed=["v_x += 1 v"]).right
+    assert result(hidden=("pose_offset",), named=("lateral_icr",)).right
+    assert not result("outside", ("x_motor_droop",), ("wheel_gain",), unnamed=["u |u|"]).right
+    assert result("outside", ("x_motor_droop",), (), unnamed=["u |u|"]).right
+    assert not result("forms", ("x_slew_limited_motor",), ("motor_lag",)).right
+    assert result("forms", ("x_slew_limited_motor",), ("motor_lag",), residue=1).right
+    assert result("circle", ("turn_slip",), (), blind=["turn_slip"]).right
+    assert not result("circle", ("turn_slip",), (), blind=["slope"]).right
+    assert not result("circle", ("turn_slip",), ("slope",), blind=["turn_slip"]).right
+
+
+def test_a_study_goes_on_where_it_was_broken_off(tmp_path, monkeypatch):
+    todo = list(jobs("single", range(1, 3)))
+    assert len({job.key for job in todo}) == len(todo) == 38
+    done = []
+
+    def broken_off(job):
+        if len(done) == 7:
+            raise KeyboardInterrupt
+        done.append(job.key)
+        return echo(job)
+
+    monkeypatch.setattr(gap_jobs, "work", broken_off)
+    with pytest.raises(KeyboardInterrupt):
+        gap_study.study(todo, tmp_path, 1, None, QUIET)
+    again = []
+    monkeypatch.setattr(gap_jobs, "work", lambda job: again.append(job.key) or echo(job))
+    results = gap_study.study(todo, tmp_path, 1, None, QUIET)
+    assert len(results) == 38
+    assert set(again) == {job.key for job in todo} - set(done)
+    assert (tmp_path / "gap_confusion.png").stat().st_size > 1000
+    # Other code: nothing of it counts any more.
+    monkeypatch.setattr(gap_study, "revision", lambda: "other")
+    again.clear()
+    gap_study.study(todo, tmp_path, 1, None, QUIET)
+    assert len(again) == 38
+
+
+def test_a_cluster_does_the_same_jobs(tmp_path, monkeypatch):
+    monkeypatch.setattr(gap_jobs, "work", echo)
+    todo = list(jobs("weak", range(1, 2)))
+    with LocalCluster(n_workers=1, processes=False, dashboard_address=":0") as cluster:
+        results = gap_study.study(todo, tmp_path, 1, cluster.scheduler_address, QUIET)
+    assert {(found.hidden[0], found.seed) for found in results} == {(next(iter(job.hidden)), job.seed) for job in todo}
+
+
+def test_figures_have_their_numbers_and_intervals():
+    found = [result(seed=seed) for seed in range(9)] + [result(named=(), errors=[], covered=[False], amended_mm=40.0)]
+    figures = gap_tables.summary(found)
+    assert figures["gap.single.logs"] == 10
+    assert figures["gap.single.right"] == pytest.approx(0.9)
+    # Wilson's interval of 9 in 10 is known.
+    assert (figures["gap.single.right_low"], figures["gap.single.right_high"]) == pytest.approx(
+        (0.596, 0.982), abs=1e-3
+    )
+    assert figures["gap.single.closed_median"] == pytest.approx(25.0 / 26.0)
+    assert figures["gap.single.covered"] == pytest.approx(0.9)
+    rows, columns, counts = gap_tables.confusion(found)
+    row = rows.index("motor_lag")
+    assert counts[row, columns.index("motor_lag")] == 9
+    assert counts[row, columns.index("nothing")] == 1
+
+
+def test_parameter_errors_are_of_the_parameters_that_were_hidden():
+    exact = {"drift_x_m_s": Estimate(0.0, -1.0, 1.0), "drift_y_m_s": Estimate(0.02, 0.01, 0.03)}
+    assert gap_jobs.judged("slope", (0.02, math.pi / 2), exact) == (pytest.approx(0.0), [True, True])
+    off = {"left": Estimate(0.03, 0.02, 0.04), "right": Estimate(0.05, 0.045, 0.055)}
+    error, covered = gap_jobs.judged("wheel_gain", 0.04, off)
+    assert error == pytest.approx(0.25)
+    assert covered == [True, False]
