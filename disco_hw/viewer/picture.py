@@ -87,7 +87,7 @@ def _draw(figure: Figure, recording: Recording, t_s: float) -> None:
     )
     top = figure.add_subplot(grid[:, 0])
     _draw_scene(top, snapshot, stage)
-    top.set_title(f"{stage.name}, {t_s:.2f} s", loc="left")
+    top.set_title(f"{stage.name}, {(snapshot.t_ns - recording.first_ns) * 1e-9:.2f} s", loc="left")
     task = snapshot.task or stage.task
     cuts: tuple[tuple[str, Callable[[Timeline, int, int], Curves]], ...] = (
         ("distance to the circle (m)", partial(curves.distance, task)),
@@ -123,7 +123,7 @@ def _draw_scene(axes: Axes, snapshot: Snapshot, stage: Stage) -> None:
         paths = shapes.fan_paths(snapshot.fan.weights, snapshot.fan.x_m, snapshot.fan.y_m)
         shades = shapes.weight_colours(snapshot.fan.weights, scene.FAN_COLOUR, scene.FAN_PALEST) / 255.0
         for path, shade in zip(paths[::-1], shades[::-1], strict=True):
-            axes.plot(*path.T, color=tuple(shade), linewidth=0.7)
+            axes.plot(*path.T, color=tuple(shade), linewidth=1.2)
     if snapshot.plan is not None:
         points = ParameterPoints(model_in_force(stage.model, snapshot.belief))
         for path in points.trajectories(snapshot.plan, snapshot.wheel_speeds or (0.0, 0.0)):

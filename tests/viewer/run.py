@@ -16,6 +16,7 @@ START_NS = 5_000_000_000_000
 RADIUS_M, SPEED_M_S = 0.75, 0.2
 LEFT_RAD_S, RIGHT_RAD_S = 2.5, 4.5
 FAULT_TICK, GATED_TICK, OVERRUN_TICK, REJECTED_TICK = 60, 80, 100, 120
+FAN_TICK = 50
 
 
 def pose_at(tick, offset_m=0.0):
@@ -34,6 +35,15 @@ def plan_at(tick):
         path_x_m=tuple(x for x, _, _ in path), path_y_m=tuple(y for _, y, _ in path),
         path_yaw_rad=tuple(yaw for _, _, yaw in path),
     )  # fmt: skip
+
+
+def fan_at(tick):
+    """Three rollouts that part to either side of the circle."""
+    paths = [[pose_at(tick + 5 * step, 0.02 * step * side)[:2] for step in range(11)] for side in (0, 1, -1)]
+    flat = [place for path in paths for place in path]
+    return records.Fan(
+        START_NS + tick * PERIOD_NS, (0.5, 0.2, 0.05), tuple(x for x, _ in flat), tuple(y for _, y in flat)
+    )
 
 
 def tick_records(tick):
@@ -62,6 +72,8 @@ def tick_records(tick):
         got.append(RobotStatus(now_ns, "ARMED", 0, fault, "NONE", "NONE", 1, 0, "NONE"))
         got.append(PowerSample(now_ns, 24.5, 1.0, 30.0))
         got.append(RobotLinkHealth(now_ns, 0, 0, 0, 0, 0, 0))
+    if tick % FAN_TICK == 0:
+        got.append(fan_at(tick))
     if tick == 10:
         got.append(records.DaemonState(now_ns, "ARMED", "READY", "armed on request"))
         got.append(records.Event(now_ns, "info", "daemon", "ready -> armed: armed on request"))

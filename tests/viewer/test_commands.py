@@ -12,6 +12,7 @@ import pytest
 from PIL import Image
 
 from disco_hw.errors import InputError
+from disco_hw.verbs.watch import view
 from disco_hw.viewer import picture, scene
 from disco_hw.viewer.commands import export_log, in_figures, snapshot_log, video_log
 from tests.viewer.run import FAULT_TICK
@@ -85,19 +86,9 @@ def test_a_log_in_figures_has_every_mark(recording):
     json.dumps(figures)
 
 
-def run_view(*arguments):
-    return subprocess.run(
-        [sys.executable, "-m", "disco_hw", "view", *map(str, arguments)], capture_output=True, text=True, check=False
-    )
-
-
-def test_json_is_one_object_on_standard_output(log_file, tmp_path):
-    done = run_view(log_file, "--snapshot", tmp_path / "a.png", "--json")
-    assert json.loads(done.stdout) == {"written": [str(tmp_path / "a.png")]}
-    bad = run_view(log_file, "--video", tmp_path / "a.avi", "--json")
-    assert bad.returncode == 2
-    assert bad.stdout == ""
-    assert len(bad.stderr.strip().splitlines()) == 1
+def test_json_is_one_object_on_standard_output(log_file, tmp_path, capsys):
+    view(log_file, snapshot=tmp_path / "a.png", as_json=True)
+    assert json.loads(capsys.readouterr().out) == {"written": [str(tmp_path / "a.png")]}
 
 
 def test_a_clip_without_end_is_refused(recording, tmp_path, monkeypatch):
@@ -108,12 +99,13 @@ def test_a_clip_without_end_is_refused(recording, tmp_path, monkeypatch):
 
 def test_a_page_is_served_until_it_is_told_to_end(log_file):
     code = "import sys; from pathlib import Path; from disco_hw.viewer.commands import view_log\n"
-    code += f"sys.exit(view_log(Path({str(log_file)!r}), port=0))"
+    code += f"sys.exit(view_log(Path({str(log_file)!r}), port=0, as_json=True))"
     process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
     try:
         line = process.stdout.readline()
-        assert line.startswith("page: http://127.0.0.1:")
-        with urllib.request.urlopen(line.split()[1], timeout=10) as answer:
+        told = json.loads(line)
+        assert told["ticks"] == 200
+        with urllib.request.urlopen(told["page"], timeout=10) as answer:
             assert answer.status == 200
         process.send_signal(signal.SIGTERM)
         assert process.wait(10) == 0

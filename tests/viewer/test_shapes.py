@@ -61,3 +61,24 @@ def test_a_wheel_rolls_forward():
     # The top of the wheel, (0, 0, 1), goes to the front: R(0, 0, 1) has x = 2 w y.
     assert 2.0 * w * y == pytest.approx(1.0)
     assert shapes.about_z(math.pi) == pytest.approx((0.0, 0.0, 0.0, 1.0))
+
+
+def test_a_fan_is_taken_apart_into_its_paths():
+    paths = shapes.fan_paths((0.6, 0.4), (1.0, 2.0, 3.0, 4.0), (5.0, 6.0, 7.0, 8.0))
+    assert paths.tolist() == [[[1.0, 5.0], [2.0, 6.0]], [[3.0, 7.0], [4.0, 8.0]]]
+
+
+@pytest.mark.parametrize(
+    ("weights", "x", "y"),
+    [((), (), ()), ((1.0,), (1.0,), (1.0,)), ((0.5, 0.5), (1.0,) * 3, (1.0,) * 3), ((1.0,), (1.0, 2.0), (1.0,))],
+)
+def test_a_fan_that_does_not_divide_is_none(weights, x, y):
+    assert shapes.fan_paths(weights, x, y).shape == (0, 0, 2)
+
+
+def test_weights_shade_from_the_colour_to_the_palest():
+    colours = shapes.weight_colours((0.5, 0.25, 0.0), (0, 100, 200), 0.2)
+    assert colours[0].tolist() == [0, 100, 200]
+    assert colours[2].tolist() == [204, 224, 244]
+    assert (np.diff(colours.astype(int), axis=0) > 0).all()
+    assert shapes.weight_colours((0.0, 0.0), (0, 100, 200), 0.2).tolist() == [[204, 224, 244]] * 2

@@ -1,0 +1,49 @@
+"""The picture without a browser: everything of the page's top view is in it, in its colour and at its place."""
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from disco_hw.errors import InputError
+from disco_hw.viewer import picture, scene
+from tests.viewer.run import FAN_TICK
+
+
+def drawn(recording, t_s, path):
+    picture.draw_picture(recording, t_s, path)
+    return np.asarray(Image.open(path).convert("RGB")).astype(int)
+
+
+def count(pixels, colour, tolerance=12):
+    return int((np.abs(pixels - colour).max(axis=2) <= tolerance).sum())
+
+
+def test_every_layer_is_in_the_picture(recording, tmp_path):
+    pixels = drawn(recording, FAN_TICK * 0.02 + 0.1, tmp_path / "a.png")
+    assert count(pixels, scene.TASK_COLOUR) > 500
+    assert count(pixels, scene.PLAN_COLOUR) > 50
+    # Thin lines are mixed with what is beside them.
+    assert count(pixels, scene.FAN_COLOUR, 40) > 20
+    assert count(pixels, scene.ELLIPSE_COLOUR) > 10
+
+
+def test_an_instant_before_the_log_and_one_after_it_are_its_ends(recording, tmp_path):
+    before, start = (drawn(recording, t_s, tmp_path / "a.png") for t_s in (-5.0, 0.0))
+    after, end = (drawn(recording, t_s, tmp_path / "a.png") for t_s in (1e6, recording.duration_s))
+    assert (before == start).all()
+    assert (after == end).all()
+    assert np.abs(start - end).max() > 100
+
+
+def test_a_clip_has_ten_pictures_a_second_and_tells_how_far_it_is(recording, tmp_path):
+    parts = []
+    picture.draw_clip(recording, tmp_path / "a.gif", 20.0, parts.append)
+    assert Image.open(tmp_path / "a.gif").n_frames == 3
+    assert parts == [0.0, 0.5, 1.0]
+
+
+@pytest.mark.parametrize("name", ["a", "a.exe"])
+def test_a_picture_of_no_kind_is_refused_before_anything_is_written(recording, tmp_path, name):
+    with pytest.raises(InputError, match="no such kind of picture"):
+        picture.draw_picture(recording, 0.0, tmp_path / name)
+    assert list(tmp_path.iterdir()) == []

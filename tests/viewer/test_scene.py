@@ -1,0 +1,146 @@
+"""What of a snapshot is drawn, where and in which colour; the browser's part is in test_page.py."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from disco_hw.config import CircleTask
+from disco_hw.log import records
+from disco_hw.viewer import scene as scene_module
+from disco_hw.viewer.scene import LAYERS, Scene, first_camera
+from disco_hw.viewer.server import serving
+from disco_hw.viewer.snapshot import snapshot_at
+from disco_hw.viewer.stage import stage_of_robot
+from disco_hw.viewer.timeline import Timeline
+from tests.viewer.run import PERIOD_NS, ROBOT_FILE, START_NS, plan_at, pose_at
+
+TICK = 150
+FAN = records.Fan(
+    START_NS + TICK * PERIOD_NS, (0.4, 0.1, 0.0), (0.0, 0.1, 0.2, 0.0, 0.1, 0.2, 0.0, 0.1, 0.2),
+    (0.0, 0.0, 0.1, 0.0, 0.0, 0.2, 0.0, 0.0, 0.3),
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def stage():
+    return stage_of_robot(ROBOT_FILE)
+
+
+@pytest.fixture
+def scene(stage):
+    with serving("test", port=0) as page:
+        yield Scene(page.server, stage)
+
+
+@pytest.fixture
+def shot(timeline):
+    cut = snapshot_at(timeline, START_NS + TICK * PERIOD_NS, plan_at(TICK))
+    return replace(cut, fan=FAN)
+
+
+def node(scene, layer):
+    return {
+        "task": scene._task, "robot": scene._robot, "trail": scene._trail, "fan": scene._fan, **scene._lines
+    }[layer]  # fmt: skip
+
+
+def test_every_layer_is_drawn_and_can_be_switched_off_and_on(scene, shot):
+    scene.show(shot)
+    assert {layer: node(scene, layer).visible for layer in LAYERS} == dict.fromkeys(LAYERS, True)
+    for layer in LAYERS:
+        scene.layers[layer] = False
+        scene.show(shot)
+        assert [name for name in LAYERS if not node(scene, name).visible] == [layer]
+        scene.layers[layer] = True
+    scene.show(shot)
+    assert all(node(scene, layer).visible for layer in LAYERS)
+
+
+def test_nothing_known_draws_the_task_alone(scene):
+    scene.show(snapshot_at(Timeline(), 5, None))
+    assert [layer for layer in LAYERS if node(scene, layer).visible] == ["task"]
+
+
+def test_the_robot_stands_at_its_pose_and_its_wheels_turn_as_measured(scene, shot):
+    scene.show(shot)
+    x_m, y_m, yaw_rad = pose_at(TICK)
+    assert scene._robot.position[:2] == pytest.approx((x_m, y_m))
+    assert scene._robot.wxyz[0] == pytest.approx(math.cos(yaw_rad / 2))
+    for wheel, angle in zip(scene._wheels, (*shot.wheel_angles, *shot.wheel_angles), strict=True):
+        assert wheel.wxyz[2] == pytest.approx(math.sin(angle / 2), abs=1e-6)
+    assert {tuple(np.sign(wheel.position[:2])) for wheel in scene._wheels} == {(1, 1), (1, -1), (-1, 1), (-1, -1)}
+
+
+def test_the_robot_is_to_scale(scene, stage):
+    across = {round(abs(wheel.position[1]), 6) for wheel in scene._wheels}
+    assert across == {round(stage.axial_distance_m / 2, 6)}
+    assert {wheel.position[2] for wheel in scene._wheels} == {stage.wheel_radius_m}
+
+
+def test_the_circle_is_the_tasks_and_follows_its_changes(scene, shot):
+    def radii(x_m=0.0):
+        points = np.asarray(scene._task.points)
+        return np.hypot(points[..., 0] - x_m, points[..., 1])
+
+    assert radii() == pytest.approx(0.75, abs=1e-5)
+    scene.show(replace(shot, task=CircleTask(center_x_m=1.0, radius_m=0.5)))
+    assert radii(1.0) == pytest.approx(0.5, abs=1e-5)
+    scene.show(shot)
+    assert radii() == pytest.approx(0.75, abs=1e-5)
+
+
+def test_the_trail_is_coloured_by_the_distance_to_the_task_in_force(scene, shot):
+    scene.show(shot)
+    on_it = np.array(scene._trail.colors)[-1, 0]
+    scene.show(replace(shot, task=CircleTask(radius_m=0.5)))
+    off_it = np.asarray(scene._trail.colors)[-1, 0]
+    assert tuple(on_it) == tuple(scene_module.shapes.distance_colours(np.zeros(1), scene_module.TRAIL_FULL_M)[0])
+    assert tuple(off_it) == tuple(scene_module.shapes.distance_colours(np.full(1, 0.25), scene_module.TRAIL_FULL_M)[0])
+
+
+def test_the_fan_is_shaded_by_weight_and_the_weightiest_lies_on_top(scene, shot):
+    scene.show(shot)
+    points, colours = np.asarray(scene._fan.points), np.asarray(scene._fan.colors).astype(int)
+    assert points.shape == (6, 2, 3)
+    assert points[0, 1, :2] == pytest.approx((0.1, 0.0))
+    strengths = [255 - colours[2 * path, 0].min() for path in range(3)]
+    assert strengths[0] > strengths[1] > strengths[2] > 0
+    assert points[0, 0, 2] > points[2, 0, 2] > points[4, 0, 2]
+    assert tuple(colours[0, 0]) == scene_module.FAN_COLOUR
+    scene.show(replace(shot, fan=None))
+    assert not scene._fan.visible
+
+
+def test_a_fan_that_is_broken_is_not_drawn(scene, shot):
+    scene.show(replace(shot, fan=records.Fan(0, (0.5, 0.5), (1.0, 2.0, 3.0), (1.0, 2.0, 3.0))))
+    assert not scene._fan.visible
+
+
+def test_an_adapted_belief_bends_the_plan_under_its_sigma_points(scene, shot, stage):
+    scene.show(shot)
+    before = np.asarray(scene._lines["points"].points).copy()
+    names = ("x_icr_m", "wheel_radius_m", "axial_distance_m")
+    change = records.BeliefChange(0, "adapted", names, (0.1, 0.05, 0.4), tuple(np.diag((1e-6, 1e-8, 1e-6)).ravel()))
+    scene.show(replace(shot, belief=change))
+    after = np.asarray(scene._lines["points"].points)
+    assert np.abs(after[-1] - before[-1]).max() > 0.01
+    scene.show(replace(shot, belief=records.BeliefChange(1, "model")))
+    assert np.asarray(scene._lines["points"].points) == pytest.approx(before)
+
+
+def test_long_lines_are_left_alone_where_only_movement_is_wanted(scene, shot, timeline):
+    scene.show(shot)
+    points = np.asarray(scene._trail.points)
+    later = snapshot_at(timeline, START_NS + 190 * PERIOD_NS, plan_at(190))
+    scene.show(later, everything=False)
+    assert np.asarray(scene._trail.points).shape == points.shape
+    assert scene._robot.position[:2] == pytest.approx(pose_at(190)[:2])
+
+
+def test_the_first_camera_sees_the_whole_task():
+    task = CircleTask(center_x_m=2.0, center_y_m=-1.0, radius_m=3.0)
+    eye, look_at = first_camera(task)
+    assert look_at == (2.0, -1.0, 0.0)
+    assert eye[2] > task.radius_m

@@ -1,0 +1,93 @@
+"""The page's end of the feed: what it receives, what it counts as lost, and that nothing malformed gets through."""
+
+import time
+
+import msgspec
+import pytest
+import zmq
+
+from disco_hw.log.link import batch_encoder
+from disco_hw.log.records import Estimate
+from disco_hw.viewer.subscriber import FeedSubscriber
+from tests.viewer.run import tick_records
+
+
+class Daemon:
+    """A publisher that sends whatever the test wants."""
+
+    def __init__(self, path):
+        self.path, self._context = path, zmq.Context()
+        self.open()
+
+    def open(self):
+        self.socket = self._context.socket(zmq.PUB)
+        self.socket.bind(f"ipc://{self.path}")
+
+    def send(self, sequence, tick=0):
+        now_ns, got = tick_records(tick)
+        self.socket.send(batch_encoder()(sequence, now_ns, got))
+        return now_ns, got
+
+    def close(self):
+        self.socket.close(0)
+
+
+@pytest.fixture
+def ends(tmp_path):
+    daemon, subscriber = Daemon(tmp_path / "feed"), FeedSubscriber(tmp_path / "feed")
+    yield daemon, subscriber
+    subscriber.close()
+    daemon.close()
+
+
+def connected(daemon, subscriber, sequence=1):
+    """Send until something arrives; returns the number after the last one sent."""
+    deadline = time.monotonic() + 10.0
+    while not subscriber.receive(0.02):
+        assert time.monotonic() < deadline, "nothing arrives"
+        daemon.send(sequence)
+        sequence += 1
+    while subscriber.receive(0.05):
+        pass
+    return sequence
+
+
+def test_a_batch_arrives_whole_with_its_ticks_time(ends):
+    daemon, subscriber = ends
+    number = connected(daemon, subscriber)
+    now_ns, got = daemon.send(number, tick=7)
+    received = subscriber.receive(5.0)
+    assert {t_ns for t_ns, _ in received} == {now_ns}
+    assert len(received) == len(got)
+    assert any(isinstance(record, Estimate) for _, record in received)
+    assert subscriber.missed == subscriber.malformed == 0
+
+
+def test_gaps_in_the_numbers_are_counted_and_a_new_daemon_is_none(ends):
+    daemon, subscriber = ends
+    number = connected(daemon, subscriber)
+    daemon.send(number + 3)
+    assert subscriber.receive(5.0)
+    assert subscriber.missed == 3
+    daemon.close()
+    daemon.open()
+    connected(daemon, subscriber)
+    assert subscriber.missed == 3
+
+
+@pytest.mark.parametrize("garbage", [b"", b"\xff" * 20, b"[1]", msgspec.msgpack.encode({"a": 1})])
+def test_what_is_none_of_the_daemons_is_counted_and_dropped(ends, garbage):
+    daemon, subscriber = ends
+    number = connected(daemon, subscriber)
+    daemon.socket.send(garbage)
+    assert subscriber.receive(5.0) == []
+    assert subscriber.malformed == 1
+    daemon.send(number)
+    assert subscriber.receive(5.0)
+
+
+def test_without_a_daemon_it_waits_no_longer_than_it_is_told(tmp_path):
+    subscriber = FeedSubscriber(tmp_path / "none")
+    assert subscriber.receive(0.01) == []
+    subscriber.close()
+    subscriber.close()
