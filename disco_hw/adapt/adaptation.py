@@ -238,8 +238,9 @@ class CheckedAdaptation:
         self._tell(now_ns, self._model, adapted=False, relearn=True)
 
     def _tell(self, now_ns: int, geometry: Geometry, *, adapted: bool, relearn: bool = False) -> None:
-        mean, covariance = tuple(geometry.mean.tolist()), tuple(geometry.covariance.ravel().tolist())
-        self._link.send(InForce(now_ns, mean, covariance, adapted, relearn))
+        x_icr, radius, axial = geometry.mean.tolist()
+        a, b, c, d, e, f, g, h, i = geometry.covariance.ravel().tolist()
+        self._link.send(InForce(now_ns, (x_icr, radius, axial), (a, b, c, d, e, f, g, h, i), adapted, relearn))
 
     def _watch(self, now_ns: int, found: list[records.Record], events: list[str]) -> None:
         """Notice an adapter that has died or says nothing; the belief in force stays."""

@@ -20,6 +20,9 @@ _PHYSICAL_LOW = np.array([_RANGES[name].low for name in NAMES])
 _PHYSICAL_HIGH = np.array([_RANGES[name].high for name in NAMES])
 
 
+_LEAST_VARIANCE, _LARGEST_VARIANCE = 1e-14, 1e4
+
+
 class Outcome(Enum):
     """What became of a proposal."""
 
@@ -119,9 +122,14 @@ class BeliefGuard:
         if not (np.isfinite(mean).all() and np.isfinite(covariance).all()):
             return "not finite"
         matrix = covariance.reshape(3, 3)
-        scale = np.sqrt(np.abs(np.diag(matrix))) + 1e-300
+        variances = np.diag(matrix)
+        if not ((variances > _LEAST_VARIANCE) & (variances < _LARGEST_VARIANCE)).all():
+            return "not a covariance"
+        scale = np.sqrt(variances)
         unit = matrix / np.outer(scale, scale)
-        if np.abs(unit - unit.T).max() > 1e-9 or np.linalg.eigvalsh(unit)[0] < 1e-9:
+        if not np.abs(unit).max() < 1.0 + 1e-9 or np.abs(unit - unit.T).max() > 1e-9:
+            return "not a covariance"
+        if np.linalg.eigvalsh(unit)[0] < 1e-9:
             return "not a covariance"
         if proposal.doubt:
             return proposal.doubt

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 
 from disco_hw.adapt.coordinates import NAMES, from_linear, to_linear
 from disco_hw.adapt.evidence import Evidence, evidence
+from disco_hw.adapt.samples import drive_of
 from disco_hw.inference.density_network import DensityNetwork, NetworkSettings, train
-from disco_hw.inference.excitation import STEP_S, Excitation, excitation
+from disco_hw.inference.excitation import STEP_S, Excitation
 from disco_hw.inference.noise import Noise
 from disco_hw.inference.simulate import Simulator, draw_seeds
-from disco_hw.log.drive import Commands, DriveLog, Gyro, Poses, Wheels
 from disco_hw.model import Model
 
 Array = NDArray[np.float64]
@@ -33,8 +33,6 @@ _SLEW_RAD_S2 = 5.0
 _LARGEST_TARGET = 8.0
 _NOISE_SPREAD = 0.4
 _MISFIT_MARGIN = 1.2
-_NOTHING = np.empty(0)
-_NO_SEGMENT = np.empty(0, dtype=np.int64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,7 +136,7 @@ def _statistics(window: Evidence, training: Training) -> tuple[Array, Array, Arr
     scaled = (centre - middle) / sizes
     duration = np.log(max(float(window.moving_s.sum()), 0.1))
     misfit = np.log(max(_misfit(window), 1e-3))
-    return np.concatenate([scaled, np.log(std / sizes), correlation, [misfit, duration]]), centre, root
+    return np.concatenate([scaled, np.log(std / sizes), correlation, [misfit, duration]]), centre, np.asarray(root)
 
 
 def _misfit(window: Evidence) -> float:
@@ -160,25 +158,18 @@ def _random_drive(training: Training, rng: np.random.Generator) -> Excitation:
         mean, half = rng.uniform(0.1, 0.8), rng.uniform(-0.3, 0.3)
         wanted[at : at + held] = training.wheel_rad_s * np.array([mean - half, mean + half])
         at += held
-    speed = np.empty_like(wanted)
+    speed = np.empty((steps, 2))
     now = wanted[0].copy()
     for k in range(steps):
         now += np.clip(wanted[k] - now, -_SLEW_RAD_S2 * STEP_S, _SLEW_RAD_S2 * STEP_S)
         speed[k] = now
     t_s = STEP_S * np.arange(steps)
-    angle = np.cumsum(speed, axis=0) * STEP_S
+    angle: Array = np.cumsum(speed, axis=0) * STEP_S
     pose_s = np.arange(0.0, t_s[-1] - STEP_S, 1.0 / training.pose_hz)
     # The poses are those of the simulation; these only have to look like motion.
     x_m = np.interp(pose_s, t_s, angle.mean(axis=1))
-    segment = np.zeros(steps, dtype=np.int64)
-    log = DriveLog(
-        ("simulated",),
-        Commands(_NOTHING, _NOTHING, _NOTHING, _NO_SEGMENT),
-        Wheels(t_s, *angle.T, *speed.T, segment, True, True),
-        Poses(pose_s, x_m, 0.0 * x_m, 0.0 * x_m, np.zeros(pose_s.size, dtype=np.int64)),
-        Gyro(_NOTHING, _NOTHING, _NO_SEGMENT),
-    )
-    return excitation(log, "encoders")
+    poses = np.column_stack([x_m, np.zeros((x_m.size, 2))])
+    return drive_of(t_s, angle, np.zeros(steps, dtype=np.int64), pose_s, poses, np.zeros(x_m.size, dtype=np.int64))
 
 
 def _measured(drive: Excitation, poses: Array) -> Excitation:

@@ -5,15 +5,19 @@ from __future__ import annotations
 from bisect import insort
 
 import numpy as np
+from numpy.typing import NDArray
 
 from disco_hw.adapt.messages import Pose, Samples, Wheels
 from disco_hw.inference.excitation import Excitation, UnusableDriveError, excitation
 from disco_hw.log.drive import Commands, DriveLog, Gyro, Poses
 from disco_hw.log.drive import Wheels as WheelArrays
 
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
 _LONGEST_GAP_NS = 500_000_000
-_NOTHING = np.empty(0)
-_NO_SEGMENT = np.empty(0, dtype=np.int64)
+_NOTHING: Array = np.empty(0)
+_NO_SEGMENT: Index = np.empty(0, dtype=np.int64)
 
 
 class SampleWindow:
@@ -56,22 +60,29 @@ class SampleWindow:
         wheel_ns = np.array([w.t_ns for w in wheels])
         pose_ns = np.array([p.t_ns for p in poses])
         breaks = wheel_ns[1:][np.diff(wheel_ns) > _LONGEST_GAP_NS]
-        angle = np.array([(w.left_rad, w.right_rad) for w in wheels])
-        wheel_s = np.array([self.seconds(w.t_ns) for w in wheels])
-        speed = np.gradient(angle, wheel_s, axis=0)
-        values = np.array([(p.x_m, p.y_m, p.yaw_rad) for p in poses])
-        log = DriveLog(
-            ("the last half minute",),
-            Commands(_NOTHING, _NOTHING, _NOTHING, _NO_SEGMENT),
-            WheelArrays(wheel_s, *angle.T, *speed.T, np.searchsorted(breaks, wheel_ns, side="right"), True, True),
-            Poses(
-                np.array([self.seconds(p.t_ns) for p in poses]),
-                *values.T,
-                np.searchsorted(breaks, pose_ns, side="right"),
-            ),
-            Gyro(_NOTHING, _NOTHING, _NO_SEGMENT),
+        return drive_of(
+            np.array([self.seconds(w.t_ns) for w in wheels]),
+            np.array([(w.left_rad, w.right_rad) for w in wheels]),
+            np.searchsorted(breaks, wheel_ns, side="right"),
+            np.array([self.seconds(p.t_ns) for p in poses]),
+            np.array([(p.x_m, p.y_m, p.yaw_rad) for p in poses]),
+            np.searchsorted(breaks, pose_ns, side="right"),
         )
-        return excitation(log, "encoders")
+
+
+def drive_of(
+    wheel_s: Array, angle_rad: Array, wheel_segment: Index, pose_s: Array, pose: Array, pose_segment: Index
+) -> Excitation:
+    """A drive of wheel angles (W, 2) and poses (P, 3), each with its times and segments; raises UnusableDriveError."""
+    speed = np.gradient(angle_rad, wheel_s, axis=0)
+    log = DriveLog(
+        ("the running drive",),
+        Commands(_NOTHING, _NOTHING, _NOTHING, _NO_SEGMENT),
+        WheelArrays(wheel_s, angle_rad[:, 0], angle_rad[:, 1], speed[:, 0], speed[:, 1], wheel_segment, True, True),
+        Poses(pose_s, pose[:, 0], pose[:, 1], pose[:, 2], pose_segment),
+        Gyro(_NOTHING, _NOTHING, _NO_SEGMENT),
+    )
+    return excitation(log, "encoders")
 
 
 def _insert(samples: list, sample: Wheels | Pose) -> None:  # type: ignore[type-arg]

@@ -122,6 +122,7 @@ def running_stack(
     task: str = FAST_TASK,
     start: tuple[float, float, float] = FAST_START,
     sim_arguments: tuple[str, ...] = (),
+    run_arguments: tuple[str, ...] = (),
 ) -> Iterator[Stack]:
     """Virtual robot and daemon on one link; both end with the block."""
     robot_file = write_robot_file(directory, link, task)
@@ -133,7 +134,9 @@ def running_stack(
         robot = stack.enter_context(disco_hw_process("virtual robot", simulator, directory / "sim.txt"))
         daemon = stack.enter_context(
             disco_hw_process(
-                "daemon", ["run", str(robot_file), "--log", str(directory / "run.mcap")], directory / "daemon.txt"
+                "daemon",
+                ["run", str(robot_file), "--log", str(directory / "run.mcap"), *run_arguments],
+                directory / "daemon.txt",
             )
         )
         yield Stack(directory, robot_file, robot, daemon, Operator(directory / "control.sock", (robot, daemon)), stack)
