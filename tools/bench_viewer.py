@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import os
+import signal
+import sys
 import tempfile
 import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
+import pytest
 import viser
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import ClientConnection, connect
@@ -19,15 +23,33 @@ from websockets.typing import Origin, Subprotocol
 
 from disco_hw.log.reader import open_log
 from disco_hw.operator import disco_hw_process
+from disco_hw.viewer.desk import Desk
 from disco_hw.viewer.feed import ViewerFeed, feed_path
+from disco_hw.viewer.live import LivePage, run_live
 from disco_hw.viewer.recording import Recording
 from disco_hw.viewer.replay import ReplayPage
 from disco_hw.viewer.server import serving
+from disco_hw.viewer.snapshot import Snapshot
+from disco_hw.viewer.stage import stage_of_robot
 from disco_hw.viewer.subscriber import FeedSubscriber
 from drivers.types import WheelSample
 from tests.hil.stack import running_stack
+from tests.viewer.browser import chromium, opened
 from tests.viewer.run import PERIOD_NS, tick_records, write_log
 
+_WATCH_STAMP = """
+window.seen = [];
+const shown = [...document.querySelectorAll("input")].find(input => /^[0-9]{6,}$/.test(input.value));
+let last = shown.value;
+const look = () => {
+  if (shown.value !== last) {
+    last = shown.value;
+    window.seen.push([last, performance.timeOrigin + performance.now()]);
+  }
+  requestAnimationFrame(look);
+};
+requestAnimationFrame(look);
+"""
 LONG_S = 600.0
 DRIVE_S = 15.0
 PORT = 8139
@@ -95,34 +117,86 @@ def _replay(directory: Path) -> dict[str, float]:
 
 
 def _live(directory: Path) -> dict[str, float]:
-    """The whole stack driving: without a page, then with a page and a browser's connection that reads everything."""
+    """The whole stack driving: without a page, with a page in a browser, with the page's process stopped."""
     view = ["view", "--live", "--port", str(PORT), "--robot"]
     spans = {}
+    figures: dict[str, float] = {}
     with running_stack(directory) as stack:
         stack.drive()
         time.sleep(2.0)
-        begin_ns = time.monotonic_ns()
-        time.sleep(DRIVE_S)
-        spans["without"] = (begin_ns, time.monotonic_ns())
-        with disco_hw_process("page", [*view, str(stack.robot_file)], directory / "page.txt") as page, _browser():
+        spans["without_page"] = _span(DRIVE_S)
+        with disco_hw_process("page", [*view, str(stack.robot_file)], directory / "page.txt") as page, _reader():
             time.sleep(2.0)
             cpu_s, begin_ns = _cpu_s(page.process.pid), time.monotonic_ns()
             ages_ms = _ages_ms(feed_path(directory / "control.sock"))
-            spans["with"] = (begin_ns, time.monotonic_ns())
-            cpu_s = _cpu_s(page.process.pid) - cpu_s
+            spans["with_page"] = (begin_ns, time.monotonic_ns())
+            figures["viewer.page_cpu_percent"] = 100.0 * (_cpu_s(page.process.pid) - cpu_s) / DRIVE_S
+            os.kill(page.process.pid, signal.SIGSTOP)
+            spans["stopped_page"] = _span(DRIVE_S)
+            os.kill(page.process.pid, signal.SIGCONT)
+        try:
+            with chromium() as browser:
+                drawn_ms = _drawn_ms(browser, stack.robot_file, directory / "control.sock")
+        except pytest.skip.Exception as reason:
+            print(f"the browser's figures are left out: {reason}", file=sys.stderr)
+        else:
+            figures["viewer.bus_to_browser_ms_p50"] = float(np.quantile(drawn_ms, 0.5))
+            figures["viewer.bus_to_browser_ms_p99"] = float(np.quantile(drawn_ms, 0.99))
         stack.operator.tell("quit")
         stack.daemon.process.wait(10.0)
-    figures = {
-        "viewer.page_cpu_percent": 100.0 * cpu_s / DRIVE_S,
-        "viewer.sample_to_page_ms_p50": float(np.quantile(ages_ms, 0.5)),
-        "viewer.sample_to_page_ms_p99": float(np.quantile(ages_ms, 0.99)),
-    }
+    figures["viewer.sample_to_page_ms_p50"] = float(np.quantile(ages_ms, 0.5))
+    figures["viewer.sample_to_page_ms_p99"] = float(np.quantile(ages_ms, 0.99))
     with open_log(directory / "run.mcap") as log:
         for name, span in spans.items():
-            lateness_us = log.columns("/loop", *span)["lateness_ns"].astype(np.float64) * 1e-3
-            figures[f"viewer.lateness_{name}_page_us_p50"] = float(np.quantile(lateness_us, 0.5))
-            figures[f"viewer.lateness_{name}_page_us_p99"] = float(np.quantile(lateness_us, 0.99))
+            loop = log.columns("/loop", *span)
+            lateness_us = loop["lateness_ns"].astype(np.float64) * 1e-3
+            figures[f"viewer.lateness_{name}_us_p50"] = float(np.quantile(lateness_us, 0.5))
+            figures[f"viewer.lateness_{name}_us_p99"] = float(np.quantile(lateness_us, 0.99))
+            figures[f"viewer.overruns_{name}"] = float(np.ptp(loop["overruns"]))
     return figures
+
+
+def _span(duration_s: float) -> tuple[int, int]:
+    begin_ns = time.monotonic_ns()
+    time.sleep(duration_s)
+    return begin_ns, time.monotonic_ns()
+
+
+def _drawn_ms(browser: Any, robot_file: Path, socket: Path) -> list[float]:
+    """Age of the newest wheel sample when a real browser has it on the page, from its time stamp on.
+
+    The live page runs in this process and shows, beside everything else, the stamp of what it has just drawn; the
+    browser notes when a frame that has a new one is due.
+    """
+    desk = Desk(socket, robot_file)
+    ending = threading.Event()
+    with serving("bench", port=0) as page:
+        live = LivePage(page.server, stage_of_robot(robot_file), socket, desk)
+        stamp = page.server.gui.add_text("stamp", "")
+        show = live.scene.show
+
+        def show_with_stamp(snapshot: Snapshot, everything: bool = True) -> None:
+            show(snapshot, everything)
+            newest = live.timeline.wheels.last(snapshot.t_ns)
+            stamp.value = "" if newest is None else str(newest[0])
+
+        live.scene.show = show_with_stamp  # type: ignore[method-assign]
+        thread = threading.Thread(target=run_live, args=(live, ending.is_set))
+        thread.start()
+        try:
+            with opened(browser, page.url, 1280, 800) as tab:
+                tab.get_by_label("stamp").wait_for()
+                tab.wait_for_timeout(10_000)
+                tab.evaluate(_WATCH_STAMP)
+                tab.wait_for_timeout(DRIVE_S * 1e3)
+                seen = tab.evaluate("window.seen")
+        finally:
+            ending.set()
+            thread.join()
+            desk.close()
+    # A browser has the wall clock alone.
+    ahead_ms = time.time() * 1e3 - time.monotonic_ns() * 1e-6  # noqa: TID251
+    return [at_ms - ahead_ms - int(stamp_ns) * 1e-6 for stamp_ns, at_ms in seen if stamp_ns][1:]
 
 
 def _ages_ms(feed: Path) -> list[float]:
@@ -139,7 +213,7 @@ def _ages_ms(feed: Path) -> list[float]:
 
 
 @contextmanager
-def _browser() -> Iterator[None]:
+def _reader() -> Iterator[None]:
     """What a browser does to the page's process: connect, and read all that comes."""
     address = f"127.0.0.1:{PORT}"
     deadline_s = time.monotonic() + 30.0

@@ -19,7 +19,8 @@ from disco_hw.viewer.timeline import Timeline
 
 WINDOW_NS = 20_000_000_000
 _HEIGHT = 170
-_COLOURS = ("#1c6dd0", "#e07b00", "#1e9650", "#b0308c")
+_BLUE, _ORANGE, _GREY = "#0072b2", "#d55e00", "#777777"
+_DASHES = [6, 4]
 Cut = Callable[[CircleTask, Timeline, int, int], Curves]
 
 
@@ -80,9 +81,9 @@ def _any_task(cut: Callable[[Timeline, int, int], Curves]) -> Cut:
 
 def _add_uplot(gui: viser.GuiApi, title: str, drawn: Curves, right: tuple[str, ...]) -> viser.GuiUplotHandle:
     series: list[dict[str, object]] = [{"label": "s"}]
-    for name, colour in zip(drawn.values, _COLOURS, strict=False):
+    for number, name in enumerate(drawn.values):
         scale = {"scale": "right"} if name in right else {}
-        series.append({"label": name, "stroke": colour, "width": 1.5, "spanGaps": False, **scale})
+        series.append({"label": name, "width": 1.5, "spanGaps": False, **_line(name, number), **scale})
     axes: list[dict[str, object]] = [{}, {"size": 55}]
     scales: dict[str, dict[str, object]] = {"x": {"time": False}}
     if right:
@@ -97,6 +98,15 @@ def _add_uplot(gui: viser.GuiApi, title: str, drawn: Curves, right: tuple[str, .
         legend={"show": len(drawn.values) > 1},
         height=_HEIGHT,
     )
+
+
+def _line(name: str, number: int) -> dict[str, object]:
+    """Colour and dashes of a curve: what is asked, allowed or believed before is dashed, the right wheel orange."""
+    if name.endswith("99 %"):
+        return {"stroke": _GREY, "dash": _DASHES}
+    if name.endswith(("asked", "reference", "model file")):
+        return {"stroke": _ORANGE if name.startswith("right") else _BLUE if "asked" in name else _GREY, "dash": _DASHES}
+    return {"stroke": _ORANGE if name.startswith("right") or (number == 1 and "measured" not in name) else _BLUE}
 
 
 def _columns(drawn: Curves) -> tuple[np.ndarray, ...]:

@@ -24,12 +24,12 @@ WHEEL_COLOUR = (45, 45, 50)
 PLAN_COLOUR = (250, 140, 0)
 POINTS_COLOUR = (150, 110, 200)
 FAN_COLOUR = (0, 105, 125)
-POSES_COLOUR = (20, 150, 150)
+POSES_COLOUR = (90, 90, 95)
 ELLIPSE_COLOUR = (120, 40, 200)
 CENTRE_COLOUR = (0, 0, 0)
 
 TRAIL_FULL_M = 0.1
-"""Distance to the task at which the trail is wholly red."""
+"""Distance to the task at which the trail is wholly amber."""
 
 LAYERS = {
     "task": "Task",
