@@ -74,6 +74,7 @@ class DaemonCore:
         self._link_up = False
         self._planner_failing = False
         self._state = supervisor.state
+        self.entered: dict[str, int] = {}
         self._task_changed = False
 
     def set_task(self, task: CircleTask) -> None:
@@ -194,6 +195,7 @@ class DaemonCore:
         before, self._state = self._state, output.state
         if output.state is before:
             return []
+        self.entered[output.state.value] = self.entered.get(output.state.value, 0) + 1
         return [records.DaemonState(now_ns, output.state.name, before.name, output.detail)]
 
     def _task_change(self, now_ns: int) -> list[records.Record]:

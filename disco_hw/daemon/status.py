@@ -85,4 +85,5 @@ def counters(core: DaemonCore, loop: LoopStats, recorder: RecorderStats, now_ns:
         recorder={name: value for name, value in asdict(recorder).items() if type(value) is int},
         loop={"ticks": loop.ticks, "overruns": loop.overruns, "skipped": loop.skipped_periods},
         adaptation=core.adaptation.counts(),
+        entered=dict(core.entered),
     )

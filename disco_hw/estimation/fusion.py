@@ -14,6 +14,8 @@ from disco_hw.estimation.odometry import Matrix3, OdometryParameters, Pose
 from disco_hw.estimation.wheels import FUTURE_TOLERANCE_NS, WheelReason, WheelTracker
 from drivers.types import PoseSample, WheelSample
 
+GAP_INTERVALS = 3.0
+INTERVAL_WEIGHT = 0.1
 _UNKNOWN: Matrix3 = ((MAX_POSITION_VARIANCE, 0.0, 0.0), (0.0, MAX_POSITION_VARIANCE, 0.0), (0.0, 0.0, MAX_YAW_VARIANCE))
 
 
@@ -83,7 +85,8 @@ class PoseUpdate:
 class FusionStats:
     """Counters since the start; each sample is in exactly one of `wheels_...` and `poses_...`, as judged on arrival.
 
-    The last three are in addition: samples taken although something about them was mended.
+    The last four are in addition: samples taken although something about them was mended, and times without a pose for
+    more than three usual intervals between them.
     """
 
     wheels_accepted: int = 0
@@ -105,6 +108,7 @@ class FusionStats:
     wheel_gaps: int = 0
     wheel_restarts: int = 0
     pose_std_floored: int = 0
+    pose_gaps: int = 0
 
 
 class PoseFusion:
@@ -122,6 +126,8 @@ class PoseFusion:
         self._wheel_timeout_s = wheel_timeout_s
         self._buffer: RewindBuffer | None = None
         self._tracker = WheelTracker()
+        self._pose_came_ns: int | None = None
+        self._pose_interval_ns = 0.0
         self._counts = {field.name: 0 for field in fields(FusionStats)}
 
     @property
@@ -151,6 +157,7 @@ class PoseFusion:
 
     def add_pose(self, sample: PoseSample, now_ns: int) -> PoseUpdate:
         """Take in a measured pose at its own stamp, and say what it did as far as is known by now."""
+        self._note_arrival(now_ns)
         outcome = self._judge(sample, now_ns)
         if isinstance(outcome, PoseReason):
             outcome = Judgement(outcome)
@@ -201,6 +208,16 @@ class PoseFusion:
             pose_ok=pose_age_s is not None and pose_age_s <= self._pose_timeout_s,
             reinitialisations=state.reinitialisations,
         )
+
+    def _note_arrival(self, now_ns: int) -> None:
+        last_ns, self._pose_came_ns = self._pose_came_ns, now_ns
+        if last_ns is None or now_ns <= last_ns:
+            return
+        if 0.0 < GAP_INTERVALS * self._pose_interval_ns < now_ns - last_ns:
+            self._counts["pose_gaps"] += 1
+            return
+        weight = 1.0 if self._pose_interval_ns == 0.0 else INTERVAL_WEIGHT
+        self._pose_interval_ns += weight * (now_ns - last_ns - self._pose_interval_ns)
 
     def _judge(self, sample: PoseSample, now_ns: int) -> Judgement | PoseReason:
         measurement = screen(sample)

@@ -137,7 +137,10 @@ class Event(msgspec.Struct, frozen=True, gc=False):
 
 
 class Counters(msgspec.Struct, frozen=True, gc=False):
-    """Every counter of the stack, about once a second: totals since the start by name, grouped by who counts."""
+    """Every counter of the stack, about once a second: totals since the start by name, grouped by who counts.
+
+    `entered`: how often the daemon has come into each of its states.
+    """
 
     t_ns: int
     transport: dict[str, int] = {}
@@ -146,6 +149,7 @@ class Counters(msgspec.Struct, frozen=True, gc=False):
     recorder: dict[str, int] = {}
     loop: dict[str, int] = {}
     adaptation: dict[str, int] = {}
+    entered: dict[str, int] = {}
 
 
 class BeliefChange(msgspec.Struct, frozen=True, gc=False):

@@ -90,6 +90,12 @@ class SupervisorModel(RuleBasedStateMachine):
             self.inputs = dataclasses.replace(self.inputs, driver_state=state)
             self.step([], 0.02)
 
+    @rule(age_s=st.sampled_from([0.0501, 0.1, 0.15, 0.1501]))
+    def samples_grow_old_while_driving(self, age_s):
+        self.a_good_arming(True)
+        self.inputs = dataclasses.replace(self.inputs, telemetry_age_s=age_s)
+        self.step([], 0.02)
+
     @rule()
     def a_reset(self):
         self.all_is_well_again([UserRequest.RESET])

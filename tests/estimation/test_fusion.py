@@ -213,6 +213,7 @@ def test_each_sample_is_counted_once():
         "wheel_gaps": 1,
         "wheel_restarts": 1,
         "pose_std_floored": 1,
+        "pose_gaps": 0,
     }
 
 
@@ -258,3 +259,10 @@ def test_no_stream_of_samples_harms_the_estimate(events, known, pose_required):
     for first, second in results:
         assert repr(first) == repr(second)
     assert fusions[0].stats == fusions[1].stats
+
+
+def test_a_time_without_poses_is_counted_once_and_a_steady_rate_never():
+    fusion = fusion_with()
+    for ms in (*range(0, 2000, 40), *range(2200, 4000, 40), *range(4000, 6000, 100)):
+        fusion.add_pose(pose(ms), ms * MS)
+    assert fusion.stats.pose_gaps == 1

@@ -59,7 +59,7 @@ _USUAL = frozenset(
         *(f"transport.{n}" for n in ("frames_sent", "frames_received", "bytes_received")),
         *(f"driver.{n}" for n in ("frames_accepted", "commands_sent", "sessions")),
         *(f"fusion.{n}" for n in ("wheels_accepted", "poses_accepted", "poses_initialised")),
-        "loop.ticks",
+        *("loop.ticks", "entered.armed", "entered.ready", "entered.handshake"),
         *("robot.t_ns", "robot.tx_error_count", "robot.rx_error_count"),
     }
 )
@@ -141,7 +141,7 @@ class LogReader:
             elif kind is records.DaemonState:
                 self.told.append((now_ns, f"{record.previous} -> {record.state}: {record.reason}"))
             elif kind is records.Counters:
-                for group in ("transport", "driver", "fusion", "loop"):
+                for group in ("transport", "driver", "fusion", "loop", "entered"):
                     for name, value in getattr(record, group).items():
                         self.counts[f"{group}.{name}"] = value
             elif kind is RobotLinkHealth:
