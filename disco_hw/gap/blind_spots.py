@@ -72,7 +72,7 @@ def _realistic(parameter: Parameter) -> float:
 def experiment_of(name: str) -> str:
     """The drive that shows an effect, as it is typed, and what it is."""
     effect = REGISTRY[name]
-    return f"disco-hw drive --script {effect.script}: {effect.excitation}"
+    return f"disco-hw drive ROBOT.toml --script {effect.script}: {effect.excitation}"
 
 
 def _largest(channel: Channel, name: str) -> float | None:

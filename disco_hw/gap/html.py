@@ -6,14 +6,24 @@ import base64
 from collections.abc import Iterable, Sequence
 from html import escape
 
-from disco_hw.gap.report import STAGES, GapReport
+from disco_hw.gap.report import REPORTED_HORIZON_S, STAGES, GapReport
 
 _STYLE = """
 body{font:16px/1.5 system-ui,sans-serif;max-width:60rem;margin:2rem auto;padding:0 1rem;color:#222}
 .answer p{font-size:1.25rem;margin:.3rem 0}
 table{border-collapse:collapse;margin:.6rem 0}td,th{padding:.2rem .8rem;text-align:left;border-bottom:1px solid #ddd}
-td.n{text-align:right;font-variant-numeric:tabular-nums}img{max-width:100%}h2{margin-top:2rem}
+td.n{text-align:right;font-variant-numeric:tabular-nums}img{max-width:100%}
+figure{margin:1.2rem 0}figcaption{color:#555;font-size:.9rem}h2{margin-top:2rem}
 """
+
+_CAPTIONS = {
+    "gap_by_horizon": "How far predictions are off, by how far ahead they look, on data not used for fitting; shaded: "
+    "95 % intervals. The dashed line is what noise alone makes.",
+    "gap_by_regime": f"The same {REPORTED_HORIZON_S:g} s ahead, by what the robot was doing.",
+    "where_command_to_wheel": "Where commands and wheels disagree. Bars that end at the line hold nothing but noise.",
+    "where_wheel_to_body": "Where wheels and poses disagree. Bars that end at the line hold nothing but noise.",
+    "worst_stretch": "The stretch in which the wheels and the model as it was lie furthest apart.",
+}
 
 
 def page(report: GapReport) -> str:
@@ -23,6 +33,8 @@ def page(report: GapReport) -> str:
         f"<p>Verdict: <b>{report.verdict}</b>. Logs: {escape(', '.join(report.sources))}.</p>",
     ]
     parts += [_picture(name, picture) for name, picture in report.pictures.items()]
+    if report.gap:
+        parts.append("<h2>The gap by what the robot was doing</h2>" + _by_regime(report))
     parts.append("<h2>What is missing</h2>")
     parts.append(_effects(report))
     if report.residue:
@@ -43,7 +55,11 @@ def page(report: GapReport) -> str:
 
 def _picture(name: str, picture: bytes) -> str:
     data = base64.b64encode(picture).decode("ascii")
-    return f'<p><img alt="{escape(name)}" src="data:image/png;base64,{data}"></p>'
+    caption = _CAPTIONS.get(name, name.replace("_", " "))
+    return (
+        f'<figure><img alt="{escape(name)}" src="data:image/png;base64,{data}">'
+        f"<figcaption>{escape(caption)}</figcaption></figure>"
+    )
 
 
 def _list(items: Iterable[str]) -> str:
@@ -62,7 +78,11 @@ def _effects(report: GapReport) -> str:
         values = ", ".join(f"{n} = {e.value:.4g} [{e.low:.4g}, {e.high:.4g}]" for n, e in effect.parameters.items())
         also = ", ".join(effect.indistinguishable_from)
         rows.append((effect.name, effect.channel, values, f"{effect.evidence:.0f}", also, effect.experiment or ""))
-    rows += [("unnamed", term.channel, term.form, f"{term.evidence:.0f}", "", "") for term in report.unnamed]
+    for term in report.unnamed:
+        place = (
+            "in the amended model" if term.in_model else "not in the model: it depends on what no model's state holds"
+        )
+        rows.append(("unnamed", term.channel, term.form, f"{term.evidence:.0f}", "", place))
     if not rows:
         return "<p>Nothing that this log shows.</p>"
     head = (
@@ -77,15 +97,27 @@ def _effects(report: GapReport) -> str:
 
 
 def _gap(report: GapReport) -> str:
+    """Position, heading and wheel speed by horizon, with bootstrap intervals over stretches of time."""
     rows = []
     for horizon in sorted(report.gap["nominal"]):
-        cells = []
-        for stage in STAGES:
-            e = report.gap[stage][horizon]
-            low, high = e.position_ci
-            cells.append(f"{1e3 * e.position_m:.1f} mm [{1e3 * low:.1f}, {1e3 * high:.1f}], {e.yaw_rad:.3f} rad")
-        rows.append((f"{horizon:g} s", *cells))
-    return _table(("ahead", *STAGES), rows)
+        errors = [report.gap[stage][horizon] for stage in STAGES]
+        rows += [
+            (f"{horizon:g} s", "position, mm", *(_with_interval(e.position_m, e.position_ci, 1e3) for e in errors)),
+            ("", "heading, mrad", *(_with_interval(e.yaw_rad, e.yaw_ci, 1e3) for e in errors)),
+            ("", "wheel speed, rad/s", *(f"{e.wheel_rad_s:.3f}" for e in errors)),
+        ]
+    return _table(("ahead", "error (root mean square)", *STAGES), rows)
+
+
+def _with_interval(value: float, interval: tuple[float, float], factor: float) -> str:
+    low, high = interval
+    return f"{factor * value:.1f} [{factor * low:.1f}, {factor * high:.1f}]"
+
+
+def _by_regime(report: GapReport) -> str:
+    errors = [report.gap[stage][REPORTED_HORIZON_S].by_regime_m for stage in STAGES]
+    rows = [(name, *(f"{1e3 * of[name]:.1f} mm" if name in of else "" for of in errors)) for name in sorted(errors[0])]
+    return _table((f"position error {REPORTED_HORIZON_S:g} s ahead", *STAGES), rows)
 
 
 def _candidates(report: GapReport) -> str:
@@ -98,4 +130,5 @@ def _blind(report: GapReport) -> str:
     for spot in report.blind_spots:
         size = "never" if spot.smallest_visible is None else f"{spot.smallest_visible:.3g} {spot.unit}"
         rows.append((spot.name, size, "blind to realistic sizes" if spot.blind else "", spot.experiment))
-    return _table(("effect", "smallest visible", "", "the drive that shows it"), rows)
+    ask = f"<p>All of it in a minute: <code>{escape(report.drive)}</code>.</p>" if report.drive else ""
+    return ask + _table(("effect", "smallest visible", "", "the drive that shows it"), rows)

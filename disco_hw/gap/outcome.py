@@ -187,7 +187,10 @@ class Outcome:
         for place, found in ((Channel.COMMAND_TO_WHEEL, self.wheels), (Channel.WHEEL_TO_BODY, self.body)):
             if found is None:
                 continue
-            out += [UnnamedFinding(place.value, term.form, term.evidence.score) for term in found.unnamed]
+            out += [
+                UnnamedFinding(place.value, one.form, one.evidence.score, one.term.model_name is not None)
+                for one in found.unnamed
+            ]
         return tuple(out)
 
     def channels(self, effects: Iterable[EffectFinding], unnamed: Iterable[str] = ()) -> tuple[ChannelFinding, ...]:

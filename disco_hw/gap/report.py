@@ -13,6 +13,7 @@ from disco_hw.model.effects import REGISTRY
 
 REPORTED_HORIZON_S = 2.0
 STAGES = ("nominal", "refitted", "amended", "floor")
+ALL_IN_ONE = "separate"
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +48,7 @@ class UnnamedFinding:
     channel: str
     form: str
     evidence: float
+    in_model: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +108,8 @@ class GapReport:
                 for effect in self.effects
             ],
             "unnamed": [
-                {"channel": term.channel, "form": term.form, "evidence": term.evidence} for term in self.unnamed
+                {"channel": term.channel, "form": term.form, "evidence": term.evidence, "in_model": term.in_model}
+                for term in self.unnamed
             ],
             "residue": list(self.residue),
             "blind_spots": [
@@ -120,6 +123,7 @@ class GapReport:
                 }
                 for spot in self.blind_spots
             ],
+            "drive": self.drive,
             "gap": self._gap_dict(),
             "notes": list(self.notes),
             "seconds": self.seconds,
@@ -156,8 +160,17 @@ class GapReport:
             )
         blind = [spot.name for spot in self.blind_spots if spot.blind]
         if blind:
-            lines.append(f"This log could not have shown {', '.join(blind)} of realistic size.")
+            drive = f": `{self.drive}` would" if self.drive else ""
+            lines.append(f"This log could not have shown {', '.join(blind)} of realistic size{drive}.")
         return lines
+
+    @property
+    def drive(self) -> str | None:
+        """The drive of at most a minute that shows what this log could not; None if there is nothing of that kind."""
+        scripts = {REGISTRY[spot.name].script for spot in self.blind_spots if spot.blind}
+        if not scripts:
+            return None
+        return f"disco-hw drive ROBOT.toml --script {scripts.pop() if len(scripts) == 1 else ALL_IN_ONE}"
 
     def as_text(self) -> str:
         """For a terminal."""

@@ -81,3 +81,34 @@ def adapt(
     result.write_csv(out / "adapt.csv")
     result.write_png(out / "adapt.png")
     print_result({"changes": result.rows()}, as_json, result.table())
+
+
+@experiment_app.command()
+def gap(
+    hide: Annotated[
+        list[str] | None,
+        typer.Option(metavar="EFFECT=VALUE", help="Hide this in the virtual robot; more than one goes."),
+    ] = None,
+    robot: Annotated[Path | None, typer.Option(help="robot.toml to drive; the shipped robot's if none.")] = None,
+    laps: Annotated[float, typer.Option(min=0.5, max=20.0, help="Laps of each circle.")] = 1.5,
+    script: Annotated[str, typer.Option(help="Script whose log is searched (docs/drive.md).")] = "excite",
+    plant_seed: Annotated[
+        int | None, typer.Option(min=0, help="Draw the true geometry from the model's posterior with this seed.")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the sensors' and the ground's noise.")] = 1,
+    out: Annotated[Path, typer.Option("-o", "--out", help="Directory for log, report, table and picture.")] = Path(
+        "out/gap"
+    ),
+    as_json: AsJson = False,
+) -> None:
+    """Hide an effect in the virtual robot, find it in a log, and drive the circle without and with it in the model."""
+    import disco_hw
+    from disco_hw.gap_experiment import GapExperimentOptions, run_gap_experiment
+
+    shipped = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
+    hidden = tuple(hide or ("deadband=0.8",))
+    options = GapExperimentOptions(robot or shipped, hidden, out, laps, script, plant_seed, seed)
+    result = run_gap_experiment(options, progress_line)
+    print_result(
+        result.as_dict(), as_json, f"{result.as_text()}\n\nwritten: {out}/experiment.png, report.html, drive.mcap"
+    )
