@@ -37,7 +37,7 @@ from disco_hw.virtual import true_parameters
 from firmware_protocol.firmware_core import FirmwareConfig
 from sim.body_dynamics import Pose
 from sim.effects import HiddenEffectError, parse_hidden_effects
-from sim.in_process import InProcessRobot
+from sim.in_process import RobotInProcess
 
 RUNS = ("given", "geometry refitted", "amended")
 _COLOURS = {"given": "#b0b0b0", "geometry refitted": "#d98c3f", "amended": "#2f7fc1"}
@@ -186,7 +186,7 @@ def without_effects(amended: Model, given: Model) -> Model:
     return replace(amended, effects=effects, belief=belief)
 
 
-def _robot(setup: Setup, options: GapExperimentOptions, hidden: Mapping[str, tuple[float, ...]]) -> InProcessRobot:
+def _robot(setup: Setup, options: GapExperimentOptions, hidden: Mapping[str, tuple[float, ...]]) -> RobotInProcess:
     task, robot = setup.config.task, setup.config.robot
     parameters = true_parameters(setup, options.plant_seed)
     firmware = FirmwareConfig(
@@ -195,7 +195,7 @@ def _robot(setup: Setup, options: GapExperimentOptions, hidden: Mapping[str, tup
         max_wheel_acceleration_rad_s2=robot.max_wheel_acceleration_rad_s2,
     )
     start = Pose(task.center_x_m + task.radius_m, task.center_y_m, math.pi / 2)
-    return InProcessRobot(parameters, hidden, start, firmware, options.seed)
+    return RobotInProcess(parameters, hidden, firmware, start, options.seed)
 
 
 def _record(
@@ -225,7 +225,7 @@ def _circle(
     rows = []
     for tick in run.ticks(2.0 * options.laps * lap_s + _SETTLING_S):
         truth = run.robot.truth
-        rows.append((run.robot.now_us * 1e-6, truth.x_m, truth.y_m, truth.yaw_rad, truth.speed_m_s))
+        rows.append((run.now_us * 1e-6, truth.x_m, truth.y_m, truth.yaw_rad, truth.speed_m_s))
         if run.core.laps.laps >= options.laps:
             break
         if tick.command is None:

@@ -16,7 +16,8 @@ from disco_hw.log.recorder import MemoryRecorder, ProcessRecorder, Recording
 from disco_hw.model.file import model_text
 from disco_hw.pipeline import Planner
 from disco_hw.robot_setup import Setup
-from sim.in_process import InProcessRobot
+from sim.in_process import RobotInProcess
+from sim.virtual_robot import STEP_US
 
 _READY_S, _ARMED_S = 1.5, 0.5
 _CLOSING_S = 60.0
@@ -25,8 +26,9 @@ _CLOSING_S = 60.0
 class SimulatedRun:
     """A robot, driven by the daemon's core with this planner and pilot; what happens is recorded in memory."""
 
-    def __init__(self, setup: Setup, robot: InProcessRobot, planner: Planner, pilot: Pilot | None = None) -> None:
+    def __init__(self, setup: Setup, robot: RobotInProcess, planner: Planner, pilot: Pilot | None = None) -> None:
         self._setup, self.robot, self._pilot = setup, robot, pilot or TaskPilot()
+        self.now_us = 0
         self._recorder = MemoryRecorder()
         pipeline = make_pipeline(setup.config, setup.model, planner)
         self.core: DaemonCore = assemble_core(
@@ -36,12 +38,13 @@ class SimulatedRun:
 
     def ticks(self, duration_s: float, *requests: UserRequest) -> Iterator[CoreTick]:
         """Let time pass and give every tick; the requests come with the first one."""
-        end_us = self.robot.now_us + round(duration_s * 1e6)
-        while self.robot.now_us < end_us:
-            now_us = self.robot.step()
-            if now_us % self._period_us:
+        end_us = self.now_us + round(duration_s * 1e6)
+        while self.now_us < end_us:
+            self.now_us += STEP_US
+            self.robot.advance(self.now_us)
+            if self.now_us % self._period_us:
                 continue
-            now_ns = now_us * 1000
+            now_ns = self.now_us * 1000
             wanted = self._pilot.step(now_ns, self.core.last)
             tick = self.core.tick(now_ns, (*requests, *wanted.requests), motion=wanted.motion)
             self._pilot.learn(now_ns, tick, tick.replies[len(requests) :])
@@ -61,7 +64,7 @@ class SimulatedRun:
         """Let the pilot drive to its end; raises WorkError if it takes longer. `progress` hears the time (s)."""
         for number, _ in enumerate(self.ticks(limit_s)):
             if number % 500 == 0:
-                progress(self.robot.now_us * 1e-6)
+                progress(self.now_us * 1e-6)
             if self._pilot.done:
                 return
         raise WorkError(f"the drive was not over after {limit_s:.0f} s")

@@ -1,11 +1,11 @@
-"""The virtual robot within the caller's process: its time goes on only when it is stepped; no clock, no thread."""
+"""The virtual robot in the host's own process and time: for experiments that must not wait for a clock."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from drivers.transport import InProcessTransport, connect_pair
-from drivers.types import OutgoingFrame
+from drivers.transport import connect_pair
+from drivers.types import OutgoingFrame, Transport
 from firmware_protocol.firmware_core import FirmwareConfig
 from sim.body_dynamics import Pose
 from sim.effects import hidden_effects
@@ -16,38 +16,37 @@ from sim.virtual_robot import STEP_US, VirtualRobot
 _FOREVER_NS = 1 << 62
 
 
-class InProcessRobot:
-    """A plant with hidden effects and the firmware in front of it, at the end of an in-process link.
+class RobotInProcess:
+    """A virtual robot on an in-process link; `host` is the host's end of it, open.
 
-    `host` is the other end, open. `effects`: by name (see `sim.effects`); raises HiddenEffectError for wrong ones.
+    Time begins at 0 and moves on by `advance` alone. `effects` as in `sim.effects`; raises HiddenEffectError.
     """
 
     def __init__(
         self,
-        parameters: PlantParameters,
+        plant: PlantParameters,
         effects: Mapping[str, float | Sequence[float]],
-        start: Pose,
         firmware: FirmwareConfig,
-        seed: int = 1,
+        start: Pose,
+        seed: int,
     ) -> None:
-        plant = Plant(parameters, hidden_effects(effects), seed, start)
-        self._robot = VirtualRobot(plant, firmware, seed=seed)
-        host, self._end = connect_pair()
-        self.host: InProcessTransport = host
-        self.now_us = 0
+        host, self._robot_end = connect_pair()
+        self.host: Transport = host
+        self._robot = VirtualRobot(Plant(plant, hidden_effects(effects), seed, start), firmware, seed=seed)
         host.open()
-        self._end.open()
+        self._robot_end.open()
+        self._now_us = 0
 
     @property
     def truth(self) -> TrueState:
-        """The true motion."""
+        """What is so now."""
         return self._robot.truth
 
-    def step(self) -> int:
-        """Let one step pass, frames both ways; returns the time (us)."""
-        self.now_us += STEP_US
-        for received in self._end.receive():
-            self._robot.receive(self.now_us, received.frame)
-        for frame in self._robot.step(self.now_us):
-            self._end.send(OutgoingFrame(frame, _FOREVER_NS), self.now_us * 1000)
-        return self.now_us
+    def advance(self, until_us: int) -> None:
+        """Let time pass until then; frames wait at both ends."""
+        while self._now_us < until_us:
+            self._now_us += STEP_US
+            for received in self._robot_end.receive():
+                self._robot.receive(self._now_us, received.frame)
+            for frame in self._robot.step(self._now_us):
+                self._robot_end.send(OutgoingFrame(frame, _FOREVER_NS), self._now_us * 1000)
