@@ -29,7 +29,7 @@ ELLIPSE_COLOUR = (120, 40, 200)
 CENTRE_COLOUR = (0, 0, 0)
 
 TRAIL_FULL_M = 0.1
-"""Distance to the task at which the trail is wholly amber."""
+"""Distance to the task at which the trail is wholly yellow."""
 
 LAYERS = {
     "task": "Task",

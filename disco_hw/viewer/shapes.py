@@ -39,12 +39,12 @@ def segments(points: Array, height_m: float) -> Array:
 
 
 def distance_colours(distance_m: Array, full_m: float) -> Bytes:
-    """Colours (N, 3) by distance to the task: dark blue on it, grey at half of `full_m`, amber at it and beyond.
+    """Colours (N, 3) by distance to the task: purple on it, teal at half of `full_m`, yellow at it and beyond.
 
     They differ in brightness too, so that everybody can tell them apart.
     """
     part = np.clip(np.abs(distance_m) / full_m, 0.0, 1.0)
-    ramps = ((0.0, 125.0, 255.0), (32.0, 125.0, 190.0), (77.0, 120.0, 0.0))
+    ramps = ((68.0, 33.0, 253.0), (1.0, 145.0, 200.0), (84.0, 140.0, 30.0))
     return np.stack([np.interp(part, (0.0, 0.5, 1.0), ramp) for ramp in ramps], axis=1).astype(np.uint8)
 
 

@@ -28,7 +28,7 @@ def chromium():
     with playwright.sync_playwright() as driver, TemporaryDirectory(prefix="disco-hw-browser-") as scratch:
         # It draws without a graphics card, and must not take the processor from a robot that is simulated beside it.
         behind = Path(scratch) / "chromium"
-        behind.write_text(f'#!/bin/sh\nexec nice -n 10 {found} "$@"\n', encoding="utf-8")
+        behind.write_text(f'#!/bin/sh\nexec nice -n 5 {found} "$@"\n', encoding="utf-8")
         behind.chmod(0o700)
         browser = driver.chromium.launch(executable_path=behind, headless=True, args=_ARGUMENTS)
         try:

@@ -25,13 +25,13 @@ def screenshot(page):
     return np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB")).astype(int)
 
 
-def like(colour, wanted, least=60):
-    """Whether the order of the channels is that of the wanted colour, clearly."""
+def like(colour, wanted, least=8):
+    """Whether the order of the channels is that of the wanted colour: what is drawn fades in, but grey stays grey."""
     return np.argmax(colour) == np.argmax(wanted) and np.argmin(colour) == np.argmin(wanted) and np.ptp(colour) > least
 
 
-def shows(picture, column, row, wanted, reach=5, least=60):
+def shows(picture, column, row, wanted, reach=5):
     """Whether a pixel near a place is like the wanted colour."""
     row, column = round(row), round(column)
     part = picture[max(row - reach, 0) : row + reach + 1, max(column - reach, 0) : column + reach + 1].reshape(-1, 3)
-    return any(like(pixel, wanted, least) for pixel in part)
+    return any(like(pixel, wanted) for pixel in part)
