@@ -12,7 +12,15 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-PARTS = ("bench_control", "bench_estimation", "bench_inference", "bench_log", "bench_loop", "bench_viewer")
+PARTS = (
+    "bench_adapt",
+    "bench_control",
+    "bench_estimation",
+    "bench_inference",
+    "bench_log",
+    "bench_loop",
+    "bench_viewer",
+)
 
 
 def main() -> int:

@@ -42,7 +42,6 @@ CHANGES: Mapping[str, tuple[float, float]] = MappingProxyType(
 BELIEVED_STD = np.array([0.002, 0.005, 0.005])
 """What `infer` leaves of x_icr (m), wheel radius and axial distance (by their size) after a drive of two minutes."""
 
-SETTLED_S = 20.0
 _ARM_S, _START_S = 1.5, 2.0
 _SMOOTH_S = 5.0
 
@@ -50,11 +49,12 @@ _SMOOTH_S = 5.0
 @dataclass(frozen=True, slots=True)
 class AdaptOptions:
     """`change` of the parameter, by its size, at `change_s`; costs are means over `compared_s` before it, and over as
-    long from 20 s after it on. Seeds 1 to `seeds` are of the plant's noise.
+    long from `settled_s` after it on. Seeds 1 to `seeds` are of the plant's noise.
     """
 
     change: float = 0.15
     change_s: float = 60.0
+    settled_s: float = 20.0
     compared_s: float = 40.0
     seeds: int = 3
 
@@ -120,9 +120,7 @@ class AdaptResult:
                 f"{row['published_s']:8.1f} s {row['half_back_s']:8.1f} s"
             )
         options = ", ".join(f"{key} = {value:g}" for key, value in asdict(self.options).items())
-        lines.append(
-            f"mean tracking cost on the plant's truth, after: from {SETTLED_S:g} s after the change; {options}"
-        )
+        lines.append(f"mean tracking cost on the plant's truth, after: from settled_s after the change; {options}")
         return "\n".join(lines)
 
     def write_csv(self, path: Path) -> None:
@@ -170,7 +168,7 @@ class AdaptResult:
 
     def _mean(self, name: str, *, adapted: bool, after: bool) -> float:
         options = self.options
-        begin = options.change_s + (SETTLED_S if after else -options.compared_s)
+        begin = options.change_s + (options.settled_s if after else -options.compared_s)
         return float(
             np.mean(
                 [
@@ -190,7 +188,7 @@ class AdaptResult:
         """Inf where the cost does not fall below the middle."""
         t_s, smooth = self.runs[name, True][0].t_s, self._smooth(name, adapted=True)
         late = np.flatnonzero(t_s > self.options.change_s)
-        peak = late[int(np.argmax(smooth[late][: round(SETTLED_S / (t_s[1] - t_s[0]))]))]
+        peak = late[int(np.argmax(smooth[late][: round(self.options.settled_s / (t_s[1] - t_s[0]))]))]
         below = np.flatnonzero(smooth[peak:] <= middle)
         return float(t_s[peak + below[0]] - self.options.change_s) if below.size else math.inf
 
@@ -220,7 +218,9 @@ def run_adapt(setup: Setup, options: AdaptOptions | None = None, progress: Progr
                 for seed in range(1, options.seeds + 1)
             ]
             if progress is not None:
-                cost = np.mean([run.cost[run.t_s > options.change_s + SETTLED_S].mean() for run in runs[name, adapted]])
+                cost = np.mean(
+                    [run.cost[run.t_s > options.change_s + options.settled_s].mean() for run in runs[name, adapted]]
+                )
                 progress(f"{name} changes, {'adapting' if adapted else 'not adapting'}: cost afterwards {cost:.4f}")
     return AdaptResult(options, setup.config.task, runs)
 
@@ -260,7 +260,7 @@ def drive(
     recorder = recorder or MemoryRecorder()
     core = assemble_core(config, robot.host, make_driver(), pipeline, recorder, adaptation=adaptation)
     period_us = round(1e6 / config.control.rate_hz)
-    end_us = round((_START_S + options.change_s + SETTLED_S + options.compared_s) * 1e6)
+    end_us = round((_START_S + options.change_s + options.settled_s + options.compared_s) * 1e6)
     rows: list[tuple[float, float, float, float]] = []
     for now_us in range(period_us, end_us + 1, period_us):
         robot.advance(now_us)

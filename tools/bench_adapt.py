@@ -1,0 +1,130 @@
+"""What adaptation costs the loop, and what it wins."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+import disco_hw
+from disco_hw.adapt.adaptable import believed_geometry, possible_range
+from disco_hw.adapt.adapter import Adapter
+from disco_hw.adapt.evidence import evidence
+from disco_hw.adapt.experiment import AdaptOptions, run_adapt
+from disco_hw.adapt.guard import Geometry
+from disco_hw.adapt.link import ProcessLink
+from disco_hw.adapt.messages import InForce
+from disco_hw.adapt.network import Training, train_network, training_range
+from disco_hw.daemon.assembly import make_adaptation, make_pipeline, make_planner, put_in_force
+from disco_hw.daemon.warm_up import warm_up
+from disco_hw.inference.noise import USUAL
+from disco_hw.robot_setup import Setup, load_setup
+from drivers.types import PoseSample, Readings, WheelSample
+from tests.adapt.drives import TRUTH, excited, messages
+from tests.hil.stack import FAST_START, FAST_TASK, running_stack
+
+LIVE_S = 30.0
+ROBOT = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
+
+
+def run() -> dict[str, float]:
+    """Microseconds of the daemon's calls, milliseconds of the adapter's, figures of the loop, and of the experiment."""
+    setup = load_setup(ROBOT)
+    return _calls(setup) | _adapter(setup) | _live() | _won_back(setup)
+
+
+def _calls(setup: Setup) -> dict[str, float]:
+    """The calls that the loop makes, the adapter's process at the other end."""
+    link = ProcessLink()
+    planner = make_planner(setup.config, setup.model)
+    pipeline = make_pipeline(setup.config, setup.model, planner)
+    warm_up(pipeline)
+    adaptation = make_adaptation(setup, pipeline, link)
+    readings = Readings(
+        wheels=(WheelSample(1, 1, 0.0, 0.0, 0.0, 0.0),), poses=(PoseSample(1, 1, 0.0, 0.0, 0.0, 0.01, 0.01),)
+    )
+    try:
+        figures = _timed("adapt.step", 2000, lambda k: adaptation.step(k * 20_000_000))
+        figures |= _timed("adapt.feed", 2000, lambda k: adaptation.feed(k * 20_000_000, readings))
+    finally:
+        link.close()
+    believed = believed_geometry(setup.model)
+    beliefs = [Geometry(believed.mean * (1.0 + 1e-4 * k), believed.covariance) for k in range(300)]
+    figures |= _timed("adapt.put_in_force", 300, lambda k: put_in_force(pipeline, setup.model, beliefs[k]))
+    return figures
+
+
+def _timed(name: str, count: int, call: Callable[[int], object]) -> dict[str, float]:
+    taken = np.empty(count)
+    for k in range(count):
+        begun = time.perf_counter()
+        call(k)
+        taken[k] = 1e6 * (time.perf_counter() - begun)
+    p50, p99, p999 = np.percentile(taken, (50.0, 99.0, 99.9))
+    return {f"{name}_p50_us": float(p50), f"{name}_p99_us": float(p99), f"{name}_p999_us": float(p999)}
+
+
+def _adapter(setup: Setup) -> dict[str, float]:
+    """A report of the recursive estimate over a full window, training, and a conditioning; coverage of the network."""
+    adapter = Adapter()
+    adapter.take(InForce(0, TRUTH, tuple((np.diag([0.02, 0.006, 0.04]) ** 2).ravel().tolist()), adapted=False))
+    reports = []
+    for message in messages(60.0):
+        begun = time.perf_counter()
+        if adapter.take(message) is not None:
+            reports.append(1e3 * (time.perf_counter() - begun))
+    mean = np.array(TRUTH)
+    low, high = training_range(mean, *possible_range(setup.config.prior))
+    begun = time.perf_counter()
+    network = train_network(Training(low, high, setup.config.robot.max_wheel_speed_rad_s), USUAL, setup.model)
+    figures = {
+        "adapt.report_p50_ms": float(np.median(reports[30:])),
+        "adapt.train_s": time.perf_counter() - begun,
+    }
+    rng = np.random.default_rng(1)
+    inside, taken = [], []
+    for seed in range(100):
+        truth = tuple((mean * rng.uniform(0.85, 1.1, 3)).tolist())
+        window = evidence(excited(8.0, seed=seed, truth=truth), USUAL)
+        begun = time.perf_counter()
+        found = network.condition(window)
+        taken.append(1e3 * (time.perf_counter() - begun))
+        inside.append(np.abs(found.mean - truth) < 1.645 * np.sqrt(np.diag(found.covariance)))
+    return figures | {"adapt.condition_p50_ms": float(np.median(taken)), "adapt.coverage_of_90": float(np.mean(inside))}
+
+
+def _live() -> dict[str, float]:
+    """The loop in real time with and without adaptation, while the network is trained and after."""
+    figures: dict[str, float] = {}
+    for name, arguments in (("without", ()), ("with", ("--adapt",))):
+        with TemporaryDirectory() as directory:
+            task = FAST_TASK.replace("0.45", "0.3")
+            with running_stack(Path(directory), task=task, start=FAST_START, run_arguments=arguments) as stack:
+                stack.start()
+                time.sleep(LIVE_S)
+                loop = stack.operator.status()["loop"]
+                stack.operator.tell("quit")
+        for figure in ("p50", "p99", "p999", "max"):
+            figures[f"adapt.loop_{name}.lateness_{figure}_us"] = loop["lateness_us"][figure]
+            figures[f"adapt.loop_{name}.duration_{figure}_us"] = loop["duration_us"][figure]
+        figures[f"adapt.loop_{name}.overruns"] = float(loop["overruns"])
+        figures[f"adapt.loop_{name}.skipped"] = float(loop["skipped"])
+    return figures
+
+
+def _won_back(setup: Setup) -> dict[str, float]:
+    """The experiment with one seed."""
+    figures: dict[str, float] = {}
+    for row in run_adapt(setup, replace(AdaptOptions(), seeds=1)).rows():
+        name = str(row.pop("changes")).replace(" ", "_")
+        figures |= {f"adapt.{name}.{key}": float(value) for key, value in row.items()}
+    return figures
+
+
+if __name__ == "__main__":
+    for key, value in run().items():
+        print(f"{key:45} {value:12.4g}")
