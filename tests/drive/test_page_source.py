@@ -71,6 +71,16 @@ def test_silence_and_late_messages_end_the_hold():
     assert source.poll(1260 * MS, VIEW).deadman
 
 
+def test_a_hold_that_lapsed_at_once_needs_a_new_release():
+    source = PageSource(8.0, 0.5)
+    source.steer(1000 * MS, 1, OPEN)
+    assert source.steer(1010 * MS, 1, held(815 * MS)) is None
+    assert source.poll(1020 * MS, VIEW).t_ns == 815 * MS
+    # The open pad is fresh still, but the person has not let go since the hold lapsed.
+    assert "release" in source.steer(1030 * MS, 1, held(1020 * MS))
+    assert not source.poll(1030 * MS, VIEW).deadman
+
+
 def test_a_hold_without_an_open_pad_before_does_not_count():
     source = PageSource(8.0, 0.5)
     assert "release the pad" in source.steer(1000 * MS, 1, held(990 * MS))
