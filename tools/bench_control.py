@@ -1,36 +1,231 @@
-"""What one step of the planner takes, on the shipped robot: K = 400 sequences, T = 50 steps, L = 7 sigma points."""
+"""The planner: time of a step beside pytorch_mppi, scaling, allocations, and how well the circle is driven.
+
+The paper's size throughout: K = 400 sequences, T = 50 steps, L = 7 sigma points; one thread.
+"""
 
 from __future__ import annotations
 
-import time
+import math
+import tracemalloc
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import torch
+from numba import njit
+from numba.core.runtime import _nrt_python, rtsys
 
 import disco_hw
-from disco_hw.control import PlannerState
+from disco_hw.control import Circle, Disco, DiscoSettings, PlannerState, Sampler, SentCommand, WheelLimits
+from disco_hw.control.black_box import BlackBoxDisco
+from disco_hw.control.experiments.circle import CircleOptions, CircleResult, Command, drive, planner_command, plants
+from disco_hw.control.experiments.pendulum import POSTERIOR
+from disco_hw.control.parameter_points import unscented_points
+from disco_hw.control.pendulum import PendulumPlanner, PendulumPoints
+from disco_hw.control.replan import replan
+from disco_hw.control.settings import ROTATION
+from disco_hw.control.sigma_points import sigma_points
+from disco_hw.control.torch_models import circle_cost, skid_steer_transition
 from disco_hw.daemon.assembly import make_planner
+from disco_hw.model import Model, load_model
 from disco_hw.robot_setup import load_setup
+from tools.step_times import summary, times_ms, undisturbed
 
-STEPS = 3000
+ROBOTS = Path(disco_hw.__file__).parent / "robots"
 PERIOD_NS = 20_000_000
+STEP_NS = 100_000_000
+LARGEST_RAD_S = ROTATION
+SIZES = (400, 1600, 6400, 25_600)
+ROUNDS = 4
+# States are made beforehand and used over and over; a step back in time leaves the plan where it is.
+CALLS = 500
+GPU_SAMPLES = 65_536
 
 
-def run() -> dict[str, float]:
-    """Time whole calls of `plan` one after another, in microseconds; the first ones are left out."""
-    setup = load_setup(Path(disco_hw.__file__).parent / "robots" / "wombot.toml")
+def run(steps: int = 3000, peer_steps: int = 100, seeds: int = 8, duration_s: float = 40.0) -> dict[str, float]:
+    """Return every figure of the planner, times in milliseconds."""
+    torch.set_num_threads(1)
+    model = load_model(ROBOTS / "wombot_model.toml")
+    figures = {f"control.allocations.{key}": value for key, value in allocations(model).items()}
+    with undisturbed() as allowed:
+        figures["control.realtime"] = float(allowed)
+        figures |= on_the_robot(steps)
+        figures |= beside_peer("skid_steer", *skid_steer_pair(model), steps, peer_steps)
+        figures |= beside_peer("pendulum", *pendulum_pair(), steps, peer_steps)
+        figures |= scaling(model, max(steps // 100, 3))
+    if torch.cuda.is_available():
+        taken = torch_times_ms(model, "cuda", GPU_SAMPLES, 50)
+        figures |= summary("control.torch_cuda_k65536_ms", taken)
+    figures |= circle_quality(model, seeds, duration_s)
+    return figures
+
+
+def moving(number: int, period_ns: int = PERIOD_NS) -> tuple[int, PlannerState]:
+    """Time and state of call `number`, on the circle and along it."""
+    now_ns = number * period_ns
+    sent = tuple(SentCommand(now_ns - back * period_ns, 2.3, 4.2) for back in range(50, 0, -1))
+    return now_ns, PlannerState(now_ns, 0.75, 0.0, 1.25, 2.3, 4.2, sent)
+
+
+def on_the_robot(steps: int) -> dict[str, float]:
+    """The whole of `plan` as the daemon calls it, with the shipped robot's task, model and settings, at 50 Hz."""
+    setup = load_setup(ROBOTS / "wombot.toml")
     planner = make_planner(setup.config, setup.model)
-    taken_ns = np.empty(STEPS)
-    for step in range(STEPS):
-        now_ns = step * PERIOD_NS
-        state = PlannerState(now_ns, 0.75, 0.0, 1.25, 2.3, 4.2)
-        began_ns = time.perf_counter_ns()
-        planner.plan(now_ns, state)
-        taken_ns[step] = time.perf_counter_ns() - began_ns
-    settled_us = taken_ns[100:] * 1e-3
+    calls = [moving(number) for number in range(CALLS)]
+    return summary("control.plan_ms", times_ms(lambda number: planner.plan(*calls[number % CALLS]), steps))
+
+
+Step = Callable[[int], object]
+
+
+def skid_steer_pair(model: Model) -> tuple[Step, Step]:
+    """A step of DISCO and of the peer on the paper's circle, with the cost that the paper gives."""
+    from tools.control_peers import circle_mppi, circle_state  # noqa: PLC0415  (a peer for the benchmark only)
+
+    circle, settings = Circle().paper(), DiscoSettings()
+    planner = Disco(model, circle, settings, WheelLimits(LARGEST_RAD_S))
+    planner.warm_up()
+    mppi = circle_mppi(model, circle, settings, LARGEST_RAD_S)
+    start = circle_state(mppi.nx // 4, moving(0)[1])
+    calls = [moving(number, STEP_NS) for number in range(CALLS)]
+    return lambda number: planner.plan(*calls[number % CALLS]), lambda _: mppi.command(start)
+
+
+def pendulum_pair() -> tuple[Step, Step]:
+    """A step of DISCO and of the peer on the paper's pendulum: K = 500, T = 30, L = 5."""
+    from tools.control_peers import pendulum_mppi  # noqa: PLC0415  (a peer for the benchmark only)
+
+    sigma = sigma_points(POSTERIOR.mean(), POSTERIOR.covariance(), 0.5)
+    points = PendulumPoints(sigma.points, sigma.mean_weights)
+    planner = PendulumPlanner(points)
+    mppi = pendulum_mppi(points, 500, 30)
+    start = torch.tensor([math.pi] * 5 + [0.0] * 5)
+    return lambda _: planner.plan(math.pi, 0.0), lambda _: mppi.command(start)
+
+
+def beside_peer(name: str, ours: Step, theirs: Step, steps: int, peer_steps: int) -> dict[str, float]:
+    """Time of a step of both, in turns so that both see the same machine; ratio of the medians, and of the minima."""
+    times: list[np.ndarray] = []
+    peer_times: list[np.ndarray] = []
+    for _ in range(ROUNDS):
+        times.append(times_ms(ours, steps // ROUNDS))
+        peer_times.append(times_ms(theirs, max(peer_steps // ROUNDS, 2), left_out=2))
+    mine, peer = np.concatenate(times), np.concatenate(peer_times)
     return {
-        "control.plan_us.p50": float(np.percentile(settled_us, 50.0)),
-        "control.plan_us.p99": float(np.percentile(settled_us, 99.0)),
-        "control.plan_us.p99_9": float(np.percentile(settled_us, 99.9)),
-        "control.plan_us.max": float(settled_us.max()),
+        **summary(f"control.{name}_step_ms", mine),
+        **summary(f"control.{name}_pytorch_mppi_ms", peer),
+        f"control.{name}_ratio_to_pytorch_mppi": float(np.median(peer) / np.median(mine)),
+        f"control.{name}_ratio_of_minima": float(peer.min() / mine.min()),
+    }
+
+
+def scaling(model: Model, steps: int) -> dict[str, float]:
+    """Time of a step for each number of samples, over what is in proportion to 400 samples: 1 is linear."""
+    settings = DiscoSettings()
+    planners = {
+        size: Disco(model, Circle(), replace(settings, sampler=Sampler(samples=size)), WheelLimits(LARGEST_RAD_S))
+        for size in SIZES
+    }
+    calls = [moving(number) for number in range(CALLS)]
+    least = dict.fromkeys(SIZES, math.inf)
+    for _ in range(ROUNDS):
+        for size, planner in planners.items():
+            count = max(2, steps * SIZES[0] // size)
+            taken = times_ms(lambda n, planner=planner: planner.plan(*calls[n % CALLS]), count, left_out=2)
+            least[size] = min(least[size], float(taken.min()))
+    shares = {size: least[size] / size for size in SIZES}
+    return {
+        **{f"control.scaling.k{size}_ms": least[size] for size in SIZES},
+        **{f"control.scaling.k{size}_over_linear": shares[size] / shares[SIZES[0]] for size in SIZES[1:]},
+    }
+
+
+@njit
+def _empty(
+    work: Any, samplings: Any, step: Any, shift: Any, gain: Any, basis: Any, limits: Any, system: Any, weights: Any
+) -> bool:
+    return True
+
+
+def allocations(model: Model, steps: int = 200) -> dict[str, float]:
+    """What a step takes from the heap.
+
+    `in_the_step`: allocations of the compiled step beyond those of an empty function with the same arguments, for which
+    numba makes a record of each array that it is handed. `bytes_grown_per_step`: Python's memory after `steps` more.
+    """
+    planner = Disco(model, Circle(), DiscoSettings(), WheelLimits(LARGEST_RAD_S))
+    planner.warm_up()
+    for number in range(20):
+        planner.plan(*moving(number))
+    arguments = planner.optimiser.arguments
+    counted = {}
+    _nrt_python.memsys_enable_stats()
+    for name, function in (("step", replan), ("empty", _empty)):
+        function(*arguments)
+        before = rtsys.get_allocation_stats().alloc
+        for _ in range(steps):
+            function(*arguments)
+        counted[name] = rtsys.get_allocation_stats().alloc - before
+    _nrt_python.memsys_disable_stats()
+    tracemalloc.start()
+    try:
+        planner.plan(*moving(20))
+        held = tracemalloc.get_traced_memory()[0]
+        for number in range(21, 21 + steps):
+            planner.plan(*moving(number))
+        grown = tracemalloc.get_traced_memory()[0] - held
+    finally:
+        tracemalloc.stop()
+    return {"in_the_step": float(counted["step"] - counted["empty"]), "bytes_grown_per_step": grown / steps}
+
+
+def torch_times_ms(model: Model, device: str, samples: int, steps: int) -> np.ndarray:
+    """Milliseconds of each step of the torch planner on the paper's circle, on a device."""
+    theta, weights = unscented_points(model, 1.0)
+    sampler = Sampler(samples=samples)
+    planner = BlackBoxDisco(
+        skid_steer_transition(DiscoSettings().step_s), circle_cost(Circle()), theta[:, :3], weights, 2, sampler,
+        largest=LARGEST_RAD_S, device=device,
+    )  # fmt: skip
+    state = np.array([0.75, 0.0, 1.25, 0.0])
+    # The plan comes back as a numpy array, so a step has waited for the device.
+    return times_ms(lambda _: planner.plan(state), steps, left_out=3)
+
+
+def circle_quality(model: Model, seeds: int, duration_s: float) -> dict[str, float]:
+    """How each controller drives the circle: plants drawn from the posterior, lag 0.1 s, 5 % wheel noise, at 10 Hz.
+
+    And the planner with the posterior at 50 Hz: how far its commands move in a second, beside 10 Hz.
+    """
+    options = CircleOptions(seeds=seeds, duration_s=duration_s)
+    figures: dict[str, float] = {}
+    for name, command in contenders(model, options).items():
+        rate_hz = 50.0 if name == "posterior_50hz" else options.rate_hz
+        here = replace(options, rate_hz=rate_hz)
+        runs = [drive(command(theta, seed), theta, here, seed) for seed, theta in enumerate(plants(model, seeds))]
+        row: Any = CircleResult(here, Circle(), name, {name: runs}).rows()[0]
+        travel = [np.abs(np.diff(run.commands_rad_s, axis=0)).mean() * rate_hz for run in runs]
+        figures[f"control.circle.{name}.steady_cost"] = row["steady_cost"]
+        figures[f"control.circle.{name}.command_change_rot_s"] = row["command_change_rot_s"]
+        figures[f"control.circle.{name}.command_travel_rot_s2"] = float(np.mean(travel)) / ROTATION
+    return figures
+
+
+def contenders(model: Model, options: CircleOptions) -> dict[str, Callable[[dict[str, float], int], Command]]:
+    """Every controller of the table, made from the plant's parameters and a seed."""
+    from tools.control_peers import circle_command, circle_mppi  # noqa: PLC0415  (a peer for the benchmark only)
+
+    ours, paper = DiscoSettings(), DiscoSettings.paper()
+    bare = replace(model, belief=None)
+    fast = replace(options, rate_hz=50.0)
+    largest = options.largest_rot_s * ROTATION
+    plain = Circle().paper()
+    return {
+        "posterior": lambda _, seed: planner_command(model, Circle(), ours, options, seed),
+        "truth": lambda theta, seed: planner_command(bare.with_point(theta), Circle(), ours, options, seed),
+        "posterior_50hz": lambda _, seed: planner_command(model, Circle(), ours, fast, seed),
+        "paper_mode": lambda _, seed: planner_command(model, plain, paper, options, seed),
+        "pytorch_mppi": lambda _, seed: circle_command(circle_mppi(model, plain, paper, largest), seed),
     }

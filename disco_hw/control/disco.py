@@ -159,6 +159,11 @@ class Disco:
         self._task = task
         self.reset()
 
+    @property
+    def optimiser(self) -> Optimiser:
+        """The sampling optimiser, for its buffers and figures."""
+        return self._optimiser
+
     def reset(self) -> None:
         """Forget the last plan, as at a new start; the random numbers go on."""
         self._optimiser.reset()
@@ -307,7 +312,7 @@ class Disco:
 
     def _with_past(self, wheel_speeds: Array) -> Array:
         """Commands from before the plan, then the plan: (history + T, 2)."""
-        return np.vstack([self._past, wheel_speeds])
+        return np.concatenate([self._past, wheel_speeds]) if self._history else wheel_speeds
 
     def sampled_rollouts(self, count: int = 50) -> Rollouts:
         """The last plan's `count` sequences of the largest weight, rolled out under the mean parameters.

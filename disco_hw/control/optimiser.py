@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from disco_hw.control.commands import Basis, Limits
 from disco_hw.control.replan import ESS, SAMPLING, TEMPERATURE, Workspace, replan
 from disco_hw.control.settings import Sampler
 from disco_hw.control.spline import spline_basis
+from disco_hw.model.jit import compiled_for
 
 Array = NDArray[np.float64]
 FIRST_TEMPERATURE = 0.1
@@ -76,6 +78,9 @@ class Optimiser:
         )
         self._sampler = sampler
         self._valid = False
+        self._replan: Callable[..., bool] | None = None
+        # What `replan` was last called with, for whoever wants to repeat a step.
+        self.arguments: tuple[Any, ...] = ()
         self.reset()
 
     def reset(self) -> None:
@@ -116,14 +121,18 @@ class Optimiser:
 
         `gain`: how far the plan moves towards the weighted mean of the samples, 0 to 1.
 
-        `before`: the commands that limits of change start from. `point_weights` (L,) float32.
+        `before`: the commands that limits of change start from. `point_weights` (L,) float32. `system` and its parts
+        must be of the same types in every step.
         """
         self._before[:] = before
         number = self.step_number
         self.step_number += 1
-        self._valid = replan(
+        self.arguments = (
             self._work, self._samplings, number, shift_steps, gain, self._basis, self._limits, system, point_weights
-        )
+        )  # fmt: skip
+        if self._replan is None:
+            self._replan = compiled_for(replan, *self.arguments)
+        self._valid = self._replan(*self.arguments)
         return self._valid
 
     @property

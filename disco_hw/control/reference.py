@@ -10,7 +10,10 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from disco_hw.control import pendulum
 from disco_hw.control.tasks.circle import Circle
+from disco_hw.control.tasks.path import FARTHEST_STEP_M, SLOW_DOWN_S, Path
+from disco_hw.control.tasks.timed_path import TimedPath
 from disco_hw.model import reference as model
 
 Array = NDArray[np.float64]
@@ -45,6 +48,57 @@ def circle_cost(circle: Circle, step_s: float) -> SequenceCost:
         return np.asarray(paper + circle.progress_weight * np.maximum(missing, 0.0) + last)
 
     return cost
+
+
+def path_cost(path: Path, place: float, step_s: float) -> SequenceCost:
+    """Cost of paths (T + 1, K) along way-points by arc length, from a place (entries of the path's table); see `Path`.
+
+    Every step moves the place by its projection on the path's direction there.
+    """
+    table, last = path.table, len(path.table) - 1
+
+    def off(at: Array, x: Array, y: Array) -> tuple[Array, Array, Array]:
+        """Offset from the path's point at a place, and its part along the path."""
+        index = np.minimum(at, last - 1.0).astype(int)
+        part = (at - index)[:, None]
+        off_x, off_y = (np.column_stack([x, y]) - (1.0 - part) * table[index, :2] - part * table[index + 1, :2]).T
+        return off_x, off_y, off_x * table[index, 2] + off_y * table[index, 3]
+
+    def cost(x: Array, y: Array, yaw: Array, forward: Array) -> Array:
+        at, total = np.full(x.shape[1], place), np.zeros(x.shape[1])
+        for x_now, y_now in zip(x[1:], y[1:], strict=True):
+            along = np.clip(off(at, x_now, y_now)[2], -FARTHEST_STEP_M, FARTHEST_STEP_M)
+            wanted = np.full(at.shape, path.speed_m_s)
+            if not path.closed:
+                wanted = np.minimum(wanted, (last - at) * path.spacing_m / SLOW_DOWN_S)
+            at = at + along / path.spacing_m
+            at = np.mod(at, last) if path.closed else np.clip(at, 0.0, last)
+            off_x, off_y, _ = off(at, x_now, y_now)
+            total += np.hypot(np.hypot(off_x, off_y), wanted - along / step_s)
+        return total
+
+    return cost
+
+
+def timed_path_cost(path: TimedPath, time_s: float, step_s: float) -> SequenceCost:
+    """Cost of paths (T + 1, K) along way-points by time, which is `time_s` at the start; see `TimedPath`."""
+
+    def cost(x: Array, y: Array, yaw: Array, forward: Array) -> Array:
+        times = time_s + step_s * np.arange(1, len(x))
+        there = [np.interp(times, path.waypoints.times_s, column)[:, None] for column in path.waypoints.places_m.T]
+        return np.asarray(np.hypot(x[1:] - there[0], y[1:] - there[1]).sum(axis=0))
+
+    return cost
+
+
+def pendulum_costs(length_m: float, mass_kg: float, angle_rad: float, speed_rad_s: float, torques: Array) -> Array:
+    """Costs (K,) of torque sequences (K, T) on the paper's pendulum under one parameter point."""
+    angle, speed = np.full(len(torques), angle_rad), np.full(len(torques), speed_rad_s)
+    total = np.zeros(len(torques))
+    for torque in torques.T:
+        angle, speed = pendulum.step(angle, speed, torque, length_m, mass_kg)
+        total += pendulum.UPRIGHT_WEIGHT * (np.cos(angle) - 1.0) ** 2 + speed**2
+    return total
 
 
 def point_costs(

@@ -83,9 +83,19 @@ class Path:
         return x, y
 
     @property
+    def table(self) -> Array:
+        """The path in equal pieces of arc length: x, y (m) and the unit tangent of the piece that begins there."""
+        return self._table
+
+    @property
+    def closed(self) -> bool:
+        """Whether the path's end is its beginning."""
+        return self._closed
+
+    @property
     def spacing_m(self) -> float:
-        """Distance between two entries of the table."""
-        return float(np.hypot(*(self._table[1, :2] - self._table[0, :2])))
+        """Arc length between two entries of the table."""
+        return self._length_m() / (len(self._table) - 1)
 
     def terms(
         self, time_s: float, x_m: float, y_m: float, memory: float | None, step_s: float, horizon: int
@@ -93,7 +103,7 @@ class Path:
         """Terms for the kernel; the memory is the place on the path, in entries of the table."""
         f32 = np.float32
         columns = [np.ascontiguousarray(c, dtype=f32) for c in (self._table - [*self.origin_m, 0.0, 0.0]).T]
-        spacing = self._length_m() / (len(self._table) - 1)
+        spacing = self.spacing_m
         last, speed = f32(len(self._table) - 1), f32(self.speed_m_s)
         per_m, speed_per_entry, slow_per_entry = f32(1.0 / spacing), f32(spacing / step_s), f32(spacing / SLOW_DOWN_S)
         x, y, along_x, along_y = columns
@@ -108,7 +118,7 @@ class Path:
         last = len(self._table) - 1
         distance = np.hypot(self._table[:, 0] - x_m, self._table[:, 1] - y_m)
         if memory is not None:
-            spacing = self._length_m() / last
+            spacing = self.spacing_m
             window = np.arange(round(memory - LOOK_BACK_M / spacing), round(memory + LOOK_AHEAD_M / spacing) + 1)
             window = np.unique(window % last if self._closed else np.clip(window, 0, last))
             nearest = window[np.argmin(distance[window])]
