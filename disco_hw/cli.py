@@ -7,9 +7,8 @@ import sys
 import typer
 
 from disco_hw.errors import InputError, WorkError
-from disco_hw.verbs import learn, robot, virtual, watch
+from disco_hw.verbs import learn, logs, robot, virtual, watch
 from disco_hw.verbs.experiment import experiment_app
-from disco_hw.verbs.logs import log_app
 
 app = typer.Typer(
     name="disco-hw",
@@ -33,7 +32,8 @@ for verb in (
 ):
     app.command()(verb)
 app.add_typer(experiment_app, name="experiment")
-app.add_typer(log_app, name="log")
+app.command("import")(logs.import_log)
+app.add_typer(logs.log_app, name="log")
 
 
 def main() -> None:

@@ -1,4 +1,4 @@
-"""Verbs on log files: log info, recover, export."""
+"""Verbs on log files: import, log info, recover, export."""
 
 from __future__ import annotations
 
@@ -9,9 +9,24 @@ import typer
 
 from disco_hw.verbs.options import (
     AsJson,
+    RobotOption,
+    print_result,
 )
 
 log_app = typer.Typer(help="Look into a log, mend it, hand it on.", no_args_is_help=True)
+
+
+def import_log(
+    log: Annotated[Path, typer.Argument(metavar="FILE", help="A CSV file, or a candump of our protocol.")],
+    robot: RobotOption,
+    out: Annotated[Path, typer.Option("-o", "--out", help="Where to write the MCAP log.")],
+    as_json: AsJson = False,
+) -> None:
+    """Write a foreign log as a log of ours, for `view` and Foxglove."""
+    from disco_hw.log.importing.commands import import_log as import_foreign
+
+    result = import_foreign(log, robot, out)
+    print_result(result.as_dict(), as_json, result.as_text())
 
 
 @log_app.command()

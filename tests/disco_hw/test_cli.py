@@ -7,7 +7,22 @@ import sys
 
 import pytest
 
-VERBS = ["demo", "run", "sim", "drive", "ctl", "check", "replay", "estop", "infer", "gap", "view", "experiment", "log"]
+VERBS = [
+    "demo",
+    "run",
+    "sim",
+    "drive",
+    "ctl",
+    "check",
+    "replay",
+    "estop",
+    "infer",
+    "gap",
+    "view",
+    "import",
+    "experiment",
+    "log",
+]
 
 
 def disco(*arguments: str) -> subprocess.CompletedProcess[str]:

@@ -14,7 +14,7 @@ from disco_hw.log.load import load_drive
 from disco_hw.model import Model
 from tests.inference.drives import TRUTH, logged, robot_config
 
-REAL_LOGS = os.environ.get("DISCO_HW_REAL_LOGS")
+REAL_LOGS = os.environ.get("DISCO_HW_DATA")
 THETA = np.array([TRUTH[name] for name in NAMES])
 FEW = InferOptions(simulations=600, seed=3)
 
@@ -83,7 +83,7 @@ def test_an_impossible_prior_is_refused():
 
 
 @pytest.mark.timeout(600)
-@pytest.mark.skipif(REAL_LOGS is None, reason="set DISCO_HW_REAL_LOGS to a folder with measured logs")
+@pytest.mark.skipif(REAL_LOGS is None, reason="set DISCO_HW_DATA to a folder with measured logs")
 @pytest.mark.parametrize("run", ["circular_20201223_0121_run01", "square_20200623_2042_run01"])
 def test_a_real_differential_drive_is_recovered(run):
     robot = Robot(
@@ -97,7 +97,7 @@ def test_a_real_differential_drive_is_recovered(run):
 
 
 @pytest.mark.timeout(600)
-@pytest.mark.skipif(REAL_LOGS is None, reason="set DISCO_HW_REAL_LOGS to a folder with measured logs")
+@pytest.mark.skipif(REAL_LOGS is None, reason="set DISCO_HW_DATA to a folder with measured logs")
 def test_a_real_skid_steer_robot_is_recovered_and_said_to_differ_from_the_model():
     robot = Robot(
         name="large", wheel_radius_m=0.162, axial_distance_m=0.481, ticks_per_rev=7800, max_wheel_speed_rad_s=10.0

@@ -1,0 +1,1 @@
+"""Foreign logs -> our MCAP log."""

@@ -1,0 +1,87 @@
+"""A drive's arrays -> our MCAP log, from which `drive_from_log` reads the same arrays again."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from itertools import groupby
+from pathlib import Path
+
+from disco_hw.log.drive import DriveLog
+from disco_hw.log.errors import LogError
+from disco_hw.log.link import Attachment, Start, batch_encoder
+from disco_hw.log.mcap_log import McapLog
+from disco_hw.log.provenance import version
+from disco_hw.log.records import Command, Record
+from disco_hw.log.writer import LogFile
+from drivers.types import PoseSample, WheelSample
+
+SOURCE = "import"
+_LONGEST_COMMAND_S = 0.5
+_Timed = tuple[int, int, Record]
+
+
+def write_log(drive: DriveLog, path: Path, robot: str, attachments: tuple[Attachment, ...] = ()) -> int:
+    """Write a new log and return how many records it has; its time 0 is the drive's.
+
+    A change of segment leaves out a tick's number, as lost ticks do. Raises LogError if the file exists or cannot be
+    written.
+    """
+    encode = batch_encoder()
+    try:
+        file = LogFile(path)
+    except FileExistsError:
+        raise LogError(f"{path}: already exists; give another name") from None
+    except OSError as error:
+        raise LogError(f"{path}: cannot be created ({error.strerror}); give another place") from None
+    try:
+        log = McapLog(file, Start(str(path), "", robot, version(), 0, 0, 0, 0, attachments))
+        for tick, (t_ns, samples) in enumerate(groupby(_samples(drive), key=lambda sample: sample[0])):
+            together = list(samples)
+            segment = max(sample[1] for sample in together)
+            log.write(encode(tick + segment, t_ns, [record for _, _, record in together]))
+        log.finish()
+        file.sync()
+    except OSError as error:
+        raise LogError(f"{path}: cannot be written ({error.strerror}); give another place") from None
+    finally:
+        file.close()
+    return log.records
+
+
+def _samples(drive: DriveLog) -> Iterator[_Timed]:
+    """Records with their time (ns) and segment, in order of time."""
+    return iter(sorted([*_commands(drive), *_wheels(drive), *_poses(drive)], key=lambda sample: sample[0]))
+
+
+def _commands(drive: DriveLog) -> Iterator[_Timed]:
+    part = drive.commands
+    rows = zip(
+        *(column.tolist() for column in (part.t_s, part.segment, part.left_rad_s, part.right_rad_s)), strict=True
+    )
+    for t_s, segment, left, right in rows:
+        t_ns = _ns(t_s)
+        known = not math.isnan(left)
+        speeds = (left, right) if known else (0.0, 0.0)
+        yield t_ns, segment, Command(t_ns, *speeds, *speeds, _LONGEST_COMMAND_S, in_force=known, source=SOURCE)
+
+
+def _wheels(drive: DriveLog) -> Iterator[_Timed]:
+    part = drive.wheels
+    columns = (part.left_angle_rad, part.right_angle_rad, part.left_speed_rad_s, part.right_speed_rad_s)
+    values = zip(*(column.tolist() for column in columns), strict=True)
+    for t_s, segment, row in zip(part.t_s.tolist(), part.segment.tolist(), values, strict=True):
+        t_ns = _ns(t_s)
+        yield t_ns, segment, WheelSample(t_ns, t_ns, *row)
+
+
+def _poses(drive: DriveLog) -> Iterator[_Timed]:
+    part = drive.poses
+    values = zip(*(column.tolist() for column in (part.x_m, part.y_m, part.yaw_rad)), strict=True)
+    for t_s, segment, row in zip(part.t_s.tolist(), part.segment.tolist(), values, strict=True):
+        t_ns = _ns(t_s)
+        yield t_ns, segment, PoseSample(t_ns, t_ns, *row, math.nan, math.nan)
+
+
+def _ns(t_s: float) -> int:
+    return round(t_s * 1e9)

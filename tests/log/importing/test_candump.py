@@ -1,0 +1,98 @@
+import can
+import numpy as np
+import pytest
+
+from disco_hw.config import Robot
+from disco_hw.log.errors import LogError
+from disco_hw.log.importing.candump import read_candump
+from firmware_protocol.codec import Codec
+
+ROBOT = Robot(name="test", wheel_radius_m=0.06, axial_distance_m=0.3, ticks_per_rev=2048, max_wheel_speed_rad_s=8.0)
+BEGAN_S = 1_700_000_000.0
+COUNT = 200
+CODEC = Codec()
+
+
+def dumped(path, spoil=lambda number, data: data):
+    """Ten seconds at 20 Hz: commands for 5 s, both wheels at 2 and 3 rad/s, a pose with every sample."""
+    with can.CanutilsLogWriter(path) as writer:
+        for k in range(COUNT):
+            t_s = 0.05 * k
+            counter, ticks = k % 16, 2048 / (2.0 * np.pi) * t_s
+            stamp = (50_000 * k) % (20 << 16)
+            frames = [
+                CODEC.encode("WHEEL_SPEED", counter, **wheel_speed(stamp)),
+                CODEC.encode("WHEEL_TICKS", counter, left_ticks=round(2.0 * ticks), right_ticks=round(3.0 * ticks)),
+                CODEC.encode("POSE_POSITION", counter, x=0.1 * t_s, y=-0.2 * t_s, valid=1),
+                CODEC.encode("POSE_HEADING", counter, **heading(0.01 * k, (50_000 * k) % (100 << 16))),
+            ]
+            if t_s < 5.0:
+                frames.append(CODEC.encode("WHEEL_COMMAND", counter, **command()))
+            for number, frame in enumerate(frames):
+                message = can.Message(
+                    timestamp=BEGAN_S + t_s + 1e-4 * number,
+                    arbitration_id=frame.can_id,
+                    data=spoil(k, frame.data),
+                    is_extended_id=False,
+                    channel="can0",
+                )
+                writer.on_message_received(message)
+    return path
+
+
+def wheel_speed(stamp):
+    flags = {"left_valid": 1, "right_valid": 1, "driver_enabled": 1, "limited": 0}
+    return {"left_speed": 2.0, "right_speed": 3.0, "sample_time": stamp, **flags}
+
+
+def heading(yaw, stamp):
+    return {"yaw": yaw, "valid": 1, "sample_time": stamp, "position_std": 0.01, "yaw_std": 0.01}
+
+
+def command():
+    return {"mode": "SPEED", "left_speed": 2.0, "right_speed": 3.0, "valid_for": 0.1, "session": 1}
+
+
+def test_a_dump_of_the_protocol_becomes_a_drive(tmp_path):
+    drive = read_candump(dumped(tmp_path / "dump.log"), ROBOT)
+    assert drive.segments == 1
+    assert drive.notes == ()
+    # The first frames only qualify their sender.
+    assert COUNT - 5 < drive.wheels.t_s.size <= COUNT
+    assert np.diff(drive.wheels.t_s) == pytest.approx(0.05, abs=1e-6)
+    assert drive.wheels.left_speed_rad_s == pytest.approx(2.0)
+    rolled = drive.wheels.right_angle_rad - drive.wheels.right_angle_rad[0]
+    assert rolled == pytest.approx(3.0 * (drive.wheels.t_s - drive.wheels.t_s[0]), abs=0.004)
+    assert drive.poses.y_m == pytest.approx(-2.0 * drive.poses.x_m, abs=2e-3)
+    assert np.diff(drive.poses.yaw_rad) == pytest.approx(0.01, abs=1e-3)
+
+
+def test_a_command_counts_no_longer_than_it_is_valid(tmp_path):
+    commands = read_candump(dumped(tmp_path / "dump.log"), ROBOT).commands
+    assert commands.left_rad_s[:-1] == pytest.approx(2.0)
+    assert np.isnan(commands.left_rad_s[-1])
+    assert commands.t_s[-1] - commands.t_s[-2] == pytest.approx(0.1, abs=1e-6)
+
+
+def test_frames_that_fail_their_check_are_left_out_and_counted(tmp_path):
+    def spoil(k, data):
+        return bytes([data[0] ^ 0xFF, *data[1:]]) if k == 100 else data
+
+    drive = read_candump(dumped(tmp_path / "dump.log", spoil), ROBOT)
+    assert drive.wheels.t_s.size < COUNT - 1
+    assert "frames failed their check" in drive.notes[0]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("(1.0) can0 7FF#00\n", "1 frames, none of them a command"),
+        ("(2.0) can0 7FF#00\n(1.0) can0 7FF#00\n", "frame 2: the clock goes backwards"),
+        ("(x) can0 7FF#00\n", "not a candump"),
+    ],
+)
+def test_what_is_no_such_dump_is_refused(tmp_path, text, message):
+    path = tmp_path / "dump.log"
+    path.write_text(text)
+    with pytest.raises(LogError, match=message):
+        read_candump(path, ROBOT)

@@ -1,0 +1,51 @@
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from disco_hw.log.errors import LogError
+from disco_hw.log.importing.commands import import_log
+from disco_hw.log.load import load_drive
+from disco_hw.log.provenance import ROBOT_TOML
+from disco_hw.log.reader import open_log
+from tests.inference.drives import TICKS_PER_REV, write_log
+from tests.inference.test_commands import ROBOT
+from tests.log.importing.test_candump import dumped
+
+
+@pytest.fixture
+def robot(tmp_path):
+    path = tmp_path / "robot.toml"
+    path.write_text(ROBOT)
+    return path
+
+
+def test_a_csv_file_becomes_a_log_with_the_robots_file_in_it(robot, tmp_path):
+    source, out = write_log(tmp_path / "log.csv", "poor"), tmp_path / "log.mcap"
+    command = [sys.executable, "-m", "disco_hw", "import", str(source), "--robot", str(robot), "-o", str(out), "--json"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    told = json.loads(done.stdout)
+    with open_log(out) as log:
+        assert log.attachment(ROBOT_TOML) == robot.read_bytes()
+        assert sum(topic.count for topic in log.summary().topics.values()) >= told["records"]
+    assert np.array_equal(load_drive(out).poses.x_m, load_drive(source, TICKS_PER_REV).poses.x_m)
+
+
+def test_a_candump_is_told_from_a_csv_file_by_its_content(robot, tmp_path):
+    found = import_log(dumped(tmp_path / "dump.csv"), robot, tmp_path / "log.mcap")
+    assert found.segments == 1
+    assert found.duration_s == pytest.approx(9.95, abs=0.3)
+    assert load_drive(found.out).poses.t_s.size > 190
+
+
+def test_our_own_logs_need_no_import(robot, tmp_path):
+    import_log(write_log(tmp_path / "log.csv", "poor"), robot, tmp_path / "log.mcap")
+    with pytest.raises(LogError, match="an MCAP log; ours needs no import"):
+        import_log(tmp_path / "log.mcap", robot, tmp_path / "again.mcap")
+
+
+def test_what_cannot_be_opened_is_told(robot, tmp_path):
+    with pytest.raises(LogError, match=r"cannot be opened \(No such file"):
+        import_log(tmp_path / "none.csv", robot, tmp_path / "log.mcap")

@@ -1,0 +1,54 @@
+import numpy as np
+import pytest
+
+from disco_hw.log.errors import LogError
+from disco_hw.log.importing.write import write_log
+from disco_hw.log.load import load_drive
+from tests.inference.drives import logged
+
+
+def parts(drive):
+    for name in ("commands", "wheels", "poses"):
+        part = getattr(drive, name)
+        for field in part.__slots__:
+            if isinstance(getattr(part, field), np.ndarray):
+                yield f"{name}.{field}", getattr(part, field)
+
+
+def in_two_segments(drive):
+    """The second half of the drive is another segment."""
+
+    def cut(part):
+        fields = {name: getattr(part, name) for name in part.__slots__}
+        return type(part)(**(fields | {"segment": (part.t_s > 6.0).astype(np.int64)}))
+
+    values = [cut(getattr(drive, name)) for name in ("commands", "wheels", "poses", "gyro")]
+    return type(drive)(drive.sources, *values, drive.notes)
+
+
+def test_what_is_written_is_read_back(tmp_path):
+    drive = in_two_segments(logged("poor"))
+    path = tmp_path / "log.mcap"
+    count = write_log(drive, path, "test")
+    back = load_drive(path)
+    assert count == drive.commands.t_s.size + drive.wheels.t_s.size + drive.poses.t_s.size
+    assert back.segments == drive.segments == 2
+    first_s = min(part.t_s[0] for part in (drive.commands, drive.wheels, drive.poses))
+    for (name, written), (_, read) in zip(parts(drive), parts(back), strict=True):
+        if name.endswith("t_s"):
+            assert read == pytest.approx(written - first_s, abs=2e-9), name
+        else:
+            assert np.array_equal(read, written, equal_nan=True), name
+
+
+def test_a_log_is_never_overwritten(tmp_path):
+    path = tmp_path / "log.mcap"
+    path.write_bytes(b"precious")
+    with pytest.raises(LogError, match="already exists; give another name"):
+        write_log(logged("poor"), path, "test")
+    assert path.read_bytes() == b"precious"
+
+
+def test_a_place_that_is_none_is_refused(tmp_path):
+    with pytest.raises(LogError, match="cannot be created"):
+        write_log(logged("poor"), tmp_path / "nowhere" / "log.mcap", "test")
