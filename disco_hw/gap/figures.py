@@ -6,6 +6,7 @@ import io
 from collections.abc import Callable
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -17,6 +18,8 @@ Array = NDArray[np.float64]
 
 _COLOURS = {"nominal": "#b0b0b0", "refitted": "#d98c3f", "amended": "#2f7fc1", "floor": "#60a060"}
 _DPI = 110
+# Upper end of the axis of residuals, in units of the noise, at least.
+_LEAST_SHOWN = 4.0
 
 
 def png(figure: Figure) -> bytes:
@@ -24,6 +27,11 @@ def png(figure: Figure) -> bytes:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=_DPI, bbox_inches="tight")
     return buffer.getvalue()
+
+
+def _legend_above(axes: Axes) -> None:
+    """A legend that covers nothing."""
+    axes.legend(frameon=False, ncols=3, loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.2, fontsize=9)
 
 
 def gap_by_horizon(gap: dict[str, dict[float, Errors]]) -> bytes:
@@ -60,7 +68,7 @@ def gap_by_regime(gap: dict[str, dict[float, Errors]]) -> bytes:
         axes.barh(rows, values, height=0.25, color=_COLOURS[stage], label=stage)
     axes.set_yticks(range(len(names)), names)
     axes.set_xlabel(f"position error {REPORTED_HORIZON_S:g} s ahead, mm")
-    axes.legend(frameon=False)
+    _legend_above(axes)
     return png(figure)
 
 
@@ -78,9 +86,13 @@ def disagreement(title: str, regimes: list[Regime]) -> bytes:
     axes.set_yticks(rows, [regime.name for regime in ordered])
     axes.set_xlabel("residual, in units of the noise (1 = nothing but noise)")
     axes.set_title(title, loc="left", fontsize=10)
-    if before.size and before.max() > 20.0:
+    largest = float(before.max()) if before.size else 1.0
+    if largest > 20.0:
         axes.set_xscale("log")
-    axes.legend(frameon=False)
+    else:
+        # Where there is nothing but noise the bars stay short, so that it looks like nothing.
+        axes.set_xlim(0.0, max(1.05 * largest, _LEAST_SHOWN))
+    _legend_above(axes)
     return png(figure)
 
 
@@ -93,5 +105,5 @@ def stretch(t_s: Array, measured: Array, before: Array, after: Array, label: str
     axes.plot(t_s, after, color=_COLOURS["amended"], linewidth=1.1, label="amended")
     axes.set_xlabel("time, s")
     axes.set_ylabel(label)
-    axes.legend(frameon=False)
+    _legend_above(axes)
     return png(figure)
