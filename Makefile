@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 SOURCES := pyproject.toml setup.py constraints.txt firmware_protocol/build_firmware.py firmware_protocol/disco_robot.dbc \
 	$(wildcard firmware_protocol/firmware/*.c firmware_protocol/firmware/*.h)
 
-.PHONY: venv demo chromium test bench gap-study firmware-check clean
+.PHONY: venv demo chromium test bench gap-study soak fault-campaign fuzz firmware-check clean
 
 venv: $(STAMP)
 
@@ -48,6 +48,15 @@ bench: $(VENV)/.peers
 
 gap-study: $(STAMP)
 	$(BIN)/python -m tools.gap_study
+
+soak: $(STAMP)
+	$(BIN)/python -m tools.soak --minutes 30
+
+fault-campaign: $(STAMP)
+	$(BIN)/python -m tools.fault_campaign --seeds 100 --hours 1
+
+fuzz: $(STAMP)
+	$(BIN)/python -m tools.fuzz
 
 firmware-check: $(STAMP)
 	$(BIN)/python -m tools.firmware_check

@@ -157,8 +157,8 @@ def _report(console: Console, results: list[dict[str, Any]]) -> int:
     seen, accepted = (sum(result[f"commands_{name}"] for result in results) for name in ("seen", "accepted"))
     factor = hours * 3600.0 / cpu_s
     console.print(
-        f"{len(results)} seeds, {hours:.2f} h simulated in {cpu_s / 3600.0:.2f} CPU h ({factor:.0f} times real time on a "
-        f"core); {seen} wheel commands reached the robot, {accepted} were accepted",
+        f"{len(results)} seeds, {hours:.2f} h simulated in {cpu_s / 3600.0:.2f} CPU h ({factor:.0f} times real time on "
+        f"a core); {seen} wheel commands reached the robot, {accepted} were accepted",
         soft_wrap=True,
     )
     bad = 0

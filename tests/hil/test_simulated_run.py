@@ -1,0 +1,74 @@
+"""The stack in simulated time: it drives, and under random faults nothing gets through to the wheels.
+
+A short part of what `make fault-campaign` does for hours.
+"""
+
+import pytest
+
+from sim.fault_schedule import KINDS, FaultSchedule, parse_schedule, random_schedule
+from tests.hil.simulated_run import SimulatedRun
+from tools.fault_campaign import KINDS_LEFT_OUT, markdown, summary
+
+FAST = {"cycle_us": 5000}
+
+
+def test_without_faults_it_drives_and_nothing_is_told():
+    run = SimulatedRun(FaultSchedule(0, ()), **FAST)
+    outcome = run.run(6.0)
+    assert outcome.violations == []
+    assert outcome.moving_s > 3.5
+    assert outcome.commands_accepted > 200
+    assert run.core.last.output.running
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_random_faults_end_in_a_stop_or_are_tolerated(seed):
+    kinds = tuple(kind for kind in KINDS if kind not in KINDS_LEFT_OUT)
+    run = SimulatedRun(random_schedule(seed, 23.0, kinds=kinds, quiet_s=(3.0, 4.0)), seed=seed, **FAST)
+    outcome = run.run(28.0)
+    assert outcome.violations == []
+    assert len(outcome.faults) >= 4
+    assert outcome.moving_s > 8.0
+
+
+@pytest.mark.parametrize(
+    ("fault", "stops"),
+    [
+        ('kind="encoder_stuck"\nfor_s=2', True),
+        ('kind="encoder_reversed"\nfor_s=2', True),
+        ('kind="motor_stall"\nfor_s=2', True),
+        ('kind="battery_sag"\nfor_s=1', True),
+        ('kind="clock_jump"\nstep_s=5', True),
+        # The core keeps a time of its own, which never goes back: watchdogs and ramps go on as if nothing had happened.
+        ('kind="clock_jump"\nstep_s=-5', False),
+        ('kind="sigkill"\nfor_s=0.5', True),
+        ('kind="flip_after_crc"\nfor_s=0.5\nprobability=0.2\nto="host"', False),
+        ('kind="pose_silent"\nfor_s=0.5', False),
+    ],
+)
+def test_what_each_fault_comes_to_is_seen_in_a_counter(fault, stops):
+    run = SimulatedRun(parse_schedule(f"[[fault]]\nat_s=4\n{fault}"), seed=3, **FAST)
+    outcome = run.run(9.0)
+    assert outcome.violations == []
+    (seen,) = outcome.faults
+    assert seen.armed_before
+    assert (seen.stopped_s is not None) == stops
+    assert seen.counters
+    assert seen.told or not stops
+
+
+def test_the_same_seeds_give_the_same_run():
+    schedule = random_schedule(5, 7.0, quiet_s=(3.0, 4.0))
+    runs = [SimulatedRun(schedule, seed=5, **FAST) for _ in range(2)]
+    outcomes = [run.run(8.0) for run in runs]
+    assert outcomes[0] == outcomes[1]
+    assert runs[0].robot.truth == runs[1].robot.truth
+
+
+def test_the_table_counts_what_struck_an_armed_robot():
+    fault = {"kind": "drop", "struck": True, "armed": True, "stopped_s": 0.3, "counters": ["x"], "told": ["y"]}
+    results = [{"faults": [fault, fault | {"stopped_s": None, "told": []}, fault | {"armed": False}]}]
+    assert summary(results)["drop"] == {
+        "struck": 2, "tolerated": 1, "stopped": 1, "slowest_s": 0.3, "counted": 2, "told": 2, "stop_untold": 0,
+    }  # fmt: skip
+    assert "| `drop` | 2 | 1 | 1 | 0.30 s | 2 | 2 |" in markdown(summary(results))
