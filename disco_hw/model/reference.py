@@ -123,8 +123,12 @@ def wheel_targets(theta: Theta, state: State, left: Any, right: Any, time_s: flo
         left, right = left * kept, right * kept
     if "stiction.threshold_rad_s" in theta:
         threshold = theta["stiction.threshold_rad_s"]
-        left = np.where((np.abs(state.wheel_left) < 0.02) & (np.abs(left) <= threshold), 0.0, left)
-        right = np.where((np.abs(state.wheel_right) < 0.02) & (np.abs(right) <= threshold), 0.0, right)
+
+        def resting(speed: Any, command: Any) -> Any:
+            return (np.abs(speed) < 0.02) | (speed * command < 0.0)
+
+        left = np.where(resting(state.wheel_left, left) & (np.abs(left) <= threshold), 0.0, left)
+        right = np.where(resting(state.wheel_right, right) & (np.abs(right) <= threshold), 0.0, right)
     return left, right
 
 

@@ -12,7 +12,7 @@ REST_RAD_S = 0.02
 
 
 class Stiction:
-    """A wheel at rest stays at rest until |u| exceeds the threshold; a turning wheel feels nothing."""
+    """A wheel at rest, or passing through it, rests until |u| exceeds the threshold; a turning one feels nothing."""
 
     name = "stiction"
     channel = Channel.COMMAND_TO_WHEEL
@@ -35,7 +35,9 @@ def term(command: Any, speed: Any, coefficients: Any) -> Any:
     if coefficients is None:
         return command
     (threshold,) = coefficients
-    stuck = (abs(speed) < cast_like(REST_RAD_S, speed)) & (abs(command) <= threshold)
+    # A wheel sent back through zero by a small command stops there.
+    resting = (abs(speed) < cast_like(REST_RAD_S, speed)) | (speed * command < cast_like(0.0, speed))
+    stuck = resting & (abs(command) <= threshold)
     return cast_like(0.0, command) if stuck else command
 
 
