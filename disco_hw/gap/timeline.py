@@ -23,6 +23,7 @@ _STRETCH_S = 20.0
 _SHORTEST_RUN_S = 1.0
 _LONGEST_SILENCE_S = 1.5
 _SPEED_SPAN_S = 0.03
+_EVEN_SAMPLES = 10
 _LONGEST_RESPONSE_S = 1.5
 _NO_COMMAND_RAD_S = 0.05
 _TURNING_RAD_S = 0.3
@@ -53,8 +54,9 @@ class Timeline:
 
     Nodes (M,): `t_s`, `first` (begins a run), `command_rad_s` (M, 2) mean over the cell that starts there, NaN where no
     command is known; `angle_rad`, `speed_rad_s` (M, 2) measured. `encoder`: wheel samples with `encoder_angle_rad`
-    (E, 2); `pose`: pose samples with `pose` (P, 3) x, y, yaw not wrapped within a run. `known_command` (M, 2) rad/s and
-    `known_motion` (M, 3) m/s, m/s, rad/s: what the terms without a name that a given model has add; None without.
+    (E, 2) laid on even times, its stamps scatter by `stamp_scatter_s`; `pose`: pose samples with `pose` (P, 3) x, y,
+    yaw not wrapped within a run. `known_command` (M, 2) rad/s and `known_motion` (M, 3) m/s, m/s, rad/s: what the
+    terms without a name that a given model has add; None without.
     """
 
     t_s: Array
@@ -66,6 +68,7 @@ class Timeline:
     encoder: Samples
     encoder_angle_rad: Array
     encoder_period_s: float
+    stamp_scatter_s: float
     quantum_rad: float
     pose: Samples
     pose_values: Array
@@ -120,9 +123,10 @@ def timeline(log: DriveLog) -> Timeline:
         changes.append(change)
         angles.append(at)
         speeds.append(speed)
-        inside = t <= grid[-1]
-        encoder_at.append(_locate(t[inside], grid, offset))
-        encoder_angle.append(angle[inside])
+        even = np.clip(even_times(t), grid[0], grid[-1])
+        moved = np.column_stack([np.interp(t, grid, speed[:, side]) for side in (0, 1)]) * (even - t)[:, None]
+        encoder_at.append(_locate(even, grid, offset))
+        encoder_angle.append(angle + moved)
         here = (poses.segment == segment) & (poses.t_s >= grid[0] + 0.02) & (poses.t_s <= grid[-1] - CELL_S)
         pose_at.append(_locate(poses.t_s[here], grid, offset))
         yaw = np.unwrap(poses.yaw_rad[here]) if here.any() else np.empty(0)
@@ -143,12 +147,36 @@ def timeline(log: DriveLog) -> Timeline:
         speed_rad_s=np.concatenate(speeds),
         encoder=encoder,
         encoder_angle_rad=measured,
-        encoder_period_s=float(np.median(np.diff(encoder.t_s))),
-        quantum_rad=_quantum(measured) if wheels.angle_measured else 0.0,
+        encoder_period_s=float(np.median(np.diff(wheels.t_s))),
+        stamp_scatter_s=_scatter(wheels.t_s),
+        quantum_rad=_quantum(np.column_stack([wheels.left_angle_rad, wheels.right_angle_rad]))
+        if wheels.angle_measured
+        else 0.0,
         pose=_joined(pose_at),
         pose_values=np.concatenate(pose_values),
         notes=tuple(notes),
     )
+
+
+def even_times(t_s: Array) -> Array:
+    """Times (N,) without the jitter of their stamps: means over as many neighbours before as after.
+
+    Where samples are lost the stamp itself stays. Angles read by jittering stamps would make every response look
+    weaker than it is; moved to even times by the measured speed they do not.
+    """
+    if t_s.size < 3:
+        return t_s
+    half = np.minimum(np.minimum(np.arange(t_s.size), np.arange(t_s.size)[::-1]), _EVEN_SAMPLES)
+    total = np.concatenate([[0.0], np.cumsum(t_s)])
+    index = np.arange(t_s.size)
+    even = (total[index + half + 1] - total[index - half]) / (2 * half + 1)
+    return np.where(np.abs(even - t_s) < 0.5 * float(np.median(np.diff(t_s))), even, t_s)
+
+
+def _scatter(t_s: Array) -> float:
+    """Scatter of time stamps, s: robust standard deviation of their differences over the root of two."""
+    steps = np.diff(t_s)
+    return float(1.4826 * np.median(np.abs(steps - np.median(steps))) / 2.0**0.5)
 
 
 def _runs(t_s: Array, segment: Index) -> list[tuple[int, int]]:
@@ -243,5 +271,17 @@ def _empty() -> Timeline:
     nothing, pairs = np.empty(0), np.empty((0, 2))
     samples = Samples(np.empty(0, np.int64), nothing, nothing, np.empty(0, np.int64))
     return Timeline(
-        nothing, np.empty(0, bool), pairs, nothing, pairs, pairs, samples, pairs, 0.0, 0.0, samples, np.empty((0, 3))
+        nothing,
+        np.empty(0, bool),
+        pairs,
+        nothing,
+        pairs,
+        pairs,
+        samples,
+        pairs,
+        0.0,
+        0.0,
+        0.0,
+        samples,
+        np.empty((0, 3)),
     )

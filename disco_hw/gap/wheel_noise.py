@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter1d
 
 from disco_hw.model.jit import kernel_function
 
@@ -18,6 +19,8 @@ Array = NDArray[np.float64]
 
 WANDER_S = 20.0
 _START_VARIANCE = 0.04
+_STEADY_S = 0.25
+_FEWEST_STEADY = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,6 +74,7 @@ def _gains(
     logs: Array,
     dt: Array,
     speed: Array,
+    steady: Array,
     jumps: Array,
     restart: Array,
     use: Array,
@@ -88,15 +92,17 @@ def _gains(
             fast = abs(speed[k, side])
             keep, hold = math.exp(-dt[k] / correlation), math.exp(-dt[k] / WANDER_S)
             decay[k, 0], decay[k, 1] = keep, hold
-            reach[k, side] = fast * dt[k]
+            # Signed: a wheel that turns too fast does so ahead and back.
+            reach[k, side, 0] = speed[k, side] * dt[k]
+            reach[k, side, 1] = steady[k, side] * dt[k]
             if restart[k]:
                 aa, aq, as_, qs = _START_VARIANCE, 0.0, 0.0, 0.0
                 qq, ss = relative * relative, wander * wander
             else:
-                go = reach[k, side]
-                aa += 2.0 * go * (aq + as_) + go * go * (qq + 2.0 * qs + ss)
+                go, far = reach[k, side, 0], reach[k, side, 1]
+                aa += 2.0 * (go * aq + far * as_) + go * go * qq + 2.0 * go * far * qs + far * far * ss
                 aa += drift * drift * dt[k] + command_stamp * command_stamp * jumps[k]
-                aq, as_ = keep * (aq + go * (qq + qs)), hold * (as_ + go * (qs + ss))
+                aq, as_ = keep * (aq + go * qq + far * qs), hold * (as_ + go * qs + far * ss)
                 qq = keep * keep * qq + relative * relative * (1.0 - keep * keep)
                 ss = hold * hold * ss + wander * wander * (1.0 - hold * hold)
                 qs *= keep * hold
@@ -132,7 +138,7 @@ def _whiten(
             if restart[k]:
                 drift = quick = slow = 0.0
             else:
-                drift += reach[k, side] * (quick + slow)
+                drift += reach[k, side, 0] * quick + reach[k, side, 1] * slow
                 quick *= decay[k, 0]
                 slow *= decay[k, 1]
             if not use[k]:
@@ -156,9 +162,13 @@ def wheel_gains(
 ) -> WheelGains:
     """Gains for samples `dt_s` apart (E,) at measured speeds (E, 2), with squared command jumps between them (E,)."""
     count = dt_s.size
-    decay, reach = np.empty((count, 2)), np.empty((count, 2))
+    decay, reach = np.empty((count, 2)), np.empty((count, 2, 2))
+    # A slow error that acted on the measured speed itself would scale the very noise it is measured by.
+    period_s = max(float(np.median(dt_s)), 1e-3) if count else 1.0
+    half = max(round(_STEADY_S / period_s), _FEWEST_STEADY)
+    steady = uniform_filter1d(speed_rad_s, 2 * half + 1, axis=0, mode="nearest") if count else speed_rad_s
     gain, scale = np.empty((count, 2, 3)), np.empty((count, 2))
-    _gains(noise.vector(), dt_s, speed_rad_s, jumps, restart, use, decay, reach, gain, scale)
+    _gains(noise.vector(), dt_s, speed_rad_s, steady, jumps, restart, use, decay, reach, gain, scale)
     return WheelGains(decay, reach, gain, scale, restart, use)
 
 
