@@ -20,9 +20,10 @@ from disco_hw.gap.fit import Fit, fit, inverse, sensitivity
 from disco_hw.gap.held_out import Chain, Errors, errors_of, floor_errors, fold_vectors, per_horizon, smoothed_poses
 from disco_hw.gap.intervals import Estimates, estimates
 from disco_hw.gap.report import CandidateEvidence, ChannelFinding, EffectFinding, UnnamedFinding
+from disco_hw.gap.residue import left_over
 from disco_hw.gap.search import Found
 from disco_hw.gap.timeline import CELL_S, Timeline
-from disco_hw.gap.where import in_words, left_over, regimes
+from disco_hw.gap.where import in_words, regimes
 from disco_hw.model.effects import REGISTRY, Channel
 
 Array = NDArray[np.float64]
@@ -213,7 +214,7 @@ class Outcome:
         out: list[str] = []
         for found in (self.wheels, self.body):
             if found is not None:
-                out += left_over(found.channel, self._regimes(found), self.line)
+                out += left_over(found)
         return tuple(out)
 
     def blind_spots(self, effects: Iterable[EffectFinding]) -> tuple[BlindSpot, ...]:

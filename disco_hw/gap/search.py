@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain
 
 import numpy as np
@@ -12,16 +12,17 @@ from numpy.typing import NDArray
 
 from disco_hw.gap.body_noise import BodyNoise
 from disco_hw.gap.candidates import CANDIDATES, indices
-from disco_hw.gap.channels import BodyChannel, WheelChannel
+from disco_hw.gap.channels import BodyChannel, Channel, WheelChannel
 from disco_hw.gap.evidence import Evidence, compare
 from disco_hw.gap.fit import Fit, fit, inverse
 from disco_hw.gap.horizon import displacement, starts_of
 from disco_hw.gap.layout import WHEEL
 from disco_hw.gap.noise_fit import learn_body_noise, learn_wheel_noise
+from disco_hw.gap.saturated import learn_saturated_body, learn_saturated_wheels
 from disco_hw.gap.selection import Names, Selector, Split, Thresholds
 from disco_hw.gap.terms import Term, WithTerms, body_terms, places, wheel_terms
 from disco_hw.gap.timeline import CELL_S, Timeline
-from disco_hw.gap.wheel_noise import WheelNoise
+from disco_hw.gap.wheel_noise import WheelNoise, whiten_wheels
 
 Array = NDArray[np.float64]
 
@@ -34,7 +35,8 @@ _RESPONSES_S = ((0.02, 0.02), (0.15, 0.1), (0.4, 0.3))
 _WORTH_TRYING = 18.0
 _GAUSSIAN_KURTOSIS = 3.0
 _CLIPPED_AT = 6.0
-_HEAVIEST = 2.0
+_HEAVIEST = 1.5
+_REST_RAD_S = 0.05
 _NO_INFORMATION = 1e-3
 _ROUGH = Thresholds(score=20.0, moves_m=0.0)
 _SMOOTH_WHEEL = ("motor_lag", "command_delay", "deadband", "battery_sag", "wheel_gain")
@@ -61,13 +63,18 @@ class UnnamedTerm:
 
 @dataclass(frozen=True)
 class Found:
-    """What a channel's search ended with: its selector (noise held, all fits kept), accepted effects and terms."""
+    """What a channel's search ended with: its selector (noise held, all fits kept), accepted effects and terms.
+
+    `richest` (n,): whitened residuals of the channel's richest model, which had `richest_parameters`.
+    """
 
     selector: Selector
     names: Names
     channel: WheelChannel | BodyChannel
     unnamed: tuple[UnnamedTerm, ...] = ()
     plain: Selector | None = None
+    richest: Array | None = None
+    richest_parameters: int = 0
 
     @property
     def fit(self) -> Fit:
@@ -134,12 +141,15 @@ def search_wheels(line: Timeline, geometry: Array, start: Array, given: Names = 
     names = rough.greedy(tuple(dict.fromkeys((*given, *_RESPONSE))))
     rich = (*names, *(name for name in _SMOOTH_WHEEL if name not in names))
     vector = fit(channel, rough.fit(names).vector, indices(channel, rich)).vector
-    channel = learn_wheel_noise(channel, vector)
-    limits = _thresholds(channel.whitened(vector), channel.gains.use)
+    channel, left, many = learn_saturated_wheels(learn_wheel_noise(channel, channel.raw_residual(vector)), vector)
+    rolling = np.abs(line.speed_rad_s[line.encoder.node]).max(axis=1) > _REST_RAD_S
+    limits = _thresholds(whiten_wheels(left, channel.gains), channel.gains.use & rolling)
     selector = Selector(channel, moves, limits, given=given, start=rough.fit(given).vector)
     begin = rough.fit(names).vector
     selector.fits[frozenset(names)] = fit(channel, begin, indices(channel, names))
-    return with_unnamed(Found(selector, selector.select(names), channel), _wheel_options)
+    richest = (whiten_wheels(left, channel.gains) * channel.weight).ravel()
+    found = Found(selector, selector.select(names), channel, richest=richest, richest_parameters=many)
+    return with_unnamed(found, _wheel_options)
 
 
 def _responding(selector: Selector) -> None:
@@ -163,15 +173,28 @@ def search_body(line: Timeline, start: Array, given: Names = ()) -> Found:
     """Effects between measured wheel angles and measured poses; `start` and `given` as for the wheels."""
     channel = BodyChannel.build(line, BodyNoise(), start)
     nominal = fit(channel, start, indices(channel, given))
-    channel = learn_body_noise(channel, nominal.vector, 4)
+    channel = learn_body_noise(channel, nominal.vector, iterations=4)
     rough = Selector(channel, body_moves(channel), _ROUGH, given=given, start=nominal.vector)
     names = rough.greedy()
     rich = (*names, *(name for name in _SMOOTH_BODY if name not in names))
     vector = fit(channel, rough.fit(names).vector, indices(channel, rich)).vector
     channel = learn_body_noise(channel, vector)
-    limits = _thresholds(channel.whitened(vector), channel.use)
+    pushes = _body_pushes(channel, rich, vector)
+    channel, fullest, extra, many = learn_saturated_body(channel, rich, vector, pushes)
+    limits = _thresholds(channel.whitened(fullest, extra), channel.use)
     selector = Selector(channel, body_moves(channel), limits, given=given, start=rough.fit(given).vector)
-    return with_unnamed(Found(selector, selector.select(), channel), _body_options)
+    richest = channel.residual(fullest, extra)
+    found = Found(selector, selector.select(), channel, richest=richest, richest_parameters=many)
+    return with_unnamed(found, _body_options)
+
+
+def _body_pushes(channel: BodyChannel, names: Names, vector: Array) -> Iterator[Array]:
+    """Pushes of all terms of the body, and of the disc of the floor that promises most."""
+    rich = fit(channel, vector, indices(channel, names), 1)
+    disc, _ = best_term(rich, channel, places(channel, vector))
+    yield from (term.push for term in body_terms(channel, vector))
+    if disc is not None:
+        yield disc.push
 
 
 def _thresholds(white: Array, use: NDArray[np.bool_]) -> Thresholds:
@@ -185,7 +208,7 @@ def _thresholds(white: Array, use: NDArray[np.bool_]) -> Thresholds:
         return Thresholds()
     sound = np.clip(sound / np.sqrt((sound**2).mean()), -_CLIPPED_AT, _CLIPPED_AT)
     heavy = float((sound**4).mean()) / _GAUSSIAN_KURTOSIS
-    return Thresholds(score=Thresholds().score * min(max(heavy, 1.0), _HEAVIEST) ** 2)
+    return Thresholds(score=Thresholds().score * min(max(heavy, 1.0), _HEAVIEST))
 
 
 def _wheel_options(found: Found) -> Iterator[Term]:
@@ -208,7 +231,7 @@ def with_unnamed(found: Found, options: Callable[[Found], Iterator[Term]]) -> Fo
     proofs: tuple[Evidence, ...] = ()
     plain = found.selector
     while len(terms) < _MOST_TERMS:
-        best, tried = best_term(found, options(found))
+        best, tried = best_term(found.fit, found.selector.channel, options(found))
         if best is None:
             break
         channel = WithTerms.of(found.channel, (*terms, best))
@@ -230,7 +253,7 @@ def with_unnamed(found: Found, options: Callable[[Found], Iterator[Term]]) -> Fo
             UnnamedTerm(term.form.format(coefficient), evidence, term)
             for term, coefficient, evidence in zip(terms, coefficients, proofs, strict=True)
         )
-        found = Found(selector, names, found.channel, accepted, plain)
+        found = replace(found, selector=selector, names=names, unnamed=accepted, plain=plain)
     return found
 
 
@@ -240,12 +263,12 @@ def _extended(plain: Selector, channel: WithTerms) -> Array:
     return np.append(start, np.zeros(channel.neutral.size - start.size))
 
 
-def best_term(found: Found, options: Iterator[Term]) -> tuple[Term | None, int]:
-    """The term that promises most to first order, if it may be worth its price, and how many were tried."""
+def best_term(small: Fit, channel: Channel, options: Iterator[Term]) -> tuple[Term | None, int]:
+    """The term that promises most to first order on top of a fit, if it may be worth it, and how many were tried."""
     best, most, tried = None, _WORTH_TRYING, 0
-    small = found.fit
-    core, held = found.selector.channel.split(small.vector)
-    base = found.channel.residual(core, held)
+    core, held = channel.split(small.vector)
+    inner = channel.inner
+    base = inner.residual(core, held)
     normal, gradient = small.information(), small.jacobian.T @ small.residual
     solved = inverse(normal)
     for term in options:
@@ -255,7 +278,7 @@ def best_term(found: Found, options: Iterator[Term]) -> tuple[Term | None, int]:
             continue
         epsilon = 1e-3 / size
         push = epsilon * term.push if held is None else held + epsilon * term.push
-        column = (found.channel.residual(core, push) - base) / epsilon
+        column = (inner.residual(core, push) - base) / epsilon
         across = small.jacobian.T @ column
         own = float(column @ column - across @ solved @ across)
         pull = float(column @ small.residual - across @ solved @ gradient)

@@ -20,6 +20,9 @@ Split = tuple[Array, Array | None]
 _MOST_EFFECTS = 6
 _WORTH_FITTING = 8.0
 _LOCAL_SEARCHES = 4
+_GAINED = 0.5
+_POOR = 0.5
+_LARGE_PART = 0.25
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,10 +155,18 @@ class Selector:
             return False
         proof = self.evidence(smaller, larger)
         return (
-            proof.score > limits.score
+            (proof.score > limits.score or self._dominant(smaller, gain))
             and proof.repeated > 0.0
             and self.moves(self.split(smaller), self.split(larger)) > limits.moves_m
         )
+
+    def _dominant(self, smaller: Names, gain: float) -> bool:
+        """Whether a gain is a large part of what a poor fit lacks: the right family in a wrong form, then.
+
+        Such a fit scatters from block to block more than any noise, and the score alone would never take it.
+        """
+        lacking = self.fit(smaller).cost - 0.5 * self.channel.count
+        return lacking > _POOR * 0.5 * self.channel.count and gain > _LARGE_PART * lacking
 
     def promise(self, accepted: Names, name: str) -> float:
         """Gain in nats of one more effect, less half its parameters' price; fitted only if it may be worth it."""
@@ -228,6 +239,21 @@ class Selector:
             if name in self.given:
                 continue
             rest = tuple(other for other in accepted if other != name)
+            self._refit_without(accepted, name, rest)
             if not self.acceptable(rest, accepted):
                 return self._backward(rest)
         return accepted
+
+    def _refit_without(self, accepted: Names, name: str, rest: Names) -> None:
+        """Fit `rest` from the fit of the larger set too: what has thresholds may have found better ones there."""
+        if not rest or frozenset(rest) <= frozenset(self.given):
+            return
+        candidate, layout = CANDIDATES[name], self.channel.layout
+        vector = self.fit(accepted).vector.copy()
+        columns = (*candidate.columns, *((candidate.profile.column,) if candidate.profile is not None else ()))
+        places = [layout.place[column] for column in columns]
+        vector[places] = layout.neutral[places]
+        option, key = fit(self.channel, vector, indices(self.channel, rest)), frozenset(rest)
+        if option.cost < self.fit(rest).cost - _GAINED:
+            self.fits[key] = option
+            self.proofs = {pair: proof for pair, proof in self.proofs.items() if key not in pair}

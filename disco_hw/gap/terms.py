@@ -77,14 +77,14 @@ def motion(line: Timeline, p: Array) -> tuple[Array, Array, Array]:
     """Forward speed (m/s), yaw rate (rad/s) and acceleration (m/s^2) that the wheels tell, (M,) each."""
     speed = line.speed_rad_s
     v = 0.5 * p[0] * speed.sum(axis=1)
-    return v, p[0] / p[1] * (speed[:, 1] - speed[:, 0]), np.gradient(_smoothed(v), CELL_S)
+    return v, p[0] / p[1] * (speed[:, 1] - speed[:, 0]), np.gradient(smoothed(v), CELL_S)
 
 
 def body_terms(channel: BodyChannel, p: Array) -> Iterator[Term]:
     """What may be added to the body's velocity; `p` is the vector of the channel."""
     line = channel.timeline
     v, w, a = motion(line, p)
-    dw = np.gradient(_smoothed(w), CELL_S)
+    dw = np.gradient(smoothed(w), CELL_S)
     moving = np.minimum(np.abs(line.speed_rad_s).max(axis=1) * p[0] / 0.05, 1.0)
     beyond = {"moving": moving, "domega/dt": dw, "v domega/dt": v * dw}
     for axis, target in enumerate(BODY_TARGETS):
@@ -149,7 +149,8 @@ def _on(axis: int, feature: Array) -> Array:
     return push
 
 
-def _smoothed(values: Array) -> Array:
+def smoothed(values: Array) -> Array:
+    """Values at the nodes without what changes from one to the next."""
     window = np.hanning(2 * _SPAN_NODES + 1)
     return np.convolve(values, window / window.sum(), "same")
 

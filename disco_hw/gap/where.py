@@ -20,9 +20,6 @@ _SPAN_NODES = 10
 _FEWEST = 40
 # Mean squares of whitened residuals are one; a regime says something from here on.
 _EXCESS = 1.5
-_CLEAR_SIGMAS = 5.0
-_LARGEST_COMMAND_JITTER_S = 0.005
-_JITTER_RATIO = 6.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,6 +34,11 @@ class Regime:
 
 def masks(line: Timeline, samples: Samples) -> Mapping[str, Mask]:
     """Which samples lie in which regime; regimes overlap."""
+    return {name: mask[samples.node] for name, mask in masks_at_nodes(line).items()}
+
+
+def masks_at_nodes(line: Timeline) -> Mapping[str, Mask]:
+    """Which nodes (M,) lie in which regime; regimes overlap."""
     speed = line.speed_rad_s
     mean, half = speed.mean(axis=1), 0.5 * (speed[:, 1] - speed[:, 0])
     ahead = np.minimum(np.arange(speed.shape[0]) + _SPAN_NODES, speed.shape[0] - 1)
@@ -49,7 +51,7 @@ def masks(line: Timeline, samples: Samples) -> Mapping[str, Mask]:
     turning = np.abs(half) > 0.3
     usual_turn = float(np.median(np.abs(half[turning]))) if turning.any() else 1.0
     times = np.linspace(line.t_s[0], line.t_s[-1], 4)
-    at_node = {
+    return {
         "standstill": ~moving,
         "speeding up": moving & (growth >= _SPEEDING_RAD_S2),
         "braking": moving & (growth <= -_SPEEDING_RAD_S2),
@@ -65,7 +67,6 @@ def masks(line: Timeline, samples: Samples) -> Mapping[str, Mask]:
         "early": line.t_s <= times[1],
         "late": line.t_s >= times[2],
     }
-    return {name: mask[samples.node] for name, mask in at_node.items()}
 
 
 def regimes(
@@ -91,29 +92,3 @@ def in_words(found: list[Regime]) -> str:
         return "nowhere more than noise"
     worst = sorted(loud, key=lambda regime: -regime.before)[:3]
     return "most " + ", ".join(f"{r.name} ({r.before**0.5:.1f} times the noise)" for r in worst)
-
-
-def left_over(channel: WheelChannel | BodyChannel, found: list[Regime], line: Timeline) -> list[str]:
-    """What is still missing after naming: regimes that stay loud, and noise that no stamp or sensor makes."""
-    out = []
-    name = "command_to_wheel" if isinstance(channel, WheelChannel) else "wheel_to_body"
-    usual = float(np.median([regime.after for regime in found])) if found else 1.0
-    for regime in found:
-        spread = (2.0 / regime.samples) ** 0.5
-        if regime.after > max(_EXCESS, 2.0 * usual) and regime.after - 1.0 > _CLEAR_SIGMAS * spread:
-            out.append(f"{name}: {regime.name} still disagrees: {regime.after**0.5:.1f} times the noise")
-    if isinstance(channel, WheelChannel):
-        stamps = stamp_jitter_s(line)
-        if channel.noise.command_stamp_s > max(_LARGEST_COMMAND_JITTER_S, _JITTER_RATIO * stamps):
-            out.append(
-                f"{name}: speeding up and braking still disagree: as if commands came "
-                f"{1e3 * channel.noise.command_stamp_s:.0f} ms early or late at random, the encoder's time stamps "
-                f"scatter by {1e3 * stamps:.1f} ms"
-            )
-    return out
-
-
-def stamp_jitter_s(line: Timeline) -> float:
-    """Scatter of the encoder's time stamps, s: robust standard deviation of their differences over the root of two."""
-    steps = np.diff(line.encoder.t_s)
-    return float(1.4826 * np.median(np.abs(steps - np.median(steps))) / 2.0**0.5)
