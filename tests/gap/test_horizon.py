@@ -1,0 +1,46 @@
+"""Displacements ahead in the frame of the start."""
+
+import numpy as np
+import pytest
+
+from disco_hw.gap.horizon import displacement, starts_of
+from disco_hw.gap.layout import BODY
+from disco_hw.gap.timeline import CELL_S
+
+N = 1000
+
+
+def test_a_circle_looks_the_same_from_everywhere():
+    t = np.arange(N) * CELL_S
+    track = np.column_stack([np.sin(0.5 * t), 1.0 - np.cos(0.5 * t), 0.5 * t])
+    start = np.array([100, 300, 600])
+    moved = displacement(BODY.neutral, track, t, start, track[start, 2], 2.0)
+    np.testing.assert_allclose(moved, np.tile([np.sin(1.0), 1.0 - np.cos(1.0), 1.0], (3, 1)), atol=1e-9)
+
+
+def test_latency_shows_what_was_and_drift_adds_in_the_world():
+    t = np.arange(N) * CELL_S
+    track = np.column_stack([0.5 * t**2, np.zeros(N), np.zeros(N)])
+    late = BODY.neutral.copy()
+    late[BODY.place["pose_latency.latency_s"]] = 0.1
+    start = np.array([300])
+    sooner, later = (displacement(p, track, t, start, np.zeros(1), 1.0)[0, 0] for p in (BODY.neutral, late))
+    assert sooner - later == pytest.approx(0.1, abs=1e-6)
+    drift = BODY.neutral.copy()
+    drift[BODY.place["slope.drift_y_m_s"]] = 0.02
+    moved = (
+        displacement(drift, track, t, start, np.full(1, np.pi / 2), 1.0)[0]
+        - displacement(BODY.neutral, track, t, start, np.full(1, np.pi / 2), 1.0)[0]
+    )
+    np.testing.assert_allclose(moved, [0.02, 0.0, 0.0], atol=1e-9)
+
+
+def test_starts_stay_within_runs_and_on_known_nodes():
+    first = np.zeros(N, bool)
+    first[[0, 500]] = True
+    usable = np.ones(N, bool)
+    usable[250] = False
+    start = starts_of(first, usable, 1.0)
+    ends = start + 100
+    assert np.all((start < 500) == (ends < 500))
+    assert not np.any((start <= 250) & (ends >= 250))
