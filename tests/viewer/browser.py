@@ -2,7 +2,7 @@
 
 import os
 import shutil
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -58,6 +58,9 @@ def opened(browser, url, width=800, height=540, scene=True):
 
 
 def keep(page, name):
-    """Keep a screenshot for a person to look at."""
+    """Keep a screenshot for a person to look at; a machine that is too busy to take one goes on without."""
+    from playwright.sync_api import TimeoutError as TooBusy  # noqa: PLC0415
+
     ARTIFACTS.mkdir(parents=True, exist_ok=True)
-    page.screenshot(path=str(ARTIFACTS / f"{name}.png"))
+    with suppress(TooBusy):
+        page.screenshot(path=str(ARTIFACTS / f"{name}.png"), timeout=20_000)

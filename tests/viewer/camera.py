@@ -25,7 +25,7 @@ def screenshot(page):
     return np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB")).astype(int)
 
 
-def like(colour, wanted, least=8):
+def like(colour, wanted, least=4):
     """Whether the order of the channels is that of the wanted colour: what is drawn fades in, but grey stays grey."""
     return np.argmax(colour) == np.argmax(wanted) and np.argmin(colour) == np.argmin(wanted) and np.ptp(colour) > least
 
