@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from disco_hw.errors import InputError
-from disco_hw.verbs.options import (
-    AsJson,
-    print_result,
-    progress_line,
-)
+from disco_hw.verbs.options import AsJson, print_result, progress_line
 
 experiment_app = typer.Typer(help="The paper's experiments, as table, CSV and PNG.", no_args_is_help=True)
 
@@ -30,7 +28,7 @@ def pendulum(
     out.mkdir(parents=True, exist_ok=True)
     result.write_csv(out / "pendulum.csv")
     result.write_png(out / "pendulum.png")
-    print_result({"curves": result.rows()}, as_json, result.table())
+    print_result({"curves": result.rows(), "options": asdict(result.options)}, as_json, result.table())
 
 
 @experiment_app.command()
@@ -40,6 +38,12 @@ def circle(
     ] = None,
     mode: Annotated[str, typer.Option(help="default or paper.")] = "default",
     seeds: Annotated[int, typer.Option(min=1, help="Plants drawn from the posterior.")] = 8,
+    duration_s: Annotated[float, typer.Option(min=1.0, help="Length of a drive.")] = 40.0,
+    rate_hz: Annotated[float, typer.Option(min=1.0, max=200.0, help="Plans a second.")] = 10.0,
+    largest_rot_s: Annotated[float, typer.Option(min=0.1, help="Largest wheel speed, rotations a second.")] = 1.0,
+    largest_rot_s2: Annotated[float, typer.Option(min=0.1, help="Largest change of it in a second.")] = math.inf,
+    lag_s: Annotated[float, typer.Option(min=0.0, help="Lag of the plant's wheels.")] = 0.1,
+    wheel_noise: Annotated[float, typer.Option(min=0.0, help="Noise of a wheel's speed, part of it.")] = 0.05,
     out: Annotated[Path, typer.Option("-o", "--out", help="Directory for CSV and PNG.")] = Path("out/circle"),
     as_json: AsJson = False,
 ) -> None:
@@ -51,11 +55,14 @@ def circle(
     if mode not in {"default", "paper"}:
         raise InputError(f"--mode {mode}: no such mode; write default or paper")
     setup = load_setup(robot or Path(disco_hw.__file__).parent / "robots" / "wombot.toml")
-    result = run_circle(setup.model, mode, CircleOptions(seeds=seeds), progress_line)
+    options = CircleOptions(seeds, duration_s, rate_hz, largest_rot_s, largest_rot_s2, lag_s, wheel_noise)
+    result = run_circle(setup.model, mode, options, progress_line)
     out.mkdir(parents=True, exist_ok=True)
     result.write_csv(out / "circle.csv")
     result.write_png(out / "circle.png")
-    print_result({"curves": result.rows()}, as_json, result.table())
+    # JSON knows no infinity: a limit that is none is null.
+    told = {key: value if math.isfinite(value) else None for key, value in asdict(options).items()}
+    print_result({"curves": result.rows(), "mode": mode, "options": told}, as_json, result.table())
 
 
 @experiment_app.command()

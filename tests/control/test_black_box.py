@@ -1,0 +1,122 @@
+"""The planner over any transition function: against the reference, repeatable, safe, on every device that is there."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from disco_hw.control import Circle, NoValidControl, Sampler, pendulum, reference
+from disco_hw.control.black_box import BlackBoxDisco
+from disco_hw.control.parameter_points import drawn_points, unscented_points
+from disco_hw.control.pendulum import PAPER_SAMPLER
+from disco_hw.control.torch_models import circle_cost, pendulum_cost, pendulum_transition, skid_steer_transition
+from disco_hw.model import load_model
+from disco_hw.model import reference as physics
+
+MODEL = load_model(Path(__file__).parents[2] / "disco_hw/robots/wombot_model.toml")
+POINTS, WEIGHTS = unscented_points(MODEL, 1.0)
+STEP_S, T, K = 0.1, 20, 64
+SAMPLER = Sampler(samples=K, horizon=T)
+START = np.array([0.75, 0.1, 1.2, 0.0])
+DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
+
+
+def skid_steer(sampler=SAMPLER, theta=POINTS, weights=WEIGHTS, **options):
+    return BlackBoxDisco(
+        skid_steer_transition(STEP_S), circle_cost(Circle()), theta[..., :3], weights, 2, sampler,
+        **{"largest": 8.0, "dtype": torch.float64} | options,
+    )  # fmt: skip
+
+
+def costs_of(disco, commands):
+    return disco._rolled(torch.as_tensor(START), torch.as_tensor(commands)).numpy()
+
+
+@pytest.mark.parametrize("each", [False, True])
+def test_costs_are_those_of_the_reference(each):
+    theta, weights = (
+        (drawn_points(MODEL, 3 * K, 1, 0).reshape(3, K, 3), np.full(3, 1 / 3)) if each else (POINTS, WEIGHTS)
+    )
+    commands = np.random.default_rng(1).uniform(-6.0, 6.0, (K, T, 2))
+    got = costs_of(skid_steer(theta=theta, weights=weights), commands)
+    start, past = physics.State(*START[:3], 0.0, 0.0), np.zeros((1, 2))
+    cost = reference.circle_cost(Circle().paper(), STEP_S)
+    for row, point in zip(got, theta, strict=True):
+        named = physics.theta_of(MODEL.parameter_names, point)
+        np.testing.assert_allclose(row, reference.point_costs(named, start, commands, past, STEP_S, cost), atol=1e-9)
+
+
+@pytest.mark.parametrize(("risk", "part"), [("mean", 1.0), ("cvar", 0.3), ("worst", 1e-9)])
+def test_risk_is_that_of_the_reference(risk, part):
+    costs = np.random.default_rng(2).gamma(2.0, size=(7, K))
+    weights = np.random.default_rng(3).dirichlet(np.ones(7))
+    disco = skid_steer(replace(SAMPLER, risk=risk, worst_part=max(part, 1e-3)), weights=weights)
+    expected = reference.mean_risk(costs, weights) if risk == "mean" else reference.cvar_risk(costs, weights, part)
+    np.testing.assert_allclose(disco._combined(torch.as_tensor(costs)).numpy(), expected, rtol=1e-9)
+
+
+def test_the_plan_is_the_weighted_mean_at_the_wanted_effective_sample_size():
+    disco = skid_steer()
+    noise = disco._noise().numpy()
+    commands = np.clip(noise, -8.0, 8.0)
+    mean = reference.mean_risk(costs_of(disco, commands), WEIGHTS)
+    weights = reference.softmax_weights(mean, reference.temperature_for(mean, SAMPLER.target_ess))
+    np.testing.assert_allclose(disco.plan(START), reference.updated(commands, weights), atol=1e-6)
+    assert disco.ess == pytest.approx(SAMPLER.target_ess, rel=1e-3)
+    assert not noise[0].any()
+
+
+def test_the_papers_control_cost_and_update_from_the_noise_as_drawn():
+    sampler = replace(SAMPLER, knots=None, with_nominal=False, temperature=0.3, control_cost_weight=0.3, noise_std=3.0,
+                      update_from="drawn", beyond_end="zero")  # fmt: skip
+    disco = skid_steer(sampler, largest=2.0)
+    nominal = disco.plan(START)
+    shifted = np.vstack([nominal[1:], np.zeros((1, 2))])
+    noise = disco._noise().numpy()
+    costs = reference.mean_risk(costs_of(disco, np.clip(shifted + noise, -2.0, 2.0)), WEIGHTS)
+    costs += reference.control_cost(shifted, noise, 3.0, 0.3)
+    expected = np.clip(shifted + reference.updated(noise, reference.softmax_weights(costs, 0.3)), -2.0, 2.0)
+    np.testing.assert_allclose(disco.plan(START), expected, atol=1e-9)
+
+
+def test_commands_keep_their_limits():
+    disco = skid_steer(largest=3.0, change=0.5)
+    plan = disco.plan(START)
+    assert np.abs(plan).max() <= 3.0
+    assert np.abs(np.diff(plan, axis=0)).max() <= 0.5 + 1e-9
+
+
+def test_the_same_seed_repeats_and_reset_goes_on():
+    one, other = skid_steer(seed=5), skid_steer(seed=5)
+    first = one.plan(START)
+    np.testing.assert_array_equal(first, other.plan(START))
+    np.testing.assert_array_equal(one.plan(START), other.plan(START))
+    one.reset()
+    assert not np.array_equal(one.plan(START), first)
+    assert not np.array_equal(skid_steer(seed=6).plan(START), first)
+
+
+def test_without_a_finite_cost_it_says_so_and_keeps_the_plan():
+    disco = skid_steer()
+    disco.plan(START)
+    kept = disco._nominal.clone()
+    with pytest.raises(NoValidControl, match="no control sequence has a finite cost"):
+        disco.plan(np.full(4, math.nan), shift_steps=0)
+    assert torch.equal(disco._nominal, kept)
+    assert np.isfinite(disco.plan(START)).all()
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_the_pendulum_is_swung_up(device):
+    theta, weights = np.array([[1.0, 1.0]]), np.ones(1)
+    disco = BlackBoxDisco(
+        pendulum_transition, pendulum_cost, theta, weights, 1, replace(PAPER_SAMPLER, samples=200),
+        largest=pendulum.LARGEST_TORQUE_NM, device=device,
+    )  # fmt: skip
+    angle, speed = math.pi, 0.0
+    for _ in range(120):
+        angle, speed = pendulum.step(angle, speed, disco.plan(np.array([angle, speed]))[0, 0], 1.0, 1.0)
+    assert math.cos(angle) > 0.95
