@@ -50,6 +50,11 @@ class Kept:
         path = self._folder / f"{job.key}.json"
         return Result(**json.loads(path.read_text(encoding="utf-8"))) if path.exists() else None
 
+    def all(self) -> list[Result]:
+        """Every result that is kept."""
+        paths = sorted(self._folder.glob("*.json"))
+        return [Result(**json.loads(path.read_text(encoding="utf-8"))) for path in paths]
+
     def put(self, result: Result) -> None:
         """Keep a result; whole or not at all."""
         path = self._folder / f"{'-'.join([result.kind, *result.hidden, str(result.seed)])}.json"
@@ -107,6 +112,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--first", type=int, default=1, help="first seed (1)")
     parser.add_argument("--processes", type=int, default=os.cpu_count() or 1, help="processes (all cores)")
     parser.add_argument("--dask", metavar="ADDRESS", help="scheduler of a dask cluster to run on instead")
+    parser.add_argument(
+        "--so-far", action="store_true", help="search nothing: tables of all that is kept for this code"
+    )
     parser.add_argument("-o", "--out", type=Path, default=Path("out/gap_study"), help="directory to write to")
     options = parser.parse_args(arguments)
     unknown = set(options.kinds) - set(KINDS)
@@ -115,7 +123,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     seeds = range(options.first, options.first + options.seeds)
     todo = [job for kind in options.kinds or KINDS for job in jobs(kind, seeds)]
     console = Console(stderr=True)
-    results = study(todo, options.out, options.processes, options.dask, console)
+    if options.so_far:
+        results = Kept(options.out / "results" / revision()).all()
+        write(results, options.out, revision())
+    else:
+        results = study(todo, options.out, options.processes, options.dask, console)
     print("\n".join(table(results)))
     for key, value in summary(results).items():
         print(f"{key:<40} {value:.4g}")

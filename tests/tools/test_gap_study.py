@@ -1,6 +1,7 @@
 """The study: a small part of it, and that it counts, keeps and resumes; real searches of a few logs only."""
 
 import dataclasses
+import json
 import math
 
 import pytest
@@ -71,6 +72,8 @@ def test_a_study_goes_on_where_it_was_broken_off(tmp_path, monkeypatch):
     assert len(results) == 38
     assert set(again) == {job.key for job in todo} - set(done)
     assert (tmp_path / "gap_confusion.png").stat().st_size > 1000
+    assert gap_study.main(["--so-far", "-o", str(tmp_path)]) == 0
+    assert len(json.loads((tmp_path / "gap_study.json").read_text())["results"]) == 38
     # Other code: nothing of it counts any more.
     monkeypatch.setattr(gap_study, "revision", lambda: "other")
     again.clear()
