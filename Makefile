@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 SOURCES := pyproject.toml setup.py constraints.txt firmware_protocol/build_firmware.py firmware_protocol/disco_robot.dbc \
 	$(wildcard firmware_protocol/firmware/*.c firmware_protocol/firmware/*.h)
 
-.PHONY: venv demo chromium test bench gap-study soak fault-campaign fuzz firmware-check clean
+.PHONY: venv demo chromium test bench gap-study soak fault-campaign fuzz firmware-check socketcan-test clean
 
 venv: $(STAMP)
 
@@ -60,6 +60,9 @@ fuzz: $(STAMP)
 
 firmware-check: $(STAMP)
 	$(BIN)/python -m tools.firmware_check
+
+socketcan-test: $(STAMP)
+	$(BIN)/python -m tools.socketcan_test
 
 clean:
 	rm -rf $(VENV) build *.egg-info firmware_protocol/_firmware*

@@ -20,6 +20,7 @@ PARTS = (
     "bench_log",
     "bench_loop",
     "bench_viewer",
+    "bench_wire",
 )
 
 

@@ -50,6 +50,36 @@ static void receive(disco_firmware_t *core, uint64_t now, uint32_t id, uint8_t *
     disco_firmware_receive(core, now, id, data, 8u);
 }
 
+/* Proves a frame as a host with the key does; the nonce is read where the robot would tell it. */
+static void prove(disco_firmware_t *core, uint64_t now, uint32_t id, const uint8_t *frame)
+{
+    static uint64_t freshness[DISCO_PROOFS];
+    static uint8_t nonce[DISCO_NONCE_LENGTH];
+    uint8_t message[24], tag[16], proof[8];
+    disco_cmac_key_t key;
+    if (!core->config.authenticated) {
+        return;
+    }
+    if (memcmp(nonce, core->authentication.nonce, sizeof(nonce)) != 0) {
+        (void)memcpy(nonce, core->authentication.nonce, sizeof(nonce));
+        (void)memset(freshness, 0, sizeof(freshness));
+    }
+    freshness[id - 0x100u]++;
+    (void)memcpy(message, nonce, sizeof(nonce));
+    for (uint8_t i = 0u; i < 8u; i++) {
+        message[6u + i] = (uint8_t)(freshness[id - 0x100u] >> (8u * i));
+    }
+    message[14] = (uint8_t)id;
+    message[15] = (uint8_t)(id >> 8);
+    (void)memcpy(&message[16], frame, 8u);
+    disco_cmac_init(&key, core->config.key);
+    disco_cmac(&key, message, sizeof(message), tag);
+    proof[0] = message[6];
+    proof[1] = message[7];
+    (void)memcpy(&proof[2], tag, 6u);
+    disco_firmware_receive(core, now, 0x0F0u + (id - 0x100u), proof, 8u);
+}
+
 static void host(disco_firmware_t *core, uint64_t now, const disco_outputs_t *out, uint8_t session)
 {
     static uint8_t host_counter, command_counter;
@@ -71,6 +101,8 @@ static void host(disco_firmware_t *core, uint64_t now, const disco_outputs_t *ou
         }
         state.challenge_answer = disco_challenge_answer(core->session.challenge, session, DISCO_DBC_HASH);
         (void)disco_robot_host_state_pack(data, &state, 8u);
+        data[0] = disco_e2e_crc(data, DISCO_HOST_STATE_DATA_ID(major));
+        prove(core, now, DISCO_ROBOT_HOST_STATE_FRAME_ID, data);
         receive(core, now, DISCO_ROBOT_HOST_STATE_FRAME_ID, data, DISCO_HOST_STATE_DATA_ID(major));
     }
     if (now % 20000u == 0u) {
@@ -82,20 +114,22 @@ static void host(disco_firmware_t *core, uint64_t now, const disco_outputs_t *ou
             command.right_speed = (int16_t)random_u32();
         }
         (void)disco_robot_wheel_command_pack(data, &command, 8u);
+        data[0] = disco_e2e_crc(data, DISCO_WHEEL_COMMAND_DATA_ID(major));
+        prove(core, now, DISCO_ROBOT_WHEEL_COMMAND_FRAME_ID, data);
         receive(core, now, DISCO_ROBOT_WHEEL_COMMAND_FRAME_ID, data, DISCO_WHEEL_COMMAND_DATA_ID(major));
     }
 }
 
 static void intruder(disco_firmware_t *core, uint64_t now)
 {
-    static const uint32_t ids[] = {0x100u, 0x101u, 0x102u, 0x150u, 0x160u};
+    static const uint32_t ids[] = {0x100u, 0x101u, 0x102u, 0x150u, 0x160u, 0x0F0u, 0x0F1u, 0x0F2u};
     uint8_t data[8];
     for (uint8_t i = 0u; i < 8u; i++) {
         data[i] = (uint8_t)random_u32();
     }
     if (chance(3u)) {
         /* Parameters first, so that random floats reach their table. */
-        const uint32_t id = ids[random_u32() % 5u];
+        const uint32_t id = ids[random_u32() % 8u];
         const uint8_t major = (id == 0x102u) ? 0u : DISCO_PROTOCOL_MAJOR;
         if (id == 0x160u) {
             data[2] = (uint8_t)(random_u32() % 8u);
@@ -107,17 +141,20 @@ static void intruder(disco_firmware_t *core, uint64_t now)
     }
 }
 
+/* Arguments: cycles; random frames in each cycle of a flood, which lasts a tenth of the time; 1 for authenticated. */
 int main(int argc, char **argv)
 {
     const uint32_t cycles = (uint32_t)strtoul(argv[1], NULL, 10);
-    const disco_config_t robot = config();
+    const uint32_t flood = (argc > 2) ? (uint32_t)strtoul(argv[2], NULL, 10) : 0u;
+    disco_config_t robot = config();
+    uint64_t frames = 0u;
     static disco_firmware_t core;
     uint32_t seen[7] = {0u};
     double ticks[2] = {0.0, 0.0};
     disco_outputs_t out = {.state = DISCO_STATE_BOOT};
     uint64_t now = 0u;
     bool mad = false;
-    (void)argc;
+    robot.authenticated = (argc > 3) && (argv[3][0] == '1');
     seed = UINT64_C(0x9E3779B97F4A7C15);
     disco_firmware_init(&core, &robot, 1u);
     for (uint32_t cycle = 1u; cycle <= cycles; cycle++) {
@@ -125,8 +162,14 @@ int main(int argc, char **argv)
         disco_frame_t frame;
         now += 1000u;
         host(&core, now, &out, (uint8_t)(1u + (cycle / 700u) % 255u));
-        if (chance(60u)) {
+        const uint32_t strangers = ((cycle % 5000u) < 500u) ? flood : (chance(60u) ? 1u : 0u);
+        for (uint32_t i = 0u; i < strangers; i++) {
             intruder(&core, now);
+        }
+        frames += strangers;
+        if ((flood > 0u) && ((cycle % 5000u) == 500u)) {
+            /* What strangers may write without a key, parameters among it, would keep the robot standing. */
+            disco_firmware_init(&core, &robot, cycle);
         }
         mad = chance(3000u) || (mad && !chance(20u));
         in.wheel_speed[0] = out.left_setpoint;
@@ -161,6 +204,7 @@ int main(int argc, char **argv)
         while (!chance(3u) && disco_firmware_pop(&core, &frame)) {
         }
     }
-    (void)printf("%u %u %u %u %u %u %u\n", seen[0], seen[1], seen[2], seen[3], seen[4], seen[5], seen[6]);
+    (void)printf("%u %u %u %u %u %u %u %llu\n", seen[0], seen[1], seen[2], seen[3], seen[4], seen[5], seen[6],
+                 (unsigned long long)frames);
     return 0;
 }

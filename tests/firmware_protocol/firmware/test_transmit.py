@@ -41,3 +41,12 @@ def test_each_message_has_its_own_counter_modulo_16():
     made = queue()
     assert [lib.disco_transmit_counter(made, 3) for _ in range(18)] == [*range(16), 0, 1]
     assert lib.disco_transmit_counter(made, 4) == 0
+
+
+def test_a_frame_has_eight_bytes_and_says_so():
+    made = queue()
+    lib.disco_transmit_send(made, 0x100, bytes(8), 0x910)
+    assert made.frames[1].can_id == 0, "nothing is written behind it"
+    frame = ffi.new("disco_frame_t *")
+    assert lib.disco_transmit_pop(made, frame)
+    assert frame.length == 8

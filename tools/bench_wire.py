@@ -1,0 +1,61 @@
+"""Cost of the wire on the host: a command made, a sample judged; what a proof adds, on the host and in the C core."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from time import perf_counter_ns
+from typing import Any
+
+import numpy as np
+
+from drivers.transmission import FrameTransmission
+from firmware_protocol import _firmware
+from firmware_protocol.authentication import aes_cmac
+from firmware_protocol.codec import Codec
+
+COMMAND = {"mode": "SPEED", "left_speed": 1.5, "right_speed": -0.75, "valid_for": 0.1, "session": 7}
+SAMPLE = {"left_valid": 1, "right_valid": 1, "driver_enabled": 1, "limited": 0, "left_speed": 1.0, "right_speed": 2.0}
+KEY = bytes(range(16))
+MESSAGE = bytes(24)
+LIFE_NS = 50_000_000
+
+
+def run(count: int = 20_000) -> dict[str, float]:
+    """Microseconds each; `wire.core_cmac_us` is C called from Python, `wire.cryptography_cmac_us` its peer."""
+    codec = Codec()
+    plain, proving = FrameTransmission(codec), FrameTransmission(codec, KEY)
+    proving.challenge(0x123456789ABC)
+    sample = codec.encode("WHEEL_SPEED", 3, sample_time=6000, **SAMPLE)
+    lib: Any = _firmware.lib
+    ffi: Any = _firmware.ffi
+    key, tag = ffi.new("disco_cmac_key_t *"), ffi.new("uint8_t[16]")
+    lib.disco_cmac_init(key, KEY)
+
+    def send(transmission: FrameTransmission) -> Callable[[], object]:
+        return lambda: transmission.proved([transmission.frame("WHEEL_COMMAND", 0, LIFE_NS, **COMMAND)])
+
+    figures: dict[str, float] = {}
+    work: dict[str, Callable[[], object]] = {
+        "wire.command_us": send(plain),
+        "wire.proved_command_us": send(proving),
+        "wire.sample_decoded_us": lambda: codec.decode(*sample),
+        "wire.core_cmac_us": lambda: lib.disco_cmac(key, MESSAGE, len(MESSAGE), tag),
+        "wire.cryptography_cmac_us": lambda: aes_cmac(KEY, MESSAGE),
+    }
+    for name, what in work.items():
+        times = np.empty(count)
+        for i in range(count):
+            start = perf_counter_ns()
+            what()
+            times[i] = (perf_counter_ns() - start) * 1e-3
+        for label, percent in (("p50", 50.0), ("p99", 99.0), ("p99.9", 99.9)):
+            figures[f"{name}.{label}"] = float(np.percentile(times, percent))
+    figures["wire.core_cmac_over_cryptography"] = (
+        figures["wire.core_cmac_us.p50"] / figures["wire.cryptography_cmac_us.p50"]
+    )
+    return figures
+
+
+if __name__ == "__main__":
+    for name, value in run().items():
+        print(f"{name} {value:.2f}")
