@@ -7,6 +7,7 @@ from itertools import pairwise, product
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import median_filter
 
 from disco_hw.inference.excitation import Excitation
 
@@ -16,6 +17,11 @@ _LAGS_S = (0.0, 0.1, 0.2, 0.4, 0.8, 1.6, 3.0)
 _CORRELATIONS_S = (1e-3, 0.1, 0.2, 0.3, 0.5)
 _FEWEST_WINDOWS = 12
 _LEAST_RATIO = 0.5
+# Of a window, the part at either end over which positions are averaged.
+_ENDS = 0.25
+# Neighbours of a pose, and how many times the median distance from their median is a jump (about 6 standard deviations).
+_NEIGHBOURS = 5
+_JUMP = 12.0
 _SMALLEST = np.array([2e-4, 2e-4, 2e-4, 2e-4, 5e-4])
 _LARGEST = np.array([0.3, 0.5, 0.5, 0.5, 1.0])
 # Of a standard normal variable: the median of its square, and the mean of its square held at 9.
@@ -60,22 +66,24 @@ def measured_noise(drive: Excitation, theta: Array) -> Noise:
     """
     error = _errors(drive, theta)
     moved = np.concatenate([np.cumsum(drive.moving_s[lo:hi]) for lo, hi in _bounds(drive)])
-    rows: list[tuple[float, float, Array]] = []
+    rows: list[tuple[float, float, float, Array]] = []
     period_s = float(np.median(np.diff(drive.t_s)[~drive.starts[1:]]))
     for lag in sorted({max(1, round(lag_s / period_s)) for lag_s in _LAGS_S}):
-        squares, moving = _windows(drive, error, moved, lag)
+        ends = max(1, round(_ENDS * lag))
+        squares, moving = _windows(drive, error, moved, lag, ends)
         length_s = lag * period_s
         for chosen in (moving < 0.05 * length_s, moving > 0.9 * length_s):
             if np.count_nonzero(chosen) >= _FEWEST_WINDOWS:
                 # Windows overlap by half.
                 independent = 0.5 * np.count_nonzero(chosen) if lag > 1 else float(np.count_nonzero(chosen))
-                rows.append((float(np.mean(moving[chosen])), independent, _variance(squares[chosen])))
+                # A random walk from the mean of one end to that of the other grows by a third of an end less.
+                time_s = float(np.mean(moving[chosen])) * (1.0 - (ends - 1) / (3.0 * lag))
+                rows.append((time_s, 2.0 / ends, independent, _variance(squares[chosen])))
     if len(rows) < 3:
         return USUAL
-    time_s = np.array([row[0] for row in rows])
-    counts = np.array([row[1] for row in rows])
-    variances = np.array([row[2] for row in rows])
-    forward, left, yaw = (_two_terms(time_s, counts, variances[:, axis]) for axis in range(3))
+    times_s, sensor, counts = np.array([row[:3] for row in rows]).T
+    variances = np.array([row[3] for row in rows])
+    forward, left, yaw = (_two_terms(times_s, sensor, counts, variances[:, axis]) for axis in range(3))
     position = 0.5 * (forward[0] + left[0])
     # Short drives say little of the smaller one; wheels that slip one way on a floor slip the other way too.
     least = _LEAST_RATIO**2 * max(forward[1], left[1])
@@ -91,8 +99,8 @@ def _variance(squares: Array) -> Array:
     return held
 
 
-def _two_terms(time_s: Array, counts: Array, variance: Array) -> tuple[float, float]:
-    """Sensor variance R and slip variance q per second in `variance = 2 R + q time`, both not negative.
+def _two_terms(time_s: Array, sensor: Array, counts: Array, variance: Array) -> tuple[float, float]:
+    """Sensor variance R and slip variance q per second in `variance = sensor R + q time`, both not negative.
 
     Slip that keeps its direction for a while grows slower at first, as time - tau (1 - exp(-time / tau)); its rate
     later on is what parameters feel. Errors are relative to the variance and fall with the number of windows.
@@ -102,7 +110,7 @@ def _two_terms(time_s: Array, counts: Array, variance: Array) -> tuple[float, fl
     best, best_cost = (0.0, 0.0), np.inf
     for tau_s, use in product(_CORRELATIONS_S, ((True, True), (True, False), (False, True))):
         grown = time_s + tau_s * np.expm1(-time_s / tau_s)
-        columns = np.column_stack([np.full(time_s.size, 2.0), grown])[:, use]
+        columns = np.column_stack([sensor, grown])[:, use]
         solution, *_ = np.linalg.lstsq(columns * scale[:, None], variance * scale, rcond=None)
         cost = float(np.sum((columns @ solution * scale - variance * scale) ** 2))
         if (solution >= 0.0).all() and cost < best_cost:
@@ -129,19 +137,30 @@ def _errors(drive: Excitation, theta: Array) -> Array:
         cosine, sine = np.cos(middle), np.sin(middle)
         steps = np.column_stack([forward * cosine - left * sine, forward * sine + left * cosine, turn])
         predicted = np.vstack([np.zeros(3), np.cumsum(steps, axis=0)])
-        parts.append(pose - pose[0] - predicted)
+        parts.append(_without_jumps(pose - pose[0] - predicted))
     return np.concatenate(parts)
 
 
-def _windows(drive: Excitation, error: Array, moved_s: Array, lag: int) -> tuple[Array, Array]:
-    """Squared errors over windows of `lag` poses: forward, left, yaw (W, 3); and the time in motion (W,)."""
+def _without_jumps(error: Array) -> Array:
+    """Errors (P, 3) with single values far from their neighbours' median put back on it."""
+    middle = median_filter(error, size=(_NEIGHBOURS, 1), mode="nearest")
+    apart = np.abs(error - middle)
+    return np.where(apart > _JUMP * np.maximum(np.median(apart, axis=0), 1e-9), middle, error)
+
+
+def _windows(drive: Excitation, error: Array, moved_s: Array, lag: int, ends: int) -> tuple[Array, Array]:
+    """Squared errors over windows of `lag` poses: forward, left, yaw (W, 3); and the time in motion (W,).
+
+    From the mean of `ends` poses to the mean of the `ends` that are `lag` later, which quietens the sensor.
+    """
     squares, moving = [], []
     stride = max(1, lag // 2)
     for lo, hi in _bounds(drive):
-        if hi - lo <= lag:
+        if hi - lo < lag + ends:
             continue
-        start = np.arange(lo, hi - lag, stride)
-        step = error[start + lag] - error[start]
+        start = np.arange(lo, hi - lag - ends + 1, stride)
+        within = np.arange(ends)
+        step = (error[start[:, None] + lag + within] - error[start[:, None] + within]).mean(axis=1)
         yaw = drive.pose[start + lag // 2, 2]
         cosine, sine = np.cos(yaw), np.sin(yaw)
         forward, left = step[:, 0] * cosine + step[:, 1] * sine, step[:, 1] * cosine - step[:, 0] * sine
