@@ -8,20 +8,8 @@ import sys
 import pytest
 
 VERBS = [
-    "demo",
-    "run",
-    "sim",
-    "drive",
-    "ctl",
-    "check",
-    "replay",
-    "estop",
-    "infer",
-    "gap",
-    "view",
-    "import",
-    "experiment",
-    "log",
+    *("demo", "run", "sim", "drive", "ctl", "check", "replay", "estop"),
+    *("infer", "gap", "view", "import", "experiment", "log"),
 ]
 
 
