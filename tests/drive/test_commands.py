@@ -21,6 +21,7 @@ from tests.hil.stack import write_robot_file
         ({"unattended": True}, "--unattended and --seconds belong to a script"),
         ({"seconds": 3.0}, "--unattended and --seconds belong to a script"),
         ({"script": "steps", "unattended": True, "gamepad": True}, "one deadman only"),
+        ({"gamepad": True, "page": True}, "--gamepad and --page: one deadman only"),
         ({"link": "wifi"}, "--link wifi"),
     ],
 )
