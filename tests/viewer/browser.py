@@ -44,7 +44,7 @@ def opened(browser, url, width=800, height=540, scene=True):
     Without its `scene` a desk is as quick as with a graphics card; with it a mouse that moves waits for frames.
     """
     page = browser.new_page(viewport={"width": width, "height": height})
-    page.set_default_timeout(60_000)
+    page.set_default_timeout(120_000)
     page.said = []
     page.on("console", lambda message: page.said.append(message.text))
     page.on("request", lambda request: page.said.append(f"request {request.url}"))
