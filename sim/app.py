@@ -57,8 +57,8 @@ class VirtualRobotOptions:
 
     `firmware`: limits and identity of the controller. `start`: pose of the tracked point at the start. `effects`:
     hidden effects by name (see `sim.effects`). `seed`: all disturbances and noise. `truth_file`: CSV of
-    `sim.truth.COLUMNS` at 100 Hz. `bus_log`: every frame on the own bus, as candump writes them. `inject`: socket for
-    the commands of `sim.injection`. `ready_fd`: descriptor that gets the ready line too, and is then closed.
+    `sim.truth.COLUMNS` at 100 Hz. `bus_log`: every frame on the own bus or line, as candump does. `inject`: socket
+    for the commands of `sim.injection`. `ready_fd`: descriptor that gets the ready line too, and is then closed.
     `faults`: what goes wrong, from the ready line on; of the faults of processes only `cpu_hog`.
     `realtime_priority`: SCHED_FIFO priority where the system allows it; 0 for none.
     """
@@ -251,7 +251,7 @@ def _open_link(options: VirtualRobotOptions, log: IO[str] | None) -> RobotLink:
         if options.baud <= 0:
             raise OptionError(f"baud {options.baud}: not positive; give the line's rate in bit/s")
         path = None if options.port is None else Path(options.port)
-        return SerialLine(path, now_ns, baud=options.baud, pacing=options.pacing)
+        return SerialLine(path, now_ns, baud=options.baud, pacing=options.pacing, log=log)
     if options.bitrate <= 0:
         raise OptionError(f"bitrate {options.bitrate}: not positive; give the bus's rate in bit/s")
     if options.interface == "unixcan":

@@ -17,11 +17,12 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import IO
 
 from drivers.types import Frame, ReceivedFrame
 from firmware_protocol.serial_framing import FrameDecoder, encode_frame
 from sim.bus import BusFault, FrameFate
-from sim.can_frame import CanFrame
+from sim.can_frame import CanFrame, candump_line
 from sim.faults import ROBOT_NODE
 from sim.robot_link import LinkFaultError
 
@@ -56,10 +57,13 @@ class SerialLine:
 
     `path` becomes a symbolic link to the port that a host opens; None leaves the port under its own name (`port`).
     `baud` is the robot's rate in bit/s (8 data bits, no parity, 1 stop bit); `pacing` off makes bytes take no time.
+    `log` gets each frame whose last bit has passed, in either direction, as candump writes it.
     Raises SerialPathError if `path` is taken by anything but a link to a terminal, ValueError for an impossible rate.
     """
 
-    def __init__(self, path: Path | None, now_ns: int, *, baud: int = 921_600, pacing: bool = True) -> None:
+    def __init__(
+        self, path: Path | None, now_ns: int, *, baud: int = 921_600, pacing: bool = True, log: IO[str] | None = None
+    ) -> None:
         if baud <= 0:
             raise ValueError(f"baud must be positive, not {baud}")
         self.stats = SerialLineStats()
@@ -72,10 +76,11 @@ class SerialLine:
         self._decoder = FrameDecoder()
         self._waiting: deque[tuple[Frame, int]] = deque()
         self._to_robot: deque[ReceivedFrame] = deque()
-        self._to_host: deque[tuple[int, bytes]] = deque()
+        self._to_host: deque[tuple[int, bytes, Frame]] = deque()
         self._master = -1
         self._connected = False
         self._fault: BusFault | None = None
+        self._log = log
         self._poll = select.poll()
         self.port = ""
         self._plug_in()
@@ -137,10 +142,13 @@ class SerialLine:
                 self._to_robot.append(ReceivedFrame(begin_ns + fate.delay_ns + size * self._byte_ns, frame))
         self._now_ns = now_ns
         while self._to_host and self._to_host[0][0] <= now_ns:
-            self._write(self._to_host.popleft()[1])
+            end_ns, encoded, frame = self._to_host.popleft()
+            self._write(encoded)
+            self._note(end_ns, frame)
         received: list[ReceivedFrame] = []
         while self._to_robot and self._to_robot[0].t_ns <= now_ns:
             received.append(self._to_robot.popleft())
+            self._note(received[-1].t_ns, received[-1].frame)
         return received
 
     def send(self, frames: Sequence[Frame]) -> None:
@@ -153,7 +161,7 @@ class SerialLine:
             encoded = _damaged(encode_frame(frame.can_id, data), fate)
             for _ in range(0 if fate.lost else fate.copies):
                 begin_ns = max(self._now_ns, self._to_host[-1][0]) if self._to_host else self._now_ns
-                self._to_host.append((begin_ns + fate.delay_ns + len(encoded) * self._byte_ns, encoded))
+                self._to_host.append((begin_ns + fate.delay_ns + len(encoded) * self._byte_ns, encoded, frame))
             self.stats.frames_out += 1
 
     def unplug(self, until_ns: int) -> None:
@@ -186,6 +194,10 @@ class SerialLine:
     def close(self) -> None:
         """Remove the port and the link to it."""
         self.unplug(self._now_ns)
+
+    def _note(self, t_ns: int, frame: Frame) -> None:
+        if self._log is not None:
+            self._log.write(candump_line(t_ns, "serial", CanFrame(frame.can_id, frame.data)) + "\n")
 
     def _fate(self, sender: str, frame: Frame) -> FrameFate:
         if self._fault is None:
