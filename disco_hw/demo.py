@@ -40,6 +40,7 @@ class DemoOptions:
     plant_seed: int = 1
     uncertainty: str = "ut"
     view: bool = False
+    adapt: bool = False
     port: int = DEFAULT_PORT
     show_progress: bool = True
 
@@ -120,7 +121,7 @@ def _drive(options: DemoOptions, files: _Files, console: Console) -> bool:
         "sim", str(files.robot), "--plant-seed", str(options.plant_seed), "--truth", str(files.truth),
         "--start", str(config.task.center_x_m + config.task.radius_m), str(config.task.center_y_m), "1.5707963",
     ]  # fmt: skip
-    daemon_arguments = ["run", str(files.robot), "--log", str(files.log), *_page(options)]
+    daemon_arguments = ["run", str(files.robot), "--log", str(files.log), *_page(options), *_adapt(options)]
     with (
         disco_hw_process("virtual robot", simulator, files.simulator_output) as robot,
         disco_hw_process("daemon", daemon_arguments, files.daemon_output) as daemon,
@@ -147,6 +148,10 @@ def _drive(options: DemoOptions, files: _Files, console: Console) -> bool:
 
 def _page(options: DemoOptions) -> list[str]:
     return ["--view", "--port", str(options.port)] if options.view else []
+
+
+def _adapt(options: DemoOptions) -> list[str]:
+    return ["--adapt"] if options.adapt else []
 
 
 def _watch_laps(operator: Operator, options: DemoOptions, limit_s: float, console: Console) -> None:

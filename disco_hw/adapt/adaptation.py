@@ -12,6 +12,7 @@ from disco_hw.adapt.coordinates import NAMES
 from disco_hw.adapt.guard import BeliefGuard, Geometry, Outcome
 from disco_hw.adapt.link import AdapterLink
 from disco_hw.adapt.messages import InForce, Pose, Proposal, Range, Report, Samples, Wheels
+from disco_hw.errors import WorkError
 from disco_hw.log import records
 from drivers.types import Readings
 
@@ -152,7 +153,12 @@ class CheckedAdaptation:
 
     def tend(self) -> None:
         """Start a dead adapter again; it begins from the belief in force."""
-        if self._link.restart():
+        try:
+            restarted = self._link.restart()
+        except WorkError as error:
+            self._text = str(error)
+            return
+        if restarted:
             self._begun_ns = self._heard_ns = None
             self._text, self._quiet = "starting again", False
 

@@ -163,7 +163,7 @@ def _random_drive(training: Training, rng: np.random.Generator) -> Excitation:
     for k in range(steps):
         now += np.clip(wanted[k] - now, -_SLEW_RAD_S2 * STEP_S, _SLEW_RAD_S2 * STEP_S)
         speed[k] = now
-    t_s = STEP_S * np.arange(steps)
+    t_s = STEP_S * np.arange(steps, dtype=np.float64)
     angle: Array = np.cumsum(speed, axis=0) * STEP_S
     pose_s = np.arange(0.0, t_s[-1] - STEP_S, 1.0 / training.pose_hz)
     # The poses are those of the simulation; these only have to look like motion.

@@ -25,6 +25,7 @@ def demo(
     plant_seed: Annotated[int, typer.Option(min=0, help="Seed of the virtual robot's true parameters.")] = 1,
     uncertainty: Annotated[str, typer.Option(help="ut, mc or point.")] = "ut",
     view: View = False,
+    adapt: Annotated[bool, typer.Option("--adapt", help="Learn the geometry on the way (docs/adapt.md).")] = False,
     port: Annotated[int, typer.Option(min=1, max=65535, help="Port of the page.")] = DEFAULT_PORT,
     as_json: AsJson = False,
 ) -> None:
@@ -39,6 +40,7 @@ def demo(
             plant_seed=plant_seed,
             uncertainty=uncertainty,
             view=view,
+            adapt=adapt,
             port=port,
             show_progress=not as_json,
         )

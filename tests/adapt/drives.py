@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
-from disco_hw.adapt.messages import Pose, Samples, Wheels
+from disco_hw.adapt.messages import Pose, Samples, Triple, Wheels
 from disco_hw.inference.excitation import Excitation
 
 TRUTH = (0.238, 0.061, 0.415)
@@ -16,10 +18,13 @@ TICK_NS = 20_000_000
 def messages(
     seconds: float,
     seed: int = 1,
-    truth=TRUTH,
+    truth: Triple = TRUTH,
     change_s: float = math.inf,
-    changed=TRUTH,
-    wheels=lambda t_s: (2.5 + 0.8 * math.sin(0.9 * t_s), 4.0 + 0.5 * math.sin(0.5 * t_s)),
+    changed: Triple = TRUTH,
+    wheels: Callable[[float], tuple[float, float]] = lambda t_s: (
+        2.5 + 0.8 * math.sin(0.9 * t_s),
+        4.0 + 0.5 * math.sin(0.5 * t_s),
+    ),
 ) -> list[Samples]:
     """What the daemon would hand on, tick by tick: wheel angles at 50 Hz, poses at 25 Hz with 5 mm and 10 mrad."""
     rng = np.random.default_rng(seed)
@@ -41,7 +46,7 @@ def messages(
             yaw += dt * omega + slip[2]
         left, right = left + 0.02 * speed_left, right + 0.02 * speed_right
         now_ns = tick * TICK_NS
-        poses = ()
+        poses: tuple[Pose, ...] = ()
         if tick % 2 == 0:
             noise = rng.standard_normal(3) * (0.005, 0.005, 0.01)
             measured_yaw = math.remainder(yaw + noise[2], 2.0 * math.pi)
@@ -50,7 +55,7 @@ def messages(
     return found
 
 
-def excited(seconds: float, **options) -> Excitation:
+def excited(seconds: float, **options: Any) -> Excitation:
     """The same as a drive."""
     from disco_hw.adapt.samples import SampleWindow
 
