@@ -58,7 +58,10 @@ def drive(
     gamepad: Annotated[bool, typer.Option("--gamepad", help="Drive with a gamepad instead of the keyboard.")] = False,
     page: Annotated[bool, typer.Option("--page", help="Drive from the page, which --view then serves.")] = False,
     script: Annotated[
-        str | None, typer.Option(help="Drive by itself while the deadman is held: circle, steps or excite.")
+        str | None,
+        typer.Option(
+            help="Drive by itself while the deadman is held: circle, steps, excite, or one that a report asks for."
+        ),
     ] = None,
     unattended: Annotated[
         bool, typer.Option("--unattended", help="Let the script hold the deadman: for virtual robots.")
