@@ -62,8 +62,12 @@ def _commands(drive: DriveLog) -> Iterator[_Timed]:
     for t_s, segment, left, right in rows:
         t_ns = _ns(t_s)
         known = not math.isnan(left)
-        speeds = (left, right) if known else (0.0, 0.0)
-        yield t_ns, segment, Command(t_ns, *speeds, *speeds, _LONGEST_COMMAND_S, in_force=known, source=SOURCE)
+        now_left, now_right = (left, right) if known else (0.0, 0.0)
+        yield (
+            t_ns,
+            segment,
+            Command(t_ns, now_left, now_right, now_left, now_right, _LONGEST_COMMAND_S, in_force=known, source=SOURCE),
+        )
 
 
 def _wheels(drive: DriveLog) -> Iterator[_Timed]:
@@ -77,10 +81,10 @@ def _wheels(drive: DriveLog) -> Iterator[_Timed]:
 
 def _poses(drive: DriveLog) -> Iterator[_Timed]:
     part = drive.poses
-    values = zip(*(column.tolist() for column in (part.x_m, part.y_m, part.yaw_rad)), strict=True)
-    for t_s, segment, row in zip(part.t_s.tolist(), part.segment.tolist(), values, strict=True):
+    columns = (part.t_s, part.segment, part.x_m, part.y_m, part.yaw_rad)
+    for t_s, segment, x_m, y_m, yaw_rad in zip(*(column.tolist() for column in columns), strict=True):
         t_ns = _ns(t_s)
-        yield t_ns, segment, PoseSample(t_ns, t_ns, *row, math.nan, math.nan)
+        yield t_ns, segment, PoseSample(t_ns, t_ns, x_m, y_m, yaw_rad, math.nan, math.nan)
 
 
 def _ns(t_s: float) -> int:
