@@ -37,8 +37,8 @@ def config() -> RobotConfig:
 def plant(seed: int) -> PlantParameters:
     """A robot of the study, with sensor noise, disturbances and quantised encoders."""
     rng = np.random.default_rng([seed, 77])
-    drawn = {name: float(rng.uniform(*span)) for name, span in PLAUSIBLE.items()}
-    return PlantParameters(**drawn).with_ideal_motors()
+    x_icr_m, radius_m, axial_m = (float(rng.uniform(*span)) for span in PLAUSIBLE.values())
+    return PlantParameters(x_icr_m=x_icr_m, wheel_radius_m=radius_m, axial_distance_m=axial_m).with_ideal_motors()
 
 
 def logged(parameters: PlantParameters, drive: str, seed: int) -> DriveLog:

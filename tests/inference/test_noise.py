@@ -3,7 +3,7 @@ import pytest
 
 from disco_hw.inference.estimates import estimates
 from disco_hw.inference.excitation import excitation
-from disco_hw.inference.noise import USUAL, Noise, measured_noise
+from disco_hw.inference.noise import USUAL, Noise, _two_terms, measured_noise
 from disco_hw.inference.simulate import NAMES, Simulator
 from disco_hw.model import Model
 from tests.inference.drives import TRUTH, logged
@@ -47,3 +47,25 @@ def test_the_plants_noise_is_found_at_its_own_estimate():
     assert noise.yaw_rad == pytest.approx(0.0087, rel=0.15)
     # Of an Ornstein-Uhlenbeck velocity of standard deviation s and correlation time tau: s sqrt(2 tau).
     assert noise.slip_yaw_rad_sqrt_s == pytest.approx(0.018 * np.sqrt(0.6), rel=0.35)
+
+
+def test_slip_that_keeps_its_direction_for_a_while_is_rated_by_what_it_grows_to():
+    tau_s, rate, sensor = 0.3, 1.5e-5, 2.5e-5
+    time_s = np.array([0.04, 0.12, 0.2, 0.4, 0.8, 1.6, 3.0])
+    weight = np.full(time_s.size, 2.0)
+    variance = weight * sensor + rate * (time_s - tau_s * (1.0 - np.exp(-time_s / tau_s)))
+    found = _two_terms(time_s, weight, np.full(time_s.size, 50.0), variance)
+    assert found == pytest.approx((sensor, rate), rel=1e-3)
+
+
+def test_one_minute_of_a_circle_tells_the_slip_without_bias():
+    drive = excitation(logged("circle"))
+    simulator = Simulator(Model(0.06, 0.4), drive, TRUE)
+    seeds = np.arange(24, dtype=np.uint32)
+    found = [
+        measured_noise(with_poses(drive, poses), THETA).vector()
+        for poses in simulator.poses(np.repeat(THETA[None], seeds.size, axis=0), seeds)
+    ]
+    ratio = np.array(found) / TRUE.vector()
+    assert np.median(ratio, axis=0) == pytest.approx(1.0, abs=0.15)
+    assert np.quantile(ratio, 0.1, axis=0).min() > 0.6
