@@ -57,6 +57,7 @@ fault-campaign: $(STAMP)
 
 fuzz: $(STAMP)
 	$(BIN)/python -m tools.fuzz
+	$(BIN)/python -m tools.fuzz_wire
 
 firmware-check: $(STAMP)
 	$(BIN)/python -m tools.firmware_check

@@ -135,7 +135,10 @@ def child(folder: Path, files: Sequence[str]) -> int:
 
 def load_the_rest() -> None:
     """Import what every child needs, so that a fork has it; all but the extension itself."""
-    import hypothesis  # noqa: PLC0415
+    import cantools.autosar.end_to_end  # noqa: F401, PLC0415
+    import crccheck.crc  # noqa: F401, PLC0415
+    import hypothesis.stateful  # noqa: PLC0415
+    import pytest  # noqa: F401, PLC0415
 
     import firmware_protocol.authentication  # noqa: F401, PLC0415
 

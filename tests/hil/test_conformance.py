@@ -11,14 +11,14 @@ from disco_hw.operator import disco_hw_process
 from tests.drivers.waiting import wait_until
 from tests.hil.stack import READY_TIMEOUT_S, write_robot_file
 
-pytestmark = pytest.mark.hil
+pytestmark = [pytest.mark.hil, pytest.mark.timeout(300)]
 ROOT = Path(__file__).resolve().parents[2]
 KEY = "000102030405060708090a0b0c0d0e0f\n"
 
 
 def conform(robot_file, *arguments):
     command = [sys.executable, "-m", "pytest", f"--robot={robot_file}", "-p", "no:cacheprovider", *arguments]
-    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=110, check=False)
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=250, check=False)
     found = {word: int(count) for count, word in re.findall(r"(\d+) (passed|failed|skipped|error)", result.stdout)}
     return result.returncode, found, result.stdout + result.stderr
 

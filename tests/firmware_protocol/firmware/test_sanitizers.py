@@ -8,6 +8,7 @@ import pytest
 from firmware_protocol.build_firmware import PACKAGE, SOURCES
 
 CYCLES = 100_000
+pytestmark = pytest.mark.timeout(300)
 SANITIZE = ["-fsanitize=undefined,address", "-fno-sanitize-recover=all"]
 
 
