@@ -4,7 +4,6 @@ import pytest
 
 from firmware_protocol.firmware_core import FirmwareConfig
 from sim.app import OptionError, _check_faults
-from sim.cpu_hogs import CpuHogs
 from sim.fault_player import FaultPlayer
 from sim.fault_schedule import KINDS, parse_schedule
 from sim.plant import Plant
@@ -104,19 +103,6 @@ def test_faults_of_processes_go_to_whoever_has_them_in_hand():
     rig = Rig('kind="sigstop"\nat_s=0.01\nfor_s=0.01', 'kind="drop"\nat_s=0.01\nfor_s=0.01', processes=processes)
     rig.run(50)
     assert processes.told == [("+", "sigstop"), ("-", "sigstop")]
-
-
-def test_hogs_run_while_the_fault_lasts_and_not_beyond_the_block():
-    faults = parse_schedule('[[fault]]\nkind="cpu_hog"\nat_s=0\nfor_s=1\ncores=2').faults
-    with CpuHogs() as hogs:
-        hogs.begin(faults[0])
-        running = hogs._busy[faults[0].number]
-        assert [process.poll() for process in running] == [None, None]
-        hogs.end(faults[0])
-        assert all(process.poll() is not None for process in running)
-        hogs.begin(faults[0])
-        running = hogs._busy[faults[0].number]
-    assert all(process.poll() is not None for process in running)
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ import serial
 
 from drivers.types import Frame
 from firmware_protocol.serial_framing import FrameDecoder, encode_frame
+from sim.bus import FrameFate
 from sim.robot_link import LinkFaultError
 from sim.serial_line import SerialLine, SerialPathError
 
@@ -244,3 +245,58 @@ def test_faults_of_a_bus_are_refused(line):
         line.force_bus_off("host")
     with pytest.raises(LinkFaultError, match="two ends"):
         line.babble(FRAME)
+
+
+class Fate:
+    """Does the same to every frame from one side."""
+
+    def __init__(self, sender, **fate):
+        self.sender, self.what = sender, FrameFate(**fate)
+
+    def fate(self, now_ns, sender, frame):
+        return self.what if sender == self.sender else FrameFate()
+
+
+@pytest.mark.parametrize(
+    ("fate", "frames"),
+    [
+        ({}, 1),
+        ({"lost": True}, 0),
+        ({"copies": 2}, 2),
+        ({"wire_error_bit": 40}, 0),
+        ({"wire_error_bit": 40, "cut": True}, 0),
+        ({"data": b"other"}, 1),
+    ],
+)
+def test_faults_on_the_way_to_the_host_are_what_the_host_reads(fate, frames):
+    line = SerialLine(None, 0, pacing=False)
+    line.tamper(Fate("robot", **fate))
+    with serial.Serial(line.port, 921_600, timeout=0.2) as host:
+        line.collect(1)
+        line.send([Frame(0x110, b"12345678")])
+        line.advance(2)
+        found = FrameDecoder().feed(host.read(200))
+        assert found == [(0x110, fate.get("data", b"12345678"))] * frames
+    line.close()
+
+
+@pytest.mark.parametrize(
+    ("fate", "expected"),
+    [
+        ({"lost_at": ("robot",)}, []),
+        ({"wire_error_bit": 3}, []),
+        ({"copies": 2}, [b"abc", b"abc"]),
+        ({"data": b"x"}, [b"x"]),
+    ],
+)
+def test_faults_on_the_way_to_the_robot_are_what_the_robot_reads(fate, expected):
+    line = SerialLine(None, 0, pacing=False)
+    line.tamper(Fate("host", **fate))
+    with serial.Serial(line.port, 921_600) as host:
+        line.collect(1)
+        host.write(encode_frame(0x100, b"abc"))
+        deadline = time.monotonic() + 5.0
+        while not line.collect(2):
+            assert time.monotonic() < deadline
+        assert [received.frame.data for received in line.advance(3)] == expected
+    line.close()
