@@ -219,7 +219,7 @@ def _ages_ms(feed: Path) -> list[float]:
 def _reader() -> Iterator[None]:
     """What a browser does to the page's process: connect, and read all that comes."""
     address = f"127.0.0.1:{PORT}"
-    deadline_s = time.monotonic() + 30.0
+    deadline_s = time.monotonic() + 120.0
     while True:
         try:
             client = connect(

@@ -106,7 +106,7 @@ def test_circle_and_robot_are_drawn_at_their_places_and_replay_is_sought(browser
         slider.focus()
         slider.press("Home")
         wait_for(tab, lambda: page.t_s == 0.0 and not page.playing)
-        with opened(browser, served.url) as other:
+        with opened(browser, served.url, 480, 320) as other:
             other.get_by_role("button", name="Play").wait_for()
             other.get_by_role("button", name="+1", exact=True).click()
             tab.get_by_text("0.020 s", exact=True).wait_for()
