@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 SOURCES := pyproject.toml setup.py constraints.txt firmware_protocol/build_firmware.py firmware_protocol/disco_robot.dbc \
 	$(wildcard firmware_protocol/firmware/*.c firmware_protocol/firmware/*.h)
 
-.PHONY: venv demo chromium test bench gap-study soak fault-campaign fuzz firmware-check socketcan-test clean
+.PHONY: venv demo chromium test bench gap-study soak fault-campaign fuzz firmware-check firmware-mutants socketcan-test clean
 
 venv: $(STAMP)
 
@@ -61,6 +61,10 @@ fuzz: $(STAMP)
 
 firmware-check: $(STAMP)
 	$(BIN)/python -m tools.firmware_check
+
+# More than an hour on two cores.
+firmware-mutants: $(STAMP)
+	$(BIN)/python -m tools.firmware_mutants
 
 socketcan-test: $(STAMP)
 	$(BIN)/python -m tools.socketcan_test

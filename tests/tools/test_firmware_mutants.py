@@ -1,4 +1,4 @@
-"""The sweep itself takes more than an hour (`make firmware-check`); here, that its list of exceptions is sound."""
+"""The sweep itself takes more than an hour (`make firmware-mutants`); here, that its list of exceptions is sound."""
 
 import tomllib
 
