@@ -17,6 +17,7 @@ PARTS = (
     "bench_control",
     "bench_estimation",
     "bench_inference",
+    "bench_latency",
     "bench_log",
     "bench_loop",
     "bench_viewer",

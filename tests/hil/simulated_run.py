@@ -53,6 +53,7 @@ While its one pose sensor lies, the robot cannot know: poses that agree with eac
 a robot sees that was carried off. It waits, counts them, and then believes them.
 """
 LIES = ("pose_jump", "pose_swapped", "pose_frozen")
+_DONE_TO_PROCESSES = {("cpu_hog", None), ("sigstop", "daemon"), ("sigkill", "daemon"), ("sigkill", "robot")}
 # Counters that rise while all is well.
 _USUAL = frozenset(
     {
@@ -393,8 +394,8 @@ class SimulatedRun:
         fault = outcome.fault
         if fault.kind.room.value == "frames" or fault.kind.name == "one_way":
             outcome.struck = self._player.frames.struck.get(fault.number, 0) > 0
-        elif fault.values.get("process", "daemon") not in ("daemon", "robot"):
-            outcome.struck = False
+        elif fault.kind.room.value == "process":
+            outcome.struck = (fault.kind.name, fault.values.get("process")) in _DONE_TO_PROCESSES
         changed = {n for n, v in log.counts.items() if v != opened.counts.get(n, 0) and n not in _USUAL}
         outcome.counters = tuple(sorted(changed))
         outcome.told = tuple(text for _, text in log.told[opened.told :])
