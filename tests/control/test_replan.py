@@ -1,0 +1,58 @@
+"""The compiled step: the shift by fractions, and that it takes nothing from the heap."""
+
+import math
+
+import numpy as np
+import pytest
+from numba import njit
+from numba.core.runtime import _nrt_python, rtsys
+
+from disco_hw.control.pendulum import PAPER_SAMPLER, PendulumPlanner, PendulumPoints
+from disco_hw.control.replan import replan, shift
+
+STEPS = np.arange(10)[:, None]
+PLAN = np.sin(np.hstack([STEPS, STEPS + 1.0])).astype(np.float32)
+
+
+@njit
+def run_shift(nominal, scratch, steps, hold):
+    shift(nominal, scratch, steps, hold)
+
+
+@njit
+def empty(work, samplings, step, steps, gain, basis, limits, system, weights):
+    return True
+
+
+def shifted(steps, hold):
+    nominal = PLAN.copy()
+    run_shift(nominal, np.empty_like(nominal), steps, hold)
+    return nominal
+
+
+@pytest.mark.parametrize("steps", [0.0, 0.2, 1.0, 3.7, 9.0, 12.5])
+def test_a_plan_is_shifted_by_fractions_and_holds_its_last_command(steps):
+    expected = [np.interp(STEPS[:, 0] + steps, STEPS[:, 0], column) for column in PLAN.T]
+    np.testing.assert_allclose(shifted(steps, True), np.transpose(expected), atol=1e-6)
+
+
+def test_or_it_ends_in_zero():
+    np.testing.assert_allclose(shifted(2.0, False), np.vstack([PLAN[2:], np.zeros((2, 2))]), atol=1e-6)
+
+
+def test_the_step_allocates_nothing():
+    planner = PendulumPlanner(PendulumPoints(np.ones((5, 2)), np.full(5, 0.2)), PAPER_SAMPLER)
+    planner.plan(math.pi, 0.0)
+    arguments, counted = planner.optimiser.arguments, []
+    _nrt_python.memsys_enable_stats()
+    try:
+        for function in (replan, empty):
+            function(*arguments)
+            before = rtsys.get_allocation_stats().alloc
+            for _ in range(10):
+                function(*arguments)
+            counted.append(rtsys.get_allocation_stats().alloc - before)
+    finally:
+        _nrt_python.memsys_disable_stats()
+    # Both make the same records of the arrays that they are handed, and nothing else.
+    assert counted[0] == counted[1] > 0
