@@ -32,11 +32,12 @@ ifeq ($(CHROMIUM),install)
 		echo "Chromium could not be installed (Debian, root and its mirrors are needed); the page's tests are skipped"
 endif
 
+# One thread of linear algebra a process: pools of them on two cores only wait for one another.
 test: $(STAMP) chromium
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/python -m pytest -n 2 --dist worksteal
+	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal
 
 # The peers that our figures stand beside; nothing else needs them.
 $(VENV)/.peers: $(STAMP)
