@@ -52,6 +52,7 @@ def run_instrumented(tree: Path, flags: str) -> bool:
         "tests/drivers",
         "tests/conftest.py",
         "drivers",
+        "docs",
         "tools",
         "pyproject.toml",
         "setup.py",
