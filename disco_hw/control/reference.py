@@ -82,10 +82,12 @@ def path_cost(path: Path, place: float, step_s: float) -> SequenceCost:
 
 def timed_path_cost(path: TimedPath, time_s: float, step_s: float) -> SequenceCost:
     """Cost of paths (T + 1, K) along way-points by time, which is `time_s` at the start; see `TimedPath`."""
+    due_s = path.waypoints.times_s
+    assert due_s is not None, "a path by time has times"
 
     def cost(x: Array, y: Array, yaw: Array, forward: Array) -> Array:
         times = time_s + step_s * np.arange(1, len(x))
-        there = [np.interp(times, path.waypoints.times_s, column)[:, None] for column in path.waypoints.places_m.T]
+        there = [np.interp(times, due_s, column)[:, None] for column in path.waypoints.places_m.T]
         return np.asarray(np.hypot(x[1:] - there[0], y[1:] - there[1]).sum(axis=0))
 
     return cost

@@ -19,7 +19,7 @@ _FEWEST_WINDOWS = 12
 _LEAST_RATIO = 0.5
 # Of a window, the part at either end over which positions are averaged.
 _ENDS = 0.25
-# Neighbours of a pose, and how many times the median distance from their median is a jump (about 6 standard deviations).
+# Neighbours of a pose; a jump is so many times the median distance from their median (12: about 6 standard deviations).
 _NEIGHBOURS = 5
 _JUMP = 12.0
 _SMALLEST = np.array([2e-4, 2e-4, 2e-4, 2e-4, 5e-4])

@@ -24,6 +24,7 @@ INLINED: dict[str, Any] = {"fastmath": FAST_MATH, "error_model": "numpy", "force
 
 scalar_function: Callable[..., Any] = njit(**INLINED)
 _intrinsic: Any = intrinsic
+_typeof: Any = typeof
 
 # A function with loops of its own, too large to be worth a copy in every caller.
 block_function: Callable[..., Any] = njit(fastmath=FAST_MATH, error_model="numpy")
@@ -75,7 +76,7 @@ def compiled_for(kernel: Callable[..., Any], *arguments: Any) -> Callable[..., A
     with arguments of the same types. Arrays of another kind are refused with a TypeError.
     """
     dispatcher: Any = kernel
-    entry: Callable[..., Any] = dispatcher.compile(tuple(typeof(argument) for argument in arguments))
+    entry: Callable[..., Any] = dispatcher.compile(tuple(_typeof(argument) for argument in arguments))
     return entry
 
 
