@@ -37,6 +37,7 @@ from tests.hil.stack import running_stack
 from tests.viewer.browser import chromium, opened
 from tests.viewer.run import PERIOD_NS, tick_records, write_log
 
+_HAS_STAMP = "[...document.querySelectorAll('input')].some(input => /^[0-9]{6,}$/.test(input.value))"
 _WATCH_STAMP = """
 window.seen = [];
 const shown = [...document.querySelectorAll("input")].find(input => /^[0-9]{6,}$/.test(input.value));
@@ -188,7 +189,7 @@ def _drawn_ms(browser: Any, robot_file: Path, socket: Path) -> list[float]:
         thread.start()
         try:
             with opened(browser, page.url, 1280, 800) as tab:
-                tab.get_by_label("stamp").wait_for()
+                tab.wait_for_function(_HAS_STAMP)
                 tab.wait_for_timeout(10_000)
                 tab.evaluate(_WATCH_STAMP)
                 tab.wait_for_timeout(DRIVE_S * 1e3)
