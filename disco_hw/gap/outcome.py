@@ -146,7 +146,9 @@ class Outcome:
                 else:
                     price = 0.5 * parameters_of((name,)) * math.log(max(found.channel.count, 2))
                     promise = selector.promise(found.names, name)
-                    gain, score, verdict = promise + price, 2.0 * promise, "not needed"
+                    gain, score = promise + price, 2.0 * promise
+                    enough = score > selector.thresholds.score
+                    verdict = "moves a 2 s prediction too little, or in one stretch only" if enough else "not needed"
                 out.append(CandidateEvidence(REGISTRY[name].channel.value, name, gain, score, verdict))
         return tuple(sorted(out, key=lambda candidate: -candidate.score))
 

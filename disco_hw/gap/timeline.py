@@ -48,6 +48,10 @@ class Samples:
         return Samples(self.node[chosen], self.fraction[chosen], self.t_s[chosen], self.block[chosen])
 
 
+# Of wheels whose readings are held, 80 s of driving may leave this many that are new.
+_FEWEST_READINGS = 100
+
+
 @dataclass(frozen=True, slots=True)
 class Timeline:
     """A drive on the grid.
@@ -80,7 +84,7 @@ class Timeline:
     def has_commands(self) -> bool:
         """Whether enough commands are known to judge the wheels."""
         known = np.count_nonzero(np.isfinite(self.command_rad_s[:, 0]))
-        return bool(known > 0.02 * self.t_s.size and self.encoder.t_s.size > 200)
+        return bool(known > 0.02 * self.t_s.size and self.encoder.t_s.size > _FEWEST_READINGS)
 
     @property
     def has_poses(self) -> bool:
