@@ -1,0 +1,69 @@
+"""The pendulum's kernel against the reference, with the paper's control cost and the update from the noise as drawn."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from disco_hw.control import NoValidControl, pendulum, reference
+from disco_hw.control.blocks import BLOCK
+from disco_hw.control.pendulum import PAPER_SAMPLER, PendulumPlanner, PendulumPoints
+
+K, T = 160, 30
+SAMPLER = replace(PAPER_SAMPLER, samples=K)
+THETA = st.lists(st.tuples(st.floats(0.5, 2.0), st.floats(0.5, 2.0)), min_size=5, max_size=5)
+
+
+def drawn(optimiser):
+    """The last step's noise (K, T)."""
+    noise = optimiser.work.noise.reshape(K // int(BLOCK), -1, int(BLOCK))[:, :T]
+    return noise.swapaxes(0, 1).reshape(T, K).T.astype(float)
+
+
+@settings(max_examples=40)
+@given(THETA, st.floats(-10.0, 10.0), st.floats(-8.0, 8.0), st.integers(0, 2**63 - 1))
+def test_costs_and_update(theta, angle, speed, seed):
+    theta, weights = np.array(theta), np.array([-3.0, 1.0, 1.0, 1.0, 1.0])
+    planner = PendulumPlanner(PendulumPoints(theta, weights), SAMPLER, seed)
+    first = planner.plan(angle, speed)
+    plan = planner.plan(angle, speed)
+    shifted = np.append(first[1:], 0.0)
+    noise = drawn(planner.optimiser)
+    # Single precision holds the angle within a turn; so does the planner.
+    wrapped = math.remainder(angle, 2.0 * math.pi)
+    torques = np.clip(shifted + noise, -pendulum.LARGEST_TORQUE_NM, pendulum.LARGEST_TORQUE_NM)
+    costs = np.array([reference.pendulum_costs(*point, wrapped, speed, torques) for point in theta])
+    got = planner.optimiser.work.point_costs.reshape(5, K)
+    np.testing.assert_allclose(got, costs, rtol=1e-4)
+    total = reference.mean_risk(got.astype(float), weights)
+    total += reference.control_cost(shifted[:, None], noise[..., None], SAMPLER.noise_std, SAMPLER.control_cost_weight)
+    np.testing.assert_allclose(planner.optimiser.work.costs, total, rtol=1e-4, atol=1e-2)
+    share = reference.softmax_weights(planner.optimiser.work.costs.astype(float), SAMPLER.temperature)
+    expected = np.clip(shifted + share @ noise, -pendulum.LARGEST_TORQUE_NM, pendulum.LARGEST_TORQUE_NM)
+    np.testing.assert_allclose(plan, expected, atol=1e-3)
+
+
+def test_every_sample_may_have_its_own_parameters():
+    theta = np.random.default_rng(1).uniform(0.5, 2.0, (2, K, 2))
+    planner = PendulumPlanner(PendulumPoints(theta, np.full(2, 0.5), each=True), SAMPLER)
+    planner.plan(math.pi, 0.0)
+    torques = np.clip(drawn(planner.optimiser), -2.0, 2.0)
+    got = planner.optimiser.work.point_costs.reshape(2, K)
+    for k in (0, 79, 80, 159):
+        expected = [reference.pendulum_costs(*theta[i, k], math.pi, 0.0, torques[k : k + 1])[0] for i in range(2)]
+        np.testing.assert_allclose(got[:, k], expected, rtol=2e-5)
+
+
+def test_a_state_that_is_none_is_told():
+    planner = PendulumPlanner(PendulumPoints(np.ones((5, 2)), np.full(5, 0.2)), SAMPLER)
+    with pytest.raises(NoValidControl, match="no torque sequence has a finite cost"):
+        planner.plan(0.0, math.nan)
+    assert np.isfinite(planner.plan(0.0, 0.0)).all()
+
+
+def test_the_printed_cost_does_not_tell_up_from_down_but_this_one_does():
+    assert pendulum.instant_cost(math.pi, 0.0) == 200.0
+    assert pendulum.instant_cost(0.0, 0.0) == 0.0
