@@ -1,6 +1,7 @@
 """The whole search on logs of a robot in which something is hidden; the truth never reaches the search."""
 
 import json
+import re
 from functools import cache
 
 import numpy as np
@@ -91,7 +92,8 @@ def test_report_and_model_can_be_written_and_read(tmp_path):
     assert load_model(tmp_path / "model.toml").parameter_names == report.model.parameter_names
     html = page(report)
     assert "0.12" in html
-    assert "http" not in html
+    # Without the pictures, whose letters may spell anything.
+    assert "http" not in re.sub(r'base64,[^"]*', "", html)
     assert html.count("data:image/png;base64,") == len(report.pictures) >= 4
 
 
