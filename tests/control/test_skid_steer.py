@@ -12,10 +12,16 @@ from disco_hw.control.blocks import BLOCK
 from disco_hw.control.parameter_points import unscented_points
 from disco_hw.control.past import past_commands
 from disco_hw.control.spline import spline_basis
+from disco_hw.control.tasks.path import Path
+from disco_hw.control.tasks.timed_path import TimedPath
+from disco_hw.control.tasks.waypoints import Waypoints
 from disco_hw.model import EffectSetting, Gaussian, Model
 from disco_hw.model import reference as physics
+from disco_hw.model.effects import MOTION_EFFECTS
 
 SAMPLES, HORIZON, STEP_S = 160, 50, 0.1
+# Single precision holds no more than this of a cost of hundreds.
+RELATIVE = 1e-5
 SAMPLER = Sampler(samples=SAMPLES, horizon=HORIZON)
 PLAN_SETTINGS = DiscoSettings(sampler=SAMPLER, iterations_at_start=1, retries=0, gain_by_time=False)
 LIMITS = WheelLimits(8.0, 20.0)
@@ -33,7 +39,7 @@ FULL = {
     "motor_lag": {"tau_s": st.floats(0.0, 0.5)},
     "command_delay": {"delay_s": st.floats(0.0, 0.45)},
     "deadband": {"width_rad_s": st.floats(0.0, 1.0)},
-    "stiction": {"threshold_rad_s": st.just(0.0)},
+    "stiction": {"threshold_rad_s": st.floats(0.0, 1.5)},
     "speed_limit": {"limit_rad_s": st.floats(2.0, 9.0)},
     "yaw_rate_limit": {"limit_rad_s": st.floats(0.3, 5.0)},
     "battery_sag": {"loss": st.floats(0.0, 0.5)},
@@ -62,13 +68,36 @@ def state_of(values, commands):
     return PlannerState(20_000_000 * len(commands), *values, sent=sent, elapsed_s=3.0)
 
 
+ANGLE = np.linspace(0.0, 2.0 * np.pi, 400)
+EIGHT = np.column_stack([1.5 * np.sin(ANGLE), 0.75 * np.sin(2.0 * ANGLE)])
+TASKS = {
+    "circle": Circle(0.3, -0.2),
+    "closed path": Path(Waypoints(EIGHT), 0.25),
+    "open path": Path(Waypoints(EIGHT[:150]), 0.25),
+    "timed path": TimedPath(Waypoints(EIGHT, ANGLE - 1.0)),
+}
+# Commands are nudged up and down to see which samples sit on an edge (stiction, the next piece of a path), where single
+# precision may fall to either side: there the two changes of the cost do not cancel.
+NUDGE_RAD_S, EDGE = 1e-5, 2e-5
+
+
+def sequence_cost(task, place):
+    match task:
+        case Circle():
+            return reference.circle_cost(task, STEP_S)
+        case Path():
+            return reference.path_cost(task, place, STEP_S)
+        case TimedPath():
+            return reference.timed_path_cost(task, 0.0, STEP_S)
+
+
 def check_against_reference(model, state, task, plan_settings, seed):
     """Plan twice and check every cost, the weights and the update of the second step."""
     disco = Disco(model, task, plan_settings, LIMITS, seed)
     now_ns = state.t_ns
     before = disco.plan(now_ns, state).wheel_speeds
     disco.plan(now_ns, state)
-    work = disco._optimiser.work
+    work = disco.optimiser.work
 
     sampler = plan_settings.sampler
     noise = work.noise.reshape(-1, work.noise.size // work.weights.size, int(BLOCK)).swapaxes(0, 1)
@@ -85,34 +114,56 @@ def check_against_reference(model, state, task, plan_settings, seed):
     theta, point_weights = unscented_points(model, plan_settings.ut_alpha)
     past = past_commands(state.sent, now_ns, STEP_S, 8, (state.left_speed_rad_s, state.right_speed_rad_s))
     start = physics.State(state.x_m, state.y_m, state.yaw_rad, state.left_speed_rad_s, state.right_speed_rad_s)
-    expected = np.array(
-        [
-            reference.point_costs(
-                physics.theta_of(model.parameter_names, point), start, commands, past, STEP_S,
-                reference.circle_cost(task, STEP_S), time_s=state.elapsed_s,
-            )
-            for point in theta
-        ]
-    )  # fmt: skip
-    got = work.point_costs.reshape(point_weights.size, -1)[:, : sampler.samples]
-    np.testing.assert_allclose(got, expected, atol=1e-4, rtol=1e-5)
+    cost = sequence_cost(task, float(disco._start[7]))
 
-    mean = reference.mean_risk(expected, point_weights)
-    np.testing.assert_allclose(work.costs[: sampler.samples], mean, atol=1e-4, rtol=1e-5)
-    report = disco._optimiser.report()
-    assert report["cost_nominal"] == pytest.approx(mean[0], abs=1e-4, rel=1e-5)
+    def costs_of(sequences):
+        names = model.parameter_names
+        return np.array(
+            [
+                reference.point_costs(
+                    physics.theta_of(names, point), start, sequences, past, STEP_S, cost, time_s=state.elapsed_s
+                )
+                for point in theta
+            ]
+        )
+
+    expected = costs_of(commands)
+    got = work.point_costs.reshape(point_weights.size, -1)[:, : sampler.samples].astype(float)
+    nudged = costs_of(commands + NUDGE_RAD_S) + costs_of(commands - NUDGE_RAD_S) - 2.0 * expected
+    clear = np.abs(nudged).max(axis=0) < EDGE
+    assert clear.mean() > 0.5
+    np.testing.assert_allclose(got[:, clear], expected[:, clear], atol=1e-4, rtol=RELATIVE)
+
+    mean = reference.mean_risk(np.where(clear, expected, got), point_weights)
+    np.testing.assert_allclose(work.costs[: sampler.samples], mean, atol=1e-4, rtol=RELATIVE)
+    report = disco.optimiser.report()
+    assert report["cost_nominal"] == pytest.approx(mean[0], abs=1e-4, rel=RELATIVE)
     kernel_weights = reference.softmax_weights(work.costs[: sampler.samples].astype(float), report["temperature"])
     assert report["ess"] == pytest.approx(reference.effective_sample_size(kernel_weights), rel=1e-3)
     np.testing.assert_allclose(work.nominal, reference.updated(commands, kernel_weights), atol=2e-4)
 
 
-@settings(max_examples=60, deadline=None)
+def test_every_effect_that_moves_the_robot_is_tried():
+    assert set(FULL) == set(MOTION_EFFECTS)
+
+
+@settings(max_examples=15)
 @given(BASE, STATES, COMMANDS, st.integers(0, 2**63 - 1))
 def test_costs_and_update_of_the_bare_model(base, values, commands, seed):
-    check_against_reference(model_of(base), state_of(values, commands), Circle(), PLAN_SETTINGS, seed)
+    check_against_reference(model_of(base), state_of(values, commands), TASKS["circle"], PLAN_SETTINGS, seed)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=15)
 @given(BASE, EFFECTS, STATES, COMMANDS, st.integers(0, 2**63 - 1))
 def test_costs_and_update_with_all_effects(base, effects, values, commands, seed):
-    check_against_reference(model_of(base, effects), state_of(values, commands), Circle(), PLAN_SETTINGS, seed)
+    check_against_reference(model_of(base, effects), state_of(values, commands), TASKS["circle"], PLAN_SETTINGS, seed)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("task", ["closed path", "open path", "timed path"])
+def test_costs_and_update_along_paths(task, seed):
+    rng = np.random.default_rng(seed)
+    base = rng.uniform((0.02, 0.2, -0.3), (0.12, 0.8, 0.4))
+    values = rng.uniform(-1.0, 1.0, 5) * (2.0, 2.0, math.pi, 6.0, 6.0)
+    commands = rng.uniform(-6.0, 6.0, (int(rng.integers(1, 30)), 2))
+    check_against_reference(model_of(base), state_of(values, commands), TASKS[task], PLAN_SETTINGS, seed)
