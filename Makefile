@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 SOURCES := pyproject.toml setup.py constraints.txt firmware_protocol/build_firmware.py firmware_protocol/disco_robot.dbc \
 	$(wildcard firmware_protocol/firmware/*.c firmware_protocol/firmware/*.h)
 
-.PHONY: venv demo chromium test bench gap-study soak fault-campaign fuzz firmware-check firmware-mutants socketcan-test clean
+.PHONY: venv demo chromium test test-long bench gap-study soak fault-campaign fuzz firmware-check firmware-mutants socketcan-test clean
 
 venv: $(STAMP)
 
@@ -37,7 +37,11 @@ test: $(STAMP) chromium
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal
+	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 3 --dist worksteal -m "not long"
+
+# Closed loops, studies, clusters and browsers: as much again.
+test-long: $(STAMP) chromium
+	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal -m long
 
 # The peers that our figures stand beside; nothing else needs them.
 $(VENV)/.peers: $(STAMP)

@@ -16,6 +16,8 @@ from disco_hw.replay import replay
 from disco_hw.robot_setup import load_setup
 from tests.disco_hw.test_replay import write_log
 
+pytestmark = pytest.mark.long
+
 CHANGE_S = 4.0
 OPTIONS = AdaptOptions(change_s=CHANGE_S, settled_s=10.0, compared_s=0.5, seeds=1)
 

@@ -137,6 +137,7 @@ def test_commands_on_their_way_are_in_the_prediction():
     np.testing.assert_allclose(np.diff(x)[:2], [0.0, 0.061 * 5.0 * 0.05], atol=1e-9)
 
 
+@pytest.mark.long
 def test_delay_and_lag_in_the_model_help_a_plant_that_has_them():
     effects = (EffectSetting("motor_lag", {"tau_s": 0.1}), EffectSetting("command_delay", {"delay_s": 0.3}))
     knowing, ignorant = planner(replace(MODEL, effects=effects)), planner()
@@ -174,6 +175,7 @@ def test_own_draws_repeat_bit_for_bit():
     np.testing.assert_array_equal(one.plan(0, TANGENT).wheel_speeds, other.plan(0, TANGENT).wheel_speeds)
 
 
+@pytest.mark.long
 def test_paper_mode_stands_still_and_chatters_as_the_published_code_does():
     disco = Disco(MODEL, Circle().paper(), DiscoSettings.paper(), WheelLimits(2.0 * math.pi), 1)
     costs, commands = drive(disco, 20.0, wheel_noise=0.05)

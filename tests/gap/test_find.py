@@ -43,11 +43,13 @@ def test_exactly_the_hidden_effect_is_named_and_the_gap_closes(name, size, param
     assert stages["refitted"] - stages["amended"] > 0.8 * (stages["refitted"] - stages["floor"])
 
 
+@pytest.mark.long
 def test_two_effects_of_different_channels_are_both_named():
     report = report_of(("yaw_rate_limit", 1.0), ("pose_latency", 0.1))
     assert {effect.name for effect in report.effects} == {"yaw_rate_limit", "pose_latency"}
 
 
+@pytest.mark.long
 def test_what_has_no_name_is_unnamed_with_its_form():
     report = report_of(("x_motor_droop", 0.01))
     assert not report.effects
@@ -56,12 +58,14 @@ def test_what_has_no_name_is_unnamed_with_its_form():
     assert report.gap["amended"][2.0].position_m < 0.7 * report.gap["refitted"][2.0].position_m
 
 
+@pytest.mark.long
 def test_an_encoder_that_counts_wrong_is_one_cause_not_two():
     report = report_of(("encoder_scale", 0.04))
     assert [effect.name for effect in report.effects] == ["encoder_scale"]
     assert report.effects[0].parameters["right"].value == pytest.approx(0.04, abs=0.006)
 
 
+@pytest.mark.long
 def test_a_sensor_mounted_aside_is_reported_as_a_class():
     report = report_of(("pose_offset", 0.04))
     assert len(report.effects) == 1
@@ -76,6 +80,7 @@ def test_a_steady_circle_is_blind_to_what_it_cannot_show():
     assert {"turn_slip", "side_slip", "wheel_radius_asymmetry", "heading_bias"} <= blind
 
 
+@pytest.mark.long
 def test_known_effects_of_the_model_are_not_reported_again():
     amended = report_of(("motor_lag", 0.12)).model
     again = find_gap(simulated_drive({"motor_lag": 0.12}, seed=902), amended)

@@ -6,6 +6,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
+pytestmark = pytest.mark.long
+
 NEW_EFFECT = '''
 """Drag that grows with the speed squared: v -> v - k v^3."""
 

@@ -12,6 +12,8 @@ from disco_hw.model import Model, load_model, save_model
 from disco_hw.model.free_run import FreeRun
 from tools.gap_logs import simulated_drive
 
+pytestmark = pytest.mark.long
+
 MODEL = Model(0.061, 0.415, 0.238)
 AHEAD_S, STEP_S = 2.0, 0.02
 

@@ -15,7 +15,7 @@ import pytest
 from disco_hw.log.reader import open_log
 from tests.hil.stack import FAST_START, FAST_TASK, running_stack
 
-pytestmark = pytest.mark.hil
+pytestmark = [pytest.mark.hil, pytest.mark.long]
 
 LOADING_S = 90.0
 SILENT_S = 9.0

@@ -11,7 +11,7 @@ from disco_hw.operator import disco_hw_process
 from tests.drivers.waiting import wait_until
 from tests.hil.stack import READY_TIMEOUT_S, write_robot_file
 
-pytestmark = [pytest.mark.hil, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.hil, pytest.mark.long, pytest.mark.timeout(300)]
 ROOT = Path(__file__).resolve().parents[2]
 KEY = "000102030405060708090a0b0c0d0e0f\n"
 

@@ -9,7 +9,7 @@ from disco_hw.cli import app
 from disco_hw.model import load_model
 
 # Compiling for two models takes most of it.
-pytestmark = [pytest.mark.hil, pytest.mark.timeout(900)]
+pytestmark = [pytest.mark.hil, pytest.mark.long, pytest.mark.timeout(900)]
 
 
 def test_what_is_found_in_a_minutes_log_makes_the_circle_better(tmp_path):

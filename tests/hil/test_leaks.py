@@ -19,6 +19,8 @@ from sim.hub import Hub
 from sim.serial_line import SerialLine
 from tests.hil.simulated_run import SimulatedRun
 
+pytestmark = pytest.mark.long
+
 HOURS = float(os.environ.get("DISCO_HW_LEAK_HOURS", "0"))
 RECONNECTS = int(os.environ.get("DISCO_HW_RECONNECTS", "30"))
 BLOCKS_OF_SLACK = 600

@@ -9,6 +9,8 @@ from disco_hw.inference.dask_workers import dask_workers
 from disco_hw.inference.infer import InferOptions, infer
 from tests.inference.drives import logged, robot_config
 
+pytestmark = pytest.mark.long
+
 distributed = pytest.importorskip("distributed")
 
 

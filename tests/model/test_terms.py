@@ -32,6 +32,7 @@ def every_term(target, features):
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("target", ["command", "v_x", "v_y", "omega"])
 def test_every_feature_agrees_with_the_reference(target):
     features = COMMAND_FEATURES if target == "command" else BODY_FEATURES

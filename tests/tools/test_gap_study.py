@@ -12,6 +12,8 @@ from disco_hw.gap.intervals import Estimate
 from tools import gap_jobs, gap_study, gap_tables
 from tools.gap_jobs import Job, Result, jobs
 
+pytestmark = pytest.mark.long
+
 QUIET = Console(quiet=True)
 
 

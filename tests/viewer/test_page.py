@@ -15,6 +15,8 @@ from disco_hw.viewer.server import serving
 from tests.viewer.browser import chromium, keep, opened
 from tests.viewer.run import RADIUS_M, pose_at
 
+pytestmark = pytest.mark.long
+
 HEIGHT_M, FIELD_OF_VIEW, SIZE = 2.5, math.radians(60.0), 480
 
 

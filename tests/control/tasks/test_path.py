@@ -39,6 +39,7 @@ def distance_to(waypoints, poses):
     return np.hypot(poses[:, :1] - columns[0], poses[:, 1:2] - columns[1]).min(axis=1)
 
 
+@pytest.mark.long
 def test_a_closed_path_that_crosses_itself_is_driven_round():
     task = Path(EIGHT, speed_m_s=0.25)
     poses, speeds, places = follow(task, 45.0, (0.0, 0.0, 0.8))
