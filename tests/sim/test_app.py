@@ -233,6 +233,7 @@ def test_the_record_has_no_gap_whatever_happens_to_the_process(start, tmp_path):
 def test_faults_at_run_time(start):
     robot = start()
     with UnixCanBus(str(robot.channel)) as bus:
+        assert bus.recv(10) is not None, "nothing comes before the bus knows of us"
         assert robot.command("bus_off") == "ok"
         assert any(message.is_error_frame for message in iter(lambda: bus.recv(1), None))
         assert robot.command("unplug 0.3") == "ok"
