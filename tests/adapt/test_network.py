@@ -15,7 +15,7 @@ def test_ranges_lie_within_the_prior():
 
 
 def test_posteriors_cover_the_truth_on_drives_of_a_simulator_that_is_not_its_own():
-    """90 % intervals of 40 drives with 3 parameters hold 85 % or more; on drives as quiet as these it is 98 %."""
+    """90 % intervals of 40 drives with 3 parameters hold 80 to 98 %."""
     rng = np.random.default_rng(1)
     inside = []
     for seed in range(40):
@@ -23,7 +23,7 @@ def test_posteriors_cover_the_truth_on_drives_of_a_simulator_that_is_not_its_own
         found = network().condition(evidence(excited(8.0, seed=seed, truth=truth), USUAL))
         assert not found.doubt
         inside.append(np.abs(found.mean - truth) < 1.645 * np.sqrt(np.diag(found.covariance)))
-    assert np.mean(inside) > 0.85
+    assert 0.80 < np.mean(inside) < 0.98
 
 
 def test_driving_that_fits_no_geometry_is_doubted():

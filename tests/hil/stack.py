@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import disco_hw
-from disco_hw.errors import WorkError
 from disco_hw.operator import Child, Operator, disco_hw_process
 
 READY_TIMEOUT_S = 60.0
@@ -62,19 +61,9 @@ class Stack:
     _end: ExitStack = field(repr=False)
 
     def drive(self, until_rad_s: float = 6.0, timeout_s: float = 10.0) -> None:
-        """Arm, start, and wait until the faster wheel has come up to speed.
-
-        On a machine that is busy with other tests the robot may rightly stop for late commands: three tries.
-        """
-        for tries_left in (2, 1, 0):
-            self.start()
-            try:
-                self.operator.wait_until("at speed", partial(_faster_than, until_rad_s), timeout_s)
-            except WorkError:
-                if not tries_left:
-                    raise
-            else:
-                return
+        """Arm, start, and wait until the faster wheel has come up to speed."""
+        self.start()
+        self.operator.wait_until("at speed", partial(_faster_than, until_rad_s), timeout_s)
 
     def start(self) -> None:
         """Arm and start the task."""
