@@ -170,10 +170,12 @@ class Disco:
         self._begun_ns = self._t0_ns = self._failing_since_ns = self._memory = None
 
     def warm_up(self) -> None:
-        """Compile everything that `plan` calls, or load it from disk; leaves the planner as after `reset`."""
+        """Compile everything that any method calls, or load it from disk; leaves the planner as after `reset`."""
         number = self._optimiser.step_number
         self.reset()
         self.plan(0, PlannerState(0, 0.0, 0.0, 0.0, 0.0, 0.0))
+        self.sampled_rollouts(1)
+        self.point_trajectories()
         self._optimiser.step_number = number
         self.reset()
 

@@ -24,6 +24,7 @@ def warm_up(pipeline: Pipeline) -> None:
     for tick in range(1, _TICKS):
         now_ns = tick * _PERIOD_NS
         pipeline.step(now_ns, _readings(now_ns, tick), FollowTask() if tick > _ON_THE_WAY else Stand())
+        pipeline.rollouts(1)
 
 
 def _readings(now_ns: int, tick: int) -> Readings:

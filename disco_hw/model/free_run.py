@@ -34,10 +34,9 @@ class FreeRun:
         """
         states = np.empty((commands.shape[0] - history + 1, 5))
         states[0] = start
-        run_states(
-            states, np.ascontiguousarray(commands), history, float(time_s), point, self._base, self._effects,
-            self._series,
-        )  # fmt: skip
+        # A fresh copy, as a read-only array or a strided one is another type and would be compiled anew, in mid-loop.
+        own = np.array(commands, dtype=np.float64, order="C")
+        run_states(states, own, history, float(time_s), point, self._base, self._effects, self._series)
         return states
 
 

@@ -2,6 +2,13 @@
 
 from __future__ import annotations
 
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
 from disco_hw.config import Estimation
 from disco_hw.control import NoValidControl
 from disco_hw.daemon.governor import Governor, WheelLimits
@@ -33,3 +40,14 @@ def test_poses_are_accepted_gated_and_refused_and_the_planner_is_asked():
     assert fusion.stats.poses_accepted > 20
     assert fusion.stats.poses_gated == 1
     assert fusion.stats.poses_not_finite == 1
+
+
+@pytest.mark.parametrize("uncertainty", ["ut", "mc"])
+def test_nothing_is_compiled_while_the_robot_is_driven(uncertainty):
+    # In a process of its own: what another test has compiled would hide it.
+    command = [sys.executable, "-m", "tests.daemon.driven_once", uncertainty]
+    run = subprocess.run(command, cwd=Path(__file__).parents[2], capture_output=True, text=True, check=False)
+    assert run.returncode == 0, run.stderr
+    told = json.loads(run.stdout)
+    assert "disco_hw.model.free_run.run_states" in told["before"]
+    assert told["after"] == told["before"]
