@@ -24,12 +24,16 @@ _COMPLETED_TOLERANCE_LAPS = 0.02
 
 @dataclass(frozen=True, slots=True)
 class LoopFigures:
-    """Loop period and lateness in microseconds at p50, p99, p99.9 and maximum, and what was missed."""
+    """Loop period and lateness in microseconds at p50, p99, p99.9 and maximum, and what was missed.
+
+    `stolen_ms`: as of `realtime.stolen_ms`, since the daemon's start.
+    """
 
     period_us: tuple[float, ...]
     lateness_us: tuple[float, ...]
     overruns: int
     skipped: int
+    stolen_ms: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,6 +84,7 @@ class CircleReport:
             ("loop period p50 / p99 / p99.9 / max", _microseconds(self.loop.period_us)),
             ("loop lateness p50 / p99 / p99.9 / max", _microseconds(self.loop.lateness_us)),
             ("overruns / skipped periods", f"{self.loop.overruns} / {self.loop.skipped}"),
+            ("CPU time that the machine's host took", f"{self.loop.stolen_ms} ms"),
             *((f"frames {name}", str(count)) for name, count in self.frames.items()),
             ("robot stands, disarmed", "yes" if self.stopped else "NO"),
         ]
@@ -171,6 +176,7 @@ def _loop_figures(log: Log, first_ns: int, last_ns: int) -> LoopFigures:
         lateness_us=_percentiles(_floats(columns["lateness_ns"]) * 1e-3),
         overruns=int(overruns[-1] - overruns[0]),
         skipped=int(skipped[-1] - skipped[0]),
+        stolen_ms=_last_counters(log).loop.get("stolen_ms", 0),
     )
 
 
@@ -182,11 +188,15 @@ def _percentiles(values: Array) -> tuple[float, ...]:
     return tuple(float(np.percentile(values, p)) for p in PERCENTILES)
 
 
-def _frame_counts(log: Log) -> dict[str, int]:
+def _last_counters(log: Log) -> Counters:
     counters = [entry.record for entry in log.records(("/counters",)) if isinstance(entry.record, Counters)]
-    if not counters:
+    return counters[-1] if counters else Counters(0)
+
+
+def _frame_counts(log: Log) -> dict[str, int]:
+    last = _last_counters(log)
+    if not last.transport:
         return {}
-    last = counters[-1]
     rejected = sum(count for name, count in last.driver.items() if name.startswith("rejected"))
     return {
         "sent": last.transport["frames_sent"],

@@ -173,6 +173,7 @@ class Daemon:
         self._notifier = Notifier()
         self._signals = signals
         self._pilot = pilot
+        self._stolen_before_ms = realtime.stolen_ms()
         self._quit = False
         self._failed = False
         self._next_second_ns = 0
@@ -305,7 +306,8 @@ class Daemon:
         last = self._core.last
         if last is not None:
             self._notifier.status(f"{last.output.state.name}: {last.output.detail}")
-        return (counters(self._core, self._loop.stats, self._recorder_stats, now_ns),)
+        stolen_ms = realtime.stolen_ms() - self._stolen_before_ms
+        return (counters(self._core, self._loop.stats, self._recorder_stats, now_ns, stolen_ms),)
 
     def _steer(self, now_ns: int, message: ControlMessage) -> None:
         """Hand what a page wants to the pilot; the reply's stamp is what its next request must carry."""

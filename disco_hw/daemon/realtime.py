@@ -29,6 +29,7 @@ _MCL_FUTURE = 2
 _CAP_IPC_LOCK = 14
 _CAP_SYS_NICE = 23
 _OTHER_THREADS_BELOW = 10
+_STOLEN_COLUMN = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +84,16 @@ def enter(priority: int, cpus: Collection[int] = ()) -> tuple[Step, ...]:
 def raise_loop_thread(priority: int) -> Step:
     """Give the calling thread SCHED_FIFO at `priority` (1 to 98), above the threads made since `enter`."""
     return _set_fifo("loop thread", priority)
+
+
+def stolen_ms(statistics: Path = Path("/proc/stat")) -> int:
+    """CPU time since boot, of all CPUs, that the host of a virtual machine gave to others while a process wanted it.
+
+    No measure above helps against it: what a loop loses so, it loses to another machine. 0 on hardware of one's own.
+    """
+    line = statistics.read_text(encoding="ascii").split("\n", 1)[0].split()
+    ticks = int(line[_STOLEN_COLUMN]) if len(line) > _STOLEN_COLUMN else 0
+    return ticks * 1000 // os.sysconf("SC_CLK_TCK")
 
 
 def can_use_fifo() -> bool:

@@ -75,15 +75,17 @@ def _microseconds(summary: dict[str, float]) -> dict[str, float]:
     return {name.removesuffix("_s"): value * 1e6 for name, value in summary.items()}
 
 
-def counters(core: DaemonCore, loop: LoopStats, recorder: RecorderStats, now_ns: int) -> records.Counters:
-    """Every counter of the stack as one record for the log."""
+def counters(
+    core: DaemonCore, loop: LoopStats, recorder: RecorderStats, now_ns: int, stolen_ms: int = 0
+) -> records.Counters:
+    """Every counter of the stack as one record for the log; `stolen_ms` as of `realtime.stolen_ms`, since the start."""
     return records.Counters(
         t_ns=now_ns,
         transport=asdict(core.transport.stats),
         driver=asdict(core.driver.stats),
         fusion=asdict(core.pipeline.fusion.stats),
         recorder={name: value for name, value in asdict(recorder).items() if type(value) is int},
-        loop={"ticks": loop.ticks, "overruns": loop.overruns, "skipped": loop.skipped_periods},
+        loop={"ticks": loop.ticks, "overruns": loop.overruns, "skipped": loop.skipped_periods, "stolen_ms": stolen_ms},
         adaptation=core.adaptation.counts(),
         entered=dict(core.entered),
     )

@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from disco_hw.daemon.realtime import can_lock_memory, can_use_fifo
+from disco_hw.daemon.realtime import can_lock_memory, can_use_fifo, stolen_ms
 
 FIFO_ALLOWED = pytest.mark.skipif(not can_use_fifo(), reason="this user may not use SCHED_FIFO")
 REPORT = """
@@ -133,3 +133,14 @@ def test_a_blas_that_is_loaded_too_early_is_said():
     name, done, text = run(script, OPENBLAS_NUM_THREADS="2")["steps"][0]
     assert (name, done) == ("threads", False)
     assert "OPENBLAS_NUM_THREADS=1" in text
+
+
+@pytest.mark.parametrize(("line", "expected_ms"), [("cpu  1 2 3 4 5 6 7 45 9 10", 450), ("cpu  1 2 3 4", 0)])
+def test_time_that_the_host_took_is_read_from_the_kernels_statistics(tmp_path, line, expected_ms):
+    statistics = tmp_path / "stat"
+    statistics.write_text(f"{line}\ncpu0 9 9 9 9 9 9 9 9 9 9\n")
+    assert stolen_ms(statistics) * os.sysconf("SC_CLK_TCK") == expected_ms * 100
+
+
+def test_this_machines_statistics_can_be_read():
+    assert stolen_ms() >= 0
