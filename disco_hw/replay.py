@@ -53,10 +53,11 @@ class ReplayReport:
     missing_ticks: int
     recorded_by: str
     difference: Difference | None
+    tolerance: float = 0.0
 
     @property
     def ok(self) -> bool:
-        """Whether everything was equal."""
+        """Whether everything was equal, or as near as was asked."""
         return self.difference is None
 
     def as_dict(self) -> dict[str, Any]:
@@ -69,7 +70,7 @@ class ReplayReport:
         if self.missing_ticks:
             lines.append(f"{self.missing_ticks} ticks are missing from the log: from there on nothing can be equal")
         if self.difference is None:
-            lines.append("equal bit for bit")
+            lines.append(f"equal to within {self.tolerance:g}" if self.tolerance else "equal bit for bit")
         else:
             d = self.difference
             lines.append(f"first difference at tick {d.tick} ({d.t_ns} ns), {d.field}:")
@@ -78,9 +79,11 @@ class ReplayReport:
         return "\n".join(lines)
 
 
-def replay(path: Path) -> ReplayReport:
+def replay(path: Path, tolerance: float = 0.0) -> ReplayReport:
     """Replay a log with the robot.toml and the model that it carries.
 
+    `tolerance`: what numbers may differ by, in their own units or as a share of the larger, whichever allows more; 0
+    for bit for bit, which only the machine that recorded promises: another processor rounds sums differently.
     Raises LogError for a log that cannot be read and InputError for one that holds no ticks or no robot.toml.
     """
     with open_log(path) as log:
@@ -96,13 +99,13 @@ def replay(path: Path) -> ReplayReport:
                 put_in_force(pipeline, setup.model, geometry_of(change))
             outcome = _replay_tick(pipeline, recorded)
             ticks += 1
-            compared, difference = _compare(tick, recorded[0].now_ns, recorded, outcome)
+            compared, difference = _compare(tick, recorded[0].now_ns, recorded, outcome, tolerance)
             values += compared
             if difference is not None:
                 break
         if not ticks:
             raise InputError(f"{path}: holds no ticks; give the log of a `disco-hw run`")
-        return ReplayReport(ticks, values, log.summary().missing_ticks, log.metadata.version, difference)
+        return ReplayReport(ticks, values, log.summary().missing_ticks, log.metadata.version, difference, tolerance)
 
 
 def _setup(log: Log) -> Setup:
@@ -142,7 +145,7 @@ def _motion(command: Command) -> Motion:
 
 
 def _compare(
-    tick: int, now_ns: int, recorded: Sequence[Entry], replayed: Sequence[Record]
+    tick: int, now_ns: int, recorded: Sequence[Entry], replayed: Sequence[Record], tolerance: float
 ) -> tuple[int, Difference | None]:
     """Compare the outputs of one tick; returns how many values were equal, and the first that is not."""
     before = [entry.record for entry in recorded if isinstance(entry.record, _COMPARED)]
@@ -152,7 +155,7 @@ def _compare(
     equal = 0
     for old, new in zip(before, replayed, strict=True):
         for field, old_value, new_value in _values(old, new):
-            if _bits(old_value) != _bits(new_value):
+            if not (_near(old_value, new_value, tolerance) if tolerance else _bits(old_value) == _bits(new_value)):
                 return equal, Difference(tick, now_ns, field, repr(old_value), repr(new_value))
             equal += 1
     return equal, None
@@ -162,6 +165,16 @@ def _values(old: Record, new: Record) -> Iterator[tuple[str, Any, Any]]:
     for name in old.__struct_fields__ if isinstance(old, msgspec.Struct) else ():
         if (type(old), name) not in _NOT_REPLAYED:
             yield f"{type(old).__name__}.{name}", getattr(old, name), getattr(new, name)
+
+
+def _near(old: Any, new: Any, tolerance: float) -> bool:
+    """Whether two values, or those of two tuples, are equal but for rounding."""
+    if isinstance(old, float) and isinstance(new, float):
+        both_nan = math.isnan(old) and math.isnan(new)
+        return both_nan or math.isclose(old, new, rel_tol=tolerance, abs_tol=tolerance)
+    if isinstance(old, tuple) and isinstance(new, tuple):
+        return len(old) == len(new) and all(_near(a, b, tolerance) for a, b in zip(old, new, strict=True))
+    return bool(old == new)
 
 
 def _bits(value: Any) -> Any:

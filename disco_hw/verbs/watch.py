@@ -54,14 +54,21 @@ def view(
         print_result({"written": written}, as_json, "")
 
 
-def replay(log: Annotated[Path, typer.Argument(metavar="LOG")], as_json: AsJson = False) -> None:
-    """Run estimator, planner and governor again on a log's samples and compare every output bit for bit."""
+def replay(
+    log: Annotated[Path, typer.Argument(metavar="LOG")],
+    tolerance: Annotated[
+        float,
+        typer.Option(min=0.0, max=1.0, help="What numbers may differ by, absolutely or relatively; 0: not a bit."),
+    ] = 0.0,
+    as_json: AsJson = False,
+) -> None:
+    """Run estimator, planner and governor again on a log's samples and compare every output, by default bit for bit."""
     from disco_hw.daemon.realtime import limit_thread_pools
 
     limit_thread_pools()
     from disco_hw.replay import replay as replay_log
 
-    report = replay_log(log)
+    report = replay_log(log, tolerance)
     print_result(report.as_dict(), as_json, report.as_text())
     if not report.ok:
         raise typer.Exit(1)

@@ -1,0 +1,164 @@
+"""Writes the reference logs that tests/disco_hw/test_reference_logs.py replays.
+
+    python -m tools.reference_logs [DIRECTORY]
+
+Only after a change that is meant to alter estimates, plans or commands: the test says at which tick and in which field
+a build first differs from the one that recorded them.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import msgspec
+
+import disco_hw
+from disco_hw.adapt.adaptable import believed_geometry
+from disco_hw.adapt.adaptation import Learnt, NoAdaptation
+from disco_hw.adapt.coordinates import NAMES
+from disco_hw.daemon.assembly import make_planner, put_in_force
+from disco_hw.daemon.supervisor import UserRequest
+from disco_hw.drive.coverage import Coverage
+from disco_hw.drive.hand_pilot import HandPilot
+from disco_hw.drive.source import ManualInput
+from disco_hw.log.link import Attachment
+from disco_hw.log.provenance import MODEL_TOML, ROBOT_TOML, version
+from disco_hw.log.recorder import ProcessRecorder, Recording
+from disco_hw.log.records import BeliefChange, FrameIn, FrameOut
+from disco_hw.pipeline import NoPlanner, Planner
+from disco_hw.robot_setup import Setup, load_setup
+from tests.daemon.simulated import SimulatedStack, simulated_stack
+
+DIRECTORY = Path(__file__).parents[1] / "tests" / "disco_hw" / "reference_logs"
+ROBOTS = Path(disco_hw.__file__).parent / "robots"
+SHORT_SIGHTED = ("rate_hz = 50.0", "rate_hz = 50.0\nhorizon = 10\nstep_s = 0.3")
+"""Ten steps instead of fifty: plans are most of a log."""
+
+
+class LearntOnce(NoAdaptation):
+    """A belief that changes once, at `at_ns`, to a wheel 2 % larger."""
+
+    def __init__(self, stack: SimulatedStack, at_ns: int) -> None:
+        self._stack, self._at_ns, self._model = stack, at_ns, setup().model
+        self._done = False
+
+    def step(self, now_ns: int) -> Learnt:
+        if self._done or now_ns < self._at_ns:
+            return Learnt()
+        self._done = True
+        believed = believed_geometry(self._model)
+        mean = believed.mean.copy()
+        mean[NAMES.index("wheel_radius_m")] *= 1.02
+        learnt = replace(believed, mean=mean)
+        put_in_force(self._stack.core.pipeline, self._model, learnt)
+        change = BeliefChange(now_ns, "adapted", NAMES, tuple(mean.tolist()), tuple(learnt.covariance.ravel().tolist()))
+        return Learnt((change,))
+
+
+class Hand:
+    """Drives a curve to the left, then backwards."""
+
+    ended, completed, task = None, True, ""
+
+    def poll(self, now_ns: int, _robot: object) -> ManualInput:
+        wheels = (2.0, 4.0) if now_ns < 3_000_000_000 else (-3.0, -2.0)
+        return ManualInput(now_ns, *wheels, now_ns > 1_000_000_000)
+
+    def close(self) -> None:
+        pass
+
+
+def robot_toml() -> str:
+    """The shipped robot, planning in few steps."""
+    text = (ROBOTS / "wombot.toml").read_text(encoding="utf-8")
+    assert SHORT_SIGHTED[0] in text
+    return text.replace(*SHORT_SIGHTED)
+
+
+def setup() -> Setup:
+    """The robot of these logs, and its model."""
+    with tempfile.TemporaryDirectory() as directory:
+        robot = Path(directory) / "robot.toml"
+        robot.write_text(robot_toml(), encoding="utf-8")
+        return load_setup(robot, ROBOTS / "wombot_model.toml")
+
+
+def planner() -> Planner:
+    """DISCO for it."""
+    found = setup()
+    return make_planner(found.config, found.model)
+
+
+def circle() -> SimulatedStack:
+    """DISCO drives, the robot is carried off by 0.2 m, and drives on."""
+    stack = _started(simulated_stack(planner()))
+    stack.run(1.0)
+    stack.robot.kidnap(0.2, 0.1, 0.3)
+    stack.run(1.5)
+    stack.run(0.6, UserRequest.DISARM)
+    return stack
+
+
+def adapted() -> SimulatedStack:
+    """Another belief comes into force on the way, and another circle after it."""
+    stack = simulated_stack(planner())
+    stack.core.adaptation = LearntOnce(stack, 2_500_000_000)
+    _started(stack)
+    stack.run(1.5)
+    stack.run(0.3, UserRequest.STOP)
+    stack.core.set_task(msgspec.structs.replace(stack.core.task, radius_m=1.0))
+    stack.run(1.0, UserRequest.START)
+    return stack
+
+
+def drive() -> SimulatedStack:
+    """A person drives."""
+    stack = simulated_stack(NoPlanner(), needs_pose=False)
+    stack.pilot = HandPilot(Hand(), Coverage(8.0))
+    stack.run(4.5)
+    return stack
+
+
+KINDS: dict[str, Callable[[], SimulatedStack]] = {"circle": circle, "adapted": adapted, "drive": drive}
+
+
+def write(name: str, directory: Path) -> Path:
+    """Record the run of that name, without its raw frames, which a replay does not need."""
+    stack = KINDS[name]()
+    files = {ROBOT_TOML: robot_toml().encode(), MODEL_TOML: (ROBOTS / "wombot_model.toml").read_bytes()}
+    attachments = tuple(Attachment(attached, "application/toml", content) for attached, content in files.items())
+    path = directory / f"{name}.mcap"
+    path.unlink(missing_ok=True)
+    recorder = ProcessRecorder(
+        Recording(path, "wombot", version=version(), attachments=attachments, queue_ticks=100_000)
+    )
+    for now_ns, recorded in stack.recorder.ticks:
+        recorder.put(now_ns, [record for record in recorded if not isinstance(record, FrameIn | FrameOut)])
+    stats = recorder.close(30.0)
+    if stats.dropped_ticks or stats.refused:
+        raise RuntimeError(f"{path}: {stats}")
+    return path
+
+
+def _started(stack: SimulatedStack) -> SimulatedStack:
+    stack.run(1.0)
+    stack.run(0.5, UserRequest.ARM)
+    stack.run(0.5, UserRequest.START)
+    return stack
+
+
+def main() -> int:
+    directory = Path(sys.argv[1]) if len(sys.argv) > 1 else DIRECTORY
+    directory.mkdir(parents=True, exist_ok=True)
+    for name in KINDS:
+        path = write(name, directory)
+        print(f"{path}: {path.stat().st_size / 1000:.0f} kB")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
