@@ -10,7 +10,6 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.gap import figures
 from disco_hw.gap.amend import with_terms_named
 from disco_hw.gap.blind_spots import BlindSpot, blind_spots, experiment_of
 from disco_hw.gap.candidates import candidates_of, indices, parameters_of
@@ -154,6 +153,8 @@ class Outcome:
 
     def pictures(self, gap: dict[str, dict[float, Errors]]) -> dict[str, bytes]:
         """PNGs by name."""
+        from disco_hw.gap import figures  # noqa: PLC0415  (matplotlib, slow to import)
+
         out: dict[str, bytes] = {}
         if gap:
             out["gap_by_horizon"] = figures.gap_by_horizon(gap)
@@ -171,6 +172,8 @@ class Outcome:
     @staticmethod
     def _worst_stretch(wheels: Found) -> bytes:
         """Wheel speed over the six seconds in which the model as it was is furthest off."""
+        from disco_hw.gap import figures  # noqa: PLC0415  (matplotlib, slow to import)
+
         channel = wheels.channel
         assert isinstance(channel, WheelChannel)
         line = channel.timeline

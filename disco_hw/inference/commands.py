@@ -20,7 +20,6 @@ from disco_hw.inference.excitation import excitation
 from disco_hw.inference.gap_check import GapCheck, gap_check_beside
 from disco_hw.inference.infer import Inference, InferOptions, infer
 from disco_hw.inference.progress import Tell
-from disco_hw.inference.report import report_html
 from disco_hw.inference.simulate import NAMES
 from disco_hw.inference.workers import LocalWorkers, Workers
 from disco_hw.log.drive import DriveLog
@@ -169,6 +168,8 @@ def infer_command(
     if out is not None:
         _write(out, model_text(replace(inference.model(nominal), missing_effects=found.missing)))
     if report is not None:
+        from disco_hw.inference.report import report_html  # noqa: PLC0415  (matplotlib, slow to import)
+
         _write(report, report_html(inference, posterior_figures(inference), result.warnings()))
     return result
 

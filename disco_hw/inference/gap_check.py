@@ -13,7 +13,6 @@ from multiprocessing import get_context
 from multiprocessing.connection import Connection
 
 from disco_hw.errors import InputError, WorkError
-from disco_hw.gap.find import missing_effects
 from disco_hw.log.drive import DriveLog
 from disco_hw.model import Model
 
@@ -28,6 +27,8 @@ class GapCheck:
 
 def gap_check(log: DriveLog, model: Model) -> GapCheck:
     """Search a log for effects that a model lacks."""
+    from disco_hw.gap.find import missing_effects  # noqa: PLC0415  (slow to import, needed only in that process)
+
     try:
         return GapCheck(missing_effects(log, model))
     except InputError as error:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -33,7 +33,8 @@ def simulate_kernel(
     base: Any,
     effects: Any,
     series: Any,
-    noise: Any,
+    noise_scale: Any,
+    noise_spread: Any,
     wheel: Any,
     moving: Any,
     node: Any,
@@ -46,14 +47,21 @@ def simulate_kernel(
     """Measured poses (n, P, 3) of n simulations, one for each row of `base` and `effects` and each of `seeds`.
 
     Every run starts at its pose of `starts` (runs, 3). Slip is added after every step of a moving robot: forward, to
-    the left, and in yaw about the tracked point, so that where random turning has its centre says nothing of x_icr;
-    `noise` (5,) as `Noise.vector`.
+    the left, and in yaw about the tracked point, so that where random turning has its centre says nothing of x_icr.
+    Every simulation has a noise of its own: `noise_scale` (5,) as `Noise.vector`, times exp(`noise_spread` (5, 5) z).
     """
     integration = integration_from(series, True)
     root = math.sqrt(integration.step_s)
-    slip_forward, slip_left, slip_yaw = noise[2] * root, noise[3] * root, noise[4] * root
+    unit, noise = np.empty(5), np.empty(5)
     for i in range(seeds.shape[0]):
         np.random.seed(seeds[i])
+        for row in range(5):
+            unit[row] = np.random.standard_normal()
+            exponent = 0.0
+            for column in range(row + 1):
+                exponent += noise_spread[row, column] * unit[column]
+            noise[row] = noise_scale[row] * math.exp(exponent)
+        slip_forward, slip_left, slip_yaw = noise[2] * root, noise[3] * root, noise[4] * root
         here, effects_here = base_point(base, i), effect_point(effects, i)
         for run in range(run_node.shape[0] - 1):
             x, y, yaw = starts[run, 0], starts[run, 1], starts[run, 2]
@@ -86,11 +94,15 @@ def simulate_kernel(
 
 @dataclass(frozen=True, slots=True)
 class Simulator:
-    """Simulations of one drive; pure: the same points and seeds give the same poses, however they are shared out."""
+    """Simulations of one drive; pure: the same points and seeds give the same poses, however they are shared out.
+
+    `noise_spread` (5, 5), lower triangular: how far the logarithms of the noise vary from simulation to simulation.
+    """
 
     model: Model
     drive: Excitation
     noise: Noise
+    noise_spread: Array = field(default_factory=lambda: np.zeros((5, 5)))
 
     def poses(self, theta: Array, seeds: Seeds) -> Array:
         """Measured poses (n, P, 3), yaw not wrapped; `theta` (n, 3) in the order of `NAMES`, `seeds` (n,)."""
@@ -106,6 +118,7 @@ class Simulator:
             effects,
             integration_series(drive.step_s, wide=True),
             self.noise.vector(),
+            self.noise_spread,
             drive.wheel_rad_s,
             drive.moving,
             drive.node,
