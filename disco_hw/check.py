@@ -21,6 +21,7 @@ from disco_hw.daemon.preflight import (
     check_link_load,
     check_realtime,
     check_round_trip,
+    check_task,
 )
 from disco_hw.daemon.realtime import can_lock_memory, can_use_fifo
 from disco_hw.errors import WorkError
@@ -66,7 +67,8 @@ def run_check(robot: Path, link: str | None = None) -> CheckReport:
     setup = load_setup(robot, None, link)
     key = link_key(setup)
     _refuse_beside_a_daemon(setup.config)
-    checks = [_model_check(setup), check_link_load(setup.config.link, setup.config.control, packaged_dbc())]
+    checks = [_model_check(setup), check_task(setup.config.robot, setup.config.task)]
+    checks.append(check_link_load(setup.config.link, setup.config.control, packaged_dbc()))
     control = setup.config.control
     priority = setup.config.daemon.realtime_priority
     checks += check_realtime(priority, can_use_fifo(), can_lock_memory(), os.cpu_count() or 1)

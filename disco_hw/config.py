@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import tomllib
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 from msgspec import Meta
@@ -17,6 +17,7 @@ NonNegative = Annotated[float, Meta(ge=0.0)]
 Probability = Annotated[float, Meta(gt=0.0, lt=1.0)]
 Share = Annotated[float, Meta(gt=0.0, le=1.0)]
 Range = tuple[float, float]
+Point = tuple[float, float]
 
 
 class ConfigError(InputError):
@@ -94,6 +95,21 @@ class CircleTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     speed_m_s: Positive = 0.2
 
 
+class PathTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, tag="path", tag_field="kind"):
+    """Follow way-points by arc length at a constant speed; round and round if the last is the first, else to the end.
+
+    `path`: CSV with columns x_m, y_m (m, world frame), relative to robot.toml. `points` are what `load_setup` has read
+    from it; no field of robot.toml.
+    """
+
+    path: Annotated[str, Meta(min_length=1)]
+    speed_m_s: Positive = 0.2
+    points: tuple[Point, ...] = ()
+
+
+RobotTask = CircleTask | PathTask
+
+
 class ModelFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Where the model with its posterior is; without a file the nominal geometry and the prior are used."""
 
@@ -135,7 +151,7 @@ class RobotConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     link: Link = Link()
     control: Control = Control()
     estimation: Estimation = Estimation()
-    task: CircleTask = CircleTask()
+    task: RobotTask = CircleTask()
     model: ModelFile = ModelFile()
     log: Log = Log()
     daemon: Daemon = Daemon()
@@ -143,7 +159,7 @@ class RobotConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
 
 
 def load_robot_config(path: Path) -> RobotConfig:
-    """Read and validate robot.toml.
+    """Read and validate robot.toml, and none of the files that it names.
 
     Raises ConfigError with one line naming file, field and remedy.
     """
@@ -154,11 +170,28 @@ def load_robot_config(path: Path) -> RobotConfig:
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: not valid TOML ({error}); mend that line") from None
     try:
-        config = msgspec.convert(raw, RobotConfig)
+        config = msgspec.convert(_with_kind_of_task(path, raw), RobotConfig)
     except msgspec.ValidationError as error:
         raise ConfigError(f"{path}: {_in_words(str(error))}") from None
     _check(path, config)
     return config
+
+
+def circle_task(task: RobotTask, purpose: str) -> CircleTask:
+    """The task, which `purpose` needs to be a circle; raises InputError for another."""
+    if not isinstance(task, CircleTask):
+        raise InputError(f'{purpose} needs a circle: write kind = "circle" with radius_m and speed_m_s in [task]')
+    return task
+
+
+def _with_kind_of_task(path: Path, raw: dict[str, Any]) -> dict[str, Any]:
+    """The file with the kind of its task, which goes without saying: a path where one is named, else a circle."""
+    task = raw.get("task")
+    if not isinstance(task, dict):
+        return raw
+    if "points" in task:
+        raise ConfigError(f"{path}: [task] points: no such field; write way-points in a CSV and name it in path")
+    return {**raw, "task": {"kind": "path" if "path" in task else "circle", **task}}
 
 
 def _in_words(message: str) -> str:

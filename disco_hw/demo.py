@@ -20,7 +20,7 @@ from rich.progress import BarColumn, Progress, TextColumn
 
 import disco_hw
 from disco_hw.circle_report import CircleReport, load_circle_report
-from disco_hw.config import load_robot_config
+from disco_hw.config import circle_task, load_robot_config
 from disco_hw.errors import InputError, WorkError
 from disco_hw.operator import Operator, disco_hw_process, stands
 from disco_hw.viewer.address import DEFAULT_PORT, LOOPBACK
@@ -69,7 +69,8 @@ def run_demo(options: DemoOptions) -> CircleReport:
         for old in (files.log, files.truth):
             old.unlink(missing_ok=True)
         stopped = _drive(options, files, console)
-    report = load_circle_report(files.log, files.truth, load_robot_config(_shipped_robot()).task, options.laps, stopped)
+    task = circle_task(load_robot_config(_shipped_robot()).task, "the demonstration")
+    report = load_circle_report(files.log, files.truth, task, options.laps, stopped)
     picture = options.out / "circle.png"
     report.draw(picture)
     console.print(report.table())
@@ -115,11 +116,11 @@ def _write_robot_file(scratch: Path, options: DemoOptions) -> Path:
 
 def _drive(options: DemoOptions, files: _Files, console: Console) -> bool:
     """Drive and stop; returns whether daemon and robot both said that the robot stands, disarmed."""
-    config = load_robot_config(files.robot)
-    lap_s = 2.0 * math.pi * config.task.radius_m / config.task.speed_m_s
+    task = circle_task(load_robot_config(files.robot).task, "the demonstration")
+    lap_s = 2.0 * math.pi * task.radius_m / task.speed_m_s
     simulator = [
         "sim", str(files.robot), "--plant-seed", str(options.plant_seed), "--truth", str(files.truth),
-        "--start", str(config.task.center_x_m + config.task.radius_m), str(config.task.center_y_m), "1.5707963",
+        "--start", str(task.center_x_m + task.radius_m), str(task.center_y_m), "1.5707963",
     ]  # fmt: skip
     daemon_arguments = ["run", str(files.robot), "--log", str(files.log), *_page(options), *_adapt(options)]
     with (

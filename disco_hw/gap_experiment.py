@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from disco_hw.config import CircleTask
+from disco_hw.config import CircleTask, circle_task
+from disco_hw.course import course_of
 from disco_hw.daemon.assembly import make_planner
 from disco_hw.drive.coverage import Coverage
 from disco_hw.drive.hand_pilot import HandPilot
@@ -142,6 +143,7 @@ def run_gap_experiment(options: GapExperimentOptions, progress: Progress = lambd
     Raises InputError for wrong options, WorkError if a drive does not come to its end.
     """
     setup = load_setup(options.robot)
+    task = circle_task(setup.config.task, "experiment gap")
     try:
         hidden = dict(parse_hidden_effects(options.hide).items)
     except HiddenEffectError as error:
@@ -160,8 +162,8 @@ def run_gap_experiment(options: GapExperimentOptions, progress: Progress = lambd
     for run, model in models.items():
         progress(f"circle with the model {run}")
         tracks[run] = _circle(setup, options, hidden, model)
-        laps[run] = _lap(tracks[run], setup.config.task)
-    result = GapExperimentResult(hidden, found, laps, tracks, setup.config.task)
+        laps[run] = _lap(tracks[run], task)
+    result = GapExperimentResult(hidden, found, laps, tracks, task)
     (options.out / "experiment.json").write_text(json.dumps(result.as_dict(), indent=1), encoding="utf-8")
     with (options.out / "experiment.csv").open("w", newline="", encoding="utf-8") as file:
         rows = csv.writer(file)
@@ -187,14 +189,14 @@ def without_effects(amended: Model, given: Model) -> Model:
 
 
 def _robot(setup: Setup, options: GapExperimentOptions, hidden: Mapping[str, tuple[float, ...]]) -> RobotInProcess:
-    task, robot = setup.config.task, setup.config.robot
+    robot = setup.config.robot
     parameters = true_parameters(setup, options.plant_seed)
     firmware = FirmwareConfig(
         ticks_per_rev=parameters.ticks_per_rev,
         max_wheel_speed_rad_s=robot.max_wheel_speed_rad_s,
         max_wheel_acceleration_rad_s2=robot.max_wheel_acceleration_rad_s2,
     )
-    start = Pose(task.center_x_m + task.radius_m, task.center_y_m, math.pi / 2)
+    start = Pose(*course_of(setup.config.task).start)
     return RobotInProcess(parameters, hidden, firmware, start, options.seed)
 
 
@@ -217,7 +219,7 @@ def _circle(
     setup: Setup, options: GapExperimentOptions, hidden: Mapping[str, tuple[float, ...]], model: Model
 ) -> Track:
     """The true path of DISCO round the circle with a model."""
-    task = setup.config.task
+    task = circle_task(setup.config.task, "experiment gap")
     with_model = replace(setup, model=model)
     run = SimulatedRun(with_model, _robot(setup, options, hidden), make_planner(setup.config, model))
     run.start()
@@ -226,7 +228,7 @@ def _circle(
     for tick in run.ticks(2.0 * options.laps * lap_s + _SETTLING_S):
         truth = run.robot.truth
         rows.append((run.now_us * 1e-6, truth.x_m, truth.y_m, truth.yaw_rad, truth.speed_m_s))
-        if run.core.laps.laps >= options.laps:
+        if run.core.progress.laps >= options.laps:
             break
         if tick.command is None:
             raise WorkError(f"the virtual robot stopped on the circle: {'; '.join(tick.events)}")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import struct
-import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby
@@ -14,16 +13,15 @@ from typing import Any
 import msgspec
 
 from disco_hw.adapt.adaptable import geometry_of
-from disco_hw.control import Circle
+from disco_hw.control import task_of_robot
 from disco_hw.daemon import records_of_tick
 from disco_hw.daemon.assembly import make_pipeline, make_planner, put_in_force
 from disco_hw.daemon.task_change import task_of
 from disco_hw.errors import InputError
-from disco_hw.log.provenance import MODEL_TOML, ROBOT_TOML
-from disco_hw.log.reader import Entry, Log, open_log
+from disco_hw.log.reader import Entry, open_log
 from disco_hw.log.records import BeliefChange, Command, Estimate, Innovation, Plan, Record, Task
+from disco_hw.log_setup import setup_of_log
 from disco_hw.pipeline import FollowTask, Manual, Motion, Off, Pipeline, Source, Stand
-from disco_hw.robot_setup import Setup, load_setup
 from drivers.types import PoseSample, Readings, WheelSample
 
 _TOPICS = ("/wheels", "/pose", "/estimate", "/estimate/innovation", "/plan", "/command", "/task", "/belief")
@@ -87,14 +85,14 @@ def replay(path: Path, tolerance: float = 0.0) -> ReplayReport:
     Raises LogError for a log that cannot be read and InputError for one that holds no ticks or no robot.toml.
     """
     with open_log(path) as log:
-        setup = _setup(log)
+        setup = setup_of_log(log, "only logs of `disco-hw run` can be replayed")
         pipeline = make_pipeline(setup.config, setup.model, make_planner(setup.config, setup.model))
         ticks = values = 0
         difference: Difference | None = None
         for tick, entries in groupby(log.records(_TOPICS), key=lambda entry: entry.tick):
             recorded = list(entries)
             for task in (entry.record for entry in recorded if isinstance(entry.record, Task)):
-                pipeline.set_task(Circle.from_config(task_of(task), setup.config.control.mode))
+                pipeline.set_task(task_of_robot(task_of(task, setup.config.task), setup.config.control.mode))
             for change in (entry.record for entry in recorded if isinstance(entry.record, BeliefChange)):
                 put_in_force(pipeline, setup.model, geometry_of(change))
             outcome = _replay_tick(pipeline, recorded)
@@ -106,19 +104,6 @@ def replay(path: Path, tolerance: float = 0.0) -> ReplayReport:
         if not ticks:
             raise InputError(f"{path}: holds no ticks; give the log of a `disco-hw run`")
         return ReplayReport(ticks, values, log.summary().missing_ticks, log.metadata.version, difference, tolerance)
-
-
-def _setup(log: Log) -> Setup:
-    """Robot and model as they were attached to the log."""
-    if ROBOT_TOML not in log.attachment_names():
-        raise InputError(f"{log.path}: carries no {ROBOT_TOML}; only logs of `disco-hw run` can be replayed")
-    with tempfile.TemporaryDirectory() as directory:
-        robot, model = Path(directory) / ROBOT_TOML, Path(directory) / MODEL_TOML
-        robot.write_bytes(log.attachment(ROBOT_TOML))
-        has_model = MODEL_TOML in log.attachment_names()
-        if has_model:
-            model.write_bytes(log.attachment(MODEL_TOML))
-        return load_setup(robot, model if has_model else None)
 
 
 def _replay_tick(pipeline: Pipeline, recorded: Sequence[Entry]) -> list[Record]:

@@ -1,4 +1,4 @@
-"""The files of one robot, read and checked together: robot.toml and the model it names."""
+"""The files of one robot, read and checked together: robot.toml, the model and the path that it names."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ from pathlib import Path
 
 import msgspec
 
-from disco_hw.config import RobotConfig, load_robot_config
+from disco_hw.config import PathTask, RobotConfig, load_robot_config
 from disco_hw.errors import InputError
 from disco_hw.model import Model, load_model
+from disco_hw.waypoints import way_points_to_follow
 from drivers.key_file import KeyFileError, read_key_file
 
 LINK_KINDS = ("can", "serial")
@@ -18,17 +19,26 @@ Matrix3 = tuple[tuple[float, float, float], tuple[float, float, float], tuple[fl
 
 @dataclass(frozen=True, slots=True)
 class Setup:
-    """The files of one robot, read and checked; `model_file` is None where robot.toml names none."""
+    """The files of one robot, read and checked; `model_file`, `path_file` are None where robot.toml names none."""
 
     robot_file: Path
     model_file: Path | None
+    path_file: Path | None
     config: RobotConfig
     model: Model
 
 
-def load_setup(robot: Path, model: Path | None = None, link: str | None = None) -> Setup:
-    """Read robot.toml and the model; `model` and `link` override what robot.toml says. Raises InputError."""
+def load_setup(robot: Path, model: Path | None = None, link: str | None = None, path_file: Path | None = None) -> Setup:
+    """Read robot.toml, the model and the task's path; the other arguments override what robot.toml says.
+
+    Raises InputError.
+    """
     config = load_robot_config(robot)
+    if isinstance(config.task, PathTask):
+        path_file = path_file or robot.parent / config.task.path
+        config = msgspec.structs.replace(config, task=with_way_points(config.task, path_file))
+    else:
+        path_file = None
     if link is not None:
         if link not in LINK_KINDS:
             raise InputError(f"--link {link}: no such kind of link; write one of {', '.join(LINK_KINDS)}")
@@ -37,7 +47,13 @@ def load_setup(robot: Path, model: Path | None = None, link: str | None = None) 
     if model_file is None and config.model.file is not None:
         model_file = robot.parent / config.model.file
     loaded = Model.nominal(config.robot, config.prior) if model_file is None else load_model(model_file)
-    return Setup(robot, model_file, config, loaded)
+    return Setup(robot, model_file, path_file, config, loaded)
+
+
+def with_way_points(task: PathTask, path_file: Path) -> PathTask:
+    """The task with the way-points of a CSV; raises InputError naming file, line and remedy."""
+    points = tuple((float(x), float(y)) for x, y in way_points_to_follow(path_file).places_m.tolist())
+    return msgspec.structs.replace(task, points=points)
 
 
 def refuse_missing_effects(setup: Setup) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 from disco_hw.daemon.assembly import assemble_core, make_driver, make_pipeline
@@ -11,8 +12,9 @@ from disco_hw.daemon.pilot import Pilot, TaskPilot
 from disco_hw.daemon.supervisor import UserRequest
 from disco_hw.errors import WorkError
 from disco_hw.log.link import Attachment
-from disco_hw.log.provenance import MODEL_TOML, ROBOT_TOML
+from disco_hw.log.provenance import MODEL_TOML
 from disco_hw.log.recorder import MemoryRecorder, ProcessRecorder, Recording
+from disco_hw.log_setup import kept_files
 from disco_hw.model.file import model_text
 from disco_hw.pipeline import Planner
 from disco_hw.robot_setup import Setup
@@ -75,10 +77,9 @@ class SimulatedRun:
 
     def write_log(self, path: Path) -> None:
         """Write what was recorded as a log that every verb reads; raises WorkError if that fails."""
-        attachments = (
-            Attachment(ROBOT_TOML, "application/toml", self._setup.robot_file.read_bytes()),
-            Attachment(MODEL_TOML, "application/toml", model_text(self._setup.model).encode()),
-        )
+        setup = replace(self._setup, model_file=None)
+        model = Attachment(MODEL_TOML, "application/toml", model_text(setup.model).encode())
+        attachments = (*kept_files(setup), model)
         ticks = self._recorder.ticks
         recorder = ProcessRecorder(
             Recording(path, self._setup.config.robot.name, attachments=attachments, queue_ticks=len(ticks) + 1)

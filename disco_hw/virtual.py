@@ -6,6 +6,7 @@ import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from disco_hw.course import course_of
 from disco_hw.errors import InputError
 from disco_hw.robot_setup import Setup, geometry, link_key, load_setup
 from firmware_protocol.firmware_core import FirmwareConfig
@@ -18,7 +19,7 @@ from sim.plant_parameters import DrawError, PlantParameters, draw_plant_paramete
 
 @dataclass(frozen=True, slots=True)
 class SimOptions:
-    """What `disco-hw sim` was asked; `start` is x, y (m) and yaw (rad), the circle's start if None."""
+    """What `disco-hw sim` was asked; `start` is x, y (m) and yaw (rad), the task's start if None."""
 
     robot: Path
     model: Path | None = None
@@ -46,8 +47,7 @@ def run_sim(options: SimOptions) -> int:
     except FaultFileError as error:
         raise InputError(str(error)) from None
     ticks_per_rev = _whole_ticks(setup)
-    task = config.task
-    x_m, y_m, yaw_rad = options.start or (task.center_x_m + task.radius_m, task.center_y_m, 1.5707963267948966)
+    x_m, y_m, yaw_rad = options.start or course_of(config.task).start
     plant = true_parameters(setup, options.plant_seed)
     print(
         f"true wheel radius {plant.wheel_radius_m:.4f} m, axial distance {plant.axial_distance_m:.4f} m, "

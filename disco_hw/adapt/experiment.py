@@ -20,7 +20,7 @@ from disco_hw.adapt.adaptable import believed_geometry, with_geometry
 from disco_hw.adapt.adapter import Adapter
 from disco_hw.adapt.guard import Geometry
 from disco_hw.adapt.inline_link import InlineLink
-from disco_hw.config import CircleTask
+from disco_hw.config import CircleTask, circle_task
 from disco_hw.daemon.assembly import assemble_core, make_adaptation, make_driver, make_pipeline, make_planner
 from disco_hw.daemon.supervisor import UserRequest
 from disco_hw.log import records
@@ -207,6 +207,7 @@ def run_adapt(setup: Setup, options: AdaptOptions | None = None, progress: Progr
     `setup`: the robot; the plant is at its model's mean at first, and the belief about it as narrow as after `infer`.
     """
     options = options or AdaptOptions()
+    task = circle_task(setup.config.task, "experiment adapt")
     mean = believed_geometry(setup.model).mean
     std = BELIEVED_STD * np.array([1.0, mean[1], mean[2]])
     setup = replace(setup, model=with_geometry(setup.model, Geometry(mean, np.diag(std**2))))
@@ -222,7 +223,7 @@ def run_adapt(setup: Setup, options: AdaptOptions | None = None, progress: Progr
                     [run.cost[run.t_s > options.change_s + options.settled_s].mean() for run in runs[name, adapted]]
                 )
                 progress(f"{name} changes, {'adapting' if adapted else 'not adapting'}: cost afterwards {cost:.4f}")
-    return AdaptResult(options, setup.config.task, runs)
+    return AdaptResult(options, task, runs)
 
 
 def _effect(name: str, options: AdaptOptions) -> dict[str, tuple[float, ...]]:
@@ -240,7 +241,8 @@ def drive(
     recorder: MemoryRecorder | None = None,
 ) -> AdaptRun:
     """One drive round the circle from standstill; times count from the start of driving."""
-    config, task = setup.config, setup.config.task
+    config = setup.config
+    task = circle_task(config.task, "experiment adapt")
     mean = believed_geometry(setup.model).mean
     plant = replace(
         PlantParameters(ticks_per_rev=round(config.robot.ticks_per_rev)),

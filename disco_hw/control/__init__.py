@@ -4,6 +4,8 @@ from disco_hw.control.disco import Disco
 from disco_hw.control.plan import Diagnostics, NoValidControl, Outcome, Plan, PlannerState, Rollouts, SentCommand
 from disco_hw.control.settings import DiscoSettings, Sampler, WheelLimits
 from disco_hw.control.tasks.circle import Circle
+from disco_hw.control.tasks.of_robot import task_of_robot
+from disco_hw.control.tasks.path import Path
 from disco_hw.control.tasks.task import Task
 
 __all__ = [
@@ -13,6 +15,7 @@ __all__ = [
     "DiscoSettings",
     "NoValidControl",
     "Outcome",
+    "Path",
     "Plan",
     "PlannerState",
     "Rollouts",
@@ -20,4 +23,5 @@ __all__ = [
     "SentCommand",
     "Task",
     "WheelLimits",
+    "task_of_robot",
 ]

@@ -12,7 +12,7 @@ from disco_hw.adapt.link import AdapterLink
 from disco_hw.config import RobotConfig
 from disco_hw.daemon.core import DaemonCore
 from disco_hw.daemon.governor import Governor, WheelLimits
-from disco_hw.daemon.preflight import check_firmware_limits, failures
+from disco_hw.daemon.preflight import check_firmware_limits, check_task, failures
 from disco_hw.daemon.supervisor import Supervisor, SupervisorSettings
 from disco_hw.estimation import OdometryParameters, PoseFusion
 from disco_hw.log.recorder import Recorder
@@ -26,7 +26,7 @@ from firmware_protocol.codec import Codec
 
 def make_planner(config: RobotConfig, model: Model) -> control.Disco:
     """DISCO for this robot's task, compiled and warmed up: takes seconds."""
-    task = control.Circle.from_config(config.task, config.control.mode)
+    task = control.task_of_robot(config.task, config.control.mode)
     planner = control.Disco(
         model,
         task,
@@ -105,13 +105,19 @@ def assemble_core(
             pose_required=needs_pose and config.estimation.pose_required,
         )
     )
-    return DaemonCore(
-        config, transport, driver, supervisor, pipeline, recorder, lambda robot: preflight(config, robot), adaptation
-    )
+
+    def check(robot: Driver) -> tuple[str, ...]:
+        # Who drives by hand, and so without a pose, does not do the task.
+        return preflight(config, robot, with_task=needs_pose)
+
+    return DaemonCore(config, transport, driver, supervisor, pipeline, recorder, check, adaptation)
 
 
-def preflight(config: RobotConfig, driver: Driver) -> tuple[str, ...]:
-    """What robot.toml asks that the robot's firmware does not allow, in words; empty if they agree."""
+def preflight(config: RobotConfig, driver: Driver, with_task: bool = True) -> tuple[str, ...]:
+    """What robot.toml asks that the robot's firmware or its wheels do not allow, in words; empty if they agree."""
     if driver.capabilities is None:
         return ()
-    return failures(check_firmware_limits(config.robot, driver.capabilities))
+    checks = check_firmware_limits(config.robot, driver.capabilities)
+    if with_task:
+        checks.append(check_task(config.robot, config.task))
+    return failures(checks)

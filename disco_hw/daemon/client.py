@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,13 @@ def ask(robot: Path, action: str) -> dict[str, Any]:
     return send_request(socket_path(load_robot_config(robot)), {"do": action})
 
 
+def progress(task: Mapping[str, Any]) -> tuple[str, str]:
+    """How far the task of a status has been driven, as (what, how much): laps of a circle, metres of a path."""
+    if task["asked"]["kind"] == "circle":
+        return "laps", f"{task['laps']:.2f}"
+    return "progress", f"{task['laps'] * task['length_m']:.2f} of {task['length_m']:.2f} m ({task['laps']:.0%})"
+
+
 def in_words(reply: dict[str, Any]) -> str:
     """A reply for a person."""
     if not reply.get("ok"):
@@ -44,7 +52,7 @@ def in_words(reply: dict[str, Any]) -> str:
     lines = [
         f"{reply['state']}: {reply['detail']}",
         f"robot {reply['robot_state']}, fault {reply['fault']}, link {reply['link']}",
-        f"laps {task['laps']:.2f}, distance {task['distance_m'] * 1e3:.0f} mm, speed {task['speed_m_s']:.3f} m/s",
+        f"{' '.join(progress(task))}, distance {task['distance_m'] * 1e3:.0f} mm, speed {task['speed_m_s']:.3f} m/s",
         f"loop lateness p99 {loop['lateness_us']['p99']:.0f} us, max {loop['lateness_us']['max']:.0f} us, "
         f"overruns {loop['overruns']}, skipped {loop['skipped']}",
     ]

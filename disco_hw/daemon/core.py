@@ -9,10 +9,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from disco_hw.adapt.adaptation import Adaptation, NoAdaptation
-from disco_hw.config import CircleTask, RobotConfig
-from disco_hw.control import Circle
+from disco_hw.config import RobotConfig, RobotTask
+from disco_hw.control import task_of_robot
+from disco_hw.course import course_of
 from disco_hw.daemon import records_of_tick
-from disco_hw.daemon.lap_counter import LapCounter
+from disco_hw.daemon.progress import progress_of
 from disco_hw.daemon.supervisor import Inputs, Output, Reply, Supervisor, UserRequest
 from disco_hw.daemon.task_change import record_of
 from disco_hw.log import records
@@ -61,8 +62,8 @@ class DaemonCore:
         self.pipeline = pipeline
         self.recorder = recorder
         self.adaptation = adaptation or NoAdaptation()
-        self.task = config.task
-        self.laps = LapCounter(config.task)
+        self.task, self.course = config.task, course_of(config.task)
+        self.progress = progress_of(config.task)
         self.newest_wheels: WheelSample | None = None
         self.robot_status: RobotStatus | None = None
         self.last: CoreTick | None = None
@@ -77,10 +78,10 @@ class DaemonCore:
         self.entered: dict[str, int] = {}
         self._task_changed = False
 
-    def set_task(self, task: CircleTask) -> None:
-        """Follow another circle from the next tick on, in which it is recorded."""
-        self.task, self.laps = task, LapCounter(task)
-        self.pipeline.set_task(Circle.from_config(task, self.config.control.mode))
+    def set_task(self, task: RobotTask) -> None:
+        """Follow another circle, or the path at another speed, from the next tick on, in which it is recorded."""
+        self.task, self.course, self.progress = task, course_of(task), progress_of(task)
+        self.pipeline.set_task(task_of_robot(task, self.config.control.mode))
         self._task_changed = True
 
     def tick(
@@ -108,7 +109,7 @@ class DaemonCore:
         sent = self._send(now_ns, output, command)
         mark("send")
         events = (*readings.events, *output.events, *learnt.events, *self._planner_events(result))
-        self._count_laps(output, result)
+        self._follow_progress(output, result)
         self.recorder.put(
             now_ns,
             [
@@ -162,6 +163,7 @@ class DaemonCore:
             wheel_speed_rad_s=speed,
             pose_ok=self.last is not None and self.last.pipeline.estimate.pose_ok,
             preflight_errors=self._preflight_errors,
+            task_finished=self.progress.finished,
             requests=tuple(requests),
         )
 
@@ -203,11 +205,11 @@ class DaemonCore:
         changed, self._task_changed = self._task_changed, False
         return [record_of(now_ns, self.task)] if changed else []
 
-    def _count_laps(self, output: Output, result: Tick) -> None:
+    def _follow_progress(self, output: Output, result: Tick) -> None:
         if output.running:
-            self.laps.add(result.estimate.x_m, result.estimate.y_m)
+            self.progress.add(result.estimate.x_m, result.estimate.y_m)
         else:
-            self.laps.pause()
+            self.progress.pause()
 
 
 def _motion(output: Output, wanted: Motion) -> Motion:

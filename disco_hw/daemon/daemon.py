@@ -26,12 +26,13 @@ from disco_hw.daemon.status import counters, loop_figures, status
 from disco_hw.daemon.stop_path import StopPath
 from disco_hw.daemon.supervisor import Reply, UserRequest
 from disco_hw.daemon.systemd import Notifier
-from disco_hw.daemon.task_change import TaskRefused, changed_task
+from disco_hw.daemon.task_change import TaskRefused, changed_task, in_words
 from disco_hw.daemon.warm_up import warm_up
 from disco_hw.log import records
 from disco_hw.log.link import Attachment
-from disco_hw.log.provenance import DBC, MODEL_TOML, ROBOT_TOML, attachment, version
+from disco_hw.log.provenance import DBC, version
 from disco_hw.log.recorder import NullRecorder, ProcessRecorder, Recorder, Recording
+from disco_hw.log_setup import kept_files
 from disco_hw.pipeline import NoPlanner, Planner
 from disco_hw.robot_setup import Setup, link_key, load_setup, refuse_missing_effects
 from disco_hw.viewer.feed import ViewerFeed, WatchedRecorder, feed_path
@@ -316,7 +317,7 @@ class Daemon:
         self._server.reply(message, body if refusal is None else {**body, "error": refusal})
 
     def _change_task(self, message: ControlMessage) -> None:
-        """Follow another circle, if this state and the robot's limits allow it."""
+        """Change the task, if this state and the robot's limits allow it."""
         last = self._core.last
         state = State.DISCONNECTED if last is None else last.output.state
         try:
@@ -325,8 +326,7 @@ class Daemon:
             self._server.reply(message, {"ok": False, "error": str(refused)})
             return
         self._core.set_task(task)
-        centre = f"({task.center_x_m:g}, {task.center_y_m:g}) m"
-        text = f"circle of {task.radius_m:g} m about {centre} at {task.speed_m_s:g} m/s"
+        text = in_words(task)
         self._say("task", text)
         self._server.reply(message, {"ok": True, "text": text})
 
@@ -361,9 +361,7 @@ def _make_recorder(setup: Setup, log_file: Path | None) -> Recorder:
     if log_file is None:
         stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
         log_file = Path(config.log.directory) / f"{config.robot.name}-{stamp}.mcap"
-    attachments = [attachment(setup.robot_file, ROBOT_TOML), Attachment(DBC, "text/plain", packaged_dbc().encode())]
-    if setup.model_file is not None:
-        attachments.append(attachment(setup.model_file, MODEL_TOML))
+    attachments = [*kept_files(setup), Attachment(DBC, "text/plain", packaged_dbc().encode())]
     return ProcessRecorder(Recording(log_file, config.robot.name, version=version(), attachments=tuple(attachments)))
 
 

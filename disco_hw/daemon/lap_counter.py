@@ -21,6 +21,11 @@ class LapCounter:
         """Laps of the present run, or of the last one while paused."""
         return self._turned_rad / (2.0 * math.pi)
 
+    @property
+    def finished(self) -> bool:
+        """Never: a circle has no end."""
+        return False
+
     def add(self, x_m: float, y_m: float) -> None:
         """Take in the position of one tick; the first one after a pause starts a new count."""
         angle = math.atan2(y_m - self._task.center_y_m, x_m - self._task.center_x_m)

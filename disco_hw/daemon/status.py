@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import asdict
 from typing import Any
 
-import msgspec
+import numpy as np
 
 from disco_hw.daemon.core import DaemonCore
 from disco_hw.daemon.loop import LoopStats
-from disco_hw.daemon.task_change import limits
+from disco_hw.daemon.task_change import asked_of, limits
 from disco_hw.log import records
 from disco_hw.log.recorder import RecorderStats
 
@@ -34,8 +33,8 @@ def status(core: DaemonCore, loop: dict[str, Any], recorder: RecorderStats) -> d
     if tick is None:
         return {"ok": False, "error": "the loop has not started yet"}
     estimate, robot, wheels = tick.pipeline.estimate, core.robot_status, core.newest_wheels
-    circle = core.task
-    distance = math.hypot(estimate.x_m - circle.center_x_m, estimate.y_m - circle.center_y_m) - circle.radius_m
+    task = core.task
+    distance = float(core.course.off_m(np.array([[estimate.x_m, estimate.y_m]]))[0])
     plan = tick.pipeline.plan
     return {
         "ok": True,
@@ -55,11 +54,12 @@ def status(core: DaemonCore, loop: dict[str, Any], recorder: RecorderStats) -> d
         "command": [tick.pipeline.command.left_rad_s, tick.pipeline.command.right_rad_s],
         "source": tick.pipeline.source.value,
         "task": {
-            "laps": core.laps.laps,
+            "laps": core.progress.laps,
+            "length_m": core.course.length_m,
             "distance_m": distance,
             "speed_m_s": estimate.speed_m_s,
-            "asked": msgspec.to_builtins(circle),
-            "limits": limits(core.config.robot, circle),
+            "asked": asked_of(task),
+            "limits": limits(core.config.robot, task),
         },
         "plan": None if plan is None else {"ess": plan.diagnostics.ess, "temperature": plan.diagnostics.temperature},
         "loop": loop,

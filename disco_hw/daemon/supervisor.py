@@ -43,7 +43,7 @@ class Inputs:
 
     `telemetry_age_s` is the age of the newest wheel sample, None before the first; `wheel_speed_rad_s` the larger
     magnitude of its two speeds. `preflight_errors` and `daemon_error` are sentences for a person and hold for as long
-    as they are given.
+    as they are given. `task_finished`: nothing of the task is left to drive.
     """
 
     link_state: LinkState
@@ -56,6 +56,7 @@ class Inputs:
     preflight_errors: tuple[str, ...] = ()
     daemon_error: str | None = None
     requests: tuple[UserRequest, ...] = ()
+    task_finished: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -279,7 +280,7 @@ class Supervisor:
         self._resetting = None
 
     def _mind_task(self, inputs: Inputs) -> None:
-        """Start the task once armed, and stop it without a pose."""
+        """Start the task once armed, and stop it without a pose and at its end."""
         if self._state is not State.ARMED:
             return
         pose_missing = self._settings.pose_required and not inputs.pose_ok
@@ -291,6 +292,9 @@ class Supervisor:
         elif self._running and pose_missing:
             self._running = False
             self._events.append("task stopped: no pose")
+        elif self._running and inputs.task_finished:
+            self._running = False
+            self._events.append("task stopped: the path's end is reached")
 
     def _words(self, inputs: Inputs) -> str:
         """Return what a person should know of the present state."""

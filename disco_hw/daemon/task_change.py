@@ -1,14 +1,17 @@
-"""Another circle than robot.toml's, as a person asks for it while the daemon runs; pure."""
+"""Another circle than robot.toml's, or another speed along its path, as a person asks for it; pure."""
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Mapping
+from functools import lru_cache
 from typing import Any
 
 import msgspec
 
-from disco_hw.config import CircleTask, Robot
+from disco_hw.config import CircleTask, PathTask, Point, Robot, RobotTask
+from disco_hw.course import course_of
 from disco_hw.daemon.states import State
 from disco_hw.log import records
 
@@ -16,7 +19,11 @@ RADIUS_M = (0.1, 50.0)
 CENTER_M = (-1000.0, 1000.0)
 SLOWEST_M_S = 0.01
 _FASTEST_M_S = 100.0
-FIELDS = ("radius_m", "speed_m_s", "center_x_m", "center_y_m")
+FIELDS = {
+    CircleTask: ("radius_m", "speed_m_s", "center_x_m", "center_y_m"),
+    PathTask: ("speed_m_s",),
+}
+"""What can be changed of each kind of task."""
 _LOCKED = frozenset({State.ARMED, State.STOPPING})
 
 
@@ -24,50 +31,97 @@ class TaskRefused(Exception):  # noqa: N818
     """The change is not made; the message says why and what to do."""
 
 
-def changed_task(task: CircleTask, asked: Mapping[str, Any], robot: Robot, state: State) -> CircleTask:
+def changed_task(task: RobotTask, asked: Mapping[str, Any], robot: Robot, state: State) -> RobotTask:
     """The task with the fields of FIELDS that are in `asked`, m and m/s.
 
     Raises TaskRefused while the robot is armed or stopping, for anything that is no number within the limits, and for a
-    speed that the outer wheel cannot reach on that circle.
+    speed that the outer wheel cannot reach on that circle, or any wheel along a path.
     """
     if state in _LOCKED:
         raise TaskRefused(f"the task can be changed while the robot is disarmed, and it is {state.name}; disarm first")
-    unknown = sorted(set(asked) - set(FIELDS))
+    fields = FIELDS[type(task)]
+    unknown = sorted(set(asked) - set(fields))
     if unknown or not asked:
-        raise TaskRefused(f"give one or more of {', '.join(FIELDS)}" + (f", not {unknown[0]}" if unknown else ""))
+        raise TaskRefused(f"give one or more of {', '.join(fields)}" + (f", not {unknown[0]}" if unknown else ""))
     changed = msgspec.structs.replace(task, **{name: _number(name, value) for name, value in asked.items()})
-    fastest = fastest_m_s(robot, changed.radius_m)
-    if changed.speed_m_s > fastest:
-        raise TaskRefused(
-            f"{changed.speed_m_s:g} m/s on a radius of {changed.radius_m:g} m asks the outer wheel for more than "
-            f"{robot.max_wheel_speed_rad_s:g} rad/s; at most {math.floor(fastest * 1000.0) / 1000.0:g} m/s, or widen it"
-        )
+    refusal = too_fast(robot, changed)
+    if refusal is not None:
+        raise TaskRefused(refusal)
     return changed
 
 
-def fastest_m_s(robot: Robot, radius_m: float) -> float:
-    """Speed on a circle at which the outer wheel of the nominal robot is at its limit."""
-    outer = 1.0 + 0.5 * robot.axial_distance_m / radius_m
+def too_fast(robot: Robot, task: RobotTask) -> str | None:
+    """Why the wheels of the nominal robot cannot do the task, and the remedy; None if they can."""
+    fastest = fastest_m_s(robot, task)
+    if task.speed_m_s <= fastest:
+        return None
+    most = f"at most {math.floor(fastest * 1000.0) / 1000.0:g} m/s"
+    if isinstance(task, CircleTask):
+        return (
+            f"{task.speed_m_s:g} m/s on a radius of {task.radius_m:g} m asks the outer wheel for more than "
+            f"{robot.max_wheel_speed_rad_s:g} rad/s; {most}, or widen it"
+        )
+    return f"{task.speed_m_s:g} m/s asks the wheels for more than {robot.max_wheel_speed_rad_s:g} rad/s; {most}"
+
+
+def fastest_m_s(robot: Robot, task: RobotTask) -> float:
+    """Speed at which a wheel of the nominal robot is at its limit: the outer one on a circle, any straight ahead."""
+    outer = 1.0 + 0.5 * robot.axial_distance_m / task.radius_m if isinstance(task, CircleTask) else 1.0
     return robot.max_wheel_speed_rad_s * robot.wheel_radius_m / outer
 
 
-def limits(robot: Robot, task: CircleTask) -> dict[str, tuple[float, float]]:
-    """Least and largest value of each field; the speed's largest is that on the present radius."""
-    return {
+def limits(robot: Robot, task: RobotTask) -> dict[str, tuple[float, float]]:
+    """Least and largest value of each field that can be changed; the speed's largest is that on the present radius."""
+    every = {
         "radius_m": RADIUS_M,
-        "speed_m_s": (SLOWEST_M_S, fastest_m_s(robot, task.radius_m)),
+        "speed_m_s": (SLOWEST_M_S, fastest_m_s(robot, task)),
         "center_x_m": CENTER_M,
         "center_y_m": CENTER_M,
     }
+    return {name: every[name] for name in FIELDS[type(task)]}
 
 
-def record_of(t_ns: int, task: CircleTask) -> records.Task:
-    """The record of a task that is in force from `t_ns` on."""
-    return records.Task(t_ns, task.center_x_m, task.center_y_m, task.radius_m, task.speed_m_s)
+def in_words(task: RobotTask) -> str:
+    """The task for a person."""
+    if isinstance(task, CircleTask):
+        centre = f"({task.center_x_m:g}, {task.center_y_m:g}) m"
+        return f"circle of {task.radius_m:g} m about {centre} at {task.speed_m_s:g} m/s"
+    return f"path {task.path} of {course_of(task).length_m:.2f} m at {task.speed_m_s:g} m/s"
 
 
-def task_of(record: records.Task) -> CircleTask:
-    """The task that a record tells of."""
+def asked_of(task: RobotTask) -> dict[str, Any]:
+    """The task as the daemon's status tells it: a path by its file's name and a digest of its way-points."""
+    if isinstance(task, CircleTask):
+        return dict(msgspec.to_builtins(task))
+    return {"kind": "path", "path": task.path, "speed_m_s": task.speed_m_s, "digest": digest_of(task.points)}
+
+
+def told_task(asked: Mapping[str, Any], robots: RobotTask) -> RobotTask | None:
+    """The task that `asked_of` told of; None for a path with other way-points than those in `robots`, robot.toml's."""
+    if asked["kind"] == "circle":
+        return msgspec.convert(asked, CircleTask)
+    if not isinstance(robots, PathTask) or asked["digest"] != digest_of(robots.points):
+        return None
+    return msgspec.structs.replace(robots, speed_m_s=asked["speed_m_s"])
+
+
+@lru_cache(maxsize=4)
+def digest_of(points: tuple[Point, ...]) -> str:
+    """A few letters that are the same for the same way-points only."""
+    return hashlib.sha256(msgspec.json.encode(points)).hexdigest()[:16]
+
+
+def record_of(t_ns: int, task: RobotTask) -> records.Task:
+    """The record of a task that is in force from `t_ns` on; a path's way-points are in the log's copy of its file."""
+    if isinstance(task, CircleTask):
+        return records.Task(t_ns, task.center_x_m, task.center_y_m, task.radius_m, task.speed_m_s)
+    return records.Task(t_ns, math.nan, math.nan, math.nan, task.speed_m_s, "path")
+
+
+def task_of(record: records.Task, robots: RobotTask) -> RobotTask:
+    """The task that a record tells of; of a path it tells the speed, and the rest is that of `robots`, robot.toml's."""
+    if record.kind == "path":
+        return msgspec.structs.replace(robots, speed_m_s=record.speed_m_s)
     return CircleTask(
         center_x_m=record.center_x_m,
         center_y_m=record.center_y_m,

@@ -12,7 +12,7 @@ import math
 import random
 from collections.abc import Callable
 
-from disco_hw.config import CircleTask, Robot
+from disco_hw.config import CircleTask, Robot, RobotTask, circle_task
 from disco_hw.drive.pieces import Pieces, rest
 from disco_hw.drive.script import Manoeuvre, Script
 from disco_hw.drive.separating import SEPARATING, separating
@@ -24,15 +24,15 @@ STEPS = 20
 _LAPS = 2.0
 
 
-def make_script(name: str, robot: Robot, task: CircleTask, speed_share: float, seed: int = 1) -> Script:
+def make_script(name: str, robot: Robot, task: RobotTask, speed_share: float, seed: int = 1) -> Script:
     """The script of that name with wheel speeds up to `speed_share` of the robot's limit.
 
-    Raises InputError for an unknown name, and for a circle that is too fast for the wheels.
+    Raises InputError for an unknown name, and for `circle` if the task is none or too fast for the wheels.
     """
     top_rad_s = speed_share * robot.max_wheel_speed_rad_s
     match name:
         case "circle":
-            return circle(robot, task)
+            return circle(robot, circle_task(task, "--script circle"))
         case "steps":
             return steps(top_rad_s, seed)
         case "excite":

@@ -11,9 +11,10 @@ from disco_hw.log.link import Attachment
 
 ROBOT_TOML = "robot.toml"
 MODEL_TOML = "model.toml"
+PATH_CSV = "path.csv"
 DBC = "disco_robot.dbc"
 
-_MEDIA_TYPES = {".toml": "application/toml", ".json": "application/json"}
+_MEDIA_TYPES = {".toml": "application/toml", ".json": "application/json", ".csv": "text/csv"}
 
 
 def version() -> str:

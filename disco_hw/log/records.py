@@ -198,13 +198,17 @@ class Fan(msgspec.Struct, frozen=True, gc=False):
 
 
 class Task(msgspec.Struct, frozen=True, gc=False):
-    """The circle to follow from `t_ns` on, where it is another than robot.toml's; counter-clockwise, m and m/s."""
+    """The task from `t_ns` on, where it is another than robot.toml's: a circle, counter-clockwise, m and m/s.
+
+    `kind` "path": robot.toml's path at another speed; the circle's fields are NaN.
+    """
 
     t_ns: int
     center_x_m: float
     center_y_m: float
     radius_m: float
     speed_m_s: float
+    kind: str = "circle"
 
 
 Record = (

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.config import CircleTask
+from disco_hw.config import RobotTask
+from disco_hw.course import course_of
 from disco_hw.model import Model
 from disco_hw.model.belief import Belief, Gaussian, Mixture, Uniform
 from disco_hw.viewer.timeline import COMMAND, ESTIMATE, INNOVATION, PLANNER, WHEELS, Series, Timeline
@@ -26,15 +27,15 @@ class Curves:
     values: dict[str, Array]
 
 
-def distance(task: CircleTask, timeline: Timeline, first_ns: int, last_ns: int) -> Curves:
-    """Distance to the circle (m), positive outside."""
+def distance(task: RobotTask, timeline: Timeline, first_ns: int, last_ns: int) -> Curves:
+    """Distance to the task's line (m), positive to the right of it: outside of a circle."""
     t_s, rows = _window(timeline, timeline.estimate, first_ns, last_ns)
-    away = np.hypot(rows[:, 0] - task.center_x_m, rows[:, 1] - task.center_y_m) - task.radius_m
+    away = course_of(task).off_m(rows[:, :2])
     away[rows[:, ESTIMATE.index("pose_healthy")] == 0.0] = np.nan
     return Curves(t_s, {"distance (m)": away})
 
 
-def speed(task: CircleTask, timeline: Timeline, first_ns: int, last_ns: int) -> Curves:
+def speed(task: RobotTask, timeline: Timeline, first_ns: int, last_ns: int) -> Curves:
     """Estimated speed against the task's (m/s)."""
     t_s, rows = _window(timeline, timeline.estimate, first_ns, last_ns)
     reference = np.full(len(t_s), task.speed_m_s)

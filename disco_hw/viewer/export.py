@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from pathlib import Path
 
+from disco_hw.course import course_of
 from disco_hw.errors import InputError
 from disco_hw.viewer.recording import Recording
 from disco_hw.viewer.scene import Scene
@@ -43,5 +44,6 @@ def export_html(recording: Recording, path: Path, progress: Progress) -> None:
 
 
 def _clock_place(recording: Recording) -> tuple[float, float, float]:
-    task = recording.stage.task
-    return (task.center_x_m, task.center_y_m + 1.2 * task.radius_m, 0.2)
+    course = course_of(recording.stage.task)
+    x_m, y_m = course.middle_m
+    return (x_m, y_m + 1.2 * course.reach_m, 0.2)

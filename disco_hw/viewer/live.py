@@ -8,11 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import viser
 
-from disco_hw.config import CircleTask
-from disco_hw.daemon.task_change import record_of, task_of
+from disco_hw.daemon.task_change import record_of, told_task
 from disco_hw.log.records import Record
 from disco_hw.viewer.desk import Desk
 from disco_hw.viewer.feed import feed_path
@@ -91,11 +89,14 @@ class LivePage:
             self.scene.show(snapshot, everything)
         if everything:
             behind_ms = None if snapshot is None else (time.monotonic_ns() - snapshot.t_ns) * 1e-6
-            _set(self._details, live_details(status, snapshot, self._subscriber.missed, behind_ms))
+            _set(
+                self._details, live_details(status, snapshot, self._subscriber.missed, behind_ms, self.scene.knows_task)
+            )
             self._show_coverage(status)
             _set(self._events, events_text(snapshot, self.timeline.first_ns))
             if snapshot is not None:
-                self._plots.show(self.timeline, snapshot.t_ns, snapshot.task or self._stage.task, snapshot.belief)
+                task = self._stage.task_at(snapshot.task)
+                self._plots.show(self.timeline, snapshot.t_ns, task, snapshot.belief)
 
     def close(self) -> None:
         """Leave the feed."""
@@ -117,11 +118,14 @@ class LivePage:
         newest = self.timeline.last_ns
         if newest is None or status is None or not status.get("ok"):
             return
-        asked = msgspec.convert(status["task"]["asked"], CircleTask)
+        asked = told_task(status["task"]["asked"], self._stage.task)
+        self.scene.knows_task = asked is not None
+        if asked is None:
+            return
         told = self.timeline.tasks.last(newest)
         if told is not None and newest - told.t_ns < _STATUS_OLDER_NS:
             return
-        if (self._stage.task if told is None else task_of(told)) != asked:
+        if self._stage.task_at(told) != asked:
             self.timeline.add(newest, record_of(newest, asked))
 
 

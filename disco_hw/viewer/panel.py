@@ -7,7 +7,11 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from disco_hw.config import CircleTask
+import numpy as np
+
+from disco_hw.config import RobotTask
+from disco_hw.course import course_of
+from disco_hw.daemon.client import progress
 from disco_hw.viewer.advice import FAULTS, in_words
 from disco_hw.viewer.snapshot import Snapshot
 
@@ -16,13 +20,20 @@ Rows = list[tuple[str, str]]
 
 
 def live_details(
-    status: Mapping[str, Any] | None, snapshot: Snapshot | None, missed: int, behind_ms: float | None
+    status: Mapping[str, Any] | None,
+    snapshot: Snapshot | None,
+    missed: int,
+    behind_ms: float | None,
+    knows_task: bool = True,
 ) -> str:
     """Markdown of the figures: robot, link, loop, motion.
 
-    `missed` batches of the feed did not reach this page; what it shows is `behind_ms` old.
+    `missed` batches of the feed did not reach this page; what it shows is `behind_ms` old. Without `knows_task` it says
+    that the daemon follows another path than this page could draw.
     """
     rows: Rows = [] if status is None or not status.get("ok") else _status_rows(status)
+    if not knows_task:
+        rows.insert(0, ("TASK NOT DRAWN", "the path's file has changed since the daemon read it; restart the daemon"))
     rows.append(("page is behind", f"{number(behind_ms, 0)} ms, {missed} batches missed"))
     if snapshot is not None:
         rows += [*health_rows(snapshot), *motion_rows(snapshot)]
@@ -40,7 +51,7 @@ def _status_rows(status: Mapping[str, Any]) -> Rows:
         ("link", link),
         ("frames", f"{transport['frames_received']} in, {transport['frames_sent']} out"),
         ("rejected, lost", f"{rejected + transport['malformed']}, {driver['lost_frames']}"),
-        ("laps", f"{task['laps']:.2f}"),
+        progress(task),
         ("distance", f"{number(task['distance_m'] * 1e3, 0)} mm"),
         ("loop late p99, max", f"{number(loop['lateness_us']['p99'], 0)}, {number(loop['lateness_us']['max'], 0)} us"),
         ("overruns, skipped", f"{loop['overruns']}, {loop['skipped']}"),
@@ -51,7 +62,7 @@ def _status_rows(status: Mapping[str, Any]) -> Rows:
     return rows
 
 
-def replay_text(snapshot: Snapshot, first_ns: int, task: CircleTask) -> str:
+def replay_text(snapshot: Snapshot, first_ns: int, task: RobotTask) -> str:
     """Markdown for one instant of a log."""
     state, status = snapshot.state, snapshot.status
     head = state.state if state is not None else (status.state if status is not None else "state not recorded")
@@ -68,8 +79,8 @@ def replay_text(snapshot: Snapshot, first_ns: int, task: CircleTask) -> str:
         ("overruns, skipped", f"{snapshot.overruns}, {snapshot.skipped}"),
     ]
     if snapshot.pose is not None:
-        distance = math.hypot(snapshot.pose[0] - task.center_x_m, snapshot.pose[1] - task.center_y_m) - task.radius_m
-        rows.append(("distance", f"{number(distance * 1e3, 0)} mm"))
+        off_m = course_of(task).off_m(np.array([snapshot.pose[:2]]))[0]
+        rows.append(("distance", f"{number(off_m * 1e3, 0)} mm"))
     rows += [*health_rows(snapshot), *motion_rows(snapshot)]
     return "\n".join([*lines, _table(rows)])
 

@@ -15,6 +15,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from disco_hw.course import course_of
 from disco_hw.errors import InputError
 from disco_hw.viewer import curves, scene, shapes
 from disco_hw.viewer.curves import Curves
@@ -88,9 +89,9 @@ def _draw(figure: Figure, recording: Recording, t_s: float) -> None:
     top = figure.add_subplot(grid[:, 0])
     _draw_scene(top, snapshot, stage)
     top.set_title(f"{stage.name}, {(snapshot.t_ns - recording.first_ns) * 1e-9:.2f} s", loc="left")
-    task = snapshot.task or stage.task
+    task = stage.task_at(snapshot.task)
     cuts: tuple[tuple[str, Callable[[Timeline, int, int], Curves]], ...] = (
-        ("distance to the circle (m)", partial(curves.distance, task)),
+        (f"distance to the {course_of(task).noun} (m)", partial(curves.distance, task)),
         ("speed (m/s)", partial(curves.speed, task)),
         ("wheels (rad/s)", curves.wheels),
     )
@@ -107,15 +108,11 @@ def _draw(figure: Figure, recording: Recording, t_s: float) -> None:
 
 
 def _draw_scene(axes: Axes, snapshot: Snapshot, stage: Stage) -> None:
-    task = snapshot.task or stage.task
-    axes.plot(
-        *shapes.circle_points(task.center_x_m, task.center_y_m, task.radius_m).T,
-        color=_web(scene.TASK_COLOUR), linewidth=2.5,
-    )  # fmt: skip
+    course = course_of(stage.task_at(snapshot.task))
+    axes.plot(*course.outline_m().T, color=_web(scene.TASK_COLOUR), linewidth=2.5)
     trail = snapshot.trail
     if len(trail) >= 2:
-        away = np.hypot(trail[:, 0] - task.center_x_m, trail[:, 1] - task.center_y_m) - task.radius_m
-        colours = shapes.distance_colours(away, scene.TRAIL_FULL_M) / 255.0
+        colours = shapes.distance_colours(course.off_m(trail), scene.TRAIL_FULL_M) / 255.0
         axes.add_collection(LineCollection(list(np.stack((trail[:-1], trail[1:]), axis=1)), colors=colours[1:], lw=1.5))
     if len(snapshot.poses):
         axes.plot(*snapshot.poses[:, :2].T, ".", color=_web(scene.POSES_COLOUR), markersize=3)
@@ -135,10 +132,10 @@ def _draw_scene(axes: Axes, snapshot: Snapshot, stage: Stage) -> None:
         axes.fill(*nose.T, color="gold")
         ellipse = shapes.ellipse_points(*snapshot.pose[:2], snapshot.covariance[:2, :2])
         axes.plot(*ellipse.T, color=_web(scene.ELLIPSE_COLOUR), linewidth=1.2)
-    reach = 1.5 * task.radius_m + 0.3
+    (x_m, y_m), reach = course.middle_m, 1.5 * course.reach_m + 0.3
     axes.set(
-        xlim=(task.center_x_m - reach, task.center_x_m + reach),
-        ylim=(task.center_y_m - reach, task.center_y_m + reach),
+        xlim=(x_m - reach, x_m + reach),
+        ylim=(y_m - reach, y_m + reach),
         aspect="equal", xlabel="x (m)", ylabel="y (m)",
     )  # fmt: skip
     axes.grid(alpha=0.3)

@@ -9,7 +9,8 @@ from functools import partial
 import numpy as np
 import viser
 
-from disco_hw.config import CircleTask
+from disco_hw.config import CircleTask, RobotTask
+from disco_hw.course import course_of
 from disco_hw.log.records import BeliefChange
 from disco_hw.model import Model
 from disco_hw.viewer import curves
@@ -21,7 +22,7 @@ WINDOW_NS = 20_000_000_000
 _HEIGHT = 170
 _BLUE, _ORANGE, _GREY = "#0072b2", "#d55e00", "#777777"
 _DASHES = [6, 4]
-Cut = Callable[[CircleTask, Timeline, int, int], Curves]
+Cut = Callable[[RobotTask, Timeline, int, int], Curves]
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +40,7 @@ class Plots:
         self._marginals: dict[str, viser.GuiUplotHandle] = {}
         self._belief: BeliefChange | None = None
         with gui.add_folder("Plots"):
-            self._add(gui, "Distance to the circle (m)", curves.distance)
+            self._add(gui, f"Distance to the {course_of(stage.task).noun} (m)", curves.distance)
             self._add(gui, "Speed (m/s)", curves.speed)
             self._add(gui, "Wheels (rad/s)", _any_task(curves.wheels))
             self._add(gui, "Planner", _any_task(curves.planner), ("temperature",))
@@ -52,7 +53,7 @@ class Plots:
                 if density is not None:
                     self._marginals[name] = _add_uplot(gui, name, density, ())
 
-    def show(self, timeline: Timeline, at_ns: int, task: CircleTask, belief: BeliefChange | None) -> None:
+    def show(self, timeline: Timeline, at_ns: int, task: RobotTask, belief: BeliefChange | None) -> None:
         """Draw the curves up to an instant, with the task and the belief that are in force then."""
         for plot in self._plots:
             found = plot.cut(task, timeline, at_ns - WINDOW_NS, at_ns)

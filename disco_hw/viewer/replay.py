@@ -87,7 +87,7 @@ class ReplayPage:
         if everything:
             self._next_redraw_s = now_s + REDRAW_S
             first_ns = self._recording.first_ns
-            task = snapshot.task or self._recording.stage.task
+            task = self._recording.stage.task_at(snapshot.task)
             self._state.content = replay_text(snapshot, first_ns, task)
             if self._excited.driven:
                 self._coverage.content = coverage_text(self._excited.items(snapshot.t_ns))

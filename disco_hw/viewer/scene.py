@@ -8,7 +8,8 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from disco_hw.config import CircleTask
+from disco_hw.config import RobotTask
+from disco_hw.course import course_of
 from disco_hw.log import records
 from disco_hw.viewer import shapes
 from disco_hw.viewer.snapshot import Snapshot
@@ -48,21 +49,23 @@ FAN_PALEST = 0.12
 _WHEEL_PARTS = (("front", 0.5), ("rear", -0.5))
 
 
-def first_camera(task: CircleTask) -> tuple[Point, Point]:
-    """Where the page's camera is at first, and what it looks at: all of the circle, from the south and above."""
-    away = 0.8 + 1.1 * task.radius_m
-    eye = (task.center_x_m - 0.35 * away, task.center_y_m - 0.9 * away, 1.25 * away)
-    return eye, (task.center_x_m, task.center_y_m, 0.0)
+def first_camera(task: RobotTask) -> tuple[Point, Point]:
+    """Where the page's camera is at first, and what it looks at: all of the task, from the south and above."""
+    course = course_of(task)
+    (x_m, y_m), away = course.middle_m, 0.8 + 1.1 * course.reach_m
+    return (x_m - 0.35 * away, y_m - 0.9 * away, 1.25 * away), (x_m, y_m, 0.0)
 
 
 class Scene:
     """Draws snapshots on a viser server; `layers` says which of LAYERS are shown.
 
+    Without `knows_task` the task is not drawn: a wrong line would be worse than none.
     `show` moves what moves in every call and redraws long lines only where `everything` is True.
     """
 
     def __init__(self, server: viser.ViserServer, stage: Stage) -> None:
         self.layers = dict.fromkeys(LAYERS, True)
+        self.knows_task = True
         self._server = server
         self._stage = stage
         self._points = ParameterPoints(stage.model)
@@ -93,8 +96,8 @@ class Scene:
         """Draw this instant."""
         layers = self.layers
         with self._server.atomic():
-            self._draw_task(snapshot.task or self._stage.task)
-            self._task.visible = layers["task"]
+            self._draw_task(self._stage.task_at(snapshot.task))
+            self._task.visible = layers["task"] and self.knows_task
             self._robot.visible = layers["robot"] and snapshot.pose is not None
             if snapshot.pose is not None:
                 x_m, y_m, yaw_rad = snapshot.pose
@@ -116,7 +119,8 @@ class Scene:
 
     def _add_ground(self) -> None:
         task, scene = self._stage.task, self._server.scene
-        size_m = max(4.0, 2.0 * math.ceil(1.5 * task.radius_m + 1.0))
+        course = course_of(task)
+        size_m = max(4.0, 2.0 * math.ceil(1.5 * course.reach_m + 1.0))
         scene.set_up_direction("+z")
         scene.add_grid(
             "/ground",
@@ -127,10 +131,10 @@ class Scene:
             cell_color=(225, 225, 225),
             section_color=(170, 170, 170),
             shadow_opacity=0.0,
-            position=(task.center_x_m, task.center_y_m, 0.0),
+            position=(*course.middle_m, 0.0),
         )
         self._task = scene.add_line_segments(
-            "/task", _circle(task), TASK_COLOUR, thickness=max(0.012, 0.006 * task.radius_m)
+            "/task", _line(task), TASK_COLOUR, thickness=max(0.012, 0.006 * course.reach_m)
         )
         self._drawn_task = task
         camera = self._server.initial_camera
@@ -185,9 +189,9 @@ class Scene:
         elif node.visible:
             node.visible = False
 
-    def _draw_task(self, task: CircleTask) -> None:
+    def _draw_task(self, task: RobotTask) -> None:
         if task != self._drawn_task:
-            self._task.points = _circle(task).astype(np.float32)
+            self._task.points = _line(task).astype(np.float32)
             self._drawn_task = task
 
     def _draw_fan(self, fan: records.Fan | None) -> None:
@@ -210,11 +214,11 @@ class Scene:
         self._fan.visible, self._drawn_fan = True, fan
 
     def _draw_trail(self, snapshot: Snapshot) -> None:
-        trail, task = snapshot.trail, snapshot.task or self._stage.task
+        trail = snapshot.trail
         visible = self.layers["trail"] and len(trail) >= 2
         if visible:
-            distance = np.hypot(trail[:, 0] - task.center_x_m, trail[:, 1] - task.center_y_m) - task.radius_m
-            colours = shapes.distance_colours(distance, TRAIL_FULL_M)
+            off_m = course_of(self._stage.task_at(snapshot.task)).off_m(trail)
+            colours = shapes.distance_colours(off_m, TRAIL_FULL_M)
             points = shapes.segments(trail, 4.0 * _GROUND_M)
             self._trail.points = points.astype(np.float32)
             self._trail.colors = np.stack((colours[:-1], colours[1:]), axis=1)
@@ -250,8 +254,8 @@ class Scene:
         return np.concatenate([shapes.segments(path, 0.008) for path in paths]) if len(paths) else np.empty((0, 2, 3))
 
 
-def _circle(task: CircleTask) -> Array:
-    return shapes.segments(shapes.circle_points(task.center_x_m, task.center_y_m, task.radius_m), _GROUND_M)
+def _line(task: RobotTask) -> Array:
+    return shapes.segments(course_of(task).outline_m(), _GROUND_M)
 
 
 def _pose_marks(poses: Array) -> Array:

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.config import CircleTask
-from disco_hw.daemon.task_change import task_of
 from disco_hw.log import records
 from disco_hw.viewer.timeline import COVARIANCE, ESTIMATE, Timeline
 from drivers.types import RobotLinkHealth, RobotStatus
@@ -30,7 +28,7 @@ class Snapshot:
     `pose` (x, y, yaw) m and rad, its `covariance` (3, 3); `speed_m_s`, `yaw_rate_rad_s`; `wheel_angles`,
     `wheel_speeds`, `command` (left, right) rad and rad/s; `plan` not older than half a second; `poses` (N, 3) measured
     in the last 3 s; `trail` (N, 2) of estimated positions; `fan` not older than 1.1 s; `task` where it is not the
-    robot.toml's, `belief` where another one than the model file's was in force.
+    robot.toml's (`Stage.task_at` makes one of both), `belief` where another one than the model file's was in force.
     """
 
     t_ns: int
@@ -60,7 +58,7 @@ class Snapshot:
     battery_c: float
     events: tuple[tuple[int, records.Event], ...]
     fan: records.Fan | None
-    task: CircleTask | None
+    task: records.Task | None
     belief: records.BeliefChange | None
     adaptation: records.Adaptation | None
 
@@ -100,7 +98,7 @@ def snapshot_at(timeline: Timeline, t_ns: int, plan: records.Plan | None) -> Sna
         battery_c=np.nan if power is None else float(power[1][2]),
         events=tuple(timeline.events.latest(t_ns, _EVENTS)),
         fan=_fresh_fan(timeline, t_ns),
-        task=None if (told := timeline.tasks.last(t_ns)) is None else task_of(told),
+        task=timeline.tasks.last(t_ns),
         belief=timeline.beliefs.last(t_ns),
         adaptation=timeline.adaptations.last(t_ns),
     )

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 from disco_hw.adapt.adaptable import geometry_of, with_geometry
-from disco_hw.config import CircleTask
-from disco_hw.errors import InputError
-from disco_hw.log.provenance import MODEL_TOML, ROBOT_TOML
+from disco_hw.config import RobotTask
+from disco_hw.daemon.task_change import task_of
 from disco_hw.log.reader import Log
-from disco_hw.log.records import BeliefChange
+from disco_hw.log.records import BeliefChange, Task
+from disco_hw.log_setup import setup_of_log
 from disco_hw.model import Model
-from disco_hw.robot_setup import geometry, load_setup
+from disco_hw.robot_setup import Setup, geometry, load_setup
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,12 +23,16 @@ class Stage:
     """
 
     name: str
-    task: CircleTask
+    task: RobotTask
     wheel_radius_m: float
     axial_distance_m: float
     x_icr_m: float
     drive_top_rad_s: float
     model: Model
+
+    def task_at(self, told: Task | None) -> RobotTask:
+        """The task that is in force where this record of it is the newest; robot.toml's without one."""
+        return self.task if told is None else task_of(told, self.task)
 
 
 def model_in_force(model: Model, change: BeliefChange | None) -> Model:
@@ -40,7 +43,17 @@ def model_in_force(model: Model, change: BeliefChange | None) -> Model:
 
 def stage_of_robot(robot_file: Path, model_file: Path | None = None) -> Stage:
     """From robot.toml and the model it names; raises InputError."""
-    setup = load_setup(robot_file, model_file)
+    return _stage(load_setup(robot_file, model_file))
+
+
+def stage_of_log(log: Log, robot_file: Path | None = None) -> Stage:
+    """From the files kept in the log, or from `robot_file` instead; raises InputError if there is neither."""
+    if robot_file is not None:
+        return stage_of_robot(robot_file)
+    return _stage(setup_of_log(log, "name the robot with --robot"))
+
+
+def _stage(setup: Setup) -> Stage:
     robot = setup.config.robot
     return Stage(
         name=robot.name,
@@ -51,19 +64,3 @@ def stage_of_robot(robot_file: Path, model_file: Path | None = None) -> Stage:
         drive_top_rad_s=setup.config.drive.speed_share * robot.max_wheel_speed_rad_s,
         model=setup.model,
     )
-
-
-def stage_of_log(log: Log, robot_file: Path | None = None) -> Stage:
-    """From the files kept in the log, or from `robot_file` instead; raises InputError if there is neither."""
-    if robot_file is not None:
-        return stage_of_robot(robot_file)
-    names = log.attachment_names()
-    if ROBOT_TOML not in names:
-        raise InputError(f"{log.path}: keeps no {ROBOT_TOML}; name the robot with --robot")
-    with TemporaryDirectory(prefix="disco-hw-view-") as scratch:
-        robot_copy, model_copy = Path(scratch) / ROBOT_TOML, Path(scratch) / MODEL_TOML
-        robot_copy.write_bytes(log.attachment(ROBOT_TOML))
-        if MODEL_TOML not in names:
-            return stage_of_robot(robot_copy)
-        model_copy.write_bytes(log.attachment(MODEL_TOML))
-        return stage_of_robot(robot_copy, model_copy)

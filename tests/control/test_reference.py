@@ -8,8 +8,8 @@ import pytest
 from disco_hw.control import Circle, pendulum, reference
 from disco_hw.control.tasks.path import Path
 from disco_hw.control.tasks.timed_path import TimedPath
-from disco_hw.control.tasks.waypoints import Waypoints
 from disco_hw.model.reference import State
+from disco_hw.waypoints import Waypoints
 
 THETA = {"wheel_radius_m": 0.1, "axial_distance_m": 0.5, "x_icr_m": 0.0}
 

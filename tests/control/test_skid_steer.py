@@ -14,10 +14,10 @@ from disco_hw.control.past import past_commands
 from disco_hw.control.spline import spline_basis
 from disco_hw.control.tasks.path import Path
 from disco_hw.control.tasks.timed_path import TimedPath
-from disco_hw.control.tasks.waypoints import Waypoints
 from disco_hw.model import EffectSetting, Gaussian, Model
 from disco_hw.model import reference as physics
 from disco_hw.model.effects import MOTION_EFFECTS
+from disco_hw.waypoints import Waypoints
 
 SAMPLES, HORIZON, STEP_S = 160, 50, 0.1
 # Single precision holds no more than this of a cost of hundreds.

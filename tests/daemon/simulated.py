@@ -22,6 +22,7 @@ from sim.plant_parameters import PlantParameters
 from sim.virtual_robot import STEP_US, VirtualRobot
 
 FOREVER_NS = 1 << 62
+ROBOT_FILE = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
 START = Pose(0.75, 0.0, 1.5707963)
 
 
@@ -58,15 +59,20 @@ class SimulatedStack:
 
 
 def simulated_stack(
-    planner: Planner | None = None, seed: int = 1, needs_pose: bool = True, **changes: float
+    planner: Planner | None = None,
+    seed: int = 1,
+    needs_pose: bool = True,
+    robot_file: Path = ROBOT_FILE,
+    start: Pose = START,
+    **changes: float,
 ) -> SimulatedStack:
     """The shipped robot with a plant at the posterior's mean; `changes` are fields of PlantParameters."""
-    setup = load_setup(Path(disco_hw.__file__).parent / "robots" / "wombot.toml")
+    setup = load_setup(robot_file)
     host_end, robot_end = connect_pair()
     recorder = MemoryRecorder()
     pipeline = make_pipeline(setup.config, setup.model, planner or make_planner(setup.config, setup.model))
     core = assemble_core(setup.config, host_end, make_driver(), pipeline, recorder, needs_pose)
-    plant = Plant(replace(PlantParameters(), **changes), None, seed, START)
+    plant = Plant(replace(PlantParameters(), **changes), None, seed, start)
     robot = VirtualRobot(plant, FirmwareConfig(ticks_per_rev=2048, max_wheel_speed_rad_s=8.0), seed=seed)
     host_end.open()
     robot_end.open()

@@ -23,7 +23,7 @@ def lap():
     stack.run(0.5, UserRequest.ARM)
     rows = []
     stack.run(0.02, UserRequest.START)
-    while stack.core.laps.laps < 1.0 and stack.now_us < 60_000_000:
+    while stack.core.progress.laps < 1.0 and stack.now_us < 60_000_000:
         stack.run(0.02)
         truth = stack.robot.truth
         rows.append((stack.now_us * 1e-6, truth.x_m, truth.y_m, truth.yaw_rad, truth.speed_m_s))

@@ -1,6 +1,7 @@
+import msgspec
 import pytest
 
-from disco_hw.config import Control, Link, Robot
+from disco_hw.config import CircleTask, Control, Link, PathTask, Robot
 from disco_hw.daemon.preflight import (
     Check,
     Level,
@@ -9,8 +10,10 @@ from disco_hw.daemon.preflight import (
     check_link_load,
     check_realtime,
     check_round_trip,
+    check_task,
     failures,
 )
+from disco_hw.daemon.task_change import fastest_m_s
 from drivers.types import Capabilities
 from firmware_protocol.dbc import packaged_dbc
 
@@ -151,3 +154,17 @@ def test_round_trip_gives_median_and_worst():
 def test_only_failures_keep_the_robot_from_being_armed():
     checks = [Check("a", Level.OK, "fine"), Check("b", Level.WARNING, "hm"), Check("c", Level.FAIL, "no")]
     assert failures(checks) == ("no",)
+
+
+@pytest.mark.parametrize(
+    "task", [CircleTask(speed_m_s=0.3), PathTask(path="p.csv", speed_m_s=0.7, points=((0, 0), (1, 0)))]
+)
+def test_a_task_that_is_too_fast_for_the_wheels_fails(task):
+    slow = msgspec.structs.replace(task, speed_m_s=0.1)
+    assert check_task(robot(), slow).level is Level.OK
+    fastest = fastest_m_s(robot(), task)
+    assert check_task(robot(), msgspec.structs.replace(task, speed_m_s=fastest)).level is Level.OK
+    found = check_task(robot(), msgspec.structs.replace(task, speed_m_s=1.01 * fastest))
+    assert found.level is Level.FAIL
+    assert found.text.startswith("task.speed_m_s: ")
+    assert "at most" in found.text

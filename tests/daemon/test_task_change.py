@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 
+import msgspec
 import pytest
 
-from disco_hw.config import CircleTask, Robot
+from disco_hw.config import CircleTask, PathTask, Robot
 from disco_hw.daemon.states import State
 from disco_hw.daemon.supervisor import UserRequest
 from disco_hw.daemon.task_change import (
@@ -14,11 +15,14 @@ from disco_hw.daemon.task_change import (
     RADIUS_M,
     SLOWEST_M_S,
     TaskRefused,
+    asked_of,
     changed_task,
     fastest_m_s,
+    in_words,
     limits,
     record_of,
     task_of,
+    told_task,
 )
 from disco_hw.log import records
 from disco_hw.replay import replay
@@ -77,15 +81,44 @@ def test_the_limits_are_those_that_are_enforced():
 
 
 def test_at_the_fastest_speed_the_outer_wheel_is_at_its_limit():
-    speed, radius_m = fastest_m_s(ROBOT, 0.75), 0.75
+    speed, radius_m = fastest_m_s(ROBOT, CircleTask(radius_m=0.75)), 0.75
     outer_rad_s = speed / radius_m * (radius_m + 0.5 * ROBOT.axial_distance_m) / ROBOT.wheel_radius_m
     assert outer_rad_s == pytest.approx(ROBOT.max_wheel_speed_rad_s)
 
 
 def test_a_record_tells_the_whole_task():
     task = CircleTask(center_x_m=1.0, center_y_m=-2.0, radius_m=0.5, speed_m_s=0.1)
-    assert task_of(record_of(7, task)) == task
+    assert task_of(record_of(7, task), CircleTask()) == task
     assert record_of(7, task).t_ns == 7
+
+
+LINE = PathTask(path="line.csv", speed_m_s=0.2, points=((0.0, 0.0), (2.0, 0.0)))
+
+
+def test_of_a_path_only_the_speed_can_be_changed():
+    changed = changed_task(LINE, {"speed_m_s": 0.3}, ROBOT, State.READY)
+    assert changed == msgspec.structs.replace(LINE, speed_m_s=0.3)
+    assert set(limits(ROBOT, LINE)) == {"speed_m_s"}
+    fastest = ROBOT.max_wheel_speed_rad_s * ROBOT.wheel_radius_m
+    assert limits(ROBOT, LINE)["speed_m_s"] == (SLOWEST_M_S, pytest.approx(fastest))
+    with pytest.raises(TaskRefused, match="give one or more of speed_m_s, not radius_m"):
+        changed_task(LINE, {"radius_m": 0.5}, ROBOT, State.READY)
+    with pytest.raises(TaskRefused, match="asks the wheels for more than 8 rad/s; at most"):
+        changed_task(LINE, {"speed_m_s": 1.01 * fastest}, ROBOT, State.READY)
+    with pytest.raises(TaskRefused, match="disarm first"):
+        changed_task(LINE, {"speed_m_s": 0.3}, ROBOT, State.ARMED)
+
+
+def test_a_status_and_a_record_tell_of_a_path_without_its_way_points():
+    other = msgspec.structs.replace(LINE, speed_m_s=0.1)
+    asked = asked_of(other)
+    assert "points" not in asked
+    assert told_task(asked, LINE) == other
+    assert told_task(asked, msgspec.structs.replace(LINE, points=((0.0, 0.0), (2.0, 0.1)))) is None
+    assert told_task(asked, CircleTask()) is None
+    assert told_task(asked_of(CircleTask(radius_m=2.0)), LINE) == CircleTask(radius_m=2.0)
+    assert task_of(record_of(7, other), LINE) == other
+    assert in_words(other) == "path line.csv of 2.00 m at 0.1 m/s"
 
 
 def test_another_circle_is_driven_recorded_and_replayed_bit_for_bit(tmp_path):
@@ -96,7 +129,7 @@ def test_another_circle_is_driven_recorded_and_replayed_bit_for_bit(tmp_path):
     stack.run(6.0, UserRequest.START)
     stack.run(0.5, UserRequest.DISARM)
     told = [record for _, tick in stack.recorder.ticks for record in tick if isinstance(record, records.Task)]
-    assert [task_of(record) for record in told] == [stack.core.task]
+    assert [task_of(record, CircleTask()) for record in told] == [stack.core.task]
     estimate = stack.core.last.pipeline.estimate
     off_new, off_old = (math.hypot(estimate.x_m - x, estimate.y_m) - r for x, r in ((0.25, 0.5), (0.0, 0.75)))
     assert abs(off_new) < 0.07 < abs(off_old)

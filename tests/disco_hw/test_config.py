@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from disco_hw.config import ConfigError, load_robot_config
+from disco_hw.config import ConfigError, PathTask, circle_task, load_robot_config
+from disco_hw.errors import InputError
 
 GOOD = """
 [robot]
@@ -101,4 +102,32 @@ def _fields_of(section: str) -> tuple[str, ...]:
 
     from disco_hw.config import RobotConfig
 
-    return typing.get_type_hints(RobotConfig)[section].__struct_fields__
+    hint = typing.get_type_hints(RobotConfig)[section]
+    kinds = typing.get_args(hint) or (hint,)
+    # What is read from the path's file is no field.
+    return tuple(dict.fromkeys(name for kind in kinds for name in kind.__struct_fields__ if name != "points"))
+
+
+@pytest.mark.parametrize("kind", ["", 'kind = "path"\n'])
+def test_a_path_is_named_in_the_task_with_or_without_its_kind(tmp_path, kind):
+    task = load(tmp_path, GOOD + f'[task]\n{kind}path = "a/b.csv"\nspeed_m_s = 0.3\n').task
+    assert task == PathTask(path="a/b.csv", speed_m_s=0.3)
+    with pytest.raises(InputError, match="--script circle needs a circle: write kind"):
+        circle_task(task, "--script circle")
+
+
+@pytest.mark.parametrize(
+    ("task", "words"),
+    [
+        ('path = "p.csv"\nradius_m = 1.0\n', "radius_m: no such field"),
+        ('kind = "circle"\npath = "p.csv"\n', "path: no such field"),
+        ('kind = "path"\n', "path: missing; add it"),
+        ('path = ""\n', "task.path: expected `str` of length >= 1"),
+        ('path = "p.csv"\npoints = [[0.0, 0.0]]\n', "points: no such field; write way-points in a CSV"),
+        ('path = "p.csv"\nspeed_m_s = 0.5\n', "task.speed_m_s: 0.5 m/s is above what the wheels can do"),
+    ],
+)
+def test_a_mistake_in_a_path_task_gets_one_line(tmp_path, task, words):
+    with pytest.raises(ConfigError, match=words) as caught:
+        load(tmp_path, GOOD + "[task]\n" + task)
+    assert "\n" not in str(caught.value)

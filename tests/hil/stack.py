@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import csv
 import socket
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -117,6 +119,14 @@ def write_robot_file(directory: Path, link: str = "can", task: str = "", model: 
     path = directory / "robot.toml"
     path.write_text(text, encoding="utf-8")
     return path
+
+
+def disco(*arguments: str, timeout_s: float = 60.0) -> tuple[int, str]:
+    """Run the command `disco-hw` to its end; returns the exit code and all that it said."""
+    result = subprocess.run(
+        [sys.executable, "-m", "disco_hw", *arguments], capture_output=True, text=True, timeout=timeout_s, check=False
+    )
+    return result.returncode, result.stdout + result.stderr
 
 
 @contextmanager

@@ -4,22 +4,13 @@ from __future__ import annotations
 
 import json
 import re
-import subprocess
-import sys
 
 import pytest
 
 from disco_hw.operator import disco_hw_process
-from tests.hil.stack import READY_TIMEOUT_S, running_stack, write_robot_file
+from tests.hil.stack import READY_TIMEOUT_S, disco, running_stack, write_robot_file
 
 pytestmark = pytest.mark.hil
-
-
-def disco(*arguments: str) -> tuple[int, str]:
-    result = subprocess.run(
-        [sys.executable, "-m", "disco_hw", *arguments], capture_output=True, text=True, timeout=60, check=False
-    )
-    return result.returncode, result.stdout + result.stderr
 
 
 @pytest.mark.parametrize("link", ["can", "serial"])

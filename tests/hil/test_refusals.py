@@ -19,16 +19,10 @@ import pytest
 from disco_hw.errors import WorkError
 from disco_hw.operator import Operator, disco_hw_process
 from firmware_protocol.codec import Codec
-from tests.hil.stack import READY_TIMEOUT_S, STILL_RAD_S, running_stack, write_robot_file
+from tests.daemon.path_robot import path_robot
+from tests.hil.stack import READY_TIMEOUT_S, STILL_RAD_S, disco, running_stack, write_robot_file
 
 pytestmark = pytest.mark.hil
-
-
-def disco(*arguments: str, timeout_s: float = 40.0) -> tuple[int, str]:
-    result = subprocess.run(
-        [sys.executable, "-m", "disco_hw", *arguments], capture_output=True, text=True, timeout=timeout_s, check=False
-    )
-    return result.returncode, result.stdout + result.stderr
 
 
 @pytest.mark.parametrize(
@@ -213,3 +207,32 @@ def test_garbage_on_a_serial_line_leaves_the_daemon_waiting(tmp_path):
         thread.join()
         os.close(master)
         os.close(slave)
+
+
+@pytest.mark.parametrize(
+    ("verb", "csv", "words"),
+    [
+        ("run", "x_m,y_m\n0,0\n1,one\n", "line 3: y_m: 'one' is not a finite number; write one"),
+        ("sim", "x_m,y_m\n0,0\n", "1 way-points; write at least two"),
+        ("check", "x,y\n0,0\n1,1\n", "line 1: column x_m: missing; name x_m and y_m there"),
+        ("view", "x_m,y_m\n0,0\n0,0\n", "line 3: the same way-point again; remove it"),
+        ("run", None, "cannot be read"),
+    ],
+)
+def test_a_bad_path_gets_one_line_and_exit_code_2(tmp_path, verb, csv, words):
+    path = path_robot(tmp_path, csv or "")
+    if csv is None:
+        (tmp_path / "path.csv").unlink()
+    code, output = disco(verb, *(["--live", "--robot"] if verb == "view" else []), str(path))
+    assert code == 2, output
+    assert len(output.strip().splitlines()) == 1
+    assert str(tmp_path / "path.csv") in output
+    assert words in output
+
+
+def test_a_daemon_can_be_told_to_stop_when_the_path_is_gone(tmp_path):
+    path = path_robot(tmp_path)
+    (tmp_path / "path.csv").unlink()
+    code, output = disco("ctl", str(path), "disarm")
+    assert code == 1, output
+    assert "path.csv" not in output

@@ -89,7 +89,7 @@ def write_log(path, ticks=200):
     recorder = ProcessRecorder(Recording(path, "wombot", attachments=attachments, queue_ticks=100_000))
     for tick in range(ticks):
         recorder.put(*tick_records(tick))
-    stats = recorder.close()
+    stats = recorder.close(300.0)
     assert stats.dropped_ticks == 0
     assert stats.refused == 0
     return path

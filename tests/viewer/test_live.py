@@ -1,14 +1,19 @@
 import time
+from contextlib import closing
 
 import pytest
+from msgspec.structs import replace
 
 from disco_hw.config import CircleTask
+from disco_hw.daemon.task_change import asked_of
 from disco_hw.log import records
 from disco_hw.viewer.desk import Desk
 from disco_hw.viewer.feed import ViewerFeed, feed_path
 from disco_hw.viewer.live import KEEP_S, LivePage, _Due
+from disco_hw.viewer.panel import live_details
 from disco_hw.viewer.server import serving
 from disco_hw.viewer.stage import stage_of_robot
+from tests.daemon.path_robot import path_robot
 from tests.viewer.run import PERIOD_NS, ROBOT_FILE, START_NS, pose_at, tick_records
 
 
@@ -79,7 +84,7 @@ def test_a_task_that_was_changed_before_the_page_was_opened_is_taken_over(page):
     live._learn_task(status_with())
     assert not len(live.timeline.tasks)
     live._learn_task(status_with(radius_m=0.5))
-    assert live._snapshot().task == CircleTask(radius_m=0.5)
+    assert live._stage.task_at(live._snapshot().task) == CircleTask(radius_m=0.5)
 
 
 def test_a_task_on_the_feed_is_newer_than_a_status_from_before_it(page):
@@ -96,3 +101,20 @@ def test_a_task_on_the_feed_is_newer_than_a_status_from_before_it(page):
 def test_what_is_due_is_due_once_a_period():
     due = _Due(0.5)
     assert [due(t) for t in (10.0, 10.2, 10.5, 10.6, 12.0, 12.1)] == [True, False, True, False, True, False]
+
+
+def test_a_path_that_is_not_the_daemons_is_not_drawn_and_told(tmp_path):
+    stage = stage_of_robot(path_robot(tmp_path))
+    told = {"ok": True, "task": {"asked": asked_of(replace(stage.task, speed_m_s=0.1))}}
+    other = replace(stage.task, points=stage.task.points[:-1])
+    with serving("test", port=0) as served, closing(Desk(tmp_path / "control.sock", ROBOT_FILE)) as desk:
+        live = LivePage(served.server, stage, tmp_path / "control.sock", desk)
+        live.take(ticks(0, 51))
+        live._learn_task(told)
+        assert live._stage.task_at(live._snapshot().task).speed_m_s == 0.1
+        assert live.scene.knows_task
+        live._learn_task({"ok": True, "task": {"asked": asked_of(other)}})
+        live.scene.show(live._snapshot())
+        assert not live.scene._task.visible
+        assert "TASK NOT DRAWN" in live_details(None, None, 0, None, live.scene.knows_task)
+        live.close()

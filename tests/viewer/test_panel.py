@@ -20,7 +20,8 @@ from tests.viewer.run import PERIOD_NS, START_NS, plan_at
 STATUS = {
     "ok": True, "state": "ARMED", "detail": "running the task", "running": True, "estop": False, "link": "up",
     "link_error": None, "robot_state": "ARMED", "fault": "NONE", "stop_cause": "NONE",
-    "task": {"laps": 1.5, "distance_m": 0.012}, "transport": {"frames_received": 10, "frames_sent": 4, "malformed": 1},
+    "task": {"laps": 1.5, "distance_m": 0.012, "length_m": 4.7, "asked": {"kind": "circle"}},
+    "transport": {"frames_received": 10, "frames_sent": 4, "malformed": 1},
     "driver": {"rejected_crc": 2, "rejected_sequence": 3, "lost_frames": 5}, "recorder": {"last_error": ""},
     "loop": {"lateness_us": {"p99": 100.4, "max": 900.0}, "overruns": 7, "skipped": 8},
 }  # fmt: skip
@@ -101,3 +102,11 @@ def test_text_from_elsewhere_is_no_markup():
 def test_numbers_that_are_none_become_a_dash():
     assert number(None, 2) == number(math.nan, 2) == number(math.inf, 2) == "—"
     assert number(1.005, 1) == "1.0"
+
+
+def test_of_a_path_the_panel_tells_the_progress_and_the_side():
+    task = {"laps": 0.25, "distance_m": -0.012, "length_m": 8.0, "asked": {"kind": "path"}}
+    text = live_details({**STATUS, "task": task}, None, 0, None)
+    assert "| progress | 2.00 of 8.00 m (25%) |" in text
+    assert "| distance | -12 mm |" in text
+    assert "| laps | 1.50 |" in live_details(STATUS, None, 0, None)

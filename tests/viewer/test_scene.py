@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from disco_hw.config import CircleTask
+from disco_hw.daemon.task_change import record_of
 from disco_hw.log import records
 from disco_hw.viewer import scene as scene_module
 from disco_hw.viewer.scene import LAYERS, Scene, first_camera
@@ -14,6 +15,7 @@ from disco_hw.viewer.server import serving
 from disco_hw.viewer.snapshot import snapshot_at
 from disco_hw.viewer.stage import stage_of_robot
 from disco_hw.viewer.timeline import Timeline
+from tests.daemon.path_robot import path_robot
 from tests.viewer.run import PERIOD_NS, ROBOT_FILE, START_NS, plan_at, pose_at
 
 TICK = 150
@@ -85,7 +87,7 @@ def test_the_circle_is_the_tasks_and_follows_its_changes(scene, shot):
         return np.hypot(points[..., 0] - x_m, points[..., 1])
 
     assert radii() == pytest.approx(0.75, abs=1e-5)
-    scene.show(replace(shot, task=CircleTask(center_x_m=1.0, radius_m=0.5)))
+    scene.show(replace(shot, task=record_of(0, CircleTask(center_x_m=1.0, radius_m=0.5))))
     assert radii(1.0) == pytest.approx(0.5, abs=1e-5)
     scene.show(shot)
     assert radii() == pytest.approx(0.75, abs=1e-5)
@@ -94,7 +96,7 @@ def test_the_circle_is_the_tasks_and_follows_its_changes(scene, shot):
 def test_the_trail_is_coloured_by_the_distance_to_the_task_in_force(scene, shot):
     scene.show(shot)
     on_it = np.array(scene._trail.colors)[-1, 0]
-    scene.show(replace(shot, task=CircleTask(radius_m=0.5)))
+    scene.show(replace(shot, task=record_of(0, CircleTask(radius_m=0.5))))
     off_it = np.asarray(scene._trail.colors)[-1, 0]
     assert tuple(on_it) == tuple(scene_module.shapes.distance_colours(np.zeros(1), scene_module.TRAIL_FULL_M)[0])
     assert tuple(off_it) == tuple(scene_module.shapes.distance_colours(np.full(1, 0.25), scene_module.TRAIL_FULL_M)[0])
@@ -144,3 +146,17 @@ def test_the_first_camera_sees_the_whole_task():
     eye, look_at = first_camera(task)
     assert look_at == (2.0, -1.0, 0.0)
     assert eye[2] > task.radius_m
+
+
+def test_a_path_is_drawn_where_it_is_and_not_at_all_where_it_is_unknown(tmp_path, shot):
+    stage = stage_of_robot(path_robot(tmp_path, "x_m,y_m\n3,0\n4,0\n4,1\n"))
+    with serving("test", port=0) as page:
+        scene = Scene(page.server, stage)
+        scene.show(shot)
+        np.testing.assert_allclose(np.asarray(scene._task.points)[:, :, :2], [[[3, 0], [4, 0]], [[4, 0], [4, 1]]])
+        far = tuple(scene_module.shapes.distance_colours(np.ones(1), scene_module.TRAIL_FULL_M)[0])
+        assert {tuple(colour) for colour in np.asarray(scene._trail.colors).reshape(-1, 3)} == {far}
+        scene.knows_task = False
+        scene.show(shot)
+        assert not scene._task.visible
+    assert first_camera(stage.task)[1] == (3.5, 0.5, 0.0)

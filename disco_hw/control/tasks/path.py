@@ -10,10 +10,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from disco_hw.config import PathTask
 from disco_hw.control.blocks import U
 from disco_hw.control.tasks.terms import has_memory, stage_cost, terminal_cost
-from disco_hw.control.tasks.waypoints import Waypoints
 from disco_hw.model.jit import cast_like, quick_norm, scalar_function, specialise
+from disco_hw.waypoints import Waypoints
 
 Array = NDArray[np.float64]
 
@@ -59,6 +60,7 @@ class Path:
     speed_m_s: float = 0.2
     _table: Array = field(init=False, repr=False)
     _closed: bool = field(init=False, repr=False)
+    _spacing_m: float = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         places = self.waypoints.places_m
@@ -75,6 +77,12 @@ class Path:
         along_y = np.append(step_y / length, (step_y / length)[0 if closed else -1])
         object.__setattr__(self, "_table", np.column_stack([x, y, along_x, along_y]))
         object.__setattr__(self, "_closed", closed)
+        object.__setattr__(self, "_spacing_m", float(distance[-1]) / count)
+
+    @classmethod
+    def from_config(cls, task: PathTask) -> Path:
+        """The path of robot.toml with the way-points that were read for it."""
+        return cls(Waypoints(np.array(task.points)), task.speed_m_s)
 
     @property
     def origin_m(self) -> tuple[float, float]:
@@ -95,7 +103,7 @@ class Path:
     @property
     def spacing_m(self) -> float:
         """Arc length between two entries of the table."""
-        return self._length_m() / (len(self._table) - 1)
+        return self._spacing_m
 
     def terms(
         self, time_s: float, x_m: float, y_m: float, memory: float | None, step_s: float, horizon: int
@@ -108,23 +116,18 @@ class Path:
         per_m, speed_per_entry, slow_per_entry = f32(1.0 / spacing), f32(spacing / step_s), f32(spacing / SLOW_DOWN_S)
         x, y, along_x, along_y = columns
         terms = PathTerms(x, y, along_x, along_y, last, self._closed, per_m, speed, speed_per_entry, slow_per_entry)
-        return terms, self._place(x_m, y_m, memory)
+        return terms, self.place(x_m, y_m, memory)
 
-    def _length_m(self) -> float:
-        return float(np.hypot(*np.diff(self.waypoints.places_m, axis=0).T).sum())
-
-    def _place(self, x_m: float, y_m: float, memory: float | None) -> float:
-        """Entry nearest to a position: near the last one, or anywhere if there was none or the path is lost."""
-        last = len(self._table) - 1
-        distance = np.hypot(self._table[:, 0] - x_m, self._table[:, 1] - y_m)
-        if memory is not None:
-            spacing = self.spacing_m
-            window = np.arange(round(memory - LOOK_BACK_M / spacing), round(memory + LOOK_AHEAD_M / spacing) + 1)
+    def place(self, x_m: float, y_m: float, before: float | None) -> float:
+        """Entry of the table nearest to a position: near the one before, or anywhere without one or off the path."""
+        last, spacing = len(self._table) - 1, self._spacing_m
+        if before is not None:
+            window = np.arange(round(before - LOOK_BACK_M / spacing), round(before + LOOK_AHEAD_M / spacing) + 1)
             window = np.unique(window % last if self._closed else np.clip(window, 0, last))
-            nearest = window[np.argmin(distance[window])]
-            if distance[nearest] < LOST_M:
-                return float(nearest)
-        return float(np.argmin(distance))
+            distance = np.hypot(self._table[window, 0] - x_m, self._table[window, 1] - y_m)
+            if distance.min() < LOST_M:
+                return float(window[np.argmin(distance)])
+        return float(np.argmin(np.hypot(self._table[:, 0] - x_m, self._table[:, 1] - y_m)))
 
     def instant_cost(self, time_s: float, x_m: float, y_m: float, forward_m_s: float) -> float:
         """Distance to the path and error of the longitudinal speed, as one length."""

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.control.tasks.terms import has_memory, stage_cost, terminal_cost
-from disco_hw.control.tasks.waypoints import Waypoints
 from disco_hw.model.jit import cast_like, quick_norm, specialise
+from disco_hw.waypoints import Waypoints
 
 Array = NDArray[np.float64]
 

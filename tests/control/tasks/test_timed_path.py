@@ -8,8 +8,8 @@ import pytest
 from disco_hw.control import Disco, DiscoSettings, PlannerState, WheelLimits
 from disco_hw.control.experiments.plant import Plant
 from disco_hw.control.tasks.timed_path import TimedPath
-from disco_hw.control.tasks.waypoints import Waypoints
 from disco_hw.model import load_model
+from disco_hw.waypoints import Waypoints
 
 MODEL = load_model(FilePath(__file__).parents[3] / "disco_hw/robots/wombot_model.toml")
 MEAN = {"wheel_radius_m": 0.061, "axial_distance_m": 0.415, "x_icr_m": 0.238}

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from disco_hw.control.tasks.waypoints import load_waypoints
 from disco_hw.errors import InputError
+from disco_hw.waypoints import load_waypoints, way_points_to_follow
 
 
 def read(tmp_path, text):
@@ -23,9 +23,9 @@ def test_columns_by_name_in_any_order_others_ignored(tmp_path):
 @pytest.mark.parametrize(
     ("text", "fault"),
     [
-        ("", "column x_m: missing; the first line must name x_m and y_m"),
+        ("", "line 1: column x_m: missing; name x_m and y_m there"),
         ("x_m,y\n0,0\n1,1\n", "column y_m: missing"),
-        ("x_m,y_m\n0,0\n", "only 1 way-point; write at least two"),
+        ("x_m,y_m\n0,0\n", "1 way-points; write at least two"),
         ("x_m,y_m\n0,0\n1,one\n", "line 3: y_m: 'one' is not a finite number; write one"),
         ("x_m,y_m\n0,0\nnan,1\n", "line 3: x_m: 'nan' is not a finite number"),
         ("x_m,y_m\n0,0\n1\n", "line 3: y_m: None is not a finite number"),
@@ -42,3 +42,27 @@ def test_faults_are_told_in_one_line(tmp_path, text, fault):
 def test_missing_file(tmp_path):
     with pytest.raises(InputError, match="cannot be read"):
         load_waypoints(tmp_path / "no.csv")
+
+
+def test_lines_are_counted_as_an_editor_does_and_a_spreadsheets_mark_is_no_name(tmp_path):
+    with pytest.raises(InputError, match="line 5: x_m: 'no' is not"):
+        read(tmp_path, "x_m,y_m\n\n0,0\n\nno,1\n")
+    found = read(tmp_path, "\ufeffx_m, y_m\n0, 0\n1, 2\n")
+    np.testing.assert_array_equal(found.places_m, [[0.0, 0.0], [1.0, 2.0]])
+
+
+@pytest.mark.parametrize(
+    ("text", "fault"),
+    [
+        ("x_m,y_m,t_s\n0,0,0\n1,1,1\n", "line 1: column t_s: the robot follows at task.speed_m_s; remove the column"),
+        ("x_m,y_m\n0,0\n0.05,0\n", "0.05 m long; between 0.1 and 2000 m"),
+        ("x_m,y_m\n0,0\n1e30,0\n", "long; between 0.1 and 2000 m"),
+        ("x_m,y_m\n" + "".join(f"{0.001 * k},0\n" for k in range(10_001)), "10001 way-points; write at most 10000"),
+    ],
+)
+def test_what_a_robot_cannot_follow_is_refused(tmp_path, text, fault):
+    path = tmp_path / "path.csv"
+    path.write_text(text)
+    with pytest.raises(InputError, match=fault) as error:
+        way_points_to_follow(path)
+    assert str(path) in str(error.value)

@@ -1,0 +1,33 @@
+"""The files of the robot that a log was recorded with: into the log, and out of it again."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from disco_hw.errors import InputError
+from disco_hw.log.link import Attachment
+from disco_hw.log.provenance import MODEL_TOML, PATH_CSV, ROBOT_TOML, attachment
+from disco_hw.log.reader import Log
+from disco_hw.robot_setup import Setup, load_setup
+
+
+def kept_files(setup: Setup) -> list[Attachment]:
+    """Copies of robot.toml, the model and the task's path for a log; raises LogError if one cannot be read."""
+    named = ((ROBOT_TOML, setup.robot_file), (MODEL_TOML, setup.model_file), (PATH_CSV, setup.path_file))
+    return [attachment(file, name) for name, file in named if file is not None]
+
+
+def setup_of_log(log: Log, remedy: str) -> Setup:
+    """The robot as it was when a log was recorded, from the copies in it; no other file is read.
+
+    The files that the result names are gone. Raises InputError, with `remedy`, for a log without a robot.toml.
+    """
+    names = log.attachment_names()
+    if ROBOT_TOML not in names:
+        raise InputError(f"{log.path}: carries no {ROBOT_TOML}; {remedy}")
+    with TemporaryDirectory(prefix="disco-hw-log-") as scratch:
+        files = {name: Path(scratch) / name for name in (ROBOT_TOML, MODEL_TOML, PATH_CSV) if name in names}
+        for name, file in files.items():
+            file.write_bytes(log.attachment(name))
+        return load_setup(files[ROBOT_TOML], files.get(MODEL_TOML), path_file=files.get(PATH_CSV))
