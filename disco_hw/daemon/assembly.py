@@ -23,6 +23,8 @@ from drivers.reference import ReferenceDriver
 from drivers.types import Driver, Transport
 from firmware_protocol.codec import Codec
 
+_REHEARSALS = 5
+
 
 def make_planner(config: RobotConfig, model: Model) -> control.Disco:
     """DISCO for this robot's task, compiled and warmed up: takes seconds."""
@@ -54,9 +56,16 @@ def make_pipeline(config: RobotConfig, model: Model, planner: Planner) -> Pipeli
 
 
 def make_adaptation(setup: Setup, pipeline: Pipeline, link: AdapterLink) -> CheckedAdaptation:
-    """Adaptation of this robot's belief over its geometry; raises InputError where the model does not allow it."""
+    """Adaptation of this robot's belief over its geometry; raises InputError where the model does not allow it.
+
+    `pipeline` has taken no step yet.
+    """
     check_adaptable(setup.model, setup.config.control.uncertainty)
     believed = believed_geometry(setup.model)
+    # What runs for the first time loads code: three times as long as later, in a tick that then must not be late.
+    for _ in range(_REHEARSALS):
+        put_in_force(pipeline, setup.model, believed)
+        put_in_force(pipeline, setup.model, None)
     return CheckedAdaptation(
         link,
         BeliefGuard(believed, *possible_range(setup.config.prior)),

@@ -34,6 +34,8 @@ class RewindBuffer:
         self._events: list[Event] = [first]
         # States after the first len(_states) events; never empty. The rest are outdated and run on demand.
         self._states: list[FilterState] = [pose_filter.begin(first)]
+        # The first so many of them are of a filter before the present one, which adopts those that it goes on from.
+        self._before = 0
         self._newest_wheels = first
 
     @property
@@ -52,7 +54,7 @@ class RewindBuffer:
     def set_filter(self, pose_filter: PoseFilter) -> None:
         """Go on with a filter of other parameters: what is run again from now on, late poses included, is run by it."""
         self._filter = pose_filter
-        self._states = [pose_filter.adopt(state) for state in self._states]
+        self._before = len(self._states)
 
     def add_wheels(self, reading: WheelReading) -> None:
         """Append a reading newer than all before."""
@@ -98,14 +100,19 @@ class RewindBuffer:
 
     def _outdate(self, index: int) -> None:
         del self._states[index:]
+        self._before = min(self._before, index)
 
     def _run(self, index: int) -> FilterState:
         while len(self._states) <= index:
             self._states.append(self._step(len(self._states)))
-        return self._states[index]
+        return self._state(index)
+
+    def _state(self, index: int) -> FilterState:
+        state = self._states[index]
+        return self._filter.adopt(state) if index < self._before else state
 
     def _step(self, index: int) -> FilterState:
-        state, event = self._states[index - 1], self._events[index]
+        state, event = self._state(index - 1), self._events[index]
         if isinstance(event, WheelReading):
             return self._filter.move(state, event.t_ns, event.left_rad, event.right_rad, event.after_gap)
         if event.t_ns >= self._newest_wheels.t_ns:
@@ -134,3 +141,4 @@ class RewindBuffer:
             self._poses -= sum(isinstance(event, Measurement) for event in self._events[:count])
             del self._events[:count]
             del self._states[:count]
+            self._before = max(self._before - count, 0)
