@@ -25,8 +25,9 @@ Array = NDArray[np.float64]
 class Evidence:
     """Of poses at `t_s` (P,): `information` (P, 3, 3) and `score` (P, 3) of beta, `square` (P,) of what was measured.
 
-    Everything is whitened. `values` (P,) counts the measured numbers: 3, or 0 at the start of a run; `moving_s` (P,) is
-    the time in motion since the pose before.
+    Everything is whitened. `rows` (P, 3, 4): of x, y and yaw what was measured, and its coefficients of beta. `values`
+    (P,) counts the measured numbers: 3, or 0 at the start of a run; `moving_s` (P,) is the time in motion since the
+    pose before.
     """
 
     t_s: Array
@@ -35,6 +36,7 @@ class Evidence:
     square: Array
     values: Array
     moving_s: Array
+    rows: Array
 
     def part(self, chosen: NDArray[np.bool_]) -> Evidence:
         """The evidence of some of the poses."""
@@ -45,6 +47,7 @@ class Evidence:
             self.square[chosen],
             self.values[chosen],
             self.moving_s[chosen],
+            self.rows[chosen],
         )
 
 
@@ -70,7 +73,9 @@ def evidence(drive: Excitation, noise: Noise) -> Evidence:
     information[:, 2, 2] = yaw[:, 1] ** 2
     score = np.column_stack([x[:, 1:] * x[:, :1] + y[:, 1:] * y[:, :1], yaw[:, 1] * yaw[:, 0]])
     square = x[:, 0] ** 2 + y[:, 0] ** 2 + yaw[:, 0] ** 2
-    return Evidence(drive.t_s, information, score, square, np.where(inside, 3.0, 0.0), drive.moving_s)
+    rows = np.zeros((drive.t_s.size, 3, 4))
+    rows[:, 0, :3], rows[:, 1, :3], rows[:, 2, 0], rows[:, 2, 3] = x, y, yaw[:, 0], yaw[:, 1]
+    return Evidence(drive.t_s, information, score, square, np.where(inside, 3.0, 0.0), drive.moving_s, rows)
 
 
 def _whitened(columns: Array, factor: Whitening) -> Array:

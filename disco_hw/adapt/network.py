@@ -32,6 +32,7 @@ _SHORTEST_HOLD_S, _LONGEST_HOLD_S = 1.0, 12.0
 _SLEW_RAD_S2 = 5.0
 _LARGEST_TARGET = 8.0
 _NOISE_SPREAD = 0.4
+_SLOW_S = 1.5
 _MISFIT_MARGIN = 1.2
 
 
@@ -121,7 +122,7 @@ def train_network(training: Training, noise: Noise, model: Model) -> WindowNetwo
 
 
 def _statistics(window: Evidence, training: Training) -> tuple[Array, Array, Array]:
-    """Statistics (11,) of a window, and the closed-form estimate that they are relative to: centre, root (3, 3)."""
+    """Statistics (13,) of a window, and the closed-form estimate that they are relative to: centre, root (3, 3)."""
     middle = 0.5 * (training.low + training.high)
     prior_mean, prior = to_linear(middle, np.diag((_VAGUE * np.array([1.0, middle[1], middle[2]])) ** 2))
     precision = np.linalg.inv(prior)
@@ -136,15 +137,34 @@ def _statistics(window: Evidence, training: Training) -> tuple[Array, Array, Arr
     scaled = (centre - middle) / sizes
     duration = np.log(max(float(window.moving_s.sum()), 0.1))
     misfit = np.log(max(_misfit(window), 1e-3))
-    return np.concatenate([scaled, np.log(std / sizes), correlation, [misfit, duration]]), centre, np.asarray(root)
+    slow = np.log(np.maximum(_slow_misfit(window), 1e-3))
+    statistics = np.concatenate([scaled, np.log(std / sizes), correlation, [misfit, duration], slow])
+    return statistics, centre, np.asarray(root)
 
 
 def _misfit(window: Evidence) -> float:
     """Mean square of what the best geometry leaves of a window."""
-    information = window.information.sum(axis=0) + 1e-9 * np.eye(3)
-    score = window.score.sum(axis=0)
-    left = window.square.sum() - score @ np.linalg.solve(information, score)
+    left = window.square.sum() - window.score.sum(axis=0) @ _best(window)
     return float(left / max(window.values.sum() - 3.0, 1.0))
+
+
+def _slow_misfit(window: Evidence) -> Array:
+    """The same of its slow part, position and yaw (2,): 1 if slip is what it was taken to be.
+
+    From pose to pose the sensor's noise drowns slip, over a second or two slip is most of what is left; sums of what is
+    white have the variance of its parts.
+    """
+    left = window.rows[:, :, 0] - window.rows[:, :, 1:] @ _best(window)
+    period_s = float(np.median(np.diff(window.t_s)))
+    count = min(max(round(_SLOW_S / period_s), 1), left.shape[0] // 2)
+    sums = np.cumsum(left, axis=0)
+    power = np.mean((sums[count:] - sums[:-count]) ** 2, axis=0) / count
+    return np.array([0.5 * (power[0] + power[1]), power[2]])
+
+
+def _best(window: Evidence) -> Array:
+    """The linear coordinates (3,) that leave least of a window."""
+    return np.linalg.solve(window.information.sum(axis=0) + 1e-9 * np.eye(3), window.score.sum(axis=0))
 
 
 def _random_drive(training: Training, rng: np.random.Generator) -> Excitation:
