@@ -36,7 +36,7 @@ endif
 test: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy
+	$(BIN)/mypy & types=$$!; $(BIN)/python -m tools.compile_kernels & kernels=$$!; wait $$types && wait $$kernels
 	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 3 --dist worksteal -m "not long"
 
 # Closed loops, studies, clusters and browsers: as much again.

@@ -13,7 +13,7 @@ from tests.hil.stack import READY_TIMEOUT_S, disco, running_stack, write_robot_f
 pytestmark = pytest.mark.hil
 
 
-@pytest.mark.parametrize("link", ["can", "serial"])
+@pytest.mark.parametrize("link", ["can", pytest.param("serial", marks=pytest.mark.long)])
 def test_check_passes_with_a_robot_and_says_what_it_measured(tmp_path, link):
     robot_file = write_robot_file(tmp_path, link=link)
     with disco_hw_process("virtual robot", ["sim", str(robot_file)], tmp_path / "sim.txt"):

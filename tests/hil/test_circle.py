@@ -11,7 +11,7 @@ import pytest
 pytestmark = pytest.mark.hil
 
 
-@pytest.mark.parametrize(("link", "plant_seed"), [("can", 3), ("serial", 4)])
+@pytest.mark.parametrize(("link", "plant_seed"), [("can", 3), pytest.param("serial", 4, marks=pytest.mark.long)])
 def test_demo_follows_the_circle(tmp_path, link, plant_seed):
     result = subprocess.run(
         [

@@ -28,8 +28,15 @@ def estop(robot_file, *arguments: str) -> tuple[int, str]:
     return result.returncode, result.stdout + result.stderr
 
 
-@pytest.mark.parametrize("link", ["can", "serial"])
-@pytest.mark.parametrize("daemon", ["healthy", "frozen"])
+@pytest.mark.parametrize(
+    ("daemon", "link"),
+    [
+        ("healthy", "can"),
+        ("frozen", "serial"),
+        pytest.param("healthy", "serial", marks=pytest.mark.long),
+        pytest.param("frozen", "can", marks=pytest.mark.long),
+    ],
+)
 def test_estop_stops_and_latches(tmp_path, link, daemon):
     with running_stack(tmp_path, link=link) as stack:
         stack.drive()

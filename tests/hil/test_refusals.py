@@ -59,10 +59,10 @@ sys.exit(run_virtual_robot(VirtualRobotOptions(
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ("protocol_major=2", ["protocol", "2"]),
+        pytest.param("protocol_major=2", ["protocol", "2"], marks=pytest.mark.long),
         ("dbc_hash=0x12345678", ["12345678"]),
         ("max_wheel_speed_rad_s=4.0", ["max_wheel_speed_rad_s", "4"]),
-        ("ticks_per_rev=1024", ["ticks_per_rev", "1024"]),
+        pytest.param("ticks_per_rev=1024", ["ticks_per_rev", "1024"], marks=pytest.mark.long),
     ],
 )
 def test_a_firmware_that_does_not_fit_is_refused_in_words(tmp_path, change, words):
@@ -113,7 +113,7 @@ def forge(codec: Codec, rng: random.Random, session: int, counter: int) -> tuple
     return right.can_id, bytes(data)
 
 
-@pytest.mark.parametrize("armed", [False, True])
+@pytest.mark.parametrize("armed", [pytest.param(False, marks=pytest.mark.long), True])
 def test_forgeries_on_the_bus_never_turn_a_wheel(tmp_path, armed):
     rng = random.Random(5)
     codec = Codec()

@@ -42,9 +42,9 @@ def mend(stack, fault: str) -> None:
         ("can", "SIGSTOP"),
         ("can", "unplug"),
         ("can", "bus_off"),
-        ("can", "babble_commands"),
+        pytest.param("can", "babble_commands", marks=pytest.mark.long),
         ("can", "babble_flood"),
-        ("serial", "SIGKILL"),
+        pytest.param("serial", "SIGKILL", marks=pytest.mark.long),
         ("serial", "unplug"),
     ],
 )
