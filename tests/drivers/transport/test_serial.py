@@ -114,7 +114,7 @@ def test_a_device_that_reads_nothing_blocks_nobody(transport, terminal):
     wait_until(lambda: median_send_s(transport) and transport.stats.expired)
     assert median_send_s(transport) < 0.01, "shorter by far than one write that waits for room"
     assert transport.stats.transmit_queue_full
-    wait_until(lambda: "takes no more bytes" in (transport.last_error or ""))
+    wait_until(lambda: median_send_s(transport) and "takes no more bytes" in (transport.last_error or ""), 60.0)
     assert transport.state is LinkState.UP
     time.sleep(0.1)
     terminal.received.clear()
