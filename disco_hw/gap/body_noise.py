@@ -8,12 +8,14 @@ the measured motion only, so whitening is linear.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.model.jit import kernel_function
+from disco_hw.model.jit import kernel_function, scalar_function
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -83,134 +85,175 @@ class Motion:
 
 @dataclass(frozen=True, slots=True)
 class BodyGains:
-    """The filter's transition, gain and whitening at every sample."""
+    """The filter's transition (P, 9) by its entries, gain (P, 9, 3) and whitening (P, 3, 3) at every sample."""
 
     transition: Array
     gain: Array
     scale: Array
-    log_scale: Array
     restart: Mask
     use: Mask
 
 
+@scalar_function
+def _transit(
+    t: Any, noise: Any, dt: float, dx: float, dy: float, cosine: float, sine: float, moving: float, speed: float,
+    rate: float,
+) -> None:  # fmt: skip
+    """How errors go over into the next sample: x and y from yaw and slip, yaw from slip, what slip and noise keep."""
+    forward = (noise[3] * moving + noise[7] * abs(speed)) * dt
+    left = (noise[4] * moving + noise[7] * abs(speed)) * dt
+    t[0], t[1], t[2] = -dy, cosine * forward, -sine * left
+    t[3], t[4], t[5] = dx, sine * forward, cosine * left
+    t[6] = (noise[5] * moving + noise[7] * abs(rate)) * dt
+    t[7], t[8] = math.exp(-dt / noise[6]), math.exp(-dt / noise[8])
+
+
+@scalar_function
+def _begin(c: Any, noise: Any) -> None:
+    """Covariance of a window's first sample."""
+    c[:, :] = 0.0
+    for i in range(3):
+        pose = noise[1] if i == 2 else noise[0]
+        c[i, i] = _START_M**2 if i < 2 else _START_RAD**2
+        c[3 + i, 3 + i] = 1.0
+        c[6 + i, 6 + i] = pose * pose
+
+
+@scalar_function
+def _spread(c: Any, t: Any, noise: Any) -> None:
+    """Covariance of the next sample, of which nothing is known yet; what is zero in the transition is left out."""
+    for j in range(9):
+        c[0, j] += t[0] * c[2, j] + t[1] * c[3, j] + t[2] * c[4, j]
+        c[1, j] += t[3] * c[2, j] + t[4] * c[3, j] + t[5] * c[4, j]
+        c[2, j] += t[6] * c[5, j]
+    for i in range(3):
+        for j in range(9):
+            c[3 + i, j] *= t[7]
+            c[6 + i, j] *= t[8]
+    for i in range(9):
+        c[i, 0] += t[0] * c[i, 2] + t[1] * c[i, 3] + t[2] * c[i, 4]
+        c[i, 1] += t[3] * c[i, 2] + t[4] * c[i, 3] + t[5] * c[i, 4]
+        c[i, 2] += t[6] * c[i, 5]
+        for j in range(3):
+            c[i, 3 + j] *= t[7]
+            c[i, 6 + j] *= t[8]
+    for i in range(3):
+        pose = noise[1] if i == 2 else noise[0]
+        c[i, i] += 1e-12
+        c[3 + i, 3 + i] += 1.0 - t[7] * t[7]
+        c[6 + i, 6 + i] += pose * pose * (1.0 - t[8] * t[8])
+
+
+@scalar_function
+def _weigh(c: Any, stamp: float, vx: float, vy: float, rate: float, m: Any) -> float:
+    """Whitening m (3, 3), lower, of the next surprise, and the logarithm of its determinant."""
+    s = stamp * stamp
+    s00 = c[0, 0] + c[6, 0] + c[0, 6] + c[6, 6] + s * vx * vx + 1e-10
+    s11 = c[1, 1] + c[7, 1] + c[1, 7] + c[7, 7] + s * vy * vy + 1e-10
+    s22 = c[2, 2] + c[8, 2] + c[2, 8] + c[8, 8] + s * rate * rate + 1e-10
+    s10 = c[1, 0] + c[7, 0] + c[1, 6] + c[7, 6] + s * vy * vx
+    s20 = c[2, 0] + c[8, 0] + c[2, 6] + c[8, 6] + s * rate * vx
+    s21 = c[2, 1] + c[8, 1] + c[2, 7] + c[8, 7] + s * rate * vy
+    l00 = math.sqrt(s00)
+    l10, l20 = s10 / l00, s20 / l00
+    l11 = math.sqrt(s11 - l10 * l10)
+    l21 = (s21 - l20 * l10) / l11
+    l22 = math.sqrt(s22 - l20 * l20 - l21 * l21)
+    m[0, 0], m[1, 1], m[2, 2] = 1.0 / l00, 1.0 / l11, 1.0 / l22
+    m[1, 0] = -l10 * m[0, 0] * m[1, 1]
+    m[2, 1] = -l21 * m[1, 1] * m[2, 2]
+    m[2, 0] = -(l20 * m[0, 0] + l21 * m[1, 0]) * m[2, 2]
+    m[0, 1] = m[0, 2] = m[1, 2] = 0.0
+    return -math.log(l00 * l11 * l22)
+
+
+@scalar_function
+def _learn(c: Any, m: Any, w: Any, gain: Any) -> None:
+    """Gain (9, 3) of a sample, P H' S^-1 with S^-1 = m' m, and covariance c after it; w (3, 9) is scratch."""
+    for i in range(9):
+        h0, h1, h2 = c[0, i] + c[6, i], c[1, i] + c[7, i], c[2, i] + c[8, i]
+        w[0, i] = m[0, 0] * h0
+        w[1, i] = m[1, 0] * h0 + m[1, 1] * h1
+        w[2, i] = m[2, 0] * h0 + m[2, 1] * h1 + m[2, 2] * h2
+    for i in range(9):
+        gain[i, 0] = m[0, 0] * w[0, i] + m[1, 0] * w[1, i] + m[2, 0] * w[2, i]
+        gain[i, 1] = m[1, 1] * w[1, i] + m[2, 1] * w[2, i]
+        gain[i, 2] = m[2, 2] * w[2, i]
+    for i in range(9):
+        a, b, d = w[0, i], w[1, i], w[2, i]
+        for j in range(9):
+            c[i, j] -= a * w[0, j] + b * w[1, j] + d * w[2, j]
+
+
+@scalar_function
+def _drift(e: Any, t: Any) -> None:
+    """Expected errors (9,) of the next sample."""
+    e[0] += t[0] * e[2] + t[1] * e[3] + t[2] * e[4]
+    e[1] += t[3] * e[2] + t[4] * e[3] + t[5] * e[4]
+    e[2] += t[6] * e[5]
+    for i in range(3):
+        e[3 + i] *= t[7]
+        e[6 + i] *= t[8]
+
+
+@scalar_function
+def _surprise(e: Any, gain: Any, m: Any, x: float, y: float, yaw: float) -> tuple[float, float, float]:
+    """Whitened difference of a residual from what was expected, which then learns from it."""
+    a, b, c = x - e[0] - e[6], y - e[1] - e[7], yaw - e[2] - e[8]
+    for i in range(9):
+        e[i] += gain[i, 0] * a + gain[i, 1] * b + gain[i, 2] * c
+    return m[0, 0] * a, m[1, 0] * a + m[1, 1] * b, m[2, 0] * a + m[2, 1] * b + m[2, 2] * c
+
+
 @kernel_function
-def _gains(  # noqa: PLR0912, PLR0915 - one recursion; cut in pieces it would only be slower
-    logs: Array,
-    dt: Array,
-    dx: Array,
-    dy: Array,
-    yaw: Array,
-    moving: Array,
-    speed: Array,
-    rate: Array,
-    restart: Array,
-    use: Array,
-    transition: Array,
-    gain: Array,
-    scale: Array,
-    log_scale: Array,
-) -> None:
-    pose = (math.exp(logs[0]), math.exp(logs[0]), math.exp(logs[1]))
-    stamp, correlation, relative = math.exp(logs[2]), math.exp(logs[6]), math.exp(logs[7])
-    slip = (math.exp(logs[3]), math.exp(logs[4]), math.exp(logs[5]))
-    noise_correlation = math.exp(logs[8])
-    covariance = np.zeros((9, 9))
-    moved = np.zeros((9, 9))
-    f = np.zeros((9, 9))
-    s = np.zeros((3, 3))
-    lower = np.zeros((3, 3))
+def _gains(
+    noise: Array, dt: Array, dx: Array, dy: Array, cosine: Array, sine: Array, moving: Array, speed: Array,
+    rate: Array, restart: Array, use: Array, transition: Array, gain: Array, scale: Array,
+) -> None:  # fmt: skip
+    c, w = np.zeros((9, 9)), np.zeros((3, 9))
     for k in range(dt.shape[0]):
-        cosine, sine = math.cos(yaw[k]), math.sin(yaw[k])
-        amount = (
-            slip[0] * moving[k] + relative * abs(speed[k]),
-            slip[1] * moving[k] + relative * abs(speed[k]),
-            slip[2] * moving[k] + relative * abs(rate[k]),
-        )
-        f[:, :] = 0.0
         if restart[k]:
-            covariance[:, :] = 0.0
-            for i in range(3):
-                covariance[i, i] = _START_M**2 if i < 2 else _START_RAD**2
-                covariance[3 + i, 3 + i] = 1.0
-                covariance[6 + i, 6 + i] = pose[i] ** 2
+            transition[k] = 0.0
+            _begin(c, noise)
         else:
-            keep, keep_noise = math.exp(-dt[k] / correlation), math.exp(-dt[k] / noise_correlation)
-            for i in range(3):
-                f[i, i] = 1.0
-                f[3 + i, 3 + i] = keep
-                f[6 + i, 6 + i] = keep_noise
-            f[0, 2], f[1, 2] = -dy[k], dx[k]
-            f[0, 3], f[0, 4] = cosine * amount[0] * dt[k], -sine * amount[1] * dt[k]
-            f[1, 3], f[1, 4] = sine * amount[0] * dt[k], cosine * amount[1] * dt[k]
-            f[2, 5] = amount[2] * dt[k]
-            for i in range(9):
-                for j in range(9):
-                    total = 0.0
-                    if i < 3:
-                        for m in range(6):
-                            total += f[i, m] * covariance[m, j]
-                    else:
-                        total = f[i, i] * covariance[i, j]
-                    moved[i, j] = total
-            for i in range(9):
-                for j in range(9):
-                    total = 0.0
-                    if j < 3:
-                        for m in range(6):
-                            total += moved[i, m] * f[j, m]
-                    else:
-                        total = moved[i, j] * f[j, j]
-                    covariance[i, j] = total
-            for i in range(3):
-                covariance[i, i] += 1e-12
-                covariance[3 + i, 3 + i] += 1.0 - keep * keep
-                covariance[6 + i, 6 + i] += pose[i] ** 2 * (1.0 - keep_noise * keep_noise)
-        transition[k] = f
-        vx, vy = cosine * speed[k], sine * speed[k]
-        late = (vx, vy, rate[k])
-        for i in range(3):
-            for j in range(3):
-                s[i, j] = (
-                    covariance[i, j]
-                    + covariance[6 + i, j]
-                    + covariance[i, 6 + j]
-                    + covariance[6 + i, 6 + j]
-                    + stamp * stamp * late[i] * late[j]
-                )
-            s[i, i] += 1e-10
-        # Cholesky factor of S and its inverse.
-        l00 = math.sqrt(s[0, 0])
-        l10, l20 = s[1, 0] / l00, s[2, 0] / l00
-        l11 = math.sqrt(s[1, 1] - l10 * l10)
-        l21 = (s[2, 1] - l20 * l10) / l11
-        l22 = math.sqrt(s[2, 2] - l20 * l20 - l21 * l21)
-        lower[0, 0], lower[1, 1], lower[2, 2] = 1.0 / l00, 1.0 / l11, 1.0 / l22
-        lower[1, 0] = -l10 * lower[0, 0] * lower[1, 1]
-        lower[2, 1] = -l21 * lower[1, 1] * lower[2, 2]
-        lower[2, 0] = -(l20 * lower[0, 0] + l21 * lower[1, 0]) * lower[2, 2]
-        lower[0, 1] = lower[0, 2] = lower[1, 2] = 0.0
-        scale[k] = lower
-        log_scale[k] = -math.log(l00) - math.log(l11) - math.log(l22)
-        gain[k] = 0.0
+            _transit(
+                transition[k], noise, dt[k], dx[k], dy[k], cosine[k], sine[k], moving[k], speed[k], rate[k]
+            )  # fmt: skip
+            _spread(c, transition[k], noise)
+        _weigh(c, noise[2], cosine[k] * speed[k], sine[k] * speed[k], rate[k], scale[k])
+        if use[k]:
+            _learn(c, scale[k], w, gain[k])
+        else:
+            gain[k] = 0.0
+
+
+@kernel_function
+def _likelihood(
+    noise: Array, dt: Array, dx: Array, dy: Array, cosine: Array, sine: Array, moving: Array, speed: Array,
+    rate: Array, restart: Array, use: Array, residual: Array, out: Array,
+) -> float:  # fmt: skip
+    c, w, gain, m = np.zeros((9, 9)), np.zeros((3, 9)), np.zeros((9, 3)), np.zeros((3, 3))
+    t, e = np.zeros(9), np.zeros(9)
+    total = 0.0
+    for k in range(dt.shape[0]):
+        if restart[k]:
+            e[:] = 0.0
+            _begin(c, noise)
+        else:
+            _transit(t, noise, dt[k], dx[k], dy[k], cosine[k], sine[k], moving[k], speed[k], rate[k])
+            _spread(c, t, noise)
+            _drift(e, t)
+        out[k, 0] = out[k, 1] = out[k, 2] = 0.0
         if not use[k]:
             continue
-        # Gain P H' S^-1 with S^-1 = lower' lower.
-        for i in range(9):
-            h = (
-                covariance[i, 0] + covariance[i, 6],
-                covariance[i, 1] + covariance[i, 7],
-                covariance[i, 2] + covariance[i, 8],
-            )
-            w0 = lower[0, 0] * h[0]
-            w1 = lower[1, 0] * h[0] + lower[1, 1] * h[1]
-            w2 = lower[2, 0] * h[0] + lower[2, 1] * h[1] + lower[2, 2] * h[2]
-            moved[i, 0], moved[i, 1], moved[i, 2] = w0, w1, w2
-            gain[k, i, 0] = lower[0, 0] * w0 + lower[1, 0] * w1 + lower[2, 0] * w2
-            gain[k, i, 1] = lower[1, 1] * w1 + lower[2, 1] * w2
-            gain[k, i, 2] = lower[2, 2] * w2
-        for i in range(9):
-            for j in range(9):
-                covariance[i, j] -= moved[i, 0] * moved[j, 0] + moved[i, 1] * moved[j, 1] + moved[i, 2] * moved[j, 2]
+        weight = _weigh(c, noise[2], cosine[k] * speed[k], sine[k] * speed[k], rate[k], m)
+        _learn(c, m, w, gain)
+        white = _surprise(e, gain, m, residual[k, 0], residual[k, 1], residual[k, 2])
+        # The first sample of a window only says where it starts.
+        if not restart[k]:
+            out[k, 0], out[k, 1], out[k, 2] = white
+            total += weight
+    return total
 
 
 @kernel_function
@@ -222,49 +265,44 @@ def _whiten(
         if restart[k]:
             e[:] = 0.0
         else:
-            f = transition[k]
-            x = e[0] + f[0, 2] * e[2] + f[0, 3] * e[3] + f[0, 4] * e[4]
-            y = e[1] + f[1, 2] * e[2] + f[1, 3] * e[3] + f[1, 4] * e[4]
-            yaw = e[2] + f[2, 5] * e[5]
-            e[0], e[1], e[2] = x, y, yaw
-            for i in range(3, 9):
-                e[i] *= f[i, i]
-        if not use[k]:
+            _drift(e, transition[k])
+        if use[k]:
+            out[k, 0], out[k, 1], out[k, 2] = _surprise(
+                e, gain[k], scale[k], residual[k, 0], residual[k, 1], residual[k, 2]
+            )
+        else:
             out[k, 0] = out[k, 1] = out[k, 2] = 0.0
-            continue
-        a = residual[k, 0] - e[0] - e[6]
-        b = residual[k, 1] - e[1] - e[7]
-        c = residual[k, 2] - e[2] - e[8]
-        m = scale[k]
-        out[k, 0] = m[0, 0] * a
-        out[k, 1] = m[1, 0] * a + m[1, 1] * b
-        out[k, 2] = m[2, 0] * a + m[2, 1] * b + m[2, 2] * c
-        for i in range(9):
-            e[i] += gain[k, i, 0] * a + gain[k, i, 1] * b + gain[k, i, 2] * c
+
+
+def _along(motion: Motion) -> tuple[Array | Mask, ...]:
+    """A motion as the kernels take it."""
+    return (
+        motion.dt_s, motion.dx_m, motion.dy_m, np.cos(motion.yaw_rad), np.sin(motion.yaw_rad), motion.moving,
+        motion.speed_m_s, motion.yaw_rate_rad_s, motion.restart, motion.use,
+    )  # fmt: skip
 
 
 def body_gains(noise: BodyNoise, motion: Motion) -> BodyGains:
     """Transition, gains and whitening for one motion."""
     count = motion.dt_s.size
-    transition, gain = np.zeros((count, STATES, STATES)), np.zeros((count, STATES, 3))
-    scale, log_scale = np.zeros((count, 3, 3)), np.zeros(count)
-    _gains(
-        noise.vector(),
-        motion.dt_s,
-        motion.dx_m,
-        motion.dy_m,
-        motion.yaw_rad,
-        motion.moving,
-        motion.speed_m_s,
-        motion.yaw_rate_rad_s,
-        motion.restart,
-        motion.use,
-        transition,
-        gain,
-        scale,
-        log_scale,
-    )
-    return BodyGains(transition, gain, scale, log_scale, motion.restart, motion.use)
+    transition, gain, scale = np.empty((count, STATES)), np.empty((count, STATES, 3)), np.empty((count, 3, 3))
+    _gains(np.exp(noise.vector()), *_along(motion), transition, gain, scale)
+    return BodyGains(transition, gain, scale, motion.restart, motion.use)
+
+
+def body_likelihood(motion: Motion, residual: Array) -> Callable[[Array], tuple[Array, float]]:
+    """For pose residuals (P, 3) a function of the logarithms of the noise (9,).
+
+    It gives the whitened residuals (P, 3), 0 where none counts, and the sum of the logarithms of their weights: what a
+    likelihood needs, in one go and without keeping the gains.
+    """
+    along = _along(motion)
+
+    def at(logs: Array) -> tuple[Array, float]:
+        out = np.empty(residual.shape)
+        return out, float(_likelihood(np.exp(logs), *along, residual, out))
+
+    return at
 
 
 def whiten_body(residual: Array, gains: BodyGains) -> Array:

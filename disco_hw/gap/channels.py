@@ -16,7 +16,7 @@ from disco_hw.gap.body_noise import BodyGains, BodyNoise, Motion, body_gains, wh
 from disco_hw.gap.free_runs import pose_residual, read_angles, run_body, run_wheels
 from disco_hw.gap.layout import BASE_COUNT, BODY, WHEEL, Layout
 from disco_hw.gap.timeline import CELL_S, Samples, Timeline
-from disco_hw.gap.wheel_noise import WheelGains, WheelNoise, wheel_gains, whiten_wheels
+from disco_hw.gap.wheel_noise import Driven, WheelGains, WheelNoise, wheel_gains, whiten_wheels
 
 WINDOW_S = 3.0
 ONSET_M_S = 0.05
@@ -68,6 +68,7 @@ class WheelChannel:
     """Commands in, wheel angles out; `weight` (E, 2) tames stretches that are noisier than the rest."""
 
     timeline: Timeline
+    driven: Driven
     gains: WheelGains
     weight: Array
     noise: WheelNoise
@@ -93,8 +94,8 @@ class WheelChannel:
         jumps = np.concatenate([[0.0], np.cumsum(line.command_change)])
         between = np.diff(jumps[place.node + 1], prepend=0.0)
         speed = line.speed_rad_s[place.node]
-        gains = wheel_gains(noise, np.maximum(dt, 0.0), speed, np.maximum(between, 0.0), first_of_run | resumed, good)
-        return cls(line, gains, np.ones((place.t_s.size, 2)), noise, geometry)
+        driven = Driven(np.maximum(dt, 0.0), speed, np.maximum(between, 0.0), first_of_run | resumed, good)
+        return cls(line, driven, wheel_gains(noise, driven), np.ones((place.t_s.size, 2)), noise, geometry)
 
     def with_noise(self, noise: WheelNoise) -> WheelChannel:
         """The same data under another noise model, weights reset."""

@@ -102,7 +102,10 @@ def run_wheels(p: Array, geometry: Array, command: Array, extra: Array, first: M
     angle = np.empty_like(command)
     late = WHEEL.at(p, "command_delay.delay_s") / CELL_S
     _run_wheels(wheel_effects(p, geometry), late, command, extra, first, t_s, start, angle)
-    angle *= (1.0 + WHEEL.at(p, "encoder_scale.left"), 1.0 + WHEEL.at(p, "encoder_scale.right"))
+    for side, name in enumerate(("left", "right")):
+        scale = WHEEL.at(p, f"encoder_scale.{name}")
+        if scale != 0.0:
+            angle[:, side] *= 1.0 + scale
     return angle
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from types import MappingProxyType
 from typing import Any
 
@@ -80,10 +81,31 @@ BODY = _layout(
 )
 
 
-def _coefficients(layout: Layout, p: Array, name: str, base: Array) -> tuple[float, ...]:
-    effect = REGISTRY[name]
-    values = np.array([[layout.at(p, f"{name}.{parameter.name}") for parameter in effect.parameters]])
-    return tuple(float(column[0]) for column in effect.coefficients(values, base, CELL_S))
+def _spans(layout: Layout) -> Mapping[str, slice]:
+    """Where each effect's parameters lie, which follow each other."""
+    first: dict[str, int] = {}
+    count: dict[str, int] = {}
+    for k, column in enumerate(layout.columns):
+        name = column.partition(".")[0]
+        first.setdefault(name, k)
+        count[name] = count.get(name, 0) + 1
+    return MappingProxyType({name: slice(first[name], first[name] + count[name]) for name in first})
+
+
+_SPANS: Mapping[bool, Mapping[str, slice]] = MappingProxyType(
+    {layout.of_wheels: _spans(layout) for layout in (WHEEL, BODY)}
+)
+
+
+def _coefficients(layout: Layout, p: Array, name: str, base: tuple[float, ...]) -> tuple[float, ...]:
+    return _kept(name, tuple(p[_SPANS[layout.of_wheels][name]].tolist()), base)
+
+
+# From one free run to the next most effects stay as they are.
+@lru_cache(maxsize=512)
+def _kept(name: str, values: tuple[float, ...], base: tuple[float, ...]) -> tuple[float, ...]:
+    columns = REGISTRY[name].coefficients(np.array([values]), np.array([base]), CELL_S)
+    return tuple(float(column[0]) for column in columns)
 
 
 # The command delay is the free run's own affair, the slope that of the world frame.
@@ -98,16 +120,16 @@ BODY_MOTION = tuple(
 
 def wheel_effects(p: Array, geometry: Array) -> Any:
     """What the model's wheel step needs at a vector of the wheel channel; `geometry` (3,) serves yaw-rate limits."""
-    base = geometry[None, :BASE_COUNT]
+    base = tuple(geometry[:BASE_COUNT].tolist())
     given = {name: _coefficients(WHEEL, p, name, base) for name in WHEEL_MOTION}
     return Effects(**{name: given.get(name) for name in MOTION_EFFECTS})
 
 
 def body_effects(p: Array) -> tuple[Base, Any]:
     """What the model's body velocity needs at a vector of the body channel."""
-    base = p[None, :BASE_COUNT]
+    base = tuple(p[:BASE_COUNT].tolist())
     given = {name: _coefficients(BODY, p, name, base) for name in BODY_MOTION}
-    radius, axial, x_icr = p[:BASE_COUNT].tolist()
+    radius, axial, x_icr = base
     return (
         Base(0.5 * radius, 0.5 * radius / axial, x_icr),
         Effects(**{name: given.get(name) for name in MOTION_EFFECTS}),

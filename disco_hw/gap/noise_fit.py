@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from disco_hw.gap.body_noise import BodyNoise, body_gains, whiten_body
+from disco_hw.gap.body_noise import BodyNoise, body_likelihood
 from disco_hw.gap.channels import BodyChannel, WheelChannel
 from disco_hw.gap.timeline import Timeline
-from disco_hw.gap.wheel_noise import WheelNoise, wheel_gains, whiten_wheels
+from disco_hw.gap.wheel_noise import WheelNoise, wheel_likelihood, whiten_wheels
 
 Array = NDArray[np.float64]
 
@@ -30,10 +30,12 @@ _JITTER_SHARE = 0.05
 _LARGEST_WHEEL_NOISE = (0.05, 1.0, 0.1, 0.05, 0.1, 0.1, 0.02)
 
 
-def _huber(squares: Array) -> float:
-    """Sum of squares that grows linearly beyond `_HUBER`."""
-    size = np.sqrt(squares)
-    return float(np.where(size <= _HUBER, squares, 2.0 * _HUBER * size - _HUBER**2).sum())
+def _huber(white: Array) -> float:
+    """Sum of squares of whitened residuals that grow linearly beyond `_HUBER`."""
+    flat = white.ravel()
+    beyond = np.abs(flat)
+    beyond = beyond[beyond > _HUBER] - _HUBER
+    return float(flat @ flat - beyond @ beyond)
 
 
 def _minimise(objective, start: Array, low: Array, high: Array, most: int) -> Array:  # type: ignore[no-untyped-def]
@@ -67,20 +69,15 @@ def largest_command_jitter_s(line: Timeline) -> float:
 
 def fit_wheel_noise(channel: WheelChannel, raw: Array) -> WheelNoise:
     """Noise of the wheels by maximum likelihood of what a model leaves of the angles, (E, 2)."""
-    gains = channel.gains
-    line = channel.timeline
-    dt = np.maximum(np.diff(line.encoder.t_s, prepend=line.encoder.t_s[0]), 0.0)
-    jumps = np.concatenate([[0.0], np.cumsum(line.command_change)])
-    between = np.maximum(np.diff(jumps[line.encoder.node + 1], prepend=0.0), 0.0)
-    speed = line.speed_rad_s[line.encoder.node]
+    line, driven = channel.timeline, channel.driven
     start = channel.noise.vector()
     # A wheel at rest reads the same however coarse its encoder is, and would speak for readings without error.
-    counted = gains.use & ~gains.restart & (np.abs(speed).max(axis=1) > _REST_RAD_S)
+    counted = driven.use & ~driven.restart & (np.abs(driven.speed_rad_s).max(axis=1) > _REST_RAD_S)
+    likelihood = wheel_likelihood(driven, counted, raw)
 
     def objective(logs: Array) -> float:
-        trial = wheel_gains(WheelNoise.from_vector(logs), dt, speed, between, gains.restart, gains.use)
-        white = whiten_wheels(raw, trial)[counted]
-        return 0.5 * _huber(white**2) - float(np.log(trial.scale[counted]).sum()) + _pull(logs, start)
+        white, weight = likelihood(logs)
+        return 0.5 * _huber(white) - weight + _pull(logs, start)
 
     # A speed that may be wrong by any amount for any time would explain wheels that do not turn at all.
     most = np.minimum(start + 5.0, WheelNoise(*_LARGEST_WHEEL_NOISE).vector())
@@ -103,12 +100,11 @@ def fit_body_noise(channel: BodyChannel, p: Array, extra: Array | None = None, i
     rim = np.abs(channel.timeline.speed_rad_s).max(axis=1) * channel.geometry[0]
     motion = channel.motion(rim)
     start = channel.noise.vector()
-    counted = motion.use & ~motion.restart
+    likelihood = body_likelihood(motion, raw)
 
     def objective(logs: Array) -> float:
-        trial = body_gains(BodyNoise.from_vector(logs), motion)
-        white = whiten_body(raw, trial)[counted]
-        return 0.5 * _huber(white**2) - float(trial.log_scale[counted].sum()) + _pull(logs, start)
+        white, weight = likelihood(logs)
+        return 0.5 * _huber(white) - weight + _pull(logs, start)
 
     return BodyNoise.from_vector(_minimise(objective, start, start - 5.0, start + 5.0, iterations))
 

@@ -130,7 +130,9 @@ class Selector:
         if value is not None and new.profile is not None:
             vector = vector.copy()
             vector[layout.place[new.profile.column]] = value
-            residual = channel.residual(vector)
+            # When something that is not there begins does not matter.
+            if not self._neutral(parent, new):
+                residual = channel.residual(vector)
         places = tuple(layout.place[column] for column in new.columns)
         columns = sensitivity(channel, vector, places, residual)
         slope = np.column_stack([parent.jacobian, columns])
@@ -138,6 +140,12 @@ class Selector:
             return parent.cost - 0.5 * float(residual @ residual)
         gradient = slope.T @ residual
         return parent.cost - 0.5 * float(residual @ residual) + 0.5 * float(gradient @ solve(slope, gradient))
+
+    def _neutral(self, parent: Fit, new: Candidate) -> bool:
+        """Whether an effect with other parameters than the profiled one does nothing at a fit."""
+        layout = self.channel.layout
+        places = [layout.place[column] for column in new.columns]
+        return bool(places) and bool((parent.vector[places] == layout.neutral[places]).all())
 
     def evidence(self, smaller: Names, larger: Names) -> Evidence:
         """Evidence for the larger set against the smaller one."""

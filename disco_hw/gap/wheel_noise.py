@@ -7,13 +7,15 @@ residuals into independent ones of unit variance. Its gains depend on the measur
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
-from disco_hw.model.jit import kernel_function
+from disco_hw.model.jit import kernel_function, scalar_function
 
 Array = NDArray[np.float64]
 
@@ -58,6 +60,21 @@ class WheelNoise:
 
 
 @dataclass(frozen=True, slots=True)
+class Driven:
+    """How the wheels were driven between samples: what the filter's transition needs.
+
+    `dt_s` (E,) since the sample before, measured `speed_rad_s` (E, 2), squared `jumps` of the command since then (E,);
+    `restart` begins a run; `use` is False for samples left out.
+    """
+
+    dt_s: Array
+    speed_rad_s: Array
+    jumps: Array
+    restart: NDArray[np.bool_]
+    use: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
 class WheelGains:
     """Transition and gains of the filter at every sample and wheel."""
 
@@ -69,56 +86,91 @@ class WheelGains:
     use: NDArray[np.bool_]
 
 
+@scalar_function
+def _spread(c: Any, noise: Any, go: float, far: float, keep: float, hold: float, dt: float, jumps: float) -> Any:
+    """Covariance of angle drift, quick and slow error of the speed (aa, aq, as, qq, qs, ss) at the next sample."""
+    aa, aq, as_, qq, qs, ss = c
+    aa += 2.0 * (go * aq + far * as_) + go * go * qq + 2.0 * go * far * qs + far * far * ss
+    aa += noise[5] * noise[5] * dt + noise[4] * noise[4] * jumps
+    aq, as_ = keep * (aq + go * qq + far * qs), hold * (as_ + go * qs + far * ss)
+    qq = keep * keep * qq + noise[0] * noise[0] * (1.0 - keep * keep)
+    ss = hold * hold * ss + noise[6] * noise[6] * (1.0 - hold * hold)
+    return aa, aq, as_, qq, qs * keep * hold, ss
+
+
+@scalar_function
+def _begin(noise: Any) -> Any:
+    """Covariance of a run's first sample."""
+    return _START_VARIANCE, 0.0, 0.0, noise[0] * noise[0], 0.0, noise[6] * noise[6]
+
+
+@scalar_function
+def _learnt(c: Any, ka: float, kq: float, ks: float) -> Any:
+    """Covariance after a sample with these gains."""
+    aa, aq, as_, qq, qs, ss = c
+    return aa - ka * aa, aq - ka * aq, as_ - ka * as_, qq - kq * aq, qs - kq * as_, ss - ks * as_
+
+
 @kernel_function
 def _gains(
-    logs: Array,
-    dt: Array,
-    speed: Array,
-    steady: Array,
-    jumps: Array,
-    restart: Array,
-    use: Array,
-    decay: Array,
-    reach: Array,
-    gain: Array,
-    scale: Array,
-) -> None:
-    relative, correlation, reading = math.exp(logs[0]), math.exp(logs[1]), math.exp(logs[2])
-    stamp, command_stamp, drift, wander = math.exp(logs[3]), math.exp(logs[4]), math.exp(logs[5]), math.exp(logs[6])
+    noise: Array, dt: Array, speed: Array, steady: Array, jumps: Array, restart: Array, use: Array, decay: Array,
+    reach: Array, gain: Array, scale: Array,
+) -> None:  # fmt: skip
     for side in range(2):
-        # Covariance of angle drift (a), quick (q) and slow (s) error of the speed.
-        aa = aq = as_ = qq = qs = ss = 0.0
+        c = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
         for k in range(dt.shape[0]):
-            fast = abs(speed[k, side])
-            keep, hold = math.exp(-dt[k] / correlation), math.exp(-dt[k] / WANDER_S)
+            keep, hold = math.exp(-dt[k] / noise[1]), math.exp(-dt[k] / WANDER_S)
             decay[k, 0], decay[k, 1] = keep, hold
             # Signed: a wheel that turns too fast does so ahead and back.
-            reach[k, side, 0] = speed[k, side] * dt[k]
-            reach[k, side, 1] = steady[k, side] * dt[k]
-            if restart[k]:
-                aa, aq, as_, qs = _START_VARIANCE, 0.0, 0.0, 0.0
-                qq, ss = relative * relative, wander * wander
-            else:
-                go, far = reach[k, side, 0], reach[k, side, 1]
-                aa += 2.0 * (go * aq + far * as_) + go * go * qq + 2.0 * go * far * qs + far * far * ss
-                aa += drift * drift * dt[k] + command_stamp * command_stamp * jumps[k]
-                aq, as_ = keep * (aq + go * qq + far * qs), hold * (as_ + go * qs + far * ss)
-                qq = keep * keep * qq + relative * relative * (1.0 - keep * keep)
-                ss = hold * hold * ss + wander * wander * (1.0 - hold * hold)
-                qs *= keep * hold
-            variance = aa + reading * reading + stamp * stamp * fast * fast
+            go, far = speed[k, side] * dt[k], steady[k, side] * dt[k]
+            reach[k, side, 0], reach[k, side, 1] = go, far
+            c = _begin(noise) if restart[k] else _spread(c, noise, go, far, keep, hold, dt[k], jumps[k])
+            variance = c[0] + noise[2] * noise[2] + (noise[3] * speed[k, side]) ** 2
             scale[k, side] = 1.0 / math.sqrt(variance)
-            if not use[k]:
+            if use[k]:
+                ka, kq, ks = c[0] / variance, c[1] / variance, c[2] / variance
+                gain[k, side, 0], gain[k, side, 1], gain[k, side, 2] = ka, kq, ks
+                c = _learnt(c, ka, kq, ks)
+            else:
                 gain[k, side, 0] = gain[k, side, 1] = gain[k, side, 2] = 0.0
+
+
+@kernel_function
+def _likelihood(
+    noise: Array, dt: Array, speed: Array, steady: Array, jumps: Array, restart: Array, use: Array, counted: Array,
+    residual: Array, out: Array,
+) -> float:  # fmt: skip
+    total = 0.0
+    for side in range(2):
+        c = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        drift = quick = slow = 0.0
+        before, keep, hold = -1.0, 0.0, 0.0
+        for k in range(dt.shape[0]):
+            if dt[k] != before:
+                before, keep, hold = dt[k], math.exp(-dt[k] / noise[1]), math.exp(-dt[k] / WANDER_S)
+            if restart[k]:
+                c = _begin(noise)
+                drift = quick = slow = 0.0
+            else:
+                go, far = speed[k, side] * dt[k], steady[k, side] * dt[k]
+                c = _spread(c, noise, go, far, keep, hold, dt[k], jumps[k])
+                drift += go * quick + far * slow
+                quick *= keep
+                slow *= hold
+            out[k, side] = 0.0
+            if not use[k]:
                 continue
-            ka, kq, ks = aa / variance, aq / variance, as_ / variance
-            gain[k, side, 0], gain[k, side, 1], gain[k, side, 2] = ka, kq, ks
-            qq -= kq * aq
-            qs -= kq * as_
-            ss -= ks * as_
-            aq -= ka * aq
-            as_ -= ka * as_
-            aa -= ka * aa
+            variance = c[0] + noise[2] * noise[2] + (noise[3] * speed[k, side]) ** 2
+            surprise = residual[k, side] - drift
+            if counted[k]:
+                out[k, side] = surprise / math.sqrt(variance)
+                total -= 0.5 * math.log(variance)
+            ka, kq, ks = c[0] / variance, c[1] / variance, c[2] / variance
+            drift += ka * surprise
+            quick += kq * surprise
+            slow += ks * surprise
+            c = _learnt(c, ka, kq, ks)
+    return total
 
 
 @kernel_function
@@ -152,24 +204,40 @@ def _whiten(
             slow += gain[k, side, 2] * surprise
 
 
-def wheel_gains(
-    noise: WheelNoise,
-    dt_s: Array,
-    speed_rad_s: Array,
-    jumps: Array,
-    restart: NDArray[np.bool_],
-    use: NDArray[np.bool_],
-) -> WheelGains:
-    """Gains for samples `dt_s` apart (E,) at measured speeds (E, 2), with squared command jumps between them (E,)."""
-    count = dt_s.size
+def wheel_gains(noise: WheelNoise, driven: Driven) -> WheelGains:
+    """Gains for one motion of the wheels."""
+    count = driven.dt_s.size
     decay, reach = np.empty((count, 2)), np.empty((count, 2, 2))
-    # A slow error that acted on the measured speed itself would scale the very noise it is measured by.
-    period_s = max(float(np.median(dt_s)), 1e-3) if count else 1.0
-    half = max(round(_STEADY_S / period_s), _FEWEST_STEADY)
-    steady = uniform_filter1d(speed_rad_s, 2 * half + 1, axis=0, mode="nearest") if count else speed_rad_s
     gain, scale = np.empty((count, 2, 3)), np.empty((count, 2))
-    _gains(noise.vector(), dt_s, speed_rad_s, steady, jumps, restart, use, decay, reach, gain, scale)
-    return WheelGains(decay, reach, gain, scale, restart, use)
+    _gains(np.exp(noise.vector()), *_along(driven), decay, reach, gain, scale)
+    return WheelGains(decay, reach, gain, scale, driven.restart, driven.use)
+
+
+def wheel_likelihood(
+    driven: Driven, counted: NDArray[np.bool_], residual: Array
+) -> Callable[[Array], tuple[Array, float]]:
+    """For angle residuals (E, 2), of which some are `counted` (E,), a function of the logarithms of the noise (7,).
+
+    It gives the whitened residuals (E, 2), 0 where none counts, and the sum of the logarithms of their weights: what a
+    likelihood needs, in one go and without keeping the gains.
+    """
+    along = _along(driven)
+
+    def at(logs: Array) -> tuple[Array, float]:
+        out = np.empty(residual.shape)
+        return out, float(_likelihood(np.exp(logs), *along, counted, residual, out))
+
+    return at
+
+
+def _along(driven: Driven) -> tuple[Array | NDArray[np.bool_], ...]:
+    """A motion of the wheels as the kernels take it."""
+    dt_s, speed_rad_s = driven.dt_s, driven.speed_rad_s
+    # A slow error that acted on the measured speed itself would scale the very noise it is measured by.
+    period_s = max(float(np.median(dt_s)), 1e-3) if dt_s.size else 1.0
+    half = max(round(_STEADY_S / period_s), _FEWEST_STEADY)
+    steady = uniform_filter1d(speed_rad_s, 2 * half + 1, axis=0, mode="nearest") if dt_s.size else speed_rad_s
+    return dt_s, speed_rad_s, steady, driven.jumps, driven.restart, driven.use
 
 
 def whiten_wheels(residual: Array, gains: WheelGains) -> Array:
