@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -67,17 +68,28 @@ def largest_command_jitter_s(line: Timeline) -> float:
     return _LEAST_JITTER_S + _JITTER_RATIO * line.stamp_scatter_s + _JITTER_SHARE * line.encoder_period_s
 
 
-def fit_wheel_noise(channel: WheelChannel, raw: Array) -> WheelNoise:
-    """Noise of the wheels by maximum likelihood of what a model leaves of the angles, (E, 2)."""
-    line, driven = channel.timeline, channel.driven
-    start = channel.noise.vector()
+def wheel_misfit(channel: WheelChannel, raw: Array) -> Callable[[Array], float]:
+    """Minus the robust log likelihood of what a model leaves of the angles (E, 2), by logarithms of the noise (7,)."""
+    driven = channel.driven
     # A wheel at rest reads the same however coarse its encoder is, and would speak for readings without error.
     counted = driven.use & ~driven.restart & (np.abs(driven.speed_rad_s).max(axis=1) > _REST_RAD_S)
     likelihood = wheel_likelihood(driven, counted, raw)
 
-    def objective(logs: Array) -> float:
+    def misfit(logs: Array) -> float:
         white, weight = likelihood(logs)
-        return 0.5 * _huber(white) - weight + _pull(logs, start)
+        return 0.5 * _huber(white) - weight
+
+    return misfit
+
+
+def fit_wheel_noise(channel: WheelChannel, raw: Array) -> WheelNoise:
+    """Noise of the wheels by maximum likelihood of what a model leaves of the angles, (E, 2)."""
+    line = channel.timeline
+    start = channel.noise.vector()
+    misfit = wheel_misfit(channel, raw)
+
+    def objective(logs: Array) -> float:
+        return misfit(logs) + _pull(logs, start)
 
     # A speed that may be wrong by any amount for any time would explain wheels that do not turn at all.
     most = np.minimum(start + 5.0, WheelNoise(*_LARGEST_WHEEL_NOISE).vector())

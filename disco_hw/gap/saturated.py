@@ -17,10 +17,9 @@ from disco_hw.gap.channels import BodyChannel, WheelChannel
 from disco_hw.gap.fit import sensitivity
 from disco_hw.gap.free_runs import read_angles
 from disco_hw.gap.layout import WHEEL
-from disco_hw.gap.noise_fit import learn_body_noise, learn_wheel_noise
-from disco_hw.gap.terms import smoothed
+from disco_hw.gap.noise_fit import learn_body_noise, learn_wheel_noise, wheel_misfit
 from disco_hw.gap.timeline import CELL_S
-from disco_hw.gap.wheel_noise import whiten_wheels
+from disco_hw.gap.wheel_noise import WheelNoise, whiten_wheels
 from disco_hw.model.jit import kernel_function
 
 Array = NDArray[np.float64]
@@ -30,7 +29,7 @@ _ROUNDS = 2
 _HALVINGS = 4
 _BENDS = (0.02, 0.05, 0.1, 0.2, 0.35, 0.55, 0.75, 0.9)
 _RESPONSES_S = (0.02, 0.05, 0.12, 0.3)
-_SLEWS = (0.25, 0.4, 0.55, 0.7, 0.85)
+_SLEWS_S = (0.1, 0.2, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0)
 
 
 def learn_saturated_wheels(channel: WheelChannel, vector: Array) -> tuple[WheelChannel, Array, int]:
@@ -45,14 +44,24 @@ def learn_saturated_wheels(channel: WheelChannel, vector: Array) -> tuple[WheelC
     for shape in _wheel_shapes(channel, vector):
         read_angles(_integrated(shape, line.first), line.encoder.node, line.encoder.fraction, at)
         columns.append(at.copy())
-    left = raw
-    for _ in range(_ROUNDS):
-        if columns:
-            slope = np.column_stack([(whiten_wheels(c, channel.gains) * channel.weight).ravel() for c in columns])
-            found = _ridge(slope, (whiten_wheels(raw, channel.gains) * channel.weight).ravel())
+    many = len(columns) + WHEEL.neutral.size
+    if not columns:
+        return learn_wheel_noise(channel, raw), raw, many
+    # A noise that was learnt from too poor a model lets the richest one leave what that model left, and learns it
+    # again; the usual noise does not. Nor does every round come closer: where something is missing the noise grows.
+    misfits: list[float] = []
+    best, least = channel, raw
+    for begin in (channel, channel.with_noise(WheelNoise(reading_rad=channel.noise.reading_rad))):
+        learnt = begin
+        for _ in range(_ROUNDS):
+            slope = np.column_stack([(whiten_wheels(c, learnt.gains) * learnt.weight).ravel() for c in columns])
+            found = _ridge(slope, (whiten_wheels(raw, learnt.gains) * learnt.weight).ravel())
             left = raw + np.tensordot(np.stack(columns, axis=-1), found, axes=1)
-        channel = learn_wheel_noise(channel, left)
-    return channel, left, len(columns) + WHEEL.neutral.size
+            learnt = learn_wheel_noise(learnt, left)
+            misfits.append(wheel_misfit(channel, left)(learnt.noise.vector()))
+            if misfits[-1] == min(misfits):
+                best, least = learnt, left
+    return best, least, many
 
 
 def learn_saturated_body(
@@ -124,11 +133,8 @@ def _wheel_shapes(channel: WheelChannel, vector: Array) -> Iterator[Array]:
         yield behind
         yield behind[:, ::-1]
         yield _slow(behind, response_s)
-    rates = np.column_stack([np.abs(np.gradient(smoothed(asked[:, side]), CELL_S)) for side in (0, 1)])
-    quick = float(rates.max(initial=0.0))
-    for share in _SLEWS:
-        if quick > 0.0:
-            yield _slewed(asked, share * quick) - asked
+    for full_s in _SLEWS_S:
+        yield _slewed(asked, largest / full_s) - asked
 
 
 def _slow(u: Array, response_s: float) -> Array:

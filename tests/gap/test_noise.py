@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from disco_hw.gap.wheel_noise import WheelNoise, wheel_gains, whiten_wheels
+from disco_hw.gap.body_noise import BodyNoise, Motion, body_gains, body_likelihood, whiten_body
+from disco_hw.gap.wheel_noise import Driven, WheelNoise, wheel_gains, wheel_likelihood, whiten_wheels
 
 
 def simulated(noise, speed, rng):
@@ -20,6 +21,12 @@ def simulated(noise, speed, rng):
     return residual
 
 
+def driven(speed, restart):
+    count = speed.shape[0]
+    use = np.arange(count) % 17 != 5
+    return Driven(np.full(count, 0.02), speed, np.zeros(count), restart, use)
+
+
 def test_wheel_residuals_become_white():
     rng = np.random.default_rng(0)
     count = 4000
@@ -27,7 +34,7 @@ def test_wheel_residuals_become_white():
     speed = np.full((count, 2), 4.0)
     residual = simulated(noise, speed, rng)
     flags = np.arange(count) == 0
-    gains = wheel_gains(noise, np.full(count, 0.02), speed, np.zeros(count), flags, np.ones(count, bool))
+    gains = wheel_gains(noise, Driven(np.full(count, 0.02), speed, np.zeros(count), flags, np.ones(count, bool)))
     white = whiten_wheels(residual, gains)[1:, 0]
     assert white.var() == pytest.approx(1.0, abs=0.08)
     assert abs(np.corrcoef(white[1:], white[:-1])[0, 1]) < 0.05
@@ -36,8 +43,61 @@ def test_wheel_residuals_become_white():
 def test_whitening_is_linear():
     rng = np.random.default_rng(1)
     speed = rng.uniform(0, 5, (300, 2))
-    gains = wheel_gains(WheelNoise(), np.full(300, 0.02), speed, np.zeros(300), np.arange(300) == 0, np.ones(300, bool))
+    gains = wheel_gains(WheelNoise(), driven(speed, np.arange(300) == 0))
     a, b = rng.standard_normal((2, 300, 2))
     np.testing.assert_allclose(
         whiten_wheels(a + 2 * b, gains), whiten_wheels(a, gains) + 2 * whiten_wheels(b, gains), atol=1e-9
     )
+
+
+def test_the_likelihood_of_the_wheels_is_that_of_their_whitened_residuals():
+    rng = np.random.default_rng(2)
+    moved = driven(rng.uniform(-5, 5, (400, 2)), np.arange(400) % 200 == 0)
+    noise, residual = WheelNoise(0.03, 0.3, 2e-3, 1e-3, 1e-3, 2e-3, 0.01), 0.01 * rng.standard_normal((400, 2))
+    counted = moved.use & ~moved.restart
+    white, weight = wheel_likelihood(moved, counted, residual)(noise.vector())
+    gains = wheel_gains(noise, moved)
+    np.testing.assert_allclose(white[counted], whiten_wheels(residual, gains)[counted], atol=1e-9)
+    assert (white[~counted] == 0.0).all()
+    assert weight == pytest.approx(np.log(gains.scale[counted]).sum())
+
+
+def body_motion(count, rng):
+    turned = np.cumsum(0.02 * rng.standard_normal(count))
+    steps = 0.02 * rng.standard_normal((2, count))
+    restart, use = np.arange(count) % 100 == 0, np.arange(count) % 23 != 7
+    rest = rng.uniform(0, 1, (3, count))
+    return Motion(np.full(count, 0.04), *steps, turned, *rest, restart, use)
+
+
+def test_whitening_of_poses_is_linear_and_silent_where_none_is_used():
+    rng = np.random.default_rng(3)
+    moved = body_motion(120, rng)
+    gains = body_gains(BodyNoise(0.01, 0.01, 1e-3, 0.02, 0.03, 0.05, 0.4, 0.02, 0.05), moved)
+    a, b = 0.02 * rng.standard_normal((2, 120, 3))
+    both = whiten_body(a + 2.0 * b, gains)
+    np.testing.assert_allclose(both, whiten_body(a, gains) + 2.0 * whiten_body(b, gains), atol=1e-9)
+    assert (both[~moved.use] == 0.0).all()
+
+
+def test_the_likelihood_of_the_body_is_that_of_its_whitened_residuals():
+    rng = np.random.default_rng(4)
+    moved, noise = body_motion(300, rng), BodyNoise(0.01, 0.02, 2e-3, 0.02, 0.03, 0.05, 0.4, 0.02, 0.05)
+    residual, counted = 0.02 * rng.standard_normal((300, 3)), moved.use & ~moved.restart
+    white, weight = body_likelihood(moved, residual)(noise.vector())
+    gains = body_gains(noise, moved)
+    np.testing.assert_allclose(white[counted], whiten_body(residual, gains)[counted], atol=1e-9)
+    assert (white[~counted] == 0.0).all()
+    determinants = np.prod(np.diagonal(gains.scale[counted], axis1=1, axis2=2), axis=1)
+    assert weight == pytest.approx(np.log(determinants).sum())
+
+
+def test_a_body_at_rest_has_the_noise_of_its_poses_alone():
+    count, rng = 4000, np.random.default_rng(5)
+    still, restart = np.zeros(count), np.arange(count) == 0
+    moved = Motion(np.full(count, 0.04), still, still, still, still, still, still, restart, ~np.zeros(count, bool))
+    noise = BodyNoise(0.01, 0.02, noise_correlation_s=1e-3)
+    residual = rng.standard_normal((count, 3)) * (0.01, 0.01, 0.02) + (0.1, -0.1, 0.05)
+    white = whiten_body(residual, body_gains(noise, moved))[10:]
+    np.testing.assert_allclose(white.var(axis=0), 1.0, atol=0.1)
+    assert abs(np.corrcoef(white[1:, 0], white[:-1, 0])[0, 1]) < 0.05

@@ -33,9 +33,6 @@ def test_the_noise_of_a_sound_robot_is_what_the_simulator_makes():
     assert channel.noise.reading_rad == pytest.approx(2 * np.pi / 2048 / 12**0.5, rel=0.2)
 
 
-@pytest.mark.xfail(
-    strict=True, reason="of a slew limit a part still passes for noise: 0.027 where the simulator has 0.015"
-)
 def test_what_has_no_name_does_not_pass_for_noise():
     plain, channel = learnt(("x_slew_limited_motor", 8.0))
     assert plain.noise.relative > 0.03
