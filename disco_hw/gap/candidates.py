@@ -23,6 +23,8 @@ Starts = tuple[tuple[float, ...], ...]
 
 # Indistinguishable from another effect, or from two at once: decided after the others, in `classes`.
 DECIDED_LATER = ("pose_offset", "encoder_scale")
+# What a patch of the floor looks like if it is left and not entered again.
+CHANGE = "surface_change"
 
 
 @dataclass(frozen=True, slots=True)

@@ -108,7 +108,7 @@ class Outcome:
         for channel, estimated in ((self.body, self._estimates[0]), (self.wheels, self._estimates[1])):
             if channel is None or estimated is None:
                 continue
-            same = alike(channel.names, possible)
+            same = alike(channel.names, possible, channel.patch)
             for name in channel.names:
                 if name in channel.selector.given and not given:
                     continue

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.gap.body_noise import BodyNoise
-from disco_hw.gap.candidates import CANDIDATES, indices
+from disco_hw.gap.candidates import CANDIDATES, CHANGE, indices, parameters_of
 from disco_hw.gap.channels import BodyChannel, Channel, WheelChannel
 from disco_hw.gap.evidence import Evidence, compare
 from disco_hw.gap.fit import Fit, fit, inverse
@@ -20,7 +20,7 @@ from disco_hw.gap.layout import WHEEL
 from disco_hw.gap.noise_fit import learn_body_noise, learn_wheel_noise
 from disco_hw.gap.saturated import learn_saturated_body, learn_saturated_wheels
 from disco_hw.gap.selection import Names, Selector, Split, Thresholds
-from disco_hw.gap.terms import Term, WithTerms, body_terms, places, wheel_terms
+from disco_hw.gap.terms import Term, WithTerms, body_terms, places, places_near, wheel_terms
 from disco_hw.gap.timeline import CELL_S, Timeline
 from disco_hw.gap.wheel_noise import WheelNoise, whiten_wheels
 
@@ -37,6 +37,9 @@ _GAUSSIAN_KURTOSIS = 3.0
 _CLIPPED_AT = 6.0
 _HEAVIEST = 1.5
 _REST_RAD_S = 0.05
+_FAR_OFF = 1.5
+_CLEARLY = 6.0
+_ABOUT_TERMS = 110
 _NO_INFORMATION = 1e-3
 _ROUGH = Thresholds(score=20.0, moves_m=0.0)
 _SMOOTH_WHEEL = ("motor_lag", "command_delay", "deadband", "battery_sag", "wheel_gain")
@@ -65,7 +68,8 @@ class UnnamedTerm:
 class Found:
     """What a channel's search ended with: its selector (noise held, all fits kept), accepted effects and terms.
 
-    `richest` (n,): whitened residuals of the channel's richest model, which had `richest_parameters`.
+    `richest` (n,): whitened residuals of the channel's richest model, which had `richest_parameters`. `patch`: whether
+    a patch of the floor explains a change of the surface as well.
     """
 
     selector: Selector
@@ -75,6 +79,7 @@ class Found:
     plain: Selector | None = None
     richest: Array | None = None
     richest_parameters: int = 0
+    patch: bool = False
 
     @property
     def fit(self) -> Fit:
@@ -141,15 +146,23 @@ def search_wheels(line: Timeline, geometry: Array, start: Array, given: Names = 
     names = rough.greedy(tuple(dict.fromkeys((*given, *_RESPONSE))))
     rich = (*names, *(name for name in _SMOOTH_WHEEL if name not in names))
     vector = fit(channel, rough.fit(names).vector, indices(channel, rich)).vector
-    channel, left, many = learn_saturated_wheels(learn_wheel_noise(channel, channel.raw_residual(vector)), vector)
-    rolling = np.abs(line.speed_rad_s[line.encoder.node]).max(axis=1) > _REST_RAD_S
-    limits = _thresholds(whiten_wheels(left, channel.gains), channel.gains.use & rolling)
-    selector = Selector(channel, moves, limits, given=given, start=rough.fit(given).vector)
-    begin = rough.fit(names).vector
-    selector.fits[frozenset(names)] = fit(channel, begin, indices(channel, names))
-    richest = (whiten_wheels(left, channel.gains) * channel.weight).ravel()
-    found = Found(selector, selector.select(names), channel, richest=richest, richest_parameters=many)
-    return with_unnamed(found, _wheel_options)
+    plain = learn_wheel_noise(channel, channel.raw_residual(vector))
+    sound, left, many = learn_saturated_wheels(plain, vector)
+
+    def searched(channel: WheelChannel) -> Found:
+        white = whiten_wheels(left, channel.gains)
+        rolling = np.abs(line.speed_rad_s[line.encoder.node]).max(axis=1) > _REST_RAD_S
+        limits = _thresholds(white, channel.gains.use & rolling)
+        selector = Selector(channel, moves, limits, given=given, start=rough.fit(given).vector)
+        selector.fits[frozenset(names)] = fit(channel, rough.fit(names).vector, indices(channel, names))
+        richest = (white * channel.weight).ravel()
+        found = Found(selector, selector.select(names), channel, richest=richest, richest_parameters=many)
+        return with_unnamed(found, _wheel_options)
+
+    found = searched(sound)
+    # Where nothing known comes near, the noise is too little to compare what is all wrong: the family shows in the
+    # noise that the best of it leaves, and what is left against the richest model.
+    return searched(plain) if found.fit.cost > _FAR_OFF * 0.5 * sound.count else found
 
 
 def _responding(selector: Selector) -> None:
@@ -185,7 +198,34 @@ def search_body(line: Timeline, start: Array, given: Names = ()) -> Found:
     selector = Selector(channel, body_moves(channel), limits, given=given, start=rough.fit(given).vector)
     richest = channel.residual(fullest, extra)
     found = Found(selector, selector.select(), channel, richest=richest, richest_parameters=many)
-    return with_unnamed(found, _body_options)
+    return _time_or_place(found)
+
+
+def _time_or_place(found: Found) -> Found:
+    """With unnamed terms; where the floor seems to have changed, a patch of it instead if that explains the log better.
+
+    A patch that was left and not entered again is a change, and the other way round: then the change is named, and
+    that the patch would do as well is kept.
+    """
+    named = with_unnamed(found, _body_options)
+    if CHANGE not in found.names or CHANGE in found.selector.given:
+        return named
+    rest = tuple(name for name in found.names if name != CHANGE)
+    placed = with_unnamed(replace(found, names=rest), _body_options)
+    if not any(one.term.disc for one in placed.unnamed):
+        return named
+    better = _priced(named) - _priced(placed)
+    return placed if better > _CLEARLY else replace(named, patch=better > -_CLEARLY)
+
+
+def _priced(found: Found) -> float:
+    """Misfit in nats with the price of all that was fitted, and of the choice among all terms."""
+    many = float(parameters_of(found.names))
+    chosen = 0.0
+    for one in found.unnamed:
+        many += 4.0 if one.term.disc else 1.0
+        chosen += 0.0 if one.term.disc else math.log(_ABOUT_TERMS)
+    return found.fit.cost + 0.5 * many * math.log(max(found.channel.count, 2)) + chosen
 
 
 def _body_pushes(channel: BodyChannel, names: Names, vector: Array) -> Iterator[Array]:
@@ -234,6 +274,11 @@ def with_unnamed(found: Found, options: Callable[[Found], Iterator[Term]]) -> Fo
         best, tried = best_term(found.fit, found.selector.channel, options(found))
         if best is None:
             break
+        if best.disc is not None and isinstance(found.channel, BodyChannel):
+            near = places_near(found.channel, found.fit.vector, best.disc)
+            best, closer = best_term(found.fit, found.selector.channel, chain((best,), near))
+            assert best is not None
+            tried += closer
         channel = WithTerms.of(found.channel, (*terms, best))
         small = found.fit
         start = np.append(small.vector, 0.0)

@@ -25,6 +25,9 @@ Index = NDArray[np.int64]
 _SPAN_NODES = 8
 _DISC_RADII_M = (0.5, 0.75, 1.0, 1.3)
 _DISC_SPACING_M = 0.4
+_DISC_STEPS_M = (-0.2, -0.1, 0.0, 0.1, 0.2)
+_DISC_SIZE_STEPS_M = (-0.15, -0.05, 0.0, 0.05, 0.15)
+_LEAST_INSIDE, _MOST_INSIDE = 0.1, 0.8
 _LARGEST_FLOOR_M2 = 60.0
 _LONGEST_S = 400.0
 
@@ -35,13 +38,14 @@ class Term:
 
     `form` has a place for the coefficient. `model_name`: the term of `disco_hw.model.terms` that it is; None if a model
     cannot carry it, because it depends on what a model's state does not hold. `geometry`: wheel radius and axial
-    distance (m) that the speeds in it are made with.
+    distance (m) that the speeds in it are made with. `disc`: x, y and radius (m) of the floor that it is about.
     """
 
     form: str
     push: Array
     model_name: str | None = None
     geometry: tuple[float, float] = (1.0, 1.0)
+    disc: tuple[float, float, float] | None = None
 
 
 def wheel_terms(channel: WheelChannel, late_s: float) -> Iterator[Term]:
@@ -127,20 +131,41 @@ def _with_place(name: str) -> str:
 def places(channel: BodyChannel, p: Array) -> Iterator[Term]:
     """Discs of the floor in which turning is different."""
     line = channel.timeline
-    x = np.interp(line.t_s, channel.samples.t_s, channel.measured[:, 0])
-    y = np.interp(line.t_s, channel.samples.t_s, channel.measured[:, 1])
-    w = p[0] / p[1] * (line.speed_rad_s[:, 1] - line.speed_rad_s[:, 0])
+    x, y = _where(channel)
     low_x, high_x, low_y, high_y = (*np.quantile(x, (0.02, 0.98)), *np.quantile(y, (0.02, 0.98)))
     if (high_x - low_x) * (high_y - low_y) > _LARGEST_FLOOR_M2 or line.t_s.size * CELL_S > _LONGEST_S:
         return
-    turned = float(np.abs(w).sum())
-    for centre_x in np.arange(low_x, high_x + 1e-9, _DISC_SPACING_M):
-        for centre_y in np.arange(low_y, high_y + 1e-9, _DISC_SPACING_M):
-            for radius in _DISC_RADII_M:
-                inside = np.hypot(x - centre_x, y - centre_y) < radius
-                if 0.1 < float(np.abs(w[inside]).sum()) / max(turned, 1e-9) < 0.8:
-                    where = f"within {radius:g} m of ({centre_x:.2f}, {centre_y:.2f}) m"
-                    yield Term(f"omega += {{:.4g}} omega {where}", _on(2, np.where(inside, w, 0.0)))
+    across, along = (np.arange(low, high + 1e-9, _DISC_SPACING_M) for low, high in ((low_x, high_x), (low_y, high_y)))
+    yield from _discs(channel, p, ((cx, cy, radius) for cx in across for cy in along for radius in _DISC_RADII_M))
+
+
+def places_near(channel: BodyChannel, p: Array, disc: tuple[float, float, float]) -> Iterator[Term]:
+    """Discs of the floor closer around one than `places` lie to each other."""
+    x, y, radius = disc
+    sizes = [size for size in (radius + step for step in _DISC_SIZE_STEPS_M) if size > 0.0]
+    steps = _DISC_STEPS_M
+    yield from _discs(channel, p, ((x + dx, y + dy, size) for dx in steps for dy in steps for size in sizes))
+
+
+def _where(channel: BodyChannel) -> tuple[Array, Array]:
+    """Measured position at the nodes, (M,) each."""
+    t_s, samples, measured = channel.timeline.t_s, channel.samples, channel.measured
+    return np.interp(t_s, samples.t_s, measured[:, 0]), np.interp(t_s, samples.t_s, measured[:, 1])
+
+
+def _discs(channel: BodyChannel, p: Array, discs: Iterable[tuple[float, float, float]]) -> Iterator[Term]:
+    """Those in which a good part of all turning was done, and outside of which too."""
+    x, y = _where(channel)
+    speed = channel.timeline.speed_rad_s
+    w = p[0] / p[1] * (speed[:, 1] - speed[:, 0])
+    turned = max(float(np.abs(w).sum()), 1e-9)
+    for centre_x, centre_y, radius in discs:
+        inside = np.hypot(x - centre_x, y - centre_y) < radius
+        if _LEAST_INSIDE < float(np.abs(w[inside]).sum()) / turned < _MOST_INSIDE:
+            where = f"within {radius:g} m of ({centre_x:.2f}, {centre_y:.2f}) m"
+            push = _on(2, np.where(inside, w, 0.0))
+            disc = (float(centre_x), float(centre_y), float(radius))
+            yield Term(f"omega += {{:.4g}} omega {where}", push, disc=disc)
 
 
 def _on(axis: int, feature: Array) -> Array:

@@ -50,8 +50,7 @@ def rms_error_m(model, log):
 )
 def test_the_form_that_was_found_closes_the_gap_on_another_drive(name, size, term, tmp_path):
     report = report_of(name, size)
-    # What else is named, rightly or not, the study counts.
-    assert term in [setting.name for setting in report.model.effects]
+    assert [setting.name for setting in report.model.effects] == [term]
     save_model(report.model, tmp_path / "model.toml")
     amended = load_model(tmp_path / "model.toml")
     other = simulated_drive({name: size}, seed=903, robot=902)

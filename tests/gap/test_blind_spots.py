@@ -1,0 +1,42 @@
+"""What a drive could not have shown: its size is the one at which the effect begins to be found."""
+
+import numpy as np
+import pytest
+
+from disco_hw.gap.blind_spots import blind_spots
+from disco_hw.gap.search import Found, body_moves
+from disco_hw.gap.selection import Selector
+from disco_hw.model.effects import REGISTRY
+from tests.gap.synthetic import body_channel, line_of
+
+
+def spots_of(channel, names=()):
+    selector = Selector(channel, body_moves(channel))
+    return {spot.name: spot for spot in blind_spots(Found(selector, names, channel))}
+
+
+def test_every_effect_that_was_not_found_is_listed_with_the_drive_that_shows_it():
+    channel, _ = body_channel(turn_slip=0.08)
+    spots = spots_of(channel, ("turn_slip",))
+    assert "turn_slip" not in spots
+    assert {"side_slip", "slope", "lateral_icr", "pose_offset", "heading_bias", "pose_latency"} <= set(spots)
+    for name, spot in spots.items():
+        assert f"--script {REGISTRY[name].script}" in spot.experiment
+    assert spots["pose_offset"].smallest_visible == spots["lateral_icr"].smallest_visible
+
+
+@pytest.mark.parametrize("name", ["turn_slip", "wheel_radius_asymmetry", "lateral_icr"])
+def test_twice_the_smallest_visible_size_is_found_and_a_third_of_it_is_not(name):
+    size = spots_of(body_channel()[0])[name].smallest_visible
+    for share, found in ((2.0, True), (1.0 / 3.0, False)):
+        channel, _ = body_channel(1, **{name: share * size})
+        assert (name in Selector(channel, body_moves(channel)).select()) is found, (name, share, size)
+
+
+def test_a_drive_that_only_goes_straight_is_blind_to_slip_in_turns():
+    channel, _ = body_channel()
+    straight = line_of(np.full((4000, 2), 4.0))
+    from_straight = type(channel).build(straight, channel.noise, channel.neutral)
+    spot = spots_of(from_straight)["turn_slip"]
+    assert spot.blind
+    assert not spots_of(channel)["turn_slip"].blind

@@ -1,0 +1,55 @@
+"""95 % intervals hold what is true about as often as they say, and are wider where the noise is more than thought."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from disco_hw.gap.intervals import estimates
+from disco_hw.gap.layout import BODY
+from disco_hw.gap.search import Found, body_moves
+from disco_hw.gap.selection import Selector
+from tests.gap.synthetic import body_channel
+
+
+def estimated(channel, names=("turn_slip",)):
+    return estimates(Found(Selector(channel, body_moves(channel)), names, channel))
+
+
+def test_intervals_hold_the_truth_nine_times_of_ten():
+    held = []
+    for seed in range(12):
+        found = estimated(body_channel(seed, turn_slip=0.08)[0]).by_name
+        for name, truth in (("turn_slip.k_s", 0.08), ("wheel_radius_m", 0.06), ("axial_distance_m", 0.4)):
+            held.append(found[name].low <= truth <= found[name].high)
+    assert np.mean(held) >= 0.85
+
+
+def test_an_estimate_tells_its_standard_deviation_and_the_joint_one():
+    found = estimated(body_channel(turn_slip=0.08)[0])
+    place = found.fitted.index("turn_slip.k_s")
+    assert found.by_name["turn_slip.k_s"].deviation == pytest.approx(found.covariance[place, place] ** 0.5)
+    # More slip and a longer axle both take from turning: what is known is their sum.
+    axle = found.fitted.index("axial_distance_m")
+    assert found.covariance[place, axle] < 0.0
+
+
+def test_noise_larger_than_thought_widens_the_interval():
+    channel, line = body_channel(turn_slip=0.08)
+    wander = 0.05 * np.sin(2.0 * np.pi * channel.samples.t_s[:, None] / (7.0, 11.0, 17.0))
+    shaken = type(channel).build(replace(line, pose_values=line.pose_values + wander), channel.noise, channel.neutral)
+    found = [estimated(one).by_name["turn_slip.k_s"] for one in (channel, shaken)]
+    assert found[1].deviation > 2.0 * found[0].deviation
+
+
+def test_the_time_of_a_change_has_an_interval_around_it():
+    channel, _ = body_channel()
+    vector = channel.neutral.copy()
+    vector[[BODY.place["surface_change.track"], BODY.place["surface_change.time_s"]]] = 0.12, 35.0
+    moved = channel.measured + (channel.track(vector) - channel.track(channel.neutral))[channel.samples.node]
+    line = replace(channel.timeline, pose_values=moved)
+    found = estimated(type(channel).build(line, channel.noise, channel.neutral), ("surface_change",))
+    time = found.by_name["surface_change.time_s"]
+    assert time.low < time.value < time.high
+    assert time.value == pytest.approx(35.0, abs=1.0)
+    assert time.high - time.low < 10.0

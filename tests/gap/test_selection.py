@@ -1,0 +1,70 @@
+"""The selection names what was put into a small drive, whatever it began with, and nothing where there is nothing."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from disco_hw.gap.layout import BODY
+from disco_hw.gap.search import body_moves
+from disco_hw.gap.selection import Selector, Thresholds
+from tests.gap.synthetic import body_channel
+
+
+def selector(given=(), start=None, moves_m=0.0005, **effects):
+    channel, _ = body_channel(**effects)
+    return Selector(channel, body_moves(channel), Thresholds(moves_m=moves_m), given=given, start=start)
+
+
+def test_nothing_is_selected_where_nothing_is_missing():
+    assert selector().select() == ()
+
+
+def test_exactly_what_is_missing_is_selected():
+    found = selector(turn_slip=0.08, wheel_radius_asymmetry=0.02)
+    names = found.select()
+    assert set(names) == {"turn_slip", "wheel_radius_asymmetry"}
+    vector = found.fit(names).vector
+    assert vector[BODY.place["turn_slip.k_s"]] == pytest.approx(0.08, rel=0.1)
+    assert vector[BODY.place["wheel_radius_asymmetry.ratio"]] == pytest.approx(0.02, rel=0.1)
+
+
+def test_what_is_not_needed_goes_again():
+    found = selector(turn_slip=0.08)
+    assert found.select(("side_slip", "turn_slip", "slope")) == ("turn_slip",)
+
+
+def test_a_stand_in_is_swapped_for_what_it_stood_in_for():
+    found = selector(turn_slip=0.08)
+    assert found._swapped(("surface_change",)) == ("turn_slip",)
+
+
+def test_given_effects_stay_and_are_not_selected_again():
+    channel, _ = body_channel(turn_slip=0.08)
+    start = channel.neutral.copy()
+    start[BODY.place["turn_slip.k_s"]] = 0.08
+    assert selector(given=("turn_slip",), start=start, turn_slip=0.08).select() == ("turn_slip",)
+
+
+def test_what_moves_no_prediction_is_not_accepted():
+    strict = selector(moves_m=1.0, turn_slip=0.08)
+    assert strict.select() == ()
+    assert not strict.acceptable((), ("turn_slip",))
+    assert selector(turn_slip=0.08).acceptable((), ("turn_slip",))
+
+
+def test_a_change_is_found_when_it_happens():
+    channel, line = body_channel()
+    late = line.t_s > 40.0
+    truth = channel.neutral.copy()
+    push = np.zeros((line.t_s.size, 3))
+    omega = truth[0] / truth[1] * (line.speed_rad_s[:, 1] - line.speed_rad_s[:, 0])
+    push[:, 2] = np.where(late, -omega * (1.0 - 1.0 / 1.12), 0.0)
+    moved = (
+        channel.measured + channel.track(truth, push)[channel.samples.node] - channel.track(truth)[channel.samples.node]
+    )
+    changed = type(channel).build(replace(line, pose_values=moved), channel.noise, truth)
+    found = Selector(changed, body_moves(changed))
+    names = found.select()
+    assert names == ("surface_change",)
+    assert found.fit(names).vector[BODY.place["surface_change.time_s"]] == pytest.approx(40.0, abs=2.0)
