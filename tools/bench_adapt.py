@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -25,6 +25,7 @@ from disco_hw.inference.noise import USUAL
 from disco_hw.robot_setup import Setup, load_setup
 from drivers.types import PoseSample, Readings, WheelSample
 from tests.adapt.drives import TRUTH, excited, messages
+from tests.hil.changing_robot import drive_through_change
 from tests.hil.stack import FAST_START, FAST_TASK, running_stack
 
 LIVE_S = 30.0
@@ -34,7 +35,7 @@ ROBOT = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
 def run() -> dict[str, float]:
     """Microseconds of the daemon's calls, milliseconds of the adapter's, figures of the loop, and of the experiment."""
     setup = load_setup(ROBOT)
-    return _calls(setup) | _adapter(setup) | _live() | _won_back(setup)
+    return _calls(setup) | _adapter(setup) | _live() | _changed_live() | _won_back(setup)
 
 
 def _calls(setup: Setup) -> dict[str, float]:
@@ -113,6 +114,16 @@ def _live() -> dict[str, float]:
             figures[f"adapt.loop_{name}.duration_{figure}_us"] = loop["duration_us"][figure]
         figures[f"adapt.loop_{name}.overruns"] = float(loop["overruns"])
         figures[f"adapt.loop_{name}.skipped"] = float(loop["skipped"])
+    return figures
+
+
+def _changed_live() -> dict[str, float]:
+    """Wheels that grow by 15 % under the real daemon: tracking costs before and after, with and without adaptation."""
+    figures: dict[str, float] = {}
+    for name, adapt in (("without", False), ("with", True)):
+        with TemporaryDirectory() as directory:
+            driven = drive_through_change(Path(directory), adapt=adapt)
+        figures |= {f"adapt.changed_live_{name}.{key}": float(value) for key, value in asdict(driven).items()}
     return figures
 
 

@@ -137,9 +137,10 @@ def running_stack(
     start: tuple[float, float, float] = FAST_START,
     sim_arguments: tuple[str, ...] = (),
     run_arguments: tuple[str, ...] = (),
+    model: str = "wombot_model.toml",
 ) -> Iterator[Stack]:
     """Virtual robot and daemon on one link; both end with the block."""
-    robot_file = write_robot_file(directory, link, task)
+    robot_file = write_robot_file(directory, link, task, model)
     simulator = [
         "sim", str(robot_file), "--truth", str(directory / "truth.csv"), "--inject", str(directory / "inject"),
         "--start", *map(str, start), *sim_arguments,

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from disco_hw.log.reader import open_log
+from tests.hil.changing_robot import GROWTH, drive_through_change
 from tests.hil.stack import FAST_START, FAST_TASK, running_stack
 
 pytestmark = [pytest.mark.hil, pytest.mark.long]
@@ -75,3 +76,12 @@ def test_an_adapter_that_freezes_and_dies_leaves_belief_and_loop(tmp_path):
     )
     assert replayed.returncode == 0, replayed.stdout + replayed.stderr
     assert json.loads(replayed.stdout)["ok"]
+
+
+@pytest.mark.timeout(300)
+def test_wheels_that_grow_on_the_way_are_learnt_and_the_circle_is_driven_again(tmp_path):
+    driven = drive_through_change(tmp_path, adapt=True)
+    assert driven.radius_m == pytest.approx(0.061 * (1.0 + GROWTH), rel=0.03)
+    assert driven.published_s < 20.0
+    # Without adaptation it is about twice as much: `python -m tools.bench_adapt`.
+    assert driven.cost_after < 1.5 * driven.cost_before

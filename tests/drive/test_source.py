@@ -1,0 +1,29 @@
+"""What all sources promise: whatever they are, input that is older than the limit no longer drives."""
+
+import pytest
+
+from disco_hw.daemon.states import State
+from disco_hw.drive.gamepad_source import GamepadSource
+from disco_hw.drive.keyboard import Keyboard
+from disco_hw.drive.page_source import PageSource
+from disco_hw.drive.scripted import ScriptSource
+from disco_hw.drive.source import INPUT_LIMIT_NS, ManualInput, ManualSource, RobotView
+
+
+def test_input_counts_for_200_ms():
+    assert INPUT_LIMIT_NS == 200_000_000
+
+
+@pytest.mark.parametrize("source", [GamepadSource, Keyboard, PageSource, ScriptSource])
+def test_every_source_has_all_that_the_pilot_asks_for(source):
+    asked = [name for name in vars(ManualSource) if not name.startswith("_")]
+    assert sorted(asked) == ["close", "completed", "ended", "poll", "task", "words"]
+    assert all(hasattr(source, name) for name in asked)
+
+
+def test_what_was_said_cannot_be_changed():
+    said, seen = ManualInput(1, 0.0, 0.0, deadman=False), RobotView(State.READY, driving=False)
+    with pytest.raises(AttributeError):
+        said.deadman = True
+    with pytest.raises(AttributeError):
+        seen.driving = True

@@ -1,0 +1,88 @@
+"""A robot whose wheels grow on the way, driven by the real daemon in real time, adapting or not."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+import disco_hw
+from disco_hw.adapt.adaptable import believed_geometry, with_geometry
+from disco_hw.adapt.experiment import BELIEVED_STD
+from disco_hw.adapt.guard import Geometry
+from disco_hw.log.reader import open_log
+from disco_hw.model.file import load_model, model_text
+from tests.hil.stack import running_stack
+
+GROWTH = 0.15
+CHANGE_S = 75.0
+SETTLED_S = 20.0
+COMPARED_S = 20.0
+TASK = 'kind = "circle"\nradius_m = 0.75\nspeed_m_s = 0.2\n'
+START = (0.75, 0.0, 1.5707963)
+
+
+@dataclass(frozen=True, slots=True)
+class Driven:
+    """Mean tracking costs on the plant's truth, over 20 s before the change and from 20 s after it on; the wheel radius
+    (m) that the robot drove by last, how long after the change (s) it was first told, and what the loop missed.
+    """
+
+    cost_before: float
+    cost_after: float
+    radius_m: float
+    published_s: float
+    overruns: int
+
+
+def drive_through_change(directory: Path, *, adapt: bool) -> Driven:
+    """The paper's circle; the belief is right, and as narrow as after `infer`, until the wheels grow by 15 %."""
+    model = load_model(Path(disco_hw.__file__).parent / "robots" / "wombot_model.toml")
+    mean = believed_geometry(model).mean
+    std = BELIEVED_STD * np.array([1.0, mean[1], mean[2]])
+    narrow = directory / "narrow.toml"
+    narrow.write_text(model_text(with_geometry(model, Geometry(mean, np.diag(std**2)))), encoding="utf-8")
+    hidden = ("--hide", f"surface_change=0.0,{CHANGE_S},{GROWTH}")
+    arguments = ("--adapt",) if adapt else ()
+    with running_stack(directory, "can", TASK, START, hidden, arguments, str(narrow)) as stack:
+        stack.operator.wait_for("READY", 60.0)
+        stack.start()
+        stack.operator.wait_until("driving", lambda s: s["source"] == "plan", 10.0)
+        first_s = first_truth_s(directory / "truth.csv")
+        end_s = first_s + CHANGE_S + SETTLED_S + COMPARED_S
+        status = stack.operator.wait_until("the end", lambda s: newest_truth_s(directory / "truth.csv") > end_s, 200.0)
+        stack.operator.tell("quit")
+        assert stack.daemon.process.wait(10.0) == 0
+    table = np.genfromtxt(directory / "truth.csv", delimiter=",", skip_header=1, usecols=(0, 1, 2, 8))
+    t_s = table[:, 0] * 1e-9 - first_s - CHANGE_S
+    cost = np.hypot(np.hypot(table[:, 1], table[:, 2]) - 0.75, table[:, 3] - 0.2)
+    with open_log(directory / "run.mcap") as log:
+        beliefs = log.columns("/belief") if adapt else {"t_ns": []}
+        told = [float(t_ns) * 1e-9 - first_s - CHANGE_S for t_ns in beliefs["t_ns"]]
+        published_s = min((at for at in told if at > 0.0), default=math.inf)
+    radius_m = status["adaptation"]["mean"]["wheel_radius_m"] if adapt else float(mean[1])
+    return Driven(
+        float(cost[(t_s > -COMPARED_S) & (t_s < 0.0)].mean()),
+        float(cost[(t_s > SETTLED_S) & (t_s < SETTLED_S + COMPARED_S)].mean()),
+        radius_m,
+        published_s,
+        int(status["loop"]["overruns"]),
+    )
+
+
+def first_truth_s(path: Path) -> float:
+    """When the truth begins, s of the monotonic clock."""
+    with path.open(encoding="utf-8") as file:
+        file.readline()
+        return int(file.readline().partition(",")[0]) * 1e-9
+
+
+def newest_truth_s(path: Path) -> float:
+    """When the newest row on disk was true."""
+    with path.open("rb") as file:
+        file.seek(0, 2)
+        file.seek(max(0, file.tell() - 1000))
+        rows = [row for row in file.read().split(b"\n")[1:-1] if row.count(b",") > 10]
+    return int(rows[-1].partition(b",")[0]) * 1e-9
