@@ -39,6 +39,8 @@ MAGIC = b"\x89MCAP0\r\n"
 
 _HEAD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")
+_WHOLE_MESSAGE = struct.Struct("<BQHIQQ")
+_MESSAGE_OPCODE = int(Opcode.MESSAGE)
 _FOOTER_BYTES = _HEAD.size + 8 + 8 + 4
 _LARGEST_OFFSET = 2**63 - 1
 _LARGEST = 256 * 1024 * 1024
@@ -200,19 +202,29 @@ def _checked_attachment(content: bytes) -> Attachment:
 
 def messages(chunk_data: bytes, wanted: Collection[int] | None = None) -> Iterator[Message]:
     """The messages in a chunk's data, of the wanted channels or of all, in file order; raises DamagedError."""
-    for opcode, start, end in _inner(chunk_data):
-        if opcode != Opcode.MESSAGE:
+    # Runs for every message of a log, so its head and its content's head are unpacked at once.
+    offset, size, whole = 0, len(chunk_data), _WHOLE_MESSAGE.size
+    unpack = _WHOLE_MESSAGE.unpack_from
+    while size - offset >= whole:
+        opcode, length, channel_id, sequence, log_time, publish_time = unpack(chunk_data, offset)
+        begin, offset = offset, offset + _HEAD.size + length
+        if offset > size:
+            raise DamagedError("a record that reaches beyond its chunk")
+        if opcode != _MESSAGE_OPCODE:
             continue
-        if end - start < _MESSAGE.size:
+        if offset - begin < whole:
             raise DamagedError("a message that is too short")
-        channel_id, sequence, log_time, publish_time = _MESSAGE.unpack_from(chunk_data, start)
         if wanted is None or channel_id in wanted:
-            yield Message(channel_id, sequence, log_time, publish_time, chunk_data[start + _MESSAGE.size : end])
+            yield Message(channel_id, sequence, log_time, publish_time, chunk_data[begin + whole : offset])
+    # What is left is too short for a message.
+    for opcode, _, _ in _inner(chunk_data, offset):
+        if opcode == _MESSAGE_OPCODE:
+            raise DamagedError("a message that is too short")
 
 
-def _inner(data: bytes) -> Iterator[tuple[int, int, int]]:
-    """Opcode, start and end of the content of each record."""
-    offset, size = 0, len(data)
+def _inner(data: bytes, offset: int = 0) -> Iterator[tuple[int, int, int]]:
+    """Opcode, start and end of the content of each record from `offset` on."""
+    size = len(data)
     while offset < size:
         if size - offset < _HEAD.size:
             raise DamagedError("a record that is cut off")

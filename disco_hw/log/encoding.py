@@ -11,8 +11,9 @@ from typing import Any
 
 import msgspec
 
-from disco_hw.log.records import TOPICS, Record
+from disco_hw.log.records import TOPICS, Plan, PlanFigures, Record, topic_of
 
+_PLAN = topic_of(Plan)
 _NOTE = 'Non-finite numbers are written as the strings "NaN", "Infinity" and "-Infinity"; bytes as base64.'
 
 _PLAIN_KEYS = ("title", "type", "description", "contentEncoding", "required")
@@ -42,15 +43,20 @@ def _spell_non_finite(value: Any) -> Any:
 
 
 class JsonDecoder:
-    """Decodes records of every topic; `decode` raises msgspec.MsgspecError on what is not such a record."""
+    """Decodes records of every topic; raises msgspec.MsgspecError on what is not such a record."""
 
     def __init__(self) -> None:
         # Lax decoding is what turns the strings of the non-finite numbers back into floats.
         self._decoders = {topic.name: msgspec.json.Decoder(topic.record, strict=False) for topic in TOPICS}
+        self._plan_figures = msgspec.json.Decoder(PlanFigures, strict=False)
 
     def decode(self, topic: str, data: bytes) -> Record:
         """The record of one message of `topic`."""
         return self._decoders[topic].decode(data)
+
+    def decode_brief(self, topic: str, data: bytes) -> Record | PlanFigures:
+        """The same, but of a plan the figures alone, which takes less than half of the time."""
+        return self._plan_figures.decode(data) if topic == _PLAN else self._decoders[topic].decode(data)
 
 
 def json_schema(record_type: type[Record]) -> bytes:

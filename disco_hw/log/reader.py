@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 from types import TracebackType
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import msgspec
 import numpy as np
@@ -27,8 +27,9 @@ from disco_hw.log.container import (
 from disco_hw.log.encoding import JsonDecoder
 from disco_hw.log.errors import LogError
 from disco_hw.log.mcap_log import METADATA, RECOVERY, Metadata
-from disco_hw.log.records import TOPIC_BY_NAME, Record
+from disco_hw.log.records import TOPIC_BY_NAME, PlanFigures, Record
 
+_R = TypeVar("_R")
 _RECOVER = "run `disco-hw log recover` and use the mended log"
 
 
@@ -147,8 +148,23 @@ class Log:
 
         Raises LogError for a topic that no log has, and for damage.
         """
+        for now_ns, tick, topic, record in self._decoded(self._decoder.decode, topics, start_ns, end_ns):
+            yield Entry(topic, now_ns, tick, record)
+
+    def brief_records(self, topics: Collection[str]) -> Iterator[tuple[int, Record | PlanFigures]]:
+        """Time of the tick and record, but of plans the figures alone: for a quick look at a whole log."""
+        for now_ns, _, _, record in self._decoded(self._decoder.decode_brief, topics, None, None):
+            yield now_ns, record
+
+    def _decoded(
+        self,
+        decode: Callable[[str, bytes], _R],
+        topics: Collection[str] | None,
+        start_ns: int | None,
+        end_ns: int | None,
+    ) -> Iterator[tuple[int, int, str, _R]]:
+        """Time of the tick, its number, topic and decoded record."""
         offset = self._metadata.wall_offset_ns
-        decode = self._decoder.decode
         names = self._topics
         for message in self._messages(topics, start_ns, end_ns):
             topic = names[message.channel_id]
@@ -156,7 +172,7 @@ class Log:
                 record = decode(topic, message.data)
             except msgspec.MsgspecError as error:
                 raise LogError(f"{self._path}: a record of {topic} cannot be read ({error}); {_RECOVER}") from None
-            yield Entry(topic, message.log_time - offset, message.sequence, record)
+            yield message.log_time - offset, message.sequence, topic, record
 
     def columns(
         self, topic: str, start_ns: int | None = None, end_ns: int | None = None

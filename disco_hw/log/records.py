@@ -87,6 +87,16 @@ class Plan(msgspec.Struct, frozen=True, gc=False):
     path_yaw_rad: tuple[float, ...] = ()
 
 
+class PlanFigures(msgspec.Struct, frozen=True, gc=False):
+    """The figures of a recorded plan without its steps and its path, which are most of a log; never recorded itself."""
+
+    t_ns: int
+    effective_samples: float = nan
+    temperature: float = nan
+    min_cost: float = nan
+    mean_cost: float = nan
+
+
 class Command(msgspec.Struct, frozen=True, gc=False):
     """The wheel command of one tick as it was asked for and as it was sent.
 

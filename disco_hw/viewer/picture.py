@@ -31,6 +31,8 @@ FRAMES_PER_S = 10
 _PICTURE_DPI = 110
 _CLIP_DPI = 70
 _LONGEST_S = 600.0
+# All pictures of these formats are held until the last one is drawn, about 1 MB each.
+_LONGEST_IN_MEMORY_S = 60.0
 _CLIP_FORMATS = {".gif": "gif", ".webp": "webp", ".apng": "apng", ".mp4": "mp4"}
 Progress = Callable[[float], None]
 
@@ -48,14 +50,15 @@ def draw_picture(recording: Recording, t_s: float, path: Path) -> None:
 def draw_clip(recording: Recording, path: Path, speed: float, progress: Progress) -> None:
     """Write the whole log as a clip of 10 pictures a second, `speed` times as fast as it was.
 
-    .gif, .webp and .apng need nothing; .mp4 needs ffmpeg. `progress` gets the part done. Raises InputError for another
-    ending, a missing ffmpeg, or a clip of more than 10 minutes.
+    .gif, .webp and .apng need nothing, and may be a minute long; .mp4 needs ffmpeg, and may be ten. `progress` gets the
+    part done. Raises InputError for another ending, a missing ffmpeg, or a longer clip.
     """
     writer = _writer(path)
     length_s = recording.duration_s / speed
-    if length_s > _LONGEST_S:
+    longest_s = _LONGEST_IN_MEMORY_S if isinstance(writer, PillowWriter) else _LONGEST_S
+    if length_s > longest_s:
         raise InputError(f"{path}: the clip would take {length_s:.0f} s; raise --speed to at least "
-                         f"{math.ceil(recording.duration_s / _LONGEST_S)}")  # fmt: skip
+                         f"{math.ceil(recording.duration_s / longest_s)}")  # fmt: skip
     figure = _figure()
     count = max(1, round(length_s * FRAMES_PER_S))
     with writer.saving(figure, str(path), _CLIP_DPI):
@@ -72,9 +75,30 @@ def _writer(path: Path) -> AbstractMovieWriter:
         raise InputError(f"{path}: no such kind of clip; end the name in {', '.join(_CLIP_FORMATS)}")
     if ending != ".mp4":
         return PillowWriter(fps=FRAMES_PER_S)
-    if shutil.which("ffmpeg") is None:
-        raise InputError(f"{path}: writing .mp4 needs ffmpeg; install it, or end the name in .gif or .webp")
-    return FFMpegWriter(fps=FRAMES_PER_S)
+    encoder = _ffmpeg()
+    if encoder is None:
+        raise InputError(
+            f"{path}: writing .mp4 needs ffmpeg; install it, or pip install 'disco-hw[video]', or end the name in .webp"
+        )
+    writer = FFMpegWriter(fps=FRAMES_PER_S)
+    # What matplotlib would look for in a setting that all figures of the process share.
+    writer.bin_path = lambda: encoder  # type: ignore[method-assign]
+    return writer
+
+
+def _ffmpeg() -> str | None:
+    """The system's ffmpeg, or else the one of the extra `video`."""
+    found = shutil.which("ffmpeg")
+    if found is not None:
+        return found
+    try:
+        from imageio_ffmpeg import get_ffmpeg_exe  # noqa: PLC0415
+    except ImportError:
+        return None
+    try:
+        return str(get_ffmpeg_exe())
+    except RuntimeError:
+        return None
 
 
 def _figure() -> Figure:

@@ -26,9 +26,9 @@ class Recording:
         self._log = Log(path)
         try:
             self.stage: Stage = stage_of_log(self._log, robot_file)
-            self.timeline = Timeline(keep_plans=False)
-            for entry in self._log.records(_SHOWN):
-                self.timeline.add(entry.now_ns, entry.record)
+            self.timeline = Timeline()
+            for now_ns, record in self._log.brief_records(_SHOWN):
+                self.timeline.add(now_ns, record)
             self.ticks: NDArray[np.int64] = self.timeline.estimate.rows(0, np.iinfo(np.int64).max)[0]
             if not len(self.ticks):
                 raise InputError(f"{path}: holds no estimates, so there is nothing to show; give a log of `run`")

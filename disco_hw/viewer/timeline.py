@@ -26,32 +26,46 @@ class Series:
         self._times = np.empty(_FIRST_ROWS, np.int64)
         self._rows = np.empty((_FIRST_ROWS, len(columns)))
         self._count = 0
+        self._new_times: list[int] = []
+        self._new_rows: list[tuple[float, ...]] = []
 
     def __len__(self) -> int:
-        return self._count
+        return self._count + len(self._new_times)
 
     def append(self, now_ns: int, row: tuple[float, ...]) -> None:
         """Add a row of as many numbers as there are columns."""
-        if self._count == len(self._times):
-            self._times = np.concatenate((self._times, np.empty_like(self._times)))
-            self._rows = np.concatenate((self._rows, np.empty_like(self._rows)))
-        self._times[self._count] = now_ns
-        self._rows[self._count] = row
-        self._count += 1
+        self._new_times.append(now_ns)
+        self._new_rows.append(row)
+
+    def _take_in(self) -> None:
+        """Put what was added into the arrays, all at once: one row costs as much as a hundred together."""
+        count = self._count + len(self._new_times)
+        if count == self._count:
+            return
+        if count > len(self._times):
+            room = max(count, 2 * len(self._times)) - len(self._times)
+            self._times = np.concatenate((self._times, np.empty(room, np.int64)))
+            self._rows = np.concatenate((self._rows, np.empty((room, len(self.columns)))))
+        self._times[self._count : count] = self._new_times
+        self._rows[self._count : count] = self._new_rows
+        self._count, self._new_times, self._new_rows = count, [], []
 
     def rows(self, first_ns: int, last_ns: int) -> tuple[Times, Array]:
         """Times (N,) and rows (N, columns) with first_ns <= time <= last_ns; views, not copies."""
+        self._take_in()
         times = self._times[: self._count]
         first, last = np.searchsorted(times, first_ns, "left"), np.searchsorted(times, last_ns, "right")
         return times[first:last], self._rows[first:last]
 
     def last(self, at_ns: int) -> tuple[int, Array] | None:
         """The newest row known at `at_ns` and its time; None before the first."""
+        self._take_in()
         index = int(np.searchsorted(self._times[: self._count], at_ns, "right")) - 1
         return None if index < 0 else (int(self._times[index]), self._rows[index])
 
     def forget_before(self, oldest_ns: int) -> None:
         """Drop rows from before `oldest_ns`, once they are at least half of all."""
+        self._take_in()
         first = int(np.searchsorted(self._times[: self._count], oldest_ns, "left"))
         if 2 * first >= self._count > 0:
             self._times = self._times[first : max(self._count, first + _FIRST_ROWS)].copy()
@@ -106,10 +120,9 @@ POWER = ("voltage_v", "current_a", "temperature_c")
 
 
 class Timeline:
-    """Every series of a run; with `keep_plans` whole plans too, which a replay reads from its log when it needs one."""
+    """Every series of a run, and whole plans where it is given them; a replay reads these from its log when needed."""
 
-    def __init__(self, keep_plans: bool = True) -> None:
-        self._keep_plans = keep_plans
+    def __init__(self) -> None:
         self.first_ns: int | None = None
         self.last_ns: int | None = None
         self.estimate = Series((*ESTIMATE, *COVARIANCE))
@@ -132,7 +145,7 @@ class Timeline:
         self.beliefs: Items[records.BeliefChange] = Items()
         self.adaptations: Items[records.Adaptation] = Items()
 
-    def add(self, now_ns: int, record: records.Record) -> None:  # noqa: PLR0912
+    def add(self, now_ns: int, record: records.Record | records.PlanFigures) -> None:  # noqa: PLR0912
         """Take in one record of the tick at `now_ns`; ticks come in order. Frames are not kept."""
         self.first_ns = now_ns if self.first_ns is None else self.first_ns
         self.last_ns = now_ns
@@ -149,17 +162,17 @@ class Timeline:
                 self.command.append(now_ns, (*requested, it.left_rad_s, it.right_rad_s, float(it.in_force)))
                 if self.source.last(now_ns) != it.source:
                     self.source.append(now_ns, it.source)
+            case records.LoopTiming() as it:
+                self.loop.append(now_ns, (float(it.lateness_ns), float(it.overruns), float(it.skipped)))
+            case records.Plan() | records.PlanFigures() as it:
+                self.planner.append(now_ns, (it.effective_samples, it.temperature, it.min_cost, it.mean_cost))
+                if isinstance(it, records.Plan):
+                    self.plans.append(now_ns, it)
             case PoseSample() as it:
                 self.pose.append(now_ns, (it.x_m, it.y_m, it.yaw_rad))
             case records.Innovation() as it:
                 row = (*it.innovation, *it.variance, it.test_ratio, float(it.accepted))
                 self.innovation.append(now_ns, row)
-            case records.Plan() as it:
-                self.planner.append(now_ns, (it.effective_samples, it.temperature, it.min_cost, it.mean_cost))
-                if self._keep_plans:
-                    self.plans.append(now_ns, it)
-            case records.LoopTiming() as it:
-                self.loop.append(now_ns, (float(it.lateness_ns), float(it.overruns), float(it.skipped)))
             case PowerSample() as it:
                 self.power.append(now_ns, (it.voltage_v, it.current_a, it.temperature_c))
             case RobotStatus() as it:

@@ -1,6 +1,5 @@
 """The live page of a running robot: it draws what is so, stops and drives the wheels, and cannot touch the loop."""
 
-import math
 import os
 import signal
 import socket
@@ -8,13 +7,15 @@ import time
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from disco_hw.config import load_robot_config
+from disco_hw.course import course_of
 from disco_hw.daemon.control_client import send_request
 from disco_hw.drive.source import INPUT_LIMIT_NS
 from disco_hw.log.reader import open_log
 from disco_hw.operator import disco_hw_process, stands
+from disco_hw.robot_setup import load_setup
 from disco_hw.viewer import scene
 from tests.hil.stack import DECELERATION_RAD_S2, STILL_RAD_S, running_stack
 from tests.hil.test_drive import Bench
@@ -68,7 +69,7 @@ def test_the_page_draws_the_robot_survives_being_stopped_and_its_estop_stops_the
             stopped_s = time.monotonic()
             tab.get_by_text("The stop is latched.").wait_for()
             keep(tab, "estop")
-            assert_drawn(tab, stack, circle=False)
+            assert_drawn(tab, stack, line=False)
             tab.get_by_role("button", name="Reset").click()
             stack.operator.wait_for("READY", 10.0)
             set_the_task(tab, stack)
@@ -98,9 +99,12 @@ def stop_the_page_for_a_while(stack, pid):
     assert after["recorder"]["dropped_ticks"] == 0
 
 
-def assert_drawn(tab, stack, circle=True):
-    """Robot and circle have their colours where they are in the world, seen from the page's first camera."""
-    task = load_robot_config(stack.robot_file).task
+def assert_drawn(tab, stack, line=True, beside=(0.0, 0.0)):
+    """Robot and task have their colours where they are in the world, seen from the page's first camera.
+
+    `beside` is a place where neither of them is.
+    """
+    task = load_setup(stack.robot_file).config.task
     x_m, y_m, _ = stack.operator.wait_until("standing still", stands, 5.0)["pose"]
     canvas = scene_canvas(tab)
     eye, look_at = scene.first_camera(task)
@@ -109,22 +113,18 @@ def assert_drawn(tab, stack, circle=True):
         column, row = project(point, eye, look_at, canvas["width"], canvas["height"])
         return column + canvas["x"], row + canvas["y"]
 
-    # Clear of the robot.
-    begin = math.atan2(y_m - task.center_y_m, x_m - task.center_x_m)
-    angles = [begin + math.radians(degrees) for degrees in (45, 110, 160, 210, 315)] if circle else []
-    on_circle = [
-        place(task.center_x_m + task.radius_m * math.cos(a), task.center_y_m + task.radius_m * math.sin(a), 0.0)
-        for a in angles
-    ]
+    outline = course_of(task).outline_m()
+    clear = outline[np.hypot(outline[:, 0] - x_m, outline[:, 1] - y_m) > 0.6]
+    on_line = [place(x, y, 0.0) for x, y in clear[:: len(clear) // 5]] if line else []
 
     def everything_is_there():
         close_notices(tab)
         picture = screenshot(tab)
         return (
-            all(shows(picture, column, row, scene.TASK_COLOUR, 3) for column, row in on_circle)
+            all(shows(picture, column, row, scene.TASK_COLOUR, 3) for column, row in on_line)
             and shows(picture, *place(x_m, y_m, 0.1), scene.BODY_COLOUR, 4)
-            and not shows(picture, *place(task.center_x_m, task.center_y_m, 0.0), scene.TASK_COLOUR, 3)
-            and not shows(picture, *place(task.center_x_m, task.center_y_m, 0.0), scene.BODY_COLOUR, 3)
+            and not shows(picture, *place(*beside, 0.0), scene.TASK_COLOUR, 3)
+            and not shows(picture, *place(*beside, 0.0), scene.BODY_COLOUR, 3)
         )
 
     wait_for(tab, everything_is_there, 120.0)

@@ -175,3 +175,18 @@ def test_a_log_still_being_written_reads_as_far_as_it_goes(tmp_path):
     with open_log(path) as log:
         assert [entry.tick for entry in log.records(("/loop",))] == [1, 2]
         assert not log.complete
+
+
+def test_a_brief_look_gives_the_same_records_but_of_plans_the_figures_alone(log_file):
+    topics = ("/plan", "/estimate", "/command")
+    with open_log(log_file) as log:
+        whole = [(entry.now_ns, entry.record) for entry in log.records(topics)]
+        brief = list(log.brief_records(topics))
+    assert len(brief) == len(whole) > 0
+    for (now_ns, record), (brief_ns, short) in zip(whole, brief, strict=True):
+        assert brief_ns == now_ns
+        if isinstance(record, Plan):
+            figures = ("t_ns", "effective_samples", "temperature", "min_cost", "mean_cost")
+            assert repr([getattr(short, name) for name in figures]) == repr([getattr(record, name) for name in figures])
+        else:
+            assert short == record

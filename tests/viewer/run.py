@@ -83,12 +83,12 @@ def tick_records(tick):
     return now_ns, got
 
 
-def write_log(path, ticks=200):
-    """A log of the run, written by the real writer."""
+def write_log(path, ticks=200, records_of=tick_records):
+    """A log of the run, written by the real writer; `records_of(tick)` is what each tick holds."""
     attachments = (attachment(ROBOT_FILE, ROBOT_TOML), attachment(MODEL_FILE, MODEL_TOML))
     recorder = ProcessRecorder(Recording(path, "wombot", attachments=attachments, queue_ticks=100_000))
     for tick in range(ticks):
-        recorder.put(*tick_records(tick))
+        recorder.put(*records_of(tick))
     stats = recorder.close(300.0)
     assert stats.dropped_ticks == 0
     assert stats.refused == 0

@@ -1,7 +1,6 @@
 """Pictures, clips and exported pages of a log, and the pages as processes."""
 
 import json
-import shutil
 import signal
 import subprocess
 import sys
@@ -32,11 +31,17 @@ def test_a_snapshot_shows_circle_and_robot(log_file, tmp_path):
     assert np.abs(np.asarray(end).astype(int) - np.asarray(start)).max() > 100, "nothing moved"
 
 
-def test_a_clip_moves(log_file, tmp_path):
-    video_log(log_file, tmp_path / "clip.gif", speed=20.0)
-    clip = Image.open(tmp_path / "clip.gif")
-    assert clip.n_frames == 3
+@pytest.mark.parametrize(("ending", "kind"), [("gif", "GIF"), ("webp", "WEBP"), ("apng", "PNG")])
+def test_a_clip_moves_with_nothing_installed(log_file, tmp_path, monkeypatch, ending, kind):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.delenv("DISPLAY", raising=False)
+    video_log(log_file, tmp_path / f"clip.{ending}", speed=20.0)
+    clip = Image.open(tmp_path / f"clip.{ending}")
+    assert (clip.format, clip.n_frames) == (kind, 3)
+    clip.load()
+    assert clip.info["duration"] == 100
     first = np.asarray(clip.convert("RGB")).astype(int)
+    assert count_of(clip, scene.TASK_COLOUR, 40) > 200
     clip.seek(2)
     assert np.abs(np.asarray(clip.convert("RGB")) - first).max() > 100
 
@@ -66,14 +71,24 @@ def test_a_name_that_cannot_be_written_is_told(log_file, tmp_path, write, name, 
 
 def test_mp4_needs_ffmpeg(log_file, tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
-    with pytest.raises(InputError, match="ffmpeg"):
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    with pytest.raises(InputError, match=r"writing \.mp4 needs ffmpeg; install it, or pip install 'disco-hw\[video"):
         video_log(log_file, tmp_path / "a.mp4")
+    assert not (tmp_path / "a.mp4").exists()
 
 
-@pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="ffmpeg is not installed: apt-get install ffmpeg")
-def test_an_mp4_is_written(log_file, tmp_path):
+@pytest.mark.skipif(picture._ffmpeg() is None, reason="no ffmpeg: install it, or pip install 'disco-hw[video]'")
+def test_an_mp4_is_written_and_has_every_picture(log_file, tmp_path):
     video_log(log_file, tmp_path / "a.mp4", speed=20.0)
     assert (tmp_path / "a.mp4").read_bytes()[4:8] == b"ftyp"
+    into = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
+    read = subprocess.run(
+        [picture._ffmpeg(), "-v", "error", "-i", str(tmp_path / "a.mp4"), *into], capture_output=True, check=True
+    )
+    pictures = np.frombuffer(read.stdout, np.uint8).reshape(-1, 448, 784, 3).astype(int)
+    assert len(pictures) == 3
+    assert (np.abs(pictures[0] - scene.TASK_COLOUR).max(axis=2) < 40).sum() > 200
+    assert np.abs(pictures[2] - pictures[0]).max() > 100
 
 
 def test_a_log_in_figures_has_every_mark(recording):
@@ -92,7 +107,7 @@ def test_json_is_one_object_on_standard_output(log_file, tmp_path, capsys):
 
 
 def test_a_clip_without_end_is_refused(recording, tmp_path, monkeypatch):
-    monkeypatch.setattr(picture, "_LONGEST_S", 1.0)
+    monkeypatch.setattr(picture, "_LONGEST_IN_MEMORY_S", 1.0)
     with pytest.raises(InputError, match="--speed to at least 4"):
         picture.draw_clip(recording, tmp_path / "a.gif", 1.0, lambda part: None)
 

@@ -3,7 +3,7 @@
 import json
 import threading
 import time
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from urllib.parse import urlsplit
 
 import pytest
@@ -217,6 +217,24 @@ def test_a_foreign_page_gets_no_line(daemon, origin):
     with desk_of(daemon.server.path) as (_, port), pytest.raises(InvalidStatus), line_to(port, origin):
         pass
     assert daemon.asked == []
+
+
+def test_with_another_address_there_is_no_control_without_its_token(daemon):
+    with (
+        closing(Desk(daemon.server.path, ROBOT_FILE)) as desk,
+        serving("test", host="0.0.0.0", port=0, desk=desk) as page,
+    ):
+        address = urlsplit(page.url)
+        own, token = f"http://127.0.0.1:{address.port}", address.query.removeprefix("token=")
+        for cookie in ({}, {"Cookie": "disco-hw-token=wrong"}):
+            with pytest.raises(InvalidStatus) as refused:
+                connect(f"ws://127.0.0.1:{address.port}/desk", origin=own, additional_headers=cookie)
+            assert refused.value.response.status_code == 403
+        assert daemon.asked == []
+        welcome, _ = get(address.port, f"/?token={token}")
+        cookie = {"Cookie": welcome.getheader("Set-Cookie").split(";")[0]}
+        with connect(f"ws://127.0.0.1:{address.port}/desk", origin=own, additional_headers=cookie) as line:
+            assert ask(line, do="stop")["ok"]
 
 
 def test_the_desk_is_what_opens_and_nobody_else_may_frame_it(daemon):

@@ -13,7 +13,7 @@ from disco_hw.viewer.commands import export_log
 from disco_hw.viewer.replay import ReplayPage, run_replay
 from disco_hw.viewer.server import serving
 from tests.viewer.browser import chromium, keep, opened
-from tests.viewer.run import RADIUS_M, pose_at
+from tests.viewer.run import FAULT_TICK, RADIUS_M, pose_at
 
 pytestmark = pytest.mark.long
 
@@ -104,6 +104,9 @@ def test_circle_and_robot_are_drawn_at_their_places_and_replay_is_sought(browser
         wait_for(tab, lambda: page.t_s == pytest.approx(3.02))
         tab.get_by_role("button", name="Play").click()
         wait_for(tab, lambda: page.t_s > 3.1)
+        tab.get_by_role("combobox", name="Marks").click()
+        tab.get_by_role("option").filter(has_text="fault:").first.click()
+        wait_for(tab, lambda: page.t_s == pytest.approx(FAULT_TICK * 0.02) and not page.playing)
         slider = tab.get_by_role("slider").first
         slider.focus()
         slider.press("Home")

@@ -2,7 +2,7 @@ import numpy as np
 
 from disco_hw.log import records
 from disco_hw.viewer.timeline import Items, Series, Timeline
-from tests.viewer.run import PERIOD_NS, START_NS, tick_records
+from tests.viewer.run import PERIOD_NS, START_NS, plan_at
 
 
 def test_series_keeps_rows_in_order_beyond_its_first_size():
@@ -71,12 +71,13 @@ def test_a_whole_run_ends_up_in_its_series(timeline):
 
 
 def test_plans_are_left_out_where_they_can_be_read_again():
-    line = Timeline(keep_plans=False)
-    now_ns, got = tick_records(0)
-    for record in got:
-        line.add(now_ns, record)
+    line = Timeline()
+    line.add(7, records.PlanFigures(7, 40.0, 0.3, 1.0, 2.0))
     assert len(line.plans) == 0
-    assert len(line.planner) == 1
+    assert line.planner.last(7)[1].tolist() == [40.0, 0.3, 1.0, 2.0]
+    line.add(8, plan_at(0))
+    assert len(line.plans) == 1
+    assert len(line.planner) == 2
 
 
 def test_forgetting_bounds_everything(timeline):
