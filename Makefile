@@ -22,7 +22,8 @@ $(STAMP): $(SOURCES) | $(BIN)/python
 demo: $(STAMP)
 	$(BIN)/disco-hw demo
 
-# The page's tests need a browser and are skipped without one. CHROMIUM=install installs it on Debian, as root.
+# The page's tests need a browser and are skipped without one. CHROMIUM=install installs it on Debian, as root, and has
+# `make test` run them too.
 CHROMIUM ?=
 
 chromium:
@@ -33,11 +34,11 @@ ifeq ($(CHROMIUM),install)
 endif
 
 # One thread of linear algebra a process: pools of them on two cores only wait for one another.
-test: $(STAMP)
+test: $(STAMP) chromium
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy & types=$$!; $(BIN)/python -m tools.compile_kernels & kernels=$$!; wait $$types && wait $$kernels
-	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 3 --dist worksteal -m "not long"
+	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 3 --dist worksteal -m "not long$(if $(CHROMIUM), or browser)"
 
 # Closed loops, studies, clusters and browsers: as much again.
 test-long: $(STAMP) chromium

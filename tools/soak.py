@@ -22,7 +22,12 @@ from tests.hil.stack import write_robot_file
 WANTED_P999_US = 1000.0
 # On a busy machine the planner's first compilation alone takes minutes.
 READY_TIMEOUT_S = 400.0
-HOG = "import os; os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0)); os.nice(int('{nice}'))\nwhile True: pass"
+# It ends with the process that started it, however that ends.
+HOG = """import os
+parent = os.getppid()
+os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+os.nice(int('{nice}'))
+while os.getppid() == parent: pass"""
 
 
 def soak(minutes: float, realtime: bool, hog_nice: int) -> dict[str, Any]:

@@ -23,7 +23,7 @@ from tests.viewer.browser import chromium, keep, opened
 from tests.viewer.camera import project, screenshot, shows
 from tests.viewer.test_page import wait_for
 
-pytestmark = [pytest.mark.hil, pytest.mark.long]
+pytestmark = [pytest.mark.hil, pytest.mark.long, pytest.mark.browser]
 # Ticks, the link, and a machine that has other things to do.
 MARGIN_S = 0.1
 

@@ -8,7 +8,7 @@ from tests.hil.test_page import assert_drawn, page_of
 from tests.viewer.browser import chromium, keep, opened
 from tests.viewer.test_page import wait_for
 
-pytestmark = [pytest.mark.hil, pytest.mark.long]
+pytestmark = [pytest.mark.hil, pytest.mark.long, pytest.mark.browser]
 TASK = 'path = "path.csv"\nspeed_m_s = 0.2\n'
 
 

@@ -15,7 +15,7 @@ from disco_hw.viewer.server import serving
 from tests.viewer.browser import chromium, keep, opened
 from tests.viewer.run import FAULT_TICK, RADIUS_M, pose_at
 
-pytestmark = pytest.mark.long
+pytestmark = [pytest.mark.long, pytest.mark.browser]
 
 HEIGHT_M, FIELD_OF_VIEW, SIZE = 2.5, math.radians(60.0), 480
 
