@@ -46,7 +46,7 @@ class HandPilot:
     def step(self, now_ns: int, last: CoreTick | None) -> PilotTick:
         """Poll the source once and judge what it says."""
         state = State.DISCONNECTED if last is None else last.output.state
-        newest = self._source.poll(now_ns, RobotView(state, self._driving))
+        newest = self._source.poll(now_ns, RobotView(state, self._driving, _measured(last)))
         verdict = self._deadman.step(now_ns, newest, state)
         if self._source.ended is not None:
             self._told.append(self._source.ended)
@@ -95,3 +95,9 @@ class HandPilot:
                 "coverage_words": self._coverage.in_words(),
             }
         }
+
+
+def _measured(last: CoreTick | None) -> tuple[float, float] | None:
+    if last is None or not last.pipeline.estimate.wheels_ok:
+        return None
+    return last.pipeline.estimate.left_speed_rad_s, last.pipeline.estimate.right_speed_rad_s

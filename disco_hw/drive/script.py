@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from disco_hw.config import Robot
 
@@ -13,12 +13,17 @@ Wheels = tuple[float, float]
 
 @dataclass(frozen=True, slots=True)
 class Manoeuvre:
-    """Wheel speeds (rad/s, left and right) over the time since its start (s), and what inference learns from it."""
+    """Wheel speeds (rad/s, left and right) over the time since its start (s), and what inference learns from it.
+
+    `finds_limits`: the wheels' limits are what it reaches; `within_limits`: its speeds are scaled into those found.
+    """
 
     name: str
     purpose: str
     duration_s: float
     wheels: Callable[[float], Wheels]
+    finds_limits: bool = False
+    within_limits: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,9 +63,7 @@ class Script:
         for manoeuvre in self.manoeuvres:
             if left_s <= 0.0:
                 break
-            kept.append(
-                Manoeuvre(manoeuvre.name, manoeuvre.purpose, min(left_s, manoeuvre.duration_s), manoeuvre.wheels)
-            )
+            kept.append(replace(manoeuvre, duration_s=min(left_s, manoeuvre.duration_s)))
             left_s -= manoeuvre.duration_s
         return Script(self.name, tuple(kept))
 

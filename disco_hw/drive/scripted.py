@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from disco_hw.daemon.states import State
-from disco_hw.drive.script import Manoeuvre, Script
+from disco_hw.drive.script import Manoeuvre, Script, Wheels
 from disco_hw.drive.source import ManualInput, ManualSource, RobotView
+from disco_hw.drive.wheel_limits import WheelLimits
 
 _LONGEST_TICK_NS = 100_000_000
+_SETTLED_S = 0.8
 
 
 class ScriptSource:
     """Plays a script while the deadman of another source is held.
 
     A manoeuvre that was broken off by disarming begins anew when driving goes on, so that each is recorded whole once.
+    The wheels' limits are what they reach at the end of the manoeuvres that are to find them.
     """
 
     def __init__(self, script: Script, deadman: ManualSource) -> None:
@@ -23,6 +26,7 @@ class ScriptSource:
         self._driven = False
         self._driving = False
         self._over = False
+        self._limits = WheelLimits()
 
     @property
     def ended(self) -> str | None:
@@ -45,9 +49,12 @@ class ScriptSource:
 
     @property
     def task(self) -> str:
-        """The manoeuvre under way, or next."""
+        """The manoeuvre under way, or next, and the limits that it keeps where it is about them."""
         manoeuvre = self._manoeuvre
-        return "" if manoeuvre is None else f"{manoeuvre.name}: {manoeuvre.purpose}"
+        if manoeuvre is None:
+            return ""
+        limits = f" ({self._limits.in_words()})" if manoeuvre.within_limits else ""
+        return f"{manoeuvre.name}{limits}: {manoeuvre.purpose}"
 
     def poll(self, now_ns: int, robot: RobotView) -> ManualInput | None:
         """The script's wheel speeds with the other source's deadman and time."""
@@ -57,7 +64,7 @@ class ScriptSource:
             return None
         if self._over:
             return ManualInput(now_ns, 0.0, 0.0, deadman=False)
-        left, right = self._script.at(self._driven_ns * 1e-9)
+        left, right = self._wheels()
         return ManualInput(held.t_ns, left, right, held.deadman)
 
     def close(self) -> None:
@@ -69,12 +76,28 @@ class ScriptSource:
         place = self._script.place(self._driven_ns * 1e-9)
         return None if place is None else place[0]
 
+    def _wheels(self) -> Wheels:
+        wheels = self._script.at(self._driven_ns * 1e-9)
+        manoeuvre = self._manoeuvre
+        return self._limits.within(wheels) if manoeuvre is not None and manoeuvre.within_limits else wheels
+
+    def _observe(self, measured: Wheels | None) -> None:
+        """Learn what the wheels reach, from the end of a manoeuvre that is to find it."""
+        t_s = self._driven_ns * 1e-9
+        place = self._script.place(t_s)
+        if measured is None or place is None or not place[0].finds_limits:
+            return
+        manoeuvre, began_s = place
+        if t_s > began_s + manoeuvre.duration_s - _SETTLED_S:
+            self._limits.observe(manoeuvre.name, manoeuvre.wheels(t_s - began_s), measured)
+
     def _advance(self, now_ns: int, robot: RobotView) -> None:
         if robot.driving and self._last_ns is not None:
             # A loop held up must not skip what was to be driven meanwhile.
             self._driven_ns += min(now_ns - self._last_ns, _LONGEST_TICK_NS)
             self._over = self._over or self._manoeuvre is None
             self._driven = True
+            self._observe(robot.wheels)
         elif self._driven and robot.state is not State.ARMED and not self._over:
             place = self._script.place(self._driven_ns * 1e-9)
             self._driven_ns = 0 if place is None else round(place[1] * 1e9)

@@ -1,9 +1,9 @@
 """The scripts of `disco-hw drive`, as functions of the robot's limits; the same seed draws the same drive.
 
-`circle` is the paper's drive. `steps` follows the protocol of norlab-ulaval's DRIVE: wheel speeds drawn uniformly
-within the limits, 6 s each. `excite` takes two minutes to show what inference and the search for gaps need to tell
-parameters and effects from each other. Those of `disco_hw.drive.separating` show in a minute what another drive could
-not.
+`circle` is the paper's drive. `steps` follows the protocol of norlab-ulaval's DRIVE: find the wheels' limits, then hold
+wheel speeds drawn evenly within them, 6 s each. `excite` takes two minutes to show what inference and the search for
+gaps need to tell parameters and effects from each other. Those of `disco_hw.drive.separating` show in a minute what
+another drive could not.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 import random
 from collections.abc import Callable
+from dataclasses import replace
 
 from disco_hw.config import CircleTask, Robot, RobotTask, circle_task
 from disco_hw.drive.pieces import Pieces, rest
@@ -20,6 +21,7 @@ from disco_hw.errors import InputError
 
 SCRIPTS = ("circle", "steps", "excite", *SEPARATING)
 STEP_S = 6.0
+FIND_S = 2.0
 STEPS = 20
 _LAPS = 2.0
 
@@ -34,7 +36,7 @@ def make_script(name: str, robot: Robot, task: RobotTask, speed_share: float, se
         case "circle":
             return circle(robot, circle_task(task, "--script circle"))
         case "steps":
-            return steps(top_rad_s, seed)
+            return steps(top_rad_s, seed, top_rad_s / robot.max_wheel_acceleration_rad_s2)
         case "excite":
             return excite(top_rad_s)
         case _ if name in SEPARATING:
@@ -59,16 +61,30 @@ def circle(robot: Robot, task: CircleTask) -> Script:
     return Script("circle", (rest(1.0), Manoeuvre("circle to the left", purpose, laps_s, _held(left, right)), rest()))
 
 
-def steps(top_rad_s: float, seed: int, count: int = STEPS) -> Script:
-    """Wheel speeds drawn evenly from the square within +-`top_rad_s`, 6 s each."""
+def steps(top_rad_s: float, seed: int, settling_s: float = 0.0, count: int = STEPS) -> Script:
+    """Wheel speeds drawn evenly within the limits that the wheels show first, 6 s each; at most `top_rad_s`.
+
+    `settling_s`: from rest to `top_rad_s`.
+    """
+    pieces = Pieces(top_rad_s)
+    search = "finds the largest wheel speed that is reached"
+    held_s = FIND_S + settling_s
+    found: list[Manoeuvre] = []
+    for name, forward, turn in (
+        ("as fast as it goes", 1.0, 0.0),
+        ("as fast as it goes, back", -1.0, 0.0),
+        ("as fast as it turns left", 0.0, 1.0),
+        ("as fast as it turns right", 0.0, -1.0),
+    ):
+        found += [replace(pieces.hold(name, search, held_s, forward, turn), finds_limits=True), rest()]
     draw = random.Random(seed)
-    manoeuvres = []
+    purpose = "steady motion anywhere within the limits, and the step to it"
     for number in range(1, count + 1):
-        left, right = draw.uniform(-top_rad_s, top_rad_s), draw.uniform(-top_rad_s, top_rad_s)
-        name = f"step {number}: {left:+.1f} {right:+.1f} rad/s"
-        purpose = "steady motion anywhere within the limits, and the step to it"
-        manoeuvres.append(Manoeuvre(name, purpose, STEP_S, _held(left, right)))
-    return Script("steps", (*manoeuvres, rest()))
+        left, right = draw.uniform(-1.0, 1.0), draw.uniform(-1.0, 1.0)
+        wheels = _held(left * top_rad_s, right * top_rad_s)
+        name = f"step {number}: {left:+.0%} {right:+.0%} of the limits"
+        found.append(Manoeuvre(name, purpose, STEP_S, wheels, within_limits=True))
+    return Script("steps", (*found, rest()))
 
 
 def excite(top_rad_s: float) -> Script:

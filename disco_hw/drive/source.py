@@ -25,10 +25,13 @@ class ManualInput:
 
 @dataclass(frozen=True, slots=True)
 class RobotView:
-    """What a source may see of the robot: the daemon's state, and whether the last tick drove the wheels by hand."""
+    """What a source may see of the robot: the daemon's state, whether the last tick drove the wheels by hand, and the
+    wheels' measured speeds (rad/s, left and right), None where they are not known.
+    """
 
     state: State
     driving: bool
+    wheels: tuple[float, float] | None = None
 
 
 class ManualSource(Protocol):

@@ -17,6 +17,7 @@ from drivers.transport import connect_pair
 from drivers.types import OutgoingFrame
 from firmware_protocol.firmware_core import FirmwareConfig
 from sim.body_dynamics import Pose
+from sim.effects import hidden_effects
 from sim.plant import Plant
 from sim.plant_parameters import PlantParameters
 from sim.virtual_robot import STEP_US, VirtualRobot
@@ -64,15 +65,16 @@ def simulated_stack(
     needs_pose: bool = True,
     robot_file: Path = ROBOT_FILE,
     start: Pose = START,
+    hide: dict[str, float] | None = None,
     **changes: float,
 ) -> SimulatedStack:
-    """The shipped robot with a plant at the posterior's mean; `changes` are fields of PlantParameters."""
+    """The shipped robot with a plant at the posterior's mean; `hide`: effects, `changes`: fields of PlantParameters."""
     setup = load_setup(robot_file)
     host_end, robot_end = connect_pair()
     recorder = MemoryRecorder()
     pipeline = make_pipeline(setup.config, setup.model, planner or make_planner(setup.config, setup.model))
     core = assemble_core(setup.config, host_end, make_driver(), pipeline, recorder, needs_pose)
-    plant = Plant(replace(PlantParameters(), **changes), None, seed, start)
+    plant = Plant(replace(PlantParameters(), **changes), hidden_effects(hide or {}), seed, start)
     robot = VirtualRobot(plant, FirmwareConfig(ticks_per_rev=2048, max_wheel_speed_rad_s=8.0), seed=seed)
     host_end.open()
     robot_end.open()

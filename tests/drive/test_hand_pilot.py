@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import re
+
+import numpy as np
 import pytest
 
 from disco_hw.daemon.states import State
 from disco_hw.daemon.supervisor import Reply, UserRequest
 from disco_hw.drive.coverage import Coverage
 from disco_hw.drive.hand_pilot import HandPilot
+from disco_hw.drive.scripted import ScriptSource, Unattended
+from disco_hw.drive.scripts import STEP_S, STEPS, make_script
 from disco_hw.drive.source import ManualInput
 from disco_hw.log import records
 from disco_hw.pipeline import NoPlanner, Source
@@ -150,3 +155,23 @@ def test_the_end_of_the_source_is_the_pilots():
     bench.run(0.02, ended="the end", held=False)
     assert bench.stack.pilot.done
     assert "the end" in bench.stack.pilot.status()["drive"]["messages"]
+
+
+def test_steps_are_driven_within_the_limits_that_the_robot_showed():
+    """The robot's wheels stop at 5 rad/s; 6.4 were asked for."""
+    bench = Bench()
+    bench.stack = simulated_stack(NoPlanner(), hide={"speed_limit": 5.0})
+    script = make_script("steps", bench.stack.core.config.robot, bench.stack.core.task, 0.8, seed=1)
+    bench.hand = ScriptSource(script, Unattended())
+    bench.stack.pilot = HandPilot(bench.hand, bench.coverage)
+    search_s = script.duration_s - STEPS * STEP_S
+    bench.stack.run(1.5 + search_s + 2.0 * STEP_S)
+    commands = [r for _, tick in bench.stack.recorder.ticks for r in tick if isinstance(r, records.Command)]
+    driven = np.array([(c.requested_left_rad_s, c.requested_right_rad_s) for c in commands if c.source == "manual"])
+    assert np.abs(driven).max() == pytest.approx(6.4)
+    steps = [step for step in script.manoeuvres if step.within_limits]
+    for number in (0, 1):
+        here = driven[round((search_s - 0.6 + (number + 0.5) * STEP_S) * 50)]
+        assert here == pytest.approx(np.array(steps[number].wheels(0.0)) * 5.0 / 6.4, abs=0.08)
+    told = [float(number) for number in re.findall(r"[-+]\d\.\d", bench.hand.task)]
+    assert told == pytest.approx([-5.0, 5.0, -5.0, 5.0], abs=0.15)

@@ -96,6 +96,30 @@ def test_a_stalled_loop_skips_nothing():
     assert bench.run(DRIVING, 1).left_rad_s == 1.0
 
 
+def limited(reached):
+    """A script that finds limits at 4 rad/s each way, then asks for half of them, on wheels that reach `reached`."""
+    search = Manoeuvre("fastest", "finds", 2.0, lambda t_s: (4.0, -4.0), finds_limits=True)
+    step = Manoeuvre("step 1", "holds", 2.0, lambda t_s: (2.0, -2.0), within_limits=True)
+    bench = Bench()
+    bench.source = ScriptSource(Script("s", (search, step)), bench.finger)
+    # What is reached at first is the wheels speeding up.
+    assert bench.run(RobotView(State.ARMED, True, (0.1, -0.1)), 50) == ManualInput(bench.now_ns - 7, 4.0, -4.0, True)
+    bench.run(RobotView(State.ARMED, True, reached), 60)
+    return bench
+
+
+def test_steps_are_held_within_what_the_wheels_reached_at_the_end_of_the_search():
+    bench = limited((3.0, -3.99))
+    assert (bench.last.left_rad_s, bench.last.right_rad_s) == (1.5, -2.0)
+    assert "step 1 (" in bench.source.task
+
+
+def test_limits_that_nobody_measured_are_those_asked_for():
+    bench = limited(None)
+    assert (bench.last.left_rad_s, bench.last.right_rad_s) == (2.0, -2.0)
+    assert "not found: no wheel speeds were measured" in bench.source.task
+
+
 def held(source, robot, ticks, start_ns=0):
     return [source.poll(start_ns + k * TICK, robot).deadman for k in range(1, ticks + 1)]
 

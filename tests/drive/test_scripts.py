@@ -49,14 +49,28 @@ def test_a_circle_beyond_the_wheels_is_refused():
         make_script("circle", robot(), CircleTask(radius_m=0.05, speed_m_s=0.3), 0.8)
 
 
+def steps_of(seed):
+    script = make_script("steps", robot(), CircleTask(), 1.0, seed)
+    return script, [manoeuvre for manoeuvre in script.manoeuvres if manoeuvre.within_limits]
+
+
 def test_steps_are_drawn_from_the_seed_and_spread_over_the_square():
-    first, again, other = (make_script("steps", robot(), CircleTask(), 1.0, seed) for seed in (1, 1, 2))
-    wheels = [first.at((k + 0.5) * STEP_S) for k in range(STEPS)]
-    assert wheels == [again.at((k + 0.5) * STEP_S) for k in range(STEPS)]
-    assert wheels != [other.at((k + 0.5) * STEP_S) for k in range(STEPS)]
-    assert first.at(0.0) == first.at(5.99) != first.at(6.01)
-    quadrants = {(left > 0.0, right > 0.0) for left, right in wheels}
-    assert len(quadrants) == 4
+    first, again, other = ([step.wheels(0.0) for step in steps_of(seed)[1]] for seed in (1, 1, 2))
+    assert first == again != other
+    script, held = steps_of(1)
+    assert [step.duration_s for step in held] == [STEP_S] * STEPS
+    begins_s = script.duration_s - 0.6 - STEPS * STEP_S
+    assert script.at(begins_s) == script.at(begins_s + 5.99) == first[0] != script.at(begins_s + 6.01)
+    assert len({(left > 0.0, right > 0.0) for left, right in first}) == 4
+
+
+def test_steps_begin_with_the_search_for_the_limits_of_each_wheel_both_ways():
+    script, _ = steps_of(1)
+    search = [manoeuvre for manoeuvre in script.manoeuvres if manoeuvre.finds_limits]
+    assert {manoeuvre.wheels(0.0) for manoeuvre in search} == {(8, 8), (-8, -8), (-8, 8), (8, -8)}
+    # From rest to 8 rad/s at 20 rad/s^2, and 2 s to see what is reached.
+    assert {manoeuvre.duration_s for manoeuvre in search} == {2.4}
+    assert script.manoeuvres[:8:2] == tuple(search)
 
 
 def test_excite_takes_about_two_minutes_and_little_room():

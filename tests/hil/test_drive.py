@@ -112,7 +112,7 @@ def assert_stands_in_time(t_s, wheels, silent_s):
 
 def test_a_script_is_driven_unattended_and_recorded_as_executed(tmp_path, monkeypatch):
     with bench(tmp_path) as made:
-        arguments = ["--script", "steps", "--seed", "1", "--seconds", "7.5", "--unattended", "--json"]
+        arguments = ["--script", "steps", "--seed", "1", "--seconds", "14", "--unattended", "--json"]
         process = made.drive(*arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
         told, complaints = process.communicate(timeout=60)
         assert process.returncode == 0, complaints.decode()
@@ -137,7 +137,7 @@ def test_a_script_is_driven_unattended_and_recorded_as_executed(tmp_path, monkey
     with open_log(made.log) as log:
         assert {"off", "hold", "manual"} == set(log.columns("/command")["source"])
         told = [entry.record.text for entry in log.records(["/event"])]
-    assert any(text.startswith("step 1") for text in told)
+    assert any(text.startswith("step 1") and "found: left -" in text for text in told)
 
 
 def test_a_key_held_drives_and_a_frozen_typist_stops_the_robot(tmp_path):
