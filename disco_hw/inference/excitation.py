@@ -116,10 +116,21 @@ def excitation(log: DriveLog, source: Source | None = None) -> Excitation:
         np.concatenate([run.moving_s for run in runs]),
         nodes.astype(np.int64),
         poses.astype(np.int64),
-        log.notes,
+        (*log.notes, *_left_out(log, source)),
     )
     _check_motion(name, joined)
     return joined
+
+
+def _left_out(log: DriveLog, source: Source) -> list[str]:
+    """A note where poses count for nothing, as the wheels beside them were not measured and those of others were."""
+    if source == "commands":
+        return []
+    lacking = ~np.isin(log.poses.segment, log.wheels.segment)
+    if not lacking.any():
+        return []
+    poses = np.count_nonzero(lacking)
+    return [f"{poses} poses come without encoders and count for nothing beside those with them; infer their log alone"]
 
 
 def _check_motion(name: str, drive: Excitation) -> None:

@@ -22,10 +22,10 @@ def drive_from_log(log: Log) -> DriveLog:
 
     Samples are put in order of their own time; a second one for the same time and measurements that are not finite are
     left out with a note. A new segment starts where ticks are missing and where wheel samples failed to come for half a
-    second. Raises LogError if there is none of the three, and for damage.
+    second. Raises LogError if there is none of the three, if the ticks' clock goes backwards, and for damage.
     """
     notes: list[str] = []
-    command = log.columns("/command")
+    command = _columns(log, "/command")
     speeds = np.column_stack([_floats(command["left_rad_s"]), _floats(command["right_rad_s"])])
     speeds[~command["in_force"].astype(bool)] = np.nan
     command_ns, speeds = _ordered(command["t_ns"], speeds, np.ones(len(speeds), dtype=bool), "commands", notes)
@@ -72,8 +72,23 @@ def ticks_per_rev(log: Log) -> int | None:
     return value if isinstance(value, int) and value > 0 else None
 
 
-def _samples(log: Log, topic: str, names: tuple[str, ...], notes: list[str]) -> tuple[Index, Array]:
+def _columns(log: Log, topic: str) -> dict[str, NDArray[np.generic]]:
+    """A topic whose ticks' times do not decrease."""
     columns = log.columns(topic)
+    now_ns = columns["now_ns"].astype(np.int64)
+    back = np.flatnonzero(np.diff(now_ns) < 0)
+    if back.size:
+        at_s = (now_ns[back[0]] - now_ns[0]) * 1e-9
+        by_s = (now_ns[back[0]] - now_ns[back[0] + 1]) * 1e-9
+        raise LogError(
+            f"{log.path}: the clock goes backwards by {by_s:.3g} s after {at_s:.3g} s of {topic}; "
+            "give each run as a log of its own"
+        )
+    return columns
+
+
+def _samples(log: Log, topic: str, names: tuple[str, ...], notes: list[str]) -> tuple[Index, Array]:
+    columns = _columns(log, topic)
     values = np.column_stack([_floats(columns[name]) for name in names])
     finite = np.asarray(np.isfinite(values).all(axis=1))
     if not finite.all():

@@ -1,4 +1,7 @@
+import base64
+import html
 import json
+import re
 from contextlib import nullcontext
 
 import pytest
@@ -8,6 +11,7 @@ from disco_hw.inference import commands
 from disco_hw.inference.commands import infer_command
 from disco_hw.inference.gap_check import GapCheck
 from disco_hw.inference.infer import InferOptions
+from disco_hw.log.importing.commands import import_log
 from disco_hw.model import load_model
 from tests.inference.drives import TICKS_PER_REV, TRUTH, write_log
 
@@ -80,9 +84,46 @@ def test_the_model_file_loads_and_holds_the_posterior(inferred):
 def test_the_report_is_whole_in_one_file(inferred):
     folder, _, _ = inferred
     page = (folder / "report.html").read_text()
-    assert page.count('src="data:image/png;base64,') == 3
     assert 'src="http' not in page
-    assert "steady circle" in page
+    pictures = re.findall(r'<img alt="([^"]*)" src="data:image/png;base64,([^"]*)">', page)
+    titles = ["Marginals and pairs of the posterior", "Posterior predictive check", "Simulation-based calibration"]
+    assert [title for title, _ in pictures] == titles
+    assert all(base64.b64decode(picture).startswith(b"\x89PNG") for _, picture in pictures)
+
+
+def test_the_report_has_every_figure_of_the_diagnostics(inferred):
+    folder, result, _ = inferred
+    page, told = (folder / "report.html").read_text(), result.as_dict()
+    numbers = told["diagnostics"]
+    assert f"rests on {numbers['effective_simulations']:.0f}; seed 2" in page
+    assert f"{numbers['simulations']} simulations" in page
+    for name, p in numbers["sbc_p"].items():
+        assert f"{name} p = {p:.2g}" in page
+    for level, share in numbers["coverage"].items():
+        assert f"<td class=n>{float(level):.0%}</td><td class=n>{share:.0%}</td>" in page
+    for one in told["posterior"].values():
+        assert f"{one['mean']:.5f}</td><td class=n>{one['sd']:.5f}" in page
+    assert all(f"<p>{html.escape(sentence)}</p>" in page for sentence in told["undetermined"])
+    assert "steady circle cannot tell the wheel radius" in page
+
+
+def test_the_report_of_the_papers_way_says_what_its_statistics_cannot_tell(robot, tmp_path):
+    log, report = write_log(tmp_path / "circle.csv"), tmp_path / "report.html"
+    infer_command([log], robot, report=report, options=InferOptions(paper=True), search=finds())
+    page = report.read_text()
+    assert "the wheel radius is left open" in page
+    assert "the wheel radius enters only through the angle at which the drive happens to end" in page
+    assert "1000 simulations" in page
+    assert "driven by commands" in page
+
+
+def test_a_log_of_ours_gives_what_its_table_gives(robot, tmp_path, inferred):
+    """To the microsecond that tables keep: the same poses, the same geometry."""
+    log, ours = write_log(tmp_path / "poor.csv", "poor"), tmp_path / "poor.mcap"
+    import_log(log, robot, ours)
+    one, other = (infer_command([path], robot, options=FEW, search=finds()).inference for path in (log, ours))
+    assert other.drive.source == "encoders"
+    assert other.draws.mean(axis=0) == pytest.approx(one.draws.mean(axis=0), rel=1e-3)
 
 
 def test_the_text_names_every_parameter_and_progress_is_told(inferred):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from disco_hw.inference.excitation import UnusableDriveError, excitation
-from disco_hw.log.drive import Commands, DriveLog, Gyro, Poses, Wheels
+from disco_hw.log.drive import Commands, DriveLog, Gyro, Poses, Wheels, concatenate
 from tests.inference.drives import logged
 
 NOTHING = np.empty(0)
@@ -58,6 +58,18 @@ def test_without_encoders_commands_drive_the_simulations():
     drive = excitation(blind)
     assert drive.source == "commands"
     assert drive.roll_rad[:, 0].sum() == pytest.approx(2.0 * (drive.t_s[-1] - drive.t_s[0]), rel=1e-6)
+
+
+def test_a_log_without_encoders_beside_one_with_them_is_said_to_count_for_nothing():
+    log = straight()
+    nothing = Wheels(NOTHING, NOTHING, NOTHING, NOTHING, NOTHING, NO_SEGMENT, False, False)
+    drive = excitation(concatenate([log, replace(log, wheels=nothing)]))
+    assert drive.t_s.size == excitation(log).t_s.size
+    assert drive.notes == (
+        "500 poses come without encoders and count for nothing beside those with them; infer their log alone",
+    )
+    assert excitation(concatenate([log, log])).notes == ()
+    assert excitation(concatenate([log, replace(log, wheels=nothing)]), "commands").notes == ()
 
 
 def test_an_unknown_command_breaks_the_run():

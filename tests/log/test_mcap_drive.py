@@ -9,7 +9,7 @@ from disco_hw.log.mcap_drive import drive_from_log, ticks_per_rev
 from disco_hw.log.reader import open_log
 from disco_hw.log.records import Command, Event
 from drivers.types import PoseSample, WheelSample
-from tests.log.samples import PERIOD_NS, drive_ticks, write_log
+from tests.log.samples import PERIOD_NS, drive_ticks, tick, write_log
 
 
 def drive_of(path, ticks, **changes):
@@ -72,6 +72,14 @@ def test_late_poses_are_put_in_order_and_doubles_and_broken_ones_left_out(tmp_pa
     assert np.allclose(drive.poses.t_s, [0.0, 0.01, 0.02])
     assert any("not finite" in note for note in drive.notes)
     assert any("have the time of another" in note for note in drive.notes)
+
+
+@pytest.mark.parametrize("flush_every", [None, 5])
+def test_a_clock_that_goes_backwards_is_refused(tmp_path, flush_every):
+    ticks = [(k * PERIOD_NS, tick(k)) for k in (*range(1, 61), *range(31, 70))]
+    words = r"run\.mcap: the clock goes backwards by 0\.58 s after 1\.18 s of /command; give each run as a log"
+    with pytest.raises(LogError, match=words):
+        drive_of(tmp_path, ticks, flush_every=flush_every)
 
 
 def test_a_log_in_which_nothing_was_driven_is_refused(tmp_path):

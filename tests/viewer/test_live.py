@@ -1,11 +1,13 @@
 import time
 from contextlib import closing
+from types import SimpleNamespace
 
 import pytest
 from msgspec.structs import replace
 
 from disco_hw.config import CircleTask
 from disco_hw.daemon.task_change import asked_of
+from disco_hw.drive.coverage import Coverage
 from disco_hw.log import records
 from disco_hw.viewer.desk import Desk
 from disco_hw.viewer.feed import ViewerFeed, feed_path
@@ -49,6 +51,21 @@ def test_before_anything_is_known_it_says_so(page):
     live.draw(everything=True)
     assert "| page is behind | — ms" in live._details.content
     assert not live.scene._robot.visible
+
+
+def test_a_drive_by_hand_shows_what_is_excited_and_what_is_missing(page):
+    live, _ = page
+    live.draw(everything=True)
+    assert not live._excited.visible
+    coverage = Coverage(6.4)
+    for tick in range(251):
+        coverage.add(tick * PERIOD_NS, 2.0, 2.0)
+    live._desk = SimpleNamespace(status={"ok": False, "drive": {"coverage": coverage.as_dict()}})
+    live.draw(everything=True)
+    assert live._excited.visible
+    assert live._coverage.content.startswith("**16 of 17 still missing**")
+    assert "○ reverse fast | 0 of 2 s" in live._coverage.content
+    assert "✔ straight slow | 3 of 3 s" in live._coverage.content
 
 
 def test_records_come_over_the_feed(page):
