@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from types import MappingProxyType
 
-from disco_hw.gap.candidates import CHANGE
 from disco_hw.gap.intervals import Estimates
 
 _SIGMAS = 3.0
@@ -15,7 +14,8 @@ SENSOR = "pose_offset"
 GAIN = "wheel_gain"
 ASYMMETRY = "wheel_radius_asymmetry"
 ENCODER = "encoder_scale"
-PATCH = "a patch of the floor"
+# What decides whether a patch of the floor or a change of all of it was driven on.
+PATCH_OR_CHANGE = "drive again, later, where it was different"
 
 # What decides between the members of a class lies outside such logs.
 OUTSIDE_TESTS: Mapping[frozenset[str], str] = MappingProxyType(
@@ -23,7 +23,6 @@ OUTSIDE_TESTS: Mapping[frozenset[str], str] = MappingProxyType(
         frozenset(
             (LATERAL, SENSOR)
         ): "measure the pose sensor's mount with a ruler, or move the payload and drive again",
-        frozenset((CHANGE, PATCH)): "drive again, later, where it was different",
         frozenset((GAIN, ENCODER)): "turn each wheel ten times by hand and count ticks",
     }
 )
@@ -48,14 +47,12 @@ def one_encoder(wheels: Estimates, body: Estimates, asymmetry_deviation: float) 
     return possible, possible and seen is not None
 
 
-def alike(names: tuple[str, ...], encoder_possible: bool, patch_possible: bool = False) -> dict[str, tuple[str, ...]]:
-    """For each accepted effect what cannot be told from it: by no drive, or, a patch of the floor, by this one."""
+def alike(names: tuple[str, ...], encoder_possible: bool) -> dict[str, tuple[str, ...]]:
+    """For each accepted effect what no drive can tell from it."""
     found: dict[str, tuple[str, ...]] = {}
     for name in names:
         if name == LATERAL:
             found[name] = (SENSOR,)
         elif name == GAIN and encoder_possible:
             found[name] = (ENCODER,)
-        elif name == CHANGE and patch_possible:
-            found[name] = (PATCH,)
     return found

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.gap.channels import Channel
-from disco_hw.gap.fit import Fit, by_block, inverse
+from disco_hw.gap.fit import Fit, by_block, inverse, known
 
 Array = NDArray[np.float64]
 
@@ -46,9 +46,10 @@ def held_out_by_block(found: Fit, channel: Channel) -> Array:
     total = normal.sum(axis=0)
     out = cost.copy()
     for b in range(cost.size):
-        step = inverse(total - normal[b]) @ gradient[b]
         # A parameter of which only this block knows stays where it is: leaving out cannot judge it.
-        step = np.where(np.isfinite(step), step, 0.0)
+        told = known(total - normal[b], total)
+        step = np.zeros(told.size)
+        step[told] = inverse((total - normal[b])[np.ix_(told, told)]) @ gradient[b][told]
         out[b] += gradient[b] @ step + 0.5 * step @ normal[b] @ step
     return out
 

@@ -16,6 +16,7 @@ Index = NDArray[np.int64]
 _MOST_ITERATIONS = 12
 _GOOD_ENOUGH = 0.02
 _LEAST_INFORMATION = 1e-12
+_LEAST_TOLD = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +49,14 @@ def inverse(matrix: Array) -> Array:
     unit = matrix / np.outer(scale, scale)
     values, vectors = np.linalg.eigh(unit)
     return np.asarray((vectors / np.maximum(values, 1e-10)) @ vectors.T / np.outer(scale, scale))
+
+
+def known(part: Array, whole: Array) -> NDArray[np.bool_]:
+    """Which parameters (A,) a part of a log tells about, from its normal matrix and the whole log's, (A, A) each.
+
+    What is told next to nothing about, a limit that was reached elsewhere only, would be moved anywhere.
+    """
+    return np.asarray(np.diag(part) > _LEAST_TOLD * np.diag(whole))
 
 
 def jacobian(

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from disco_hw.gap.channels import BodyChannel, WheelChannel, total_push
-from disco_hw.gap.fit import Fit, by_block, inverse
+from disco_hw.gap.fit import Fit, by_block, inverse, known
 from disco_hw.gap.free_runs import read_angles, run_body
 from disco_hw.gap.horizon import displacement, starts_of
 from disco_hw.gap.timeline import BLOCK_S, CELL_S
@@ -168,16 +168,23 @@ def prediction_error(body: BodyChannel, starts: Starts, p: Array, track: Array, 
     return np.column_stack([cosine * dx + sine * dy - moved[:, 0], -sine * dx + cosine * dy - moved[:, 1], yaw])
 
 
-def fold_vectors(found: Fit, block: Index) -> dict[int, Array]:
-    """For each of two interleaved folds the vector fitted on the other one's data, to second order."""
+def fold_vectors(found: Fit, block: Index, neutral: Array) -> dict[int, Array]:
+    """For each of two interleaved folds the vector fitted on the other one's data, to second order.
+
+    What the other one's data say next to nothing about is as in `neutral`: a limit that was reached, or a patch of the
+    floor that was crossed, in one fold only is not known in the other.
+    """
     fold = (block // _FOLD_BLOCKS) % 2
     if not found.active or np.unique(fold).size < 2:
         return {0: found.vector, 1: found.vector}
     normal, gradient = by_block(found, fold)
     out = {}
+    active = np.array(found.active)
     for held in (0, 1):
         vector = found.vector.copy()
-        vector[list(found.active)] -= inverse(normal[1 - held]) @ gradient[1 - held]
+        told = known(normal[1 - held], normal.sum(axis=0))
+        vector[active[told]] -= inverse(normal[1 - held][np.ix_(told, told)]) @ gradient[1 - held][told]
+        vector[active[~told]] = neutral[active[~told]]
         out[held] = vector
     return out
 

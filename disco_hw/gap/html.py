@@ -82,7 +82,8 @@ def _effects(report: GapReport) -> str:
         place = (
             "in the amended model" if term.in_model else "not in the model: it depends on what no model's state holds"
         )
-        rows.append(("unnamed", term.channel, term.form, f"{term.evidence:.0f}", "", place))
+        also, test = ", ".join(term.indistinguishable_from), f"; {term.experiment}" if term.experiment else ""
+        rows.append(("unnamed", term.channel, term.form, f"{term.evidence:.0f}", also, place + test))
     if not rows:
         return "<p>Nothing that this log shows.</p>"
     head = (

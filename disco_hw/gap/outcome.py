@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from disco_hw.gap.amend import with_terms_named
 from disco_hw.gap.blind_spots import BlindSpot, blind_spots, experiment_of
-from disco_hw.gap.candidates import candidates_of, indices, parameters_of
+from disco_hw.gap.candidates import CHANGE, candidates_of, indices, parameters_of
 from disco_hw.gap.channels import BodyChannel, WheelChannel
-from disco_hw.gap.classes import ASYMMETRY, ENCODER, GAIN, OUTSIDE_TESTS, alike, one_encoder
+from disco_hw.gap.classes import ASYMMETRY, ENCODER, GAIN, OUTSIDE_TESTS, PATCH_OR_CHANGE, alike, one_encoder
 from disco_hw.gap.fit import Fit, fit, inverse, sensitivity
 from disco_hw.gap.held_out import Chain, Errors, errors_of, floor_errors, fold_vectors, per_horizon, smoothed_poses
 from disco_hw.gap.intervals import Estimates, estimates
@@ -108,7 +108,7 @@ class Outcome:
         for channel, estimated in ((self.body, self._estimates[0]), (self.wheels, self._estimates[1])):
             if channel is None or estimated is None:
                 continue
-            same = alike(channel.names, possible, channel.patch)
+            same = alike(channel.names, possible)
             for name in channel.names:
                 if name in channel.selector.given and not given:
                     continue
@@ -193,10 +193,11 @@ class Outcome:
         for place, found in ((Channel.COMMAND_TO_WHEEL, self.wheels), (Channel.WHEEL_TO_BODY, self.body)):
             if found is None:
                 continue
-            out += [
-                UnnamedFinding(place.value, one.form, one.evidence.score, one.term.model_name is not None)
-                for one in found.unnamed
-            ]
+            for one in found.unnamed:
+                either = found.either and one.term.disc is not None
+                same, test = ((CHANGE,), PATCH_OR_CHANGE) if either else ((), None)
+                in_model = one.term.model_name is not None
+                out.append(UnnamedFinding(place.value, one.form, one.evidence.score, in_model, same, test))
         return tuple(out)
 
     def channels(self, effects: Iterable[EffectFinding], unnamed: Iterable[str] = ()) -> tuple[ChannelFinding, ...]:
@@ -247,13 +248,14 @@ class Outcome:
         wheels = None if self.wheels is None else self.wheels.channel
         assert wheels is None or isinstance(wheels, WheelChannel)
         poses = smoothed_poses(body, final.vector)
-        refitted = fold_vectors(self.body.base, body.block)
-        amended = fold_vectors(final, body.block)
+        refitted = fold_vectors(self.body.base, body.block, self.body.selector.channel.neutral)
+        amended = fold_vectors(final, body.block, self.body.selector.channel.neutral)
         wheels_base = {0: self.nominal_wheels, 1: self.nominal_wheels}
         wheels_full = wheels_base
         if self.wheels is not None and wheels is not None:
-            wheels_base = fold_vectors(self.wheels.base, wheels.block)
-            wheels_full = fold_vectors(self.wheels.fit, wheels.block)
+            wheels_neutral = self.wheels.selector.channel.neutral
+            wheels_base = fold_vectors(self.wheels.base, wheels.block, wheels_neutral)
+            wheels_full = fold_vectors(self.wheels.fit, wheels.block, wheels_neutral)
         whole = self._chain(final.vector, self.wheels.fit.vector if self.wheels else None)
 
         def chains(of_body: dict[int, Array], of_wheels: dict[int, Array]) -> dict[int, Chain]:

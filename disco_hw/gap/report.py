@@ -45,12 +45,14 @@ class EffectFinding:
 
 @dataclass(frozen=True)
 class UnnamedFinding:
-    """Something missing that is none of the named effects, as a term of the model."""
+    """Something missing that is none of the named effects, as a term of the model, and what cannot be told from it."""
 
     channel: str
     form: str
     evidence: float
     in_model: bool = True
+    indistinguishable_from: tuple[str, ...] = ()
+    experiment: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,7 +112,14 @@ class GapReport:
                 for effect in self.effects
             ],
             "unnamed": [
-                {"channel": term.channel, "form": term.form, "evidence": term.evidence, "in_model": term.in_model}
+                {
+                    "channel": term.channel,
+                    "form": term.form,
+                    "evidence": term.evidence,
+                    "in_model": term.in_model,
+                    "indistinguishable_from": list(term.indistinguishable_from),
+                    "experiment": term.experiment,
+                }
                 for term in self.unnamed
             ],
             "residue": list(self.residue),
@@ -191,9 +200,8 @@ class GapReport:
         lines = [*self.answer(), ""]
         for effect in self.effects:
             values = ", ".join(f"{n} {e.value:.4g} [{e.low:.4g}, {e.high:.4g}]" for n, e in effect.parameters.items())
-            also = f" (not to be told from {', '.join(effect.indistinguishable_from)})"
-            lines.append(f"{effect.channel}: {effect.name}: {values}{also if effect.indistinguishable_from else ''}")
-        lines += [f"{term.channel}: unnamed: {term.form}" for term in self.unnamed]
+            lines.append(f"{effect.channel}: {effect.name}: {values}{_alike(effect)}")
+        lines += [f"{term.channel}: unnamed: {term.form}{_alike(term)}" for term in self.unnamed]
         lines += list(self.residue)
         if self.gap:
             lines += ["", f"{'ahead':>6} " + " ".join(f"{stage:>20}" for stage in STAGES)]
@@ -204,6 +212,11 @@ class GapReport:
                 )
                 lines.append(f"{horizon:4g} s  " + " ".join(f"{cell:>20}" for cell in cells))
         return "\n".join(lines)
+
+
+def _alike(finding: EffectFinding | UnnamedFinding) -> str:
+    same = ", ".join(finding.indistinguishable_from)
+    return f" (not to be told from {same})" if same else ""
 
 
 def _errors_dict(errors: Errors) -> dict[str, Any]:

@@ -68,8 +68,8 @@ class UnnamedTerm:
 class Found:
     """What a channel's search ended with: its selector (noise held, all fits kept), accepted effects and terms.
 
-    `richest` (n,): whitened residuals of the channel's richest model, which had `richest_parameters`. `patch`: whether
-    a patch of the floor explains a change of the surface as well.
+    `richest` (n,): whitened residuals of the channel's richest model, which had `richest_parameters`. `either`:
+    whether a change of the surface explains what a patch of the floor does as well.
     """
 
     selector: Selector
@@ -79,7 +79,7 @@ class Found:
     plain: Selector | None = None
     richest: Array | None = None
     richest_parameters: int = 0
-    patch: bool = False
+    either: bool = False
 
     @property
     def fit(self) -> Fit:
@@ -202,20 +202,20 @@ def search_body(line: Timeline, start: Array, given: Names = ()) -> Found:
 
 
 def _time_or_place(found: Found) -> Found:
-    """With unnamed terms; where the floor seems to have changed, a patch of it instead if that explains the log better.
+    """With unnamed terms; where the floor seems to have changed, a patch of it instead if that does as well.
 
-    A patch that was left and not entered again is a change, and the other way round: then the change is named, and
-    that the patch would do as well is kept.
+    A patch that was left and not entered again looks like a change. No floor changes while one drives on it, so the
+    patch is told then, and that a change would do as well is kept.
     """
     named = with_unnamed(found, _body_options)
     if CHANGE not in found.names or CHANGE in found.selector.given:
         return named
     rest = tuple(name for name in found.names if name != CHANGE)
     placed = with_unnamed(replace(found, names=rest), _body_options)
-    if not any(one.term.disc for one in placed.unnamed):
+    if CHANGE in placed.names or not any(one.term.disc for one in placed.unnamed):
         return named
     better = _priced(named) - _priced(placed)
-    return placed if better > _CLEARLY else replace(named, patch=better > -_CLEARLY)
+    return replace(placed, either=better < _CLEARLY) if better > -_CLEARLY else named
 
 
 def _priced(found: Found) -> float:

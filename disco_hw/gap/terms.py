@@ -27,7 +27,7 @@ _DISC_RADII_M = (0.5, 0.75, 1.0, 1.3)
 _DISC_SPACING_M = 0.4
 _DISC_STEPS_M = (-0.2, -0.1, 0.0, 0.1, 0.2)
 _DISC_SIZE_STEPS_M = (-0.15, -0.05, 0.0, 0.05, 0.15)
-_LEAST_INSIDE, _MOST_INSIDE = 0.1, 0.8
+_LEAST_INSIDE, _MOST_INSIDE = 0.03, 0.8
 _LARGEST_FLOOR_M2 = 60.0
 _LONGEST_S = 400.0
 
@@ -162,7 +162,7 @@ def _discs(channel: BodyChannel, p: Array, discs: Iterable[tuple[float, float, f
     for centre_x, centre_y, radius in discs:
         inside = np.hypot(x - centre_x, y - centre_y) < radius
         if _LEAST_INSIDE < float(np.abs(w[inside]).sum()) / turned < _MOST_INSIDE:
-            where = f"within {radius:g} m of ({centre_x:.2f}, {centre_y:.2f}) m"
+            where = f"within {radius:.2f} m of ({centre_x:.2f}, {centre_y:.2f}) m"
             push = _on(2, np.where(inside, w, 0.0))
             disc = (float(centre_x), float(centre_y), float(radius))
             yield Term(f"omega += {{:.4g}} omega {where}", push, disc=disc)

@@ -57,3 +57,17 @@ def test_a_block_is_judged_by_the_others():
     assert proof.gain > 100.0
     assert proof.repeated <= 1e-6
     assert held_out_by_block(fitted, channel()).size == N // EACH
+
+
+def test_what_only_one_block_knows_does_not_hide_what_all_show():
+    rng = np.random.default_rng(3)
+    everywhere = rng.standard_normal((N, 1))
+    limit = np.full((N, 1), 1e-7)
+    limit[:EACH] = 1.0
+    y = rng.standard_normal(N) + 0.3 * everywhere[:, 0] + 2.0 * limit[:, 0]
+    both = linear_fit(np.hstack([limit, everywhere]), y)
+    proof = compare(
+        linear_fit(limit, y), Fit(both.vector, (0, 1), both.cost, both.residual, both.jacobian), channel(), 1.0
+    )
+    assert proof.held_out == pytest.approx(proof.gain, rel=0.2)
+    assert proof.repeated > 50.0

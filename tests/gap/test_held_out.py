@@ -1,13 +1,16 @@
 """Errors on held-out stretches: the right model errs by the noise of a pose, a wrong one by what it lacks."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from disco_hw.gap.channels import BodyChannel
 from disco_hw.gap.fit import fit
-from disco_hw.gap.held_out import Chain, errors_of, floor_errors, fold_vectors, smoothed_poses
+from disco_hw.gap.held_out import FOLD_S, Chain, errors_of, floor_errors, fold_vectors, smoothed_poses
 from disco_hw.gap.layout import BODY
 from disco_hw.gap.search import indices
+from disco_hw.gap.timeline import BLOCK_S
 from tests.gap.synthetic import NOISE, body_channel
 
 AHEAD_S = 2.0
@@ -57,11 +60,25 @@ def test_each_fold_is_predicted_by_what_was_fitted_on_the_other():
     spoilt[first, 2] *= 1.1
     shifted = BodyChannel.build(type(line)(**{**_fields(line), "pose_values": spoilt}), NOISE, channel.neutral)
     found = fit(shifted, channel.neutral, indices(shifted, ()))
-    vectors = fold_vectors(found, shifted.block)
+    vectors = fold_vectors(found, shifted.block, shifted.neutral)
     axle = {fold: vector[1] for fold, vector in vectors.items()}
     # Fold 0 holds that stretch: who predicts it has not seen it.
     assert axle[0] == pytest.approx(0.4, rel=0.01)
     assert abs(axle[1] - 0.4) > 3.0 * abs(axle[0] - 0.4)
+
+
+def test_what_a_fold_knows_nothing_about_is_not_in_its_prediction():
+    channel, _ = body_channel(turn_slip=0.1)
+    place = BODY.place["turn_slip.k_s"]
+    found = fit(channel, with_slip(channel), indices(channel, ("turn_slip",)))
+    # As if all turning had been done in fold 0: nothing elsewhere depends on the slip.
+    column = found.active.index(place)
+    elsewhere = (channel.block // round(FOLD_S / BLOCK_S)) % 2 == 1
+    slope = found.jacobian.copy()
+    slope[elsewhere, column] *= 1e-6
+    vectors = fold_vectors(replace(found, jacobian=slope), channel.block, channel.neutral)
+    assert vectors[0][place] == 0.0
+    assert vectors[1][place] == pytest.approx(0.1, rel=0.2)
 
 
 def _fields(line):
