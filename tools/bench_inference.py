@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-from importlib import import_module
+from importlib.util import find_spec
 from time import perf_counter
 
 import numpy as np
-import torch
 
 from disco_hw.inference.estimates import estimates
 from disco_hw.inference.excitation import excitation
 from disco_hw.inference.infer import Inference, infer, noise_of
-from disco_hw.inference.rounds import Fitted
 from disco_hw.inference.simulate import NAMES, Simulator, draw_seeds
 from disco_hw.log.drive import DriveLog
 from disco_hw.model import Model
 from tools.infer_study import config, logged, plant
+from tools.sharpness import PEERS, paired, scores
 
 SEED = 5
 SIMULATIONS = 300
-TEST_SIMULATIONS = 500
 
 
 def run() -> dict[str, float]:
@@ -48,40 +46,17 @@ def run() -> dict[str, float]:
 
 
 def log_scores(result: Inference) -> dict[str, float]:
-    """Mean log density (nats, in the last region's coordinates) at the truth of fresh simulations from that region.
-
-    Ours is the network as it stands; `sbi` is NPE-C as the package sets it up, mixture density and spline flow, trained
-    on the same simulations and statistics under the uniform prior of the region's box. Without sbi only ours.
+    """Mean log scores of the posteriors on fresh simulations (`tools.sharpness`): ours, and how far it is ahead of
+    sbi's with the standard error of that, also before the posteriors are cut to their region. Without sbi only ours.
     """
-    fitted, size = result.fitted, result.prior.centre.size
-    rng = np.random.default_rng(11)
-    theta = fitted.region.draw(TEST_SIMULATIONS, rng)
-    statistics = result.simulator.summaries(theta, draw_seeds(TEST_SIMULATIONS, rng), result.summary)
-    unit = fitted.region.unit(theta)
-    ours = fitted.network.mixtures(statistics).log_density(unit[:, None])[:, 0]
-    found = {"log_score": float(ours.mean())}
-    try:
-        npe = import_module("sbi.inference").NPE
-    except ImportError:
-        return found
-    trained_on = [torch.as_tensor(part, dtype=torch.float32) for part in (unit_of(fitted), fitted.statistics)]
-    bounds = torch.ones(size)
-    for kind in ("mdn", "nsf"):
-        torch.manual_seed(1)
-        prior = torch.distributions.Independent(torch.distributions.Uniform(-bounds, bounds), 1)
-        inference = npe(prior=prior, density_estimator=kind, show_progress_bars=False)
-        estimator = inference.append_simulations(*trained_on).train()
-        with torch.no_grad():
-            score = estimator.log_prob(
-                torch.as_tensor(unit, dtype=torch.float32)[None], torch.as_tensor(statistics, dtype=torch.float32)
-            )
-        found[f"sbi_{kind}.log_score"] = float(score.mean())
+    peers = PEERS if find_spec("sbi") else ()
+    given = scores(result, peers)
+    found = {"log_score": float(given["ours"].mean())}
+    for peer in peers:
+        for kind in ("", "_raw"):
+            ahead, error = paired(given[f"ours{kind}"], given[f"{peer}{kind}"])
+            found |= {f"ahead_of_sbi_{peer}{kind}": ahead, f"ahead_of_sbi_{peer}{kind}.error": error}
     return found
-
-
-def unit_of(fitted: Fitted) -> np.ndarray:
-    """The parameters that the last network was trained on, in its coordinates (n, 3)."""
-    return np.asarray(fitted.region.unit(fitted.theta))
 
 
 def reference_sd(log: DriveLog, truth: np.ndarray) -> np.ndarray:

@@ -83,25 +83,24 @@ class AdaptResult:
     def rows(self) -> list[dict[str, float | str]]:
         """For each change: costs before it and after it without and with adaptation, and the share won back.
 
-        `half_back_s` is how long after the change the cost, smoothed over 5 s and averaged over the seeds, falls below
-        the middle between before and without adaptation for the first time after its peak.
+        What is lost is what the same stretch costs more than on the plant that nothing happens to: the cost varies
+        along the lap. `half_back_s` is how long after the change half of it was won back over 5 s for the first time.
         """
         found: list[dict[str, float | str]] = []
+        unchanged = self._mean("nothing", adapted=False, after=True)
         for name in dict.fromkeys(name for name, _ in self.runs):
-            before = self._mean(name, adapted=False, after=False)
             without = self._mean(name, adapted=False, after=True)
             adapted = self._mean(name, adapted=True, after=True)
-            lost = without - before
             changed = any(CHANGES[name])
             found.append(
                 {
                     "changes": name,
-                    "cost_before": before,
+                    "cost_before": self._mean(name, adapted=False, after=False),
                     "cost_before_adapting": self._mean(name, adapted=True, after=False),
                     "cost_after": without,
                     "cost_after_adapting": adapted,
-                    "won_back": (without - adapted) / lost if changed else math.nan,
-                    "half_back_s": self._half_back_s(name, before + 0.5 * lost) if changed else math.nan,
+                    "won_back": (without - adapted) / (without - unchanged) if changed else math.nan,
+                    "half_back_s": self._half_back_s(name) if changed else math.nan,
                     "published_s": self._published_s(name) if changed else math.nan,
                 }
             )
@@ -184,13 +183,13 @@ class AdaptResult:
         sums = np.cumsum(np.mean([run.cost for run in runs], axis=0))
         return np.asarray((sums - np.concatenate([np.zeros(width), sums[:-width]])) / width)
 
-    def _half_back_s(self, name: str, middle: float) -> float:
-        """Inf where the cost does not fall below the middle."""
-        t_s, smooth = self.runs[name, True][0].t_s, self._smooth(name, adapted=True)
-        late = np.flatnonzero(t_s > self.options.change_s)
-        peak = late[int(np.argmax(smooth[late][: round(self.options.settled_s / (t_s[1] - t_s[0]))]))]
-        below = np.flatnonzero(smooth[peak:] <= middle)
-        return float(t_s[peak + below[0]] - self.options.change_s) if below.size else math.inf
+    def _half_back_s(self, name: str) -> float:
+        """Inf where it never is."""
+        t_s = self.runs[name, True][0].t_s - self.options.change_s
+        without, adapted = self._smooth(name, adapted=False), self._smooth(name, adapted=True)
+        lost = without - self._smooth("nothing", adapted=False)
+        back = np.flatnonzero((t_s >= _SMOOTH_S) & (lost > 0.0) & (without - adapted >= 0.5 * lost))
+        return float(t_s[back[0]]) if back.size else math.inf
 
     def _published_s(self, name: str) -> float:
         """Mean time from the change to the first belief after it."""
