@@ -142,8 +142,9 @@ def search_wheels(line: Timeline, geometry: Array, start: Array, given: Names = 
     channel = WheelChannel.build(line, WheelNoise(reading_rad=max(line.quantum_rad, 2e-4)), geometry)
     moves = wheel_moves(channel, geometry)
     rough = Selector(channel, moves, _ROUGH, given=given, start=start)
-    _responding(rough)
-    names = rough.greedy(tuple(dict.fromkeys((*given, *_RESPONSE))))
+    begin = tuple(dict.fromkeys((*given, *_RESPONSE)))
+    _responding(rough, begin)
+    names = rough.greedy(begin, _responding)
     rich = (*names, *(name for name in _SMOOTH_WHEEL if name not in names))
     vector = fit(channel, rough.fit(names).vector, indices(channel, rich)).vector
     plain = learn_wheel_noise(channel, channel.raw_residual(vector))
@@ -165,18 +166,20 @@ def search_wheels(line: Timeline, geometry: Array, start: Array, given: Names = 
     return searched(plain) if found.fit.cost > _FAR_OFF * 0.5 * sound.count else found
 
 
-def _responding(selector: Selector) -> None:
-    """Fit lag and delay together from slow and quick responses.
+def _responding(selector: Selector, names: Names) -> None:
+    """Fit lag and delay together from slow and quick responses; on top of others that were accepted, from none.
 
     One at a time they may lose to effects that merely stop the wheels: on a slow robot neither is much without the
-    other.
+    other. And what stops the wheels looks slow until it is named: then the others are fitted without a response first.
     """
-    channel, names = selector.channel, (*selector.given, *_RESPONSE)
+    channel, before = selector.channel, selector.fits.get(frozenset(names))
+    others = tuple(name for name in names if name in selector.given or name not in _RESPONSE)
     active = indices(channel, names)
     places = [channel.layout.place[column] for name in _RESPONSE for column in CANDIDATES[name].columns]
-    options = []
-    for response_s in _RESPONSES_S:
-        vector = selector.fit(selector.given).vector.copy()
+    plain = selector.fit(others).vector
+    options = [] if before is None else [before, fit(channel, plain, active)]
+    for response_s in _RESPONSES_S if before is None else ():
+        vector = plain.copy()
         vector[places] = response_s
         options.append(fit(channel, vector, active))
     selector.fits[frozenset(names)] = min(options, key=lambda option: option.cost)

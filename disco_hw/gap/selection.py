@@ -193,8 +193,8 @@ class Selector:
         promises = {name: self.promise(accepted, name) for name in rest}
         return sorted((name for name in rest if promises[name] > 0.0), key=lambda name: -promises[name])
 
-    def greedy(self, begin: Names = ()) -> Names:
-        """Forward steps only, from a set that is kept."""
+    def greedy(self, begin: Names = (), settle: Callable[[Selector, Names], None] | None = None) -> Names:
+        """Forward steps only, from a set that is kept; `settle` may better the fit of a set before the next step."""
         accepted = begin or self.given
         while len(accepted) < _MOST_EFFECTS:
             ranked = self.ranked(accepted)
@@ -202,6 +202,8 @@ class Selector:
             if new is None:
                 break
             accepted = (*accepted, new)
+            if settle is not None:
+                settle(self, accepted)
         return accepted
 
     def select(self, begin: Names = ()) -> Names:
