@@ -8,7 +8,9 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from disco_hw.control.blocks import BLOCK, U
-from disco_hw.model.jit import block_function, scalar_function, tune_loops
+from disco_hw.model.jit import block_function, float32, scalar_function, tune_loops
+
+_LANES = U(16)
 
 
 class Basis(NamedTuple):
@@ -98,11 +100,74 @@ def add_control_cost(costs: Any, first: Any, commands: Any, history: int, nomina
                 costs[first + b] += scale * (u * (commands[row + b] - u))
 
 
+@scalar_function
+def _spread(pull: Any, row: Any, channels: int, weights: Any, value: Any) -> None:
+    """Add a value at a step to the rows of the four knots that act there, or to that of its one knot for None."""
+    if weights is None:
+        pull[row] += value
+    else:
+        for j in range(4):
+            pull[row + j * channels] += weights[j] * value
+
+
 @block_function
-def add_weighted(sums: Any, weights: Any, first: Any, commands: Any, skip: Any, rows: int) -> None:
-    """Add the block's commands, from row `skip` on, times its weights to the rows of `sums`."""
+def pull_on_knots(pull: Any, nominal: Any, basis: Any) -> None:
+    """How sum_t u_t eps_t grows with each row of noise, `pull` (R,): the nominal u (T, C) through the basis."""
+    horizon, channels = nominal.shape
+    for r in range(pull.size):
+        pull[r] = float32(0.0)
+    for t in range(horizon):
+        weights = _weights(basis.weights, t)
+        for c in range(channels):
+            _spread(pull, basis.first[t] * channels + c, channels, weights, nominal[t, c])
+
+
+@block_function
+def add_drawn_control_cost(costs: Any, first: Any, noise: Any, at: Any, pull: Any, scale: float) -> None:
+    """As `add_control_cost`, but of the noise as drawn, which begins at index `at` of `noise`, by `pull_on_knots`."""
+    tune_loops()
+    for r in range(U(pull.size)):
+        slope = scale * pull[r]
+        row = at + r * BLOCK
+        for b in range(BLOCK):
+            costs[first + b] += slope * noise[row + b]
+
+
+@block_function
+def add_weighted(
+    sums: Any, weights: Any, first_block: Any, blocks: int, values: Any, stride: Any, skip: Any, rows: int
+) -> None:
+    """Add blocks of values, times their weights, to the rows of `sums`.
+
+    A block has `rows` rows in `values`, from row `skip` of it on, and begins `stride` after the one before it.
+    """
     tune_loops()
     for j in range(U(rows)):
         to, source = j * BLOCK, (skip + j) * BLOCK
-        for b in range(BLOCK):
-            sums[to + b] += weights[first + b] * commands[source + b]
+        for block in range(U(blocks)):
+            at, weight = block * stride + source, (first_block + block) * BLOCK
+            for b in range(BLOCK):
+                sums[to + b] += weights[weight + b] * values[at + b]
+
+
+@block_function
+def sum_lanes(sums: Any, rows: int) -> None:
+    """Sum each row of BLOCK into its first entry, always in the same order."""
+    tune_loops()
+    for j in range(U(rows)):
+        row = j * BLOCK
+        for part in range(U(1), BLOCK // _LANES):
+            for lane in range(_LANES):
+                sums[row + lane] += sums[row + part * _LANES + lane]
+        for lane in range(U(8)):
+            sums[row + lane] += sums[row + U(8) + lane]
+        for lane in range(U(4)):
+            sums[row + lane] += sums[row + U(4) + lane]
+        sums[row] = (sums[row] + sums[row + U(2)]) + (sums[row + U(1)] + sums[row + U(3)])
+
+
+@scalar_function
+def mean_noise(sums: Any, t: int, c: int, channels: int, basis: Any) -> Any:
+    """Noise at step t of channel c, from the rows of noise in the first entries of the rows of `sums`."""
+    row = U(basis.first[t] * channels + c) * BLOCK
+    return _noise(sums, row, U(channels) * BLOCK, _weights(basis.weights, t))

@@ -9,7 +9,14 @@ import numpy as np
 
 from disco_hw.control.blocks import BLOCK, aligned_zeros
 from disco_hw.control.optimiser import Optimiser
-from disco_hw.control.parameter_points import drawn_points, mean_point, point_estimate, twins, unscented_points
+from disco_hw.control.parameter_points import (
+    drawn_points,
+    mean_point,
+    point_estimate,
+    shared_pairs,
+    twins,
+    unscented_points,
+)
 from disco_hw.control.past import past_commands
 from disco_hw.control.plan import Array, Diagnostics, NoValidControl, Outcome, Plan, PlannerState, Rollouts
 from disco_hw.control.settings import DiscoSettings, WheelLimits
@@ -52,6 +59,7 @@ class Disco:
         )
         self._wide = True if may_turn_more or self._largest_turn_rad(theta) > NARROW_TURN_RAD else None
         self._series = integration_series(step_s, self._wide is not None, np.float32)
+        self._pairs = shared_pairs(model, theta, step_s)
         self._take_points(model, theta)
         self._start = np.zeros(8, np.float32)
         self._wheels = aligned_zeros(sampler.horizon * WHEEL_ROWS * int(BLOCK))
@@ -93,7 +101,10 @@ class Disco:
         self._points = FreeRun(model, theta, step_s)
         self._response_s = self._value(self._mean_theta, "motor_lag.tau_s") + self._value(self._mean_theta, DELAY)
         self._tables = coefficient_tables(model, theta, step_s, np.float32)
-        self._twins = twins(model, theta)
+        found = twins(model, theta, step_s, self._pairs)
+        self._ahead, self._scaled = (
+            np.ascontiguousarray(found[:, 2 * pair : 2 * pair + 2]) if pair < self._pairs else None for pair in (0, 1)
+        )
         self._wheels_differ = self._do_wheels_differ(theta)
 
     def set_belief(self, belief: Belief) -> None:
@@ -262,16 +273,15 @@ class Disco:
         The last ones sent; but no further from the measured wheel speeds than the wheels could be behind them, so that
         a plan does not run away from wheels that are held back.
         """
-        measured = (state.left_speed_rad_s, state.right_speed_rad_s)
+        left, right = state.left_speed_rad_s, state.right_speed_rad_s
         if not state.sent:
-            return measured
+            return left, right
         last = state.sent[-1]
         slack = self._limits.acceleration_rad_s2 * (self._settings.step_s + self._response_s)
-        left, right = (
-            min(max(sent, speed - slack), speed + slack)
-            for sent, speed in zip((last.left_rad_s, last.right_rad_s), measured, strict=True)
+        return (
+            min(max(last.left_rad_s, left - slack), left + slack),
+            min(max(last.right_rad_s, right - slack), right + slack),
         )
-        return left, right
 
     def _predicted(self, state: PlannerState, t0_ns: int, elapsed_s: float) -> Array:
         """State (5,) at `t0_ns`: x, y, yaw, wheel speeds, under the mean parameters and the commands already sent."""
@@ -301,8 +311,8 @@ class Disco:
         base, effects = self._tables
         each = True if self._own_draws else None
         return SkidSteer(
-            self._start, base, effects, each, self._twins, self._series, self._wide, task, self._history, self._wheels,
-            self._wheels_differ,
+            self._start, base, effects, each, self._ahead, self._scaled, self._series, self._wide, task, self._history,
+            self._wheels, self._wheels_differ,
         )  # fmt: skip
 
     def _draw_points(self) -> None:

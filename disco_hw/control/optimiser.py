@@ -18,7 +18,7 @@ from disco_hw.model.jit import compiled_for
 Array = NDArray[np.float64]
 FIRST_TEMPERATURE = 0.1
 # Commands of all samples are kept for the update while they fit the second-level cache (numbers of four bytes).
-MOST_KEPT = 131_072
+MOST_KEPT = 262_144
 
 
 class Optimiser:
@@ -72,7 +72,8 @@ class Optimiser:
             point_costs=aligned_zeros(points * padded),
             costs=aligned_zeros(padded),
             weights=aligned_zeros(padded),
-            sums=aligned_zeros(horizon * channels * int(BLOCK)),
+            sums=aligned_zeros(max(horizon * channels, rows) * int(BLOCK)),
+            pull=np.zeros(rows, f32),
             order=np.zeros(points, np.int64),
             report=np.zeros(6),
         )

@@ -2,27 +2,42 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.control.sigma_points import sigma_points
 from disco_hw.model import Belief, Mixture, Model
+from disco_hw.model.effects import Channel
 from disco_hw.model.parameter import BASE_PARAMETERS, X_ICR
 from disco_hw.model.terms import effect_of
 
 Array = NDArray[np.float64]
 DOMINANT_WEIGHT = 0.9
+SCALED = ("wheel_radius_m", "axial_distance_m")
+SAME_RATIO = 1e-9
 
 
 def moving_names(belief: Belief) -> tuple[str, ...]:
-    """Those parameters of a belief that change motion, x_icr last.
-
-    Then the sigma points along the last column of the square root differ from the mean in x_icr alone, and the rollout
-    of the three is shared.
-    """
+    """Those parameters of a belief that change motion: of effects, then wheel radius and axial distance, then x_icr."""
     base = {parameter.name for parameter in BASE_PARAMETERS}
     moving = [name for name in belief.names if name in base or effect_of(name.split(".")[0]).moves]
-    return tuple(sorted(moving, key=lambda name: name == X_ICR.name))
+    return tuple(sorted(moving, key=lambda name: (name in base) + (name == X_ICR.name)))
+
+
+def shared_basis(names: tuple[str, ...], mean: Array) -> Array:
+    """Coordinates (n, n) in which to take the square root, so that as many sigma points as can be share a rollout.
+
+    The points along the last column then differ from the mean in x_icr alone, and those along the one before it, if
+    wheel radius and axial distance are both believed in, in these in proportion and in x_icr: they turn alike.
+    """
+    basis = np.eye(len(names))
+    if set(SCALED) <= set(names):
+        rows = sorted(names.index(name) for name in SCALED)
+        if mean[rows].min() > 0.0:
+            basis[rows, rows[1]] = mean[rows] / mean[rows[1]]
+    return basis
 
 
 def moments(belief: Belief) -> tuple[Array, Array]:
@@ -49,8 +64,9 @@ def unscented_points(model: Model, alpha: float) -> tuple[Array, Array]:
     belief = model.belief
     if belief is None or not moving_names(belief):
         return point_estimate(model)
-    sigma = sigma_points(*moments(belief), alpha)
-    return model.complete(sigma.points, moving_names(belief)), sigma.mean_weights
+    names, (mean, covariance) = moving_names(belief), moments(belief)
+    sigma = sigma_points(mean, covariance, alpha, basis=shared_basis(names, mean))
+    return model.complete(sigma.points, names), sigma.mean_weights
 
 
 def drawn_points(model: Model, count: int, seed: int, step: int) -> Array:
@@ -76,16 +92,51 @@ def mean_point(model: Model) -> Array:
     return model.complete(model.belief.mean()[None], model.belief.names)
 
 
-def twins(model: Model, points: Array) -> NDArray[np.int64]:
-    """For points (L, P), those that differ from one in x_icr alone: (L, 2), -1 for none, -2 for being such a twin.
+def twins(model: Model, points: Array, step_s: float, pairs: int) -> NDArray[np.int64]:
+    """For points (L, P), those that share one's rollout: (L, 2 * pairs), -1 for none, -2 for being such a twin.
 
-    Only pairs of twins count, as the unscented transform makes them.
+    The first pair differs from the point in x_icr alone. The second one differs from it in wheel radius and axial
+    distance too, in proportion: the robot then turns alike and drives a path of the same shape at another scale, unless
+    an effect between wheel and body interferes. A point has all pairs, as the unscented transform makes them, or none.
     """
-    found = np.full((len(points), 2), -1)
-    others = np.delete(points, model.parameter_names.index(X_ICR.name), axis=1)
-    for i, row in enumerate(others):
-        alike = [j for j in range(i + 1, len(points)) if found[j, 0] == -1 and np.array_equal(others[j], row)]
-        if found[i, 0] == -1 and len(alike) >= 2:
-            found[i] = alike[:2]
-            found[alike[:2]] = -2
+    found = np.full((len(points), 2 * pairs), -1)
+    columns = [model.parameter_names.index(name) for name in (*SCALED, X_ICR.name)]
+    ratio = points[:, columns[0]] / points[:, columns[1]]
+    others = np.delete(points, columns, axis=1)
+    terms = _wheel_coefficients(model, points, step_s)
+    for i in range(len(points) if pairs else 0):
+        if found[i, 0] != -1:
+            continue
+        free = [j for j in range(i + 1, len(points)) if found[j, 0] == -1 and np.array_equal(others[j], others[i])]
+        group = [j for j in free if np.array_equal(points[j, columns[:2]], points[i, columns[:2]])][:2]
+        if terms is not None and pairs == 2:
+            group += [
+                j
+                for j in free
+                if j not in group
+                and math.isclose(ratio[j], ratio[i], rel_tol=SAME_RATIO)
+                and np.allclose(terms[j], terms[i], rtol=SAME_RATIO, atol=0.0)
+            ][:2]
+        if len(group) == 2 * pairs:
+            found[i] = group
+            found[group] = -2
     return found
+
+
+def shared_pairs(model: Model, points: Array, step_s: float) -> int:
+    """Pairs of `twins` that these points have: 0, 1 or 2."""
+    return max((pairs for pairs in (1, 2) if np.any(twins(model, points, step_s, pairs) >= 0)), default=0)
+
+
+def _wheel_coefficients(model: Model, points: Array, step_s: float) -> Array | None:
+    """What the effects of points (L, P) work with, (L, N); None if one acts after the wheels."""
+    columns = [np.empty((len(points), 0))]
+    at = len(BASE_PARAMETERS)
+    for setting in model.effects:
+        width = len(setting.effect.parameters)
+        if setting.effect.moves and setting.effect.channel is not Channel.COMMAND_TO_WHEEL:
+            return None
+        values = setting.effect.coefficients(points[:, at : at + width], points[:, : len(BASE_PARAMETERS)], step_s)
+        columns += [column[:, None] for column in values]
+        at += width
+    return np.hstack(columns)

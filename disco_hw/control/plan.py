@@ -5,6 +5,7 @@ from __future__ import annotations
 import enum
 from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -50,8 +51,7 @@ class Outcome(enum.Enum):
     STOPPING = "stopping"
 
 
-@dataclass(frozen=True, slots=True)
-class Diagnostics:
+class Diagnostics(msgspec.Struct, frozen=True):
     """How the optimisation went.
 
     `ess` effective sample size, `collapsed` whether it is below the alarm; `temperature`; `cost_min`, `cost_mean` of
@@ -70,8 +70,7 @@ class Diagnostics:
     outcome: Outcome = Outcome.PLANNED
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class Plan:
+class Plan(msgspec.Struct, frozen=True, eq=False):
     """Wheel speeds from `t0_ns` on, as a function of time.
 
     `wheel_speeds` (T, 2) rad/s, left and right: the mean over each step of `step_s`. `trajectory` (T + 1, 3): the pose

@@ -8,12 +8,20 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from disco_hw.control.blocks import BLOCK, U
-from disco_hw.control.commands import Limits, add_control_cost, add_weighted, expand
+from disco_hw.control.commands import (
+    add_control_cost,
+    add_drawn_control_cost,
+    add_weighted,
+    expand,
+    mean_noise,
+    pull_on_knots,
+    sum_lanes,
+)
 from disco_hw.control.random_numbers import fill_normal_block
 from disco_hw.control.risk import mean_over_points, worst_over_points
 from disco_hw.control.rollout import roll_block
 from disco_hw.control.weighting import INVALID, refuse_invalid, temperature_for, weigh
-from disco_hw.model.jit import block_function, float32, kernel_function, scalar_function
+from disco_hw.model.jit import block_function, float32, kernel_function
 
 ESS, TEMPERATURE, LEAST, MEAN, NOMINAL, VALID = range(6)
 
@@ -23,8 +31,8 @@ class Workspace(NamedTuple):
 
     `nominal`, `updated`, `before_update` (T, C); `noise` (blocks, R, BLOCK); `commands` (blocks or 1,
     (H + T) * C * BLOCK); `state` (STATE_ROWS, BLOCK); `point_costs` (L, K'); `costs`, `weights` (K',); `sums`
-    (T * C, BLOCK); `order` (L,) int64; `report` (6,) float64: effective sample size, temperature, least, mean and
-    nominal cost, number of finite costs.
+    (T * C or R, BLOCK); `pull` (R,); `order` (L,) int64; `report` (6,) float64: effective sample size, temperature,
+    least, mean and nominal cost, number of finite costs.
     """
 
     nominal: Any
@@ -37,6 +45,7 @@ class Workspace(NamedTuple):
     costs: Any
     weights: Any
     sums: Any
+    pull: Any
     order: Any
     report: Any
 
@@ -87,19 +96,15 @@ def shift(nominal: Any, scratch: Any, steps: float, hold: bool) -> None:
             nominal[t, c] = scratch[t, c]
 
 
-@scalar_function
-def _unlimited(limits: Any) -> Any:
-    """Limits that bind nothing."""
-    infinite = float32(np.inf)
-    return Limits(infinite, infinite, limits.before)
-
-
 @block_function
 def sample_and_roll(work: Any, sampling: Any, step: int, basis: Any, limits: Any, system: Any, points: int) -> None:
     """Draw all samples and cost them: writes `noise`, `point_costs` and, as far as the control cost goes, `costs`."""
     nominal, history = work.nominal, sampling.history
     horizon = nominal.shape[0]
     padded = sampling.blocks * int(BLOCK)
+    charged = sampling.control_cost > float32(0.0)
+    if charged and sampling.drawn:
+        pull_on_knots(work.pull, nominal, basis)
     for block in range(sampling.blocks):
         fill_normal_block(work.noise, sampling.rows, block, step, sampling.seed, sampling.noise_std)
         first_noise, first = U(block * sampling.rows) * BLOCK, U(block) * BLOCK
@@ -109,11 +114,10 @@ def sample_and_roll(work: Any, sampling: Any, step: int, basis: Any, limits: Any
                 work.noise[j * BLOCK] = float32(0.0)
         for b in range(BLOCK):
             work.costs[first + b] = float32(0.0)
-        if sampling.drawn and sampling.control_cost > float32(0.0):
-            expand(commands, work.state, history, nominal, work.noise, first_noise, basis, _unlimited(limits))
-            add_control_cost(work.costs, first, commands, history, nominal, sampling.control_cost)
         expand(commands, work.state, history, nominal, work.noise, first_noise, basis, limits)
-        if sampling.control_cost > float32(0.0) and not sampling.drawn:
+        if charged and sampling.drawn:
+            add_drawn_control_cost(work.costs, first, work.noise, first_noise, work.pull, sampling.control_cost)
+        elif charged:
             add_control_cost(work.costs, first, commands, history, nominal, sampling.control_cost)
         roll_block(system, work.point_costs, points, padded, block, horizon, commands, work.state)
 
@@ -146,27 +150,32 @@ def weigh_all(work: Any, sampling: Any) -> Any:
 @block_function
 def update(work: Any, sampling: Any, basis: Any, limits: Any, total: float, gain: float) -> Any:
     """Move `nominal` by `gain` towards the weighted mean of the samples' commands; False if that is not finite."""
-    nominal, sums, history = work.nominal, work.sums, sampling.history
+    nominal, sums = work.nominal, work.sums
     horizon, channels = nominal.shape
-    rows = horizon * channels
+    rows = sampling.rows if sampling.drawn else horizon * channels
     for j in range(U(rows) * BLOCK):
         sums[j] = float32(0.0)
-    for block in range(sampling.blocks):
-        commands = work.commands[block if sampling.kept else 0]
-        if sampling.drawn or not sampling.kept:
+    skip = U(sampling.history * channels)
+    if sampling.drawn:
+        add_weighted(sums, work.weights, U(0), sampling.blocks, work.noise, U(rows) * BLOCK, U(0), rows)
+    elif sampling.kept:
+        commands = work.commands.reshape(work.commands.size)
+        add_weighted(sums, work.weights, U(0), sampling.blocks, commands, U(work.commands.shape[1]), skip, rows)
+    else:
+        commands = work.commands[0]
+        for block in range(sampling.blocks):
             first_noise = U(block * sampling.rows) * BLOCK
-            bounds = _unlimited(limits) if sampling.drawn else limits
-            expand(commands, work.state, history, nominal, work.noise, first_noise, basis, bounds)
-        add_weighted(sums, work.weights, U(block) * BLOCK, commands, U(history * channels), rows)
+            expand(commands, work.state, sampling.history, nominal, work.noise, first_noise, basis, limits)
+            add_weighted(sums, work.weights, U(block), 1, commands, U(0), skip, rows)
+    sum_lanes(sums, rows)
     finite = True
     for t in range(horizon):
         for c in range(channels):
-            row = U(t * channels + c) * BLOCK
-            value = float32(0.0)
-            for b in range(BLOCK):
-                value += sums[row + b]
-            value /= total
-            value = nominal[t, c] + gain * (value - nominal[t, c])
+            if sampling.drawn:
+                value = gain * (mean_noise(sums, t, c, channels, basis) / total)
+            else:
+                value = gain * (sums[U(t * channels + c) * BLOCK] / total - nominal[t, c])
+            value += nominal[t, c]
             work.updated[t, c] = min(max(value, -limits.largest), limits.largest)
             finite &= math.isfinite(value)
     if finite:

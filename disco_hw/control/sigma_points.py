@@ -23,12 +23,15 @@ class SigmaPoints:
     covariance_weights: Array
 
 
-def sigma_points(mean: Array, covariance: Array, alpha: float, kappa: float = 0.0, xi: float = 2.0) -> SigmaPoints:
+def sigma_points(
+    mean: Array, covariance: Array, alpha: float, kappa: float = 0.0, xi: float = 2.0, basis: Array | None = None
+) -> SigmaPoints:
     """Sigma points of a mean (n,) and a covariance (n, n).
 
-    The points are mean +- columns of a lower Cholesky factor C of (n + nu) covariance, C C' = (n + nu) covariance, so
-    that sum w d d' is the covariance exactly, correlated or not. alpha = 1 gives non-negative weights.
-    Raises ValueError unless alpha > 0 and the covariance is positive definite.
+    The points are mean +- columns of a square root C of (n + nu) covariance, C C' = (n + nu) covariance, so that
+    sum w d d' is the covariance exactly, correlated or not. C is the lower Cholesky factor; in the coordinates of
+    `basis` (n, n), if given, whose last column is then the direction of the last points. alpha = 1 gives non-negative
+    weights. Raises ValueError unless alpha > 0 and the covariance is positive definite.
     """
     n = mean.size
     if not alpha > 0.0:
@@ -36,8 +39,10 @@ def sigma_points(mean: Array, covariance: Array, alpha: float, kappa: float = 0.
     spread = alpha**2 * (n + kappa)
     if spread <= 0.0:
         raise ValueError(f"n + kappa must be positive, not {n + kappa}")
+    axes = np.eye(n) if basis is None else basis
+    inverse = np.linalg.inv(axes)
     try:
-        factor = np.linalg.cholesky(spread * covariance)
+        factor = axes @ np.linalg.cholesky(spread * (inverse @ covariance @ inverse.T))
     except np.linalg.LinAlgError:
         raise ValueError("the covariance is not positive definite") from None
     points = np.vstack([mean, mean + factor.T, mean - factor.T])

@@ -12,17 +12,17 @@ from typing import Any, NamedTuple
 from disco_hw.control.blocks import BLOCK, U
 from disco_hw.control.rollout import roll_block
 from disco_hw.control.tasks.terms import has_memory, stage_cost, terminal_cost
-from disco_hw.model.compose import needs_change
+from disco_hw.model.compose import needs_change, wheels_follow
 from disco_hw.model.effects import command_delay
 from disco_hw.model.jit import block_function, cast_like, scalar_function, specialise, tune_loops
 from disco_hw.model.step import axle_of, body_step, integration_from, tracked_of, wheel_step
 from disco_hw.model.tables import base_point, effect_point, lane_base, lane_effects
 
-# Rows of a block's state; one flat buffer at fixed offsets spares the compiler all checks for overlap. Three sets of
+# Rows of a block's state; one flat buffer at fixed offsets spares the compiler all checks for overlap. Five sets of
 # rows for what differs between points that share the axle's motion.
 _AXLE_X, _AXLE_Y, _COS, _SIN, _FORWARD = (U(row) * BLOCK for row in range(5))
 _LEFT, _RIGHT = U(0) * BLOCK, BLOCK
-_OWN, _FIRST_TWIN, _SECOND_TWIN = U(5) * BLOCK, U(9) * BLOCK, U(13) * BLOCK
+_OWN, _TWIN0, _TWIN1, _TWIN2, _TWIN3 = (U(row) * BLOCK for row in (5, 9, 13, 17, 21))
 _X, _Y, _MEMORY, _TOTAL = (U(row) * BLOCK for row in range(4))
 _CHANNELS = 2
 # The wheels' motion: for every step a row of their sum and one of right minus left; then a row of the sum's change.
@@ -36,17 +36,18 @@ class SkidSteer(NamedTuple):
 
     `start` (8,): x, y relative to the task's origin (m), cos and sin of yaw, left and right wheel speed (rad/s), time
     (s), the task's memory. `base`, `effects`: coefficient tables of L points; `each` is None, or anything else if the
-    tables hold points for every sample, (L, K'). `twins` (L, 2) int: points that differ from a point in x_icr alone,
-    -1 for none, -2 for a point that is itself a twin. `series` (8,), `wide`: how a step is integrated. `history`: rows
-    of commands from before the plan. `wheels`: buffer of the wheels' motion, T * WHEEL_ROWS * BLOCK; `wheels_differ`:
-    whether the points differ in how the wheels turn.
+    tables hold points for every sample, (L, K'). `ahead`, `scaled` (L, 2) int or None: pairs of points that
+    share a point's rollout, as `parameter_points.twins` finds them. `series` (8,), `wide`: how a step is integrated.
+    `history`: rows of commands from before the plan. `wheels`: buffer of the wheels' motion, T * WHEEL_ROWS * BLOCK;
+    `wheels_differ`: whether the points differ in how the wheels turn.
     """
 
     start: Any
     base: Any
     effects: Any
     each: Any
-    twins: Any
+    ahead: Any
+    scaled: Any
     series: Any
     wide: Any
     task: Any
@@ -84,14 +85,23 @@ def _turn_wheels(
 
 
 @scalar_function
-def _move(
-    state: Any, b: Any, wheels: Any, row: Any, change_row: Any, time_s: Any, base: Any, effects: Any, integration: Any
-) -> None:
+def _rolling(wheels: Any, t: int, b: Any, commands: Any, late: int, horizon: int, effects: Any) -> Any:
+    """Sum of the mean wheel speeds of sample b over step t, right minus left, and the sum's change (rad/s)."""
+    if wheels_follow(effects) and not needs_change(effects):
+        row = U(t + late) * _WHEEL_STRIDE
+        left, right = commands[row + _LEFT + b], commands[row + _RIGHT + b]
+        return left + right, right - left, cast_like(0.0, left)
+    row, change_row = U(t) * _WHEEL_STRIDE, U(2 * horizon + t) * BLOCK
+    return wheels[row + _SUM + b], wheels[row + _DIFFERENCE + b], wheels[change_row + b]
+
+
+@scalar_function
+def _move(state: Any, b: Any, rolling: Any, time_s: Any, base: Any, effects: Any, integration: Any) -> None:
     """Move sample b on by one step."""
+    wheel_sum, difference, change = rolling
     axle_x, axle_y, cos_yaw, sin_yaw, forward, _ = body_step(
         state[_AXLE_X + b], state[_AXLE_Y + b], state[_COS + b], state[_SIN + b],
-        wheels[row + _SUM + b], wheels[row + _DIFFERENCE + b], wheels[change_row + b], time_s,
-        base, effects, integration,
+        wheel_sum, difference, change, time_s, base, effects, integration,
     )  # fmt: skip
     state[_AXLE_X + b] = axle_x
     state[_AXLE_Y + b] = axle_y
@@ -110,54 +120,64 @@ def _begin(state: Any, own: Any, b: Any, start: Any) -> None:
 
 
 @scalar_function
-def _cost(state: Any, own: Any, b: Any, t: int, axle_x: Any, axle_y: Any, base: Any, task: Any) -> None:
-    """Add the cost of step t, which sample b has just made, to the rows from `own` on."""
+def _cost(
+    state: Any, own: Any, b: Any, t: int, axle_x: Any, axle_y: Any, forward: Any, base: Any, task: Any, last: Any
+) -> None:  # fmt: skip
+    """Add the cost of step t, which sample b has just made, to the rows from `own` on; `last` is None before it."""
     cos_yaw, sin_yaw = state[_COS + b], state[_SIN + b]
     x, y = tracked_of(axle_x, axle_y, cos_yaw, sin_yaw, base)
     cost, memory = stage_cost(
-        task, state[own + _MEMORY + b], t, state[own + _X + b], state[own + _Y + b], x, y, cos_yaw, sin_yaw,
-        state[_FORWARD + b],
-    )  # fmt: skip
-    state[own + _X + b] = x
-    state[own + _Y + b] = y
+        task, state[own + _MEMORY + b], t, state[own + _X + b], state[own + _Y + b], x, y, cos_yaw, sin_yaw, forward
+    )
     state[own + _TOTAL + b] += cost
     if has_memory(task):
         state[own + _MEMORY + b] = memory
+    if has_memory(task) or last is not None:
+        state[own + _X + b] = x
+        state[own + _Y + b] = y
 
 
 @scalar_function
-def _cost_twin(state: Any, own: Any, b: Any, t: int, base: Any, twin: Any, start: Any, task: Any) -> None:
-    """As `_cost`, for a twin of the point `base`: its axle moves alike from another place. None has no cost."""
-    if twin is None:
-        return
-    ahead = twin.x_icr_m - base.x_icr_m
-    _cost(state, own, b, t, state[_AXLE_X + b] + ahead * start[2], state[_AXLE_Y + b] + ahead * start[3], twin, task)
+def _twin_cost(state: Any, own: Any, b: Any, t: int, base: Any, twin: Any, start: Any, task: Any, last: Any) -> None:
+    """As `_cost`, for a twin of the point `base`: its axle draws the same path from another place, at another scale."""
+    scale = twin.half_radius_m / base.half_radius_m
+    ahead, stays = twin.x_icr_m - scale * base.x_icr_m, cast_like(1.0, scale) - scale
+    axle_x = scale * state[_AXLE_X + b] + (stays * start[0] + ahead * start[2])
+    axle_y = scale * state[_AXLE_Y + b] + (stays * start[1] + ahead * start[3])
+    _cost(state, own, b, t, axle_x, axle_y, scale * state[_FORWARD + b], twin, task, last)
 
 
 @scalar_function
-def _end(costs: Any, at: Any, state: Any, own: Any, b: Any, task: Any) -> None:
-    """Write the cost of the rows from `own` on."""
-    costs[at + b] = state[own + _TOTAL + b] + terminal_cost(
-        task, state[own + _MEMORY + b], state[own + _X + b], state[own + _Y + b], state[_COS + b], state[_SIN + b]
-    )
+def _costs(state: Any, b: Any, t: int, base: Any, ahead: Any, scaled: Any, start: Any, task: Any, last: Any) -> None:
+    """Costs of step t under a point and its twins, pairs or None."""
+    _cost(state, _OWN, b, t, state[_AXLE_X + b], state[_AXLE_Y + b], state[_FORWARD + b], base, task, last)
+    if ahead is not None:
+        _twin_cost(state, _TWIN0, b, t, base, ahead[0], start, task, last)
+        _twin_cost(state, _TWIN1, b, t, base, ahead[1], start, task, last)
+    if scaled is not None:
+        _twin_cost(state, _TWIN2, b, t, base, scaled[0], start, task, last)
+        _twin_cost(state, _TWIN3, b, t, base, scaled[1], start, task, last)
 
 
-@scalar_function
-def _end_twin(costs: Any, at: Any, state: Any, own: Any, b: Any, twin: Any, task: Any) -> None:
-    """As `_end`, for a twin; nothing for None."""
-    if twin is not None:
-        _end(costs, at, state, own, b, task)
+@block_function
+def _end(costs: Any, at: Any, state: Any, own: Any, task: Any) -> None:
+    """Write the costs of the rows from `own` on to `costs[at:at + BLOCK]`."""
+    tune_loops()
+    for b in range(BLOCK):
+        costs[at + b] = state[own + _TOTAL + b] + terminal_cost(
+            task, state[own + _MEMORY + b], state[own + _X + b], state[own + _Y + b], state[_COS + b], state[_SIN + b]
+        )
 
 
 @block_function
 def _roll(
-    costs: Any, at: Any, first_at: Any, second_at: Any, horizon: int, wheels: Any, state: Any, start: Any, base: Any,
-    first_twin: Any, second_twin: Any, effects: Any, integration: Any, task: Any,
+    costs: Any, at: Any, ahead_at: Any, scaled_at: Any, horizon: int, commands: Any, late: int, wheels: Any,
+    state: Any, start: Any, base: Any, ahead: Any, scaled: Any, effects: Any, integration: Any, task: Any,
 ) -> None:  # fmt: skip
     """Roll the block out from `start` with its wheels turning as in `wheels`; writes `costs[at:at + BLOCK]`.
 
-    `base` and `effects` hold numbers, or arrays whose entries from `at` on belong to the block's samples. Twins differ
-    from `base` in x_icr alone and are costed along with it, at `first_at` and `second_at`; or None. A step is costed
+    `base` and `effects` hold numbers, or arrays whose entries from `at` on belong to the block's samples. Twins, the
+    pairs `ahead` and `scaled` or None, are costed along with it, at `ahead_at` and `scaled_at`. A step is costed
     together with the next one's motion: neither waits for the other, which saves a sixth of the time.
     """
     tune_loops()
@@ -167,61 +187,91 @@ def _roll(
         state[_COS + b] = cos_yaw
         state[_SIN + b] = sin_yaw
         _begin(state, _OWN, b, start)
-        _begin(state, _FIRST_TWIN, b, start)
-        _begin(state, _SECOND_TWIN, b, start)
+        _begin(state, _TWIN0, b, start)
+        _begin(state, _TWIN1, b, start)
+        _begin(state, _TWIN2, b, start)
+        _begin(state, _TWIN3, b, start)
     for t in range(horizon):
         time_s = start[6] + cast_like(t, x) * integration.step_s
-        row, change_row = U(t) * _WHEEL_STRIDE, U(2 * horizon + t) * BLOCK
         if t == 0:
             for b in range(BLOCK):
                 here, acting = lane_base(base, at + b), lane_effects(effects, at + b)
-                _move(state, b, wheels, row, change_row, time_s, here, acting, integration)
+                _move(
+                    state, b, _rolling(wheels, t, b, commands, late, horizon, acting), time_s, here, acting, integration
+                )  # fmt: skip
         else:
             for b in range(BLOCK):
                 here, acting = lane_base(base, at + b), lane_effects(effects, at + b)
-                _cost(state, _OWN, b, t - 1, state[_AXLE_X + b], state[_AXLE_Y + b], here, task)
-                _cost_twin(state, _FIRST_TWIN, b, t - 1, here, first_twin, start, task)
-                _cost_twin(state, _SECOND_TWIN, b, t - 1, here, second_twin, start, task)
-                _move(state, b, wheels, row, change_row, time_s, here, acting, integration)
+                _costs(state, b, t - 1, here, ahead, scaled, start, task, None)
+                _move(
+                    state, b, _rolling(wheels, t, b, commands, late, horizon, acting), time_s, here, acting, integration
+                )  # fmt: skip
     for b in range(BLOCK):
-        here = lane_base(base, at + b)
-        _cost(state, _OWN, b, horizon - 1, state[_AXLE_X + b], state[_AXLE_Y + b], here, task)
-        _cost_twin(state, _FIRST_TWIN, b, horizon - 1, here, first_twin, start, task)
-        _cost_twin(state, _SECOND_TWIN, b, horizon - 1, here, second_twin, start, task)
-        _end(costs, at, state, _OWN, b, task)
-        _end_twin(costs, first_at, state, _FIRST_TWIN, b, first_twin, task)
-        _end_twin(costs, second_at, state, _SECOND_TWIN, b, second_twin, task)
+        _costs(state, b, horizon - 1, lane_base(base, at + b), ahead, scaled, start, task, True)
+    # One after the other: a loop that wrote to all at once would not be vectorised.
+    _end(costs, at, state, _OWN, task)
+    if ahead is not None:
+        _end(costs, ahead_at[0], state, _TWIN0, task)
+        _end(costs, ahead_at[1], state, _TWIN1, task)
+    if scaled is not None:
+        _end(costs, scaled_at[0], state, _TWIN2, task)
+        _end(costs, scaled_at[1], state, _TWIN3, task)
+
+
+@scalar_function
+def _bases(base: Any, pair: Any) -> Any:
+    """Base coefficients of a pair of points."""
+    return base_point(base, pair[0]), base_point(base, pair[1])
+
+
+@scalar_function
+def _places(pair: Any, padded: int, lane: Any) -> Any:
+    """Where the costs of a pair of points begin."""
+    return U(pair[0] * padded) + lane, U(pair[1] * padded) + lane
 
 
 @block_function
 def _roll_points(
-    each: Any, system: Any, costs: Any, points: int, padded: int, block: int, horizon: int, commands: Any, state: Any
-) -> None:
+    each: Any, ahead: Any, scaled: Any, system: Any, costs: Any, points: int, padded: int, block: int, horizon: int,
+    commands: Any, state: Any,
+) -> None:  # fmt: skip
     integration = integration_from(system.series, system.wide)
     start, wheels, task = system.start, system.wheels, system.task
+    lane = U(block) * BLOCK
     for i in range(points):
-        at = U(i * padded) + U(block) * BLOCK
+        at = U(i * padded) + lane
         here, acting = base_point(system.base, i), effect_point(system.effects, i)
         late = system.history - command_delay.whole_steps(acting.command_delay)
-        if each is None:
-            first, second = system.twins[i, 0], system.twins[i, 1]
-            if i == 0 or system.wheels_differ:
-                _turn_wheels(wheels, at, horizon, commands, state, start, acting, late, integration.step_s)
-            if first >= 0:
-                first_at = U(first * padded) + U(block) * BLOCK
-                second_at = U(second * padded) + U(block) * BLOCK
-                _roll(
-                    costs, at, first_at, second_at, horizon, wheels, state, start, here,
-                    base_point(system.base, first), base_point(system.base, second), acting, integration, task,
-                )  # fmt: skip
-            elif first == -1:
-                _roll(costs, at, at, at, horizon, wheels, state, start, here, None, None, acting, integration, task)
-        else:
-            _turn_wheels(wheels, at, horizon, commands, state, start, system.effects, late, integration.step_s)
+        if each is not None:
+            if needs_change(acting) or not wheels_follow(acting):
+                _turn_wheels(wheels, at, horizon, commands, state, start, system.effects, late, integration.step_s)
             _roll(
-                costs, at, at, at, horizon, wheels, state, start, system.base, None, None, system.effects, integration,
-                task,
+                costs, at, None, None, horizon, commands, late, wheels, state, start, system.base, None, None,
+                system.effects, integration, task,
             )  # fmt: skip
+        else:
+            if (i == 0 or system.wheels_differ) and (needs_change(acting) or not wheels_follow(acting)):
+                _turn_wheels(wheels, at, horizon, commands, state, start, acting, late, integration.step_s)
+            alone = True
+            if ahead is not None:
+                alone = ahead[i, 0] == -1
+                if ahead[i, 0] >= 0:
+                    if scaled is None:
+                        _roll(
+                            costs, at, _places(ahead[i], padded, lane), None, horizon, commands, late, wheels, state,
+                            start, here, _bases(system.base, ahead[i]), None, acting, integration, task,
+                        )  # fmt: skip
+                    else:
+                        _roll(
+                            costs, at, _places(ahead[i], padded, lane), _places(scaled[i], padded, lane), horizon,
+                            commands, late, wheels, state, start, here, _bases(system.base, ahead[i]),
+                            _bases(system.base, scaled[i]), acting, integration, task,
+                        )  # fmt: skip
+            if alone:
+                _roll(
+                    costs, at, None, None, horizon, commands, late, wheels, state, start, here, None, None, acting,
+                    integration, task,
+                )  # fmt: skip
 
 
 @specialise(roll_block)
@@ -234,6 +284,8 @@ def _roll_block(
     def roll_skid_steer(
         system: Any, costs: Any, points: Any, padded: Any, block: Any, horizon: Any, commands: Any, state: Any
     ) -> None:
-        _roll_points(system.each, system, costs, points, padded, block, horizon, commands, state)
+        _roll_points(
+            system.each, system.ahead, system.scaled, system, costs, points, padded, block, horizon, commands, state
+        )
 
     return roll_skid_steer

@@ -77,6 +77,11 @@ def _change_lines() -> list[str]:
     return [f"return {' or '.join([*asking, 'terms_need_change(effects.body_terms)'])}"]
 
 
+def _follow_lines() -> list[str]:
+    absent = [f"effects.{name} is None" for name in _staged(_WHEELS)]
+    return [f"return {' and '.join([*absent, 'effects.command_delay is None', 'effects.command_terms is None'])}"]
+
+
 @scalar_function
 def _plus(lateral: Any, more: Any) -> Any:
     if lateral is None:
@@ -119,4 +124,10 @@ needs_change = _made(
     "effects",
     _change_lines(),
     "Whether the body's motion depends on the change of the wheel speeds; a constant to the compiler.",
+)
+wheels_follow = _made(
+    "wheels_follow",
+    "effects",
+    _follow_lines(),
+    "Whether the wheels turn as commanded, with nothing in between; a constant to the compiler.",
 )

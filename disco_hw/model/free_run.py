@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.model.effects import command_delay
-from disco_hw.model.jit import kernel_function
+from disco_hw.model.jit import compiled_for, kernel_function
 from disco_hw.model.model import Model, coefficient_tables
 from disco_hw.model.step import axle_of, integration_from, integration_series, step, tracked_of
 from disco_hw.model.tables import base_point, effect_point
@@ -24,6 +25,7 @@ class FreeRun:
         self._base, self._effects = coefficient_tables(model, theta, step_s)
         self._series = integration_series(step_s, wide=True)
         delay = self._effects.command_delay
+        self._run: Callable[..., None] | None = None
         self.past_rows = 0 if delay is None else int(delay[0].max()) + 1
 
     def states(self, start: Array, commands: Array, history: int, time_s: float = 0.0, point: int = 0) -> Array:
@@ -36,7 +38,10 @@ class FreeRun:
         states[0] = start
         # A fresh copy, as a read-only array or a strided one is another type and would be compiled anew, in mid-loop.
         own = np.array(commands, dtype=np.float64, order="C")
-        run_states(states, own, history, float(time_s), point, self._base, self._effects, self._series)
+        arguments = states, own, history, float(time_s), point, self._base, self._effects, self._series
+        if self._run is None:
+            self._run = compiled_for(run_states, *arguments)
+        self._run(*arguments)
         return states
 
 

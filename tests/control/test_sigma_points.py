@@ -42,6 +42,20 @@ def test_any_covariance_is_matched_exactly(n, alpha, seed):
     np.testing.assert_allclose(covariance_of(sigma, mean), covariance, atol=1e-12 * covariance.max() / alpha**2)
 
 
+@settings(max_examples=50, deadline=None)
+@given(st.integers(2, 5), st.floats(0.3, 1.0), st.integers(0, 10_000))
+def test_in_any_coordinates_the_covariance_is_the_same_and_the_last_points_lie_along_the_last_axis(n, alpha, seed):
+    rng = np.random.default_rng(seed)
+    factor, basis = (rng.standard_normal((n, n)) + 2.0 * np.eye(n) for _ in range(2))
+    if np.linalg.cond(basis) > 100.0:
+        basis = np.eye(n)
+    mean, covariance = rng.standard_normal(n), factor @ factor.T + 1e-3 * np.eye(n)
+    sigma = sigma_points(mean, covariance, alpha, basis=basis)
+    np.testing.assert_allclose(covariance_of(sigma, mean), covariance, atol=1e-10 * covariance.max() / alpha**2)
+    along = (sigma.points[n] - mean) / np.linalg.norm(sigma.points[n] - mean)
+    assert abs(along @ basis[:, -1]) / np.linalg.norm(basis[:, -1]) == pytest.approx(1.0)
+
+
 def test_weights_are_the_papers():
     half = sigma_points(np.zeros(3), np.eye(3), 0.5)
     np.testing.assert_allclose(half.mean_weights, [-3.0] + [2 / 3] * 6)

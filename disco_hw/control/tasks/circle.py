@@ -24,7 +24,7 @@ class CircleTerms(NamedTuple):
     """What the kernel needs of a circle.
 
     Radius (m), speed (m/s); weight of lost progress or None, progress wanted by the end of the horizon (m/s times
-    steps), progress of a radian (m/s), largest reciprocal square of the radius; weight of the last distance.
+    steps), progress of a radian (m/s), largest reciprocal square of the radius; weight of the last distance or None.
     """
 
     radius_m: Any
@@ -101,7 +101,7 @@ def _terms(circle: Circle, step_s: float, horizon: int) -> CircleTerms:
         f32(circle.progress_part * circle.speed_m_s * horizon),
         f32(circle.radius_m / step_s),
         f32((NEAR_CENTRE / circle.radius_m) ** 2),
-        f32(circle.terminal_s / step_s),
+        f32(circle.terminal_s / step_s) if circle.terminal_s > 0.0 else None,
     )
 
 
@@ -124,6 +124,14 @@ def _lost(weight: Any, memory: Any, task: Any) -> Any:
     if weight is None:
         return zero
     return weight * max(task.wanted - memory * task.per_rad, zero)
+
+
+@scalar_function
+def _last_distance(steps: Any, x: Any, y: Any, task: Any) -> Any:
+    """Cost of the distance to the edge that is left at the end."""
+    if steps is None:
+        return cast_like(0.0, x)
+    return steps * abs(quick_norm(x, y) - task.radius_m)
 
 
 @specialise(stage_cost)
@@ -160,8 +168,7 @@ def _terminal_cost(task: Any, memory: Any, x: Any, y: Any, cos_yaw: Any, sin_yaw
         return None
 
     def cost(task: Any, memory: Any, x: Any, y: Any, cos_yaw: Any, sin_yaw: Any) -> Any:
-        off_edge = quick_norm(x, y) - task.radius_m
-        return _lost(task.progress_weight, memory, task) + task.terminal_steps * abs(off_edge)
+        return _lost(task.progress_weight, memory, task) + _last_distance(task.terminal_steps, x, y, task)
 
     return cost
 
