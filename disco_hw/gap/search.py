@@ -143,8 +143,8 @@ def search_wheels(line: Timeline, geometry: Array, start: Array, given: Names = 
     moves = wheel_moves(channel, geometry)
     rough = Selector(channel, moves, _ROUGH, given=given, start=start)
     begin = tuple(dict.fromkeys((*given, *_RESPONSE)))
-    _responding(rough, begin)
-    names = rough.greedy(begin, _responding)
+    responding(rough, begin)
+    names = rough.greedy(begin, responding)
     rich = (*names, *(name for name in _SMOOTH_WHEEL if name not in names))
     vector = fit(channel, rough.fit(names).vector, indices(channel, rich)).vector
     plain = learn_wheel_noise(channel, channel.raw_residual(vector))
@@ -166,7 +166,7 @@ def search_wheels(line: Timeline, geometry: Array, start: Array, given: Names = 
     return searched(plain) if found.fit.cost > _FAR_OFF * 0.5 * sound.count else found
 
 
-def _responding(selector: Selector, names: Names) -> None:
+def responding(selector: Selector, names: Names) -> None:
     """Fit lag and delay together from slow and quick responses; on top of others that were accepted, from none.
 
     One at a time they may lose to effects that merely stop the wheels: on a slow robot neither is much without the

@@ -1,14 +1,21 @@
-"""Of a floor that is different from some time on, and one that is different at some place, the right one is told."""
+"""Of a floor that is different from some time on, and one that is different at some place, the right one is told.
+
+And what holds the wheels is not taken for a slow response.
+"""
 
 from functools import cache
 
+import numpy as np
 import pytest
 
 from disco_hw.gap.candidates import CHANGE
+from disco_hw.gap.channels import WheelChannel
 from disco_hw.gap.find import find_gap
-from disco_hw.gap.layout import BODY
-from disco_hw.gap.search import search_body
+from disco_hw.gap.layout import BODY, WHEEL
+from disco_hw.gap.search import responding, search_body, wheel_moves
+from disco_hw.gap.selection import Selector
 from disco_hw.gap.timeline import timeline
+from disco_hw.gap.wheel_noise import WheelNoise
 from disco_hw.model import Model
 from tools.gap_logs import simulated_drive
 
@@ -48,3 +55,17 @@ def test_a_patch_that_is_left_for_good_is_told_with_the_change_it_looks_like():
     assert "not to be told from surface_change" in report.as_text()
     # Half of the log says nothing about it: its prediction is that of the plain model, not worse.
     assert not report.amended_is_worse
+
+
+def test_what_holds_the_wheels_is_not_fitted_with_a_slow_response():
+    geometry = np.array([0.061, 0.415, 0.238])
+    line = timeline(simulated_drive({"stiction": 0.85}, seed=3005))
+    channel = WheelChannel.build(line, WheelNoise(reading_rad=max(line.quantum_rad, 2e-4)), geometry)
+    selector = Selector(channel, wheel_moves(channel, geometry), start=WHEEL.neutral.copy())
+    both = ("motor_lag", "command_delay")
+    responding(selector, both)
+    slow = selector.fit((*both, "stiction")).cost
+    responding(selector, (*both, "stiction"))
+    alone = selector.fit(("stiction",)).cost
+    assert slow > 1.5 * alone
+    assert selector.fit((*both, "stiction")).cost <= alone + 1e-6
