@@ -20,7 +20,8 @@ from disco_hw.model import Model
 from tools.gap_logs import NAMED, realistic, simulated_drive
 
 MODEL = Model(0.061, 0.415, 0.238)
-TOP_RAD_S = 6.4
+# What the robot can do, and what scripts ask of it.
+LARGEST_RAD_S, TOP_RAD_S = 8.0, 6.4
 OUTSIDE = ("x_wheel_ripple", "x_motor_droop", "x_shared_supply", "x_speed_squared_drag", "x_carpet_patch")
 # Another form of a named family, and the names that count as the family's.
 FORMS = {
@@ -116,7 +117,7 @@ def work(job: Job) -> Result:
     script = separating("separate", TOP_RAD_S) if job.kind == "asked" else None
     log = simulated_drive(job.hidden, job.seed, "circle" if circle else "rich", job.kind == "dirty", script=script)
     began = time.process_time()
-    report = find_gap(log, MODEL)
+    report = find_gap(log, MODEL, top_rad_s=LARGEST_RAD_S)
     cpu_s = time.process_time() - began
     mm = {stage: 1e3 * errors[2.0].position_m for stage, errors in report.gap.items()}
     errors, covered = [], []

@@ -18,6 +18,10 @@ from disco_hw.model.parameter import Parameter
 Array = NDArray[np.float64]
 
 _LIMITS = ("speed_limit", "yaw_rate_limit")
+# A limit shows only where more is asked: this share of what the robot can do, and no more turning than robots are
+# held to.
+_MOST_OF_IT = 0.75
+_REALISTIC_YAW_RATE_RAD_S = 1.2
 _EXACT_ALIKE = {"pose_offset": "lateral_icr", "encoder_scale": "wheel_gain"}
 _SCORE = 20.0
 _USUAL_INFLATION = 1.5
@@ -38,10 +42,14 @@ class BlindSpot:
     experiment: str
 
 
-def blind_spots(found: Found) -> tuple[BlindSpot, ...]:
-    """Blind spots of one channel, one for each of its effects that was not accepted."""
+def blind_spots(found: Found, top_rad_s: float | None = None) -> tuple[BlindSpot, ...]:
+    """Blind spots of one channel, one for each of its effects that was not accepted.
+
+    `top_rad_s`: the largest wheel speed of the robot, if it is known; without it nobody knows what was not asked of it.
+    """
     channel, best = found.selector.channel, found.fit
-    spots = [_spot(channel, best, name) for name in candidates_of(channel.layout) if name not in found.names]
+    missing = [name for name in candidates_of(channel.layout) if name not in found.names]
+    spots = [_limit(channel, name, top_rad_s) if name in _LIMITS else _spot(channel, best, name) for name in missing]
     for spot in tuple(spots):
         for other, like in _EXACT_ALIKE.items():
             if spot.name == like:
@@ -56,9 +64,6 @@ def _spot(channel: Channel, best: Fit, name: str) -> BlindSpot:
     effect, candidate = REGISTRY[name], CANDIDATES[name]
     parameter = effect.parameters[0]
     column = f"{name}.{parameter.name}"
-    if name in _LIMITS:
-        largest = _largest(channel, name)
-        return BlindSpot(name, parameter.name, parameter.unit, largest, largest is None, experiment_of(name))
     size = _size(channel, best, name, column, candidate.columns)
     blind = size is None or size > _realistic(parameter)
     return BlindSpot(name, parameter.name, parameter.unit, size, blind, experiment_of(name))
@@ -75,10 +80,20 @@ def experiment_of(name: str) -> str:
     return f"disco-hw drive ROBOT.toml --script {effect.script}: {effect.excitation}"
 
 
-def _largest(channel: Channel, name: str) -> float | None:
-    """The largest limit that cuts at least half a second of the commands."""
-    wheels = channel.inner
+def _limit(channel: Channel, name: str, top_rad_s: float | None) -> BlindSpot:
+    wheels, parameter = channel.inner, REGISTRY[name].parameters[0]
     assert isinstance(wheels, WheelChannel)
+    largest = _largest(wheels, name)
+    enough = 0.0 if top_rad_s is None else _MOST_OF_IT * top_rad_s
+    if name == "yaw_rate_limit":
+        turning = math.inf if top_rad_s is None else enough * 2.0 * wheels.geometry[0] / wheels.geometry[1]
+        enough = min(turning, _REALISTIC_YAW_RATE_RAD_S)
+    blind = largest is None or largest < enough
+    return BlindSpot(name, parameter.name, parameter.unit, largest, blind, experiment_of(name))
+
+
+def _largest(wheels: WheelChannel, name: str) -> float | None:
+    """The largest limit that cuts at least half a second of the commands."""
     command = wheels.timeline.command_rad_s
     command = command[np.isfinite(command[:, 0])]
     if name == "speed_limit":

@@ -47,7 +47,7 @@ def gap(
     config = load_robot_config(robot)
     start = load_model(model) if model is not None else Model.nominal(config.robot)
     drive = load_drive(list(logs), config.robot.ticks_per_rev, config.robot.wheel_radius_m)
-    report = find_gap(drive, start, progress, pictures=True)
+    report = find_gap(drive, start, progress, pictures=True, top_rad_s=config.robot.max_wheel_speed_rad_s)
     try:
         out.mkdir(parents=True, exist_ok=True)
         (out / "report.json").write_text(json.dumps(report.as_dict(), indent=1), encoding="utf-8")

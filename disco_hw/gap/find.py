@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,19 +26,24 @@ Progress = Callable[[str], None]
 
 
 def find_gap(
-    logs: DriveLog | Sequence[DriveLog], model: Model, progress: Progress | None = None, pictures: bool = False
+    logs: DriveLog | Sequence[DriveLog],
+    model: Model,
+    progress: Progress | None = None,
+    pictures: bool = False,
+    top_rad_s: float | None = None,
 ) -> GapReport:
     """Find where logs and model disagree, name what is missing, amend the model and show the gap shrink.
 
     `logs`: one drive or several of one robot. `model`: nominal geometry, with the effects that are known already;
-    those are refitted, not reported. `progress` is told what is being done; `pictures` draws
-    them too. Raises LogError if the logs hold too
-    little to judge either channel.
+    those are refitted, not reported. `progress` is told what is being done; `pictures` draws them too. `top_rad_s`: the
+    robot's largest wheel speed, without which it is not known to which speed limits the logs are blind. Raises LogError
+    if the logs hold too little to judge either channel.
     """
     began = time.perf_counter()
     say = progress or (lambda text: None)
     log = logs if isinstance(logs, DriveLog) else concatenate(logs)
     outcome, notes = _searched(log, model, say)
+    outcome = replace(outcome, top_rad_s=top_rad_s)
     say("intervals, blind spots and the gap on held-out data")
     effects, unnamed = outcome.effects(), outcome.unnamed()
     named = {effect.name: effect.parameters for effect in outcome.effects(given=True)}

@@ -32,7 +32,8 @@ Array = NDArray[np.float64]
 class Outcome:
     """What was found in the channels of one timeline; a channel that could not be judged is None.
 
-    `nominal_body`, `nominal_wheels` are the vectors of the model as given.
+    `nominal_body`, `nominal_wheels` are the vectors of the model as given; `top_rad_s` the robot's largest wheel speed,
+    if it is known.
     """
 
     line: Timeline
@@ -40,6 +41,7 @@ class Outcome:
     nominal_wheels: Array
     body: Found | None
     wheels: Found | None
+    top_rad_s: float | None = None
 
     @cached_property
     def _estimates(self) -> tuple[Estimates | None, Estimates | None]:
@@ -229,7 +231,7 @@ class Outcome:
         spots: list[BlindSpot] = []
         for found in (self.wheels, self.body):
             if found is not None:
-                spots += [spot for spot in blind_spots(found) if spot.name not in named]
+                spots += [spot for spot in blind_spots(found, self.top_rad_s) if spot.name not in named]
         seen = {spot.name for spot in spots} | named
         for name, effect in REGISTRY.items():
             judged = self.wheels if effect.channel is Channel.COMMAND_TO_WHEEL else self.body

@@ -4,10 +4,12 @@ import numpy as np
 import pytest
 
 from disco_hw.gap.blind_spots import blind_spots
-from disco_hw.gap.search import Found, body_moves
+from disco_hw.gap.channels import WheelChannel
+from disco_hw.gap.search import Found, body_moves, wheel_moves
 from disco_hw.gap.selection import Selector
+from disco_hw.gap.wheel_noise import WheelNoise
 from disco_hw.model.effects import REGISTRY
-from tests.gap.synthetic import body_channel, line_of
+from tests.gap.synthetic import GEOMETRY, body_channel, line_of
 
 
 def spots_of(channel, names=()):
@@ -40,3 +42,25 @@ def test_a_drive_that_only_goes_straight_is_blind_to_slip_in_turns():
     spot = spots_of(from_straight)["turn_slip"]
     assert spot.blind
     assert not spots_of(channel)["turn_slip"].blind
+
+
+def test_no_limit_shows_above_what_was_asked_of_the_robot():
+    geometry = np.array(GEOMETRY)
+
+    def spots_at(left, right, top_rad_s):
+        channel = WheelChannel.build(line_of(np.full((4000, 2), (left, right))), WheelNoise(), geometry)
+        found = Found(Selector(channel, wheel_moves(channel, geometry)), (), channel)
+        return {spot.name: spot for spot in blind_spots(found, top_rad_s)}
+
+    # A steady circle at half speed: 0.3 rad/s of turning.
+    slow = spots_at(3.0, 5.0, 10.0)
+    assert slow["speed_limit"].smallest_visible == pytest.approx(0.97 * 5.0)
+    assert slow["speed_limit"].blind
+    assert slow["yaw_rate_limit"].blind
+    spinning = spots_at(-7.9, 7.9, 10.0)
+    assert not spinning["speed_limit"].blind
+    assert not spinning["yaw_rate_limit"].blind
+    # A robot that turns no faster: its own largest yaw rate is enough.
+    assert not spots_at(-2.0, 2.0, 2.5)["yaw_rate_limit"].blind
+    # Without knowing what the robot can do, a speed limit above what was asked cannot be called hidden.
+    assert not spots_at(3.0, 5.0, None)["speed_limit"].blind
