@@ -118,12 +118,14 @@ def _live() -> dict[str, float]:
 
 
 def _changed_live() -> dict[str, float]:
-    """Wheels that grow by 15 % under the real daemon: tracking costs before and after, with and without adaptation."""
+    """Wheels or axle that grow by 15 % under the real daemon: tracking costs before and after, adapting and not."""
     figures: dict[str, float] = {}
-    for name, adapt in (("without", False), ("with", True)):
-        with TemporaryDirectory() as directory:
-            driven = drive_through_change(Path(directory), adapt=adapt)
-        figures |= {f"adapt.changed_live_{name}.{key}": float(value) for key, value in asdict(driven).items()}
+    for changes in ("wheel radius", "axial distance"):
+        for name, adapt in (("without", False), ("with", True)):
+            with TemporaryDirectory() as directory:
+                driven = drive_through_change(Path(directory), changes, adapt=adapt)
+            key = f"adapt.{changes.replace(' ', '_')}_live_{name}"
+            figures |= {f"{key}.{field}": float(value) for field, value in asdict(driven).items()}
     return figures
 
 

@@ -1,4 +1,4 @@
-"""A robot whose wheels grow on the way, driven by the real daemon in real time, adapting or not."""
+"""A robot whose wheels or axle grow on the way, driven by the real daemon in real time, adapting or not."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ import numpy as np
 
 import disco_hw
 from disco_hw.adapt.adaptable import believed_geometry, with_geometry
-from disco_hw.adapt.experiment import BELIEVED_STD
+from disco_hw.adapt.coordinates import NAMES
+from disco_hw.adapt.experiment import BELIEVED_STD, CHANGES
 from disco_hw.adapt.guard import Geometry
 from disco_hw.log.reader import open_log
 from disco_hw.model.file import load_model, model_text
@@ -26,25 +27,29 @@ START = (0.75, 0.0, 1.5707963)
 
 @dataclass(frozen=True, slots=True)
 class Driven:
-    """Mean tracking costs on the plant's truth, over 20 s before the change and from 20 s after it on; the wheel radius
-    (m) that the robot drove by last, how long after the change (s) it was first told, and what the loop missed.
+    """Mean tracking costs on the plant's truth, over 20 s before the change and from 20 s after it on; what changed, by
+    its size before, as the robot believed it at last, how long after the change (s) it was first told, and what the
+    loop missed.
     """
 
     cost_before: float
     cost_after: float
-    radius_m: float
+    believed: float
     published_s: float
     overruns: int
 
 
-def drive_through_change(directory: Path, *, adapt: bool) -> Driven:
-    """The paper's circle; the belief is right, and as narrow as after `infer`, until the wheels grow by 15 %."""
+def drive_through_change(directory: Path, changes: str, *, adapt: bool) -> Driven:
+    """The paper's circle; the belief is right, and as narrow as after `infer`, until the wheel radius or axial distance
+    (`changes`) grows by 15 %.
+    """
     model = load_model(Path(disco_hw.__file__).parent / "robots" / "wombot_model.toml")
     mean = believed_geometry(model).mean
     std = BELIEVED_STD * np.array([1.0, mean[1], mean[2]])
     narrow = directory / "narrow.toml"
     narrow.write_text(model_text(with_geometry(model, Geometry(mean, np.diag(std**2)))), encoding="utf-8")
-    hidden = ("--hide", f"surface_change=0.0,{CHANGE_S},{GROWTH}")
+    axle, wheels = CHANGES[changes]
+    hidden = ("--hide", f"surface_change={axle * GROWTH},{CHANGE_S},{wheels * GROWTH}")
     arguments = ("--adapt",) if adapt else ()
     with running_stack(directory, "can", TASK, START, hidden, arguments, str(narrow)) as stack:
         stack.operator.wait_for("READY", 60.0)
@@ -62,11 +67,12 @@ def drive_through_change(directory: Path, *, adapt: bool) -> Driven:
         beliefs = log.columns("/belief") if adapt else {"t_ns": []}
         told = [float(t_ns) * 1e-9 - first_s - CHANGE_S for t_ns in beliefs["t_ns"]]
         published_s = min((at for at in told if at > 0.0), default=math.inf)
-    radius_m = status["adaptation"]["mean"]["wheel_radius_m"] if adapt else float(mean[1])
+    index = NAMES.index("wheel_radius_m" if wheels else "axial_distance_m")
+    believed = status["adaptation"]["mean"][NAMES[index]] / float(mean[index]) if adapt else 1.0
     return Driven(
         float(cost[(t_s > -COMPARED_S) & (t_s < 0.0)].mean()),
         float(cost[(t_s > SETTLED_S) & (t_s < SETTLED_S + COMPARED_S)].mean()),
-        radius_m,
+        believed,
         published_s,
         int(status["loop"]["overruns"]),
     )

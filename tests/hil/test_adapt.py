@@ -79,9 +79,10 @@ def test_an_adapter_that_freezes_and_dies_leaves_belief_and_loop(tmp_path):
 
 
 @pytest.mark.timeout(300)
-def test_wheels_that_grow_on_the_way_are_learnt_and_the_circle_is_driven_again(tmp_path):
-    driven = drive_through_change(tmp_path, adapt=True)
-    assert driven.radius_m == pytest.approx(0.061 * (1.0 + GROWTH), rel=0.03)
+@pytest.mark.parametrize(("changes", "most"), [("wheel radius", 1.5), ("axial distance", 1.3)])
+def test_what_grows_on_the_way_is_learnt_and_the_circle_is_driven_again(tmp_path, changes, most):
+    driven = drive_through_change(tmp_path, changes, adapt=True)
+    assert driven.believed == pytest.approx(1.0 + GROWTH, rel=0.03)
     assert driven.published_s < 20.0
-    # Without adaptation it is about twice as much: `python -m tools.bench_adapt`.
-    assert driven.cost_after < 1.5 * driven.cost_before
+    # Without adaptation it is 1.6 and 1.35 times as much: `python -m tools.bench_adapt`, `disco-hw experiment adapt`.
+    assert driven.cost_after < most * driven.cost_before

@@ -5,7 +5,7 @@ import pytest
 
 from disco_hw.inference.density_network import Mixtures
 from disco_hw.inference.region import Region
-from tools.sharpness import _log_inside, paired
+from tools.sharpness import _least_squares, _log_inside, paired
 
 BOX = Region.box(np.full(3, -1.0), np.ones(3))
 
@@ -14,7 +14,7 @@ def draws(mean, sd, count=600):
     """Draws for `count` simulations of one Gaussian."""
     given = Mixtures(np.zeros((count, 1)), np.full((count, 1, 3), mean), np.full((count, 1, 3, 3), np.eye(3) / sd))
     rng = np.random.default_rng(0)
-    return lambda piece: Mixtures(given.log_weight[piece], given.mean[piece], given.factor[piece]).draw(400, rng)
+    return lambda piece: Mixtures(given.log_weight[piece], given.mean[piece], given.factor[piece]).draw(200, rng)
 
 
 @pytest.mark.parametrize(("mean", "share"), [(0.0, 1.0), (1.0, 0.5**3)])
@@ -25,7 +25,7 @@ def test_what_is_outside_the_region_is_found(mean, share):
 
 
 def test_a_posterior_that_is_all_outside_counts_as_one_draw_inside():
-    assert _log_inside(draws(9.0, 0.1), BOX, 600) == pytest.approx(np.full(600, np.log(1 / 400)))
+    assert _log_inside(draws(9.0, 0.1), BOX, 600) == pytest.approx(np.full(600, np.log(1 / 200)))
 
 
 def test_a_paired_difference_has_the_error_of_its_differences():
@@ -34,3 +34,10 @@ def test_a_paired_difference_has_the_error_of_its_differences():
     mean, error = paired(common + off, common)
     assert mean == pytest.approx(0.2)
     assert error == pytest.approx(0.1 / np.sqrt(1000), rel=0.01)
+
+
+def test_what_statistics_point_to_is_found_whatever_their_scale():
+    rng = np.random.default_rng(0)
+    unit = rng.uniform(-1.0, 1.0, (300, 3))
+    statistics = unit @ rng.standard_normal((3, 3)) * (1.0, 1e-3, 1e3) + 7.0
+    assert _least_squares(unit[:200], statistics[:200], statistics[200:]) == pytest.approx(unit[200:], abs=1e-9)
