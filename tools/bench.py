@@ -15,6 +15,7 @@ from rich.table import Table
 PARTS = (
     "bench_adapt",
     "bench_control",
+    "bench_control_path",
     "bench_estimation",
     "bench_inference",
     "bench_latency",

@@ -74,6 +74,7 @@ TASKS = {
     "circle": Circle(0.3, -0.2),
     "closed path": Path(Waypoints(EIGHT), 0.25),
     "open path": Path(Waypoints(EIGHT[:150]), 0.25),
+    "path of pieces": Path(Waypoints(np.array([[0.2, 0.1], [1.7, 0.2], [-0.6, 0.3], [0.2, 0.1]])), 0.3),
     "timed path": TimedPath(Waypoints(EIGHT, ANGLE - 1.0)),
 }
 # Commands are nudged up and down to see which samples sit on an edge (stiction, the next piece of a path), where single
@@ -160,7 +161,7 @@ def test_costs_and_update_with_all_effects(base, effects, values, commands, seed
 
 
 @pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("task", ["closed path", "open path", "timed path"])
+@pytest.mark.parametrize("task", ["closed path", "open path", "path of pieces", "timed path"])
 def test_costs_and_update_along_paths(task, seed):
     rng = np.random.default_rng(seed)
     base = rng.uniform((0.02, 0.2, -0.3), (0.12, 0.8, 0.4))

@@ -24,36 +24,57 @@ LOOK_AHEAD_M = 1.0
 LOST_M = 1.0
 SLOW_DOWN_S = 1.0
 FARTHEST_STEP_M = 0.5
+# Facing straight against the way costs as much as being so far off it.
+AGAINST_M = 0.6
+# Standing costs at least as much as being so far off the path, however slow it is to be driven.
+STANDING_M = 0.4
+# The last distance counts as much as it would over so much longer: turning in pushes the tracked point out at first.
+TERMINAL_S = 1.0
+# Where the way turns by more than SHARP from one TURN_M to the next, the robot stops, within REACHED_M, and turns.
+SHARP_RAD = math.radians(125.0)
+TURN_M = 0.15
+REACHED_M = 0.05
 
 
 class PathTerms(NamedTuple):
     """What the kernel needs of a path: a table of points a spacing apart.
 
-    `x`, `y` (m) and unit tangents `along_x`, `along_y`, each (M + 1,), the last entry repeating the first of a closed
-    path; `last`: largest position in the table, M; `closed`; `per_m`: entries a metre; `speed_m_s`; `speed_per_entry`:
-    progress speed of one entry in a step (m/s); `slow_per_entry`: wanted speed for each entry left of an open path.
+    `x`, `y` (m) and unit tangents `along_x`, `along_y`, each (M + 1,), or (2 M + 1,) of a closed path: twice round and
+    the first again; `first`, `last`: least and largest position in the table that can be reached; `endless`: whether
+    these two are the same place; `per_m`: entries a metre; `speed_m_s`; `speed_per_entry`: progress speed of one entry
+    in a step (m/s); `slow_per_entry`: wanted speed for each entry left; `speed_weight`: of missing speed;
+    `terminal_steps`: weight of the last distance.
     """
 
     x: Any
     y: Any
     along_x: Any
     along_y: Any
+    first: Any
     last: Any
-    closed: Any
+    endless: Any
     per_m: Any
     speed_m_s: Any
     speed_per_entry: Any
     slow_per_entry: Any
+    speed_weight: Any
+    terminal_steps: Any
 
 
 @dataclass(frozen=True, eq=False)
 class Path:
-    """Follow way-points by arc length: c = sqrt(e^2 + (progress - wanted)^2), e the distance to the path.
+    """Follow way-points by arc length: c = sqrt(e^2 + (progress - wanted)^2) + facing, e the distance to the path.
 
     The place on the path is carried along every rollout: each step moves it by the step's projection on the path's
-    direction, whose speed is the progress; so standing still or spinning costs the whole wanted speed, and a path may
-    cross itself. Wanted is `speed_m_s`, and less in the last second of an open path. The path is closed if its last
-    way-point is its first. Raises ValueError for way-points closer than the table's spacing throughout.
+    direction; so a path may cross itself. The speed of that is the progress, but no more than the forward speed; so
+    standing still or spinning costs the whole wanted speed, and driving backwards twice of it. Facing is AGAINST_M
+    times the part of the heading that is against the path's direction: backwards would else be the easier way, for it
+    puts the tracked point before the axle. Wanted is `speed_m_s`, and less in the last second of an open path.
+
+    Where the way turns sharply it is cut into pieces: rollouts end at the piece's end, the robot stops there, and then
+    turns to the next, which it could not find by sampling as nothing is gained before the turn is half done. The path
+    is closed if its last way-point is its first. Raises ValueError for way-points closer than the table's spacing
+    throughout.
     """
 
     waypoints: Waypoints
@@ -61,6 +82,8 @@ class Path:
     _table: Array = field(init=False, repr=False)
     _closed: bool = field(init=False, repr=False)
     _spacing_m: float = field(init=False, repr=False)
+    _bounds: Array = field(init=False, repr=False)
+    _columns: tuple[NDArray[np.float32], ...] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         places = self.waypoints.places_m
@@ -75,9 +98,16 @@ class Path:
         length = np.maximum(np.hypot(step_x, step_y), 1e-12)
         along_x = np.append(step_x / length, (step_x / length)[0 if closed else -1])
         along_y = np.append(step_y / length, (step_y / length)[0 if closed else -1])
-        object.__setattr__(self, "_table", np.column_stack([x, y, along_x, along_y]))
+        table, spacing = np.column_stack([x, y, along_x, along_y]), float(distance[-1]) / count
+        corners = sharp_turns(table[:, :2], closed, max(1, round(TURN_M / spacing)))
+        bounds = [*corners, *(corner + count for corner in corners[:1])] if closed else [0, *corners, count]
+        rows = np.concatenate([table[:-1], table[:-1], table[:1]]) if closed else table
+        columns = (rows - [x[0], y[0], 0.0, 0.0]).T.astype(np.float32)
+        object.__setattr__(self, "_table", table)
         object.__setattr__(self, "_closed", closed)
-        object.__setattr__(self, "_spacing_m", float(distance[-1]) / count)
+        object.__setattr__(self, "_spacing_m", spacing)
+        object.__setattr__(self, "_bounds", np.array(bounds, dtype=float))
+        object.__setattr__(self, "_columns", tuple(np.ascontiguousarray(column) for column in columns))
 
     @classmethod
     def from_config(cls, task: PathTask) -> Path:
@@ -101,6 +131,12 @@ class Path:
         return self._closed
 
     @property
+    def sharp_turns(self) -> tuple[int, ...]:
+        """Entries of the table at which the robot stops to turn."""
+        ends = slice(0, -1) if self._closed else slice(1, -1)
+        return tuple(self._bounds.astype(int)[ends].tolist())
+
+    @property
     def spacing_m(self) -> float:
         """Arc length between two entries of the table."""
         return self._spacing_m
@@ -110,23 +146,60 @@ class Path:
     ) -> tuple[Any, float]:
         """Terms for the kernel; the memory is the place on the path, in entries of the table."""
         f32 = np.float32
-        columns = [np.ascontiguousarray(c, dtype=f32) for c in (self._table - [*self.origin_m, 0.0, 0.0]).T]
-        spacing = self.spacing_m
-        last, speed = f32(len(self._table) - 1), f32(self.speed_m_s)
-        per_m, speed_per_entry, slow_per_entry = f32(1.0 / spacing), f32(spacing / step_s), f32(spacing / SLOW_DOWN_S)
-        x, y, along_x, along_y = columns
-        terms = PathTerms(x, y, along_x, along_y, last, self._closed, per_m, speed, speed_per_entry, slow_per_entry)
-        return terms, self.place(x_m, y_m, memory)
+        spacing, speed = self._spacing_m, self.speed_m_s
+        place, first, last = self.piece(self.place(x_m, y_m, memory))
+        x, y, along_x, along_y = self._columns
+        terms = PathTerms(
+            x,
+            y,
+            along_x,
+            along_y,
+            f32(first),
+            f32(last),
+            not self._bounds.size,
+            f32(1.0 / spacing),
+            f32(speed),
+            f32(spacing / step_s),
+            f32(spacing / SLOW_DOWN_S),
+            f32(max(1.0, STANDING_M / speed)),
+            f32(TERMINAL_S / step_s),
+        )
+        return terms, place
+
+    def piece(self, place: float) -> tuple[float, float, float]:
+        """The piece that a place is on: the place, not less than the piece's first entry; its first and last entry.
+
+        A piece of a closed path may go past the table's end, and so may the place. A path without sharp turns is one
+        piece; of a closed one, which has no end, the last entry is the first again.
+        """
+        bounds, count = self._bounds, len(self._table) - 1
+        if not bounds.size:
+            return place % count, 0.0, float(count)
+        if self._closed:
+            place = place % count
+            place += count if place < bounds[0] else 0.0
+        at = min(int(np.searchsorted(bounds, place, side="right")), bounds.size - 1)
+        return place, float(bounds[at - 1]), float(bounds[at])
 
     def place(self, x_m: float, y_m: float, before: float | None) -> float:
-        """Entry of the table nearest to a position: near the one before, or anywhere without one or off the path."""
-        last, spacing = len(self._table) - 1, self._spacing_m
+        """Entry of the table nearest to a position: near the one before, or anywhere without one or off the path.
+
+        Near the one before means on the same piece; at the end of a piece the next one begins.
+        """
+        count, spacing = len(self._table) - 1, self._spacing_m
         if before is not None:
-            window = np.arange(round(before - LOOK_BACK_M / spacing), round(before + LOOK_AHEAD_M / spacing) + 1)
-            window = np.unique(window % last if self._closed else np.clip(window, 0, last))
-            distance = np.hypot(self._table[window, 0] - x_m, self._table[window, 1] - y_m)
+            here, first, last = self.piece(before)
+            low, high = round(here - LOOK_BACK_M / spacing), round(here + LOOK_AHEAD_M / spacing)
+            if self._bounds.size:
+                low, high = max(low, int(first)), min(high, int(last))
+            window = np.arange(low, high + 1)
+            rows = self._table[window % count if self._closed else window]
+            distance = np.hypot(rows[:, 0] - x_m, rows[:, 1] - y_m)
             if distance.min() < LOST_M:
-                return float(window[np.argmin(distance)])
+                found = float(window[np.argmin(distance)])
+                if self._bounds.size and (self._closed or last < count) and (last - found) * spacing <= REACHED_M:
+                    found = last
+                return found % count if self._closed else found
         return float(np.argmin(np.hypot(self._table[:, 0] - x_m, self._table[:, 1] - y_m)))
 
     def instant_cost(self, time_s: float, x_m: float, y_m: float, forward_m_s: float) -> float:
@@ -139,15 +212,36 @@ class Path:
         return self.waypoints.places_m
 
 
+def sharp_turns(points: Array, closed: bool, reach: int) -> list[int]:
+    """Indices of points (M + 1, 2) where the way turns by more than SHARP_RAD from `reach` points to the next `reach`.
+
+    The sharpest of any that are within `reach` of one another; in rising order. The last point of a closed way is its
+    first, and not told again.
+    """
+    count = len(points) - 1
+    index = np.arange(count) if closed else np.arange(1, count)
+    before, after = index - reach, index + reach
+    before, after = (before % count, after % count) if closed else (np.maximum(before, 0), np.minimum(after, count))
+    came, goes = points[index] - points[before], points[after] - points[index]
+    alike = (came * goes).sum(axis=1)
+    sharp = alike < math.cos(SHARP_RAD) * np.hypot(*came.T) * np.hypot(*goes.T)
+    found: list[int] = []
+    # Where the way turns back, points before the turn look as sharp, but not over as long a way.
+    for at in np.flatnonzero(sharp)[np.argsort(alike[sharp], kind="stable")]:
+        apart = [abs(int(index[at]) - other) for other in found]
+        if all(min(gap, count - gap) > reach if closed else gap > reach for gap in apart):
+            found.append(int(index[at]))
+    return sorted(found)
+
+
 @scalar_function
 def _moved(task: Any, place: Any, by: Any) -> Any:
-    """Place on the path, `by` entries on: round a closed path, up to the ends of an open one."""
-    zero = cast_like(0.0, place)
+    """Place on the path, `by` entries on: round a closed path, else up to the ends."""
     on = place + by
-    if task.closed:
-        on = on + task.last if on < zero else on
+    if task.endless:
+        on = on + task.last if on < task.first else on
         return on - task.last if on >= task.last else on
-    return min(max(on, zero), task.last)
+    return min(max(on, task.first), task.last)
 
 
 @scalar_function
@@ -164,7 +258,7 @@ def _offset(task: Any, place: Any, x: Any, y: Any) -> Any:
 @scalar_function
 def _wanted(task: Any, place: Any) -> Any:
     """Wanted progress speed (m/s)."""
-    if task.closed:
+    if task.endless:
         return task.speed_m_s
     return min(task.speed_m_s, (task.last - place) * task.slow_per_entry)
 
@@ -197,8 +291,9 @@ def _stage_cost(
         along = min(max(off_x * along_x + off_y * along_y, -farthest), farthest) * task.per_m
         place = _moved(task, memory, along)
         off_x, off_y, along_x, along_y = _offset(task, place, x, y)
-        missing = _wanted(task, memory) - along * task.speed_per_entry
-        return quick_norm(quick_norm(off_x, off_y), missing), place
+        missing = task.speed_weight * (_wanted(task, memory) - min(along * task.speed_per_entry, forward))
+        against = max(-(cos_yaw * along_x + sin_yaw * along_y), cast_like(0.0, x))
+        return quick_norm(quick_norm(off_x, off_y), missing) + cast_like(AGAINST_M, x) * against, place
 
     return cost
 
@@ -207,7 +302,12 @@ def _stage_cost(
 def _terminal_cost(task: Any, memory: Any, x: Any, y: Any, cos_yaw: Any, sin_yaw: Any) -> Callable[..., Any] | None:
     if not _is_path(task):
         return None
-    return lambda task, memory, x, y, cos_yaw, sin_yaw: cast_like(0.0, x)
+
+    def cost(task: Any, memory: Any, x: Any, y: Any, cos_yaw: Any, sin_yaw: Any) -> Any:
+        off_x, off_y, _, _ = _offset(task, memory, x, y)
+        return task.terminal_steps * quick_norm(off_x, off_y)
+
+    return cost
 
 
 @specialise(has_memory)

@@ -9,26 +9,35 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from disco_hw.control.tasks.path import AGAINST_M
 from disco_hw.control.tasks.terms import has_memory, stage_cost, terminal_cost
 from disco_hw.model.jit import cast_like, quick_norm, specialise
 from disco_hw.waypoints import Waypoints
 
 Array = NDArray[np.float64]
+# A place that moves by less in a step has no direction.
+RESTS_M = 1e-6
 
 
 class TimedPathTerms(NamedTuple):
-    """Where to be at the end of each step: `x`, `y` (T,) m."""
+    """Where to be at the end of each step: `x`, `y` (T,) m; and which way that goes, `along_x`, `along_y` (T,).
+
+    The latter are of length one, or zero while the place rests.
+    """
 
     x: Any
     y: Any
+    along_x: Any
+    along_y: Any
 
 
 @dataclass(frozen=True, eq=False)
 class TimedPath:
-    """Follow way-points with times: c is the distance to where the robot should be now.
+    """Follow way-points with times: c is the distance to where the robot should be now, and facing.
 
-    The place moves on by itself, so nothing but following it is cheap. Before the first time it is the first way-point,
-    after the last the last one. Raises ValueError for way-points without times.
+    The place moves on by itself, so nothing but following it is cheap. Facing is as of `Path`, against the way that the
+    place goes, so that it is not followed backwards; while the place rests it is nothing. Before the first time the
+    place is the first way-point, after the last the last one. Raises ValueError for way-points without times.
     """
 
     waypoints: Waypoints
@@ -53,9 +62,13 @@ class TimedPath:
         self, time_s: float, x_m: float, y_m: float, memory: float | None, step_s: float, horizon: int
     ) -> tuple[Any, float]:
         """Terms for the kernel; there is no memory."""
-        x, y = self._where(time_s + step_s * np.arange(1, horizon + 1))
+        x, y = self._where(time_s + step_s * np.arange(horizon + 1))
+        along_x, along_y = np.diff(x), np.diff(y)
+        length = np.hypot(along_x, along_y)
+        length[length < RESTS_M] = np.inf
         origin_x, origin_y = self.origin_m
-        return TimedPathTerms((x - origin_x).astype(np.float32), (y - origin_y).astype(np.float32)), 0.0
+        columns = (x[1:] - origin_x, y[1:] - origin_y, along_x / length, along_y / length)
+        return TimedPathTerms(*(column.astype(np.float32) for column in columns)), 0.0
 
     def instant_cost(self, time_s: float, x_m: float, y_m: float, forward_m_s: float) -> float:
         """Distance to where the robot should be."""
@@ -90,7 +103,9 @@ def _stage_cost(
         sin_yaw: Any,
         forward: Any,
     ) -> Any:
-        return quick_norm(x - task.x[step], y - task.y[step]), memory
+        zero = cast_like(0.0, x)
+        against = max(-(cos_yaw * task.along_x[step] + sin_yaw * task.along_y[step]), zero)
+        return quick_norm(x - task.x[step], y - task.y[step]) + cast_like(AGAINST_M, x) * against, memory
 
     return cost
 

@@ -1,4 +1,4 @@
-"""A path by arc length: followed at its speed, through crossings, to its end; standing still is not optimal."""
+"""A path by arc length: followed forwards, at its speed, through crossings and sharp turns, to its end."""
 
 import math
 from pathlib import Path as FilePath
@@ -8,7 +8,7 @@ import pytest
 
 from disco_hw.control import Disco, DiscoSettings, PlannerState, WheelLimits
 from disco_hw.control.experiments.plant import Plant
-from disco_hw.control.tasks.path import Path
+from disco_hw.control.tasks.path import Path, sharp_turns
 from disco_hw.model import load_model
 from disco_hw.waypoints import Waypoints
 
@@ -61,6 +61,105 @@ def test_an_open_path_is_driven_to_its_end_and_no_further():
 def test_a_start_beside_the_path_joins_it():
     poses, _, _ = follow(Path(EIGHT, speed_m_s=0.25), 25.0, (0.5, 1.2, math.pi))
     assert distance_to(EIGHT, poses)[150:].mean() < 0.05
+
+
+ROUND = Waypoints(np.column_stack([np.sin(ANGLE), 1.0 - np.cos(ANGLE)]))
+# Wheel speeds (rad/s) of spinning at 1.6 rad/s about the point of rotation.
+SPIN = 1.6 * MEAN["axial_distance_m"] / MEAN["wheel_radius_m"] / 2.0
+
+
+@pytest.mark.parametrize("trap", ["standing", "spinning"])
+def test_the_planner_leaves_the_traps(trap):
+    task = Path(ROUND, speed_m_s=0.2)
+    plant = Plant(MEAN, (0.0, 0.0, 0.0), 0.1, 0.0, 1)
+    disco = Disco(MODEL, task, DiscoSettings(), WheelLimits(8.0, 20.0), 2)
+    if trap == "spinning":
+        plant.wheels = (-SPIN, SPIN)
+    # The trap is the plan that it starts from.
+    disco.plan(0, PlannerState(0, 0.0, 0.0, 0.0, *plant.wheels))
+    disco.optimiser.set_nominal(np.broadcast_to(plant.wheels, (50, 2)))
+    poses, places = [], []
+    for step in range(1, 151):
+        now_ns = step * 100_000_000
+        state = PlannerState(now_ns, plant.x_m, plant.y_m, plant.yaw_rad, *plant.wheels)
+        plant.advance(*disco.plan(now_ns, state).at(now_ns), 0.1)
+        poses.append((plant.x_m, plant.y_m, plant.yaw_rad))
+        places.append(disco._memory)
+    assert distance_to(ROUND, np.array(poses))[80:].mean() < 0.05
+    # 15 s at 0.2 m/s, less the way out of the trap.
+    assert places[-1] * task.spacing_m > 2.2
+
+
+def test_a_round_path_is_driven_forwards():
+    # The nearer to the path with the tracked point before the axle, which asks for driving backwards.
+    poses, speeds, places = follow(Path(ROUND, speed_m_s=0.25), 20.0, (0.0, 0.0, 0.0))
+    assert speeds.min() > -0.02
+    assert places[-1] * 0.02 > 4.0
+    assert distance_to(ROUND, poses)[20:].mean() < 0.03
+
+
+@pytest.mark.parametrize("yaw_rad", [math.pi, -2.0])
+def test_a_robot_that_faces_the_wrong_way_turns_round(yaw_rad):
+    poses, speeds, places = follow(Path(ROUND, speed_m_s=0.25), 15.0, (0.0, 0.0, yaw_rad))
+    assert speeds[60:].min() > -0.02
+    assert places[-1] * 0.02 > 2.0
+    assert distance_to(ROUND, poses)[60:].mean() < 0.03
+
+
+BACK = Waypoints(np.array([[0.0, 0.0], [1.2, 0.0], [0.0, 0.0]]))
+
+
+def test_a_path_that_turns_back_is_driven_forwards_both_ways():
+    poses, speeds, _ = follow(Path(BACK, speed_m_s=0.25), 20.0, (0.0, 0.0, 0.0))
+    x, heading = poses[:, 0], np.cos(poses[:, 2])
+    tip = int(np.argmax(x > 1.13))
+    assert x.max() > 1.13
+    assert speeds[:tip].min() > -0.02
+    # Back past the middle, looking where it goes.
+    back = tip + int(np.argmax(x[tip:] < 0.5))
+    assert back > tip
+    assert heading[back] < -0.9
+    assert speeds[back] > 0.1
+
+
+def test_sharp_turns_cut_a_path_into_pieces():
+    task = Path(BACK)
+    assert task.closed
+    assert task.sharp_turns == (0, 60)
+    assert task.piece(30.0) == (30.0, 0.0, 60.0)
+    assert task.piece(60.0) == (60.0, 60.0, 120.0)
+    # Where it is on the way back is not taken for where it was on the way there, nor the other way round.
+    assert task.place(1.0, 0.01, 49.0) == 50.0
+    assert task.place(1.0, 0.01, 71.0) == 70.0
+    # At the end of a piece the next begins, even if the end is not quite reached; the last is followed by the first.
+    assert task.place(1.16, 0.0, 57.0) == 60.0
+    assert task.place(0.03, 0.0, 117.0) == 0.0
+    assert Path(EIGHT).sharp_turns == Path(CORNER).sharp_turns == ()
+
+
+def test_a_piece_of_a_closed_path_goes_on_past_the_first_way_point():
+    # A drop, whose point is at the third way-point.
+    drop = Path(Waypoints(np.array([[0.0, 0.0], [0.3, 0.3], [1.5, 0.0], [0.3, -0.3], [0.0, 0.0]])))
+    (point,) = drop.sharp_turns
+    count = len(drop.table) - 1
+    np.testing.assert_allclose(drop.table[point, :2], [1.5, 0.0], atol=0.02)
+    assert drop.piece(0.0) == (count, point, point + count)
+    assert drop.piece(point + 1.0) == (point + 1.0, point, point + count)
+    assert drop.place(0.02, 0.02, count - 1.0) == 1.0
+
+
+def test_a_turn_is_sharp_by_its_angle_over_a_length():
+    def bent(angle_rad):
+        leg = 0.02 * np.arange(1, 31)[:, None]
+        there = np.concatenate([[[0.0, 0.0]], leg * [1.0, 0.0]])
+        return np.concatenate([there, there[-1] + leg * [math.cos(angle_rad), math.sin(angle_rad)]])
+
+    assert sharp_turns(bent(math.radians(120.0)), False, 7) == []
+    for degrees in (130.0, -150.0, 180.0):
+        assert sharp_turns(bent(math.radians(degrees)), False, 7) == [30]
+    # As sharp, but over half a metre.
+    around = np.linspace(0.0, np.pi, 40)
+    assert sharp_turns(0.25 * np.column_stack([np.sin(around), 1.0 - np.cos(around)]), False, 7) == []
 
 
 def test_instant_cost_and_picture():
