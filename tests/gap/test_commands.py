@@ -1,0 +1,29 @@
+"""What the command hands to the search."""
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+import disco_hw
+from disco_hw.config import load_robot_config
+from disco_hw.gap import commands
+
+
+class EnoughError(Exception):
+    """Ends the command where the search would begin."""
+
+
+def test_the_search_knows_what_the_robot_can_do(monkeypatch, tmp_path):
+    handed = SimpleNamespace()
+
+    def search(*_, **options):
+        vars(handed).update(options)
+        raise EnoughError
+
+    monkeypatch.setattr(commands, "load_drive", lambda *_: None)
+    monkeypatch.setattr(commands, "find_gap", search)
+    robot = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
+    with pytest.raises(EnoughError):
+        commands.gap([], robot, tmp_path)
+    assert handed.top_rad_s == load_robot_config(robot).robot.max_wheel_speed_rad_s
