@@ -6,7 +6,7 @@ import math
 import os
 import time
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 # Each process works alone on one log: a second thread for its small matrices would only be in another one's way.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -41,7 +41,7 @@ KINDS = {
     "weak": "a quarter of the realistic size",
     "outside": "an effect outside the list",
     "forms": "a named family in another form",
-    "circle": "one effect, on a steady circle only: named, or said to be invisible",
+    "circle": "one effect, on a steady circle only: named, alone or in a class, or said to be invisible",
     "asked": "the same robot, circle and then `--script separate`",
 }
 Hidden = dict[str, float | tuple[float, ...]]
@@ -78,6 +78,7 @@ class Result:
     errors: list[float]
     covered: list[bool]
     cpu_s: float
+    alike: list[str] = field(default_factory=list)
 
     @property
     def right(self) -> bool:
@@ -88,7 +89,8 @@ class Result:
         if self.kind == "forms":
             return bool(named & FORMS[self.hidden[0]]) and bool(self.residue or self.unnamed)
         if self.kind == "circle":
-            return named == hidden or (not named and self.hidden[0] in self.blind)
+            told = len(named) == 1 and hidden <= named | set(self.alike)
+            return told or (not named and self.hidden[0] in self.blind)
         return named == hidden and not self.unnamed
 
     @property
@@ -131,6 +133,7 @@ def work(job: Job) -> Result:
         [term.form for term in report.unnamed], len(report.residue),
         [spot.name for spot in report.blind_spots if spot.blind],
         mm["refitted"], mm["amended"], mm["floor"], errors, covered, cpu_s,
+        [name for effect in report.effects for name in effect.indistinguishable_from],
     )  # fmt: skip
 
 

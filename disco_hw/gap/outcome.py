@@ -126,6 +126,10 @@ class Outcome:
             parameter.name: estimated.by_name[f"{name}.{parameter.name}"] for parameter in REGISTRY[name].parameters
         }
         test = next((text for members, text in OUTSIDE_TESTS.items() if {name, *same} <= members and same), None)
+        rivals = tuple(other for other in found.selector.rivals(found.names, name) if other not in same)
+        if rivals:
+            test = "; ".join([*([test] if test else []), experiment_of(name)])
+            same = (*same, *rivals)
         return EffectFinding(name, REGISTRY[name].channel.value, values, _evidence(found, name), same, test)
 
     def _encoder_finding(self, wheels: Found, estimated: Estimates) -> EffectFinding:

@@ -23,6 +23,8 @@ _LOCAL_SEARCHES = 4
 _GAINED = 0.5
 _POOR = 0.5
 _LARGE_PART = 0.25
+# Half a difference of BIC of 6: positive evidence, no more.
+_CLEARLY = 3.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -230,8 +232,7 @@ class Selector:
                 if old in self.given:
                     continue
                 rest = (*accepted[:place], *accepted[place + 1 :])
-                worth = self.fit(rest).cost - self.fit(accepted).cost
-                worth -= 0.5 * CANDIDATES[old].parameters * np.log(self.channel.count)
+                worth = self._worth(rest, accepted, old)
                 for name in candidates_of(self.channel.layout):
                     if name not in accepted and self.promise(rest, name) - worth > score:
                         best, score = (
@@ -242,6 +243,18 @@ class Selector:
                 break
             accepted = best
         return accepted
+
+    def rivals(self, accepted: Names, name: str) -> Names:
+        """Effects that would do in place of an accepted one: not clearly worse, the price of parameters paid."""
+        rest = tuple(other for other in accepted if other != name)
+        worth = self._worth(rest, accepted, name) - _CLEARLY
+        others = (other for other in candidates_of(self.channel.layout) if other not in accepted)
+        return tuple(other for other in others if self.promise(rest, other) > worth)
+
+    def _worth(self, rest: Names, accepted: Names, name: str) -> float:
+        """Gain in nats of an accepted effect, less half its parameters' price."""
+        price = 0.5 * CANDIDATES[name].parameters * np.log(self.channel.count)
+        return float(self.fit(rest).cost - self.fit(accepted).cost - price)
 
     def _backward(self, accepted: Names) -> Names:
         """Drop effects that the others have made unnecessary."""

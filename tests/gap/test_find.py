@@ -10,6 +10,7 @@ import pytest
 from disco_hw.gap import find_gap
 from disco_hw.gap.find import missing_effects
 from disco_hw.gap.html import page
+from disco_hw.gap.selection import Selector
 from disco_hw.log.drive import DriveLog
 from disco_hw.log.errors import LogError
 from disco_hw.model import Model, load_model, save_model
@@ -78,6 +79,14 @@ def test_a_steady_circle_is_blind_to_what_it_cannot_show():
     assert not report.effects
     blind = {spot.name for spot in report.blind_spots if spot.blind}
     assert {"turn_slip", "side_slip", "wheel_radius_asymmetry", "heading_bias"} <= blind
+
+
+def test_what_would_do_as_well_is_reported_with_the_drive_that_decides(monkeypatch):
+    monkeypatch.setattr(Selector, "rivals", lambda self, accepted, name: ("command_delay",))
+    report = find_gap(simulated_drive({"motor_lag": 0.12}, seed=902, drive="circle"), MODEL)
+    (effect,) = report.effects
+    assert effect.indistinguishable_from == ("command_delay",)
+    assert effect.experiment.startswith("disco-hw drive ROBOT.toml --script starts")
 
 
 @pytest.mark.long

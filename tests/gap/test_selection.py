@@ -5,10 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from disco_hw.gap.channels import WheelChannel
 from disco_hw.gap.layout import BODY
-from disco_hw.gap.search import body_moves
+from disco_hw.gap.search import body_moves, wheel_moves
 from disco_hw.gap.selection import Selector, Thresholds
-from tests.gap.synthetic import body_channel
+from disco_hw.gap.wheel_noise import WheelNoise
+from tests.gap.synthetic import GEOMETRY, body_channel, line_of
 
 
 def selector(given=(), start=None, moves_m=0.0005, **effects):
@@ -68,3 +70,22 @@ def test_a_change_is_found_when_it_happens():
     names = found.select()
     assert names == ("surface_change",)
     assert found.fit(names).vector[BODY.place["surface_change.time_s"]] == pytest.approx(40.0, abs=2.0)
+
+
+def wheels_late(commands_rad_s, late_cells=20):
+    """A search of wheels that follow these commands (M,) 0.2 s late."""
+    commands = np.repeat(commands_rad_s[:, None], 2, axis=1)
+    followed = np.concatenate([np.repeat(commands[:1], late_cells, axis=0), commands[:-late_cells]])
+    geometry = np.array(GEOMETRY)
+    line = replace(line_of(followed), command_rad_s=commands)
+    channel = WheelChannel.build(line, WheelNoise(), geometry)
+    return Selector(channel, wheel_moves(channel, geometry))
+
+
+def test_a_slow_drive_cannot_tell_lag_from_delay_and_says_so():
+    t_s = 0.01 * np.arange(6000)
+    slow = wheels_late(3.0 + 2.0 * np.sin(2.0 * np.pi * t_s / 20.0))
+    assert "motor_lag" in slow.rivals(("command_delay",), "command_delay")
+    assert "command_delay" in slow.rivals(("motor_lag",), "motor_lag")
+    steps = wheels_late(np.where(np.floor(t_s / 2.0) % 2 == 0, 4.0, -3.0))
+    assert steps.rivals(("command_delay",), "command_delay") == ()

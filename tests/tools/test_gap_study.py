@@ -52,6 +52,8 @@ def test_what_counts_as_right_depends_on_the_kind():
     assert result("circle", ("turn_slip",), (), blind=["turn_slip"]).right
     assert not result("circle", ("turn_slip",), (), blind=["slope"]).right
     assert not result("circle", ("turn_slip",), ("slope",), blind=["turn_slip"]).right
+    assert result("circle", ("motor_lag",), ("command_delay",), alike=["motor_lag"]).right
+    assert not result("circle", ("motor_lag",), ("command_delay",), alike=["deadband"]).right
 
 
 def test_a_study_goes_on_where_it_was_broken_off(tmp_path, monkeypatch):
