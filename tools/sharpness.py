@@ -20,11 +20,11 @@ from tools.infer_study import config, logged, plant
 
 Array = NDArray[np.float64]
 
-TESTS = 2000
+TESTS = 4000
 CENTRAL = 0.5
 PEERS = ("nsf", "mdn")
-_DRAWS = 200
-_PIECE = 500
+_DRAWS = 400
+_PIECE = 250
 
 
 def scores(result: Inference, peers: tuple[str, ...] = PEERS, tests: int = TESTS) -> dict[str, Array]:

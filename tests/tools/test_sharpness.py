@@ -14,7 +14,7 @@ def draws(mean, sd, count=600):
     """Draws for `count` simulations of one Gaussian."""
     given = Mixtures(np.zeros((count, 1)), np.full((count, 1, 3), mean), np.full((count, 1, 3, 3), np.eye(3) / sd))
     rng = np.random.default_rng(0)
-    return lambda piece: Mixtures(given.log_weight[piece], given.mean[piece], given.factor[piece]).draw(200, rng)
+    return lambda piece: Mixtures(given.log_weight[piece], given.mean[piece], given.factor[piece]).draw(400, rng)
 
 
 @pytest.mark.parametrize(("mean", "share"), [(0.0, 1.0), (1.0, 0.5**3)])
@@ -25,7 +25,7 @@ def test_what_is_outside_the_region_is_found(mean, share):
 
 
 def test_a_posterior_that_is_all_outside_counts_as_one_draw_inside():
-    assert _log_inside(draws(9.0, 0.1), BOX, 600) == pytest.approx(np.full(600, np.log(1 / 200)))
+    assert _log_inside(draws(9.0, 0.1), BOX, 600) == pytest.approx(np.full(600, np.log(1 / 400)))
 
 
 def test_a_paired_difference_has_the_error_of_its_differences():
