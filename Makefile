@@ -44,13 +44,21 @@ test: $(STAMP) chromium
 test-long: $(STAMP) chromium
 	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal -m long
 
-# The peers that our figures stand beside; nothing else needs them.
-$(VENV)/.peers: $(STAMP)
-	PIP_CONSTRAINT=constraints.txt $(BIN)/python -m pip install --disable-pip-version-check --quiet -e '.[bench]'
+# The peers that our figures stand beside, and nothing else needs: in an environment of their own, on top of ours.
+PEERS := .venv-bench
+$(PEERS)/.installed: $(STAMP)
+	$(BIN)/python -m venv $(PEERS)
+	ours=$$($(BIN)/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))') && \
+		theirs=$$($(PEERS)/bin/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))') && \
+		echo "import site; site.addsitedir('$$ours')" > "$$theirs/ours.pth"
+	PIP_CONSTRAINT=constraints.txt $(PEERS)/bin/python -m pip install --disable-pip-version-check --quiet \
+		$$($(BIN)/python -c 'import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["project"]["optional-dependencies"]["bench"])')
 	@touch $@
 
-bench: $(VENV)/.peers
-	$(BIN)/python -m tools.bench
+# PARTS names some of tools/bench_*.py; without it all of them run.
+PARTS ?=
+bench: $(PEERS)/.installed
+	$(PEERS)/bin/python -m tools.bench $(PARTS)
 
 gap-study: $(STAMP)
 	$(BIN)/python -m tools.gap_study
@@ -76,4 +84,4 @@ socketcan-test: $(STAMP)
 	$(BIN)/python -m tools.socketcan_test
 
 clean:
-	rm -rf $(VENV) build *.egg-info firmware_protocol/_firmware*
+	rm -rf $(VENV) $(PEERS) build *.egg-info firmware_protocol/_firmware*

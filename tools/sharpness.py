@@ -1,6 +1,6 @@
 """Log scores of `infer`'s posterior and of sbi's NPE, trained on the same simulations, paired on the same fresh ones.
 
-python -m tools.sharpness --drive circle --robots 8        (make .venv/.peers installs sbi)
+.venv-bench/bin/python -m tools.sharpness --drive circle --robots 8        (make .venv-bench/.installed installs sbi)
 """
 
 from __future__ import annotations

@@ -73,7 +73,7 @@ class DaemonCore:
         self._preflight_done = False
         self._generation = 0
         self._link_up = False
-        self._planner_failing = False
+        self._planner_failing = self._planner_collapsed = False
         self._state = supervisor.state
         self.entered: dict[str, int] = {}
         self._task_changed = False
@@ -185,12 +185,19 @@ class DaemonCore:
         return [records_of_tick.frame_out(now_ns, frame, self.transport.send(frame, now_ns)) for frame in outgoing]
 
     def _planner_events(self, result: Tick) -> tuple[str, ...]:
-        """Say when the planner begins and ceases to fail, not in every tick."""
+        """Say when the planner begins and ceases to fail, or to plan from too few samples, not in every tick."""
+        told: list[str] = []
         failing = result.planner_failure is not None
-        changed, self._planner_failing = failing != self._planner_failing, failing
-        if not changed:
-            return ()
-        return (f"planner: {result.planner_failure}",) if failing else ("planner: recovered",)
+        if failing != self._planner_failing:
+            told.append(f"planner: {result.planner_failure}" if failing else "planner: recovered")
+        self._planner_failing = failing
+        if result.plan is not None:
+            found = result.plan.diagnostics
+            if found.collapsed != self._planner_collapsed:
+                few = f"planner: plans hang on {found.ess:.1f} effective samples, too few to be trusted"
+                told.append(few if found.collapsed else "planner: enough effective samples again")
+            self._planner_collapsed = found.collapsed
+        return tuple(told)
 
     def _state_change(self, now_ns: int, output: Output) -> list[records.Record]:
         """The record of a change of state, in the tick in which it happens."""

@@ -2,17 +2,25 @@
 
 from __future__ import annotations
 
+from pathlib import Path as FilePath
+
+import msgspec
 import numpy as np
 import pytest
 
+import disco_hw
 from disco_hw.config import CircleTask
 from disco_hw.control import NoValidControl
+from disco_hw.daemon.assembly import make_planner
 from disco_hw.daemon.states import State
 from disco_hw.daemon.supervisor import UserRequest
 from disco_hw.log import records
 from disco_hw.metrics import Path, circle_figures
 from disco_hw.pipeline import Source
+from disco_hw.robot_setup import load_setup
 from tests.daemon.simulated import simulated_stack
+
+ROBOT = FilePath(disco_hw.__file__).parent / "robots" / "wombot.toml"
 
 
 @pytest.fixture(scope="module")
@@ -105,13 +113,7 @@ class Moody:
 
 
 def test_a_planner_that_gives_up_is_followed_on_its_tail_then_the_wheels_ramp_down():
-    from pathlib import Path as FilePath
-
-    import disco_hw
-    from disco_hw.daemon.assembly import make_planner
-    from disco_hw.robot_setup import load_setup
-
-    setup = load_setup(FilePath(disco_hw.__file__).parent / "robots" / "wombot.toml")
+    setup = load_setup(ROBOT)
     stack = simulated_stack(Moody(make_planner(setup.config, setup.model), 4_000_000_000))
     stack.run(1.5)
     stack.run(0.5, UserRequest.ARM)
@@ -125,6 +127,36 @@ def test_a_planner_that_gives_up_is_followed_on_its_tail_then_the_wheels_ramp_do
     assert ticks[-1].output.state is State.ARMED
     told = [text for tick in ticks for text in tick.events if text.startswith("planner")]
     assert told == ["planner: planted"]
+
+
+class Collapsing:
+    """A planner whose plans between two times hang on one sample, as they say."""
+
+    def __init__(self, inner, first_ns: int, last_ns: int) -> None:
+        self.inner, self.first_ns, self.last_ns = inner, first_ns, last_ns
+
+    def plan(self, now_ns, state):
+        plan = self.inner.plan(now_ns, state)
+        if not self.first_ns <= now_ns <= self.last_ns:
+            return plan
+        few = msgspec.structs.replace(plan.diagnostics, ess=1.2, collapsed=True)
+        return msgspec.structs.replace(plan, diagnostics=few)
+
+    def reset(self) -> None:
+        self.inner.reset()
+
+
+def test_plans_that_hang_on_too_few_samples_are_told_once():
+    setup = load_setup(ROBOT)
+    stack = simulated_stack(Collapsing(make_planner(setup.config, setup.model), 2_500_000_000, 3_000_000_000))
+    stack.run(1.5)
+    stack.run(0.5, UserRequest.ARM)
+    ticks = stack.run(2.0, UserRequest.START)
+    told = [text for tick in ticks for text in tick.events if text.startswith("planner")]
+    assert told == [
+        "planner: plans hang on 1.2 effective samples, too few to be trusted",
+        "planner: enough effective samples again",
+    ]
 
 
 def test_runs_with_one_seed_are_equal_bit_for_bit():

@@ -1,0 +1,107 @@
+"""The circle experiment: its figures from runs that are known, its plants, its files, a short drive of each curve."""
+
+import csv
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from disco_hw.control import Circle
+from disco_hw.control.experiments.circle import CURVES, CircleOptions, CircleResult, Run, drive, plants, run_circle
+from disco_hw.control.settings import ROTATION
+from disco_hw.errors import InputError
+from disco_hw.model import Gaussian, load_model
+
+MODEL = load_model(Path(__file__).parents[3] / "disco_hw/robots/wombot_model.toml")
+MEAN = {"wheel_radius_m": 0.061, "axial_distance_m": 0.415, "x_icr_m": 0.238}
+
+
+def standing(place, count=40, commands=None):
+    """A run that stays in one place."""
+    commands = np.zeros((count, 2)) if commands is None else commands
+    return Run(np.tile([*place, 0.0], (count, 1)), np.zeros(count), commands)
+
+
+def test_figures_of_runs_that_are_known():
+    # One robot stands on the edge, c = s0; one 0.15 m inside it, c = hypot(0.15, 0.2); its left command saws.
+    saw = np.column_stack([np.arange(40) % 2 * 0.1 * ROTATION, np.zeros(40)])
+    runs = {"one": [standing((0.75, 0.0)), standing((0.0, 0.6), commands=saw)]}
+    result = CircleResult(CircleOptions(seeds=2, duration_s=4.0), Circle(), "default", runs)
+    (row,) = result.rows()
+    assert row["mean_cost"] == row["steady_cost"] == pytest.approx(0.225)
+    assert row["std_over_seeds"] == pytest.approx(0.05 / math.sqrt(2.0))
+    assert row["command_change_rot_s"] == pytest.approx(0.1 / 4.0)
+    fast = CircleResult(CircleOptions(seeds=2, rate_hz=20.0), Circle(), "default", runs)
+    assert fast.rows()[0]["command_change_rot_s"] == pytest.approx(0.0)
+
+
+def test_only_the_last_half_is_steady():
+    run = standing((0.75, 0.0))
+    run.forward_m_s[20:] = 0.2
+    result = CircleResult(CircleOptions(seeds=1), Circle(), "default", {"one": [run]})
+    (row,) = result.rows()
+    assert (row["mean_cost"], row["steady_cost"]) == pytest.approx((0.1, 0.0))
+    assert math.isnan(row["std_over_seeds"])
+
+
+def test_plants_are_drawn_from_the_posterior():
+    drawn = np.array([[plant[name] for name in MODEL.belief.names] for plant in plants(MODEL, 4000)])
+    np.testing.assert_allclose(drawn.mean(axis=0), MODEL.belief.mean(), atol=1e-3)
+    np.testing.assert_allclose(np.cov(drawn.T), MODEL.belief.covariance(), atol=1.5e-5)
+    assert plants(MODEL, 3) == plants(MODEL, 5)[:3]
+
+
+def test_a_robot_that_is_told_nothing_stands_at_the_cost_of_standing():
+    asked = []
+
+    def command(now_ns, state):
+        asked.append((now_ns, state.t_ns, len(state.sent)))
+        return 0.0, 0.0
+
+    run = drive(command, MEAN, CircleOptions(duration_s=3.0), 1)
+    np.testing.assert_array_equal(run.poses, np.tile([0.75, 0.0, math.pi / 2], (30, 1)))
+    assert [now_ns for now_ns, _, _ in asked] == [t_ns for _, t_ns, _ in asked] == list(range(0, 3 * 10**9, 10**8))
+    assert [count for _, _, count in asked] == [min(step, 20) for step in range(30)]
+    assert Circle().instant_cost(0.0, *run.poses[-1, :2], run.forward_m_s[-1]) == pytest.approx(0.2)
+
+
+@pytest.fixture(scope="module")
+def short():
+    told = []
+    return run_circle(MODEL, "default", CircleOptions(seeds=8, duration_s=6.0), told.append), told
+
+
+def test_every_curve_is_driven_and_told(short):
+    result, told = short
+    assert tuple(result.runs) == CURVES
+    assert [line.split(":")[0] for line in told] == list(CURVES)
+    cost = {row["controller"]: row["steady_cost"] for row in result.rows()}
+    # Who knows the robot is on the way after six seconds from rest. The truth is worth something over many plants, not
+    # on one that happens to be the posterior's mean.
+    assert cost["true parameters"] < 0.03
+    assert cost["true parameters"] < cost["posterior"] < cost["point estimate"] < cost["prior"]
+
+
+def test_table_csv_and_picture(short, tmp_path):
+    result, _ = short
+    table = result.table()
+    for said in (*CURVES, "lag_s = 0.1", "wheel_noise = 0.05", "largest_rot_s = 1", "rate_hz = 10", "mode default"):
+        assert said in table
+    result.write_csv(tmp_path / "circle.csv")
+    rows = list(csv.DictReader((tmp_path / "circle.csv").open()))
+    assert list(rows[0]) == ["t_s", *CURVES]
+    assert (len(rows), rows[-1]["t_s"]) == (60, "6.000")
+    # The running mean of the instant cost ends at the mean cost.
+    for row in result.rows():
+        assert float(rows[-1][row["controller"]]) == pytest.approx(row["mean_cost"], rel=1e-5)
+    result.write_png(tmp_path / "circle.png")
+    assert (tmp_path / "circle.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_a_model_without_the_posterior_is_refused():
+    one = Gaussian(("wheel_radius_m",), np.array([0.06]), np.array([[1e-5]]))
+    for belief in (None, one):
+        with pytest.raises(InputError, match="no belief over wheel radius, axial distance and x_icr"):
+            run_circle(replace(MODEL, belief=belief))

@@ -1,0 +1,77 @@
+"""The pendulum experiment: its figures from costs that are known, its files, and the paper's ordering."""
+
+import csv
+import math
+
+import numpy as np
+import pytest
+
+from disco_hw.control import pendulum
+from disco_hw.control.experiments.pendulum import (
+    CURVES,
+    POSTERIOR,
+    PRIOR,
+    PendulumOptions,
+    PendulumResult,
+    run_pendulum,
+)
+
+
+def test_the_experiment_is_the_papers():
+    assert CURVES == ("true parameters", "UT, prior", "UT, posterior", "MC, prior", "MC, posterior")
+    np.testing.assert_allclose(POSTERIOR.mean(), [0.8918, 0.8985])
+    np.testing.assert_allclose(np.diag(POSTERIOR.covariance()), [0.0093, 0.0027])
+    np.testing.assert_allclose(PRIOR.mean(), [2.55, 2.55])
+    sampler = pendulum.PAPER_SAMPLER
+    assert (sampler.samples, sampler.horizon, sampler.temperature, sampler.noise_std) == (500, 30, 10.0, 1.0)
+
+
+def test_figures_of_costs_that_are_known():
+    costs = {"one": np.array([[4.0, 4.0, 4.0, 0.0], [8.0, 8.0, 8.0, 8.0]])}
+    (row,) = PendulumResult(PendulumOptions(seeds=2, steps=4), costs).rows()
+    assert row["mean_cost"] == pytest.approx(5.5)
+    assert row["std_over_seeds"] == pytest.approx(5.0 / math.sqrt(2.0))
+    assert row["standard_error"] == pytest.approx(2.5)
+    assert row["mean_cost_last_quarter"] == pytest.approx(4.0)
+
+
+@pytest.fixture(scope="module")
+def swings():
+    told = []
+    return run_pendulum(PendulumOptions(seeds=3, steps=200), told.append), told
+
+
+def test_the_papers_ordering(swings):
+    result, told = swings
+    assert [line.rsplit(":", 1)[0] for line in told] == list(CURVES)
+    mean = {name: costs.mean() for name, costs in result.costs.items()}
+    for posterior in ("UT, posterior", "MC, posterior"):
+        assert mean[posterior] < 0.5 * min(mean["UT, prior"], mean["MC, prior"])
+    # Three seeds do not tell the two apart to better than a few per cent.
+    assert mean["UT, posterior"] < 1.05 * mean["true parameters"]
+    # It swings up, and stays up.
+    assert all(result.costs[name][:, -50:].mean() < 1.0 for name in ("true parameters", "UT, posterior"))
+    assert result.costs["UT, prior"][:, 0].min() > 150.0
+
+
+def test_seeds_repeat(swings):
+    result, _ = swings
+    again = run_pendulum(PendulumOptions(seeds=1, steps=15))
+    for name in CURVES:
+        np.testing.assert_array_equal(again.costs[name], result.costs[name][:1, :15])
+        assert not np.array_equal(result.costs[name][0], result.costs[name][1])
+
+
+def test_table_csv_and_picture(swings, tmp_path):
+    result, _ = swings
+    for said in (*CURVES, "3 seeds, 200 steps of 0.05 s"):
+        assert said in result.table()
+    result.write_csv(tmp_path / "pendulum.csv")
+    rows = list(csv.DictReader((tmp_path / "pendulum.csv").open()))
+    assert len(rows) == 200
+    assert rows[-1]["t_s"] == "10.00"
+    one = result.costs["UT, posterior"][:, 7]
+    assert float(rows[7]["UT, posterior: mean"]) == pytest.approx(one.mean(), rel=1e-5)
+    assert float(rows[7]["UT, posterior: std"]) == pytest.approx(one.std(), rel=1e-4)
+    result.write_png(tmp_path / "pendulum.png")
+    assert (tmp_path / "pendulum.png").read_bytes()[:4] == b"\x89PNG"
