@@ -51,7 +51,7 @@ def paths() -> dict[str, Points]:
     }
 
 
-def run(seeds: int = 5, duration_s: float = 40.0, speed_m_s: float = 0.25) -> dict[str, float]:
+def run(seeds: int = 3, duration_s: float = 40.0, speed_m_s: float = 0.25) -> dict[str, float]:
     """Every path from facing the way and against it: see `followed`."""
     model = load_model(ROBOTS / "wombot_model.toml")
     figures: dict[str, float] = {}
