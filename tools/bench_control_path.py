@@ -23,6 +23,7 @@ from disco_hw.control.tasks.path import Path
 from disco_hw.course import course_of
 from disco_hw.model import Model, load_model
 from disco_hw.waypoints import load_waypoints
+from tools.step_times import summary, times_ms, undisturbed
 
 ROBOTS = FilePath(disco_hw.__file__).parent / "robots"
 LIMITS = WheelLimits(8.0, 20.0)
@@ -52,15 +53,27 @@ def paths() -> dict[str, Points]:
 
 
 def run(seeds: int = 3, duration_s: float = 40.0, speed_m_s: float = 0.25) -> dict[str, float]:
-    """Every path from facing the way and against it: see `followed`."""
+    """Time of a plan; every path from facing the way and against it: see `followed`."""
     model = load_model(ROBOTS / "wombot_model.toml")
-    figures: dict[str, float] = {}
+    figures = plan_times(model, speed_m_s)
     for name, points in paths().items():
         task = PathTask(path=f"{name}.csv", speed_m_s=speed_m_s, points=points)
         for facing in TURNED_RAD:
             drives = [drive(model, task, theta, facing, s, duration_s) for s, theta in enumerate(plants(model, seeds))]
             figures |= {f"control.path.{name}.{facing}.{key}": v for key, v in followed(task, drives, facing).items()}
     return figures
+
+
+def plan_times(model: Model, speed_m_s: float, steps: int = 500) -> dict[str, float]:
+    """Milliseconds of a plan along the eight at the paper's size, as the robot moves on."""
+    path = Path.from_config(PathTask(path="eight.csv", speed_m_s=speed_m_s, points=paths()["eight"]))
+    x_m, y_m, *_ = path.table[0].tolist()
+    planner = Disco(model, path, DiscoSettings(), LIMITS)
+    with undisturbed():
+        return summary(
+            "control.path.plan_ms",
+            times_ms(lambda n: planner.plan(n * 10**8, PlannerState(n * 10**8, x_m, y_m, 0.8, 3.0, 3.0)), steps),
+        )
 
 
 def followed(task: PathTask, drives: list[Array], facing: str) -> dict[str, float]:
