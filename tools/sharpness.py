@@ -104,35 +104,41 @@ def paired(one: Array, other: Array) -> tuple[float, float]:
     return float(difference.mean()), float(difference.std(ddof=1) / np.sqrt(difference.size))
 
 
+def compared(found: dict[str, Array], peer: str) -> dict[str, tuple[float, float]]:
+    """Mean difference of the log scores, ours less a peer's, with its standard error: in the three ways of looking."""
+    central = found["central"] > 0.0
+    ours, theirs = found["ours_raw"], found[f"{peer}_raw"]
+    return {
+        f"as posteriors, {peer}": paired(found["ours"], found[peer]),
+        f"as they come out, {peer}": paired(ours, theirs),
+        f"the same, near the log, {peer}": paired(ours[central], theirs[central]),
+    }
+
+
+def summary(means: dict[str, list[float]]) -> list[str]:
+    """A line for each comparison of several robots."""
+    lines = []
+    for name, values in means.items():
+        error = np.std(values, ddof=1) / np.sqrt(len(values)) if len(values) > 1 else float("nan")
+        span = f"{min(values):+.4f} to {max(values):+.4f}"
+        lines.append(f"{name:28} {np.mean(values):+.4f} +- {error:.4f} over {len(values)} robots, {span}")
+    return lines
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n", maxsplit=1)[0])
     parser.add_argument("--drive", default="circle")
     parser.add_argument("--robots", type=int, default=8)
     parser.add_argument("--first", type=int, default=1, help="seed of the first robot")
     options = parser.parse_args()
-    seeds = range(options.first, options.first + options.robots)
     means: dict[str, list[float]] = {}
-    for seed in seeds:
+    for seed in range(options.first, options.first + options.robots):
         found = scores(infer(logged(plant(seed), options.drive, seed), config(), InferOptions(seed=seed)))
-        central = found["central"] > 0.0
         for peer in PEERS:
-            rows = {
-                f"as posteriors, {peer}": paired(found["ours"], found[peer]),
-                f"away from the edges, {peer}": paired(found["ours"][central], found[peer][central]),
-                f"as they come out, {peer}": paired(found["ours_raw"], found[f"{peer}_raw"]),
-            }
-            for name, (mean, error) in rows.items():
+            for name, (mean, error) in compared(found, peer).items():
                 means.setdefault(name, []).append(mean)
                 print(f"robot {seed}: {name}: ours - sbi's {mean:+.4f} +- {error:.4f}", flush=True)
-        print(
-            f"robot {seed}: ours {found['ours'].mean():.4f}, away from the edges {np.count_nonzero(central)} of {TESTS}"
-        )
-    print(f"{options.drive}, {len(seeds)} robots: ours {np.mean(means.pop('ours')):.4f} nats; ours - sbi's:")
-    for name, values in means.items():
-        error = np.std(values, ddof=1) / np.sqrt(len(values)) if len(values) > 1 else float("nan")
-        print(
-            f"{name:28} {np.mean(values):+.4f} +- {error:.4f}, robot by robot {min(values):+.4f} to {max(values):+.4f}"
-        )
+    print("\n".join(summary(means)))
     return 0
 
 
