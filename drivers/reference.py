@@ -88,6 +88,8 @@ class ReferenceDriver:
         self._time_sequence = 0
         self._time_requests: dict[int, int] = {}
         self._commands_sent = 0
+        self._clock_errors_told: int | None = None
+        self._clock_errors = 0
         self._last_heard_ns = 0
         self._events: list[str] = []
         self._foreign_told = False
@@ -152,6 +154,7 @@ class ReferenceDriver:
             implausible_values=self._telemetry.implausible_values,
             commands_sent=self._commands_sent,
             sessions=self._arming.sessions,
+            robot_clock_errors=self._clock_errors,
         )
 
     @property
@@ -348,6 +351,14 @@ class ReferenceDriver:
         bits = int(values["blockers"])
         blockers = tuple(name for bit, name in self._blocker_bits.items() if bits & bit)
         self._arming.take_session(int(values["challenge"]), int(values["session"]), blockers, received_ns)
+        self._take_clock_errors(int(values["clock_error_count"]))
+
+    def _take_clock_errors(self, told: int) -> None:
+        before, self._clock_errors_told = self._clock_errors_told, told
+        # A smaller count is that of a robot that has restarted meanwhile.
+        if before is not None and told > before:
+            self._clock_errors += told - before
+            self._events.append("the robot's controller found its clock set back and goes on with a time of its own")
 
     def _take_time(self, decoded: Decoded, received_ns: int) -> None:
         sent_ns = self._time_requests.pop(int(decoded.values["sequence"]), None)
@@ -379,6 +390,7 @@ class ReferenceDriver:
         self._time_requests.clear()
         self._status = None
         self._host_accepted = False
+        self._clock_errors_told = None
         self._foreign_told = False
 
     def _new_handshake(self) -> Handshake:

@@ -249,6 +249,7 @@ class DriverStats:
     implausible_values: int = 0
     commands_sent: int = 0
     sessions: int = 0
+    robot_clock_errors: int = 0
 
 
 class Driver(Protocol):

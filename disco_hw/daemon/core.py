@@ -13,6 +13,7 @@ from disco_hw.config import RobotConfig, RobotTask
 from disco_hw.control import task_of_robot
 from disco_hw.course import course_of
 from disco_hw.daemon import records_of_tick
+from disco_hw.daemon.plausibility import Plausibility
 from disco_hw.daemon.progress import progress_of
 from disco_hw.daemon.supervisor import Inputs, Output, Reply, Supervisor, UserRequest
 from disco_hw.daemon.task_change import record_of
@@ -62,6 +63,7 @@ class DaemonCore:
         self.pipeline = pipeline
         self.recorder = recorder
         self.adaptation = adaptation or NoAdaptation()
+        self.plausibility = Plausibility()
         self.task, self.course = config.task, course_of(config.task)
         self.progress = progress_of(config.task)
         self.newest_wheels: WheelSample | None = None
@@ -108,7 +110,8 @@ class DaemonCore:
         command = self._command(output, result)
         sent = self._send(now_ns, output, command)
         mark("send")
-        events = (*readings.events, *output.events, *learnt.events, *self._planner_events(result))
+        doubts = self.plausibility.step(now_ns, readings.wheels, readings.poses, readings.power, command)
+        events = (*readings.events, *output.events, *learnt.events, *self._planner_events(result), *doubts)
         self._follow_progress(output, result)
         self.recorder.put(
             now_ns,

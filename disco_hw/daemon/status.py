@@ -66,6 +66,7 @@ def status(core: DaemonCore, loop: dict[str, Any], recorder: RecorderStats) -> d
         "transport": asdict(core.transport.stats),
         "driver": asdict(core.driver.stats),
         "fusion": asdict(core.pipeline.fusion.stats),
+        "plausibility": asdict(core.plausibility.stats),
         "recorder": asdict(recorder),
         "adaptation": core.adaptation.status(),
     }
@@ -84,6 +85,7 @@ def counters(
         transport=asdict(core.transport.stats),
         driver=asdict(core.driver.stats),
         fusion=asdict(core.pipeline.fusion.stats),
+        plausibility=asdict(core.plausibility.stats),
         recorder={name: value for name, value in asdict(recorder).items() if type(value) is int},
         loop={"ticks": loop.ticks, "overruns": loop.overruns, "skipped": loop.skipped_periods, "stolen_ms": stolen_ms},
         adaptation=core.adaptation.counts(),

@@ -149,7 +149,8 @@ class Event(msgspec.Struct, frozen=True, gc=False):
 class Counters(msgspec.Struct, frozen=True, gc=False):
     """Every counter of the stack, about once a second: totals since the start by name, grouped by who counts.
 
-    `entered`: how often the daemon has come into each of its states.
+    `entered`: how often the daemon has come into each of its states. `plausibility`: what the robot did although it was
+    told otherwise, and the rest of the stack tolerated.
     """
 
     t_ns: int
@@ -160,6 +161,7 @@ class Counters(msgspec.Struct, frozen=True, gc=False):
     loop: dict[str, int] = {}
     adaptation: dict[str, int] = {}
     entered: dict[str, int] = {}
+    plausibility: dict[str, int] = {}
 
 
 class BeliefChange(msgspec.Struct, frozen=True, gc=False):

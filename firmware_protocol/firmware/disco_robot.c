@@ -1922,6 +1922,7 @@ int disco_robot_session_state_pack(
     dst_p[4] |= pack_left_shift_u8(src_p->session, 0u, 0xffu);
     dst_p[5] |= pack_left_shift_u8(src_p->host_accepted, 0u, 0x01u);
     dst_p[6] |= pack_left_shift_u8(src_p->blockers, 0u, 0xffu);
+    dst_p[7] |= pack_left_shift_u8(src_p->clock_error_count, 0u, 0xffu);
 
     return (8);
 }
@@ -1942,6 +1943,7 @@ int disco_robot_session_state_unpack(
     dst_p->session = unpack_right_shift_u8(src_p[4], 0u, 0xffu);
     dst_p->host_accepted = unpack_right_shift_u8(src_p[5], 0u, 0x01u);
     dst_p->blockers = unpack_right_shift_u8(src_p[6], 0u, 0xffu);
+    dst_p->clock_error_count = unpack_right_shift_u8(src_p[7], 0u, 0xffu);
 
     return (0);
 }
@@ -2019,6 +2021,18 @@ bool disco_robot_session_state_blockers_is_in_range(uint8_t value)
 }
 
 bool disco_robot_session_state_blockers_is_in_phys_range(double value)
+{
+    return ((value >= 0.0) && (value <= 255.0));
+}
+
+bool disco_robot_session_state_clock_error_count_is_in_range(uint8_t value)
+{
+    (void)value;
+
+    return (true);
+}
+
+bool disco_robot_session_state_clock_error_count_is_in_phys_range(double value)
 {
     return ((value >= 0.0) && (value <= 255.0));
 }

@@ -375,6 +375,7 @@ extern "C" {
 #define DISCO_ROBOT_SESSION_STATE_SESSION_NAME "session"
 #define DISCO_ROBOT_SESSION_STATE_HOST_ACCEPTED_NAME "host_accepted"
 #define DISCO_ROBOT_SESSION_STATE_BLOCKERS_NAME "blockers"
+#define DISCO_ROBOT_SESSION_STATE_CLOCK_ERROR_COUNT_NAME "clock_error_count"
 #define DISCO_ROBOT_MAC_CHALLENGE_CRC_NAME "crc"
 #define DISCO_ROBOT_MAC_CHALLENGE_COUNTER_NAME "counter"
 #define DISCO_ROBOT_MAC_CHALLENGE_NONCE_NAME "nonce"
@@ -1150,6 +1151,15 @@ struct disco_robot_session_state_t {
      * Offset: 0
      */
     uint8_t blockers;
+
+    /**
+     * Cycles whose clock lay before the last one's; the controller counts 1 ms for such a cycle.
+     *
+     * Range: 0..255 (0..255 -)
+     * Scale: 1
+     * Offset: 0
+     */
+    uint8_t clock_error_count;
 };
 
 /**
@@ -3964,6 +3974,28 @@ bool disco_robot_session_state_blockers_is_in_range(uint8_t value);
  * @return true if in range, false otherwise.
  */
 bool disco_robot_session_state_blockers_is_in_phys_range(double value);
+
+/**
+ * Check that given signal is in allowed range.
+ *
+ * @param[in] value Signal to check.
+ *
+ * @return true if in range, false otherwise.
+ */
+bool disco_robot_session_state_clock_error_count_is_in_range(uint8_t value);
+
+/**
+ * Check that given physical value is in allowed range before encoding.
+ *
+ * Use this BEFORE calling _encode() to avoid silent integer overflow:
+ *   encode(-1.0) on a [0,100] signal wraps to 255 and passes is_in_range().
+ *   is_in_phys_range(-1.0) correctly returns false.
+ *
+ * @param[in] value Physical signal value to check.
+ *
+ * @return true if in range, false otherwise.
+ */
+bool disco_robot_session_state_clock_error_count_is_in_phys_range(double value);
 
 /**
  * Pack message MAC_CHALLENGE.

@@ -85,6 +85,9 @@ void disco_firmware_step(disco_firmware_t *core, uint64_t now_us, const disco_in
     if (now_us > core->cycle_us) {
         disco_advance(core, now_us);
     } else {
+        if (now_us < core->cycle_us) {
+            core->clock_errors++;
+        }
         core->clock_us = now_us;
         core->now_us += NOMINAL_CYCLE_US;
     }

@@ -115,6 +115,7 @@ typedef struct {
     uint32_t sequence_errors;
     uint32_t watchdog_events;
     uint32_t bus_off_events;
+    uint32_t clock_errors;
     uint32_t unknown_frames;
     uint8_t state;
     uint8_t estop_source;

@@ -4,7 +4,7 @@
 
 #define DISCO_PROTOCOL_MAJOR (1u)
 #define DISCO_PROTOCOL_MINOR (0u)
-#define DISCO_DBC_HASH (0xD6CF6DC1u)
+#define DISCO_DBC_HASH (0x9B08C737u)
 
 /* Data ids of the end-to-end CRC; the handshake's are the same for every major version. */
 #define DISCO_WHEEL_COMMAND_DATA_ID(major) ((uint16_t)(0x100u ^ ((uint32_t)(major) << 11)))

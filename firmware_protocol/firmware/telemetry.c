@@ -135,6 +135,7 @@ static void send_session_state(disco_firmware_t *core)
         .session = core->session.current,
         .host_accepted = core->host.accepted,
         .blockers = disco_blockers(core),
+        .clock_error_count = (uint8_t)core->clock_errors,
     };
     SEND(core, SESSION_STATE, session_state, session);
 }

@@ -5,6 +5,7 @@ A short part of what `make fault-campaign` does for hours.
 
 import pytest
 
+from disco_hw.daemon.plausibility import PlausibilityStats
 from sim.fault_schedule import KINDS, FaultSchedule, parse_schedule, random_schedule
 from tests.hil.simulated_run import SimulatedRun
 from tools.fault_campaign import KINDS_LEFT_OUT, markdown, summary
@@ -19,6 +20,7 @@ def test_without_faults_it_drives_and_nothing_is_told():
     assert outcome.moving_s > 3.5
     assert outcome.commands_accepted > 200
     assert run.core.last.output.running
+    assert run.core.plausibility.stats == PlausibilityStats()
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -55,6 +57,25 @@ def test_what_each_fault_comes_to_is_seen_in_a_counter(fault, stops):
     assert (seen.stopped_s is not None) == stops
     assert seen.counters
     assert seen.told or not stops
+
+
+@pytest.mark.parametrize(
+    ("fault", "counter"),
+    [
+        ('kind="motor_stall"\nfor_s=0.2', "wheels_not_following"),
+        ('kind="encoder_reversed"\nfor_s=0.15', "wheels_not_following"),
+        ('kind="encoder_stuck"\nfor_s=0.1', "wheels_not_following"),
+        ('kind="battery_sag"\nfor_s=0.5\ndrop_v=2', "supply_dips"),
+        ('kind="pose_frozen"\nfor_s=0.15', "poses_frozen"),
+    ],
+)
+def test_a_fault_too_short_to_stop_for_is_counted_and_told(fault, counter):
+    run = SimulatedRun(parse_schedule(f"[[fault]]\nat_s=4\n{fault}"), seed=3, **FAST)
+    (seen,) = run.run(9.0).faults
+    assert seen.armed_before
+    assert seen.stopped_s is None
+    assert f"plausibility.{counter}" in seen.counters
+    assert seen.told
 
 
 def test_the_same_seeds_give_the_same_run():

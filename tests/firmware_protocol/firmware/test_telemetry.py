@@ -191,6 +191,16 @@ def test_session_state_tells_challenge_session_acceptance_and_blockers():
     assert values["blockers"] == bench.out.blockers
 
 
+def test_cycles_whose_clock_goes_back_are_counted_and_others_are_not():
+    bench = Bench()
+    bench.run(150)
+    assert last(bench, "SESSION_STATE")["clock_error_count"] == 0
+    for elapsed_us in (-1, -50_000, 0):
+        bench.step(elapsed_us)
+    bench.run(150)
+    assert last(bench, "SESSION_STATE")["clock_error_count"] == 2
+
+
 def test_a_session_that_ends_is_told_at_once():
     bench = Bench()
     bench.to_ready()
