@@ -32,6 +32,7 @@ def blocks():
     return sys.getallocatedblocks()
 
 
+@pytest.mark.timeout(300.0 + 3600.0 * HOURS)
 def test_memory_is_flat_while_the_robot_drives():
     run = SimulatedRun(FaultSchedule(0, ()), cycle_us=5000)
     run.run(8.0)
