@@ -69,9 +69,12 @@ soak: $(STAMP)
 fault-campaign: $(STAMP)
 	$(BIN)/python -m tools.fault_campaign --seeds 100 --hours 1
 
+# The tests of properties, too, with new examples.
+PROPERTY_TESTS = $$(grep -rl hypothesis tests --include=test_*.py)
 fuzz: $(STAMP)
 	$(BIN)/python -m tools.fuzz
 	$(BIN)/python -m tools.fuzz_wire
+	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --hypothesis-profile=search $(PROPERTY_TESTS)
 
 firmware-check: $(STAMP)
 	$(BIN)/python -m tools.firmware_check
