@@ -83,14 +83,13 @@ class WheelChannel:
         place = line.encoder
         known = np.isfinite(line.command_rad_s[:, 0])
         # One known cell before is not enough: the run begins anew after unknown commands.
-        good = known[place.node] & known[np.maximum(place.node - 1, 0)]
-        if use is not None:
-            good &= use
+        followed = known[place.node] & known[np.maximum(place.node - 1, 0)]
+        good = followed if use is None else followed & use
         dt = np.diff(place.t_s, prepend=place.t_s[0])
         first_of_run = np.zeros(place.t_s.size, dtype=bool)
         starts = np.flatnonzero(line.first)
         first_of_run[np.searchsorted(place.node, starts)] = True
-        resumed = good & ~np.concatenate([[False], known[place.node][:-1]])
+        resumed = followed & ~np.concatenate([[False], followed[:-1]])
         jumps = np.concatenate([[0.0], np.cumsum(line.command_change)])
         between = np.diff(jumps[place.node + 1], prepend=0.0)
         speed = line.speed_rad_s[place.node]

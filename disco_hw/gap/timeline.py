@@ -6,6 +6,7 @@ and, for the command channel, the commands were known. Runs follow each other in
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -117,8 +118,9 @@ def timeline(log: DriveLog) -> Timeline:
         grid = t[0] + CELL_S * np.arange(int((t[-1] - t[0]) / CELL_S) + 1)
         at = np.column_stack([np.interp(grid, t, angle[:, side]) for side in (0, 1)])
         command, change = _command_cells(log.commands, segment, grid)
-        speed = _speeds(grid, t, angle)
-        foreign = _foreign(command, speed)
+        span_s = max(_SPEED_SPAN_S, float(np.median(np.diff(t))))
+        speed = _speeds(grid, t, angle, span_s)
+        foreign = _foreign(command, speed, span_s)
         command[foreign] = np.nan
         foreign_s += CELL_S * int(foreign.sum())
         nodes_t.append(grid)
@@ -244,22 +246,25 @@ def _command_cells(commands: Commands, segment: int, grid: Array) -> tuple[Array
     return means, jumps
 
 
-def _foreign(command: Array, speed: Array) -> Mask:
-    """Cells (M,) in which wheels turn long after the last command or rest under a large one: another master drives."""
+def _foreign(command: Array, speed: Array, span_s: float) -> Mask:
+    """Cells (M,) in which wheels turn long after the last command or rest under a large one: another master drives.
+
+    A speed taken over `span_s` either side rises that much before the command that it follows.
+    """
     asked = np.nan_to_num(np.abs(command).max(axis=1), nan=np.inf)
     turning = np.abs(speed).max(axis=1)
     span = round(_LONGEST_RESPONSE_S / CELL_S)
-    most = maximum_filter1d(asked, span, origin=(span - 1) // 2)
+    before = maximum_filter1d(asked, span, origin=(span - 1) // 2)
+    most = np.maximum(before, maximum_filter1d(asked, 2 * math.ceil(span_s / CELL_S) + 3))
     least = minimum_filter1d(asked, span, origin=(span - 1) // 2)
     unasked = (most < _NO_COMMAND_RAD_S) & (turning > _TURNING_RAD_S)
     unheard = (least > _LOUD_RAD_S) & np.isfinite(asked) & (turning < _NO_COMMAND_RAD_S)
     return np.asarray(maximum_filter1d((unasked | unheard).astype(np.uint8), 2 * span) > 0)
 
 
-def _speeds(grid: Array, t: Array, angle: Array) -> Array:
-    """Speeds at the nodes from differences of the angle over `2 _SPEED_SPAN_S` or the sampling period, (M, 2)."""
-    span = max(_SPEED_SPAN_S, float(np.median(np.diff(t))))
-    low, high = np.maximum(grid - span, t[0]), np.minimum(grid + span, t[-1])
+def _speeds(grid: Array, t: Array, angle: Array, span_s: float) -> Array:
+    """Speeds at the nodes from differences of the angle over `span_s` either side, (M, 2)."""
+    low, high = np.maximum(grid - span_s, t[0]), np.minimum(grid + span_s, t[-1])
     columns = [np.interp(high, t, angle[:, side]) - np.interp(low, t, angle[:, side]) for side in (0, 1)]
     return np.asarray(np.column_stack(columns) / (high - low)[:, None])
 

@@ -4,7 +4,10 @@ import numpy as np
 import pytest
 
 from disco_hw.gap.body_noise import BodyNoise, Motion, body_gains, body_likelihood, whiten_body
+from disco_hw.gap.channels import WheelChannel
+from disco_hw.gap.layout import WHEEL
 from disco_hw.gap.wheel_noise import Driven, WheelNoise, wheel_gains, wheel_likelihood, whiten_wheels
+from tests.gap.synthetic import GEOMETRY, line_of
 
 
 def simulated(noise, speed, rng):
@@ -101,3 +104,14 @@ def test_a_body_at_rest_has_the_noise_of_its_poses_alone():
     white = whiten_body(residual, body_gains(noise, moved))[10:]
     np.testing.assert_allclose(white.var(axis=0), 1.0, atol=0.1)
     assert abs(np.corrcoef(white[1:, 0], white[:-1, 0])[0, 1]) < 0.05
+
+
+def test_after_unknown_commands_the_wheels_angle_begins_anew():
+    line = line_of(np.full((2000, 2), 3.0))
+    line.command_rad_s[600:900] = np.nan
+    channel = WheelChannel.build(line, WheelNoise(), np.array(GEOMETRY))
+    again = np.flatnonzero(np.diff(channel.driven.use.astype(int)) == 1) + 1
+    assert again.size == 1
+    assert channel.driven.restart[again].all()
+    # Nine radians were turned meanwhile, of which the model knows nothing.
+    assert np.abs(channel.whitened(WHEEL.neutral)).max() < 0.5

@@ -74,3 +74,11 @@ def test_wheels_that_another_master_turns_are_left_out():
     assert np.isnan(line.command_rad_s[round(25.0 / CELL_S), 0])
     assert np.isfinite(line.command_rad_s[round(5.0 / CELL_S), 0])
     assert any("left out" in note for note in line.notes)
+
+
+def test_a_sudden_start_out_of_a_long_rest_is_no_other_master():
+    t = np.arange(0.0, 20.0, 0.02)
+    command = np.where((t >= 10.0) & (t < 13.0), 4.0, 0.0)
+    line = timeline(drive(t, command, t, command))
+    assert np.isfinite(line.command_rad_s[:-5]).all()
+    assert not line.notes
