@@ -15,6 +15,7 @@ import numpy as np
 
 from disco_hw.drive.separating import separating
 from disco_hw.gap import find_gap
+from disco_hw.gap.blind_spots import LIMITS, BlindSpot
 from disco_hw.gap.intervals import Estimate
 from disco_hw.model import Model
 from tools.gap_logs import NAMED, realistic, simulated_drive
@@ -63,7 +64,10 @@ class Job:
 
 @dataclass(frozen=True)
 class Result:
-    """What was found in one log; errors at 2 s in mm, parameter errors and whether their intervals hold the truth."""
+    """What was found in one log; errors at 2 s in mm, parameter errors and whether their intervals hold the truth.
+
+    `too_small`: of what was hidden, that which the report says the log could not have shown at the hidden size.
+    """
 
     kind: str
     hidden: list[str]
@@ -79,6 +83,12 @@ class Result:
     covered: list[bool]
     cpu_s: float
     alike: list[str] = field(default_factory=list)
+    too_small: list[str] = field(default_factory=list)
+
+    @property
+    def told(self) -> bool:
+        """Whether it is right, or nothing was named and what was hidden is said to be too small for this log."""
+        return self.right or not (self.named or self.unnamed or set(self.hidden) - set(self.too_small))
 
     @property
     def right(self) -> bool:
@@ -134,7 +144,19 @@ def work(job: Job) -> Result:
         [spot.name for spot in report.blind_spots if spot.blind],
         mm["refitted"], mm["amended"], mm["floor"], errors, covered, cpu_s,
         [name for effect in report.effects for name in effect.indistinguishable_from],
+        [
+            spot.name for spot in report.blind_spots
+            if spot.name in job.hidden and too_small(spot, job.hidden[spot.name])
+        ],
     )  # fmt: skip
+
+
+def too_small(spot: BlindSpot, hidden: float | tuple[float, ...]) -> bool:
+    """Whether a blind spot says that a hidden effect of this size could not be seen; a limit, that it is too large."""
+    size = abs(hidden[0] if isinstance(hidden, tuple) else hidden)
+    if spot.smallest_visible is None:
+        return True
+    return size > spot.smallest_visible if spot.name in LIMITS else size < spot.smallest_visible
 
 
 def judged(name: str, hidden: float | tuple[float, ...], found: dict[str, Estimate]) -> tuple[float, list[bool]]:

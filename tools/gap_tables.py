@@ -36,6 +36,7 @@ def summary(results: Sequence[Result]) -> dict[str, float]:
             f"gap.{kind}.right": right / len(of),
             f"gap.{kind}.right_low": low,
             f"gap.{kind}.right_high": high,
+            f"gap.{kind}.told": sum(result.told for result in of) / len(of),
             f"gap.{kind}.cpu_s": float(np.median([result.cpu_s for result in of])),
         }
         closed = [result.closed for result in of if result.closed is not None]
@@ -54,8 +55,9 @@ def table(results: Sequence[Result]) -> list[str]:
     """The figures by kind, as Markdown."""
     figures = summary(results)
     lines = [
-        "| hidden | right | 95 % interval | gap closed, median | parameter error, median | intervals hold | CPU |",
-        "|---|---|---|---|---|---|---|",
+        "| hidden | right | 95 % interval | or said to be too small | gap closed, median | parameter error, median "
+        "| intervals hold | CPU |",
+        "|---|---|---|---|---|---|---|---|",
     ]
     for kind, words in KINDS.items():
         count = int(figures.get(f"gap.{kind}.logs", 0))
@@ -70,6 +72,7 @@ def table(results: Sequence[Result]) -> list[str]:
         lines.append(
             f"| {words} | {round(figures[f'gap.{kind}.right'] * count)} of {count} | "
             f"{figures[f'gap.{kind}.right_low']:.0%} to {figures[f'gap.{kind}.right_high']:.0%} | "
+            f"{round(figures[f'gap.{kind}.told'] * count)} of {count} | "
             f"{cell('closed_median', '{:.0%}')} | {cell('parameter_error_median', '{:.1%}')} | "
             f"{cell('covered', '{:.0%}')}{holds} | {cell('cpu_s', '{:.1f} s')} |"
         )

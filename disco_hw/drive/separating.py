@@ -30,14 +30,12 @@ def _straights(pieces: Pieces, long_s: float, short_s: float) -> list[Manoeuvre]
     )
 
 
-def _spins(pieces: Pieces, long_s: float, short_s: float) -> list[Manoeuvre]:
-    return pieces.each(
-        _SPIN,
-        ("slow turn left", long_s, 0.0, 0.3),
-        ("slow turn right", long_s, 0.0, -0.3),
-        ("fast turn left", short_s, 0.0, 0.85),
-        ("fast turn right", short_s, 0.0, -0.85),
-    )
+def _slow_spins(pieces: Pieces, each_s: float) -> list[Manoeuvre]:
+    return pieces.each(_SPIN, ("slow turn left", each_s, 0.0, 0.3), ("slow turn right", each_s, 0.0, -0.3))
+
+
+def _fast_spins(pieces: Pieces, each_s: float) -> list[Manoeuvre]:
+    return pieces.each(_SPIN, ("fast turn left", each_s, 0.0, 0.85), ("fast turn right", each_s, 0.0, -0.85))
 
 
 def _curves(pieces: Pieces, long_s: float, short_s: float) -> list[Manoeuvre]:
@@ -51,9 +49,10 @@ def _curves(pieces: Pieces, long_s: float, short_s: float) -> list[Manoeuvre]:
 
 
 def _starts(pieces: Pieces, count: int) -> list[Manoeuvre]:
+    # Slip under acceleration grows with the square of the speed reached, being late in proportion to it: two speeds.
     found: list[Manoeuvre] = []
     for number in range(count):
-        forward = 0.7 if number % 2 == 0 else -0.7
+        forward = (1.0, -1.0, 0.5, -0.5)[number % 4]
         found += [pieces.hold(f"start and stop {number + 1}", _START, 0.8, forward, 0.0), pieces.rest()]
     return found
 
@@ -77,17 +76,20 @@ def _ramps(pieces: Pieces, duration_s: float) -> list[Manoeuvre]:
 def _built(pieces: Pieces) -> dict[str, list[Manoeuvre]]:
     return {
         "straights": 2 * _straights(pieces, 4.0, 3.0),
-        "spins": 2 * _spins(pieces, 4.0, 3.0),
+        "spins": 2 * (_slow_spins(pieces, 4.0) + _fast_spins(pieces, 3.0)),
         "curves": 2 * _curves(pieces, 4.0, 3.0),
         "starts": _starts(pieces, 12) + _steering(pieces, 10.0),
         "ramps": 2 * _ramps(pieces, 8.0),
+        # Turns at either end: what changes on the way shows in no other manoeuvre as soon.
         "separate": [
-            *_straights(pieces, 2.5, 2.0),
-            *_spins(pieces, 2.5, 2.0),
-            *_curves(pieces, 2.5, 2.0),
+            *_straights(pieces, 2.0, 2.0),
+            *_fast_spins(pieces, 1.5),
+            *_curves(pieces, 2.0, 2.0),
             *_starts(pieces, 6),
             *_steering(pieces, 4.0),
             *_ramps(pieces, 5.0),
+            *_slow_spins(pieces, 2.0),
+            *_fast_spins(pieces, 1.5),
         ],
     }
 

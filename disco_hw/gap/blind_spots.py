@@ -10,20 +10,19 @@ from numpy.typing import NDArray
 
 from disco_hw.gap.candidates import CANDIDATES, candidates_of
 from disco_hw.gap.channels import Channel, WheelChannel
-from disco_hw.gap.fit import Fit, inverse, sensitivity
+from disco_hw.gap.fit import inverse, sensitivity
 from disco_hw.gap.search import Found
 from disco_hw.model.effects import REGISTRY
 from disco_hw.model.parameter import Parameter
 
 Array = NDArray[np.float64]
 
-_LIMITS = ("speed_limit", "yaw_rate_limit")
+LIMITS = ("speed_limit", "yaw_rate_limit")
 # A limit shows only where more is asked: this share of what the robot can do, and no more turning than robots are
 # held to.
 _MOST_OF_IT = 0.75
 _REALISTIC_YAW_RATE_RAD_S = 1.2
 _EXACT_ALIKE = {"pose_offset": "lateral_icr", "encoder_scale": "wheel_gain"}
-_SCORE = 20.0
 _USUAL_INFLATION = 1.5
 
 
@@ -47,9 +46,9 @@ def blind_spots(found: Found, top_rad_s: float | None = None) -> tuple[BlindSpot
 
     `top_rad_s`: the largest wheel speed of the robot, if it is known; without it nobody knows what was not asked of it.
     """
-    channel, best = found.selector.channel, found.fit
+    channel = found.selector.channel
     missing = [name for name in candidates_of(channel.layout) if name not in found.names]
-    spots = [_limit(channel, name, top_rad_s) if name in _LIMITS else _spot(channel, best, name) for name in missing]
+    spots = [_limit(channel, name, top_rad_s) if name in LIMITS else _spot(found, name) for name in missing]
     for spot in tuple(spots):
         for other, like in _EXACT_ALIKE.items():
             if spot.name == like:
@@ -60,11 +59,9 @@ def blind_spots(found: Found, top_rad_s: float | None = None) -> tuple[BlindSpot
     return tuple(spots)
 
 
-def _spot(channel: Channel, best: Fit, name: str) -> BlindSpot:
-    effect, candidate = REGISTRY[name], CANDIDATES[name]
-    parameter = effect.parameters[0]
-    column = f"{name}.{parameter.name}"
-    size = _size(channel, best, name, column, candidate.columns)
+def _spot(found: Found, name: str) -> BlindSpot:
+    parameter = REGISTRY[name].parameters[0]
+    size = _size(found, name, f"{name}.{parameter.name}")
     blind = size is None or size > _realistic(parameter)
     return BlindSpot(name, parameter.name, parameter.unit, size, blind, experiment_of(name))
 
@@ -105,39 +102,52 @@ def _largest(wheels: WheelChannel, name: str) -> float | None:
     return float(0.97 * np.sort(size)[-50])
 
 
-def _size(channel: Channel, best: Fit, name: str, column: str, columns: tuple[str, ...]) -> float | None:
-    """Size at which the expected evidence reaches the threshold, the other free parameters projected out."""
-    layout = channel.layout
-    candidate = CANDIDATES[name]
-    threshold = _SCORE + candidate.parameters * math.log(max(channel.count, 2))
+def _size(found: Found, name: str, column: str) -> float | None:
+    """Size at which the expected evidence reaches the threshold and the 2 s prediction moves as far as it must.
+
+    The other free parameters make up for what they can.
+    """
+    channel, best = found.selector.channel, found.fit
+    layout, candidate, limits = channel.layout, CANDIDATES[name], found.selector.thresholds
+    threshold = limits.score + candidate.parameters * math.log(max(channel.count, 2))
     if candidate.profile is not None and column == candidate.profile.column:
-        return _by_trial(channel, best, column, threshold)
+        return _by_trial(found, column, threshold)
     vector = best.vector.copy()
     if candidate.profile is not None:
         values = candidate.profile.values(channel)
         if not values:
             return None
         vector[layout.place[candidate.profile.column]] = values[len(values) // 2]
-    places = tuple(layout.place[name] for name in columns)
+    places = tuple(layout.place[name] for name in candidate.columns)
     base = channel.residual(vector)
     slope = np.column_stack([best.jacobian, sensitivity(channel, vector, places, base)])
     first = best.jacobian.shape[1]
     information = slope.T @ slope
     if information[first, first] <= 1e-9:
         return None
-    variance = float(inverse(information)[first, first])
-    size = math.sqrt(threshold * _USUAL_INFLATION * variance)
+    covariance = inverse(information)
+    size = math.sqrt(threshold * _USUAL_INFLATION * float(covariance[first, first]))
     limit = max(abs(layout.low[places[0]]), abs(layout.high[places[0]]))
+    if size >= limit:
+        return None
+    # With the size of one parameter go, of those not said, the values that hide it best.
+    with_it = vector.copy()
+    with_it[[*best.active, *places]] += size * covariance[first] / covariance[first, first]
+    moved = found.selector.moves(channel.split(vector), channel.split(with_it))
+    if moved < limits.moves_m:
+        size = size * limits.moves_m / moved if moved > 0.0 else math.inf
     return size if size < limit else None
 
 
-def _by_trial(channel: Channel, best: Fit, column: str, threshold: float) -> float | None:
-    """Smallest of a row of sizes whose prediction differs from the one without by the threshold."""
+def _by_trial(found: Found, column: str, threshold: float) -> float | None:
+    """Smallest of a row of sizes whose prediction differs from the one without clearly, and enough to matter."""
+    channel, best = found.selector.channel, found.fit
     place = channel.layout.place[column]
     for size in (0.05, 0.1, 0.2, 0.3, 0.5, 0.75, 1.0, 1.5, 2.0):
         vector = best.vector.copy()
         vector[place] = size
         difference = channel.residual(vector) - best.residual
-        if float(difference @ difference) > threshold * _USUAL_INFLATION:
+        enough = found.selector.moves(channel.split(best.vector), channel.split(vector))
+        if float(difference @ difference) > threshold * _USUAL_INFLATION and enough > found.selector.thresholds.moves_m:
             return size
     return None

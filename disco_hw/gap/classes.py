@@ -8,6 +8,8 @@ from types import MappingProxyType
 from disco_hw.gap.intervals import Estimates
 
 _SIGMAS = 3.0
+# The odds of a wrong name are then below one in a hundred.
+_SURE_NATS = 5.0
 
 LATERAL = "lateral_icr"
 SENSOR = "pose_offset"
@@ -28,11 +30,12 @@ OUTSIDE_TESTS: Mapping[frozenset[str], str] = MappingProxyType(
 )
 
 
-def one_encoder(wheels: Estimates, body: Estimates, asymmetry_deviation: float) -> tuple[bool, bool]:
+def one_encoder(wheels: Estimates, asymmetry: tuple[float, float], accepted: bool) -> tuple[bool, bool]:
     """Whether an encoder that counts wrong explains the wheels' gains, and whether it is the only explanation.
 
     An encoder's scale shows as a gain of its wheel and, with the opposite sign, as an asymmetry of half the difference;
-    `asymmetry_deviation` is the asymmetry's standard deviation where the asymmetry itself was not accepted.
+    `asymmetry` is what the body alone tells of it, with its standard deviation, `accepted` if that is an effect of its
+    own. Too small for that it still decides where it is clearly what the encoder would make it and clearly not none.
     """
     gains = [wheels.by_name.get(f"{GAIN}.{side}") for side in ("left", "right")]
     if gains[0] is None or gains[1] is None:
@@ -40,11 +43,11 @@ def one_encoder(wheels: Estimates, body: Estimates, asymmetry_deviation: float) 
     left, right = gains[0].value, gains[1].value
     expected = (left - right) / (2.0 + left + right)
     spread = 0.5 * (gains[0].deviation + gains[1].deviation)
-    seen = body.by_name.get(f"{ASYMMETRY}.ratio")
-    value, deviation = (seen.value, seen.deviation) if seen else (0.0, asymmetry_deviation)
-    tolerance = _SIGMAS * (deviation**2 + spread**2) ** 0.5
-    possible = abs(value - expected) < tolerance
-    return possible, possible and seen is not None
+    value, deviation = asymmetry
+    variance = deviation**2 + spread**2
+    possible = abs(value - expected) < _SIGMAS * variance**0.5
+    nats = 0.5 * (value**2 - (value - expected) ** 2) / variance
+    return possible, possible and (accepted or nats > _SURE_NATS)
 
 
 def alike(names: tuple[str, ...], encoder_possible: bool) -> dict[str, tuple[str, ...]]:

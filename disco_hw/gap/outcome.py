@@ -15,7 +15,8 @@ from disco_hw.gap.blind_spots import BlindSpot, blind_spots, experiment_of
 from disco_hw.gap.candidates import CHANGE, candidates_of, indices, parameters_of
 from disco_hw.gap.channels import BodyChannel, WheelChannel
 from disco_hw.gap.classes import ASYMMETRY, ENCODER, GAIN, OUTSIDE_TESTS, PATCH_OR_CHANGE, alike, one_encoder
-from disco_hw.gap.fit import Fit, fit, inverse, sensitivity
+from disco_hw.gap.evidence import inflation
+from disco_hw.gap.fit import Fit, fit
 from disco_hw.gap.held_out import Chain, Errors, errors_of, floor_errors, fold_vectors, per_horizon, smoothed_poses
 from disco_hw.gap.intervals import Estimates, estimates
 from disco_hw.gap.report import CandidateEvidence, ChannelFinding, EffectFinding, UnnamedFinding
@@ -58,14 +59,18 @@ class Outcome:
             return GAIN in (self.wheels.names if self.wheels else ()), False
         if GAIN not in self.wheels.names or GAIN in self.wheels.selector.given:
             return False, False
-        return one_encoder(wheels, body, self._asymmetry_deviation(self.body))
+        seen = body.by_name.get(f"{ASYMMETRY}.ratio")
+        told = self._asymmetry(self.body) if seen is None else (seen.value, seen.deviation)
+        return one_encoder(wheels, told, seen is not None)
 
     @staticmethod
-    def _asymmetry_deviation(found: Found) -> float:
+    def _asymmetry(found: Found) -> tuple[float, float]:
+        """Asymmetry of the wheels that would fit best if it were free too, and its standard deviation."""
         channel, best = found.selector.channel, found.fit
         place = channel.layout.place[f"{ASYMMETRY}.ratio"]
-        slope = np.column_stack([best.jacobian, sensitivity(channel, best.vector, (place,), best.residual)])
-        return float(np.sqrt(inverse(slope.T @ slope)[-1, -1]))
+        free = fit(channel, best.vector, (*best.active, place))
+        variance = free.covariance()[-1, -1] * inflation(free, channel, (place,))
+        return float(free.vector[place]), float(np.sqrt(variance))
 
     @cached_property
     def _final_body(self) -> tuple[Fit, Estimates] | None:

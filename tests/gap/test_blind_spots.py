@@ -6,14 +6,14 @@ import pytest
 from disco_hw.gap.blind_spots import blind_spots
 from disco_hw.gap.channels import WheelChannel
 from disco_hw.gap.search import Found, body_moves, wheel_moves
-from disco_hw.gap.selection import Selector
+from disco_hw.gap.selection import Selector, Thresholds
 from disco_hw.gap.wheel_noise import WheelNoise
 from disco_hw.model.effects import REGISTRY
 from tests.gap.synthetic import GEOMETRY, body_channel, line_of
 
 
-def spots_of(channel, names=()):
-    selector = Selector(channel, body_moves(channel))
+def spots_of(channel, names=(), limits=None):
+    selector = Selector(channel, body_moves(channel), limits or Thresholds())
     return {spot.name: spot for spot in blind_spots(Found(selector, names, channel))}
 
 
@@ -33,6 +33,15 @@ def test_twice_the_smallest_visible_size_is_found_and_a_third_of_it_is_not(name)
     for share, found in ((2.0, True), (1.0 / 3.0, False)):
         channel, _ = body_channel(1, **{name: share * size})
         assert (name in Selector(channel, body_moves(channel)).select()) is found, (name, share, size)
+
+
+def test_what_moves_the_prediction_too_little_to_be_reported_is_called_too_small():
+    limits = Thresholds(moves_m=0.008)
+    size = spots_of(body_channel()[0], limits=limits)["lateral_icr"].smallest_visible
+    assert size > 1.5 * spots_of(body_channel()[0])["lateral_icr"].smallest_visible
+    for share, found in ((1.2, True), (0.8, False)):
+        channel, _ = body_channel(1, lateral_icr=share * size)
+        assert ("lateral_icr" in Selector(channel, body_moves(channel), limits).select()) is found, (share, size)
 
 
 def test_a_drive_that_only_goes_straight_is_blind_to_slip_in_turns():

@@ -8,6 +8,7 @@ import pytest
 from dask.distributed import LocalCluster
 from rich.console import Console
 
+from disco_hw.gap.blind_spots import BlindSpot
 from disco_hw.gap.intervals import Estimate
 from tools import gap_jobs, gap_study, gap_tables
 from tools.gap_jobs import Job, Result, jobs
@@ -54,6 +55,22 @@ def test_what_counts_as_right_depends_on_the_kind():
     assert not result("circle", ("turn_slip",), ("slope",), blind=["turn_slip"]).right
     assert result("circle", ("motor_lag",), ("command_delay",), alike=["motor_lag"]).right
     assert not result("circle", ("motor_lag",), ("command_delay",), alike=["deadband"]).right
+
+
+def test_a_miss_that_the_report_calls_too_small_is_counted_beside_and_never_as_right():
+    missed = result("weak", named=(), too_small=["motor_lag"])
+    assert not missed.right
+    assert missed.told
+    assert not result("weak", named=()).told
+    assert not result("weak", named=("deadband",), too_small=["motor_lag"]).told
+    figures = gap_tables.summary([missed, result("weak", seed=2)])
+    assert (figures["gap.weak.right"], figures["gap.weak.told"]) == (0.5, 1.0)
+    spot = BlindSpot("turn_slip", "k_s", "s/rad", 0.02, False, "")
+    assert gap_jobs.too_small(spot, 0.01)
+    assert not gap_jobs.too_small(spot, 0.03)
+    limit = BlindSpot("speed_limit", "limit_rad_s", "rad/s", 6.0, False, "")
+    assert gap_jobs.too_small(limit, 7.0)
+    assert not gap_jobs.too_small(limit, 5.0)
 
 
 def test_a_study_goes_on_where_it_was_broken_off(tmp_path, monkeypatch):
