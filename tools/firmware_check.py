@@ -88,19 +88,33 @@ def coverage_of(tree: Path, name: str) -> Coverage:
     )
 
 
+def build_harness(folder: Path, replaced: dict[str, Path] | None = None) -> Path:
+    """Compile the sanitizers' harness into `folder`; `replaced` gives other files in the place of sources, by name."""
+    harness = folder / "harness"
+    firmware = ROOT / "firmware_protocol" / "firmware"
+    sources = [str((replaced or {}).get(name, firmware / name)) for name in SOURCES]
+    command = ["gcc", "-std=c99", "-O1", "-g", "-fsanitize=undefined,address", "-fno-sanitize-recover=all"]
+    subprocess.run([*command, f"-I{firmware}", str(HARNESS), *sources, "-o", str(harness), "-lm"], check=True)
+    return harness
+
+
+def run_harness(
+    harness: Path, cycles: int, frames: int, authenticated: bool, timeout_s: float | None = None
+) -> subprocess.CompletedProcess[str]:
+    """Run it: so many cycles of a host and mad measurements, then random frames; its status is 0 if all was sound."""
+    return subprocess.run(
+        [str(harness), str(cycles), str(frames), "1" if authenticated else "0"],
+        capture_output=True, text=True, check=False, timeout=timeout_s,
+        env=os.environ | {"ASAN_OPTIONS": "detect_leaks=0"},
+    )  # fmt: skip
+
+
 def flood(folder: Path) -> bool:
     """Send ten million random frames through the core, half of them in authenticated mode, under the sanitizers."""
-    harness = folder / "harness"
-    sources = [str(ROOT / "firmware_protocol" / "firmware" / name) for name in SOURCES]
-    command = ["gcc", "-std=c99", "-O1", "-g", "-fsanitize=undefined,address", "-fno-sanitize-recover=all"]
-    command += [f"-I{ROOT / 'firmware_protocol' / 'firmware'}", str(HARNESS), *sources, "-o", str(harness), "-lm"]
-    subprocess.run(command, check=True)
+    harness = build_harness(folder)
     sound = True
-    for authenticated in ("0", "1"):
-        ran = subprocess.run(
-            [str(harness), str(FLOOD_CYCLES), str(FLOOD_FRAMES), authenticated],
-            capture_output=True, text=True, check=False, env=os.environ | {"ASAN_OPTIONS": "detect_leaks=0"},
-        )  # fmt: skip
+    for authenticated in (False, True):
+        ran = run_harness(harness, FLOOD_CYCLES, FLOOD_FRAMES, authenticated)
         print(f"random frames, authenticated {authenticated}: BOOT to ESTOP, frames: {ran.stdout.strip()}{ran.stderr}")
         sound &= ran.returncode == 0
     return sound

@@ -2,7 +2,8 @@
 
     python -m tools.firmware_mutants [--only FILE.c ...] [--jobs 2] [--report FILE]
 
-A mutant that compiles to the same machine code as the original is none. Those that cannot be told from the original
+A mutant that compiles to the same machine code as the original is none. One that passes the tests is run under the
+sanitizers too. Those that cannot be told from the original
 by any frame or setpoint are in firmware_equivalents.toml, each with its reason. Exits 1 if any other survives.
 """
 
@@ -22,6 +23,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from firmware_protocol.build_firmware import PACKAGE, SOURCES, make_ffi
+from tools.firmware_check import build_harness, run_harness
 from tools.mutation import Mutant, mutants
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -31,6 +33,8 @@ EQUIVALENTS = Path(__file__).with_name("firmware_equivalents.toml")
 HAND_WRITTEN = tuple(name for name in SOURCES if name != "disco_robot.c")
 FLAGS = ("-std=c99", "-O1", "-fPIC", "-w")
 TIMEOUT_S = 240
+SANITIZED_CYCLES = 20_000
+SANITIZED_FRAMES = 20
 MEMORY = 6 << 30
 # The tests that are most likely to notice, by file; then all others.
 FIRST = {
@@ -133,6 +137,20 @@ def child(folder: Path, files: Sequence[str]) -> int:
     return 0
 
 
+def sanitizers_notice(name: str, mutant: Mutant, folder: Path) -> bool:
+    """Whether the sanitizers' harness fails with this mutant: what reads beyond its bounds may do no visible harm."""
+    mutated = folder / name
+    mutated.write_text(mutant.apply((FIRMWARE / name).read_text("utf-8")), "utf-8")
+    harness = build_harness(folder, {name: mutated})
+    try:
+        return any(
+            run_harness(harness, SANITIZED_CYCLES, SANITIZED_FRAMES, authenticated, TIMEOUT_S).returncode != 0
+            for authenticated in (False, True)
+        )
+    except subprocess.TimeoutExpired:
+        return True
+
+
 def load_the_rest() -> None:
     """Import what every child needs, so that a fork has it; all but the extension itself."""
     import cantools.autosar.end_to_end  # noqa: F401, PLC0415
@@ -156,9 +174,10 @@ def sweep(names: Sequence[str], jobs: int, chosen: slice, report: Path | None = 
     def finish() -> None:
         process, status = os.wait()
         name, mutant, folder = running.pop(process)
-        shutil.rmtree(folder, ignore_errors=True)
         # A crash, a hang and a failing test all are a change that was noticed; 0 alone is none.
-        add(Result(name, mutant, "SURVIVED" if status == 0 else "killed"))
+        survived = status == 0 and not sanitizers_notice(name, mutant, folder)
+        shutil.rmtree(folder, ignore_errors=True)
+        add(Result(name, mutant, "SURVIVED" if survived else "killed"))
 
     def add(result: Result) -> None:
         results.append(result)
