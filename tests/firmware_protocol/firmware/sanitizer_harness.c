@@ -72,7 +72,11 @@ static void prove(disco_firmware_t *core, uint64_t now, uint32_t id, const uint8
     message[14] = (uint8_t)id;
     message[15] = (uint8_t)(id >> 8);
     (void)memcpy(&message[16], frame, 8u);
-    disco_cmac_init(&key, core->config.key);
+    /* In a block of its own, so that the sanitizers see a step beyond its end. */
+    uint8_t *bare_key = malloc(16u);
+    (void)memcpy(bare_key, core->config.key, 16u);
+    disco_cmac_init(&key, bare_key);
+    free(bare_key);
     disco_cmac(&key, message, sizeof(message), tag);
     proof[0] = message[6];
     proof[1] = message[7];
