@@ -18,11 +18,11 @@ from disco_hw.gap import find_gap
 from disco_hw.gap.blind_spots import LIMITS, BlindSpot
 from disco_hw.gap.intervals import Estimate
 from disco_hw.model import Model
-from tools.gap_logs import NAMED, realistic, simulated_drive
+from tools.gap_logs import LARGEST_RAD_S, NAMED, realistic, simulated_drive
 
 MODEL = Model(0.061, 0.415, 0.238)
-# What the robot can do, and what scripts ask of it.
-LARGEST_RAD_S, TOP_RAD_S = 8.0, 6.4
+# What scripts ask of the robot.
+TOP_RAD_S = 6.4
 OUTSIDE = ("x_wheel_ripple", "x_motor_droop", "x_shared_supply", "x_speed_squared_drag", "x_carpet_patch")
 # Another form of a named family, and the names that count as the family's.
 FORMS = {

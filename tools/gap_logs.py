@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from disco_hw.daemon.governor import Governor, WheelLimits
 from disco_hw.drive.script import Script
 from disco_hw.log.drive import Commands, DriveLog, Gyro, Poses, Wheels, differentiate_angle
 from sim.drives import Drive, make_drive
@@ -13,6 +14,8 @@ from sim.effects import EFFECTS, HiddenEffects, hidden_effects
 from sim.log_csv import LogOptions, dirty_log_options, dirty_parameters, simulated_log, varied_parameters
 from sim.plant_parameters import PlantParameters
 
+# What a robot.toml sets if it says nothing else.
+LARGEST_RAD_S, LARGEST_RAD_S2 = 8.0, 20.0
 NAMED = tuple(name for name in EFFECTS if not name.startswith("x_"))
 
 
@@ -47,9 +50,11 @@ def simulated_drive(
 
 
 def then_scripted(drive: Drive, script: Script) -> Drive:
-    """A drive, and then a script as the commands that `disco-hw drive` sends."""
+    """A drive, and then a script as the commands that `disco-hw drive` sends: held to the usual acceleration."""
     t_s = np.arange(0.0, script.duration_s, drive.period_s)
-    wheels = np.array([script.at(float(t)) for t in t_s])
+    governor = Governor(WheelLimits(LARGEST_RAD_S, LARGEST_RAD_S2, LARGEST_RAD_S2), drive.period_s)
+    sent = [governor.step(*script.at(float(t)), drive.period_s) for t in t_s]
+    wheels = np.array([(command.left_rad_s, command.right_rad_s) for command in sent])
     return Drive(
         f"{drive.name} and {script.name}",
         drive.period_s,

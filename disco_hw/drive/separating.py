@@ -20,14 +20,12 @@ _STEER = "delay told from lag"
 _RAMP = "deadband told from stiction, slowly through zero"
 
 
-def _straights(pieces: Pieces, long_s: float, short_s: float) -> list[Manoeuvre]:
-    return pieces.each(
-        _STRAIGHT,
-        ("slow straight", long_s, 0.4, 0.0),
-        ("slow reverse", long_s, -0.4, 0.0),
-        ("full speed straight", short_s, 1.0, 0.0),
-        ("full speed reverse", short_s, -1.0, 0.0),
-    )
+def _slow_straights(pieces: Pieces, each_s: float) -> list[Manoeuvre]:
+    return pieces.each(_STRAIGHT, ("slow straight", each_s, 0.4, 0.0), ("slow reverse", each_s, -0.4, 0.0))
+
+
+def _fast_straights(pieces: Pieces, each_s: float) -> list[Manoeuvre]:
+    return pieces.each(_STRAIGHT, ("full speed straight", each_s, 1.0, 0.0), ("full speed reverse", each_s, -1.0, 0.0))
 
 
 def _slow_spins(pieces: Pieces, each_s: float) -> list[Manoeuvre]:
@@ -75,14 +73,14 @@ def _ramps(pieces: Pieces, duration_s: float) -> list[Manoeuvre]:
 
 def _built(pieces: Pieces) -> dict[str, list[Manoeuvre]]:
     return {
-        "straights": 2 * _straights(pieces, 4.0, 3.0),
+        "straights": 2 * (_slow_straights(pieces, 4.0) + _fast_straights(pieces, 3.0)),
         "spins": 2 * (_slow_spins(pieces, 4.0) + _fast_spins(pieces, 3.0)),
         "curves": 2 * _curves(pieces, 4.0, 3.0),
         "starts": _starts(pieces, 12) + _steering(pieces, 10.0),
         "ramps": 2 * _ramps(pieces, 8.0),
-        # Turns at either end: what changes on the way shows in no other manoeuvre as soon.
+        # Turns and straights at either end, for what changes on the way.
         "separate": [
-            *_straights(pieces, 2.0, 2.0),
+            *_slow_straights(pieces, 2.0),
             *_fast_spins(pieces, 1.5),
             *_curves(pieces, 2.0, 2.0),
             *_starts(pieces, 6),
@@ -90,6 +88,7 @@ def _built(pieces: Pieces) -> dict[str, list[Manoeuvre]]:
             *_ramps(pieces, 5.0),
             *_slow_spins(pieces, 2.0),
             *_fast_spins(pieces, 1.5),
+            *_fast_straights(pieces, 2.0),
         ],
     }
 

@@ -55,21 +55,27 @@ def held_out_by_block(found: Fit, channel: Channel) -> Array:
 
 
 def inflation(found: Fit, channel: Channel, added: tuple[int, ...]) -> float:
-    """Largest ratio over block lengths of the sandwich variance to the model's, for the added entries; at least 1."""
+    """Largest ratio over block lengths of the sandwich variance to the model's, for the added entries; at least 1.
+
+    What blocks tell is weighed against what is known of the channel: `trusted_blocks` of them in which the model holds.
+    """
     places = [found.active.index(index) for index in added if index in found.active]
     if not places:
         return 1.0
     covariance = found.covariance()
-    inner = covariance[np.ix_(places, places)]
+    moved = covariance[:, places]
+    weight = np.linalg.inv(covariance[np.ix_(places, places)])
     largest = 1.0
     for length in _BLOCK_LENGTHS:
-        _, gradient = by_block(found, channel.block, length)
+        normal, gradient = by_block(found, channel.block, length)
         if gradient.shape[0] < _FEWEST_BLOCKS:
             continue
-        moved = gradient @ covariance[:, places]
-        sandwich = moved.T @ moved * gradient.shape[0] / (gradient.shape[0] - 1.0)
-        ratio = float(np.trace(np.linalg.solve(inner, sandwich))) / len(places)
-        largest = max(largest, ratio)
+        scatter = float(np.einsum("bi,ij,bj->", gradient @ moved, weight, gradient @ moved))
+        told = np.einsum("bij,ip,pq,jq->b", normal, moved, weight, moved)
+        # Where few blocks tell most, as few scatter: fitting takes one of them, and the rest says little of the noise.
+        blocks = float(told.sum() ** 2 / (told**2).sum())
+        known = channel.trusted_blocks / len(places)
+        largest = max(largest, (known + blocks * scatter / len(places)) / (known + blocks - 1.0))
     return largest
 
 

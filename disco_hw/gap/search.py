@@ -36,6 +36,8 @@ _WORTH_TRYING = 18.0
 _GAUSSIAN_KURTOSIS = 3.0
 _CLIPPED_AT = 6.0
 _HEAVIEST = 1.5
+# Scores of named effects that are not there: in wheels up to 10 on dirty logs, in bodies none above 0.
+_WHEEL_SCORE, _BODY_SCORE, _UNNAMED_SCORE = 20.0, 10.0, 20.0
 _REST_RAD_S = 0.05
 _FAR_OFF = 1.5
 _CLEARLY = 6.0
@@ -153,7 +155,7 @@ def search_wheels(line: Timeline, geometry: Array, start: Array, given: Names = 
     def searched(channel: WheelChannel) -> Found:
         white = whiten_wheels(left, channel.gains)
         rolling = np.abs(line.speed_rad_s[line.encoder.node]).max(axis=1) > _REST_RAD_S
-        limits = _thresholds(white, channel.gains.use & rolling)
+        limits = _thresholds(white, channel.gains.use & rolling, _WHEEL_SCORE)
         selector = Selector(channel, moves, limits, given=given, start=rough.fit(given).vector)
         selector.fits[frozenset(names)] = fit(channel, rough.fit(names).vector, indices(channel, names))
         richest = (white * channel.weight).ravel()
@@ -197,7 +199,7 @@ def search_body(line: Timeline, start: Array, given: Names = ()) -> Found:
     channel = learn_body_noise(channel, vector)
     pushes = _body_pushes(channel, rich, vector)
     channel, fullest, extra, many = learn_saturated_body(channel, rich, vector, pushes)
-    limits = _thresholds(channel.whitened(fullest, extra), channel.use)
+    limits = _thresholds(channel.whitened(fullest, extra), channel.use, _BODY_SCORE)
     selector = Selector(channel, body_moves(channel), limits, given=given, start=rough.fit(given).vector)
     richest = channel.residual(fullest, extra)
     found = Found(selector, selector.select(), channel, richest=richest, richest_parameters=many)
@@ -240,18 +242,19 @@ def _body_pushes(channel: BodyChannel, names: Names, vector: Array) -> Iterator[
         yield disc.push
 
 
-def _thresholds(white: Array, use: NDArray[np.bool_]) -> Thresholds:
-    """Thresholds for a channel: the heavier the tails of its noise, the more evidence it takes.
+def _thresholds(white: Array, use: NDArray[np.bool_], score: float) -> Thresholds:
+    """Thresholds for a channel, from a named effect's `score`: the heavier the noise's tails, the more it takes.
 
     Noise that comes in bursts wanders too, more slowly than any block that could show it.
     """
     sound = white[use]
     sound = sound[np.abs(sound).max(axis=1) > _NO_INFORMATION]
     if not sound.size:
-        return Thresholds()
+        return Thresholds(score=score)
     sound = np.clip(sound / np.sqrt((sound**2).mean()), -_CLIPPED_AT, _CLIPPED_AT)
     heavy = float((sound**4).mean()) / _GAUSSIAN_KURTOSIS
-    return Thresholds(score=Thresholds().score * min(max(heavy, 1.0), _HEAVIEST))
+    times = min(max(heavy, 1.0), _HEAVIEST)
+    return Thresholds(score=times * score, unnamed_score=times * _UNNAMED_SCORE)
 
 
 def _wheel_options(found: Found) -> Iterator[Term]:
@@ -291,7 +294,7 @@ def with_unnamed(found: Found, options: Callable[[Found], Iterator[Term]]) -> Fo
         proof = compare(small, big, channel, parameters)
         moved = selector.moves(found.selector.channel.split(small.vector), channel.split(big.vector))
         limits = plain.thresholds
-        if proof.score < limits.score or proof.repeated <= 0.0 or moved < limits.moves_m:
+        if proof.score < limits.unnamed_score or proof.repeated <= 0.0 or moved < limits.moves_m:
             break
         terms = (*terms, best)
         names = selector.select()

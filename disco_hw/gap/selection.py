@@ -29,10 +29,11 @@ _CLEARLY = 3.0
 
 @dataclass(frozen=True, slots=True)
 class Thresholds:
-    """When an effect is accepted: evidence score and shift of a 2 s prediction."""
+    """When an effect is accepted: evidence score, of one without a name too, and shift of a 2 s prediction."""
 
     score: float = 20.0
     moves_m: float = 0.0005
+    unnamed_score: float = 20.0
 
 
 @dataclass

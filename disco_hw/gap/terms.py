@@ -226,6 +226,11 @@ class WithTerms:
         """Number of residuals that are used."""
         return self.inner.count
 
+    @property
+    def trusted_blocks(self) -> float:
+        """How many blocks of time that agree with the noise model it is worth."""
+        return self.inner.trusted_blocks
+
     def split(self, p: Array) -> tuple[Array, Array | None]:
         """The inner channel's vector, and what the terms add at the nodes."""
         width = len(self.inner.layout.columns)

@@ -62,11 +62,13 @@ def test_all_together_take_a_minute_and_serve_every_purpose():
     assert set(PURPOSES.values()) - {PURPOSES["separate"]} <= purposes
 
 
-def test_all_together_turn_fast_both_ways_at_either_end():
-    _, turn = driven("separate").T
-    fast = np.flatnonzero(np.abs(turn) > 0.8 * TOP_RAD_S)
-    early, late = fast[fast < 0.3 * turn.size], fast[fast > 0.9 * turn.size]
-    assert {np.sign(turn[k]) for k in early} == {np.sign(turn[k]) for k in late} == {1.0, -1.0}
+def test_all_together_turn_fast_and_go_straight_both_ways_at_either_end():
+    forward, turn = driven("separate").T
+    straight = np.where(turn == 0.0, forward, 0.0)
+    for values, least in ((turn, 0.8 * TOP_RAD_S), (straight, 0.35 * TOP_RAD_S)):
+        held = np.flatnonzero(np.abs(values) > least)
+        early, late = held[held < 0.2 * turn.size], held[held > 0.8 * turn.size]
+        assert {np.sign(values[k]) for k in early} == {np.sign(values[k]) for k in late} == {1.0, -1.0}
 
 
 def test_starts_reach_two_speeds_both_ways():

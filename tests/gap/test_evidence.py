@@ -19,7 +19,7 @@ def linear_fit(columns, y):
 
 
 def channel():
-    return SimpleNamespace(block=np.arange(N) // EACH, count=N)
+    return SimpleNamespace(block=np.arange(N) // EACH, count=N, trusted_blocks=6.0)
 
 
 def test_white_noise_speaks_for_nothing_and_a_real_slope_for_itself():
@@ -71,3 +71,14 @@ def test_what_only_one_block_knows_does_not_hide_what_all_show():
     )
     assert proof.held_out == pytest.approx(proof.gain, rel=0.2)
     assert proof.repeated > 50.0
+
+
+def test_few_blocks_that_happen_to_scatter_do_not_take_the_evidence_away():
+    rng = np.random.default_rng(4)
+    # Nearly all is told in two of 20 blocks of nine.
+    x = np.full((9000, 1), 0.02)
+    x[:450] = x[4500:4950] = 1.0
+    wide = SimpleNamespace(block=np.arange(9000) // EACH, count=9000, trusted_blocks=6.0)
+    factors = [inflation(linear_fit(x, rng.standard_normal(9000)), wide, (0,)) for _ in range(200)]
+    assert np.quantile(factors, 0.95) < 2.0
+    assert np.mean(factors) == pytest.approx(1.15, abs=0.15)
