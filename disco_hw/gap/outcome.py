@@ -17,6 +17,7 @@ from disco_hw.gap.channels import BodyChannel, WheelChannel
 from disco_hw.gap.classes import ASYMMETRY, ENCODER, GAIN, OUTSIDE_TESTS, PATCH_OR_CHANGE, alike, one_encoder
 from disco_hw.gap.evidence import inflation
 from disco_hw.gap.fit import Fit, fit
+from disco_hw.gap.form import other_forms
 from disco_hw.gap.held_out import Chain, Errors, errors_of, floor_errors, fold_vectors, per_horizon, smoothed_poses
 from disco_hw.gap.intervals import Estimates, estimates
 from disco_hw.gap.report import CandidateEvidence, ChannelFinding, EffectFinding, UnnamedFinding
@@ -231,7 +232,7 @@ class Outcome:
         out: list[str] = []
         for found in (self.wheels, self.body):
             if found is not None:
-                out += left_over(found)
+                out += [*left_over(found), *other_forms(found)]
         return tuple(out)
 
     def blind_spots(self, effects: Iterable[EffectFinding]) -> tuple[BlindSpot, ...]:
