@@ -95,6 +95,12 @@ _SPECS = (
         (EffectValue("limit_rad_s", "rad/s", (0.7, 1.2), _POSITIVE, neutral=math.inf),),
     ),
     EffectSpec(
+        "yaw_acceleration_limit",
+        _WHEEL,
+        "the yaw rate r (w_R - w_L) / a that the motors are asked for changes by at most this, their mean is kept",
+        (EffectValue("limit_rad_s2", "rad/s^2", (1.0, 3.0), _POSITIVE, neutral=math.inf),),
+    ),
+    EffectSpec(
         "battery_sag",
         _WHEEL,
         "u -> u (1 - loss t / duration): wheel speed falls linearly with the time since start",

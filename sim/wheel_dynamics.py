@@ -45,6 +45,7 @@ _PARAMETERS = np.dtype(
         ("smooth_deadband", "f8"),
         ("mean_to_yaw_rate", "f8"),
         ("yaw_rate_limit", "f8"),
+        ("yaw_acceleration_limit", "f8"),
         ("speed_limit", "f8"),
         ("droop", "f8"),
         ("shared_supply", "f8"),
@@ -58,6 +59,7 @@ _PARAMETERS = np.dtype(
 
 _WHEEL = np.dtype(
     [
+        ("setpoint", "f8"),
         ("profile", "f8"),
         ("profile_rate", "f8"),
         ("error", "f8"),
@@ -161,6 +163,7 @@ def _parameter_record(p: PlantParameters, effects: HiddenEffects) -> npt.NDArray
         "smooth_deadband": effects.values("x_smooth_deadband")[0],
         "mean_to_yaw_rate": p.wheel_radius_m / p.axial_distance_m,
         "yaw_rate_limit": effects.values("yaw_rate_limit")[0],
+        "yaw_acceleration_limit": effects.values("yaw_acceleration_limit")[0],
         "speed_limit": effects.values("speed_limit")[0],
         "droop": effects.values("x_motor_droop")[0],
         "shared_supply": effects.values("x_shared_supply")[0],
@@ -203,6 +206,21 @@ def _handled(p: Any, left: float, right: float, now_s: float) -> tuple[float, fl
         right = math.copysign(max(abs(right) - taken_right, 0.0), right)
     supply = 1.0 - min(p["sag_per_s"] * now_s, LARGEST_SAG)
     return left * p["left_factor"] * supply, right * p["right_factor"] * supply
+
+
+@compiled
+def _setpoints(p: Any, wheels: Any, left: float, right: float, now_s: float, dt: float) -> tuple[float, float]:
+    """Setpoints of the motors from the commands, left and right: of the handled ones the turn follows as it may."""
+    left, right = _handled(p, left, right, now_s)
+    if not math.isinf(p["yaw_acceleration_limit"]):
+        most = 0.5 * p["yaw_acceleration_limit"] * dt / p["mean_to_yaw_rate"]
+        before = 0.5 * (wheels[1]["setpoint"] - wheels[0]["setpoint"])
+        mean = 0.5 * (left + right)
+        turn = before + min(max(0.5 * (right - left) - before, -most), most)
+        left, right = mean - turn, mean + turn
+    wheels[0]["setpoint"] = left
+    wheels[1]["setpoint"] = right
+    return left, right
 
 
 @compiled
@@ -269,6 +287,7 @@ def _run_free(p: Any, wheel: Any, brake: bool, load: float, dt: float) -> None:
     against = p["dry"] + (load if speed > 0.0 else -load)
     lost = max(against, 0.0) * dt / p["inertia"]
     wheel["profile"] = math.copysign(max(abs(speed) - lost, 0.0), speed)
+    wheel["setpoint"] = wheel["profile"]
     wheel["profile_rate"] = 0.0
     wheel["error"] = 0.0
     wheel["integral"] = 0.0
@@ -296,7 +315,7 @@ def _advance(
         cell = now_us // step_us
         end_us = min((cell + 1) * step_us, until_us)
         dt = (end_us - now_us) * 1e-6
-        references = _handled(p, left, right, now_us * 1e-6)
+        references = _setpoints(p, wheels, left, right, now_us * 1e-6, dt)
         scrub = 0.0
         if p["turning_load"] > 0.0:
             difference = wheels[1]["profile"] + wheels[1]["error"] - wheels[0]["profile"] - wheels[0]["error"]

@@ -110,6 +110,8 @@ def realistic(name: str, seed: int, share: float = 1.0) -> dict[str, float | tup
     if name in {"speed_limit", "yaw_rate_limit"}:
         top = 7.6 if name == "speed_limit" else 1.5
         return {name: top - share * (top - drawn["limit_rad_s"])}
+    if name == "yaw_acceleration_limit":
+        return {name: drawn["limit_rad_s2"] / share}
     if name == "x_slew_limited_motor":
         return {name: drawn["limit_rad_s2"]}
     if name == "x_second_order_motor":

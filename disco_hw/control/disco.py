@@ -149,7 +149,7 @@ class Disco:
         differing = {name for name, column in zip(self._model.parameter_names, theta.T, strict=True) if np.ptp(column)}
         wheel_effects = [s for s in self._model.effects if s.effect.channel is Channel.COMMAND_TO_WHEEL]
         names = {f"{setting.name}.{key}" for setting in wheel_effects for key in setting.values}
-        if any(setting.name == "yaw_rate_limit" for setting in wheel_effects):
+        if any(setting.name in ("yaw_rate_limit", "yaw_acceleration_limit") for setting in wheel_effects):
             names |= {"wheel_radius_m", "axial_distance_m"}
         return bool(names & differing)
 

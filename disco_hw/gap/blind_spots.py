@@ -10,14 +10,17 @@ from numpy.typing import NDArray
 
 from disco_hw.gap.candidates import CANDIDATES, candidates_of
 from disco_hw.gap.channels import Channel, WheelChannel
-from disco_hw.gap.fit import inverse, sensitivity
+from disco_hw.gap.fit import inverse, sensitivity, solve
 from disco_hw.gap.search import Found
 from disco_hw.model.effects import REGISTRY
 from disco_hw.model.parameter import Parameter
 
 Array = NDArray[np.float64]
 
-LIMITS = ("speed_limit", "yaw_rate_limit")
+_RAMP = "yaw_acceleration_limit"
+LIMITS = ("speed_limit", "yaw_rate_limit", _RAMP)
+_RAMPS_RAD_S2 = (20.0, 10.0, 7.0, 5.0, 3.5, 2.5, 1.5, 1.0, 0.5)
+_RESPONSE = ("motor_lag.tau_s", "command_delay.delay_s")
 # A limit shows only where more is asked: this share of what the robot can do, and no more turning than robots are
 # held to.
 _MOST_OF_IT = 0.75
@@ -48,7 +51,7 @@ def blind_spots(found: Found, top_rad_s: float | None = None) -> tuple[BlindSpot
     """
     channel = found.selector.channel
     missing = [name for name in candidates_of(channel.layout) if name not in found.names]
-    spots = [_limit(channel, name, top_rad_s) if name in LIMITS else _spot(found, name) for name in missing]
+    spots = [_limit(found, name, top_rad_s) if name in LIMITS else _spot(found, name) for name in missing]
     for spot in tuple(spots):
         for other, like in _EXACT_ALIKE.items():
             if spot.name == like:
@@ -77,9 +80,13 @@ def experiment_of(name: str) -> str:
     return f"disco-hw drive ROBOT.toml --script {effect.script}: {effect.excitation}"
 
 
-def _limit(channel: Channel, name: str, top_rad_s: float | None) -> BlindSpot:
-    wheels, parameter = channel.inner, REGISTRY[name].parameters[0]
+def _limit(found: Found, name: str, top_rad_s: float | None) -> BlindSpot:
+    wheels, parameter = found.selector.channel.inner, REGISTRY[name].parameters[0]
     assert isinstance(wheels, WheelChannel)
+    if name == _RAMP:
+        largest = _largest_ramp(found)
+        blind = largest is None or largest < _realistic(parameter)
+        return BlindSpot(name, parameter.name, parameter.unit, largest, blind, experiment_of(name))
     largest = _largest(wheels, name)
     enough = 0.0 if top_rad_s is None else _MOST_OF_IT * top_rad_s
     if name == "yaw_rate_limit":
@@ -100,6 +107,24 @@ def _largest(wheels: WheelChannel, name: str) -> float | None:
     if size.size < 200 or size.max() < 1e-3:
         return None
     return float(0.97 * np.sort(size)[-50])
+
+
+def _largest_ramp(found: Found) -> float | None:
+    """The largest limit of the yaw acceleration that would have shown, with a lag and a delay that may hide it."""
+    channel, best = found.selector.channel, found.fit
+    layout, limits = channel.layout, found.selector.thresholds
+    places = tuple(layout.place[name] for name in _RESPONSE if layout.place[name] not in best.active)
+    slope = np.column_stack([best.jacobian, sensitivity(channel, best.vector, places, best.residual)])
+    vector = best.vector.copy()
+    for limit in _RAMPS_RAD_S2:
+        vector[layout.place[f"{_RAMP}.{REGISTRY[_RAMP].parameters[0].name}"]] = limit
+        moved = channel.residual(vector) - best.residual
+        own = moved - slope @ solve(slope, slope.T @ moved)
+        enough = (limits.score + math.log(max(channel.count, 2))) * _USUAL_INFLATION
+        ahead_m = found.selector.moves(channel.split(best.vector), channel.split(vector))
+        if float(own @ own) > enough and ahead_m > limits.moves_m:
+            return limit
+    return None
 
 
 def _size(found: Found, name: str, column: str) -> float | None:

@@ -25,6 +25,7 @@ Starts = tuple[tuple[float, ...], ...]
 DECIDED_LATER = ("pose_offset", "encoder_scale")
 # What a patch of the floor looks like if it is left and not entered again.
 CHANGE = "surface_change"
+_RISES_S = (0.15, 0.5, 1.2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,6 +72,12 @@ def _below_largest(turning: bool) -> Callable[[Channel], Starts]:
     return starts
 
 
+def _slow_to_turn(channel: Channel) -> Starts:
+    """Limits of the yaw acceleration start where the fastest turn that was commanded takes a while."""
+    fastest = _below_largest(True)(channel)
+    return tuple((fastest[0][0] / rise_s,) for rise_s in _RISES_S) if fastest else ()
+
+
 def _stiction_values(channel: Channel) -> tuple[float, ...]:
     return tuple(np.arange(0.1, 2.05, 0.1).tolist())
 
@@ -91,6 +98,7 @@ _SPECIAL = (
     Candidate("stiction", (), None, Profile("stiction.threshold_rad_s", _stiction_values, 0.002)),
     Candidate("speed_limit", ("speed_limit.limit_rad_s",), _below_largest(False)),
     Candidate("yaw_rate_limit", ("yaw_rate_limit.limit_rad_s",), _below_largest(True)),
+    Candidate("yaw_acceleration_limit", ("yaw_acceleration_limit.limit_rad_s2",), _slow_to_turn),
     Candidate(
         "surface_change",
         ("surface_change.track", "surface_change.radius"),

@@ -24,7 +24,15 @@ Array = NDArray[np.float64]
 BASE_COUNT = len(BASE_PARAMETERS)
 
 # Difference steps by unit: well above rounding, well below what a log resolves.
-_STEPS: Mapping[str, float] = {"s": 2e-3, "rad/s": 2e-2, "m": 1e-4, "m/s": 1e-4, "rad": 1e-3, "1": 2e-4}
+_STEPS: Mapping[str, float] = {
+    "s": 2e-3,
+    "rad/s": 2e-2,
+    "rad/s^2": 1e-2,
+    "m": 1e-4,
+    "m/s": 1e-4,
+    "rad": 1e-3,
+    "1": 2e-4,
+}
 _OTHER_STEP = 1e-3
 # A host that stamps commands or encoders late shows as a negative delay; better told than hidden in noise.
 _EARLIEST_DELAY_S = -0.05

@@ -23,6 +23,7 @@ _RETURNS = {
     Stage.TURN: "turn",
     Stage.WORLD: "x, y",
 }
+_BOTH_RESPOND = "end_left, end_right, mean_left, mean_right"
 _ROLL = ("forward = base.half_radius_m * wheel_sum", "turn = base.half_turn_ratio * difference")
 
 
@@ -45,7 +46,7 @@ def _wheel_lines() -> list[str]:
     for name in _staged(_WHEELS):
         response = REGISTRY[name].stage is Stage.RESPONSE
         if "command" not in _asked(name):
-            lines.append(f"left, right = {_call(name)}")
+            lines.append(f"{_BOTH_RESPOND if response else 'left, right'} = {_call(name)}")
             continue
         for side in ("left", "right"):
             got = f"end_{side}, mean_{side}" if response else side

@@ -140,6 +140,18 @@ def lagged(theta: Theta, target: Any, speed: Any, step_s: float) -> tuple[Any, A
     return target + (speed - target) * left_at_end, target + (speed - target) * left_in_mean
 
 
+def turning_within_limits(theta: Theta, state: State, left: Any, right: Any, within_s: float) -> tuple[Any, Any]:
+    """Wheel speeds (rad/s) that the largest yaw acceleration reaches from the state's in this time."""
+    if "yaw_acceleration_limit.limit_rad_s2" not in theta:
+        return left, right
+    to_rate = theta["wheel_radius_m"] / theta["axial_distance_m"]
+    change = theta["yaw_acceleration_limit.limit_rad_s2"] * within_s
+    before = to_rate * (state.wheel_right - state.wheel_left)
+    rate = np.clip(to_rate * (right - left), before - change, before + change)
+    mean = (left + right) / 2.0
+    return mean - rate / to_rate / 2.0, mean + rate / to_rate / 2.0
+
+
 def body_velocity(
     theta: Theta, left: Any, right: Any, change: Any, step_s: float, time_s: float
 ) -> tuple[Any, Any, Any]:
@@ -183,6 +195,8 @@ def step(
     target_left, target_right = wheel_targets(theta, state, left, right, time_s)
     end_left, mean_left = lagged(theta, target_left, state.wheel_left, step_s)
     end_right, mean_right = lagged(theta, target_right, state.wheel_right, step_s)
+    end_left, end_right = turning_within_limits(theta, state, end_left, end_right, step_s)
+    mean_left, mean_right = turning_within_limits(theta, state, mean_left, mean_right, step_s / 2.0)
     change = (end_left + end_right) - (state.wheel_left + state.wheel_right)
     v, v_lateral, omega = body_velocity(theta, mean_left, mean_right, change, step_s, time_s)
 

@@ -42,6 +42,7 @@ FULL = {
     "stiction": {"threshold_rad_s": st.floats(0.0, 1.5)},
     "speed_limit": {"limit_rad_s": st.floats(2.0, 9.0)},
     "yaw_rate_limit": {"limit_rad_s": st.floats(0.3, 5.0)},
+    "yaw_acceleration_limit": {"limit_rad_s2": st.floats(0.5, 50.0)},
     "battery_sag": {"loss": st.floats(0.0, 0.5)},
     "wheel_gain": {"left": st.floats(-0.1, 0.1), "right": st.floats(-0.1, 0.1)},
     "wheel_radius_asymmetry": {"ratio": st.floats(-0.05, 0.05)},

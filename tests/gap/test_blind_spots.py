@@ -53,6 +53,24 @@ def test_a_drive_that_only_goes_straight_is_blind_to_slip_in_turns():
     assert not spots_of(channel)["turn_slip"].blind
 
 
+def test_how_fast_turning_speeds_up_shows_only_where_the_robot_is_asked_to_turn():
+    geometry = np.array(GEOMETRY)
+
+    def spot_at(*commands):
+        channel = WheelChannel.build(line_of(np.repeat(commands, 200, axis=0)), WheelNoise(), geometry)
+        found = Found(Selector(channel, wheel_moves(channel, geometry)), (), channel)
+        return {spot.name: spot for spot in blind_spots(found, 8.0)}["yaw_acceleration_limit"]
+
+    straight = spot_at(*[(0.0, 0.0), (5.0, 5.0), (-5.0, -5.0)] * 4)
+    assert straight.smallest_visible is None
+    assert straight.blind
+    gentle = spot_at(*[(4.0, 4.0), (3.9, 4.1), (4.1, 3.9)] * 4)
+    sharp = spot_at(*[(4.0, 4.0), (-4.0, 4.0), (4.0, -4.0)] * 4)
+    assert gentle.smallest_visible is None or gentle.smallest_visible < sharp.smallest_visible
+    assert not sharp.blind
+    assert "--script spins" in sharp.experiment
+
+
 def test_no_limit_shows_above_what_was_asked_of_the_robot():
     geometry = np.array(GEOMETRY)
 

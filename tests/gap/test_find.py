@@ -32,7 +32,14 @@ def test_nothing_is_missing_in_a_log_with_nothing_hidden():
     assert {spot.name for spot in report.blind_spots} >= {"turn_slip", "motor_lag", "pose_offset", "encoder_scale"}
 
 
-@pytest.mark.parametrize(("name", "size", "parameter"), [("motor_lag", 0.12, "tau_s"), ("turn_slip", 0.09, "k_s")])
+@pytest.mark.parametrize(
+    ("name", "size", "parameter"),
+    [
+        ("motor_lag", 0.12, "tau_s"),
+        ("turn_slip", 0.09, "k_s"),
+        ("yaw_acceleration_limit", 2.0, "limit_rad_s2"),
+    ],
+)
 def test_exactly_the_hidden_effect_is_named_and_the_gap_closes(name, size, parameter):
     report = report_of((name, size))
     assert [effect.name for effect in report.effects] == [name]

@@ -19,8 +19,8 @@ from disco_hw.model.free_run import FreeRun
 
 NAMES = {
     Channel.COMMAND_TO_WHEEL: {
-        "motor_lag", "command_delay", "deadband", "stiction", "speed_limit", "yaw_rate_limit", "battery_sag",
-        "wheel_gain",
+        "motor_lag", "command_delay", "deadband", "stiction", "speed_limit", "yaw_rate_limit",
+        "yaw_acceleration_limit", "battery_sag", "wheel_gain",
     },
     Channel.WHEEL_TO_BODY: {
         "encoder_scale", "wheel_radius_asymmetry", "turn_slip", "acceleration_slip", "side_slip", "lateral_icr",
@@ -59,6 +59,7 @@ def by_reference(effects, commands, start=(0.0, 0.0, 0.0, 0.0, 0.0), time_s=0.0)
 STRAIGHT = np.full((20, 2), 4.0)
 SPIN = np.tile([-4.0, 4.0], (20, 1))
 TURN = np.tile([2.0, 5.0], (20, 1))
+THERE_AND_BACK = np.repeat([[-3.0, 5.0], [5.0, -3.0]], 10, axis=0)
 START_STOP = np.repeat([[0.0, 0.0], [5.0, 5.0], [0.0, 0.0], [-3.0, -4.0]], 5, axis=0)
 
 
@@ -90,6 +91,7 @@ def test_effects_describe_themselves(effect):
         ("stiction", {"threshold_rad_s": 4.5}, START_STOP),
         ("speed_limit", {"limit_rad_s": 3.0}, START_STOP),
         ("yaw_rate_limit", {"limit_rad_s": 0.6}, SPIN),
+        ("yaw_acceleration_limit", {"limit_rad_s2": 2.0}, THERE_AND_BACK),
         ("battery_sag", {"loss": 0.5}, START_STOP),
         ("wheel_gain", {"left": -0.1, "right": 0.05}, TURN),
         ("wheel_radius_asymmetry", {"ratio": 0.03}, STRAIGHT),
@@ -123,6 +125,26 @@ def test_yaw_rate_limit_keeps_the_mean_and_cuts_the_turn():
     states = free_run({"yaw_rate_limit": {"limit_rad_s": 0.3}}, TURN)
     assert states[-1, 2] / 2.0 == pytest.approx(0.3)
     assert states[-1, 3:].mean() == pytest.approx(3.5)
+
+
+def test_yaw_acceleration_limit_keeps_the_mean_and_ramps_the_turn():
+    states = free_run({"yaw_acceleration_limit": {"limit_rad_s2": 2.0}}, THERE_AND_BACK)
+    rate = 0.06 * (states[:, 4] - states[:, 3]) / 0.4
+    np.testing.assert_allclose(rate[:7], 0.2 * np.arange(7), atol=1e-12)
+    np.testing.assert_allclose(rate[6:11], 1.2, atol=1e-12)
+    np.testing.assert_allclose(rate[10:], np.maximum(1.2 - 0.2 * np.arange(11), -1.2), atol=1e-12)
+    np.testing.assert_allclose(states[1:, 3:].mean(axis=1), 1.0, atol=1e-12)
+    # The turn of a ramp that is as long as six steps, with the speed reached exactly at its end.
+    assert states[6, 2] == pytest.approx(0.5 * 2.0 * 0.6**2)
+
+
+def test_yaw_acceleration_limit_comes_after_the_motors_lag():
+    both = {"motor_lag": {"tau_s": 0.1}, "yaw_acceleration_limit": {"limit_rad_s2": 2.0}}
+    got = free_run(both, THERE_AND_BACK)
+    np.testing.assert_allclose(got, by_reference(both, THERE_AND_BACK), atol=1e-9)
+    rate = 0.06 * (got[:, 4] - got[:, 3]) / 0.4
+    assert np.abs(np.diff(rate)).max() == pytest.approx(0.2)
+    assert 0.0 < 1.2 - rate[10] < 0.05
 
 
 def test_stiction_holds_a_wheel_at_rest_but_not_a_turning_one():

@@ -161,6 +161,26 @@ def test_the_yaw_rate_limit_cuts_the_turn_and_keeps_the_mean():
     assert steady(7.0, 7.0, yaw_rate_limit=1.0) == (7.0, 7.0)
 
 
+def test_the_yaw_acceleration_limit_ramps_the_turn_and_keeps_the_mean():
+    bench = Bench(IDEAL, yaw_acceleration_limit=2.0)
+    speeds = np.concatenate([bench.run(0.4, -1.0, 7.0), bench.run(0.4, 7.0, -1.0)])
+    yaw_rate = (speeds[:, 1] - speeds[:, 0]) * 0.061 / 0.415
+    t = np.arange(1, 401) * 1e-3
+    np.testing.assert_allclose(yaw_rate, np.concatenate([2.0 * t, 0.8 - 2.0 * t]), atol=1e-9)
+    np.testing.assert_allclose(speeds.mean(axis=1), 3.0, atol=1e-9)
+    assert steady(-1.0, 7.0, seconds=1.0, yaw_acceleration_limit=2.0) == pytest.approx((-1.0, 7.0))
+
+
+def test_the_turn_is_ramped_from_where_coasting_has_left_the_wheels():
+    bench = Bench(IDEAL, yaw_acceleration_limit=2.0)
+    bench.run(1.0, -4.0, 4.0)
+    left, right = bench.run(0.05, 0.0, 0.0, enabled=False)[-1]
+    before = right - left
+    left, right = bench.run(0.001, -4.0, 4.0)[-1]
+    assert right - left == pytest.approx(min(before + 2.0e-3 * 0.415 / 0.061, 8.0))
+    assert 1.0 < before < 8.0
+
+
 def test_the_battery_sags_linearly_with_time():
     bench = Bench(IDEAL, battery_sag=(0.1, 10.0))
     assert bench.run(5.0, 4.0, 4.0)[-1, 0] == pytest.approx(4.0 * 0.95, rel=1e-4)

@@ -25,12 +25,13 @@ class Stage(enum.Enum):
     """What of a step an effect's `term` changes, that is what it returns.
 
     A `term` names what it needs: of the wheels `left`, `right` (commands, rad/s) or `command` and `speed` of one wheel
-    at a time, `time_s`; of the body `wheel_sum`, `difference` (of right and left, rad/s), `change` (of the sum over the
-    step), `forward` (m/s), `turn` (half the yaw rate, rad/s), `time_s`; and `coefficients`, None where it is absent.
+    at a time, or what both do in the step, `end_left`, `end_right`, `mean_left`, `mean_right` from `wheel_left`,
+    `wheel_right`; of the body `wheel_sum`, `difference` (of right and left, rad/s), `change` (of the sum over the
+    step), `forward` (m/s), `turn` (half the yaw rate, rad/s); `time_s`; and `coefficients`, None where it is absent.
     """
 
     COMMAND = "the commands left and right, or the one of a wheel"
-    RESPONSE = "wheel speed at the end of the step and its mean"
+    RESPONSE = "wheel speed at the end of the step and its mean; of both wheels left and right, then the means"
     ROLLING = "wheel_sum and difference"
     VELOCITY = "forward and turn"
     FORWARD = "forward"
