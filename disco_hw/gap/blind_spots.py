@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.gap.candidates import CANDIDATES, candidates_of
-from disco_hw.gap.channels import Channel, WheelChannel
+from disco_hw.gap.channels import WheelChannel
 from disco_hw.gap.fit import inverse, sensitivity, solve
 from disco_hw.gap.search import Found
 from disco_hw.model.effects import REGISTRY

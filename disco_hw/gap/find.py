@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from disco_hw.gap.amend import amended_model
 from disco_hw.gap.candidates import candidates_of
+from disco_hw.gap.harmless import harmless, left_out
 from disco_hw.gap.layout import BASE_COUNT, BODY, WHEEL, Layout
 from disco_hw.gap.outcome import Outcome
 from disco_hw.gap.report import GapReport
@@ -57,7 +58,7 @@ def find_gap(
         blind_spots=outcome.blind_spots(effects),
         gap=gap,
         model=amended,
-        residue=outcome.residue(),
+        residue=(*left_out(outcome), *outcome.residue()),
         notes=(*log.notes, *notes, *remarks),
         candidates=outcome.candidates(),
         pictures=outcome.pictures(gap) if pictures else {},
@@ -72,7 +73,7 @@ def missing_effects(log: DriveLog, model: Model) -> tuple[str, ...]:
 
 
 def _searched(log: DriveLog, model: Model, say: Progress) -> tuple[Outcome, list[str]]:
-    """Both channels searched; and notes on what could not be judged."""
+    """Both channels searched, without what makes predictions worse; and notes on what could not be judged."""
     line = timeline(log)
     if not (line.has_poses or line.has_commands):
         raise LogError(
@@ -95,7 +96,7 @@ def _searched(log: DriveLog, model: Model, say: Progress) -> tuple[Outcome, list
         wheels = search_wheels(line, geometry, nominal_wheels, _given(model, WHEEL))
     else:
         notes.append("no commands: the way from command to wheel is not judged")
-    return Outcome(line, nominal_body, nominal_wheels, body, wheels), notes
+    return harmless(Outcome(line, nominal_body, nominal_wheels, body, wheels)), notes
 
 
 def _vector(layout: Layout, model: Model) -> Array:

@@ -26,7 +26,10 @@ _REACH_S = 0.3
 _SLOW_M_S = 0.02
 _TURNING_RAD_S = 0.3
 _SPEEDING_M_S2 = 0.25
+_FIXED_SIGMAS = 5.0
 _RESAMPLES = 400
+# Held-out errors scatter by some percent between equally good models.
+WORSE = 1.05
 _PATHS = 3
 
 
@@ -40,6 +43,11 @@ class Errors:
     yaw_ci: tuple[float, float]
     wheel_rad_s: float
     by_regime_m: dict[str, float]
+
+
+def worse_by(before: Errors, after: Errors) -> float:
+    """Ratio of errors after to before, the larger one of position and heading."""
+    return max(after.position_m / before.position_m, after.yaw_rad / before.yaw_rad)
 
 
 @dataclass(frozen=True)
@@ -172,7 +180,7 @@ def fold_vectors(found: Fit, block: Index, neutral: Array) -> dict[int, Array]:
     """For each of two interleaved folds the vector fitted on the other one's data, to second order.
 
     What the other one's data say next to nothing about is as in `neutral`: a limit that was reached, or a patch of the
-    floor that was crossed, in one fold only is not known in the other.
+    floor that was crossed, in one fold only is not known in the other, unless its few data fix the value by themselves.
     """
     fold = (block // _FOLD_BLOCKS) % 2
     if not found.active or np.unique(fold).size < 2:
@@ -183,6 +191,7 @@ def fold_vectors(found: Fit, block: Index, neutral: Array) -> dict[int, Array]:
     for held in (0, 1):
         vector = found.vector.copy()
         told = known(normal[1 - held], normal.sum(axis=0))
+        told |= np.diag(normal[1 - held]) * vector[active] ** 2 > _FIXED_SIGMAS**2
         vector[active[told]] -= inverse(normal[1 - held][np.ix_(told, told)]) @ gradient[1 - held][told]
         vector[active[~told]] = neutral[active[~told]]
         out[held] = vector

@@ -35,7 +35,7 @@ class Outcome:
     """What was found in the channels of one timeline; a channel that could not be judged is None.
 
     `nominal_body`, `nominal_wheels` are the vectors of the model as given; `top_rad_s` the robot's largest wheel speed,
-    if it is known.
+    if it is known; `harmful` what fits and was left out, as predictions are worse with it.
     """
 
     line: Timeline
@@ -44,6 +44,7 @@ class Outcome:
     body: Found | None
     wheels: Found | None
     top_rad_s: float | None = None
+    harmful: tuple[str, ...] = ()
 
     @cached_property
     def _estimates(self) -> tuple[Estimates | None, Estimates | None]:
@@ -160,6 +161,7 @@ class Outcome:
                     gain, score = promise + price, 2.0 * promise
                     enough = score > selector.thresholds.score
                     verdict = "moves a 2 s prediction too little, or in one stretch only" if enough else "not needed"
+                    verdict = "makes held-out predictions worse" if name in self.harmful else verdict
                 out.append(CandidateEvidence(REGISTRY[name].channel.value, name, gain, score, verdict))
         return tuple(sorted(out, key=lambda candidate: -candidate.score))
 
@@ -259,7 +261,37 @@ class Outcome:
         final = self._final_body[0]
         wheels = None if self.wheels is None else self.wheels.channel
         assert wheels is None or isinstance(wheels, WheelChannel)
-        poses = smoothed_poses(body, final.vector)
+        table = {
+            stage: per_horizon(lambda ahead_s, stage=stage: self.errors(stage, ahead_s))  # type: ignore[misc]
+            for stage in self._stages
+        }
+        whole = self._chain(final.vector, self.wheels.fit.vector if self.wheels else None)
+        table["floor"] = per_horizon(lambda ahead_s: floor_errors(body, wheels, whole, ahead_s, self._poses))
+        return table
+
+    def errors(self, stage: str, ahead_s: float) -> Errors:
+        """Errors of prediction of one stage, `nominal`, `refitted` or `amended`, on held-out data."""
+        assert self.body is not None
+        assert isinstance(self.body.channel, BodyChannel)
+        wheels = None if self.wheels is None else self.wheels.channel
+        assert wheels is None or isinstance(wheels, WheelChannel)
+        return errors_of(self.body.channel, wheels, self._stages[stage], ahead_s, self._poses)
+
+    @cached_property
+    def _poses(self) -> tuple[Array, Array]:
+        """Poses at all nodes, smoothed and not."""
+        assert self.body is not None
+        assert self._final_body is not None
+        assert isinstance(self.body.channel, BodyChannel)
+        return smoothed_poses(self.body.channel, self._final_body[0].vector)
+
+    @cached_property
+    def _stages(self) -> dict[str, dict[int, Chain]]:
+        """For each stage of the gap the chains of the two folds, each fitted on the other one's data."""
+        assert self.body is not None
+        assert self._final_body is not None
+        body, final = self.body.channel, self._final_body[0]
+        wheels = None if self.wheels is None else self.wheels.channel
         refitted = fold_vectors(self.body.base, body.block, self.body.selector.channel.neutral)
         amended = fold_vectors(final, body.block, self.body.selector.channel.neutral)
         wheels_base = {0: self.nominal_wheels, 1: self.nominal_wheels}
@@ -268,23 +300,16 @@ class Outcome:
             wheels_neutral = self.wheels.selector.channel.neutral
             wheels_base = fold_vectors(self.wheels.base, wheels.block, wheels_neutral)
             wheels_full = fold_vectors(self.wheels.fit, wheels.block, wheels_neutral)
-        whole = self._chain(final.vector, self.wheels.fit.vector if self.wheels else None)
 
         def chains(of_body: dict[int, Array], of_wheels: dict[int, Array]) -> dict[int, Chain]:
             return {held: self._chain(of_body[held], None if wheels is None else of_wheels[held]) for held in (0, 1)}
 
         nominal = {0: self.nominal_body, 1: self.nominal_body}
-        stages = {
+        return {
             "nominal": chains(nominal, {0: self.nominal_wheels, 1: self.nominal_wheels}),
             "refitted": chains(refitted, wheels_base),
             "amended": chains(amended, wheels_full),
         }
-        table = {
-            stage: per_horizon(lambda ahead_s, of=of: errors_of(body, wheels, of, ahead_s, poses))  # type: ignore[misc]
-            for stage, of in stages.items()
-        }
-        table["floor"] = per_horizon(lambda ahead_s: floor_errors(body, wheels, whole, ahead_s, poses))
-        return table
 
     def _chain(self, body: Array, wheels: Array | None) -> Chain:
         """A chain of two vectors; where it is the encoders that count wrong, the wheels turn as commanded."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from disco_hw.gap.blind_spots import BlindSpot
-from disco_hw.gap.held_out import Errors
+from disco_hw.gap.held_out import WORSE, Errors, worse_by
 from disco_hw.gap.intervals import Estimate
 from disco_hw.model import Model
 from disco_hw.model.effects import REGISTRY
@@ -14,8 +14,6 @@ from disco_hw.model.effects import REGISTRY
 REPORTED_HORIZON_S = 2.0
 STAGES = ("nominal", "refitted", "amended", "floor")
 ALL_IN_ONE = "separate"
-# Held-out errors scatter by some percent between equally good models.
-_WORSE = 1.05
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,7 +183,7 @@ class GapReport:
         if not self.gap:
             return False
         before, after = (self.gap[stage][REPORTED_HORIZON_S] for stage in ("refitted", "amended"))
-        return after.position_m > _WORSE * before.position_m or after.yaw_rad > _WORSE * before.yaw_rad
+        return worse_by(before, after) > WORSE
 
     @property
     def drive(self) -> str | None:
