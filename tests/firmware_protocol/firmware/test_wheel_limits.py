@@ -58,3 +58,8 @@ def test_largest_and_equal():
     assert lib.disco_wheels_equal(wheels(1.0, 2.0), wheels(1.0, 2.0))
     assert not lib.disco_wheels_equal(wheels(1.0, 2.0), wheels(2.0, 2.0))
     assert not lib.disco_wheels_equal(wheels(1.0, 2.0), wheels(1.0, 1.0))
+
+
+def test_approach_with_no_step_from_the_target_stays_and_is_a_number():
+    result = lib.disco_approach(wheels(1.0, -2.0), wheels(1.0, -2.0), 0.0)
+    assert (result.left, result.right) == (1.0, -2.0)
