@@ -36,7 +36,7 @@ BOUNDS = {
 FREE = {"board_id", "firmware_version", "capabilities", "dbc_hash", "protocol_major", "key"}
 
 
-def valid(**changes):
+def valid_with(**changes):
     bench = Bench(dataclasses.replace(CONFIG, **changes))
     assert bench.out.state == ("FAULT" if bench.out.fault == FAULTS["CONFIG_INVALID"] else "STANDBY")
     return bench.out.state == "STANDBY"
@@ -46,9 +46,20 @@ def test_every_field_is_bounded_or_free():
     assert {field.name for field in dataclasses.fields(FirmwareConfig)} == set(BOUNDS) | FREE
 
 
+# What has to be at least as large as another: without it that one's own bound would not be seen.
+ROOM = {
+    "command_timeout_s": {"drive_off_timeout_s": 2.0},
+    "host_state_timeout_s": {"host_forget_timeout_s": 60.0},
+}
+
+
 @pytest.mark.parametrize("name", BOUNDS)
 def test_bounds(name):
     low, high = BOUNDS[name]
+
+    def valid(**changes):
+        return valid_with(**ROOM.get(name, {}), **changes)
+
     assert valid(**{name: low})
     assert valid(**{name: high})
     if low > 0:
@@ -60,7 +71,12 @@ def test_bounds(name):
 @pytest.mark.parametrize("name", [name for name in BOUNDS if name.endswith(("rad_s", "rad_s2", "_v", "_a", "_c"))])
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_what_is_not_a_number_is_refused(name, value):
-    assert not valid(**{name: value})
+    assert not valid_with(**{name: value})
+
+
+def test_the_two_voltages_share_one_range():
+    assert valid_with(under_voltage_v=99.5, over_voltage_v=100.0)
+    assert not valid_with(under_voltage_v=99.5, over_voltage_v=99.4)
 
 
 def test_an_invalid_configuration_never_leaves_fault():

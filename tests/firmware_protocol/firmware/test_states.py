@@ -230,6 +230,30 @@ MAY_ARM = ("HOST_ACCEPTED", "HOST_QUALIFIED", "REQUEST_ARM", "CHALLENGE_ANSWERED
 NO_MOTION = ("FAULT", "ESTOP_INPUT", "HOST_FAULT")
 
 
+STOPS = [
+    *((state, "ESTOP_LATCHED", "ESTOP") for state in ALL_BUT_BOOT_AND_ESTOP),
+    *((state, "FAULT_LATCHED", "FAULT") for state in ("BOOT", "STANDBY", "READY", "ARMED", "STOPPING")),
+    *(
+        ("ARMED", name, "STOPPING")
+        for name in ("FAULT", "COMMANDS_DISQUALIFIED", "HOST_DISQUALIFIED", "COMMAND_EXPIRED", "COMMAND_TIMEOUT")
+    ),
+    *(("ARMED", name, "STOPPING") for name in ("HOST_FAULT", "HOST_SILENT", "SESSION_CHANGED", "REQUEST_STOP")),
+    ("STOPPING", "STOPPED", "STANDBY"),
+    ("STOPPING", "STOP_TIMEOUT", "STANDBY"),
+]
+
+
+@pytest.mark.parametrize(("state", "name", "to"), STOPS)
+def test_stopping_needs_nothing_but_its_reason(state, name, to):
+    assert next_state(state, condition(name)) == to
+    assert next_state(state, 0) == state
+
+
+def test_a_fault_is_left_by_a_reset_of_a_qualified_host_alone():
+    assert next_state("FAULT", condition("RESET") | condition("HOST_QUALIFIED")) == "STANDBY"
+    assert next_state("BOOT", condition("SELF_TEST_PASSED")) == "STANDBY"
+
+
 @pytest.mark.parametrize(("state", "to", "needs"), [("STANDBY", "READY", MAY_READY), ("READY", "ARMED", MAY_ARM)])
 def test_motion_needs_every_proof(state, to, needs):
     complete = sum(condition(name) for name in needs)
