@@ -62,7 +62,7 @@ class Control(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
 
     rate_hz: Annotated[float, Meta(ge=20.0, le=100.0)] = 50.0
     mode: Literal["default", "paper"] = "default"
-    uncertainty: Literal["ut", "mc", "point"] = "ut"
+    uncertainty: Literal["ut", "mc", "joint", "point"] = "ut"
     samples: Annotated[int, Meta(ge=8, le=1_000_000)] = 400
     horizon: Annotated[int, Meta(ge=2, le=500)] = 50
     step_s: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.1
@@ -107,7 +107,27 @@ class PathTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     points: tuple[Point, ...] = ()
 
 
-RobotTask = CircleTask | PathTask
+class TimedPathTask(
+    msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, tag="timed_path", tag_field="kind"
+):
+    """Follow way-points by time: be at each when its time has come, counted from the start of the task, to the last.
+
+    `path`: CSV with columns t_s (s), x_m, y_m (m, world frame), relative to robot.toml. `points` and `times_s` are what
+    `load_setup` has read from it; no fields of robot.toml.
+    """
+
+    path: Annotated[str, Meta(min_length=1)]
+    points: tuple[Point, ...] = ()
+    times_s: tuple[float, ...] = ()
+
+    @property
+    def speed_m_s(self) -> float:
+        """The fastest that the times ask for, straight from one way-point to the next; 0 before they are read."""
+        ways = zip(self.points, self.points[1:], self.times_s, self.times_s[1:], strict=False)
+        return max((math.dist(here, there) / (then - now) for here, there, now, then in ways), default=0.0)
+
+
+RobotTask = CircleTask | PathTask | TimedPathTask
 
 
 class ModelFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -189,8 +209,9 @@ def _with_kind_of_task(path: Path, raw: dict[str, Any]) -> dict[str, Any]:
     task = raw.get("task")
     if not isinstance(task, dict):
         return raw
-    if "points" in task:
-        raise ConfigError(f"{path}: [task] points: no such field; write way-points in a CSV and name it in path")
+    for name in ("points", "times_s"):
+        if name in task:
+            raise ConfigError(f"{path}: [task] {name}: no such field; write way-points in a CSV and name it in path")
     return {**raw, "task": {"kind": "path" if "path" in task else "circle", **task}}
 
 

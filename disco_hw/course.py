@@ -16,6 +16,7 @@ Array = NDArray[np.float64]
 _PIECE_M = 0.05
 _NEAREST = 4
 _NO_LENGTH_M2 = 1e-18
+_ELSEWHERE_M = 1e-6
 
 
 class Course(Protocol):
@@ -133,9 +134,11 @@ class PathCourse:
 
     @property
     def start(self) -> tuple[float, float, float]:
-        """The first way-point, facing the second."""
-        (x, y), (next_x, next_y) = self.points_m[:2].tolist()
-        return x, y, math.atan2(next_y - y, next_x - x)
+        """The first way-point, facing the next that is elsewhere."""
+        x, y = self.points_m[0].tolist()
+        away = self.points_m - self.points_m[0]
+        to_x, to_y = away[int(np.argmax(np.hypot(away[:, 0], away[:, 1]) > _ELSEWHERE_M))].tolist()
+        return x, y, math.atan2(to_y, to_x)
 
     def outline_m(self) -> Array:
         """The way-points."""

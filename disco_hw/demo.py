@@ -52,8 +52,8 @@ def run_demo(options: DemoOptions) -> CircleReport:
     """
     if options.link not in {"can", "serial"}:
         raise InputError(f"--link {options.link}: no such link; write can or serial")
-    if options.uncertainty not in {"ut", "mc", "point"}:
-        raise InputError(f"--uncertainty {options.uncertainty}: no such choice; write ut, mc or point")
+    if options.uncertainty not in {"ut", "mc", "joint", "point"}:
+        raise InputError(f"--uncertainty {options.uncertainty}: no such choice; write ut, mc, joint or point")
     options.out.mkdir(parents=True, exist_ok=True)
     console = Console(stderr=not options.show_progress)
     with tempfile.TemporaryDirectory(prefix="disco-hw-demo-") as scratch:

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import msgspec
 
-from disco_hw.config import PathTask, RobotConfig, load_robot_config
+from disco_hw.config import CircleTask, PathTask, Point, Robot, RobotConfig, TimedPathTask, load_robot_config
 from disco_hw.errors import InputError
 from disco_hw.model import Model, load_model
-from disco_hw.waypoints import way_points_to_follow
+from disco_hw.waypoints import Waypoints, way_points_to_follow, way_points_to_meet
 from drivers.key_file import KeyFileError, read_key_file
 
 LINK_KINDS = ("can", "serial")
@@ -34,11 +34,11 @@ def load_setup(robot: Path, model: Path | None = None, link: str | None = None, 
     Raises InputError.
     """
     config = load_robot_config(robot)
-    if isinstance(config.task, PathTask):
-        path_file = path_file or robot.parent / config.task.path
-        config = msgspec.structs.replace(config, task=with_way_points(config.task, path_file))
-    else:
+    if isinstance(config.task, CircleTask):
         path_file = None
+    else:
+        path_file = path_file or robot.parent / config.task.path
+        config = msgspec.structs.replace(config, task=with_way_points(config.task, path_file, config.robot))
     if link is not None:
         if link not in LINK_KINDS:
             raise InputError(f"--link {link}: no such kind of link; write one of {', '.join(LINK_KINDS)}")
@@ -50,10 +50,17 @@ def load_setup(robot: Path, model: Path | None = None, link: str | None = None, 
     return Setup(robot, model_file, path_file, config, loaded)
 
 
-def with_way_points(task: PathTask, path_file: Path) -> PathTask:
+def with_way_points(task: PathTask | TimedPathTask, path_file: Path, robot: Robot) -> PathTask | TimedPathTask:
     """The task with the way-points of a CSV; raises InputError naming file, line and remedy."""
-    points = tuple((float(x), float(y)) for x, y in way_points_to_follow(path_file).places_m.tolist())
-    return msgspec.structs.replace(task, points=points)
+    if isinstance(task, PathTask):
+        return msgspec.structs.replace(task, points=_points(way_points_to_follow(path_file)))
+    found = way_points_to_meet(path_file, robot.max_wheel_speed_rad_s * robot.wheel_radius_m)
+    assert found.times_s is not None, "they are refused without"
+    return msgspec.structs.replace(task, points=_points(found), times_s=tuple(found.times_s.tolist()))
+
+
+def _points(waypoints: Waypoints) -> tuple[Point, ...]:
+    return tuple((float(x), float(y)) for x, y in waypoints.places_m.tolist())
 
 
 def refuse_missing_effects(setup: Setup) -> None:

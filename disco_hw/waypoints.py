@@ -21,10 +21,14 @@ MOST_POINTS = 10_000
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Waypoints:
-    """Places (N, 2) in the world frame (m) and times (N,) from the start (s), or None."""
+    """Places (N, 2) in the world frame (m) and times (N,) from the start (s), or None.
+
+    `lines`: where in their file they are, if they are from one.
+    """
 
     places_m: Array
     times_s: Array | None = None
+    lines: tuple[int, ...] = ()
 
 
 def load_waypoints(path: Path) -> Waypoints:
@@ -62,7 +66,7 @@ def load_waypoints(path: Path) -> Waypoints:
     elif np.any(np.diff(times) <= 0.0):
         line = lines[int(np.argmax(np.diff(times) <= 0.0)) + 1]
         raise InputError(f"{path}: line {line}: t_s does not increase; sort the way-points by time")
-    return Waypoints(places, times)
+    return Waypoints(places, times, tuple(lines))
 
 
 def way_points_to_follow(path: Path) -> Waypoints:
@@ -73,13 +77,50 @@ def way_points_to_follow(path: Path) -> Waypoints:
     """
     found = load_waypoints(path)
     if found.times_s is not None:
-        raise InputError(f"{path}: line 1: column t_s: the robot follows at task.speed_m_s; remove the column")
+        raise InputError(
+            f"{path}: line 1: column t_s: the robot follows at task.speed_m_s; remove the column, or follow it by time "
+            'with kind = "timed_path" in [task]'
+        )
+    _check_size(path, found)
+    return found
+
+
+def way_points_to_meet(path: Path, fastest_m_s: float) -> Waypoints:
+    """The way-points of a CSV that a robot is to be at when their times have come.
+
+    Raises InputError as `way_points_to_follow`, but for a missing column of times; for a first time before the start;
+    and for way-points that are further apart than the robot can drive between their times at `fastest_m_s`.
+    """
+    found = load_waypoints(path)
+    times = found.times_s
+    if times is None:
+        raise InputError(
+            f"{path}: line 1: column t_s: missing; add the times in s from the start of the task, or follow the path "
+            'at task.speed_m_s with kind = "path" in [task]'
+        )
+    if times[0] < 0.0:
+        raise InputError(f"{path}: line {found.lines[0]}: t_s: {times[0]:g} is before the start; begin at 0 or later")
+    _check_size(path, found)
+    way_m = np.hypot(*np.diff(found.places_m, axis=0).T)
+    late = way_m > fastest_m_s * np.diff(times)
+    if late.any():
+        at = int(np.argmax(late)) + 1
+        soonest_s = math.ceil(1e3 * (times[at - 1] + way_m[at - 1] / fastest_m_s)) / 1e3
+        raise InputError(
+            f"{path}: line {found.lines[at]}: t_s: {way_m[at - 1]:g} m from line {found.lines[at - 1]} in "
+            f"{times[at] - times[at - 1]:g} s, and the wheels can do {fastest_m_s:.3g} m/s; be there at {soonest_s:g} "
+            "or later"
+        )
+    return found
+
+
+def _check_size(path: Path, found: Waypoints) -> None:
+    """Refuse more way-points, and a shorter or longer path, than can be followed."""
     if len(found.places_m) > MOST_POINTS:
         raise InputError(f"{path}: {len(found.places_m)} way-points; write at most {MOST_POINTS}")
     length_m = float(np.hypot(*np.diff(found.places_m, axis=0).T).sum())
     if not SHORTEST_M <= length_m <= LONGEST_M:
         raise InputError(f"{path}: {length_m:g} m long; between {SHORTEST_M:g} and {LONGEST_M:g} m can be followed")
-    return found
 
 
 def _number(path: Path, line: int, name: str, text: str | None) -> float:

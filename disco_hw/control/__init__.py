@@ -7,6 +7,7 @@ from disco_hw.control.tasks.circle import Circle
 from disco_hw.control.tasks.of_robot import task_of_robot
 from disco_hw.control.tasks.path import Path
 from disco_hw.control.tasks.task import Task
+from disco_hw.control.tasks.timed_path import TimedPath
 
 __all__ = [
     "Circle",
@@ -22,6 +23,7 @@ __all__ = [
     "Sampler",
     "SentCommand",
     "Task",
+    "TimedPath",
     "WheelLimits",
     "task_of_robot",
 ]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 U = np.uintp
 BLOCK = U(80)
 
-STATE_ROWS = 25
+STATE_ROWS = 55
 
 _CACHE_LINE = 64
 

@@ -296,13 +296,12 @@ class Disco:
         return np.asarray(states[-1])
 
     def _system(self, state: PlannerState, start: Array, t0_ns: int, task_s: float, elapsed_s: float) -> SkidSteer:
-        origin_x, origin_y = self._task.origin_m
         x, y, yaw, left, right = start.tolist()
-        task, self._memory = self._task.terms(
+        task, (origin_x, origin_y), begin, self._memory = self._task.prepare(
             task_s, x, y, self._memory, self._settings.step_s, self._settings.sampler.horizon
         )
         direction = (math.cos(yaw), math.sin(yaw)) if math.isfinite(yaw) else (math.nan, math.nan)
-        self._start[:] = (x - origin_x, y - origin_y, *direction, left, right, elapsed_s, self._memory)
+        self._start[:] = (x - origin_x, y - origin_y, *direction, left, right, elapsed_s, begin)
         if self._history:
             self._past = past_commands(state.sent, t0_ns, self._settings.step_s, self._history, (left, right))
             self._optimiser.set_past(self._past)

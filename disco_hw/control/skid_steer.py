@@ -11,10 +11,18 @@ from typing import Any, NamedTuple
 
 from disco_hw.control.blocks import BLOCK, U
 from disco_hw.control.rollout import roll_block
-from disco_hw.control.tasks.terms import has_memory, stage_cost, terminal_cost
+from disco_hw.control.tasks.terms import follow, has_memory, looks_up, row_of, stage_cost, table_of, terminal_cost
 from disco_hw.model.compose import needs_change, wheels_follow
 from disco_hw.model.effects import command_delay
-from disco_hw.model.jit import block_function, cast_like, scalar_function, specialise, tune_loops
+from disco_hw.model.jit import (
+    bits_of_float,
+    block_function,
+    cast_like,
+    float_from_bits,
+    scalar_function,
+    specialise,
+    tune_loops,
+)
 from disco_hw.model.step import axle_of, body_step, integration_from, tracked_of, wheel_step
 from disco_hw.model.tables import base_point, effect_point, lane_base, lane_effects
 
@@ -22,8 +30,9 @@ from disco_hw.model.tables import base_point, effect_point, lane_base, lane_effe
 # rows for what differs between points that share the axle's motion.
 _AXLE_X, _AXLE_Y, _COS, _SIN, _FORWARD = (U(row) * BLOCK for row in range(5))
 _LEFT, _RIGHT = U(0) * BLOCK, BLOCK
-_OWN, _TWIN0, _TWIN1, _TWIN2, _TWIN3 = (U(row) * BLOCK for row in (5, 9, 13, 17, 21))
-_X, _Y, _MEMORY, _TOTAL = (U(row) * BLOCK for row in range(4))
+_OWN, _TWIN0, _TWIN1, _TWIN2, _TWIN3 = (U(row) * BLOCK for row in (5, 15, 25, 35, 45))
+_X, _Y, _MEMORY, _TOTAL, _KEPT, _ROW, _FOUND = (U(row) * BLOCK for row in range(7))
+_COLUMNS = U(4)
 _CHANNELS = 2
 # The wheels' motion: for every step a row of their sum and one of right minus left; then a row of the sum's change.
 _SUM, _DIFFERENCE = U(0) * BLOCK, BLOCK
@@ -111,12 +120,75 @@ def _move(state: Any, b: Any, rolling: Any, time_s: Any, base: Any, effects: Any
 
 
 @scalar_function
-def _begin(state: Any, own: Any, b: Any, start: Any) -> None:
+def _begin(state: Any, own: Any, b: Any, start: Any, task: Any) -> None:
     """Set the rows from `own` on to the start."""
     state[own + _X + b] = start[0]
     state[own + _Y + b] = start[1]
     state[own + _MEMORY + b] = start[7]
     state[own + _TOTAL + b] = cast_like(0.0, start[0])
+    _remember(looks_up(task), state, own, b, start[7], task)
+
+
+@scalar_function
+def _found(looks: Any, state: Any, own: Any, b: Any) -> Any:
+    """What sample b has kept and found in the task's table, in the rows from `own` on; zeros without a table."""
+    if looks is None:
+        zero = cast_like(0.0, state[own])
+        return zero, zero, zero, zero, zero
+    at = own + _FOUND + _COLUMNS * b
+    return state[own + _KEPT + b], state[at], state[at + U(1)], state[at + U(2)], state[at + U(3)]
+
+
+@scalar_function
+def _remember(looks: Any, state: Any, own: Any, b: Any, memory: Any, task: Any) -> None:
+    """Set the memory of sample b, and where to look up for it, in bits; nothing without a table."""
+    if looks is None:
+        return
+    state[own + _MEMORY + b] = memory
+    state[own + _ROW + b] = float_from_bits(row_of(task, memory))
+
+
+@scalar_function
+def _follow(
+    looks: Any, state: Any, own: Any, b: Any, axle_x: Any, axle_y: Any, forward: Any, base: Any, task: Any
+) -> None:  # fmt: skip
+    """Move the memory of sample b on by the step that it has just made; nothing without a table."""
+    if looks is None:
+        return
+    x, y = tracked_of(axle_x, axle_y, state[_COS + b], state[_SIN + b], base)
+    found = _found(looks, state, own, b)
+    memory, state[own + _KEPT + b] = follow(task, state[own + _MEMORY + b], x, y, forward, found)
+    _remember(looks, state, own, b, memory, task)
+
+
+@scalar_function
+def _look_up(table: Any, state: Any, own: Any) -> None:
+    """Copy every sample's row of the table to the rows from `own` on: apart, as no compiler makes vectors of it.
+
+    A sample's four numbers stay together, and are all read before the first is written: one load and one store.
+    """
+    for b in range(BLOCK):
+        row, at = _COLUMNS * U(bits_of_float(state[own + _ROW + b])), own + _FOUND + _COLUMNS * b
+        first, second, third, fourth = table[row], table[row + U(1)], table[row + U(2)], table[row + U(3)]
+        state[at] = first
+        state[at + U(1)] = second
+        state[at + U(2)] = third
+        state[at + U(3)] = fourth
+
+
+@scalar_function
+def _look_ups(looks: Any, state: Any, ahead: Any, scaled: Any, task: Any) -> None:
+    """Look up for a point and its twins; nothing without a table."""
+    if looks is None:
+        return
+    table = table_of(task)
+    _look_up(table, state, _OWN)
+    if ahead is not None:
+        _look_up(table, state, _TWIN0)
+        _look_up(table, state, _TWIN1)
+    if scaled is not None:
+        _look_up(table, state, _TWIN2)
+        _look_up(table, state, _TWIN3)
 
 
 @scalar_function
@@ -127,8 +199,9 @@ def _cost(
     cos_yaw, sin_yaw = state[_COS + b], state[_SIN + b]
     x, y = tracked_of(axle_x, axle_y, cos_yaw, sin_yaw, base)
     cost, memory = stage_cost(
-        task, state[own + _MEMORY + b], t, state[own + _X + b], state[own + _Y + b], x, y, cos_yaw, sin_yaw, forward
-    )
+        task, state[own + _MEMORY + b], t, state[own + _X + b], state[own + _Y + b], x, y, cos_yaw, sin_yaw, forward,
+        _found(looks_up(task), state, own, b),
+    )  # fmt: skip
     state[own + _TOTAL + b] += cost
     if has_memory(task):
         state[own + _MEMORY + b] = memory
@@ -138,13 +211,41 @@ def _cost(
 
 
 @scalar_function
-def _twin_cost(state: Any, own: Any, b: Any, t: int, base: Any, twin: Any, start: Any, task: Any, last: Any) -> None:
-    """As `_cost`, for a twin of the point `base`: its axle draws the same path from another place, at another scale."""
+def _twin_axle(state: Any, b: Any, base: Any, twin: Any, start: Any) -> Any:
+    """Axle and forward speed of a twin of the point `base`: the same path from another place, at another scale."""
     scale = twin.half_radius_m / base.half_radius_m
     ahead, stays = twin.x_icr_m - scale * base.x_icr_m, cast_like(1.0, scale) - scale
     axle_x = scale * state[_AXLE_X + b] + (stays * start[0] + ahead * start[2])
     axle_y = scale * state[_AXLE_Y + b] + (stays * start[1] + ahead * start[3])
-    _cost(state, own, b, t, axle_x, axle_y, scale * state[_FORWARD + b], twin, task, last)
+    return axle_x, axle_y, scale * state[_FORWARD + b]
+
+
+@scalar_function
+def _twin_cost(state: Any, own: Any, b: Any, t: int, base: Any, twin: Any, start: Any, task: Any, last: Any) -> None:
+    """As `_cost`, for a twin of the point `base`."""
+    axle_x, axle_y, forward = _twin_axle(state, b, base, twin, start)
+    _cost(state, own, b, t, axle_x, axle_y, forward, twin, task, last)
+
+
+@scalar_function
+def _twin_follow(looks: Any, state: Any, own: Any, b: Any, base: Any, twin: Any, start: Any, task: Any) -> None:
+    """As `_follow`, for a twin of the point `base`."""
+    if looks is None:
+        return
+    axle_x, axle_y, forward = _twin_axle(state, b, base, twin, start)
+    _follow(looks, state, own, b, axle_x, axle_y, forward, twin, task)
+
+
+@scalar_function
+def _follows(looks: Any, state: Any, b: Any, base: Any, ahead: Any, scaled: Any, start: Any, task: Any) -> None:
+    """Move the memories of a point and its twins on."""
+    _follow(looks, state, _OWN, b, state[_AXLE_X + b], state[_AXLE_Y + b], state[_FORWARD + b], base, task)
+    if ahead is not None:
+        _twin_follow(looks, state, _TWIN0, b, base, ahead[0], start, task)
+        _twin_follow(looks, state, _TWIN1, b, base, ahead[1], start, task)
+    if scaled is not None:
+        _twin_follow(looks, state, _TWIN2, b, base, scaled[0], start, task)
+        _twin_follow(looks, state, _TWIN3, b, base, scaled[1], start, task)
 
 
 @scalar_function
@@ -165,8 +266,9 @@ def _end(costs: Any, at: Any, state: Any, own: Any, task: Any) -> None:
     tune_loops()
     for b in range(BLOCK):
         costs[at + b] = state[own + _TOTAL + b] + terminal_cost(
-            task, state[own + _MEMORY + b], state[own + _X + b], state[own + _Y + b], state[_COS + b], state[_SIN + b]
-        )
+            task, state[own + _MEMORY + b], state[own + _X + b], state[own + _Y + b], state[_COS + b], state[_SIN + b],
+            _found(looks_up(task), state, own, b),
+        )  # fmt: skip
 
 
 @block_function
@@ -186,11 +288,12 @@ def _roll(
         state[_AXLE_X + b], state[_AXLE_Y + b] = axle_of(x, y, cos_yaw, sin_yaw, lane_base(base, at + b))
         state[_COS + b] = cos_yaw
         state[_SIN + b] = sin_yaw
-        _begin(state, _OWN, b, start)
-        _begin(state, _TWIN0, b, start)
-        _begin(state, _TWIN1, b, start)
-        _begin(state, _TWIN2, b, start)
-        _begin(state, _TWIN3, b, start)
+        _begin(state, _OWN, b, start, task)
+        _begin(state, _TWIN0, b, start, task)
+        _begin(state, _TWIN1, b, start, task)
+        _begin(state, _TWIN2, b, start, task)
+        _begin(state, _TWIN3, b, start, task)
+    _look_ups(looks_up(task), state, ahead, scaled, task)
     for t in range(horizon):
         time_s = start[6] + cast_like(t, x) * integration.step_s
         if t == 0:
@@ -199,6 +302,7 @@ def _roll(
                 _move(
                     state, b, _rolling(wheels, t, b, commands, late, horizon, acting), time_s, here, acting, integration
                 )  # fmt: skip
+                _follows(looks_up(task), state, b, here, ahead, scaled, start, task)
         else:
             for b in range(BLOCK):
                 here, acting = lane_base(base, at + b), lane_effects(effects, at + b)
@@ -206,6 +310,8 @@ def _roll(
                 _move(
                     state, b, _rolling(wheels, t, b, commands, late, horizon, acting), time_s, here, acting, integration
                 )  # fmt: skip
+                _follows(looks_up(task), state, b, here, ahead, scaled, start, task)
+        _look_ups(looks_up(task), state, ahead, scaled, task)
     for b in range(BLOCK):
         _costs(state, b, horizon - 1, lane_base(base, at + b), ahead, scaled, start, task, True)
     # One after the other: a loop that wrote to all at once would not be vectorised.

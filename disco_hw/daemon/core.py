@@ -217,7 +217,7 @@ class DaemonCore:
 
     def _follow_progress(self, output: Output, result: Tick) -> None:
         if output.running:
-            self.progress.add(result.estimate.x_m, result.estimate.y_m)
+            self.progress.add(result.t_ns, result.estimate.x_m, result.estimate.y_m)
         else:
             self.progress.pause()
 

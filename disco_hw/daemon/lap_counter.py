@@ -26,7 +26,7 @@ class LapCounter:
         """Never: a circle has no end."""
         return False
 
-    def add(self, x_m: float, y_m: float) -> None:
+    def add(self, _now_ns: int, x_m: float, y_m: float) -> None:
         """Take in the position of one tick; the first one after a pause starts a new count."""
         angle = math.atan2(y_m - self._task.center_y_m, x_m - self._task.center_x_m)
         if self._paused or self._last_rad is None:

@@ -10,7 +10,7 @@ from typing import Any
 
 import msgspec
 
-from disco_hw.config import CircleTask, PathTask, Point, Robot, RobotTask
+from disco_hw.config import CircleTask, PathTask, Point, Robot, RobotTask, TimedPathTask
 from disco_hw.course import course_of
 from disco_hw.daemon.states import State
 from disco_hw.log import records
@@ -22,6 +22,7 @@ _FASTEST_M_S = 100.0
 FIELDS = {
     CircleTask: ("radius_m", "speed_m_s", "center_x_m", "center_y_m"),
     PathTask: ("speed_m_s",),
+    TimedPathTask: (),
 }
 """What can be changed of each kind of task."""
 _LOCKED = frozenset({State.ARMED, State.STOPPING})
@@ -40,6 +41,8 @@ def changed_task(task: RobotTask, asked: Mapping[str, Any], robot: Robot, state:
     if state in _LOCKED:
         raise TaskRefused(f"the task can be changed while the robot is disarmed, and it is {state.name}; disarm first")
     fields = FIELDS[type(task)]
+    if not fields:
+        raise TaskRefused("the way-points have times, which say all; change t_s in their CSV and start anew")
     unknown = sorted(set(asked) - set(fields))
     if unknown or not asked:
         raise TaskRefused(f"give one or more of {', '.join(fields)}" + (f", not {unknown[0]}" if unknown else ""))
@@ -86,29 +89,34 @@ def in_words(task: RobotTask) -> str:
     if isinstance(task, CircleTask):
         centre = f"({task.center_x_m:g}, {task.center_y_m:g}) m"
         return f"circle of {task.radius_m:g} m about {centre} at {task.speed_m_s:g} m/s"
-    return f"path {task.path} of {course_of(task).length_m:.2f} m at {task.speed_m_s:g} m/s"
+    path = f"path {task.path} of {course_of(task).length_m:.2f} m"
+    if isinstance(task, TimedPathTask):
+        return f"{path} in {task.times_s[-1]:g} s, at most {task.speed_m_s:.3g} m/s"
+    return f"{path} at {task.speed_m_s:g} m/s"
 
 
 def asked_of(task: RobotTask) -> dict[str, Any]:
     """The task as the daemon's status tells it: a path by its file's name and a digest of its way-points."""
     if isinstance(task, CircleTask):
         return dict(msgspec.to_builtins(task))
-    return {"kind": "path", "path": task.path, "speed_m_s": task.speed_m_s, "digest": digest_of(task.points)}
+    if isinstance(task, PathTask):
+        return {"kind": "path", "path": task.path, "speed_m_s": task.speed_m_s, "digest": digest_of(task.points, ())}
+    return {"kind": "timed_path", "path": task.path, "digest": digest_of(task.points, task.times_s)}
 
 
 def told_task(asked: Mapping[str, Any], robots: RobotTask) -> RobotTask | None:
     """The task that `asked_of` told of; None for a path with other way-points than those in `robots`, robot.toml's."""
     if asked["kind"] == "circle":
         return msgspec.convert(asked, CircleTask)
-    if not isinstance(robots, PathTask) or asked["digest"] != digest_of(robots.points):
+    if asked_of(robots).get("digest") != asked["digest"]:
         return None
-    return msgspec.structs.replace(robots, speed_m_s=asked["speed_m_s"])
+    return msgspec.structs.replace(robots, speed_m_s=asked["speed_m_s"]) if isinstance(robots, PathTask) else robots
 
 
 @lru_cache(maxsize=4)
-def digest_of(points: tuple[Point, ...]) -> str:
+def digest_of(points: tuple[Point, ...], times_s: tuple[float, ...]) -> str:
     """A few letters that are the same for the same way-points only."""
-    return hashlib.sha256(msgspec.json.encode(points)).hexdigest()[:16]
+    return hashlib.sha256(msgspec.json.encode((points, times_s))).hexdigest()[:16]
 
 
 def record_of(t_ns: int, task: RobotTask) -> records.Task:
@@ -121,7 +129,7 @@ def record_of(t_ns: int, task: RobotTask) -> records.Task:
 def task_of(record: records.Task, robots: RobotTask) -> RobotTask:
     """The task that a record tells of; of a path it tells the speed, and the rest is that of `robots`, robot.toml's."""
     if record.kind == "path":
-        return msgspec.structs.replace(robots, speed_m_s=record.speed_m_s)
+        return msgspec.structs.replace(robots, speed_m_s=record.speed_m_s) if isinstance(robots, PathTask) else robots
     return CircleTask(
         center_x_m=record.center_x_m,
         center_y_m=record.center_y_m,

@@ -140,6 +140,13 @@ def quick_norm_and_inverse(x: Any, y: Any) -> Any:
 
 
 @scalar_function
+def quick_length(x: Any, y: Any, z: Any) -> Any:
+    """Length of a vector of three, as of `quick_norm_and_inverse`."""
+    square = x * x + (y * y + (z * z + cast_like(1e-30, x)))
+    return square * (cast_like(1.0, x) / math.sqrt(square))
+
+
+@scalar_function
 def quick_norm(x: Any, y: Any) -> Any:
     """Length of a vector, as of `quick_norm_and_inverse`."""
     norm, _ = quick_norm_and_inverse(x, y)

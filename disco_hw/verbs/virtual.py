@@ -23,7 +23,7 @@ def demo(
     out: Annotated[Path, typer.Option(help="Directory for the log, the picture and the figures.")] = Path("out/demo"),
     laps: Annotated[float, typer.Option(min=0.5, max=100.0, help="Laps to drive.")] = 1.5,
     plant_seed: Annotated[int, typer.Option(min=0, help="Seed of the virtual robot's true parameters.")] = 1,
-    uncertainty: Annotated[str, typer.Option(help="ut, mc or point.")] = "ut",
+    uncertainty: Annotated[str, typer.Option(help="ut, mc, joint or point.")] = "ut",
     view: View = False,
     adapt: Annotated[bool, typer.Option("--adapt", help="Learn the geometry on the way (docs/adapt.md).")] = False,
     port: Annotated[int, typer.Option(min=1, max=65535, help="Port of the page.")] = DEFAULT_PORT,

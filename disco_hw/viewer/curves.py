@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.config import RobotTask
+from disco_hw.config import RobotTask, TimedPathTask
 from disco_hw.course import course_of
 from disco_hw.model import Model
 from disco_hw.model.belief import Belief, Gaussian, Mixture, Uniform
@@ -36,9 +36,9 @@ def distance(task: RobotTask, timeline: Timeline, first_ns: int, last_ns: int) -
 
 
 def speed(task: RobotTask, timeline: Timeline, first_ns: int, last_ns: int) -> Curves:
-    """Estimated speed against the task's (m/s)."""
+    """Estimated speed against the task's (m/s); way-points by time have no one speed."""
     t_s, rows = _window(timeline, timeline.estimate, first_ns, last_ns)
-    reference = np.full(len(t_s), task.speed_m_s)
+    reference = np.full(len(t_s), np.nan if isinstance(task, TimedPathTask) else task.speed_m_s)
     return Curves(t_s, {"speed (m/s)": rows[:, ESTIMATE.index("speed_m_s")], "reference": reference})
 
 

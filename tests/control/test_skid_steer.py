@@ -1,6 +1,7 @@
 """The fused kernel against the numpy reference: costs, weights and update, over random parameters, effects, states."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -69,18 +70,52 @@ def state_of(values, commands):
     return PlannerState(20_000_000 * len(commands), *values, sent=sent, elapsed_s=3.0)
 
 
-ANGLE = np.linspace(0.0, 2.0 * np.pi, 400)
-EIGHT = np.column_stack([1.5 * np.sin(ANGLE), 0.75 * np.sin(2.0 * ANGLE)])
-TASKS = {
-    "circle": Circle(0.3, -0.2),
-    "closed path": Path(Waypoints(EIGHT), 0.25),
-    "open path": Path(Waypoints(EIGHT[:150]), 0.25),
-    "path of pieces": Path(Waypoints(np.array([[0.2, 0.1], [1.7, 0.2], [-0.6, 0.3], [0.2, 0.1]])), 0.3),
-    "timed path": TimedPath(Waypoints(EIGHT, ANGLE - 1.0)),
-}
-# Commands are nudged up and down to see which samples sit on an edge (stiction, the next piece of a path), where single
-# precision may fall to either side: there the two changes of the cost do not cancel.
-NUDGE_RAD_S, EDGE = 1e-5, 2e-5
+CIRCLE = Circle(0.3, -0.2)
+
+
+@st.composite
+def way_points(draw):
+    """Places (N, 2) from the origin on: legs with corners or an even curve between, once round or not."""
+    corners = draw(st.booleans())
+    count = draw(st.integers(1, 5))
+    length_m = draw(st.lists(st.floats(0.2, 2.0), min_size=count, max_size=count))
+    turn_rad = draw(st.lists(st.floats(-math.pi, math.pi), min_size=count, max_size=count))
+    pieces = 1 if corners else 20
+    heading = np.cumsum(np.repeat(turn_rad, pieces) / pieces)
+    step = np.repeat(length_m, pieces) / pieces
+    places = np.concatenate(
+        [[[0.0, 0.0]], np.cumsum(step[:, None] * np.column_stack([np.cos(heading), np.sin(heading)]), axis=0)]
+    )
+    away = np.hypot(*places[-1]) > 0.2
+    return np.concatenate([places, places[:1]]) if away and draw(st.booleans()) else places
+
+
+@st.composite
+def paths(draw):
+    """A path at a speed, and where the robot is beside it: anywhere along it, however long the way there is."""
+    places = draw(way_points())
+    if draw(st.booleans()):
+        # The way up to here, or what is left of it.
+        far_m = draw(st.floats(-1500.0, 1500.0))
+        there = [[far_m, 500.0]]
+        places = np.concatenate([there, places]) if far_m < 0.0 else np.concatenate([places, there])
+    return Path(Waypoints(places), draw(st.floats(0.05, 0.5)))
+
+
+@st.composite
+def timed_paths(draw):
+    places = draw(way_points())
+    apart_s = draw(st.lists(st.floats(0.05, 4.0), min_size=len(places) - 1, max_size=len(places) - 1))
+    begin_s = draw(st.floats(-3.0, 3.0))
+    return TimedPath(Waypoints(places, np.concatenate([[begin_s], begin_s + np.cumsum(apart_s)])))
+
+
+# Where single precision may fall to either side of an edge (stiction, the next piece of a path), nudges there and back
+# change the cost by what does not cancel: of the commands, and of the start along and across. Far beside a curve the
+# place on a path runs away from the least error: there a nudge of the start changes the cost by 100 times its length,
+# twice what all steps' distances make of it.
+NUDGE_RAD_S, NUDGES_M, EDGE, STEEP = 1e-5, ((1e-5, 1e-5), (1e-5, -1e-5)), 2e-5, 3e-3
+FEW = 0.1
 
 
 def sequence_cost(task, place):
@@ -116,27 +151,38 @@ def check_against_reference(model, state, task, plan_settings, seed):
     theta, point_weights = unscented_points(model, plan_settings.ut_alpha)
     past = past_commands(state.sent, now_ns, STEP_S, 8, (state.left_speed_rad_s, state.right_speed_rad_s))
     start = physics.State(state.x_m, state.y_m, state.yaw_rad, state.left_speed_rad_s, state.right_speed_rad_s)
-    cost = sequence_cost(task, float(disco._start[7]))
+    cost = sequence_cost(task, disco._memory)
 
-    def costs_of(sequences):
+    def costs_of(sequences, x_m=0.0, y_m=0.0):
         names = model.parameter_names
+        begin = replace(start, x=start.x + x_m, y=start.y + y_m)
         return np.array(
             [
                 reference.point_costs(
-                    physics.theta_of(names, point), start, sequences, past, STEP_S, cost, time_s=state.elapsed_s
+                    physics.theta_of(names, point), begin, sequences, past, STEP_S, cost, time_s=state.elapsed_s
                 )
                 for point in theta
             ]
         )
 
+    def beyond_single_precision(sequences):
+        there_and_back = [(costs_of(sequences + NUDGE_RAD_S), costs_of(sequences - NUDGE_RAD_S))]
+        there_and_back += [(costs_of(sequences, x, y), costs_of(sequences, -x, -y)) for x, y in NUDGES_M]
+        middle = costs_of(sequences)
+        edge = [np.abs(there + back - 2.0 * middle) > EDGE for there, back in there_and_back]
+        steep = [np.abs(there - back) > STEEP for there, back in there_and_back]
+        return np.any([*edge, *steep], axis=(0, 1))
+
     expected = costs_of(commands)
     got = work.point_costs.reshape(point_weights.size, -1)[:, : sampler.samples].astype(float)
-    nudged = costs_of(commands + NUDGE_RAD_S) + costs_of(commands - NUDGE_RAD_S) - 2.0 * expected
-    clear = np.abs(nudged).max(axis=0) < EDGE
-    assert clear.mean() > 0.5
-    np.testing.assert_allclose(got[:, clear], expected[:, clear], atol=1e-4, rtol=RELATIVE)
+    apart = ~np.isclose(got, expected, atol=1e-4, rtol=RELATIVE).all(axis=0)
+    assert apart.mean() < FEW
+    excused = apart.copy()
+    if apart.any():
+        excused[apart] = beyond_single_precision(commands[apart])
+    np.testing.assert_allclose(got[:, ~excused], expected[:, ~excused], atol=1e-4, rtol=RELATIVE)
 
-    mean = reference.mean_risk(np.where(clear, expected, got), point_weights)
+    mean = reference.mean_risk(np.where(excused, got, expected), point_weights)
     np.testing.assert_allclose(work.costs[: sampler.samples], mean, atol=1e-4, rtol=RELATIVE)
     report = disco.optimiser.report()
     assert report["cost_nominal"] == pytest.approx(mean[0], abs=1e-4, rel=RELATIVE)
@@ -152,20 +198,28 @@ def test_every_effect_that_moves_the_robot_is_tried():
 @settings(max_examples=15)
 @given(BASE, STATES, COMMANDS, st.integers(0, 2**63 - 1))
 def test_costs_and_update_of_the_bare_model(base, values, commands, seed):
-    check_against_reference(model_of(base), state_of(values, commands), TASKS["circle"], PLAN_SETTINGS, seed)
+    check_against_reference(model_of(base), state_of(values, commands), CIRCLE, PLAN_SETTINGS, seed)
 
 
 @settings(max_examples=15)
 @given(BASE, EFFECTS, STATES, COMMANDS, st.integers(0, 2**63 - 1))
 def test_costs_and_update_with_all_effects(base, effects, values, commands, seed):
-    check_against_reference(model_of(base, effects), state_of(values, commands), TASKS["circle"], PLAN_SETTINGS, seed)
+    check_against_reference(model_of(base, effects), state_of(values, commands), CIRCLE, PLAN_SETTINGS, seed)
 
 
-@pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("task", ["closed path", "open path", "path of pieces", "timed path"])
-def test_costs_and_update_along_paths(task, seed):
-    rng = np.random.default_rng(seed)
-    base = rng.uniform((0.02, 0.2, -0.3), (0.12, 0.8, 0.4))
-    values = rng.uniform(-1.0, 1.0, 5) * (2.0, 2.0, math.pi, 6.0, 6.0)
-    commands = rng.uniform(-6.0, 6.0, (int(rng.integers(1, 30)), 2))
-    check_against_reference(model_of(base), state_of(values, commands), TASKS[task], PLAN_SETTINGS, seed)
+@settings(max_examples=40)
+@given(paths(), BASE, STATES, COMMANDS, st.integers(0, 2**63 - 1))
+def test_costs_and_update_along_a_path(path, base, values, commands, seed):
+    check_against_reference(model_of(base), state_of(values, commands), path, PLAN_SETTINGS, seed)
+
+
+@settings(max_examples=15)
+@given(paths(), BASE, EFFECTS, STATES, COMMANDS, st.integers(0, 2**63 - 1))
+def test_costs_and_update_along_a_path_with_all_effects(path, base, effects, values, commands, seed):
+    check_against_reference(model_of(base, effects), state_of(values, commands), path, PLAN_SETTINGS, seed)
+
+
+@settings(max_examples=20)
+@given(timed_paths(), BASE, STATES, COMMANDS, st.integers(0, 2**63 - 1))
+def test_costs_and_update_along_a_path_by_time(path, base, values, commands, seed):
+    check_against_reference(model_of(base), state_of(values, commands), path, PLAN_SETTINGS, seed)

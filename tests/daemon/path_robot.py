@@ -13,10 +13,20 @@ _CIRCLE = 'kind = "circle"\nradius_m = 0.75\nspeed_m_s = 0.2\n'
 
 def path_robot(directory: Path, csv: str | None = None, speed_m_s: float = 0.3) -> Path:
     """Write robot.toml, model and path.csv (the shipped figure of eight if None); returns robot.toml."""
+    eight = (ROBOTS / "eight.csv").read_text()
+    return _robot(directory, f'path = "path.csv"\nspeed_m_s = {speed_m_s}\n', eight if csv is None else csv)
+
+
+def timed_path_robot(directory: Path, csv: str) -> Path:
+    """Write robot.toml, model and path.csv, with times; returns robot.toml."""
+    return _robot(directory, 'kind = "timed_path"\npath = "path.csv"\n', csv)
+
+
+def _robot(directory: Path, task: str, csv: str) -> Path:
     text = (ROBOTS / "wombot.toml").read_text()
     assert _CIRCLE in text
     robot = directory / "robot.toml"
-    robot.write_text(text.replace(_CIRCLE, f'path = "path.csv"\nspeed_m_s = {speed_m_s}\n'))
+    robot.write_text(text.replace(_CIRCLE, task))
     shutil.copy(ROBOTS / "wombot_model.toml", directory)
-    (directory / "path.csv").write_text((ROBOTS / "eight.csv").read_text() if csv is None else csv)
+    (directory / "path.csv").write_text(csv)
     return robot

@@ -13,7 +13,7 @@ from disco_hw.daemon.lap_counter import LapCounter
 def drive(counter: LapCounter, laps: float, steps: int = 200) -> None:
     for k in range(steps + 1):
         angle = 2.0 * math.pi * laps * k / steps + 3.0
-        counter.add(1.0 + math.cos(angle), -2.0 + math.sin(angle))
+        counter.add(0, 1.0 + math.cos(angle), -2.0 + math.sin(angle))
 
 
 @pytest.mark.parametrize("laps", [0.5, 2.25, -1.75])

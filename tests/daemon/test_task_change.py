@@ -7,7 +7,7 @@ import math
 import msgspec
 import pytest
 
-from disco_hw.config import CircleTask, PathTask, Robot
+from disco_hw.config import CircleTask, PathTask, Robot, TimedPathTask
 from disco_hw.daemon.states import State
 from disco_hw.daemon.supervisor import UserRequest
 from disco_hw.daemon.task_change import (
@@ -119,6 +119,21 @@ def test_a_status_and_a_record_tell_of_a_path_without_its_way_points():
     assert told_task(asked_of(CircleTask(radius_m=2.0)), LINE) == CircleTask(radius_m=2.0)
     assert task_of(record_of(7, other), LINE) == other
     assert in_words(other) == "path line.csv of 2.00 m at 0.1 m/s"
+
+
+TIMED = TimedPathTask(path="line.csv", points=LINE.points, times_s=(0.0, 10.0))
+
+
+def test_of_way_points_by_time_nothing_can_be_changed():
+    with pytest.raises(TaskRefused, match="have times, which say all; change t_s in their CSV"):
+        changed_task(TIMED, {"speed_m_s": 0.3}, ROBOT, State.READY)
+    assert limits(ROBOT, TIMED) == {}
+    assert in_words(TIMED) == "path line.csv of 2.00 m in 10 s, at most 0.2 m/s"
+    assert told_task(asked_of(TIMED), TIMED) == TIMED
+    assert told_task(asked_of(TIMED), msgspec.structs.replace(TIMED, times_s=(0.0, 11.0))) is None
+    assert told_task(asked_of(TIMED), LINE) is None
+    assert told_task(asked_of(LINE), TIMED) is None
+    assert task_of(record_of(7, TIMED), TIMED) == TIMED
 
 
 def test_another_circle_is_driven_recorded_and_replayed_bit_for_bit(tmp_path):

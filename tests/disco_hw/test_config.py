@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from disco_hw.config import ConfigError, PathTask, circle_task, load_robot_config
+from disco_hw.config import ConfigError, PathTask, TimedPathTask, circle_task, load_robot_config
 from disco_hw.errors import InputError
 
 GOOD = """
@@ -105,7 +105,9 @@ def _fields_of(section: str) -> tuple[str, ...]:
     hint = typing.get_type_hints(RobotConfig)[section]
     kinds = typing.get_args(hint) or (hint,)
     # What is read from the path's file is no field.
-    return tuple(dict.fromkeys(name for kind in kinds for name in kind.__struct_fields__ if name != "points"))
+    return tuple(
+        dict.fromkeys(name for kind in kinds for name in kind.__struct_fields__ if name not in ("points", "times_s"))
+    )
 
 
 @pytest.mark.parametrize("kind", ["", 'kind = "path"\n'])
@@ -125,9 +127,28 @@ def test_a_path_is_named_in_the_task_with_or_without_its_kind(tmp_path, kind):
         ('path = ""\n', "task.path: expected `str` of length >= 1"),
         ('path = "p.csv"\npoints = [[0.0, 0.0]]\n', "points: no such field; write way-points in a CSV"),
         ('path = "p.csv"\nspeed_m_s = 0.5\n', "task.speed_m_s: 0.5 m/s is above what the wheels can do"),
+        ('kind = "timed_path"\npath = "p.csv"\nspeed_m_s = 0.2\n', "speed_m_s: no such field"),
+        ('kind = "timed_path"\n', "path: missing; add it"),
+        ('kind = "timed_path"\npath = "p.csv"\ntimes_s = [0.0]\n', "times_s: no such field; write way-points in a CSV"),
     ],
 )
 def test_a_mistake_in_a_path_task_gets_one_line(tmp_path, task, words):
     with pytest.raises(ConfigError, match=words) as caught:
         load(tmp_path, GOOD + "[task]\n" + task)
     assert "\n" not in str(caught.value)
+
+
+def test_way_points_by_time_are_asked_for_by_their_kind(tmp_path):
+    task = load(tmp_path, GOOD + '[task]\nkind = "timed_path"\npath = "p.csv"\n').task
+    assert (task, task.speed_m_s) == (TimedPathTask(path="p.csv"), 0.0)
+    read = TimedPathTask(path="p.csv", points=((0.0, 0.0), (1.0, 0.0), (1.0, 0.3)), times_s=(1.0, 6.0, 7.0))
+    assert read.speed_m_s == pytest.approx(0.3)
+    with pytest.raises(InputError, match="needs a circle"):
+        circle_task(read, "--script circle")
+
+
+def test_every_form_of_uncertainty_can_be_asked_for(tmp_path):
+    for name in ("ut", "mc", "joint", "point"):
+        assert load(tmp_path, GOOD + f'[control]\nuncertainty = "{name}"\n').control.uncertainty == name
+    with pytest.raises(ConfigError, match=r"control\.uncertainty: .*'both'"):
+        load(tmp_path, GOOD + '[control]\nuncertainty = "both"\n')

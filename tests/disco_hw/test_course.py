@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from disco_hw.config import CircleTask, PathTask
+from disco_hw.config import CircleTask, PathTask, TimedPathTask
 from disco_hw.course import course_of
 
 CIRCLE = CircleTask(center_x_m=1.0, center_y_m=-2.0, radius_m=0.5)
@@ -56,3 +56,11 @@ def test_a_position_that_is_no_number_is_at_no_distance():
     off_m = course_of(CORNER).off_m(np.array([[1.0, 0.2], [math.nan, 0.0], [math.inf, 1.0]]))
     np.testing.assert_allclose(off_m, [-0.2, math.nan, math.nan])
     assert len(course_of(CORNER).off_m(np.empty((0, 2)))) == 0
+
+
+def test_a_course_that_begins_with_a_rest_faces_where_it_goes():
+    course = course_of(
+        TimedPathTask(path="p.csv", points=((1.0, 0.0), (1.0, 0.0), (1.0, 2.0)), times_s=(0.0, 1.0, 9.0))
+    )
+    assert course.start == pytest.approx((1.0, 0.0, 0.5 * math.pi))
+    np.testing.assert_allclose(course.off_m(np.array([[1.2, 1.0]])), [0.2])

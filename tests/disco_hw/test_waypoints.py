@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from disco_hw.errors import InputError
-from disco_hw.waypoints import load_waypoints, way_points_to_follow
+from disco_hw.waypoints import load_waypoints, way_points_to_follow, way_points_to_meet
 
 
 def read(tmp_path, text):
@@ -54,7 +54,10 @@ def test_lines_are_counted_as_an_editor_does_and_a_spreadsheets_mark_is_no_name(
 @pytest.mark.parametrize(
     ("text", "fault"),
     [
-        ("x_m,y_m,t_s\n0,0,0\n1,1,1\n", "line 1: column t_s: the robot follows at task.speed_m_s; remove the column"),
+        (
+            "x_m,y_m,t_s\n0,0,0\n1,1,1\n",
+            "line 1: column t_s: the robot follows at task.speed_m_s; remove the column.*timed_path",
+        ),
         ("x_m,y_m\n0,0\n0.05,0\n", "0.05 m long; between 0.1 and 2000 m"),
         ("x_m,y_m\n0,0\n1e30,0\n", "long; between 0.1 and 2000 m"),
         ("x_m,y_m\n" + "".join(f"{0.001 * k},0\n" for k in range(10_001)), "10001 way-points; write at most 10000"),
@@ -66,3 +69,34 @@ def test_what_a_robot_cannot_follow_is_refused(tmp_path, text, fault):
     with pytest.raises(InputError, match=fault) as error:
         way_points_to_follow(path)
     assert str(path) in str(error.value)
+
+
+def meet(tmp_path, text):
+    path = tmp_path / "path.csv"
+    path.write_text(text)
+    return way_points_to_meet(path, 0.5)
+
+
+def test_way_points_to_meet_may_rest_and_pass_one_place_twice(tmp_path):
+    found = meet(tmp_path, "t_s,x_m,y_m\n0.5,0,0\n2,0.75,0\n3,0.75,0\n4.5,0,0\n")
+    np.testing.assert_array_equal(found.times_s, [0.5, 2.0, 3.0, 4.5])
+
+
+@pytest.mark.parametrize(
+    ("text", "fault"),
+    [
+        ("x_m,y_m\n0,0\n1,1\n", 'line 1: column t_s: missing; add the times.*or.*kind = "path"'),
+        ("t_s,x_m,y_m\n-1,0,0\n4,1,1\n", "line 2: t_s: -1 is before the start; begin at 0 or later"),
+        (
+            "t_s,x_m,y_m\n0,0,0\n4,1,0\n\n5,1,0.6\n",
+            "line 5: t_s: 0.6 m from line 3 in 1 s, and the wheels can do 0.5 m/s; be there at 5.2 or later",
+        ),
+        ("t_s,x_m,y_m\n0,0,0\n4,0,0\n", "0 m long; between 0.1 and 2000 m"),
+        ("t_s,x_m,y_m\n4,0,0\n4,1,0\n", "line 3: t_s does not increase"),
+    ],
+)
+def test_what_a_robot_cannot_meet_is_refused(tmp_path, text, fault):
+    with pytest.raises(InputError, match=fault) as error:
+        meet(tmp_path, text)
+    assert str(tmp_path / "path.csv") in str(error.value)
+    assert "\n" not in str(error.value)

@@ -13,7 +13,8 @@ from numba import types
 from numpy.typing import NDArray
 
 from disco_hw.config import CircleTask
-from disco_hw.control.tasks.terms import has_memory, stage_cost, terminal_cost
+from disco_hw.control.tasks.task import Prepared
+from disco_hw.control.tasks.terms import has_memory, looks_up, stage_cost, terminal_cost
 from disco_hw.model.jit import cast_like, quick_norm, quick_norm_and_inverse, scalar_function, specialise
 
 # The radius over the distance from the centre below which progress stops growing.
@@ -67,16 +68,11 @@ class Circle:
         """The same circle with the paper's cost alone."""
         return replace(self, progress_weight=0.0, terminal_s=0.0)
 
-    @property
-    def origin_m(self) -> tuple[float, float]:
-        """World position that rollouts are relative to."""
-        return self.center_x_m, self.center_y_m
-
-    def terms(
+    def prepare(
         self, time_s: float, x_m: float, y_m: float, memory: float | None, step_s: float, horizon: int
-    ) -> tuple[Any, float]:
+    ) -> Prepared:
         """Terms for the kernel; nothing depends on time or place. The memory is the angle swept (rad)."""
-        return _terms(self, step_s, horizon), 0.0
+        return _prepared(self, step_s, horizon)
 
     def instant_cost(self, time_s: float, x_m: float, y_m: float, forward_m_s: float) -> float:
         """The paper's instant cost of a state."""
@@ -92,9 +88,9 @@ class Circle:
 
 
 @lru_cache(maxsize=16)
-def _terms(circle: Circle, step_s: float, horizon: int) -> CircleTerms:
+def _prepared(circle: Circle, step_s: float, horizon: int) -> Prepared:
     f32 = np.float32
-    return CircleTerms(
+    terms = CircleTerms(
         f32(circle.radius_m),
         f32(circle.speed_m_s),
         f32(circle.progress_weight) if circle.progress_weight > 0.0 else None,
@@ -103,6 +99,7 @@ def _terms(circle: Circle, step_s: float, horizon: int) -> CircleTerms:
         f32((NEAR_CENTRE / circle.radius_m) ** 2),
         f32(circle.terminal_s / step_s) if circle.terminal_s > 0.0 else None,
     )
+    return Prepared(terms, (circle.center_x_m, circle.center_y_m))
 
 
 def _is_circle(task: Any) -> bool:
@@ -136,8 +133,9 @@ def _last_distance(steps: Any, x: Any, y: Any, task: Any) -> Any:
 
 @specialise(stage_cost)
 def _stage_cost(
-    task: Any, memory: Any, step: Any, x_old: Any, y_old: Any, x: Any, y: Any, cos_yaw: Any, sin_yaw: Any, forward: Any
-) -> Callable[..., Any] | None:
+    task: Any, memory: Any, step: Any, x_old: Any, y_old: Any, x: Any, y: Any, cos_yaw: Any, sin_yaw: Any, forward: Any,
+    found: Any,
+) -> Callable[..., Any] | None:  # fmt: skip
     if not _is_circle(task):
         return None
 
@@ -152,6 +150,7 @@ def _stage_cost(
         cos_yaw: Any,
         sin_yaw: Any,
         forward: Any,
+        found: Any,
     ) -> Any:
         rho, inverse = quick_norm_and_inverse(x, y)
         off_edge = rho - task.radius_m
@@ -163,11 +162,13 @@ def _stage_cost(
 
 
 @specialise(terminal_cost)
-def _terminal_cost(task: Any, memory: Any, x: Any, y: Any, cos_yaw: Any, sin_yaw: Any) -> Callable[..., Any] | None:
+def _terminal_cost(
+    task: Any, memory: Any, x: Any, y: Any, cos_yaw: Any, sin_yaw: Any, found: Any
+) -> Callable[..., Any] | None:
     if not _is_circle(task):
         return None
 
-    def cost(task: Any, memory: Any, x: Any, y: Any, cos_yaw: Any, sin_yaw: Any) -> Any:
+    def cost(task: Any, memory: Any, x: Any, y: Any, cos_yaw: Any, sin_yaw: Any, found: Any) -> Any:
         return _lost(task.progress_weight, memory, task) + _last_distance(task.terminal_steps, x, y, task)
 
     return cost
@@ -179,3 +180,8 @@ def _has_memory(task: Any) -> Callable[..., Any] | None:
         return None
     pays_for_progress = not isinstance(task.types[CircleTerms._fields.index("progress_weight")], types.NoneType)
     return (lambda task: True) if pays_for_progress else (lambda task: False)
+
+
+@specialise(looks_up)
+def _looks_up(task: Any) -> Callable[..., Any] | None:
+    return (lambda task: None) if _is_circle(task) else None

@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
-from disco_hw.config import CircleTask, RobotTask
+from disco_hw.config import CircleTask, PathTask, RobotTask
 from disco_hw.control.tasks.circle import Circle
 from disco_hw.control.tasks.path import Path
+from disco_hw.control.tasks.timed_path import TimedPath
 
 
-def task_of_robot(task: RobotTask, mode: str = "default") -> Circle | Path:
+def task_of_robot(task: RobotTask, mode: str = "default") -> Circle | Path | TimedPath:
     """The task with the cost of the control mode, which a path has only one of."""
-    return Circle.from_config(task, mode) if isinstance(task, CircleTask) else Path.from_config(task)
+    match task:
+        case CircleTask():
+            return Circle.from_config(task, mode)
+        case PathTask():
+            return Path.from_config(task)
+        case _:
+            return TimedPath.from_config(task)

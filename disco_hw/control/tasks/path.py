@@ -5,15 +5,24 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.config import PathTask
-from disco_hw.control.blocks import U
-from disco_hw.control.tasks.terms import has_memory, stage_cost, terminal_cost
-from disco_hw.model.jit import cast_like, quick_norm, scalar_function, specialise
+from disco_hw.control.tasks.task import Prepared
+from disco_hw.control.tasks.terms import follow, has_memory, looks_up, row_of, stage_cost, table_of, terminal_cost
+from disco_hw.model.jit import (
+    cast_like,
+    int32,
+    quick_length,
+    quick_norm,
+    quick_norm_and_inverse,
+    scalar_function,
+    specialise,
+)
 from disco_hw.waypoints import Waypoints
 
 Array = NDArray[np.float64]
@@ -34,25 +43,23 @@ TERMINAL_S = 1.0
 SHARP_RAD = math.radians(125.0)
 TURN_M = 0.15
 REACHED_M = 0.05
+# Entries of the table that rollouts see relative to the same point.
+NEAR = 1000
 
 
 class PathTerms(NamedTuple):
-    """What the kernel needs of a path: a table of points a spacing apart.
+    """What the kernel needs of a path: the part of its table that can be reached within the horizon.
 
-    `x`, `y` (m) and unit tangents `along_x`, `along_y`, each (M + 1,), or (2 M + 1,) of a closed path: twice round and
-    the first again; `first`, `last`: least and largest position in the table that can be reached; `endless`: whether
-    these two are the same place; `per_m`: entries a metre; `speed_m_s`; `speed_per_entry`: progress speed of one entry
-    in a step (m/s); `slow_per_entry`: wanted speed for each entry left; `speed_weight`: of missing speed;
+    `table` (4 M,): for each piece between two entries, from one to the next, where it begins, x and y (m), and how far
+    it goes in x and y (m). Places count in entries from the first: `last` is M, `end` where the robot stops, or
+    infinite. `per_m`: entries a metre; `speed_m_s`; `speed_per_entry`: progress speed of one
+    entry in a step (m/s); `slow_per_entry`: wanted speed for each entry left; `speed_weight`: of missing speed;
     `terminal_steps`: weight of the last distance.
     """
 
-    x: Any
-    y: Any
-    along_x: Any
-    along_y: Any
-    first: Any
+    table: Any
     last: Any
-    endless: Any
+    end: Any
     per_m: Any
     speed_m_s: Any
     speed_per_entry: Any
@@ -83,7 +90,6 @@ class Path:
     _closed: bool = field(init=False, repr=False)
     _spacing_m: float = field(init=False, repr=False)
     _bounds: Array = field(init=False, repr=False)
-    _columns: tuple[NDArray[np.float32], ...] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         places = self.waypoints.places_m
@@ -101,24 +107,15 @@ class Path:
         table, spacing = np.column_stack([x, y, along_x, along_y]), float(distance[-1]) / count
         corners = sharp_turns(table[:, :2], closed, max(1, round(TURN_M / spacing)))
         bounds = [*corners, *(corner + count for corner in corners[:1])] if closed else [0, *corners, count]
-        rows = np.concatenate([table[:-1], table[:-1], table[:1]]) if closed else table
-        columns = (rows - [x[0], y[0], 0.0, 0.0]).T.astype(np.float32)
         object.__setattr__(self, "_table", table)
         object.__setattr__(self, "_closed", closed)
         object.__setattr__(self, "_spacing_m", spacing)
         object.__setattr__(self, "_bounds", np.array(bounds, dtype=float))
-        object.__setattr__(self, "_columns", tuple(np.ascontiguousarray(column) for column in columns))
 
     @classmethod
     def from_config(cls, task: PathTask) -> Path:
         """The path of robot.toml with the way-points that were read for it."""
         return cls(Waypoints(np.array(task.points)), task.speed_m_s)
-
-    @property
-    def origin_m(self) -> tuple[float, float]:
-        """World position that rollouts are relative to: the path's first point."""
-        x, y = self._table[0, :2].tolist()
-        return x, y
 
     @property
     def table(self) -> Array:
@@ -141,30 +138,28 @@ class Path:
         """Arc length between two entries of the table."""
         return self._spacing_m
 
-    def terms(
+    def prepare(
         self, time_s: float, x_m: float, y_m: float, memory: float | None, step_s: float, horizon: int
-    ) -> tuple[Any, float]:
-        """Terms for the kernel; the memory is the place on the path, in entries of the table."""
-        f32 = np.float32
-        spacing, speed = self._spacing_m, self.speed_m_s
+    ) -> Prepared:
+        """Terms for the kernel; the memory is the place on the path, in entries of the table.
+
+        Rollouts count it from the first entry that they can reach, and are relative to a point of the path nearby, so
+        that a long path is as precise as a short one.
+        """
         place, first, last = self.piece(self.place(x_m, y_m, memory))
-        x, y, along_x, along_y = self._columns
+        reach = horizon * math.ceil(FARTHEST_STEP_M / self._spacing_m) + 1
+        near = _nearby(self, int(place) // NEAR, reach)
+        low, high, end = place - reach, place + reach, math.inf
+        if self._bounds.size:
+            low, high, end = max(low, first), min(high, last), last - max(low, first)
+        begin, rows = int(low) - near.first, int(high - low)
         terms = PathTerms(
-            x,
-            y,
-            along_x,
-            along_y,
-            f32(first),
-            f32(last),
-            not self._bounds.size,
-            f32(1.0 / spacing),
-            f32(speed),
-            f32(spacing / step_s),
-            f32(spacing / SLOW_DOWN_S),
-            f32(max(1.0, STANDING_M / speed)),
-            f32(TERMINAL_S / step_s),
+            near.pieces[4 * begin : 4 * (begin + rows)],
+            np.float32(rows),
+            np.float32(end),
+            *_numbers(self, step_s),
         )
-        return terms, place
+        return Prepared(terms, near.origin_m, place - low, place)
 
     def piece(self, place: float) -> tuple[float, float, float]:
         """The piece that a place is on: the place, not less than the piece's first entry; its first and last entry.
@@ -192,11 +187,14 @@ class Path:
             low, high = round(here - LOOK_BACK_M / spacing), round(here + LOOK_AHEAD_M / spacing)
             if self._bounds.size:
                 low, high = max(low, int(first)), min(high, int(last))
-            window = np.arange(low, high + 1)
-            rows = self._table[window % count if self._closed else window]
-            distance = np.hypot(rows[:, 0] - x_m, rows[:, 1] - y_m)
-            if distance.min() < LOST_M:
-                found = float(window[np.argmin(distance)])
+            if low >= 0 and high <= count:
+                rows = self._table[low : high + 1]
+            else:
+                rows = self._table[np.arange(low, high + 1) % count]
+            square = (rows[:, 0] - x_m) ** 2 + (rows[:, 1] - y_m) ** 2
+            nearest = int(square.argmin())
+            if square[nearest] < LOST_M**2:
+                found = float(low + nearest)
                 if self._bounds.size and (self._closed or last < count) and (last - found) * spacing <= REACHED_M:
                     found = last
                 return found % count if self._closed else found
@@ -234,33 +232,53 @@ def sharp_turns(points: Array, closed: bool, reach: int) -> list[int]:
     return sorted(found)
 
 
-@scalar_function
-def _moved(task: Any, place: Any, by: Any) -> Any:
-    """Place on the path, `by` entries on: round a closed path, else up to the ends."""
-    on = place + by
-    if task.endless:
-        on = on + task.last if on < task.first else on
-        return on - task.last if on >= task.last else on
-    return min(max(on, task.first), task.last)
+class _Nearby(NamedTuple):
+    """Part of a path, flat as in PathTerms, from the entry `first` on and relative to `origin_m`."""
+
+    pieces: NDArray[np.float32]
+    first: int
+    origin_m: tuple[float, float]
+
+
+@lru_cache(maxsize=8)
+def _nearby(path: Path, block: int, reach: int) -> _Nearby:
+    """The block of NEAR entries of a path, and `reach` more on both sides: round and round if it is closed."""
+    table, count = path.table, len(path.table) - 1
+    first, end = block * NEAR - reach, (block + 1) * NEAR + reach
+    if not path.closed:
+        first, end = max(first, 0), min(end, count)
+    at = np.arange(first, end) % count
+    here, there = table[at, :2], table[at + 1, :2]
+    origin = table[block * NEAR % count, :2]
+    pieces = np.hstack([here - origin, there - here]).astype(np.float32)
+    x_m, y_m = origin.tolist()
+    return _Nearby(pieces.reshape(-1), first, (x_m, y_m))
+
+
+@lru_cache(maxsize=8)
+def _numbers(path: Path, step_s: float) -> tuple[np.float32, ...]:
+    """The terms from `per_m` on: those that no plan changes."""
+    spacing, speed = path.spacing_m, path.speed_m_s
+    return tuple(
+        np.float32(value)
+        for value in (
+            1.0 / spacing,
+            speed,
+            spacing / step_s,
+            spacing / SLOW_DOWN_S,
+            max(1.0, STANDING_M / speed),
+            TERMINAL_S / step_s,
+        )
+    )
 
 
 @scalar_function
-def _offset(task: Any, place: Any, x: Any, y: Any) -> Any:
-    """Position relative to the path's point at a place (m), and the direction of the path there."""
-    before = min(place, task.last - cast_like(1.0, place))
-    at = U(int(before))
-    part = place - cast_like(int(before), place)
-    point_x = task.x[at] + part * (task.x[at + U(1)] - task.x[at])
-    point_y = task.y[at] + part * (task.y[at + U(1)] - task.y[at])
-    return x - point_x, y - point_y, task.along_x[at], task.along_y[at]
-
-
-@scalar_function
-def _wanted(task: Any, place: Any) -> Any:
-    """Wanted progress speed (m/s)."""
-    if task.endless:
-        return task.speed_m_s
-    return min(task.speed_m_s, (task.last - place) * task.slow_per_entry)
+def _offset(task: Any, place: Any, x: Any, y: Any, piece: Any) -> Any:
+    """Position relative to the path's point at a place (m), and the direction of the path there; `piece` is its row."""
+    begin_x, begin_y, step_x, step_y = piece
+    part = place - np.floor(min(place, task.last - cast_like(1.0, place)))
+    _, per_m = quick_norm_and_inverse(step_x, step_y)
+    return x - (begin_x + part * step_x), y - (begin_y + part * step_y), step_x * per_m, step_y * per_m
 
 
 def _is_path(task: Any) -> bool:
@@ -269,8 +287,9 @@ def _is_path(task: Any) -> bool:
 
 @specialise(stage_cost)
 def _stage_cost(
-    task: Any, memory: Any, step: Any, x_old: Any, y_old: Any, x: Any, y: Any, cos_yaw: Any, sin_yaw: Any, forward: Any
-) -> Callable[..., Any] | None:
+    task: Any, memory: Any, step: Any, x_old: Any, y_old: Any, x: Any, y: Any, cos_yaw: Any, sin_yaw: Any, forward: Any,
+    found: Any,
+) -> Callable[..., Any] | None:  # fmt: skip
     if not _is_path(task):
         return None
 
@@ -285,26 +304,48 @@ def _stage_cost(
         cos_yaw: Any,
         sin_yaw: Any,
         forward: Any,
+        found: Any,
     ) -> Any:
-        off_x, off_y, along_x, along_y = _offset(task, memory, x, y)
-        farthest = cast_like(FARTHEST_STEP_M, x)
-        along = min(max(off_x * along_x + off_y * along_y, -farthest), farthest) * task.per_m
-        place = _moved(task, memory, along)
-        off_x, off_y, along_x, along_y = _offset(task, place, x, y)
-        missing = task.speed_weight * (_wanted(task, memory) - min(along * task.speed_per_entry, forward))
+        off_x, off_y, along_x, along_y = _offset(task, memory, x, y, found[1:])
         against = max(-(cos_yaw * along_x + sin_yaw * along_y), cast_like(0.0, x))
-        return quick_norm(quick_norm(off_x, off_y), missing) + cast_like(AGAINST_M, x) * against, place
+        return quick_length(off_x, off_y, found[0]) + cast_like(AGAINST_M, x) * against, memory
 
     return cost
 
 
-@specialise(terminal_cost)
-def _terminal_cost(task: Any, memory: Any, x: Any, y: Any, cos_yaw: Any, sin_yaw: Any) -> Callable[..., Any] | None:
+@specialise(follow)
+def _follow(task: Any, memory: Any, x: Any, y: Any, forward: Any, found: Any) -> Callable[..., Any] | None:
     if not _is_path(task):
         return None
 
-    def cost(task: Any, memory: Any, x: Any, y: Any, cos_yaw: Any, sin_yaw: Any) -> Any:
-        off_x, off_y, _, _ = _offset(task, memory, x, y)
+    def after(task: Any, memory: Any, x: Any, y: Any, forward: Any, found: Any) -> Any:
+        off_x, off_y, along_x, along_y = _offset(task, memory, x, y, found[1:])
+        farthest = cast_like(FARTHEST_STEP_M, x)
+        along = min(max(off_x * along_x + off_y * along_y, -farthest), farthest) * task.per_m
+        wanted = min(task.speed_m_s, (task.end - memory) * task.slow_per_entry)
+        missing = task.speed_weight * (wanted - min(along * task.speed_per_entry, forward))
+        # In this order, so that what is no number becomes a place, and the cost tells of it.
+        return min(task.last, max(cast_like(0.0, x), memory + along)), missing
+
+    return after
+
+
+@specialise(row_of)
+def _row_of(task: Any, memory: Any) -> Callable[..., Any] | None:
+    if not _is_path(task):
+        return None
+    return lambda task, memory: int32(min(memory, task.last - cast_like(1.0, memory)))
+
+
+@specialise(terminal_cost)
+def _terminal_cost(
+    task: Any, memory: Any, x: Any, y: Any, cos_yaw: Any, sin_yaw: Any, found: Any
+) -> Callable[..., Any] | None:
+    if not _is_path(task):
+        return None
+
+    def cost(task: Any, memory: Any, x: Any, y: Any, cos_yaw: Any, sin_yaw: Any, found: Any) -> Any:
+        off_x, off_y, _, _ = _offset(task, memory, x, y, found[1:])
         return task.terminal_steps * quick_norm(off_x, off_y)
 
     return cost
@@ -312,4 +353,14 @@ def _terminal_cost(task: Any, memory: Any, x: Any, y: Any, cos_yaw: Any, sin_yaw
 
 @specialise(has_memory)
 def _has_memory(task: Any) -> Callable[..., Any] | None:
+    return (lambda task: False) if _is_path(task) else None
+
+
+@specialise(looks_up)
+def _looks_up(task: Any) -> Callable[..., Any] | None:
     return (lambda task: True) if _is_path(task) else None
+
+
+@specialise(table_of)
+def _table_of(task: Any) -> Callable[..., Any] | None:
+    return (lambda task: task.table) if _is_path(task) else None

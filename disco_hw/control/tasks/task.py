@@ -2,25 +2,34 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 
+class Prepared(NamedTuple):
+    """What a plan needs of its task.
+
+    `terms`: for the compiled cost, in float32. `origin_m`: world position that rollouts are relative to, so that single
+    precision is fine anywhere; `begin`: the memory that they start with. `memory`: to hand back at the next plan.
+    """
+
+    terms: Any
+    origin_m: tuple[float, float]
+    begin: float = 0.0
+    memory: float = 0.0
+
+
 class Task(Protocol):
     """What the robot is to do; immutable. Its terms' type decides which compiled cost is used (tasks/terms.py)."""
 
-    @property
-    def origin_m(self) -> tuple[float, float]:
-        """World position that rollouts are relative to, so that single precision is fine anywhere."""
-
-    def terms(
+    def prepare(
         self, time_s: float, x_m: float, y_m: float, memory: float | None, step_s: float, horizon: int
-    ) -> tuple[Any, float]:
-        """Terms for the compiled cost, in float32, and the memory that rollouts start with.
+    ) -> Prepared:
+        """What a plan from here needs.
 
-        `time_s` since the planner's start, the position in the world, the memory that the last plan started with (None
+        `time_s` since the planner's start, the position in the world, the memory that the last plan handed back (None
         at the first), and the steps that will be planned.
         """
 

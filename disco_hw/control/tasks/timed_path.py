@@ -9,8 +9,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from disco_hw.config import TimedPathTask
 from disco_hw.control.tasks.path import AGAINST_M
-from disco_hw.control.tasks.terms import has_memory, stage_cost, terminal_cost
+from disco_hw.control.tasks.task import Prepared
+from disco_hw.control.tasks.terms import has_memory, looks_up, stage_cost, terminal_cost
 from disco_hw.model.jit import cast_like, quick_norm, specialise
 from disco_hw.waypoints import Waypoints
 
@@ -46,11 +48,10 @@ class TimedPath:
         if self.waypoints.times_s is None:
             raise ValueError("the way-points have no times")
 
-    @property
-    def origin_m(self) -> tuple[float, float]:
-        """World position that rollouts are relative to: the first way-point."""
-        x, y = self.waypoints.places_m[0].tolist()
-        return x, y
+    @classmethod
+    def from_config(cls, task: TimedPathTask) -> TimedPath:
+        """The path of robot.toml with the way-points that were read for it."""
+        return cls(Waypoints(np.array(task.points), np.array(task.times_s)))
 
     def _where(self, time_s: NDArray[np.floating]) -> tuple[Array, Array]:
         times, places = self.waypoints.times_s, self.waypoints.places_m
@@ -58,17 +59,16 @@ class TimedPath:
         x, y = (np.interp(time_s, times, column) for column in places.T)
         return np.asarray(x), np.asarray(y)
 
-    def terms(
+    def prepare(
         self, time_s: float, x_m: float, y_m: float, memory: float | None, step_s: float, horizon: int
-    ) -> tuple[Any, float]:
-        """Terms for the kernel; there is no memory."""
+    ) -> Prepared:
+        """Terms for the kernel, relative to where the robot should be now; there is no memory."""
         x, y = self._where(time_s + step_s * np.arange(horizon + 1))
         along_x, along_y = np.diff(x), np.diff(y)
         length = np.hypot(along_x, along_y)
         length[length < RESTS_M] = np.inf
-        origin_x, origin_y = self.origin_m
-        columns = (x[1:] - origin_x, y[1:] - origin_y, along_x / length, along_y / length)
-        return TimedPathTerms(*(column.astype(np.float32) for column in columns)), 0.0
+        columns = (x[1:] - x[0], y[1:] - y[0], along_x / length, along_y / length)
+        return Prepared(TimedPathTerms(*(column.astype(np.float32) for column in columns)), (float(x[0]), float(y[0])))
 
     def instant_cost(self, time_s: float, x_m: float, y_m: float, forward_m_s: float) -> float:
         """Distance to where the robot should be."""
@@ -86,8 +86,9 @@ def _is_timed_path(task: Any) -> bool:
 
 @specialise(stage_cost)
 def _stage_cost(
-    task: Any, memory: Any, step: Any, x_old: Any, y_old: Any, x: Any, y: Any, cos_yaw: Any, sin_yaw: Any, forward: Any
-) -> Callable[..., Any] | None:
+    task: Any, memory: Any, step: Any, x_old: Any, y_old: Any, x: Any, y: Any, cos_yaw: Any, sin_yaw: Any, forward: Any,
+    found: Any,
+) -> Callable[..., Any] | None:  # fmt: skip
     if not _is_timed_path(task):
         return None
 
@@ -102,6 +103,7 @@ def _stage_cost(
         cos_yaw: Any,
         sin_yaw: Any,
         forward: Any,
+        found: Any,
     ) -> Any:
         zero = cast_like(0.0, x)
         against = max(-(cos_yaw * task.along_x[step] + sin_yaw * task.along_y[step]), zero)
@@ -111,12 +113,19 @@ def _stage_cost(
 
 
 @specialise(terminal_cost)
-def _terminal_cost(task: Any, memory: Any, x: Any, y: Any, cos_yaw: Any, sin_yaw: Any) -> Callable[..., Any] | None:
+def _terminal_cost(
+    task: Any, memory: Any, x: Any, y: Any, cos_yaw: Any, sin_yaw: Any, found: Any
+) -> Callable[..., Any] | None:
     if not _is_timed_path(task):
         return None
-    return lambda task, memory, x, y, cos_yaw, sin_yaw: cast_like(0.0, x)
+    return lambda task, memory, x, y, cos_yaw, sin_yaw, found: cast_like(0.0, x)
 
 
 @specialise(has_memory)
 def _has_memory(task: Any) -> Callable[..., Any] | None:
     return (lambda task: False) if _is_timed_path(task) else None
+
+
+@specialise(looks_up)
+def _looks_up(task: Any) -> Callable[..., Any] | None:
+    return (lambda task: None) if _is_timed_path(task) else None

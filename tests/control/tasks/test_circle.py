@@ -102,7 +102,8 @@ def test_the_horizon_of_half_the_length_no_longer_ends_in_a_trap():
 
 def test_from_config_and_picture():
     circle = Circle.from_config(CircleTask(center_x_m=1.0, radius_m=2.0, speed_m_s=0.3))
-    assert (circle.center_x_m, circle.radius_m, circle.speed_m_s, circle.origin_m) == (1.0, 2.0, 0.3, (1.0, 0.0))
+    assert (circle.center_x_m, circle.radius_m, circle.speed_m_s) == (1.0, 2.0, 0.3)
+    assert circle.prepare(0.0, 5.0, 0.0, None, 0.1, 50).origin_m == (1.0, 0.0)
     assert circle.progress_weight > 0.0
     assert Circle.from_config(CircleTask(), "paper") == Circle().paper()
     picture = circle.picture()

@@ -1,12 +1,13 @@
 """A path by arc length: followed forwards, at its speed, through crossings and sharp turns, to its end."""
 
 import math
+from dataclasses import replace
 from pathlib import Path as FilePath
 
 import numpy as np
 import pytest
 
-from disco_hw.control import Disco, DiscoSettings, PlannerState, WheelLimits
+from disco_hw.control import Disco, DiscoSettings, Outcome, PlannerState, WheelLimits
 from disco_hw.control.experiments.plant import Plant
 from disco_hw.control.tasks.path import Path, sharp_turns
 from disco_hw.model import load_model
@@ -172,3 +173,44 @@ def test_instant_cost_and_picture():
 def test_a_path_without_length_is_refused():
     with pytest.raises(ValueError, match="it must be longer than"):
         Path(Waypoints(np.array([[0.0, 0.0], [0.001, 0.0]])))
+
+
+@pytest.mark.parametrize("broken", [{"x_m": math.nan}, {"y_m": -math.inf}, {"yaw_rad": math.nan}])
+@pytest.mark.parametrize("waypoints", [EIGHT, BACK, CORNER])
+def test_a_state_that_is_none_is_told_and_forgotten(waypoints, broken):
+    disco = Disco(MODEL, Path(waypoints), DiscoSettings(), WheelLimits(8.0, 20.0), 2)
+    good = PlannerState(0, 0.1, 0.0, 0.0, 0.0, 0.0)
+    disco.plan(0, good)
+    stopping = disco.plan(100_000_000, replace(good, t_ns=100_000_000, **broken))
+    assert stopping.diagnostics.outcome is Outcome.STOPPING
+    assert np.isfinite(stopping.wheel_speeds).all()
+    after = disco.plan(200_000_000, replace(good, t_ns=200_000_000))
+    assert after.diagnostics.outcome is Outcome.PLANNED
+    assert after.diagnostics.valid_samples == 400
+
+
+def test_rollouts_are_relative_to_a_point_nearby_and_see_what_they_can_reach():
+    line = Path(Waypoints(np.array([[0.0, 0.0], [1900.0, 0.0]])))
+    prepared = line.prepare(0.0, 1600.3, 0.0, None, 0.1, 50)
+    x = prepared.terms.table[0::4]
+    assert prepared.memory * line.spacing_m == pytest.approx(1600.3, abs=0.01)
+    assert x[int(prepared.begin)] + prepared.origin_m[0] == pytest.approx(1600.3, abs=0.011)
+    assert np.abs(x).max() < 60.0
+    # Half a metre a step, back and on, is what rollouts may gain at most.
+    assert prepared.begin * line.spacing_m == pytest.approx(25.0, abs=0.1)
+    assert prepared.terms.last * line.spacing_m == pytest.approx(50.0, abs=0.1)
+    # Near the end there is less to see.
+    assert line.prepare(0.0, 1899.0, 0.0, None, 0.1, 50).terms.last * line.spacing_m == pytest.approx(26.0, abs=0.1)
+
+
+def test_a_closed_path_goes_on_past_its_first_way_point_however_short_it_is():
+    ring = Path(Waypoints(0.3 * ROUND.places_m))
+    prepared = ring.prepare(0.0, 0.3, 0.3, None, 0.1, 50)
+    table, count = prepared.terms.table.reshape(-1, 4), len(ring.table) - 1
+    at = int(prepared.begin)
+    np.testing.assert_allclose(
+        table[at : at + 3 * count, :2],
+        np.tile(ring.table[:-1, :2], (4, 1))[int(prepared.memory) :][: 3 * count] - prepared.origin_m,
+        atol=1e-6,
+    )
+    np.testing.assert_allclose(np.diff(table[:, :2], axis=0), table[:-1, 2:], atol=1e-6)

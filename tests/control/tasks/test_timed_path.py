@@ -72,7 +72,7 @@ def test_it_is_followed_forwards(yaw_rad):
 
 
 def test_where_the_place_rests_it_has_no_direction():
-    terms, _ = TimedPath(ROUND).terms(4.75, 0.0, 0.0, None, 0.1, 4)
+    terms = TimedPath(ROUND).prepare(4.75, 0.0, 0.0, None, 0.1, 4).terms
     np.testing.assert_allclose(terms.along_x, [0.0, 0.0, 1.0, 1.0], atol=0.05)
     np.testing.assert_allclose(np.hypot(terms.along_x, terms.along_y), [0.0, 0.0, 1.0, 1.0], atol=1e-6)
 
