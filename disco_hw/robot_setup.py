@@ -31,14 +31,16 @@ class Setup:
 def load_setup(robot: Path, model: Path | None = None, link: str | None = None, path_file: Path | None = None) -> Setup:
     """Read robot.toml, the model and the task's path; the other arguments override what robot.toml says.
 
-    Raises InputError.
+    A `path_file` that is given was driven before, and is not judged for hairpins. Raises InputError.
     """
     config = load_robot_config(robot)
     if isinstance(config.task, CircleTask):
         path_file = None
     else:
-        path_file = path_file or robot.parent / config.task.path
-        config = msgspec.structs.replace(config, task=with_way_points(config.task, path_file, config.robot))
+        task = config.task
+        task = _with_way_points(task, path_file or robot.parent / task.path, config.robot, path_file is None)
+        path_file = path_file or robot.parent / task.path
+        config = msgspec.structs.replace(config, task=task)
     if link is not None:
         if link not in LINK_KINDS:
             raise InputError(f"--link {link}: no such kind of link; write one of {', '.join(LINK_KINDS)}")
@@ -50,10 +52,18 @@ def load_setup(robot: Path, model: Path | None = None, link: str | None = None, 
     return Setup(robot, model_file, path_file, config, loaded)
 
 
-def with_way_points(task: PathTask | TimedPathTask, path_file: Path, robot: Robot) -> PathTask | TimedPathTask:
+def _with_way_points(
+    task: PathTask | TimedPathTask, path_file: Path, robot: Robot, judged: bool
+) -> PathTask | TimedPathTask:
     """The task with the way-points of a CSV; raises InputError naming file, line and remedy."""
     if isinstance(task, PathTask):
-        return msgspec.structs.replace(task, points=_points(way_points_to_follow(path_file)))
+        followed = way_points_to_follow(path_file)
+        if judged:
+            # Loaded for paths alone: it brings the planner with it.
+            from disco_hw.hairpins import refuse_hairpins  # noqa: PLC0415
+
+            refuse_hairpins(path_file, followed)
+        return msgspec.structs.replace(task, points=_points(followed))
     found = way_points_to_meet(path_file, robot.max_wheel_speed_rad_s * robot.wheel_radius_m)
     assert found.times_s is not None, "they are refused without"
     return msgspec.structs.replace(task, points=_points(found), times_s=tuple(found.times_s.tolist()))

@@ -216,6 +216,7 @@ def test_garbage_on_a_serial_line_leaves_the_daemon_waiting(tmp_path):
         ("sim", "x_m,y_m\n0,0\n", "1 way-points; write at least two"),
         ("check", "x,y\n0,0\n1,1\n", "line 1: column x_m: missing; name x_m and y_m there"),
         ("view", "x_m,y_m\n0,0\n0,0\n", "line 3: the same way-point again; remove it"),
+        ("check", "x_m,y_m\n0,0\n1,0\n1,0.2\n0,0.2\n", "lines 3 to 4: the way turns twice within 0.28 m, too near"),
         ("run", None, "cannot be read"),
     ],
 )
