@@ -1,15 +1,17 @@
 """Names that make the whole prediction worse are not told, however well they fit their own channel.
 
 Where the true form is none that is known, the best stand-in of one channel may lead the chain from command to pose
-further astray than none. Held-out predictions decide: it goes, or another that would do as well takes its place.
+astray. Held-out predictions decide: a name without which they are clearly better goes; where they are worse than with
+the refitted geometry alone, one that does harm goes or another that would do as well takes its place.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
+from itertools import chain
 
-from disco_hw.gap.held_out import WORSE, worse_by
+from disco_hw.gap.held_out import WORSE, Errors, worse_by
 from disco_hw.gap.outcome import Outcome
 from disco_hw.gap.report import REPORTED_HORIZON_S
 from disco_hw.gap.search import Found
@@ -19,39 +21,61 @@ _MOST_CHANGES = 4
 
 
 def harmless(outcome: Outcome) -> Outcome:
-    """The outcome without what makes its held-out predictions worse than those of the refitted geometry."""
+    """The outcome without what makes its held-out predictions worse."""
     if outcome.body is None:
         return outcome
-    worse = _worse(outcome)
+    refitted = outcome.errors("refitted", REPORTED_HORIZON_S)
     for _ in range(_MOST_CHANGES):
-        if not worse > WORSE:
+        now = _amended(outcome)
+        if worse_by(refitted, now) > WORSE:
+            better = _best(refitted, worse_by(refitted, now), chain(_lacking_one(outcome), _swapped_one(outcome)))
+        else:
+            better = _best(now, 1.0 / WORSE, _lacking_one(outcome))
+        if better is None:
             break
-        options = [(_worse(option), place, option) for place, option in enumerate(_without_one(outcome))]
-        if not options or min(options)[0] >= worse:
-            break
-        worse, _, outcome = min(options)
+        outcome = better
     return outcome
 
 
-def _worse(outcome: Outcome) -> float:
-    before, after = (outcome.errors(stage, REPORTED_HORIZON_S) for stage in ("refitted", "amended"))
-    return worse_by(before, after)
+def _amended(outcome: Outcome) -> Errors:
+    return outcome.errors("amended", REPORTED_HORIZON_S)
 
 
-def _without_one(outcome: Outcome) -> Iterator[Outcome]:
-    """Outcomes that lack one of the names, or have a rival in its place, or lack the terms of a channel."""
+def _best(than: Errors, below: float, options: Iterable[Outcome]) -> Outcome | None:
+    """Of some outcomes the one that predicts best, if its errors are less than `below` times those of another."""
+    ratios = [(worse_by(than, _amended(option)), place, option) for place, option in enumerate(options)]
+    if not ratios or not min(ratios)[0] < below:
+        return None
+    return min(ratios)[2]
+
+
+def _lacking_one(outcome: Outcome) -> Iterator[Outcome]:
+    """Outcomes that lack one of the names, or the terms of a channel."""
     for found in (outcome.wheels, outcome.body):
         if found is None:
             continue
-        for name in found.names:
-            if name in found.selector.given:
-                continue
-            rest = tuple(other for other in found.names if other != name)
-            for instead in ((), *((rival,) for rival in found.selector.rivals(found.names, name))):
-                yield _changed(outcome, found, replace(found, names=(*rest, *instead)), (name,))
+        for name, rest in _each(found):
+            yield _changed(outcome, found, replace(found, names=rest), (name,))
         if found.unnamed and found.plain is not None:
             bare = replace(found, selector=found.plain, unnamed=(), plain=None)
             yield _changed(outcome, found, bare, tuple(term.form for term in found.unnamed))
+
+
+def _swapped_one(outcome: Outcome) -> Iterator[Outcome]:
+    """Outcomes that have, in place of one of the names, another that would do as well."""
+    for found in (outcome.wheels, outcome.body):
+        if found is None:
+            continue
+        for name, rest in _each(found):
+            for rival in found.selector.rivals(found.names, name):
+                yield _changed(outcome, found, replace(found, names=(*rest, rival)), (name,))
+
+
+def _each(found: Found) -> Iterator[tuple[str, tuple[str, ...]]]:
+    """Every name that was found, and the others."""
+    for name in found.names:
+        if name not in found.selector.given:
+            yield name, tuple(other for other in found.names if other != name)
 
 
 def _changed(outcome: Outcome, old: Found, new: Found, harmful: tuple[str, ...]) -> Outcome:
