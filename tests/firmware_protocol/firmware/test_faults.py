@@ -83,11 +83,17 @@ def test_much_current_without_ticks_is_a_stall(side):
     assert wait_for_fault(bench) == (f"STALL_{side.upper()}", 300)
 
 
+def test_the_stall_current_itself_is_none():
+    bench = driving_with("left", current_a=CONFIG.stall_current_a)
+    bench.inputs["left_ticks"] = int(bench.ticks[0])
+    assert wait_for_fault(bench) == ("ENCODER_MISSING_LEFT", 300)
+
+
 @pytest.mark.parametrize(
     "spoil",
     [
-        lambda bench: bench.inputs.update(left_current_a=0.4),
-        lambda bench: setattr(bench, "command", {"left": 0.9, "right": 4.0}),
+        lambda bench: bench.inputs.update(left_current_a=CONFIG.encoder_check_current_a),
+        lambda bench: setattr(bench, "command", {"left": CONFIG.encoder_check_speed_rad_s, "right": 4.0}),
         lambda bench: bench.inputs.pop("left_ticks"),
     ],
     ids=["no current", "hardly commanded", "ticks come"],
@@ -131,6 +137,14 @@ def test_a_jump_is_more_than_three_times_the_fastest_wheel_and_sixteen_ticks(ela
             assert (bench.out.fault == FAULTS["ENCODER_JUMP_LEFT"]) == jump, ticks
 
 
+@pytest.mark.parametrize("ticks", [16, 17])
+def test_sixteen_ticks_in_a_microsecond_are_no_jump(ticks):
+    bench = Bench()
+    bench.inputs["right_ticks"] = ticks
+    bench.step(elapsed_us=1)
+    assert (bench.out.fault == FAULTS["ENCODER_JUMP_RIGHT"]) == (ticks > 16)
+
+
 def test_ticks_may_wrap():
     bench = Bench()
     bench.ticks = [2.0**32 - 500, -(2.0**31)]
@@ -162,6 +176,16 @@ def test_turning_against_the_setpoint_is_wrong_direction(side, sign):
     bench.wheels_follow = False
     bench.speeds[SIDES.index(side)] = -3.0 * sign
     assert wait_for_fault(bench) == (f"WRONG_DIRECTION_{side.upper()}", 300)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize(("asked", "speed"), [(1.0, -3.0), (4.0, -1.0), (4.0, 0.5), (4.0, -0.5), (4.0, 0.0)])
+def test_up_to_the_check_speed_a_wheel_does_not_turn_against_its_setpoint(asked, speed, sign):
+    bench = Bench()
+    bench.to_driving(asked * sign, asked * sign)
+    bench.wheels_follow = False
+    bench.speeds[0] = speed * sign
+    assert wait_for_fault(bench, within_ms=1000) == (None, None)
 
 
 def test_each_time_the_wheel_turns_against_its_setpoint_is_judged_by_itself():
@@ -203,6 +227,16 @@ def test_a_wheel_is_late_if_it_lost_a_tenth_of_its_speed(part, late):
     bench.run(290)
     bench.speeds[0] = -3.0 * part
     assert (bench.run(20).fault == 0) == late
+
+
+def test_a_slow_wheel_that_slows_down_is_only_late_too():
+    bench = Bench(dataclasses.replace(CONFIG, encoder_check_speed_rad_s=0.1))
+    bench.to_driving(4.0, 4.0)
+    bench.wheels_follow = False
+    bench.speeds[0] = -0.3
+    bench.run(290)
+    bench.speeds[0] = -0.2
+    assert bench.run(20).fault == 0
 
 
 def test_wrong_direction_asks_for_an_enabled_driver():
@@ -283,6 +317,15 @@ def test_a_passing_fault_blocks_ready_while_it_is_held():
     assert (bench.out.state, name_of(bench.out.fault)) == ("STANDBY", "UNDER_VOLTAGE")
     bench.run(200)
     assert (bench.out.state, bench.out.fault) == ("READY", 0)
+
+
+def test_a_passing_fault_is_held_to_the_millisecond():
+    bench = Bench()
+    bench.inputs["voltage_v"] = 12.0
+    bench.run(300)
+    bench.inputs.clear()
+    assert name_of(bench.run(499).fault) == "UNDER_VOLTAGE"
+    assert name_of(bench.step().fault) == "NONE"
 
 
 def test_the_graver_fault_is_shown():
