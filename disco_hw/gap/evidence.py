@@ -72,6 +72,8 @@ def inflation(found: Fit, channel: Channel, added: tuple[int, ...]) -> float:
             continue
         scatter = float(np.einsum("bi,ij,bj->", gradient @ moved, weight, gradient @ moved))
         told = np.einsum("bij,ip,pq,jq->b", normal, moved, weight, moved)
+        if told.max() <= 0.0:
+            continue
         # Where few blocks tell most, as few scatter: fitting takes one of them, and the rest says little of the noise.
         blocks = float(told.sum() ** 2 / (told**2).sum())
         known = channel.trusted_blocks / len(places)
