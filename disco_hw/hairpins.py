@@ -68,11 +68,7 @@ def _headings(path: Path) -> Array:
     along = path.table[:-1, 2:]
     if path.closed:
         along = along[np.arange(len(along) + math.ceil(SHARP_APART_M / path.spacing_m)) % len(along)]
-    heading = np.arctan2(along[:, 1], along[:, 0])
-    # A piece whose end is its beginning, at the tip of a way there and back, goes on as the one before.
-    moves = (along != 0.0).any(axis=1)
-    known = np.maximum.accumulate(np.where(moves, np.arange(len(along)), 0))
-    return np.asarray(np.unwrap(heading[known]))
+    return np.asarray(np.unwrap(np.arctan2(along[:, 1], along[:, 0])))
 
 
 def _sharp_pair(path: Path, heading: Array) -> tuple[int, int, float] | None:

@@ -83,6 +83,14 @@ def test_what_has_room_or_turns_at_one_place_is_driven(places):
     assert found(places) is None
 
 
+@pytest.mark.parametrize("heading_rad", np.linspace(-3.0, 3.0, 7))
+def test_there_and_back_has_none_whichever_way_it_goes_and_wherever_its_tip_falls(heading_rad):
+    for length_m in (1.0, 1.21, 1.215):
+        tip = length_m * np.array([math.cos(heading_rad), math.sin(heading_rad)])
+        assert found(np.array([[0.0, 0.0], tip, [0.0, 0.0]])) is None
+        assert found(np.array([[0.0, 0.0], tip, 0.3 * tip])) is None
+
+
 def test_places_that_a_hand_recorded_are_no_hairpins():
     rng = np.random.default_rng(1)
     along = np.linspace(0.0, 3.0, 150)
