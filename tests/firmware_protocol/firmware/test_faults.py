@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from firmware_protocol.firmware_core import FirmwareInputs, ResetCause
+from firmware_protocol.firmware_core import FirmwareCore, FirmwareInputs, ResetCause
 from tests.firmware_protocol.bench import CONFIG, FAULTS, MS, Bench
 
 SIDES = ("left", "right")
@@ -59,6 +59,13 @@ def test_a_shorter_disturbance_is_no_fault(field, bad, good, fault, debounce_ms)
         bench.run(debounce_ms - 1)
         bench.inputs[field] = good
         assert bench.run(2).fault == 0, fault
+
+
+def test_time_counts_from_the_first_cycle_whatever_the_clock_shows_then():
+    core = FirmwareCore(CONFIG)
+    inputs = FirmwareInputs(left_ticks=0, right_ticks=0, left_speed_rad_s=0.0, right_speed_rad_s=0.0, voltage_v=12.0)
+    faults = [core.step(10_000 * MS + after_ms * MS, inputs).fault for after_ms in range(201)]
+    assert faults == [0] * 200 + [FAULTS["UNDER_VOLTAGE"]]
 
 
 def driving_with(side, **inputs):
@@ -242,7 +249,7 @@ def test_a_slow_wheel_that_slows_down_is_only_late_too():
 
 
 def test_wrong_direction_asks_for_an_enabled_driver():
-    bench = Bench()
+    bench = Bench(dataclasses.replace(CONFIG, encoder_check_speed_rad_s=0.1))
     bench.wheels_follow = False
     bench.speeds = [-3.0, 3.0]
     assert wait_for_fault(bench) == (None, None)
