@@ -313,6 +313,19 @@ def test_a_latched_fault_outlives_its_cause_and_a_reset_waits_for_the_cause_to_g
     assert (bench.out.state, name_of(bench.out.fault)) == ("FAULT", "OVER_CURRENT_LEFT")
 
 
+def test_a_reset_of_one_fault_hides_no_other_for_a_single_cycle():
+    bench = Bench()
+    bench.inputs.update(voltage_v=12.0, left_current_a=50.0)
+    bench.run(300)
+    bench.inputs.pop("left_current_a")
+    bench.ask("STANDBY")
+    bench.run(250)
+    bench.ask("RESET")
+    shown = {name_of(bench.step().fault) for _ in range(60)}
+    assert shown == {"OVER_CURRENT_LEFT", "UNDER_VOLTAGE"}
+    assert (bench.out.state, name_of(bench.out.fault)) == ("STANDBY", "UNDER_VOLTAGE")
+
+
 def test_a_passing_fault_blocks_ready_while_it_is_held():
     bench = Bench()
     bench.hello()
