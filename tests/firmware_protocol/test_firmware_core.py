@@ -154,6 +154,17 @@ def test_after_the_clock_went_back_time_goes_on_at_its_rate():
     assert heading.values["sample_time"] == pytest.approx(expected, abs=100)
 
 
+@pytest.mark.parametrize("skipped", [7, 15])
+def test_repeated_commands_and_leaps_of_the_counter_are_counted(skipped):
+    bench = Bench()
+    bench.to_driving()
+    errors = bench.core._core.sequence_errors
+    for _ in range(skipped):
+        bench.next_counter("WHEEL_COMMAND")
+    bench.wheel_command(**bench.command)
+    assert bench.core._core.sequence_errors == errors + 1
+
+
 def test_lost_commands_are_counted():
     bench = Bench()
     bench.to_driving()
