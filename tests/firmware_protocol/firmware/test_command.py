@@ -195,7 +195,40 @@ def test_an_unusable_frame_breaks_the_row_of_zeros(broken):
     else:
         bench.counters["WHEEL_COMMAND"] -= 1
         bench.wheel_command()
+    five_zeros_more(bench)
+
+
+def five_zeros_more(bench):
+    """Nothing of what was sent before counts towards the five in a row."""
+    for _ in range(4):
+        bench.wheel_command()
+        bench.step()
+        assert "ZERO_COMMANDS" in bench.blockers()
     bench.wheel_command()
+    bench.step()
+    assert "ZERO_COMMANDS" not in bench.blockers()
+
+
+def test_zeros_of_an_arming_before_do_not_count():
+    bench = Bench()
+    bench.to_armed()
+    bench.command = None
+    bench.ask("STANDBY")
+    bench.run_until("STANDBY")
+    bench.ask("READY", session=9)
+    bench.run_until("READY", within_ms=60)
+    five_zeros_more(bench)
+
+
+def test_zeros_count_until_the_command_timeout_is_over():
+    bench = Bench()
+    bench.to_ready()
+    for _ in range(3 + 5):
+        bench.wheel_command()
+        bench.step()
+    assert "ZERO_COMMANDS" not in bench.blockers()
+    bench.run(99)
+    assert "ZERO_COMMANDS" not in bench.blockers()
     bench.step()
     assert "ZERO_COMMANDS" in bench.blockers()
 

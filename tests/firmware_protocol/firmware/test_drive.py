@@ -260,7 +260,7 @@ def test_a_pause_between_cycles_does_not_become_one_big_step():
     bench.wheel_command(8.0, 8.0)
     before = setpoints(bench)[0]
     bench.step(elapsed_us=60 * MS)
-    assert setpoints(bench)[0] - before <= 20.0 * 0.010 + EPS
+    assert setpoints(bench)[0] - before == pytest.approx(20.0 * 0.010, abs=EPS)
 
 
 @pytest.mark.parametrize("at_ms", range(1, 700, 23))

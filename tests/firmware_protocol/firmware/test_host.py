@@ -7,7 +7,7 @@ import pytest
 
 from firmware_protocol.e2e import challenge_answer
 from firmware_protocol.firmware_core import FirmwareCore, FirmwareInputs
-from tests.firmware_protocol.bench import CODEC, CONFIG, FAULTS, Bench, sealed
+from tests.firmware_protocol.bench import CODEC, CONFIG, FAULTS, MS, Bench, sealed
 
 
 def test_without_a_handshake_nothing_gets_ready():
@@ -301,6 +301,17 @@ def test_arming_waits_for_wheels_that_stand():
     assert bench.out.blockers == 0
 
 
+def test_wheels_stand_below_the_speed_of_stillness_and_not_at_it():
+    bench = Bench(dataclasses.replace(CONFIG, still_speed_rad_s=0.0625))
+    bench.wheels_follow = False
+    bench.speeds = [0.0, -0.0625]
+    bench.step()
+    assert "WHEELS_MOVING" in bench.blockers()
+    bench.speeds = [0.0, -0.0624]
+    bench.step()
+    assert "WHEELS_MOVING" not in bench.blockers()
+
+
 def estopped():
     bench = Bench()
     bench.to_driving()
@@ -379,6 +390,20 @@ def test_a_reset_no_longer_asked_for_is_void(end):
     assert bench.out.state == "ESTOP"
 
 
+def test_a_reset_is_asked_for_until_the_host_is_silent_and_no_longer():
+    for silent_ms, state in ((500, "STANDBY"), (501, "ESTOP")):
+        bench = estopped()
+        bench.wheels_follow = False
+        bench.speeds = [1.0, 1.0]
+        bench.ask("RESET")
+        bench.run(50 - bench.now_us // MS % 50)
+        bench.request = None
+        bench.run(silent_ms - 1)
+        assert bench.out.state == "ESTOP"
+        bench.speeds = [0.0, 0.0]
+        assert bench.step().state == state
+
+
 @pytest.mark.parametrize("source", ["estop_button", "estop_line"])
 def test_a_pressed_button_cannot_be_reset_nor_does_its_release_reset(source):
     bench = Bench()
@@ -388,9 +413,13 @@ def test_a_pressed_button_cannot_be_reset_nor_does_its_release_reset(source):
     assert (bench.out.state, bench.out.estop_source) == ("ESTOP", source.removeprefix("estop_").upper())
     assert "ESTOP" in bench.blockers()
     bench.command = None
+    bench.run(600)
+    challenge = bench.core.challenge
     bench.ask("RESET")
     bench.run(700)
     assert bench.out.state == "ESTOP"
+    # A challenge is renewed on the way through STANDBY, be it between two cycles.
+    assert bench.core.challenge == challenge
     bench.inputs.clear()
     bench.run(1000)
     assert bench.out.state == "ESTOP"

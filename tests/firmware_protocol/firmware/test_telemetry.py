@@ -214,9 +214,11 @@ def test_a_session_that_ends_is_told_at_once():
 
 def test_link_health():
     bench = Bench()
+    bench.run(1000)
+    assert set(last(bench, "LINK_HEALTH").values()) == {0}
     bench.inputs.update(tx_error_count=300, rx_error_count=130)
     bench.run(10)
-    bench.inputs.update(tx_error_count=90)
+    bench.inputs.update(tx_error_count=255)
     bench.run(10)
     bench.inputs.update(tx_error_count=256)
     for _ in range(3):
