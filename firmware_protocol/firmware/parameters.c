@@ -18,8 +18,8 @@ static const parameter_t parameters[] = {
     {DISCO_KEY_OVER_TEMPERATURE, true, 30.0f, 120.0f},
     {DISCO_KEY_UNDER_VOLTAGE, true, 5.0f, 60.0f},
     {DISCO_KEY_STOP_DECELERATION, true, 1.0f, 655.0f},
-    {DISCO_KEY_MAX_WHEEL_SPEED, false, 0.0f, 0.0f},
-    {DISCO_KEY_MAX_WHEEL_ACCELERATION, false, 0.0f, 0.0f},
+    {.key = DISCO_KEY_MAX_WHEEL_SPEED, .writable = false},
+    {.key = DISCO_KEY_MAX_WHEEL_ACCELERATION, .writable = false},
 };
 
 static float *slot(disco_config_t *config, uint16_t key)
