@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +15,11 @@ from disco_hw.errors import InputError
 ADAPT_ACTIONS = ("revert", "adapt")
 """Back to the belief of the model file, and learning again."""
 ACTIONS = ("arm", "start", "stop", "disarm", "estop", "reset", "status", "quit", *ADAPT_ACTIONS)
-PAGE_ACTIONS = ("task", "drive")
+TASK = "task"
+PAGE_ACTIONS = (TASK, "drive")
 """What takes arguments: another circle, and a hand on the page's pad."""
+ASKED = (*ACTIONS, TASK)
+"""What a person may ask for here; a hand on a pad is no matter of single requests."""
 SERVED = (*ACTIONS, *PAGE_ACTIONS)
 
 
@@ -25,14 +29,29 @@ def socket_path(config: RobotConfig) -> Path:
     return Path(configured) if configured is not None else default_socket_path(config.robot.name)
 
 
-def ask(robot: Path, action: str) -> dict[str, Any]:
-    """Send one request to the daemon of `robot`.
+def ask(robot: Path, action: str, changes: Sequence[str] = ()) -> dict[str, Any]:
+    """Send one request to the daemon of `robot`; `changes`, as "radius_m=0.8", are for `task` alone.
 
-    Raises InputError for an unknown action and WorkError without a daemon.
+    Raises InputError for an unknown action and for changes that are none, and WorkError without a daemon.
     """
-    if action not in ACTIONS:
-        raise InputError(f"{action}: no such request; write one of {', '.join(ACTIONS)}")
-    return send_request(socket_path(load_robot_config(robot)), {"do": action})
+    if action not in ASKED:
+        raise InputError(f"{action}: no such request; write one of {', '.join(ASKED)}")
+    if (action == TASK) != bool(changes):
+        said = "say what to change" if action == TASK else f"{action} takes nothing more; only {TASK} does"
+        raise InputError(f"{said}: ctl {robot} {TASK} radius_m=0.8 speed_m_s=0.3")
+    request = {"do": action} | dict(map(_change, changes))
+    return send_request(socket_path(load_robot_config(robot)), request)
+
+
+def _change(text: str) -> tuple[str, float]:
+    name, _, value = text.partition("=")
+    try:
+        number = float(value)
+    except ValueError:
+        number = math.nan
+    if name == "do" or not math.isfinite(number):
+        raise InputError(f"{text}: not a change of the task; write NAME=NUMBER, as radius_m=0.8")
+    return name, number
 
 
 def progress(task: Mapping[str, Any]) -> tuple[str, str]:

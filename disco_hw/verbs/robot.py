@@ -104,13 +104,18 @@ def drive(
 
 def ctl(
     robot: RobotFile,
-    do: Annotated[str, typer.Argument(help="arm, start, stop, disarm, reset, estop, status, revert, adapt or quit.")],
+    do: Annotated[
+        str, typer.Argument(help="arm, start, stop, disarm, reset, estop, status, task, revert, adapt or quit.")
+    ],
+    changes: Annotated[
+        list[str] | None, typer.Argument(help="Of the task, while disarmed: radius_m=0.8 speed_m_s=0.3, for example.")
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Tell the running daemon what to do, or ask how it is."""
     from disco_hw.daemon.client import ask, in_words
 
-    reply = ask(robot, do)
+    reply = ask(robot, do, changes or ())
     print_result(reply, as_json, in_words(reply))
     if not reply.get("ok", False):
         raise typer.Exit(1)

@@ -56,6 +56,13 @@ def test_check_and_a_second_daemon_keep_out_of_a_running_daemons_way(tmp_path):
         assert "arm first" in output
         code, output = disco("ctl", str(stack.robot_file), "jump")
         assert code == 2
+        code, output = disco("ctl", str(stack.robot_file), "task", "radius_m=1.25", "speed_m_s=0.25")
+        assert (code, "circle of 1.25 m" in output, "0.25 m/s" in output) == (0, True, True), output
+        assert stack.operator.status()["task"]["asked"]["radius_m"] == 1.25
+        code, output = disco("ctl", str(stack.robot_file), "task", "speed_m_s=90")
+        assert code == 1
+        assert "refused: " in output
+        assert stack.operator.status()["task"]["asked"]["speed_m_s"] == 0.25
         code, output = disco("run", str(stack.robot_file))
         assert code == 2
         assert "a daemon serves this socket already" in output
