@@ -16,7 +16,7 @@ from disco_hw.gap.body_noise import BodyGains, BodyNoise, Motion, body_gains, wh
 from disco_hw.gap.free_runs import pose_residual, read_angles, run_body, run_wheels
 from disco_hw.gap.layout import BASE_COUNT, BODY, WHEEL, Layout
 from disco_hw.gap.timeline import CELL_S, Samples, Timeline
-from disco_hw.gap.wheel_noise import Driven, WheelGains, WheelNoise, wheel_gains, whiten_wheels
+from disco_hw.gap.wheel_noise import Driven, WheelGains, WheelNoise, steady_speeds, wheel_gains, whiten_wheels
 
 WINDOW_S = 3.0
 ONSET_M_S = 0.05
@@ -100,12 +100,24 @@ class WheelChannel:
         jumps = np.concatenate([[0.0], np.cumsum(line.command_change)])
         between = np.diff(jumps[place.node + 1], prepend=0.0)
         speed = line.speed_rad_s[place.node]
-        driven = Driven(np.maximum(dt, 0.0), speed, np.maximum(between, 0.0), first_of_run | resumed, good)
+        dt = np.maximum(dt, 0.0)
+        steady = steady_speeds(dt, speed)
+        driven = Driven(dt, speed, steady, np.maximum(between, 0.0), first_of_run | resumed, good)
         return cls(line, driven, wheel_gains(noise, driven), np.ones((place.t_s.size, 2)), noise, geometry)
 
-    def with_noise(self, noise: WheelNoise) -> WheelChannel:
-        """The same data under another noise model, weights reset."""
-        return WheelChannel.build(self.timeline, noise, self.geometry, self.gains.use)
+    def with_noise(self, noise: WheelNoise, use: Mask | None = None) -> WheelChannel:
+        """The same data under another noise model, weights reset; `use` (E,) leaves samples out."""
+        driven = self.driven if use is None else replace(self.driven, use=self.driven.use & use)
+        return replace(
+            self, driven=driven, gains=wheel_gains(noise, driven), weight=np.ones(self.weight.shape), noise=noise
+        )
+
+    def expecting(self, p: Array) -> WheelChannel:
+        """The same, whose wheels' slow error acts on the speed that a parameter vector gives; weights reset."""
+        turned = np.diff(self._predicted(p), axis=0, prepend=np.nan)
+        moving = (self.driven.dt_s > 0.0) & ~self.driven.restart
+        expected = np.where(moving[:, None], turned / np.maximum(self.driven.dt_s, 1e-9)[:, None], 0.0)
+        return replace(self, driven=replace(self.driven, expected_rad_s=expected)).with_noise(self.noise)
 
     def weighted(self, weight: Array) -> WheelChannel:
         """The same with other weights (E, 2)."""
@@ -158,10 +170,13 @@ class WheelChannel:
 
     def raw_residual(self, p: Array, extra: Array | None = None) -> Array:
         """Measured minus predicted wheel angles at the samples, (E, 2)."""
+        return self.timeline.encoder_angle_rad - self._predicted(p, extra)
+
+    def _predicted(self, p: Array, extra: Array | None = None) -> Array:
         place = self.timeline.encoder
         predicted = np.empty((place.t_s.size, 2))
         read_angles(self.angles(p, extra), place.node, place.fraction, predicted)
-        return self.timeline.encoder_angle_rad - predicted
+        return predicted
 
     def whitened(self, p: Array, extra: Array | None = None) -> Array:
         """Residuals of unit variance, not weighted, (E, 2)."""

@@ -74,6 +74,7 @@ def inflation(found: Fit, channel: Channel, added: tuple[int, ...]) -> float:
         told = np.einsum("bij,ip,pq,jq->b", normal, moved, weight, moved)
         if told.max() <= 0.0:
             continue
+        told = told / told.max()
         # Where few blocks tell most, as few scatter: fitting takes one of them, and the rest says little of the noise.
         blocks = float(told.sum() ** 2 / (told**2).sum())
         known = channel.trusted_blocks / len(places)

@@ -23,7 +23,8 @@ _LEAST_TOLD = 1e-3
 class Fit:
     """A fitted parameter vector.
 
-    `cost` is half the sum of squares; `jacobian` (n, A) over the `active` entries, derivative of the residual.
+    `cost` is half the sum of squares; `jacobian` (n, A) over the `active` entries, derivative of the residual;
+    `precision` (A,) of what was expected of them, none if nothing was.
     """
 
     vector: Array
@@ -31,10 +32,12 @@ class Fit:
     cost: float
     residual: Array
     jacobian: Array
+    precision: Array | None = None
 
     def information(self) -> Array:
-        """Normal matrix, (A, A)."""
-        return np.asarray(self.jacobian.T @ self.jacobian)
+        """Normal matrix, (A, A), with what was expected."""
+        normal = np.asarray(self.jacobian.T @ self.jacobian)
+        return normal if self.precision is None else normal + np.diag(self.precision)
 
     def covariance(self) -> Array:
         """Covariance of the active entries under the noise model, (A, A); pseudo-inverse where nothing is known."""
@@ -89,18 +92,27 @@ def fit(
     active: tuple[int, ...],
     iterations: int = _MOST_ITERATIONS,
 ) -> Fit:
-    """Fit the `active` entries from `start`."""
+    """Fit the `active` entries from `start`; what a log does not tell stays near what is expected."""
     layout = channel.layout
     chosen = list(active)
     low, high = layout.low[chosen], layout.high[chosen]
+    precision, expected = layout.precision[chosen], layout.neutral[chosen]
+    held = bool(precision.any())
+
+    def total(residual: Array, vector: Array) -> float:
+        cost = 0.5 * float(residual @ residual)
+        return cost + 0.5 * float(precision @ (vector[chosen] - expected) ** 2) if held else cost
+
     residual = channel.residual
     vector = start.copy()
     now = residual(vector)
-    cost = 0.5 * float(now @ now)
+    cost = total(now, vector)
     slope = jacobian(residual, vector, active, layout, now)
     damping = 1e-3
     for _ in range(iterations if active else 0):
         normal, gradient = slope.T @ slope, slope.T @ now
+        if held:
+            normal, gradient = normal + np.diag(precision), gradient + precision * (vector[chosen] - expected)
         scale = np.maximum(np.diag(normal), 1e-12 * max(float(np.max(np.diag(normal))), 1e-30))
         better = False
         gained = 0.0
@@ -109,7 +121,7 @@ def fit(
             trial = vector.copy()
             trial[chosen] = np.clip(vector[chosen] + step, low, high)
             there = residual(trial)
-            cost_there = 0.5 * float(there @ there)
+            cost_there = total(there, trial)
             if cost_there < cost:
                 gained, better = cost - cost_there, True
                 vector, now, cost = trial, there, cost_there
@@ -120,7 +132,7 @@ def fit(
             slope = jacobian(residual, vector, active, layout, now)
         if not better or gained < _GOOD_ENOUGH:
             break
-    return Fit(vector, active, cost, now, slope)
+    return Fit(vector, active, 0.5 * float(now @ now), now, slope, precision if held else None)
 
 
 def by_block(found: Fit, block: Index, blocks_each: int = 1) -> tuple[Array, Array]:

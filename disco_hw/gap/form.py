@@ -10,16 +10,20 @@ from numpy.typing import NDArray
 
 from disco_hw.gap.candidates import CANDIDATES, indices
 from disco_hw.gap.channels import BodyChannel
-from disco_hw.gap.evidence import compare
+from disco_hw.gap.evidence import inflation
 from disco_hw.gap.fit import fit
+from disco_hw.gap.layout import BODY
 from disco_hw.gap.search import Found
+from disco_hw.gap.selection import Split
 from disco_hw.gap.terms import Term, WithTerms
 from disco_hw.gap.timeline import CELL_S
 from disco_hw.model.effects import REGISTRY
 
 Array = NDArray[np.float64]
 
-_SIGMAS = 3.0
+# As sure as the intervals of the report: 95 %.
+_SIGMAS = 1.96
+_MOST_TIMES = 9.9
 _LEVER_M = 0.2
 _UNITS = ("m/s ahead", "m/s to the side", "rad/s")
 
@@ -31,27 +35,38 @@ def other_forms(found: Found) -> list[str]:
         return []
     out = []
     for name in found.names:
-        pushed = _pushed(found, name, channel)
+        pushed = _pushed(found.selector.split(found.names), name, channel)
         level, axis = _middle(pushed)
         if level <= 0.0:
             continue
-        small = np.where((np.abs(pushed[:, axis]) < level)[:, None], pushed, 0.0)
-        wide = WithTerms.of(channel, (*(one.term for one in found.unnamed), Term("", small)))
+        # What saturates grows with less than its first power, what sets in late with more.
+        more = pushed * np.sqrt(np.abs(pushed[:, axis]) / level)[:, None]
+        wide = WithTerms.of(channel, (*(one.term for one in found.unnamed), Term("", more)))
         now = found.fit
         free = fit(wide, np.append(now.vector, 0.0), indices(wide, found.names))
-        proof = compare(now, free, channel, 1.0)
-        if 2.0 * proof.gain > _SIGMAS**2 * proof.inflation and proof.repeated > 0.0:
-            out.append(
-                f"wheel_to_body: {name} is {1.0 + free.vector[-1]:.1f} times as strong where it makes up less than "
-                f"{level:.2g} {_UNITS[axis]} as where it makes up more: its form is another"
-            )
+        if 2.0 * (now.cost - free.cost) < _SIGMAS**2 * inflation(free, wide, (free.vector.size - 1,)):
+            continue
+        again = _pushed(wide.split(free.vector), name, channel)
+        share = float((again * pushed).sum() / (pushed**2).sum())
+        times = _ratio(share + 0.5 * float(free.vector[-1]), share + float(free.vector[-1]))
+        out.append(
+            f"wheel_to_body: {name} is {times:.1f} times as strong where it makes up {0.25 * level:.2g} "
+            f"{_UNITS[axis]} as where it makes up {level:.2g}: 95 % sure that its form is another"
+        )
     return out
 
 
-def _pushed(found: Found, name: str, channel: BodyChannel) -> Array:
-    """What an accepted effect adds to the body's velocity at the nodes, (M, 3) in m/s, m/s, rad/s."""
+def _ratio(small: float, large: float) -> float:
+    """How much stronger where small, within what can be said."""
+    if large <= small / _MOST_TIMES:
+        return _MOST_TIMES
+    return max(small / large, 1.0 / _MOST_TIMES)
+
+
+def _pushed(split: Split, name: str, channel: BodyChannel) -> Array:
+    """What an effect adds to the body's velocity at the nodes of a fit, (M, 3) in m/s, m/s, rad/s."""
     place = channel.layout.place
-    vector, extra = found.selector.split(found.names)
+    vector, extra = split
     without = vector.copy()
     columns = [place[column] for column in CANDIDATES[name].columns]
     without[columns] = channel.layout.neutral[columns]
@@ -61,13 +76,16 @@ def _pushed(found: Found, name: str, channel: BodyChannel) -> Array:
 
 
 def _velocity(channel: BodyChannel, vector: Array, extra: Array | None) -> Array:
-    """Velocity in the body's frame at the nodes of a free run, (M, 3); zero where a run ends."""
+    """Velocity of the point of the axle that rolls, in the body's frame, at the nodes of a free run, (M, 3); zero where
+    a run ends.
+    """
     track = channel.track(vector, extra)
     step = np.diff(track, axis=0, append=track[-1:])
     step[np.append(channel.timeline.first[1:], True)] = 0.0
     yaw = track[:, 2] + 0.5 * step[:, 2]
     ahead = np.cos(yaw) * step[:, 0] + np.sin(yaw) * step[:, 1]
-    left = np.cos(yaw) * step[:, 1] - np.sin(yaw) * step[:, 0]
+    # Of the point that rolls, as a push of the yaw rate moves the tracked one to the side by itself.
+    left = np.cos(yaw) * step[:, 1] - np.sin(yaw) * step[:, 0] + BODY.at(vector, "x_icr_m") * step[:, 2]
     return np.column_stack([ahead, left, step[:, 2]]) / CELL_S
 
 

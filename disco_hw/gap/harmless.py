@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from itertools import chain
 
-from disco_hw.gap.held_out import WORSE, Errors, worse_by
+from disco_hw.gap.held_out import WORSE, Errors, clearly_worse, worse_by
 from disco_hw.gap.outcome import Outcome
 from disco_hw.gap.report import REPORTED_HORIZON_S
 from disco_hw.gap.search import Found
@@ -27,10 +27,12 @@ def harmless(outcome: Outcome) -> Outcome:
     refitted = outcome.errors("refitted", REPORTED_HORIZON_S)
     for _ in range(_MOST_CHANGES):
         now = _amended(outcome)
-        if worse_by(refitted, now) > WORSE:
+        if clearly_worse(refitted, now):
             better = _best(refitted, worse_by(refitted, now), chain(_lacking_one(outcome), _swapped_one(outcome)))
         else:
             better = _best(now, 1.0 / WORSE, _lacking_one(outcome))
+            if better is not None and not clearly_worse(_amended(better), now):
+                better = None
         if better is None:
             break
         outcome = better

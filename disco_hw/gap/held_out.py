@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,12 +31,16 @@ _FIXED_SIGMAS = 5.0
 _RESAMPLES = 400
 # Held-out errors scatter by some percent between equally good models.
 WORSE = 1.05
+_FAR_WORSE, _SIGMAS = 1.25, 2.0
 _PATHS = 3
 
 
 @dataclass(frozen=True, slots=True)
 class Errors:
-    """Root mean square at one horizon with 95 % bootstrap intervals over blocks of time."""
+    """Root mean square at one horizon with 95 % bootstrap intervals over blocks of time.
+
+    `squares` (B, 2): sums of squares of position and of yaw by block, for a comparison block by block.
+    """
 
     position_m: float
     position_ci: tuple[float, float]
@@ -43,11 +48,34 @@ class Errors:
     yaw_ci: tuple[float, float]
     wheel_rad_s: float
     by_regime_m: dict[str, float]
+    squares: Array | None = field(default=None, repr=False, compare=False)
 
 
 def worse_by(before: Errors, after: Errors) -> float:
     """Ratio of errors after to before, the larger one of position and heading."""
-    return max(after.position_m / before.position_m, after.yaw_rad / before.yaw_rad)
+    return max(_ratios(before, after))
+
+
+def _ratios(before: Errors, after: Errors) -> tuple[float, float]:
+    """Errors after over those before, of position and of heading."""
+    return after.position_m / before.position_m, after.yaw_rad / before.yaw_rad
+
+
+def clearly_worse(before: Errors, after: Errors) -> bool:
+    """Whether errors after are larger by 5 % and by two standard deviations of what blocks scatter, or by a quarter."""
+    for quantity, ratio in enumerate(_ratios(before, after)):
+        if ratio > _FAR_WORSE or (ratio > WORSE and _sigmas(before, after, quantity) > _SIGMAS):
+            return True
+    return False
+
+
+def _sigmas(before: Errors, after: Errors, quantity: int) -> float:
+    """Growth of a sum of squares over its standard deviation, which is how much the growth of the blocks scatters."""
+    if before.squares is None or after.squares is None:
+        return math.inf
+    growth = after.squares[:, quantity] - before.squares[:, quantity]
+    scatter = math.sqrt(growth.size) * float(growth.std(ddof=1)) if growth.size > 1 else math.inf
+    return float(growth.sum()) / max(scatter, 1e-30)
 
 
 @dataclass(frozen=True)
@@ -192,7 +220,8 @@ def fold_vectors(found: Fit, block: Index, neutral: Array) -> dict[int, Array]:
         vector = found.vector.copy()
         told = known(normal[1 - held], normal.sum(axis=0))
         told |= np.diag(normal[1 - held]) * vector[active] ** 2 > _FIXED_SIGMAS**2
-        vector[active[told]] -= inverse(normal[1 - held][np.ix_(told, told)]) @ gradient[1 - held][told]
+        here = normal[1 - held] if found.precision is None else normal[1 - held] + np.diag(found.precision)
+        vector[active[told]] -= inverse(here[np.ix_(told, told)]) @ gradient[1 - held][told]
         vector[active[~told]] = neutral[active[~told]]
         out[held] = vector
     return out
@@ -226,6 +255,8 @@ def summarise(error: Array, speed_error: Array, starts: Starts) -> Errors:
         nan = float("nan")
         return Errors(nan, (nan, nan), nan, (nan, nan), nan, {})
     regimes = np.array(starts.regime)
+    label = np.unique(starts.block, return_inverse=True)[1]
+    squares = np.column_stack([np.bincount(label, position), np.bincount(label, yaw)]).astype(np.float64)
     by_regime = {str(name): float(np.sqrt(position[regimes == name].mean())) for name in np.unique(regimes)}
     return Errors(
         float(np.sqrt(position.mean())),
@@ -234,6 +265,7 @@ def summarise(error: Array, speed_error: Array, starts: Starts) -> Errors:
         _interval(yaw, starts.block),
         float(np.sqrt((speed_error**2).mean())),
         by_regime,
+        squares,
     )
 
 

@@ -37,11 +37,16 @@ _OTHER_STEP = 1e-3
 # A host that stamps commands or encoders late shows as a negative delay; better told than hidden in noise.
 _EARLIEST_DELAY_S = -0.05
 _UNLIMITED = 1e6
+# A floor changes how much is lost in turning, and rolling hardly: in a log that only turns both do the same.
+_EXPECTED = {"surface_change.radius": 0.05}
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Columns of a channel's vector, its neutral point, how each varies; `of_wheels` tells the channels apart."""
+    """Columns of a channel's vector, its neutral point, how each varies; `of_wheels` tells the channels apart.
+
+    `precision`: how surely an entry is near its neutral value before a log is looked at, mostly 0.
+    """
 
     of_wheels: bool
     columns: tuple[str, ...]
@@ -49,6 +54,7 @@ class Layout:
     step: Array
     low: Array
     high: Array
+    precision: Array
     place: Mapping[str, int]
 
     def at(self, p: Array, name: str) -> float:
@@ -70,6 +76,7 @@ def _layout(parameters: Mapping[str, Parameter], base: int) -> Layout:
         ),
         low=low,
         high=np.array([max(p.high, p.neutral if p.neutral < np.inf else _UNLIMITED) for p in parameters.values()]),
+        precision=np.array([_EXPECTED.get(name, np.inf) ** -2.0 for name in columns]),
         place=MappingProxyType({name: k for k, name in enumerate(columns)}),
     )
 

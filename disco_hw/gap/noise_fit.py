@@ -156,7 +156,7 @@ def learn_wheel_noise(channel: WheelChannel, raw: Array) -> WheelChannel:
     white = whiten_wheels(raw, channel.gains)
     wild = channel.gains.use & (np.abs(white).max(axis=1) > 2.0 * _OUTLIER)
     if 0 < wild.sum() < 0.02 * wild.size:
-        channel = WheelChannel.build(channel.timeline, channel.noise, channel.geometry, channel.gains.use & ~wild)
+        channel = channel.with_noise(channel.noise, ~wild)
         white = whiten_wheels(raw, channel.gains)
     return channel.weighted(local_weight(white, channel.gains.use))
 

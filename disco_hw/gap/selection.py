@@ -29,10 +29,10 @@ _CLEARLY = 3.0
 
 @dataclass(frozen=True, slots=True)
 class Thresholds:
-    """When an effect is accepted: evidence score, of one without a name too, and shift of a 2 s prediction."""
+    """When an effect is accepted: evidence score, of one without a name too, and shift of the 2 s predictions."""
 
     score: float = 20.0
-    moves_m: float = 0.0005
+    moves_m: float = 0.001
     unnamed_score: float = 20.0
 
 
@@ -258,15 +258,16 @@ class Selector:
         return float(self.fit(rest).cost - self.fit(accepted).cost - price)
 
     def _backward(self, accepted: Names) -> Names:
-        """Drop effects that the others have made unnecessary."""
+        """Drop effects that the others have made unnecessary, of several first the one that is missed least."""
+        idle = []
         for name in accepted:
             if name in self.given:
                 continue
             rest = tuple(other for other in accepted if other != name)
             self._refit_without(accepted, name, rest)
             if not self.acceptable(rest, accepted):
-                return self._backward(rest)
-        return accepted
+                idle.append((self._worth(rest, accepted, name), rest))
+        return self._backward(min(idle)[1]) if idle else accepted
 
     def _refit_without(self, accepted: Names, name: str, rest: Names) -> None:
         """Fit `rest` from the fit of the larger set too: what has thresholds may have found better ones there."""

@@ -158,10 +158,14 @@ def _discs(channel: BodyChannel, p: Array, discs: Iterable[tuple[float, float, f
     x, y = _where(channel)
     speed = channel.timeline.speed_rad_s
     w = p[0] / p[1] * (speed[:, 1] - speed[:, 0])
-    turned = max(float(np.abs(w).sum()), 1e-9)
+    turning = np.abs(w)
+    turned = max(float(turning.sum()), 1e-9)
+    centre, squares = (math.nan, math.nan), np.empty(0)
     for centre_x, centre_y, radius in discs:
-        inside = np.hypot(x - centre_x, y - centre_y) < radius
-        if _LEAST_INSIDE < float(np.abs(w[inside]).sum()) / turned < _MOST_INSIDE:
+        if centre != (centre_x, centre_y):
+            centre, squares = (centre_x, centre_y), (x - centre_x) ** 2 + (y - centre_y) ** 2
+        inside = squares < radius * radius
+        if _LEAST_INSIDE < float(turning @ inside) / turned < _MOST_INSIDE:
             where = f"within {radius:.2f} m of ({centre_x:.2f}, {centre_y:.2f}) m"
             push = _on(2, np.where(inside, w, 0.0))
             disc = (float(centre_x), float(centre_y), float(radius))
@@ -201,6 +205,7 @@ class WithTerms:
             step=np.append(plain.step, [1e-3 / size for size in sizes]),
             low=np.append(plain.low, np.full(count, -math.inf)),
             high=np.append(plain.high, np.full(count, math.inf)),
+            precision=np.append(plain.precision, np.zeros(count)),
             place={**plain.place, **{name: len(plain.columns) + k for k, name in enumerate(names)}},
         )
         return cls(inner, terms, layout)

@@ -63,12 +63,13 @@ class WheelNoise:
 class Driven:
     """How the wheels were driven between samples: what the filter's transition needs.
 
-    `dt_s` (E,) since the sample before, measured `speed_rad_s` (E, 2), squared `jumps` of the command since then (E,);
-    `restart` begins a run; `use` is False for samples left out.
+    `dt_s` (E,) since the sample before, measured `speed_rad_s` (E, 2), `expected_rad_s` (E, 2) that a model gives,
+    squared `jumps` of the command since then (E,); `restart` begins a run; `use` is False for samples left out.
     """
 
     dt_s: Array
     speed_rad_s: Array
+    expected_rad_s: Array
     jumps: Array
     restart: NDArray[np.bool_]
     use: NDArray[np.bool_]
@@ -113,7 +114,7 @@ def _learnt(c: Any, ka: float, kq: float, ks: float) -> Any:
 
 @kernel_function
 def _gains(
-    noise: Array, dt: Array, speed: Array, steady: Array, jumps: Array, restart: Array, use: Array, decay: Array,
+    noise: Array, dt: Array, speed: Array, expected: Array, jumps: Array, restart: Array, use: Array, decay: Array,
     reach: Array, gain: Array, scale: Array,
 ) -> None:  # fmt: skip
     for side in range(2):
@@ -122,7 +123,7 @@ def _gains(
             keep, hold = math.exp(-dt[k] / noise[1]), math.exp(-dt[k] / WANDER_S)
             decay[k, 0], decay[k, 1] = keep, hold
             # Signed: a wheel that turns too fast does so ahead and back.
-            go, far = speed[k, side] * dt[k], steady[k, side] * dt[k]
+            go, far = speed[k, side] * dt[k], expected[k, side] * dt[k]
             reach[k, side, 0], reach[k, side, 1] = go, far
             c = _begin(noise) if restart[k] else _spread(c, noise, go, far, keep, hold, dt[k], jumps[k])
             variance = c[0] + noise[2] * noise[2] + (noise[3] * speed[k, side]) ** 2
@@ -137,7 +138,7 @@ def _gains(
 
 @kernel_function
 def _likelihood(
-    noise: Array, dt: Array, speed: Array, steady: Array, jumps: Array, restart: Array, use: Array, counted: Array,
+    noise: Array, dt: Array, speed: Array, expected: Array, jumps: Array, restart: Array, use: Array, counted: Array,
     residual: Array, out: Array,
 ) -> float:  # fmt: skip
     total = 0.0
@@ -152,7 +153,7 @@ def _likelihood(
                 c = _begin(noise)
                 drift = quick = slow = 0.0
             else:
-                go, far = speed[k, side] * dt[k], steady[k, side] * dt[k]
+                go, far = speed[k, side] * dt[k], expected[k, side] * dt[k]
                 c = _spread(c, noise, go, far, keep, hold, dt[k], jumps[k])
                 drift += go * quick + far * slow
                 quick *= keep
@@ -204,6 +205,17 @@ def _whiten(
             slow += gain[k, side, 2] * surprise
 
 
+def steady_speeds(dt_s: Array, speed_rad_s: Array) -> Array:
+    """What is expected of measured speeds (E, 2) as long as no model tells: their mean over half a second.
+
+    A slow error that acted on the measured speed itself would scale the very noise it is measured by.
+    """
+    if not dt_s.size:
+        return speed_rad_s
+    half = max(round(_STEADY_S / max(float(np.median(dt_s)), 1e-3)), _FEWEST_STEADY)
+    return np.asarray(uniform_filter1d(speed_rad_s, 2 * half + 1, axis=0, mode="nearest"))
+
+
 def wheel_gains(noise: WheelNoise, driven: Driven) -> WheelGains:
     """Gains for one motion of the wheels."""
     count = driven.dt_s.size
@@ -232,12 +244,7 @@ def wheel_likelihood(
 
 def _along(driven: Driven) -> tuple[Array | NDArray[np.bool_], ...]:
     """A motion of the wheels as the kernels take it."""
-    dt_s, speed_rad_s = driven.dt_s, driven.speed_rad_s
-    # A slow error that acted on the measured speed itself would scale the very noise it is measured by.
-    period_s = max(float(np.median(dt_s)), 1e-3) if dt_s.size else 1.0
-    half = max(round(_STEADY_S / period_s), _FEWEST_STEADY)
-    steady = uniform_filter1d(speed_rad_s, 2 * half + 1, axis=0, mode="nearest") if dt_s.size else speed_rad_s
-    return dt_s, speed_rad_s, steady, driven.jumps, driven.restart, driven.use
+    return driven.dt_s, driven.speed_rad_s, driven.expected_rad_s, driven.jumps, driven.restart, driven.use
 
 
 def whiten_wheels(residual: Array, gains: WheelGains) -> Array:

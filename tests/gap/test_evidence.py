@@ -46,6 +46,12 @@ def test_noise_that_comes_in_blocks_inflates_the_variance():
     assert shaken > 20.0
 
 
+def test_what_is_told_of_next_to_nothing_is_judged_without_a_fault():
+    white = np.random.default_rng(5).standard_normal(N)
+    with np.errstate(all="raise"):
+        assert inflation(linear_fit(np.full((N, 1), 1e-90), white), channel(), (0,)) >= 1.0
+
+
 def test_a_block_is_judged_by_the_others():
     rng = np.random.default_rng(2)
     x = np.zeros((N, 1))

@@ -10,10 +10,13 @@ from disco_hw.gap.fit import by_block, fit, inverse, solve
 T = np.linspace(0.0, 4.0, 400)
 
 
-def channel(truth, low=-10.0, high=10.0, noise=0.0):
+def channel(truth, low=-10.0, high=10.0, noise=0.0, precision=0.0):
     rng = np.random.default_rng(0)
     y = truth[0] * np.exp(-truth[1] * T) + noise * rng.standard_normal(T.size)
-    layout = SimpleNamespace(step=np.array([1e-5, 1e-5]), low=np.full(2, low), high=np.full(2, high))
+    layout = SimpleNamespace(
+        step=np.array([1e-5, 1e-5]), low=np.full(2, low), high=np.full(2, high), neutral=np.zeros(2),
+        precision=np.array([0.0, precision]),
+    )  # fmt: skip
     return SimpleNamespace(layout=layout, residual=lambda p: y - p[0] * np.exp(-p[1] * T))
 
 
@@ -27,6 +30,15 @@ def test_bounds_hold_and_what_is_not_active_stays():
     found = fit(channel((2.0, 0.7), high=1.5), np.array([0.5, 0.1]), (0, 1))
     assert found.vector[0] == 1.5
     assert fit(channel((2.0, 0.7)), np.array([2.0, 0.1]), (0,)).vector[1] == 0.1
+
+
+def test_what_is_not_told_stays_near_what_is_expected_and_what_is_told_is_fitted():
+    # Without a size the rate of decay changes nothing.
+    blind = fit(channel((0.0, 0.7), precision=100.0), np.array([0.0, 0.7]), (0, 1))
+    assert abs(blind.vector[1]) < 1e-3
+    assert np.sqrt(blind.covariance()[1, 1]) == pytest.approx(0.1, rel=0.01)
+    told = fit(channel((200.0, 0.7), high=1e3, precision=100.0), np.array([100.0, 0.5]), (0, 1), 30)
+    assert told.vector[1] == pytest.approx(0.7, rel=1e-3)
 
 
 def test_blocks_add_up_to_the_whole():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from disco_hw.gap.channels import BodyChannel
-from disco_hw.gap.form import other_forms
+from disco_hw.gap.form import _pushed, other_forms
 from disco_hw.gap.free_runs import read_angles
 from disco_hw.gap.layout import BODY
 from disco_hw.gap.search import Found, body_moves
@@ -42,6 +42,14 @@ def test_slip_that_saturates_is_stronger_where_it_is_small():
     (told,) = other_forms(slipping(0.4, 0.5))
     assert "turn_slip" in told
     assert float(told.split(" is ")[1].split(" times")[0]) > 1.2
+
+
+def test_what_turns_less_is_not_pushed_sideways():
+    found = slipping(0.1)
+    pushed = _pushed(found.selector.split(found.names), "turn_slip", found.channel)
+    assert np.abs(pushed[:, 2]).max() > 0.1
+    # The tracked point, GEOMETRY[2] behind the one that rolls, moves to the side because the yaw rate is another.
+    assert np.abs(pushed[:, :2]).max() < 1e-9
 
 
 @pytest.mark.parametrize("k_s", [0.05, 0.1])

@@ -7,7 +7,16 @@ import pytest
 
 from disco_hw.gap.channels import BodyChannel
 from disco_hw.gap.fit import fit
-from disco_hw.gap.held_out import FOLD_S, Chain, errors_of, floor_errors, fold_vectors, smoothed_poses
+from disco_hw.gap.held_out import (
+    FOLD_S,
+    Chain,
+    Errors,
+    clearly_worse,
+    errors_of,
+    floor_errors,
+    fold_vectors,
+    smoothed_poses,
+)
 from disco_hw.gap.layout import BODY
 from disco_hw.gap.search import indices
 from disco_hw.gap.timeline import BLOCK_S
@@ -39,6 +48,19 @@ def test_the_right_model_errs_by_the_noise_alone_and_a_wrong_one_by_more():
     assert wrong.yaw_rad > 5.0 * sound.yaw_rad
     assert wrong.position_ci[0] < wrong.position_m < wrong.position_ci[1]
     assert wrong.by_regime_m["turning on the spot"] > 2.0 * sound.by_regime_m["turning on the spot"]
+
+
+def test_only_what_repeats_in_most_stretches_or_is_far_worse_is_clearly_worse():
+    def errors(*squares):
+        both = np.column_stack([squares, np.ones(len(squares))])
+        return Errors(float(np.sqrt(np.mean(squares))), (0.0, 1.0), 1.0, (0.0, 1.0), 0.0, {}, both)
+
+    before = errors(1.0, 1.0, 1.0, 1.0, 1.0, 1.0)
+    assert clearly_worse(before, errors(1.2, 1.2, 1.1, 1.3, 1.2, 1.2))
+    assert not clearly_worse(before, errors(2.2, 0.9, 1.1, 0.9, 1.1, 1.0))
+    assert clearly_worse(before, errors(5.0, 0.9, 1.1, 0.9, 1.1, 1.0))
+    assert not clearly_worse(before, errors(1.05, 1.05, 1.05, 1.05, 1.05, 1.05))
+    assert not clearly_worse(errors(1.2, 1.2, 1.1, 1.3, 1.2, 1.2), before)
 
 
 def test_smoothed_poses_are_closer_to_the_truth_than_measured_ones():

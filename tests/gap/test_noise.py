@@ -27,7 +27,7 @@ def simulated(noise, speed, rng):
 def driven(speed, restart):
     count = speed.shape[0]
     use = np.arange(count) % 17 != 5
-    return Driven(np.full(count, 0.02), speed, np.zeros(count), restart, use)
+    return Driven(np.full(count, 0.02), speed, speed, np.zeros(count), restart, use)
 
 
 def test_wheel_residuals_become_white():
@@ -37,7 +37,7 @@ def test_wheel_residuals_become_white():
     speed = np.full((count, 2), 4.0)
     residual = simulated(noise, speed, rng)
     flags = np.arange(count) == 0
-    gains = wheel_gains(noise, Driven(np.full(count, 0.02), speed, np.zeros(count), flags, np.ones(count, bool)))
+    gains = wheel_gains(noise, Driven(np.full(count, 0.02), speed, speed, np.zeros(count), flags, np.ones(count, bool)))
     white = whiten_wheels(residual, gains)[1:, 0]
     assert white.var() == pytest.approx(1.0, abs=0.08)
     assert abs(np.corrcoef(white[1:], white[:-1])[0, 1]) < 0.05
@@ -104,6 +104,20 @@ def test_a_body_at_rest_has_the_noise_of_its_poses_alone():
     white = whiten_body(residual, body_gains(noise, moved))[10:]
     np.testing.assert_allclose(white.var(axis=0), 1.0, atol=0.1)
     assert abs(np.corrcoef(white[1:, 0], white[:-1, 0])[0, 1]) < 0.05
+
+
+def test_a_slow_error_acts_on_the_speed_that_is_expected_and_tells_nothing_of_a_gain():
+    # Starts and stops: a gain shows in each, and so does an error of the speed that is slower than all of them.
+    asked = np.repeat(np.where(np.arange(60) % 2 == 0, 4.0, 0.0), 100)[:, None].repeat(2, axis=1)
+    line = line_of(asked)
+    stamped = WheelNoise(relative=1e-4, reading_rad=1e-3, stamp_s=4e-3, command_stamp_s=1e-5, wander=0.01)
+    channel = WheelChannel.build(line, stamped, np.array(GEOMETRY)).expecting(WHEEL.neutral)
+    gained = WHEEL.neutral.copy()
+    gained[WHEEL.place["wheel_gain.left"]] = 0.01
+    difference = channel.residual(gained) - channel.residual(WHEEL.neutral)
+    # In 60 s there are two independent errors of 1 %, and what is told of their mean is not a mark more.
+    assert float(difference @ difference) < 5.0
+    np.testing.assert_allclose(channel.driven.expected_rad_s[10:45], 4.0)
 
 
 def test_after_unknown_commands_the_wheels_angle_begins_anew():

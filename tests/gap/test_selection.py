@@ -4,16 +4,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from disco_hw.gap.channels import WheelChannel
 from disco_hw.gap.layout import BODY
 from disco_hw.gap.search import body_moves, wheel_moves
 from disco_hw.gap.selection import Selector, Thresholds
+from disco_hw.gap.timeline import CELL_S
 from disco_hw.gap.wheel_noise import WheelNoise
 from tests.gap.synthetic import GEOMETRY, body_channel, line_of
 
 
-def selector(given=(), start=None, moves_m=0.0005, **effects):
+def selector(given=(), start=None, moves_m=0.001, **effects):
     channel, _ = body_channel(**effects)
     return Selector(channel, body_moves(channel), Thresholds(moves_m=moves_m), given=given, start=start)
 
@@ -39,6 +41,24 @@ def test_what_is_not_needed_goes_again():
 def test_a_stand_in_is_swapped_for_what_it_stood_in_for():
     found = selector(turn_slip=0.08)
     assert found._swapped(("surface_change",)) == ("turn_slip",)
+
+
+def wheels_slow(tau_s):
+    """A search of wheels that follow steps of their commands as a lag."""
+    commands = np.repeat(np.random.default_rng(7).choice([-4.0, -2.0, 0.0, 3.0, 5.0], 60), 100)
+    keep = np.exp(-CELL_S / tau_s)
+    followed = lfilter([1.0 - keep], [1.0, -keep], commands)
+    line = line_of(np.repeat(followed[:, None], 2, axis=1))
+    line = replace(line, command_rad_s=np.repeat(commands[:, None], 2, axis=1))
+    channel = WheelChannel.build(line, WheelNoise(), np.array(GEOMETRY))
+    return Selector(channel, wheel_moves(channel, np.array(GEOMETRY)), Thresholds(moves_m=0.005))
+
+
+def test_a_short_lag_with_a_delay_beside_it_is_not_taken_for_the_delay():
+    found = wheels_slow(0.03)
+    both = ("motor_lag", "command_delay")
+    assert not any(found.acceptable((name,), both) for name in both)
+    assert found._backward(both) == ("motor_lag",)
 
 
 def test_given_effects_stay_and_are_not_selected_again():
