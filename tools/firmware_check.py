@@ -22,6 +22,7 @@ HAND_WRITTEN = tuple(name for name in SOURCES if name != "disco_robot.c")
 WARNINGS = ("-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wshadow", "-Wstrict-prototypes", "-Wno-sign-conversion")
 SANITIZE = "-O1 -fsanitize=undefined -fno-sanitize-recover=all"
 COVER = "-O0 --coverage"
+HARNESS_SANITIZERS = ("-fsanitize=undefined,address", "-fno-sanitize-recover=all")
 HARNESS = ROOT / "tests" / "firmware_protocol" / "firmware" / "sanitizer_harness.c"
 # A tenth of the cycles are a flood, so that the core is met in every state.
 FLOOD_CYCLES = 1_000_000
@@ -93,7 +94,7 @@ def build_harness(folder: Path, replaced: dict[str, Path] | None = None) -> Path
     harness = folder / "harness"
     firmware = ROOT / "firmware_protocol" / "firmware"
     sources = [str((replaced or {}).get(name, firmware / name)) for name in SOURCES]
-    command = ["gcc", "-std=c99", "-O1", "-g", "-fsanitize=undefined,address", "-fno-sanitize-recover=all"]
+    command = ["cc", "-std=c99", "-O1", "-g", *HARNESS_SANITIZERS]
     subprocess.run([*command, f"-I{firmware}", str(HARNESS), *sources, "-o", str(harness), "-lm"], check=True)
     return harness
 
