@@ -204,7 +204,10 @@ def test_every_entry_of_standby_and_ready_has_a_new_challenge_never_zero():
 
 
 def test_challenges_depend_on_the_entropy():
-    assert len({Bench(entropy=seed).core.challenge for seed in range(50)}) > 45
+    seen = {Bench(entropy=seed).core.challenge for seed in range(50)}
+    assert len(seen) > 45
+    for bit in range(16):
+        assert {challenge >> bit & 1 for challenge in seen} == {0, 1}
 
 
 @pytest.mark.parametrize("entry", [1, 2])

@@ -272,6 +272,21 @@ def test_what_the_handshake_says():
     )
 
 
+def test_a_hello_is_answered_from_20_ms_after_the_answer_before():
+    bench = Bench()
+    bench.hello()
+    bench.run(100)
+    bench.hello()
+    bench.step()
+    before = len(bench.messages("HELLO"))
+    bench.hello()
+    bench.run(19)
+    bench.step(elapsed_us=999)
+    assert len(bench.messages("HELLO")) == before
+    bench.step(elapsed_us=1)
+    assert len(bench.messages("HELLO")) == before + 1
+
+
 def test_a_flood_of_hellos_gets_an_answer_every_20_ms():
     bench = Bench()
     bench.run(100)
