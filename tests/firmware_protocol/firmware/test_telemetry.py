@@ -117,6 +117,17 @@ def test_motor_and_power_values():
     assert last(bench, "POWER") == pytest.approx({"voltage": 24.57, "current": -2.5, "temperature": 127})
 
 
+def test_values_are_rounded_to_the_nearest_step_and_end_at_zero_where_there_is_no_less():
+    bench = Bench()
+    bench.inputs.update(
+        left_temperature_c=20.496, right_temperature_c=20.504, voltage_v=0.0, battery_temperature_c=100.0
+    )
+    bench.run(600)
+    motor, power = last(bench, "MOTOR"), last(bench, "POWER")
+    assert (motor["left_temperature"], motor["right_temperature"]) == (20, 21)
+    assert (power["voltage"], power["temperature"]) == (0.0, 100)
+
+
 def test_system_state_tells_every_change_at_once():
     bench = Bench()
     bench.run(105)
@@ -357,7 +368,8 @@ def test_a_pose_that_does_not_fit_is_not_valid(arguments):
 
 
 def test_a_pose_without_deviation_is_valid():
-    assert pose(0.0, 0.0, 0.0, 0, 0.0, 0.0)["valid"] == 1
+    values = pose(0.0, 0.0, 0.0, 0, 0.0, 0.0)
+    assert (values["valid"], values["position_std"], values["yaw_std"]) == (1, 0.0, 0.0)
 
 
 def test_a_large_deviation_saturates():
