@@ -53,3 +53,26 @@ def test_a_command_that_is_not_known_stops_the_prediction():
     assert np.all(np.isfinite(angle))
     assert angle[60, 0] == angle[41, 0]
     assert angle[99, 0] > angle[60, 0] + 0.5
+
+
+def test_however_fast_it_turns_the_path_is_that_of_every_cells_mean_heading():
+    rng = np.random.default_rng(3)
+    count = 4000
+    # From slow turns to 300 rad/s, far beyond what short series are for.
+    speed = rng.uniform(-1.0, 1.0, (count, 2)) * rng.choice([1.0, 30.0, 1000.0], (count, 1))
+    angle = np.cumsum(speed, axis=0) * CELL_S
+    first = np.isin(np.arange(count), (0, 2500))
+    p = BODY.neutral.copy()
+    p[:3] = radius, axial, x_icr = 0.06, 0.4, 0.1
+    track = run_body(p, angle, speed, np.zeros((count, 3)), first, np.arange(count) * CELL_S)
+    step = np.where(first[:, None], 0.0, np.diff(angle, axis=0, prepend=0.0)) * radius
+    along, turn = step.mean(axis=1), (step[:, 1] - step[:, 0]) / axial
+    assert np.abs(turn).max() > 2.0
+    for begin, end in ((0, 2500), (2500, count)):
+        part = slice(begin, end)
+        yaw = np.cumsum(turn[part])
+        middle = yaw - 0.5 * turn[part]
+        across = -x_icr * turn[part]
+        x = np.cumsum(np.cos(middle) * along[part] - np.sin(middle) * across)
+        y = np.cumsum(np.sin(middle) * along[part] + np.cos(middle) * across)
+        np.testing.assert_allclose(track[part], np.column_stack([x, y, yaw]), atol=1e-9)
