@@ -16,7 +16,15 @@ from disco_hw.gap.body_noise import BodyGains, BodyNoise, Motion, body_gains, wh
 from disco_hw.gap.free_runs import pose_residual, read_angles, run_body, run_wheels
 from disco_hw.gap.layout import BASE_COUNT, BODY, WHEEL, Layout
 from disco_hw.gap.timeline import CELL_S, Samples, Timeline
-from disco_hw.gap.wheel_noise import Driven, WheelGains, WheelNoise, steady_speeds, wheel_gains, whiten_wheels
+from disco_hw.gap.wheel_noise import (
+    Driven,
+    WheelGains,
+    WheelNoise,
+    calm_speeds,
+    steady_speeds,
+    wheel_gains,
+    whiten_wheels,
+)
 
 WINDOW_S = 3.0
 ONSET_M_S = 0.05
@@ -102,7 +110,7 @@ class WheelChannel:
         speed = line.speed_rad_s[place.node]
         dt = np.maximum(dt, 0.0)
         steady = steady_speeds(dt, speed)
-        driven = Driven(dt, speed, steady, np.maximum(between, 0.0), first_of_run | resumed, good)
+        driven = Driven(dt, calm_speeds(dt, speed), steady, np.maximum(between, 0.0), first_of_run | resumed, good)
         return cls(line, driven, wheel_gains(noise, driven), np.ones((place.t_s.size, 2)), noise, geometry)
 
     def with_noise(self, noise: WheelNoise, use: Mask | None = None) -> WheelChannel:

@@ -8,8 +8,8 @@ from types import MappingProxyType
 from disco_hw.gap.intervals import Estimates
 
 _SIGMAS = 3.0
-# The odds of a wrong name are then below one in a hundred.
-_SURE_NATS = 5.0
+# Of gains that are none of an encoder fewer than one in a hundred comes so far by chance.
+_SURE_NATS = 3.0
 
 LATERAL = "lateral_icr"
 SENSOR = "pose_offset"

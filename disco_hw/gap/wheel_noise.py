@@ -21,6 +21,7 @@ Array = NDArray[np.float64]
 
 WANDER_S = 20.0
 _START_VARIANCE = 0.04
+_CALM_S = 0.05
 _STEADY_S = 0.25
 _FEWEST_STEADY = 3
 
@@ -205,14 +206,24 @@ def _whiten(
             slow += gain[k, side, 2] * surprise
 
 
-def steady_speeds(dt_s: Array, speed_rad_s: Array) -> Array:
-    """What is expected of measured speeds (E, 2) as long as no model tells: their mean over half a second.
+def calm_speeds(dt_s: Array, speed_rad_s: Array) -> Array:
+    """Measured speeds (E, 2) with less of their own noise: their mean over a tenth of a second.
 
-    A slow error that acted on the measured speed itself would scale the very noise it is measured by.
+    An error that acted on the measured speed itself would scale the very noise it is measured by, and look like a gain.
     """
+    return _mean(dt_s, speed_rad_s, _CALM_S, 0)
+
+
+def steady_speeds(dt_s: Array, speed_rad_s: Array) -> Array:
+    """What is expected of measured speeds (E, 2) as long as no model tells: their mean over half a second."""
+    return _mean(dt_s, speed_rad_s, _STEADY_S, _FEWEST_STEADY)
+
+
+def _mean(dt_s: Array, speed_rad_s: Array, span_s: float, fewest: int) -> Array:
+    """Mean speeds (E, 2) over so long before and after, and over so many samples at least."""
     if not dt_s.size:
         return speed_rad_s
-    half = max(round(_STEADY_S / max(float(np.median(dt_s)), 1e-3)), _FEWEST_STEADY)
+    half = max(round(span_s / max(float(np.median(dt_s)), 1e-3)), fewest)
     return np.asarray(uniform_filter1d(speed_rad_s, 2 * half + 1, axis=0, mode="nearest"))
 
 
