@@ -24,6 +24,9 @@ def test_an_asymmetry_too_small_to_be_named_still_decides():
     expected = -0.008 / 2.008
     # Four standard deviations from none, at what the encoder would make it.
     assert one_encoder(gains, (expected, 0.0007), False) == (True, True)
+    # Three nats say so, and then two and a half.
+    assert one_encoder(gains, (expected, 0.0011), False) == (True, True)
+    assert one_encoder(gains, (expected, 0.0014), False) == (True, False)
     # Nobody knows: either.
     assert one_encoder(gains, (0.5 * expected, 0.003), False) == (True, False)
     # None, and not what the encoder would make it.

@@ -1,11 +1,16 @@
 """Whitening makes independent residuals of unit variance of the noise it describes."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from disco_hw.gap.body_noise import BodyNoise, Motion, body_gains, body_likelihood, whiten_body
+from disco_hw.gap.candidates import indices
 from disco_hw.gap.channels import WheelChannel
+from disco_hw.gap.fit import fit
 from disco_hw.gap.layout import WHEEL
+from disco_hw.gap.timeline import CELL_S
 from disco_hw.gap.wheel_noise import Driven, WheelNoise, wheel_gains, wheel_likelihood, whiten_wheels
 from tests.gap.synthetic import GEOMETRY, line_of
 
@@ -118,6 +123,22 @@ def test_a_slow_error_acts_on_the_speed_that_is_expected_and_tells_nothing_of_a_
     # In 60 s there are two independent errors of 1 %, and what is told of their mean is not a mark more.
     assert float(difference @ difference) < 5.0
     np.testing.assert_allclose(channel.driven.expected_rad_s[10:45], 4.0)
+
+
+def test_readings_with_an_error_make_no_gain():
+    rng = np.random.default_rng(6)
+    asked = np.repeat(rng.uniform(-5.0, 5.0, 60), 100)[:, None].repeat(2, axis=1)
+    line = line_of(asked)
+    read = line.encoder_angle_rad + 0.004 * rng.standard_normal((line.encoder.node.size, 2))
+    between = np.column_stack([np.interp(line.t_s, line.t_s[line.encoder.node], side) for side in read.T])
+    # As speeds are measured: over 20 ms either side.
+    speed = (np.roll(between, -2, axis=0) - np.roll(between, 2, axis=0)) / (4.0 * CELL_S)
+    line = replace(line, encoder_angle_rad=read, speed_rad_s=np.clip(speed, -6.0, 6.0))
+    noise = WheelNoise(0.015, 0.16, 0.004, 1e-5, 1e-5, 1e-5, 1e-4)
+    channel = WheelChannel.build(line, noise, np.array(GEOMETRY))
+    found = fit(channel, WHEEL.neutral, indices(channel, ("wheel_gain",)))
+    gains = found.vector[list(found.active)]
+    assert np.abs(gains).max() < 5e-4
 
 
 def test_after_unknown_commands_the_wheels_angle_begins_anew():
