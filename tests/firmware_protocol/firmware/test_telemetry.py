@@ -263,7 +263,7 @@ def test_handshake_is_offered_until_accepted_and_answered_ever_after():
 
 def test_what_the_handshake_says():
     bench = Bench(
-        dataclasses.replace(CONFIG, board_id=77, firmware_version=(3, 4, 5), capabilities=9, command_timeout_s=0.08)
+        dataclasses.replace(CONFIG, board_id=77, firmware_version=(3, 4, 5), capabilities=8, command_timeout_s=0.08)
     )
     assert last(bench, "HELLO") == {
         "protocol_major": PROTOCOL_MAJOR,
@@ -271,7 +271,7 @@ def test_what_the_handshake_says():
         "firmware_major": 3,
         "firmware_minor": 4,
         "firmware_patch": 5,
-        "capabilities": 9,
+        "capabilities": 8,
     }
     assert last(bench, "BUILD") == {"dbc_hash": CODEC.dbc_hash, "board_id": 77}
     first, second = (message.values for message in bench.messages("LIMITS"))
@@ -365,6 +365,15 @@ def test_pose_values():
 )
 def test_a_pose_that_does_not_fit_is_not_valid(arguments):
     assert pose(*arguments)["valid"] == 0
+
+
+@pytest.mark.parametrize(("place", "largest"), [(0, 0.0001 * 0x7FFFFF), (1, 0.0001 * 0x7FFFFF), (2, 0.0001 * 0x7FFF)])
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_a_pose_is_valid_up_to_the_largest_that_its_frames_hold(place, largest, sign):
+    for value, valid in ((largest, 1), (math.nextafter(largest, math.inf), 0)):
+        arguments = [0.0, 0.0, 0.0, 0, 0.0, 0.0]
+        arguments[place] = sign * value
+        assert pose(*arguments)["valid"] == valid
 
 
 def test_a_pose_without_deviation_is_valid():
