@@ -376,6 +376,12 @@ def test_a_pose_is_valid_up_to_the_largest_that_its_frames_hold(place, largest, 
         assert pose(*arguments)["valid"] == valid
 
 
+def test_a_pose_beyond_its_frames_ends_at_their_edge():
+    low, high = pose(-900.0, -900.0, -4.0, 0, 0.0, 0.0), pose(900.0, 900.0, 4.0, 0, 0.0, 0.0)
+    assert (low["x"], low["y"], low["yaw"]) == pytest.approx((-838.8608, -838.8608, -3.2768), abs=1e-9)
+    assert (high["x"], high["y"], high["yaw"]) == pytest.approx((838.8607, 838.8607, 3.2767), abs=1e-9)
+
+
 def test_a_pose_without_deviation_is_valid():
     values = pose(0.0, 0.0, 0.0, 0, 0.0, 0.0)
     assert (values["valid"], values["position_std"], values["yaw_std"]) == (1, 0.0, 0.0)
