@@ -104,6 +104,7 @@ def test_a_written_value_is_in_force_and_told_in_limits():
     bench.run(100)
     before = bench.now_us
     assert ask(bench, "WRITE", 4, 40.0)[0] == "OK"
+    bench.run(100)
     pages = [message.values for message in bench.messages("LIMITS", since_us=before)]
     assert [page["page"] for page in pages] == [0, 1]
     assert pages[1]["stop_deceleration"] == 40.0

@@ -256,6 +256,9 @@ def test_handshake_is_offered_until_accepted_and_answered_ever_after():
     bench.hello()
     bench.run(1)
     assert len(bench.messages("HELLO")) == 4
+    # Two pages with each, and no more.
+    bench.run(100)
+    assert len(bench.messages("LIMITS")) == 8
     bench.request = {"request": "STANDBY", "session": 0}
     bench.run(4000)
     assert len(bench.messages("HELLO")) == 4
@@ -408,6 +411,19 @@ def test_after_a_pause_nothing_is_caught_up_in_a_burst():
     assert len(bench.messages("WHEEL_SPEED", since_us=start)) == 1
     bench.run(20)
     assert len(bench.messages("WHEEL_SPEED", since_us=start)) == 3
+
+
+def test_a_cycle_that_is_late_by_one_period_sends_once():
+    bench = Bench()
+    while not bench.messages("WHEEL_SPEED", since_us=max(bench.now_us, 50 * MS)):
+        bench.step()
+    bench.step(elapsed_us=20 * MS)
+    start = bench.now_us
+    assert len(bench.messages("WHEEL_SPEED", since_us=start)) == 1
+    bench.run(9)
+    assert len(bench.messages("WHEEL_SPEED", since_us=start)) == 1
+    bench.step()
+    assert len(bench.messages("WHEEL_SPEED", since_us=start)) == 2
 
 
 def test_a_queue_that_nobody_empties_counts_what_it_drops():
