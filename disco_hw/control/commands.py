@@ -8,9 +8,8 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from disco_hw.control.blocks import BLOCK, U
+from disco_hw.control.lanes import row_sum
 from disco_hw.model.jit import block_function, float32, scalar_function, tune_loops
-
-_LANES = U(16)
 
 
 class Basis(NamedTuple):
@@ -36,14 +35,15 @@ def clip(value: Any, low: Any, high: Any) -> Any:
 
 
 @scalar_function
-def _noise(noise: Any, at: Any, stride: Any, weights: Any) -> Any:
-    """Noise of the sample at index `at`: weighted sum over four knots from there on, or that knot alone for None."""
+def _with_noise(middle: Any, noise: Any, at: Any, stride: Any, weights: Any) -> Any:
+    """`middle` plus the noise at index `at`: of four knots from there on by their weights, or of one alone for None."""
     if weights is None:
-        return noise[at]
+        return middle + noise[at]
     w0, w1, w2, w3 = weights
-    return (w0 * noise[at] + w1 * noise[at + stride]) + (
-        w2 * noise[at + U(2) * stride] + w3 * noise[at + U(3) * stride]
-    )
+    value = middle + w0 * noise[at]
+    value += w1 * noise[at + stride]
+    value += w2 * noise[at + U(2) * stride]
+    return value + w3 * noise[at + U(3) * stride]
 
 
 @scalar_function
@@ -81,7 +81,7 @@ def expand(
             kept = U(c) * BLOCK
             for b in range(BLOCK):
                 previous = state[kept + b]
-                value = middle + _noise(noise, first_knot + kept + b, stride, weights)
+                value = _with_noise(middle, noise, first_knot + kept + b, stride, weights)
                 value = clip(clip(value, previous - change, previous + change), -largest, largest)
                 commands[first_row + kept + b] = value
                 state[kept + b] = value
@@ -155,19 +155,11 @@ def sum_lanes(sums: Any, rows: int) -> None:
     """Sum each row of BLOCK into its first entry, always in the same order."""
     tune_loops()
     for j in range(U(rows)):
-        row = j * BLOCK
-        for part in range(U(1), BLOCK // _LANES):
-            for lane in range(_LANES):
-                sums[row + lane] += sums[row + part * _LANES + lane]
-        for lane in range(U(8)):
-            sums[row + lane] += sums[row + U(8) + lane]
-        for lane in range(U(4)):
-            sums[row + lane] += sums[row + U(4) + lane]
-        sums[row] = (sums[row] + sums[row + U(2)]) + (sums[row + U(1)] + sums[row + U(3)])
+        sums[j * BLOCK] = row_sum(sums, j * BLOCK)
 
 
 @scalar_function
 def mean_noise(sums: Any, t: int, c: int, channels: int, basis: Any) -> Any:
     """Noise at step t of channel c, from the rows of noise in the first entries of the rows of `sums`."""
     row = U(basis.first[t] * channels + c) * BLOCK
-    return _noise(sums, row, U(channels) * BLOCK, _weights(basis.weights, t))
+    return _with_noise(float32(0.0), sums, row, U(channels) * BLOCK, _weights(basis.weights, t))

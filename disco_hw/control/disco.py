@@ -219,13 +219,13 @@ class Disco:
             step_s=settings.step_s,
             wheel_speeds=wheel_speeds,
             trajectory=self._trajectory(self._mean, wheel_speeds, 0),
-            diagnostics=Diagnostics(
-                **self._optimiser.report(),  # type: ignore[arg-type]
-                retries=retries,
-                collapsed=self._optimiser.ess < settings.min_ess,
-                outcome=outcome,
-            ),
+            diagnostics=self._diagnostics(retries, outcome),
         )
+
+    def _diagnostics(self, retries: int, outcome: Outcome) -> Diagnostics:
+        ess, temperature, least, mean, nominal, valid = self._optimiser.report().values()
+        collapsed = ess < self._settings.min_ess
+        return Diagnostics(ess, temperature, least, mean, nominal, int(valid), retries, collapsed, outcome)
 
     def _improve(
         self, shift_steps: float, before: tuple[float, float], system: SkidSteer, first: bool

@@ -142,7 +142,7 @@ class Optimiser:
         return float(self._work.report[ESS])
 
     def report(self) -> dict[str, float]:
-        """Figures of the last step: ess, temperature, cost_min, cost_mean, cost_nominal, valid_samples."""
+        """Figures of the last step, in order: ess, temperature, cost_min, cost_mean, cost_nominal, valid_samples."""
         ess, temperature, least, mean, nominal, valid = self._work.report.tolist()
         return {
             "ess": ess,

@@ -133,10 +133,8 @@ def _value(table: Any, lane: Any, point: int, each: Any) -> Any:
 
 @scalar_function
 def _cos_sin(angle: Any) -> Any:
-    """Cosine and sine of any angle."""
-    half_turns = angle * cast_like(1.0 / math.pi, angle)
-    turns = np.floor((half_turns + cast_like(1.0, angle)) * cast_like(0.5, angle))
-    return cos_sin_half_turns(half_turns - (turns + turns))
+    """Cosine and sine of an angle."""
+    return cos_sin_half_turns(angle * cast_like(1.0 / math.pi, angle))
 
 
 @block_function

@@ -79,18 +79,16 @@ SAMPLING = np.dtype(
 def shift(nominal: Any, scratch: Any, steps: float, hold: bool) -> None:
     """Move the sequence (T, C) on by a fraction of steps; beyond its end it holds the last command or is zero."""
     horizon, channels = nominal.shape
+    whole = int(min(steps, float(horizon)))
+    fraction = float32(min(steps - whole, 1.0))
     for t in range(horizon):
+        at, after = min(t + whole, horizon - 1), min(t + whole + 1, horizon - 1)
         for c in range(channels):
-            position = t + steps
-            index = int(min(position, float(horizon)))
-            fraction = float32(position - index)
-            at = min(index, horizon - 1)
-            after = min(index + 1, horizon - 1)
             first, second = nominal[at, c], nominal[after, c]
             if not hold:
-                first = first if index < horizon else float32(0.0)
-                second = second if index + 1 < horizon else float32(0.0)
-            scratch[t, c] = first + min(fraction, float32(1.0)) * (second - first)
+                first = first if t + whole < horizon else float32(0.0)
+                second = second if t + whole + 1 < horizon else float32(0.0)
+            scratch[t, c] = first + fraction * (second - first)
     for t in range(horizon):
         for c in range(channels):
             nominal[t, c] = scratch[t, c]

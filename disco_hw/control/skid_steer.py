@@ -149,13 +149,11 @@ def _remember(looks: Any, state: Any, own: Any, b: Any, memory: Any, task: Any) 
 
 
 @scalar_function
-def _follow(
-    looks: Any, state: Any, own: Any, b: Any, axle_x: Any, axle_y: Any, forward: Any, base: Any, task: Any
-) -> None:  # fmt: skip
+def _follow(looks: Any, state: Any, own: Any, b: Any, place: Any, task: Any) -> None:
     """Move the memory of sample b on by the step that it has just made; nothing without a table."""
     if looks is None:
         return
-    x, y = tracked_of(axle_x, axle_y, state[_COS + b], state[_SIN + b], base)
+    x, y, forward = place
     found = _found(looks, state, own, b)
     memory, state[own + _KEPT + b] = follow(task, state[own + _MEMORY + b], x, y, forward, found)
     _remember(looks, state, own, b, memory, task)
@@ -192,12 +190,10 @@ def _look_ups(looks: Any, state: Any, ahead: Any, scaled: Any, task: Any) -> Non
 
 
 @scalar_function
-def _cost(
-    state: Any, own: Any, b: Any, t: int, axle_x: Any, axle_y: Any, forward: Any, base: Any, task: Any, last: Any
-) -> None:  # fmt: skip
+def _cost(state: Any, own: Any, b: Any, t: int, place: Any, task: Any, last: Any) -> None:
     """Add the cost of step t, which sample b has just made, to the rows from `own` on; `last` is None before it."""
     cos_yaw, sin_yaw = state[_COS + b], state[_SIN + b]
-    x, y = tracked_of(axle_x, axle_y, cos_yaw, sin_yaw, base)
+    x, y, forward = place
     cost, memory = stage_cost(
         task, state[own + _MEMORY + b], t, state[own + _X + b], state[own + _Y + b], x, y, cos_yaw, sin_yaw, forward,
         _found(looks_up(task), state, own, b),
@@ -211,53 +207,55 @@ def _cost(
 
 
 @scalar_function
-def _twin_axle(state: Any, b: Any, base: Any, twin: Any, start: Any) -> Any:
-    """Axle and forward speed of a twin of the point `base`: the same path from another place, at another scale."""
+def _place(state: Any, b: Any, base: Any) -> Any:
+    """Tracked point of sample b and forward speed over its last step, under the point `base`."""
+    x, y = tracked_of(state[_AXLE_X + b], state[_AXLE_Y + b], state[_COS + b], state[_SIN + b], base)
+    return x, y, state[_FORWARD + b]
+
+
+@scalar_function
+def _ahead_place(state: Any, b: Any, base: Any, twin: Any, start: Any) -> Any:
+    """As `_place`, for a twin of the point `base` that differs in x_icr: it turns about the same axle."""
+    x, y, forward = _place(state, b, base)
+    farther = twin.x_icr_m - base.x_icr_m
+    return x - farther * (state[_COS + b] - start[2]), y - farther * (state[_SIN + b] - start[3]), forward
+
+
+@scalar_function
+def _scaled_place(state: Any, b: Any, base: Any, twin: Any, start: Any) -> Any:
+    """As `_place`, for a twin of the point `base` whose path is the same at another scale."""
     scale = twin.half_radius_m / base.half_radius_m
     ahead, stays = twin.x_icr_m - scale * base.x_icr_m, cast_like(1.0, scale) - scale
     axle_x = scale * state[_AXLE_X + b] + (stays * start[0] + ahead * start[2])
     axle_y = scale * state[_AXLE_Y + b] + (stays * start[1] + ahead * start[3])
-    return axle_x, axle_y, scale * state[_FORWARD + b]
-
-
-@scalar_function
-def _twin_cost(state: Any, own: Any, b: Any, t: int, base: Any, twin: Any, start: Any, task: Any, last: Any) -> None:
-    """As `_cost`, for a twin of the point `base`."""
-    axle_x, axle_y, forward = _twin_axle(state, b, base, twin, start)
-    _cost(state, own, b, t, axle_x, axle_y, forward, twin, task, last)
-
-
-@scalar_function
-def _twin_follow(looks: Any, state: Any, own: Any, b: Any, base: Any, twin: Any, start: Any, task: Any) -> None:
-    """As `_follow`, for a twin of the point `base`."""
-    if looks is None:
-        return
-    axle_x, axle_y, forward = _twin_axle(state, b, base, twin, start)
-    _follow(looks, state, own, b, axle_x, axle_y, forward, twin, task)
+    x, y = tracked_of(axle_x, axle_y, state[_COS + b], state[_SIN + b], twin)
+    return x, y, scale * state[_FORWARD + b]
 
 
 @scalar_function
 def _follows(looks: Any, state: Any, b: Any, base: Any, ahead: Any, scaled: Any, start: Any, task: Any) -> None:
-    """Move the memories of a point and its twins on."""
-    _follow(looks, state, _OWN, b, state[_AXLE_X + b], state[_AXLE_Y + b], state[_FORWARD + b], base, task)
+    """Move the memories of a point and its twins on; nothing without a table."""
+    if looks is None:
+        return
+    _follow(looks, state, _OWN, b, _place(state, b, base), task)
     if ahead is not None:
-        _twin_follow(looks, state, _TWIN0, b, base, ahead[0], start, task)
-        _twin_follow(looks, state, _TWIN1, b, base, ahead[1], start, task)
+        _follow(looks, state, _TWIN0, b, _ahead_place(state, b, base, ahead[0], start), task)
+        _follow(looks, state, _TWIN1, b, _ahead_place(state, b, base, ahead[1], start), task)
     if scaled is not None:
-        _twin_follow(looks, state, _TWIN2, b, base, scaled[0], start, task)
-        _twin_follow(looks, state, _TWIN3, b, base, scaled[1], start, task)
+        _follow(looks, state, _TWIN2, b, _scaled_place(state, b, base, scaled[0], start), task)
+        _follow(looks, state, _TWIN3, b, _scaled_place(state, b, base, scaled[1], start), task)
 
 
 @scalar_function
 def _costs(state: Any, b: Any, t: int, base: Any, ahead: Any, scaled: Any, start: Any, task: Any, last: Any) -> None:
     """Costs of step t under a point and its twins, pairs or None."""
-    _cost(state, _OWN, b, t, state[_AXLE_X + b], state[_AXLE_Y + b], state[_FORWARD + b], base, task, last)
+    _cost(state, _OWN, b, t, _place(state, b, base), task, last)
     if ahead is not None:
-        _twin_cost(state, _TWIN0, b, t, base, ahead[0], start, task, last)
-        _twin_cost(state, _TWIN1, b, t, base, ahead[1], start, task, last)
+        _cost(state, _TWIN0, b, t, _ahead_place(state, b, base, ahead[0], start), task, last)
+        _cost(state, _TWIN1, b, t, _ahead_place(state, b, base, ahead[1], start), task, last)
     if scaled is not None:
-        _twin_cost(state, _TWIN2, b, t, base, scaled[0], start, task, last)
-        _twin_cost(state, _TWIN3, b, t, base, scaled[1], start, task, last)
+        _cost(state, _TWIN2, b, t, _scaled_place(state, b, base, scaled[0], start), task, last)
+        _cost(state, _TWIN3, b, t, _scaled_place(state, b, base, scaled[1], start), task, last)
 
 
 @block_function

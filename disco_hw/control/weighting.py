@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from disco_hw.control.blocks import BLOCK, U
+from disco_hw.control.lanes import row_sum
 from disco_hw.model.jit import block_function, float32, float_from_bits, int32, scalar_function, tune_loops
 
 _LOG2_E = np.float32(math.log2(math.e))
@@ -75,10 +76,7 @@ def weigh(weights: Any, scratch: Any, costs: Any, blocks: int, samples: int, lea
             weights[first + b] = weight
             scratch[_SUM + b] += weight
             scratch[_SQUARES + b] += weight * weight
-    total, squares = zero, zero
-    for b in range(BLOCK):
-        total += scratch[_SUM + b]
-        squares += scratch[_SQUARES + b]
+    total, squares = row_sum(scratch, _SUM), row_sum(scratch, _SQUARES)
     return total, total * total / squares
 
 

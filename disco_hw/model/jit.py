@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-import math
+import platform
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -17,8 +17,9 @@ from numba.extending import intrinsic, overload
 
 from disco_hw.model.plugins import plugin_sources
 
-# No `nnan`, `ninf` (non-finite costs must stay visible) and no `reassoc` (sums keep their order, so a run replays).
-FAST_MATH = {"contract", "nsz", "arcp"}
+# No `nnan`, `ninf` (non-finite costs must stay visible), no `reassoc` (sums keep their order, so a run replays), no
+# `arcp` (a quotient by a root is exact but where `reciprocal_root` asks for an estimate).
+FAST_MATH = {"contract", "nsz"}
 
 INLINED: dict[str, Any] = {"fastmath": FAST_MATH, "error_model": "numpy", "forceinline": True}
 
@@ -26,8 +27,12 @@ scalar_function: Callable[..., Any] = njit(**INLINED)
 _intrinsic: Any = intrinsic
 _typeof: Any = typeof
 
-# A function with loops of its own, too large to be worth a copy in every caller.
-block_function: Callable[..., Any] = njit(fastmath=FAST_MATH, error_model="numpy")
+# Where an estimate of a reciprocal root is good for 11 bits, which one Newton step makes 22; ARM's is good for 8.
+ESTIMATES_ROOTS = ("x86_64", "AMD64")
+
+# A function with loops of its own, too large to be worth a copy in every caller. What is not said here numba would take
+# over from whichever function calls it first.
+block_function: Callable[..., Any] = njit(fastmath=FAST_MATH, error_model="numpy", forceinline=False)
 
 # The compiler's scalar types, as casts.
 int32: Any = types.int32
@@ -85,16 +90,35 @@ def tune_loops(_context: Any) -> tuple[Any, Callable[..., Any]]:
     """Let the loops of the calling function use the processor's widest vectors and its estimates of reciprocal roots.
 
     LLVM holds back to 256 bits on processors whose early kinds slowed down for 512; here every loop is long enough to
-    gain. An estimate is refined by one Newton step, to 2e-7, and is what makes `quick_sqrt` quick.
+    gain. The arrays that the function is handed must not overlap: no loop checks for it, and sums stay in registers.
     """
 
     def generate(context: Any, builder: Any, _signature: Any, _arguments: Any) -> Any:
         # llvmlite knows no attributes with values; the set takes them all the same.
         set.add(builder.function.attributes, '"prefer-vector-width"="512"')
-        set.add(builder.function.attributes, '"reciprocal-estimates"="vec-sqrtf:1"')
+        if platform.machine() in ESTIMATES_ROOTS:
+            set.add(builder.function.attributes, '"reciprocal-estimates"="vec-sqrtf:0"')
+        # A copy in the caller would be compiled with the caller's attributes.
+        builder.function.attributes.add("noinline")
+        for argument in builder.function.args:
+            if isinstance(getattr(argument.type, "pointee", None), ir.FloatType):
+                argument.add_attribute("noalias")
         return context.get_dummy_value()
 
     return types.void(), generate
+
+
+@_intrinsic
+def reciprocal_root(_context: Any, value: Any) -> tuple[Any, Callable[..., Any]]:
+    """Reciprocal of a square root: to 11 bits or more in a loop with `tune_loops` that is float32, else exact."""
+
+    def generate(_c: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        kind = arguments[0].type
+        root = builder.module.declare_intrinsic("llvm.sqrt", [kind])
+        one = ir.Constant(kind, 1.0)
+        return builder.fdiv(one, builder.call(root, arguments), flags=("arcp",))
+
+    return value(value), generate
 
 
 @_intrinsic
@@ -132,18 +156,27 @@ def _cast_like(value: Any, like: Any) -> Callable[..., Any]:
 
 
 @scalar_function
+def _newton(square: Any) -> Any:
+    """Estimates of the reciprocal root and of the root of a number, and the factor that refines both."""
+    estimate = reciprocal_root(square)
+    root = square * estimate
+    return estimate, root, cast_like(1.5, square) + root * (cast_like(-0.5, square) * estimate)
+
+
+@scalar_function
 def quick_norm_and_inverse(x: Any, y: Any) -> Any:
-    """Length of a vector and its reciprocal, which a loop with `tune_loops` estimates; of zero, 1e-15 and 1e15."""
+    """Length of a vector and its reciprocal, by Newton's step from an estimate, to 2e-7; of zero, 1e-15 and 1e15."""
     square = x * x + (y * y + cast_like(1e-30, x))
-    inverse = cast_like(1.0, x) / math.sqrt(square)
-    return square * inverse, inverse
+    estimate, norm, step = _newton(square)
+    return norm * step, estimate * step
 
 
 @scalar_function
 def quick_length(x: Any, y: Any, z: Any) -> Any:
     """Length of a vector of three, as of `quick_norm_and_inverse`."""
     square = x * x + (y * y + (z * z + cast_like(1e-30, x)))
-    return square * (cast_like(1.0, x) / math.sqrt(square))
+    _, norm, step = _newton(square)
+    return norm * step
 
 
 @scalar_function

@@ -6,7 +6,7 @@ from numba import njit
 from scipy import stats
 
 from disco_hw.control.blocks import BLOCK, aligned_zeros
-from disco_hw.control.random_numbers import fill_normal_block, philox
+from disco_hw.control.random_numbers import cos_sin_half_turns, fill_normal_block, philox
 
 
 @njit
@@ -18,6 +18,12 @@ def raw(c0, c1, c2, c3, k0, k1):
 def fill(noise, rows, blocks, step, seed, scale):
     for block in range(blocks):
         fill_normal_block(noise, rows, block, step, seed, scale)
+
+
+@njit
+def cos_sin(half_turns, cosine, sine):
+    for i in range(half_turns.size):
+        cosine[i], sine[i] = cos_sin_half_turns(half_turns[i])
 
 
 def normals(rows, blocks, step=0, seed=1, scale=1.0):
@@ -59,3 +65,14 @@ def test_a_deviate_depends_on_seed_step_sample_and_row_alone():
     np.testing.assert_array_equal(normals(4, 2, scale=2.0), 2.0 * small)
     for other in (normals(4, 2, step=1), normals(4, 2, seed=2), normals(4, 2, seed=1 + 2**32)):
         assert not np.any(other == small)
+
+
+def test_cosine_and_sine_are_right_over_many_turns():
+    half_turns = np.linspace(-40.0, 40.0, 160_001).astype(np.float32)
+    found = np.empty((2, half_turns.size), np.float32)
+    cos_sin(half_turns, *found)
+    angle = np.pi * half_turns.astype(float)
+    np.testing.assert_allclose(found, [np.cos(angle), np.sin(angle)], rtol=0.0, atol=3e-7)
+    for value in (np.nan, np.inf, -np.inf):
+        cos_sin(np.full(1, value, np.float32), found[0], found[1])
+        assert np.isnan(found[:, 0]).all()
