@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from disco_hw.control import Circle, Disco, DiscoSettings, PlannerState, Sampler, SentCommand, WheelLimits, reference
@@ -213,7 +213,37 @@ def test_costs_and_update_along_a_path(path, base, values, commands, seed):
     check_against_reference(model_of(base), state_of(values, commands), path, PLAN_SETTINGS, seed)
 
 
+# A way of 1.6 km up to here: places on it that count from far off are too coarse for single precision.
+LONG_WAY = Path(
+    Waypoints(
+        np.array([[-1488.79531, 500.0], [0.0, 0.0], [0.449185571, 0.255162581], [-0.182519024, 1.60631644], [0, 0]])
+    ),
+    0.1529235977265182,
+)
+OF_LONG_WAY = {
+    "motor_lag": {"tau_s": 0.479},
+    "stiction": {"threshold_rad_s": 1.252},
+    "acceleration_slip": {"k_s2_m": 0.2344},
+    "battery_sag": {"loss": 0.456},
+    "turn_slip": {"k_s": -0.0436},
+    "deadband": {"width_rad_s": 0.7306},
+    "lateral_icr": {"offset_m": -0.00456},
+    "command_delay": {"delay_s": 0.2629},
+    "yaw_acceleration_limit": {"limit_rad_s2": 38.7},
+    "speed_limit": {"limit_rad_s": 7.98},
+    "yaw_rate_limit": {"limit_rad_s": 1.5},
+}
+
+
 @settings(max_examples=15)
+@example(
+    LONG_WAY,
+    (0.12, 0.586163711510468, -0.19162802348634833),
+    {name: OF_LONG_WAY.get(name, dict.fromkeys(values, 0.0)) for name, values in FULL.items()},
+    (0.0, 0.0, -1.856898605248339, -0.8129740774929726, 4.5038842029330866),
+    [(0.0, 0.0)],
+    0,
+)
 @given(paths(), BASE, EFFECTS, STATES, COMMANDS, st.integers(0, 2**63 - 1))
 def test_costs_and_update_along_a_path_with_all_effects(path, base, effects, values, commands, seed):
     check_against_reference(model_of(base, effects), state_of(values, commands), path, PLAN_SETTINGS, seed)

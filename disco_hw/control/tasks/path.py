@@ -43,21 +43,22 @@ TERMINAL_S = 1.0
 SHARP_RAD = math.radians(125.0)
 TURN_M = 0.15
 REACHED_M = 0.05
-# Entries of the table that rollouts see relative to the same point.
-NEAR = 1000
+# Entries of the table that rollouts see relative to the same point: few, as single precision tells 0.1 um of 1 m.
+NEAR = 50
 
 
 class PathTerms(NamedTuple):
     """What the kernel needs of a path: the part of its table that can be reached within the horizon.
 
     `table` (4 M,): for each piece between two entries, from one to the next, where it begins, x and y (m), and how far
-    it goes in x and y (m). Places count in entries from the first: `last` is M, `end` where the robot stops, or
-    infinite. `per_m`: entries a metre; `speed_m_s`; `speed_per_entry`: progress speed of one
-    entry in a step (m/s); `slow_per_entry`: wanted speed for each entry left; `speed_weight`: of missing speed;
-    `terminal_steps`: weight of the last distance.
+    it goes in x and y (m). Places count in entries from where the robot is: `first` and `last` are the table's ends,
+    `end` is where the robot stops, or infinite. `per_m`: entries a metre; `speed_m_s`; `speed_per_entry`: progress
+    speed of one entry in a step (m/s); `slow_per_entry`: wanted speed for each entry left; `speed_weight`: of missing
+    speed; `terminal_steps`: weight of the last distance.
     """
 
     table: Any
+    first: Any
     last: Any
     end: Any
     per_m: Any
@@ -143,23 +144,24 @@ class Path:
     ) -> Prepared:
         """Terms for the kernel; the memory is the place on the path, in entries of the table.
 
-        Rollouts count it from the first entry that they can reach, and are relative to a point of the path nearby, so
-        that a long path is as precise as a short one.
+        Rollouts count it from where they begin, and are relative to a point of the path nearby, so that a long path is
+        as precise as a short one.
         """
         place, first, last = self.piece(self.place(x_m, y_m, memory))
         reach = horizon * math.ceil(FARTHEST_STEP_M / self._spacing_m) + 1
         near = _nearby(self, int(place) // NEAR, reach)
         low, high, end = place - reach, place + reach, math.inf
         if self._bounds.size:
-            low, high, end = max(low, first), min(high, last), last - max(low, first)
+            low, high, end = max(low, first), min(high, last), last - place
         begin, rows = int(low) - near.first, int(high - low)
         terms = PathTerms(
             near.pieces[4 * begin : 4 * (begin + rows)],
-            np.float32(rows),
+            np.float32(low - place),
+            np.float32(high - place),
             np.float32(end),
             *_numbers(self, step_s),
         )
-        return Prepared(terms, near.origin_m, place - low, place)
+        return Prepared(terms, near.origin_m, 0.0, place)
 
     def piece(self, place: float) -> tuple[float, float, float]:
         """The piece that a place is on: the place, not less than the piece's first entry; its first and last entry.
@@ -325,7 +327,7 @@ def _follow(task: Any, memory: Any, x: Any, y: Any, forward: Any, found: Any) ->
         wanted = min(task.speed_m_s, (task.end - memory) * task.slow_per_entry)
         missing = task.speed_weight * (wanted - min(along * task.speed_per_entry, forward))
         # In this order, so that what is no number becomes a place, and the cost tells of it.
-        return min(task.last, max(cast_like(0.0, x), memory + along)), missing
+        return min(task.last, max(task.first, memory + along)), missing
 
     return after
 
@@ -334,7 +336,7 @@ def _follow(task: Any, memory: Any, x: Any, y: Any, forward: Any, found: Any) ->
 def _row_of(task: Any, memory: Any) -> Callable[..., Any] | None:
     if not _is_path(task):
         return None
-    return lambda task, memory: int32(min(memory, task.last - cast_like(1.0, memory)))
+    return lambda task, memory: int32(np.floor(min(memory, task.last - cast_like(1.0, memory))) - task.first)
 
 
 @specialise(terminal_cost)

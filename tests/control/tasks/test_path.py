@@ -194,20 +194,22 @@ def test_rollouts_are_relative_to_a_point_nearby_and_see_what_they_can_reach():
     prepared = line.prepare(0.0, 1600.3, 0.0, None, 0.1, 50)
     x = prepared.terms.table[0::4]
     assert prepared.memory * line.spacing_m == pytest.approx(1600.3, abs=0.01)
-    assert x[int(prepared.begin)] + prepared.origin_m[0] == pytest.approx(1600.3, abs=0.011)
-    assert np.abs(x).max() < 60.0
+    assert prepared.begin == 0.0
+    here = x[-int(prepared.terms.first)]
+    assert here + prepared.origin_m[0] == pytest.approx(1600.3, abs=0.011)
+    assert abs(here) < 1.1
     # Half a metre a step, back and on, is what rollouts may gain at most.
-    assert prepared.begin * line.spacing_m == pytest.approx(25.0, abs=0.1)
-    assert prepared.terms.last * line.spacing_m == pytest.approx(50.0, abs=0.1)
+    assert prepared.terms.first * line.spacing_m == pytest.approx(-25.0, abs=0.1)
+    assert prepared.terms.last * line.spacing_m == pytest.approx(25.0, abs=0.1)
     # Near the end there is less to see.
-    assert line.prepare(0.0, 1899.0, 0.0, None, 0.1, 50).terms.last * line.spacing_m == pytest.approx(26.0, abs=0.1)
+    assert line.prepare(0.0, 1899.0, 0.0, None, 0.1, 50).terms.last * line.spacing_m == pytest.approx(1.0, abs=0.1)
 
 
 def test_a_closed_path_goes_on_past_its_first_way_point_however_short_it_is():
     ring = Path(Waypoints(0.3 * ROUND.places_m))
     prepared = ring.prepare(0.0, 0.3, 0.3, None, 0.1, 50)
     table, count = prepared.terms.table.reshape(-1, 4), len(ring.table) - 1
-    at = int(prepared.begin)
+    at = -int(prepared.terms.first)
     np.testing.assert_allclose(
         table[at : at + 3 * count, :2],
         np.tile(ring.table[:-1, :2], (4, 1))[int(prepared.memory) :][: 3 * count] - prepared.origin_m,
