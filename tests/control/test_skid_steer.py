@@ -216,21 +216,24 @@ def test_costs_and_update_along_a_path(path, base, values, commands, seed):
 # A way of 1.6 km up to here: places on it that count from far off are too coarse for single precision.
 LONG_WAY = Path(
     Waypoints(
-        np.array([[-1488.79531, 500.0], [0.0, 0.0], [0.449185571, 0.255162581], [-0.182519024, 1.60631644], [0, 0]])
+        np.array([[-1488.79531, 500.0], [0.0, 0.0], [0.449185571, 0.255162581], [-0.182519024, 1.60631644], [0.0, 0.0]])
     ),
     0.1529235977265182,
 )
 OF_LONG_WAY = {
-    "motor_lag": {"tau_s": 0.479},
-    "stiction": {"threshold_rad_s": 1.252},
-    "acceleration_slip": {"k_s2_m": 0.2344},
-    "battery_sag": {"loss": 0.456},
-    "turn_slip": {"k_s": -0.0436},
-    "deadband": {"width_rad_s": 0.7306},
-    "lateral_icr": {"offset_m": -0.00456},
-    "command_delay": {"delay_s": 0.2629},
-    "yaw_acceleration_limit": {"limit_rad_s2": 38.7},
-    "speed_limit": {"limit_rad_s": 7.98},
+    "motor_lag": {"tau_s": 0.47914409582507633},
+    "stiction": {"threshold_rad_s": 1.2520654093994823},
+    "acceleration_slip": {"k_s2_m": 0.23437032236889863},
+    "battery_sag": {"loss": 0.4561363272116118},
+    "turn_slip": {"k_s": -0.04359815160943236},
+    "deadband": {"width_rad_s": 0.7305651833213925},
+    "lateral_icr": {"offset_m": -0.004562940814339528},
+    "surface_change": {"track": 0.008894168233453126, "time_s": 3.1938459042995833, "radius": 0.0},
+    "command_delay": {"delay_s": 0.26292225199520247},
+    "yaw_acceleration_limit": {"limit_rad_s2": 38.72731466682443},
+    "slope": {"drift_x_m_s": 0.0002, "drift_y_m_s": 0.0093},
+    "speed_limit": {"limit_rad_s": 7.97758228652401},
+    "wheel_gain": {"left": 0.030486864105775724, "right": 0.0},
     "yaw_rate_limit": {"limit_rad_s": 1.5},
 }
 
