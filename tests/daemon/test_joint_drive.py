@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from disco_hw.daemon.assembly import make_planner
 from disco_hw.daemon.supervisor import UserRequest
@@ -10,6 +11,9 @@ from disco_hw.replay import replay
 from disco_hw.robot_setup import load_setup
 from tests.daemon.simulated import ROBOT_FILE, simulated_stack
 from tests.daemon.test_path_drive import write_log
+
+# A kernel to compile; tests/control/test_disco.py drives with joint sampling in every `make test`.
+pytestmark = pytest.mark.long
 
 
 def test_robot_toml_asks_for_joint_sampling_and_it_drives_and_replays(tmp_path):

@@ -18,6 +18,9 @@ from disco_hw.viewer.recording import Recording
 from tests.daemon.path_robot import timed_path_robot
 from tests.daemon.test_path_drive import drive, started, write_log
 
+# Half a minute of compiling; tests/control/tasks/test_timed_path.py drives such a path in every `make test`.
+pytestmark = pytest.mark.long
+
 # Straight, a rest of 2 s, and round a corner.
 CSV = "t_s,x_m,y_m\n1,0,0\n4,0.9,0\n6,0.9,0\n8,1.4,0\n11,1.4,0.7\n"
 
