@@ -52,6 +52,7 @@ class Disco:
         )
         theta, weights = self._shared_points(model)
         self._weights = weights.astype(np.float32)
+        self._unweighed = True if self._weights[0] == 0.0 and not self._own_draws else None
         delay_is_believed = model.belief is not None and DELAY in model.belief.names
         self._history = self._history_for(model, theta) + (SPARE_HISTORY if delay_is_believed else 0)
         may_turn_more = settings.uncertainty in ("mc", "joint") or any(
@@ -310,8 +311,8 @@ class Disco:
         base, effects = self._tables
         each = True if self._own_draws else None
         return SkidSteer(
-            self._start, base, effects, each, self._ahead, self._scaled, self._series, self._wide, task, self._history,
-            self._wheels, self._wheels_differ,
+            self._start, base, effects, each, self._ahead, self._scaled, self._unweighed, self._series, self._wide,
+            task, self._history, self._wheels, self._wheels_differ,
         )  # fmt: skip
 
     def _draw_points(self) -> None:

@@ -46,7 +46,9 @@ class SkidSteer(NamedTuple):
     `start` (8,): x, y relative to the task's origin (m), cos and sin of yaw, left and right wheel speed (rad/s), time
     (s), the task's memory. `base`, `effects`: coefficient tables of L points; `each` is None, or anything else if the
     tables hold points for every sample, (L, K'). `ahead`, `scaled` (L, 2) int or None: pairs of points that
-    share a point's rollout, as `parameter_points.twins` finds them. `series` (8,), `wide`: how a step is integrated.
+    share a point's rollout, as `parameter_points.twins` finds them. `unweighed`: None, or anything else if the first
+    point has no weight, so that it is rolled out for its twins alone and its cost is left as it is. `series` (8,),
+    `wide`: how a step is integrated.
     `history`: rows of commands from before the plan. `wheels`: buffer of the wheels' motion, T * WHEEL_ROWS * BLOCK;
     `wheels_differ`: whether the points differ in how the wheels turn.
     """
@@ -57,6 +59,7 @@ class SkidSteer(NamedTuple):
     each: Any
     ahead: Any
     scaled: Any
+    unweighed: Any
     series: Any
     wide: Any
     task: Any
@@ -175,12 +178,13 @@ def _look_up(table: Any, state: Any, own: Any) -> None:
 
 
 @scalar_function
-def _look_ups(looks: Any, state: Any, ahead: Any, scaled: Any, task: Any) -> None:
+def _look_ups(looks: Any, state: Any, unweighed: Any, ahead: Any, scaled: Any, task: Any) -> None:
     """Look up for a point and its twins; nothing without a table."""
     if looks is None:
         return
     table = table_of(task)
-    _look_up(table, state, _OWN)
+    if unweighed is None:
+        _look_up(table, state, _OWN)
     if ahead is not None:
         _look_up(table, state, _TWIN0)
         _look_up(table, state, _TWIN1)
@@ -233,11 +237,14 @@ def _scaled_place(state: Any, b: Any, base: Any, twin: Any, start: Any) -> Any:
 
 
 @scalar_function
-def _follows(looks: Any, state: Any, b: Any, base: Any, ahead: Any, scaled: Any, start: Any, task: Any) -> None:
+def _follows(
+    looks: Any, state: Any, b: Any, base: Any, unweighed: Any, ahead: Any, scaled: Any, start: Any, task: Any
+) -> None:
     """Move the memories of a point and its twins on; nothing without a table."""
     if looks is None:
         return
-    _follow(looks, state, _OWN, b, _place(state, b, base), task)
+    if unweighed is None:
+        _follow(looks, state, _OWN, b, _place(state, b, base), task)
     if ahead is not None:
         _follow(looks, state, _TWIN0, b, _ahead_place(state, b, base, ahead[0], start), task)
         _follow(looks, state, _TWIN1, b, _ahead_place(state, b, base, ahead[1], start), task)
@@ -247,9 +254,12 @@ def _follows(looks: Any, state: Any, b: Any, base: Any, ahead: Any, scaled: Any,
 
 
 @scalar_function
-def _costs(state: Any, b: Any, t: int, base: Any, ahead: Any, scaled: Any, start: Any, task: Any, last: Any) -> None:
+def _costs(
+    state: Any, b: Any, t: int, base: Any, unweighed: Any, ahead: Any, scaled: Any, start: Any, task: Any, last: Any
+) -> None:
     """Costs of step t under a point and its twins, pairs or None."""
-    _cost(state, _OWN, b, t, _place(state, b, base), task, last)
+    if unweighed is None:
+        _cost(state, _OWN, b, t, _place(state, b, base), task, last)
     if ahead is not None:
         _cost(state, _TWIN0, b, t, _ahead_place(state, b, base, ahead[0], start), task, last)
         _cost(state, _TWIN1, b, t, _ahead_place(state, b, base, ahead[1], start), task, last)
@@ -272,13 +282,15 @@ def _end(costs: Any, at: Any, state: Any, own: Any, task: Any) -> None:
 @block_function
 def _roll(
     costs: Any, at: Any, ahead_at: Any, scaled_at: Any, horizon: int, commands: Any, late: int, wheels: Any,
-    state: Any, start: Any, base: Any, ahead: Any, scaled: Any, effects: Any, integration: Any, task: Any,
+    state: Any, start: Any, base: Any, unweighed: Any, ahead: Any, scaled: Any, effects: Any, integration: Any,
+    task: Any,
 ) -> None:  # fmt: skip
     """Roll the block out from `start` with its wheels turning as in `wheels`; writes `costs[at:at + BLOCK]`.
 
     `base` and `effects` hold numbers, or arrays whose entries from `at` on belong to the block's samples. Twins, the
-    pairs `ahead` and `scaled` or None, are costed along with it, at `ahead_at` and `scaled_at`. A step is costed
-    together with the next one's motion: neither waits for the other, which saves a sixth of the time.
+    pairs `ahead` and `scaled` or None, are costed along with it, at `ahead_at` and `scaled_at`; they alone, where
+    `unweighed` is not None. A step is costed together with the next one's motion: neither waits for the other, which
+    saves a sixth of the time.
     """
     tune_loops()
     x, y, cos_yaw, sin_yaw = start[0], start[1], start[2], start[3]
@@ -286,12 +298,13 @@ def _roll(
         state[_AXLE_X + b], state[_AXLE_Y + b] = axle_of(x, y, cos_yaw, sin_yaw, lane_base(base, at + b))
         state[_COS + b] = cos_yaw
         state[_SIN + b] = sin_yaw
-        _begin(state, _OWN, b, start, task)
+        if unweighed is None:
+            _begin(state, _OWN, b, start, task)
         _begin(state, _TWIN0, b, start, task)
         _begin(state, _TWIN1, b, start, task)
         _begin(state, _TWIN2, b, start, task)
         _begin(state, _TWIN3, b, start, task)
-    _look_ups(looks_up(task), state, ahead, scaled, task)
+    _look_ups(looks_up(task), state, unweighed, ahead, scaled, task)
     for t in range(horizon):
         time_s = start[6] + cast_like(t, x) * integration.step_s
         if t == 0:
@@ -300,20 +313,21 @@ def _roll(
                 _move(
                     state, b, _rolling(wheels, t, b, commands, late, horizon, acting), time_s, here, acting, integration
                 )  # fmt: skip
-                _follows(looks_up(task), state, b, here, ahead, scaled, start, task)
+                _follows(looks_up(task), state, b, here, unweighed, ahead, scaled, start, task)
         else:
             for b in range(BLOCK):
                 here, acting = lane_base(base, at + b), lane_effects(effects, at + b)
-                _costs(state, b, t - 1, here, ahead, scaled, start, task, None)
+                _costs(state, b, t - 1, here, unweighed, ahead, scaled, start, task, None)
                 _move(
                     state, b, _rolling(wheels, t, b, commands, late, horizon, acting), time_s, here, acting, integration
                 )  # fmt: skip
-                _follows(looks_up(task), state, b, here, ahead, scaled, start, task)
-        _look_ups(looks_up(task), state, ahead, scaled, task)
+                _follows(looks_up(task), state, b, here, unweighed, ahead, scaled, start, task)
+        _look_ups(looks_up(task), state, unweighed, ahead, scaled, task)
     for b in range(BLOCK):
-        _costs(state, b, horizon - 1, lane_base(base, at + b), ahead, scaled, start, task, True)
+        _costs(state, b, horizon - 1, lane_base(base, at + b), unweighed, ahead, scaled, start, task, True)
     # One after the other: a loop that wrote to all at once would not be vectorised.
-    _end(costs, at, state, _OWN, task)
+    if unweighed is None:
+        _end(costs, at, state, _OWN, task)
     if ahead is not None:
         _end(costs, ahead_at[0], state, _TWIN0, task)
         _end(costs, ahead_at[1], state, _TWIN1, task)
@@ -336,8 +350,8 @@ def _places(pair: Any, padded: int, lane: Any) -> Any:
 
 @block_function
 def _roll_points(
-    each: Any, ahead: Any, scaled: Any, system: Any, costs: Any, points: int, padded: int, block: int, horizon: int,
-    commands: Any, state: Any,
+    each: Any, unweighed: Any, ahead: Any, scaled: Any, system: Any, costs: Any, points: int, padded: int, block: int,
+    horizon: int, commands: Any, state: Any,
 ) -> None:  # fmt: skip
     integration = integration_from(system.series, system.wide)
     start, wheels, task = system.start, system.wheels, system.task
@@ -350,31 +364,32 @@ def _roll_points(
             if needs_change(acting) or not wheels_follow(acting):
                 _turn_wheels(wheels, at, horizon, commands, state, start, system.effects, late, integration.step_s)
             _roll(
-                costs, at, None, None, horizon, commands, late, wheels, state, start, system.base, None, None,
+                costs, at, None, None, horizon, commands, late, wheels, state, start, system.base, None, None, None,
                 system.effects, integration, task,
             )  # fmt: skip
         else:
             if (i == 0 or system.wheels_differ) and (needs_change(acting) or not wheels_follow(acting)):
                 _turn_wheels(wheels, at, horizon, commands, state, start, acting, late, integration.step_s)
-            alone = True
+            alone = i > 0 or unweighed is None
             if ahead is not None:
-                alone = ahead[i, 0] == -1
+                # Whatever leads twins beside the first point is costed in a rollout of its own.
+                alone = alone and (ahead[i, 0] == -1 or (unweighed is not None and ahead[i, 0] >= 0))
                 if ahead[i, 0] >= 0:
                     if scaled is None:
                         _roll(
                             costs, at, _places(ahead[i], padded, lane), None, horizon, commands, late, wheels, state,
-                            start, here, _bases(system.base, ahead[i]), None, acting, integration, task,
+                            start, here, unweighed, _bases(system.base, ahead[i]), None, acting, integration, task,
                         )  # fmt: skip
                     else:
                         _roll(
                             costs, at, _places(ahead[i], padded, lane), _places(scaled[i], padded, lane), horizon,
-                            commands, late, wheels, state, start, here, _bases(system.base, ahead[i]),
+                            commands, late, wheels, state, start, here, unweighed, _bases(system.base, ahead[i]),
                             _bases(system.base, scaled[i]), acting, integration, task,
                         )  # fmt: skip
             if alone:
                 _roll(
-                    costs, at, None, None, horizon, commands, late, wheels, state, start, here, None, None, acting,
-                    integration, task,
+                    costs, at, None, None, horizon, commands, late, wheels, state, start, here, None, None, None,
+                    acting, integration, task,
                 )  # fmt: skip
 
 
@@ -389,7 +404,8 @@ def _roll_block(
         system: Any, costs: Any, points: Any, padded: Any, block: Any, horizon: Any, commands: Any, state: Any
     ) -> None:
         _roll_points(
-            system.each, system.ahead, system.scaled, system, costs, points, padded, block, horizon, commands, state
-        )
+            system.each, system.unweighed, system.ahead, system.scaled, system, costs, points, padded, block, horizon,
+            commands, state,
+        )  # fmt: skip
 
     return roll_skid_steer

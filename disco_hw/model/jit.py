@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 from llvmlite import ir  # type: ignore[import-untyped]
 from numba import njit, typeof, types
+from numba.core.codegen import JITCodeLibrary
+from numba.core.compiler import Compiler
 from numba.extending import intrinsic, overload
 
 from disco_hw.model.plugins import plugin_sources
@@ -47,6 +49,32 @@ def specialise(function: Callable[..., Any]) -> Callable[..., Any]:
     return decorator
 
 
+class _SelfContained(JITCodeLibrary):
+    """Machine code that calls nothing but what is in it.
+
+    A process may hold other copies of the functions that a kernel calls: those that they were compiled to before the
+    kernel was, or another kernel's. They differ in how sums of products are rounded, and the linker takes whichever
+    came first, unless the kernel's own have no symbol. So a kernel gives the same bits in the process that compiled it
+    as in one that loads it.
+    """
+
+    def _optimize_final_module(self) -> None:
+        libraries = (library._get_module_for_linking() for library in self._linking_libraries)
+        called = {function.name for library in libraries for function in library.functions}
+        for function in self._final_module.functions:
+            if function.name in called and not function.is_declaration:
+                function.linkage = "private"
+        super()._optimize_final_module()  # type: ignore[no-untyped-call]
+
+
+class _KernelCompiler(Compiler):
+    def __init__(self, typing: Any, target: Any, library: Any, *rest: Any) -> None:
+        if library is None:
+            library = _SelfContained(target.codegen(), "kernel")  # type: ignore[no-untyped-call]
+            library.enable_object_caching()
+        super().__init__(typing, target, library, *rest)  # type: ignore[no-untyped-call]
+
+
 @cache
 def sources_fingerprint() -> str:
     """Hash of all Python sources that compiled code can come from."""
@@ -70,7 +98,8 @@ def kernel_function(function: Callable[..., Any]) -> Callable[..., Any]:
     code = function.__code__.replace(co_freevars=("sources",))
     keyed = FunctionType(code, function.__globals__, function.__name__, None, (CellType(sources_fingerprint()),))
     keyed.__qualname__, keyed.__module__, keyed.__doc__ = function.__qualname__, function.__module__, function.__doc__
-    compiled: Callable[..., Any] = njit(cache=True, fastmath=FAST_MATH, error_model="numpy")(keyed)
+    options: Any = {"cache": True, "fastmath": FAST_MATH, "error_model": "numpy", "pipeline_class": _KernelCompiler}
+    compiled: Callable[..., Any] = njit(**options)(keyed)
     return compiled
 
 

@@ -149,6 +149,7 @@ def check_against_reference(model, state, task, plan_settings, seed):
     commands = reference.limited(before, spread, anchor, LIMITS.speed_rad_s, change)
 
     theta, point_weights = unscented_points(model, plan_settings.ut_alpha)
+    weighed = point_weights != 0.0
     past = past_commands(state.sent, now_ns, STEP_S, 8, (state.left_speed_rad_s, state.right_speed_rad_s))
     start = physics.State(state.x_m, state.y_m, state.yaw_rad, state.left_speed_rad_s, state.right_speed_rad_s)
     cost = sequence_cost(task, disco._memory)
@@ -161,7 +162,7 @@ def check_against_reference(model, state, task, plan_settings, seed):
                 reference.point_costs(
                     physics.theta_of(names, point), begin, sequences, past, STEP_S, cost, time_s=state.elapsed_s
                 )
-                for point in theta
+                for point in theta[weighed]
             ]
         )
 
@@ -175,6 +176,8 @@ def check_against_reference(model, state, task, plan_settings, seed):
 
     expected = costs_of(commands)
     got = work.point_costs.reshape(point_weights.size, -1)[:, : sampler.samples].astype(float)
+    assert not got[~weighed].any()
+    got = got[weighed]
     apart = ~np.isclose(got, expected, atol=1e-4, rtol=RELATIVE).all(axis=0)
     assert apart.mean() < FEW
     excused = apart.copy()
@@ -182,7 +185,7 @@ def check_against_reference(model, state, task, plan_settings, seed):
         excused[apart] = beyond_single_precision(commands[apart])
     np.testing.assert_allclose(got[:, ~excused], expected[:, ~excused], atol=1e-4, rtol=RELATIVE)
 
-    mean = reference.mean_risk(np.where(excused, got, expected), point_weights)
+    mean = reference.mean_risk(np.where(excused, got, expected), point_weights[weighed])
     np.testing.assert_allclose(work.costs[: sampler.samples], mean, atol=1e-4, rtol=RELATIVE)
     report = disco.optimiser.report()
     assert report["cost_nominal"] == pytest.approx(mean[0], abs=1e-4, rel=RELATIVE)
@@ -199,6 +202,14 @@ def test_every_effect_that_moves_the_robot_is_tried():
 @given(BASE, STATES, COMMANDS, st.integers(0, 2**63 - 1))
 def test_costs_and_update_of_the_bare_model(base, values, commands, seed):
     check_against_reference(model_of(base), state_of(values, commands), CIRCLE, PLAN_SETTINGS, seed)
+
+
+@pytest.mark.long
+@settings(max_examples=15)
+@given(BASE, STATES, COMMANDS, st.integers(0, 2**63 - 1))
+def test_costs_and_update_where_the_mean_has_a_weight(base, values, commands, seed):
+    plan_settings = replace(PLAN_SETTINGS, ut_alpha=0.5)
+    check_against_reference(model_of(base), state_of(values, commands), CIRCLE, plan_settings, seed)
 
 
 @settings(max_examples=15)

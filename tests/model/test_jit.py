@@ -1,0 +1,74 @@
+"""How kernels are compiled: what the compiling process runs is what later ones load."""
+
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from numba import config, njit
+
+from disco_hw.model.jit import block_function, kernel_function, tune_loops
+
+PLANS = """
+from pathlib import Path
+
+import disco_hw
+from disco_hw.control import Circle, Disco, DiscoSettings, PlannerState, WheelLimits
+from disco_hw.model import load_model
+
+model = load_model(Path(disco_hw.__file__).parent / "robots" / "wombot_model.toml")
+disco = Disco(model, Circle(), DiscoSettings(), WheelLimits(6.4))
+for number in range(5):
+    plan = disco.plan(number * 100_000_000, PlannerState(number * 100_000_000, 0.75, 0.02 * number, 1.5, 2.3, 4.2))
+print(disco.optimiser.work.point_costs.tobytes().hex(), plan.wheel_speeds.tobytes().hex())
+"""
+
+
+@block_function
+def double(values):
+    tune_loops()
+    for i in range(values.size):
+        values[i] *= 2.0
+
+
+def twice(values):
+    double(values)
+    double(values)
+
+
+def once(values):
+    double(values)
+
+
+def test_no_other_copy_of_what_a_kernel_calls_is_ever_linked(tmp_path, monkeypatch):
+    monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path))
+    kernel = kernel_function(twice)
+    values = np.ones(3)
+    kernel(values)
+    np.testing.assert_array_equal(values, 4.0)
+    (signature,), (called,) = kernel.signatures, double.overloads.values()
+    code = kernel.overloads[signature].library.get_llvm_str()
+    defined = [line for line in code.splitlines() if line.startswith("define") and called.fndesc.mangled_name in line]
+    assert defined
+    assert all(line.startswith("define private") for line in defined)
+
+
+def test_what_a_kernel_calls_can_be_called_from_elsewhere_too(tmp_path, monkeypatch):
+    monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path))
+    values = np.ones(3)
+    kernel_function(twice)(values)
+    njit(once)(values)
+    double(values)
+    np.testing.assert_array_equal(values, 16.0)
+
+
+@pytest.mark.long
+def test_plans_are_the_same_bits_from_the_process_that_compiles_as_from_one_that_loads(tmp_path):
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    compiled, loaded = (
+        subprocess.run([sys.executable, "-c", PLANS], env=environment, check=True, capture_output=True, text=True)
+        for _ in range(2)
+    )
+    assert compiled.stdout == loaded.stdout
+    assert compiled.stdout.strip()
