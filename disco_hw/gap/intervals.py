@@ -14,6 +14,8 @@ from disco_hw.gap.search import Found
 
 Array = NDArray[np.float64]
 
+# Limits of the robot's turning, which act on the wheels: known in wheel speeds, times radius over axial distance.
+_OF_TURNING = ("yaw_rate_limit.limit_rad_s", "yaw_acceleration_limit.limit_rad_s2")
 _Z95 = 1.96
 _RISE = 0.5 * _Z95**2
 
@@ -57,6 +59,23 @@ def estimates(found: Found) -> Estimates:
         if profile is not None:
             by_name[profile.column] = _profiled(found, profile.column, profile.refine)
     return Estimates(by_name, tuple(columns[index] for index in best.active), covariance)
+
+
+def in_motion(wheels: Estimates, body: Estimates) -> Estimates:
+    """The wheels' estimates, where those of the robot's motion are no better known than its geometry in `body`."""
+    slope = np.zeros(len(body.fitted))
+    for name, sign in (("wheel_radius_m", 1.0), ("axial_distance_m", -1.0)):
+        if name in body.fitted:
+            slope[body.fitted.index(name)] = sign / body.by_name[name].value
+    of_ratio = float(slope @ body.covariance @ slope)
+    moved = {name: wheels.by_name[name] for name in _OF_TURNING if name in wheels.by_name}
+    added = np.array([moved[name].value if name in moved else 0.0 for name in wheels.fitted])
+    by_name = {
+        name: Estimate(each.value, *_around(each.value, float(np.hypot(each.deviation, each.value * of_ratio**0.5))))
+        for name, each in moved.items()
+    }
+    covariance = wheels.covariance + of_ratio * np.outer(added, added)
+    return Estimates({**wheels.by_name, **by_name}, wheels.fitted, covariance)
 
 
 def _around(value: float, deviation: float) -> tuple[float, float]:

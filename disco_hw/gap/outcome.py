@@ -19,7 +19,7 @@ from disco_hw.gap.evidence import inflation
 from disco_hw.gap.fit import Fit, fit
 from disco_hw.gap.form import other_forms
 from disco_hw.gap.held_out import Chain, Errors, errors_of, floor_errors, fold_vectors, per_horizon, smoothed_poses
-from disco_hw.gap.intervals import Estimates, estimates
+from disco_hw.gap.intervals import Estimates, estimates, in_motion
 from disco_hw.gap.report import CandidateEvidence, ChannelFinding, EffectFinding, UnnamedFinding
 from disco_hw.gap.residue import left_over
 from disco_hw.gap.search import Found
@@ -48,10 +48,10 @@ class Outcome:
 
     @cached_property
     def _estimates(self) -> tuple[Estimates | None, Estimates | None]:
-        return (
-            None if self.body is None else estimates(self.body),
-            None if self.wheels is None else estimates(self.wheels),
-        )
+        body, wheels = (None if found is None else estimates(found) for found in (self.body, self.wheels))
+        if body is not None and wheels is not None:
+            wheels = in_motion(wheels, body)
+        return body, wheels
 
     @cached_property
     def _encoder(self) -> tuple[bool, bool]:

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from disco_hw.gap.intervals import estimates
+from disco_hw.gap.intervals import Estimate, Estimates, estimates, in_motion
 from disco_hw.gap.layout import BODY
 from disco_hw.gap.search import Found, body_moves
 from disco_hw.gap.selection import Selector
@@ -53,3 +53,21 @@ def test_the_time_of_a_change_has_an_interval_around_it():
     assert time.low < time.value < time.high
     assert time.value == pytest.approx(35.0, abs=1.0)
     assert time.high - time.low < 10.0
+
+
+def test_a_limit_of_turning_is_no_better_known_than_the_geometry_that_it_is_told_in():
+    def estimates_of(covariance, **values):
+        ends = [1.96 * spread for spread in np.sqrt(np.diag(covariance))]
+        by_name = {name: Estimate(v, v - end, v + end) for (name, v), end in zip(values.items(), ends, strict=True)}
+        return Estimates(by_name, tuple(values), np.asarray(covariance))
+
+    limit, lag = "yaw_rate_limit.limit_rad_s", "motor_lag.tau_s"
+    # Radius and axial distance are known to 1 % and 2 %, and their ratio to sqrt(1 + 4 - 2 * 1.5) %.
+    geometry = estimates_of([[0.0006**2, 3.6e-6], [3.6e-6, 0.008**2]], wheel_radius_m=0.06, axial_distance_m=0.4)
+    wheels = estimates_of([[0.01**2, 1e-6], [1e-6, 0.001**2]], **{limit: 1.0, lag: 0.1})
+    found = in_motion(wheels, geometry)
+    assert found.by_name[limit].deviation == pytest.approx(np.hypot(0.01, 0.02**0.5 / 10.0))
+    assert found.by_name[limit].value == 1.0
+    assert found.by_name[lag] == wheels.by_name[lag]
+    assert found.covariance[0, 0] == pytest.approx(found.by_name[limit].deviation ** 2)
+    np.testing.assert_array_equal(found.covariance.ravel()[1:], wheels.covariance.ravel()[1:])
