@@ -30,6 +30,7 @@ from disco_hw.control.sigma_points import sigma_points
 from disco_hw.control.torch_models import circle_cost, skid_steer_transition
 from disco_hw.daemon.assembly import make_planner
 from disco_hw.model import Model, load_model
+from disco_hw.model.jit import block_function, float32, tune_loops
 from disco_hw.robot_setup import load_setup
 from tools.step_times import summary, times_ms, undisturbed
 
@@ -39,6 +40,9 @@ STEP_NS = 100_000_000
 LARGEST_RAD_S = ROTATION
 SIZES = (400, 1600, 6400, 25_600)
 ROUNDS = 4
+# In a round our step and the bare loop take turns this often: who else is on the processor changes by the tenth second.
+BURSTS = 10
+BARE_ROUNDS = 1200
 # States are made beforehand and used over and over; a step back in time leaves the plan where it is.
 CALLS = 500
 GPU_SAMPLES = 65_536
@@ -80,6 +84,23 @@ def on_the_robot(steps: int) -> dict[str, float]:
 Step = Callable[[int], object]
 
 
+@block_function
+def _multiply_and_add(numbers: Any, rounds: int) -> None:
+    tune_loops()
+    for _ in range(rounds):
+        for i in range(192):
+            numbers[i] = numbers[i] * float32(0.999) + float32(0.001)
+
+
+def bare_loop() -> Step:
+    """As many vector instructions as a step has, and nothing else: what it takes longer than its least, a step does.
+
+    A processor whose other thread is somebody else's gives it half of its vector units.
+    """
+    numbers = np.ones(192, np.float32)
+    return lambda _: _multiply_and_add(numbers, BARE_ROUNDS)
+
+
 def skid_steer_pair(model: Model) -> tuple[Step, Step]:
     """A step of DISCO and of the peer on the paper's circle, with the cost that the paper gives."""
     from tools.control_peers import circle_mppi, circle_state  # noqa: PLC0415  (a peer for the benchmark only)
@@ -106,15 +127,24 @@ def pendulum_pair() -> tuple[Step, Step]:
 
 
 def beside_peer(name: str, ours: Step, theirs: Step, steps: int, peer_steps: int) -> dict[str, float]:
-    """Time of a step of both, in turns so that both see the same machine; ratio of the medians, and of the minima."""
+    """Time of a step of both and of a bare loop, in turns so that all see the same machine.
+
+    Ratio of the medians, and of the minima.
+    """
     times: list[np.ndarray] = []
+    bare_times: list[np.ndarray] = []
     peer_times: list[np.ndarray] = []
+    bare = bare_loop()
+    calls = max(steps // (ROUNDS * BURSTS), 1)
     for _ in range(ROUNDS):
-        times.append(times_ms(ours, steps // ROUNDS))
+        for _ in range(BURSTS):
+            times.append(times_ms(ours, calls, left_out=5))
+            bare_times.append(times_ms(bare, calls, left_out=1))
         peer_times.append(times_ms(theirs, max(peer_steps // ROUNDS, 2), left_out=2))
     mine, peer = np.concatenate(times), np.concatenate(peer_times)
     return {
         **summary(f"control.{name}_step_ms", mine),
+        **summary(f"control.{name}_bare_loop_ms", np.concatenate(bare_times)),
         **summary(f"control.{name}_pytorch_mppi_ms", peer),
         f"control.{name}_ratio_to_pytorch_mppi": float(np.median(peer) / np.median(mine)),
         f"control.{name}_ratio_of_minima": float(peer.min() / mine.min()),
