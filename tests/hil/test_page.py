@@ -161,6 +161,24 @@ def set_the_task(tab, stack):
 
 
 @pytest.mark.timeout(300)
+def test_a_request_that_the_page_died_with_is_said_to_have_no_answer(tmp_path):
+    with (
+        chromium() as browser,
+        running_stack(tmp_path) as stack,
+        page_of(stack.robot_file, tmp_path / "page.txt") as (page, url),
+        opened(browser, url, 760, 560) as tab,
+    ):
+        stack.operator.wait_for("READY", 60.0)
+        tab.frame_locator("#scene").get_by_text("READY, no fault").wait_for()
+        os.kill(page.pid, signal.SIGSTOP)
+        tab.get_by_role("button", name="Arm", exact=True).click()
+        os.kill(page.pid, signal.SIGKILL)
+        tab.get_by_text("arm: no answer").wait_for()
+        assert stack.operator.status()["state"] == "READY"
+        page.wait(10)
+
+
+@pytest.mark.timeout(300)
 def test_the_pad_drives_while_it_is_held_and_seen(tmp_path):
     with chromium() as browser, ExitStack() as stack, (tmp_path / "drive.txt").open("wb") as output:
         bench = Bench(tmp_path, stack)
