@@ -42,7 +42,7 @@ SIZES = (400, 1600, 6400, 25_600)
 ROUNDS = 4
 # In a round our step and the bare loop take turns this often: who else is on the processor changes by the tenth second.
 BURSTS = 10
-BARE_ROUNDS = 1200
+BARE_ROUNDS = 32_000
 # States are made beforehand and used over and over; a step back in time leaves the plan where it is.
 CALLS = 500
 GPU_SAMPLES = 65_536
