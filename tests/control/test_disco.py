@@ -247,6 +247,7 @@ def test_a_broken_plan_is_planned_anew():
     assert np.isfinite(plan.wheel_speeds).all()
 
 
+@pytest.mark.long
 def test_effects_under_the_belief_become_sigma_points():
     names = (*MODEL.belief.names, "motor_lag.tau_s")
     covariance = np.zeros((4, 4))

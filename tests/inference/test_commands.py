@@ -107,6 +107,7 @@ def test_the_report_has_every_figure_of_the_diagnostics(inferred):
     assert "steady circle cannot tell the wheel radius" in page
 
 
+@pytest.mark.long
 def test_the_report_of_the_papers_way_says_what_its_statistics_cannot_tell(robot, tmp_path):
     log, report = write_log(tmp_path / "circle.csv"), tmp_path / "report.html"
     infer_command([log], robot, report=report, options=InferOptions(paper=True), search=finds())
