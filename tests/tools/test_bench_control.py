@@ -24,6 +24,8 @@ def test_the_ratio_is_of_times_in_the_same_run():
     figures = beside_peer("x", lambda _: None, lambda _: sum(range(20_000)), 40, 40)
     assert figures["control.x_ratio_to_pytorch_mppi"] > 10.0
     assert figures["control.x_step_ms.min"] <= figures["control.x_step_ms.p50"] <= figures["control.x_step_ms.max"]
+    # Eight million multiplications cannot be that fast, unless a compiler has seen through them.
+    assert figures["control.x_bare_loop_ms.min"] > 0.01
 
 
 def test_calls_are_told_their_number_and_summed_up():
