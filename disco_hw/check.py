@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from disco_hw.config import Link, RobotConfig
+from disco_hw.config import RobotConfig
 from disco_hw.daemon.assembly import make_driver
 from disco_hw.daemon.client import socket_path
 from disco_hw.daemon.control_client import send_request
@@ -25,14 +25,25 @@ from disco_hw.daemon.preflight import (
 )
 from disco_hw.daemon.realtime import can_lock_memory, can_use_fifo
 from disco_hw.errors import WorkError
+from disco_hw.link import make_link
 from disco_hw.robot_setup import Setup, link_key, load_setup
-from drivers.transport import open_transport
-from drivers.types import Capabilities, DriverState, LinkState, OutgoingFrame, ReceivedFrame, Transport
+from drivers import words
+from drivers.types import (
+    Capabilities,
+    DriverState,
+    LinkState,
+    OutgoingFrame,
+    ReceivedFrame,
+    RobotStatus,
+    Transport,
+)
 from firmware_protocol.codec import Codec, Decoded
 from firmware_protocol.dbc import packaged_dbc
 
 _LINK_TIMEOUT_S = 2.0
 _LISTEN_S = 3.0
+# By then the handshake is over: what the robot rejects from now on it would reject while driving.
+_SETTLED_S = 1.5
 _STEP_S = 0.002
 
 
@@ -65,19 +76,20 @@ def run_check(robot: Path, link: str | None = None) -> CheckReport:
     Raises InputError if a file is wrong, WorkError while a daemon drives this robot: the two would speak at once.
     """
     setup = load_setup(robot, None, link)
-    key = link_key(setup)
+    key, transport = link_key(setup), make_link(setup)
     _refuse_beside_a_daemon(setup.config)
     checks = [_model_check(setup), check_task(setup.config.robot, setup.config.task)]
     checks.append(check_link_load(setup.config.link, setup.config.control, packaged_dbc()))
     control = setup.config.control
     priority = setup.config.daemon.realtime_priority
     checks += check_realtime(priority, can_use_fifo(), can_lock_memory(), os.cpu_count() or 1)
-    transport = _open(setup.config.link)
+    transport.open()
     try:
         checks.append(_link_check(transport))
         if checks[-1].level is Level.OK:
             found = _ask_robot(transport, key)
             checks.append(_firmware_check(found))
+            checks.append(_hearing_check(found))
             checks.append(check_round_trip(found.round_trips_s, 1.0 / control.rate_hz))
             checks.append(_telemetry_check(found))
             if found.capabilities is not None:
@@ -99,6 +111,7 @@ class _Found:
     wheel_samples: int
     pose_samples: int
     rejected: int
+    told: tuple[RobotStatus, ...]
     round_trips_s: tuple[float, ...]
 
 
@@ -112,17 +125,6 @@ def _refuse_beside_a_daemon(config: RobotConfig) -> None:
         return
     raise WorkError(
         f"{path}: a daemon drives this robot; ask it with `disco-hw ctl ROBOT.toml status`, or stop it first"
-    )
-
-
-def _open(link: Link) -> Transport:
-    return open_transport(
-        link.kind,
-        interface=link.interface,
-        channel=link.channel,
-        bitrate=link.bitrate,
-        port=link.port,
-        baud=link.baud,
     )
 
 
@@ -147,14 +149,17 @@ def _ask_robot(transport: Transport, key: bytes | None) -> _Found:
     driver = make_driver(key)
     stopwatch = _Stopwatch()
     wheels = poses = 0
-    driver.link_up(time.monotonic_ns())
-    end_ns = time.monotonic_ns() + round(_LISTEN_S * 1e9)
+    told: list[RobotStatus] = []
+    start_ns = time.monotonic_ns()
+    driver.link_up(start_ns)
+    end_ns = start_ns + round(_LISTEN_S * 1e9)
     while (now_ns := time.monotonic_ns()) < end_ns:
         frames = transport.receive()
         stopwatch.received(frames)
         readings = driver.receive(now_ns, frames)
         wheels += len(readings.wheels)
         poses += len(readings.poses)
+        told += [status for status in readings.status if status.t_ns - start_ns > _SETTLED_S * 1e9]
         for outgoing in driver.transmit(now_ns, None):
             if transport.send(outgoing, now_ns):
                 stopwatch.sent(outgoing)
@@ -168,6 +173,7 @@ def _ask_robot(transport: Transport, key: bytes | None) -> _Found:
         wheel_samples=wheels,
         pose_samples=poses,
         rejected=stats.rejected_crc + stats.rejected_sequence + stats.rejected_length + transport.stats.malformed,
+        told=tuple(told),
         round_trips_s=tuple(stopwatch.round_trips_s),
     )
 
@@ -204,6 +210,19 @@ def _firmware_check(found: _Found) -> Check:
     clock = "clock synchronised" if found.clock_synchronised else "clock NOT synchronised"
     version = f"{capabilities.firmware_version}, protocol {capabilities.protocol_major}.{capabilities.protocol_minor}"
     return Check(name, Level.OK, f"{version}, DBC {capabilities.dbc_hash:08x} matches, {found.state.value}, {clock}")
+
+
+def _hearing_check(found: _Found) -> Check:
+    """Whether the robot takes what this host sends; a wrong key shows nowhere else."""
+    name = "hearing"
+    if not found.told:
+        return Check(name, Level.FAIL, "the robot did not say what it hears; check the firmware")
+    first, last = found.told[0], found.told[-1]
+    rejected = (last.rejected_count - first.rejected_count) % 256
+    if not rejected:
+        return Check(name, Level.OK, "the robot rejects nothing")
+    level = Level.FAIL if last.reject_reason == "AUTHENTICATION" else Level.WARNING
+    return Check(name, level, f"the robot rejected {rejected} frames: {words.reject_reason(last.reject_reason)}")
 
 
 def _telemetry_check(found: _Found) -> Check:

@@ -28,6 +28,7 @@ from disco_hw.daemon.supervisor import Reply, UserRequest
 from disco_hw.daemon.systemd import Notifier
 from disco_hw.daemon.task_change import TaskRefused, changed_task, in_words
 from disco_hw.daemon.warm_up import warm_up
+from disco_hw.link import make_link
 from disco_hw.log import records
 from disco_hw.log.link import Attachment
 from disco_hw.log.provenance import DBC, version
@@ -36,7 +37,6 @@ from disco_hw.log_setup import kept_files
 from disco_hw.pipeline import NoPlanner, Planner
 from disco_hw.robot_setup import Setup, link_key, load_setup, refuse_missing_effects
 from disco_hw.viewer.feed import ViewerFeed, WatchedRecorder, feed_path
-from drivers.transport import open_transport
 from drivers.types import Request
 from firmware_protocol.dbc import packaged_dbc
 
@@ -115,8 +115,8 @@ def _start(
     adapt: bool,
 ) -> Daemon:
     """Make everything, in the order that real time needs, and add to the stop path what must be undone."""
-    config, link = setup.config, setup.config.link
-    key = link_key(setup)
+    config = setup.config
+    key, transport = link_key(setup), make_link(setup)
     planner = new_planner()
     warm_up(make_pipeline(config, setup.model, new_planner()))
     pipeline = make_pipeline(config, setup.model, planner)
@@ -132,14 +132,7 @@ def _start(
         stop.add("adapter", adaptation.close)
     for step in realtime.enter(config.daemon.realtime_priority):
         say("real time", str(step))
-    transport = open_transport(
-        link.kind,
-        interface=link.interface,
-        channel=link.channel,
-        bitrate=link.bitrate,
-        port=link.port,
-        baud=link.baud,
-    )
+    transport.open()
     stop.add("link", transport.close)
     core = assemble_core(config, transport, make_driver(key), pipeline, recorder, pilot.needs_pose, adaptation)
     daemon = Daemon(core, server, recorder, MonotonicClock(), signals, say, pilot)

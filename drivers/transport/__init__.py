@@ -1,7 +1,7 @@
 """Media that carry frames, one file a medium; every one reconnects by itself and counts what it drops."""
 
 from drivers.transport.can import CanMedium
-from drivers.transport.factory import TransportSettingsError, open_transport
+from drivers.transport.factory import TransportSettingsError, make_transport, open_transport
 from drivers.transport.inprocess import InProcessTransport, connect_pair
 from drivers.transport.reconnecting import ReconnectingTransport
 from drivers.transport.serial import SerialMedium
@@ -13,5 +13,6 @@ __all__ = [
     "SerialMedium",
     "TransportSettingsError",
     "connect_pair",
+    "make_transport",
     "open_transport",
 ]

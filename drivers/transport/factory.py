@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 from can.interfaces import VALID_INTERFACES
 
@@ -17,7 +17,7 @@ class TransportSettingsError(ValueError):
     """Settings that no device could satisfy; the message is one line: field, what is wrong, what to write."""
 
 
-def open_transport(
+def make_transport(
     kind: Literal["can", "serial"],
     *,
     interface: str = "socketcan",
@@ -26,13 +26,18 @@ def open_transport(
     port: str = "/dev/ttyUSB0",
     baud: int = 921_600,
 ) -> ReconnectingTransport:
-    """Open a link by the fields of robot.toml's [link]; a device that is absent is waited for, not an error.
+    """Make a link by the fields of robot.toml's [link]; it holds nothing before it is opened.
 
     Raises TransportSettingsError for a kind, interface or bit rate that does not exist.
     """
-    transport = ReconnectingTransport(
+    return ReconnectingTransport(
         SerialMedium(port, baud) if kind == "serial" else _can_medium(kind, interface, channel, bitrate)
     )
+
+
+def open_transport(kind: Literal["can", "serial"], **settings: Any) -> ReconnectingTransport:
+    """Make a link as `make_transport` does, and open it; a device that is absent is waited for, not an error."""
+    transport = make_transport(kind, **settings)
     transport.open()
     return transport
 

@@ -1,0 +1,67 @@
+"""What `check` concludes from what a robot says; the verb as a whole is tested in tests/hil."""
+
+import time
+from dataclasses import replace
+
+import pytest
+
+from disco_hw import check
+from disco_hw.daemon.preflight import Level
+from drivers.transport import connect_pair
+from drivers.types import Frame, OutgoingFrame
+from tests.drivers.reference_robot import CONFIG, ReferenceRobot
+
+KEY = bytes(range(16))
+MS_NS = 1_000_000
+
+
+class RobotInTime:
+    """The real core on the other end of a link, which lives as fast as it is asked."""
+
+    def __init__(self, key):
+        self.link, self._far = connect_pair()
+        self.link.open()
+        self._far.open()
+        self._robot = ReferenceRobot(replace(CONFIG, key=key))
+        self._now_ns = time.monotonic_ns()
+        self.stats, self.send = self.link.stats, self.link.send
+        self.disturb = None
+
+    def receive(self):
+        while self._now_ns < time.monotonic_ns():
+            for received in self._far.receive():
+                self._robot.receive(self._now_ns, received.frame)
+            if self.disturb is not None:
+                self._robot.receive(self._now_ns, self.disturb)
+            self._robot.step(self._now_ns)
+            for frame in self._robot.drain():
+                self._far.send(OutgoingFrame(frame, self._now_ns), self._now_ns)
+            self._now_ns += MS_NS
+        return self.link.receive()
+
+
+@pytest.fixture(autouse=True)
+def brief(monkeypatch):
+    monkeypatch.setattr(check, "_LISTEN_S", 1.2)
+    monkeypatch.setattr(check, "_SETTLED_S", 0.6)
+
+
+@pytest.mark.parametrize("key", [b"", KEY])
+def test_a_robot_that_takes_what_it_is_sent(key):
+    found = check._ask_robot(RobotInTime(key), key or None)
+    assert check._hearing_check(found).level is Level.OK
+
+
+def test_a_key_that_is_not_the_robots_fails():
+    found = check._ask_robot(RobotInTime(KEY), KEY[::-1])
+    heard = check._hearing_check(found)
+    assert heard.level is Level.FAIL
+    assert "link.key_file" in heard.text
+
+
+def test_what_else_the_robot_rejects_is_a_warning():
+    robot = RobotInTime(b"")
+    robot.disturb = Frame(0x101, bytes(8))
+    heard = check._hearing_check(check._ask_robot(robot, None))
+    assert heard.level is Level.WARNING
+    assert "checksum" in heard.text
