@@ -20,8 +20,20 @@ from disco_hw.daemon.task_change import record_of
 from disco_hw.log import records
 from disco_hw.log.recorder import Recorder
 from disco_hw.pipeline import FollowTask, Motion, Off, Pipeline, Stand, Tick, untimed
-from drivers.types import Driver, DriverState, LinkState, Readings, RobotStatus, Transport, WheelCommand, WheelSample
+from drivers.types import (
+    Capabilities,
+    Driver,
+    DriverState,
+    LinkState,
+    Readings,
+    RobotStatus,
+    Transport,
+    WheelCommand,
+    WheelSample,
+)
 
+STATUS_HOLDS_NS = 500_000_000
+"""What the robot said of its state is not known any more after so long: five of its reports have failed to come."""
 _FOLLOW_TASK = FollowTask()
 
 
@@ -72,7 +84,7 @@ class DaemonCore:
         self._supervisor = supervisor
         self._preflight = preflight
         self._preflight_errors: tuple[str, ...] = ()
-        self._preflight_done = False
+        self._judged: Capabilities | None = None
         self._generation = 0
         self._link_up = False
         self._planner_failing = self._planner_collapsed = False
@@ -102,7 +114,7 @@ class DaemonCore:
         self._follow_link(now_ns)
         frames = self.transport.receive()
         readings = self.driver.receive(now_ns, frames)
-        self._remember(readings)
+        self._remember(now_ns, readings)
         output = self._supervisor.step(now_ns, self._inputs(now_ns, requests))
         mark("receive")
         learnt = self.adaptation.step(now_ns)
@@ -138,21 +150,25 @@ class DaemonCore:
         renewed = self.transport.generation != self._generation
         if self._link_up and (not up or renewed):
             self.driver.link_down(now_ns)
-            self._preflight_done, self._preflight_errors = False, ()
             self._link_up = False
         if up and not self._link_up:
             self._generation = self.transport.generation
             self.driver.link_up(now_ns)
             self._link_up = True
 
-    def _remember(self, readings: Readings) -> None:
+    def _remember(self, now_ns: int, readings: Readings) -> None:
         if readings.wheels:
             self.newest_wheels = readings.wheels[-1]
         if readings.status:
             self.robot_status = readings.status[-1]
-        if not self._preflight_done and self.driver.capabilities is not None:
-            self._preflight_errors = self._preflight(self.driver)
-            self._preflight_done = True
+        elif self.robot_status is not None and now_ns - self.robot_status.t_ns > STATUS_HOLDS_NS:
+            # Whoever asks whether the robot is in e-stop must not hear of one that has fallen silent since.
+            self.robot_status = None
+        # A controller can be exchanged or written anew while the link, to an adapter that stays, is up.
+        capabilities = self.driver.capabilities
+        if capabilities != self._judged:
+            self._judged = capabilities
+            self._preflight_errors = () if capabilities is None else self._preflight(self.driver)
 
     def _inputs(self, now_ns: int, requests: Sequence[UserRequest]) -> Inputs:
         wheels = self.newest_wheels

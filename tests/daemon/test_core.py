@@ -16,9 +16,14 @@ from disco_hw.daemon.states import State
 from disco_hw.daemon.supervisor import UserRequest
 from disco_hw.log import records
 from disco_hw.metrics import Path, circle_figures
-from disco_hw.pipeline import Source
+from disco_hw.pipeline import NoPlanner, Source
 from disco_hw.robot_setup import load_setup
-from tests.daemon.simulated import simulated_stack
+from firmware_protocol.firmware_core import FirmwareConfig
+from sim.effects import hidden_effects
+from sim.plant import Plant
+from sim.plant_parameters import PlantParameters
+from sim.virtual_robot import VirtualRobot
+from tests.daemon.simulated import START, simulated_stack
 
 ROBOT = FilePath(disco_hw.__file__).parent / "robots" / "wombot.toml"
 
@@ -95,6 +100,51 @@ def test_a_lost_link_voids_the_session_and_nothing_rearms():
     stack.run(0.5, UserRequest.ARM)
     assert stack.core.last.output.state is State.ARMED
     assert stack.robot.outputs.session != session
+
+
+def exchanged(stack, **firmware):
+    """Put another controller, that starts now, in the robot's place; the link stays up."""
+    since_us, plant = stack.now_us, Plant(PlantParameters(), hidden_effects({}), 1, START)
+    robot = VirtualRobot(plant, FirmwareConfig(**{"ticks_per_rev": 2048, "max_wheel_speed_rad_s": 8.0, **firmware}))
+
+    class Robot:
+        def receive(self, now_us, frame):
+            robot.receive(now_us - since_us, frame)
+
+        def step(self, now_us):
+            return robot.step(now_us - since_us)
+
+    stack.robot = Robot()
+
+
+@pytest.mark.parametrize("limits", [{"max_wheel_speed_rad_s": 4.0}, {"ticks_per_rev": 1024}])
+def test_a_controller_exchanged_on_a_living_link_is_judged_anew(limits):
+    stack = simulated_stack(NoPlanner(), needs_pose=False)
+    assert stack.run(1.5)[-1].output.state is State.READY
+    exchanged(stack, **limits)
+    last = stack.run(3.0)[-1].output
+    assert last.state is State.FAULT, last.detail
+    assert next(iter(limits)) in last.detail
+    assert not any(reply.accepted for tick in stack.run(0.1, UserRequest.ARM) for reply in tick.replies)
+    # The one that fits is taken again, once a person has reset.
+    exchanged(stack)
+    stack.run(3.0)
+    stack.run(0.1, UserRequest.RESET)
+    assert stack.run(3.0)[-1].output.state is State.READY
+
+
+@pytest.mark.parametrize("lost", ["link", "robot"])
+def test_what_a_robot_said_that_is_not_heard_any_more_is_not_its_state(lost):
+    stack = simulated_stack(NoPlanner(), needs_pose=False)
+    stack.run(1.5)
+    stack.run(0.5, UserRequest.ESTOP)
+    assert stack.core.robot_status.state == "ESTOP"
+    if lost == "link":
+        stack.robot_end.plug(False)
+    else:
+        stack.robot.step = lambda _now_us: ()
+    stack.run(1.0)
+    assert stack.core.robot_status is None
 
 
 class Moody:
