@@ -74,10 +74,17 @@ class EstopOutcome:
 def stop_robot(robot: Path, link: str | None = None) -> EstopOutcome:
     """Send the e-stop on the link and through the daemon, and wait half a second for the robot to confirm.
 
-    `link` overrides robot.toml's kind. Raises InputError only when the file does not even say where the link is.
+    `link` overrides robot.toml's kind. Raises InputError only when the file does not even say where the link is and no
+    daemon takes the stop either.
     """
     raw = _read(robot)
-    settings = _link_settings(robot, raw, link)
+    try:
+        settings = _link_settings(robot, raw, link)
+    except InputError as error:
+        confirmed, daemon_error = _ask_daemon(_socket_path(raw))
+        if daemon_error is not None:
+            raise
+        return EstopOutcome("link", str(error), None, confirmed)
     frame_id, data = Codec().encode("ESTOP", reason=1)
     frame = Frame(frame_id, data)
     way = _stop_over_serial if settings.kind == "serial" else _stop_over_can
@@ -105,7 +112,8 @@ def _link_settings(robot: Path, raw: dict[str, Any], kind: str | None) -> Link:
     if kind is not None:
         section = {**section, "kind": kind}
     try:
-        return msgspec.convert(section, Link)
+        # A field that is none, misspelt or of another version, must not keep the stop from the robot.
+        return msgspec.convert({name: section[name] for name in section if name in Link.__struct_fields__}, Link)
     except msgspec.ValidationError as error:
         raise InputError(f"{robot}: [link]: {error}; use the robot's own e-stop button, now") from None
 
@@ -172,17 +180,22 @@ def _says_estop(codec: Codec, can_id: int, data: bytes) -> bool:
 
 
 def _ask_daemon(socket_path: Path | None) -> tuple[bool, str | None]:
-    if socket_path is None or not socket_path.exists():
-        return False, "not running"
     try:
+        if socket_path is None or not socket_path.exists():
+            return False, "not running"
         reply = send_request(socket_path, {"do": "estop"}, timeout_s=0.5)
         if not reply.get("ok"):
             return False, str(reply.get("error"))
+        link = None
         deadline_ns = time.monotonic_ns() + round(_CONFIRM_S * 1e9)
         while time.monotonic_ns() < deadline_ns:
-            if send_request(socket_path, {"do": "status"}, timeout_s=0.5).get("robot_state") == "ESTOP":
+            status = send_request(socket_path, {"do": "status"}, timeout_s=0.5)
+            if status.get("robot_state") == "ESTOP":
                 return True, None
+            link = status.get("link")
             time.sleep(0.02)
+        if link not in {None, LinkState.UP.value}:
+            return False, f"holds the e-stop until its link is up; it is {link}"
     except Exception as error:  # a hung or dying daemon must not look like a failure of the link
         return False, str(error) or type(error).__name__
     return False, None
