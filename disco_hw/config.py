@@ -187,7 +187,8 @@ def load_robot_config(path: Path) -> RobotConfig:
         raw = tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read ({error.strerror}); give the path of a robot.toml") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:
+        # Not all that tomllib raises is its own error: numbers of thousands of digits, brackets nested as deep.
         raise ConfigError(f"{path}: not valid TOML ({error}); mend that line") from None
     try:
         config = msgspec.convert(_with_kind_of_task(path, raw), RobotConfig)
@@ -242,6 +243,8 @@ def _check(path: Path, config: RobotConfig) -> None:
             value = getattr(section, field)
             if isinstance(value, float) and not math.isfinite(value):
                 refuse(f"{section_name}.{field}", "not a finite number", "write a finite value")
+            if isinstance(value, str) and "\0" in value:
+                refuse(f"{section_name}.{field}", "holds a NUL character, which no name has", "take it out")
     for field in config.prior.__struct_fields__:
         low, high = getattr(config.prior, field)
         if not (math.isfinite(low) and math.isfinite(high) and low < high):

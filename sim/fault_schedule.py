@@ -173,7 +173,7 @@ def parse_schedule(text: str, name: str = "schedule") -> FaultSchedule:
     """Parse the text of a schedule, see `load_schedule`; `name` stands for the file in messages."""
     try:
         table = tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:
         raise FaultFileError(f"{name}: not TOML ({' '.join(str(error).split())}); correct that place") from None
     unknown = set(table) - {"seed", "fault"}
     if unknown:

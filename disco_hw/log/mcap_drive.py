@@ -67,7 +67,7 @@ def ticks_per_rev(log: Log) -> int | None:
         return None
     try:
         value = tomllib.loads(log.attachment(ROBOT_TOML).decode("utf-8"))["robot"]["ticks_per_rev"]
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, KeyError, TypeError):
+    except (ValueError, RecursionError, KeyError, TypeError):
         return None
     return value if isinstance(value, int) and value > 0 else None
 

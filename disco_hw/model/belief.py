@@ -42,6 +42,8 @@ def _checked_covariance(covariance: Array, size: int, what: str) -> Array:
         np.linalg.cholesky(matrix)
     except np.linalg.LinAlgError:
         raise ValueError(f"{what} is not positive definite") from None
+    # Numbers that were rounded on their way are symmetric to the last bit from here on, as the estimator wants them.
+    matrix = 0.5 * (matrix + matrix.T)
     matrix.setflags(write=False)
     return matrix
 

@@ -63,7 +63,8 @@ def load_model(path: Path) -> Model:
         raw = tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); give the path of a model file") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:
+        # Not all that tomllib raises is its own error: numbers of thousands of digits, brackets nested as deep.
         raise InputError(f"{path}: not valid TOML ({error}); mend that line") from None
     try:
         content = msgspec.convert(raw, _File)
@@ -100,7 +101,7 @@ def _effect(index: int, entry: dict[str, Any]) -> EffectSetting:
     if not isinstance(name, str):
         raise ValueError(f"effects[{index}].name: missing; write the name of an effect")
     for key, value in values.items():
-        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < math.inf:
             raise ValueError(f"effects[{index}] {name}.{key}: not a finite number; write a finite value")
     return EffectSetting(name, values)
 

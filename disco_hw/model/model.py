@@ -66,7 +66,8 @@ class Model:
     `base` and `effects` hold the point values; `belief` is a joint distribution over any of `parameter_names`, and
     parameters it does not name are known exactly. `missing_effects` names effects of the robot that the model is known
     to lack, so that its parameters may have absorbed them. Raises ValueError for repeated effects, values outside their
-    physical range, a belief over parameters that the model does not have, or a missing effect that is unknown or there.
+    physical range, a belief over parameters that the model does not have or with a mean outside theirs, or a missing
+    effect that is unknown or there.
     """
 
     wheel_radius_m: float
@@ -98,6 +99,8 @@ class Model:
                     )
                 if self.belief.names.count(believed) > 1:
                     raise ValueError(f"belief names {believed!r} twice; keep one")
+            for believed, mean in zip(self.belief.names, self.belief.mean().tolist(), strict=True):
+                _check_range(f"belief: mean of {believed}", self.parameters[believed], mean)
 
     @classmethod
     def nominal(cls, robot: config.Robot, prior: config.Prior | None = None) -> Model:

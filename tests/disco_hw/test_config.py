@@ -51,6 +51,8 @@ def test_shipped_robot_file_is_valid():
         (("ticks_per_rev = 2048", "ticks_per_rev = true"), ["robot.ticks_per_rev", "bool", "float"]),
         (("[robot]", "[robott]"), ["robott", "no such field"]),
         (("[robot]", "[robot"), ["not valid TOML", "line"]),
+        (("ticks_per_rev = 2048", "ticks_per_rev = " + "1" * 5000), ["not valid TOML", "5000 digits"]),
+        (("ticks_per_rev = 2048", "ticks_per_rev = " + "[" * 3000 + "]" * 3000), ["not valid TOML", "recursion"]),
         (("max_wheel_speed_rad_s = 8.0", "max_wheel_speed_rad_s = 2.0"), ["task.speed_m_s", "wheels"]),
     ],
 )
@@ -75,6 +77,7 @@ def test_a_mistake_gets_one_line_with_file_and_field(tmp_path, change, words):
         ('[link]\nkind = "wifi"\n', "link.kind"),
         ('[task]\nkind = "square"\n', "task"),
         ("[estimation]\npose_timeout_s = inf\n", "estimation.pose_timeout_s"),
+        ('[model]\nfile = "a\\u0000b.toml"\n', "model.file: holds a NUL"),
     ],
 )
 def test_ranges_and_relations_are_checked(tmp_path, extra, field):

@@ -96,6 +96,8 @@ def test_a_log_in_which_nothing_was_driven_is_refused(tmp_path):
         (b"[robot]\nticks_per_rev = -1\n", None),
         (b'[robot]\nticks_per_rev = "x"\n', None),
         (b"\xff\xfe[", None),
+        (b"[robot]\nticks_per_rev = " + b"1" * 5000, None),
+        (b"robot = " + b"[" * 3000, None),
     ],
 )
 def test_the_ticks_of_a_revolution_come_from_the_configuration_in_the_log(tmp_path, content, expected):

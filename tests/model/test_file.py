@@ -84,6 +84,11 @@ GOOD = model_text(
         ('"x_icr_m"]', '"wheel_radius_m"]', "belief names 'wheel_radius_m' twice"),
         ("mean = [0.06, 0.1]", "mean = [0.06, nan]", "belief: mean holds a value that is not finite; correct it"),
         ("mean = [0.06, 0.1]", "mean = [0.06]", "belief: mean has 1 entries, not 2"),
+        ("mean = [0.06, 0.1]", "mean = [60.0, 0.1]", r"belief: mean of wheel_radius_m: 60.0 is outside .* m; write"),
+        ("mean = [0.06, 0.1]", "mean = [-0.06, 0.1]", "belief: mean of wheel_radius_m: -0.06 is outside"),
+        ("tau_s = 0.1", "tau_s = " + "1" * 400, "motor_lag.tau_s: 1+ is outside"),
+        ("tau_s = 0.1", "tau_s = " + "1" * 5000, "not valid TOML .*5000 digits"),
+        ("tau_s = 0.1", "tau_s = " + "[" * 3000 + "]" * 3000, "not valid TOML .*recursion"),
         ("[0.0001, 0.0]", "[0.0001, 0.1]", "belief: covariance is not symmetric"),
         ("[0.0, 0.0001]", "[0.0, -0.0001]", "belief: covariance is not positive definite"),
         ("[0.0, 0.0001]", "[0.0]", "belief: covariance has rows of different lengths"),
@@ -102,6 +107,12 @@ def test_an_effect_listed_twice_is_refused(tmp_path):
     twice = '\n[[effects]]\nname = "motor_lag"\ntau_s = 0.2\n'
     with pytest.raises(InputError, match="effect 'motor_lag' is listed twice; keep one"):
         read(tmp_path, GOOD.replace("[belief]", f"{twice}\n[belief]"))
+
+
+def test_a_covariance_that_was_rounded_on_its_way_is_symmetric_to_the_last_bit(tmp_path):
+    rounded = GOOD.replace("[0.0001, 0.0]", "[0.0001, 1e-15]")
+    covariance = read(tmp_path, rounded).belief.covariance()
+    assert covariance[0, 1] == covariance[1, 0] == 0.5e-15
 
 
 def test_mixture_lists_must_agree(tmp_path):

@@ -59,6 +59,7 @@ def test_all_kinds_are_drawn_in_time():
     ("text", "words"),
     [
         ("fault = [", ["not TOML"]),
+        ("seed = " + "1" * 5000, ["not TOML", "5000 digits"]),
         ("faults = 1", ["faults", "unknown"]),
         ("seed = -1", ["seed", "-1"]),
         ("seed = true", ["seed", "True"]),
