@@ -7,7 +7,6 @@ DISCO three times: with the model as given, with its geometry refitted and nothi
 from __future__ import annotations
 
 import csv
-import json
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
@@ -25,12 +24,13 @@ from disco_hw.drive.hand_pilot import HandPilot
 from disco_hw.drive.scripted import ScriptSource, Unattended
 from disco_hw.drive.scripts import make_script
 from disco_hw.errors import InputError, WorkError
-from disco_hw.gap.commands import gap
+from disco_hw.gap.commands import WRITTEN, gap
 from disco_hw.gap.report import REPORTED_HORIZON_S, STAGES, GapReport
 from disco_hw.metrics import Path as Track
 from disco_hw.metrics import circle_figures
 from disco_hw.model import EffectSetting, Gaussian, Model
 from disco_hw.model.parameter import BASE_PARAMETERS
+from disco_hw.outputs import as_json, refuse_directory
 from disco_hw.pipeline import NoPlanner
 from disco_hw.robot_setup import Setup, load_setup
 from disco_hw.simulated_time import SimulatedRun
@@ -148,6 +148,8 @@ def run_gap_experiment(options: GapExperimentOptions, progress: Progress = lambd
         hidden = dict(parse_hidden_effects(options.hide).items)
     except HiddenEffectError as error:
         raise InputError(f"--hide: {error}") from None
+    inputs = [options.robot, *([setup.model_file] if setup.model_file is not None else [])]
+    refuse_directory(options.out, WRITTEN, inputs)
     options.out.mkdir(parents=True, exist_ok=True)
     log = options.out / "drive.mcap"
     log.unlink(missing_ok=True)
@@ -164,7 +166,7 @@ def run_gap_experiment(options: GapExperimentOptions, progress: Progress = lambd
         tracks[run] = _circle(setup, options, hidden, model)
         laps[run] = _lap(tracks[run], task)
     result = GapExperimentResult(hidden, found, laps, tracks, task)
-    (options.out / "experiment.json").write_text(json.dumps(result.as_dict(), indent=1), encoding="utf-8")
+    (options.out / "experiment.json").write_text(as_json(result.as_dict(), indent=1), encoding="utf-8")
     with (options.out / "experiment.csv").open("w", newline="", encoding="utf-8") as file:
         rows = csv.writer(file)
         rows.writerow(("model", *Lap.__dataclass_fields__))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +14,9 @@ from disco_hw.gap.html import page
 from disco_hw.gap.report import GapReport
 from disco_hw.log.load import load_drive
 from disco_hw.model import Model, load_model, save_model
+from disco_hw.outputs import as_json, refuse_directory
+
+WRITTEN = ("report.json", "report.html", "model.toml")
 
 
 @dataclass(frozen=True)
@@ -42,15 +44,17 @@ def gap(
 ) -> GapResult:
     """Find what a model misses in logs and write everything to the directory `out`.
 
-    Raises InputError for files that cannot be used, WorkError if `out` cannot be written.
+    Raises InputError for files that cannot be used and for an `out` that cannot be written, or where an input would be
+    written over; WorkError if it cannot be written after all.
     """
+    refuse_directory(out, WRITTEN, [*logs, robot, *([model] if model is not None else [])])
     config = load_robot_config(robot)
     start = load_model(model) if model is not None else Model.nominal(config.robot)
     drive = load_drive(list(logs), config.robot.ticks_per_rev, config.robot.wheel_radius_m)
     report = find_gap(drive, start, progress, pictures=True, top_rad_s=config.robot.max_wheel_speed_rad_s)
     try:
         out.mkdir(parents=True, exist_ok=True)
-        (out / "report.json").write_text(json.dumps(report.as_dict(), indent=1), encoding="utf-8")
+        (out / "report.json").write_text(as_json(report.as_dict(), indent=1), encoding="utf-8")
         (out / "report.html").write_text(page(report), encoding="utf-8")
         save_model(report.model, out / "model.toml")
         for name, picture in report.pictures.items():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import math
 from collections.abc import Iterable, Sequence
 from html import escape
 
@@ -105,14 +106,20 @@ def _gap(report: GapReport) -> str:
         rows += [
             (f"{horizon:g} s", "position, mm", *(_with_interval(e.position_m, e.position_ci, 1e3) for e in errors)),
             ("", "heading, mrad", *(_with_interval(e.yaw_rad, e.yaw_ci, 1e3) for e in errors)),
-            ("", "wheel speed, rad/s", *(f"{e.wheel_rad_s:.3f}" for e in errors)),
+            ("", "wheel speed, rad/s", *(_or_dash(e.wheel_rad_s) for e in errors)),
         ]
     return _table(("ahead", "error (root mean square)", *STAGES), rows)
 
 
 def _with_interval(value: float, interval: tuple[float, float], factor: float) -> str:
     low, high = interval
+    if not math.isfinite(value):
+        return "-"
     return f"{factor * value:.1f} [{factor * low:.1f}, {factor * high:.1f}]"
+
+
+def _or_dash(speed_rad_s: float) -> str:
+    return f"{speed_rad_s:.3f}" if math.isfinite(speed_rad_s) else "-"
 
 
 def _by_regime(report: GapReport) -> str:
@@ -123,7 +130,8 @@ def _by_regime(report: GapReport) -> str:
 
 def _candidates(report: GapReport) -> str:
     rows = [(c.channel, c.name, f"{c.gain:.1f}", f"{c.score:.1f}", c.verdict) for c in report.candidates]
-    return _table(("channel", "effect", "gain, nats", "score (20 accepts)", "verdict"), rows)
+    score = "score (4 accepts, up to 6 where the noise has heavy tails)"
+    return _table(("channel", "effect", "gain, nats", score, "verdict"), rows)
 
 
 def _blind(report: GapReport) -> str:

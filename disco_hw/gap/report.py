@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -162,7 +163,11 @@ class GapReport:
         else:
             first = "Nothing is missing that this log could show."
         lines = [first[0].upper() + first[1:]]
-        if self.gap:
+        if self.gap and not self._told:
+            lines.append(
+                f"No stretch of the logs is long enough to see how far {REPORTED_HORIZON_S:g} s predictions are off."
+            )
+        elif self.gap:
             mm = {stage: 1e3 * self.gap[stage][REPORTED_HORIZON_S].position_m for stage in STAGES}
             added = "adding it takes" if len(self.effects) + len(self.unnamed) == 1 else "the amended model takes"
             worse = " Do not drive with it: it predicts worse than without." if self.amended_is_worse else ""
@@ -176,6 +181,11 @@ class GapReport:
             drive = f": `{self.drive}` would" if self.drive else ""
             lines.append(f"This log could not have shown {', '.join(blind)} of realistic size{drive}.")
         return lines
+
+    @property
+    def _told(self) -> bool:
+        """Whether the log has stretches as long as the horizon that is told."""
+        return math.isfinite(self.gap["refitted"][REPORTED_HORIZON_S].position_m)
 
     @property
     def amended_is_worse(self) -> bool:
@@ -204,12 +214,15 @@ class GapReport:
         if self.gap:
             lines += ["", f"{'ahead':>6} " + " ".join(f"{stage:>20}" for stage in STAGES)]
             for horizon in self.gap["nominal"]:
-                cells = (
-                    f"{1e3 * self.gap[stage][horizon].position_m:9.1f} mm {self.gap[stage][horizon].yaw_rad:6.3f} rad"
-                    for stage in STAGES
-                )
+                cells = (_in_cell(self.gap[stage][horizon]) for stage in STAGES)
                 lines.append(f"{horizon:4g} s  " + " ".join(f"{cell:>20}" for cell in cells))
         return "\n".join(lines)
+
+
+def _in_cell(errors: Errors) -> str:
+    if not math.isfinite(errors.position_m):
+        return "-"
+    return f"{1e3 * errors.position_m:9.1f} mm {errors.yaw_rad:6.3f} rad"
 
 
 def _alike(finding: EffectFinding | UnnamedFinding) -> str:

@@ -26,6 +26,7 @@ from disco_hw.log.drive import DriveLog
 from disco_hw.log.load import load_drive
 from disco_hw.model import Model
 from disco_hw.model.file import model_text
+from disco_hw.outputs import refuse_file
 
 Search = Callable[[DriveLog, Model], AbstractContextManager[Callable[[], GapCheck]]]
 
@@ -152,10 +153,15 @@ def infer_command(
     """Infer the geometry from logs; write the model to `out` and, if asked for, a page with pictures to `report`.
 
     `dask` is the address of a cluster to work on. `search` looks for effects that the nominal model lacks, while the
-    inference runs; the model is marked with what it finds. Raises InputError for what the user can mend and WorkError
-    for files that cannot be written and a cluster that is lost.
+    inference runs; the model is marked with what it finds. Raises InputError for what the user can mend, such
+    as a file that cannot be written or that is read here, before the work; WorkError for a cluster that is lost, and
+    for files that cannot be written after all.
     """
     began = perf_counter()
+    if out is not None:
+        refuse_file(out, [*logs, robot])
+    if report is not None:
+        refuse_file(report, [*logs, robot, *([out] if out is not None else [])])
     config = load_robot_config(robot)
     drive = load_drive(list(logs), config.robot.ticks_per_rev, config.robot.wheel_radius_m)
     nominal = Model.nominal(config.robot)

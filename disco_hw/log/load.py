@@ -19,12 +19,22 @@ def load_drive(
     """One log or several as one drive: our MCAP logs and CSV files, told apart by their content.
 
     `ticks_per_rev` and the nominal `wheel_radius_m` come from robot.toml and serve CSV files only. Raises LogError with
-    one line for the first file that cannot be used.
+    one line for the first file that cannot be used, or that is there already.
     """
     several = [paths] if isinstance(paths, Path) else list(paths)
     if not several:
         raise LogError("no log given; give at least one")
+    for place, path in enumerate(several):
+        if any(_same(path, other) for other in several[:place]):
+            raise LogError(f"{path}: given twice, and what it says would count twice; give each log once")
     return concatenate([_load(path, ticks_per_rev, wheel_radius_m) for path in several])
+
+
+def _same(path: Path, other: Path) -> bool:
+    try:
+        return path.samefile(other)
+    except OSError:
+        return False
 
 
 def _load(path: Path, ticks_per_rev: float | None, wheel_radius_m: float | None) -> DriveLog:

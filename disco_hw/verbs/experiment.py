@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from disco_hw.errors import InputError
+from disco_hw.outputs import refuse_directory
 from disco_hw.verbs.options import AsJson, print_result, progress_line
 
 experiment_app = typer.Typer(help="The paper's experiments, as table, CSV and PNG.", no_args_is_help=True)
@@ -24,6 +25,7 @@ def pendulum(
     """Swing a pendulum up: true parameters; unscented transform and draws, each with prior and posterior."""
     from disco_hw.control.experiments.pendulum import PendulumOptions, run_pendulum
 
+    refuse_directory(out)
     result = run_pendulum(PendulumOptions(seeds=seeds), progress_line)
     out.mkdir(parents=True, exist_ok=True)
     result.write_csv(out / "pendulum.csv")
@@ -54,15 +56,17 @@ def circle(
 
     if mode not in {"default", "paper"}:
         raise InputError(f"--mode {mode}: no such mode; write default or paper")
+    for option, value in (("duration-s", duration_s), ("lag-s", lag_s), ("wheel-noise", wheel_noise)):
+        if not math.isfinite(value):
+            raise InputError(f"--{option} {value}: not a finite number; write one")
+    refuse_directory(out)
     setup = load_setup(robot or Path(disco_hw.__file__).parent / "robots" / "wombot.toml")
     options = CircleOptions(seeds, duration_s, rate_hz, largest_rot_s, largest_rot_s2, lag_s, wheel_noise)
     result = run_circle(setup.model, mode, options, progress_line)
     out.mkdir(parents=True, exist_ok=True)
     result.write_csv(out / "circle.csv")
     result.write_png(out / "circle.png")
-    # JSON knows no infinity: a limit that is none is null.
-    told = {key: value if math.isfinite(value) else None for key, value in asdict(options).items()}
-    print_result({"curves": result.rows(), "mode": mode, "options": told}, as_json, result.table())
+    print_result({"curves": result.rows(), "mode": mode, "options": asdict(options)}, as_json, result.table())
 
 
 @experiment_app.command()
@@ -82,6 +86,7 @@ def adapt(
     from disco_hw.adapt.experiment import AdaptOptions, run_adapt
     from disco_hw.robot_setup import load_setup
 
+    refuse_directory(out)
     setup = load_setup(robot or Path(disco_hw.__file__).parent / "robots" / "wombot.toml")
     result = run_adapt(setup, AdaptOptions(change=change, seeds=seeds), progress_line)
     out.mkdir(parents=True, exist_ok=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -12,6 +11,8 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
+
+from disco_hw import outputs
 
 RobotFile = Annotated[Path, typer.Argument(metavar="ROBOT.toml", help="The robot's configuration (docs/robot.md).")]
 RobotOption = Annotated[Path, typer.Option("--robot", help="The robot's configuration (docs/robot.md).")]
@@ -49,4 +50,4 @@ def progress_bar() -> Iterator[Callable[[str, float], None]]:
 
 def print_result(result: dict[str, Any], as_json: bool, text: str) -> None:
     """Print the result once: as one JSON object, or as text."""
-    print(json.dumps(result) if as_json else text)
+    print(outputs.as_json(result) if as_json else text)

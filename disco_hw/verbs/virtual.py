@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from disco_hw import outputs
 from disco_hw.verbs.options import (
     AsJson,
     LinkOption,
@@ -46,7 +46,7 @@ def demo(
         )
     )
     if as_json:
-        print(json.dumps(result.as_dict()))
+        print(outputs.as_json(result.as_dict()))
     if not result.success:
         raise typer.Exit(1)
 

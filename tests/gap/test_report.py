@@ -1,12 +1,18 @@
 """The report's sentences, where they decide what a person does next."""
 
+import json
+import math
 from dataclasses import replace
+
+import pytest
 
 from disco_hw.gap.blind_spots import BlindSpot
 from disco_hw.gap.held_out import Errors
 from disco_hw.gap.html import page
 from disco_hw.gap.report import STAGES, GapReport, UnnamedFinding
+from disco_hw.gap.search import _HEAVIEST, _NAMED_SCORE
 from disco_hw.model import Model
+from disco_hw.outputs import as_json
 
 
 def errors(position_m, yaw_rad=0.02):
@@ -55,3 +61,21 @@ def test_the_page_says_what_is_in_the_model():
     assert "in the amended model" in page(inside)
     assert "no model&#x27;s state holds" in page(outside)
     assert not outside.as_dict()["unnamed"][0]["in_model"]
+
+
+def test_a_log_of_short_stretches_says_that_it_does_not_tell_the_gap():
+    nan = Errors(math.nan, (math.nan, math.nan), math.nan, (math.nan, math.nan), math.nan, {})
+    some = report(0.014)
+    short = replace(some, gap={s: {h: e if h < 2.0 else nan for h, e in of.items()} for s, of in some.gap.items()})
+    assert short.answer()[1] == "No stretch of the logs is long enough to see how far 2 s predictions are off."
+    told = json.loads(as_json(short.as_dict()), parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
+    assert told["gap"]["amended"]["position_rmse_m"] is None
+    assert told["gap"]["amended"]["position_ci95_m"] == [None, None]
+    assert told["gap"]["horizons"][0]["amended"]["position_rmse_m"] == 0.014
+    assert "nan" not in short.as_text()
+    assert "nan" not in page(short).replace("dominant", "")
+
+
+def test_the_page_names_the_score_that_a_name_takes():
+    accepts = f"score ({_NAMED_SCORE:g} accepts, up to {_HEAVIEST * _NAMED_SCORE:g} where"
+    assert accepts in page(report(0.014))

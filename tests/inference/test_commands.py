@@ -201,6 +201,25 @@ def test_a_bad_log_gets_one_line_and_no_model(robot, tmp_path, text, message):
 
 def test_a_model_that_cannot_be_written_is_an_error_of_the_work(known, robot, tmp_path):
     log = write_log(tmp_path / "log.csv", "poor")
-    (tmp_path / "file").write_text("")
+
+    def in_the_way(*given):
+        (tmp_path / "file").write_text("")
+        return finds()(*given)
+
     with pytest.raises(WorkError, match="cannot be written"):
-        infer_command([log], robot, tmp_path / "file" / "model.toml", options=FEW, search=finds())
+        infer_command([log], robot, tmp_path / "file" / "model.toml", options=FEW, search=in_the_way)
+
+
+def test_nothing_that_is_read_is_written_over(robot, tmp_path):
+    log = write_log(tmp_path / "circle.csv")
+    before = log.read_bytes(), robot.read_bytes()
+    for out, report in ((log, None), (robot, None), (None, log), (tmp_path / "new", tmp_path / "new")):
+        with pytest.raises(InputError, match="would be written over, and is read here; give another path"):
+            infer_command([log], robot, out, report, FEW, search=finds())
+    assert (log.read_bytes(), robot.read_bytes()) == before
+
+
+def test_a_file_that_cannot_be_written_is_told_before_the_work(robot, tmp_path):
+    log = write_log(tmp_path / "circle.csv")
+    with pytest.raises(InputError, match=r"circle\.csv is no directory; give another path"):
+        infer_command([log], robot, log / "model.toml", options=FEW, search=finds())

@@ -50,3 +50,11 @@ def test_bad_ones_are_refused(tmp_path, mcap):
     (tmp_path / "x").write_text("a,b\n1,2\n", encoding="utf-8")
     with pytest.raises(LogError, match="no column"):
         load_drive(tmp_path / "x")
+
+
+def test_a_log_given_twice_is_refused_by_whatever_name(tmp_path, mcap, table):
+    link = tmp_path / "link"
+    link.symlink_to(mcap)
+    for again in (mcap, link, tmp_path / "." / mcap.name):
+        with pytest.raises(LogError, match="given twice, and what it says would count twice; give each log once"):
+            load_drive([mcap, table, again])

@@ -85,14 +85,14 @@ class CircleResult:
         found: list[dict[str, float | str]] = []
         for name, runs in self.runs.items():
             costs = self.costs(name)
-            changes = [np.abs(run.commands_rad_s[apart:] - run.commands_rad_s[:-apart]).mean() for run in runs]
+            changes = [np.abs(run.commands_rad_s[apart:] - run.commands_rad_s[:-apart]) for run in runs]
             found.append(
                 {
                     "controller": name,
                     "mean_cost": float(costs.mean()),
                     "std_over_seeds": float(costs.mean(axis=1).std(ddof=1)) if len(runs) > 1 else math.nan,
                     "steady_cost": float(costs[:, costs.shape[1] // 2 :].mean()),
-                    "command_change_rot_s": float(np.mean(changes)) / ROTATION,
+                    "command_change_rot_s": float(np.mean(changes)) / ROTATION if costs.shape[1] > apart else math.nan,
                 }
             )
         return found
