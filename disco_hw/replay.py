@@ -29,6 +29,8 @@ _COMPARED = (Estimate, Innovation, Plan, Command)
 # Whether a command went out is the driver's part, which is not replayed.
 _NOT_REPLAYED = {(Command, "in_force"), (Command, "valid_for_s")}
 _FLOAT = struct.Struct("<d")
+_SOURCES = frozenset(source.value for source in Source)
+_REPLAYED = "only logs of `disco-hw run` and `drive` can be replayed"
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +87,12 @@ def replay(path: Path, tolerance: float = 0.0) -> ReplayReport:
     Raises LogError for a log that cannot be read and InputError for one that holds no ticks or no robot.toml.
     """
     with open_log(path) as log:
-        setup = setup_of_log(log, "only logs of `disco-hw run` can be replayed")
+        first = next((entry.record for entry in log.records(("/command",))), None)
+        if isinstance(first, Command) and first.source not in _SOURCES:
+            raise InputError(
+                f"{path}: its commands are from {first.source!r}, not from a planner or a hand; {_REPLAYED}"
+            )
+        setup = setup_of_log(log, _REPLAYED)
         pipeline = make_pipeline(setup.config, setup.model, make_planner(setup.config, setup.model))
         ticks = values = 0
         difference: Difference | None = None

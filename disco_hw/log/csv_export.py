@@ -43,6 +43,8 @@ def write_csv(drive: DriveLog, path: Path, ticks_per_rev: int | None) -> int:
     except FileExistsError:
         raise LogError(f"{path}: already exists; give another name") from None
     except OSError as error:
+        # Half a table would pass for a whole one.
+        path.unlink(missing_ok=True)
         raise LogError(f"{path}: cannot be written ({error.strerror}); give another place") from None
     return times.size
 

@@ -1,5 +1,6 @@
 import csv
 import math
+import resource
 
 import numpy as np
 import pytest
@@ -84,3 +85,13 @@ def test_nothing_is_overwritten_and_a_bad_place_is_named(drive, tmp_path):
     with pytest.raises(LogError, match="cannot be written"):
         write_csv(drive, tmp_path / "none" / "x.csv", None)
     assert path.read_text(encoding="utf-8") == "precious"
+
+
+def test_a_full_disk_leaves_no_half_table_behind(drive, tmp_path):
+    resource.prlimit(0, resource.RLIMIT_FSIZE, (2_000, resource.RLIM_INFINITY))
+    try:
+        with pytest.raises(LogError, match="File too large"):
+            write_csv(drive, tmp_path / "run.csv", None)
+    finally:
+        resource.prlimit(0, resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+    assert not (tmp_path / "run.csv").exists()

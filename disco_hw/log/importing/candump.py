@@ -67,7 +67,7 @@ def read_candump(path: Path, robot: Robot) -> DriveLog:
 
 
 def _frames(path: Path) -> Iterator[ReceivedFrame]:
-    first_ns = last_ns = 0
+    first_ns = last_ns = whole = 0
     try:
         with can.CanutilsLogReader(path) as reader:
             for number, message in enumerate(reader, start=1):
@@ -76,12 +76,14 @@ def _frames(path: Path) -> Iterator[ReceivedFrame]:
                 first_ns = first_ns or t_ns
                 if t_ns < last_ns:
                     raise LogError(f"{path}: frame {number}: the clock goes backwards; sort the lines by time")
-                last_ns = t_ns
+                last_ns, whole = t_ns, number
                 if not (message.is_error_frame or message.is_remote_frame or message.is_extended_id):
                     yield ReceivedFrame(t_ns - first_ns, Frame(message.arbitration_id, bytes(message.data)))
     except OSError as error:
         raise LogError(f"{path}: cannot be read ({error.strerror}); give the path of a candump") from None
-    except (ValueError, IndexError) as error:
+    except (ValueError, IndexError, OverflowError) as error:
+        if whole:
+            raise LogError(f"{path}: after {whole} frames a line is none ({error}); take that line out") from None
         raise LogError(f"{path}: not a candump ({error}); record with `candump -l`") from None
 
 

@@ -18,6 +18,9 @@ from drivers.types import PoseSample, WheelSample
 
 SOURCE = "import"
 _LONGEST_COMMAND_S = 0.5
+_LONGEST_S = 9e9
+"""Nanoseconds of more do not fit into the 64 bits that a log has for them."""
+
 _Timed = tuple[int, int, Record]
 
 
@@ -27,6 +30,8 @@ def write_log(drive: DriveLog, path: Path, robot: str, attachments: tuple[Attach
     A change of segment leaves out a tick's number, as lost ticks do. Raises LogError if the file exists or cannot be
     written.
     """
+    if drive.end_s > _LONGEST_S:
+        raise LogError(f"{', '.join(drive.sources)}: its times span {drive.end_s:.3g} s; mend the clock that jumps")
     encode = batch_encoder()
     try:
         file = LogFile(path)
@@ -42,8 +47,12 @@ def write_log(drive: DriveLog, path: Path, robot: str, attachments: tuple[Attach
             log.write(encode(tick + segment, t_ns, [record for _, _, record in together]))
         log.finish()
         file.sync()
-    except OSError as error:
-        raise LogError(f"{path}: cannot be written ({error.strerror}); give another place") from None
+    except BaseException as error:
+        # Half a log would only be in the way of the next try.
+        path.unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            raise LogError(f"{path}: cannot be written ({error.strerror}); give another place") from None
+        raise
     finally:
         file.close()
     return log.records

@@ -1,3 +1,6 @@
+import resource
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -52,3 +55,24 @@ def test_a_log_is_never_overwritten(tmp_path):
 def test_a_place_that_is_none_is_refused(tmp_path):
     with pytest.raises(LogError, match="cannot be created"):
         write_log(logged("poor"), tmp_path / "nowhere" / "log.mcap", "test")
+
+
+def test_times_that_do_not_fit_into_a_log_are_refused_and_leave_nothing_behind(tmp_path):
+    drive = logged("poor")
+    t_s = drive.commands.t_s.copy()
+    t_s[-1] = 1e12
+    far = replace(drive, commands=replace(drive.commands, t_s=t_s))
+    with pytest.raises(LogError, match=r"its times span 1e\+12 s; mend the clock that jumps"):
+        write_log(far, tmp_path / "log.mcap", "test")
+    assert not (tmp_path / "log.mcap").exists()
+
+
+def test_a_full_disk_leaves_no_half_log_behind(tmp_path):
+    drive = logged("poor")
+    resource.prlimit(0, resource.RLIMIT_FSIZE, (20_000, resource.RLIM_INFINITY))
+    try:
+        with pytest.raises(LogError, match="File too large"):
+            write_log(drive, tmp_path / "log.mcap", "test")
+    finally:
+        resource.prlimit(0, resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+    assert not (tmp_path / "log.mcap").exists()
