@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import json
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -27,6 +28,7 @@ from disco_hw.daemon.stop_path import StopPath
 from disco_hw.daemon.supervisor import Reply, UserRequest
 from disco_hw.daemon.systemd import Notifier
 from disco_hw.daemon.task_change import TaskRefused, changed_task, in_words
+from disco_hw.daemon.teller import STANDARD_OUTPUT, Teller
 from disco_hw.daemon.warm_up import warm_up
 from disco_hw.link import make_link
 from disco_hw.log import records
@@ -69,15 +71,15 @@ def run_daemon(options: DaemonOptions) -> int:
     Raises InputError, before anything is opened, if a file or an option is wrong. An exception in the loop is told, the
     robot stopped, and the exception passed on.
     """
-    say: Say = _say_json if options.as_json else _say_text
     setup = load_setup(options.robot, options.model, options.link)
     if not options.accept_missing_effects:
         refuse_missing_effects(setup)
     if options.adapt:
         check_adaptable(setup.model, setup.config.control.uncertainty)
-    return serve(
-        setup, options.log_file, say, TaskPilot(), lambda: make_planner(setup.config, setup.model), options.adapt
-    )
+    with closing(Teller(STANDARD_OUTPUT, in_json if options.as_json else in_text)) as say:
+        return serve(
+            setup, options.log_file, say, TaskPilot(), lambda: make_planner(setup.config, setup.model), options.adapt
+        )
 
 
 def serve(
@@ -90,8 +92,9 @@ def serve(
 ) -> int:
     """Run until SIGTERM, SIGINT, a quit request or the pilot's end, as `run_daemon`; returns the exit code.
 
-    `pilot` decides what the robot does while motion is allowed; `new_planner` is called twice, as one planner is used
-    up in the warm-up. `adapt`: learn the geometry on the way, in a process of its own. Raises InputError.
+    `say` is called in the loop, and so must not wait. `pilot` decides what the robot does while motion is allowed;
+    `new_planner` is called twice, as one planner is used up in the warm-up. `adapt`: learn the geometry on the way, in
+    a process of its own. Raises InputError.
     """
     stop = StopPath()
     with StopSignals() as signals:
@@ -364,9 +367,11 @@ def _close_recorder(recorder: Recorder, say: Say) -> None:
         say("recording", f"{stats.dropped_ticks} ticks dropped, {stats.refused} records refused")
 
 
-def _say_text(topic: str, text: str) -> None:
-    print(f"{topic}: {text}", flush=True)
+def in_text(topic: str, text: str) -> str:
+    """A sentence of the daemon for a person."""
+    return f"{topic}: {text}"
 
 
-def _say_json(topic: str, text: str) -> None:
-    print(json.dumps({"topic": topic, "text": text}), flush=True)
+def in_json(topic: str, text: str) -> str:
+    """A sentence of the daemon for machines."""
+    return json.dumps({"topic": topic, "text": text})

@@ -6,7 +6,7 @@ import subprocess
 import sys
 from collections import deque
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -15,7 +15,8 @@ from typing import Any
 from disco_hw.config import RobotConfig
 from disco_hw.daemon.client import socket_path
 from disco_hw.daemon.clock import MonotonicClock
-from disco_hw.daemon.daemon import serve
+from disco_hw.daemon.daemon import in_text, serve
+from disco_hw.daemon.teller import STANDARD_ERROR, STANDARD_OUTPUT, Teller
 from disco_hw.drive.coverage import Coverage
 from disco_hw.drive.gamepad_source import GamepadSource
 from disco_hw.drive.hand_pilot import HandPilot
@@ -170,23 +171,24 @@ def _display(socket: Path, shown: bool) -> Iterator[Any]:
     In a terminal the table has the newest of them, so they are printed once it is gone.
     """
     if not shown:
-        yield lambda topic, text: print(f"{topic}: {text}", file=sys.stderr, flush=True)
+        with closing(Teller(STANDARD_ERROR, in_text)) as told:
+            yield told
         return
     later: deque[str] = deque(maxlen=20)
-    in_terminal = sys.stdout.isatty()
 
-    def say(topic: str, text: str) -> None:
-        if in_terminal:
-            later.append(f"{topic}: {text}")
-        else:
-            print(f"{topic}: {text}", flush=True)
+    def keep(topic: str, text: str) -> None:
+        later.append(in_text(topic, text))
 
     # Started before the daemon takes on real time, and in a session of its own: Ctrl-C is for the daemon alone.
     process = subprocess.Popen(
         [sys.executable, "-m", "disco_hw.drive.display", str(socket)], start_new_session=True, stdin=subprocess.DEVNULL
     )
     try:
-        yield say
+        if sys.stdout.isatty():
+            yield keep
+        else:
+            with closing(Teller(STANDARD_OUTPUT, in_text)) as told:
+                yield told
     finally:
         try:
             process.wait(_DISPLAY_TIMEOUT_S)

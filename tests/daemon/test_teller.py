@@ -1,0 +1,76 @@
+"""Sentences reach whoever reads, and nobody waits for who does not; over real pipes and a real terminal."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import pty
+import termios
+import threading
+
+import pytest
+
+from disco_hw.daemon.teller import Teller
+
+
+def line_of(topic, text):
+    return f"{topic}: {text}"
+
+
+@pytest.fixture
+def pipe():
+    ends = os.pipe()
+    yield ends
+    for end in ends:
+        try:
+            os.close(end)
+        except OSError:
+            continue
+
+
+def held(descriptor):
+    """A teller, and whether telling it ten sentences ended although nobody reads."""
+    teller = Teller(descriptor, line_of, most=4)
+    telling = threading.Thread(target=lambda: [teller("event", str(k)) for k in range(10)], daemon=True)
+    telling.start()
+    telling.join(10.0)
+    return teller, not telling.is_alive()
+
+
+def test_everything_is_written_in_order_by_the_end(pipe):
+    teller = Teller(pipe[1], line_of)
+    for k in range(200):
+        teller("event", f"{k} \udcff")
+    teller.close()
+    teller.close()
+    assert os.read(pipe[0], 65536) == b"".join(b"event: %d \xff\n" % k for k in range(200))
+
+
+def test_a_terminal_that_is_held_by_ctrl_s_holds_nobody_up():
+    master, slave = pty.openpty()
+    termios.tcflow(slave, termios.TCOOFF)
+    teller, told = held(slave)
+    assert told
+    teller.close(0.1)
+    termios.tcflow(slave, termios.TCOON)
+    teller.close(10.0)
+    said = os.read(master, 65536).decode().splitlines()
+    assert said[0] == "event: 0"
+    assert "sentences are missing here" in said[-1]
+    os.close(master)
+    os.close(slave)
+
+
+def test_a_pipe_that_nobody_reads_holds_nobody_up(pipe):
+    os.write(pipe[1], b"x" * fcntl.fcntl(pipe[1], fcntl.F_GETPIPE_SZ))
+    teller, told = held(pipe[1])
+    assert told
+    assert teller.dropped >= 5
+
+
+def test_a_reader_that_has_gone_is_no_error(pipe):
+    os.close(pipe[0])
+    teller, told = held(pipe[1])
+    assert told
+    teller.close()
+    assert not teller._thread.is_alive()
