@@ -22,10 +22,10 @@ from disco_hw.viewer.address import DEFAULT_PORT, LOOPBACK
 PagePort = Annotated[int, typer.Option("--port", min=1, max=65535, help="Port of the page.")]
 
 
-def _page(view: bool, robot: Path, model: Path | None, port: int) -> AbstractContextManager[object]:
+def _page(view: bool, robot: Path, model: Path | None, port: int, link: str | None) -> AbstractContextManager[object]:
     from disco_hw.viewer.beside import page_beside
 
-    return page_beside(robot, model, LOOPBACK, port) if view else nullcontext()
+    return page_beside(robot, model, LOOPBACK, port, link) if view else nullcontext()
 
 
 def run(
@@ -48,7 +48,7 @@ def run(
     limit_thread_pools()
     from disco_hw.daemon.daemon import DaemonOptions, run_daemon
 
-    with _page(view, robot, model, port):
+    with _page(view, robot, model, port, link):
         code = run_daemon(DaemonOptions(robot, model, link, log_file, as_json, accept_missing_effects, adapt))
     raise typer.Exit(code)
 
@@ -81,7 +81,7 @@ def drive(
     limit_thread_pools()
     from disco_hw.drive.commands import DriveOptions, run_drive
 
-    with _page(view or page, robot, model, port):
+    with _page(view or page, robot, model, port, link):
         result = run_drive(
             DriveOptions(
                 robot=robot,

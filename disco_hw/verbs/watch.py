@@ -10,6 +10,7 @@ import typer
 from disco_hw.errors import InputError
 from disco_hw.verbs.options import (
     AsJson,
+    LinkOption,
     ModelOption,
     print_result,
 )
@@ -21,6 +22,7 @@ def view(
     live: Annotated[bool, typer.Option("--live", help="Show the running daemon of --robot.")] = False,
     robot: Annotated[Path | None, typer.Option(help="robot.toml; for a log, instead of the one it carries.")] = None,
     model: ModelOption = None,
+    link: LinkOption = None,
     snapshot: Annotated[Path | None, typer.Option(help="Write a picture of the log instead.")] = None,
     at: Annotated[float | None, typer.Option(metavar="SECONDS", help="Where in the log; its end if not given.")] = None,
     video: Annotated[Path | None, typer.Option(help="Write a clip of the log instead.")] = None,
@@ -38,7 +40,7 @@ def view(
     if live:
         if robot is None or log is not None:
             raise InputError("view --live: needs --robot ROBOT.toml and no LOG")
-        raise typer.Exit(commands.view_live(robot, model, host, port, as_json=as_json))
+        raise typer.Exit(commands.view_live(robot, model, host, port, as_json=as_json, link=link))
     if log is None:
         raise InputError("view: give a LOG, or --live with --robot ROBOT.toml")
     if snapshot is not None:

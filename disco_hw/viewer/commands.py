@@ -18,6 +18,7 @@ from disco_hw.config import load_robot_config
 from disco_hw.daemon.client import socket_path
 from disco_hw.daemon.signals import StopSignals
 from disco_hw.errors import InputError
+from disco_hw.robot_setup import LINK_KINDS
 from disco_hw.viewer.address import DEFAULT_PORT, LOOPBACK
 from disco_hw.viewer.desk import Desk
 from disco_hw.viewer.live import LivePage, run_live
@@ -35,14 +36,18 @@ def view_live(
     port: int = DEFAULT_PORT,
     ended: Callable[[], bool] = lambda: False,
     as_json: bool = False,
+    link: str | None = None,
 ) -> int:
     """Serve the live page of this robot's daemon until SIGTERM, SIGINT or `ended()`; returns the exit code.
 
-    The daemon may come and go. Raises InputError for a bad file, or a host or port that cannot be listened to.
+    The daemon may come and go. `link` overrides robot.toml's kind for the e-stop that the page sends by itself. Raises
+    InputError for a bad file or link, or a host or port that cannot be listened to.
     """
+    if link is not None and link not in LINK_KINDS:
+        raise InputError(f"--link {link}: no such kind of link; write one of {', '.join(LINK_KINDS)}")
     stage = stage_of_robot(robot, model)
     socket = socket_path(load_robot_config(robot))
-    desk = Desk(socket, robot)
+    desk = Desk(socket, robot, link)
     with (
         StopSignals() as signals,
         closing(desk),

@@ -39,14 +39,16 @@ Send = Callable[[Mapping[str, Any]], Awaitable[None]]
 class Desk:
     """Serves any number of browsers on the event loop of the page's server; `status` is the newest of the daemon.
 
-    `robot_file` is needed to stop the robot on its link when the daemon does not answer.
+    `robot_file`, and `link` where that overrides its kind, are needed to stop the robot on its link when the daemon
+    does not answer.
     """
 
-    def __init__(self, socket: Path, robot_file: Path) -> None:
+    def __init__(self, socket: Path, robot_file: Path, link: str | None = None) -> None:
         self.status: dict[str, Any] | None = None
         self.error = "not asked yet"
         self._socket = socket
         self._robot_file = robot_file
+        self._link = link
         self._asking = ThreadPoolExecutor(4, "desk")
         # Of its own, so that no other request can be before it in a queue.
         self._stopping = ThreadPoolExecutor(2, "desk e-stop")
@@ -122,7 +124,7 @@ class Desk:
         except WorkError as error:
             refused = str(error)
         try:
-            outcome = stop_robot(self._robot_file)
+            outcome = stop_robot(self._robot_file, self._link)
         except InputError as error:
             return {"do": "estop", "ok": False, "error": f"{refused}; NOT SENT: {error}"}
         words = "text" if outcome.sent else "error"

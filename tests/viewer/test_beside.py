@@ -70,6 +70,20 @@ def test_a_page_that_cannot_start_does_not_matter(tmp_path, capfd):
     assert "none.toml" in capfd.readouterr().err
 
 
+def test_the_link_that_the_daemon_was_given_is_the_pages_too(capfd):
+    with page_beside(ROBOT_FILE, None, "127.0.0.1", 0, "carrier pigeon") as page:
+        assert page.wait(20) == 2
+    assert "--link carrier pigeon" in capfd.readouterr().err
+
+
+def test_what_the_page_says_is_none_of_the_blocks_output(capfd):
+    port = free_port()
+    said = []
+    with page_beside(ROBOT_FILE, None, "127.0.0.1", port):
+        wait_until(lambda: said.append(capfd.readouterr()) or f":{port}/" in "".join(it.out + it.err for it in said))
+    assert not any(it.out for it in said)
+
+
 def test_a_page_that_hangs_is_ended_all_the_same():
     port = free_port()
     with page_beside(ROBOT_FILE, None, "127.0.0.1", port) as page:

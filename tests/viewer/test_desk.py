@@ -1,6 +1,8 @@
 """The desk's way to the daemon, over a real page server and a real control socket."""
 
 import json
+import os
+import pty
 import threading
 import time
 from contextlib import closing, contextmanager
@@ -15,6 +17,8 @@ from disco_hw.daemon.control_socket import ControlServer
 from disco_hw.viewer import desk as desk_module
 from disco_hw.viewer.desk import Desk, shown
 from disco_hw.viewer.server import serving
+from firmware_protocol.codec import Codec
+from firmware_protocol.serial_framing import encode_frame
 from tests.viewer.run import ROBOT_FILE
 from tests.viewer.test_server import get
 
@@ -150,6 +154,18 @@ def test_without_a_daemon_the_estop_takes_the_link_and_says_if_that_failed(tmp_p
         assert "disco-hw run" in ask(line, do="arm")["error"]
     with desk_of(tmp_path / "none.sock", tmp_path / "none.toml") as (_, port), line_to(port) as line:
         assert "NOT SENT" in ask(line, do="estop")["error"]
+
+
+def test_the_estop_takes_the_link_that_the_daemon_was_given(tmp_path):
+    master, slave = pty.openpty()
+    robot = robot_elsewhere(tmp_path)
+    robot.write_text(robot.read_text().replace("/tmp/disco-hw-wombot.tty", os.ttyname(slave)))
+    with closing(Desk(tmp_path / "none.sock", robot, "serial")) as desk:
+        assert desk.estop()["ok"]
+    frame = encode_frame(*Codec().encode("ESTOP", reason=1))
+    assert frame in os.read(master, 4096)
+    os.close(master)
+    os.close(slave)
 
 
 def test_the_estop_is_not_behind_requests_that_hang(daemon, monkeypatch):
