@@ -34,7 +34,7 @@ def make_script(name: str, robot: Robot, task: RobotTask, speed_share: float, se
     top_rad_s = speed_share * robot.max_wheel_speed_rad_s
     match name:
         case "circle":
-            return circle(robot, circle_task(task, "--script circle"))
+            return circle(robot, circle_task(task, "--script circle"), top_rad_s)
         case "steps":
             return steps(top_rad_s, seed, top_rad_s / robot.max_wheel_acceleration_rad_s2)
         case "excite":
@@ -45,16 +45,20 @@ def make_script(name: str, robot: Robot, task: RobotTask, speed_share: float, se
             raise InputError(f"--script {name}: no such script; write one of {', '.join(SCRIPTS)}")
 
 
-def circle(robot: Robot, task: CircleTask) -> Script:
-    """Two laps of the task's circle, counter-clockwise at constant wheel speeds, from rest to rest."""
+def circle(robot: Robot, task: CircleTask, top_rad_s: float) -> Script:
+    """Two laps of the task's circle, counter-clockwise at constant wheel speeds, from rest to rest.
+
+    Raises InputError if a wheel would need more than `top_rad_s`.
+    """
     yaw_rate_rad_s = task.speed_m_s / task.radius_m
     half_m = 0.5 * robot.axial_distance_m
     left = (task.speed_m_s - yaw_rate_rad_s * half_m) / robot.wheel_radius_m
     right = (task.speed_m_s + yaw_rate_rad_s * half_m) / robot.wheel_radius_m
-    if max(abs(left), abs(right)) > robot.max_wheel_speed_rad_s:
+    if max(abs(left), abs(right)) > top_rad_s:
         raise InputError(
-            f"--script circle: the outer wheel would need {right:.2f} rad/s, robot.max_wheel_speed_rad_s is "
-            f"{robot.max_wheel_speed_rad_s:g}; lower task.speed_m_s or raise task.radius_m"
+            f"--script circle: the outer wheel would need {right:.2f} rad/s, and drive.speed_share of "
+            f"robot.max_wheel_speed_rad_s is {top_rad_s:.4g}; lower task.speed_m_s, or raise task.radius_m or "
+            "drive.speed_share"
         )
     laps_s = _LAPS * 2.0 * math.pi / yaw_rate_rad_s
     purpose = "the paper's drive; cannot tell the wheel radius from slip, nor left from right"

@@ -49,6 +49,14 @@ def test_a_circle_beyond_the_wheels_is_refused():
         make_script("circle", robot(), CircleTask(radius_m=0.05, speed_m_s=0.3), 0.8)
 
 
+def test_a_circle_beyond_the_share_of_the_limit_is_refused():
+    task = CircleTask(radius_m=0.75, speed_m_s=0.38)
+    fastest = (task.speed_m_s + task.speed_m_s / task.radius_m * 0.155) / 0.06
+    make_script("circle", robot(), task, fastest / 8.0 + 1e-6)
+    with pytest.raises(InputError, match=r"drive\.speed_share.*lower task\.speed_m_s"):
+        make_script("circle", robot(), task, fastest / 8.0 - 1e-6)
+
+
 def steps_of(seed):
     script = make_script("steps", robot(), CircleTask(), 1.0, seed)
     return script, [manoeuvre for manoeuvre in script.manoeuvres if manoeuvre.within_limits]
