@@ -187,7 +187,7 @@ class ControlServer:
         if not isinstance(action, str) or action not in self._actions:
             self._refuse(client, f'"do" must be one of {", ".join(sorted(self._actions))}')
             return
-        if len(client.waiting) >= _MAX_WAITING:
+        if len(client.waiting) >= _MAX_WAITING and action != _ESTOP:
             self._refuse(client, f"more than {_MAX_WAITING} requests at once; wait for the replies")
             return
         self._activity += 1

@@ -213,6 +213,12 @@ def test_a_flood_is_hung_up_on_after_what_was_waiting(server):
         assert hung_up(client)
 
 
+def test_an_estop_behind_as_many_requests_as_may_wait_is_taken(server):
+    with connect(server) as client:
+        send(client, *[{"do": "status"}] * 16, {"do": "estop"})
+        assert server.poll()[0].action == "estop"
+
+
 def test_a_client_that_never_reads_its_replies_is_let_go(server):
     with connect(server) as client:
         for _ in range(2000):
