@@ -165,13 +165,14 @@ def open_gamepad(mapping: GamepadMapping, now_ns: int, path: str = "") -> Gamepa
     for candidate in [path] if path else evdev.list_devices(writable=False):
         try:
             device = evdev.InputDevice(candidate)
+            # Asks the device, which may go in this very moment.
+            found = device.capabilities(absinfo=False)
         except OSError as error:
             if path:
                 raise GamepadError(
                     f"{path}: cannot be opened ({error.strerror}); is it plugged in, and yours?"
                 ) from None
             continue
-        found = device.capabilities(absinfo=False)
         if axes <= set(found.get(_EV_ABS, ())) and button in found.get(_EV_KEY, ()):
             return Gamepad(device, mapping, now_ns)
         device.close()

@@ -74,6 +74,7 @@ def test_a_mistake_gets_one_line_with_file_and_field(tmp_path, change, words):
         ("[control]\nrate_hz = 500.0\n", "control.rate_hz"),
         ("[control]\nrate_hz = 20.0\ncommand_valid_for_s = 0.05\n", "control.command_valid_for_s"),
         ("[control]\ntelemetry_zero_s = 0.2\n", "control.telemetry_disarm_s"),
+        ("[control]\nseed = 9223372036854775808\n", "control.seed"),
         ('[link]\nkind = "wifi"\n', "link.kind"),
         ('[task]\nkind = "square"\n', "task"),
         ("[estimation]\npose_timeout_s = inf\n", "estimation.pose_timeout_s"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import struct
 import sys
@@ -155,6 +156,22 @@ def test_without_a_device_one_line_says_what_to_do(tmp_path):
     if not evdev.list_devices():
         with pytest.raises(GamepadError, match="no gamepad found"):
             open_gamepad(GamepadMapping(), 0)
+
+
+def test_a_device_that_goes_while_it_is_looked_at_is_passed_over(monkeypatch):
+    class Going:
+        def __init__(self, _path):
+            pass
+
+        def capabilities(self, absinfo):
+            raise OSError(errno.ENODEV, "No such device")
+
+    monkeypatch.setattr(evdev, "list_devices", lambda writable: ["/dev/input/event7"])
+    monkeypatch.setattr(evdev, "InputDevice", Going)
+    with pytest.raises(GamepadError, match="no gamepad found"):
+        open_gamepad(GamepadMapping(), 0)
+    with pytest.raises(GamepadError, match="cannot be opened"):
+        open_gamepad(GamepadMapping(), 0, "/dev/input/event7")
 
 
 @pytest.mark.skipif(
