@@ -290,7 +290,9 @@ def _metadata(contents: Contents, path: Path) -> Metadata:
             except (KeyError, ValueError):
                 break
     if contents.chunks:
-        raise LogError(f"{path}: an MCAP file, but not a log of disco-hw; see `disco-hw import`")
+        raise LogError(
+            f"{path}: an MCAP file, but not a log of disco-hw; write it as a CSV, which `disco-hw import` takes"
+        )
     raise LogError(f"{path}: nothing of the log is left but its first bytes; there is nothing to read")
 
 

@@ -22,7 +22,7 @@ def import_log(
     out: Annotated[Path, typer.Option("-o", "--out", help="Where to write the MCAP log.")],
     as_json: AsJson = False,
 ) -> None:
-    """Write a foreign log as a log of ours, for `view` and Foxglove."""
+    """Write a foreign log as a log of ours, for `infer`, `gap` and Foxglove; `view` and `replay` need one of `run`."""
     from disco_hw.log.importing.commands import import_log as import_foreign
 
     result = import_foreign(log, robot, out)

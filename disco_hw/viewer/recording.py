@@ -25,13 +25,13 @@ class Recording:
     def __init__(self, path: Path, robot_file: Path | None = None) -> None:
         self._log = Log(path)
         try:
+            if "/estimate" not in self._log.counts:
+                raise InputError(f"{path}: holds no estimates, so there is nothing to show; give a log of `run`")
             self.stage: Stage = stage_of_log(self._log, robot_file)
             self.timeline = Timeline()
             for now_ns, record in self._log.brief_records(_SHOWN):
                 self.timeline.add(now_ns, record)
             self.ticks: NDArray[np.int64] = self.timeline.estimate.rows(0, np.iinfo(np.int64).max)[0]
-            if not len(self.ticks):
-                raise InputError(f"{path}: holds no estimates, so there is nothing to show; give a log of `run`")
         except BaseException:
             self._log.close()
             raise

@@ -102,3 +102,6 @@ def test_a_log_without_ticks_or_robot_is_refused(tmp_path, ticks):
     recorder.close(30.0)
     with pytest.raises(InputError, match=r"carries no robot\.toml"):
         replay(tmp_path / "bare.mcap")
+    odd = write_log(tmp_path / "odd.mcap", ticks[:1], model="format = 7\n")
+    with pytest.raises(InputError, match=rf"^{odd}: model\.toml: format: "):
+        replay(odd)

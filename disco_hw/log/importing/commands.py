@@ -6,14 +6,13 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from disco_hw.config import CircleTask, RobotConfig, load_robot_config
+from disco_hw.config import load_robot_config
 from disco_hw.log.container import MAGIC
 from disco_hw.log.csv_import import read_csv
 from disco_hw.log.errors import LogError
 from disco_hw.log.importing.candump import read_candump
 from disco_hw.log.importing.write import write_log
-from disco_hw.log.link import Attachment
-from disco_hw.log.provenance import MODEL_TOML, PATH_CSV, ROBOT_TOML, attachment
+from disco_hw.log.provenance import ROBOT_TOML, attachment
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,37 +38,18 @@ class Imported:
 def import_log(path: Path, robot: Path, out: Path) -> Imported:
     """Write a foreign log, a CSV file or a candump of our protocol, as an MCAP log of ours.
 
-    robot.toml goes into the log, with the model and the path that it names. Raises LogError for what can be no such
-    file, and InputError.
+    robot.toml goes into the log. Raises LogError for what can be no such file, and InputError.
     """
     config = load_robot_config(robot)
     if _begins(path).startswith(b"("):
         drive = read_candump(path, config.robot)
     else:
         drive = read_csv(path, config.robot.ticks_per_rev, config.robot.wheel_radius_m)
-    files, lacking = _kept_files(robot, config)
-    records = write_log(drive, out, config.robot.name, files)
-    notes = drive.notes + lacking
+    records = write_log(drive, out, config.robot.name, (attachment(robot, ROBOT_TOML),))
+    notes = drive.notes
     if drive.gyro.t_s.size:
         notes += (f"{path}: the gyro was left out; a log of ours has none",)
     return Imported(out, records, drive.segments, drive.end_s, notes)
-
-
-def _kept_files(robot: Path, config: RobotConfig) -> tuple[tuple[Attachment, ...], tuple[str, ...]]:
-    """robot.toml and the files that it names, as far as they are there: `infer` may be what makes the model; notes."""
-    named = [("model.file", config.model.file, MODEL_TOML)]
-    if not isinstance(config.task, CircleTask):
-        named.append(("task.path", config.task.path, PATH_CSV))
-    files, lacking = [attachment(robot, ROBOT_TOML)], []
-    for field, name, kept_as in named:
-        if name is None:
-            continue
-        file = robot.parent / name
-        if file.is_file():
-            files.append(attachment(file, kept_as))
-        else:
-            lacking.append(f"{robot}: {field}: {name} is not there, so the log lacks it and `view` will want --robot")
-    return tuple(files), tuple(lacking)
 
 
 def _begins(path: Path) -> bytes:
@@ -79,5 +59,7 @@ def _begins(path: Path) -> bytes:
     except OSError as error:
         raise LogError(f"{path}: cannot be opened ({error.strerror}); give the path of a log") from None
     if begin == MAGIC:
-        raise LogError(f"{path}: an MCAP log; ours needs no import, and of others none can be imported yet")
+        raise LogError(
+            f"{path}: an MCAP log; ours needs no import, and of others none can be imported yet: write a CSV"
+        )
     return begin

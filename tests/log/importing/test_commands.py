@@ -1,13 +1,10 @@
 import json
-import shutil
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-import disco_hw
 from disco_hw.errors import InputError
 from disco_hw.log.errors import LogError
 from disco_hw.log.importing.commands import import_log
@@ -16,12 +13,10 @@ from disco_hw.log.provenance import ROBOT_TOML
 from disco_hw.log.reader import open_log
 from disco_hw.log_setup import setup_of_log
 from disco_hw.replay import replay
+from disco_hw.viewer.recording import Recording
 from tests.inference.drives import TICKS_PER_REV, write_log
 from tests.inference.test_commands import ROBOT
 from tests.log.importing.test_candump import dumped
-
-ROBOTS = Path(disco_hw.__file__).parent / "robots"
-NAMED = '[model]\nfile = "wombot_model.toml"\n[task]\npath = "eight.csv"\n'
 
 
 @pytest.fixture
@@ -60,37 +55,21 @@ def test_what_cannot_be_opened_is_told(robot, tmp_path):
         import_log(tmp_path / "none.csv", robot, tmp_path / "log.mcap")
 
 
-def test_what_robot_toml_names_goes_into_the_log_so_that_the_page_shows_it(tmp_path):
-    for name in ("wombot_model.toml", "eight.csv"):
-        shutil.copy(ROBOTS / name, tmp_path)
-    robot = tmp_path / "robot.toml"
-    robot.write_text(ROBOT + NAMED)
-    found = import_log(write_log(tmp_path / "log.csv", "poor"), robot, tmp_path / "log.mcap")
-    assert found.notes == ()
-    with open_log(found.out) as log:
-        setup = setup_of_log(log, "name the robot")
-        assert setup.model.axial_distance_m == 0.415
-        assert len(setup.config.task.points) > 10
-
-
-def test_what_robot_toml_names_and_is_not_there_is_told_now_and_when_it_is_missed(tmp_path):
-    robot = tmp_path / "robot.toml"
-    robot.write_text(ROBOT + NAMED)
-    found = import_log(write_log(tmp_path / "log.csv", "poor"), robot, tmp_path / "log.mcap")
-    assert [note.split(": ")[1] for note in found.notes] == ["model.file", "task.path"]
-    with open_log(found.out) as log:
-        assert log.attachment_names() == (ROBOT_TOML,)
-        with pytest.raises(InputError, match=r"log\.mcap: carries no model\.toml, which its .* names; name it"):
-            setup_of_log(log, "name it")
-
-
-def test_a_copy_that_is_wrong_is_named_by_its_log(robot, tmp_path):
+def test_a_file_that_the_logs_robot_names_and_the_log_lacks_is_told(robot, tmp_path):
     robot.write_text(ROBOT + '[model]\nfile = "model.toml"\n')
-    (tmp_path / "model.toml").write_text("format = 7\n")
     import_log(write_log(tmp_path / "log.csv", "poor"), robot, tmp_path / "log.mcap")
-    with open_log(tmp_path / "log.mcap") as log, pytest.raises(InputError) as error:
-        setup_of_log(log, "")
-    assert str(error.value).startswith(f"{tmp_path}/log.mcap: model.toml: format: ")
+    with (
+        open_log(tmp_path / "log.mcap") as log,
+        pytest.raises(InputError, match=r"log\.mcap: carries no model\.toml, which its robot\.toml names; do this"),
+    ):
+        setup_of_log(log, "do this")
+
+
+def test_nothing_of_an_imported_log_can_be_shown_and_that_is_said_whatever_it_carries(robot, tmp_path):
+    robot.write_text(ROBOT + '[model]\nfile = "model.toml"\n')
+    import_log(write_log(tmp_path / "log.csv", "poor"), robot, tmp_path / "log.mcap")
+    with pytest.raises(InputError, match="holds no estimates, so there is nothing to show"):
+        Recording(tmp_path / "log.mcap")
 
 
 def test_an_imported_log_cannot_be_replayed_and_says_so(robot, tmp_path):
