@@ -24,8 +24,7 @@ from disco_hw.inference.simulate import NAMES
 from disco_hw.inference.workers import LocalWorkers, Workers
 from disco_hw.log.drive import DriveLog
 from disco_hw.log.load import load_drive
-from disco_hw.model import Model
-from disco_hw.model.file import model_text
+from disco_hw.model import Model, save_model
 from disco_hw.outputs import refuse_file
 
 Search = Callable[[DriveLog, Model], AbstractContextManager[Callable[[], GapCheck]]]
@@ -172,11 +171,13 @@ def infer_command(
         found = searched()
     result = InferResult(inference, found, tuple(logs), robot, out, perf_counter() - began)
     if out is not None:
-        _write(out, model_text(replace(inference.model(nominal), missing_effects=found.missing)))
+        model = replace(inference.model(nominal), missing_effects=found.missing)
+        _write(out, lambda: save_model(model, out))
     if report is not None:
         from disco_hw.inference.report import report_html  # noqa: PLC0415  (matplotlib, slow to import)
 
-        _write(report, report_html(inference, posterior_figures(inference), result.warnings()))
+        page = report_html(inference, posterior_figures(inference), result.warnings())
+        _write(report, lambda: report.write_text(page, encoding="utf-8"))
     return result
 
 
@@ -189,9 +190,9 @@ def _workers(dask: str | None) -> Iterator[Workers]:
         yield workers
 
 
-def _write(path: Path, text: str) -> None:
+def _write(path: Path, write: Callable[[], object]) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text, encoding="utf-8")
+        write()
     except OSError as error:
         raise WorkError(f"{path}: cannot be written ({error.strerror}); give another path") from None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -136,8 +137,26 @@ def _array(values: Vector | Matrix, what: str) -> np.ndarray:
 
 
 def save_model(model: Model, path: Path) -> None:
-    """Write a model file that `load_model` reads back to the same numbers, bit for bit."""
-    path.write_text(model_text(model), encoding="utf-8")
+    """Write a model file that `load_model` reads back to the same numbers, bit for bit.
+
+    Raises OSError; a file that was there is then as it was.
+    """
+    text = model_text(model).encode()
+    if path.exists() and not path.is_file():
+        # A pipe or a terminal; nothing can take its place.
+        path.write_bytes(text)
+        return
+    target = path.resolve()
+    new = target.with_name(f".{target.name}.new")
+    try:
+        with new.open("wb") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        new.replace(target)
+    except OSError:
+        new.unlink(missing_ok=True)
+        raise
 
 
 def model_text(model: Model) -> str:

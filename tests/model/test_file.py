@@ -1,5 +1,7 @@
 """The model file: what is written is read back bit for bit, and every fault is one line with file, field and remedy."""
 
+import os
+import resource
 from dataclasses import replace
 from pathlib import Path
 
@@ -140,3 +142,30 @@ def test_the_mark_of_missing_effects_is_kept(tmp_path):
 def test_a_mark_must_name_an_effect_that_the_model_lacks(tmp_path, name, fault):
     with pytest.raises(InputError, match=f"missing_effects: .*{fault}"):
         read(tmp_path, GOOD.replace("format = 1", f'format = 1\nmissing_effects = ["{name}"]'))
+
+
+def test_a_model_that_cannot_be_written_whole_leaves_the_old_one(tmp_path):
+    model, path = load_model(SHIPPED), tmp_path / "model.toml"
+    save_model(model, path)
+    before = path.read_text()
+    resource.prlimit(0, resource.RLIMIT_FSIZE, (len(before) // 2, resource.RLIM_INFINITY))
+    try:
+        with pytest.raises(OSError, match="File too large"):
+            save_model(replace(model, name="another"), path)
+    finally:
+        resource.prlimit(0, resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+    assert path.read_text() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_link_stays_a_link_and_a_pipe_takes_the_text(tmp_path):
+    model = load_model(SHIPPED)
+    (tmp_path / "link.toml").symlink_to(tmp_path / "real.toml")
+    save_model(model, tmp_path / "link.toml")
+    assert (tmp_path / "link.toml").is_symlink()
+    assert load_model(tmp_path / "real.toml").name == model.name
+    reading, writing = os.pipe()
+    with open(reading, encoding="utf-8") as pipe:
+        save_model(model, Path(f"/proc/self/fd/{writing}"))
+        os.close(writing)
+        assert pipe.read() == model_text(model)
