@@ -8,7 +8,7 @@ from typing import Any
 
 from drivers import telemetry, words
 from drivers.arming import Arming, HostState
-from drivers.device_clock import DeviceClock
+from drivers.device_clock import DEVICE_CLOCK_MODULUS_US, DeviceClock
 from drivers.handshake import MESSAGES as HANDSHAKE_MESSAGES
 from drivers.handshake import Handshake
 from drivers.reception import FrameReception
@@ -88,6 +88,7 @@ class ReferenceDriver:
         self._time_sequence = 0
         self._time_requests: dict[int, int] = {}
         self._commands_sent = 0
+        self._device_us: int | None = None
         self._clock_errors_told: int | None = None
         self._clock_errors = 0
         self._last_heard_ns = 0
@@ -364,9 +365,18 @@ class ReferenceDriver:
         sent_ns = self._time_requests.pop(int(decoded.values["sequence"]), None)
         if sent_ns is None:
             return
-        if self._clock.add(sent_ns, received_ns, int(decoded.values["receive_time"])):
-            self._restart("the robot has restarted")
-            self._events.append("the robot has restarted: its clock was set back")
+        device_us = int(decoded.values["receive_time"])
+        before_us, self._device_us = self._device_us, device_us
+        if not self._clock.add(sent_ns, received_ns, device_us):
+            return
+        if before_us is not None and (device_us - before_us) % DEVICE_CLOCK_MODULUS_US < DEVICE_CLOCK_MODULUS_US // 2:
+            why = "its clock leapt"
+            told = "the robot's clock leapt: this computer slept, or the controller's clock is over 200 ppm off"
+        else:
+            why = "the robot has restarted"
+            told = f"{why}: its clock was set back"
+        self._restart(why)
+        self._events.append(told)
 
     def _mind_trust(self, now_ns: int) -> None:
         """Start afresh with a robot that has fallen silent, or whose sample times contradict its clock."""
@@ -388,6 +398,7 @@ class ReferenceDriver:
         self._telemetry.restart()
         self._clock.forget()
         self._time_requests.clear()
+        self._device_us = None
         self._status = None
         self._host_accepted = False
         self._clock_errors_told = None

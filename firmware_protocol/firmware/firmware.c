@@ -82,14 +82,16 @@ void disco_advance(disco_firmware_t *core, uint64_t clock_us)
 void disco_firmware_step(disco_firmware_t *core, uint64_t now_us, const disco_inputs_t *inputs,
                          disco_outputs_t *outputs)
 {
-    if (now_us > core->cycle_us) {
-        disco_advance(core, now_us);
-    } else {
-        if (now_us < core->cycle_us) {
-            core->clock_errors++;
-        }
+    /* A frame may be stamped a little later than the cycle that follows it, but not so that time would stand long. */
+    const bool back = (now_us < core->cycle_us) || (core->clock_us > (now_us + LONGEST_CYCLE_US));
+    if (back) {
+        core->clock_errors++;
+    }
+    if (back || (now_us == core->cycle_us)) {
         core->clock_us = now_us;
         core->now_us += NOMINAL_CYCLE_US;
+    } else {
+        disco_advance(core, now_us);
     }
     core->cycle_us = now_us;
     uint64_t elapsed_us = core->now_us - core->last_step_us;

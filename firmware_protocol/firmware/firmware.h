@@ -2,7 +2,8 @@
  *
  * Call disco_firmware_receive for each frame from the bus and disco_firmware_step at 1 kHz, both with the same
  * monotonic microsecond clock, from one context; then send what disco_firmware_pop gives. Should the clock stand or go
- * back all the same, each cycle counts as a millisecond: no watchdog waits for a broken clock.
+ * back all the same, or stamp a frame over 10 ms ahead of the cycle that follows, each cycle counts as a millisecond: no
+ * watchdog waits for a broken clock.
  */
 #ifndef DISCO_FIRMWARE_H
 #define DISCO_FIRMWARE_H

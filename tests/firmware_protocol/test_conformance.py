@@ -2,9 +2,20 @@
 
 from dataclasses import replace
 
+import pytest
+
 from tests.drivers.reference_robot import CONFIG, ReferenceRobot
 from tests.firmware_protocol.conformance import FirmwareConformance
 from tests.firmware_protocol.other_end import SimulatedEnd
+from tests.firmware_protocol.protocol_host import ProtocolHost
+
+
+@pytest.mark.parametrize("skew", [0.001, -0.001])
+def test_a_clock_that_runs_away_does_not_conform(skew):
+    host = ProtocolHost(SimulatedEnd(ReferenceRobot(skew=skew)))
+    host.settle()
+    with pytest.raises(AssertionError, match="it needs a crystal"):
+        FirmwareConformance().test_the_clock_answers_and_keeps_time(host)
 
 
 class TestCore(FirmwareConformance):

@@ -154,6 +154,33 @@ def test_after_the_clock_went_back_time_goes_on_at_its_rate():
     assert heading.values["sample_time"] == pytest.approx(expected, abs=100)
 
 
+@pytest.mark.parametrize("ahead_us", [10_001, 70_000, 1 << 32])
+def test_a_frame_stamped_far_ahead_does_not_hold_time_up(ahead_us):
+    """As by a clock of two words that is read while its low word wraps: 71 minutes ahead, once."""
+    bench = Bench()
+    bench.run(1000)
+    before, since_us = bench.core._core.now_us, bench.now_us
+    bench.core.receive(bench.now_us + 1000 + ahead_us, 0x7FF, b"")
+    bench.run(500)
+    assert bench.core._core.now_us - before == 1000 + ahead_us + 500_000
+    assert len(bench.messages("WHEEL_SPEED", since_us)) >= 50
+    bench.run(100)
+    assert bench.messages("SESSION_STATE")[-1].values["clock_error_count"] == 1
+
+
+def test_a_frame_may_be_stamped_after_the_cycle_that_follows():
+    """A board may read its clock for a cycle, take in frames, and then run the cycle."""
+    bench = Bench()
+    bench.run(1000)
+    before = bench.core._core.now_us
+    bench.core.receive(bench.now_us + 1000 + 10_000, 0x7FF, b"")
+    bench.run(1)
+    assert bench.core._core.now_us - before == 11_000
+    bench.run(500)
+    assert bench.core._core.now_us - before == 501_000
+    assert bench.messages("SESSION_STATE")[-1].values["clock_error_count"] == 0
+
+
 @pytest.mark.parametrize("skipped", [7, 15])
 def test_repeated_commands_and_leaps_of_the_counter_are_counted(skipped):
     bench = Bench()
