@@ -316,9 +316,9 @@ class FirmwareConformance:
         assert host.fastest < STILL_RAD_S
         ticks = dict(host.latest["WHEEL_TICKS"])
         host.heard.clear()
-        host.command = {"left": 1.5, "right": -1.0}
-        host.run(1.5)
-        assert host.speeds == pytest.approx((1.5, -1.0), rel=0.1, abs=0.05)
+        host.command = {"left": host.fast, "right": -host.fast / 1.5}
+        host.run(1.5 + host.speed_up_s)
+        assert host.speeds == pytest.approx((host.fast, -host.fast / 1.5), rel=0.1, abs=0.05)
         turn = 2 * math.pi / host.limits["ticks_per_rev"]
         for side, sign in (("left", 1), ("right", -1)):
             moved = (host.latest["WHEEL_TICKS"][f"{side}_ticks"] - ticks[f"{side}_ticks"] + 2**23) % 2**24 - 2**23
@@ -352,7 +352,7 @@ class FirmwareConformance:
     def test_a_command_holds_no_longer_than_it_says(self, host, slack_s):
         host.to_driving()
         host.command = None
-        host.wheel_command(1.5, 1.0, valid_for=0.04)
+        host.wheel_command(host.fast, host.fast / 1.5, valid_for=0.04)
         assert self.stops(host, "COMMAND_EXPIRED", 1.0) <= 0.04 + slack_s
 
     @pytest.mark.motion

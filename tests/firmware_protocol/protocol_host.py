@@ -78,6 +78,15 @@ class ProtocolHost:
         return speed["left_speed"], speed["right_speed"]
 
     @property
+    def fast(self):
+        """Speed of the faster wheel where wheels turn, rad/s: 1.5, or as fast as the robot can."""
+        return min(1.5, self.limits["max_wheel_speed"])
+
+    @property
+    def speed_up_s(self):
+        return self.fast / self.limits["max_wheel_acceleration"]
+
+    @property
     def fastest(self):
         return max(map(abs, self.speeds))
 
@@ -197,10 +206,12 @@ class ProtocolHost:
         self.wait_for_state("ARMED")
         return session
 
-    def to_driving(self, left=1.5, right=1.0):
+    def to_driving(self):
         session = self.to_armed()
+        left, right = self.fast, self.fast / 1.5
         self.command = {"left": left, "right": right}
-        self.wait_for("wheels at speed", lambda: self.speeds[0] > 0.8 * left and self.speeds[1] > 0.8 * right)
+        at_speed = lambda: self.speeds[0] > 0.8 * left and self.speeds[1] > 0.8 * right  # noqa: E731
+        self.wait_for("wheels at speed", at_speed, 3.0 + self.speed_up_s)
         return session
 
     def _choice(self, message, signal):

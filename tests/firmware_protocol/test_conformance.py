@@ -30,3 +30,14 @@ class TestAuthenticatedCore(FirmwareConformance):
     @classmethod
     def make_end(cls, config):
         return SimulatedEnd(ReferenceRobot(replace(CONFIG, key=cls.key)))
+
+
+class TestSlowCore(FirmwareConformance):
+    """A robot that can go at less than the suite's 1.5 rad/s, and takes its time to."""
+
+    key = bytes(range(16))
+
+    @classmethod
+    def make_end(cls, config):
+        slow = replace(CONFIG, key=cls.key, max_wheel_speed_rad_s=1.0, max_wheel_acceleration_rad_s2=0.5)
+        return SimulatedEnd(ReferenceRobot(slow))
