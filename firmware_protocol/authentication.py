@@ -15,6 +15,7 @@ from firmware_protocol.codec import Codec, EncodedFrame
 KEY_LENGTH = 16
 NONCE_LENGTH = 6
 MAC_LENGTH = 6
+REMEMBERED_NONCES = 8
 PROVED = ("WHEEL_COMMAND", "HOST_STATE", "PARAM_REQUEST")
 _KEY = re.compile(rf"[0-9a-fA-F]{{{2 * KEY_LENGTH}}}")
 
@@ -48,7 +49,7 @@ class Prover:
         """`key`: 16 bytes."""
         self._key = key
         self._nonce: bytes | None = None
-        self._freshness: dict[int, int] = {}
+        self._freshness: dict[bytes, dict[int, int]] = {}
         self._mac_ids = {codec.can_id(name): codec.can_id(f"{name}_MAC") for name in PROVED}
 
     @property
@@ -57,11 +58,16 @@ class Prover:
         return self._nonce is not None
 
     def challenge(self, nonce: int) -> None:
-        """Take in MAC_CHALLENGE's nonce; with another one than before the counters begin anew."""
+        """Take in MAC_CHALLENGE's nonce; with a new one the counters begin anew, with one told before they go on.
+
+        Anybody can send a wrong nonce: were the right one's counters lost with it, the robot would hear nothing more
+        until they had caught up with its own.
+        """
         value = nonce.to_bytes(NONCE_LENGTH, "little")
-        if value != self._nonce:
-            self._nonce = value
-            self._freshness.clear()
+        if value not in self._freshness and len(self._freshness) >= REMEMBERED_NONCES:
+            del self._freshness[min(self._freshness, key=lambda known: sum(self._freshness[known].values()))]
+        self._freshness.setdefault(value, {})
+        self._nonce = value
 
     def forget(self) -> None:
         """Forget the nonce: the robot may be another one."""
@@ -78,7 +84,7 @@ class Prover:
         """
         if self._nonce is None or not self.needs_proof(frame.can_id):
             raise ValueError(f"no proof for 0x{frame.can_id:03X}: no nonce yet, or none needed")
-        freshness = self._freshness.get(frame.can_id, 0) + 1
-        self._freshness[frame.can_id] = freshness
+        counters = self._freshness[self._nonce]
+        freshness = counters[frame.can_id] = counters.get(frame.can_id, 0) + 1
         mac = truncated_mac(self._key, self._nonce, freshness, frame)
         return EncodedFrame(self._mac_ids[frame.can_id], (freshness & 0xFFFF).to_bytes(2, "little") + mac)

@@ -197,6 +197,22 @@ def test_the_same_nonce_again_does_not_start_the_counters_anew():
     assert len({proof.data[2:] for proof in proofs}) == 3
 
 
+@pytest.mark.parametrize("wrong", [1, 100])
+def test_wrong_nonces_in_between_do_not_set_the_counters_back(wrong):
+    """Anybody can send a MAC_CHALLENGE; the least used nonces are forgotten first."""
+    c = c_authentication()
+    prover = prover_for(c)
+    for _ in range(20):
+        proof = prover.prove(COMMAND)
+    assert c_holds(c, lib.DISCO_PROOF_WHEEL_COMMAND, proof, COMMAND)
+    for nonce in range(wrong):
+        prover.challenge(nonce)
+        prover.prove(COMMAND)
+    prover.forget()
+    prover.challenge(int.from_bytes(bytes(c.nonce), "little"))
+    assert c_holds(c, lib.DISCO_PROOF_WHEEL_COMMAND, prover.prove(COMMAND), COMMAND)
+
+
 def test_nothing_is_proved_without_a_nonce_or_need():
     prover = Prover(RFC_KEY, CODEC)
     with pytest.raises(ValueError, match="no nonce"):
