@@ -18,6 +18,8 @@ Probability = Annotated[float, Meta(gt=0.0, lt=1.0)]
 Share = Annotated[float, Meta(gt=0.0, le=1.0)]
 Range = tuple[float, float]
 Point = tuple[float, float]
+# The frames of a pose hold 838.86 m along x and y (disco_robot.dbc); where there is no pose nothing can be followed.
+FARTHEST_M = 838.0
 
 
 class ConfigError(InputError):
@@ -258,6 +260,15 @@ def _check(path: Path, config: RobotConfig) -> None:
         )
     if control.telemetry_disarm_s <= control.telemetry_zero_s:
         refuse("control.telemetry_disarm_s", "not above telemetry_zero_s", "write a larger value")
+    if isinstance(config.task, CircleTask):
+        for field in ("center_x_m", "center_y_m"):
+            farthest_m = abs(getattr(config.task, field)) + config.task.radius_m
+            if farthest_m > FARTHEST_M:
+                refuse(
+                    f"task.{field}",
+                    f"with radius_m the circle goes {farthest_m:g} m from the origin, and poses only {FARTHEST_M:g} m",
+                    "write a circle in the frame of the poses",
+                )
     if config.task.speed_m_s > config.robot.max_wheel_speed_rad_s * config.robot.wheel_radius_m:
         refuse(
             "task.speed_m_s",

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from disco_hw.config import FARTHEST_M
 from disco_hw.errors import InputError
 
 Array = NDArray[np.float64]
@@ -72,8 +73,8 @@ def load_waypoints(path: Path) -> Waypoints:
 def way_points_to_follow(path: Path) -> Waypoints:
     """The way-points of a CSV that a robot is to follow at a speed of its own.
 
-    Raises InputError as `load_waypoints`, and for times, for more than 10 000 way-points, and for a path that is
-    shorter than 0.1 m or longer than 2 km.
+    Raises InputError as `load_waypoints`, and for times, for more than 10 000 way-points, for a path that is shorter
+    than 0.1 m or longer than 2 km, and for a way-point further from the origin than poses go.
     """
     found = load_waypoints(path)
     if found.times_s is not None:
@@ -115,12 +116,19 @@ def way_points_to_meet(path: Path, fastest_m_s: float) -> Waypoints:
 
 
 def _check_size(path: Path, found: Waypoints) -> None:
-    """Refuse more way-points, and a shorter or longer path, than can be followed."""
+    """Refuse more way-points, a shorter or longer path, and places further off, than can be followed."""
     if len(found.places_m) > MOST_POINTS:
         raise InputError(f"{path}: {len(found.places_m)} way-points; write at most {MOST_POINTS}")
     length_m = float(np.hypot(*np.diff(found.places_m, axis=0).T).sum())
     if not SHORTEST_M <= length_m <= LONGEST_M:
         raise InputError(f"{path}: {length_m:g} m long; between {SHORTEST_M:g} and {LONGEST_M:g} m can be followed")
+    beyond = np.argwhere(np.abs(found.places_m) > FARTHEST_M)
+    if beyond.size:
+        row, column = beyond[0].tolist()
+        raise InputError(
+            f"{path}: line {found.lines[row]}: {'xy'[column]}_m: {found.places_m[row, column]:g}, and poses go "
+            f"{FARTHEST_M:g} m from the origin at most; write way-points in the frame of the poses"
+        )
 
 
 def _number(path: Path, line: int, name: str, text: str | None) -> float:

@@ -122,12 +122,16 @@ def sample_and_roll(work: Any, sampling: Any, step: int, basis: Any, limits: Any
 
 @block_function
 def weigh_all(work: Any, sampling: Any) -> Any:
-    """Weights from costs; fills the report. Returns the sum of the weights, or 0 if no cost is finite."""
+    """Weights from costs; fills the report. Returns the sum of the weights, or 0 if no cost is finite.
+
+    Without a finite cost the effective sample size is 0, and there is no least and no mean cost.
+    """
     costs, report = work.costs, work.report
     report[NOMINAL] = costs[0]
     least, valid = refuse_invalid(costs, sampling.samples)
     report[VALID] = valid
     if valid == 0:
+        report[ESS], report[LEAST], report[MEAN] = 0.0, math.nan, math.nan
         return float32(0.0)
     total_cost = 0.0
     for k in range(U(sampling.samples)):

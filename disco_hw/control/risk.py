@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from disco_hw.control.blocks import BLOCK, U
@@ -32,7 +33,12 @@ def worst_over_points(costs: Any, point_costs: Any, weights: Any, blocks: int, p
     for k in range(padded):
         for i in range(points):
             j = i
-            while j > 0 and point_costs[order[j - 1] * padded + k] < point_costs[i * padded + k]:
+            cost = point_costs[i * padded + k]
+            while j > 0:
+                before = point_costs[order[j - 1] * padded + k]
+                # What is no number comes first: a sequence without a cost under some point has none.
+                if math.isnan(before) or before >= cost:
+                    break
                 order[j] = order[j - 1]
                 j -= 1
             order[j] = i

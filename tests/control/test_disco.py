@@ -229,6 +229,10 @@ def test_without_a_valid_control_it_ramps_to_zero_then_says_so_then_recovers(bro
     for t in (1, 3, 5):
         plan = disco.plan(t * PERIOD_NS, bad)
         assert plan.diagnostics.outcome is Outcome.STOPPING
+        # Nothing of the last step that had samples is told of one that has none.
+        assert (plan.diagnostics.ess, plan.diagnostics.valid_samples, plan.diagnostics.collapsed) == (0.0, 0, True)
+        assert math.isnan(plan.diagnostics.cost_min)
+        assert math.isnan(plan.diagnostics.cost_mean)
         assert plan.diagnostics.valid_samples == 0
         assert np.isfinite(plan.wheel_speeds).all()
         assert np.abs(plan.wheel_speeds).max() <= 3.0

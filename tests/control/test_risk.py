@@ -51,6 +51,16 @@ def test_a_vanishing_part_is_the_worst_point(case):
     np.testing.assert_allclose(costs, point_costs.max(axis=0), rtol=1e-6)
 
 
+@pytest.mark.parametrize("place", [0, 3, 6])
+@pytest.mark.parametrize("part", [1e-6, 0.25])
+def test_a_point_under_which_a_sequence_has_no_cost_is_its_worst(case, part, place):
+    point_costs, weights = case
+    point_costs[place, 5] = np.nan
+    costs = aligned_zeros(B)
+    run_worst(costs, point_costs.ravel(), weights, 1, np.float32(part), np.zeros(7, np.int64))
+    assert np.flatnonzero(np.isnan(costs)).tolist() == [5]
+
+
 def test_points_of_weight_zero_do_not_count(case):
     point_costs, weights = case
     weights[0], point_costs[0] = 0.0, 1e3

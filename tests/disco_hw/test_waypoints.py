@@ -1,9 +1,15 @@
 """Way-points from a CSV: read by name, refused in one line with place and remedy."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
+from cantools.database import load_file
 
+import firmware_protocol
+from disco_hw.config import FARTHEST_M
 from disco_hw.errors import InputError
+from disco_hw.estimation.gate import MAX_POSITION_M
 from disco_hw.waypoints import load_waypoints, way_points_to_follow, way_points_to_meet
 
 
@@ -60,6 +66,8 @@ def test_lines_are_counted_as_an_editor_does_and_a_spreadsheets_mark_is_no_name(
         ),
         ("x_m,y_m\n0,0\n0.05,0\n", "0.05 m long; between 0.1 and 2000 m"),
         ("x_m,y_m\n0,0\n1e30,0\n", "long; between 0.1 and 2000 m"),
+        ("x_m,y_m\n0,0\n1,-839\n", "line 3: y_m: -839, and poses go 838 m from the origin at most"),
+        ("x_m,y_m\n500000,838\n500010,838\n", "line 2: x_m: 500000, and poses go.*in the frame of the poses"),
         ("x_m,y_m\n" + "".join(f"{0.001 * k},0\n" for k in range(10_001)), "10001 way-points; write at most 10000"),
     ],
 )
@@ -100,3 +108,12 @@ def test_what_a_robot_cannot_meet_is_refused(tmp_path, text, fault):
         meet(tmp_path, text)
     assert str(tmp_path / "path.csv") in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_a_pose_can_be_told_wherever_a_robot_is_asked_to_go():
+    database = load_file(Path(firmware_protocol.__file__).parent / "disco_robot.dbc")
+    position = database.get_message_by_name("POSE_POSITION")
+    for name in "xy":
+        signal = position.get_signal_by_name(name)
+        assert signal.minimum < -FARTHEST_M < FARTHEST_M < signal.maximum
+    assert FARTHEST_M < MAX_POSITION_M

@@ -251,7 +251,8 @@ def _nearby(path: Path, block: int, reach: int) -> _Nearby:
         first, end = max(first, 0), min(end, count)
     at = np.arange(first, end) % count
     here, there = table[at, :2], table[at + 1, :2]
-    origin = table[block * NEAR % count, :2]
+    # An open path's last entry is one of its own: it is not the first.
+    origin = table[block * NEAR % count if path.closed else block * NEAR, :2]
     pieces = np.hstack([here - origin, there - here]).astype(np.float32)
     x_m, y_m = origin.tolist()
     return _Nearby(pieces.reshape(-1), first, (x_m, y_m))

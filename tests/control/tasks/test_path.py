@@ -205,6 +205,15 @@ def test_rollouts_are_relative_to_a_point_nearby_and_see_what_they_can_reach():
     assert line.prepare(0.0, 1899.0, 0.0, None, 0.1, 50).terms.last * line.spacing_m == pytest.approx(1.0, abs=0.1)
 
 
+@pytest.mark.parametrize("length_m", [1000.0, 1000.3])
+def test_rollouts_at_the_end_of_a_long_path_are_relative_to_a_point_nearby(length_m):
+    path = Path(Waypoints(np.array([[-length_m, 0.0], [0.0, 0.0]])))
+    prepared = path.prepare(0.0, 0.0, 0.0, None, 0.1, 50)
+    assert prepared.memory == len(path.table) - 1
+    assert np.hypot(*prepared.origin_m) < 1.0
+    assert np.abs(prepared.terms.table).max() < 60.0
+
+
 def test_a_closed_path_goes_on_past_its_first_way_point_however_short_it_is():
     ring = Path(Waypoints(0.3 * ROUND.places_m))
     prepared = ring.prepare(0.0, 0.3, 0.3, None, 0.1, 50)
