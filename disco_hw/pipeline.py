@@ -11,6 +11,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
+import msgspec
+
 from disco_hw.control import NoValidControl, Plan, PlannerState, Rollouts, SentCommand, Task
 from disco_hw.daemon.governor import Governed, Governor
 from disco_hw.estimation import Estimate, OdometryParameters, PoseFusion, PoseUpdate
@@ -97,8 +99,7 @@ class Source(enum.Enum):
 Motion = Off | Stand | FollowTask | Manual
 
 
-@dataclass(frozen=True, slots=True)
-class Tick:
+class Tick(msgspec.Struct, frozen=True, gc=False):
     """What one tick made of its samples.
 
     `plan` is this tick's new plan or None, `plan_age_ns` the age of the one in force, `planner_failure` why there is no

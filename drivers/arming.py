@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+
+import msgspec
 
 from drivers import words
 from drivers.types import Request
@@ -16,8 +17,7 @@ _LATCHED = ("FAULT", "ESTOP")
 _SESSIONS = 255
 
 
-@dataclass(frozen=True, slots=True)
-class HostState:
+class HostState(msgspec.Struct, frozen=True, gc=False):
     """What HOST_STATE is to say."""
 
     request: str
@@ -52,6 +52,7 @@ class Arming:
         self._reject_reason = "NONE"
         self._blockers: tuple[str, ...] = ()
         self._challenge = (0, 0)
+        self._answer = challenge_answer(0, 0, dbc_hash)
 
     @property
     def armed(self) -> bool:
@@ -111,7 +112,9 @@ class Arming:
 
     def take_session(self, challenge: int, session: int, blockers: tuple[str, ...], now_ns: int) -> None:
         """Take in SESSION_STATE; `blockers` by the names of the DBC's value table."""
-        self._challenge = (challenge, session)
+        if self._challenge != (challenge, session):
+            self._challenge = (challenge, session)
+            self._answer = challenge_answer(challenge, session, self._dbc_hash)
         self._blockers = blockers
         refused = "SESSION" in blockers and self._robot_state == "STANDBY" and self.session != 0
         if refused and now_ns - self._session_since_ns > SESSION_REFUSED_AFTER_NS:
@@ -135,10 +138,9 @@ class Arming:
             return HostState("STANDBY", self.session, 0)
         if self.wanted is Request.RESET:
             return HostState("RESET", self.session, 0)
-        challenge, session = self._challenge
-        may_answer = self._ours and session == self.session and self._robot_state in _OPEN
+        may_answer = self._ours and self._challenge[1] == self.session and self._robot_state in _OPEN
         if self.wanted is Request.ARM and may_answer:
-            return HostState("ARM", session, challenge_answer(challenge, session, self._dbc_hash))
+            return HostState("ARM", self.session, self._answer)
         return HostState("READY", self.session, 0)
 
     def _choose_session(self, now_ns: int) -> None:

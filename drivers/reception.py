@@ -13,6 +13,8 @@ _SLOW = frozenset({"POWER", "LINK_HEALTH"})
 _ANSWERS = frozenset({"HELLO", "BUILD", "LIMITS", "TIME_RESPONSE", "PARAM_RESPONSE", "MAC_CHALLENGE"})
 _SENDERS = {layout.name: layout.sender for layout in PROTOCOL.messages}
 _USABLE = (E2EStatus.OK, E2EStatus.OK_SOME_LOST)
+_REJECTED = (E2EStatus.REPEATED, E2EStatus.WRONG_SEQUENCE)
+_AFTER_A_GAP = (E2EStatus.OK_SOME_LOST, E2EStatus.WRONG_SEQUENCE)
 
 
 class FrameReception:
@@ -52,7 +54,7 @@ class FrameReception:
             receiver = self._receiver(decoded.name)
             status = receiver.check(decoded.counter, True, received.t_ns)
             self._count_lost(decoded, status)
-            if status in (E2EStatus.REPEATED, E2EStatus.WRONG_SEQUENCE):
+            if status in _REJECTED:
                 self.rejected_sequence += 1
             if not (receiver.qualified and status in _USABLE):
                 return None
@@ -78,5 +80,5 @@ class FrameReception:
     def _count_lost(self, decoded: Decoded, status: E2EStatus) -> None:
         previous = self._counters.get(decoded.name)
         self._counters[decoded.name] = decoded.counter
-        if previous is not None and status in (E2EStatus.OK_SOME_LOST, E2EStatus.WRONG_SEQUENCE):
+        if previous is not None and status in _AFTER_A_GAP:
             self.lost += (decoded.counter - previous) % COUNTER_MODULUS - 1

@@ -11,25 +11,24 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
+import msgspec
 
-@dataclass(frozen=True, slots=True)
-class Frame:
+
+class Frame(msgspec.Struct, frozen=True, gc=False):
     """One classic CAN data frame with an 11-bit identifier; serial links tunnel the same frame."""
 
     can_id: int
     data: bytes
 
 
-@dataclass(frozen=True, slots=True)
-class ReceivedFrame:
+class ReceivedFrame(msgspec.Struct, frozen=True, gc=False):
     """A frame as it came in, with the host time of its reception (from the kernel where the medium gives one)."""
 
     t_ns: int
     frame: Frame
 
 
-@dataclass(frozen=True, slots=True)
-class OutgoingFrame:
+class OutgoingFrame(msgspec.Struct, frozen=True, gc=False):
     """A frame to send, and the host time after which it must be dropped instead of sent late."""
 
     frame: Frame
@@ -98,8 +97,7 @@ class Transport(Protocol):
         """Stop the thread and release the medium; safe to call twice."""
 
 
-@dataclass(frozen=True, slots=True)
-class WheelCommand:
+class WheelCommand(msgspec.Struct, frozen=True, gc=False):
     """Wheel speeds to hold for at most `valid_for_s` after reception."""
 
     left_rad_s: float
@@ -107,8 +105,7 @@ class WheelCommand:
     valid_for_s: float
 
 
-@dataclass(frozen=True, slots=True)
-class WheelSample:
+class WheelSample(msgspec.Struct, frozen=True, gc=False):
     """Wheel angles and speeds of one instant; angles are cumulative and do not wrap."""
 
     t_ns: int
@@ -119,8 +116,7 @@ class WheelSample:
     right_speed_rad_s: float
 
 
-@dataclass(frozen=True, slots=True)
-class PoseSample:
+class PoseSample(msgspec.Struct, frozen=True, gc=False):
     """A measured pose in the world frame; `t_ns` is when it was true, `received_ns` when it arrived."""
 
     t_ns: int
@@ -132,8 +128,7 @@ class PoseSample:
     yaw_std_rad: float
 
 
-@dataclass(frozen=True, slots=True)
-class MotorSample:
+class MotorSample(msgspec.Struct, frozen=True, gc=False):
     """Motor currents and temperatures."""
 
     t_ns: int
@@ -143,8 +138,7 @@ class MotorSample:
     right_temperature_c: float
 
 
-@dataclass(frozen=True, slots=True)
-class PowerSample:
+class PowerSample(msgspec.Struct, frozen=True, gc=False):
     """Battery voltage, current and temperature."""
 
     t_ns: int
@@ -153,8 +147,7 @@ class PowerSample:
     temperature_c: float
 
 
-@dataclass(frozen=True, slots=True)
-class RobotStatus:
+class RobotStatus(msgspec.Struct, frozen=True, gc=False):
     """What the robot's controller says of itself; names are those of the DBC's value tables."""
 
     t_ns: int
@@ -168,8 +161,7 @@ class RobotStatus:
     reject_reason: str
 
 
-@dataclass(frozen=True, slots=True)
-class RobotLinkHealth:
+class RobotLinkHealth(msgspec.Struct, frozen=True, gc=False):
     """The robot's own count of trouble on the link."""
 
     t_ns: int
@@ -198,8 +190,7 @@ class Capabilities:
     stop_deceleration_rad_s2: float
 
 
-@dataclass(frozen=True, slots=True)
-class Readings:
+class Readings(msgspec.Struct, frozen=True, gc=False):
     """Everything that one batch of received frames meant, oldest first."""
 
     wheels: tuple[WheelSample, ...] = ()

@@ -62,15 +62,28 @@ class _Plan(msgspec.Struct, frozen=True):
     float_rows: tuple[tuple[str, int], ...]
 
 
+class _Slot(msgspec.Struct, frozen=True):
+    """What encoding one signal needs, worked out beforehand; raw values lie between `least` and `most`."""
+
+    signal: SignalLayout
+    name: str
+    page: int | None
+    shift: int
+    least: int
+    most: int
+    values: dict[str, int]
+
+
 class Codec:
     """The packaged DBC as an encoder and a decoder; it has no state between frames."""
 
-    __slots__ = ("_by_id", "_by_name", "dbc_hash")
+    __slots__ = ("_by_id", "_by_name", "_slots", "dbc_hash")
 
     def __init__(self) -> None:
         self.dbc_hash = PROTOCOL.dbc_hash
         self._by_id = {layout.can_id: _plan(layout) for layout in PROTOCOL.messages}
         self._by_name = {layout.name: layout for layout in PROTOCOL.messages}
+        self._slots = {layout.name: _slots(layout) for layout in PROTOCOL.messages}
 
     def can_id(self, name: str) -> int:
         """Return the CAN identifier of a message. Raises ValueError for a name that is not in the DBC."""
@@ -86,7 +99,10 @@ class Codec:
 
     def choice_value(self, message: str, signal: str, name: str) -> int:
         """Return the value of a name in a signal's value table. Raises ValueError if the table does not have it."""
-        return _choice_value(self._signal(message, signal), name)
+        values = _choice_values(self._signal(message, signal))
+        if name not in values:
+            raise ValueError(f"signal {signal} has no value named {name!r}")
+        return values[name]
 
     def encode(self, name: str, counter: int = 0, **signals: float | str) -> EncodedFrame:
         """Pack physical values (or names of a value table) and fill in the E2E header where the message has one.
@@ -99,16 +115,14 @@ class Codec:
         page = signals.get(layout.page_signal) if layout.page_signal else None
         remaining = dict(signals)
         bits = 0
-        for signal in layout.signals:
-            if signal.page is not None and signal.page != page:
-                continue
-            if layout.data_id is not None and signal.name in {"crc", "counter"}:
+        for slot in self._slots[name]:
+            if slot.page is not None and slot.page != page:
                 continue
             try:
-                value = remaining.pop(signal.name)
+                value = remaining.pop(slot.name)
             except KeyError:
-                raise ValueError(f"{name}: signal {signal.name} is missing") from None
-            bits |= _raw(name, signal, value) << signal.shift
+                raise ValueError(f"{name}: signal {slot.name} is missing") from None
+            bits |= _raw(name, slot, value) << slot.shift
         if remaining:
             raise ValueError(f"{name}: no such signal: {', '.join(remaining)}")
         if layout.data_id is None:
@@ -182,25 +196,43 @@ def _plan(layout: MessageLayout) -> _Plan:
     )
 
 
-def _choice_value(signal: SignalLayout, name: str) -> int:
-    for value, known in signal.choices.items():
-        if known == name:
-            return value
-    raise ValueError(f"signal {signal.name} has no value named {name!r}")
+def _slots(layout: MessageLayout) -> tuple[_Slot, ...]:
+    filled_in = {"crc", "counter"} if layout.data_id is not None else set()
+    return tuple(
+        _Slot(
+            signal=signal,
+            name=signal.name,
+            page=signal.page,
+            shift=signal.shift,
+            least=round(signal.minimum / signal.scale),
+            most=round(signal.maximum / signal.scale),
+            values=_choice_values(signal),
+        )
+        for signal in layout.signals
+        if signal.name not in filled_in
+    )
 
 
-def _raw(message: str, signal: SignalLayout, value: float | str) -> int:
+def _choice_values(signal: SignalLayout) -> dict[str, int]:
+    return {name: value for value, name in signal.choices.items()}
+
+
+def _raw(message: str, slot: _Slot, value: float | str) -> int:
     """Return the signal's bits, unshifted; rounds halves up, as the C core does."""
-    number = _choice_value(signal, value) if isinstance(value, str) else value
-    if not math.isfinite(number):
-        raise ValueError(f"{message}.{signal.name}: {number} is not finite")
+    signal = slot.signal
+    if isinstance(value, str):
+        if value not in slot.values:
+            raise ValueError(f"signal {slot.name} has no value named {value!r}")
+        value = slot.values[value]
+    if not math.isfinite(value):
+        raise ValueError(f"{message}.{slot.name}: {value} is not finite")
     if signal.is_float:
-        if not signal.minimum <= number <= signal.maximum:
-            raise ValueError(f"{message}.{signal.name}: {number} is not within {signal.minimum} to {signal.maximum}")
-        return int.from_bytes(_FLOAT.pack(number), "little")
-    raw = math.floor(number / signal.scale + 0.5)
-    if not round(signal.minimum / signal.scale) <= raw <= round(signal.maximum / signal.scale):
+        if not signal.minimum <= value <= signal.maximum:
+            raise ValueError(f"{message}.{slot.name}: {value} is not within {signal.minimum} to {signal.maximum}")
+        return int.from_bytes(_FLOAT.pack(value), "little")
+    raw = math.floor(value / signal.scale + 0.5)
+    if not slot.least <= raw <= slot.most:
         raise ValueError(
-            f"{message}.{signal.name}: {number} {signal.unit} is not within {signal.minimum} to {signal.maximum}"
+            f"{message}.{slot.name}: {value} {signal.unit} is not within {signal.minimum} to {signal.maximum}"
         )
     return raw & ((1 << signal.width) - 1)

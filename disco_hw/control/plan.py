@@ -16,8 +16,7 @@ class NoValidControl(Exception):  # noqa: N818
     """No command sequence with a finite cost was found, after every retry; the message says what was tried."""
 
 
-@dataclass(frozen=True, slots=True)
-class SentCommand:
+class SentCommand(msgspec.Struct, frozen=True, gc=False):
     """Wheel speeds (rad/s) commanded from `t_ns` on."""
 
     t_ns: int
@@ -25,8 +24,7 @@ class SentCommand:
     right_rad_s: float
 
 
-@dataclass(frozen=True, slots=True)
-class PlannerState:
+class PlannerState(msgspec.Struct, frozen=True, gc=False):
     """Pose in the world frame and measured wheel speeds at `t_ns`, and the commands sent up to now, oldest first.
 
     `elapsed_s`: time since the drive began, for effects that depend on it; None counts from the planner's start.

@@ -6,7 +6,8 @@ The real-time shell and the harness in simulated time run this same object.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+
+import msgspec
 
 from disco_hw.adapt.adaptation import Adaptation, NoAdaptation
 from disco_hw.config import RobotConfig, RobotTask
@@ -37,8 +38,7 @@ STATUS_HOLDS_NS = 500_000_000
 _FOLLOW_TASK = FollowTask()
 
 
-@dataclass(frozen=True, slots=True)
-class CoreTick:
+class CoreTick(msgspec.Struct, frozen=True, gc=False):
     """What one tick did: the supervisor's verdict, the pipeline's work, the command sent (None if none was)."""
 
     output: Output

@@ -10,6 +10,8 @@ import enum
 import math
 from dataclasses import dataclass
 
+import msgspec
+
 # A tick that comes late may move the command by half a period more than usual, never by the whole time missed.
 _LARGEST_STEP_PERIODS = 1.5
 
@@ -39,8 +41,7 @@ class WheelLimits:
                 raise ValueError(f"{name} must be positive and finite, not {value}")
 
 
-@dataclass(frozen=True, slots=True)
-class Governed:
+class Governed(msgspec.Struct, frozen=True, gc=False):
     """The command that may be sent (rad/s, left before right) and why it is not the desired one."""
 
     left_rad_s: float

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -84,7 +85,7 @@ def tick(result: Tick, command: WheelCommand | None, valid_for_s: float) -> Iter
         valid_for_s=valid_for_s,
         in_force=command is not None and result.source is not Source.OFF,
         source=result.source.value,
-        limits=tuple(flag.name or "" for flag in Limited if flag in governed.limited),
+        limits=_names(governed.limited),
     )
 
 
@@ -105,6 +106,11 @@ def _innovation(update: PoseUpdate) -> records.Record:
         accepted=update.accepted,
         reason=update.reason.value,
     )
+
+
+@functools.cache
+def _names(limited: Limited) -> tuple[str, ...]:
+    return tuple(flag.name or "" for flag in Limited if flag in limited)
 
 
 def _plain(values: NDArray[np.float64]) -> tuple[float, ...]:

@@ -101,15 +101,16 @@ TRANSITIONS: tuple[Transition, ...] = (
 )
 
 
-_ROWS_FROM = {state: tuple(row for row in TRANSITIONS if state in row.sources) for state in State}
+# On the integers below the flags: this runs in every tick, and flags cost a microsecond an operation.
+_ROWS_FROM = {
+    state: tuple((row.needs.value, row.blocked_by.value, row) for row in TRANSITIONS if state in row.sources)
+    for state in State
+}
 
 
-def next_transition(state: State, conditions: Condition) -> Transition | None:
-    """Return the first row that leads out of `state` under `conditions`, or None to stay."""
-    held = conditions.value
-    for row in _ROWS_FROM[state]:
-        # On the integers below the flags: this runs in every tick, and flags cost a microsecond an operation.
-        needs, blocked_by = row.needs.value, row.blocked_by.value
+def next_transition(state: State, held: int) -> Transition | None:
+    """Return the first row that leads out of `state`, or None to stay; `held` is the value of all that is true now."""
+    for needs, blocked_by, row in _ROWS_FROM[state]:
         if held & needs == needs and not held & blocked_by:
             return row
     return None

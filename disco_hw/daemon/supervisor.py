@@ -6,12 +6,35 @@ import enum
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+import msgspec
+
 from disco_hw.daemon.states import PROBLEM, Condition, State, Transition, next_transition
 from drivers.types import DriverState, LinkState, Request
 
 _IDLE = frozenset({DriverState.STANDBY, DriverState.READY})
 _MAY_MOVE = frozenset({DriverState.ARMING, DriverState.ARMED, DriverState.STOPPING})
-_ROBOT_TROUBLE = Condition.ROBOT_ESTOP | Condition.ROBOT_FAULT | Condition.ROBOT_REFUSED
+# Conditions as integers: flags cost a microsecond an operation in Python 3.11, and this runs in every tick.
+_LINK_UP = Condition.LINK_UP.value
+_LINK_RENEWED = Condition.LINK_RENEWED.value
+_ROBOT_TALKS = Condition.ROBOT_TALKS.value
+_ROBOT_IDLE = Condition.ROBOT_IDLE.value
+_ROBOT_ARMED = Condition.ROBOT_ARMED.value
+_ROBOT_MAY_MOVE = Condition.ROBOT_MAY_MOVE.value
+_ROBOT_REFUSED = Condition.ROBOT_REFUSED.value
+_ROBOT_FAULT = Condition.ROBOT_FAULT.value
+_ROBOT_ESTOP = Condition.ROBOT_ESTOP.value
+_TELEMETRY_FRESH = Condition.TELEMETRY_FRESH.value
+_TELEMETRY_LOST = Condition.TELEMETRY_LOST.value
+_WHEELS_STILL = Condition.WHEELS_STILL.value
+_ARM_PENDING = Condition.ARM_PENDING.value
+_DISARM_ASKED = Condition.DISARM_ASKED.value
+_ESTOP_ASKED = Condition.ESTOP_ASKED.value
+_RESET_PENDING = Condition.RESET_PENDING.value
+_PREFLIGHT_ERROR = Condition.PREFLIGHT_ERROR.value
+_DAEMON_ERROR = Condition.DAEMON_ERROR.value
+_ROBOT_TROUBLE = _ROBOT_ESTOP | _ROBOT_FAULT | _ROBOT_REFUSED
+_MOVABLE = _TELEMETRY_FRESH | _ROBOT_ARMED
+_PROBLEM = PROBLEM.value
 
 
 class UserRequest(enum.Enum):
@@ -37,8 +60,7 @@ class SupervisorSettings:
     reset_timeout_s: float = 3.0
 
 
-@dataclass(frozen=True, slots=True)
-class Inputs:
+class Inputs(msgspec.Struct, frozen=True, gc=False):
     """Everything the supervisor looks at in one tick.
 
     `telemetry_age_s` is the age of the newest wheel sample, None before the first; `wheel_speed_rad_s` the larger
@@ -59,8 +81,7 @@ class Inputs:
     task_finished: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class Reply:
+class Reply(msgspec.Struct, frozen=True, gc=False):
     """The answer to one request, in words; accepted means begun, `Output.state` tells when it is done."""
 
     request: UserRequest
@@ -68,8 +89,7 @@ class Reply:
     text: str
 
 
-@dataclass(frozen=True, slots=True)
-class Output:
+class Output(msgspec.Struct, frozen=True, gc=False):
     """What holds for this tick.
 
     `driver_request`: to be handed to the driver; None leaves the last one. `motion_allowed`: the plan may drive the
@@ -135,7 +155,7 @@ class Supervisor:
         row = next_transition(before, seen | self._asked())
         if row is not None:
             self._enter(row)
-        if self._state is State.FAULT and PROBLEM & (seen | self._asked()):
+        if self._state is State.FAULT and _PROBLEM & (seen | self._asked()):
             self._trouble = self._words(inputs)
         if row is not None:
             words = f": {self._trouble}" if row.target is State.FAULT else ""
@@ -143,43 +163,38 @@ class Supervisor:
         self._mind_task(inputs)
         return self._output(inputs, seen, replies)
 
-    def _observe(self, inputs: Inputs) -> Condition:
+    def _observe(self, inputs: Inputs) -> int:
         """Return the conditions that the inputs alone decide."""
-        robot, age_s = inputs.driver_state, inputs.telemetry_age_s
+        age_s = inputs.telemetry_age_s
         link_up = inputs.link_state is LinkState.UP
-        flags = (
-            (Condition.LINK_UP, link_up),
-            (Condition.LINK_RENEWED, link_up and inputs.link_generation != self._generation),
-            (Condition.ROBOT_TALKS, robot in _IDLE | _MAY_MOVE),
-            (Condition.ROBOT_IDLE, robot in _IDLE),
-            (Condition.ROBOT_ARMED, robot is DriverState.ARMED),
-            (Condition.ROBOT_MAY_MOVE, robot in _MAY_MOVE),
-            (Condition.ROBOT_REFUSED, robot is DriverState.REFUSED),
-            (Condition.ROBOT_FAULT, robot is DriverState.FAULT),
-            (Condition.ROBOT_ESTOP, robot is DriverState.ESTOP),
-            # Written so that an age or a speed that is not a number counts as no telemetry and as moving.
-            (Condition.TELEMETRY_FRESH, age_s is not None and age_s <= self._settings.telemetry_zero_s),
-            (Condition.TELEMETRY_LOST, age_s is None or not age_s <= self._settings.telemetry_disarm_s),
-            (Condition.WHEELS_STILL, inputs.wheel_speed_rad_s < self._settings.still_rad_s),
-            (Condition.PREFLIGHT_ERROR, bool(inputs.preflight_errors)),
-            (Condition.DAEMON_ERROR, inputs.daemon_error is not None),
+        seen = _SAID_BY[inputs.driver_state] | _union(
+            (
+                (_LINK_UP, link_up),
+                (_LINK_RENEWED, link_up and inputs.link_generation != self._generation),
+                # Written so that an age or a speed that is not a number counts as no telemetry and as moving.
+                (_TELEMETRY_FRESH, age_s is not None and age_s <= self._settings.telemetry_zero_s),
+                (_TELEMETRY_LOST, age_s is None or not age_s <= self._settings.telemetry_disarm_s),
+                (_WHEELS_STILL, inputs.wheel_speed_rad_s < self._settings.still_rad_s),
+                (_PREFLIGHT_ERROR, bool(inputs.preflight_errors)),
+                (_DAEMON_ERROR, inputs.daemon_error is not None),
+            )
         )
         if link_up:
             self._generation = inputs.link_generation
-        return _union(flags)
+        return seen
 
-    def _asked(self) -> Condition:
+    def _asked(self) -> int:
         """Return the conditions that requests have set."""
         return _union(
             (
-                (Condition.ARM_PENDING, self._arming is not None),
-                (Condition.DISARM_ASKED, self._disarm_asked),
-                (Condition.ESTOP_ASKED, self._estop_asked),
-                (Condition.RESET_PENDING, self._resetting is not None),
+                (_ARM_PENDING, self._arming is not None),
+                (_DISARM_ASKED, self._disarm_asked),
+                (_ESTOP_ASKED, self._estop_asked),
+                (_RESET_PENDING, self._resetting is not None),
             )
         )
 
-    def _answer(self, now_ns: int, request: UserRequest, estop_now: bool, inputs: Inputs, seen: Condition) -> Reply:
+    def _answer(self, now_ns: int, request: UserRequest, estop_now: bool, inputs: Inputs, seen: int) -> Reply:
         """Take up or refuse one request, in words; an e-stop beats all that could lead to motion in the same tick."""
         refusal: str | None = None
         text = ""
@@ -187,7 +202,7 @@ class Supervisor:
             case UserRequest.ESTOP:
                 self._estop_asked, self._resetting = True, None
                 self._drop_pending("e-stop")
-                text = "e-stop" if Condition.LINK_UP in seen else "e-stop held; it is sent when the link is up"
+                text = "e-stop" if seen & _LINK_UP else "e-stop held; it is sent when the link is up"
             case UserRequest.DISARM:
                 self._disarm_asked = True
                 self._drop_pending("disarm")
@@ -211,13 +226,13 @@ class Supervisor:
                 text = "resetting"
         return Reply(request, refusal is None, text if refusal is None else refusal)
 
-    def _why_not_arm(self, inputs: Inputs, seen: Condition) -> str | None:
+    def _why_not_arm(self, inputs: Inputs, seen: int) -> str | None:
         match self._state:
             case State.ARMED:
                 return None
-            case State.READY if Condition.TELEMETRY_FRESH not in seen:
+            case State.READY if not seen & _TELEMETRY_FRESH:
                 return "no fresh wheel samples"
-            case State.READY if Condition.WHEELS_STILL not in seen:
+            case State.READY if not seen & _WHEELS_STILL:
                 return "the wheels are turning; wait until they stand still"
             case State.READY:
                 return None
@@ -228,32 +243,32 @@ class Supervisor:
             case State.DISCONNECTED | State.HANDSHAKE:
                 return f"not connected to the robot: {self._words(inputs)}"
 
-    def _why_not_start(self, inputs: Inputs, seen: Condition) -> str | None:
+    def _why_not_start(self, inputs: Inputs, seen: int) -> str | None:
         if self._state is not State.ARMED and self._arming is None:
             return "not armed; arm first"
-        if self._state is State.ARMED and Condition.TELEMETRY_FRESH not in seen:
+        if self._state is State.ARMED and not seen & _TELEMETRY_FRESH:
             return "no fresh wheel samples"
         if self._settings.pose_required and not inputs.pose_ok:
             return "no pose; check the pose sensor, or set estimation.pose_required = false"
         return None
 
-    def _why_not_reset(self, inputs: Inputs, seen: Condition) -> str | None:
+    def _why_not_reset(self, inputs: Inputs, seen: int) -> str | None:
         if self._state is not State.FAULT:
             return f"nothing to reset in state {self._state.value}"
         if inputs.daemon_error is not None:
             return f"the daemon failed ({inputs.daemon_error}); restart it"
         if inputs.preflight_errors:
             return f"{inputs.preflight_errors[0]}; mend it and restart the daemon"
-        if self._estop_asked and Condition.ROBOT_ESTOP not in seen:
+        if self._estop_asked and not seen & _ROBOT_ESTOP:
             return "the robot has not confirmed the e-stop yet"
         return None
 
-    def _drop_what_failed(self, now_ns: int, inputs: Inputs, seen: Condition) -> None:
+    def _drop_what_failed(self, now_ns: int, inputs: Inputs, seen: int) -> None:
         """End requests to the robot that it refused or did not answer in time."""
         arming, resetting = self._arming, self._resetting
         if arming is not None:
             arming.begun = arming.begun or inputs.driver_state is DriverState.ARMING
-            if arming.begun and Condition.ROBOT_IDLE in seen:
+            if arming.begun and seen & _ROBOT_IDLE:
                 self._drop_pending(f"the robot did not arm: {inputs.driver_detail}")
             elif now_ns - arming.since_ns > self._settings.arming_timeout_s * 1e9:
                 self._drop_pending(f"not armed within {self._settings.arming_timeout_s:g} s: {inputs.driver_detail}")
@@ -308,11 +323,11 @@ class Supervisor:
             return "e-stop requested here"
         return inputs.driver_detail
 
-    def _detail(self, inputs: Inputs, seen: Condition) -> str:
+    def _detail(self, inputs: Inputs, seen: int) -> str:
         match self._state:
             case State.READY:
                 return "arming" if self._arming is not None else "ready to be armed"
-            case State.ARMED if Condition.TELEMETRY_FRESH not in seen:
+            case State.ARMED if not seen & _TELEMETRY_FRESH:
                 return "no fresh wheel samples: holding zero"
             case State.ARMED:
                 return "running the task" if self._running else "armed, holding zero"
@@ -323,13 +338,13 @@ class Supervisor:
             case State.DISCONNECTED | State.HANDSHAKE:
                 return self._words(inputs)
 
-    def _output(self, inputs: Inputs, seen: Condition, replies: tuple[Reply, ...]) -> Output:
+    def _output(self, inputs: Inputs, seen: int, replies: tuple[Reply, ...]) -> Output:
         armed = self._state is State.ARMED
-        may_move = Condition.TELEMETRY_FRESH | Condition.ROBOT_ARMED in seen
+        may_move = seen & _MOVABLE == _MOVABLE
         motion_allowed = armed and self._running and may_move
-        stopping = self._state in {State.STOPPING, State.FAULT}
+        stopping = self._state in (State.STOPPING, State.FAULT)
         # With telemetry lost nothing is sent any more: the robot's own watchdog then stops it by a second way.
-        braking = stopping and Condition.ROBOT_ARMED in seen and Condition.TELEMETRY_LOST not in seen
+        braking = stopping and seen & (_ROBOT_ARMED | _TELEMETRY_LOST) == _ROBOT_ARMED
         return Output(
             state=self._state,
             detail=self._detail(inputs, seen),
@@ -337,13 +352,13 @@ class Supervisor:
             motion_allowed=motion_allowed,
             zero_only=(armed and not motion_allowed) or braking,
             running=self._running,
-            send_estop=self._estop_asked and Condition.LINK_UP in seen and Condition.ROBOT_ESTOP not in seen,
-            estop=self._estop_asked or Condition.ROBOT_ESTOP in seen,
+            send_estop=self._estop_asked and seen & (_LINK_UP | _ROBOT_ESTOP) == _LINK_UP,
+            estop=self._estop_asked or bool(seen & _ROBOT_ESTOP),
             events=tuple(self._events),
             replies=replies,
         )
 
-    def _driver_request(self, seen: Condition) -> Request | None:
+    def _driver_request(self, seen: int) -> Request | None:
         """Return what to ask of the driver; ARM and RESET once each, as the driver holds or consumes them."""
         if self._state is State.ARMED:
             return None
@@ -362,5 +377,23 @@ def _once(pending: _Pending, request: Request) -> Request | None:
     return request
 
 
-def _union(flags: Iterable[tuple[Condition, bool]]) -> Condition:
-    return Condition(sum(flag.value for flag, holds in flags if holds))
+def _union(flags: Iterable[tuple[int, bool]]) -> int:
+    return sum([flag for flag, holds in flags if holds])
+
+
+def _said_by(robot: DriverState) -> int:
+    """The conditions that the driver's state alone decides."""
+    return _union(
+        (
+            (_ROBOT_TALKS, robot in _IDLE | _MAY_MOVE),
+            (_ROBOT_IDLE, robot in _IDLE),
+            (_ROBOT_ARMED, robot is DriverState.ARMED),
+            (_ROBOT_MAY_MOVE, robot in _MAY_MOVE),
+            (_ROBOT_REFUSED, robot is DriverState.REFUSED),
+            (_ROBOT_FAULT, robot is DriverState.FAULT),
+            (_ROBOT_ESTOP, robot is DriverState.ESTOP),
+        )
+    )
+
+
+_SAID_BY = {robot: _said_by(robot) for robot in DriverState}

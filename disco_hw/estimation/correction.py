@@ -17,6 +17,9 @@ Triple = tuple[float, float, float]
 # Added to the covariance at each correction: a thousand poses at standstill do not average away the sensor's bias, and
 # the covariance stays positive definite whatever is rounded. (0.05 mm)^2 and (0.05 mrad)^2.
 FLOOR_VARIANCE = 2.5e-9
+# The pose is what is measured.
+_IDENTITY = np.eye(3)
+_IDENTITY.flags.writeable = False
 
 
 class Correction(msgspec.Struct, frozen=True, gc=False):
@@ -49,15 +52,16 @@ class PoseCorrector:
         ekf = self._filter
         ekf.x = np.array((belief.x_m, belief.y_m, belief.yaw_rad))
         ekf.P = np.array(belief.covariance)
-        noise = np.diag((measurement.position_variance, measurement.position_variance, measurement.yaw_variance))
-        ekf.update(np.array((pose.x_m, pose.y_m, pose.yaw_rad)), _jacobian, _predicted, R=noise, residual=_residual)
+        position, yaw = measurement.position_variance, measurement.yaw_variance
+        ekf.R = np.array(((position, 0.0, 0.0), (0.0, position, 0.0), (0.0, 0.0, yaw)))
+        ekf.update(np.array((pose.x_m, pose.y_m, pose.yaw_rad)), _jacobian, _predicted, residual=_residual)
         if ekf.x.shape != (3,) or ekf.P.shape != (3, 3) or ekf.S.shape != (3, 3):
             raise AssertionError(f"filterpy returned shapes {ekf.x.shape}, {ekf.P.shape}, {ekf.S.shape}")
         x, y, yaw = ekf.x.tolist()
         covariance, sensitivity = ekf.P, None
         if belief.sensitivity is not None:
             # The parameters are not estimated: their part of the error shrinks like any other error of the pose.
-            part = (np.eye(3) - ekf.K) @ np.array(belief.sensitivity).reshape(3, 3)
+            part = (_IDENTITY - ekf.K) @ np.array(belief.sensitivity).reshape(3, 3)
             covariance = covariance - part @ part.T
             sensitivity = _flat(part)
         (xx, xy, xt), (_, yy, yt), (_, _, tt) = covariance.tolist()
@@ -88,7 +92,7 @@ def _flat(matrix: Vector) -> Flat9:
 
 
 def _jacobian(_state: Vector) -> Vector:
-    return np.eye(3)
+    return _IDENTITY
 
 
 def _predicted(state: Vector) -> Vector:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 
+import msgspec
+
 from disco_hw.config import Estimation
 from disco_hw.estimation.belief import MAX_POSITION_VARIANCE, MAX_YAW_VARIANCE
 from disco_hw.estimation.correction import Triple
@@ -19,8 +21,7 @@ INTERVAL_WEIGHT = 0.1
 _UNKNOWN: Matrix3 = ((MAX_POSITION_VARIANCE, 0.0, 0.0), (0.0, MAX_POSITION_VARIANCE, 0.0), (0.0, 0.0, MAX_YAW_VARIANCE))
 
 
-@dataclass(frozen=True, slots=True)
-class Estimate:
+class Estimate(msgspec.Struct, frozen=True, gc=False):
     """Where the tracked body point is at `t_ns`, and how well this is known.
 
     World frame; `covariance` of (x, y, yaw) is 3x3, rows of floats, m and rad, symmetric and positive definite.
@@ -58,8 +59,7 @@ class Estimate:
         return self.initialised and self.wheels_ok and self.pose_ok
 
 
-@dataclass(frozen=True, slots=True)
-class PoseUpdate:
+class PoseUpdate(msgspec.Struct, frozen=True, gc=False):
     """What a measured pose did.
 
     `innovation` is measured minus predicted (x m, y m, yaw rad), `innovation_variance` the diagonal of its covariance

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import fields, is_dataclass
 from typing import Any
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,7 +21,7 @@ def to_columns(record_type: type[Record], now_ns: Sequence[int], records: Sequen
     column `field.key` for every key found, float64 with NaN where a record lacks it.
     """
     columns: dict[str, Column] = {"now_ns": np.asarray(now_ns, dtype=np.int64)}
-    for name in _field_names(record_type):
+    for name in record_type.__struct_fields__:
         values = [getattr(record, name) for record in records]
         if values and isinstance(values[0], dict):
             for key in sorted({key for value in values for key in value}):
@@ -31,12 +29,6 @@ def to_columns(record_type: type[Record], now_ns: Sequence[int], records: Sequen
         else:
             columns[name] = _column(values)
     return columns
-
-
-def _field_names(record_type: type[Any]) -> tuple[str, ...]:
-    if is_dataclass(record_type):
-        return tuple(field.name for field in fields(record_type))
-    return tuple(field.name for field in msgspec.structs.fields(record_type))
 
 
 def _column(values: list[Any]) -> Column:

@@ -4,6 +4,7 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -94,21 +95,21 @@ def test_commands_stay_within_speed_and_acceleration():
 def test_the_first_command_is_tied_to_what_was_sent_and_to_the_measured_wheels():
     disco = planner(task=Circle(speed_m_s=3.0), limits=WheelLimits(8.0, 5.0))
     sent = (SentCommand(-PERIOD_NS, 4.0, 4.0),)
-    rolling = disco.plan(0, replace(TANGENT, left_speed_rad_s=4.0, right_speed_rad_s=4.0, sent=sent))
+    rolling = disco.plan(0, msgspec.structs.replace(TANGENT, left_speed_rad_s=4.0, right_speed_rad_s=4.0, sent=sent))
     assert np.all(np.abs(rolling.wheel_speeds[0] - 4.0) <= 0.5 + 1e-5)
     disco.reset()
-    blocked = disco.plan(0, replace(TANGENT, sent=sent))
+    blocked = disco.plan(0, msgspec.structs.replace(TANGENT, sent=sent))
     assert np.all(blocked.wheel_speeds[0] <= 1.0 + 1e-5)
 
 
 def test_shifting_by_fractions_continues_the_plan():
     disco = planner(gain_by_time=True)
     first = disco.plan(0, TANGENT)
-    second = disco.plan(20_000_000, replace(TANGENT, t_ns=20_000_000))
+    second = disco.plan(20_000_000, msgspec.structs.replace(TANGENT, t_ns=20_000_000))
     at = np.array([second.at(t) for t in range(100_000_000, 4_000_000_000, 100_000_000)])
     before = np.array([first.at(t) for t in range(100_000_000, 4_000_000_000, 100_000_000)])
     assert np.abs(at - before).max() < 0.5
-    again = disco.plan(20_000_000, replace(TANGENT, t_ns=20_000_000))
+    again = disco.plan(20_000_000, msgspec.structs.replace(TANGENT, t_ns=20_000_000))
     np.testing.assert_allclose(again.wheel_speeds, second.wheel_speeds, atol=1e-6)
 
 
@@ -223,9 +224,9 @@ def test_a_healthy_step_is_neither_retried_nor_collapsed():
 def test_without_a_valid_control_it_ramps_to_zero_then_says_so_then_recovers(broken):
     disco = planner(limits=WheelLimits(8.0, 10.0))
     sent = (SentCommand(-PERIOD_NS, 3.0, -2.0),)
-    good = replace(TANGENT, left_speed_rad_s=3.0, right_speed_rad_s=-2.0, sent=sent)
+    good = msgspec.structs.replace(TANGENT, left_speed_rad_s=3.0, right_speed_rad_s=-2.0, sent=sent)
     disco.plan(0, good)
-    bad = replace(good, **broken)
+    bad = msgspec.structs.replace(good, **broken)
     for t in (1, 3, 5):
         plan = disco.plan(t * PERIOD_NS, bad)
         assert plan.diagnostics.outcome is Outcome.STOPPING
@@ -278,7 +279,7 @@ def test_there_is_nothing_to_look_at_without_a_plan():
     assert len(disco.sampled_rollouts().weights) == 0
     disco.plan(0, TANGENT)
     assert len(disco.sampled_rollouts(7).weights) == 7
-    assert disco.plan(PERIOD_NS, replace(TANGENT, x_m=math.nan)).diagnostics.outcome is Outcome.STOPPING
+    assert disco.plan(PERIOD_NS, msgspec.structs.replace(TANGENT, x_m=math.nan)).diagnostics.outcome is Outcome.STOPPING
     assert len(disco.sampled_rollouts().weights) == 0
 
 
@@ -303,7 +304,7 @@ def test_a_belief_set_between_plans_keeps_the_plan_compiles_nothing_and_repeats(
         plans = [disco.plan(0, TANGENT)]
         compiled = len(replan.signatures)
         disco.set_belief(LEARNT)
-        plans.append(disco.plan(20_000_000, replace(TANGENT, t_ns=20_000_000)))
+        plans.append(disco.plan(20_000_000, msgspec.structs.replace(TANGENT, t_ns=20_000_000)))
         assert len(replan.signatures) == compiled
         assert plans[1].diagnostics.outcome is Outcome.PLANNED
         assert np.abs(plans[1].wheel_speeds - plans[0].wheel_speeds).max() < 1.0

@@ -1,6 +1,6 @@
 """A supervisor on the bench, with a stand-in for the robot: used by test_supervisor.py."""
 
-from dataclasses import replace
+from msgspec.structs import replace
 
 from disco_hw.daemon.states import State
 from disco_hw.daemon.supervisor import Inputs, Supervisor, SupervisorSettings, UserRequest

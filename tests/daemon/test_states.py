@@ -23,31 +23,31 @@ def identify(row, source):
 
 @pytest.mark.parametrize("state", State, ids=lambda state: state.value)
 def test_nothing_happens_while_nothing_changes(state):
-    assert next_transition(state, QUIET[state]) is None
+    assert next_transition(state, QUIET[state].value) is None
 
 
 @pytest.mark.parametrize(("row", "source"), ROWS, ids=itertools.starmap(identify, ROWS))
 def test_each_row_fires_when_its_conditions_hold_and_not_when_one_is_missing_or_one_blocks(row, source):
     conditions = (QUIET[source] | row.needs) & ~row.blocked_by
-    assert next_transition(source, conditions) is row
+    assert next_transition(source, conditions.value) is row
     for needed in row.needs & ~QUIET[source]:
-        assert next_transition(source, conditions & ~needed) is not row
+        assert next_transition(source, (conditions & ~needed).value) is not row
     for blocker in row.blocked_by:
-        assert next_transition(source, conditions | blocker) is not row
+        assert next_transition(source, (conditions | blocker).value) is not row
 
 
 @pytest.mark.parametrize("problem", PROBLEM, ids=lambda problem: problem.name)
 @pytest.mark.parametrize("source", [State.HANDSHAKE, State.READY, State.ARMED, State.STOPPING])
 def test_every_problem_leads_to_fault_whatever_else_is_asked(source, problem):
     everything_asked = C.ARM_PENDING | C.RESET_PENDING | C.DISARM_ASKED
-    row = next_transition(source, QUIET[source] | everything_asked | problem)
+    row = next_transition(source, (QUIET[source] | everything_asked | problem).value)
     assert row is not None
     assert row.target is State.FAULT
 
 
 @pytest.mark.parametrize("problem", PROBLEM, ids=lambda problem: problem.name)
 def test_no_reset_while_a_problem_lasts(problem):
-    assert next_transition(State.FAULT, QUIET[State.FAULT] | C.RESET_PENDING | problem) is None
+    assert next_transition(State.FAULT, (QUIET[State.FAULT] | C.RESET_PENDING | problem).value) is None
 
 
 def test_armed_can_be_entered_from_ready_only_and_only_on_request():

@@ -4,8 +4,7 @@ The specification keeps every step and looks back through all of it each time; i
 supervisor's variables.
 """
 
-import dataclasses
-
+import msgspec
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, rule
@@ -60,24 +59,24 @@ class SupervisorModel(RuleBasedStateMachine):
 
     @rule(change=ONE_CHANGE, requests=REQUESTS, wait_s=st.sampled_from([0.02, 0.02, 1.0, 4.0]))
     def one_thing(self, change, requests, wait_s):
-        self.inputs = dataclasses.replace(self.inputs, **change)
+        self.inputs = msgspec.structs.replace(self.inputs, **change)
         self.step(requests, wait_s)
 
     @rule(changes=st.lists(ONE_CHANGE, min_size=2, max_size=4), requests=REQUESTS)
     def several_things(self, changes, requests):
         for change in changes:
-            self.inputs = dataclasses.replace(self.inputs, **change)
+            self.inputs = msgspec.structs.replace(self.inputs, **change)
         self.step(requests, 0.02)
 
     @rule(change=ONE_CHANGE, requests=REQUESTS)
     def one_thing_while_driving(self, change, requests):
         self.a_good_arming(True)
-        self.inputs = dataclasses.replace(self.inputs, **change)
+        self.inputs = msgspec.structs.replace(self.inputs, **change)
         self.step(requests, 0.02)
 
     @rule(requests=st.lists(st.sampled_from(UserRequest), max_size=2))
     def all_is_well_again(self, requests):
-        self.inputs = dataclasses.replace(HEALTHY, link_generation=self.inputs.link_generation)
+        self.inputs = msgspec.structs.replace(HEALTHY, link_generation=self.inputs.link_generation)
         self.step(requests, 0.02)
 
     @rule(start=st.booleans())
@@ -87,13 +86,13 @@ class SupervisorModel(RuleBasedStateMachine):
         self.all_is_well_again([])
         self.all_is_well_again([UserRequest.ARM, *([UserRequest.START] if start else [])])
         for state in (DriverState.ARMING, DriverState.ARMED, DriverState.ARMED):
-            self.inputs = dataclasses.replace(self.inputs, driver_state=state)
+            self.inputs = msgspec.structs.replace(self.inputs, driver_state=state)
             self.step([], 0.02)
 
     @rule(age_s=st.sampled_from([0.0501, 0.1, 0.15, 0.1501]))
     def samples_grow_old_while_driving(self, age_s):
         self.a_good_arming(True)
-        self.inputs = dataclasses.replace(self.inputs, telemetry_age_s=age_s)
+        self.inputs = msgspec.structs.replace(self.inputs, telemetry_age_s=age_s)
         self.step([], 0.02)
 
     @rule()
@@ -102,7 +101,7 @@ class SupervisorModel(RuleBasedStateMachine):
 
     def step(self, requests, wait_s):
         self.now_ns += round(wait_s * 1e9)
-        inputs = dataclasses.replace(self.inputs, requests=tuple(requests))
+        inputs = msgspec.structs.replace(self.inputs, requests=tuple(requests))
         before = self.history[-1][1].state if self.history else State.DISCONNECTED
         output = self.supervisor.step(self.now_ns, inputs)
         self.history.append((inputs, output))

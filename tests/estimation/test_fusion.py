@@ -3,6 +3,7 @@
 import dataclasses
 import math
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -66,7 +67,7 @@ def test_estimate_is_predicted_to_the_time_asked_for():
     fusion = running()
     fusion.add_wheels(wheels(20, 0.03, 0.04, (3.0, 4.0)))
     estimate = fusion.estimate(45 * MS)
-    start = dataclasses.replace(running().estimate(10 * MS)).pose
+    start = msgspec.structs.replace(running().estimate(10 * MS)).pose
     expected = advance(PARAMETERS, start, [(3.0, 4.0, 0.01), (3.0, 4.0, 0.025)])
     assert (estimate.x_m, estimate.y_m, estimate.yaw_rad) == pytest.approx(
         (expected.x_m, expected.y_m, expected.yaw_rad), abs=1e-12
@@ -159,7 +160,7 @@ def test_yaw_passes_through_pi_without_a_jump():
 @pytest.mark.parametrize("value", [math.nan, math.inf])
 def test_a_pose_that_is_not_finite_leaves_no_trace(field, value):
     fusion, untouched = running(), running()
-    update = fusion.add_pose(dataclasses.replace(pose(10), **{field: value}), 10 * MS)
+    update = fusion.add_pose(msgspec.structs.replace(pose(10), **{field: value}), 10 * MS)
     assert (update.reason, update.innovation) == (PoseReason.NOT_FINITE, None)
     assert fusion.estimate(20 * MS) == untouched.estimate(20 * MS)
     assert fusion.stats.poses_not_finite == 1
@@ -178,7 +179,7 @@ def test_each_sample_is_counted_once():
     fusion.add_wheels(wheels(10))
     fusion.add_wheels(wheels(20, math.nan))
     fusion.add_wheels(wheels(20, 1e10))
-    fusion.add_wheels(dataclasses.replace(wheels(9000), received_ns=20 * MS))
+    fusion.add_wheels(msgspec.structs.replace(wheels(9000), received_ns=20 * MS))
     fusion.add_wheels(wheels(500, 1000.0, 1000.0))
     poses = [
         pose(10),

@@ -1,8 +1,8 @@
 """Screening of pose samples and the gate's limit."""
 
-import dataclasses
 import math
 
+import msgspec
 import pytest
 from scipy.stats import chi2
 
@@ -13,7 +13,7 @@ GOOD = PoseSample(t_ns=5, received_ns=7, x_m=1.0, y_m=-2.0, yaw_rad=3.0, positio
 
 
 def changed(**fields):
-    return screen(dataclasses.replace(GOOD, **fields))
+    return screen(msgspec.structs.replace(GOOD, **fields))
 
 
 @pytest.mark.parametrize("probability", [0.5, 0.95, 0.999, 0.999999])

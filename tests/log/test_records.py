@@ -1,4 +1,3 @@
-import dataclasses
 import typing
 
 import msgspec
@@ -26,12 +25,7 @@ def test_every_record_is_frozen_and_starts_with_its_time(topic):
     hints = typing.get_type_hints(topic.record)
     assert next(iter(hints)) == "t_ns"
     assert hints["t_ns"] is int
-    frozen = (
-        topic.record.__dataclass_params__.frozen
-        if dataclasses.is_dataclass(topic.record)
-        else topic.record.__struct_config__.frozen
-    )
-    assert frozen
+    assert topic.record.__struct_config__.frozen
 
 
 def test_a_record_of_an_older_version_still_reads():

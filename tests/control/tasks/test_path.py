@@ -1,9 +1,9 @@
 """A path by arc length: followed forwards, at its speed, through crossings and sharp turns, to its end."""
 
 import math
-from dataclasses import replace
 from pathlib import Path as FilePath
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -181,10 +181,10 @@ def test_a_state_that_is_none_is_told_and_forgotten(waypoints, broken):
     disco = Disco(MODEL, Path(waypoints), DiscoSettings(), WheelLimits(8.0, 20.0), 2)
     good = PlannerState(0, 0.1, 0.0, 0.0, 0.0, 0.0)
     disco.plan(0, good)
-    stopping = disco.plan(100_000_000, replace(good, t_ns=100_000_000, **broken))
+    stopping = disco.plan(100_000_000, msgspec.structs.replace(good, t_ns=100_000_000, **broken))
     assert stopping.diagnostics.outcome is Outcome.STOPPING
     assert np.isfinite(stopping.wheel_speeds).all()
-    after = disco.plan(200_000_000, replace(good, t_ns=200_000_000))
+    after = disco.plan(200_000_000, msgspec.structs.replace(good, t_ns=200_000_000))
     assert after.diagnostics.outcome is Outcome.PLANNED
     assert after.diagnostics.valid_samples == 400
 
