@@ -153,7 +153,17 @@ def _fill_config(target: Any, config: FirmwareConfig) -> None:
 class FirmwareCore:
     """One controller: frames and measurements in, setpoints and frames out; time is passed in, in microseconds."""
 
-    __slots__ = ("_core", "_estop_sources", "_frame", "_inputs", "_outputs", "_reasons", "_states", "_stop_causes")
+    __slots__ = (
+        "_core",
+        "_data",
+        "_estop_sources",
+        "_frame",
+        "_inputs",
+        "_outputs",
+        "_reasons",
+        "_states",
+        "_stop_causes",
+    )
 
     def __init__(self, config: FirmwareConfig, entropy: int = 0) -> None:
         """`entropy` (64 bits) seeds challenges and nonces: never the same twice under one key.
@@ -169,6 +179,7 @@ class FirmwareCore:
         self._inputs = _ffi.new("disco_inputs_t *")
         self._outputs = _ffi.new("disco_outputs_t *")
         self._frame = _ffi.new("disco_frame_t *")
+        self._data = _ffi.buffer(self._frame.data)
         c_config = _ffi.new("disco_config_t *")
         _fill_config(c_config, config)
         _lib.disco_firmware_init(self._core, c_config, entropy & 0xFFFF_FFFF_FFFF_FFFF)
@@ -180,16 +191,11 @@ class FirmwareCore:
     def step(self, now_us: int, inputs: FirmwareInputs) -> FirmwareOutputs:
         """Run one cycle, meant for 1 kHz."""
         c = self._inputs
-        c.ticks[0] = inputs.left_ticks & _TICKS_MASK
-        c.ticks[1] = inputs.right_ticks & _TICKS_MASK
-        c.wheel_speed[0] = inputs.left_speed_rad_s
-        c.wheel_speed[1] = inputs.right_speed_rad_s
-        c.current[0] = inputs.left_current_a
-        c.current[1] = inputs.right_current_a
-        c.temperature[0] = inputs.left_temperature_c
-        c.temperature[1] = inputs.right_temperature_c
-        c.encoder_valid[0] = inputs.left_encoder_valid
-        c.encoder_valid[1] = inputs.right_encoder_valid
+        c.ticks = (inputs.left_ticks & _TICKS_MASK, inputs.right_ticks & _TICKS_MASK)
+        c.wheel_speed = (inputs.left_speed_rad_s, inputs.right_speed_rad_s)
+        c.current = (inputs.left_current_a, inputs.right_current_a)
+        c.temperature = (inputs.left_temperature_c, inputs.right_temperature_c)
+        c.encoder_valid = (inputs.left_encoder_valid, inputs.right_encoder_valid)
         c.voltage = inputs.voltage_v
         c.battery_current = inputs.battery_current_a
         c.battery_temperature = inputs.battery_temperature_c
@@ -230,7 +236,7 @@ class FirmwareCore:
         frames = []
         frame = self._frame
         while _lib.disco_firmware_pop(self._core, frame):
-            frames.append((frame.can_id, bytes(frame.data)))
+            frames.append((frame.can_id, self._data[:]))
         return frames
 
     @property

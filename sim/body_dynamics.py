@@ -9,9 +9,9 @@ wheels rolling at rim speeds u_L, u_R: v = (u_L + u_R) / 2, omega = (u_R - u_L) 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
+import msgspec
 import numpy as np
 import numpy.typing as npt
 
@@ -74,8 +74,7 @@ _BODY = np.dtype(
 )
 
 
-@dataclass(frozen=True, slots=True)
-class Pose:
+class Pose(msgspec.Struct, frozen=True, gc=False):
     """Position (m) and yaw (rad, counter-clockwise, not wrapped) in the world frame."""
 
     x_m: float = 0.0
@@ -89,37 +88,32 @@ class Body:
     def __init__(self, parameters: PlantParameters, effects: HiddenEffects, start: Pose) -> None:
         self._parameters = _parameter_record(parameters, effects)
         self._state = np.zeros(1, dtype=_BODY)
+        # The same memory as plain numbers: reading a record field by field takes microseconds.
+        numbers = self._state.view(np.float64)
+        self._pose, self._poses, self._velocity = numbers[:3], numbers[:6], numbers[-3:]
+        self._times_us = self._state.view(np.int64)[6:8]
         self._set(start)
-
-    @property
-    def now_us(self) -> int:
-        """Plant time of the pose, us."""
-        return int(self._state["now_us"][0])
 
     @property
     def pose(self) -> Pose:
         """The pose now."""
-        state = self._state[0]
-        return Pose(float(state["x"]), float(state["y"]), float(state["yaw"]))
+        return Pose(*self._pose.tolist())
 
     @property
     def velocity(self) -> tuple[float, float, float]:
         """Velocity of the tracked point in the body frame: forward (m/s), left (m/s), yaw rate (rad/s)."""
-        state = self._state[0]
-        return float(state["speed"]), float(state["lateral_speed"]), float(state["yaw_rate"])
+        speed, lateral, yaw_rate = self._velocity.tolist()
+        return speed, lateral, yaw_rate
 
     def pose_at(self, t_us: int) -> Pose:
         """The pose within the newest integration piece, at t_us: between its end points on a straight line."""
-        state = self._state[0]
-        span = int(state["now_us"]) - int(state["last_us"])
+        x, y, yaw, last_x, last_y, last_yaw = self._poses.tolist()
+        last_us, now_us = self._times_us.tolist()
+        span = now_us - last_us
         if span == 0:
-            return self.pose
-        part = (t_us - int(state["last_us"])) / span
-        return Pose(
-            float(state["last_x"] + part * (state["x"] - state["last_x"])),
-            float(state["last_y"] + part * (state["y"] - state["last_y"])),
-            float(state["last_yaw"] + part * (state["yaw"] - state["last_yaw"])),
-        )
+            return Pose(x, y, yaw)
+        part = (t_us - last_us) / span
+        return Pose(last_x + part * (x - last_x), last_y + part * (y - last_y), last_yaw + part * (yaw - last_yaw))
 
     def advance(
         self,

@@ -6,9 +6,12 @@ Pure: time enters only through `CanBus.advance`. Source: Bosch CAN specification
 from __future__ import annotations
 
 import heapq
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import Protocol
+
+import msgspec
+from msgspec.structs import replace
 
 from sim.bus_node import BusNode, ErrorState, TransmitOrder
 from sim.can_bits import (
@@ -48,6 +51,10 @@ class FrameFate:
     cut: bool = False
 
 
+UNHARMED = FrameFate()
+"""Nothing happens to it: the one that is carried fastest."""
+
+
 class BusFault(Protocol):
     """Decides the fate of each transmission, retransmissions included."""
 
@@ -55,7 +62,7 @@ class BusFault(Protocol):
         """Called once when `frame` starts on the wire."""
 
 
-class Delivery(NamedTuple):
+class Delivery(msgspec.Struct, frozen=True, gc=False):
     """A frame that `receivers` have at `t_ns`; for a node's own error frames `sender` is that node."""
 
     t_ns: int
@@ -64,7 +71,7 @@ class Delivery(NamedTuple):
     receivers: tuple[BusNode, ...]
 
 
-class _Transmission(NamedTuple):
+class _Transmission(msgspec.Struct, frozen=True, gc=False):
     end_ns: int
     senders: list[BusNode]
     frame: CanFrame
@@ -73,7 +80,8 @@ class _Transmission(NamedTuple):
     acknowledged: bool
 
 
-_UNHARMED = FrameFate()
+# Looked at with every frame; through the enum each look is a call of a function in Python 3.11.
+_BUS_OFF, _PASSIVE = ErrorState.BUS_OFF, ErrorState.PASSIVE
 
 
 class CanBus:
@@ -99,6 +107,7 @@ class CanBus:
         self.busy_ns = 0
         self._bitrate = bitrate
         self._log = log
+        self._interframe_ns = self._bits_ns(INTERFRAME_BITS)
         self._now_ns = start_ns
         self._free_ns = start_ns
         self._idle_counted_ns = start_ns
@@ -170,7 +179,11 @@ class CanBus:
         if self._on_wire is not None:
             times.append(self._on_wire.end_ns)
         else:
-            times.extend(t for t in (self._next_start_ns(), self._next_recovery_ns()) if t is not None)
+            start_ns = self._next_start_ns()
+            if start_ns is not None:
+                times.append(start_ns)
+            if self._recovering:
+                times.append(self._next_recovery_ns())
         return min(times) if times else None
 
     def advance(self, until_ns: int) -> list[Delivery]:
@@ -200,13 +213,14 @@ class CanBus:
             self._end(on_wire)
             return True
         start_ns = self._next_start_ns()
-        recovery_ns = self._next_recovery_ns()
-        if recovery_ns is not None and (start_ns is None or recovery_ns <= start_ns):
-            if recovery_ns > until_ns:
-                return False
-            self._now_ns = recovery_ns
-            self._count_idle(recovery_ns)
-            return True
+        if self._recovering:
+            recovery_ns = self._next_recovery_ns()
+            if start_ns is None or recovery_ns <= start_ns:
+                if recovery_ns > until_ns:
+                    return False
+                self._now_ns = recovery_ns
+                self._count_idle(recovery_ns)
+                return True
         if start_ns is None or start_ns > until_ns:
             return False
         self._now_ns = start_ns
@@ -225,15 +239,17 @@ class CanBus:
 
     def _start(self, now_ns: int) -> None:
         """Arbitrate among the heads of the queues and put the winner on the wire."""
-        contenders = [node for node in self._nodes if node.queue and node.eligible_ns <= now_ns]
-        best = min([node.queue[0][2] for node in contenders])
-        senders = [node for node in contenders if node.queue[0][2] == best]
-        for node in contenders:
-            if node not in senders:
-                node.arbitrations_lost += 1
+        senders = [node for node in self._nodes if node.queue and node.eligible_ns <= now_ns]
+        if len(senders) > 1:
+            contenders = senders
+            best = min([node.queue[0][2] for node in contenders])
+            senders = [node for node in contenders if node.queue[0][2] == best]
+            for node in contenders:
+                if node not in senders:
+                    node.arbitrations_lost += 1
         frames = [node.start() for node in senders]
         frame = frames[0]
-        fate = _UNHARMED if self.fault is None else self.fault.fate(now_ns, senders[0].name, frame)
+        fate = UNHARMED if self.fault is None else self.fault.fate(now_ns, senders[0].name, frame)
         bits = frame_bits(frame)
         after_error_flag = ERROR_DELIMITER_BITS + INTERFRAME_BITS
         error_bit = _first_difference(frames) if len(frames) > 1 else None
@@ -245,7 +261,7 @@ class CanBus:
             bits = error_bit + 1 + 2 * ERROR_FLAG_BITS + after_error_flag
             acknowledged = True
         else:
-            acknowledged = any(node not in senders and node.state is not ErrorState.BUS_OFF for node in self._nodes)
+            acknowledged = bool(self._listeners(senders))
             if not acknowledged:
                 ack_slot = bits - INTERFRAME_BITS - ACK_AND_END_BITS
                 bits = ack_slot + 1 + ERROR_FLAG_BITS + after_error_flag
@@ -257,13 +273,13 @@ class CanBus:
 
     def _end(self, transmission: _Transmission) -> None:
         """The last bit of a frame or of an error delimiter has passed: count, deliver or requeue."""
-        end_ns, senders, frame, fate, intact, acknowledged = transmission
+        end_ns, senders, intact = transmission.end_ns, transmission.senders, transmission.intact
         self._on_wire = None
-        self._free_ns = end_ns + self._bits_ns(INTERFRAME_BITS)
-        receivers = [node for node in self._nodes if node not in senders and node.state is not ErrorState.BUS_OFF]
+        self._free_ns = end_ns + self._interframe_ns
+        receivers = self._listeners(senders)
         for node in senders:
-            self._report(node, node.count_sent() if intact else node.count_transmit_error(acknowledged))
-            if node.state is ErrorState.PASSIVE:
+            self._report(node, node.count_sent() if intact else node.count_transmit_error(transmission.acknowledged))
+            if node.state is _PASSIVE:
                 node.eligible_ns = self._free_ns + self._bits_ns(SUSPEND_TRANSMISSION_BITS)
         for node in receivers:
             self._report(node, node.count_received() if intact else node.count_receive_error())
@@ -273,18 +289,28 @@ class CanBus:
         if not intact:
             self.error_frames += 1
         if self._log is not None:
-            self._log(candump_line(end_ns, _LOG_CHANNEL, frame if intact else protocol_error_frame()))
+            self._log(candump_line(end_ns, _LOG_CHANNEL, transmission.frame if intact else protocol_error_frame()))
         if intact:
             receivers.extend([node for node in senders if node.echo])
-            self._deliver(Delivery(end_ns, senders[0], frame, tuple(receivers)), fate)
+            self._deliver(Delivery(end_ns, senders[0], transmission.frame, tuple(receivers)), transmission.fate)
+
+    def _listeners(self, senders: Sequence[BusNode]) -> list[BusNode]:
+        """Who hears what these send, the senders left out."""
+        return [node for node in self._nodes if node.state is not _BUS_OFF and node not in senders]
 
     def _deliver(self, delivery: Delivery, fate: FrameFate) -> None:
-        t_ns, sender, frame, receivers = delivery
-        if fate is not _UNHARMED:
-            if fate.data is not None:
-                frame = frame._replace(data=fate.data)
-            receivers = () if fate.lost else tuple(node for node in receivers if node.name not in fate.lost_at)
-            delivery = Delivery(t_ns + fate.delay_ns, sender, frame, receivers)
+        receivers = delivery.receivers
+        if fate is UNHARMED:
+            for node in receivers:
+                node.received += 1
+            if receivers:
+                self._out.append(delivery)
+            return
+        frame = delivery.frame
+        if fate.data is not None:
+            frame = replace(frame, data=fate.data)
+        receivers = () if fate.lost else tuple(node for node in receivers if node.name not in fate.lost_at)
+        delivery = Delivery(delivery.t_ns + fate.delay_ns, delivery.sender, frame, receivers)
         for node in receivers:
             node.received += fate.copies
         for _ in range(fate.copies if receivers else 0):
@@ -298,10 +324,8 @@ class CanBus:
         if error_frame is not None:
             self._out.append(Delivery(self._now_ns, node, error_frame, (node,)))
 
-    def _next_recovery_ns(self) -> int | None:
+    def _next_recovery_ns(self) -> int:
         """When on an idle bus the first recovering node will have seen enough recessive bits."""
-        if not self._recovering:
-            return None
         seen = max(node.recessive_sequences or 0 for node in self._recovering)
         left_ns = self._bits_ns(RECESSIVE_SEQUENCE_BITS * (RECOVERY_SEQUENCES - seen))
         return max(self._idle_counted_ns + left_ns, self._now_ns)

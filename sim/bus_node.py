@@ -37,6 +37,10 @@ class ErrorState(enum.Enum):
     BUS_OFF = "bus-off"
 
 
+# Looked at with every frame; through the enum each look is a call of a function in Python 3.11.
+_PRIORITY, _BUS_OFF = TransmitOrder.PRIORITY, ErrorState.BUS_OFF
+
+
 @dataclass(slots=True, eq=False)
 class BusNode:
     """State and counters of one controller; made by `CanBus.attach` and changed only by the bus.
@@ -73,14 +77,14 @@ class BusNode:
 
     def push(self, sequence: int, frame: CanFrame) -> bool:
         """Queue a frame; False, and a counter, when the queue is full or the node is bus-off."""
-        if self.state is ErrorState.BUS_OFF:
+        if self.state is _BUS_OFF:
             self.refused_bus_off += 1
             return False
         if len(self.queue) + (self.on_wire is not None) >= self.capacity:
             self.refused_full += 1
             return False
         key = arbitration_key(frame)
-        heapq.heappush(self.queue, (key if self.order is TransmitOrder.PRIORITY else 0, sequence, key, frame))
+        heapq.heappush(self.queue, (key if self.order is _PRIORITY else 0, sequence, key, frame))
         return True
 
     def start(self) -> CanFrame:
@@ -92,7 +96,7 @@ class BusNode:
         """The frame on the wire went through."""
         self.sent += 1
         self.on_wire = None
-        if self.state is ErrorState.BUS_OFF or not self.tec:
+        if not self.tec or self.state is _BUS_OFF:
             return None
         self.tec -= 1
         return self._confine()

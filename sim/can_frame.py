@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import struct
-from typing import NamedTuple
+
+import msgspec
 
 FRAME_BYTES = 16
 """Length of Linux `struct can_frame`."""
@@ -18,7 +19,7 @@ _STANDARD_MASK = 0x7FF
 _FRAME = struct.Struct("=IB3x8s")
 
 
-class CanFrame(NamedTuple):
+class CanFrame(msgspec.Struct, frozen=True, gc=False):
     """One classic CAN frame; `remote_length` is the length code of a remote frame, which carries no data."""
 
     can_id: int
@@ -34,16 +35,16 @@ def pack_frame(frame: CanFrame) -> bytes:
 
     Raises ValueError if the identifier or the data do not fit a classic frame.
     """
-    can_id, data, extended, remote, error, remote_length = frame
-    length = remote_length if remote else len(data)
-    limit = _EXTENDED_MASK if extended or error else _STANDARD_MASK
+    can_id, data = frame.can_id, frame.data
+    length = frame.remote_length if frame.remote else len(data)
+    limit = _EXTENDED_MASK if frame.extended or frame.error else _STANDARD_MASK
     if not 0 <= can_id <= limit or length > 8 or len(data) > 8:
         raise ValueError(f"not a classic CAN frame: {frame}")
-    if extended:
+    if frame.extended:
         can_id |= _EXTENDED_FLAG
-    if remote:
+    if frame.remote:
         can_id |= _REMOTE_FLAG
-    if error:
+    if frame.error:
         can_id |= _ERROR_FLAG
     return _FRAME.pack(can_id, length, data)
 

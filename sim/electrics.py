@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+
+import msgspec
 
 from sim.effects import HiddenEffects
 from sim.plant_parameters import PlantParameters
@@ -13,8 +14,7 @@ SECONDS_PER_HOUR = 3600.0
 BATTERY_HEATING = 0.02
 
 
-@dataclass(frozen=True, slots=True)
-class Battery:
+class Battery(msgspec.Struct, frozen=True, gc=False):
     """Voltage (V), current drawn (A, positive out of the battery) and temperature (degC)."""
 
     voltage_v: float
@@ -43,24 +43,26 @@ class Electrics:
     ) -> None:
         """Move on by `dt_s` to `now_s` with these motor torques and wheel speeds (left, right)."""
         p = self._parameters
-        left_a, right_a = (torque / p.motor_torque_constant_nm_per_a for torque in torques_nm)
-        heat_w = (p.motor_resistance_ohm * left_a**2, p.motor_resistance_ohm * right_a**2)
-        mechanical_w = sum(torque * speed for torque, speed in zip(torques_nm, speeds_rad_s, strict=True))
-        drawn_a = p.idle_current_a + (mechanical_w + sum(heat_w)) / p.battery_voltage_v
+        (left_nm, right_nm), (left_rad_s, right_rad_s) = torques_nm, speeds_rad_s
+        left_a, right_a = left_nm / p.motor_torque_constant_nm_per_a, right_nm / p.motor_torque_constant_nm_per_a
+        left_w, right_w = p.motor_resistance_ohm * left_a**2, p.motor_resistance_ohm * right_a**2
+        mechanical_w = left_nm * left_rad_s + right_nm * right_rad_s
+        drawn_a = p.idle_current_a + (mechanical_w + (left_w + right_w)) / p.battery_voltage_v
         self._charge_used_as += drawn_a * dt_s
         empty = self._charge_used_as / (p.battery_capacity_ah * SECONDS_PER_HOUR)
         open_v = p.battery_voltage_v * (1.0 - VOLTAGE_LOST_WHEN_EMPTY * empty - self._sag_per_s * now_s)
         self.motor_currents_a = (left_a, right_a)
         cooled = math.exp(-dt_s / (p.motor_thermal_resistance_k_per_w * p.motor_thermal_capacity_j_per_k))
-        left_c, right_c = (
-            p.ambient_temperature_c
-            + p.motor_thermal_resistance_k_per_w * watt
-            + (now_c - p.ambient_temperature_c - p.motor_thermal_resistance_k_per_w * watt) * cooled
-            for now_c, watt in zip(self.motor_temperatures_c, heat_w, strict=True)
-        )
-        self.motor_temperatures_c = (left_c, right_c)
+        left_c, right_c = self.motor_temperatures_c
+        self.motor_temperatures_c = (self._warmed(left_c, left_w, cooled), self._warmed(right_c, right_w, cooled))
         self.battery = Battery(
             voltage_v=max(open_v - p.battery_resistance_ohm * drawn_a, 0.0),
             current_a=drawn_a,
             temperature_c=p.ambient_temperature_c + BATTERY_HEATING * drawn_a**2,
         )
+
+    def _warmed(self, now_c: float, heat_w: float, cooled: float) -> float:
+        """A motor's temperature on its way to where this heat keeps it."""
+        p = self._parameters
+        rise_k = p.motor_thermal_resistance_k_per_w * heat_w
+        return p.ambient_temperature_c + rise_k + (now_c - p.ambient_temperature_c - rise_k) * cooled

@@ -9,13 +9,12 @@ import random
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from sim.bus import FrameFate
+from sim.bus import UNHARMED, FrameFate
 from sim.can_frame import CanFrame
 from sim.fault_schedule import Fault, FaultSchedule, Room
 
 ROBOT_NODE = "robot"
 LONGEST_FRAME_BITS = 111
-_INTACT = FrameFate()
 
 
 class Step(NamedTuple):
@@ -92,7 +91,7 @@ class FrameFaults:
                 continue
             self.struck[fault.number] = self.struck.get(fault.number, 0) + 1
             return self._fate(fault, to, frame)
-        return _INTACT
+        return UNHARMED
 
     def _picks(self, fault: Fault, frame: CanFrame) -> bool:
         return fault["id"] in (-1, frame.can_id) and self._chance.random() < fault["probability"]
@@ -117,4 +116,4 @@ class FrameFaults:
             case "wrong_length":
                 length = chance.choice([n for n in range(9) if n != len(frame.data)])
                 return FrameFate(data=frame.data[:length] + bytes(max(0, length - len(frame.data))))
-        return _INTACT
+        return UNHARMED

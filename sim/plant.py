@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import bisect
 from collections import deque
-from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 
 from sim.body_dynamics import Body, Pose
@@ -25,8 +25,7 @@ from sim.wheel_dynamics import Wheels
 ELECTRICS_STEP_US = 10_000
 
 
-@dataclass(frozen=True, slots=True)
-class TrueState:
+class TrueState(msgspec.Struct, frozen=True, gc=False):
     """What is so at plant time `t_us`, known to nobody on board.
 
     Pose of the tracked point in the world frame (m, rad; yaw in (-pi, pi]); wheel speeds (rad/s); velocity of the
@@ -131,6 +130,8 @@ class Plant:
         self._ask((left_setpoint_rad_s, right_setpoint_rad_s))
         while self._now_us < until_us:
             self._advance(self._apply_due(until_us), enabled, brake)
+        if not self._poses:
+            return []
         ready = bisect.bisect_right(self._poses, until_us, key=_available_us)
         poses, self._poses[:ready] = self._poses[:ready], []
         return poses
@@ -168,7 +169,8 @@ class Plant:
             piece = self._body.advance(
                 wheels.pieces, piece, count, sensor.next_true_us, noise.slip, noise.first_cell, self._step_us
             )
-            while sensor.next_true_us <= self._body.now_us:
+            reached_us = until_us if piece == count else wheels.pieces.times_us[piece - 1]
+            while sensor.next_true_us <= reached_us:
                 measurement = sensor.sample(self._body.pose_at(sensor.next_true_us))
                 if measurement is not None:
                     bisect.insort(self._poses, measurement, key=_available_us)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 
 from sim.body_dynamics import Pose
@@ -14,8 +14,7 @@ from sim.plant_parameters import PlantParameters
 LARGEST_JITTER_PERIODS = 0.45
 
 
-@dataclass(frozen=True, slots=True)
-class PoseMeasurement:
+class PoseMeasurement(msgspec.Struct, frozen=True, gc=False):
     """One measured pose in the world frame (m, rad; yaw in (-pi, pi]) with the sensor's own standard deviations.
 
     `sample_us` is the plant time at which the sensor says it was true, `available_us` when it can be read.
@@ -52,7 +51,8 @@ class PoseSensor:
         self._period_us = 1e6 / parameters.pose_rate_hz
         correlation_s = parameters.pose_noise_correlation_s
         self._decay = math.exp(-1.0 / (parameters.pose_rate_hz * correlation_s)) if correlation_s > 0.0 else 0.0
-        self._noise = self._generator.standard_normal(3)
+        self._fresh = math.sqrt(1.0 - self._decay**2)
+        self._noise: list[float] = self._generator.standard_normal(3).tolist()
         self._silent_until_us = 0
         self._count = 0
         self._schedule()
@@ -60,13 +60,13 @@ class PoseSensor:
     def sample(self, pose: Pose) -> PoseMeasurement | None:
         """Measure the true pose of `next_true_us`; None if the sample is lost. Moves on to the next sample."""
         p = self._parameters
-        normal = self._generator.standard_normal(6)
-        chance = self._generator.random(5)
-        self._noise = self._decay * self._noise + math.sqrt(1.0 - self._decay**2) * normal[:3]
+        normal: list[float] = self._generator.standard_normal(6).tolist()
+        chance: list[float] = self._generator.random(5).tolist()
+        self._noise = [self._decay * old + self._fresh * new for old, new in zip(self._noise, normal[:3], strict=True)]
         burst = math.exp(p.pose_noise_volatility * normal[3] - p.pose_noise_volatility**2)
         position_noise = p.pose_position_std_m * burst
         sample_us = self._sample_us
-        delay_us = round(max(p.pose_delay_s + p.pose_delay_jitter_s * float(normal[4]), 0.0) * 1e6)
+        delay_us = round(max(p.pose_delay_s + p.pose_delay_jitter_s * normal[4], 0.0) * 1e6)
 
         cosine, sine = math.cos(pose.yaw_rad), math.sin(pose.yaw_rad)
         x = pose.x_m + cosine * self._forward_m - sine * self._left_m + position_noise * self._noise[0]
@@ -87,9 +87,9 @@ class PoseSensor:
         return PoseMeasurement(
             sample_us=sample_us,
             available_us=sample_us + delay_us,
-            x_m=float(x),
-            y_m=float(y),
-            yaw_rad=wrapped(float(yaw)),
+            x_m=x,
+            y_m=y,
+            yaw_rad=wrapped(yaw),
             position_std_m=p.pose_position_std_m,
             yaw_std_rad=p.pose_yaw_std_rad,
         )

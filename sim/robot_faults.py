@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
-import msgspec
+from msgspec.structs import replace
 
 from firmware_protocol.firmware_core import FirmwareInputs
 from sim.fault_schedule import Fault, Room
@@ -15,6 +15,7 @@ from sim.pose_sensor import PoseMeasurement
 
 STALL_CURRENT_A = 18.0
 _SIDES = ("left", "right")
+_OF_ONE_WHEEL = ("motor_stall", "encoder_stuck", "encoder_wrap", "encoder_reversed")
 
 
 @dataclass(slots=True)
@@ -52,6 +53,7 @@ class RobotFaults:
         self._jumps: list[Fault] = []
         self._late: deque[tuple[int, PoseMeasurement]] = deque()
         self._last_pose: PoseMeasurement | None = None
+        self._sort_out()
 
     def set_active(self, active: Sequence[Fault], begun: Sequence[Fault] = ()) -> None:
         """Take what concerns the robot out of `active`; of `begun`, what happens once."""
@@ -59,10 +61,11 @@ class RobotFaults:
         self._jumps += [fault for fault in begun if fault.kind.name == "encoder_jump"]
         self._changed = True
         self._touched = self._touched or any(f.kind.name.startswith("encoder") for f in (*self.active, *begun))
+        self._sort_out()
 
     def setpoints(self, left_rad_s: float, right_rad_s: float) -> tuple[float, float]:
         """What the motors make of the setpoints (rad/s)."""
-        stalled = self._sides("motor_stall")
+        stalled = self._by_wheel["motor_stall"]
         return (0.0 if "left" in stalled else left_rad_s), (0.0 if "right" in stalled else right_rad_s)
 
     def poses(self, now_us: int, measured: Sequence[PoseMeasurement]) -> Sequence[PoseMeasurement]:
@@ -71,11 +74,10 @@ class RobotFaults:
             if measured:
                 self._last_pose = measured[-1]
             return measured
-        delay_us = max((round(f["delay_s"] * 1e6) for f in self.active if f.kind.name == "pose_late"), default=0)
         for pose in measured:
             changed = self._changed_pose(pose)
             if changed is not None:
-                self._late.append((now_us + delay_us, changed))
+                self._late.append((now_us + self._delay_us, changed))
         due: list[PoseMeasurement] = []
         while self._late and self._late[0][0] <= now_us:
             due.append(self._late.popleft()[1])
@@ -88,8 +90,7 @@ class RobotFaults:
         ticks = [inputs.left_ticks, inputs.right_ticks]
         speeds = [inputs.left_speed_rad_s, inputs.right_speed_rad_s]
         currents = [inputs.left_current_a, inputs.right_current_a]
-        stuck, wrapped, backwards = (self._sides(f"encoder_{name}") for name in ("stuck", "wrap", "reversed"))
-        stalled = self._sides("motor_stall")
+        stalled, stuck, wrapped, backwards = (self._by_wheel[kind] for kind in _OF_ONE_WHEEL)
         for index, side in enumerate(_SIDES):
             encoder = self._encoders[index]
             if self._changed:
@@ -107,8 +108,7 @@ class RobotFaults:
                 currents[index] = math.copysign(STALL_CURRENT_A, setpoints[index])
         self._changed = False
         self._jumps.clear()
-        drop_v = max((f["drop_v"] for f in self.active if f.kind.name == "battery_sag"), default=0.0)
-        return msgspec.structs.replace(
+        return replace(
             inputs,
             left_ticks=ticks[0],
             right_ticks=ticks[1],
@@ -116,7 +116,7 @@ class RobotFaults:
             right_speed_rad_s=speeds[1],
             left_current_a=currents[0],
             right_current_a=currents[1],
-            voltage_v=max(0.0, inputs.voltage_v - drop_v),
+            voltage_v=max(0.0, inputs.voltage_v - self._drop_v),
         )
 
     def _changed_pose(self, pose: PoseMeasurement) -> PoseMeasurement | None:
@@ -136,5 +136,10 @@ class RobotFaults:
                     return replace(pose, x_m=math.nan, yaw_rad=math.nan)
         return pose
 
-    def _sides(self, kind: str) -> dict[str, Fault]:
-        return {fault["wheel"]: fault for fault in self.active if fault.kind.name == kind}
+    def _sort_out(self) -> None:
+        """What each cycle asks of the active faults, found once."""
+        self._by_wheel = {
+            kind: {fault["wheel"]: fault for fault in self.active if fault.kind.name == kind} for kind in _OF_ONE_WHEEL
+        }
+        self._delay_us = max((round(f["delay_s"] * 1e6) for f in self.active if f.kind.name == "pose_late"), default=0)
+        self._drop_v = max((f["drop_v"] for f in self.active if f.kind.name == "battery_sag"), default=0.0)

@@ -12,6 +12,7 @@ from sim.faults import ROBOT_NODE
 
 ROBOT_QUEUE = 64
 BABBLER_QUEUE = 32
+_BUS_OFF = ErrorState.BUS_OFF
 RESTART_DELAY_NS = 200_000_000
 """After bus-off the robot's controller asks for recovery so much later, as can-dev does with restart-ms 200."""
 
@@ -33,7 +34,7 @@ class RobotNode:
     def take(self, now_ns: int, deliveries: Sequence[Delivery]) -> list[ReceivedFrame]:
         """The data frames among the bus's deliveries that the robot has received; minds the restart after bus-off."""
         node = self.node
-        if node.state is ErrorState.BUS_OFF and node.recessive_sequences is None:
+        if node.state is _BUS_OFF and node.recessive_sequences is None:
             if self.restart_ns is None:
                 self.restart_ns = now_ns + RESTART_DELAY_NS
             elif now_ns >= self.restart_ns:

@@ -21,7 +21,7 @@ from typing import IO
 
 from drivers.types import Frame, ReceivedFrame
 from firmware_protocol.serial_framing import FrameDecoder, encode_frame
-from sim.bus import BusFault, FrameFate
+from sim.bus import UNHARMED, BusFault, FrameFate
 from sim.can_frame import CanFrame, candump_line
 from sim.faults import ROBOT_NODE
 from sim.robot_link import LinkFaultError
@@ -33,7 +33,6 @@ READ_BYTES = 4096
 _BAUD_OF_CODE = {
     getattr(termios, name): int(name[1:]) for name in dir(termios) if name.startswith("B") and name[1:].isdigit()
 }
-_UNHARMED = FrameFate()
 _HANG_UP = select.POLLHUP | select.POLLERR
 
 
@@ -201,7 +200,7 @@ class SerialLine:
 
     def _fate(self, sender: str, frame: Frame) -> FrameFate:
         if self._fault is None:
-            return _UNHARMED
+            return UNHARMED
         return self._fault.fate(self._now_ns, sender, CanFrame(frame.can_id, frame.data))
 
     def _plug_in(self) -> None:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
+from dataclasses import asdict
 
-from drivers.transport.counters import Counters
 from drivers.types import Frame, LinkState, OutgoingFrame, ReceivedFrame, TransportStats
 from sim.bus import BusFault, CanBus, Delivery
 from sim.bus_node import BusNode, ErrorState, TransmitOrder
@@ -14,6 +14,7 @@ from sim.robot_link import LinkFaultError
 from sim.robot_node import RobotNode
 
 HOST_QUEUE = 32
+_BUS_OFF = ErrorState.BUS_OFF
 RECEIVE_CAPACITY = 4096
 REOPEN_NS = 100_000_000
 """After bus-off or a lost line the host's transport opens the bus again so much later."""
@@ -97,7 +98,7 @@ class HostTransport:
     def __init__(self, bus: CanBus) -> None:
         self.node: BusNode | None = None
         self._bus = bus
-        self._counters = Counters()
+        self._counts = asdict(TransportStats())
         self._open = False
         self._generation = 0
         self._reopen_ns: int | None = None
@@ -124,7 +125,7 @@ class HostTransport:
     @property
     def stats(self) -> TransportStats:
         """A snapshot of the counters."""
-        return self._counters.snapshot()
+        return TransportStats(**self._counts)
 
     @property
     def last_error(self) -> str | None:
@@ -144,16 +145,16 @@ class HostTransport:
     def send(self, outgoing: OutgoingFrame, now_ns: int) -> bool:
         """Queue a frame on the host's controller; False (and a counter) if it expired or does not fit."""
         if outgoing.deadline_ns < now_ns:
-            self._counters.add(expired=1)
+            self._counts["expired"] += 1
             return False
         if self.node is None:
-            self._counters.add(send_errors=1)
+            self._counts["send_errors"] += 1
             return False
         frame = outgoing.frame
         if not self._bus.send(self.node, CanFrame(frame.can_id, frame.data)):
-            self._counters.add(transmit_queue_full=1)
+            self._counts["transmit_queue_full"] += 1
             return False
-        self._counters.add(frames_sent=1)
+        self._counts["frames_sent"] += 1
         return True
 
     def receive(self) -> Sequence[ReceivedFrame]:
@@ -167,23 +168,22 @@ class HostTransport:
         if self._reopen_ns is not None and now_ns >= self._reopen_ns:
             self._connect()
         node = self.node
-        frames = octets = errors = 0
-        for t_ns, _, frame, receivers in deliveries:
-            if node not in receivers:
+        counts = self._counts
+        for delivery in deliveries:
+            if node not in delivery.receivers:
                 continue
+            frame = delivery.frame
             if frame.error:
-                errors += 1
+                counts["bus_errors"] += 1
                 continue
-            frames += 1
-            octets += len(frame.data)
-            self._incoming.append(ReceivedFrame(t_ns, Frame(frame.can_id, frame.data)))
-        if frames or errors:
-            self._counters.add(frames_received=frames, bytes_received=octets, bus_errors=errors)
+            counts["frames_received"] += 1
+            counts["bytes_received"] += len(frame.data)
+            self._incoming.append(ReceivedFrame(delivery.t_ns, Frame(frame.can_id, frame.data)))
         while len(self._incoming) > RECEIVE_CAPACITY:
             self._incoming.popleft()
-            self._counters.add(receive_overflow=1)
-        if node is not None and node.state is ErrorState.BUS_OFF:
-            self._counters.add(bus_off=1)
+            counts["receive_overflow"] += 1
+        if node is not None and node.state is _BUS_OFF:
+            counts["bus_off"] += 1
             self.lose(now_ns + REOPEN_NS, "the controller is bus-off")
 
     def lose(self, until_ns: int, why: str) -> None:
@@ -201,7 +201,7 @@ class HostTransport:
         self.node = self._bus.attach("host", capacity=HOST_QUEUE, order=TransmitOrder.FIFO)
         self._generation += 1
         self._last_error = None
-        self._counters.add(reconnects=int(self._generation > 1))
+        self._counts["reconnects"] += self._generation > 1
 
     def _leave(self) -> None:
         if self.node is not None:
