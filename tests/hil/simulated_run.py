@@ -5,7 +5,6 @@ The same objects as in real time, without processes, threads or a clock; what th
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import random
 from collections.abc import Sequence
@@ -77,7 +76,8 @@ class CirclingPlanner:
     def __init__(self, config, model_geometry) -> None:
         self._task = config.task
         self._radius_m, self._axial_m, self._x_icr_m = model_geometry
-        self._top = config.robot.max_wheel_speed_rad_s
+        self._nowhere = np.zeros((self.STEPS + 1, 3))
+        self._found = Diagnostics(1.0, 1.0, 0.0, 0.0, 0.0, 1)
 
     def plan(self, now_ns: int, state: PlannerState) -> Plan:
         task = self._task
@@ -93,8 +93,7 @@ class CirclingPlanner:
         right = (speed + 0.5 * self._axial_m * turn) / self._radius_m
         speeds = np.empty((self.STEPS, 2))
         speeds[:] = (left, right)
-        found = Diagnostics(1.0, 1.0, 0.0, 0.0, 0.0, 1)
-        return Plan(now_ns, 0.05, speeds, np.zeros((self.STEPS + 1, 3)), found)
+        return Plan(now_ns, 0.05, speeds, self._nowhere, self._found)
 
     def reset(self) -> None:
         pass
@@ -148,7 +147,7 @@ class LogReader:
                     for name, value in getattr(record, group).items():
                         self.counts[f"{group}.{name}"] = value
             elif kind is RobotLinkHealth:
-                self._take_robot({f.name: getattr(record, f.name) for f in dataclasses.fields(record)})
+                self._take_robot({name: getattr(record, name) for name in record.__struct_fields__})
             elif kind is RobotStatus:
                 self._take_robot({"rejected_count": record.rejected_count})
 

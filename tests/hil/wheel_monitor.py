@@ -1,7 +1,7 @@
 """Watches the wheels of a virtual robot and what reaches its controller; shares no code with what it watches.
 
-Its proofs are written from firmware_protocol/README.md: CRC-8H2F bit by bit, the layout of WHEEL_COMMAND, the rules for
-motion. `see` is called once per cycle of the controller.
+Its proofs are written from firmware_protocol/README.md: CRC-8H2F from its polynomial, the layout of WHEEL_COMMAND, the
+rules for motion. `see` is called once per cycle of the controller.
 """
 
 from __future__ import annotations
@@ -73,8 +73,9 @@ class WheelMonitor:
             self._zero_since_us = now_us
             return
         dt_s = (now_us - self._last_us) * 1e-6
-        good = [c for c in (read_command(f.can_id, f.data) for f in frames if f.can_id == WHEEL_COMMAND) if c]
-        self.commands_seen += sum(f.can_id == WHEEL_COMMAND for f in frames)
+        commands = [f for f in frames if f.can_id == WHEEL_COMMAND]
+        good = [c for f in commands if (c := read_command(f.can_id, f.data))]
+        self.commands_seen += len(commands)
         accepted = outputs.accepted_commands - before.accepted_commands
         if accepted:
             self._mind_accepted(now_us, accepted, good, before, outputs)
@@ -118,8 +119,9 @@ class WheelMonitor:
 
     def _mind_limits(self, now_us, dt_s, setpoints, earlier, before, outputs) -> None:
         limits = self.limits
+        turning = any(setpoints)
         for side, name in enumerate(("left", "right")):
-            value, last, targets = setpoints[side], earlier[side], [target[side] for target in self._targets]
+            value, last = setpoints[side], earlier[side]
             if not abs(value) <= limits.max_speed_rad_s + TINY:
                 self._tell(now_us, f"{name} setpoint {value} rad/s is beyond {limits.max_speed_rad_s}")
             if value == last:
@@ -129,14 +131,15 @@ class WheelMonitor:
             if not abs(value - last) <= limits.max_acceleration_rad_s2 * dt_s + TINY:
                 self._tell(now_us, f"{name} setpoint went from {last} to {value} rad/s in {dt_s} s")
             # Towards the last command that had a proof, or towards standstill; never past, never elsewhere.
+            targets = [target[side] for target in self._targets]
             towards_target = min(last, *targets) - TINY <= value <= max(last, *targets) + TINY
             towards_zero = min(last, 0.0) - TINY <= value <= max(last, 0.0) + TINY
             armed = "ARMED" in (before.state, outputs.state)
             if not (towards_zero or (armed and towards_target)):
                 self._tell(now_us, f"{name} setpoint {last} -> {value} rad/s in {outputs.state}; asked was {targets}")
-        if any(setpoints) and outputs.state not in MAY_TURN:
+        if turning and outputs.state not in MAY_TURN:
             self._tell(now_us, f"setpoints {setpoints} in {outputs.state}")
-        if any(setpoints) and not outputs.driver_enabled:
+        if turning and not outputs.driver_enabled:
             self._tell(now_us, f"setpoints {setpoints} with the driver off")
 
     def _mind_time(self, now_us, dt_s, setpoints, earlier, outputs) -> None:
@@ -187,12 +190,18 @@ def read_command(can_id: int, data: bytes) -> Command | None:
 SPEED_LSB = 0.002
 
 
+def _after_eight_bits(crc: int) -> int:
+    for _ in range(8):
+        crc = ((crc << 1) ^ 0x2F if crc & 0x80 else crc << 1) & 0xFF
+    return crc
+
+
+_AFTER_A_BYTE = bytes(map(_after_eight_bits, range(256)))
+
+
 def crc8h2f(data: bytes) -> int:
     """CRC-8H2F (AUTOSAR): polynomial 0x2F, initial value and final xor 0xFF; 0xDF over b"123456789"."""
     crc = 0xFF
     for byte in data:
-        crc ^= byte
-        for _ in range(8):
-            crc = (crc << 1) ^ 0x2F if crc & 0x80 else crc << 1
-            crc &= 0xFF
+        crc = _AFTER_A_BYTE[crc ^ byte]
     return crc ^ 0xFF
