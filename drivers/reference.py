@@ -50,6 +50,7 @@ _STATES = {
     "FAULT": DriverState.FAULT,
     "ESTOP": DriverState.ESTOP,
 }
+_ON_THE_WAY = {DriverState.ARMING: "arming", DriverState.ARMED: "armed"}
 _MAY_ARM = frozenset(DriverState) - {
     DriverState.DISCONNECTED,
     DriverState.HANDSHAKE,
@@ -78,6 +79,7 @@ class ReferenceDriver:
         self._transmission = FrameTransmission(codec, key)
         self._clock = DeviceClock()
         self._telemetry = telemetry.Telemetry(self._clock)
+        self._takers = self._make_takers()
         self._arming = Arming(codec.dbc_hash, draw_session)
         self._handshake = self._new_handshake()
         self._blocker_bits = codec.choices("SESSION_STATE", "blockers")
@@ -116,6 +118,8 @@ class ReferenceDriver:
     def detail(self) -> str:
         """One sentence for a person: why the state is what it is and what to do about it."""
         state, status, note = self.state, self._status, self._arming.note
+        if state in _ON_THE_WAY:
+            return _ON_THE_WAY[state]
         if state is DriverState.DISCONNECTED:
             return f"the link is down; {note}" if note else "the link is down"
         if self._handshake.refusal is not None:
@@ -127,10 +131,6 @@ class ReferenceDriver:
                 return f"the robot reports {words.fault(status.fault)}"
             case DriverState.ESTOP:
                 return words.estop(status.estop_source)
-            case DriverState.ARMING:
-                return "arming"
-            case DriverState.ARMED:
-                return "armed"
             case DriverState.STOPPING if status.state == "ARMED":
                 return note or "the robot is armed, but not by us or no longer wanted: it is being stopped"
         return note or f"the robot is in {status.state}"
@@ -284,34 +284,33 @@ class ReferenceDriver:
         return frames
 
     def _take(self, decoded: Decoded, received_ns: int, collected: dict[str, list[Any]]) -> None:
-        name = decoded.name
-        sample: tuple[str, Any] | None = None
-        if name in telemetry.WHEEL_MESSAGES:
-            sample = ("wheels", self._telemetry.wheels(decoded, received_ns))
-        elif name in telemetry.POSE_MESSAGES:
-            sample = ("poses", self._telemetry.pose(decoded, received_ns))
-        elif name in HANDSHAKE_MESSAGES:
-            self._take_handshake(decoded)
-        else:
-            match name:
-                case "SYSTEM_STATE":
-                    sample = ("status", self._take_status(decoded, received_ns))
-                case "SESSION_STATE":
-                    self._take_session(decoded, received_ns)
-                case "TIME_RESPONSE":
-                    self._take_time(decoded, received_ns)
-                case "MAC_CHALLENGE":
-                    self._transmission.challenge(int(decoded.values["nonce"]))
-                case "MOTOR":
-                    sample = ("motors", telemetry.motor(decoded, received_ns))
-                case "POWER":
-                    sample = ("power", telemetry.power(decoded, received_ns))
-                case "LINK_HEALTH":
-                    sample = ("link_health", telemetry.link_health(decoded, received_ns))
-        if sample is not None and sample[1] is not None:
-            collected.setdefault(sample[0], []).append(sample[1])
+        taker = self._takers.get(decoded.name)
+        if taker is None:
+            return
+        kind, take = taker
+        sample = take(decoded, received_ns)
+        if sample is not None:
+            collected.setdefault(kind, []).append(sample)
 
-    def _take_handshake(self, decoded: Decoded) -> None:
+    def _make_takers(self) -> dict[str, tuple[str, Callable[[Decoded, int], Any]]]:
+        """By message: the kind of sample in `Readings`, and who makes it or None of a frame and its reception."""
+        return {
+            **dict.fromkeys(telemetry.WHEEL_MESSAGES, ("wheels", self._telemetry.wheels)),
+            **dict.fromkeys(telemetry.POSE_MESSAGES, ("poses", self._telemetry.pose)),
+            **dict.fromkeys(HANDSHAKE_MESSAGES, ("", self._take_handshake)),
+            "SYSTEM_STATE": ("status", self._take_status),
+            "SESSION_STATE": ("", self._take_session),
+            "TIME_RESPONSE": ("", self._take_time),
+            "MAC_CHALLENGE": ("", self._take_challenge),
+            "MOTOR": ("motors", telemetry.motor),
+            "POWER": ("power", telemetry.power),
+            "LINK_HEALTH": ("link_health", telemetry.link_health),
+        }
+
+    def _take_challenge(self, decoded: Decoded, _received_ns: int) -> None:
+        self._transmission.challenge(int(decoded.values["nonce"]))
+
+    def _take_handshake(self, decoded: Decoded, _received_ns: int) -> None:
         before, refusal = self.capabilities, self._handshake.refusal
         self._handshake.take(decoded)
         capabilities = self.capabilities
@@ -419,6 +418,6 @@ class ReferenceDriver:
 
 
 def _check(command: WheelCommand) -> None:
-    speeds = (command.left_rad_s, command.right_rad_s)
-    if not all(math.isfinite(speed) for speed in speeds) or not command.valid_for_s >= SHORTEST_VALID_FOR_S:
+    finite = math.isfinite(command.left_rad_s) and math.isfinite(command.right_rad_s)
+    if not finite or not command.valid_for_s >= SHORTEST_VALID_FOR_S:
         raise ValueError(f"not a wheel command: {command}")

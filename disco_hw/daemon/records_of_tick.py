@@ -61,19 +61,21 @@ def tick(result: Tick, command: WheelCommand | None, valid_for_s: float) -> Iter
         yield _innovation(update)
     if result.plan is not None:
         plan, found = result.plan, result.plan.diagnostics
+        left, right = plan.wheel_speeds.T.tolist()
+        path_x, path_y, path_yaw = plan.trajectory.T.tolist()
         yield records.Plan(
             t_ns=result.t_ns,
             t0_ns=plan.t0_ns,
             step_s=plan.step_s,
-            left_rad_s=_plain(plan.wheel_speeds[:, 0]),
-            right_rad_s=_plain(plan.wheel_speeds[:, 1]),
+            left_rad_s=tuple(left),
+            right_rad_s=tuple(right),
             effective_samples=found.ess,
             temperature=found.temperature,
             min_cost=found.cost_min,
             mean_cost=found.cost_mean,
-            path_x_m=_plain(plan.trajectory[:, 0]),
-            path_y_m=_plain(plan.trajectory[:, 1]),
-            path_yaw_rad=_plain(plan.trajectory[:, 2]),
+            path_x_m=tuple(path_x),
+            path_y_m=tuple(path_y),
+            path_yaw_rad=tuple(path_yaw),
         )
     governed = result.command
     yield records.Command(

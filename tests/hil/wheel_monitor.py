@@ -132,10 +132,8 @@ class WheelMonitor:
                 self._tell(now_us, f"{name} setpoint went from {last} to {value} rad/s in {dt_s} s")
             # Towards the last command that had a proof, or towards standstill; never past, never elsewhere.
             targets = [target[side] for target in self._targets]
-            towards_target = min(last, *targets) - TINY <= value <= max(last, *targets) + TINY
-            towards_zero = min(last, 0.0) - TINY <= value <= max(last, 0.0) + TINY
             armed = "ARMED" in (before.state, outputs.state)
-            if not (towards_zero or (armed and towards_target)):
+            if not ((armed and _towards(value, last, targets)) or _towards(value, last, [0.0])):
                 self._tell(now_us, f"{name} setpoint {last} -> {value} rad/s in {outputs.state}; asked was {targets}")
         if turning and outputs.state not in MAY_TURN:
             self._tell(now_us, f"setpoints {setpoints} in {outputs.state}")
@@ -175,6 +173,11 @@ class WheelMonitor:
     def _tell(self, now_us: int, text: str) -> None:
         if len(self.violations) < ENOUGH_VIOLATIONS:
             self.violations.append(f"{now_us * 1e-6:.3f} s: {text}")
+
+
+def _towards(value: float, last: float, targets: list[float]) -> bool:
+    """Whether `value` is on the way from `last` to one of the targets, or between them."""
+    return min(last, *targets) - TINY <= value <= max(last, *targets) + TINY
 
 
 def read_command(can_id: int, data: bytes) -> Command | None:
