@@ -75,14 +75,14 @@ class FaultPlayer:
         return begun, ended
 
     def _begin(self, fault: Fault, now_ns: int) -> None:
-        left_s = (fault.end_ns - fault.begin_ns) * 1e-9
         if fault.kind.room is Room.PROCESS and self._processes is not None:
             self._processes.begin(fault)
         match fault.kind.name:
             case "unplug":
-                self._do(f"unplug {left_s}", now_ns)
+                self._unplug_until_ns = max(self._unplug_until_ns, now_ns + fault.end_ns - fault.begin_ns)
+                self._link.unplug(self._unplug_until_ns)
             case "unplug_mid_frame":
-                self._unplug_until_ns = now_ns + fault.end_ns - fault.begin_ns
+                self._unplug_until_ns = max(self._unplug_until_ns, now_ns + fault.end_ns - fault.begin_ns)
                 self.frames.break_next = True
             case "bus_off":
                 self._do(f"bus_off {fault['who']}", now_ns)
@@ -100,10 +100,14 @@ class FaultPlayer:
     def _end(self, fault: Fault, now_ns: int) -> None:
         if fault.kind.room is Room.PROCESS and self._processes is not None:
             self._processes.end(fault)
+        # Of two faults of a kind at once, the end of one is not that of the other.
+        others = [other for other in self.timeline.active if other.kind is fault.kind]
         match fault.kind.name:
+            case "babble" if others:
+                self._do(f"babble {others[-1]['id']} {others[-1]['rate_hz']}", now_ns)
             case "babble":
                 self._do("babble 0 0", now_ns)
-            case "estop_button":
+            case "estop_button" if not others:
                 self._do("estop_button off", now_ns)
             case "unplug_mid_frame":
                 self.frames.break_next = False

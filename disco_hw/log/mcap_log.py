@@ -69,13 +69,10 @@ class Metadata:
     @staticmethod
     def from_text(text: dict[str, str]) -> Metadata:
         """Read what `as_text` wrote; raises KeyError or ValueError on anything else."""
-        return Metadata(
-            robot=text["robot"],
-            version=text["version"],
-            part=int(text["part"]),
-            start_ns=int(text["start_ns"]),
-            wall_offset_ns=int(text["wall_offset_ns"]),
-        )
+        start_ns, wall_offset_ns = int(text["start_ns"]), int(text["wall_offset_ns"])
+        if max(abs(start_ns), abs(wall_offset_ns)) > _MAX_TIME_NS // 2:
+            raise ValueError("times of another age of the universe")
+        return Metadata(text["robot"], text["version"], int(text["part"]), start_ns, wall_offset_ns)
 
 
 class McapLog:

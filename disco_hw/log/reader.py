@@ -171,7 +171,12 @@ class Log:
             try:
                 record = decode(topic, message.data)
             except msgspec.MsgspecError as error:
-                raise LogError(f"{self._path}: a record of {topic} cannot be read ({error}); {_RECOVER}") from None
+                # Its checksum is right, so it was written like this: there is nothing to recover.
+                by = self._metadata.version or "another one"
+                raise LogError(
+                    f"{self._path}: a record of {topic} cannot be read ({error}); read it with the disco-hw that "
+                    f"recorded it: {by}"
+                ) from None
             yield message.log_time - offset, message.sequence, topic, record
 
     def columns(

@@ -2,8 +2,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mcap.writer import Writer
 
 from disco_hw.log.errors import LogError
+from disco_hw.log.load import load_drive
 from disco_hw.log.reader import Gap, open_log
 from disco_hw.log.records import Counters, Estimate, Event, Innovation, Plan
 from tests.log.samples import (
@@ -190,3 +192,37 @@ def test_a_brief_look_gives_the_same_records_but_of_plans_the_figures_alone(log_
             assert repr([getattr(short, name) for name in figures]) == repr([getattr(record, name) for name in figures])
         else:
             assert short == record
+
+
+ABOUT = {"robot": "x", "version": "7.0", "part": "1", "start_ns": "0", "wall_offset_ns": "0"}
+WHEELS = '{"t_ns":%d,"received_ns":5,"left_angle_rad":0,"right_angle_rad":0,"left_speed_rad_s":1,"right_speed_rad_s":1}'
+
+
+def hostile(path, about=None, wheels=WHEELS % 5, log_time=10**18):
+    """A log that no recorder of ours has written."""
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        writer.add_metadata("disco-hw", ABOUT | (about or {}))
+        channel = writer.register_channel("/wheels", "json", writer.register_schema("x", "jsonschema", b"{}"))
+        writer.add_message(channel, log_time, wheels.encode(), 0, 1)
+        writer.finish()
+    return path
+
+
+@pytest.mark.parametrize("name", ["start_ns", "wall_offset_ns"])
+@pytest.mark.parametrize("value", ["9" * 30, "-" + "9" * 30])
+def test_times_that_no_clock_has_make_it_no_log_of_ours(tmp_path, name, value):
+    with pytest.raises(LogError, match="not a log of disco-hw"):
+        open_log(hostile(tmp_path / "run.mcap", {name: value}))
+
+
+@pytest.mark.parametrize("change", [{"wheels": WHEELS % 10**25}, {"log_time": 2**64 - 1}])
+def test_a_record_at_a_time_that_no_clock_has_is_refused(tmp_path, change):
+    with pytest.raises(LogError, match=r"run\.mcap: a time in it is beyond 64 bits"):
+        load_drive(hostile(tmp_path / "run.mcap", **change))
+
+
+def test_of_a_record_that_was_written_otherwise_the_version_is_named(tmp_path):
+    with pytest.raises(LogError, match=r"a record of /wheels cannot be read .*; read it with .* recorded it: 7\.0"):
+        load_drive(hostile(tmp_path / "run.mcap", wheels="{}"))

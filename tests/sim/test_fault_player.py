@@ -87,6 +87,43 @@ def test_button_and_babble_are_taken_back():
     assert 0x7FF not in rig.heard
 
 
+def test_of_two_faults_of_a_kind_at_once_the_end_of_one_leaves_the_other():
+    rig = Rig(
+        'kind="estop_button"\nat_s=0.05\nfor_s=0.3',
+        'kind="estop_button"\nat_s=0.1\nfor_s=0.05',
+        'kind="babble"\nat_s=0.05\nfor_s=0.3\nid=0x7fe\nrate_hz=500',
+        'kind="babble"\nat_s=0.1\nfor_s=0.05\nid=0x7ff\nrate_hz=500',
+    )
+    rig.run(200)
+    assert rig.robot.estop_button
+    rig.heard.clear()
+    rig.run(300)
+    assert rig.robot.estop_button
+    assert 0x7FE in rig.heard
+    assert 0x7FF not in rig.heard
+    rig.run(400)
+    rig.heard.clear()
+    rig.run(450)
+    assert not rig.robot.estop_button
+    assert 0x7FE not in rig.heard
+
+
+@pytest.mark.parametrize("second", ["unplug", "unplug_mid_frame"])
+def test_a_line_that_is_out_comes_back_no_sooner_for_a_second_fault(second):
+    rig = Rig('kind="unplug"\nat_s=0.05\nfor_s=0.3', f'kind="{second}"\nat_s=0.1\nfor_s=0.05')
+    rig.run(340)
+    assert rig.can.host.node is None
+    rig.run(420)
+    assert rig.can.host.node is not None
+
+
+def test_a_line_may_be_out_for_hours():
+    rig = Rig('kind="unplug"\nat_s=0.05\nfor_s=5000')
+    rig.run(100)
+    assert rig.can.host.node is None
+    assert rig.told == ["fault 1 begins: unplug"]
+
+
 class Processes:
     def __init__(self):
         self.told = []
