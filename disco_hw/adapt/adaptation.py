@@ -172,6 +172,7 @@ class CheckedAdaptation:
             "text": self._text,
             "mean": dict(zip(NAMES, guard.in_force.mean.tolist(), strict=True)),
             "std": dict(zip(NAMES, guard.in_force.std.tolist(), strict=True)),
+            "covariance": guard.in_force.covariance.ravel().tolist(),
             "advantage": self._advantage,
             **self._counts,
             "link": asdict(self._link.stats),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ from typing import Any
 import viser
 
 from disco_hw.daemon.task_change import record_of, told_task
-from disco_hw.log.records import Record
+from disco_hw.log.records import BeliefChange, Record
 from disco_hw.viewer.desk import Desk
 from disco_hw.viewer.feed import feed_path
 from disco_hw.viewer.layers import add_layers
@@ -21,7 +21,7 @@ from disco_hw.viewer.scene import Scene
 from disco_hw.viewer.snapshot import Snapshot, snapshot_at
 from disco_hw.viewer.stage import Stage
 from disco_hw.viewer.subscriber import FeedSubscriber
-from disco_hw.viewer.timeline import Timeline
+from disco_hw.viewer.timeline import Items, Timeline
 
 MOVE_S = 0.1
 REDRAW_S = 0.5
@@ -84,6 +84,7 @@ class LivePage:
         """Draw the newest instant; the panel and long lines only if `everything`."""
         status = self._desk.status
         self._learn_task(status)
+        self._learn_belief(status)
         snapshot = self._snapshot()
         if snapshot is not None:
             self.scene.show(snapshot, everything)
@@ -127,6 +128,34 @@ class LivePage:
             return
         if self._stage.task_at(told) != asked:
             self.timeline.add(newest, record_of(newest, asked))
+
+    def _learn_belief(self, status: dict[str, Any] | None) -> None:
+        """Take over the belief in force: it may be from before this page was opened, or of a daemon that has gone."""
+        newest = self.timeline.last_ns
+        if newest is None or status is None or not status.get("ok"):
+            return
+        told = self.timeline.beliefs.last(newest)
+        if told is not None and newest - told.t_ns < _STATUS_OLDER_NS:
+            return
+        adaptation = status["adaptation"]
+        if adaptation is None:
+            self.timeline.adaptations = Items()
+        in_force = _belief_in_force(newest, adaptation)
+        if _geometry(told) != _geometry(in_force):
+            self.timeline.add(newest, in_force)
+
+
+def _belief_in_force(now_ns: int, adaptation: Mapping[str, Any] | None) -> BeliefChange:
+    """The belief that a status tells of."""
+    if adaptation is None or adaptation["belief"] != "adapted":
+        return BeliefChange(now_ns, "model")
+    mean = adaptation["mean"]
+    return BeliefChange(now_ns, "adapted", tuple(mean), tuple(mean.values()), tuple(adaptation["covariance"]))
+
+
+def _geometry(change: BeliefChange | None) -> tuple[tuple[float, ...], ...]:
+    """What tells two beliefs apart; the model file's is empty."""
+    return () if change is None or change.source == "model" else (change.mean, change.covariance)
 
 
 def run_live(page: LivePage, should_stop: Callable[[], bool]) -> None:

@@ -1,10 +1,13 @@
+import json
 import time
 from contextlib import closing
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from msgspec.structs import replace
 
+from disco_hw.adapt.coordinates import NAMES
 from disco_hw.config import CircleTask
 from disco_hw.daemon.task_change import asked_of
 from disco_hw.drive.coverage import Coverage
@@ -102,6 +105,45 @@ def test_a_task_that_was_changed_before_the_page_was_opened_is_taken_over(page):
     assert not len(live.timeline.tasks)
     live._learn_task(status_with(radius_m=0.5))
     assert live._stage.task_at(live._snapshot().task) == CircleTask(radius_m=0.5)
+
+
+def adapted(now_ns, radius_m=0.061):
+    covariance = tuple(value for row in np.diag([1e-6, 1e-8, 1e-6]) for value in row)
+    return records.BeliefChange(now_ns, "adapted", NAMES, (0.24, radius_m, 0.41), covariance)
+
+
+def status_of(change):
+    told = {"belief": "adapted", "mean": dict(zip(NAMES, change.mean, strict=True)), "covariance": change.covariance}
+    return json.loads(json.dumps({"ok": True, "adaptation": told}))
+
+
+def test_a_belief_from_before_the_page_was_opened_is_taken_over(page):
+    live, _ = page
+    live.take(ticks(0, 51))
+    learnt = adapted(START_NS)
+    live._learn_belief(status_of(learnt))
+    in_force = live._snapshot().belief
+    assert (in_force.names, in_force.mean, in_force.covariance) == (learnt.names, learnt.mean, learnt.covariance)
+    live.take(ticks(51, 200))
+    live._learn_belief(status_of(learnt))
+    assert len(live.timeline.beliefs) == 1
+    live._learn_belief(status_of(adapted(START_NS, 0.062)))
+    assert live._snapshot().belief.mean[1] == 0.062
+
+
+def test_a_belief_of_a_daemon_that_has_gone_is_not_the_next_ones(page):
+    live, _ = page
+    live.take(ticks(0, 2))
+    live.take(
+        [(live.timeline.last_ns, adapted(START_NS)), (live.timeline.last_ns, records.Adaptation(START_NS, "a", ""))]
+    )
+    live._learn_belief({"ok": True, "adaptation": None})
+    # So soon after it the status may be the older one.
+    assert live._snapshot().belief.source == "adapted"
+    live.take(ticks(2, 200))
+    live._learn_belief({"ok": True, "adaptation": None})
+    assert live._snapshot().belief.source == "model"
+    assert live._snapshot().adaptation is None
 
 
 def test_a_task_on_the_feed_is_newer_than_a_status_from_before_it(page):
