@@ -10,7 +10,7 @@ from typing import Any
 from disco_hw.config import RobotConfig, load_robot_config
 from disco_hw.daemon.control_client import send_request
 from disco_hw.daemon.control_socket import default_socket_path
-from disco_hw.errors import InputError
+from disco_hw.errors import InputError, WorkError
 
 ADAPT_ACTIONS = ("revert", "adapt")
 """Back to the belief of the model file, and learning again."""
@@ -32,7 +32,8 @@ def socket_path(config: RobotConfig) -> Path:
 def ask(robot: Path, action: str, changes: Sequence[str] = ()) -> dict[str, Any]:
     """Send one request to the daemon of `robot`; `changes`, as "radius_m=0.8", are for `task` alone.
 
-    Raises InputError for an unknown action and for changes that are none, and WorkError without a daemon.
+    Raises InputError for an unknown action and for changes that are none, and WorkError without a daemon; for an e-stop
+    with what stops the robot all the same.
     """
     if action not in ASKED:
         raise InputError(f"{action}: no such request; write one of {', '.join(ASKED)}")
@@ -40,7 +41,13 @@ def ask(robot: Path, action: str, changes: Sequence[str] = ()) -> dict[str, Any]
         said = "say what to change" if action == TASK else f"{action} takes nothing more; only {TASK} does"
         raise InputError(f"{said}: ctl {robot} {TASK} radius_m=0.8 speed_m_s=0.3")
     request = {"do": action} | dict(map(_change, changes))
-    return send_request(socket_path(load_robot_config(robot)), request)
+    try:
+        return send_request(socket_path(load_robot_config(robot)), request)
+    except (InputError, WorkError) as error:
+        if action != "estop":
+            raise
+        remedy = f"use `disco-hw estop {robot}` or the robot's own e-stop button, now"
+        raise type(error)(f"NOT SENT: {remedy} ({error})") from None
 
 
 def _change(text: str) -> tuple[str, float]:

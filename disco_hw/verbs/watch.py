@@ -40,9 +40,13 @@ def view(
     if live:
         if robot is None or log is not None:
             raise InputError("view --live: needs --robot ROBOT.toml and no LOG")
+        if (snapshot, video, export) != (None, None, None):
+            raise InputError("view --live: --snapshot, --video and --export are for a LOG; leave them out")
         raise typer.Exit(commands.view_live(robot, model, host, port, as_json=as_json, link=link))
     if log is None:
         raise InputError("view: give a LOG, or --live with --robot ROBOT.toml")
+    if (model, link) != (None, None):
+        raise InputError("view LOG: --model and --link are for --live, as a log has its own model; leave them out")
     if snapshot is not None:
         commands.snapshot_log(log, snapshot, at, robot)
     if video is not None:

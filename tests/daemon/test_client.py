@@ -6,7 +6,7 @@ import pytest
 
 import disco_hw
 from disco_hw.daemon.client import ask
-from disco_hw.errors import InputError
+from disco_hw.errors import InputError, WorkError
 
 ROBOT = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
 
@@ -27,3 +27,16 @@ ROBOT = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
 def test_what_is_no_request_is_not_sent(action, changes, words):
     with pytest.raises(InputError, match=words):
         ask(ROBOT, action, changes)
+
+
+@pytest.mark.parametrize("robot", ["no daemon", "no robot.toml"])
+def test_an_estop_that_reaches_nobody_says_what_does(tmp_path, robot):
+    path = tmp_path / "robot.toml"
+    if robot == "no daemon":
+        path.write_text(ROBOT.read_text() + f'[daemon]\ncontrol_socket = "{tmp_path / "none"}"\n')
+    error = WorkError if robot == "no daemon" else InputError
+    with pytest.raises(error, match=r"NOT SENT: use `disco-hw estop .*button, now"):
+        ask(path, "estop")
+    with pytest.raises((InputError, WorkError)) as other:
+        ask(path, "status")
+    assert "NOT SENT" not in str(other.value)

@@ -45,6 +45,19 @@ def test_a_mistake_is_one_line_and_exit_code_2(arguments):
     assert "Traceback" not in result.stderr
 
 
+@pytest.mark.parametrize(
+    ("arguments", "ignored"),
+    [
+        (("--live", "--robot", "/nowhere.toml", "--snapshot", "picture.png"), "--snapshot"),
+        (("/nowhere.mcap", "--model", "model.toml"), "--model"),
+    ],
+)
+def test_what_view_would_ignore_is_refused(arguments, ignored):
+    result = disco("view", *arguments)
+    assert result.returncode == 2
+    assert ignored in result.stderr
+
+
 def test_wrong_usage_exits_with_2():
     assert disco("run").returncode == 2
     assert disco("fly").returncode == 2
