@@ -196,7 +196,7 @@ def chain_track(
 
 def prediction_error(body: BodyChannel, starts: Starts, p: Array, track: Array, ahead_s: float) -> Array:
     """Measured minus predicted pose (K, 3) at the end, in the frame of the start: forward, left, yaw."""
-    moved = displacement(p, track, body.moving_s, starts.node, starts.pose[:, 2], ahead_s)
+    moved = displacement(p, body.timeline.first, track, body.moving_s, starts.node, starts.pose[:, 2], ahead_s)
     dx, dy = starts.end[:, 0] - starts.pose[:, 0], starts.end[:, 1] - starts.pose[:, 1]
     cosine, sine = np.cos(starts.pose[:, 2]), np.sin(starts.pose[:, 2])
     yaw = starts.end[:, 2] - starts.pose[:, 2] - moved[:, 2]
@@ -283,15 +283,15 @@ def floor_errors(
 ) -> Errors:
     """What the amended model would err if it were exactly right, by simulating the noise that was estimated."""
     starts = find_starts(body, poses, ahead_s)
-    noise = body.noise
+    noise, begins = body.noise, body.timeline.first
     clean, _ = chain_track(body, wheels, chain)
-    still = displacement(chain.body, clean, body.moving_s, starts.node, starts.pose[:, 2], ahead_s)
+    still = displacement(chain.body, begins, clean, body.moving_s, starts.node, starts.pose[:, 2], ahead_s)
     generator = np.random.default_rng(1)
     squares, speeds = [], []
     for _ in range(_PATHS):
         extra, wander = _disturbance(body, wheels, generator)
         track, _ = chain_track(body, wheels, chain, extra)
-        moved = displacement(chain.body, track, body.moving_s, starts.node, starts.pose[:, 2], ahead_s)
+        moved = displacement(chain.body, begins, track, body.moving_s, starts.node, starts.pose[:, 2], ahead_s)
         error = moved - still
         averaged = np.sqrt(max(2.0 * _REACH_S / max(float(np.median(np.diff(body.samples.t_s))), 1e-3), 1.0))
         jitter = generator.standard_normal((starts.node.size, 6))

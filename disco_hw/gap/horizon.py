@@ -19,13 +19,16 @@ _LEAD_S = 1.0
 
 
 @kernel_function
-def _displace(p: Any, track: Any, moving_s: Any, start: Any, heading: Any, ahead: int, out: Any) -> None:
+def _displace(
+    p: Any, track: Any, moving_s: Any, start: Any, low: Any, high: Any, heading: Any, ahead: int, out: Any
+) -> None:
     late = p[0] / CELL_S
     top = track.shape[0] - 2
     for k in range(start.shape[0]):
-        a = max(start[k] - late, 0.0)
-        b = max(start[k] + ahead - late, 0.0)
-        i, j = min(math.floor(a), top), min(math.floor(b), top)
+        a = max(start[k] - late, float(low[k]))
+        b = max(start[k] + ahead - late, float(low[k]))
+        # Poses that are true later than stamped may be so after the run's end: the last speed is kept.
+        i, j = min(math.floor(a), high[k] - 1), min(math.floor(b), high[k] - 1)
         f, g = a - i, b - j
         x = track[j, 0] + g * (track[j + 1, 0] - track[j, 0]) - track[i, 0] - f * (track[i + 1, 0] - track[i, 0])
         y = track[j, 1] + g * (track[j + 1, 1] - track[j, 1]) - track[i, 1] - f * (track[i + 1, 1] - track[i, 1])
@@ -41,11 +44,17 @@ def _displace(p: Any, track: Any, moving_s: Any, start: Any, heading: Any, ahead
         out[k, 2] = yaw - yaw_start
 
 
-def displacement(p: Array, track: Array, moving_s: Array, start: Index, heading_rad: Array, ahead_s: float) -> Array:
+def displacement(
+    p: Array, first: NDArray[np.bool_], track: Array, moving_s: Array, start: Index, heading_rad: Array, ahead_s: float
+) -> Array:
     """Forward, left and yaw (K, 3) that a pose sensor would see from each start node to `ahead_s` later.
 
-    `p` in the order of `BODY.columns`; `track` (M, 3) a free run of the body; `heading_rad` (K,) measured there.
+    `p` in the order of `BODY.columns`; `first` (M,) where runs begin, out of which no latency looks; `track` (M, 3) a
+    free run of the body; `heading_rad` (K,) measured there.
     """
+    begins = np.flatnonzero(first)
+    run = np.searchsorted(begins, start, side="right") - 1
+    low, high = begins[run], np.append(begins[1:], first.size)[run] - 1
     out = np.empty((start.size, 3))
     world = np.array(
         [
@@ -55,7 +64,7 @@ def displacement(p: Array, track: Array, moving_s: Array, start: Index, heading_
             BODY.at(p, "slope.drift_y_m_s"),
         ]
     )
-    _displace(world, track, moving_s, start, heading_rad, round(ahead_s / CELL_S), out)
+    _displace(world, track, moving_s, start, low, high, heading_rad, round(ahead_s / CELL_S), out)
     return out
 
 

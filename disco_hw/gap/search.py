@@ -129,7 +129,7 @@ def body_moves(channel: BodyChannel) -> Callable[[Split, Split], float]:
             return 0.0
         ends = []
         for p, extra in (small, big):
-            ends.append(displacement(p, channel.track(p, extra), channel.moving_s, start, heading, AHEAD_S))
+            ends.append(displacement(p, line.first, channel.track(p, extra), channel.moving_s, start, heading, AHEAD_S))
         apart = ends[1] - ends[0]
         lever = 0.5 * np.hypot(ends[1][:, 0], ends[1][:, 1])
         return _where_most(apart[:, 0] ** 2 + apart[:, 1] ** 2 + (lever * apart[:, 2]) ** 2)
