@@ -77,7 +77,7 @@ def run_check(robot: Path, link: str | None = None) -> CheckReport:
     """
     setup = load_setup(robot, None, link)
     key, transport = link_key(setup), make_link(setup)
-    _refuse_beside_a_daemon(setup.config)
+    refuse_beside_a_daemon(setup.config)
     checks = [_model_check(setup), check_task(setup.config.robot, setup.config.task)]
     checks.append(check_link_load(setup.config.link, setup.config.control, packaged_dbc()))
     control = setup.config.control
@@ -115,7 +115,8 @@ class _Found:
     round_trips_s: tuple[float, ...]
 
 
-def _refuse_beside_a_daemon(config: RobotConfig) -> None:
+def refuse_beside_a_daemon(config: RobotConfig) -> None:
+    """Raise WorkError while a daemon drives this robot."""
     path = socket_path(config)
     if not path.exists():
         return

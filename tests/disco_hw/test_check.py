@@ -2,6 +2,7 @@
 
 import time
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 
@@ -9,7 +10,9 @@ from disco_hw import check
 from disco_hw.daemon.preflight import Level
 from drivers.transport import connect_pair
 from drivers.types import Frame, OutgoingFrame
+from tests.daemon.test_control_client import Daemon
 from tests.drivers.reference_robot import CONFIG, ReferenceRobot
+from tests.robot import test_robot
 
 KEY = bytes(range(16))
 MS_NS = 1_000_000
@@ -65,3 +68,20 @@ def test_what_else_the_robot_rejects_is_a_warning():
     heard = check._hearing_check(check._ask_robot(robot, None))
     assert heard.level is Level.WARNING
     assert "checksum" in heard.text
+
+
+def test_the_conformance_suite_keeps_out_of_a_daemons_way_too(tmp_path):
+    """Two hosts would speak at once, and each test would fail for another reason."""
+    robot = tmp_path / "robot.toml"
+    robot.write_text(
+        '[robot]\nname = "busy"\nwheel_radius_m = 0.06\naxial_distance_m = 0.31\nticks_per_rev = 2048\n'
+        f'max_wheel_speed_rad_s = 8.0\n[link]\ninterface = "unixcan"\nchannel = "{tmp_path}/bus"\n'
+        f'[daemon]\ncontrol_socket = "{tmp_path}/control.sock"\n'
+    )
+    daemon = Daemon(tmp_path / "control.sock", {})
+    try:
+        with pytest.raises(pytest.exit.Exception, match="a daemon drives this robot") as caught:
+            test_robot.TestRobot.make_end(SimpleNamespace(getoption=lambda _: str(robot)))
+    finally:
+        daemon.close()
+    assert caught.value.returncode == 1

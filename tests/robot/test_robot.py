@@ -4,7 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from disco_hw.errors import InputError
+from disco_hw.check import refuse_beside_a_daemon
+from disco_hw.errors import InputError, WorkError
 from disco_hw.link import make_link
 from disco_hw.robot_setup import link_key, load_setup
 from tests.firmware_protocol.conformance import FirmwareConformance
@@ -17,7 +18,10 @@ class TestRobot(FirmwareConformance):
         try:
             setup = load_setup(Path(config.getoption("--robot")))
             cls.key, transport = link_key(setup), make_link(setup)
+            refuse_beside_a_daemon(setup.config)
         except InputError as error:
             pytest.exit(str(error), returncode=2)
+        except WorkError as error:
+            pytest.exit(str(error), returncode=1)
         transport.open()
         return LinkEnd(transport)
