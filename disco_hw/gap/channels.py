@@ -220,7 +220,7 @@ class BodyChannel:
         """
         window, keep = _windows(line)
         samples = line.pose.pick(keep)
-        measured = line.pose_values[keep]
+        measured = _turned_as_the_wheels(line, samples, line.pose_values[keep], geometry)
         chosen = np.ones(samples.t_s.size, dtype=bool) if use is None else use[keep]
         starts = np.flatnonzero(line.first)
         ends = np.append(starts[1:], line.t_s.size) - 1
@@ -367,6 +367,16 @@ def _windows(line: Timeline) -> tuple[Index, Mask]:
     keep = sizes[number] >= min(_SHORTEST_WINDOW, int(np.median(sizes)))
     _, renumbered = np.unique(number[keep], return_inverse=True)
     return renumbered.astype(np.int64), keep
+
+
+def _turned_as_the_wheels(line: Timeline, samples: Samples, measured: Array, geometry: Array) -> Array:
+    """Poses (P, 3) with whole turns as the wheels make them: while no pose comes, it may be more than half of one."""
+    push = total_push(line, 3, line.known_motion)
+    track = run_body(geometry, line.angle_rad, line.speed_rad_s, push, line.first, line.t_s)
+    expected = np.empty(measured.shape)
+    read_angles(track, samples.node, samples.fraction, expected)
+    yaw = expected[:, 2] + np.unwrap(measured[:, 2] - expected[:, 2])
+    return np.column_stack([measured[:, :2], yaw])
 
 
 def _no_motion(samples: Samples) -> Motion:
