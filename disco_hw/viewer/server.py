@@ -41,11 +41,13 @@ class Guard:
 
     Without a `token` only pages and browsers of this machine do: the name asked for must be a loopback one, which also
     defeats a foreign name that resolves to it. With one, the first request must carry it and gets a cookie. A
-    WebSocket must come from a page of this same server. `open` is False until the page is whole.
+    WebSocket must come from a page of this same server. `open` is False until the page is whole; its `port` tells its
+    cookie from that of another page, as a browser keeps the cookies of a host together.
     """
 
     token: str | None = None
     open: bool = False
+    port: int = 0
 
     def refusal(self, path: str, headers: Headers, upgrade: bool) -> Response | None:
         """The answer to a request that must not go on, or None."""
@@ -56,14 +58,18 @@ class Guard:
             return _plain(http.HTTPStatus.FORBIDDEN, "this page is for this machine only")
         if upgrade and headers.get("Origin") not in {f"http://{host}", f"https://{host}"}:
             return _plain(http.HTTPStatus.FORBIDDEN, "only this server's own page may connect")
-        if self.token is None or self._same(_cookie(headers)):
+        if self.token is None or self._same(_cookie(headers, self._cookie_name)):
             return None
         if not upgrade and self._same(parse_qs(urlsplit(path).query).get("token", [""])[0]):
-            cookie = f"{_COOKIE}={self.token}; HttpOnly; SameSite=Strict; Path=/"
+            cookie = f"{self._cookie_name}={self.token}; HttpOnly; SameSite=Strict; Path=/"
             return _answer(http.HTTPStatus.SEE_OTHER, "welcome", {"Location": "/", "Set-Cookie": cookie})
         return _plain(
             http.HTTPStatus.FORBIDDEN, "open the address with its token, as printed where the page was started"
         )
+
+    @property
+    def _cookie_name(self) -> str:
+        return f"{_COOKIE}-{self.port}"
 
     def _same(self, offered: str) -> bool:
         return self.token is not None and hmac.compare_digest(offered.encode(), self.token.encode())
@@ -95,6 +101,7 @@ def serving(label: str, host: str = LOOPBACK, port: int = DEFAULT_PORT, desk: De
         if port not in {0, taken}:
             raise InputError(f"--port {port}: another program took it just now; give another one")
         server.gui.configure_theme(show_share_button=False, show_logo=False, dark_mode=False)
+        guard.port = taken
         guard.open = True
         suffix = "" if guard.token is None else f"?token={guard.token}"
         yield Page(server, f"http://{host}:{taken}/{suffix}")
@@ -167,12 +174,12 @@ def _check_free(host: str, port: int) -> None:
         ) from None
 
 
-def _cookie(headers: Headers) -> str:
+def _cookie(headers: Headers, name: str) -> str:
     try:
         jar = SimpleCookie("; ".join(headers.get_all("Cookie")))
     except CookieError:
         return ""
-    return jar[_COOKIE].value if _COOKIE in jar else ""
+    return jar[name].value if name in jar else ""
 
 
 def _plain(status: http.HTTPStatus, text: str) -> Response:

@@ -242,7 +242,7 @@ def test_with_another_address_there_is_no_control_without_its_token(daemon):
     ):
         address = urlsplit(page.url)
         own, token = f"http://127.0.0.1:{address.port}", address.query.removeprefix("token=")
-        for cookie in ({}, {"Cookie": "disco-hw-token=wrong"}):
+        for cookie in ({}, {"Cookie": f"disco-hw-token-{address.port}=wrong"}):
             with pytest.raises(InvalidStatus) as refused:
                 connect(f"ws://127.0.0.1:{address.port}/desk", origin=own, additional_headers=cookie)
             assert refused.value.response.status_code == 403

@@ -128,6 +128,19 @@ def test_another_address_needs_its_token():
             assert client.recv(timeout=10)
 
 
+def test_two_pages_of_one_host_do_not_take_each_others_token():
+    # A browser keeps the cookies of a host together, whatever the port: the desk of one robot must not lose its line,
+    # and with that its e-stop, when that of another is opened.
+    with serving("one", host="0.0.0.0", port=0) as one, serving("two", host="0.0.0.0", port=0) as two:
+        jar = {}
+        for page in (one, two):
+            welcome, _ = get(port_of(page), f"/?{urlsplit(page.url).query}")
+            name, _, value = welcome.getheader("Set-Cookie").split(";")[0].partition("=")
+            jar[name] = value
+        cookies = "; ".join(f"{name}={value}" for name, value in jar.items())
+        assert [get(port_of(page), Cookie=cookies)[0].status for page in (one, two)] == [200, 200]
+
+
 def test_a_page_in_the_making_answers_nobody():
     guard = Guard()
     headers = Headers({"Host": "127.0.0.1:8080", "Origin": "http://127.0.0.1:8080"})
@@ -136,7 +149,9 @@ def test_a_page_in_the_making_answers_nobody():
     assert guard.refusal("/", headers, upgrade=True) is None
 
 
-@pytest.mark.parametrize("cookie", ["disco-hw-token=", "disco-hw-token", "=;;=", '"', "disco-hw-token=ö"])
+@pytest.mark.parametrize("cookie", ["disco-hw-token-0=", "disco-hw-token-0", "=;;=", '"', "disco-hw-token-0=ö"])
 def test_odd_cookies_are_no_token(cookie):
     guard = Guard(token="secret", open=True)
     assert guard.refusal("/", Headers({"Host": "a", "Cookie": cookie}), upgrade=False).status_code == 403
+    right = Headers({"Host": "a", "Cookie": "disco-hw-token-0=secret"})
+    assert guard.refusal("/", right, upgrade=False) is None
