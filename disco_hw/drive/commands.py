@@ -54,13 +54,17 @@ class DriveOptions:
 
 @dataclass(frozen=True, slots=True)
 class DriveResult:
-    """How a drive went: its log, what was excited, why it ended, and whether that was as wanted."""
+    """How a drive went: its log, what was excited, why it ended, whether that was as wanted, what of the log was lost.
+
+    `recording_errors`: sentences; with any of them the drive is not `completed`, as it was made for its log.
+    """
 
     log: Path
     ended: str
     completed: bool
     coverage: dict[str, Any]
     coverage_words: str
+    recording_errors: tuple[str, ...] = ()
 
     def as_dict(self) -> dict[str, Any]:
         """The result for machines."""
@@ -68,7 +72,8 @@ class DriveResult:
 
     def as_text(self) -> str:
         """The result for a person."""
-        return f"{self.ended}\n{self.coverage_words}\nlog {self.log}"
+        lost = "".join(f"\nNOT WHOLE: {error}" for error in self.recording_errors)
+        return f"{self.ended}\n{self.coverage_words}\nlog {self.log}{lost}"
 
 
 def run_drive(options: DriveOptions) -> DriveResult:
@@ -88,16 +93,24 @@ def run_drive(options: DriveOptions) -> DriveResult:
         if not options.as_json:
             print("\n".join(_announcement(options, config, script)), flush=True)
         coverage = Coverage(top_rad_s)
+        lost: list[str] = []
         with _display(socket_path(config), shown=not options.as_json) as say:
-            serve(setup, log_file, say, HandPilot(source, coverage, page))
+
+            def tell(topic: str, text: str) -> None:
+                if topic == "recording":
+                    lost.append(text)
+                say(topic, text)
+
+            serve(setup, log_file, tell, HandPilot(source, coverage, page))
     finally:
         source.close()
     return DriveResult(
         log=log_file,
         ended=source.ended or "stopped on request",
-        completed=source.completed,
+        completed=source.completed and not lost,
         coverage=coverage.as_dict(),
         coverage_words=coverage.in_words(),
+        recording_errors=tuple(lost),
     )
 
 

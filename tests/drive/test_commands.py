@@ -65,3 +65,13 @@ def test_the_result_is_for_people_and_machines():
     result = DriveResult(Path("a.mcap"), "script circle completed", True, {"missing": ["rest"]}, "1 of 2")
     assert result.as_text() == "script circle completed\n1 of 2\nlog a.mcap"
     assert json.loads(json.dumps(result.as_dict()))["log"] == "a.mcap"
+
+
+@pytest.mark.parametrize("said", [("event", "armed"), ("recording", "the log writer died (signal 9)")])
+def test_a_drive_whose_log_is_not_whole_is_not_completed(tmp_path, monkeypatch, said):
+    monkeypatch.setattr("disco_hw.drive.commands.serve", lambda _setup, _log, say, _pilot: say(*said))
+    result = run_drive(DriveOptions(write_robot_file(tmp_path), page=True, as_json=True))
+    whole = said[0] != "recording"
+    assert result.completed is whole
+    assert ("NOT WHOLE: the log writer died" in result.as_text()) is not whole
+    assert result.as_dict()["recording_errors"] == (() if whole else (said[1],))
