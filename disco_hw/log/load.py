@@ -5,12 +5,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+
 from disco_hw.log.container import MAGIC
 from disco_hw.log.csv_import import read_csv
 from disco_hw.log.drive import DriveLog, concatenate
 from disco_hw.log.errors import LogError
 from disco_hw.log.mcap_drive import drive_from_log
 from disco_hw.log.reader import open_log
+
+_FEWEST_POSES = 20
+_COPIED_SHARE = 0.5
 
 
 def load_drive(
@@ -27,7 +32,27 @@ def load_drive(
     for place, path in enumerate(several):
         if any(_same(path, other) for other in several[:place]):
             raise LogError(f"{path}: given twice, and what it says would count twice; give each log once")
-    return concatenate([_load(path, ticks_per_rev, wheel_radius_m) for path in several])
+    drives = [_load(path, ticks_per_rev, wheel_radius_m) for path in several]
+    if len(drives) > 1:
+        _refuse_copies(several, [_marks(drive) for drive in drives])
+    return concatenate(drives)
+
+
+def _refuse_copies(paths: Sequence[Path], marks: Sequence[set[tuple[float, ...]]]) -> None:
+    """A log and its recovered, exported or imported copy are one drive under two names."""
+    for place, path in enumerate(paths):
+        for other, theirs in zip(paths[:place], marks[:place], strict=True):
+            fewest = min(len(marks[place]), len(theirs))
+            if fewest >= _FEWEST_POSES and len(marks[place] & theirs) > _COPIED_SHARE * fewest:
+                raise LogError(f"{path}: holds what {other} holds, which would count twice; give one of them")
+
+
+def _marks(drive: DriveLog) -> set[tuple[float, ...]]:
+    """The different measured poses, each with the time since the one before (us), as no other drive has them."""
+    poses = drive.poses
+    since_us = np.rint(np.diff(poses.t_s) * 1e6)
+    columns = (since_us, poses.x_m[1:], poses.y_m[1:], poses.yaw_rad[1:])
+    return set(zip(*(column.tolist() for column in columns), strict=True))
 
 
 def _same(path: Path, other: Path) -> bool:

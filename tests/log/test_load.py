@@ -4,6 +4,7 @@ import pytest
 from disco_hw.log.csv_export import write_csv
 from disco_hw.log.errors import LogError
 from disco_hw.log.load import load_drive
+from disco_hw.log.recovery import recover
 from tests.log.samples import drive_ticks, log_bytes, write_log
 
 
@@ -58,3 +59,20 @@ def test_a_log_given_twice_is_refused_by_whatever_name(tmp_path, mcap, table):
     for again in (mcap, link, tmp_path / "." / mcap.name):
         with pytest.raises(LogError, match="given twice, and what it says would count twice; give each log once"):
             load_drive([mcap, table, again])
+
+
+@pytest.mark.parametrize("share", [1.0, 0.6])
+def test_a_log_and_its_copy_are_one_drive(tmp_path, share):
+    data = log_bytes(drive_ticks(200), flush_every=5)
+    whole, cut, mended = (tmp_path / name for name in ("whole.mcap", "cut.mcap", "mended.mcap"))
+    whole.write_bytes(data)
+    cut.write_bytes(data[: int(len(data) * share)])
+    recover(cut, mended)
+    with pytest.raises(LogError, match=r"mended\.mcap: holds what .*whole\.mcap holds, which would count twice"):
+        load_drive([whole, mended])
+
+
+def test_two_drives_are_two(tmp_path):
+    first, later = drive_ticks(200), drive_ticks(600)[380:]
+    logs = [write_log(tmp_path / "first.mcap", first), write_log(tmp_path / "later.mcap", later, numbers=True)]
+    assert load_drive(logs).poses.t_s.size == 84
