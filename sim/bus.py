@@ -162,7 +162,9 @@ class CanBus:
 
     def force_bus_off(self, node: BusNode) -> None:
         """Put a node into bus-off; its waiting frames are lost, a frame already on the wire ends."""
-        self._report(node, node.force_bus_off())
+        error_frame = node.force_bus_off()
+        if error_frame is not None:
+            self._report(node, error_frame)
 
     def request_recovery(self, node: BusNode) -> None:
         """Let a bus-off node come back after 128 sequences of 11 recessive bits; no effect in any other state."""
@@ -278,11 +280,15 @@ class CanBus:
         self._free_ns = end_ns + self._interframe_ns
         receivers = self._listeners(senders)
         for node in senders:
-            self._report(node, node.count_sent() if intact else node.count_transmit_error(transmission.acknowledged))
+            changed = node.count_sent() if intact else node.count_transmit_error(transmission.acknowledged)
+            if changed is not None:
+                self._report(node, changed)
             if node.state is _PASSIVE:
                 node.eligible_ns = self._free_ns + self._bits_ns(SUSPEND_TRANSMISSION_BITS)
         for node in receivers:
-            self._report(node, node.count_received() if intact else node.count_receive_error())
+            changed = node.count_received() if intact else node.count_receive_error()
+            if changed is not None:
+                self._report(node, changed)
         if self._recovering:
             self._count_recessive_sequences(1)
         self._idle_counted_ns = self._free_ns
@@ -320,9 +326,8 @@ class CanBus:
             else:
                 self._out.append(delivery)
 
-    def _report(self, node: BusNode, error_frame: CanFrame | None) -> None:
-        if error_frame is not None:
-            self._out.append(Delivery(self._now_ns, node, error_frame, (node,)))
+    def _report(self, node: BusNode, error_frame: CanFrame) -> None:
+        self._out.append(Delivery(self._now_ns, node, error_frame, (node,)))
 
     def _next_recovery_ns(self) -> int:
         """When on an idle bus the first recovering node will have seen enough recessive bits."""

@@ -31,6 +31,9 @@ class Learnt:
     events: tuple[str, ...] = ()
 
 
+_NOTHING = Learnt()
+
+
 class Adaptation(Protocol):
     """Asked before and told after each tick of the core; no call waits for anything."""
 
@@ -61,7 +64,7 @@ class NoAdaptation:
 
     def step(self, now_ns: int) -> Learnt:
         """Nothing is learnt."""
-        return Learnt()
+        return _NOTHING
 
     def feed(self, now_ns: int, readings: Readings) -> None:
         """Nobody listens."""
