@@ -24,7 +24,7 @@ from disco_hw.daemon.preflight import (
     check_task,
 )
 from disco_hw.daemon.realtime import can_lock_memory, can_use_fifo
-from disco_hw.errors import WorkError
+from disco_hw.errors import InputError, WorkError
 from disco_hw.link import make_link
 from disco_hw.robot_setup import Setup, link_key, load_setup
 from drivers import words
@@ -116,10 +116,15 @@ class _Found:
 
 
 def refuse_beside_a_daemon(config: RobotConfig) -> None:
-    """Raise WorkError while a daemon drives this robot."""
+    """Raise WorkError while a daemon drives this robot, InputError where that cannot be seen."""
     path = socket_path(config)
-    if not path.exists():
-        return
+    try:
+        if not path.exists():
+            return
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be looked at ({error.strerror}); be the daemon's user, or mend daemon.control_socket"
+        ) from None
     try:
         send_request(path, {"do": "status"}, timeout_s=1.0)
     except WorkError:

@@ -4,12 +4,16 @@ import time
 from dataclasses import replace
 from types import SimpleNamespace
 
+import msgspec
 import pytest
 
 from disco_hw import check
 from disco_hw.daemon.preflight import Level
+from disco_hw.errors import InputError
+from disco_hw.robot_setup import load_setup
 from drivers.transport import connect_pair
 from drivers.types import Frame, OutgoingFrame
+from tests.daemon.simulated import ROBOT_FILE
 from tests.daemon.test_control_client import Daemon
 from tests.drivers.reference_robot import CONFIG, ReferenceRobot
 from tests.robot import test_robot
@@ -85,3 +89,11 @@ def test_the_conformance_suite_keeps_out_of_a_daemons_way_too(tmp_path):
     finally:
         daemon.close()
     assert caught.value.returncode == 1
+
+
+def test_a_socket_that_cannot_be_looked_at_is_one_line():
+    # As where the daemon runs as another user, in a directory that only that one may enter.
+    setup = load_setup(ROBOT_FILE)
+    daemon = msgspec.structs.replace(setup.config.daemon, control_socket=f"/tmp/{'x' * 300}")
+    with pytest.raises(InputError, match="cannot be looked at"):
+        check.refuse_beside_a_daemon(msgspec.structs.replace(setup.config, daemon=daemon))
