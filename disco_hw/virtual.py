@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -46,6 +47,8 @@ def run_sim(options: SimOptions) -> int:
         faults = None if options.faults is None else load_schedule(options.faults)
     except FaultFileError as error:
         raise InputError(str(error)) from None
+    if options.start is not None and not all(map(math.isfinite, options.start)):
+        raise InputError(f"--start: {' '.join(map(str, options.start))} is no place; write finite numbers")
     ticks_per_rev = _whole_ticks(setup)
     x_m, y_m, yaw_rad = options.start or course_of(config.task).start
     plant = true_parameters(setup, options.plant_seed)

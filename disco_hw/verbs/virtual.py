@@ -8,11 +8,11 @@ from typing import Annotated
 import typer
 
 from disco_hw import outputs
+from disco_hw.errors import InputError
 from disco_hw.verbs.options import (
     AsJson,
     LinkOption,
     ModelOption,
-    RobotFile,
     View,
 )
 from disco_hw.viewer.address import DEFAULT_PORT
@@ -52,7 +52,9 @@ def demo(
 
 
 def sim(
-    robot: RobotFile,
+    robot: Annotated[
+        Path | None, typer.Argument(metavar="ROBOT.toml", help="The robot's configuration (docs/robot.md).")
+    ] = None,
     hide: Annotated[list[str] | None, typer.Option(metavar="EFFECT=VALUE", help="Give the plant this effect.")] = None,
     model: ModelOption = None,
     link: LinkOption = None,
@@ -81,6 +83,8 @@ def sim(
     if list_effects:
         print(effects_table())
         return
+    if robot is None:
+        raise InputError("sim: no ROBOT.toml given; name one, such as disco_hw/robots/wombot.toml")
     raise typer.Exit(
         run_sim(
             SimOptions(

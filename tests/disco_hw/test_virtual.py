@@ -6,8 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 import disco_hw
+from disco_hw.cli import app
 from disco_hw.errors import InputError
 from disco_hw.robot_setup import load_setup
 from disco_hw.virtual import SimOptions, run_sim, true_parameters
@@ -43,3 +45,18 @@ def test_a_fractional_encoder_is_refused(tmp_path):
     path.write_text(text.replace("wombot_model.toml", str(ROBOT.parent / "wombot_model.toml")))
     with pytest.raises(InputError, match="whole number"):
         run_sim(SimOptions(path))
+    # Checked before the encoder, so that this ends even where the start is not looked at.
+    with pytest.raises(InputError, match=r"--start: nan 0\.0 0\.0 is no place"):
+        run_sim(SimOptions(path, start=(float("nan"), 0.0, 0.0)))
+
+
+@pytest.mark.parametrize("what", ["effects", "faults"])
+def test_what_can_be_hidden_or_go_wrong_is_listed_without_a_robot(what):
+    result = CliRunner().invoke(app, ["sim", f"--list-{what}"])
+    assert result.exit_code == 0
+    assert {"effects": "motor_lag", "faults": "bus_off"}[what] in result.output
+
+
+def test_a_robot_is_needed_to_run():
+    with pytest.raises(InputError, match=r"no ROBOT\.toml given; name one"):
+        CliRunner().invoke(app, ["sim"], catch_exceptions=False)
