@@ -139,7 +139,8 @@ void disco_firmware_receive(disco_firmware_t *core, uint64_t now_us, uint32_t ca
 void disco_firmware_step(disco_firmware_t *core, uint64_t now_us, const disco_inputs_t *inputs,
                          disco_outputs_t *outputs);
 
-/* Queues one measured pose: metres, radians, the time when it was true, standard deviations. */
+/* Queues one measured pose: metres, radians, the time when it was true, standard deviations. One that does not fit its
+ * frames, a deviation of more than 0.255 m or rad among them, is sent as not valid. */
 void disco_firmware_pose(disco_firmware_t *core, double x, double y, double yaw, uint64_t sample_us,
                          double position_std, double yaw_std);
 

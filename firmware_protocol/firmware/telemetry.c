@@ -231,9 +231,13 @@ void disco_firmware_pose(disco_firmware_t *core, double x, double y, double yaw,
     const uint64_t own_us = sample_us + (core->now_us - core->clock_us);
     const double largest_x = DISCO_POSE_POSITION_X_SCALE * 0x7FFFFF;
     const double largest_yaw = DISCO_POSE_HEADING_YAW_SCALE * INT16_MAX;
-    /* Written so that what is not a number is not valid. */
+    const double largest_position_std = DISCO_POSE_HEADING_POSITION_STD_SCALE * UINT8_MAX;
+    const double largest_yaw_std = DISCO_POSE_HEADING_YAW_STD_SCALE * UINT8_MAX;
+    /* Written so that what is not a number is not valid. A deviation that is cut off would have the host trust a pose
+     * more than its sensor does. */
     const bool valid = (fabs(x) <= largest_x) && (fabs(y) <= largest_x) && (fabs(yaw) <= largest_yaw) &&
-                       (position_std >= 0.0) && (yaw_std >= 0.0);
+                       (position_std >= 0.0) && (yaw_std >= 0.0) && (position_std <= largest_position_std) &&
+                       (yaw_std <= largest_yaw_std);
     struct disco_robot_pose_position_t position = {
         .valid = valid,
         .x = raw(x, DISCO_POSE_POSITION_X_SCALE, -0x800000, 0x7FFFFF),

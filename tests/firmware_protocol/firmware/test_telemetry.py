@@ -390,8 +390,21 @@ def test_a_pose_without_deviation_is_valid():
     assert (values["valid"], values["position_std"], values["yaw_std"]) == (1, 0.0, 0.0)
 
 
-def test_a_large_deviation_saturates():
-    assert pose(0.0, 0.0, 0.0, 0, 5.0, 5.0)["position_std"] == pytest.approx(0.255)
+@pytest.mark.parametrize(
+    ("position_std_m", "yaw_std_rad", "valid"),
+    [
+        (0.255, 0.255, True),
+        (0.256, 0.1, False),
+        (0.1, 0.256, False),
+        (math.inf, 0.1, False),
+        (0.1, math.inf, False),
+    ],
+)
+def test_a_deviation_that_does_not_fit_makes_the_pose_not_valid(position_std_m, yaw_std_rad, valid):
+    seen = pose(0.0, 0.0, 0.0, 0, position_std_m, yaw_std_rad)
+    assert seen["valid"] == valid
+    assert seen["position_std"] == pytest.approx(min(position_std_m, 0.255))
+    assert seen["yaw_std"] == pytest.approx(min(yaw_std_rad, 0.255))
 
 
 def test_pose_counters():
