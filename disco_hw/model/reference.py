@@ -119,7 +119,7 @@ def wheel_targets(theta: Theta, state: State, left: Any, right: Any, time_s: flo
     if "wheel_gain.left" in theta:
         left, right = left * (1.0 + theta["wheel_gain.left"]), right * (1.0 + theta["wheel_gain.right"])
     if "battery_sag.loss" in theta:
-        kept = 1.0 - np.clip(theta["battery_sag.loss"] * time_s / 150.0, 0.0, 0.9)
+        kept = 1.0 - np.clip(theta["battery_sag.loss"] * time_s / 150.0, 0.0, 0.3)
         left, right = left * kept, right * kept
     if "stiction.threshold_rad_s" in theta:
         threshold = theta["stiction.threshold_rad_s"]

@@ -117,6 +117,8 @@ def test_lag_and_delay_and_limits_act_on_the_wheels():
     assert free_run({"speed_limit": {"limit_rad_s": 3.0}}, STRAIGHT)[-1, 3] == pytest.approx(3.0)
     assert free_run({"deadband": {"width_rad_s": 0.5}}, -STRAIGHT)[-1, 3] == pytest.approx(-3.5)
     assert free_run({"battery_sag": {"loss": 0.15}}, STRAIGHT, time_s=100.0)[1, 3] == pytest.approx(3.6)
+    # No pack loses more: a planner that believed it would ask for ever more speed.
+    assert free_run({"battery_sag": {"loss": 0.15}}, STRAIGHT, time_s=5000.0)[1, 3] == pytest.approx(2.8)
     left, right = free_run({"wheel_gain": {"left": 0.1, "right": -0.1}}, STRAIGHT)[-1, 3:]
     assert (left, right) == pytest.approx((4.4, 3.6))
 

@@ -9,11 +9,12 @@ from disco_hw.model.jit import cast_like, scalar_function
 from disco_hw.model.parameter import Parameter
 
 REFERENCE_S = 150.0
-LARGEST_LOSS = 0.9
+LARGEST_LOSS = 0.3
+"""A pack is empty before its voltage has fallen further: a lithium cell from 4.2 V to 3.0 V."""
 
 
 class BatterySag:
-    """u -> u (1 - loss t / 150 s): wheel speed falls linearly with the time since the start, to a tenth at least."""
+    """u -> u (1 - loss t / 150 s): wheel speed falls linearly with the time since the start, to 70 % at least."""
 
     name = "battery_sag"
     channel = Channel.COMMAND_TO_WHEEL
