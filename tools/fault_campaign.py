@@ -45,6 +45,7 @@ def run_seed(seed: int, duration_s: float, cycle_us: int, planner: str) -> dict[
     try:
         run.run(duration_s - 0.1)
     except Exception:
+        # Whatever came out of the stack is a finding, kept with its seed, and fails the campaign.
         raised = traceback.format_exc(limit=-4)
     wall_s, cpu_s = time.perf_counter() - began_s, time.process_time() - began_cpu_s
     outcome = run.outcome

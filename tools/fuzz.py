@@ -137,6 +137,7 @@ def _trouble(name: str, path: Path, refused: dict[str, int]) -> str:
         refused[name] += 1
         return f"more than one line: {error!r}" if "\n" in str(error) else ""
     except Exception:
+        # Anything but a refusal in words is what the fuzzer is looking for.
         return traceback.format_exc(limit=-3).replace("\n", " | ")
     return ""
 

@@ -207,6 +207,7 @@ class Daemon:
             try:
                 tick = self._core.tick(now_ns, requests)
             except Exception:
+                # Even where the tick itself fails while stopping, the robot is told to stop before that is passed on.
                 self._send_stop()
                 raise
             requests = ()
@@ -222,6 +223,7 @@ class Daemon:
             core.driver.request(Request.STANDBY)
             frames = core.driver.transmit(now_ns, None)
         except Exception:
+            # A driver that cannot even ask for standby has one frame left that needs no state.
             for frame in core.driver.estop(now_ns):
                 core.transport.send(frame, now_ns)
             raise
