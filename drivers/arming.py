@@ -85,6 +85,12 @@ class Arming:
         self._asked_ns = None
         self._was_armed = False
 
+    def give_up(self, why: str) -> None:
+        """End an arming or an armed session, with what `note` is to say."""
+        self.note = why
+        self._spent = self._opened
+        self._set_standby()
+
     def reset(self, why: str) -> None:
         """Void everything agreed with the robot: the link or the robot is another one."""
         if self.wanted is Request.ARM:
@@ -105,7 +111,7 @@ class Arming:
         if self.armed:
             self._was_armed = True
         elif self._was_armed or (self.wanted is Request.ARM and state in _LATCHED):
-            self._give_up(f"the robot disarmed itself: {words.stop_cause(stop_cause)}" if self._was_armed else "")
+            self.give_up(f"the robot disarmed itself: {words.stop_cause(stop_cause)}" if self._was_armed else "")
         if self.wanted is Request.RESET and before in _LATCHED and state not in _LATCHED:
             self._set_standby()
             self.note = ""
@@ -127,7 +133,7 @@ class Arming:
             if self._asked_ns is None:
                 self._asked_ns = now_ns
             elif now_ns - self._asked_ns > ARMING_TIMEOUT_NS:
-                self._give_up(f"not armed within {ARMING_TIMEOUT_NS * 1e-9:g} s: {self._why_not()}")
+                self.give_up(f"not armed within {ARMING_TIMEOUT_NS * 1e-9:g} s: {self._why_not()}")
         wanted = self.wanted in (Request.READY, Request.ARM)
         if wanted and self.session == 0 and self._robot_state in ("STANDBY", "READY"):
             self._choose_session(now_ns)
@@ -154,11 +160,6 @@ class Arming:
     def _void_session(self) -> None:
         self.session = 0
         self._opened = self._spent = False
-
-    def _give_up(self, why: str) -> None:
-        self.note = why
-        self._spent = self._opened
-        self._set_standby()
 
     def _set_standby(self) -> None:
         self.wanted = Request.STANDBY

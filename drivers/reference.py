@@ -8,6 +8,7 @@ from typing import Any
 
 from drivers import telemetry, words
 from drivers.arming import Arming, HostState
+from drivers.command_echo import CommandEcho
 from drivers.device_clock import DEVICE_CLOCK_MODULUS_US, DeviceClock
 from drivers.handshake import MESSAGES as HANDSHAKE_MESSAGES
 from drivers.handshake import Handshake
@@ -37,6 +38,8 @@ TIME_PERIOD_NS = 1_000_000_000
 FAST_TIME_COUNT = 10
 ZERO_VALID_FOR_S = 0.1
 ESTOP_REPEATS = 3
+# Above the 100 ms after which the robot stops by itself, so that no pause of this host alone looks like a slow link.
+LATE_NS = 150_000_000
 SHORTEST_VALID_FOR_S = 0.002
 _HOUSE_KEEPING_NS = 100_000_000
 _ESTOP_DEADLINE_NS = 1_000_000_000
@@ -90,6 +93,8 @@ class ReferenceDriver:
         self._time_sequence = 0
         self._time_requests: dict[int, int] = {}
         self._commands_sent = 0
+        self._echo = CommandEcho()
+        self._late_commands = 0
         self._device_us: int | None = None
         self._clock_errors_told: int | None = None
         self._clock_errors = 0
@@ -156,6 +161,7 @@ class ReferenceDriver:
             commands_sent=self._commands_sent,
             sessions=self._arming.sessions,
             robot_clock_errors=self._clock_errors,
+            late_commands=self._late_commands,
         )
 
     @property
@@ -221,6 +227,8 @@ class ReferenceDriver:
             frames.append(self._wheel_command(now_ns, "SPEED", command))
         elif self._arming.needs_zeros:
             frames.append(self._wheel_command(now_ns, "HOLD_ZERO", WheelCommand(0.0, 0.0, ZERO_VALID_FOR_S)))
+        else:
+            self._echo.forget()
         return self._transmission.proved((*frames, *self._house_keeping(now_ns)))
 
     def estop(self, now_ns: int) -> tuple[OutgoingFrame, ...]:
@@ -230,8 +238,7 @@ class ReferenceDriver:
         return (frame,) * ESTOP_REPEATS
 
     def _wheel_command(self, now_ns: int, mode: str, command: WheelCommand) -> OutgoingFrame:
-        self._commands_sent += 1
-        return self._transmission.frame(
+        frame = self._transmission.frame(
             "WHEEL_COMMAND",
             now_ns,
             # Half of its validity may pass on the way; the firmware counts the whole from the reception.
@@ -242,6 +249,9 @@ class ReferenceDriver:
             valid_for=command.valid_for_s,
             session=self._arming.session,
         )
+        self._echo.sent(self._commands_sent, now_ns)
+        self._commands_sent += 1
+        return frame
 
     def _house_keeping(self, now_ns: int) -> list[OutgoingFrame]:
         frames = []
@@ -343,7 +353,15 @@ class ReferenceDriver:
             came_from = before.state if before is not None else "unknown"
             self._events.append(f"robot {came_from} -> {status.state}{fault}")
         self._arming.take_status(status.state, status.session, status.stop_cause, status.reject_reason)
+        self._mind_lateness(self._echo.late_ns(int(values["last_command_counter"]), received_ns))
         return status
+
+    def _mind_lateness(self, late_ns: int) -> None:
+        if self._arming.armed and late_ns > LATE_NS:
+            self._late_commands += 1
+            why = f"disarmed: commands reach the robot over {late_ns * 1e-9:.2f} s late"
+            self._arming.give_up(why)
+            self._events.append(f"{why}; see what holds up the link")
 
     def _take_session(self, decoded: Decoded, received_ns: int) -> None:
         values = decoded.values

@@ -241,6 +241,7 @@ class DriverStats:
     commands_sent: int = 0
     sessions: int = 0
     robot_clock_errors: int = 0
+    late_commands: int = 0
 
 
 class Driver(Protocol):

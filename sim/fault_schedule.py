@@ -72,7 +72,10 @@ KINDS: Mapping[str, Kind] = MappingProxyType(
         for kind in (
             Kind("drop", Room.FRAMES, "frames are lost", _FRAMES),
             Kind("duplicate", Room.FRAMES, "frames come twice", _FRAMES),
-            Kind("delay", Room.FRAMES, "frames come late", (*_FRAMES, _number("delay_s", 0.05, 1e-4, 10.0))),
+            Kind(
+                "delay", Room.FRAMES, "frames come late, by `growth` s more with each second that it lasts",
+                (*_FRAMES, _number("delay_s", 0.05, 1e-4, 10.0), _number("growth", 0.0, 0.0, 10.0)),
+            ),
             Kind("reorder", Room.FRAMES, "frames overtake", (*_FRAMES, _number("window_s", 0.03, 1e-4, 1.0))),
             Kind("flip_before_crc", Room.FRAMES, "a bit is wrong on the wire: the link's own check sees it", _FRAMES),
             Kind("flip_after_crc", Room.FRAMES, "a bit is wrong behind the link's check: only E2E can see it", _FRAMES),
@@ -297,11 +300,15 @@ _DRAWN: Mapping[tuple[str, str], tuple[float, ...]] = MappingProxyType(
         ("cpu_hog", "cores"): (1, 2),
     }
 )
+# A delay that grows is not drawn: as short as drawn faults are, it would be one that stays.
+_NOT_DRAWN = frozenset({("delay", "growth")})
 _FRAME_IDS = (-1, -1, -1, 0x100, 0x101, 0x110, 0x111, 0x118, 0x119, 0x130, 0x133)
 _BABBLED_IDS = (0x000, 0x080, 0x100, 0x101, 0x110, 0x130, 0x7FF)
 
 
 def _drawn(kind: str, parameter: Parameter, chance: random.Random) -> float | str:
+    if (kind, parameter.name) in _NOT_DRAWN:
+        return parameter.default
     if parameter.choices:
         return chance.choice(parameter.choices)
     if parameter.name == "id":

@@ -73,6 +73,7 @@ class FrameFaults:
         self.broken = False
         self._chance = random.Random(seed)
         self._active: tuple[Fault, ...] = ()
+        self._since_ns: dict[int, int] = {}
 
     def set_active(self, active: Sequence[Fault]) -> None:
         """Take those of `active` that concern frames as the faults in force."""
@@ -90,13 +91,13 @@ class FrameFaults:
             if fault.kind.room is Room.FRAMES and not self._picks(fault, frame):
                 continue
             self.struck[fault.number] = self.struck.get(fault.number, 0) + 1
-            return self._fate(fault, to, frame)
+            return self._fate(now_ns, fault, to, frame)
         return UNHARMED
 
     def _picks(self, fault: Fault, frame: CanFrame) -> bool:
         return fault["id"] in (-1, frame.can_id) and self._chance.random() < fault["probability"]
 
-    def _fate(self, fault: Fault, to: str, frame: CanFrame) -> FrameFate:
+    def _fate(self, now_ns: int, fault: Fault, to: str, frame: CanFrame) -> FrameFate:
         chance = self._chance
         match fault.kind.name:
             case "drop" | "one_way":
@@ -104,7 +105,8 @@ class FrameFaults:
             case "duplicate":
                 return FrameFate(copies=2)
             case "delay":
-                return FrameFate(delay_ns=round(fault["delay_s"] * 1e9))
+                lasted_ns = now_ns - self._since_ns.setdefault(fault.number, now_ns)
+                return FrameFate(delay_ns=round(fault["delay_s"] * 1e9 + fault["growth"] * lasted_ns))
             case "reorder":
                 return FrameFate(delay_ns=round(chance.random() * fault["window_s"] * 1e9))
             case "flip_before_crc":

@@ -13,10 +13,11 @@ START_NS = 50_000 * MS
 class Bench:
     """Steps everything; `robot` is what the conformance suite calls a robot simulator (see `ReferenceRobot`).
 
-    `delay_ns(generator)` is how long each frame travels, `loses(generator)` whether it is lost on the way.
+    `delay_ns(generator)` is how long each frame travels, `loses(generator)` whether it is lost on the way;
+    `lag_ns(now_ns)` is how much longer it takes to the robot.
     """
 
-    def __init__(self, driver, robot, *, rate_hz=50, delay_ns=None, loses=None, seed=1):
+    def __init__(self, driver, robot, *, rate_hz=50, delay_ns=None, loses=None, lag_ns=None, seed=1):
         self.driver = driver
         self.robot = robot
         self.period_ns = round(1e9 / rate_hz)
@@ -25,6 +26,7 @@ class Bench:
         self.random = random.Random(seed)
         self.delay_ns = delay_ns
         self.loses = loses
+        self.lag_ns = lag_ns
         self.command = None
         self.host_runs = True
         self.readings = []
@@ -116,6 +118,8 @@ class Bench:
         if self.loses is not None and self.loses(self.random):
             return
         arrival_ns = self.now_ns + (round(self.delay_ns(self.random)) if self.delay_ns is not None else 0)
+        if self.lag_ns is not None and end is self.host_end:
+            arrival_ns += round(self.lag_ns(self.now_ns))
         self._sequence += 1
         heapq.heappush(self._under_way, (arrival_ns, self._sequence, end, frame))
         self._deliver()

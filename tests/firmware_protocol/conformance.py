@@ -216,6 +216,18 @@ class FirmwareConformance:
         assert host.state == "READY"
         assert host.fastest < STILL_RAD_S
 
+    def test_it_tells_the_counter_of_the_last_command_that_it_took(self, host):
+        """By which the host sees how late the robot is with them."""
+        session = host.to_ready()
+        for wheel_speed, taken in ((0.0, True), (1.0, False)):
+            for _ in range(10):
+                host.wheel_command(wheel_speed, wheel_speed, session=session)
+                host.run(0.02)
+                if taken:
+                    last = host.last_counter("WHEEL_COMMAND")
+            host.run(0.15)
+            assert host.latest["SYSTEM_STATE"]["last_command_counter"] == last
+
     def test_no_arming_without_zero_commands(self, host):
         session = host.to_ready()
         host.ask("ARM", session)

@@ -98,6 +98,10 @@ class ProtocolHost:
         self._counters[name] = (self._counters.get(name, -1) + 1) % 16
         return self._counters[name]
 
+    def last_counter(self, name):
+        """The counter of the last frame of this message."""
+        return self._counters[name]
+
     def send(self, name, **signals):
         """Send one frame as it should be."""
         frame = CODEC.encode(name, self.counter(name), **signals)

@@ -93,3 +93,17 @@ def test_the_table_counts_what_struck_an_armed_robot():
         "struck": 2, "tolerated": 1, "stopped": 1, "slowest_s": 0.3, "counted": 2, "told": 2, "stop_untold": 0,
     }  # fmt: skip
     assert "| `drop` | 2 | 1 | 1 | 0.30 s | 2 | 2 |" in markdown(summary(results))
+
+
+@pytest.mark.parametrize("growth", [0.1, 0.2, 1.0])
+@pytest.mark.parametrize("to", ["robot", "both"])
+def test_commands_that_come_later_and_later_end_in_a_stop(growth, to):
+    """Each in its turn, so that neither counter nor watchdog notices."""
+    text = f'[[fault]]\nat_s=4\nfor_s=10\nkind="delay"\nto="{to}"\nprobability=1\ndelay_s=0.001\ngrowth={growth}'
+    run = SimulatedRun(parse_schedule(text), seed=3, **FAST)
+    (seen,) = run.run(17.0).faults
+    assert run.outcome.violations == []
+    # Found when commands are 0.15 s late; then what is on its way, the watchdog's 0.1 s and the ramp.
+    assert seen.stopped_s < 0.15 * (1 + growth) / growth + 0.25 + 0.15 * (1 + growth) + 0.1 + 0.4
+    assert "driver.late_commands" in seen.counters
+    assert any("late" in text for text in seen.told)

@@ -117,3 +117,11 @@ def test_the_line_breaks_within_the_next_frame_and_only_there():
     assert first.wire_error_bit is not None
     assert faults.broken
     assert second.wire_error_bit is None
+
+
+def test_a_growing_delay_grows_from_the_first_frame_on():
+    faults = FrameFaults(1)
+    faults.set_active(schedule('kind="delay"\nat_s=0\nfor_s=9\nprobability=1\ndelay_s=0.05\ngrowth=0.2').faults)
+    begin_ns = 70_000 * MS
+    found = [faults.fate(begin_ns + ms * MS, "host", FRAME).delay_ns for ms in (0, 100, 1000)]
+    assert found == [50 * MS, 70 * MS, 250 * MS]
