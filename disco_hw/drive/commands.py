@@ -12,7 +12,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from disco_hw.config import RobotConfig
+from disco_hw.config import Link, RobotConfig
 from disco_hw.daemon.client import socket_path
 from disco_hw.daemon.clock import MonotonicClock
 from disco_hw.daemon.daemon import in_text, serve
@@ -27,6 +27,7 @@ from disco_hw.drive.script import Script, in_table, room_needed
 from disco_hw.drive.scripted import ScriptSource, Unattended
 from disco_hw.drive.scripts import make_script
 from disco_hw.drive.source import ManualSource
+from disco_hw.drive.virtual_link import leads_to_virtual_robot
 from disco_hw.errors import InputError
 from disco_hw.robot_setup import load_setup
 from drivers.gamepad import Gamepad, GamepadError, GamepadMapping, open_gamepad
@@ -143,6 +144,11 @@ def _source(
         raise InputError(f"{' and '.join(chosen)}: one deadman only; leave one of them out")
     held: ManualSource
     if options.unattended:
+        if not leads_to_virtual_robot(config.link):
+            raise InputError(
+                f"--unattended: {_words(config.link)} may lead to a real robot; hold a deadman (keyboard, --gamepad, "
+                "--page), or start the virtual robot first"
+            )
         held = Unattended()
     elif page is not None:
         held = page
@@ -151,6 +157,10 @@ def _source(
     else:
         held = Keyboard(_STANDARD_INPUT, KeyHold(top_rad_s), MonotonicClock())
     return held if script is None else ScriptSource(script, held)
+
+
+def _words(link: Link) -> str:
+    return f"link.port {link.port}" if link.kind == "serial" else f"link.interface {link.interface} {link.channel}"
 
 
 def _gamepad(config: RobotConfig, top_rad_s: float) -> GamepadSource:

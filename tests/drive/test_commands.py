@@ -32,6 +32,22 @@ def test_wrong_options_get_one_line(tmp_path, options, words):
     assert not (tmp_path / "control.sock").exists()
 
 
+@pytest.mark.parametrize(
+    ("interface", "words"), [("socketcan", "link.interface socketcan"), ("serial", "link.port /dev/ttyUSB0")]
+)
+def test_nobody_drives_a_robot_that_may_be_real_unattended(tmp_path, interface, words):
+    robot = write_robot_file(tmp_path)
+    text = robot.read_text()
+    if interface == "serial":
+        text = re.sub(r"(?m)^port = .*$", 'port = "/dev/ttyUSB0"', text)
+    else:
+        text = re.sub(r"(?m)^interface = .*$", 'interface = "socketcan"', text)
+    robot.write_text(text)
+    link = "serial" if interface == "serial" else None
+    with pytest.raises(InputError, match=f"^--unattended: {words}.* may lead to a real robot; hold a deadman"):
+        run_drive(DriveOptions(robot, link=link, script="steps", unattended=True))
+
+
 def test_without_a_terminal_one_line_says_what_to_use(tmp_path, monkeypatch):
     with (tmp_path / "nothing").open("w+b") as file:
         monkeypatch.setattr("disco_hw.drive.commands._STANDARD_INPUT", file.fileno())
