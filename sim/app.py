@@ -9,10 +9,10 @@ import secrets
 import select
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import IO, Literal
+from typing import Literal
 
 import can
 
@@ -32,6 +32,7 @@ from sim.python_can_link import PythonCanLink
 from sim.robot_link import RobotLink
 from sim.serial_line import SerialLine, SerialPathError
 from sim.stop_signal import StopSignal
+from sim.text_record import TextRecord
 from sim.truth import TruthRecorder
 from sim.unix_listener import SocketPathError
 from sim.virtual_robot import STEP_US, DeviceClock, VirtualRobot
@@ -95,12 +96,13 @@ def run_virtual_robot(options: VirtualRobotOptions) -> int:
     """Run the virtual robot until SIGTERM or SIGINT; main thread only.
 
     Prints one line that begins with "ready" when a host can open the link. Returns 0 after a clean stop, 2 with one
-    line on stderr if an option cannot be used.
+    line on stderr if an option cannot be used, 1 if a record could not be written to its end, which was told then.
     """
     stop = StopSignal()
+    records: list[TextRecord] = []
     with contextlib.ExitStack() as resources:
         try:
-            process = _set_up(options, resources)
+            process = _set_up(options, records, resources)
         except (OptionError, SocketPathError, SerialPathError, HiddenEffectError) as error:
             print(error, file=sys.stderr)
             return 2
@@ -111,7 +113,7 @@ def run_virtual_robot(options: VirtualRobotOptions) -> int:
             select.select((*process.filenos(), stop.fileno()), (), (), process.timeout_s())
             process.work()
         print(f"stopped after {process.robot.now_us / 1e6:.3f} s: {process.link.summary()}", file=sys.stderr)
-    return 0
+    return 1 if any(record.error for record in records) else 0
 
 
 class _Process:
@@ -179,20 +181,13 @@ class _Process:
             self.robot.receive((received.t_ns - self._start_ns) // 1000, received.frame)
 
 
-def _set_up(options: VirtualRobotOptions, resources: contextlib.ExitStack) -> _Process:
+def _set_up(options: VirtualRobotOptions, records: list[TextRecord], resources: contextlib.ExitStack) -> _Process:
     if options.faults is not None:
         _check_faults(options.faults, options.kind, options.interface)
     robot = _make_robot(options)
-    recorder = None
-    log = None
-    try:
-        if options.truth_file is not None:
-            recorder = TruthRecorder(options.truth_file)
-            resources.callback(recorder.close)
-        if options.bus_log is not None:
-            log = resources.enter_context(options.bus_log.open("w", encoding="utf-8"))
-    except OSError as error:
-        raise OptionError(f"{error.filename}: {error.strerror}; choose another file") from None
+    truth, bus = (_open_record(path, records, resources) for path in (options.truth_file, options.bus_log))
+    recorder = None if truth is None else TruthRecorder(truth)
+    log = None if bus is None else bus.line
     link = _open_link(options, log)
     resources.callback(link.close)
     commands = None if options.inject is None else CommandSocket(options.inject)
@@ -202,6 +197,18 @@ def _set_up(options: VirtualRobotOptions, resources: contextlib.ExitStack) -> _P
     # Nothing made so far will go away: the collector need not look at it again.
     gc.freeze()
     return _Process(robot, link, commands, recorder)
+
+
+def _open_record(path: Path | None, records: list[TextRecord], resources: contextlib.ExitStack) -> TextRecord | None:
+    if path is None:
+        return None
+    try:
+        record = TextRecord(path, _tell)
+    except OSError as error:
+        raise OptionError(f"{error.filename}: {error.strerror}; choose another file") from None
+    resources.callback(record.close)
+    records.append(record)
+    return record
 
 
 def _check_faults(schedule: FaultSchedule, kind: str, interface: str) -> None:
@@ -245,7 +252,7 @@ def _given(config: FirmwareConfig) -> str:
     return f"firmware {', '.join(chosen)}"
 
 
-def _open_link(options: VirtualRobotOptions, log: IO[str] | None) -> RobotLink:
+def _open_link(options: VirtualRobotOptions, log: Callable[[str], object] | None) -> RobotLink:
     now_ns = time.monotonic_ns()
     if options.kind == "serial":
         if options.baud <= 0:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import IO
 
 from drivers.types import Frame, ReceivedFrame
 from sim.bus import BusFault
@@ -16,14 +15,19 @@ from sim.robot_node import RobotNode
 class HubLink:
     """A hub at `path` with the robot as a node; satisfies `sim.robot_link.RobotLink`.
 
-    `log` gets every frame on the bus in candump format. Raises SocketPathError if the hub cannot listen.
+    `log` gets a line for every frame on the bus, as candump writes it. Raises SocketPathError if the hub cannot listen.
     """
 
     def __init__(
-        self, path: Path, now_ns: int, *, bitrate: int = 500_000, pacing: bool = True, log: IO[str] | None = None
+        self,
+        path: Path,
+        now_ns: int,
+        *,
+        bitrate: int = 500_000,
+        pacing: bool = True,
+        log: Callable[[str], object] | None = None,
     ) -> None:
-        write_line = None if log is None else lambda line: log.write(line + "\n")
-        self.hub = Hub(path, now_ns, bitrate=bitrate, pacing=pacing, log=write_line)
+        self.hub = Hub(path, now_ns, bitrate=bitrate, pacing=pacing, log=log)
         self._robot = RobotNode(self.hub.bus)
         self.robot = self._robot.node
 

@@ -14,10 +14,9 @@ import select
 import termios
 import tty
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO
 
 from drivers.types import Frame, ReceivedFrame
 from firmware_protocol.serial_framing import FrameDecoder, encode_frame
@@ -56,12 +55,18 @@ class SerialLine:
 
     `path` becomes a symbolic link to the port that a host opens; None leaves the port under its own name (`port`).
     `baud` is the robot's rate in bit/s (8 data bits, no parity, 1 stop bit); `pacing` off makes bytes take no time.
-    `log` gets each frame whose last bit has passed, in either direction, as candump writes it.
+    `log` gets a line for each frame whose last bit has passed, in either direction, as candump writes it.
     Raises SerialPathError if `path` is taken by anything but a link to a terminal, ValueError for an impossible rate.
     """
 
     def __init__(
-        self, path: Path | None, now_ns: int, *, baud: int = 921_600, pacing: bool = True, log: IO[str] | None = None
+        self,
+        path: Path | None,
+        now_ns: int,
+        *,
+        baud: int = 921_600,
+        pacing: bool = True,
+        log: Callable[[str], object] | None = None,
     ) -> None:
         if baud <= 0:
             raise ValueError(f"baud must be positive, not {baud}")
@@ -196,7 +201,7 @@ class SerialLine:
 
     def _note(self, t_ns: int, frame: Frame) -> None:
         if self._log is not None:
-            self._log.write(candump_line(t_ns, "serial", CanFrame(frame.can_id, frame.data)) + "\n")
+            self._log(candump_line(t_ns, "serial", CanFrame(frame.can_id, frame.data)))
 
     def _fate(self, sender: str, frame: Frame) -> FrameFate:
         if self._fault is None:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import TextIO
-
+from sim.text_record import TextRecord
 from sim.virtual_robot import VirtualRobot
 
 COLUMNS = (
@@ -41,21 +39,17 @@ def truth_row(robot: VirtualRobot, t_ns: int) -> str:
 
 
 class TruthRecorder:
-    """Writes `COLUMNS` as CSV to `path`; what is older than a second is on disk. Raises OSError if it cannot write."""
+    """Writes `COLUMNS` as CSV; what is older than a second is on disk."""
 
-    def __init__(self, path: Path) -> None:
-        self._file: TextIO = path.open("w", encoding="utf-8")
-        self._file.write(",".join(COLUMNS) + "\n")
-        self._file.flush()
+    def __init__(self, record: TextRecord) -> None:
+        self._record = record
+        record.line(",".join(COLUMNS))
+        record.flush()
         self._flushed_ns = 0
 
     def record(self, robot: VirtualRobot, t_ns: int) -> None:
         """Write the state of the last step, which was at the monotonic time `t_ns`."""
-        self._file.write(truth_row(robot, t_ns) + "\n")
+        self._record.line(truth_row(robot, t_ns))
         if t_ns - self._flushed_ns >= FLUSH_NS:
             self._flushed_ns = t_ns
-            self._file.flush()
-
-    def close(self) -> None:
-        """Write what is left and close; safe to call twice."""
-        self._file.close()
+            self._record.flush()

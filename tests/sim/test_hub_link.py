@@ -129,7 +129,7 @@ def test_a_babbling_node_is_heard_by_robot_and_hosts(link, bus):
 
 def test_the_log_is_candump(tmp_path):
     with (tmp_path / "bus.log").open("w") as log:
-        link = HubLink(tmp_path / "hub2", 0, log=log)
+        link = HubLink(tmp_path / "hub2", 0, log=lambda line: log.write(line + "\n"))
         link.send([FRAME])
         run(link, 0, MS)
         link.close()
