@@ -14,7 +14,7 @@ _ANSWERS = frozenset({"HELLO", "BUILD", "LIMITS", "TIME_RESPONSE", "PARAM_RESPON
 _SENDERS = {layout.name: layout.sender for layout in PROTOCOL.messages}
 _USABLE = (E2EStatus.OK, E2EStatus.OK_SOME_LOST)
 _REJECTED = (E2EStatus.REPEATED, E2EStatus.WRONG_SEQUENCE)
-_AFTER_A_GAP = (E2EStatus.OK_SOME_LOST, E2EStatus.WRONG_SEQUENCE)
+_AFTER_A_GAP = (E2EStatus.INITIAL, E2EStatus.OK_SOME_LOST, E2EStatus.WRONG_SEQUENCE)
 
 
 class FrameReception:
@@ -35,6 +35,7 @@ class FrameReception:
     def reset(self) -> None:
         """Forget the senders, as at a new link; the counts stay."""
         self._receivers.clear()
+        self._counters.clear()
         self.foreign = None
 
     def accept(self, received: ReceivedFrame) -> Decoded | None:
@@ -81,4 +82,5 @@ class FrameReception:
         previous = self._counters.get(decoded.name)
         self._counters[decoded.name] = decoded.counter
         if previous is not None and status in _AFTER_A_GAP:
-            self.lost += (decoded.counter - previous) % COUNTER_MODULUS - 1
+            # At least: whole turns of the counter do not show.
+            self.lost += (decoded.counter - previous - 1) % COUNTER_MODULUS

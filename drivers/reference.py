@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from drivers import telemetry, words
+from drivers.armed_watch import ArmedWatch
 from drivers.arming import Arming, HostState
-from drivers.command_echo import CommandEcho
 from drivers.device_clock import DEVICE_CLOCK_MODULUS_US, DeviceClock
 from drivers.handshake import MESSAGES as HANDSHAKE_MESSAGES
 from drivers.handshake import Handshake
@@ -38,8 +38,6 @@ TIME_PERIOD_NS = 1_000_000_000
 FAST_TIME_COUNT = 10
 ZERO_VALID_FOR_S = 0.1
 ESTOP_REPEATS = 3
-# Above the 100 ms after which the robot stops by itself, so that no pause of this host alone looks like a slow link.
-LATE_NS = 150_000_000
 SHORTEST_VALID_FOR_S = 0.002
 _HOUSE_KEEPING_NS = 100_000_000
 _ESTOP_DEADLINE_NS = 1_000_000_000
@@ -93,8 +91,7 @@ class ReferenceDriver:
         self._time_sequence = 0
         self._time_requests: dict[int, int] = {}
         self._commands_sent = 0
-        self._echo = CommandEcho()
-        self._late_commands = 0
+        self._watch = ArmedWatch()
         self._device_us: int | None = None
         self._clock_errors_told: int | None = None
         self._clock_errors = 0
@@ -161,7 +158,8 @@ class ReferenceDriver:
             commands_sent=self._commands_sent,
             sessions=self._arming.sessions,
             robot_clock_errors=self._clock_errors,
-            late_commands=self._late_commands,
+            late_commands=self._watch.late,
+            silent_states=self._watch.silent,
         )
 
     @property
@@ -228,7 +226,7 @@ class ReferenceDriver:
         elif self._arming.needs_zeros:
             frames.append(self._wheel_command(now_ns, "HOLD_ZERO", WheelCommand(0.0, 0.0, ZERO_VALID_FOR_S)))
         else:
-            self._echo.forget()
+            self._watch.rest()
         return self._transmission.proved((*frames, *self._house_keeping(now_ns)))
 
     def estop(self, now_ns: int) -> tuple[OutgoingFrame, ...]:
@@ -249,7 +247,7 @@ class ReferenceDriver:
             valid_for=command.valid_for_s,
             session=self._arming.session,
         )
-        self._echo.sent(self._commands_sent, now_ns)
+        self._watch.sent(self._commands_sent, now_ns)
         self._commands_sent += 1
         return frame
 
@@ -353,15 +351,8 @@ class ReferenceDriver:
             came_from = before.state if before is not None else "unknown"
             self._events.append(f"robot {came_from} -> {status.state}{fault}")
         self._arming.take_status(status.state, status.session, status.stop_cause, status.reject_reason)
-        self._mind_lateness(self._echo.late_ns(int(values["last_command_counter"]), received_ns))
+        self._watch.told(int(values["last_command_counter"]), received_ns)
         return status
-
-    def _mind_lateness(self, late_ns: int) -> None:
-        if self._arming.armed and late_ns > LATE_NS:
-            self._late_commands += 1
-            why = f"disarmed: commands reach the robot over {late_ns * 1e-9:.2f} s late"
-            self._arming.give_up(why)
-            self._events.append(f"{why}; see what holds up the link")
 
     def _take_session(self, decoded: Decoded, received_ns: int) -> None:
         values = decoded.values
@@ -402,6 +393,10 @@ class ReferenceDriver:
         if known and now_ns - self._last_heard_ns > (REFUSED_SILENCE_NS if refused else SILENCE_NS):
             self._restart("the robot fell silent")
             self._events.append("the robot fell silent: new handshake")
+        objection = self._watch.objection(now_ns) if self._arming.armed else None
+        if objection is not None:
+            self._arming.give_up(f"disarmed: {objection}")
+            self._events.append(f"disarmed: {objection}")
         if self._telemetry.distrusts_clock:
             self._clock.forget()
             self._telemetry.restart()

@@ -242,6 +242,7 @@ class DriverStats:
     sessions: int = 0
     robot_clock_errors: int = 0
     late_commands: int = 0
+    silent_states: int = 0
 
 
 class Driver(Protocol):

@@ -53,6 +53,17 @@ def test_lost_repeated_and_out_of_sequence():
     assert reception.accept(ticks(13)) is not None
 
 
+def test_what_is_lost_in_a_long_gap_counts_as_far_as_the_counter_shows_it():
+    reception = qualified()
+    reception.accept(ticks(9, 2 * TIMEOUT_NS))
+    assert reception.lost == 5
+    reception.accept(ticks(10, 4 * TIMEOUT_NS))
+    assert reception.lost == 5, "a silence in which nothing was sent is no loss"
+    reception.reset()
+    reception.accept(ticks(3, 4 * TIMEOUT_NS))
+    assert reception.lost == 5, "a new link, or another robot, begins anew"
+
+
 def test_a_damaged_frame_is_counted_and_many_cost_the_trust():
     reception = qualified()
     good = ticks(4)
