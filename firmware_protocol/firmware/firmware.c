@@ -2,8 +2,8 @@
 
 #include "core.h"
 
-/* A longer pause between two cycles must not become one big step of the setpoint. */
 #define LONGEST_CYCLE_US (10000u)
+#define CYCLES_REMEMBERED (256u)
 #define NOMINAL_CYCLE_US (1000u)
 #define BUS_OFF_ABOVE (255u)
 
@@ -79,6 +79,18 @@ void disco_advance(disco_firmware_t *core, uint64_t clock_us)
     }
 }
 
+/* How long this cycle counts for the setpoint: no longer than those before it, so that neither a pause nor a leap of the
+ * clock becomes one big step. */
+static uint32_t counted_us(disco_firmware_t *core)
+{
+    const uint64_t since_us = core->now_us - core->last_step_us;
+    const uint32_t elapsed_us = (since_us < LONGEST_CYCLE_US) ? (uint32_t)since_us : LONGEST_CYCLE_US;
+    const uint32_t longest_us = core->longest_cycle_us;
+    const uint32_t remembered_us = longest_us - (longest_us / CYCLES_REMEMBERED);
+    core->longest_cycle_us = (elapsed_us > remembered_us) ? elapsed_us : remembered_us;
+    return (elapsed_us < longest_us) ? elapsed_us : longest_us;
+}
+
 void disco_firmware_step(disco_firmware_t *core, uint64_t now_us, const disco_inputs_t *inputs,
                          disco_outputs_t *outputs)
 {
@@ -94,8 +106,7 @@ void disco_firmware_step(disco_firmware_t *core, uint64_t now_us, const disco_in
         disco_advance(core, now_us);
     }
     core->cycle_us = now_us;
-    uint64_t elapsed_us = core->now_us - core->last_step_us;
-    elapsed_us = (elapsed_us < LONGEST_CYCLE_US) ? elapsed_us : LONGEST_CYCLE_US;
+    const uint32_t elapsed_us = counted_us(core);
     core->last_step_us = core->now_us;
     core->inputs = *inputs;
     core->inputs_known = true;

@@ -110,6 +110,7 @@ typedef struct {
     uint64_t clock_us; /* the caller's clock, when it last told */
     uint64_t cycle_us; /* the same, at the last cycle */
     uint64_t last_step_us;
+    uint32_t longest_cycle_us; /* of the last ones, forgotten slowly */
     uint32_t rejected[DISCO_REJECT_REASONS];
     uint32_t rejected_total;
     uint32_t crc_errors;

@@ -41,6 +41,8 @@ def test_random_faults_end_in_a_stop_or_are_tolerated(seed):
         ('kind="motor_stall"\nfor_s=2', True),
         ('kind="battery_sag"\nfor_s=1', True),
         ('kind="clock_jump"\nstep_s=5', True),
+        # Longer than the watchdog, shorter than what lets the driver go: a stop with its ramp.
+        ('kind="clock_jump"\nstep_s=0.25', True),
         # The core keeps a time of its own, which never goes back: watchdogs and ramps go on as if nothing had happened.
         ('kind="clock_jump"\nstep_s=-5', False),
         ('kind="sigkill"\nfor_s=0.5', True),
