@@ -209,11 +209,11 @@ class ReconnectingTransport:
             self._incoming.clear()
             self._connection = connection
             self._last_error = None
+            # Counted before it shows, so that nobody sees a link that came back and was not counted.
+            self._counters.add(reconnects=1 if self._generation else 0)
             self._generation += 1
             self._state = LinkState.UP
             self._changed.notify_all()
-        if self._generation > 1:
-            self._counters.add(reconnects=1)
 
     def _go_down(self, connection: Connection) -> None:
         with self._changed:
