@@ -96,6 +96,25 @@ def test_each_violation_is_told(commit, words):
     assert any(words in text for text in scene.monitor.violations), scene.monitor.violations
 
 
+@pytest.mark.parametrize(("cycles_armed", "told"), [(21, False), (24, True)])
+def test_the_watchdog_runs_from_the_instant_of_arming(cycles_armed, told):
+    scene = Scene(state="READY", driver_enabled=False)
+    for _ in range(3):
+        scene.step()
+    for _ in range(cycles_armed):
+        scene.step(state="ARMED", driver_enabled=True)
+    assert any("ARMED 0.1" in text for text in scene.monitor.violations) is told, scene.monitor.violations
+
+
+def test_an_arming_without_a_command_shortly_before_is_told():
+    scene = Scene(state="READY", driver_enabled=False)
+    for _ in range(23):
+        scene.step()
+    assert scene.monitor.violations == []
+    scene.step(state="ARMED", driver_enabled=True)
+    assert any("armed 0.120 s after" in text for text in scene.monitor.violations), scene.monitor.violations
+
+
 def test_a_stop_that_does_not_slow_down_is_told():
     scene = Scene(left_setpoint_rad_s=2.0, right_setpoint_rad_s=2.0)
     for _ in range(5):

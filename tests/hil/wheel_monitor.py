@@ -53,6 +53,7 @@ class WheelMonitor:
     _last_us: int = 0
     _targets: tuple[tuple[float, float], ...] = ((0.0, 0.0),)
     _accepted_us: int | None = None
+    _armed_us: int = 0
     _zero_since_us: int | None = None
     _last_counter: int | None = None
     _falling_bound: float | None = None
@@ -88,7 +89,7 @@ class WheelMonitor:
         if before.session != outputs.session and outputs.session:
             self._ended_sessions.pop(outputs.session, None)
         self._mind_limits(now_us, dt_s, setpoints, earlier, before, outputs)
-        self._mind_time(now_us, dt_s, setpoints, earlier, outputs)
+        self._mind_time(now_us, dt_s, setpoints, earlier, before, outputs)
         self._mind_wheels(now_us, setpoints, wheel_speeds)
         self._last, self._last_us = outputs, now_us
 
@@ -140,10 +141,16 @@ class WheelMonitor:
         if turning and not outputs.driver_enabled:
             self._tell(now_us, f"setpoints {setpoints} with the driver off")
 
-    def _mind_time(self, now_us, dt_s, setpoints, earlier, outputs) -> None:
+    def _mind_time(self, now_us, dt_s, setpoints, earlier, before, outputs) -> None:
         limits = self.limits
         age_s = float("inf") if self._accepted_us is None else (now_us - self._accepted_us) * 1e-6
-        if outputs.state == "ARMED" and age_s > limits.command_timeout_s + 2.0 * dt_s:
+        longest_s = limits.command_timeout_s + 2.0 * dt_s
+        if outputs.state == "ARMED" != before.state:
+            self._armed_us = now_us
+            if age_s > longest_s:
+                self._tell(now_us, f"armed {age_s:.3f} s after the last accepted command")
+        # The watchdog runs from the instant of arming, then from the last accepted command.
+        if outputs.state == "ARMED" and min(age_s, (now_us - self._armed_us) * 1e-6) > longest_s:
             self._tell(now_us, f"ARMED {age_s:.3f} s after the last accepted command")
         if outputs.driver_enabled and age_s > limits.drive_off_s + 2.0 * dt_s:
             self._tell(now_us, f"the driver is on {age_s:.3f} s after the last accepted command")
