@@ -154,12 +154,12 @@ class Supervisor:
         before = self._state
         row = next_transition(before, seen | self._asked())
         if row is not None:
-            self._enter(row)
+            self._enter(row, inputs)
         if self._state is State.FAULT and _PROBLEM & (seen | self._asked()):
             self._trouble = self._words(inputs)
         if row is not None:
-            words = f": {self._trouble}" if row.target is State.FAULT else ""
-            self._events.append(f"{before.value} -> {row.target.value}: {row.reason}{words}")
+            words = f"{row.reason}: {self._trouble}" if row.target is State.FAULT else _reason(row, inputs)
+            self._events.append(f"{before.value} -> {row.target.value}: {words}")
         self._mind_task(inputs)
         return self._output(inputs, seen, replies)
 
@@ -283,10 +283,10 @@ class Supervisor:
             self._events.append(f"start request dropped: {why}")
         self._arming, self._start_pending = None, False
 
-    def _enter(self, row: Transition) -> None:
+    def _enter(self, row: Transition, inputs: Inputs) -> None:
         self._state = row.target
         if row.target is State.STOPPING:
-            self._stop_reason = row.reason
+            self._stop_reason = _reason(row, inputs)
         if row.target is State.ARMED:
             self._arming = None
         else:
@@ -367,6 +367,11 @@ class Supervisor:
         if self._state is State.FAULT and self._resetting is not None and seen & _ROBOT_TROUBLE:
             return _once(self._resetting, Request.RESET)
         return Request.STANDBY
+
+
+def _reason(row: Transition, inputs: Inputs) -> str:
+    """Return the row's reason; where the robot acted first, with what the driver knows of its reason."""
+    return f"{row.reason}: {inputs.driver_detail}" if Condition.ROBOT_ARMED in row.blocked_by else row.reason
 
 
 def _once(pending: _Pending, request: Request) -> Request | None:

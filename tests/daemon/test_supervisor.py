@@ -109,9 +109,10 @@ def test_lost_telemetry_disarms_and_stops_sending(age_s):
 @pytest.mark.parametrize("robot", [DriverState.STOPPING, DriverState.STANDBY, DriverState.READY, DriverState.HANDSHAKE])
 def test_a_robot_that_stops_by_itself_ends_the_run(robot):
     bench = Bench().running()
-    out = bench.tick(driver_state=robot)
+    out = bench.tick(driver_state=robot, driver_detail="no wheel command arrived in time")
     assert out.state is State.STOPPING
-    assert "by itself" in out.detail
+    assert "no longer armed: no wheel command arrived in time; waiting" in out.detail
+    assert any("no longer armed: no wheel command arrived in time" in event for event in out.events)
     bench.tick(count=50)
     assert bench.out.state is State.READY
     assert Request.ARM not in bench.requests_sent[-50:]
