@@ -9,13 +9,15 @@ from typing import Any
 
 # A terminal that closes must not end the process before it has stopped the wheels, hence SIGHUP.
 _STOP_SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
+_MAY_STAY_IGNORED = signal.SIGHUP
 
 
 class StopSignals:
     """Catches the signals while entered, in the main thread; the former handlers come back on exit.
 
-    To be entered around the stop path too: the second signal of somebody impatient must not break it off. A signal
-    that is ignored already stays ignored, as by nohup.
+    To be entered around the stop path too: the second signal of somebody impatient must not break it off. SIGHUP stays
+    ignored where it was, as by nohup; SIGINT does not: a shell has it ignored in what a script starts with `&`, and
+    whoever presses Ctrl-C wants the robot to stop.
     """
 
     def __init__(self, signals: Sequence[signal.Signals] = _STOP_SIGNALS) -> None:
@@ -30,7 +32,7 @@ class StopSignals:
 
     def __enter__(self) -> StopSignals:
         for number in self._signals:
-            if signal.getsignal(number) is not signal.SIG_IGN:
+            if number is not _MAY_STAY_IGNORED or signal.getsignal(number) is not signal.SIG_IGN:
                 self._former[number] = signal.signal(number, self._note)
         return self
 

@@ -109,8 +109,8 @@ class ScriptSource:
 class Unattended:
     """Holds the deadman by itself, once: for the virtual robot, and for tests.
 
-    Pressed when the robot has become ready; if driving does not begin, or ends by anything else than the script, it
-    is released for good.
+    Pressed when the robot has become ready; if it does not drive within `driving_within_s`, then or after a hold while
+    armed, or is disarmed by anybody, it is released for good.
     """
 
     def __init__(self, ready_within_s: float = 60.0, driving_within_s: float = 5.0) -> None:
@@ -118,6 +118,7 @@ class Unattended:
         self._driving_within_ns = round(driving_within_s * 1e9)
         self._first_ns: int | None = None
         self._pressed_ns: int | None = None
+        self._waiting_ns = 0
         self._driven = False
         self._ended: str | None = None
 
@@ -149,15 +150,16 @@ class Unattended:
         if self._pressed_ns is None:
             if robot.state is State.READY:
                 # Held from the next tick on: a deadman counts only after it was seen open.
-                self._pressed_ns = now_ns
+                self._pressed_ns = self._waiting_ns = now_ns
             elif now_ns - self._first_ns > self._ready_within_ns:
                 self._ended = f"the robot was not ready within {self._ready_within_ns * 1e-9:g} s"
         elif robot.driving:
-            self._driven = True
+            self._driven, self._waiting_ns = True, now_ns
         elif self._driven and robot.state is not State.ARMED:
             self._ended = self._ended or "the robot was disarmed before the script was over"
-        elif now_ns - self._pressed_ns > self._driving_within_ns:
-            self._ended = self._ended or "the robot did not start to drive"
+        elif now_ns - self._waiting_ns > self._driving_within_ns:
+            hold = f"the robot held still for {self._driving_within_ns * 1e-9:g} s before the script was over"
+            self._ended = self._ended or (hold if self._driven else "the robot did not start to drive")
         return ManualInput(now_ns, 0.0, 0.0, deadman=held)
 
     def close(self) -> None:

@@ -69,12 +69,13 @@ def test_the_former_handlers_come_back():
     assert [signal.getsignal(number) for number in STOP_SIGNALS] == before
 
 
-def test_an_ignored_signal_stays_ignored():
-    former = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+@pytest.mark.parametrize(("number", "noticed"), [(signal.SIGINT, True), (signal.SIGTERM, True), (signal.SIGHUP, False)])
+def test_of_ignored_signals_only_that_of_the_terminal_stays_ignored(number, noticed):
+    former = signal.signal(number, signal.SIG_IGN)
     try:
         with StopSignals() as signals:
-            os.kill(os.getpid(), signal.SIGHUP)
-            assert signals.received is None
-        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+            os.kill(os.getpid(), number)
+            assert (signals.received is number) is noticed
+        assert signal.getsignal(number) is signal.SIG_IGN
     finally:
-        signal.signal(signal.SIGHUP, former)
+        signal.signal(number, former)

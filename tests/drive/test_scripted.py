@@ -141,6 +141,16 @@ def test_unattended_never_presses_again():
     assert held(source, READY, 100, 6 * TICK) == [False] * 100
 
 
+def test_unattended_goes_on_after_a_short_hold_however_late():
+    source = Unattended(driving_within_s=1.0)
+    held(source, READY, 2)
+    held(source, DRIVING, 100, 2 * TICK)
+    assert held(source, HOLDING, 50, 102 * TICK) == [True] * 50
+    assert held(source, DRIVING, 1, 152 * TICK) == [True]
+    assert held(source, HOLDING, 60, 153 * TICK)[-1] is False
+    assert "held still for 1 s" in source.ended
+
+
 def test_unattended_gives_up():
     source = Unattended(ready_within_s=1.0)
     held(source, RobotView(State.HANDSHAKE, driving=False), 52)
