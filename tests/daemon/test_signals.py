@@ -34,15 +34,18 @@ print(signals.received.name, flush=True)
 """
 
 
-def start():
-    process = subprocess.Popen([sys.executable, "-c", DAEMON], stdout=subprocess.PIPE, text=True)
-    assert process.stdout.readline() == "running\n"
-    return process
+@pytest.fixture
+def process():
+    with subprocess.Popen([sys.executable, "-c", DAEMON], stdout=subprocess.PIPE, text=True) as started:
+        try:
+            assert started.stdout.readline() == "running\n"
+            yield started
+        finally:
+            started.kill()
 
 
 @pytest.mark.parametrize("number", STOP_SIGNALS)
-def test_a_signal_stops_the_loop_and_the_stop_path_runs_in_order(number):
-    process = start()
+def test_a_signal_stops_the_loop_and_the_stop_path_runs_in_order(process, number):
     process.send_signal(number)
     output, _ = process.communicate(timeout=10)
     assert output.splitlines() == ["stopping", "wheels stand", "log closed", number.name]
@@ -50,8 +53,7 @@ def test_a_signal_stops_the_loop_and_the_stop_path_runs_in_order(number):
 
 
 @pytest.mark.parametrize("second", STOP_SIGNALS)
-def test_a_second_signal_does_not_break_the_stop_path_off(second):
-    process = start()
+def test_a_second_signal_does_not_break_the_stop_path_off(process, second):
     process.send_signal(signal.SIGTERM)
     assert process.stdout.readline() == "stopping\n"
     process.send_signal(second)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+import warnings
 
 import pytest
 
@@ -20,10 +21,12 @@ def test_demo_follows_the_circle(tmp_path, link, plant_seed):
         ],
         capture_output=True,
         text=True,
-        timeout=250,
+        timeout=160,
         check=False,
     )  # fmt: skip
     assert result.returncode == 0, result.stderr
+    if "driving anew" in result.stderr:
+        warnings.warn(f"driven twice: {result.stderr}", stacklevel=1)
     figures = json.loads(result.stdout)
     assert figures["success"]
     assert figures["circle"]["laps"] >= 0.98
