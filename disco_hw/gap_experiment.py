@@ -18,23 +18,23 @@ from matplotlib.figure import Figure
 
 from disco_hw.config import CircleTask, circle_task
 from disco_hw.course import course_of
-from disco_hw.daemon.assembly import make_planner
 from disco_hw.drive.coverage import Coverage
 from disco_hw.drive.hand_pilot import HandPilot
 from disco_hw.drive.scripted import ScriptSource, Unattended
 from disco_hw.drive.scripts import make_script
 from disco_hw.errors import InputError, WorkError
+from disco_hw.experiments.metrics import Path as Track
+from disco_hw.experiments.metrics import circle_figures
+from disco_hw.experiments.simulated_time import SimulatedRun
+from disco_hw.experiments.virtual import true_parameters
 from disco_hw.gap.commands import WRITTEN, gap
 from disco_hw.gap.report import REPORTED_HORIZON_S, STAGES, GapReport
-from disco_hw.metrics import Path as Track
-from disco_hw.metrics import circle_figures
 from disco_hw.model import EffectSetting, Gaussian, Model
 from disco_hw.model.parameter import BASE_PARAMETERS
 from disco_hw.outputs import as_json, refuse_directory
-from disco_hw.pipeline import NoPlanner
-from disco_hw.robot_setup import Setup, load_setup
-from disco_hw.simulated_time import SimulatedRun
-from disco_hw.virtual import true_parameters
+from disco_hw.runtime.assembly import make_planner
+from disco_hw.runtime.pipeline import NoPlanner
+from disco_hw.runtime.robot_setup import Setup, load_setup
 from firmware_protocol.firmware_core import FirmwareConfig
 from sim.body_dynamics import Pose
 from sim.effects import HiddenEffectError, parse_hidden_effects

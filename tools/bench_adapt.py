@@ -11,20 +11,20 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 import disco_hw
-from disco_hw.adapt.adaptable import believed_geometry, possible_range
-from disco_hw.adapt.adapter import Adapter
-from disco_hw.adapt.evidence import evidence
-from disco_hw.adapt.experiment import AdaptOptions, run_adapt
-from disco_hw.adapt.guard import Geometry
-from disco_hw.adapt.link import ProcessLink
-from disco_hw.adapt.messages import InForce
-from disco_hw.adapt.network import Training, train_network, training_range
-from disco_hw.daemon.assembly import make_adaptation, make_pipeline, make_planner, put_in_force
+from disco_hw.adaptation.adaptable import believed_geometry, possible_range
+from disco_hw.adaptation.adapter import Adapter
+from disco_hw.adaptation.evidence import evidence
+from disco_hw.adaptation.guard import Geometry
+from disco_hw.adaptation.link import ProcessLink
+from disco_hw.adaptation.messages import InForce
+from disco_hw.adaptation.network import Training, train_network, training_range
 from disco_hw.daemon.warm_up import warm_up
+from disco_hw.experiments.adapt import AdaptOptions, run_adapt
 from disco_hw.inference.noise import USUAL
-from disco_hw.robot_setup import Setup, load_setup
+from disco_hw.runtime.assembly import make_adaptation, make_pipeline, make_planner, put_in_force
+from disco_hw.runtime.robot_setup import Setup, load_setup
 from drivers.types import PoseSample, Readings, WheelSample
-from tests.adapt.drives import TRUTH, excited, messages
+from tests.adaptation.drives import TRUTH, excited, messages
 from tests.hil.changing_robot import drive_through_change
 from tests.hil.stack import FAST_START, FAST_TASK, running_stack
 

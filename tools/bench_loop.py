@@ -10,9 +10,9 @@ import time
 
 from disco_hw.daemon import realtime
 from disco_hw.daemon.clock import MonotonicClock
-from disco_hw.daemon.governor import Governor, WheelLimits
 from disco_hw.daemon.loop import Loop
-from disco_hw.daemon.supervisor import Inputs, Supervisor, SupervisorSettings
+from disco_hw.runtime.governor import Governor, WheelLimits
+from disco_hw.runtime.supervisor import Inputs, Supervisor, SupervisorSettings
 from drivers.types import DriverState, LinkState
 
 RATE_HZ = 50.0

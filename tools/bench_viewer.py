@@ -23,12 +23,12 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Origin, Subprotocol
 
+from disco_hw.daemon.page_feed import ViewerFeed, feed_path
 from disco_hw.daemon.realtime import stolen_ms
+from disco_hw.experiments.operator import disco_hw_process
 from disco_hw.log.reader import open_log
 from disco_hw.log.records import Plan
-from disco_hw.operator import disco_hw_process
 from disco_hw.viewer.desk import Desk
-from disco_hw.viewer.feed import ViewerFeed, feed_path
 from disco_hw.viewer.live import LivePage, run_live
 from disco_hw.viewer.recording import Recording
 from disco_hw.viewer.replay import ReplayPage

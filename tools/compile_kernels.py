@@ -6,10 +6,10 @@ import sys
 from pathlib import Path
 
 import disco_hw
-from disco_hw.daemon.assembly import make_planner
 from disco_hw.gap.find import missing_effects
 from disco_hw.model import Model
-from disco_hw.robot_setup import load_setup
+from disco_hw.runtime.assembly import make_planner
+from disco_hw.runtime.robot_setup import load_setup
 from tools.gap_logs import simulated_drive
 
 ROBOT = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"

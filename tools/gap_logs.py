@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 
-from disco_hw.daemon.governor import Governor, WheelLimits
 from disco_hw.drive.script import Script
 from disco_hw.log.drive import Commands, DriveLog, Gyro, Poses, Wheels, differentiate_angle
+from disco_hw.runtime.governor import Governor, WheelLimits
 from sim.drives import Drive, make_drive
 from sim.effects import EFFECTS, HiddenEffects, hidden_effects
 from sim.log_csv import LogOptions, dirty_log_options, dirty_parameters, simulated_log, varied_parameters

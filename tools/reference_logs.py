@@ -1,4 +1,4 @@
-"""Writes the reference logs that tests/disco_hw/test_reference_logs.py replays.
+"""Writes the reference logs that tests/runtime/test_reference_logs.py replays.
 
     python -m tools.reference_logs [DIRECTORY]
 
@@ -17,11 +17,9 @@ from pathlib import Path
 import msgspec
 
 import disco_hw
-from disco_hw.adapt.adaptable import believed_geometry
-from disco_hw.adapt.adaptation import Learnt, NoAdaptation
-from disco_hw.adapt.coordinates import NAMES
-from disco_hw.daemon.assembly import make_planner, put_in_force
-from disco_hw.daemon.supervisor import UserRequest
+from disco_hw.adaptation.adaptable import believed_geometry
+from disco_hw.adaptation.adaptation import Learnt, NoAdaptation
+from disco_hw.adaptation.coordinates import NAMES
 from disco_hw.drive.coverage import Coverage
 from disco_hw.drive.hand_pilot import HandPilot
 from disco_hw.drive.source import ManualInput
@@ -29,11 +27,13 @@ from disco_hw.log.link import Attachment
 from disco_hw.log.provenance import MODEL_TOML, ROBOT_TOML, version
 from disco_hw.log.recorder import ProcessRecorder, Recording
 from disco_hw.log.records import BeliefChange, FrameIn, FrameOut
-from disco_hw.pipeline import NoPlanner, Planner
-from disco_hw.robot_setup import Setup, load_setup
-from tests.daemon.simulated import SimulatedStack, simulated_stack
+from disco_hw.runtime.assembly import make_planner, put_in_force
+from disco_hw.runtime.pipeline import NoPlanner, Planner
+from disco_hw.runtime.robot_setup import Setup, load_setup
+from disco_hw.runtime.supervisor import UserRequest
+from tests.runtime.simulated import SimulatedStack, simulated_stack
 
-DIRECTORY = Path(__file__).parents[1] / "tests" / "disco_hw" / "reference_logs"
+DIRECTORY = Path(__file__).parents[1] / "tests" / "runtime" / "reference_logs"
 ROBOTS = Path(disco_hw.__file__).parent / "robots"
 SHORT_SIGHTED = ("rate_hz = 50.0", "rate_hz = 50.0\nhorizon = 10\nstep_s = 0.3")
 """Ten steps instead of fifty: plans are most of a log."""

@@ -18,7 +18,7 @@ from typing import Any
 
 from disco_hw.daemon.realtime import stolen_ms
 from disco_hw.errors import WorkError
-from disco_hw.operator import Operator, disco_hw_process
+from disco_hw.experiments.operator import Operator, disco_hw_process
 from tests.hil.stack import write_robot_file
 
 WANTED_P999_US = 1000.0

@@ -11,34 +11,35 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from disco_hw.adapt.adaptable import check_adaptable
-from disco_hw.adapt.link import ProcessLink
-from disco_hw.daemon import realtime, records_of_tick
-from disco_hw.daemon.assembly import assemble_core, make_adaptation, make_driver, make_pipeline, make_planner
+from disco_hw.adaptation.adaptable import check_adaptable
+from disco_hw.adaptation.link import ProcessLink
+from disco_hw.daemon import realtime
 from disco_hw.daemon.client import ADAPT_ACTIONS, PAGE_ACTIONS, SERVED, socket_path
 from disco_hw.daemon.clock import Clock, MonotonicClock
 from disco_hw.daemon.control_socket import ControlMessage, ControlServer
-from disco_hw.daemon.core import DaemonCore
+from disco_hw.daemon.link import make_link
 from disco_hw.daemon.loop import Loop
-from disco_hw.daemon.pilot import Pilot, TaskPilot
+from disco_hw.daemon.page_feed import ViewerFeed, WatchedRecorder, feed_path
 from disco_hw.daemon.signals import StopSignals
-from disco_hw.daemon.states import State
 from disco_hw.daemon.status import counters, loop_figures, status
-from disco_hw.daemon.stop_path import StopPath
-from disco_hw.daemon.supervisor import Reply, UserRequest
 from disco_hw.daemon.systemd import Notifier
-from disco_hw.daemon.task_change import TaskRefused, changed_task, in_words
 from disco_hw.daemon.teller import STANDARD_OUTPUT, Teller
 from disco_hw.daemon.warm_up import warm_up
-from disco_hw.link import make_link
 from disco_hw.log import records
 from disco_hw.log.link import Attachment
 from disco_hw.log.provenance import DBC, version
 from disco_hw.log.recorder import NullRecorder, ProcessRecorder, Recorder, Recording
-from disco_hw.log_setup import kept_files
-from disco_hw.pipeline import NoPlanner, Planner
-from disco_hw.robot_setup import Setup, link_key, load_setup, refuse_missing_effects
-from disco_hw.viewer.feed import ViewerFeed, WatchedRecorder, feed_path
+from disco_hw.runtime import records_of_tick
+from disco_hw.runtime.assembly import assemble_core, make_adaptation, make_driver, make_pipeline, make_planner
+from disco_hw.runtime.core import DaemonCore
+from disco_hw.runtime.log_setup import kept_files
+from disco_hw.runtime.pilot import Pilot, TaskPilot
+from disco_hw.runtime.pipeline import NoPlanner, Planner
+from disco_hw.runtime.robot_setup import Setup, link_key, load_setup, refuse_missing_effects
+from disco_hw.runtime.states import State
+from disco_hw.runtime.stop_path import StopPath
+from disco_hw.runtime.supervisor import Reply, UserRequest
+from disco_hw.runtime.task_change import TaskRefused, changed_task, in_words
 from drivers.types import Request
 from firmware_protocol.dbc import packaged_dbc
 

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from disco_hw.daemon.core import DaemonCore
 from disco_hw.daemon.loop import LoopStats
-from disco_hw.daemon.task_change import asked_of, limits
 from disco_hw.log import records
 from disco_hw.log.recorder import RecorderStats
+from disco_hw.runtime.core import DaemonCore
+from disco_hw.runtime.task_change import asked_of, limits
 
 
 def loop_figures(loop: LoopStats) -> dict[str, Any]:

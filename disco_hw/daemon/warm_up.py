@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 
-from disco_hw.pipeline import FollowTask, Off, Pipeline, Stand
+from disco_hw.runtime.pipeline import FollowTask, Off, Pipeline, Stand
 from drivers.types import PoseSample, Readings, WheelSample
 
 _PERIOD_NS = 20_000_000

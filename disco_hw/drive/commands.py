@@ -29,7 +29,7 @@ from disco_hw.drive.scripts import make_script
 from disco_hw.drive.source import ManualSource
 from disco_hw.drive.virtual_link import leads_to_virtual_robot
 from disco_hw.errors import InputError
-from disco_hw.robot_setup import load_setup
+from disco_hw.runtime.robot_setup import load_setup
 from drivers.gamepad import Gamepad, GamepadError, GamepadMapping, open_gamepad
 
 _DISPLAY_TIMEOUT_S = 2.0

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from disco_hw.daemon.states import State
-from disco_hw.daemon.supervisor import UserRequest
 from disco_hw.drive.source import INPUT_LIMIT_NS, ManualInput
-from disco_hw.pipeline import Manual, Stand
+from disco_hw.runtime.pipeline import Manual, Stand
+from disco_hw.runtime.states import State
+from disco_hw.runtime.supervisor import UserRequest
 
 
 @dataclass(frozen=True, slots=True)

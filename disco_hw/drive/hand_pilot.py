@@ -6,15 +6,15 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from disco_hw.daemon.core import CoreTick
-from disco_hw.daemon.pilot import PilotTick
-from disco_hw.daemon.states import State
-from disco_hw.daemon.supervisor import Reply
 from disco_hw.drive.coverage import Coverage
 from disco_hw.drive.deadman import Deadman
 from disco_hw.drive.page_source import PageSource, steering_from
 from disco_hw.drive.source import ManualSource, RobotView
-from disco_hw.pipeline import Source
+from disco_hw.runtime.core import CoreTick
+from disco_hw.runtime.pilot import PilotTick
+from disco_hw.runtime.pipeline import Source
+from disco_hw.runtime.states import State
+from disco_hw.runtime.supervisor import Reply
 
 _MESSAGES = 5
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from disco_hw.daemon.states import State
 from disco_hw.drive.script import Manoeuvre, Script, Wheels
 from disco_hw.drive.source import ManualInput, ManualSource, RobotView
 from disco_hw.drive.wheel_limits import WheelLimits
+from disco_hw.runtime.states import State
 
 _LONGEST_TICK_NS = 100_000_000
 _SETTLED_S = 0.8

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
-from disco_hw.daemon.states import State
+from disco_hw.runtime.states import State
 
 INPUT_LIMIT_NS = 200_000_000
 

@@ -52,7 +52,7 @@ def circle(
     """Drive the circle knowing the prior, the posterior, a point estimate, or the truth."""
     import disco_hw
     from disco_hw.control.experiments.circle import CircleOptions, run_circle
-    from disco_hw.robot_setup import load_setup
+    from disco_hw.runtime.robot_setup import load_setup
 
     if mode not in {"default", "paper"}:
         raise InputError(f"--mode {mode}: no such mode; write default or paper")
@@ -83,8 +83,8 @@ def adapt(
 ) -> None:
     """Let wheel radius or axial distance change on the way, and see what adaptation wins back."""
     import disco_hw
-    from disco_hw.adapt.experiment import AdaptOptions, run_adapt
-    from disco_hw.robot_setup import load_setup
+    from disco_hw.experiments.adapt import AdaptOptions, run_adapt
+    from disco_hw.runtime.robot_setup import load_setup
 
     refuse_directory(out)
     setup = load_setup(robot or Path(disco_hw.__file__).parent / "robots" / "wombot.toml")

@@ -127,7 +127,7 @@ def check(
     as_json: AsJson = False,
 ) -> None:
     """Preflight: link, firmware match, latency, bus load, real-time settings, limits. Nothing moves."""
-    from disco_hw.check import run_check
+    from disco_hw.daemon.check import run_check
 
     report = run_check(robot, link)
     print_result(report.as_dict(), as_json, report.as_text())
@@ -141,7 +141,7 @@ def estop(
     as_json: AsJson = False,
 ) -> None:
     """Stop the robot now, whatever state anything else is in."""
-    from disco_hw.emergency import stop_robot
+    from disco_hw.daemon.emergency import stop_robot
 
     outcome = stop_robot(robot, link)
     print_result(outcome.as_dict(), as_json, outcome.as_text())

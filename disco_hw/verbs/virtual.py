@@ -30,7 +30,7 @@ def demo(
     as_json: AsJson = False,
 ) -> None:
     """Drive the paper's circle with a virtual robot in real time, end to end, and print the figures."""
-    from disco_hw.demo import DemoOptions, run_demo
+    from disco_hw.experiments.demo import DemoOptions, run_demo
 
     result = run_demo(
         DemoOptions(
@@ -73,7 +73,7 @@ def sim(
     list_faults: Annotated[bool, typer.Option("--list-faults", help="List the kinds of faults and exit.")] = False,
 ) -> None:
     """Run the virtual robot alone, behind a CAN bus or a serial line."""
-    from disco_hw.virtual import SimOptions, run_sim
+    from disco_hw.experiments.virtual import SimOptions, run_sim
     from sim.effects import effects_table
     from sim.fault_schedule import kinds_table
 

@@ -72,7 +72,7 @@ def replay(
     from disco_hw.daemon.realtime import limit_thread_pools
 
     limit_thread_pools()
-    from disco_hw.replay import replay as replay_log
+    from disco_hw.runtime.replay import replay as replay_log
 
     report = replay_log(log, tolerance)
     print_result(report.as_dict(), as_json, report.as_text())

@@ -18,7 +18,7 @@ from disco_hw.config import load_robot_config
 from disco_hw.daemon.client import socket_path
 from disco_hw.daemon.signals import StopSignals
 from disco_hw.errors import InputError
-from disco_hw.robot_setup import LINK_KINDS
+from disco_hw.runtime.robot_setup import LINK_KINDS
 from disco_hw.viewer.address import DEFAULT_PORT, LOOPBACK
 from disco_hw.viewer.desk import Desk
 from disco_hw.viewer.live import LivePage, run_live

@@ -19,7 +19,7 @@ from websockets.asyncio.server import ServerConnection
 from websockets.exceptions import ConnectionClosed
 
 from disco_hw.daemon.control_client import send_request
-from disco_hw.emergency import stop_robot
+from disco_hw.daemon.emergency import stop_robot
 from disco_hw.errors import InputError, WorkError
 from disco_hw.viewer.advice import advice, next_step
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from disco_hw.drive.coverage import Coverage
-from disco_hw.pipeline import Source
+from disco_hw.runtime.pipeline import Source
 from disco_hw.viewer.timeline import COMMAND, Timeline
 
 _STEP_NS = 500_000_000

@@ -10,10 +10,10 @@ from typing import Any
 
 import viser
 
-from disco_hw.daemon.task_change import record_of, told_task
+from disco_hw.daemon.page_feed import feed_path
 from disco_hw.log.records import BeliefChange, Record
+from disco_hw.runtime.task_change import record_of, told_task
 from disco_hw.viewer.desk import Desk
-from disco_hw.viewer.feed import feed_path
 from disco_hw.viewer.layers import add_layers
 from disco_hw.viewer.panel import coverage_text, events_text, live_details
 from disco_hw.viewer.plots import Plots

@@ -11,10 +11,10 @@ import pytest
 
 from disco_hw.config import Estimation
 from disco_hw.control import NoValidControl
-from disco_hw.daemon.governor import Governor, WheelLimits
 from disco_hw.daemon.warm_up import warm_up
 from disco_hw.estimation import OdometryParameters, PoseFusion
-from disco_hw.pipeline import Pipeline
+from disco_hw.runtime.governor import Governor, WheelLimits
+from disco_hw.runtime.pipeline import Pipeline
 
 
 class Refusing:
@@ -45,7 +45,7 @@ def test_poses_are_accepted_gated_and_refused_and_the_planner_is_asked():
 @pytest.mark.parametrize("uncertainty", ["ut", "mc"])
 def test_nothing_is_compiled_while_the_robot_is_driven(uncertainty):
     # In a process of its own: what another test has compiled would hide it.
-    command = [sys.executable, "-m", "tests.daemon.driven_once", uncertainty]
+    command = [sys.executable, "-m", "tests.runtime.driven_once", uncertainty]
     run = subprocess.run(command, cwd=Path(__file__).parents[2], capture_output=True, text=True, check=False)
     assert run.returncode == 0, run.stderr
     told = json.loads(run.stdout)

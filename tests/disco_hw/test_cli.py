@@ -65,7 +65,7 @@ def test_wrong_usage_exits_with_2():
 
 def test_the_estop_loads_neither_planner_nor_estimator():
     script = (
-        "import sys, disco_hw.emergency; "
+        "import sys, disco_hw.daemon.emergency; "
         "heavy = {'numba', 'torch', 'scipy', 'matplotlib', 'disco_hw.control', 'disco_hw.estimation'}; "
         "print(sorted(heavy & set(sys.modules)))"
     )

@@ -8,9 +8,9 @@ import pytest
 from disco_hw.control.tasks.path import Path
 from disco_hw.errors import InputError
 from disco_hw.hairpins import hairpin
-from disco_hw.robot_setup import load_setup
+from disco_hw.runtime.robot_setup import load_setup
 from disco_hw.waypoints import Waypoints, load_waypoints
-from tests.daemon.path_robot import ROBOTS, path_robot
+from tests.runtime.path_robot import ROBOTS, path_robot
 
 
 def way(*legs):

@@ -6,11 +6,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from disco_hw.daemon.states import State
-from disco_hw.daemon.supervisor import UserRequest
 from disco_hw.drive.deadman import Deadman
 from disco_hw.drive.source import ManualInput
-from disco_hw.pipeline import Manual, Stand
+from disco_hw.runtime.pipeline import Manual, Stand
+from disco_hw.runtime.states import State
+from disco_hw.runtime.supervisor import UserRequest
 
 MS = 1_000_000
 TICK = 20 * MS

@@ -7,16 +7,16 @@ import re
 import numpy as np
 import pytest
 
-from disco_hw.daemon.states import State
-from disco_hw.daemon.supervisor import Reply, UserRequest
 from disco_hw.drive.coverage import Coverage
 from disco_hw.drive.hand_pilot import HandPilot
 from disco_hw.drive.scripted import ScriptSource, Unattended
 from disco_hw.drive.scripts import STEP_S, STEPS, make_script
 from disco_hw.drive.source import ManualInput
 from disco_hw.log import records
-from disco_hw.pipeline import NoPlanner, Source
-from tests.daemon.simulated import simulated_stack
+from disco_hw.runtime.pipeline import NoPlanner, Source
+from disco_hw.runtime.states import State
+from disco_hw.runtime.supervisor import Reply, UserRequest
+from tests.runtime.simulated import simulated_stack
 
 
 class Hand:

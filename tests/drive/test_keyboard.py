@@ -12,11 +12,11 @@ import time
 import pytest
 
 from disco_hw.daemon.clock import SimulatedClock
-from disco_hw.daemon.states import State
 from disco_hw.drive.keyboard import Keyboard
 from disco_hw.drive.keys import KeyHold
 from disco_hw.drive.source import RobotView
 from disco_hw.errors import InputError
+from disco_hw.runtime.states import State
 
 MS = 1_000_000
 VIEW = RobotView(State.READY, driving=False)

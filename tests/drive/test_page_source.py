@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import pytest
 
-from disco_hw.daemon.states import State
 from disco_hw.drive.coverage import Coverage
 from disco_hw.drive.hand_pilot import HandPilot
 from disco_hw.drive.page_source import PageSource, Steering, steering_from
 from disco_hw.drive.source import INPUT_LIMIT_NS, RobotView
-from disco_hw.pipeline import NoPlanner
-from tests.daemon.simulated import simulated_stack
+from disco_hw.runtime.pipeline import NoPlanner
+from disco_hw.runtime.states import State
+from tests.runtime.simulated import simulated_stack
 
 MS = 1_000_000
 VIEW = RobotView(State.READY, driving=False)

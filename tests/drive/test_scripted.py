@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from disco_hw.daemon.states import State
 from disco_hw.drive.script import Manoeuvre, Script
 from disco_hw.drive.scripted import ScriptSource, Unattended
 from disco_hw.drive.source import ManualInput, RobotView
+from disco_hw.runtime.states import State
 
 TICK = 20_000_000
 READY = RobotView(State.READY, driving=False)

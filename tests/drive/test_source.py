@@ -2,12 +2,12 @@
 
 import pytest
 
-from disco_hw.daemon.states import State
 from disco_hw.drive.gamepad_source import GamepadSource
 from disco_hw.drive.keyboard import Keyboard
 from disco_hw.drive.page_source import PageSource
 from disco_hw.drive.scripted import ScriptSource
 from disco_hw.drive.source import INPUT_LIMIT_NS, ManualInput, ManualSource, RobotView
+from disco_hw.runtime.states import State
 
 
 def test_input_counts_for_200_ms():

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 
 import disco_hw
-from disco_hw.adapt.adaptable import believed_geometry, with_geometry
-from disco_hw.adapt.coordinates import NAMES
-from disco_hw.adapt.experiment import BELIEVED_STD, CHANGES
-from disco_hw.adapt.guard import Geometry
+from disco_hw.adaptation.adaptable import believed_geometry, with_geometry
+from disco_hw.adaptation.coordinates import NAMES
+from disco_hw.adaptation.guard import Geometry
+from disco_hw.experiments.adapt import BELIEVED_STD, CHANGES
 from disco_hw.log.reader import open_log
 from disco_hw.model.file import load_model, model_text
 from tests.hil.stack import running_stack

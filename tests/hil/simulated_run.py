@@ -16,16 +16,16 @@ import numpy as np
 import disco_hw
 from disco_hw.control import Plan, PlannerState
 from disco_hw.control.plan import Diagnostics
-from disco_hw.daemon.assembly import assemble_core, make_pipeline
-from disco_hw.daemon.core import CoreTick, DaemonCore
 from disco_hw.daemon.loop import LoopStats
-from disco_hw.daemon.states import State
 from disco_hw.daemon.status import counters
-from disco_hw.daemon.supervisor import UserRequest
 from disco_hw.log import records
 from disco_hw.log.recorder import RecorderStats
-from disco_hw.pipeline import Planner
-from disco_hw.robot_setup import load_setup
+from disco_hw.runtime.assembly import assemble_core, make_pipeline
+from disco_hw.runtime.core import CoreTick, DaemonCore
+from disco_hw.runtime.pipeline import Planner
+from disco_hw.runtime.robot_setup import load_setup
+from disco_hw.runtime.states import State
+from disco_hw.runtime.supervisor import UserRequest
 from drivers.reference import ReferenceDriver
 from drivers.types import RobotLinkHealth, RobotStatus
 from firmware_protocol.codec import Codec

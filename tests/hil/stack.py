@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import disco_hw
-from disco_hw.operator import Child, Operator, disco_hw_process
+from disco_hw.experiments.operator import Child, Operator, disco_hw_process
 
 READY_TIMEOUT_S = 60.0
 FAST_TASK = 'kind = "circle"\nradius_m = 3.0\nspeed_m_s = 0.45\n'

@@ -7,7 +7,7 @@ import re
 
 import pytest
 
-from disco_hw.operator import disco_hw_process
+from disco_hw.experiments.operator import disco_hw_process
 from tests.hil.stack import READY_TIMEOUT_S, disco, running_stack, write_robot_file
 
 pytestmark = pytest.mark.hil

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from disco_hw.operator import disco_hw_process
+from disco_hw.experiments.operator import disco_hw_process
 from tests.drivers.waiting import wait_until
 from tests.hil.stack import READY_TIMEOUT_S, write_robot_file
 

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from disco_hw.experiments.operator import Child
 from disco_hw.log.reader import open_log
-from disco_hw.operator import Child
 from tests.hil.stack import STILL_RAD_S, running_stack
 
 pytestmark = pytest.mark.hil
@@ -68,7 +68,7 @@ def daemon_that_fails(monkeypatch, error: str):
     import subprocess
     import sys
 
-    import disco_hw.operator as operator_module
+    import disco_hw.experiments.operator as operator_module
 
     popen = subprocess.Popen
 

@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 
 from disco_hw.drive.source import INPUT_LIMIT_NS
+from disco_hw.experiments.operator import Operator, disco_hw_process
 from disco_hw.log.load import load_drive
 from disco_hw.log.reader import open_log
-from disco_hw.operator import Operator, disco_hw_process
-from disco_hw.pipeline import NoPlanner
-from disco_hw.replay import replay
+from disco_hw.runtime.pipeline import NoPlanner
+from disco_hw.runtime.replay import replay
 from tests.hil.stack import DECELERATION_RAD_S2, MOTOR_SETTLING_S, STILL_RAD_S, write_robot_file
 
 pytestmark = pytest.mark.hil
@@ -132,7 +132,7 @@ def test_a_script_is_driven_unattended_and_recorded_as_executed(tmp_path, monkey
     assert np.abs(np.diff(given, axis=0)).max() <= 20.0 * 0.03 + 1e-9
     assert np.abs(wheels[-1]).max() < STILL_RAD_S
     # No plan was made, so the replay needs no planner either, which takes long to compile.
-    monkeypatch.setattr("disco_hw.replay.make_planner", lambda *_: NoPlanner())
+    monkeypatch.setattr("disco_hw.runtime.replay.make_planner", lambda *_: NoPlanner())
     assert replay(made.log).ok
     with open_log(made.log) as log:
         assert {"off", "hold", "manual"} == set(log.columns("/command")["source"])

@@ -13,9 +13,9 @@ import pytest
 from disco_hw.course import course_of
 from disco_hw.daemon.control_client import send_request
 from disco_hw.drive.source import INPUT_LIMIT_NS
+from disco_hw.experiments.operator import disco_hw_process, stands
 from disco_hw.log.reader import open_log
-from disco_hw.operator import disco_hw_process, stands
-from disco_hw.robot_setup import load_setup
+from disco_hw.runtime.robot_setup import load_setup
 from disco_hw.viewer import scene
 from tests.hil.stack import DECELERATION_RAD_S2, STILL_RAD_S, running_stack
 from tests.hil.test_drive import Bench

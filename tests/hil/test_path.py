@@ -6,8 +6,8 @@ import json
 
 import pytest
 
-from tests.daemon.path_robot import ROBOTS
 from tests.hil.stack import READY_TIMEOUT_S, disco, running_stack, write_robot_file
+from tests.runtime.path_robot import ROBOTS
 
 PATH = "x_m,y_m\n0,0\n0.5,0\n0.8,0.2\n"
 TASK = 'path = "path.csv"\nspeed_m_s = 0.25\n'

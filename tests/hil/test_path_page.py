@@ -2,9 +2,9 @@
 
 import pytest
 
-from tests.daemon.path_robot import ROBOTS
 from tests.hil.stack import running_stack
 from tests.hil.test_page import assert_drawn, page_of
+from tests.runtime.path_robot import ROBOTS
 from tests.viewer.browser import chromium, keep, opened
 from tests.viewer.test_page import wait_for
 

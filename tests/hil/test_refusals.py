@@ -17,10 +17,10 @@ import can
 import pytest
 
 from disco_hw.errors import WorkError
-from disco_hw.operator import Operator, disco_hw_process
+from disco_hw.experiments.operator import Operator, disco_hw_process
 from firmware_protocol.codec import Codec
-from tests.daemon.path_robot import path_robot
 from tests.hil.stack import READY_TIMEOUT_S, STILL_RAD_S, disco, running_stack, write_robot_file
+from tests.runtime.path_robot import path_robot
 
 pytestmark = pytest.mark.hil
 

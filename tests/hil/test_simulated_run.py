@@ -5,7 +5,7 @@ A short part of what `make fault-campaign` does for hours.
 
 import pytest
 
-from disco_hw.daemon.plausibility import PlausibilityStats
+from disco_hw.runtime.plausibility import PlausibilityStats
 from sim.fault_schedule import KINDS, FaultSchedule, parse_schedule, random_schedule
 from tests.hil.simulated_run import SimulatedRun
 from tools.fault_campaign import KINDS_LEFT_OUT, markdown, summary

@@ -3,7 +3,7 @@
 import cantools
 import pytest
 
-from disco_hw.daemon.states import State
+from disco_hw.runtime.states import State
 from disco_hw.viewer.advice import FAULTS, advice, in_words, next_step
 from firmware_protocol.dbc import packaged_dbc
 

@@ -7,18 +7,18 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from disco_hw.adapt.coordinates import NAMES
+from disco_hw.adaptation.coordinates import NAMES
 from disco_hw.config import CircleTask
-from disco_hw.daemon.task_change import asked_of
+from disco_hw.daemon.page_feed import ViewerFeed, feed_path
 from disco_hw.drive.coverage import Coverage
 from disco_hw.log import records
+from disco_hw.runtime.task_change import asked_of
 from disco_hw.viewer.desk import Desk
-from disco_hw.viewer.feed import ViewerFeed, feed_path
 from disco_hw.viewer.live import KEEP_S, LivePage, _Due
 from disco_hw.viewer.panel import live_details
 from disco_hw.viewer.server import serving
 from disco_hw.viewer.stage import stage_of_robot
-from tests.daemon.path_robot import path_robot
+from tests.runtime.path_robot import path_robot
 from tests.viewer.run import PERIOD_NS, ROBOT_FILE, START_NS, pose_at, tick_records
 
 

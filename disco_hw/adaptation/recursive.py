@@ -1,0 +1,138 @@
+"""The fast estimator: sufficient statistics of the drive in closed form, with a test for a change at every instant.
+
+All evidence since the last change counts alike, on top of what was believed before it; what is older than the window is
+folded into one Gaussian. At every split of the window the new part's score is tested against what the old part
+predicts: a tyre that loses air or a new floor shows within seconds, and everything from before is then forgotten except
+that parameters do not change by more than `CHANGE`. Slow drift is let in as a random walk.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from disco_hw.adaptation.coordinates import from_linear, to_linear
+from disco_hw.adaptation.evidence import Evidence
+
+Array = NDArray[np.float64]
+
+CHANGE = np.array([0.15, 0.3, 0.3])
+"""What may change at once: standard deviations of x_icr (m), and of wheel radius and axial distance by their size."""
+
+DRIFT_PER_SQRT_S = np.array([5e-4, 5e-4, 5e-4])
+"""Random walk of the same three while the robot moves; half a percent of the radius in 100 s."""
+
+_SPLIT_S = 0.5
+_LEAST_VARIANCE = 1e-14
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Judged:
+    """What is known of theta (order of `coordinates.NAMES`): `mean` (3,), `covariance` (3, 3).
+
+    `data_s` of driving since `since_s` it rests on; `largest_change` is the chi-square (3 degrees) of the worst split,
+    and `changed_s` when a change was found in this update, else None. `misfit` is the mean square of what this geometry
+    leaves of the window, 1 if the noise is what it is taken to be.
+    """
+
+    mean: Array
+    covariance: Array
+    since_s: float
+    data_s: float
+    largest_change: float
+    changed_s: float | None
+    misfit: float
+
+
+class RecursiveGeometry:
+    """The estimator; `mean` (3,) and `covariance` (3, 3) of theta are what is believed before the drive.
+
+    `change_limit`: chi-square above which a split is a change; evidence from before `since_s` does not count. Pure: no
+    clock, the same calls give the same results.
+    """
+
+    def __init__(self, mean: Array, covariance: Array, change_limit: float, since_s: float = 0.0) -> None:
+        self._change_limit = change_limit
+        self._mean, self._covariance = to_linear(mean, covariance)
+        self._folded_s = self._since_s = since_s
+        self._data_s = 0.0
+
+    def judge(self, window: Evidence, fold_before_s: float) -> Judged:
+        """Take in the window's evidence; what is older than `fold_before_s` need not come again."""
+        part = window.part(window.t_s > self._folded_s)
+        split_s, worst = self._worst_split(part)
+        changed_s = None
+        if worst > self._change_limit and split_s is not None:
+            changed_s = split_s
+            self._open(split_s)
+            part = window.part(window.t_s > self._folded_s)
+        mean, covariance = self._with(part)
+        misfit = _misfit(part, mean)
+        theta, spread = from_linear(mean, covariance)
+        judged = Judged(theta, spread, self._since_s, self._data_s + _moving_s(part), worst, changed_s, misfit)
+        self._fold(part, fold_before_s)
+        return judged
+
+    def _worst_split(self, part: Evidence) -> tuple[float | None, float]:
+        """When what follows fits worst to what was before, and the chi-square of that."""
+        if part.t_s.size < 3:
+            return None, 0.0
+        splits = np.arange(part.t_s[0], part.t_s[-1] - _SPLIT_S, _SPLIT_S)
+        first = np.searchsorted(part.t_s, splits)
+        total, score = part.information.sum(axis=0), part.score.sum(axis=0)
+        before = np.concatenate([np.zeros((1, 3, 3)), np.cumsum(part.information, axis=0)])[first]
+        score_before = np.concatenate([np.zeros((1, 3)), np.cumsum(part.score, axis=0)])[first]
+        prior = np.linalg.inv(self._covariance)
+        known = np.linalg.inv(before + prior)
+        old = np.einsum("sij,sj->si", known, score_before + prior @ self._mean)
+        later = total - before
+        surprise = score - score_before - np.einsum("sij,sj->si", later, old)
+        spread = later + later @ known @ later
+        # Directions that nothing was learnt of say nothing; the scale makes "nothing" comparable between them.
+        scale = np.sqrt(np.maximum(np.diagonal(spread, axis1=1, axis2=2), 1e-12))
+        unit = spread / (scale[:, :, None] * scale[:, None, :]) + 1e-9 * np.eye(3)
+        surprise = surprise / scale
+        distance2 = np.einsum("si,si->s", surprise, np.linalg.solve(unit, surprise[..., None])[..., 0])
+        worst = int(np.argmax(distance2))
+        return float(splits[worst]), float(distance2[worst])
+
+    def _open(self, split_s: float) -> None:
+        """Forget what was before: the old mean, plus all that may have changed."""
+        theta, spread = from_linear(self._mean, self._covariance)
+        sizes = CHANGE * np.array([1.0, theta[1], theta[2]])
+        self._mean, self._covariance = to_linear(theta, spread + np.diag(sizes**2))
+        self._folded_s = self._since_s = split_s
+        self._data_s = 0.0
+
+    def _with(self, part: Evidence) -> tuple[Array, Array]:
+        prior = np.linalg.inv(self._covariance)
+        covariance = np.linalg.inv(prior + part.information.sum(axis=0))
+        mean = covariance @ (prior @ self._mean + part.score.sum(axis=0))
+        return mean, 0.5 * (covariance + covariance.T) + _LEAST_VARIANCE * np.eye(3)
+
+    def _fold(self, part: Evidence, before_s: float) -> None:
+        old = part.part(part.t_s <= before_s)
+        if not old.t_s.size:
+            return
+        self._mean, covariance = self._with(old)
+        moved_s = _moving_s(old)
+        theta, _ = from_linear(self._mean, covariance)
+        sizes = DRIFT_PER_SQRT_S * np.array([1.0, theta[1], theta[2]])
+        _, drift = to_linear(theta, moved_s * np.diag(sizes**2))
+        self._covariance = covariance + drift
+        self._folded_s = float(old.t_s[-1])
+        self._data_s += moved_s
+
+
+def _moving_s(part: Evidence) -> float:
+    return float(part.moving_s.sum())
+
+
+def _misfit(part: Evidence, mean: Array) -> float:
+    values = float(part.values.sum())
+    if values < 9.0:
+        return 1.0
+    information, score = part.information.sum(axis=0), part.score.sum(axis=0)
+    return float((part.square.sum() - 2.0 * mean @ score + mean @ information @ mean) / (values - 3.0))

@@ -1,0 +1,249 @@
+"""`disco-hw check`: is everything ready to drive? Looks and asks; nothing moves and nothing is armed."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from disco_hw.config import RobotConfig
+from disco_hw.daemon.client import socket_path
+from disco_hw.daemon.control_client import send_request
+from disco_hw.daemon.link import make_link
+from disco_hw.daemon.realtime import can_lock_memory, can_use_fifo
+from disco_hw.errors import InputError, WorkError
+from disco_hw.runtime.assembly import make_driver
+from disco_hw.runtime.preflight import (
+    Check,
+    Level,
+    check_command_timing,
+    check_firmware_limits,
+    check_link_load,
+    check_realtime,
+    check_round_trip,
+    check_task,
+)
+from disco_hw.runtime.robot_setup import Setup, link_key, load_setup
+from drivers import words
+from drivers.types import (
+    Capabilities,
+    DriverState,
+    LinkState,
+    OutgoingFrame,
+    ReceivedFrame,
+    RobotStatus,
+    Transport,
+)
+from firmware_protocol.codec import Codec, Decoded
+from firmware_protocol.dbc import packaged_dbc
+
+_LINK_TIMEOUT_S = 2.0
+_LISTEN_S = 3.0
+# By then the handshake is over: what the robot rejects from now on it would reject while driving.
+_SETTLED_S = 1.5
+_STEP_S = 0.002
+
+
+@dataclass(frozen=True, slots=True)
+class CheckReport:
+    """The checks in the order in which they were made."""
+
+    checks: tuple[Check, ...]
+
+    @property
+    def ok(self) -> bool:
+        """Whether no check failed; warnings do not count."""
+        return all(check.level is not Level.FAIL for check in self.checks)
+
+    def as_dict(self) -> dict[str, Any]:
+        """The report for machines."""
+        return {
+            "ok": self.ok,
+            "checks": [{"name": check.name, "level": check.level.value, "text": check.text} for check in self.checks],
+        }
+
+    def as_text(self) -> str:
+        """The report for a person, one line a check."""
+        return "\n".join(f"{check.level.value:4}  {check.name}: {check.text}" for check in self.checks)
+
+
+def run_check(robot: Path, link: str | None = None) -> CheckReport:
+    """Check files, link, firmware, timing and this computer; takes about three seconds.
+
+    Raises InputError if a file is wrong, WorkError while a daemon drives this robot: the two would speak at once.
+    """
+    setup = load_setup(robot, None, link)
+    key, transport = link_key(setup), make_link(setup)
+    refuse_beside_a_daemon(setup.config)
+    checks = [_model_check(setup), check_task(setup.config.robot, setup.config.task)]
+    checks.append(check_link_load(setup.config.link, setup.config.control, packaged_dbc()))
+    control = setup.config.control
+    priority = setup.config.daemon.realtime_priority
+    checks += check_realtime(priority, can_use_fifo(), can_lock_memory(), os.cpu_count() or 1)
+    transport.open()
+    try:
+        checks.append(_link_check(transport))
+        if checks[-1].level is Level.OK:
+            found = _ask_robot(transport, key)
+            checks.append(_firmware_check(found))
+            checks.append(_hearing_check(found))
+            checks.append(check_round_trip(found.round_trips_s, 1.0 / control.rate_hz))
+            checks.append(_telemetry_check(found))
+            if found.capabilities is not None:
+                checks += check_firmware_limits(setup.config.robot, found.capabilities)
+                checks.append(check_command_timing(control, found.capabilities))
+    finally:
+        transport.close()
+    return CheckReport(tuple(checks))
+
+
+@dataclass(frozen=True, slots=True)
+class _Found:
+    """What the robot answered."""
+
+    state: DriverState
+    detail: str
+    capabilities: Capabilities | None
+    clock_synchronised: bool
+    wheel_samples: int
+    pose_samples: int
+    rejected: int
+    told: tuple[RobotStatus, ...]
+    round_trips_s: tuple[float, ...]
+
+
+def refuse_beside_a_daemon(config: RobotConfig) -> None:
+    """Raise WorkError while a daemon drives this robot, InputError where that cannot be seen."""
+    path = socket_path(config)
+    try:
+        if not path.exists():
+            return
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be looked at ({error.strerror}); be the daemon's user, or mend daemon.control_socket"
+        ) from None
+    try:
+        send_request(path, {"do": "status"}, timeout_s=1.0)
+    except WorkError:
+        return
+    raise WorkError(
+        f"{path}: a daemon drives this robot; ask it with `disco-hw ctl ROBOT.toml status`, or stop it first"
+    )
+
+
+def _model_check(setup: Setup) -> Check:
+    if setup.model_file is None:
+        return Check("model", Level.WARNING, "none is named: plans use the nominal geometry and the whole prior")
+    effects = ", ".join(effect.name for effect in setup.model.effects) or "none"
+    return Check("model", Level.OK, f"{setup.model_file}, effects: {effects}")
+
+
+def _link_check(transport: Transport) -> Check:
+    deadline = time.monotonic() + _LINK_TIMEOUT_S
+    while transport.state is not LinkState.UP:
+        if time.monotonic() > deadline:
+            return Check("link", Level.FAIL, f"{transport.name}: {transport.last_error or 'did not come up'}")
+        time.sleep(_STEP_S)
+    return Check("link", Level.OK, transport.name)
+
+
+def _ask_robot(transport: Transport, key: bytes | None) -> _Found:
+    """Shake hands, listen for three seconds and time the answers to the driver's own clock requests."""
+    driver = make_driver(key)
+    stopwatch = _Stopwatch()
+    wheels = poses = 0
+    told: list[RobotStatus] = []
+    start_ns = time.monotonic_ns()
+    driver.link_up(start_ns)
+    end_ns = start_ns + round(_LISTEN_S * 1e9)
+    while (now_ns := time.monotonic_ns()) < end_ns:
+        frames = transport.receive()
+        stopwatch.received(frames)
+        readings = driver.receive(now_ns, frames)
+        wheels += len(readings.wheels)
+        poses += len(readings.poses)
+        told += [status for status in readings.status if status.t_ns - start_ns > _SETTLED_S * 1e9]
+        for outgoing in driver.transmit(now_ns, None):
+            if transport.send(outgoing, now_ns):
+                stopwatch.sent(outgoing)
+        time.sleep(_STEP_S)
+    stats = driver.stats
+    return _Found(
+        state=driver.state,
+        detail=driver.detail,
+        capabilities=driver.capabilities,
+        clock_synchronised=driver.clock_offset_ns is not None,
+        wheel_samples=wheels,
+        pose_samples=poses,
+        rejected=stats.rejected_crc + stats.rejected_sequence + stats.rejected_length + transport.stats.malformed,
+        told=tuple(told),
+        round_trips_s=tuple(stopwatch.round_trips_s),
+    )
+
+
+class _Stopwatch:
+    """Round trips of the clock requests that pass by."""
+
+    def __init__(self) -> None:
+        self._codec = Codec()
+        self._sent_ns: dict[float, int] = {}
+        self.round_trips_s: list[float] = []
+
+    def sent(self, outgoing: OutgoingFrame) -> None:
+        decoded = self._codec.decode(outgoing.frame.can_id, outgoing.frame.data)
+        if isinstance(decoded, Decoded) and decoded.name == "TIME_REQUEST":
+            self._sent_ns[decoded.values["sequence"]] = time.monotonic_ns()
+
+    def received(self, frames: Sequence[ReceivedFrame]) -> None:
+        for received in frames:
+            decoded = self._codec.decode(received.frame.can_id, received.frame.data)
+            if isinstance(decoded, Decoded) and decoded.name == "TIME_RESPONSE":
+                sent_ns = self._sent_ns.pop(decoded.values["sequence"], None)
+                if sent_ns is not None:
+                    self.round_trips_s.append((received.t_ns - sent_ns) * 1e-9)
+
+
+def _firmware_check(found: _Found) -> Check:
+    name = "firmware"
+    if found.capabilities is None:
+        return Check(name, Level.FAIL, found.detail)
+    if found.state in {DriverState.REFUSED, DriverState.FAULT, DriverState.ESTOP}:
+        return Check(name, Level.FAIL, f"{found.state.value}: {found.detail}")
+    capabilities = found.capabilities
+    clock = "clock synchronised" if found.clock_synchronised else "clock NOT synchronised"
+    version = f"{capabilities.firmware_version}, protocol {capabilities.protocol_major}.{capabilities.protocol_minor}"
+    return Check(name, Level.OK, f"{version}, DBC {capabilities.dbc_hash:08x} matches, {found.state.value}, {clock}")
+
+
+def _hearing_check(found: _Found) -> Check:
+    """Whether the robot takes what this host sends; a wrong key shows nowhere else."""
+    name = "hearing"
+    if not found.told:
+        return Check(name, Level.FAIL, "the robot did not say what it hears; check the firmware")
+    first, last = found.told[0], found.told[-1]
+    rejected = (last.rejected_count - first.rejected_count) % 256
+    if not rejected:
+        return Check(name, Level.OK, "the robot rejects nothing")
+    level = Level.FAIL if last.reject_reason == "AUTHENTICATION" else Level.WARNING
+    return Check(name, level, f"the robot rejected {rejected} frames: {words.reject_reason(last.reject_reason)}")
+
+
+def _telemetry_check(found: _Found) -> Check:
+    name = "telemetry"
+    rates = (
+        f"{found.wheel_samples / _LISTEN_S:.0f} wheel and {found.pose_samples / _LISTEN_S:.0f} pose samples a second"
+    )
+    if not found.wheel_samples:
+        return Check(name, Level.FAIL, f"{rates}; check the encoders and the firmware")
+    if not found.pose_samples:
+        return Check(
+            name, Level.WARNING, f"{rates}; without a pose the task does not start if estimation.pose_required"
+        )
+    if found.rejected:
+        return Check(
+            name, Level.WARNING, f"{rates}, {found.rejected} frames rejected; check the cable and other senders"
+        )
+    return Check(name, Level.OK, f"{rates}, none rejected")

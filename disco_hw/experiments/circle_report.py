@@ -1,0 +1,216 @@
+"""What a driven circle amounts to: the log and the simulator's truth read back, as a table, a picture and numbers."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import asdict, dataclass
+from pathlib import Path as FilePath
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from rich.table import Table
+
+from disco_hw.config import CircleTask
+from disco_hw.errors import WorkError
+from disco_hw.experiments.metrics import (
+    Array,
+    CircleFigures,
+    EstimationFigures,
+    Path,
+    circle_figures,
+    estimation_figures,
+)
+from disco_hw.log.reader import Log, open_log
+from disco_hw.log.records import Counters
+
+PERCENTILES = (50.0, 99.0, 99.9, 100.0)
+_COMPLETED_TOLERANCE_LAPS = 0.02
+
+
+@dataclass(frozen=True, slots=True)
+class LoopFigures:
+    """Loop period and lateness in microseconds at p50, p99, p99.9 and maximum, and what was missed.
+
+    `stolen_ms`: as of `realtime.stolen_ms`, since the daemon's start.
+    """
+
+    period_us: tuple[float, ...]
+    lateness_us: tuple[float, ...]
+    overruns: int
+    skipped: int
+    stolen_ms: int
+
+
+@dataclass(frozen=True, slots=True)
+class CircleReport:
+    """The figures of one driven circle; `circle` is judged on the simulator's truth while the task ran."""
+
+    task: CircleTask
+    circle: CircleFigures
+    estimation: EstimationFigures
+    loop: LoopFigures
+    frames: dict[str, int]
+    laps_wanted: float
+    stopped: bool
+    truth: Path
+    estimate: Path
+
+    @property
+    def success(self) -> bool:
+        """Whether the laps were completed and the robot stands, disarmed."""
+        return self.stopped and self.circle.laps >= self.laps_wanted - _COMPLETED_TOLERANCE_LAPS
+
+    def as_dict(self) -> dict[str, Any]:
+        """The figures for machines."""
+        return {
+            "success": self.success,
+            "stopped": self.stopped,
+            "circle": asdict(self.circle),
+            "estimation": asdict(self.estimation),
+            "loop": asdict(self.loop),
+            "frames": self.frames,
+        }
+
+    def table(self) -> Table:
+        """The figures for a person."""
+        table = Table(title=f"Circle of {self.task.radius_m} m at {self.task.speed_m_s} m/s", title_justify="left")
+        table.add_column("figure")
+        table.add_column("value", justify="right")
+        c, e = self.circle, self.estimation
+        rows = [
+            ("laps driven", f"{c.laps:.2f}"),
+            ("mean instant cost", f"{c.mean_cost:.4f}"),
+            ("  after the first quarter lap", f"{c.settled_mean_cost:.4f}"),
+            ("RMS distance to the circle", f"{c.rms_distance_m * 1e3:.1f} mm"),
+            ("  after the first quarter lap", f"{c.settled_rms_distance_m * 1e3:.1f} mm"),
+            ("RMS speed error", f"{c.rms_speed_error_m_s * 1e3:.1f} mm/s"),
+            ("estimation error, position RMS / max", f"{e.rms_position_m * 1e3:.1f} / {e.max_position_m * 1e3:.1f} mm"),
+            ("estimation error, heading RMS", f"{np.degrees(e.rms_yaw_rad):.2f} deg"),
+            ("loop period p50 / p99 / p99.9 / max", _microseconds(self.loop.period_us)),
+            ("loop lateness p50 / p99 / p99.9 / max", _microseconds(self.loop.lateness_us)),
+            ("overruns / skipped periods", f"{self.loop.overruns} / {self.loop.skipped}"),
+            ("CPU time that the machine's host took", f"{self.loop.stolen_ms} ms"),
+            *((f"frames {name}", str(count)) for name, count in self.frames.items()),
+            ("robot stands, disarmed", "yes" if self.stopped else "NO"),
+        ]
+        for row in rows:
+            table.add_row(*row)
+        return table
+
+    def draw(self, path: FilePath) -> None:
+        """Write a PNG of the circle with the driven and the estimated path; needs no display."""
+        figure = Figure(figsize=(6.4, 6.4), layout="constrained")
+        axes = figure.add_subplot()
+        angle = np.linspace(0.0, 2.0 * np.pi, 361)
+        axes.plot(
+            self.task.center_x_m + self.task.radius_m * np.cos(angle),
+            self.task.center_y_m + self.task.radius_m * np.sin(angle),
+            color="0.6", linewidth=4.0, label=f"circle, {self.task.radius_m} m",
+        )  # fmt: skip
+        axes.plot(self.truth.x_m, self.truth.y_m, color="tab:blue", linewidth=1.4, label="driven")
+        axes.plot(
+            self.estimate.x_m, self.estimate.y_m, color="tab:orange", linewidth=0.8, linestyle="--", label="estimated"
+        )
+        axes.plot(self.truth.x_m[:1], self.truth.y_m[:1], "o", color="tab:green", label="start")
+        axes.set(xlabel="x (m)", ylabel="y (m)", aspect="equal")
+        axes.set_title(
+            f"{self.circle.laps:.2f} laps, RMS distance {self.circle.settled_rms_distance_m * 1e3:.0f} mm, "
+            f"mean cost {self.circle.mean_cost:.3f}"
+        )
+        axes.grid(alpha=0.3)
+        axes.legend(loc="center")
+        figure.savefig(path, dpi=110)
+
+
+def load_circle_report(
+    log_file: FilePath, truth_file: FilePath, task: CircleTask, laps_wanted: float, stopped: bool
+) -> CircleReport:
+    """Read log and truth of one run; raises WorkError when the task never ran or a file does not fit."""
+    log = open_log(log_file)
+    command = log.columns("/command")
+    driven = command["in_force"].astype(bool) & (command["source"] == "plan")
+    if not driven.any():
+        raise WorkError(f"{log_file}: the planner never drove")
+    first_ns, last_ns = int(command["t_ns"][driven][0]), int(command["t_ns"][driven][-1])
+    truth = _between(_read_truth(truth_file), first_ns * 1e-9, last_ns * 1e-9)
+    columns = log.columns("/estimate")
+    estimate = _between(
+        Path(
+            _floats(columns["t_ns"]) * 1e-9,
+            *(_floats(columns[name]) for name in ("x_m", "y_m", "yaw_rad", "speed_m_s")),
+        ),
+        first_ns * 1e-9,
+        last_ns * 1e-9,
+    )
+    return CircleReport(
+        task=task,
+        circle=circle_figures(truth, task),
+        estimation=estimation_figures(estimate, truth),
+        loop=_loop_figures(log, first_ns, last_ns),
+        frames=_frame_counts(log),
+        laps_wanted=laps_wanted,
+        stopped=stopped,
+        truth=truth,
+        estimate=estimate,
+    )
+
+
+def _read_truth(path: FilePath) -> Path:
+    """Read the simulator's CSV (columns t_ns, x_m, y_m, yaw_rad, speed_m_s among others)."""
+    with path.open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+
+    def column(name: str) -> Array:
+        return np.array([float(row[name]) for row in rows])
+
+    if not rows:
+        raise WorkError(f"{path}: no truth was recorded")
+    return Path(column("t_ns") * 1e-9, column("x_m"), column("y_m"), column("yaw_rad"), column("speed_m_s"))
+
+
+def _between(path: Path, first_s: float, last_s: float) -> Path:
+    inside = (path.t_s >= first_s) & (path.t_s <= last_s)
+    return Path(path.t_s[inside], path.x_m[inside], path.y_m[inside], path.yaw_rad[inside], path.speed_m_s[inside])
+
+
+def _loop_figures(log: Log, first_ns: int, last_ns: int) -> LoopFigures:
+    columns = log.columns("/loop", first_ns, last_ns)
+    overruns, skipped = _floats(columns["overruns"]), _floats(columns["skipped"])
+    return LoopFigures(
+        period_us=_percentiles(np.diff(_floats(columns["woke_ns"])) * 1e-3),
+        lateness_us=_percentiles(_floats(columns["lateness_ns"]) * 1e-3),
+        overruns=int(overruns[-1] - overruns[0]),
+        skipped=int(skipped[-1] - skipped[0]),
+        stolen_ms=_last_counters(log).loop.get("stolen_ms", 0),
+    )
+
+
+def _floats(values: NDArray[np.generic]) -> Array:
+    return values.astype(np.float64)
+
+
+def _percentiles(values: Array) -> tuple[float, ...]:
+    return tuple(float(np.percentile(values, p)) for p in PERCENTILES)
+
+
+def _last_counters(log: Log) -> Counters:
+    counters = [entry.record for entry in log.records(("/counters",)) if isinstance(entry.record, Counters)]
+    return counters[-1] if counters else Counters(0)
+
+
+def _frame_counts(log: Log) -> dict[str, int]:
+    last = _last_counters(log)
+    if not last.transport:
+        return {}
+    rejected = sum(count for name, count in last.driver.items() if name.startswith("rejected"))
+    return {
+        "sent": last.transport["frames_sent"],
+        "received": last.transport["frames_received"],
+        "rejected": rejected + last.transport["malformed"],
+    }
+
+
+def _microseconds(values: tuple[float, ...]) -> str:
+    return " / ".join(f"{value:.0f}" for value in values) + " us"

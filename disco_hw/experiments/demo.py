@@ -1,0 +1,236 @@
+"""The demonstration: virtual robot and daemon as processes of their own, driven round the circle and judged.
+
+This process plays the operator: it starts both, talks to the daemon's control socket, and reads the log and the
+simulator's truth afterwards. Nothing here reaches into either process.
+"""
+
+from __future__ import annotations
+
+import math
+import tempfile
+import time
+from collections import deque
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.live import Live
+from rich.progress import BarColumn, Progress, TextColumn
+
+import disco_hw
+from disco_hw.config import circle_task, load_robot_config
+from disco_hw.daemon.realtime import stolen_ms
+from disco_hw.errors import InputError, WorkError
+from disco_hw.experiments.circle_report import CircleReport, load_circle_report
+from disco_hw.experiments.operator import Operator, disco_hw_process, stands
+from disco_hw.viewer.address import DEFAULT_PORT, LOOPBACK
+
+_START_TIMEOUT_S = 90.0
+_POLL_S = 0.1
+_STOP_TIMEOUT_S = 10.0
+_STALL_MS = 100
+_STALL_LOOK_BACK_S = 0.5
+_WATCHDOG = frozenset({"COMMAND_TIMEOUT", "COMMAND_EXPIRED", "HOST_SILENT"})
+
+
+@dataclass(frozen=True, slots=True)
+class DemoOptions:
+    """What to demonstrate; `laps` are counter-clockwise turns around the circle's centre."""
+
+    link: str = "can"
+    out: Path = Path("out/demo")
+    laps: float = 1.5
+    plant_seed: int = 1
+    uncertainty: str = "ut"
+    view: bool = False
+    adapt: bool = False
+    port: int = DEFAULT_PORT
+    show_progress: bool = True
+
+
+def run_demo(options: DemoOptions) -> CircleReport:
+    """Drive the circle with a virtual robot and return the figures; prints progress, a table and the files written.
+
+    Drives anew, once, and says so, where the robot's watchdog stopped it right after the host of this virtual machine
+    had taken the processors away. Raises InputError for wrong options and WorkError when a process fails, the robot
+    stops for another reason, or the lap is not completed in time.
+    """
+    if options.link not in {"can", "serial"}:
+        raise InputError(f"--link {options.link}: no such link; write can or serial")
+    if options.uncertainty not in {"ut", "mc", "joint", "point"}:
+        raise InputError(f"--uncertainty {options.uncertainty}: no such choice; write ut, mc, joint or point")
+    options.out.mkdir(parents=True, exist_ok=True)
+    console = Console(stderr=not options.show_progress)
+    with tempfile.TemporaryDirectory(prefix="disco-hw-demo-") as scratch:
+        robot_file = _write_robot_file(Path(scratch), options)
+        files = _Files(
+            robot=robot_file,
+            socket=Path(scratch) / "control.sock",
+            log=options.out / "demo.mcap",
+            truth=options.out / "truth.csv",
+            simulator_output=options.out / "sim.txt",
+            daemon_output=options.out / "daemon.txt",
+        )
+        stopped = _drive_undisturbed(options, files, console)
+    task = circle_task(load_robot_config(_shipped_robot()).task, "the demonstration")
+    report = load_circle_report(files.log, files.truth, task, options.laps, stopped)
+    picture = options.out / "circle.png"
+    report.draw(picture)
+    console.print(report.table())
+    console.print(f"log {files.log}   picture {picture}   truth {files.truth}")
+    return report
+
+
+@dataclass(frozen=True, slots=True)
+class _Files:
+    robot: Path
+    socket: Path
+    log: Path
+    truth: Path
+    simulator_output: Path
+    daemon_output: Path
+
+
+def _shipped_robot() -> Path:
+    return Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
+
+
+def _write_robot_file(scratch: Path, options: DemoOptions) -> Path:
+    """Copy the shipped robot with addresses of its own, so that two demonstrations never meet."""
+    shipped = _shipped_robot()
+    model = shipped.with_name("wombot_model.toml")
+    text = shipped.read_text(encoding="utf-8")
+    replaced = {
+        'kind = "can"': f'kind = "{options.link}"',
+        'channel = "/tmp/disco-hw-wombot.can"': f'channel = "{scratch / "bus"}"',
+        'port = "/tmp/disco-hw-wombot.tty"': f'port = "{scratch / "tty"}"',
+        'file = "wombot_model.toml"': f'file = "{model}"',
+        "[control]\n": f'[control]\nuncertainty = "{options.uncertainty}"\n',
+    }
+    for old, new in replaced.items():
+        if text.count(old) != 1:
+            raise WorkError(f"{shipped}: expected exactly one line '{old.strip()}'")
+        text = text.replace(old, new)
+    text += f'\n[daemon]\ncontrol_socket = "{scratch / "control.sock"}"\n'
+    path = scratch / "robot.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+class _HostStallError(WorkError):
+    """The robot's watchdog ended the drive right after the host of this virtual machine took 100 ms or more."""
+
+
+def _drive_undisturbed(options: DemoOptions, files: _Files, console: Console) -> bool:
+    """`_drive`, once more from new processes where the machine's host held it up just before the robot stopped."""
+    try:
+        return _drive(options, files, console)
+    except _HostStallError as error:
+        console.print(f"{error}\ndriving anew")
+    return _drive(options, files, console)
+
+
+def _drive(options: DemoOptions, files: _Files, console: Console) -> bool:
+    """Drive and stop; returns whether daemon and robot both said that the robot stands, disarmed."""
+    for old in (files.log, files.truth):
+        old.unlink(missing_ok=True)
+    task = circle_task(load_robot_config(files.robot).task, "the demonstration")
+    lap_s = 2.0 * math.pi * task.radius_m / task.speed_m_s
+    simulator = [
+        "sim", str(files.robot), "--plant-seed", str(options.plant_seed), "--truth", str(files.truth),
+        "--start", str(task.center_x_m + task.radius_m), str(task.center_y_m), "1.5707963",
+    ]  # fmt: skip
+    daemon_arguments = ["run", str(files.robot), "--log", str(files.log), *_page(options), *_adapt(options)]
+    with (
+        disco_hw_process("virtual robot", simulator, files.simulator_output) as robot,
+        disco_hw_process("daemon", daemon_arguments, files.daemon_output) as daemon,
+    ):
+        operator = Operator(files.socket, (robot, daemon))
+        console.print(f"virtual robot pid {robot.process.pid}, daemon pid {daemon.process.pid}, link {options.link}")
+        if options.view:
+            console.print(f"page http://{LOOPBACK}:{options.port}")
+        operator.wait_for("READY", _START_TIMEOUT_S)
+        operator.tell("arm")
+        operator.wait_for("ARMED", 5.0)
+        operator.tell("start")
+        _watch_laps(operator, options, 3.0 * lap_s * options.laps + 10.0, console)
+        operator.tell("stop")
+        operator.wait_for_standstill(5.0)
+        operator.tell("disarm")
+        stopped = stands(operator.wait_for("READY", 5.0))
+        operator.tell("quit")
+        code = daemon.process.wait(_STOP_TIMEOUT_S)
+        if code != 0:
+            raise WorkError(f"the daemon ended with exit code {code}: {daemon.last_words()}")
+    return stopped
+
+
+def _page(options: DemoOptions) -> list[str]:
+    return ["--view", "--port", str(options.port)] if options.view else []
+
+
+def _adapt(options: DemoOptions) -> list[str]:
+    return ["--adapt"] if options.adapt else []
+
+
+def _watch_laps(operator: Operator, options: DemoOptions, limit_s: float, console: Console) -> None:
+    """Show progress until the laps are driven; raises WorkError when it takes longer than `limit_s`."""
+    stolen: deque[tuple[float, int]] = deque()
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(bar_width=30),
+        TextColumn("{task.completed:.2f} of {task.total:.2f} laps"),
+        TextColumn("{task.fields[figures]}"),
+    )
+    progress = Progress(*columns, console=console)
+    task = progress.add_task("circle", total=options.laps, figures="")
+    deadline = time.monotonic() + limit_s
+    next_line = 0.0
+    with Live(progress, console=console, refresh_per_second=4) if console.is_terminal else _nothing():
+        while True:
+            # Taken before a status is asked for: a daemon that is held up answers only afterwards.
+            stolen.append((time.monotonic(), stolen_ms()))
+            while len(stolen) > 1 and stolen[-1][0] - stolen[1][0] >= _STALL_LOOK_BACK_S:
+                stolen.popleft()
+            status = operator.status()
+            if status["state"] != "ARMED":
+                raise _why_stopped(operator, status, stolen_ms() - stolen[0][1])
+            laps = float(status["task"]["laps"])
+            figures = (
+                f"d {status['task']['distance_m'] * 1e3:4.0f} mm  v {status['task']['speed_m_s']:.3f} m/s  "
+                f"late p99 {status['loop']['lateness_us']['p99'] or 0.0:.0f} us"
+            )
+            progress.update(task, completed=min(max(laps, 0.0), options.laps), figures=figures)
+            if not console.is_terminal and laps >= next_line:
+                console.print(f"laps {laps:5.2f}  {figures}")
+                next_line = max(next_line, 0.0) + 0.1
+            if laps >= options.laps:
+                return
+            if time.monotonic() > deadline:
+                raise WorkError(f"only {laps:.2f} of {options.laps} laps were driven in {limit_s:.0f} s")
+            time.sleep(_POLL_S)
+
+
+def _why_stopped(operator: Operator, status: Mapping[str, Any], taken_ms: int) -> WorkError:
+    """Return what to raise for a drive that ended before its laps; `taken_ms`: CPU time lost to the host just before.
+
+    What the host takes bit by bit over a whole drive excuses nothing, hence only the last half second.
+    """
+    words = f"the daemon left ARMED for {status['state']}: {status['detail']}"
+    if status["state"] != "STOPPING" or taken_ms < _STALL_MS:
+        return WorkError(words)
+    # The daemon may notice a stall before the robot has told it of its own stop.
+    after = operator.wait_until("stopped", lambda status: bool(status["state"] != "STOPPING"), 5.0)
+    if after["stop_cause"] not in _WATCHDOG:
+        return WorkError(words)
+    return _HostStallError(
+        f"{words}\nthe host of this virtual machine took {taken_ms} ms of its processors just before"
+    )
+
+
+@contextmanager
+def _nothing() -> Iterator[None]:
+    yield

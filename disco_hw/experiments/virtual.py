@@ -1,0 +1,110 @@
+"""`disco-hw sim`: the virtual robot of a robot.toml, its true parameters from the model and what the user hides."""
+
+from __future__ import annotations
+
+import math
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from disco_hw.course import course_of
+from disco_hw.errors import InputError
+from disco_hw.runtime.robot_setup import Setup, geometry, link_key, load_setup
+from firmware_protocol.firmware_core import FirmwareConfig
+from sim.app import VirtualRobotOptions, run_virtual_robot
+from sim.body_dynamics import Pose
+from sim.effects import HiddenEffectError, parse_hidden_effects
+from sim.fault_schedule import FaultFileError, load_schedule
+from sim.plant_parameters import DrawError, PlantParameters, draw_plant_parameters
+
+
+@dataclass(frozen=True, slots=True)
+class SimOptions:
+    """What `disco-hw sim` was asked; `start` is x, y (m) and yaw (rad), the task's start if None."""
+
+    robot: Path
+    model: Path | None = None
+    link: str | None = None
+    hide: tuple[str, ...] = ()
+    plant_seed: int | None = None
+    start: tuple[float, float, float] | None = None
+    truth: Path | None = None
+    inject: Path | None = None
+    bus_log: Path | None = None
+    faults: Path | None = None
+    seed: int = 1
+
+
+def run_sim(options: SimOptions) -> int:
+    """Run the virtual robot until SIGTERM or SIGINT; returns the exit code. Raises InputError for wrong options."""
+    setup = load_setup(options.robot, options.model, options.link)
+    config = setup.config
+    try:
+        effects = dict(parse_hidden_effects(options.hide).items)
+    except HiddenEffectError as error:
+        raise InputError(f"--hide: {error}") from None
+    try:
+        faults = None if options.faults is None else load_schedule(options.faults)
+    except FaultFileError as error:
+        raise InputError(str(error)) from None
+    if options.start is not None and not all(map(math.isfinite, options.start)):
+        raise InputError(f"--start: {' '.join(map(str, options.start))} is no place; write finite numbers")
+    ticks_per_rev = _whole_ticks(setup)
+    x_m, y_m, yaw_rad = options.start or course_of(config.task).start
+    plant = true_parameters(setup, options.plant_seed)
+    print(
+        f"true wheel radius {plant.wheel_radius_m:.4f} m, axial distance {plant.axial_distance_m:.4f} m, "
+        f"x_icr {plant.x_icr_m:.4f} m" + "".join(f", hidden {name} {values}" for name, values in effects.items()),
+        file=sys.stderr,
+        flush=True,
+    )
+    return run_virtual_robot(
+        VirtualRobotOptions(
+            kind=config.link.kind,
+            interface=config.link.interface,
+            channel=config.link.channel,
+            bitrate=config.link.bitrate,
+            port=config.link.port,
+            baud=config.link.baud,
+            start=Pose(x_m, y_m, yaw_rad),
+            plant=plant,
+            effects=effects,
+            seed=options.seed,
+            firmware=FirmwareConfig(
+                ticks_per_rev=ticks_per_rev,
+                max_wheel_speed_rad_s=config.robot.max_wheel_speed_rad_s,
+                max_wheel_acceleration_rad_s2=config.robot.max_wheel_acceleration_rad_s2,
+                key=link_key(setup) or b"",
+            ),
+            truth_file=options.truth,
+            bus_log=options.bus_log,
+            inject=options.inject,
+            faults=faults,
+        )
+    )
+
+
+def true_parameters(setup: Setup, plant_seed: int | None) -> PlantParameters:
+    """The plant at the model's mean, or drawn from the model's belief with this seed."""
+    mean, covariance = geometry(setup.model)
+    radius, axial, x_icr = mean
+    base = PlantParameters(ticks_per_rev=_whole_ticks(setup))
+    if plant_seed is None:
+        return replace(base, wheel_radius_m=radius, axial_distance_m=axial, x_icr_m=x_icr)
+    order = (2, 0, 1)
+    try:
+        return draw_plant_parameters(
+            [mean[i] for i in order], [[covariance[i][j] for j in order] for i in order], plant_seed, base
+        )
+    except DrawError as error:
+        raise InputError(f"{setup.model_file or setup.robot_file}: {error}") from None
+
+
+def _whole_ticks(setup: Setup) -> int:
+    """Ticks of the virtual robot's encoder, which counts whole ones as its firmware's LIMITS message does."""
+    ticks = setup.config.robot.ticks_per_rev
+    if ticks != round(ticks):
+        raise InputError(
+            f"{setup.robot_file}: robot.ticks_per_rev: {ticks} is not a whole number; the virtual robot needs one"
+        )
+    return round(ticks)

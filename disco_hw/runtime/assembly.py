@@ -1,0 +1,132 @@
+"""Puts the daemon's parts together from robot.toml and the model; the tests and the harness assemble the same way."""
+
+from __future__ import annotations
+
+import secrets
+
+from disco_hw import control
+from disco_hw.adaptation.adaptable import believed_geometry, check_adaptable, possible_range, with_geometry
+from disco_hw.adaptation.adaptation import Adaptation, CheckedAdaptation
+from disco_hw.adaptation.guard import BeliefGuard, Geometry
+from disco_hw.adaptation.link import AdapterLink
+from disco_hw.config import RobotConfig
+from disco_hw.estimation import OdometryParameters, PoseFusion
+from disco_hw.log.recorder import Recorder
+from disco_hw.model import Model
+from disco_hw.runtime.core import DaemonCore
+from disco_hw.runtime.governor import Governor, WheelLimits
+from disco_hw.runtime.pipeline import Pipeline, Planner
+from disco_hw.runtime.preflight import check_firmware_limits, check_task, failures
+from disco_hw.runtime.robot_setup import Setup, geometry
+from disco_hw.runtime.supervisor import Supervisor, SupervisorSettings
+from drivers.reference import ReferenceDriver
+from drivers.types import Driver, Transport
+from firmware_protocol.codec import Codec
+
+_REHEARSALS = 5
+
+
+def make_planner(config: RobotConfig, model: Model) -> control.Disco:
+    """DISCO for this robot's task, compiled and warmed up: takes seconds."""
+    task = control.task_of_robot(config.task, config.control.mode)
+    planner = control.Disco(
+        model,
+        task,
+        control.DiscoSettings.from_config(config.control),
+        control.WheelLimits.of_robot(config.robot),
+        config.control.seed,
+    )
+    planner.warm_up()
+    return planner
+
+
+def make_pipeline(config: RobotConfig, model: Model, planner: Planner) -> Pipeline:
+    """Estimator, planner and governor with the limits of robot.toml."""
+    limits = WheelLimits(
+        max_speed_rad_s=config.robot.max_wheel_speed_rad_s,
+        max_acceleration_rad_s2=config.robot.max_wheel_acceleration_rad_s2,
+        max_deceleration_rad_s2=config.robot.max_wheel_acceleration_rad_s2,
+    )
+    return Pipeline(
+        fusion=PoseFusion(config.estimation, odometry_parameters(model), config.control.telemetry_zero_s),
+        planner=planner,
+        governor=Governor(limits, 1.0 / config.control.rate_hz),
+        plan_tail_s=config.control.plan_tail_s,
+    )
+
+
+def make_adaptation(setup: Setup, pipeline: Pipeline, link: AdapterLink) -> CheckedAdaptation:
+    """Adaptation of this robot's belief over its geometry; raises InputError where the model does not allow it.
+
+    `pipeline` has taken no step yet.
+    """
+    check_adaptable(setup.model, setup.config.control.uncertainty)
+    believed = believed_geometry(setup.model)
+    # What runs for the first time loads code: three times as long as later, in a tick that then must not be late.
+    for _ in range(_REHEARSALS):
+        put_in_force(pipeline, setup.model, believed)
+        put_in_force(pipeline, setup.model, None)
+    return CheckedAdaptation(
+        link,
+        BeliefGuard(believed, *possible_range(setup.config.prior)),
+        believed,
+        lambda geometry: put_in_force(pipeline, setup.model, geometry),
+        setup.config.robot.max_wheel_speed_rad_s,
+    )
+
+
+def put_in_force(pipeline: Pipeline, model: Model, learnt: Geometry | None) -> None:
+    """Plan and estimate with this geometry, or with the model file's for None; raises ValueError if that cannot be."""
+    adapted = model if learnt is None else with_geometry(model, learnt)
+    if adapted.belief is None:
+        raise ValueError("the model has no belief")
+    pipeline.set_belief(adapted.belief, odometry_parameters(adapted))
+
+
+def odometry_parameters(model: Model) -> OdometryParameters:
+    """Mean and covariance of the geometry, as the estimator wants them."""
+    (wheel_radius_m, axial_distance_m, x_icr_m), covariance = geometry(model)
+    return OdometryParameters(wheel_radius_m, axial_distance_m, x_icr_m, covariance)
+
+
+def make_driver(key: bytes | None = None) -> ReferenceDriver:
+    """The driver of the reference protocol; session ids are unpredictable, so that no old one fits by accident.
+
+    `key`: of authenticated mode, 16 bytes.
+    """
+    return ReferenceDriver(Codec(), lambda: secrets.randbits(16), key)
+
+
+def assemble_core(
+    config: RobotConfig,
+    transport: Transport,
+    driver: Driver,
+    pipeline: Pipeline,
+    recorder: Recorder,
+    needs_pose: bool = True,
+    adaptation: Adaptation | None = None,
+) -> DaemonCore:
+    """The daemon's tick over these parts; without `needs_pose` motion needs no pose, whatever robot.toml says."""
+    supervisor = Supervisor(
+        SupervisorSettings(
+            telemetry_zero_s=config.control.telemetry_zero_s,
+            telemetry_disarm_s=config.control.telemetry_disarm_s,
+            pose_required=needs_pose and config.estimation.pose_required,
+        )
+    )
+
+    def check(robot: Driver) -> tuple[str, ...]:
+        # Who drives by hand, and so without a pose, does not do the task.
+        return preflight(config, robot, with_task=needs_pose)
+
+    return DaemonCore(config, transport, driver, supervisor, pipeline, recorder, check, adaptation)
+
+
+def preflight(config: RobotConfig, driver: Driver, with_task: bool = True) -> tuple[str, ...]:
+    """What robot.toml asks that the robot's firmware or its wheels do not allow, in words; empty if they agree."""
+    if driver.capabilities is None:
+        return ()
+    checks = check_firmware_limits(config.robot, driver.capabilities)
+    if with_task:
+        checks.append(check_task(config.robot, config.task))
+    return failures(checks)

@@ -1,0 +1,244 @@
+"""The daemon without clock, thread or process: one tick from received frames to sent frames.
+
+The real-time shell and the harness in simulated time run this same object.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import msgspec
+
+from disco_hw.adaptation.adaptation import Adaptation, NoAdaptation
+from disco_hw.config import RobotConfig, RobotTask
+from disco_hw.control import task_of_robot
+from disco_hw.course import course_of
+from disco_hw.log import records
+from disco_hw.log.recorder import Recorder
+from disco_hw.runtime import records_of_tick
+from disco_hw.runtime.pipeline import FollowTask, Motion, Off, Pipeline, Stand, Tick, untimed
+from disco_hw.runtime.plausibility import Plausibility
+from disco_hw.runtime.progress import progress_of
+from disco_hw.runtime.supervisor import Inputs, Output, Reply, Supervisor, UserRequest
+from disco_hw.runtime.task_change import record_of
+from drivers.types import (
+    Capabilities,
+    Driver,
+    DriverState,
+    LinkState,
+    Readings,
+    RobotStatus,
+    Transport,
+    WheelCommand,
+    WheelSample,
+)
+
+STATUS_HOLDS_NS = 500_000_000
+"""What the robot said of its state is not known any more after so long: five of its reports have failed to come."""
+_FOLLOW_TASK = FollowTask()
+
+
+class CoreTick(msgspec.Struct, frozen=True, gc=False):
+    """What one tick did: the supervisor's verdict, the pipeline's work, the command sent (None if none was)."""
+
+    output: Output
+    pipeline: Tick
+    command: WheelCommand | None
+    events: tuple[str, ...]
+
+    @property
+    def replies(self) -> tuple[Reply, ...]:
+        """Answers to this tick's requests."""
+        return self.output.replies
+
+
+class DaemonCore:
+    """Transport, driver, supervisor, pipeline and recorder in one tick.
+
+    `preflight(driver)` is called once for each handshake; the sentences it returns keep the robot from being armed.
+    """
+
+    def __init__(
+        self,
+        config: RobotConfig,
+        transport: Transport,
+        driver: Driver,
+        supervisor: Supervisor,
+        pipeline: Pipeline,
+        recorder: Recorder,
+        preflight: Callable[[Driver], tuple[str, ...]],
+        adaptation: Adaptation | None = None,
+    ) -> None:
+        self.config = config
+        self.transport = transport
+        self.driver = driver
+        self.pipeline = pipeline
+        self.recorder = recorder
+        self.adaptation = adaptation or NoAdaptation()
+        self.plausibility = Plausibility()
+        self.task, self.course = config.task, course_of(config.task)
+        self.progress = progress_of(config.task)
+        self.newest_wheels: WheelSample | None = None
+        self.robot_status: RobotStatus | None = None
+        self.last: CoreTick | None = None
+        self._supervisor = supervisor
+        self._preflight = preflight
+        self._preflight_errors: tuple[str, ...] = ()
+        self._judged: Capabilities | None = None
+        self._generation = 0
+        self._link_up = False
+        self._planner_failing = self._planner_collapsed = False
+        self._state = supervisor.state
+        self.entered: dict[str, int] = {}
+        self._task_changed = False
+
+    def set_task(self, task: RobotTask) -> None:
+        """Follow another circle, or the path at another speed, from the next tick on, in which it is recorded."""
+        self.task, self.course, self.progress = task, course_of(task), progress_of(task)
+        self.pipeline.set_task(task_of_robot(task, self.config.control.mode))
+        self._task_changed = True
+
+    def tick(
+        self,
+        now_ns: int,
+        requests: Sequence[UserRequest] = (),
+        extra_records: Sequence[records.Record] = (),
+        mark: Callable[[str], None] = untimed,
+        motion: Motion = _FOLLOW_TASK,
+    ) -> CoreTick:
+        """Advance by one tick: receive, decide, estimate, plan, command, record.
+
+        `extra_records` are recorded with the tick; `mark(stage)` is called at the end of each stage; `motion` is what
+        the robot does if the supervisor allows motion. Never raises on what the robot sent.
+        """
+        self._follow_link(now_ns)
+        frames = self.transport.receive()
+        readings = self.driver.receive(now_ns, frames)
+        self._remember(now_ns, readings)
+        output = self._supervisor.step(now_ns, self._inputs(now_ns, requests))
+        mark("receive")
+        learnt = self.adaptation.step(now_ns)
+        result = self.pipeline.step(now_ns, readings, _motion(output, motion), mark)
+        command = self._command(output, result)
+        sent = self._send(now_ns, output, command)
+        mark("send")
+        doubts = self.plausibility.step(now_ns, readings.wheels, readings.poses, readings.power, command)
+        events = (*readings.events, *output.events, *learnt.events, *self._planner_events(result), *doubts)
+        self._follow_progress(output, result)
+        self.recorder.put(
+            now_ns,
+            [
+                *records_of_tick.frames_in(frames),
+                *records_of_tick.samples(readings),
+                *records_of_tick.tick(result, command, self.config.control.command_valid_for_s),
+                *sent,
+                *self._state_change(now_ns, output),
+                *self._task_change(now_ns),
+                *learnt.records,
+                *(records.Event(now_ns, "info", "daemon", text) for text in events),
+                *extra_records,
+            ],
+        )
+        self.adaptation.feed(now_ns, readings)
+        mark("record")
+        self.last = CoreTick(output, result, command, events)
+        return self.last
+
+    def _follow_link(self, now_ns: int) -> None:
+        """Tell the driver when the link comes and goes; a link renewed between two ticks is both."""
+        up = self.transport.state is LinkState.UP
+        renewed = self.transport.generation != self._generation
+        if self._link_up and (not up or renewed):
+            self.driver.link_down(now_ns)
+            self._link_up = False
+        if up and not self._link_up:
+            self._generation = self.transport.generation
+            self.driver.link_up(now_ns)
+            self._link_up = True
+
+    def _remember(self, now_ns: int, readings: Readings) -> None:
+        if readings.wheels:
+            self.newest_wheels = readings.wheels[-1]
+        if readings.status:
+            self.robot_status = readings.status[-1]
+        elif self.robot_status is not None and now_ns - self.robot_status.t_ns > STATUS_HOLDS_NS:
+            # Whoever asks whether the robot is in e-stop must not hear of one that has fallen silent since.
+            self.robot_status = None
+        # A controller can be exchanged or written anew while the link, to an adapter that stays, is up.
+        capabilities = self.driver.capabilities
+        if capabilities != self._judged:
+            self._judged = capabilities
+            self._preflight_errors = () if capabilities is None else self._preflight(self.driver)
+
+    def _inputs(self, now_ns: int, requests: Sequence[UserRequest]) -> Inputs:
+        wheels = self.newest_wheels
+        speed = 0.0 if wheels is None else max(abs(wheels.left_speed_rad_s), abs(wheels.right_speed_rad_s))
+        return Inputs(
+            link_state=self.transport.state,
+            link_generation=self.transport.generation,
+            driver_state=self.driver.state,
+            driver_detail=self.driver.detail,
+            telemetry_age_s=None if wheels is None else (now_ns - wheels.t_ns) * 1e-9,
+            wheel_speed_rad_s=speed,
+            pose_ok=self.last is not None and self.last.pipeline.estimate.pose_ok,
+            preflight_errors=self._preflight_errors,
+            task_finished=self.progress.finished,
+            requests=tuple(requests),
+        )
+
+    def _command(self, output: Output, result: Tick) -> WheelCommand | None:
+        """The command to send; while the robot is arming the driver sends the zeros that this takes."""
+        may_command = output.motion_allowed or output.zero_only
+        if not may_command or self.driver.state is not DriverState.ARMED:
+            return None
+        governed = result.command
+        return WheelCommand(governed.left_rad_s, governed.right_rad_s, self.config.control.command_valid_for_s)
+
+    def _send(self, now_ns: int, output: Output, command: WheelCommand | None) -> list[records.Record]:
+        """Hand this tick's frames to the link; the e-stop goes before everything else."""
+        if output.driver_request is not None:
+            self.driver.request(output.driver_request)
+        outgoing = self.driver.transmit(now_ns, command)
+        if output.send_estop:
+            outgoing = (*self.driver.estop(now_ns), *outgoing)
+        return [records_of_tick.frame_out(now_ns, frame, self.transport.send(frame, now_ns)) for frame in outgoing]
+
+    def _planner_events(self, result: Tick) -> tuple[str, ...]:
+        """Say when the planner begins and ceases to fail, or to plan from too few samples, not in every tick."""
+        told: list[str] = []
+        failing = result.planner_failure is not None
+        if failing != self._planner_failing:
+            told.append(f"planner: {result.planner_failure}" if failing else "planner: recovered")
+        self._planner_failing = failing
+        if result.plan is not None:
+            found = result.plan.diagnostics
+            if found.collapsed != self._planner_collapsed:
+                few = f"planner: plans hang on {found.ess:.1f} effective samples, too few to be trusted"
+                told.append(few if found.collapsed else "planner: enough effective samples again")
+            self._planner_collapsed = found.collapsed
+        return tuple(told)
+
+    def _state_change(self, now_ns: int, output: Output) -> list[records.Record]:
+        """The record of a change of state, in the tick in which it happens."""
+        before, self._state = self._state, output.state
+        if output.state is before:
+            return []
+        self.entered[output.state.value] = self.entered.get(output.state.value, 0) + 1
+        return [records.DaemonState(now_ns, output.state.name, before.name, output.detail)]
+
+    def _task_change(self, now_ns: int) -> list[records.Record]:
+        """The record of another task, in the first tick that it holds for."""
+        changed, self._task_changed = self._task_changed, False
+        return [record_of(now_ns, self.task)] if changed else []
+
+    def _follow_progress(self, output: Output, result: Tick) -> None:
+        if output.running:
+            self.progress.add(result.t_ns, result.estimate.x_m, result.estimate.y_m)
+        else:
+            self.progress.pause()
+
+
+def _motion(output: Output, wanted: Motion) -> Motion:
+    if output.motion_allowed:
+        return wanted
+    return Stand() if output.zero_only else Off()

@@ -1,0 +1,239 @@
+"""One tick, pure: samples in, estimate, plan, governed wheel command out.
+
+The real-time loop, the replay and the simulated-time harness run this same object; it has no clock, thread or I/O.
+"""
+
+from __future__ import annotations
+
+import enum
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import msgspec
+
+from disco_hw.control import NoValidControl, Plan, PlannerState, Rollouts, SentCommand, Task
+from disco_hw.estimation import Estimate, OdometryParameters, PoseFusion, PoseUpdate
+from disco_hw.model import Belief
+from disco_hw.runtime.governor import Governed, Governor
+from drivers.types import Readings
+
+HISTORY_NS = 2_000_000_000
+
+
+class Planner(Protocol):
+    """Whatever turns a state into a plan; DISCO is one."""
+
+    def plan(self, now_ns: int, state: PlannerState) -> Plan:
+        """Plan from the state; raises NoValidControl when there is nothing to execute."""
+
+    def reset(self) -> None:
+        """Forget the last plan, as at a new start."""
+
+    def set_task(self, task: Task) -> None:
+        """Plan for another task of the same kind from the next reset on."""
+
+    def set_belief(self, belief: Belief) -> None:
+        """Plan under this belief from the next plan on; raises ValueError, and keeps the old one, if it cannot."""
+
+    def sampled_rollouts(self, count: int) -> Rollouts:
+        """The weightiest sequences of the last plan; changes nothing."""
+
+
+class NoPlanner:
+    """In the place of a planner where the robot is driven by hand: it never has a plan."""
+
+    def plan(self, _now_ns: int, _state: PlannerState) -> Plan:
+        """Raise NoValidControl."""
+        raise NoValidControl("there is no planner: the robot is driven by hand")
+
+    def reset(self) -> None:
+        """Nothing is kept."""
+
+    def set_task(self, _task: Task) -> None:
+        """A person decides."""
+
+    def set_belief(self, _belief: Belief) -> None:
+        """Nothing is planned."""
+
+    def sampled_rollouts(self, _count: int) -> Rollouts:
+        """Raise NoValidControl."""
+        raise NoValidControl("there is no planner")
+
+
+@dataclass(frozen=True, slots=True)
+class Off:
+    """Nothing is sent to the wheels."""
+
+
+@dataclass(frozen=True, slots=True)
+class Stand:
+    """Come to zero wheel speed within the limits and hold it."""
+
+
+@dataclass(frozen=True, slots=True)
+class FollowTask:
+    """Let the planner drive."""
+
+
+@dataclass(frozen=True, slots=True)
+class Manual:
+    """Drive at these wheel speeds (rad/s, left and right), within the governor's limits."""
+
+    left_rad_s: float
+    right_rad_s: float
+
+
+class Source(enum.Enum):
+    """Who asked for a tick's wheel speeds."""
+
+    OFF = "off"
+    HOLD = "hold"
+    PLAN = "plan"
+    TAIL = "tail"
+    RAMP = "ramp"
+    MANUAL = "manual"
+
+
+Motion = Off | Stand | FollowTask | Manual
+
+
+class Tick(msgspec.Struct, frozen=True, gc=False):
+    """What one tick made of its samples.
+
+    `plan` is this tick's new plan or None, `plan_age_ns` the age of the one in force, `planner_failure` why there is no
+    new one; `requested` is what `source` wanted, `command` what the governor lets through (rad/s).
+    """
+
+    t_ns: int
+    pose_updates: tuple[PoseUpdate, ...]
+    estimate: Estimate
+    plan: Plan | None
+    plan_age_ns: int | None
+    planner_failure: str | None
+    source: Source
+    requested: tuple[float, float]
+    command: Governed
+
+
+def untimed(_stage: str) -> None:
+    """Time nothing: for callers without a clock."""
+
+
+class Pipeline:
+    """Estimator, planner and governor in one step.
+
+    A plan that is late or missing is followed on its tail for `plan_tail_s` after the tick it was made for; then the
+    wheels ramp to zero. The governor runs in every tick, so that stopping obeys the acceleration limit as well.
+    """
+
+    def __init__(self, fusion: PoseFusion, planner: Planner, governor: Governor, plan_tail_s: float) -> None:
+        self._fusion = fusion
+        self._planner = planner
+        self._governor = governor
+        self._plan_tail_ns = round(plan_tail_s * 1e9)
+        self._plan: Plan | None = None
+        self._plan_made_ns = 0
+        self._following = False
+        self._last_ns: int | None = None
+        self._sent: deque[SentCommand] = deque()
+
+    @property
+    def fusion(self) -> PoseFusion:
+        """The estimator, for its counters."""
+        return self._fusion
+
+    def set_task(self, task: Task) -> None:
+        """Follow another task of the same kind; what is planned for the present one is dropped."""
+        self._planner.set_task(task)
+        self._plan, self._following = None, False
+
+    def set_belief(self, belief: Belief, odometry: OdometryParameters) -> None:
+        """Plan and estimate with another geometry from the next step on; plan and estimate in force stay.
+
+        Raises ValueError, with everything as it was, if the planner cannot take the belief.
+        """
+        self._planner.set_belief(belief)
+        self._fusion.set_parameters(odometry)
+
+    def rollouts(self, count: int) -> Rollouts | None:
+        """What the plan in force was weighed from, the `count` of the largest weight; None without one.
+
+        A look from outside: no later tick is changed by it.
+        """
+        return None if self._plan is None else self._planner.sampled_rollouts(count)
+
+    def step(self, now_ns: int, readings: Readings, motion: Motion, mark: Callable[[str], None] = untimed) -> Tick:
+        """Advance by one tick; `mark(stage)` is called at the end of the stages "estimate" and "plan".
+
+        Never raises on what the robot sent; a planner without a valid control is reported in the tick.
+        """
+        for wheels in readings.wheels:
+            self._fusion.add_wheels(wheels)
+        updates = tuple(self._fusion.add_pose(pose, now_ns) for pose in readings.poses)
+        estimate = self._fusion.estimate(now_ns)
+        mark("estimate")
+        plan, failure = None, None
+        if isinstance(motion, FollowTask):
+            plan, failure = self._replan(now_ns, estimate)
+        else:
+            self._plan, self._following = None, False
+        source, requested = self._wanted(now_ns, motion, plan)
+        command = self._govern(now_ns, source, requested)
+        mark("plan")
+        return Tick(
+            t_ns=now_ns,
+            pose_updates=updates,
+            estimate=estimate,
+            plan=plan,
+            plan_age_ns=None if self._plan is None else now_ns - self._plan_made_ns,
+            planner_failure=failure,
+            source=source,
+            requested=requested,
+            command=command,
+        )
+
+    def _replan(self, now_ns: int, estimate: Estimate) -> tuple[Plan | None, str | None]:
+        if not self._following:
+            self._planner.reset()
+            self._following = True
+        state = PlannerState(
+            t_ns=now_ns,
+            x_m=estimate.x_m,
+            y_m=estimate.y_m,
+            yaw_rad=estimate.yaw_rad,
+            left_speed_rad_s=estimate.left_speed_rad_s,
+            right_speed_rad_s=estimate.right_speed_rad_s,
+            sent=tuple(self._sent),
+        )
+        try:
+            plan = self._planner.plan(now_ns, state)
+        except NoValidControl as error:
+            return None, str(error)
+        self._plan, self._plan_made_ns = plan, now_ns
+        return plan, None
+
+    def _wanted(self, now_ns: int, motion: Motion, new: Plan | None) -> tuple[Source, tuple[float, float]]:
+        match motion:
+            case Off():
+                return Source.OFF, (0.0, 0.0)
+            case Stand():
+                return Source.HOLD, (0.0, 0.0)
+            case Manual(left_rad_s=left, right_rad_s=right):
+                return Source.MANUAL, (left, right)
+            case FollowTask():
+                if self._plan is None or now_ns - self._plan_made_ns > self._plan_tail_ns:
+                    return Source.RAMP, (0.0, 0.0)
+                return Source.TAIL if new is None else Source.PLAN, self._plan.at(now_ns)
+
+    def _govern(self, now_ns: int, source: Source, requested: tuple[float, float]) -> Governed:
+        if source is Source.OFF:
+            self._governor.reset()
+        dt_s = 0.0 if self._last_ns is None else (now_ns - self._last_ns) * 1e-9
+        self._last_ns = now_ns
+        command = self._governor.step(requested[0], requested[1], dt_s)
+        self._sent.append(SentCommand(now_ns, command.left_rad_s, command.right_rad_s))
+        while now_ns - self._sent[0].t_ns > HISTORY_NS:
+            self._sent.popleft()
+        return command

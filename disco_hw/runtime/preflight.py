@@ -1,0 +1,135 @@
+"""Checks before the first motion: each a pure judgement of figures that somebody else took."""
+
+from __future__ import annotations
+
+import enum
+import math
+import statistics
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from disco_hw.config import Control, Link, Robot, RobotTask
+from disco_hw.runtime.link_load import can_load, cyclic_frames, serial_load
+from disco_hw.runtime.task_change import fastest_m_s, in_words, too_fast
+from drivers.limits import check_limits
+from drivers.types import Capabilities
+
+_LOAD_BUDGET = 0.4
+_LOAD_LIMIT = 0.8
+_COMMANDS_TO_SPARE = 2
+
+
+class Level(enum.Enum):
+    """What a check's result means for a person."""
+
+    OK = "ok"
+    WARNING = "warn"
+    FAIL = "fail"
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """One check's result: `text` says what was found, and what to do if it is not ok."""
+
+    name: str
+    level: Level
+    text: str
+
+
+def failures(checks: Iterable[Check]) -> tuple[str, ...]:
+    """Return the texts of the checks that failed: what keeps the robot from being armed."""
+    return tuple(check.text for check in checks if check.level is Level.FAIL)
+
+
+def check_link_load(link: Link, control: Control, dbc: str) -> Check:
+    """Compare the load of the link by the cyclic frames of the DBC (its text) with a budget of 40 %."""
+    frames = cyclic_frames(dbc, control.rate_hz, authenticated=link.key_file is not None)
+    if link.kind == "can":
+        load = can_load(frames, link.bitrate)
+        found = f"{load:.1%} of the bus at {link.bitrate / 1e3:g} kbit/s with the most stuff bits"
+        remedy = "raise link.bitrate on both ends, or lower control.rate_hz"
+    else:
+        load = serial_load(frames, link.baud)
+        found = f"{load:.1%} of the busier direction at {link.baud} baud"
+        remedy = "raise link.baud on both ends, or lower control.rate_hz"
+    if load > _LOAD_LIMIT:
+        return Check("link load", Level.FAIL, f"{found} is too much; {remedy}")
+    if load > _LOAD_BUDGET:
+        return Check("link load", Level.WARNING, f"{found} is above {_LOAD_BUDGET:.0%}; {remedy}")
+    return Check("link load", Level.OK, found)
+
+
+def check_firmware_limits(robot: Robot, capabilities: Capabilities) -> list[Check]:
+    """Compare robot.toml's limits and encoder with what the firmware says of itself; a check for each difference."""
+    errors = check_limits(
+        capabilities, robot.max_wheel_speed_rad_s, robot.max_wheel_acceleration_rad_s2, robot.ticks_per_rev
+    )
+    if errors:
+        return [Check("firmware limits", Level.FAIL, error) for error in errors]
+    found = (
+        f"{robot.max_wheel_speed_rad_s:g} rad/s and {robot.max_wheel_acceleration_rad_s2:g} rad/s^2 are within the "
+        f"firmware's {capabilities.max_wheel_speed_rad_s:g} and {capabilities.max_wheel_acceleration_rad_s2:g}; "
+        f"{capabilities.ticks_per_rev} ticks a turn"
+    )
+    return [Check("firmware limits", Level.OK, found)]
+
+
+def check_task(robot: Robot, task: RobotTask) -> Check:
+    """Compare the task's speed with what the nominal robot's wheels can do on it."""
+    refusal = too_fast(robot, task)
+    if refusal is not None:
+        return Check("task", Level.FAIL, f"task.speed_m_s: {refusal}")
+    return Check("task", Level.OK, f"{in_words(task)}; the wheels can do {fastest_m_s(robot, task):.2f} m/s on it")
+
+
+def check_command_timing(control: Control, capabilities: Capabilities) -> Check:
+    """Count how many commands in a row may be lost before the firmware stops the robot."""
+    timeout_s = min(control.command_valid_for_s, capabilities.command_timeout_s)
+    # The last command received holds for the timeout; the next that arrives must do so within it.
+    spare = math.ceil(round(timeout_s * control.rate_hz, 6)) - 2
+    found = f"the firmware stops {timeout_s * 1e3:g} ms after a command; at {control.rate_hz:g} Hz "
+    if spare < 0:
+        return Check("command timing", Level.FAIL, f"{found}it stops between two commands; raise control.rate_hz")
+    if spare < _COMMANDS_TO_SPARE:
+        few = f"only {spare}" if spare else "not one"
+        text = f"{found}{few} may be lost; raise control.rate_hz or control.command_valid_for_s"
+        return Check("command timing", Level.WARNING, text)
+    return Check("command timing", Level.OK, f"{found}{spare} in a row may be lost")
+
+
+def check_realtime(priority: int, fifo_allowed: bool, memory_lock_allowed: bool, cpu_count: int) -> list[Check]:
+    """Say which real-time measures this process may take; none is required, each makes the loop more punctual."""
+    checks = []
+    if priority == 0:
+        checks.append(Check("scheduler", Level.WARNING, "left alone: daemon.realtime_priority is 0; write 80"))
+    elif fifo_allowed:
+        checks.append(Check("scheduler", Level.OK, f"SCHED_FIFO {priority} is allowed"))
+    else:
+        remedy = "set LimitRTPRIO=99 in the service, or an rtprio line in /etc/security/limits.conf"
+        checks.append(Check("scheduler", Level.WARNING, f"SCHED_FIFO is not allowed; {remedy}"))
+    if memory_lock_allowed:
+        checks.append(Check("memory", Level.OK, "may be locked"))
+    else:
+        remedy = "set LimitMEMLOCK=infinity in the service, or a memlock line in /etc/security/limits.conf"
+        checks.append(Check("memory", Level.WARNING, f"may not be locked; {remedy}"))
+    if cpu_count < 2:
+        checks.append(Check("CPUs", Level.WARNING, "one CPU serves the loop and all else; use one with more"))
+    return checks
+
+
+def check_round_trip(round_trips_s: Sequence[float], period_s: float) -> Check:
+    """Compare measured round trips to the robot and back (s) with the control period (s)."""
+    name = "round trip"
+    if not round_trips_s:
+        return Check(name, Level.FAIL, "the robot did not answer; check its power, the cable and the link's settings")
+    worst_s = max(round_trips_s)
+    found = (
+        f"median {statistics.median(round_trips_s) * 1e3:.2f} ms, worst {worst_s * 1e3:.2f} ms of {len(round_trips_s)}"
+    )
+    remedy = "look for a USB adapter without low-latency mode, or a loaded bus"
+    if worst_s >= period_s:
+        return Check(name, Level.FAIL, f"{found}, longer than a control period of {period_s * 1e3:g} ms; {remedy}")
+    if worst_s >= period_s / 2:
+        text = f"{found}, longer than half a control period of {period_s * 1e3:g} ms; {remedy}"
+        return Check(name, Level.WARNING, text)
+    return Check(name, Level.OK, found)

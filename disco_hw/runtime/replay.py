@@ -1,0 +1,178 @@
+"""Runs estimator, planner and governor again on a log's samples and compares what comes out, bit for bit."""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from disco_hw.adaptation.adaptable import geometry_of
+from disco_hw.control import task_of_robot
+from disco_hw.errors import InputError
+from disco_hw.log.reader import Entry, open_log
+from disco_hw.log.records import BeliefChange, Command, Estimate, Innovation, Plan, Record, Task
+from disco_hw.runtime import records_of_tick
+from disco_hw.runtime.assembly import make_pipeline, make_planner, put_in_force
+from disco_hw.runtime.log_setup import setup_of_log
+from disco_hw.runtime.pipeline import FollowTask, Manual, Motion, Off, Pipeline, Source, Stand
+from disco_hw.runtime.task_change import task_of
+from drivers.types import PoseSample, Readings, WheelSample
+
+_TOPICS = ("/wheels", "/pose", "/estimate", "/estimate/innovation", "/plan", "/command", "/task", "/belief")
+_COMPARED = (Estimate, Innovation, Plan, Command)
+# Whether a command went out is the driver's part, which is not replayed.
+_NOT_REPLAYED = {(Command, "in_force"), (Command, "valid_for_s")}
+_FLOAT = struct.Struct("<d")
+_SOURCES = frozenset(source.value for source in Source)
+_REPLAYED = "only logs of `disco-hw run` and `drive` can be replayed"
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """The first place where the two runs part; values as text, so that every bit shows."""
+
+    tick: int
+    t_ns: int
+    field: str
+    recorded: str
+    replayed: str
+
+
+@dataclass(frozen=True, slots=True)
+class ReplayReport:
+    """How many ticks and values were compared, and where they first differ (None if nowhere)."""
+
+    ticks: int
+    values: int
+    missing_ticks: int
+    recorded_by: str
+    difference: Difference | None
+    tolerance: float = 0.0
+
+    @property
+    def ok(self) -> bool:
+        """Whether everything was equal, or as near as was asked."""
+        return self.difference is None
+
+    def as_dict(self) -> dict[str, Any]:
+        """The report for machines."""
+        return {"ok": self.ok, **msgspec.to_builtins(self)}
+
+    def as_text(self) -> str:
+        """The report for a person."""
+        lines = [f"{self.ticks} ticks, {self.values} values compared; recorded by disco-hw {self.recorded_by}"]
+        if self.missing_ticks:
+            lines.append(f"{self.missing_ticks} ticks are missing from the log: from there on nothing can be equal")
+        if self.difference is None:
+            lines.append(f"equal to within {self.tolerance:g}" if self.tolerance else "equal bit for bit")
+        else:
+            d = self.difference
+            lines.append(f"first difference at tick {d.tick} ({d.t_ns} ns), {d.field}:")
+            lines.append(f"  recorded {d.recorded}")
+            lines.append(f"  replayed {d.replayed}")
+        return "\n".join(lines)
+
+
+def replay(path: Path, tolerance: float = 0.0) -> ReplayReport:
+    """Replay a log with the robot.toml and the model that it carries.
+
+    `tolerance`: what numbers may differ by, in their own units or as a share of the larger, whichever allows more; 0
+    for bit for bit, which only the machine that recorded promises: another processor rounds sums differently.
+    Raises LogError for a log that cannot be read and InputError for one that holds no ticks or no robot.toml.
+    """
+    with open_log(path) as log:
+        first = next((entry.record for entry in log.records(("/command",))), None)
+        if isinstance(first, Command) and first.source not in _SOURCES:
+            raise InputError(
+                f"{path}: its commands are from {first.source!r}, not from a planner or a hand; {_REPLAYED}"
+            )
+        setup = setup_of_log(log, _REPLAYED)
+        pipeline = make_pipeline(setup.config, setup.model, make_planner(setup.config, setup.model))
+        ticks = values = 0
+        difference: Difference | None = None
+        for tick, entries in groupby(log.records(_TOPICS), key=lambda entry: entry.tick):
+            recorded = list(entries)
+            for task in (entry.record for entry in recorded if isinstance(entry.record, Task)):
+                pipeline.set_task(task_of_robot(task_of(task, setup.config.task), setup.config.control.mode))
+            for change in (entry.record for entry in recorded if isinstance(entry.record, BeliefChange)):
+                put_in_force(pipeline, setup.model, geometry_of(change))
+            outcome = _replay_tick(pipeline, recorded)
+            ticks += 1
+            compared, difference = _compare(tick, recorded[0].now_ns, recorded, outcome, tolerance)
+            values += compared
+            if difference is not None:
+                break
+        if not ticks:
+            raise InputError(f"{path}: holds no ticks; give the log of a `disco-hw run`")
+        return ReplayReport(ticks, values, log.summary().missing_ticks, log.metadata.version, difference, tolerance)
+
+
+def _replay_tick(pipeline: Pipeline, recorded: Sequence[Entry]) -> list[Record]:
+    found = [entry.record for entry in recorded]
+    readings = Readings(
+        wheels=tuple(record for record in found if isinstance(record, WheelSample)),
+        poses=tuple(record for record in found if isinstance(record, PoseSample)),
+    )
+    command = next((record for record in found if isinstance(record, Command)), None)
+    motion = Off() if command is None else _motion(command)
+    return list(records_of_tick.tick(pipeline.step(recorded[0].now_ns, readings, motion), None, 0.0))
+
+
+def _motion(command: Command) -> Motion:
+    match Source(command.source):
+        case Source.OFF:
+            return Off()
+        case Source.HOLD:
+            return Stand()
+        case Source.MANUAL:
+            return Manual(command.requested_left_rad_s, command.requested_right_rad_s)
+        case Source.PLAN | Source.TAIL | Source.RAMP:
+            return FollowTask()
+
+
+def _compare(
+    tick: int, now_ns: int, recorded: Sequence[Entry], replayed: Sequence[Record], tolerance: float
+) -> tuple[int, Difference | None]:
+    """Compare the outputs of one tick; returns how many values were equal, and the first that is not."""
+    before = [entry.record for entry in recorded if isinstance(entry.record, _COMPARED)]
+    names = [type(record).__name__ for record in before], [type(record).__name__ for record in replayed]
+    if names[0] != names[1]:
+        return 0, Difference(tick, now_ns, "records", " ".join(names[0]), " ".join(names[1]))
+    equal = 0
+    for old, new in zip(before, replayed, strict=True):
+        for field, old_value, new_value in _values(old, new):
+            if not (_near(old_value, new_value, tolerance) if tolerance else _bits(old_value) == _bits(new_value)):
+                return equal, Difference(tick, now_ns, field, repr(old_value), repr(new_value))
+            equal += 1
+    return equal, None
+
+
+def _values(old: Record, new: Record) -> Iterator[tuple[str, Any, Any]]:
+    for name in old.__struct_fields__ if isinstance(old, msgspec.Struct) else ():
+        if (type(old), name) not in _NOT_REPLAYED:
+            yield f"{type(old).__name__}.{name}", getattr(old, name), getattr(new, name)
+
+
+def _near(old: Any, new: Any, tolerance: float) -> bool:
+    """Whether two values, or those of two tuples, are equal but for rounding."""
+    if isinstance(old, float) and isinstance(new, float):
+        both_nan = math.isnan(old) and math.isnan(new)
+        return both_nan or math.isclose(old, new, rel_tol=tolerance, abs_tol=tolerance)
+    if isinstance(old, tuple) and isinstance(new, tuple):
+        return len(old) == len(new) and all(_near(a, b, tolerance) for a, b in zip(old, new, strict=True))
+    return bool(old == new)
+
+
+def _bits(value: Any) -> Any:
+    """Something that is equal exactly if the values are: -0.0 differs from 0.0, NaN equals NaN."""
+    if isinstance(value, float):
+        return "nan" if math.isnan(value) else _FLOAT.pack(value)
+    if isinstance(value, tuple):
+        return tuple(map(_bits, value))
+    return value

@@ -1,0 +1,404 @@
+"""Walks the table of states: turns what is seen and what the user asks into what the robot is asked and allowed."""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import msgspec
+
+from disco_hw.runtime.states import PROBLEM, Condition, State, Transition, next_transition
+from drivers.types import DriverState, LinkState, Request
+
+_IDLE = frozenset({DriverState.STANDBY, DriverState.READY})
+_MAY_MOVE = frozenset({DriverState.ARMING, DriverState.ARMED, DriverState.STOPPING})
+# Conditions as integers: flags cost a microsecond an operation in Python 3.11, and this runs in every tick.
+_LINK_UP = Condition.LINK_UP.value
+_LINK_RENEWED = Condition.LINK_RENEWED.value
+_ROBOT_TALKS = Condition.ROBOT_TALKS.value
+_ROBOT_IDLE = Condition.ROBOT_IDLE.value
+_ROBOT_ARMED = Condition.ROBOT_ARMED.value
+_ROBOT_MAY_MOVE = Condition.ROBOT_MAY_MOVE.value
+_ROBOT_REFUSED = Condition.ROBOT_REFUSED.value
+_ROBOT_FAULT = Condition.ROBOT_FAULT.value
+_ROBOT_ESTOP = Condition.ROBOT_ESTOP.value
+_TELEMETRY_FRESH = Condition.TELEMETRY_FRESH.value
+_TELEMETRY_LOST = Condition.TELEMETRY_LOST.value
+_WHEELS_STILL = Condition.WHEELS_STILL.value
+_ARM_PENDING = Condition.ARM_PENDING.value
+_DISARM_ASKED = Condition.DISARM_ASKED.value
+_ESTOP_ASKED = Condition.ESTOP_ASKED.value
+_RESET_PENDING = Condition.RESET_PENDING.value
+_PREFLIGHT_ERROR = Condition.PREFLIGHT_ERROR.value
+_DAEMON_ERROR = Condition.DAEMON_ERROR.value
+_ROBOT_TROUBLE = _ROBOT_ESTOP | _ROBOT_FAULT | _ROBOT_REFUSED
+_MOVABLE = _TELEMETRY_FRESH | _ROBOT_ARMED
+_PROBLEM = PROBLEM.value
+
+
+class UserRequest(enum.Enum):
+    """What a person can ask of the daemon."""
+
+    ARM = "arm"
+    START = "start"
+    STOP = "stop"
+    DISARM = "disarm"
+    ESTOP = "estop"
+    RESET = "reset"
+
+
+@dataclass(frozen=True, slots=True)
+class SupervisorSettings:
+    """Ages, times and bounds of the supervisor."""
+
+    telemetry_zero_s: float
+    telemetry_disarm_s: float
+    pose_required: bool
+    still_rad_s: float = 0.05
+    arming_timeout_s: float = 2.0
+    reset_timeout_s: float = 3.0
+
+
+class Inputs(msgspec.Struct, frozen=True, gc=False):
+    """Everything the supervisor looks at in one tick.
+
+    `telemetry_age_s` is the age of the newest wheel sample, None before the first; `wheel_speed_rad_s` the larger
+    magnitude of its two speeds. `preflight_errors` and `daemon_error` are sentences for a person and hold for as long
+    as they are given. `task_finished`: nothing of the task is left to drive.
+    """
+
+    link_state: LinkState
+    link_generation: int
+    driver_state: DriverState
+    driver_detail: str
+    telemetry_age_s: float | None
+    wheel_speed_rad_s: float
+    pose_ok: bool
+    preflight_errors: tuple[str, ...] = ()
+    daemon_error: str | None = None
+    requests: tuple[UserRequest, ...] = ()
+    task_finished: bool = False
+
+
+class Reply(msgspec.Struct, frozen=True, gc=False):
+    """The answer to one request, in words; accepted means begun, `Output.state` tells when it is done."""
+
+    request: UserRequest
+    accepted: bool
+    text: str
+
+
+class Output(msgspec.Struct, frozen=True, gc=False):
+    """What holds for this tick.
+
+    `driver_request`: to be handed to the driver; None leaves the last one. `motion_allowed`: the plan may drive the
+    wheels. `zero_only`: the command ramps to zero and stays there. Neither: no wheel command is sent. `send_estop`:
+    the driver's e-stop frames are due. `estop`: to be shown as e-stop.
+    """
+
+    state: State
+    detail: str
+    driver_request: Request | None
+    motion_allowed: bool
+    zero_only: bool
+    running: bool
+    send_estop: bool
+    estop: bool
+    events: tuple[str, ...]
+    replies: tuple[Reply, ...]
+
+
+@dataclass(slots=True)
+class _Pending:
+    """A request to the robot that is under way."""
+
+    since_ns: int
+    sent: bool = False
+    begun: bool = False
+
+
+class Supervisor:
+    """The daemon's state and the only place where motion is allowed; it has no clock, thread or I/O.
+
+    Arming and starting happen on a user's request only: a link loss, a fault or a restart drops what was pending.
+    """
+
+    def __init__(self, settings: SupervisorSettings) -> None:
+        self._settings = settings
+        self._state = State.DISCONNECTED
+        self._generation: int | None = None
+        self._running = False
+        self._start_pending = False
+        self._arming: _Pending | None = None
+        self._resetting: _Pending | None = None
+        self._estop_asked = False
+        self._disarm_asked = False
+        self._trouble = ""
+        self._stop_reason = ""
+        self._events: list[str] = []
+
+    @property
+    def state(self) -> State:
+        """The state after the last step."""
+        return self._state
+
+    def step(self, now_ns: int, inputs: Inputs) -> Output:
+        """Take in one tick's inputs, make at most one transition, and return what holds until the next step."""
+        self._events = []
+        self._disarm_asked = False
+        seen = self._observe(inputs)
+        estop_now = UserRequest.ESTOP in inputs.requests
+        replies = tuple(self._answer(now_ns, request, estop_now, inputs, seen) for request in inputs.requests)
+        self._drop_what_failed(now_ns, inputs, seen)
+        before = self._state
+        row = next_transition(before, seen | self._asked())
+        if row is not None:
+            self._enter(row, inputs)
+        if self._state is State.FAULT and _PROBLEM & (seen | self._asked()):
+            self._trouble = self._words(inputs)
+        if row is not None:
+            words = f"{row.reason}: {self._trouble}" if row.target is State.FAULT else _reason(row, inputs)
+            self._events.append(f"{before.value} -> {row.target.value}: {words}")
+        self._mind_task(inputs)
+        return self._output(inputs, seen, replies)
+
+    def _observe(self, inputs: Inputs) -> int:
+        """Return the conditions that the inputs alone decide."""
+        age_s = inputs.telemetry_age_s
+        link_up = inputs.link_state is LinkState.UP
+        seen = _SAID_BY[inputs.driver_state] | _union(
+            (
+                (_LINK_UP, link_up),
+                (_LINK_RENEWED, link_up and inputs.link_generation != self._generation),
+                # Written so that an age or a speed that is not a number counts as no telemetry and as moving.
+                (_TELEMETRY_FRESH, age_s is not None and age_s <= self._settings.telemetry_zero_s),
+                (_TELEMETRY_LOST, age_s is None or not age_s <= self._settings.telemetry_disarm_s),
+                (_WHEELS_STILL, inputs.wheel_speed_rad_s < self._settings.still_rad_s),
+                (_PREFLIGHT_ERROR, bool(inputs.preflight_errors)),
+                (_DAEMON_ERROR, inputs.daemon_error is not None),
+            )
+        )
+        if link_up:
+            self._generation = inputs.link_generation
+        return seen
+
+    def _asked(self) -> int:
+        """Return the conditions that requests have set."""
+        return _union(
+            (
+                (_ARM_PENDING, self._arming is not None),
+                (_DISARM_ASKED, self._disarm_asked),
+                (_ESTOP_ASKED, self._estop_asked),
+                (_RESET_PENDING, self._resetting is not None),
+            )
+        )
+
+    def _answer(self, now_ns: int, request: UserRequest, estop_now: bool, inputs: Inputs, seen: int) -> Reply:
+        """Take up or refuse one request, in words; an e-stop beats all that could lead to motion in the same tick."""
+        refusal: str | None = None
+        text = ""
+        match request:
+            case UserRequest.ESTOP:
+                self._estop_asked, self._resetting = True, None
+                self._drop_pending("e-stop")
+                text = "e-stop" if seen & _LINK_UP else "e-stop held; it is sent when the link is up"
+            case UserRequest.DISARM:
+                self._disarm_asked = True
+                self._drop_pending("disarm")
+                text = "disarming" if self._state is State.ARMED else "not armed"
+            case UserRequest.STOP:
+                text = "stopping the task" if self._running else "no task is running"
+                self._running = self._start_pending = False
+            case UserRequest.ARM:
+                refusal = "e-stop in the same instant" if estop_now else self._why_not_arm(inputs, seen)
+                if refusal is None and self._state is State.READY and self._arming is None:
+                    self._arming = _Pending(now_ns)
+                text = "already armed" if self._state is State.ARMED else "arming"
+            case UserRequest.START:
+                refusal = "e-stop in the same instant" if estop_now else self._why_not_start(inputs, seen)
+                self._start_pending = self._start_pending or (refusal is None and not self._running)
+                text = "starting" if self._state is State.ARMED else "starting once armed"
+            case UserRequest.RESET:
+                refusal = "e-stop in the same instant" if estop_now else self._why_not_reset(inputs, seen)
+                if refusal is None:
+                    self._estop_asked, self._resetting = False, self._resetting or _Pending(now_ns)
+                text = "resetting"
+        return Reply(request, refusal is None, text if refusal is None else refusal)
+
+    def _why_not_arm(self, inputs: Inputs, seen: int) -> str | None:
+        match self._state:
+            case State.ARMED:
+                return None
+            case State.READY if not seen & _TELEMETRY_FRESH:
+                return "no fresh wheel samples"
+            case State.READY if not seen & _WHEELS_STILL:
+                return "the wheels are turning; wait until they stand still"
+            case State.READY:
+                return None
+            case State.STOPPING:
+                return "still stopping; ask again when ready"
+            case State.FAULT:
+                return f"{self._trouble}; mend it and reset first"
+            case State.DISCONNECTED | State.HANDSHAKE:
+                return f"not connected to the robot: {self._words(inputs)}"
+
+    def _why_not_start(self, inputs: Inputs, seen: int) -> str | None:
+        if self._state is not State.ARMED and self._arming is None:
+            return "not armed; arm first"
+        if self._state is State.ARMED and not seen & _TELEMETRY_FRESH:
+            return "no fresh wheel samples"
+        if self._settings.pose_required and not inputs.pose_ok:
+            return "no pose; check the pose sensor, or set estimation.pose_required = false"
+        return None
+
+    def _why_not_reset(self, inputs: Inputs, seen: int) -> str | None:
+        if self._state is not State.FAULT:
+            return f"nothing to reset in state {self._state.value}"
+        if inputs.daemon_error is not None:
+            return f"the daemon failed ({inputs.daemon_error}); restart it"
+        if inputs.preflight_errors:
+            return f"{inputs.preflight_errors[0]}; mend it and restart the daemon"
+        if self._estop_asked and not seen & _ROBOT_ESTOP:
+            return "the robot has not confirmed the e-stop yet"
+        return None
+
+    def _drop_what_failed(self, now_ns: int, inputs: Inputs, seen: int) -> None:
+        """End requests to the robot that it refused or did not answer in time."""
+        arming, resetting = self._arming, self._resetting
+        if arming is not None:
+            arming.begun = arming.begun or inputs.driver_state is DriverState.ARMING
+            if arming.begun and seen & _ROBOT_IDLE:
+                self._drop_pending(f"the robot did not arm: {inputs.driver_detail}")
+            elif now_ns - arming.since_ns > self._settings.arming_timeout_s * 1e9:
+                self._drop_pending(f"not armed within {self._settings.arming_timeout_s:g} s: {inputs.driver_detail}")
+        if resetting is not None and now_ns - resetting.since_ns > self._settings.reset_timeout_s * 1e9:
+            self._resetting = None
+            self._events.append(f"no reset within {self._settings.reset_timeout_s:g} s: {inputs.driver_detail}")
+
+    def _drop_pending(self, why: str) -> None:
+        if self._arming is not None:
+            self._events.append(f"arm request dropped: {why}")
+        if self._start_pending:
+            self._events.append(f"start request dropped: {why}")
+        self._arming, self._start_pending = None, False
+
+    def _enter(self, row: Transition, inputs: Inputs) -> None:
+        self._state = row.target
+        if row.target is State.STOPPING:
+            self._stop_reason = _reason(row, inputs)
+        if row.target is State.ARMED:
+            self._arming = None
+        else:
+            self._drop_pending(row.reason)
+            self._running = False
+        self._resetting = None
+
+    def _mind_task(self, inputs: Inputs) -> None:
+        """Start the task once armed, and stop it without a pose and at its end."""
+        if self._state is not State.ARMED:
+            return
+        pose_missing = self._settings.pose_required and not inputs.pose_ok
+        if self._start_pending and pose_missing:
+            self._drop_pending("no pose")
+        elif self._start_pending:
+            self._start_pending, self._running = False, True
+            self._events.append("task started")
+        elif self._running and pose_missing:
+            self._running = False
+            self._events.append("task stopped: no pose")
+        elif self._running and inputs.task_finished:
+            self._running = False
+            self._events.append("task stopped: the path's end is reached")
+
+    def _words(self, inputs: Inputs) -> str:
+        """Return what a person should know of the present state."""
+        if inputs.daemon_error is not None:
+            return inputs.daemon_error
+        if inputs.link_state is not LinkState.UP:
+            return f"the link is {inputs.link_state.value}"
+        if self._state is State.FAULT and inputs.preflight_errors:
+            return "; ".join(inputs.preflight_errors)
+        if self._state is State.FAULT and self._estop_asked:
+            return "e-stop requested here"
+        return inputs.driver_detail
+
+    def _detail(self, inputs: Inputs, seen: int) -> str:
+        match self._state:
+            case State.READY:
+                return "arming" if self._arming is not None else "ready to be armed"
+            case State.ARMED if not seen & _TELEMETRY_FRESH:
+                return "no fresh wheel samples: holding zero"
+            case State.ARMED:
+                return "running the task" if self._running else "armed, holding zero"
+            case State.STOPPING:
+                return f"{self._stop_reason}; waiting until the robot is disarmed and its wheels are still"
+            case State.FAULT:
+                return f"{self._trouble}; mend it, then reset"
+            case State.DISCONNECTED | State.HANDSHAKE:
+                return self._words(inputs)
+
+    def _output(self, inputs: Inputs, seen: int, replies: tuple[Reply, ...]) -> Output:
+        armed = self._state is State.ARMED
+        may_move = seen & _MOVABLE == _MOVABLE
+        motion_allowed = armed and self._running and may_move
+        stopping = self._state in (State.STOPPING, State.FAULT)
+        # With telemetry lost nothing is sent any more: the robot's own watchdog then stops it by a second way.
+        braking = stopping and seen & (_ROBOT_ARMED | _TELEMETRY_LOST) == _ROBOT_ARMED
+        return Output(
+            state=self._state,
+            detail=self._detail(inputs, seen),
+            driver_request=self._driver_request(seen),
+            motion_allowed=motion_allowed,
+            zero_only=(armed and not motion_allowed) or braking,
+            running=self._running,
+            send_estop=self._estop_asked and seen & (_LINK_UP | _ROBOT_ESTOP) == _LINK_UP,
+            estop=self._estop_asked or bool(seen & _ROBOT_ESTOP),
+            events=tuple(self._events),
+            replies=replies,
+        )
+
+    def _driver_request(self, seen: int) -> Request | None:
+        """Return what to ask of the driver; ARM and RESET once each, as the driver holds or consumes them."""
+        if self._state is State.ARMED:
+            return None
+        if self._state is State.READY:
+            return _once(self._arming, Request.ARM) if self._arming is not None else Request.READY
+        if self._state is State.FAULT and self._resetting is not None and seen & _ROBOT_TROUBLE:
+            return _once(self._resetting, Request.RESET)
+        return Request.STANDBY
+
+
+def _reason(row: Transition, inputs: Inputs) -> str:
+    """Return the row's reason; where the robot acted first, with what the driver knows of its reason."""
+    return f"{row.reason}: {inputs.driver_detail}" if Condition.ROBOT_ARMED in row.blocked_by else row.reason
+
+
+def _once(pending: _Pending, request: Request) -> Request | None:
+    """Return the request the first time, None from then on."""
+    if pending.sent:
+        return None
+    pending.sent = True
+    return request
+
+
+def _union(flags: Iterable[tuple[int, bool]]) -> int:
+    return sum([flag for flag, holds in flags if holds])
+
+
+def _said_by(robot: DriverState) -> int:
+    """The conditions that the driver's state alone decides."""
+    return _union(
+        (
+            (_ROBOT_TALKS, robot in _IDLE | _MAY_MOVE),
+            (_ROBOT_IDLE, robot in _IDLE),
+            (_ROBOT_ARMED, robot is DriverState.ARMED),
+            (_ROBOT_MAY_MOVE, robot in _MAY_MOVE),
+            (_ROBOT_REFUSED, robot is DriverState.REFUSED),
+            (_ROBOT_FAULT, robot is DriverState.FAULT),
+            (_ROBOT_ESTOP, robot is DriverState.ESTOP),
+        )
+    )
+
+
+_SAID_BY = {robot: _said_by(robot) for robot in DriverState}

@@ -1,0 +1,43 @@
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import disco_hw
+from disco_hw.adaptation.adaptable import believed_geometry, check_adaptable, possible_range, with_geometry
+from disco_hw.adaptation.guard import Geometry
+from disco_hw.config import Prior
+from disco_hw.errors import InputError
+from disco_hw.model import EffectSetting, Gaussian, load_model
+
+MODEL = load_model(Path(disco_hw.__file__).parent / "robots" / "wombot_model.toml")
+NEW = Geometry(np.array([0.2, 0.07, 0.4]), np.diag([1e-6, 2e-8, 3e-6]))
+
+
+def test_the_geometry_is_replaced_and_nothing_else():
+    lag = EffectSetting("motor_lag", {"tau_s": 0.1})
+    names = ("wheel_radius_m", "motor_lag.tau_s", "x_icr_m", "axial_distance_m")
+    covariance = np.diag([1e-4, 1e-3, 1e-4, 1e-4]) + 1e-5
+    model = replace(MODEL, effects=(lag,), belief=Gaussian(names, np.array([0.06, 0.12, 0.2, 0.4]), covariance))
+    changed = with_geometry(model, NEW)
+    assert changed.belief.names == names
+    assert changed.belief.mean() == pytest.approx([0.07, 0.12, 0.2, 0.4])
+    assert changed.belief.covariance()[1] == pytest.approx([0.0, covariance[1, 1], 0.0, 0.0])
+    assert believed_geometry(changed).covariance == pytest.approx(NEW.covariance)
+
+
+def test_what_cannot_be_adapted_is_refused():
+    check_adaptable(MODEL, "ut")
+    with pytest.raises(InputError, match="uncertainty"):
+        check_adaptable(MODEL, "point")
+    with pytest.raises(InputError, match="no belief"):
+        check_adaptable(replace(MODEL, belief=None), "ut")
+    with pytest.raises(InputError, match="side_slip"):
+        check_adaptable(replace(MODEL, effects=(EffectSetting("side_slip", {"k_s": 0.1}),)), "ut")
+
+
+def test_the_range_is_the_prior_as_far_as_it_is_possible():
+    low, high = possible_range(Prior(wheel_radius_m=(0.0, 0.2)))
+    assert low.tolist() == [0.0, 0.005, 0.1]
+    assert high.tolist() == [0.5, 0.2, 0.5]

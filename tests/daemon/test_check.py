@@ -1,0 +1,99 @@
+"""What `check` concludes from what a robot says; the verb as a whole is tested in tests/hil."""
+
+import time
+from dataclasses import replace
+from types import SimpleNamespace
+
+import msgspec
+import pytest
+
+from disco_hw.daemon import check
+from disco_hw.errors import InputError
+from disco_hw.runtime.preflight import Level
+from disco_hw.runtime.robot_setup import load_setup
+from drivers.transport import connect_pair
+from drivers.types import Frame, OutgoingFrame
+from tests.daemon.test_control_client import Daemon
+from tests.drivers.reference_robot import CONFIG, ReferenceRobot
+from tests.robot import test_robot
+from tests.runtime.simulated import ROBOT_FILE
+
+KEY = bytes(range(16))
+MS_NS = 1_000_000
+
+
+class RobotInTime:
+    """The real core on the other end of a link, which lives as fast as it is asked."""
+
+    def __init__(self, key):
+        self.link, self._far = connect_pair()
+        self.link.open()
+        self._far.open()
+        self._robot = ReferenceRobot(replace(CONFIG, key=key))
+        self._now_ns = time.monotonic_ns()
+        self.stats, self.send = self.link.stats, self.link.send
+        self.disturb = None
+
+    def receive(self):
+        while self._now_ns < time.monotonic_ns():
+            for received in self._far.receive():
+                self._robot.receive(self._now_ns, received.frame)
+            if self.disturb is not None:
+                self._robot.receive(self._now_ns, self.disturb)
+            self._robot.step(self._now_ns)
+            for frame in self._robot.drain():
+                self._far.send(OutgoingFrame(frame, self._now_ns), self._now_ns)
+            self._now_ns += MS_NS
+        return self.link.receive()
+
+
+@pytest.fixture(autouse=True)
+def brief(monkeypatch):
+    monkeypatch.setattr(check, "_LISTEN_S", 1.2)
+    monkeypatch.setattr(check, "_SETTLED_S", 0.6)
+
+
+@pytest.mark.parametrize("key", [b"", KEY])
+def test_a_robot_that_takes_what_it_is_sent(key):
+    found = check._ask_robot(RobotInTime(key), key or None)
+    assert check._hearing_check(found).level is Level.OK
+
+
+def test_a_key_that_is_not_the_robots_fails():
+    found = check._ask_robot(RobotInTime(KEY), KEY[::-1])
+    heard = check._hearing_check(found)
+    assert heard.level is Level.FAIL
+    assert "link.key_file" in heard.text
+
+
+def test_what_else_the_robot_rejects_is_a_warning():
+    robot = RobotInTime(b"")
+    robot.disturb = Frame(0x101, bytes(8))
+    heard = check._hearing_check(check._ask_robot(robot, None))
+    assert heard.level is Level.WARNING
+    assert "checksum" in heard.text
+
+
+def test_the_conformance_suite_keeps_out_of_a_daemons_way_too(tmp_path):
+    """Two hosts would speak at once, and each test would fail for another reason."""
+    robot = tmp_path / "robot.toml"
+    robot.write_text(
+        '[robot]\nname = "busy"\nwheel_radius_m = 0.06\naxial_distance_m = 0.31\nticks_per_rev = 2048\n'
+        f'max_wheel_speed_rad_s = 8.0\n[link]\ninterface = "unixcan"\nchannel = "{tmp_path}/bus"\n'
+        f'[daemon]\ncontrol_socket = "{tmp_path}/control.sock"\n'
+    )
+    daemon = Daemon(tmp_path / "control.sock", {})
+    try:
+        with pytest.raises(pytest.exit.Exception, match="a daemon drives this robot") as caught:
+            test_robot.TestRobot.make_end(SimpleNamespace(getoption=lambda _: str(robot)))
+    finally:
+        daemon.close()
+    assert caught.value.returncode == 1
+
+
+def test_a_socket_that_cannot_be_looked_at_is_one_line():
+    # As where the daemon runs as another user, in a directory that only that one may enter.
+    setup = load_setup(ROBOT_FILE)
+    daemon = msgspec.structs.replace(setup.config.daemon, control_socket=f"/tmp/{'x' * 300}")
+    with pytest.raises(InputError, match="cannot be looked at"):
+        check.refuse_beside_a_daemon(msgspec.structs.replace(setup.config, daemon=daemon))

@@ -1,0 +1,89 @@
+"""The e-stop with a daemon and robot.toml in trouble: each way is tried, and what is said of it is so."""
+
+from __future__ import annotations
+
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+import disco_hw
+from disco_hw.daemon.client import SERVED
+from disco_hw.daemon.control_socket import ControlServer
+from disco_hw.daemon.emergency import stop_robot
+from disco_hw.errors import InputError
+
+SHIPPED = (Path(disco_hw.__file__).parent / "robots" / "wombot.toml").read_text(encoding="utf-8")
+
+
+def robot_file(directory, socket, link='interface = "virtual"', **others):
+    text = SHIPPED.replace('interface = "unixcan"', link) + f'[daemon]\ncontrol_socket = "{socket}"\n'
+    for old, new in others.items():
+        assert old in text
+        text = text.replace(old, new)
+    path = directory / "robot.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+@pytest.fixture
+def daemon(tmp_path):
+    """Serves a control socket that takes an e-stop; its status, and what it was asked, are attributes."""
+
+    class Daemon:
+        status, asked, ending = {"ok": True, "robot_state": "READY", "link": "up"}, [], False
+
+    directory = tmp_path / "run"
+    directory.mkdir(mode=0o700)
+    Daemon.socket = directory / "control.sock"
+    server = ControlServer(Daemon.socket, SERVED)
+
+    def serve():
+        while not Daemon.ending:
+            for message in server.poll():
+                Daemon.asked.append(message.action)
+                server.reply(message, Daemon.status if message.action == "status" else {"ok": True})
+            time.sleep(0.002)
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    yield Daemon
+    Daemon.ending = True
+    thread.join()
+    server.close()
+
+
+def test_a_socket_that_cannot_be_looked_at_does_not_hide_what_became_of_the_link(tmp_path):
+    # As where a daemon runs as another user, in a directory that only that one may enter.
+    outcome = stop_robot(robot_file(tmp_path, f"/tmp/{'x' * 300}"))
+    assert outcome.link_error is None
+    assert "too long" in outcome.daemon_error
+
+
+def test_a_link_section_that_says_nothing_leaves_the_daemon(tmp_path, daemon):
+    daemon.status = {**daemon.status, "robot_state": "ESTOP"}
+    outcome = stop_robot(robot_file(tmp_path, daemon.socket, link="interface = 7"))
+    assert daemon.asked[0] == "estop"
+    assert outcome.sent
+    assert outcome.confirmed
+    assert "interface" in outcome.link_error
+
+
+def test_a_link_section_that_says_nothing_without_a_daemon_is_one_line(tmp_path):
+    with pytest.raises(InputError, match="own e-stop button, now"):
+        stop_robot(robot_file(tmp_path, tmp_path / "none", link="interface = 7"))
+
+
+def test_a_misspelt_field_of_the_link_does_not_keep_the_stop_from_it(tmp_path):
+    outcome = stop_robot(robot_file(tmp_path, tmp_path / "none", link='interface = "virtual"\nbitrat = 7'))
+    assert outcome.link_error is None
+
+
+def test_a_daemon_that_holds_the_stop_until_its_link_is_up_has_not_sent_it(tmp_path, daemon):
+    daemon.status = {**daemon.status, "link": "connecting", "robot_state": "UNKNOWN"}
+    nowhere = {"/tmp/disco-hw-wombot.can": "/nowhere/bus"}
+    outcome = stop_robot(robot_file(tmp_path, daemon.socket, link='interface = "unixcan"', **nowhere))
+    assert not outcome.sent
+    assert "NOT SENT" in outcome.as_text()
+    assert "connecting" in outcome.as_text()

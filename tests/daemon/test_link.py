@@ -1,0 +1,35 @@
+"""Settings of the link that no device could satisfy are bad input: one line with file, field and remedy."""
+
+import pytest
+
+from disco_hw.daemon.check import run_check
+from disco_hw.daemon.daemon import DaemonOptions, run_daemon
+from disco_hw.errors import InputError
+
+ROBOT = """
+[robot]
+name = "misspelt"
+wheel_radius_m = 0.06
+axial_distance_m = 0.31
+ticks_per_rev = 2048
+max_wheel_speed_rad_s = 8.0
+
+[link]
+"""
+
+
+@pytest.mark.parametrize(
+    ("link", "words"),
+    [
+        ('interface = "sockercan"', 'link.interface: python-can has no interface "sockercan"; write one of '),
+        ('interface = "slcan"\nbitrate = 123456', "link.bitrate: slcan has no 123456 bit/s; write one of "),
+    ],
+)
+@pytest.mark.parametrize("verb", [run_check, lambda robot: run_daemon(DaemonOptions(robot))], ids=["check", "run"])
+def test_what_no_device_could_satisfy_is_refused_before_anything_is_opened(tmp_path, link, words, verb):
+    robot = tmp_path / "robot.toml"
+    robot.write_text(ROBOT + link)
+    with pytest.raises(InputError) as caught:
+        verb(robot)
+    assert str(caught.value).startswith(f"{robot}: {words}")
+    assert "\n" not in str(caught.value)

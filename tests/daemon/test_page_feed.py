@@ -1,0 +1,195 @@
+"""Feed and subscriber over real sockets, the subscriber in a process of its own where it is to be broken."""
+
+import os
+import signal
+import stat
+import subprocess
+import sys
+import time
+
+import pytest
+
+from disco_hw.daemon.page_feed import ViewerFeed, WatchedRecorder, feed_path
+from disco_hw.errors import InputError
+from disco_hw.log import records
+from disco_hw.log.recorder import MemoryRecorder
+from disco_hw.viewer.subscriber import FeedSubscriber
+from tests.viewer.run import PERIOD_NS, tick_records
+
+_WATCH = """
+import sys
+from pathlib import Path
+from disco_hw.viewer.subscriber import FeedSubscriber
+subscriber = FeedSubscriber(Path(sys.argv[1]))
+got = 0
+print("ready", flush=True)
+while True:
+    batch = subscriber.receive(0.1)
+    got += len(batch)
+    print(got, subscriber.missed, flush=True)
+"""
+
+
+@pytest.fixture
+def feed(tmp_path):
+    made = ViewerFeed(tmp_path / "control.sock.view")
+    yield made
+    made.close()
+
+
+def connected(feed, *subscribers, timeout_s=10.0):
+    """Tick until every subscriber has got something; returns the next tick's number."""
+    deadline = time.monotonic() + timeout_s
+    tick, waiting = 0, set(subscribers)
+    while waiting:
+        assert time.monotonic() < deadline, "nothing came through"
+        feed.put(*tick_records(tick))
+        tick += 1
+        waiting -= {subscriber for subscriber in waiting if subscriber.receive(0.01)}
+    return tick
+
+
+def test_records_arrive_whole_and_without_frames(feed, tmp_path):
+    subscriber = FeedSubscriber(tmp_path / "control.sock.view")
+    tick = connected(feed, subscriber)
+    subscriber.receive(0.2)
+    sent = []
+    for number in range(tick, tick + 30):
+        now_ns, got = tick_records(number)
+        sent += [record for record in got if not isinstance(record, records.FrameIn | records.Plan)]
+        feed.put(now_ns, got)
+    feed.put(tick_records(tick + 60)[0], [])
+    received = []
+    deadline = time.monotonic() + 5.0
+    while len([r for _, r in received if not isinstance(r, records.Plan)]) < len(sent):
+        assert time.monotonic() < deadline
+        received += subscriber.receive(0.1)
+    subscriber.close()
+    got_records = [record for _, record in received]
+    assert [record for record in got_records if not isinstance(record, records.Plan)] == sent
+    plans = [record for record in got_records if isinstance(record, records.Plan)]
+    assert 8 <= len(plans) <= 16, "one a batch"
+    assert (subscriber.missed, subscriber.malformed, feed.refused) == (0, 0, 0)
+    times = [now_ns for now_ns, _ in received]
+    assert times == sorted(times)
+
+
+def test_nobody_looking_costs_nothing_and_keeps_nothing(feed):
+    for tick in range(500):
+        feed.put(*tick_records(tick))
+    assert feed.sent == 0
+    assert feed._pending == []
+
+
+def test_the_feed_notices_that_everybody_left(feed, tmp_path):
+    subscriber = FeedSubscriber(tmp_path / "control.sock.view")
+    tick = connected(feed, subscriber)
+    subscriber.close()
+    deadline = time.monotonic() + 5.0
+    while True:
+        assert time.monotonic() < deadline, "it goes on publishing"
+        before = feed.sent
+        for number in range(tick, tick + 10):
+            feed.put(*tick_records(number))
+        tick += 10
+        time.sleep(0.01)
+        if feed.sent == before:
+            return
+
+
+def test_a_stopped_page_holds_up_neither_the_feed_nor_another_page(feed, tmp_path):
+    path = tmp_path / "control.sock.view"
+    process = subprocess.Popen([sys.executable, "-c", _WATCH, str(path)], stdout=subprocess.PIPE, text=True)
+    other = FeedSubscriber(path)
+    try:
+        assert process.stdout.readline() == "ready\n"
+        tick = connected(feed, other)
+        while process.stdout.readline().startswith("0 "):
+            feed.put(*tick_records(tick))
+            tick += 1
+        os.kill(process.pid, signal.SIGSTOP)
+        longest_s, seen = 0.0, 0
+        for number in range(tick, tick + 12_000):
+            now_ns, got = tick_records(number)
+            begun = time.perf_counter()
+            feed.put(now_ns, got)
+            longest_s = max(longest_s, time.perf_counter() - begun)
+            if number % 20 == 0:
+                seen += len(other.receive(0.001))
+        assert longest_s < 1.0, "it waited"
+        assert feed.refused == 0
+        seen += len(other.receive(0.2))
+        assert seen > 10_000, "the other page starved"
+        os.kill(process.pid, signal.SIGCONT)
+        tick, deadline = tick + 12_000, time.monotonic() + 10.0
+        missed = 0
+        while missed == 0:
+            assert time.monotonic() < deadline, "the stopped page does not know that it missed something"
+            feed.put(*tick_records(tick))
+            tick += 5
+            missed = int(process.stdout.readline().split()[1])
+    finally:
+        other.close()
+        process.kill()
+        process.wait()
+
+
+def test_what_cannot_be_encoded_is_counted(feed, tmp_path):
+    subscriber = FeedSubscriber(tmp_path / "control.sock.view")
+    tick = connected(feed, subscriber)
+    now_ns = tick_records(tick + 50)[0]
+    feed.put(now_ns, [records.Event(now_ns, "info", "x", object())])
+    assert feed.refused == 1
+    subscriber.close()
+
+
+def test_garbage_is_counted_by_the_subscriber(tmp_path):
+    import zmq
+
+    context = zmq.Context()
+    socket = context.socket(zmq.PUB)
+    socket.bind(f"ipc://{tmp_path}/feed")
+    subscriber = FeedSubscriber(tmp_path / "feed")
+    deadline = time.monotonic() + 5.0
+    while subscriber.malformed < 3:
+        assert time.monotonic() < deadline
+        for garbage in (b"", b"\xc1", b"\x93\x01\x02\x91\x92\x63\xc0"):
+            socket.send(garbage)
+        assert subscriber.receive(0.05) == []
+    subscriber.close()
+    socket.close(0)
+    context.term()
+
+
+def test_a_page_survives_the_daemons_restart(tmp_path):
+    path = tmp_path / "feed"
+    first = ViewerFeed(path)
+    subscriber = FeedSubscriber(path)
+    connected(first, subscriber)
+    first.close()
+    second = ViewerFeed(path)
+    connected(second, subscriber)
+    subscriber.close()
+    second.close()
+    assert not path.exists()
+
+
+def test_the_socket_is_its_owners_alone(feed, tmp_path):
+    path = feed_path(tmp_path / "control.sock")
+    assert path.is_socket()
+    assert stat.S_IMODE(path.stat().st_mode) & 0o077 == 0
+
+
+def test_a_path_that_cannot_be_used_is_told_in_one_line(tmp_path):
+    with pytest.raises(InputError, match=r"shorten daemon\.control_socket"):
+        ViewerFeed(tmp_path / ("x" * 120))
+
+
+def test_the_recorder_gets_everything_first(feed):
+    memory = MemoryRecorder()
+    both = WatchedRecorder(memory, feed)
+    now_ns, got = tick_records(0)
+    both.put(now_ns, got)
+    both.put(now_ns + PERIOD_NS, got)
+    assert memory.ticks == [(now_ns, tuple(got)), (now_ns + PERIOD_NS, tuple(got))]
+    assert both.poll().ticks == both.close().ticks == 2

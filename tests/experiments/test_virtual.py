@@ -1,0 +1,62 @@
+"""The virtual robot's true parameters: the model's mean, or a draw from its belief."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import disco_hw
+from disco_hw.cli import app
+from disco_hw.errors import InputError
+from disco_hw.experiments.virtual import SimOptions, run_sim, true_parameters
+from disco_hw.runtime.robot_setup import load_setup
+
+ROBOT = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
+
+
+def test_without_a_seed_the_plant_is_the_mean():
+    plant = true_parameters(load_setup(ROBOT), None)
+    assert (plant.wheel_radius_m, plant.axial_distance_m, plant.x_icr_m) == (0.061, 0.415, 0.238)
+
+
+def test_draws_have_the_posteriors_spread_parameter_by_parameter():
+    setup = load_setup(ROBOT)
+    plants = [true_parameters(setup, seed) for seed in range(400)]
+    drawn = np.array([(p.wheel_radius_m, p.axial_distance_m, p.x_icr_m) for p in plants])
+    assert drawn.mean(0) == pytest.approx((0.061, 0.415, 0.238), abs=0.003)
+    assert drawn.std(0) == pytest.approx((0.01225, 0.00949, 0.0114), rel=0.15)
+
+
+@pytest.mark.parametrize(
+    ("hide", "words"),
+    [("turn_slp=0.1", "turn_slp"), ("turn_slip", "no value"), ("turn_slip=much", "not a number")],
+)
+def test_a_mistake_in_what_to_hide_is_named(hide, words):
+    with pytest.raises(InputError, match=words):
+        run_sim(SimOptions(ROBOT, hide=(hide,)))
+
+
+def test_a_fractional_encoder_is_refused(tmp_path):
+    path = tmp_path / "robot.toml"
+    text = ROBOT.read_text().replace("ticks_per_rev = 2048", "ticks_per_rev = 2796.8")
+    path.write_text(text.replace("wombot_model.toml", str(ROBOT.parent / "wombot_model.toml")))
+    with pytest.raises(InputError, match="whole number"):
+        run_sim(SimOptions(path))
+    # Checked before the encoder, so that this ends even where the start is not looked at.
+    with pytest.raises(InputError, match=r"--start: nan 0\.0 0\.0 is no place"):
+        run_sim(SimOptions(path, start=(float("nan"), 0.0, 0.0)))
+
+
+@pytest.mark.parametrize("what", ["effects", "faults"])
+def test_what_can_be_hidden_or_go_wrong_is_listed_without_a_robot(what):
+    result = CliRunner().invoke(app, ["sim", f"--list-{what}"])
+    assert result.exit_code == 0
+    assert {"effects": "motor_lag", "faults": "bus_off"}[what] in result.output
+
+
+def test_a_robot_is_needed_to_run():
+    with pytest.raises(InputError, match=r"no ROBOT\.toml given; name one"):
+        CliRunner().invoke(app, ["sim"], catch_exceptions=False)

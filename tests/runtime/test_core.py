@@ -1,0 +1,222 @@
+"""The daemon's tick in simulated time against the virtual robot: from handshake to circle, and through trouble."""
+
+from __future__ import annotations
+
+from pathlib import Path as FilePath
+
+import msgspec
+import numpy as np
+import pytest
+
+import disco_hw
+from disco_hw.config import CircleTask
+from disco_hw.control import NoValidControl
+from disco_hw.experiments.metrics import Path, circle_figures
+from disco_hw.log import records
+from disco_hw.runtime.assembly import make_planner
+from disco_hw.runtime.pipeline import NoPlanner, Source
+from disco_hw.runtime.robot_setup import load_setup
+from disco_hw.runtime.states import State
+from disco_hw.runtime.supervisor import UserRequest
+from firmware_protocol.firmware_core import FirmwareConfig
+from sim.effects import hidden_effects
+from sim.plant import Plant
+from sim.plant_parameters import PlantParameters
+from sim.virtual_robot import VirtualRobot
+from tests.runtime.simulated import START, simulated_stack
+
+ROBOT = FilePath(disco_hw.__file__).parent / "robots" / "wombot.toml"
+
+
+@pytest.fixture(scope="module")
+def lap():
+    """One lap of the circle, and the stop after it."""
+    stack = simulated_stack()
+    stack.run(1.5)
+    stack.run(0.5, UserRequest.ARM)
+    rows = []
+    stack.run(0.02, UserRequest.START)
+    while stack.core.progress.laps < 1.0 and stack.now_us < 60_000_000:
+        stack.run(0.02)
+        truth = stack.robot.truth
+        rows.append((stack.now_us * 1e-6, truth.x_m, truth.y_m, truth.yaw_rad, truth.speed_m_s))
+    stopping = stack.run(1.5, UserRequest.DISARM)
+    return stack, Path(*np.array(rows).T), stopping
+
+
+def test_the_circle_is_followed_in_simulated_time(lap):
+    _, path, _ = lap
+    figures = circle_figures(path, CircleTask())
+    assert figures.laps > 0.9
+    assert figures.settled_rms_distance_m < 0.05
+
+
+def test_the_stop_ends_in_ready_with_still_wheels(lap):
+    stack, _, stopping = lap
+    assert stopping[-1].output.state is State.READY
+    assert stack.robot.truth.left_speed_rad_s == pytest.approx(0.0, abs=0.05)
+    assert stack.robot.outputs.state in {"STANDBY", "READY"}
+
+
+def test_everything_is_recorded(lap):
+    stack, _, _ = lap
+    kinds = {type(record) for _, tick in stack.recorder.ticks for record in tick}
+    assert {
+        records.FrameIn, records.FrameOut, records.Estimate, records.Innovation, records.Plan, records.Command,
+        records.Event,
+    } <= kinds  # fmt: skip
+    commands = [record for _, tick in stack.recorder.ticks for record in tick if isinstance(record, records.Command)]
+    assert len(commands) == len(stack.recorder.ticks)
+    driven = [command for command in commands if command.in_force and command.source == "plan"]
+    assert len(driven) > 500
+    assert all(abs(command.left_rad_s) <= 8.0 and abs(command.right_rad_s) <= 8.0 for command in driven)
+
+
+def test_no_command_frame_leaves_before_arming():
+    stack = simulated_stack()
+    stack.run(2.0)
+    assert stack.core.last.output.state is State.READY
+    sent = [r for _, tick in stack.recorder.ticks for r in tick if isinstance(r, records.FrameOut)]
+    assert sent
+    assert not [frame for frame in sent if frame.can_id == 0x100]
+
+
+def test_a_lost_link_voids_the_session_and_nothing_rearms():
+    stack = simulated_stack()
+    stack.run(1.5)
+    stack.run(0.5, UserRequest.ARM)
+    stack.run(2.0, UserRequest.START)
+    session = stack.robot.outputs.session
+    assert abs(stack.robot.truth.right_speed_rad_s) > 1.0
+    stack.robot_end.plug(False)
+    ticks = stack.run(1.5)
+    assert ticks[-1].output.state is State.DISCONNECTED
+    assert abs(stack.robot.truth.right_speed_rad_s) < 0.05
+    stack.robot_end.plug(True)
+    ticks = stack.run(3.0)
+    assert ticks[-1].output.state is State.READY
+    assert all(tick.command is None for tick in ticks)
+    assert abs(stack.robot.truth.right_speed_rad_s) < 0.05
+    stack.run(0.5, UserRequest.ARM)
+    assert stack.core.last.output.state is State.ARMED
+    assert stack.robot.outputs.session != session
+
+
+def exchanged(stack, **firmware):
+    """Put another controller, that starts now, in the robot's place; the link stays up."""
+    since_us, plant = stack.now_us, Plant(PlantParameters(), hidden_effects({}), 1, START)
+    robot = VirtualRobot(plant, FirmwareConfig(**{"ticks_per_rev": 2048, "max_wheel_speed_rad_s": 8.0, **firmware}))
+
+    class Robot:
+        def receive(self, now_us, frame):
+            robot.receive(now_us - since_us, frame)
+
+        def step(self, now_us):
+            return robot.step(now_us - since_us)
+
+    stack.robot = Robot()
+
+
+@pytest.mark.parametrize("limits", [{"max_wheel_speed_rad_s": 4.0}, {"ticks_per_rev": 1024}])
+def test_a_controller_exchanged_on_a_living_link_is_judged_anew(limits):
+    stack = simulated_stack(NoPlanner(), needs_pose=False)
+    assert stack.run(1.5)[-1].output.state is State.READY
+    exchanged(stack, **limits)
+    last = stack.run(3.0)[-1].output
+    assert last.state is State.FAULT, last.detail
+    assert next(iter(limits)) in last.detail
+    assert not any(reply.accepted for tick in stack.run(0.1, UserRequest.ARM) for reply in tick.replies)
+    # The one that fits is taken again, once a person has reset.
+    exchanged(stack)
+    stack.run(3.0)
+    stack.run(0.1, UserRequest.RESET)
+    assert stack.run(3.0)[-1].output.state is State.READY
+
+
+@pytest.mark.parametrize("lost", ["link", "robot"])
+def test_what_a_robot_said_that_is_not_heard_any_more_is_not_its_state(lost):
+    stack = simulated_stack(NoPlanner(), needs_pose=False)
+    stack.run(1.5)
+    stack.run(0.5, UserRequest.ESTOP)
+    assert stack.core.robot_status.state == "ESTOP"
+    if lost == "link":
+        stack.robot_end.plug(False)
+    else:
+        stack.robot.step = lambda _now_us: ()
+    stack.run(1.0)
+    assert stack.core.robot_status is None
+
+
+class Moody:
+    """A planner that drives straight until it gives up."""
+
+    def __init__(self, inner, last_ns: int) -> None:
+        self.inner, self.last_ns = inner, last_ns
+
+    def plan(self, now_ns, state):
+        if now_ns > self.last_ns:
+            raise NoValidControl("planted")
+        return self.inner.plan(now_ns, state)
+
+    def reset(self) -> None:
+        self.inner.reset()
+
+
+def test_a_planner_that_gives_up_is_followed_on_its_tail_then_the_wheels_ramp_down():
+    setup = load_setup(ROBOT)
+    stack = simulated_stack(Moody(make_planner(setup.config, setup.model), 4_000_000_000))
+    stack.run(1.5)
+    stack.run(0.5, UserRequest.ARM)
+    ticks = stack.run(4.0, UserRequest.START)
+    sources = [tick.pipeline.source for tick in ticks]
+    tail = [k for k, source in enumerate(sources) if source is Source.TAIL]
+    assert len(tail) == 10
+    assert sources[tail[0] - 1] is Source.PLAN
+    assert set(sources[tail[-1] + 1 :]) == {Source.RAMP}
+    assert ticks[-1].pipeline.command.left_rad_s == 0.0
+    assert ticks[-1].output.state is State.ARMED
+    told = [text for tick in ticks for text in tick.events if text.startswith("planner")]
+    assert told == ["planner: planted"]
+
+
+class Collapsing:
+    """A planner whose plans between two times hang on one sample, as they say."""
+
+    def __init__(self, inner, first_ns: int, last_ns: int) -> None:
+        self.inner, self.first_ns, self.last_ns = inner, first_ns, last_ns
+
+    def plan(self, now_ns, state):
+        plan = self.inner.plan(now_ns, state)
+        if not self.first_ns <= now_ns <= self.last_ns:
+            return plan
+        few = msgspec.structs.replace(plan.diagnostics, ess=1.2, collapsed=True)
+        return msgspec.structs.replace(plan, diagnostics=few)
+
+    def reset(self) -> None:
+        self.inner.reset()
+
+
+def test_plans_that_hang_on_too_few_samples_are_told_once():
+    setup = load_setup(ROBOT)
+    stack = simulated_stack(Collapsing(make_planner(setup.config, setup.model), 2_500_000_000, 3_000_000_000))
+    stack.run(1.5)
+    stack.run(0.5, UserRequest.ARM)
+    ticks = stack.run(2.0, UserRequest.START)
+    told = [text for tick in ticks for text in tick.events if text.startswith("planner")]
+    assert told == [
+        "planner: plans hang on 1.2 effective samples, too few to be trusted",
+        "planner: enough effective samples again",
+    ]
+
+
+def test_runs_with_one_seed_are_equal_bit_for_bit():
+    def commands():
+        stack = simulated_stack(seed=3)
+        stack.run(1.5)
+        stack.run(0.5, UserRequest.ARM)
+        ticks = stack.run(1.0, UserRequest.START)
+        return [(tick.pipeline.command.left_rad_s, tick.pipeline.command.right_rad_s) for tick in ticks]
+
+    first = commands()
+    assert any(left != 0.0 for left, _ in first)
+    assert first == commands()

@@ -1,0 +1,38 @@
+"""The joint-sampling form of the control law, asked for in robot.toml, drives the circle in simulated time."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from disco_hw.runtime.assembly import make_planner
+from disco_hw.runtime.replay import replay
+from disco_hw.runtime.robot_setup import load_setup
+from disco_hw.runtime.supervisor import UserRequest
+from tests.runtime.simulated import ROBOT_FILE, simulated_stack
+from tests.runtime.test_path_drive import write_log
+
+# A kernel to compile; tests/control/test_disco.py drives with joint sampling in every `make test`.
+pytestmark = pytest.mark.long
+
+
+def test_robot_toml_asks_for_joint_sampling_and_it_drives_and_replays(tmp_path):
+    robot_file = tmp_path / "robot.toml"
+    text = ROBOT_FILE.read_text().replace("[control]\n", '[control]\nuncertainty = "joint"\n')
+    robot_file.write_text(text.replace('"wombot_model.toml"', f'"{ROBOT_FILE.parent / "wombot_model.toml"}"'))
+    setup = load_setup(robot_file)
+    planner = make_planner(setup.config, setup.model)
+    assert planner.settings.uncertainty == "joint"
+    stack = simulated_stack(planner, robot_file=robot_file)
+    stack.run(1.5)
+    stack.run(0.5, UserRequest.ARM)
+    stack.run(0.02, UserRequest.START)
+    off_m = []
+    for _ in range(150):
+        stack.run(0.1)
+        truth = stack.robot.truth
+        off_m.append(np.hypot(truth.x_m, truth.y_m) - 0.75)
+    assert np.abs(off_m[50:]).max() < 0.06
+    assert stack.core.progress.laps > 0.4
+    report = replay(write_log(tmp_path / "run.mcap", setup, stack.recorder.ticks))
+    assert report.ok, report.as_text()

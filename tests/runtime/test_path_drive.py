@@ -1,0 +1,130 @@
+"""A path as the robot's task in simulated time: followed, recorded, replayed and shown without its file."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from disco_hw.config import PathTask
+from disco_hw.course import course_of
+from disco_hw.daemon.loop import LoopStats
+from disco_hw.daemon.status import loop_figures, status
+from disco_hw.log.link import Attachment
+from disco_hw.log.recorder import ProcessRecorder, RecorderStats
+from disco_hw.log.recorder import Recording as Begin
+from disco_hw.runtime.log_setup import kept_files
+from disco_hw.runtime.pipeline import Source
+from disco_hw.runtime.replay import replay
+from disco_hw.runtime.robot_setup import load_setup
+from disco_hw.runtime.states import State
+from disco_hw.runtime.supervisor import UserRequest
+from disco_hw.viewer.commands import snapshot_log
+from disco_hw.viewer.recording import Recording
+from sim.body_dynamics import Pose
+from tests.runtime.path_robot import path_robot
+from tests.runtime.simulated import simulated_stack
+
+CORNER = "x_m,y_m\n0,0\n1.2,0\n1.2,0.8\n"
+
+
+def write_log(path, setup, ticks):
+    begin = Begin(path, "wombot", attachments=tuple(kept_files(setup)), queue_ticks=100_000)
+    recorder = ProcessRecorder(begin)
+    for now_ns, got in ticks:
+        recorder.put(now_ns, got)
+    stats = recorder.close(30.0)
+    assert (stats.dropped_ticks, stats.refused) == (0, 0)
+    return path
+
+
+def started(robot_file):
+    setup = load_setup(robot_file)
+    stack = simulated_stack(robot_file=robot_file, start=Pose(*course_of(setup.config.task).start))
+    stack.run(1.5)
+    stack.run(0.5, UserRequest.ARM)
+    stack.run(0.02, UserRequest.START)
+    return setup, stack
+
+
+def drive(stack, done, limit_s=60.0):
+    """True positions (N, 2) and speeds (N,) until it is done."""
+    rows = []
+    end_us = stack.now_us + round(limit_s * 1e6)
+    while not done() and stack.now_us < end_us:
+        stack.run(0.02)
+        truth = stack.robot.truth
+        rows.append((truth.x_m, truth.y_m, truth.speed_m_s))
+    rows = np.array(rows)
+    return rows[:, :2], rows[:, 2]
+
+
+def test_the_shipped_eight_is_followed_once_round(tmp_path):
+    setup, stack = started(path_robot(tmp_path))
+    places, speeds = drive(stack, lambda: stack.core.progress.laps >= 1.0)
+    assert stack.core.progress.laps >= 1.0
+    off_m = course_of(setup.config.task).off_m(places)
+    assert np.sqrt(np.mean(off_m[100:] ** 2)) < 0.05
+    assert np.abs(off_m).max() < 0.15
+    assert speeds[100:].mean() == pytest.approx(0.3, abs=0.05)
+
+
+def test_an_open_path_ends_with_the_robot_standing_and_is_replayed_and_shown_without_its_file(tmp_path):
+    robot_file = path_robot(tmp_path, CORNER)
+    setup, stack = started(robot_file)
+    places, _ = drive(stack, lambda: not stack.core.last.output.running, 20.0)
+    stack.run(0.5)
+    told = [text for _, tick in stack.recorder.ticks for text in (getattr(r, "text", "") for r in tick)]
+    assert "task stopped: the path's end is reached" in told
+    assert stack.core.last.output.state is State.ARMED
+    assert stack.core.last.pipeline.source is Source.HOLD
+    assert abs(stack.robot.truth.left_speed_rad_s) < 0.05
+    assert np.hypot(*(places[-1] - (1.2, 0.8))) < 0.12
+    assert np.abs(course_of(setup.config.task).off_m(places)).max() < 0.12
+    shown = status(stack.core, loop_figures(LoopStats()), RecorderStats())["task"]
+    assert shown["laps"] == pytest.approx(1.0, abs=0.03)
+    assert shown["length_m"] == pytest.approx(2.0)
+    assert "points" not in shown["asked"]
+    log = write_log(tmp_path / "run.mcap", setup, stack.recorder.ticks)
+    (tmp_path / "path.csv").unlink()
+    robot_file.unlink()
+    report = replay(log)
+    assert report.ok, report.as_text()
+    with Recording(log) as recording:
+        task = recording.stage.task_at(recording.at(3.0).task)
+        assert isinstance(task, PathTask)
+        assert task.points == ((0.0, 0.0), (1.2, 0.0), (1.2, 0.8))
+    snapshot_log(log, tmp_path / "end.png")
+    assert (tmp_path / "end.png").stat().st_size > 10_000
+
+
+def test_another_speed_is_recorded_and_replayed(tmp_path):
+    robot_file = path_robot(tmp_path, CORNER)
+    setup = load_setup(robot_file)
+    stack = simulated_stack(robot_file=robot_file, start=Pose(0.0, 0.0, 0.0))
+    stack.run(1.5)
+    stack.core.set_task(PathTask(path="path.csv", speed_m_s=0.15, points=setup.config.task.points))
+    stack.run(0.5, UserRequest.ARM)
+    stack.run(3.0, UserRequest.START)
+    assert stack.robot.truth.speed_m_s == pytest.approx(0.15, abs=0.04)
+    log = write_log(tmp_path / "run.mcap", setup, stack.recorder.ticks)
+    report = replay(log)
+    assert report.ok, report.as_text()
+    with Recording(log) as recording:
+        assert recording.stage.task.speed_m_s == 0.3
+        assert recording.stage.task_at(recording.at(3.0).task).speed_m_s == 0.15
+
+
+def test_other_way_points_give_other_plans(tmp_path):
+    setup, stack = started(path_robot(tmp_path, CORNER))
+    stack.run(1.0)
+    files = [
+        Attachment("path.csv", "text/csv", CORNER.replace("1.2,0\n", "1.2,0.3\n").encode())
+        if a.name == "path.csv"
+        else a
+        for a in kept_files(setup)
+    ]
+    recorder = ProcessRecorder(Begin(tmp_path / "run.mcap", "w", attachments=tuple(files), queue_ticks=10_000))
+    for now_ns, got in stack.recorder.ticks:
+        recorder.put(now_ns, got)
+    recorder.close(30.0)
+    assert not replay(tmp_path / "run.mcap").ok

@@ -1,0 +1,141 @@
+"""One tick: who asks for the wheel speeds, what the governor makes of it, and what the planner is told."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from disco_hw.config import Estimation
+from disco_hw.control import NoValidControl
+from disco_hw.estimation import OdometryParameters, PoseFusion
+from disco_hw.runtime.governor import Governor, Limited, WheelLimits
+from disco_hw.runtime.pipeline import FollowTask, Manual, Off, Pipeline, Source, Stand
+from drivers.types import PoseSample, Readings, WheelSample
+
+PERIOD_NS = 20_000_000
+
+
+class StraightPlan:
+    """A plan of one speed for both wheels."""
+
+    def __init__(self, t0_ns: int, speed: float) -> None:
+        self.t0_ns, self.speed = t0_ns, speed
+
+    def at(self, t_ns: int) -> tuple[float, float]:
+        return self.speed, self.speed
+
+
+class Scripted:
+    """A planner whose plans are given: a speed, or None for no valid control."""
+
+    def __init__(self, *speeds: float | None) -> None:
+        self.speeds = list(speeds)
+        self.states = []
+        self.resets = 0
+
+    def plan(self, now_ns, state):
+        self.states.append(state)
+        speed = self.speeds.pop(0) if self.speeds else None
+        if speed is None:
+            raise NoValidControl("nothing left")
+        return StraightPlan(now_ns, speed)
+
+    def reset(self) -> None:
+        self.resets += 1
+
+
+def make(planner, plan_tail_s: float = 0.06) -> Pipeline:
+    fusion = PoseFusion(Estimation(), OdometryParameters(0.06, 0.4, 0.0), 0.05)
+    return Pipeline(fusion, planner, Governor(WheelLimits(8.0, 20.0, 20.0), 0.02), plan_tail_s)
+
+
+def run(pipeline: Pipeline, motions, start: int = 0):
+    return [pipeline.step((start + k) * PERIOD_NS, Readings(), motion) for k, motion in enumerate(motions)]
+
+
+def test_standing_and_off_ask_for_zero():
+    ticks = run(make(Scripted()), [Off(), Stand()])
+    assert [tick.source for tick in ticks] == [Source.OFF, Source.HOLD]
+    assert all(tick.requested == (0.0, 0.0) for tick in ticks)
+    assert all(tick.plan is None for tick in ticks)
+
+
+def test_a_plan_is_followed_within_the_acceleration_limit():
+    ticks = run(make(Scripted(2.0, 2.0, 2.0)), [Off(), FollowTask(), FollowTask()])
+    assert ticks[1].source is Source.PLAN
+    assert ticks[1].requested == (2.0, 2.0)
+    assert ticks[1].command.left_rad_s == pytest.approx(0.4)
+    assert ticks[2].command.left_rad_s == pytest.approx(0.8)
+    assert Limited.ACCELERATION in ticks[2].command.limited
+
+
+def test_a_missing_plan_is_followed_on_its_tail_then_the_wheels_ramp_to_zero():
+    ticks = run(make(Scripted(0.4), plan_tail_s=0.06), [Off(), *[FollowTask()] * 6])
+    assert [tick.source for tick in ticks[1:]] == [Source.PLAN, *[Source.TAIL] * 3, *[Source.RAMP] * 2]
+    assert ticks[4].requested == (0.4, 0.4)
+    assert ticks[5].requested == (0.0, 0.0)
+    assert ticks[2].planner_failure == "nothing left"
+    assert ticks[3].plan_age_ns == 2 * PERIOD_NS
+
+
+def test_a_planner_that_never_found_anything_moves_nothing():
+    ticks = run(make(Scripted()), [Off(), *[FollowTask()] * 3])
+    assert {tick.source for tick in ticks[1:]} == {Source.RAMP}
+    assert all(tick.command.left_rad_s == 0.0 for tick in ticks)
+
+
+def test_the_planner_starts_anew_after_every_pause():
+    planner = Scripted(*[1.0] * 10)
+    run(make(planner), [Off(), FollowTask(), FollowTask(), Stand(), FollowTask()])
+    assert planner.resets == 2
+
+
+def test_an_old_plan_does_not_outlive_a_pause():
+    planner = Scripted(1.0)
+    ticks = run(make(planner), [Off(), FollowTask(), Stand(), FollowTask()])
+    assert ticks[3].source is Source.RAMP
+
+
+def test_manual_speeds_pass_the_governor_too():
+    ticks = run(make(Scripted()), [Off(), Manual(100.0, -50.0), Manual(float("nan"), 0.0)])
+    assert ticks[1].source is Source.MANUAL
+    assert Limited.SPEED in ticks[1].command.limited
+    assert abs(ticks[1].command.left_rad_s) <= 0.4 + 1e-12
+    assert Limited.NOT_FINITE in ticks[2].command.limited
+
+
+def test_off_forgets_the_last_command():
+    pipeline = make(Scripted(*[3.0] * 10))
+    ticks = run(pipeline, [Off(), *[FollowTask()] * 5, Off(), FollowTask()])
+    assert ticks[5].command.left_rad_s == pytest.approx(2.0)
+    assert ticks[6].command.left_rad_s == 0.0
+    assert ticks[7].command.left_rad_s == pytest.approx(0.4)
+
+
+def test_the_planner_sees_the_estimate_and_the_commands_sent():
+    planner = Scripted(*[1.0] * 3)
+    pipeline = make(planner)
+    for k in range(6):
+        now_ns = k * PERIOD_NS
+        wheels = WheelSample(now_ns, now_ns, 0.1 * k, 0.2 * k, 5.0, 10.0)
+        pose = PoseSample(now_ns, now_ns, 1.0, 2.0, 0.5, 0.005, 0.01)
+        pipeline.step(now_ns, Readings(wheels=(wheels,), poses=(pose,)), FollowTask() if k > 2 else Stand())
+    state = planner.states[-1]
+    assert (state.x_m, state.y_m) == pytest.approx((1.0, 2.0), abs=0.05)
+    assert (state.left_speed_rad_s, state.right_speed_rad_s) == (5.0, 10.0)
+    assert [sent.t_ns for sent in state.sent] == [k * PERIOD_NS for k in range(5)]
+    assert state.sent[-1].left_rad_s == pytest.approx(0.8)
+
+
+def test_the_history_of_commands_is_bounded_to_two_seconds():
+    planner = Scripted(*[0.0] * 300)
+    run(make(planner), [Off(), *[FollowTask()] * 250])
+    sent = planner.states[-1].sent
+    assert sent[0].t_ns >= planner.states[-1].t_ns - 2_000_000_000 - PERIOD_NS
+    assert np.all(np.diff([command.t_ns for command in sent]) == PERIOD_NS)
+
+
+def test_stages_are_marked_in_order():
+    marked = []
+    make(Scripted()).step(0, Readings(), Off(), marked.append)
+    assert marked == ["estimate", "plan"]

@@ -1,0 +1,170 @@
+import msgspec
+import pytest
+
+from disco_hw.config import CircleTask, Control, Link, PathTask, Robot
+from disco_hw.runtime.preflight import (
+    Check,
+    Level,
+    check_command_timing,
+    check_firmware_limits,
+    check_link_load,
+    check_realtime,
+    check_round_trip,
+    check_task,
+    failures,
+)
+from disco_hw.runtime.task_change import fastest_m_s
+from drivers.types import Capabilities
+from firmware_protocol.dbc import packaged_dbc
+
+DBC = packaged_dbc()
+
+
+def robot(**changes):
+    values = {"name": "wombot", "wheel_radius_m": 0.06, "axial_distance_m": 0.31, "ticks_per_rev": 2048}
+    return Robot(**{**values, "max_wheel_speed_rad_s": 8.0, **changes})
+
+
+def capabilities(**changes):
+    values = {
+        "protocol_major": 1,
+        "protocol_minor": 0,
+        "firmware_version": "1.0.0",
+        "dbc_hash": 1,
+        "board_id": 1,
+        "max_wheel_speed_rad_s": 8.0,
+        "max_wheel_acceleration_rad_s2": 20.0,
+        "ticks_per_rev": 2048,
+        "command_timeout_s": 0.1,
+        "drive_off_timeout_s": 0.5,
+        "stop_deceleration_rad_s2": 20.0,
+    }
+    return Capabilities(**{**values, **changes})
+
+
+@pytest.mark.parametrize(
+    ("link", "level"),
+    [
+        (Link(kind="can", bitrate=500_000), Level.OK),
+        (Link(kind="can", bitrate=100_000), Level.WARNING),
+        (Link(kind="can", bitrate=50_000), Level.FAIL),
+        (Link(kind="serial", baud=921_600), Level.OK),
+        (Link(kind="serial", baud=76_800), Level.WARNING),
+        (Link(kind="serial", baud=38_400), Level.FAIL),
+    ],
+)
+def test_link_load_is_judged_by_its_budget(link, level):
+    check = check_link_load(link, Control(), DBC)
+    assert check.level is level
+    assert "%" in check.text
+    if level is not Level.OK:
+        assert f"link.{'bitrate' if link.kind == 'can' else 'baud'}" in check.text
+
+
+def test_link_load_counts_the_control_rate():
+    slow, fast = (check_link_load(Link(), Control(rate_hz=rate_hz), DBC).text for rate_hz in (20.0, 100.0))
+    assert float(fast.split("%")[0]) == pytest.approx(float(slow.split("%")[0]) + 80 * 135 / 5000, abs=0.15)
+
+
+def test_limits_within_the_firmwares_are_ok():
+    (check,) = check_firmware_limits(robot(), capabilities())
+    assert check.level is Level.OK
+    assert "8" in check.text
+
+
+@pytest.mark.parametrize(
+    ("changes", "field"),
+    [
+        ({"max_wheel_speed_rad_s": 8.1}, "robot.max_wheel_speed_rad_s"),
+        ({"max_wheel_acceleration_rad_s2": 20.1}, "robot.max_wheel_acceleration_rad_s2"),
+        ({"ticks_per_rev": 2000}, "robot.ticks_per_rev"),
+    ],
+)
+def test_limits_beyond_the_firmwares_fail_and_name_the_field(changes, field):
+    (check,) = check_firmware_limits(robot(**changes), capabilities())
+    assert check.level is Level.FAIL
+    assert field in check.text
+
+
+def test_each_difference_is_a_check_of_its_own():
+    checks = check_firmware_limits(robot(max_wheel_speed_rad_s=9.0, ticks_per_rev=1), capabilities())
+    assert len(failures(checks)) == 2
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "valid_for_s", "timeout_s", "level", "words"),
+    [
+        (50.0, 0.1, 0.1, Level.OK, "3 in a row"),
+        (100.0, 0.1, 0.1, Level.OK, "8 in a row"),
+        (50.0, 0.1, 0.08, Level.OK, "2 in a row"),
+        (100.0, 0.1, 0.07, Level.OK, "5 in a row"),
+        (50.0, 0.06, 0.1, Level.WARNING, "only 1"),
+        (20.0, 0.1, 0.1, Level.WARNING, "not one"),
+        (20.0, 0.1, 0.05, Level.FAIL, "between two commands"),
+        (20.0, 0.1, 0.02, Level.FAIL, "between two commands"),
+    ],
+)
+def test_command_timing_counts_what_may_be_lost(rate_hz, valid_for_s, timeout_s, level, words):
+    control = Control(rate_hz=rate_hz, command_valid_for_s=valid_for_s)
+    check = check_command_timing(control, capabilities(command_timeout_s=timeout_s))
+    assert check.level is level
+    assert words in check.text
+
+
+@pytest.mark.parametrize("rate_hz", [20.0, 30.0, 50.0, 100.0])
+@pytest.mark.parametrize("timeout_s", [0.06, 0.08, 0.1])
+def test_command_timing_agrees_with_a_count_of_periods(rate_hz, timeout_s):
+    spare = 0
+    while (spare + 2) / rate_hz < timeout_s - 1e-9:
+        spare += 1
+    check = check_command_timing(Control(rate_hz=rate_hz), capabilities(command_timeout_s=timeout_s))
+    if 1 / rate_hz < timeout_s:
+        assert ("not one" if spare == 0 else str(spare)) in check.text.split("Hz")[1]
+
+
+def test_realtime_says_what_is_allowed_and_the_remedy_for_what_is_not():
+    assert {check.level for check in check_realtime(80, True, True, 4)} == {Level.OK}
+    checks = check_realtime(80, False, False, 1)
+    assert [check.level for check in checks] == [Level.WARNING] * 3
+    assert "LimitRTPRIO" in checks[0].text
+    assert "LimitMEMLOCK" in checks[1].text
+    assert "realtime_priority is 0" in check_realtime(0, True, True, 4)[0].text
+
+
+@pytest.mark.parametrize(
+    ("round_trips_s", "level"),
+    [
+        ([0.001, 0.002, 0.003], Level.OK),
+        ([0.001, 0.0099], Level.OK),
+        ([0.001, 0.011], Level.WARNING),
+        ([0.001, 0.020], Level.FAIL),
+        ([], Level.FAIL),
+    ],
+)
+def test_round_trips_are_judged_by_the_control_period(round_trips_s, level):
+    assert check_round_trip(round_trips_s, 0.02).level is level
+
+
+def test_round_trip_gives_median_and_worst():
+    text = check_round_trip([0.001, 0.002, 0.006], 0.02).text
+    assert "median 2.00 ms" in text
+    assert "worst 6.00 ms of 3" in text
+
+
+def test_only_failures_keep_the_robot_from_being_armed():
+    checks = [Check("a", Level.OK, "fine"), Check("b", Level.WARNING, "hm"), Check("c", Level.FAIL, "no")]
+    assert failures(checks) == ("no",)
+
+
+@pytest.mark.parametrize(
+    "task", [CircleTask(speed_m_s=0.3), PathTask(path="p.csv", speed_m_s=0.7, points=((0, 0), (1, 0)))]
+)
+def test_a_task_that_is_too_fast_for_the_wheels_fails(task):
+    slow = msgspec.structs.replace(task, speed_m_s=0.1)
+    assert check_task(robot(), slow).level is Level.OK
+    fastest = fastest_m_s(robot(), task)
+    assert check_task(robot(), msgspec.structs.replace(task, speed_m_s=fastest)).level is Level.OK
+    found = check_task(robot(), msgspec.structs.replace(task, speed_m_s=1.01 * fastest))
+    assert found.level is Level.FAIL
+    assert found.text.startswith("task.speed_m_s: ")
+    assert "at most" in found.text

@@ -1,0 +1,43 @@
+"""Logs of an earlier build are still read, and give the estimates, plans and commands that they gave then.
+
+Where one does not on purpose, `python -m tools.reference_logs` writes them anew.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from disco_hw.estimation import filter  # noqa: A004 - the module's name
+from disco_hw.estimation.odometry import arc
+from disco_hw.runtime.replay import replay
+
+LOGS = Path(__file__).parent / "reference_logs"
+# Another processor rounds sums otherwise: with the plainest instructions there are, everything stayed within 1e-5.
+TOLERANCE = 1e-4
+
+
+@pytest.mark.parametrize(
+    ("name", "ticks", "values"), [("circle", 255, 7500), ("adapted", 240, 7200), ("drive", 225, 4900)]
+)
+def test_a_reference_log_gives_what_it_gave(name, ticks, values):
+    report = replay(LOGS / f"{name}.mcap", TOLERANCE)
+    assert report.ok, report.as_text()
+    assert report.ticks == ticks
+    assert report.values > values
+
+
+def test_a_changed_build_is_told_by_tick_and_field(monkeypatch):
+    def longer(parameters, left_rad, right_rad):
+        return arc(parameters, 1.001 * left_rad, right_rad)
+
+    monkeypatch.setattr(filter, "arc", longer)
+    report = replay(LOGS / "drive.mcap", TOLERANCE)
+    assert report.difference.field.startswith(("Estimate.", "Innovation."))
+    # The hand takes hold at 1 s.
+    assert 50 < report.difference.tick < 110
+
+
+def test_reference_logs_are_small():
+    assert 0 < sum(path.stat().st_size for path in LOGS.glob("*.mcap")) < 1_000_000

@@ -1,0 +1,107 @@
+"""A log replays bit for bit, and a changed robot shows at the first tick and field that differ."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+import disco_hw
+from disco_hw.errors import InputError
+from disco_hw.log.link import Attachment
+from disco_hw.log.provenance import MODEL_TOML, ROBOT_TOML
+from disco_hw.log.recorder import ProcessRecorder, Recording
+from disco_hw.runtime.replay import replay
+from disco_hw.runtime.supervisor import UserRequest
+from tests.runtime.simulated import simulated_stack
+
+ROBOTS = Path(disco_hw.__file__).parent / "robots"
+
+
+@pytest.fixture(scope="module")
+def ticks():
+    """What the daemon records of a start, two seconds of driving and a stop."""
+    stack = simulated_stack()
+    stack.run(1.5)
+    stack.run(0.5, UserRequest.ARM)
+    stack.run(2.0, UserRequest.START)
+    stack.run(1.0, UserRequest.DISARM)
+    return stack.recorder.ticks
+
+
+def write_log(path: Path, ticks, robot: str | None = None, model: str | None = None) -> Path:
+    robot = robot or (ROBOTS / "wombot.toml").read_text()
+    model = model or (ROBOTS / "wombot_model.toml").read_text()
+    attachments = (
+        Attachment(ROBOT_TOML, "application/toml", robot.encode()),
+        Attachment(MODEL_TOML, "application/toml", model.encode()),
+    )
+    recorder = ProcessRecorder(Recording(path, "wombot", attachments=attachments, queue_ticks=100_000))
+    for now_ns, records in ticks:
+        recorder.put(now_ns, records)
+    stats = recorder.close(30.0)
+    assert stats.dropped_ticks == 0
+    assert stats.refused == 0
+    return path
+
+
+def test_the_same_robot_gives_the_same_bits(tmp_path, ticks):
+    report = replay(write_log(tmp_path / "run.mcap", ticks))
+    assert report.ok, report.as_text()
+    assert report.ticks == len(ticks)
+    assert report.values > 5000
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "field"),
+    [
+        ("model", "wheel_radius_m = 0.061", "wheel_radius_m = 0.0611", "Plan."),
+        ("robot", "rate_hz = 50.0", "rate_hz = 50.0\nseed = 2", "Plan."),
+        ("robot", "max_wheel_acceleration_rad_s2 = 20.0", "max_wheel_acceleration_rad_s2 = 10.0", ""),
+        ("robot", "[log]", "[estimation]\nslip_std_m_per_sqrt_m = 0.021\n[log]", "Estimate."),
+    ],
+)
+def test_another_robot_shows_where_it_first_differs(tmp_path, ticks, file, old, new, field):
+    text = (ROBOTS / ("wombot.toml" if file == "robot" else "wombot_model.toml")).read_text()
+    assert old in text
+    changed = {file: text.replace(old, new, 1)}
+    if file == "model":
+        # The belief's mean, which the estimator and the sigma points use.
+        changed[file] = changed[file].replace("0.061", "0.0611")
+    report = replay(write_log(tmp_path / "run.mcap", ticks, **changed))
+    assert not report.ok
+    assert report.difference.recorded != report.difference.replayed
+    if file == "robot":
+        assert report.difference.field.startswith(field)
+    assert "first difference at tick" in report.as_text()
+
+
+def test_one_changed_bit_in_the_log_is_found(tmp_path, ticks):
+    import msgspec
+
+    from disco_hw.log.records import Command
+
+    def shifted(record):
+        if not isinstance(record, Command):
+            return record
+        return msgspec.structs.replace(record, left_rad_s=record.left_rad_s + 2.0**-40)
+
+    changed = list(ticks)
+    changed[150] = (ticks[150][0], tuple(map(shifted, ticks[150][1])))
+    report = replay(write_log(tmp_path / "run.mcap", changed))
+    assert not report.ok
+    assert report.difference.field == "Command.left_rad_s"
+    assert report.difference.t_ns == ticks[150][0]
+
+
+def test_a_log_without_ticks_or_robot_is_refused(tmp_path, ticks):
+    with pytest.raises(InputError, match="holds no ticks"):
+        replay(write_log(tmp_path / "empty.mcap", []))
+    recorder = ProcessRecorder(Recording(tmp_path / "bare.mcap", "wombot"))
+    recorder.put(*ticks[0])
+    recorder.close(30.0)
+    with pytest.raises(InputError, match=r"carries no robot\.toml"):
+        replay(tmp_path / "bare.mcap")
+    odd = write_log(tmp_path / "odd.mcap", ticks[:1], model="format = 7\n")
+    with pytest.raises(InputError, match=rf"^{odd}: model\.toml: format: "):
+        replay(odd)

@@ -1,0 +1,56 @@
+import sys
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from disco_hw.runtime.stop_path import StepOutcome, StopPath
+
+ERRORS = [None, RuntimeError("broken"), OSError(5, "unplugged"), SystemExit(3), KeyboardInterrupt(), RecursionError()]
+
+
+def test_what_was_added_last_runs_first():
+    done = []
+    path = StopPath()
+    for name in ("log", "link", "wheels"):
+        path.add(name, lambda name=name: done.append(name))
+    assert path.run() == [StepOutcome(name, None) for name in ("wheels", "link", "log")]
+    assert done == ["wheels", "link", "log"]
+
+
+@given(st.lists(st.sampled_from(ERRORS), max_size=8))
+def test_every_step_runs_once_whatever_the_others_raise(errors):
+    done = []
+    path = StopPath()
+
+    def step(number, error):
+        done.append(number)
+        if error is not None:
+            raise error
+
+    for number, error in enumerate(errors):
+        path.add(str(number), lambda number=number, error=error: step(number, error))
+    outcomes = path.run()
+    assert done == list(range(len(errors)))[::-1]
+    assert [outcome.ok for outcome in outcomes] == [error is None for error in errors[::-1]]
+    assert path.run() == []
+    assert len(done) == len(errors)
+
+
+@pytest.mark.parametrize(
+    ("error", "words"), [(OSError(5, "unplugged"), "OSError: [Errno 5] unplugged"), (SystemExit(3), "SystemExit: 3")]
+)
+def test_a_failure_is_told_in_words(error, words):
+    path = StopPath()
+    path.add("wheels", lambda: sys.exit(3) if isinstance(error, SystemExit) else (_ for _ in ()).throw(error))
+    (outcome,) = path.run()
+    assert outcome == StepOutcome("wheels", words)
+    assert not outcome.ok
+
+
+def test_a_step_may_add_another():
+    done = []
+    path = StopPath()
+    path.add("outer", lambda: path.add("inner", lambda: done.append("inner")))
+    assert [outcome.name for outcome in path.run()] == ["outer", "inner"]
+    assert done == ["inner"]

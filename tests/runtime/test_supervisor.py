@@ -1,0 +1,418 @@
+import math
+from dataclasses import replace
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from disco_hw.runtime.states import TRANSITIONS, State
+from disco_hw.runtime.supervisor import Inputs, Supervisor, UserRequest
+from drivers.types import DriverState, LinkState, Request
+from tests.runtime.supervisor_bench import ARM, DISARM, ESTOP, RESET, SETTINGS, START, STOP, TICK_NS, Bench
+
+
+def refusal(out):
+    assert len(out.replies) == 1
+    assert not out.replies[0].accepted
+    return out.replies[0].text
+
+
+# --- one test per row of the table -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("start", ["ready", "armed", "running", "stopping", "faulted"])
+def test_a_link_that_is_down_means_disconnected_and_no_command(start):
+    bench = Bench()
+    getattr(bench, start)()
+    out = bench.tick(link_state=LinkState.CONNECTING)
+    assert out.state is State.DISCONNECTED
+    assert (out.motion_allowed, out.zero_only, out.running) == (False, False, False)
+    assert "link is down" in out.events[-1]
+
+
+@pytest.mark.parametrize("start", ["ready", "armed", "running", "stopping", "faulted"])
+def test_a_link_interrupted_between_two_ticks_voids_the_session(start):
+    bench = Bench()
+    getattr(bench, start)()
+    out = bench.tick(link_generation=2)
+    assert out.state is State.DISCONNECTED
+    assert (out.motion_allowed, out.zero_only, out.running) == (False, False, False)
+    assert bench.tick(driver_state=DriverState.HANDSHAKE).state is State.HANDSHAKE
+
+
+@pytest.mark.parametrize("start", ["ready", "armed", "running", "stopping"])
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"daemon_error": "the pipeline raised ValueError"}, "the pipeline raised ValueError"),
+        ({"driver_state": DriverState.ESTOP}, "detail of the driver"),
+        ({"driver_state": DriverState.FAULT}, "detail of the driver"),
+        ({"driver_state": DriverState.REFUSED}, "detail of the driver"),
+        ({"preflight_errors": ("speed limit above the firmware's",)}, "speed limit above the firmware's"),
+    ],
+)
+def test_a_problem_means_fault_in_words_without_motion(start, changes, words):
+    bench = Bench()
+    getattr(bench, start)()
+    out = bench.tick(**changes)
+    assert out.state is State.FAULT
+    assert out.driver_request is Request.STANDBY
+    assert (out.motion_allowed, out.running) == (False, False)
+    assert words in out.detail
+    assert words in out.events[-1]
+    assert out.estop == (changes.get("driver_state") is DriverState.ESTOP)
+
+
+@pytest.mark.parametrize("start", ["ready", "armed", "running", "stopping"])
+def test_estop_means_fault_in_the_same_tick_and_its_frames_until_the_robot_shows_it(start):
+    bench = Bench()
+    getattr(bench, start)()
+    bench.robot_obeys = False
+    out = bench.tick(ESTOP)
+    assert out.state is State.FAULT
+    assert out.estop
+    assert not out.motion_allowed
+    assert out.replies[0].accepted
+    for _ in range(5):
+        assert out.send_estop
+        out = bench.tick()
+    out = bench.tick(driver_state=DriverState.ESTOP)
+    assert out.estop
+    assert not out.send_estop
+
+
+def test_reset_leads_from_fault_by_handshake_to_ready_and_not_to_armed():
+    bench = Bench().faulted()
+    assert bench.tick(RESET).driver_request is Request.RESET
+    assert bench.tick().state is State.HANDSHAKE
+    assert bench.tick(count=50).state is State.READY
+    assert Request.ARM not in bench.requests_sent
+
+
+def test_disarm_stops_in_the_same_tick():
+    bench = Bench().running()
+    out = bench.tick(DISARM)
+    assert out.state is State.STOPPING
+    assert out.driver_request is Request.STANDBY
+    assert out.zero_only
+    assert (out.motion_allowed, out.running) == (False, False)
+
+
+@pytest.mark.parametrize("age_s", [0.16, None, math.nan, math.inf])
+def test_lost_telemetry_disarms_and_stops_sending(age_s):
+    out = Bench().running().tick(telemetry_age_s=age_s)
+    assert out.state is State.STOPPING
+    assert out.driver_request is Request.STANDBY
+    assert (out.motion_allowed, out.zero_only) == (False, False)
+
+
+@pytest.mark.parametrize("robot", [DriverState.STOPPING, DriverState.STANDBY, DriverState.READY, DriverState.HANDSHAKE])
+def test_a_robot_that_stops_by_itself_ends_the_run(robot):
+    bench = Bench().running()
+    out = bench.tick(driver_state=robot, driver_detail="no wheel command arrived in time")
+    assert out.state is State.STOPPING
+    assert "no longer armed: no wheel command arrived in time; waiting" in out.detail
+    assert any("no longer armed: no wheel command arrived in time" in event for event in out.events)
+    bench.tick(count=50)
+    assert bench.out.state is State.READY
+    assert Request.ARM not in bench.requests_sent[-50:]
+
+
+@pytest.mark.parametrize("robot", [DriverState.ARMING, DriverState.ARMED, DriverState.STOPPING])
+def test_a_robot_armed_unasked_is_stopped(robot):
+    out = Bench().ready().tick(driver_state=robot)
+    assert out.state is State.STOPPING
+    assert out.driver_request is Request.STANDBY
+
+
+def test_a_robot_found_armed_is_stopped():
+    bench = Bench()
+    bench.tick(driver_state=DriverState.ARMED)
+    out = bench.tick(driver_state=DriverState.ARMED)
+    assert out.state is State.STOPPING
+    assert out.driver_request is Request.STANDBY
+
+
+@pytest.mark.parametrize("start", ["ready", "stopping"])
+def test_a_robot_that_restarts_begins_with_a_handshake(start):
+    bench = Bench()
+    getattr(bench, start)()
+    assert bench.tick(driver_state=DriverState.HANDSHAKE).state is State.HANDSHAKE
+
+
+def test_lost_telemetry_while_ready_means_handshake():
+    bench = Bench().ready()
+    assert bench.tick(telemetry_age_s=0.16).state is State.HANDSHAKE
+    assert bench.tick(telemetry_age_s=0.01).state is State.READY
+
+
+def test_the_way_up_to_ready():
+    bench = Bench()
+    bench.robot_obeys = False
+    assert bench.tick(link_state=LinkState.CONNECTING).state is State.DISCONNECTED
+    assert bench.tick(link_state=LinkState.UP).state is State.HANDSHAKE
+    assert bench.tick(count=10).state is State.HANDSHAKE
+    assert bench.tick(driver_state=DriverState.STANDBY, telemetry_age_s=None).state is State.HANDSHAKE
+    assert bench.tick(telemetry_age_s=0.01).state is State.READY
+    assert bench.out.driver_request is Request.READY
+
+
+def test_arming_needs_a_request_and_holds_zero():
+    bench = Bench().ready()
+    assert bench.tick(count=100).state is State.READY
+    assert bench.tick(ARM).driver_request is Request.ARM
+    assert bench.tick(count=3).state is State.ARMED
+    assert bench.requests_sent.count(Request.ARM) == 1
+    assert bench.out.zero_only
+    assert not bench.out.motion_allowed
+
+
+def test_stopping_lasts_until_the_robot_is_disarmed_and_the_wheels_are_still():
+    bench = Bench().stopping()
+    assert bench.tick(wheel_speed_rad_s=3.0).zero_only
+    assert bench.tick(driver_state=DriverState.STANDBY, wheel_speed_rad_s=0.051).state is State.STOPPING
+    assert bench.tick(driver_state=DriverState.STANDBY, wheel_speed_rad_s=math.nan).state is State.STOPPING
+    assert bench.tick(driver_state=DriverState.ARMED, wheel_speed_rad_s=0.0).state is State.STOPPING
+    assert bench.tick(driver_state=DriverState.STANDBY, telemetry_age_s=0.2).state is State.STOPPING
+    assert bench.tick(driver_state=DriverState.STANDBY, telemetry_age_s=0.01).state is State.READY
+
+
+# --- the task ---------------------------------------------------------------------------------------------------------
+
+
+def test_start_and_stop_switch_between_the_task_and_holding_zero():
+    bench = Bench().armed()
+    out = bench.tick(START)
+    assert (out.motion_allowed, out.zero_only, out.running) == (True, False, True)
+    out = bench.tick(STOP)
+    assert out.state is State.ARMED
+    assert (out.motion_allowed, out.zero_only, out.running) == (False, True, False)
+
+
+def test_stale_telemetry_commands_zero_and_fresh_telemetry_continues():
+    bench = Bench().running()
+    out = bench.tick(telemetry_age_s=0.06)
+    assert out.state is State.ARMED
+    assert (out.motion_allowed, out.zero_only) == (False, True)
+    assert bench.tick(telemetry_age_s=0.01).motion_allowed
+
+
+def test_a_lost_pose_stops_the_task_for_good():
+    bench = Bench().running()
+    out = bench.tick(pose_ok=False)
+    assert (out.state, out.motion_allowed, out.zero_only) == (State.ARMED, False, True)
+    assert "no pose" in out.events[-1]
+    assert not bench.tick(pose_ok=True, count=10).motion_allowed
+
+
+def test_without_pose_required_the_task_runs_on_odometry():
+    bench = Bench(replace(SETTINGS, pose_required=False)).running()
+    assert bench.tick(pose_ok=False).motion_allowed
+
+
+def test_start_during_arming_starts_once_armed():
+    bench = Bench().ready()
+    bench.tick(ARM, START)
+    assert bench.tick(count=4).motion_allowed
+
+
+def test_start_during_arming_is_dropped_when_the_pose_is_lost_meanwhile():
+    bench = Bench().ready()
+    bench.tick(ARM, START)
+    for _ in range(4):
+        assert not bench.tick(pose_ok=False).motion_allowed
+    assert bench.out.state is State.ARMED
+    assert not bench.tick(pose_ok=True, count=4).running
+
+
+@pytest.mark.parametrize("undo", [STOP, DISARM, ESTOP])
+def test_what_comes_after_arm_and_start_in_the_same_tick_wins(undo):
+    bench = Bench().ready()
+    bench.tick(ARM, START, undo)
+    assert not bench.tick(count=20).running
+
+
+# --- pending requests -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("loss", [{"link_state": LinkState.CONNECTING}, {"link_generation": 2}])
+def test_arm_and_start_pending_at_a_link_loss_are_dropped_and_nothing_rearms(loss):
+    bench = Bench().ready()
+    bench.robot_obeys = False
+    bench.tick(ARM, START)
+    bench.requests_sent.clear()
+    bench.tick(**loss)
+    assert any("arm request dropped" in event for event in bench.events)
+    assert any("start request dropped" in event for event in bench.events)
+    bench.robot_obeys = True
+    bench.tick(link_state=LinkState.UP, link_generation=3, driver_state=DriverState.HANDSHAKE)
+    assert bench.tick(count=100).state is State.READY
+    assert Request.ARM not in bench.requests_sent
+
+
+def test_arming_that_the_robot_never_finishes_is_given_up():
+    bench = Bench().ready()
+    bench.robot_obeys = False
+    bench.tick(ARM)
+    bench.tick(count=99, driver_state=DriverState.ARMING)
+    assert bench.out.detail == "arming"
+    bench.tick(count=3)
+    assert bench.out.state is State.STOPPING
+    assert any("not armed within 2 s: detail of the driver" in event for event in bench.events)
+
+
+def test_arming_that_the_robot_refuses_is_given_up_at_once():
+    bench = Bench().ready()
+    bench.robot_obeys = False
+    bench.tick(ARM)
+    bench.tick(driver_state=DriverState.ARMING)
+    bench.tick(driver_state=DriverState.READY)
+    assert bench.out.driver_request is Request.READY
+    assert any("did not arm: detail of the driver" in event for event in bench.events)
+
+
+def test_disarm_during_arming_stops():
+    bench = Bench().ready()
+    bench.tick(ARM)
+    out = bench.tick(DISARM)
+    assert out.state is State.STOPPING
+    assert bench.tick(count=50).state is State.READY
+
+
+def test_a_reset_without_effect_is_given_up_and_said():
+    bench = Bench().faulted()
+    bench.robot_obeys = False
+    bench.tick(RESET)
+    bench.tick(count=149)
+    assert bench.out.driver_request is None
+    bench.tick(count=2)
+    assert bench.out.driver_request is Request.STANDBY
+    assert any("no reset within 3 s: detail of the driver" in event for event in bench.events)
+
+
+def test_estop_during_a_reset_ends_the_reset():
+    bench = Bench().faulted()
+    bench.robot_obeys = False
+    bench.tick(RESET)
+    out = bench.tick(ESTOP)
+    assert out.state is State.FAULT
+    assert out.driver_request is Request.STANDBY
+
+
+def test_after_a_disarm_the_robot_can_be_armed_again():
+    bench = Bench().running()
+    bench.tick(DISARM)
+    bench.tick(count=5)
+    bench.tick(ARM, START)
+    assert bench.tick(count=5).motion_allowed
+
+
+def test_estop_asked_while_disconnected_is_sent_when_the_link_is_up():
+    bench = Bench()
+    bench.tick(link_state=LinkState.CONNECTING)
+    out = bench.tick(ESTOP)
+    assert not out.send_estop
+    assert "when the link is up" in out.replies[0].text
+    assert bench.tick(link_state=LinkState.UP).send_estop
+    assert bench.tick(count=5).state is State.FAULT
+
+
+# --- refusals in words ------------------------------------------------------------------------------------------------
+
+
+def test_arm_is_refused_with_the_reason():
+    assert "link is connecting" in refusal(Bench().tick(ARM, link_state=LinkState.CONNECTING))
+    bench = Bench()
+    bench.robot_obeys = False
+    bench.tick()
+    assert "detail of the driver" in refusal(bench.tick(ARM))
+    assert "turning" in refusal(Bench().ready().tick(ARM, wheel_speed_rad_s=0.06))
+    assert "wheel samples" in refusal(Bench().ready().tick(ARM, telemetry_age_s=0.06))
+    assert "stopping" in refusal(Bench().stopping().tick(ARM))
+    assert "e-stop requested here" in refusal(Bench().faulted().tick(ARM))
+
+
+def test_start_is_refused_with_the_reason():
+    assert "arm first" in refusal(Bench().ready().tick(START))
+    assert "pose" in refusal(Bench().armed().tick(START, pose_ok=False))
+    assert "wheel samples" in refusal(Bench().armed().tick(START, telemetry_age_s=0.06))
+
+
+def test_reset_is_refused_with_the_reason():
+    assert "nothing to reset" in refusal(Bench().ready().tick(RESET))
+    bench = Bench().ready()
+    bench.tick(daemon_error="boom")
+    assert "boom" in refusal(bench.tick(RESET))
+    bench = Bench().ready()
+    bench.tick(preflight_errors=("limits differ",))
+    assert "limits differ" in refusal(bench.tick(RESET))
+    bench = Bench().ready()
+    bench.robot_obeys = False
+    bench.tick(ESTOP)
+    assert "not confirmed" in refusal(bench.tick(RESET))
+
+
+@pytest.mark.parametrize("order", [(ESTOP, ARM), (ARM, ESTOP)])
+def test_estop_beats_arm_in_the_same_tick_in_either_order(order):
+    bench = Bench().ready()
+    out = bench.tick(*order)
+    assert [reply.accepted for reply in out.replies] == [request is ESTOP for request in order]
+    assert out.state is State.FAULT
+    assert Request.ARM not in bench.requests_sent
+
+
+def test_asking_twice_is_harmless():
+    bench = Bench().running()
+    assert bench.tick(ARM, START).replies[0].text == "already armed"
+    assert bench.out.motion_allowed
+    bench.tick(STOP, STOP, DISARM, DISARM)
+    assert all(reply.accepted for reply in bench.out.replies)
+
+
+# --- whatever happens -------------------------------------------------------------------------------------------------
+
+ANY_INPUTS = st.builds(
+    Inputs,
+    link_state=st.sampled_from([LinkState.UP, LinkState.UP, LinkState.UP, LinkState.CONNECTING]),
+    link_generation=st.sampled_from([1, 1, 1, 1, 2]),
+    driver_state=st.sampled_from([*DriverState, *[DriverState.ARMED] * 6, *[DriverState.READY] * 4]),
+    driver_detail=st.just("words"),
+    telemetry_age_s=st.sampled_from([0.01, 0.01, 0.01, 0.1, 0.2, None, math.nan]),
+    wheel_speed_rad_s=st.sampled_from([0.0, 0.0, 1.0, math.nan]),
+    pose_ok=st.sampled_from([True, True, True, False]),
+    requests=st.lists(st.sampled_from([ARM, ARM, START, START, *UserRequest]), max_size=3).map(tuple),
+)
+
+
+@settings(max_examples=300)
+@given(st.lists(ANY_INPUTS, min_size=1, max_size=80))
+def test_whatever_happens_motion_needs_everything(history):
+    supervisor = Supervisor(SETTINGS)
+    armed_by_user = started_by_user = False
+    generation = None
+    for index, inputs in enumerate(history):
+        before = supervisor.state
+        out = supervisor.step(index * TICK_NS, inputs)
+        if inputs.link_state is not LinkState.UP or inputs.link_generation != generation:
+            armed_by_user = started_by_user = False
+        generation = inputs.link_generation if inputs.link_state is LinkState.UP else None
+        accepted = {reply.request for reply in out.replies if reply.accepted}
+        armed_by_user |= ARM in accepted
+        started_by_user |= START in accepted
+        assert not (out.motion_allowed and out.zero_only)
+        if out.motion_allowed:
+            assert out.state is State.ARMED
+            assert inputs.driver_state is DriverState.ARMED
+            assert inputs.telemetry_age_s <= SETTINGS.telemetry_zero_s
+            assert inputs.pose_ok
+            assert armed_by_user
+            assert started_by_user
+            assert not {DISARM, ESTOP} & set(inputs.requests)
+        if out.driver_request is Request.ARM:
+            assert ARM in accepted
+        if out.state is not before:
+            assert any(before in row.sources and row.target is out.state for row in TRANSITIONS)
+            assert out.events
+        assert len(out.replies) == len(inputs.requests)
+        assert all(reply.text for reply in out.replies)
+        assert out.detail

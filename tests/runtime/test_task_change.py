@@ -1,0 +1,156 @@
+"""What a person may ask of the task while the daemon runs, and that the log replays what was made of it."""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+import pytest
+
+from disco_hw.config import CircleTask, PathTask, Robot, TimedPathTask
+from disco_hw.log import records
+from disco_hw.runtime.replay import replay
+from disco_hw.runtime.states import State
+from disco_hw.runtime.supervisor import UserRequest
+from disco_hw.runtime.task_change import (
+    CENTER_M,
+    RADIUS_M,
+    SLOWEST_M_S,
+    TaskRefused,
+    asked_of,
+    changed_task,
+    fastest_m_s,
+    in_words,
+    limits,
+    record_of,
+    task_of,
+    told_task,
+)
+from tests.runtime.simulated import simulated_stack
+from tests.runtime.test_replay import write_log
+
+ROBOT = Robot(
+    name="r", wheel_radius_m=0.06, axial_distance_m=0.31, ticks_per_rev=2048, max_wheel_speed_rad_s=8.0
+)  # fmt: skip
+
+
+def test_the_fields_that_are_given_change_and_the_others_stay():
+    changed = changed_task(CircleTask(center_x_m=1.0), {"radius_m": 0.5, "speed_m_s": 0.1}, ROBOT, State.READY)
+    assert changed == CircleTask(center_x_m=1.0, radius_m=0.5, speed_m_s=0.1)
+
+
+@pytest.mark.parametrize("state", [State.ARMED, State.STOPPING])
+def test_an_armed_robot_keeps_its_task(state):
+    with pytest.raises(TaskRefused, match="disarm first"):
+        changed_task(CircleTask(), {"radius_m": 0.5}, ROBOT, state)
+
+
+@pytest.mark.parametrize(
+    ("asked", "words"),
+    [
+        ({}, "give one or more of radius_m"),
+        ({"radius": 0.5}, "not radius"),
+        ({"radius_m": "0.5"}, "radius_m: not a number"),
+        ({"radius_m": True}, "radius_m: not a number"),
+        ({"radius_m": math.nan}, "radius_m: not within"),
+        ({"radius_m": math.inf}, "radius_m: not within"),
+        ({"radius_m": 10**400}, "radius_m"),
+        ({"radius_m": 0.0}, "not within 0.1 and 50"),
+        ({"radius_m": -0.75}, "not within 0.1 and 50"),
+        ({"speed_m_s": 0.0}, "speed_m_s: not within"),
+        ({"speed_m_s": -0.2}, "speed_m_s"),
+        ({"center_x_m": 1e6}, "center_x_m"),
+        ({"speed_m_s": 0.45}, "at most 0.397 m/s"),
+        ({"radius_m": 0.1, "speed_m_s": 0.2}, "outer wheel for more than 8 rad/s"),
+    ],
+)
+def test_what_the_robot_cannot_do_is_refused_in_words(asked, words):
+    with pytest.raises(TaskRefused, match=words):
+        changed_task(CircleTask(), asked, ROBOT, State.READY)
+
+
+def test_the_limits_are_those_that_are_enforced():
+    shown = limits(ROBOT, CircleTask())
+    assert shown["radius_m"] == RADIUS_M
+    assert shown["center_y_m"] == CENTER_M
+    slowest, fastest = shown["speed_m_s"]
+    assert slowest == SLOWEST_M_S
+    changed_task(CircleTask(), {"speed_m_s": fastest}, ROBOT, State.READY)
+    with pytest.raises(TaskRefused):
+        changed_task(CircleTask(), {"speed_m_s": fastest * 1.001}, ROBOT, State.READY)
+
+
+def test_at_the_fastest_speed_the_outer_wheel_is_at_its_limit():
+    speed, radius_m = fastest_m_s(ROBOT, CircleTask(radius_m=0.75)), 0.75
+    outer_rad_s = speed / radius_m * (radius_m + 0.5 * ROBOT.axial_distance_m) / ROBOT.wheel_radius_m
+    assert outer_rad_s == pytest.approx(ROBOT.max_wheel_speed_rad_s)
+
+
+def test_a_record_tells_the_whole_task():
+    task = CircleTask(center_x_m=1.0, center_y_m=-2.0, radius_m=0.5, speed_m_s=0.1)
+    assert task_of(record_of(7, task), CircleTask()) == task
+    assert record_of(7, task).t_ns == 7
+
+
+LINE = PathTask(path="line.csv", speed_m_s=0.2, points=((0.0, 0.0), (2.0, 0.0)))
+
+
+def test_of_a_path_only_the_speed_can_be_changed():
+    changed = changed_task(LINE, {"speed_m_s": 0.3}, ROBOT, State.READY)
+    assert changed == msgspec.structs.replace(LINE, speed_m_s=0.3)
+    assert set(limits(ROBOT, LINE)) == {"speed_m_s"}
+    fastest = ROBOT.max_wheel_speed_rad_s * ROBOT.wheel_radius_m
+    assert limits(ROBOT, LINE)["speed_m_s"] == (SLOWEST_M_S, pytest.approx(fastest))
+    with pytest.raises(TaskRefused, match="give one or more of speed_m_s, not radius_m"):
+        changed_task(LINE, {"radius_m": 0.5}, ROBOT, State.READY)
+    with pytest.raises(TaskRefused, match="asks the wheels for more than 8 rad/s; at most"):
+        changed_task(LINE, {"speed_m_s": 1.01 * fastest}, ROBOT, State.READY)
+    with pytest.raises(TaskRefused, match="disarm first"):
+        changed_task(LINE, {"speed_m_s": 0.3}, ROBOT, State.ARMED)
+
+
+def test_a_status_and_a_record_tell_of_a_path_without_its_way_points():
+    other = msgspec.structs.replace(LINE, speed_m_s=0.1)
+    asked = asked_of(other)
+    assert "points" not in asked
+    assert told_task(asked, LINE) == other
+    assert told_task(asked, msgspec.structs.replace(LINE, points=((0.0, 0.0), (2.0, 0.1)))) is None
+    assert told_task(asked, CircleTask()) is None
+    assert told_task(asked_of(CircleTask(radius_m=2.0)), LINE) == CircleTask(radius_m=2.0)
+    assert task_of(record_of(7, other), LINE) == other
+    assert in_words(other) == "path line.csv of 2.00 m at 0.1 m/s"
+
+
+TIMED = TimedPathTask(path="line.csv", points=LINE.points, times_s=(0.0, 10.0))
+
+
+def test_of_way_points_by_time_nothing_can_be_changed():
+    with pytest.raises(TaskRefused, match="have times, which say all; change t_s in their CSV"):
+        changed_task(TIMED, {"speed_m_s": 0.3}, ROBOT, State.READY)
+    assert limits(ROBOT, TIMED) == {}
+    assert in_words(TIMED) == "path line.csv of 2.00 m in 10 s, at most 0.2 m/s"
+    assert told_task(asked_of(TIMED), TIMED) == TIMED
+    assert told_task(asked_of(TIMED), msgspec.structs.replace(TIMED, times_s=(0.0, 11.0))) is None
+    assert told_task(asked_of(TIMED), LINE) is None
+    assert told_task(asked_of(LINE), TIMED) is None
+    assert task_of(record_of(7, TIMED), TIMED) == TIMED
+
+
+def test_another_circle_is_driven_recorded_and_replayed_bit_for_bit(tmp_path):
+    stack = simulated_stack()
+    stack.run(1.5)
+    stack.core.set_task(CircleTask(center_x_m=0.25, radius_m=0.5, speed_m_s=0.15))
+    stack.run(0.5, UserRequest.ARM)
+    stack.run(6.0, UserRequest.START)
+    stack.run(0.5, UserRequest.DISARM)
+    told = [record for _, tick in stack.recorder.ticks for record in tick if isinstance(record, records.Task)]
+    assert [task_of(record, CircleTask()) for record in told] == [stack.core.task]
+    estimate = stack.core.last.pipeline.estimate
+    off_new, off_old = (math.hypot(estimate.x_m - x, estimate.y_m) - r for x, r in ((0.25, 0.5), (0.0, 0.75)))
+    assert abs(off_new) < 0.07 < abs(off_old)
+    log = write_log(tmp_path / "run.mcap", stack.recorder.ticks)
+    report = replay(log)
+    assert report.ok, report.as_text()
+    # Without the record the planner would have followed the circle of robot.toml.
+    untold = [(t, [r for r in tick if not isinstance(r, records.Task)]) for t, tick in stack.recorder.ticks]
+    assert not replay(write_log(tmp_path / "untold.mcap", untold)).ok
