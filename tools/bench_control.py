@@ -18,16 +18,16 @@ from numba import njit
 from numba.core.runtime import _nrt_python, rtsys
 
 import disco_hw
-from disco_hw.control import Circle, Disco, DiscoSettings, PlannerState, Sampler, SentCommand, WheelLimits
+from disco_hw.control import Circle, CommandLimits, Disco, DiscoSettings, PlannerState, Sampler, SentCommand
 from disco_hw.control.black_box import BlackBoxDisco
-from disco_hw.control.experiments.circle import CircleOptions, CircleResult, Command, drive, planner_command, plants
-from disco_hw.control.experiments.pendulum import POSTERIOR
+from disco_hw.control.kernel.replan import replan
 from disco_hw.control.parameter_points import unscented_points
 from disco_hw.control.pendulum import PendulumPlanner, PendulumPoints
-from disco_hw.control.replan import replan
 from disco_hw.control.settings import ROTATION
 from disco_hw.control.sigma_points import sigma_points
 from disco_hw.control.torch_models import circle_cost, skid_steer_transition
+from disco_hw.experiments.circle import CircleOptions, CircleResult, Command, drive, planner_command, plants
+from disco_hw.experiments.pendulum import POSTERIOR
 from disco_hw.model import Model, load_model
 from disco_hw.model.jit import block_function, float32, tune_loops
 from disco_hw.runtime.assembly import make_planner
@@ -109,7 +109,7 @@ def skid_steer_pair(model: Model) -> tuple[Step, Step]:
     from tools.control_peers import circle_mppi, circle_state  # noqa: PLC0415  (a peer for the benchmark only)
 
     circle, settings = Circle().paper(), DiscoSettings()
-    planner = Disco(model, circle, settings, WheelLimits(LARGEST_RAD_S))
+    planner = Disco(model, circle, settings, CommandLimits(LARGEST_RAD_S))
     planner.warm_up()
     mppi = circle_mppi(model, circle, settings, LARGEST_RAD_S)
     start = circle_state(mppi.nx // 4, moving(0)[1])
@@ -158,7 +158,7 @@ def scaling(model: Model, steps: int) -> dict[str, float]:
     """Time of a step for each number of samples, over what is in proportion to 400 samples: 1 is linear."""
     settings = DiscoSettings()
     planners = {
-        size: Disco(model, Circle(), replace(settings, sampler=Sampler(samples=size)), WheelLimits(LARGEST_RAD_S))
+        size: Disco(model, Circle(), replace(settings, sampler=Sampler(samples=size)), CommandLimits(LARGEST_RAD_S))
         for size in SIZES
     }
     calls = [moving(number) for number in range(CALLS)]
@@ -188,7 +188,7 @@ def allocations(model: Model, steps: int = 200) -> dict[str, float]:
     `in_the_step`: allocations of the compiled step beyond those of an empty function with the same arguments, for which
     numba makes a record of each array that it is handed. `bytes_grown_per_step`: Python's memory after `steps` more.
     """
-    planner = Disco(model, Circle(), DiscoSettings(), WheelLimits(LARGEST_RAD_S))
+    planner = Disco(model, Circle(), DiscoSettings(), CommandLimits(LARGEST_RAD_S))
     planner.warm_up()
     for number in range(20):
         planner.plan(*moving(number))

@@ -16,17 +16,17 @@ from numpy.typing import NDArray
 
 import disco_hw
 from disco_hw.config import PathTask
-from disco_hw.control import Disco, DiscoSettings, PlannerState, SentCommand, WheelLimits
-from disco_hw.control.experiments.circle import plants
-from disco_hw.control.experiments.plant import Plant
+from disco_hw.control import CommandLimits, Disco, DiscoSettings, PlannerState, SentCommand
 from disco_hw.control.tasks.path import Path
 from disco_hw.course import course_of
+from disco_hw.experiments.circle import plants
+from disco_hw.experiments.plant import Plant
 from disco_hw.model import Model, load_model
 from disco_hw.waypoints import load_waypoints
 from tools.step_times import summary, times_ms, undisturbed
 
 ROBOTS = FilePath(disco_hw.__file__).parent / "robots"
-LIMITS = WheelLimits(8.0, 20.0)
+LIMITS = CommandLimits(8.0, 20.0)
 RATE_HZ = 10.0
 LAG_S, WHEEL_NOISE = 0.1, 0.05
 REVERSE_M_S = -0.02

@@ -15,12 +15,12 @@ from pytorch_mppi import MPPI
 from torch import Tensor
 
 from disco_hw.control import pendulum
-from disco_hw.control.experiments.circle import Command
 from disco_hw.control.parameter_points import unscented_points
 from disco_hw.control.pendulum import PendulumPoints
 from disco_hw.control.plan import PlannerState
 from disco_hw.control.settings import DiscoSettings
 from disco_hw.control.tasks.circle import Circle
+from disco_hw.experiments.circle import Command
 from disco_hw.model import Model
 
 

@@ -7,20 +7,20 @@ from dataclasses import replace
 
 import numpy as np
 
-from disco_hw.control.blocks import BLOCK, aligned_zeros
+from disco_hw.control.command_history import command_history
+from disco_hw.control.kernel.blocks import BLOCK, aligned_zeros
+from disco_hw.control.kernel.skid_steer import WHEEL_ROWS, SkidSteer
 from disco_hw.control.optimiser import Optimiser
 from disco_hw.control.parameter_points import (
     drawn_points,
+    equivalent_points,
     mean_point,
     point_estimate,
     shared_pairs,
-    twins,
     unscented_points,
 )
-from disco_hw.control.past import past_commands
-from disco_hw.control.plan import Array, Diagnostics, NoValidControl, Outcome, Plan, PlannerState, Rollouts
-from disco_hw.control.settings import DiscoSettings, WheelLimits
-from disco_hw.control.skid_steer import WHEEL_ROWS, SkidSteer
+from disco_hw.control.plan import Array, Diagnostics, NoValidControl, PlannerState, PlanOutcome, Rollouts, WheelPlan
+from disco_hw.control.settings import CommandLimits, DiscoSettings
 from disco_hw.control.tasks.task import Task
 from disco_hw.model import Belief, Model
 from disco_hw.model.effects import Channel
@@ -44,7 +44,7 @@ class Disco:
     compiles; `warm_up` does that beforehand.
     """
 
-    def __init__(self, model: Model, task: Task, settings: DiscoSettings, limits: WheelLimits, seed: int = 1) -> None:
+    def __init__(self, model: Model, task: Task, settings: DiscoSettings, limits: CommandLimits, seed: int = 1) -> None:
         sampler, step_s = settings.sampler, settings.step_s
         self._model, self._task, self._settings, self._limits, self._seed = model, task, settings, limits, seed
         self._own_draws = settings.uncertainty == "joint" or (
@@ -52,7 +52,7 @@ class Disco:
         )
         theta, weights = self._shared_points(model)
         self._weights = weights.astype(np.float32)
-        self._unweighed = True if self._weights[0] == 0.0 and not self._own_draws else None
+        self._skip_mean_cost = True if self._weights[0] == 0.0 and not self._own_draws else None
         delay_is_believed = model.belief is not None and DELAY in model.belief.names
         self._history = self._history_for(model, theta) + (SPARE_HISTORY if delay_is_believed else 0)
         may_turn_more = settings.uncertainty in ("mc", "joint") or any(
@@ -77,7 +77,11 @@ class Disco:
         self._t0_ns: int | None = None
         self._failing_since_ns: int | None = None
         self._memory: float | None = None
-        self._planned_from, self._elapsed_s, self._past = np.zeros(5), 0.0, np.zeros((self._history, CHANNELS))
+        self._planned_from, self._elapsed_s, self._earlier = (
+            np.zeros(5),
+            0.0,
+            np.zeros((self._history, CHANNELS)),
+        )
 
     def _shared_points(self, model: Model) -> tuple[Array, Array]:
         """Parameter points (L, P) and weights (L,) of the first step; those of `ut` and `point` stay."""
@@ -102,7 +106,7 @@ class Disco:
         self._points = FreeRun(model, theta, step_s)
         self._response_s = self._value(self._mean_theta, "motor_lag.tau_s") + self._value(self._mean_theta, DELAY)
         self._tables = coefficient_tables(model, theta, step_s, np.float32)
-        found = twins(model, theta, step_s, self._pairs)
+        found = equivalent_points(model, theta, step_s, self._pairs)
         self._ahead, self._scaled = (
             np.ascontiguousarray(found[:, 2 * pair : 2 * pair + 2]) if pair < self._pairs else None for pair in (0, 1)
         )
@@ -191,7 +195,7 @@ class Disco:
         self._optimiser.step_number = number
         self.reset()
 
-    def plan(self, now_ns: int, state: PlannerState) -> Plan:
+    def plan(self, now_ns: int, state: PlannerState) -> WheelPlan:
         """Plan from the state, predicted to when a command made from it acts.
 
         A step without a valid result is tried again, then planned anew from standstill, then answered with a ramp to
@@ -209,13 +213,13 @@ class Disco:
         shift_steps = 0.0 if self._t0_ns is None else (t0_ns - self._t0_ns) * 1e-9 / settings.step_s
         self._t0_ns = t0_ns
         outcome, retries = self._improve(max(shift_steps, 0.0), before, system, first)
-        if outcome is Outcome.STOPPING:
+        if outcome is PlanOutcome.STOPPING:
             self._stop(now_ns, before)
         else:
             self._failing_since_ns = None
         wheel_speeds = self._optimiser.nominal()
         self._planned_from, self._elapsed_s = start, elapsed_s
-        return Plan(
+        return WheelPlan(
             t0_ns=t0_ns,
             step_s=settings.step_s,
             wheel_speeds=wheel_speeds,
@@ -223,14 +227,14 @@ class Disco:
             diagnostics=self._diagnostics(retries, outcome),
         )
 
-    def _diagnostics(self, retries: int, outcome: Outcome) -> Diagnostics:
+    def _diagnostics(self, retries: int, outcome: PlanOutcome) -> Diagnostics:
         ess, temperature, least, mean, nominal, valid = self._optimiser.report().values()
         collapsed = ess < self._settings.min_ess
         return Diagnostics(ess, temperature, least, mean, nominal, int(valid), retries, collapsed, outcome)
 
     def _improve(
         self, shift_steps: float, before: tuple[float, float], system: SkidSteer, first: bool
-    ) -> tuple[Outcome, int]:
+    ) -> tuple[PlanOutcome, int]:
         """Climb the ladder until a step is valid; returns how it went and the attempts beyond the first."""
         settings, optimiser = self._settings, self._optimiser
         retries = 0
@@ -239,15 +243,15 @@ class Disco:
         while retries < settings.retries and not (usable and optimiser.ess >= settings.min_ess):
             retries += 1
             usable = optimiser.step(0.0, gain, before, system, self._weights) or usable
-        outcome = Outcome.RETRIED if retries else Outcome.PLANNED
+        outcome = PlanOutcome.RETRIED if retries else PlanOutcome.PLANNED
         if not usable:
             optimiser.reset()
-            outcome = Outcome.RESTARTED
+            outcome = PlanOutcome.RESTARTED
             retries += 1
             usable = optimiser.step(0.0, 1.0, before, system, self._weights)
         if not usable:
-            return Outcome.STOPPING, retries
-        if first or outcome is Outcome.RESTARTED:
+            return PlanOutcome.STOPPING, retries
+        if first or outcome is PlanOutcome.RESTARTED:
             for _ in range(settings.iterations_at_start - 1):
                 optimiser.step(0.0, 1.0, before, system, self._weights)
         return outcome, retries
@@ -292,7 +296,7 @@ class Disco:
             return start
         count = math.ceil(gap_s / self._settings.step_s)
         run = FreeRun(self._model, self._mean_theta, gap_s / count)
-        past = past_commands(state.sent, t0_ns, gap_s / count, run.past_rows + count, (start[3], start[4]))
+        past = command_history(state.sent, t0_ns, gap_s / count, run.past_rows + count, (start[3], start[4]))
         states = run.states(start, past, run.past_rows, elapsed_s - gap_s)
         return np.asarray(states[-1])
 
@@ -304,14 +308,14 @@ class Disco:
         direction = (math.cos(yaw), math.sin(yaw)) if math.isfinite(yaw) else (math.nan, math.nan)
         self._start[:] = (x - origin_x, y - origin_y, *direction, left, right, elapsed_s, begin)
         if self._history:
-            self._past = past_commands(state.sent, t0_ns, self._settings.step_s, self._history, (left, right))
-            self._optimiser.set_past(self._past)
+            self._earlier = command_history(state.sent, t0_ns, self._settings.step_s, self._history, (left, right))
+            self._optimiser.set_command_history(self._earlier)
         if self._settings.uncertainty in ("mc", "joint"):
             self._draw_points()
         base, effects = self._tables
         each = True if self._own_draws else None
         return SkidSteer(
-            self._start, base, effects, each, self._ahead, self._scaled, self._unweighed, self._series, self._wide,
+            self._start, base, effects, each, self._ahead, self._scaled, self._skip_mean_cost, self._series, self._wide,
             task, self._history, self._wheels, self._wheels_differ,
         )  # fmt: skip
 
@@ -324,7 +328,7 @@ class Disco:
 
     def _with_past(self, wheel_speeds: Array) -> Array:
         """Commands from before the plan, then the plan: (history + T, 2)."""
-        return np.concatenate([self._past, wheel_speeds]) if self._history else wheel_speeds
+        return np.concatenate([self._earlier, wheel_speeds]) if self._history else wheel_speeds
 
     def sampled_rollouts(self, count: int = 50) -> Rollouts:
         """The last plan's `count` sequences of the largest weight, rolled out under the mean parameters.

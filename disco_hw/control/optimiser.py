@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.control.blocks import BLOCK, STATE_ROWS, aligned_zeros, block_count
-from disco_hw.control.commands import Basis, Limits
-from disco_hw.control.replan import ESS, SAMPLING, TEMPERATURE, Workspace, replan
+from disco_hw.control.kernel.blocks import BLOCK, STATE_ROWS, aligned_zeros, block_count
+from disco_hw.control.kernel.replan import ESS, SAMPLING, TEMPERATURE, Workspace, replan
+from disco_hw.control.kernel.sequences import Basis, Limits
 from disco_hw.control.settings import Sampler
 from disco_hw.control.spline import spline_basis
 from disco_hw.model.jit import compiled_for
@@ -110,7 +110,7 @@ class Optimiser:
         """Continue from this plan, (T, C)."""
         self._work.nominal[:] = commands
 
-    def set_past(self, past: Array) -> None:
+    def set_command_history(self, past: Array) -> None:
         """Set the commands before the plan, (history, C)."""
         blocks = self._work.commands
         blocks.reshape(len(blocks), -1, int(BLOCK))[:, : past.size] = past.reshape(-1, 1)

@@ -92,7 +92,7 @@ def mean_point(model: Model) -> Array:
     return model.complete(model.belief.mean()[None], model.belief.names)
 
 
-def twins(model: Model, points: Array, step_s: float, pairs: int) -> NDArray[np.int64]:
+def equivalent_points(model: Model, points: Array, step_s: float, pairs: int) -> NDArray[np.int64]:
     """For points (L, P), those that share one's rollout: (L, 2 * pairs), -1 for none, -2 for being such a twin.
 
     The first pair differs from the point in x_icr alone. The second one differs from it in wheel radius and axial
@@ -124,8 +124,8 @@ def twins(model: Model, points: Array, step_s: float, pairs: int) -> NDArray[np.
 
 
 def shared_pairs(model: Model, points: Array, step_s: float) -> int:
-    """Pairs of `twins` that these points have: 0, 1 or 2."""
-    return max((pairs for pairs in (1, 2) if np.any(twins(model, points, step_s, pairs) >= 0)), default=0)
+    """Pairs of `equivalent_points` that these points have: 0, 1 or 2."""
+    return max((pairs for pairs in (1, 2) if np.any(equivalent_points(model, points, step_s, pairs) >= 0)), default=0)
 
 
 def _wheel_coefficients(model: Model, points: Array, step_s: float) -> Array | None:

@@ -15,11 +15,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.control.blocks import BLOCK, U
+from disco_hw.control.kernel.blocks import BLOCK, U
+from disco_hw.control.kernel.random_numbers import cos_sin_half_turns
+from disco_hw.control.kernel.rollout import roll_block
 from disco_hw.control.optimiser import Optimiser
 from disco_hw.control.plan import NoValidControl
-from disco_hw.control.random_numbers import cos_sin_half_turns
-from disco_hw.control.rollout import roll_block
 from disco_hw.control.settings import Sampler
 from disco_hw.model.jit import block_function, cast_like, scalar_function, specialise, tune_loops
 

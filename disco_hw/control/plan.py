@@ -40,7 +40,7 @@ class PlannerState(msgspec.Struct, frozen=True, gc=False):
     elapsed_s: float | None = None
 
 
-class Outcome(enum.Enum):
+class PlanOutcome(enum.Enum):
     """How a plan came about: at once, after a retry, from scratch, or as a ramp to zero because nothing helped."""
 
     PLANNED = "planned"
@@ -65,10 +65,10 @@ class Diagnostics(msgspec.Struct, frozen=True):
     valid_samples: int
     retries: int = 0
     collapsed: bool = False
-    outcome: Outcome = Outcome.PLANNED
+    outcome: PlanOutcome = PlanOutcome.PLANNED
 
 
-class Plan(msgspec.Struct, frozen=True, eq=False):
+class WheelPlan(msgspec.Struct, frozen=True, eq=False):
     """Wheel speeds from `t0_ns` on, as a function of time.
 
     `wheel_speeds` (T, 2) rad/s, left and right: the mean over each step of `step_s`. `trajectory` (T + 1, 3): the pose

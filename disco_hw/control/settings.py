@@ -20,14 +20,14 @@ def _require(holds: bool, field: str, remedy: str) -> None:
 
 
 @dataclass(frozen=True, slots=True)
-class WheelLimits:
+class CommandLimits:
     """What a wheel may be asked for: speed (rad/s) and acceleration (rad/s^2)."""
 
     speed_rad_s: float
     acceleration_rad_s2: float = math.inf
 
     @classmethod
-    def of_robot(cls, robot: config.Robot) -> WheelLimits:
+    def of_robot(cls, robot: config.Robot) -> CommandLimits:
         """The limits of robot.toml."""
         return cls(robot.max_wheel_speed_rad_s, robot.max_wheel_acceleration_rad_s2)
 

@@ -33,7 +33,7 @@ def make_planner(config: RobotConfig, model: Model) -> control.Disco:
         model,
         task,
         control.DiscoSettings.from_config(config.control),
-        control.WheelLimits.of_robot(config.robot),
+        control.CommandLimits.of_robot(config.robot),
         config.control.seed,
     )
     planner.warm_up()

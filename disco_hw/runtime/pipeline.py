@@ -13,7 +13,7 @@ from typing import Protocol
 
 import msgspec
 
-from disco_hw.control import NoValidControl, Plan, PlannerState, Rollouts, SentCommand, Task
+from disco_hw.control import NoValidControl, PlannerState, Rollouts, SentCommand, Task, WheelPlan
 from disco_hw.estimation import Estimate, OdometryParameters, PoseFusion, PoseUpdate
 from disco_hw.model import Belief
 from disco_hw.runtime.governor import Governed, Governor
@@ -25,17 +25,17 @@ HISTORY_NS = 2_000_000_000
 class Planner(Protocol):
     """Whatever turns a state into a plan; DISCO is one."""
 
-    def plan(self, now_ns: int, state: PlannerState) -> Plan:
-        """Plan from the state; raises NoValidControl when there is nothing to execute."""
+    def plan(self, now_ns: int, state: PlannerState) -> WheelPlan:
+        """WheelPlan from the state; raises NoValidControl when there is nothing to execute."""
 
     def reset(self) -> None:
         """Forget the last plan, as at a new start."""
 
     def set_task(self, task: Task) -> None:
-        """Plan for another task of the same kind from the next reset on."""
+        """WheelPlan for another task of the same kind from the next reset on."""
 
     def set_belief(self, belief: Belief) -> None:
-        """Plan under this belief from the next plan on; raises ValueError, and keeps the old one, if it cannot."""
+        """WheelPlan under this belief from the next plan on; raises ValueError, and keeps the old one, if it cannot."""
 
     def sampled_rollouts(self, count: int) -> Rollouts:
         """The weightiest sequences of the last plan; changes nothing."""
@@ -44,7 +44,7 @@ class Planner(Protocol):
 class NoPlanner:
     """In the place of a planner where the robot is driven by hand: it never has a plan."""
 
-    def plan(self, _now_ns: int, _state: PlannerState) -> Plan:
+    def plan(self, _now_ns: int, _state: PlannerState) -> WheelPlan:
         """Raise NoValidControl."""
         raise NoValidControl("there is no planner: the robot is driven by hand")
 
@@ -109,7 +109,7 @@ class Tick(msgspec.Struct, frozen=True, gc=False):
     t_ns: int
     pose_updates: tuple[PoseUpdate, ...]
     estimate: Estimate
-    plan: Plan | None
+    plan: WheelPlan | None
     plan_age_ns: int | None
     planner_failure: str | None
     source: Source
@@ -133,7 +133,7 @@ class Pipeline:
         self._planner = planner
         self._governor = governor
         self._plan_tail_ns = round(plan_tail_s * 1e9)
-        self._plan: Plan | None = None
+        self._plan: WheelPlan | None = None
         self._plan_made_ns = 0
         self._following = False
         self._last_ns: int | None = None
@@ -150,7 +150,7 @@ class Pipeline:
         self._plan, self._following = None, False
 
     def set_belief(self, belief: Belief, odometry: OdometryParameters) -> None:
-        """Plan and estimate with another geometry from the next step on; plan and estimate in force stay.
+        """WheelPlan and estimate with another geometry from the next step on; plan and estimate in force stay.
 
         Raises ValueError, with everything as it was, if the planner cannot take the belief.
         """
@@ -194,7 +194,7 @@ class Pipeline:
             command=command,
         )
 
-    def _replan(self, now_ns: int, estimate: Estimate) -> tuple[Plan | None, str | None]:
+    def _replan(self, now_ns: int, estimate: Estimate) -> tuple[WheelPlan | None, str | None]:
         if not self._following:
             self._planner.reset()
             self._following = True
@@ -214,7 +214,7 @@ class Pipeline:
         self._plan, self._plan_made_ns = plan, now_ns
         return plan, None
 
-    def _wanted(self, now_ns: int, motion: Motion, new: Plan | None) -> tuple[Source, tuple[float, float]]:
+    def _wanted(self, now_ns: int, motion: Motion, new: WheelPlan | None) -> tuple[Source, tuple[float, float]]:
         match motion:
             case Off():
                 return Source.OFF, (0.0, 0.0)

@@ -23,7 +23,7 @@ def pendulum(
     as_json: AsJson = False,
 ) -> None:
     """Swing a pendulum up: true parameters; unscented transform and draws, each with prior and posterior."""
-    from disco_hw.control.experiments.pendulum import PendulumOptions, run_pendulum
+    from disco_hw.experiments.pendulum import PendulumOptions, run_pendulum
 
     refuse_directory(out)
     result = run_pendulum(PendulumOptions(seeds=seeds), progress_line)
@@ -51,7 +51,7 @@ def circle(
 ) -> None:
     """Drive the circle knowing the prior, the posterior, a point estimate, or the truth."""
     import disco_hw
-    from disco_hw.control.experiments.circle import CircleOptions, run_circle
+    from disco_hw.experiments.circle import CircleOptions, run_circle
     from disco_hw.runtime.robot_setup import load_setup
 
     if mode not in {"default", "paper"}:

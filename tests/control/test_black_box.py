@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from disco_hw.control import Circle, NoValidControl, Sampler, pendulum, reference
+from disco_hw.control import Circle, NoValidControl, Sampler, oracle, pendulum
 from disco_hw.control.black_box import BlackBoxDisco
 from disco_hw.control.parameter_points import drawn_points, unscented_points
 from disco_hw.control.pendulum import PAPER_SAMPLER
@@ -43,10 +43,10 @@ def test_costs_are_those_of_the_reference(each):
     commands = np.random.default_rng(1).uniform(-6.0, 6.0, (K, T, 2))
     got = costs_of(skid_steer(theta=theta, weights=weights), commands)
     start, past = physics.State(*START[:3], 0.0, 0.0), np.zeros((1, 2))
-    cost = reference.circle_cost(Circle().paper(), STEP_S)
+    cost = oracle.circle_cost(Circle().paper(), STEP_S)
     for row, point in zip(got, theta, strict=True):
         named = physics.theta_of(MODEL.parameter_names, point)
-        np.testing.assert_allclose(row, reference.point_costs(named, start, commands, past, STEP_S, cost), atol=1e-9)
+        np.testing.assert_allclose(row, oracle.point_costs(named, start, commands, past, STEP_S, cost), atol=1e-9)
 
 
 @pytest.mark.parametrize(("risk", "part"), [("mean", 1.0), ("cvar", 0.3), ("worst", 1e-9)])
@@ -54,7 +54,7 @@ def test_risk_is_that_of_the_reference(risk, part):
     costs = np.random.default_rng(2).gamma(2.0, size=(7, K))
     weights = np.random.default_rng(3).dirichlet(np.ones(7))
     disco = skid_steer(replace(SAMPLER, risk=risk, worst_part=max(part, 1e-3)), weights=weights)
-    expected = reference.mean_risk(costs, weights) if risk == "mean" else reference.cvar_risk(costs, weights, part)
+    expected = oracle.mean_risk(costs, weights) if risk == "mean" else oracle.cvar_risk(costs, weights, part)
     np.testing.assert_allclose(disco._combined(torch.as_tensor(costs)).numpy(), expected, rtol=1e-9)
 
 
@@ -62,9 +62,9 @@ def test_the_plan_is_the_weighted_mean_at_the_wanted_effective_sample_size():
     disco = skid_steer()
     noise = disco._noise().numpy()
     commands = np.clip(noise, -8.0, 8.0)
-    mean = reference.mean_risk(costs_of(disco, commands), WEIGHTS)
-    weights = reference.softmax_weights(mean, reference.temperature_for(mean, SAMPLER.target_ess))
-    np.testing.assert_allclose(disco.plan(START), reference.updated(commands, weights), atol=1e-6)
+    mean = oracle.mean_risk(costs_of(disco, commands), WEIGHTS)
+    weights = oracle.softmax_weights(mean, oracle.temperature_for(mean, SAMPLER.target_ess))
+    np.testing.assert_allclose(disco.plan(START), oracle.updated(commands, weights), atol=1e-6)
     assert disco.ess == pytest.approx(SAMPLER.target_ess, rel=1e-3)
     assert not noise[0].any()
 
@@ -76,9 +76,9 @@ def test_the_papers_control_cost_and_update_from_the_noise_as_drawn():
     nominal = disco.plan(START)
     shifted = np.vstack([nominal[1:], np.zeros((1, 2))])
     noise = disco._noise().numpy()
-    costs = reference.mean_risk(costs_of(disco, np.clip(shifted + noise, -2.0, 2.0)), WEIGHTS)
-    costs += reference.control_cost(shifted, noise, 3.0, 0.3)
-    expected = np.clip(shifted + reference.updated(noise, reference.softmax_weights(costs, 0.3)), -2.0, 2.0)
+    costs = oracle.mean_risk(costs_of(disco, np.clip(shifted + noise, -2.0, 2.0)), WEIGHTS)
+    costs += oracle.control_cost(shifted, noise, 3.0, 0.3)
+    expected = np.clip(shifted + oracle.updated(noise, oracle.softmax_weights(costs, 0.3)), -2.0, 2.0)
     np.testing.assert_allclose(disco.plan(START), expected, atol=1e-9)
 
 

@@ -10,22 +10,22 @@ import pytest
 
 from disco_hw.control import (
     Circle,
+    CommandLimits,
     Disco,
     DiscoSettings,
     NoValidControl,
-    Outcome,
     PlannerState,
+    PlanOutcome,
     Sampler,
     SentCommand,
-    WheelLimits,
 )
-from disco_hw.control.experiments.plant import Plant
-from disco_hw.control.replan import replan
+from disco_hw.control.kernel.replan import replan
+from disco_hw.experiments.plant import Plant
 from disco_hw.model import EffectSetting, Gaussian, load_model
 
 MODEL = load_model(Path(__file__).parents[2] / "disco_hw/robots/wombot_model.toml")
 MEAN = {"wheel_radius_m": 0.061, "axial_distance_m": 0.415, "x_icr_m": 0.238}
-LIMITS = WheelLimits(8.0, 20.0)
+LIMITS = CommandLimits(8.0, 20.0)
 TANGENT = PlannerState(0, 0.75, 0.0, math.pi / 2, 0.0, 0.0)
 PERIOD_NS = 100_000_000
 
@@ -84,7 +84,7 @@ def test_warming_up_changes_no_plan():
 
 
 def test_commands_stay_within_speed_and_acceleration():
-    disco = planner(task=Circle(speed_m_s=3.0), limits=WheelLimits(2.0, 1.0))
+    disco = planner(task=Circle(speed_m_s=3.0), limits=CommandLimits(2.0, 1.0))
     for t in range(20):
         plan = disco.plan(t * PERIOD_NS, TANGENT)
         assert np.abs(plan.wheel_speeds).max() <= 2.0 + 1e-5
@@ -93,7 +93,7 @@ def test_commands_stay_within_speed_and_acceleration():
 
 
 def test_the_first_command_is_tied_to_what_was_sent_and_to_the_measured_wheels():
-    disco = planner(task=Circle(speed_m_s=3.0), limits=WheelLimits(8.0, 5.0))
+    disco = planner(task=Circle(speed_m_s=3.0), limits=CommandLimits(8.0, 5.0))
     sent = (SentCommand(-PERIOD_NS, 4.0, 4.0),)
     rolling = disco.plan(0, msgspec.structs.replace(TANGENT, left_speed_rad_s=4.0, right_speed_rad_s=4.0, sent=sent))
     assert np.all(np.abs(rolling.wheel_speeds[0] - 4.0) <= 0.5 + 1e-5)
@@ -180,7 +180,7 @@ def test_own_draws_repeat_bit_for_bit():
 def test_paper_mode_stands_still_and_chatters_as_the_published_code_does():
     costs, changes = [], []
     for seed in range(1, 5):
-        disco = Disco(MODEL, Circle().paper(), DiscoSettings.paper(), WheelLimits(2.0 * math.pi), seed)
+        disco = Disco(MODEL, Circle().paper(), DiscoSettings.paper(), CommandLimits(2.0 * math.pi), seed)
         costs_of_drive, commands = drive(disco, 20.0, wheel_noise=0.05)
         costs.append(costs_of_drive[100:].mean())
         changes.append(np.abs(np.diff(commands, axis=0)).mean() / (2.0 * math.pi))
@@ -209,12 +209,12 @@ def test_a_collapse_is_tried_again_and_told():
     disco = planner(sampler=Sampler(temperature=1e-4), retries=2)
     found = disco.plan(0, TANGENT).diagnostics
     assert found.ess < 3.0
-    assert (found.collapsed, found.retries, found.outcome) == (True, 2, Outcome.RETRIED)
+    assert (found.collapsed, found.retries, found.outcome) == (True, 2, PlanOutcome.RETRIED)
 
 
 def test_a_healthy_step_is_neither_retried_nor_collapsed():
     found = planner().plan(0, TANGENT).diagnostics
-    assert (found.collapsed, found.retries, found.outcome) == (False, 0, Outcome.PLANNED)
+    assert (found.collapsed, found.retries, found.outcome) == (False, 0, PlanOutcome.PLANNED)
     assert found.ess == pytest.approx(20.0, rel=0.02)
     assert found.valid_samples == 400
     assert found.cost_min <= found.cost_mean
@@ -222,14 +222,14 @@ def test_a_healthy_step_is_neither_retried_nor_collapsed():
 
 @pytest.mark.parametrize("broken", [{"x_m": math.nan}, {"yaw_rad": math.inf}, {"x_m": math.inf}])
 def test_without_a_valid_control_it_ramps_to_zero_then_says_so_then_recovers(broken):
-    disco = planner(limits=WheelLimits(8.0, 10.0))
+    disco = planner(limits=CommandLimits(8.0, 10.0))
     sent = (SentCommand(-PERIOD_NS, 3.0, -2.0),)
     good = msgspec.structs.replace(TANGENT, left_speed_rad_s=3.0, right_speed_rad_s=-2.0, sent=sent)
     disco.plan(0, good)
     bad = msgspec.structs.replace(good, **broken)
     for t in (1, 3, 5):
         plan = disco.plan(t * PERIOD_NS, bad)
-        assert plan.diagnostics.outcome is Outcome.STOPPING
+        assert plan.diagnostics.outcome is PlanOutcome.STOPPING
         # Nothing of the last step that had samples is told of one that has none.
         assert (plan.diagnostics.ess, plan.diagnostics.valid_samples, plan.diagnostics.collapsed) == (0.0, 0, True)
         assert math.isnan(plan.diagnostics.cost_min)
@@ -240,7 +240,7 @@ def test_without_a_valid_control_it_ramps_to_zero_then_says_so_then_recovers(bro
         assert not plan.wheel_speeds[4:].any()
     with pytest.raises(NoValidControl, match=r"no command sequence had a finite cost for 0\.5 s"):
         disco.plan(7 * PERIOD_NS, bad)
-    assert disco.plan(8 * PERIOD_NS, good).diagnostics.outcome is not Outcome.STOPPING
+    assert disco.plan(8 * PERIOD_NS, good).diagnostics.outcome is not PlanOutcome.STOPPING
 
 
 def test_a_broken_plan_is_planned_anew():
@@ -248,7 +248,7 @@ def test_a_broken_plan_is_planned_anew():
     disco.plan(0, TANGENT)
     disco._optimiser.work.nominal[:] = np.nan
     plan = disco.plan(PERIOD_NS, TANGENT)
-    assert plan.diagnostics.outcome is Outcome.RESTARTED
+    assert plan.diagnostics.outcome is PlanOutcome.RESTARTED
     assert np.isfinite(plan.wheel_speeds).all()
 
 
@@ -279,7 +279,10 @@ def test_there_is_nothing_to_look_at_without_a_plan():
     assert len(disco.sampled_rollouts().weights) == 0
     disco.plan(0, TANGENT)
     assert len(disco.sampled_rollouts(7).weights) == 7
-    assert disco.plan(PERIOD_NS, msgspec.structs.replace(TANGENT, x_m=math.nan)).diagnostics.outcome is Outcome.STOPPING
+    assert (
+        disco.plan(PERIOD_NS, msgspec.structs.replace(TANGENT, x_m=math.nan)).diagnostics.outcome
+        is PlanOutcome.STOPPING
+    )
     assert len(disco.sampled_rollouts().weights) == 0
 
 
@@ -306,7 +309,7 @@ def test_a_belief_set_between_plans_keeps_the_plan_compiles_nothing_and_repeats(
         disco.set_belief(LEARNT)
         plans.append(disco.plan(20_000_000, msgspec.structs.replace(TANGENT, t_ns=20_000_000)))
         assert len(replan.signatures) == compiled
-        assert plans[1].diagnostics.outcome is Outcome.PLANNED
+        assert plans[1].diagnostics.outcome is PlanOutcome.PLANNED
         assert np.abs(plans[1].wheel_speeds - plans[0].wheel_speeds).max() < 1.0
         runs.append(plans[1].wheel_speeds)
     np.testing.assert_array_equal(*runs)

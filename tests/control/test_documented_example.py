@@ -16,7 +16,7 @@ def test_the_example_is_short_and_reaches_its_goal(capsys):
     assert capsys.readouterr().out.startswith("at ")
 
 
-def test_the_document_begins_with_the_reference():
+def test_the_document_begins_with_the_oracle():
     text = DOCUMENT.read_text("utf-8")
-    assert "reference.py" in text.splitlines()[2]
-    assert text.index("reference.py") < text.index("disco_hw.control.Disco")
+    assert "oracle.py" in text.splitlines()[2]
+    assert text.index("oracle.py") < text.index("disco_hw.control.Disco")

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from disco_hw.control.blocks import BLOCK
+from disco_hw.control.kernel.blocks import BLOCK
 from disco_hw.control.optimiser import FIRST_TEMPERATURE, Optimiser
 from disco_hw.control.pendulum import LARGEST_TORQUE_NM, PAPER_SAMPLER, STEP_S, PendulumTerms
 
@@ -112,7 +112,7 @@ def test_samples_can_be_worked_out_again_and_make_the_plan():
 def test_what_was_sent_before_lies_ahead_of_every_blocks_commands():
     found = optimiser(history=2)
     past = np.array([[0.5], [-0.25]])
-    found.set_past(past)
+    found.set_command_history(past)
     found.step(0.0, 1.0, (0.0,), pendulum(), WEIGHTS)
     rows = found.work.commands.reshape(-1, 2 + T, int(BLOCK))
     assert rows.shape[0] == 2

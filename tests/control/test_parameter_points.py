@@ -8,11 +8,11 @@ import pytest
 
 from disco_hw.control.parameter_points import (
     drawn_points,
+    equivalent_points,
     mean_point,
     moments,
     point_estimate,
     shared_pairs,
-    twins,
     unscented_points,
 )
 from disco_hw.model import EffectSetting, Gaussian, Mixture, Model, load_model
@@ -37,7 +37,7 @@ def test_unscented_points_carry_the_beliefs_moments_over_all_parameters():
 def test_two_points_differ_from_the_mean_in_x_icr_alone_and_two_in_scale_too():
     points, _ = unscented_points(PAPER, 0.5)
     assert shared_pairs(PAPER, points, STEP_S) == 2
-    found = twins(PAPER, points, STEP_S, 2)
+    found = equivalent_points(PAPER, points, STEP_S, 2)
     np.testing.assert_array_equal(found[0], [3, 6, 2, 5])
     np.testing.assert_array_equal(found[[2, 3, 5, 6]], np.full((4, 4), -2))
     np.testing.assert_array_equal(found[[1, 4]], np.full((2, 4), -1))
@@ -53,7 +53,7 @@ def test_behind_an_effect_on_the_body_no_point_is_another_at_a_scale(effect):
     model = replace(PAPER, effects=(LAG, EffectSetting(effect, values)))
     points, _ = unscented_points(model, 1.0)
     assert shared_pairs(model, points, STEP_S) == 1
-    np.testing.assert_array_equal(twins(model, points, STEP_S, 1)[0], [3, 6])
+    np.testing.assert_array_equal(equivalent_points(model, points, STEP_S, 1)[0], [3, 6])
 
 
 def test_effects_on_the_wheels_leave_the_scale_alone_and_believed_ones_keep_their_own_points():
@@ -62,7 +62,7 @@ def test_effects_on_the_wheels_leave_the_scale_alone_and_believed_ones_keep_thei
     model = Model(0.06, 0.4, effects=(LAG,), belief=belief)
     points, weights = unscented_points(model, 1.0)
     assert shared_pairs(model, points, STEP_S) == 2
-    found = twins(model, points, STEP_S, 2)
+    found = equivalent_points(model, points, STEP_S, 2)
     assert np.sum(found[:, 0] >= 0) == 1
     np.testing.assert_array_equal(points[found[0], 3], np.full(4, points[0, 3]))
     order = [model.parameter_names.index(name) for name in names]
@@ -74,7 +74,7 @@ def test_without_twins_there_are_none():
     model = Model(0.06, 0.4, belief=Gaussian(("wheel_radius_m",), np.array([0.06]), np.array([[1e-5]])))
     points, _ = unscented_points(model, 1.0)
     assert shared_pairs(model, points, STEP_S) == 0
-    np.testing.assert_array_equal(twins(model, points, STEP_S, 1), np.full((3, 2), -1))
+    np.testing.assert_array_equal(equivalent_points(model, points, STEP_S, 1), np.full((3, 2), -1))
 
 
 def test_points_at_the_end_of_their_range_are_no_twins():
@@ -83,7 +83,7 @@ def test_points_at_the_end_of_their_range_are_no_twins():
     model = replace(PAPER, belief=wide)
     points, _ = unscented_points(model, 1.0)
     assert points[:, 0].min() == 0.005
-    found = twins(model, points, STEP_S, 2)
+    found = equivalent_points(model, points, STEP_S, 2)
     for leader, group in enumerate(found):
         for twin in group[group >= 0]:
             assert points[twin, 0] / points[twin, 1] == pytest.approx(points[leader, 0] / points[leader, 1], rel=1e-9)

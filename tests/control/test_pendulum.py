@@ -8,8 +8,8 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from disco_hw.control import NoValidControl, pendulum, reference
-from disco_hw.control.blocks import BLOCK
+from disco_hw.control import NoValidControl, oracle, pendulum
+from disco_hw.control.kernel.blocks import BLOCK
 from disco_hw.control.pendulum import PAPER_SAMPLER, PendulumPlanner, PendulumPoints
 
 K, T = 160, 30
@@ -32,7 +32,7 @@ def within(theta, angle, speed, torques, got):
     nearby = (np.spacing(np.float32(math.pi)), np.spacing(np.float32(pendulum.LARGEST_SPEED_RAD_S)))
     for i, point in enumerate(theta):
         costs[i], *others = (
-            reference.pendulum_costs(*point, angle + a * nearby[0], speed + b * nearby[1], torques)
+            oracle.pendulum_costs(*point, angle + a * nearby[0], speed + b * nearby[1], torques)
             for a, b in ((0, 0), (1, 1), (1, -1))
         )
         spread[i] = np.abs(np.array(others) - costs[i]).max(axis=0)
@@ -54,10 +54,10 @@ def test_costs_and_update(theta, angle, speed, seed):
     torques = np.clip(shifted + noise, -pendulum.LARGEST_TORQUE_NM, pendulum.LARGEST_TORQUE_NM)
     got = planner.optimiser.work.point_costs.reshape(5, K)
     assert within(theta, wrapped, speed, torques, got).all()
-    total = reference.mean_risk(got.astype(float), weights)
-    total += reference.control_cost(shifted[:, None], noise[..., None], SAMPLER.noise_std, SAMPLER.control_cost_weight)
+    total = oracle.mean_risk(got.astype(float), weights)
+    total += oracle.control_cost(shifted[:, None], noise[..., None], SAMPLER.noise_std, SAMPLER.control_cost_weight)
     np.testing.assert_allclose(planner.optimiser.work.costs, total, rtol=1e-4, atol=1e-2)
-    share = reference.softmax_weights(planner.optimiser.work.costs.astype(float), SAMPLER.temperature)
+    share = oracle.softmax_weights(planner.optimiser.work.costs.astype(float), SAMPLER.temperature)
     expected = np.clip(shifted + share @ noise, -pendulum.LARGEST_TORQUE_NM, pendulum.LARGEST_TORQUE_NM)
     np.testing.assert_allclose(plan, expected, atol=1e-3)
 
@@ -69,7 +69,7 @@ def test_every_sample_may_have_its_own_parameters():
     torques = np.clip(drawn(planner.optimiser), -2.0, 2.0)
     got = planner.optimiser.work.point_costs.reshape(2, K)
     for k in (0, 79, 80, 159):
-        expected = [reference.pendulum_costs(*theta[i, k], math.pi, 0.0, torques[k : k + 1])[0] for i in range(2)]
+        expected = [oracle.pendulum_costs(*theta[i, k], math.pi, 0.0, torques[k : k + 1])[0] for i in range(2)]
         np.testing.assert_allclose(got[:, k], expected, rtol=2e-5)
 
 

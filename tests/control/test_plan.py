@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from disco_hw.control import Diagnostics, Plan
+from disco_hw.control import Diagnostics, WheelPlan
 
 SPEEDS = np.array([[0.0, 1.0], [2.0, 3.0], [4.0, -1.0]])
-PLAN = Plan(1_000_000_000, 0.1, SPEEDS, np.zeros((4, 3)), Diagnostics(20.0, 0.1, 1.0, 2.0, 1.5, 400))
+PLAN = WheelPlan(1_000_000_000, 0.1, SPEEDS, np.zeros((4, 3)), Diagnostics(20.0, 0.1, 1.0, 2.0, 1.5, 400))
 
 
 @pytest.mark.parametrize(

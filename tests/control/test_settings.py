@@ -5,7 +5,7 @@ import math
 import pytest
 
 from disco_hw.config import Control, Robot
-from disco_hw.control import DiscoSettings, Sampler, WheelLimits
+from disco_hw.control import CommandLimits, DiscoSettings, Sampler
 from disco_hw.control.settings import ROTATION
 
 
@@ -29,8 +29,8 @@ def test_from_config_takes_size_mode_and_uncertainty():
 
 def test_limits_of_the_robot():
     robot = Robot(name="r", wheel_radius_m=0.06, axial_distance_m=0.3, ticks_per_rev=1, max_wheel_speed_rad_s=7.0)
-    assert WheelLimits.of_robot(robot) == WheelLimits(7.0, 20.0)
-    assert WheelLimits(7.0).acceleration_rad_s2 == math.inf
+    assert CommandLimits.of_robot(robot) == CommandLimits(7.0, 20.0)
+    assert CommandLimits(7.0).acceleration_rad_s2 == math.inf
 
 
 @pytest.mark.parametrize(

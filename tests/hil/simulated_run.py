@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 import disco_hw
-from disco_hw.control import Plan, PlannerState
+from disco_hw.control import PlannerState, WheelPlan
 from disco_hw.control.plan import Diagnostics
 from disco_hw.daemon.loop import LoopStats
 from disco_hw.daemon.status import counters
@@ -79,7 +79,7 @@ class CirclingPlanner:
         self._nowhere = np.zeros((self.STEPS + 1, 3))
         self._found = Diagnostics(1.0, 1.0, 0.0, 0.0, 0.0, 1)
 
-    def plan(self, now_ns: int, state: PlannerState) -> Plan:
+    def plan(self, now_ns: int, state: PlannerState) -> WheelPlan:
         task = self._task
         bearing = math.atan2(state.y_m - task.center_y_m, state.x_m - task.center_x_m) + self.LOOK_AHEAD_RAD
         x_m, y_m = (
@@ -93,7 +93,7 @@ class CirclingPlanner:
         right = (speed + 0.5 * self._axial_m * turn) / self._radius_m
         speeds = np.empty((self.STEPS, 2))
         speeds[:] = (left, right)
-        return Plan(now_ns, 0.05, speeds, self._nowhere, self._found)
+        return WheelPlan(now_ns, 0.05, speeds, self._nowhere, self._found)
 
     def reset(self) -> None:
         pass

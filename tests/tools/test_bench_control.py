@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import torch
 
-from disco_hw.control import Circle, DiscoSettings, PlannerState, reference
+from disco_hw.control import Circle, DiscoSettings, PlannerState, oracle
 from disco_hw.control.parameter_points import unscented_points
 from disco_hw.model import load_model
-from disco_hw.model import reference as physics
+from disco_hw.model import oracle as physics
 from tools.bench_control import ROBOTS, beside_peer, torch_times_ms
 from tools.step_times import summary, times_ms, undisturbed
 
@@ -50,11 +50,11 @@ def test_the_peer_rolls_the_same_model_and_cost():
         total += mppi.running_cost(state, control)
     theta, weights = unscented_points(MODEL, settings.ut_alpha)
     start = physics.State(0.7, 0.1, 1.2, 0.0, 0.0)
-    cost = reference.circle_cost(circle, settings.step_s)
+    cost = oracle.circle_cost(circle, settings.step_s)
     expected = [
-        reference.point_costs(
+        oracle.point_costs(
             physics.theta_of(MODEL.parameter_names, point), start, commands, np.zeros((1, 2)), settings.step_s, cost
         )
         for point in theta
     ]
-    np.testing.assert_allclose(total.numpy(), reference.mean_risk(np.array(expected), weights), rtol=1e-5)
+    np.testing.assert_allclose(total.numpy(), oracle.mean_risk(np.array(expected), weights), rtol=1e-5)

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from disco_hw.config import CircleTask
-from disco_hw.control import Circle, reference
+from disco_hw.control import Circle, oracle
 from disco_hw.control.disco import Disco
-from disco_hw.control.experiments.plant import Plant
 from disco_hw.control.plan import PlannerState
-from disco_hw.control.settings import DiscoSettings, WheelLimits
+from disco_hw.control.settings import CommandLimits, DiscoSettings
+from disco_hw.experiments.plant import Plant
 from disco_hw.model import load_model
 from disco_hw.model import reference as physics
 
@@ -24,7 +24,7 @@ def sequence_cost(circle, start, left, right):
     """Cost of constant wheel speeds over the horizon, from a state."""
     commands = np.broadcast_to([left, right], (1, T, 2))
     past = np.zeros((1, 2))
-    return reference.point_costs(MEAN, start, commands, past, STEP_S, reference.circle_cost(circle, STEP_S))[0]
+    return oracle.point_costs(MEAN, start, commands, past, STEP_S, oracle.circle_cost(circle, STEP_S))[0]
 
 
 def on_circle():
@@ -71,7 +71,7 @@ def test_the_planner_leaves_the_traps(start):
     }
     place = places[start]
     plant = Plant(MEAN, place, 0.1, 0.0, 1)
-    disco = Disco(MODEL, Circle(), DiscoSettings(), WheelLimits(8.0, 20.0), 2)
+    disco = Disco(MODEL, Circle(), DiscoSettings(), CommandLimits(8.0, 20.0), 2)
     if start == "spinning":
         plant.wheels = (left, right)
         disco.plan(0, PlannerState(0, *place, left, right))
@@ -90,7 +90,7 @@ def test_the_planner_leaves_the_traps(start):
 
 def test_the_horizon_of_half_the_length_no_longer_ends_in_a_trap():
     plant = Plant(MEAN, (0.75, 0.0, math.pi / 2), 0.1, 0.0, 1)
-    disco = Disco(MODEL, Circle(), DiscoSettings(step_s=0.05), WheelLimits(8.0, 20.0), 2)
+    disco = Disco(MODEL, Circle(), DiscoSettings(step_s=0.05), CommandLimits(8.0, 20.0), 2)
     costs = []
     for step in range(200):
         now_ns = step * 100_000_000

@@ -7,9 +7,9 @@ import msgspec
 import numpy as np
 import pytest
 
-from disco_hw.control import Disco, DiscoSettings, Outcome, PlannerState, WheelLimits
-from disco_hw.control.experiments.plant import Plant
+from disco_hw.control import CommandLimits, Disco, DiscoSettings, PlannerState, PlanOutcome
 from disco_hw.control.tasks.path import Path, sharp_turns
+from disco_hw.experiments.plant import Plant
 from disco_hw.model import load_model
 from disco_hw.waypoints import Waypoints
 
@@ -23,7 +23,7 @@ CORNER = Waypoints(np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]]))
 def follow(task, seconds, start):
     """Drive along; returns poses (N, 3), speeds (N,) and places (N,) on the path."""
     plant = Plant(MEAN, start, 0.1, 0.0, 1)
-    disco = Disco(MODEL, task, DiscoSettings(), WheelLimits(8.0, 20.0), 2)
+    disco = Disco(MODEL, task, DiscoSettings(), CommandLimits(8.0, 20.0), 2)
     found = []
     for step in range(round(seconds * 10)):
         now_ns = step * 100_000_000
@@ -73,7 +73,7 @@ SPIN = 1.6 * MEAN["axial_distance_m"] / MEAN["wheel_radius_m"] / 2.0
 def test_the_planner_leaves_the_traps(trap):
     task = Path(ROUND, speed_m_s=0.2)
     plant = Plant(MEAN, (0.0, 0.0, 0.0), 0.1, 0.0, 1)
-    disco = Disco(MODEL, task, DiscoSettings(), WheelLimits(8.0, 20.0), 2)
+    disco = Disco(MODEL, task, DiscoSettings(), CommandLimits(8.0, 20.0), 2)
     if trap == "spinning":
         plant.wheels = (-SPIN, SPIN)
     # The trap is the plan that it starts from.
@@ -178,14 +178,14 @@ def test_a_path_without_length_is_refused():
 @pytest.mark.parametrize("broken", [{"x_m": math.nan}, {"y_m": -math.inf}, {"yaw_rad": math.nan}])
 @pytest.mark.parametrize("waypoints", [EIGHT, BACK, CORNER])
 def test_a_state_that_is_none_is_told_and_forgotten(waypoints, broken):
-    disco = Disco(MODEL, Path(waypoints), DiscoSettings(), WheelLimits(8.0, 20.0), 2)
+    disco = Disco(MODEL, Path(waypoints), DiscoSettings(), CommandLimits(8.0, 20.0), 2)
     good = PlannerState(0, 0.1, 0.0, 0.0, 0.0, 0.0)
     disco.plan(0, good)
     stopping = disco.plan(100_000_000, msgspec.structs.replace(good, t_ns=100_000_000, **broken))
-    assert stopping.diagnostics.outcome is Outcome.STOPPING
+    assert stopping.diagnostics.outcome is PlanOutcome.STOPPING
     assert np.isfinite(stopping.wheel_speeds).all()
     after = disco.plan(200_000_000, msgspec.structs.replace(good, t_ns=200_000_000))
-    assert after.diagnostics.outcome is Outcome.PLANNED
+    assert after.diagnostics.outcome is PlanOutcome.PLANNED
     assert after.diagnostics.valid_samples == 400
 
 

@@ -6,9 +6,9 @@ from pathlib import Path as FilePath
 import numpy as np
 import pytest
 
-from disco_hw.control import Disco, DiscoSettings, PlannerState, WheelLimits
-from disco_hw.control.experiments.plant import Plant
+from disco_hw.control import CommandLimits, Disco, DiscoSettings, PlannerState
 from disco_hw.control.tasks.timed_path import TimedPath
+from disco_hw.experiments.plant import Plant
 from disco_hw.model import load_model
 from disco_hw.waypoints import Waypoints
 
@@ -21,7 +21,7 @@ ROUND = Waypoints(np.column_stack([np.sin(ANGLE), 1.0 - np.cos(ANGLE)]), 5.0 + 4
 def test_places_are_reached_at_their_times_after_waiting_for_the_first():
     task = TimedPath(ROUND)
     plant = Plant(MEAN, (0.0, 0.0, 0.3), 0.1, 0.0, 1)
-    disco = Disco(MODEL, task, DiscoSettings(), WheelLimits(8.0, 20.0), 2)
+    disco = Disco(MODEL, task, DiscoSettings(), CommandLimits(8.0, 20.0), 2)
     off = []
     for step in range(350):
         now_ns = 10**12 + step * 100_000_000
@@ -40,7 +40,7 @@ SPIN = 1.6 * MEAN["axial_distance_m"] / MEAN["wheel_radius_m"] / 2.0
 def test_the_planner_leaves_the_traps(trap):
     task = TimedPath(Waypoints(ROUND.places_m, 4.0 * ANGLE))
     plant = Plant(MEAN, (0.0, 0.0, 0.0), 0.1, 0.0, 1)
-    disco = Disco(MODEL, task, DiscoSettings(), WheelLimits(8.0, 20.0), 2)
+    disco = Disco(MODEL, task, DiscoSettings(), CommandLimits(8.0, 20.0), 2)
     if trap == "spinning":
         plant.wheels = (-SPIN, SPIN)
     # The trap is the plan that it starts from.
@@ -59,7 +59,7 @@ def test_the_planner_leaves_the_traps(trap):
 def test_it_is_followed_forwards(yaw_rad):
     task = TimedPath(Waypoints(ROUND.places_m, 4.0 * ANGLE))
     plant = Plant(MEAN, (0.0, 0.0, yaw_rad), 0.1, 0.0, 1)
-    disco = Disco(MODEL, task, DiscoSettings(), WheelLimits(8.0, 20.0), 2)
+    disco = Disco(MODEL, task, DiscoSettings(), CommandLimits(8.0, 20.0), 2)
     speeds, off = [], []
     for step in range(200):
         now_ns = step * 100_000_000

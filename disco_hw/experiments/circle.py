@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 
 from disco_hw import config
 from disco_hw.control.disco import Disco
-from disco_hw.control.experiments.plant import Plant
 from disco_hw.control.plan import PlannerState, SentCommand
-from disco_hw.control.settings import ROTATION, DiscoSettings, WheelLimits
+from disco_hw.control.settings import ROTATION, CommandLimits, DiscoSettings
 from disco_hw.control.tasks.circle import Circle
 from disco_hw.errors import InputError
+from disco_hw.experiments.plant import Plant
 from disco_hw.model import Model, Uniform
 from disco_hw.model.parameter import BASE_PARAMETERS
 
@@ -190,7 +190,7 @@ def _knowing(name: str, model: Model, theta: dict[str, float]) -> Model:
 
 def planner_command(model: Model, task: Circle, settings: DiscoSettings, options: CircleOptions, seed: int) -> Command:
     """DISCO as a function from time (ns) and state to wheel speeds."""
-    limits = WheelLimits(options.largest_rot_s * ROTATION, options.largest_rot_s2 * ROTATION)
+    limits = CommandLimits(options.largest_rot_s * ROTATION, options.largest_rot_s2 * ROTATION)
     planner = Disco(model, task, settings, limits, seed)
     return lambda now_ns, state: planner.plan(now_ns, state).at(now_ns)
 

@@ -5,8 +5,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numba import njit
 
-from disco_hw.control.blocks import BLOCK, U
-from disco_hw.control.lanes import row_sum
+from disco_hw.control.kernel.blocks import BLOCK, U
+from disco_hw.control.kernel.lanes import row_sum
 
 B = int(BLOCK)
 

@@ -7,8 +7,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from disco_hw.control.blocks import BLOCK, U
-from disco_hw.control.commands import (
+from disco_hw.control.kernel.blocks import BLOCK, U
+from disco_hw.control.kernel.random_numbers import fill_normal_block
+from disco_hw.control.kernel.risk import mean_over_points, worst_over_points
+from disco_hw.control.kernel.rollout import roll_block
+from disco_hw.control.kernel.sequences import (
     add_control_cost,
     add_drawn_control_cost,
     add_weighted,
@@ -17,10 +20,7 @@ from disco_hw.control.commands import (
     pull_on_knots,
     sum_lanes,
 )
-from disco_hw.control.random_numbers import fill_normal_block
-from disco_hw.control.risk import mean_over_points, worst_over_points
-from disco_hw.control.rollout import roll_block
-from disco_hw.control.weighting import INVALID, refuse_invalid, temperature_for, weigh
+from disco_hw.control.kernel.weighting import INVALID, refuse_invalid, temperature_for, weigh
 from disco_hw.model.jit import block_function, float32, kernel_function
 
 ESS, TEMPERATURE, LEAST, MEAN, NOMINAL, VALID = range(6)

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-from disco_hw.control.blocks import BLOCK, U
-from disco_hw.control.lanes import row_sum
+from disco_hw.control.kernel.blocks import BLOCK, U
+from disco_hw.control.kernel.lanes import row_sum
 from disco_hw.model.jit import block_function, float32, scalar_function, tune_loops
 
 

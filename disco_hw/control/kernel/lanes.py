@@ -9,7 +9,7 @@ from llvmlite import ir  # type: ignore[import-untyped]
 from numba import types
 from numba.extending import intrinsic
 
-from disco_hw.control.blocks import BLOCK
+from disco_hw.control.kernel.blocks import BLOCK
 
 _intrinsic: Any = intrinsic
 _LANES = 16

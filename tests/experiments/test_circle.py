@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from disco_hw.control import Circle
-from disco_hw.control.experiments.circle import CURVES, CircleOptions, CircleResult, Run, drive, plants, run_circle
 from disco_hw.control.settings import ROTATION
 from disco_hw.errors import InputError
+from disco_hw.experiments.circle import CURVES, CircleOptions, CircleResult, Run, drive, plants, run_circle
 from disco_hw.model import Gaussian, load_model
 
 MODEL = load_model(Path(__file__).parents[3] / "disco_hw/robots/wombot_model.toml")

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from disco_hw.control.blocks import BLOCK, U
-from disco_hw.control.lanes import row_sum
+from disco_hw.control.kernel.blocks import BLOCK, U
+from disco_hw.control.kernel.lanes import row_sum
 from disco_hw.model.jit import block_function, float32, float_from_bits, int32, scalar_function, tune_loops
 
 _LOG2_E = np.float32(math.log2(math.e))

@@ -8,10 +8,10 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from disco_hw.control import Circle, Disco, DiscoSettings, PlannerState, Sampler, SentCommand, WheelLimits, reference
-from disco_hw.control.blocks import BLOCK
+from disco_hw.control import Circle, CommandLimits, Disco, DiscoSettings, PlannerState, Sampler, SentCommand, oracle
+from disco_hw.control.command_history import command_history
+from disco_hw.control.kernel.blocks import BLOCK
 from disco_hw.control.parameter_points import unscented_points
-from disco_hw.control.past import past_commands
 from disco_hw.control.spline import spline_basis
 from disco_hw.control.tasks.path import Path
 from disco_hw.control.tasks.timed_path import TimedPath
@@ -25,7 +25,7 @@ SAMPLES, HORIZON, STEP_S = 160, 50, 0.1
 RELATIVE = 1e-5
 SAMPLER = Sampler(samples=SAMPLES, horizon=HORIZON)
 PLAN_SETTINGS = DiscoSettings(sampler=SAMPLER, iterations_at_start=1, retries=0, gain_by_time=False)
-LIMITS = WheelLimits(8.0, 20.0)
+LIMITS = CommandLimits(8.0, 20.0)
 
 BASE = st.tuples(st.floats(0.02, 0.12), st.floats(0.2, 0.8), st.floats(-0.3, 0.4))
 STATES = st.tuples(
@@ -121,11 +121,11 @@ FEW = 0.1
 def sequence_cost(task, place):
     match task:
         case Circle():
-            return reference.circle_cost(task, STEP_S)
+            return oracle.circle_cost(task, STEP_S)
         case Path():
-            return reference.path_cost(task, place, STEP_S)
+            return oracle.path_cost(task, place, STEP_S)
         case TimedPath():
-            return reference.timed_path_cost(task, 0.0, STEP_S)
+            return oracle.timed_path_cost(task, 0.0, STEP_S)
 
 
 def check_against_reference(model, state, task, plan_settings, seed):
@@ -146,11 +146,11 @@ def check_against_reference(model, state, task, plan_settings, seed):
     anchor = np.array(disco._anchor(state))
     assert np.all(np.abs(anchor - (last.left_rad_s, last.right_rad_s)) <= 12.0)
     change = LIMITS.acceleration_rad_s2 * STEP_S
-    commands = reference.limited(before, spread, anchor, LIMITS.speed_rad_s, change)
+    commands = oracle.limited(before, spread, anchor, LIMITS.speed_rad_s, change)
 
     theta, point_weights = unscented_points(model, plan_settings.ut_alpha)
     weighed = point_weights != 0.0
-    past = past_commands(state.sent, now_ns, STEP_S, 8, (state.left_speed_rad_s, state.right_speed_rad_s))
+    past = command_history(state.sent, now_ns, STEP_S, 8, (state.left_speed_rad_s, state.right_speed_rad_s))
     start = physics.State(state.x_m, state.y_m, state.yaw_rad, state.left_speed_rad_s, state.right_speed_rad_s)
     cost = sequence_cost(task, disco._memory)
 
@@ -159,7 +159,7 @@ def check_against_reference(model, state, task, plan_settings, seed):
         begin = replace(start, x=start.x + x_m, y=start.y + y_m)
         return np.array(
             [
-                reference.point_costs(
+                oracle.point_costs(
                     physics.theta_of(names, point), begin, sequences, past, STEP_S, cost, time_s=state.elapsed_s
                 )
                 for point in theta[weighed]
@@ -185,13 +185,13 @@ def check_against_reference(model, state, task, plan_settings, seed):
         excused[apart] = beyond_single_precision(commands[apart])
     np.testing.assert_allclose(got[:, ~excused], expected[:, ~excused], atol=1e-4, rtol=RELATIVE)
 
-    mean = reference.mean_risk(np.where(excused, got, expected), point_weights[weighed])
+    mean = oracle.mean_risk(np.where(excused, got, expected), point_weights[weighed])
     np.testing.assert_allclose(work.costs[: sampler.samples], mean, atol=1e-4, rtol=RELATIVE)
     report = disco.optimiser.report()
     assert report["cost_nominal"] == pytest.approx(mean[0], abs=1e-4, rel=RELATIVE)
-    kernel_weights = reference.softmax_weights(work.costs[: sampler.samples].astype(float), report["temperature"])
-    assert report["ess"] == pytest.approx(reference.effective_sample_size(kernel_weights), rel=1e-3)
-    np.testing.assert_allclose(work.nominal, reference.updated(commands, kernel_weights), atol=2e-4)
+    kernel_weights = oracle.softmax_weights(work.costs[: sampler.samples].astype(float), report["temperature"])
+    assert report["ess"] == pytest.approx(oracle.effective_sample_size(kernel_weights), rel=1e-3)
+    np.testing.assert_allclose(work.nominal, oracle.updated(commands, kernel_weights), atol=2e-4)
 
 
 def test_every_effect_that_moves_the_robot_is_tried():

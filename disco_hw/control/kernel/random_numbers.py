@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from disco_hw.control.blocks import BLOCK, U
+from disco_hw.control.kernel.blocks import BLOCK, U
 from disco_hw.model.jit import (
     bits_of_float,
     block_function,

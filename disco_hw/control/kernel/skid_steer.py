@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from disco_hw.control.blocks import BLOCK, U
-from disco_hw.control.rollout import roll_block
+from disco_hw.control.kernel.blocks import BLOCK, U
+from disco_hw.control.kernel.rollout import roll_block
 from disco_hw.control.tasks.terms import follow, has_memory, looks_up, row_of, stage_cost, table_of, terminal_cost
 from disco_hw.model.compose import needs_change, wheels_follow
 from disco_hw.model.effects import command_delay
@@ -46,9 +46,9 @@ class SkidSteer(NamedTuple):
     `start` (8,): x, y relative to the task's origin (m), cos and sin of yaw, left and right wheel speed (rad/s), time
     (s), the task's memory. `base`, `effects`: coefficient tables of L points; `each` is None, or anything else if the
     tables hold points for every sample, (L, K'). `ahead`, `scaled` (L, 2) int or None: pairs of points that
-    share a point's rollout, as `parameter_points.twins` finds them. `unweighed`: None, or anything else if the first
-    point has no weight, so that it is rolled out for its twins alone and its cost is left as it is. `series` (8,),
-    `wide`: how a step is integrated.
+    share a point's rollout, as `parameter_points.equivalent_points` finds them. `skip_mean`: None, or anything else if
+    the first point has no weight, so that it is rolled out for its twins alone and its cost is left as it is. `series`
+    (8,), `wide`: how a step is integrated.
     `history`: rows of commands from before the plan. `wheels`: buffer of the wheels' motion, T * WHEEL_ROWS * BLOCK;
     `wheels_differ`: whether the points differ in how the wheels turn.
     """
@@ -59,7 +59,7 @@ class SkidSteer(NamedTuple):
     each: Any
     ahead: Any
     scaled: Any
-    unweighed: Any
+    skip_mean: Any
     series: Any
     wide: Any
     task: Any
@@ -178,12 +178,12 @@ def _look_up(table: Any, state: Any, own: Any) -> None:
 
 
 @scalar_function
-def _look_ups(looks: Any, state: Any, unweighed: Any, ahead: Any, scaled: Any, task: Any) -> None:
+def _look_ups(looks: Any, state: Any, skip_mean: Any, ahead: Any, scaled: Any, task: Any) -> None:
     """Look up for a point and its twins; nothing without a table."""
     if looks is None:
         return
     table = table_of(task)
-    if unweighed is None:
+    if skip_mean is None:
         _look_up(table, state, _OWN)
     if ahead is not None:
         _look_up(table, state, _TWIN0)
@@ -238,12 +238,12 @@ def _scaled_place(state: Any, b: Any, base: Any, twin: Any, start: Any) -> Any:
 
 @scalar_function
 def _follows(
-    looks: Any, state: Any, b: Any, base: Any, unweighed: Any, ahead: Any, scaled: Any, start: Any, task: Any
+    looks: Any, state: Any, b: Any, base: Any, skip_mean: Any, ahead: Any, scaled: Any, start: Any, task: Any
 ) -> None:
     """Move the memories of a point and its twins on; nothing without a table."""
     if looks is None:
         return
-    if unweighed is None:
+    if skip_mean is None:
         _follow(looks, state, _OWN, b, _place(state, b, base), task)
     if ahead is not None:
         _follow(looks, state, _TWIN0, b, _ahead_place(state, b, base, ahead[0], start), task)
@@ -255,10 +255,19 @@ def _follows(
 
 @scalar_function
 def _costs(
-    state: Any, b: Any, t: int, base: Any, unweighed: Any, ahead: Any, scaled: Any, start: Any, task: Any, last: Any
+    state: Any,
+    b: Any,
+    t: int,
+    base: Any,
+    skip_mean: Any,
+    ahead: Any,
+    scaled: Any,
+    start: Any,
+    task: Any,
+    last: Any,
 ) -> None:
     """Costs of step t under a point and its twins, pairs or None."""
-    if unweighed is None:
+    if skip_mean is None:
         _cost(state, _OWN, b, t, _place(state, b, base), task, last)
     if ahead is not None:
         _cost(state, _TWIN0, b, t, _ahead_place(state, b, base, ahead[0], start), task, last)
@@ -282,14 +291,14 @@ def _end(costs: Any, at: Any, state: Any, own: Any, task: Any) -> None:
 @block_function
 def _roll(
     costs: Any, at: Any, ahead_at: Any, scaled_at: Any, horizon: int, commands: Any, late: int, wheels: Any,
-    state: Any, start: Any, base: Any, unweighed: Any, ahead: Any, scaled: Any, effects: Any, integration: Any,
+    state: Any, start: Any, base: Any, skip_mean: Any, ahead: Any, scaled: Any, effects: Any, integration: Any,
     task: Any,
 ) -> None:  # fmt: skip
     """Roll the block out from `start` with its wheels turning as in `wheels`; writes `costs[at:at + BLOCK]`.
 
     `base` and `effects` hold numbers, or arrays whose entries from `at` on belong to the block's samples. Twins, the
     pairs `ahead` and `scaled` or None, are costed along with it, at `ahead_at` and `scaled_at`; they alone, where
-    `unweighed` is not None. A step is costed together with the next one's motion: neither waits for the other, which
+    `skip_mean` is not None. A step is costed together with the next one's motion: neither waits for the other, which
     saves a sixth of the time.
     """
     tune_loops()
@@ -298,13 +307,13 @@ def _roll(
         state[_AXLE_X + b], state[_AXLE_Y + b] = axle_of(x, y, cos_yaw, sin_yaw, lane_base(base, at + b))
         state[_COS + b] = cos_yaw
         state[_SIN + b] = sin_yaw
-        if unweighed is None:
+        if skip_mean is None:
             _begin(state, _OWN, b, start, task)
         _begin(state, _TWIN0, b, start, task)
         _begin(state, _TWIN1, b, start, task)
         _begin(state, _TWIN2, b, start, task)
         _begin(state, _TWIN3, b, start, task)
-    _look_ups(looks_up(task), state, unweighed, ahead, scaled, task)
+    _look_ups(looks_up(task), state, skip_mean, ahead, scaled, task)
     for t in range(horizon):
         time_s = start[6] + cast_like(t, x) * integration.step_s
         if t == 0:
@@ -313,20 +322,20 @@ def _roll(
                 _move(
                     state, b, _rolling(wheels, t, b, commands, late, horizon, acting), time_s, here, acting, integration
                 )  # fmt: skip
-                _follows(looks_up(task), state, b, here, unweighed, ahead, scaled, start, task)
+                _follows(looks_up(task), state, b, here, skip_mean, ahead, scaled, start, task)
         else:
             for b in range(BLOCK):
                 here, acting = lane_base(base, at + b), lane_effects(effects, at + b)
-                _costs(state, b, t - 1, here, unweighed, ahead, scaled, start, task, None)
+                _costs(state, b, t - 1, here, skip_mean, ahead, scaled, start, task, None)
                 _move(
                     state, b, _rolling(wheels, t, b, commands, late, horizon, acting), time_s, here, acting, integration
                 )  # fmt: skip
-                _follows(looks_up(task), state, b, here, unweighed, ahead, scaled, start, task)
-        _look_ups(looks_up(task), state, unweighed, ahead, scaled, task)
+                _follows(looks_up(task), state, b, here, skip_mean, ahead, scaled, start, task)
+        _look_ups(looks_up(task), state, skip_mean, ahead, scaled, task)
     for b in range(BLOCK):
-        _costs(state, b, horizon - 1, lane_base(base, at + b), unweighed, ahead, scaled, start, task, True)
+        _costs(state, b, horizon - 1, lane_base(base, at + b), skip_mean, ahead, scaled, start, task, True)
     # One after the other: a loop that wrote to all at once would not be vectorised.
-    if unweighed is None:
+    if skip_mean is None:
         _end(costs, at, state, _OWN, task)
     if ahead is not None:
         _end(costs, ahead_at[0], state, _TWIN0, task)
@@ -350,7 +359,7 @@ def _places(pair: Any, padded: int, lane: Any) -> Any:
 
 @block_function
 def _roll_points(
-    each: Any, unweighed: Any, ahead: Any, scaled: Any, system: Any, costs: Any, points: int, padded: int, block: int,
+    each: Any, skip_mean: Any, ahead: Any, scaled: Any, system: Any, costs: Any, points: int, padded: int, block: int,
     horizon: int, commands: Any, state: Any,
 ) -> None:  # fmt: skip
     integration = integration_from(system.series, system.wide)
@@ -370,20 +379,20 @@ def _roll_points(
         else:
             if (i == 0 or system.wheels_differ) and (needs_change(acting) or not wheels_follow(acting)):
                 _turn_wheels(wheels, at, horizon, commands, state, start, acting, late, integration.step_s)
-            alone = i > 0 or unweighed is None
+            alone = i > 0 or skip_mean is None
             if ahead is not None:
                 # Whatever leads twins beside the first point is costed in a rollout of its own.
-                alone = alone and (ahead[i, 0] == -1 or (unweighed is not None and ahead[i, 0] >= 0))
+                alone = alone and (ahead[i, 0] == -1 or (skip_mean is not None and ahead[i, 0] >= 0))
                 if ahead[i, 0] >= 0:
                     if scaled is None:
                         _roll(
                             costs, at, _places(ahead[i], padded, lane), None, horizon, commands, late, wheels, state,
-                            start, here, unweighed, _bases(system.base, ahead[i]), None, acting, integration, task,
+                            start, here, skip_mean, _bases(system.base, ahead[i]), None, acting, integration, task,
                         )  # fmt: skip
                     else:
                         _roll(
                             costs, at, _places(ahead[i], padded, lane), _places(scaled[i], padded, lane), horizon,
-                            commands, late, wheels, state, start, here, unweighed, _bases(system.base, ahead[i]),
+                            commands, late, wheels, state, start, here, skip_mean, _bases(system.base, ahead[i]),
                             _bases(system.base, scaled[i]), acting, integration, task,
                         )  # fmt: skip
             if alone:
@@ -404,7 +413,7 @@ def _roll_block(
         system: Any, costs: Any, points: Any, padded: Any, block: Any, horizon: Any, commands: Any, state: Any
     ) -> None:
         _roll_points(
-            system.each, system.unweighed, system.ahead, system.scaled, system, costs, points, padded, block, horizon,
+            system.each, system.skip_mean, system.ahead, system.scaled, system, costs, points, padded, block, horizon,
             commands, state,
         )  # fmt: skip
 

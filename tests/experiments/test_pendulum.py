@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from disco_hw.control import pendulum
-from disco_hw.control.experiments.pendulum import (
+from disco_hw.experiments.pendulum import (
     CURVES,
     POSTERIOR,
     PRIOR,

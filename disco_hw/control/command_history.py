@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from disco_hw.control.plan import SentCommand
 
 
-def past_commands(
+def command_history(
     sent: Sequence[SentCommand], end_ns: int, step_s: float, count: int, otherwise: tuple[float, float]
 ) -> NDArray[np.float64]:
     """Mean commands (count, 2) over the `count` steps that end at `end_ns`, oldest first.

@@ -6,9 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numba import njit
 
-from disco_hw.control import reference
-from disco_hw.control.blocks import BLOCK, aligned_zeros
-from disco_hw.control.weighting import INVALID, exp_nonpositive, refuse_invalid, temperature_for, weigh
+from disco_hw.control import oracle
+from disco_hw.control.kernel.blocks import BLOCK, aligned_zeros
+from disco_hw.control.kernel.weighting import INVALID, exp_nonpositive, refuse_invalid, temperature_for, weigh
 
 B = int(BLOCK)
 
@@ -61,10 +61,10 @@ def test_weights_are_the_softmax(costs, temperature):
     total, size = run_weigh(
         weights, scratch, padded, blocks, len(costs), np.float32(costs.min()), np.float32(temperature)
     )
-    expected = reference.softmax_weights(costs.astype(float), temperature)
+    expected = oracle.softmax_weights(costs.astype(float), temperature)
     np.testing.assert_allclose(weights[: len(costs)] / total, expected, atol=1e-5)
     assert not weights[len(costs) :].any()
-    assert size == pytest.approx(reference.effective_sample_size(expected), rel=1e-3)
+    assert size == pytest.approx(oracle.effective_sample_size(expected), rel=1e-3)
 
 
 @settings(max_examples=60, deadline=None)
@@ -76,7 +76,7 @@ def test_temperature_reaches_the_target_from_any_guess(seed, count, spread, targ
         np.float32(target), weights, scratch, padded, blocks, count, np.float32(costs.min()), guess
     )
     assert size == pytest.approx(target, rel=0.02)
-    expected = reference.softmax_weights(costs.astype(float), float(temperature))
+    expected = oracle.softmax_weights(costs.astype(float), float(temperature))
     np.testing.assert_allclose(weights[:count] / total, expected, atol=1e-4)
 
 

@@ -7,8 +7,8 @@ import pytest
 from numba import njit
 from numba.core.runtime import _nrt_python, rtsys
 
+from disco_hw.control.kernel.replan import replan, shift
 from disco_hw.control.pendulum import PAPER_SAMPLER, PendulumPlanner, PendulumPoints
-from disco_hw.control.replan import replan, shift
 
 STEPS = np.arange(10)[:, None]
 PLAN = np.sin(np.hstack([STEPS, STEPS + 1.0])).astype(np.float32)

@@ -5,8 +5,8 @@ import pytest
 from numba import njit
 from scipy import stats
 
-from disco_hw.control.blocks import BLOCK, aligned_zeros
-from disco_hw.control.random_numbers import cos_sin_half_turns, fill_normal_block, philox
+from disco_hw.control.kernel.blocks import BLOCK, aligned_zeros
+from disco_hw.control.kernel.random_numbers import cos_sin_half_turns, fill_normal_block, philox
 
 
 @njit

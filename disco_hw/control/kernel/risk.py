@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from disco_hw.control.blocks import BLOCK, U
+from disco_hw.control.kernel.blocks import BLOCK, U
 from disco_hw.model.jit import block_function, cast_like, tune_loops
 
 

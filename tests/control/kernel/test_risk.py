@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from numba import njit
 
-from disco_hw.control import reference
-from disco_hw.control.blocks import BLOCK, aligned_zeros
-from disco_hw.control.risk import mean_over_points, worst_over_points
+from disco_hw.control import oracle
+from disco_hw.control.kernel.blocks import BLOCK, aligned_zeros
+from disco_hw.control.kernel.risk import mean_over_points, worst_over_points
 
 B = int(BLOCK)
 
@@ -33,7 +33,7 @@ def test_mean_adds_to_what_is_there(case):
     costs = aligned_zeros(B)
     costs[:] = 1.0
     run_mean(costs, point_costs.ravel(), weights, 1)
-    np.testing.assert_allclose(costs, 1.0 + reference.mean_risk(point_costs, weights), rtol=1e-5)
+    np.testing.assert_allclose(costs, 1.0 + oracle.mean_risk(point_costs, weights), rtol=1e-5)
 
 
 @pytest.mark.parametrize("part", [0.05, 0.25, 0.6, 0.99])
@@ -41,7 +41,7 @@ def test_cvar_is_the_mean_of_the_worst_part(case, part):
     point_costs, weights = case
     costs = aligned_zeros(B)
     run_worst(costs, point_costs.ravel(), weights, 1, np.float32(part), np.zeros(7, np.int64))
-    np.testing.assert_allclose(costs, reference.cvar_risk(point_costs, weights, part), rtol=1e-5)
+    np.testing.assert_allclose(costs, oracle.cvar_risk(point_costs, weights, part), rtol=1e-5)
 
 
 def test_a_vanishing_part_is_the_worst_point(case):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from disco_hw.control.blocks import BLOCK, aligned_zeros, block_count
+from disco_hw.control.kernel.blocks import BLOCK, aligned_zeros, block_count
 
 
 @pytest.mark.parametrize(("size", "dtype"), [(1, np.float32), (80, np.float32), (33, np.float64), (7, np.int64)])

@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numba import njit
 
-from disco_hw.control import reference
-from disco_hw.control.blocks import BLOCK, U, aligned_zeros
-from disco_hw.control.commands import (
+from disco_hw.control import oracle
+from disco_hw.control.kernel.blocks import BLOCK, U, aligned_zeros
+from disco_hw.control.kernel.sequences import (
     Basis,
     Limits,
     add_control_cost,
@@ -97,7 +97,7 @@ def expanded(basis, noise, nominal, largest, change, before):
 def test_commands_are_plan_plus_noise_within_the_limits(basis, seed, largest, change, before):
     noise, over_time, nominal = drawn(basis, seed)
     commands = expanded(basis, noise, nominal, largest, change, before).reshape(HISTORY + T, C, B)
-    expected = reference.limited(nominal.astype(float), over_time, np.array(before), largest, change)
+    expected = oracle.limited(nominal.astype(float), over_time, np.array(before), largest, change)
     np.testing.assert_allclose(commands[HISTORY:].transpose(2, 0, 1), expected, atol=1e-5)
     assert np.all(commands[:HISTORY] == 77.0)
 
@@ -112,8 +112,8 @@ def test_the_control_cost_is_of_the_noise_as_applied():
     commands = expanded(SPLINE, noise, nominal, 1.5, 0.4, (0.2, -0.1))
     costs = np.ones(B, F32)
     run_control_cost(costs, commands, HISTORY, nominal, F32(0.7))
-    applied = reference.limited(nominal.astype(float), over_time, np.array([0.2, -0.1]), 1.5, 0.4) - nominal
-    np.testing.assert_allclose(costs, 1.0 + reference.control_cost(nominal, applied, 1.0, 0.7), atol=2e-4)
+    applied = oracle.limited(nominal.astype(float), over_time, np.array([0.2, -0.1]), 1.5, 0.4) - nominal
+    np.testing.assert_allclose(costs, 1.0 + oracle.control_cost(nominal, applied, 1.0, 0.7), atol=2e-4)
 
 
 @pytest.mark.parametrize("basis", [SPLINE, WHITE], ids=["spline", "white"])
@@ -121,7 +121,7 @@ def test_or_of_the_noise_as_drawn(basis):
     noise, over_time, nominal = drawn(basis, 5)
     costs, pull = np.ones(B, F32), np.full(noise.size // B, 9.0, F32)
     run_drawn_control_cost(costs, noise, pull, nominal, basis, F32(0.7))
-    np.testing.assert_allclose(costs, 1.0 + reference.control_cost(nominal, over_time, 1.0, 0.7), atol=2e-4)
+    np.testing.assert_allclose(costs, 1.0 + oracle.control_cost(nominal, over_time, 1.0, 0.7), atol=2e-4)
 
 
 def test_weighted_sums_over_blocks_skip_what_came_before():
