@@ -28,8 +28,8 @@ from disco_hw.control.sigma_points import sigma_points
 from disco_hw.control.torch_models import circle_cost, skid_steer_transition
 from disco_hw.experiments.circle import CircleOptions, CircleResult, Command, drive, planner_command, plants
 from disco_hw.experiments.pendulum import POSTERIOR
+from disco_hw.jit import block_function, float32, tune_loops
 from disco_hw.model import Model, load_model
-from disco_hw.model.jit import block_function, float32, tune_loops
 from disco_hw.runtime.assembly import make_planner
 from disco_hw.runtime.robot_setup import load_setup
 from tools.step_times import summary, times_ms, undisturbed

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from disco_hw.adaptation.coordinates import NAMES
 from disco_hw.adaptation.guard import Geometry
 from disco_hw.config import Prior
+from disco_hw.effects.effect import Channel
 from disco_hw.errors import InputError
 from disco_hw.log.records import BeliefChange
 from disco_hw.model import Gaussian, Model
-from disco_hw.model.effects import Channel
 from disco_hw.model.parameter import BASE_PARAMETERS
 
 Array = NDArray[np.float64]

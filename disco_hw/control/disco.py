@@ -22,8 +22,8 @@ from disco_hw.control.parameter_points import (
 from disco_hw.control.plan import Array, Diagnostics, NoValidControl, PlannerState, PlanOutcome, Rollouts, WheelPlan
 from disco_hw.control.settings import CommandLimits, DiscoSettings
 from disco_hw.control.tasks.task import Task
+from disco_hw.effects.effect import Channel
 from disco_hw.model import Belief, Model
-from disco_hw.model.effects import Channel
 from disco_hw.model.free_run import FreeRun
 from disco_hw.model.model import coefficient_tables
 from disco_hw.model.step import integration_series

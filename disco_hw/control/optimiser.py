@@ -13,7 +13,7 @@ from disco_hw.control.kernel.replan import ESS, SAMPLING, TEMPERATURE, Workspace
 from disco_hw.control.kernel.sequences import Basis, Limits
 from disco_hw.control.settings import Sampler
 from disco_hw.control.spline import spline_basis
-from disco_hw.model.jit import compiled_for
+from disco_hw.jit import compiled_for
 
 Array = NDArray[np.float64]
 FIRST_TEMPERATURE = 0.1

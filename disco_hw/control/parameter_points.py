@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.control.sigma_points import sigma_points
+from disco_hw.effects.effect import Channel
 from disco_hw.model import Belief, Mixture, Model
-from disco_hw.model.effects import Channel
 from disco_hw.model.parameter import BASE_PARAMETERS, X_ICR
 from disco_hw.model.terms import effect_of
 

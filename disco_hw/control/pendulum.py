@@ -21,7 +21,7 @@ from disco_hw.control.kernel.rollout import roll_block
 from disco_hw.control.optimiser import Optimiser
 from disco_hw.control.plan import NoValidControl
 from disco_hw.control.settings import Sampler
-from disco_hw.model.jit import block_function, cast_like, scalar_function, specialise, tune_loops
+from disco_hw.jit import block_function, cast_like, scalar_function, specialise, tune_loops
 
 Array = NDArray[np.float64]
 

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from disco_hw.effects.effect import Parameter
+from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.candidates import CANDIDATES, candidates_of
 from disco_hw.gap.channels import WheelChannel
 from disco_hw.gap.fit import inverse, sensitivity, solve
 from disco_hw.gap.search import Found
-from disco_hw.model.effects import REGISTRY
-from disco_hw.model.parameter import Parameter
 
 Array = NDArray[np.float64]
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.model.jit import kernel_function, scalar_function
+from disco_hw.jit import kernel_function, scalar_function
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -13,10 +13,10 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
+from disco_hw.effects.effect import Channel as Place
+from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.channels import BodyChannel, Channel, WheelChannel
 from disco_hw.gap.layout import Layout
-from disco_hw.model.effects import REGISTRY
-from disco_hw.model.effects import Channel as Place
 
 Array = NDArray[np.float64]
 Starts = tuple[tuple[float, ...], ...]

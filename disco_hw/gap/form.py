@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.candidates import CANDIDATES, indices
 from disco_hw.gap.channels import BodyChannel
 from disco_hw.gap.evidence import inflation
@@ -17,7 +18,6 @@ from disco_hw.gap.search import Found
 from disco_hw.gap.selection import Split
 from disco_hw.gap.terms import Term, WithTerms
 from disco_hw.gap.timeline import CELL_S
-from disco_hw.model.effects import REGISTRY
 
 Array = NDArray[np.float64]
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from disco_hw.gap.layout import BODY, WHEEL, body_effects, wheel_effects
 from disco_hw.gap.timeline import CELL_S
-from disco_hw.model.jit import kernel_function, scalar_function
+from disco_hw.jit import kernel_function, scalar_function
 from disco_hw.model.step import body_velocity, wheel_step
 
 # Half a turn in one cell that a short series is exact for: 20 rad/s of yaw rate.

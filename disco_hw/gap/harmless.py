@@ -11,11 +11,11 @@ from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from itertools import chain
 
+from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.held_out import WORSE, Errors, clearly_worse, worse_by
 from disco_hw.gap.outcome import Outcome
 from disco_hw.gap.report import REPORTED_HORIZON_S
 from disco_hw.gap.search import Found
-from disco_hw.model.effects import REGISTRY
 
 _MOST_CHANGES = 4
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from disco_hw.gap.layout import BODY
 from disco_hw.gap.timeline import CELL_S
-from disco_hw.model.jit import kernel_function
+from disco_hw.jit import kernel_function
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]

@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from disco_hw.effects.effect import Channel, Parameter
+from disco_hw.effects.registry import MOTION_EFFECTS, REGISTRY
 from disco_hw.gap.timeline import CELL_S
-from disco_hw.model.effects import MOTION_EFFECTS, REGISTRY, Channel
-from disco_hw.model.parameter import BASE_PARAMETERS, Parameter
+from disco_hw.model.parameter import BASE_PARAMETERS
 from disco_hw.model.step import Base, Effects
 
 Array = NDArray[np.float64]

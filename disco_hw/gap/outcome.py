@@ -10,6 +10,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from disco_hw.effects.effect import Channel
+from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.amend import with_terms_named
 from disco_hw.gap.blind_spots import BlindSpot, blind_spots, experiment_of
 from disco_hw.gap.candidates import CHANGE, candidates_of, indices, parameters_of
@@ -25,7 +27,6 @@ from disco_hw.gap.residue import left_over
 from disco_hw.gap.search import Found
 from disco_hw.gap.timeline import CELL_S, Timeline
 from disco_hw.gap.where import in_words, regimes
-from disco_hw.model.effects import REGISTRY, Channel
 
 Array = NDArray[np.float64]
 

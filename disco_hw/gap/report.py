@@ -6,11 +6,11 @@ import math
 from dataclasses import dataclass, field
 from typing import Any
 
+from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.blind_spots import BlindSpot
 from disco_hw.gap.held_out import WORSE, Errors, worse_by
 from disco_hw.gap.intervals import Estimate
 from disco_hw.model import Model
-from disco_hw.model.effects import REGISTRY
 
 REPORTED_HORIZON_S = 2.0
 STAGES = ("nominal", "refitted", "amended", "floor")

@@ -20,7 +20,7 @@ from disco_hw.gap.layout import WHEEL
 from disco_hw.gap.noise_fit import learn_body_noise, learn_wheel_noise, wheel_misfit
 from disco_hw.gap.timeline import CELL_S
 from disco_hw.gap.wheel_noise import WheelNoise, whiten_wheels
-from disco_hw.model.jit import kernel_function
+from disco_hw.jit import kernel_function
 
 Array = NDArray[np.float64]
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
-from disco_hw.model.jit import kernel_function, scalar_function
+from disco_hw.jit import kernel_function, scalar_function
 
 Array = NDArray[np.float64]
 

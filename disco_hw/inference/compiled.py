@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from disco_hw.model.jit import kernel_function
+from disco_hw.jit import kernel_function
 
 
 def parallel_kernel(function: Callable[..., Any]) -> Callable[..., Any]:

@@ -10,8 +10,9 @@ import inspect
 from collections.abc import Callable, Iterable
 from typing import Any
 
-from disco_hw.model.effects import REGISTRY, STEP_TERMS, Stage
-from disco_hw.model.jit import scalar_function
+from disco_hw.effects.effect import Stage
+from disco_hw.effects.registry import REGISTRY, STEP_TERMS
+from disco_hw.jit import scalar_function
 from disco_hw.model.terms import terms_need_change
 
 _WHEELS = (Stage.COMMAND, Stage.RESPONSE)

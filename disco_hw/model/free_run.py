@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.model.effects import command_delay
-from disco_hw.model.jit import compiled_for, kernel_function
+from disco_hw.effects import command_delay
+from disco_hw.jit import compiled_for, kernel_function
 from disco_hw.model.model import Model, coefficient_tables
 from disco_hw.model.step import axle_of, integration_from, integration_series, step, tracked_of
 from disco_hw.model.tables import base_point, effect_point

@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw import config
+from disco_hw.effects.effect import Effect, Parameter
+from disco_hw.effects.registry import MOTION_EFFECTS, REGISTRY
 from disco_hw.model.belief import Belief, Uniform
-from disco_hw.model.effects import MOTION_EFFECTS, REGISTRY, Effect
-from disco_hw.model.parameter import BASE_PARAMETERS, Parameter
+from disco_hw.model.parameter import BASE_PARAMETERS
 from disco_hw.model.step import Base, Effects
 from disco_hw.model.terms import COMMAND, TERMS, effect_of, table_entry
 

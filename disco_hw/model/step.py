@@ -15,9 +15,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from disco_hw.effects.registry import MOTION_EFFECTS
+from disco_hw.jit import cast_like, scalar_function
 from disco_hw.model.compose import body_terms, wheel_terms, world_terms
-from disco_hw.model.effects import MOTION_EFFECTS
-from disco_hw.model.jit import cast_like, scalar_function
 from disco_hw.model.terms import add_to_commands, add_to_velocity
 
 # A field for every effect that moves the robot: None where absent, else what the effect's `coefficients` returned; and

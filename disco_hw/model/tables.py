@@ -7,8 +7,8 @@ from typing import Any
 
 from numba import types
 
-from disco_hw.model.effects import MOTION_EFFECTS
-from disco_hw.model.jit import scalar_function, specialise
+from disco_hw.effects.registry import MOTION_EFFECTS
+from disco_hw.jit import scalar_function, specialise
 from disco_hw.model.step import Base, Effects
 from disco_hw.model.terms import terms_point
 

@@ -17,9 +17,9 @@ import numpy as np
 from numba import types
 from numpy.typing import NDArray
 
-from disco_hw.model.effects import REGISTRY, Channel, Effect, Stage
-from disco_hw.model.jit import cast_like, scalar_function, specialise
-from disco_hw.model.parameter import Parameter
+from disco_hw.effects.effect import Channel, Effect, Parameter, Stage
+from disco_hw.effects.registry import REGISTRY
+from disco_hw.jit import cast_like, scalar_function, specialise
 
 Array = NDArray[np.float64]
 Feature = Callable[..., Any]

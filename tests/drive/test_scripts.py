@@ -12,8 +12,8 @@ from disco_hw.config import CircleTask, Robot
 from disco_hw.drive.script import room_needed
 from disco_hw.drive.scripts import SCRIPTS, STEP_S, STEPS, make_script
 from disco_hw.drive.separating import SEPARATING
+from disco_hw.effects.registry import REGISTRY
 from disco_hw.errors import InputError
-from disco_hw.model.effects import REGISTRY
 
 
 def robot(top=8.0):

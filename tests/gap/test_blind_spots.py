@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
+from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.blind_spots import blind_spots
 from disco_hw.gap.channels import WheelChannel
 from disco_hw.gap.search import Found, body_moves, wheel_moves
 from disco_hw.gap.selection import Selector, Thresholds
 from disco_hw.gap.wheel_noise import WheelNoise
-from disco_hw.model.effects import REGISTRY
 from tests.gap.synthetic import GEOMETRY, body_channel, line_of
 
 

@@ -13,9 +13,8 @@ pytestmark = pytest.mark.long
 NEW_EFFECT = '''
 """Drag that grows with the speed squared: v -> v - k v^3."""
 
-from disco_hw.model.effects import Channel, Stage
-from disco_hw.model.jit import scalar_function
-from disco_hw.model.parameter import Parameter
+from disco_hw.effects.effect import Channel, Parameter, Stage
+from disco_hw.jit import scalar_function
 
 
 class SpeedDrag:

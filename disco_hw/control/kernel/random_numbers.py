@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from disco_hw.control.kernel.blocks import BLOCK, U
-from disco_hw.model.jit import (
+from disco_hw.jit import (
     bits_of_float,
     block_function,
     float32,

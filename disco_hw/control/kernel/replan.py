@@ -21,7 +21,7 @@ from disco_hw.control.kernel.sequences import (
     sum_lanes,
 )
 from disco_hw.control.kernel.weighting import INVALID, refuse_invalid, temperature_for, weigh
-from disco_hw.model.jit import block_function, float32, kernel_function
+from disco_hw.jit import block_function, float32, kernel_function
 
 ESS, TEMPERATURE, LEAST, MEAN, NOMINAL, VALID = range(6)
 

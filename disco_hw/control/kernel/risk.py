@@ -6,7 +6,7 @@ import math
 from typing import Any
 
 from disco_hw.control.kernel.blocks import BLOCK, U
-from disco_hw.model.jit import block_function, cast_like, tune_loops
+from disco_hw.jit import block_function, cast_like, tune_loops
 
 
 @block_function

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 from disco_hw.control.kernel.blocks import BLOCK, U
 from disco_hw.control.kernel.lanes import row_sum
-from disco_hw.model.jit import block_function, float32, scalar_function, tune_loops
+from disco_hw.jit import block_function, float32, scalar_function, tune_loops
 
 
 class Basis(NamedTuple):

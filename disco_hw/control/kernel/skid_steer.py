@@ -12,9 +12,8 @@ from typing import Any, NamedTuple
 from disco_hw.control.kernel.blocks import BLOCK, U
 from disco_hw.control.kernel.rollout import roll_block
 from disco_hw.control.tasks.terms import follow, has_memory, looks_up, row_of, stage_cost, table_of, terminal_cost
-from disco_hw.model.compose import needs_change, wheels_follow
-from disco_hw.model.effects import command_delay
-from disco_hw.model.jit import (
+from disco_hw.effects import command_delay
+from disco_hw.jit import (
     bits_of_float,
     block_function,
     cast_like,
@@ -23,6 +22,7 @@ from disco_hw.model.jit import (
     specialise,
     tune_loops,
 )
+from disco_hw.model.compose import needs_change, wheels_follow
 from disco_hw.model.step import axle_of, body_step, integration_from, tracked_of, wheel_step
 from disco_hw.model.tables import base_point, effect_point, lane_base, lane_effects
 

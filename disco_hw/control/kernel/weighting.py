@@ -12,7 +12,7 @@ import numpy as np
 
 from disco_hw.control.kernel.blocks import BLOCK, U
 from disco_hw.control.kernel.lanes import row_sum
-from disco_hw.model.jit import block_function, float32, float_from_bits, int32, scalar_function, tune_loops
+from disco_hw.jit import block_function, float32, float_from_bits, int32, scalar_function, tune_loops
 
 _LOG2_E = np.float32(math.log2(math.e))
 _LN2_HIGH = np.float32(0.693359375)

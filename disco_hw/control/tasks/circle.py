@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from disco_hw.config import CircleTask
 from disco_hw.control.tasks.task import Prepared
 from disco_hw.control.tasks.terms import has_memory, looks_up, stage_cost, terminal_cost
-from disco_hw.model.jit import cast_like, quick_norm, quick_norm_and_inverse, scalar_function, specialise
+from disco_hw.jit import cast_like, quick_norm, quick_norm_and_inverse, scalar_function, specialise
 
 # The radius over the distance from the centre below which progress stops growing.
 NEAR_CENTRE = 2.0

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from disco_hw.config import PathTask
 from disco_hw.control.tasks.task import Prepared
 from disco_hw.control.tasks.terms import follow, has_memory, looks_up, row_of, stage_cost, table_of, terminal_cost
-from disco_hw.model.jit import (
+from disco_hw.jit import (
     cast_like,
     int32,
     quick_length,

@@ -13,7 +13,7 @@ from disco_hw.config import TimedPathTask
 from disco_hw.control.tasks.path import AGAINST_M
 from disco_hw.control.tasks.task import Prepared
 from disco_hw.control.tasks.terms import has_memory, looks_up, stage_cost, terminal_cost
-from disco_hw.model.jit import cast_like, quick_norm, specialise
+from disco_hw.jit import cast_like, quick_norm, specialise
 from disco_hw.waypoints import Waypoints
 
 Array = NDArray[np.float64]

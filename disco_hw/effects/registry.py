@@ -1,4 +1,4 @@
-"""The effects a model can gain, one file each; a module of this package with an `EFFECT` is found by itself.
+"""All effects that a model can gain: every module beside this one that has an `EFFECT`, found by itself.
 
 So is one of another package that names it in the entry-point group `disco_hw.effects`.
 """
@@ -11,15 +11,14 @@ from importlib import import_module
 from types import MappingProxyType
 from typing import Any
 
-from disco_hw.model.effects.effect import Channel, Effect, Stage
-from disco_hw.model.plugins import plugin_modules
-
-__all__ = ["MOTION_EFFECTS", "REGISTRY", "STEP_TERMS", "Channel", "Effect", "Stage"]
+from disco_hw import effects
+from disco_hw.effects.effect import Effect, Stage
+from disco_hw.jit.plugins import plugin_modules
 
 
 def _discover() -> dict[str, tuple[Effect, Any]]:
-    names = (*(f"{__name__}.{found.name}" for found in pkgutil.iter_modules(__path__)), *plugin_modules())
-    modules = [module for module in map(import_module, names) if hasattr(module, "EFFECT")]
+    beside = (found.name for found in pkgutil.iter_modules(effects.__path__, f"{effects.__name__}."))
+    modules = [module for module in map(import_module, (*beside, *plugin_modules())) if hasattr(module, "EFFECT")]
     return {module.EFFECT.name: (module.EFFECT, module) for module in sorted(modules, key=lambda m: str(m.EFFECT.name))}
 
 

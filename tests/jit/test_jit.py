@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numba import config, njit
 
-from disco_hw.model.jit import block_function, kernel_function, tune_loops
+from disco_hw.jit import block_function, kernel_function, tune_loops
 
 PLANS = """
 from pathlib import Path

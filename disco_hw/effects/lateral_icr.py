@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from disco_hw.model.effects.effect import Array, Channel, Stage
-from disco_hw.model.jit import scalar_function
-from disco_hw.model.parameter import Parameter
+from disco_hw.effects.effect import Array, Channel, Parameter, Stage
+from disco_hw.jit import scalar_function
 
 
 class LateralIcr:

@@ -6,9 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from disco_hw.model.effects.effect import Array, Channel, Stage
-from disco_hw.model.jit import scalar_function
-from disco_hw.model.parameter import Parameter
+from disco_hw.effects.effect import Array, Channel, Parameter, Stage
+from disco_hw.jit import scalar_function
 
 
 class CommandDelay:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from disco_hw.model.effects.effect import Array, Channel, Stage
-from disco_hw.model.parameter import Parameter
+from disco_hw.effects.effect import Array, Channel, Parameter, Stage
 
 
 class PoseLatency:

@@ -17,7 +17,7 @@ from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler
 from numba.extending import intrinsic, overload
 
-from disco_hw.model.plugins import plugin_sources
+from disco_hw.jit.plugins import plugin_sources
 
 # No `nnan`, `ninf` (non-finite costs must stay visible), no `reassoc` (sums keep their order, so a run replays), no
 # `arcp` (a quotient by a root is exact but where `reciprocal_root` asks for an estimate).
@@ -80,7 +80,7 @@ def sources_fingerprint() -> str:
     """Hash of all Python sources that compiled code can come from."""
     package = Path(__file__).parents[1]
     digest = hashlib.sha256()
-    for folder in ("model", "control"):
+    for folder in ("jit", "effects", "model", "control"):
         for path in sorted((package / folder).rglob("*.py")):
             digest.update(path.read_bytes())
     for path in plugin_sources():

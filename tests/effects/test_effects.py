@@ -5,16 +5,10 @@ import math
 import numpy as np
 import pytest
 
+from disco_hw.effects import encoder_scale, heading_bias, pose_latency, pose_offset
+from disco_hw.effects.effect import Channel
+from disco_hw.effects.registry import MOTION_EFFECTS, REGISTRY
 from disco_hw.model import EffectSetting, Model, reference
-from disco_hw.model.effects import (
-    MOTION_EFFECTS,
-    REGISTRY,
-    Channel,
-    encoder_scale,
-    heading_bias,
-    pose_latency,
-    pose_offset,
-)
 from disco_hw.model.free_run import FreeRun
 
 NAMES = {

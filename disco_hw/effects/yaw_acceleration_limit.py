@@ -5,9 +5,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from disco_hw.model.effects.effect import Array, Channel, Stage
-from disco_hw.model.jit import cast_like, scalar_function
-from disco_hw.model.parameter import Parameter
+from disco_hw.effects.effect import Array, Channel, Parameter, Stage
+from disco_hw.jit import cast_like, scalar_function
 
 
 class YawAccelerationLimit:

@@ -3,14 +3,32 @@
 from __future__ import annotations
 
 import enum
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.model.parameter import Parameter
-
 Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """One number of theta.
+
+    `low` and `high` bound what is physically possible; `start` is a plausible value to begin a fit from and `starts`
+    are further ones for parameters whose likelihood has several hills; `neutral` is the value without any effect;
+    `realistic` is the smallest size that real robots show, None where that says nothing.
+    """
+
+    name: str
+    unit: str
+    low: float
+    high: float
+    start: float
+    neutral: float = 0.0
+    starts: tuple[float, ...] = ()
+    realistic: float | None = None
 
 
 class Channel(enum.Enum):
