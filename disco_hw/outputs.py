@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import numbers
 import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -47,17 +48,27 @@ def _refuse_place(path: Path) -> None:
 
 
 def as_json(result: Mapping[str, Any], indent: int | None = None) -> str:
-    """One JSON object; JSON knows no infinity and no NaN, so that what is no number is null."""
-    return json.dumps(_finite(result), indent=indent, allow_nan=False)
+    """One JSON object; JSON knows no infinity and no NaN, so that what is no number is null.
+
+    Scalars and arrays of numpy are written as the numbers they are. Raises TypeError for what JSON has no word for.
+    """
+    return json.dumps(_plain(result), indent=indent, allow_nan=False)
 
 
-def _finite(value: Any) -> Any:
+def _plain(value: Any) -> Any:
+    """The value in the types that `json` knows; numpy is recognised by its methods, as importing it takes long."""
     match value:
-        case float():
-            return value if math.isfinite(value) else None
-        case dict():
-            return {key: _finite(one) for key, one in value.items()}
+        case bool() | str() | None:
+            return value
+        case numbers.Integral():
+            return int(value)
+        case numbers.Real():
+            return float(value) if math.isfinite(value) else None
+        case Mapping():
+            return {_plain(key): _plain(one) for key, one in value.items()}
         case list() | tuple():
-            return [_finite(one) for one in value]
+            return [_plain(one) for one in value]
+        case _ if hasattr(value, "tolist"):
+            return _plain(value.tolist())
         case _:
             return value

@@ -90,7 +90,8 @@ def _limit(found: Found, name: str, top_rad_s: float | None) -> BlindSpot:
     largest = _largest(wheels, name)
     enough = 0.0 if top_rad_s is None else _MOST_OF_IT * top_rad_s
     if name == "yaw_rate_limit":
-        turning = math.inf if top_rad_s is None else enough * 2.0 * wheels.geometry[0] / wheels.geometry[1]
+        radius, axial = wheels.geometry[:2].tolist()
+        turning = math.inf if top_rad_s is None else enough * 2.0 * radius / axial
         enough = min(turning, _REALISTIC_YAW_RATE_RAD_S)
     blind = largest is None or largest < enough
     return BlindSpot(name, parameter.name, parameter.unit, largest, blind, experiment_of(name))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -62,7 +62,7 @@ class ReplayReport:
 
     def as_dict(self) -> dict[str, Any]:
         """The report for machines."""
-        return {"ok": self.ok, **msgspec.to_builtins(self)}
+        return {"ok": self.ok, **asdict(self)}
 
     def as_text(self) -> str:
         """The report for a person."""

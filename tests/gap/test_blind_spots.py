@@ -91,3 +91,14 @@ def test_no_limit_shows_above_what_was_asked_of_the_robot():
     assert not spots_at(-2.0, 2.0, 2.5)["yaw_rate_limit"].blind
     # Without knowing what the robot can do, a speed limit above what was asked cannot be called hidden.
     assert not spots_at(3.0, 5.0, None)["speed_limit"].blind
+
+
+@pytest.mark.parametrize("top_rad_s", [0.5, 2.0, 5.0, 8.0, 50.0, None])
+def test_whether_a_drive_is_blind_is_a_plain_truth_value_however_slowly_the_robot_turns(top_rad_s):
+    geometry = np.array(GEOMETRY)
+    for speeds in ((0.0, 0.0), (4.0, 4.0), (-1.5, 1.5), (-40.0, 40.0)):
+        channel = WheelChannel.build(line_of(np.full((4000, 2), speeds)), WheelNoise(), geometry)
+        found = Found(Selector(channel, wheel_moves(channel, geometry)), (), channel)
+        for spot in blind_spots(found, top_rad_s):
+            assert type(spot.blind) is bool, spot.name
+            assert spot.smallest_visible is None or type(spot.smallest_visible) is float, spot.name
