@@ -47,7 +47,7 @@ class Prior(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 
 
 class Link(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """How the robot is reached."""
+    """How the robot is reached; `options` go to the python-can interface as they are."""
 
     driver: Literal["reference"] = "reference"
     kind: Literal["can", "serial"] = "can"
@@ -56,6 +56,9 @@ class Link(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
     bitrate: Annotated[int, Meta(ge=10_000, le=1_000_000)] = 500_000
     port: str = "/dev/ttyUSB0"
     baud: Annotated[int, Meta(ge=9600, le=4_000_000)] = 921_600
+    options: dict[str, Any] = {}
+    dtr: bool = False
+    rts: bool = False
     key_file: str | None = None
 
 

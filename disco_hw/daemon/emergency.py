@@ -21,7 +21,8 @@ from disco_hw.config import Link
 from disco_hw.daemon.control_client import send_request
 from disco_hw.daemon.control_socket import default_socket_path
 from disco_hw.errors import InputError
-from drivers.transport import open_transport
+from drivers.transport import SerialMedium, open_transport
+from drivers.transport.serial import open_port
 from drivers.types import Frame, LinkState, OutgoingFrame
 from firmware_protocol.codec import Codec, Decoded
 from firmware_protocol.serial_framing import FrameDecoder, encode_frame
@@ -127,7 +128,11 @@ def _socket_path(raw: dict[str, Any]) -> Path | None:
 
 def _stop_over_can(settings: Link, frame: Frame) -> bool:
     transport = open_transport(
-        kind="can", interface=settings.interface, channel=settings.channel, bitrate=settings.bitrate
+        kind="can",
+        interface=settings.interface,
+        channel=settings.channel,
+        bitrate=settings.bitrate,
+        options=settings.options,
     )
     try:
         deadline_ns = time.monotonic_ns() + round(_CONNECT_S * 1e9)
@@ -146,7 +151,8 @@ def _stop_over_can(settings: Link, frame: Frame) -> bool:
 
 def _stop_over_serial(settings: Link, frame: Frame) -> bool:
     # Not exclusive: the daemon may hold the port, and must not be able to keep the stop from the robot.
-    with serial.serial_for_url(settings.port, baudrate=settings.baud, timeout=0.01, write_timeout=0.5) as port:
+    medium = SerialMedium(settings.port, settings.baud, settings.dtr, settings.rts)
+    with open_port(medium, timeout_s=0.01, write_timeout_s=0.5, exclusive=False) as port:
         # The delimiter ends whatever frame another sender may be in the middle of.
         port.write(b"\0" + _REPEATS * encode_frame(frame.can_id, frame.data))
         port.flush()

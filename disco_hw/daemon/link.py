@@ -16,8 +16,11 @@ def make_link(setup: Setup) -> ReconnectingTransport:
             interface=link.interface,
             channel=link.channel,
             bitrate=link.bitrate,
+            options=link.options,
             port=link.port,
             baud=link.baud,
+            dtr=link.dtr,
+            rts=link.rts,
         )
     except TransportSettingsError as error:
         raise InputError(f"{setup.robot_file}: {error}") from None

@@ -5,8 +5,8 @@ from __future__ import annotations
 import errno
 import socket
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,8 @@ import can
 from drivers.transport.can_errors import decode_error_frame
 from drivers.transport.counters import Counters
 from drivers.transport.explain import error_number, explain_can
-from drivers.transport.reconnecting import LinkLostError, TransmitBusyError
+from drivers.transport.own_frames import OwnFrames
+from drivers.transport.reconnecting import LinkLostError, LinkMuteError, TransmitBusyError
 from drivers.types import Frame, ReceivedFrame
 from firmware_protocol.serial_framing import MAX_CAN_ID, MAX_DATA
 
@@ -24,18 +25,23 @@ WRITE_TIMEOUT_S = 0.05
 MAX_STAMP_AGE_S = 1.0
 GARBAGE_LIMIT = 50
 _INTERFACE_UP_FLAG = 0x1
+_PROBE_TIMEOUT_S = 1.0
+_ECHO_OPTION = "receive_own_messages"
+_ECHOING_INTERFACES = frozenset({"udp_multicast"})
 
 
 @dataclass(frozen=True, slots=True)
 class CanMedium:
     """A CAN bus by python-can's interface name: "socketcan", "slcan", "unixcan", "virtual" and all others.
 
-    `bitrate` is in bit/s; a socketcan interface has its own, set by `ip link`.
+    `bitrate` is in bit/s; a socketcan interface has its own, set by `ip link`. `options` go to the python-can interface
+    as they are.
     """
 
     interface: str
     channel: str
     bitrate: int
+    options: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def name(self) -> str:
@@ -52,12 +58,19 @@ class CanMedium:
         if self.interface == "slcan":
             # Its default is two seconds for boards that restart when the port opens; it polls at 1 kHz as well.
             options |= {"sleep_after_open": 0.0, "timeout": READ_TIMEOUT_S}
+        options |= self.options
+        if self.interface == "socketcand":
+            require_server(str(options["host"]), int(options["port"]))
         # Without ignore_config a file in the user's home could change what is opened.
         bus = can.Bus(interface=self.interface, channel=self.channel, ignore_config=True, **options)
-        return CanConnection(bus, counters)
+        echoes = self.interface in _ECHOING_INTERFACES or bool(self.options.get(_ECHO_OPTION))
+        return CanConnection(bus, counters, OwnFrames() if echoes else None)
 
     def explain(self, error: Exception) -> str:
         """Say in one line what the error means and what to do."""
+        if isinstance(error, LinkMuteError):
+            where = "the adapter (its number may have changed: name it as in /dev/serial/by-id)"
+            return f"{self.name}: {error}; check the robot's power, the bit rate and {where}"
         if isinstance(error, LinkLostError):
             return f"{self.name}: {error}"
         return explain_can(self.interface, self.channel, self.bitrate, error)
@@ -69,9 +82,11 @@ class CanConnection:
     Whether a frame "is_rx" is not asked: on a virtual CAN every frame of another local process says it is not.
     """
 
-    def __init__(self, bus: can.BusABC, counters: Counters) -> None:
+    def __init__(self, bus: can.BusABC, counters: Counters, own: OwnFrames | None = None) -> None:
+        """`own`: of a bus that hands a sender its own frames, which then are not received."""
         self._bus = bus
         self._counters = counters
+        self._own = own
         self._garbage = 0
 
     def read(self) -> Sequence[ReceivedFrame]:
@@ -105,15 +120,21 @@ class CanConnection:
             self._counters.add(malformed=1)
             return ()
         self._garbage = 0
-        t_ns = monotonic_stamp_ns(message.timestamp, wall_now_ns, now_ns)
-        return (ReceivedFrame(t_ns, Frame(message.arbitration_id, data)),)
+        frame = Frame(message.arbitration_id, data)
+        if self._own is not None and self._own.is_echo(now_ns, frame):
+            return ()
+        return (ReceivedFrame(monotonic_stamp_ns(message.timestamp, wall_now_ns, now_ns), frame),)
 
     def write(self, frame: Frame) -> None:
         """Send one frame, waiting 0.05 s at most; raises TransmitBusyError if there was no room."""
         message = can.Message(arbitration_id=frame.can_id, data=frame.data, is_extended_id=False, check=True)
+        if self._own is not None:
+            self._own.sent(time.monotonic_ns(), frame)
         try:
             self._bus.send(message, timeout=WRITE_TIMEOUT_S)
         except (can.CanError, OSError) as error:
+            if self._own is not None:
+                self._own.not_sent(frame)
             if is_busy(error):
                 raise TransmitBusyError(str(error)) from error
             raise
@@ -173,6 +194,11 @@ def is_busy(error: Exception) -> bool:
             return True
         seen = seen.__cause__
     return False
+
+
+def require_server(host: str, port: int) -> None:
+    """Raise OSError where nothing listens; python-can would try again without a pause for ten seconds."""
+    socket.create_connection((host, port), _PROBE_TIMEOUT_S).close()
 
 
 def require_working_interface(channel: str, sysfs: Path = Path("/sys/class/net")) -> None:

@@ -4,7 +4,13 @@ from __future__ import annotations
 
 import errno
 
+import can
+
+_NOT_HERE = (can.CanInterfaceNotImplementedError, ImportError, NameError)
 _GONE = (errno.ENOENT, errno.ENODEV, errno.ENXIO, errno.EIO)
+
+
+_OVER_A_TTY = ("slcan", "serial", "seeedstudio", "robotell")
 
 
 def error_number(error: BaseException) -> int | None:
@@ -31,14 +37,24 @@ def explain_port(port: str, error: BaseException) -> str:
     return f"{port}: {_plain(error)}"
 
 
+def explain_mute(port: str, error: BaseException) -> str:
+    """Say what to look at when a serial port is open and nothing comes from it."""
+    return (
+        f"{port}: {error}; is the robot switched on, and is this its port? Adapters change their numbers: name it as "
+        "in /dev/serial/by-id. Some USB boards speak only with link.dtr = true"
+    )
+
+
 def explain_can(interface: str, channel: str, bitrate: int, error: BaseException) -> str:
     """Say what went wrong with a CAN bus and what to do about it."""
     number = error_number(error)
     where = f"{interface} {channel}"
-    if interface == "slcan":
-        if number is not None:
-            return explain_port(channel, error)
-        return f"{where}: {_plain(error)}"
+    if isinstance(error, TypeError):
+        return f"{where}: link.options do not fit this interface ({error}); correct them"
+    if isinstance(error, _NOT_HERE):
+        return f"{where}: cannot be used here ({_plain(error)}); install its maker's driver, or use another interface"
+    if type(error).__name__ == "NoBackendError":
+        return f"{where}: libusb is missing; run: sudo apt-get install libusb-1.0-0"
     if interface == "socketcan":
         virtual = channel.startswith("vcan")
         bring_up = f"sudo ip link set {channel} up" + ("" if virtual else f" type can bitrate {bitrate}")
@@ -52,6 +68,8 @@ def explain_can(interface: str, channel: str, bitrate: int, error: BaseException
             return f"{where}: this kernel has no CAN; load it with: sudo modprobe can_raw, or use another interface"
         if number == errno.ENOBUFS:
             return f"{where}: transmit queue full; is anybody else on the bus? (ip -details link show {channel})"
+    if interface in _OVER_A_TTY and number is not None:
+        return explain_port(channel, error)
     if number in (errno.ENOENT, errno.ECONNREFUSED):
         return f"{where}: nothing listens there; start the other end first"
     return f"{where}: {_plain(error)}"

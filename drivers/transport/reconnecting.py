@@ -23,6 +23,7 @@ TRANSMIT_CAPACITY = 64
 _BUSY_RETRY_S = 0.001
 _DRAIN_S = 0.1
 _JOIN_S = 1.0
+_MOST_PATIENT_S = 30.0
 
 
 class TransmitBusyError(Exception):
@@ -31,6 +32,10 @@ class TransmitBusyError(Exception):
 
 class LinkLostError(Exception):
     """The medium said that it is gone; the message is for a person."""
+
+
+class LinkMuteError(LinkLostError):
+    """The medium is open and nothing comes from it."""
 
 
 class Connection(Protocol):
@@ -67,9 +72,15 @@ class ReconnectingTransport:
     in the order of CAN identifiers, and is dropped when its deadline has passed or when it does not fit the queue.
     """
 
-    def __init__(self, medium: Medium, *, backoff: BackoffPolicy = DEFAULT_BACKOFF) -> None:
+    def __init__(
+        self, medium: Medium, *, backoff: BackoffPolicy = DEFAULT_BACKOFF, mute_after_s: float | None = None
+    ) -> None:
+        """`mute_after_s`: a link on which no frame comes for so long is closed and connected again; None: never."""
         self._medium = medium
         self._backoff = backoff
+        self._mute_after_s = mute_after_s
+        self._patience_s = mute_after_s
+        self._mute_words: str | None = None
         self._counters = Counters()
         self._changed = threading.Condition()
         self._writing = threading.Lock()
@@ -106,7 +117,10 @@ class ReconnectingTransport:
 
     @property
     def last_error(self) -> str | None:
-        """The newest error with its remedy, or None if there was none since the link last came up."""
+        """The newest error with its remedy, or None if there was none since the link last came up.
+
+        That it was mute, and so was connected again, is said until a frame comes.
+        """
         return self._last_error
 
     def open(self) -> None:
@@ -180,17 +194,35 @@ class ReconnectingTransport:
             self._stop.wait(delay_s)
 
     def _pump(self, connection: Connection) -> None:
+        heard_ns = time.monotonic_ns()
         while not (self._stop.is_set() or self._lost.is_set()):
             try:
                 frames = connection.read()
+                if not frames:
+                    self._refuse_silence(heard_ns)
             except Exception as error:  # whatever a backend raises, this thread must outlive it
                 self._counters.add(receive_errors=1)
                 self._note(error)
+                self._mute_words = self._last_error if isinstance(error, LinkMuteError) else None
                 return
             if frames:
+                heard_ns = time.monotonic_ns()
                 self._deliver(frames)
 
+    def _refuse_silence(self, heard_ns: int) -> None:
+        """Raise LinkMuteError when nothing has come for too long, and be twice as patient the next time.
+
+        An adapter that comes back under another name can leave an open port behind that says nothing and never fails.
+        """
+        if self._patience_s is not None and time.monotonic_ns() - heard_ns > self._patience_s * 1e9:
+            silent_s = self._patience_s
+            self._patience_s = min(2.0 * silent_s, _MOST_PATIENT_S)
+            raise LinkMuteError(f"open, but no frame has come for {silent_s:g} s")
+
     def _deliver(self, frames: Sequence[ReceivedFrame]) -> None:
+        if self._mute_words is not None:
+            self._last_error = self._mute_words = None
+        self._patience_s = self._mute_after_s
         with self._changed:
             self._incoming.extend(frames)
             overflow = max(0, len(self._incoming) - RECEIVE_CAPACITY)
@@ -208,7 +240,8 @@ class ReconnectingTransport:
             self._lost.clear()
             self._incoming.clear()
             self._connection = connection
-            self._last_error = None
+            # That it was mute is worth saying until it is not.
+            self._last_error = self._mute_words
             # Counted before it shows, so that nobody sees a link that came back and was not counted.
             self._counters.add(reconnects=1 if self._generation else 0)
             self._generation += 1

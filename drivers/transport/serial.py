@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import serial
 
 from drivers.transport.counters import Counters
-from drivers.transport.explain import explain_port
-from drivers.transport.reconnecting import TransmitBusyError
+from drivers.transport.explain import explain_mute, explain_port
+from drivers.transport.reconnecting import LinkMuteError, TransmitBusyError
 from drivers.types import Frame, ReceivedFrame
 from firmware_protocol.serial_framing import FrameDecoder, encode_frame
 
@@ -21,10 +21,15 @@ _DELIMITER = b"\0"
 
 @dataclass(frozen=True, slots=True)
 class SerialMedium:
-    """A serial port by its device name or pyserial URL, at `baud` bit/s, 8 data bits, no parity, 1 stop bit."""
+    """A serial port by its device name or pyserial URL, at `baud` bit/s, 8 data bits, no parity, 1 stop bit.
+
+    `dtr`, `rts`: the levels of these lines while the port is open.
+    """
 
     port: str
     baud: int
+    dtr: bool = False
+    rts: bool = False
 
     @property
     def name(self) -> str:
@@ -33,19 +38,13 @@ class SerialMedium:
 
     def connect(self, counters: Counters) -> SerialConnection:
         """Open the port for this process alone. Raises what pyserial raises."""
-        port = serial.serial_for_url(
-            self.port,
-            baudrate=self.baud,
-            timeout=READ_TIMEOUT_S,
-            write_timeout=WRITE_TIMEOUT_S,
-            exclusive=True,
-        )
+        port = open_port(self, timeout_s=READ_TIMEOUT_S, write_timeout_s=WRITE_TIMEOUT_S, exclusive=True)
         ask_for_low_latency(port)
         return SerialConnection(port, counters)
 
     def explain(self, error: Exception) -> str:
         """Say in one line what the error means and what to do."""
-        return explain_port(self.port, error)
+        return explain_mute(self.port, error) if isinstance(error, LinkMuteError) else explain_port(self.port, error)
 
 
 class SerialConnection:
@@ -84,6 +83,18 @@ class SerialConnection:
     def close(self) -> None:
         """Close the port."""
         self._port.close()
+
+
+def open_port(medium: SerialMedium, *, timeout_s: float, write_timeout_s: float, exclusive: bool) -> serial.Serial:
+    """Open the port with its lines as `medium` says. Raises what pyserial raises.
+
+    The lines are set before it is opened: pyserial would raise both, and boards that take that as a reset restart.
+    """
+    port = serial.serial_for_url(medium.port, do_not_open=True, baudrate=medium.baud)
+    port.timeout, port.write_timeout, port.exclusive = timeout_s, write_timeout_s, exclusive
+    port.dtr, port.rts = medium.dtr, medium.rts
+    port.open()
+    return port
 
 
 def ask_for_low_latency(port: serial.Serial) -> None:

@@ -1,10 +1,13 @@
 """The CAN transport on real buses: python-can's virtual one, our hub between processes, slcan on a pseudo-terminal."""
 
+import contextlib
 import errno
 import itertools
 import os
+import socket
 import subprocess
 import sys
+import threading
 import time
 
 import can
@@ -14,8 +17,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.transport.backoff import BackoffPolicy
-from drivers.transport.can import GARBAGE_LIMIT, CanMedium, is_busy, monotonic_stamp_ns, require_working_interface
-from drivers.transport.reconnecting import LinkLostError, ReconnectingTransport
+from drivers.transport.can import (
+    GARBAGE_LIMIT,
+    CanConnection,
+    CanMedium,
+    is_busy,
+    monotonic_stamp_ns,
+    require_working_interface,
+)
+from drivers.transport.counters import Counters
+from drivers.transport.own_frames import OwnFrames
+from drivers.transport.reconnecting import LinkLostError, ReconnectingTransport, TransmitBusyError
 from drivers.types import Frame, LinkState
 from tests.drivers.transport.pseudo_terminal import PseudoTerminal
 from tests.drivers.waiting import collect, median_send_s, outgoing, send, wait_until
@@ -24,8 +36,8 @@ FAST = BackoffPolicy(first_s=0.01, longest_s=0.05, steady_s=0.1)
 CHANNELS = (f"can-test-{number}" for number in itertools.count())
 
 
-def opened(interface, channel, bitrate=500_000):
-    transport = ReconnectingTransport(CanMedium(interface, channel, bitrate), backoff=FAST)
+def opened(interface, channel, bitrate=500_000, **options):
+    transport = ReconnectingTransport(CanMedium(interface, channel, bitrate, options), backoff=FAST)
     transport.open()
     return transport
 
@@ -90,6 +102,212 @@ def test_error_frames_are_counted_and_bus_off_is_a_lost_link(virtual):
     other.send(message(0x113))
     assert [received.frame.can_id for received in collect(transport, 1)] == [0x113]
     assert len(virtual_bus.channels[other.channel_id]) == 2, "the lost bus has been shut down"
+
+
+def test_a_file_in_the_users_home_changes_nothing(tmp_path, monkeypatch):
+    """python-can reads settings from ~/.canrc, can.ini and its environment, unless it is told not to."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(can.util, "CONFIG_FILES", [str(tmp_path / "can.ini")])
+    (tmp_path / "can.ini").write_text("[default]\nreceive_own_messages = True\n")
+    monkeypatch.setenv("CAN_CONFIG", '{"receive_own_messages": true}')
+    channel = next(CHANNELS)
+    transport = opened("virtual", channel)
+    other = can.Bus(interface="virtual", channel=channel, ignore_config=True)
+    try:
+        up(transport)
+        send(transport, outgoing(0x100, b"ours"))
+        other.recv(5.0)
+        other.send(message(0x111))
+        assert [received.frame.can_id for received in collect(transport, 1)] == [0x111]
+    finally:
+        transport.close()
+        other.shutdown()
+
+
+def test_the_bus_is_opened_as_asked_and_options_go_through_as_they_are(monkeypatch):
+    asked = []
+
+    def refuse(**settings):
+        asked.append(settings)
+        raise OSError("not here")
+
+    monkeypatch.setattr(can, "Bus", refuse)
+    for medium in (
+        CanMedium("virtual", "one", 250_000, {"rx_queue_size": 7}),
+        CanMedium("slcan", "/dev/x", 125_000),
+        CanMedium("slcan", "/dev/x", 125_000, {"sleep_after_open": 2.0, "tty_baudrate": 9600}),
+    ):
+        with pytest.raises(OSError, match="not here"):
+            medium.connect(Counters())
+    plain = {"interface": "slcan", "channel": "/dev/x", "ignore_config": True, "bitrate": 125_000, "timeout": 0.1}
+    assert asked == [
+        {"interface": "virtual", "channel": "one", "ignore_config": True, "bitrate": 250_000, "rx_queue_size": 7},
+        {**plain, "sleep_after_open": 0.0},
+        {**plain, "sleep_after_open": 2.0, "tty_baudrate": 9600},
+    ]
+
+
+def test_a_bus_that_hands_back_own_frames_brings_those_of_another_host_only():
+    channel = next(CHANNELS)
+    transport = opened("virtual", channel, receive_own_messages=True)
+    other = can.Bus(interface="virtual", channel=channel, ignore_config=True)
+    try:
+        up(transport)
+        for number in range(3):
+            send(transport, outgoing(0x100, bytes((number,))))
+            assert bytes(other.recv(5.0).data) == bytes((number,))
+        send(transport, outgoing(0x100, b"same"))
+        other.recv(5.0)
+        other.send(message(0x100, b"same"))
+        other.send(message(0x111))
+        got = [(received.frame.can_id, received.frame.data) for received in collect(transport, 2)]
+        assert got == [(0x100, b"same"), (0x111, b"\x01\x02")]
+    finally:
+        transport.close()
+        other.shutdown()
+
+
+def test_a_frame_that_found_no_room_excuses_no_other_hosts():
+    class Full:
+        def send(self, message, timeout):
+            raise can.CanOperationError("Transmit buffer full")
+
+        def recv(self, timeout):
+            return message(0x100, b"\1")
+
+    connection = CanConnection(Full(), Counters(), OwnFrames())
+    with pytest.raises(TransmitBusyError):
+        connection.write(Frame(0x100, b"\1"))
+    assert [received.frame for received in connection.read()] == [Frame(0x100, b"\1")]
+
+
+# Of interface-local scope: nothing of it leaves this machine.
+MULTICAST_GROUP = "ff11::6469:7363"
+
+
+def test_over_udp_multicast_own_frames_do_not_come_back_and_another_hosts_do():
+    # A port that the system says is free, so that runs side by side do not hear each other.
+    with socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as free:
+        free.bind(("::", 0))
+        port = free.getsockname()[1]
+    transport = opened("udp_multicast", MULTICAST_GROUP, port=port, hop_limit=0)
+    other = can.Bus(interface="udp_multicast", channel=MULTICAST_GROUP, port=port, hop_limit=0, ignore_config=True)
+    try:
+        up(transport)
+        for number in range(5):
+            send(transport, outgoing(0x100, bytes((number,))))
+            assert bytes(other.recv(5.0).data) == bytes((number,))
+        other.send(message(0x100, b"\4"))
+        other.send(message(0x111))
+        got = [(received.frame.can_id, received.frame.data) for received in collect(transport, 2)]
+        assert got == [(0x100, b"\4"), (0x111, b"\x01\x02")]
+    finally:
+        transport.close()
+        other.shutdown()
+
+
+class SocketcandServer:
+    """A server in the manner of socketcand, on a TCP port of its own: raw mode, one client at a time."""
+
+    def __init__(self):
+        self.frames, self.opened, self._client = [], [], None
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self.port = self._listener.getsockname()[1]
+        self._thread = threading.Thread(target=self._serve)
+        self._thread.start()
+
+    def _serve(self):
+        while True:
+            try:
+                client, _ = self._listener.accept()
+            except OSError:
+                return
+            with client:
+                self._talk(client)
+
+    def _talk(self, client):
+        client.sendall(b"< hi >")
+        text = ""
+        while True:
+            try:
+                data = client.recv(4096)
+            except OSError:
+                return
+            if not data:
+                return
+            *commands, text = (text + data.decode()).split(">")
+            for command in commands:
+                words = command.strip("< ").split()
+                if words[0] == "send":
+                    self.frames.append((int(words[1], 16), bytes.fromhex("".join(f"{byte:0>2}" for byte in words[3:]))))
+                else:
+                    self.opened.append(words)
+                    client.sendall(b"< ok >")
+                    self._client = client
+
+    def send(self, can_id, data):
+        self._client.sendall(f"< frame {can_id:03X} 1.000000 {data.hex().upper()} >".encode())
+
+    def stop(self):
+        """End, with whoever is connected."""
+        # A plain close does not wake the thread that waits in accept.
+        for connected in (self._listener, self._client):
+            if connected is not None:
+                with contextlib.suppress(OSError):
+                    connected.shutdown(socket.SHUT_RDWR)
+        self._listener.close()
+        self._thread.join()
+
+
+def test_socketcand_by_host_and_port_from_the_options():
+    server = SocketcandServer()
+    transport = opened("socketcand", "can7", host="127.0.0.1", port=server.port)
+    try:
+        up(transport)
+        assert server.opened == [["open", "can7"], ["rawmode"]]
+        server.send(0x110, b"\x11\x22")
+        (received,) = collect(transport, 1)
+        assert received.frame == Frame(0x110, b"\x11\x22")
+        assert 0 <= time.monotonic_ns() - received.t_ns < 10**10
+        send(transport, outgoing(0x100, b"\xab\x01"))
+        wait_until(lambda: server.frames == [(0x100, b"\xab\x01")])
+        server.stop()
+
+        def lost():
+            transport.send(outgoing(), time.monotonic_ns())
+            return transport.state is LinkState.CONNECTING
+
+        wait_until(lost)
+        wait_until(lambda: "start the other end first" in (transport.last_error or ""))
+    finally:
+        transport.close()
+
+
+def test_a_bus_over_a_port_that_stays_mute_is_opened_again():
+    terminal = PseudoTerminal()
+    medium = CanMedium("slcan", str(terminal.path), 500_000)
+    transport = ReconnectingTransport(medium, backoff=FAST, mute_after_s=0.2)
+    transport.open()
+    try:
+        up(transport, generation=2)
+        assert "no frame has come for 0.2 s" in transport.last_error
+    finally:
+        transport.close()
+        terminal.remove()
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (TypeError("no argument 'hots'"), "link.options do not fit this interface"),
+        (can.CanInterfaceNotImplementedError("only on Windows"), "install its maker's driver"),
+        (NameError("canGetNumberOfChannels"), "install its maker's driver"),
+    ],
+)
+def test_why_an_interface_does_not_open_is_one_line_with_a_remedy(error, words):
+    said = CanMedium("kvaser", "0", 500_000).explain(error)
+    assert words in said
+    assert "kvaser 0" in said
 
 
 @pytest.fixture

@@ -4,8 +4,10 @@ import termios
 import time
 
 import pytest
+import serial
 
 from drivers.transport.backoff import BackoffPolicy
+from drivers.transport.counters import Counters
 from drivers.transport.reconnecting import ReconnectingTransport
 from drivers.transport.serial import SerialMedium, ask_for_low_latency
 from drivers.types import Frame, LinkState
@@ -122,6 +124,90 @@ def test_a_device_that_reads_nothing_blocks_nobody(transport, terminal):
     wait_until(lambda: terminal.received)
     send(transport, outgoing(0x100, b"first after the jam"[:8]))
     wait_until(lambda: decoded(terminal)[-1] == (0x100, b"first after the jam"[:8]))
+
+
+def test_an_adapter_that_comes_back_under_another_number_is_found_by_its_lasting_name(tmp_path):
+    """The old number belongs to another device meanwhile, which is open, says nothing, and never fails."""
+    before, after = PseudoTerminal(), PseudoTerminal()
+    by_id = tmp_path / "usb-FTDI_A10K3X-if00"
+    by_id.symlink_to(before.path)
+    transport = ReconnectingTransport(SerialMedium(str(by_id), 115_200), backoff=FAST, mute_after_s=0.3)
+    transport.open()
+    try:
+        wait_until(lambda: transport.state is LinkState.UP)
+        before.write(LINE)
+        assert collect(transport, 1)[-1].frame == FRAME
+        by_id.unlink()
+        by_id.symlink_to(after.path)
+        wait_until(lambda: transport.generation >= 2)
+        assert "no frame has come for 0.3 s" in transport.last_error
+        assert "/dev/serial/by-id" in transport.last_error
+        after.write(LINE)
+        assert collect(transport, 1)[-1].frame == FRAME
+        wait_until(lambda: transport.last_error is None)
+    finally:
+        transport.close()
+        before.remove()
+        after.remove()
+
+
+def test_bytes_that_are_no_frames_do_not_count_as_an_answer(terminal):
+    transport = ReconnectingTransport(SerialMedium(str(terminal.path), 115_200), backoff=FAST, mute_after_s=0.3)
+    transport.open()
+
+    def reopened():
+        terminal.write(b"$GPGGA,,,\r\n\0")
+        return transport.generation >= 2
+
+    try:
+        wait_until(reopened)
+    finally:
+        transport.close()
+
+
+def test_a_port_that_answers_is_left_open(terminal):
+    transport = ReconnectingTransport(SerialMedium(str(terminal.path), 115_200), backoff=FAST, mute_after_s=5.0)
+    transport.open()
+    try:
+        wait_until(lambda: transport.state is LinkState.UP)
+        for _ in range(10):
+            terminal.write(LINE)
+            time.sleep(0.12)
+        assert transport.generation == 1
+    finally:
+        transport.close()
+
+
+@pytest.mark.parametrize(("dtr", "rts"), [(False, False), (True, False), (False, True)])
+def test_the_lines_are_set_before_the_port_is_opened(terminal, monkeypatch, dtr, rts):
+    seen = []
+    really_open = serial.Serial.open
+
+    def look(port):
+        seen.append((port.dtr, port.rts, port.exclusive))
+        really_open(port)
+
+    monkeypatch.setattr(serial.Serial, "open", look)
+    SerialMedium(str(terminal.path), 115_200, dtr, rts).connect(Counters()).close()
+    assert seen == [(dtr, rts, True)]
+
+
+def test_both_lines_are_low_unless_robot_toml_says_otherwise(terminal):
+    """At the seam to the kernel, as pseudo-terminals have no such lines: which are set, and which are cleared."""
+    asked = []
+
+    class Port(serial.Serial):
+        def _update_dtr_state(self):
+            asked.append(("dtr", self._dtr_state))
+
+        def _update_rts_state(self):
+            asked.append(("rts", self._rts_state))
+
+    port = SerialMedium(str(terminal.path), 115_200)
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(serial, "Serial", Port)
+        port.connect(Counters()).close()
+    assert set(asked) == {("dtr", False), ("rts", False)}
 
 
 class FtdiPort:
