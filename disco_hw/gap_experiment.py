@@ -25,7 +25,7 @@ from disco_hw.drive.scripts import make_script
 from disco_hw.errors import InputError, WorkError
 from disco_hw.experiments.metrics import Path as Track
 from disco_hw.experiments.metrics import circle_figures
-from disco_hw.experiments.simulated_time import SimulatedRun
+from disco_hw.experiments.simulated_time import SimulatedRun, virtual_robot
 from disco_hw.experiments.virtual import true_parameters
 from disco_hw.gap.commands import WRITTEN, gap
 from disco_hw.gap.report import REPORTED_HORIZON_S, STAGES, GapReport
@@ -35,7 +35,6 @@ from disco_hw.outputs import as_json, refuse_directory
 from disco_hw.runtime.assembly import make_planner
 from disco_hw.runtime.pipeline import NoPlanner
 from disco_hw.runtime.robot_setup import Setup, load_setup
-from firmware_protocol.firmware_core import FirmwareConfig
 from sim.body_dynamics import Pose
 from sim.effects import HiddenEffectError, parse_hidden_effects
 from sim.in_process import RobotInProcess
@@ -191,15 +190,9 @@ def without_effects(amended: Model, given: Model) -> Model:
 
 
 def _robot(setup: Setup, options: GapExperimentOptions, hidden: Mapping[str, tuple[float, ...]]) -> RobotInProcess:
-    robot = setup.config.robot
     parameters = true_parameters(setup, options.plant_seed)
-    firmware = FirmwareConfig(
-        ticks_per_rev=parameters.ticks_per_rev,
-        max_wheel_speed_rad_s=robot.max_wheel_speed_rad_s,
-        max_wheel_acceleration_rad_s2=robot.max_wheel_acceleration_rad_s2,
-    )
     start = Pose(*course_of(setup.config.task).start)
-    return RobotInProcess(parameters, hidden, firmware, start, options.seed)
+    return virtual_robot(setup, parameters, start, effects=hidden, seed=options.seed)
 
 
 def _record(
@@ -213,7 +206,7 @@ def _record(
     )
     run = SimulatedRun(setup, _robot(setup, options, hidden), NoPlanner(), pilot)
     progress(f"driving the script {options.script}, {script.duration_s:.0f} s of simulated time")
-    run.drive(script.duration_s + 10.0, lambda t_s: None)
+    run.drive(script.duration_s + 10.0)
     run.write_log(log)
 
 

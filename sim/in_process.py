@@ -17,9 +17,10 @@ _FOREVER_NS = 1 << 62
 
 
 class RobotInProcess:
-    """A virtual robot on an in-process link; `host` is the host's end of it, open.
+    """A virtual robot on an in-process link; `host` is the host's end of it, open, and `link` the robot's.
 
     Time begins at 0 and moves on by `advance` alone. `effects` as in `sim.effects`; raises HiddenEffectError.
+    `board` may be exchanged for another one between two steps.
     """
 
     def __init__(
@@ -30,23 +31,23 @@ class RobotInProcess:
         start: Pose,
         seed: int,
     ) -> None:
-        host, self._robot_end = connect_pair()
+        host, self.link = connect_pair()
         self.host: Transport = host
-        self._robot = VirtualRobot(Plant(plant, hidden_effects(effects), seed, start), firmware, seed=seed)
+        self.board = VirtualRobot(Plant(plant, hidden_effects(effects), seed, start), firmware, seed=seed)
         host.open()
-        self._robot_end.open()
+        self.link.open()
         self._now_us = 0
 
     @property
     def truth(self) -> TrueState:
-        """What is so now."""
-        return self._robot.truth
+        """The true state of the plant now."""
+        return self.board.truth
 
     def advance(self, until_us: int) -> None:
         """Let time pass until then; frames wait at both ends."""
         while self._now_us < until_us:
             self._now_us += STEP_US
-            for received in self._robot_end.receive():
-                self._robot.receive(self._now_us, received.frame)
-            for frame in self._robot.step(self._now_us):
-                self._robot_end.send(OutgoingFrame(frame, _FOREVER_NS), self._now_us * 1000)
+            for received in self.link.receive():
+                self.board.receive(self._now_us, received.frame)
+            for frame in self.board.step(self._now_us):
+                self.link.send(OutgoingFrame(frame, _FOREVER_NS), self._now_us * 1000)

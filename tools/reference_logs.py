@@ -23,6 +23,7 @@ from disco_hw.adaptation.coordinates import NAMES
 from disco_hw.drive.coverage import Coverage
 from disco_hw.drive.hand_pilot import HandPilot
 from disco_hw.drive.source import ManualInput
+from disco_hw.experiments.simulated_time import SimulatedRun, virtual_robot
 from disco_hw.log.link import Attachment
 from disco_hw.log.provenance import MODEL_TOML, ROBOT_TOML, version
 from disco_hw.log.recorder import ProcessRecorder, Recording
@@ -31,7 +32,8 @@ from disco_hw.runtime.assembly import make_planner, put_in_force
 from disco_hw.runtime.pipeline import NoPlanner, Planner
 from disco_hw.runtime.robot_setup import Setup, load_setup
 from disco_hw.runtime.supervisor import UserRequest
-from tests.runtime.simulated import SimulatedStack, simulated_stack
+from sim.body_dynamics import Pose
+from sim.plant_parameters import PlantParameters
 
 DIRECTORY = Path(__file__).parents[1] / "tests" / "runtime" / "reference_logs"
 ROBOTS = Path(disco_hw.__file__).parent / "robots"
@@ -42,7 +44,7 @@ SHORT_SIGHTED = ("rate_hz = 50.0", "rate_hz = 50.0\nhorizon = 10\nstep_s = 0.3")
 class LearntOnce(NoAdaptation):
     """A belief that changes once, at `at_ns`, to a wheel 2 % larger."""
 
-    def __init__(self, stack: SimulatedStack, at_ns: int) -> None:
+    def __init__(self, stack: SimulatedRun, at_ns: int) -> None:
         self._stack, self._at_ns, self._model = stack, at_ns, setup().model
         self._done = False
 
@@ -93,19 +95,26 @@ def planner() -> Planner:
     return make_planner(found.config, found.model)
 
 
-def circle() -> SimulatedStack:
+def simulated(chosen: Planner, needs_pose: bool = True) -> SimulatedRun:
+    """The shipped robot on its circle."""
+    shipped = load_setup(ROBOTS / "wombot.toml")
+    robot = virtual_robot(shipped, PlantParameters(), Pose(0.75, 0.0, 1.5707963))
+    return SimulatedRun(shipped, robot, chosen, needs_pose=needs_pose)
+
+
+def circle() -> SimulatedRun:
     """DISCO drives, the robot is carried off by 0.2 m, and drives on."""
-    stack = _started(simulated_stack(planner()))
+    stack = _started(simulated(planner()))
     stack.run(1.0)
-    stack.robot.kidnap(0.2, 0.1, 0.3)
+    stack.robot.board.kidnap(0.2, 0.1, 0.3)
     stack.run(1.5)
     stack.run(0.6, UserRequest.DISARM)
     return stack
 
 
-def adapted() -> SimulatedStack:
+def adapted() -> SimulatedRun:
     """Another belief comes into force on the way, and another circle after it."""
-    stack = simulated_stack(planner())
+    stack = simulated(planner())
     stack.core.adaptation = LearntOnce(stack, 2_500_000_000)
     _started(stack)
     stack.run(1.5)
@@ -115,15 +124,15 @@ def adapted() -> SimulatedStack:
     return stack
 
 
-def drive() -> SimulatedStack:
+def drive() -> SimulatedRun:
     """A person drives."""
-    stack = simulated_stack(NoPlanner(), needs_pose=False)
+    stack = simulated(NoPlanner(), needs_pose=False)
     stack.pilot = HandPilot(Hand(), Coverage(8.0))
     stack.run(4.5)
     return stack
 
 
-KINDS: dict[str, Callable[[], SimulatedStack]] = {"circle": circle, "adapted": adapted, "drive": drive}
+KINDS: dict[str, Callable[[], SimulatedRun]] = {"circle": circle, "adapted": adapted, "drive": drive}
 
 
 def write(name: str, directory: Path) -> Path:
@@ -144,7 +153,7 @@ def write(name: str, directory: Path) -> Path:
     return path
 
 
-def _started(stack: SimulatedStack) -> SimulatedStack:
+def _started(stack: SimulatedRun) -> SimulatedRun:
     stack.run(1.0)
     stack.run(0.5, UserRequest.ARM)
     stack.run(0.5, UserRequest.START)

@@ -21,14 +21,13 @@ from disco_hw.adaptation.adapter import Adapter
 from disco_hw.adaptation.guard import Geometry
 from disco_hw.adaptation.inline_link import InlineLink
 from disco_hw.config import CircleTask, circle_task
+from disco_hw.experiments.simulated_time import SimulatedRun, virtual_robot
 from disco_hw.log import records
 from disco_hw.log.recorder import MemoryRecorder
-from disco_hw.runtime.assembly import assemble_core, make_adaptation, make_driver, make_pipeline, make_planner
+from disco_hw.runtime.assembly import make_planner
 from disco_hw.runtime.robot_setup import Setup
 from disco_hw.runtime.supervisor import UserRequest
-from firmware_protocol.firmware_core import FirmwareConfig
 from sim.body_dynamics import Pose
-from sim.in_process import RobotInProcess
 from sim.plant_parameters import PlantParameters
 
 Array = NDArray[np.float64]
@@ -249,31 +248,30 @@ def drive(
         wheel_radius_m=float(mean[1]),
         axial_distance_m=float(mean[2]),
     )
-    firmware = FirmwareConfig(
-        ticks_per_rev=round(config.robot.ticks_per_rev),
-        max_wheel_speed_rad_s=config.robot.max_wheel_speed_rad_s,
-        max_wheel_acceleration_rad_s2=config.robot.max_wheel_acceleration_rad_s2,
-    )
     start = Pose(task.center_x_m + task.radius_m, task.center_y_m, 0.5 * math.pi)
-    robot = RobotInProcess(plant, effects, firmware, start, seed)
-    pipeline = make_pipeline(config, setup.model, make_planner(config, setup.model))
-    adaptation = make_adaptation(setup, pipeline, InlineLink(Adapter())) if adapted else None
-    recorder = recorder or MemoryRecorder()
-    core = assemble_core(config, robot.host, make_driver(), pipeline, recorder, adaptation=adaptation)
-    period_us = round(1e6 / config.control.rate_hz)
-    end_us = round((_START_S + options.change_s + options.settled_s + options.compared_s) * 1e6)
+    run = SimulatedRun(
+        setup,
+        virtual_robot(setup, plant, start, effects=effects, seed=seed),
+        make_planner(config, setup.model),
+        adapter=InlineLink(Adapter()) if adapted else None,
+        recorder=recorder,
+    )
     rows: list[tuple[float, float, float, float]] = []
-    for now_us in range(period_us, end_us + 1, period_us):
-        robot.advance(now_us)
-        requests = {round(_ARM_S * 1e6): (UserRequest.ARM,), round(_START_S * 1e6): (UserRequest.START,)}
-        core.tick(now_us * 1000, requests.get(now_us, ()))
-        truth = robot.truth
-        distance = math.hypot(truth.x_m - task.center_x_m, truth.y_m - task.center_y_m) - task.radius_m
-        cost = math.hypot(distance, truth.speed_m_s - task.speed_m_s)
-        rows.append((now_us * 1e-6 - _START_S, cost, truth.x_m, truth.y_m))
+
+    def drive_for(duration_s: float, *requests: UserRequest) -> None:
+        for _ in run.ticks(duration_s, *requests):
+            truth = run.robot.truth
+            distance = math.hypot(truth.x_m - task.center_x_m, truth.y_m - task.center_y_m) - task.radius_m
+            cost = math.hypot(distance, truth.speed_m_s - task.speed_m_s)
+            rows.append((run.now_us * 1e-6 - _START_S, cost, truth.x_m, truth.y_m))
+
+    period_s = 1.0 / config.control.rate_hz
+    drive_for(_ARM_S - period_s)
+    drive_for(_START_S - _ARM_S, UserRequest.ARM)
+    drive_for(options.change_s + options.settled_s + options.compared_s + period_s, UserRequest.START)
     table = np.array(rows)
     table = table[table[:, 0] > 0.0]
-    return AdaptRun(table[:, 0], table[:, 1], table[:, 2:], *_beliefs(recorder, believed_geometry(setup.model)))
+    return AdaptRun(table[:, 0], table[:, 1], table[:, 2:], *_beliefs(run.recorder, believed_geometry(setup.model)))
 
 
 def _beliefs(recorder: MemoryRecorder, model: Geometry) -> tuple[tuple[tuple[float, Array, Array], ...], int]:

@@ -1,45 +1,94 @@
-"""The daemon's core against a virtual robot in simulated time: the same tick as on a robot, no clock and no thread."""
+"""The daemon's core and a virtual robot in one process and in simulated time: the robot's own tick, without a clock.
+
+The one harness of experiments, tests and tools. What happens is recorded in memory and can be written as a log.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from disco_hw.adaptation.link import AdapterLink
 from disco_hw.errors import WorkError
 from disco_hw.log.link import Attachment
 from disco_hw.log.provenance import MODEL_TOML
 from disco_hw.log.recorder import MemoryRecorder, ProcessRecorder, Recording
 from disco_hw.model.file import model_text
-from disco_hw.runtime.assembly import assemble_core, make_driver, make_pipeline
+from disco_hw.runtime.assembly import assemble_core, make_adaptation, make_driver, make_pipeline
 from disco_hw.runtime.core import CoreTick, DaemonCore
 from disco_hw.runtime.log_setup import kept_files
 from disco_hw.runtime.pilot import Pilot, TaskPilot
 from disco_hw.runtime.pipeline import Planner
 from disco_hw.runtime.robot_setup import Setup
 from disco_hw.runtime.supervisor import UserRequest
+from firmware_protocol.firmware_core import FirmwareConfig
+from sim.body_dynamics import Pose
 from sim.in_process import RobotInProcess
+from sim.plant_parameters import PlantParameters
 from sim.virtual_robot import STEP_US
 
 _READY_S, _ARMED_S = 1.5, 0.5
 _CLOSING_S = 60.0
 
 
-class SimulatedRun:
-    """A robot, driven by the daemon's core with this planner and pilot; what happens is recorded in memory."""
+def virtual_robot(
+    setup: Setup,
+    plant: PlantParameters,
+    start: Pose,
+    *,
+    effects: Mapping[str, float | Sequence[float]] | None = None,
+    seed: int = 1,
+) -> RobotInProcess:
+    """A robot with this plant whose controller has the limits of robot.toml.
 
-    def __init__(self, setup: Setup, robot: RobotInProcess, planner: Planner, pilot: Pilot | None = None) -> None:
-        self._setup, self.robot, self._pilot = setup, robot, pilot or TaskPilot()
+    `effects`: hidden ones, as in `sim.effects`. Raises HiddenEffectError.
+    """
+    robot = setup.config.robot
+    firmware = FirmwareConfig(
+        ticks_per_rev=plant.ticks_per_rev,
+        max_wheel_speed_rad_s=robot.max_wheel_speed_rad_s,
+        max_wheel_acceleration_rad_s2=robot.max_wheel_acceleration_rad_s2,
+    )
+    return RobotInProcess(plant, effects or {}, firmware, start, seed)
+
+
+class SimulatedRun:
+    """A virtual robot, driven by the daemon's core with this planner and pilot.
+
+    Without `needs_pose` motion needs no pose, whatever robot.toml says. `adapter`: the geometry is learnt on the way.
+    """
+
+    def __init__(
+        self,
+        setup: Setup,
+        robot: RobotInProcess,
+        planner: Planner,
+        pilot: Pilot | None = None,
+        *,
+        needs_pose: bool | None = None,
+        adapter: AdapterLink | None = None,
+        recorder: MemoryRecorder | None = None,
+    ) -> None:
+        self.robot = robot
+        self.pilot = pilot or TaskPilot()
+        self.recorder = recorder or MemoryRecorder()
         self.now_us = 0
-        self._recorder = MemoryRecorder()
+        self._setup = setup
         pipeline = make_pipeline(setup.config, setup.model, planner)
         self.core: DaemonCore = assemble_core(
-            setup.config, robot.host, make_driver(), pipeline, self._recorder, self._pilot.needs_pose
+            setup.config,
+            robot.host,
+            make_driver(),
+            pipeline,
+            self.recorder,
+            self.pilot.needs_pose if needs_pose is None else needs_pose,
+            adaptation=None if adapter is None else make_adaptation(setup, pipeline, adapter),
         )
         self._period_us = round(1e6 / setup.config.control.rate_hz)
 
     def ticks(self, duration_s: float, *requests: UserRequest) -> Iterator[CoreTick]:
-        """Let time pass and give every tick; the requests come with the first one."""
+        """Let time pass and give every tick as it comes; the requests come with the first one."""
         end_us = self.now_us + round(duration_s * 1e6)
         while self.now_us < end_us:
             self.now_us += STEP_US
@@ -47,40 +96,40 @@ class SimulatedRun:
             if self.now_us % self._period_us:
                 continue
             now_ns = self.now_us * 1000
-            wanted = self._pilot.step(now_ns, self.core.last)
+            wanted = self.pilot.step(now_ns, self.core.last)
             tick = self.core.tick(now_ns, (*requests, *wanted.requests), motion=wanted.motion)
-            self._pilot.learn(now_ns, tick, tick.replies[len(requests) :])
+            self.pilot.learn(now_ns, tick, tick.replies[len(requests) :])
             requests = ()
             yield tick
 
+    def run(self, duration_s: float, *requests: UserRequest) -> list[CoreTick]:
+        """Let time pass; the requests come with the first tick. All ticks are returned."""
+        return list(self.ticks(duration_s, *requests))
+
     def start(self) -> None:
         """Arm and start the task; raises WorkError if the robot refuses."""
-        self._pass(_READY_S)
+        self.run(_READY_S)
         for tick in self.ticks(_ARMED_S, UserRequest.ARM):
             for reply in tick.replies:
                 if not reply.accepted:
                     raise WorkError(f"the virtual robot could not be armed: {reply.text}")
-        self._pass(0.02, UserRequest.START)
+        self.run(0.02, UserRequest.START)
 
-    def drive(self, limit_s: float, progress: Callable[[float], None]) -> None:
-        """Let the pilot drive to its end; raises WorkError if it takes longer. `progress` hears the time (s)."""
+    def drive(self, limit_s: float, progress: Callable[[float], None] = lambda t_s: None) -> None:
+        """Let the pilot drive to its end; raises WorkError if it takes longer. `progress` gets the time (s)."""
         for number, _ in enumerate(self.ticks(limit_s)):
             if number % 500 == 0:
                 progress(self.now_us * 1e-6)
-            if self._pilot.done:
+            if self.pilot.done:
                 return
         raise WorkError(f"the drive was not over after {limit_s:.0f} s")
-
-    def _pass(self, duration_s: float, *requests: UserRequest) -> None:
-        for _ in self.ticks(duration_s, *requests):
-            pass
 
     def write_log(self, path: Path) -> None:
         """Write what was recorded as a log that every verb reads; raises WorkError if that fails."""
         setup = replace(self._setup, model_file=None)
         model = Attachment(MODEL_TOML, "application/toml", model_text(setup.model).encode())
         attachments = (*kept_files(setup), model)
-        ticks = self._recorder.ticks
+        ticks = self.recorder.ticks
         recorder = ProcessRecorder(
             Recording(path, self._setup.config.robot.name, attachments=attachments, queue_ticks=len(ticks) + 1)
         )

@@ -55,9 +55,8 @@ class Bench:
         return self
 
     def asked(self):
-        return max(
-            abs(self.stack.robot.outputs.left_setpoint_rad_s), abs(self.stack.robot.outputs.right_setpoint_rad_s)
-        )
+        outputs = self.stack.robot.board.outputs
+        return max(abs(outputs.left_setpoint_rad_s), abs(outputs.right_setpoint_rad_s))
 
 
 def test_what_is_held_is_driven_and_recorded_as_executed():
@@ -120,7 +119,7 @@ def test_the_status_says_what_is_going_on():
 def test_a_press_while_not_ready_is_told_and_sends_nothing():
     bench = Bench()
     bench.run(1.5)
-    bench.stack.robot_end.plug(False)
+    bench.stack.robot.link.plug(False)
     bench.run(0.1)
     ticks = bench.run(0.5, held=True)
     assert all(tick.command is None for tick in ticks)

@@ -151,7 +151,7 @@ class Bench:
         return self
 
     def asked(self):
-        outputs = self.stack.robot.outputs
+        outputs = self.stack.robot.board.outputs
         return max(abs(outputs.left_setpoint_rad_s), abs(outputs.right_setpoint_rad_s))
 
     def driving(self):

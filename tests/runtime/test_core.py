@@ -55,7 +55,7 @@ def test_the_stop_ends_in_ready_with_still_wheels(lap):
     stack, _, stopping = lap
     assert stopping[-1].output.state is State.READY
     assert stack.robot.truth.left_speed_rad_s == pytest.approx(0.0, abs=0.05)
-    assert stack.robot.outputs.state in {"STANDBY", "READY"}
+    assert stack.robot.board.outputs.state in {"STANDBY", "READY"}
 
 
 def test_everything_is_recorded(lap):
@@ -86,20 +86,20 @@ def test_a_lost_link_voids_the_session_and_nothing_rearms():
     stack.run(1.5)
     stack.run(0.5, UserRequest.ARM)
     stack.run(2.0, UserRequest.START)
-    session = stack.robot.outputs.session
+    session = stack.robot.board.outputs.session
     assert abs(stack.robot.truth.right_speed_rad_s) > 1.0
-    stack.robot_end.plug(False)
+    stack.robot.link.plug(False)
     ticks = stack.run(1.5)
     assert ticks[-1].output.state is State.DISCONNECTED
     assert abs(stack.robot.truth.right_speed_rad_s) < 0.05
-    stack.robot_end.plug(True)
+    stack.robot.link.plug(True)
     ticks = stack.run(3.0)
     assert ticks[-1].output.state is State.READY
     assert all(tick.command is None for tick in ticks)
     assert abs(stack.robot.truth.right_speed_rad_s) < 0.05
     stack.run(0.5, UserRequest.ARM)
     assert stack.core.last.output.state is State.ARMED
-    assert stack.robot.outputs.session != session
+    assert stack.robot.board.outputs.session != session
 
 
 def exchanged(stack, **firmware):
@@ -114,7 +114,7 @@ def exchanged(stack, **firmware):
         def step(self, now_us):
             return robot.step(now_us - since_us)
 
-    stack.robot = Robot()
+    stack.robot.board = Robot()
 
 
 @pytest.mark.parametrize("limits", [{"max_wheel_speed_rad_s": 4.0}, {"ticks_per_rev": 1024}])
@@ -140,9 +140,9 @@ def test_what_a_robot_said_that_is_not_heard_any_more_is_not_its_state(lost):
     stack.run(0.5, UserRequest.ESTOP)
     assert stack.core.robot_status.state == "ESTOP"
     if lost == "link":
-        stack.robot_end.plug(False)
+        stack.robot.link.plug(False)
     else:
-        stack.robot.step = lambda _now_us: ()
+        stack.robot.board.step = lambda _now_us: ()
     stack.run(1.0)
     assert stack.core.robot_status is None
 
