@@ -15,8 +15,8 @@ import numpy as np
 
 from disco_hw.drive.separating import separating
 from disco_hw.gap import find_gap
-from disco_hw.gap.blind_spots import LIMITS, BlindSpot
-from disco_hw.gap.intervals import Estimate
+from disco_hw.gap.report.blind_spots import LIMITS, BlindSpot
+from disco_hw.gap.search.intervals import Estimate
 from disco_hw.model import Model
 from tools.gap_logs import LARGEST_RAD_S, NAMED, realistic, simulated_drive
 

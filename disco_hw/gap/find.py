@@ -9,15 +9,15 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.gap.amend import amended_model
-from disco_hw.gap.candidates import candidates_of
-from disco_hw.gap.harmless import harmless, left_out
-from disco_hw.gap.layout import BASE_COUNT, BODY, WHEEL, Layout
-from disco_hw.gap.outcome import Outcome
-from disco_hw.gap.report import GapReport
-from disco_hw.gap.search import search_body, search_wheels
-from disco_hw.gap.terms import with_known_terms
-from disco_hw.gap.timeline import timeline
+from disco_hw.gap.data.gridded_drive import timeline
+from disco_hw.gap.data.layout import BASE_COUNT, BODY, WHEEL, Layout
+from disco_hw.gap.report.amend import amended_model
+from disco_hw.gap.report.findings import GapReport
+from disco_hw.gap.search.analysis import Outcome
+from disco_hw.gap.search.candidates import candidates_of
+from disco_hw.gap.search.channel_search import search_body, search_wheels
+from disco_hw.gap.search.predictive_pruning import harmless, left_out
+from disco_hw.gap.search.unnamed_terms import with_known_terms
 from disco_hw.log.drive import DriveLog, concatenate
 from disco_hw.log.errors import LogError
 from disco_hw.model import Model

@@ -115,7 +115,7 @@ def gap(
 ) -> None:
     """Hide an effect in the virtual robot, find it in a log, and drive the circle without and with it in the model."""
     import disco_hw
-    from disco_hw.gap_experiment import GapExperimentOptions, run_gap_experiment
+    from disco_hw.experiments.gap import GapExperimentOptions, run_gap_experiment
 
     shipped = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
     hidden = tuple(hide or ("deadband=0.8",))

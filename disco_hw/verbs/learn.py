@@ -55,7 +55,7 @@ def gap(
     from disco_hw.daemon.realtime import limit_thread_pools
 
     limit_thread_pools()
-    from disco_hw.gap.commands import gap as find_gap
+    from disco_hw.gap.write_report import gap as find_gap
 
     result = find_gap(logs, robot, out, model, progress_line)
     print_result(result.as_dict(), as_json, result.as_text())

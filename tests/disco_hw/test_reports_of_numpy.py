@@ -10,18 +10,16 @@ from types import NoneType, SimpleNamespace, UnionType
 import numpy as np
 import pytest
 
-from disco_hw.adapt.experiment import CHANGES, AdaptOptions, AdaptResult, AdaptRun
-from disco_hw.check import Check, CheckReport, Level
-from disco_hw.circle_report import CircleReport
-from disco_hw.control.experiments.circle import CircleOptions, CircleResult, Run
-from disco_hw.control.experiments.pendulum import PendulumOptions, PendulumResult
+from disco_hw.daemon.check import Check, CheckReport, Level
+from disco_hw.daemon.emergency import EstopOutcome
 from disco_hw.drive.commands import DriveResult
-from disco_hw.emergency import EstopOutcome
-from disco_hw.gap.blind_spots import BlindSpot
-from disco_hw.gap.commands import GapResult
-from disco_hw.gap.held_out import Errors
-from disco_hw.gap.intervals import Estimate
-from disco_hw.gap.report import (
+from disco_hw.experiments.adapt import CHANGES, AdaptOptions, AdaptResult, AdaptRun
+from disco_hw.experiments.circle import CircleOptions, CircleResult, Run
+from disco_hw.experiments.circle_report import CircleReport
+from disco_hw.experiments.gap import RUNS, GapExperimentResult, Lap
+from disco_hw.experiments.pendulum import PendulumOptions, PendulumResult
+from disco_hw.gap.report.blind_spots import BlindSpot
+from disco_hw.gap.report.findings import (
     STAGES,
     CandidateEvidence,
     ChannelFinding,
@@ -29,7 +27,9 @@ from disco_hw.gap.report import (
     GapReport,
     UnnamedFinding,
 )
-from disco_hw.gap_experiment import RUNS, GapExperimentResult, Lap
+from disco_hw.gap.search.cross_validation import Errors
+from disco_hw.gap.search.intervals import Estimate
+from disco_hw.gap.write_report import GapResult
 from disco_hw.inference.checks import CHECKS
 from disco_hw.inference.commands import InferResult
 from disco_hw.inference.gap_check import GapCheck
@@ -37,7 +37,7 @@ from disco_hw.inference.predictive import Predictive
 from disco_hw.log.importing.commands import Imported
 from disco_hw.model import Model
 from disco_hw.outputs import as_json
-from disco_hw.replay import ReplayReport
+from disco_hw.runtime.replay import ReplayReport
 from disco_hw.verbs.options import print_result
 
 FLOATS = (np.float16, np.float32, np.float64, np.longdouble)

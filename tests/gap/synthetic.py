@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from disco_hw.gap.body_noise import BodyNoise
-from disco_hw.gap.channels import BodyChannel
-from disco_hw.gap.free_runs import read_angles
-from disco_hw.gap.layout import BODY
-from disco_hw.gap.timeline import BLOCK_S, CELL_S, Samples, Timeline
+from disco_hw.gap.data.free_runs import read_angles
+from disco_hw.gap.data.gridded_drive import BLOCK_S, CELL_S, Samples, Timeline
+from disco_hw.gap.data.layout import BODY
+from disco_hw.gap.noise.body_noise import BodyNoise
+from disco_hw.gap.noise.channels import BodyChannel
 
 GEOMETRY = (0.06, 0.4, 0.1)
 NOISE = BodyNoise(0.004, 0.006, 1e-4, 1e-4, 1e-4, 1e-4, 0.3, 1e-4, 1e-3)

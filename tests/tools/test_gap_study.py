@@ -8,8 +8,8 @@ import pytest
 from dask.distributed import LocalCluster
 from rich.console import Console
 
-from disco_hw.gap.blind_spots import BlindSpot
-from disco_hw.gap.intervals import Estimate
+from disco_hw.gap.report.blind_spots import BlindSpot
+from disco_hw.gap.search.intervals import Estimate
 from tools import gap_jobs, gap_study, gap_tables
 from tools.gap_jobs import Job, Result, jobs
 from tools.gap_logs import NAMED

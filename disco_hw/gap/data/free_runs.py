@@ -1,0 +1,217 @@
+"""Free runs of one channel at a time: wheels from commands alone, body from measured wheel angles alone.
+
+The equations are the model's own step, fed with what was measured where the chain is cut.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from disco_hw.gap.data.gridded_drive import CELL_S
+from disco_hw.gap.data.layout import BODY, WHEEL, body_effects, wheel_effects
+from disco_hw.jit import kernel_function, scalar_function
+from disco_hw.model.step import body_velocity, wheel_step
+
+# Half a turn in one cell that a short series is exact for: 20 rad/s of yaw rate.
+_SMALL_RAD = 0.1
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+
+@scalar_function
+def _at(command: Any, node: int, begin: int, late_cells: float, side: int) -> Any:
+    """Command of the cell at `node`, `late_cells` earlier; before the run's first it is that one."""
+    place = node - late_cells
+    below = math.floor(place)
+    part = place - below
+    low = min(max(below, begin), command.shape[0] - 1)
+    if part == 0.0:
+        return command[low, side]
+    high = min(max(below + 1, begin), command.shape[0] - 1)
+    return command[low, side] + part * (command[high, side] - command[low, side])
+
+
+@kernel_function
+def _run_wheels(
+    effects: Any, late: float, command: Array, extra: Array, first: Mask, t_s: Array, start: Array, angle: Array
+) -> None:
+    begin = 0
+    left_speed, right_speed = 0.0, 0.0
+    known = False
+    for i in range(command.shape[0]):
+        if first[i] or not known:
+            begin = i
+            angle[i, 0] = 0.0 if first[i] else angle[i - 1, 0]
+            angle[i, 1] = 0.0 if first[i] else angle[i - 1, 1]
+            left_speed, right_speed = start[i, 0], start[i, 1]
+            known = not math.isnan(command[i, 0])
+            continue
+        cell = i - 1
+        left, right = _at(command, cell, begin, late, 0), _at(command, cell, begin, late, 1)
+        if math.isnan(command[cell, 0]) or math.isnan(left) or math.isnan(right):
+            known = False
+            angle[i, 0], angle[i, 1] = angle[i - 1, 0], angle[i - 1, 1]
+            continue
+        left_speed, right_speed, mean_left, mean_right = wheel_step(
+            left + extra[cell, 0], right + extra[cell, 1], left_speed, right_speed, t_s[cell], effects
+        )
+        angle[i, 0] = angle[i - 1, 0] + CELL_S * mean_left
+        angle[i, 1] = angle[i - 1, 1] + CELL_S * mean_right
+
+
+@scalar_function
+def _turned(cosine: float, sine: float, half: float) -> tuple[float, float]:
+    """Cosine and sine of an angle to which a small one is added; exact to rounding below `_SMALL_RAD`."""
+    q = half * half
+    c = 1.0 - q * (0.5 - q * (1.0 / 24.0 - q * (1.0 / 720.0 - q / 40320.0)))
+    s = half * (1.0 - q * (1.0 / 6.0 - q * (1.0 / 120.0 - q / 5040.0)))
+    return cosine * c - sine * s, sine * c + cosine * s
+
+
+@kernel_function
+def _run_body(
+    base: Any,
+    effects: Any,
+    scale: Any,
+    angle: Array,
+    speed: Array,
+    extra: Array,
+    first: Mask,
+    t_s: Array,
+    track: Array,
+) -> None:
+    x = y = yaw = 0.0
+    c, s = 1.0, 0.0
+    for i in range(angle.shape[0]):
+        if first[i]:
+            x = y = yaw = 0.0
+            c, s = 1.0, 0.0
+        else:
+            left = (angle[i, 0] - angle[i - 1, 0]) * scale[0] / CELL_S
+            right = (angle[i, 1] - angle[i - 1, 1]) * scale[1] / CELL_S
+            change = scale[0] * (speed[i, 0] - speed[i - 1, 0]) + scale[1] * (speed[i, 1] - speed[i - 1, 1])
+            forward, lateral, half_rate = body_velocity(left + right, right - left, change, t_s[i - 1], base, effects)
+            turn = (2.0 * half_rate + extra[i - 1, 2]) * CELL_S
+            along = (forward + extra[i - 1, 0]) * CELL_S
+            across = (lateral + extra[i - 1, 1]) * CELL_S - base.x_icr_m * turn
+            half = 0.5 * turn
+            small = abs(half) < _SMALL_RAD
+            if small:
+                cosine, sine = _turned(c, s, half)
+            else:
+                cosine, sine = math.cos(yaw + half), math.sin(yaw + half)
+            x += cosine * along - sine * across
+            y += sine * along + cosine * across
+            yaw += turn
+            c, s = _turned(cosine, sine, half) if small else (math.cos(yaw), math.sin(yaw))
+        track[i, 0], track[i, 1], track[i, 2] = x, y, yaw
+
+
+def run_wheels(p: Array, geometry: Array, command: Array, extra: Array, first: Mask, t_s: Array, start: Array) -> Array:
+    """Measured wheel angles (M, 2) that the commands alone make.
+
+    `p` in the order of `WHEEL.columns`; `command` (M, 2) rad/s per cell, NaN begins anew; `extra` (M, 2) is added to
+    the command; `start` (M, 2) measured speeds, read where a run begins; `geometry` (3,).
+    """
+    angle = np.empty_like(command)
+    late = WHEEL.at(p, "command_delay.delay_s") / CELL_S
+    _run_wheels(wheel_effects(p, geometry), late, command, extra, first, t_s, start, angle)
+    for side, name in enumerate(("left", "right")):
+        scale = WHEEL.at(p, f"encoder_scale.{name}")
+        if scale != 0.0:
+            angle[:, side] *= 1.0 + scale
+    return angle
+
+
+def run_body(p: Array, angle: Array, speed: Array, extra: Array, first: Mask, t_s: Array) -> Array:
+    """Path x, y, yaw (M, 3) of the tracked point from measured wheel angles and speeds (M, 2), each run from 0.
+
+    `p` in the order of `BODY.columns`; `extra` (M, 3) is added to forward, left (m/s) and yaw rate (rad/s). Drift in
+    the world, latency and heading bias are not in here: they act when the path is laid on the measured poses.
+    """
+    track = np.empty((angle.shape[0], 3))
+    base, effects = body_effects(p)
+    scale = (1.0 / (1.0 + BODY.at(p, "encoder_scale.left")), 1.0 / (1.0 + BODY.at(p, "encoder_scale.right")))
+    _run_body(base, effects, scale, angle, speed, extra, first, t_s, track)
+    left, forward = BODY.at(p, "pose_offset.left_m"), BODY.at(p, "pose_offset.forward_m")
+    if left != 0.0 or forward != 0.0:
+        cosine, sine = np.cos(track[:, 2]), np.sin(track[:, 2])
+        track[:, 0] += forward * cosine - left * sine
+        track[:, 1] += forward * sine + left * cosine
+    return track
+
+
+@kernel_function
+def read_angles(angle: Array, node: Index, fraction: Array, out: Array) -> None:
+    """Values (S, columns) between nodes, on straight lines."""
+    for k in range(node.shape[0]):
+        low, part = node[k], fraction[k]
+        for column in range(out.shape[1]):
+            out[k, column] = angle[low, column] + part * (angle[low + 1, column] - angle[low, column])
+
+
+@kernel_function
+def _lay(
+    late: float, bias: float, drift_x: float, drift_y: float, track: Array, moving_s: Array, node: Index,
+    fraction: Array, window: Index, first_node: Index, last_node: Index, use: Mask, measured: Array, out: Array,
+) -> None:  # fmt: skip
+    count = node.shape[0]
+    begin = 0
+    while begin < count:
+        end = begin
+        turned = used = 0.0
+        while end < count and window[end] == window[begin]:
+            place = min(max(node[end] + fraction[end] - late, float(first_node[end])), last_node[end] - 1e-6)
+            low = math.floor(place)
+            part = place - low
+            for column in range(3):
+                out[end, column] = track[low, column] + part * (track[low + 1, column] - track[low, column])
+            out[end, 2] += bias
+            if use[end]:
+                turned += measured[end, 2] - out[end, 2]
+                used += 1.0
+            end += 1
+        turned /= max(used, 1.0)
+        cosine, sine = math.cos(turned), math.sin(turned)
+        mean_x = mean_y = 0.0
+        for k in range(begin, end):
+            place = min(max(node[k] + fraction[k] - late, float(first_node[k])), last_node[k] - 1e-6)
+            low = math.floor(place)
+            moved = moving_s[low] + (place - low) * (moving_s[low + 1] - moving_s[low])
+            x = cosine * out[k, 0] - sine * out[k, 1] + drift_x * moved
+            y = sine * out[k, 0] + cosine * out[k, 1] + drift_y * moved
+            out[k, 0], out[k, 1] = measured[k, 0] - x, measured[k, 1] - y
+            out[k, 2] = measured[k, 2] - out[k, 2] - turned
+            if use[k]:
+                mean_x += out[k, 0] / used
+                mean_y += out[k, 1] / used
+        for k in range(begin, end):
+            out[k, 0] -= mean_x
+            out[k, 1] -= mean_y
+        begin = end
+
+
+def pose_residual(
+    p: Array, track: Array, moving_s: Array, node: Index, fraction: Array, window: Index, first_node: Index,
+    last_node: Index, use: Mask, measured: Array,
+) -> Array:  # fmt: skip
+    """Measured minus predicted pose (P, 3) in the world frame, each window laid on its measurements.
+
+    `window` (P,) numbers ascending from 0; within one the predicted path is turned and shifted as a whole by the mean
+    difference over the samples in `use`. `moving_s` (M,) is the time in motion, for the drift; `first_node`,
+    `last_node` (P,) bound the run of each sample, for the latency.
+    """
+    out = np.empty_like(measured)
+    late = BODY.at(p, "pose_latency.latency_s") / CELL_S
+    bias = BODY.at(p, "heading_bias.bias_rad")
+    drift = BODY.at(p, "slope.drift_x_m_s"), BODY.at(p, "slope.drift_y_m_s")
+    _lay(
+        late, bias, *drift, track, moving_s, node, fraction, window, first_node, last_node, use, measured, out
+    )  # fmt: skip
+    return out

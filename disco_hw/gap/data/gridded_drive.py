@@ -1,0 +1,296 @@
+"""A drive on an even time grid: what the free runs of the channels read, prepared once.
+
+The grid's nodes are `CELL_S` apart within a run; a run is a stretch of one segment in which the wheels were measured
+and, for the command channel, the commands were known. Runs follow each other in the same arrays.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter1d, minimum_filter1d
+
+from disco_hw.gap.data.sample_hold import without_repeats
+from disco_hw.log.drive import Commands, DriveLog
+
+CELL_S = 0.01
+BLOCK_S = 3.0
+LONGEST_S = 320.0
+_STRETCH_S = 20.0
+_SHORTEST_RUN_S = 1.0
+_LONGEST_SILENCE_S = 1.5
+_SPEED_SPAN_S = 0.03
+_EVEN_SAMPLES = 10
+_LONGEST_RESPONSE_S = 1.5
+_NO_COMMAND_RAD_S = 0.05
+_TURNING_RAD_S = 0.3
+_LOUD_RAD_S = 2.0
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class Samples:
+    """Where measurements lie on the grid, all (S,): node before, fraction of a cell after it, time, block of time."""
+
+    node: Index
+    fraction: Array
+    t_s: Array
+    block: Index
+
+    def pick(self, chosen: Mask | Index) -> Samples:
+        """Some of them."""
+        return Samples(self.node[chosen], self.fraction[chosen], self.t_s[chosen], self.block[chosen])
+
+
+# Of wheels whose readings are held, 80 s of driving may leave this many that are new.
+_FEWEST_READINGS = 100
+
+
+@dataclass(frozen=True, slots=True)
+class Timeline:
+    """A drive on the grid.
+
+    Nodes (M,): `t_s`, `first` (begins a run), `command_rad_s` (M, 2) mean over the cell that starts there, NaN where no
+    command is known; `angle_rad`, `speed_rad_s` (M, 2) measured. `encoder`: wheel samples with `encoder_angle_rad`
+    (E, 2) laid on even times, its stamps scatter by `stamp_scatter_s`; `pose`: pose samples with `pose` (P, 3) x, y,
+    yaw not wrapped within a run. `known_command` (M, 2) rad/s and `known_motion` (M, 3) m/s, m/s, rad/s: what the
+    terms without a name that a given model has add; None without.
+    """
+
+    t_s: Array
+    first: Mask
+    command_rad_s: Array
+    command_change: Array
+    angle_rad: Array
+    speed_rad_s: Array
+    encoder: Samples
+    encoder_angle_rad: Array
+    encoder_period_s: float
+    stamp_scatter_s: float
+    quantum_rad: float
+    pose: Samples
+    pose_values: Array
+    notes: tuple[str, ...] = ()
+    known_command: Array | None = None
+    known_motion: Array | None = None
+
+    @property
+    def has_commands(self) -> bool:
+        """Whether enough commands are known to judge the wheels."""
+        known = np.count_nonzero(np.isfinite(self.command_rad_s[:, 0]))
+        return bool(known > 0.02 * self.t_s.size and self.encoder.t_s.size > _FEWEST_READINGS)
+
+    @property
+    def has_poses(self) -> bool:
+        """Whether enough poses were measured to judge the body."""
+        return self.pose.t_s.size > 60
+
+    @property
+    def duration_s(self) -> float:
+        """Time covered by the grid."""
+        return float(self.t_s.size * CELL_S)
+
+
+def timeline(log: DriveLog) -> Timeline:
+    """Lay a drive on the grid; a log without wheel samples has an empty one."""
+    wheels, poses = without_repeats(log.wheels), log.poses
+    notes: list[str] = []
+    nodes_t, nodes_first, commands, changes, angles, speeds = [], [], [], [], [], []
+    encoder_at, encoder_angle, pose_at, pose_values = [], [], [], []
+    offset, foreign_s = 0, 0.0
+    runs = _runs(wheels.t_s, wheels.segment)
+    driven_s = sum(float(wheels.t_s[hi - 1] - wheels.t_s[lo]) for lo, hi in runs)
+    if driven_s > LONGEST_S:
+        runs = _spread(wheels.t_s, runs, driven_s)
+        notes.append(f"{driven_s:.0f} s of driving: {LONGEST_S:.0f} s of it, evenly spread, are judged")
+    for lo, hi in runs:
+        t = wheels.t_s[lo:hi]
+        angle = np.column_stack([wheels.left_angle_rad[lo:hi], wheels.right_angle_rad[lo:hi]])
+        angle = angle - angle[0]
+        segment = int(wheels.segment[lo])
+        grid = t[0] + CELL_S * np.arange(int((t[-1] - t[0]) / CELL_S) + 1)
+        at = np.column_stack([np.interp(grid, t, angle[:, side]) for side in (0, 1)])
+        command, change = _command_cells(log.commands, segment, grid)
+        span_s = max(_SPEED_SPAN_S, float(np.median(np.diff(t))))
+        speed = _speeds(grid, t, angle, span_s)
+        foreign = _foreign(command, speed, span_s)
+        command[foreign] = np.nan
+        foreign_s += CELL_S * int(foreign.sum())
+        nodes_t.append(grid)
+        nodes_first.append(np.arange(grid.size) == 0)
+        commands.append(command)
+        changes.append(change)
+        angles.append(at)
+        speeds.append(speed)
+        even = np.clip(even_times(t), grid[0], grid[-1])
+        moved = np.column_stack([np.interp(t, grid, speed[:, side]) for side in (0, 1)]) * (even - t)[:, None]
+        encoder_at.append(_locate(even, grid, offset))
+        encoder_angle.append(angle + moved)
+        here = (poses.segment == segment) & (poses.t_s >= grid[0] + 0.02) & (poses.t_s <= grid[-1] - CELL_S)
+        pose_at.append(_locate(poses.t_s[here], grid, offset))
+        yaw = np.unwrap(poses.yaw_rad[here]) if here.any() else np.empty(0)
+        pose_values.append(np.column_stack([poses.x_m[here], poses.y_m[here], yaw]))
+        offset += grid.size
+    if not nodes_t:
+        return _empty()
+    if foreign_s > 0.0:
+        notes.append(f"{foreign_s:.0f} s in which wheels and commands have nothing to do with each other are left out")
+    encoder = _joined(encoder_at)
+    measured = np.concatenate(encoder_angle)
+    return Timeline(
+        t_s=np.concatenate(nodes_t),
+        first=np.concatenate(nodes_first),
+        command_rad_s=np.concatenate(commands),
+        command_change=np.concatenate(changes),
+        angle_rad=np.concatenate(angles),
+        speed_rad_s=np.concatenate(speeds),
+        encoder=encoder,
+        encoder_angle_rad=measured,
+        encoder_period_s=float(np.median(np.diff(wheels.t_s))),
+        stamp_scatter_s=_scatter(wheels.t_s),
+        quantum_rad=_quantum(np.column_stack([wheels.left_angle_rad, wheels.right_angle_rad]))
+        if wheels.angle_measured
+        else 0.0,
+        pose=_joined(pose_at),
+        pose_values=np.concatenate(pose_values),
+        notes=tuple(notes),
+    )
+
+
+def even_times(t_s: Array) -> Array:
+    """Times (N,) without the jitter of their stamps: means over as many neighbours before as after.
+
+    Where samples are lost the stamp itself stays. Angles read by jittering stamps would make every response look
+    weaker than it is; moved to even times by the measured speed they do not.
+    """
+    if t_s.size < 3:
+        return t_s
+    half = np.minimum(np.minimum(np.arange(t_s.size), np.arange(t_s.size)[::-1]), _EVEN_SAMPLES)
+    total = np.concatenate([[0.0], np.cumsum(t_s)])
+    index = np.arange(t_s.size)
+    even = (total[index + half + 1] - total[index - half]) / (2 * half + 1)
+    return np.where(np.abs(even - t_s) < 0.5 * float(np.median(np.diff(t_s))), even, t_s)
+
+
+def _scatter(t_s: Array) -> float:
+    """Scatter of time stamps, s: robust standard deviation of their differences over the root of two."""
+    steps = np.diff(t_s)
+    return float(1.4826 * np.median(np.abs(steps - np.median(steps))) / 2.0**0.5)
+
+
+def _runs(t_s: Array, segment: Index) -> list[tuple[int, int]]:
+    """Stretches of one segment without silence, as half-open index ranges."""
+    if t_s.size < 2:
+        return []
+    breaks = np.flatnonzero((np.diff(segment) != 0) | (np.diff(t_s) > _LONGEST_SILENCE_S)) + 1
+    edges = [0, *breaks.tolist(), t_s.size]
+    pairs = pairwise(edges)
+    return [(lo, hi) for lo, hi in pairs if hi - lo > 2 and t_s[hi - 1] - t_s[lo] >= _SHORTEST_RUN_S]
+
+
+def _spread(t_s: Array, runs: list[tuple[int, int]], driven_s: float) -> list[tuple[int, int]]:
+    """Stretches of `_STRETCH_S`, evenly spread over the runs, that add up to about `LONGEST_S`."""
+    stretches = []
+    for lo, hi in runs:
+        edges = np.arange(t_s[lo], t_s[hi - 1], _STRETCH_S)
+        cuts = [*np.searchsorted(t_s[lo:hi], edges).tolist(), hi - lo]
+        stretches += [(lo + a, lo + b) for a, b in pairwise(cuts) if b - a > 2]
+    kept = np.unique(np.linspace(0, len(stretches) - 1, max(int(len(stretches) * LONGEST_S / driven_s), 1)).astype(int))
+    pieces = [stretches[k] for k in kept]
+    return [(lo, hi) for lo, hi in pieces if t_s[hi - 1] - t_s[lo] >= _SHORTEST_RUN_S]
+
+
+def _locate(t_s: Array, grid: Array, offset: int) -> Samples:
+    """Positions of times on a run's grid whose first node has index `offset`."""
+    place = (t_s - grid[0]) / CELL_S
+    node = np.clip(np.floor(place).astype(np.int64), 0, grid.size - 2)
+    return Samples(node + offset, place - node, t_s, np.floor(t_s / BLOCK_S).astype(np.int64))
+
+
+def _joined(parts: list[Samples]) -> Samples:
+    return Samples(
+        np.concatenate([part.node for part in parts]),
+        np.concatenate([part.fraction for part in parts]),
+        np.concatenate([part.t_s for part in parts]),
+        np.concatenate([part.block for part in parts]),
+    )
+
+
+def _command_cells(commands: Commands, segment: int, grid: Array) -> tuple[Array, Array]:
+    """Mean command over each cell (M, 2), exact for commands held until the next, and the squared jumps in it (M,)."""
+    inside = commands.segment == segment
+    t, values = commands.t_s[inside], np.column_stack([commands.left_rad_s[inside], commands.right_rad_s[inside]])
+    if not t.size:
+        return np.full((grid.size, 2), np.nan), np.zeros(grid.size)
+    known = np.isfinite(values[:, 0])
+    filled = np.nan_to_num(values)
+    edges = np.append(grid, grid[-1] + CELL_S)
+    ends = np.append(t[1:], max(edges[-1], t[-1]) + 1.0)
+    integral = np.concatenate([np.zeros((1, 2)), np.cumsum(filled * (ends - t)[:, None], axis=0)])
+    knots = np.append(t, ends[-1])
+    means = np.column_stack([np.diff(np.interp(edges, knots, integral[:, side])) for side in (0, 1)]) / CELL_S
+    unknown = np.concatenate([[0.0], np.cumsum((~known) * (ends - t))])
+    lost = np.diff(np.interp(edges, knots, unknown)) > 1e-9
+    means[lost | (grid < t[0] - 1e-9)] = np.nan
+    jumps = np.zeros(grid.size)
+    steps = (np.diff(filled, axis=0) ** 2).mean(axis=1)
+    where = np.clip(((t[1:] - grid[0]) / CELL_S).astype(np.int64), 0, grid.size - 1)
+    np.add.at(jumps, where, steps)
+    return means, jumps
+
+
+def _foreign(command: Array, speed: Array, span_s: float) -> Mask:
+    """Cells (M,) in which wheels turn long after the last command or rest under a large one: another master drives.
+
+    A speed taken over `span_s` either side rises that much before the command that it follows.
+    """
+    asked = np.nan_to_num(np.abs(command).max(axis=1), nan=np.inf)
+    turning = np.abs(speed).max(axis=1)
+    span = round(_LONGEST_RESPONSE_S / CELL_S)
+    before = maximum_filter1d(asked, span, origin=(span - 1) // 2)
+    most = np.maximum(before, maximum_filter1d(asked, 2 * math.ceil(span_s / CELL_S) + 3))
+    least = minimum_filter1d(asked, span, origin=(span - 1) // 2)
+    unasked = (most < _NO_COMMAND_RAD_S) & (turning > _TURNING_RAD_S)
+    unheard = (least > _LOUD_RAD_S) & np.isfinite(asked) & (turning < _NO_COMMAND_RAD_S)
+    return np.asarray(maximum_filter1d((unasked | unheard).astype(np.uint8), 2 * span) > 0)
+
+
+def _speeds(grid: Array, t: Array, angle: Array, span_s: float) -> Array:
+    """Speeds at the nodes from differences of the angle over `span_s` either side, (M, 2)."""
+    low, high = np.maximum(grid - span_s, t[0]), np.minimum(grid + span_s, t[-1])
+    columns = [np.interp(high, t, angle[:, side]) - np.interp(low, t, angle[:, side]) for side in (0, 1)]
+    return np.asarray(np.column_stack(columns) / (high - low)[:, None])
+
+
+def _quantum(angle: Array) -> float:
+    """The smallest step of the angle, rad; 0 if it has none."""
+    steps = np.abs(np.diff(angle, axis=0)).ravel()
+    steps = steps[steps > 1e-9]
+    return float(np.quantile(steps, 0.001)) if steps.size > 100 else 0.0
+
+
+def _empty() -> Timeline:
+    nothing, pairs = np.empty(0), np.empty((0, 2))
+    samples = Samples(np.empty(0, np.int64), nothing, nothing, np.empty(0, np.int64))
+    return Timeline(
+        nothing,
+        np.empty(0, bool),
+        pairs,
+        nothing,
+        pairs,
+        pairs,
+        samples,
+        pairs,
+        0.0,
+        0.0,
+        0.0,
+        samples,
+        np.empty((0, 3)),
+    )

@@ -1,0 +1,385 @@
+"""The two channels that are cut where they are measured: command to wheel, and wheel to pose.
+
+Each gives whitened residuals of a free run for any parameter vector; the pose sensor's effects live in the second one's
+data.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from disco_hw.gap.data.free_runs import pose_residual, read_angles, run_body, run_wheels
+from disco_hw.gap.data.gridded_drive import CELL_S, Samples, Timeline
+from disco_hw.gap.data.layout import BASE_COUNT, BODY, WHEEL, Layout
+from disco_hw.gap.noise.body_noise import BodyGains, BodyNoise, Motion, body_gains, whiten_body
+from disco_hw.gap.noise.wheel_noise import (
+    Driven,
+    WheelGains,
+    WheelNoise,
+    calm_speeds,
+    steady_speeds,
+    wheel_gains,
+    whiten_wheels,
+)
+
+WINDOW_S = 3.0
+ONSET_M_S = 0.05
+DRIFT_ONSET_M_S = 0.02
+_SHORTEST_WINDOW = 12
+_LONGEST_POSE_GAP_S = 2.0
+# How far a noise model is believed before a log speaks, in blocks: wheels wander as long as a log's blocks are and
+# longer, bodies do not (mean square of the scores of what is not there, over six dirty logs: 3.4 and 1.4).
+_TRUSTED_WHEEL_BLOCKS, _TRUSTED_BODY_BLOCKS = 1.0, 6.0
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+
+class Channel(Protocol):
+    """What fitting and selecting need of a channel; n is the number of its residuals."""
+
+    @property
+    def layout(self) -> Layout:
+        """What the parameter vector's entries are."""
+
+    @property
+    def neutral(self) -> Array:
+        """The parameter vector without any effect, at the nominal geometry."""
+
+    @property
+    def inner(self) -> WheelChannel | BodyChannel:
+        """The channel itself, without unnamed terms."""
+
+    @property
+    def free(self) -> tuple[int, ...]:
+        """Entries of the vector that are fitted whatever the effects."""
+
+    @property
+    def block(self) -> Index:
+        """Block of time of each residual, (n,)."""
+
+    @property
+    def count(self) -> int:
+        """Number of residuals that are used."""
+
+    @property
+    def trusted_blocks(self) -> float:
+        """How many blocks of time that agree with the noise model it is worth, before the log is looked at."""
+
+    def residual(self, p: Array) -> Array:
+        """Whitened residuals (n,) at a parameter vector."""
+
+    def split(self, p: Array) -> tuple[Array, Array | None]:
+        """Entries of effects and base alone, and what unnamed terms add at the nodes, if any."""
+
+
+@dataclass(frozen=True)
+class WheelChannel:
+    """Commands in, wheel angles out; `weight` (E, 2) tames stretches that are noisier than the rest."""
+
+    timeline: Timeline
+    driven: Driven
+    gains: WheelGains
+    weight: Array
+    noise: WheelNoise
+    geometry: Array
+
+    @classmethod
+    def build(cls, line: Timeline, noise: WheelNoise, geometry: Array, use: Mask | None = None) -> WheelChannel:
+        """The channel with a noise model; samples where no command is known are left out.
+
+        `geometry` (3,): wheel radius, axial distance, x_icr, for effects that speak of the robot's motion.
+        """
+        place = line.encoder
+        known = np.isfinite(line.command_rad_s[:, 0])
+        # One known cell before is not enough: the run begins anew after unknown commands.
+        followed = known[place.node] & known[np.maximum(place.node - 1, 0)]
+        good = followed if use is None else followed & use
+        dt = np.diff(place.t_s, prepend=place.t_s[0])
+        first_of_run = np.zeros(place.t_s.size, dtype=bool)
+        starts = np.flatnonzero(line.first)
+        first_of_run[np.searchsorted(place.node, starts)] = True
+        resumed = followed & ~np.concatenate([[False], followed[:-1]])
+        jumps = np.concatenate([[0.0], np.cumsum(line.command_change)])
+        between = np.diff(jumps[place.node + 1], prepend=0.0)
+        speed = line.speed_rad_s[place.node]
+        dt = np.maximum(dt, 0.0)
+        steady = steady_speeds(dt, speed)
+        driven = Driven(dt, calm_speeds(dt, speed), steady, np.maximum(between, 0.0), first_of_run | resumed, good)
+        return cls(line, driven, wheel_gains(noise, driven), np.ones((place.t_s.size, 2)), noise, geometry)
+
+    def with_noise(self, noise: WheelNoise, use: Mask | None = None) -> WheelChannel:
+        """The same data under another noise model, weights reset; `use` (E,) leaves samples out."""
+        driven = self.driven if use is None else replace(self.driven, use=self.driven.use & use)
+        return replace(
+            self, driven=driven, gains=wheel_gains(noise, driven), weight=np.ones(self.weight.shape), noise=noise
+        )
+
+    def expecting(self, p: Array) -> WheelChannel:
+        """The same, whose wheels' slow error acts on the speed that a parameter vector gives; weights reset."""
+        turned = np.diff(self._predicted(p), axis=0, prepend=np.nan)
+        moving = (self.driven.dt_s > 0.0) & ~self.driven.restart
+        expected = np.where(moving[:, None], turned / np.maximum(self.driven.dt_s, 1e-9)[:, None], 0.0)
+        return replace(self, driven=replace(self.driven, expected_rad_s=expected)).with_noise(self.noise)
+
+    def weighted(self, weight: Array) -> WheelChannel:
+        """The same with other weights (E, 2)."""
+        return replace(self, weight=weight)
+
+    @property
+    def layout(self) -> Layout:
+        """What the parameter vector's entries are."""
+        return WHEEL
+
+    @property
+    def neutral(self) -> Array:
+        """The parameter vector without any effect."""
+        return WHEEL.neutral
+
+    @property
+    def inner(self) -> WheelChannel:
+        """The channel itself."""
+        return self
+
+    @property
+    def free(self) -> tuple[int, ...]:
+        """Entries of the vector that are fitted whatever the effects."""
+        return ()
+
+    def split(self, p: Array) -> tuple[Array, Array | None]:
+        """The vector; there are no unnamed terms in it."""
+        return p, None
+
+    @property
+    def block(self) -> Index:
+        """Block of time of each residual, (2 E,)."""
+        return np.repeat(self.timeline.encoder.block, 2)
+
+    @property
+    def count(self) -> int:
+        """Number of residuals that are used."""
+        return 2 * int(self.gains.use.sum())
+
+    @property
+    def trusted_blocks(self) -> float:
+        """How many blocks of time that agree with the noise model it is worth."""
+        return _TRUSTED_WHEEL_BLOCKS
+
+    def angles(self, p: Array, extra: Array | None = None) -> Array:
+        """Free-running wheel angles at the nodes, (M, 2)."""
+        line = self.timeline
+        push = total_push(line, 2, line.known_command, extra)
+        return run_wheels(p, self.geometry, line.command_rad_s, push, line.first, line.t_s, line.speed_rad_s)
+
+    def raw_residual(self, p: Array, extra: Array | None = None) -> Array:
+        """Measured minus predicted wheel angles at the samples, (E, 2)."""
+        return self.timeline.encoder_angle_rad - self._predicted(p, extra)
+
+    def _predicted(self, p: Array, extra: Array | None = None) -> Array:
+        place = self.timeline.encoder
+        predicted = np.empty((place.t_s.size, 2))
+        read_angles(self.angles(p, extra), place.node, place.fraction, predicted)
+        return predicted
+
+    def whitened(self, p: Array, extra: Array | None = None) -> Array:
+        """Residuals of unit variance, not weighted, (E, 2)."""
+        return whiten_wheels(self.raw_residual(p, extra), self.gains)
+
+    def residual(self, p: Array, extra: Array | None = None) -> Array:
+        """Whitened residuals, (2 E,)."""
+        return (self.whitened(p, extra) * self.weight).ravel()
+
+
+@dataclass(frozen=True)
+class BodyChannel:
+    """Measured wheel angles in, poses out, in windows of `WINDOW_S` whose start pose is unknown."""
+
+    timeline: Timeline
+    samples: Samples
+    measured: Array
+    window: Index
+    first_node: Index
+    last_node: Index
+    moving_s: Array
+    use: Mask
+    gains: BodyGains
+    weight: Array
+    noise: BodyNoise
+    geometry: Array
+
+    @classmethod
+    def build(cls, line: Timeline, noise: BodyNoise, geometry: Array, use: Mask | None = None) -> BodyChannel:
+        """The channel with a noise model; `geometry` is the parameter vector that describes the motion roughly.
+
+        `use` (P,) leaves single poses of the timeline out.
+        """
+        window, keep = _windows(line)
+        samples = line.pose.pick(keep)
+        measured = _turned_as_the_wheels(line, samples, line.pose_values[keep], geometry)
+        chosen = np.ones(samples.t_s.size, dtype=bool) if use is None else use[keep]
+        starts = np.flatnonzero(line.first)
+        ends = np.append(starts[1:], line.t_s.size) - 1
+        run = np.searchsorted(starts, samples.node, side="right") - 1
+        rim = np.abs(line.speed_rad_s).max(axis=1) * geometry[0]
+        rolling = np.abs(line.speed_rad_s).mean(axis=1) * geometry[0]
+        moving_s = np.cumsum(np.minimum(rolling / DRIFT_ONSET_M_S, 1.0)) * CELL_S
+        channel = cls(
+            line,
+            samples,
+            measured,
+            window,
+            starts[run],
+            ends[run],
+            moving_s,
+            chosen,
+            body_gains(noise, _no_motion(samples)),
+            np.ones((samples.t_s.size, 3)),
+            noise,
+            geometry,
+        )
+        return replace(channel, gains=body_gains(noise, channel.motion(rim)))
+
+    def motion(self, rim_m_s: Array) -> Motion:
+        """How the robot moved between the pose samples, from the wheels and the rough geometry."""
+        line, samples, p = self.timeline, self.samples, self.geometry
+        speeds = line.speed_rad_s[samples.node]
+        v = 0.5 * p[0] * (speeds[:, 0] + speeds[:, 1])
+        omega = p[0] / p[1] * (speeds[:, 1] - speeds[:, 0])
+        restart = np.concatenate([[True], np.diff(self.window) != 0])
+        predicted = self.measured - self.raw_residual(p)
+        step = np.diff(predicted, axis=0, prepend=predicted[:1])
+        step[restart] = 0.0
+        dt = np.diff(samples.t_s, prepend=samples.t_s[0])
+        dt[restart] = 0.0
+        moving = np.minimum(rim_m_s[samples.node] / ONSET_M_S, 1.0)
+        return Motion(dt, step[:, 0], step[:, 1], predicted[:, 2], moving, v, omega, restart, self.use)
+
+    def with_noise(self, noise: BodyNoise, geometry: Array | None = None, use: Mask | None = None) -> BodyChannel:
+        """The same data under another noise model, weights reset; `use` is over this channel's samples."""
+        changed = replace(
+            self,
+            noise=noise,
+            geometry=self.geometry if geometry is None else geometry,
+            use=self.use if use is None else use,
+        )
+        rim = np.abs(self.timeline.speed_rad_s).max(axis=1) * changed.geometry[0]
+        return replace(
+            changed, gains=body_gains(noise, changed.motion(rim)), weight=np.ones((self.samples.t_s.size, 3))
+        )
+
+    def weighted(self, weight: Array) -> BodyChannel:
+        """The same with other weights (P, 3)."""
+        return replace(self, weight=weight)
+
+    @property
+    def layout(self) -> Layout:
+        """What the parameter vector's entries are."""
+        return BODY
+
+    @property
+    def neutral(self) -> Array:
+        """The parameter vector without any effect, at the given geometry."""
+        return np.concatenate([self.geometry[:BASE_COUNT], BODY.neutral[BASE_COUNT:]])
+
+    @property
+    def inner(self) -> BodyChannel:
+        """The channel itself."""
+        return self
+
+    @property
+    def free(self) -> tuple[int, ...]:
+        """Entries of the vector that are fitted whatever the effects."""
+        return tuple(range(BASE_COUNT))
+
+    def split(self, p: Array) -> tuple[Array, Array | None]:
+        """The vector; there are no unnamed terms in it."""
+        return p, None
+
+    @property
+    def block(self) -> Index:
+        """Block of time of each residual, (3 P,)."""
+        return np.repeat(self.samples.block, 3)
+
+    @property
+    def count(self) -> int:
+        """Number of residuals that are used, less the unknown starts."""
+        return 3 * int(self.use.sum()) - 3 * int(self.window[-1] + 1)
+
+    @property
+    def trusted_blocks(self) -> float:
+        """How many blocks of time that agree with the noise model it is worth."""
+        return _TRUSTED_BODY_BLOCKS
+
+    def track(self, p: Array, extra: Array | None = None) -> Array:
+        """Path at the nodes from the measured wheel angles, (M, 3)."""
+        line = self.timeline
+        push = total_push(line, 3, line.known_motion, extra)
+        return run_body(p, line.angle_rad, line.speed_rad_s, push, line.first, line.t_s)
+
+    def raw_residual(self, p: Array, extra: Array | None = None) -> Array:
+        """Measured minus predicted poses (P, 3) in the world, each window laid on its measurements."""
+        return pose_residual(
+            p,
+            self.track(p, extra),
+            self.moving_s,
+            self.samples.node,
+            self.samples.fraction,
+            self.window,
+            self.first_node,
+            self.last_node,
+            self.use,
+            self.measured,
+        )
+
+    def whitened(self, p: Array, extra: Array | None = None) -> Array:
+        """Residuals of unit variance, not weighted, (P, 3)."""
+        return whiten_body(self.raw_residual(p, extra), self.gains)
+
+    def residual(self, p: Array, extra: Array | None = None) -> Array:
+        """Whitened residuals, (3 P,)."""
+        return (self.whitened(p, extra) * self.weight).ravel()
+
+
+def total_push(line: Timeline, width: int, *pushes: Array | None) -> Array:
+    """Sum (M, width) of what is added at the nodes by those that are there."""
+    return np.asarray(sum((push for push in pushes if push is not None), np.zeros((line.t_s.size, width))))
+
+
+def _windows(line: Timeline) -> tuple[Index, Mask]:
+    """Window of each kept pose, numbered from 0, and which poses are kept (those in windows that are too thin are not).
+
+    A window ends after `WINDOW_S`, with its run, and where poses fail to come for long.
+    """
+    t, node = line.pose.t_s, line.pose.node
+    run = np.searchsorted(np.flatnonzero(line.first), node, side="right")
+    number = np.zeros(t.size, dtype=np.int64)
+    current, begin = 0, 0
+    for k in range(1, t.size):
+        if run[k] != run[k - 1] or t[k] - t[begin] > WINDOW_S or t[k] - t[k - 1] > _LONGEST_POSE_GAP_S:
+            current, begin = current + 1, k
+        number[k] = current
+    sizes = np.bincount(number, minlength=current + 1)
+    keep = sizes[number] >= min(_SHORTEST_WINDOW, int(np.median(sizes)))
+    _, renumbered = np.unique(number[keep], return_inverse=True)
+    return renumbered.astype(np.int64), keep
+
+
+def _turned_as_the_wheels(line: Timeline, samples: Samples, measured: Array, geometry: Array) -> Array:
+    """Poses (P, 3) with whole turns as the wheels make them: while no pose comes, it may be more than half of one."""
+    push = total_push(line, 3, line.known_motion)
+    track = run_body(geometry, line.angle_rad, line.speed_rad_s, push, line.first, line.t_s)
+    expected = np.empty(measured.shape)
+    read_angles(track, samples.node, samples.fraction, expected)
+    yaw = expected[:, 2] + np.unwrap(measured[:, 2] - expected[:, 2])
+    return np.column_stack([measured[:, :2], yaw])
+
+
+def _no_motion(samples: Samples) -> Motion:
+    still = np.zeros(samples.t_s.size)
+    flags = np.zeros(samples.t_s.size, dtype=bool)
+    return Motion(still, still, still, still, still, still, still, ~flags, ~flags)

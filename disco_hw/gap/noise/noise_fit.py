@@ -1,0 +1,170 @@
+"""The noise of a channel, learnt from what the richest model leaves of this log, then held for every comparison."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from disco_hw.gap.data.gridded_drive import Timeline
+from disco_hw.gap.noise.body_noise import BodyNoise, body_likelihood
+from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
+from disco_hw.gap.noise.wheel_noise import WheelNoise, wheel_likelihood, whiten_wheels
+
+Array = NDArray[np.float64]
+
+_HUBER = 3.0
+_PRIOR_SD = 2.0
+_STEP = 2e-2
+_OUTLIER = 5.0
+_SMOOTH_SAMPLES = 25
+_LOCAL_EXCESS = 1.4
+_REST_RAD_S = 0.05
+_READING, _COMMAND_STAMP = 2, 4
+_LEAST_JITTER_S = 1e-3
+_JITTER_RATIO = 2.0
+_JITTER_SHARE = 0.05
+_LARGEST_WHEEL_NOISE = (0.05, 1.0, 0.1, 0.05, 0.1, 0.1, 0.02)
+
+
+def _huber(white: Array) -> float:
+    """Sum of squares of whitened residuals that grow linearly beyond `_HUBER`."""
+    flat = white.ravel()
+    beyond = np.abs(flat)
+    beyond = beyond[beyond > _HUBER] - _HUBER
+    return float(flat @ flat - beyond @ beyond)
+
+
+def _minimise(objective, start: Array, low: Array, high: Array, most: int) -> Array:  # type: ignore[no-untyped-def]
+    def slope(logs: Array) -> Array:
+        # Central: a one-sided difference this wide would end the search some way off.
+        out = np.empty(logs.size)
+        for k in range(logs.size):
+            ahead, behind = logs.copy(), logs.copy()
+            ahead[k], behind[k] = min(logs[k] + _STEP, high[k]), max(logs[k] - _STEP, low[k])
+            out[k] = (objective(ahead) - objective(behind)) / max(ahead[k] - behind[k], 1e-9)
+        return out
+
+    found = minimize(
+        objective,
+        start,
+        jac=slope,
+        method="L-BFGS-B",
+        bounds=list(zip(low, high, strict=True)),
+        options={"maxiter": most, "ftol": 3e-6},
+    )
+    return np.asarray(found.x)
+
+
+def largest_command_jitter_s(line: Timeline) -> float:
+    """How far commands may plausibly come early or late, s, by how the encoder's time stamps scatter.
+
+    More than that is no jitter but a response that the model does not have, and must not pass for noise.
+    """
+    return _LEAST_JITTER_S + _JITTER_RATIO * line.stamp_scatter_s + _JITTER_SHARE * line.encoder_period_s
+
+
+def wheel_misfit(channel: WheelChannel, raw: Array) -> Callable[[Array], float]:
+    """Minus the robust log likelihood of what a model leaves of the angles (E, 2), by logarithms of the noise (7,)."""
+    driven = channel.driven
+    # A wheel at rest reads the same however coarse its encoder is, and would speak for readings without error.
+    counted = driven.use & ~driven.restart & (np.abs(driven.speed_rad_s).max(axis=1) > _REST_RAD_S)
+    likelihood = wheel_likelihood(driven, counted, raw)
+
+    def misfit(logs: Array) -> float:
+        white, weight = likelihood(logs)
+        return 0.5 * _huber(white) - weight
+
+    return misfit
+
+
+def fit_wheel_noise(channel: WheelChannel, raw: Array) -> WheelNoise:
+    """Noise of the wheels by maximum likelihood of what a model leaves of the angles, (E, 2)."""
+    line = channel.timeline
+    start = channel.noise.vector()
+    misfit = wheel_misfit(channel, raw)
+
+    def objective(logs: Array) -> float:
+        return misfit(logs) + _pull(logs, start)
+
+    # A speed that may be wrong by any amount for any time would explain wheels that do not turn at all.
+    most = np.minimum(start + 5.0, WheelNoise(*_LARGEST_WHEEL_NOISE).vector())
+    most[_COMMAND_STAMP] = min(most[_COMMAND_STAMP], math.log(largest_command_jitter_s(line)))
+    begin = np.minimum(start, most)
+    least = begin - 5.0
+    if line.quantum_rad > 0.0:
+        least[_READING] = max(least[_READING], math.log(line.quantum_rad / math.sqrt(12.0)))
+    return WheelNoise.from_vector(_minimise(objective, np.maximum(begin, least), least, most, 25))
+
+
+def _pull(logs: Array, start: Array) -> float:
+    """A weak prior that keeps parameters the log says nothing about where they are."""
+    return 0.5 * float((((logs - start) / _PRIOR_SD) ** 2).sum())
+
+
+def fit_body_noise(channel: BodyChannel, p: Array, extra: Array | None = None, iterations: int = 15) -> BodyNoise:
+    """Noise of poses and body by maximum likelihood at a parameter vector and what unnamed terms add."""
+    raw = channel.raw_residual(p, extra)
+    rim = np.abs(channel.timeline.speed_rad_s).max(axis=1) * channel.geometry[0]
+    motion = channel.motion(rim)
+    start = channel.noise.vector()
+    likelihood = body_likelihood(motion, raw)
+
+    def objective(logs: Array) -> float:
+        white, weight = likelihood(logs)
+        return 0.5 * _huber(white) - weight + _pull(logs, start)
+
+    return BodyNoise.from_vector(_minimise(objective, start, start - 5.0, start + 5.0, iterations))
+
+
+def without_outliers(channel: BodyChannel, p: Array, extra: Array | None = None) -> BodyChannel:
+    """The channel without poses that no noise of this size explains; found again until none is left."""
+    for _ in range(3):
+        white = channel.whitened(p, extra)
+        wild = channel.use & (np.abs(white).max(axis=1) > _OUTLIER)
+        # A pose that jumps makes its successors look wild too: only the first of a row goes, then look again.
+        wild &= ~np.concatenate([[False], wild[:-1]])
+        if not wild.any() or wild.sum() > 0.1 * channel.use.sum():
+            break
+        channel = channel.with_noise(channel.noise, use=channel.use & ~wild)
+    return channel
+
+
+def local_weight(white: Array, use: NDArray[np.bool_]) -> Array:
+    """Weights that bring stretches and samples with larger residuals than the noise model's down to its size.
+
+    `white` (S, k) whitened, not weighted; the local scale is the mean square over `2 _SMOOTH_SAMPLES + 1` samples.
+    """
+    clipped = np.minimum(white**2, 16.0) * use[:, None]
+    window = np.ones(2 * _SMOOTH_SAMPLES + 1)
+    amount = np.convolve(use.astype(float), window, "same")
+    weights = np.empty_like(white)
+    for side in range(white.shape[1]):
+        local = np.convolve(clipped[:, side], window, "same") / np.maximum(amount, 1.0)
+        weights[:, side] = 1.0 / np.sqrt(np.maximum(local / _LOCAL_EXCESS, 1.0))
+    tamed = np.abs(white) * weights
+    return np.asarray(weights * np.minimum(1.0, _HUBER / np.maximum(tamed, 1e-9)))
+
+
+def learn_wheel_noise(channel: WheelChannel, raw: Array) -> WheelChannel:
+    """The channel with the noise of residuals `raw` (E, 2), and weights for what is noisier still."""
+    channel = channel.with_noise(fit_wheel_noise(channel, raw))
+    white = whiten_wheels(raw, channel.gains)
+    wild = channel.gains.use & (np.abs(white).max(axis=1) > 2.0 * _OUTLIER)
+    if 0 < wild.sum() < 0.02 * wild.size:
+        channel = channel.with_noise(channel.noise, ~wild)
+        white = whiten_wheels(raw, channel.gains)
+    return channel.weighted(local_weight(white, channel.gains.use))
+
+
+def learn_body_noise(channel: BodyChannel, p: Array, extra: Array | None = None, iterations: int = 15) -> BodyChannel:
+    """The channel with the noise that is left at `p`, without outliers, and weights for what is noisier still."""
+    geometry = p.copy()
+    channel = without_outliers(replace(channel, geometry=geometry).with_noise(channel.noise), p, extra)
+    channel = channel.with_noise(fit_body_noise(channel, p, extra, iterations))
+    channel = without_outliers(channel, p, extra)
+    return channel.weighted(local_weight(channel.whitened(p, extra), channel.use))

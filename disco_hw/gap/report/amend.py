@@ -1,0 +1,123 @@
+"""The amended model: nominal geometry refitted, what is missing added, joint uncertainty of old and new parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from disco_hw.gap.search.channel_search import UnnamedTerm
+from disco_hw.gap.search.intervals import Estimate, Estimates
+from disco_hw.model import EffectSetting, Gaussian, Model
+from disco_hw.model.parameter import BASE_PARAMETERS
+from disco_hw.model.terms import TERMS, effect_of
+
+Array = NDArray[np.float64]
+
+_Z95 = 1.96
+
+
+def with_terms_named(part: Estimates, unnamed: Sequence[UnnamedTerm], geometry: tuple[float, float]) -> Estimates:
+    """A channel's estimates with the numbers of its unnamed terms under their names in a model.
+
+    They are put in units of the speeds that wheels of the final `geometry` (radius, axial distance, m) make.
+    """
+    names, factors = list(part.fitted), np.ones(len(part.fitted))
+    by_name = dict(part.by_name)
+    for number, found in enumerate(unnamed):
+        name, column = found.term.model_name, f"term{number}"
+        if name is None or column not in names:
+            continue
+        place = names.index(column)
+        old_radius, old_axial = found.term.geometry
+        factor = TERMS[name].rescaled(geometry[0] / old_radius, geometry[1] / old_axial)
+        names[place], factors[place] = f"{name}.k", factor
+        old = by_name.pop(column)
+        by_name[f"{name}.k"] = Estimate(old.value * factor, old.low * factor, old.high * factor)
+    return Estimates(by_name, tuple(names), part.covariance * np.outer(factors, factors))
+
+
+def amended_model(
+    model: Model,
+    effects: Mapping[str, Mapping[str, Estimate]],
+    terms: Sequence[str],
+    parts: tuple[Estimates, ...],
+) -> tuple[Model, tuple[str, ...]]:
+    """The model with base parameters of `parts`, `effects` and `terms` added, and their joint Gaussian; and notes.
+
+    Terms that the model has already stay, with what was believed of them. Values outside an effect's physical range are
+    put at its end, with a note.
+    """
+    notes: list[str] = []
+    estimates = {name: estimate for part in parts for name, estimate in part.by_name.items()}
+    base = {p.name: estimates[p.name].value for p in BASE_PARAMETERS if p.name in estimates}
+    known = _known_terms(model, base)
+    for name in terms:
+        found, before = estimates[f"{name}.k"], known[name].value if name in known else 0.0
+        known[name] = Estimate(before + found.value, before + found.low, before + found.high)
+    wanted = {**effects, **{name: {"k": estimate} for name, estimate in known.items()}}
+    settings = []
+    for name, values in wanted.items():
+        inside = {}
+        for parameter in effect_of(name).parameters:
+            key = parameter.name
+            value = values[key].value if key in values else parameter.neutral
+            inside[key] = min(max(value, parameter.low), parameter.high)
+            if inside[key] != value:
+                notes.append(f"{name}.{key}: {value:.4g} is outside what the model takes; {inside[key]:.4g} is written")
+        settings.append(EffectSetting(name, inside))
+    bare = Model(
+        **{p.name: base.get(p.name, getattr(model, p.name)) for p in BASE_PARAMETERS},
+        effects=tuple(settings),
+        name=model.name,
+    )
+    names, covariance = _joint(bare, wanted, estimates, parts)
+    if not names:
+        return bare, tuple(notes)
+    point = dict(zip(bare.parameter_names, bare.point(), strict=True))
+    belief = Gaussian(names, np.array([point[name] for name in names]), covariance)
+    return replace(bare, belief=belief), tuple(notes)
+
+
+def _known_terms(model: Model, base: Mapping[str, float]) -> dict[str, Estimate]:
+    """The terms that a model has, with their intervals, in units of the refitted `base`."""
+    ratios = [
+        base.get(name, getattr(model, name)) / getattr(model, name) for name in ("wheel_radius_m", "axial_distance_m")
+    ]
+    found = {}
+    for setting in model.effects:
+        if setting.name not in TERMS:
+            continue
+        factor, key = TERMS[setting.name].rescaled(*ratios), f"{setting.name}.k"
+        deviation = 0.0
+        if model.belief is not None and key in model.belief.names:
+            place = model.belief.names.index(key)
+            deviation = abs(factor) * float(model.belief.covariance()[place, place]) ** 0.5
+        value = setting.values["k"] * factor
+        found[setting.name] = Estimate(value, value - _Z95 * deviation, value + _Z95 * deviation)
+    return found
+
+
+def _joint(
+    bare: Model,
+    effects: Mapping[str, Mapping[str, Estimate]],
+    estimates: Mapping[str, Estimate],
+    parts: tuple[Estimates, ...],
+) -> tuple[tuple[str, ...], Array]:
+    """Names and covariance: joint within a channel, independent between channels."""
+    full = {f"{effect}.{key}": estimate for effect, values in effects.items() for key, estimate in values.items()}
+    known = {p.name: estimates[p.name] for p in BASE_PARAMETERS if p.name in estimates} | full
+    names = tuple(name for name in bare.parameter_names if name in known)
+    covariance = np.diag([known[name].deviation ** 2 for name in names])
+    for part in parts:
+        order = {name: place for place, name in enumerate(part.fitted)}
+        for i, first in enumerate(names):
+            for j, second in enumerate(names):
+                if i != j and first in order and second in order:
+                    covariance[i, j] = part.covariance[order[first], order[second]]
+    scale = np.sqrt(np.diag(covariance))
+    values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
+    sound = (vectors * np.maximum(values, 1e-8)) @ vectors.T * np.outer(scale, scale)
+    return names, np.asarray(0.5 * (sound + sound.T))

@@ -1,0 +1,179 @@
+"""What a log could not have shown: for each effect that was not found, the smallest size that would have been seen."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from disco_hw.effects.effect import Parameter
+from disco_hw.effects.registry import REGISTRY
+from disco_hw.gap.noise.channels import WheelChannel
+from disco_hw.gap.search.candidates import CANDIDATES, candidates_of
+from disco_hw.gap.search.channel_search import Found
+from disco_hw.gap.search.least_squares import inverse, sensitivity, solve
+
+Array = NDArray[np.float64]
+
+_RAMP = "yaw_acceleration_limit"
+LIMITS = ("speed_limit", "yaw_rate_limit", _RAMP)
+_RAMPS_RAD_S2 = (20.0, 10.0, 7.0, 5.0, 3.5, 2.5, 1.5, 1.0, 0.5)
+_RESPONSE = ("motor_lag.tau_s", "command_delay.delay_s")
+# A limit shows only where more is asked: this share of what the robot can do, and no more turning than robots are
+# held to.
+_MOST_OF_IT = 0.75
+_REALISTIC_YAW_RATE_RAD_S = 1.2
+_EXACT_ALIKE = {"pose_offset": "lateral_icr", "encoder_scale": "wheel_gain"}
+_USUAL_INFLATION = 1.5
+
+
+@dataclass(frozen=True, slots=True)
+class BlindSpot:
+    """An effect that was not found: the parameter that measures it, its smallest visible size, None if none is.
+
+    For a limit it is the largest that would have been seen. `blind` if realistic sizes would have stayed hidden.
+    """
+
+    name: str
+    parameter: str
+    unit: str
+    smallest_visible: float | None
+    blind: bool
+    experiment: str
+
+
+def blind_spots(found: Found, top_rad_s: float | None = None) -> tuple[BlindSpot, ...]:
+    """Blind spots of one channel, one for each of its effects that was not accepted.
+
+    `top_rad_s`: the largest wheel speed of the robot, if it is known; without it nobody knows what was not asked of it.
+    """
+    channel = found.selector.channel
+    missing = [name for name in candidates_of(channel.layout) if name not in found.names]
+    spots = [_limit(found, name, top_rad_s) if name in LIMITS else _spot(found, name) for name in missing]
+    for spot in tuple(spots):
+        for other, like in _EXACT_ALIKE.items():
+            if spot.name == like:
+                parameter = next(p for p in REGISTRY[other].parameters if p.realistic is not None)
+                size = spot.smallest_visible
+                blind = size is None or size > _realistic(parameter)
+                spots.append(BlindSpot(other, parameter.name, spot.unit, size, blind, experiment_of(other)))
+    return tuple(spots)
+
+
+def _spot(found: Found, name: str) -> BlindSpot:
+    parameter = REGISTRY[name].parameters[0]
+    size = _size(found, name, f"{name}.{parameter.name}")
+    blind = size is None or size > _realistic(parameter)
+    return BlindSpot(name, parameter.name, parameter.unit, size, blind, experiment_of(name))
+
+
+def _realistic(parameter: Parameter) -> float:
+    """A size that real robots show; an effect whose smallest visible size is above it is one this log is blind to."""
+    return math.inf if parameter.realistic is None else parameter.realistic
+
+
+def experiment_of(name: str) -> str:
+    """The drive that shows an effect, as it is typed, and what it is."""
+    effect = REGISTRY[name]
+    return f"disco-hw drive ROBOT.toml --script {effect.script}: {effect.excitation}"
+
+
+def _limit(found: Found, name: str, top_rad_s: float | None) -> BlindSpot:
+    wheels, parameter = found.selector.channel.inner, REGISTRY[name].parameters[0]
+    assert isinstance(wheels, WheelChannel)
+    if name == _RAMP:
+        largest = _largest_ramp(found)
+        blind = largest is None or largest < _realistic(parameter)
+        return BlindSpot(name, parameter.name, parameter.unit, largest, blind, experiment_of(name))
+    largest = _largest(wheels, name)
+    enough = 0.0 if top_rad_s is None else _MOST_OF_IT * top_rad_s
+    if name == "yaw_rate_limit":
+        radius, axial = wheels.geometry[:2].tolist()
+        turning = math.inf if top_rad_s is None else enough * 2.0 * radius / axial
+        enough = min(turning, _REALISTIC_YAW_RATE_RAD_S)
+    blind = largest is None or largest < enough
+    return BlindSpot(name, parameter.name, parameter.unit, largest, blind, experiment_of(name))
+
+
+def _largest(wheels: WheelChannel, name: str) -> float | None:
+    """The largest limit that cuts at least half a second of the commands."""
+    command = wheels.timeline.command_rad_s
+    command = command[np.isfinite(command[:, 0])]
+    if name == "speed_limit":
+        size = np.abs(command).max(axis=1)
+    else:
+        size = np.abs(command[:, 1] - command[:, 0]) * wheels.geometry[0] / wheels.geometry[1]
+    if size.size < 200 or size.max() < 1e-3:
+        return None
+    return float(0.97 * np.sort(size)[-50])
+
+
+def _largest_ramp(found: Found) -> float | None:
+    """The largest limit of the yaw acceleration that would have shown, with a lag and a delay that may hide it."""
+    channel, best = found.selector.channel, found.fit
+    layout, limits = channel.layout, found.selector.thresholds
+    places = tuple(layout.place[name] for name in _RESPONSE if layout.place[name] not in best.active)
+    slope = np.column_stack([best.jacobian, sensitivity(channel, best.vector, places, best.residual)])
+    vector = best.vector.copy()
+    for limit in _RAMPS_RAD_S2:
+        vector[layout.place[f"{_RAMP}.{REGISTRY[_RAMP].parameters[0].name}"]] = limit
+        moved = channel.residual(vector) - best.residual
+        own = moved - slope @ solve(slope, slope.T @ moved)
+        enough = (limits.score + math.log(max(channel.count, 2))) * _USUAL_INFLATION
+        ahead_m = found.selector.moves(channel.split(best.vector), channel.split(vector))
+        if float(own @ own) > enough and ahead_m > limits.moves_m:
+            return limit
+    return None
+
+
+def _size(found: Found, name: str, column: str) -> float | None:
+    """Size at which the expected evidence reaches the threshold and the 2 s prediction moves as far as it must.
+
+    The other free parameters make up for what they can.
+    """
+    channel, best = found.selector.channel, found.fit
+    layout, candidate, limits = channel.layout, CANDIDATES[name], found.selector.thresholds
+    threshold = limits.score + candidate.parameters * math.log(max(channel.count, 2))
+    if candidate.profile is not None and column == candidate.profile.column:
+        return _by_trial(found, column, threshold)
+    vector = best.vector.copy()
+    if candidate.profile is not None:
+        values = candidate.profile.values(channel)
+        if not values:
+            return None
+        vector[layout.place[candidate.profile.column]] = values[len(values) // 2]
+    places = tuple(layout.place[name] for name in candidate.columns)
+    base = channel.residual(vector)
+    slope = np.column_stack([best.jacobian, sensitivity(channel, vector, places, base)])
+    first = best.jacobian.shape[1]
+    information = slope.T @ slope
+    if information[first, first] <= 1e-9:
+        return None
+    covariance = inverse(information)
+    size = math.sqrt(threshold * _USUAL_INFLATION * float(covariance[first, first]))
+    limit = max(abs(layout.low[places[0]]), abs(layout.high[places[0]]))
+    if size >= limit:
+        return None
+    # With the size of one parameter go, of those not said, the values that hide it best.
+    with_it = vector.copy()
+    with_it[[*best.active, *places]] += size * covariance[first] / covariance[first, first]
+    moved = found.selector.moves(channel.split(vector), channel.split(with_it))
+    if moved < limits.moves_m:
+        size = size * limits.moves_m / moved if moved > 0.0 else math.inf
+    return size if size < limit else None
+
+
+def _by_trial(found: Found, column: str, threshold: float) -> float | None:
+    """Smallest of a row of sizes whose prediction differs from the one without clearly, and enough to matter."""
+    channel, best = found.selector.channel, found.fit
+    place = channel.layout.place[column]
+    for size in (0.05, 0.1, 0.2, 0.3, 0.5, 0.75, 1.0, 1.5, 2.0):
+        vector = best.vector.copy()
+        vector[place] = size
+        difference = channel.residual(vector) - best.residual
+        enough = found.selector.moves(channel.split(best.vector), channel.split(vector))
+        if float(difference @ difference) > threshold * _USUAL_INFLATION and enough > found.selector.thresholds.moves_m:
+            return size
+    return None

@@ -1,0 +1,109 @@
+"""Pictures a person reads at a glance, as PNG."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from disco_hw.gap.report.findings import REPORTED_HORIZON_S, STAGES
+from disco_hw.gap.report.regimes import Regime
+from disco_hw.gap.search.cross_validation import Errors
+
+Array = NDArray[np.float64]
+
+_COLOURS = {"nominal": "#b0b0b0", "refitted": "#d98c3f", "amended": "#2f7fc1", "floor": "#60a060"}
+_DPI = 110
+# Upper end of the axis of residuals, in units of the noise, at least.
+_LEAST_SHOWN = 4.0
+
+
+def png(figure: Figure) -> bytes:
+    """A figure as bytes."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=_DPI, bbox_inches="tight")
+    return buffer.getvalue()
+
+
+def _legend_above(axes: Axes) -> None:
+    """A legend that covers nothing."""
+    axes.legend(frameon=False, ncols=3, loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.2, fontsize=9)
+
+
+def gap_by_horizon(gap: dict[str, dict[float, Errors]]) -> bytes:
+    """Position and heading error over the horizon, for every stage, with bootstrap intervals."""
+    figure = Figure(figsize=(9.0, 3.4))
+    panels: list[tuple[str, Callable[[Errors], float], Callable[[Errors], tuple[float, float]], float]] = [
+        ("position error, mm", lambda e: e.position_m, lambda e: e.position_ci, 1e3),
+        ("heading error, mrad", lambda e: e.yaw_rad, lambda e: e.yaw_ci, 1e3),
+    ]
+    for place, (label, value, interval, factor) in enumerate(panels):
+        axes = figure.add_subplot(1, 2, place + 1)
+        for stage in STAGES:
+            horizons = sorted(gap[stage])
+            values = np.array([value(gap[stage][h]) for h in horizons]) * factor
+            ends = np.array([interval(gap[stage][h]) for h in horizons]) * factor
+            style = "--" if stage == "floor" else "-o"
+            axes.plot(horizons, values, style, color=_COLOURS[stage], label=stage, markersize=4)
+            axes.fill_between(horizons, ends[:, 0], ends[:, 1], color=_COLOURS[stage], alpha=0.15, linewidth=0)
+        axes.set_xlabel("predicted ahead, s")
+        axes.set_ylabel(label)
+        axes.set_ylim(bottom=0.0)
+        axes.legend(frameon=False)
+    return png(figure)
+
+
+def gap_by_regime(gap: dict[str, dict[float, Errors]]) -> bytes:
+    """Position error two seconds ahead by what the robot was doing."""
+    names = sorted(gap["refitted"][REPORTED_HORIZON_S].by_regime_m)
+    figure = Figure(figsize=(9.0, 0.6 + 0.5 * max(len(names), 1)))
+    axes = figure.add_subplot()
+    for offset, stage in enumerate(("refitted", "amended", "floor")):
+        values = [1e3 * gap[stage][REPORTED_HORIZON_S].by_regime_m.get(name, 0.0) for name in names]
+        rows = np.arange(len(names)) + 0.27 * (1 - offset)
+        axes.barh(rows, values, height=0.25, color=_COLOURS[stage], label=stage)
+    axes.set_yticks(range(len(names)), names)
+    axes.set_xlabel(f"position error {REPORTED_HORIZON_S:g} s ahead, mm")
+    _legend_above(axes)
+    return png(figure)
+
+
+def disagreement(title: str, regimes: list[Regime]) -> bytes:
+    """Residuals by regime in units of the noise, before and after what was found is added."""
+    figure = Figure(figsize=(9.0, 0.6 + 0.3 * max(len(regimes), 1)))
+    axes = figure.add_subplot()
+    ordered = sorted(regimes, key=lambda regime: regime.before)
+    rows = np.arange(len(ordered))
+    before = np.sqrt([regime.before for regime in ordered])
+    after = np.sqrt([regime.after for regime in ordered])
+    axes.barh(rows, before, color=_COLOURS["refitted"], label="as it was")
+    axes.barh(rows, after, height=0.4, color=_COLOURS["amended"], label="amended")
+    axes.axvline(1.0, color="black", linewidth=0.8)
+    axes.set_yticks(rows, [regime.name for regime in ordered])
+    axes.set_xlabel("residual, in units of the noise (1 = nothing but noise)")
+    axes.set_title(title, loc="left", fontsize=10)
+    largest = float(before.max()) if before.size else 1.0
+    if largest > 20.0:
+        axes.set_xscale("log")
+    else:
+        # Where there is nothing but noise the bars stay short, so that it looks like nothing.
+        axes.set_xlim(0.0, max(1.05 * largest, _LEAST_SHOWN))
+    _legend_above(axes)
+    return png(figure)
+
+
+def stretch(t_s: Array, measured: Array, before: Array, after: Array, label: str) -> bytes:
+    """The stretch of the log in which model and measurement differ most."""
+    figure = Figure(figsize=(9.0, 2.8))
+    axes = figure.add_subplot()
+    axes.plot(t_s, measured, color="black", linewidth=1.4, label="measured")
+    axes.plot(t_s, before, color=_COLOURS["refitted"], linewidth=1.1, label="as it was")
+    axes.plot(t_s, after, color=_COLOURS["amended"], linewidth=1.1, label="amended")
+    axes.set_xlabel("time, s")
+    axes.set_ylabel(label)
+    _legend_above(axes)
+    return png(figure)

@@ -1,0 +1,143 @@
+"""The report as one self-contained page: the answer first, then pictures, then the evidence."""
+
+from __future__ import annotations
+
+import base64
+import math
+from collections.abc import Iterable, Sequence
+from html import escape
+
+from disco_hw.gap.report.findings import REPORTED_HORIZON_S, STAGES, GapReport
+
+_STYLE = """
+body{font:16px/1.5 system-ui,sans-serif;max-width:60rem;margin:2rem auto;padding:0 1rem;color:#222}
+.answer p{font-size:1.25rem;margin:.3rem 0}
+table{border-collapse:collapse;margin:.6rem 0}td,th{padding:.2rem .8rem;text-align:left;border-bottom:1px solid #ddd}
+td.n{text-align:right;font-variant-numeric:tabular-nums}img{max-width:100%}
+figure{margin:1.2rem 0}figcaption{color:#555;font-size:.9rem}h2{margin-top:2rem}
+"""
+
+_CAPTIONS = {
+    "gap_by_horizon": "How far predictions are off, by how far ahead they look, on data not used for fitting; shaded: "
+    "95 % intervals. The dashed line is what noise alone makes.",
+    "gap_by_regime": f"The same {REPORTED_HORIZON_S:g} s ahead, by what the robot was doing.",
+    "where_command_to_wheel": "Where commands and wheels disagree. Bars that end at the line hold nothing but noise.",
+    "where_wheel_to_body": "Where wheels and poses disagree. Bars that end at the line hold nothing but noise.",
+    "worst_stretch": "The stretch in which the wheels and the model as it was lie furthest apart.",
+}
+
+
+def page(report: GapReport) -> str:
+    """The whole page."""
+    parts = [
+        f'<div class="answer">{"".join(f"<p>{escape(line)}</p>" for line in report.answer())}</div>',
+        f"<p>Verdict: <b>{report.verdict}</b>. Logs: {escape(', '.join(report.sources))}.</p>",
+    ]
+    parts += [_picture(name, picture) for name, picture in report.pictures.items()]
+    if report.gap:
+        parts.append("<h2>The gap by what the robot was doing</h2>" + _by_regime(report))
+    parts.append("<h2>What is missing</h2>")
+    parts.append(_effects(report))
+    if report.residue:
+        parts.append("<h2>What is still left</h2>" + _list(report.residue))
+    if report.gap:
+        parts.append("<h2>The gap on data not used for fitting</h2>" + _gap(report))
+    parts.append("<h2>Evidence of every candidate</h2>" + _candidates(report))
+    parts.append("<h2>What this log could not have shown</h2>" + _blind(report))
+    if report.notes:
+        parts.append("<h2>Notes</h2>" + _list(report.notes))
+    body = "\n".join(parts)
+    title = "What the model misses"
+    return (
+        f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{title}</title>'
+        f"<style>{_STYLE}</style></head><body><h1>{title}</h1>{body}</body></html>"
+    )
+
+
+def _picture(name: str, picture: bytes) -> str:
+    data = base64.b64encode(picture).decode("ascii")
+    caption = _CAPTIONS.get(name, name.replace("_", " "))
+    return (
+        f'<figure><img alt="{escape(name)}" src="data:image/png;base64,{data}">'
+        f"<figcaption>{escape(caption)}</figcaption></figure>"
+    )
+
+
+def _list(items: Iterable[str]) -> str:
+    return "<ul>" + "".join(f"<li>{escape(item)}</li>" for item in items) + "</ul>"
+
+
+def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    cells = "".join(f"<th>{escape(cell)}</th>" for cell in head)
+    lines = "".join("<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
+    return f"<table><tr>{cells}</tr>{lines}</table>"
+
+
+def _effects(report: GapReport) -> str:
+    rows = []
+    for effect in report.effects:
+        values = ", ".join(f"{n} = {e.value:.4g} [{e.low:.4g}, {e.high:.4g}]" for n, e in effect.parameters.items())
+        also = ", ".join(effect.indistinguishable_from)
+        rows.append((effect.name, effect.channel, values, f"{effect.evidence:.0f}", also, effect.experiment or ""))
+    for term in report.unnamed:
+        place = (
+            "in the amended model" if term.in_model else "not in the model: it depends on what no model's state holds"
+        )
+        also, test = ", ".join(term.indistinguishable_from), f"; {term.experiment}" if term.experiment else ""
+        rows.append(("unnamed", term.channel, term.form, f"{term.evidence:.0f}", also, place + test))
+    if not rows:
+        return "<p>Nothing that this log shows.</p>"
+    head = (
+        "effect",
+        "channel",
+        "parameters with 95 % intervals",
+        "evidence",
+        "not to be told from",
+        "what would decide",
+    )
+    return _table(head, rows)
+
+
+def _gap(report: GapReport) -> str:
+    """Position, heading and wheel speed by horizon, with bootstrap intervals over stretches of time."""
+    rows = []
+    for horizon in sorted(report.gap["nominal"]):
+        errors = [report.gap[stage][horizon] for stage in STAGES]
+        rows += [
+            (f"{horizon:g} s", "position, mm", *(_with_interval(e.position_m, e.position_ci, 1e3) for e in errors)),
+            ("", "heading, mrad", *(_with_interval(e.yaw_rad, e.yaw_ci, 1e3) for e in errors)),
+            ("", "wheel speed, rad/s", *(_or_dash(e.wheel_rad_s) for e in errors)),
+        ]
+    return _table(("ahead", "error (root mean square)", *STAGES), rows)
+
+
+def _with_interval(value: float, interval: tuple[float, float], factor: float) -> str:
+    low, high = interval
+    if not math.isfinite(value):
+        return "-"
+    return f"{factor * value:.1f} [{factor * low:.1f}, {factor * high:.1f}]"
+
+
+def _or_dash(speed_rad_s: float) -> str:
+    return f"{speed_rad_s:.3f}" if math.isfinite(speed_rad_s) else "-"
+
+
+def _by_regime(report: GapReport) -> str:
+    errors = [report.gap[stage][REPORTED_HORIZON_S].by_regime_m for stage in STAGES]
+    rows = [(name, *(f"{1e3 * of[name]:.1f} mm" if name in of else "" for of in errors)) for name in sorted(errors[0])]
+    return _table((f"position error {REPORTED_HORIZON_S:g} s ahead", *STAGES), rows)
+
+
+def _candidates(report: GapReport) -> str:
+    rows = [(c.channel, c.name, f"{c.gain:.1f}", f"{c.score:.1f}", c.verdict) for c in report.candidates]
+    score = "score (4 accepts, up to 6 where the noise has heavy tails)"
+    return _table(("channel", "effect", "gain, nats", score, "verdict"), rows)
+
+
+def _blind(report: GapReport) -> str:
+    rows = []
+    for spot in report.blind_spots:
+        size = "never" if spot.smallest_visible is None else f"{spot.smallest_visible:.3g} {spot.unit}"
+        rows.append((spot.name, size, "blind to realistic sizes" if spot.blind else "", spot.experiment))
+    ask = f"<p>All of it in a minute: <code>{escape(report.drive)}</code>.</p>" if report.drive else ""
+    return ask + _table(("effect", "smallest visible", "", "the drive that shows it"), rows)

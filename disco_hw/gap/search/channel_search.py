@@ -1,0 +1,348 @@
+"""Search of one channel: learn its noise from a rich model, hold it, then select."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from itertools import chain
+
+import numpy as np
+from numpy.typing import NDArray
+
+from disco_hw.gap.data.gridded_drive import CELL_S, Timeline
+from disco_hw.gap.data.horizon import displacement, starts_of
+from disco_hw.gap.data.layout import WHEEL
+from disco_hw.gap.noise.body_noise import BodyNoise
+from disco_hw.gap.noise.channels import BodyChannel, Channel, WheelChannel
+from disco_hw.gap.noise.noise_fit import learn_body_noise, learn_wheel_noise
+from disco_hw.gap.noise.wheel_noise import WheelNoise, whiten_wheels
+from disco_hw.gap.search.candidates import CANDIDATES, CHANGE, indices, parameters_of
+from disco_hw.gap.search.evidence import Evidence, compare
+from disco_hw.gap.search.least_squares import Fit, fit, inverse
+from disco_hw.gap.search.richest_model import learn_saturated_body, learn_saturated_wheels
+from disco_hw.gap.search.selection import Names, Selector, Split, Thresholds
+from disco_hw.gap.search.unnamed_terms import Term, WithTerms, body_terms, places, places_near, wheel_terms
+
+Array = NDArray[np.float64]
+
+AHEAD_S = 2.0
+_MOST_TERMS = 2
+# A term that what is fitted already does nine tenths of would only pull against it.
+_LEAST_OWN = 0.1
+_RESPONSE = ("motor_lag", "command_delay")
+_RESPONSES_S = ((0.02, 0.02), (0.15, 0.1), (0.4, 0.3))
+_WORTH_TRYING = 18.0
+_GAUSSIAN_KURTOSIS = 3.0
+_CLIPPED_AT = 6.0
+_HEAVIEST = 1.5
+# Of one parameter 4 takes twice the gain 13: by chance in one log of 3700, of about 18 names in one of 200.
+_NAMED_SCORE, _UNNAMED_SCORE = 4.0, 20.0
+# Where it moves predictions most, an effect moves them enough to matter, be it felt in few places only.
+_MOST_MOVED = 0.1
+_REST_RAD_S = 0.05
+_FAR_OFF = 1.5
+_CLEARLY = 6.0
+_ABOUT_TERMS = 110
+_NO_INFORMATION = 1e-3
+_ROUGH = Thresholds(score=20.0, moves_m=0.0)
+_SMOOTH_WHEEL = ("motor_lag", "command_delay", "deadband", "battery_sag", "wheel_gain")
+_SMOOTH_BODY = (
+    "wheel_radius_asymmetry",
+    "turn_slip",
+    "acceleration_slip",
+    "side_slip",
+    "lateral_icr",
+    "slope",
+    "pose_latency",
+    "heading_bias",
+)
+
+
+@dataclass(frozen=True)
+class UnnamedTerm:
+    """An accepted unnamed term: how it is written, with its coefficient, its evidence, and the term itself."""
+
+    form: str
+    evidence: Evidence
+    term: Term
+
+
+@dataclass(frozen=True)
+class Found:
+    """What a channel's search ended with: its selector (noise held, all fits kept), accepted effects and terms.
+
+    `richest` (n,): whitened residuals of the channel's richest model, which had `richest_parameters`. `either`:
+    whether a change of the surface explains what a patch of the floor does as well.
+    """
+
+    selector: Selector
+    names: Names
+    channel: WheelChannel | BodyChannel
+    unnamed: tuple[UnnamedTerm, ...] = ()
+    plain: Selector | None = None
+    richest: Array | None = None
+    richest_parameters: int = 0
+    either: bool = False
+
+    @property
+    def fit(self) -> Fit:
+        """The fit of the accepted effects and terms."""
+        return self.selector.fit(self.names)
+
+    @property
+    def base(self) -> Fit:
+        """The fit without anything that is missing."""
+        selector = self.plain or self.selector
+        return selector.fit(selector.given)
+
+
+def wheel_moves(channel: WheelChannel, geometry: Array) -> Callable[[Split, Split], float]:
+    """How far two fits of the wheels lie apart `AHEAD_S` ahead, m (lever arm of half the way)."""
+    line = channel.timeline
+    usable = np.isfinite(line.command_rad_s[:, 0])
+    start = starts_of(line.first, usable, AHEAD_S)
+    ahead = round(AHEAD_S / CELL_S)
+
+    def moves(small: Split, big: Split) -> float:
+        if not start.size:
+            return 0.0
+        difference = channel.angles(*big) - channel.angles(*small)
+        step = difference[start + ahead] - difference[start]
+        way = line.angle_rad[start + ahead] - line.angle_rad[start]
+        forward = 0.5 * geometry[0] * step.sum(axis=1)
+        yaw = geometry[0] / geometry[1] * (step[:, 1] - step[:, 0])
+        lever = np.abs(0.25 * geometry[0] * way.sum(axis=1)) + abs(geometry[2])
+        return _where_most(forward**2 + (lever * yaw) ** 2)
+
+    return moves
+
+
+def body_moves(channel: BodyChannel) -> Callable[[Split, Split], float]:
+    """How far two fits of the body lie apart `AHEAD_S` ahead, m."""
+    line = channel.timeline
+    start = starts_of(line.first, np.ones(line.t_s.size, dtype=bool), AHEAD_S)
+    heading = np.interp(line.t_s[start], channel.samples.t_s, channel.measured[:, 2])
+
+    def moves(small: Split, big: Split) -> float:
+        if not start.size:
+            return 0.0
+        ends = []
+        for p, extra in (small, big):
+            ends.append(displacement(p, line.first, channel.track(p, extra), channel.moving_s, start, heading, AHEAD_S))
+        apart = ends[1] - ends[0]
+        lever = 0.5 * np.hypot(ends[1][:, 0], ends[1][:, 1])
+        return _where_most(apart[:, 0] ** 2 + apart[:, 1] ** 2 + (lever * apart[:, 2]) ** 2)
+
+    return moves
+
+
+def _where_most(squares: Array) -> float:
+    """Root of the mean of the largest tenth of some squares (n,)."""
+    few = max(round(_MOST_MOVED * squares.size), 1)
+    return float(np.sqrt(np.partition(squares, squares.size - few)[-few:].mean()))
+
+
+def search_wheels(line: Timeline, geometry: Array, start: Array, given: Names = ()) -> Found:
+    """Effects between command and wheel.
+
+    `geometry` (3,) tells how far they move the robot; `start` is the vector without what is missing, in which effects
+    `given` are known already.
+    """
+    channel = WheelChannel.build(line, WheelNoise(reading_rad=max(line.quantum_rad, 2e-4)), geometry)
+    moves = wheel_moves(channel, geometry)
+    rough = Selector(channel, moves, _ROUGH, given=given, start=start)
+    begin = tuple(dict.fromkeys((*given, *_RESPONSE)))
+    responding(rough, begin)
+    names = rough.greedy(begin, responding)
+    rich = (*names, *(name for name in _SMOOTH_WHEEL if name not in names))
+    vector = fit(channel, rough.fit(names).vector, indices(channel, rich)).vector
+    channel = channel.expecting(vector)
+    plain = learn_wheel_noise(channel, channel.raw_residual(vector))
+    sound, left, many = learn_saturated_wheels(plain, vector)
+
+    def searched(channel: WheelChannel) -> Found:
+        white = whiten_wheels(left, channel.gains)
+        rolling = np.abs(line.speed_rad_s[line.encoder.node]).max(axis=1) > _REST_RAD_S
+        limits = _thresholds(white, channel.gains.use & rolling)
+        selector = Selector(channel, moves, limits, given=given, start=rough.fit(given).vector)
+        selector.fits[frozenset(names)] = fit(channel, rough.fit(names).vector, indices(channel, names))
+        richest = (white * channel.weight).ravel()
+        found = Found(selector, selector.select(names), channel, richest=richest, richest_parameters=many)
+        return with_unnamed(found, _wheel_options)
+
+    found = searched(sound)
+    # Where nothing known comes near, the noise is too little to compare what is all wrong: the family shows in the
+    # noise that the best of it leaves, and what is left against the richest model.
+    return searched(plain) if found.fit.cost > _FAR_OFF * 0.5 * sound.count else found
+
+
+def responding(selector: Selector, names: Names) -> None:
+    """Fit lag and delay together from slow and quick responses; on top of others that were accepted, from none.
+
+    One at a time they may lose to effects that merely stop the wheels: on a slow robot neither is much without the
+    other. And what stops the wheels looks slow until it is named: then the others are fitted without a response first.
+    """
+    channel, before = selector.channel, selector.fits.get(frozenset(names))
+    others = tuple(name for name in names if name in selector.given or name not in _RESPONSE)
+    active = indices(channel, names)
+    places = [channel.layout.place[column] for name in _RESPONSE for column in CANDIDATES[name].columns]
+    plain = selector.fit(others).vector
+    options = [] if before is None else [before, fit(channel, plain, active)]
+    for response_s in _RESPONSES_S if before is None else ():
+        vector = plain.copy()
+        vector[places] = response_s
+        options.append(fit(channel, vector, active))
+    selector.fits[frozenset(names)] = min(options, key=lambda option: option.cost)
+
+
+def search_body(line: Timeline, start: Array, given: Names = ()) -> Found:
+    """Effects between measured wheel angles and measured poses; `start` and `given` as for the wheels."""
+    channel = BodyChannel.build(line, BodyNoise(), start)
+    nominal = fit(channel, start, indices(channel, given))
+    channel = learn_body_noise(channel, nominal.vector, iterations=4)
+    rough = Selector(channel, body_moves(channel), _ROUGH, given=given, start=nominal.vector)
+    names = rough.greedy()
+    rich = (*names, *(name for name in _SMOOTH_BODY if name not in names))
+    vector = fit(channel, rough.fit(names).vector, indices(channel, rich)).vector
+    channel = learn_body_noise(channel, vector)
+    pushes = _body_pushes(channel, rich, vector)
+    channel, fullest, extra, many = learn_saturated_body(channel, rich, vector, pushes)
+    limits = _thresholds(channel.whitened(fullest, extra), channel.use)
+    selector = Selector(channel, body_moves(channel), limits, given=given, start=rough.fit(given).vector)
+    richest = channel.residual(fullest, extra)
+    found = Found(selector, selector.select(), channel, richest=richest, richest_parameters=many)
+    return _time_or_place(found)
+
+
+def _time_or_place(found: Found) -> Found:
+    """With unnamed terms; where the floor seems to have changed, a patch of it instead if that does as well.
+
+    A patch that was left and not entered again looks like a change. No floor changes while one drives on it, so the
+    patch is told then, and that a change would do as well is kept.
+    """
+    named = with_unnamed(found, _body_options)
+    if CHANGE not in found.names or CHANGE in found.selector.given:
+        return named
+    rest = tuple(name for name in found.names if name != CHANGE)
+    placed = with_unnamed(replace(found, names=rest), _body_options)
+    if CHANGE in placed.names or not any(one.term.disc for one in placed.unnamed):
+        return named
+    better = _priced(named) - _priced(placed)
+    return replace(placed, either=better < _CLEARLY) if better > -_CLEARLY else named
+
+
+def _priced(found: Found) -> float:
+    """Misfit in nats with the price of all that was fitted, and of the choice among all terms."""
+    many = float(parameters_of(found.names))
+    chosen = 0.0
+    for one in found.unnamed:
+        many += 4.0 if one.term.disc else 1.0
+        chosen += 0.0 if one.term.disc else math.log(_ABOUT_TERMS)
+    return found.fit.cost + 0.5 * many * math.log(max(found.channel.count, 2)) + chosen
+
+
+def _body_pushes(channel: BodyChannel, names: Names, vector: Array) -> Iterator[Array]:
+    """Pushes of all terms of the body, and of the disc of the floor that promises most."""
+    rich = fit(channel, vector, indices(channel, names), 1)
+    disc, _ = best_term(rich, channel, places(channel, vector))
+    yield from (term.push for term in body_terms(channel, vector))
+    if disc is not None:
+        yield disc.push
+
+
+def _thresholds(white: Array, use: NDArray[np.bool_]) -> Thresholds:
+    """Thresholds for a channel: the heavier the noise's tails, the more it takes.
+
+    Noise that comes in bursts wanders too, more slowly than any block that could show it.
+    """
+    sound = white[use]
+    sound = sound[np.abs(sound).max(axis=1) > _NO_INFORMATION]
+    if not sound.size:
+        return Thresholds(score=_NAMED_SCORE)
+    sound = np.clip(sound / np.sqrt((sound**2).mean()), -_CLIPPED_AT, _CLIPPED_AT)
+    heavy = float((sound**4).mean()) / _GAUSSIAN_KURTOSIS
+    times = min(max(heavy, 1.0), _HEAVIEST)
+    return Thresholds(score=times * _NAMED_SCORE, unnamed_score=times * _UNNAMED_SCORE)
+
+
+def _wheel_options(found: Found) -> Iterator[Term]:
+    assert isinstance(found.channel, WheelChannel)
+    return wheel_terms(found.channel, WHEEL.at(found.fit.vector, "command_delay.delay_s"))
+
+
+def _body_options(found: Found) -> Iterator[Term]:
+    assert isinstance(found.channel, BodyChannel)
+    p = found.fit.vector
+    return chain(body_terms(found.channel, p), places(found.channel, p))
+
+
+def with_unnamed(found: Found, options: Callable[[Found], Iterator[Term]]) -> Found:
+    """Add unnamed terms as long as the best one is worth its price and that of the choice among all.
+
+    After each, the named effects are selected anew: one that only stood in for the term is not needed any more.
+    """
+    terms: tuple[Term, ...] = ()
+    proofs: tuple[Evidence, ...] = ()
+    plain = found.selector
+    while len(terms) < _MOST_TERMS:
+        best, tried = best_term(found.fit, found.selector.channel, options(found))
+        if best is None:
+            break
+        if best.disc is not None and isinstance(found.channel, BodyChannel):
+            near = places_near(found.channel, found.fit.vector, best.disc)
+            best, closer = best_term(found.fit, found.selector.channel, chain((best,), near))
+            assert best is not None
+            tried += closer
+        channel = WithTerms.of(found.channel, (*terms, best))
+        small = found.fit
+        start = np.append(small.vector, 0.0)
+        selector = Selector(channel, found.selector.moves, given=found.selector.given, start=_extended(plain, channel))
+        selector.fits[frozenset(found.names)] = big = fit(channel, start, indices(channel, found.names))
+        parameters = 1.0 + 2.0 * math.log(tried) / math.log(channel.count)
+        proof = compare(small, big, channel, parameters)
+        moved = selector.moves(found.selector.channel.split(small.vector), channel.split(big.vector))
+        limits = plain.thresholds
+        if proof.score < limits.unnamed_score or proof.repeated <= 0.0 or moved < limits.moves_m:
+            break
+        terms = (*terms, best)
+        names = selector.select()
+        proofs = (*proofs, proof)
+        coefficients = selector.fit(names).vector[-len(terms) :].tolist()
+        accepted = tuple(
+            UnnamedTerm(term.form.format(coefficient), evidence, term)
+            for term, coefficient, evidence in zip(terms, coefficients, proofs, strict=True)
+        )
+        found = replace(found, selector=selector, names=names, unnamed=accepted, plain=plain)
+    return found
+
+
+def _extended(plain: Selector, channel: WithTerms) -> Array:
+    """Where the fits of a channel with terms begin."""
+    start = plain.fit(plain.given).vector
+    return np.append(start, np.zeros(channel.neutral.size - start.size))
+
+
+def best_term(small: Fit, channel: Channel, options: Iterator[Term]) -> tuple[Term | None, int]:
+    """The term that promises most to first order on top of a fit, if it may be worth it, and how many were tried."""
+    best, most, tried = None, _WORTH_TRYING, 0
+    core, held = channel.split(small.vector)
+    inner = channel.inner
+    base = inner.residual(core, held)
+    normal, gradient = small.information(), small.jacobian.T @ small.residual
+    solved = inverse(normal)
+    for term in options:
+        tried += 1
+        size = float(np.sqrt((term.push**2).mean()))
+        if size < 1e-9:
+            continue
+        epsilon = 1e-3 / size
+        push = epsilon * term.push if held is None else held + epsilon * term.push
+        column = (inner.residual(core, push) - base) / epsilon
+        across = small.jacobian.T @ column
+        own = float(column @ column - across @ solved @ across)
+        pull = float(column @ small.residual - across @ solved @ gradient)
+        gain = 0.5 * pull * pull / own if own > _LEAST_OWN * float(column @ column) else 0.0
+        if gain > most:
+            best, most = term, gain
+    return best, max(tried, 2)

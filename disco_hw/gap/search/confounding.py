@@ -1,0 +1,61 @@
+"""What a log cannot tell apart, by algebra: effects with the same equations, and one cause seen in two channels."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+
+from disco_hw.gap.search.intervals import Estimates
+
+_SIGMAS = 3.0
+# Of gains that are none of an encoder fewer than one in a hundred comes so far by chance.
+_SURE_NATS = 3.0
+
+LATERAL = "lateral_icr"
+SENSOR = "pose_offset"
+GAIN = "wheel_gain"
+ASYMMETRY = "wheel_radius_asymmetry"
+ENCODER = "encoder_scale"
+# What decides whether a patch of the floor or a change of all of it was driven on.
+PATCH_OR_CHANGE = "drive again, later, where it was different"
+
+# What decides between the members of a class lies outside such logs.
+OUTSIDE_TESTS: Mapping[frozenset[str], str] = MappingProxyType(
+    {
+        frozenset(
+            (LATERAL, SENSOR)
+        ): "measure the pose sensor's mount with a ruler, or move the payload and drive again",
+        frozenset((GAIN, ENCODER)): "turn each wheel ten times by hand and count ticks",
+    }
+)
+
+
+def one_encoder(wheels: Estimates, asymmetry: tuple[float, float], accepted: bool) -> tuple[bool, bool]:
+    """Whether an encoder that counts wrong explains the wheels' gains, and whether it is the only explanation.
+
+    An encoder's scale shows as a gain of its wheel and, with the opposite sign, as an asymmetry of half the difference;
+    `asymmetry` is what the body alone tells of it, with its standard deviation, `accepted` if that is an effect of its
+    own. Too small for that it still decides where it is clearly what the encoder would make it and clearly not none.
+    """
+    gains = [wheels.by_name.get(f"{GAIN}.{side}") for side in ("left", "right")]
+    if gains[0] is None or gains[1] is None:
+        return False, False
+    left, right = gains[0].value, gains[1].value
+    expected = (left - right) / (2.0 + left + right)
+    spread = 0.5 * (gains[0].deviation + gains[1].deviation)
+    value, deviation = asymmetry
+    variance = deviation**2 + spread**2
+    possible = abs(value - expected) < _SIGMAS * variance**0.5
+    nats = 0.5 * (value**2 - (value - expected) ** 2) / variance
+    return possible, possible and (accepted or nats > _SURE_NATS)
+
+
+def alike(names: tuple[str, ...], encoder_possible: bool) -> dict[str, tuple[str, ...]]:
+    """For each accepted effect what no drive can tell from it."""
+    found: dict[str, tuple[str, ...]] = {}
+    for name in names:
+        if name == LATERAL:
+            found[name] = (SENSOR,)
+        elif name == GAIN and encoder_possible:
+            found[name] = (ENCODER,)
+    return found

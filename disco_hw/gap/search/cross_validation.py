@@ -1,0 +1,343 @@
+"""The gap on data not used for fitting: nominal, refitted, amended and what the noise alone makes, by horizon."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import lfilter
+
+from disco_hw.gap.data.free_runs import read_angles, run_body
+from disco_hw.gap.data.gridded_drive import BLOCK_S, CELL_S
+from disco_hw.gap.data.horizon import displacement, starts_of
+from disco_hw.gap.noise.channels import BodyChannel, WheelChannel, total_push
+from disco_hw.gap.noise.wheel_noise import WANDER_S
+from disco_hw.gap.search.least_squares import Fit, by_block, inverse, known
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+HORIZONS_S = (0.5, 1.0, 2.0, 5.0)
+FOLD_S = 21.0
+_FOLD_BLOCKS = round(FOLD_S / BLOCK_S)
+_REACH_S = 0.3
+_SLOW_M_S = 0.02
+_TURNING_RAD_S = 0.3
+_SPEEDING_M_S2 = 0.25
+_FIXED_SIGMAS = 5.0
+_RESAMPLES = 400
+# Held-out errors scatter by some percent between equally good models.
+WORSE = 1.05
+_FAR_WORSE, _SIGMAS = 1.25, 2.0
+_PATHS = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Errors:
+    """Root mean square at one horizon with 95 % bootstrap intervals over blocks of time.
+
+    `squares` (B, 2): sums of squares of position and of yaw by block, for a comparison block by block.
+    """
+
+    position_m: float
+    position_ci: tuple[float, float]
+    yaw_rad: float
+    yaw_ci: tuple[float, float]
+    wheel_rad_s: float
+    by_regime_m: dict[str, float]
+    squares: Array | None = field(default=None, repr=False, compare=False)
+
+
+def worse_by(before: Errors, after: Errors) -> float:
+    """Ratio of errors after to before, the larger one of position and heading."""
+    return max(_ratios(before, after))
+
+
+def _ratios(before: Errors, after: Errors) -> tuple[float, float]:
+    """Errors after over those before, of position and of heading."""
+    return after.position_m / before.position_m, after.yaw_rad / before.yaw_rad
+
+
+def clearly_worse(before: Errors, after: Errors) -> bool:
+    """Whether errors after are larger by 5 % and by two standard deviations of what blocks scatter, or by a quarter."""
+    for quantity, ratio in enumerate(_ratios(before, after)):
+        if ratio > _FAR_WORSE or (ratio > WORSE and _sigmas(before, after, quantity) > _SIGMAS):
+            return True
+    return False
+
+
+def _sigmas(before: Errors, after: Errors, quantity: int) -> float:
+    """Growth of a sum of squares over its standard deviation, which is how much the growth of the blocks scatters."""
+    if before.squares is None or after.squares is None:
+        return math.inf
+    growth = after.squares[:, quantity] - before.squares[:, quantity]
+    scatter = math.sqrt(growth.size) * float(growth.std(ddof=1)) if growth.size > 1 else math.inf
+    return float(growth.sum()) / max(scatter, 1e-30)
+
+
+@dataclass(frozen=True)
+class Starts:
+    """Where predictions begin: nodes (K,), poses there (K, 3) smoothed, poses measured at the end (K, 3)."""
+
+    node: Index
+    pose: Array
+    end: Array
+    block: Index
+    regime: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Chain:
+    """Both channels with one parameter vector each: commands in, poses out; without wheels the measured ones.
+
+    The pushes are what unnamed terms add at the nodes.
+    """
+
+    body: Array
+    wheels: Array | None
+    body_push: Array | None = None
+    wheels_push: Array | None = None
+
+
+def smoothed_poses(channel: BodyChannel, p: Array) -> tuple[Array, Array]:
+    """Poses at all nodes (M, 3): averaged over `_REACH_S` along the wheels' path, and from the nearest sample alone."""
+    line, samples = channel.timeline, channel.samples
+    track = channel.track(p)
+    at = np.empty((samples.t_s.size, 3))
+    read_angles(track, samples.node, samples.fraction, at)
+    good = channel.use
+    t, at, measured = samples.t_s[good], at[good], channel.measured[good]
+    run_of = np.cumsum(line.first)
+    run_sample = run_of[samples.node[good]]
+    turned = measured[:, 2] - at[:, 2]
+    centre = np.clip(np.searchsorted(t, line.t_s), 0, t.size - 1)
+    reach = max(int(_REACH_S / max(float(np.median(np.diff(t))), 1e-3)), 1)
+    near = np.arange(-reach, reach + 1)
+    members = np.clip(centre[:, None] + near[None, :], 0, t.size - 1)
+    valid = (np.abs(t[members] - line.t_s[:, None]) <= _REACH_S) & (run_sample[members] == run_of[:, None])
+    weight = valid / np.maximum(valid.sum(axis=1, keepdims=True), 1)
+    angle = (turned[members] * weight).sum(axis=1)
+    cosine, sine = np.cos(angle), np.sin(angle)
+
+    def carried(member: Index, share: Array, turn_c: Array, turn_s: Array) -> Array:
+        dx, dy = track[:, None, 0] - at[member, 0], track[:, None, 1] - at[member, 1]
+        x = measured[member, 0] + turn_c[:, None] * dx - turn_s[:, None] * dy
+        y = measured[member, 1] + turn_s[:, None] * dx + turn_c[:, None] * dy
+        return np.column_stack([(x * share).sum(axis=1), (y * share).sum(axis=1)])
+
+    smooth = np.column_stack([carried(members, weight, cosine, sine), angle + track[:, 2]])
+    before = np.maximum(centre - 1, 0)
+    nearest = np.where(np.abs(t[before] - line.t_s) < np.abs(t[centre] - line.t_s), before, centre)[:, None]
+    alone = np.column_stack(
+        [carried(nearest, np.ones_like(nearest, dtype=float), cosine, sine), turned[nearest[:, 0]] + track[:, 2]]
+    )
+    far = ~valid.any(axis=1) | (np.abs(t[nearest[:, 0]] - line.t_s) > 0.1)
+    smooth[far], alone[far] = np.nan, np.nan
+    return smooth, alone
+
+
+def find_starts(channel: BodyChannel, poses: tuple[Array, Array], ahead_s: float) -> Starts:
+    """Starts of predictions every 0.2 s where poses and commands are known."""
+    line = channel.timeline
+    known = np.isfinite(line.command_rad_s[:, 0]) if line.has_commands else np.ones(line.t_s.size, dtype=bool)
+    smooth, alone = poses
+    node = starts_of(line.first, known, ahead_s)
+    ahead = round(ahead_s / CELL_S)
+    node = node[np.isfinite(smooth[node, 0]) & np.isfinite(alone[node + ahead, 0])]
+    block = np.floor(line.t_s[node] / FOLD_S).astype(np.int64)
+    return Starts(node, smooth[node], alone[node + ahead], block, tuple(_regimes(channel, node, ahead)))
+
+
+def _regimes(channel: BodyChannel, node: Index, ahead: int) -> list[str]:
+    """What the robot mostly does between start and end."""
+    line, p = channel.timeline, channel.geometry
+    v = 0.5 * p[0] * line.speed_rad_s.sum(axis=1)
+    omega = p[0] / p[1] * (line.speed_rad_s[:, 1] - line.speed_rad_s[:, 0])
+    size = np.concatenate([[0.0], np.cumsum(np.abs(v))])
+    turn = np.concatenate([[0.0], np.cumsum(np.abs(omega))])
+    signed = np.concatenate([[0.0], np.cumsum(v)])
+    out = []
+    for k in node:
+        mean, mean_turn = (size[k + ahead] - size[k]) / ahead, (turn[k + ahead] - turn[k]) / ahead
+        if mean < _SLOW_M_S and mean_turn < 0.05:
+            out.append("standstill")
+        elif mean < _SLOW_M_S * 3 and mean_turn > 0.1:
+            out.append("turning on the spot")
+        elif float(np.ptp(v[k : k + ahead])) > _SPEEDING_M_S2 * ahead * CELL_S * 0.5:
+            out.append("speeding up and braking")
+        elif mean_turn > _TURNING_RAD_S:
+            out.append("curves")
+        else:
+            out.append("straight back" if signed[k + ahead] < signed[k] else "straight ahead")
+    return out
+
+
+def chain_track(
+    body: BodyChannel, wheels: WheelChannel | None, chain: Chain, extra: Array | None = None
+) -> tuple[Array, Array]:
+    """Free run from commands to the path (M, 3), and wheel speeds (M, 2) on the way."""
+    line = body.timeline
+    p = chain.body.copy()
+    scale = [body.layout.place[f"encoder_scale.{side}"] for side in ("left", "right")]
+    push = total_push(line, 3, line.known_motion, chain.body_push, extra)
+    if wheels is None or chain.wheels is None:
+        return run_body(p, line.angle_rad, line.speed_rad_s, push, line.first, line.t_s), line.speed_rad_s
+    q = chain.wheels.copy()
+    q[[wheels.layout.place[f"encoder_scale.{side}"] for side in ("left", "right")]] = 0.0
+    p[scale] = 0.0
+    angle = wheels.angles(q, chain.wheels_push)
+    speed = np.gradient(angle, CELL_S, axis=0)
+    speed[line.first] = 0.0
+    return run_body(p, angle, speed, push, line.first, line.t_s), speed
+
+
+def prediction_error(body: BodyChannel, starts: Starts, p: Array, track: Array, ahead_s: float) -> Array:
+    """Measured minus predicted pose (K, 3) at the end, in the frame of the start: forward, left, yaw."""
+    moved = displacement(p, body.timeline.first, track, body.moving_s, starts.node, starts.pose[:, 2], ahead_s)
+    dx, dy = starts.end[:, 0] - starts.pose[:, 0], starts.end[:, 1] - starts.pose[:, 1]
+    cosine, sine = np.cos(starts.pose[:, 2]), np.sin(starts.pose[:, 2])
+    yaw = starts.end[:, 2] - starts.pose[:, 2] - moved[:, 2]
+    yaw = np.mod(yaw + np.pi, 2.0 * np.pi) - np.pi
+    return np.column_stack([cosine * dx + sine * dy - moved[:, 0], -sine * dx + cosine * dy - moved[:, 1], yaw])
+
+
+def fold_vectors(found: Fit, block: Index, neutral: Array) -> dict[int, Array]:
+    """For each of two interleaved folds the vector fitted on the other one's data, to second order.
+
+    What the other one's data say next to nothing about is as in `neutral`: a limit that was reached, or a patch of the
+    floor that was crossed, in one fold only is not known in the other, unless its few data fix the value by themselves.
+    """
+    fold = (block // _FOLD_BLOCKS) % 2
+    if not found.active or np.unique(fold).size < 2:
+        return {0: found.vector, 1: found.vector}
+    normal, gradient = by_block(found, fold)
+    out = {}
+    active = np.array(found.active)
+    for held in (0, 1):
+        vector = found.vector.copy()
+        told = known(normal[1 - held], normal.sum(axis=0))
+        told |= np.diag(normal[1 - held]) * vector[active] ** 2 > _FIXED_SIGMAS**2
+        here = normal[1 - held] if found.precision is None else normal[1 - held] + np.diag(found.precision)
+        vector[active[told]] -= inverse(here[np.ix_(told, told)]) @ gradient[1 - held][told]
+        vector[active[~told]] = neutral[active[~told]]
+        out[held] = vector
+    return out
+
+
+def errors_of(
+    body: BodyChannel,
+    wheels: WheelChannel | None,
+    chains: dict[int, Chain],
+    ahead_s: float,
+    poses: tuple[Array, Array],
+) -> Errors:
+    """Errors at one horizon, each start predicted by the chain of its fold."""
+    starts = find_starts(body, poses, ahead_s)
+    error = np.zeros((starts.node.size, 3))
+    speed_error = np.zeros(starts.node.size)
+    ahead = round(ahead_s / CELL_S)
+    for held, chain in chains.items():
+        inside = starts.block % 2 == held
+        track, speed = chain_track(body, wheels, chain)
+        error[inside] = prediction_error(body, starts, chain.body, track, ahead_s)[inside]
+        there = starts.node[inside] + ahead
+        speed_error[inside] = (body.timeline.speed_rad_s[there] - speed[there]).mean(axis=1)
+    return summarise(error, speed_error, starts)
+
+
+def summarise(error: Array, speed_error: Array, starts: Starts) -> Errors:
+    """Root mean squares, their bootstrap intervals over blocks, and position by regime."""
+    position, yaw = error[:, 0] ** 2 + error[:, 1] ** 2, error[:, 2] ** 2
+    if not position.size:
+        nan = float("nan")
+        return Errors(nan, (nan, nan), nan, (nan, nan), nan, {})
+    regimes = np.array(starts.regime)
+    label = np.unique(starts.block, return_inverse=True)[1]
+    squares = np.column_stack([np.bincount(label, position), np.bincount(label, yaw)]).astype(np.float64)
+    by_regime = {str(name): float(np.sqrt(position[regimes == name].mean())) for name in np.unique(regimes)}
+    return Errors(
+        float(np.sqrt(position.mean())),
+        _interval(position, starts.block),
+        float(np.sqrt(yaw.mean())),
+        _interval(yaw, starts.block),
+        float(np.sqrt((speed_error**2).mean())),
+        by_regime,
+        squares,
+    )
+
+
+def _interval(squares: Array, block: Index) -> tuple[float, float]:
+    label = np.unique(block, return_inverse=True)[1]
+    sums, counts = np.bincount(label, squares), np.bincount(label)
+    draws = np.random.default_rng(0).integers(0, sums.size, (_RESAMPLES, sums.size))
+    means = np.sqrt(sums[draws].sum(axis=1) / counts[draws].sum(axis=1))
+    low, high = np.quantile(means, (0.025, 0.975))
+    return float(low), float(high)
+
+
+def floor_errors(
+    body: BodyChannel, wheels: WheelChannel | None, chain: Chain, ahead_s: float, poses: tuple[Array, Array]
+) -> Errors:
+    """What the amended model would err if it were exactly right, by simulating the noise that was estimated."""
+    starts = find_starts(body, poses, ahead_s)
+    noise, begins = body.noise, body.timeline.first
+    clean, _ = chain_track(body, wheels, chain)
+    still = displacement(chain.body, begins, clean, body.moving_s, starts.node, starts.pose[:, 2], ahead_s)
+    generator = np.random.default_rng(1)
+    squares, speeds = [], []
+    for _ in range(_PATHS):
+        extra, wander = _disturbance(body, wheels, generator)
+        track, _ = chain_track(body, wheels, chain, extra)
+        moved = displacement(chain.body, begins, track, body.moving_s, starts.node, starts.pose[:, 2], ahead_s)
+        error = moved - still
+        averaged = np.sqrt(max(2.0 * _REACH_S / max(float(np.median(np.diff(body.samples.t_s))), 1e-3), 1.0))
+        jitter = generator.standard_normal((starts.node.size, 6))
+        first = jitter[:, :3] * (noise.position_m, noise.position_m, noise.yaw_rad) / averaged
+        last = jitter[:, 3:] * (noise.position_m, noise.position_m, noise.yaw_rad)
+        error += last - first
+        error[:, 0] += still[:, 1] * first[:, 2]
+        error[:, 1] -= still[:, 0] * first[:, 2]
+        squares.append(error)
+        speeds.append(wander[starts.node + round(ahead_s / CELL_S)])
+    stacked = np.stack(squares)
+    root = np.sqrt((stacked**2).mean(axis=0))
+    return summarise(root, np.sqrt((np.stack(speeds) ** 2).mean(axis=0)), starts)
+
+
+def _disturbance(body: BodyChannel, wheels: WheelChannel | None, generator: np.random.Generator) -> tuple[Array, Array]:
+    """Velocities (M, 3) forward, left, yaw rate that wheels and ground add at random, and mean wheel speed error."""
+    line, noise, p = body.timeline, body.noise, body.geometry
+    count = line.t_s.size
+    v = 0.5 * p[0] * line.speed_rad_s.sum(axis=1)
+    omega = p[0] / p[1] * (line.speed_rad_s[:, 1] - line.speed_rad_s[:, 0])
+    moving = np.minimum(np.abs(line.speed_rad_s).max(axis=1) * p[0] / 0.05, 1.0)
+    slip = _correlated(generator, count, 3, noise.slip_correlation_s)
+    extra = np.column_stack(
+        [
+            slip[:, 0] * (noise.slip_forward_m_s * moving + noise.relative * np.abs(v)),
+            slip[:, 1] * (noise.slip_left_m_s * moving + noise.relative * np.abs(v)),
+            slip[:, 2] * (noise.slip_yaw_rad_s * moving + noise.relative * np.abs(omega)),
+        ]
+    )
+    if wheels is None:
+        return extra, np.zeros(count)
+    quick = _correlated(generator, count, 2, wheels.noise.correlation_s) * wheels.noise.relative
+    slow = _correlated(generator, count, 2, WANDER_S) * wheels.noise.wander
+    error = (quick + slow) * line.speed_rad_s
+    extra[:, 0] += 0.5 * p[0] * error.sum(axis=1)
+    extra[:, 2] += p[0] / p[1] * (error[:, 1] - error[:, 0])
+    return extra, error.mean(axis=1)
+
+
+def _correlated(generator: np.random.Generator, count: int, width: int, correlation_s: float) -> Array:
+    keep = float(np.exp(-CELL_S / max(correlation_s, 1e-3)))
+    noise = generator.standard_normal((count, width)) * np.sqrt(1.0 - keep * keep)
+    return np.asarray(lfilter([1.0], [1.0, -keep], noise, axis=0))
+
+
+def per_horizon(measure: Callable[[float], Errors]) -> dict[float, Errors]:
+    """Errors at every horizon."""
+    return {horizon: measure(horizon) for horizon in HORIZONS_S}

@@ -1,0 +1,150 @@
+"""Least squares on whitened residuals: bounded Levenberg-Marquardt, and what its normal equations say by block."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from disco_hw.gap.data.layout import Layout
+from disco_hw.gap.noise.channels import Channel
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+_MOST_ITERATIONS = 12
+_GOOD_ENOUGH = 0.02
+_LEAST_INFORMATION = 1e-12
+_LEAST_TOLD = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A fitted parameter vector.
+
+    `cost` is half the sum of squares; `jacobian` (n, A) over the `active` entries, derivative of the residual;
+    `precision` (A,) of what was expected of them, none if nothing was.
+    """
+
+    vector: Array
+    active: tuple[int, ...]
+    cost: float
+    residual: Array
+    jacobian: Array
+    precision: Array | None = None
+
+    def information(self) -> Array:
+        """Normal matrix, (A, A), with what was expected."""
+        normal = np.asarray(self.jacobian.T @ self.jacobian)
+        return normal if self.precision is None else normal + np.diag(self.precision)
+
+    def covariance(self) -> Array:
+        """Covariance of the active entries under the noise model, (A, A); pseudo-inverse where nothing is known."""
+        return inverse(self.information())
+
+
+def inverse(matrix: Array) -> Array:
+    """Inverse of a normal matrix, scaled first; directions without information get a large variance."""
+    if not matrix.size:
+        return matrix
+    scale = np.sqrt(np.maximum(np.diag(matrix), _LEAST_INFORMATION))
+    unit = matrix / np.outer(scale, scale)
+    values, vectors = np.linalg.eigh(unit)
+    return np.asarray((vectors / np.maximum(values, 1e-10)) @ vectors.T / np.outer(scale, scale))
+
+
+def known(part: Array, whole: Array) -> NDArray[np.bool_]:
+    """Which parameters (A,) a part of a log tells about, from its normal matrix and the whole log's, (A, A) each.
+
+    What is told next to nothing about, a limit that was reached elsewhere only, would be moved anywhere.
+    """
+    return np.asarray(np.diag(part) > _LEAST_TOLD * np.diag(whole))
+
+
+def jacobian(
+    residual: Callable[[Array], Array], vector: Array, active: tuple[int, ...], layout: Layout, base: Array
+) -> Array:
+    """Derivative of the residual by differences within bounds, (n, A); `base` is the residual at `vector`."""
+    out = np.empty((base.size, len(active)))
+    for place, index in enumerate(active):
+        moved = vector.copy()
+        moved[index] += layout.step[index]
+        if moved[index] > layout.high[index]:
+            moved[index] = vector[index] - layout.step[index]
+        out[:, place] = (residual(moved) - base) / (moved[index] - vector[index])
+    return out
+
+
+def sensitivity(channel: Channel, vector: Array, places: tuple[int, ...], residual: Array) -> Array:
+    """Derivative of a channel's residual with respect to some entries, (n, len(places))."""
+    return jacobian(channel.residual, vector, places, channel.layout, residual)
+
+
+def solve(slope: Array, gradient: Array) -> Array:
+    """Solve the normal equations of `slope` (n, A) for a right side (A,)."""
+    return np.asarray(inverse(slope.T @ slope) @ gradient)
+
+
+def fit(
+    channel: Channel,
+    start: Array,
+    active: tuple[int, ...],
+    iterations: int = _MOST_ITERATIONS,
+) -> Fit:
+    """Fit the `active` entries from `start`; what a log does not tell stays near what is expected."""
+    layout = channel.layout
+    chosen = list(active)
+    low, high = layout.low[chosen], layout.high[chosen]
+    precision, expected = layout.precision[chosen], layout.neutral[chosen]
+    held = bool(precision.any())
+
+    def total(residual: Array, vector: Array) -> float:
+        cost = 0.5 * float(residual @ residual)
+        return cost + 0.5 * float(precision @ (vector[chosen] - expected) ** 2) if held else cost
+
+    residual = channel.residual
+    vector = start.copy()
+    now = residual(vector)
+    cost = total(now, vector)
+    slope = jacobian(residual, vector, active, layout, now)
+    damping = 1e-3
+    for _ in range(iterations if active else 0):
+        normal, gradient = slope.T @ slope, slope.T @ now
+        if held:
+            normal, gradient = normal + np.diag(precision), gradient + precision * (vector[chosen] - expected)
+        scale = np.maximum(np.diag(normal), 1e-12 * max(float(np.max(np.diag(normal))), 1e-30))
+        better = False
+        gained = 0.0
+        for _ in range(6):
+            step = -np.linalg.solve(normal + np.diag(damping * scale + 1e-300), gradient)
+            trial = vector.copy()
+            trial[chosen] = np.clip(vector[chosen] + step, low, high)
+            there = residual(trial)
+            cost_there = total(there, trial)
+            if cost_there < cost:
+                gained, better = cost - cost_there, True
+                vector, now, cost = trial, there, cost_there
+                damping = max(damping * 0.1, 1e-9)
+                break
+            damping *= 10.0
+        if better or damping < 1.0:
+            slope = jacobian(residual, vector, active, layout, now)
+        if not better or gained < _GOOD_ENOUGH:
+            break
+    return Fit(vector, active, 0.5 * float(now @ now), now, slope, precision if held else None)
+
+
+def by_block(found: Fit, block: Index, blocks_each: int = 1) -> tuple[Array, Array]:
+    """Normal matrices (B, A, A) and gradients (B, A) by block of time, `blocks_each` neighbouring blocks as one."""
+    label = np.unique(block // blocks_each, return_inverse=True)[1]
+    count, width = int(label.max()) + 1, len(found.active)
+    normal, gradient = np.zeros((count, width, width)), np.zeros((count, width))
+    order = np.argsort(label, kind="stable")
+    edges = np.searchsorted(label[order], np.arange(count + 1))
+    for b in range(count):
+        rows = order[edges[b] : edges[b + 1]]
+        part = found.jacobian[rows]
+        normal[b] = part.T @ part
+        gradient[b] = part.T @ found.residual[rows]
+    return normal, gradient

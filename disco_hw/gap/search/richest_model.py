@@ -1,0 +1,159 @@
+"""The richest model of a channel: everything that has a name and everything that has none, fitted at once.
+
+What it leaves is noise. A noise model learnt from a poorer one takes what is missing for noise and hides it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import lfilter
+
+from disco_hw.gap.data.free_runs import read_angles
+from disco_hw.gap.data.gridded_drive import CELL_S
+from disco_hw.gap.data.layout import WHEEL
+from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
+from disco_hw.gap.noise.noise_fit import learn_body_noise, learn_wheel_noise, wheel_misfit
+from disco_hw.gap.noise.wheel_noise import WheelNoise, whiten_wheels
+from disco_hw.gap.search.candidates import indices
+from disco_hw.gap.search.least_squares import sensitivity
+from disco_hw.jit import kernel_function
+
+Array = NDArray[np.float64]
+
+_RIDGE = 1e-2
+_ROUNDS = 2
+_HALVINGS = 4
+_BENDS = (0.02, 0.05, 0.1, 0.2, 0.35, 0.55, 0.75, 0.9)
+_RESPONSES_S = (0.02, 0.05, 0.12, 0.3)
+_SLEWS_S = (0.1, 0.2, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0)
+
+
+def learn_saturated_wheels(channel: WheelChannel, vector: Array) -> tuple[WheelChannel, Array, int]:
+    """The channel with the noise its richest model leaves, the residual (E, 2) of that, how many parameters it had.
+
+    `vector`: the fit of the smooth effects; on top come any static response of a wheel, quick and slow ones, limited
+    changes of speed and the other wheel's influence, each as speed of the wheel itself.
+    """
+    line, raw = channel.timeline, channel.raw_residual(vector)
+    at = np.empty_like(raw)
+    columns = []
+    for shape in _wheel_shapes(channel, vector):
+        read_angles(_integrated(shape, line.first), line.encoder.node, line.encoder.fraction, at)
+        columns.append(at.copy())
+    many = len(columns) + WHEEL.neutral.size
+    if not columns:
+        return learn_wheel_noise(channel, raw), raw, many
+    # A noise that was learnt from too poor a model lets the richest one leave what that model left, and learns it
+    # again; the usual noise does not. Nor does every round come closer: where something is missing the noise grows.
+    misfits: list[float] = []
+    best, least = channel, raw
+    for begin in (channel, channel.with_noise(WheelNoise(reading_rad=channel.noise.reading_rad))):
+        learnt = begin
+        for _ in range(_ROUNDS):
+            slope = np.column_stack([(whiten_wheels(c, learnt.gains) * learnt.weight).ravel() for c in columns])
+            found = _ridge(slope, (whiten_wheels(raw, learnt.gains) * learnt.weight).ravel())
+            left = raw + np.tensordot(np.stack(columns, axis=-1), found, axes=1)
+            learnt = learn_wheel_noise(learnt, left)
+            misfits.append(wheel_misfit(channel, left)(learnt.noise.vector()))
+            if misfits[-1] == min(misfits):
+                best, least = learnt, left
+    return best, least, many
+
+
+def learn_saturated_body(
+    channel: BodyChannel, names: tuple[str, ...], vector: Array, pushes: Iterable[Array]
+) -> tuple[BodyChannel, Array, Array, int]:
+    """The channel with the noise its richest model leaves, that model's vector, what it adds, its parameters' number.
+
+    `names`: effects whose entries are free; `vector` where they were fitted; `pushes` (M, 3) each.
+    """
+    base = channel.residual(vector)
+    active = indices(channel, names)
+    slopes, steps = [sensitivity(channel, vector, active, base)], []
+    for push in pushes:
+        size = float(np.sqrt((push**2).mean()))
+        if size < 1e-9:
+            continue
+        step = 1e-3 / size
+        slopes.append(((channel.residual(vector, step * push) - base) / step)[:, None])
+        steps.append(push)
+    found = _ridge(np.column_stack(slopes), base)
+    chosen, layout = list(active), channel.layout
+    push = (
+        np.tensordot(found[len(chosen) :], np.stack(steps), axes=1)
+        if steps
+        else np.zeros((channel.timeline.t_s.size, 3))
+    )
+    for halving in range(_HALVINGS):
+        share = 0.5**halving
+        moved, extra = vector.copy(), share * push
+        moved[chosen] = np.clip(vector[chosen] + share * found[: len(chosen)], layout.low[chosen], layout.high[chosen])
+        if np.sum(channel.residual(moved, extra) ** 2) < np.sum(base**2):
+            return learn_body_noise(channel, moved, extra), moved, extra, found.size
+    return channel, vector, np.zeros_like(push), found.size
+
+
+def _ridge(slope: Array, residual: Array) -> Array:
+    """Coefficients that take most of a residual away; where columns look alike, small ones."""
+    scale = np.maximum(np.sqrt((slope**2).sum(axis=0)), 1e-12)
+    unit = slope / scale
+    normal = unit.T @ unit + _RIDGE * np.eye(unit.shape[1])
+    return np.asarray(-np.linalg.solve(normal, unit.T @ residual) / scale)
+
+
+def _integrated(speed: Array, first: NDArray[np.bool_]) -> Array:
+    """Angles (M, 2) of speeds at the nodes, negative: as a residual feels them, each run from 0."""
+    angle = -np.cumsum(speed, axis=0) * CELL_S
+    starts = np.flatnonzero(first)
+    return np.asarray(angle - np.repeat(angle[starts], np.diff(np.append(starts, first.size)), axis=0))
+
+
+def _wheel_shapes(channel: WheelChannel, vector: Array) -> Iterator[Array]:
+    """Speeds (M, 2) of the wheels that a command may make in ways the named effects do not have."""
+    line = channel.timeline
+    raw = np.nan_to_num(line.command_rad_s)
+    late = max(round(WHEEL.at(vector, "command_delay.delay_s") / CELL_S), 0)
+    asked = np.concatenate([np.repeat(raw[:1], late, axis=0), raw[: raw.shape[0] - late]])
+    u = _slow(asked, max(WHEEL.at(vector, "motor_lag.tau_s"), 1e-3))
+    largest = float(np.abs(u).max(initial=0.0))
+    if largest <= 0.0:
+        return
+    for share in _BENDS:
+        yield np.sign(u) * np.maximum(np.abs(u) - share * largest, 0.0)
+    other = u[:, ::-1]
+    yield from (np.tanh(u / 0.05), u, np.abs(u), u * u, other, np.abs(other) * np.tanh(u / 0.05), np.abs(other) * u)
+    # Not time: what wanders slowly would be taken for a trend, and the noise then for less than it is.
+    yield from (u * np.sin(line.angle_rad), u * np.cos(line.angle_rad))
+    for response_s in _RESPONSES_S:
+        behind = _slow(u, response_s) - u
+        yield behind
+        yield behind[:, ::-1]
+        yield _slow(behind, response_s)
+    for full_s in _SLEWS_S:
+        yield _slewed(asked, largest / full_s) - asked
+
+
+def _slow(u: Array, response_s: float) -> Array:
+    """`u` (M, 2) through a first-order lag."""
+    keep = math.exp(-CELL_S / response_s)
+    return np.asarray(lfilter([1.0 - keep], [1.0, -keep], u, axis=0))
+
+
+def _slewed(u: Array, rate: float) -> Array:
+    """`u` (M, 2) followed with at most this rate (1/s of its unit)."""
+    out = np.empty_like(u)
+    _follow(u, rate * CELL_S, out)
+    return out
+
+
+@kernel_function
+def _follow(u: Array, most: float, out: Array) -> None:
+    for side in range(u.shape[1]):
+        now = u[0, side]
+        for k in range(u.shape[0]):
+            now += min(max(u[k, side] - now, -most), most)
+            out[k, side] = now

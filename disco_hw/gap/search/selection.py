@@ -1,0 +1,284 @@
+"""Which effects: forward selection with swaps and a backward check, refitting everything each time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from disco_hw.gap.noise.channels import Channel
+from disco_hw.gap.search.candidates import CANDIDATES, Candidate, candidates_of, indices, parameters_of
+from disco_hw.gap.search.evidence import Evidence, compare
+from disco_hw.gap.search.least_squares import Fit, fit, sensitivity, solve
+
+Array = NDArray[np.float64]
+Names = tuple[str, ...]
+Split = tuple[Array, Array | None]
+
+_MOST_EFFECTS = 6
+_WORTH_FITTING = 8.0
+_LOCAL_SEARCHES = 4
+_GAINED = 0.5
+_POOR = 0.5
+_LARGE_PART = 0.25
+# Half a difference of BIC of 6: positive evidence, no more.
+_CLEARLY = 3.0
+
+
+@dataclass(frozen=True, slots=True)
+class Thresholds:
+    """When an effect is accepted: evidence score, of one without a name too, and shift of the 2 s predictions."""
+
+    score: float = 20.0
+    moves_m: float = 0.001
+    unnamed_score: float = 20.0
+
+
+@dataclass
+class Selector:
+    """Fits sets of effects of one channel, each once; `moves` tells how far a fit moves the prediction of another.
+
+    Effects `given` are in from the beginning, with values of `start`.
+    """
+
+    channel: Channel
+    moves: Callable[[Split, Split], float]
+    thresholds: Thresholds = Thresholds()
+    given: Names = ()
+    start: Array | None = None
+    fits: dict[frozenset[str], Fit] = field(default_factory=dict)
+    proofs: dict[tuple[frozenset[str], frozenset[str]], Evidence] = field(default_factory=dict)
+
+    def fit(self, names: Names) -> Fit:
+        """The best fit of a set, started from the best smaller ones known."""
+        key = frozenset(names)
+        if key not in self.fits:
+            if key <= frozenset(self.given):
+                begin = self.channel.neutral if self.start is None else self.start
+                self.fits[key] = fit(self.channel, begin, indices(self.channel, names))
+            else:
+                new = [name for name in names if key - {name} in self.fits] or [names[-1]]
+                options = [
+                    self._with(self.fit(tuple(other for other in names if other != name)), names, CANDIDATES[name])
+                    for name in new
+                ]
+                self.fits[key] = min(options, key=lambda option: option.cost)
+        return self.fits[key]
+
+    def split(self, names: Names) -> Split:
+        """Vector of effects of a set's fit, and what its unnamed terms add."""
+        return self.channel.split(self.fit(names).vector)
+
+    def _with(self, parent: Fit, names: Names, new: Candidate) -> Fit:
+        """Fit `names` from `parent`, which lacks `new`."""
+        channel, layout = self.channel, self.channel.layout
+        active = indices(channel, names)
+        if new.profile is not None:
+            return self._profiled(parent, active, new)
+        if new.starts is None:
+            return fit(channel, parent.vector, active)
+        tried = []
+        places = [layout.place[column] for column in new.columns]
+        for values in new.starts(channel):
+            vector = parent.vector.copy()
+            vector[places] = values
+            tried.append(fit(channel, vector, active, 2))
+        if not tried:
+            return fit(channel, parent.vector, active)
+        return fit(channel, min(tried, key=lambda option: option.cost).vector, active)
+
+    def _profiled(self, parent: Fit, active: tuple[int, ...], new: Candidate) -> Fit:
+        """Search the profiled entry by its linear gain, then closer around the best, then refit everything."""
+        assert new.profile is not None
+        values = new.profile.values(self.channel)
+        if not values:
+            return fit(self.channel, parent.vector, active)
+        gains = {value: self._linear_gain(parent, new, value) for value in values}
+        spacing = values[1] - values[0]
+
+        def closer(gain_at: Callable[[float], float], spacing: float) -> None:
+            while spacing > new.profile.refine:  # type: ignore[union-attr]
+                spacing *= 0.5
+                best = max(gains, key=gains.__getitem__)
+                for value in (best - spacing, best + spacing):
+                    if value not in gains:
+                        gains[value] = gain_at(value)
+
+        closer(lambda value: self._linear_gain(parent, new, value), spacing)
+        best = max(gains, key=gains.__getitem__)
+        found = self._at(parent.vector, active, new, best)
+        if parent.cost - found.cost < _WORTH_FITTING:
+            return found
+        refined = {best: found}
+        step = new.profile.refine
+        for _ in range(_LOCAL_SEARCHES):
+            centre = min(refined, key=lambda value: refined[value].cost)
+            for value in (centre - step, centre + step):
+                if value not in refined:
+                    refined[value] = self._at(refined[centre].vector, active, new, value, 2)
+        return min(refined.values(), key=lambda option: option.cost)
+
+    def _at(self, start: Array, active: tuple[int, ...], new: Candidate, value: float, iterations: int = 12) -> Fit:
+        assert new.profile is not None
+        vector = start.copy()
+        vector[self.channel.layout.place[new.profile.column]] = value
+        return fit(self.channel, vector, active, iterations)
+
+    def _linear_gain(self, parent: Fit, new: Candidate, value: float | None = None) -> float:
+        """Gain in nats that the candidate promises to first order, from the parent's fit."""
+        channel, layout = self.channel, self.channel.layout
+        vector, residual = parent.vector, parent.residual
+        if value is not None and new.profile is not None:
+            vector = vector.copy()
+            vector[layout.place[new.profile.column]] = value
+            # When something that is not there begins does not matter.
+            if not self._neutral(parent, new):
+                residual = channel.residual(vector)
+        places = tuple(layout.place[column] for column in new.columns)
+        columns = sensitivity(channel, vector, places, residual)
+        slope = np.column_stack([parent.jacobian, columns])
+        if not slope.shape[1]:
+            return parent.cost - 0.5 * float(residual @ residual)
+        gradient = slope.T @ residual
+        return parent.cost - 0.5 * float(residual @ residual) + 0.5 * float(gradient @ solve(slope, gradient))
+
+    def _neutral(self, parent: Fit, new: Candidate) -> bool:
+        """Whether an effect with other parameters than the profiled one does nothing at a fit."""
+        layout = self.channel.layout
+        places = [layout.place[column] for column in new.columns]
+        return bool(places) and bool((parent.vector[places] == layout.neutral[places]).all())
+
+    def evidence(self, smaller: Names, larger: Names) -> Evidence:
+        """Evidence for the larger set against the smaller one."""
+        key = (frozenset(smaller), frozenset(larger))
+        if key not in self.proofs:
+            parameters = parameters_of(larger) - parameters_of(smaller)
+            self.proofs[key] = compare(self.fit(smaller), self.fit(larger), self.channel, parameters)
+        return self.proofs[key]
+
+    def acceptable(self, smaller: Names, larger: Names) -> bool:
+        """Whether what the larger set has more is accepted."""
+        limits = self.thresholds
+        gain = self.fit(smaller).cost - self.fit(larger).cost
+        if 2.0 * gain < limits.score:
+            return False
+        proof = self.evidence(smaller, larger)
+        return (
+            (proof.score > limits.score or self._dominant(smaller, gain))
+            and proof.repeated > 0.0
+            and self.moves(self.split(smaller), self.split(larger)) > limits.moves_m
+        )
+
+    def _dominant(self, smaller: Names, gain: float) -> bool:
+        """Whether a gain is a large part of what a poor fit lacks: the right family in a wrong form, then.
+
+        Such a fit scatters from block to block more than any noise, and the score alone would never take it.
+        """
+        lacking = self.fit(smaller).cost - 0.5 * self.channel.count
+        return lacking > _POOR * 0.5 * self.channel.count and gain > _LARGE_PART * lacking
+
+    def promise(self, accepted: Names, name: str) -> float:
+        """Gain in nats of one more effect, less half its parameters' price; fitted only if it may be worth it."""
+        candidate = CANDIDATES[name]
+        price = 0.5 * candidate.parameters * np.log(self.channel.count)
+        smooth = candidate.starts is None and candidate.profile is None
+        if smooth and frozenset((*accepted, name)) not in self.fits:
+            gain = self._linear_gain(self.fit(accepted), candidate)
+            if gain < _WORTH_FITTING:
+                return float(gain - price)
+        return float(self.fit(accepted).cost - self.fit((*accepted, name)).cost - price)
+
+    def ranked(self, accepted: Names) -> list[str]:
+        """Candidates that are not in yet, the most promising first."""
+        rest = [name for name in candidates_of(self.channel.layout) if name not in accepted]
+        promises = {name: self.promise(accepted, name) for name in rest}
+        return sorted((name for name in rest if promises[name] > 0.0), key=lambda name: -promises[name])
+
+    def greedy(self, begin: Names = (), settle: Callable[[Selector, Names], None] | None = None) -> Names:
+        """Forward steps only, from a set that is kept; `settle` may better the fit of a set before the next step."""
+        accepted = begin or self.given
+        while len(accepted) < _MOST_EFFECTS:
+            ranked = self.ranked(accepted)
+            new = next((name for name in ranked if self.acceptable(accepted, (*accepted, name))), None)
+            if new is None:
+                break
+            accepted = (*accepted, new)
+            if settle is not None:
+                settle(self, accepted)
+        return accepted
+
+    def select(self, begin: Names = ()) -> Names:
+        """Forward, swap, backward, until nothing changes; from what is needed of a set to begin with."""
+        accepted = self._backward(begin) if begin else self.given
+        visited = {frozenset(accepted)}
+        while len(accepted) < _MOST_EFFECTS:
+            ranked = self.ranked(accepted)
+            new = next((name for name in ranked if self.acceptable(accepted, (*accepted, name))), None)
+            if new is None:
+                break
+            larger = self._backward(self._swapped((*accepted, new)))
+            if frozenset(larger) in visited:
+                break
+            visited.add(frozenset(larger))
+            accepted = larger
+        return accepted
+
+    def _swapped(self, accepted: Names) -> Names:
+        """Replace single effects as long as that fits better by more than the parameters' price."""
+        for _ in range(len(accepted)):
+            best, score = accepted, 2.0
+            for place, old in enumerate(accepted):
+                if old in self.given:
+                    continue
+                rest = (*accepted[:place], *accepted[place + 1 :])
+                worth = self._worth(rest, accepted, old)
+                for name in candidates_of(self.channel.layout):
+                    if name not in accepted and self.promise(rest, name) - worth > score:
+                        best, score = (
+                            (*accepted[:place], name, *accepted[place + 1 :]),
+                            self.promise(rest, name) - worth,
+                        )
+            if best == accepted:
+                break
+            accepted = best
+        return accepted
+
+    def rivals(self, accepted: Names, name: str) -> Names:
+        """Effects that would do in place of an accepted one: not clearly worse, the price of parameters paid."""
+        rest = tuple(other for other in accepted if other != name)
+        worth = self._worth(rest, accepted, name) - _CLEARLY
+        others = (other for other in candidates_of(self.channel.layout) if other not in accepted)
+        return tuple(other for other in others if self.promise(rest, other) > worth)
+
+    def _worth(self, rest: Names, accepted: Names, name: str) -> float:
+        """Gain in nats of an accepted effect, less half its parameters' price."""
+        price = 0.5 * CANDIDATES[name].parameters * np.log(self.channel.count)
+        return float(self.fit(rest).cost - self.fit(accepted).cost - price)
+
+    def _backward(self, accepted: Names) -> Names:
+        """Drop effects that the others have made unnecessary, of several first the one that is missed least."""
+        idle = []
+        for name in accepted:
+            if name in self.given:
+                continue
+            rest = tuple(other for other in accepted if other != name)
+            self._refit_without(accepted, name, rest)
+            if not self.acceptable(rest, accepted):
+                idle.append((self._worth(rest, accepted, name), rest))
+        return self._backward(min(idle)[1]) if idle else accepted
+
+    def _refit_without(self, accepted: Names, name: str, rest: Names) -> None:
+        """Fit `rest` from the fit of the larger set too: what has thresholds may have found better ones there."""
+        if not rest or frozenset(rest) <= frozenset(self.given):
+            return
+        candidate, layout = CANDIDATES[name], self.channel.layout
+        vector = self.fit(accepted).vector.copy()
+        columns = (*candidate.columns, *((candidate.profile.column,) if candidate.profile is not None else ()))
+        places = [layout.place[column] for column in columns]
+        vector[places] = layout.neutral[places]
+        option, key = fit(self.channel, vector, indices(self.channel, rest)), frozenset(rest)
+        if option.cost < self.fit(rest).cost - _GAINED:
+            self.fits[key] = option
+            self.proofs = {pair: proof for pair, proof in self.proofs.items() if key not in pair}

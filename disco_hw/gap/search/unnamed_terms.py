@@ -1,0 +1,250 @@
+"""Unnamed terms: physical features of the motion that a channel may depend on, whatever the cause.
+
+Features are made of what was measured or commanded, once, so that they do not change while parameters are fitted, and
+their effect goes through the free run: nothing is differentiated but the wheels' speed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from disco_hw.gap.data.gridded_drive import CELL_S, Timeline
+from disco_hw.gap.data.layout import Layout
+from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
+from disco_hw.model import EffectSetting
+from disco_hw.model.terms import BODY_FEATURES, BODY_TARGETS, COMMAND, COMMAND_FEATURES, TERMS, term_name
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+_SPAN_NODES = 8
+_DISC_RADII_M = (0.5, 0.75, 1.0, 1.3)
+_DISC_SPACING_M = 0.4
+_DISC_STEPS_M = (-0.2, -0.1, 0.0, 0.1, 0.2)
+_DISC_SIZE_STEPS_M = (-0.15, -0.05, 0.0, 0.05, 0.15)
+_LEAST_INSIDE, _MOST_INSIDE = 0.03, 0.8
+_LARGEST_FLOOR_M2 = 60.0
+_LONGEST_S = 400.0
+
+
+@dataclass(frozen=True)
+class Term:
+    """A feature at the nodes, (M, 2) in rad/s of command or (M, 3) in m/s, m/s, rad/s of motion, and how it is written.
+
+    `form` has a place for the coefficient. `model_name`: the term of `disco_hw.model.terms` that it is; None if a model
+    cannot carry it, because it depends on what a model's state does not hold. `geometry`: wheel radius and axial
+    distance (m) that the speeds in it are made with. `disc`: x, y and radius (m) of the floor that it is about.
+    """
+
+    form: str
+    push: Array
+    model_name: str | None = None
+    geometry: tuple[float, float] = (1.0, 1.0)
+    disc: tuple[float, float, float] | None = None
+
+
+def wheel_terms(channel: WheelChannel, late_s: float) -> Iterator[Term]:
+    """What may be added to both wheels' commands; `late_s` is the dead time that was found."""
+    line = channel.timeline
+    u = late_commands(line, late_s)
+    other, t = u[:, ::-1], line.t_s[:, None]
+    for form, feature in COMMAND_FEATURES.items():
+        name = term_name(COMMAND, form)
+        yield Term(_with_place(name), feature(u, other, t), name)
+    growth = np.gradient(u, CELL_S, axis=0)
+    sign = COMMAND_FEATURES["sign(u)"](u, other, t)
+    angle = line.angle_rad
+    features = {
+        "du/dt": growth,
+        "|du/dt| sign(u)": np.abs(growth) * sign,
+        "u |du/dt|": u * np.abs(growth),
+        "u sin(wheel angle)": u * np.sin(angle),
+        "u cos(wheel angle)": u * np.cos(angle),
+    }
+    for form, push in features.items():
+        yield Term(_with_place(term_name(COMMAND, form)), push)
+
+
+def late_commands(line: Timeline, late_s: float) -> Array:
+    """Commands at the nodes (M, 2) that are in force after a dead time; zero where none is known."""
+    raw = np.nan_to_num(line.command_rad_s)
+    late = max(round(late_s / CELL_S), 0)
+    return np.concatenate([np.repeat(raw[:1], late, axis=0), raw[: raw.shape[0] - late]])
+
+
+def motion(line: Timeline, p: Array) -> tuple[Array, Array, Array]:
+    """Forward speed (m/s), yaw rate (rad/s) and acceleration (m/s^2) that the wheels tell, (M,) each."""
+    speed = line.speed_rad_s
+    v = 0.5 * p[0] * speed.sum(axis=1)
+    return v, p[0] / p[1] * (speed[:, 1] - speed[:, 0]), np.gradient(smoothed(v), CELL_S)
+
+
+def body_terms(channel: BodyChannel, p: Array) -> Iterator[Term]:
+    """What may be added to the body's velocity; `p` is the vector of the channel."""
+    line = channel.timeline
+    v, w, a = motion(line, p)
+    dw = np.gradient(smoothed(w), CELL_S)
+    moving = np.minimum(np.abs(line.speed_rad_s).max(axis=1) * p[0] / 0.05, 1.0)
+    beyond = {"moving": moving, "domega/dt": dw, "v domega/dt": v * dw}
+    for axis, target in enumerate(BODY_TARGETS):
+        for form, feature in BODY_FEATURES.items():
+            name = term_name(target, form)
+            yield Term(_with_place(name), _on(axis, feature(v, w, a, line.t_s)), name, (float(p[0]), float(p[1])))
+        for form, push in beyond.items():
+            yield Term(_with_place(term_name(target, form)), _on(axis, push))
+    left, right = line.speed_rad_s[:, 0] * p[0] / 2.0, line.speed_rad_s[:, 1] * p[0] / 2.0
+    angle = line.angle_rad
+    for wave, turn in (("sin", np.sin), ("cos", np.cos)):
+        rim = (left * turn(angle[:, 0]), right * turn(angle[:, 1]))
+        push = np.column_stack([rim[0] + rim[1], np.zeros_like(v), 2.0 * (rim[1] - rim[0]) / p[1]])
+        yield Term(f"rim speed += {{:.4g}} {wave}(wheel angle) of itself", push)
+
+
+def with_known_terms(line: Timeline, effects: Iterable[EffectSetting], p: Array, late_s: float) -> Timeline:
+    """The timeline with what the terms among a given model's effects add; `p` is its vector of the body."""
+    u, (v, w, a) = late_commands(line, late_s), motion(line, p)
+    command = motion_push = None
+    for setting in effects:
+        term = TERMS.get(setting.name)
+        if term is None:
+            continue
+        if term.target == COMMAND:
+            push = setting.values["k"] * COMMAND_FEATURES[term.feature](u, u[:, ::-1], line.t_s[:, None])
+            command = push if command is None else command + push
+        else:
+            push = setting.values["k"] * BODY_FEATURES[term.feature](v, w, a, line.t_s)
+            push = _on(BODY_TARGETS.index(term.target), push)
+            motion_push = push if motion_push is None else motion_push + push
+    return replace(line, known_command=command, known_motion=motion_push)
+
+
+def _with_place(name: str) -> str:
+    """A term's equation with a place for the number in place of the k."""
+    return name.replace("+= k ", "+= {:.4g} ")
+
+
+def places(channel: BodyChannel, p: Array) -> Iterator[Term]:
+    """Discs of the floor in which turning is different."""
+    line = channel.timeline
+    x, y = _where(channel)
+    low_x, high_x, low_y, high_y = (*np.quantile(x, (0.02, 0.98)), *np.quantile(y, (0.02, 0.98)))
+    if (high_x - low_x) * (high_y - low_y) > _LARGEST_FLOOR_M2 or line.t_s.size * CELL_S > _LONGEST_S:
+        return
+    across, along = (np.arange(low, high + 1e-9, _DISC_SPACING_M) for low, high in ((low_x, high_x), (low_y, high_y)))
+    yield from _discs(channel, p, ((cx, cy, radius) for cx in across for cy in along for radius in _DISC_RADII_M))
+
+
+def places_near(channel: BodyChannel, p: Array, disc: tuple[float, float, float]) -> Iterator[Term]:
+    """Discs of the floor closer around one than `places` lie to each other."""
+    x, y, radius = disc
+    sizes = [size for size in (radius + step for step in _DISC_SIZE_STEPS_M) if size > 0.0]
+    steps = _DISC_STEPS_M
+    yield from _discs(channel, p, ((x + dx, y + dy, size) for dx in steps for dy in steps for size in sizes))
+
+
+def _where(channel: BodyChannel) -> tuple[Array, Array]:
+    """Measured position at the nodes, (M,) each."""
+    t_s, samples, measured = channel.timeline.t_s, channel.samples, channel.measured
+    return np.interp(t_s, samples.t_s, measured[:, 0]), np.interp(t_s, samples.t_s, measured[:, 1])
+
+
+def _discs(channel: BodyChannel, p: Array, discs: Iterable[tuple[float, float, float]]) -> Iterator[Term]:
+    """Those in which a good part of all turning was done, and outside of which too."""
+    x, y = _where(channel)
+    speed = channel.timeline.speed_rad_s
+    w = p[0] / p[1] * (speed[:, 1] - speed[:, 0])
+    turning = np.abs(w)
+    turned = max(float(turning.sum()), 1e-9)
+    centre, squares = (math.nan, math.nan), np.empty(0)
+    for centre_x, centre_y, radius in discs:
+        if centre != (centre_x, centre_y):
+            centre, squares = (centre_x, centre_y), (x - centre_x) ** 2 + (y - centre_y) ** 2
+        inside = squares < radius * radius
+        if _LEAST_INSIDE < float(turning @ inside) / turned < _MOST_INSIDE:
+            where = f"within {radius:.2f} m of ({centre_x:.2f}, {centre_y:.2f}) m"
+            push = _on(2, np.where(inside, w, 0.0))
+            disc = (float(centre_x), float(centre_y), float(radius))
+            yield Term(f"omega += {{:.4g}} omega {where}", push, disc=disc)
+
+
+def _on(axis: int, feature: Array) -> Array:
+    push = np.zeros((feature.size, 3))
+    push[:, axis] = feature
+    return push
+
+
+def smoothed(values: Array) -> Array:
+    """Values at the nodes without what changes from one to the next."""
+    window = np.hanning(2 * _SPAN_NODES + 1)
+    return np.convolve(values, window / window.sum(), "same")
+
+
+@dataclass(frozen=True)
+class WithTerms:
+    """A channel with unnamed terms, whose coefficients are further entries of the parameter vector, always free."""
+
+    inner: WheelChannel | BodyChannel
+    terms: tuple[Term, ...]
+    layout: Layout
+
+    @classmethod
+    def of(cls, inner: WheelChannel | BodyChannel, terms: tuple[Term, ...]) -> WithTerms:
+        """Extend a channel."""
+        plain, count = inner.layout, len(terms)
+        names = tuple(f"term{k}" for k in range(count))
+        sizes = [max(float(np.sqrt((term.push**2).mean())), 1e-12) for term in terms]
+        layout = replace(
+            plain,
+            columns=plain.columns + names,
+            neutral=np.append(plain.neutral, np.zeros(count)),
+            step=np.append(plain.step, [1e-3 / size for size in sizes]),
+            low=np.append(plain.low, np.full(count, -math.inf)),
+            high=np.append(plain.high, np.full(count, math.inf)),
+            precision=np.append(plain.precision, np.zeros(count)),
+            place={**plain.place, **{name: len(plain.columns) + k for k, name in enumerate(names)}},
+        )
+        return cls(inner, terms, layout)
+
+    @property
+    def neutral(self) -> Array:
+        """The vector without any effect or term."""
+        return np.append(self.inner.neutral, np.zeros(len(self.terms)))
+
+    @property
+    def free(self) -> tuple[int, ...]:
+        """Entries that are always fitted: the base and the coefficients."""
+        first = len(self.inner.layout.columns)
+        return (*self.inner.free, *range(first, first + len(self.terms)))
+
+    @property
+    def block(self) -> Index:
+        """Block of time of each residual."""
+        return self.inner.block
+
+    @property
+    def count(self) -> int:
+        """Number of residuals that are used."""
+        return self.inner.count
+
+    @property
+    def trusted_blocks(self) -> float:
+        """How many blocks of time that agree with the noise model it is worth."""
+        return self.inner.trusted_blocks
+
+    def split(self, p: Array) -> tuple[Array, Array | None]:
+        """The inner channel's vector, and what the terms add at the nodes."""
+        width = len(self.inner.layout.columns)
+        push = np.zeros_like(self.terms[0].push)
+        for coefficient, term in zip(p[width:], self.terms, strict=True):
+            push += coefficient * term.push
+        return p[:width], push
+
+    def residual(self, p: Array) -> Array:
+        """Whitened residuals."""
+        core, push = self.split(p)
+        return self.inner.residual(core, push)

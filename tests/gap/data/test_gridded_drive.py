@@ -1,0 +1,84 @@
+"""A drive on the grid: commands exact in the mean, runs cut where nothing was measured, foreign stretches left out."""
+
+import math
+
+import numpy as np
+import pytest
+
+from disco_hw.gap.data.gridded_drive import CELL_S, even_times, timeline
+from disco_hw.log.drive import Commands, DriveLog, Gyro, Poses, Wheels
+
+
+def drive(t_command, command, t_wheel, speed, ticks=2048, segment=None, pose_s=None):
+    quantum = 2 * math.pi / ticks
+    angle = np.round(np.cumsum(speed * np.diff(t_wheel, prepend=t_wheel[0])) / quantum) * quantum
+    where = np.zeros(t_wheel.size, np.int64) if segment is None else segment
+    poses = np.arange(0.0, t_wheel[-1], 0.04) if pose_s is None else pose_s
+    none = np.zeros(poses.size)
+    zeros = np.zeros(t_command.size, np.int64)
+    empty = np.empty(0)
+    return DriveLog(
+        ("made",),
+        Commands(t_command, command, command, zeros),
+        Wheels(t_wheel, angle, angle, speed, speed, where, True, False),
+        Poses(poses, none, none, np.mod(poses + np.pi, 2 * np.pi) - np.pi, np.zeros(poses.size, np.int64)),
+        Gyro(empty, empty, np.empty(0, np.int64)),
+    )
+
+
+def test_a_command_that_changes_within_a_cell_counts_by_its_share():
+    t = np.arange(0.0, 10.0, 0.02)
+    line = timeline(drive(np.array([0.0, 5.003]), np.array([0.0, 1.0]), t, np.where(t > 5.1, 1.0, 0.0)))
+    cell = round(5.0 / CELL_S)
+    assert line.command_rad_s[cell, 0] == pytest.approx(0.7, abs=1e-6)
+    assert line.command_rad_s[cell - 1, 0] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_silence_and_segments_cut_runs():
+    t = np.concatenate([np.arange(0.0, 8.0, 0.02), np.arange(11.0, 20.0, 0.02)])
+    line = timeline(drive(t, np.full(t.size, 1.0), t, np.full(t.size, 1.0)))
+    assert line.first.sum() == 2
+    segment = (t > 4.0).astype(np.int64)
+    assert timeline(drive(t, np.full(t.size, 1.0), t, np.full(t.size, 1.0), segment=segment)).first.sum() == 3
+
+
+def test_yaw_is_not_wrapped_and_stamps_scatter_as_they_do():
+    rng = np.random.default_rng(0)
+    t = np.arange(0.0, 20.0, 0.02) + 0.001 * rng.standard_normal(1000)
+    line = timeline(drive(t, np.full(t.size, 1.0), t, np.full(t.size, 1.0)))
+    assert line.pose_values[-1, 2] - line.pose_values[0, 2] > 6.0
+    assert line.stamp_scatter_s == pytest.approx(0.001, rel=0.3)
+
+
+def test_the_smallest_step_of_the_angle_is_the_encoders():
+    t = np.arange(0.0, 20.0, 0.02)
+    line = timeline(drive(t, np.sin(t), t, np.sin(t)))
+    assert line.quantum_rad == pytest.approx(2 * math.pi / 2048, rel=1e-6)
+
+
+def test_even_times_take_the_jitter_of_stamps_out_and_keep_gaps():
+    rng = np.random.default_rng(1)
+    even = np.arange(500) * 0.02
+    stamped = even + 0.003 * rng.standard_normal(500)
+    assert np.std(even_times(stamped)[20:-20] - even[20:-20]) < 0.001
+    lost = np.concatenate([even[:200], even[200:] + 5.0])
+    np.testing.assert_allclose(np.diff(even_times(lost))[200:], 0.02, atol=0.012)
+    assert even_times(lost)[200] - even_times(lost)[199] > 4.9
+
+
+def test_wheels_that_another_master_turns_are_left_out():
+    t = np.arange(0.0, 30.0, 0.02)
+    command = np.where(t < 10.0, 2.0, 0.0)
+    speed = np.where(t < 10.0, 2.0, np.where(t > 20.0, 1.5, 0.0))
+    line = timeline(drive(t, command, t, speed))
+    assert np.isnan(line.command_rad_s[round(25.0 / CELL_S), 0])
+    assert np.isfinite(line.command_rad_s[round(5.0 / CELL_S), 0])
+    assert any("left out" in note for note in line.notes)
+
+
+def test_a_sudden_start_out_of_a_long_rest_is_no_other_master():
+    t = np.arange(0.0, 20.0, 0.02)
+    command = np.where((t >= 10.0) & (t < 13.0), 4.0, 0.0)
+    line = timeline(drive(t, command, t, command))
+    assert np.isfinite(line.command_rad_s[:-5]).all()
+    assert not line.notes

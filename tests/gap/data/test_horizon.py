@@ -1,0 +1,64 @@
+"""Displacements ahead in the frame of the start."""
+
+import numpy as np
+import pytest
+
+from disco_hw.gap.data.gridded_drive import CELL_S
+from disco_hw.gap.data.horizon import displacement, starts_of
+from disco_hw.gap.data.layout import BODY
+
+N = 1000
+ONE_RUN = np.arange(N) == 0
+
+
+def test_a_circle_looks_the_same_from_everywhere():
+    t = np.arange(N) * CELL_S
+    track = np.column_stack([np.sin(0.5 * t), 1.0 - np.cos(0.5 * t), 0.5 * t])
+    start = np.array([100, 300, 600])
+    moved = displacement(BODY.neutral, ONE_RUN, track, t, start, track[start, 2], 2.0)
+    np.testing.assert_allclose(moved, np.tile([np.sin(1.0), 1.0 - np.cos(1.0), 1.0], (3, 1)), atol=1e-9)
+
+
+def test_latency_shows_what_was_and_drift_adds_in_the_world():
+    t = np.arange(N) * CELL_S
+    track = np.column_stack([0.5 * t**2, np.zeros(N), np.zeros(N)])
+    late = BODY.neutral.copy()
+    late[BODY.place["pose_latency.latency_s"]] = 0.1
+    start = np.array([300])
+    sooner, later = (displacement(p, ONE_RUN, track, t, start, np.zeros(1), 1.0)[0, 0] for p in (BODY.neutral, late))
+    assert sooner - later == pytest.approx(0.1, abs=1e-6)
+    drift = BODY.neutral.copy()
+    drift[BODY.place["slope.drift_y_m_s"]] = 0.02
+    moved = (
+        displacement(drift, ONE_RUN, track, t, start, np.full(1, np.pi / 2), 1.0)[0]
+        - displacement(BODY.neutral, ONE_RUN, track, t, start, np.full(1, np.pi / 2), 1.0)[0]
+    )
+    np.testing.assert_allclose(moved, [0.02, 0.0, 0.0], atol=1e-9)
+
+
+@pytest.mark.parametrize("latency_s", [-0.3, -0.04, 0.0, 0.3, 1.5])
+def test_a_latency_does_not_look_into_another_run(latency_s):
+    """Where each run begins anew from 0, and the next ones are driven the other way."""
+    first = np.arange(N) % 250 == 0
+    track = np.column_stack([0.005 * (np.arange(N) % 250), np.zeros(N), np.zeros(N)])
+    track[250:500, 0] *= -1.0
+    shifted = BODY.neutral.copy()
+    shifted[BODY.place["pose_latency.latency_s"]] = latency_s
+    start = starts_of(first, np.ones(N, bool), 1.0, 0.01)
+    assert start.max() + 102 == N
+    moved = displacement(shifted, first, track, np.zeros(N), start, np.zeros(start.size), 1.0)[:, 0]
+    # Before a run begins nothing is known: a pose that is so late sees the robot stand.
+    expected = 0.5 - 0.5 * np.maximum(latency_s - (start % 250) * CELL_S, 0.0)
+    expected[start // 250 == 1] *= -1.0
+    np.testing.assert_allclose(moved, expected, atol=1e-9)
+
+
+def test_starts_stay_within_runs_and_on_known_nodes():
+    first = np.zeros(N, bool)
+    first[[0, 500]] = True
+    usable = np.ones(N, bool)
+    usable[250] = False
+    start = starts_of(first, usable, 1.0)
+    ends = start + 100
+    assert np.all((start < 500) == (ends < 500))
+    assert not np.any((start <= 250) & (ends >= 250))

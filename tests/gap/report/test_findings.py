@@ -1,0 +1,81 @@
+"""The report's sentences, where they decide what a person does next."""
+
+import json
+import math
+from dataclasses import replace
+
+import pytest
+
+from disco_hw.gap.report.blind_spots import BlindSpot
+from disco_hw.gap.report.findings import STAGES, GapReport, UnnamedFinding
+from disco_hw.gap.report.page import page
+from disco_hw.gap.search.channel_search import _HEAVIEST, _NAMED_SCORE
+from disco_hw.gap.search.cross_validation import Errors
+from disco_hw.model import Model
+from disco_hw.outputs import as_json
+
+
+def errors(position_m, yaw_rad=0.02):
+    interval = (0.9 * position_m, 1.1 * position_m)
+    return Errors(position_m, interval, yaw_rad, (0.9 * yaw_rad, 1.1 * yaw_rad), 0.1, {"curves": position_m})
+
+
+def report(amended_m, yaw_rad=0.02, blind=()):
+    sizes = dict(zip(STAGES, (0.06, 0.047, amended_m, 0.014), strict=True))
+    gap = {
+        s: {h: errors(size, yaw_rad if s == "amended" else 0.02) for h in (0.5, 1.0, 2.0, 5.0)}
+        for s, size in sizes.items()
+    }
+    spots = tuple(
+        BlindSpot(name, "k", "s", None, True, f"disco-hw drive ROBOT.toml --script x: {name}") for name in blind
+    )
+    unnamed = (UnnamedFinding("wheel_to_body", "v_x += -0.4 v^3", 99.0),)
+    return GapReport(("log",), (), (), unnamed, spots, gap, Model(0.06, 0.4), 1.0)
+
+
+def test_the_answer_has_the_gap_before_and_after_and_the_noise():
+    assert report(0.014).answer()[1] == (
+        "Adding it takes the 2 s position error from 47 mm (nominal 60 mm) to 14 mm; noise alone gives 14 mm."
+    )
+
+
+def test_a_model_that_predicts_worse_is_not_recommended():
+    for worse in (report(0.052), report(0.014, yaw_rad=0.03)):
+        assert worse.answer()[1].endswith("Do not drive with it: it predicts worse than without.")
+        assert worse.as_dict()["gap"]["amended_is_worse"]
+    assert not report(0.048).as_dict()["gap"]["amended_is_worse"]
+
+
+def test_one_drive_is_asked_for():
+    assert report(0.014).drive is None
+    assert report(0.014, blind=("turn_slip", "yaw_rate_limit")).drive == "disco-hw drive ROBOT.toml --script spins"
+    several = report(0.014, blind=("turn_slip", "deadband"))
+    assert several.drive == "disco-hw drive ROBOT.toml --script separate"
+    assert several.drive in several.answer()[2]
+    assert several.drive in page(several)
+
+
+def test_the_page_says_what_is_in_the_model():
+    inside = report(0.014)
+    outside = replace(inside, unnamed=(replace(inside.unnamed[0], in_model=False),))
+    assert "in the amended model" in page(inside)
+    assert "no model&#x27;s state holds" in page(outside)
+    assert not outside.as_dict()["unnamed"][0]["in_model"]
+
+
+def test_a_log_of_short_stretches_says_that_it_does_not_tell_the_gap():
+    nan = Errors(math.nan, (math.nan, math.nan), math.nan, (math.nan, math.nan), math.nan, {})
+    some = report(0.014)
+    short = replace(some, gap={s: {h: e if h < 2.0 else nan for h, e in of.items()} for s, of in some.gap.items()})
+    assert short.answer()[1] == "No stretch of the logs is long enough to see how far 2 s predictions are off."
+    told = json.loads(as_json(short.as_dict()), parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
+    assert told["gap"]["amended"]["position_rmse_m"] is None
+    assert told["gap"]["amended"]["position_ci95_m"] == [None, None]
+    assert told["gap"]["horizons"][0]["amended"]["position_rmse_m"] == 0.014
+    assert "nan" not in short.as_text()
+    assert "nan" not in page(short).replace("dominant", "")
+
+
+def test_the_page_names_the_score_that_a_name_takes():
+    accepts = f"score ({_NAMED_SCORE:g} accepts, up to {_HEAVIEST * _NAMED_SCORE:g} where"
+    assert accepts in page(report(0.014))

@@ -1,0 +1,107 @@
+"""Errors on held-out stretches: the right model errs by the noise of a pose, a wrong one by what it lacks."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from disco_hw.gap.data.gridded_drive import BLOCK_S
+from disco_hw.gap.data.layout import BODY
+from disco_hw.gap.noise.channels import BodyChannel
+from disco_hw.gap.search.channel_search import indices
+from disco_hw.gap.search.cross_validation import (
+    FOLD_S,
+    Chain,
+    Errors,
+    clearly_worse,
+    errors_of,
+    floor_errors,
+    fold_vectors,
+    smoothed_poses,
+)
+from disco_hw.gap.search.least_squares import fit
+from tests.gap.synthetic import NOISE, body_channel
+
+AHEAD_S = 2.0
+
+
+def both(vector):
+    return {fold: Chain(vector, None) for fold in (0, 1)}
+
+
+def with_slip(channel, k_s=0.1):
+    vector = channel.neutral.copy()
+    vector[BODY.place["turn_slip.k_s"]] = k_s
+    return vector
+
+
+def test_the_right_model_errs_by_the_noise_alone_and_a_wrong_one_by_more():
+    channel, _ = body_channel(turn_slip=0.1)
+    right = with_slip(channel)
+    poses = smoothed_poses(channel, right)
+    sound = errors_of(channel, None, both(right), AHEAD_S, poses)
+    wrong = errors_of(channel, None, both(channel.neutral), AHEAD_S, poses)
+    floor = floor_errors(channel, None, Chain(right, None), AHEAD_S, poses)
+    # The pose at the end is a single measured one, that at the start a mean of many.
+    assert sound.yaw_rad == pytest.approx(NOISE.yaw_rad, rel=0.25)
+    assert sound.position_m == pytest.approx(floor.position_m, rel=0.2)
+    assert wrong.yaw_rad > 5.0 * sound.yaw_rad
+    assert wrong.position_ci[0] < wrong.position_m < wrong.position_ci[1]
+    assert wrong.by_regime_m["turning on the spot"] > 2.0 * sound.by_regime_m["turning on the spot"]
+
+
+def test_only_what_repeats_in_most_stretches_or_is_far_worse_is_clearly_worse():
+    def errors(*squares):
+        both = np.column_stack([squares, np.ones(len(squares))])
+        return Errors(float(np.sqrt(np.mean(squares))), (0.0, 1.0), 1.0, (0.0, 1.0), 0.0, {}, both)
+
+    before = errors(1.0, 1.0, 1.0, 1.0, 1.0, 1.0)
+    assert clearly_worse(before, errors(1.2, 1.2, 1.1, 1.3, 1.2, 1.2))
+    assert not clearly_worse(before, errors(2.2, 0.9, 1.1, 0.9, 1.1, 1.0))
+    assert clearly_worse(before, errors(5.0, 0.9, 1.1, 0.9, 1.1, 1.0))
+    assert not clearly_worse(before, errors(1.05, 1.05, 1.05, 1.05, 1.05, 1.05))
+    assert not clearly_worse(errors(1.2, 1.2, 1.1, 1.3, 1.2, 1.2), before)
+
+
+def test_smoothed_poses_are_closer_to_the_truth_than_measured_ones():
+    channel, _ = body_channel()
+    smooth, alone = smoothed_poses(channel, channel.neutral)
+    truth = channel.track(channel.neutral)
+    inside = np.isfinite(smooth[:, 0]) & np.isfinite(alone[:, 0])
+    assert inside.mean() > 0.95
+    error = [np.sqrt(np.mean((poses - truth)[inside, :2] ** 2)) for poses in (smooth, alone)]
+    assert error[0] < 0.6 * error[1]
+    assert error[1] == pytest.approx(NOISE.position_m, rel=0.3)
+
+
+def test_each_fold_is_predicted_by_what_was_fitted_on_the_other():
+    channel, line = body_channel()
+    spoilt = line.pose_values.copy()
+    # In the first stretch of 21 s every turn is measured a tenth too large.
+    first = line.pose.t_s < 21.0
+    spoilt[first, 2] *= 1.1
+    shifted = BodyChannel.build(type(line)(**{**_fields(line), "pose_values": spoilt}), NOISE, channel.neutral)
+    found = fit(shifted, channel.neutral, indices(shifted, ()))
+    vectors = fold_vectors(found, shifted.block, shifted.neutral)
+    axle = {fold: vector[1] for fold, vector in vectors.items()}
+    # Fold 0 holds that stretch: who predicts it has not seen it.
+    assert axle[0] == pytest.approx(0.4, rel=0.01)
+    assert abs(axle[1] - 0.4) > 3.0 * abs(axle[0] - 0.4)
+
+
+def test_what_a_fold_knows_nothing_about_is_not_in_its_prediction():
+    channel, _ = body_channel(turn_slip=0.1)
+    place = BODY.place["turn_slip.k_s"]
+    found = fit(channel, with_slip(channel), indices(channel, ("turn_slip",)))
+    # As if all turning had been done in fold 0: nothing elsewhere depends on the slip.
+    column = found.active.index(place)
+    elsewhere = (channel.block // round(FOLD_S / BLOCK_S)) % 2 == 1
+    slope = found.jacobian.copy()
+    slope[elsewhere, column] *= 1e-6
+    vectors = fold_vectors(replace(found, jacobian=slope), channel.block, channel.neutral)
+    assert vectors[0][place] == 0.0
+    assert vectors[1][place] == pytest.approx(0.1, rel=0.2)
+
+
+def _fields(line):
+    return {name: getattr(line, name) for name in line.__slots__}

@@ -1,0 +1,90 @@
+"""Evidence is honest about noise that is not what the model says."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from disco_hw.gap.search.evidence import compare, held_out_by_block, inflation
+from disco_hw.gap.search.least_squares import Fit
+
+N, EACH = 3000, 50
+
+
+def linear_fit(columns, y):
+    active = tuple(range(columns.shape[1]))
+    coefficient = np.linalg.lstsq(columns, y, rcond=None)[0] if active else np.empty(0)
+    residual = columns @ coefficient - y
+    return Fit(coefficient, active, 0.5 * float(residual @ residual), residual, columns)
+
+
+def channel():
+    return SimpleNamespace(block=np.arange(N) // EACH, count=N, trusted_blocks=6.0)
+
+
+def test_white_noise_speaks_for_nothing_and_a_real_slope_for_itself():
+    rng = np.random.default_rng(0)
+    x = rng.standard_normal((N, 1))
+    noise = rng.standard_normal(N)
+    empty = np.empty((N, 0))
+    nothing = compare(linear_fit(empty, noise), linear_fit(x, noise), channel(), 1.0)
+    real = compare(linear_fit(empty, noise + 0.2 * x[:, 0]), linear_fit(x, noise + 0.2 * x[:, 0]), channel(), 1.0)
+    assert nothing.score < 0.0
+    assert real.score > 50.0
+    assert real.repeated > 0.0
+    assert real.held_out == pytest.approx(real.gain, rel=0.2)
+
+
+def test_noise_that_comes_in_blocks_inflates_the_variance():
+    rng = np.random.default_rng(1)
+    x = np.ones((N, 1))
+    white = rng.standard_normal(N)
+    wander = np.repeat(rng.standard_normal(N // EACH), EACH)
+    sound = inflation(linear_fit(x, white), channel(), (0,))
+    shaken = inflation(linear_fit(x, white + wander), channel(), (0,))
+    assert sound < 3.0
+    assert shaken > 20.0
+
+
+def test_what_is_told_of_next_to_nothing_is_judged_without_a_fault():
+    white = np.random.default_rng(5).standard_normal(N)
+    with np.errstate(all="raise"):
+        assert inflation(linear_fit(np.full((N, 1), 1e-90), white), channel(), (0,)) >= 1.0
+
+
+def test_a_block_is_judged_by_the_others():
+    rng = np.random.default_rng(2)
+    x = np.zeros((N, 1))
+    x[:EACH] = 1.0
+    y = rng.standard_normal(N) + 3.0 * x[:, 0]
+    fitted = linear_fit(x, y)
+    proof = compare(linear_fit(np.empty((N, 0)), y), fitted, channel(), 1.0)
+    # Only one block speaks for it: without that one nothing repeats.
+    assert proof.gain > 100.0
+    assert proof.repeated <= 1e-6
+    assert held_out_by_block(fitted, channel()).size == N // EACH
+
+
+def test_what_only_one_block_knows_does_not_hide_what_all_show():
+    rng = np.random.default_rng(3)
+    everywhere = rng.standard_normal((N, 1))
+    limit = np.full((N, 1), 1e-7)
+    limit[:EACH] = 1.0
+    y = rng.standard_normal(N) + 0.3 * everywhere[:, 0] + 2.0 * limit[:, 0]
+    both = linear_fit(np.hstack([limit, everywhere]), y)
+    proof = compare(
+        linear_fit(limit, y), Fit(both.vector, (0, 1), both.cost, both.residual, both.jacobian), channel(), 1.0
+    )
+    assert proof.held_out == pytest.approx(proof.gain, rel=0.2)
+    assert proof.repeated > 50.0
+
+
+def test_few_blocks_that_happen_to_scatter_do_not_take_the_evidence_away():
+    rng = np.random.default_rng(4)
+    # Nearly all is told in two of 20 blocks of nine.
+    x = np.full((9000, 1), 0.02)
+    x[:450] = x[4500:4950] = 1.0
+    wide = SimpleNamespace(block=np.arange(9000) // EACH, count=9000, trusted_blocks=6.0)
+    factors = [inflation(linear_fit(x, rng.standard_normal(9000)), wide, (0,)) for _ in range(200)]
+    assert np.quantile(factors, 0.95) < 2.0
+    assert np.mean(factors) == pytest.approx(1.15, abs=0.15)

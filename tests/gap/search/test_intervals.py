@@ -1,0 +1,73 @@
+"""95 % intervals hold what is true about as often as they say, and are wider where the noise is more than thought."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from disco_hw.gap.data.layout import BODY
+from disco_hw.gap.search.channel_search import Found, body_moves
+from disco_hw.gap.search.intervals import Estimate, Estimates, estimates, in_motion
+from disco_hw.gap.search.selection import Selector
+from tests.gap.synthetic import body_channel
+
+
+def estimated(channel, names=("turn_slip",)):
+    return estimates(Found(Selector(channel, body_moves(channel)), names, channel))
+
+
+def test_intervals_hold_the_truth_nine_times_of_ten():
+    held = []
+    for seed in range(12):
+        found = estimated(body_channel(seed, turn_slip=0.08)[0]).by_name
+        for name, truth in (("turn_slip.k_s", 0.08), ("wheel_radius_m", 0.06), ("axial_distance_m", 0.4)):
+            held.append(found[name].low <= truth <= found[name].high)
+    assert np.mean(held) >= 0.85
+
+
+def test_an_estimate_tells_its_standard_deviation_and_the_joint_one():
+    found = estimated(body_channel(turn_slip=0.08)[0])
+    place = found.fitted.index("turn_slip.k_s")
+    assert found.by_name["turn_slip.k_s"].deviation == pytest.approx(found.covariance[place, place] ** 0.5)
+    # More slip and a longer axle both take from turning: what is known is their sum.
+    axle = found.fitted.index("axial_distance_m")
+    assert found.covariance[place, axle] < 0.0
+
+
+def test_noise_larger_than_thought_widens_the_interval():
+    channel, line = body_channel(turn_slip=0.08)
+    wander = 0.05 * np.sin(2.0 * np.pi * channel.samples.t_s[:, None] / (7.0, 11.0, 17.0))
+    shaken = type(channel).build(replace(line, pose_values=line.pose_values + wander), channel.noise, channel.neutral)
+    found = [estimated(one).by_name["turn_slip.k_s"] for one in (channel, shaken)]
+    assert found[1].deviation > 2.0 * found[0].deviation
+
+
+def test_the_time_of_a_change_has_an_interval_around_it():
+    channel, _ = body_channel()
+    vector = channel.neutral.copy()
+    vector[[BODY.place["surface_change.track"], BODY.place["surface_change.time_s"]]] = 0.12, 35.0
+    moved = channel.measured + (channel.track(vector) - channel.track(channel.neutral))[channel.samples.node]
+    line = replace(channel.timeline, pose_values=moved)
+    found = estimated(type(channel).build(line, channel.noise, channel.neutral), ("surface_change",))
+    time = found.by_name["surface_change.time_s"]
+    assert time.low < time.value < time.high
+    assert time.value == pytest.approx(35.0, abs=1.0)
+    assert time.high - time.low < 10.0
+
+
+def test_a_limit_of_turning_is_no_better_known_than_the_geometry_that_it_is_told_in():
+    def estimates_of(covariance, **values):
+        ends = [1.96 * spread for spread in np.sqrt(np.diag(covariance))]
+        by_name = {name: Estimate(v, v - end, v + end) for (name, v), end in zip(values.items(), ends, strict=True)}
+        return Estimates(by_name, tuple(values), np.asarray(covariance))
+
+    limit, lag = "yaw_rate_limit.limit_rad_s", "motor_lag.tau_s"
+    # Radius and axial distance are known to 1 % and 2 %, and their ratio to sqrt(1 + 4 - 2 * 1.5) %.
+    geometry = estimates_of([[0.0006**2, 3.6e-6], [3.6e-6, 0.008**2]], wheel_radius_m=0.06, axial_distance_m=0.4)
+    wheels = estimates_of([[0.01**2, 1e-6], [1e-6, 0.001**2]], **{limit: 1.0, lag: 0.1})
+    found = in_motion(wheels, geometry)
+    assert found.by_name[limit].deviation == pytest.approx(np.hypot(0.01, 0.02**0.5 / 10.0))
+    assert found.by_name[limit].value == 1.0
+    assert found.by_name[lag] == wheels.by_name[lag]
+    assert found.covariance[0, 0] == pytest.approx(found.by_name[limit].deviation ** 2)
+    np.testing.assert_array_equal(found.covariance.ravel()[1:], wheels.covariance.ravel()[1:])

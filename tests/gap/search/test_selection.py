@@ -1,0 +1,111 @@
+"""The selection names what was put into a small drive, whatever it began with, and nothing where there is nothing."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from disco_hw.gap.data.gridded_drive import CELL_S
+from disco_hw.gap.data.layout import BODY
+from disco_hw.gap.noise.channels import WheelChannel
+from disco_hw.gap.noise.wheel_noise import WheelNoise
+from disco_hw.gap.search.channel_search import body_moves, wheel_moves
+from disco_hw.gap.search.selection import Selector, Thresholds
+from tests.gap.synthetic import GEOMETRY, body_channel, line_of
+
+
+def selector(given=(), start=None, moves_m=0.001, **effects):
+    channel, _ = body_channel(**effects)
+    return Selector(channel, body_moves(channel), Thresholds(moves_m=moves_m), given=given, start=start)
+
+
+def test_nothing_is_selected_where_nothing_is_missing():
+    assert selector().select() == ()
+
+
+def test_exactly_what_is_missing_is_selected():
+    found = selector(turn_slip=0.08, wheel_radius_asymmetry=0.02)
+    names = found.select()
+    assert set(names) == {"turn_slip", "wheel_radius_asymmetry"}
+    vector = found.fit(names).vector
+    assert vector[BODY.place["turn_slip.k_s"]] == pytest.approx(0.08, rel=0.1)
+    assert vector[BODY.place["wheel_radius_asymmetry.ratio"]] == pytest.approx(0.02, rel=0.1)
+
+
+def test_what_is_not_needed_goes_again():
+    found = selector(turn_slip=0.08)
+    assert found.select(("side_slip", "turn_slip", "slope")) == ("turn_slip",)
+
+
+def test_a_stand_in_is_swapped_for_what_it_stood_in_for():
+    found = selector(turn_slip=0.08)
+    assert found._swapped(("surface_change",)) == ("turn_slip",)
+
+
+def wheels_slow(tau_s):
+    """A search of wheels that follow steps of their commands as a lag."""
+    commands = np.repeat(np.random.default_rng(7).choice([-4.0, -2.0, 0.0, 3.0, 5.0], 60), 100)
+    keep = np.exp(-CELL_S / tau_s)
+    followed = lfilter([1.0 - keep], [1.0, -keep], commands)
+    line = line_of(np.repeat(followed[:, None], 2, axis=1))
+    line = replace(line, command_rad_s=np.repeat(commands[:, None], 2, axis=1))
+    channel = WheelChannel.build(line, WheelNoise(), np.array(GEOMETRY))
+    return Selector(channel, wheel_moves(channel, np.array(GEOMETRY)), Thresholds(moves_m=0.005))
+
+
+def test_a_short_lag_with_a_delay_beside_it_is_not_taken_for_the_delay():
+    found = wheels_slow(0.03)
+    both = ("motor_lag", "command_delay")
+    assert not any(found.acceptable((name,), both) for name in both)
+    assert found._backward(both) == ("motor_lag",)
+
+
+def test_given_effects_stay_and_are_not_selected_again():
+    channel, _ = body_channel(turn_slip=0.08)
+    start = channel.neutral.copy()
+    start[BODY.place["turn_slip.k_s"]] = 0.08
+    assert selector(given=("turn_slip",), start=start, turn_slip=0.08).select() == ("turn_slip",)
+
+
+def test_what_moves_no_prediction_is_not_accepted():
+    strict = selector(moves_m=1.0, turn_slip=0.08)
+    assert strict.select() == ()
+    assert not strict.acceptable((), ("turn_slip",))
+    assert selector(turn_slip=0.08).acceptable((), ("turn_slip",))
+
+
+def test_a_change_is_found_when_it_happens():
+    channel, line = body_channel()
+    late = line.t_s > 40.0
+    truth = channel.neutral.copy()
+    push = np.zeros((line.t_s.size, 3))
+    omega = truth[0] / truth[1] * (line.speed_rad_s[:, 1] - line.speed_rad_s[:, 0])
+    push[:, 2] = np.where(late, -omega * (1.0 - 1.0 / 1.12), 0.0)
+    moved = (
+        channel.measured + channel.track(truth, push)[channel.samples.node] - channel.track(truth)[channel.samples.node]
+    )
+    changed = type(channel).build(replace(line, pose_values=moved), channel.noise, truth)
+    found = Selector(changed, body_moves(changed))
+    names = found.select()
+    assert names == ("surface_change",)
+    assert found.fit(names).vector[BODY.place["surface_change.time_s"]] == pytest.approx(40.0, abs=2.0)
+
+
+def wheels_late(commands_rad_s, late_cells=20):
+    """A search of wheels that follow these commands (M,) 0.2 s late."""
+    commands = np.repeat(commands_rad_s[:, None], 2, axis=1)
+    followed = np.concatenate([np.repeat(commands[:1], late_cells, axis=0), commands[:-late_cells]])
+    geometry = np.array(GEOMETRY)
+    line = replace(line_of(followed), command_rad_s=commands)
+    channel = WheelChannel.build(line, WheelNoise(), geometry)
+    return Selector(channel, wheel_moves(channel, geometry))
+
+
+def test_a_slow_drive_cannot_tell_lag_from_delay_and_says_so():
+    t_s = 0.01 * np.arange(6000)
+    slow = wheels_late(3.0 + 2.0 * np.sin(2.0 * np.pi * t_s / 20.0))
+    assert "motor_lag" in slow.rivals(("command_delay",), "command_delay")
+    assert "command_delay" in slow.rivals(("motor_lag",), "motor_lag")
+    steps = wheels_late(np.where(np.floor(t_s / 2.0) % 2 == 0, 4.0, -3.0))
+    assert steps.rivals(("command_delay",), "command_delay") == ()
