@@ -247,6 +247,46 @@ def test_silence_is_noticed_by_each_half_of_a_tick(call):
     assert driver.state is DriverState.HANDSHAKE
 
 
+def test_nothing_is_silent_that_was_never_heard():
+    bench = make_bench()
+    bench.loses = lambda _: True
+    bench.run(4.0)
+    assert bench.events == []
+
+
+@pytest.mark.parametrize(
+    ("protocol", "silence_ms"), [({}, 500), ({"dbc_hash": 0x0BADCAFE}, 3000), ({"protocol_major": 2}, 3000)]
+)
+def test_a_silence_counts_only_beyond_its_limit_which_is_longer_for_a_robot_that_was_refused(protocol, silence_ms):
+    """One that is refused says less, and should stay refused in words until it is gone."""
+    bench = make_bench(ReferenceRobot(replace(CONFIG, **protocol)))
+    bench.run_until(DriverState.REFUSED if protocol else DriverState.STANDBY)
+    heard_ns = bench.driver._last_heard_ns
+    assert bench.driver.receive(heard_ns + silence_ms * MS, ()).events == ()
+    assert bench.driver.receive(heard_ns + silence_ms * MS + 1, ()).events == ("the robot fell silent: new handshake",)
+    assert bench.driver.state is DriverState.HANDSHAKE
+
+
+def test_a_robot_that_has_shown_only_its_state_can_fall_silent_too():
+    driver, status = make_driver(), {"state": 1, "fault": 0, "session": 0, "estop_source": 0, "last_command_counter": 0}
+    driver.link_up(START_NS)
+    for counter in range(4):
+        frame = CODEC.encode("SYSTEM_STATE", counter, **status, rejected_count=0, reject_reason=0, stop_cause=0)
+        now_ns = START_NS + counter * MS
+        driver.receive(now_ns, [ReceivedFrame(now_ns, Frame(*frame))])
+    assert driver.capabilities is None
+    assert driver.receive(START_NS + 504 * MS, ()).events == ("the robot fell silent: new handshake",)
+
+
+def test_a_robot_that_has_shown_all_but_its_state_can_fall_silent_too():
+    driver = make_driver()
+    driver.link_up(START_NS)
+    build = answer("BUILD", dbc_hash=CODEC.dbc_hash, board_id=1)
+    driver.receive(START_NS, [hello(), limits(0), limits(1), build])
+    assert driver.capabilities is not None
+    assert "the robot fell silent: new handshake" in driver.receive(START_NS + 501 * MS, ()).events
+
+
 def test_a_robot_that_turns_out_to_be_another_is_commanded_no_more():
     bench = make_bench()
     bench.arm()

@@ -7,6 +7,7 @@ from pathlib import Path as FilePath
 import msgspec
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 import disco_hw
 from disco_hw.config import CircleTask
@@ -145,6 +146,24 @@ def test_what_a_robot_said_that_is_not_heard_any_more_is_not_its_state(lost):
         stack.robot.board.step = lambda _now_us: ()
     stack.run(1.0)
     assert stack.core.robot_status is None
+
+
+@pytest.mark.parametrize("speeds", [(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)])
+def test_a_wheel_that_turns_either_way_on_either_side_keeps_the_robot_from_being_armed(speeds):
+    stack = simulated_stack(NoPlanner(), needs_pose=False)
+    stack.run(1.5)
+    receive = stack.core.driver.receive
+
+    def turning(now_ns, frames):
+        readings = receive(now_ns, frames)
+        left, right = speeds
+        wheels = tuple(replace(sample, left_speed_rad_s=left, right_speed_rad_s=right) for sample in readings.wheels)
+        return replace(readings, wheels=wheels)
+
+    stack.core.driver.receive = turning
+    stack.run(0.1)
+    (reply,) = (reply for tick in stack.run(0.02, UserRequest.ARM) for reply in tick.replies)
+    assert (reply.accepted, "the wheels are turning" in reply.text) == (False, True)
 
 
 class Moody:

@@ -110,11 +110,17 @@ def pose(x_m: float) -> tuple[PoseSample, ...]:
     return (PoseSample(0, 0, x_m, 1.0, 0.5, 0.01, 0.01),)
 
 
-@pytest.mark.parametrize(("speed", "count"), [(2.0, 1), (0.0, 0)])
-def test_a_pose_that_stays_the_same_to_the_digit_counts_while_the_wheels_turn(speed, count):
+@pytest.mark.parametrize(
+    ("left", "right", "count"),
+    [
+        (2.0, 2.0, 1), (-2.0, -2.0, 1), (0.31, 0.0, 1), (-0.31, 0.0, 1), (0.0, 0.31, 1), (0.0, -0.31, 1),
+        (0.0, 0.0, 0), (0.29, -0.29, 0),
+    ],
+)  # fmt: skip
+def test_a_pose_that_stays_the_same_to_the_digit_counts_while_a_wheel_turns_either_way(left, right, count):
     watch = Plausibility()
     for x_m in (0.1, 0.2, 0.2, 0.2, 0.2, 0.3):
-        watch.step(0, (wheels(0, speed, speed),), pose(x_m), (), None)
+        watch.step(0, (wheels(0, left, right),), pose(x_m), (), None)
     assert watch.stats == PlausibilityStats(poses_frozen=count)
 
 

@@ -361,6 +361,18 @@ def test_estop_beats_arm_in_the_same_tick_in_either_order(order):
     assert Request.ARM not in bench.requests_sent
 
 
+def test_what_it_says_of_each_state():
+    bench = Bench()
+    assert bench.ready().out.detail == "ready to be armed"
+    assert bench.tick(ARM).detail == "arming"
+    bench.tick(count=3)
+    assert (bench.out.state, bench.out.detail) == (State.ARMED, "armed, holding zero")
+    assert bench.tick(START).detail == "running the task"
+    assert bench.tick(telemetry_age_s=0.06).detail == "no fresh wheel samples: holding zero"
+    assert bench.tick(telemetry_age_s=0.01).detail == "running the task"
+    assert bench.tick(STOP).detail == "armed, holding zero"
+
+
 def test_asking_twice_is_harmless():
     bench = Bench().running()
     assert bench.tick(ARM, START).replies[0].text == "already armed"
