@@ -31,21 +31,27 @@ class FrameReception:
         self.unknown_id = 0
         self.lost = 0
         self.foreign: str | None = None
+        self.outside_stop_ns: int | None = None
 
     def reset(self) -> None:
         """Forget the senders, as at a new link; the counts stay."""
         self._receivers.clear()
         self._counters.clear()
         self.foreign = None
+        self.outside_stop_ns = None
 
     def accept(self, received: ReceivedFrame) -> Decoded | None:
         """Return the decoded frame if it may be believed, None otherwise; whatever the wire brings, nothing is raised.
 
-        `foreign` names the last message seen that only a host sends: somebody else commands this robot.
+        `foreign` names the last message seen that only a host sends: somebody else commands this robot. An e-stop does
+        not count as that, as anybody may send one: `outside_stop_ns` is when the last was received.
         """
         decoded = self._codec.decode(received.frame.can_id, received.frame.data)
         if isinstance(decoded, DecodeFault):
             self._count(decoded, received.t_ns)
+            return None
+        if decoded.name == "ESTOP":
+            self.outside_stop_ns = received.t_ns
             return None
         if _SENDERS[decoded.name] != "ROBOT":
             self.foreign = decoded.name

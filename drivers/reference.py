@@ -42,6 +42,7 @@ SHORTEST_VALID_FOR_S = 0.002
 _HOUSE_KEEPING_NS = 100_000_000
 _ESTOP_DEADLINE_NS = 1_000_000_000
 _PENDING_TIMES = 8
+_ONE_STOP_NS = 1_000_000_000
 _STATES = {
     "BOOT": DriverState.HANDSHAKE,
     "STANDBY": DriverState.STANDBY,
@@ -195,6 +196,7 @@ class ReferenceDriver:
         """Take in received frames and return what they meant; frames that come while the link is down are ignored."""
         self._now_ns = now_ns
         collected: dict[str, list[Any]] = {}
+        stopped_ns = self._reception.outside_stop_ns
         for received in frames if self._link_is_up else ():
             decoded = self._reception.accept(received)
             if decoded is None:
@@ -202,6 +204,7 @@ class ReferenceDriver:
             self._last_heard_ns = min(received.t_ns, now_ns)
             self._take(decoded, received.t_ns, collected)
         self._mind_trust(now_ns)
+        self._take_outside_stop(stopped_ns)
         if self._reception.foreign is not None and not self._foreign_told:
             self._foreign_told = True
             self._events.append(f"another host is on the link: it sends {self._reception.foreign}; disconnect it")
@@ -361,6 +364,12 @@ class ReferenceDriver:
         blockers = tuple(name for bit, name in self._blocker_bits.items() if bits & bit)
         self._arming.take_session(int(values["challenge"]), int(values["session"]), blockers, received_ns)
         self._take_clock_errors(int(values["clock_error_count"]))
+
+    def _take_outside_stop(self, before_ns: int | None) -> None:
+        """Say that somebody else sent an e-stop, once for frames that come within a second."""
+        newest_ns = self._reception.outside_stop_ns
+        if newest_ns is not None and (before_ns is None or newest_ns - before_ns > _ONE_STOP_NS):
+            self._events.append("e-stop from outside on the link, by `disco-hw estop` or another host")
 
     def _take_clock_errors(self, told: int) -> None:
         before, self._clock_errors_told = self._clock_errors_told, told

@@ -2,6 +2,7 @@ import os
 import signal
 import subprocess
 import sys
+from contextlib import contextmanager
 
 import pytest
 
@@ -9,6 +10,8 @@ from disco_hw.daemon.signals import StopSignals
 
 STOP_SIGNALS = [signal.SIGTERM, signal.SIGINT, signal.SIGHUP]
 DAEMON = """
+import signal
+import sys
 import time
 from disco_hw.daemon.clock import MonotonicClock
 from disco_hw.daemon.loop import Loop
@@ -20,6 +23,8 @@ def stop_wheels():
     time.sleep(0.3)
     print("wheels stand", flush=True)
 
+# Whoever runs these tests may have told its children to ignore the signal, as nohup does.
+signal.signal(signal.SIGHUP, getattr(signal, sys.argv[1]))
 path = StopPath()
 path.add("log", lambda: print("log closed", flush=True))
 path.add("wheels", stop_wheels)
@@ -34,14 +39,30 @@ print(signals.received.name, flush=True)
 """
 
 
-@pytest.fixture
-def process():
-    with subprocess.Popen([sys.executable, "-c", DAEMON], stdout=subprocess.PIPE, text=True) as started:
+@contextmanager
+def daemon(hangup="SIG_DFL"):
+    """A loop that runs in a process of its own, started with this disposition of SIGHUP."""
+    command = [sys.executable, "-c", DAEMON, hangup]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as started:
         try:
             assert started.stdout.readline() == "running\n"
             yield started
         finally:
             started.kill()
+
+
+@pytest.fixture
+def process():
+    with daemon() as started:
+        yield started
+
+
+def test_under_nohup_the_loop_goes_on_after_a_hangup():
+    with daemon("SIG_IGN") as process:
+        process.send_signal(signal.SIGHUP)
+        process.send_signal(signal.SIGTERM)
+        output, _ = process.communicate(timeout=10)
+        assert output.splitlines()[-1] == "SIGTERM"
 
 
 @pytest.mark.parametrize("number", STOP_SIGNALS)

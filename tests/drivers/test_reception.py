@@ -88,10 +88,18 @@ def test_what_only_a_host_sends_betrays_another_host():
     assert reception.accept(received("TIME_REQUEST", sequence=1)) is None
     assert reception.foreign == "TIME_REQUEST"
     assert reception.unknown_id == 1
-    reception.accept(ReceivedFrame(0, Frame(CODEC.can_id("ESTOP"), b"")))
-    assert reception.foreign == "ESTOP"
     reception.reset()
     assert reception.foreign is None
+
+
+def test_an_estop_from_outside_betrays_nobody():
+    """Anybody may stop the robot, as `disco-hw estop` does beside the daemon."""
+    reception = FrameReception(CODEC)
+    assert reception.accept(ReceivedFrame(7, Frame(CODEC.can_id("ESTOP"), b""))) is None
+    assert reception.outside_stop_ns == 7
+    assert (reception.foreign, reception.unknown_id) == (None, 0)
+    reception.reset()
+    assert reception.outside_stop_ns is None
 
 
 def test_trust_ends_with_silence_and_at_a_new_link():

@@ -169,6 +169,32 @@ def test_a_second_host_that_commands_motion_stops_the_robot_but_never_drives_it(
     assert "another host is on the link: it sends WHEEL_COMMAND; disconnect it" in bench.events
 
 
+def test_an_estop_from_outside_is_no_second_host_and_is_said_once_a_stop():
+    """As `disco-hw estop` sends it beside the daemon: three frames, which the robot and the driver both receive."""
+    bench = make_bench()
+    bench.arm()
+    told = "e-stop from outside on the link, by `disco-hw estop` or another host"
+    for stops in (1, 2):
+        for _ in range(3):
+            bench.inject_to_robot(*CODEC.encode("ESTOP", reason="UNSPECIFIED"))
+            bench.inject_to_host(*CODEC.encode("ESTOP", reason="UNSPECIFIED"))
+            bench.run(0.02)
+        bench.run(2.0)
+        assert bench.events.count(told) == stops
+    assert bench.driver.state is DriverState.ESTOP
+    assert not any("another host is on the link" in event for event in bench.events)
+    assert bench.driver.stats.unknown_id == 0
+
+
+def test_a_second_host_is_pointed_out_even_if_it_sends_an_estop_first():
+    bench = make_bench()
+    bench.run_until(*STILL)
+    bench.inject_to_host(*CODEC.encode("ESTOP", reason="UNSPECIFIED"))
+    bench.inject_to_host(*CODEC.encode("TIME_REQUEST", 0, sequence=1))
+    bench.run(0.1)
+    assert "another host is on the link: it sends TIME_REQUEST; disconnect it" in bench.events
+
+
 def test_a_new_link_voids_everything_even_if_its_loss_went_unseen():
     bench = make_bench()
     bench.arm()
