@@ -14,7 +14,7 @@ from disco_hw.errors import InputError
 from disco_hw.experiments.circle import CURVES, CircleOptions, CircleResult, Run, drive, plants, run_circle
 from disco_hw.model import Gaussian, load_model
 
-MODEL = load_model(Path(__file__).parents[3] / "disco_hw/robots/wombot_model.toml")
+MODEL = load_model(Path(__file__).parents[2] / "disco_hw/robots/wombot_model.toml")
 MEAN = {"wheel_radius_m": 0.061, "axial_distance_m": 0.415, "x_icr_m": 0.238}
 
 
