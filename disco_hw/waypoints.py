@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.config import FARTHEST_M
+from disco_hw.config.input_file import WAY_POINTS, read_lines
 from disco_hw.errors import InputError
 
 Array = NDArray[np.float64]
@@ -38,25 +39,7 @@ def load_waypoints(path: Path) -> Waypoints:
     Raises InputError with one line naming file, place and remedy: a file that cannot be read, a missing column, a cell
     that is not a finite number, fewer than two way-points, one repeated, times that do not increase.
     """
-    try:
-        # Spreadsheets write a mark before the first column's name.
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            reader = csv.DictReader(file, skipinitialspace=True)
-            header = reader.fieldnames or ()
-            numbered = [(reader.line_num, row) for row in reader]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{path}: cannot be read ({error}); give the path of a CSV of way-points") from None
-    for name in ("x_m", "y_m"):
-        if name not in header:
-            raise InputError(f"{path}: line 1: column {name}: missing; name x_m and y_m there, with a comma between")
-    if len(numbered) < 2:
-        raise InputError(f"{path}: {len(numbered)} way-points; write at least two")
-    lines = [line for line, _ in numbered]
-    columns = {
-        name: np.array([_number(path, line, name, row[name]) for line, row in numbered])
-        for name in ("x_m", "y_m", "t_s")
-        if name in header
-    }
+    lines, columns = _columns(path)
     places = np.column_stack([columns["x_m"], columns["y_m"]])
     times = columns.get("t_s")
     if times is None:
@@ -68,6 +51,34 @@ def load_waypoints(path: Path) -> Waypoints:
         line = lines[int(np.argmax(np.diff(times) <= 0.0)) + 1]
         raise InputError(f"{path}: line {line}: t_s does not increase; sort the way-points by time")
     return Waypoints(places, times, tuple(lines))
+
+
+def _columns(path: Path) -> tuple[list[int], dict[str, Array]]:
+    """The lines of the rows, and the columns that there are of x_m, y_m and t_s."""
+    reader = csv.reader(read_lines(path, WAY_POINTS), skipinitialspace=True)
+    lines: list[int] = []
+    try:
+        header = next(reader, [])
+        for name in ("x_m", "y_m"):
+            if name not in header:
+                raise InputError(
+                    f"{path}: line 1: column {name}: missing; name x_m and y_m there, with a comma between"
+                )
+        places = {name: header.index(name) for name in ("x_m", "y_m", "t_s") if name in header}
+        columns: dict[str, list[float]] = {name: [] for name in places}
+        for row in reader:
+            if not row:
+                continue
+            if len(lines) == MOST_POINTS:
+                raise InputError(f"{path}: over {MOST_POINTS} way-points; write at most {MOST_POINTS}")
+            lines.append(reader.line_num)
+            for name, place in places.items():
+                columns[name].append(_number(path, reader.line_num, name, row[place] if place < len(row) else None))
+    except csv.Error as error:
+        raise InputError(f"{path}: cannot be read ({error}); give the path of a CSV of way-points") from None
+    if len(lines) < 2:
+        raise InputError(f"{path}: {len(lines)} way-points; write at least two")
+    return lines, {name: np.array(column) for name, column in columns.items()}
 
 
 def way_points_to_follow(path: Path) -> Waypoints:
@@ -116,9 +127,7 @@ def way_points_to_meet(path: Path, fastest_m_s: float) -> Waypoints:
 
 
 def _check_size(path: Path, found: Waypoints) -> None:
-    """Refuse more way-points, a shorter or longer path, and places further off, than can be followed."""
-    if len(found.places_m) > MOST_POINTS:
-        raise InputError(f"{path}: {len(found.places_m)} way-points; write at most {MOST_POINTS}")
+    """Refuse a shorter or longer path, and places further off, than can be followed."""
     length_m = float(np.hypot(*np.diff(found.places_m, axis=0).T).sum())
     if not SHORTEST_M <= length_m <= LONGEST_M:
         raise InputError(f"{path}: {length_m:g} m long; between {SHORTEST_M:g} and {LONGEST_M:g} m can be followed")

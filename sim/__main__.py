@@ -11,7 +11,6 @@ from firmware_protocol.firmware_core import FirmwareConfig
 from sim.app import VirtualRobotOptions, run_virtual_robot
 from sim.body_dynamics import Pose
 from sim.effects import HiddenEffectError, effects_table, parse_hidden_effects
-from sim.fault_schedule import FaultFileError, load_schedule
 from sim.injection import COMMANDS
 from sim.plant_parameters import PlantParameters
 
@@ -21,7 +20,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = _parser().parse_args(arguments)
     try:
         options = _options(given)
-    except (ValueError, HiddenEffectError, FaultFileError) as error:
+    except (ValueError, HiddenEffectError) as error:
         print(error, file=sys.stderr)
         return 2
     return run_virtual_robot(options)
@@ -62,7 +61,6 @@ def _parser() -> argparse.ArgumentParser:
     add("--truth", type=Path, metavar="CSV", help="record what truly happens")
     add("--bus-log", type=Path, metavar="FILE", help="record every frame on the served bus, as candump -L does")
     add("--inject", type=Path, metavar="SOCKET", help="take commands, see below")
-    add("--faults", type=Path, metavar="TOML", help="what goes wrong and when, see docs/faults.md")
     add("--ready-fd", type=int, metavar="N", help="also write the ready line to this descriptor")
     add("--realtime-priority", type=int, default=defaults.realtime_priority, help="SCHED_FIFO, 0 for none")
     return parser
@@ -100,7 +98,6 @@ def _options(given: argparse.Namespace) -> VirtualRobotOptions:
         bus_log=given.bus_log,
         inject=given.inject,
         ready_fd=given.ready_fd,
-        faults=None if given.faults is None else load_schedule(given.faults),
         realtime_priority=given.realtime_priority,
     )
 

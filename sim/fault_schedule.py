@@ -7,7 +7,6 @@ import random
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
@@ -157,27 +156,20 @@ class FaultSchedule:
     faults: tuple[Fault, ...]
 
 
-def load_schedule(path: Path) -> FaultSchedule:
-    """Read a schedule; raises FaultFileError for a file that is none.
-
-    The file: `seed` (0 if absent) and a table `[[fault]]` for each fault with `kind`, `at_s`, `for_s` (only kinds that
-    last) and the kind's parameters.
-    """
-    try:
-        text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise FaultFileError(f"{path}: {error.strerror}; choose another file") from None
-    except UnicodeDecodeError:
-        raise FaultFileError(f"{path}: not a text file; give a fault schedule in TOML") from None
-    return parse_schedule(text, str(path))
-
-
 def parse_schedule(text: str, name: str = "schedule") -> FaultSchedule:
-    """Parse the text of a schedule, see `load_schedule`; `name` stands for the file in messages."""
+    """The schedule of a TOML text, see `schedule_of`."""
     try:
-        table = tomllib.loads(text)
+        return schedule_of(tomllib.loads(text), name)
     except (ValueError, RecursionError) as error:
         raise FaultFileError(f"{name}: not TOML ({' '.join(str(error).split())}); correct that place") from None
+
+
+def schedule_of(table: Mapping[str, Any], name: str) -> FaultSchedule:
+    """The schedule of a TOML table: `seed` (0 if absent) and a table `[[fault]]` for each fault with `kind`, `at_s`,
+    `for_s` (only kinds that last) and the kind's parameters.
+
+    `name` stands for the file in messages. Raises FaultFileError for a table that is none.
+    """
     unknown = set(table) - {"seed", "fault"}
     if unknown:
         raise FaultFileError(f"{name}: {min(unknown)}: unknown; a schedule has seed and [[fault]] only")

@@ -18,13 +18,14 @@ from pathlib import Path
 
 import disco_hw
 from disco_hw.config import load_robot_config
+from disco_hw.config.input_file import FAULTS_TOML, read_toml
 from disco_hw.errors import InputError, WorkError
 from disco_hw.log.csv_import import read_csv
 from disco_hw.log.mcap_drive import drive_from_log
 from disco_hw.log.reader import open_log
 from disco_hw.log.recovery import recover
 from disco_hw.model import load_model
-from sim.fault_schedule import FaultFileError, load_schedule
+from sim.fault_schedule import FaultFileError, schedule_of
 
 GROWTH_LIMIT_MB = 30.0
 WARM_UP = 300
@@ -49,7 +50,7 @@ def _read_log(path: Path) -> None:
 READERS: dict[str, Callable[[Path], object]] = {
     "robot.toml": load_robot_config,
     "model.toml": load_model,
-    "faults.toml": load_schedule,
+    "faults.toml": lambda path: schedule_of(read_toml(path, FAULTS_TOML), str(path)),
     "drive.csv": lambda path: read_csv(path, 2048.0),
     "run.mcap": _read_log,
 }

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import time
-import tomllib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +17,7 @@ import msgspec
 import serial
 
 from disco_hw.config import Link
+from disco_hw.config.input_file import ROBOT_TOML, read_toml
 from disco_hw.daemon.control_client import send_request
 from disco_hw.daemon.control_socket import default_socket_path
 from disco_hw.errors import InputError
@@ -101,9 +101,9 @@ def stop_robot(robot: Path, link: str | None = None) -> EstopOutcome:
 
 def _read(robot: Path) -> dict[str, Any]:
     try:
-        return tomllib.loads(robot.read_text(encoding="utf-8"))
-    except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{robot}: cannot be read ({error}); use the robot's own e-stop button, now") from None
+        return read_toml(robot, ROBOT_TOML)
+    except InputError as error:
+        raise InputError(f"{error}; use the robot's own e-stop button, now") from None
 
 
 def _link_settings(robot: Path, raw: dict[str, Any], kind: str | None) -> Link:

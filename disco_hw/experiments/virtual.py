@@ -7,6 +7,7 @@ import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from disco_hw.config.input_file import FAULTS_TOML, read_toml
 from disco_hw.course import course_of
 from disco_hw.errors import InputError
 from disco_hw.runtime.robot_setup import Setup, geometry, link_key, load_setup
@@ -14,7 +15,7 @@ from firmware_protocol.firmware_core import FirmwareConfig
 from sim.app import VirtualRobotOptions, run_virtual_robot
 from sim.body_dynamics import Pose
 from sim.effects import HiddenEffectError, parse_hidden_effects
-from sim.fault_schedule import FaultFileError, load_schedule
+from sim.fault_schedule import FaultFileError, schedule_of
 from sim.plant_parameters import DrawError, PlantParameters, draw_plant_parameters
 
 
@@ -44,7 +45,9 @@ def run_sim(options: SimOptions) -> int:
     except HiddenEffectError as error:
         raise InputError(f"--hide: {error}") from None
     try:
-        faults = None if options.faults is None else load_schedule(options.faults)
+        faults = None
+        if options.faults is not None:
+            faults = schedule_of(read_toml(options.faults, FAULTS_TOML), str(options.faults))
     except FaultFileError as error:
         raise InputError(str(error)) from None
     if options.start is not None and not all(map(math.isfinite, options.start)):

@@ -9,13 +9,15 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Sequence
+from array import array
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from disco_hw.config.input_file import DRIVE_CSV, read_lines
 from disco_hw.log.drive import (
     Array,
     Commands,
@@ -41,6 +43,7 @@ SEGMENT = "segment"
 Mask = NDArray[np.bool_]
 
 _GROUPS = (COMMAND, SPEED, TICKS, POSE, GYRO)
+_KNOWN = frozenset({TIME, SEGMENT, *(name for group in _GROUPS for name in group)})
 _LONGEST_HOLD_S = 0.5
 _LARGEST_STEP_REV = 10.0
 
@@ -88,37 +91,47 @@ def read_csv(path: Path, ticks_per_rev: float | None = None, wheel_radius_m: flo
 
 
 def _read(path: Path) -> _Sheet:
+    reader = csv.reader(read_lines(path, DRIVE_CSV))
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            rows = list(csv.reader(file))
-    except OSError as error:
-        raise LogError(f"{path}: cannot be read ({error.strerror}); give the path of a CSV file") from None
-    except (UnicodeDecodeError, csv.Error) as error:
+        header = [name.strip() for name in next(reader, [])]
+        if not header:
+            raise LogError(f"{path}: empty file; it needs a header row and samples")
+        _check_header(path, header)
+        lines, columns = _columns(path, header, reader)
+    except csv.Error as error:
         raise LogError(f"{path}: not a CSV file ({error}); give an MCAP log or a CSV file") from None
-    if not rows:
-        raise LogError(f"{path}: empty file; it needs a header row and samples")
-    header = [name.strip() for name in rows[0]]
-    known = {TIME, SEGMENT, *(name for group in _GROUPS for name in group)}
-    _check_header(path, header)
-    columns: dict[str, list[str]] = {name: [] for name in header if name in known}
-    places = [(header.index(name), column) for name, column in columns.items()]
-    for line, row in enumerate(rows[1:], start=2):
+    if not lines:
+        raise LogError(f"{path}: a header and no rows; nothing was recorded in it")
+    t_s = columns.pop(TIME)
+    _check_clock(path, t_s, lines)
+    segment = columns.pop(SEGMENT, np.zeros(t_s.size)).astype(np.int64)
+    ignored = tuple(name for name in header if name not in _KNOWN)
+    return _Sheet(str(path), t_s - t_s[0], segment, columns, ignored)
+
+
+def _columns(path: Path, header: Sequence[str], rows: Iterator[list[str]]) -> tuple[Sequence[int], dict[str, Array]]:
+    """The lines of the rows, and their known columns: NaN where a cell is empty, segments numbered from 0."""
+    lines = array("q")
+    columns = {name: array("d") for name in header if name in _KNOWN}
+    places = [(header.index(name), name, column) for name, column in columns.items() if name != SEGMENT]
+    segments, label_at = columns.get(SEGMENT), header.index(SEGMENT) if SEGMENT in header else 0
+    label, number = "", 0
+    for line, row in enumerate(rows, start=2):
         if not row:
             continue
         if len(row) != len(header):
             raise LogError(f"{path}: line {line}: {len(row)} cells under {len(header)} columns; mend that line")
-        for place, column in places:
-            column.append(row[place])
-    lines = [line for line, row in enumerate(rows[1:], start=2) if row]
-    if not lines:
-        raise LogError(f"{path}: a header and no rows; nothing was recorded in it")
-    t_s = _numbers(path, TIME, columns[TIME], lines)
-    _check_clock(path, t_s, lines)
-    segment = _segments(columns.get(SEGMENT), len(lines))
-    cells = {
-        name: _numbers(path, name, column, lines) for name, column in columns.items() if name not in (TIME, SEGMENT)
-    }
-    return _Sheet(str(path), t_s - t_s[0], segment, cells, tuple(name for name in header if name not in known))
+        lines.append(line)
+        for place, name, column in places:
+            column.append(_number(path, line, name, row[place]))
+        if segments is not None:
+            # An empty cell continues the segment.
+            given = row[label_at].strip()
+            if given and given != label:
+                number += bool(label)
+                label = given
+            segments.append(number)
+    return lines, {name: np.array(column) for name, column in columns.items()}
 
 
 def _check_header(path: Path, header: Sequence[str]) -> None:
@@ -150,35 +163,18 @@ def _check_clock(path: Path, t_s: Array, lines: Sequence[int]) -> None:
         )
 
 
-def _numbers(path: Path, name: str, column: Sequence[str], lines: Sequence[int]) -> Array:
-    values = np.empty(len(column))
-    for at, text in enumerate(column):
-        try:
-            value = float(text) if text.strip() else math.nan
-            good = math.isfinite(value) or not text.strip()
-        except ValueError:
-            good = False
-        if not good:
-            raise LogError(
-                f"{path}: line {lines[at]}: {name} is {text!r}, not a finite number; leave a cell without sample empty"
-            )
-        values[at] = value
-    return values
-
-
-def _segments(column: Sequence[str] | None, count: int) -> Index:
-    """Numbered from 0 in order of appearance; an empty cell continues."""
-    segment = np.zeros(count, dtype=np.int64)
-    if column is None:
-        return segment
-    number, present = 0, column[0].strip()
-    for at, text in enumerate(column):
-        label = text.strip()
-        if label and label != present:
-            number += bool(present)
-            present = label
-        segment[at] = number
-    return segment
+def _number(path: Path, line: int, name: str, text: str) -> float:
+    if not text.strip():
+        return math.nan
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise LogError(
+            f"{path}: line {line}: {name} is {text!r}, not a finite number; leave a cell without sample empty"
+        )
+    return value
 
 
 def _commands(sheet: _Sheet) -> Commands:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from disco_hw.config.input_file import LOG, begin_of
 from disco_hw.log.container import MAGIC
 from disco_hw.log.csv_import import read_csv
 from disco_hw.log.drive import DriveLog, concatenate
@@ -63,12 +64,7 @@ def _same(path: Path, other: Path) -> bool:
 
 
 def _load(path: Path, ticks_per_rev: float | None, wheel_radius_m: float | None) -> DriveLog:
-    try:
-        with path.open("rb") as file:
-            magic = file.read(len(MAGIC))
-    except OSError as error:
-        raise LogError(f"{path}: cannot be opened ({error.strerror}); give the path of a log") from None
-    if magic == MAGIC:
+    if begin_of(path, LOG, len(MAGIC)) == MAGIC:
         with open_log(path) as log:
             return drive_from_log(log)
     return read_csv(path, ticks_per_rev, wheel_radius_m)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import tomllib
-
 import numpy as np
 from numpy.typing import NDArray
 
+from disco_hw.config.input_file import parse_toml
+from disco_hw.errors import InputError
 from disco_hw.log.drive import Array, Commands, DriveLog, Gyro, Index, Poses, Wheels
 from disco_hw.log.errors import LogError
 from disco_hw.log.provenance import ROBOT_TOML
@@ -73,8 +73,8 @@ def ticks_per_rev(log: Log) -> int | None:
     if ROBOT_TOML not in log.attachment_names():
         return None
     try:
-        value = tomllib.loads(log.attachment(ROBOT_TOML).decode("utf-8"))["robot"]["ticks_per_rev"]
-    except (ValueError, RecursionError, KeyError, TypeError):
+        value = parse_toml(log.attachment(ROBOT_TOML), ROBOT_TOML)["robot"]["ticks_per_rev"]
+    except (InputError, KeyError, TypeError):
         return None
     return value if isinstance(value, int) and value > 0 else None
 

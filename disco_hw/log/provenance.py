@@ -6,7 +6,7 @@ import subprocess
 from importlib import metadata
 from pathlib import Path
 
-from disco_hw.log.errors import LogError
+from disco_hw.config.input_file import FileKind, read_bytes
 from disco_hw.log.link import Attachment
 
 ROBOT_TOML = "robot.toml"
@@ -34,10 +34,6 @@ def version() -> str:
     return f"{package}+g{commit}"
 
 
-def attachment(path: Path, name: str | None = None) -> Attachment:
-    """A copy of a file for the log, under its own name or another; raises LogError if it cannot be read."""
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise LogError(f"{path}: cannot be read ({error.strerror}); it is kept in every log") from None
-    return Attachment(name or path.name, _MEDIA_TYPES.get(path.suffix, "text/plain"), data)
+def attachment(path: Path, name: str, kind: FileKind) -> Attachment:
+    """A copy of a file for the log, under a name of the log's; raises InputError if it cannot be read."""
+    return Attachment(name, _MEDIA_TYPES.get(path.suffix, "text/plain"), read_bytes(path, kind)[0])

@@ -13,6 +13,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from disco_hw.config.input_file import LOG, open_file
 from disco_hw.log.columns import to_columns
 from disco_hw.log.container import (
     ChunkRef,
@@ -82,10 +83,7 @@ class Log:
     """
 
     def __init__(self, path: Path) -> None:
-        try:
-            self._fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
-        except OSError as error:
-            raise LogError(f"{path}: cannot be opened ({error.strerror}); give the path of a log") from None
+        self._fd = open_file(path, LOG)
         self._path = path
         try:
             self._contents = _contents(self._fd, path)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from mcap.writer import CompressionType, Writer
 
+from disco_hw.config.input_file import LOG, open_file
 from disco_hw.log.container import Contents, DamagedError, messages, read_attachment, read_chunk, read_contents
 from disco_hw.log.errors import LogError
 from disco_hw.log.mcap_log import CHUNK_BYTES, LIBRARY, PROFILE, RECOVERY
@@ -29,10 +30,7 @@ def recover(source: Path, target: Path) -> Recovered:
     Works on any MCAP file with zstd or no compression. Raises LogError if the source is no MCAP file or the target
     exists or cannot be written; a half-written target is removed.
     """
-    try:
-        fd = os.open(source, os.O_RDONLY | os.O_CLOEXEC)
-    except OSError as error:
-        raise LogError(f"{source}: cannot be opened ({error.strerror}); give the path of a log") from None
+    fd = open_file(source, LOG)
     try:
         contents = read_contents(fd, str(source))
         try:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -12,6 +11,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
+from disco_hw.config.input_file import MODEL_TOML, read_toml
 from disco_hw.errors import InputError
 from disco_hw.model.belief import Belief, Gaussian, Mixture, Uniform
 from disco_hw.model.model import EffectSetting, Model
@@ -60,13 +60,7 @@ class _File(msgspec.Struct, forbid_unknown_fields=True):
 
 def load_model(path: Path) -> Model:
     """Read and validate a model file; raises InputError with one line naming file, field and remedy."""
-    try:
-        raw = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); give the path of a model file") from None
-    except (ValueError, RecursionError) as error:
-        # Not all that tomllib raises is its own error: numbers of thousands of digits, brackets nested as deep.
-        raise InputError(f"{path}: not valid TOML ({error}); mend that line") from None
+    raw = read_toml(path, MODEL_TOML)
     try:
         content = msgspec.convert(raw, _File)
     except msgspec.ValidationError as error:

@@ -6,6 +6,9 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from disco_hw.config import CircleTask, load_robot_config
+from disco_hw.config.input_file import MODEL_TOML as MODEL_KIND
+from disco_hw.config.input_file import ROBOT_TOML as ROBOT_KIND
+from disco_hw.config.input_file import WAY_POINTS
 from disco_hw.errors import InputError
 from disco_hw.log.link import Attachment
 from disco_hw.log.provenance import MODEL_TOML, PATH_CSV, ROBOT_TOML, attachment
@@ -14,9 +17,13 @@ from disco_hw.runtime.robot_setup import Setup, load_setup
 
 
 def kept_files(setup: Setup) -> list[Attachment]:
-    """Copies of robot.toml, the model and the task's path for a log; raises LogError if one cannot be read."""
-    named = ((ROBOT_TOML, setup.robot_file), (MODEL_TOML, setup.model_file), (PATH_CSV, setup.path_file))
-    return [attachment(file, name) for name, file in named if file is not None]
+    """Copies of robot.toml, the model and the task's path for a log; raises InputError if one cannot be read."""
+    named = (
+        (ROBOT_TOML, ROBOT_KIND, setup.robot_file),
+        (MODEL_TOML, MODEL_KIND, setup.model_file),
+        (PATH_CSV, WAY_POINTS, setup.path_file),
+    )
+    return [attachment(file, name, kind) for name, kind, file in named if file is not None]
 
 
 def setup_of_log(log: Log, remedy: str) -> Setup:

@@ -8,10 +8,11 @@ from pathlib import Path
 import msgspec
 
 from disco_hw.config import CircleTask, PathTask, Point, Robot, RobotConfig, TimedPathTask, load_robot_config
+from disco_hw.config.input_file import KEY, read_bytes
 from disco_hw.errors import InputError
 from disco_hw.model import Model, load_model
 from disco_hw.waypoints import Waypoints, way_points_to_follow, way_points_to_meet
-from drivers.key_file import KeyFileError, read_key_file
+from drivers.key_file import KeyFileError, key_of_file
 
 LINK_KINDS = ("can", "serial")
 Matrix3 = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
@@ -87,9 +88,10 @@ def link_key(setup: Setup) -> bytes | None:
     name = setup.config.link.key_file
     if name is None:
         return None
+    path = setup.robot_file.parent / name
     try:
-        return read_key_file(setup.robot_file.parent / name)
-    except KeyFileError as error:
+        return key_of_file(path, *read_bytes(path, KEY))
+    except (KeyFileError, InputError) as error:
         raise InputError(f"{setup.robot_file}: link.key_file: {error}") from None
 
 

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from disco_hw.errors import InputError
 from disco_hw.log.csv_import import read_csv
 from disco_hw.log.errors import LogError
 
@@ -196,11 +197,11 @@ def test_degrees_and_millimetres_are_refused(tmp_path):
 
 
 def test_a_missing_file_and_one_that_is_no_text(tmp_path):
-    with pytest.raises(LogError, match="cannot be read"):
+    with pytest.raises(InputError, match="cannot be read"):
         read_csv(tmp_path / "none.csv")
     path = tmp_path / "x.csv"
     path.write_bytes(b"\xff\xfe\x00t")
-    with pytest.raises(LogError, match="not a CSV file"):
+    with pytest.raises(InputError, match="not a CSV file"):
         read_csv(path)
 
 

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from disco_hw.errors import InputError
 from disco_hw.log.csv_export import write_csv
 from disco_hw.log.errors import LogError
 from disco_hw.log.load import load_drive
@@ -46,7 +47,7 @@ def test_a_cut_log_is_loaded_as_far_as_it_goes(tmp_path):
 def test_bad_ones_are_refused(tmp_path, mcap):
     with pytest.raises(LogError, match="no log given"):
         load_drive([])
-    with pytest.raises(LogError, match="cannot be opened"):
+    with pytest.raises(InputError, match="cannot be read"):
         load_drive([mcap, tmp_path / "none"])
     (tmp_path / "x").write_text("a,b\n1,2\n", encoding="utf-8")
     with pytest.raises(LogError, match="no column"):

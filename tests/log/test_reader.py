@@ -4,6 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.writer import Writer
 
+from disco_hw.errors import InputError
 from disco_hw.log.errors import LogError
 from disco_hw.log.load import load_drive
 from disco_hw.log.reader import Gap, open_log
@@ -133,9 +134,9 @@ def test_what_is_no_log_is_refused_in_one_line(tmp_path, content, words):
 
 
 def test_a_missing_file_a_directory_and_a_foreign_log_are_refused(tmp_path):
-    with pytest.raises(LogError, match="cannot be opened"):
+    with pytest.raises(InputError, match="cannot be read"):
         open_log(tmp_path / "none.mcap")
-    with pytest.raises(LogError, match="cannot be"):
+    with pytest.raises(InputError, match="cannot be"):
         open_log(tmp_path)
     foreign = tmp_path / "foreign.mcap"
     foreign.write_bytes(log_bytes(drive_ticks(3)).replace(b"disco-hw", b"other-hw"))

@@ -4,6 +4,7 @@ import resource
 import pytest
 from mcap.reader import make_reader
 
+from disco_hw.errors import InputError
 from disco_hw.log.errors import LogError
 from disco_hw.log.reader import open_log
 from disco_hw.log.recovery import recover
@@ -85,9 +86,9 @@ def test_a_disk_full_on_the_way_leaves_no_target_behind(tmp_path):
 
 
 def test_places_that_cannot_be_read_or_written_are_named(tmp_path):
-    with pytest.raises(LogError, match="cannot be opened"):
+    with pytest.raises(InputError, match="cannot be read"):
         recover(tmp_path / "none", tmp_path / "y")
     source = tmp_path / "cut.mcap"
     source.write_bytes(WHOLE)
-    with pytest.raises(LogError, match="No such file"):
+    with pytest.raises(InputError, match="No such file"):
         recover(source, tmp_path / "no directory" / "y")

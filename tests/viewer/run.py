@@ -4,6 +4,8 @@ import math
 from pathlib import Path
 
 import disco_hw
+from disco_hw.config.input_file import MODEL_TOML as MODEL_KIND
+from disco_hw.config.input_file import ROBOT_TOML as ROBOT_KIND
 from disco_hw.log import records
 from disco_hw.log.provenance import MODEL_TOML, ROBOT_TOML, attachment
 from disco_hw.log.recorder import ProcessRecorder, Recording
@@ -85,7 +87,7 @@ def tick_records(tick):
 
 def write_log(path, ticks=200, records_of=tick_records):
     """A log of the run, written by the real writer; `records_of(tick)` is what each tick holds."""
-    attachments = (attachment(ROBOT_FILE, ROBOT_TOML), attachment(MODEL_FILE, MODEL_TOML))
+    attachments = (attachment(ROBOT_FILE, ROBOT_TOML, ROBOT_KIND), attachment(MODEL_FILE, MODEL_TOML, MODEL_KIND))
     recorder = ProcessRecorder(Recording(path, "wombot", attachments=attachments, queue_ticks=100_000))
     for tick in range(ticks):
         recorder.put(*records_of(tick))

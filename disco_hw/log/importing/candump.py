@@ -7,11 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TextIO, cast
 
 import can
 import numpy as np
 
 from disco_hw.config import Robot
+from disco_hw.config.input_file import CANDUMP, read_lines
 from disco_hw.log.drive import Array, Commands, DriveLog, Gyro, Poses, Wheels
 from disco_hw.log.errors import LogError
 from drivers.device_clock import DeviceClock
@@ -69,7 +71,8 @@ def read_candump(path: Path, robot: Robot) -> DriveLog:
 def _frames(path: Path) -> Iterator[ReceivedFrame]:
     first_ns = last_ns = whole = 0
     try:
-        with can.CanutilsLogReader(path) as reader:
+        # It takes any iterator of lines that can be closed, not only files.
+        with can.CanutilsLogReader(cast(TextIO, read_lines(path, CANDUMP))) as reader:
             for number, message in enumerate(reader, start=1):
                 t_ns = round(message.timestamp * 1e9)
                 # Since the first frame: nanoseconds since 1970 are more than a float can tell apart.
@@ -79,8 +82,6 @@ def _frames(path: Path) -> Iterator[ReceivedFrame]:
                 last_ns, whole = t_ns, number
                 if not (message.is_error_frame or message.is_remote_frame or message.is_extended_id):
                     yield ReceivedFrame(t_ns - first_ns, Frame(message.arbitration_id, bytes(message.data)))
-    except OSError as error:
-        raise LogError(f"{path}: cannot be read ({error.strerror}); give the path of a candump") from None
     except (ValueError, IndexError, OverflowError) as error:
         if whole:
             raise LogError(f"{path}: after {whole} frames a line is none ({error}); take that line out") from None

@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from disco_hw.config import load_robot_config
+from disco_hw.config.input_file import LOG, begin_of
+from disco_hw.config.input_file import ROBOT_TOML as ROBOT_FILE
 from disco_hw.log.container import MAGIC
 from disco_hw.log.csv_import import read_csv
 from disco_hw.log.errors import LogError
@@ -45,7 +47,7 @@ def import_log(path: Path, robot: Path, out: Path) -> Imported:
         drive = read_candump(path, config.robot)
     else:
         drive = read_csv(path, config.robot.ticks_per_rev, config.robot.wheel_radius_m)
-    records = write_log(drive, out, config.robot.name, (attachment(robot, ROBOT_TOML),))
+    records = write_log(drive, out, config.robot.name, (attachment(robot, ROBOT_TOML, ROBOT_FILE),))
     notes = drive.notes
     if drive.gyro.t_s.size:
         notes += (f"{path}: the gyro was left out; a log of ours has none",)
@@ -53,11 +55,7 @@ def import_log(path: Path, robot: Path, out: Path) -> Imported:
 
 
 def _begins(path: Path) -> bytes:
-    try:
-        with path.open("rb") as file:
-            begin = file.read(len(MAGIC))
-    except OSError as error:
-        raise LogError(f"{path}: cannot be opened ({error.strerror}); give the path of a log") from None
+    begin = begin_of(path, LOG, len(MAGIC))
     if begin == MAGIC:
         raise LogError(
             f"{path}: an MCAP log; ours needs no import, and of others none can be imported yet: write a CSV"

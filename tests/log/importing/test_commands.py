@@ -51,7 +51,7 @@ def test_our_own_logs_need_no_import(robot, tmp_path):
 
 
 def test_what_cannot_be_opened_is_told(robot, tmp_path):
-    with pytest.raises(LogError, match=r"cannot be opened \(No such file"):
+    with pytest.raises(InputError, match=r"cannot be read \(No such file"):
         import_log(tmp_path / "none.csv", robot, tmp_path / "log.mcap")
 
 

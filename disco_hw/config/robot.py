@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import msgspec
 from msgspec import Meta
 
+from disco_hw.config.input_file import ROBOT_TOML, read_toml
 from disco_hw.errors import InputError
 
 Positive = Annotated[float, Meta(gt=0.0)]
@@ -20,10 +20,6 @@ Range = tuple[float, float]
 Point = tuple[float, float]
 # The frames of a pose hold 838.86 m along x and y (disco_robot.dbc); where there is no pose nothing can be followed.
 FARTHEST_M = 838.0
-
-
-class ConfigError(InputError):
-    """Bad configuration; the message is one line for the user: file, field, what is wrong, what to write."""
 
 
 class Robot(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -186,19 +182,13 @@ class RobotConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
 def load_robot_config(path: Path) -> RobotConfig:
     """Read and validate robot.toml, and none of the files that it names.
 
-    Raises ConfigError with one line naming file, field and remedy.
+    Raises InputError with one line naming file, field and remedy.
     """
-    try:
-        raw = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read ({error.strerror}); give the path of a robot.toml") from None
-    except (ValueError, RecursionError) as error:
-        # Not all that tomllib raises is its own error: numbers of thousands of digits, brackets nested as deep.
-        raise ConfigError(f"{path}: not valid TOML ({error}); mend that line") from None
+    raw = read_toml(path, ROBOT_TOML)
     try:
         config = msgspec.convert(_with_kind_of_task(path, raw), RobotConfig)
     except msgspec.ValidationError as error:
-        raise ConfigError(f"{path}: {_in_words(str(error))}") from None
+        raise InputError(f"{path}: {_in_words(str(error))}") from None
     _check(path, config)
     return config
 
@@ -217,7 +207,7 @@ def _with_kind_of_task(path: Path, raw: dict[str, Any]) -> dict[str, Any]:
         return raw
     for name in ("points", "times_s"):
         if name in task:
-            raise ConfigError(f"{path}: [task] {name}: no such field; write way-points in a CSV and name it in path")
+            raise InputError(f"{path}: [task] {name}: no such field; write way-points in a CSV and name it in path")
     return {**raw, "task": {"kind": "path" if "path" in task else "circle", **task}}
 
 
@@ -240,7 +230,7 @@ def _check(path: Path, config: RobotConfig) -> None:
     """Refuse what no single field shows."""
 
     def refuse(field: str, fault: str, remedy: str) -> None:
-        raise ConfigError(f"{path}: {field}: {fault}; {remedy}")
+        raise InputError(f"{path}: {field}: {fault}; {remedy}")
 
     for section_name in config.__struct_fields__:
         section = getattr(config, section_name)

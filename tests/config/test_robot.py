@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from disco_hw.config import ConfigError, PathTask, TimedPathTask, circle_task, load_robot_config
+from disco_hw.config import PathTask, TimedPathTask, circle_task, load_robot_config
 from disco_hw.errors import InputError
 
 GOOD = """
@@ -51,13 +51,19 @@ def test_shipped_robot_file_is_valid():
         (("ticks_per_rev = 2048", "ticks_per_rev = true"), ["robot.ticks_per_rev", "bool", "float"]),
         (("[robot]", "[robott]"), ["robott", "no such field"]),
         (("[robot]", "[robot"), ["not valid TOML", "line"]),
-        (("ticks_per_rev = 2048", "ticks_per_rev = " + "1" * 5000), ["not valid TOML", "5000 digits"]),
-        (("ticks_per_rev = 2048", "ticks_per_rev = " + "[" * 3000 + "]" * 3000), ["not valid TOML", "recursion"]),
+        (
+            ("ticks_per_rev = 2048", "ticks_per_rev = " + "1" * 5000),
+            ["not valid TOML", "line 6", "64 characters"],
+        ),
+        (
+            ("ticks_per_rev = 2048", "ticks_per_rev = " + "[" * 3000 + "]" * 3000),
+            ["line 6", "16 deep"],
+        ),
         (("max_wheel_speed_rad_s = 8.0", "max_wheel_speed_rad_s = 2.0"), ["task.speed_m_s", "wheels"]),
     ],
 )
 def test_a_mistake_gets_one_line_with_file_and_field(tmp_path, change, words):
-    with pytest.raises(ConfigError) as caught:
+    with pytest.raises(InputError) as caught:
         load(tmp_path, GOOD.replace(*change))
     message = str(caught.value)
     assert "\n" not in message
@@ -85,12 +91,12 @@ def test_a_mistake_gets_one_line_with_file_and_field(tmp_path, change, words):
     ],
 )
 def test_ranges_and_relations_are_checked(tmp_path, extra, field):
-    with pytest.raises(ConfigError, match=field.replace(".", r"\.")):
+    with pytest.raises(InputError, match=field.replace(".", r"\.")):
         load(tmp_path, GOOD + extra)
 
 
 def test_unreadable_file(tmp_path):
-    with pytest.raises(ConfigError, match="cannot be read"):
+    with pytest.raises(InputError, match="cannot be read"):
         load_robot_config(tmp_path / "none.toml")
 
 
@@ -140,7 +146,7 @@ def test_a_path_is_named_in_the_task_with_or_without_its_kind(tmp_path, kind):
     ],
 )
 def test_a_mistake_in_a_path_task_gets_one_line(tmp_path, task, words):
-    with pytest.raises(ConfigError, match=words) as caught:
+    with pytest.raises(InputError, match=words) as caught:
         load(tmp_path, GOOD + "[task]\n" + task)
     assert "\n" not in str(caught.value)
 
@@ -157,5 +163,5 @@ def test_way_points_by_time_are_asked_for_by_their_kind(tmp_path):
 def test_every_form_of_uncertainty_can_be_asked_for(tmp_path):
     for name in ("ut", "mc", "joint", "point"):
         assert load(tmp_path, GOOD + f'[control]\nuncertainty = "{name}"\n').control.uncertainty == name
-    with pytest.raises(ConfigError, match=r"control\.uncertainty: .*'both'"):
+    with pytest.raises(InputError, match=r"control\.uncertainty: .*'both'"):
         load(tmp_path, GOOD + '[control]\nuncertainty = "both"\n')

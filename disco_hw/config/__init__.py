@@ -1,0 +1,43 @@
+"""robot.toml and the one reader of every file that a user names."""
+
+from disco_hw.config.robot import (
+    FARTHEST_M,
+    CircleTask,
+    Control,
+    Daemon,
+    Drive,
+    Estimation,
+    Link,
+    Log,
+    ModelFile,
+    PathTask,
+    Point,
+    Prior,
+    Robot,
+    RobotConfig,
+    RobotTask,
+    TimedPathTask,
+    circle_task,
+    load_robot_config,
+)
+
+__all__ = [
+    "FARTHEST_M",
+    "CircleTask",
+    "Control",
+    "Daemon",
+    "Drive",
+    "Estimation",
+    "Link",
+    "Log",
+    "ModelFile",
+    "PathTask",
+    "Point",
+    "Prior",
+    "Robot",
+    "RobotConfig",
+    "RobotTask",
+    "TimedPathTask",
+    "circle_task",
+    "load_robot_config",
+]

@@ -1,0 +1,188 @@
+"""The one reader of files that a user names: what kind of file, how large, how deep, all bounded before it is parsed.
+
+A path may name anything: a pipe that nobody writes to, a device without an end, a directory, a file of many gigabytes.
+Each is refused in one line, at once, before a byte of it is taken in.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import re
+import stat
+import tomllib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from disco_hw.errors import InputError
+
+LONGEST_LINE = 65_536
+DEEPEST_NESTING = 16
+LONGEST_WORD = 64
+LONGEST_STRING = 4096
+MOST_KEY_PARTS = 8
+
+_KIB, _MIB = 1024, 1024 * 1024
+_FLAGS = os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOCTTY
+_NOT_REGULAR = (
+    (stat.S_ISDIR, "a directory"),
+    (stat.S_ISFIFO, "a pipe"),
+    (stat.S_ISSOCK, "a socket"),
+    (stat.S_ISCHR, "a device"),
+    (stat.S_ISBLK, "a device"),
+)
+# Strings and comments whole, so that what is in them is not counted; one without its end goes on to the end.
+_TOML_TOKEN = re.compile(
+    r'''(?P<string>"""(?:[^\\"]|\\.|"(?!""))*+(?:"{3,5}|\\?\Z)|"(?:[^"\\\n]|\\.)*+"?'''
+    r"""|'''(?:[^']|'(?!''))*+(?:'{3,5}|\Z)|'[^'\n]*+'?)"""
+    r"|(?P<comment>#[^\n]*+)|(?P<open>[\[{])|(?P<close>[\]}])|(?P<word>[\w+:-]++)|(?P<dot>\.)|(?P<end>[=,\n])",
+    re.DOTALL | re.ASCII,
+)
+
+
+@dataclass(frozen=True, slots=True)
+class FileKind:
+    """What a file should be, in words, the most bytes that it may have, and what to do where there is none."""
+
+    what: str
+    most_bytes: int
+    remedy: str
+
+
+ROBOT_TOML = FileKind("a robot.toml", 256 * _KIB, "give the path of a robot.toml")
+MODEL_TOML = FileKind("a model file", _MIB, "give the path of a model file")
+FAULTS_TOML = FileKind("a fault schedule", _MIB, "give the path of a fault schedule in TOML")
+WAY_POINTS = FileKind("a CSV of way-points", 4 * _MIB, "give the path of a CSV of way-points")
+KEY = FileKind("a key", _KIB, "make one with `(umask 077; openssl rand -hex 16 > FILE)`")
+DRIVE_CSV = FileKind("a CSV file", 128 * _MIB, "give the path of a CSV file")
+CANDUMP = FileKind("a candump", 512 * _MIB, "give the path of a candump")
+LOG = FileKind("a log", 16 * _KIB * _MIB, "give the path of a log")
+
+
+def open_file(path: Path, kind: FileKind) -> int:
+    """A descriptor of a plain file that is not too large; raises InputError for anything else."""
+    try:
+        # A pipe without a writer would hold up a plain open for ever.
+        descriptor = os.open(path, _FLAGS)
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read ({_why(error)}); {kind.remedy}") from None
+    try:
+        _refuse_unfit(path, kind, os.fstat(descriptor))
+    except BaseException:
+        os.close(descriptor)
+        raise
+    return descriptor
+
+
+def read_bytes(path: Path, kind: FileKind) -> tuple[bytes, os.stat_result]:
+    """What is in a file, with the status of the very file that was read; raises InputError."""
+    with os.fdopen(open_file(path, kind), "rb") as file:
+        status = os.fstat(file.fileno())
+        try:
+            # A file may grow, and those of /proc have no size to begin with.
+            content = file.read(kind.most_bytes + 1)
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read ({_why(error)}); {kind.remedy}") from None
+    if len(content) > kind.most_bytes:
+        raise _too_large(path, kind)
+    return content, status
+
+
+def begin_of(path: Path, kind: FileKind, count: int) -> bytes:
+    """The first bytes of a file, fewer where it has fewer; raises InputError."""
+    with os.fdopen(open_file(path, kind), "rb") as file:
+        try:
+            return file.read(count)
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read ({_why(error)}); {kind.remedy}") from None
+
+
+def read_lines(path: Path, kind: FileKind) -> Iterator[str]:
+    """The lines of a text file, each with its end, one at a time; raises InputError, also for a line without an end."""
+    # Spreadsheets write a mark before the first column's name.
+    with io.TextIOWrapper(os.fdopen(open_file(path, kind), "rb"), encoding="utf-8-sig", newline="") as file:
+        taken = number = 0
+        while True:
+            try:
+                line = file.readline(LONGEST_LINE + 1)
+            except OSError as error:
+                raise InputError(f"{path}: cannot be read ({_why(error)}); {kind.remedy}") from None
+            except UnicodeDecodeError as error:
+                raise InputError(f"{path}: not {kind.what} (not UTF-8: {error.reason}); {kind.remedy}") from None
+            if not line:
+                return
+            number, taken = number + 1, taken + len(line)
+            if len(line) > LONGEST_LINE:
+                raise InputError(f"{path}: line {number}: over {LONGEST_LINE} characters long; {kind.remedy}")
+            if taken > kind.most_bytes:
+                raise _too_large(path, kind)
+            yield line
+
+
+def read_toml(path: Path, kind: FileKind) -> dict[str, Any]:
+    """A TOML file's table; raises InputError."""
+    return parse_toml(read_bytes(path, kind)[0], str(path))
+
+
+def parse_toml(content: bytes, name: str) -> dict[str, Any]:
+    """The table of a TOML file's content, `name` in messages.
+
+    Raises InputError, also for what a parser needs for ever or a deep stack for: brackets nested more than 16 deep,
+    words, numbers among them, over 64 characters, strings over 4096, keys of more than 8 parts.
+    """
+    try:
+        text = content.decode("utf-8").replace("\r\n", "\n")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{name}: not valid TOML (not UTF-8: {error.reason}); save it as UTF-8") from None
+    _refuse_hostile(text, name)
+    try:
+        return tomllib.loads(text)
+    except (ValueError, RecursionError) as error:
+        # Not all that tomllib raises is its own error.
+        raise InputError(f"{name}: not valid TOML ({' '.join(str(error).split())}); mend that line") from None
+
+
+def _refuse_hostile(text: str, name: str) -> None:
+    depth = dots = 0
+
+    def refuse(fault: str, at: int) -> InputError:
+        line = text.count("\n", 0, at) + 1
+        return InputError(f"{name}: not valid TOML (line {line}: {fault}); mend that line")
+
+    for token in _TOML_TOKEN.finditer(text):
+        match token.lastgroup:
+            case "open":
+                depth, dots = depth + 1, 0
+                if depth > DEEPEST_NESTING:
+                    raise refuse(f"brackets nested more than {DEEPEST_NESTING} deep", token.start())
+            case "close":
+                depth, dots = max(0, depth - 1), 0
+            case "end":
+                dots = 0
+            case "dot":
+                dots += 1
+                if dots >= MOST_KEY_PARTS:
+                    raise refuse(f"a key of more than {MOST_KEY_PARTS} parts", token.start())
+            case "word" if token.end() - token.start() > LONGEST_WORD:
+                raise refuse(f"a number or key of more than {LONGEST_WORD} characters", token.start())
+            case "string" if token.end() - token.start() > LONGEST_STRING:
+                raise refuse(f"a string of more than {LONGEST_STRING} characters", token.start())
+
+
+def _refuse_unfit(path: Path, kind: FileKind, status: os.stat_result) -> None:
+    if not stat.S_ISREG(status.st_mode):
+        found = next((words for is_one, words in _NOT_REGULAR if is_one(status.st_mode)), "something else")
+        raise InputError(f"{path}: cannot be read ({found}, not a plain file); {kind.remedy}")
+    if status.st_size > kind.most_bytes:
+        raise _too_large(path, kind)
+
+
+def _too_large(path: Path, kind: FileKind) -> InputError:
+    most = f"{kind.most_bytes // _MIB} MiB" if kind.most_bytes >= _MIB else f"{kind.most_bytes // _KIB} KiB"
+    return InputError(f"{path}: too large to be {kind.what} (over {most}); {kind.remedy}")
+
+
+def _why(error: OSError | ValueError) -> str:
+    return (error.strerror if isinstance(error, OSError) else None) or str(error)
