@@ -1,7 +1,6 @@
 import pytest
 
 from disco_hw.errors import InputError
-from disco_hw.log.errors import LogError
 from disco_hw.log.recorder import ProcessRecorder
 from disco_hw.log.recorder import Recording as Written
 from disco_hw.viewer.recording import Recording
@@ -50,7 +49,7 @@ def test_a_log_without_estimates_is_told(tmp_path):
 
 
 def test_what_is_no_log_is_told(tmp_path):
-    with pytest.raises(LogError):
+    with pytest.raises(InputError):
         Recording(tmp_path / "missing.mcap")
-    with pytest.raises(LogError):
+    with pytest.raises(InputError):
         Recording(ROBOT_FILE)
