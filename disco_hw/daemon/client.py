@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from disco_hw.config import RobotConfig, load_robot_config
 from disco_hw.daemon.control_client import send_request
-from disco_hw.daemon.control_socket import default_socket_path
+from disco_hw.daemon.socket_place import default_socket_path, passed_over
 from disco_hw.errors import InputError, WorkError
 
 ADAPT_ACTIONS = ("revert", "adapt")
@@ -42,7 +43,10 @@ def ask(robot: Path, action: str, changes: Sequence[str] = ()) -> dict[str, Any]
         raise InputError(f"{said}: ctl {robot} {TASK} radius_m=0.8 speed_m_s=0.3")
     request = {"do": action} | dict(map(_change, changes))
     try:
-        return send_request(socket_path(load_robot_config(robot)), request)
+        path = socket_path(load_robot_config(robot))
+        for line in passed_over(path):
+            print(f"disco-hw: {line}", file=sys.stderr)
+        return send_request(path, request)
     except (InputError, WorkError) as error:
         if action != "estop":
             raise

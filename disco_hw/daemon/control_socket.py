@@ -9,10 +9,7 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import os
-import re
 import socket
-import stat
-import struct
 from collections import deque
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
@@ -21,7 +18,9 @@ from typing import Any
 
 import msgspec
 
+from disco_hw.daemon.socket_place import REMEDY, peer_uid
 from disco_hw.errors import InputError
+from drivers.ownership import why_not_private
 
 _MAX_CLIENTS = 8
 _ACCEPTS_PER_POLL = 4
@@ -31,7 +30,6 @@ _REQUESTS_PER_POLL = 4
 _MAX_WAITING = 16
 _MAX_UNREAD_BYTES = 65536
 _ESTOP = "estop"
-_REMEDY = "set daemon.control_socket to a path in a directory of your own"
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,18 +60,6 @@ class _Client:
     waiting: deque[ControlMessage] = field(default_factory=deque)
     outgoing: bytearray = field(default_factory=bytearray)
     finished: bool = False
-
-
-def default_socket_path(name: str) -> Path:
-    """Return where the socket of the robot called `name` is, in a directory that only this user can enter.
-
-    $XDG_RUNTIME_DIR/disco-hw/NAME.sock, or /tmp/disco-hw-UID/NAME.sock where that variable is not set.
-    """
-    file_name = re.sub(r"[^A-Za-z0-9_-]", "_", name) + ".sock"
-    runtime = os.environ.get("XDG_RUNTIME_DIR")
-    if runtime and Path(runtime).is_dir():
-        return Path(runtime) / "disco-hw" / file_name
-    return Path(f"/tmp/disco-hw-{os.geteuid()}") / file_name
 
 
 class ControlServer:
@@ -143,7 +129,7 @@ class ControlServer:
                 connection, _ = self._listener.accept()
             except OSError:
                 return
-            if _peer_uid(connection) not in self._allowed_uids:
+            if peer_uid(connection) not in self._allowed_uids:
                 self.stats.foreign_users += 1
                 connection.close()
                 continue
@@ -226,13 +212,11 @@ def _make_private_directory(directory: Path) -> None:
     try:
         with contextlib.suppress(FileExistsError):
             directory.mkdir(mode=0o700, parents=True)
-        status = directory.lstat()
+        why = why_not_private(directory, {os.geteuid(), 0})
     except OSError as error:
-        raise InputError(f"{directory}: cannot hold the control socket ({error.strerror}); {_REMEDY}") from None
-    if not stat.S_ISDIR(status.st_mode):
-        raise InputError(f"{directory}: a link or not a directory; {_REMEDY}")
-    if status.st_uid not in {os.geteuid(), 0} or status.st_mode & 0o022:
-        raise InputError(f"{directory}: others can write to it; {_REMEDY}")
+        raise InputError(f"{directory}: cannot hold the control socket ({error.strerror}); {REMEDY}") from None
+    if why is not None:
+        raise InputError(f"{directory}: {why}; {REMEDY}")
 
 
 def _lock(path: Path) -> int:
@@ -241,7 +225,7 @@ def _lock(path: Path) -> int:
     try:
         descriptor = os.open(lock_path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
     except OSError as error:
-        raise InputError(f"{lock_path}: cannot be opened ({error.strerror}); {_REMEDY}") from None
+        raise InputError(f"{lock_path}: cannot be opened ({error.strerror}); {REMEDY}") from None
     try:
         # A record lock, as a child made by fork() does not hold it on when the daemon dies.
         fcntl.lockf(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -259,7 +243,7 @@ def _listen(path: Path) -> socket.socket:
     if path.is_socket():
         path.unlink()
     elif os.path.lexists(path):
-        raise InputError(f"{path}: not a socket; remove it, or {_REMEDY}")
+        raise InputError(f"{path}: not a socket; remove it, or {REMEDY}")
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
         # On Linux the mode of the unbound socket becomes that of the file, so it is never open to others.
@@ -269,10 +253,5 @@ def _listen(path: Path) -> socket.socket:
         listener.setblocking(False)
     except OSError as error:
         listener.close()
-        raise InputError(f"{path}: cannot be made ({error.strerror or error}); {_REMEDY}") from None
+        raise InputError(f"{path}: cannot be made ({error.strerror or error}); {REMEDY}") from None
     return listener
-
-
-def _peer_uid(connection: socket.socket) -> int:
-    credentials = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i"))
-    return int(struct.unpack("3i", credentials)[1])

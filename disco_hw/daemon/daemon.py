@@ -21,6 +21,7 @@ from disco_hw.daemon.link import make_link
 from disco_hw.daemon.loop import Loop
 from disco_hw.daemon.page_feed import ViewerFeed, WatchedRecorder, feed_path
 from disco_hw.daemon.signals import StopSignals
+from disco_hw.daemon.socket_place import passed_over
 from disco_hw.daemon.status import counters, loop_figures, status
 from disco_hw.daemon.systemd import Notifier
 from disco_hw.daemon.teller import STANDARD_OUTPUT, Teller
@@ -126,6 +127,8 @@ def _start(
     pipeline = make_pipeline(config, setup.model, planner)
     # The planner was compiled before: whoever finds the socket gets an answer.
     server = ControlServer(socket_path(config), SERVED)
+    for line in passed_over(server.path):
+        say("control socket", line)
     stop.add("control socket", server.close)
     feed = ViewerFeed(feed_path(server.path))
     stop.add("page feed", feed.close)

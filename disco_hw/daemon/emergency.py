@@ -19,7 +19,7 @@ import serial
 from disco_hw.config import Link
 from disco_hw.config.input_file import ROBOT_TOML, read_toml
 from disco_hw.daemon.control_client import send_request
-from disco_hw.daemon.control_socket import default_socket_path
+from disco_hw.daemon.socket_place import believed_users, default_socket_path, passed_over
 from disco_hw.errors import InputError
 from drivers.transport import SerialMedium, open_transport
 from drivers.transport.serial import open_port
@@ -41,6 +41,7 @@ class EstopOutcome:
     link_error: str | None
     daemon_error: str | None
     confirmed: bool
+    passed_over: tuple[str, ...] = ()
 
     @property
     def sent(self) -> bool:
@@ -55,12 +56,14 @@ class EstopOutcome:
             "link": self.link,
             "link_error": self.link_error,
             "daemon_error": self.daemon_error,
+            "passed_over": list(self.passed_over),
         }
 
     def as_text(self) -> str:
         """The outcome for a person."""
         lines = [
             f"{self.link}: {self.link_error or 'e-stop sent'}",
+            *(f"daemon: {line}" for line in self.passed_over),
             f"daemon: {self.daemon_error or 'e-stop accepted'}",
         ]
         if self.confirmed:
@@ -79,13 +82,15 @@ def stop_robot(robot: Path, link: str | None = None) -> EstopOutcome:
     daemon takes the stop either.
     """
     raw = _read(robot)
+    socket_path = _socket_path(raw)
+    refused = passed_over(socket_path) if socket_path is not None else ()
     try:
         settings = _link_settings(robot, raw, link)
     except InputError as error:
-        confirmed, daemon_error = _ask_daemon(_socket_path(raw))
+        confirmed, daemon_error = _ask_daemon(socket_path)
         if daemon_error is not None:
             raise
-        return EstopOutcome("link", str(error), None, confirmed)
+        return EstopOutcome("link", str(error), None, confirmed, refused)
     frame_id, data = Codec().encode("ESTOP", reason=1)
     frame = Frame(frame_id, data)
     way = _stop_over_serial if settings.kind == "serial" else _stop_over_can
@@ -95,8 +100,8 @@ def stop_robot(robot: Path, link: str | None = None) -> EstopOutcome:
         confirmed = way(settings, frame)
     except Exception as error:  # whatever the medium raises, the daemon is asked as well
         link_error = str(error) or type(error).__name__
-    daemon_confirmed, daemon_error = _ask_daemon(_socket_path(raw))
-    return EstopOutcome(address, link_error, daemon_error, confirmed or daemon_confirmed)
+    daemon_confirmed, daemon_error = _ask_daemon(socket_path)
+    return EstopOutcome(address, link_error, daemon_error, confirmed or daemon_confirmed, refused)
 
 
 def _read(robot: Path) -> dict[str, Any]:
@@ -120,7 +125,7 @@ def _link_settings(robot: Path, raw: dict[str, Any], kind: str | None) -> Link:
 
 
 def _socket_path(raw: dict[str, Any]) -> Path | None:
-    with contextlib.suppress(AttributeError, KeyError, TypeError):
+    with contextlib.suppress(AttributeError, KeyError, TypeError, OSError):
         configured = raw.get("daemon", {}).get("control_socket")
         return Path(configured) if configured else default_socket_path(raw["robot"]["name"])
     return None
@@ -140,11 +145,13 @@ def _stop_over_can(settings: Link, frame: Frame) -> bool:
             if time.monotonic_ns() > deadline_ns:
                 raise ConnectionError(transport.last_error or "the link did not come up")
             time.sleep(0.002)
+        asked_ns = time.monotonic_ns()
         for _ in range(_REPEATS):
             now_ns = time.monotonic_ns()
             if not transport.send(OutgoingFrame(frame, now_ns + _FRAME_LIFE_NS), now_ns):
                 raise ConnectionError(transport.last_error or "the frame could not be queued")
-        return _confirmed(lambda: [(r.frame.can_id, r.frame.data) for r in transport.receive()])
+        # What was under way before says nothing about this request.
+        return _confirmed(lambda: [(r.frame.can_id, r.frame.data) for r in transport.receive() if r.t_ns >= asked_ns])
     finally:
         transport.close()
 
@@ -153,7 +160,7 @@ def _stop_over_serial(settings: Link, frame: Frame) -> bool:
     # Not exclusive: the daemon may hold the port, and must not be able to keep the stop from the robot.
     medium = SerialMedium(settings.port, settings.baud, settings.dtr, settings.rts)
     with open_port(medium, timeout_s=0.01, write_timeout_s=0.5, exclusive=False) as port:
-        # The delimiter ends whatever frame another sender may be in the middle of.
+        # Opening threw away what came in before. The delimiter ends what another sender may be in the middle of.
         port.write(b"\0" + _REPEATS * encode_frame(frame.can_id, frame.data))
         port.flush()
         decoder = FrameDecoder()
@@ -185,10 +192,20 @@ def _says_estop(codec: Codec, can_id: int, data: bytes) -> bool:
     return codec.choice_name("SYSTEM_STATE", "state", decoded.values["state"]) == "ESTOP"
 
 
+def _is_served(socket_path: Path) -> bool:
+    """Whether there is a socket. Raises WorkError where a stranger could have put it there."""
+    try:
+        believed_users(socket_path)
+    except FileNotFoundError:
+        return False
+    return socket_path.exists()
+
+
 def _ask_daemon(socket_path: Path | None) -> tuple[bool, str | None]:
     try:
-        if socket_path is None or not socket_path.exists():
+        if socket_path is None or not _is_served(socket_path):
             return False, "not running"
+        asked_ns = time.monotonic_ns()
         reply = send_request(socket_path, {"do": "estop"}, timeout_s=0.5)
         if not reply.get("ok"):
             return False, str(reply.get("error"))
@@ -196,7 +213,8 @@ def _ask_daemon(socket_path: Path | None) -> tuple[bool, str | None]:
         deadline_ns = time.monotonic_ns() + round(_CONFIRM_S * 1e9)
         while time.monotonic_ns() < deadline_ns:
             status = send_request(socket_path, {"do": "status"}, timeout_s=0.5)
-            if status.get("robot_state") == "ESTOP":
+            # What the robot said before the request is no answer to it.
+            if status.get("robot_state") == "ESTOP" and status["robot_state_ns"] >= asked_ns:
                 return True, None
             link = status.get("link")
             time.sleep(0.02)

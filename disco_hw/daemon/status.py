@@ -27,6 +27,8 @@ def loop_figures(loop: LoopStats) -> dict[str, Any]:
 def status(core: DaemonCore, loop: dict[str, Any], recorder: RecorderStats) -> dict[str, Any]:
     """Everything that a person or a page wants to know now; what does not exist is None.
 
+    `robot_state_ns`: when the newest frame with the robot's state arrived, on the monotonic clock of this host.
+
     `loop` is from `loop_figures`.
     """
     tick = core.last
@@ -46,6 +48,7 @@ def status(core: DaemonCore, loop: dict[str, Any], recorder: RecorderStats) -> d
         "link_error": core.transport.last_error,
         "driver_state": core.driver.state.name,
         "robot_state": "UNKNOWN" if robot is None else robot.state,
+        "robot_state_ns": None if robot is None else robot.t_ns,
         "fault": "UNKNOWN" if robot is None else robot.fault,
         "stop_cause": "UNKNOWN" if robot is None else robot.stop_cause,
         "pose": [estimate.x_m, estimate.y_m, estimate.yaw_rad],

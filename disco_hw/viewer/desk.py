@@ -20,6 +20,7 @@ from websockets.exceptions import ConnectionClosed
 
 from disco_hw.daemon.control_client import send_request
 from disco_hw.daemon.emergency import stop_robot
+from disco_hw.daemon.socket_place import connect
 from disco_hw.errors import InputError, WorkError
 from disco_hw.viewer.advice import advice, next_step
 
@@ -196,13 +197,13 @@ class _DriveLine:
         """Pass on what the pad says; the answer goes to the browser when it comes."""
         try:
             if self._writer is None:
-                async with asyncio.timeout(_DRIVE_TIMEOUT_S):
-                    reader, self._writer = await asyncio.open_unix_connection(str(self._socket))
+                connection = await asyncio.to_thread(connect, self._socket, _DRIVE_TIMEOUT_S)
+                reader, self._writer = await asyncio.open_unix_connection(sock=connection)
                 self._reading = asyncio.create_task(self._read(reader))
             self._writer.write(json.dumps(dict(request)).encode() + b"\n")
             async with asyncio.timeout(_DRIVE_TIMEOUT_S):
                 await self._writer.drain()
-        except (OSError, TimeoutError):
+        except (OSError, TimeoutError, WorkError):
             await self.close()
             await self._send({"kind": "drive", "ok": False, "error": "no daemon hears the pad"})
 

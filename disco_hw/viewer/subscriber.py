@@ -1,12 +1,18 @@
-"""The page's end of the daemon's feed; it connects, and connects again, whenever there is a daemon."""
+"""The page's end of the daemon's feed; it connects, and connects again, whenever there is a daemon.
+
+It connects only where no stranger can listen: in a directory as `socket_place.believed_users` asks for.
+"""
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 
 import msgspec
 import zmq
 
+from disco_hw.daemon.socket_place import believed_users
+from disco_hw.errors import WorkError
 from disco_hw.log.link import BatchDecoder
 from disco_hw.log.records import Record
 
@@ -28,11 +34,13 @@ class FeedSubscriber:
         self._socket.setsockopt(zmq.RECONNECT_IVL, 100)
         self._socket.setsockopt(zmq.RECONNECT_IVL_MAX, 1000)
         self._socket.setsockopt(zmq.SUBSCRIBE, b"")
-        self._socket.connect(f"ipc://{path}")
+        self._path = path
+        self._connected = False
 
     def receive(self, timeout_s: float) -> list[tuple[int, Record]]:
         """Wait at most `timeout_s` for a batch; then everything that is there as (tick's time, record)."""
         received: list[tuple[int, Record]] = []
+        self._connect()
         if not self._socket.poll(round(timeout_s * 1e3)):
             return received
         while True:
@@ -48,6 +56,15 @@ class FeedSubscriber:
                 continue
             self._count(batch.sequence)
             received += [(batch.now_ns, record) for record in records]
+
+    def _connect(self) -> None:
+        if self._connected:
+            return
+        # Without a daemon there may be no directory yet; the page says what is wrong with another's.
+        with contextlib.suppress(OSError, WorkError):
+            believed_users(self._path)
+            self._socket.connect(f"ipc://{self._path}")
+            self._connected = True
 
     def close(self) -> None:
         """Disconnect; safe to call twice."""

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from disco_hw.daemon.control_socket import ControlServer, default_socket_path
+from disco_hw.daemon.control_socket import ControlServer
 from disco_hw.errors import InputError
 
 ACTIONS = ("arm", "start", "stop", "disarm", "estop", "reset", "status", "set_task")
@@ -395,15 +395,6 @@ def test_a_file_that_is_no_socket_is_not_removed(tmp_path):
 def test_a_path_that_is_too_long_is_said(tmp_path):
     with pytest.raises(InputError, match=r"too long.*; set daemon\.control_socket"):
         ControlServer(tmp_path / ("x" * 120), ACTIONS)
-
-
-def test_default_path_is_in_the_runtime_directory_or_in_tmp(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    assert default_socket_path("wom bot/../1") == tmp_path / "disco-hw" / "wom_bot____1.sock"
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "missing"))
-    assert str(default_socket_path("wombot")) == f"/tmp/disco-hw-{os.geteuid()}/wombot.sock"
-    monkeypatch.delenv("XDG_RUNTIME_DIR")
-    assert str(default_socket_path("wombot")) == f"/tmp/disco-hw-{os.geteuid()}/wombot.sock"
 
 
 def test_a_poll_with_eight_flooding_clients_stays_bounded(server):

@@ -2,19 +2,51 @@
 
 from __future__ import annotations
 
+import os
+import pty
 import threading
 import time
+import tty
 from pathlib import Path
 
 import pytest
 
 import disco_hw
+from disco_hw.daemon import emergency
 from disco_hw.daemon.client import SERVED
 from disco_hw.daemon.control_socket import ControlServer
 from disco_hw.daemon.emergency import stop_robot
 from disco_hw.errors import InputError
+from drivers.types import Frame, LinkState, ReceivedFrame
+from firmware_protocol.codec import Codec
+from firmware_protocol.serial_framing import encode_frame
 
 SHIPPED = (Path(disco_hw.__file__).parent / "robots" / "wombot.toml").read_text(encoding="utf-8")
+
+
+STATE = {
+    "state": "ESTOP", "fault": "NONE", "session": 0, "estop_source": "FRAME", "last_command_counter": 0,
+    "rejected_count": 0, "reject_reason": "NONE", "stop_cause": "NONE",
+}  # fmt: skip
+
+
+class Bus:
+    """A link that is up, takes every frame and holds these."""
+
+    state, last_error = LinkState.UP, None
+
+    def __init__(self, frames):
+        self.frames = frames
+
+    def send(self, outgoing, now_ns):
+        return True
+
+    def receive(self):
+        frames, self.frames = self.frames, []
+        return frames
+
+    def close(self):
+        pass
 
 
 def robot_file(directory, socket, link='interface = "virtual"', **others):
@@ -56,13 +88,13 @@ def daemon(tmp_path):
 
 def test_a_socket_that_cannot_be_looked_at_does_not_hide_what_became_of_the_link(tmp_path):
     # As where a daemon runs as another user, in a directory that only that one may enter.
-    outcome = stop_robot(robot_file(tmp_path, f"/tmp/{'x' * 300}"))
+    outcome = stop_robot(robot_file(tmp_path, tmp_path / ("x" * 300)))
     assert outcome.link_error is None
     assert "too long" in outcome.daemon_error
 
 
 def test_a_link_section_that_says_nothing_leaves_the_daemon(tmp_path, daemon):
-    daemon.status = {**daemon.status, "robot_state": "ESTOP"}
+    daemon.status = {**daemon.status, "robot_state": "ESTOP", "robot_state_ns": time.monotonic_ns() + 10**10}
     outcome = stop_robot(robot_file(tmp_path, daemon.socket, link="interface = 7"))
     assert daemon.asked[0] == "estop"
     assert outcome.sent
@@ -87,3 +119,37 @@ def test_a_daemon_that_holds_the_stop_until_its_link_is_up_has_not_sent_it(tmp_p
     assert not outcome.sent
     assert "NOT SENT" in outcome.as_text()
     assert "connecting" in outcome.as_text()
+
+
+def test_a_robot_state_from_before_the_request_confirms_nothing(tmp_path, daemon):
+    daemon.status = {**daemon.status, "robot_state": "ESTOP", "robot_state_ns": time.monotonic_ns()}
+    outcome = stop_robot(robot_file(tmp_path, daemon.socket, link="interface = 7"))
+    assert outcome.sent
+    assert not outcome.confirmed
+    assert "the robot has not confirmed" in outcome.as_text()
+
+
+def test_a_state_on_the_bus_from_before_the_request_confirms_nothing(tmp_path, monkeypatch):
+    # The robot said ESTOP before and is silent since: the frame lies in the socket when the request goes out.
+    frame_id, data = Codec().encode("SYSTEM_STATE", **STATE)
+    before, after = [ReceivedFrame(1, Frame(frame_id, data))], [ReceivedFrame(1 << 62, Frame(frame_id, data))]
+    for bus, confirmed in ((Bus(before), False), (Bus(after), True)):
+        monkeypatch.setattr(emergency, "open_transport", lambda bus=bus, **_: bus)
+        assert stop_robot(robot_file(tmp_path, tmp_path / "none")).confirmed is confirmed
+
+
+def test_a_state_on_the_serial_line_from_before_the_request_confirms_nothing(tmp_path):
+    frame_id, data = Codec().encode("SYSTEM_STATE", **STATE)
+    robot_end, host_end = pty.openpty()
+    try:
+        tty.setraw(host_end)
+        os.write(robot_end, encode_frame(frame_id, data))
+        robot = robot_file(tmp_path, tmp_path / "none", **{"/tmp/disco-hw-wombot.tty": os.ttyname(host_end)})
+        assert not stop_robot(robot, "serial").confirmed
+        answering = threading.Timer(0.2, os.write, (robot_end, encode_frame(frame_id, data)))
+        answering.start()
+        assert stop_robot(robot, "serial").confirmed
+        answering.join()
+    finally:
+        os.close(robot_end)
+        os.close(host_end)

@@ -91,3 +91,13 @@ def test_without_a_daemon_it_waits_no_longer_than_it_is_told(tmp_path):
     assert subscriber.receive(0.01) == []
     subscriber.close()
     subscriber.close()
+
+
+def test_it_does_not_listen_to_a_feed_that_a_stranger_could_have_put_there(ends, tmp_path):
+    daemon, subscriber = ends
+    tmp_path.chmod(0o777)
+    for number in range(1, 20):
+        daemon.send(number)
+        assert subscriber.receive(0.02) == []
+    tmp_path.chmod(0o700)
+    connected(daemon, subscriber, 20)
