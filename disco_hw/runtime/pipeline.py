@@ -26,16 +26,16 @@ class Planner(Protocol):
     """Whatever turns a state into a plan; DISCO is one."""
 
     def plan(self, now_ns: int, state: PlannerState) -> WheelPlan:
-        """WheelPlan from the state; raises NoValidControl when there is nothing to execute."""
+        """Plan from the state; raises NoValidControl when there is nothing to execute."""
 
     def reset(self) -> None:
         """Forget the last plan, as at a new start."""
 
     def set_task(self, task: Task) -> None:
-        """WheelPlan for another task of the same kind from the next reset on."""
+        """Plan for another task of the same kind from the next reset on."""
 
     def set_belief(self, belief: Belief) -> None:
-        """WheelPlan under this belief from the next plan on; raises ValueError, and keeps the old one, if it cannot."""
+        """Plan under this belief from the next plan on; raises ValueError, and keeps the old one, if it cannot."""
 
     def sampled_rollouts(self, count: int) -> Rollouts:
         """The weightiest sequences of the last plan; changes nothing."""
@@ -150,7 +150,7 @@ class Pipeline:
         self._plan, self._following = None, False
 
     def set_belief(self, belief: Belief, odometry: OdometryParameters) -> None:
-        """WheelPlan and estimate with another geometry from the next step on; plan and estimate in force stay.
+        """Plan and estimate with another geometry from the next step on; plan and estimate in force stay.
 
         Raises ValueError, with everything as it was, if the planner cannot take the belief.
         """

@@ -12,12 +12,12 @@ from pathlib import Path
 
 import pytest
 
+from disco_hw.experiments.fault_run import FaultRun
 from drivers.transport.factory import open_transport
 from drivers.types import LinkState
 from sim.fault_schedule import FaultSchedule
 from sim.hub import Hub
 from sim.serial_line import SerialLine
-from tests.hil.simulated_run import SimulatedRun
 
 pytestmark = pytest.mark.long
 
@@ -34,7 +34,7 @@ def blocks():
 
 @pytest.mark.timeout(300.0 + 3600.0 * HOURS)
 def test_memory_is_flat_while_the_robot_drives():
-    run = SimulatedRun(FaultSchedule(0, ()), cycle_us=5000)
+    run = FaultRun(FaultSchedule(0, ()), cycle_us=5000)
     run.run(8.0)
     run.run(HOURS * 1800.0)
     half = blocks()
@@ -45,7 +45,7 @@ def test_memory_is_flat_while_the_robot_drives():
 
 @pytest.mark.skipif("DISCO_HW_LEAK_HOURS" in os.environ, reason="the long run is asked for alone")
 def test_a_leak_of_one_object_a_tick_would_be_seen(monkeypatch):
-    run = SimulatedRun(FaultSchedule(0, ()), cycle_us=5000)
+    run = FaultRun(FaultSchedule(0, ()), cycle_us=5000)
     kept, put = [], run.log.put
     monkeypatch.setattr(run.log, "put", lambda now_ns, recorded: (kept.append(float(now_ns)), put(now_ns, recorded)))
     run.run(2.0)

@@ -7,7 +7,11 @@ rules for motion. `see` is called once per cycle of the controller.
 from __future__ import annotations
 
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Protocol
+
+from drivers.types import Frame
 
 WHEEL_COMMAND = 0x100
 MAJOR = 1
@@ -17,8 +21,40 @@ TINY = 1e-4
 ENOUGH_VIOLATIONS = 20
 
 
+Pair = tuple[float, float]
+"""Left and right, rad/s."""
+
+
+class Outputs(Protocol):
+    """What the controller under watch puts out after a cycle."""
+
+    @property
+    def state(self) -> str:
+        """Name of its state."""
+
+    @property
+    def session(self) -> int:
+        """Of the host that armed it; 0 without one."""
+
+    @property
+    def accepted_commands(self) -> int:
+        """How many commands it has accepted since it started."""
+
+    @property
+    def driver_enabled(self) -> bool:
+        """Whether the motor driver is on."""
+
+    @property
+    def left_setpoint_rad_s(self) -> float:
+        """Of the left wheels."""
+
+    @property
+    def right_setpoint_rad_s(self) -> float:
+        """Of the right wheels."""
+
+
 @dataclass(frozen=True)
-class Limits:
+class MonitoredLimits:
     """What the robot was built with."""
 
     max_speed_rad_s: float = 8.0
@@ -31,12 +67,12 @@ class Limits:
 
 
 @dataclass(frozen=True)
-class Command:
+class SeenCommand:
     """A WHEEL_COMMAND as this monitor reads it."""
 
     counter: int
     mode: int
-    speeds: tuple[float, float]
+    speeds: Pair
     session: int
 
 
@@ -44,14 +80,14 @@ class Command:
 class WheelMonitor:
     """Collects violations as sentences; an empty list is what must come out."""
 
-    limits: Limits = field(default_factory=Limits)
+    limits: MonitoredLimits = field(default_factory=MonitoredLimits)
     violations: list[str] = field(default_factory=list)
     commands_seen: int = 0
     commands_accepted: int = 0
     commands_refused: int = 0
-    _last: object = None
+    _last: Outputs | None = None
     _last_us: int = 0
-    _targets: tuple[tuple[float, float], ...] = ((0.0, 0.0),)
+    _targets: tuple[Pair, ...] = ((0.0, 0.0),)
     _accepted_us: int | None = None
     _armed_us: int = 0
     _zero_since_us: int | None = None
@@ -66,7 +102,7 @@ class WheelMonitor:
         self._last_counter = None
         self._falling_bound = None
 
-    def see(self, now_us, frames, outputs, wheel_speeds) -> None:
+    def see(self, now_us: int, frames: Sequence[Frame], outputs: Outputs, wheel_speeds: Pair) -> None:
         """One cycle: the frames that reached the controller since the last one, its outputs after it, true speeds."""
         before = self._last
         if before is None:
@@ -79,7 +115,7 @@ class WheelMonitor:
         self.commands_seen += len(commands)
         accepted = outputs.accepted_commands - before.accepted_commands
         if accepted:
-            self._mind_accepted(now_us, accepted, good, before, outputs)
+            self._check_accepted(now_us, accepted, good, before, outputs)
         if good:
             self._last_counter = good[-1].counter
         setpoints = (outputs.left_setpoint_rad_s, outputs.right_setpoint_rad_s)
@@ -88,72 +124,78 @@ class WheelMonitor:
             self._ended_sessions[before.session] = now_us
         if before.session != outputs.session and outputs.session:
             self._ended_sessions.pop(outputs.session, None)
-        self._mind_limits(now_us, dt_s, setpoints, earlier, before, outputs)
-        self._mind_time(now_us, dt_s, setpoints, earlier, before, outputs)
-        self._mind_wheels(now_us, setpoints, wheel_speeds)
+        self._check_limits(now_us, dt_s, setpoints, earlier, before, outputs)
+        self._check_time(now_us, dt_s, setpoints, earlier, before, outputs)
+        self._check_wheels(now_us, setpoints, wheel_speeds)
         self._last, self._last_us = outputs, now_us
 
-    def _mind_accepted(self, now_us, accepted, good, before, outputs) -> None:
+    def _check_accepted(
+        self, now_us: int, accepted: int, good: list[SeenCommand], before: Outputs, outputs: Outputs
+    ) -> None:
         self.commands_accepted += accepted
         fitting = [c for c in good if c.session in (before.session, outputs.session)]
         if len(fitting) < accepted:
-            self._tell(now_us, f"{accepted} commands accepted, {len(fitting)} of those that came have a proof")
+            self._report(now_us, f"{accepted} commands accepted, {len(fitting)} of those that came have a proof")
             return
         for command in fitting:
             if command.session in self._ended_sessions:
-                self._tell(now_us, f"a command of the ended session {command.session} was accepted")
+                self._report(now_us, f"a command of the ended session {command.session} was accepted")
             if command.counter == self._last_counter:
-                self._tell(now_us, "a repeated command was accepted")
+                self._report(now_us, "a repeated command was accepted")
         states = (before.state, outputs.state)
         if "ARMED" not in states and any(c.mode == SPEED_MODE and any(c.speeds) for c in fitting[-accepted:]):
-            self._tell(now_us, f"a command to move was accepted in {before.state}")
+            self._report(now_us, f"a command to move was accepted in {before.state}")
         # Of more commands in a cycle than were accepted, any may have been the last that was.
         self._targets = tuple(self._scaled(c) for c in (fitting if len(fitting) > accepted else fitting[-1:]))
         self._accepted_us = now_us
 
-    def _scaled(self, command: Command) -> tuple[float, float]:
+    def _scaled(self, command: SeenCommand) -> Pair:
         """What the command comes to within the limits."""
         if command.mode != SPEED_MODE:
             return (0.0, 0.0)
         scale = min(1.0, self.limits.max_speed_rad_s / max(*map(abs, command.speeds), 1e-9))
         return (command.speeds[0] * scale, command.speeds[1] * scale)
 
-    def _mind_limits(self, now_us, dt_s, setpoints, earlier, before, outputs) -> None:
+    def _check_limits(
+        self, now_us: int, dt_s: float, setpoints: Pair, earlier: Pair, before: Outputs, outputs: Outputs
+    ) -> None:
         limits = self.limits
         turning = any(setpoints)
         for side, name in enumerate(("left", "right")):
             value, last = setpoints[side], earlier[side]
             if not abs(value) <= limits.max_speed_rad_s + TINY:
-                self._tell(now_us, f"{name} setpoint {value} rad/s is beyond {limits.max_speed_rad_s}")
+                self._report(now_us, f"{name} setpoint {value} rad/s is beyond {limits.max_speed_rad_s}")
             if value == last:
                 continue
             if not outputs.driver_enabled and value == 0.0:
                 continue
             if not abs(value - last) <= limits.max_acceleration_rad_s2 * dt_s + TINY:
-                self._tell(now_us, f"{name} setpoint went from {last} to {value} rad/s in {dt_s} s")
+                self._report(now_us, f"{name} setpoint went from {last} to {value} rad/s in {dt_s} s")
             # Towards the last command that had a proof, or towards standstill; never past, never elsewhere.
             targets = [target[side] for target in self._targets]
             armed = "ARMED" in (before.state, outputs.state)
             if not ((armed and _towards(value, last, targets)) or _towards(value, last, [0.0])):
-                self._tell(now_us, f"{name} setpoint {last} -> {value} rad/s in {outputs.state}; asked was {targets}")
+                self._report(now_us, f"{name} setpoint {last} -> {value} rad/s in {outputs.state}; asked was {targets}")
         if turning and outputs.state not in MAY_TURN:
-            self._tell(now_us, f"setpoints {setpoints} in {outputs.state}")
+            self._report(now_us, f"setpoints {setpoints} in {outputs.state}")
         if turning and not outputs.driver_enabled:
-            self._tell(now_us, f"setpoints {setpoints} with the driver off")
+            self._report(now_us, f"setpoints {setpoints} with the driver off")
 
-    def _mind_time(self, now_us, dt_s, setpoints, earlier, before, outputs) -> None:
+    def _check_time(
+        self, now_us: int, dt_s: float, setpoints: Pair, earlier: Pair, before: Outputs, outputs: Outputs
+    ) -> None:
         limits = self.limits
         age_s = float("inf") if self._accepted_us is None else (now_us - self._accepted_us) * 1e-6
         longest_s = limits.command_timeout_s + 2.0 * dt_s
         if outputs.state == "ARMED" != before.state:
             self._armed_us = now_us
             if age_s > longest_s:
-                self._tell(now_us, f"armed {age_s:.3f} s after the last accepted command")
+                self._report(now_us, f"armed {age_s:.3f} s after the last accepted command")
         # The watchdog runs from the instant of arming, then from the last accepted command.
         if outputs.state == "ARMED" and min(age_s, (now_us - self._armed_us) * 1e-6) > longest_s:
-            self._tell(now_us, f"ARMED {age_s:.3f} s after the last accepted command")
+            self._report(now_us, f"ARMED {age_s:.3f} s after the last accepted command")
         if outputs.driver_enabled and age_s > limits.drive_off_s + 2.0 * dt_s:
-            self._tell(now_us, f"the driver is on {age_s:.3f} s after the last accepted command")
+            self._report(now_us, f"the driver is on {age_s:.3f} s after the last accepted command")
         fastest = max(map(abs, setpoints))
         if outputs.state == "ARMED" or fastest == 0.0:
             self._falling_bound = None
@@ -164,10 +206,10 @@ class WheelMonitor:
                 bound += limits.max_acceleration_rad_s2 * dt_s
             bound = max(0.0, bound - limits.max_acceleration_rad_s2 * dt_s)
             if fastest > bound + 0.02 + limits.max_acceleration_rad_s2 * dt_s:
-                self._tell(now_us, f"setpoint {fastest} rad/s in {outputs.state} where {bound:.2f} is due")
+                self._report(now_us, f"setpoint {fastest} rad/s in {outputs.state} where {bound:.2f} is due")
             self._falling_bound = bound
 
-    def _mind_wheels(self, now_us, setpoints, wheel_speeds) -> None:
+    def _check_wheels(self, now_us: int, setpoints: Pair, wheel_speeds: Pair) -> None:
         if any(setpoints):
             self._zero_since_us = None
         elif self._zero_since_us is None:
@@ -175,9 +217,9 @@ class WheelMonitor:
         zero_s = 0.0 if self._zero_since_us is None else (now_us - self._zero_since_us) * 1e-6
         fastest = max(map(abs, wheel_speeds))
         if zero_s > self.limits.settling_s and fastest > self.limits.still_rad_s:
-            self._tell(now_us, f"the wheels turn at {fastest:.3f} rad/s {zero_s:.2f} s after zero was asked for")
+            self._report(now_us, f"the wheels turn at {fastest:.3f} rad/s {zero_s:.2f} s after zero was asked for")
 
-    def _tell(self, now_us: int, text: str) -> None:
+    def _report(self, now_us: int, text: str) -> None:
         if len(self.violations) < ENOUGH_VIOLATIONS:
             self.violations.append(f"{now_us * 1e-6:.3f} s: {text}")
 
@@ -187,14 +229,14 @@ def _towards(value: float, last: float, targets: list[float]) -> bool:
     return min(last, *targets) - TINY <= value <= max(last, *targets) + TINY
 
 
-def read_command(can_id: int, data: bytes) -> Command | None:
+def read_command(can_id: int, data: bytes) -> SeenCommand | None:
     """Return the WHEEL_COMMAND in these bytes, or None if its length or its proof is wrong."""
     if can_id != WHEEL_COMMAND or len(data) != 8:
         return None
     if crc8h2f(data[1:] + struct.pack("<H", can_id ^ (MAJOR << 11))) != data[0]:
         return None
     left, right = struct.unpack_from("<hh", data, 2)
-    return Command(data[1] & 0x0F, data[1] >> 4, (left * SPEED_LSB, right * SPEED_LSB), data[7])
+    return SeenCommand(data[1] & 0x0F, data[1] >> 4, (left * SPEED_LSB, right * SPEED_LSB), data[7])
 
 
 SPEED_LSB = 0.002

@@ -5,16 +5,16 @@ A short part of what `make fault-campaign` does for hours.
 
 import pytest
 
+from disco_hw.experiments.fault_run import FaultRun
 from disco_hw.runtime.plausibility import PlausibilityStats
 from sim.fault_schedule import KINDS, FaultSchedule, parse_schedule, random_schedule
-from tests.hil.simulated_run import SimulatedRun
 from tools.fault_campaign import KINDS_LEFT_OUT, markdown, summary
 
 FAST = {"cycle_us": 5000}
 
 
 def test_without_faults_it_drives_and_nothing_is_told():
-    run = SimulatedRun(FaultSchedule(0, ()), **FAST)
+    run = FaultRun(FaultSchedule(0, ()), **FAST)
     outcome = run.run(6.0)
     assert outcome.violations == []
     assert outcome.moving_s > 3.5
@@ -26,7 +26,7 @@ def test_without_faults_it_drives_and_nothing_is_told():
 @pytest.mark.parametrize("seed", [0, 1])
 def test_random_faults_end_in_a_stop_or_are_tolerated(seed):
     kinds = tuple(kind for kind in KINDS if kind not in KINDS_LEFT_OUT)
-    run = SimulatedRun(random_schedule(seed, 23.0, kinds=kinds, quiet_s=(3.0, 4.0)), seed=seed, **FAST)
+    run = FaultRun(random_schedule(seed, 23.0, kinds=kinds, quiet_s=(3.0, 4.0)), seed=seed, **FAST)
     outcome = run.run(28.0)
     assert outcome.violations == []
     assert len(outcome.faults) >= 4
@@ -51,7 +51,7 @@ def test_random_faults_end_in_a_stop_or_are_tolerated(seed):
     ],
 )
 def test_what_each_fault_comes_to_is_seen_in_a_counter(fault, stops):
-    run = SimulatedRun(parse_schedule(f"[[fault]]\nat_s=4\n{fault}"), seed=3, **FAST)
+    run = FaultRun(parse_schedule(f"[[fault]]\nat_s=4\n{fault}"), seed=3, **FAST)
     outcome = run.run(9.0)
     assert outcome.violations == []
     (seen,) = outcome.faults
@@ -72,7 +72,7 @@ def test_what_each_fault_comes_to_is_seen_in_a_counter(fault, stops):
     ],
 )
 def test_a_fault_too_short_to_stop_for_is_counted_and_told(fault, counter):
-    run = SimulatedRun(parse_schedule(f"[[fault]]\nat_s=4\n{fault}"), seed=3, **FAST)
+    run = FaultRun(parse_schedule(f"[[fault]]\nat_s=4\n{fault}"), seed=3, **FAST)
     (seen,) = run.run(9.0).faults
     assert seen.armed_before
     assert seen.stopped_s is None
@@ -82,7 +82,7 @@ def test_a_fault_too_short_to_stop_for_is_counted_and_told(fault, counter):
 
 def test_the_same_seeds_give_the_same_run():
     schedule = random_schedule(5, 7.0, quiet_s=(3.0, 4.0))
-    runs = [SimulatedRun(schedule, seed=5, **FAST) for _ in range(2)]
+    runs = [FaultRun(schedule, seed=5, **FAST) for _ in range(2)]
     outcomes = [run.run(8.0) for run in runs]
     assert outcomes[0] == outcomes[1]
     assert runs[0].robot.truth == runs[1].robot.truth
@@ -102,7 +102,7 @@ def test_the_table_counts_what_struck_an_armed_robot():
 def test_commands_that_come_later_and_later_end_in_a_stop(growth, to):
     """Each in its turn, so that neither counter nor watchdog notices."""
     text = f'[[fault]]\nat_s=4\nfor_s=10\nkind="delay"\nto="{to}"\nprobability=1\ndelay_s=0.001\ngrowth={growth}'
-    run = SimulatedRun(parse_schedule(text), seed=3, **FAST)
+    run = FaultRun(parse_schedule(text), seed=3, **FAST)
     (seen,) = run.run(17.0).faults
     assert run.outcome.violations == []
     # Found when commands are 0.15 s late; then what is on its way, the watchdog's 0.1 s and the ramp.

@@ -14,12 +14,15 @@ from pathlib import Path
 import numpy as np
 
 import disco_hw
-from disco_hw.control import PlannerState, WheelPlan
+from disco_hw.config import RobotConfig, circle_task
+from disco_hw.control import NoValidControl, PlannerState, Rollouts, Task, WheelPlan
 from disco_hw.control.plan import Diagnostics
 from disco_hw.daemon.loop import LoopStats
 from disco_hw.daemon.status import counters
+from disco_hw.experiments.wheel_monitor import WheelMonitor
 from disco_hw.log import records
 from disco_hw.log.recorder import RecorderStats
+from disco_hw.model import Belief
 from disco_hw.runtime.assembly import assemble_core, make_pipeline
 from disco_hw.runtime.core import CoreTick, DaemonCore
 from disco_hw.runtime.pipeline import Planner
@@ -33,11 +36,10 @@ from firmware_protocol.firmware_core import FirmwareConfig
 from sim.body_dynamics import Pose
 from sim.fault_player import FaultPlayer
 from sim.fault_schedule import Fault, FaultSchedule
-from sim.plant import Plant
+from sim.plant import Plant, TrueState
 from sim.plant_parameters import PlantParameters
 from sim.simulated_can import SimulatedCan
 from sim.virtual_robot import VirtualRobot
-from tests.hil.wheel_monitor import WheelMonitor
 
 ROBOT_FILE = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
 SETTLED_S = 2.5
@@ -73,13 +75,14 @@ class CirclingPlanner:
     STEPS = 10
     LOOK_AHEAD_RAD = 0.35
 
-    def __init__(self, config, model_geometry) -> None:
-        self._task = config.task
+    def __init__(self, config: RobotConfig, model_geometry: tuple[float, float, float]) -> None:
+        self._task = circle_task(config.task, "the campaign")
         self._radius_m, self._axial_m, self._x_icr_m = model_geometry
         self._nowhere = np.zeros((self.STEPS + 1, 3))
         self._found = Diagnostics(1.0, 1.0, 0.0, 0.0, 0.0, 1)
 
     def plan(self, now_ns: int, state: PlannerState) -> WheelPlan:
+        """Turn towards a point ahead on the circle."""
         task = self._task
         bearing = math.atan2(state.y_m - task.center_y_m, state.x_m - task.center_x_m) + self.LOOK_AHEAD_RAD
         x_m, y_m = (
@@ -96,10 +99,17 @@ class CirclingPlanner:
         return WheelPlan(now_ns, 0.05, speeds, self._nowhere, self._found)
 
     def reset(self) -> None:
-        pass
+        """Nothing is kept from plan to plan."""
 
-    def set_task(self, task) -> None:
-        pass
+    def set_task(self, task: Task) -> None:
+        """The circle stays as it is."""
+
+    def set_belief(self, belief: Belief) -> None:
+        """It steers by what it sees."""
+
+    def sampled_rollouts(self, count: int) -> Rollouts:
+        """Raise NoValidControl: nothing is sampled."""
+        raise NoValidControl("this planner samples nothing")
 
 
 class Attendant:
@@ -109,6 +119,7 @@ class Attendant:
         self._last_ns = 0
 
     def requests(self, now_ns: int, last: CoreTick | None) -> tuple[UserRequest, ...]:
+        """What the person asks for in this tick."""
         if last is None or now_ns - self._last_ns < 400_000_000:
             return ()
         match last.output.state:
@@ -135,20 +146,20 @@ class LogReader:
         self._sums: dict[str, int] = {}
 
     def put(self, now_ns: int, recorded: Sequence[records.Record]) -> None:
+        """Keep what tells of trouble."""
         self.ticks += 1
         for record in recorded:
-            kind = type(record)
-            if kind is records.Event:
+            if isinstance(record, records.Event):
                 self.told.append((now_ns, record.text))
-            elif kind is records.DaemonState:
+            elif isinstance(record, records.DaemonState):
                 self.told.append((now_ns, f"{record.previous} -> {record.state}: {record.reason}"))
-            elif kind is records.Counters:
+            elif isinstance(record, records.Counters):
                 for group in ("transport", "driver", "fusion", "plausibility", "loop", "entered"):
                     for name, value in getattr(record, group).items():
                         self.counts[f"{group}.{name}"] = value
-            elif kind is RobotLinkHealth:
+            elif isinstance(record, RobotLinkHealth):
                 self._take_robot({name: getattr(record, name) for name in record.__struct_fields__})
-            elif kind is RobotStatus:
+            elif isinstance(record, RobotStatus):
                 self._take_robot({"rejected_count": record.rejected_count})
 
     def _take_robot(self, values: dict[str, int]) -> None:
@@ -160,9 +171,11 @@ class LogReader:
             self.counts[key] = self.counts.get(key, 0) + (value != before)
 
     def poll(self) -> RecorderStats:
+        """Nothing is lost in memory."""
         return RecorderStats()
 
     def close(self, timeout_s: float = 5.0) -> RecorderStats:
+        """There is nothing to close."""
         return RecorderStats()
 
 
@@ -179,7 +192,7 @@ class FaultOutcome:
 
 
 @dataclass
-class Outcome:
+class FaultRunResult:
     """What one run showed."""
 
     simulated_s: float = 0.0
@@ -198,7 +211,7 @@ class _Open:
     left_armed: bool = False
 
 
-class SimulatedRun:
+class FaultRun:
     """One robot and one daemon. `run` moves time on; `outcome` is what the monitors saw so far.
 
     `cycle_us`: period of the robot's controller (1 ms on a board; 5 ms is what campaigns use, which makes its times
@@ -225,7 +238,7 @@ class SimulatedRun:
         parameters = plant or PlantParameters(
             encoder_start_left_ticks=WRAP_SOON_TICKS, encoder_start_right_ticks=WRAP_SOON_TICKS
         )
-        task = self.config.task
+        task = circle_task(self.config.task, "the campaign")
         start = Pose(task.center_x_m + task.radius_m, task.center_y_m, 0.5 * math.pi)
         parameters = replace(parameters, wheel_radius_m=0.061, axial_distance_m=0.415, x_icr_m=0.238)
         self.robot = VirtualRobot(
@@ -248,10 +261,10 @@ class SimulatedRun:
         self._closing: list[tuple[int, _Open]] = []
         self._lost_since_us: int | None = None
         self._thawed_us = 0
-        self.outcome = Outcome(violations=self.monitor.violations)
+        self.outcome = FaultRunResult(violations=self.monitor.violations)
         self._start_daemon()
 
-    def run(self, duration_s: float) -> Outcome:
+    def run(self, duration_s: float) -> FaultRunResult:
         """Let time pass."""
         end_us = self.now_us + round(duration_s * 1e6)
         can, robot, player, monitor, cycle_us = self.can, self.robot, self._player, self.monitor, self._cycle_us
@@ -269,7 +282,7 @@ class SimulatedRun:
             armed = robot.outputs.state == "ARMED"
             begun, ended = player.step(now_ns)
             if begun or ended:
-                self._mind_faults(begun, ended, armed)
+                self._note_faults(begun, ended, armed)
             if robot.firmware is not firmware:
                 monitor.restarted()
             if now_us >= self._next_tick_us:
@@ -277,9 +290,9 @@ class SimulatedRun:
                 wheels = (truth.left_speed_rad_s, truth.right_speed_rad_s)
                 self._loop.ticks += 1
                 self._tick_if_able(now_ns)
-                self._mind_estimate(truth)
-                self._mind_telemetry(now_us)
-                self._mind_outcomes(now_us)
+                self._check_estimate(truth)
+                self._check_telemetry(now_us)
+                self._close_faults(now_us)
         self.outcome.simulated_s = self.now_us * 1e-6
         self.outcome.commands_seen = monitor.commands_seen
         self.outcome.commands_accepted = monitor.commands_accepted
@@ -311,7 +324,7 @@ class SimulatedRun:
 
     def _start_daemon(self) -> None:
         setup, config = self._setup, self.config
-        planner = self._planner or CirclingPlanner(config, (0.061, 0.415, 0.238))
+        planner: Planner = self._planner or CirclingPlanner(config, (0.061, 0.415, 0.238))
         driver = ReferenceDriver(Codec(), draw_session=lambda: self._chance.getrandbits(16))
         self.core = assemble_core(config, self.can.host, driver, make_pipeline(config, setup.model, planner), self.log)
         self.can.host.open()
@@ -330,20 +343,20 @@ class SimulatedRun:
         if self._frozen:
             self._loop.skipped_periods += 1
             return
-        extra = ()
+        extra: tuple[records.Record, ...] = ()
         if now_ns >= self._next_second_ns:
             self._next_second_ns = now_ns + 1_000_000_000
             extra = (counters(core, self._loop, RecorderStats(), now_ns),)
         core.tick(now_ns, self._attendant.requests(now_ns, core.last), extra)
 
-    def _mind_faults(self, begun: Sequence[Fault], ended: Sequence[Fault], armed: bool) -> None:
+    def _note_faults(self, begun: Sequence[Fault], ended: Sequence[Fault], armed: bool) -> None:
         for fault in begun:
             self._open.append(_Open(FaultOutcome(fault, armed), dict(self.log.counts), len(self.log.told)))
         for fault in ended:
             opened = next(o for o in self._open if o.outcome.fault is fault)
             self._closing.append((self.now_us + round(SETTLED_S * 1e6), opened))
 
-    def _mind_estimate(self, truth) -> None:
+    def _check_estimate(self, truth: TrueState) -> None:
         """The robot may not go on for long with a wrong idea of where it is."""
         lied_to = any(o.outcome.fault.kind.name in LIES for o in self._open)
         moving = max(abs(truth.left_speed_rad_s), abs(truth.right_speed_rad_s)) > 0.05
@@ -365,18 +378,19 @@ class SimulatedRun:
             self.monitor.violations.append(f"{self.now_us * 1e-6:.2f} s: moving on a wrong estimate under {struck}")
             self._lost_since_us = self.now_us + 10_000_000
 
-    def _mind_telemetry(self, now_us: int) -> None:
+    def _check_telemetry(self, now_us: int) -> None:
         """A daemon that no longer hears of the wheels takes the motion away."""
         core = self.core
-        blind = core is not None and core.newest_wheels is not None and not self._frozen and not self._hogged
-        if blind and core.last is not None and core.last.output.state is State.ARMED:
+        if core is None or core.newest_wheels is None or core.last is None or self._frozen or self._hogged:
+            return
+        if core.last.output.state is State.ARMED:
             age_s = now_us * 1e-6 - core.newest_wheels.t_ns * 1e-9
             blind = age_s > self.config.control.telemetry_disarm_s + 2.5e-6 * self._period_us
             if blind and now_us > self._thawed_us:
                 self.monitor.violations.append(f"{now_us * 1e-6:.2f} s: armed on wheel samples {age_s:.2f} s old")
                 self._thawed_us = now_us + 10_000_000
 
-    def _mind_outcomes(self, now_us: int) -> None:
+    def _close_faults(self, now_us: int) -> None:
         if not self._open:
             return
         outputs = self.robot.outputs
