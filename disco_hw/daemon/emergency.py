@@ -1,7 +1,8 @@
 """Stop the robot from outside, with as little as possible in the way.
 
 The frame goes out on the link by a connection of its own, beside the daemon's, and the daemon is asked as well; each
-way is tried whatever became of the other. A robot.toml whose other sections are broken still says where the link is.
+way is tried whatever became of the other. A robot.toml whose other sections are broken still says where the link is;
+without one that can be read, the option --link does.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import serial
 
 from disco_hw.config import Link
 from disco_hw.config.input_file import ROBOT_TOML, read_toml
+from disco_hw.config.link_option import link_fields, names_address
 from disco_hw.daemon.control_client import send_request
 from disco_hw.daemon.socket_place import believed_users, default_socket_path, passed_over
 from disco_hw.errors import InputError
@@ -31,17 +33,22 @@ _REPEATS = 3
 _CONNECT_S = 1.0
 _CONFIRM_S = 0.5
 _FRAME_LIFE_NS = 1_000_000_000
+_REMEDY = "give --link can:INTERFACE:CHANNEL or --link serial:PORT, or use the robot's own e-stop button, now"
 
 
 @dataclass(frozen=True, slots=True)
 class EstopOutcome:
-    """What became of each way to stop the robot, and whether the robot said that it is in e-stop."""
+    """What became of each way to stop the robot, and whether the robot said that it is in e-stop.
+
+    `file_error`: why robot.toml did not say where the link is, which --link then had to.
+    """
 
     link: str
     link_error: str | None
     daemon_error: str | None
     confirmed: bool
     passed_over: tuple[str, ...] = ()
+    file_error: str | None = None
 
     @property
     def sent(self) -> bool:
@@ -57,11 +64,13 @@ class EstopOutcome:
             "link_error": self.link_error,
             "daemon_error": self.daemon_error,
             "passed_over": list(self.passed_over),
+            "file_error": self.file_error,
         }
 
     def as_text(self) -> str:
         """The outcome for a person."""
         lines = [
+            *([] if self.file_error is None else [f"{self.file_error}: used --link alone"]),
             f"{self.link}: {self.link_error or 'e-stop sent'}",
             *(f"daemon: {line}" for line in self.passed_over),
             f"daemon: {self.daemon_error or 'e-stop accepted'}",
@@ -78,18 +87,18 @@ class EstopOutcome:
 def stop_robot(robot: Path, link: str | None = None) -> EstopOutcome:
     """Send the e-stop on the link and through the daemon, and wait half a second for the robot to confirm.
 
-    `link` overrides robot.toml's kind. Raises InputError only when the file does not even say where the link is and no
-    daemon takes the stop either.
+    `link` is what the option --link says. Raises InputError only when neither it nor the file says where the link is,
+    and no daemon takes the stop either.
     """
-    raw = _read(robot)
+    raw, file_error = _read(robot)
     socket_path = _socket_path(raw)
     refused = passed_over(socket_path) if socket_path is not None else ()
     try:
-        settings = _link_settings(robot, raw, link)
+        settings, file_error = _settings(robot, raw, file_error, link)
     except InputError as error:
         confirmed, daemon_error = _ask_daemon(socket_path)
         if daemon_error is not None:
-            raise
+            raise InputError(f"{error}; {_REMEDY}") from None
         return EstopOutcome("link", str(error), None, confirmed, refused)
     frame_id, data = Codec().encode("ESTOP", reason=1)
     frame = Frame(frame_id, data)
@@ -101,27 +110,40 @@ def stop_robot(robot: Path, link: str | None = None) -> EstopOutcome:
     except Exception as error:  # whatever the medium raises, the daemon is asked as well
         link_error = str(error) or type(error).__name__
     daemon_confirmed, daemon_error = _ask_daemon(socket_path)
-    return EstopOutcome(address, link_error, daemon_error, confirmed or daemon_confirmed, refused)
+    return EstopOutcome(address, link_error, daemon_error, confirmed or daemon_confirmed, refused, file_error)
 
 
-def _read(robot: Path) -> dict[str, Any]:
+def _read(robot: Path) -> tuple[dict[str, Any], str | None]:
+    """What is in robot.toml, and why it cannot be read."""
     try:
-        return read_toml(robot, ROBOT_TOML)
+        return read_toml(robot, ROBOT_TOML), None
     except InputError as error:
-        raise InputError(f"{error}; use the robot's own e-stop button, now") from None
+        return {}, str(error)
 
 
-def _link_settings(robot: Path, raw: dict[str, Any], kind: str | None) -> Link:
+def _settings(robot: Path, raw: dict[str, Any], file_error: str | None, option: str | None) -> tuple[Link, str | None]:
+    """Where the link is, and why robot.toml did not say it."""
+    given = link_fields(option)
+    if file_error is None:
+        try:
+            return _link_settings(robot, raw, given), None
+        except InputError as error:
+            file_error = str(error)
+    if not names_address(given):
+        raise InputError(file_error)
+    return msgspec.convert(given, Link), file_error
+
+
+def _link_settings(robot: Path, raw: dict[str, Any], given: dict[str, Any]) -> Link:
     section = raw.get("link", {})
     if not isinstance(section, dict):
-        raise InputError(f"{robot}: link: not a section; use the robot's own e-stop button, now")
-    if kind is not None:
-        section = {**section, "kind": kind}
+        raise InputError(f"{robot}: link: not a section")
+    section = {**section, **given}
     try:
         # A field that is none, misspelt or of another version, must not keep the stop from the robot.
         return msgspec.convert({name: section[name] for name in section if name in Link.__struct_fields__}, Link)
     except msgspec.ValidationError as error:
-        raise InputError(f"{robot}: [link]: {error}; use the robot's own e-stop button, now") from None
+        raise InputError(f"{robot}: [link]: {error}") from None
 
 
 def _socket_path(raw: dict[str, Any]) -> Path | None:

@@ -9,12 +9,12 @@ import msgspec
 
 from disco_hw.config import CircleTask, PathTask, Point, Robot, RobotConfig, TimedPathTask, load_robot_config
 from disco_hw.config.input_file import KEY, read_bytes
+from disco_hw.config.link_option import link_fields
 from disco_hw.errors import InputError
 from disco_hw.model import Model, load_model
 from disco_hw.waypoints import Waypoints, way_points_to_follow, way_points_to_meet
 from drivers.key_file import KeyFileError, key_of_file
 
-LINK_KINDS = ("can", "serial")
 Matrix3 = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
 
 
@@ -43,9 +43,7 @@ def load_setup(robot: Path, model: Path | None = None, link: str | None = None, 
         path_file = path_file or robot.parent / task.path
         config = msgspec.structs.replace(config, task=task)
     if link is not None:
-        if link not in LINK_KINDS:
-            raise InputError(f"--link {link}: no such kind of link; write one of {', '.join(LINK_KINDS)}")
-        config = msgspec.structs.replace(config, link=msgspec.structs.replace(config.link, kind=link))
+        config = msgspec.structs.replace(config, link=msgspec.structs.replace(config.link, **link_fields(link)))
     model_file = model
     if model_file is None and config.model.file is not None:
         model_file = robot.parent / config.model.file

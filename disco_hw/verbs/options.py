@@ -13,11 +13,14 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
 from disco_hw import outputs
+from disco_hw.config.link_option import FORMS
 
 RobotFile = Annotated[Path, typer.Argument(metavar="ROBOT.toml", help="The robot's configuration (docs/robot.md).")]
 RobotOption = Annotated[Path, typer.Option("--robot", help="The robot's configuration (docs/robot.md).")]
 ModelOption = Annotated[Path | None, typer.Option("--model", help="Use this model.toml instead of robot.toml's.")]
-LinkOption = Annotated[str | None, typer.Option("--link", help="Use this link instead of robot.toml's: can or serial.")]
+LinkOption = Annotated[
+    str | None, typer.Option("--link", metavar="LINK", help=f"Use this link instead of robot.toml's: {FORMS}.")
+]
 LogFileOption = Annotated[Path | None, typer.Option("--log", help="Record to this file.")]
 Logs = Annotated[list[Path], typer.Argument(metavar="LOG...", help="Logs of driving: MCAP or CSV.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object for machines.")]

@@ -15,10 +15,10 @@ from rich.console import Console
 from rich.progress import Progress
 
 from disco_hw.config import load_robot_config
+from disco_hw.config.link_option import link_fields
 from disco_hw.daemon.client import socket_path
 from disco_hw.daemon.signals import StopSignals
 from disco_hw.errors import InputError
-from disco_hw.runtime.robot_setup import LINK_KINDS
 from disco_hw.viewer.address import DEFAULT_PORT, LOOPBACK
 from disco_hw.viewer.desk import Desk
 from disco_hw.viewer.live import LivePage, run_live
@@ -43,8 +43,7 @@ def view_live(
     The daemon may come and go. `link` overrides robot.toml's kind for the e-stop that the page sends by itself. Raises
     InputError for a bad file or link, or a host or port that cannot be listened to.
     """
-    if link is not None and link not in LINK_KINDS:
-        raise InputError(f"--link {link}: no such kind of link; write one of {', '.join(LINK_KINDS)}")
+    link_fields(link)
     stage = stage_of_robot(robot, model)
     socket = socket_path(load_robot_config(robot))
     desk = Desk(socket, robot, link)

@@ -9,6 +9,7 @@ import time
 import tty
 from pathlib import Path
 
+import can
 import pytest
 
 import disco_hw
@@ -19,7 +20,7 @@ from disco_hw.daemon.emergency import stop_robot
 from disco_hw.errors import InputError
 from drivers.types import Frame, LinkState, ReceivedFrame
 from firmware_protocol.codec import Codec
-from firmware_protocol.serial_framing import encode_frame
+from firmware_protocol.serial_framing import FrameDecoder, encode_frame
 
 SHIPPED = (Path(disco_hw.__file__).parent / "robots" / "wombot.toml").read_text(encoding="utf-8")
 
@@ -153,3 +154,52 @@ def test_a_state_on_the_serial_line_from_before_the_request_confirms_nothing(tmp
     finally:
         os.close(robot_end)
         os.close(host_end)
+
+
+BROKEN = {
+    "absent": None,
+    "no TOML": "[link",
+    "nested": "a = " + "[" * 5000,
+    "a long number": "a = " + "1" * 5000,
+    "a long key": ".".join("a" * 100_000) + " = 1",
+    "a link that is none": "[link]\nbitrate = []\n",
+}
+
+
+@pytest.mark.parametrize("text", BROKEN.values(), ids=BROKEN)
+def test_without_a_file_that_can_be_read_the_option_says_where_the_link_is(tmp_path, text):
+    path = tmp_path / "robot.toml"
+    if text is not None:
+        path.write_text(text)
+    with pytest.raises(InputError, match=r"can:INTERFACE:CHANNEL or --link serial:PORT, or use the robot's own"):
+        stop_robot(path)
+    other = can.Bus(interface="virtual", channel=str(tmp_path))
+    try:
+        outcome = stop_robot(path, f"can:virtual:{tmp_path}")
+        heard = other.recv(1.0)
+    finally:
+        other.shutdown()
+    assert heard is not None
+    assert Codec().decode(heard.arbitration_id, bytes(heard.data)).name == "ESTOP"
+    assert (outcome.link, outcome.link_error) == (f"virtual {tmp_path}", None)
+    assert str(path) in outcome.file_error
+    assert f"{path}: " in outcome.as_text()
+    assert outcome.as_dict()["file_error"] == outcome.file_error
+
+
+def test_over_a_serial_port_that_the_option_names_the_stop_goes_out(tmp_path):
+    ours, theirs = pty.openpty()
+    try:
+        outcome = stop_robot(tmp_path / "none.toml", f"serial:{os.ttyname(theirs)}")
+        frames = FrameDecoder().feed(os.read(ours, 4096))
+    finally:
+        os.close(ours)
+        os.close(theirs)
+    assert (outcome.link_error, outcome.sent, outcome.confirmed) == (None, True, False)
+    assert {Codec().decode(can_id, data).name for can_id, data in frames} == {"ESTOP"}
+
+
+@pytest.mark.parametrize("option", ["radio", "can:", "can:socketcan", "can::can0", "can:socketcan:", "serial:"])
+def test_a_link_option_that_says_nothing_is_refused_with_what_to_write(tmp_path, option):
+    with pytest.raises(InputError, match=f"--link {option}: .*write can, serial, can:INTERFACE:CHANNEL or serial:PORT"):
+        stop_robot(robot_file(tmp_path, tmp_path / "none"), option)

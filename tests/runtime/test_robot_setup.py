@@ -29,7 +29,7 @@ def test_the_shipped_robot_carries_the_papers_posterior():
 
 def test_overrides_and_their_mistakes():
     assert load_setup(ROBOT, link="serial").config.link.kind == "serial"
-    with pytest.raises(InputError, match="no such kind of link"):
+    with pytest.raises(InputError, match="--link radio: not a link"):
         load_setup(ROBOT, link="radio")
     with pytest.raises(InputError, match="cannot be read"):
         load_setup(ROBOT, model=Path("/nowhere/model.toml"))
