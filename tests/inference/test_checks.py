@@ -36,3 +36,14 @@ def test_a_hidden_effect_stands_out_in_its_check(effect, value, name):
 
 def test_a_drive_that_cannot_show_it_scores_no_false_alarm():
     assert np.isfinite(list(scores(drive="circle").values())).all()
+
+
+@pytest.mark.parametrize(("track", "radius", "name"), [(0.1, 0.0, "turning changes"), (0.0, 0.04, "distance changes")])
+def test_a_change_during_the_drive_stands_out_and_says_which_way_it_went(track, radius, name):
+    for sign in (1.0, -1.0):
+        middle_s = 0.5 * float(logged("rich", 5).wheels.t_s[-1])
+        found = scores((("surface_change", (sign * track, middle_s, sign * radius)),))
+        assert abs(found[name]) > 6.0
+        assert abs(found[name]) == max(abs(score) for score in found.values())
+        # A wider track turns less for the same wheels from then on; a larger radius goes further.
+        assert np.sign(found[name]) == (sign if name == "distance changes" else -sign)

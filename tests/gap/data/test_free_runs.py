@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from disco_hw.gap.data.free_runs import run_body, run_wheels
+from disco_hw.gap.data.free_runs import pose_residual, run_body, run_wheels
 from disco_hw.gap.data.gridded_drive import CELL_S
 from disco_hw.gap.data.layout import BODY, WHEEL
 from disco_hw.model import EffectSetting, Model
@@ -76,3 +76,31 @@ def test_however_fast_it_turns_the_path_is_that_of_every_cells_mean_heading():
         x = np.cumsum(np.cos(middle) * along[part] - np.sin(middle) * across)
         y = np.cumsum(np.sin(middle) * along[part] + np.cos(middle) * across)
         np.testing.assert_allclose(track[part], np.column_stack([x, y, yaw]), atol=1e-9)
+
+
+@pytest.mark.parametrize("late_s", [0.2, -0.2, 0.035])
+def test_poses_that_are_older_than_their_stamps_have_a_latency_above_zero(late_s):
+    t_s = np.arange(3000) * CELL_S
+    yaw = 0.6 * np.sin(0.7 * t_s)
+    track = np.column_stack([np.cumsum(np.cos(yaw)) * 0.4 * CELL_S, np.cumsum(np.sin(yaw)) * 0.4 * CELL_S, yaw])
+    moving_s = np.minimum(t_s, 15.0) + 0.5 * np.maximum(t_s - 15.0, 0.0)
+    node = np.arange(100, 2900, 4)
+    p = BODY.neutral.copy()
+    drift = (0.05, -0.03)
+    p[BODY.place["slope.drift_x_m_s"]], p[BODY.place["slope.drift_y_m_s"]] = drift
+    then = t_s[node] - late_s
+    # What the sensor reports at a stamp is where the robot was that long before.
+    measured = np.column_stack([np.interp(then, t_s, track[:, axis]) for axis in range(3)])
+    measured[:, :2] += np.interp(then, t_s, moving_s)[:, None] * drift
+
+    def residual(latency_s):
+        q = p.copy()
+        q[BODY.place["pose_latency.latency_s"]] = latency_s
+        return pose_residual(
+            q, track, moving_s, node, np.zeros(node.size), np.arange(node.size) // 100,
+            np.zeros(node.size, dtype=np.int64), np.full(node.size, 2999), np.ones(node.size, dtype=bool), measured,
+        )  # fmt: skip
+
+    np.testing.assert_allclose(residual(late_s), 0.0, atol=1e-9)
+    assert np.abs(residual(0.0)).max() > 0.1 * abs(late_s)
+    assert np.linalg.norm(residual(-late_s)) > 1.5 * np.linalg.norm(residual(0.0))

@@ -88,3 +88,16 @@ def test_few_blocks_that_happen_to_scatter_do_not_take_the_evidence_away():
     factors = [inflation(linear_fit(x, rng.standard_normal(9000)), wide, (0,)) for _ in range(200)]
     assert np.quantile(factors, 0.95) < 2.0
     assert np.mean(factors) == pytest.approx(1.15, abs=0.15)
+
+
+def test_the_cost_of_a_block_is_that_of_a_fit_without_it():
+    rng = np.random.default_rng(6)
+    x = rng.standard_normal((N, 2)) * (1.0, 0.3)
+    y = x @ (0.5, -2.0) + rng.standard_normal(N)
+    blocks = held_out_by_block(linear_fit(x, y), channel())
+    expected = []
+    for b in range(N // EACH):
+        out = channel().block == b
+        coefficient = np.linalg.lstsq(x[~out], y[~out], rcond=None)[0]
+        expected.append(0.5 * float(((x[out] @ coefficient - y[out]) ** 2).sum()))
+    np.testing.assert_allclose(blocks, expected, rtol=1e-9)

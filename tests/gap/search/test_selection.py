@@ -1,6 +1,7 @@
 """The selection names what was put into a small drive, whatever it began with, and nothing where there is nothing."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,7 +11,10 @@ from disco_hw.gap.data.gridded_drive import CELL_S
 from disco_hw.gap.data.layout import BODY
 from disco_hw.gap.noise.channels import WheelChannel
 from disco_hw.gap.noise.wheel_noise import WheelNoise
+from disco_hw.gap.search.candidates import candidates_of
 from disco_hw.gap.search.channel_search import body_moves, wheel_moves
+from disco_hw.gap.search.evidence import Evidence
+from disco_hw.gap.search.least_squares import Fit
 from disco_hw.gap.search.selection import Selector, Thresholds
 from tests.gap.synthetic import GEOMETRY, body_channel, line_of
 
@@ -109,3 +113,102 @@ def test_a_slow_drive_cannot_tell_lag_from_delay_and_says_so():
     assert "command_delay" in slow.rivals(("motor_lag",), "motor_lag")
     steps = wheels_late(np.where(np.floor(t_s / 2.0) % 2 == 0, 4.0, -3.0))
     assert steps.rivals(("command_delay",), "command_delay") == ()
+
+
+def judged(gain=30.0, score=30.0, repeated=10.0, moved_m=0.01, misfit=0.0, count=1000):
+    """Whether one effect is accepted on top of none: its gain, proof, what it moves, and what the fit without lacks."""
+    channel = SimpleNamespace(count=count, split=lambda vector: (vector, None))
+    base = 0.5 * count * (1.0 + misfit)
+    limits = Thresholds(score=20.0, moves_m=0.001)
+    chosen = Selector(channel, lambda small, big: moved_m, limits)
+    for names, cost in ((frozenset(), base), (frozenset({"turn_slip"}), base - gain)):
+        chosen.fits[names] = Fit(np.zeros(1), (), cost, np.empty(0), np.empty((0, 0)))
+    chosen.proofs[frozenset(), frozenset({"turn_slip"})] = Evidence(gain, repeated, repeated, 1.0, score)
+    return chosen.acceptable((), ("turn_slip",))
+
+
+def test_an_effect_is_accepted_only_if_every_condition_holds():
+    assert judged() is True
+    assert judged(gain=10.1) is True
+    assert judged(gain=9.9) is False
+    assert judged(score=19.9) is False
+    assert judged(repeated=0.0) is False
+    assert judged(repeated=-1.0) is False
+    assert judged(moved_m=0.001) is False
+
+
+def test_what_fits_badly_is_helped_by_a_large_part_of_what_it_lacks_whatever_its_score():
+    # 500 of 1000 residuals' half squares are expected: with a misfit of 2, 1000 are lacking.
+    assert judged(score=-5.0, gain=260.0, misfit=2.0) is True
+    assert judged(score=-5.0, gain=240.0, misfit=2.0) is False
+    assert judged(score=-5.0, gain=200.0, misfit=0.45) is False
+    assert judged(score=-5.0, gain=260.0, misfit=2.0, repeated=-1.0) is False
+    assert judged(score=-5.0, gain=260.0, misfit=2.0, moved_m=0.0) is False
+
+
+def test_noise_that_wanders_is_named_by_gain_alone_and_not_by_the_rule():
+    """Heading that wanders by itself: some effect always fits it, and no block of time repeats another."""
+    channel, line = body_channel()
+    rng = np.random.default_rng(11)
+    steps = np.repeat(rng.standard_normal(line.t_s.size // 300 + 1), 300)[: line.t_s.size]
+    push = np.zeros((line.t_s.size, 3))
+    push[:, 2] = 0.03 * steps * (np.abs(line.speed_rad_s).max(axis=1) > 0.0)
+    plain = channel.neutral
+    moved = channel.track(plain, push) - channel.track(plain)
+    wandering = type(channel).build(
+        replace(line, pose_values=channel.measured + moved[channel.samples.node]), channel.noise, plain
+    )
+    found = Selector(wandering, body_moves(wandering), Thresholds(score=20.0))
+    gains = {name: found.fit(()).cost - found.fit((name,)).cost for name in ("turn_slip", "surface_change")}
+    assert max(gains.values()) > 20.0
+    assert found.select() == ()
+
+
+def test_candidates_come_in_order_of_what_they_promise():
+    found = selector(turn_slip=0.08, wheel_radius_asymmetry=0.004)
+    ranked = found.ranked(())
+    assert len(ranked) > 2
+    promises = [found.promise((), name) for name in ranked]
+    assert promises == sorted(promises, reverse=True)
+    assert promises[-1] > 0.0
+    assert ranked[0] == "turn_slip"
+    others = set(candidates_of(BODY)) - set(ranked)
+    assert all(found.promise((), name) <= 0.0 for name in others)
+    assert "turn_slip" not in found.ranked(("turn_slip",))
+
+
+def test_the_first_that_is_taken_is_the_most_promising():
+    found = selector(turn_slip=0.08, wheel_radius_asymmetry=0.004)
+    tried = []
+    found.acceptable = lambda smaller, larger: tried.append(larger[-1])
+    assert found.select() == ()
+    assert tried[0] == "turn_slip"
+
+
+def test_a_set_is_fitted_again_from_the_larger_one_that_found_better():
+    found = selector(turn_slip=0.08, side_slip=0.1)
+    both, rest = ("turn_slip", "side_slip"), ("side_slip",)
+    good = found.fit(rest)
+    poor = replace(good, cost=good.cost + 50.0)
+    found.fits[frozenset(rest)] = poor
+    found.evidence(rest, both)
+    found.evidence((), ("turn_slip",))
+    found._refit_without(both, "turn_slip", rest)
+    assert found.fit(rest).cost == pytest.approx(good.cost, abs=1.0)
+    # What was proved with the worse fit is judged anew, what had nothing to do with it is kept.
+    assert (frozenset(rest), frozenset(both)) not in found.proofs
+    assert (frozenset(), frozenset({"turn_slip"})) in found.proofs
+
+
+def test_a_fit_that_is_as_good_is_kept_and_so_is_that_of_what_is_given():
+    found = selector(turn_slip=0.08)
+    both, rest = ("turn_slip", "side_slip"), ("turn_slip",)
+    before = found.fit(rest)
+    found._refit_without(both, "side_slip", rest)
+    assert found.fit(rest) is before
+    start = found.channel.neutral
+    known = selector(given=("turn_slip",), start=start, turn_slip=0.08)
+    worse = replace(known.fit(rest), cost=known.fit(rest).cost + 50.0)
+    known.fits[frozenset(rest)] = worse
+    known._refit_without(both, "side_slip", rest)
+    assert known.fit(rest) is worse

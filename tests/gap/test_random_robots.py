@@ -1,0 +1,84 @@
+"""Whatever the robot, the last stage of `gap` judges what its log could not show and writes every file."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from disco_hw.gap import find, write_report
+from disco_hw.gap.write_report import WRITTEN
+from disco_hw.model import Model, load_model
+from tools.gap_logs import simulated_drive
+
+MODEL = Model(0.061, 0.415, 0.238)
+
+
+@pytest.fixture(scope="module")
+def searched():
+    """A log in which something is hidden, what the search finds in it, and the gap that is left, each made once."""
+    log = simulated_drive({"motor_lag": 0.15}, 1, "circle")
+    outcome, notes = find._searched(log, MODEL, lambda text: None)
+    return log, outcome, notes, outcome.gap()
+
+
+def robot_toml(generator):
+    """A robot from a toy to a lorry, drawn at random; some that turn slower than robots are held to."""
+    radius_m = float(10.0 ** generator.uniform(-2.0, 0.3))
+    axial_m = float(min(10.0 ** generator.uniform(-1.3, 0.69), 5.0))
+    fastest_rad_s = float(10.0 ** generator.uniform(-1.0, 1.81))
+    return (radius_m, axial_m, fastest_rad_s), (
+        f'[robot]\nname = "drawn"\nwheel_radius_m = {radius_m}\naxial_distance_m = {axial_m}\n'
+        f"ticks_per_rev = {int(generator.integers(1, 65536))}\nmax_wheel_speed_rad_s = {fastest_rad_s}\n"
+        f'[task]\nkind = "circle"\nradius_m = {2.0 * axial_m}\nspeed_m_s = {0.3 * fastest_rad_s * radius_m}\n'
+    )
+
+
+def of_geometry(outcome, radius_m, axial_m):
+    """The same result of the search for a robot of another size, on whose wheels the turning limits depend."""
+    geometry = np.array([radius_m, axial_m, 0.1 * axial_m])
+    wheels = outcome.wheels
+    channel = replace(wheels.channel, geometry=geometry)
+    selector = replace(wheels.selector, channel=channel)
+    return replace(outcome, wheels=replace(wheels, selector=selector, channel=channel))
+
+
+def written(searched, monkeypatch, folder, seeds):
+    """Whether each of some random robots is judged as slow to turn; the files of all were written and are sound."""
+    log, outcome, notes, gap = searched
+    slow = []
+    monkeypatch.setattr(write_report, "load_drive", lambda *_: log)
+    # Neither depends on the robot's limits, and each takes long.
+    monkeypatch.setattr(type(outcome), "gap", lambda self: gap)
+    monkeypatch.setattr(type(outcome), "pictures", lambda self, gap: {"picture": b"PNG"})
+    for seed in seeds:
+        (radius_m, axial_m, fastest_rad_s), text = robot_toml(np.random.default_rng([23, seed]))
+        robot, out = folder / f"{seed}.toml", folder / str(seed)
+        robot.write_text(text)
+        here = of_geometry(outcome, radius_m, axial_m)
+        monkeypatch.setattr(find, "_searched", lambda *_, here=here: (here, notes))
+        result = write_report.gap([], robot, out)
+        report = json.loads((out / "report.json").read_text())
+        assert all(type(spot["blind"]) is bool for spot in report["blind_spots"])
+        # What was asked of this robot's wheels is the same; a limit beyond it is one that the log is blind to.
+        turning = next(spot for spot in report["blind_spots"] if spot["name"] == "yaw_rate_limit")
+        enough = min(0.75 * fastest_rad_s * 2.0 * radius_m / axial_m, 1.2)
+        assert turning["blind"] is (turning["smallest_visible"] is None or turning["smallest_visible"] < enough)
+        assert report["blind_spots"] == json.loads(json.dumps(result.as_dict()["blind_spots"]))
+        assert (out / "report.html").read_text().startswith("<!doctype html>")
+        assert load_model(out / "model.toml").effects[0].name == "motor_lag"
+        assert {path.name for path in out.iterdir()} == {*WRITTEN, "picture.png"}
+        slow.append(enough < 1.2)
+    return slow
+
+
+def test_robots_of_every_size_get_their_report(searched, monkeypatch, tmp_path):
+    slow = written(searched, monkeypatch, tmp_path, range(12))
+    assert any(slow)
+    assert not all(slow)
+
+
+@pytest.mark.long
+def test_two_hundred_robots_of_every_size_get_their_report(searched, monkeypatch, tmp_path):
+    slow = written(searched, monkeypatch, tmp_path, range(200))
+    assert 40 < sum(slow) < 160
