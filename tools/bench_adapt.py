@@ -20,13 +20,13 @@ from disco_hw.adaptation.messages import InForce
 from disco_hw.adaptation.network import Training, train_network, training_range
 from disco_hw.daemon.warm_up import warm_up
 from disco_hw.experiments.adapt import AdaptOptions, run_adapt
+from disco_hw.experiments.changing_robot import drive_through_change
+from disco_hw.experiments.live_stack import FAST_START, FAST_TASK, running_stack
 from disco_hw.inference.noise import USUAL
 from disco_hw.runtime.assembly import make_adaptation, make_pipeline, make_planner, put_in_force
 from disco_hw.runtime.robot_setup import Setup, load_setup
 from drivers.types import PoseSample, Readings, WheelSample
-from tests.adaptation.drives import TRUTH, excited, messages
-from tests.hil.changing_robot import drive_through_change
-from tests.hil.stack import FAST_START, FAST_TASK, running_stack
+from tools.adaptation_drives import TRUTH, excited, messages
 
 LIVE_S = 30.0
 ROBOT = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"

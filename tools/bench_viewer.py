@@ -25,6 +25,7 @@ from websockets.typing import Origin, Subprotocol
 
 from disco_hw.daemon.page_feed import ViewerFeed, feed_path
 from disco_hw.daemon.realtime import stolen_ms
+from disco_hw.experiments.live_stack import running_stack
 from disco_hw.experiments.operator import disco_hw_process
 from disco_hw.log.reader import open_log
 from disco_hw.log.records import Plan
@@ -37,9 +38,8 @@ from disco_hw.viewer.snapshot import Snapshot
 from disco_hw.viewer.stage import stage_of_robot
 from disco_hw.viewer.subscriber import FeedSubscriber
 from drivers.types import WheelSample
-from tests.hil.stack import running_stack
-from tests.viewer.browser import chromium, opened
-from tests.viewer.run import PERIOD_NS, pose_at, tick_records, write_log
+from tools.browser import chromium, opened
+from tools.viewer_run import PERIOD_NS, pose_at, tick_records, write_log
 
 _HAS_STAMP = "[...document.querySelectorAll('input')].some(input => /^[0-9]{6,}$/.test(input.value))"
 _WATCH_STAMP = """

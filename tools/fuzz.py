@@ -58,7 +58,7 @@ READERS: dict[str, Callable[[Path], object]] = {
 
 def good_files() -> dict[str, bytes]:
     """One sound file for each reader."""
-    from tests.log.samples import drive_ticks, log_bytes  # noqa: PLC0415 - the samples are the tests'
+    from tools.log_samples import drive_ticks, log_bytes  # noqa: PLC0415 - the samples are the tests'
 
     rows = "".join(f"{0.05 * k:.2f},1,1,1,1,{0.003 * k},0,0,0\n" for k in range(60))
     return {

@@ -9,7 +9,7 @@ from disco_hw.adaptation.messages import InForce
 from disco_hw.adaptation.network import Training, train_network, training_range
 from disco_hw.inference.noise import USUAL
 from disco_hw.model import Model
-from tests.adaptation.drives import TRUTH, messages
+from tools.adaptation_drives import TRUTH, messages
 
 WIDE = tuple((np.diag([0.02, 0.006, 0.04]) ** 2).ravel().tolist())
 NARROW = tuple((np.diag([0.002, 0.0003, 0.002]) ** 2).ravel().tolist())

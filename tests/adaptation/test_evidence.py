@@ -4,7 +4,7 @@ import pytest
 from disco_hw.adaptation.coordinates import from_linear
 from disco_hw.adaptation.evidence import evidence
 from disco_hw.inference.noise import Noise
-from tests.adaptation.drives import TRUTH, excited
+from tools.adaptation_drives import TRUTH, excited
 
 NOISE = Noise(0.005, 0.01, 0.004, 0.004, 0.012)
 

@@ -9,7 +9,7 @@ from disco_hw.adaptation.network import Training, train_network, training_range
 from disco_hw.inference.noise import USUAL, Noise
 from disco_hw.inference.simulate import Simulator, draw_seeds
 from disco_hw.model import Model
-from tests.adaptation.drives import TRUTH, excited
+from tools.adaptation_drives import TRUTH, excited
 
 
 @cache

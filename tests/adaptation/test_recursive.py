@@ -4,7 +4,7 @@ import pytest
 from disco_hw.adaptation.evidence import evidence
 from disco_hw.adaptation.recursive import RecursiveGeometry
 from disco_hw.inference.noise import Noise
-from tests.adaptation.drives import TRUTH, excited
+from tools.adaptation_drives import TRUTH, excited
 
 NOISE = Noise(0.005, 0.01, 0.004, 0.004, 0.012)
 WIDE = np.diag([0.02, 0.006, 0.04]) ** 2

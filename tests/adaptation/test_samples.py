@@ -4,7 +4,7 @@ import pytest
 from disco_hw.adaptation.messages import Samples
 from disco_hw.adaptation.samples import SampleWindow
 from disco_hw.inference.excitation import UnusableDriveError
-from tests.adaptation.drives import messages
+from tools.adaptation_drives import messages
 
 
 def filled(sent, length_s=1e4):

@@ -14,7 +14,7 @@ from disco_hw.errors import InputError
 from disco_hw.log import records
 from disco_hw.log.recorder import MemoryRecorder
 from disco_hw.viewer.subscriber import FeedSubscriber
-from tests.viewer.run import PERIOD_NS, tick_records
+from tools.viewer_run import PERIOD_NS, tick_records
 
 _WATCH = """
 import sys

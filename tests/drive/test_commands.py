@@ -11,7 +11,7 @@ import pytest
 
 from disco_hw.drive.commands import DriveOptions, DriveResult, run_drive
 from disco_hw.errors import InputError
-from tests.hil.stack import write_robot_file
+from disco_hw.experiments.live_stack import write_robot_file
 
 
 @pytest.mark.parametrize(

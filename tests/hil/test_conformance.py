@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from disco_hw.experiments.live_stack import READY_TIMEOUT_S, write_robot_file
 from disco_hw.experiments.operator import disco_hw_process
 from tests.drivers.waiting import wait_until
-from tests.hil.stack import READY_TIMEOUT_S, write_robot_file
 
 pytestmark = [pytest.mark.hil, pytest.mark.long, pytest.mark.timeout(300)]
 ROOT = Path(__file__).resolve().parents[2]

@@ -10,9 +10,10 @@ from pathlib import Path
 
 import pytest
 
+from disco_hw.experiments.live_stack import running_stack
 from disco_hw.experiments.operator import Child
 from disco_hw.log.reader import open_log
-from tests.hil.stack import STILL_RAD_S, running_stack
+from tests.hil.stack import STILL_RAD_S
 
 pytestmark = pytest.mark.hil
 

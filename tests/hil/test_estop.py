@@ -12,7 +12,8 @@ import time
 import pytest
 
 from disco_hw.errors import WorkError
-from tests.hil.stack import STILL_RAD_S, running_stack
+from disco_hw.experiments.live_stack import running_stack
+from tests.hil.stack import STILL_RAD_S
 
 pytestmark = pytest.mark.hil
 
@@ -76,7 +77,7 @@ def test_estop_needs_no_more_of_robot_toml_than_the_link(tmp_path):
 
 
 def test_estop_without_a_robot_says_so_and_fails(tmp_path):
-    from tests.hil.stack import write_robot_file
+    from disco_hw.experiments.live_stack import write_robot_file
 
     code, output = estop(write_robot_file(tmp_path))
     assert code == 1

@@ -13,15 +13,16 @@ import pytest
 from disco_hw.course import course_of
 from disco_hw.daemon.control_client import send_request
 from disco_hw.drive.source import INPUT_LIMIT_NS
+from disco_hw.experiments.live_stack import running_stack
 from disco_hw.experiments.operator import disco_hw_process, stands
 from disco_hw.log.reader import open_log
 from disco_hw.runtime.robot_setup import load_setup
 from disco_hw.viewer import scene
-from tests.hil.stack import DECELERATION_RAD_S2, STILL_RAD_S, running_stack
+from tests.hil.stack import DECELERATION_RAD_S2, STILL_RAD_S
 from tests.hil.test_drive import Bench
-from tests.viewer.browser import chromium, keep, opened
 from tests.viewer.camera import project, screenshot, shows
 from tests.viewer.test_page import wait_for
+from tools.browser import chromium, keep, opened
 
 pytestmark = [pytest.mark.hil, pytest.mark.long, pytest.mark.browser]
 # Ticks, the link, and a machine that has other things to do.

@@ -6,7 +6,8 @@ import json
 
 import pytest
 
-from tests.hil.stack import READY_TIMEOUT_S, disco, running_stack, write_robot_file
+from disco_hw.experiments.live_stack import READY_TIMEOUT_S, running_stack, write_robot_file
+from tests.hil.stack import disco
 from tests.runtime.path_robot import ROBOTS
 
 PATH = "x_m,y_m\n0,0\n0.5,0\n0.8,0.2\n"

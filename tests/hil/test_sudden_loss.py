@@ -8,8 +8,9 @@ import time
 
 import pytest
 
+from disco_hw.experiments.live_stack import running_stack
 from disco_hw.log.reader import open_log
-from tests.hil.stack import assert_stopped_in_time, running_stack
+from tests.hil.stack import assert_stopped_in_time
 
 pytestmark = pytest.mark.hil
 

@@ -12,9 +12,9 @@ import time
 
 import pytest
 
+from disco_hw.experiments.live_stack import write_robot_file
 from disco_hw.experiments.operator import disco_hw_process
 from tests.drivers.waiting import wait_until
-from tests.hil.stack import write_robot_file
 from tests.hil.test_check import wait_for_line
 
 pytestmark = pytest.mark.hil

@@ -7,14 +7,14 @@ import time
 from pathlib import Path
 
 from disco_hw.log.recorder import Recording
-from tests.log.samples import ATTACHMENTS, tick
+from tools.log_samples import ATTACHMENTS, tick
 
 _RECORD = """
 import sys, time
 from pathlib import Path
 from disco_hw.log.recorder import ProcessRecorder
 from tests.log.processes import recording
-from tests.log.samples import tick
+from tools.log_samples import tick
 recorder = ProcessRecorder(recording(Path(sys.argv[1])))
 print(recorder.writer_pid, flush=True)
 first, last = int(sys.argv[2]), int(sys.argv[3])

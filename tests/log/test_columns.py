@@ -6,7 +6,7 @@ import pytest
 from disco_hw.log.columns import to_columns
 from disco_hw.log.records import Command, Estimate, Event, FrameIn, LoopTiming, Plan
 from drivers.types import WheelSample
-from tests.log.samples import bits
+from tools.log_samples import bits
 
 
 def test_numbers_keep_their_type_and_their_bits():

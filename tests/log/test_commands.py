@@ -4,7 +4,7 @@ import pytest
 
 from disco_hw.log.commands import export, info, recover
 from disco_hw.log.errors import LogError
-from tests.log.samples import drive_ticks, log_bytes, write_log
+from tools.log_samples import drive_ticks, log_bytes, write_log
 
 
 @pytest.fixture

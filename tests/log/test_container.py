@@ -12,7 +12,7 @@ from mcap.writer import CompressionType, Writer
 
 from disco_hw.log.container import MAGIC, DamagedError, messages, read_attachment, read_chunk, read_contents
 from disco_hw.log.errors import LogError
-from tests.log.samples import ATTACHMENTS, drive_ticks, log_bytes
+from tools.log_samples import ATTACHMENTS, drive_ticks, log_bytes
 
 WHOLE = log_bytes(drive_ticks(120), flush_every=10)
 KILLED = log_bytes(drive_ticks(120), flush_every=10, finish=False)

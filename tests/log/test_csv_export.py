@@ -12,7 +12,7 @@ from disco_hw.log.mcap_drive import drive_from_log
 from disco_hw.log.reader import open_log
 from disco_hw.log.records import Command
 from drivers.types import PoseSample, WheelSample
-from tests.log.samples import PERIOD_NS, write_log
+from tools.log_samples import PERIOD_NS, write_log
 
 TICKS = 2048
 NUMBERS = np.random.default_rng(3).random((400, 8))

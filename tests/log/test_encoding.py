@@ -7,7 +7,7 @@ from hypothesis import given
 
 from disco_hw.log.encoding import JsonDecoder, encode_json, json_schema
 from disco_hw.log.records import TOPICS, Estimate, Event, topic_of
-from tests.log.samples import ANY_RECORD, bits
+from tools.log_samples import ANY_RECORD, bits
 
 DECODER = JsonDecoder()
 VIEWER_TYPES = {"boolean", "string", "number", "integer", "object", "array"}

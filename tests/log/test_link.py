@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from disco_hw.log.link import ENCODE_ERRORS, BatchDecoder, batch_encoder
 from disco_hw.log.records import TOPICS, Estimate, Event, Plan
-from tests.log.samples import ANY_RECORD, bits
+from tools.log_samples import ANY_RECORD, bits
 
 ENCODE = batch_encoder()
 DECODER = BatchDecoder()

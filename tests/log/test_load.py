@@ -6,7 +6,7 @@ from disco_hw.log.csv_export import write_csv
 from disco_hw.log.errors import LogError
 from disco_hw.log.load import load_drive
 from disco_hw.log.recovery import recover
-from tests.log.samples import drive_ticks, log_bytes, write_log
+from tools.log_samples import drive_ticks, log_bytes, write_log
 
 
 @pytest.fixture

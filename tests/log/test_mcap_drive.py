@@ -9,7 +9,7 @@ from disco_hw.log.mcap_drive import drive_from_log, ticks_per_rev
 from disco_hw.log.reader import open_log
 from disco_hw.log.records import Command, Event
 from drivers.types import PoseSample, WheelSample
-from tests.log.samples import PERIOD_NS, drive_ticks, tick, write_log
+from tools.log_samples import PERIOD_NS, drive_ticks, tick, write_log
 
 
 def drive_of(path, ticks, **changes):

@@ -12,7 +12,7 @@ from mcap_protobuf.decoder import DecoderFactory
 from disco_hw.log.link import batch_encoder
 from disco_hw.log.mcap_log import CHUNK_BYTES, METADATA, McapLog, Metadata
 from disco_hw.log.records import TOPIC_INDEX, TOPICS, Event, FrameIn
-from tests.log.samples import ATTACHMENTS, PERIOD_NS, WALL_OFFSET_NS, drive_ticks, log_bytes, start, tick
+from tools.log_samples import ATTACHMENTS, PERIOD_NS, WALL_OFFSET_NS, drive_ticks, log_bytes, start, tick
 
 ENCODE = batch_encoder()
 

@@ -9,7 +9,7 @@ from disco_hw.log.errors import LogError
 from disco_hw.log.load import load_drive
 from disco_hw.log.reader import Gap, open_log
 from disco_hw.log.records import Counters, Estimate, Event, Innovation, Plan
-from tests.log.samples import (
+from tools.log_samples import (
     ANY_RECORD,
     ATTACHMENTS,
     PERIOD_NS,

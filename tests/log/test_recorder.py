@@ -18,7 +18,7 @@ from disco_hw.log.recorder import (
 )
 from disco_hw.log.records import Event
 from tests.log.processes import alive, drive, recording, size, wait_until
-from tests.log.samples import ATTACHMENTS, bits, tick
+from tools.log_samples import ATTACHMENTS, bits, tick
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ from disco_hw.errors import InputError
 from disco_hw.log.errors import LogError
 from disco_hw.log.reader import open_log
 from disco_hw.log.recovery import recover
-from tests.log.samples import ATTACHMENTS, bits, drive_ticks, log_bytes
+from tools.log_samples import ATTACHMENTS, bits, drive_ticks, log_bytes
 
 WHOLE = log_bytes(drive_ticks(300), flush_every=10)
 

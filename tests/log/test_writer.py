@@ -16,7 +16,7 @@ from disco_hw.log.link import EXIT_CANNOT_CREATE, EXIT_CANNOT_WRITE
 from disco_hw.log.reader import open_log
 from disco_hw.log.recorder import ProcessRecorder
 from tests.log.processes import RecordingProcess, alive, drive, recording, size, wait_until
-from tests.log.samples import start
+from tools.log_samples import start
 
 SECOND_NS = 1_000_000_000
 

@@ -2,7 +2,7 @@ import pytest
 
 from disco_hw.viewer.recording import Recording
 from disco_hw.viewer.timeline import Timeline
-from tests.viewer.run import tick_records, write_log
+from tools.viewer_run import tick_records, write_log
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from disco_hw.viewer.beside import page_beside
-from tests.viewer.run import ROBOT_FILE
+from tools.viewer_run import ROBOT_FILE
 
 _PARENT = """
 import sys, time

@@ -14,7 +14,7 @@ from disco_hw.errors import InputError
 from disco_hw.verbs.watch import view
 from disco_hw.viewer import picture, scene
 from disco_hw.viewer.commands import export_log, in_figures, snapshot_log, video_log
-from tests.viewer.run import FAULT_TICK
+from tools.viewer_run import FAULT_TICK
 
 
 def count_of(image, colour, tolerance=12):

@@ -4,7 +4,7 @@ import pytest
 from disco_hw.config import CircleTask
 from disco_hw.model import Gaussian, Mixture, Model, Uniform
 from disco_hw.viewer import curves
-from tests.viewer.run import LEFT_RAD_S, PERIOD_NS, RIGHT_RAD_S, SPEED_M_S, START_NS
+from tools.viewer_run import LEFT_RAD_S, PERIOD_NS, RIGHT_RAD_S, SPEED_M_S, START_NS
 
 END_NS = START_NS + 199 * PERIOD_NS
 NAMES = ("wheel_radius_m", "axial_distance_m", "x_icr_m")

@@ -19,8 +19,8 @@ from disco_hw.viewer.desk import Desk, shown
 from disco_hw.viewer.server import serving
 from firmware_protocol.codec import Codec
 from firmware_protocol.serial_framing import encode_frame
-from tests.viewer.run import ROBOT_FILE
 from tests.viewer.test_server import get
+from tools.viewer_run import ROBOT_FILE
 
 STATUS = {
     "ok": True, "state": "READY", "detail": "ready to be armed", "running": False, "estop": False, "fault": "NONE",

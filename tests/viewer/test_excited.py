@@ -5,7 +5,7 @@ import pytest
 from disco_hw.log import records
 from disco_hw.viewer.excited import Excited
 from disco_hw.viewer.timeline import Timeline
-from tests.viewer.run import PERIOD_NS
+from tools.viewer_run import PERIOD_NS
 
 TOP_RAD_S = 6.4
 

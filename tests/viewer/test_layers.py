@@ -8,7 +8,7 @@ from disco_hw.viewer.layers import add_layers
 from disco_hw.viewer.scene import LAYERS, Scene
 from disco_hw.viewer.server import serving
 from disco_hw.viewer.stage import stage_of_robot
-from tests.viewer.run import ROBOT_FILE
+from tools.viewer_run import ROBOT_FILE
 
 
 class Boxes:

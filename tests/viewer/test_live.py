@@ -19,7 +19,7 @@ from disco_hw.viewer.panel import live_details
 from disco_hw.viewer.server import serving
 from disco_hw.viewer.stage import stage_of_robot
 from tests.runtime.path_robot import path_robot
-from tests.viewer.run import PERIOD_NS, ROBOT_FILE, START_NS, pose_at, tick_records
+from tools.viewer_run import PERIOD_NS, ROBOT_FILE, START_NS, pose_at, tick_records
 
 
 @pytest.fixture

@@ -1,7 +1,7 @@
 from disco_hw.log import records
 from disco_hw.viewer.marks import ADAPTED, EVENT, FAULT, GATED, OVERRUN, REJECTED_FRAMES, marks_of
 from disco_hw.viewer.timeline import Timeline
-from tests.viewer.run import FAULT_TICK, GATED_TICK, OVERRUN_TICK, PERIOD_NS, REJECTED_TICK, START_NS
+from tools.viewer_run import FAULT_TICK, GATED_TICK, OVERRUN_TICK, PERIOD_NS, REJECTED_TICK, START_NS
 
 
 def test_every_kind_is_found_at_its_tick(timeline):

@@ -12,8 +12,8 @@ from disco_hw.viewer import scene
 from disco_hw.viewer.commands import export_log
 from disco_hw.viewer.replay import ReplayPage, run_replay
 from disco_hw.viewer.server import serving
-from tests.viewer.browser import chromium, keep, opened
-from tests.viewer.run import FAULT_TICK, RADIUS_M, pose_at
+from tools.browser import chromium, keep, opened
+from tools.viewer_run import FAULT_TICK, RADIUS_M, pose_at
 
 pytestmark = [pytest.mark.long, pytest.mark.browser]
 

@@ -15,7 +15,7 @@ from disco_hw.viewer.panel import (
 from disco_hw.viewer.snapshot import snapshot_at
 from disco_hw.viewer.timeline import Timeline
 from drivers.types import RobotStatus
-from tests.viewer.run import PERIOD_NS, START_NS, plan_at
+from tools.viewer_run import PERIOD_NS, START_NS, plan_at
 
 STATUS = {
     "ok": True, "state": "ARMED", "detail": "running the task", "running": True, "estop": False, "link": "up",

@@ -6,7 +6,7 @@ from PIL import Image
 
 from disco_hw.errors import InputError
 from disco_hw.viewer import picture, scene
-from tests.viewer.run import FAN_TICK
+from tools.viewer_run import FAN_TICK
 
 
 def drawn(recording, t_s, path):

@@ -4,7 +4,7 @@ from disco_hw.errors import InputError
 from disco_hw.log.recorder import ProcessRecorder
 from disco_hw.log.recorder import Recording as Written
 from disco_hw.viewer.recording import Recording
-from tests.viewer.run import ROBOT_FILE, plan_at, pose_at, tick_records
+from tools.viewer_run import ROBOT_FILE, plan_at, pose_at, tick_records
 
 
 def test_a_log_is_shown_as_it_was_recorded(recording, timeline):

@@ -3,7 +3,7 @@ import pytest
 from disco_hw.viewer.marks import EVENT, GATED, Mark
 from disco_hw.viewer.replay import ReplayPage, _spread
 from disco_hw.viewer.server import serving
-from tests.viewer.run import pose_at
+from tools.viewer_run import pose_at
 
 
 @pytest.fixture

@@ -16,7 +16,7 @@ from disco_hw.viewer.snapshot import snapshot_at
 from disco_hw.viewer.stage import stage_of_robot
 from disco_hw.viewer.timeline import Timeline
 from tests.runtime.path_robot import path_robot
-from tests.viewer.run import PERIOD_NS, ROBOT_FILE, START_NS, plan_at, pose_at
+from tools.viewer_run import PERIOD_NS, ROBOT_FILE, START_NS, plan_at, pose_at
 
 TICK = 150
 FAN = records.Fan(

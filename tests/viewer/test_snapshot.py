@@ -4,7 +4,7 @@ import pytest
 from disco_hw.log import records
 from disco_hw.viewer.snapshot import PLAN_AGE_NS, snapshot_at, thinned
 from disco_hw.viewer.timeline import Timeline
-from tests.viewer.run import LEFT_RAD_S, PERIOD_NS, RIGHT_RAD_S, START_NS, plan_at, pose_at
+from tools.viewer_run import LEFT_RAD_S, PERIOD_NS, RIGHT_RAD_S, START_NS, plan_at, pose_at
 
 
 def test_an_instant_is_what_was_known_then(timeline):

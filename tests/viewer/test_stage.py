@@ -3,7 +3,7 @@ import pytest
 from disco_hw.errors import InputError
 from disco_hw.log.reader import open_log
 from disco_hw.viewer.stage import stage_of_log, stage_of_robot
-from tests.viewer.run import MODEL_FILE, ROBOT_FILE
+from tools.viewer_run import MODEL_FILE, ROBOT_FILE
 
 
 def test_the_robot_file_and_its_model():

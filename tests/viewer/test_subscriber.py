@@ -9,7 +9,7 @@ import zmq
 from disco_hw.log.link import batch_encoder
 from disco_hw.log.records import Estimate
 from disco_hw.viewer.subscriber import FeedSubscriber
-from tests.viewer.run import tick_records
+from tools.viewer_run import tick_records
 
 
 class Daemon:

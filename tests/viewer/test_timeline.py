@@ -2,7 +2,7 @@ import numpy as np
 
 from disco_hw.log import records
 from disco_hw.viewer.timeline import Items, Series, Timeline
-from tests.viewer.run import PERIOD_NS, START_NS, plan_at
+from tools.viewer_run import PERIOD_NS, START_NS, plan_at
 
 
 def test_series_keeps_rows_in_order_beyond_its_first_size():

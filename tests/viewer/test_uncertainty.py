@@ -6,7 +6,7 @@ from disco_hw.log import records
 from disco_hw.model import Gaussian, Model, load_model
 from disco_hw.model.free_run import FreeRun
 from disco_hw.viewer.uncertainty import ParameterPoints
-from tests.viewer.run import MODEL_FILE, plan_at
+from tools.viewer_run import MODEL_FILE, plan_at
 
 
 def test_paths_are_those_of_the_compiled_model():

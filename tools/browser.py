@@ -59,7 +59,7 @@ def opened(browser, url, width=800, height=540, scene=True):
 
 def keep(page, name):
     """Keep a screenshot for a person to look at; a machine that is too busy to take one goes on without."""
-    from playwright.sync_api import TimeoutError as TooBusy
+    from playwright.sync_api import TimeoutError as TooBusy  # noqa: PLC0415 - a test dependency
 
     ARTIFACTS.mkdir(parents=True, exist_ok=True)
     with suppress(TooBusy):

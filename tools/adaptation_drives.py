@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from disco_hw.adaptation.messages import Pose, Samples, Triple, Wheels
+from disco_hw.adaptation.samples import SampleWindow
 from disco_hw.inference.excitation import Excitation
 
 TRUTH = (0.238, 0.061, 0.415)
@@ -57,8 +58,6 @@ def messages(
 
 def excited(seconds: float, **options: Any) -> Excitation:
     """The same as a drive."""
-    from disco_hw.adaptation.samples import SampleWindow
-
     window = SampleWindow(1e4)
     for message in messages(seconds, **options):
         window.add(message)

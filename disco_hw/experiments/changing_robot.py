@@ -13,9 +13,9 @@ from disco_hw.adaptation.adaptable import believed_geometry, with_geometry
 from disco_hw.adaptation.coordinates import NAMES
 from disco_hw.adaptation.guard import Geometry
 from disco_hw.experiments.adapt import BELIEVED_STD, CHANGES
+from disco_hw.experiments.live_stack import running_stack
 from disco_hw.log.reader import open_log
 from disco_hw.model.file import load_model, model_text
-from tests.hil.stack import running_stack
 
 GROWTH = 0.15
 CHANGE_S = 75.0
@@ -26,7 +26,7 @@ START = (0.75, 0.0, 1.5707963)
 
 
 @dataclass(frozen=True, slots=True)
-class Driven:
+class LiveDrive:
     """Mean tracking costs on the plant's truth, over 20 s before the change and from 20 s after it on; what changed, by
     its size before, as the robot believed it at last, how long after the change (s) it was first told, and what the
     loop missed.
@@ -39,7 +39,7 @@ class Driven:
     overruns: int
 
 
-def drive_through_change(directory: Path, changes: str, *, adapt: bool) -> Driven:
+def drive_through_change(directory: Path, changes: str, *, adapt: bool) -> LiveDrive:
     """The paper's circle; the belief is right, and as narrow as after `infer`, until the wheel radius or axial distance
     (`changes`) grows by 15 %.
     """
@@ -64,12 +64,12 @@ def drive_through_change(directory: Path, changes: str, *, adapt: bool) -> Drive
     t_s = table[:, 0] * 1e-9 - first_s - CHANGE_S
     cost = np.hypot(np.hypot(table[:, 1], table[:, 2]) - 0.75, table[:, 3] - 0.2)
     with open_log(directory / "run.mcap") as log:
-        beliefs = log.columns("/belief") if adapt else {"t_ns": []}
-        told = [float(t_ns) * 1e-9 - first_s - CHANGE_S for t_ns in beliefs["t_ns"]]
-        published_s = min((at for at in told if at > 0.0), default=math.inf)
+        times_ns = log.columns("/belief")["t_ns"].tolist() if adapt else []
+        published = [t_ns * 1e-9 - first_s - CHANGE_S for t_ns in times_ns]
+        published_s = min((at for at in published if at > 0.0), default=math.inf)
     index = NAMES.index("wheel_radius_m" if wheels else "axial_distance_m")
     believed = status["adaptation"]["mean"][NAMES[index]] / float(mean[index]) if adapt else 1.0
-    return Driven(
+    return LiveDrive(
         float(cost[(t_s > -COMPARED_S) & (t_s < 0.0)].mean()),
         float(cost[(t_s > SETTLED_S) & (t_s < SETTLED_S + COMPARED_S)].mean()),
         believed,
