@@ -7,6 +7,8 @@ from typing import ParamSpec, TypeVar, cast
 
 from numba import njit
 
+from drivers.kernel_cache import kept_on_disk
+
 P = ParamSpec("P")
 R = TypeVar("R")
 
@@ -17,4 +19,4 @@ def compiled(function: Callable[P, R]) -> Callable[P, R]:
     A compiled function may call only compiled functions of its own file: the cache on disk is renewed when that file
     changes, and not when another one does.
     """
-    return cast(Callable[P, R], njit(cache=True, nogil=True)(function))
+    return cast(Callable[P, R], kept_on_disk(njit(nogil=True)(function)))

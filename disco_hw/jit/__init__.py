@@ -18,6 +18,7 @@ from numba.core.compiler import Compiler
 from numba.extending import intrinsic, overload
 
 from disco_hw.jit.plugins import plugin_sources
+from drivers.kernel_cache import kept_on_disk
 
 # No `nnan`, `ninf` (non-finite costs must stay visible), no `reassoc` (sums keep their order, so a run replays), no
 # `arcp` (a quotient by a root is exact but where `reciprocal_root` asks for an estimate).
@@ -98,8 +99,8 @@ def kernel_function(function: Callable[..., Any]) -> Callable[..., Any]:
     code = function.__code__.replace(co_freevars=("sources",))
     keyed = FunctionType(code, function.__globals__, function.__name__, None, (CellType(sources_fingerprint()),))
     keyed.__qualname__, keyed.__module__, keyed.__doc__ = function.__qualname__, function.__module__, function.__doc__
-    options: Any = {"cache": True, "fastmath": FAST_MATH, "error_model": "numpy", "pipeline_class": _KernelCompiler}
-    compiled: Callable[..., Any] = njit(**options)(keyed)
+    options: Any = {"fastmath": FAST_MATH, "error_model": "numpy", "pipeline_class": _KernelCompiler}
+    compiled: Callable[..., Any] = kept_on_disk(njit(**options)(keyed))
     return compiled
 
 

@@ -1,0 +1,132 @@
+"""Machine code on disk is loaded only from a directory of this user's own: a planted pickle is not run."""
+
+import os
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+NOBODY = 65534
+KERNELS = {
+    "plant": "from sim.compiled import compiled as compile_kernel",
+    "model": "from disco_hw.jit import kernel_function as compile_kernel",
+}
+SOURCE = """
+import sys
+{imported}
+
+@compile_kernel
+def twice(value):
+    return 2.0 * value
+
+if __name__ == "__main__":
+    print(twice(float(sys.argv[1])), dict(twice.stats.cache_hits) != {{}})
+"""
+
+
+class Bomb:
+    """A pickle that makes a file when it is loaded."""
+
+    def __init__(self, marker):
+        self.marker = marker
+
+    def __reduce__(self):
+        return open, (str(self.marker), "w")
+
+
+@pytest.fixture
+def script(request, tmp_path):
+    path = tmp_path / "code" / "kernel.py"
+    path.parent.mkdir()
+    path.write_text(SOURCE.format(imported=KERNELS[getattr(request, "param", "plant")]), encoding="utf-8")
+    return path
+
+
+def run(script, cache, home):
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(cache or ""), "HOME": str(home)}
+    environment.pop("XDG_CACHE_HOME", None)
+    command = [sys.executable, str(script), "21"]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120, check=True)
+    value, loaded = done.stdout.split()
+    assert value == "42.0"
+    return loaded == "True", done.stderr
+
+
+def plant(cache, marker):
+    (index,) = Path(cache).rglob("*twice*.nbi")
+    index.write_bytes(pickle.dumps(Bomb(marker)))
+
+
+def test_a_kernel_is_loaded_from_a_directory_of_ones_own(script, tmp_path):
+    cache = tmp_path / "cache"
+    assert run(script, cache, tmp_path) == (False, "")
+    assert {path.stat().st_mode & 0o777 for path in cache.iterdir()} == {0o700}
+    assert run(script, cache, tmp_path) == (True, "")
+
+
+def test_a_planted_pickle_would_run_if_it_were_loaded(script, tmp_path):
+    # What shows that the other tests can fail: in a directory of one's own numba loads what it finds.
+    cache, marker = tmp_path / "cache", tmp_path / "ran"
+    run(script, cache, tmp_path)
+    plant(cache, marker)
+    run(script, cache, tmp_path)
+    assert marker.exists()
+
+
+@pytest.mark.parametrize("script", KERNELS, indirect=True)
+@pytest.mark.parametrize("opened", ["the directory named", "the directory of the module"])
+def test_a_pickle_in_a_directory_that_others_can_write_to_is_not_run(script, tmp_path, opened):
+    cache, marker, home = tmp_path / "cache", tmp_path / "ran", tmp_path / "home"
+    home.mkdir()
+    run(script, cache, home)
+    plant(cache, marker)
+    place = cache if opened == "the directory named" else next(cache.iterdir())
+    place.chmod(0o777)
+    loaded, told = run(script, cache, home)
+    assert not loaded
+    assert told == f"disco-hw: {place}: others can write to it; kernels there are not loaded but compiled anew\n"
+    assert not marker.exists()
+    # It is kept in the next directory, which is this user's alone.
+    assert run(script, cache, home)[0]
+    assert not marker.exists()
+
+
+def test_a_pickle_that_others_can_write_is_not_run_though_its_directory_is_ones_own(script, tmp_path):
+    cache, marker = tmp_path / "cache", tmp_path / "ran"
+    run(script, cache, tmp_path)
+    plant(cache, marker)
+    next(cache.rglob("*.nbi")).chmod(0o666)
+    assert "not loaded but compiled anew" in run(script, cache, tmp_path)[1]
+    assert not marker.exists()
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="needs root to give a directory to another user")
+def test_a_pickle_of_another_user_is_not_run(script, tmp_path):
+    cache, marker = tmp_path / "cache", tmp_path / "ran"
+    run(script, cache, tmp_path)
+    plant(cache, marker)
+    for path in (next(cache.rglob("*.nbi")), next(cache.iterdir())):
+        os.chown(path, NOBODY, NOBODY)
+        loaded, told = run(script, cache, tmp_path)
+        assert not loaded or path.is_dir()
+        assert f"{path}: belongs to nobody (65534)" in told
+        assert not marker.exists()
+        os.chown(path, 0, 0)
+
+
+def test_a_pickle_beside_the_source_is_not_run_either_and_where_none_is_private_nothing_is_kept(script, tmp_path):
+    marker, home = tmp_path / "ran", tmp_path / "home"
+    home.mkdir()
+    run(script, None, home)
+    beside = script.parent / "__pycache__"
+    plant(beside, marker)
+    beside.chmod(0o777)
+    assert str(beside) in run(script, None, home)[1]
+    (module,) = (home / ".cache" / "numba").iterdir()
+    module.chmod(0o777)
+    loaded, told = run(script, None, home)
+    assert not loaded
+    assert "kernels are compiled anew in each process" in told
+    assert not marker.exists()
