@@ -16,7 +16,7 @@ import numpy as np
 from disco_hw.drive.separating import separating
 from disco_hw.gap import find_gap
 from disco_hw.gap.report.blind_spots import LIMITS, BlindSpot
-from disco_hw.gap.search.intervals import Estimate
+from disco_hw.gap.search.intervals import ParameterEstimate
 from disco_hw.model import Model
 from tools.gap_logs import LARGEST_RAD_S, NAMED, realistic, simulated_drive
 
@@ -159,7 +159,9 @@ def too_small(spot: BlindSpot, hidden: float | tuple[float, ...]) -> bool:
     return size > spot.smallest_visible if spot.name in LIMITS else size < spot.smallest_visible
 
 
-def judged(name: str, hidden: float | tuple[float, ...], found: dict[str, Estimate]) -> tuple[float, list[bool]]:
+def judged(
+    name: str, hidden: float | tuple[float, ...], found: dict[str, ParameterEstimate]
+) -> tuple[float, list[bool]]:
     """Relative error of an effect's parameters, taken together, and whether each interval holds the truth."""
     numbers = hidden if isinstance(hidden, tuple) else (hidden,)
     match name:

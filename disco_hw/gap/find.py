@@ -9,14 +9,14 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.gap.data.gridded_drive import timeline
+from disco_hw.gap.data.gridded_drive import grid_drive
 from disco_hw.gap.data.layout import BASE_COUNT, BODY, WHEEL, Layout
 from disco_hw.gap.report.amend import amended_model
 from disco_hw.gap.report.findings import GapReport
-from disco_hw.gap.search.analysis import Outcome
+from disco_hw.gap.search.analysis import GapAnalysis
 from disco_hw.gap.search.candidates import candidates_of
 from disco_hw.gap.search.channel_search import search_body, search_wheels
-from disco_hw.gap.search.predictive_pruning import harmless, left_out
+from disco_hw.gap.search.predictive_pruning import prune, pruning_sentences
 from disco_hw.gap.search.unnamed_terms import with_known_terms
 from disco_hw.log.drive import DriveLog, concatenate
 from disco_hw.log.errors import LogError
@@ -43,60 +43,60 @@ def find_gap(
     began = time.perf_counter()
     say = progress or (lambda text: None)
     log = logs if isinstance(logs, DriveLog) else concatenate(logs)
-    outcome, notes = _searched(log, model, say)
-    outcome = replace(outcome, top_rad_s=top_rad_s)
+    analysis, notes = _searched(log, model, say)
+    analysis = replace(analysis, top_rad_s=top_rad_s)
     say("intervals, blind spots and the gap on held-out data")
-    effects, unnamed = outcome.effects(), outcome.unnamed()
-    named = {effect.name: effect.parameters for effect in outcome.effects(given=True)}
-    amended, remarks = amended_model(model, named, outcome.terms(), outcome.parts())
-    gap = outcome.gap() if outcome.body is not None else {}
+    effects, unnamed = analysis.effects(), analysis.unnamed()
+    named = {effect.name: effect.parameters for effect in analysis.effects(given=True)}
+    amended, remarks = amended_model(model, named, analysis.terms(), analysis.parts())
+    gap = analysis.gap() if analysis.body is not None else {}
     return GapReport(
         sources=log.sources,
-        channels=outcome.channels(effects, (term.channel for term in unnamed)),
+        channels=analysis.channels(effects, (term.channel for term in unnamed)),
         effects=effects,
         unnamed=unnamed,
-        blind_spots=outcome.blind_spots(effects),
+        blind_spots=analysis.blind_spots(effects),
         gap=gap,
         model=amended,
-        residue=(*left_out(outcome), *outcome.residue()),
+        residue=(*pruning_sentences(analysis), *analysis.residue()),
         notes=(*log.notes, *notes, *remarks),
-        candidates=outcome.candidates(),
-        pictures=outcome.pictures(gap) if pictures else {},
+        candidates=analysis.candidates(),
+        pictures=analysis.pictures(gap) if pictures else {},
         seconds=time.perf_counter() - began,
     )
 
 
 def missing_effects(log: DriveLog, model: Model) -> tuple[str, ...]:
     """Only the names of what a log shows and a model lacks, the surest first; raises LogError as `find_gap`."""
-    outcome, _ = _searched(log, model, lambda text: None)
-    return tuple(effect.name for effect in outcome.effects())
+    analysis, _ = _searched(log, model, lambda text: None)
+    return tuple(effect.name for effect in analysis.effects())
 
 
-def _searched(log: DriveLog, model: Model, say: Progress) -> tuple[Outcome, list[str]]:
+def _searched(log: DriveLog, model: Model, say: Progress) -> tuple[GapAnalysis, list[str]]:
     """Both channels searched, without what makes predictions worse; and notes on what could not be judged."""
-    line = timeline(log)
-    if not (line.has_poses or line.has_commands):
+    drive = grid_drive(log)
+    if not (drive.has_poses or drive.has_commands):
         raise LogError(
             f"{', '.join(log.sources)}: too little to judge: it needs wheel samples with poses, or with commands, "
             "for at least some seconds of driving"
         )
     nominal_body, nominal_wheels = _vector(BODY, model), _vector(WHEEL, model)
-    line = with_known_terms(line, model.effects, nominal_body, WHEEL.at(nominal_wheels, "command_delay.delay_s"))
+    drive = with_known_terms(drive, model.effects, nominal_body, WHEEL.at(nominal_wheels, "command_delay.delay_s"))
     geometry = nominal_body[:BASE_COUNT]
     body = wheels = None
     notes: list[str] = []
-    if line.has_poses:
+    if drive.has_poses:
         say("wheel to body: which effects are missing")
-        body = search_body(line, nominal_body, _given(model, BODY))
+        body = search_body(drive, nominal_body, _given(model, BODY))
         geometry = body.fit.vector[:BASE_COUNT]
     else:
         notes.append("no poses: only the way from command to wheel is judged")
-    if line.has_commands:
+    if drive.has_commands:
         say("command to wheel: which effects are missing")
-        wheels = search_wheels(line, geometry, nominal_wheels, _given(model, WHEEL))
+        wheels = search_wheels(drive, geometry, nominal_wheels, _given(model, WHEEL))
     else:
         notes.append("no commands: the way from command to wheel is not judged")
-    return harmless(Outcome(line, nominal_body, nominal_wheels, body, wheels)), notes
+    return prune(GapAnalysis(drive, nominal_body, nominal_wheels, body, wheels)), notes
 
 
 def _vector(layout: Layout, model: Model) -> Array:

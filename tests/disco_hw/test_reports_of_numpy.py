@@ -27,8 +27,8 @@ from disco_hw.gap.report.findings import (
     GapReport,
     UnnamedFinding,
 )
-from disco_hw.gap.search.cross_validation import Errors
-from disco_hw.gap.search.intervals import Estimate
+from disco_hw.gap.search.cross_validation import PredictionErrors
+from disco_hw.gap.search.intervals import ParameterEstimate
 from disco_hw.gap.write_report import GapResult
 from disco_hw.inference.checks import CHECKS
 from disco_hw.inference.commands import InferResult
@@ -65,10 +65,10 @@ def made(kind, scalar):
 
 
 def gap_report(scalar):
-    stages = {stage: {scalar(horizon): made(Errors, scalar) for horizon in (1.0, 2.0)} for stage in STAGES}
+    stages = {stage: {scalar(horizon): made(PredictionErrors, scalar) for horizon in (1.0, 2.0)} for stage in STAGES}
     return GapReport(
         ("log",), (made(ChannelFinding, scalar),),
-        (EffectFinding("motor_lag", "command_to_wheel", {"tau_s": made(Estimate, scalar)}, scalar(1)),),
+        (EffectFinding("motor_lag", "command_to_wheel", {"tau_s": made(ParameterEstimate, scalar)}, scalar(1)),),
         (made(UnnamedFinding, scalar),), (replace(made(BlindSpot, scalar), name="turn_slip"),),
         stages, Model(0.06, 0.4), scalar(1), candidates=(made(CandidateEvidence, scalar),),
     )  # fmt: skip

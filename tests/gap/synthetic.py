@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from disco_hw.gap.data.free_runs import read_angles
-from disco_hw.gap.data.gridded_drive import BLOCK_S, CELL_S, Samples, Timeline
+from disco_hw.gap.data.gridded_drive import BLOCK_S, GRID_STEP_S, GriddedDrive, GridSamples
 from disco_hw.gap.data.layout import BODY
 from disco_hw.gap.noise.body_noise import BodyNoise
 from disco_hw.gap.noise.channels import BodyChannel
@@ -16,23 +16,23 @@ DRIVE = ((4, 4), (0, 0), (-3, 3), (4, -4), (6, 6), (2, 5), (5, 2), (-4, -4), (-1
 
 
 def line_of(speed_rad_s):
-    """A timeline of wheels at these speeds (M, 2), known without error, read every 2 cells, commands as the speeds."""
+    """A gridded drive of wheels at these speeds (M, 2), read without error every 2 cells, commands as the speeds."""
     speed = np.asarray(speed_rad_s, dtype=float)
     count = speed.shape[0]
-    t_s = CELL_S * np.arange(count)
-    angle = np.concatenate([np.zeros((1, 2)), CELL_S * np.cumsum(speed[:-1], axis=0)])
+    t_s = GRID_STEP_S * np.arange(count)
+    angle = np.concatenate([np.zeros((1, 2)), GRID_STEP_S * np.cumsum(speed[:-1], axis=0)])
     nodes = np.arange(0, count - 1, 2)
-    encoder = Samples(nodes, np.zeros(nodes.size), t_s[nodes], np.floor(t_s[nodes] / BLOCK_S).astype(np.int64))
+    encoder = GridSamples(nodes, np.zeros(nodes.size), t_s[nodes], np.floor(t_s[nodes] / BLOCK_S).astype(np.int64))
     poses = np.arange(4, count - 2, 4)
-    pose = Samples(poses, np.zeros(poses.size), t_s[poses], np.floor(t_s[poses] / BLOCK_S).astype(np.int64))
-    return Timeline(
-        t_s, np.arange(count) == 0, speed.copy(), np.zeros(count), angle, speed, encoder, angle[nodes], 2 * CELL_S, 0.0,
-        0.0, pose, np.zeros((poses.size, 3)),
+    pose = GridSamples(poses, np.zeros(poses.size), t_s[poses], np.floor(t_s[poses] / BLOCK_S).astype(np.int64))
+    return GriddedDrive(
+        t_s, np.arange(count) == 0, speed.copy(), np.zeros(count), angle, speed, encoder, angle[nodes],
+        2 * GRID_STEP_S, 0.0, 0.0, pose, np.zeros((poses.size, 3)),
     )  # fmt: skip
 
 
 def body_channel(seed=0, **effects):
-    """A body channel and its timeline; its poses are the model's with these first parameters of motion effects."""
+    """A body channel and its drive; its poses are the model's with these first parameters of motion effects."""
     line = line_of(np.repeat(np.array(DRIVE * 3, dtype=float), 200, axis=0))
     truth = BODY.neutral.copy()
     truth[:3] = GEOMETRY

@@ -18,8 +18,8 @@ MODEL = Model(0.061, 0.415, 0.238)
 def searched():
     """A log in which something is hidden, what the search finds in it, and the gap that is left, each made once."""
     log = simulated_drive({"motor_lag": 0.15}, 1, "circle")
-    outcome, notes = find._searched(log, MODEL, lambda text: None)
-    return log, outcome, notes, outcome.gap()
+    analysis, notes = find._searched(log, MODEL, lambda text: None)
+    return log, analysis, notes, analysis.gap()
 
 
 def robot_toml(generator):
@@ -34,28 +34,28 @@ def robot_toml(generator):
     )
 
 
-def of_geometry(outcome, radius_m, axial_m):
+def of_geometry(analysis, radius_m, axial_m):
     """The same result of the search for a robot of another size, on whose wheels the turning limits depend."""
     geometry = np.array([radius_m, axial_m, 0.1 * axial_m])
-    wheels = outcome.wheels
+    wheels = analysis.wheels
     channel = replace(wheels.channel, geometry=geometry)
     selector = replace(wheels.selector, channel=channel)
-    return replace(outcome, wheels=replace(wheels, selector=selector, channel=channel))
+    return replace(analysis, wheels=replace(wheels, selector=selector, channel=channel))
 
 
 def written(searched, monkeypatch, folder, seeds):
     """Whether each of some random robots is judged as slow to turn; the files of all were written and are sound."""
-    log, outcome, notes, gap = searched
+    log, analysis, notes, gap = searched
     slow = []
     monkeypatch.setattr(write_report, "load_drive", lambda *_: log)
     # Neither depends on the robot's limits, and each takes long.
-    monkeypatch.setattr(type(outcome), "gap", lambda self: gap)
-    monkeypatch.setattr(type(outcome), "pictures", lambda self, gap: {"picture": b"PNG"})
+    monkeypatch.setattr(type(analysis), "gap", lambda self: gap)
+    monkeypatch.setattr(type(analysis), "pictures", lambda self, gap: {"picture": b"PNG"})
     for seed in seeds:
         (radius_m, axial_m, fastest_rad_s), text = robot_toml(np.random.default_rng([23, seed]))
         robot, out = folder / f"{seed}.toml", folder / str(seed)
         robot.write_text(text)
-        here = of_geometry(outcome, radius_m, axial_m)
+        here = of_geometry(analysis, radius_m, axial_m)
         monkeypatch.setattr(find, "_searched", lambda *_, here=here: (here, notes))
         result = write_report.gap([], robot, out)
         report = json.loads((out / "report.json").read_text())

@@ -9,7 +9,7 @@ from dask.distributed import LocalCluster
 from rich.console import Console
 
 from disco_hw.gap.report.blind_spots import BlindSpot
-from disco_hw.gap.search.intervals import Estimate
+from disco_hw.gap.search.intervals import ParameterEstimate
 from tools import gap_jobs, gap_study, gap_tables
 from tools.gap_jobs import Job, Result, jobs
 from tools.gap_logs import NAMED
@@ -129,9 +129,9 @@ def test_figures_have_their_numbers_and_intervals():
 
 
 def test_parameter_errors_are_of_the_parameters_that_were_hidden():
-    exact = {"drift_x_m_s": Estimate(0.0, -1.0, 1.0), "drift_y_m_s": Estimate(0.02, 0.01, 0.03)}
+    exact = {"drift_x_m_s": ParameterEstimate(0.0, -1.0, 1.0), "drift_y_m_s": ParameterEstimate(0.02, 0.01, 0.03)}
     assert gap_jobs.judged("slope", (0.02, math.pi / 2), exact) == (pytest.approx(0.0), [True, True])
-    off = {"left": Estimate(0.03, 0.02, 0.04), "right": Estimate(0.05, 0.045, 0.055)}
+    off = {"left": ParameterEstimate(0.03, 0.02, 0.04), "right": ParameterEstimate(0.05, 0.045, 0.055)}
     error, covered = gap_jobs.judged("wheel_gain", 0.04, off)
     assert error == pytest.approx(0.25)
     assert covered == [True, False]

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.gap.data.gridded_drive import CELL_S
+from disco_hw.gap.data.gridded_drive import GRID_STEP_S
 from disco_hw.gap.data.layout import BODY, WHEEL, body_effects, wheel_effects
 from disco_hw.jit import kernel_function, scalar_function
 from disco_hw.model.step import body_velocity, wheel_step
@@ -61,8 +61,8 @@ def _run_wheels(
         left_speed, right_speed, mean_left, mean_right = wheel_step(
             left + extra[cell, 0], right + extra[cell, 1], left_speed, right_speed, t_s[cell], effects
         )
-        angle[i, 0] = angle[i - 1, 0] + CELL_S * mean_left
-        angle[i, 1] = angle[i - 1, 1] + CELL_S * mean_right
+        angle[i, 0] = angle[i - 1, 0] + GRID_STEP_S * mean_left
+        angle[i, 1] = angle[i - 1, 1] + GRID_STEP_S * mean_right
 
 
 @scalar_function
@@ -93,13 +93,13 @@ def _run_body(
             x = y = yaw = 0.0
             c, s = 1.0, 0.0
         else:
-            left = (angle[i, 0] - angle[i - 1, 0]) * scale[0] / CELL_S
-            right = (angle[i, 1] - angle[i - 1, 1]) * scale[1] / CELL_S
+            left = (angle[i, 0] - angle[i - 1, 0]) * scale[0] / GRID_STEP_S
+            right = (angle[i, 1] - angle[i - 1, 1]) * scale[1] / GRID_STEP_S
             change = scale[0] * (speed[i, 0] - speed[i - 1, 0]) + scale[1] * (speed[i, 1] - speed[i - 1, 1])
             forward, lateral, half_rate = body_velocity(left + right, right - left, change, t_s[i - 1], base, effects)
-            turn = (2.0 * half_rate + extra[i - 1, 2]) * CELL_S
-            along = (forward + extra[i - 1, 0]) * CELL_S
-            across = (lateral + extra[i - 1, 1]) * CELL_S - base.x_icr_m * turn
+            turn = (2.0 * half_rate + extra[i - 1, 2]) * GRID_STEP_S
+            along = (forward + extra[i - 1, 0]) * GRID_STEP_S
+            across = (lateral + extra[i - 1, 1]) * GRID_STEP_S - base.x_icr_m * turn
             half = 0.5 * turn
             small = abs(half) < _SMALL_RAD
             if small:
@@ -120,7 +120,7 @@ def run_wheels(p: Array, geometry: Array, command: Array, extra: Array, first: M
     the command; `start` (M, 2) measured speeds, read where a run begins; `geometry` (3,).
     """
     angle = np.empty_like(command)
-    late = WHEEL.at(p, "command_delay.delay_s") / CELL_S
+    late = WHEEL.at(p, "command_delay.delay_s") / GRID_STEP_S
     _run_wheels(wheel_effects(p, geometry), late, command, extra, first, t_s, start, angle)
     for side, name in enumerate(("left", "right")):
         scale = WHEEL.at(p, f"encoder_scale.{name}")
@@ -208,7 +208,7 @@ def pose_residual(
     `last_node` (P,) bound the run of each sample, for the latency.
     """
     out = np.empty_like(measured)
-    late = BODY.at(p, "pose_latency.latency_s") / CELL_S
+    late = BODY.at(p, "pose_latency.latency_s") / GRID_STEP_S
     bias = BODY.at(p, "heading_bias.bias_rad")
     drift = BODY.at(p, "slope.drift_x_m_s"), BODY.at(p, "slope.drift_y_m_s")
     _lay(

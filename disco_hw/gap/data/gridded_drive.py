@@ -1,7 +1,7 @@
 """A drive on an even time grid: what the free runs of the channels read, prepared once.
 
-The grid's nodes are `CELL_S` apart within a run; a run is a stretch of one segment in which the wheels were measured
-and, for the command channel, the commands were known. Runs follow each other in the same arrays.
+The grid's nodes are `GRID_STEP_S` apart within a run; a run is a stretch of one segment in which the wheels were
+measured and, for the command channel, the commands were known. Runs follow each other in the same arrays.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
-from disco_hw.gap.data.sample_hold import without_repeats
+from disco_hw.gap.data.sample_hold import undo_sample_hold
 from disco_hw.log.drive import Commands, DriveLog
 
-CELL_S = 0.01
+GRID_STEP_S = 0.01
 BLOCK_S = 3.0
 LONGEST_S = 320.0
 _STRETCH_S = 20.0
@@ -36,7 +36,7 @@ Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)
-class Samples:
+class GridSamples:
     """Where measurements lie on the grid, all (S,): node before, fraction of a cell after it, time, block of time."""
 
     node: Index
@@ -44,9 +44,9 @@ class Samples:
     t_s: Array
     block: Index
 
-    def pick(self, chosen: Mask | Index) -> Samples:
+    def pick(self, chosen: Mask | Index) -> GridSamples:
         """Some of them."""
-        return Samples(self.node[chosen], self.fraction[chosen], self.t_s[chosen], self.block[chosen])
+        return GridSamples(self.node[chosen], self.fraction[chosen], self.t_s[chosen], self.block[chosen])
 
 
 # Of wheels whose readings are held, 80 s of driving may leave this many that are new.
@@ -54,7 +54,7 @@ _FEWEST_READINGS = 100
 
 
 @dataclass(frozen=True, slots=True)
-class Timeline:
+class GriddedDrive:
     """A drive on the grid.
 
     Nodes (M,): `t_s`, `first` (begins a run), `command_rad_s` (M, 2) mean over the cell that starts there, NaN where no
@@ -70,12 +70,12 @@ class Timeline:
     command_change: Array
     angle_rad: Array
     speed_rad_s: Array
-    encoder: Samples
+    encoder: GridSamples
     encoder_angle_rad: Array
     encoder_period_s: float
     stamp_scatter_s: float
     quantum_rad: float
-    pose: Samples
+    pose: GridSamples
     pose_values: Array
     notes: tuple[str, ...] = ()
     known_command: Array | None = None
@@ -95,12 +95,12 @@ class Timeline:
     @property
     def duration_s(self) -> float:
         """Time covered by the grid."""
-        return float(self.t_s.size * CELL_S)
+        return float(self.t_s.size * GRID_STEP_S)
 
 
-def timeline(log: DriveLog) -> Timeline:
+def grid_drive(log: DriveLog) -> GriddedDrive:
     """Lay a drive on the grid; a log without wheel samples has an empty one."""
-    wheels, poses = without_repeats(log.wheels), log.poses
+    wheels, poses = undo_sample_hold(log.wheels), log.poses
     notes: list[str] = []
     nodes_t, nodes_first, commands, changes, angles, speeds = [], [], [], [], [], []
     encoder_at, encoder_angle, pose_at, pose_values = [], [], [], []
@@ -115,14 +115,14 @@ def timeline(log: DriveLog) -> Timeline:
         angle = np.column_stack([wheels.left_angle_rad[lo:hi], wheels.right_angle_rad[lo:hi]])
         angle = angle - angle[0]
         segment = int(wheels.segment[lo])
-        grid = t[0] + CELL_S * np.arange(int((t[-1] - t[0]) / CELL_S) + 1)
+        grid = t[0] + GRID_STEP_S * np.arange(int((t[-1] - t[0]) / GRID_STEP_S) + 1)
         at = np.column_stack([np.interp(grid, t, angle[:, side]) for side in (0, 1)])
         command, change = _command_cells(log.commands, segment, grid)
         span_s = max(_SPEED_SPAN_S, float(np.median(np.diff(t))))
         speed = _speeds(grid, t, angle, span_s)
         foreign = _foreign(command, speed, span_s)
         command[foreign] = np.nan
-        foreign_s += CELL_S * int(foreign.sum())
+        foreign_s += GRID_STEP_S * int(foreign.sum())
         nodes_t.append(grid)
         nodes_first.append(np.arange(grid.size) == 0)
         commands.append(command)
@@ -133,7 +133,7 @@ def timeline(log: DriveLog) -> Timeline:
         moved = np.column_stack([np.interp(t, grid, speed[:, side]) for side in (0, 1)]) * (even - t)[:, None]
         encoder_at.append(_locate(even, grid, offset))
         encoder_angle.append(angle + moved)
-        here = (poses.segment == segment) & (poses.t_s >= grid[0] + 0.02) & (poses.t_s <= grid[-1] - CELL_S)
+        here = (poses.segment == segment) & (poses.t_s >= grid[0] + 0.02) & (poses.t_s <= grid[-1] - GRID_STEP_S)
         pose_at.append(_locate(poses.t_s[here], grid, offset))
         yaw = np.unwrap(poses.yaw_rad[here]) if here.any() else np.empty(0)
         pose_values.append(np.column_stack([poses.x_m[here], poses.y_m[here], yaw]))
@@ -144,7 +144,7 @@ def timeline(log: DriveLog) -> Timeline:
         notes.append(f"{foreign_s:.0f} s in which wheels and commands have nothing to do with each other are left out")
     encoder = _joined(encoder_at)
     measured = np.concatenate(encoder_angle)
-    return Timeline(
+    return GriddedDrive(
         t_s=np.concatenate(nodes_t),
         first=np.concatenate(nodes_first),
         command_rad_s=np.concatenate(commands),
@@ -207,15 +207,15 @@ def _spread(t_s: Array, runs: list[tuple[int, int]], driven_s: float) -> list[tu
     return [(lo, hi) for lo, hi in pieces if t_s[hi - 1] - t_s[lo] >= _SHORTEST_RUN_S]
 
 
-def _locate(t_s: Array, grid: Array, offset: int) -> Samples:
+def _locate(t_s: Array, grid: Array, offset: int) -> GridSamples:
     """Positions of times on a run's grid whose first node has index `offset`."""
-    place = (t_s - grid[0]) / CELL_S
+    place = (t_s - grid[0]) / GRID_STEP_S
     node = np.clip(np.floor(place).astype(np.int64), 0, grid.size - 2)
-    return Samples(node + offset, place - node, t_s, np.floor(t_s / BLOCK_S).astype(np.int64))
+    return GridSamples(node + offset, place - node, t_s, np.floor(t_s / BLOCK_S).astype(np.int64))
 
 
-def _joined(parts: list[Samples]) -> Samples:
-    return Samples(
+def _joined(parts: list[GridSamples]) -> GridSamples:
+    return GridSamples(
         np.concatenate([part.node for part in parts]),
         np.concatenate([part.fraction for part in parts]),
         np.concatenate([part.t_s for part in parts]),
@@ -231,17 +231,17 @@ def _command_cells(commands: Commands, segment: int, grid: Array) -> tuple[Array
         return np.full((grid.size, 2), np.nan), np.zeros(grid.size)
     known = np.isfinite(values[:, 0])
     filled = np.nan_to_num(values)
-    edges = np.append(grid, grid[-1] + CELL_S)
+    edges = np.append(grid, grid[-1] + GRID_STEP_S)
     ends = np.append(t[1:], max(edges[-1], t[-1]) + 1.0)
     integral = np.concatenate([np.zeros((1, 2)), np.cumsum(filled * (ends - t)[:, None], axis=0)])
     knots = np.append(t, ends[-1])
-    means = np.column_stack([np.diff(np.interp(edges, knots, integral[:, side])) for side in (0, 1)]) / CELL_S
+    means = np.column_stack([np.diff(np.interp(edges, knots, integral[:, side])) for side in (0, 1)]) / GRID_STEP_S
     unknown = np.concatenate([[0.0], np.cumsum((~known) * (ends - t))])
     lost = np.diff(np.interp(edges, knots, unknown)) > 1e-9
     means[lost | (grid < t[0] - 1e-9)] = np.nan
     jumps = np.zeros(grid.size)
     steps = (np.diff(filled, axis=0) ** 2).mean(axis=1)
-    where = np.clip(((t[1:] - grid[0]) / CELL_S).astype(np.int64), 0, grid.size - 1)
+    where = np.clip(((t[1:] - grid[0]) / GRID_STEP_S).astype(np.int64), 0, grid.size - 1)
     np.add.at(jumps, where, steps)
     return means, jumps
 
@@ -253,9 +253,9 @@ def _foreign(command: Array, speed: Array, span_s: float) -> Mask:
     """
     asked = np.nan_to_num(np.abs(command).max(axis=1), nan=np.inf)
     turning = np.abs(speed).max(axis=1)
-    span = round(_LONGEST_RESPONSE_S / CELL_S)
+    span = round(_LONGEST_RESPONSE_S / GRID_STEP_S)
     before = maximum_filter1d(asked, span, origin=(span - 1) // 2)
-    most = np.maximum(before, maximum_filter1d(asked, 2 * math.ceil(span_s / CELL_S) + 3))
+    most = np.maximum(before, maximum_filter1d(asked, 2 * math.ceil(span_s / GRID_STEP_S) + 3))
     least = minimum_filter1d(asked, span, origin=(span - 1) // 2)
     unasked = (most < _NO_COMMAND_RAD_S) & (turning > _TURNING_RAD_S)
     unheard = (least > _LOUD_RAD_S) & np.isfinite(asked) & (turning < _NO_COMMAND_RAD_S)
@@ -276,10 +276,10 @@ def _quantum(angle: Array) -> float:
     return float(np.quantile(steps, 0.001)) if steps.size > 100 else 0.0
 
 
-def _empty() -> Timeline:
+def _empty() -> GriddedDrive:
     nothing, pairs = np.empty(0), np.empty((0, 2))
-    samples = Samples(np.empty(0, np.int64), nothing, nothing, np.empty(0, np.int64))
-    return Timeline(
+    samples = GridSamples(np.empty(0, np.int64), nothing, nothing, np.empty(0, np.int64))
+    return GriddedDrive(
         nothing,
         np.empty(0, bool),
         pairs,

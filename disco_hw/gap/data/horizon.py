@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.gap.data.gridded_drive import CELL_S
+from disco_hw.gap.data.gridded_drive import GRID_STEP_S
 from disco_hw.gap.data.layout import BODY
 from disco_hw.jit import kernel_function
 
@@ -22,7 +22,7 @@ _LEAD_S = 1.0
 def _displace(
     p: Any, track: Any, moving_s: Any, start: Any, low: Any, high: Any, heading: Any, ahead: int, out: Any
 ) -> None:
-    late = p[0] / CELL_S
+    late = p[0] / GRID_STEP_S
     top = track.shape[0] - 2
     for k in range(start.shape[0]):
         a = max(start[k] - late, float(low[k]))
@@ -64,15 +64,15 @@ def displacement(
             BODY.at(p, "slope.drift_y_m_s"),
         ]
     )
-    _displace(world, track, moving_s, start, low, high, heading_rad, round(ahead_s / CELL_S), out)
+    _displace(world, track, moving_s, start, low, high, heading_rad, round(ahead_s / GRID_STEP_S), out)
     return out
 
 
 def starts_of(first: NDArray[np.bool_], usable: NDArray[np.bool_], ahead_s: float, every_s: float = 0.2) -> Index:
     """Nodes (K,), `every_s` apart, from which a prediction stays within its run and on usable nodes."""
-    ahead, stride = round(ahead_s / CELL_S), round(every_s / CELL_S)
+    ahead, stride = round(ahead_s / GRID_STEP_S), round(every_s / GRID_STEP_S)
     # What was commanded before a run is not known, and late wheels still follow it.
-    lead = round(_LEAD_S / CELL_S)
+    lead = round(_LEAD_S / GRID_STEP_S)
     begins = np.flatnonzero(first)
     ends = np.append(begins[1:], first.size)
     bad = np.concatenate([[0], np.cumsum(~usable)])

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from disco_hw.effects.effect import Channel, Parameter
 from disco_hw.effects.registry import MOTION_EFFECTS, REGISTRY
-from disco_hw.gap.data.gridded_drive import CELL_S
+from disco_hw.gap.data.gridded_drive import GRID_STEP_S
 from disco_hw.model.parameter import BASE_PARAMETERS
 from disco_hw.model.step import Base, Effects
 
@@ -120,7 +120,7 @@ def _coefficients(layout: Layout, p: Array, name: str, base: tuple[float, ...]) 
 # From one free run to the next most effects stay as they are.
 @lru_cache(maxsize=512)
 def _kept(name: str, values: tuple[float, ...], base: tuple[float, ...]) -> tuple[float, ...]:
-    columns = REGISTRY[name].coefficients(np.array([values]), np.array([base]), CELL_S)
+    columns = REGISTRY[name].coefficients(np.array([values]), np.array([base]), GRID_STEP_S)
     return tuple(float(column[0]) for column in columns)
 
 

@@ -20,7 +20,7 @@ _TURNING_RAD_S = 0.05
 _LONGEST_PERIODS = 4.0
 
 
-def without_repeats(wheels: Wheels) -> Wheels:
+def undo_sample_hold(wheels: Wheels) -> Wheels:
     """The wheels' samples without repeated ones, angles integrated backwards; unchanged where nothing is held.
 
     Held are speeds from which the angles were derived, if the log repeats more than a third of those of turning wheels.

@@ -65,7 +65,7 @@ class BodyNoise:
 
 
 @dataclass(frozen=True, slots=True)
-class Motion:
+class BodyMotion:
     """Motion between pose samples, all (P,): what the filter's transition needs.
 
     `dt_s` since the sample before; step in the world `dx_m`, `dy_m`; `yaw_rad`; `moving` from 0 at rest to 1; speed
@@ -274,7 +274,7 @@ def _whiten(
             out[k, 0] = out[k, 1] = out[k, 2] = 0.0
 
 
-def _along(motion: Motion) -> tuple[Array | Mask, ...]:
+def _along(motion: BodyMotion) -> tuple[Array | Mask, ...]:
     """A motion as the kernels take it."""
     return (
         motion.dt_s, motion.dx_m, motion.dy_m, np.cos(motion.yaw_rad), np.sin(motion.yaw_rad), motion.moving,
@@ -282,7 +282,7 @@ def _along(motion: Motion) -> tuple[Array | Mask, ...]:
     )  # fmt: skip
 
 
-def body_gains(noise: BodyNoise, motion: Motion) -> BodyGains:
+def body_gains(noise: BodyNoise, motion: BodyMotion) -> BodyGains:
     """Transition, gains and whitening for one motion."""
     count = motion.dt_s.size
     transition, gain, scale = np.empty((count, STATES)), np.empty((count, STATES, 3)), np.empty((count, 3, 3))
@@ -290,7 +290,7 @@ def body_gains(noise: BodyNoise, motion: Motion) -> BodyGains:
     return BodyGains(transition, gain, scale, motion.restart, motion.use)
 
 
-def body_likelihood(motion: Motion, residual: Array) -> Callable[[Array], tuple[Array, float]]:
+def body_likelihood(motion: BodyMotion, residual: Array) -> Callable[[Array], tuple[Array, float]]:
     """For pose residuals (P, 3) a function of the logarithms of the noise (9,).
 
     It gives the whitened residuals (P, 3), 0 where none counts, and the sum of the logarithms of their weights: what a

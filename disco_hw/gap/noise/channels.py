@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.gap.data.free_runs import pose_residual, read_angles, run_body, run_wheels
-from disco_hw.gap.data.gridded_drive import CELL_S, Samples, Timeline
+from disco_hw.gap.data.gridded_drive import GRID_STEP_S, GriddedDrive, GridSamples
 from disco_hw.gap.data.layout import BASE_COUNT, BODY, WHEEL, Layout
-from disco_hw.gap.noise.body_noise import BodyGains, BodyNoise, Motion, body_gains, whiten_body
+from disco_hw.gap.noise.body_noise import BodyGains, BodyMotion, BodyNoise, body_gains, whiten_body
 from disco_hw.gap.noise.wheel_noise import (
-    Driven,
     WheelGains,
+    WheelMotion,
     WheelNoise,
     calm_speeds,
     steady_speeds,
@@ -40,7 +40,7 @@ Index = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 
-class Channel(Protocol):
+class ResidualChannel(Protocol):
     """What fitting and selecting need of a channel; n is the number of its residuals."""
 
     @property
@@ -82,50 +82,50 @@ class Channel(Protocol):
 class WheelChannel:
     """Commands in, wheel angles out; `weight` (E, 2) tames stretches that are noisier than the rest."""
 
-    timeline: Timeline
-    driven: Driven
+    drive: GriddedDrive
+    motion: WheelMotion
     gains: WheelGains
     weight: Array
     noise: WheelNoise
     geometry: Array
 
     @classmethod
-    def build(cls, line: Timeline, noise: WheelNoise, geometry: Array, use: Mask | None = None) -> WheelChannel:
+    def build(cls, drive: GriddedDrive, noise: WheelNoise, geometry: Array, use: Mask | None = None) -> WheelChannel:
         """The channel with a noise model; samples where no command is known are left out.
 
         `geometry` (3,): wheel radius, axial distance, x_icr, for effects that speak of the robot's motion.
         """
-        place = line.encoder
-        known = np.isfinite(line.command_rad_s[:, 0])
+        place = drive.encoder
+        known = np.isfinite(drive.command_rad_s[:, 0])
         # One known cell before is not enough: the run begins anew after unknown commands.
         followed = known[place.node] & known[np.maximum(place.node - 1, 0)]
         good = followed if use is None else followed & use
         dt = np.diff(place.t_s, prepend=place.t_s[0])
         first_of_run = np.zeros(place.t_s.size, dtype=bool)
-        starts = np.flatnonzero(line.first)
+        starts = np.flatnonzero(drive.first)
         first_of_run[np.searchsorted(place.node, starts)] = True
         resumed = followed & ~np.concatenate([[False], followed[:-1]])
-        jumps = np.concatenate([[0.0], np.cumsum(line.command_change)])
+        jumps = np.concatenate([[0.0], np.cumsum(drive.command_change)])
         between = np.diff(jumps[place.node + 1], prepend=0.0)
-        speed = line.speed_rad_s[place.node]
+        speed = drive.speed_rad_s[place.node]
         dt = np.maximum(dt, 0.0)
         steady = steady_speeds(dt, speed)
-        driven = Driven(dt, calm_speeds(dt, speed), steady, np.maximum(between, 0.0), first_of_run | resumed, good)
-        return cls(line, driven, wheel_gains(noise, driven), np.ones((place.t_s.size, 2)), noise, geometry)
+        motion = WheelMotion(dt, calm_speeds(dt, speed), steady, np.maximum(between, 0.0), first_of_run | resumed, good)
+        return cls(drive, motion, wheel_gains(noise, motion), np.ones((place.t_s.size, 2)), noise, geometry)
 
     def with_noise(self, noise: WheelNoise, use: Mask | None = None) -> WheelChannel:
         """The same data under another noise model, weights reset; `use` (E,) leaves samples out."""
-        driven = self.driven if use is None else replace(self.driven, use=self.driven.use & use)
+        motion = self.motion if use is None else replace(self.motion, use=self.motion.use & use)
         return replace(
-            self, driven=driven, gains=wheel_gains(noise, driven), weight=np.ones(self.weight.shape), noise=noise
+            self, motion=motion, gains=wheel_gains(noise, motion), weight=np.ones(self.weight.shape), noise=noise
         )
 
     def expecting(self, p: Array) -> WheelChannel:
         """The same, whose wheels' slow error acts on the speed that a parameter vector gives; weights reset."""
         turned = np.diff(self._predicted(p), axis=0, prepend=np.nan)
-        moving = (self.driven.dt_s > 0.0) & ~self.driven.restart
-        expected = np.where(moving[:, None], turned / np.maximum(self.driven.dt_s, 1e-9)[:, None], 0.0)
-        return replace(self, driven=replace(self.driven, expected_rad_s=expected)).with_noise(self.noise)
+        moving = (self.motion.dt_s > 0.0) & ~self.motion.restart
+        expected = np.where(moving[:, None], turned / np.maximum(self.motion.dt_s, 1e-9)[:, None], 0.0)
+        return replace(self, motion=replace(self.motion, expected_rad_s=expected)).with_noise(self.noise)
 
     def weighted(self, weight: Array) -> WheelChannel:
         """The same with other weights (E, 2)."""
@@ -158,7 +158,7 @@ class WheelChannel:
     @property
     def block(self) -> Index:
         """Block of time of each residual, (2 E,)."""
-        return np.repeat(self.timeline.encoder.block, 2)
+        return np.repeat(self.drive.encoder.block, 2)
 
     @property
     def count(self) -> int:
@@ -172,16 +172,18 @@ class WheelChannel:
 
     def angles(self, p: Array, extra: Array | None = None) -> Array:
         """Free-running wheel angles at the nodes, (M, 2)."""
-        line = self.timeline
-        push = total_push(line, 2, line.known_command, extra)
-        return run_wheels(p, self.geometry, line.command_rad_s, push, line.first, line.t_s, line.speed_rad_s)
+        drive = self.drive
+        perturbation = total_perturbation(drive, 2, drive.known_command, extra)
+        return run_wheels(
+            p, self.geometry, drive.command_rad_s, perturbation, drive.first, drive.t_s, drive.speed_rad_s
+        )
 
     def raw_residual(self, p: Array, extra: Array | None = None) -> Array:
         """Measured minus predicted wheel angles at the samples, (E, 2)."""
-        return self.timeline.encoder_angle_rad - self._predicted(p, extra)
+        return self.drive.encoder_angle_rad - self._predicted(p, extra)
 
     def _predicted(self, p: Array, extra: Array | None = None) -> Array:
-        place = self.timeline.encoder
+        place = self.drive.encoder
         predicted = np.empty((place.t_s.size, 2))
         read_angles(self.angles(p, extra), place.node, place.fraction, predicted)
         return predicted
@@ -199,8 +201,8 @@ class WheelChannel:
 class BodyChannel:
     """Measured wheel angles in, poses out, in windows of `WINDOW_S` whose start pose is unknown."""
 
-    timeline: Timeline
-    samples: Samples
+    drive: GriddedDrive
+    samples: GridSamples
     measured: Array
     window: Index
     first_node: Index
@@ -213,23 +215,23 @@ class BodyChannel:
     geometry: Array
 
     @classmethod
-    def build(cls, line: Timeline, noise: BodyNoise, geometry: Array, use: Mask | None = None) -> BodyChannel:
+    def build(cls, drive: GriddedDrive, noise: BodyNoise, geometry: Array, use: Mask | None = None) -> BodyChannel:
         """The channel with a noise model; `geometry` is the parameter vector that describes the motion roughly.
 
-        `use` (P,) leaves single poses of the timeline out.
+        `use` (P,) leaves single poses of the drive out.
         """
-        window, keep = _windows(line)
-        samples = line.pose.pick(keep)
-        measured = _turned_as_the_wheels(line, samples, line.pose_values[keep], geometry)
+        window, keep = _windows(drive)
+        samples = drive.pose.pick(keep)
+        measured = _turned_as_the_wheels(drive, samples, drive.pose_values[keep], geometry)
         chosen = np.ones(samples.t_s.size, dtype=bool) if use is None else use[keep]
-        starts = np.flatnonzero(line.first)
-        ends = np.append(starts[1:], line.t_s.size) - 1
+        starts = np.flatnonzero(drive.first)
+        ends = np.append(starts[1:], drive.t_s.size) - 1
         run = np.searchsorted(starts, samples.node, side="right") - 1
-        rim = np.abs(line.speed_rad_s).max(axis=1) * geometry[0]
-        rolling = np.abs(line.speed_rad_s).mean(axis=1) * geometry[0]
-        moving_s = np.cumsum(np.minimum(rolling / DRIFT_ONSET_M_S, 1.0)) * CELL_S
+        rim = np.abs(drive.speed_rad_s).max(axis=1) * geometry[0]
+        rolling = np.abs(drive.speed_rad_s).mean(axis=1) * geometry[0]
+        moving_s = np.cumsum(np.minimum(rolling / DRIFT_ONSET_M_S, 1.0)) * GRID_STEP_S
         channel = cls(
-            line,
+            drive,
             samples,
             measured,
             window,
@@ -244,10 +246,10 @@ class BodyChannel:
         )
         return replace(channel, gains=body_gains(noise, channel.motion(rim)))
 
-    def motion(self, rim_m_s: Array) -> Motion:
+    def motion(self, rim_m_s: Array) -> BodyMotion:
         """How the robot moved between the pose samples, from the wheels and the rough geometry."""
-        line, samples, p = self.timeline, self.samples, self.geometry
-        speeds = line.speed_rad_s[samples.node]
+        drive, samples, p = self.drive, self.samples, self.geometry
+        speeds = drive.speed_rad_s[samples.node]
         v = 0.5 * p[0] * (speeds[:, 0] + speeds[:, 1])
         omega = p[0] / p[1] * (speeds[:, 1] - speeds[:, 0])
         restart = np.concatenate([[True], np.diff(self.window) != 0])
@@ -257,7 +259,7 @@ class BodyChannel:
         dt = np.diff(samples.t_s, prepend=samples.t_s[0])
         dt[restart] = 0.0
         moving = np.minimum(rim_m_s[samples.node] / ONSET_M_S, 1.0)
-        return Motion(dt, step[:, 0], step[:, 1], predicted[:, 2], moving, v, omega, restart, self.use)
+        return BodyMotion(dt, step[:, 0], step[:, 1], predicted[:, 2], moving, v, omega, restart, self.use)
 
     def with_noise(self, noise: BodyNoise, geometry: Array | None = None, use: Mask | None = None) -> BodyChannel:
         """The same data under another noise model, weights reset; `use` is over this channel's samples."""
@@ -267,7 +269,7 @@ class BodyChannel:
             geometry=self.geometry if geometry is None else geometry,
             use=self.use if use is None else use,
         )
-        rim = np.abs(self.timeline.speed_rad_s).max(axis=1) * changed.geometry[0]
+        rim = np.abs(self.drive.speed_rad_s).max(axis=1) * changed.geometry[0]
         return replace(
             changed, gains=body_gains(noise, changed.motion(rim)), weight=np.ones((self.samples.t_s.size, 3))
         )
@@ -317,9 +319,9 @@ class BodyChannel:
 
     def track(self, p: Array, extra: Array | None = None) -> Array:
         """Path at the nodes from the measured wheel angles, (M, 3)."""
-        line = self.timeline
-        push = total_push(line, 3, line.known_motion, extra)
-        return run_body(p, line.angle_rad, line.speed_rad_s, push, line.first, line.t_s)
+        drive = self.drive
+        perturbation = total_perturbation(drive, 3, drive.known_motion, extra)
+        return run_body(p, drive.angle_rad, drive.speed_rad_s, perturbation, drive.first, drive.t_s)
 
     def raw_residual(self, p: Array, extra: Array | None = None) -> Array:
         """Measured minus predicted poses (P, 3) in the world, each window laid on its measurements."""
@@ -345,18 +347,23 @@ class BodyChannel:
         return (self.whitened(p, extra) * self.weight).ravel()
 
 
-def total_push(line: Timeline, width: int, *pushes: Array | None) -> Array:
+def total_perturbation(drive: GriddedDrive, width: int, *perturbations: Array | None) -> Array:
     """Sum (M, width) of what is added at the nodes by those that are there."""
-    return np.asarray(sum((push for push in pushes if push is not None), np.zeros((line.t_s.size, width))))
+    return np.asarray(
+        sum(
+            (perturbation for perturbation in perturbations if perturbation is not None),
+            np.zeros((drive.t_s.size, width)),
+        )
+    )
 
 
-def _windows(line: Timeline) -> tuple[Index, Mask]:
+def _windows(drive: GriddedDrive) -> tuple[Index, Mask]:
     """Window of each kept pose, numbered from 0, and which poses are kept (those in windows that are too thin are not).
 
     A window ends after `WINDOW_S`, with its run, and where poses fail to come for long.
     """
-    t, node = line.pose.t_s, line.pose.node
-    run = np.searchsorted(np.flatnonzero(line.first), node, side="right")
+    t, node = drive.pose.t_s, drive.pose.node
+    run = np.searchsorted(np.flatnonzero(drive.first), node, side="right")
     number = np.zeros(t.size, dtype=np.int64)
     current, begin = 0, 0
     for k in range(1, t.size):
@@ -369,17 +376,17 @@ def _windows(line: Timeline) -> tuple[Index, Mask]:
     return renumbered.astype(np.int64), keep
 
 
-def _turned_as_the_wheels(line: Timeline, samples: Samples, measured: Array, geometry: Array) -> Array:
+def _turned_as_the_wheels(drive: GriddedDrive, samples: GridSamples, measured: Array, geometry: Array) -> Array:
     """Poses (P, 3) with whole turns as the wheels make them: while no pose comes, it may be more than half of one."""
-    push = total_push(line, 3, line.known_motion)
-    track = run_body(geometry, line.angle_rad, line.speed_rad_s, push, line.first, line.t_s)
+    perturbation = total_perturbation(drive, 3, drive.known_motion)
+    track = run_body(geometry, drive.angle_rad, drive.speed_rad_s, perturbation, drive.first, drive.t_s)
     expected = np.empty(measured.shape)
     read_angles(track, samples.node, samples.fraction, expected)
     yaw = expected[:, 2] + np.unwrap(measured[:, 2] - expected[:, 2])
     return np.column_stack([measured[:, :2], yaw])
 
 
-def _no_motion(samples: Samples) -> Motion:
+def _no_motion(samples: GridSamples) -> BodyMotion:
     still = np.zeros(samples.t_s.size)
     flags = np.zeros(samples.t_s.size, dtype=bool)
-    return Motion(still, still, still, still, still, still, still, ~flags, ~flags)
+    return BodyMotion(still, still, still, still, still, still, still, ~flags, ~flags)

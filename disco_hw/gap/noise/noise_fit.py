@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from disco_hw.gap.data.gridded_drive import Timeline
+from disco_hw.gap.data.gridded_drive import GriddedDrive
 from disco_hw.gap.noise.body_noise import BodyNoise, body_likelihood
 from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
 from disco_hw.gap.noise.wheel_noise import WheelNoise, wheel_likelihood, whiten_wheels
@@ -60,20 +60,20 @@ def _minimise(objective, start: Array, low: Array, high: Array, most: int) -> Ar
     return np.asarray(found.x)
 
 
-def largest_command_jitter_s(line: Timeline) -> float:
+def largest_command_jitter_s(drive: GriddedDrive) -> float:
     """How far commands may plausibly come early or late, s, by how the encoder's time stamps scatter.
 
     More than that is no jitter but a response that the model does not have, and must not pass for noise.
     """
-    return _LEAST_JITTER_S + _JITTER_RATIO * line.stamp_scatter_s + _JITTER_SHARE * line.encoder_period_s
+    return _LEAST_JITTER_S + _JITTER_RATIO * drive.stamp_scatter_s + _JITTER_SHARE * drive.encoder_period_s
 
 
 def wheel_misfit(channel: WheelChannel, raw: Array) -> Callable[[Array], float]:
     """Minus the robust log likelihood of what a model leaves of the angles (E, 2), by logarithms of the noise (7,)."""
-    driven = channel.driven
+    motion = channel.motion
     # A wheel at rest reads the same however coarse its encoder is, and would speak for readings without error.
-    counted = driven.use & ~driven.restart & (np.abs(driven.speed_rad_s).max(axis=1) > _REST_RAD_S)
-    likelihood = wheel_likelihood(driven, counted, raw)
+    counted = motion.use & ~motion.restart & (np.abs(motion.speed_rad_s).max(axis=1) > _REST_RAD_S)
+    likelihood = wheel_likelihood(motion, counted, raw)
 
     def misfit(logs: Array) -> float:
         white, weight = likelihood(logs)
@@ -84,7 +84,7 @@ def wheel_misfit(channel: WheelChannel, raw: Array) -> Callable[[Array], float]:
 
 def fit_wheel_noise(channel: WheelChannel, raw: Array) -> WheelNoise:
     """Noise of the wheels by maximum likelihood of what a model leaves of the angles, (E, 2)."""
-    line = channel.timeline
+    drive = channel.drive
     start = channel.noise.vector()
     misfit = wheel_misfit(channel, raw)
 
@@ -93,11 +93,11 @@ def fit_wheel_noise(channel: WheelChannel, raw: Array) -> WheelNoise:
 
     # A speed that may be wrong by any amount for any time would explain wheels that do not turn at all.
     most = np.minimum(start + 5.0, WheelNoise(*_LARGEST_WHEEL_NOISE).vector())
-    most[_COMMAND_STAMP] = min(most[_COMMAND_STAMP], math.log(largest_command_jitter_s(line)))
+    most[_COMMAND_STAMP] = min(most[_COMMAND_STAMP], math.log(largest_command_jitter_s(drive)))
     begin = np.minimum(start, most)
     least = begin - 5.0
-    if line.quantum_rad > 0.0:
-        least[_READING] = max(least[_READING], math.log(line.quantum_rad / math.sqrt(12.0)))
+    if drive.quantum_rad > 0.0:
+        least[_READING] = max(least[_READING], math.log(drive.quantum_rad / math.sqrt(12.0)))
     return WheelNoise.from_vector(_minimise(objective, np.maximum(begin, least), least, most, 25))
 
 
@@ -109,7 +109,7 @@ def _pull(logs: Array, start: Array) -> float:
 def fit_body_noise(channel: BodyChannel, p: Array, extra: Array | None = None, iterations: int = 15) -> BodyNoise:
     """Noise of poses and body by maximum likelihood at a parameter vector and what unnamed terms add."""
     raw = channel.raw_residual(p, extra)
-    rim = np.abs(channel.timeline.speed_rad_s).max(axis=1) * channel.geometry[0]
+    rim = np.abs(channel.drive.speed_rad_s).max(axis=1) * channel.geometry[0]
     motion = channel.motion(rim)
     start = channel.noise.vector()
     likelihood = body_likelihood(motion, raw)

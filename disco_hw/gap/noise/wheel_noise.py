@@ -61,7 +61,7 @@ class WheelNoise:
 
 
 @dataclass(frozen=True, slots=True)
-class Driven:
+class WheelMotion:
     """How the wheels were driven between samples: what the filter's transition needs.
 
     `dt_s` (E,) since the sample before, measured `speed_rad_s` (E, 2), `expected_rad_s` (E, 2) that a model gives,
@@ -227,24 +227,24 @@ def _mean(dt_s: Array, speed_rad_s: Array, span_s: float, fewest: int) -> Array:
     return np.asarray(uniform_filter1d(speed_rad_s, 2 * half + 1, axis=0, mode="nearest"))
 
 
-def wheel_gains(noise: WheelNoise, driven: Driven) -> WheelGains:
+def wheel_gains(noise: WheelNoise, motion: WheelMotion) -> WheelGains:
     """Gains for one motion of the wheels."""
-    count = driven.dt_s.size
+    count = motion.dt_s.size
     decay, reach = np.empty((count, 2)), np.empty((count, 2, 2))
     gain, scale = np.empty((count, 2, 3)), np.empty((count, 2))
-    _gains(np.exp(noise.vector()), *_along(driven), decay, reach, gain, scale)
-    return WheelGains(decay, reach, gain, scale, driven.restart, driven.use)
+    _gains(np.exp(noise.vector()), *_along(motion), decay, reach, gain, scale)
+    return WheelGains(decay, reach, gain, scale, motion.restart, motion.use)
 
 
 def wheel_likelihood(
-    driven: Driven, counted: NDArray[np.bool_], residual: Array
+    motion: WheelMotion, counted: NDArray[np.bool_], residual: Array
 ) -> Callable[[Array], tuple[Array, float]]:
     """For angle residuals (E, 2), of which some are `counted` (E,), a function of the logarithms of the noise (7,).
 
     It gives the whitened residuals (E, 2), 0 where none counts, and the sum of the logarithms of their weights: what a
     likelihood needs, in one go and without keeping the gains.
     """
-    along = _along(driven)
+    along = _along(motion)
 
     def at(logs: Array) -> tuple[Array, float]:
         out = np.empty(residual.shape)
@@ -253,9 +253,9 @@ def wheel_likelihood(
     return at
 
 
-def _along(driven: Driven) -> tuple[Array | NDArray[np.bool_], ...]:
+def _along(motion: WheelMotion) -> tuple[Array | NDArray[np.bool_], ...]:
     """A motion of the wheels as the kernels take it."""
-    return driven.dt_s, driven.speed_rad_s, driven.expected_rad_s, driven.jumps, driven.restart, driven.use
+    return motion.dt_s, motion.speed_rad_s, motion.expected_rad_s, motion.jumps, motion.restart, motion.use
 
 
 def whiten_wheels(residual: Array, gains: WheelGains) -> Array:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.gap.search.channel_search import UnnamedTerm
-from disco_hw.gap.search.intervals import Estimate, Estimates
+from disco_hw.gap.search.intervals import ChannelEstimates, ParameterEstimate
 from disco_hw.model import EffectSetting, Gaussian, Model
 from disco_hw.model.parameter import BASE_PARAMETERS
 from disco_hw.model.terms import TERMS, effect_of
@@ -19,7 +19,9 @@ Array = NDArray[np.float64]
 _Z95 = 1.96
 
 
-def with_terms_named(part: Estimates, unnamed: Sequence[UnnamedTerm], geometry: tuple[float, float]) -> Estimates:
+def with_terms_named(
+    part: ChannelEstimates, unnamed: Sequence[UnnamedTerm], geometry: tuple[float, float]
+) -> ChannelEstimates:
     """A channel's estimates with the numbers of its unnamed terms under their names in a model.
 
     They are put in units of the speeds that wheels of the final `geometry` (radius, axial distance, m) make.
@@ -35,15 +37,15 @@ def with_terms_named(part: Estimates, unnamed: Sequence[UnnamedTerm], geometry: 
         factor = TERMS[name].rescaled(geometry[0] / old_radius, geometry[1] / old_axial)
         names[place], factors[place] = f"{name}.k", factor
         old = by_name.pop(column)
-        by_name[f"{name}.k"] = Estimate(old.value * factor, old.low * factor, old.high * factor)
-    return Estimates(by_name, tuple(names), part.covariance * np.outer(factors, factors))
+        by_name[f"{name}.k"] = ParameterEstimate(old.value * factor, old.low * factor, old.high * factor)
+    return ChannelEstimates(by_name, tuple(names), part.covariance * np.outer(factors, factors))
 
 
 def amended_model(
     model: Model,
-    effects: Mapping[str, Mapping[str, Estimate]],
+    effects: Mapping[str, Mapping[str, ParameterEstimate]],
     terms: Sequence[str],
-    parts: tuple[Estimates, ...],
+    parts: tuple[ChannelEstimates, ...],
 ) -> tuple[Model, tuple[str, ...]]:
     """The model with base parameters of `parts`, `effects` and `terms` added, and their joint Gaussian; and notes.
 
@@ -56,7 +58,7 @@ def amended_model(
     known = _known_terms(model, base)
     for name in terms:
         found, before = estimates[f"{name}.k"], known[name].value if name in known else 0.0
-        known[name] = Estimate(before + found.value, before + found.low, before + found.high)
+        known[name] = ParameterEstimate(before + found.value, before + found.low, before + found.high)
     wanted = {**effects, **{name: {"k": estimate} for name, estimate in known.items()}}
     settings = []
     for name, values in wanted.items():
@@ -81,7 +83,7 @@ def amended_model(
     return replace(bare, belief=belief), tuple(notes)
 
 
-def _known_terms(model: Model, base: Mapping[str, float]) -> dict[str, Estimate]:
+def _known_terms(model: Model, base: Mapping[str, float]) -> dict[str, ParameterEstimate]:
     """The terms that a model has, with their intervals, in units of the refitted `base`."""
     ratios = [
         base.get(name, getattr(model, name)) / getattr(model, name) for name in ("wheel_radius_m", "axial_distance_m")
@@ -96,15 +98,15 @@ def _known_terms(model: Model, base: Mapping[str, float]) -> dict[str, Estimate]
             place = model.belief.names.index(key)
             deviation = abs(factor) * float(model.belief.covariance()[place, place]) ** 0.5
         value = setting.values["k"] * factor
-        found[setting.name] = Estimate(value, value - _Z95 * deviation, value + _Z95 * deviation)
+        found[setting.name] = ParameterEstimate(value, value - _Z95 * deviation, value + _Z95 * deviation)
     return found
 
 
 def _joint(
     bare: Model,
-    effects: Mapping[str, Mapping[str, Estimate]],
-    estimates: Mapping[str, Estimate],
-    parts: tuple[Estimates, ...],
+    effects: Mapping[str, Mapping[str, ParameterEstimate]],
+    estimates: Mapping[str, ParameterEstimate],
+    parts: tuple[ChannelEstimates, ...],
 ) -> tuple[tuple[str, ...], Array]:
     """Names and covariance: joint within a channel, independent between channels."""
     full = {f"{effect}.{key}": estimate for effect, values in effects.items() for key, estimate in values.items()}

@@ -12,7 +12,7 @@ from disco_hw.effects.effect import Parameter
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.noise.channels import WheelChannel
 from disco_hw.gap.search.candidates import CANDIDATES, candidates_of
-from disco_hw.gap.search.channel_search import Found
+from disco_hw.gap.search.channel_search import ChannelResult
 from disco_hw.gap.search.least_squares import inverse, sensitivity, solve
 
 Array = NDArray[np.float64]
@@ -44,7 +44,7 @@ class BlindSpot:
     experiment: str
 
 
-def blind_spots(found: Found, top_rad_s: float | None = None) -> tuple[BlindSpot, ...]:
+def blind_spots(found: ChannelResult, top_rad_s: float | None = None) -> tuple[BlindSpot, ...]:
     """Blind spots of one channel, one for each of its effects that was not accepted.
 
     `top_rad_s`: the largest wheel speed of the robot, if it is known; without it nobody knows what was not asked of it.
@@ -62,7 +62,7 @@ def blind_spots(found: Found, top_rad_s: float | None = None) -> tuple[BlindSpot
     return tuple(spots)
 
 
-def _spot(found: Found, name: str) -> BlindSpot:
+def _spot(found: ChannelResult, name: str) -> BlindSpot:
     parameter = REGISTRY[name].parameters[0]
     size = _size(found, name, f"{name}.{parameter.name}")
     blind = size is None or size > _realistic(parameter)
@@ -80,7 +80,7 @@ def experiment_of(name: str) -> str:
     return f"disco-hw drive ROBOT.toml --script {effect.script}: {effect.excitation}"
 
 
-def _limit(found: Found, name: str, top_rad_s: float | None) -> BlindSpot:
+def _limit(found: ChannelResult, name: str, top_rad_s: float | None) -> BlindSpot:
     wheels, parameter = found.selector.channel.inner, REGISTRY[name].parameters[0]
     assert isinstance(wheels, WheelChannel)
     if name == _RAMP:
@@ -99,7 +99,7 @@ def _limit(found: Found, name: str, top_rad_s: float | None) -> BlindSpot:
 
 def _largest(wheels: WheelChannel, name: str) -> float | None:
     """The largest limit that cuts at least half a second of the commands."""
-    command = wheels.timeline.command_rad_s
+    command = wheels.drive.command_rad_s
     command = command[np.isfinite(command[:, 0])]
     if name == "speed_limit":
         size = np.abs(command).max(axis=1)
@@ -110,7 +110,7 @@ def _largest(wheels: WheelChannel, name: str) -> float | None:
     return float(0.97 * np.sort(size)[-50])
 
 
-def _largest_ramp(found: Found) -> float | None:
+def _largest_ramp(found: ChannelResult) -> float | None:
     """The largest limit of the yaw acceleration that would have shown, with a lag and a delay that may hide it."""
     channel, best = found.selector.channel, found.fit
     layout, limits = channel.layout, found.selector.thresholds
@@ -128,7 +128,7 @@ def _largest_ramp(found: Found) -> float | None:
     return None
 
 
-def _size(found: Found, name: str, column: str) -> float | None:
+def _size(found: ChannelResult, name: str, column: str) -> float | None:
     """Size at which the expected evidence reaches the threshold and the 2 s prediction moves as far as it must.
 
     The other free parameters make up for what they can.
@@ -165,7 +165,7 @@ def _size(found: Found, name: str, column: str) -> float | None:
     return size if size < limit else None
 
 
-def _by_trial(found: Found, column: str, threshold: float) -> float | None:
+def _by_trial(found: ChannelResult, column: str, threshold: float) -> float | None:
     """Smallest of a row of sizes whose prediction differs from the one without clearly, and enough to matter."""
     channel, best = found.selector.channel, found.fit
     place = channel.layout.place[column]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from disco_hw.gap.report.findings import REPORTED_HORIZON_S, STAGES
 from disco_hw.gap.report.regimes import Regime
-from disco_hw.gap.search.cross_validation import Errors
+from disco_hw.gap.search.cross_validation import PredictionErrors
 
 Array = NDArray[np.float64]
 
@@ -34,10 +34,12 @@ def _legend_above(axes: Axes) -> None:
     axes.legend(frameon=False, ncols=3, loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.2, fontsize=9)
 
 
-def gap_by_horizon(gap: dict[str, dict[float, Errors]]) -> bytes:
+def gap_by_horizon(gap: dict[str, dict[float, PredictionErrors]]) -> bytes:
     """Position and heading error over the horizon, for every stage, with bootstrap intervals."""
     figure = Figure(figsize=(9.0, 3.4))
-    panels: list[tuple[str, Callable[[Errors], float], Callable[[Errors], tuple[float, float]], float]] = [
+    panels: list[
+        tuple[str, Callable[[PredictionErrors], float], Callable[[PredictionErrors], tuple[float, float]], float]
+    ] = [
         ("position error, mm", lambda e: e.position_m, lambda e: e.position_ci, 1e3),
         ("heading error, mrad", lambda e: e.yaw_rad, lambda e: e.yaw_ci, 1e3),
     ]
@@ -57,7 +59,7 @@ def gap_by_horizon(gap: dict[str, dict[float, Errors]]) -> bytes:
     return png(figure)
 
 
-def gap_by_regime(gap: dict[str, dict[float, Errors]]) -> bytes:
+def gap_by_regime(gap: dict[str, dict[float, PredictionErrors]]) -> bytes:
     """Position error two seconds ahead by what the robot was doing."""
     names = sorted(gap["refitted"][REPORTED_HORIZON_S].by_regime_m)
     figure = Figure(figsize=(9.0, 0.6 + 0.5 * max(len(names), 1)))

@@ -8,8 +8,8 @@ from typing import Any
 
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.report.blind_spots import BlindSpot
-from disco_hw.gap.search.cross_validation import WORSE, Errors, worse_by
-from disco_hw.gap.search.intervals import Estimate
+from disco_hw.gap.search.cross_validation import WORSE, PredictionErrors, worse_by
+from disco_hw.gap.search.intervals import ParameterEstimate
 from disco_hw.model import Model
 
 REPORTED_HORIZON_S = 2.0
@@ -32,7 +32,7 @@ class EffectFinding:
 
     name: str
     channel: str
-    parameters: dict[str, Estimate]
+    parameters: dict[str, ParameterEstimate]
     evidence: float
     indistinguishable_from: tuple[str, ...] = ()
     experiment: str | None = None
@@ -74,7 +74,7 @@ class GapReport:
     effects: tuple[EffectFinding, ...]
     unnamed: tuple[UnnamedFinding, ...]
     blind_spots: tuple[BlindSpot, ...]
-    gap: dict[str, dict[float, Errors]]
+    gap: dict[str, dict[float, PredictionErrors]]
     model: Model
     seconds: float
     residue: tuple[str, ...] = ()
@@ -208,8 +208,8 @@ class GapReport:
         lines = [*self.answer(), ""]
         for effect in self.effects:
             values = ", ".join(f"{n} {e.value:.4g} [{e.low:.4g}, {e.high:.4g}]" for n, e in effect.parameters.items())
-            lines.append(f"{effect.channel}: {effect.name}: {values}{_alike(effect)}")
-        lines += [f"{term.channel}: unnamed: {term.form}{_alike(term)}" for term in self.unnamed]
+            lines.append(f"{effect.channel}: {effect.name}: {values}{_confounded(effect)}")
+        lines += [f"{term.channel}: unnamed: {term.form}{_confounded(term)}" for term in self.unnamed]
         lines += list(self.residue)
         if self.gap:
             lines += ["", f"{'ahead':>6} " + " ".join(f"{stage:>20}" for stage in STAGES)]
@@ -219,18 +219,18 @@ class GapReport:
         return "\n".join(lines)
 
 
-def _in_cell(errors: Errors) -> str:
+def _in_cell(errors: PredictionErrors) -> str:
     if not math.isfinite(errors.position_m):
         return "-"
     return f"{1e3 * errors.position_m:9.1f} mm {errors.yaw_rad:6.3f} rad"
 
 
-def _alike(finding: EffectFinding | UnnamedFinding) -> str:
+def _confounded(finding: EffectFinding | UnnamedFinding) -> str:
     same = ", ".join(finding.indistinguishable_from)
     return f" (not to be told from {same})" if same else ""
 
 
-def _errors_dict(errors: Errors) -> dict[str, Any]:
+def _errors_dict(errors: PredictionErrors) -> dict[str, Any]:
     return {
         "position_rmse_m": errors.position_m,
         "position_ci95_m": list(errors.position_ci),

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.effects.registry import REGISTRY
-from disco_hw.gap.data.gridded_drive import CELL_S
+from disco_hw.gap.data.gridded_drive import GRID_STEP_S
 from disco_hw.gap.data.layout import BODY
 from disco_hw.gap.noise.channels import BodyChannel
 from disco_hw.gap.search.candidates import CANDIDATES, indices
-from disco_hw.gap.search.channel_search import Found
+from disco_hw.gap.search.channel_search import ChannelResult
 from disco_hw.gap.search.evidence import inflation
 from disco_hw.gap.search.least_squares import fit
 from disco_hw.gap.search.selection import Split
@@ -28,26 +28,26 @@ _LEVER_M = 0.2
 _UNITS = ("m/s ahead", "m/s to the side", "rad/s")
 
 
-def other_forms(found: Found) -> list[str]:
+def misspecified_effects(found: ChannelResult) -> list[str]:
     """Sentences on accepted effects of the body that are not as strong where they are small as where they are large."""
     channel = found.channel
     if not isinstance(channel, BodyChannel):
         return []
     out = []
     for name in found.names:
-        pushed = _pushed(found.selector.split(found.names), name, channel)
-        level, axis = _middle(pushed)
+        perturbation = _perturbation_of(found.selector.split(found.names), name, channel)
+        level, axis = _middle(perturbation)
         if level <= 0.0:
             continue
         # What saturates grows with less than its first power, what sets in late with more.
-        more = pushed * np.sqrt(np.abs(pushed[:, axis]) / level)[:, None]
+        more = perturbation * np.sqrt(np.abs(perturbation[:, axis]) / level)[:, None]
         wide = WithTerms.of(channel, (*(one.term for one in found.unnamed), Term("", more)))
         now = found.fit
         free = fit(wide, np.append(now.vector, 0.0), indices(wide, found.names))
         if 2.0 * (now.cost - free.cost) < _SIGMAS**2 * inflation(free, wide, (free.vector.size - 1,)):
             continue
-        again = _pushed(wide.split(free.vector), name, channel)
-        share = float((again * pushed).sum() / (pushed**2).sum())
+        again = _perturbation_of(wide.split(free.vector), name, channel)
+        share = float((again * perturbation).sum() / (perturbation**2).sum())
         times = _ratio(share + 0.5 * float(free.vector[-1]), share + float(free.vector[-1]))
         out.append(
             f"wheel_to_body: {name} is {times:.1f} times as strong where it makes up {0.25 * level:.2g} "
@@ -63,7 +63,7 @@ def _ratio(small: float, large: float) -> float:
     return max(small / large, 1.0 / _MOST_TIMES)
 
 
-def _pushed(split: Split, name: str, channel: BodyChannel) -> Array:
+def _perturbation_of(split: Split, name: str, channel: BodyChannel) -> Array:
     """What an effect adds to the body's velocity at the nodes of a fit, (M, 3) in m/s, m/s, rad/s."""
     place = channel.layout.place
     vector, extra = split
@@ -71,7 +71,7 @@ def _pushed(split: Split, name: str, channel: BodyChannel) -> Array:
     columns = [place[column] for column in CANDIDATES[name].columns]
     without[columns] = channel.layout.neutral[columns]
     if not REGISTRY[name].moves:
-        return np.zeros((channel.timeline.t_s.size, 3))
+        return np.zeros((channel.drive.t_s.size, 3))
     return _velocity(channel, vector, extra) - _velocity(channel, without, extra)
 
 
@@ -81,19 +81,19 @@ def _velocity(channel: BodyChannel, vector: Array, extra: Array | None) -> Array
     """
     track = channel.track(vector, extra)
     step = np.diff(track, axis=0, append=track[-1:])
-    step[np.append(channel.timeline.first[1:], True)] = 0.0
+    step[np.append(channel.drive.first[1:], True)] = 0.0
     yaw = track[:, 2] + 0.5 * step[:, 2]
     ahead = np.cos(yaw) * step[:, 0] + np.sin(yaw) * step[:, 1]
-    # Of the point that rolls, as a push of the yaw rate moves the tracked one to the side by itself.
+    # Of the point that rolls, as a perturbation of the yaw rate moves the tracked one to the side by itself.
     left = np.cos(yaw) * step[:, 1] - np.sin(yaw) * step[:, 0] + BODY.at(vector, "x_icr_m") * step[:, 2]
-    return np.column_stack([ahead, left, step[:, 2]]) / CELL_S
+    return np.column_stack([ahead, left, step[:, 2]]) / GRID_STEP_S
 
 
-def _middle(pushed: Array) -> tuple[float, int]:
+def _middle(perturbation: Array) -> tuple[float, int]:
     """The size below which half of what an effect does is done, and the axis it acts on most."""
-    power = (pushed * (1.0, 1.0, _LEVER_M)) ** 2
+    power = (perturbation * (1.0, 1.0, _LEVER_M)) ** 2
     axis = int(np.argmax(power.sum(axis=0)))
-    size = np.sort(np.abs(pushed[:, axis]))
+    size = np.sort(np.abs(perturbation[:, axis]))
     share = np.cumsum(size**2)
     if share[-1] <= 0.0:
         return 0.0, axis

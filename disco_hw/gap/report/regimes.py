@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.gap.data.gridded_drive import Samples, Timeline
+from disco_hw.gap.data.gridded_drive import GriddedDrive, GridSamples
 from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
 
 Array = NDArray[np.float64]
@@ -32,14 +32,14 @@ class Regime:
     samples: int
 
 
-def masks(line: Timeline, samples: Samples) -> Mapping[str, Mask]:
+def masks(drive: GriddedDrive, samples: GridSamples) -> Mapping[str, Mask]:
     """Which samples lie in which regime; regimes overlap."""
-    return {name: mask[samples.node] for name, mask in masks_at_nodes(line).items()}
+    return {name: mask[samples.node] for name, mask in masks_at_nodes(drive).items()}
 
 
-def masks_at_nodes(line: Timeline) -> Mapping[str, Mask]:
+def masks_at_nodes(drive: GriddedDrive) -> Mapping[str, Mask]:
     """Which nodes (M,) lie in which regime; regimes overlap."""
-    speed = line.speed_rad_s
+    speed = drive.speed_rad_s
     mean, half = speed.mean(axis=1), 0.5 * (speed[:, 1] - speed[:, 0])
     ahead = np.minimum(np.arange(speed.shape[0]) + _SPAN_NODES, speed.shape[0] - 1)
     behind = np.maximum(np.arange(speed.shape[0]) - _SPAN_NODES, 0)
@@ -50,7 +50,7 @@ def masks_at_nodes(line: Timeline) -> Mapping[str, Mask]:
     middle = float(np.median(size[moving])) if moving.any() else 1.0
     turning = np.abs(half) > 0.3
     usual_turn = float(np.median(np.abs(half[turning]))) if turning.any() else 1.0
-    times = np.linspace(line.t_s[0], line.t_s[-1], 4)
+    times = np.linspace(drive.t_s[0], drive.t_s[-1], 4)
     return {
         "standstill": ~moving,
         "speeding up": moving & (growth >= _SPEEDING_RAD_S2),
@@ -64,8 +64,8 @@ def masks_at_nodes(line: Timeline) -> Mapping[str, Mask]:
         "turning fast": turning & (np.abs(half) > usual_turn),
         "driving ahead": moving & (mean > 0.3),
         "driving back": moving & (mean < -0.3),
-        "early": line.t_s <= times[1],
-        "late": line.t_s >= times[2],
+        "early": drive.t_s <= times[1],
+        "late": drive.t_s >= times[2],
     }
 
 
@@ -73,12 +73,12 @@ def regimes(
     channel: WheelChannel | BodyChannel, before: Array, after: Array, extra: Array | None = None
 ) -> list[Regime]:
     """Every regime with enough samples, from the vectors before and after, the one that improves most first."""
-    samples = channel.timeline.encoder if isinstance(channel, WheelChannel) else channel.samples
+    samples = channel.drive.encoder if isinstance(channel, WheelChannel) else channel.samples
     use = channel.gains.use if isinstance(channel, WheelChannel) else channel.use
     first = (channel.whitened(before) ** 2).mean(axis=1)
     last = (channel.whitened(after, extra) ** 2).mean(axis=1)
     found = []
-    for name, mask in masks(channel.timeline, samples).items():
+    for name, mask in masks(channel.drive, samples).items():
         inside = mask & use
         if inside.sum() >= _FEWEST:
             found.append(Regime(name, float(first[inside].mean()), float(last[inside].mean()), int(inside.sum())))

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from disco_hw.gap.noise.channels import WheelChannel
 from disco_hw.gap.noise.noise_fit import largest_command_jitter_s
 from disco_hw.gap.report.regimes import masks
-from disco_hw.gap.search.channel_search import Found
+from disco_hw.gap.search.channel_search import ChannelResult
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -29,36 +29,36 @@ _MOST_REGIMES = 3
 _AT_BOUND = 0.9
 
 
-def left_over(found: Found) -> list[str]:
+def remaining_disagreements(found: ChannelResult) -> list[str]:
     """Sentences on what a channel's accepted set leaves, the loudest regime first; none where nothing is left."""
     channel = found.channel
     is_wheels = isinstance(channel, WheelChannel)
     name = "command_to_wheel" if is_wheels else "wheel_to_body"
     out = [f"{name}: {regime} still disagrees: {times:.1f} times the noise" for times, regime in loud_regimes(found)]
     if isinstance(channel, WheelChannel):
-        line = channel.timeline
-        if channel.noise.command_stamp_s > _AT_BOUND * largest_command_jitter_s(line):
+        drive = channel.drive
+        if channel.noise.command_stamp_s > _AT_BOUND * largest_command_jitter_s(drive):
             out.append(
                 f"{name}: speeding up and braking still disagree: as if commands came "
                 f"{1e3 * channel.noise.command_stamp_s:.0f} ms early or late at random, the encoder's time stamps "
-                f"scatter by {1e3 * line.stamp_scatter_s:.1f} ms"
+                f"scatter by {1e3 * drive.stamp_scatter_s:.1f} ms"
             )
     return out
 
 
-def loud_regimes(found: Found) -> list[tuple[float, str]]:
+def loud_regimes(found: ChannelResult) -> list[tuple[float, str]]:
     """Root mean square of what is left over the noise's, and name, of regimes in which something is left."""
     channel = found.channel
     if found.richest is None:
         return []
-    samples = channel.timeline.encoder if isinstance(channel, WheelChannel) else channel.samples
+    samples = channel.drive.encoder if isinstance(channel, WheelChannel) else channel.samples
     use = channel.gains.use if isinstance(channel, WheelChannel) else channel.use
     width = found.richest.size // use.size
     now = (found.fit.residual.reshape(-1, width) ** 2).sum(axis=1)
     best = (found.richest.reshape(-1, width) ** 2).sum(axis=1)
     price = _LEAST_NATS + _NATS_EACH * found.richest_parameters
     loud = []
-    for name, mask in masks(channel.timeline, samples).items():
+    for name, mask in masks(channel.drive, samples).items():
         inside = mask & use
         if name == "standstill" or inside.sum() < _FEWEST:
             continue

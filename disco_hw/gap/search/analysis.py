@@ -12,20 +12,28 @@ from numpy.typing import NDArray
 
 from disco_hw.effects.effect import Channel
 from disco_hw.effects.registry import REGISTRY
-from disco_hw.gap.data.gridded_drive import CELL_S, Timeline
+from disco_hw.gap.data.gridded_drive import GRID_STEP_S, GriddedDrive
 from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
 from disco_hw.gap.report.amend import with_terms_named
 from disco_hw.gap.report.blind_spots import BlindSpot, blind_spots, experiment_of
 from disco_hw.gap.report.findings import CandidateEvidence, ChannelFinding, EffectFinding, UnnamedFinding
-from disco_hw.gap.report.misspecification import other_forms
+from disco_hw.gap.report.misspecification import misspecified_effects
 from disco_hw.gap.report.regimes import in_words, regimes
-from disco_hw.gap.report.residue import left_over
+from disco_hw.gap.report.residue import remaining_disagreements
 from disco_hw.gap.search.candidates import CHANGE, candidates_of, indices, parameters_of
-from disco_hw.gap.search.channel_search import Found
-from disco_hw.gap.search.confounding import ASYMMETRY, ENCODER, GAIN, OUTSIDE_TESTS, PATCH_OR_CHANGE, alike, one_encoder
+from disco_hw.gap.search.channel_search import ChannelResult
+from disco_hw.gap.search.confounding import (
+    ASYMMETRY,
+    ENCODER,
+    GAIN,
+    OUTSIDE_TESTS,
+    PATCH_OR_CHANGE,
+    confounded_with,
+    one_encoder,
+)
 from disco_hw.gap.search.cross_validation import (
     Chain,
-    Errors,
+    PredictionErrors,
     errors_of,
     floor_errors,
     fold_vectors,
@@ -33,31 +41,31 @@ from disco_hw.gap.search.cross_validation import (
     smoothed_poses,
 )
 from disco_hw.gap.search.evidence import inflation
-from disco_hw.gap.search.intervals import Estimates, estimates, in_motion
+from disco_hw.gap.search.intervals import ChannelEstimates, estimate_parameters, in_motion
 from disco_hw.gap.search.least_squares import Fit, fit
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """What was found in the channels of one timeline; a channel that could not be judged is None.
+class GapAnalysis:
+    """What was found in the channels of one drive; a channel that could not be judged is None.
 
     `nominal_body`, `nominal_wheels` are the vectors of the model as given; `top_rad_s` the robot's largest wheel speed,
-    if it is known; `harmful` what fits and was left out, as predictions are worse with it.
+    if it is known; `pruned` what fits and was left out, as predictions are worse with it.
     """
 
-    line: Timeline
+    drive: GriddedDrive
     nominal_body: Array
     nominal_wheels: Array
-    body: Found | None
-    wheels: Found | None
+    body: ChannelResult | None
+    wheels: ChannelResult | None
     top_rad_s: float | None = None
-    harmful: tuple[str, ...] = ()
+    pruned: tuple[str, ...] = ()
 
     @cached_property
-    def _estimates(self) -> tuple[Estimates | None, Estimates | None]:
-        body, wheels = (None if found is None else estimates(found) for found in (self.body, self.wheels))
+    def _estimates(self) -> tuple[ChannelEstimates | None, ChannelEstimates | None]:
+        body, wheels = (None if found is None else estimate_parameters(found) for found in (self.body, self.wheels))
         if body is not None and wheels is not None:
             wheels = in_motion(wheels, body)
         return body, wheels
@@ -75,7 +83,7 @@ class Outcome:
         return one_encoder(wheels, told, seen is not None)
 
     @staticmethod
-    def _asymmetry(found: Found) -> tuple[float, float]:
+    def _asymmetry(found: ChannelResult) -> tuple[float, float]:
         """Asymmetry of the wheels that would fit best if it were free too, and its standard deviation."""
         channel, best = found.selector.channel, found.fit
         place = channel.layout.place[f"{ASYMMETRY}.ratio"]
@@ -84,7 +92,7 @@ class Outcome:
         return float(free.vector[place]), float(np.sqrt(variance))
 
     @cached_property
-    def _final_body(self) -> tuple[Fit, Estimates] | None:
+    def _final_body(self) -> tuple[Fit, ChannelEstimates] | None:
         """The body's fit; where an encoder is the cause, with its scale in place of the asymmetry."""
         estimated = self._estimates[0]
         if self.body is None or estimated is None:
@@ -101,9 +109,9 @@ class Outcome:
             vector[channel.layout.place[f"{ENCODER}.{side}"]] = gain
         refitted = fit(channel, vector, indices(channel, names))
         selector = replace(self.body.selector, fits={frozenset(names): refitted}, proofs={})
-        return refitted, estimates(replace(self.body, selector=selector, names=names))
+        return refitted, estimate_parameters(replace(self.body, selector=selector, names=names))
 
-    def parts(self) -> tuple[Estimates, ...]:
+    def parts(self) -> tuple[ChannelEstimates, ...]:
         """Estimates of the channels, for the amended model."""
         body, wheels = self._final_body, self._estimates[1]
         geometry = (1.0, 1.0) if body is None else (float(body[0].vector[0]), float(body[0].vector[1]))
@@ -126,7 +134,7 @@ class Outcome:
         for channel, estimated in ((self.body, self._estimates[0]), (self.wheels, self._estimates[1])):
             if channel is None or estimated is None:
                 continue
-            same = alike(channel.names, possible)
+            same = confounded_with(channel.names, possible)
             for name in channel.names:
                 if name in channel.selector.given and not given:
                     continue
@@ -137,7 +145,9 @@ class Outcome:
             found.append(self._encoder_finding(self.wheels, self._estimates[1]))
         return tuple(sorted(found, key=lambda effect: -effect.evidence))
 
-    def _finding(self, name: str, found: Found, estimated: Estimates, same: tuple[str, ...]) -> EffectFinding:
+    def _finding(
+        self, name: str, found: ChannelResult, estimated: ChannelEstimates, same: tuple[str, ...]
+    ) -> EffectFinding:
         values = {
             parameter.name: estimated.by_name[f"{name}.{parameter.name}"] for parameter in REGISTRY[name].parameters
         }
@@ -148,7 +158,7 @@ class Outcome:
             same = (*same, *rivals)
         return EffectFinding(name, REGISTRY[name].channel.value, values, _evidence(found, name), same, test)
 
-    def _encoder_finding(self, wheels: Found, estimated: Estimates) -> EffectFinding:
+    def _encoder_finding(self, wheels: ChannelResult, estimated: ChannelEstimates) -> EffectFinding:
         values = {side: estimated.by_name[f"{GAIN}.{side}"] for side in ("left", "right")}
         return EffectFinding(ENCODER, REGISTRY[ENCODER].channel.value, values, _evidence(wheels, GAIN))
 
@@ -170,11 +180,11 @@ class Outcome:
                     gain, score = promise + price, 2.0 * promise
                     enough = score > selector.thresholds.score
                     verdict = "moves a 2 s prediction too little, or in one stretch only" if enough else "not needed"
-                    verdict = "makes held-out predictions worse" if name in self.harmful else verdict
+                    verdict = "makes held-out predictions worse" if name in self.pruned else verdict
                 out.append(CandidateEvidence(REGISTRY[name].channel.value, name, gain, score, verdict))
         return tuple(sorted(out, key=lambda candidate: -candidate.score))
 
-    def pictures(self, gap: dict[str, dict[float, Errors]]) -> dict[str, bytes]:
+    def pictures(self, gap: dict[str, dict[float, PredictionErrors]]) -> dict[str, bytes]:
         """PNGs by name."""
         from disco_hw.gap.report import figures  # noqa: PLC0415  (matplotlib, slow to import)
 
@@ -193,21 +203,21 @@ class Outcome:
         return out
 
     @staticmethod
-    def _worst_stretch(wheels: Found) -> bytes:
+    def _worst_stretch(wheels: ChannelResult) -> bytes:
         """Wheel speed over the six seconds in which the model as it was is furthest off."""
         from disco_hw.gap.report import figures  # noqa: PLC0415  (matplotlib, slow to import)
 
         channel = wheels.channel
         assert isinstance(channel, WheelChannel)
-        line = channel.timeline
+        drive = channel.drive
         angles = (channel.angles(wheels.base.vector), channel.angles(*wheels.selector.split(wheels.names)))
-        before, after = (np.gradient(angle, CELL_S, axis=0) for angle in angles)
-        size = np.where(np.isfinite(line.command_rad_s[:, 0]), np.abs(before - line.speed_rad_s).mean(axis=1), 0.0)
+        before, after = (np.gradient(angle, GRID_STEP_S, axis=0) for angle in angles)
+        size = np.where(np.isfinite(drive.command_rad_s[:, 0]), np.abs(before - drive.speed_rad_s).mean(axis=1), 0.0)
         width = min(600, size.size)
         begin = int(np.argmax(np.convolve(size, np.ones(width), "valid")))
         part = slice(begin, begin + width)
         return figures.stretch(
-            line.t_s[part], line.speed_rad_s[part, 0], before[part, 0], after[part, 0], "left wheel, rad/s"
+            drive.t_s[part], drive.speed_rad_s[part, 0], before[part, 0], after[part, 0], "left wheel, rad/s"
         )
 
     def unnamed(self) -> tuple[UnnamedFinding, ...]:
@@ -235,7 +245,7 @@ class Outcome:
         return tuple(out)
 
     @staticmethod
-    def _regimes(found: Found):  # type: ignore[no-untyped-def]
+    def _regimes(found: ChannelResult):  # type: ignore[no-untyped-def]
         return regimes(found.channel, found.base.vector, *found.selector.split(found.names))
 
     def residue(self) -> tuple[str, ...]:
@@ -243,7 +253,7 @@ class Outcome:
         out: list[str] = []
         for found in (self.wheels, self.body):
             if found is not None:
-                out += [*left_over(found), *other_forms(found)]
+                out += [*remaining_disagreements(found), *misspecified_effects(found)]
         return tuple(out)
 
     def blind_spots(self, effects: Iterable[EffectFinding]) -> tuple[BlindSpot, ...]:
@@ -261,7 +271,7 @@ class Outcome:
                 spots.append(BlindSpot(name, first.name, first.unit, None, True, experiment_of(name)))
         return tuple(sorted(spots, key=lambda spot: not spot.blind))
 
-    def gap(self) -> dict[str, dict[float, Errors]]:
+    def gap(self) -> dict[str, dict[float, PredictionErrors]]:
         """Errors of prediction by stage and horizon on held-out data."""
         assert self.body is not None
         assert self._final_body is not None
@@ -278,7 +288,7 @@ class Outcome:
         table["floor"] = per_horizon(lambda ahead_s: floor_errors(body, wheels, whole, ahead_s, self._poses))
         return table
 
-    def errors(self, stage: str, ahead_s: float) -> Errors:
+    def errors(self, stage: str, ahead_s: float) -> PredictionErrors:
         """Errors of prediction of one stage, `nominal`, `refitted` or `amended`, on held-out data."""
         assert self.body is not None
         assert isinstance(self.body.channel, BodyChannel)
@@ -323,25 +333,25 @@ class Outcome:
     def _chain(self, body: Array, wheels: Array | None) -> Chain:
         """A chain of two vectors; where it is the encoders that count wrong, the wheels turn as commanded."""
         assert self.body is not None
-        core, push = _split(self.body, body)
+        core, perturbation = _split(self.body, body)
         if self.wheels is None or wheels is None:
-            return Chain(core, None, push)
-        wheels_core, wheels_push = _split(self.wheels, wheels)
+            return Chain(core, None, perturbation)
+        wheels_core, wheels_perturbation = _split(self.wheels, wheels)
         if self._encoder[1]:
             places = [self.wheels.channel.layout.place[f"{GAIN}.{side}"] for side in ("left", "right")]
             wheels_core = wheels_core.copy()
             wheels_core[places] = 0.0
-        return Chain(core, wheels_core, push, wheels_push)
+        return Chain(core, wheels_core, perturbation, wheels_perturbation)
 
 
-def _split(found: Found, vector: Array) -> tuple[Array, Array | None]:
+def _split(found: ChannelResult, vector: Array) -> tuple[Array, Array | None]:
     """Entries of effects and what terms add; a vector without terms is whole already."""
     if vector.size == len(found.channel.layout.columns):
         return vector, None
     return found.selector.channel.split(vector)
 
 
-def _evidence(found: Found, name: str) -> float:
+def _evidence(found: ChannelResult, name: str) -> float:
     """Evidence score of one accepted effect, the others kept."""
     rest = tuple(other for other in found.names if other != name)
     if name in found.selector.given:

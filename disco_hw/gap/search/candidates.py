@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from disco_hw.effects.effect import Channel as Place
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.data.layout import Layout
-from disco_hw.gap.noise.channels import BodyChannel, Channel, WheelChannel
+from disco_hw.gap.noise.channels import BodyChannel, ResidualChannel, WheelChannel
 
 Array = NDArray[np.float64]
 Starts = tuple[tuple[float, ...], ...]
@@ -33,7 +33,7 @@ class Profile:
     """An entry that is searched over values: its name, the values for a channel, and how close to search."""
 
     column: str
-    values: Callable[[Channel], tuple[float, ...]]
+    values: Callable[[ResidualChannel], tuple[float, ...]]
     refine: float
 
 
@@ -46,7 +46,7 @@ class Candidate:
 
     name: str
     columns: tuple[str, ...]
-    starts: Callable[[Channel], Starts] | None = None
+    starts: Callable[[ResidualChannel], Starts] | None = None
     profile: Profile | None = None
 
     @property
@@ -55,13 +55,13 @@ class Candidate:
         return len(self.columns) + (self.profile is not None)
 
 
-def _below_largest(turning: bool) -> Callable[[Channel], Starts]:
+def _below_largest(turning: bool) -> Callable[[ResidualChannel], Starts]:
     """Limits start where they cut a part of what was commanded."""
 
-    def starts(channel: Channel) -> Starts:
+    def starts(channel: ResidualChannel) -> Starts:
         wheels = channel.inner
         assert isinstance(wheels, WheelChannel)
-        command = wheels.timeline.command_rad_s
+        command = wheels.drive.command_rad_s
         command = command[np.isfinite(command[:, 0])]
         size = np.abs(0.5 * (command[:, 1] - command[:, 0])) if turning else np.abs(command).max(axis=1)
         largest = float(size.max()) if size.size else 0.0
@@ -72,17 +72,17 @@ def _below_largest(turning: bool) -> Callable[[Channel], Starts]:
     return starts
 
 
-def _slow_to_turn(channel: Channel) -> Starts:
+def _slow_to_turn(channel: ResidualChannel) -> Starts:
     """Limits of the yaw acceleration start where the fastest turn that was commanded takes a while."""
     fastest = _below_largest(True)(channel)
     return tuple((fastest[0][0] / rise_s,) for rise_s in _RISES_S) if fastest else ()
 
 
-def _stiction_values(channel: Channel) -> tuple[float, ...]:
+def _stiction_values(channel: ResidualChannel) -> tuple[float, ...]:
     return tuple(np.arange(0.1, 2.05, 0.1).tolist())
 
 
-def _change_times(channel: Channel) -> tuple[float, ...]:
+def _change_times(channel: ResidualChannel) -> tuple[float, ...]:
     body = channel.inner
     assert isinstance(body, BodyChannel)
     first, last = float(body.samples.t_s[0]), float(body.samples.t_s[-1])
@@ -130,7 +130,7 @@ def parameters_of(names: tuple[str, ...]) -> int:
     return sum(CANDIDATES[name].parameters for name in names)
 
 
-def indices(channel: Channel, names: tuple[str, ...]) -> tuple[int, ...]:
+def indices(channel: ResidualChannel, names: tuple[str, ...]) -> tuple[int, ...]:
     """Places in the parameter vector of what a set of effects frees, after those that are always free."""
     place = channel.layout.place
     return (*channel.free, *(place[column] for name in names for column in CANDIDATES[name].columns))

@@ -10,15 +10,15 @@ from itertools import chain
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.gap.data.gridded_drive import CELL_S, Timeline
+from disco_hw.gap.data.gridded_drive import GRID_STEP_S, GriddedDrive
 from disco_hw.gap.data.horizon import displacement, starts_of
 from disco_hw.gap.data.layout import WHEEL
 from disco_hw.gap.noise.body_noise import BodyNoise
-from disco_hw.gap.noise.channels import BodyChannel, Channel, WheelChannel
+from disco_hw.gap.noise.channels import BodyChannel, ResidualChannel, WheelChannel
 from disco_hw.gap.noise.noise_fit import learn_body_noise, learn_wheel_noise
 from disco_hw.gap.noise.wheel_noise import WheelNoise, whiten_wheels
 from disco_hw.gap.search.candidates import CANDIDATES, CHANGE, indices, parameters_of
-from disco_hw.gap.search.evidence import Evidence, compare
+from disco_hw.gap.search.evidence import EffectEvidence, compare
 from disco_hw.gap.search.least_squares import Fit, fit, inverse
 from disco_hw.gap.search.richest_model import learn_saturated_body, learn_saturated_wheels
 from disco_hw.gap.search.selection import Names, Selector, Split, Thresholds
@@ -64,12 +64,12 @@ class UnnamedTerm:
     """An accepted unnamed term: how it is written, with its coefficient, its evidence, and the term itself."""
 
     form: str
-    evidence: Evidence
+    evidence: EffectEvidence
     term: Term
 
 
 @dataclass(frozen=True)
-class Found:
+class ChannelResult:
     """What a channel's search ended with: its selector (noise held, all fits kept), accepted effects and terms.
 
     `richest` (n,): whitened residuals of the channel's richest model, which had `richest_parameters`. `either`:
@@ -99,17 +99,17 @@ class Found:
 
 def wheel_moves(channel: WheelChannel, geometry: Array) -> Callable[[Split, Split], float]:
     """How far two fits of the wheels lie apart `AHEAD_S` ahead, m (lever arm of half the way)."""
-    line = channel.timeline
-    usable = np.isfinite(line.command_rad_s[:, 0])
-    start = starts_of(line.first, usable, AHEAD_S)
-    ahead = round(AHEAD_S / CELL_S)
+    drive = channel.drive
+    usable = np.isfinite(drive.command_rad_s[:, 0])
+    start = starts_of(drive.first, usable, AHEAD_S)
+    ahead = round(AHEAD_S / GRID_STEP_S)
 
     def moves(small: Split, big: Split) -> float:
         if not start.size:
             return 0.0
         difference = channel.angles(*big) - channel.angles(*small)
         step = difference[start + ahead] - difference[start]
-        way = line.angle_rad[start + ahead] - line.angle_rad[start]
+        way = drive.angle_rad[start + ahead] - drive.angle_rad[start]
         forward = 0.5 * geometry[0] * step.sum(axis=1)
         yaw = geometry[0] / geometry[1] * (step[:, 1] - step[:, 0])
         lever = np.abs(0.25 * geometry[0] * way.sum(axis=1)) + abs(geometry[2])
@@ -120,16 +120,18 @@ def wheel_moves(channel: WheelChannel, geometry: Array) -> Callable[[Split, Spli
 
 def body_moves(channel: BodyChannel) -> Callable[[Split, Split], float]:
     """How far two fits of the body lie apart `AHEAD_S` ahead, m."""
-    line = channel.timeline
-    start = starts_of(line.first, np.ones(line.t_s.size, dtype=bool), AHEAD_S)
-    heading = np.interp(line.t_s[start], channel.samples.t_s, channel.measured[:, 2])
+    drive = channel.drive
+    start = starts_of(drive.first, np.ones(drive.t_s.size, dtype=bool), AHEAD_S)
+    heading = np.interp(drive.t_s[start], channel.samples.t_s, channel.measured[:, 2])
 
     def moves(small: Split, big: Split) -> float:
         if not start.size:
             return 0.0
         ends = []
         for p, extra in (small, big):
-            ends.append(displacement(p, line.first, channel.track(p, extra), channel.moving_s, start, heading, AHEAD_S))
+            ends.append(
+                displacement(p, drive.first, channel.track(p, extra), channel.moving_s, start, heading, AHEAD_S)
+            )
         apart = ends[1] - ends[0]
         lever = 0.5 * np.hypot(ends[1][:, 0], ends[1][:, 1])
         return _where_most(apart[:, 0] ** 2 + apart[:, 1] ** 2 + (lever * apart[:, 2]) ** 2)
@@ -143,13 +145,13 @@ def _where_most(squares: Array) -> float:
     return float(np.sqrt(np.partition(squares, squares.size - few)[-few:].mean()))
 
 
-def search_wheels(line: Timeline, geometry: Array, start: Array, given: Names = ()) -> Found:
+def search_wheels(drive: GriddedDrive, geometry: Array, start: Array, given: Names = ()) -> ChannelResult:
     """Effects between command and wheel.
 
     `geometry` (3,) tells how far they move the robot; `start` is the vector without what is missing, in which effects
     `given` are known already.
     """
-    channel = WheelChannel.build(line, WheelNoise(reading_rad=max(line.quantum_rad, 2e-4)), geometry)
+    channel = WheelChannel.build(drive, WheelNoise(reading_rad=max(drive.quantum_rad, 2e-4)), geometry)
     moves = wheel_moves(channel, geometry)
     rough = Selector(channel, moves, _ROUGH, given=given, start=start)
     begin = tuple(dict.fromkeys((*given, *_RESPONSE)))
@@ -161,14 +163,14 @@ def search_wheels(line: Timeline, geometry: Array, start: Array, given: Names = 
     plain = learn_wheel_noise(channel, channel.raw_residual(vector))
     sound, left, many = learn_saturated_wheels(plain, vector)
 
-    def searched(channel: WheelChannel) -> Found:
+    def searched(channel: WheelChannel) -> ChannelResult:
         white = whiten_wheels(left, channel.gains)
-        rolling = np.abs(line.speed_rad_s[line.encoder.node]).max(axis=1) > _REST_RAD_S
+        rolling = np.abs(drive.speed_rad_s[drive.encoder.node]).max(axis=1) > _REST_RAD_S
         limits = _thresholds(white, channel.gains.use & rolling)
         selector = Selector(channel, moves, limits, given=given, start=rough.fit(given).vector)
         selector.fits[frozenset(names)] = fit(channel, rough.fit(names).vector, indices(channel, names))
         richest = (white * channel.weight).ravel()
-        found = Found(selector, selector.select(names), channel, richest=richest, richest_parameters=many)
+        found = ChannelResult(selector, selector.select(names), channel, richest=richest, richest_parameters=many)
         return with_unnamed(found, _wheel_options)
 
     found = searched(sound)
@@ -196,9 +198,9 @@ def responding(selector: Selector, names: Names) -> None:
     selector.fits[frozenset(names)] = min(options, key=lambda option: option.cost)
 
 
-def search_body(line: Timeline, start: Array, given: Names = ()) -> Found:
+def search_body(drive: GriddedDrive, start: Array, given: Names = ()) -> ChannelResult:
     """Effects between measured wheel angles and measured poses; `start` and `given` as for the wheels."""
-    channel = BodyChannel.build(line, BodyNoise(), start)
+    channel = BodyChannel.build(drive, BodyNoise(), start)
     nominal = fit(channel, start, indices(channel, given))
     channel = learn_body_noise(channel, nominal.vector, iterations=4)
     rough = Selector(channel, body_moves(channel), _ROUGH, given=given, start=nominal.vector)
@@ -206,16 +208,16 @@ def search_body(line: Timeline, start: Array, given: Names = ()) -> Found:
     rich = (*names, *(name for name in _SMOOTH_BODY if name not in names))
     vector = fit(channel, rough.fit(names).vector, indices(channel, rich)).vector
     channel = learn_body_noise(channel, vector)
-    pushes = _body_pushes(channel, rich, vector)
-    channel, fullest, extra, many = learn_saturated_body(channel, rich, vector, pushes)
+    perturbations = _body_perturbations(channel, rich, vector)
+    channel, fullest, extra, many = learn_saturated_body(channel, rich, vector, perturbations)
     limits = _thresholds(channel.whitened(fullest, extra), channel.use)
     selector = Selector(channel, body_moves(channel), limits, given=given, start=rough.fit(given).vector)
     richest = channel.residual(fullest, extra)
-    found = Found(selector, selector.select(), channel, richest=richest, richest_parameters=many)
+    found = ChannelResult(selector, selector.select(), channel, richest=richest, richest_parameters=many)
     return _time_or_place(found)
 
 
-def _time_or_place(found: Found) -> Found:
+def _time_or_place(found: ChannelResult) -> ChannelResult:
     """With unnamed terms; where the floor seems to have changed, a patch of it instead if that does as well.
 
     A patch that was left and not entered again looks like a change. No floor changes while one drives on it, so the
@@ -232,7 +234,7 @@ def _time_or_place(found: Found) -> Found:
     return replace(placed, either=better < _CLEARLY) if better > -_CLEARLY else named
 
 
-def _priced(found: Found) -> float:
+def _priced(found: ChannelResult) -> float:
     """Misfit in nats with the price of all that was fitted, and of the choice among all terms."""
     many = float(parameters_of(found.names))
     chosen = 0.0
@@ -242,13 +244,13 @@ def _priced(found: Found) -> float:
     return found.fit.cost + 0.5 * many * math.log(max(found.channel.count, 2)) + chosen
 
 
-def _body_pushes(channel: BodyChannel, names: Names, vector: Array) -> Iterator[Array]:
+def _body_perturbations(channel: BodyChannel, names: Names, vector: Array) -> Iterator[Array]:
     """Pushes of all terms of the body, and of the disc of the floor that promises most."""
     rich = fit(channel, vector, indices(channel, names), 1)
     disc, _ = best_term(rich, channel, places(channel, vector))
-    yield from (term.push for term in body_terms(channel, vector))
+    yield from (term.perturbation for term in body_terms(channel, vector))
     if disc is not None:
-        yield disc.push
+        yield disc.perturbation
 
 
 def _thresholds(white: Array, use: NDArray[np.bool_]) -> Thresholds:
@@ -266,24 +268,24 @@ def _thresholds(white: Array, use: NDArray[np.bool_]) -> Thresholds:
     return Thresholds(score=times * _NAMED_SCORE, unnamed_score=times * _UNNAMED_SCORE)
 
 
-def _wheel_options(found: Found) -> Iterator[Term]:
+def _wheel_options(found: ChannelResult) -> Iterator[Term]:
     assert isinstance(found.channel, WheelChannel)
     return wheel_terms(found.channel, WHEEL.at(found.fit.vector, "command_delay.delay_s"))
 
 
-def _body_options(found: Found) -> Iterator[Term]:
+def _body_options(found: ChannelResult) -> Iterator[Term]:
     assert isinstance(found.channel, BodyChannel)
     p = found.fit.vector
     return chain(body_terms(found.channel, p), places(found.channel, p))
 
 
-def with_unnamed(found: Found, options: Callable[[Found], Iterator[Term]]) -> Found:
+def with_unnamed(found: ChannelResult, options: Callable[[ChannelResult], Iterator[Term]]) -> ChannelResult:
     """Add unnamed terms as long as the best one is worth its price and that of the choice among all.
 
     After each, the named effects are selected anew: one that only stood in for the term is not needed any more.
     """
     terms: tuple[Term, ...] = ()
-    proofs: tuple[Evidence, ...] = ()
+    proofs: tuple[EffectEvidence, ...] = ()
     plain = found.selector
     while len(terms) < _MOST_TERMS:
         best, tried = best_term(found.fit, found.selector.channel, options(found))
@@ -323,7 +325,7 @@ def _extended(plain: Selector, channel: WithTerms) -> Array:
     return np.append(start, np.zeros(channel.neutral.size - start.size))
 
 
-def best_term(small: Fit, channel: Channel, options: Iterator[Term]) -> tuple[Term | None, int]:
+def best_term(small: Fit, channel: ResidualChannel, options: Iterator[Term]) -> tuple[Term | None, int]:
     """The term that promises most to first order on top of a fit, if it may be worth it, and how many were tried."""
     best, most, tried = None, _WORTH_TRYING, 0
     core, held = channel.split(small.vector)
@@ -333,12 +335,12 @@ def best_term(small: Fit, channel: Channel, options: Iterator[Term]) -> tuple[Te
     solved = inverse(normal)
     for term in options:
         tried += 1
-        size = float(np.sqrt((term.push**2).mean()))
+        size = float(np.sqrt((term.perturbation**2).mean()))
         if size < 1e-9:
             continue
         epsilon = 1e-3 / size
-        push = epsilon * term.push if held is None else held + epsilon * term.push
-        column = (inner.residual(core, push) - base) / epsilon
+        perturbation = epsilon * term.perturbation if held is None else held + epsilon * term.perturbation
+        column = (inner.residual(core, perturbation) - base) / epsilon
         across = small.jacobian.T @ column
         own = float(column @ column - across @ solved @ across)
         pull = float(column @ small.residual - across @ solved @ gradient)

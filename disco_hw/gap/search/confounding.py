@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from types import MappingProxyType
 
-from disco_hw.gap.search.intervals import Estimates
+from disco_hw.gap.search.intervals import ChannelEstimates
 
 _SIGMAS = 3.0
 # Of gains that are none of an encoder fewer than one in a hundred comes so far by chance.
@@ -30,7 +30,7 @@ OUTSIDE_TESTS: Mapping[frozenset[str], str] = MappingProxyType(
 )
 
 
-def one_encoder(wheels: Estimates, asymmetry: tuple[float, float], accepted: bool) -> tuple[bool, bool]:
+def one_encoder(wheels: ChannelEstimates, asymmetry: tuple[float, float], accepted: bool) -> tuple[bool, bool]:
     """Whether an encoder that counts wrong explains the wheels' gains, and whether it is the only explanation.
 
     An encoder's scale shows as a gain of its wheel and, with the opposite sign, as an asymmetry of half the difference;
@@ -50,7 +50,7 @@ def one_encoder(wheels: Estimates, asymmetry: tuple[float, float], accepted: boo
     return possible, possible and (accepted or nats > _SURE_NATS)
 
 
-def alike(names: tuple[str, ...], encoder_possible: bool) -> dict[str, tuple[str, ...]]:
+def confounded_with(names: tuple[str, ...], encoder_possible: bool) -> dict[str, tuple[str, ...]]:
     """For each accepted effect what no drive can tell from it."""
     found: dict[str, tuple[str, ...]] = {}
     for name in names:

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from disco_hw.gap.data.free_runs import read_angles, run_body
-from disco_hw.gap.data.gridded_drive import BLOCK_S, CELL_S
+from disco_hw.gap.data.gridded_drive import BLOCK_S, GRID_STEP_S
 from disco_hw.gap.data.horizon import displacement, starts_of
-from disco_hw.gap.noise.channels import BodyChannel, WheelChannel, total_push
+from disco_hw.gap.noise.channels import BodyChannel, WheelChannel, total_perturbation
 from disco_hw.gap.noise.wheel_noise import WANDER_S
 from disco_hw.gap.search.least_squares import Fit, by_block, inverse, known
 
@@ -36,7 +36,7 @@ _PATHS = 3
 
 
 @dataclass(frozen=True, slots=True)
-class Errors:
+class PredictionErrors:
     """Root mean square at one horizon with 95 % bootstrap intervals over blocks of time.
 
     `squares` (B, 2): sums of squares of position and of yaw by block, for a comparison block by block.
@@ -51,17 +51,17 @@ class Errors:
     squares: Array | None = field(default=None, repr=False, compare=False)
 
 
-def worse_by(before: Errors, after: Errors) -> float:
+def worse_by(before: PredictionErrors, after: PredictionErrors) -> float:
     """Ratio of errors after to before, the larger one of position and heading."""
     return max(_ratios(before, after))
 
 
-def _ratios(before: Errors, after: Errors) -> tuple[float, float]:
+def _ratios(before: PredictionErrors, after: PredictionErrors) -> tuple[float, float]:
     """Errors after over those before, of position and of heading."""
     return after.position_m / before.position_m, after.yaw_rad / before.yaw_rad
 
 
-def clearly_worse(before: Errors, after: Errors) -> bool:
+def clearly_worse(before: PredictionErrors, after: PredictionErrors) -> bool:
     """Whether errors after are larger by 5 % and by two standard deviations of what blocks scatter, or by a quarter."""
     for quantity, ratio in enumerate(_ratios(before, after)):
         if ratio > _FAR_WORSE or (ratio > WORSE and _sigmas(before, after, quantity) > _SIGMAS):
@@ -69,7 +69,7 @@ def clearly_worse(before: Errors, after: Errors) -> bool:
     return False
 
 
-def _sigmas(before: Errors, after: Errors, quantity: int) -> float:
+def _sigmas(before: PredictionErrors, after: PredictionErrors, quantity: int) -> float:
     """Growth of a sum of squares over its standard deviation, which is how much the growth of the blocks scatters."""
     if before.squares is None or after.squares is None:
         return math.inf
@@ -93,31 +93,31 @@ class Starts:
 class Chain:
     """Both channels with one parameter vector each: commands in, poses out; without wheels the measured ones.
 
-    The pushes are what unnamed terms add at the nodes.
+    The perturbations are what unnamed terms add at the nodes.
     """
 
     body: Array
     wheels: Array | None
-    body_push: Array | None = None
-    wheels_push: Array | None = None
+    body_perturbation: Array | None = None
+    wheels_perturbation: Array | None = None
 
 
 def smoothed_poses(channel: BodyChannel, p: Array) -> tuple[Array, Array]:
     """Poses at all nodes (M, 3): averaged over `_REACH_S` along the wheels' path, and from the nearest sample alone."""
-    line, samples = channel.timeline, channel.samples
+    drive, samples = channel.drive, channel.samples
     track = channel.track(p)
     at = np.empty((samples.t_s.size, 3))
     read_angles(track, samples.node, samples.fraction, at)
     good = channel.use
     t, at, measured = samples.t_s[good], at[good], channel.measured[good]
-    run_of = np.cumsum(line.first)
+    run_of = np.cumsum(drive.first)
     run_sample = run_of[samples.node[good]]
     turned = measured[:, 2] - at[:, 2]
-    centre = np.clip(np.searchsorted(t, line.t_s), 0, t.size - 1)
+    centre = np.clip(np.searchsorted(t, drive.t_s), 0, t.size - 1)
     reach = max(int(_REACH_S / max(float(np.median(np.diff(t))), 1e-3)), 1)
     near = np.arange(-reach, reach + 1)
     members = np.clip(centre[:, None] + near[None, :], 0, t.size - 1)
-    valid = (np.abs(t[members] - line.t_s[:, None]) <= _REACH_S) & (run_sample[members] == run_of[:, None])
+    valid = (np.abs(t[members] - drive.t_s[:, None]) <= _REACH_S) & (run_sample[members] == run_of[:, None])
     weight = valid / np.maximum(valid.sum(axis=1, keepdims=True), 1)
     angle = (turned[members] * weight).sum(axis=1)
     cosine, sine = np.cos(angle), np.sin(angle)
@@ -130,32 +130,32 @@ def smoothed_poses(channel: BodyChannel, p: Array) -> tuple[Array, Array]:
 
     smooth = np.column_stack([carried(members, weight, cosine, sine), angle + track[:, 2]])
     before = np.maximum(centre - 1, 0)
-    nearest = np.where(np.abs(t[before] - line.t_s) < np.abs(t[centre] - line.t_s), before, centre)[:, None]
+    nearest = np.where(np.abs(t[before] - drive.t_s) < np.abs(t[centre] - drive.t_s), before, centre)[:, None]
     alone = np.column_stack(
         [carried(nearest, np.ones_like(nearest, dtype=float), cosine, sine), turned[nearest[:, 0]] + track[:, 2]]
     )
-    far = ~valid.any(axis=1) | (np.abs(t[nearest[:, 0]] - line.t_s) > 0.1)
+    far = ~valid.any(axis=1) | (np.abs(t[nearest[:, 0]] - drive.t_s) > 0.1)
     smooth[far], alone[far] = np.nan, np.nan
     return smooth, alone
 
 
 def find_starts(channel: BodyChannel, poses: tuple[Array, Array], ahead_s: float) -> Starts:
     """Starts of predictions every 0.2 s where poses and commands are known."""
-    line = channel.timeline
-    known = np.isfinite(line.command_rad_s[:, 0]) if line.has_commands else np.ones(line.t_s.size, dtype=bool)
+    drive = channel.drive
+    known = np.isfinite(drive.command_rad_s[:, 0]) if drive.has_commands else np.ones(drive.t_s.size, dtype=bool)
     smooth, alone = poses
-    node = starts_of(line.first, known, ahead_s)
-    ahead = round(ahead_s / CELL_S)
+    node = starts_of(drive.first, known, ahead_s)
+    ahead = round(ahead_s / GRID_STEP_S)
     node = node[np.isfinite(smooth[node, 0]) & np.isfinite(alone[node + ahead, 0])]
-    block = np.floor(line.t_s[node] / FOLD_S).astype(np.int64)
+    block = np.floor(drive.t_s[node] / FOLD_S).astype(np.int64)
     return Starts(node, smooth[node], alone[node + ahead], block, tuple(_regimes(channel, node, ahead)))
 
 
 def _regimes(channel: BodyChannel, node: Index, ahead: int) -> list[str]:
     """What the robot mostly does between start and end."""
-    line, p = channel.timeline, channel.geometry
-    v = 0.5 * p[0] * line.speed_rad_s.sum(axis=1)
-    omega = p[0] / p[1] * (line.speed_rad_s[:, 1] - line.speed_rad_s[:, 0])
+    drive, p = channel.drive, channel.geometry
+    v = 0.5 * p[0] * drive.speed_rad_s.sum(axis=1)
+    omega = p[0] / p[1] * (drive.speed_rad_s[:, 1] - drive.speed_rad_s[:, 0])
     size = np.concatenate([[0.0], np.cumsum(np.abs(v))])
     turn = np.concatenate([[0.0], np.cumsum(np.abs(omega))])
     signed = np.concatenate([[0.0], np.cumsum(v)])
@@ -166,7 +166,7 @@ def _regimes(channel: BodyChannel, node: Index, ahead: int) -> list[str]:
             out.append("standstill")
         elif mean < _SLOW_M_S * 3 and mean_turn > 0.1:
             out.append("turning on the spot")
-        elif float(np.ptp(v[k : k + ahead])) > _SPEEDING_M_S2 * ahead * CELL_S * 0.5:
+        elif float(np.ptp(v[k : k + ahead])) > _SPEEDING_M_S2 * ahead * GRID_STEP_S * 0.5:
             out.append("speeding up and braking")
         elif mean_turn > _TURNING_RAD_S:
             out.append("curves")
@@ -179,24 +179,24 @@ def chain_track(
     body: BodyChannel, wheels: WheelChannel | None, chain: Chain, extra: Array | None = None
 ) -> tuple[Array, Array]:
     """Free run from commands to the path (M, 3), and wheel speeds (M, 2) on the way."""
-    line = body.timeline
+    drive = body.drive
     p = chain.body.copy()
     scale = [body.layout.place[f"encoder_scale.{side}"] for side in ("left", "right")]
-    push = total_push(line, 3, line.known_motion, chain.body_push, extra)
+    perturbation = total_perturbation(drive, 3, drive.known_motion, chain.body_perturbation, extra)
     if wheels is None or chain.wheels is None:
-        return run_body(p, line.angle_rad, line.speed_rad_s, push, line.first, line.t_s), line.speed_rad_s
+        return run_body(p, drive.angle_rad, drive.speed_rad_s, perturbation, drive.first, drive.t_s), drive.speed_rad_s
     q = chain.wheels.copy()
     q[[wheels.layout.place[f"encoder_scale.{side}"] for side in ("left", "right")]] = 0.0
     p[scale] = 0.0
-    angle = wheels.angles(q, chain.wheels_push)
-    speed = np.gradient(angle, CELL_S, axis=0)
-    speed[line.first] = 0.0
-    return run_body(p, angle, speed, push, line.first, line.t_s), speed
+    angle = wheels.angles(q, chain.wheels_perturbation)
+    speed = np.gradient(angle, GRID_STEP_S, axis=0)
+    speed[drive.first] = 0.0
+    return run_body(p, angle, speed, perturbation, drive.first, drive.t_s), speed
 
 
 def prediction_error(body: BodyChannel, starts: Starts, p: Array, track: Array, ahead_s: float) -> Array:
     """Measured minus predicted pose (K, 3) at the end, in the frame of the start: forward, left, yaw."""
-    moved = displacement(p, body.timeline.first, track, body.moving_s, starts.node, starts.pose[:, 2], ahead_s)
+    moved = displacement(p, body.drive.first, track, body.moving_s, starts.node, starts.pose[:, 2], ahead_s)
     dx, dy = starts.end[:, 0] - starts.pose[:, 0], starts.end[:, 1] - starts.pose[:, 1]
     cosine, sine = np.cos(starts.pose[:, 2]), np.sin(starts.pose[:, 2])
     yaw = starts.end[:, 2] - starts.pose[:, 2] - moved[:, 2]
@@ -233,32 +233,32 @@ def errors_of(
     chains: dict[int, Chain],
     ahead_s: float,
     poses: tuple[Array, Array],
-) -> Errors:
+) -> PredictionErrors:
     """Errors at one horizon, each start predicted by the chain of its fold."""
     starts = find_starts(body, poses, ahead_s)
     error = np.zeros((starts.node.size, 3))
     speed_error = np.zeros(starts.node.size)
-    ahead = round(ahead_s / CELL_S)
+    ahead = round(ahead_s / GRID_STEP_S)
     for held, chain in chains.items():
         inside = starts.block % 2 == held
         track, speed = chain_track(body, wheels, chain)
         error[inside] = prediction_error(body, starts, chain.body, track, ahead_s)[inside]
         there = starts.node[inside] + ahead
-        speed_error[inside] = (body.timeline.speed_rad_s[there] - speed[there]).mean(axis=1)
+        speed_error[inside] = (body.drive.speed_rad_s[there] - speed[there]).mean(axis=1)
     return summarise(error, speed_error, starts)
 
 
-def summarise(error: Array, speed_error: Array, starts: Starts) -> Errors:
+def summarise(error: Array, speed_error: Array, starts: Starts) -> PredictionErrors:
     """Root mean squares, their bootstrap intervals over blocks, and position by regime."""
     position, yaw = error[:, 0] ** 2 + error[:, 1] ** 2, error[:, 2] ** 2
     if not position.size:
         nan = float("nan")
-        return Errors(nan, (nan, nan), nan, (nan, nan), nan, {})
+        return PredictionErrors(nan, (nan, nan), nan, (nan, nan), nan, {})
     regimes = np.array(starts.regime)
     label = np.unique(starts.block, return_inverse=True)[1]
     squares = np.column_stack([np.bincount(label, position), np.bincount(label, yaw)]).astype(np.float64)
     by_regime = {str(name): float(np.sqrt(position[regimes == name].mean())) for name in np.unique(regimes)}
-    return Errors(
+    return PredictionErrors(
         float(np.sqrt(position.mean())),
         _interval(position, starts.block),
         float(np.sqrt(yaw.mean())),
@@ -280,10 +280,10 @@ def _interval(squares: Array, block: Index) -> tuple[float, float]:
 
 def floor_errors(
     body: BodyChannel, wheels: WheelChannel | None, chain: Chain, ahead_s: float, poses: tuple[Array, Array]
-) -> Errors:
+) -> PredictionErrors:
     """What the amended model would err if it were exactly right, by simulating the noise that was estimated."""
     starts = find_starts(body, poses, ahead_s)
-    noise, begins = body.noise, body.timeline.first
+    noise, begins = body.noise, body.drive.first
     clean, _ = chain_track(body, wheels, chain)
     still = displacement(chain.body, begins, clean, body.moving_s, starts.node, starts.pose[:, 2], ahead_s)
     generator = np.random.default_rng(1)
@@ -301,7 +301,7 @@ def floor_errors(
         error[:, 0] += still[:, 1] * first[:, 2]
         error[:, 1] -= still[:, 0] * first[:, 2]
         squares.append(error)
-        speeds.append(wander[starts.node + round(ahead_s / CELL_S)])
+        speeds.append(wander[starts.node + round(ahead_s / GRID_STEP_S)])
     stacked = np.stack(squares)
     root = np.sqrt((stacked**2).mean(axis=0))
     return summarise(root, np.sqrt((np.stack(speeds) ** 2).mean(axis=0)), starts)
@@ -309,11 +309,11 @@ def floor_errors(
 
 def _disturbance(body: BodyChannel, wheels: WheelChannel | None, generator: np.random.Generator) -> tuple[Array, Array]:
     """Velocities (M, 3) forward, left, yaw rate that wheels and ground add at random, and mean wheel speed error."""
-    line, noise, p = body.timeline, body.noise, body.geometry
-    count = line.t_s.size
-    v = 0.5 * p[0] * line.speed_rad_s.sum(axis=1)
-    omega = p[0] / p[1] * (line.speed_rad_s[:, 1] - line.speed_rad_s[:, 0])
-    moving = np.minimum(np.abs(line.speed_rad_s).max(axis=1) * p[0] / 0.05, 1.0)
+    drive, noise, p = body.drive, body.noise, body.geometry
+    count = drive.t_s.size
+    v = 0.5 * p[0] * drive.speed_rad_s.sum(axis=1)
+    omega = p[0] / p[1] * (drive.speed_rad_s[:, 1] - drive.speed_rad_s[:, 0])
+    moving = np.minimum(np.abs(drive.speed_rad_s).max(axis=1) * p[0] / 0.05, 1.0)
     slip = _correlated(generator, count, 3, noise.slip_correlation_s)
     extra = np.column_stack(
         [
@@ -326,18 +326,18 @@ def _disturbance(body: BodyChannel, wheels: WheelChannel | None, generator: np.r
         return extra, np.zeros(count)
     quick = _correlated(generator, count, 2, wheels.noise.correlation_s) * wheels.noise.relative
     slow = _correlated(generator, count, 2, WANDER_S) * wheels.noise.wander
-    error = (quick + slow) * line.speed_rad_s
+    error = (quick + slow) * drive.speed_rad_s
     extra[:, 0] += 0.5 * p[0] * error.sum(axis=1)
     extra[:, 2] += p[0] / p[1] * (error[:, 1] - error[:, 0])
     return extra, error.mean(axis=1)
 
 
 def _correlated(generator: np.random.Generator, count: int, width: int, correlation_s: float) -> Array:
-    keep = float(np.exp(-CELL_S / max(correlation_s, 1e-3)))
+    keep = float(np.exp(-GRID_STEP_S / max(correlation_s, 1e-3)))
     noise = generator.standard_normal((count, width)) * np.sqrt(1.0 - keep * keep)
     return np.asarray(lfilter([1.0], [1.0, -keep], noise, axis=0))
 
 
-def per_horizon(measure: Callable[[float], Errors]) -> dict[float, Errors]:
+def per_horizon(measure: Callable[[float], PredictionErrors]) -> dict[float, PredictionErrors]:
     """Errors at every horizon."""
     return {horizon: measure(horizon) for horizon in HORIZONS_S}

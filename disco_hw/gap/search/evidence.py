@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.gap.noise.channels import Channel
+from disco_hw.gap.noise.channels import ResidualChannel
 from disco_hw.gap.search.least_squares import Fit, by_block, inverse, known
 
 Array = NDArray[np.float64]
@@ -22,7 +22,7 @@ _FEWEST_BLOCKS = 5
 
 
 @dataclass(frozen=True, slots=True)
-class Evidence:
+class EffectEvidence:
     """For one set of effects against a smaller one.
 
     `gain` in nats of the fit; `held_out` in nats on blocks left out, `repeated` the same without the block that says
@@ -36,7 +36,7 @@ class Evidence:
     score: float
 
 
-def held_out_by_block(found: Fit, channel: Channel) -> Array:
+def held_out_by_block(found: Fit, channel: ResidualChannel) -> Array:
     """Half squares on each block (B,) with parameters fitted without it, to second order."""
     label = np.unique(channel.block, return_inverse=True)[1]
     cost = np.asarray(0.5 * np.bincount(label, weights=found.residual**2), dtype=np.float64)
@@ -54,7 +54,7 @@ def held_out_by_block(found: Fit, channel: Channel) -> Array:
     return out
 
 
-def inflation(found: Fit, channel: Channel, added: tuple[int, ...]) -> float:
+def inflation(found: Fit, channel: ResidualChannel, added: tuple[int, ...]) -> float:
     """Largest ratio over block lengths of the sandwich variance to the model's, for the added entries; at least 1.
 
     What blocks tell is weighed against what is known of the channel: `trusted_blocks` of them in which the model holds.
@@ -82,7 +82,7 @@ def inflation(found: Fit, channel: Channel, added: tuple[int, ...]) -> float:
     return largest
 
 
-def compare(small: Fit, big: Fit, channel: Channel, parameters: float) -> Evidence:
+def compare(small: Fit, big: Fit, channel: ResidualChannel, parameters: float) -> EffectEvidence:
     """Evidence for `big` against `small`, which lacks `parameters` of its parameters."""
     added = tuple(index for index in big.active if index not in small.active)
     factor = inflation(big, channel, added)
@@ -90,4 +90,4 @@ def compare(small: Fit, big: Fit, channel: Channel, parameters: float) -> Eviden
     blocks = held_out_by_block(small, channel) - held_out_by_block(big, channel)
     held_out = float(blocks.sum())
     score = 2.0 * gain / factor - parameters * math.log(max(channel.count, 2))
-    return Evidence(gain, held_out, held_out - float(blocks.max(initial=0.0)), factor, score)
+    return EffectEvidence(gain, held_out, held_out - float(blocks.max(initial=0.0)), factor, score)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.gap.search.candidates import CANDIDATES, indices
-from disco_hw.gap.search.channel_search import Found
+from disco_hw.gap.search.channel_search import ChannelResult
 from disco_hw.gap.search.evidence import inflation
 from disco_hw.gap.search.least_squares import fit
 
@@ -21,7 +21,7 @@ _RISE = 0.5 * _Z95**2
 
 
 @dataclass(frozen=True, slots=True)
-class Estimate:
+class ParameterEstimate:
     """A parameter with its 95 % interval."""
 
     value: float
@@ -35,15 +35,15 @@ class Estimate:
 
 
 @dataclass(frozen=True)
-class Estimates:
+class ChannelEstimates:
     """Parameters of a channel by full name, and the covariance (A, A) of the fitted ones in order of `fitted`."""
 
-    by_name: dict[str, Estimate]
+    by_name: dict[str, ParameterEstimate]
     fitted: tuple[str, ...]
     covariance: Array
 
 
-def estimates(found: Found) -> Estimates:
+def estimate_parameters(found: ChannelResult) -> ChannelEstimates:
     """Intervals of all parameters that a channel's accepted set frees."""
     best, channel = found.fit, found.selector.channel
     columns = channel.layout.columns
@@ -51,17 +51,19 @@ def estimates(found: Found) -> Estimates:
     covariance = best.covariance() * np.sqrt(np.outer(factors, factors))
     deviations = np.sqrt(np.diag(covariance))
     by_name = {
-        columns[index]: Estimate(float(best.vector[index]), *_around(float(best.vector[index]), float(deviation)))
+        columns[index]: ParameterEstimate(
+            float(best.vector[index]), *_around(float(best.vector[index]), float(deviation))
+        )
         for index, deviation in zip(best.active, deviations, strict=True)
     }
     for name in found.names:
         profile = CANDIDATES[name].profile
         if profile is not None:
             by_name[profile.column] = _profiled(found, profile.column, profile.refine)
-    return Estimates(by_name, tuple(columns[index] for index in best.active), covariance)
+    return ChannelEstimates(by_name, tuple(columns[index] for index in best.active), covariance)
 
 
-def in_motion(wheels: Estimates, body: Estimates) -> Estimates:
+def in_motion(wheels: ChannelEstimates, body: ChannelEstimates) -> ChannelEstimates:
     """The wheels' estimates, where those of the robot's motion are no better known than its geometry in `body`."""
     slope = np.zeros(len(body.fitted))
     for name, sign in (("wheel_radius_m", 1.0), ("axial_distance_m", -1.0)):
@@ -71,18 +73,20 @@ def in_motion(wheels: Estimates, body: Estimates) -> Estimates:
     moved = {name: wheels.by_name[name] for name in _OF_TURNING if name in wheels.by_name}
     added = np.array([moved[name].value if name in moved else 0.0 for name in wheels.fitted])
     by_name = {
-        name: Estimate(each.value, *_around(each.value, float(np.hypot(each.deviation, each.value * of_ratio**0.5))))
+        name: ParameterEstimate(
+            each.value, *_around(each.value, float(np.hypot(each.deviation, each.value * of_ratio**0.5)))
+        )
         for name, each in moved.items()
     }
     covariance = wheels.covariance + of_ratio * np.outer(added, added)
-    return Estimates({**wheels.by_name, **by_name}, wheels.fitted, covariance)
+    return ChannelEstimates({**wheels.by_name, **by_name}, wheels.fitted, covariance)
 
 
 def _around(value: float, deviation: float) -> tuple[float, float]:
     return value - _Z95 * deviation, value + _Z95 * deviation
 
 
-def _profiled(found: Found, column: str, step: float) -> Estimate:
+def _profiled(found: ChannelResult, column: str, step: float) -> ParameterEstimate:
     """Interval in which the profile of the cost rises by no more than 1.92 nats."""
     selector, best = found.selector, found.fit
     channel = selector.channel
@@ -98,4 +102,4 @@ def _profiled(found: Found, column: str, step: float) -> Estimate:
                 break
             reach *= 2.0
         edges.append(float(best.vector[place] + sign * reach))
-    return Estimate(float(best.vector[place]), edges[0], edges[1])
+    return ParameterEstimate(float(best.vector[place]), edges[0], edges[1])

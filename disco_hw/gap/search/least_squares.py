@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.gap.data.layout import Layout
-from disco_hw.gap.noise.channels import Channel
+from disco_hw.gap.noise.channels import ResidualChannel
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -76,7 +76,7 @@ def jacobian(
     return out
 
 
-def sensitivity(channel: Channel, vector: Array, places: tuple[int, ...], residual: Array) -> Array:
+def sensitivity(channel: ResidualChannel, vector: Array, places: tuple[int, ...], residual: Array) -> Array:
     """Derivative of a channel's residual with respect to some entries, (n, len(places))."""
     return jacobian(channel.residual, vector, places, channel.layout, residual)
 
@@ -87,7 +87,7 @@ def solve(slope: Array, gradient: Array) -> Array:
 
 
 def fit(
-    channel: Channel,
+    channel: ResidualChannel,
     start: Array,
     active: tuple[int, ...],
     iterations: int = _MOST_ITERATIONS,

@@ -13,84 +13,84 @@ from itertools import chain
 
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.report.findings import REPORTED_HORIZON_S
-from disco_hw.gap.search.analysis import Outcome
-from disco_hw.gap.search.channel_search import Found
-from disco_hw.gap.search.cross_validation import WORSE, Errors, clearly_worse, worse_by
+from disco_hw.gap.search.analysis import GapAnalysis
+from disco_hw.gap.search.channel_search import ChannelResult
+from disco_hw.gap.search.cross_validation import WORSE, PredictionErrors, clearly_worse, worse_by
 
 _MOST_CHANGES = 4
 
 
-def harmless(outcome: Outcome) -> Outcome:
-    """The outcome without what makes its held-out predictions worse."""
-    if outcome.body is None:
-        return outcome
-    refitted = outcome.errors("refitted", REPORTED_HORIZON_S)
+def prune(analysis: GapAnalysis) -> GapAnalysis:
+    """The analysis without what makes its held-out predictions worse."""
+    if analysis.body is None:
+        return analysis
+    refitted = analysis.errors("refitted", REPORTED_HORIZON_S)
     for _ in range(_MOST_CHANGES):
-        now = _amended(outcome)
+        now = _amended(analysis)
         if clearly_worse(refitted, now):
-            better = _best(refitted, worse_by(refitted, now), chain(_lacking_one(outcome), _swapped_one(outcome)))
+            better = _best(refitted, worse_by(refitted, now), chain(_lacking_one(analysis), _swapped_one(analysis)))
         else:
-            better = _best(now, 1.0 / WORSE, _lacking_one(outcome))
+            better = _best(now, 1.0 / WORSE, _lacking_one(analysis))
             if better is not None and not clearly_worse(_amended(better), now):
                 better = None
         if better is None:
             break
-        outcome = better
-    return outcome
+        analysis = better
+    return analysis
 
 
-def _amended(outcome: Outcome) -> Errors:
-    return outcome.errors("amended", REPORTED_HORIZON_S)
+def _amended(analysis: GapAnalysis) -> PredictionErrors:
+    return analysis.errors("amended", REPORTED_HORIZON_S)
 
 
-def _best(than: Errors, below: float, options: Iterable[Outcome]) -> Outcome | None:
-    """Of some outcomes the one that predicts best, if its errors are less than `below` times those of another."""
+def _best(than: PredictionErrors, below: float, options: Iterable[GapAnalysis]) -> GapAnalysis | None:
+    """Of some analyses the one that predicts best, if its errors are less than `below` times those of another."""
     ratios = [(worse_by(than, _amended(option)), place, option) for place, option in enumerate(options)]
     if not ratios or not min(ratios)[0] < below:
         return None
     return min(ratios)[2]
 
 
-def _lacking_one(outcome: Outcome) -> Iterator[Outcome]:
-    """Outcomes that lack one of the names, or the terms of a channel."""
-    for found in (outcome.wheels, outcome.body):
+def _lacking_one(analysis: GapAnalysis) -> Iterator[GapAnalysis]:
+    """Analyses that lack one of the names, or the terms of a channel."""
+    for found in (analysis.wheels, analysis.body):
         if found is None:
             continue
         for name, rest in _each(found):
-            yield _changed(outcome, found, replace(found, names=rest), (name,))
+            yield _changed(analysis, found, replace(found, names=rest), (name,))
         if found.unnamed and found.plain is not None:
             bare = replace(found, selector=found.plain, unnamed=(), plain=None)
-            yield _changed(outcome, found, bare, tuple(term.form for term in found.unnamed))
+            yield _changed(analysis, found, bare, tuple(term.form for term in found.unnamed))
 
 
-def _swapped_one(outcome: Outcome) -> Iterator[Outcome]:
-    """Outcomes that have, in place of one of the names, another that would do as well."""
-    for found in (outcome.wheels, outcome.body):
+def _swapped_one(analysis: GapAnalysis) -> Iterator[GapAnalysis]:
+    """Analyses that have, in place of one of the names, another that would do as well."""
+    for found in (analysis.wheels, analysis.body):
         if found is None:
             continue
         for name, rest in _each(found):
             for rival in found.selector.rivals(found.names, name):
-                yield _changed(outcome, found, replace(found, names=(*rest, rival)), (name,))
+                yield _changed(analysis, found, replace(found, names=(*rest, rival)), (name,))
 
 
-def _each(found: Found) -> Iterator[tuple[str, tuple[str, ...]]]:
+def _each(found: ChannelResult) -> Iterator[tuple[str, tuple[str, ...]]]:
     """Every name that was found, and the others."""
     for name in found.names:
         if name not in found.selector.given:
             yield name, tuple(other for other in found.names if other != name)
 
 
-def _changed(outcome: Outcome, old: Found, new: Found, harmful: tuple[str, ...]) -> Outcome:
-    harmful = (*outcome.harmful, *harmful)
-    if old is outcome.wheels:
-        return replace(outcome, wheels=new, harmful=harmful)
-    return replace(outcome, body=new, harmful=harmful)
+def _changed(analysis: GapAnalysis, old: ChannelResult, new: ChannelResult, pruned: tuple[str, ...]) -> GapAnalysis:
+    pruned = (*analysis.pruned, *pruned)
+    if old is analysis.wheels:
+        return replace(analysis, wheels=new, pruned=pruned)
+    return replace(analysis, body=new, pruned=pruned)
 
 
-def left_out(outcome: Outcome) -> list[str]:
+def pruning_sentences(analysis: GapAnalysis) -> list[str]:
     """Sentences on what was left out for its harm."""
     return [
         f"{REGISTRY[name].channel.value if name in REGISTRY else 'unnamed'}: {name} fits, and yet makes held-out "
         "predictions worse: it only stands for what is missing"
-        for name in outcome.harmful
+        for name in analysis.pruned
     ]

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from disco_hw.gap.data.free_runs import read_angles
-from disco_hw.gap.data.gridded_drive import CELL_S
+from disco_hw.gap.data.gridded_drive import GRID_STEP_S
 from disco_hw.gap.data.layout import WHEEL
 from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
 from disco_hw.gap.noise.noise_fit import learn_body_noise, learn_wheel_noise, wheel_misfit
@@ -38,11 +38,11 @@ def learn_saturated_wheels(channel: WheelChannel, vector: Array) -> tuple[WheelC
     `vector`: the fit of the smooth effects; on top come any static response of a wheel, quick and slow ones, limited
     changes of speed and the other wheel's influence, each as speed of the wheel itself.
     """
-    line, raw = channel.timeline, channel.raw_residual(vector)
+    drive, raw = channel.drive, channel.raw_residual(vector)
     at = np.empty_like(raw)
     columns = []
     for shape in _wheel_shapes(channel, vector):
-        read_angles(_integrated(shape, line.first), line.encoder.node, line.encoder.fraction, at)
+        read_angles(_integrated(shape, drive.first), drive.encoder.node, drive.encoder.fraction, at)
         columns.append(at.copy())
     many = len(columns) + WHEEL.neutral.size
     if not columns:
@@ -65,36 +65,34 @@ def learn_saturated_wheels(channel: WheelChannel, vector: Array) -> tuple[WheelC
 
 
 def learn_saturated_body(
-    channel: BodyChannel, names: tuple[str, ...], vector: Array, pushes: Iterable[Array]
+    channel: BodyChannel, names: tuple[str, ...], vector: Array, perturbations: Iterable[Array]
 ) -> tuple[BodyChannel, Array, Array, int]:
     """The channel with the noise its richest model leaves, that model's vector, what it adds, its parameters' number.
 
-    `names`: effects whose entries are free; `vector` where they were fitted; `pushes` (M, 3) each.
+    `names`: effects whose entries are free; `vector` where they were fitted; `perturbations` (M, 3) each.
     """
     base = channel.residual(vector)
     active = indices(channel, names)
     slopes, steps = [sensitivity(channel, vector, active, base)], []
-    for push in pushes:
-        size = float(np.sqrt((push**2).mean()))
+    for perturbation in perturbations:
+        size = float(np.sqrt((perturbation**2).mean()))
         if size < 1e-9:
             continue
         step = 1e-3 / size
-        slopes.append(((channel.residual(vector, step * push) - base) / step)[:, None])
-        steps.append(push)
+        slopes.append(((channel.residual(vector, step * perturbation) - base) / step)[:, None])
+        steps.append(perturbation)
     found = _ridge(np.column_stack(slopes), base)
     chosen, layout = list(active), channel.layout
-    push = (
-        np.tensordot(found[len(chosen) :], np.stack(steps), axes=1)
-        if steps
-        else np.zeros((channel.timeline.t_s.size, 3))
+    perturbation = (
+        np.tensordot(found[len(chosen) :], np.stack(steps), axes=1) if steps else np.zeros((channel.drive.t_s.size, 3))
     )
     for halving in range(_HALVINGS):
         share = 0.5**halving
-        moved, extra = vector.copy(), share * push
+        moved, extra = vector.copy(), share * perturbation
         moved[chosen] = np.clip(vector[chosen] + share * found[: len(chosen)], layout.low[chosen], layout.high[chosen])
         if np.sum(channel.residual(moved, extra) ** 2) < np.sum(base**2):
             return learn_body_noise(channel, moved, extra), moved, extra, found.size
-    return channel, vector, np.zeros_like(push), found.size
+    return channel, vector, np.zeros_like(perturbation), found.size
 
 
 def _ridge(slope: Array, residual: Array) -> Array:
@@ -107,16 +105,16 @@ def _ridge(slope: Array, residual: Array) -> Array:
 
 def _integrated(speed: Array, first: NDArray[np.bool_]) -> Array:
     """Angles (M, 2) of speeds at the nodes, negative: as a residual feels them, each run from 0."""
-    angle = -np.cumsum(speed, axis=0) * CELL_S
+    angle = -np.cumsum(speed, axis=0) * GRID_STEP_S
     starts = np.flatnonzero(first)
     return np.asarray(angle - np.repeat(angle[starts], np.diff(np.append(starts, first.size)), axis=0))
 
 
 def _wheel_shapes(channel: WheelChannel, vector: Array) -> Iterator[Array]:
     """Speeds (M, 2) of the wheels that a command may make in ways the named effects do not have."""
-    line = channel.timeline
-    raw = np.nan_to_num(line.command_rad_s)
-    late = max(round(WHEEL.at(vector, "command_delay.delay_s") / CELL_S), 0)
+    drive = channel.drive
+    raw = np.nan_to_num(drive.command_rad_s)
+    late = max(round(WHEEL.at(vector, "command_delay.delay_s") / GRID_STEP_S), 0)
     asked = np.concatenate([np.repeat(raw[:1], late, axis=0), raw[: raw.shape[0] - late]])
     u = _slow(asked, max(WHEEL.at(vector, "motor_lag.tau_s"), 1e-3))
     largest = float(np.abs(u).max(initial=0.0))
@@ -127,7 +125,7 @@ def _wheel_shapes(channel: WheelChannel, vector: Array) -> Iterator[Array]:
     other = u[:, ::-1]
     yield from (np.tanh(u / 0.05), u, np.abs(u), u * u, other, np.abs(other) * np.tanh(u / 0.05), np.abs(other) * u)
     # Not time: what wanders slowly would be taken for a trend, and the noise then for less than it is.
-    yield from (u * np.sin(line.angle_rad), u * np.cos(line.angle_rad))
+    yield from (u * np.sin(drive.angle_rad), u * np.cos(drive.angle_rad))
     for response_s in _RESPONSES_S:
         behind = _slow(u, response_s) - u
         yield behind
@@ -139,14 +137,14 @@ def _wheel_shapes(channel: WheelChannel, vector: Array) -> Iterator[Array]:
 
 def _slow(u: Array, response_s: float) -> Array:
     """`u` (M, 2) through a first-order lag."""
-    keep = math.exp(-CELL_S / response_s)
+    keep = math.exp(-GRID_STEP_S / response_s)
     return np.asarray(lfilter([1.0 - keep], [1.0, -keep], u, axis=0))
 
 
 def _slewed(u: Array, rate: float) -> Array:
     """`u` (M, 2) followed with at most this rate (1/s of its unit)."""
     out = np.empty_like(u)
-    _follow(u, rate * CELL_S, out)
+    _follow(u, rate * GRID_STEP_S, out)
     return out
 
 

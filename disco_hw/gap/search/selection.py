@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.gap.noise.channels import Channel
+from disco_hw.gap.noise.channels import ResidualChannel
 from disco_hw.gap.search.candidates import CANDIDATES, Candidate, candidates_of, indices, parameters_of
-from disco_hw.gap.search.evidence import Evidence, compare
+from disco_hw.gap.search.evidence import EffectEvidence, compare
 from disco_hw.gap.search.least_squares import Fit, fit, sensitivity, solve
 
 Array = NDArray[np.float64]
@@ -43,13 +43,13 @@ class Selector:
     Effects `given` are in from the beginning, with values of `start`.
     """
 
-    channel: Channel
+    channel: ResidualChannel
     moves: Callable[[Split, Split], float]
     thresholds: Thresholds = Thresholds()
     given: Names = ()
     start: Array | None = None
     fits: dict[frozenset[str], Fit] = field(default_factory=dict)
-    proofs: dict[tuple[frozenset[str], frozenset[str]], Evidence] = field(default_factory=dict)
+    proofs: dict[tuple[frozenset[str], frozenset[str]], EffectEvidence] = field(default_factory=dict)
 
     def fit(self, names: Names) -> Fit:
         """The best fit of a set, started from the best smaller ones known."""
@@ -150,7 +150,7 @@ class Selector:
         places = [layout.place[column] for column in new.columns]
         return bool(places) and bool((parent.vector[places] == layout.neutral[places]).all())
 
-    def evidence(self, smaller: Names, larger: Names) -> Evidence:
+    def evidence(self, smaller: Names, larger: Names) -> EffectEvidence:
         """Evidence for the larger set against the smaller one."""
         key = (frozenset(smaller), frozenset(larger))
         if key not in self.proofs:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.gap.data.gridded_drive import CELL_S, Timeline
+from disco_hw.gap.data.gridded_drive import GRID_STEP_S, GriddedDrive
 from disco_hw.gap.data.layout import Layout
 from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
 from disco_hw.model import EffectSetting
@@ -42,7 +42,7 @@ class Term:
     """
 
     form: str
-    push: Array
+    perturbation: Array
     model_name: str | None = None
     geometry: tuple[float, float] = (1.0, 1.0)
     disc: tuple[float, float, float] | None = None
@@ -50,15 +50,15 @@ class Term:
 
 def wheel_terms(channel: WheelChannel, late_s: float) -> Iterator[Term]:
     """What may be added to both wheels' commands; `late_s` is the dead time that was found."""
-    line = channel.timeline
-    u = late_commands(line, late_s)
-    other, t = u[:, ::-1], line.t_s[:, None]
+    drive = channel.drive
+    u = late_commands(drive, late_s)
+    other, t = u[:, ::-1], drive.t_s[:, None]
     for form, feature in COMMAND_FEATURES.items():
         name = term_name(COMMAND, form)
         yield Term(_with_place(name), feature(u, other, t), name)
-    growth = np.gradient(u, CELL_S, axis=0)
+    growth = np.gradient(u, GRID_STEP_S, axis=0)
     sign = COMMAND_FEATURES["sign(u)"](u, other, t)
-    angle = line.angle_rad
+    angle = drive.angle_rad
     features = {
         "du/dt": growth,
         "|du/dt| sign(u)": np.abs(growth) * sign,
@@ -66,61 +66,61 @@ def wheel_terms(channel: WheelChannel, late_s: float) -> Iterator[Term]:
         "u sin(wheel angle)": u * np.sin(angle),
         "u cos(wheel angle)": u * np.cos(angle),
     }
-    for form, push in features.items():
-        yield Term(_with_place(term_name(COMMAND, form)), push)
+    for form, perturbation in features.items():
+        yield Term(_with_place(term_name(COMMAND, form)), perturbation)
 
 
-def late_commands(line: Timeline, late_s: float) -> Array:
+def late_commands(drive: GriddedDrive, late_s: float) -> Array:
     """Commands at the nodes (M, 2) that are in force after a dead time; zero where none is known."""
-    raw = np.nan_to_num(line.command_rad_s)
-    late = max(round(late_s / CELL_S), 0)
+    raw = np.nan_to_num(drive.command_rad_s)
+    late = max(round(late_s / GRID_STEP_S), 0)
     return np.concatenate([np.repeat(raw[:1], late, axis=0), raw[: raw.shape[0] - late]])
 
 
-def motion(line: Timeline, p: Array) -> tuple[Array, Array, Array]:
+def motion(drive: GriddedDrive, p: Array) -> tuple[Array, Array, Array]:
     """Forward speed (m/s), yaw rate (rad/s) and acceleration (m/s^2) that the wheels tell, (M,) each."""
-    speed = line.speed_rad_s
+    speed = drive.speed_rad_s
     v = 0.5 * p[0] * speed.sum(axis=1)
-    return v, p[0] / p[1] * (speed[:, 1] - speed[:, 0]), np.gradient(smoothed(v), CELL_S)
+    return v, p[0] / p[1] * (speed[:, 1] - speed[:, 0]), np.gradient(smoothed(v), GRID_STEP_S)
 
 
 def body_terms(channel: BodyChannel, p: Array) -> Iterator[Term]:
     """What may be added to the body's velocity; `p` is the vector of the channel."""
-    line = channel.timeline
-    v, w, a = motion(line, p)
-    dw = np.gradient(smoothed(w), CELL_S)
-    moving = np.minimum(np.abs(line.speed_rad_s).max(axis=1) * p[0] / 0.05, 1.0)
+    drive = channel.drive
+    v, w, a = motion(drive, p)
+    dw = np.gradient(smoothed(w), GRID_STEP_S)
+    moving = np.minimum(np.abs(drive.speed_rad_s).max(axis=1) * p[0] / 0.05, 1.0)
     beyond = {"moving": moving, "domega/dt": dw, "v domega/dt": v * dw}
     for axis, target in enumerate(BODY_TARGETS):
         for form, feature in BODY_FEATURES.items():
             name = term_name(target, form)
-            yield Term(_with_place(name), _on(axis, feature(v, w, a, line.t_s)), name, (float(p[0]), float(p[1])))
-        for form, push in beyond.items():
-            yield Term(_with_place(term_name(target, form)), _on(axis, push))
-    left, right = line.speed_rad_s[:, 0] * p[0] / 2.0, line.speed_rad_s[:, 1] * p[0] / 2.0
-    angle = line.angle_rad
+            yield Term(_with_place(name), _on(axis, feature(v, w, a, drive.t_s)), name, (float(p[0]), float(p[1])))
+        for form, perturbation in beyond.items():
+            yield Term(_with_place(term_name(target, form)), _on(axis, perturbation))
+    left, right = drive.speed_rad_s[:, 0] * p[0] / 2.0, drive.speed_rad_s[:, 1] * p[0] / 2.0
+    angle = drive.angle_rad
     for wave, turn in (("sin", np.sin), ("cos", np.cos)):
         rim = (left * turn(angle[:, 0]), right * turn(angle[:, 1]))
-        push = np.column_stack([rim[0] + rim[1], np.zeros_like(v), 2.0 * (rim[1] - rim[0]) / p[1]])
-        yield Term(f"rim speed += {{:.4g}} {wave}(wheel angle) of itself", push)
+        perturbation = np.column_stack([rim[0] + rim[1], np.zeros_like(v), 2.0 * (rim[1] - rim[0]) / p[1]])
+        yield Term(f"rim speed += {{:.4g}} {wave}(wheel angle) of itself", perturbation)
 
 
-def with_known_terms(line: Timeline, effects: Iterable[EffectSetting], p: Array, late_s: float) -> Timeline:
-    """The timeline with what the terms among a given model's effects add; `p` is its vector of the body."""
-    u, (v, w, a) = late_commands(line, late_s), motion(line, p)
-    command = motion_push = None
+def with_known_terms(drive: GriddedDrive, effects: Iterable[EffectSetting], p: Array, late_s: float) -> GriddedDrive:
+    """The drive with what the terms among a given model's effects add; `p` is its vector of the body."""
+    u, (v, w, a) = late_commands(drive, late_s), motion(drive, p)
+    command = motion_perturbation = None
     for setting in effects:
         term = TERMS.get(setting.name)
         if term is None:
             continue
         if term.target == COMMAND:
-            push = setting.values["k"] * COMMAND_FEATURES[term.feature](u, u[:, ::-1], line.t_s[:, None])
-            command = push if command is None else command + push
+            perturbation = setting.values["k"] * COMMAND_FEATURES[term.feature](u, u[:, ::-1], drive.t_s[:, None])
+            command = perturbation if command is None else command + perturbation
         else:
-            push = setting.values["k"] * BODY_FEATURES[term.feature](v, w, a, line.t_s)
-            push = _on(BODY_TARGETS.index(term.target), push)
-            motion_push = push if motion_push is None else motion_push + push
-    return replace(line, known_command=command, known_motion=motion_push)
+            perturbation = setting.values["k"] * BODY_FEATURES[term.feature](v, w, a, drive.t_s)
+            perturbation = _on(BODY_TARGETS.index(term.target), perturbation)
+            motion_perturbation = perturbation if motion_perturbation is None else motion_perturbation + perturbation
+    return replace(drive, known_command=command, known_motion=motion_perturbation)
 
 
 def _with_place(name: str) -> str:
@@ -130,10 +130,10 @@ def _with_place(name: str) -> str:
 
 def places(channel: BodyChannel, p: Array) -> Iterator[Term]:
     """Discs of the floor in which turning is different."""
-    line = channel.timeline
+    drive = channel.drive
     x, y = _where(channel)
     low_x, high_x, low_y, high_y = (*np.quantile(x, (0.02, 0.98)), *np.quantile(y, (0.02, 0.98)))
-    if (high_x - low_x) * (high_y - low_y) > _LARGEST_FLOOR_M2 or line.t_s.size * CELL_S > _LONGEST_S:
+    if (high_x - low_x) * (high_y - low_y) > _LARGEST_FLOOR_M2 or drive.t_s.size * GRID_STEP_S > _LONGEST_S:
         return
     across, along = (np.arange(low, high + 1e-9, _DISC_SPACING_M) for low, high in ((low_x, high_x), (low_y, high_y)))
     yield from _discs(channel, p, ((cx, cy, radius) for cx in across for cy in along for radius in _DISC_RADII_M))
@@ -149,14 +149,14 @@ def places_near(channel: BodyChannel, p: Array, disc: tuple[float, float, float]
 
 def _where(channel: BodyChannel) -> tuple[Array, Array]:
     """Measured position at the nodes, (M,) each."""
-    t_s, samples, measured = channel.timeline.t_s, channel.samples, channel.measured
+    t_s, samples, measured = channel.drive.t_s, channel.samples, channel.measured
     return np.interp(t_s, samples.t_s, measured[:, 0]), np.interp(t_s, samples.t_s, measured[:, 1])
 
 
 def _discs(channel: BodyChannel, p: Array, discs: Iterable[tuple[float, float, float]]) -> Iterator[Term]:
     """Those in which a good part of all turning was done, and outside of which too."""
     x, y = _where(channel)
-    speed = channel.timeline.speed_rad_s
+    speed = channel.drive.speed_rad_s
     w = p[0] / p[1] * (speed[:, 1] - speed[:, 0])
     turning = np.abs(w)
     turned = max(float(turning.sum()), 1e-9)
@@ -167,15 +167,15 @@ def _discs(channel: BodyChannel, p: Array, discs: Iterable[tuple[float, float, f
         inside = squares < radius * radius
         if _LEAST_INSIDE < float(turning @ inside) / turned < _MOST_INSIDE:
             where = f"within {radius:.2f} m of ({centre_x:.2f}, {centre_y:.2f}) m"
-            push = _on(2, np.where(inside, w, 0.0))
+            perturbation = _on(2, np.where(inside, w, 0.0))
             disc = (float(centre_x), float(centre_y), float(radius))
-            yield Term(f"omega += {{:.4g}} omega {where}", push, disc=disc)
+            yield Term(f"omega += {{:.4g}} omega {where}", perturbation, disc=disc)
 
 
 def _on(axis: int, feature: Array) -> Array:
-    push = np.zeros((feature.size, 3))
-    push[:, axis] = feature
-    return push
+    perturbation = np.zeros((feature.size, 3))
+    perturbation[:, axis] = feature
+    return perturbation
 
 
 def smoothed(values: Array) -> Array:
@@ -197,7 +197,7 @@ class WithTerms:
         """Extend a channel."""
         plain, count = inner.layout, len(terms)
         names = tuple(f"term{k}" for k in range(count))
-        sizes = [max(float(np.sqrt((term.push**2).mean())), 1e-12) for term in terms]
+        sizes = [max(float(np.sqrt((term.perturbation**2).mean())), 1e-12) for term in terms]
         layout = replace(
             plain,
             columns=plain.columns + names,
@@ -239,12 +239,12 @@ class WithTerms:
     def split(self, p: Array) -> tuple[Array, Array | None]:
         """The inner channel's vector, and what the terms add at the nodes."""
         width = len(self.inner.layout.columns)
-        push = np.zeros_like(self.terms[0].push)
+        perturbation = np.zeros_like(self.terms[0].perturbation)
         for coefficient, term in zip(p[width:], self.terms, strict=True):
-            push += coefficient * term.push
-        return p[:width], push
+            perturbation += coefficient * term.perturbation
+        return p[:width], perturbation
 
     def residual(self, p: Array) -> Array:
         """Whitened residuals."""
-        core, push = self.split(p)
-        return self.inner.residual(core, push)
+        core, perturbation = self.split(p)
+        return self.inner.residual(core, perturbation)

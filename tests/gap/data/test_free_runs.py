@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from disco_hw.gap.data.free_runs import pose_residual, run_body, run_wheels
-from disco_hw.gap.data.gridded_drive import CELL_S
+from disco_hw.gap.data.gridded_drive import GRID_STEP_S
 from disco_hw.gap.data.layout import BODY, WHEEL
 from disco_hw.model import EffectSetting, Model
 from disco_hw.model.free_run import FreeRun
@@ -25,7 +25,7 @@ EFFECTS = (
 @pytest.mark.parametrize("effect", [*EFFECTS, None])
 def test_two_channels_in_a_row_are_the_model(effect):
     model = Model(0.06, 0.4, 0.1, (effect,) if effect else ())
-    t = np.arange(N) * CELL_S
+    t = np.arange(N) * GRID_STEP_S
     commands = np.column_stack([4 * np.sin(0.8 * t), 6 * np.sin(0.5 * t) + 1])
     p = {"wheels": WHEEL.neutral.copy(), "body": BODY.neutral.copy()}
     for name, value in zip(model.parameter_names, model.point(), strict=True):
@@ -34,9 +34,9 @@ def test_two_channels_in_a_row_are_the_model(effect):
                 p[key][layout.place[name]] = value
     first = t == 0.0
     angle = run_wheels(p["wheels"], model.point()[:3], commands, np.zeros((N, 2)), first, t, np.zeros((N, 2)))
-    speed = np.gradient(angle, CELL_S, axis=0)
+    speed = np.gradient(angle, GRID_STEP_S, axis=0)
     track = run_body(p["body"], angle, speed, np.zeros((N, 3)), first, t)
-    run = FreeRun(model, model.point()[None, :], CELL_S)
+    run = FreeRun(model, model.point()[None, :], GRID_STEP_S)
     history = np.repeat(commands[:1], run.past_rows, axis=0)
     states = run.states(np.zeros(5), np.concatenate([history, commands[:-1]]), run.past_rows)
     np.testing.assert_allclose(track, states[:, :3], atol=2e-3)
@@ -47,7 +47,7 @@ def test_a_command_that_is_not_known_stops_the_prediction():
     commands[40:60] = np.nan
     first = np.arange(100) == 0
     angle = run_wheels(
-        WHEEL.neutral, np.array([0.06, 0.4, 0.0]), commands, np.zeros((100, 2)), first, np.arange(100) * CELL_S,
+        WHEEL.neutral, np.array([0.06, 0.4, 0.0]), commands, np.zeros((100, 2)), first, np.arange(100) * GRID_STEP_S,
         np.zeros((100, 2)),
     )  # fmt: skip
     assert np.all(np.isfinite(angle))
@@ -60,11 +60,11 @@ def test_however_fast_it_turns_the_path_is_that_of_every_cells_mean_heading():
     count = 4000
     # From slow turns to 300 rad/s, far beyond what short series are for.
     speed = rng.uniform(-1.0, 1.0, (count, 2)) * rng.choice([1.0, 30.0, 1000.0], (count, 1))
-    angle = np.cumsum(speed, axis=0) * CELL_S
+    angle = np.cumsum(speed, axis=0) * GRID_STEP_S
     first = np.isin(np.arange(count), (0, 2500))
     p = BODY.neutral.copy()
     p[:3] = radius, axial, x_icr = 0.06, 0.4, 0.1
-    track = run_body(p, angle, speed, np.zeros((count, 3)), first, np.arange(count) * CELL_S)
+    track = run_body(p, angle, speed, np.zeros((count, 3)), first, np.arange(count) * GRID_STEP_S)
     step = np.where(first[:, None], 0.0, np.diff(angle, axis=0, prepend=0.0)) * radius
     along, turn = step.mean(axis=1), (step[:, 1] - step[:, 0]) / axial
     assert np.abs(turn).max() > 2.0
@@ -80,9 +80,11 @@ def test_however_fast_it_turns_the_path_is_that_of_every_cells_mean_heading():
 
 @pytest.mark.parametrize("late_s", [0.2, -0.2, 0.035])
 def test_poses_that_are_older_than_their_stamps_have_a_latency_above_zero(late_s):
-    t_s = np.arange(3000) * CELL_S
+    t_s = np.arange(3000) * GRID_STEP_S
     yaw = 0.6 * np.sin(0.7 * t_s)
-    track = np.column_stack([np.cumsum(np.cos(yaw)) * 0.4 * CELL_S, np.cumsum(np.sin(yaw)) * 0.4 * CELL_S, yaw])
+    track = np.column_stack(
+        [np.cumsum(np.cos(yaw)) * 0.4 * GRID_STEP_S, np.cumsum(np.sin(yaw)) * 0.4 * GRID_STEP_S, yaw]
+    )
     moving_s = np.minimum(t_s, 15.0) + 0.5 * np.maximum(t_s - 15.0, 0.0)
     node = np.arange(100, 2900, 4)
     p = BODY.neutral.copy()

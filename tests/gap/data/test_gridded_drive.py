@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from disco_hw.gap.data.gridded_drive import CELL_S, even_times, timeline
+from disco_hw.gap.data.gridded_drive import GRID_STEP_S, even_times, grid_drive
 from disco_hw.log.drive import Commands, DriveLog, Gyro, Poses, Wheels
 
 
@@ -28,31 +28,31 @@ def drive(t_command, command, t_wheel, speed, ticks=2048, segment=None, pose_s=N
 
 def test_a_command_that_changes_within_a_cell_counts_by_its_share():
     t = np.arange(0.0, 10.0, 0.02)
-    line = timeline(drive(np.array([0.0, 5.003]), np.array([0.0, 1.0]), t, np.where(t > 5.1, 1.0, 0.0)))
-    cell = round(5.0 / CELL_S)
+    line = grid_drive(drive(np.array([0.0, 5.003]), np.array([0.0, 1.0]), t, np.where(t > 5.1, 1.0, 0.0)))
+    cell = round(5.0 / GRID_STEP_S)
     assert line.command_rad_s[cell, 0] == pytest.approx(0.7, abs=1e-6)
     assert line.command_rad_s[cell - 1, 0] == pytest.approx(0.0, abs=1e-9)
 
 
 def test_silence_and_segments_cut_runs():
     t = np.concatenate([np.arange(0.0, 8.0, 0.02), np.arange(11.0, 20.0, 0.02)])
-    line = timeline(drive(t, np.full(t.size, 1.0), t, np.full(t.size, 1.0)))
+    line = grid_drive(drive(t, np.full(t.size, 1.0), t, np.full(t.size, 1.0)))
     assert line.first.sum() == 2
     segment = (t > 4.0).astype(np.int64)
-    assert timeline(drive(t, np.full(t.size, 1.0), t, np.full(t.size, 1.0), segment=segment)).first.sum() == 3
+    assert grid_drive(drive(t, np.full(t.size, 1.0), t, np.full(t.size, 1.0), segment=segment)).first.sum() == 3
 
 
 def test_yaw_is_not_wrapped_and_stamps_scatter_as_they_do():
     rng = np.random.default_rng(0)
     t = np.arange(0.0, 20.0, 0.02) + 0.001 * rng.standard_normal(1000)
-    line = timeline(drive(t, np.full(t.size, 1.0), t, np.full(t.size, 1.0)))
+    line = grid_drive(drive(t, np.full(t.size, 1.0), t, np.full(t.size, 1.0)))
     assert line.pose_values[-1, 2] - line.pose_values[0, 2] > 6.0
     assert line.stamp_scatter_s == pytest.approx(0.001, rel=0.3)
 
 
 def test_the_smallest_step_of_the_angle_is_the_encoders():
     t = np.arange(0.0, 20.0, 0.02)
-    line = timeline(drive(t, np.sin(t), t, np.sin(t)))
+    line = grid_drive(drive(t, np.sin(t), t, np.sin(t)))
     assert line.quantum_rad == pytest.approx(2 * math.pi / 2048, rel=1e-6)
 
 
@@ -70,15 +70,15 @@ def test_wheels_that_another_master_turns_are_left_out():
     t = np.arange(0.0, 30.0, 0.02)
     command = np.where(t < 10.0, 2.0, 0.0)
     speed = np.where(t < 10.0, 2.0, np.where(t > 20.0, 1.5, 0.0))
-    line = timeline(drive(t, command, t, speed))
-    assert np.isnan(line.command_rad_s[round(25.0 / CELL_S), 0])
-    assert np.isfinite(line.command_rad_s[round(5.0 / CELL_S), 0])
+    line = grid_drive(drive(t, command, t, speed))
+    assert np.isnan(line.command_rad_s[round(25.0 / GRID_STEP_S), 0])
+    assert np.isfinite(line.command_rad_s[round(5.0 / GRID_STEP_S), 0])
     assert any("left out" in note for note in line.notes)
 
 
 def test_a_sudden_start_out_of_a_long_rest_is_no_other_master():
     t = np.arange(0.0, 20.0, 0.02)
     command = np.where((t >= 10.0) & (t < 13.0), 4.0, 0.0)
-    line = timeline(drive(t, command, t, command))
+    line = grid_drive(drive(t, command, t, command))
     assert np.isfinite(line.command_rad_s[:-5]).all()
     assert not line.notes

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from disco_hw.gap.data.gridded_drive import CELL_S
+from disco_hw.gap.data.gridded_drive import GRID_STEP_S
 from disco_hw.gap.data.horizon import displacement, starts_of
 from disco_hw.gap.data.layout import BODY
 
@@ -12,7 +12,7 @@ ONE_RUN = np.arange(N) == 0
 
 
 def test_a_circle_looks_the_same_from_everywhere():
-    t = np.arange(N) * CELL_S
+    t = np.arange(N) * GRID_STEP_S
     track = np.column_stack([np.sin(0.5 * t), 1.0 - np.cos(0.5 * t), 0.5 * t])
     start = np.array([100, 300, 600])
     moved = displacement(BODY.neutral, ONE_RUN, track, t, start, track[start, 2], 2.0)
@@ -20,7 +20,7 @@ def test_a_circle_looks_the_same_from_everywhere():
 
 
 def test_latency_shows_what_was_and_drift_adds_in_the_world():
-    t = np.arange(N) * CELL_S
+    t = np.arange(N) * GRID_STEP_S
     track = np.column_stack([0.5 * t**2, np.zeros(N), np.zeros(N)])
     late = BODY.neutral.copy()
     late[BODY.place["pose_latency.latency_s"]] = 0.1
@@ -48,7 +48,7 @@ def test_a_latency_does_not_look_into_another_run(latency_s):
     assert start.max() + 102 == N
     moved = displacement(shifted, first, track, np.zeros(N), start, np.zeros(start.size), 1.0)[:, 0]
     # Before a run begins nothing is known: a pose that is so late sees the robot stand.
-    expected = 0.5 - 0.5 * np.maximum(latency_s - (start % 250) * CELL_S, 0.0)
+    expected = 0.5 - 0.5 * np.maximum(latency_s - (start % 250) * GRID_STEP_S, 0.0)
     expected[start // 250 == 1] *= -1.0
     np.testing.assert_allclose(moved, expected, atol=1e-9)
 

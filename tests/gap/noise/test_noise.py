@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from disco_hw.gap.data.gridded_drive import CELL_S
+from disco_hw.gap.data.gridded_drive import GRID_STEP_S
 from disco_hw.gap.data.layout import WHEEL
-from disco_hw.gap.noise.body_noise import BodyNoise, Motion, body_gains, body_likelihood, whiten_body
+from disco_hw.gap.noise.body_noise import BodyMotion, BodyNoise, body_gains, body_likelihood, whiten_body
 from disco_hw.gap.noise.channels import WheelChannel
-from disco_hw.gap.noise.wheel_noise import Driven, WheelNoise, wheel_gains, wheel_likelihood, whiten_wheels
+from disco_hw.gap.noise.wheel_noise import WheelMotion, WheelNoise, wheel_gains, wheel_likelihood, whiten_wheels
 from disco_hw.gap.search.candidates import indices
 from disco_hw.gap.search.least_squares import fit
 from tests.gap.synthetic import GEOMETRY, line_of
@@ -32,7 +32,7 @@ def simulated(noise, speed, rng):
 def driven(speed, restart):
     count = speed.shape[0]
     use = np.arange(count) % 17 != 5
-    return Driven(np.full(count, 0.02), speed, speed, np.zeros(count), restart, use)
+    return WheelMotion(np.full(count, 0.02), speed, speed, np.zeros(count), restart, use)
 
 
 def test_wheel_residuals_become_white():
@@ -42,7 +42,9 @@ def test_wheel_residuals_become_white():
     speed = np.full((count, 2), 4.0)
     residual = simulated(noise, speed, rng)
     flags = np.arange(count) == 0
-    gains = wheel_gains(noise, Driven(np.full(count, 0.02), speed, speed, np.zeros(count), flags, np.ones(count, bool)))
+    gains = wheel_gains(
+        noise, WheelMotion(np.full(count, 0.02), speed, speed, np.zeros(count), flags, np.ones(count, bool))
+    )
     white = whiten_wheels(residual, gains)[1:, 0]
     assert white.var() == pytest.approx(1.0, abs=0.08)
     assert abs(np.corrcoef(white[1:], white[:-1])[0, 1]) < 0.05
@@ -75,7 +77,7 @@ def body_motion(count, rng):
     steps = 0.02 * rng.standard_normal((2, count))
     restart, use = np.arange(count) % 100 == 0, np.arange(count) % 23 != 7
     rest = rng.uniform(0, 1, (3, count))
-    return Motion(np.full(count, 0.04), *steps, turned, *rest, restart, use)
+    return BodyMotion(np.full(count, 0.04), *steps, turned, *rest, restart, use)
 
 
 def test_whitening_of_poses_is_linear_and_silent_where_none_is_used():
@@ -103,7 +105,7 @@ def test_the_likelihood_of_the_body_is_that_of_its_whitened_residuals():
 def test_a_body_at_rest_has_the_noise_of_its_poses_alone():
     count, rng = 4000, np.random.default_rng(5)
     still, restart = np.zeros(count), np.arange(count) == 0
-    moved = Motion(np.full(count, 0.04), still, still, still, still, still, still, restart, ~np.zeros(count, bool))
+    moved = BodyMotion(np.full(count, 0.04), still, still, still, still, still, still, restart, ~np.zeros(count, bool))
     noise = BodyNoise(0.01, 0.02, noise_correlation_s=1e-3)
     residual = rng.standard_normal((count, 3)) * (0.01, 0.01, 0.02) + (0.1, -0.1, 0.05)
     white = whiten_body(residual, body_gains(noise, moved))[10:]
@@ -122,7 +124,7 @@ def test_a_slow_error_acts_on_the_speed_that_is_expected_and_tells_nothing_of_a_
     difference = channel.residual(gained) - channel.residual(WHEEL.neutral)
     # In 60 s there are two independent errors of 1 %, and what is told of their mean is not a mark more.
     assert float(difference @ difference) < 5.0
-    np.testing.assert_allclose(channel.driven.expected_rad_s[10:45], 4.0)
+    np.testing.assert_allclose(channel.motion.expected_rad_s[10:45], 4.0)
 
 
 def test_readings_with_an_error_make_no_gain():
@@ -132,7 +134,7 @@ def test_readings_with_an_error_make_no_gain():
     read = line.encoder_angle_rad + 0.004 * rng.standard_normal((line.encoder.node.size, 2))
     between = np.column_stack([np.interp(line.t_s, line.t_s[line.encoder.node], side) for side in read.T])
     # As speeds are measured: over 20 ms either side.
-    speed = (np.roll(between, -2, axis=0) - np.roll(between, 2, axis=0)) / (4.0 * CELL_S)
+    speed = (np.roll(between, -2, axis=0) - np.roll(between, 2, axis=0)) / (4.0 * GRID_STEP_S)
     line = replace(line, encoder_angle_rad=read, speed_rad_s=np.clip(speed, -6.0, 6.0))
     noise = WheelNoise(0.015, 0.16, 0.004, 1e-5, 1e-5, 1e-5, 1e-4)
     channel = WheelChannel.build(line, noise, np.array(GEOMETRY))
@@ -145,8 +147,8 @@ def test_after_unknown_commands_the_wheels_angle_begins_anew():
     line = line_of(np.full((2000, 2), 3.0))
     line.command_rad_s[600:900] = np.nan
     channel = WheelChannel.build(line, WheelNoise(), np.array(GEOMETRY))
-    again = np.flatnonzero(np.diff(channel.driven.use.astype(int)) == 1) + 1
+    again = np.flatnonzero(np.diff(channel.motion.use.astype(int)) == 1) + 1
     assert again.size == 1
-    assert channel.driven.restart[again].all()
+    assert channel.motion.restart[again].all()
     # Nine radians were turned meanwhile, of which the model knows nothing.
     assert np.abs(channel.whitened(WHEEL.neutral)).max() < 0.5

@@ -7,14 +7,14 @@ from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.noise.channels import WheelChannel
 from disco_hw.gap.noise.wheel_noise import WheelNoise
 from disco_hw.gap.report.blind_spots import blind_spots
-from disco_hw.gap.search.channel_search import Found, body_moves, wheel_moves
+from disco_hw.gap.search.channel_search import ChannelResult, body_moves, wheel_moves
 from disco_hw.gap.search.selection import Selector, Thresholds
 from tests.gap.synthetic import GEOMETRY, body_channel, line_of
 
 
 def spots_of(channel, names=(), limits=None):
     selector = Selector(channel, body_moves(channel), limits or Thresholds())
-    return {spot.name: spot for spot in blind_spots(Found(selector, names, channel))}
+    return {spot.name: spot for spot in blind_spots(ChannelResult(selector, names, channel))}
 
 
 def test_every_effect_that_was_not_found_is_listed_with_the_drive_that_shows_it():
@@ -58,7 +58,7 @@ def test_how_fast_turning_speeds_up_shows_only_where_the_robot_is_asked_to_turn(
 
     def spot_at(*commands):
         channel = WheelChannel.build(line_of(np.repeat(commands, 200, axis=0)), WheelNoise(), geometry)
-        found = Found(Selector(channel, wheel_moves(channel, geometry)), (), channel)
+        found = ChannelResult(Selector(channel, wheel_moves(channel, geometry)), (), channel)
         return {spot.name: spot for spot in blind_spots(found, 8.0)}["yaw_acceleration_limit"]
 
     straight = spot_at(*[(0.0, 0.0), (5.0, 5.0), (-5.0, -5.0)] * 4)
@@ -76,7 +76,7 @@ def test_no_limit_shows_above_what_was_asked_of_the_robot():
 
     def spots_at(left, right, top_rad_s):
         channel = WheelChannel.build(line_of(np.full((4000, 2), (left, right))), WheelNoise(), geometry)
-        found = Found(Selector(channel, wheel_moves(channel, geometry)), (), channel)
+        found = ChannelResult(Selector(channel, wheel_moves(channel, geometry)), (), channel)
         return {spot.name: spot for spot in blind_spots(found, top_rad_s)}
 
     # A steady circle at half speed: 0.3 rad/s of turning.
@@ -98,7 +98,7 @@ def test_whether_a_drive_is_blind_is_a_plain_truth_value_however_slowly_the_robo
     geometry = np.array(GEOMETRY)
     for speeds in ((0.0, 0.0), (4.0, 4.0), (-1.5, 1.5), (-40.0, 40.0)):
         channel = WheelChannel.build(line_of(np.full((4000, 2), speeds)), WheelNoise(), geometry)
-        found = Found(Selector(channel, wheel_moves(channel, geometry)), (), channel)
+        found = ChannelResult(Selector(channel, wheel_moves(channel, geometry)), (), channel)
         for spot in blind_spots(found, top_rad_s):
             assert type(spot.blind) is bool, spot.name
             assert spot.smallest_visible is None or type(spot.smallest_visible) is float, spot.name

@@ -10,14 +10,14 @@ from disco_hw.gap.report.blind_spots import BlindSpot
 from disco_hw.gap.report.findings import STAGES, GapReport, UnnamedFinding
 from disco_hw.gap.report.page import page
 from disco_hw.gap.search.channel_search import _HEAVIEST, _NAMED_SCORE
-from disco_hw.gap.search.cross_validation import Errors
+from disco_hw.gap.search.cross_validation import PredictionErrors
 from disco_hw.model import Model
 from disco_hw.outputs import as_json
 
 
 def errors(position_m, yaw_rad=0.02):
     interval = (0.9 * position_m, 1.1 * position_m)
-    return Errors(position_m, interval, yaw_rad, (0.9 * yaw_rad, 1.1 * yaw_rad), 0.1, {"curves": position_m})
+    return PredictionErrors(position_m, interval, yaw_rad, (0.9 * yaw_rad, 1.1 * yaw_rad), 0.1, {"curves": position_m})
 
 
 def report(amended_m, yaw_rad=0.02, blind=()):
@@ -64,7 +64,7 @@ def test_the_page_says_what_is_in_the_model():
 
 
 def test_a_log_of_short_stretches_says_that_it_does_not_tell_the_gap():
-    nan = Errors(math.nan, (math.nan, math.nan), math.nan, (math.nan, math.nan), math.nan, {})
+    nan = PredictionErrors(math.nan, (math.nan, math.nan), math.nan, (math.nan, math.nan), math.nan, {})
     some = report(0.014)
     short = replace(some, gap={s: {h: e if h < 2.0 else nan for h, e in of.items()} for s, of in some.gap.items()})
     assert short.answer()[1] == "No stretch of the logs is long enough to see how far 2 s predictions are off."

@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from disco_hw.gap.data.gridded_drive import timeline
+from disco_hw.gap.data.gridded_drive import grid_drive
 from disco_hw.gap.data.layout import BODY, WHEEL
 from disco_hw.gap.find import find_gap
 from disco_hw.gap.noise.channels import WheelChannel
@@ -26,7 +26,7 @@ pytestmark = pytest.mark.long
 def found_in(name, values, seed):
     start = BODY.neutral.copy()
     start[:3] = 0.061, 0.415, 0.238
-    return search_body(timeline(simulated_drive({name: values}, seed=seed)), start)
+    return search_body(grid_drive(simulated_drive({name: values}, seed=seed)), start)
 
 
 def test_a_patch_that_is_entered_again_is_a_patch():
@@ -59,7 +59,7 @@ def test_a_patch_that_is_left_for_good_is_told_with_the_change_it_looks_like():
 
 def test_what_holds_the_wheels_is_not_fitted_with_a_slow_response():
     geometry = np.array([0.061, 0.415, 0.238])
-    line = timeline(simulated_drive({"stiction": 0.85}, seed=3005))
+    line = grid_drive(simulated_drive({"stiction": 0.85}, seed=3005))
     channel = WheelChannel.build(line, WheelNoise(reading_rad=max(line.quantum_rad, 2e-4)), geometry)
     selector = Selector(channel, wheel_moves(channel, geometry), start=WHEEL.neutral.copy())
     both = ("motor_lag", "command_delay")

@@ -2,13 +2,13 @@
 
 from types import SimpleNamespace
 
-from disco_hw.gap.search.confounding import alike, one_encoder
-from disco_hw.gap.search.intervals import Estimate
+from disco_hw.gap.search.confounding import confounded_with, one_encoder
+from disco_hw.gap.search.intervals import ParameterEstimate
 
 
 def estimates(**values):
     return SimpleNamespace(
-        by_name={name.replace("__", "."): Estimate(v, v - 0.002, v + 0.002) for name, v in values.items()}
+        by_name={name.replace("__", "."): ParameterEstimate(v, v - 0.002, v + 0.002) for name, v in values.items()}
     )
 
 
@@ -41,6 +41,6 @@ def test_without_an_asymmetry_a_gain_of_one_wheel_is_a_gain():
 
 
 def test_lateral_offsets_are_one_class():
-    assert alike(("lateral_icr", "turn_slip"), False) == {"lateral_icr": ("pose_offset",)}
-    assert alike(("wheel_gain",), True) == {"wheel_gain": ("encoder_scale",)}
-    assert alike(("wheel_gain",), False) == {}
+    assert confounded_with(("lateral_icr", "turn_slip"), False) == {"lateral_icr": ("pose_offset",)}
+    assert confounded_with(("wheel_gain",), True) == {"wheel_gain": ("encoder_scale",)}
+    assert confounded_with(("wheel_gain",), False) == {}

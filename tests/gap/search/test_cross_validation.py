@@ -12,7 +12,7 @@ from disco_hw.gap.search.channel_search import indices
 from disco_hw.gap.search.cross_validation import (
     FOLD_S,
     Chain,
-    Errors,
+    PredictionErrors,
     clearly_worse,
     errors_of,
     floor_errors,
@@ -53,7 +53,7 @@ def test_the_right_model_errs_by_the_noise_alone_and_a_wrong_one_by_more():
 def test_only_what_repeats_in_most_stretches_or_is_far_worse_is_clearly_worse():
     def errors(*squares):
         both = np.column_stack([squares, np.ones(len(squares))])
-        return Errors(float(np.sqrt(np.mean(squares))), (0.0, 1.0), 1.0, (0.0, 1.0), 0.0, {}, both)
+        return PredictionErrors(float(np.sqrt(np.mean(squares))), (0.0, 1.0), 1.0, (0.0, 1.0), 0.0, {}, both)
 
     before = errors(1.0, 1.0, 1.0, 1.0, 1.0, 1.0)
     assert clearly_worse(before, errors(1.2, 1.2, 1.1, 1.3, 1.2, 1.2))

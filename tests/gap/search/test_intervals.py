@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from disco_hw.gap.data.layout import BODY
-from disco_hw.gap.search.channel_search import Found, body_moves
-from disco_hw.gap.search.intervals import Estimate, Estimates, estimates, in_motion
+from disco_hw.gap.search.channel_search import ChannelResult, body_moves
+from disco_hw.gap.search.intervals import ChannelEstimates, ParameterEstimate, estimate_parameters, in_motion
 from disco_hw.gap.search.selection import Selector
 from tests.gap.synthetic import body_channel
 
 
 def estimated(channel, names=("turn_slip",)):
-    return estimates(Found(Selector(channel, body_moves(channel)), names, channel))
+    return estimate_parameters(ChannelResult(Selector(channel, body_moves(channel)), names, channel))
 
 
 def test_intervals_hold_the_truth_nine_times_of_ten():
@@ -47,7 +47,7 @@ def test_the_time_of_a_change_has_an_interval_around_it():
     vector = channel.neutral.copy()
     vector[[BODY.place["surface_change.track"], BODY.place["surface_change.time_s"]]] = 0.12, 35.0
     moved = channel.measured + (channel.track(vector) - channel.track(channel.neutral))[channel.samples.node]
-    line = replace(channel.timeline, pose_values=moved)
+    line = replace(channel.drive, pose_values=moved)
     found = estimated(type(channel).build(line, channel.noise, channel.neutral), ("surface_change",))
     time = found.by_name["surface_change.time_s"]
     assert time.low < time.value < time.high
@@ -58,8 +58,10 @@ def test_the_time_of_a_change_has_an_interval_around_it():
 def test_a_limit_of_turning_is_no_better_known_than_the_geometry_that_it_is_told_in():
     def estimates_of(covariance, **values):
         ends = [1.96 * spread for spread in np.sqrt(np.diag(covariance))]
-        by_name = {name: Estimate(v, v - end, v + end) for (name, v), end in zip(values.items(), ends, strict=True)}
-        return Estimates(by_name, tuple(values), np.asarray(covariance))
+        by_name = {
+            name: ParameterEstimate(v, v - end, v + end) for (name, v), end in zip(values.items(), ends, strict=True)
+        }
+        return ChannelEstimates(by_name, tuple(values), np.asarray(covariance))
 
     limit, lag = "yaw_rate_limit.limit_rad_s", "motor_lag.tau_s"
     # Radius and axial distance are known to 1 % and 2 %, and their ratio to sqrt(1 + 4 - 2 * 1.5) %.

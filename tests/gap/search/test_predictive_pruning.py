@@ -6,8 +6,8 @@ from types import SimpleNamespace
 import pytest
 
 from disco_hw.gap import find_gap
-from disco_hw.gap.search.cross_validation import Errors
-from disco_hw.gap.search.predictive_pruning import harmless, left_out
+from disco_hw.gap.search.cross_validation import PredictionErrors
+from disco_hw.gap.search.predictive_pruning import prune, pruning_sentences
 from disco_hw.model import Model
 from tools.gap_logs import simulated_drive
 
@@ -30,18 +30,18 @@ class Whole:
     wheels: Part
     body: Part
     amended_m: dict
-    harmful: tuple = ()
+    pruned: tuple = ()
 
     def errors(self, stage, ahead_s):
         names = frozenset((*self.wheels.names, *self.body.names))
         size = 0.1 if stage == "refitted" else self.amended_m.get(names, 0.1)
-        return Errors(size, (size, size), size, (size, size), size, {})
+        return PredictionErrors(size, (size, size), size, (size, size), size, {})
 
 
 def told(amended_m, wheels, body=(), **rivals):
     by_set = {frozenset(names.split()): size for names, size in amended_m.items()}
-    found = harmless(Whole(Part(wheels, rivals), Part(body), by_set))
-    return (*found.wheels.names, *found.body.names), found.harmful
+    found = prune(Whole(Part(wheels, rivals), Part(body), by_set))
+    return (*found.wheels.names, *found.body.names), found.pruned
 
 
 def test_what_predicts_better_or_hardly_worse_stays_without_another_look():
@@ -67,8 +67,8 @@ def test_a_name_without_which_predictions_are_clearly_better_goes():
 
 def test_another_that_would_do_in_its_place_takes_it_if_it_predicts_better_than_none():
     amended_m = {"wheel_gain": 0.5, "": 0.1, "motor_lag": 0.04, "command_delay": 0.06}
-    names, harmful = told(amended_m, ("wheel_gain",), wheel_gain=("command_delay", "motor_lag"))
-    assert (names, harmful) == (("motor_lag",), ("wheel_gain",))
+    names, pruned = told(amended_m, ("wheel_gain",), wheel_gain=("command_delay", "motor_lag"))
+    assert (names, pruned) == (("motor_lag",), ("wheel_gain",))
 
 
 def test_nothing_goes_where_all_else_is_worse_still():
@@ -77,11 +77,11 @@ def test_nothing_goes_where_all_else_is_worse_still():
 
 def test_what_the_given_model_has_stays():
     whole = Whole(Part(("motor_lag",), given=("motor_lag",)), Part(()), {frozenset(("motor_lag",)): 0.5})
-    assert harmless(whole).wheels.names == ("motor_lag",)
+    assert prune(whole).wheels.names == ("motor_lag",)
 
 
 def test_what_was_left_out_is_said():
-    (said,) = left_out(Whole(Part(()), Part(()), {}, ("motor_lag",)))
+    (said,) = pruning_sentences(Whole(Part(()), Part(()), {}, ("motor_lag",)))
     assert said.startswith("command_to_wheel: motor_lag fits")
     assert "worse" in said
 

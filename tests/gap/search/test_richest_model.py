@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from disco_hw.gap.data.gridded_drive import timeline
+from disco_hw.gap.data.gridded_drive import grid_drive
 from disco_hw.gap.data.layout import WHEEL
 from disco_hw.gap.noise.channels import WheelChannel
 from disco_hw.gap.noise.noise_fit import largest_command_jitter_s, learn_wheel_noise
@@ -20,7 +20,7 @@ GEOMETRY = np.array([0.061, 0.415, 0.238])
 
 @cache
 def learnt(*hidden):
-    line = timeline(simulated_drive(dict(hidden), seed=905))
+    line = grid_drive(simulated_drive(dict(hidden), seed=905))
     channel = WheelChannel.build(line, WheelNoise(reading_rad=line.quantum_rad), GEOMETRY)
     plain = learn_wheel_noise(channel, channel.raw_residual(WHEEL.neutral))
     return plain, learn_saturated_wheels(plain, WHEEL.neutral)[0]
@@ -37,4 +37,4 @@ def test_what_has_no_name_does_not_pass_for_noise():
     plain, channel = learnt(("x_slew_limited_motor", 8.0))
     assert plain.noise.relative > 0.03
     assert channel.noise.relative < 0.022
-    assert channel.noise.command_stamp_s <= 1.001 * largest_command_jitter_s(channel.timeline)
+    assert channel.noise.command_stamp_s <= 1.001 * largest_command_jitter_s(channel.drive)

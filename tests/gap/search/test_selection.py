@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from disco_hw.gap.data.gridded_drive import CELL_S
+from disco_hw.gap.data.gridded_drive import GRID_STEP_S
 from disco_hw.gap.data.layout import BODY
 from disco_hw.gap.noise.channels import WheelChannel
 from disco_hw.gap.noise.wheel_noise import WheelNoise
 from disco_hw.gap.search.candidates import candidates_of
 from disco_hw.gap.search.channel_search import body_moves, wheel_moves
-from disco_hw.gap.search.evidence import Evidence
+from disco_hw.gap.search.evidence import EffectEvidence
 from disco_hw.gap.search.least_squares import Fit
 from disco_hw.gap.search.selection import Selector, Thresholds
 from tests.gap.synthetic import GEOMETRY, body_channel, line_of
@@ -50,7 +50,7 @@ def test_a_stand_in_is_swapped_for_what_it_stood_in_for():
 def wheels_slow(tau_s):
     """A search of wheels that follow steps of their commands as a lag."""
     commands = np.repeat(np.random.default_rng(7).choice([-4.0, -2.0, 0.0, 3.0, 5.0], 60), 100)
-    keep = np.exp(-CELL_S / tau_s)
+    keep = np.exp(-GRID_STEP_S / tau_s)
     followed = lfilter([1.0 - keep], [1.0, -keep], commands)
     line = line_of(np.repeat(followed[:, None], 2, axis=1))
     line = replace(line, command_rad_s=np.repeat(commands[:, None], 2, axis=1))
@@ -83,11 +83,13 @@ def test_a_change_is_found_when_it_happens():
     channel, line = body_channel()
     late = line.t_s > 40.0
     truth = channel.neutral.copy()
-    push = np.zeros((line.t_s.size, 3))
+    perturbation = np.zeros((line.t_s.size, 3))
     omega = truth[0] / truth[1] * (line.speed_rad_s[:, 1] - line.speed_rad_s[:, 0])
-    push[:, 2] = np.where(late, -omega * (1.0 - 1.0 / 1.12), 0.0)
+    perturbation[:, 2] = np.where(late, -omega * (1.0 - 1.0 / 1.12), 0.0)
     moved = (
-        channel.measured + channel.track(truth, push)[channel.samples.node] - channel.track(truth)[channel.samples.node]
+        channel.measured
+        + channel.track(truth, perturbation)[channel.samples.node]
+        - channel.track(truth)[channel.samples.node]
     )
     changed = type(channel).build(replace(line, pose_values=moved), channel.noise, truth)
     found = Selector(changed, body_moves(changed))
@@ -123,7 +125,7 @@ def judged(gain=30.0, score=30.0, repeated=10.0, moved_m=0.01, misfit=0.0, count
     chosen = Selector(channel, lambda small, big: moved_m, limits)
     for names, cost in ((frozenset(), base), (frozenset({"turn_slip"}), base - gain)):
         chosen.fits[names] = Fit(np.zeros(1), (), cost, np.empty(0), np.empty((0, 0)))
-    chosen.proofs[frozenset(), frozenset({"turn_slip"})] = Evidence(gain, repeated, repeated, 1.0, score)
+    chosen.proofs[frozenset(), frozenset({"turn_slip"})] = EffectEvidence(gain, repeated, repeated, 1.0, score)
     return chosen.acceptable((), ("turn_slip",))
 
 
@@ -151,10 +153,10 @@ def test_noise_that_wanders_is_named_by_gain_alone_and_not_by_the_rule():
     channel, line = body_channel()
     rng = np.random.default_rng(11)
     steps = np.repeat(rng.standard_normal(line.t_s.size // 300 + 1), 300)[: line.t_s.size]
-    push = np.zeros((line.t_s.size, 3))
-    push[:, 2] = 0.03 * steps * (np.abs(line.speed_rad_s).max(axis=1) > 0.0)
+    perturbation = np.zeros((line.t_s.size, 3))
+    perturbation[:, 2] = 0.03 * steps * (np.abs(line.speed_rad_s).max(axis=1) > 0.0)
     plain = channel.neutral
-    moved = channel.track(plain, push) - channel.track(plain)
+    moved = channel.track(plain, perturbation) - channel.track(plain)
     wandering = type(channel).build(
         replace(line, pose_values=channel.measured + moved[channel.samples.node]), channel.noise, plain
     )
