@@ -2,29 +2,7 @@
 
 from __future__ import annotations
 
-_FAULTS = {
-    "UNDER_VOLTAGE": "charge the battery",
-    "OVER_VOLTAGE": "check the battery and the charger",
-    "OVER_TEMPERATURE_LEFT": "let the left motor cool",
-    "OVER_TEMPERATURE_RIGHT": "let the right motor cool",
-    "OVER_CURRENT_LEFT": "look for what blocks the left wheels",
-    "OVER_CURRENT_RIGHT": "look for what blocks the right wheels",
-    "STALL_LEFT": "free the left wheels",
-    "STALL_RIGHT": "free the right wheels",
-    "ENCODER_MISSING_LEFT": "check the left encoder's cable",
-    "ENCODER_MISSING_RIGHT": "check the right encoder's cable",
-    "ENCODER_JUMP_LEFT": "check the left encoder's shield and magnet",
-    "ENCODER_JUMP_RIGHT": "check the right encoder's shield and magnet",
-    "WRONG_DIRECTION_LEFT": "swap two wires of the left motor or encoder",
-    "WRONG_DIRECTION_RIGHT": "swap two wires of the right motor or encoder",
-    "BUS_OFF": "check the bus: wiring, termination, bit rate",
-    "DBC_HASH_MISMATCH": "flash the firmware that matches this host",
-    "PROTOCOL_MAJOR_MISMATCH": "flash the firmware that matches this host",
-    "CONFIG_INVALID": "correct the controller's configuration and flash it again",
-    "WATCHDOG_RESET": "the controller hung and restarted; report it",
-    "BROWN_OUT_RESET": "check the controller's supply",
-    "SELF_TEST_FAILED": "the controller is broken; replace it",
-}
+from firmware_protocol import faults
 
 _STOP_CAUSES = {
     "REQUESTED": "it was asked to",
@@ -74,8 +52,8 @@ _ESTOP_SOURCES = {
 
 def fault(name: str) -> str:
     """Say what a fault of the robot is and what to do about it."""
-    remedy = _FAULTS.get(name)
-    return f"{name}: {remedy}" if remedy else name
+    advice = faults.advice(name)
+    return f"{name}: {advice}" if advice else name
 
 
 def stop_cause(name: str) -> str:

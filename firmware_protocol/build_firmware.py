@@ -32,6 +32,7 @@ SOURCES = (
     "states.c",
     "faults.c",
     "transmit.c",
+    "timebase.c",
     "reception.c",
     "host.c",
     "command.c",

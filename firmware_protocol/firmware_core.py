@@ -1,6 +1,7 @@
 """The C firmware core as a Python object: what the virtual robot runs and what the tests hold to account."""
 
 import enum
+import secrets
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -12,6 +13,7 @@ from firmware_protocol.codec import PROTOCOL, PROTOCOL_MAJOR, Codec
 _lib: Any = _firmware.lib
 _ffi: Any = _firmware.ffi
 _TICKS_MASK = 0xFFFF_FFFF
+_ENTROPY_MASK = 0xFFFF_FFFF_FFFF_FFFF
 
 
 class ResetCause(enum.IntEnum):
@@ -28,7 +30,7 @@ class FirmwareConfig:
 
     `capabilities` is the sum of the bits in the DBC's value table; `dbc_hash` and `protocol_major` are other than the
     packaged DBC's only to play a robot that speaks another one. With a `key` (16 bytes) commands need a proof made
-    with it; empty: none.
+    with it; empty: none. `cycle_s`: the period at which `FirmwareCore.step` is called.
     """
 
     ticks_per_rev: int
@@ -36,6 +38,7 @@ class FirmwareConfig:
     max_wheel_acceleration_rad_s2: float = 20.0
     stop_deceleration_rad_s2: float = 20.0
     still_speed_rad_s: float = 0.05
+    cycle_s: float = 0.001
     command_timeout_s: float = 0.1
     drive_off_timeout_s: float = 0.5
     stop_timeout_s: float = 1.0
@@ -110,6 +113,11 @@ class FirmwareOutputs(msgspec.Struct, frozen=True, gc=False):
     watchdog_events: int
 
 
+def drawn_entropy() -> int:
+    """Return 64 bits from the system that are not all 0."""
+    return 1 + secrets.randbelow(_ENTROPY_MASK)
+
+
 def _microseconds(seconds: float) -> int:
     return round(seconds * 1e6)
 
@@ -135,6 +143,7 @@ def _fill_config(target: Any, config: FirmwareConfig) -> None:
     ):
         setattr(target, name, getattr(config, f"{name}_{unit}"))
     for name in (
+        "cycle",
         "command_timeout",
         "drive_off_timeout",
         "stop_timeout",
@@ -165,10 +174,11 @@ class FirmwareCore:
         "_stop_causes",
     )
 
-    def __init__(self, config: FirmwareConfig, entropy: int = 0) -> None:
-        """`entropy` (64 bits) seeds challenges and nonces: never the same twice under one key.
+    def __init__(self, config: FirmwareConfig, entropy: int | None = None, last_entropy: int = 0) -> None:
+        """`entropy` (64 bits) seeds challenges and nonces; None draws it from the system.
 
-        Raises OverflowError for a value that its C field cannot hold.
+        The core refuses to leave FAULT if it is 0 or that of the start before, `last_entropy`. Raises OverflowError for
+        a value that its C field cannot hold.
         """
         codec = Codec()
         self._states = _names(codec, "state")
@@ -182,14 +192,15 @@ class FirmwareCore:
         self._data = _ffi.buffer(self._frame.data)
         c_config = _ffi.new("disco_config_t *")
         _fill_config(c_config, config)
-        _lib.disco_firmware_init(self._core, c_config, entropy & 0xFFFF_FFFF_FFFF_FFFF)
+        drawn = drawn_entropy() if entropy is None else entropy
+        _lib.disco_firmware_init(self._core, c_config, drawn & _ENTROPY_MASK, last_entropy & _ENTROPY_MASK)
 
     def receive(self, now_us: int, can_id: int, data: bytes) -> None:
         """Take in one frame from the bus; anything may come."""
         _lib.disco_firmware_receive(self._core, now_us, can_id & 0xFFFF_FFFF, data, min(len(data), 0xFF))
 
     def step(self, now_us: int, inputs: FirmwareInputs) -> FirmwareOutputs:
-        """Run one cycle, meant for 1 kHz."""
+        """Run one cycle; call it once in `cycle_s`."""
         c = self._inputs
         c.ticks = (inputs.left_ticks & _TICKS_MASK, inputs.right_ticks & _TICKS_MASK)
         c.wheel_speed = (inputs.left_speed_rad_s, inputs.right_speed_rad_s)

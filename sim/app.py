@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import gc
 import os
-import secrets
 import select
 import sys
 import time
@@ -57,7 +56,8 @@ class VirtualRobotOptions:
     makes a pseudo-terminal, and a symbolic link to it at `port` unless that is None.
 
     `firmware`: limits and identity of the controller. `start`: pose of the tracked point at the start. `effects`:
-    hidden effects by name (see `sim.effects`). `seed`: all disturbances and noise. `truth_file`: CSV of
+    hidden effects by name (see `sim.effects`). `seed`: all disturbances and noise. `challenge_seed`: arming
+    challenges that are the same in every run, for tests alone; None draws them from the system. `truth_file`: CSV of
     `sim.truth.COLUMNS` at 100 Hz. `bus_log`: every frame on the own bus or line, as candump does. `inject`: socket
     for the commands of `sim.injection`. `ready_fd`: descriptor that gets the ready line too, and is then closed.
     `faults`: what goes wrong, from the ready line on; of the faults of processes only `cpu_hog`.
@@ -75,6 +75,7 @@ class VirtualRobotOptions:
     plant: PlantParameters = field(default_factory=PlantParameters)
     effects: Mapping[str, float | Sequence[float]] = field(default_factory=dict)
     seed: int = 0
+    challenge_seed: int | None = None
     firmware: FirmwareConfig | None = None
     clock: DeviceClock = field(default_factory=DeviceClock)
     truth_file: Path | None = None
@@ -226,9 +227,7 @@ def _check_faults(schedule: FaultSchedule, kind: str, interface: str) -> None:
 def _make_robot(options: VirtualRobotOptions) -> VirtualRobot:
     plant = Plant(options.plant, hidden_effects(options.effects), options.seed, options.start)
     try:
-        # A nonce must never come again under one key, not even in another process with the same seed.
-        seed = secrets.randbits(64) if options.firmware_config.key else options.seed
-        return VirtualRobot(plant, options.firmware_config, options.clock, seed)
+        return VirtualRobot(plant, options.firmware_config, options.clock, options.challenge_seed)
     except OverflowError as error:
         raise OptionError(f"{_given(options.firmware_config)}: {error}; give a smaller value") from None
 

@@ -33,7 +33,7 @@ class RobotInProcess:
     ) -> None:
         host, self.link = connect_pair()
         self.host: Transport = host
-        self.board = VirtualRobot(Plant(plant, hidden_effects(effects), seed, start), firmware, seed=seed)
+        self.board = VirtualRobot(Plant(plant, hidden_effects(effects), seed, start), firmware)
         host.open()
         self.link.open()
         self._now_us = 0

@@ -9,7 +9,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from drivers.types import Frame
-from firmware_protocol.firmware_core import FirmwareConfig, FirmwareCore, FirmwareInputs, FirmwareOutputs, ResetCause
+from firmware_protocol.firmware_core import (
+    FirmwareConfig,
+    FirmwareCore,
+    FirmwareInputs,
+    FirmwareOutputs,
+    ResetCause,
+    drawn_entropy,
+)
 from sim.plant import Plant, TrueState
 from sim.pose_sensor import PoseMeasurement
 from sim.robot_faults import RobotFaults
@@ -37,19 +44,24 @@ class VirtualRobot:
 
     Robot time is true microseconds since the robot was switched on, the plant's time. The motor driver takes the
     firmware's setpoints, its enable and its brake one cycle later. `estop_button` is the state of the button on the
-    robot; `faults`, if there is one, stands between plant and firmware. `seed` decides the arming challenges.
+    robot; `faults`, if there is one, stands between plant and firmware. At each start the controller draws its
+    challenges from the system's entropy, as a real one must; with a `challenge_seed` every run has the same ones, and
+    whoever has recorded one run can replay it in the next: for tests alone.
     """
 
-    def __init__(self, plant: Plant, config: FirmwareConfig, clock: DeviceClock | None = None, seed: int = 0) -> None:
+    def __init__(
+        self, plant: Plant, config: FirmwareConfig, clock: DeviceClock | None = None, challenge_seed: int | None = None
+    ) -> None:
         self.plant = plant
         self.estop_button = False
         self.faults: RobotFaults | None = None
         self._config = config
         self._clock = clock or DeviceClock()
         self._clock_start_us = 0
-        self._seed = seed
+        self._challenge_seed = challenge_seed
         self._reset_cause = ResetCause.POWER_ON
-        self._firmware = FirmwareCore(config, entropy=seed)
+        self._entropy = self._draw_entropy()
+        self._firmware = FirmwareCore(config, self._entropy)
         self._outputs = _RELEASED
 
     @property
@@ -139,9 +151,15 @@ class VirtualRobot:
 
     def reboot(self, cause: ResetCause = ResetCause.POWER_ON) -> None:
         """Restart the controller: it forgets everything, its clock begins anew, the wheels brake until it is up."""
-        self._seed += 1
+        last_entropy, self._entropy = self._entropy, self._draw_entropy()
         self._reset_cause = cause
         self._clock_start_us = self.plant.now_us
         self._clock = DeviceClock(0, self._clock.skew_ppm)
-        self._firmware = FirmwareCore(self._config, entropy=self._seed)
+        self._firmware = FirmwareCore(self._config, self._entropy, last_entropy)
         self._outputs = _RELEASED
+
+    def _draw_entropy(self) -> int:
+        if self._challenge_seed is None:
+            return drawn_entropy()
+        self._challenge_seed += 1
+        return self._challenge_seed

@@ -212,6 +212,8 @@ def _firmware_check(found: _Found) -> Check:
         return Check(name, Level.FAIL, found.detail)
     if found.state in {DriverState.REFUSED, DriverState.FAULT, DriverState.ESTOP}:
         return Check(name, Level.FAIL, f"{found.state.value}: {found.detail}")
+    if found.told and found.told[-1].fault_code:
+        return Check(name, Level.FAIL, f"{found.state.value}: the robot reports {words.fault(found.told[-1].fault)}")
     capabilities = found.capabilities
     clock = "clock synchronised" if found.clock_synchronised else "clock NOT synchronised"
     version = f"{capabilities.firmware_version}, protocol {capabilities.protocol_major}.{capabilities.protocol_minor}"

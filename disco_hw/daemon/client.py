@@ -12,6 +12,7 @@ from disco_hw.config import RobotConfig, load_robot_config
 from disco_hw.daemon.control_client import send_request
 from disco_hw.daemon.socket_place import default_socket_path, passed_over
 from disco_hw.errors import InputError, WorkError
+from drivers import words
 
 ADAPT_ACTIONS = ("revert", "adapt")
 """Back to the belief of the model file, and learning again."""
@@ -81,7 +82,7 @@ def in_words(reply: dict[str, Any]) -> str:
     task, loop = reply["task"], reply["loop"]
     lines = [
         f"{reply['state']}: {reply['detail']}",
-        f"robot {reply['robot_state']}, fault {reply['fault']}, link {reply['link']}",
+        f"robot {reply['robot_state']}, link {reply['link']}, fault {words.fault(reply['fault'])}",
         f"{' '.join(progress(task))}, distance {task['distance_m'] * 1e3:.0f} mm, speed {task['speed_m_s']:.3f} m/s",
         f"loop lateness p99 {loop['lateness_us']['p99']:.0f} us, max {loop['lateness_us']['max']:.0f} us, "
         f"overruns {loop['overruns']}, skipped {loop['skipped']}",

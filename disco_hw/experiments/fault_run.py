@@ -243,8 +243,8 @@ class FaultRun:
         parameters = replace(parameters, wheel_radius_m=0.061, axial_distance_m=0.415, x_icr_m=0.238)
         self.robot = VirtualRobot(
             Plant(parameters, None, seed, start),
-            FirmwareConfig(ticks_per_rev=2048, max_wheel_speed_rad_s=8.0),
-            seed=seed,
+            FirmwareConfig(ticks_per_rev=2048, max_wheel_speed_rad_s=8.0, cycle_s=cycle_us * 1e-6),
+            challenge_seed=seed,
         )
         self.log = LogReader()
         self.monitor = WheelMonitor()

@@ -1,42 +1,13 @@
-"""What a person beside the robot should do about its state; every fault of the protocol has its sentence."""
+"""What a person beside the robot should do about its state; on faults `firmware_protocol.faults` has the word."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any
 
-ESTOP_REMEDY = "The stop is latched. Make the place safe, release the robot's own button, then press Reset."
-_CURRENT = "Free what blocks the wheel, look for a short or a dragging brake, then press Reset."
-_HEAT = "Let the motor cool down and drive more gently, then press Reset."
-_STALL = "The wheel is asked to turn and does not: free it, check its motor cable, then press Reset."
-_ENCODER = "Check the encoder's plug and cable, then press Reset."
-_DIRECTION = "The wheel turns against its command: swap the motor's wires or the encoder's channels, then press Reset."
-_FILES = "Robot and computer speak different protocols: build the firmware from this version, flash it, restart."
-_RESTARTED = "The controller restarted by itself: look at its supply and its firmware, then press Reset."
+from firmware_protocol import faults
 
-FAULTS: Mapping[str, str] = {
-    "UNDER_VOLTAGE": "Charge or change the battery; it clears by itself.",
-    "OVER_VOLTAGE": "Braking feeds back more than the battery takes: brake more gently, check the charger.",
-    "OVER_TEMPERATURE_LEFT": _HEAT,
-    "OVER_TEMPERATURE_RIGHT": _HEAT,
-    "OVER_CURRENT_LEFT": _CURRENT,
-    "OVER_CURRENT_RIGHT": _CURRENT,
-    "STALL_LEFT": _STALL,
-    "STALL_RIGHT": _STALL,
-    "ENCODER_MISSING_LEFT": _ENCODER,
-    "ENCODER_MISSING_RIGHT": _ENCODER,
-    "ENCODER_JUMP_LEFT": _ENCODER,
-    "ENCODER_JUMP_RIGHT": _ENCODER,
-    "WRONG_DIRECTION_LEFT": _DIRECTION,
-    "WRONG_DIRECTION_RIGHT": _DIRECTION,
-    "BUS_OFF": "The robot left the CAN bus: check termination, bit rate and cable, then restart it.",
-    "DBC_HASH_MISMATCH": _FILES,
-    "PROTOCOL_MAJOR_MISMATCH": _FILES,
-    "CONFIG_INVALID": "The robot's stored settings are not valid: write them again, then restart it.",
-    "WATCHDOG_RESET": _RESTARTED,
-    "BROWN_OUT_RESET": _RESTARTED,
-    "SELF_TEST_FAILED": "The controller failed its own test: switch it off and on; if it stays, do not drive.",
-}
+ESTOP_REMEDY = "The stop is latched. Make the place safe, release the robot's own button, then press Reset."
 _NEXT = {
     "DISCONNECTED": "Check the robot's power and the cable to it.",
     "HANDSHAKE": "The robot is being asked who it is; wait.",
@@ -52,8 +23,7 @@ def advice(status: Mapping[str, Any]) -> tuple[str, ...]:
         said.append(f"E-STOP. {ESTOP_REMEDY}")
     fault = str(status["fault"])
     if fault not in {"NONE", "UNKNOWN"}:
-        remedy = FAULTS.get(fault, "Look it up in firmware_protocol/README.md, mend it, then press Reset.")
-        said.append(f"{in_words(fault)}. {remedy}")
+        said.append(fault_sentence(fault))
     state = str(status["state"])
     if said:
         return tuple(said)
@@ -74,6 +44,12 @@ def next_step(status: Mapping[str, Any]) -> str:
     if state == "ARMED":
         return "stop" if status["running"] else "start"
     return {"READY": "arm", "FAULT": "reset"}.get(state, "")
+
+
+def fault_sentence(name: str) -> str:
+    """Return what a fault is and what to do about it."""
+    todo = faults.advice(name) or "not known here: look it up where the robot's firmware comes from"
+    return f"{in_words(name)}. {todo[0].upper()}{todo[1:]}."
 
 
 def in_words(code: str) -> str:

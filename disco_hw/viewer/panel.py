@@ -12,7 +12,7 @@ import numpy as np
 from disco_hw.config import RobotTask
 from disco_hw.course import course_of
 from disco_hw.daemon.client import progress
-from disco_hw.viewer.advice import FAULTS, in_words
+from disco_hw.viewer.advice import fault_sentence, in_words
 from disco_hw.viewer.snapshot import Snapshot
 
 _NO_NUMBER = "—"
@@ -70,7 +70,7 @@ def replay_text(snapshot: Snapshot, first_ns: int, task: RobotTask) -> str:
     if state is not None and state.reason:
         lines += [escaped(state.reason), ""]
     if status is not None and status.fault != "NONE":
-        lines += [f"**{escaped(in_words(status.fault))}.** {escaped(FAULTS.get(status.fault, ''))}", ""]
+        lines += [f"**{escaped(fault_sentence(status.fault))}**", ""]
     rows: Rows = [("time", f"{(snapshot.t_ns - first_ns) * 1e-9:.3f} s")]
     if status is not None:
         rows.append(("robot", _robot(status.state, status.fault, status.stop_cause)))

@@ -54,6 +54,7 @@ void disco_command_receive(disco_firmware_t *core, const uint8_t *data, bool crc
     const uint32_t longest_us = core->config.command_timeout_us;
     command->valid_for_us = (valid_for_us < longest_us) ? valid_for_us : longest_us;
     command->last_accepted_us = core->now_us;
+    command->last_accepted_cycles_us = core->cycles_us;
     command->mode = frame.mode;
     command->counter = frame.counter;
     command->target = (disco_wheels_t){(float)frame.left_speed * (float)DISCO_WHEEL_COMMAND_LEFT_SPEED_SCALE,
@@ -68,6 +69,7 @@ void disco_command_arm(disco_firmware_t *core)
 {
     disco_command_t *command = &core->command;
     command->last_accepted_us = core->now_us;
+    command->last_accepted_cycles_us = core->cycles_us;
     command->valid_for_us = core->config.command_timeout_us;
     command->mode = DISCO_MODE_HOLD_ZERO;
     command->target = (disco_wheels_t){0.0f, 0.0f};
@@ -85,4 +87,12 @@ void disco_command_expire(disco_firmware_t *core)
 bool disco_command_enough_zeros(const disco_firmware_t *core)
 {
     return core->command.zero_count >= ZEROS_TO_ARM;
+}
+
+/* By the clock, or by the cycles that have ended since. */
+bool disco_command_older_than(const disco_firmware_t *core, uint32_t age_us)
+{
+    const disco_command_t *command = &core->command;
+    return ((core->now_us - command->last_accepted_us) >= age_us) ||
+           ((core->cycles_us - command->last_accepted_cycles_us) > age_us);
 }

@@ -5,8 +5,9 @@
 #include "firmware.h"
 #include "protocol_constants.h"
 
-/* firmware.c */
-void disco_advance(disco_firmware_t *core, uint64_t clock_us);
+/* timebase.c: the core's own time, and its second clock, the count of its cycles */
+void disco_time_advance(disco_firmware_t *core, uint64_t clock_us);
+void disco_time_step(disco_firmware_t *core, uint64_t clock_us);
 
 /* reception.c */
 void disco_reject(disco_firmware_t *core, uint8_t reason);
@@ -25,6 +26,7 @@ void disco_command_receive(disco_firmware_t *core, const uint8_t *data, bool crc
 void disco_command_arm(disco_firmware_t *core);
 void disco_command_expire(disco_firmware_t *core);
 bool disco_command_enough_zeros(const disco_firmware_t *core);
+bool disco_command_older_than(const disco_firmware_t *core, uint32_t age_us);
 
 /* supervisor.c: conditions and transitions */
 void disco_estop_latch(disco_firmware_t *core, uint8_t source);
@@ -32,7 +34,7 @@ uint8_t disco_blockers(const disco_firmware_t *core);
 void disco_supervise(disco_firmware_t *core);
 
 /* drive.c: what the wheels do in each state */
-void disco_drive_step(disco_firmware_t *core, float elapsed_s);
+void disco_drive_step(disco_firmware_t *core);
 bool disco_wheels_still(const disco_firmware_t *core);
 
 /* parameters.c */

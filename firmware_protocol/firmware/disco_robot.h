@@ -186,9 +186,11 @@ extern "C" {
 #define DISCO_ROBOT_SYSTEM_STATE_FAULT_DBC_HASH_MISMATCH_CHOICE (24577u)
 #define DISCO_ROBOT_SYSTEM_STATE_FAULT_PROTOCOL_MAJOR_MISMATCH_CHOICE (24578u)
 #define DISCO_ROBOT_SYSTEM_STATE_FAULT_CONFIG_INVALID_CHOICE (27649u)
+#define DISCO_ROBOT_SYSTEM_STATE_FAULT_CLOCK_MISMATCH_CHOICE (28673u)
 #define DISCO_ROBOT_SYSTEM_STATE_FAULT_WATCHDOG_RESET_CHOICE (30721u)
 #define DISCO_ROBOT_SYSTEM_STATE_FAULT_BROWN_OUT_RESET_CHOICE (30722u)
 #define DISCO_ROBOT_SYSTEM_STATE_FAULT_SELF_TEST_FAILED_CHOICE (31745u)
+#define DISCO_ROBOT_SYSTEM_STATE_FAULT_ENTROPY_INVALID_CHOICE (31746u)
 
 #define DISCO_ROBOT_SYSTEM_STATE_ESTOP_SOURCE_NONE_CHOICE (0u)
 #define DISCO_ROBOT_SYSTEM_STATE_ESTOP_SOURCE_FRAME_CHOICE (1u)
@@ -944,7 +946,7 @@ struct disco_robot_system_state_t {
     uint8_t state;
 
     /**
-     * High nibble: class (1 power, 2 motor, 3 encoder, 4 link, 6 configuration, 7 internal). Bit 0x0800: latching, only RESET clears it once its cause is gone. Bit 0x0400: permanent, only a restart clears it. Low 10 bits: number. Without either bit the fault clears by itself when its cause is gone.
+     * What to do about each is in firmware_protocol/faults.py. High nibble: class (1 power, 2 motor, 3 encoder, 4 link, 6 configuration, 7 internal). Bit 0x0800: latching, only RESET clears it once its cause is gone. Bit 0x0400: permanent, only a restart clears it. Low 10 bits: number. Without either bit the fault clears by itself when its cause is gone.
      *
      * Range: 0..65535 (0..65535 -)
      * Scale: 1
@@ -1153,7 +1155,7 @@ struct disco_robot_session_state_t {
     uint8_t blockers;
 
     /**
-     * Cycles whose clock lay before the last one's; the controller counts 1 ms for such a cycle.
+     * Cycles whose clock lay before the last one's; for such a cycle the controller counts its nominal period.
      *
      * Range: 0..255 (0..255 -)
      * Scale: 1

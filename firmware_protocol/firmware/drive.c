@@ -31,25 +31,32 @@ static void follow(disco_firmware_t *core, disco_wheels_t target, float max_chan
         disco_clamp_speed(disco_approach(drive->setpoint, target, max_change), core->config.max_wheel_speed);
 }
 
-static void stop_and_brake(disco_firmware_t *core, float elapsed_s)
+/* What a limit of acceleration (rad/s^2) allows in a cycle, which counts as long as it should be: neither a pause nor a
+ * broken clock becomes one big step. */
+static float in_a_cycle(const disco_firmware_t *core, float acceleration)
+{
+    return acceleration * ((float)core->config.cycle_us * 1.0e-6f);
+}
+
+static void stop_and_brake(disco_firmware_t *core)
 {
     disco_drive_t *drive = &core->drive;
     const bool stopped = disco_wheels_equal(drive->setpoint, standstill) && (drive->brake || disco_wheels_still(core));
     if (stopped) {
         off(drive, true);
     } else {
-        follow(core, standstill, core->config.stop_deceleration * elapsed_s);
+        follow(core, standstill, in_a_cycle(core, core->config.stop_deceleration));
     }
 }
 
-static void obey_command(disco_firmware_t *core, float elapsed_s)
+static void obey_command(disco_firmware_t *core)
 {
     disco_drive_t *drive = &core->drive;
     const disco_config_t *config = &core->config;
     const disco_wheels_t target = disco_clamp_speed(core->command.target, config->max_wheel_speed);
     switch (core->command.mode) {
     case DISCO_MODE_BRAKE:
-        stop_and_brake(core, elapsed_s);
+        stop_and_brake(core);
         break;
     case DISCO_MODE_COAST:
         off(drive, false);
@@ -59,7 +66,7 @@ static void obey_command(disco_firmware_t *core, float elapsed_s)
     case DISCO_MODE_SPEED:
     case DISCO_MODE_HOLD_ZERO:
     default:
-        follow(core, target, config->max_wheel_acceleration * elapsed_s);
+        follow(core, target, in_a_cycle(core, config->max_wheel_acceleration));
         break;
     }
     drive->limited = drive->enabled && !disco_wheels_equal(drive->setpoint, core->command.target);
@@ -71,21 +78,20 @@ static bool may_decelerate(const disco_firmware_t *core)
 {
     const bool in_stop = (core->state == DISCO_STATE_STOPPING) || (core->state == DISCO_STATE_ESTOP);
     const uint64_t since_stop_us = core->now_us - core->drive.stop_since_us;
-    const uint64_t since_command_us = core->now_us - core->command.last_accepted_us;
     const bool done = disco_wheels_equal(core->drive.setpoint, standstill) && disco_wheels_still(core);
     return in_stop && !core->drive.brake && !done && (core->faults.latched == 0u) &&
-           (since_stop_us < core->config.stop_timeout_us) && (since_command_us < core->config.drive_off_timeout_us);
+           (since_stop_us < core->config.stop_timeout_us) && !disco_command_older_than(core, core->config.drive_off_timeout_us);
 }
 
-void disco_drive_step(disco_firmware_t *core, float elapsed_s)
+void disco_drive_step(disco_firmware_t *core)
 {
     disco_drive_t *drive = &core->drive;
     drive->limited = false;
     if (core->state == DISCO_STATE_ARMED) {
-        obey_command(core, elapsed_s);
+        obey_command(core);
     } else if (may_decelerate(core)) {
         drive->limited = true;
-        follow(core, standstill, core->config.stop_deceleration * elapsed_s);
+        follow(core, standstill, in_a_cycle(core, core->config.stop_deceleration));
     } else {
         off(drive, true);
     }

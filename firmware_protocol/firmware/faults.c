@@ -26,6 +26,7 @@ typedef struct {
 enum {
     SLOT_SELF_TEST,
     SLOT_CONFIG,
+    SLOT_ENTROPY,
     SLOT_WATCHDOG_RESET,
     SLOT_BROWN_OUT_RESET,
     SLOT_OVER_CURRENT,
@@ -38,13 +39,15 @@ enum {
     SLOT_OVER_TEMPERATURE,
     SLOT_BUS_OFF = SLOT_OVER_TEMPERATURE + 2,
     SLOT_HASH_MISMATCH,
-    SLOT_MAJOR_MISMATCH
+    SLOT_MAJOR_MISMATCH,
+    SLOT_CLOCK_MISMATCH
 };
 
 /* In the order in which they are shown. */
 static const fault_row_t rows[DISCO_FAULT_SLOTS] = {
     {DISCO_FAULT_SELF_TEST_FAILED, NO_DEBOUNCE},
     {DISCO_FAULT_CONFIG_INVALID, NO_DEBOUNCE},
+    {DISCO_FAULT_ENTROPY_INVALID, NO_DEBOUNCE},
     {DISCO_FAULT_WATCHDOG_RESET, NO_DEBOUNCE},
     {DISCO_FAULT_BROWN_OUT_RESET, NO_DEBOUNCE},
     {DISCO_FAULT_OVER_CURRENT_LEFT, CURRENT},
@@ -64,6 +67,7 @@ static const fault_row_t rows[DISCO_FAULT_SLOTS] = {
     {DISCO_FAULT_BUS_OFF, NO_DEBOUNCE},
     {DISCO_FAULT_DBC_HASH_MISMATCH, NO_DEBOUNCE},
     {DISCO_FAULT_PROTOCOL_MAJOR_MISMATCH, NO_DEBOUNCE},
+    {DISCO_FAULT_CLOCK_MISMATCH, NO_DEBOUNCE},
 };
 
 void disco_faults_init(disco_faults_t *faults)
@@ -157,11 +161,13 @@ static uint32_t board_faults(const disco_config_t *config, const disco_inputs_t 
     uint32_t present = 0u;
     present |= bit_if(inputs->self_test_failed, SLOT_SELF_TEST);
     present |= bit_if(context->config_invalid, SLOT_CONFIG);
+    present |= bit_if(context->entropy_invalid, SLOT_ENTROPY);
     present |= bit_if(!(inputs->voltage >= config->under_voltage), SLOT_UNDER_VOLTAGE);
     present |= bit_if(inputs->voltage > config->over_voltage, SLOT_OVER_VOLTAGE);
     present |= bit_if(inputs->tx_error_count > BUS_OFF_ABOVE, SLOT_BUS_OFF);
     present |= bit_if(context->hash_mismatch, SLOT_HASH_MISMATCH);
     present |= bit_if(context->major_mismatch, SLOT_MAJOR_MISMATCH);
+    present |= bit_if(context->clock_mismatch, SLOT_CLOCK_MISMATCH);
     return present;
 }
 

@@ -9,7 +9,7 @@
 #include "robot_config.h"
 #include "wheel_limits.h"
 
-enum { DISCO_FAULT_SLOTS = 21 };
+enum { DISCO_FAULT_SLOTS = 23 };
 
 typedef enum {
     DISCO_RESET_POWER_ON = 0,
@@ -40,6 +40,8 @@ typedef struct {
     disco_wheels_t setpoint;
     bool driver_enabled;
     bool config_invalid;
+    bool entropy_invalid;
+    bool clock_mismatch;
     bool hash_mismatch;
     bool major_mismatch;
 } disco_fault_context_t;

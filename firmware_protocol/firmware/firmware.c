@@ -2,18 +2,16 @@
 
 #include "core.h"
 
-#define LONGEST_CYCLE_US (10000u)
-#define CYCLES_REMEMBERED (256u)
-#define NOMINAL_CYCLE_US (1000u)
 #define BUS_OFF_ABOVE (255u)
 
-void disco_firmware_init(disco_firmware_t *core, const disco_config_t *config, uint64_t entropy)
+void disco_firmware_init(disco_firmware_t *core, const disco_config_t *config, uint64_t entropy, uint64_t last_entropy)
 {
     *core = (disco_firmware_t){
         .config = *config,
         .state = DISCO_STATE_BOOT,
         .config_valid = disco_config_valid(config),
-        .session = {.seed = (uint32_t)entropy},
+        .entropy_valid = (entropy != 0u) && (entropy != last_entropy),
+        .session = {.entropy = entropy},
         .drive = {.brake = true},
     };
     disco_authentication_init(&core->authentication, config->authenticated, config->key, entropy);
@@ -30,6 +28,8 @@ static void watch(disco_firmware_t *core)
         .setpoint = core->drive.setpoint,
         .driver_enabled = core->drive.enabled,
         .config_invalid = !core->config_valid,
+        .entropy_invalid = !core->entropy_valid,
+        .clock_mismatch = core->clock_mismatch,
         .hash_mismatch = core->host.hash_mismatch,
         .major_mismatch = core->host.major_mismatch,
     };
@@ -71,50 +71,17 @@ static void report(const disco_firmware_t *core, disco_outputs_t *outputs)
     };
 }
 
-void disco_advance(disco_firmware_t *core, uint64_t clock_us)
-{
-    if (clock_us > core->clock_us) {
-        core->now_us += clock_us - core->clock_us;
-        core->clock_us = clock_us;
-    }
-}
-
-/* How long this cycle counts for the setpoint: no longer than those before it, so that neither a pause nor a leap of the
- * clock becomes one big step. */
-static uint32_t counted_us(disco_firmware_t *core)
-{
-    const uint64_t since_us = core->now_us - core->last_step_us;
-    const uint32_t elapsed_us = (since_us < LONGEST_CYCLE_US) ? (uint32_t)since_us : LONGEST_CYCLE_US;
-    const uint32_t longest_us = core->longest_cycle_us;
-    const uint32_t remembered_us = longest_us - (longest_us / CYCLES_REMEMBERED);
-    core->longest_cycle_us = (elapsed_us > remembered_us) ? elapsed_us : remembered_us;
-    return (elapsed_us < longest_us) ? elapsed_us : longest_us;
-}
-
 void disco_firmware_step(disco_firmware_t *core, uint64_t now_us, const disco_inputs_t *inputs,
                          disco_outputs_t *outputs)
 {
-    /* A frame may be stamped a little later than the cycle that follows it, but not so that time would stand long. */
-    const bool back = (now_us < core->cycle_us) || (core->clock_us > (now_us + LONGEST_CYCLE_US));
-    if (back) {
-        core->clock_errors++;
-    }
-    if (back || (now_us == core->cycle_us)) {
-        core->clock_us = now_us;
-        core->now_us += NOMINAL_CYCLE_US;
-    } else {
-        disco_advance(core, now_us);
-    }
-    core->cycle_us = now_us;
-    const uint32_t elapsed_us = counted_us(core);
-    core->last_step_us = core->now_us;
+    disco_time_step(core, now_us);
     core->inputs = *inputs;
     core->inputs_known = true;
     disco_host_expire(core);
     disco_command_expire(core);
     watch(core);
     disco_supervise(core);
-    disco_drive_step(core, (float)elapsed_us * 1.0e-6f);
+    disco_drive_step(core);
     disco_telemetry_step(core);
     report(core, outputs);
 }

@@ -1,9 +1,11 @@
 /* The reference firmware core: frames and measurements in, wheel setpoints and frames out. No I/O, clock or allocation.
  *
- * Call disco_firmware_receive for each frame from the bus and disco_firmware_step at 1 kHz, both with the same
- * monotonic microsecond clock, from one context; then send what disco_firmware_pop gives. Should the clock stand or go
- * back all the same, or stamp a frame over 10 ms ahead of the cycle that follows, each cycle counts as a millisecond: no
- * watchdog waits for a broken clock.
+ * Call disco_firmware_receive for each frame from the bus and disco_firmware_step once in `cycle_us` of the
+ * configuration, both with the same monotonic microsecond clock, from one context; then send what disco_firmware_pop
+ * gives. The count of cycles is the core's second clock: a command is too old as soon as it is so by either, and the
+ * robot stops (CLOCK_MISMATCH) when the two have come 20 ms apart, of which a tenth of a cycle is forgotten in each
+ * cycle. Where the clock stands, goes back, lags behind so far, or stamps a frame over 10 ms ahead of the cycle that
+ * follows, each cycle counts as long as it should be: no watchdog waits for a broken clock.
  */
 #ifndef DISCO_FIRMWARE_H
 #define DISCO_FIRMWARE_H
@@ -56,8 +58,8 @@ typedef struct {
 
 typedef struct {
     uint16_t challenge;
+    uint64_t entropy;
     uint32_t entries; /* makes each challenge another one */
-    uint32_t seed;
     uint8_t current;  /* 0: none */
     uint8_t last;
     bool challenge_answered;
@@ -66,6 +68,7 @@ typedef struct {
 typedef struct {
     disco_e2e_receiver_t e2e;
     uint64_t last_accepted_us;
+    uint64_t last_accepted_cycles_us; /* the same on the second clock */
     uint64_t last_motion_us; /* when motion was last asked for, accepted or not */
     uint32_t valid_for_us;
     uint32_t accepted_count;
@@ -106,11 +109,11 @@ typedef struct {
     disco_drive_t drive;
     disco_telemetry_t telemetry;
     disco_transmit_t transmit;
-    uint64_t now_us;   /* the core's own time, which only goes forwards */
-    uint64_t clock_us; /* the caller's clock, when it last told */
-    uint64_t cycle_us; /* the same, at the last cycle */
-    uint64_t last_step_us;
-    uint32_t longest_cycle_us; /* of the last ones, forgotten slowly */
+    uint64_t now_us;         /* the core's own time, which only goes forwards */
+    uint64_t clock_us;       /* the caller's clock, when it last told */
+    uint64_t cycle_clock_us; /* the same, at the last cycle */
+    uint64_t cycles_us;      /* the second clock: cycles, each as long as it should be */
+    int64_t clock_ahead_us;  /* of the second clock, forgotten slowly */
     uint32_t rejected[DISCO_REJECT_REASONS];
     uint32_t rejected_total;
     uint32_t crc_errors;
@@ -127,12 +130,16 @@ typedef struct {
     bool self_test_passed;
     bool bus_off;
     bool inputs_known;
+    bool clock_mismatch;
+    bool entropy_valid;
 } disco_firmware_t;
 
-/* `entropy` seeds the challenges; anything that differs from start to start will do. With a key it must never be the
- * same twice: take it from a hardware generator, or count the starts in flash.
+/* `entropy` seeds the challenges and nonces, and must be another one at each start: take it from a hardware generator, or
+ * count the starts in flash. `last_entropy` is that of the start before, as far as the board remembers it (memory that a
+ * reset leaves alone, flash); 0 if it does not. A start whose entropy is 0 or the last one is refused
+ * (ENTROPY_INVALID): what was recorded before it could be replayed.
  */
-void disco_firmware_init(disco_firmware_t *core, const disco_config_t *config, uint64_t entropy);
+void disco_firmware_init(disco_firmware_t *core, const disco_config_t *config, uint64_t entropy, uint64_t last_entropy);
 
 void disco_firmware_receive(disco_firmware_t *core, uint64_t now_us, uint32_t can_id, const uint8_t *data,
                             uint8_t length);

@@ -2,6 +2,7 @@
 #include "disco_robot.h"
 
 #define LENGTH (8u)
+#define MIXING_STEP UINT64_C(0x9E3779B97F4A7C15)
 
 void disco_host_hello(disco_firmware_t *core, const uint8_t *data)
 {
@@ -84,15 +85,21 @@ void disco_host_expire(disco_firmware_t *core)
     }
 }
 
+/* SplitMix64 (Steele, Lea, Flood: Fast splittable pseudorandom number generators, OOPSLA 2014): unlike starts, counted
+ * ones too, give unlike challenges. The last shift leaves the bits that are used as they are. */
+static uint64_t mixed(uint64_t value)
+{
+    const uint64_t once = (value ^ (value >> 30)) * UINT64_C(0xBF58476D1CE4E5B9);
+    return (once ^ (once >> 27)) * UINT64_C(0x94D049BB133111EB);
+}
+
 void disco_session_new_challenge(disco_firmware_t *core)
 {
     disco_session_t *session = &core->session;
     uint16_t challenge = session->challenge;
     while ((challenge == session->challenge) || (challenge == 0u)) {
         session->entries++;
-        /* Multiplicative hash (Knuth, The Art of Computer Programming, volume 3, section 6.4). */
-        const uint32_t mixed = (session->seed ^ session->entries) * UINT32_C(2654435761);
-        challenge = (uint16_t)(mixed >> 16);
+        challenge = (uint16_t)(mixed(session->entropy + (session->entries * MIXING_STEP)) >> 48);
     }
     session->challenge = challenge;
     session->challenge_answered = false;

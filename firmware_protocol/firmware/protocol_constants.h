@@ -4,7 +4,7 @@
 
 #define DISCO_PROTOCOL_MAJOR (1u)
 #define DISCO_PROTOCOL_MINOR (0u)
-#define DISCO_DBC_HASH (0x9B08C737u)
+#define DISCO_DBC_HASH (0xF2E6B366u)
 
 /* Data ids of the end-to-end CRC; the handshake's are the same for every major version. */
 #define DISCO_WHEEL_COMMAND_DATA_ID(major) ((uint16_t)(0x100u ^ ((uint32_t)(major) << 11)))
@@ -98,9 +98,11 @@
 #define DISCO_FAULT_DBC_HASH_MISMATCH (24577u)
 #define DISCO_FAULT_PROTOCOL_MAJOR_MISMATCH (24578u)
 #define DISCO_FAULT_CONFIG_INVALID (27649u)
+#define DISCO_FAULT_CLOCK_MISMATCH (28673u)
 #define DISCO_FAULT_WATCHDOG_RESET (30721u)
 #define DISCO_FAULT_BROWN_OUT_RESET (30722u)
 #define DISCO_FAULT_SELF_TEST_FAILED (31745u)
+#define DISCO_FAULT_ENTROPY_INVALID (31746u)
 
 /* estop_source */
 #define DISCO_ESTOP_SOURCE_NONE (0u)

@@ -127,7 +127,7 @@ static bool is_for_us(uint32_t can_id)
 void disco_firmware_receive(disco_firmware_t *core, uint64_t now_us, uint32_t can_id, const uint8_t *data,
                             uint8_t length)
 {
-    disco_advance(core, now_us);
+    disco_time_advance(core, now_us);
     /* A command that comes too late must find the watchdog expired, even if no cycle ran in between. */
     disco_supervise(core);
     if (can_id == DISCO_ROBOT_ESTOP_FRAME_ID) {

@@ -35,6 +35,7 @@ bool disco_config_valid(const disco_config_t *config)
         {config->encoder_check_speed, 0.01f, 65.5f},
     };
     const bounded_t times_us[] = {
+        {(float)config->cycle_us, 1.0e3f, 10.0e3f},
         {(float)config->command_timeout_us, 10.0e3f, 500.0e3f},
         {(float)config->drive_off_timeout_us, (float)config->command_timeout_us, 2.0e6f},
         {(float)config->stop_timeout_us, 100.0e3f, 5.0e6f},

@@ -18,6 +18,7 @@ typedef struct {
     float stop_deceleration;      /* rad/s^2 */
     float still_speed;            /* rad/s: slower counts as standing */
 
+    uint32_t cycle_us;               /* the period at which disco_firmware_step is called */
     uint32_t command_timeout_us;
     uint32_t drive_off_timeout_us;
     uint32_t stop_timeout_us;

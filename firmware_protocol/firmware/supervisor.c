@@ -48,12 +48,12 @@ static uint32_t host_conditions(const disco_firmware_t *core)
 static uint32_t command_conditions(const disco_firmware_t *core)
 {
     const disco_command_t *command = &core->command;
-    const uint64_t age_us = core->now_us - command->last_accepted_us;
     const uint32_t timeout_us = core->config.command_timeout_us;
-    const bool expired = (command->valid_for_us < timeout_us) && (age_us >= command->valid_for_us);
+    const bool expired =
+        (command->valid_for_us < timeout_us) && disco_command_older_than(core, command->valid_for_us);
     return when(disco_command_enough_zeros(core), DISCO_WHEN_ZERO_COMMANDS) |
            when(!command->e2e.qualified, DISCO_WHEN_COMMANDS_DISQUALIFIED) |
-           when(age_us >= timeout_us, DISCO_WHEN_COMMAND_TIMEOUT) | when(expired, DISCO_WHEN_COMMAND_EXPIRED) |
+           when(disco_command_older_than(core, timeout_us), DISCO_WHEN_COMMAND_TIMEOUT) | when(expired, DISCO_WHEN_COMMAND_EXPIRED) |
            when((core->now_us - command->last_motion_us) >= core->config.reset_quiet_us, DISCO_WHEN_NO_MOTION_ASKED);
 }
 

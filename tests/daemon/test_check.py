@@ -13,6 +13,7 @@ from disco_hw.runtime.preflight import Level
 from disco_hw.runtime.robot_setup import load_setup
 from drivers.transport import connect_pair
 from drivers.types import Frame, OutgoingFrame
+from firmware_protocol.faults import FAULTS
 from tests.daemon.test_control_client import Daemon
 from tests.drivers.reference_robot import CONFIG, ReferenceRobot
 from tests.robot import test_robot
@@ -29,7 +30,7 @@ class RobotInTime:
         self.link, self._far = connect_pair()
         self.link.open()
         self._far.open()
-        self._robot = ReferenceRobot(replace(CONFIG, key=key))
+        self.robot = ReferenceRobot(replace(CONFIG, key=key))
         self._now_ns = time.monotonic_ns()
         self.stats, self.send = self.link.stats, self.link.send
         self.disturb = None
@@ -37,11 +38,11 @@ class RobotInTime:
     def receive(self):
         while self._now_ns < time.monotonic_ns():
             for received in self._far.receive():
-                self._robot.receive(self._now_ns, received.frame)
+                self.robot.receive(self._now_ns, received.frame)
             if self.disturb is not None:
-                self._robot.receive(self._now_ns, self.disturb)
-            self._robot.step(self._now_ns)
-            for frame in self._robot.drain():
+                self.robot.receive(self._now_ns, self.disturb)
+            self.robot.step(self._now_ns)
+            for frame in self.robot.drain():
                 self._far.send(OutgoingFrame(frame, self._now_ns), self._now_ns)
             self._now_ns += MS_NS
         return self.link.receive()
@@ -64,6 +65,16 @@ def test_a_key_that_is_not_the_robots_fails():
     heard = check._hearing_check(found)
     assert heard.level is Level.FAIL
     assert "link.key_file" in heard.text
+
+
+def test_a_fault_that_does_not_latch_fails_with_what_to_do():
+    robot = RobotInTime(b"")
+    robot.robot.inputs["right_temperature_c"] = 100.0
+    firmware = check._firmware_check(check._ask_robot(robot, None))
+    assert (firmware.level, firmware.text) == (
+        Level.FAIL,
+        "standby: the robot reports OVER_TEMPERATURE_RIGHT: " + FAULTS["OVER_TEMPERATURE_RIGHT"].advice,
+    )
 
 
 def test_what_else_the_robot_rejects_is_a_warning():

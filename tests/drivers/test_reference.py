@@ -9,6 +9,7 @@ import pytest
 from drivers.reference import ESTOP_REPEATS, ReferenceDriver
 from drivers.types import DriverState, Frame, ReceivedFrame, Request, WheelCommand
 from firmware_protocol.codec import Codec
+from firmware_protocol.faults import FAULTS
 from tests.drivers.bench import MS, START_NS, Bench
 from tests.drivers.reference_robot import CONFIG, ReferenceRobot
 
@@ -344,7 +345,7 @@ def test_faults_and_emergency_stops_are_told_in_words():
     bench.run_until(*STILL)
     bench.robot.break_down(True)
     bench.run_until(DriverState.FAULT)
-    assert bench.driver.detail == "the robot reports OVER_CURRENT_LEFT: look for what blocks the left wheels"
+    assert bench.driver.detail == f"the robot reports OVER_CURRENT_LEFT: {FAULTS['OVER_CURRENT_LEFT'].advice}"
     assert any(event == f"robot STANDBY -> FAULT, fault {bench.driver.detail[18:]}" for event in bench.events)
 
 

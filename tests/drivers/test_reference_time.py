@@ -105,14 +105,19 @@ def test_a_controller_whose_clock_goes_back_is_counted_and_goes_on():
     bench.run(1.0, (3.0, 3.0))
     told = "the robot's controller found its clock set back and goes on with a time of its own"
     for times in (1, 2):
-        bench.robot.boot_ns += 2 * 10**9
+        bench.robot.boot_ns += 15 * 10**6
         bench.run(1.0)
         assert bench.driver.stats.robot_clock_errors == times
         assert bench.events.count(told) == times
     assert bench.driver.state is DriverState.ARMED
+    bench.robot.boot_ns += 2 * 10**9
+    bench.run(0.4)
+    assert bench.driver.state in STILL, "a clock that goes back so far stops the robot"
+    assert any("fault CLOCK_MISMATCH" in event for event in bench.events)
+    assert bench.driver.stats.robot_clock_errors == 3
     bench.robot = ReferenceRobot(boot_ns=bench.now_ns)
     bench.run(3.0)
-    assert bench.driver.stats.robot_clock_errors == 2, "a restart is no clock that went back"
+    assert bench.driver.stats.robot_clock_errors == 3, "a restart is no clock that went back"
 
 
 def test_the_ticks_of_another_robot_on_a_new_link_are_no_motion():

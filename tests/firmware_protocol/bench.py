@@ -21,9 +21,9 @@ def sealed(can_id: int, body: bytes, major: int = 1) -> bytes:
 
 
 class Bench:
-    def __init__(self, config: FirmwareConfig = CONFIG, entropy: int = 1) -> None:
+    def __init__(self, config: FirmwareConfig = CONFIG, entropy: int = 1, last_entropy: int = 0) -> None:
         self.config = config
-        self.core = FirmwareCore(config, entropy)
+        self.core = FirmwareCore(config, entropy, last_entropy)
         self.now_us = 0
         self.counters: dict[str, int] = {}
         self.inputs: dict[str, object] = {}
@@ -59,8 +59,10 @@ class Bench:
         signals = {"mode": "SPEED", "left_speed": left, "right_speed": right, "valid_for": 0.1, "session": session}
         self.send("WHEEL_COMMAND", **signals | changes)
 
-    def step(self, elapsed_us: int = MS):
+    def step(self, elapsed_us: int | None = None):
         """One cycle; before it, what the host has due: its state every 50 ms, its command every 20 ms."""
+        if elapsed_us is None:
+            elapsed_us = round(self.config.cycle_s * 1e6)
         self.now_us += elapsed_us
         if self.request is not None and self.now_us % (50 * MS) == 0:
             request = dict(self.request)
@@ -91,8 +93,8 @@ class Bench:
                 self.prover.challenge(int(decoded.values["nonce"]))
         return self.out
 
-    def run(self, milliseconds: int):
-        for _ in range(milliseconds):
+    def run(self, cycles: int):
+        for _ in range(cycles):
             self.step()
         return self.out
 

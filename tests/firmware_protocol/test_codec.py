@@ -249,4 +249,8 @@ def test_fault_codes_say_what_they_are():
         assert value & 0x03FF, name
         if value & 0x0400:
             assert value & 0x0800, name
-    assert {faults[value] for value in faults if value & 0x0400} == {"CONFIG_INVALID", "SELF_TEST_FAILED"}
+    assert {faults[value] for value in faults if value & 0x0400} == {
+        "CONFIG_INVALID",
+        "ENTROPY_INVALID",
+        "SELF_TEST_FAILED",
+    }

@@ -10,6 +10,7 @@ from firmware_protocol.authentication import Prover
 from firmware_protocol.build_firmware import PACKAGE
 from firmware_protocol.codec import PROTOCOL, Codec, EncodedFrame
 from firmware_protocol.e2e import challenge_answer, crc8
+from firmware_protocol.faults import FAULTS
 from firmware_protocol.serial_framing import encode_frame
 
 TEXT = (Path(PACKAGE) / "README.md").read_text("utf-8")
@@ -41,6 +42,14 @@ def test_states_are_those_of_the_c_table():
         for i in range(count[0])
     ]
     assert [(row[0].split(", "), row[1], row[2]) for row in rows("States")] == expected
+
+
+def test_faults_are_those_of_the_table():
+    documented = [tuple(row) for row in rows("Faults")]
+    assert documented == [
+        (f"`{fault.name}`", f"0x{fault.code:04X}", "yes" if fault.latches else "no", fault.remedy, fault.ending)
+        for fault in FAULTS.values()
+    ]
 
 
 def host_state_mac():

@@ -215,10 +215,30 @@ def test_a_watchdog_reset_is_a_fault(setup):
     assert setup.robot.outputs.fault == setup.host.codec.choice_value("SYSTEM_STATE", "fault", "WATCHDOG_RESET")
 
 
+def challenges(**options):
+    """The first one of three starts, by way of two restarts."""
+    setup, seen = Setup(**options), []
+    for _ in range(3):
+        setup.run(20)
+        seen.append(setup.robot.firmware.challenge)
+        setup.robot.reboot()
+    return seen
+
+
+def test_every_start_and_every_restart_draws_a_challenge_of_its_own():
+    seen = [challenge for _ in range(3) for challenge in challenges()]
+    assert len(set(seen)) >= len(seen) - 1, "of 65535; two alike may happen, three hardly ever"
+
+
+def test_only_a_seed_that_is_asked_for_by_name_repeats_them():
+    assert challenges(challenge_seed=3) == challenges(challenge_seed=3)
+    assert len(set(challenges(challenge_seed=3))) == 3
+
+
 def test_two_runs_with_one_seed_are_equal():
     runs = []
     for _ in range(2):
-        setup = Setup(parameters=PlantParameters())
+        setup = Setup(parameters=PlantParameters(), challenge_seed=5)
         setup.arm()
         setup.host.speeds = (3.0, 2.0)
         setup.run(500)

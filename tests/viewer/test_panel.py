@@ -2,7 +2,6 @@ import math
 
 from disco_hw.config import CircleTask
 from disco_hw.log import records
-from disco_hw.viewer.advice import FAULTS
 from disco_hw.viewer.panel import (
     coverage_text,
     escaped,
@@ -15,6 +14,7 @@ from disco_hw.viewer.panel import (
 from disco_hw.viewer.snapshot import snapshot_at
 from disco_hw.viewer.timeline import Timeline
 from drivers.types import RobotStatus
+from firmware_protocol.faults import advice
 from tools.viewer_run import PERIOD_NS, START_NS, plan_at
 
 STATUS = {
@@ -54,7 +54,7 @@ def test_a_fault_is_told_in_words_with_what_to_do():
     line.add(5, RobotStatus(5, "FAULT", 0, "STALL_LEFT", "FAULT", "NONE", 1, 0, "NONE"))
     text = replay_text(snapshot_at(line, 5, None), 5, CircleTask())
     assert "Stall left" in text
-    assert FAULTS["STALL_LEFT"] in text.replace("\\", "")
+    assert advice("STALL_LEFT")[1:] in text.replace("\\", "")
 
 
 def test_what_is_in_force_of_adaptation_is_told():

@@ -35,7 +35,7 @@ static disco_config_t config(void)
     return (disco_config_t){
         .protocol_major = DISCO_PROTOCOL_MAJOR, .dbc_hash = DISCO_DBC_HASH, .ticks_per_rev = 2048u,
         .max_wheel_speed = 8.0f, .max_wheel_acceleration = 20.0f, .stop_deceleration = 20.0f, .still_speed = 0.05f,
-        .command_timeout_us = 100000u, .drive_off_timeout_us = 500000u, .stop_timeout_us = 1000000u,
+        .cycle_us = 1000u, .command_timeout_us = 100000u, .drive_off_timeout_us = 500000u, .stop_timeout_us = 1000000u,
         .host_state_timeout_us = 500000u, .host_forget_timeout_us = 5000000u, .reset_quiet_us = 500000u,
         .under_voltage = 20.0f, .over_voltage = 30.0f, .over_current = 30.0f, .over_temperature = 80.0f,
         .stall_current = 15.0f, .encoder_check_current = 0.5f, .encoder_check_speed = 1.0f,
@@ -160,7 +160,7 @@ int main(int argc, char **argv)
     bool mad = false;
     robot.authenticated = (argc > 3) && (argv[3][0] == '1');
     seed = UINT64_C(0x9E3779B97F4A7C15);
-    disco_firmware_init(&core, &robot, 1u);
+    disco_firmware_init(&core, &robot, 1u, 0u);
     for (uint32_t cycle = 1u; cycle <= cycles; cycle++) {
         disco_inputs_t in = {.temperature = {25.0f, 25.0f}, .encoder_valid = {true, true}, .voltage = 24.0f};
         disco_frame_t frame;
@@ -173,7 +173,7 @@ int main(int argc, char **argv)
         frames += strangers;
         if ((flood > 0u) && ((cycle % 5000u) == 500u)) {
             /* What strangers may write without a key, parameters among it, would keep the robot standing. */
-            disco_firmware_init(&core, &robot, cycle);
+            disco_firmware_init(&core, &robot, cycle, 0u);
         }
         mad = chance(3000u) || (mad && !chance(20u));
         in.wheel_speed[0] = out.left_setpoint;

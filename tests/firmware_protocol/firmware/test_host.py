@@ -203,8 +203,41 @@ def test_every_entry_of_standby_and_ready_has_a_new_challenge_never_zero():
     assert 0 not in seen
 
 
+def test_a_counted_start_gives_none_of_the_challenges_of_the_starts_before():
+    """The first twenty of each of a hundred starts: as few are alike as of numbers drawn at random."""
+    seen = []
+    for start in range(1, 101):
+        bench = Bench(entropy=start, last_entropy=start - 1)
+        bench.to_ready()
+        for session in range(8, 18):
+            seen.append(bench.core.challenge)
+            bench.ask("STANDBY")
+            bench.run_until("STANDBY")
+            seen.append(bench.core.challenge)
+            bench.ask("READY", session)
+            bench.run_until("READY")
+    assert len(seen) - len(set(seen)) < 70, "of 2000 out of 65535 thirty are expected"
+
+
+@pytest.mark.parametrize(("entropy", "last_entropy"), [(0, 0), (0, 5), (5, 5), (2**64 - 1, 2**64 - 1)])
+def test_a_start_without_entropy_or_with_that_of_the_last_one_is_refused_for_good(entropy, last_entropy):
+    bench = Bench(entropy=entropy, last_entropy=last_entropy)
+    bench.hello()
+    bench.ask("READY")
+    assert bench.run(200).state == "FAULT"
+    assert bench.out.fault == FAULTS["ENTROPY_INVALID"]
+    bench.ask("RESET")
+    bench.run(800)
+    assert (bench.out.state, bench.out.driver_enabled) == ("FAULT", False)
+
+
+@pytest.mark.parametrize(("entropy", "last_entropy"), [(1, 0), (5, 6), (2**32, 0), (2**32, 2**33)])
+def test_a_start_with_entropy_of_its_own_is_taken(entropy, last_entropy):
+    assert Bench(entropy=entropy, last_entropy=last_entropy).to_armed().state == "ARMED"
+
+
 def test_challenges_depend_on_the_entropy():
-    seen = {Bench(entropy=seed).core.challenge for seed in range(50)}
+    seen = {Bench(entropy=seed).core.challenge for seed in range(1, 51)}
     assert len(seen) > 45
     for bit in range(16):
         assert {challenge >> bit & 1 for challenge in seen} == {0, 1}
@@ -212,8 +245,12 @@ def test_challenges_depend_on_the_entropy():
 
 @pytest.mark.parametrize("entry", [1, 2])
 def test_a_hash_of_zero_is_passed_over(entry):
-    """The hash is (entropy xor entry) * 2654435761; this entropy makes its upper half zero at the given entry."""
-    bench = Bench(entropy=5 * pow(2654435761, -1, 2**32) % 2**32 ^ entry)
+    """The hash is SplitMix64, undone here; this entropy makes its upper 16 bits zero at the given entry."""
+    value = 5
+    for factor, shift in ((0x94D049BB133111EB, 27), (0xBF58476D1CE4E5B9, 30)):
+        value = value * pow(factor, -1, 2**64) % 2**64
+        value ^= value >> shift ^ value >> 2 * shift
+    bench = Bench(entropy=(value - entry * 0x9E3779B97F4A7C15) % 2**64)
     first = bench.core.challenge
     bench.to_ready()
     assert 0 not in {first, bench.core.challenge}

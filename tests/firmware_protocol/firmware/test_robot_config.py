@@ -21,6 +21,7 @@ BOUNDS = {
     "stall_current_a": (0.1, 300.0),
     "encoder_check_current_a": (0.01, 300.0),
     "encoder_check_speed_rad_s": (0.01, 65.5),
+    "cycle_s": (0.001, 0.01),
     "command_timeout_s": (0.01, 0.5),
     "drive_off_timeout_s": (CONFIG.command_timeout_s, 2.0),
     "stop_timeout_s": (0.1, 5.0),

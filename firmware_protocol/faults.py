@@ -1,0 +1,86 @@
+"""Every fault that a controller can report: its code and name, whether it latches, and what a person does about it.
+
+Codes and names are the DBC's value table, and how a fault ends is a bit of its code; the remedies stand here alone. The
+page, `ctl`, `check`, the log's events and the table in README.md take their words from this table.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from firmware_protocol.codec import PROTOCOL
+
+_LATCHING = 0x0800
+_PERMANENT = 0x0400
+
+_REMEDIES: Mapping[str, str] = {
+    "UNDER_VOLTAGE": "charge or change the battery",
+    "OVER_VOLTAGE": "braking feeds back more than the battery takes: brake more gently, check battery and charger",
+    "OVER_TEMPERATURE_LEFT": "let the left motor cool down and drive more gently",
+    "OVER_TEMPERATURE_RIGHT": "let the right motor cool down and drive more gently",
+    "OVER_CURRENT_LEFT": "free what blocks the left wheels, look for a short or a dragging brake",
+    "OVER_CURRENT_RIGHT": "free what blocks the right wheels, look for a short or a dragging brake",
+    "STALL_LEFT": "free the left wheels, check their motor's cable",
+    "STALL_RIGHT": "free the right wheels, check their motor's cable",
+    "ENCODER_MISSING_LEFT": "check the left encoder's plug and cable",
+    "ENCODER_MISSING_RIGHT": "check the right encoder's plug and cable",
+    "ENCODER_JUMP_LEFT": "check the left encoder's cable, shield and magnet",
+    "ENCODER_JUMP_RIGHT": "check the right encoder's cable, shield and magnet",
+    "WRONG_DIRECTION_LEFT": "swap two wires of the left motor or the channels of its encoder",
+    "WRONG_DIRECTION_RIGHT": "swap two wires of the right motor or the channels of its encoder",
+    "BUS_OFF": "check the bus: wiring, termination, bit rate",
+    "DBC_HASH_MISMATCH": "flash the firmware that is built from this version",
+    "PROTOCOL_MAJOR_MISMATCH": "flash the firmware that speaks this protocol version",
+    "CLOCK_MISMATCH": "check the controller's clock source, and that its control loop keeps the period it is built for",
+    "CONFIG_INVALID": "correct the controller's configuration and flash it again",
+    "ENTROPY_INVALID": "give the controller another random number, other than 0, at each start",
+    "WATCHDOG_RESET": "the controller hung and restarted: look for the cause in its firmware",
+    "BROWN_OUT_RESET": "the controller lost its supply and restarted: check battery, fuse and wiring",
+    "SELF_TEST_FAILED": "the controller failed its own test: if it does so again, do not drive, replace it",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """One fault of the value table of SYSTEM_STATE.fault; `remedy` is what to do about its cause."""
+
+    code: int
+    name: str
+    remedy: str
+
+    @property
+    def latches(self) -> bool:
+        """Whether it stays when its cause is gone."""
+        return bool(self.code & _LATCHING)
+
+    @property
+    def permanent(self) -> bool:
+        """Whether no reset clears it."""
+        return bool(self.code & _PERMANENT)
+
+    @property
+    def ending(self) -> str:
+        """What ends it once its cause is gone."""
+        if self.permanent:
+            return "then restart the controller"
+        return "then reset" if self.latches else "it clears by itself"
+
+    @property
+    def advice(self) -> str:
+        """What to do, to the end."""
+        return f"{self.remedy}; {self.ending}"
+
+
+def _table() -> dict[str, Fault]:
+    signals = next(message.signals for message in PROTOCOL.messages if message.name == "SYSTEM_STATE")
+    names = next(signal.choices for signal in signals if signal.name == "fault")
+    return {name: Fault(code, name, _REMEDIES[name]) for code, name in names.items() if code}
+
+
+FAULTS: Mapping[str, Fault] = _table()
+"""Every fault of the DBC by its name."""
+
+
+def advice(name: str) -> str:
+    """Return what to do about a fault; empty for one that this version does not know, and for none."""
+    fault = FAULTS.get(name)
+    return "" if fault is None else fault.advice

@@ -1,0 +1,222 @@
+"""The core's two clocks: the caller's and the count of its own cycles. Where they come apart, the robot stops."""
+
+import dataclasses
+import itertools
+import math
+import random
+
+import pytest
+
+from tests.firmware_protocol.bench import CONFIG, FAULTS, MS, Bench
+
+SPEED = 4.0
+RAMP_CYCLES = math.ceil(SPEED / CONFIG.stop_deceleration_rad_s2 * 1000)
+TIMEOUT_MS = 100
+TOLERANCE_MS = 20
+RATES = [
+    0.0,
+    1e-6,
+    0.001,
+    0.01,
+    0.1,
+    0.3,
+    0.5,
+    0.7,
+    0.8,
+    0.85,
+    0.88,
+    1.12,
+    1.15,
+    1.2,
+    1.5,
+    2.0,
+    3.0,
+    10.0,
+    100.0,
+    1000.0,
+]
+
+
+class OtherClock:
+    """A core whose board tells it another time than passes: `clock` gives what it shows at a true time (us)."""
+
+    def __init__(self, core):
+        self.core = core
+        self.clock = lambda true_us: true_us
+
+    def receive(self, true_us, can_id, data):
+        self.core.receive(self.clock(true_us), can_id, data)
+
+    def step(self, true_us, inputs):
+        return self.core.step(self.clock(true_us), inputs)
+
+    def __getattr__(self, name):
+        return getattr(self.core, name)
+
+
+def bench_with_clock(config=CONFIG):
+    bench = Bench(config)
+    bench.core = OtherClock(bench.core)
+    return bench
+
+
+def driving(config=CONFIG):
+    bench = bench_with_clock(config)
+    bench.to_driving(SPEED, SPEED / 2)
+    return bench
+
+
+def running_at(rate, since_us):
+    return lambda true_us: since_us + math.floor((true_us - since_us) * rate)
+
+
+def cycles_until(bench, holds, at_most):
+    for cycles in range(1, at_most + 1):
+        bench.step()
+        if holds(bench.out):
+            return cycles
+    raise AssertionError(f"not within {at_most} cycles: {bench.out}")
+
+
+def is_stopped(out):
+    return out.state != "ARMED"
+
+
+def stands(out):
+    return out.left_setpoint_rad_s == 0.0 and out.right_setpoint_rad_s == 0.0
+
+
+def stays_stopped(bench, cycles=2000):
+    """Whatever the host goes on asking for."""
+    for k in range(cycles):
+        bench.step()
+        assert bench.out.state != "ARMED"
+        assert stands(bench.out)
+        if k % 200 == 0:
+            bench.ask("READY" if k % 400 else "ARM", session=8 + k // 200)
+
+
+@pytest.mark.parametrize("rate", RATES)
+def test_a_clock_that_begins_to_run_at_another_rate_stops_a_robot_whose_host_goes_on(rate):
+    bench = driving()
+    bench.core.clock = running_at(rate, bench.now_us)
+    apart_a_cycle = abs(rate - 1.0) - 0.1
+    cycles_until(bench, is_stopped, math.ceil(TOLERANCE_MS / apart_a_cycle) + 1)
+    cycles_until(bench, stands, RAMP_CYCLES + 1)
+    stays_stopped(bench)
+
+
+@pytest.mark.parametrize("rate", [*RATES, 0.9, 0.95, 0.99, 1.0, 1.01, 1.05, 1.1])
+@pytest.mark.parametrize("late_us", [0, 1, 300, 999])
+def test_with_a_silent_host_the_wheels_stand_in_the_watchdogs_time_by_either_clock(rate, late_us):
+    bench = driving()
+    bench.command = None
+    bench.now_us += late_us
+    bench.wheel_command(SPEED, SPEED / 2)
+    bench.now_us -= late_us
+    bench.core.clock = running_at(rate, bench.now_us)
+    by_clock = math.ceil((TIMEOUT_MS + late_us * 1e-3) / rate) if rate else math.inf
+    stopped = cycles_until(bench, is_stopped, min(TIMEOUT_MS, by_clock) + 1)
+    cycles_until(bench, stands, RAMP_CYCLES + 1)
+    assert stopped + RAMP_CYCLES <= TIMEOUT_MS + 1 + RAMP_CYCLES
+    stays_stopped(bench)
+
+
+@pytest.mark.parametrize("rate", RATES)
+def test_a_robot_whose_clock_never_ran_right_is_never_armed(rate):
+    bench = bench_with_clock()
+    bench.core.clock = running_at(rate, bench.now_us)
+    bench.hello()
+    bench.command = {}
+    stays_stopped(bench, 5000)
+    assert "FAULT" in bench.blockers()
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize("leap_us", [21_100, 25_000, 60_000, 250_000, 10**6, 3600 * 10**6, 10**15])
+def test_one_leap_of_the_clock_stops_the_robot_at_once(leap_us, sign):
+    bench = driving()
+    bench.run(40_000)
+    begin_us = bench.now_us
+    bench.core.clock = lambda true_us: max(0, true_us + sign * leap_us * (true_us > begin_us))
+    assert bench.step().state == "STOPPING"
+    assert bench.out.stop_cause == "FAULT"
+    assert bench.out.fault == FAULTS["CLOCK_MISMATCH"]
+    cycles_until(bench, stands, RAMP_CYCLES + 1)
+    stays_stopped(bench)
+
+
+def test_the_fault_passes_once_the_clock_is_sound_again():
+    bench = driving()
+    begin_us = bench.now_us
+    bench.core.clock = lambda true_us: true_us + 10**6 * (true_us > begin_us)
+    bench.request = bench.command = None
+    assert bench.run(500).fault == FAULTS["CLOCK_MISMATCH"]
+    assert bench.run(300).fault == 0
+    bench.to_armed(session=9)
+
+
+@pytest.mark.parametrize("leap_us", [1000, 10_000, 18_000, -1000, -10_000, -18_000])
+def test_with_a_silent_host_no_row_of_small_leaps_keeps_the_robot_armed(leap_us):
+    """To and fro, each within the tolerance: the clock loses as much as it gains."""
+    bench = driving()
+    bench.command = None
+    bench.wheel_command(SPEED, SPEED / 2)
+    begin_us = bench.now_us
+    bench.core.clock = lambda true_us: true_us + leap_us * ((true_us - begin_us) // MS % 2)
+    cycles_until(bench, is_stopped, TIMEOUT_MS + 1)
+    cycles_until(bench, stands, RAMP_CYCLES + 1)
+
+
+@pytest.mark.parametrize("config", [CONFIG, dataclasses.replace(CONFIG, cycle_s=0.005)], ids=["1 kHz", "200 Hz"])
+@pytest.mark.parametrize("rate", [0.91, 0.999, 0.9999, 1.0, 1.00004, 1.001, 1.09])
+@pytest.mark.parametrize("jitter", [0.0, 0.5, 0.99])
+def test_no_sound_clock_stops_the_robot_whose_cycles_jitter(config, rate, jitter):
+    """Cycles a tenth too long or too short, each up to a whole period late or early, and now and then one lost."""
+    bench = driving(config)
+    cycle_us, drawn = config.cycle_s * 1e6, random.Random(3)
+    begin_us = bench.now_us
+    for k in itertools.count(1):
+        lost = 0.5 * cycle_us * (k % 50 == 0)
+        due_us = begin_us + k * cycle_us * rate + drawn.uniform(-jitter, jitter) * 0.5 * cycle_us + lost
+        step_to(bench, math.floor(due_us))
+        assert bench.out.state == "ARMED", (k, bench.out)
+        if bench.now_us - begin_us > 5_000_000:
+            break
+
+
+def step_to(bench, due_us):
+    """The next cycle at this time; the host's frames are due by the clock, at whatever cycle comes first."""
+    for period_us, send in ((50 * MS, lambda: host_state(bench)), (20 * MS, lambda: bench.wheel_command(SPEED, 2.0))):
+        if due_us // period_us != bench.now_us // period_us:
+            send()
+    request, command = bench.request, bench.command
+    bench.request = bench.command = None
+    bench.now_us, elapsed_us = due_us - 1, due_us - bench.now_us
+    bench.ticks = [
+        t + s * bench.config.ticks_per_rev / (2e6 * math.pi) * elapsed_us
+        for t, s in zip(bench.ticks, bench.speeds, strict=True)
+    ]
+    bench.step(1)
+    bench.request, bench.command = request, command
+
+
+def host_state(bench):
+    bench.host_state(request="ARM", session=bench.request["session"])
+
+
+@pytest.mark.parametrize("pause_ms", [2, 5, 10, 20])
+def test_a_pause_within_the_tolerance_stops_nothing_even_once_in_a_quarter_of_a_second(pause_ms):
+    bench = driving()
+    for _ in range(8):
+        step_to(bench, bench.now_us + pause_ms * MS)
+        for _ in range(250):
+            step_to(bench, bench.now_us + MS)
+            assert bench.out.state == "ARMED"
+
+
+def test_cycles_of_a_period_that_is_not_the_configured_one_are_refused():
+    bench = Bench(dataclasses.replace(CONFIG, cycle_s=0.002))
+    for _ in range(100):
+        bench.step(MS)
+    assert bench.out.fault == FAULTS["CLOCK_MISMATCH"]

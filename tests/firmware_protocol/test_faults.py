@@ -1,0 +1,163 @@
+"""The one table of faults: complete, true to the C core, and alone."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from drivers import words
+from firmware_protocol.faults import _REMEDIES, FAULTS, advice
+from firmware_protocol.firmware_core import ResetCause
+from tests.firmware_protocol.bench import CODEC, CONFIG, MS, Bench
+
+ROOT = Path(__file__).parents[2]
+# Where the table stands, and the page on which it is printed, equal to it by test_readme.py.
+HOMES = {"firmware_protocol/faults.py", "firmware_protocol/README.md"}
+SIDES = {"LEFT": 0, "RIGHT": 1}
+
+
+def test_every_code_of_the_dbc_has_a_row_and_no_other():
+    choices = CODEC.choices("SYSTEM_STATE", "fault")
+    assert {fault.code: fault.name for fault in FAULTS.values()} == {
+        code: name for code, name in choices.items() if code
+    }
+    assert set(FAULTS) == set(_REMEDIES)
+    assert all(name == fault.name and fault.remedy for name, fault in FAULTS.items())
+
+
+def bad_input(field, value):
+    """A cause that lies in one measurement, and its end."""
+
+    def begin():
+        bench = Bench()
+        bench.to_driving()
+        bench.inputs[field] = value
+        return bench
+
+    return begin, lambda bench: bench.inputs.clear()
+
+
+def dead_wheel(side, current_a):
+    """A driven wheel without ticks."""
+
+    def begin():
+        bench = Bench()
+        bench.to_driving(4.0, 4.0)
+        bench.inputs.update({f"{side}_current_a": current_a, f"{side}_ticks": int(bench.ticks[side == "right"])})
+        return bench
+
+    return begin, lambda bench: bench.inputs.clear()
+
+
+def jump(side):
+    def begin():
+        bench = Bench()
+        bench.to_driving()
+        bench.ticks[side] += 5000
+        return bench
+
+    return begin, lambda bench: None
+
+
+def turned_round(side):
+    def begin():
+        bench = Bench()
+        bench.to_driving(4.0, 4.0)
+        bench.wheels_follow = False
+        bench.speeds[side] = -3.0
+        return bench
+
+    def end(bench):
+        bench.wheels_follow = True
+
+    return begin, end
+
+
+def stranger(**changes):
+    def begin():
+        bench = Bench()
+        bench.hello(**changes)
+        return bench
+
+    return begin, lambda bench: bench.hello()
+
+
+def started_by(cause):
+    class Started(Bench):
+        def step(self, elapsed_us=None):
+            self.inputs["reset_cause"] = cause
+            return super().step(elapsed_us)
+
+    return Started, lambda bench: None
+
+
+def leapt_clock():
+    bench = Bench()
+    bench.to_driving()
+    bench.step(50 * MS)
+    return bench
+
+
+PROVOKED = {
+    "UNDER_VOLTAGE": bad_input("voltage_v", 12.0),
+    "OVER_VOLTAGE": bad_input("voltage_v", 40.0),
+    "BUS_OFF": bad_input("tx_error_count", 256),
+    "SELF_TEST_FAILED": bad_input("self_test_failed", True),
+    "DBC_HASH_MISMATCH": stranger(dbc_hash=1),
+    "PROTOCOL_MAJOR_MISMATCH": stranger(protocol_major=99),
+    "CLOCK_MISMATCH": (leapt_clock, lambda bench: None),
+    "CONFIG_INVALID": (lambda: Bench(replace(CONFIG, max_wheel_speed_rad_s=-1.0)), lambda bench: None),
+    "ENTROPY_INVALID": (lambda: Bench(entropy=0), lambda bench: None),
+    "WATCHDOG_RESET": started_by(ResetCause.WATCHDOG),
+    "BROWN_OUT_RESET": started_by(ResetCause.BROWN_OUT),
+    **{f"OVER_TEMPERATURE_{side}": bad_input(f"{side.lower()}_temperature_c", 100.0) for side in SIDES},
+    **{f"OVER_CURRENT_{side}": bad_input(f"{side.lower()}_current_a", 99.0) for side in SIDES},
+    **{f"STALL_{side}": dead_wheel(side.lower(), 16.0) for side in SIDES},
+    **{f"ENCODER_MISSING_{side}": dead_wheel(side.lower(), 2.0) for side in SIDES},
+    **{f"ENCODER_JUMP_{side}": jump(index) for side, index in SIDES.items()},
+    **{f"WRONG_DIRECTION_{side}": turned_round(index) for side, index in SIDES.items()},
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS.values(), ids=FAULTS)
+def test_the_core_ends_each_fault_as_the_table_says(fault):
+    begin, end = PROVOKED[fault.name]
+    bench = begin()
+    for _ in range(1500):
+        if bench.out.fault == fault.code:
+            break
+        bench.step()
+    assert bench.out.fault == fault.code
+    assert bench.run(5).state == ("FAULT" if fault.latches else bench.out.state)
+    bench.command = None
+    end(bench)
+    bench.ask("STANDBY")
+    bench.run(3000)
+    assert (bench.out.fault != 0, bench.out.state) == (fault.latches, "FAULT" if fault.latches else "STANDBY")
+    bench.ask("RESET")
+    bench.run(500)
+    assert (bench.out.fault != 0, bench.out.state) == (fault.permanent, "FAULT" if fault.permanent else "STANDBY")
+
+
+def test_what_ends_a_fault_is_said_with_the_remedy():
+    assert FAULTS["STALL_LEFT"].advice.endswith("; then reset")
+    assert FAULTS["OVER_TEMPERATURE_LEFT"].advice.endswith("; it clears by itself")
+    assert FAULTS["SELF_TEST_FAILED"].advice.endswith("; then restart the controller")
+    assert not any(word in fault.remedy for fault in FAULTS.values() for word in ("reset", "clear"))
+    assert advice("NONE") == advice("NO_SUCH_FAULT") == ""
+    assert words.fault("BUS_OFF") == f"BUS_OFF: {FAULTS['BUS_OFF'].advice}"
+
+
+def test_no_other_file_holds_a_remedy_or_lists_the_faults():
+    """No file but the table's own holds what it says, or has a mapping from names of faults to text."""
+    remedies = {fault.remedy.lower() for fault in FAULTS.values()}
+    files = [path for folder in ("disco_hw", "drivers", "firmware_protocol", "sim", "docs", "README.md")
+             for path in ([ROOT / folder] if folder.endswith(".md") else (ROOT / folder).rglob("*"))
+             if path.suffix in {".py", ".md", ".html", ".js", ".toml", ".dbc"}]  # fmt: skip
+    assert len(files) > 200
+    for path in files:
+        name = path.relative_to(ROOT).as_posix()
+        if name not in HOMES:
+            text = path.read_text("utf-8")
+            assert not [remedy for remedy in remedies if remedy in text.lower()], name
+            assert not [fault for fault in FAULTS if f'"{fault}": ' in text or f"`{fault}` |" in text], name
