@@ -23,14 +23,15 @@ from disco_hw.control.plan import Array, Diagnostics, NoValidControl, PlannerSta
 from disco_hw.control.settings import CommandLimits, DiscoSettings
 from disco_hw.control.tasks.task import Task
 from disco_hw.effects.effect import Channel
+from disco_hw.effects.registry import DELAY
 from disco_hw.model import Belief, Model
 from disco_hw.model.free_run import FreeRun
 from disco_hw.model.model import coefficient_tables
+from disco_hw.model.parameter import BASE_PARAMETERS
 from disco_hw.model.step import integration_series
 
 NARROW_TURN_RAD = 0.4
-TURNING_EFFECTS = ("wheel_gain", "wheel_radius_asymmetry", "surface_change", "turn_slip")
-DELAY = "command_delay.delay_s"
+DELAYED_BY = DELAY.columns[0]
 # Steps kept beyond the longest delay that is believed in at first, for later beliefs.
 SPARE_HISTORY = 2
 SHORTEST_GAP_S = 1e-6
@@ -53,11 +54,9 @@ class Disco:
         theta, weights = self._shared_points(model)
         self._weights = weights.astype(np.float32)
         self._skip_mean_cost = True if self._weights[0] == 0.0 and not self._own_draws else None
-        delay_is_believed = model.belief is not None and DELAY in model.belief.names
+        delay_is_believed = model.belief is not None and DELAYED_BY in model.belief.names
         self._history = self._history_for(model, theta) + (SPARE_HISTORY if delay_is_believed else 0)
-        may_turn_more = settings.uncertainty in ("mc", "joint") or any(
-            s.name in TURNING_EFFECTS or s.name.startswith("omega +=") for s in model.effects
-        )
+        may_turn_more = settings.uncertainty in ("mc", "joint") or any(s.effect.may_turn_more for s in model.effects)
         self._wide = True if may_turn_more or self._largest_turn_rad(theta) > NARROW_TURN_RAD else None
         self._series = integration_series(step_s, self._wide is not None, np.float32)
         self._pairs = shared_pairs(model, theta, step_s)
@@ -104,7 +103,8 @@ class Disco:
         self._mean_theta = mean_point(model)
         self._mean = FreeRun(model, self._mean_theta, step_s)
         self._points = FreeRun(model, theta, step_s)
-        self._response_s = self._value(self._mean_theta, "motor_lag.tau_s") + self._value(self._mean_theta, DELAY)
+        late = [f"{s.name}.{s.effect.late_by}" for s in model.effects if s.effect.late_by is not None]
+        self._response_s = sum(self._value(self._mean_theta, name) for name in late)
         self._tables = coefficient_tables(model, theta, step_s, np.float32)
         found = equivalent_points(model, theta, step_s, self._pairs)
         self._ahead, self._scaled = (
@@ -129,7 +129,7 @@ class Disco:
         if not np.isfinite(theta).all() or weights.size != self._weights.size:
             raise ValueError("the belief's points are not finite, or not as many as before")
         if self._history_for(model, theta) > self._history:
-            raise ValueError(f"{DELAY}: longer than the {self._history} steps of commands that the planner keeps")
+            raise ValueError(f"{DELAYED_BY}: longer than the {self._history} steps of commands that the planner keeps")
         if self._wide is None and self._largest_turn_rad(theta) > NARROW_TURN_RAD:
             raise ValueError(f"the wheels would turn the robot by more than {NARROW_TURN_RAD} rad in a step")
         self._take_points(model, theta)
@@ -141,7 +141,7 @@ class Disco:
 
     def _history_for(self, model: Model, theta: Array) -> int:
         """Steps of past commands that the points (L, P) and the mean look back on."""
-        delay_steps = max(self._value(each, DELAY) for each in (theta, mean_point(model))) / self._settings.step_s
+        delay_steps = max(self._value(each, DELAYED_BY) for each in (theta, mean_point(model))) / self._settings.step_s
         return 0 if delay_steps == 0.0 else math.floor(delay_steps) + 1
 
     def _value(self, theta: Array, name: str) -> float:
@@ -154,8 +154,8 @@ class Disco:
         differing = {name for name, column in zip(self._model.parameter_names, theta.T, strict=True) if np.ptp(column)}
         wheel_effects = [s for s in self._model.effects if s.effect.channel is Channel.COMMAND_TO_WHEEL]
         names = {f"{setting.name}.{key}" for setting in wheel_effects for key in setting.values}
-        if any(setting.name in ("yaw_rate_limit", "yaw_acceleration_limit") for setting in wheel_effects):
-            names |= {"wheel_radius_m", "axial_distance_m"}
+        if any(setting.effect.uses_geometry for setting in wheel_effects):
+            names |= {parameter.name for parameter in BASE_PARAMETERS}
         return bool(names & differing)
 
     @property

@@ -14,7 +14,7 @@ from disco_hw.control import pendulum
 from disco_hw.control.tasks.circle import Circle
 from disco_hw.control.tasks.path import AGAINST_M, FARTHEST_STEP_M, SLOW_DOWN_S, STANDING_M, TERMINAL_S, Path
 from disco_hw.control.tasks.timed_path import RESTS_M, TimedPath
-from disco_hw.model import reference as model
+from disco_hw.model import plain as model
 
 Array = NDArray[np.float64]
 SequenceCost = Callable[[Array, Array, Array, Array], Array]

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from disco_hw.control.sigma_points import sigma_points
 from disco_hw.effects.effect import Channel
+from disco_hw.effects.registry import DELAY
 from disco_hw.model import Belief, Mixture, Model
 from disco_hw.model.parameter import BASE_PARAMETERS, X_ICR
 from disco_hw.model.terms import effect_of
@@ -79,8 +80,8 @@ def drawn_points(model: Model, count: int, seed: int, step: int) -> Array:
         return np.tile(model.point(), (count, 1))
     rng = np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, 0, step]))
     draws = belief.draw(count, rng)
-    if "command_delay.delay_s" in belief.names:
-        column = belief.names.index("command_delay.delay_s")
+    if DELAY.columns[0] in belief.names:
+        column = belief.names.index(DELAY.columns[0])
         draws[:, column] = belief.mean()[column]
     return model.complete(draws, belief.names)
 

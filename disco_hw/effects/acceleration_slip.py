@@ -2,34 +2,29 @@
 
 from __future__ import annotations
 
-from typing import Any
+import numpy as np
 
-from disco_hw.effects.effect import Array, Channel, Parameter, Stage
+from disco_hw.effects.effect import Array, Channel, Effect, Parameter, Stage, Symptom, Value, Values
 from disco_hw.jit import cast_like, scalar_function
 
 LARGEST_SLIP = 0.6
 
 
-class AccelerationSlip:
+def plain(forward: Value, change: Value, values: Values, geometry: Values, step_s: float) -> Value:
     """v -> v - k |v| dv/dt, at most 60 % of it."""
+    (k_s2_m,), (radius, _, _) = values, geometry
+    acceleration = radius * change / 2.0 / step_s
+    lost: Value = np.abs(forward) * np.clip(k_s2_m * acceleration, -0.6, 0.6)
+    return forward - lost
 
-    name = "acceleration_slip"
-    channel = Channel.WHEEL_TO_BODY
-    moves = True
-    stage = Stage.FORWARD
-    order = 140
-    parameters = (Parameter("k_s2_m", "s^2/m", -5.0, 5.0, 0.1, realistic=0.08),)
-    excitation = "start-stops on a straight, forward and back"
-    script = "starts"
-    sentence = "speeding up slips: {k_s2_m:.1%} of the speed is lost for every m/s^2"
 
-    def coefficients(self, values: Array, base: Array, step_s: float) -> tuple[Array, ...]:
-        """Slip per change of the two wheel speeds' sum over a step, (L,)."""
-        return (values[:, 0] * 0.5 * base[:, 0] / step_s,)
+def coefficients(values: Array, base: Array, step_s: float) -> tuple[Array, ...]:
+    """Slip per change of the two wheel speeds' sum over a step, (L,)."""
+    return (values[:, 0] * 0.5 * base[:, 0] / step_s,)
 
 
 @scalar_function
-def term(forward: Any, change: Any, coefficients: Any) -> Any:
+def term(forward: float, change: float, coefficients: tuple[float] | None) -> float:
     """Forward speed (m/s) while the sum of the wheel speeds changes by `change` (rad/s) over the step."""
     if coefficients is None:
         return forward
@@ -38,4 +33,18 @@ def term(forward: Any, change: Any, coefficients: Any) -> Any:
     return forward - abs(forward) * min(max(k * change, -largest), largest)
 
 
-EFFECT = AccelerationSlip()
+EFFECT = Effect(
+    name="acceleration_slip",
+    channel=Channel.WHEEL_TO_BODY,
+    stage=Stage.FORWARD,
+    order=140,
+    parameters=(Parameter("k_s2_m", "s^2/m", -5.0, 5.0, 0.1, realistic=0.08),),
+    plain=plain,
+    coefficients=coefficients,
+    term=term,
+    uses_geometry=True,
+    symptoms=(Symptom.LATE_POSITIONS, Symptom.SHORTER_AT_SPEED),
+    excitation="start-stops on a straight, forward and back",
+    script="starts",
+    sentence="speeding up slips: {k_s2_m:.1%} of the speed is lost for every m/s^2",
+)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
+import numpy as np
 
-from disco_hw.effects.effect import Array, Channel, Parameter, Stage
+from disco_hw.effects.effect import Array, Channel, Effect, Parameter, Stage, Value, Values
 from disco_hw.jit import cast_like, scalar_function
 
 REFERENCE_S = 150.0
@@ -12,26 +12,20 @@ LARGEST_LOSS = 0.3
 """A pack is empty before its voltage has fallen further: a lithium cell from 4.2 V to 3.0 V."""
 
 
-class BatterySag:
+def plain(left: Value, right: Value, time_s: float, values: Values) -> tuple[Value, Value]:
     """u -> u (1 - loss t / 150 s): wheel speed falls linearly with the time since the start, to 70 % at least."""
+    (loss,) = values
+    kept = 1.0 - np.clip(loss * time_s / 150.0, 0.0, 0.3)
+    return left * kept, right * kept
 
-    name = "battery_sag"
-    channel = Channel.COMMAND_TO_WHEEL
-    moves = True
-    stage = Stage.COMMAND
-    order = 50
-    parameters = (Parameter("loss", "1 in 150 s", 0.0, 0.9, 0.05, starts=(0.02, 0.15), realistic=0.05),)
-    excitation = "the same manoeuvre early and late in a drive of minutes"
-    script = "straights"
-    sentence = "the wheels lose {loss:.1%} of their speed in every 150 s of driving"
 
-    def coefficients(self, values: Array, base: Array, step_s: float) -> tuple[Array, ...]:
-        """Loss per second, (L,)."""
-        return (values[:, 0] / REFERENCE_S,)
+def coefficients(values: Array, base: Array, step_s: float) -> tuple[Array, ...]:
+    """Loss per second, (L,)."""
+    return (values[:, 0] / REFERENCE_S,)
 
 
 @scalar_function
-def term(left: Any, right: Any, time_s: Any, coefficients: Any) -> Any:
+def term(left: float, right: float, time_s: float, coefficients: tuple[float] | None) -> tuple[float, float]:
     """Wheel speeds that are left at this time (rad/s)."""
     if coefficients is None:
         return left, right
@@ -40,4 +34,16 @@ def term(left: Any, right: Any, time_s: Any, coefficients: Any) -> Any:
     return left - left * lost, right - right * lost
 
 
-EFFECT = BatterySag()
+EFFECT = Effect(
+    name="battery_sag",
+    channel=Channel.COMMAND_TO_WHEEL,
+    stage=Stage.COMMAND,
+    order=50,
+    parameters=(Parameter("loss", "1 in 150 s", 0.0, 0.9, 0.05, realistic=0.05),),
+    plain=plain,
+    coefficients=coefficients,
+    term=term,
+    excitation="the same manoeuvre early and late in a drive of minutes",
+    script="straights",
+    sentence="the wheels lose {loss:.1%} of their speed in every 150 s of driving",
+)

@@ -2,32 +2,25 @@
 
 from __future__ import annotations
 
-from typing import Any
+import numpy as np
 
-from disco_hw.effects.effect import Array, Channel, Parameter, Stage
+from disco_hw.effects.effect import Array, Channel, Driven, Effect, Parameter, Stage, Value, Values
 from disco_hw.jit import scalar_function
 
 
-class Deadband:
+def plain(command: Value, values: Values) -> Value:
     """u -> sign(u) max(|u| - width, 0) on each wheel's command."""
+    (width,) = values
+    return np.sign(command) * np.maximum(np.abs(command) - width, 0.0)
 
-    name = "deadband"
-    channel = Channel.COMMAND_TO_WHEEL
-    moves = True
-    stage = Stage.COMMAND
-    order = 10
-    parameters = (Parameter("width_rad_s", "rad/s", 0.0, 5.0, 0.3, starts=(0.1, 0.8), realistic=0.25),)
-    excitation = "slow ramps of the wheel command through zero"
-    script = "ramps"
-    sentence = "the wheels ignore the first {width_rad_s:.2f} rad/s of every command"
 
-    def coefficients(self, values: Array, base: Array, step_s: float) -> tuple[Array, ...]:
-        """The width, (L,)."""
-        return (values[:, 0],)
+def coefficients(values: Array, base: Array, step_s: float) -> tuple[Array, ...]:
+    """The width, (L,)."""
+    return (values[:, 0],)
 
 
 @scalar_function
-def term(command: Any, coefficients: Any) -> Any:
+def term(command: float, coefficients: tuple[float] | None) -> float:
     """Command that is left of a wheel's command (rad/s)."""
     if coefficients is None:
         return command
@@ -35,4 +28,22 @@ def term(command: Any, coefficients: Any) -> Any:
     return command - min(max(command, -width), width)
 
 
-EFFECT = Deadband()
+def starts(driven: Driven) -> tuple[tuple[float, ...], ...]:
+    """Where a fit begins."""
+    return ((0.2,),)
+
+
+EFFECT = Effect(
+    name="deadband",
+    channel=Channel.COMMAND_TO_WHEEL,
+    stage=Stage.COMMAND,
+    order=10,
+    parameters=(Parameter("width_rad_s", "rad/s", 0.0, 5.0, 0.3, realistic=0.25),),
+    plain=plain,
+    coefficients=coefficients,
+    term=term,
+    starts=starts,
+    excitation="slow ramps of the wheel command through zero",
+    script="ramps",
+    sentence="the wheels ignore the first {width_rad_s:.2f} rad/s of every command",
+)

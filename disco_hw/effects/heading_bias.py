@@ -2,32 +2,24 @@
 
 from __future__ import annotations
 
-import numpy as np
-
-from disco_hw.effects.effect import Array, Channel, Parameter, Stage
+from disco_hw.effects.effect import Channel, Effect, Parameter, Stage, Symptom, Value, Values
 
 
-class HeadingBias:
-    """The measured yaw is the true one plus this."""
-
-    name = "heading_bias"
-    channel = Channel.POSE_SENSOR
-    moves = False
-    stage = Stage.ELSEWHERE
-    order = 0
-    parameters = (Parameter("bias_rad", "rad", -3.2, 3.2, 0.0, realistic=0.026),)
-    excitation = "straights and fast steering"
-    script = "curves"
-    sentence = "the measured yaw is {bias_rad:+.4f} rad off"
-
-    def coefficients(self, values: Array, base: Array, step_s: float) -> tuple[Array, ...]:
-        """None: it moves nothing."""
-        return ()
+def plain(x: Value, y: Value, yaw: Value, values: Values) -> tuple[Value, Value, Value]:
+    """The measured yaw is the true one plus this (rad, not wrapped)."""
+    (bias_rad,) = values
+    return x, y, yaw + bias_rad
 
 
-def measured(yaw: Array, values: Array) -> Array:
-    """Yaw as the sensor tells it (rad, not wrapped); `values` (1,)."""
-    return np.asarray(yaw + values[0])
-
-
-EFFECT = HeadingBias()
+EFFECT = Effect(
+    name="heading_bias",
+    channel=Channel.POSE_SENSOR,
+    stage=Stage.POSE,
+    order=20,
+    parameters=(Parameter("bias_rad", "rad", -3.2, 3.2, 0.0, realistic=0.026),),
+    plain=plain,
+    symptoms=(Symptom.SIDEWAYS_WITH_SPEED, Symptom.FORWARD_WITH_TURNING),
+    excitation="straights and fast steering",
+    script="curves",
+    sentence="the measured yaw is {bias_rad:+.4f} rad off",
+)

@@ -2,32 +2,24 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-from disco_hw.effects.effect import Array, Channel, Parameter, Stage
+from disco_hw.effects.effect import Array, Channel, Effect, Parameter, Stage, Symptom, Value, Values
 from disco_hw.jit import scalar_function
 
 
-class LateralIcr:
+def plain(forward: Value, turn: Value, values: Values) -> Value:
     """v_x -> v_x + offset omega: the instantaneous centre of rotation lies this far to the left."""
+    (offset_m,) = values
+    omega = 2.0 * turn
+    return forward + offset_m * omega
 
-    name = "lateral_icr"
-    channel = Channel.WHEEL_TO_BODY
-    moves = True
-    stage = Stage.FORWARD
-    order = 160
-    parameters = (Parameter("offset_m", "m", -1.0, 1.0, 0.0, realistic=0.015),)
-    excitation = "turning on the spot, both ways"
-    script = "spins"
-    sentence = "the robot turns about a point {offset_m:+.3f} m to the left of its middle line"
 
-    def coefficients(self, values: Array, base: Array, step_s: float) -> tuple[Array, ...]:
-        """Forward speed per half of the yaw rate, (L,)."""
-        return (2.0 * values[:, 0],)
+def coefficients(values: Array, base: Array, step_s: float) -> tuple[Array, ...]:
+    """Forward speed per half of the yaw rate, (L,)."""
+    return (2.0 * values[:, 0],)
 
 
 @scalar_function
-def term(forward: Any, turn: Any, coefficients: Any) -> Any:
+def term(forward: float, turn: float, coefficients: tuple[float] | None) -> float:
     """Forward speed (m/s) at half the yaw rate `turn` (rad/s)."""
     if coefficients is None:
         return forward
@@ -35,4 +27,17 @@ def term(forward: Any, turn: Any, coefficients: Any) -> Any:
     return forward + offset * turn
 
 
-EFFECT = LateralIcr()
+EFFECT = Effect(
+    name="lateral_icr",
+    channel=Channel.WHEEL_TO_BODY,
+    stage=Stage.FORWARD,
+    order=160,
+    parameters=(Parameter("offset_m", "m", -1.0, 1.0, 0.0, realistic=0.015),),
+    plain=plain,
+    coefficients=coefficients,
+    term=term,
+    symptoms=(Symptom.FORWARD_WITH_TURNING, Symptom.LEFT_UNLIKE_RIGHT),
+    excitation="turning on the spot, both ways",
+    script="spins",
+    sentence="the robot turns about a point {offset_m:+.3f} m to the left of its middle line",
+)

@@ -4,34 +4,30 @@ from __future__ import annotations
 
 import numpy as np
 
-from disco_hw.effects.effect import Array, Channel, Parameter, Stage
+from disco_hw.effects import lateral_icr
+from disco_hw.effects.effect import Channel, Effect, Mimicked, Parameter, Stage, Symptom, Value, Values
 
 
-class PoseOffset:
+def plain(x: Value, y: Value, yaw: Value, values: Values) -> tuple[Value, Value, Value]:
     """The sensor sits beside the tracked point, in the body frame: forward and to the left."""
+    forward_m, left_m = values
+    cosine, sine = np.cos(yaw), np.sin(yaw)
+    return x + (forward_m * cosine - left_m * sine), y + (forward_m * sine + left_m * cosine), yaw
 
-    name = "pose_offset"
-    channel = Channel.POSE_SENSOR
-    moves = False
-    stage = Stage.ELSEWHERE
-    order = 0
-    parameters = (
+
+EFFECT = Effect(
+    name="pose_offset",
+    channel=Channel.POSE_SENSOR,
+    stage=Stage.POSE,
+    order=10,
+    parameters=(
         Parameter("forward_m", "m", -1.0, 1.0, 0.0),
         Parameter("left_m", "m", -1.0, 1.0, 0.0, realistic=0.015),
-    )
-    excitation = "turning on the spot, both ways"
-    script = "spins"
-    sentence = "the pose sensor sits {forward_m:+.3f} m forward and {left_m:+.3f} m to the left of the tracked point"
-
-    def coefficients(self, values: Array, base: Array, step_s: float) -> tuple[Array, ...]:
-        """None: it moves nothing."""
-        return ()
-
-
-def measured(x: Array, y: Array, yaw: Array, values: Array) -> tuple[Array, Array]:
-    """Position of the sensor; `values` (2,)."""
-    cos_yaw, sin_yaw = np.cos(yaw), np.sin(yaw)
-    return x + values[0] * cos_yaw - values[1] * sin_yaw, y + values[0] * sin_yaw + values[1] * cos_yaw
-
-
-EFFECT = PoseOffset()
+    ),
+    plain=plain,
+    mimics=Mimicked(lateral_icr, "measure the pose sensor's mount with a ruler, or move the payload and drive again"),
+    symptoms=(Symptom.FORWARD_WITH_TURNING,),
+    excitation="turning on the spot, both ways",
+    script="spins",
+    sentence="the pose sensor sits {forward_m:+.3f} m forward and {left_m:+.3f} m to the left of the tracked point",
+)

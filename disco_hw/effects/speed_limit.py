@@ -3,32 +3,26 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
-from disco_hw.effects.effect import Array, Channel, Parameter, Stage
+import numpy as np
+
+from disco_hw.effects.effect import Array, Channel, Driven, Effect, Parameter, Stage, Value, Values
 from disco_hw.jit import scalar_function
 
 
-class SpeedLimit:
+def plain(command: Value, values: Values) -> Value:
     """Each wheel's command is cut at +- the limit."""
+    (limit,) = values
+    return np.clip(command, -limit, limit)
 
-    name = "speed_limit"
-    channel = Channel.COMMAND_TO_WHEEL
-    moves = True
-    stage = Stage.COMMAND
-    order = 30
-    parameters = (Parameter("limit_rad_s", "rad/s", 0.1, 100.0, 6.0, neutral=math.inf, starts=(3.0, 10.0)),)
-    excitation = "straights and turns at full speed"
-    script = "straights"
-    sentence = "no wheel turns faster than {limit_rad_s:.2f} rad/s"
 
-    def coefficients(self, values: Array, base: Array, step_s: float) -> tuple[Array, ...]:
-        """The limit, (L,)."""
-        return (values[:, 0],)
+def coefficients(values: Array, base: Array, step_s: float) -> tuple[Array, ...]:
+    """The limit, (L,)."""
+    return (values[:, 0],)
 
 
 @scalar_function
-def term(command: Any, coefficients: Any) -> Any:
+def term(command: float, coefficients: tuple[float] | None) -> float:
     """Command that is left of a wheel's command (rad/s)."""
     if coefficients is None:
         return command
@@ -36,4 +30,29 @@ def term(command: Any, coefficients: Any) -> Any:
     return min(max(command, -limit), limit)
 
 
-EFFECT = SpeedLimit()
+def limited(commands: Array, geometry: tuple[float, float]) -> Array:
+    """Speed of the faster wheel, (N,)."""
+    return np.asarray(np.abs(commands).max(axis=1))
+
+
+def starts(driven: Driven) -> tuple[tuple[float, ...], ...]:
+    """A fit begins where a part of what was commanded is cut."""
+    largest = driven.largest_speed_rad_s
+    return tuple((share * largest,) for share in (0.92, 0.75, 0.5)) if largest > 0.1 else ()
+
+
+EFFECT = Effect(
+    name="speed_limit",
+    channel=Channel.COMMAND_TO_WHEEL,
+    stage=Stage.COMMAND,
+    order=30,
+    parameters=(Parameter("limit_rad_s", "rad/s", 0.1, 100.0, 6.0, neutral=math.inf),),
+    plain=plain,
+    coefficients=coefficients,
+    term=term,
+    limited=limited,
+    starts=starts,
+    excitation="straights and turns at full speed",
+    script="straights",
+    sentence="no wheel turns faster than {limit_rad_s:.2f} rad/s",
+)

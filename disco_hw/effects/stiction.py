@@ -2,34 +2,28 @@
 
 from __future__ import annotations
 
-from typing import Any
+import numpy as np
 
-from disco_hw.effects.effect import Array, Channel, Parameter, Stage
+from disco_hw.effects.effect import Array, Channel, Driven, Effect, Parameter, Scan, Stage, Value, Values
 from disco_hw.jit import cast_like, scalar_function
 
 REST_RAD_S = 0.02
 
 
-class Stiction:
+def plain(command: Value, speed: Value, values: Values) -> Value:
     """A wheel at rest, or passing through it, rests until |u| exceeds the threshold; a turning one feels nothing."""
+    (threshold,) = values
+    resting = (np.abs(speed) < 0.02) | (np.asarray(speed * command) < 0.0)
+    return np.where(resting & (np.abs(command) <= threshold), 0.0, command)
 
-    name = "stiction"
-    channel = Channel.COMMAND_TO_WHEEL
-    moves = True
-    stage = Stage.COMMAND
-    order = 60
-    parameters = (Parameter("threshold_rad_s", "rad/s", 0.0, 5.0, 0.7, starts=(0.3, 1.2), realistic=0.5),)
-    excitation = "slow ramps of the wheel command from rest"
-    script = "ramps"
-    sentence = "a wheel at rest starts to turn only above {threshold_rad_s:.2f} rad/s"
 
-    def coefficients(self, values: Array, base: Array, step_s: float) -> tuple[Array, ...]:
-        """The threshold, (L,)."""
-        return (values[:, 0],)
+def coefficients(values: Array, base: Array, step_s: float) -> tuple[Array, ...]:
+    """The threshold, (L,)."""
+    return (values[:, 0],)
 
 
 @scalar_function
-def term(command: Any, speed: Any, coefficients: Any) -> Any:
+def term(command: float, speed: float, coefficients: tuple[float] | None) -> float:
     """Command that moves a wheel that turns with `speed` at the start of the step (rad/s)."""
     if coefficients is None:
         return command
@@ -40,4 +34,23 @@ def term(command: Any, speed: Any, coefficients: Any) -> Any:
     return cast_like(0.0, command) if stuck else command
 
 
-EFFECT = Stiction()
+def thresholds(driven: Driven) -> tuple[float, ...]:
+    """Thresholds to try (rad/s)."""
+    return tuple(np.arange(0.1, 2.05, 0.1).tolist())
+
+
+EFFECT = Effect(
+    name="stiction",
+    channel=Channel.COMMAND_TO_WHEEL,
+    stage=Stage.COMMAND,
+    order=60,
+    parameters=(Parameter("threshold_rad_s", "rad/s", 0.0, 5.0, 0.7, realistic=0.5),),
+    plain=plain,
+    coefficients=coefficients,
+    term=term,
+    scan=Scan("threshold_rad_s", thresholds, 0.002),
+    trials=(0.05, 0.1, 0.2, 0.3, 0.5, 0.75, 1.0, 1.5, 2.0),
+    excitation="slow ramps of the wheel command from rest",
+    script="ramps",
+    sentence="a wheel at rest starts to turn only above {threshold_rad_s:.2f} rad/s",
+)

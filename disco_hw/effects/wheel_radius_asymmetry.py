@@ -2,32 +2,24 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-from disco_hw.effects.effect import Array, Channel, Parameter, Stage
+from disco_hw.effects.effect import Array, Channel, Effect, Parameter, Stage, Symptom, Value, Values
 from disco_hw.jit import scalar_function
 
 
-class WheelRadiusAsymmetry:
+def plain(wheel_sum: Value, difference: Value, values: Values) -> tuple[Value, Value]:
     """r_R = r (1 + ratio), r_L = r (1 - ratio)."""
+    (ratio,) = values
+    left, right = (wheel_sum - difference) / 2.0 * (1.0 - ratio), (wheel_sum + difference) / 2.0 * (1.0 + ratio)
+    return left + right, right - left
 
-    name = "wheel_radius_asymmetry"
-    channel = Channel.WHEEL_TO_BODY
-    moves = True
-    stage = Stage.ROLLING
-    order = 110
-    parameters = (Parameter("ratio", "1", -0.5, 0.5, 0.0, realistic=0.008),)
-    excitation = "long straights, forward and back"
-    script = "straights"
-    sentence = "the right wheels are {ratio:+.2%} larger than the mean and the left ones as much smaller"
 
-    def coefficients(self, values: Array, base: Array, step_s: float) -> tuple[Array, ...]:
-        """The ratio, (L,)."""
-        return (values[:, 0],)
+def coefficients(values: Array, base: Array, step_s: float) -> tuple[Array, ...]:
+    """The ratio, (L,)."""
+    return (values[:, 0],)
 
 
 @scalar_function
-def term(wheel_sum: Any, difference: Any, coefficients: Any) -> Any:
+def term(wheel_sum: float, difference: float, coefficients: tuple[float] | None) -> tuple[float, float]:
     """Sum and difference (right minus left) of the wheel speeds that equal wheels would need (rad/s)."""
     if coefficients is None:
         return wheel_sum, difference
@@ -35,4 +27,18 @@ def term(wheel_sum: Any, difference: Any, coefficients: Any) -> Any:
     return wheel_sum + ratio * difference, difference + ratio * wheel_sum
 
 
-EFFECT = WheelRadiusAsymmetry()
+EFFECT = Effect(
+    name="wheel_radius_asymmetry",
+    channel=Channel.WHEEL_TO_BODY,
+    stage=Stage.ROLLING,
+    order=110,
+    parameters=(Parameter("ratio", "1", -0.5, 0.5, 0.0, realistic=0.008),),
+    plain=plain,
+    coefficients=coefficients,
+    term=term,
+    may_turn_more=True,
+    symptoms=(Symptom.TURNS_ON_STRAIGHTS, Symptom.LEFT_UNLIKE_RIGHT),
+    excitation="long straights, forward and back",
+    script="straights",
+    sentence="the right wheels are {ratio:+.2%} larger than the mean and the left ones as much smaller",
+)

@@ -13,6 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_banded
 
+from disco_hw.effects.effect import Symptom
+from disco_hw.effects.registry import REGISTRY
 from disco_hw.inference.estimates import Estimates, Whitening
 from disco_hw.inference.excitation import Excitation
 
@@ -23,31 +25,36 @@ _LEAST_LEFT = 1e-4
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """One way to differ: a name, what it would look like, and the effects that leave such a pattern."""
+    """One way to differ: a name and what it would look like."""
 
     name: str
-    meaning: str
-    effects: tuple[str, ...]
+    symptom: Symptom
+
+    @property
+    def meaning(self) -> str:
+        """What it would look like, in words."""
+        return self.symptom.value
+
+    @property
+    def effects(self) -> tuple[str, ...]:
+        """The effects that leave such a pattern."""
+        return tuple(effect.name for effect in REGISTRY.values() if self.symptom in effect.symptoms)
 
 
 CHECKS = (
-    Check("late positions", "positions lag behind the wheels' motion", ("pose_latency", "acceleration_slip")),
-    Check("sideways with speed", "the robot moves sideways on straights", ("heading_bias",)),
-    Check("sideways in fast turns", "the robot slides outwards the faster it turns", ("side_slip",)),
-    Check(
-        "forward with turning",
-        "turning shifts the robot forward or back",
-        ("lateral_icr", "pose_offset", "heading_bias"),
-    ),
-    Check("downhill", "motion adds a drift in one direction of the floor", ("slope",)),
-    Check("downhill across", "motion adds a drift in one direction of the floor", ("slope",)),
-    Check("shorter at speed", "the distance per turn of the wheels changes with speed", ("acceleration_slip",)),
-    Check("distance changes", "the distance per turn of the wheels changes during the drive", ("surface_change",)),
-    Check("turns on straights", "the robot turns with equal wheel speeds", ("wheel_radius_asymmetry", "encoder_scale")),
-    Check("less turn at speed", "turning falls short the faster it is", ("turn_slip",)),
-    Check("late yaw", "yaw lags behind the wheels' turning", ("pose_latency", "motor_lag", "command_delay")),
-    Check("left unlike right", "left and right turns differ", ("lateral_icr", "wheel_radius_asymmetry")),
-    Check("turning changes", "turning per turn of the wheels changes during the drive", ("surface_change",)),
+    Check("late positions", Symptom.LATE_POSITIONS),
+    Check("sideways with speed", Symptom.SIDEWAYS_WITH_SPEED),
+    Check("sideways in fast turns", Symptom.SIDEWAYS_IN_FAST_TURNS),
+    Check("forward with turning", Symptom.FORWARD_WITH_TURNING),
+    Check("downhill", Symptom.DOWNHILL),
+    Check("downhill across", Symptom.DOWNHILL),
+    Check("shorter at speed", Symptom.SHORTER_AT_SPEED),
+    Check("distance changes", Symptom.DISTANCE_CHANGES),
+    Check("turns on straights", Symptom.TURNS_ON_STRAIGHTS),
+    Check("less turn at speed", Symptom.LESS_TURN_AT_SPEED),
+    Check("late yaw", Symptom.LATE_YAW),
+    Check("left unlike right", Symptom.LEFT_UNLIKE_RIGHT),
+    Check("turning changes", Symptom.TURNING_CHANGES),
 )
 _POSITION_CHECKS = 8
 

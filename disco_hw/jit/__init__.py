@@ -171,12 +171,13 @@ def bits_of_float(_context: Any, _value: Any) -> tuple[Any, Callable[..., Any]]:
     return types.int32(types.float32), generate
 
 
-def cast_like(value: float, like: float) -> Any:
+def cast_like(value: float, like: float) -> float:
     """Return `value` in the floating-point type of `like`; in compiled code it costs nothing.
 
     A literal is float64 to the compiler and would pull single-precision arithmetic up with it.
     """
-    return np.asarray(like).dtype.type(value)
+    cast: float = np.asarray(like).dtype.type(value)
+    return cast
 
 
 @specialise(cast_like)

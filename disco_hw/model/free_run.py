@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.effects import command_delay
+from disco_hw.effects.registry import DELAY
 from disco_hw.jit import compiled_for, kernel_function
+from disco_hw.model.compose import delay_steps, in_force
 from disco_hw.model.model import Model, coefficient_tables
 from disco_hw.model.step import axle_of, integration_from, integration_series, step, tracked_of
 from disco_hw.model.tables import base_point, effect_point
@@ -24,7 +25,7 @@ class FreeRun:
     def __init__(self, model: Model, theta: Array, step_s: float) -> None:
         self._base, self._effects = coefficient_tables(model, theta, step_s)
         self._series = integration_series(step_s, wide=True)
-        delay = self._effects.command_delay
+        delay = getattr(self._effects, DELAY.name)
         self._run: Callable[..., None] | None = None
         self.past_rows = 0 if delay is None else int(delay[0].max()) + 1
 
@@ -56,11 +57,11 @@ def run_states(
     wheel_left, wheel_right = states[0, 3], states[0, 4]
     cos_yaw, sin_yaw = math.cos(yaw), math.sin(yaw)
     axle_x, axle_y = axle_of(x, y, cos_yaw, sin_yaw, here)
-    late = history - command_delay.whole_steps(acting.command_delay)
+    late = history - delay_steps(acting)
     for t in range(states.shape[0] - 1):
         recent, older = max(t + late, 0), max(t + late - 1, 0)
-        left = command_delay.blend(commands[recent, 0], commands[older, 0], acting.command_delay)
-        right = command_delay.blend(commands[recent, 1], commands[older, 1], acting.command_delay)
+        left = in_force(commands[recent, 0], commands[older, 0], acting)
+        right = in_force(commands[recent, 1], commands[older, 1], acting)
         axle_x, axle_y, cos_yaw, sin_yaw, wheel_left, wheel_right, _, turn = step(
             axle_x, axle_y, cos_yaw, sin_yaw, wheel_left, wheel_right, left, right,
             time_s + t * integration.step_s, here, acting, integration,

@@ -1,7 +1,7 @@
 """The transition function f_theta: one step of the skid-steer robot with the effects its model has.
 
 Compiled scalar functions, generic in precision. An effect that is absent is None; the compiler sees that in the type of
-its argument and leaves nothing of it in the machine code. The same in numpy, for reading: `disco_hw.model.reference`.
+its argument and leaves nothing of it in the machine code. The same in numpy, for reading: `disco_hw.model.plain`.
 
     v = r (w_R + w_L) / 2        omega = r (w_R - w_L) / a        v_lateral = -omega x_icr
     x' = v cos(yaw) - v_lateral sin(yaw)      y' = v sin(yaw) + v_lateral cos(yaw)      yaw' = omega

@@ -28,13 +28,10 @@ def entry(table: Any, i: int) -> Any:
 def _entry(table: Any, i: Any) -> Callable[..., Any] | None:
     if isinstance(table, types.NoneType):
         return lambda table, i: None
-    picks: dict[int, Callable[..., Any]] = {
-        1: lambda table, i: (table[0][i],),
-        2: lambda table, i: (table[0][i], table[1][i]),
-        3: lambda table, i: (table[0][i], table[1][i], table[2][i]),
-        4: lambda table, i: (table[0][i], table[1][i], table[2][i], table[3][i]),
-    }
-    return picks[len(table)]
+    # A tuple can only be looked up at constant places in compiled code, so they are written out.
+    places = "".join(f"table[{place}][i], " for place in range(len(table)))
+    pick: Callable[..., Any] = eval(f"lambda table, i: ({places})")
+    return pick
 
 
 def effect_point(effects: Any, i: int) -> Any:

@@ -105,17 +105,21 @@ def term_name(target: str, feature: str) -> str:
     return f"{target} += k {feature}"
 
 
+def _nothing_plain() -> None:
+    """`disco_hw.model.plain` has the features itself."""
+
+
+def _coefficients(values: Array, base: Array, step_s: float) -> tuple[Array, ...]:
+    """k and steps a second, each (L,)."""
+    return values[:, 0], np.full(values.shape[0], 1.0 / step_s)
+
+
 @dataclass(frozen=True, slots=True)
 class GenericTerm:
-    """A term as an effect of a model: `target` of `COMMAND` and `BODY_TARGETS` gains k times the feature."""
+    """A term: `target` of `COMMAND` and `BODY_TARGETS` gains k times the feature."""
 
     target: str
     feature: str
-    moves: bool = True
-    stage: Stage = Stage.ELSEWHERE
-    order: int = 0
-    excitation: str = "the drive in which it was found"
-    script: str = "excite"
 
     @property
     def name(self) -> str:
@@ -123,23 +127,20 @@ class GenericTerm:
         return term_name(self.target, self.feature)
 
     @property
-    def channel(self) -> Channel:
-        """Where it acts."""
-        return Channel.COMMAND_TO_WHEEL if self.target == COMMAND else Channel.WHEEL_TO_BODY
-
-    @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        """The number k, in SI units."""
-        return (Parameter("k", "SI", -np.inf, np.inf, 0.0),)
-
-    @property
-    def sentence(self) -> str:
-        """Its equation with the number."""
-        return f"{self.target} += {{k:.4g}} {self.feature}"
-
-    def coefficients(self, values: Array, base: Array, step_s: float) -> tuple[Array, ...]:
-        """k and steps a second, each (L,)."""
-        return values[:, 0], np.full(values.shape[0], 1.0 / step_s)
+    def effect(self) -> Effect:
+        """The term as an effect of a model; k is in SI units."""
+        return Effect(
+            name=self.name,
+            channel=Channel.COMMAND_TO_WHEEL if self.target == COMMAND else Channel.WHEEL_TO_BODY,
+            stage=Stage.TERMS,
+            parameters=(Parameter("k", "SI", -np.inf, np.inf, 0.0),),
+            plain=_nothing_plain,
+            coefficients=_coefficients,
+            may_turn_more=self.target == "omega",
+            excitation="the drive in which it was found",
+            script="excite",
+            sentence=f"{self.target} += {{k:.4g}} {self.feature}",
+        )
 
     def rescaled(self, radius_ratio: float, axial_ratio: float) -> float:
         """Factor of k if the speeds in it are to be those of other wheels, with `new / old` radius and axial distance.
@@ -166,9 +167,12 @@ TERMS: Mapping[str, GenericTerm] = MappingProxyType(
 )
 
 
+_TERM_EFFECTS: Mapping[str, Effect] = MappingProxyType({name: term.effect for name, term in TERMS.items()})
+
+
 def effect_of(name: str) -> Effect:
     """A named effect or a term; raises KeyError for what is neither."""
-    return REGISTRY[name] if name in REGISTRY else TERMS[name]
+    return REGISTRY[name] if name in REGISTRY else _TERM_EFFECTS[name]
 
 
 def _entry_type(name: str) -> Any:

@@ -6,9 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.control.parameter_points import unscented_points
+from disco_hw.effects.registry import DELAY
 from disco_hw.log.records import Plan
 from disco_hw.model import Model
-from disco_hw.model.reference import State, delayed, step, theta_of
+from disco_hw.model.plain import State, delayed, step, theta_of
 
 Array = NDArray[np.float64]
 
@@ -34,7 +35,7 @@ class ParameterPoints:
 
     def _delay_groups(self) -> list[Array]:
         """Points that can be stepped together: a delay shifts whole rows of commands."""
-        if "command_delay.delay_s" not in self._names:
+        if DELAY.columns[0] not in self._names:
             return [self._points]
         return [point[None] for point in self._points]
 

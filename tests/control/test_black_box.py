@@ -14,7 +14,7 @@ from disco_hw.control.parameter_points import drawn_points, unscented_points
 from disco_hw.control.pendulum import PAPER_SAMPLER
 from disco_hw.control.torch_models import circle_cost, pendulum_cost, pendulum_transition, skid_steer_transition
 from disco_hw.model import load_model
-from disco_hw.model import reference as physics
+from disco_hw.model import plain as physics
 
 MODEL = load_model(Path(__file__).parents[2] / "disco_hw/robots/wombot_model.toml")
 POINTS, WEIGHTS = unscented_points(MODEL, 1.0)

@@ -8,7 +8,7 @@ import pytest
 from disco_hw.control import Circle, oracle, pendulum
 from disco_hw.control.tasks.path import Path
 from disco_hw.control.tasks.timed_path import TimedPath
-from disco_hw.model.reference import State
+from disco_hw.model.plain import State
 from disco_hw.waypoints import Waypoints
 
 THETA = {"wheel_radius_m": 0.1, "axial_distance_m": 0.5, "x_icr_m": 0.0}

@@ -5,7 +5,7 @@ import torch
 
 from disco_hw.control import Circle, pendulum
 from disco_hw.control.torch_models import circle_cost, pendulum_cost, pendulum_transition, skid_steer_transition
-from disco_hw.model import reference as physics
+from disco_hw.model import plain as physics
 
 RNG = np.random.default_rng(4)
 

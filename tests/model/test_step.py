@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from disco_hw.model import Model, reference
+from disco_hw.model import Model, plain
 from disco_hw.model.free_run import FreeRun
 
 
@@ -52,9 +52,9 @@ def test_euler_steps_converge_to_it():
 def test_fast_turns_of_several_radians_a_step_stay_exact():
     model = Model(0.5, 0.1, 0.0)
     states = run(model, (0.0, 0.0, 0.0, 0.0, 0.0), [(-4.0, 4.0), (-8.0, 7.0)] * 5)
-    theta = reference.theta_of(model.parameter_names, model.point())
-    state = reference.State(0.0, 0.0, 0.0, 0.0, 0.0)
+    theta = plain.theta_of(model.parameter_names, model.point())
+    state = plain.State(0.0, 0.0, 0.0, 0.0, 0.0)
     for left, right in [(-4.0, 4.0), (-8.0, 7.0)] * 5:
-        state, _, _ = reference.step(theta, state, left, right, 0.1)
+        state, _, _ = plain.step(theta, state, left, right, 0.1)
     assert abs(state.yaw) > 30.0
     np.testing.assert_allclose(states[-1, :3], [state.x, state.y, state.yaw], atol=1e-6)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from disco_hw.model import EffectSetting, Gaussian, Model, load_model, reference, save_model
+from disco_hw.model import EffectSetting, Gaussian, Model, load_model, plain, save_model
 from disco_hw.model.free_run import FreeRun
 from disco_hw.model.terms import BODY_FEATURES, COMMAND_FEATURES, TERMS
 
@@ -19,10 +19,10 @@ def compiled(effects, time_s=60.0):
 
 def by_reference(effects, time_s=60.0):
     model = Model(*BASE, effects=effects)
-    theta = reference.theta_of(model.parameter_names, model.point())
-    states = [reference.State(0.0, 0.0, 0.0, 0.0, 0.0)]
+    theta = plain.theta_of(model.parameter_names, model.point())
+    states = [plain.State(0.0, 0.0, 0.0, 0.0, 0.0)]
     for t, (left, right) in enumerate(DRIVE):
-        states.append(reference.step(theta, states[-1], left, right, STEP_S, time_s + t * STEP_S)[0])
+        states.append(plain.step(theta, states[-1], left, right, STEP_S, time_s + t * STEP_S)[0])
     return np.array([[s.x, s.y, s.yaw, s.wheel_left, s.wheel_right] for s in states])
 
 

@@ -7,7 +7,7 @@ import torch
 from disco_hw.control import Circle, DiscoSettings, PlannerState, oracle
 from disco_hw.control.parameter_points import unscented_points
 from disco_hw.model import load_model
-from disco_hw.model import reference as physics
+from disco_hw.model import plain as physics
 from tools.bench_control import ROBOTS, beside_peer, torch_times_ms
 from tools.step_times import summary, times_ms, undisturbed
 

@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 from disco_hw.control.kernel.blocks import BLOCK, U
 from disco_hw.control.kernel.rollout import roll_block
 from disco_hw.control.tasks.terms import follow, has_memory, looks_up, row_of, stage_cost, table_of, terminal_cost
-from disco_hw.effects import command_delay
 from disco_hw.jit import (
     bits_of_float,
     block_function,
@@ -22,7 +21,7 @@ from disco_hw.jit import (
     specialise,
     tune_loops,
 )
-from disco_hw.model.compose import needs_change, wheels_follow
+from disco_hw.model.compose import delay_steps, in_force, needs_change, wheels_follow
 from disco_hw.model.step import axle_of, body_step, integration_from, tracked_of, wheel_step
 from disco_hw.model.tables import base_point, effect_point, lane_base, lane_effects
 
@@ -84,8 +83,8 @@ def _turn_wheels(
         row, change_row = U(t) * _WHEEL_STRIDE, U(2 * horizon + t) * BLOCK
         for b in range(BLOCK):
             acting = lane_effects(effects, at + b)
-            left = command_delay.blend(commands[recent + b], commands[older + b], acting.command_delay)
-            right = command_delay.blend(commands[recent + BLOCK + b], commands[older + BLOCK + b], acting.command_delay)
+            left = in_force(commands[recent + b], commands[older + b], acting)
+            right = in_force(commands[recent + BLOCK + b], commands[older + BLOCK + b], acting)
             was_left, was_right = state[_LEFT + b], state[_RIGHT + b]
             end_left, end_right, mean_left, mean_right = wheel_step(left, right, was_left, was_right, time_s, acting)
             state[_LEFT + b] = end_left
@@ -368,7 +367,7 @@ def _roll_points(
     for i in range(points):
         at = U(i * padded) + lane
         here, acting = base_point(system.base, i), effect_point(system.effects, i)
-        late = system.history - command_delay.whole_steps(acting.command_delay)
+        late = system.history - delay_steps(acting)
         if each is not None:
             if needs_change(acting) or not wheels_follow(acting):
                 _turn_wheels(wheels, at, horizon, commands, state, start, system.effects, late, integration.step_s)

@@ -17,7 +17,7 @@ from disco_hw.control.tasks.path import Path
 from disco_hw.control.tasks.timed_path import TimedPath
 from disco_hw.effects.registry import MOTION_EFFECTS
 from disco_hw.model import EffectSetting, Gaussian, Model
-from disco_hw.model import reference as physics
+from disco_hw.model import plain as physics
 from disco_hw.waypoints import Waypoints
 
 SAMPLES, HORIZON, STEP_S = 160, 50, 0.1

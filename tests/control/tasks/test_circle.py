@@ -13,7 +13,7 @@ from disco_hw.control.plan import PlannerState
 from disco_hw.control.settings import CommandLimits, DiscoSettings
 from disco_hw.experiments.plant import Plant
 from disco_hw.model import load_model
-from disco_hw.model import reference as physics
+from disco_hw.model import plain as physics
 
 MODEL = load_model(Path(__file__).parents[3] / "disco_hw/robots/wombot_model.toml")
 MEAN = {"wheel_radius_m": 0.061, "axial_distance_m": 0.415, "x_icr_m": 0.238}
