@@ -27,6 +27,7 @@ from disco_hw.runtime.preflight import (
     check_task,
 )
 from disco_hw.runtime.robot_setup import Setup, link_key, load_setup
+from disco_hw.runtime.situation import connection
 from drivers import words
 from drivers.types import (
     Capabilities,
@@ -145,7 +146,8 @@ def _link_check(transport: Transport) -> Check:
     deadline = time.monotonic() + _LINK_TIMEOUT_S
     while transport.state is not LinkState.UP:
         if time.monotonic() > deadline:
-            return Check("link", Level.FAIL, f"{transport.name}: {transport.last_error or 'did not come up'}")
+            said = connection(transport.state, transport.last_error, DriverState.DISCONNECTED, "")
+            return Check("link", Level.FAIL, said)
         time.sleep(_STEP_S)
     return Check("link", Level.OK, transport.name)
 
@@ -173,7 +175,7 @@ def _ask_robot(transport: Transport, key: bytes | None) -> _Found:
     stats = driver.stats
     return _Found(
         state=driver.state,
-        detail=driver.detail,
+        detail=connection(transport.state, transport.last_error, driver.state, driver.detail),
         capabilities=driver.capabilities,
         clock_synchronised=driver.clock_offset_ns is not None,
         wheel_samples=wheels,

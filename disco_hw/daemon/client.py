@@ -12,6 +12,7 @@ from disco_hw.config import RobotConfig, load_robot_config
 from disco_hw.daemon.control_client import send_request
 from disco_hw.daemon.socket_place import default_socket_path, passed_over
 from disco_hw.errors import InputError, WorkError
+from disco_hw.runtime.situation import advice, by_command, status_headline
 from drivers import words
 
 ADAPT_ACTIONS = ("revert", "adapt")
@@ -73,15 +74,16 @@ def progress(task: Mapping[str, Any]) -> tuple[str, str]:
     return "progress", f"{task['laps'] * task['length_m']:.2f} of {task['length_m']:.2f} m ({task['laps']:.0%})"
 
 
-def in_words(reply: dict[str, Any]) -> str:
-    """A reply for a person."""
+def in_words(reply: dict[str, Any], robot: Path) -> str:
+    """A reply of the daemon of `robot` for a person."""
     if not reply.get("ok"):
         return f"refused: {reply.get('error')}"
     if reply.get("do") != "status":
         return str(reply.get("text", "done"))
     task, loop = reply["task"], reply["loop"]
     lines = [
-        f"{reply['state']}: {reply['detail']}",
+        ": ".join(status_headline(reply)),
+        *(f"next: {sentence}" for sentence in advice(reply, by_command(robot))),
         f"robot {reply['robot_state']}, link {reply['link']}, fault {words.fault(reply['fault'])}",
         f"{' '.join(progress(task))}, distance {task['distance_m'] * 1e3:.0f} mm, speed {task['speed_m_s']:.3f} m/s",
         f"loop lateness p99 {loop['lateness_us']['p99']:.0f} us, max {loop['lateness_us']['max']:.0f} us, "

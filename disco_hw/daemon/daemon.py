@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import json
+import sys
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
@@ -13,9 +15,11 @@ from typing import Any
 
 from disco_hw.adaptation.adaptable import check_adaptable
 from disco_hw.adaptation.link import ProcessLink
+from disco_hw.config import RobotConfig
 from disco_hw.daemon import realtime
 from disco_hw.daemon.client import ADAPT_ACTIONS, PAGE_ACTIONS, SERVED, socket_path
 from disco_hw.daemon.clock import Clock, MonotonicClock
+from disco_hw.daemon.compile_progress import compile_progress
 from disco_hw.daemon.control_socket import ControlMessage, ControlServer
 from disco_hw.daemon.link import make_link
 from disco_hw.daemon.loop import Loop
@@ -25,6 +29,7 @@ from disco_hw.daemon.socket_place import passed_over
 from disco_hw.daemon.status import counters, loop_figures, status
 from disco_hw.daemon.systemd import Notifier
 from disco_hw.daemon.teller import STANDARD_OUTPUT, Teller
+from disco_hw.daemon.waiting import Waiting
 from disco_hw.daemon.warm_up import warm_up
 from disco_hw.log import records
 from disco_hw.log.link import Attachment
@@ -32,16 +37,17 @@ from disco_hw.log.provenance import DBC, version
 from disco_hw.log.recorder import NullRecorder, ProcessRecorder, Recorder, Recording
 from disco_hw.runtime import records_of_tick
 from disco_hw.runtime.assembly import assemble_core, make_adaptation, make_driver, make_pipeline, make_planner
-from disco_hw.runtime.core import DaemonCore
+from disco_hw.runtime.core import CoreTick, DaemonCore
 from disco_hw.runtime.log_setup import kept_files
 from disco_hw.runtime.pilot import Pilot, TaskPilot
-from disco_hw.runtime.pipeline import NoPlanner, Planner
+from disco_hw.runtime.pipeline import NoPlanner, Pipeline, Planner
 from disco_hw.runtime.robot_setup import Setup, link_key, load_setup, refuse_missing_effects
+from disco_hw.runtime.situation import Ask, advice, by_command, headline
 from disco_hw.runtime.states import State
 from disco_hw.runtime.stop_path import StopPath
 from disco_hw.runtime.supervisor import Reply, UserRequest
 from disco_hw.runtime.task_change import TaskRefused, changed_task, in_words
-from drivers.types import Request
+from drivers.types import Request, Transport
 from firmware_protocol.dbc import packaged_dbc
 
 _SECOND_NS = 1_000_000_000
@@ -80,7 +86,13 @@ def run_daemon(options: DaemonOptions) -> int:
         check_adaptable(setup.model, setup.config.control.uncertainty)
     with closing(Teller(STANDARD_OUTPUT, in_json if options.as_json else in_text)) as say:
         return serve(
-            setup, options.log_file, say, TaskPilot(), lambda: make_planner(setup.config, setup.model), options.adapt
+            setup,
+            options.log_file,
+            say,
+            TaskPilot(),
+            lambda: make_planner(setup.config, setup.model),
+            options.adapt,
+            by_command(options.robot),
         )
 
 
@@ -91,17 +103,25 @@ def serve(
     pilot: Pilot,
     new_planner: Callable[[], Planner] = NoPlanner,
     adapt: bool = False,
+    ask: Ask | None = None,
 ) -> int:
     """Run until SIGTERM, SIGINT, a quit request or the pilot's end, as `run_daemon`; returns the exit code.
 
     `say` is called in the loop, and so must not wait. `pilot` decides what the robot does while motion is allowed;
     `new_planner` is called twice, as one planner is used up in the warm-up. `adapt`: learn the geometry on the way, in
-    a process of its own. Raises InputError.
+    a process of its own. `ask`: how a person asks for what comes next; with it the daemon says what it waits for, what
+    to do, and where the log is. Raises InputError.
     """
+    key, transport = link_key(setup), make_link(setup)
+    # Before the signals are caught: whoever has enough of a compilation may break it off, as nothing is open yet.
+    with compile_progress(_compiled(setup), _progress):
+        planner = new_planner()
+        warm_up(make_pipeline(setup.config, setup.model, new_planner()))
+    pipeline = make_pipeline(setup.config, setup.model, planner)
     stop = StopPath()
     with StopSignals() as signals:
         try:
-            return _start(setup, log_file, signals, stop, say, pilot, new_planner, adapt).run()
+            return _start(setup, key, transport, pipeline, log_file, signals, stop, say, pilot, adapt, ask).run()
         finally:
             # Whatever is interrupted here, the wheels come first: they were added last.
             for outcome in stop.run():
@@ -111,42 +131,47 @@ def serve(
 
 def _start(
     setup: Setup,
+    key: bytes | None,
+    transport: Transport,
+    pipeline: Pipeline,
     log_file: Path | None,
     signals: StopSignals,
     stop: StopPath,
     say: Say,
     pilot: Pilot,
-    new_planner: Callable[[], Planner],
     adapt: bool,
+    ask: Ask | None,
 ) -> Daemon:
     """Make everything, in the order that real time needs, and add to the stop path what must be undone."""
     config = setup.config
-    key, transport = link_key(setup), make_link(setup)
-    planner = new_planner()
-    warm_up(make_pipeline(config, setup.model, new_planner()))
-    pipeline = make_pipeline(config, setup.model, planner)
     # The planner was compiled before: whoever finds the socket gets an answer.
     server = ControlServer(socket_path(config), SERVED)
-    for line in passed_over(server.path):
-        say("control socket", line)
     stop.add("control socket", server.close)
     feed = ViewerFeed(feed_path(server.path))
     stop.add("page feed", feed.close)
-    recorder = WatchedRecorder(_make_recorder(setup, log_file), feed)
+    log = _log_path(config, log_file)
+    recorder = WatchedRecorder(_make_recorder(setup, log), feed)
+    if ask is not None and log is not None:
+        stop.add("log", lambda: say("log", f"look at it: disco-hw view {log}, or disco-hw log info {log}"))
     stop.add("recorder", lambda: _close_recorder(recorder, say))
     adaptation = make_adaptation(setup, pipeline, ProcessLink()) if adapt else None
     if adaptation is not None:
         stop.add("adapter", adaptation.close)
     for step in realtime.enter(config.daemon.realtime_priority):
         say("real time", str(step))
+    for line in passed_over(server.path):
+        say("control socket", line)
     transport.open()
     stop.add("link", transport.close)
     core = assemble_core(config, transport, make_driver(key), pipeline, recorder, pilot.needs_pose, adaptation)
-    daemon = Daemon(core, server, recorder, MonotonicClock(), signals, say, pilot)
+    daemon = Daemon(core, server, recorder, MonotonicClock(), signals, say, pilot, ask)
     stop.add("wheels", daemon.stop_wheels)
     if config.daemon.realtime_priority:
         say("real time", str(realtime.raise_loop_thread(config.daemon.realtime_priority)))
     say("daemon", f"{transport.name}, control socket {server.path}")
+    if ask is not None:
+        say("log", f"recording to {log}" if log is not None else "nothing is recorded, as log.enabled is false")
+        say("next", f"once it says READY, {ask('arm')}, then {ask('start')}")
     return daemon
 
 
@@ -162,7 +187,10 @@ class Daemon:
         signals: StopSignals,
         say: Say,
         pilot: Pilot,
+        ask: Ask | None = None,
     ) -> None:
+        self._ask = ask
+        self._waiting = Waiting()
         self._core = core
         self._server = server
         self._recorder = recorder
@@ -308,9 +336,27 @@ class Daemon:
         self._loop_figures = loop_figures(self._loop.stats)
         last = self._core.last
         if last is not None:
-            self._notifier.status(f"{last.output.state.name}: {last.output.detail}")
+            self._tell_state(last)
         stolen_ms = realtime.stolen_ms() - self._stolen_before_ms
         return (counters(self._core, self._loop.stats, self._recorder_stats, now_ns, stolen_ms),)
+
+    def _tell_state(self, last: CoreTick) -> None:
+        """Say how things are and what to do, to the service manager and to whoever reads the output."""
+        output, robot = last.output, self._core.robot_status
+        head, detail = headline(output.state.name, output.detail, output.running, output.estop)
+        self._notifier.status(f"{head}: {detail}")
+        if self._ask is None:
+            return
+        known = {
+            "state": output.state.name,
+            "running": output.running,
+            "estop": output.estop,
+            "robot_state": "UNKNOWN" if robot is None else robot.state,
+            "fault": "UNKNOWN" if robot is None else robot.fault,
+        }
+        words = " ".join((f"{head}: {detail}.", *advice(known, self._ask)))
+        if self._waiting.is_worth_saying(output.state, words):
+            self._say("state", words)
 
     def _steer(self, now_ns: int, message: ControlMessage) -> None:
         """Hand what a page wants to the pilot; the reply's stamp is what its next request must carry."""
@@ -356,15 +402,32 @@ class Daemon:
 _REQUESTS = frozenset(request.value for request in UserRequest)
 
 
-def _make_recorder(setup: Setup, log_file: Path | None) -> Recorder:
-    config = setup.config
-    if log_file is None and not config.log.enabled:
+def _compiled(setup: Setup) -> str:
+    """What the planner is compiled for, in words."""
+    effects = ", ".join(effect.name for effect in setup.model.effects)
+    return f"the planner for this task{f' and a model with {effects}' if effects else ''}"
+
+
+def _progress(text: str) -> None:
+    """Write a line to standard error at once; for the time before the loop, when waiting harms nobody."""
+    with contextlib.suppress(OSError):
+        print(text, file=sys.stderr, flush=True)
+
+
+def _log_path(config: RobotConfig, log_file: Path | None) -> Path | None:
+    """Where is recorded to; None if nothing is."""
+    if log_file is not None or not config.log.enabled:
+        return log_file
+    stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
+    return Path(config.log.directory) / f"{config.robot.name}-{stamp}.mcap"
+
+
+def _make_recorder(setup: Setup, log: Path | None) -> Recorder:
+    if log is None:
         return NullRecorder()
-    if log_file is None:
-        stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
-        log_file = Path(config.log.directory) / f"{config.robot.name}-{stamp}.mcap"
     attachments = [*kept_files(setup), Attachment(DBC, "text/plain", packaged_dbc().encode())]
-    return ProcessRecorder(Recording(log_file, config.robot.name, version=version(), attachments=tuple(attachments)))
+    name = setup.config.robot.name
+    return ProcessRecorder(Recording(log, name, version=version(), attachments=tuple(attachments)))
 
 
 def _close_recorder(recorder: Recorder, say: Say) -> None:

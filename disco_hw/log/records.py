@@ -129,12 +129,17 @@ class LoopTiming(msgspec.Struct, frozen=True, gc=False):
 
 
 class DaemonState(msgspec.Struct, frozen=True, gc=False):
-    """A change of the daemon's state, and why."""
+    """A change of the daemon's state or of what it says of it, which is `reason`; `previous` is then the same state.
+
+    `running`: the task; `estop`: to be shown as such.
+    """
 
     t_ns: int
     state: str
     previous: str
     reason: str = ""
+    running: bool = False
+    estop: bool = False
 
 
 class Event(msgspec.Struct, frozen=True, gc=False):

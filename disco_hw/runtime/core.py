@@ -89,6 +89,7 @@ class DaemonCore:
         self._link_up = False
         self._planner_failing = self._planner_collapsed = False
         self._state = supervisor.state
+        self._said: tuple[str, bool, bool] | None = None
         self.entered: dict[str, int] = {}
         self._task_changed = False
 
@@ -176,6 +177,7 @@ class DaemonCore:
         return Inputs(
             link_state=self.transport.state,
             link_generation=self.transport.generation,
+            link_error=self.transport.last_error,
             driver_state=self.driver.state,
             driver_detail=self.driver.detail,
             telemetry_age_s=None if wheels is None else (now_ns - wheels.t_ns) * 1e-9,
@@ -219,12 +221,14 @@ class DaemonCore:
         return tuple(told)
 
     def _state_change(self, now_ns: int, output: Output) -> list[records.Record]:
-        """The record of a change of state, in the tick in which it happens."""
+        """The record of a change of state or of what is said of it, in the tick in which it happens."""
         before, self._state = self._state, output.state
-        if output.state is before:
+        said, self._said = self._said, (output.detail, output.running, output.estop)
+        if output.state is before and self._said == said:
             return []
-        self.entered[output.state.value] = self.entered.get(output.state.value, 0) + 1
-        return [records.DaemonState(now_ns, output.state.name, before.name, output.detail)]
+        if output.state is not before:
+            self.entered[output.state.value] = self.entered.get(output.state.value, 0) + 1
+        return [records.DaemonState(now_ns, output.state.name, before.name, *self._said)]
 
     def _task_change(self, now_ns: int) -> list[records.Record]:
         """The record of another task, in the first tick that it holds for."""

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import msgspec
 
+from disco_hw.runtime.situation import connection
 from disco_hw.runtime.states import PROBLEM, Condition, State, Transition, next_transition
 from drivers.types import DriverState, LinkState, Request
 
@@ -64,8 +65,9 @@ class Inputs(msgspec.Struct, frozen=True, gc=False):
     """Everything the supervisor looks at in one tick.
 
     `telemetry_age_s` is the age of the newest wheel sample, None before the first; `wheel_speed_rad_s` the larger
-    magnitude of its two speeds. `preflight_errors` and `daemon_error` are sentences for a person and hold for as long
-    as they are given. `task_finished`: nothing of the task is left to drive.
+    magnitude of its two speeds. `link_error` is the link's newest error, with its remedy. `preflight_errors` and
+    `daemon_error` are sentences for a person and hold for as long as they are given. `task_finished`: nothing of the
+    task is left to drive.
     """
 
     link_state: LinkState
@@ -75,6 +77,7 @@ class Inputs(msgspec.Struct, frozen=True, gc=False):
     telemetry_age_s: float | None
     wheel_speed_rad_s: float
     pose_ok: bool
+    link_error: str | None = None
     preflight_errors: tuple[str, ...] = ()
     daemon_error: str | None = None
     requests: tuple[UserRequest, ...] = ()
@@ -315,13 +318,12 @@ class Supervisor:
         """Return what a person should know of the present state."""
         if inputs.daemon_error is not None:
             return inputs.daemon_error
-        if inputs.link_state is not LinkState.UP:
-            return f"the link is {inputs.link_state.value}"
-        if self._state is State.FAULT and inputs.preflight_errors:
-            return "; ".join(inputs.preflight_errors)
-        if self._state is State.FAULT and self._estop_asked:
-            return "e-stop requested here"
-        return inputs.driver_detail
+        if inputs.link_state is LinkState.UP and self._state is State.FAULT:
+            if inputs.preflight_errors:
+                return "; ".join(inputs.preflight_errors)
+            if self._estop_asked:
+                return "e-stop requested here"
+        return connection(inputs.link_state, inputs.link_error, inputs.driver_state, inputs.driver_detail)
 
     def _detail(self, inputs: Inputs, seen: int) -> str:
         match self._state:

@@ -116,7 +116,7 @@ def ctl(
     from disco_hw.daemon.client import ask, in_words
 
     reply = ask(robot, do, changes or ())
-    print_result(reply, as_json, in_words(reply))
+    print_result(reply, as_json, in_words(reply, robot))
     if not reply.get("ok", False):
         raise typer.Exit(1)
 

@@ -22,7 +22,7 @@ from disco_hw.daemon.control_client import send_request
 from disco_hw.daemon.emergency import stop_robot
 from disco_hw.daemon.socket_place import connect
 from disco_hw.errors import InputError, WorkError
-from disco_hw.viewer.advice import advice, next_step
+from disco_hw.runtime.situation import advice, is_estop, next_step, status_headline
 
 REQUESTS = ("arm", "start", "stop", "disarm", "reset", "task")
 STATUS_S = 0.25
@@ -170,13 +170,15 @@ def shown(status: Mapping[str, Any] | None, error: str) -> dict[str, Any]:
         why = error or str((status or {}).get("error") or "the daemon has not started its loop yet")
         return {"kind": "status", "ok": False, "state": "NO DAEMON", "detail": why}
     drive = status.get("drive")
+    head, detail = status_headline(status)
     return {
         "kind": "status",
         "ok": True,
         "state": status["state"],
-        "detail": "driven by hand" if drive is not None and drive["driving"] else status["detail"],
+        "head": head,
+        "detail": detail,
         "running": status["running"],
-        "estop": status["estop"] or status["robot_state"] == "ESTOP",
+        "estop": is_estop(status),
         "advice": advice(status),
         "next": next_step(status),
         "task": {"asked": status["task"]["asked"], "limits": status["task"]["limits"]},

@@ -12,7 +12,8 @@ import numpy as np
 from disco_hw.config import RobotTask
 from disco_hw.course import course_of
 from disco_hw.daemon.client import progress
-from disco_hw.viewer.advice import fault_sentence, in_words
+from disco_hw.runtime.pipeline import Source
+from disco_hw.runtime.situation import fault_sentence, headline, in_words
 from disco_hw.viewer.snapshot import Snapshot
 
 _NO_NUMBER = "—"
@@ -65,10 +66,13 @@ def _status_rows(status: Mapping[str, Any]) -> Rows:
 def replay_text(snapshot: Snapshot, first_ns: int, task: RobotTask) -> str:
     """Markdown for one instant of a log."""
     state, status = snapshot.state, snapshot.status
-    head = state.state if state is not None else (status.state if status is not None else "state not recorded")
+    head, detail = status.state if status is not None else "state not recorded", ""
+    if state is not None:
+        by_hand = snapshot.in_force and snapshot.source == Source.MANUAL.value
+        head, detail = headline(state.state, state.reason, state.running, state.estop, by_hand)
     lines = [f"### {head}", ""]
-    if state is not None and state.reason:
-        lines += [escaped(state.reason), ""]
+    if detail:
+        lines += [escaped(detail), ""]
     if status is not None and status.fault != "NONE":
         lines += [f"**{escaped(fault_sentence(status.fault))}**", ""]
     rows: Rows = [("time", f"{(snapshot.t_ns - first_ns) * 1e-9:.3f} s")]

@@ -10,12 +10,14 @@ from numpy.typing import NDArray
 from disco_hw.errors import InputError
 from disco_hw.log.reader import Log
 from disco_hw.log.records import TOPICS, FrameIn, FrameOut, Plan
+from disco_hw.runtime.pipeline import Source
 from disco_hw.viewer.snapshot import PLAN_AGE_NS, Snapshot, snapshot_at
 from disco_hw.viewer.stage import Stage, stage_of_log
 from disco_hw.viewer.timeline import Timeline
 from drivers.types import MotorSample
 
 _UNSEEN = (FrameIn, FrameOut, MotorSample)
+_DRIVING = frozenset({Source.PLAN.value, Source.MANUAL.value})
 _SHOWN = tuple(topic.name for topic in TOPICS if topic.record not in _UNSEEN)
 
 
@@ -55,6 +57,12 @@ class Recording:
     def duration_s(self) -> float:
         """From the first tick to the last."""
         return float(self.ticks[-1] - self.ticks[0]) * 1e-9
+
+    @property
+    def task_start_s(self) -> float:
+        """Seconds from the first tick to the first that drives: by the task's plan, or by hand; 0 if none does."""
+        driven = (t_ns for t_ns, source in self.timeline.source if source in _DRIVING)
+        return (next(driven, self.first_ns) - self.first_ns) * 1e-9
 
     def at(self, t_s: float) -> Snapshot:
         """The instant of the last tick at or before `t_s` seconds from the first; the ends beyond them."""

@@ -27,13 +27,13 @@ _NO_MARK = "go to ..."
 
 
 class ReplayPage:
-    """Everything on the replay page; `t_s` is where it is, in seconds from the log's first tick.
+    """Everything on the replay page, which opens where the task starts; `t_s`: where it is, from the first tick.
 
     The buttons' callbacks run in threads of the page's server and only note what is asked; `step` acts on it.
     """
 
     def __init__(self, server: viser.ViserServer, recording: Recording) -> None:
-        self.t_s = 0.0
+        self.t_s = recording.task_start_s
         self.playing = False
         self._recording = recording
         self._speed = 1.0
@@ -105,7 +105,7 @@ class ReplayPage:
     def _add_controls(self, gui: viser.GuiApi) -> None:
         duration_s = max(self._recording.duration_s, 0.001)
         shown = [round(self._seconds(mark), 3) for mark in _spread(self._marks, _SLIDER_MARKS)]
-        self._slider = gui.add_slider("Time (s)", 0.0, duration_s, 0.001, 0.0, marks=tuple(shown))
+        self._slider = gui.add_slider("Time (s)", 0.0, duration_s, 0.001, round(self.t_s, 3), marks=tuple(shown))
         self._play_button = gui.add_button("Play")
         steps = gui.add_button_group("Step", ("-10", "-1", "+1", "+10"))
         speed = gui.add_dropdown("Speed", tuple(SPEEDS), initial_value="1")

@@ -33,6 +33,7 @@ class RobotInTime:
         self.robot = ReferenceRobot(replace(CONFIG, key=key))
         self._now_ns = time.monotonic_ns()
         self.stats, self.send = self.link.stats, self.link.send
+        self.state, self.last_error = self.link.state, None
         self.disturb = None
 
     def receive(self):

@@ -2,9 +2,11 @@
 
 import pytest
 
+from disco_hw.daemon import link
 from disco_hw.daemon.check import run_check
 from disco_hw.daemon.daemon import DaemonOptions, run_daemon
 from disco_hw.errors import InputError
+from disco_hw.runtime.robot_setup import load_setup
 
 ROBOT = """
 [robot]
@@ -19,17 +21,32 @@ max_wheel_speed_rad_s = 8.0
 
 
 @pytest.mark.parametrize(
-    ("link", "words"),
+    ("section", "words"),
     [
         ('interface = "sockercan"', 'link.interface: python-can has no interface "sockercan"; write one of '),
+        ('interface = "socketcand"', "link.options: socketcand needs host and port; write options = { host = "),
+        (
+            'interface = "virtual"\noptions = { bitrate = 1 }',
+            "link.options: bitrate has a field of its own; write ",
+        ),
         ('interface = "slcan"\nbitrate = 123456', "link.bitrate: slcan has no 123456 bit/s; write one of "),
     ],
 )
 @pytest.mark.parametrize("verb", [run_check, lambda robot: run_daemon(DaemonOptions(robot))], ids=["check", "run"])
-def test_what_no_device_could_satisfy_is_refused_before_anything_is_opened(tmp_path, link, words, verb):
+def test_what_no_device_could_satisfy_is_refused_before_anything_is_opened(tmp_path, section, words, verb):
     robot = tmp_path / "robot.toml"
-    robot.write_text(ROBOT + link)
+    robot.write_text(ROBOT + section)
     with pytest.raises(InputError) as caught:
         verb(robot)
     assert str(caught.value).startswith(f"{robot}: {words}")
     assert "\n" not in str(caught.value)
+
+
+def test_what_robot_toml_says_of_the_link_reaches_it(tmp_path, monkeypatch):
+    asked = {}
+    monkeypatch.setattr(link, "make_transport", lambda kind, **settings: asked.update(settings))
+    robot = tmp_path / "robot.toml"
+    robot.write_text(ROBOT + 'options = { host = "10.0.0.1", port = 29536 }\ndtr = true\nrts = true\n')
+    link.make_link(load_setup(robot))
+    assert asked["options"] == {"host": "10.0.0.1", "port": 29536}
+    assert (asked["dtr"], asked["rts"]) == (True, True)

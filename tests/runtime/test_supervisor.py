@@ -30,6 +30,19 @@ def test_a_link_that_is_down_means_disconnected_and_no_command(start):
     assert "link is down" in out.events[-1]
 
 
+def test_without_a_link_it_says_why_and_what_to_do():
+    bench = Bench()
+    assert bench.tick(link_state=LinkState.CONNECTING).detail == "the link is connecting"
+    remedy = "serial /dev/ttyUSB0: no such device; plug the adapter in"
+    out = bench.tick(ARM, link_state=LinkState.CONNECTING, link_error=remedy)
+    assert out.detail == remedy
+    assert remedy in refusal(out)
+    bench.tick(link_state=LinkState.UP, driver_state=DriverState.HANDSHAKE)
+    mute = "/dev/ttyUSB0: open, but no frame has come for 4 s"
+    assert bench.tick(driver_state=DriverState.HANDSHAKE, link_error=mute).detail == mute
+    assert bench.tick(driver_state=DriverState.HANDSHAKE, link_error=None).detail == "detail of the driver"
+
+
 @pytest.mark.parametrize("start", ["ready", "armed", "running", "stopping", "faulted"])
 def test_a_link_interrupted_between_two_ticks_voids_the_session(start):
     bench = Bench()

@@ -1,9 +1,19 @@
 """Every fault and state of the protocol is told with what to do about it."""
 
+from pathlib import Path
+
 import pytest
 
+from disco_hw.runtime.situation import (
+    advice,
+    by_command,
+    connection,
+    headline,
+    in_words,
+    next_step,
+)
 from disco_hw.runtime.states import State
-from disco_hw.viewer.advice import advice, in_words, next_step
+from drivers.types import DriverState, LinkState
 from firmware_protocol.faults import FAULTS
 
 STATUS = {"estop": False, "robot_state": "READY", "fault": "NONE", "state": "READY", "running": False}
@@ -26,6 +36,40 @@ def test_every_state_says_what_to_do(state):
     said = advice({**STATUS, "state": state.name})
     assert len(said) == 1
     assert said[0].endswith(".")
+
+
+@pytest.mark.parametrize("state", ["READY", "ARMED", "FAULT"])
+def test_in_a_terminal_it_names_commands_in_place_of_buttons(state):
+    ask = by_command(Path("robots/mine.toml"))
+    for running in (False, True):
+        said = " ".join(advice({**STATUS, "state": state, "running": running}, ask))
+        assert "disco-hw ctl robots/mine.toml " in said
+        assert "press" not in said.lower()
+    latched = advice({**STATUS, "state": "FAULT", "estop": True, "fault": "STALL_LEFT"}, ask)
+    assert latched[0].endswith("then run `disco-hw ctl robots/mine.toml reset`.")
+
+
+@pytest.mark.parametrize(
+    ("link", "link_error", "driver", "words"),
+    [
+        (LinkState.CONNECTING, None, DriverState.DISCONNECTED, "the link is connecting"),
+        (LinkState.CONNECTING, "plug it in", DriverState.DISCONNECTED, "plug it in"),
+        (LinkState.UP, None, DriverState.HANDSHAKE, "no answer"),
+        (LinkState.UP, "open, but mute", DriverState.HANDSHAKE, "open, but mute"),
+        (LinkState.UP, "transmit queue full", DriverState.READY, "no answer"),
+    ],
+)
+def test_what_stands_between_the_host_and_the_robot(link, link_error, driver, words):
+    assert connection(link, link_error, driver, "no answer") == words
+
+
+@pytest.mark.parametrize(
+    ("running", "estop", "by_hand", "line"),
+    [(False, False, False, ("ARMED", "why")), (True, False, False, ("ARMED · running", "why")),
+     (True, True, False, ("E-STOP", "why")), (True, False, True, ("ARMED · running", "driven by hand"))],
+)  # fmt: skip
+def test_the_headline(running, estop, by_hand, line):
+    assert headline("ARMED", "why", running, estop, by_hand) == line
 
 
 @pytest.mark.parametrize(
