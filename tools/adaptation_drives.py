@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from disco_hw.adaptation.messages import Pose, Samples, Triple, Wheels
+from disco_hw.adaptation.link import Pose, Samples, Triple, Wheels
 from disco_hw.adaptation.samples import SampleWindow
 from disco_hw.inference.excitation import Excitation
 

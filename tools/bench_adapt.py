@@ -11,13 +11,11 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 import disco_hw
-from disco_hw.adaptation.adaptable import believed_geometry, possible_range
 from disco_hw.adaptation.adapter import Adapter
-from disco_hw.adaptation.evidence import evidence
-from disco_hw.adaptation.guard import Geometry
-from disco_hw.adaptation.link import ProcessLink
-from disco_hw.adaptation.messages import InForce
+from disco_hw.adaptation.guard import Geometry, believed_geometry, possible_range
+from disco_hw.adaptation.link import InForce, ProcessLink
 from disco_hw.adaptation.network import Training, train_network, training_range
+from disco_hw.adaptation.recursive import evidence
 from disco_hw.daemon.warm_up import warm_up
 from disco_hw.experiments.adapt import AdaptOptions, run_adapt
 from disco_hw.experiments.changing_robot import drive_through_change

@@ -17,9 +17,9 @@ from pathlib import Path
 import msgspec
 
 import disco_hw
-from disco_hw.adaptation.adaptable import believed_geometry
 from disco_hw.adaptation.adaptation import Learnt, NoAdaptation
-from disco_hw.adaptation.coordinates import NAMES
+from disco_hw.adaptation.guard import believed_geometry
+from disco_hw.adaptation.recursive import NAMES
 from disco_hw.drive.coverage import Coverage
 from disco_hw.drive.hand_pilot import HandPilot
 from disco_hw.drive.source import ManualInput

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.adaptation.coordinates import to_linear
-from disco_hw.adaptation.evidence import Evidence, evidence
-from disco_hw.adaptation.messages import InForce, Proposal, Report, Samples, ToAdapter
-from disco_hw.adaptation.noise import RunningNoise
-from disco_hw.adaptation.recursive import Judged, RecursiveGeometry
+from disco_hw.adaptation.link import FromAdapter, InForce, LinkStats, Proposal, Report, Samples, ToAdapter
+from disco_hw.adaptation.recursive import Evidence, Judged, RecursiveGeometry, RunningNoise, evidence, to_linear
 from disco_hw.adaptation.samples import SampleWindow
 from disco_hw.inference.excitation import UnusableDriveError
 from disco_hw.inference.noise import measured_noise
@@ -207,3 +205,38 @@ def _proposal(t_ns: int, estimator: str, mean: Array, covariance: Array, data_s:
     x_icr, radius, axial = mean.tolist()
     a, b, c, d, e, f, g, h, i = covariance.ravel().tolist()
     return Proposal(t_ns, estimator, (x_icr, radius, axial), (a, b, c, d, e, f, g, h, i), data_s, doubt)
+
+
+class InlineLink:
+    """The adapter in the same thread, for simulated time: a report is there with the tick after its samples."""
+
+    def __init__(self, adapter: Adapter) -> None:
+        self._adapter = adapter
+        self._reports: deque[FromAdapter] = deque()
+        self._sent = self._taken = 0
+
+    @property
+    def stats(self) -> LinkStats:
+        """Counters."""
+        return LinkStats(sent=self._sent, reports=self._taken, alive=True)
+
+    def send(self, message: ToAdapter) -> None:
+        """Let the adapter take the message in."""
+        self._sent += 1
+        report = self._adapter.take(message)
+        if report is not None:
+            self._reports.append(report)
+
+    def receive(self) -> tuple[FromAdapter, ...]:
+        """The reports so far."""
+        found = tuple(self._reports)
+        self._reports.clear()
+        self._taken += len(found)
+        return found
+
+    def restart(self) -> bool:
+        """It does not die."""
+        return False
+
+    def close(self) -> None:
+        """Nothing is open."""

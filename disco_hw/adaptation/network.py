@@ -14,8 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.adaptation.coordinates import NAMES, from_linear, to_linear
-from disco_hw.adaptation.evidence import Evidence, evidence
+from disco_hw.adaptation.recursive import NAMES, Evidence, evidence, from_linear, to_linear
 from disco_hw.adaptation.samples import drive_of
 from disco_hw.inference.density_network import DensityNetwork, NetworkSettings, train
 from disco_hw.inference.excitation import STEP_S, Excitation

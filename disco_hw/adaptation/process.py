@@ -15,7 +15,7 @@ from disco_hw.daemon.realtime import limit_thread_pools
 
 if TYPE_CHECKING:
     from disco_hw.adaptation.adapter import Adapter
-    from disco_hw.adaptation.messages import Range
+    from disco_hw.adaptation.link import Range
 
 _NICE = 10
 
@@ -27,8 +27,11 @@ def main(descriptor: int) -> int:
         os.nice(_NICE)
     # Imported late: the numeric libraries read their limits when they are loaded.
     from disco_hw.adaptation.adapter import Adapter  # noqa: PLC0415
-    from disco_hw.adaptation.link import MAX_PACKET_BYTES  # noqa: PLC0415
-    from disco_hw.adaptation.messages import Range, ToAdapter  # noqa: PLC0415
+    from disco_hw.adaptation.link import (  # noqa: PLC0415
+        MAX_PACKET_BYTES,
+        Range,
+        ToAdapter,
+    )
 
     decode, encode = msgspec.msgpack.Decoder(ToAdapter).decode, msgspec.msgpack.Encoder().encode
     adapter = Adapter()

@@ -4,6 +4,15 @@ All evidence since the last change counts alike, on top of what was believed bef
 folded into one Gaussian. At every split of the window the new part's score is tested against what the old part
 predicts: a tyre that loses air or a new floor shows within seconds, and everything from before is then forgotten except
 that parameters do not change by more than `CHANGE`. Slow drift is let in as a random walk.
+
+Evidence is kept in coordinates in which the increments between two poses are linear,
+
+    beta = (r_w, gamma, kappa),  kappa = r_w / a_w,  gamma = x_icr kappa:
+
+given yaw, the displacement is r_w (roll_L + roll_R)/2 along and -gamma (roll_R - roll_L) across the body, the change
+of yaw kappa (roll_R - roll_L); over a longer way both directions shrink by sin(h)/h with h half the turn. Neighbouring
+displacements share a pose and its noise; the bidiagonal factor of `inference.estimates` whitens them in one pass, after
+which every pose adds J'J to the information and J'y to the score.
 """
 
 from __future__ import annotations
@@ -12,9 +21,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import solve_banded
 
-from disco_hw.adaptation.coordinates import from_linear, to_linear
-from disco_hw.adaptation.evidence import Evidence
+from disco_hw.inference.estimates import Whitening, whitening
+from disco_hw.inference.excitation import Excitation
+from disco_hw.inference.noise import USUAL, Noise
 
 Array = NDArray[np.float64]
 
@@ -136,3 +147,120 @@ def _misfit(part: Evidence, mean: Array) -> float:
         return 1.0
     information, score = part.information.sum(axis=0), part.score.sum(axis=0)
     return float((part.square.sum() - 2.0 * mean @ score + mean @ information @ mean) / (values - 3.0))
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Evidence:
+    """Of poses at `t_s` (P,): `information` (P, 3, 3) and `score` (P, 3) of beta, `square` (P,) of what was measured.
+
+    Everything is whitened. `rows` (P, 3, 4): of x, y and yaw what was measured, and its coefficients of beta. `values`
+    (P,) counts the measured numbers: 3, or 0 at the start of a run; `moving_s` (P,) is the time in motion since the
+    pose before.
+    """
+
+    t_s: Array
+    information: Array
+    score: Array
+    square: Array
+    values: Array
+    moving_s: Array
+    rows: Array
+
+    def part(self, chosen: NDArray[np.bool_]) -> Evidence:
+        """The evidence of some of the poses."""
+        return Evidence(
+            self.t_s[chosen],
+            self.information[chosen],
+            self.score[chosen],
+            self.square[chosen],
+            self.values[chosen],
+            self.moving_s[chosen],
+            self.rows[chosen],
+        )
+
+
+def evidence(drive: Excitation, noise: Noise) -> Evidence:
+    """The evidence of each pose of a drive under this noise."""
+    slip_m = float(np.hypot(noise.slip_forward_m_sqrt_s, noise.slip_left_m_sqrt_s)) * np.sqrt(0.5)
+    inside = ~drive.starts
+    steps = np.where(inside[:, None], np.diff(drive.pose, axis=0, prepend=drive.pose[:1]), 0.0)
+    middle = drive.pose[:, 2] - 0.5 * steps[:, 2]
+    cosine, sine = np.cos(middle), np.sin(middle)
+    # np.sinc(x) is sin(pi x) / (pi x).
+    shrink = np.sinc(steps[:, 2] / (2.0 * np.pi))
+    along, across = drive.roll_rad[:, 0] * shrink, drive.roll_rad[:, 1] * shrink
+    in_x = np.column_stack([steps[:, 0], along * cosine, across * sine])
+    in_y = np.column_stack([steps[:, 1], along * sine, -across * cosine])
+    turned = np.column_stack([steps[:, 2], drive.roll_rad[:, 1]])
+    x, y = np.hsplit(_whitened(np.hstack([in_x, in_y]), whitening(drive, noise.position_m, slip_m)), 2)
+    yaw = _whitened(turned, whitening(drive, noise.yaw_rad, noise.slip_yaw_rad_sqrt_s))
+    x, y, yaw = (np.where(inside[:, None], part, 0.0) for part in (x, y, yaw))
+
+    information = np.zeros((drive.t_s.size, 3, 3))
+    information[:, :2, :2] = x[:, 1:, None] * x[:, None, 1:] + y[:, 1:, None] * y[:, None, 1:]
+    information[:, 2, 2] = yaw[:, 1] ** 2
+    score = np.column_stack([x[:, 1:] * x[:, :1] + y[:, 1:] * y[:, :1], yaw[:, 1] * yaw[:, 0]])
+    square = x[:, 0] ** 2 + y[:, 0] ** 2 + yaw[:, 0] ** 2
+    rows = np.zeros((drive.t_s.size, 3, 4))
+    rows[:, 0, :3], rows[:, 1, :3], rows[:, 2, 0], rows[:, 2, 3] = x, y, yaw[:, 0], yaw[:, 1]
+    return Evidence(drive.t_s, information, score, square, np.where(inside, 3.0, 0.0), drive.moving_s, rows)
+
+
+def _whitened(columns: Array, factor: Whitening) -> Array:
+    band = np.vstack([factor.diagonal, np.append(factor.carry[1:], 0.0)])
+    return np.asarray(solve_banded((1, 0), band, columns, check_finite=False))
+
+
+# A stretch is a few dozen independent errors of the slip: one alone is off by half.
+_USUAL_COUNTS_FOR = 3.0
+_LONGEST_MEMORY = 12.0
+
+
+class RunningNoise:
+    """A mean of variances over stretches of driving, which begins as `USUAL`."""
+
+    def __init__(self) -> None:
+        self._weight = _USUAL_COUNTS_FOR
+        self._variance: Array = USUAL.vector() ** 2
+
+    @property
+    def noise(self) -> Noise:
+        """The noise now."""
+        return Noise(*np.sqrt(self._variance).tolist())
+
+    def add(self, measured: Noise) -> None:
+        """Take in the noise of one stretch."""
+        self._weight = min(self._weight + 1.0, _LONGEST_MEMORY)
+        self._variance += (measured.vector() ** 2 - self._variance) / self._weight
+
+
+NAMES = ("x_icr_m", "wheel_radius_m", "axial_distance_m")
+"""The order of theta, as everywhere in inference."""
+
+
+def to_linear(mean: Array, covariance: Array) -> tuple[Array, Array]:
+    """Mean (3,) and covariance (3, 3) of beta from those of theta in the order of `NAMES`, to first order."""
+    x_icr, radius, axial = mean.tolist()
+    kappa = radius / axial
+    by_theta = np.array(
+        [
+            [0.0, 1.0, 0.0],
+            [kappa, x_icr / axial, -x_icr * kappa / axial],
+            [0.0, 1.0 / axial, -kappa / axial],
+        ]
+    )
+    return np.array([radius, x_icr * kappa, kappa]), by_theta @ covariance @ by_theta.T
+
+
+def from_linear(mean: Array, covariance: Array) -> tuple[Array, Array]:
+    """Mean (3,) and covariance (3, 3) of theta from those of beta, to first order."""
+    radius, gamma, kappa = mean.tolist()
+    by_beta = np.array(
+        [
+            [0.0, 1.0 / kappa, -gamma / kappa**2],
+            [1.0, 0.0, 0.0],
+            [1.0 / kappa, 0.0, -radius / kappa**2],
+        ]
+    )
+    spread = by_beta @ covariance @ by_beta.T
+    return np.array([gamma / kappa, radius, radius / kappa]), 0.5 * (spread + spread.T)

@@ -7,7 +7,7 @@ from bisect import insort
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.adaptation.messages import Pose, Samples, Wheels
+from disco_hw.adaptation.link import Pose, Samples, Wheels
 from disco_hw.inference.excitation import Excitation, UnusableDriveError, excitation
 from disco_hw.log.drive import Commands, DriveLog, Gyro, Poses
 from disco_hw.log.drive import Wheels as WheelArrays

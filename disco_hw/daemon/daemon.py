@@ -13,7 +13,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from disco_hw.adaptation.adaptable import check_adaptable
+from disco_hw.adaptation.guard import check_adaptable
 from disco_hw.adaptation.link import ProcessLink
 from disco_hw.config import RobotConfig
 from disco_hw.daemon import realtime
@@ -27,6 +27,7 @@ from disco_hw.daemon.page_feed import ViewerFeed, WatchedRecorder, feed_path
 from disco_hw.daemon.signals import StopSignals
 from disco_hw.daemon.socket_place import passed_over
 from disco_hw.daemon.status import counters, loop_figures, status
+from disco_hw.daemon.stop_path import StopPath
 from disco_hw.daemon.systemd import Notifier
 from disco_hw.daemon.teller import STANDARD_OUTPUT, Teller
 from disco_hw.daemon.waiting import Waiting
@@ -44,7 +45,6 @@ from disco_hw.runtime.pipeline import NoPlanner, Pipeline, Planner
 from disco_hw.runtime.robot_setup import Setup, link_key, load_setup, refuse_missing_effects
 from disco_hw.runtime.situation import Ask, advice, by_command, headline
 from disco_hw.runtime.states import State
-from disco_hw.runtime.stop_path import StopPath
 from disco_hw.runtime.supervisor import Reply, UserRequest
 from disco_hw.runtime.task_change import TaskRefused, changed_task, in_words
 from drivers.types import Request, Transport

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from collections import deque
@@ -20,17 +21,27 @@ from disco_hw.daemon.teller import STANDARD_ERROR, STANDARD_OUTPUT, Teller
 from disco_hw.drive.coverage import Coverage
 from disco_hw.drive.gamepad_source import GamepadSource
 from disco_hw.drive.hand_pilot import HandPilot
-from disco_hw.drive.keyboard import Keyboard
-from disco_hw.drive.keys import HELP, KeyHold
+from disco_hw.drive.keyboard import HELP, Keyboard, KeyHold
 from disco_hw.drive.page_source import PageSource
-from disco_hw.drive.script import Script, in_table, room_needed
-from disco_hw.drive.scripted import ScriptSource, Unattended
+from disco_hw.drive.script import Script, ScriptSource, Unattended, in_table, room_needed
 from disco_hw.drive.scripts import make_script
 from disco_hw.drive.source import ManualSource
-from disco_hw.drive.virtual_link import leads_to_virtual_robot
 from disco_hw.errors import InputError
 from disco_hw.runtime.robot_setup import load_setup
 from drivers.gamepad import Gamepad, GamepadError, GamepadMapping, open_gamepad
+
+_VIRTUAL_INTERFACES = ("unixcan", "virtual")
+_PSEUDO_TERMINALS = "/dev/pts/"
+
+
+def leads_to_virtual_robot(link: Link) -> bool:
+    """True for the simulator's own bus, Linux's vcan and pseudo-terminals that exist; False when in doubt."""
+    if link.kind == "serial":
+        return os.path.realpath(link.port).startswith(_PSEUDO_TERMINALS)
+    if link.interface == "socketcan":
+        return link.channel.startswith("vcan")
+    return link.interface in _VIRTUAL_INTERFACES
+
 
 _DISPLAY_TIMEOUT_S = 2.0
 _STANDARD_INPUT = 0

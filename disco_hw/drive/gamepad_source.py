@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from disco_hw.drive.keys import wheel_speeds
+from disco_hw.drive.keyboard import wheel_speeds
 from disco_hw.drive.source import ManualInput, RobotView
 from drivers.gamepad import Gamepad, GamepadError
 

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from disco_hw.drive.keys import wheel_speeds
+from disco_hw.drive.keyboard import wheel_speeds
 from disco_hw.drive.source import INPUT_LIMIT_NS, ManualInput, RobotView
 
 

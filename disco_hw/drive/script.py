@@ -1,12 +1,20 @@
-"""A scripted drive: manoeuvres one after the other, each wheel speeds as a function of time; pure."""
+"""A scripted drive: manoeuvres one after the other, each wheel speeds as a function of time; pure.
+
+Manoeuvres are shares of the largest wheel speed that the robot reaches, which is measured first: the fastest, both
+ways, straight and turning. The script's clock runs while the robot is driven; the deadman is somebody else's.
+"""
 
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from statistics import median
 
 from disco_hw.config import Robot
+from disco_hw.drive.source import ManualInput, ManualSource, RobotView
+from disco_hw.runtime.states import State
 
 Wheels = tuple[float, float]
 
@@ -107,3 +115,243 @@ def in_table(script: Script) -> Sequence[str]:
         lines.append(f"{start_s:6.1f} s  {manoeuvre.name:<28} {manoeuvre.purpose}")
         start_s += manoeuvre.duration_s
     return lines
+
+
+Profile = Callable[[float], tuple[float, float]]
+REST_S = 0.6
+
+
+def rest(duration_s: float = REST_S, purpose: str = "separates what comes before from what comes after") -> Manoeuvre:
+    """Stand still."""
+    return Manoeuvre("rest", purpose, duration_s, lambda _t_s: (0.0, 0.0))
+
+
+@dataclass(frozen=True, slots=True)
+class Pieces:
+    """Manoeuvres as shares of `top_rad_s`: (forward, turn to the left)."""
+
+    top_rad_s: float
+
+    def play(self, name: str, purpose: str, duration_s: float, profile: Profile) -> Manoeuvre:
+        """Shares as a function of the time since its start (s)."""
+
+        def wheels(t_s: float) -> tuple[float, float]:
+            forward, turn = profile(t_s)
+            return (forward - turn) * self.top_rad_s, (forward + turn) * self.top_rad_s
+
+        return Manoeuvre(name, purpose, duration_s, wheels)
+
+    def hold(self, name: str, purpose: str, duration_s: float, forward: float, turn: float) -> Manoeuvre:
+        """Constant shares."""
+        return self.play(name, purpose, duration_s, lambda _t_s: (forward, turn))
+
+    def each(self, purpose: str, *held: tuple[str, float, float, float]) -> list[Manoeuvre]:
+        """Several held ones (name, duration, forward, turn), each followed by a rest."""
+        return [part for one in held for part in (self.hold(one[0], purpose, *one[1:]), self.rest())]
+
+    @staticmethod
+    def rest(duration_s: float = REST_S) -> Manoeuvre:
+        """Stand still."""
+        return rest(duration_s)
+
+
+_LONGEST_TICK_NS = 100_000_000
+_SETTLED_S = 0.8
+
+
+class ScriptSource:
+    """Plays a script while the deadman of another source is held.
+
+    A manoeuvre that was broken off by disarming begins anew when driving goes on, so that each is recorded whole once.
+    The wheels' limits are what they reach at the end of the manoeuvres that are to find them.
+    """
+
+    def __init__(self, script: Script, deadman: ManualSource) -> None:
+        self._script = script
+        self._deadman = deadman
+        self._driven_ns = 0
+        self._last_ns: int | None = None
+        self._driven = False
+        self._driving = False
+        self._over = False
+        self._limits = WheelLimits()
+
+    @property
+    def ended(self) -> str | None:
+        """The end of the script or of the source of the deadman."""
+        return f"script {self._script.name} completed" if self._over else self._deadman.ended
+
+    @property
+    def completed(self) -> bool:
+        """Whether the script was played to its end."""
+        return self._over
+
+    @property
+    def words(self) -> str:
+        """How far it is; what to do where nothing moves."""
+        progress = f"{self._driven_ns * 1e-9:.0f} of {self._script.duration_s:.0f} s"
+        manoeuvre = self._manoeuvre
+        name = "" if manoeuvre is None else f", {manoeuvre.name}"
+        held = "" if self._driving else f"; {self._deadman.words}"
+        return f"{progress}{name}{held}"
+
+    @property
+    def task(self) -> str:
+        """The manoeuvre under way, or next, and the limits that it keeps where it is about them."""
+        manoeuvre = self._manoeuvre
+        if manoeuvre is None:
+            return ""
+        limits = f" ({self._limits.in_words()})" if manoeuvre.within_limits else ""
+        return f"{manoeuvre.name}{limits}: {manoeuvre.purpose}"
+
+    def poll(self, now_ns: int, robot: RobotView) -> ManualInput | None:
+        """The script's wheel speeds with the other source's deadman and time."""
+        held = self._deadman.poll(now_ns, robot)
+        self._advance(now_ns, robot)
+        if held is None:
+            return None
+        if self._over:
+            return ManualInput(now_ns, 0.0, 0.0, deadman=False)
+        left, right = self._wheels()
+        return ManualInput(held.t_ns, left, right, held.deadman)
+
+    def close(self) -> None:
+        """Close the source of the deadman."""
+        self._deadman.close()
+
+    @property
+    def _manoeuvre(self) -> Manoeuvre | None:
+        place = self._script.place(self._driven_ns * 1e-9)
+        return None if place is None else place[0]
+
+    def _wheels(self) -> Wheels:
+        wheels = self._script.at(self._driven_ns * 1e-9)
+        manoeuvre = self._manoeuvre
+        return self._limits.within(wheels) if manoeuvre is not None and manoeuvre.within_limits else wheels
+
+    def _observe(self, measured: Wheels | None) -> None:
+        """Learn what the wheels reach, from the end of a manoeuvre that is to find it."""
+        t_s = self._driven_ns * 1e-9
+        place = self._script.place(t_s)
+        if measured is None or place is None or not place[0].finds_limits:
+            return
+        manoeuvre, began_s = place
+        if t_s > began_s + manoeuvre.duration_s - _SETTLED_S:
+            self._limits.observe(manoeuvre.name, manoeuvre.wheels(t_s - began_s), measured)
+
+    def _advance(self, now_ns: int, robot: RobotView) -> None:
+        if robot.driving and self._last_ns is not None:
+            # A loop held up must not skip what was to be driven meanwhile.
+            self._driven_ns += min(now_ns - self._last_ns, _LONGEST_TICK_NS)
+            self._over = self._over or self._manoeuvre is None
+            self._driven = True
+            self._observe(robot.wheels)
+        elif self._driven and robot.state is not State.ARMED and not self._over:
+            place = self._script.place(self._driven_ns * 1e-9)
+            self._driven_ns = 0 if place is None else round(place[1] * 1e9)
+            self._driven = False
+        self._driving = robot.driving
+        self._last_ns = now_ns
+
+
+class Unattended:
+    """Holds the deadman by itself, once: for the virtual robot, and for tests.
+
+    Pressed when the robot has become ready; if it does not drive within `driving_within_s`, then or after a hold while
+    armed, or is disarmed by anybody, it is released for good.
+    """
+
+    def __init__(self, ready_within_s: float = 60.0, driving_within_s: float = 5.0) -> None:
+        self._ready_within_ns = round(ready_within_s * 1e9)
+        self._driving_within_ns = round(driving_within_s * 1e9)
+        self._first_ns: int | None = None
+        self._pressed_ns: int | None = None
+        self._waiting_ns = 0
+        self._driven = False
+        self._ended: str | None = None
+
+    @property
+    def ended(self) -> str | None:
+        """Why it was released."""
+        return self._ended
+
+    @property
+    def completed(self) -> bool:
+        """It never ends by itself as it should."""
+        return False
+
+    @property
+    def words(self) -> str:
+        """What it waits for."""
+        return "unattended: waiting for the robot" if self._pressed_ns is None else "unattended: deadman held"
+
+    @property
+    def task(self) -> str:
+        """Holding the deadman is all it does."""
+        return ""
+
+    def poll(self, now_ns: int, robot: RobotView) -> ManualInput | None:
+        """The deadman; speeds are zero."""
+        if self._first_ns is None:
+            self._first_ns = now_ns
+        held = self._pressed_ns is not None and self._ended is None
+        if self._pressed_ns is None:
+            if robot.state is State.READY:
+                # Held from the next tick on: a deadman counts only after it was seen open.
+                self._pressed_ns = self._waiting_ns = now_ns
+            elif now_ns - self._first_ns > self._ready_within_ns:
+                self._ended = f"the robot was not ready within {self._ready_within_ns * 1e-9:g} s"
+        elif robot.driving:
+            self._driven, self._waiting_ns = True, now_ns
+        elif self._driven and robot.state is not State.ARMED:
+            self._ended = self._ended or "the robot was disarmed before the script was over"
+        elif now_ns - self._waiting_ns > self._driving_within_ns:
+            hold = f"the robot held still for {self._driving_within_ns * 1e-9:g} s before the script was over"
+            self._ended = self._ended or (hold if self._driven else "the robot did not start to drive")
+        return ManualInput(now_ns, 0.0, 0.0, deadman=held)
+
+    def close(self) -> None:
+        """Nothing is held open."""
+
+
+KEPT = 0.95
+"""Reached is what comes so close to what was asked."""
+
+_LARGEST = 1.0
+
+
+class WheelLimits:
+    """Shares of what was asked that each wheel reached forward and backward, in the manoeuvre where it reached least.
+
+    Where nothing was observed, all of it counts as reached.
+    """
+
+    def __init__(self) -> None:
+        self._shares: dict[tuple[int, bool], dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
+        self._asked: dict[tuple[int, bool], float] = {}
+
+    def observe(self, manoeuvre: str, asked: Wheels, measured: Wheels) -> None:
+        """Take in wheel speeds (rad/s, left and right) after they had time to settle."""
+        for wheel, (wanted, reached) in enumerate(zip(asked, measured, strict=True)):
+            if wanted != 0.0:
+                self._shares[wheel, wanted > 0.0][manoeuvre].append(reached / wanted)
+                self._asked[wheel, wanted > 0.0] = wanted
+
+    def share(self, wheel: int, *, forward: bool) -> float:
+        """Of the speed asked for, in [0, 1], for wheel 0 (left) or 1 (right)."""
+        found = [median(shares) for shares in self._shares[wheel, forward].values()]
+        least = min(found, default=_LARGEST)
+        return _LARGEST if not least < KEPT else max(0.0, least)
+
+    def within(self, asked: Wheels) -> Wheels:
+        """Wheel speeds scaled into the limits that were found."""
+        left, right = (speed * self.share(wheel, forward=speed > 0.0) for wheel, speed in enumerate(asked))
+        return left, right
+
+    def in_words(self) -> str:
+        """The limits for a person."""
+        if len(self._asked) < 4:
+            return "limits not found: no wheel speeds were measured"
+        reached = {key: asked * self.share(key[0], forward=key[1]) for key, asked in self._asked.items()}
+        left, right = (f"{reached[wheel, False]:+.1f} to {reached[wheel, True]:+.1f}" for wheel in (0, 1))
+        return f"found: left {left}, right {right} rad/s"

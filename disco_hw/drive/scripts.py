@@ -14,8 +14,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from disco_hw.config import CircleTask, Robot, RobotTask, circle_task
-from disco_hw.drive.pieces import Pieces, rest
-from disco_hw.drive.script import Manoeuvre, Script
+from disco_hw.drive.script import Manoeuvre, Pieces, Script, rest
 from disco_hw.drive.separating import SEPARATING, separating
 from disco_hw.errors import InputError
 

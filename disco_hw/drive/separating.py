@@ -9,8 +9,7 @@ import math
 from collections.abc import Mapping
 from types import MappingProxyType
 
-from disco_hw.drive.pieces import Pieces
-from disco_hw.drive.script import Manoeuvre, Script
+from disco_hw.drive.script import Manoeuvre, Pieces, Script
 
 _STRAIGHT = "wheel radius against gains, slope and unequal wheels: two speeds, both ways"
 _SPIN = "axial distance against slip in turns, and where it turns about: two rates, both ways"

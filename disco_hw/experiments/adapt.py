@@ -16,10 +16,8 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.adaptation.adaptable import believed_geometry, with_geometry
-from disco_hw.adaptation.adapter import Adapter
-from disco_hw.adaptation.guard import Geometry
-from disco_hw.adaptation.inline_link import InlineLink
+from disco_hw.adaptation.adapter import Adapter, InlineLink
+from disco_hw.adaptation.guard import Geometry, believed_geometry, with_geometry
 from disco_hw.config import CircleTask, circle_task
 from disco_hw.experiments.simulated_time import SimulatedRun, virtual_robot
 from disco_hw.log import records

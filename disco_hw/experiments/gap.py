@@ -20,7 +20,7 @@ from disco_hw.config import CircleTask, circle_task
 from disco_hw.course import course_of
 from disco_hw.drive.coverage import Coverage
 from disco_hw.drive.hand_pilot import HandPilot
-from disco_hw.drive.scripted import ScriptSource, Unattended
+from disco_hw.drive.script import ScriptSource, Unattended
 from disco_hw.drive.scripts import make_script
 from disco_hw.errors import InputError, WorkError
 from disco_hw.experiments.metrics import Path as Track

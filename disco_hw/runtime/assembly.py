@@ -5,9 +5,15 @@ from __future__ import annotations
 import secrets
 
 from disco_hw import control
-from disco_hw.adaptation.adaptable import believed_geometry, check_adaptable, possible_range, with_geometry
 from disco_hw.adaptation.adaptation import Adaptation, CheckedAdaptation
-from disco_hw.adaptation.guard import BeliefGuard, Geometry
+from disco_hw.adaptation.guard import (
+    BeliefGuard,
+    Geometry,
+    believed_geometry,
+    check_adaptable,
+    possible_range,
+    with_geometry,
+)
 from disco_hw.adaptation.link import AdapterLink
 from disco_hw.config import RobotConfig
 from disco_hw.estimation import OdometryParameters, PoseFusion

@@ -12,7 +12,7 @@ from typing import Any
 
 import msgspec
 
-from disco_hw.adaptation.adaptable import geometry_of
+from disco_hw.adaptation.guard import geometry_of
 from disco_hw.control import task_of_robot
 from disco_hw.errors import InputError
 from disco_hw.log.reader import Entry, open_log

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from disco_hw.adaptation.adaptable import geometry_of, with_geometry
+from disco_hw.adaptation.guard import geometry_of, with_geometry
 from disco_hw.config import RobotTask
 from disco_hw.log.reader import Log
 from disco_hw.log.records import BeliefChange, Task

@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 
 import disco_hw
-from disco_hw.adaptation.adaptable import believed_geometry, check_adaptable, possible_range, with_geometry
-from disco_hw.adaptation.guard import Geometry
+from disco_hw.adaptation.guard import Geometry, believed_geometry, check_adaptable, possible_range, with_geometry
 from disco_hw.config import Prior
 from disco_hw.errors import InputError
 from disco_hw.model import EffectSetting, Gaussian, load_model

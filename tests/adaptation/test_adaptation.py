@@ -3,8 +3,7 @@ import pytest
 
 from disco_hw.adaptation.adaptation import CheckedAdaptation, NoAdaptation
 from disco_hw.adaptation.guard import BeliefGuard, Geometry
-from disco_hw.adaptation.link import LinkStats
-from disco_hw.adaptation.messages import InForce, Proposal, Range, Report, Samples
+from disco_hw.adaptation.link import InForce, LinkStats, Proposal, Range, Report, Samples
 from disco_hw.log import records
 from drivers.types import PoseSample, Readings, WheelSample
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from disco_hw.adaptation.adapter import Adapter
-from disco_hw.adaptation.messages import InForce
+from disco_hw.adaptation.link import InForce
 from disco_hw.adaptation.network import Training, train_network, training_range
 from disco_hw.inference.noise import USUAL
 from disco_hw.model import Model

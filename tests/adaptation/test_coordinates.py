@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from disco_hw.adaptation.coordinates import from_linear, to_linear
+from disco_hw.adaptation.recursive import from_linear, to_linear
 
 THETA = np.array([0.2, 0.06, 0.4])
 SPREAD = np.array([[4e-6, 1e-7, 2e-7], [1e-7, 1e-6, 5e-7], [2e-7, 5e-7, 9e-6]])

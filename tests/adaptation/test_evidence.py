@@ -1,8 +1,7 @@
 import numpy as np
 import pytest
 
-from disco_hw.adaptation.coordinates import from_linear
-from disco_hw.adaptation.evidence import evidence
+from disco_hw.adaptation.recursive import evidence, from_linear
 from disco_hw.inference.noise import Noise
 from tools.adaptation_drives import TRUTH, excited
 

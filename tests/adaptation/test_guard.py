@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from disco_hw.adaptation.guard import BeliefGuard, Geometry, Outcome
-from disco_hw.adaptation.messages import Proposal
+from disco_hw.adaptation.link import Proposal
 
 S = 1_000_000_000
 MEAN = np.array([0.238, 0.061, 0.415])

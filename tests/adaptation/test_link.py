@@ -7,8 +7,7 @@ import msgspec
 import pytest
 
 from disco_hw.adaptation import link as link_module
-from disco_hw.adaptation.link import ProcessLink
-from disco_hw.adaptation.messages import Report, Samples
+from disco_hw.adaptation.link import ProcessLink, Report, Samples
 
 
 @pytest.fixture

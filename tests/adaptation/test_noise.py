@@ -1,6 +1,6 @@
 import pytest
 
-from disco_hw.adaptation.noise import RunningNoise
+from disco_hw.adaptation.recursive import RunningNoise
 from disco_hw.inference.noise import USUAL, Noise
 
 OTHER = Noise(0.02, 0.03, 0.02, 0.02, 0.05)

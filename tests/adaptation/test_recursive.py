@@ -1,8 +1,7 @@
 import numpy as np
 import pytest
 
-from disco_hw.adaptation.evidence import evidence
-from disco_hw.adaptation.recursive import RecursiveGeometry
+from disco_hw.adaptation.recursive import RecursiveGeometry, evidence
 from disco_hw.inference.noise import Noise
 from tools.adaptation_drives import TRUTH, excited
 

@@ -16,7 +16,7 @@ import time
 from disco_hw.daemon.clock import MonotonicClock
 from disco_hw.daemon.loop import Loop
 from disco_hw.daemon.signals import StopSignals
-from disco_hw.runtime.stop_path import StopPath
+from disco_hw.daemon.stop_path import StopPath
 
 def stop_wheels():
     print("stopping", flush=True)

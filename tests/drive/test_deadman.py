@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from disco_hw.drive.deadman import Deadman
+from disco_hw.drive.hand_pilot import Deadman
 from disco_hw.drive.source import ManualInput
 from disco_hw.runtime.pipeline import Manual, Stand
 from disco_hw.runtime.states import State

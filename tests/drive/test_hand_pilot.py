@@ -9,7 +9,7 @@ import pytest
 
 from disco_hw.drive.coverage import Coverage
 from disco_hw.drive.hand_pilot import HandPilot
-from disco_hw.drive.scripted import ScriptSource, Unattended
+from disco_hw.drive.script import ScriptSource, Unattended
 from disco_hw.drive.scripts import STEP_S, STEPS, make_script
 from disco_hw.drive.source import ManualInput
 from disco_hw.log import records

@@ -12,8 +12,7 @@ import time
 import pytest
 
 from disco_hw.daemon.clock import SimulatedClock
-from disco_hw.drive.keyboard import Keyboard
-from disco_hw.drive.keys import KeyHold
+from disco_hw.drive.keyboard import Keyboard, KeyHold
 from disco_hw.drive.source import RobotView
 from disco_hw.errors import InputError
 from disco_hw.runtime.states import State

@@ -2,7 +2,7 @@
 
 import pytest
 
-from disco_hw.drive.pieces import REST_S, Pieces
+from disco_hw.drive.script import REST_S, Pieces
 
 PIECES = Pieces(5.0)
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from disco_hw.drive.script import Manoeuvre, Script
-from disco_hw.drive.scripted import ScriptSource, Unattended
+from disco_hw.drive.script import Manoeuvre, Script, ScriptSource, Unattended
 from disco_hw.drive.source import ManualInput, RobotView
 from disco_hw.runtime.states import State
 

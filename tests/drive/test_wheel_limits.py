@@ -2,7 +2,7 @@
 
 import pytest
 
-from disco_hw.drive.wheel_limits import WheelLimits
+from disco_hw.drive.script import WheelLimits
 
 
 def limits(**observed):

@@ -7,7 +7,7 @@ import math
 import pytest
 
 from disco_hw.config import CircleTask
-from disco_hw.runtime.lap_counter import LapCounter
+from disco_hw.runtime.progress import LapCounter
 
 
 def drive(counter: LapCounter, laps: float, steps: int = 200) -> None:
