@@ -29,6 +29,7 @@ from disco_hw.experiments.live_stack import running_stack
 from disco_hw.experiments.operator import disco_hw_process
 from disco_hw.log.reader import open_log
 from disco_hw.log.records import Plan
+from disco_hw.viewer.address import TOKEN_VARIABLE, page_token
 from disco_hw.viewer.desk import Desk
 from disco_hw.viewer.live import LivePage, run_live
 from disco_hw.viewer.recording import Recording
@@ -161,6 +162,7 @@ def _live(directory: Path) -> dict[str, float]:
         spans[name].append((begin_ns, time.monotonic_ns()))
         stolen[name].append(stolen_ms() - stolen_before_ms)
 
+    os.environ[TOKEN_VARIABLE] = page_token()
     with running_stack(directory) as stack:
         stack.drive()
         for _ in range(TURNS):
@@ -269,11 +271,12 @@ def _ages_ms(feed: Path) -> list[float]:
 def _reader() -> Iterator[None]:
     """What a browser does to the page's process: connect, and read all that comes."""
     address = f"127.0.0.1:{PORT}"
+    token = os.environ[TOKEN_VARIABLE]
     deadline_s = time.monotonic() + 120.0
     while True:
         try:
             client = connect(
-                f"ws://{address}/", origin=Origin(f"http://{address}"), max_size=None,
+                f"ws://{address}/?token={token}", origin=Origin(f"http://{address}"), max_size=None,
                 subprotocols=[Subprotocol(f"viser-v{viser.__version__}")],
             )  # fmt: skip
             break

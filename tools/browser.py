@@ -49,7 +49,7 @@ def opened(browser, url, width=800, height=540, scene=True):
     page.on("console", lambda message: page.said.append(message.text))
     page.on("request", lambda request: page.said.append(f"request {request.url}"))
     if not scene:
-        page.route("**/index.html", lambda route: route.abort())
+        page.route("**/index.html*", lambda route: route.abort())
     page.goto(url)
     try:
         yield page

@@ -7,6 +7,7 @@ simulator's truth afterwards. Nothing here reaches into either process.
 from __future__ import annotations
 
 import math
+import os
 import tempfile
 import time
 from collections import deque
@@ -26,7 +27,7 @@ from disco_hw.daemon.realtime import stolen_ms
 from disco_hw.errors import InputError, WorkError
 from disco_hw.experiments.circle_report import CircleReport, load_circle_report
 from disco_hw.experiments.operator import Operator, disco_hw_process, stands
-from disco_hw.viewer.address import DEFAULT_PORT, LOOPBACK
+from disco_hw.viewer.address import DEFAULT_PORT, LOOPBACK, TOKEN_VARIABLE, page_address, page_token
 
 _START_TIMEOUT_S = 90.0
 _POLL_S = 0.1
@@ -143,6 +144,9 @@ def _drive(options: DemoOptions, files: _Files, console: Console) -> bool:
         "sim", str(files.robot), "--plant-seed", str(options.plant_seed), "--truth", str(files.truth),
         "--start", str(task.center_x_m + task.radius_m), str(task.center_y_m), "1.5707963",
     ]  # fmt: skip
+    # The daemon hands the variable on to its page.
+    os.environ[TOKEN_VARIABLE] = token = page_token()
+    address = page_address(LOOPBACK, options.port, token)
     daemon_arguments = ["run", str(files.robot), "--log", str(files.log), *_page(options), *_adapt(options)]
     with (
         disco_hw_process("virtual robot", simulator, files.simulator_output) as robot,
@@ -151,7 +155,7 @@ def _drive(options: DemoOptions, files: _Files, console: Console) -> bool:
         operator = Operator(files.socket, (robot, daemon))
         console.print(f"virtual robot pid {robot.process.pid}, daemon pid {daemon.process.pid}, link {options.link}")
         if options.view:
-            console.print(f"page http://{LOOPBACK}:{options.port}")
+            console.print(f"page {address}", soft_wrap=True)
         operator.wait_for("READY", _START_TIMEOUT_S)
         operator.tell("arm")
         operator.wait_for("ARMED", 5.0)

@@ -57,10 +57,13 @@ class Desk:
         self._watchers = 0
         self._watch: asyncio.Task[None] | None = None
 
-    def page(self, instance: str) -> bytes:
-        """The desk as HTML; `instance` is what this server tells of itself under any of its names."""
+    def page(self, instance: str, token: str = "") -> bytes:
+        """The desk as HTML; `instance` is what this server tells of itself under any of its names.
+
+        `token` lets the scene in under this machine's other name; without it the scene stays under the desk's.
+        """
         text = files("disco_hw.viewer").joinpath("desk.html").read_text(encoding="utf-8")
-        return text.replace("@@INSTANCE@@", instance).encode()
+        return text.replace("@@INSTANCE@@", instance).replace("@@TOKEN@@", token).encode()
 
     async def serve(self, connection: ServerConnection) -> None:
         """Serve one browser until it leaves."""

@@ -6,6 +6,7 @@ operator's browser press its buttons, and opens a public tunnel for any client t
 
 from __future__ import annotations
 
+import errno
 import functools
 import hmac
 import http
@@ -13,7 +14,7 @@ import io
 import secrets
 import socket
 from collections.abc import Awaitable, Callable, Iterator
-from contextlib import contextmanager, redirect_stdout
+from contextlib import contextmanager, nullcontext, redirect_stdout
 from dataclasses import dataclass
 from http.cookies import CookieError, SimpleCookie
 from typing import Any
@@ -25,12 +26,13 @@ from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
 from disco_hw.errors import InputError
-from disco_hw.viewer.address import DEFAULT_PORT, LOOPBACK
+from disco_hw.viewer.address import DEFAULT_PORT, LOOPBACK, page_address, page_token
 from disco_hw.viewer.desk import Desk
 
 _LOOPBACK_NAMES = frozenset({"127.0.0.1", "localhost"})
 _COOKIE = "disco-hw-token"
 _DESK_PATH = "/desk"
+_INSTANCE_PATH = "/instance"
 Answer = Callable[[Any, Request], Response | None]
 Handler = Callable[[Any], Awaitable[None]]
 
@@ -39,28 +41,35 @@ Handler = Callable[[Any], Awaitable[None]]
 class Guard:
     """Decides which requests reach the page.
 
-    Without a `token` only pages and browsers of this machine do: the name asked for must be a loopback one, which also
-    defeats a foreign name that resolves to it. With one, the first request must carry it and gets a cookie. A
-    WebSocket must come from a page of this same server. `open` is False until the page is whole; its `port` tells its
-    cookie from that of another page, as a browser keeps the cookies of a host together.
+    Every request must carry the `token`, in its query or in the cookie that the first one gets. `local`: the name asked
+    for must moreover be a loopback one, which defeats a foreign name that resolves to it. A WebSocket must come from a
+    page of this same server. `open` is False until the page is whole; its `port` tells its cookie from that of another
+    page, as a browser keeps the cookies of a host together. `alone`: no other program can listen on this port under
+    the other name of this machine, so that the desk may hand the token on to that name.
     """
 
-    token: str | None = None
+    token: str
+    local: bool = False
     open: bool = False
     port: int = 0
+    alone: bool = False
 
     def refusal(self, path: str, headers: Headers, upgrade: bool) -> Response | None:
         """The answer to a request that must not go on, or None."""
         if not self.open:
             return _plain(http.HTTPStatus.SERVICE_UNAVAILABLE, "the page is being made; load it again")
         host = headers.get("Host", "")
-        if self.token is None and urlsplit(f"//{host}").hostname not in _LOOPBACK_NAMES:
+        if self.local and urlsplit(f"//{host}").hostname not in _LOOPBACK_NAMES:
             return _plain(http.HTTPStatus.FORBIDDEN, "this page is for this machine only")
         if upgrade and headers.get("Origin") not in {f"http://{host}", f"https://{host}"}:
             return _plain(http.HTTPStatus.FORBIDDEN, "only this server's own page may connect")
-        if self.token is None or self._same(_cookie(headers, self._cookie_name)):
+        address = urlsplit(path)
+        # Says nothing but which server this is, and is asked for under a name for which the browser has no cookie.
+        if self._same(_cookie(headers, self._cookie_name)) or (address.path == _INSTANCE_PATH and not upgrade):
             return None
-        if not upgrade and self._same(parse_qs(urlsplit(path).query).get("token", [""])[0]):
+        if self._same(parse_qs(address.query).get("token", [""])[0]):
+            if upgrade or address.path != "/":
+                return None
             cookie = f"{self._cookie_name}={self.token}; HttpOnly; SameSite=Strict; Path=/"
             return _answer(http.HTTPStatus.SEE_OTHER, "welcome", {"Location": "/", "Set-Cookie": cookie})
         return _plain(
@@ -72,7 +81,7 @@ class Guard:
         return f"{_COOKIE}-{self.port}"
 
     def _same(self, offered: str) -> bool:
-        return self.token is not None and hmac.compare_digest(offered.encode(), self.token.encode())
+        return hmac.compare_digest(offered.encode(), self.token.encode())
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,14 +96,18 @@ class Page:
 def serving(label: str, host: str = LOOPBACK, port: int = DEFAULT_PORT, desk: Desk | None = None) -> Iterator[Page]:
     """Serve a page until the block ends; port 0 takes a free one. With a desk that is what opens, with the scene in it.
 
-    Any host but 127.0.0.1 makes a token, which is part of the printed address. Raises InputError if the port is taken
-    or the host is none of this machine's.
+    The address carries the page's token. Raises InputError if the port is taken, the host is none of this machine's, or
+    the token of the environment is none.
     """
     _check_free(host, port)
-    guard = Guard(None if host == LOOPBACK else secrets.token_urlsafe(16))
+    try:
+        guard = Guard(page_token(), local=host == LOOPBACK)
+    except ValueError as error:
+        raise InputError(str(error)) from None
     with _guarded(guard, desk), redirect_stdout(io.StringIO()):
         server = viser.ViserServer(host=host, port=port, label=label, verbose=False)
     try:
+        elsewhere = _held_on_ipv6(server.get_port()) if guard.local else None
         # Looked up when a client asks for it, so this is enough to keep the tunnel shut.
         server.request_share_url = lambda verbose=True: None  # type: ignore[method-assign]
         taken = server.get_port()
@@ -102,9 +115,10 @@ def serving(label: str, host: str = LOOPBACK, port: int = DEFAULT_PORT, desk: De
             raise InputError(f"--port {port}: another program took it just now; give another one")
         server.gui.configure_theme(show_share_button=False, show_logo=False, dark_mode=False)
         guard.port = taken
+        guard.alone = elsewhere is not None
         guard.open = True
-        suffix = "" if guard.token is None else f"?token={guard.token}"
-        yield Page(server, f"http://{host}:{taken}/{suffix}")
+        with elsewhere or nullcontext():
+            yield Page(server, page_address(host, taken, guard.token))
     finally:
         with redirect_stdout(io.StringIO()):
             server.stop()
@@ -122,15 +136,16 @@ def _guarded(guard: Guard, desk: Desk | None) -> Iterator[None]:
             upgrade = request.headers.get("Upgrade", "").lower() == "websocket"
             response = guard.refusal(request.path, request.headers, upgrade)
             if response is None and desk is not None and not upgrade:
-                response = _desk_answer(desk, instance, request)
+                response = _desk_answer(desk, instance, guard, request)
             if response is None:
                 response = process_request(connection, request)
             if response is not None:
+                response.headers["Referrer-Policy"] = "no-referrer"
                 response.headers["Content-Security-Policy"] = f"frame-ancestors {_framers(request)}"
             return response
 
         async def handle(connection: Any) -> None:
-            if desk is not None and connection.request.path == _DESK_PATH:
+            if desk is not None and urlsplit(connection.request.path).path == _DESK_PATH:
                 await desk.serve(connection)
             else:
                 await handler(connection)
@@ -144,12 +159,17 @@ def _guarded(guard: Guard, desk: Desk | None) -> Iterator[None]:
         websockets.asyncio.server.serve = serve  # type: ignore[misc]
 
 
-def _desk_answer(desk: Desk, instance: str, request: Request) -> Response | None:
+def _desk_answer(desk: Desk, instance: str, guard: Guard, request: Request) -> Response | None:
     """The desk's own pages; None for what belongs to the scene in it."""
     path = urlsplit(request.path).path
     if path == "/":
-        return _answer(http.HTTPStatus.OK, "", {"Cache-Control": "no-store"}, desk.page(instance))
-    if path == "/instance":
+        return _answer(
+            http.HTTPStatus.OK,
+            "",
+            {"Cache-Control": "no-store"},
+            desk.page(instance, guard.token if guard.alone else ""),
+        )
+    if path == _INSTANCE_PATH:
         origin = request.headers.get("Origin", "")
         own = urlsplit(origin).hostname in _LOOPBACK_NAMES
         return _answer(http.HTTPStatus.OK, instance, {"Access-Control-Allow-Origin": origin} if own else {})
@@ -162,6 +182,26 @@ def _framers(request: Request) -> str:
         return "'none'"
     port = urlsplit(f"//{request.headers.get('Host', '')}").port
     return "'self' " + " ".join(f"http://{name}:{port}" for name in sorted(_LOOPBACK_NAMES))
+
+
+def _held_on_ipv6(port: int) -> socket.socket | None:
+    """Keep other users from listening at [::1], where a browser looks for "localhost" first; None if one does already.
+
+    The scene is asked for under that name with the token in its address.
+    """
+    try:
+        held = socket.socket(socket.AF_INET6, socket.SOCK_STREAM)
+    except OSError:
+        # A machine without IPv6 has nobody there.
+        return socket.socket()
+    try:
+        # Bound and not listening: the browser is refused there, and goes on to 127.0.0.1.
+        held.bind(("::1", port))
+    except OSError as error:
+        if error.errno == errno.EADDRINUSE:
+            held.close()
+            return None
+    return held
 
 
 def _check_free(host: str, port: int) -> None:

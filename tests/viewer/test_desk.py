@@ -68,18 +68,26 @@ def daemon(tmp_path):
     made.close()
 
 
+COOKIES = {}
+
+
 @contextmanager
 def desk_of(socket, robot=ROBOT_FILE):
     """A served desk, and its port."""
     desk = Desk(socket, robot)
     with serving("test", port=0, desk=desk) as page:
-        yield desk, urlsplit(page.url).port
+        address = urlsplit(page.url)
+        COOKIES[address.port] = f"disco-hw-token-{address.port}={address.query.removeprefix('token=')}"
+        yield desk, address.port
     desk.close()
 
 
 @contextmanager
 def line_to(port, origin=None):
-    with connect(f"ws://127.0.0.1:{port}/desk", origin=origin or f"http://127.0.0.1:{port}", open_timeout=10) as line:
+    own, cookie = f"http://127.0.0.1:{port}", {"Cookie": COOKIES[port]}
+    with connect(
+        f"ws://127.0.0.1:{port}/desk", origin=origin or own, additional_headers=cookie, open_timeout=10
+    ) as line:
         yield line
 
 
@@ -255,11 +263,12 @@ def test_with_another_address_there_is_no_control_without_its_token(daemon):
 
 def test_the_desk_is_what_opens_and_nobody_else_may_frame_it(daemon):
     with desk_of(daemon.server.path) as (_, port):
-        response, body = get(port)
+        cookie = {"Cookie": COOKIES[port]}
+        response, body = get(port, **cookie)
         assert b"E-STOP" in body
         assert b"@@" not in body
         assert response.getheader("Content-Security-Policy") == "frame-ancestors 'none'"
-        response, scene = get(port, "/index.html")
+        response, scene = get(port, "/index.html", **cookie)
         assert b"E-STOP" not in scene
         assert f"http://127.0.0.1:{port}" in response.getheader("Content-Security-Policy")
         own, instance = get(port, "/instance", Origin=f"http://localhost:{port}")

@@ -3,6 +3,7 @@
 import http.client
 import socket
 import time
+from contextlib import closing
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -15,6 +16,7 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from disco_hw.errors import InputError
+from disco_hw.viewer.desk import Desk
 from disco_hw.viewer.server import Guard, serving
 
 SUBPROTOCOL = f"viser-v{viser.__version__}"
@@ -24,6 +26,11 @@ SUBPROTOCOL = f"viser-v{viser.__version__}"
 def page():
     with serving("test", port=0) as served:
         yield served
+
+
+def cookie_of(page):
+    """What a browser sends once it has opened the printed address."""
+    return {"Cookie": f"disco-hw-token-{port_of(page)}={urlsplit(page.url).query.removeprefix('token=')}"}
 
 
 def get(port, path="/", host=None, **headers):
@@ -46,24 +53,92 @@ def port_of(page):
 
 def test_the_own_page_is_served_and_may_connect(page):
     port = port_of(page)
-    response, body = get(port)
+    response, body = get(port, **cookie_of(page))
     assert response.status == 200
     assert b"<html" in body
     for name in ("127.0.0.1", "localhost"):
-        assert get(port, host=f"{name}:{port}")[0].status == 200
-    with upgrade(port, f"http://127.0.0.1:{port}") as client:
+        assert get(port, host=f"{name}:{port}", **cookie_of(page))[0].status == 200
+    with upgrade(port, f"http://127.0.0.1:{port}", cookie_of(page)) as client:
         assert client.recv(timeout=10)
+
+
+@pytest.mark.parametrize("path", ["/", "/index.html", "/desk", "/?token=", "/?token=wrong", "/instance/../"])
+def test_another_user_of_this_machine_gets_nothing_without_the_token(page, path):
+    # Who he is cannot be seen on a loopback address; he has no token.
+    port = port_of(page)
+    response, body = get(port, path)
+    assert response.status == 403
+    assert b"open the address with its token" in body
+    for headers in ({}, {"Cookie": f"disco-hw-token-{port}=wrong"}):
+        with pytest.raises(InvalidStatus) as refused:
+            connect(
+                f"ws://127.0.0.1:{port}{path}", origin=f"http://127.0.0.1:{port}", subprotocols=[SUBPROTOCOL],
+                additional_headers=headers, open_timeout=10,
+            )  # fmt: skip
+        assert refused.value.response.status_code == 403
+
+
+def test_the_printed_address_lets_in_and_the_cookie_keeps(page):
+    port, query = port_of(page), urlsplit(page.url).query
+    assert len(query.removeprefix("token=")) >= 16
+    welcome, _ = get(port, f"/?{query}")
+    assert (welcome.status, welcome.getheader("Location")) == (303, "/")
+    assert welcome.getheader("Referrer-Policy") == "no-referrer"
+    assert welcome.getheader("Set-Cookie").startswith(cookie_of(page)["Cookie"])
+    assert get(port, **cookie_of(page))[0].status == 200
+
+
+def test_the_scene_gets_in_by_its_address_as_its_name_has_no_cookie(page):
+    port, query = port_of(page), urlsplit(page.url).query
+    assert get(port, f"/index.html?{query}", host=f"localhost:{port}")[0].status == 200
+    address = f"ws://127.0.0.1:{port}/?{query}"
+    with connect(address, origin=f"http://127.0.0.1:{port}", subprotocols=[SUBPROTOCOL], open_timeout=10) as client:
+        assert client.recv(timeout=10)
+
+
+def test_nobody_else_can_listen_where_a_browser_looks_for_localhost_first(page):
+    with socket.socket(socket.AF_INET6) as stranger:
+        stranger.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        with pytest.raises(OSError, match="in use"):
+            stranger.bind(("::1", port_of(page)))
+
+
+def test_where_somebody_listens_there_already_the_token_is_not_handed_on(tmp_path):
+    desk = Desk(tmp_path / "none.sock", tmp_path / "none.toml")
+    with closing(desk), socket.socket(socket.AF_INET6) as stranger:
+        stranger.bind(("::1", 0))
+        stranger.listen(1)
+        port = stranger.getsockname()[1]
+        with serving("test", port=port, desk=desk) as served:
+            token = urlsplit(served.url).query.removeprefix("token=")
+            assert token.encode() not in get(port, **cookie_of(served))[1]
+    with (
+        closing(Desk(tmp_path / "none.sock", tmp_path / "none.toml")) as other,
+        serving("t", port=0, desk=other) as alone,
+    ):
+        token = urlsplit(alone.url).query.removeprefix("token=")
+        assert token.encode() in get(port_of(alone), **cookie_of(alone))[1]
+
+
+def test_the_token_of_the_environment_is_taken_and_a_short_one_refused(monkeypatch):
+    monkeypatch.setenv("DISCO_HW_PAGE_TOKEN", "of-my-own-and-long_enough")
+    with serving("test", port=0) as served:
+        assert served.url.endswith("?token=of-my-own-and-long_enough")
+    for bad in ("short", "with a blank in the middle", "ö" * 20):
+        monkeypatch.setenv("DISCO_HW_PAGE_TOKEN", bad)
+        with pytest.raises(InputError, match="DISCO_HW_PAGE_TOKEN"), serving("test", port=0):
+            pass
 
 
 @pytest.mark.parametrize("origin", ["http://evil.example", "http://127.0.0.1:1", "null", None])
 def test_a_foreign_page_may_not_connect(page, origin):
-    with pytest.raises(InvalidStatus) as refused, upgrade(port_of(page), origin):
+    with pytest.raises(InvalidStatus) as refused, upgrade(port_of(page), origin, cookie_of(page)):
         pass
     assert refused.value.response.status_code == 403
 
 
 def test_a_foreign_name_for_this_machine_is_refused(page):
-    response, body = get(port_of(page), host="evil.example")
+    response, body = get(port_of(page), host="evil.example", **cookie_of(page))
     assert response.status == 403
     assert b"this machine only" in body
 
@@ -79,7 +154,7 @@ def test_a_client_that_asks_for_a_public_tunnel_gets_none(page, monkeypatch):
     dug = []
     monkeypatch.setattr(viser._viser, "ViserTunnel", lambda *arguments, **named: dug.append(arguments))
     port = port_of(page)
-    with upgrade(port, f"http://127.0.0.1:{port}") as client:
+    with upgrade(port, f"http://127.0.0.1:{port}", cookie_of(page)) as client:
         client.recv(timeout=10)
         client.send(msgspec.msgpack.encode({"type": "ShareUrlRequest"}))
         # Whatever it makes of the request happens in a thread of its own.
@@ -142,8 +217,10 @@ def test_two_pages_of_one_host_do_not_take_each_others_token():
 
 
 def test_a_page_in_the_making_answers_nobody():
-    guard = Guard()
-    headers = Headers({"Host": "127.0.0.1:8080", "Origin": "http://127.0.0.1:8080"})
+    guard = Guard("secret")
+    headers = Headers(
+        {"Host": "127.0.0.1:8080", "Origin": "http://127.0.0.1:8080", "Cookie": "disco-hw-token-0=secret"}
+    )
     assert guard.refusal("/", headers, upgrade=True).status_code == 503
     guard.open = True
     assert guard.refusal("/", headers, upgrade=True) is None
