@@ -94,7 +94,7 @@ def _long(directory: Path) -> dict[str, float]:
     encode = batch_encoder()
     messages = [encode(k, k * 10**9 // RATE_HZ, _tick(k, k * 10**9 // RATE_HZ)) for k in range(1, 501)]
     file = LogFile(path)
-    log = McapLog(file, Start(str(path), "", "bench", "", 1, 0, 0, 0))
+    log = McapLog(file, Start(str(path), "bench", "", 0, 0))
     begin = time.perf_counter()
     for k in range(ticks):
         log.write(messages[k % len(messages)])

@@ -51,11 +51,9 @@ def tick(k, t_ns=None):
 def start(path=Path("memory"), **changes):
     given = {
         "path": str(path),
-        "endpoint": "ipc://nowhere",
         "robot": "wombot",
         "version": "1.2.3",
         "part": 1,
-        "parent_pid": 1,
         "start_ns": 5,
         "wall_offset_ns": WALL_OFFSET_NS,
         "attachments": ATTACHMENTS,
@@ -63,7 +61,7 @@ def start(path=Path("memory"), **changes):
     return Start(**(given | changes))
 
 
-def log_bytes(ticks, finish=True, flush_every=None, numbers=False, **changes):
+def log_bytes(ticks, finish=True, flush_every=None, numbers=False, end=None, **changes):
     """A log in memory: `ticks` are (now_ns, records); `flush_every` ends a chunk after so many ticks.
 
     With `numbers` a tick's number is its time in periods, so that a missing one leaves a gap.
@@ -76,6 +74,8 @@ def log_bytes(ticks, finish=True, flush_every=None, numbers=False, **changes):
         if flush_every and number % flush_every == 0:
             log.flush()
     log.flush()
+    if end is not None:
+        log.end(end)
     if finish:
         log.finish()
     return sink.getvalue()

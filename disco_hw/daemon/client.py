@@ -19,6 +19,9 @@ ADAPT_ACTIONS = ("revert", "adapt")
 """Back to the belief of the model file, and learning again."""
 ACTIONS = ("arm", "start", "stop", "disarm", "estop", "reset", "status", "quit", *ADAPT_ACTIONS)
 TASK = "task"
+UNRECORDED = "unrecorded"
+"""What `arm` must say where nothing is being recorded although it should be."""
+UNRECORDED_REMEDY = "mend that, or arm with --unrecorded"
 PAGE_ACTIONS = (TASK, "drive")
 """What takes arguments: another circle, and a hand on the page's pad."""
 ASKED = (*ACTIONS, TASK)
@@ -32,8 +35,10 @@ def socket_path(config: RobotConfig) -> Path:
     return Path(configured) if configured is not None else default_socket_path(config.robot.name)
 
 
-def ask(robot: Path, action: str, changes: Sequence[str] = ()) -> dict[str, Any]:
+def ask(robot: Path, action: str, changes: Sequence[str] = (), unrecorded: bool = False) -> dict[str, Any]:
     """Send one request to the daemon of `robot`; `changes`, as "radius_m=0.8", are for `task` alone.
+
+    `unrecorded`, for `arm` alone: arm even though nothing is recorded that should be.
 
     Raises InputError for an unknown action and for changes that are none, and WorkError without a daemon; for an e-stop
     with what stops the robot all the same.
@@ -43,7 +48,9 @@ def ask(robot: Path, action: str, changes: Sequence[str] = ()) -> dict[str, Any]
     if (action == TASK) != bool(changes):
         said = "say what to change" if action == TASK else f"{action} takes nothing more; only {TASK} does"
         raise InputError(f"{said}: ctl {robot} {TASK} radius_m=0.8 speed_m_s=0.3")
-    request = {"do": action} | dict(map(_change, changes))
+    if unrecorded and action != "arm":
+        raise InputError(f"--unrecorded: only arm takes it, and not {action}; leave it out")
+    request: dict[str, Any] = {"do": action} | dict(map(_change, changes)) | ({UNRECORDED: True} if unrecorded else {})
     try:
         path = socket_path(load_robot_config(robot))
         for line in passed_over(path):
@@ -100,6 +107,24 @@ def in_words(reply: dict[str, Any], robot: Path) -> str:
             )
         )
         lines.append(f"adaptation: {adaptation['text']}")
-    if reply["recorder"]["last_error"]:
-        lines.append(f"recording: {reply['recorder']['last_error']}")
+    recorder = reply["recorder"]
+    if recorder["fault"]:
+        lines.append(f"RECORDING: {recorder['fault']}")
+    if recorder["path"]:
+        lines.append(f"recording {recording_in_words(recorder)}")
+    if recorder["last_error"] and recorder["last_error"] not in recorder["fault"]:
+        lines.append(f"recording, last error: {recorder['last_error']}")
     return "\n".join(lines)
+
+
+def recording_in_words(recorder: Mapping[str, Any]) -> str:
+    """Where every tick that the recorder of a status was given has gone."""
+    given = recorder["ticks"] + recorder["dropped_ticks"]
+    counts = {"waiting": "waiting_ticks", "dropped": "dropped_ticks", "lost with a deleted file": "lost_ticks"}
+    words = [f"{recorder['delivered_ticks']} of {given} ticks"]
+    words += [f"{recorder[count]} {what}" for what, count in counts.items() if recorder[count]]
+    if recorder["refused"]:
+        words.append(f"{recorder['refused']} records refused")
+    if recorder["writer_deaths"]:
+        words.append(f"begun anew {recorder['writer_deaths']} times")
+    return f"{recorder['path']}: {', '.join(words)}"

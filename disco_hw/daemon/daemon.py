@@ -8,7 +8,7 @@ import json
 import sys
 from collections.abc import Callable
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,14 @@ from disco_hw.adaptation.guard import check_adaptable
 from disco_hw.adaptation.link import ProcessLink
 from disco_hw.config import RobotConfig
 from disco_hw.daemon import realtime
-from disco_hw.daemon.client import ADAPT_ACTIONS, PAGE_ACTIONS, SERVED, socket_path
+from disco_hw.daemon.client import (
+    ADAPT_ACTIONS,
+    PAGE_ACTIONS,
+    SERVED,
+    UNRECORDED_REMEDY,
+    recording_in_words,
+    socket_path,
+)
 from disco_hw.daemon.clock import Clock, MonotonicClock
 from disco_hw.daemon.compile_progress import compile_progress
 from disco_hw.daemon.control_socket import ControlMessage, ControlServer
@@ -51,6 +58,7 @@ from drivers.types import Request, Transport
 from firmware_protocol.dbc import packaged_dbc
 
 _SECOND_NS = 1_000_000_000
+_RECORDER_NS = _SECOND_NS // 10
 _COLLECT_NS = 5 * _SECOND_NS
 _STOP_LIMIT_NS = 1_500_000_000
 _FAN_NS = _SECOND_NS
@@ -206,6 +214,7 @@ class Daemon:
         self._quit = False
         self._failed = False
         self._next_second_ns = 0
+        self._next_recorder_ns = 0
         self._next_collect_ns = 0
         self._next_fan_ns = 0
         self._fan: tuple[records.Record, ...] = ()
@@ -265,7 +274,7 @@ class Daemon:
     def _tick(self, now_ns: int) -> None:
         mark = self._loop.stages.mark
         messages = self._server.poll()
-        requests = tuple(UserRequest(message.action) for message in messages if message.action in _REQUESTS)
+        requests = tuple(_request(message) for message in messages if message.action in _REQUESTS)
         for message in messages:
             if message.action == "drive":
                 self._steer(now_ns, message)
@@ -277,7 +286,7 @@ class Daemon:
         tick = self._core.tick(
             now_ns,
             (*requests, *wanted.requests),
-            (self._timing(now_ns), *self._every_second(now_ns), *self._fan, *told),
+            (self._timing(now_ns), *self._mind_recorder(now_ns), *self._every_second(now_ns), *self._fan, *told),
             mark,
             wanted.motion,
         )
@@ -325,14 +334,25 @@ class Daemon:
         self._next_fan_ns = now_ns + (_WATCHED_FAN_NS if self._recorder.watched else _FAN_NS)
         return (records_of_tick.fan(now_ns, rollouts),)
 
+    def _mind_recorder(self, now_ns: int) -> tuple[records.Record, ...]:
+        """Look after the recorder ten times a second; what happens to it goes to the terminal, the log and the page."""
+        if now_ns < self._next_recorder_ns:
+            return ()
+        self._next_recorder_ns = now_ns + _RECORDER_NS
+        last = self._core.last
+        if last is None or last.output.state not in {State.ARMED, State.STOPPING}:
+            self._recorder.tend()
+        self._recorder_stats = self._recorder.poll()
+        self._core.recording_fault = self._recorder_stats.fault
+        news = self._recorder.news()
+        for sentence in news:
+            self._say("recording", sentence)
+        return tuple(records.Event(now_ns, "warning", "recording", sentence) for sentence in news)
+
     def _every_second(self, now_ns: int) -> tuple[records.Record, ...]:
         if now_ns < self._next_second_ns:
             return ()
         self._next_second_ns = now_ns + _SECOND_NS
-        before = self._recorder_stats
-        self._recorder_stats = self._recorder.poll()
-        if self._recorder_stats.last_error and self._recorder_stats.last_error != before.last_error:
-            self._say("recording", self._recorder_stats.last_error)
         self._loop_figures = loop_figures(self._loop.stats)
         last = self._core.last
         if last is not None:
@@ -388,6 +408,8 @@ class Daemon:
                 reply = remaining.pop(0)
                 body: dict[str, Any] = {"ok": reply.accepted}
                 body["text" if reply.accepted else "error"] = reply.text
+                if reply.request is UserRequest.ARM and not reply.accepted and reply.text == self._core.recording_fault:
+                    body |= {"error": f"{reply.text}; {UNRECORDED_REMEDY}", "unrecorded": True}
             elif message.action in ADAPT_ACTIONS:
                 obeyed, text = self._core.adaptation.ask(message.action)
                 body = {"ok": obeyed, "text" if obeyed else "error": text}
@@ -399,7 +421,14 @@ class Daemon:
             self._server.reply(message, body)
 
 
-_REQUESTS = frozenset(request.value for request in UserRequest)
+_REQUESTS = frozenset(request.value for request in UserRequest if request is not UserRequest.ARM_UNRECORDED)
+
+
+def _request(message: ControlMessage) -> UserRequest:
+    """What a message asks of the supervisor."""
+    if message.action == UserRequest.ARM.value and message.arguments.get("unrecorded") is True:
+        return UserRequest.ARM_UNRECORDED
+    return UserRequest(message.action)
 
 
 def _compiled(setup: Setup) -> str:
@@ -432,8 +461,10 @@ def _make_recorder(setup: Setup, log: Path | None) -> Recorder:
 
 def _close_recorder(recorder: Recorder, say: Say) -> None:
     stats = recorder.close()
-    if stats.dropped_ticks or stats.refused:
-        say("recording", f"{stats.dropped_ticks} ticks dropped, {stats.refused} records refused")
+    for sentence in recorder.news():
+        say("recording", sentence)
+    if stats.path:
+        say("recording", recording_in_words(asdict(stats)))
 
 
 def in_text(topic: str, text: str) -> str:

@@ -132,6 +132,14 @@ class WatchedRecorder:
         """The recorder's counters."""
         return self._recorder.poll()
 
+    def news(self) -> tuple[str, ...]:
+        """The recorder's."""
+        return self._recorder.news()
+
+    def tend(self) -> None:
+        """Mend the recorder."""
+        self._recorder.tend()
+
     def close(self, timeout_s: float = 5.0) -> RecorderStats:
         """End the log; the feed is closed by who made it."""
         return self._recorder.close(timeout_s)

@@ -174,6 +174,13 @@ class LogReader:
         """Nothing is lost in memory."""
         return RecorderStats()
 
+    def news(self) -> tuple[str, ...]:
+        """Nothing happens to it."""
+        return ()
+
+    def tend(self) -> None:
+        """Nothing of it can break."""
+
     def close(self, timeout_s: float = 5.0) -> RecorderStats:
         """There is nothing to close."""
         return RecorderStats()

@@ -41,14 +41,24 @@ def export(path: Path, out: Path, as_json: bool) -> str:
     return "\n".join([f"{out}: {rows} rows, {drive.segments} segments", *drive.notes])
 
 
+def _end_in_words(summary: LogSummary) -> str:
+    """What the file proves of its end."""
+    if summary.ended:
+        return "ended properly" if summary.complete else "ended by its recorder, but the file is not whole"
+    if summary.ended is None:
+        index = "whole" if summary.complete else "without its end"
+        return f"the file is {index}, and its version did not record whether its recorder ended it"
+    return f"nothing after {summary.end}: the daemon or its recorder was gone then, or the log is still being written"
+
+
 def _in_words(summary: LogSummary) -> str:
     size_mb = summary.bytes / 1e6
-    ended = "ended properly" if summary.complete else "not ended properly"
     lines = [
         f"{summary.path}: {summary.robot}, {summary.duration_s:.1f} s from {summary.start}, {size_mb:.2f} MB",
         f"recorded by disco-hw {summary.version or 'of unknown version'}, part {summary.part}",
-        f"{summary.ticks} ticks, {summary.missing_ticks} missing; {ended}",
+        f"{summary.ticks} ticks, {summary.missing_ticks} missing; {_end_in_words(summary)}",
     ]
+    lines += [f"continues {summary.continues}"] if summary.continues else []
     lines += [
         f"  {topic:<24} {item.count:>9}  {item.rate_hz:8.1f} Hz" for topic, item in sorted(summary.topics.items())
     ]

@@ -1,26 +1,27 @@
-"""What recorder and writer say to each other: the start file, the batches, the status lines.
+"""What recorder, keeper and writer say to each other.
 
-The start file goes ahead on disk, so that a writer started anew knows what the file begins with. Batches go over a
-local ZeroMQ socket, one message for each tick. Status lines come back over the writer's standard output.
+The recorder hands records to the writer over a stream socket, one frame a tick, and the writer answers on the same
+socket with how far it has come: a tick is delivered when it is in the file, not when it was sent. The keeper, on
+another socket, starts writers, which inherit what every log begins with (`Start`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import struct
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Literal
 
 import msgspec
 
 from disco_hw.log.records import TOPIC_INDEX, TOPICS, Record
 
-END = b""
-"""The message after which no batch follows."""
-
-EXIT_CANNOT_CREATE = 73
-EXIT_CANNOT_WRITE = 74
-
 ENCODE_ERRORS = (TypeError, ValueError, OverflowError, KeyError)
 """What encoding raises for something that is not a record, or a record with content that it cannot have."""
+
+TICK, END = 0, 1
+"""Kinds of frames to the writer: a `Batch`, and the `End` after which none follows."""
+
+_HEAD = struct.Struct(">BI")
 
 
 class Attachment(msgspec.Struct, frozen=True):
@@ -32,30 +33,73 @@ class Attachment(msgspec.Struct, frozen=True):
 
 
 class Start(msgspec.Struct, frozen=True):
-    """Everything a writer must know; wall-clock time is monotonic time plus `wall_offset_ns` throughout the log."""
+    """Everything a writer must know; wall-clock time is monotonic time plus `wall_offset_ns` throughout the log.
+
+    `path` is the first part's. A later part names the file that it continues, of which it is known that ticks up to
+    `continues_sequence` are in it.
+    """
 
     path: str
-    endpoint: str
     robot: str
     version: str
-    part: int
-    parent_pid: int
     start_ns: int
     wall_offset_ns: int
+    part: int = 1
+    continues: str = ""
+    continues_sequence: int = 0
     attachments: tuple[Attachment, ...] = ()
     flush_s: float = 0.5
-    silence_s: float = 10.0
+    beat_s: float = 0.2
     grace_s: float = 3.0
 
 
+class Launch(msgspec.Struct, frozen=True):
+    """To the keeper: start a writer on the socket that comes with this."""
+
+    part: int
+    start_ns: int
+    continues: str
+    continues_sequence: int
+
+
+class Started(msgspec.Struct, frozen=True, tag=True):
+    """From the keeper: the process of the newest writer; 0 if none could be made, `error` says why."""
+
+    pid: int
+    error: str = ""
+
+
+class Ended(msgspec.Struct, frozen=True, tag=True):
+    """From the keeper: how a writer's process ended, negative for a signal."""
+
+    pid: int
+    code: int
+
+
+class End(msgspec.Struct, frozen=True):
+    """The recorder's last word: the number of the last tick that it was given, and how many it had to drop."""
+
+    t_ns: int
+    sequence: int
+    dropped_ticks: int
+
+
 class WriterStatus(msgspec.Struct, frozen=True):
-    """How the writer is doing: totals since its start, and the error that ended it, if any."""
+    """How the writer is doing: what is in its file, and the error that ended it, if any.
+
+    All ticks up to number `sequence` that were sent are in the file, apart from `refused` records. `deleted`: the file
+    was removed, and all that was in it with it.
+    """
 
     state: Literal["recording", "finished", "failed"]
-    records: int
-    refused: int
-    bytes: int
+    path: str
+    part: int
+    sequence: int = 0
+    records: int = 0
+    refused: int = 0
+    bytes: int = 0
     error: str = ""
+    deleted: bool = False
 
 
 class Batch(msgspec.Struct, frozen=True, array_like=True):
@@ -64,6 +108,37 @@ class Batch(msgspec.Struct, frozen=True, array_like=True):
     sequence: int
     now_ns: int
     records: tuple[tuple[int, msgspec.Raw], ...]
+
+
+def frame(kind: int, payload: bytes) -> bytes:
+    """One frame of the stream to the writer."""
+    return _HEAD.pack(kind, len(payload)) + payload
+
+
+class Frames:
+    """Takes a stream apart into frames again."""
+
+    def __init__(self) -> None:
+        self._received = bytearray()
+
+    def add(self, data: bytes) -> None:
+        """Take in what came."""
+        self._received += data
+
+    def __iter__(self) -> Iterator[tuple[int, bytes]]:
+        """Kind and payload of each frame that is whole; what is not stays."""
+        offset = 0
+        try:
+            while len(self._received) - offset >= _HEAD.size:
+                kind, length = _HEAD.unpack_from(self._received, offset)
+                end = offset + _HEAD.size + length
+                if end > len(self._received):
+                    return
+                payload = bytes(memoryview(self._received)[offset + _HEAD.size : end])
+                offset = end
+                yield kind, payload
+        finally:
+            del self._received[:offset]
 
 
 def batch_encoder() -> Callable[[int, int, Sequence[Record]], bytes]:

@@ -17,14 +17,17 @@ from mcap_protobuf.schema import build_file_descriptor_set
 
 from disco_hw.log.encoding import encode_json, json_schema
 from disco_hw.log.foxglove import VIEWS, views
-from disco_hw.log.link import Batch, BatchDecoder, Start
+from disco_hw.log.link import Batch, BatchDecoder, End, Start
 from disco_hw.log.records import TOPICS
 
 PROFILE = ""
 LIBRARY = "disco-hw"
 METADATA = "disco-hw"
 RECOVERY = "disco-hw-recovery"
-FORMAT = "1"
+ENDING = "disco-hw-end"
+"""Metadata: about the log, of a mended one, and the recorder's last word, without which nobody ended the log."""
+FORMAT = "2"
+"""Since 2 a log that its recorder ended has a last word."""
 CHUNK_BYTES = 64 * 1024
 
 _NO_LIMIT = 2**62
@@ -47,24 +50,35 @@ class ByteSink(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Metadata:
-    """What the log says of itself: wall-clock time is monotonic time plus `wall_offset_ns`."""
+    """What the log says of itself: wall-clock time is monotonic time plus `wall_offset_ns`.
+
+    A later part `continues` the file of that path, which holds ticks up to number `continues_sequence`; None if that
+    was not recorded.
+    """
 
     robot: str
     version: str
     part: int
     start_ns: int
     wall_offset_ns: int
+    format: str = FORMAT
+    continues: str = ""
+    continues_sequence: int | None = None
 
     def as_text(self) -> dict[str, str]:
         """The form kept in the file."""
         return {
-            "format": FORMAT,
+            "format": self.format,
             "robot": self.robot,
             "version": self.version,
             "part": str(self.part),
             "start_ns": str(self.start_ns),
             "wall_offset_ns": str(self.wall_offset_ns),
-        }
+        } | (
+            {}
+            if self.continues_sequence is None
+            else {"continues": self.continues, "continues_sequence": str(self.continues_sequence)}
+        )
 
     @staticmethod
     def from_text(text: dict[str, str]) -> Metadata:
@@ -72,7 +86,35 @@ class Metadata:
         start_ns, wall_offset_ns = int(text["start_ns"]), int(text["wall_offset_ns"])
         if max(abs(start_ns), abs(wall_offset_ns)) > _MAX_TIME_NS // 2:
             raise ValueError("times of another age of the universe")
-        return Metadata(text["robot"], text["version"], int(text["part"]), start_ns, wall_offset_ns)
+        former = text.get("continues_sequence")
+        return Metadata(
+            text["robot"],
+            text["version"],
+            int(text["part"]),
+            start_ns,
+            wall_offset_ns,
+            text.get("format", ""),
+            text.get("continues", ""),
+            None if former is None else int(former),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Ending:
+    """The recorder's last word: when it ended (monotonic), the last tick's number, and how many ticks it dropped."""
+
+    t_ns: int
+    sequence: int
+    dropped_ticks: int
+
+    def as_text(self) -> dict[str, str]:
+        """The form kept in the file."""
+        return {"t_ns": str(self.t_ns), "sequence": str(self.sequence), "dropped_ticks": str(self.dropped_ticks)}
+
+    @staticmethod
+    def from_text(text: dict[str, str]) -> Ending:
+        """Read what `as_text` wrote; raises KeyError or ValueError on anything else."""
+        return Ending(int(text["t_ns"]), int(text["sequence"]), int(text["dropped_ticks"]))
 
 
 class McapLog:
@@ -88,18 +130,37 @@ class McapLog:
         self._decoder = BatchDecoder()
         self._offset_ns = start.wall_offset_ns
         self._pending_bytes = 0
+        self._sequence = self._flushed_sequence = 0
         self._records = 0
-        self._refused = 0
+        self._refused = self._flushed_refused = 0
         self._last_refusal = ""
         self._writer.start(profile=PROFILE, library=LIBRARY)
         wall_ns = start.start_ns + start.wall_offset_ns
-        metadata = Metadata(start.robot, start.version, start.part, start.start_ns, start.wall_offset_ns)
+        metadata = Metadata(
+            start.robot,
+            start.version,
+            start.part,
+            start.start_ns,
+            start.wall_offset_ns,
+            continues=start.continues,
+            continues_sequence=start.continues_sequence if start.part > 1 else None,
+        )
         self._writer.add_metadata(METADATA, metadata.as_text())
         for attachment in start.attachments:
             self._writer.add_attachment(wall_ns, wall_ns, attachment.name, attachment.media_type, attachment.data)
         self._channels = tuple(self._json_channel(topic.name, topic.record) for topic in TOPICS)
         self._view_channels = self._register_views()
         self._writer.flush()  # type: ignore[no-untyped-call]
+
+    @property
+    def flushed_sequence(self) -> int:
+        """Number of the last tick that was handed to the sink; 0 if none was."""
+        return self._flushed_sequence
+
+    @property
+    def flushed_refused(self) -> int:
+        """Refused records of the ticks up to there."""
+        return self._flushed_refused
 
     @property
     def records(self) -> int:
@@ -123,6 +184,7 @@ class McapLog:
         except msgspec.MsgspecError as error:
             self._refuse(f"a message of {len(message)} bytes: {error}")
             return
+        self._sequence = batch.sequence
         log_time = batch.now_ns + self._offset_ns
         if not 0 <= log_time <= _MAX_TIME_NS:
             self._refuse(f"a tick at the impossible time {batch.now_ns}")
@@ -136,9 +198,18 @@ class McapLog:
         """End the chunk and hand it on, so that a reader can have everything written so far."""
         self._writer.flush()  # type: ignore[no-untyped-call]
         self._pending_bytes = 0
+        self._flushed_sequence = self._sequence
+        self._flushed_refused = self._refused
+
+    def end(self, end: End) -> None:
+        """Write the recorder's last word; no tick comes after it."""
+        self.flush()
+        ending = Ending(end.t_ns, end.sequence, end.dropped_ticks)
+        self._writer.add_metadata(ENDING, ending.as_text())
 
     def finish(self) -> None:
         """Write the index; nothing can be written after it."""
+        self.flush()
         self._writer.finish()  # type: ignore[no-untyped-call]
 
     def _write_record(self, batch: Batch, log_time: int, topic_index: int, data: msgspec.Raw) -> None:

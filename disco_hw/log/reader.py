@@ -27,7 +27,7 @@ from disco_hw.log.container import (
 )
 from disco_hw.log.encoding import JsonDecoder
 from disco_hw.log.errors import LogError
-from disco_hw.log.mcap_log import METADATA, RECOVERY, Metadata
+from disco_hw.log.mcap_log import ENDING, FORMAT, METADATA, RECOVERY, Ending, Metadata
 from disco_hw.log.records import TOPIC_BY_NAME, PlanFigures, Record
 
 _R = TypeVar("_R")
@@ -58,11 +58,20 @@ class TopicSummary(msgspec.Struct, frozen=True):
 
 
 class LogSummary(msgspec.Struct, frozen=True):
-    """What a log holds; `missing_ticks` were dropped on the way to the file, `damage` says what of the file is lost."""
+    """What a log holds and what it proves of its end.
+
+    `missing_ticks` were given to the recorder and are not in the file: between its ticks, before the first as far as
+    the former part says, and after the last where the log was ended. `ended`: the recorder ended it, at `end`; None for
+    a log from before that was recorded. `complete`: its index is there. `continues`: the former part. `damage`: what of
+    the file is lost.
+    """
 
     path: str
     bytes: int
     complete: bool
+    ended: bool | None
+    end: str
+    continues: str
     robot: str
     version: str
     part: int
@@ -88,10 +97,12 @@ class Log:
         try:
             self._contents = _contents(self._fd, path)
             self._metadata = _metadata(self._contents, path)
+            self._ending = _ending(self._contents)
         except BaseException:
             self.close()
             raise
         self._decoder = JsonDecoder()
+        self._last_tick = 0
         self._topics = {
             channel.id: channel.topic
             for channel in self._contents.channels.values()
@@ -119,8 +130,13 @@ class Log:
 
     @property
     def complete(self) -> bool:
-        """Whether the log was ended properly."""
+        """Whether the file has its index, as a writer leaves it that came to its end."""
         return self._contents.complete
+
+    @property
+    def ending(self) -> Ending | None:
+        """The recorder's last word; None if there is none, as the daemon or its recorder was gone before."""
+        return self._ending
 
     @property
     def damage(self) -> tuple[str, ...]:
@@ -215,10 +231,16 @@ class Log:
             ticks += 1
             missing += lost
         duration_s = (last - first) * 1e-9
+        ending = self._ending
+        if ending is not None:
+            missing += max(0, ending.sequence - (self._last_tick or self._metadata.continues_sequence or 0))
         return LogSummary(
             path=str(self._path),
             bytes=self._contents.size,
             complete=self.complete,
+            ended=True if ending is not None else False if self._metadata.format >= FORMAT else None,
+            end=_iso((last if ending is None else ending.t_ns) + self._metadata.wall_offset_ns),
+            continues=self._metadata.continues,
             robot=self._metadata.robot,
             version=self._metadata.version,
             part=self._metadata.part,
@@ -241,14 +263,14 @@ class Log:
     def _ticks(self) -> Iterator[tuple[int, int]]:
         """Time of each tick and the number of ticks missing just before it."""
         # Ticks are numbered from 1 on, in all parts of a log together.
-        previous = 0 if self._metadata.part == 1 else None
+        previous = 0 if self._metadata.part == 1 else self._metadata.continues_sequence
         any_yet = False
         for message in self._messages(None, None, None):
             if any_yet and message.sequence == previous:
                 continue
             lost = 0 if previous is None else (message.sequence - previous - 1) & 0xFFFFFFFF
             yield message.log_time - self._metadata.wall_offset_ns, lost
-            previous = message.sequence
+            previous = self._last_tick = message.sequence
             any_yet = True
 
     def _messages(self, topics: Collection[str] | None, start_ns: int | None, end_ns: int | None) -> Iterator[Message]:
@@ -297,6 +319,16 @@ def _metadata(contents: Contents, path: Path) -> Metadata:
             f"{path}: an MCAP file, but not a log of disco-hw; write it as a CSV, which `disco-hw import` takes"
         )
     raise LogError(f"{path}: nothing of the log is left but its first bytes; there is nothing to read")
+
+
+def _ending(contents: Contents) -> Ending | None:
+    for record in contents.metadata:
+        if record.name == ENDING:
+            try:
+                return Ending.from_text(record.metadata)
+            except (KeyError, ValueError):
+                break
+    return None
 
 
 def _iso(wall_ns: int) -> str:

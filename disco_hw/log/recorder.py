@@ -1,50 +1,63 @@
 """The recording side of the daemon: hands records to the writer's process and never waits for it.
 
-What cannot be handed on is dropped and counted. The socket belongs to the thread that made the recorder.
+What the writer has not confirmed is kept and given to the next one, should it end; what cannot be kept is dropped and
+counted. A recorder belongs to the thread that made it.
 """
 
 from __future__ import annotations
 
-import contextlib
 import os
-import shutil
-import subprocess
-import sys
-import tempfile
+import select
+import signal
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
 import msgspec
-import zmq
 
+from disco_hw.log.delivery import Delivery
 from disco_hw.log.errors import LogError
-from disco_hw.log.link import ENCODE_ERRORS, END, Attachment, Start, WriterStatus, batch_encoder
+from disco_hw.log.keeper_link import KeeperLink
+from disco_hw.log.link import ENCODE_ERRORS, TICK, Attachment, End, Launch, Start, WriterStatus, batch_encoder, frame
 from disco_hw.log.records import Record
-from disco_hw.log.spawn import spawn_at_normal_priority
+from disco_hw.log.writer_line import WriterLine
 
-_STATUS_BYTES = 65_536
+_SENT_PER_TICK = 16
+_SILENCE_S = 0.7
+_PATIENCE_S = 2.0
+_START_PATIENCE_S = 15.0
+_CAUSE_S = 0.3
+_RETRY_S = (0.0, 1.0, 2.0, 5.0)
+_CLOSING_STEP_S = 0.02
 
 
 @dataclass(frozen=True, slots=True)
 class RecorderStats:
-    """Counters since the recorder was made; what the writer says of itself is as old as its last flush.
+    """Counters since the recorder was made.
 
-    `ticks` and `records` were handed on; `dropped_*` were not, because the writer was too slow or dead; `refused` could
-    not be encoded or decoded. `written` and `bytes` are in the present file.
+    Of the ticks given, `ticks` were taken and `dropped_ticks` were not, as too many waited. Those taken are in the
+    log's files (`delivered_ticks`), not confirmed yet (`waiting_ticks`), or were in a file that was deleted
+    (`lost_ticks`). `refused` records could not be encoded or decoded. `path`, `written` records and `bytes` are of the
+    newest file. `fault`: why nothing is being recorded now although it should be; empty if all is well.
     """
 
     ticks: int = 0
     records: int = 0
     dropped_ticks: int = 0
     dropped_records: int = 0
+    delivered_ticks: int = 0
+    waiting_ticks: int = 0
+    lost_ticks: int = 0
     refused: int = 0
     written: int = 0
     bytes: int = 0
     writer_deaths: int = 0
     writer_alive: bool = False
+    path: str = ""
+    fault: str = ""
     last_error: str = ""
 
 
@@ -55,7 +68,13 @@ class Recorder(Protocol):
         """Record what happened in the tick at `now_ns`, in this order."""
 
     def poll(self) -> RecorderStats:
-        """Look after the writer and return the counters; call it about once a second."""
+        """Look after the writer and return the counters; call it ten times a second."""
+
+    def news(self) -> tuple[str, ...]:
+        """What a person should know of the recording, in sentences, since this was last asked."""
+
+    def tend(self) -> None:
+        """Mend what takes milliseconds; call it only while the robot is not armed."""
 
     def close(self, timeout_s: float = 5.0) -> RecorderStats:
         """End the log, wait at most `timeout_s` for the file to be whole, and return the final counters."""
@@ -70,6 +89,13 @@ class NullRecorder:
     def poll(self) -> RecorderStats:
         """Counters of nothing."""
         return RecorderStats()
+
+    def news(self) -> tuple[str, ...]:
+        """Nothing happens to it."""
+        return ()
+
+    def tend(self) -> None:
+        """Nothing of it can break."""
 
     def close(self, timeout_s: float = 5.0) -> RecorderStats:
         """Counters of nothing."""
@@ -90,6 +116,13 @@ class MemoryRecorder:
         """Counters of what was kept."""
         return RecorderStats(ticks=len(self.ticks), records=sum(len(records) for _, records in self.ticks))
 
+    def news(self) -> tuple[str, ...]:
+        """Nothing happens to it."""
+        return ()
+
+    def tend(self) -> None:
+        """Nothing of it can break."""
+
     def close(self, timeout_s: float = 5.0) -> RecorderStats:
         """Counters of what was kept."""
         return self.poll()
@@ -104,7 +137,7 @@ def wall_offset_ns() -> int:
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """What a log begins with, and how much may wait for the writer (`queue_ticks`) before ticks are dropped."""
+    """What a log begins with, and how many ticks may wait for the writer (`queue_ticks`) before more are dropped."""
 
     path: Path
     robot: str
@@ -112,68 +145,66 @@ class Recording:
     attachments: tuple[Attachment, ...] = ()
     queue_ticks: int = 1000
     flush_s: float = 0.5
-    silence_s: float = 10.0
     offset_ns: int = field(default_factory=wall_offset_ns)
 
 
 class ProcessRecorder:
-    """Records through a writer process of its own; it runs at normal priority and in a session of its own.
+    """Records through a writer process, which is replaced when it dies, freezes or cannot write.
 
-    Make it before the loop starts: starting a process takes milliseconds. Raises LogError when the log's directory
-    cannot be made or the file already exists; every later failure is counted and shown by `poll`.
+    Make it before the loop starts: that takes as long as starting Python. A replacement is a fork of another process
+    and costs the loop some microseconds; it begins a file of its own, with all that is not in the former one. Raises
+    LogError when the file exists or cannot be made; every later failure is counted, told by `news` and mended.
     """
 
     def __init__(self, recording: Recording) -> None:
         self._recording = recording
         self._encode = batch_encoder()
-        self._decode_status = msgspec.json.Decoder(WriterStatus).decode
-        self._part = 1
+        self._delivery = Delivery(recording.queue_ticks)
         self._sequence = 0
-        self._ticks = 0
-        self._records = 0
-        self._dropped_ticks = 0
-        self._dropped_records = 0
         self._refused = 0
         self._deaths = 0
         self._last_error = ""
-        self._closing = False
-        self._final = RecorderStats()
-        self._status = WriterStatus("recording", 0, 0, 0)
-        self._status_rest = b""
-        self._process: subprocess.Popen[bytes] | None = None
-        _prepare(recording.path)
-        self._runtime = _runtime_directory()
-        self._endpoint = f"ipc://{self._runtime}/log"
-        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-        self._socket = self._context.socket(zmq.PUSH)
-        self._socket.setsockopt(zmq.SNDHWM, recording.queue_ticks)
-        self._socket.setsockopt(zmq.LINGER, 0)
-        self._socket.setsockopt(zmq.RECONNECT_IVL, 20)
-        try:
-            # The recorder connects, so that batches queue while the writer starts.
-            self._socket.connect(self._endpoint)
-        except zmq.ZMQError as error:
-            self._release()
-            raise LogError(
-                f"{self._runtime}: cannot hold a socket ({error.strerror}); set XDG_RUNTIME_DIR to a short path"
-            ) from None
-        try:
-            self._launch()
-        except LogError:
-            self._release()
-            raise
+        self._news: list[str] = []
+        self._fault = ""
+        self._retries = 0
+        self._retry_s = 0.0
+        self._patience_s = _PATIENCE_S
+        self._stopped_s = 0.0
+        self._next_part = 1
+        self._continues = ""
+        self._frozen = False
+        self._end: bytes | None = None
+        self._final: RecorderStats | None = None
+        _check_place(recording.path)
+        start = Start(
+            path=str(recording.path.absolute()),
+            robot=recording.robot,
+            version=recording.version,
+            start_ns=0,
+            wall_offset_ns=recording.offset_ns,
+            attachments=recording.attachments,
+            flush_s=recording.flush_s,
+        )
+        self._start = start
+        self._keeper = KeeperLink(start)
+        self._line: WriterLine | None = None
+        self._status = WriterStatus("recording", str(recording.path), 1)
+        self._await_first_writer()
 
     @property
     def path(self) -> Path:
-        """The file being written now."""
-        if self._part == 1:
-            return self._recording.path
-        return self._recording.path.with_suffix(f".part{self._part}{self._recording.path.suffix}")
+        """The file being written now, or that was written last."""
+        return Path(self._status.path)
 
     @property
     def writer_pid(self) -> int | None:
-        """The writer's process, or None once it has ended."""
-        return None if self._process is None else self._process.pid
+        """The writer's process, or None while there is none."""
+        return None if self._line is None else self._keeper.pid
+
+    @property
+    def keeper_pid(self) -> int | None:
+        """The process that starts writers, or None once it has ended."""
+        return self._keeper.process_pid
 
     def put(self, now_ns: int, records: Sequence[Record]) -> None:
         """Record what happened in the tick at `now_ns`, in this order; never blocks and never raises."""
@@ -185,70 +216,68 @@ class ProcessRecorder:
         except ENCODE_ERRORS:
             records = self._encodable(now_ns, records)
             message = self._encode(self._sequence, now_ns, records)
-        try:
-            if self._process is None:
-                raise zmq.Again
-            self._socket.send(message, zmq.NOBLOCK)
-        except zmq.ZMQError:
-            self._dropped_ticks += 1
-            self._dropped_records += len(records)
-        else:
-            self._ticks += 1
-            self._records += len(records)
+        if self._final is not None:
+            self._delivery.drop(len(records))
+            return
+        self._delivery.put(self._sequence, len(records), frame(TICK, message))
+        self._exchange(_SENT_PER_TICK)
 
     def poll(self) -> RecorderStats:
-        """Read what the writer says, notice its death, and return the counters."""
-        process = self._process
-        if process is not None:
-            # The exit is looked at before the status is read, so that nothing said before it is missed.
-            code = process.poll()
-            self._read_status(process)
-            if code is not None:
-                self._ended(process, code)
-        return RecorderStats(
-            ticks=self._ticks,
-            records=self._records,
-            dropped_ticks=self._dropped_ticks,
-            dropped_records=self._dropped_records,
-            refused=self._refused + self._status.refused,
-            written=self._status.records,
-            bytes=self._status.bytes,
-            writer_deaths=self._deaths,
-            writer_alive=self._process is not None,
-            last_error=self._last_error,
-        )
+        """Read what the writer says, replace it if it has ended or is silent for long, and return the counters."""
+        if self._final is not None:
+            return self._final
+        self._exchange(_SENT_PER_TICK)
+        self._keeper.read()
+        self._look_after(time.monotonic())
+        return self._stats()
 
-    def restart(self) -> bool:
-        """Start a new writer with a new file part if the writer has died; True if one was started.
+    def news(self) -> tuple[str, ...]:
+        """What a person should know of the recording, in sentences, since this was last asked."""
+        news, self._news = tuple(self._news), []
+        return news
 
-        Takes milliseconds: call it only while the robot is not armed. Raises LogError as the constructor does.
-        """
-        if self._closing or self.poll().writer_alive:
-            return False
-        self._part += 1
-        _prepare(self.path)
-        self._launch()
-        return True
+    def tend(self) -> None:
+        """Start the keeper again if it has died or does not answer: takes milliseconds."""
+        if self._final is None and self._keeper.needs_renewal(time.monotonic()):
+            try:
+                self._keeper.renew()
+            except LogError as error:
+                self._tell(str(error))
+                return
+            self._tell("the process that starts log writers had ended or did not answer; there is another one now")
+            if self._line is None or not self._line.heard:
+                self._line = None
+                self._retry_s = 0.0
 
     def close(self, timeout_s: float = 5.0) -> RecorderStats:
         """End the log and wait at most `timeout_s` for it; a writer still busy then finishes by itself."""
-        if not self._closing:
-            self._closing = True
-            deadline = time.monotonic() + timeout_s
-            self._send_end(deadline)
-            if self._process is not None:
-                with contextlib.suppress(subprocess.TimeoutExpired):
-                    self._process.wait(max(0.0, deadline - time.monotonic()))
-            self._final = self.poll()
-            self._release()
+        if self._final is None:
+            deadline_s = time.monotonic() + timeout_s
+            self._end = msgspec.msgpack.encode(End(time.monotonic_ns(), self._sequence, self._delivery.dropped_ticks))
+            while self._unfinished() and time.monotonic() < deadline_s:
+                self._exchange(self._recording.queue_ticks)
+                self._keeper.read()
+                self._look_after(time.monotonic())
+                self._wait(min(_CLOSING_STEP_S, max(0.0, deadline_s - time.monotonic())))
+            self._final = self._stats()
+            if self._line is not None:
+                self._line.close()
+                self._line = None
+            self._keeper.close()
         return self._final
 
-    def _send_end(self, deadline: float) -> None:
-        while self.poll().writer_alive and time.monotonic() < deadline:
-            with contextlib.suppress(zmq.Again):
-                self._socket.send(END, zmq.NOBLOCK)
-                return
-            time.sleep(0.01)
+    def _await_first_writer(self) -> None:
+        deadline_s = time.monotonic() + _START_PATIENCE_S
+        self._launch()
+        while self._line is not None and not (self._line.heard and self._line.status.state == "recording"):
+            self._exchange(0)
+            self._keeper.read()
+            if self._line.ended or time.monotonic() > deadline_s or not self._keeper.alive:
+                error = self._line.status.error or f"{self._recording.path}: the log writer did not start"
+                self._line.close()
+                self._keeper.close()
+                raise LogError(f"{error}; see what is said above it, or give another path with --log")
+            self._wait(_CLOSING_STEP_S)
 
     def _encodable(self, now_ns: int, records: Sequence[Record]) -> list[Record]:
         """The records that can be encoded; the others are counted."""
@@ -258,72 +287,159 @@ class ProcessRecorder:
                 self._encode(0, now_ns, (record,))
             except ENCODE_ERRORS as error:
                 self._refused += 1
-                self._last_error = f"a {type(record).__name__} could not be recorded: {error}"
+                self._tell(f"a {type(record).__name__} could not be recorded: {error}")
             else:
                 kept.append(record)
         return kept
 
-    def _launch(self) -> None:
-        recording = self._recording
-        start = Start(
-            path=str(self.path.absolute()),
-            endpoint=self._endpoint,
-            robot=recording.robot,
-            version=recording.version,
-            part=self._part,
-            parent_pid=os.getpid(),
-            start_ns=time.monotonic_ns(),
-            wall_offset_ns=recording.offset_ns,
-            attachments=recording.attachments,
-            flush_s=recording.flush_s,
-            silence_s=recording.silence_s,
-        )
-        start_file = self._runtime / f"start{self._part}"
-        try:
-            start_file.write_bytes(msgspec.msgpack.encode(start))
-        except OSError as error:
-            raise LogError(f"{start_file}: cannot be written ({error.strerror}); make room there") from None
-        command = [sys.executable, "-m", "disco_hw.log.writer", str(start_file)]
-        self._status = WriterStatus("recording", 0, 0, 0)
-        self._status_rest = b""
-        self._process = spawn_at_normal_priority(command)
+    def _exchange(self, most: int) -> None:
+        """Send what has not been sent, `most` ticks of it, and take in what is confirmed."""
+        line, delivery = self._line, self._delivery
+        if line is None:
+            return
+        if line.send_rest():
+            for _ in range(most):
+                following = delivery.next_frame()
+                if following is None:
+                    break
+                delivery.sent()
+                if not line.send(following):
+                    break
+            else:
+                following = b""
+            if following is None and self._end is not None:
+                line.send_end(self._end)
+        refusal = line.status.error
+        if line.read():
+            status = self._status = line.status
+            delivery.acknowledge(status.sequence)
+            if status.sequence:
+                self._retries, self._patience_s = 0, _PATIENCE_S
+            if status.state != "failed" and status.error and status.error != refusal:
+                self._tell(f"a record was refused by the log writer: {status.error}")
 
-    def _read_status(self, process: subprocess.Popen[bytes]) -> None:
-        assert process.stdout is not None
-        with contextlib.suppress(BlockingIOError):
-            while data := os.read(process.stdout.fileno(), _STATUS_BYTES):
-                *lines, self._status_rest = (self._status_rest + data).split(b"\n")
-                for line in lines[-1:]:
-                    with contextlib.suppress(msgspec.MsgspecError):
-                        self._status = self._decode_status(line)
-        if self._status.error:
-            self._last_error = self._status.error
+    def _look_after(self, now_s: float) -> None:
+        line = self._line
+        if line is None:
+            if now_s >= self._retry_s and (self._end is None or self._delivery.waiting_ticks):
+                self._launch()
+            return
+        if line.ended:
+            code = self._keeper.code
+            if line.status.state == "recording" and code is None and self._keeper.alive and line.silent_s < _CAUSE_S:
+                return
+            self._writer_ended(now_s, _cause(line, code))
+            return
+        silent_s = line.silent_s
+        if line.ending and not self._delivery.waiting_ticks:
+            return
+        if silent_s < _SILENCE_S:
+            if line.heard:
+                self._recovered()
+            return
+        if line.heard:
+            self._fault = f"the log writer has not answered for {silent_s:.1f} s; what comes is kept and waits"
+            if not self._frozen:
+                self._frozen = True
+                self._tell(self._fault)
+        if silent_s >= (self._patience_s if line.heard else _START_PATIENCE_S):
+            pid = self._keeper.pid
+            if pid:
+                with suppress(ProcessLookupError):
+                    os.kill(pid, signal.SIGKILL)
+            self._patience_s *= 2.0
+            self._writer_ended(now_s, f"the log writer did not answer for {silent_s:.1f} s and was ended")
 
-    def _ended(self, process: subprocess.Popen[bytes], code: int) -> None:
-        assert process.stdout is not None
-        process.stdout.close()
-        self._process = None
-        self._refused += self._status.refused
-        self._status = msgspec.structs.replace(self._status, refused=0)
-        if self._status.state == "finished":
-            if not self._closing:
-                self._deaths += 1
-                self._last_error = "the log writer heard nothing for too long and ended the file"
+    def _writer_ended(self, now_s: float, cause: str) -> None:
+        line = self._line
+        assert line is not None
+        status = line.status
+        line.close()
+        self._line, self._frozen = None, False
+        self._refused += status.refused
+        if status.deleted:
+            self._delivery.file_deleted()
+        if line.heard and not (status.state == "failed" and not status.sequence):
+            self._next_part = status.part + 1
+            self._continues = status.path
+        self._delivery.new_file()
+        if self._end is not None and status.state == "finished":
             return
         self._deaths += 1
-        if self._status.state != "failed":
-            how = f"signal {-code}" if code < 0 else f"exit status {code}"
-            self._last_error = f"the log writer died ({how}); {self.path} holds what it had written"
+        self._fault = f"nothing is being recorded: {cause}"
+        self._retry_s = now_s + _RETRY_S[min(self._retries, len(_RETRY_S) - 1)]
+        self._retries += 1
+        self._tell(cause)
+        self._look_after(now_s)
 
-    def _release(self) -> None:
-        self._socket.close()
-        self._context.term()
-        if self._process is not None and self._process.stdout is not None:
-            self._process.stdout.close()
-        shutil.rmtree(self._runtime, ignore_errors=True)
+    def _launch(self) -> None:
+        launch = Launch(self._next_part, time.monotonic_ns(), self._continues, self._delivery.last_delivered)
+        connection = self._keeper.launch(launch)
+        if connection is not None:
+            self._line = WriterLine(connection, self._start.path, self._next_part)
+            self._next_part = max(2, self._next_part)
+        else:
+            self._retry_s = time.monotonic() + _RETRY_S[-1]
+            self._fault = "nothing is being recorded: the process that starts log writers has ended; disarm to renew it"
+            self._tell(self._fault)
+
+    def _recovered(self) -> None:
+        """The writer writes: say so if it did not, or was another one."""
+        if self._fault:
+            self._fault, self._frozen = "", False
+            self._news.append(f"recording goes on in {self._status.path}")
+
+    def _tell(self, sentence: str) -> None:
+        """Report a failure, but not again while it only repeats itself."""
+        if sentence != self._last_error or self._retries <= 1:
+            self._news.append(sentence)
+        self._last_error = sentence
+
+    def _unfinished(self) -> bool:
+        """Whether there is something to wait for at the end."""
+        return self._line is not None or bool(self._delivery.waiting_ticks)
+
+    def _wait(self, timeout_s: float) -> None:
+        """Wait for the writer, or until it can take more."""
+        if self._line is None or self._line.ended:
+            time.sleep(timeout_s)
+            return
+        full = [self._line] if self._line.full else []
+        select.select([self._line], full, [], timeout_s)
+
+    def _stats(self) -> RecorderStats:
+        delivery, line, status = self._delivery, self._line, self._status
+        return RecorderStats(
+            ticks=delivery.ticks,
+            records=delivery.records,
+            dropped_ticks=delivery.dropped_ticks,
+            dropped_records=delivery.dropped_records,
+            delivered_ticks=delivery.delivered_ticks,
+            waiting_ticks=delivery.waiting_ticks,
+            lost_ticks=delivery.lost_ticks,
+            refused=self._refused + (status.refused if line is not None and line.heard else 0),
+            written=status.records,
+            bytes=status.bytes,
+            writer_deaths=self._deaths,
+            writer_alive=line is not None and line.heard and not line.ended,
+            path=status.path,
+            fault=self._fault,
+            last_error=self._last_error,
+        )
 
 
-def _prepare(path: Path) -> None:
+def _cause(line: WriterLine, code: int | None) -> str:
+    """Why a writer has ended, for a person."""
+    status = line.status
+    if status.state == "failed":
+        return status.error
+    if status.state == "finished":
+        return "the log writer was told to end, and not by the recorder"
+    how = "" if code is None else f" (signal {-code})" if code < 0 else f" (exit status {code})"
+    return f"the log writer died{how}; {status.path} holds what it had written"
+
+
+def _check_place(path: Path) -> None:
     """Make the directory; refuse what the writer could not create."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -335,14 +451,3 @@ def _prepare(path: Path) -> None:
         raise LogError(f"{path}: already exists and a log is never overwritten; give another name")
     if not os.access(path.parent, os.W_OK | os.X_OK):
         raise LogError(f"{path.parent}: cannot be written to; give another directory or mend its permissions")
-
-
-def _runtime_directory() -> Path:
-    """A new directory for the socket, where sockets of this user live; mkdtemp makes it 0700, its owner's alone."""
-    root = os.environ.get("XDG_RUNTIME_DIR", "")
-    if not (root and os.access(root, os.W_OK | os.X_OK)):
-        root = tempfile.gettempdir()
-    try:
-        return Path(tempfile.mkdtemp(prefix="disco-hw-", dir=root))
-    except OSError as error:
-        raise LogError(f"{root}: no directory can be made in it ({error.strerror}); set XDG_RUNTIME_DIR") from None

@@ -1,31 +1,32 @@
-"""The process that writes the log: `python -m disco_hw.log.writer START_FILE`, started by the recorder.
+"""Writes the log, in a process of its own that the keeper has made.
 
-It lives as long as the recorder's process needs it: it ends the file properly on the recorder's end message, when that
-process is gone, or after a long silence. SIGINT is ignored (it is meant for the recorder's process) and SIGTERM only
-sets a time limit: a service manager sends it to all processes at once, and the last second of driving, the stop, is
-still to come then.
+It lives as long as the recorder's process needs it: it ends the file properly on the recorder's last word or when that
+process is gone. SIGTERM only sets a time limit: a service manager sends it to all processes at once, and the last
+second of driving, the stop, is still to come then.
 """
 
 from __future__ import annotations
 
 import contextlib
 import os
+import select
 import signal
-import sys
+import socket
 import time
 from pathlib import Path
 from typing import Literal
 
 import msgspec
-import zmq
 
-from disco_hw.log.link import END, EXIT_CANNOT_CREATE, EXIT_CANNOT_WRITE, Start, WriterStatus
+from disco_hw.log.link import END, End, Frames, Start, WriterStatus
 from disco_hw.log.mcap_log import McapLog
 
-_RECEIVE_HIGH_WATER = 256
-_LARGEST_BURST = 64
-_ORPHAN_DRAIN_S = 0.1
+EXIT_CANNOT_CREATE = 73
+EXIT_CANNOT_WRITE = 74
+
+_RECEIVE_BYTES = 1 << 18
 _LONGEST_ERROR = 300
+_MOST_PARTS = 1000
 
 
 class LogFile:
@@ -48,8 +49,6 @@ class LogFile:
             count = os.write(self._fd, view)
             self._written += count
             view = view[count:]
-        # The library writes whole records at a time.
-        self._whole = self._written
         return len(data)
 
     def tell(self) -> int:
@@ -57,14 +56,20 @@ class LogFile:
         return self._written
 
     def flush(self) -> None:
-        """Do nothing: nothing is buffered."""
+        """Note that what has been written is whole: nothing is buffered."""
+        self._whole = self._written
 
     def sync(self) -> None:
         """Return when what was written is on the disk."""
         os.fsync(self._fd)
 
+    @property
+    def deleted(self) -> bool:
+        """Whether no directory names the file any more."""
+        return os.fstat(self._fd).st_nlink == 0
+
     def cut_to_whole(self) -> None:
-        """Drop a half-written end, so that the file ends with a whole record."""
+        """Drop what came after the last flush, so that the file holds what was confirmed and nothing else."""
         os.ftruncate(self._fd, self._whole)
         self._written = self._whole
 
@@ -74,172 +79,154 @@ class LogFile:
 
 
 class StatusLine:
-    """Status to the recorder over standard output; a recorder that is gone or does not read costs nothing."""
+    """Status to the recorder; a recorder that is gone or does not read costs nothing."""
 
-    def __init__(self, fd: int) -> None:
-        self._fd = fd
-        os.set_blocking(fd, False)
+    def __init__(self, connection: socket.socket) -> None:
+        self._connection = connection
+        self._rest = b""
 
     def send(self, status: WriterStatus) -> None:
-        """Write one line, or drop it; a long error is cut, so that a line is written whole or not at all."""
+        """Send one line, or drop it; a long error is cut, and the rest of a line goes before the next."""
         status = msgspec.structs.replace(status, error=status.error[:_LONGEST_ERROR])
-        with contextlib.suppress(BlockingIOError, BrokenPipeError):
-            os.write(self._fd, msgspec.json.encode(status) + b"\n")
-
-
-class Deadlines:
-    """When to stop waiting for the recorder: pure, all times in monotonic ns."""
-
-    def __init__(self, start: Start, now_ns: int) -> None:
-        self._parent_pid = start.parent_pid
-        self._silence_ns = round(start.silence_s * 1e9)
-        self._grace_ns = round(start.grace_s * 1e9)
-        self._last_message_ns = now_ns
-        self._terminated_ns: int | None = None
-
-    def heard(self, now_ns: int) -> None:
-        """A message came."""
-        self._last_message_ns = now_ns
-
-    def terminate(self, now_ns: int) -> None:
-        """A request to end came; the first one counts."""
-        if self._terminated_ns is None:
-            self._terminated_ns = now_ns
-
-    def orphaned(self, parent_pid: int) -> bool:
-        """Whether the recorder's process is gone."""
-        return parent_pid != self._parent_pid
-
-    def passed(self, now_ns: int) -> bool:
-        """Whether to end the file although the recorder has not said so."""
-        silent = now_ns - self._last_message_ns > self._silence_ns
-        asked = self._terminated_ns is not None and now_ns - self._terminated_ns > self._grace_ns
-        return silent or asked
+        line = self._rest or msgspec.json.encode(status) + b"\n"
+        with contextlib.suppress(OSError):
+            self._rest = line[self._connection.send(line, socket.MSG_DONTWAIT) :]
 
 
 class Session:
     """One log from its first byte to its last: socket in, file out; every method raises OSError from the file."""
 
-    def __init__(self, start: Start, socket: zmq.Socket[bytes], file: LogFile, status: StatusLine) -> None:
+    def __init__(self, start: Start, connection: socket.socket, file: LogFile, line: StatusLine) -> None:
         self._start = start
-        self._socket = socket
+        self._connection = connection
         self._file = file
-        self._status = status
-        self._deadlines = Deadlines(start, time.monotonic_ns())
+        self._line = line
+        self._frames = Frames()
+        self._grace_ends_s: float | None = None
         self._log = McapLog(file, start)
-        self._flush("recording")
+        self._file.sync()
+        self._say("recording")
+
+    @property
+    def sequence(self) -> int:
+        """Number of the last tick in the file; 0 if there is none."""
+        return self._log.flushed_sequence
 
     def terminate(self) -> None:
         """End within the grace time even if the recorder does not say so."""
-        self._deadlines.terminate(time.monotonic_ns())
+        if self._grace_ends_s is None:
+            self._grace_ends_s = time.monotonic() + self._start.grace_s
 
     def run(self) -> None:
-        """Write batches until the recorder ends, then the index."""
-        flush_ns = round(self._start.flush_s * 1e9)
-        next_flush_ns = time.monotonic_ns() + flush_ns
+        """Write ticks until the recorder ends or is gone, then the index."""
+        now_s = time.monotonic()
+        next_flush_s, next_beat_s = now_s + self._start.flush_s, now_s + self._start.beat_s
         ended = False
         while not ended:
-            timeout_ms = max(0, (next_flush_ns - time.monotonic_ns()) // 1_000_000)
-            if self._socket.poll(timeout_ms):
-                ended = self._take_burst()
-                self._deadlines.heard(time.monotonic_ns())
-            if time.monotonic_ns() < next_flush_ns:
-                continue
-            self._flush("recording")
-            now_ns = time.monotonic_ns()
-            next_flush_ns = now_ns + flush_ns
-            if self._deadlines.orphaned(os.getppid()):
-                while not ended and self._socket.poll(round(_ORPHAN_DRAIN_S * 1e3)):
-                    ended = self._take_burst()
-                ended = True
-            ended = ended or self._deadlines.passed(now_ns)
+            ended = self._take(max(0.0, min(next_flush_s, next_beat_s) - time.monotonic()))
+            now_s = time.monotonic()
+            if now_s >= next_flush_s:
+                self._flush("recording")
+                now_s = time.monotonic()
+                next_flush_s = now_s + self._start.flush_s
+            if now_s >= next_beat_s:
+                self._say("recording")
+                next_beat_s = now_s + self._start.beat_s
+            ended = ended or (self._grace_ends_s is not None and now_s > self._grace_ends_s)
         self._log.finish()
         self._flush("finished")
+
+    def _take(self, timeout_s: float) -> bool:
+        """Wait for ticks and write them; True if no more will come."""
+        if not select.select([self._connection], [], [], timeout_s)[0]:
+            return False
+        try:
+            data = self._connection.recv(_RECEIVE_BYTES)
+        except OSError:
+            data = b""
+        self._frames.add(data)
+        before = self.sequence
+        for kind, payload in self._frames:
+            if kind == END:
+                self._log.end(msgspec.msgpack.decode(payload, type=End))
+                return True
+            self._log.write(payload)
+        if self.sequence != before:
+            self._say("recording")
+        return not data
 
     def _flush(self, state: Literal["recording", "finished"]) -> None:
         if state == "recording":
             self._log.flush()
+            # What is in the file outlives this process; the disk may take its time to make it outlive a power cut.
+            self._say(state)
         self._file.sync()
-        log = self._log
-        self._status.send(WriterStatus(state, log.records, log.refused, self._file.tell(), log.last_refusal))
+        if self._file.deleted:
+            raise FileNotFoundError("it was deleted while it was written, and what it held is gone")
+        self._say(state)
 
-    def _take_burst(self) -> bool:
-        """Write what is waiting, so much at most that the flush stays on time; True at the end message."""
-        for _ in range(_LARGEST_BURST):
-            try:
-                message = self._socket.recv(zmq.NOBLOCK)
-            except zmq.Again:
-                return False
-            if message == END:
-                return True
-            self._log.write(message)
-        return False
+    def _say(self, state: Literal["recording", "finished"]) -> None:
+        log, start = self._log, self._start
+        self._line.send(
+            WriterStatus(
+                state, start.path, start.part, self.sequence, log.records, log.flushed_refused, self._file.tell(),
+                log.last_refusal,
+            )
+        )  # fmt: skip
 
 
-def run(start: Start) -> int:
-    """Record to a new file; return the exit status and say on standard error what went wrong."""
-    status = StatusLine(sys.stdout.fileno())
-    path = Path(start.path)
-    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-    socket = context.socket(zmq.PULL)
-    socket.setsockopt(zmq.LINGER, 0)
-    socket.setsockopt(zmq.RCVHWM, _RECEIVE_HIGH_WATER)
+def run(start: Start, connection: socket.socket) -> int:
+    """Record to a new file; return the exit status. `start.path` is the first part's, and so is its number."""
+    line = StatusLine(connection)
     try:
-        socket.bind(start.endpoint)
-        file = LogFile(path)
-    except (OSError, zmq.ZMQError) as error:
-        return _fail(status, EXIT_CANNOT_CREATE, f"{path}: cannot be created ({_reason(error)})", 0)
-    try:
-        session = Session(start, socket, file, status)
-        signal.signal(signal.SIGTERM, lambda *_: session.terminate())
-        session.run()
+        start, file = _create(start)
     except OSError as error:
-        file.cut_to_whole()
-        return _fail(status, EXIT_CANNOT_WRITE, f"{path}: cannot be written ({_reason(error)})", file.tell())
+        words = f"{start.path}: cannot be created ({_reason(error)})"
+        line.send(WriterStatus("failed", start.path, start.part, error=words))
+        return EXIT_CANNOT_CREATE
+    sequence = 0
+    try:
+        session = Session(start, connection, file, line)
+        signal.signal(signal.SIGTERM, lambda *_: session.terminate())
+        try:
+            session.run()
+        finally:
+            sequence = session.sequence
+    except OSError as error:
+        _give_up(start, file, line, error, sequence)
+        return EXIT_CANNOT_WRITE
     finally:
         file.close()
-        socket.close()
-        context.term()
-    if os.getppid() != start.parent_pid:
-        _remove_runtime_directory(Path(start.endpoint.removeprefix("ipc://")))
     return 0
 
 
-def _remove_runtime_directory(socket_file: Path) -> None:
-    """Clear up after a recorder that cannot any more."""
+def _create(start: Start) -> tuple[Start, LogFile]:
+    """Make the file, and its directory where it has gone; a later part takes the next name that is free."""
+    first = Path(start.path)
+    first.parent.mkdir(parents=True, exist_ok=True)
+    if start.part == 1:
+        return start, LogFile(first)
+    for part in range(start.part, start.part + _MOST_PARTS):
+        path = first.with_suffix(f".part{part}{first.suffix}")
+        with contextlib.suppress(FileExistsError):
+            return msgspec.structs.replace(start, path=str(path), part=part), LogFile(path)
+    raise FileExistsError(f"there are {_MOST_PARTS} parts already")
+
+
+def _give_up(start: Start, file: LogFile, line: StatusLine, error: OSError, sequence: int) -> None:
+    """Leave what is whole in the file, and no file that holds nothing."""
+    deleted = file.deleted
     with contextlib.suppress(OSError):
-        socket_file.unlink(missing_ok=True)
-        socket_file.parent.rmdir()
+        file.cut_to_whole()
+        if not sequence and not deleted:
+            os.unlink(start.path)
+    line.send(
+        WriterStatus(
+            "failed", start.path, start.part, sequence, bytes=file.tell(), deleted=deleted,
+            error=f"{start.path}: {'' if deleted else 'cannot be written: '}{_reason(error)}",
+        )
+    )  # fmt: skip
 
 
-def _reason(error: OSError | zmq.ZMQError) -> str:
+def _reason(error: OSError) -> str:
     return error.strerror or str(error)
-
-
-def _fail(status: StatusLine, code: int, message: str, written: int) -> int:
-    with contextlib.suppress(OSError):
-        print(f"log writer: {message}", file=sys.stderr, flush=True)
-    status.send(WriterStatus("failed", 0, 0, written, message))
-    return code
-
-
-def main() -> int:
-    """Read the start file named on the command line, remove it, and record."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    # The recorder's process may block signals that it takes another way; that would have been inherited.
-    signal.pthread_sigmask(signal.SIG_SETMASK, ())
-    if len(sys.argv) != 2:
-        print("usage: python -m disco_hw.log.writer START_FILE (it is started by the recorder)", file=sys.stderr)
-        return 2
-    start_file = Path(sys.argv[1])
-    try:
-        start = msgspec.msgpack.decode(start_file.read_bytes(), type=Start)
-    except (OSError, msgspec.MsgspecError) as error:
-        print(f"log writer: {start_file}: not a start file ({error})", file=sys.stderr)
-        return 2
-    start_file.unlink(missing_ok=True)
-    return run(start)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

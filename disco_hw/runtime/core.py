@@ -81,6 +81,8 @@ class DaemonCore:
         self.newest_wheels: WheelSample | None = None
         self.robot_status: RobotStatus | None = None
         self.last: CoreTick | None = None
+        self.recording_fault = ""
+        """Why nothing is recorded although it should be, kept up to date by whoever looks after the recorder."""
         self._supervisor = supervisor
         self._preflight = preflight
         self._preflight_errors: tuple[str, ...] = ()
@@ -186,6 +188,7 @@ class DaemonCore:
             preflight_errors=self._preflight_errors,
             task_finished=self.progress.finished,
             requests=tuple(requests),
+            recording_fault=self.recording_fault,
         )
 
     def _command(self, output: Output, result: Tick) -> WheelCommand | None:

@@ -42,6 +42,7 @@ class UserRequest(enum.Enum):
     """What a person can ask of the daemon."""
 
     ARM = "arm"
+    ARM_UNRECORDED = "arm_unrecorded"
     START = "start"
     STOP = "stop"
     DISARM = "disarm"
@@ -67,7 +68,8 @@ class Inputs(msgspec.Struct, frozen=True, gc=False):
     `telemetry_age_s` is the age of the newest wheel sample, None before the first; `wheel_speed_rad_s` the larger
     magnitude of its two speeds. `link_error` is the link's newest error, with its remedy. `preflight_errors` and
     `daemon_error` are sentences for a person and hold for as long as they are given. `task_finished`: nothing of the
-    task is left to drive.
+    task is left to drive. `recording_fault`: why nothing is recorded although it should be, which keeps the robot from
+    being armed unless that is asked for.
     """
 
     link_state: LinkState
@@ -82,6 +84,7 @@ class Inputs(msgspec.Struct, frozen=True, gc=False):
     daemon_error: str | None = None
     requests: tuple[UserRequest, ...] = ()
     task_finished: bool = False
+    recording_fault: str = ""
 
 
 class Reply(msgspec.Struct, frozen=True, gc=False):
@@ -213,8 +216,10 @@ class Supervisor:
             case UserRequest.STOP:
                 text = "stopping the task" if self._running else "no task is running"
                 self._running = self._start_pending = False
-            case UserRequest.ARM:
+            case UserRequest.ARM | UserRequest.ARM_UNRECORDED:
                 refusal = "e-stop in the same instant" if estop_now else self._why_not_arm(inputs, seen)
+                if refusal is None and request is UserRequest.ARM and self._state is not State.ARMED:
+                    refusal = inputs.recording_fault or None
                 if refusal is None and self._state is State.READY and self._arming is None:
                     self._arming = _Pending(now_ns)
                 text = "already armed" if self._state is State.ARMED else "arming"

@@ -110,12 +110,15 @@ def ctl(
     changes: Annotated[
         list[str] | None, typer.Argument(help="Of the task, while disarmed: radius_m=0.8 speed_m_s=0.3, for example.")
     ] = None,
+    unrecorded: Annotated[
+        bool, typer.Option("--unrecorded", help="Arm although nothing is being recorded that should be.")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Tell the running daemon what to do, or ask how it is."""
     from disco_hw.daemon.client import ask, in_words
 
-    reply = ask(robot, do, changes or ())
+    reply = ask(robot, do, changes or (), unrecorded)
     print_result(reply, as_json, in_words(reply, robot))
     if not reply.get("ok", False):
         raise typer.Exit(1)

@@ -182,11 +182,17 @@ def shown(status: Mapping[str, Any] | None, error: str) -> dict[str, Any]:
         "detail": detail,
         "running": status["running"],
         "estop": is_estop(status),
-        "advice": advice(status),
+        "advice": (*advice(status), *_recording(status)),
         "next": next_step(status),
         "task": {"asked": status["task"]["asked"], "limits": status["task"]["limits"]},
         "drive": None if drive is None else {"by_page": drive["by_page"], "driving": drive["driving"]},
     }
+
+
+def _recording(status: Mapping[str, Any]) -> tuple[str, ...]:
+    """What is wrong with the recording now, as a sentence."""
+    fault = status["recorder"]["fault"]
+    return (f"RECORDING: {fault}.",) if fault else ()
 
 
 class _DriveLine:

@@ -11,7 +11,7 @@ import numpy as np
 
 from disco_hw.config import RobotTask
 from disco_hw.course import course_of
-from disco_hw.daemon.client import progress
+from disco_hw.daemon.client import progress, recording_in_words
 from disco_hw.runtime.pipeline import Source
 from disco_hw.runtime.situation import fault_sentence, headline, in_words
 from disco_hw.viewer.snapshot import Snapshot
@@ -58,8 +58,15 @@ def _status_rows(status: Mapping[str, Any]) -> Rows:
         ("overruns, skipped", f"{loop['overruns']}, {loop['skipped']}"),
     ]
     recorder = status["recorder"]
-    if recorder["last_error"]:
-        rows.append(("recording", str(recorder["last_error"])))
+    if recorder["path"]:
+        rows.append(("recording", recording_in_words(recorder)))
+    if recorder["fault"] or recorder["last_error"]:
+        rows.append(
+            (
+                "RECORDING FAILS" if recorder["fault"] else "recording failed",
+                recorder["fault"] or recorder["last_error"],
+            )
+        )
     return rows
 
 

@@ -40,3 +40,8 @@ def test_an_estop_that_reaches_nobody_says_what_does(tmp_path, robot):
     with pytest.raises((InputError, WorkError)) as other:
         ask(path, "status")
     assert "NOT SENT" not in str(other.value)
+
+
+def test_only_arming_is_done_unrecorded():
+    with pytest.raises(InputError, match="--unrecorded: only arm takes it, and not start"):
+        ask(ROBOT, "start", unrecorded=True)

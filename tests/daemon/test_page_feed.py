@@ -49,23 +49,30 @@ def connected(feed, *subscribers, timeout_s=10.0):
     return tick
 
 
-def test_records_arrive_whole_and_without_frames(feed, tmp_path):
+@pytest.mark.parametrize("ticks_before", range(5))
+def test_records_arrive_whole_and_without_frames(feed, tmp_path, ticks_before):
     subscriber = FeedSubscriber(tmp_path / "control.sock.view")
     tick = connected(feed, subscriber)
-    subscriber.receive(0.2)
+    for number in range(tick, tick + ticks_before):
+        feed.put(*tick_records(number))
+    tick += ticks_before
+    first_ns = tick_records(tick)[0]
     sent = []
     for number in range(tick, tick + 30):
         now_ns, got = tick_records(number)
         sent += [record for record in got if not isinstance(record, records.FrameIn | records.Plan)]
         feed.put(now_ns, got)
-    feed.put(tick_records(tick + 60)[0], [])
+    last_ns = tick_records(tick + 60)[0]
+    sent.append(records.Event(last_ns, "info", "daemon", "the last one"))
+    feed.put(last_ns, sent[-1:])
     received = []
     deadline = time.monotonic() + 5.0
-    while len([r for _, r in received if not isinstance(r, records.Plan)]) < len(sent):
+    while not received or received[-1][0] < last_ns:
         assert time.monotonic() < deadline
         received += subscriber.receive(0.1)
     subscriber.close()
-    got_records = [record for _, record in received]
+    # What the ticks before left behind, to be published or on its way, depends on when the connection came about.
+    got_records = [record for _, record in received if record.t_ns >= first_ns]
     assert [record for record in got_records if not isinstance(record, records.Plan)] == sent
     plans = [record for record in got_records if isinstance(record, records.Plan)]
     assert 8 <= len(plans) <= 16, "one a batch"

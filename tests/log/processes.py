@@ -6,6 +6,8 @@ import sys
 import time
 from pathlib import Path
 
+import pytest
+
 from disco_hw.log.recorder import Recording
 from tools.log_samples import ATTACHMENTS, tick
 
@@ -16,11 +18,12 @@ from disco_hw.log.recorder import ProcessRecorder
 from tests.log.processes import recording
 from tools.log_samples import tick
 recorder = ProcessRecorder(recording(Path(sys.argv[1])))
-print(recorder.writer_pid, flush=True)
+print(recorder.writer_pid, recorder.keeper_pid, flush=True)
 first, last = int(sys.argv[2]), int(sys.argv[3])
 for k in range(1, 100_000):
     now_ns = time.monotonic_ns()
     recorder.put(now_ns, tick(k, now_ns)[first:last])
+    recorder.poll()
     print(k, flush=True)
     time.sleep(0.005)
 """
@@ -72,7 +75,7 @@ class RecordingProcess:
             cwd=root,
             env=os.environ | {"PYTHONPATH": root},
         )
-        self.writer_pid = int(self.process.stdout.readline())
+        self.writer_pid, self.keeper_pid = map(int, self.process.stdout.readline().split())
 
     def __enter__(self):
         return self
@@ -81,4 +84,25 @@ class RecordingProcess:
         self.process.kill()
         self.process.wait()
         self.process.stdout.close()
-        wait_until(lambda: not alive(self.writer_pid))
+        wait_until(lambda: not alive(self.writer_pid) and not alive(self.keeper_pid))
+
+
+class SmallDisk:
+    """A directory on a file system of its own, of so many kB; skips the test where none can be mounted."""
+
+    def __init__(self, directory, kilobytes):
+        self.path = directory / "disk"
+        self.path.mkdir()
+        mounted = subprocess.run(
+            ["mount", "-t", "tmpfs", "-o", f"size={kilobytes}k", "tmpfs", str(self.path)],
+            capture_output=True,
+            check=False,
+        )
+        if mounted.returncode:
+            pytest.skip(f"a small file system cannot be mounted here: {mounted.stderr.decode().strip()}")
+
+    def __enter__(self):
+        return self.path
+
+    def __exit__(self, *_):
+        subprocess.run(["umount", "--lazy", str(self.path)], check=True)

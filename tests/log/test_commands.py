@@ -4,12 +4,13 @@ import pytest
 
 from disco_hw.log.commands import export, info, recover
 from disco_hw.log.errors import LogError
-from tools.log_samples import drive_ticks, log_bytes, write_log
+from disco_hw.log.link import End
+from tools.log_samples import PERIOD_NS, drive_ticks, log_bytes, tick, write_log
 
 
 @pytest.fixture
 def log(tmp_path):
-    return write_log(tmp_path / "run.mcap", drive_ticks(100), flush_every=10)
+    return write_log(tmp_path / "run.mcap", drive_ticks(100), flush_every=10, end=End(101 * PERIOD_NS, 100, 0))
 
 
 @pytest.fixture
@@ -29,12 +30,46 @@ def test_info_says_what_a_log_holds(log):
     assert "lost" not in text
     summary = json.loads(info(log, as_json=True))
     assert summary["topics"]["/wheels"]["count"] == 100
-    assert summary["complete"] is True
+    assert (summary["complete"], summary["ended"]) == (True, True)
+
+
+def test_an_index_alone_does_not_prove_that_the_log_was_ended(tmp_path):
+    gone = write_log(tmp_path / "gone.mcap", drive_ticks(100))
+    text = info(gone, as_json=False)
+    assert "ended properly" not in text
+    assert "nothing after 2023-11-14T22:13:22.000+00:00: the daemon or its recorder was gone then" in text
+    summary = json.loads(info(gone, as_json=True))
+    assert (summary["complete"], summary["ended"], summary["missing_ticks"]) == (True, False, 0)
+
+
+def test_what_was_given_and_never_delivered_is_missing_at_the_end(tmp_path):
+    short = write_log(tmp_path / "short.mcap", drive_ticks(100), end=End(101 * PERIOD_NS, 793, 286))
+    assert "100 ticks, 693 missing; ended properly" in info(short, as_json=False)
+
+
+def test_a_later_part_says_what_it_continues_and_what_is_missing_in_between(tmp_path):
+    later = [(k * PERIOD_NS, tick(k)) for k in range(31, 51)]
+    part = {"part": 2, "continues": "/logs/run.mcap", "continues_sequence": 27, "end": End(51 * PERIOD_NS, 50, 0)}
+    path = write_log(tmp_path / "run.part2.mcap", later, numbers=True, **part)
+    text = info(path, as_json=False)
+    assert "20 ticks, 3 missing; ended properly" in text
+    assert "continues /logs/run.mcap" in text
+
+
+def test_of_a_log_from_before_the_recorders_last_word_nothing_is_claimed(tmp_path):
+    old, new = (b"\x06\0\0\0format\x01\0\0\0" + version for version in (b"1", b"2"))
+    data = log_bytes(drive_ticks(10))
+    assert data.count(new) == 1
+    old_log = tmp_path / "old.mcap"
+    old_log.write_bytes(data.replace(new, old))
+    text = info(old_log, as_json=False)
+    assert "the file is whole, and its version did not record whether its recorder ended it" in text
 
 
 def test_info_says_what_is_lost(cut):
     text = info(cut, as_json=False)
-    assert "not ended properly" in text
+    assert "; nothing after 2023-11-14T22:13:21" in text
+    assert "ended properly" not in text
     assert "lost: at byte" in text
     assert json.loads(info(cut, as_json=True))["damage"]
 

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from disco_hw.log.link import ENCODE_ERRORS, BatchDecoder, batch_encoder
+from disco_hw.log.link import ENCODE_ERRORS, BatchDecoder, Frames, batch_encoder, frame
 from disco_hw.log.records import TOPICS, Estimate, Event, Plan
 from tools.log_samples import ANY_RECORD, bits
 
@@ -56,3 +56,13 @@ def test_a_topic_that_does_not_exist_is_refused(index):
     batch = DECODER.batch(msgspec.msgpack.encode((1, 2, [(index, {"t_ns": 1})])))
     with pytest.raises(msgspec.MsgspecError):
         DECODER.record(*batch.records[0])
+
+
+@given(st.lists(st.tuples(st.integers(0, 255), st.binary(max_size=40))), st.integers(1, 30))
+def test_a_stream_cut_anywhere_gives_the_same_frames(frames, length):
+    stream = b"".join(frame(kind, payload) for kind, payload in frames)
+    taken, got = Frames(), []
+    for start in range(0, len(stream), length):
+        taken.add(stream[start : start + length])
+        got += list(taken)
+    assert got == frames

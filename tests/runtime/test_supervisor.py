@@ -441,3 +441,34 @@ def test_whatever_happens_motion_needs_everything(history):
         assert len(out.replies) == len(inputs.requests)
         assert all(reply.text for reply in out.replies)
         assert out.detail
+
+
+# --- recording -------------------------------------------------------------------------------------------------------
+
+
+def test_what_would_not_be_recorded_is_armed_only_if_that_is_asked_for():
+    bench = Bench()
+    bench.ready()
+    out = bench.tick(ARM, recording_fault="nothing is being recorded: no room")
+    assert refusal(out) == "nothing is being recorded: no room"
+    assert bench.tick(count=5).state is State.READY
+    assert bench.tick(UserRequest.ARM_UNRECORDED).replies[0].accepted
+    assert bench.tick(count=5).state is State.ARMED
+
+
+def test_a_recorder_that_fails_on_the_way_does_not_stop_the_robot():
+    bench = Bench()
+    bench.running()
+    out = bench.tick(recording_fault="nothing is being recorded: no room", count=5)
+    assert (out.state, out.running) == (State.ARMED, True)
+    assert bench.tick(ARM).replies[0].text == "already armed"
+
+
+@pytest.mark.parametrize("state", ["faulted", "stopping"])
+def test_to_arm_unrecorded_needs_all_else_that_arming_needs(state):
+    bench = Bench()
+    getattr(bench, state)()
+    assert not bench.tick(UserRequest.ARM_UNRECORDED).replies[0].accepted
+    ready = Bench()
+    ready.ready()
+    assert not ready.tick(UserRequest.ARM_UNRECORDED, wheel_speed_rad_s=1.0).replies[0].accepted

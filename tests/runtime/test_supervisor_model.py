@@ -19,6 +19,7 @@ TALKS = {
     DriverState.STANDBY, DriverState.READY, DriverState.ARMING, DriverState.ARMED, DriverState.STOPPING,
 }  # fmt: skip
 MAY_MOVE = {DriverState.ARMING, DriverState.ARMED, DriverState.STOPPING}
+ARMINGS = {UserRequest.ARM, UserRequest.ARM_UNRECORDED}
 IDLE = {DriverState.STANDBY, DriverState.READY}
 LATCHED = {DriverState.FAULT, DriverState.ESTOP, DriverState.REFUSED}
 AGES = st.sampled_from([0.0, 0.01, 0.05, 0.0501, 0.1, 0.15, 0.1501, 1.0, float("nan"), None])
@@ -32,6 +33,7 @@ VALUES = {
     "pose_ok": st.booleans(),
     "preflight_errors": st.sampled_from([(), ("limits differ",)]),
     "daemon_error": st.sampled_from([None, "boom"]),
+    "recording_fault": st.sampled_from(["", "no room"]),
 }
 ONE_CHANGE = st.sampled_from(sorted(VALUES)).flatmap(lambda name: st.fixed_dictionaries({name: VALUES[name]}))
 REQUESTS = st.lists(st.sampled_from(UserRequest), max_size=2)
@@ -142,10 +144,10 @@ class SupervisorModel(RuleBasedStateMachine):
                 if after is State.ARMED:
                     assert robot is DriverState.ARMED
                     assert fresh(inputs)
-                    assert self.asked_since(UserRequest.ARM, State.READY)
+                    assert self.asked_to_arm()
                 if robot not in TALKS or lost(inputs):
                     assert after is not State.READY
-                if robot in MAY_MOVE and not self.asked_since(UserRequest.ARM, State.READY):
+                if robot in MAY_MOVE and not self.asked_to_arm():
                     assert after is State.STOPPING
             case State.STOPPING:
                 assert after in (State.STOPPING, State.READY, State.HANDSHAKE)
@@ -166,6 +168,9 @@ class SupervisorModel(RuleBasedStateMachine):
             if output is not self.history[-1][1] and output.state is not state:
                 return False
         return False
+
+    def asked_to_arm(self):
+        return any(self.asked_since(r, State.READY) for r in ARMINGS)
 
     def estop_held(self):
         """Whether an e-stop was asked for and no reset accepted after it, in the order of the requests."""
@@ -204,9 +209,9 @@ class SupervisorModel(RuleBasedStateMachine):
             started = started or UserRequest.START in accepted
             if UserRequest.STOP in inputs.requests and not started:
                 return False
-            if started and output.state is State.READY and UserRequest.ARM in accepted:
+            if started and output.state is State.READY and ARMINGS & accepted:
                 return True
-            if UserRequest.ARM in accepted and started:
+            if ARMINGS & accepted and started:
                 return True
             if output.state not in (State.ARMED, State.READY):
                 return False
@@ -215,8 +220,12 @@ class SupervisorModel(RuleBasedStateMachine):
     def check_requests(self, output):
         """The robot is asked to arm only after a person asked for it, once for each asking; ARMED asks for nothing."""
         armings = sum(past.driver_request is Request.ARM for _, past in self.history)
-        asked = sum(r.request is UserRequest.ARM and r.accepted for _, past in self.history for r in past.replies)
+        asked = sum(r.request in ARMINGS and r.accepted for _, past in self.history for r in past.replies)
         assert armings <= asked
+        inputs, before = self.history[-1][0], self.history[-2][1].state if len(self.history) > 1 else None
+        for reply in output.replies:
+            if reply.request is UserRequest.ARM and inputs.recording_fault and before is not State.ARMED:
+                assert not reply.accepted
         resets = sum(past.driver_request is Request.RESET for _, past in self.history)
         asked = sum(r.request is UserRequest.RESET and r.accepted for _, past in self.history for r in past.replies)
         assert resets <= asked

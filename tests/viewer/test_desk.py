@@ -25,6 +25,7 @@ from tools.viewer_run import ROBOT_FILE
 STATUS = {
     "ok": True, "state": "READY", "detail": "ready to be armed", "running": False, "estop": False, "fault": "NONE",
     "robot_state": "READY", "task": {"asked": {"radius_m": 0.75}, "limits": {"radius_m": [0.1, 50.0]}},
+    "recorder": {"fault": ""},
 }  # fmt: skip
 
 
@@ -287,6 +288,12 @@ def test_without_a_status_it_says_why(status, error, words):
     said = shown(status, error)
     assert not said["ok"]
     assert words in said["detail"]
+
+
+def test_what_is_not_recorded_is_shown_whatever_the_state():
+    said = shown({**STATUS, "recorder": {"fault": "nothing is being recorded: no room"}}, "")
+    assert said["advice"][-1] == "RECORDING: nothing is being recorded: no room."
+    assert not any("RECORDING" in sentence for sentence in shown(STATUS, "")["advice"])
 
 
 def test_a_latched_stop_and_a_drive_by_page_are_shown():

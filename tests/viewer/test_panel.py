@@ -1,7 +1,9 @@
 import math
+from dataclasses import asdict
 
 from disco_hw.config import CircleTask
 from disco_hw.log import records
+from disco_hw.log.recorder import RecorderStats
 from disco_hw.viewer.panel import (
     coverage_text,
     escaped,
@@ -17,14 +19,23 @@ from drivers.types import RobotStatus
 from firmware_protocol.faults import advice
 from tools.viewer_run import PERIOD_NS, START_NS, plan_at
 
+RECORDED = RecorderStats(ticks=90, dropped_ticks=10, delivered_ticks=80, waiting_ticks=7, lost_ticks=3, path="run.mcap")
 STATUS = {
     "ok": True, "state": "ARMED", "detail": "running the task", "running": True, "estop": False, "link": "up",
     "link_error": None, "robot_state": "ARMED", "fault": "NONE", "stop_cause": "NONE",
     "task": {"laps": 1.5, "distance_m": 0.012, "length_m": 4.7, "asked": {"kind": "circle"}},
     "transport": {"frames_received": 10, "frames_sent": 4, "malformed": 1},
-    "driver": {"rejected_crc": 2, "rejected_sequence": 3, "lost_frames": 5}, "recorder": {"last_error": ""},
+    "driver": {"rejected_crc": 2, "rejected_sequence": 3, "lost_frames": 5}, "recorder": asdict(RECORDED),
     "loop": {"lateness_us": {"p99": 100.4, "max": 900.0}, "overruns": 7, "skipped": 8},
 }  # fmt: skip
+
+
+def test_the_details_say_where_every_tick_has_gone_and_what_fails():
+    text = live_details(STATUS, None, 0, None)
+    assert "| recording | run.mcap: 80 of 100 ticks, 7 waiting, 10 dropped, 3 lost with a deleted file |" in text
+    assert "FAILS" not in text
+    failing = STATUS | {"recorder": STATUS["recorder"] | {"fault": "nothing is being recorded: no room"}}
+    assert "| RECORDING FAILS | nothing is being recorded: no room |" in live_details(failing, None, 0, None)
 
 
 def test_without_a_status_the_page_says_how_old_it_is():

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from disco_hw.log.drive import DriveLog
 from disco_hw.log.errors import LogError
-from disco_hw.log.link import Attachment, Start, batch_encoder
+from disco_hw.log.link import Attachment, End, Start, batch_encoder
 from disco_hw.log.mcap_log import McapLog
 from disco_hw.log.provenance import version
 from disco_hw.log.records import Command, Record
@@ -40,11 +40,14 @@ def write_log(drive: DriveLog, path: Path, robot: str, attachments: tuple[Attach
     except OSError as error:
         raise LogError(f"{path}: cannot be created ({error.strerror}); give another place") from None
     try:
-        log = McapLog(file, Start(str(path), "", robot, version(), 0, 0, 0, 0, attachments))
+        log = McapLog(file, Start(str(path), robot, version(), 0, 0, part=0, attachments=attachments))
+        last_ns, last_tick = 0, 0
         for tick, (t_ns, samples) in enumerate(groupby(_samples(drive), key=lambda sample: sample[0])):
             together = list(samples)
             segment = max(sample[1] for sample in together)
-            log.write(encode(tick + segment, t_ns, [record for _, _, record in together]))
+            last_ns, last_tick = t_ns, tick + segment
+            log.write(encode(last_tick, t_ns, [record for _, _, record in together]))
+        log.end(End(last_ns, last_tick, 0))
         log.finish()
         file.sync()
     except BaseException as error:

@@ -1,0 +1,145 @@
+"""The recorder broken while the robot drives: the log is begun anew, and nobody is left to believe that all is well."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+from pathlib import Path
+
+import pytest
+
+from disco_hw.errors import WorkError
+from disco_hw.log.commands import info
+from disco_hw.log.reader import open_log
+from tests.hil.stack import Stack, disco, running_stack
+
+pytestmark = pytest.mark.hil
+
+
+def children(pid: int) -> list[int]:
+    return [
+        int(child) for task in Path(f"/proc/{pid}/task").iterdir() for child in (task / "children").read_text().split()
+    ]
+
+
+def named(pid: int, module: str) -> bool:
+    return module.encode() in Path(f"/proc/{pid}/cmdline").read_bytes()
+
+
+def keeper_of(stack: Stack) -> int:
+    """The process that starts log writers."""
+    (keeper,) = [pid for pid in children(stack.daemon.process.pid) if named(pid, "disco_hw.log.keeper")]
+    return keeper
+
+
+def writer_of(stack: Stack) -> int:
+    return children(keeper_of(stack))[-1]
+
+
+def wait_for_recording(stack: Stack, deaths: int) -> None:
+    stack.operator.wait_until(
+        f"recording again after {deaths} ends",
+        lambda status: status["recorder"]["writer_deaths"] >= deaths and not status["recorder"]["fault"],
+        20.0,
+    )
+
+
+def events_in(path: Path) -> list[str]:
+    with open_log(path) as log:
+        return [entry.record.text for entry in log.records(("/event",)) if entry.record.code == "recording"]
+
+
+def ticks_in(path: Path) -> list[int]:
+    with open_log(path) as log:
+        return [entry.tick for entry in log.records(("/loop",))]
+
+
+def test_a_recorder_frozen_killed_and_deleted_on_the_way_is_told_counted_and_replaced(tmp_path):
+    first, second, third, fourth = (tmp_path / f"run{part}.mcap" for part in ("", ".part2", ".part3", ".part4"))
+    with running_stack(tmp_path) as stack:
+        stack.drive(until_rad_s=2.0)
+        os.kill(writer_of(stack), signal.SIGSTOP)
+        frozen = stack.operator.wait_until("told", lambda status: status["recorder"]["fault"], 10.0)
+        assert "the log writer has not answered for" in frozen["recorder"]["fault"]
+        code, text = disco("ctl", str(stack.robot_file), "status")
+        assert (code, "recording " in text) == (0, True)
+        wait_for_recording(stack, 1)
+        os.kill(writer_of(stack), signal.SIGKILL)
+        wait_for_recording(stack, 2)
+        third.unlink()
+        wait_for_recording(stack, 3)
+        status = stack.operator.status()
+        assert status["state"] == "ARMED"
+        recorder = status["recorder"]
+        assert recorder["path"] == str(fourth)
+        assert recorder["dropped_ticks"] == 0
+        assert recorder["ticks"] == sum(recorder[f"{where}_ticks"] for where in ("delivered", "waiting", "lost"))
+        stack.operator.tell("quit")
+        assert stack.daemon.process.wait(10.0) == 0
+        output = (tmp_path / "daemon.txt").read_text()
+    for words in ("has not answered for", "was ended", "signal 9", "deleted while it was written", "goes on in"):
+        assert any(line.startswith("recording: ") and words in line for line in output.splitlines()), words
+    assert not third.exists()
+    kept = [*ticks_in(first), *ticks_in(second)]
+    assert kept == list(range(1, kept[-1] + 1)), "a tick is missing, or twice there"
+    with open_log(fourth) as log:
+        lost = log.metadata.continues_sequence - kept[-1]
+        summary = log.summary()
+        assert log.metadata.continues == str(third)
+    assert (summary.ended, summary.missing_ticks) == (True, 0)
+    assert f"{lost} lost with a deleted file" in output
+    told = [*events_in(first), *events_in(second), *events_in(fourth)]
+    assert any("has not answered" in text for text in told)
+    assert any("deleted" in text for text in told)
+    assert "ended properly" not in info(first, as_json=False)
+    assert f"continues {first}" in info(second, as_json=False)
+
+
+def test_after_the_daemon_was_killed_the_log_does_not_say_that_it_was_ended(tmp_path):
+    with running_stack(tmp_path) as stack:
+        stack.drive(until_rad_s=2.0)
+        writer = writer_of(stack)
+        os.kill(stack.daemon.process.pid, signal.SIGKILL)
+        while Path(f"/proc/{writer}").exists():
+            pass
+    text = info(tmp_path / "run.mcap", as_json=False)
+    assert "ended properly" not in text
+    assert "the daemon or its recorder was gone then" in text
+
+
+def test_where_nothing_can_be_recorded_arming_is_refused_unless_that_is_asked_for(tmp_path):
+    logs = tmp_path / "logs"
+    with running_stack(tmp_path, run_arguments=("--log", str(logs / "run.mcap"))) as stack:
+        stack.operator.wait_for("READY", 60.0)
+        shutil.rmtree(logs)
+        logs.write_text("in the way")
+        stack.operator.wait_until("told", lambda status: status["recorder"]["fault"], 10.0)
+        with pytest.raises(WorkError, match=r"nothing is being recorded: .*; mend that, or arm with --unrecorded"):
+            stack.operator.tell("arm")
+        code, text = disco("ctl", str(stack.robot_file), "arm")
+        assert code == 1
+        assert "refused: nothing is being recorded" in text
+        assert stack.operator.status()["state"] == "READY"
+        code, text = disco("ctl", str(stack.robot_file), "status")
+        assert "RECORDING: nothing is being recorded" in text
+        code, text = disco("ctl", str(stack.robot_file), "arm", "--unrecorded")
+        assert (code, text.strip()) == (0, "arming")
+        stack.operator.wait_for("ARMED", 5.0)
+        logs.unlink()
+        wait_for_recording(stack, 1)
+        stack.operator.tell("disarm")
+        stack.operator.wait_for("READY", 5.0)
+        stack.operator.tell("arm")
+
+
+def test_a_keeper_frozen_or_killed_is_made_again_while_disarmed(tmp_path):
+    with running_stack(tmp_path) as stack:
+        stack.operator.wait_for("READY", 60.0)
+        first = keeper_of(stack)
+        os.kill(first, signal.SIGKILL)
+        deaths = 0
+        while deaths == 0:
+            found = [pid for pid in children(stack.daemon.process.pid) if named(pid, "disco_hw.log.keeper")]
+            deaths = int(bool(found) and found != [first])
+        stack.operator.tell("arm")
