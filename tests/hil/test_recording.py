@@ -10,9 +10,10 @@ from pathlib import Path
 import pytest
 
 from disco_hw.errors import WorkError
+from disco_hw.experiments.live_stack import Stack, running_stack
 from disco_hw.log.commands import info
 from disco_hw.log.reader import open_log
-from tests.hil.stack import Stack, disco, running_stack
+from tests.hil.stack import disco
 
 pytestmark = pytest.mark.hil
 
