@@ -35,7 +35,10 @@ class Robot(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 
 
 class Prior(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Uniform ranges of the model's base parameters; the defaults are the paper's (appendix, skid-steer table)."""
+    """Uniform ranges of the model's base parameters; the defaults are the paper's (appendix, skid-steer table).
+
+    What a robot.toml leaves out is made from its own robot, see `prior_around`.
+    """
 
     x_icr_m: Range = (0.0, 0.5)
     wheel_radius_m: Range = (0.0, 0.5)
@@ -189,8 +192,24 @@ def load_robot_config(path: Path) -> RobotConfig:
         config = msgspec.convert(_with_kind_of_task(path, raw), RobotConfig)
     except msgspec.ValidationError as error:
         raise InputError(f"{path}: {_in_words(str(error))}") from None
+    given = {name: getattr(config.prior, name) for name in raw.get("prior", {})}
+    config = msgspec.structs.replace(config, prior=msgspec.structs.replace(prior_around(config.robot), **given))
     _check(path, config)
     return config
+
+
+def prior_around(robot: Robot) -> Prior:
+    """Ranges that hold the robots of this nominal geometry.
+
+    A skid-steer's wheels slip sideways in turns, so that it turns as an ideal robot with a track 1.5 to 2.5 times its
+    own would (Mandow et al., IROS 2007); a differential drive as one with its own track.
+    """
+    radius, axial = robot.wheel_radius_m, robot.axial_distance_m
+    return Prior(
+        x_icr_m=(robot.x_icr_m - axial, robot.x_icr_m + axial),
+        wheel_radius_m=(0.5 * radius, 1.5 * radius),
+        axial_distance_m=(0.5 * axial, 3.0 * axial),
+    )
 
 
 def circle_task(task: RobotTask, purpose: str) -> CircleTask:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from disco_hw.config import PathTask, TimedPathTask, circle_task, load_robot_config
+from disco_hw.config import PathTask, Prior, TimedPathTask, circle_task, load_robot_config
 from disco_hw.errors import InputError
 
 GOOD = """
@@ -25,12 +25,27 @@ def load(tmp_path: Path, text: str):
     return load_robot_config(path)
 
 
-def test_minimal_file_gets_the_papers_defaults(tmp_path):
+def test_minimal_file_gets_the_papers_task(tmp_path):
     config = load(tmp_path, GOOD)
     assert config.robot.wheel_radius_m == 0.06
-    assert config.prior.axial_distance_m == (0.1, 0.5)
     assert config.task.radius_m == 0.75
     assert config.task.speed_m_s == 0.2
+
+
+def test_the_prior_is_around_the_robot_where_the_file_leaves_it_out(tmp_path):
+    prior = load(tmp_path, GOOD.replace("name =", "x_icr_m = 0.1\nname =")).prior
+    assert prior.wheel_radius_m == pytest.approx((0.03, 0.09))
+    assert prior.axial_distance_m == pytest.approx((0.155, 0.93))
+    assert prior.x_icr_m == pytest.approx((-0.21, 0.41))
+    given = load(tmp_path, GOOD + "[prior]\nx_icr_m = [0.0, 0.5]\n").prior
+    assert (given.x_icr_m, given.wheel_radius_m) == ((0.0, 0.5), pytest.approx((0.03, 0.09)))
+
+
+def test_the_papers_robot_has_the_papers_prior():
+    import disco_hw
+
+    config = load_robot_config(Path(disco_hw.__file__).parent / "robots" / "wombot.toml")
+    assert config.prior == Prior()
 
 
 def test_shipped_robot_file_is_valid():
