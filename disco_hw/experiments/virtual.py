@@ -54,7 +54,7 @@ def run_sim(options: SimOptions) -> int:
         raise InputError(f"--start: {' '.join(map(str, options.start))} is no place; write finite numbers")
     ticks_per_rev = _whole_ticks(setup)
     x_m, y_m, yaw_rad = options.start or course_of(config.task).start
-    plant = true_parameters(setup, options.plant_seed)
+    plant, key = true_parameters(setup, options.plant_seed), link_key(setup)
     print(
         f"true wheel radius {plant.wheel_radius_m:.4f} m, axial distance {plant.axial_distance_m:.4f} m, "
         f"x_icr {plant.x_icr_m:.4f} m" + "".join(f", hidden {name} {values}" for name, values in effects.items()),
@@ -77,7 +77,7 @@ def run_sim(options: SimOptions) -> int:
                 ticks_per_rev=ticks_per_rev,
                 max_wheel_speed_rad_s=config.robot.max_wheel_speed_rad_s,
                 max_wheel_acceleration_rad_s2=config.robot.max_wheel_acceleration_rad_s2,
-                key=link_key(setup) or b"",
+                key=key or b"",
             ),
             truth_file=options.truth,
             bus_log=options.bus_log,
