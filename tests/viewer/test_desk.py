@@ -36,6 +36,7 @@ class Daemon:
         directory.mkdir(mode=0o700)
         self.server = ControlServer(directory / "control.sock", SERVED)
         self.asked, self.hangs, self._ending = [], False, threading.Event()
+        self.status = STATUS
         self._thread = threading.Thread(target=self._serve)
         self._thread.start()
 
@@ -48,7 +49,7 @@ class Daemon:
 
     def _answer(self, message):
         if message.action == "status":
-            return STATUS
+            return self.status
         if message.action == "drive":
             return {"ok": True, "stamp": str(1_000 + len(self.asked))}
         return {"ok": message.action != "arm", "text": "done it", "error": "not now"}

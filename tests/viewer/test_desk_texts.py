@@ -1,0 +1,125 @@
+"""The texts around the live page are whole at every width from a phone's to a desk's, in every state, light or dark."""
+
+from contextlib import ExitStack
+
+import pytest
+
+from tests.viewer.test_desk import STATUS, Daemon, desk_of
+from tools.browser import chromium, keep, opened
+
+pytestmark = [pytest.mark.long, pytest.mark.browser]
+
+WIDTHS = (390, 430, 540, 600, 768, 900, 1000, 1001, 1100, 1280, 1400, 1600)
+SCHEMES = ("light", "dark")
+HEIGHT = 844
+
+LINK_ERROR = (
+    "socketcan can0: no such CAN interface; plug the adapter in and run: "
+    "sudo ip link set can0 up type can bitrate 500000"
+)
+LIMITS = {"asked": {"kind": "circle", "radius_m": 0.75, "speed_m_s": 0.2, "center_x_m": 0.0, "center_y_m": 0.0},
+          "limits": {name: [0.1, 50.0] for name in ("radius_m", "speed_m_s", "center_x_m", "center_y_m")}}  # fmt: skip
+WHOLE = {**STATUS, "task": LIMITS}
+HELD = {"by_page": True, "driving": False, "words": "hold the pad to drive; the robot is armed by holding, not by Arm"}
+STATES = {
+    "disconnected": {"state": "DISCONNECTED", "detail": LINK_ERROR, "robot_state": "UNKNOWN"},
+    "handshake": {
+        "state": "HANDSHAKE",
+        "detail": "no answer from the robot; is it switched on, and does it use the same bit rate?",
+    },
+    "ready": {},
+    "armed": {"state": "ARMED", "detail": "armed, holding zero"},
+    "running": {"state": "ARMED", "detail": "running the task", "running": True},
+    "stopping": {
+        "state": "STOPPING",
+        "detail": "the robot is no longer armed: no wheel command arrived in time; the link or this host was too slow; "
+        "waiting until the robot is disarmed and its wheels are still",
+    },
+    "fault": {
+        "state": "FAULT",
+        "fault": "OVER_VOLTAGE",
+        "detail": "the robot reports OVER_VOLTAGE; mend it, then reset",
+    },
+    "estop": {
+        "state": "FAULT",
+        "estop": True,
+        "robot_state": "ESTOP",
+        "detail": "e-stop requested here; mend it, then reset",
+    },
+    "by hand": {"state": "READY", "drive": HELD},
+}
+
+# Every element that holds text of its own: is all of it inside of the element and of the window?
+CUT_OFF = """() => [...document.querySelectorAll("body *:not(script)")].flatMap(element => {
+  const own = [...element.childNodes].some(node => node.nodeType === Node.TEXT_NODE && node.textContent.trim());
+  if (!own || !element.checkVisibility()) return [];
+  const box = element.getBoundingClientRect(), faults = [];
+  for (let holder = element; holder; holder = holder.parentElement) {
+    if (getComputedStyle(holder).display === "inline") continue;
+    if (holder.scrollWidth > holder.clientWidth) faults.push(`${holder.id || holder.tagName} is ${holder.scrollWidth} in ${holder.clientWidth} wide`);
+    if (holder.scrollHeight > holder.clientHeight) faults.push(`${holder.id || holder.tagName} is ${holder.scrollHeight} in ${holder.clientHeight} high`);
+  }
+  if (box.left < 0 || box.right > innerWidth || box.top < 0 || box.bottom > innerHeight) faults.push("reaches out of the window");
+  return faults.map(fault => `"${element.textContent.trim().slice(0, 40)}": ${fault}`);
+})"""  # noqa: E501
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with chromium() as started:
+        yield started
+
+
+@pytest.fixture
+def daemon(tmp_path):
+    made = Daemon(tmp_path / "run")
+    yield made
+    made.close()
+
+
+def cut_off(tab, name):
+    """What is cut off of the page's texts, at all widths and in both colour schemes."""
+    found = []
+    for scheme in SCHEMES:
+        tab.emulate_media(color_scheme=scheme)
+        for width in WIDTHS:
+            tab.set_viewport_size({"width": width, "height": HEIGHT})
+            found += [f"{name}, {scheme}, {width} px: {fault}" for fault in tab.evaluate(CUT_OFF)]
+            if scheme == "light" and width in (390, 768, 1400):
+                keep(tab, f"desk-{name}-{width}")
+    return found
+
+
+@pytest.mark.parametrize("name", STATES)
+def test_every_text_is_whole(browser, daemon, name):
+    daemon.status = {**WHOLE, **STATES[name]}
+    with desk_of(daemon.server.path) as (_, port), opened(browser, f"http://127.0.0.1:{port}", scene=False) as tab:
+        said = daemon.status["detail"]
+        tab.locator("#detail", has_text=said[:60]).wait_for()
+        assert cut_off(tab, name) == []
+        # The longest answers of the daemon are refusals.
+        tab.evaluate("text => answer(text, true)", f"arm refused: not connected to the robot: {LINK_ERROR}")
+        assert cut_off(tab, f"{name}, answered") == []
+        if name == "ready":
+            tab.locator("#taskbutton").click()
+            assert cut_off(tab, "task") == []
+
+
+def test_every_text_is_whole_without_a_daemon(browser, tmp_path):
+    with desk_of(tmp_path / "none.sock") as (_, port), opened(browser, f"http://127.0.0.1:{port}", scene=False) as tab:
+        tab.locator("#state", has_text="NO DAEMON").wait_for()
+        assert cut_off(tab, "no daemon") == []
+
+
+def test_every_text_is_whole_without_a_connection(browser, daemon):
+    with ExitStack() as ending:
+        _, port = ending.enter_context(desk_of(daemon.server.path))
+        with opened(browser, f"http://127.0.0.1:{port}", scene=False) as tab:
+            tab.locator("#state", has_text="READY").wait_for()
+            ending.close()
+            tab.locator("#estop", has_text="NO CONNECTION").wait_for()
+            tab.locator("#state", has_text="NO CONNECTION").wait_for()
+            assert cut_off(tab, "no connection") == []
+            tab.locator("#estop").click()
+            tab.locator("#answer", has_text="NOT SENT").wait_for()
+            assert cut_off(tab, "no connection, pressed") == []
