@@ -25,8 +25,7 @@ from websockets.typing import Origin, Subprotocol
 
 from disco_hw.daemon.page_feed import ViewerFeed, feed_path
 from disco_hw.daemon.realtime import stolen_ms
-from disco_hw.experiments.live_stack import running_stack
-from disco_hw.experiments.operator import disco_hw_process
+from disco_hw.experiments.live_stack import disco_hw_process, running_stack
 from disco_hw.log.reader import open_log
 from disco_hw.log.records import Plan
 from disco_hw.viewer.address import TOKEN_VARIABLE, page_token

@@ -26,7 +26,7 @@ from disco_hw.config import circle_task, load_robot_config
 from disco_hw.daemon.realtime import stolen_ms
 from disco_hw.errors import InputError, WorkError
 from disco_hw.experiments.circle_report import CircleReport, load_circle_report
-from disco_hw.experiments.operator import Operator, disco_hw_process, stands
+from disco_hw.experiments.live_stack import Operator, disco_hw_process, stands
 from disco_hw.viewer.address import DEFAULT_PORT, LOOPBACK, TOKEN_VARIABLE, page_address, page_token
 
 _START_TIMEOUT_S = 90.0

@@ -10,8 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from disco_hw.experiments.live_stack import running_stack
-from disco_hw.experiments.operator import Child
+from disco_hw.experiments.live_stack import Child, running_stack
 from disco_hw.log.reader import open_log
 from tests.hil.stack import STILL_RAD_S
 
@@ -69,7 +68,7 @@ def daemon_that_fails(monkeypatch, error: str):
     import subprocess
     import sys
 
-    import disco_hw.experiments.operator as operator_module
+    import disco_hw.experiments.live_stack as operator_module
 
     popen = subprocess.Popen
 

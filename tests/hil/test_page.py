@@ -13,8 +13,7 @@ import pytest
 from disco_hw.course import course_of
 from disco_hw.daemon.control_client import send_request
 from disco_hw.drive.source import INPUT_LIMIT_NS
-from disco_hw.experiments.live_stack import running_stack
-from disco_hw.experiments.operator import disco_hw_process, stands
+from disco_hw.experiments.live_stack import disco_hw_process, running_stack, stands
 from disco_hw.log.reader import open_log
 from disco_hw.runtime.robot_setup import load_setup
 from disco_hw.viewer import scene

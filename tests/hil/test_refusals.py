@@ -17,8 +17,7 @@ import can
 import pytest
 
 from disco_hw.errors import WorkError
-from disco_hw.experiments.live_stack import READY_TIMEOUT_S, running_stack, write_robot_file
-from disco_hw.experiments.operator import Operator, disco_hw_process
+from disco_hw.experiments.live_stack import READY_TIMEOUT_S, Operator, disco_hw_process, running_stack, write_robot_file
 from firmware_protocol.codec import Codec
 from tests.hil.stack import STILL_RAD_S, disco
 from tests.runtime.path_robot import path_robot
