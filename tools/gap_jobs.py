@@ -14,8 +14,9 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 
 from disco_hw.drive.separating import separating
+from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap import find_gap
-from disco_hw.gap.report.blind_spots import LIMITS, BlindSpot
+from disco_hw.gap.report.blind_spots import BlindSpot
 from disco_hw.gap.search.intervals import ParameterEstimate
 from disco_hw.model import Model
 from tools.gap_logs import LARGEST_RAD_S, NAMED, realistic, simulated_drive
@@ -156,7 +157,7 @@ def too_small(spot: BlindSpot, hidden: float | tuple[float, ...]) -> bool:
     size = abs(hidden[0] if isinstance(hidden, tuple) else hidden)
     if spot.smallest_visible is None:
         return True
-    return size > spot.smallest_visible if spot.name in LIMITS else size < spot.smallest_visible
+    return size > spot.smallest_visible if REGISTRY[spot.name].is_limit else size < spot.smallest_visible
 
 
 def judged(

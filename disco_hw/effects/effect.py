@@ -83,8 +83,8 @@ STAGE_GROUPS = (
     (Stage.VELOCITY, Stage.FORWARD, Stage.TURN, Stage.LATERAL),
     (Stage.WORLD,),
     (Stage.ENCODERS,),
-    (Stage.POSE,),
     (Stage.POSE_TIME,),
+    (Stage.POSE,),
     (Stage.TERMS,),
 )
 
@@ -162,10 +162,16 @@ class Scan:
 
 @dataclass(frozen=True, slots=True)
 class Mimicked:
-    """Another effect, by the module that holds it, that no drive tells from this one, and what does (`decided_by`)."""
+    """Another effect, by the module that holds it, that no drive tells from this one, and what does (`decided_by`).
+
+    `seen_too_as` is the effect of the other channel that the same cause shows as, if it shows in two; `seen_too` the
+    value that its first parameter then has, from the values of the mimicked effect.
+    """
 
     module: Any
     decided_by: str
+    seen_too_as: Any = None
+    seen_too: Callable[[Values], float] | None = None
 
     @property
     def effect(self) -> Effect:
@@ -267,6 +273,11 @@ class Effect:
     def columns(self) -> tuple[str, ...]:
         """Full names of its parameters, as models and logs have them."""
         return tuple(f"{self.name}.{parameter.name}" for parameter in self.parameters)
+
+    @property
+    def is_limit(self) -> bool:
+        """Whether it does nothing where its first parameter is large: the largest size is what a drive can show."""
+        return math.isinf(self.parameters[0].neutral)
 
     @property
     def smooth(self) -> bool:

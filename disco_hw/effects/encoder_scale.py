@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from disco_hw.effects import wheel_gain
+from disco_hw.effects import wheel_gain, wheel_radius_asymmetry
 from disco_hw.effects.effect import Channel, Effect, Mimicked, Parameter, Stage, Symptom, Value, Values
 
 
@@ -12,13 +12,24 @@ def plain(left: Value, right: Value, values: Values) -> tuple[Value, Value]:
     return left * (1.0 + scale_left), right * (1.0 + scale_right)
 
 
+def asymmetry(gains: Values) -> float:
+    """Ratio of unequal wheels that poses show: the gain of a wheel's drive is undone between wheel and body."""
+    left, right = (float(gain) for gain in gains)
+    return (left - right) / (2.0 + left + right)
+
+
 EFFECT = Effect(
     name="encoder_scale",
     channel=Channel.WHEEL_TO_BODY,
     stage=Stage.ENCODERS,
     parameters=(Parameter("left", "1", -0.9, 2.0, 0.0, realistic=0.015), Parameter("right", "1", -0.9, 2.0, 0.0)),
     plain=plain,
-    mimics=Mimicked(wheel_gain, "turn each wheel ten times by hand and count ticks"),
+    mimics=Mimicked(
+        wheel_gain,
+        "turn each wheel ten times by hand and count ticks",
+        seen_too_as=wheel_radius_asymmetry,
+        seen_too=asymmetry,
+    ),
     symptoms=(Symptom.TURNS_ON_STRAIGHTS,),
     excitation="straights and turns at several speeds, with poses",
     script="straights",

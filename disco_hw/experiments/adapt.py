@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from disco_hw.adaptation.adapter import Adapter, InlineLink
 from disco_hw.adaptation.guard import Geometry, believed_geometry, with_geometry
 from disco_hw.config import CircleTask, circle_task
+from disco_hw.effects import surface_change
 from disco_hw.experiments.simulated_time import SimulatedRun, virtual_robot
 from disco_hw.log import records
 from disco_hw.log.recorder import MemoryRecorder
@@ -224,7 +225,7 @@ def run_adapt(setup: Setup, options: AdaptOptions | None = None, progress: Progr
 
 def _effect(name: str, options: AdaptOptions) -> dict[str, tuple[float, ...]]:
     track, radius = CHANGES[name]
-    return {"surface_change": (options.change * track, options.change_s + _START_S, options.change * radius)}
+    return {surface_change.EFFECT.name: (options.change * track, options.change_s + _START_S, options.change * radius)}
 
 
 def drive(

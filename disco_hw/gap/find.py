@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.gap.data.gridded_drive import grid_drive
-from disco_hw.gap.data.layout import BASE_COUNT, BODY, WHEEL, Layout
+from disco_hw.gap.data.layout import BASE_COUNT, BODY, DELAYED_BY, WHEEL, Layout
 from disco_hw.gap.report.amend import amended_model
 from disco_hw.gap.report.findings import GapReport
 from disco_hw.gap.search.analysis import GapAnalysis
@@ -81,7 +81,7 @@ def _searched(log: DriveLog, model: Model, say: Progress) -> tuple[GapAnalysis, 
             "for at least some seconds of driving"
         )
     nominal_body, nominal_wheels = _vector(BODY, model), _vector(WHEEL, model)
-    drive = with_known_terms(drive, model.effects, nominal_body, WHEEL.at(nominal_wheels, "command_delay.delay_s"))
+    drive = with_known_terms(drive, model.effects, nominal_body, WHEEL.at(nominal_wheels, DELAYED_BY))
     geometry = nominal_body[:BASE_COUNT]
     body = wheels = None
     notes: list[str] = []

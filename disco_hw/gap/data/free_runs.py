@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.gap.data.gridded_drive import GRID_STEP_S
-from disco_hw.gap.data.layout import BODY, WHEEL, body_effects, wheel_effects
+from disco_hw.gap.data.layout import BODY, DELAYED_BY, WHEEL, body_effects, counted, pose_sensor, wheel_effects
 from disco_hw.jit import kernel_function, scalar_function
 from disco_hw.model.step import body_velocity, wheel_step
 
@@ -120,12 +120,11 @@ def run_wheels(p: Array, geometry: Array, command: Array, extra: Array, first: M
     the command; `start` (M, 2) measured speeds, read where a run begins; `geometry` (3,).
     """
     angle = np.empty_like(command)
-    late = WHEEL.at(p, "command_delay.delay_s") / GRID_STEP_S
+    late = WHEEL.at(p, DELAYED_BY) / GRID_STEP_S
     _run_wheels(wheel_effects(p, geometry), late, command, extra, first, t_s, start, angle)
-    for side, name in enumerate(("left", "right")):
-        scale = WHEEL.at(p, f"encoder_scale.{name}")
-        if scale != 0.0:
-            angle[:, side] *= 1.0 + scale
+    turns = counted(WHEEL, p)
+    if turns != (1.0, 1.0):
+        angle *= turns
     return angle
 
 
@@ -137,9 +136,11 @@ def run_body(p: Array, angle: Array, speed: Array, extra: Array, first: Mask, t_
     """
     track = np.empty((angle.shape[0], 3))
     base, effects = body_effects(p)
-    scale = (1.0 / (1.0 + BODY.at(p, "encoder_scale.left")), 1.0 / (1.0 + BODY.at(p, "encoder_scale.right")))
+    turns = counted(BODY, p)
+    scale = (1.0 / turns[0], 1.0 / turns[1])
     _run_body(base, effects, scale, angle, speed, extra, first, t_s, track)
-    left, forward = BODY.at(p, "pose_offset.left_m"), BODY.at(p, "pose_offset.forward_m")
+    sensor = pose_sensor(p)
+    left, forward = sensor.left_m, sensor.forward_m
     if left != 0.0 or forward != 0.0:
         cosine, sine = np.cos(track[:, 2]), np.sin(track[:, 2])
         track[:, 0] += forward * cosine - left * sine
@@ -208,9 +209,8 @@ def pose_residual(
     `last_node` (P,) bound the run of each sample, for the latency.
     """
     out = np.empty_like(measured)
-    late = BODY.at(p, "pose_latency.latency_s") / GRID_STEP_S
-    bias = BODY.at(p, "heading_bias.bias_rad")
-    drift = BODY.at(p, "slope.drift_x_m_s"), BODY.at(p, "slope.drift_y_m_s")
+    sensor = pose_sensor(p)
+    late, bias, drift = sensor.late_s / GRID_STEP_S, sensor.bias_rad, (sensor.drift_x_m_s, sensor.drift_y_m_s)
     _lay(
         late, bias, *drift, track, moving_s, node, fraction, window, first_node, last_node, use, measured, out
     )  # fmt: skip

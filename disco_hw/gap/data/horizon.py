@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.gap.data.gridded_drive import GRID_STEP_S
-from disco_hw.gap.data.layout import BODY
+from disco_hw.gap.data.layout import pose_sensor
 from disco_hw.jit import kernel_function
 
 Array = NDArray[np.float64]
@@ -56,14 +56,8 @@ def displacement(
     run = np.searchsorted(begins, start, side="right") - 1
     low, high = begins[run], np.append(begins[1:], first.size)[run] - 1
     out = np.empty((start.size, 3))
-    world = np.array(
-        [
-            BODY.at(p, "pose_latency.latency_s"),
-            BODY.at(p, "heading_bias.bias_rad"),
-            BODY.at(p, "slope.drift_x_m_s"),
-            BODY.at(p, "slope.drift_y_m_s"),
-        ]
-    )
+    sensor = pose_sensor(p)
+    world = np.array([sensor.late_s, sensor.bias_rad, sensor.drift_x_m_s, sensor.drift_y_m_s])
     _displace(world, track, moving_s, start, low, high, heading_rad, round(ahead_s / GRID_STEP_S), out)
     return out
 

@@ -9,13 +9,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.effects.effect import Channel, Parameter
-from disco_hw.effects.registry import MOTION_EFFECTS, REGISTRY
+from disco_hw.effects.effect import Channel, Effect, Parameter, Stage, asks_for
+from disco_hw.effects.registry import DELAY, MOTION_EFFECTS, REGISTRY, in_stages
 from disco_hw.gap.data.gridded_drive import GRID_STEP_S
 from disco_hw.model.parameter import BASE_PARAMETERS
 from disco_hw.model.step import Base, Effects
@@ -35,11 +35,9 @@ _STEPS: Mapping[str, float] = {
     "1": 2e-4,
 }
 _OTHER_STEP = 1e-3
-# A host that stamps commands or encoders late shows as a negative delay; better told than hidden in noise.
-_EARLIEST_DELAY_S = -0.05
 _UNLIMITED = 1e6
-# A floor changes how much is lost in turning, and rolling hardly: in a log that only turns both do the same.
-_EXPECTED = {"surface_change.radius": 0.05}
+# Wheel speed (rad/s) at which whatever sets in with motion has set in.
+_FAST_RAD_S = 1e6
 
 
 @dataclass(frozen=True)
@@ -66,8 +64,7 @@ class Layout:
 def _layout(parameters: Mapping[str, Parameter], base: int) -> Layout:
     columns = tuple(parameters)
     neutral = np.array([min(p.neutral, _UNLIMITED) for p in parameters.values()])
-    low = np.array([p.low for p in parameters.values()])
-    low[[name == "command_delay.delay_s" for name in columns]] = _EARLIEST_DELAY_S
+    low = np.array([p.low if p.least_fitted is None else p.least_fitted for p in parameters.values()])
     return Layout(
         of_wheels=base == 0,
         columns=columns,
@@ -77,7 +74,7 @@ def _layout(parameters: Mapping[str, Parameter], base: int) -> Layout:
         ),
         low=low,
         high=np.array([max(p.high, p.neutral if p.neutral < np.inf else _UNLIMITED) for p in parameters.values()]),
-        precision=np.array([_EXPECTED.get(name, np.inf) ** -2.0 for name in columns]),
+        precision=np.array([p.expected**-2.0 for p in parameters.values()]),
         place=MappingProxyType({name: k for k, name in enumerate(columns)}),
     )
 
@@ -86,7 +83,7 @@ def _of_channels(*channels: Channel) -> dict[str, Parameter]:
     return {
         f"{name}.{parameter.name}": parameter
         for name, effect in REGISTRY.items()
-        if effect.channel in channels or (name == "encoder_scale")
+        if effect.channel in channels or effect.stage is Stage.ENCODERS
         for parameter in effect.parameters
     }
 
@@ -124,14 +121,54 @@ def _kept(name: str, values: tuple[float, ...], base: tuple[float, ...]) -> tupl
     return tuple(float(column[0]) for column in columns)
 
 
-# The command delay is the free run's own affair, the slope that of the world frame.
-_NOT_IN_STEP = ("command_delay", "slope")
-WHEEL_MOTION = tuple(
-    name for name in MOTION_EFFECTS if REGISTRY[name].channel is Channel.COMMAND_TO_WHEEL and name not in _NOT_IN_STEP
-)
-BODY_MOTION = tuple(
-    name for name in MOTION_EFFECTS if REGISTRY[name].channel is Channel.WHEEL_TO_BODY and name not in _NOT_IN_STEP
-)
+# The delay is the free run's own affair, what acts in the world that of who lays its path on poses.
+_IN_STEP = [name for name in MOTION_EFFECTS if REGISTRY[name].stage not in (Stage.DELAY, Stage.WORLD)]
+WHEEL_MOTION = tuple(name for name in _IN_STEP if REGISTRY[name].channel is Channel.COMMAND_TO_WHEEL)
+BODY_MOTION = tuple(name for name in _IN_STEP if REGISTRY[name].channel is Channel.WHEEL_TO_BODY)
+DELAYED_BY = DELAY.columns[0]
+# What the encoders count wrong, in either channel's vector.
+ENCODER_COLUMNS = tuple(column for effect in in_stages(Stage.ENCODERS) for column in effect.columns)
+
+
+class PoseSensor(NamedTuple):
+    """What a vector of the body channel says of the poses: how old they are (s), where the sensor sits ahead and to the
+    left of the tracked point (m), how far its yaw is off (rad), and the drift of a moving robot in the world (m/s).
+    """
+
+    late_s: float
+    forward_m: float
+    left_m: float
+    bias_rad: float
+    drift_x_m_s: float
+    drift_y_m_s: float
+
+
+def pose_sensor(p: Array) -> PoseSensor:
+    """The sensor of a vector in the order of `BODY.columns`."""
+    late_s = -sum(float(_plain(BODY, p, effect, time_s=0.0)) for effect in in_stages(Stage.POSE_TIME))
+    mount = 0.0, 0.0, 0.0
+    for effect in in_stages(Stage.POSE):
+        mount = _plain(BODY, p, effect, x=mount[0], y=mount[1], yaw=mount[2])
+    drift = 0.0, 0.0
+    for effect in in_stages(Stage.WORLD):
+        moving = {"wheel_sum": _FAST_RAD_S, "difference": 0.0, "time_s": 0.0}
+        drift = _plain(BODY, p, effect, x=drift[0], y=drift[1], **moving)
+    return PoseSensor(late_s, *(float(each) for each in (*mount, *drift)))
+
+
+def counted(layout: Layout, p: Array) -> tuple[float, float]:
+    """How many turns the left and right encoder count for one of their wheel."""
+    turns = 1.0, 1.0
+    for effect in in_stages(Stage.ENCODERS):
+        turns = _plain(layout, p, effect, left=turns[0], right=turns[1])
+    return float(turns[0]), float(turns[1])
+
+
+def _plain(layout: Layout, p: Array, effect: Effect, **motion: float) -> Any:
+    """What an effect makes of the motion in a second, at a vector."""
+    known = {"values": tuple(p[_SPANS[layout.of_wheels][effect.name]].tolist()), "step_s": 1.0, **motion}
+    known["geometry"] = tuple(p[:BASE_COUNT].tolist())
+    return effect.plain(**{name: known[name] for name in asks_for(effect.plain)})
 
 
 def wheel_effects(p: Array, geometry: Array) -> Any:

@@ -3,29 +3,23 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.effects.effect import Parameter
+from disco_hw.effects.effect import Effect, Parameter
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.noise.channels import WheelChannel
-from disco_hw.gap.search.candidates import CANDIDATES, candidates_of
+from disco_hw.gap.search.candidates import CANDIDATES, LATE_COLUMNS, candidates_of
 from disco_hw.gap.search.channel_search import ChannelResult
 from disco_hw.gap.search.least_squares import inverse, sensitivity, solve
 
 Array = NDArray[np.float64]
 
-_RAMP = "yaw_acceleration_limit"
-LIMITS = ("speed_limit", "yaw_rate_limit", _RAMP)
-_RAMPS_RAD_S2 = (20.0, 10.0, 7.0, 5.0, 3.5, 2.5, 1.5, 1.0, 0.5)
-_RESPONSE = ("motor_lag.tau_s", "command_delay.delay_s")
-# A limit shows only where more is asked: this share of what the robot can do, and no more turning than robots are
-# held to.
+# A limit shows only where more is asked: this share of what the robot can do, and no more than robots are held to.
 _MOST_OF_IT = 0.75
-_REALISTIC_YAW_RATE_RAD_S = 1.2
-_EXACT_ALIKE = {"pose_offset": "lateral_icr", "encoder_scale": "wheel_gain"}
 _USUAL_INFLATION = 1.5
 
 
@@ -51,11 +45,11 @@ def blind_spots(found: ChannelResult, top_rad_s: float | None = None) -> tuple[B
     """
     channel = found.selector.channel
     missing = [name for name in candidates_of(channel.layout) if name not in found.names]
-    spots = [_limit(found, name, top_rad_s) if name in LIMITS else _spot(found, name) for name in missing]
+    spots = [_limit(found, name, top_rad_s) if REGISTRY[name].is_limit else _spot(found, name) for name in missing]
     for spot in tuple(spots):
-        for other, like in _EXACT_ALIKE.items():
-            if spot.name == like:
-                parameter = next(p for p in REGISTRY[other].parameters if p.realistic is not None)
+        for other, effect in REGISTRY.items():
+            if effect.mimics is not None and effect.mimics.effect.name == spot.name:
+                parameter = next(p for p in effect.parameters if p.realistic is not None)
                 size = spot.smallest_visible
                 blind = size is None or size > _realistic(parameter)
                 spots.append(BlindSpot(other, parameter.name, spot.unit, size, blind, experiment_of(other)))
@@ -81,44 +75,42 @@ def experiment_of(name: str) -> str:
 
 
 def _limit(found: ChannelResult, name: str, top_rad_s: float | None) -> BlindSpot:
-    wheels, parameter = found.selector.channel.inner, REGISTRY[name].parameters[0]
-    assert isinstance(wheels, WheelChannel)
-    if name == _RAMP:
-        largest = _largest_ramp(found)
-        blind = largest is None or largest < _realistic(parameter)
-        return BlindSpot(name, parameter.name, parameter.unit, largest, blind, experiment_of(name))
-    largest = _largest(wheels, name)
-    enough = 0.0 if top_rad_s is None else _MOST_OF_IT * top_rad_s
-    if name == "yaw_rate_limit":
-        radius, axial = wheels.geometry[:2].tolist()
-        turning = math.inf if top_rad_s is None else enough * 2.0 * radius / axial
-        enough = min(turning, _REALISTIC_YAW_RATE_RAD_S)
-    blind = largest is None or largest < enough
+    channel, effect = found.selector.channel.inner, REGISTRY[name]
+    parameter, possible = effect.parameters[0], math.inf
+    if effect.limited is None or not isinstance(channel, WheelChannel):
+        largest = _largest_tried(found, effect)
+    else:
+        geometry = (float(channel.geometry[0]), float(channel.geometry[1]))
+        largest = _largest(channel, effect.limited, geometry)
+        if top_rad_s is not None:
+            possible = _MOST_OF_IT * float(effect.limited(np.array([[-top_rad_s, top_rad_s]]), geometry)[0])
+    enough = min(possible, _realistic(parameter))
+    blind = largest is None or (largest < enough < math.inf)
     return BlindSpot(name, parameter.name, parameter.unit, largest, blind, experiment_of(name))
 
 
-def _largest(wheels: WheelChannel, name: str) -> float | None:
+def _largest(
+    wheels: WheelChannel, limited: Callable[[Array, tuple[float, float]], Array], geometry: tuple[float, float]
+) -> float | None:
     """The largest limit that cuts at least half a second of the commands."""
     command = wheels.drive.command_rad_s
-    command = command[np.isfinite(command[:, 0])]
-    if name == "speed_limit":
-        size = np.abs(command).max(axis=1)
-    else:
-        size = np.abs(command[:, 1] - command[:, 0]) * wheels.geometry[0] / wheels.geometry[1]
+    size = limited(command[np.isfinite(command[:, 0])], geometry)
     if size.size < 200 or size.max() < 1e-3:
         return None
     return float(0.97 * np.sort(size)[-50])
 
 
-def _largest_ramp(found: ChannelResult) -> float | None:
-    """The largest limit of the yaw acceleration that would have shown, with a lag and a delay that may hide it."""
+def _largest_tried(found: ChannelResult, effect: Effect) -> float | None:
+    """The largest of a limit's trials that would have shown, with what makes wheels late, as that may hide it."""
     channel, best = found.selector.channel, found.fit
     layout, limits = channel.layout, found.selector.thresholds
-    places = tuple(layout.place[name] for name in _RESPONSE if layout.place[name] not in best.active)
+    places = tuple(
+        layout.place[name] for name in LATE_COLUMNS if name in layout.place and layout.place[name] not in best.active
+    )
     slope = np.column_stack([best.jacobian, sensitivity(channel, best.vector, places, best.residual)])
     vector = best.vector.copy()
-    for limit in _RAMPS_RAD_S2:
-        vector[layout.place[f"{_RAMP}.{REGISTRY[_RAMP].parameters[0].name}"]] = limit
+    for limit in effect.trials:
+        vector[layout.place[effect.columns[0]]] = limit
         moved = channel.residual(vector) - best.residual
         own = moved - slope @ solve(slope, slope.T @ moved)
         enough = (limits.score + math.log(max(channel.count, 2))) * _USUAL_INFLATION
@@ -137,7 +129,7 @@ def _size(found: ChannelResult, name: str, column: str) -> float | None:
     layout, candidate, limits = channel.layout, CANDIDATES[name], found.selector.thresholds
     threshold = limits.score + candidate.parameters * math.log(max(channel.count, 2))
     if candidate.profile is not None and column == candidate.profile.column:
-        return _by_trial(found, column, threshold)
+        return _by_trial(found, column, REGISTRY[name].trials, threshold)
     vector = best.vector.copy()
     if candidate.profile is not None:
         values = candidate.profile.values(channel)
@@ -165,11 +157,11 @@ def _size(found: ChannelResult, name: str, column: str) -> float | None:
     return size if size < limit else None
 
 
-def _by_trial(found: ChannelResult, column: str, threshold: float) -> float | None:
+def _by_trial(found: ChannelResult, column: str, trials: tuple[float, ...], threshold: float) -> float | None:
     """Smallest of a row of sizes whose prediction differs from the one without clearly, and enough to matter."""
     channel, best = found.selector.channel, found.fit
     place = channel.layout.place[column]
-    for size in (0.05, 0.1, 0.2, 0.3, 0.5, 0.75, 1.0, 1.5, 2.0):
+    for size in trials:
         vector = best.vector.copy()
         vector[place] = size
         difference = channel.residual(vector) - best.residual

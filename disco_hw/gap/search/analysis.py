@@ -20,14 +20,14 @@ from disco_hw.gap.report.findings import CandidateEvidence, ChannelFinding, Effe
 from disco_hw.gap.report.misspecification import misspecified_effects
 from disco_hw.gap.report.regimes import in_words, regimes
 from disco_hw.gap.report.residue import remaining_disagreements
-from disco_hw.gap.search.candidates import CHANGE, candidates_of, indices, parameters_of
+from disco_hw.gap.search.candidates import candidates_of, indices, parameters_of
 from disco_hw.gap.search.channel_search import ChannelResult
 from disco_hw.gap.search.confounding import (
     ASYMMETRY,
+    ASYMMETRY_COLUMN,
     ENCODER,
     GAIN,
     OUTSIDE_TESTS,
-    PATCH_OR_CHANGE,
     confounded_with,
     one_encoder,
 )
@@ -78,7 +78,7 @@ class GapAnalysis:
             return GAIN in (self.wheels.names if self.wheels else ()), False
         if GAIN not in self.wheels.names or GAIN in self.wheels.selector.given:
             return False, False
-        seen = body.by_name.get(f"{ASYMMETRY}.ratio")
+        seen = body.by_name.get(ASYMMETRY_COLUMN)
         told = self._asymmetry(self.body) if seen is None else (seen.value, seen.deviation)
         return one_encoder(wheels, told, seen is not None)
 
@@ -86,7 +86,7 @@ class GapAnalysis:
     def _asymmetry(found: ChannelResult) -> tuple[float, float]:
         """Asymmetry of the wheels that would fit best if it were free too, and its standard deviation."""
         channel, best = found.selector.channel, found.fit
-        place = channel.layout.place[f"{ASYMMETRY}.ratio"]
+        place = channel.layout.place[ASYMMETRY_COLUMN]
         free = fit(channel, best.vector, (*best.active, place))
         variance = free.covariance()[-1, -1] * inflation(free, channel, (place,))
         return float(free.vector[place]), float(np.sqrt(variance))
@@ -102,7 +102,7 @@ class GapAnalysis:
         names = tuple(name for name in self.body.names if name != ASYMMETRY)
         channel = self.body.selector.channel
         vector = self.body.fit.vector.copy()
-        vector[channel.layout.place[f"{ASYMMETRY}.ratio"]] = 0.0
+        vector[channel.layout.place[ASYMMETRY_COLUMN]] = 0.0
         wheels = self.wheels.fit.vector
         for side in ("left", "right"):
             gain = wheels[self.wheels.selector.channel.layout.place[f"{GAIN}.{side}"]]
@@ -227,8 +227,8 @@ class GapAnalysis:
             if found is None:
                 continue
             for one in found.unnamed:
-                either = found.either and one.term.disc is not None
-                same, test = ((CHANGE,), PATCH_OR_CHANGE) if either else ((), None)
+                same = found.either if one.term.disc is not None else ()
+                test = REGISTRY[same[0]].like_a_patch if same else None
                 in_model = one.term.model_name is not None
                 out.append(UnnamedFinding(place.value, one.form, one.evidence.score, in_model, same, test))
         return tuple(out)

@@ -1,7 +1,6 @@
 """The named effects as they compete: what each frees of a channel's parameter vector, and where its fit starts.
 
-An effect of the registry competes with all its parameters, from its own start values. Listed here is only what is
-different: parameters in which the residual is not smooth, and effects with the equations of another.
+An effect of the registry competes with all its parameters, from its own start values, or along its scan.
 """
 
 from __future__ import annotations
@@ -14,18 +13,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.effects.effect import Channel as Place
-from disco_hw.effects.registry import REGISTRY
+from disco_hw.effects.effect import Driven, Effect, Stage
+from disco_hw.effects.registry import REGISTRY, in_stages
 from disco_hw.gap.data.layout import Layout
-from disco_hw.gap.noise.channels import BodyChannel, ResidualChannel, WheelChannel
+from disco_hw.gap.noise.channels import BodyChannel, ResidualChannel
 
 Array = NDArray[np.float64]
 Starts = tuple[tuple[float, ...], ...]
 
-# Indistinguishable from another effect, or from two at once: decided after the others, in `classes`.
-DECIDED_LATER = ("pose_offset", "encoder_scale")
-# What a patch of the floor looks like if it is left and not entered again.
-CHANGE = "surface_change"
-_RISES_S = (0.15, 0.5, 1.2)
+# What makes wheels late, from the wheel back to the command.
+_LATE = [effect for effect in reversed(in_stages(Stage.DELAY, Stage.COMMAND, Stage.RESPONSE)) if effect.late_by]
+LATE = tuple(effect.name for effect in _LATE)
+LATE_COLUMNS = tuple(f"{effect.name}.{effect.late_by}" for effect in _LATE)
+LATE_STARTS_S = tuple(zip(*(effect.late_starts for effect in _LATE), strict=False))
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,66 +55,31 @@ class Candidate:
         return len(self.columns) + (self.profile is not None)
 
 
-def _below_largest(turning: bool) -> Callable[[ResidualChannel], Starts]:
-    """Limits start where they cut a part of what was commanded."""
-
-    def starts(channel: ResidualChannel) -> Starts:
-        wheels = channel.inner
-        assert isinstance(wheels, WheelChannel)
-        command = wheels.drive.command_rad_s
-        command = command[np.isfinite(command[:, 0])]
-        size = np.abs(0.5 * (command[:, 1] - command[:, 0])) if turning else np.abs(command).max(axis=1)
-        largest = float(size.max()) if size.size else 0.0
-        if turning:
-            largest *= 2.0 * wheels.geometry[0] / wheels.geometry[1]
-        return tuple((share * largest,) for share in (0.92, 0.75, 0.5)) if largest > 0.1 else ()
-
-    return starts
+def driven(channel: ResidualChannel) -> Driven:
+    """The drive of a channel as effects see it."""
+    inner = channel.inner
+    commands, geometry = inner.drive.command_rad_s, inner.geometry
+    t_s = inner.samples.t_s if isinstance(inner, BodyChannel) else inner.drive.t_s
+    known = commands[np.isfinite(commands[:, 0])]
+    return Driven(known, (float(geometry[0]), float(geometry[1])), float(t_s[0]), float(t_s[-1]))
 
 
-def _slow_to_turn(channel: ResidualChannel) -> Starts:
-    """Limits of the yaw acceleration start where the fastest turn that was commanded takes a while."""
-    fastest = _below_largest(True)(channel)
-    return tuple((fastest[0][0] / rise_s,) for rise_s in _RISES_S) if fastest else ()
-
-
-def _stiction_values(channel: ResidualChannel) -> tuple[float, ...]:
-    return tuple(np.arange(0.1, 2.05, 0.1).tolist())
-
-
-def _change_times(channel: ResidualChannel) -> tuple[float, ...]:
-    body = channel.inner
-    assert isinstance(body, BodyChannel)
-    first, last = float(body.samples.t_s[0]), float(body.samples.t_s[-1])
-    if last - first < 30.0:
-        return ()
-    return tuple(np.arange(first + 10.0, last - 10.0, max(4.0, (last - first) / 40.0)).tolist())
-
-
-_SPECIAL = (
-    Candidate("motor_lag", ("motor_lag.tau_s",), lambda channel: ((0.05,), (0.25,))),
-    Candidate("command_delay", ("command_delay.delay_s",), lambda channel: ((0.03,), (0.12,), (0.3,))),
-    Candidate("deadband", ("deadband.width_rad_s",), lambda channel: ((0.2,),)),
-    Candidate("stiction", (), None, Profile("stiction.threshold_rad_s", _stiction_values, 0.002)),
-    Candidate("speed_limit", ("speed_limit.limit_rad_s",), _below_largest(False)),
-    Candidate("yaw_rate_limit", ("yaw_rate_limit.limit_rad_s",), _below_largest(True)),
-    Candidate("yaw_acceleration_limit", ("yaw_acceleration_limit.limit_rad_s2",), _slow_to_turn),
-    Candidate(
-        "surface_change",
-        ("surface_change.track", "surface_change.radius"),
-        None,
-        Profile("surface_change.time_s", _change_times, 0.25),
-    ),
-)
+def _candidate(effect: Effect) -> Candidate:
+    scan, begin = effect.scan, effect.starts
+    fitted = [p.name for p in effect.parameters if scan is None or p.name != scan.parameter]
+    return Candidate(
+        effect.name,
+        tuple(f"{effect.name}.{key}" for key in fitted),
+        None if begin is None else lambda channel: begin(driven(channel)),
+        None
+        if scan is None
+        else Profile(f"{effect.name}.{scan.parameter}", lambda channel: scan.values(driven(channel)), scan.refine),
+    )
 
 
 def _competing() -> dict[str, Candidate]:
-    special = {candidate.name: candidate for candidate in _SPECIAL}
-    return {
-        name: special.get(name) or Candidate(name, tuple(f"{name}.{p.name}" for p in effect.parameters))
-        for name, effect in REGISTRY.items()
-        if name not in DECIDED_LATER
-    }
+    # What mimics another effect is decided after the others, in `confounding`.
+    return {name: _candidate(effect) for name, effect in REGISTRY.items() if effect.mimics is None}
 
 
 CANDIDATES: Mapping[str, Candidate] = MappingProxyType(_competing())
@@ -123,6 +88,12 @@ CANDIDATES: Mapping[str, Candidate] = MappingProxyType(_competing())
 def candidates_of(layout: Layout) -> tuple[str, ...]:
     """Names of the effects that compete in the channel of a layout."""
     return tuple(name for name in CANDIDATES if (REGISTRY[name].channel is Place.COMMAND_TO_WHEEL) == layout.of_wheels)
+
+
+def smooth_of(layout: Layout) -> tuple[str, ...]:
+    """Those of them that a fit finds from neutral, in the order in which they act."""
+    acting = [effect.name for effect in in_stages(*Stage) if effect.smooth]
+    return tuple(name for name in acting if name in candidates_of(layout))
 
 
 def parameters_of(names: tuple[str, ...]) -> int:

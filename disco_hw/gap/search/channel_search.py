@@ -10,14 +10,15 @@ from itertools import chain
 import numpy as np
 from numpy.typing import NDArray
 
+from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.data.gridded_drive import GRID_STEP_S, GriddedDrive
 from disco_hw.gap.data.horizon import displacement, starts_of
-from disco_hw.gap.data.layout import WHEEL
+from disco_hw.gap.data.layout import BODY, DELAYED_BY, WHEEL
 from disco_hw.gap.noise.body_noise import BodyNoise
 from disco_hw.gap.noise.channels import BodyChannel, ResidualChannel, WheelChannel
 from disco_hw.gap.noise.noise_fit import learn_body_noise, learn_wheel_noise
 from disco_hw.gap.noise.wheel_noise import WheelNoise, whiten_wheels
-from disco_hw.gap.search.candidates import CANDIDATES, CHANGE, indices, parameters_of
+from disco_hw.gap.search.candidates import LATE, LATE_COLUMNS, LATE_STARTS_S, indices, parameters_of, smooth_of
 from disco_hw.gap.search.evidence import EffectEvidence, compare
 from disco_hw.gap.search.least_squares import Fit, fit, inverse
 from disco_hw.gap.search.richest_model import learn_saturated_body, learn_saturated_wheels
@@ -30,8 +31,6 @@ AHEAD_S = 2.0
 _MOST_TERMS = 2
 # A term that what is fitted already does nine tenths of would only pull against it.
 _LEAST_OWN = 0.1
-_RESPONSE = ("motor_lag", "command_delay")
-_RESPONSES_S = ((0.02, 0.02), (0.15, 0.1), (0.4, 0.3))
 _WORTH_TRYING = 18.0
 _GAUSSIAN_KURTOSIS = 3.0
 _CLIPPED_AT = 6.0
@@ -46,17 +45,6 @@ _CLEARLY = 6.0
 _ABOUT_TERMS = 110
 _NO_INFORMATION = 1e-3
 _ROUGH = Thresholds(score=20.0, moves_m=0.0)
-_SMOOTH_WHEEL = ("motor_lag", "command_delay", "deadband", "battery_sag", "wheel_gain")
-_SMOOTH_BODY = (
-    "wheel_radius_asymmetry",
-    "turn_slip",
-    "acceleration_slip",
-    "side_slip",
-    "lateral_icr",
-    "slope",
-    "pose_latency",
-    "heading_bias",
-)
 
 
 @dataclass(frozen=True)
@@ -73,7 +61,7 @@ class ChannelResult:
     """What a channel's search ended with: its selector (noise held, all fits kept), accepted effects and terms.
 
     `richest` (n,): whitened residuals of the channel's richest model, which had `richest_parameters`. `either`:
-    whether a change of the surface explains what a patch of the floor does as well.
+    effects that explain what a patch of the floor does as well.
     """
 
     selector: Selector
@@ -83,7 +71,7 @@ class ChannelResult:
     plain: Selector | None = None
     richest: Array | None = None
     richest_parameters: int = 0
-    either: bool = False
+    either: tuple[str, ...] = ()
 
     @property
     def fit(self) -> Fit:
@@ -154,10 +142,10 @@ def search_wheels(drive: GriddedDrive, geometry: Array, start: Array, given: Nam
     channel = WheelChannel.build(drive, WheelNoise(reading_rad=max(drive.quantum_rad, 2e-4)), geometry)
     moves = wheel_moves(channel, geometry)
     rough = Selector(channel, moves, _ROUGH, given=given, start=start)
-    begin = tuple(dict.fromkeys((*given, *_RESPONSE)))
+    begin = tuple(dict.fromkeys((*given, *LATE)))
     responding(rough, begin)
     names = rough.greedy(begin, responding)
-    rich = (*names, *(name for name in _SMOOTH_WHEEL if name not in names))
+    rich = (*names, *(name for name in smooth_of(WHEEL) if name not in names))
     vector = fit(channel, rough.fit(names).vector, indices(channel, rich)).vector
     channel = channel.expecting(vector)
     plain = learn_wheel_noise(channel, channel.raw_residual(vector))
@@ -186,12 +174,12 @@ def responding(selector: Selector, names: Names) -> None:
     other. And what stops the wheels looks slow until it is named: then the others are fitted without a response first.
     """
     channel, before = selector.channel, selector.fits.get(frozenset(names))
-    others = tuple(name for name in names if name in selector.given or name not in _RESPONSE)
+    others = tuple(name for name in names if name in selector.given or name not in LATE)
     active = indices(channel, names)
-    places = [channel.layout.place[column] for name in _RESPONSE for column in CANDIDATES[name].columns]
+    places = [channel.layout.place[column] for column in LATE_COLUMNS]
     plain = selector.fit(others).vector
     options = [] if before is None else [before, fit(channel, plain, active)]
-    for response_s in _RESPONSES_S if before is None else ():
+    for response_s in LATE_STARTS_S if before is None else ():
         vector = plain.copy()
         vector[places] = response_s
         options.append(fit(channel, vector, active))
@@ -205,7 +193,7 @@ def search_body(drive: GriddedDrive, start: Array, given: Names = ()) -> Channel
     channel = learn_body_noise(channel, nominal.vector, iterations=4)
     rough = Selector(channel, body_moves(channel), _ROUGH, given=given, start=nominal.vector)
     names = rough.greedy()
-    rich = (*names, *(name for name in _SMOOTH_BODY if name not in names))
+    rich = (*names, *(name for name in smooth_of(BODY) if name not in names))
     vector = fit(channel, rough.fit(names).vector, indices(channel, rich)).vector
     channel = learn_body_noise(channel, vector)
     perturbations = _body_perturbations(channel, rich, vector)
@@ -224,14 +212,15 @@ def _time_or_place(found: ChannelResult) -> ChannelResult:
     patch is told then, and that a change would do as well is kept.
     """
     named = with_unnamed(found, _body_options)
-    if CHANGE not in found.names or CHANGE in found.selector.given:
+    alike = tuple(name for name in found.names if REGISTRY[name].like_a_patch and name not in found.selector.given)
+    if not alike:
         return named
-    rest = tuple(name for name in found.names if name != CHANGE)
+    rest = tuple(name for name in found.names if name not in alike)
     placed = with_unnamed(replace(found, names=rest), _body_options)
-    if CHANGE in placed.names or not any(one.term.disc for one in placed.unnamed):
+    if set(alike) & set(placed.names) or not any(one.term.disc for one in placed.unnamed):
         return named
     better = _priced(named) - _priced(placed)
-    return replace(placed, either=better < _CLEARLY) if better > -_CLEARLY else named
+    return replace(placed, either=alike if better < _CLEARLY else ()) if better > -_CLEARLY else named
 
 
 def _priced(found: ChannelResult) -> float:
@@ -270,7 +259,7 @@ def _thresholds(white: Array, use: NDArray[np.bool_]) -> Thresholds:
 
 def _wheel_options(found: ChannelResult) -> Iterator[Term]:
     assert isinstance(found.channel, WheelChannel)
-    return wheel_terms(found.channel, WHEEL.at(found.fit.vector, "command_delay.delay_s"))
+    return wheel_terms(found.channel, WHEEL.at(found.fit.vector, DELAYED_BY))
 
 
 def _body_options(found: ChannelResult) -> Iterator[Term]:

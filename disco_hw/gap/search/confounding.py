@@ -5,28 +5,23 @@ from __future__ import annotations
 from collections.abc import Mapping
 from types import MappingProxyType
 
+from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.search.intervals import ChannelEstimates
 
 _SIGMAS = 3.0
 # Of gains that are none of an encoder fewer than one in a hundred comes so far by chance.
 _SURE_NATS = 3.0
 
-LATERAL = "lateral_icr"
-SENSOR = "pose_offset"
-GAIN = "wheel_gain"
-ASYMMETRY = "wheel_radius_asymmetry"
-ENCODER = "encoder_scale"
-# What decides whether a patch of the floor or a change of all of it was driven on.
-PATCH_OR_CHANGE = "drive again, later, where it was different"
+_MIMICS = {name: effect.mimics for name, effect in REGISTRY.items() if effect.mimics is not None}
+# The cause that shows in two channels: as a gain of the drive, and as unequal wheels.
+ENCODER, _SHOWN = next((name, one) for name, one in _MIMICS.items() if one.seen_too is not None)
+GAIN = _SHOWN.effect.name
+ASYMMETRY = _SHOWN.seen_too_as.EFFECT.name
+ASYMMETRY_COLUMN = REGISTRY[ASYMMETRY].columns[0]
 
 # What decides between the members of a class lies outside such logs.
 OUTSIDE_TESTS: Mapping[frozenset[str], str] = MappingProxyType(
-    {
-        frozenset(
-            (LATERAL, SENSOR)
-        ): "measure the pose sensor's mount with a ruler, or move the payload and drive again",
-        frozenset((GAIN, ENCODER)): "turn each wheel ten times by hand and count ticks",
-    }
+    {frozenset((name, mimicked.effect.name)): mimicked.decided_by for name, mimicked in _MIMICS.items()}
 )
 
 
@@ -41,7 +36,8 @@ def one_encoder(wheels: ChannelEstimates, asymmetry: tuple[float, float], accept
     if gains[0] is None or gains[1] is None:
         return False, False
     left, right = gains[0].value, gains[1].value
-    expected = (left - right) / (2.0 + left + right)
+    assert _SHOWN.seen_too is not None
+    expected = _SHOWN.seen_too((left, right))
     spread = 0.5 * (gains[0].deviation + gains[1].deviation)
     value, deviation = asymmetry
     variance = deviation**2 + spread**2
@@ -53,9 +49,7 @@ def one_encoder(wheels: ChannelEstimates, asymmetry: tuple[float, float], accept
 def confounded_with(names: tuple[str, ...], encoder_possible: bool) -> dict[str, tuple[str, ...]]:
     """For each accepted effect what no drive can tell from it."""
     found: dict[str, tuple[str, ...]] = {}
-    for name in names:
-        if name == LATERAL:
-            found[name] = (SENSOR,)
-        elif name == GAIN and encoder_possible:
-            found[name] = (ENCODER,)
+    for other, mimicked in _MIMICS.items():
+        if mimicked.effect.name in names and (mimicked.seen_too is None or encoder_possible):
+            found[mimicked.effect.name] = (*found.get(mimicked.effect.name, ()), other)
     return found

@@ -13,6 +13,7 @@ from scipy.signal import lfilter
 from disco_hw.gap.data.free_runs import read_angles, run_body
 from disco_hw.gap.data.gridded_drive import BLOCK_S, GRID_STEP_S
 from disco_hw.gap.data.horizon import displacement, starts_of
+from disco_hw.gap.data.layout import ENCODER_COLUMNS
 from disco_hw.gap.noise.channels import BodyChannel, WheelChannel, total_perturbation
 from disco_hw.gap.noise.wheel_noise import WANDER_S
 from disco_hw.gap.search.least_squares import Fit, by_block, inverse, known
@@ -181,12 +182,12 @@ def chain_track(
     """Free run from commands to the path (M, 3), and wheel speeds (M, 2) on the way."""
     drive = body.drive
     p = chain.body.copy()
-    scale = [body.layout.place[f"encoder_scale.{side}"] for side in ("left", "right")]
+    scale = [body.layout.place[column] for column in ENCODER_COLUMNS]
     perturbation = total_perturbation(drive, 3, drive.known_motion, chain.body_perturbation, extra)
     if wheels is None or chain.wheels is None:
         return run_body(p, drive.angle_rad, drive.speed_rad_s, perturbation, drive.first, drive.t_s), drive.speed_rad_s
     q = chain.wheels.copy()
-    q[[wheels.layout.place[f"encoder_scale.{side}"] for side in ("left", "right")]] = 0.0
+    q[[wheels.layout.place[column] for column in ENCODER_COLUMNS]] = 0.0
     p[scale] = 0.0
     angle = wheels.angles(q, chain.wheels_perturbation)
     speed = np.gradient(angle, GRID_STEP_S, axis=0)

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from disco_hw.effects.effect import Channel
+from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.search.candidates import CANDIDATES, indices
 from disco_hw.gap.search.channel_search import ChannelResult
 from disco_hw.gap.search.evidence import inflation
@@ -14,8 +16,13 @@ from disco_hw.gap.search.least_squares import fit
 
 Array = NDArray[np.float64]
 
-# Limits of the robot's turning, which act on the wheels: known in wheel speeds, times radius over axial distance.
-_OF_TURNING = ("yaw_rate_limit.limit_rad_s", "yaw_acceleration_limit.limit_rad_s2")
+# Of the robot's turning, which act on the wheels: known in wheel speeds, times radius over axial distance.
+_OF_TURNING = tuple(
+    column
+    for effect in REGISTRY.values()
+    if effect.uses_geometry and effect.channel is Channel.COMMAND_TO_WHEEL
+    for column in effect.columns
+)
 _Z95 = 1.96
 _RISE = 0.5 * _Z95**2
 

@@ -14,11 +14,11 @@ from scipy.signal import lfilter
 
 from disco_hw.gap.data.free_runs import read_angles
 from disco_hw.gap.data.gridded_drive import GRID_STEP_S
-from disco_hw.gap.data.layout import WHEEL
+from disco_hw.gap.data.layout import DELAYED_BY, WHEEL
 from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
 from disco_hw.gap.noise.noise_fit import learn_body_noise, learn_wheel_noise, wheel_misfit
 from disco_hw.gap.noise.wheel_noise import WheelNoise, whiten_wheels
-from disco_hw.gap.search.candidates import indices
+from disco_hw.gap.search.candidates import LATE_COLUMNS, indices
 from disco_hw.gap.search.least_squares import sensitivity
 from disco_hw.jit import kernel_function
 
@@ -114,9 +114,10 @@ def _wheel_shapes(channel: WheelChannel, vector: Array) -> Iterator[Array]:
     """Speeds (M, 2) of the wheels that a command may make in ways the named effects do not have."""
     drive = channel.drive
     raw = np.nan_to_num(drive.command_rad_s)
-    late = max(round(WHEEL.at(vector, "command_delay.delay_s") / GRID_STEP_S), 0)
+    late = max(round(WHEEL.at(vector, DELAYED_BY) / GRID_STEP_S), 0)
     asked = np.concatenate([np.repeat(raw[:1], late, axis=0), raw[: raw.shape[0] - late]])
-    u = _slow(asked, max(WHEEL.at(vector, "motor_lag.tau_s"), 1e-3))
+    response_s = sum(WHEEL.at(vector, column) for column in LATE_COLUMNS if column != DELAYED_BY)
+    u = _slow(asked, max(response_s, 1e-3))
     largest = float(np.abs(u).max(initial=0.0))
     if largest <= 0.0:
         return

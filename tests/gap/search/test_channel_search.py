@@ -13,7 +13,6 @@ from disco_hw.gap.data.layout import BODY, WHEEL
 from disco_hw.gap.find import find_gap
 from disco_hw.gap.noise.channels import WheelChannel
 from disco_hw.gap.noise.wheel_noise import WheelNoise
-from disco_hw.gap.search.candidates import CHANGE
 from disco_hw.gap.search.channel_search import responding, search_body, wheel_moves
 from disco_hw.gap.search.selection import Selector
 from disco_hw.model import Model
@@ -31,7 +30,7 @@ def found_in(name, values, seed):
 
 def test_a_patch_that_is_entered_again_is_a_patch():
     found = found_in("x_carpet_patch", (0.28,), 503)
-    assert CHANGE not in found.names
+    assert "surface_change" not in found.names
     x, y, radius = found.unnamed[0].term.disc
     assert (x, y, radius) == pytest.approx((0.5, 0.0, 0.75), abs=0.45)
 
@@ -39,8 +38,8 @@ def test_a_patch_that_is_entered_again_is_a_patch():
 # The second leaves a patch that would do, but worse.
 @pytest.mark.parametrize(("values", "seed"), [((0.16, 58.0, -0.03), 502), ((-0.094, 42.1, -0.021), 3005)])
 def test_a_change_is_a_change(values, seed):
-    found = found_in(CHANGE, values, seed)
-    assert found.names == (CHANGE,)
+    found = found_in("surface_change", values, seed)
+    assert found.names == ("surface_change",)
     assert not found.unnamed
     assert not found.either
 
@@ -50,7 +49,7 @@ def test_a_patch_that_is_left_for_good_is_told_with_the_change_it_looks_like():
     assert not report.effects
     (term,) = report.unnamed
     assert "within" in term.form
-    assert term.indistinguishable_from == (CHANGE,)
+    assert term.indistinguishable_from == ("surface_change",)
     assert term.experiment == "drive again, later, where it was different"
     assert "not to be told from surface_change" in report.as_text()
     # Half of the log says nothing about it: its prediction is that of the plain model, not worse.
