@@ -44,7 +44,7 @@ def _tick(k: int, now_ns: int) -> list[Record]:
         PoseSample(now_ns, now_ns, number(), number(), number(), 0.01, 0.02),
         Innovation(now_ns, (number(), number(), number()), (number(), number(), number()), 0.1, True),
         Estimate(now_ns, number(), number(), number(), tuple(number() for _ in range(9)), 0.2, 0.1, 2.0, 2.0),
-        Plan(now_ns, now_ns, 0.1, speeds, speeds, 100.0, 1.0, 0.1, 0.2, 0.1, speeds, speeds, speeds),
+        Plan(now_ns, now_ns, 0.1, speeds, speeds, 100.0, 1.0, 0.1, 0.2, speeds, speeds, speeds),
         Command(now_ns, number(), number(), number(), number(), 0.1, True, "plan", ("acceleration",), 20_000_000),
         LoopTiming(now_ns, k, now_ns, 50_000, {"receive": 40_000, "estimate": 90_000, "plan": 3_000_000}),
     ]

@@ -33,7 +33,7 @@ def plan_at(tick):
     path = [pose_at(tick + 5 * step) for step in range(11)]
     return records.Plan(
         t_ns=now_ns, t0_ns=now_ns, step_s=0.1, left_rad_s=(LEFT_RAD_S,) * 10, right_rad_s=(RIGHT_RAD_S,) * 10,
-        effective_samples=40.0 + tick % 7, temperature=0.3, min_cost=1.0, mean_cost=2.0, instant_cost=0.5,
+        effective_samples=40.0 + tick % 7, temperature=0.3, min_cost=1.0, mean_cost=2.0,
         path_x_m=tuple(x for x, _, _ in path), path_y_m=tuple(y for _, y, _ in path),
         path_yaw_rad=tuple(yaw for _, _, yaw in path),
     )  # fmt: skip

@@ -1,7 +1,9 @@
-"""Records as JSON and their JSON schemas, such that every float comes back bit for bit.
+"""Records as JSON and their JSON schemas, such that every message obeys its schema and every float comes back.
 
-JSON has no NaN or infinity; they are written as the strings "NaN", "Infinity" and "-Infinity" (the mapping that
-protobuf uses for JSON). Their sign survives, the payload bits of a NaN do not. Bytes are base64.
+JSON has no NaN or infinity. A field that is not finite, or holds something that is not, is left out, so that viewers
+see no value; what it was is in the text field `not_finite`, as JSON with the strings "NaN", "Infinity" and "-Infinity"
+(the mapping that protobuf uses). Every finite float comes back bit for bit, of NaN only that it was one. Bytes are
+base64. Logs of before have those strings in the fields themselves, and are read as well.
 """
 
 from __future__ import annotations
@@ -14,9 +16,11 @@ import msgspec
 from disco_hw.log.records import TOPICS, Plan, PlanFigures, Record, topic_of
 
 _PLAN = topic_of(Plan)
-_NOTE = 'Non-finite numbers are written as the strings "NaN", "Infinity" and "-Infinity"; bytes as base64.'
+_NOT_FINITE = "not_finite"
+_NOT_FINITE_KEY = b'"not_finite":'
+_NOTE = "A field that is not finite is left out, and what it was is in not_finite, as JSON; bytes are base64."
 
-_PLAIN_KEYS = ("title", "type", "description", "contentEncoding", "required")
+_PLAIN_KEYS = ("title", "type", "description", "contentEncoding")
 
 
 def encode_json(record: Record) -> bytes:
@@ -25,21 +29,36 @@ def encode_json(record: Record) -> bytes:
     if b"null" not in encoded:
         return encoded
     # No field is optional, so a null is a non-finite number (or the word in a text, which the detour leaves alone).
-    return msgspec.json.encode(_spell_non_finite(msgspec.to_builtins(record)))
+    fields: dict[str, Any] = msgspec.to_builtins(record)
+    odd = {name: _spelled(value) for name, value in fields.items() if not _finite(value)}
+    if not odd:
+        return encoded
+    finite = {name: value for name, value in fields.items() if name not in odd}
+    return msgspec.json.encode({**finite, _NOT_FINITE: msgspec.json.encode(odd).decode()})
 
 
-def _spell_non_finite(value: Any) -> Any:
-    if isinstance(value, float):
-        if math.isfinite(value):
-            return value
-        if math.isnan(value):
-            return "NaN"
-        return "Infinity" if value > 0 else "-Infinity"
-    if isinstance(value, dict):
-        return {key: _spell_non_finite(item) for key, item in value.items()}
+def _finite(value: Any) -> bool:
     if isinstance(value, list | tuple):
-        return [_spell_non_finite(item) for item in value]
-    return value
+        return all(map(_finite, value))
+    return not isinstance(value, float) or math.isfinite(value)
+
+
+def _spelled(value: Any) -> Any:
+    if isinstance(value, list | tuple):
+        return [_spelled(item) for item in value]
+    if _finite(value):
+        return value
+    return "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"
+
+
+def _restored(data: bytes) -> bytes:
+    """A message with what it says of its fields that are not finite put back into them; raises MsgspecError."""
+    fields = msgspec.json.decode(data, type=dict[str, msgspec.Raw])
+    if _NOT_FINITE not in fields:
+        return data
+    text = msgspec.json.decode(fields.pop(_NOT_FINITE), type=str)
+    fields |= msgspec.json.decode(text, type=dict[str, msgspec.Raw])
+    return msgspec.json.encode(fields)
 
 
 class JsonDecoder:
@@ -52,11 +71,15 @@ class JsonDecoder:
 
     def decode(self, topic: str, data: bytes) -> Record:
         """The record of one message of `topic`."""
+        if _NOT_FINITE_KEY in data:
+            data = _restored(data)
         return self._decoders[topic].decode(data)
 
     def decode_brief(self, topic: str, data: bytes) -> Record | PlanFigures:
         """The same, but of a plan the figures alone, which takes less than half of the time."""
-        return self._plan_figures.decode(data) if topic == _PLAN else self._decoders[topic].decode(data)
+        if topic != _PLAN:
+            return self.decode(topic, data)
+        return self._plan_figures.decode(_restored(data) if _NOT_FINITE_KEY in data else data)
 
 
 def json_schema(record_type: type[Record]) -> bytes:
@@ -67,7 +90,16 @@ def json_schema(record_type: type[Record]) -> bytes:
     schema = msgspec.json.schema(record_type)
     plain = _plain(schema, schema.get("$defs", {}))
     plain["description"] = f"{plain.get('description', '')} {_NOTE}".strip()
+    fields = plain["properties"]
+    plain["required"] = [name for name in fields if not _may_be_missing(fields[name])]
+    if len(plain["required"]) < len(fields):
+        fields[_NOT_FINITE] = {"type": "string"}
     return msgspec.json.encode(plain)
+
+
+def _may_be_missing(field: dict[str, Any]) -> bool:
+    """Whether a field has numbers that need not be finite."""
+    return "number" in (field["type"], field.get("items", {}).get("type"))
 
 
 def _plain(schema: dict[str, Any], definitions: dict[str, Any]) -> dict[str, Any]:

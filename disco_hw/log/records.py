@@ -81,7 +81,6 @@ class Plan(msgspec.Struct, frozen=True, gc=False):
     temperature: float = nan
     min_cost: float = nan
     mean_cost: float = nan
-    instant_cost: float = nan
     path_x_m: tuple[float, ...] = ()
     path_y_m: tuple[float, ...] = ()
     path_yaw_rad: tuple[float, ...] = ()

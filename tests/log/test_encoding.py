@@ -4,6 +4,7 @@ import math
 import msgspec
 import pytest
 from hypothesis import given
+from jsonschema import Draft202012Validator
 
 from disco_hw.log.encoding import JsonDecoder, encode_json, json_schema
 from disco_hw.log.records import TOPICS, Estimate, Event, topic_of
@@ -19,26 +20,60 @@ def test_every_record_comes_back_to_the_last_bit(record):
     assert bits(back) == bits(record)
 
 
+VALIDATORS = {topic.name: Draft202012Validator(json.loads(json_schema(topic.record))) for topic in TOPICS}
+
+
 @given(ANY_RECORD)
-def test_every_record_is_strict_json_with_the_properties_of_its_schema(record):
+def test_every_record_is_strict_json_that_obeys_its_schema(record):
     def refuse(constant):
         raise AssertionError(f"{constant} is not JSON")
 
     plain = json.loads(encode_json(record), parse_constant=refuse)
-    assert set(plain) == set(json.loads(json_schema(type(record)))["properties"])
+    VALIDATORS[topic_of(type(record))].validate(plain)
+    assert set(plain) <= set(json.loads(json_schema(type(record)))["properties"])
 
 
-def test_non_finite_numbers_are_spelled_as_protobuf_spells_them_in_json():
+@pytest.mark.parametrize("topic", TOPICS, ids=lambda topic: topic.name)
+def test_a_schema_tells_its_own_messages_from_others(topic):
+    validator = VALIDATORS[topic.name]
+    Draft202012Validator.check_schema(validator.schema)
+    assert not validator.is_valid({})
+    for name, field in validator.schema["properties"].items():
+        if field["type"] in {"number", "integer"}:
+            assert not validator.is_valid({name: "NaN"})
+            assert not validator.is_valid({name: None})
+
+
+def test_a_field_that_is_not_finite_is_left_out_and_comes_back():
     values = (math.nan, math.inf, -math.inf, -0.0, 5e-324, 0.1, 1.7976931348623157e308, 0.0, 1.0)
     record = Estimate(1, math.nan, math.inf, -0.0, values, 1.0, 1.0, 1.0, 1.0)
     plain = json.loads(encode_json(record))
-    assert plain["x_m"] == "NaN"
-    assert plain["y_m"] == "Infinity"
-    assert plain["covariance"] == ["NaN", "Infinity", "-Infinity", -0.0, 5e-324, 0.1, 1.7976931348623157e308, 0.0, 1.0]
+    assert not {"x_m", "y_m", "covariance"} & set(plain)
+    assert json.loads(plain["not_finite"]) == {
+        "x_m": "NaN",
+        "y_m": "Infinity",
+        "covariance": ["NaN", "Infinity", "-Infinity", -0.0, 5e-324, 0.1, 1.7976931348623157e308, 0.0, 1.0],
+    }
+    assert bits(DECODER.decode("/estimate", encode_json(record))) == bits(record)
+    assert "not_finite" not in json.loads(encode_json(Estimate(1, 1.0, 1.0, 1.0, (), 1.0, 1.0, 1.0, 1.0)))
+
+
+def test_what_older_logs_hold_in_the_field_itself_is_read():
+    old = b'{"t_ns":1,"t0_ns":1,"step_s":0.1,"left_rad_s":[],"right_rad_s":["-Infinity"],"mean_cost":"NaN","x":"NaN"}'
+    plan = DECODER.decode("/plan", old)
+    assert math.isnan(plan.mean_cost)
+    assert plan.right_rad_s == (-math.inf,)
+
+
+@pytest.mark.parametrize("text", ["x", "[]", "1", '{"x_m":"far"}', '{"x_m":'])
+def test_what_is_said_of_a_field_and_is_nonsense_is_refused(text):
+    fields = json.loads(encode_json(Estimate(1, 1.0, 1.0, 1.0, (), 1.0, 1.0, 1.0, 1.0))) | {"not_finite": text}
+    with pytest.raises(msgspec.MsgspecError):
+        DECODER.decode("/estimate", json.dumps(fields, separators=(",", ":")).encode())
 
 
 def test_a_text_that_looks_like_a_number_stays_a_text():
-    for text in ("NaN", "null", "Infinity", "1.5"):
+    for text in ("NaN", "null", "Infinity", "1.5", "not_finite", '"not_finite":', "null not_finite"):
         record = Event(1, "info", text, text)
         assert DECODER.decode("/event", encode_json(record)) == record
 
@@ -69,4 +104,4 @@ def test_every_schema_is_one_that_viewers_read(topic):
     schema = json.loads(json_schema(topic.record))
     viewer_reads(schema)
     assert schema["title"] == topic.record.__name__
-    assert "NaN" in schema["description"]
+    assert "not_finite" in schema["description"]
