@@ -1,9 +1,13 @@
-"""Text commands over a Unix datagram socket that only the owner can open, each answered with one line."""
+"""Text commands over a Unix datagram socket that only the owner can open, each answered with one line.
+
+`python -m sim.command_socket SOCKET COMMAND...` sends one: to a virtual robot run with `--inject SOCKET`.
+"""
 
 from __future__ import annotations
 
 import socket
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from sim.unix_listener import bind_private
@@ -55,3 +59,22 @@ def send_command(path: Path, text: str, timeout_s: float = 5.0) -> str:
         client.settimeout(timeout_s)
         client.sendto(text.encode(), str(path))
         return client.recv(MAX_COMMAND_BYTES).decode()
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Send one command and print its answer; return 0 if it was obeyed, 1 if not, 2 for wrong usage."""
+    given = sys.argv[1:] if arguments is None else list(arguments)
+    if len(given) < 2:
+        print("usage: python -m sim.command_socket SOCKET COMMAND...", file=sys.stderr)
+        return 2
+    try:
+        answer = send_command(Path(given[0]), " ".join(given[1:]))
+    except OSError as error:
+        print(f"{given[0]}: no answer ({error}); is the virtual robot running, with --inject?", file=sys.stderr)
+        return 1
+    print(answer)
+    return int(answer.startswith("error"))
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

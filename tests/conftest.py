@@ -24,8 +24,12 @@ def pytest_ignore_collect(collection_path, config):
 
 
 def pytest_collection_modifyitems(config, items):
-    if config.getoption("--robot") and not config.getoption("--allow-motion"):
-        still = pytest.mark.skip(reason="turns the wheels; lift them off the ground and give --allow-motion")
-        for item in items:
-            if item.get_closest_marker("motion"):
-                item.add_marker(still)
+    if not config.getoption("--robot"):
+        return
+    still = pytest.mark.skip(reason="turns the wheels; lift them off the ground and give --allow-motion")
+    left_on = pytest.mark.skip(reason="restarts the controller; give --allow-restart or --allow-restart=COMMAND")
+    for item in items:
+        if item.get_closest_marker("motion") and not config.getoption("--allow-motion"):
+            item.add_marker(still)
+        if item.get_closest_marker("restart") and config.getoption("--allow-restart") is None:
+            item.add_marker(left_on)

@@ -190,18 +190,23 @@ class Stack:
     def truth(self) -> list[TruthRow]:
         """End both processes and read what truly happened."""
         self._end.close()
-        with (self.directory / "truth.csv").open(newline="", encoding="utf-8") as file:
-            return [
-                TruthRow(
-                    t_s=int(row["t_ns"]) * 1e-9,
-                    wheels=(float(row["left_speed_rad_s"]), float(row["right_speed_rad_s"])),
-                    setpoints=(float(row["left_setpoint_rad_s"]), float(row["right_setpoint_rad_s"])),
-                    state=row["state"],
-                    session=int(row["session"]),
-                    accepted=int(row["accepted_commands"]),
-                )
-                for row in csv.DictReader(file)
-            ]
+        return read_truth(self.directory / "truth.csv")
+
+
+def read_truth(path: Path) -> list[TruthRow]:
+    """Read what a virtual robot that has ended recorded of what truly happened."""
+    with path.open(newline="", encoding="utf-8") as file:
+        return [
+            TruthRow(
+                t_s=int(row["t_ns"]) * 1e-9,
+                wheels=(float(row["left_speed_rad_s"]), float(row["right_speed_rad_s"])),
+                setpoints=(float(row["left_setpoint_rad_s"]), float(row["right_setpoint_rad_s"])),
+                state=row["state"],
+                session=int(row["session"]),
+                accepted=int(row["accepted_commands"]),
+            )
+            for row in csv.DictReader(file)
+        ]
 
 
 def write_robot_file(directory: Path, link: str = "can", task: str = "", model: str = "wombot_model.toml") -> Path:

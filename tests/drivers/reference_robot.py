@@ -11,8 +11,8 @@ CONFIG = FirmwareConfig(ticks_per_rev=2048, max_wheel_speed_rad_s=8.0)
 class ReferenceRobot:
     """What the bench and the conformance suite need of a robot; wheels turn as the core's outputs say."""
 
-    def __init__(self, config=CONFIG, *, boot_ns=0, skew=0.0, first_ticks=(0, 0)):
-        self.core = FirmwareCore(config, entropy=7)
+    def __init__(self, config=CONFIG, *, boot_ns=0, skew=0.0, first_ticks=(0, 0), entropy=7):
+        self.core = FirmwareCore(config, entropy)
         self.config = config
         self.boot_ns = boot_ns
         self.skew = skew

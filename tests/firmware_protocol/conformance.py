@@ -24,7 +24,7 @@ CLOCK_S = 5.0
 
 
 class FirmwareConformance:
-    """The suite; `key` is that of authenticated mode. A whole class talks to one robot, which is never restarted."""
+    """The suite; `key` is that of authenticated mode. A class talks to one robot; tests marked `restart` restart it."""
 
     key: bytes | None = None
 
@@ -279,6 +279,51 @@ class FirmwareConformance:
         host.run(0.2)
         host.ask("RESET")
         host.wait_for_state("STANDBY")
+
+    # Restarts.
+
+    def challenges_after_a_restart(self, host):
+        """What a controller asks for in its first three sessions, and the first nonce where there is a key."""
+        host.restart()
+        seen = [host.latest["MAC_CHALLENGE"]["nonce"]] if self.key is not None else []
+        for _ in range(3):
+            host.settle()
+            host.to_ready()
+            host.run(0.15)
+            seen.append(host.challenge)
+        return seen
+
+    @pytest.mark.restart
+    def test_a_restarted_controller_has_no_session_and_other_challenges(self, host):
+        first, second = self.challenges_after_a_restart(host), self.challenges_after_a_restart(host)
+        assert first != second, f"after two starts it asked for the same, {first}: its entropy repeats"
+
+    @pytest.mark.restart
+    @pytest.mark.motion
+    def test_a_session_recorded_after_one_restart_does_not_arm_after_the_next(self, host):
+        """With a key or without: the recording answers a challenge that is not asked again."""
+        sent, send = [], host.end.send
+        started_ns = host.restart()
+
+        def record(can_id, data):
+            sent.append((host.end.now_ns - started_ns, can_id, data))
+            send(can_id, data)
+
+        host.end.send = record
+        try:
+            host.hello()
+            host.run(0.2)
+            host.to_armed()
+            host.run(0.3)
+        finally:
+            host.end.send = send
+        started_ns = host.restart()
+        for after_ns, can_id, data in [*sent, (sent[-1][0] + 300_000_000, None, None)]:
+            while host.end.now_ns - started_ns < after_ns:
+                host.step()
+                assert host.state not in ("ARMED", "STOPPING"), "what was recorded has armed it: its entropy repeats"
+            if can_id is not None:
+                send(can_id, data)
 
     # With a key.
 

@@ -16,9 +16,14 @@ class SimulatedEnd:
 
     slack_s = 0.012
 
-    def __init__(self, robot):
+    def __init__(self, robot, restarted=None):
+        """`restarted(now_ns)` is the robot after a restart."""
         self.now_ns = MS_NS
         self._robot = robot
+        self._restarted = restarted
+
+    def restart(self):
+        self._robot = self._restarted(self.now_ns)
 
     def send(self, can_id, data):
         self._robot.receive(self.now_ns, Frame(can_id, data))
@@ -29,6 +34,9 @@ class SimulatedEnd:
         self._robot.step(self.now_ns)
         return [(self.now_ns, frame.can_id, frame.data) for frame in self._robot.drain()]
 
+    def wait_until_up(self):
+        pass
+
     def close(self):
         pass
 
@@ -38,12 +46,17 @@ class LinkEnd:
 
     slack_s = 0.15
 
-    def __init__(self, transport):
+    def __init__(self, transport, restart=None):
+        """`restart()` has the robot's controller restarted, and returns when that is done."""
         self._transport = transport
+        self.restart = restart
         with contextlib.suppress(OSError):
             # A host that is late looks to the robot like a host that is silent.
             os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(20))
-        deadline = time.monotonic() + _CONNECT_S
+        self.wait_until_up()
+
+    def wait_until_up(self):
+        deadline, transport = time.monotonic() + _CONNECT_S, self._transport
         while transport.state is not LinkState.UP:
             assert time.monotonic() < deadline, f"{transport.name}: {transport.last_error or 'did not come up'}"
             time.sleep(0.01)

@@ -172,6 +172,30 @@ class ProtocolHost:
         """What was heard of one message since `heard` was cleared: (time in ns, decoded)."""
         return [(t_ns, decoded) for t_ns, decoded in self.heard if decoded.name == name]
 
+    def restart(self):
+        """Have the controller restarted; return the time (ns) at which it was seen to be there again."""
+        self.request = self.command = None
+        before_us = self._device_ahead_us()
+        self.end.restart()
+        self.end.wait_until_up()
+        self.end.step()
+        for kept in (self.latest, self.limits, self.heard):
+            kept.clear()
+        told = {"HELLO", "SYSTEM_STATE", "SESSION_STATE"} | ({"MAC_CHALLENGE"} if self.prover is not None else set())
+        self.wait_for("word from the restarted controller", lambda: told <= self.latest.keys(), 10.0)
+        apart_us = (self._device_ahead_us() - before_us + 2**39) % 2**40 - 2**39
+        assert abs(apart_us) > 100_000, "its clock went on as if nothing had happened: was it restarted?"
+        assert (self.accepted, self.session) == (False, 0), "it knows a host or a session before any has come"
+        return self.end.now_ns
+
+    def _device_ahead_us(self):
+        """How far the robot's clock is ahead of this host's."""
+        self.latest.pop("TIME_RESPONSE", None)
+        sequence = self.end.now_ns // 1_000_000 % 256
+        self.send("TIME_REQUEST", sequence=sequence)
+        self.wait_for("TIME_RESPONSE", lambda: self.latest.get("TIME_RESPONSE", {}).get("sequence") == sequence)
+        return int(self.latest["TIME_RESPONSE"]["receive_time"]) - self.end.now_ns // 1000
+
     def settle(self):
         """Bring the robot to STANDBY, accepted, still, without fault or emergency stop, whatever was before."""
         self.proves, self.command = True, None

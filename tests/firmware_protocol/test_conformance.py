@@ -18,10 +18,37 @@ def test_a_clock_that_runs_away_does_not_conform(skew):
         FirmwareConformance().test_the_clock_answers_and_keeps_time(host)
 
 
+def restarted(config, entropy=None):
+    """What a restart makes of a robot: another entropy each time, unless it is given."""
+    return lambda now_ns: ReferenceRobot(config, boot_ns=now_ns, entropy=entropy)
+
+
+def test_a_controller_whose_entropy_repeats_does_not_conform():
+    suite = FirmwareConformance()
+    for test, told in (
+        (suite.test_a_restarted_controller_has_no_session_and_other_challenges, "asked for the same"),
+        (suite.test_a_session_recorded_after_one_restart_does_not_arm_after_the_next, "has armed it"),
+    ):
+        host = ProtocolHost(SimulatedEnd(ReferenceRobot(), restarted(CONFIG, entropy=7)))
+        host.settle()
+        with pytest.raises(AssertionError, match=f"{told}.*: its entropy repeats"):
+            test(host)
+
+
+def test_a_restart_that_was_none_is_told():
+    end = SimulatedEnd(ReferenceRobot())
+    end.restart = lambda: None
+    host = ProtocolHost(end)
+    host.settle()
+    host.to_ready()
+    with pytest.raises(AssertionError, match=r"was it restarted\?"):
+        host.restart()
+
+
 class TestCore(FirmwareConformance):
     @classmethod
     def make_end(cls, config):
-        return SimulatedEnd(ReferenceRobot())
+        return SimulatedEnd(ReferenceRobot(), restarted(CONFIG))
 
 
 class TestAuthenticatedCore(FirmwareConformance):
@@ -29,7 +56,8 @@ class TestAuthenticatedCore(FirmwareConformance):
 
     @classmethod
     def make_end(cls, config):
-        return SimulatedEnd(ReferenceRobot(replace(CONFIG, key=cls.key)))
+        config_with_key = replace(CONFIG, key=cls.key)
+        return SimulatedEnd(ReferenceRobot(config_with_key), restarted(config_with_key))
 
 
 class TestSlowCore(FirmwareConformance):
@@ -40,4 +68,4 @@ class TestSlowCore(FirmwareConformance):
     @classmethod
     def make_end(cls, config):
         slow = replace(CONFIG, key=cls.key, max_wheel_speed_rad_s=1.0, max_wheel_acceleration_rad_s2=0.5)
-        return SimulatedEnd(ReferenceRobot(slow))
+        return SimulatedEnd(ReferenceRobot(slow), restarted(slow))

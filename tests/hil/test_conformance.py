@@ -15,9 +15,11 @@ ROOT = Path(__file__).resolve().parents[2]
 KEY = "000102030405060708090a0b0c0d0e0f\n"
 
 
-def conform(robot_file, *arguments):
+def conform(robot_file, *arguments, at_terminal=""):
     command = [sys.executable, "-m", "pytest", f"--robot={robot_file}", "-p", "no:cacheprovider", *arguments]
-    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=250, check=False)
+    result = subprocess.run(
+        command, cwd=ROOT, input=at_terminal, capture_output=True, text=True, timeout=250, check=False
+    )
     found = {word: int(count) for count, word in re.findall(r"(\d+) (passed|failed|skipped|error)", result.stdout)}
     return result.returncode, found, result.stdout + result.stderr
 
@@ -43,3 +45,29 @@ def test_the_virtual_robot_conforms(tmp_path, link, key, chosen, least):
         if key is None:
             code, found, output = conform(robot_file, "-k", "follows or introduces")
             assert (code, found) == (0, {"passed": 1, "skipped": 1}), output
+
+
+@pytest.mark.parametrize("key", [None, KEY])
+def test_the_virtual_robot_draws_anew_at_each_restart(tmp_path, key):
+    robot_file = write_robot_file(tmp_path)
+    if key is not None:
+        (tmp_path / "key").write_text(key)
+        (tmp_path / "key").chmod(0o600)
+        robot_file.write_text(robot_file.read_text().replace("[link]\n", '[link]\nkey_file = "key"\n'))
+    socket = tmp_path / "inject"
+    restart = f"{sys.executable} -m sim.command_socket {socket} reboot"
+    with disco_hw_process("virtual robot", ["sim", str(robot_file), "--inject", str(socket)], tmp_path / "sim.txt"):
+        wait_until(lambda: "ready" in (tmp_path / "sim.txt").read_text(), READY_TIMEOUT_S)
+        code, found, output = conform(robot_file, "--allow-motion", f"--allow-restart={restart}", "-k", "restart")
+        assert (code, found) == (0, {"passed": 2}), output
+        code, found, output = conform(robot_file, "-k", "restart")
+        assert (code, found) == (0, {"skipped": 2}), output
+        code, found, output = conform(robot_file, "--allow-restart", "-k", "no_session")
+        assert code == 1
+        assert "there is no terminal to ask at" in output
+        code, found, output = conform(robot_file, "--allow-restart", "-k", "no_session", at_terminal="\n")
+        assert code == 1
+        assert "was it restarted?" in output
+        code, found, output = conform(robot_file, "--allow-restart=false", "-k", "no_session")
+        assert code == 1
+        assert "--allow-restart: false:" in output

@@ -11,14 +11,25 @@ import sys
 import threading
 import time
 import tty
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import can
 import pytest
 
 from disco_hw.errors import WorkError
-from disco_hw.experiments.live_stack import READY_TIMEOUT_S, Operator, disco_hw_process, running_stack, write_robot_file
+from disco_hw.experiments.live_stack import (
+    FAST_TASK,
+    READY_TIMEOUT_S,
+    Operator,
+    Stack,
+    disco_hw_process,
+    read_truth,
+    running_stack,
+    write_robot_file,
+)
 from firmware_protocol.codec import Codec
+from tests.drivers.waiting import wait_until
 from tests.hil.stack import STILL_RAD_S, disco
 from tests.runtime.path_robot import path_robot
 
@@ -175,6 +186,72 @@ def test_a_replayed_session_never_turns_a_wheel(tmp_path):
     after = [row for row in rows if row.t_s > stopped_s]
     assert max(row.asked for row in after) == 0.0
     assert max(row.fastest for row in after) < STILL_RAD_S
+
+
+SEEDED_ROBOT = """
+import sys
+from pathlib import Path
+from sim.app import VirtualRobotOptions, run_virtual_robot
+from sim.body_dynamics import Pose
+sys.exit(run_virtual_robot(VirtualRobotOptions(
+    channel=sys.argv[1], truth_file=Path(sys.argv[2]), bus_log=Path(sys.argv[3]), start=Pose(3.0, 0.0, 1.57),
+    challenge_seed=5)))
+"""
+
+
+@contextmanager
+def virtual_robot(folder, robot_file, name, seeded):
+    """One life of the controller, as a process; yields where its truth and its bus are recorded."""
+    truth, bus, told = folder / f"{name}.csv", folder / f"{name}.log", folder / f"{name}.txt"
+    command = ["-m", "disco_hw", "sim", str(robot_file), "--truth", str(truth), "--bus-log", str(bus)]
+    if seeded:
+        command = ["-c", SEEDED_ROBOT, str(folder / "bus"), str(truth), str(bus)]
+    with told.open("wb") as output, subprocess.Popen([sys.executable, *command], stdout=output) as robot:
+        try:
+            wait_until(lambda: "ready" in told.read_text(), READY_TIMEOUT_S)
+            yield truth, bus
+        finally:
+            robot.terminate()
+
+
+def from_the_host(bus_log):
+    """What a candump log holds of a host's frames: (time in s, identifier, data)."""
+    for line in bus_log.read_text().splitlines():
+        time_s, _, frame = line.split()[:3]
+        can_id, data = frame.split("#")
+        if int(can_id, 16) in {0x100, 0x101, 0x102}:
+            yield float(time_s.strip("()")), int(can_id, 16), bytes.fromhex(data)
+
+
+@pytest.mark.parametrize("seeded", [False, True], ids=["entropy", "a seed asked for by name"])
+def test_a_session_recorded_before_a_restart_does_not_arm_after_it(tmp_path, seeded):
+    """Without a key. The robot with a seed, whose entropy repeats, shows that the recording is a good one."""
+    robot_file = write_robot_file(tmp_path, task=FAST_TASK)
+    with (
+        virtual_robot(tmp_path, robot_file, "first", seeded) as (truth, bus_log),
+        disco_hw_process("daemon", ["run", str(robot_file)], tmp_path / "daemon.txt") as daemon,
+    ):
+        operator = Operator(tmp_path / "control.sock", (daemon,))
+        stack = Stack(tmp_path, robot_file, daemon, daemon, operator, ExitStack())
+        stack.drive(until_rad_s=3.0)
+        operator.tell("quit")
+        daemon.process.wait(10.0)
+    assert max(row.fastest for row in read_truth(truth)) > 3.0
+    sent = list(from_the_host(bus_log))
+    with virtual_robot(tmp_path, robot_file, "second", seeded) as (truth, _):
+        with can.Bus(interface="unixcan", channel=str(tmp_path / "bus")) as bus:
+            begin_s = time.monotonic()
+            for at_s, can_id, data in sent:
+                time.sleep(max(0.0, begin_s + at_s - sent[0][0] - time.monotonic()))
+                bus.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False), timeout=1.0)
+                while bus.recv(0.0):
+                    pass
+        time.sleep(0.3)
+    rows = read_truth(truth)
+    assert ({row.state for row in rows} >= {"ARMED"}) == seeded
+    assert (max(row.fastest for row in rows) > STILL_RAD_S) == seeded
+    assert (max(row.asked for row in rows) > 0.0) == seeded
+    assert "READY" in {row.state for row in rows}, "the recording does not even begin a session"
 
 
 def test_garbage_on_a_serial_line_leaves_the_daemon_waiting(tmp_path):

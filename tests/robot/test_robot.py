@@ -1,5 +1,7 @@
 """`pytest --robot=ROBOT.toml`: the conformance suite of the protocol against whatever answers on that link."""
 
+import shlex
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -24,4 +26,21 @@ class TestRobot(FirmwareConformance):
         except WorkError as error:
             pytest.exit(str(error), returncode=1)
         transport.open()
-        return LinkEnd(transport)
+        return LinkEnd(transport, lambda: restart(config))
+
+
+def restart(config):
+    """Have the robot's controller restarted: by the command that was given, or by whoever sits at the terminal."""
+    command = config.getoption("--allow-restart")
+    if command:
+        done = subprocess.run(shlex.split(command), capture_output=True, text=True, timeout=60, check=False)
+        assert done.returncode == 0, f"--allow-restart: {command}: {done.stderr.strip() or done.stdout.strip()}"
+        return
+    capture = config.pluginmanager.getplugin("capturemanager")
+    capture.suspend_global_capture(in_=True)
+    try:
+        input("\nSwitch the robot's controller off and on, then press Enter: ")
+    except EOFError:
+        pytest.fail("there is no terminal to ask at; give --allow-restart=COMMAND, or run pytest at one")
+    finally:
+        capture.resume_global_capture()

@@ -3,7 +3,7 @@ import threading
 
 import pytest
 
-from sim.command_socket import CommandSocket, send_command
+from sim.command_socket import CommandSocket, main, send_command
 from sim.unix_listener import SocketPathError
 
 
@@ -67,3 +67,15 @@ def test_close_removes_the_socket_and_may_be_repeated(tmp_path, commands):
     assert not (tmp_path / "commands").exists()
     with pytest.raises(OSError, match="No such file"):
         send_command(tmp_path / "commands", "state")
+
+
+def test_the_command_line_sends_one_command(tmp_path, commands, capsys):
+    path = str(tmp_path / "commands")
+    for answer, code in (("ok", 0), ("error: no", 1)):
+        thread = serve_once(commands, lambda text: f"{answer} {text}")  # noqa: B023
+        assert main([path, "reboot", "watchdog"]) == code
+        thread.join()
+        assert capsys.readouterr().out == f"{answer} reboot watchdog\n"
+    assert main([str(tmp_path / "none"), "reboot"]) == 1
+    assert "is the virtual robot running" in capsys.readouterr().err
+    assert main([path]) == 2
