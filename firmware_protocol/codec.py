@@ -8,12 +8,12 @@ from typing import NamedTuple
 import msgspec
 
 from firmware_protocol import e2e
-from firmware_protocol.dbc import MessageLayout, SignalLayout, load_protocol, packaged_dbc
+from firmware_protocol.dbc import MessageLayout, SignalLayout, packaged_protocol
 
 _FLOAT = struct.Struct("<f")
 _MAX_DATA = 8
 
-PROTOCOL = load_protocol(packaged_dbc())
+PROTOCOL = packaged_protocol()
 PROTOCOL_MAJOR = PROTOCOL.major
 PROTOCOL_MINOR = PROTOCOL.minor
 

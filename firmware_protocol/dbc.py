@@ -1,14 +1,22 @@
 """Reads the packaged DBC, the one source of the wire layout, into flat tables that a codec can run on."""
 
+from __future__ import annotations
+
 import re
 import zlib
 from dataclasses import dataclass
+from functools import cache
 from importlib import resources
+from typing import TYPE_CHECKING
 
-import cantools.database.can
+import msgspec
 
 from firmware_protocol.e2e import data_id
 
+if TYPE_CHECKING:
+    import cantools.database.can
+
+TABLES = "firmware/disco_robot.json"
 _TOKEN = re.compile(r'"(?:[^"\\]|\\.)*"|[^\s":;,|@()\[\]]+|[:;,|@()\[\]]')
 
 
@@ -56,6 +64,14 @@ class Protocol:
     messages: tuple[MessageLayout, ...]
 
 
+@dataclass(frozen=True, slots=True)
+class Tables:
+    """What tools/generate_protocol.py writes for Python: the tables, and the CRC-32 of the DBC that they are of."""
+
+    crc: int
+    protocol: Protocol
+
+
 def packaged_dbc() -> str:
     """Return the text of the DBC that this package speaks."""
     return resources.files("firmware_protocol").joinpath("disco_robot.dbc").read_text("utf-8")
@@ -77,12 +93,27 @@ def dbc_hash(text: str) -> int:
     return zlib.crc32(" ".join(kept).encode())
 
 
+@cache
+def packaged_protocol() -> Protocol:
+    """Return the tables of the packaged DBC, from what tools/generate_protocol.py wrote of them if that is current."""
+    text = packaged_dbc()
+    try:
+        written = resources.files("firmware_protocol").joinpath(TABLES).read_bytes()
+        tables = msgspec.json.decode(written, type=Tables)
+    except (OSError, msgspec.MsgspecError):
+        return load_protocol(text)
+    return tables.protocol if tables.crc == zlib.crc32(text.encode()) else load_protocol(text)
+
+
 def load_protocol(text: str) -> Protocol:
     """Read a DBC into tables.
 
     Raises ValueError for a DBC without protocol version, and for what this protocol does not use: big-endian signals
     and offsets.
     """
+    # A third of a second that only a DBC other than the packaged one takes.
+    import cantools.database.can  # noqa: PLC0415
+
     database = cantools.database.can.Database()
     database.add_dbc_string(text)
     attributes = database.dbc.attributes if database.dbc is not None else {}

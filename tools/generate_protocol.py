@@ -1,14 +1,16 @@
-"""Writes the C side of the protocol from the DBC; with --check only says whether the committed files are current."""
+"""Writes the C side of the protocol and the tables that Python runs on; --check only says whether they are current."""
 
 import argparse
 import re
 import sys
+import zlib
 from pathlib import Path
 
 import cantools
+import msgspec
 from cantools.database.can.c_source import generate
 
-from firmware_protocol.dbc import MessageLayout, Protocol, load_protocol
+from firmware_protocol.dbc import MessageLayout, Protocol, Tables, load_protocol
 
 ROOT = Path(__file__).resolve().parent.parent
 DBC = ROOT / "firmware_protocol" / "disco_robot.dbc"
@@ -26,7 +28,13 @@ def generated_files(dbc_text: str) -> dict[str, str]:
         f"{PREFIX}.h": _without_date(header),
         f"{PREFIX}.c": _without_date(source),
         "protocol_constants.h": _constants(load_protocol(dbc_text)),
+        "disco_robot.json": _tables(dbc_text),
     }
+
+
+def _tables(dbc_text: str) -> str:
+    tables = Tables(zlib.crc32(dbc_text.encode()), load_protocol(dbc_text))
+    return msgspec.json.format(msgspec.json.encode(tables)).decode() + "\n"
 
 
 def _without_date(text: str) -> str:

@@ -19,7 +19,7 @@ import msgspec
 import disco_hw
 from disco_hw.adaptation.adaptation import Learnt, NoAdaptation
 from disco_hw.adaptation.guard import believed_geometry
-from disco_hw.adaptation.recursive import NAMES
+from disco_hw.adaptation.link import NAMES
 from disco_hw.drive.coverage import Coverage
 from disco_hw.drive.hand_pilot import HandPilot
 from disco_hw.drive.source import ManualInput

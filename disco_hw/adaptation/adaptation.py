@@ -9,8 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from disco_hw.adaptation.guard import BeliefGuard, Geometry, Outcome
-from disco_hw.adaptation.link import AdapterLink, InForce, Pose, Proposal, Range, Report, Samples, Wheels
-from disco_hw.adaptation.recursive import NAMES
+from disco_hw.adaptation.link import NAMES, AdapterLink, InForce, Pose, Proposal, Range, Report, Samples, Wheels
 from disco_hw.errors import WorkError
 from disco_hw.log import records
 from drivers.types import Readings

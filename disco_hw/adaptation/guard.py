@@ -8,8 +8,7 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.adaptation.link import Proposal
-from disco_hw.adaptation.recursive import NAMES
+from disco_hw.adaptation.link import NAMES, Proposal
 from disco_hw.config import Prior
 from disco_hw.effects.effect import Channel
 from disco_hw.errors import InputError
@@ -56,7 +55,7 @@ class GuardSettings:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Geometry:
-    """A Gaussian over the geometry in the order of `coordinates.NAMES`: `mean` (3,), `covariance` (3, 3)."""
+    """A Gaussian over the geometry in the order of `link.NAMES`: `mean` (3,), `covariance` (3, 3)."""
 
     mean: Array
     covariance: Array

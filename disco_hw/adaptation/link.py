@@ -18,6 +18,7 @@ from disco_hw.errors import WorkError
 from disco_hw.log.errors import LogError
 from disco_hw.log.spawn import spawn_at_normal_priority
 
+NAMES = ("x_icr_m", "wheel_radius_m", "axial_distance_m")
 Triple = tuple[float, float, float]
 Nine = tuple[float, float, float, float, float, float, float, float, float]
 
@@ -57,7 +58,7 @@ class Range(msgspec.Struct, frozen=True, tag="range", gc=False):
 
 
 class InForce(msgspec.Struct, frozen=True, tag="in_force", gc=False):
-    """The belief over the geometry (order of `coordinates.NAMES`) that the robot drives by from `now_ns` on.
+    """The belief over the geometry (order of `link.NAMES`) that the robot drives by from `now_ns` on.
 
     `adapted` is False for that of the model file; with `relearn`, what was learnt so far is to be forgotten.
     """

@@ -14,7 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.adaptation.recursive import NAMES, Evidence, evidence, from_linear, to_linear
+from disco_hw.adaptation.link import NAMES
+from disco_hw.adaptation.recursive import Evidence, evidence, from_linear, to_linear
 from disco_hw.adaptation.samples import drive_of
 from disco_hw.inference.density_network import DensityNetwork, NetworkSettings, train
 from disco_hw.inference.excitation import STEP_S, Excitation
@@ -37,7 +38,7 @@ _MISFIT_MARGIN = 1.2
 
 @dataclass(frozen=True, slots=True)
 class Training:
-    """What is simulated: parameters uniform between `low` and `high` (3,) in the order of `coordinates.NAMES`, wheel
+    """What is simulated: parameters uniform between `low` and `high` (3,) in the order of `link.NAMES`, wheel
     speeds up to `wheel_rad_s`, poses at `pose_hz`, on so many drives with so many simulations of each.
     """
 

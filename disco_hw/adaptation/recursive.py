@@ -41,7 +41,7 @@ _LEAST_VARIANCE = 1e-14
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Judged:
-    """What is known of theta (order of `coordinates.NAMES`): `mean` (3,), `covariance` (3, 3).
+    """What is known of theta (order of `link.NAMES`): `mean` (3,), `covariance` (3, 3).
 
     `data_s` of driving since `since_s` it rests on; `largest_change` is the chi-square (3 degrees) of the worst split,
     and `changed_s` when a change was found in this update, else None. `misfit` is the mean square of what this geometry
@@ -234,7 +234,6 @@ class RunningNoise:
         self._variance += (measured.vector() ** 2 - self._variance) / self._weight
 
 
-NAMES = ("x_icr_m", "wheel_radius_m", "axial_distance_m")
 """The order of theta, as everywhere in inference."""
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import BSpline
 
 DEGREE = 3
 
@@ -20,7 +19,14 @@ def spline_basis(knots: int, horizon: int) -> tuple[NDArray[np.int64], NDArray[n
     inner = np.linspace(0.0, 1.0, knots - DEGREE + 1)
     vector = np.concatenate([np.zeros(DEGREE), inner, np.ones(DEGREE)])
     middles = (np.arange(horizon) + 0.5) / horizon
-    dense = BSpline.design_matrix(middles, vector, DEGREE).toarray()
     first = np.clip(np.searchsorted(inner, middles, side="right") - 1, 0, knots - DEGREE - 1)
-    weights = np.take_along_axis(dense, first[:, None] + np.arange(DEGREE + 1), axis=1)
+    weights = np.ones((horizon, 1))
+    # The recursion of de Boor (A Practical Guide to Splines, chapter X) from one degree to the next.
+    for degree in range(1, DEGREE + 1):
+        number = first[:, None] + DEGREE + np.arange(1, degree + 1)
+        upper, lower = vector[number], vector[number - degree]
+        share = weights / (upper - lower)
+        weights = np.zeros((horizon, degree + 1))
+        weights[:, :-1] = share * (upper - middles[:, None])
+        weights[:, 1:] += share * (middles[:, None] - lower)
     return first.astype(np.int64), weights

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import msgspec
 import numpy as np
-from filterpy.kalman import ExtendedKalmanFilter
 from numpy.typing import NDArray
 
 from disco_hw.estimation.belief import Belief, Flat9
+from disco_hw.estimation.deferred import deferred
 from disco_hw.estimation.gate import Measurement
 from disco_hw.estimation.odometry import wrap
+
+# What is not used here of filterpy brings most of scipy with it, into a process that locks its memory.
+with deferred("filterpy.stats", "scipy.ndimage"):
+    from filterpy.kalman import ExtendedKalmanFilter
 
 Vector = NDArray[np.float64]
 Triple = tuple[float, float, float]

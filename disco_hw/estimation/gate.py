@@ -6,7 +6,6 @@ import enum
 import math
 
 import msgspec
-from scipy.special import chdtri
 
 from disco_hw.estimation.belief import MAX_POSITION_VARIANCE, MAX_YAW_VARIANCE
 from disco_hw.estimation.odometry import Pose
@@ -72,5 +71,19 @@ def screen(sample: PoseSample) -> Measurement | PoseReason:
 
 
 def gate_limit(probability: float) -> float:
-    """Squared Mahalanobis distance that a right pose stays below with this probability (chi-square, 3 degrees)."""
-    return float(chdtri(3.0, 1.0 - probability))
+    """Squared Mahalanobis distance that a right pose stays below with this probability (chi-square, 3 degrees).
+
+    Raises ValueError for a probability that is not between 0 and 1.
+    """
+    if not 0.0 < probability < 1.0:
+        raise ValueError(f"a probability between 0 and 1, not {probability}")
+    low, high = 0.0, 1500.0
+    while low < (middle := 0.5 * (low + high)) < high:
+        low, high = (middle, high) if _exceeded(middle) > 1.0 - probability else (low, middle)
+    return middle
+
+
+def _exceeded(distance2: float) -> float:
+    """Probability that chi-square with 3 degrees of freedom exceeds this (Abramowitz and Stegun, 26.4.4)."""
+    half = 0.5 * distance2
+    return math.erfc(math.sqrt(half)) + 2.0 * math.sqrt(half / math.pi) * math.exp(-half)

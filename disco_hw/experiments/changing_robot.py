@@ -10,7 +10,7 @@ import numpy as np
 
 import disco_hw
 from disco_hw.adaptation.guard import Geometry, believed_geometry, with_geometry
-from disco_hw.adaptation.recursive import NAMES
+from disco_hw.adaptation.link import NAMES
 from disco_hw.experiments.adapt import BELIEVED_STD, CHANGES
 from disco_hw.experiments.live_stack import running_stack
 from disco_hw.log.reader import open_log

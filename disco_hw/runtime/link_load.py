@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-import cantools.database.can
+from firmware_protocol.dbc import load_protocol
 
 _COMMANDS = ("WHEEL_COMMAND", "WHEEL_COMMAND_MAC")
 _AUTHENTICATION = ("WHEEL_COMMAND_MAC", "HOST_STATE_MAC", "MAC_CHALLENGE")
@@ -28,14 +28,12 @@ def cyclic_frames(dbc: str, command_rate_hz: float, *, authenticated: bool = Fal
 
     The wheel command counts at the rate of the control loop; proofs and their challenge only if `authenticated`.
     """
-    database = cantools.database.can.Database()
-    database.add_dbc_string(dbc)
     frames = []
-    for message in database.messages:
-        if message.cycle_time and (authenticated or message.name not in _AUTHENTICATION):
-            pages = {page for signal in message.signals for page in signal.multiplexer_ids or ()}
-            rate_hz = command_rate_hz if message.name in _COMMANDS else 1000.0 / message.cycle_time
-            frames.append(CyclicFrame(message.name, message.senders[0], message.length, rate_hz * max(1, len(pages))))
+    for message in load_protocol(dbc).messages:
+        if message.period_s is not None and (authenticated or message.name not in _AUTHENTICATION):
+            pages = {signal.page for signal in message.signals} - {None}
+            rate_hz = command_rate_hz if message.name in _COMMANDS else 1.0 / message.period_s
+            frames.append(CyclicFrame(message.name, message.sender, message.length, rate_hz * max(1, len(pages))))
     return tuple(frames)
 
 

@@ -2,7 +2,8 @@ import re
 
 import pytest
 
-from firmware_protocol.dbc import dbc_hash, load_protocol, packaged_dbc
+from firmware_protocol import dbc
+from firmware_protocol.dbc import dbc_hash, load_protocol, packaged_dbc, packaged_protocol
 
 TEXT = packaged_dbc()
 
@@ -69,3 +70,19 @@ def test_every_signal_has_a_unit_or_a_table_or_is_a_plain_number():
     for message in load_protocol(TEXT).messages:
         for signal in message.signals:
             assert signal.unit or signal.scale == 1, f"{message.name}.{signal.name}"
+
+
+def test_the_written_tables_are_those_of_the_packaged_dbc():
+    assert packaged_protocol() == load_protocol(TEXT)
+
+
+@pytest.mark.parametrize("change", ["another DBC", "no tables", "broken tables"])
+def test_tables_of_another_dbc_or_none_are_not_used(monkeypatch, change):
+    text = TEXT.replace("VAL_ 304 state", "VAL_ 304  state") if change == "another DBC" else TEXT
+    names = {"another DBC": dbc.TABLES, "no tables": "nowhere.json", "broken tables": "disco_robot.dbc"}
+    read = []
+    monkeypatch.setattr(dbc, "TABLES", names[change])
+    monkeypatch.setattr(dbc, "packaged_dbc", lambda: text)
+    monkeypatch.setattr(dbc, "load_protocol", lambda got: read.append(got) or load_protocol(got))
+    assert packaged_protocol.__wrapped__() == load_protocol(TEXT)
+    assert read == [text]
