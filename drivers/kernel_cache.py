@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from numba import config
-from numba.core.caching import CompileResultCacheImpl, FunctionCache
+from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile
 
 from drivers.ownership import user_name, why_not_private
 
@@ -30,7 +30,7 @@ def kept_on_disk(dispatcher: _Dispatcher) -> _Dispatcher:
     """
     compiled: Any = dispatcher
     try:
-        compiled._cache = _KernelCache(compiled.py_func)  # type: ignore[no-untyped-call]
+        compiled._cache = _KernelCache(compiled.py_func)
     except RuntimeError:
         _tell("kernels are compiled anew in each process, as no directory to keep them is this user's alone")
     return dispatcher
@@ -61,8 +61,22 @@ class _KernelCacheImpl(CompileResultCacheImpl):
         super().__init__(py_func)  # type: ignore[no-untyped-call]
 
 
+class _Index(IndexDataCacheFile):
+    def _load_index(self) -> Any:
+        try:
+            return super()._load_index()  # type: ignore[no-untyped-call]
+        except Exception:
+            # Another version of the sources left it, with types that are elsewhere now: nothing is there.
+            return {}
+
+
 class _KernelCache(FunctionCache):
     _impl_class = _KernelCacheImpl
+
+    def __init__(self, py_func: Any) -> None:
+        super().__init__(py_func)  # type: ignore[no-untyped-call]
+        of = self._impl
+        self._cache_file = _Index(self._cache_path, of.filename_base, of.locator.get_source_stamp())  # type: ignore[no-untyped-call]
 
 
 def _why_not_believed(cache_path: str) -> str | None:

@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numba
 import pytest
 
 NOBODY = 65534
@@ -63,6 +64,18 @@ def test_a_kernel_is_loaded_from_a_directory_of_ones_own(script, tmp_path):
     cache = tmp_path / "cache"
     assert run(script, cache, tmp_path) == (False, "")
     assert {path.stat().st_mode & 0o777 for path in cache.iterdir()} == {0o700}
+    assert run(script, cache, tmp_path) == (True, "")
+
+
+def test_what_another_version_kept_there_is_compiled_anew(script, tmp_path):
+    cache = tmp_path / "cache"
+    run(script, cache, tmp_path)
+    (index,) = cache.rglob("*twice*.nbi")
+    version = pickle.loads(index.read_bytes())
+    assert version == numba.__version__
+    # A type that has moved: what a model's coefficients are, say.
+    index.write_bytes(pickle.dumps(version) + b"cdisco_hw.gone\nEffects\n.")
+    assert run(script, cache, tmp_path) == (False, "")
     assert run(script, cache, tmp_path) == (True, "")
 
 
