@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.effects.registry import DELAY
 from disco_hw.jit import compiled_for, kernel_function
+from disco_hw.model.coefficients import Base, Coefficients
 from disco_hw.model.compose import delay_steps, in_force
 from disco_hw.model.model import Model, coefficient_tables
 from disco_hw.model.step import axle_of, integration_from, integration_series, step, tracked_of
@@ -48,8 +48,9 @@ class FreeRun:
 
 @kernel_function
 def run_states(
-    states: Any, commands: Any, history: int, time_s: float, point: int, base: Any, effects: Any, series: Any
-) -> None:
+    states: Array, commands: Array, history: int, time_s: float, point: int, base: Base, effects: Coefficients,
+    series: NDArray[np.floating],
+) -> None:  # fmt: skip
     """Fill `states[1:]` from `states[0]`; as `FreeRun.states`."""
     integration = integration_from(series, True)
     here, acting = base_point(base, point), effect_point(effects, point)

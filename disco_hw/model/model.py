@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +13,8 @@ from disco_hw import config
 from disco_hw.effects.effect import Effect, Parameter
 from disco_hw.effects.registry import MOTION_EFFECTS, REGISTRY
 from disco_hw.model.belief import Belief, Uniform
+from disco_hw.model.coefficients import Base, Coefficients, Effects, Term
 from disco_hw.model.parameter import BASE_PARAMETERS
-from disco_hw.model.step import Base, Effects
 from disco_hw.model.terms import COMMAND, TERMS, effect_of, table_entry
 
 Array = NDArray[np.float64]
@@ -158,7 +157,9 @@ class Model:
         return replace(self, effects=effects, **base)
 
 
-def coefficient_tables(model: Model, theta: Array, step_s: float, dtype: type = np.float64) -> tuple[Base, Any]:
+def coefficient_tables(
+    model: Model, theta: Array, step_s: float, dtype: type = np.float64
+) -> tuple[Base, Coefficients]:
     """Work out what the compiled step needs, for L parameter points.
 
     `theta` (L, P) in the order of `model.parameter_names`. Gives Base and Effects of arrays (L,); None if absent.
@@ -170,7 +171,7 @@ def coefficient_tables(model: Model, theta: Array, step_s: float, dtype: type = 
     radius, axial, x_icr = theta[:, 0], theta[:, 1], theta[:, 2]
     base = Base(table(0.5 * radius), table(0.5 * radius / axial), table(x_icr))
     tables: dict[str, tuple[NDArray[np.floating], ...] | None] = dict.fromkeys(MOTION_EFFECTS)
-    terms: dict[bool, list[Any]] = {True: [], False: []}
+    terms: dict[bool, list[Term]] = {True: [], False: []}
     column = len(BASE_PARAMETERS)
     for setting in model.effects:
         width = len(setting.effect.parameters)

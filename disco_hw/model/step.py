@@ -9,48 +9,13 @@ its argument and leaves nothing of it in the machine code. The same in numpy, fo
 
 from __future__ import annotations
 
-from collections import namedtuple
-from typing import Any, NamedTuple
-
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.effects.registry import MOTION_EFFECTS
 from disco_hw.jit import cast_like, scalar_function
+from disco_hw.model.coefficients import Base, Coefficients, Integration
 from disco_hw.model.compose import body_terms, wheel_terms, world_terms
 from disco_hw.model.terms import add_to_commands, add_to_velocity
-
-# A field for every effect that moves the robot: None where absent, else what the effect's `coefficients` returned; and
-# one each for the terms without a name that act on commands and on the body.
-effects_type: Any = namedtuple
-Effects = effects_type("Effects", (*MOTION_EFFECTS, "command_terms", "body_terms"), defaults=(None, None))
-
-
-class Base(NamedTuple):
-    """Base coefficients of one parameter point, or arrays (L,) of many: r/2 (m), r/(2a) (1), x_icr (m)."""
-
-    half_radius_m: Any
-    half_turn_ratio: Any
-    x_icr_m: Any
-
-
-class Integration(NamedTuple):
-    """Length of a step, and what the sine and cosine of half a step's turn need.
-
-    With z = turn * step, step * sin(z) / z and cos(z) are polynomials in turn^2: `chord0` (the step) to `chord3`, 1 and
-    `cos1` to `cos3`. They are good for 0.2 rad; `wide` is None, or anything else to work on a sixteenth of z
-    and double it four times, which is good for 4 rad.
-    """
-
-    step_s: Any
-    chord0: Any
-    chord1: Any
-    chord2: Any
-    chord3: Any
-    cos1: Any
-    cos2: Any
-    cos3: Any
-    wide: Any
 
 
 def integration_series(step_s: float, wide: bool, dtype: type = np.float64) -> NDArray[np.floating]:
@@ -62,23 +27,28 @@ def integration_series(step_s: float, wide: bool, dtype: type = np.float64) -> N
 
 
 @scalar_function
-def integration_from(series: Any, wide: Any) -> Any:
+def integration_from(series: NDArray[np.floating], wide: object) -> Integration:
     """What a step needs, from `integration_series`; `wide` is None or anything else."""
     return Integration(series[0], series[1], series[2], series[3], series[4], series[5], series[6], series[7], wide)
 
 
 @scalar_function
-def wheel_step(left: Any, right: Any, wheel_left: Any, wheel_right: Any, time_s: Any, effects: Any) -> Any:
+def wheel_step(
+    left: float, right: float, wheel_left: float, wheel_right: float, time_s: float, effects: Coefficients
+) -> tuple[float, float, float, float]:
     """Wheel speeds at the end of a step and their means over it, left and right (rad/s).
 
     From the commands (after the command delay), the wheel speeds at the start of the step and its time.
     """
     left, right = add_to_commands(left, right, time_s, effects.command_terms)
-    return wheel_terms(left, right, wheel_left, wheel_right, time_s, effects)
+    turned: tuple[float, float, float, float] = wheel_terms(left, right, wheel_left, wheel_right, time_s, effects)
+    return turned
 
 
 @scalar_function
-def body_velocity(wheel_sum: Any, difference: Any, change: Any, time_s: Any, base: Any, effects: Any) -> Any:
+def body_velocity(
+    wheel_sum: float, difference: float, change: float, time_s: float, base: Base, effects: Coefficients
+) -> tuple[float, float | None, float]:
     """Forward speed (m/s), lateral speed of the axle (m/s) or None, and half the yaw rate (rad/s).
 
     From the mean wheel speeds over a step, left plus right and right minus left, the change of their sum over it
@@ -91,7 +61,7 @@ def body_velocity(wheel_sum: Any, difference: Any, change: Any, time_s: Any, bas
 
 
 @scalar_function
-def half_turn(turn: Any, wide: Any, series: Any) -> Any:
+def half_turn(turn: float, wide: object, series: Integration) -> tuple[float, float]:
     """Chord of a step over its speed (s), and cosine of the turn in half a step; `turn` is half the yaw rate (rad/s).
 
     The sine of the turn in half a step is `turn` times the chord.
@@ -112,7 +82,9 @@ def half_turn(turn: Any, wide: Any, series: Any) -> Any:
 
 
 @scalar_function
-def sideways(lateral: Any, chord: float, x: float, y: float, cos_mid: float, sin_mid: float) -> Any:
+def sideways(
+    lateral: float | None, chord: float, x: float, y: float, cos_mid: float, sin_mid: float
+) -> tuple[float, float]:
     """Add the lateral part of a step to a position; nothing if there is none."""
     if lateral is None:
         return x, y
@@ -122,8 +94,15 @@ def sideways(lateral: Any, chord: float, x: float, y: float, cos_mid: float, sin
 
 @scalar_function
 def move(
-    x: float, y: float, cos_yaw: float, sin_yaw: float, forward: float, lateral: Any, turn: float, integration: Any
-) -> Any:
+    x: float,
+    y: float,
+    cos_yaw: float,
+    sin_yaw: float,
+    forward: float,
+    lateral: float | None,
+    turn: float,
+    integration: Integration,
+) -> tuple[float, float, float, float]:
     """Move the axle's centre along the exact arc of a constant body velocity; returns x, y, cos(yaw), sin(yaw)."""
     chord, cosine = half_turn(turn, integration.wide, integration)
     sine = turn * chord
@@ -137,7 +116,7 @@ def move(
 
 
 @scalar_function
-def axle_of(x: Any, y: Any, cos_yaw: Any, sin_yaw: Any, base: Any) -> Any:
+def axle_of(x: float, y: float, cos_yaw: float, sin_yaw: float, base: Base) -> tuple[float, float]:
     """Point of the axle, x_icr ahead of the tracked point, that rolls without sliding sideways.
 
     It moves as a unicycle whatever x_icr is, so the step is worked out for it.
@@ -146,16 +125,16 @@ def axle_of(x: Any, y: Any, cos_yaw: Any, sin_yaw: Any, base: Any) -> Any:
 
 
 @scalar_function
-def tracked_of(axle_x: Any, axle_y: Any, cos_yaw: Any, sin_yaw: Any, base: Any) -> Any:
+def tracked_of(axle_x: float, axle_y: float, cos_yaw: float, sin_yaw: float, base: Base) -> tuple[float, float]:
     """The tracked point, from the axle's point."""
     return axle_x - base.x_icr_m * cos_yaw, axle_y - base.x_icr_m * sin_yaw
 
 
 @scalar_function
 def body_step(
-    axle_x: Any, axle_y: Any, cos_yaw: Any, sin_yaw: Any, wheel_sum: Any, difference: Any, change: Any, time_s: Any,
-    base: Any, effects: Any, integration: Any,
-) -> Any:  # fmt: skip
+    axle_x: float, axle_y: float, cos_yaw: float, sin_yaw: float, wheel_sum: float, difference: float, change: float,
+    time_s: float, base: Base, effects: Coefficients, integration: Integration,
+) -> tuple[float, float, float, float, float, float]:  # fmt: skip
     """The body's half of a step: the axle's point (m), cosine and sine of yaw after it; forward speed (m/s) and half
     the yaw rate (rad/s) over it. Wheel speeds as for `body_velocity`.
     """
@@ -167,9 +146,9 @@ def body_step(
 
 @scalar_function
 def step(
-    axle_x: Any, axle_y: Any, cos_yaw: Any, sin_yaw: Any, wheel_left: Any, wheel_right: Any, left: Any, right: Any,
-    time_s: Any, base: Any, effects: Any, integration: Any,
-) -> Any:  # fmt: skip
+    axle_x: float, axle_y: float, cos_yaw: float, sin_yaw: float, wheel_left: float, wheel_right: float, left: float,
+    right: float, time_s: float, base: Base, effects: Coefficients, integration: Integration,
+) -> tuple[float, float, float, float, float, float, float, float]:  # fmt: skip
     """One step of f_theta.
 
     State: the axle's point (m), cosine and sine of yaw, wheel speeds (rad/s); controls: the commands in force over the

@@ -20,9 +20,11 @@ from numpy.typing import NDArray
 from disco_hw.effects.effect import Channel, Effect, Parameter, Stage
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.jit import cast_like, scalar_function, specialise
+from disco_hw.model.coefficients import Base, Term
 
 Array = NDArray[np.float64]
 Feature = Callable[..., Any]
+Terms = tuple[Term, ...]
 
 COMMAND = "command"
 BODY_TARGETS = ("v_x", "v_y", "omega")
@@ -32,16 +34,16 @@ _REST_M_S = 0.02
 _REST_YAW_RAD_S = 0.05
 
 
-def _sign(x: Any, rest: float) -> Any:
+def _sign(x: float, rest: float) -> float:
     width = cast_like(rest, x)
     return x * abs(x) / (x * x + width * width)
 
 
-def _soft(x: Any, rate: float) -> Any:
+def _soft(x: float, rate: float) -> float:
     return x / (cast_like(1.0, x) + cast_like(rate, x) * abs(x))
 
 
-def _per_100(t: Any) -> Any:
+def _per_100(t: float) -> float:
     return cast_like(0.01, t) * t
 
 
@@ -195,18 +197,23 @@ _COMPILED: Mapping[str, Any] = MappingProxyType(
 )
 
 
-def table_entry(name: str, columns: tuple[Any, ...]) -> Any:
+def table_entry(name: str, columns: tuple[NDArray[np.floating], ...]) -> Term:
     """A term's coefficients, arrays (L,), in the form that the step takes."""
-    return _ENTRIES[name](*columns)
+    made: Term = _ENTRIES[name](*columns)
+    return made
 
 
-def terms_point(terms: Any, i: int) -> Any:
+def terms_point(terms: Terms | None, i: int) -> Terms | None:
     """Coefficients of all terms at point i; None if there are none."""
-    return None if terms is None else tuple(type(term)(term.k[i], term.per_s[i]) for term in terms)
+    if terms is None:
+        return None
+    kinds: list[Any] = [type(term) for term in terms]
+    return tuple(kind(term.k[i], term.per_s[i]) for kind, term in zip(kinds, terms, strict=True))
 
 
+# What is overloaded is chosen by numba's types; those of tuples have fields that its annotations do not know.
 @specialise(terms_point)
-def _terms_point(terms: Any, i: Any) -> Callable[..., Any]:
+def _terms_point(terms: Any, i: types.Type) -> Callable[..., Any]:
     if isinstance(terms, types.NoneType):
         return lambda terms, i: None
     kinds = [kind.instance_class for kind in terms.types]
@@ -215,7 +222,7 @@ def _terms_point(terms: Any, i: Any) -> Callable[..., Any]:
     return _made("terms_point", "terms, i", [f"return ({parts})"], scope)
 
 
-def add_to_commands(left: Any, right: Any, time_s: Any, terms: Any) -> Any:
+def add_to_commands(left: float, right: float, time_s: float, terms: Terms | None) -> tuple[float, float]:
     """Both commands (rad/s) with the terms that act on them."""
     if terms is None:
         return left, right
@@ -228,7 +235,7 @@ def add_to_commands(left: Any, right: Any, time_s: Any, terms: Any) -> Any:
 
 
 @specialise(add_to_commands)
-def _add_to_commands(left: Any, right: Any, time_s: Any, terms: Any) -> Callable[..., Any]:
+def _add_to_commands(left: types.Type, right: types.Type, time_s: types.Type, terms: Any) -> Callable[..., Any]:
     if isinstance(terms, types.NoneType):
         return lambda left, right, time_s, terms: (left, right)
     scope, lines = {}, ["new_left, new_right = left, right"]
@@ -242,16 +249,16 @@ def _add_to_commands(left: Any, right: Any, time_s: Any, terms: Any) -> Callable
 
 
 @scalar_function
-def _plus(lateral: Any, more: Any) -> Any:
+def _plus(lateral: float | None, more: float) -> float:
     if lateral is None:
         return more
     return lateral + more
 
 
 def add_to_velocity(
-    forward: Any, lateral: Any, turn: Any, wheel_sum: Any, difference: Any, change: Any, time_s: Any, base: Any,
-    terms: Any,
-) -> Any:  # fmt: skip
+    forward: float, lateral: float | None, turn: float, wheel_sum: float, difference: float, change: float,
+    time_s: float, base: Base, terms: Terms | None,
+) -> tuple[float, float | None, float]:  # fmt: skip
     """Forward and lateral speed (m/s) and half the yaw rate (rad/s) with the terms; wheels as for `body_velocity`."""
     if terms is None:
         return forward, lateral, turn
@@ -271,8 +278,8 @@ def add_to_velocity(
 
 @specialise(add_to_velocity)
 def _add_to_velocity(
-    forward: Any, lateral: Any, turn: Any, wheel_sum: Any, difference: Any, change: Any, time_s: Any, base: Any,
-    terms: Any,
+    forward: types.Type, lateral: types.Type, turn: types.Type, wheel_sum: types.Type, difference: types.Type,
+    change: types.Type, time_s: types.Type, base: types.Type, terms: Any,
 ) -> Callable[..., Any]:  # fmt: skip
     arguments = "forward, lateral, turn, wheel_sum, difference, change, time_s, base, terms"
     if isinstance(terms, types.NoneType):
@@ -304,7 +311,7 @@ def _reads_change(term: GenericTerm) -> bool:
     return re.search(r"\ba\b", term.feature) is not None
 
 
-def terms_need_change(terms: Any) -> bool:
+def terms_need_change(terms: Terms | None) -> bool:
     """Whether any of the body's terms depends on the acceleration; a constant to the compiler."""
     return terms is not None and any(_reads_change(TERMS[_NAME_OF[type(term)]]) for term in terms)
 

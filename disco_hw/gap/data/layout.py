@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from disco_hw.effects.effect import Channel, Effect, Parameter, Stage, asks_for
 from disco_hw.effects.registry import DELAY, MOTION_EFFECTS, REGISTRY, in_stages
 from disco_hw.gap.data.gridded_drive import GRID_STEP_S
+from disco_hw.model.coefficients import Base, Coefficients, Effects
 from disco_hw.model.parameter import BASE_PARAMETERS
-from disco_hw.model.step import Base, Effects
 
 Array = NDArray[np.float64]
 
@@ -171,14 +171,15 @@ def _plain(layout: Layout, p: Array, effect: Effect, **motion: float) -> Any:
     return effect.plain(**{name: known[name] for name in asks_for(effect.plain)})
 
 
-def wheel_effects(p: Array, geometry: Array) -> Any:
+def wheel_effects(p: Array, geometry: Array) -> Coefficients:
     """What the model's wheel step needs at a vector of the wheel channel; `geometry` (3,) serves yaw-rate limits."""
     base = tuple(geometry[:BASE_COUNT].tolist())
     given = {name: _coefficients(WHEEL, p, name, base) for name in WHEEL_MOTION}
-    return Effects(**{name: given.get(name) for name in MOTION_EFFECTS})
+    made: Coefficients = Effects(**{name: given.get(name) for name in MOTION_EFFECTS})
+    return made
 
 
-def body_effects(p: Array) -> tuple[Base, Any]:
+def body_effects(p: Array) -> tuple[Base, Coefficients]:
     """What the model's body velocity needs at a vector of the body channel."""
     base = tuple(p[:BASE_COUNT].tolist())
     given = {name: _coefficients(BODY, p, name, base) for name in BODY_MOTION}
