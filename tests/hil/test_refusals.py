@@ -11,7 +11,7 @@ import sys
 import threading
 import time
 import tty
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 
 import can
@@ -19,10 +19,8 @@ import pytest
 
 from disco_hw.errors import WorkError
 from disco_hw.experiments.live_stack import (
-    FAST_TASK,
     READY_TIMEOUT_S,
     Operator,
-    Stack,
     disco_hw_process,
     read_truth,
     running_stack,
@@ -226,17 +224,12 @@ def from_the_host(bus_log):
 @pytest.mark.parametrize("seeded", [False, True], ids=["entropy", "a seed asked for by name"])
 def test_a_session_recorded_before_a_restart_does_not_arm_after_it(tmp_path, seeded):
     """Without a key. The robot with a seed, whose entropy repeats, shows that the recording is a good one."""
-    robot_file = write_robot_file(tmp_path, task=FAST_TASK)
-    with (
-        virtual_robot(tmp_path, robot_file, "first", seeded) as (truth, bus_log),
-        disco_hw_process("daemon", ["run", str(robot_file)], tmp_path / "daemon.txt") as daemon,
-    ):
-        operator = Operator(tmp_path / "control.sock", (daemon,))
-        stack = Stack(tmp_path, robot_file, daemon, daemon, operator, ExitStack())
-        stack.drive(until_rad_s=3.0)
-        operator.tell("quit")
-        daemon.process.wait(10.0)
-    assert max(row.fastest for row in read_truth(truth)) > 3.0
+    robot_file = write_robot_file(tmp_path)
+    drive = ["drive", str(robot_file), "--script", "circle", "--unattended", "--seconds", "4"]
+    with virtual_robot(tmp_path, robot_file, "first", seeded) as (truth, bus_log):
+        _, told = disco(*drive, "--log", str(tmp_path / "drive.mcap"))
+    assert "script circle completed" in told
+    assert max(row.fastest for row in read_truth(truth)) > 1.0
     sent = list(from_the_host(bus_log))
     with virtual_robot(tmp_path, robot_file, "second", seeded) as (truth, _):
         with can.Bus(interface="unixcan", channel=str(tmp_path / "bus")) as bus:
