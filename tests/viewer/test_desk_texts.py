@@ -1,11 +1,14 @@
 """The texts around the live page are whole at every width from a phone's to a desk's, in every state, light or dark."""
 
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 
 import pytest
 
-from tests.viewer.test_desk import STATUS, Daemon, desk_of
+from disco_hw.viewer.desk import Desk
+from disco_hw.viewer.server import serving
+from tests.viewer.test_desk import STATUS, Daemon
 from tools.browser import chromium, keep, opened
+from tools.viewer_run import ROBOT_FILE
 
 pytestmark = [pytest.mark.long, pytest.mark.browser]
 
@@ -77,6 +80,15 @@ def daemon(tmp_path):
     made.close()
 
 
+@contextmanager
+def desk_at(socket):
+    """The address of a served desk."""
+    desk = Desk(socket, ROBOT_FILE)
+    with serving("test", port=0, desk=desk) as page:
+        yield page.url
+    desk.close()
+
+
 def cut_off(tab, name):
     """What is cut off of the page's texts, at all widths and in both colour schemes."""
     found = []
@@ -93,7 +105,7 @@ def cut_off(tab, name):
 @pytest.mark.parametrize("name", STATES)
 def test_every_text_is_whole(browser, daemon, name):
     daemon.status = {**WHOLE, **STATES[name]}
-    with desk_of(daemon.server.path) as (_, port), opened(browser, f"http://127.0.0.1:{port}", scene=False) as tab:
+    with desk_at(daemon.server.path) as url, opened(browser, url, scene=False) as tab:
         said = daemon.status["detail"]
         tab.locator("#detail", has_text=said[:60]).wait_for()
         assert cut_off(tab, name) == []
@@ -105,16 +117,29 @@ def test_every_text_is_whole(browser, daemon, name):
             assert cut_off(tab, "task") == []
 
 
+def test_the_stop_button_stays_where_it_is_whatever_is_said(browser, daemon):
+    with desk_at(daemon.server.path) as url, opened(browser, url, scene=False) as tab:
+        places = {}
+        for name in ("ready", "disconnected", "stopping"):
+            daemon.status = {**WHOLE, **STATES[name]}
+            tab.locator("#detail", has_text=daemon.status["detail"][:60]).wait_for()
+            for width in WIDTHS:
+                tab.set_viewport_size({"width": width, "height": HEIGHT})
+                box = tab.locator("#estop").bounding_box()
+                places.setdefault(width, set()).add(tuple(box.values()))
+    assert {width: len(found) for width, found in places.items()} == dict.fromkeys(WIDTHS, 1)
+
+
 def test_every_text_is_whole_without_a_daemon(browser, tmp_path):
-    with desk_of(tmp_path / "none.sock") as (_, port), opened(browser, f"http://127.0.0.1:{port}", scene=False) as tab:
+    with desk_at(tmp_path / "none.sock") as url, opened(browser, url, scene=False) as tab:
         tab.locator("#state", has_text="NO DAEMON").wait_for()
         assert cut_off(tab, "no daemon") == []
 
 
 def test_every_text_is_whole_without_a_connection(browser, daemon):
     with ExitStack() as ending:
-        _, port = ending.enter_context(desk_of(daemon.server.path))
-        with opened(browser, f"http://127.0.0.1:{port}", scene=False) as tab:
+        url = ending.enter_context(desk_at(daemon.server.path))
+        with opened(browser, url, scene=False) as tab:
             tab.locator("#state", has_text="READY").wait_for()
             ending.close()
             tab.locator("#estop", has_text="NO CONNECTION").wait_for()
