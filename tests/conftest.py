@@ -23,7 +23,15 @@ def pytest_ignore_collect(collection_path, config):
     return None
 
 
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config, items):
+    for item in items:
+        # With --dist loadgroup one worker runs all stacks with real-time priority, one after the other: side by side
+        # they would take the processors from each other. Other files stay whole, for what their tests share.
+        group = "realtime" if item.get_closest_marker("hil") else str(item.path.relative_to(ROBOT_TESTS.parent))
+        item.add_marker(pytest.mark.xdist_group(group))
+    # They take longest, so they begin first.
+    items.sort(key=lambda item: item.get_closest_marker("hil") is None)
     if not config.getoption("--robot"):
         return
     still = pytest.mark.skip(reason="turns the wheels; lift them off the ground and give --allow-motion")

@@ -14,6 +14,7 @@ PATH = "x_m,y_m\n0,0\n0.5,0\n0.8,0.2\n"
 TASK = 'path = "path.csv"\nspeed_m_s = 0.25\n'
 
 
+@pytest.mark.hil
 @pytest.mark.long
 def test_a_path_is_driven_to_its_end_and_the_log_needs_no_other_file(tmp_path):
     (tmp_path / "path.csv").write_text(PATH)
