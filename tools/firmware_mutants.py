@@ -45,6 +45,8 @@ FIRST = {
     "firmware": ("test_firmware_core", "firmware/test_telemetry"),
     "supervisor": ("firmware/test_host", "firmware/test_states", "firmware/test_command"),
     "drive": ("firmware/test_drive",),
+    "host": ("firmware/test_host",),
+    "timebase": ("firmware/test_timebase",),
 }
 
 

@@ -236,6 +236,28 @@ def test_a_start_with_entropy_of_its_own_is_taken(entropy, last_entropy):
     assert Bench(entropy=entropy, last_entropy=last_entropy).to_armed().state == "ARMED"
 
 
+@pytest.mark.parametrize(
+    ("entropy", "outputs"),
+    [
+        (1234567, (6457827717110365317, 3203168211198807973, 9817491932198370423, 4593380528125082431)),
+        (2**64 - 1, (0xE4D971771B652C20, 0xE99FF867DBF682C9, 0x382FF84CB27281E9, 0x6D1DB36CCBA982D2)),
+    ],
+)
+def test_challenges_are_the_upper_sixteen_bits_of_splitmix64(entropy, outputs):
+    """Its published first outputs for the seed 1234567; those for 2^64 - 1 from an implementation in Python."""
+    bench = Bench(entropy=entropy)
+    seen = [bench.core.challenge]
+    for session in (7, 8):
+        bench.hello()
+        bench.ask("READY", session)
+        bench.run_until("READY")
+        seen.append(bench.core.challenge)
+        bench.ask("STANDBY")
+        bench.run_until("STANDBY")
+        seen.append(bench.core.challenge)
+    assert seen[:4] == [output >> 48 for output in outputs]
+
+
 def test_challenges_depend_on_the_entropy():
     seen = {Bench(entropy=seed).core.challenge for seed in range(1, 51)}
     assert len(seen) > 45

@@ -146,6 +146,70 @@ def test_one_leap_of_the_clock_stops_the_robot_at_once(leap_us, sign):
     stays_stopped(bench)
 
 
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize(("leap_us", "stops"), [(20_100, False), (20_101, True)])
+def test_the_tolerance_is_twenty_milliseconds_and_what_a_cycle_forgets(sign, leap_us, stops):
+    bench = driving()
+    bench.run(30)
+    begin_us = bench.now_us
+    bench.core.clock = lambda true_us: true_us + sign * leap_us * (true_us > begin_us)
+    assert (bench.step().fault == FAULTS["CLOCK_MISMATCH"]) == stops
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_however_far_it_leapt_the_fault_passes_in_its_time(sign):
+    """Counted as 40 ms, less the cycle itself; a tenth of a cycle is forgotten in each; then the hold of 0.5 s."""
+    bench = bench_with_clock()
+    bench.run(100_000)
+    begin_us = bench.now_us
+    bench.core.clock = lambda true_us: true_us + sign * 90_000_000 * (true_us > begin_us)
+    cycles = cycles_until(bench, lambda out: out.fault, 1) + cycles_until(bench, lambda out: not out.fault, 1000)
+    # From 38.9 ms, or 40 ms where it went back, to the tolerance of 20 ms, by 0.1 ms a cycle.
+    assert cycles == (189 if sign > 0 else 200) + 500
+
+
+def wheel_samples(bench, cycles):
+    begin_us = bench.now_us
+    bench.run(cycles)
+    return len(bench.messages("WHEEL_SPEED", begin_us + 1))
+
+
+@pytest.mark.parametrize(("rate", "samples"), [(0.0, 100), (0.001, 100), (0.5, 100), (2.0, 200), (3.0, 300)])
+def test_once_apart_the_cores_own_time_goes_by_the_faster_of_the_two_clocks(rate, samples):
+    """One sample of the wheels in ten milliseconds of it."""
+    bench = bench_with_clock()
+    bench.core.clock = running_at(rate, bench.now_us)
+    assert bench.run(200).fault == FAULTS["CLOCK_MISMATCH"]
+    assert wheel_samples(bench, 1000) == pytest.approx(samples, abs=1)
+
+
+def own_time_us(bench):
+    bench.send("TIME_REQUEST", sequence=1)
+    bench.step()
+    return bench.messages("TIME_RESPONSE")[-1].values["receive_time"]
+
+
+def test_the_cores_own_time_is_that_of_a_clock_whose_cycles_jitter():
+    bench, drawn = Bench(), random.Random(1)
+    for _ in range(1000):
+        bench.step(drawn.randrange(500, 1500))
+    now_us = bench.now_us
+    assert own_time_us(bench) == now_us
+
+
+def test_after_a_leap_frames_within_the_cycles_make_time_no_faster():
+    bench = Bench()
+    bench.step(100 * MS)
+    assert bench.out.fault == FAULTS["CLOCK_MISMATCH"]
+    for _ in range(100):
+        bench.now_us += 400
+        bench.send("TIME_REQUEST", sequence=2)
+        bench.now_us -= 400
+        bench.step()
+    now_us = bench.now_us
+    assert own_time_us(bench) == now_us
+
+
 def test_the_fault_passes_once_the_clock_is_sound_again():
     bench = driving()
     begin_us = bench.now_us
