@@ -18,20 +18,21 @@ from numba import njit
 from numba.core.runtime import _nrt_python, rtsys
 
 import disco_hw
-from disco_hw.control import Circle, CommandLimits, Disco, DiscoSettings, PlannerState, Sampler, SentCommand
+from disco_hw.control import CommandLimits, Disco, DiscoSettings, PlannerState, Sampler, SentCommand
 from disco_hw.control.black_box import BlackBoxDisco
 from disco_hw.control.kernel.replan import replan
 from disco_hw.control.parameter_points import unscented_points
 from disco_hw.control.pendulum import PendulumPlanner, PendulumPoints
 from disco_hw.control.settings import ROTATION
 from disco_hw.control.sigma_points import sigma_points
-from disco_hw.control.torch_models import circle_cost, skid_steer_transition
 from disco_hw.experiments.circle import CircleOptions, CircleResult, Command, drive, planner_command, plants
 from disco_hw.experiments.pendulum import POSTERIOR
+from disco_hw.experiments.torch_models import circle_cost, skid_steer_transition
 from disco_hw.jit import block_function, float32, tune_loops
 from disco_hw.model import Model, load_model
 from disco_hw.runtime.assembly import make_planner
 from disco_hw.runtime.robot_setup import load_setup
+from disco_hw.tasks.circle import CircleCost
 from tools.step_times import summary, times_ms, undisturbed
 
 ROBOTS = Path(disco_hw.__file__).parent / "robots"
@@ -108,7 +109,7 @@ def skid_steer_pair(model: Model) -> tuple[Step, Step]:
     """A step of DISCO and of the peer on the paper's circle, with the cost that the paper gives."""
     from tools.control_peers import circle_mppi, circle_state  # noqa: PLC0415  (a peer for the benchmark only)
 
-    circle, settings = Circle().paper(), DiscoSettings()
+    circle, settings = CircleCost().paper(), DiscoSettings()
     planner = Disco(model, circle, settings, CommandLimits(LARGEST_RAD_S))
     planner.warm_up()
     mppi = circle_mppi(model, circle, settings, LARGEST_RAD_S)
@@ -158,7 +159,7 @@ def scaling(model: Model, steps: int) -> dict[str, float]:
     """Time of a step for each number of samples, over what is in proportion to 400 samples: 1 is linear."""
     settings = DiscoSettings()
     planners = {
-        size: Disco(model, Circle(), replace(settings, sampler=Sampler(samples=size)), CommandLimits(LARGEST_RAD_S))
+        size: Disco(model, CircleCost(), replace(settings, sampler=Sampler(samples=size)), CommandLimits(LARGEST_RAD_S))
         for size in SIZES
     }
     calls = [moving(number) for number in range(CALLS)]
@@ -188,7 +189,7 @@ def allocations(model: Model, steps: int = 200) -> dict[str, float]:
     `in_the_step`: allocations of the compiled step beyond those of an empty function with the same arguments, for which
     numba makes a record of each array that it is handed. `bytes_grown_per_step`: Python's memory after `steps` more.
     """
-    planner = Disco(model, Circle(), DiscoSettings(), CommandLimits(LARGEST_RAD_S))
+    planner = Disco(model, CircleCost(), DiscoSettings(), CommandLimits(LARGEST_RAD_S))
     planner.warm_up()
     for number in range(20):
         planner.plan(*moving(number))
@@ -219,7 +220,7 @@ def torch_times_ms(model: Model, device: str, samples: int, steps: int) -> np.nd
     theta, weights = unscented_points(model, 1.0)
     sampler = Sampler(samples=samples)
     planner = BlackBoxDisco(
-        skid_steer_transition(DiscoSettings().step_s), circle_cost(Circle()), theta[:, :3], weights, 2, sampler,
+        skid_steer_transition(DiscoSettings().step_s), circle_cost(CircleCost()), theta[:, :3], weights, 2, sampler,
         largest=LARGEST_RAD_S, device=device,
     )  # fmt: skip
     state = np.array([0.75, 0.0, 1.25, 0.0])
@@ -238,7 +239,7 @@ def circle_quality(model: Model, seeds: int, duration_s: float) -> dict[str, flo
         rate_hz = 50.0 if name == "posterior_50hz" else options.rate_hz
         here = replace(options, rate_hz=rate_hz)
         runs = [drive(command(theta, seed), theta, here, seed) for seed, theta in enumerate(plants(model, seeds))]
-        row: Any = CircleResult(here, Circle(), name, {name: runs}).rows()[0]
+        row: Any = CircleResult(here, CircleCost(), name, {name: runs}).rows()[0]
         travel = [np.abs(np.diff(run.commands_rad_s, axis=0)).mean() * rate_hz for run in runs]
         figures[f"control.circle.{name}.steady_cost"] = row["steady_cost"]
         figures[f"control.circle.{name}.command_change_rot_s"] = row["command_change_rot_s"]
@@ -254,11 +255,11 @@ def contenders(model: Model, options: CircleOptions) -> dict[str, Callable[[dict
     bare = replace(model, belief=None)
     fast = replace(options, rate_hz=50.0)
     largest = options.largest_rot_s * ROTATION
-    plain = Circle().paper()
+    plain = CircleCost().paper()
     return {
-        "posterior": lambda _, seed: planner_command(model, Circle(), ours, options, seed),
-        "truth": lambda theta, seed: planner_command(bare.with_point(theta), Circle(), ours, options, seed),
-        "posterior_50hz": lambda _, seed: planner_command(model, Circle(), ours, fast, seed),
+        "posterior": lambda _, seed: planner_command(model, CircleCost(), ours, options, seed),
+        "truth": lambda theta, seed: planner_command(bare.with_point(theta), CircleCost(), ours, options, seed),
+        "posterior_50hz": lambda _, seed: planner_command(model, CircleCost(), ours, fast, seed),
         "paper_mode": lambda _, seed: planner_command(model, plain, paper, options, seed),
         "pytorch_mppi": lambda _, seed: circle_command(circle_mppi(model, plain, paper, largest), seed),
     }

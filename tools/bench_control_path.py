@@ -15,14 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 import disco_hw
-from disco_hw.config import PathTask
 from disco_hw.control import CommandLimits, Disco, DiscoSettings, PlannerState, SentCommand
-from disco_hw.control.tasks.path import Path
-from disco_hw.course import course_of
 from disco_hw.experiments.circle import plants
 from disco_hw.experiments.plant import Plant
 from disco_hw.model import Model, load_model
-from disco_hw.waypoints import load_waypoints
+from disco_hw.tasks.line.waypoints import load_waypoints
+from disco_hw.tasks.path import PathTask
 from tools.step_times import summary, times_ms, undisturbed
 
 ROBOTS = FilePath(disco_hw.__file__).parent / "robots"
@@ -66,7 +64,7 @@ def run(seeds: int = 3, duration_s: float = 40.0, speed_m_s: float = 0.25) -> di
 
 def plan_times(model: Model, speed_m_s: float, steps: int = 500) -> dict[str, float]:
     """Milliseconds of a plan along the eight at the paper's size, as the robot moves on."""
-    path = Path.from_config(PathTask(path="eight.csv", speed_m_s=speed_m_s, points=paths()["eight"]))
+    path = PathTask(path="eight.csv", speed_m_s=speed_m_s, points=paths()["eight"]).planned("default")
     x_m, y_m, *_ = path.table[0].tolist()
     planner = Disco(model, path, DiscoSettings(), LIMITS)
     with undisturbed():
@@ -79,7 +77,7 @@ def plan_times(model: Model, speed_m_s: float, steps: int = 500) -> dict[str, fl
 def followed(task: PathTask, drives: list[Array], facing: str) -> dict[str, float]:
     """Root mean square and largest distance (mm), part of the time in reverse, mean and least way driven (m)."""
     settled = round(SETTLED_S[facing] * RATE_HZ)
-    course, path = course_of(task), Path.from_config(task)
+    course, path = task.course(), task.planned("default")
     off_mm = np.array([np.abs(course.off_m(rows[settled:, :2])) * 1e3 for rows in drives])
     reverse = np.array([rows[settled:, 2] < REVERSE_M_S for rows in drives])
     count = len(path.table) - 1
@@ -98,8 +96,8 @@ def followed(task: PathTask, drives: list[Array], facing: str) -> dict[str, floa
 
 def drive(model: Model, task: PathTask, theta: dict[str, float], facing: str, seed: int, duration_s: float) -> Array:
     """One drive from the first way-point: x, y (m), forward speed (m/s) and place in the table after each period."""
-    path = Path.from_config(task)
-    x_m, y_m, yaw_rad = course_of(task).start
+    path = task.planned("default")
+    x_m, y_m, yaw_rad = task.course().start
     plant = Plant(theta, (x_m, y_m, yaw_rad + TURNED_RAD[facing]), LAG_S, WHEEL_NOISE, seed)
     planner = Disco(model, path, DiscoSettings(), LIMITS, seed + 1)
     sent: list[SentCommand] = []

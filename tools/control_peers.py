@@ -19,12 +19,12 @@ from disco_hw.control.parameter_points import unscented_points
 from disco_hw.control.pendulum import PendulumPoints
 from disco_hw.control.plan import PlannerState
 from disco_hw.control.settings import DiscoSettings
-from disco_hw.control.tasks.circle import Circle
 from disco_hw.experiments.circle import Command
 from disco_hw.model import Model
+from disco_hw.tasks.circle import CircleCost
 
 
-def circle_mppi(model: Model, circle: Circle, settings: DiscoSettings, largest_rad_s: float) -> Any:
+def circle_mppi(model: Model, circle: CircleCost, settings: DiscoSettings, largest_rad_s: float) -> Any:
     """MPPI for the paper's circle under sigma points; its state is x, y, yaw and speed of L points, (4 L,)."""
     theta, weights = unscented_points(model, settings.ut_alpha)
     radius, axial, x_icr = (torch.tensor(column, dtype=torch.float32) for column in theta[:, :3].T)

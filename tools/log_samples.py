@@ -111,6 +111,7 @@ _STRATEGIES = {
     bytes: st.binary(max_size=8),
     tuple[float, ...]: st.lists(st.floats(), max_size=12).map(tuple),
     tuple[str, ...]: st.lists(st.text(max_size=8), max_size=3).map(tuple),
+    dict[str, float]: st.dictionaries(st.text(max_size=8), st.floats(), max_size=4),
     dict[str, int]: st.dictionaries(st.text(max_size=8), st.integers(-(2**62), 2**62), max_size=4),
 }
 

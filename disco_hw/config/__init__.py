@@ -1,8 +1,6 @@
 """robot.toml and the one reader of every file that a user names."""
 
 from disco_hw.config.robot import (
-    FARTHEST_M,
-    CircleTask,
     Control,
     Daemon,
     Drive,
@@ -10,20 +8,13 @@ from disco_hw.config.robot import (
     Link,
     Log,
     ModelFile,
-    PathTask,
-    Point,
     Prior,
     Robot,
     RobotConfig,
-    RobotTask,
-    TimedPathTask,
-    circle_task,
     load_robot_config,
 )
 
 __all__ = [
-    "FARTHEST_M",
-    "CircleTask",
     "Control",
     "Daemon",
     "Drive",
@@ -31,13 +22,8 @@ __all__ = [
     "Link",
     "Log",
     "ModelFile",
-    "PathTask",
-    "Point",
     "Prior",
     "Robot",
     "RobotConfig",
-    "RobotTask",
-    "TimedPathTask",
-    "circle_task",
     "load_robot_config",
 ]

@@ -11,15 +11,13 @@ from msgspec import Meta
 
 from disco_hw.config.input_file import ROBOT_TOML, read_toml
 from disco_hw.errors import InputError
+from disco_hw.tasks import ReadField, RobotTask, UnknownKind, default_task, task_from
 
 Positive = Annotated[float, Meta(gt=0.0)]
 NonNegative = Annotated[float, Meta(ge=0.0)]
 Probability = Annotated[float, Meta(gt=0.0, lt=1.0)]
 Share = Annotated[float, Meta(gt=0.0, le=1.0)]
 Range = tuple[float, float]
-Point = tuple[float, float]
-# The frames of a pose hold 838.86 m along x and y (disco_robot.dbc); where there is no pose nothing can be followed.
-FARTHEST_M = 838.0
 
 
 class Robot(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -90,50 +88,6 @@ class Estimation(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     pose_required: bool = True
 
 
-class CircleTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, tag="circle", tag_field="kind"):
-    """Follow a circle counter-clockwise at a constant speed (paper, section V-B)."""
-
-    center_x_m: float = 0.0
-    center_y_m: float = 0.0
-    radius_m: Positive = 0.75
-    speed_m_s: Positive = 0.2
-
-
-class PathTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, tag="path", tag_field="kind"):
-    """Follow way-points by arc length at a constant speed; round and round if the last is the first, else to the end.
-
-    `path`: CSV with columns x_m, y_m (m, world frame), relative to robot.toml. `points` are what `load_setup` has read
-    from it; no field of robot.toml.
-    """
-
-    path: Annotated[str, Meta(min_length=1)]
-    speed_m_s: Positive = 0.2
-    points: tuple[Point, ...] = ()
-
-
-class TimedPathTask(
-    msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, tag="timed_path", tag_field="kind"
-):
-    """Follow way-points by time: be at each when its time has come, counted from the start of the task, to the last.
-
-    `path`: CSV with columns t_s (s), x_m, y_m (m, world frame), relative to robot.toml. `points` and `times_s` are what
-    `load_setup` has read from it; no fields of robot.toml.
-    """
-
-    path: Annotated[str, Meta(min_length=1)]
-    points: tuple[Point, ...] = ()
-    times_s: tuple[float, ...] = ()
-
-    @property
-    def speed_m_s(self) -> float:
-        """The fastest that the times ask for, straight from one way-point to the next; 0 before they are read."""
-        ways = zip(self.points, self.points[1:], self.times_s, self.times_s[1:], strict=False)
-        return max((math.dist(here, there) / (then - now) for here, there, now, then in ways), default=0.0)
-
-
-RobotTask = CircleTask | PathTask | TimedPathTask
-
-
 class ModelFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Where the model with its posterior is; without a file the nominal geometry and the prior are used."""
 
@@ -175,7 +129,7 @@ class RobotConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     link: Link = Link()
     control: Control = Control()
     estimation: Estimation = Estimation()
-    task: RobotTask = CircleTask()
+    task: RobotTask = msgspec.field(default_factory=default_task)
     model: ModelFile = ModelFile()
     log: Log = Log()
     daemon: Daemon = Daemon()
@@ -188,12 +142,14 @@ def load_robot_config(path: Path) -> RobotConfig:
     Raises InputError with one line naming file, field and remedy.
     """
     raw = read_toml(path, ROBOT_TOML)
+    section = raw.pop("task", {})
     try:
-        config = msgspec.convert(_with_kind_of_task(path, raw), RobotConfig)
+        config = msgspec.convert(raw, RobotConfig)
     except msgspec.ValidationError as error:
         raise InputError(f"{path}: {_in_words(str(error))}") from None
     given = {name: getattr(config.prior, name) for name in raw.get("prior", {})}
     config = msgspec.structs.replace(config, prior=msgspec.structs.replace(prior_around(config.robot), **given))
+    config = msgspec.structs.replace(config, task=_task_of(path, section))
     _check(path, config)
     return config
 
@@ -212,22 +168,19 @@ def prior_around(robot: Robot) -> Prior:
     )
 
 
-def circle_task(task: RobotTask, purpose: str) -> CircleTask:
-    """The task, which `purpose` needs to be a circle; raises InputError for another."""
-    if not isinstance(task, CircleTask):
-        raise InputError(f'{purpose} needs a circle: write kind = "circle" with radius_m and speed_m_s in [task]')
-    return task
-
-
-def _with_kind_of_task(path: Path, raw: dict[str, Any]) -> dict[str, Any]:
-    """The file with the kind of its task, which goes without saying: a path where one is named, else a circle."""
-    task = raw.get("task")
-    if not isinstance(task, dict):
-        return raw
-    for name in ("points", "times_s"):
-        if name in task:
-            raise InputError(f"{path}: [task] {name}: no such field; write way-points in a CSV and name it in path")
-    return {**raw, "task": {"kind": "path" if "path" in task else "circle", **task}}
+def _task_of(path: Path, section: object) -> RobotTask:
+    """The task that [task] says; its kind knows which fields that has."""
+    if not isinstance(section, dict):
+        raise InputError(f"{path}: task: not a section; write [task] above its fields")
+    try:
+        return task_from(section)
+    except UnknownKind as error:
+        raise InputError(f"{path}: task.kind: {error}") from None
+    except ReadField as error:
+        raise InputError(f"{path}: [task] {error}") from None
+    except msgspec.ValidationError as error:
+        text, at, where = str(error).partition(" - at `$")
+        raise InputError(f"{path}: {_in_words(text + (at or ' - at `$') + '.task' + (where or '`'))}") from None
 
 
 def _in_words(message: str) -> str:
@@ -272,15 +225,9 @@ def _check(path: Path, config: RobotConfig) -> None:
         )
     if control.telemetry_disarm_s <= control.telemetry_zero_s:
         refuse("control.telemetry_disarm_s", "not above telemetry_zero_s", "write a larger value")
-    if isinstance(config.task, CircleTask):
-        for field in ("center_x_m", "center_y_m"):
-            farthest_m = abs(getattr(config.task, field)) + config.task.radius_m
-            if farthest_m > FARTHEST_M:
-                refuse(
-                    f"task.{field}",
-                    f"with radius_m the circle goes {farthest_m:g} m from the origin, and poses only {FARTHEST_M:g} m",
-                    "write a circle in the frame of the poses",
-                )
+    fault = config.task.fault()
+    if fault is not None:
+        refuse(f"task.{fault.field}", fault.fault, fault.remedy)
     if config.task.speed_m_s > config.robot.max_wheel_speed_rad_s * config.robot.wheel_radius_m:
         refuse(
             "task.speed_m_s",

@@ -21,7 +21,6 @@ from disco_hw.control.parameter_points import (
 )
 from disco_hw.control.plan import Array, Diagnostics, NoValidControl, PlannerState, PlanOutcome, Rollouts, WheelPlan
 from disco_hw.control.settings import CommandLimits, DiscoSettings
-from disco_hw.control.tasks.task import Task
 from disco_hw.effects.effect import Channel
 from disco_hw.effects.registry import DELAY
 from disco_hw.model import Belief, Model
@@ -29,6 +28,7 @@ from disco_hw.model.free_run import FreeRun
 from disco_hw.model.model import coefficient_tables
 from disco_hw.model.parameter import BASE_PARAMETERS
 from disco_hw.model.step import integration_series
+from disco_hw.tasks import PlannedTask
 
 NARROW_TURN_RAD = 0.4
 DELAYED_BY = DELAY.columns[0]
@@ -45,7 +45,9 @@ class Disco:
     compiles; `warm_up` does that beforehand.
     """
 
-    def __init__(self, model: Model, task: Task, settings: DiscoSettings, limits: CommandLimits, seed: int = 1) -> None:
+    def __init__(
+        self, model: Model, task: PlannedTask, settings: DiscoSettings, limits: CommandLimits, seed: int = 1
+    ) -> None:
         sampler, step_s = settings.sampler, settings.step_s
         self._model, self._task, self._settings, self._limits, self._seed = model, task, settings, limits, seed
         self._own_draws = settings.uncertainty == "joint" or (
@@ -159,7 +161,7 @@ class Disco:
         return bool(names & differing)
 
     @property
-    def task(self) -> Task:
+    def task(self) -> PlannedTask:
         """What is planned for."""
         return self._task
 
@@ -168,7 +170,7 @@ class Disco:
         """How it is planned."""
         return self._settings
 
-    def set_task(self, task: Task) -> None:
+    def set_task(self, task: PlannedTask) -> None:
         """Plan for another task of the same type from the next `plan` on; nothing is compiled. Raises TypeError."""
         if type(task) is not type(self._task):
             raise TypeError(f"the planner was compiled for {type(self._task).__name__}, not {type(task).__name__}")
@@ -303,7 +305,7 @@ class Disco:
     def _system(self, state: PlannerState, start: Array, t0_ns: int, task_s: float, elapsed_s: float) -> SkidSteer:
         x, y, yaw, left, right = start.tolist()
         task, (origin_x, origin_y), begin, self._memory = self._task.prepare(
-            task_s, x, y, self._memory, self._settings.step_s, self._settings.sampler.horizon
+            task_s, x, y, yaw, self._memory, self._settings.step_s, self._settings.sampler.horizon
         )
         direction = (math.cos(yaw), math.sin(yaw)) if math.isfinite(yaw) else (math.nan, math.nan)
         self._start[:] = (x - origin_x, y - origin_y, *direction, left, right, elapsed_s, begin)

@@ -11,9 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.control import pendulum
-from disco_hw.control.tasks.circle import Circle
-from disco_hw.control.tasks.path import AGAINST_M, FARTHEST_STEP_M, SLOW_DOWN_S, STANDING_M, TERMINAL_S, Path
-from disco_hw.control.tasks.timed_path import RESTS_M, TimedPath
 from disco_hw.model import plain as model
 
 Array = NDArray[np.float64]
@@ -32,79 +29,6 @@ def limited(nominal: Array, noise: Array, before: Array, speed: float, change: f
         previous = np.clip(np.clip(wanted, previous - change, previous + change), -speed, speed)
         commands[:, t] = previous
     return commands
-
-
-def circle_cost(circle: Circle, step_s: float) -> SequenceCost:
-    """Cost of paths x, y, yaw (T + 1, K) and forward speeds (T, K) round a circle; see `Circle`."""
-
-    def cost(x: Array, y: Array, yaw: Array, forward: Array) -> Array:
-        x, y = x - circle.center_x_m, y - circle.center_y_m
-        off_edge = np.hypot(x[1:], y[1:]) - circle.radius_m
-        paper = np.hypot(off_edge, forward - circle.speed_m_s).sum(axis=0)
-        closest = np.maximum(x[1:] ** 2 + y[1:] ** 2, (circle.radius_m / 2.0) ** 2)
-        angle = (x[:-1] * y[1:] - y[:-1] * x[1:]) / closest
-        missing = circle.progress_part * circle.speed_m_s * len(forward) - circle.radius_m / step_s * angle.sum(axis=0)
-        last = circle.terminal_s / step_s * np.abs(off_edge[-1])
-        return np.asarray(paper + circle.progress_weight * np.maximum(missing, 0.0) + last)
-
-    return cost
-
-
-def facing_cost(yaw: Array, along_x: Array | float, along_y: Array | float) -> Array:
-    """Cost of a step for the part of the heading that is against the way."""
-    return AGAINST_M * np.maximum(-(np.cos(yaw) * along_x + np.sin(yaw) * along_y), 0.0)
-
-
-def path_cost(path: Path, place: float, step_s: float) -> SequenceCost:
-    """Cost of paths (T + 1, K) along way-points by arc length, from a place (entries of the path's table); see `Path`.
-
-    Every step moves the place by its projection on the path's direction there, within the place's piece.
-    """
-    table, count = path.table, len(path.table) - 1
-    place, first, last = path.piece(place)
-    endless = path.closed and not path.sharp_turns
-    weight = max(1.0, STANDING_M / path.speed_m_s)
-
-    def off(at: Array, x: Array, y: Array) -> tuple[Array, Array, Array, Array]:
-        """Offset from the path's point at a place, and the path's direction there."""
-        index = np.minimum(at, last - 1.0).astype(int)
-        part = (at - index)[:, None]
-        here, there = (table[i % count if path.closed else i] for i in (index, index + 1))
-        off_x, off_y = (np.column_stack([x, y]) - (1.0 - part) * here[:, :2] - part * there[:, :2]).T
-        return off_x, off_y, here[:, 2], here[:, 3]
-
-    def cost(x: Array, y: Array, yaw: Array, forward: Array) -> Array:
-        at, total = np.full(x.shape[1], place), np.zeros(x.shape[1])
-        for x_now, y_now, yaw_now, forward_now in zip(x[1:], y[1:], yaw[1:], forward, strict=True):
-            off_x, off_y, along_x, along_y = off(at, x_now, y_now)
-            along = np.clip(off_x * along_x + off_y * along_y, -FARTHEST_STEP_M, FARTHEST_STEP_M)
-            wanted = np.full(at.shape, path.speed_m_s)
-            if not endless:
-                wanted = np.minimum(wanted, (last - at) * path.spacing_m / SLOW_DOWN_S)
-            at = at + along / path.spacing_m
-            at = np.mod(at, last) if endless else np.clip(at, first, last)
-            off_x, off_y, along_x, along_y = off(at, x_now, y_now)
-            missing = weight * (wanted - np.minimum(along / step_s, forward_now))
-            total += np.hypot(np.hypot(off_x, off_y), missing) + facing_cost(yaw_now, along_x, along_y)
-        return np.asarray(total + TERMINAL_S / step_s * np.hypot(off_x, off_y))
-
-    return cost
-
-
-def timed_path_cost(path: TimedPath, time_s: float, step_s: float) -> SequenceCost:
-    """Cost of paths (T + 1, K) along way-points by time, which is `time_s` at the start; see `TimedPath`."""
-    due_s = path.waypoints.times_s
-    assert due_s is not None, "a path by time has times"
-
-    def cost(x: Array, y: Array, yaw: Array, forward: Array) -> Array:
-        times = time_s + step_s * np.arange(len(x))
-        there_x, there_y = (np.interp(times, due_s, column)[:, None] for column in path.waypoints.places_m.T)
-        length = np.hypot(np.diff(there_x, axis=0), np.diff(there_y, axis=0))
-        length = np.where(length < RESTS_M, np.inf, length)
-        facing = facing_cost(yaw[1:], np.diff(there_x, axis=0) / length, np.diff(there_y, axis=0) / length)
-        return np.asarray((np.hypot(x[1:] - there_x[1:], y[1:] - there_y[1:]) + facing).sum(axis=0))
-
-    return cost
 
 
 def pendulum_costs(length_m: float, mass_kg: float, angle_rad: float, speed_rad_s: float, torques: Array) -> Array:

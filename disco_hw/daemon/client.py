@@ -74,13 +74,6 @@ def _change(text: str) -> tuple[str, float]:
     return name, number
 
 
-def progress(task: Mapping[str, Any]) -> tuple[str, str]:
-    """How far the task of a status has been driven, as (what, how much): laps of a circle, metres of a path."""
-    if task["asked"]["kind"] == "circle":
-        return "laps", f"{task['laps']:.2f}"
-    return "progress", f"{task['laps'] * task['length_m']:.2f} of {task['length_m']:.2f} m ({task['laps']:.0%})"
-
-
 def in_words(reply: dict[str, Any], robot: Path) -> str:
     """A reply of the daemon of `robot` for a person."""
     if not reply.get("ok"):
@@ -92,7 +85,7 @@ def in_words(reply: dict[str, Any], robot: Path) -> str:
         ": ".join(status_headline(reply)),
         *(f"next: {sentence}" for sentence in advice(reply, by_command(robot))),
         f"robot {reply['robot_state']}, link {reply['link']}, fault {words.fault(reply['fault'])}",
-        f"{' '.join(progress(task))}, distance {task['distance_m'] * 1e3:.0f} mm, speed {task['speed_m_s']:.3f} m/s",
+        f"{' '.join(task['progress'])}, distance {task['distance_m'] * 1e3:.0f} mm, speed {task['speed_m_s']:.3f} m/s",
         f"loop lateness p99 {loop['lateness_us']['p99']:.0f} us, max {loop['lateness_us']['max']:.0f} us, "
         f"overruns {loop['overruns']}, skipped {loop['skipped']}",
     ]

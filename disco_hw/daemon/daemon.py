@@ -53,7 +53,7 @@ from disco_hw.runtime.robot_setup import Setup, link_key, load_setup, refuse_mis
 from disco_hw.runtime.situation import Ask, advice, by_command, headline
 from disco_hw.runtime.states import State
 from disco_hw.runtime.supervisor import Reply, UserRequest
-from disco_hw.runtime.task_change import TaskRefused, changed_task, in_words
+from disco_hw.runtime.task_change import TaskRefused, changed_task
 from drivers.types import Request, Transport
 from firmware_protocol.dbc import packaged_dbc
 
@@ -394,7 +394,7 @@ class Daemon:
             self._server.reply(message, {"ok": False, "error": str(refused)})
             return
         self._core.set_task(task)
-        text = in_words(task)
+        text = task.in_words()
         self._say("task", text)
         self._server.reply(message, {"ok": True, "text": text})
 

@@ -13,10 +13,12 @@ import random
 from collections.abc import Callable
 from dataclasses import replace
 
-from disco_hw.config import CircleTask, Robot, RobotTask, circle_task
+from disco_hw.config import Robot
 from disco_hw.drive.script import Manoeuvre, Pieces, Script, rest
 from disco_hw.drive.separating import SEPARATING, separating
 from disco_hw.errors import InputError
+from disco_hw.tasks import RobotTask
+from disco_hw.tasks.circle import CircleTask, circle_task
 
 SCRIPTS = ("circle", "steps", "excite", *SEPARATING)
 STEP_S = 6.0

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from disco_hw.adaptation.adapter import Adapter, InlineLink
 from disco_hw.adaptation.guard import Geometry, believed_geometry, with_geometry
-from disco_hw.config import CircleTask, circle_task
 from disco_hw.effects import surface_change
 from disco_hw.experiments.simulated_time import SimulatedRun, virtual_robot
 from disco_hw.log import records
@@ -26,6 +25,7 @@ from disco_hw.log.recorder import MemoryRecorder
 from disco_hw.runtime.assembly import make_planner
 from disco_hw.runtime.robot_setup import Setup
 from disco_hw.runtime.supervisor import UserRequest
+from disco_hw.tasks.circle import CircleTask, circle_task
 from sim.body_dynamics import Pose
 from sim.plant_parameters import PlantParameters
 

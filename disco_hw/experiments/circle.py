@@ -19,11 +19,11 @@ from disco_hw import config
 from disco_hw.control.disco import Disco
 from disco_hw.control.plan import PlannerState, SentCommand
 from disco_hw.control.settings import ROTATION, CommandLimits, DiscoSettings
-from disco_hw.control.tasks.circle import Circle
 from disco_hw.errors import InputError
 from disco_hw.experiments.plant import Plant
 from disco_hw.model import Model, Uniform
 from disco_hw.model.parameter import BASE_PARAMETERS
+from disco_hw.tasks.circle import CircleCost, CircleTask
 
 Array = NDArray[np.float64]
 Progress = Callable[[str], None]
@@ -65,7 +65,7 @@ class CircleResult:
     """Runs of each curve over the seeds, by name."""
 
     options: CircleOptions
-    circle: Circle
+    circle: CircleCost
     mode: str
     runs: dict[str, list[Run]]
 
@@ -124,7 +124,7 @@ class CircleResult:
 
         figure = Figure(figsize=(11.0, 5.0), layout="constrained")
         left, right = figure.subplots(1, 2)
-        picture = self.circle.picture()
+        picture = CircleTask().course().outline_m()
         right.plot(picture[:, 0], picture[:, 1], color="0.6", linestyle="--", label="circle")
         for name, runs in self.runs.items():
             mean = _running_mean(self.costs(name)).mean(axis=0)
@@ -149,7 +149,7 @@ def run_circle(
     base = {parameter.name for parameter in BASE_PARAMETERS}
     if model.belief is None or set(model.belief.names) != base:
         raise InputError("the model has no belief over wheel radius, axial distance and x_icr; name a file that does")
-    circle = Circle()
+    circle = CircleCost()
     task = circle.paper() if mode == "paper" else circle
     settings = DiscoSettings.paper() if mode == "paper" else DiscoSettings()
     runs: dict[str, list[Run]] = {}
@@ -188,7 +188,9 @@ def _knowing(name: str, model: Model, theta: dict[str, float]) -> Model:
             return bare.with_point(theta)
 
 
-def planner_command(model: Model, task: Circle, settings: DiscoSettings, options: CircleOptions, seed: int) -> Command:
+def planner_command(
+    model: Model, task: CircleCost, settings: DiscoSettings, options: CircleOptions, seed: int
+) -> Command:
     """DISCO as a function from time (ns) and state to wheel speeds."""
     limits = CommandLimits(options.largest_rot_s * ROTATION, options.largest_rot_s2 * ROTATION)
     planner = Disco(model, task, settings, limits, seed)
@@ -197,7 +199,7 @@ def planner_command(model: Model, task: Circle, settings: DiscoSettings, options
 
 def drive(command: Command, theta: dict[str, float], options: CircleOptions, seed: int) -> Run:
     """Drive a plant with these parameters by a controller for the whole duration."""
-    circle, period_s = Circle(), 1.0 / options.rate_hz
+    circle, period_s = CircleCost(), 1.0 / options.rate_hz
     plant = Plant(theta, (circle.radius_m, 0.0, math.pi / 2), options.lag_s, options.wheel_noise, seed)
     count = round(options.duration_s * options.rate_hz)
     poses, speeds, commands = np.empty((count, 3)), np.empty(count), np.empty((count, 2))

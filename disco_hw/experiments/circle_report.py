@@ -12,7 +12,6 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from rich.table import Table
 
-from disco_hw.config import CircleTask
 from disco_hw.errors import WorkError
 from disco_hw.experiments.metrics import (
     Array,
@@ -24,6 +23,7 @@ from disco_hw.experiments.metrics import (
 )
 from disco_hw.log.reader import Log, open_log
 from disco_hw.log.records import Counters
+from disco_hw.tasks.circle import CircleTask
 
 PERCENTILES = (50.0, 99.0, 99.9, 100.0)
 _COMPLETED_TOLERANCE_LAPS = 0.02

@@ -22,11 +22,12 @@ from rich.live import Live
 from rich.progress import BarColumn, Progress, TextColumn
 
 import disco_hw
-from disco_hw.config import circle_task, load_robot_config
+from disco_hw.config import load_robot_config
 from disco_hw.daemon.realtime import stolen_ms
 from disco_hw.errors import InputError, WorkError
 from disco_hw.experiments.circle_report import CircleReport, load_circle_report
 from disco_hw.experiments.live_stack import Operator, disco_hw_process, stands
+from disco_hw.tasks.circle import circle_task
 from disco_hw.viewer.address import DEFAULT_PORT, LOOPBACK, TOKEN_VARIABLE, page_address, page_token
 
 _START_TIMEOUT_S = 90.0

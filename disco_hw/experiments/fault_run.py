@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 
 import disco_hw
-from disco_hw.config import RobotConfig, circle_task
-from disco_hw.control import NoValidControl, PlannerState, Rollouts, Task, WheelPlan
+from disco_hw.config import RobotConfig
+from disco_hw.control import NoValidControl, PlannerState, Rollouts, WheelPlan
 from disco_hw.control.plan import Diagnostics
 from disco_hw.daemon.loop import LoopStats
 from disco_hw.daemon.status import counters
@@ -29,6 +29,8 @@ from disco_hw.runtime.pipeline import Planner
 from disco_hw.runtime.robot_setup import load_setup
 from disco_hw.runtime.states import State
 from disco_hw.runtime.supervisor import UserRequest
+from disco_hw.tasks import PlannedTask
+from disco_hw.tasks.circle import circle_task
 from drivers.reference import ReferenceDriver
 from drivers.types import RobotLinkHealth, RobotStatus
 from firmware_protocol.codec import Codec
@@ -101,7 +103,7 @@ class CirclingPlanner:
     def reset(self) -> None:
         """Nothing is kept from plan to plan."""
 
-    def set_task(self, task: Task) -> None:
+    def set_task(self, task: PlannedTask) -> None:
         """The circle stays as it is."""
 
     def set_belief(self, belief: Belief) -> None:

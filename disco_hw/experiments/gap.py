@@ -16,8 +16,6 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from disco_hw.config import CircleTask, circle_task
-from disco_hw.course import course_of
 from disco_hw.drive.coverage import Coverage
 from disco_hw.drive.hand_pilot import HandPilot
 from disco_hw.drive.script import ScriptSource, Unattended
@@ -35,6 +33,7 @@ from disco_hw.outputs import as_json, refuse_directory
 from disco_hw.runtime.assembly import make_planner
 from disco_hw.runtime.pipeline import NoPlanner
 from disco_hw.runtime.robot_setup import Setup, load_setup
+from disco_hw.tasks.circle import CircleTask, circle_task
 from sim.body_dynamics import Pose
 from sim.effects import HiddenEffectError, parse_hidden_effects
 from sim.in_process import RobotInProcess
@@ -191,7 +190,7 @@ def without_effects(amended: Model, given: Model) -> Model:
 
 def _robot(setup: Setup, options: GapExperimentOptions, hidden: Mapping[str, tuple[float, ...]]) -> RobotInProcess:
     parameters = true_parameters(setup, options.plant_seed)
-    start = Pose(*course_of(setup.config.task).start)
+    start = Pose(*setup.config.task.course().start)
     return virtual_robot(setup, parameters, start, effects=hidden, seed=options.seed)
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.config import CircleTask
+from disco_hw.tasks.circle import CircleTask
 
 Array = NDArray[np.float64]
 

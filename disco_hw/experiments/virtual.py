@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from disco_hw.config.input_file import FAULTS_TOML, read_toml
-from disco_hw.course import course_of
 from disco_hw.errors import InputError
 from disco_hw.runtime.robot_setup import Setup, geometry, link_key, load_setup
 from firmware_protocol.firmware_core import FirmwareConfig
@@ -53,7 +52,7 @@ def run_sim(options: SimOptions) -> int:
     if options.start is not None and not all(map(math.isfinite, options.start)):
         raise InputError(f"--start: {' '.join(map(str, options.start))} is no place; write finite numbers")
     ticks_per_rev = _whole_ticks(setup)
-    x_m, y_m, yaw_rad = options.start or course_of(config.task).start
+    x_m, y_m, yaw_rad = options.start or config.task.course().start
     plant, key = true_parameters(setup, options.plant_seed), link_key(setup)
     print(
         f"true wheel radius {plant.wheel_radius_m:.4f} m, axial distance {plant.axial_distance_m:.4f} m, "

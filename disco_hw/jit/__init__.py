@@ -81,7 +81,7 @@ def sources_fingerprint() -> str:
     """Hash of all Python sources that compiled code can come from."""
     package = Path(__file__).parents[1]
     digest = hashlib.sha256()
-    for folder in ("jit", "effects", "model", "control"):
+    for folder in ("jit", "effects", "model", "tasks", "control"):
         for path in sorted((package / folder).rglob("*.py")):
             digest.update(path.read_bytes())
     for path in plugin_sources():

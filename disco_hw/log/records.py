@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from math import nan
+from math import isfinite, nan
 from types import MappingProxyType
 from typing import Literal
 
@@ -214,17 +214,25 @@ class Fan(msgspec.Struct, frozen=True, gc=False):
 
 
 class Task(msgspec.Struct, frozen=True, gc=False):
-    """The task from `t_ns` on, where it is another than robot.toml's: a circle, counter-clockwise, m and m/s.
+    """The task from `t_ns` on, where it is another than robot.toml's: its kind, and what a person can change of it.
 
-    `kind` "path": robot.toml's path at another speed; the circle's fields are NaN.
+    `settings`: fields of [task] in robot.toml, m and m/s. The last four are how logs were written before those.
     """
 
     t_ns: int
-    center_x_m: float
-    center_y_m: float
-    radius_m: float
-    speed_m_s: float
-    kind: str = "circle"
+    kind: str = ""
+    settings: dict[str, float] = {}
+    center_x_m: float = nan
+    center_y_m: float = nan
+    radius_m: float = nan
+    speed_m_s: float = nan
+
+    def values(self) -> dict[str, float]:
+        """The settings, of old and new logs."""
+        old = (self.center_x_m, self.center_y_m, self.radius_m, self.speed_m_s)
+        names = ("center_x_m", "center_y_m", "radius_m", "speed_m_s")
+        kept = {name: value for name, value in zip(names, old, strict=True) if isfinite(value)}
+        return kept | self.settings
 
 
 Record = (

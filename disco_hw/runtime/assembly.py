@@ -34,7 +34,7 @@ _REHEARSALS = 5
 
 def make_planner(config: RobotConfig, model: Model) -> control.Disco:
     """DISCO for this robot's task, compiled and warmed up: takes seconds."""
-    task = control.task_of_robot(config.task, config.control.mode)
+    task = config.task.planned(config.control.mode)
     planner = control.Disco(
         model,
         task,

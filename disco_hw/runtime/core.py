@@ -10,17 +10,15 @@ from collections.abc import Callable, Sequence
 import msgspec
 
 from disco_hw.adaptation.adaptation import Adaptation, NoAdaptation
-from disco_hw.config import RobotConfig, RobotTask
-from disco_hw.control import task_of_robot
-from disco_hw.course import course_of
+from disco_hw.config import RobotConfig
 from disco_hw.log import records
 from disco_hw.log.recorder import Recorder
 from disco_hw.runtime import records_of_tick
 from disco_hw.runtime.pipeline import FollowTask, Motion, Off, Pipeline, Stand, Tick, untimed
 from disco_hw.runtime.plausibility import Plausibility
-from disco_hw.runtime.progress import progress_of
 from disco_hw.runtime.supervisor import Inputs, Output, Reply, Supervisor, UserRequest
 from disco_hw.runtime.task_change import record_of
+from disco_hw.tasks import RobotTask
 from drivers.types import (
     Capabilities,
     Driver,
@@ -76,8 +74,8 @@ class DaemonCore:
         self.recorder = recorder
         self.adaptation = adaptation or NoAdaptation()
         self.plausibility = Plausibility()
-        self.task, self.course = config.task, course_of(config.task)
-        self.progress = progress_of(config.task)
+        self.task, self.course = config.task, config.task.course()
+        self.progress = config.task.progress()
         self.newest_wheels: WheelSample | None = None
         self.robot_status: RobotStatus | None = None
         self.last: CoreTick | None = None
@@ -96,9 +94,9 @@ class DaemonCore:
         self._task_changed = False
 
     def set_task(self, task: RobotTask) -> None:
-        """Follow another circle, or the path at another speed, from the next tick on, in which it is recorded."""
-        self.task, self.course, self.progress = task, course_of(task), progress_of(task)
-        self.pipeline.set_task(task_of_robot(task, self.config.control.mode))
+        """Follow another task of the same kind from the next tick on, in which it is recorded."""
+        self.task, self.course, self.progress = task, task.course(), task.progress()
+        self.pipeline.set_task(task.planned(self.config.control.mode))
         self._task_changed = True
 
     def tick(
@@ -240,7 +238,7 @@ class DaemonCore:
 
     def _follow_progress(self, output: Output, result: Tick) -> None:
         if output.running:
-            self.progress.add(result.t_ns, result.estimate.x_m, result.estimate.y_m)
+            self.progress.add(result.t_ns, result.estimate.x_m, result.estimate.y_m, result.estimate.yaw_rad)
         else:
             self.progress.pause()
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from disco_hw.config import CircleTask, load_robot_config
+from disco_hw.config import load_robot_config
 from disco_hw.config.input_file import MODEL_TOML as MODEL_KIND
 from disco_hw.config.input_file import ROBOT_TOML as ROBOT_KIND
 from disco_hw.config.input_file import WAY_POINTS
@@ -43,7 +43,7 @@ def setup_of_log(log: Log, remedy: str) -> Setup:
             config = load_robot_config(files[ROBOT_TOML])
             if config.model.file is not None and MODEL_TOML not in names:
                 raise InputError(f"{log.path}: carries no {MODEL_TOML}, which its {ROBOT_TOML} names; {remedy}")
-            if not isinstance(config.task, CircleTask) and PATH_CSV not in names:
+            if config.task.file is not None and PATH_CSV not in names:
                 raise InputError(f"{log.path}: carries no {PATH_CSV}, which its {ROBOT_TOML} names; {remedy}")
             return load_setup(files[ROBOT_TOML], files.get(MODEL_TOML), path_file=files.get(PATH_CSV))
         except InputError as error:

@@ -13,10 +13,11 @@ from typing import Protocol
 
 import msgspec
 
-from disco_hw.control import NoValidControl, PlannerState, Rollouts, SentCommand, Task, WheelPlan
+from disco_hw.control import NoValidControl, PlannerState, Rollouts, SentCommand, WheelPlan
 from disco_hw.estimation import Estimate, OdometryParameters, PoseFusion, PoseUpdate
 from disco_hw.model import Belief
 from disco_hw.runtime.governor import Governed, Governor
+from disco_hw.tasks import PlannedTask
 from drivers.types import Readings
 
 HISTORY_NS = 2_000_000_000
@@ -31,7 +32,7 @@ class Planner(Protocol):
     def reset(self) -> None:
         """Forget the last plan, as at a new start."""
 
-    def set_task(self, task: Task) -> None:
+    def set_task(self, task: PlannedTask) -> None:
         """Plan for another task of the same kind from the next reset on."""
 
     def set_belief(self, belief: Belief) -> None:
@@ -51,7 +52,7 @@ class NoPlanner:
     def reset(self) -> None:
         """Nothing is kept."""
 
-    def set_task(self, _task: Task) -> None:
+    def set_task(self, _task: PlannedTask) -> None:
         """A person decides."""
 
     def set_belief(self, _belief: Belief) -> None:
@@ -144,7 +145,7 @@ class Pipeline:
         """The estimator, for its counters."""
         return self._fusion
 
-    def set_task(self, task: Task) -> None:
+    def set_task(self, task: PlannedTask) -> None:
         """Follow another task of the same kind; what is planned for the present one is dropped."""
         self._planner.set_task(task)
         self._plan, self._following = None, False

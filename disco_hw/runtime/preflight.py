@@ -8,9 +8,9 @@ import statistics
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from disco_hw.config import Control, Link, Robot, RobotTask
+from disco_hw.config import Control, Link, Robot
 from disco_hw.runtime.link_load import can_load, cyclic_frames, serial_load
-from disco_hw.runtime.task_change import fastest_m_s, in_words, too_fast
+from disco_hw.tasks import RobotTask
 from drivers.limits import check_limits
 from drivers.types import Capabilities
 
@@ -76,10 +76,10 @@ def check_firmware_limits(robot: Robot, capabilities: Capabilities) -> list[Chec
 
 def check_task(robot: Robot, task: RobotTask) -> Check:
     """Compare the task's speed with what the nominal robot's wheels can do on it."""
-    refusal = too_fast(robot, task)
+    refusal = task.too_fast(robot)
     if refusal is not None:
         return Check("task", Level.FAIL, f"task.speed_m_s: {refusal}")
-    return Check("task", Level.OK, f"{in_words(task)}; the wheels can do {fastest_m_s(robot, task):.2f} m/s on it")
+    return Check("task", Level.OK, f"{task.in_words()}; the wheels can do {task.fastest_m_s(robot):.2f} m/s on it")
 
 
 def check_command_timing(control: Control, capabilities: Capabilities) -> Check:

@@ -13,7 +13,6 @@ from typing import Any
 import msgspec
 
 from disco_hw.adaptation.guard import geometry_of
-from disco_hw.control import task_of_robot
 from disco_hw.errors import InputError
 from disco_hw.log.reader import Entry, open_log
 from disco_hw.log.records import BeliefChange, Command, Estimate, Innovation, Plan, Record, Task
@@ -99,7 +98,7 @@ def replay(path: Path, tolerance: float = 0.0) -> ReplayReport:
         for tick, entries in groupby(log.records(_TOPICS), key=lambda entry: entry.tick):
             recorded = list(entries)
             for task in (entry.record for entry in recorded if isinstance(entry.record, Task)):
-                pipeline.set_task(task_of_robot(task_of(task, setup.config.task), setup.config.control.mode))
+                pipeline.set_task(task_of(task, setup.config.task).planned(setup.config.control.mode))
             for change in (entry.record for entry in recorded if isinstance(entry.record, BeliefChange)):
                 put_in_force(pipeline, setup.model, geometry_of(change))
             outcome = _replay_tick(pipeline, recorded)

@@ -1,4 +1,4 @@
-"""The files of one robot, read and checked together: robot.toml, the model and the path that it names."""
+"""The files of one robot, read and checked together: robot.toml, the model and the task's file that it names."""
 
 from __future__ import annotations
 
@@ -7,12 +7,11 @@ from pathlib import Path
 
 import msgspec
 
-from disco_hw.config import CircleTask, PathTask, Point, Robot, RobotConfig, TimedPathTask, load_robot_config
+from disco_hw.config import RobotConfig, load_robot_config
 from disco_hw.config.input_file import KEY, read_bytes
 from disco_hw.config.link_option import link_fields
 from disco_hw.errors import InputError
 from disco_hw.model import Model, load_model
-from disco_hw.waypoints import Waypoints, way_points_to_follow, way_points_to_meet
 from drivers.key_file import KeyFileError, key_of_file
 
 Matrix3 = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
@@ -30,18 +29,17 @@ class Setup:
 
 
 def load_setup(robot: Path, model: Path | None = None, link: str | None = None, path_file: Path | None = None) -> Setup:
-    """Read robot.toml, the model and the task's path; the other arguments override what robot.toml says.
+    """Read robot.toml, the model and the task's file; the other arguments override what robot.toml says.
 
-    A `path_file` that is given was driven before, and is not judged for hairpins. Raises InputError.
+    A `path_file` that is given was driven before, and is not judged for what the robot cannot get past. Raises
+    InputError.
     """
     config = load_robot_config(robot)
-    if isinstance(config.task, CircleTask):
+    if config.task.file is None:
         path_file = None
     else:
-        task = config.task
-        task = _with_way_points(task, path_file or robot.parent / task.path, config.robot, path_file is None)
-        path_file = path_file or robot.parent / task.path
-        config = msgspec.structs.replace(config, task=task)
+        judged, path_file = path_file is None, path_file or robot.parent / config.task.file
+        config = msgspec.structs.replace(config, task=config.task.with_file(path_file, config.robot, judged))
     if link is not None:
         config = msgspec.structs.replace(config, link=msgspec.structs.replace(config.link, **link_fields(link)))
     model_file = model
@@ -49,27 +47,6 @@ def load_setup(robot: Path, model: Path | None = None, link: str | None = None, 
         model_file = robot.parent / config.model.file
     loaded = Model.nominal(config.robot, config.prior) if model_file is None else load_model(model_file)
     return Setup(robot, model_file, path_file, config, loaded)
-
-
-def _with_way_points(
-    task: PathTask | TimedPathTask, path_file: Path, robot: Robot, judged: bool
-) -> PathTask | TimedPathTask:
-    """The task with the way-points of a CSV; raises InputError naming file, line and remedy."""
-    if isinstance(task, PathTask):
-        followed = way_points_to_follow(path_file)
-        if judged:
-            # Loaded for paths alone: it brings the planner with it.
-            from disco_hw.hairpins import refuse_hairpins  # noqa: PLC0415
-
-            refuse_hairpins(path_file, followed)
-        return msgspec.structs.replace(task, points=_points(followed))
-    found = way_points_to_meet(path_file, robot.max_wheel_speed_rad_s * robot.wheel_radius_m)
-    assert found.times_s is not None, "they are refused without"
-    return msgspec.structs.replace(task, points=_points(found), times_s=tuple(found.times_s.tolist()))
-
-
-def _points(waypoints: Waypoints) -> tuple[Point, ...]:
-    return tuple((float(x), float(y)) for x, y in waypoints.places_m.tolist())
 
 
 def refuse_missing_effects(setup: Setup) -> None:

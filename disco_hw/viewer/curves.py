@@ -7,10 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.config import RobotTask, TimedPathTask
-from disco_hw.course import course_of
 from disco_hw.model import Model
 from disco_hw.model.belief import Belief, Gaussian, Mixture, Uniform
+from disco_hw.tasks import RobotTask
 from disco_hw.viewer.timeline import COMMAND, ESTIMATE, INNOVATION, PLANNER, WHEELS, Series, Timeline
 
 Array = NDArray[np.float64]
@@ -30,15 +29,15 @@ class Curves:
 def distance(task: RobotTask, timeline: Timeline, first_ns: int, last_ns: int) -> Curves:
     """Distance to the task's line (m), positive to the right of it: outside of a circle."""
     t_s, rows = _window(timeline, timeline.estimate, first_ns, last_ns)
-    away = course_of(task).off_m(rows[:, :2])
+    away = task.course().off_m(rows[:, :2])
     away[rows[:, ESTIMATE.index("pose_healthy")] == 0.0] = np.nan
     return Curves(t_s, {"distance (m)": away})
 
 
 def speed(task: RobotTask, timeline: Timeline, first_ns: int, last_ns: int) -> Curves:
-    """Estimated speed against the task's (m/s); way-points by time have no one speed."""
+    """Estimated speed against the task's (m/s); NaN for a task without one speed."""
     t_s, rows = _window(timeline, timeline.estimate, first_ns, last_ns)
-    reference = np.full(len(t_s), np.nan if isinstance(task, TimedPathTask) else task.speed_m_s)
+    reference = np.full(len(t_s), task.reference_speed_m_s)
     return Curves(t_s, {"speed (m/s)": rows[:, ESTIMATE.index("speed_m_s")], "reference": reference})
 
 

@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable
 from pathlib import Path
 
-from disco_hw.course import course_of
 from disco_hw.errors import InputError
 from disco_hw.viewer.recording import Recording
 from disco_hw.viewer.scene import Scene
@@ -44,6 +43,6 @@ def export_html(recording: Recording, path: Path, progress: Progress) -> None:
 
 
 def _clock_place(recording: Recording) -> tuple[float, float, float]:
-    course = course_of(recording.stage.task)
+    course = recording.stage.task.course()
     x_m, y_m = course.middle_m
     return (x_m, y_m + 1.2 * course.reach_m, 0.2)

@@ -9,11 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from disco_hw.config import RobotTask
-from disco_hw.course import course_of
-from disco_hw.daemon.client import progress, recording_in_words
+from disco_hw.daemon.client import recording_in_words
 from disco_hw.runtime.pipeline import Source
 from disco_hw.runtime.situation import fault_sentence, headline, in_words
+from disco_hw.tasks import RobotTask
 from disco_hw.viewer.snapshot import Snapshot
 
 _NO_NUMBER = "—"
@@ -52,7 +51,7 @@ def _status_rows(status: Mapping[str, Any]) -> Rows:
         ("link", link),
         ("frames", f"{transport['frames_received']} in, {transport['frames_sent']} out"),
         ("rejected, lost", f"{rejected + transport['malformed']}, {driver['lost_frames']}"),
-        progress(task),
+        tuple(task["progress"]),
         ("distance", f"{number(task['distance_m'] * 1e3, 0)} mm"),
         ("loop late p99, max", f"{number(loop['lateness_us']['p99'], 0)}, {number(loop['lateness_us']['max'], 0)} us"),
         ("overruns, skipped", f"{loop['overruns']}, {loop['skipped']}"),
@@ -90,7 +89,7 @@ def replay_text(snapshot: Snapshot, first_ns: int, task: RobotTask) -> str:
         ("overruns, skipped", f"{snapshot.overruns}, {snapshot.skipped}"),
     ]
     if snapshot.pose is not None:
-        off_m = course_of(task).off_m(np.array([snapshot.pose[:2]]))[0]
+        off_m = task.course().off_m(np.array([snapshot.pose[:2]]))[0]
         rows.append(("distance", f"{number(off_m * 1e3, 0)} mm"))
     rows += [*health_rows(snapshot), *motion_rows(snapshot)]
     return "\n".join([*lines, _table(rows)])

@@ -15,7 +15,6 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from disco_hw.course import course_of
 from disco_hw.errors import InputError
 from disco_hw.viewer import curves, scene, shapes
 from disco_hw.viewer.curves import Curves
@@ -115,7 +114,7 @@ def _draw(figure: Figure, recording: Recording, t_s: float) -> None:
     top.set_title(f"{stage.name}, {(snapshot.t_ns - recording.first_ns) * 1e-9:.2f} s", loc="left")
     task = stage.task_at(snapshot.task)
     cuts: tuple[tuple[str, Callable[[Timeline, int, int], Curves]], ...] = (
-        (f"distance to the {course_of(task).noun} (m)", partial(curves.distance, task)),
+        (f"distance to the {task.course().noun} (m)", partial(curves.distance, task)),
         ("speed (m/s)", partial(curves.speed, task)),
         ("wheels (rad/s)", curves.wheels),
     )
@@ -132,7 +131,7 @@ def _draw(figure: Figure, recording: Recording, t_s: float) -> None:
 
 
 def _draw_scene(axes: Axes, snapshot: Snapshot, stage: Stage) -> None:
-    course = course_of(stage.task_at(snapshot.task))
+    course = stage.task_at(snapshot.task).course()
     axes.plot(*course.outline_m().T, color=_web(scene.TASK_COLOUR), linewidth=2.5)
     trail = snapshot.trail
     if len(trail) >= 2:

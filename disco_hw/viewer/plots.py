@@ -9,10 +9,9 @@ from functools import partial
 import numpy as np
 import viser
 
-from disco_hw.config import CircleTask, RobotTask
-from disco_hw.course import course_of
 from disco_hw.log.records import BeliefChange
 from disco_hw.model import Model
+from disco_hw.tasks import RobotTask, default_task
 from disco_hw.viewer import curves
 from disco_hw.viewer.curves import Curves
 from disco_hw.viewer.stage import Stage, model_in_force
@@ -40,7 +39,7 @@ class Plots:
         self._marginals: dict[str, viser.GuiUplotHandle] = {}
         self._belief: BeliefChange | None = None
         with gui.add_folder("Plots"):
-            self._add(gui, f"Distance to the {course_of(stage.task).noun} (m)", curves.distance)
+            self._add(gui, f"Distance to the {stage.task.course().noun} (m)", curves.distance)
             self._add(gui, "Speed (m/s)", curves.speed)
             self._add(gui, "Wheels (rad/s)", _any_task(curves.wheels))
             self._add(gui, "Planner", _any_task(curves.planner), ("temperature",))
@@ -71,7 +70,7 @@ class Plots:
                 handle.data = _columns(density)
 
     def _add(self, gui: viser.GuiApi, title: str, cut: Cut, right: tuple[str, ...] = ()) -> None:
-        empty = cut(CircleTask(), Timeline(), 0, 0)
+        empty = cut(default_task(), Timeline(), 0, 0)
         blank = Curves(np.array((0.0, 1.0)), {name: np.zeros(2) for name in empty.values})
         self._plots.append(_Plot(_add_uplot(gui, title, blank, right), cut))
 

@@ -8,9 +8,8 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from disco_hw.config import RobotTask
-from disco_hw.course import course_of
 from disco_hw.log import records
+from disco_hw.tasks import RobotTask
 from disco_hw.viewer import shapes
 from disco_hw.viewer.snapshot import Snapshot
 from disco_hw.viewer.stage import Stage, model_in_force
@@ -51,7 +50,7 @@ _WHEEL_PARTS = (("front", 0.5), ("rear", -0.5))
 
 def first_camera(task: RobotTask) -> tuple[Point, Point]:
     """Where the page's camera is at first, and what it looks at: all of the task, from the south and above."""
-    course = course_of(task)
+    course = task.course()
     (x_m, y_m), away = course.middle_m, 0.8 + 1.1 * course.reach_m
     return (x_m - 0.35 * away, y_m - 0.9 * away, 1.25 * away), (x_m, y_m, 0.0)
 
@@ -119,7 +118,7 @@ class Scene:
 
     def _add_ground(self) -> None:
         task, scene = self._stage.task, self._server.scene
-        course = course_of(task)
+        course = task.course()
         size_m = max(4.0, 2.0 * math.ceil(1.5 * course.reach_m + 1.0))
         scene.set_up_direction("+z")
         scene.add_grid(
@@ -217,7 +216,7 @@ class Scene:
         trail = snapshot.trail
         visible = self.layers["trail"] and len(trail) >= 2
         if visible:
-            off_m = course_of(self._stage.task_at(snapshot.task)).off_m(trail)
+            off_m = self._stage.task_at(snapshot.task).course().off_m(trail)
             colours = shapes.distance_colours(off_m, TRAIL_FULL_M)
             points = shapes.segments(trail, 4.0 * _GROUND_M)
             self._trail.points = points.astype(np.float32)
@@ -255,7 +254,7 @@ class Scene:
 
 
 def _line(task: RobotTask) -> Array:
-    return shapes.segments(course_of(task).outline_m(), _GROUND_M)
+    return shapes.segments(task.course().outline_m(), _GROUND_M)
 
 
 def _pose_marks(poses: Array) -> Array:

@@ -6,13 +6,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from disco_hw.adaptation.guard import geometry_of, with_geometry
-from disco_hw.config import RobotTask
 from disco_hw.log.reader import Log
 from disco_hw.log.records import BeliefChange, Task
 from disco_hw.model import Model
 from disco_hw.runtime.log_setup import setup_of_log
 from disco_hw.runtime.robot_setup import Setup, geometry, load_setup
 from disco_hw.runtime.task_change import task_of
+from disco_hw.tasks import RobotTask
 
 
 @dataclass(frozen=True, slots=True)

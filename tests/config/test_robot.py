@@ -6,8 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from disco_hw.config import PathTask, Prior, TimedPathTask, circle_task, load_robot_config
+from disco_hw.config import Prior, load_robot_config
 from disco_hw.errors import InputError
+from disco_hw.tasks import kinds, task_class
+from disco_hw.tasks.circle import circle_task
+from disco_hw.tasks.path import PathTask
+from disco_hw.tasks.timed_path import TimedPathTask
 
 GOOD = """
 [robot]
@@ -130,12 +134,24 @@ def _fields_of(section: str) -> tuple[str, ...]:
 
     from disco_hw.config import RobotConfig
 
-    hint = typing.get_type_hints(RobotConfig)[section]
-    kinds = typing.get_args(hint) or (hint,)
-    # What is read from the path's file is no field.
-    return tuple(
-        dict.fromkeys(name for kind in kinds for name in kind.__struct_fields__ if name not in ("points", "times_s"))
-    )
+    if section == "task":
+        classes = [task_class(kind) for kind in kinds()]
+        # What is read from the task's file is no field.
+        return tuple({name for found in classes for name in found.__struct_fields__ if name not in found.read_fields})
+    return tuple(typing.get_type_hints(RobotConfig)[section].__struct_fields__)
+
+
+def test_every_kind_of_task_is_documented():
+    text = (Path(__file__).parents[2] / "docs" / "robot.md").read_text(encoding="utf-8")
+    for kind in kinds():
+        assert f'kind = "{kind}"' in text, kind
+
+
+def test_an_unknown_kind_of_task_gets_one_line_with_those_that_there_are(tmp_path):
+    with pytest.raises(
+        InputError, match=r"task.kind: 'spiral' is no kind of task; write one of circle, lemniscate, path"
+    ):
+        load(tmp_path, GOOD + '[task]\nkind = "spiral"\n')
 
 
 @pytest.mark.parametrize("kind", ["", 'kind = "path"\n'])

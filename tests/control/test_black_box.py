@@ -8,13 +8,15 @@ import numpy as np
 import pytest
 import torch
 
-from disco_hw.control import Circle, NoValidControl, Sampler, oracle, pendulum
+from disco_hw.control import NoValidControl, Sampler, oracle, pendulum
 from disco_hw.control.black_box import BlackBoxDisco
 from disco_hw.control.parameter_points import drawn_points, unscented_points
 from disco_hw.control.pendulum import PAPER_SAMPLER
-from disco_hw.control.torch_models import circle_cost, pendulum_cost, pendulum_transition, skid_steer_transition
+from disco_hw.experiments.torch_models import circle_cost, pendulum_cost, pendulum_transition, skid_steer_transition
 from disco_hw.model import load_model
 from disco_hw.model import plain as physics
+from disco_hw.tasks.circle import CircleCost
+from tests.tasks import costs
 
 MODEL = load_model(Path(__file__).parents[2] / "disco_hw/robots/wombot_model.toml")
 POINTS, WEIGHTS = unscented_points(MODEL, 1.0)
@@ -26,7 +28,7 @@ DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 
 def skid_steer(sampler=SAMPLER, theta=POINTS, weights=WEIGHTS, **options):
     return BlackBoxDisco(
-        skid_steer_transition(STEP_S), circle_cost(Circle()), theta[..., :3], weights, 2, sampler,
+        skid_steer_transition(STEP_S), circle_cost(CircleCost()), theta[..., :3], weights, 2, sampler,
         **{"largest": 8.0, "dtype": torch.float64} | options,
     )  # fmt: skip
 
@@ -43,7 +45,7 @@ def test_costs_are_those_of_the_reference(each):
     commands = np.random.default_rng(1).uniform(-6.0, 6.0, (K, T, 2))
     got = costs_of(skid_steer(theta=theta, weights=weights), commands)
     start, past = physics.State(*START[:3], 0.0, 0.0), np.zeros((1, 2))
-    cost = oracle.circle_cost(Circle().paper(), STEP_S)
+    cost = costs.circle_cost(CircleCost().paper(), STEP_S)
     for row, point in zip(got, theta, strict=True):
         named = physics.theta_of(MODEL.parameter_names, point)
         np.testing.assert_allclose(row, oracle.point_costs(named, start, commands, past, STEP_S, cost), atol=1e-9)

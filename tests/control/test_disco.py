@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from disco_hw.control import (
-    Circle,
     CommandLimits,
     Disco,
     DiscoSettings,
@@ -22,6 +21,7 @@ from disco_hw.control import (
 from disco_hw.control.kernel.replan import replan
 from disco_hw.experiments.plant import Plant
 from disco_hw.model import EffectSetting, Gaussian, load_model
+from disco_hw.tasks.circle import CircleCost
 
 MODEL = load_model(Path(__file__).parents[2] / "disco_hw/robots/wombot_model.toml")
 MEAN = {"wheel_radius_m": 0.061, "axial_distance_m": 0.415, "x_icr_m": 0.238}
@@ -31,7 +31,7 @@ PERIOD_NS = 100_000_000
 
 
 def planner(model=MODEL, task=None, seed=3, limits=LIMITS, **changes):
-    return Disco(model, task or Circle(), replace(DiscoSettings(), **changes), limits, seed)
+    return Disco(model, task or CircleCost(), replace(DiscoSettings(), **changes), limits, seed)
 
 
 def drive(disco, seconds, start=(0.75, 0.0, math.pi / 2), period_s=0.1, wheel_noise=0.0, lag_s=0.1):
@@ -84,7 +84,7 @@ def test_warming_up_changes_no_plan():
 
 
 def test_commands_stay_within_speed_and_acceleration():
-    disco = planner(task=Circle(speed_m_s=3.0), limits=CommandLimits(2.0, 1.0))
+    disco = planner(task=CircleCost(speed_m_s=3.0), limits=CommandLimits(2.0, 1.0))
     for t in range(20):
         plan = disco.plan(t * PERIOD_NS, TANGENT)
         assert np.abs(plan.wheel_speeds).max() <= 2.0 + 1e-5
@@ -93,7 +93,7 @@ def test_commands_stay_within_speed_and_acceleration():
 
 
 def test_the_first_command_is_tied_to_what_was_sent_and_to_the_measured_wheels():
-    disco = planner(task=Circle(speed_m_s=3.0), limits=CommandLimits(8.0, 5.0))
+    disco = planner(task=CircleCost(speed_m_s=3.0), limits=CommandLimits(8.0, 5.0))
     sent = (SentCommand(-PERIOD_NS, 4.0, 4.0),)
     rolling = disco.plan(0, msgspec.structs.replace(TANGENT, left_speed_rad_s=4.0, right_speed_rad_s=4.0, sent=sent))
     assert np.all(np.abs(rolling.wheel_speeds[0] - 4.0) <= 0.5 + 1e-5)
@@ -180,7 +180,7 @@ def test_own_draws_repeat_bit_for_bit():
 def test_paper_mode_stands_still_and_chatters_as_the_published_code_does():
     costs, changes = [], []
     for seed in range(1, 5):
-        disco = Disco(MODEL, Circle().paper(), DiscoSettings.paper(), CommandLimits(2.0 * math.pi), seed)
+        disco = Disco(MODEL, CircleCost().paper(), DiscoSettings.paper(), CommandLimits(2.0 * math.pi), seed)
         costs_of_drive, commands = drive(disco, 20.0, wheel_noise=0.05)
         costs.append(costs_of_drive[100:].mean())
         changes.append(np.abs(np.diff(commands, axis=0)).mean() / (2.0 * math.pi))

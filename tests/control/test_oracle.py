@@ -5,11 +5,12 @@ import math
 import numpy as np
 import pytest
 
-from disco_hw.control import Circle, oracle, pendulum
-from disco_hw.control.tasks.path import Path
-from disco_hw.control.tasks.timed_path import TimedPath
+from disco_hw.control import oracle, pendulum
 from disco_hw.model.plain import State
-from disco_hw.waypoints import Waypoints
+from disco_hw.tasks.circle import CircleCost
+from disco_hw.tasks.line.waypoints import Waypoints
+from disco_hw.tasks.timed_path import TimedPathCost
+from tests.tasks.costs import circle_cost, path_along, path_cost, timed_path_cost
 
 THETA = {"wheel_radius_m": 0.1, "axial_distance_m": 0.5, "x_icr_m": 0.0}
 
@@ -27,7 +28,7 @@ def test_control_cost():
 
 def test_straight_ahead_past_a_circle():
     start, commands = State(1.0, 0.0, 0.0, 0.0, 0.0), np.full((1, 2, 2), 2.0)
-    cost = oracle.circle_cost(Circle(radius_m=1.0).paper(), 0.5)
+    cost = circle_cost(CircleCost(radius_m=1.0).paper(), 0.5)
     expected = math.hypot(0.1, 0.0) + math.hypot(0.2, 0.0)
     got = oracle.point_costs(THETA, start, commands, np.zeros((1, 2)), 0.5, cost)
     assert got[0] == pytest.approx(expected)
@@ -53,8 +54,8 @@ def test_following_a_path_costs_nothing_and_standing_costs_the_speed():
     line = Waypoints(np.array([[0.0, 0.0], [2.0, 0.0]]), np.array([0.0, 10.0]))
     moving = 0.02 * np.arange(6)[:, None]
     still = np.zeros((6, 1))
-    by_length = oracle.path_cost(Path(line, 0.2), 0.0, 0.1)
-    by_time = oracle.timed_path_cost(TimedPath(line), 0.0, 0.1)
+    by_length = path_cost(path_along(line, 0.2), 0.0, 0.1)
+    by_time = timed_path_cost(TimedPathCost(line), 0.0, 0.1)
     for cost in (by_length, by_time):
         assert cost(moving, still, still, np.full((5, 1), 0.2))[0] == pytest.approx(0.0, abs=1e-9)
     # As dear as being STANDING_M beside it.
@@ -66,8 +67,8 @@ def test_going_backwards_costs_twice_the_speed_and_facing():
     line = Waypoints(np.array([[0.0, 0.0], [2.0, 0.0]]), np.array([0.0, 10.0]))
     moving, still = 0.02 * np.arange(6)[:, None], np.zeros((6, 1))
     back, across = np.full((6, 1), math.pi), np.full((6, 1), 0.5 * math.pi)
-    by_length = oracle.path_cost(Path(line, 0.2), 0.0, 0.1)
-    by_time = oracle.timed_path_cost(TimedPath(line), 0.0, 0.1)
+    by_length = path_cost(path_along(line, 0.2), 0.0, 0.1)
+    by_time = timed_path_cost(TimedPathCost(line), 0.0, 0.1)
     assert by_length(moving, still, back, np.full((5, 1), -0.2))[0] == pytest.approx(5 * (2 * 0.4 + 0.6))
     # Sideways, as in turning about a point ahead, is no progress, but not against the way.
     assert by_length(moving, still, across, still[1:])[0] == pytest.approx(5 * 0.4)
@@ -77,16 +78,16 @@ def test_going_backwards_costs_twice_the_speed_and_facing():
 def test_the_last_distance_of_a_path_counts_for_a_second_more():
     line = Waypoints(np.array([[0.0, 0.0], [2.0, 0.0]]))
     beside, still = np.full((6, 1), 0.3), np.zeros((6, 1))
-    cost = oracle.path_cost(Path(line, 0.2), 50.0, 0.1)
+    cost = path_cost(path_along(line, 0.2), 50.0, 0.1)
     expected = 5 * math.hypot(0.3, 0.4) + 10 * 0.3
     assert cost(np.ones((6, 1)), beside, still, still[1:])[0] == pytest.approx(expected)
 
 
 def test_a_place_does_not_leave_its_piece():
-    there_and_back = Path(Waypoints(np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 0.0]])), 0.2)
+    there_and_back = path_along(Waypoints(np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 0.0]])), 0.2)
     past = 0.98 + 0.02 * np.arange(6)[:, None]
     still = np.zeros((6, 1))
-    cost = oracle.path_cost(there_and_back, 49.0, 0.1)
+    cost = path_cost(there_and_back, 49.0, 0.1)
     # It is wanted to stop at the piece's end, so going on costs more and more: distance and, as a speed, all of it.
     got = cost(past, still, still, np.full((5, 1), 0.2))[0]
     beyond = 0.02 * np.arange(5)

@@ -10,10 +10,11 @@ from tests.effects.outside import ROOT, OutsidePackage, effect_of_the_page
 TURN_DROOP = Path(__file__).with_name("turn_droop.py").read_text(encoding="utf-8")
 
 POINTS_DIFFER = """
-from disco_hw.control import Circle, CommandLimits, Disco, DiscoSettings
+from disco_hw.tasks.circle import CircleCost
+from disco_hw.control import CommandLimits, Disco, DiscoSettings
 from tests.control.kernel.test_skid_steer import model_of
 for effects in ({"motor_lag": {"tau_s": 0.1}}, {"motor_lag": {"tau_s": 0.1}, "turn_droop": {"k_s": 0.8}}):
-    disco = Disco(model_of((0.06, 0.4, 0.1), effects), Circle(0.3, -0.2), DiscoSettings(), CommandLimits(8.0, 20.0))
+    disco = Disco(model_of((0.06, 0.4, 0.1), effects), CircleCost(0.3, -0.2), DiscoSettings(), CommandLimits(8.0, 20.0))
     print(disco._wheels_differ)
 """
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 import disco_hw
-from disco_hw.config import CircleTask
 from disco_hw.experiments.adapt import AdaptOptions, AdaptResult, AdaptRun, drive
 from disco_hw.log import records
 from disco_hw.log.recorder import MemoryRecorder
 from disco_hw.runtime.replay import replay
 from disco_hw.runtime.robot_setup import load_setup
+from disco_hw.tasks.circle import CircleTask
 from tests.runtime.test_replay import write_log
 
 pytestmark = pytest.mark.long

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from disco_hw.control import Circle
 from disco_hw.control.settings import ROTATION
 from disco_hw.errors import InputError
 from disco_hw.experiments.circle import CURVES, CircleOptions, CircleResult, Run, drive, plants, run_circle
 from disco_hw.model import Gaussian, load_model
+from disco_hw.tasks.circle import CircleCost
 
 MODEL = load_model(Path(__file__).parents[2] / "disco_hw/robots/wombot_model.toml")
 MEAN = {"wheel_radius_m": 0.061, "axial_distance_m": 0.415, "x_icr_m": 0.238}
@@ -28,19 +28,19 @@ def test_figures_of_runs_that_are_known():
     # One robot stands on the edge, c = s0; one 0.15 m inside it, c = hypot(0.15, 0.2); its left command saws.
     saw = np.column_stack([np.arange(40) % 2 * 0.1 * ROTATION, np.zeros(40)])
     runs = {"one": [standing((0.75, 0.0)), standing((0.0, 0.6), commands=saw)]}
-    result = CircleResult(CircleOptions(seeds=2, duration_s=4.0), Circle(), "default", runs)
+    result = CircleResult(CircleOptions(seeds=2, duration_s=4.0), CircleCost(), "default", runs)
     (row,) = result.rows()
     assert row["mean_cost"] == row["steady_cost"] == pytest.approx(0.225)
     assert row["std_over_seeds"] == pytest.approx(0.05 / math.sqrt(2.0))
     assert row["command_change_rot_s"] == pytest.approx(0.1 / 4.0)
-    fast = CircleResult(CircleOptions(seeds=2, rate_hz=20.0), Circle(), "default", runs)
+    fast = CircleResult(CircleOptions(seeds=2, rate_hz=20.0), CircleCost(), "default", runs)
     assert fast.rows()[0]["command_change_rot_s"] == pytest.approx(0.0)
 
 
 def test_only_the_last_half_is_steady():
     run = standing((0.75, 0.0))
     run.forward_m_s[20:] = 0.2
-    result = CircleResult(CircleOptions(seeds=1), Circle(), "default", {"one": [run]})
+    result = CircleResult(CircleOptions(seeds=1), CircleCost(), "default", {"one": [run]})
     (row,) = result.rows()
     assert (row["mean_cost"], row["steady_cost"]) == pytest.approx((0.1, 0.0))
     assert math.isnan(row["std_over_seeds"])
@@ -64,7 +64,7 @@ def test_a_robot_that_is_told_nothing_stands_at_the_cost_of_standing():
     np.testing.assert_array_equal(run.poses, np.tile([0.75, 0.0, math.pi / 2], (30, 1)))
     assert [now_ns for now_ns, _, _ in asked] == [t_ns for _, t_ns, _ in asked] == list(range(0, 3 * 10**9, 10**8))
     assert [count for _, _, count in asked] == [min(step, 20) for step in range(30)]
-    assert Circle().instant_cost(0.0, *run.poses[-1, :2], run.forward_m_s[-1]) == pytest.approx(0.2)
+    assert CircleCost().instant_cost(0.0, *run.poses[-1, :2], run.forward_m_s[-1]) == pytest.approx(0.2)
 
 
 @pytest.fixture(scope="module")

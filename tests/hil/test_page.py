@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from disco_hw.course import course_of
 from disco_hw.daemon.control_client import send_request
 from disco_hw.drive.source import INPUT_LIMIT_NS
 from disco_hw.experiments.live_stack import disco_hw_process, running_stack, stands
@@ -113,7 +112,7 @@ def assert_drawn(tab, stack, line=True, beside=(0.0, 0.0)):
         column, row = project(point, eye, look_at, canvas["width"], canvas["height"])
         return column + canvas["x"], row + canvas["y"]
 
-    outline = course_of(task).outline_m()
+    outline = task.course().outline_m()
     clear = outline[np.hypot(outline[:, 0] - x_m, outline[:, 1] - y_m) > 0.6]
     on_line = [place(x, y, 0.0) for x, y in clear[:: len(clear) // 5]] if line else []
 

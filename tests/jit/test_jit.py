@@ -14,11 +14,12 @@ PLANS = """
 from pathlib import Path
 
 import disco_hw
-from disco_hw.control import Circle, Disco, DiscoSettings, PlannerState, CommandLimits
+from disco_hw.tasks.circle import CircleCost
+from disco_hw.control import Disco, DiscoSettings, PlannerState, CommandLimits
 from disco_hw.model import load_model
 
 model = load_model(Path(disco_hw.__file__).parent / "robots" / "wombot_model.toml")
-disco = Disco(model, Circle(), DiscoSettings(), CommandLimits(6.4))
+disco = Disco(model, CircleCost(), DiscoSettings(), CommandLimits(6.4))
 for number in range(5):
     plan = disco.plan(number * 100_000_000, PlannerState(number * 100_000_000, 0.75, 0.02 * number, 1.5, 2.3, 4.2))
 print(disco.optimiser.work.point_costs.tobytes().hex(), plan.wheel_speeds.tobytes().hex())

@@ -10,7 +10,6 @@ import pytest
 from msgspec.structs import replace
 
 import disco_hw
-from disco_hw.config import CircleTask
 from disco_hw.control import NoValidControl
 from disco_hw.experiments.metrics import Path, circle_figures
 from disco_hw.log import records
@@ -19,6 +18,7 @@ from disco_hw.runtime.pipeline import NoPlanner, Source
 from disco_hw.runtime.robot_setup import load_setup
 from disco_hw.runtime.states import State
 from disco_hw.runtime.supervisor import UserRequest
+from disco_hw.tasks.circle import CircleTask
 from firmware_protocol.firmware_core import FirmwareConfig
 from sim.effects import hidden_effects
 from sim.plant import Plant

@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from disco_hw.config import PathTask
-from disco_hw.course import course_of
 from disco_hw.daemon.loop import LoopStats
 from disco_hw.daemon.status import loop_figures, status
 from disco_hw.log.link import Attachment
@@ -18,6 +16,7 @@ from disco_hw.runtime.replay import replay
 from disco_hw.runtime.robot_setup import load_setup
 from disco_hw.runtime.states import State
 from disco_hw.runtime.supervisor import UserRequest
+from disco_hw.tasks.path import PathTask
 from disco_hw.viewer.commands import snapshot_log
 from disco_hw.viewer.recording import Recording
 from sim.body_dynamics import Pose
@@ -39,7 +38,7 @@ def write_log(path, setup, ticks):
 
 def started(robot_file):
     setup = load_setup(robot_file)
-    stack = simulated_stack(robot_file=robot_file, start=Pose(*course_of(setup.config.task).start))
+    stack = simulated_stack(robot_file=robot_file, start=Pose(*setup.config.task.course().start))
     stack.run(1.5)
     stack.run(0.5, UserRequest.ARM)
     stack.run(0.02, UserRequest.START)
@@ -62,7 +61,7 @@ def test_the_shipped_eight_is_followed_once_round(tmp_path):
     setup, stack = started(path_robot(tmp_path))
     places, speeds = drive(stack, lambda: stack.core.progress.laps >= 1.0)
     assert stack.core.progress.laps >= 1.0
-    off_m = course_of(setup.config.task).off_m(places)
+    off_m = setup.config.task.course().off_m(places)
     assert np.sqrt(np.mean(off_m[100:] ** 2)) < 0.05
     assert np.abs(off_m).max() < 0.15
     assert speeds[100:].mean() == pytest.approx(0.3, abs=0.05)
@@ -79,7 +78,7 @@ def test_an_open_path_ends_with_the_robot_standing_and_is_replayed_and_shown_wit
     assert stack.core.last.pipeline.source is Source.HOLD
     assert abs(stack.robot.truth.left_speed_rad_s) < 0.05
     assert np.hypot(*(places[-1] - (1.2, 0.8))) < 0.12
-    assert np.abs(course_of(setup.config.task).off_m(places)).max() < 0.12
+    assert np.abs(setup.config.task.course().off_m(places)).max() < 0.12
     shown = status(stack.core, loop_figures(LoopStats()), RecorderStats())["task"]
     assert shown["laps"] == pytest.approx(1.0, abs=0.03)
     assert shown["length_m"] == pytest.approx(2.0)

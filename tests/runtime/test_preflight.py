@@ -1,7 +1,7 @@
 import msgspec
 import pytest
 
-from disco_hw.config import CircleTask, Control, Link, PathTask, Robot
+from disco_hw.config import Control, Link, Robot
 from disco_hw.runtime.preflight import (
     Check,
     Level,
@@ -13,7 +13,8 @@ from disco_hw.runtime.preflight import (
     check_task,
     failures,
 )
-from disco_hw.runtime.task_change import fastest_m_s
+from disco_hw.tasks.circle import CircleTask
+from disco_hw.tasks.path import PathTask
 from drivers.types import Capabilities
 from firmware_protocol.dbc import packaged_dbc
 
@@ -162,7 +163,7 @@ def test_only_failures_keep_the_robot_from_being_armed():
 def test_a_task_that_is_too_fast_for_the_wheels_fails(task):
     slow = msgspec.structs.replace(task, speed_m_s=0.1)
     assert check_task(robot(), slow).level is Level.OK
-    fastest = fastest_m_s(robot(), task)
+    fastest = task.fastest_m_s(robot())
     assert check_task(robot(), msgspec.structs.replace(task, speed_m_s=fastest)).level is Level.OK
     found = check_task(robot(), msgspec.structs.replace(task, speed_m_s=1.01 * fastest))
     assert found.level is Level.FAIL

@@ -7,31 +7,32 @@ import math
 import msgspec
 import pytest
 
-from disco_hw.config import CircleTask, PathTask, Robot, TimedPathTask
+from disco_hw.config import Robot
 from disco_hw.log import records
 from disco_hw.runtime.replay import replay
 from disco_hw.runtime.states import State
 from disco_hw.runtime.supervisor import UserRequest
 from disco_hw.runtime.task_change import (
-    CENTER_M,
-    RADIUS_M,
-    SLOWEST_M_S,
     TaskRefused,
     asked_of,
     changed_task,
-    fastest_m_s,
-    in_words,
     limits,
     record_of,
     task_of,
     told_task,
 )
+from disco_hw.tasks.circle import RADIUS_M, CircleTask
+from disco_hw.tasks.path import PathTask
+from disco_hw.tasks.task import CENTER_M, SLOWEST_M_S
+from disco_hw.tasks.timed_path import TimedPathTask
 from tests.runtime.simulated import simulated_stack
 from tests.runtime.test_replay import write_log
 
 ROBOT = Robot(
     name="r", wheel_radius_m=0.06, axial_distance_m=0.31, ticks_per_rev=2048, max_wheel_speed_rad_s=8.0
 )  # fmt: skip
+LINE = PathTask(path="line.csv", speed_m_s=0.2, points=((0.0, 0.0), (2.0, 0.0)))
+TIMED = TimedPathTask(path="line.csv", points=LINE.points, times_s=(0.0, 10.0))
 
 
 def test_the_fields_that_are_given_change_and_the_others_stay():
@@ -81,7 +82,7 @@ def test_the_limits_are_those_that_are_enforced():
 
 
 def test_at_the_fastest_speed_the_outer_wheel_is_at_its_limit():
-    speed, radius_m = fastest_m_s(ROBOT, CircleTask(radius_m=0.75)), 0.75
+    speed, radius_m = CircleTask(radius_m=0.75).fastest_m_s(ROBOT), 0.75
     outer_rad_s = speed / radius_m * (radius_m + 0.5 * ROBOT.axial_distance_m) / ROBOT.wheel_radius_m
     assert outer_rad_s == pytest.approx(ROBOT.max_wheel_speed_rad_s)
 
@@ -92,7 +93,23 @@ def test_a_record_tells_the_whole_task():
     assert record_of(7, task).t_ns == 7
 
 
-LINE = PathTask(path="line.csv", speed_m_s=0.2, points=((0.0, 0.0), (2.0, 0.0)))
+def test_a_record_tells_the_kind_and_what_can_be_changed():
+    assert record_of(7, CircleTask()).kind == "circle"
+    assert record_of(7, LINE) == records.Task(7, "path", {"speed_m_s": 0.2})
+    assert record_of(7, TIMED) == records.Task(7, "timed_path", {})
+
+
+def test_a_record_of_an_old_log_is_understood():
+    old = msgspec.json.decode(
+        b'{"t_ns":7,"center_x_m":1.0,"center_y_m":-2.0,"radius_m":0.5,"speed_m_s":0.1,"kind":"circle"}',
+        type=records.Task,
+    )
+    assert task_of(old, CircleTask()) == CircleTask(center_x_m=1.0, center_y_m=-2.0, radius_m=0.5, speed_m_s=0.1)
+    # Paths, and way-points by time, were both called paths.
+    path = '{"t_ns":7,"center_x_m":"NaN","center_y_m":"NaN","radius_m":"NaN","speed_m_s":0.1,"kind":"path"}'
+    old = msgspec.json.decode(path, type=records.Task, strict=False)
+    assert task_of(old, LINE) == msgspec.structs.replace(LINE, speed_m_s=0.1)
+    assert task_of(old, TIMED) == TIMED
 
 
 def test_of_a_path_only_the_speed_can_be_changed():
@@ -118,17 +135,14 @@ def test_a_status_and_a_record_tell_of_a_path_without_its_way_points():
     assert told_task(asked, CircleTask()) is None
     assert told_task(asked_of(CircleTask(radius_m=2.0)), LINE) == CircleTask(radius_m=2.0)
     assert task_of(record_of(7, other), LINE) == other
-    assert in_words(other) == "path line.csv of 2.00 m at 0.1 m/s"
-
-
-TIMED = TimedPathTask(path="line.csv", points=LINE.points, times_s=(0.0, 10.0))
+    assert other.in_words() == "path line.csv of 2.00 m at 0.1 m/s"
 
 
 def test_of_way_points_by_time_nothing_can_be_changed():
     with pytest.raises(TaskRefused, match="have times, which say all; change t_s in their CSV"):
         changed_task(TIMED, {"speed_m_s": 0.3}, ROBOT, State.READY)
     assert limits(ROBOT, TIMED) == {}
-    assert in_words(TIMED) == "path line.csv of 2.00 m in 10 s, at most 0.2 m/s"
+    assert TIMED.in_words() == "path line.csv of 2.00 m in 10 s, at most 0.2 m/s"
     assert told_task(asked_of(TIMED), TIMED) == TIMED
     assert told_task(asked_of(TIMED), msgspec.structs.replace(TIMED, times_s=(0.0, 11.0))) is None
     assert told_task(asked_of(TIMED), LINE) is None

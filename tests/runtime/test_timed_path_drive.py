@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from disco_hw.config import TimedPathTask
-from disco_hw.control import TimedPath
 from disco_hw.daemon.loop import LoopStats
 from disco_hw.daemon.status import loop_figures, status
 from disco_hw.log.recorder import RecorderStats
@@ -14,6 +12,7 @@ from disco_hw.runtime.pipeline import Source
 from disco_hw.runtime.replay import replay
 from disco_hw.runtime.states import State
 from disco_hw.runtime.supervisor import UserRequest
+from disco_hw.tasks.timed_path import TimedPathTask
 from disco_hw.viewer.recording import Recording
 from tests.runtime.path_robot import timed_path_robot
 from tests.runtime.test_path_drive import drive, started, write_log
@@ -29,7 +28,7 @@ def test_way_points_are_met_at_their_times_to_the_end_and_replayed_and_shown_wit
     robot_file = timed_path_robot(tmp_path, CSV)
     setup, stack = started(robot_file)
     assert isinstance(setup.config.task, TimedPathTask)
-    task = TimedPath.from_config(setup.config.task)
+    task = setup.config.task.planned("default")
     places, _ = drive(stack, lambda: not stack.core.last.output.running, 20.0)
     off_m = [task.instant_cost(0.02 * (k + 2), x_m, y_m, 0.0) for k, (x_m, y_m) in enumerate(places)]
     assert np.sqrt(np.mean(np.square(off_m))) < 0.06

@@ -4,10 +4,12 @@ import numpy as np
 import pytest
 import torch
 
-from disco_hw.control import Circle, DiscoSettings, PlannerState, oracle
+from disco_hw.control import DiscoSettings, PlannerState, oracle
 from disco_hw.control.parameter_points import unscented_points
 from disco_hw.model import load_model
 from disco_hw.model import plain as physics
+from disco_hw.tasks.circle import CircleCost
+from tests.tasks import costs
 from tools.bench_control import ROBOTS, beside_peer, torch_times_ms
 from tools.step_times import summary, times_ms, undisturbed
 
@@ -39,7 +41,7 @@ def test_calls_are_told_their_number_and_summed_up():
 
 def test_the_peer_rolls_the_same_model_and_cost():
     peers = pytest.importorskip("tools.control_peers", reason="pytorch_mppi comes with the extra [bench]")
-    settings, circle = DiscoSettings(), Circle().paper()
+    settings, circle = DiscoSettings(), CircleCost().paper()
     mppi = peers.circle_mppi(MODEL, circle, settings, 6.0)
     commands = np.random.default_rng(1).uniform(-6.0, 6.0, (3, settings.sampler.horizon, 2))
     state = peers.circle_state(7, PlannerState(0, 0.7, 0.1, 1.2, 0.0, 0.0)).expand(3, -1)
@@ -50,7 +52,7 @@ def test_the_peer_rolls_the_same_model_and_cost():
         total += mppi.running_cost(state, control)
     theta, weights = unscented_points(MODEL, settings.ut_alpha)
     start = physics.State(0.7, 0.1, 1.2, 0.0, 0.0)
-    cost = oracle.circle_cost(circle, settings.step_s)
+    cost = costs.circle_cost(circle, settings.step_s)
     expected = [
         oracle.point_costs(
             physics.theta_of(MODEL.parameter_names, point), start, commands, np.zeros((1, 2)), settings.step_s, cost

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from disco_hw.config import CircleTask
 from disco_hw.model import Gaussian, Mixture, Model, Uniform
+from disco_hw.tasks.circle import CircleTask
 from disco_hw.viewer import curves
 from tools.viewer_run import LEFT_RAD_S, PERIOD_NS, RIGHT_RAD_S, SPEED_M_S, START_NS
 

@@ -8,11 +8,11 @@ import pytest
 from msgspec.structs import replace
 
 from disco_hw.adaptation.link import NAMES
-from disco_hw.config import CircleTask
 from disco_hw.daemon.page_feed import ViewerFeed, feed_path
 from disco_hw.drive.coverage import Coverage
 from disco_hw.log import records
 from disco_hw.runtime.task_change import asked_of
+from disco_hw.tasks.circle import CircleTask
 from disco_hw.viewer.desk import Desk
 from disco_hw.viewer.live import KEEP_S, LivePage, _Due
 from disco_hw.viewer.panel import live_details
@@ -149,7 +149,18 @@ def test_a_belief_of_a_daemon_that_has_gone_is_not_the_next_ones(page):
 def test_a_task_on_the_feed_is_newer_than_a_status_from_before_it(page):
     live, _ = page
     live.take(ticks(0, 51))
-    live.take([(live.timeline.last_ns, records.Task(live.timeline.last_ns, 1.0, 0.0, 0.5, 0.1))])
+    live.take(
+        [
+            (
+                live.timeline.last_ns,
+                records.Task(
+                    live.timeline.last_ns,
+                    "circle",
+                    {"center_x_m": 1.0, "center_y_m": 0.0, "radius_m": 0.5, "speed_m_s": 0.1},
+                ),
+            )
+        ]
+    )
     live._learn_task(status_with(radius_m=0.75))
     assert live._snapshot().task.radius_m == 0.5
     live.take(ticks(51, 200))

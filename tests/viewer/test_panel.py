@@ -1,9 +1,9 @@
 import math
 from dataclasses import asdict
 
-from disco_hw.config import CircleTask
 from disco_hw.log import records
 from disco_hw.log.recorder import RecorderStats
+from disco_hw.tasks.circle import CircleTask
 from disco_hw.viewer.panel import (
     coverage_text,
     escaped,
@@ -23,7 +23,7 @@ RECORDED = RecorderStats(ticks=90, dropped_ticks=10, delivered_ticks=80, waiting
 STATUS = {
     "ok": True, "state": "ARMED", "detail": "running the task", "running": True, "estop": False, "link": "up",
     "link_error": None, "robot_state": "ARMED", "fault": "NONE", "stop_cause": "NONE",
-    "task": {"laps": 1.5, "distance_m": 0.012, "length_m": 4.7, "asked": {"kind": "circle"}},
+    "task": {"laps": 1.5, "distance_m": 0.012, "progress": ["laps", "1.50"]},
     "transport": {"frames_received": 10, "frames_sent": 4, "malformed": 1},
     "driver": {"rejected_crc": 2, "rejected_sequence": 3, "lost_frames": 5}, "recorder": asdict(RECORDED),
     "loop": {"lateness_us": {"p99": 100.4, "max": 900.0}, "overruns": 7, "skipped": 8},
@@ -116,7 +116,13 @@ def test_numbers_that_are_none_become_a_dash():
 
 
 def test_of_a_path_the_panel_tells_the_progress_and_the_side():
-    task = {"laps": 0.25, "distance_m": -0.012, "length_m": 8.0, "asked": {"kind": "path"}}
+    task = {
+        "laps": 0.25,
+        "distance_m": -0.012,
+        "length_m": 8.0,
+        "progress": ["progress", "2.00 of 8.00 m (25%)"],
+        "asked": {"kind": "path"},
+    }
     text = live_details({**STATUS, "task": task}, None, 0, None)
     assert "| progress | 2.00 of 8.00 m (25%) |" in text
     assert "| distance | -12 mm |" in text

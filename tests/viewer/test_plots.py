@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from disco_hw.config import CircleTask
+from disco_hw.tasks.circle import CircleTask
 from disco_hw.viewer.curves import Curves
 from disco_hw.viewer.plots import Plots, _columns
 from disco_hw.viewer.server import serving

@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from disco_hw.config import CircleTask
 from disco_hw.log import records
 from disco_hw.runtime.task_change import record_of
+from disco_hw.tasks.circle import CircleTask
 from disco_hw.viewer import scene as scene_module
 from disco_hw.viewer.scene import LAYERS, Scene, first_camera
 from disco_hw.viewer.server import serving

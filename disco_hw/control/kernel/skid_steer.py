@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from disco_hw.control.kernel.blocks import BLOCK, U
 from disco_hw.control.kernel.rollout import roll_block
-from disco_hw.control.tasks.terms import follow, has_memory, looks_up, row_of, stage_cost, table_of, terminal_cost
+from disco_hw.control.kernel.task_costs import follow, looks_up, row_of, stage_cost, terminal_cost
 from disco_hw.jit import (
     bits_of_float,
     block_function,
@@ -181,7 +181,7 @@ def _look_ups(looks: Any, state: Any, skip_mean: Any, ahead: Any, scaled: Any, t
     """Look up for a point and its twins; nothing without a table."""
     if looks is None:
         return
-    table = table_of(task)
+    table = task.table
     if skip_mean is None:
         _look_up(table, state, _OWN)
     if ahead is not None:
@@ -202,9 +202,9 @@ def _cost(state: Any, own: Any, b: Any, t: int, place: Any, task: Any, last: Any
         _found(looks_up(task), state, own, b),
     )  # fmt: skip
     state[own + _TOTAL + b] += cost
-    if has_memory(task):
+    if looks_up(task) is None:
         state[own + _MEMORY + b] = memory
-    if has_memory(task) or last is not None:
+    if looks_up(task) is None or last is not None:
         state[own + _X + b] = x
         state[own + _Y + b] = y
 

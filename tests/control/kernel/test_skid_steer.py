@@ -8,17 +8,19 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from disco_hw.control import Circle, CommandLimits, Disco, DiscoSettings, PlannerState, Sampler, SentCommand, oracle
+from disco_hw.control import CommandLimits, Disco, DiscoSettings, PlannerState, Sampler, SentCommand, oracle
 from disco_hw.control.command_history import command_history
 from disco_hw.control.kernel.blocks import BLOCK
 from disco_hw.control.parameter_points import unscented_points
 from disco_hw.control.spline import spline_basis
-from disco_hw.control.tasks.path import Path
-from disco_hw.control.tasks.timed_path import TimedPath
 from disco_hw.effects.registry import MOTION_EFFECTS
 from disco_hw.model import EffectSetting, Gaussian, Model
 from disco_hw.model import plain as physics
-from disco_hw.waypoints import Waypoints
+from disco_hw.tasks.circle import CircleCost
+from disco_hw.tasks.line.cost import PathCost
+from disco_hw.tasks.line.waypoints import Waypoints
+from disco_hw.tasks.timed_path import TimedPathCost
+from tests.tasks.costs import circle_cost, path_along, path_cost, timed_path_cost
 
 SAMPLES, HORIZON, STEP_S = 160, 50, 0.1
 # Single precision holds no more than this of a cost of hundreds.
@@ -70,7 +72,7 @@ def state_of(values, commands):
     return PlannerState(20_000_000 * len(commands), *values, sent=sent, elapsed_s=3.0)
 
 
-CIRCLE = Circle(0.3, -0.2)
+CIRCLE = CircleCost(0.3, -0.2)
 
 
 @st.composite
@@ -99,7 +101,7 @@ def paths(draw):
         far_m = draw(st.floats(-1500.0, 1500.0))
         there = [[far_m, 500.0]]
         places = np.concatenate([there, places]) if far_m < 0.0 else np.concatenate([places, there])
-    return Path(Waypoints(places), draw(st.floats(0.05, 0.5)))
+    return path_along(Waypoints(places), draw(st.floats(0.05, 0.5)))
 
 
 @st.composite
@@ -107,7 +109,7 @@ def timed_paths(draw):
     places = draw(way_points())
     apart_s = draw(st.lists(st.floats(0.05, 4.0), min_size=len(places) - 1, max_size=len(places) - 1))
     begin_s = draw(st.floats(-3.0, 3.0))
-    return TimedPath(Waypoints(places, np.concatenate([[begin_s], begin_s + np.cumsum(apart_s)])))
+    return TimedPathCost(Waypoints(places, np.concatenate([[begin_s], begin_s + np.cumsum(apart_s)])))
 
 
 # Where single precision may fall to either side of an edge (stiction, the next piece of a path), nudges there and back
@@ -120,12 +122,12 @@ FEW = 0.1
 
 def sequence_cost(task, place):
     match task:
-        case Circle():
-            return oracle.circle_cost(task, STEP_S)
-        case Path():
-            return oracle.path_cost(task, place, STEP_S)
-        case TimedPath():
-            return oracle.timed_path_cost(task, 0.0, STEP_S)
+        case CircleCost():
+            return circle_cost(task, STEP_S)
+        case PathCost():
+            return path_cost(task, place, STEP_S)
+        case TimedPathCost():
+            return timed_path_cost(task, 0.0, STEP_S)
 
 
 def check_against_reference(model, state, task, plan_settings, seed):
@@ -225,7 +227,7 @@ def test_costs_and_update_along_a_path(path, base, values, commands, seed):
 
 
 # A way of 1.6 km up to here: places on it that count from far off are too coarse for single precision.
-LONG_WAY = Path(
+LONG_WAY = path_along(
     Waypoints(
         np.array([[-1488.79531, 500.0], [0.0, 0.0], [0.449185571, 0.255162581], [-0.182519024, 1.60631644], [0.0, 0.0]])
     ),

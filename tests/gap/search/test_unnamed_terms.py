@@ -6,10 +6,11 @@ from functools import cache
 import numpy as np
 import pytest
 
-from disco_hw.control import Circle, CommandLimits, Disco, DiscoSettings, PlannerState, Sampler, SentCommand
+from disco_hw.control import CommandLimits, Disco, DiscoSettings, PlannerState, Sampler, SentCommand
 from disco_hw.gap import find_gap
 from disco_hw.model import Model, load_model, save_model
 from disco_hw.model.free_run import FreeRun
+from disco_hw.tasks.circle import CircleCost
 from tools.gap_logs import simulated_drive
 
 pytestmark = pytest.mark.long
@@ -90,7 +91,7 @@ def test_disco_plans_with_it_and_commands_what_the_term_takes_away():
         ("amended", model),
         ("bare", Model(model.wheel_radius_m, model.axial_distance_m, model.x_icr_m)),
     ):
-        disco = Disco(used, Circle(), settings, CommandLimits(8.0, 20.0), 1)
+        disco = Disco(used, CircleCost(), settings, CommandLimits(8.0, 20.0), 1)
         state = PlannerState(0, 0.75, 0.0, math.pi / 2, 5.0, 7.0, sent=(SentCommand(0, 5.0, 7.0),), elapsed_s=3.0)
         for k in range(6):
             plan = disco.plan(k * 50_000_000, state)

@@ -1,120 +1,36 @@
-"""Where a task is: its line on the ground, and how far from it a position is. Pure geometry for panels and pictures."""
+"""The line through way-points as a course: pure geometry for panels and pictures."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
-from disco_hw.config import CircleTask, Point, RobotTask
+from disco_hw.tasks.task import Array, Point
 
-Array = NDArray[np.float64]
+if TYPE_CHECKING:
+    from scipy.spatial import KDTree
+
 _PIECE_M = 0.05
 _NEAREST = 4
 _NO_LENGTH_M2 = 1e-18
 _ELSEWHERE_M = 1e-6
 
 
-class Course(Protocol):
-    """The line that a task follows."""
-
-    @property
-    def noun(self) -> str:
-        """What it is called."""
-
-    @property
-    def middle_m(self) -> Point:
-        """The middle of the ground that it takes."""
-
-    @property
-    def reach_m(self) -> float:
-        """How far it goes from the middle along x or y."""
-
-    @property
-    def length_m(self) -> float:
-        """Length of the line, once round if it is closed."""
-
-    @property
-    def start(self) -> tuple[float, float, float]:
-        """Where to begin and which way to face: x, y (m), yaw (rad)."""
-
-    def outline_m(self) -> Array:
-        """The line as points (N, 2)."""
-
-    def off_m(self, places_m: Array) -> Array:
-        """Distance (N,) of positions (N, 2), positive to the right of the way: outside of a circle."""
-
-
-def course_of(task: RobotTask) -> Course:
-    """The course of a task, the same one for every speed."""
-    if isinstance(task, CircleTask):
-        return CircleCourse(task.center_x_m, task.center_y_m, task.radius_m)
-    return _path_course(task.points)
-
-
-@dataclass(frozen=True, slots=True)
-class CircleCourse:
-    """A circle, driven counter-clockwise."""
-
-    center_x_m: float
-    center_y_m: float
-    radius_m: float
-
-    @property
-    def noun(self) -> str:
-        """What it is called."""
-        return "circle"
-
-    @property
-    def middle_m(self) -> Point:
-        """The centre."""
-        return self.center_x_m, self.center_y_m
-
-    @property
-    def reach_m(self) -> float:
-        """The radius."""
-        return self.radius_m
-
-    @property
-    def length_m(self) -> float:
-        """The circumference."""
-        return 2.0 * math.pi * self.radius_m
-
-    @property
-    def start(self) -> tuple[float, float, float]:
-        """East of the centre, facing north."""
-        return self.center_x_m + self.radius_m, self.center_y_m, 0.5 * math.pi
-
-    def outline_m(self) -> Array:
-        """Points (181, 2), the last on the first."""
-        angle = np.linspace(0.0, 2.0 * np.pi, 181)
-        x, y = np.cos(angle), np.sin(angle)
-        return np.stack((self.center_x_m + self.radius_m * x, self.center_y_m + self.radius_m * y), axis=1)
-
-    def off_m(self, places_m: Array) -> Array:
-        """Distance (N,) of positions (N, 2), positive outside."""
-        return np.asarray(np.hypot(places_m[:, 0] - self.center_x_m, places_m[:, 1] - self.center_y_m) - self.radius_m)
-
-
 @dataclass(frozen=True, eq=False, slots=True)
-class PathCourse:
+class LineCourse:
     """Straight pieces between way-points (N, 2), N >= 2; a position belongs to the nearest piece.
 
     `fine_m` (M, 2): the same line in pieces of at most 5 cm; `tree` finds the nearest of these.
     """
 
+    noun: str
     points_m: Array
     fine_m: Array
-    tree: Any
-
-    @property
-    def noun(self) -> str:
-        """What it is called."""
-        return "path"
+    tree: KDTree
 
     @property
     def middle_m(self) -> Point:
@@ -167,7 +83,8 @@ class PathCourse:
 
 
 @lru_cache(maxsize=8)
-def _path_course(points: tuple[Point, ...]) -> PathCourse:
+def line_course(points: tuple[Point, ...], noun: str) -> LineCourse:
+    """The line through way-points, the same one for the same way-points; `noun` is what it is called."""
     # Loaded for paths alone: half of the daemon's commands need no course at all.
     from scipy.spatial import KDTree  # noqa: PLC0415
 
@@ -176,4 +93,4 @@ def _path_course(points: tuple[Point, ...]) -> PathCourse:
     between = np.linspace(0.0, at_m[-1], max(2, math.ceil(at_m[-1] / _PIECE_M) + 1))
     fine_at_m = np.union1d(at_m, between)
     fine = np.column_stack([np.interp(fine_at_m, at_m, column) for column in corners.T])
-    return PathCourse(corners, fine, KDTree(fine))
+    return LineCourse(noun, corners, fine, KDTree(fine))

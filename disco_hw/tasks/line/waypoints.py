@@ -8,13 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from disco_hw.config import FARTHEST_M
 from disco_hw.config.input_file import WAY_POINTS, read_lines
 from disco_hw.errors import InputError
+from disco_hw.tasks.task import FARTHEST_M, Array, Point
 
-Array = NDArray[np.float64]
 LEAST_DISTANCE_M = 1e-6
 SHORTEST_M = 0.1
 LONGEST_M = 2000.0
@@ -81,53 +79,8 @@ def _columns(path: Path) -> tuple[list[int], dict[str, Array]]:
     return lines, {name: np.array(column) for name, column in columns.items()}
 
 
-def way_points_to_follow(path: Path) -> Waypoints:
-    """The way-points of a CSV that a robot is to follow at a speed of its own.
-
-    Raises InputError as `load_waypoints`, and for times, for more than 10 000 way-points, for a path that is shorter
-    than 0.1 m or longer than 2 km, and for a way-point further from the origin than poses go.
-    """
-    found = load_waypoints(path)
-    if found.times_s is not None:
-        raise InputError(
-            f"{path}: line 1: column t_s: the robot follows at task.speed_m_s; remove the column, or follow it by time "
-            'with kind = "timed_path" in [task]'
-        )
-    _check_size(path, found)
-    return found
-
-
-def way_points_to_meet(path: Path, fastest_m_s: float) -> Waypoints:
-    """The way-points of a CSV that a robot is to be at when their times have come.
-
-    Raises InputError as `way_points_to_follow`, but for a missing column of times; for a first time before the start;
-    and for way-points that are further apart than the robot can drive between their times at `fastest_m_s`.
-    """
-    found = load_waypoints(path)
-    times = found.times_s
-    if times is None:
-        raise InputError(
-            f"{path}: line 1: column t_s: missing; add the times in s from the start of the task, or follow the path "
-            'at task.speed_m_s with kind = "path" in [task]'
-        )
-    if times[0] < 0.0:
-        raise InputError(f"{path}: line {found.lines[0]}: t_s: {times[0]:g} is before the start; begin at 0 or later")
-    _check_size(path, found)
-    way_m = np.hypot(*np.diff(found.places_m, axis=0).T)
-    late = way_m > fastest_m_s * np.diff(times)
-    if late.any():
-        at = int(np.argmax(late)) + 1
-        soonest_s = math.ceil(1e3 * (times[at - 1] + way_m[at - 1] / fastest_m_s)) / 1e3
-        raise InputError(
-            f"{path}: line {found.lines[at]}: t_s: {way_m[at - 1]:g} m from line {found.lines[at - 1]} in "
-            f"{times[at] - times[at - 1]:g} s, and the wheels can do {fastest_m_s:.3g} m/s; be there at {soonest_s:g} "
-            "or later"
-        )
-    return found
-
-
-def _check_size(path: Path, found: Waypoints) -> None:
-    """Refuse a shorter or longer path, and places further off, than can be followed."""
+def check_size(path: Path, found: Waypoints) -> None:
+    """Raise InputError for a shorter or longer path, and places further off, than can be followed."""
     length_m = float(np.hypot(*np.diff(found.places_m, axis=0).T).sum())
     if not SHORTEST_M <= length_m <= LONGEST_M:
         raise InputError(f"{path}: {length_m:g} m long; between {SHORTEST_M:g} and {LONGEST_M:g} m can be followed")
@@ -138,6 +91,11 @@ def _check_size(path: Path, found: Waypoints) -> None:
             f"{path}: line {found.lines[row]}: {'xy'[column]}_m: {found.places_m[row, column]:g}, and poses go "
             f"{FARTHEST_M:g} m from the origin at most; write way-points in the frame of the poses"
         )
+
+
+def points_of(waypoints: Waypoints) -> tuple[Point, ...]:
+    """The places as plain numbers."""
+    return tuple((float(x), float(y)) for x, y in waypoints.places_m.tolist())
 
 
 def _number(path: Path, line: int, name: str, text: str | None) -> float:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from disco_hw.control import pendulum
 from disco_hw.control.black_box import StageCost, Transition
-from disco_hw.control.tasks.circle import Circle
+from disco_hw.tasks.circle import CircleCost
 
 
 def pendulum_transition(state: Tensor, control: Tensor, theta: Tensor) -> Tensor:
@@ -50,7 +50,7 @@ def skid_steer_transition(step_s: float) -> Transition:
     return transition
 
 
-def circle_cost(circle: Circle) -> StageCost:
+def circle_cost(circle: CircleCost) -> StageCost:
     """The paper's stage cost (L, K) of skid-steer states."""
 
     def cost(state: Tensor, t: int) -> Tensor:

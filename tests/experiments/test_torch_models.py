@@ -3,9 +3,10 @@
 import numpy as np
 import torch
 
-from disco_hw.control import Circle, pendulum
-from disco_hw.control.torch_models import circle_cost, pendulum_cost, pendulum_transition, skid_steer_transition
+from disco_hw.control import pendulum
+from disco_hw.experiments.torch_models import circle_cost, pendulum_cost, pendulum_transition, skid_steer_transition
 from disco_hw.model import plain as physics
+from disco_hw.tasks.circle import CircleCost
 
 RNG = np.random.default_rng(4)
 
@@ -33,6 +34,6 @@ def test_skid_steer_and_circle():
     start = physics.State(state[..., 0], state[..., 1], state[..., 2], 0.0, 0.0)
     after, forward, _ = physics.step(named, start, control[:, 0], control[:, 1], 0.1)
     np.testing.assert_allclose(got, np.stack([after.x, after.y, after.yaw, forward], -1), atol=1e-12)
-    circle = Circle(0.2, -0.1)
+    circle = CircleCost(0.2, -0.1)
     cost = circle_cost(circle)(tensor(got), 0).numpy()
     np.testing.assert_allclose(cost[2, 7], circle.instant_cost(0.0, *got[2, 7, [0, 1, 3]]))

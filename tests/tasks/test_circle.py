@@ -6,16 +6,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from disco_hw.config import CircleTask
-from disco_hw.control import Circle, oracle
+from disco_hw.control import oracle
 from disco_hw.control.disco import Disco
 from disco_hw.control.plan import PlannerState
 from disco_hw.control.settings import CommandLimits, DiscoSettings
 from disco_hw.experiments.plant import Plant
 from disco_hw.model import load_model
 from disco_hw.model import plain as physics
+from disco_hw.tasks.circle import CircleCost, CircleTask
+from tests.tasks.costs import circle_cost
 
-MODEL = load_model(Path(__file__).parents[3] / "disco_hw/robots/wombot_model.toml")
+MODEL = load_model(Path(__file__).parents[2] / "disco_hw/robots/wombot_model.toml")
 MEAN = {"wheel_radius_m": 0.061, "axial_distance_m": 0.415, "x_icr_m": 0.238}
 T, STEP_S = 50, 0.1
 
@@ -24,7 +25,7 @@ def sequence_cost(circle, start, left, right):
     """Cost of constant wheel speeds over the horizon, from a state."""
     commands = np.broadcast_to([left, right], (1, T, 2))
     past = np.zeros((1, 2))
-    return oracle.point_costs(MEAN, start, commands, past, STEP_S, oracle.circle_cost(circle, STEP_S))[0]
+    return oracle.point_costs(MEAN, start, commands, past, STEP_S, circle_cost(circle, STEP_S))[0]
 
 
 def on_circle():
@@ -44,21 +45,21 @@ def spinning():
 
 
 def test_the_papers_cost_of_standing_still_on_the_circle_is_s0():
-    paper = Circle().paper()
+    paper = CircleCost().paper()
     assert paper.instant_cost(0.0, 0.75, 0.0, 0.0) == pytest.approx(0.2)
     assert sequence_cost(paper, physics.State(0.75, 0.0, 0.0, 0.0, 0.0), 0.0, 0.0) == pytest.approx(0.2 * T)
 
 
 def test_driving_round_costs_nothing_and_pays_for_no_progress():
-    for circle in (Circle(), Circle().paper()):
+    for circle in (CircleCost(), CircleCost().paper()):
         assert sequence_cost(circle, *on_circle()) == pytest.approx(0.0, abs=1e-3)
 
 
 def test_progress_takes_the_reward_from_standing_and_from_spinning():
     stand = (physics.State(0.75, 0.0, math.pi / 2, 0.0, 0.0), 0.0, 0.0)
     for trap in (stand, spinning()):
-        assert sequence_cost(Circle(), *trap) > sequence_cost(Circle().paper(), *trap) + 0.05 * T
-    assert sequence_cost(Circle(), *spinning()) > 0.3 * T
+        assert sequence_cost(CircleCost(), *trap) > sequence_cost(CircleCost().paper(), *trap) + 0.05 * T
+    assert sequence_cost(CircleCost(), *spinning()) > 0.3 * T
 
 
 @pytest.mark.parametrize("start", ["standing", "spinning", "centre"])
@@ -71,7 +72,7 @@ def test_the_planner_leaves_the_traps(start):
     }
     place = places[start]
     plant = Plant(MEAN, place, 0.1, 0.0, 1)
-    disco = Disco(MODEL, Circle(), DiscoSettings(), CommandLimits(8.0, 20.0), 2)
+    disco = Disco(MODEL, CircleCost(), DiscoSettings(), CommandLimits(8.0, 20.0), 2)
     if start == "spinning":
         plant.wheels = (left, right)
         disco.plan(0, PlannerState(0, *place, left, right))
@@ -83,28 +84,29 @@ def test_the_planner_leaves_the_traps(start):
         angle = math.atan2(plant.y_m, plant.x_m)
         plant.advance(*disco.plan(now_ns, state_now).at(now_ns), 0.1)
         travelled += math.remainder(math.atan2(plant.y_m, plant.x_m) - angle, 2.0 * math.pi)
-        costs.append(Circle().instant_cost(0.0, plant.x_m, plant.y_m, plant.forward_m_s))
+        costs.append(CircleCost().instant_cost(0.0, plant.x_m, plant.y_m, plant.forward_m_s))
     assert np.mean(costs[-50:]) < 0.04
     assert travelled > math.pi
 
 
 def test_the_horizon_of_half_the_length_no_longer_ends_in_a_trap():
     plant = Plant(MEAN, (0.75, 0.0, math.pi / 2), 0.1, 0.0, 1)
-    disco = Disco(MODEL, Circle(), DiscoSettings(step_s=0.05), CommandLimits(8.0, 20.0), 2)
+    disco = Disco(MODEL, CircleCost(), DiscoSettings(step_s=0.05), CommandLimits(8.0, 20.0), 2)
     costs = []
     for step in range(200):
         now_ns = step * 100_000_000
         state = PlannerState(now_ns, plant.x_m, plant.y_m, plant.yaw_rad, *plant.wheels)
         plant.advance(*disco.plan(now_ns, state).at(now_ns), 0.1)
-        costs.append(Circle().instant_cost(0.0, plant.x_m, plant.y_m, plant.forward_m_s))
+        costs.append(CircleCost().instant_cost(0.0, plant.x_m, plant.y_m, plant.forward_m_s))
     assert np.mean(costs[100:]) < 0.12
 
 
-def test_from_config_and_picture():
-    circle = Circle.from_config(CircleTask(center_x_m=1.0, radius_m=2.0, speed_m_s=0.3))
+def test_the_section_gives_cost_and_outline():
+    task = CircleTask(center_x_m=1.0, radius_m=2.0, speed_m_s=0.3)
+    circle = task.planned("default")
     assert (circle.center_x_m, circle.radius_m, circle.speed_m_s) == (1.0, 2.0, 0.3)
-    assert circle.prepare(0.0, 5.0, 0.0, None, 0.1, 50).origin_m == (1.0, 0.0)
+    assert circle.prepare(0.0, 5.0, 0.0, 0.0, None, 0.1, 50).origin_m == (1.0, 0.0)
     assert circle.progress_weight > 0.0
-    assert Circle.from_config(CircleTask(), "paper") == Circle().paper()
-    picture = circle.picture()
+    assert CircleTask().planned("paper") == CircleCost().paper()
+    picture = task.course().outline_m()
     np.testing.assert_allclose(np.hypot(picture[:, 0] - 1.0, picture[:, 1]), 2.0)

@@ -7,19 +7,19 @@ import numpy as np
 import pytest
 
 from disco_hw.control import CommandLimits, Disco, DiscoSettings, PlannerState
-from disco_hw.control.tasks.timed_path import TimedPath
 from disco_hw.experiments.plant import Plant
 from disco_hw.model import load_model
-from disco_hw.waypoints import Waypoints
+from disco_hw.tasks.line.waypoints import Waypoints
+from disco_hw.tasks.timed_path import TimedPathCost
 
-MODEL = load_model(FilePath(__file__).parents[3] / "disco_hw/robots/wombot_model.toml")
+MODEL = load_model(FilePath(__file__).parents[2] / "disco_hw/robots/wombot_model.toml")
 MEAN = {"wheel_radius_m": 0.061, "axial_distance_m": 0.415, "x_icr_m": 0.238}
 ANGLE = np.linspace(0.0, 2.0 * np.pi, 100)
 ROUND = Waypoints(np.column_stack([np.sin(ANGLE), 1.0 - np.cos(ANGLE)]), 5.0 + 4.0 * ANGLE)
 
 
 def test_places_are_reached_at_their_times_after_waiting_for_the_first():
-    task = TimedPath(ROUND)
+    task = TimedPathCost(ROUND)
     plant = Plant(MEAN, (0.0, 0.0, 0.3), 0.1, 0.0, 1)
     disco = Disco(MODEL, task, DiscoSettings(), CommandLimits(8.0, 20.0), 2)
     off = []
@@ -38,7 +38,7 @@ SPIN = 1.6 * MEAN["axial_distance_m"] / MEAN["wheel_radius_m"] / 2.0
 
 @pytest.mark.parametrize("trap", ["standing", "spinning"])
 def test_the_planner_leaves_the_traps(trap):
-    task = TimedPath(Waypoints(ROUND.places_m, 4.0 * ANGLE))
+    task = TimedPathCost(Waypoints(ROUND.places_m, 4.0 * ANGLE))
     plant = Plant(MEAN, (0.0, 0.0, 0.0), 0.1, 0.0, 1)
     disco = Disco(MODEL, task, DiscoSettings(), CommandLimits(8.0, 20.0), 2)
     if trap == "spinning":
@@ -57,7 +57,7 @@ def test_the_planner_leaves_the_traps(trap):
 
 @pytest.mark.parametrize("yaw_rad", [0.0, math.pi])
 def test_it_is_followed_forwards(yaw_rad):
-    task = TimedPath(Waypoints(ROUND.places_m, 4.0 * ANGLE))
+    task = TimedPathCost(Waypoints(ROUND.places_m, 4.0 * ANGLE))
     plant = Plant(MEAN, (0.0, 0.0, yaw_rad), 0.1, 0.0, 1)
     disco = Disco(MODEL, task, DiscoSettings(), CommandLimits(8.0, 20.0), 2)
     speeds, off = [], []
@@ -72,17 +72,17 @@ def test_it_is_followed_forwards(yaw_rad):
 
 
 def test_where_the_place_rests_it_has_no_direction():
-    terms = TimedPath(ROUND).prepare(4.75, 0.0, 0.0, None, 0.1, 4).terms
+    terms = TimedPathCost(ROUND).prepare(4.75, 0.0, 0.0, 0.0, None, 0.1, 4).terms
     np.testing.assert_allclose(terms.along_x, [0.0, 0.0, 1.0, 1.0], atol=0.05)
     np.testing.assert_allclose(np.hypot(terms.along_x, terms.along_y), [0.0, 0.0, 1.0, 1.0], atol=1e-6)
 
 
 def test_instant_cost_is_the_distance_to_where_the_robot_should_be():
-    task = TimedPath(ROUND)
+    task = TimedPathCost(ROUND)
     assert task.instant_cost(0.0, 0.0, 0.0, 1.0) == pytest.approx(0.0)
     assert task.instant_cost(5.0 + 4.0 * np.pi, 0.0, 0.0, 0.0) == pytest.approx(2.0, abs=1e-3)
 
 
 def test_times_are_needed():
     with pytest.raises(ValueError, match="have no times"):
-        TimedPath(Waypoints(np.zeros((2, 2))))
+        TimedPathCost(Waypoints(np.zeros((2, 2))))

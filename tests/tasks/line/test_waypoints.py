@@ -7,10 +7,16 @@ import pytest
 from cantools.database import load_file
 
 import firmware_protocol
-from disco_hw.config import FARTHEST_M
+from disco_hw.config import Robot
 from disco_hw.errors import InputError
 from disco_hw.estimation.gate import MAX_POSITION_M
-from disco_hw.waypoints import load_waypoints, way_points_to_follow, way_points_to_meet
+from disco_hw.tasks.line.waypoints import load_waypoints
+from disco_hw.tasks.path import PathTask
+from disco_hw.tasks.task import FARTHEST_M
+from disco_hw.tasks.timed_path import TimedPathTask
+
+# Its wheels do 0.5 m/s.
+ROBOT = Robot(name="r", wheel_radius_m=0.1, axial_distance_m=0.4, ticks_per_rev=1024, max_wheel_speed_rad_s=5.0)
 
 
 def read(tmp_path, text):
@@ -78,19 +84,19 @@ def test_what_a_robot_cannot_follow_is_refused(tmp_path, text, fault):
     path = tmp_path / "path.csv"
     path.write_text(text)
     with pytest.raises(InputError, match=fault) as error:
-        way_points_to_follow(path)
+        PathTask(path="path.csv").with_file(path, ROBOT, True)
     assert str(path) in str(error.value)
 
 
 def meet(tmp_path, text):
     path = tmp_path / "path.csv"
     path.write_text(text)
-    return way_points_to_meet(path, 0.5)
+    return TimedPathTask(path="path.csv").with_file(path, ROBOT, True)
 
 
 def test_way_points_to_meet_may_rest_and_pass_one_place_twice(tmp_path):
     found = meet(tmp_path, "t_s,x_m,y_m\n0.5,0,0\n2,0.75,0\n3,0.75,0\n4.5,0,0\n")
-    np.testing.assert_array_equal(found.times_s, [0.5, 2.0, 3.0, 4.5])
+    assert found.times_s == (0.5, 2.0, 3.0, 4.5)
 
 
 @pytest.mark.parametrize(

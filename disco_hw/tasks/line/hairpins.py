@@ -7,17 +7,15 @@ that where they were this near to one another; one turn at one place did not, wh
 from __future__ import annotations
 
 import math
-from pathlib import Path as FilePath
-from typing import Any
+from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from disco_hw.control.tasks.path import SHARP_RAD, Path
 from disco_hw.errors import InputError
-from disco_hw.waypoints import Waypoints
+from disco_hw.tasks.line.table import SHARP_RAD, PathTable
+from disco_hw.tasks.line.waypoints import Waypoints
+from disco_hw.tasks.task import Array
 
-Array = NDArray[np.float64]
 SHARP_APART_M = 1.0
 """What two turns need between them of which each is sharp."""
 BACK_RAD, BACK_APART_M = math.radians(160.0), 0.28
@@ -30,9 +28,9 @@ _ELSEWHERE_RAD = math.radians(45.0)
 _PLACE = 2
 
 
-def refuse_hairpins(file: FilePath, waypoints: Waypoints) -> None:
+def refuse_hairpins(file: Path, waypoints: Waypoints) -> None:
     """Raise InputError naming the lines of turns that are too near to one another for the robot to get past."""
-    found = hairpin(Path(waypoints))
+    found = hairpin(PathTable(waypoints.places_m))
     if found is None:
         return
     begin_m, end_m, least_m = found
@@ -44,7 +42,7 @@ def refuse_hairpins(file: FilePath, waypoints: Waypoints) -> None:
     )
 
 
-def hairpin(path: Path) -> tuple[float, float, float] | None:
+def hairpin(path: PathTable) -> tuple[float, float, float] | None:
     """The first turns that are too near to one another, and what they need between them, m along the path; or None."""
     heading = _headings(path)
     length_m = path.spacing_m * (len(path.table) - 1)
@@ -63,7 +61,7 @@ def hairpin(path: Path) -> tuple[float, float, float] | None:
     return begin * path.spacing_m % length_m, end * path.spacing_m % length_m, least_m
 
 
-def _headings(path: Path) -> Array:
+def _headings(path: PathTable) -> Array:
     """Heading of every piece of the path's table without jumps (rad), and of a closed one as far on as is looked."""
     along = path.table[:-1, 2:]
     if path.closed:
@@ -71,7 +69,7 @@ def _headings(path: Path) -> Array:
     return np.asarray(np.unwrap(np.arctan2(along[:, 1], along[:, 0])))
 
 
-def _sharp_pair(path: Path, heading: Array) -> tuple[int, int, float] | None:
+def _sharp_pair(path: PathTable, heading: Array) -> tuple[int, int, float] | None:
     """Entries of two sharp turns, each at one place."""
     sharp = np.flatnonzero(np.abs(heading[_PLACE:] - heading[:-_PLACE]) > SHARP_RAD) + 1
     apart = np.diff(sharp)
@@ -79,12 +77,12 @@ def _sharp_pair(path: Path, heading: Array) -> tuple[int, int, float] | None:
     return (int(sharp[near[0]]), int(sharp[near[0] + 1]), SHARP_APART_M) if near.size else None
 
 
-def _turn_back(path: Path, heading: Array, turned_rad: float, least_m: float) -> tuple[int, int, float] | None:
+def _turn_back(path: PathTable, heading: Array, turned_rad: float, least_m: float) -> tuple[int, int, float] | None:
     """Entries between which the way turns by more than `turned_rad`, one way round, and not at one place."""
     for apart in range(_PLACE + 1, min(math.ceil(least_m / path.spacing_m - 1e-6) + 1, len(heading))):
         turned = heading[apart:] - heading[:-apart]
         for at in np.flatnonzero(np.abs(turned) > turned_rad).tolist():
-            within: Any = heading[at : at + apart + 1]
+            within = heading[at : at + apart + 1]
             if abs(turned[at]) - np.abs(within[_PLACE:] - within[:-_PLACE]).max() > _ELSEWHERE_RAD:
                 return at + 1, at + apart, least_m
     return None

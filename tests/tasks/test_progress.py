@@ -5,8 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from disco_hw.config import CircleTask, PathTask, TimedPathTask
-from disco_hw.runtime.progress import END_M, progress_of
+from disco_hw.tasks.circle import CircleTask
+from disco_hw.tasks.line.progress import END_M
+from disco_hw.tasks.path import PathTask
+from disco_hw.tasks.timed_path import TimedPathTask
 
 ANGLE = np.linspace(0.0, 2.0 * np.pi, 181)
 EIGHT = tuple((1.5 * math.sin(a), 0.75 * math.sin(2.0 * a)) for a in ANGLE[:-1])
@@ -15,61 +17,61 @@ LINE = PathTask(path="line.csv", points=((0.0, 0.0), (2.0, 0.0)))
 
 
 def test_a_closed_path_that_crosses_itself_counts_laps_on_and_back():
-    progress = progress_of(CLOSED)
+    progress = CLOSED.progress()
     for a in np.linspace(0.5, 0.5 + 4.5 * np.pi, 500):
-        progress.add(0, 1.5 * math.sin(a), 0.75 * math.sin(2.0 * a))
+        progress.add(0, 1.5 * math.sin(a), 0.75 * math.sin(2.0 * a), math.nan)
     assert progress.laps == pytest.approx(2.25, abs=0.06)
     for a in np.linspace(0.5 + 4.5 * np.pi, 0.5 + 2.5 * np.pi, 250):
-        progress.add(0, 1.5 * math.sin(a), 0.75 * math.sin(2.0 * a))
+        progress.add(0, 1.5 * math.sin(a), 0.75 * math.sin(2.0 * a), math.nan)
     assert progress.laps == pytest.approx(1.25, abs=0.06)
     assert not progress.finished
 
 
 def test_an_open_path_has_an_end():
-    progress = progress_of(LINE)
+    progress = LINE.progress()
     assert (progress.laps, progress.finished) == (0.0, False)
     for x_m in np.arange(0.5, 1.93, 0.02):
-        progress.add(0, x_m, 0.1)
+        progress.add(0, x_m, 0.1, math.nan)
         assert not progress.finished
     assert progress.laps == pytest.approx(0.96, abs=0.011)
-    progress.add(0, 2.0 - END_M + 0.011, 0.1)
+    progress.add(0, 2.0 - END_M + 0.011, 0.1, math.nan)
     assert progress.finished
     progress.pause()
     assert not progress.finished
-    progress.add(0, 0.1, 0.0)
+    progress.add(0, 0.1, 0.0, math.nan)
     assert (progress.laps, progress.finished) == (pytest.approx(0.05), False)
 
 
 def test_a_new_run_counts_anew():
-    progress = progress_of(CLOSED)
+    progress = CLOSED.progress()
     for a in np.linspace(0.0, 3.0, 100):
-        progress.add(0, 1.5 * math.sin(a), 0.75 * math.sin(2.0 * a))
+        progress.add(0, 1.5 * math.sin(a), 0.75 * math.sin(2.0 * a), math.nan)
     assert progress.laps > 0.4
     progress.pause()
     assert progress.laps > 0.4
-    progress.add(0, *EIGHT[40])
+    progress.add(0, *EIGHT[40], math.nan)
     assert progress.laps == 0.0
 
 
 def test_a_circle_counts_turns():
-    progress = progress_of(CircleTask())
+    progress = CircleTask().progress()
     for angle in np.linspace(0.0, math.pi, 50):
-        progress.add(0, math.cos(angle), math.sin(angle))
+        progress.add(0, math.cos(angle), math.sin(angle), math.nan)
     assert (progress.laps, progress.finished) == (pytest.approx(0.5), False)
 
 
 def test_way_points_by_time_end_when_the_time_is_over_and_the_robot_is_there():
     points = ((0.0, 0.0), (1.0, 0.0), (1.0, 1.0))
-    progress = progress_of(TimedPathTask(path="p.csv", points=points, times_s=(1.0, 3.0, 7.0)))
+    progress = TimedPathTask(path="p.csv", points=points, times_s=(1.0, 3.0, 7.0)).progress()
     assert (progress.laps, progress.finished) == (0.0, False)
     found = []
     for second in range(9):
-        progress.add((100 + second) * 10**9, 1.0, 1.0 - 0.5 * END_M)
+        progress.add((100 + second) * 10**9, 1.0, 1.0 - 0.5 * END_M, math.nan)
         found.append((progress.laps, progress.finished))
     assert [part for part, _ in found] == pytest.approx([0.0, 0.0, 0.25, 0.5, 0.625, 0.75, 0.875, 1.0, 1.0])
     assert [done for _, done in found] == [False] * 7 + [True] * 2
-    progress.add(109 * 10**9, 1.0, 1.0 - 1.1 * END_M)
+    progress.add(109 * 10**9, 1.0, 1.0 - 1.1 * END_M, math.nan)
     assert not progress.finished
     progress.pause()
-    progress.add(200 * 10**9, 1.0, 1.0)
+    progress.add(200 * 10**9, 1.0, 1.0, math.nan)
     assert (progress.laps, progress.finished) == (0.0, False)

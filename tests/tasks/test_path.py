@@ -1,19 +1,20 @@
 """A path by arc length: followed forwards, at its speed, through crossings and sharp turns, to its end."""
 
 import math
-from pathlib import Path as FilePath
+from pathlib import Path
 
 import msgspec
 import numpy as np
 import pytest
 
 from disco_hw.control import CommandLimits, Disco, DiscoSettings, PlannerState, PlanOutcome
-from disco_hw.control.tasks.path import Path, sharp_turns
 from disco_hw.experiments.plant import Plant
 from disco_hw.model import load_model
-from disco_hw.waypoints import Waypoints
+from disco_hw.tasks.line.table import PathTable, sharp_turns
+from disco_hw.tasks.line.waypoints import Waypoints
+from tests.tasks.costs import path_along
 
-MODEL = load_model(FilePath(__file__).parents[3] / "disco_hw/robots/wombot_model.toml")
+MODEL = load_model(Path(__file__).parents[2] / "disco_hw/robots/wombot_model.toml")
 MEAN = {"wheel_radius_m": 0.061, "axial_distance_m": 0.415, "x_icr_m": 0.238}
 ANGLE = np.linspace(0.0, 2.0 * np.pi, 200)
 EIGHT = Waypoints(np.column_stack([1.5 * np.sin(ANGLE), 0.75 * np.sin(2.0 * ANGLE)]))
@@ -42,7 +43,7 @@ def distance_to(waypoints, poses):
 
 @pytest.mark.long
 def test_a_closed_path_that_crosses_itself_is_driven_round():
-    task = Path(EIGHT, speed_m_s=0.25)
+    task = path_along(EIGHT, speed_m_s=0.25)
     poses, speeds, places = follow(task, 45.0, (0.0, 0.0, 0.8))
     assert distance_to(EIGHT, poses)[20:].mean() < 0.03
     assert speeds[50:].mean() == pytest.approx(0.25, abs=0.03)
@@ -52,7 +53,7 @@ def test_a_closed_path_that_crosses_itself_is_driven_round():
 
 
 def test_an_open_path_is_driven_to_its_end_and_no_further():
-    poses, speeds, places = follow(Path(CORNER, speed_m_s=0.25), 20.0, (0.0, 0.0, 0.0))
+    poses, speeds, places = follow(path_along(CORNER, speed_m_s=0.25), 20.0, (0.0, 0.0, 0.0))
     assert distance_to(CORNER, poses).max() < 0.12
     assert np.hypot(*(poses[-1, :2] - [1.0, 1.0])) < 0.1
     assert np.abs(speeds[-10:]).max() < 0.05
@@ -60,7 +61,7 @@ def test_an_open_path_is_driven_to_its_end_and_no_further():
 
 
 def test_a_start_beside_the_path_joins_it():
-    poses, _, _ = follow(Path(EIGHT, speed_m_s=0.25), 25.0, (0.5, 1.2, math.pi))
+    poses, _, _ = follow(path_along(EIGHT, speed_m_s=0.25), 25.0, (0.5, 1.2, math.pi))
     assert distance_to(EIGHT, poses)[150:].mean() < 0.05
 
 
@@ -71,7 +72,7 @@ SPIN = 1.6 * MEAN["axial_distance_m"] / MEAN["wheel_radius_m"] / 2.0
 
 @pytest.mark.parametrize("trap", ["standing", "spinning"])
 def test_the_planner_leaves_the_traps(trap):
-    task = Path(ROUND, speed_m_s=0.2)
+    task = path_along(ROUND, speed_m_s=0.2)
     plant = Plant(MEAN, (0.0, 0.0, 0.0), 0.1, 0.0, 1)
     disco = Disco(MODEL, task, DiscoSettings(), CommandLimits(8.0, 20.0), 2)
     if trap == "spinning":
@@ -88,12 +89,12 @@ def test_the_planner_leaves_the_traps(trap):
         places.append(disco._memory)
     assert distance_to(ROUND, np.array(poses))[80:].mean() < 0.05
     # 15 s at 0.2 m/s, less the way out of the trap.
-    assert places[-1] * task.spacing_m > 2.2
+    assert places[-1] * task.path.spacing_m > 2.2
 
 
 def test_a_round_path_is_driven_forwards():
     # The nearer to the path with the tracked point before the axle, which asks for driving backwards.
-    poses, speeds, places = follow(Path(ROUND, speed_m_s=0.25), 20.0, (0.0, 0.0, 0.0))
+    poses, speeds, places = follow(path_along(ROUND, speed_m_s=0.25), 20.0, (0.0, 0.0, 0.0))
     assert speeds.min() > -0.02
     assert places[-1] * 0.02 > 4.0
     assert distance_to(ROUND, poses)[20:].mean() < 0.03
@@ -101,7 +102,7 @@ def test_a_round_path_is_driven_forwards():
 
 @pytest.mark.parametrize("yaw_rad", [math.pi, -2.0])
 def test_a_robot_that_faces_the_wrong_way_turns_round(yaw_rad):
-    poses, speeds, places = follow(Path(ROUND, speed_m_s=0.25), 15.0, (0.0, 0.0, yaw_rad))
+    poses, speeds, places = follow(path_along(ROUND, speed_m_s=0.25), 15.0, (0.0, 0.0, yaw_rad))
     assert speeds[60:].min() > -0.02
     assert places[-1] * 0.02 > 2.0
     assert distance_to(ROUND, poses)[60:].mean() < 0.03
@@ -111,7 +112,7 @@ BACK = Waypoints(np.array([[0.0, 0.0], [1.2, 0.0], [0.0, 0.0]]))
 
 
 def test_a_path_that_turns_back_is_driven_forwards_both_ways():
-    poses, speeds, _ = follow(Path(BACK, speed_m_s=0.25), 20.0, (0.0, 0.0, 0.0))
+    poses, speeds, _ = follow(path_along(BACK, speed_m_s=0.25), 20.0, (0.0, 0.0, 0.0))
     x, heading = poses[:, 0], np.cos(poses[:, 2])
     tip = int(np.argmax(x > 1.13))
     assert x.max() > 1.13
@@ -124,23 +125,23 @@ def test_a_path_that_turns_back_is_driven_forwards_both_ways():
 
 
 def test_sharp_turns_cut_a_path_into_pieces():
-    task = Path(BACK)
+    task = PathTable(BACK.places_m)
     assert task.closed
     assert task.sharp_turns == (0, 60)
     assert task.piece(30.0) == (30.0, 0.0, 60.0)
     assert task.piece(60.0) == (60.0, 60.0, 120.0)
     # Where it is on the way back is not taken for where it was on the way there, nor the other way round.
-    assert task.place(1.0, 0.01, 49.0) == 50.0
-    assert task.place(1.0, 0.01, 71.0) == 70.0
+    assert task.place(1.0, 0.01, 0.0, 49.0) == 50.0
+    assert task.place(1.0, 0.01, 0.0, 71.0) == 70.0
     # At the end of a piece the next begins, even if the end is not quite reached; the last is followed by the first.
-    assert task.place(1.16, 0.0, 57.0) == 60.0
-    assert task.place(0.03, 0.0, 117.0) == 0.0
-    assert Path(EIGHT).sharp_turns == Path(CORNER).sharp_turns == ()
+    assert task.place(1.16, 0.0, 0.0, 57.0) == 60.0
+    assert task.place(0.03, 0.0, 0.0, 117.0) == 0.0
+    assert PathTable(EIGHT.places_m).sharp_turns == PathTable(CORNER.places_m).sharp_turns == ()
 
 
 def test_a_piece_of_a_closed_path_goes_on_past_the_first_way_point():
     # A drop, whose point is at the third way-point.
-    drop = Path(Waypoints(np.array([[0.0, 0.0], [0.3, 0.3], [1.5, 0.0], [0.3, -0.3], [0.0, 0.0]])))
+    drop = PathTable(np.array([[0.0, 0.0], [0.3, 0.3], [1.5, 0.0], [0.3, -0.3], [0.0, 0.0]]))
     (point,) = drop.sharp_turns
     count = len(drop.table) - 1
     np.testing.assert_allclose(drop.table[point, :2], [1.5, 0.0], atol=0.02)
@@ -163,22 +164,21 @@ def test_a_turn_is_sharp_by_its_angle_over_a_length():
     assert sharp_turns(0.25 * np.column_stack([np.sin(around), 1.0 - np.cos(around)]), False, 7) == []
 
 
-def test_instant_cost_and_picture():
-    task = Path(CORNER, speed_m_s=0.2)
+def test_the_instant_cost_is_distance_and_speed_error():
+    task = path_along(CORNER, speed_m_s=0.2)
     assert task.instant_cost(0.0, 0.5, 0.3, 0.2) == pytest.approx(0.3)
     assert task.instant_cost(0.0, 0.5, 0.0, 0.0) == pytest.approx(0.2)
-    np.testing.assert_array_equal(task.picture(), CORNER.places_m)
 
 
 def test_a_path_without_length_is_refused():
     with pytest.raises(ValueError, match="it must be longer than"):
-        Path(Waypoints(np.array([[0.0, 0.0], [0.001, 0.0]])))
+        PathTable(np.array([[0.0, 0.0], [0.001, 0.0]]))
 
 
 @pytest.mark.parametrize("broken", [{"x_m": math.nan}, {"y_m": -math.inf}, {"yaw_rad": math.nan}])
 @pytest.mark.parametrize("waypoints", [EIGHT, BACK, CORNER])
 def test_a_state_that_is_none_is_told_and_forgotten(waypoints, broken):
-    disco = Disco(MODEL, Path(waypoints), DiscoSettings(), CommandLimits(8.0, 20.0), 2)
+    disco = Disco(MODEL, path_along(waypoints), DiscoSettings(), CommandLimits(8.0, 20.0), 2)
     good = PlannerState(0, 0.1, 0.0, 0.0, 0.0, 0.0)
     disco.plan(0, good)
     stopping = disco.plan(100_000_000, msgspec.structs.replace(good, t_ns=100_000_000, **broken))
@@ -190,38 +190,40 @@ def test_a_state_that_is_none_is_told_and_forgotten(waypoints, broken):
 
 
 def test_rollouts_are_relative_to_a_point_nearby_and_see_what_they_can_reach():
-    line = Path(Waypoints(np.array([[0.0, 0.0], [1900.0, 0.0]])))
-    prepared = line.prepare(0.0, 1600.3, 0.0, None, 0.1, 50)
+    line = path_along(Waypoints(np.array([[0.0, 0.0], [1900.0, 0.0]])))
+    prepared = line.prepare(0.0, 1600.3, 0.0, 0.0, None, 0.1, 50)
     x = prepared.terms.table[0::4]
-    assert prepared.memory * line.spacing_m == pytest.approx(1600.3, abs=0.01)
+    assert prepared.memory * line.path.spacing_m == pytest.approx(1600.3, abs=0.01)
     assert prepared.begin == 0.0
     here = x[-int(prepared.terms.first)]
     assert here + prepared.origin_m[0] == pytest.approx(1600.3, abs=0.011)
     assert abs(here) < 1.1
     # Half a metre a step, back and on, is what rollouts may gain at most.
-    assert prepared.terms.first * line.spacing_m == pytest.approx(-25.0, abs=0.1)
-    assert prepared.terms.last * line.spacing_m == pytest.approx(25.0, abs=0.1)
+    assert prepared.terms.first * line.path.spacing_m == pytest.approx(-25.0, abs=0.1)
+    assert prepared.terms.last * line.path.spacing_m == pytest.approx(25.0, abs=0.1)
     # Near the end there is less to see.
-    assert line.prepare(0.0, 1899.0, 0.0, None, 0.1, 50).terms.last * line.spacing_m == pytest.approx(1.0, abs=0.1)
+    assert line.prepare(0.0, 1899.0, 0.0, 0.0, None, 0.1, 50).terms.last * line.path.spacing_m == pytest.approx(
+        1.0, abs=0.1
+    )
 
 
 @pytest.mark.parametrize("length_m", [1000.0, 1000.3])
 def test_rollouts_at_the_end_of_a_long_path_are_relative_to_a_point_nearby(length_m):
-    path = Path(Waypoints(np.array([[-length_m, 0.0], [0.0, 0.0]])))
-    prepared = path.prepare(0.0, 0.0, 0.0, None, 0.1, 50)
-    assert prepared.memory == len(path.table) - 1
+    path = path_along(Waypoints(np.array([[-length_m, 0.0], [0.0, 0.0]])))
+    prepared = path.prepare(0.0, 0.0, 0.0, 0.0, None, 0.1, 50)
+    assert prepared.memory == len(path.path.table) - 1
     assert np.hypot(*prepared.origin_m) < 1.0
     assert np.abs(prepared.terms.table).max() < 60.0
 
 
 def test_a_closed_path_goes_on_past_its_first_way_point_however_short_it_is():
-    ring = Path(Waypoints(0.3 * ROUND.places_m))
-    prepared = ring.prepare(0.0, 0.3, 0.3, None, 0.1, 50)
-    table, count = prepared.terms.table.reshape(-1, 4), len(ring.table) - 1
+    ring = path_along(Waypoints(0.3 * ROUND.places_m))
+    prepared = ring.prepare(0.0, 0.3, 0.3, 0.0, None, 0.1, 50)
+    table, count = prepared.terms.table.reshape(-1, 4), len(ring.path.table) - 1
     at = -int(prepared.terms.first)
     np.testing.assert_allclose(
         table[at : at + 3 * count, :2],
-        np.tile(ring.table[:-1, :2], (4, 1))[int(prepared.memory) :][: 3 * count] - prepared.origin_m,
+        np.tile(ring.path.table[:-1, :2], (4, 1))[int(prepared.memory) :][: 3 * count] - prepared.origin_m,
         atol=1e-6,
     )
     np.testing.assert_allclose(np.diff(table[:, :2], axis=0), table[:-1, 2:], atol=1e-6)

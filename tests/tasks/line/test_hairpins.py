@@ -5,11 +5,11 @@ import math
 import numpy as np
 import pytest
 
-from disco_hw.control.tasks.path import Path
 from disco_hw.errors import InputError
-from disco_hw.hairpins import hairpin
 from disco_hw.runtime.robot_setup import load_setup
-from disco_hw.waypoints import Waypoints, load_waypoints
+from disco_hw.tasks.line.hairpins import hairpin
+from disco_hw.tasks.line.table import PathTable
+from disco_hw.tasks.line.waypoints import load_waypoints
 from tests.runtime.path_robot import ROBOTS, path_robot
 
 
@@ -24,7 +24,7 @@ def way(*legs):
 
 
 def found(places):
-    return hairpin(Path(Waypoints(places)))
+    return hairpin(PathTable(places))
 
 
 # Where the planner stopped for good in simulated drives (docs/robot.md).

@@ -1,0 +1,294 @@
+"""The paper's task: follow a circle at a constant speed, counter-clockwise (section V-B)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import ClassVar, NamedTuple, Self
+
+import msgspec
+import numpy as np
+
+from disco_hw.errors import InputError
+from disco_hw.tasks.cost import Found, norm, norm_and_inverse, single
+from disco_hw.tasks.task import (
+    CENTER_M,
+    FARTHEST_M,
+    SLOWEST_M_S,
+    Array,
+    Chassis,
+    Editable,
+    Point,
+    Positive,
+    Prepared,
+    RobotTask,
+    TaskFault,
+)
+
+RADIUS_M = (0.1, 50.0)
+"""Least and largest radius that a person may change it to."""
+# The radius over the distance from the centre below which progress stops growing.
+NEAR_CENTRE = 2.0
+_ZERO = single(0.0)
+
+
+class CircleTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Follow a circle counter-clockwise at a constant speed (paper, section V-B)."""
+
+    implied_by: ClassVar[str | None] = ""
+    read_fields: ClassVar[tuple[str, ...]] = ()
+
+    center_x_m: float = 0.0
+    center_y_m: float = 0.0
+    radius_m: Positive = 0.75
+    speed_m_s: Positive = 0.2
+
+    @property
+    def reference_speed_m_s(self) -> float:
+        """The speed of [task]."""
+        return self.speed_m_s
+
+    @property
+    def file(self) -> str | None:
+        """None: the fields say all."""
+        return None
+
+    def with_file(self, _file: Path, _robot: Chassis, _judged: bool) -> Self:
+        """Itself."""
+        return self
+
+    def fault(self) -> TaskFault | None:
+        """A circle that goes where no pose is known."""
+        for field in ("center_x_m", "center_y_m"):
+            farthest_m = abs(getattr(self, field)) + self.radius_m
+            if farthest_m > FARTHEST_M:
+                return TaskFault(
+                    field,
+                    f"with radius_m the circle goes {farthest_m:g} m from the origin, and poses only {FARTHEST_M:g} m",
+                    "write a circle in the frame of the poses",
+                )
+        return None
+
+    def fastest_m_s(self, robot: Chassis) -> float:
+        """Speed at which the outer wheel is at its limit."""
+        outer = 1.0 + 0.5 * robot.axial_distance_m / self.radius_m
+        return robot.max_wheel_speed_rad_s * robot.wheel_radius_m / outer
+
+    def too_fast(self, robot: Chassis) -> str | None:
+        """Why the outer wheel cannot do it, and the remedy; None if it can."""
+        fastest = self.fastest_m_s(robot)
+        if self.speed_m_s <= fastest:
+            return None
+        return (
+            f"{self.speed_m_s:g} m/s on a radius of {self.radius_m:g} m asks the outer wheel for more than "
+            f"{robot.max_wheel_speed_rad_s:g} rad/s; at most {math.floor(fastest * 1000.0) / 1000.0:g} m/s, or widen it"
+        )
+
+    def editable(self, robot: Chassis) -> Mapping[str, Editable]:
+        """All fields; the speed's largest value is that on the present radius."""
+        return {
+            "radius_m": Editable(*RADIUS_M, "Radius (m)"),
+            "speed_m_s": Editable(SLOWEST_M_S, self.fastest_m_s(robot), "Speed (m/s)"),
+            "center_x_m": Editable(*CENTER_M, "Centre x (m)"),
+            "center_y_m": Editable(*CENTER_M, "Centre y (m)"),
+        }
+
+    def editing_note(self, robot: Chassis) -> str:
+        """The range of the radius and the largest speed."""
+        low, high = RADIUS_M
+        return f"Radius {low:g} to {high:g} m; at {self.radius_m:g} m at most {self.fastest_m_s(robot):.3f} m/s."
+
+    def in_words(self) -> str:
+        """Size, place and speed."""
+        centre = f"({self.center_x_m:g}, {self.center_y_m:g}) m"
+        return f"circle of {self.radius_m:g} m about {centre} at {self.speed_m_s:g} m/s"
+
+    def course(self) -> CircleCourse:
+        """The circle."""
+        return CircleCourse(self.center_x_m, self.center_y_m, self.radius_m)
+
+    def progress(self) -> LapCounter:
+        """Laps round the centre."""
+        return LapCounter(self.center_x_m, self.center_y_m)
+
+    def planned(self, mode: str) -> CircleCost:
+        """The circle with the cost of the control mode."""
+        cost = CircleCost(self.center_x_m, self.center_y_m, self.radius_m, self.speed_m_s)
+        return cost.paper() if mode == "paper" else cost
+
+
+TASK = CircleTask
+
+
+def circle_task(task: RobotTask, purpose: str) -> CircleTask:
+    """The task, which `purpose` needs to be a circle; raises InputError for another."""
+    if not isinstance(task, CircleTask):
+        raise InputError(f'{purpose} needs a circle: write kind = "circle" with radius_m and speed_m_s in [task]')
+    return task
+
+
+@dataclass(frozen=True, slots=True)
+class CircleCourse:
+    """A circle, driven counter-clockwise."""
+
+    center_x_m: float
+    center_y_m: float
+    radius_m: float
+
+    @property
+    def noun(self) -> str:
+        """What it is called."""
+        return "circle"
+
+    @property
+    def middle_m(self) -> Point:
+        """The centre."""
+        return self.center_x_m, self.center_y_m
+
+    @property
+    def reach_m(self) -> float:
+        """The radius."""
+        return self.radius_m
+
+    @property
+    def length_m(self) -> float:
+        """The circumference."""
+        return 2.0 * math.pi * self.radius_m
+
+    @property
+    def start(self) -> tuple[float, float, float]:
+        """East of the centre, facing north."""
+        return self.center_x_m + self.radius_m, self.center_y_m, 0.5 * math.pi
+
+    def outline_m(self) -> Array:
+        """Points (181, 2), the last on the first."""
+        angle = np.linspace(0.0, 2.0 * np.pi, 181)
+        x, y = np.cos(angle), np.sin(angle)
+        return np.stack((self.center_x_m + self.radius_m * x, self.center_y_m + self.radius_m * y), axis=1)
+
+    def off_m(self, places_m: Array) -> Array:
+        """Distance (N,) of positions (N, 2), positive outside."""
+        return np.asarray(np.hypot(places_m[:, 0] - self.center_x_m, places_m[:, 1] - self.center_y_m) - self.radius_m)
+
+
+class LapCounter:
+    """Laps round a centre since the task last started, counter-clockwise positive."""
+
+    def __init__(self, center_x_m: float, center_y_m: float) -> None:
+        self._center_x_m, self._center_y_m = center_x_m, center_y_m
+        self._last_rad: float | None = None
+        self._turned_rad = 0.0
+        self._paused = True
+
+    @property
+    def laps(self) -> float:
+        """Laps of the present run, or of the last one while paused."""
+        return self._turned_rad / (2.0 * math.pi)
+
+    @property
+    def finished(self) -> bool:
+        """Never: a circle has no end."""
+        return False
+
+    def in_words(self) -> tuple[str, str]:
+        """Laps."""
+        return "laps", f"{self.laps:.2f}"
+
+    def add(self, _now_ns: int, x_m: float, y_m: float, _yaw_rad: float) -> None:
+        """Take in the pose of one tick; the first one after a pause starts a new count."""
+        angle = math.atan2(y_m - self._center_y_m, x_m - self._center_x_m)
+        if self._paused or self._last_rad is None:
+            self._turned_rad, self._paused = 0.0, False
+        else:
+            self._turned_rad += math.remainder(angle - self._last_rad, 2.0 * math.pi)
+        self._last_rad = angle
+
+    def pause(self) -> None:
+        """The task does not run in this tick."""
+        self._paused = True
+
+
+@dataclass(frozen=True, slots=True)
+class CircleCost:
+    """Follow a circle counter-clockwise: sum of c = sqrt(d^2 + (s - s0)^2) over the steps, plus lost progress.
+
+    d is the distance to the circle's edge, s the longitudinal speed: the paper's cost (section V-B). It alone is 0.2
+    for standing still and less for spinning about an offset centre of rotation. Progress takes the reward from both: it
+    is R times the angle by which the tracked point moves on about the centre, zero in sum for any loop beside it; what
+    the steps together miss of `progress_part` of s0 costs `progress_weight` times as much as the same miss of speed. A
+    robot that drives round pays nothing. The
+    last d counts as much as it would over `terminal_s` more: the way back to the edge begins with a loss, as turning in
+    pushes the tracked point out, and would else not pay within the horizon. `paper` has neither.
+    """
+
+    center_x_m: float = 0.0
+    center_y_m: float = 0.0
+    radius_m: float = 0.75
+    speed_m_s: float = 0.2
+    progress_weight: float = 1.0
+    progress_part: float = 0.8
+    terminal_s: float = 1.0
+
+    def paper(self) -> CircleCost:
+        """The same circle with the paper's cost alone."""
+        return replace(self, progress_weight=0.0, terminal_s=0.0)
+
+    def prepare(
+        self, time_s: float, x_m: float, y_m: float, yaw_rad: float, memory: float | None, step_s: float, horizon: int
+    ) -> Prepared:
+        """Terms for the kernel; nothing depends on time or place. The memory is the angle swept (rad)."""
+        return _prepared(self, step_s, horizon)
+
+    def instant_cost(self, time_s: float, x_m: float, y_m: float, forward_m_s: float) -> float:
+        """The paper's instant cost of a state."""
+        distance = math.hypot(x_m - self.center_x_m, y_m - self.center_y_m) - self.radius_m
+        return math.hypot(distance, forward_m_s - self.speed_m_s)
+
+
+class CircleTerms(NamedTuple):
+    """The cost round the origin.
+
+    Radius (m), speed (m/s); weight of lost progress, progress wanted by the end of the horizon (m/s times steps),
+    progress of a radian (m/s), largest reciprocal square of the radius; weight of the last distance.
+    """
+
+    radius_m: float
+    speed_m_s: float
+    progress_weight: float
+    wanted: float
+    per_rad: float
+    closest: float
+    terminal_steps: float
+
+    def stage(
+        self, memory: float, step: int, x_old: float, y_old: float, x: float, y: float,
+        cos_yaw: float, sin_yaw: float, forward: float, found: Found,
+    ) -> tuple[float, float]:  # fmt: skip
+        """The paper's c, and the angle swept about the centre (rad); near the centre steps count less than theirs."""
+        rho, inverse = norm_and_inverse(x, y)
+        off_edge = rho - self.radius_m
+        off_speed = forward - self.speed_m_s
+        swept = memory + (x_old * y - y_old * x) * min(inverse * inverse, self.closest)
+        return math.sqrt(off_edge * off_edge + off_speed * off_speed), swept
+
+    def terminal(self, memory: float, x: float, y: float, cos_yaw: float, sin_yaw: float, found: Found) -> float:
+        """The progress that is missing at the end, and the distance to the edge that is left."""
+        lost = self.progress_weight * max(self.wanted - memory * self.per_rad, _ZERO)
+        return lost + self.terminal_steps * abs(norm(x, y) - self.radius_m)
+
+
+@lru_cache(maxsize=16)
+def _prepared(circle: CircleCost, step_s: float, horizon: int) -> Prepared:
+    numbers = (
+        circle.radius_m,
+        circle.speed_m_s,
+        circle.progress_weight,
+        circle.progress_part * circle.speed_m_s * horizon,
+        circle.radius_m / step_s,
+        (NEAR_CENTRE / circle.radius_m) ** 2,
+        circle.terminal_s / step_s,
+    )
+    return Prepared(CircleTerms(*map(single, numbers)), (circle.center_x_m, circle.center_y_m))

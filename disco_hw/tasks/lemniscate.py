@@ -1,0 +1,127 @@
+"""Follow a figure of eight that crosses itself: the lemniscate of Bernoulli, round and round at a constant speed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from functools import lru_cache
+from pathlib import Path
+from typing import Annotated, ClassVar, Self
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+
+from disco_hw.tasks.line.cost import PathCost
+from disco_hw.tasks.line.course import LineCourse, line_course
+from disco_hw.tasks.line.progress import PathProgress
+from disco_hw.tasks.line.table import PathTable
+from disco_hw.tasks.task import CENTER_M, FARTHEST_M, SLOWEST_M_S, Chassis, Editable, Point, Positive, TaskFault
+
+SIZE_M = (0.3, 50.0)
+_POINTS = 400
+_SMALLEST_M = 0.05
+
+
+class LemniscateTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Follow a lemniscate of Bernoulli, both lobes in turn, at a constant speed.
+
+    `size_m`: from the crossing to the far end of each lobe, along x. With t from 0 to 2 pi, in units of it,
+    x = cos t / (1 + sin^2 t), y = x sin t; the tightest bend is at the far ends, of radius size / 3.
+    """
+
+    implied_by: ClassVar[str | None] = None
+    read_fields: ClassVar[tuple[str, ...]] = ()
+
+    center_x_m: float = 0.0
+    center_y_m: float = 0.0
+    size_m: Annotated[float, Meta(ge=_SMALLEST_M)] = 1.5
+    speed_m_s: Positive = 0.2
+
+    @property
+    def reference_speed_m_s(self) -> float:
+        """The speed of [task]."""
+        return self.speed_m_s
+
+    @property
+    def file(self) -> str | None:
+        """None: the fields say all."""
+        return None
+
+    def with_file(self, _file: Path, _robot: Chassis, _judged: bool) -> Self:
+        """Itself."""
+        return self
+
+    def fault(self) -> TaskFault | None:
+        """A figure that goes where no pose is known."""
+        for field in ("center_x_m", "center_y_m"):
+            farthest_m = abs(getattr(self, field)) + self.size_m
+            if farthest_m > FARTHEST_M:
+                return TaskFault(
+                    field,
+                    f"with size_m the figure goes {farthest_m:g} m from the origin, and poses only {FARTHEST_M:g} m",
+                    "write a figure in the frame of the poses",
+                )
+        return None
+
+    def fastest_m_s(self, robot: Chassis) -> float:
+        """Speed at which the outer wheel is at its limit in the tightest bend."""
+        outer = 1.0 + 0.5 * robot.axial_distance_m / (self.size_m / 3.0)
+        return robot.max_wheel_speed_rad_s * robot.wheel_radius_m / outer
+
+    def too_fast(self, robot: Chassis) -> str | None:
+        """Why the outer wheel cannot do it, and the remedy; None if it can."""
+        fastest = self.fastest_m_s(robot)
+        if self.speed_m_s <= fastest:
+            return None
+        return (
+            f"{self.speed_m_s:g} m/s on a figure of {self.size_m:g} m asks the outer wheel for more than "
+            f"{robot.max_wheel_speed_rad_s:g} rad/s; at most {math.floor(fastest * 1000.0) / 1000.0:g} m/s, or widen it"
+        )
+
+    def editable(self, robot: Chassis) -> Mapping[str, Editable]:
+        """All fields; the speed's largest value is that on the present size."""
+        return {
+            "size_m": Editable(*SIZE_M, "Size (m)"),
+            "speed_m_s": Editable(SLOWEST_M_S, self.fastest_m_s(robot), "Speed (m/s)"),
+            "center_x_m": Editable(*CENTER_M, "Centre x (m)"),
+            "center_y_m": Editable(*CENTER_M, "Centre y (m)"),
+        }
+
+    def editing_note(self, robot: Chassis) -> str:
+        """The largest speed."""
+        return f"At a size of {self.size_m:g} m at most {self.fastest_m_s(robot):.3f} m/s."
+
+    def in_words(self) -> str:
+        """Size, place and speed."""
+        centre = f"({self.center_x_m:g}, {self.center_y_m:g}) m"
+        return f"lemniscate of {self.size_m:g} m about {centre} at {self.speed_m_s:g} m/s"
+
+    def points(self) -> tuple[Point, ...]:
+        """The figure as way-points: from the crossing along the lobe to the right, the last on the first."""
+        return _points(self.center_x_m, self.center_y_m, self.size_m)
+
+    def course(self) -> LineCourse:
+        """The line through the figure's points."""
+        return line_course(self.points(), "lemniscate")
+
+    def progress(self) -> PathProgress:
+        """Laps of both lobes."""
+        return PathProgress(PathTable(np.array(self.points())))
+
+    def planned(self, _mode: str) -> PathCost:
+        """The figure with the cost of a path, the same in every mode."""
+        return PathCost(PathTable(np.array(self.points())), self.speed_m_s)
+
+
+TASK = LemniscateTask
+
+
+@lru_cache(maxsize=8)
+def _points(center_x_m: float, center_y_m: float, size_m: float) -> tuple[Point, ...]:
+    t = np.linspace(-0.5 * math.pi, 1.5 * math.pi, _POINTS + 1)
+    x = size_m * np.cos(t) / (1.0 + np.sin(t) ** 2)
+    y = x * np.sin(t)
+    # Rounding is no reason for an end: the last point is the first.
+    x[-1], y[-1] = x[0], y[0]
+    return tuple(zip((center_x_m + x).tolist(), (center_y_m + y).tolist(), strict=True))

@@ -1,0 +1,1 @@
+"""What kinds of tasks share that follow a line of way-points: its table, course, progress and cost, and their file."""

@@ -1,0 +1,180 @@
+"""The cost of following way-points by arc length, at a constant speed, and of stopping at their end."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from disco_hw.tasks.cost import Found, constant, helper, norm, norm_and_inverse, norm_of_three, single
+from disco_hw.tasks.line.table import PathTable
+from disco_hw.tasks.task import Prepared
+
+SLOW_DOWN_S = 1.0
+FARTHEST_STEP_M = 0.5
+# Facing straight against the way costs as much as being so far off it.
+AGAINST_M = 0.6
+# Standing costs at least as much as being so far off the path, however slow it is to be driven.
+STANDING_M = 0.4
+# The last distance counts as much as it would over so much longer: turning in pushes the tracked point out at first.
+TERMINAL_S = 1.0
+# Entries of the table that rollouts see relative to the same point: few, as single precision tells 0.1 um of 1 m.
+NEAR = 50
+_ZERO, _ONE, _AGAINST = single(0.0), single(1.0), single(AGAINST_M)
+
+
+@dataclass(frozen=True, eq=False)
+class PathCost:
+    """Follow way-points by arc length: c = sqrt(e^2 + (progress - wanted)^2) + facing, e the distance to the path.
+
+    The place on the path is carried along every rollout: each step moves it by the step's projection on the path's
+    direction; so a path may cross itself. The speed of that is the progress, but no more than the forward speed; so
+    standing still or spinning costs the whole wanted speed, and driving backwards twice of it. Facing is AGAINST_M
+    times the part of the heading that is against the path's direction: backwards would else be the easier way, for it
+    puts the tracked point before the axle. Wanted is `speed_m_s`, and less in the last second of an open path.
+
+    Where the way turns sharply, rollouts end at the end of the table's piece, the robot stops there, and then turns to
+    the next, which it could not find by sampling as nothing is gained before the turn is half done.
+    """
+
+    path: PathTable
+    speed_m_s: float = 0.2
+
+    def prepare(
+        self, time_s: float, x_m: float, y_m: float, yaw_rad: float, memory: float | None, step_s: float, horizon: int
+    ) -> Prepared:
+        """Terms for the kernel; the memory is the place on the path, in entries of the table.
+
+        Rollouts count it from where they begin, and are relative to a point of the path nearby, so that a long path is
+        as precise as a short one.
+        """
+        path = self.path
+        place, first, last = path.piece(path.place(x_m, y_m, yaw_rad, memory))
+        reach = horizon * math.ceil(FARTHEST_STEP_M / path.spacing_m) + 1
+        near = _nearby(path, int(place) // NEAR, reach)
+        low, high, end = place - reach, place + reach, math.inf
+        if path.ends:
+            low, high, end = max(low, first), min(high, last), last - place
+        begin, rows = int(low) - near.first, int(high - low)
+        terms = PathTerms(
+            near.pieces[4 * begin : 4 * (begin + rows)],
+            single(low - place),
+            single(high - place),
+            single(end),
+            *_numbers(path, self.speed_m_s, step_s),
+        )
+        return Prepared(terms, near.origin_m, 0.0, place)
+
+    def instant_cost(self, time_s: float, x_m: float, y_m: float, forward_m_s: float) -> float:
+        """Distance to the path and error of the longitudinal speed, as one length."""
+        table = self.path.table
+        distance = np.hypot(table[:, 0] - x_m, table[:, 1] - y_m).min()
+        return math.hypot(float(distance), forward_m_s - self.speed_m_s)
+
+
+class PathTerms(NamedTuple):
+    """The cost along the part of a path's table that can be reached within the horizon.
+
+    `table` (4 M,): for each piece between two entries, from one to the next, where it begins, x and y (m), and how far
+    it goes in x and y (m). Places count in entries from where the robot is: `first` and `last` are the table's ends,
+    `end` is where the robot stops, or infinite. `per_m`: entries a metre; `speed_m_s`; `speed_per_entry`: progress
+    speed of one entry in a step (m/s); `slow_per_entry`: wanted speed for each entry left; `speed_weight`: of missing
+    speed; `terminal_steps`: weight of the last distance.
+    """
+
+    table: NDArray[np.float32]
+    first: float
+    last: float
+    end: float
+    per_m: float
+    speed_m_s: float
+    speed_per_entry: float
+    slow_per_entry: float
+    speed_weight: float
+    terminal_steps: float
+
+    def follow(self, memory: float, x: float, y: float, forward: float, found: Found) -> tuple[float, float]:
+        """The place after a step, and what the step misses of the wanted speed, weighted."""
+        off_x, off_y, along_x, along_y = _offset(self.last, memory, x, y, found[1:])
+        # A `single` of its own makes the compiler round another product: old logs would give other last bits.
+        farthest = constant(FARTHEST_STEP_M, x)
+        along = min(max(off_x * along_x + off_y * along_y, -farthest), farthest) * self.per_m
+        wanted = min(self.speed_m_s, (self.end - memory) * self.slow_per_entry)
+        missing = self.speed_weight * (wanted - min(along * self.speed_per_entry, forward))
+        # In this order, so that what is no number becomes a place, and the cost tells of it.
+        return min(self.last, max(self.first, memory + along)), missing
+
+    def row_of(self, memory: float) -> int:
+        """The row of the table for a place."""
+        row: int = np.int32(np.floor(min(memory, self.last - _ONE)) - self.first)  # type: ignore[assignment]
+        return row
+
+    def stage(
+        self, memory: float, step: int, x_old: float, y_old: float, x: float, y: float,
+        cos_yaw: float, sin_yaw: float, forward: float, found: Found,
+    ) -> tuple[float, float]:  # fmt: skip
+        """Distance to the path and missing speed as one length, and facing."""
+        off_x, off_y, along_x, along_y = _offset(self.last, memory, x, y, found[1:])
+        against = max(-(cos_yaw * along_x + sin_yaw * along_y), _ZERO)
+        return norm_of_three(off_x, off_y, found[0]) + _AGAINST * against, memory
+
+    def terminal(self, memory: float, x: float, y: float, cos_yaw: float, sin_yaw: float, found: Found) -> float:
+        """The last distance."""
+        off_x, off_y, _, _ = _offset(self.last, memory, x, y, found[1:])
+        return self.terminal_steps * norm(off_x, off_y)
+
+
+@helper
+def _offset(
+    last: float, place: float, x: float, y: float, piece: tuple[float, float, float, float]
+) -> tuple[float, float, float, float]:
+    """Position relative to the path's point at a place (m), and the direction of the path there; `piece` is its row."""
+    begin_x, begin_y, step_x, step_y = piece
+    part = place - np.floor(min(place, last - _ONE))
+    _, per_m = norm_and_inverse(step_x, step_y)
+    return x - (begin_x + part * step_x), y - (begin_y + part * step_y), step_x * per_m, step_y * per_m
+
+
+class _Nearby(NamedTuple):
+    """Part of a path, flat as in PathTerms, from the entry `first` on and relative to `origin_m`."""
+
+    pieces: NDArray[np.float32]
+    first: int
+    origin_m: tuple[float, float]
+
+
+@lru_cache(maxsize=8)
+def _nearby(path: PathTable, block: int, reach: int) -> _Nearby:
+    """The block of NEAR entries of a path, and `reach` more on both sides: round and round if it is closed."""
+    table, count = path.table, len(path.table) - 1
+    first, end = block * NEAR - reach, (block + 1) * NEAR + reach
+    if not path.closed:
+        first, end = max(first, 0), min(end, count)
+    at = np.arange(first, end) % count
+    here, there = table[at, :2], table[at + 1, :2]
+    # An open path's last entry is one of its own: it is not the first.
+    origin = table[block * NEAR % count if path.closed else block * NEAR, :2]
+    pieces = np.hstack([here - origin, there - here]).astype(np.float32)
+    x_m, y_m = origin.tolist()
+    return _Nearby(pieces.reshape(-1), first, (x_m, y_m))
+
+
+@lru_cache(maxsize=8)
+def _numbers(path: PathTable, speed_m_s: float, step_s: float) -> tuple[float, ...]:
+    """The terms from `per_m` on: those that no plan changes."""
+    spacing = path.spacing_m
+    return tuple(
+        single(value)
+        for value in (
+            1.0 / spacing,
+            speed_m_s,
+            spacing / step_s,
+            spacing / SLOW_DOWN_S,
+            max(1.0, STANDING_M / speed_m_s),
+            TERMINAL_S / step_s,
+        )
+    )

@@ -1,0 +1,164 @@
+"""A path of way-points in equal pieces of arc length, and where on it a robot is."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from disco_hw.tasks.task import Array
+
+SPACING_M = 0.02
+LOOK_BACK_M = 0.3
+LOOK_AHEAD_M = 1.0
+LOST_M = 1.0
+# Where the way turns by more than SHARP from one TURN_M to the next, the robot stops, within REACHED_M, and turns.
+SHARP_RAD = math.radians(125.0)
+TURN_M = 0.15
+REACHED_M = 0.05
+# Branches of which none is further off than the nearest by so much may be meant; facing straight against one counts as
+# much as being so much further off it.
+BRANCHES_M = 0.3
+AGAINST_BRANCH_M = 0.6
+
+
+@dataclass(frozen=True, eq=False)
+class PathTable:
+    """Way-points (N, 2) in equal pieces of arc length.
+
+    Where the way turns sharply it is cut into pieces: the robot stops at a piece's end and turns to the next. The path
+    is closed if its last way-point is its first. Raises ValueError for way-points closer than the table's spacing
+    throughout.
+    """
+
+    places_m: Array
+    _table: Array = field(init=False, repr=False)
+    _closed: bool = field(init=False, repr=False)
+    _spacing_m: float = field(init=False, repr=False)
+    _bounds: Array = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        places = self.places_m
+        distance = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(places, axis=0).T))])
+        count = round(distance[-1] / SPACING_M)
+        if count < 1:
+            raise ValueError(f"the path is {distance[-1]} m long; it must be longer than {SPACING_M} m")
+        at = np.linspace(0.0, distance[-1], count + 1)
+        x, y = np.interp(at, distance, places[:, 0]), np.interp(at, distance, places[:, 1])
+        closed = bool(np.hypot(*(places[0] - places[-1])) < SPACING_M)
+        step_x, step_y = np.diff(x), np.diff(y)
+        length = np.maximum(np.hypot(step_x, step_y), 1e-12)
+        along_x = np.append(step_x / length, (step_x / length)[0 if closed else -1])
+        along_y = np.append(step_y / length, (step_y / length)[0 if closed else -1])
+        table, spacing = np.column_stack([x, y, along_x, along_y]), float(distance[-1]) / count
+        corners = sharp_turns(table[:, :2], closed, max(1, round(TURN_M / spacing)))
+        bounds = [*corners, *(corner + count for corner in corners[:1])] if closed else [0, *corners, count]
+        object.__setattr__(self, "_table", table)
+        object.__setattr__(self, "_closed", closed)
+        object.__setattr__(self, "_spacing_m", spacing)
+        object.__setattr__(self, "_bounds", np.array(bounds, dtype=float))
+
+    @property
+    def table(self) -> Array:
+        """The path in equal pieces of arc length: x, y (m) and the unit tangent of the piece that begins there."""
+        return self._table
+
+    @property
+    def closed(self) -> bool:
+        """Whether the path's end is its beginning."""
+        return self._closed
+
+    @property
+    def sharp_turns(self) -> tuple[int, ...]:
+        """Entries of the table at which the robot stops to turn."""
+        ends = slice(0, -1) if self._closed else slice(1, -1)
+        return tuple(self._bounds.astype(int)[ends].tolist())
+
+    @property
+    def ends(self) -> bool:
+        """Whether rollouts end somewhere: at the path's end or before a sharp turn."""
+        return bool(self._bounds.size)
+
+    @property
+    def spacing_m(self) -> float:
+        """Arc length between two entries of the table."""
+        return self._spacing_m
+
+    def piece(self, place: float) -> tuple[float, float, float]:
+        """The piece that a place is on: the place, not less than the piece's first entry; its first and last entry.
+
+        A piece of a closed path may go past the table's end, and so may the place. A path without sharp turns is one
+        piece; of a closed one, which has no end, the last entry is the first again.
+        """
+        bounds, count = self._bounds, len(self._table) - 1
+        if not bounds.size:
+            return place % count, 0.0, float(count)
+        if self._closed:
+            place = place % count
+            place += count if place < bounds[0] else 0.0
+        at = min(int(np.searchsorted(bounds, place, side="right")), bounds.size - 1)
+        return place, float(bounds[at - 1]), float(bounds[at])
+
+    def place(self, x_m: float, y_m: float, yaw_rad: float, before: float | None) -> float:
+        """Entry of the table nearest to a pose: near the one before, or anywhere without one or off the path.
+
+        Near the one before means on the same piece; at the end of a piece the next one begins. Where several branches
+        pass by, the first place is on the one that the heading fits.
+        """
+        count, spacing = len(self._table) - 1, self._spacing_m
+        if before is not None:
+            here, first, last = self.piece(before)
+            low, high = round(here - LOOK_BACK_M / spacing), round(here + LOOK_AHEAD_M / spacing)
+            if self._bounds.size:
+                low, high = max(low, int(first)), min(high, int(last))
+            if low >= 0 and high <= count:
+                rows = self._table[low : high + 1]
+            else:
+                rows = self._table[np.arange(low, high + 1) % count]
+            square = (rows[:, 0] - x_m) ** 2 + (rows[:, 1] - y_m) ** 2
+            nearest = int(square.argmin())
+            if square[nearest] < LOST_M**2:
+                found = float(low + nearest)
+                if self._bounds.size and (self._closed or last < count) and (last - found) * spacing <= REACHED_M:
+                    found = last
+                return found % count if self._closed else found
+        return float(self._branch(x_m, y_m, yaw_rad))
+
+    def _branch(self, x_m: float, y_m: float, yaw_rad: float) -> int:
+        """Entry where the branch is nearest whose distance and direction together fit a pose best."""
+        distance = np.hypot(self._table[:, 0] - x_m, self._table[:, 1] - y_m)
+        nearest = int(np.argmin(distance))
+        if not (math.isfinite(yaw_rad) and math.isfinite(distance[nearest])):
+            return nearest
+        if self._closed:
+            before, after = np.roll(distance[:-1], 1), np.roll(distance[:-1], -1)
+            before, after = np.append(before, before[0]), np.append(after, after[0])
+        else:
+            before, after = np.append(np.inf, distance[:-1]), np.append(distance[1:], np.inf)
+        branches = np.flatnonzero((distance <= before) & (distance < after))
+        branches = np.append(nearest, branches[distance[branches] < distance[nearest] + BRANCHES_M])
+        along = self._table[branches, 2] * math.cos(yaw_rad) + self._table[branches, 3] * math.sin(yaw_rad)
+        return int(branches[np.argmin(distance[branches] + 0.5 * AGAINST_BRANCH_M * (1.0 - along))])
+
+
+def sharp_turns(points: Array, closed: bool, reach: int) -> list[int]:
+    """Indices of points (M + 1, 2) where the way turns by more than SHARP_RAD from `reach` points to the next `reach`.
+
+    The sharpest of any that are within `reach` of one another; in rising order. The last point of a closed way is its
+    first, and not told again.
+    """
+    count = len(points) - 1
+    index = np.arange(count) if closed else np.arange(1, count)
+    before, after = index - reach, index + reach
+    before, after = (before % count, after % count) if closed else (np.maximum(before, 0), np.minimum(after, count))
+    came, goes = points[index] - points[before], points[after] - points[index]
+    alike = (came * goes).sum(axis=1)
+    sharp = alike < math.cos(SHARP_RAD) * np.hypot(*came.T) * np.hypot(*goes.T)
+    found: list[int] = []
+    # Where the way turns back, points before the turn look as sharp, but not over as long a way.
+    for at in np.flatnonzero(sharp)[np.argsort(alike[sharp], kind="stable")]:
+        apart = [abs(int(index[at]) - other) for other in found]
+        if all(min(gap, count - gap) > reach if closed else gap > reach for gap in apart):
+            found.append(int(index[at]))
+    return sorted(found)

@@ -1,0 +1,104 @@
+"""Follow way-points by arc length at a constant speed: round and round if the last is the first, else to the end."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, ClassVar, Self
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+
+from disco_hw.errors import InputError
+from disco_hw.tasks.line.cost import PathCost
+from disco_hw.tasks.line.course import LineCourse, line_course
+from disco_hw.tasks.line.progress import PathProgress
+from disco_hw.tasks.line.speed import speed_range, straight_fastest_m_s, straight_too_fast
+from disco_hw.tasks.line.table import PathTable
+from disco_hw.tasks.line.waypoints import check_size, load_waypoints, points_of
+from disco_hw.tasks.task import Chassis, Editable, Point, Positive, TaskFault
+
+
+class PathTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Follow way-points by arc length at a constant speed; round and round if the last is the first, else to the end.
+
+    `path`: CSV with columns x_m, y_m (m, world frame), relative to robot.toml. `points` are what is read from it; no
+    field of robot.toml.
+    """
+
+    implied_by: ClassVar[str | None] = "path"
+    read_fields: ClassVar[tuple[str, ...]] = ("points",)
+
+    path: Annotated[str, Meta(min_length=1)]
+    speed_m_s: Positive = 0.2
+    points: tuple[Point, ...] = ()
+
+    @property
+    def reference_speed_m_s(self) -> float:
+        """The speed of [task]."""
+        return self.speed_m_s
+
+    @property
+    def file(self) -> str | None:
+        """The CSV."""
+        return self.path
+
+    def with_file(self, file: Path, _robot: Chassis, judged: bool) -> Self:
+        """The task with the way-points of a CSV.
+
+        Raises InputError as `load_waypoints`, and for times, for too many way-points, for a path that is too short or
+        too long, for a way-point further from the origin than poses go, and, if it is `judged`, for hairpins.
+        """
+        found = load_waypoints(file)
+        if found.times_s is not None:
+            raise InputError(
+                f"{file}: line 1: column t_s: the robot follows at task.speed_m_s; remove the column, or follow it by "
+                'time with kind = "timed_path" in [task]'
+            )
+        check_size(file, found)
+        if judged:
+            # Loaded where it is needed alone: half of the daemon's commands need no path.
+            from disco_hw.tasks.line.hairpins import refuse_hairpins  # noqa: PLC0415
+
+            refuse_hairpins(file, found)
+        return msgspec.structs.replace(self, points=points_of(found))
+
+    def fault(self) -> TaskFault | None:
+        """None: what can be wrong is in the file."""
+        return None
+
+    def fastest_m_s(self, robot: Chassis) -> float:
+        """Speed straight ahead at which the wheels are at their limit."""
+        return straight_fastest_m_s(robot)
+
+    def too_fast(self, robot: Chassis) -> str | None:
+        """Why the wheels cannot do it, and the remedy; None if they can."""
+        return straight_too_fast(self.speed_m_s, robot)
+
+    def editable(self, robot: Chassis) -> Mapping[str, Editable]:
+        """The speed."""
+        return speed_range(robot)
+
+    def editing_note(self, robot: Chassis) -> str:
+        """The largest speed."""
+        return f"At most {self.fastest_m_s(robot):.3f} m/s."
+
+    def in_words(self) -> str:
+        """File, length and speed."""
+        return f"path {self.path} of {self.course().length_m:.2f} m at {self.speed_m_s:g} m/s"
+
+    def course(self) -> LineCourse:
+        """The line through the way-points."""
+        return line_course(self.points, "path")
+
+    def progress(self) -> PathProgress:
+        """Laps of a closed path, or the part of an open one that is behind."""
+        return PathProgress(PathTable(np.array(self.points)))
+
+    def planned(self, _mode: str) -> PathCost:
+        """The path with its cost, the same in every mode."""
+        return PathCost(PathTable(np.array(self.points)), self.speed_m_s)
+
+
+TASK = PathTask

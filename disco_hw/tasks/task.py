@@ -1,0 +1,188 @@
+"""What a task is to everything else: the section of robot.toml, its line on the ground, its progress, its cost."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, NamedTuple, Protocol, Self
+
+import numpy as np
+from msgspec import Meta
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Point = tuple[float, float]
+FARTHEST_M = 838.0
+"""How far from the origin a task may go: the frames of a pose hold 838.86 m along x and y (disco_robot.dbc)."""
+SLOWEST_M_S = 0.01
+CENTER_M = (-1000.0, 1000.0)
+"""The slowest speed, and the least and largest coordinate of a centre, that a person may change a task to."""
+Positive = Annotated[float, Meta(gt=0.0)]
+
+
+class Chassis(Protocol):
+    """What a task asks of the robot: [robot] of robot.toml has it."""
+
+    @property
+    def wheel_radius_m(self) -> float:
+        """Nominal radius of the wheels."""
+
+    @property
+    def axial_distance_m(self) -> float:
+        """Nominal distance between left and right wheels."""
+
+    @property
+    def max_wheel_speed_rad_s(self) -> float:
+        """The fastest that a wheel may turn."""
+
+
+class Editable(NamedTuple):
+    """A field that a person may change while the robot is disarmed: least and largest value, and what it is called."""
+
+    low: float
+    high: float
+    label: str
+
+
+class TaskFault(NamedTuple):
+    """What is wrong with a task that no single field shows: the field to change, the fault, the remedy."""
+
+    field: str
+    fault: str
+    remedy: str
+
+
+class Course(Protocol):
+    """The line that a task follows: pure geometry for panels and pictures."""
+
+    @property
+    def noun(self) -> str:
+        """What it is called."""
+
+    @property
+    def middle_m(self) -> Point:
+        """The middle of the ground that it takes."""
+
+    @property
+    def reach_m(self) -> float:
+        """How far it goes from the middle along x or y."""
+
+    @property
+    def length_m(self) -> float:
+        """Length of the line, once round if it is closed."""
+
+    @property
+    def start(self) -> tuple[float, float, float]:
+        """Where to begin and which way to face: x, y (m), yaw (rad)."""
+
+    def outline_m(self) -> Array:
+        """The line as points (N, 2)."""
+
+    def off_m(self, places_m: Array) -> Array:
+        """Distance (N,) of positions (N, 2), positive to the right of the way: outside of a circle."""
+
+
+class Progress(Protocol):
+    """How far the task has been driven; follows the robot while the task runs."""
+
+    @property
+    def laps(self) -> float:
+        """Laps of the present run, or of the last one while paused; of a line with an end the part behind, 0 to 1."""
+
+    @property
+    def finished(self) -> bool:
+        """Whether there is nothing left to drive."""
+
+    def in_words(self) -> tuple[str, str]:
+        """What is counted, and how much of it, for a person."""
+
+    def add(self, now_ns: int, x_m: float, y_m: float, yaw_rad: float) -> None:
+        """Take in the pose of one tick; the first one after a pause begins anew."""
+
+    def pause(self) -> None:
+        """The task does not run in this tick."""
+
+
+class Prepared(NamedTuple):
+    """What a plan needs of its task.
+
+    `terms`: the compiled cost with its numbers in float32 (disco_hw/tasks/cost.py). `origin_m`: world position that
+    rollouts are relative to, so that single precision is fine anywhere; `begin`: the memory that they start with.
+    `memory`: to hand back at the next plan.
+    """
+
+    terms: tuple[Any, ...]  # Any: every kind has a named tuple of its own, which the compiler looks into.
+    origin_m: tuple[float, float]
+    begin: float = 0.0
+    memory: float = 0.0
+
+
+class PlannedTask(Protocol):
+    """A task as the planner takes it; immutable. The type of its terms decides which compiled cost is used."""
+
+    def prepare(
+        self, time_s: float, x_m: float, y_m: float, yaw_rad: float, memory: float | None, step_s: float, horizon: int
+    ) -> Prepared:
+        """What a plan from here needs.
+
+        `time_s` since the planner's start, the pose in the world, the memory that the last plan handed back (None at
+        the first), and the steps that will be planned.
+        """
+
+    def instant_cost(self, time_s: float, x_m: float, y_m: float, forward_m_s: float) -> float:
+        """Cost of being here at this time with this speed, for figures and displays."""
+
+
+class RobotTask(Protocol):
+    """A kind of task: a frozen msgspec struct whose fields are those of [task] in robot.toml."""
+
+    __struct_fields__: ClassVar[tuple[str, ...]]
+    implied_by: ClassVar[str | None]
+    """Field of [task] that says this kind where `kind` is not given; "" for the kind without one, else None."""
+    read_fields: ClassVar[tuple[str, ...]]
+    """Fields that are read from the file that `path` names, and are none of robot.toml's; () without a file."""
+
+    @property
+    def speed_m_s(self) -> float:
+        """The fastest that the task asks for."""
+
+    @property
+    def reference_speed_m_s(self) -> float:
+        """The one speed that is asked for throughout; NaN if there is none."""
+
+    @property
+    def file(self) -> str | None:
+        """The file that [task] names, relative to robot.toml."""
+
+    def with_file(self, file: Path, robot: Chassis, judged: bool) -> Self:
+        """The task with what its file holds, judged for what the robot cannot get past unless it was driven before.
+
+        Raises InputError naming file, line and remedy.
+        """
+
+    def fault(self) -> TaskFault | None:
+        """What is wrong with the fields of [task] taken together."""
+
+    def fastest_m_s(self, robot: Chassis) -> float:
+        """Speed at which a wheel of the nominal robot is at its limit on this task."""
+
+    def too_fast(self, robot: Chassis) -> str | None:
+        """Why the wheels of the nominal robot cannot do the task, and the remedy; None if they can."""
+
+    def editable(self, robot: Chassis) -> Mapping[str, Editable]:
+        """The fields that a person may change; the largest speed is that on the present line."""
+
+    def editing_note(self, robot: Chassis) -> str:
+        """What the page says below those fields, and why there are none where there are none."""
+
+    def in_words(self) -> str:
+        """The task for a person."""
+
+    def course(self) -> Course:
+        """Its line on the ground, the same one for every speed."""
+
+    def progress(self) -> Progress:
+        """The progress of the task as it begins."""
+
+    def planned(self, mode: str) -> PlannedTask:
+        """The task with the cost of the control mode, "default" or "paper"."""

@@ -1,0 +1,90 @@
+"""The costs of tasks over whole paths, in numpy and double precision, written apart from what is compiled."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from disco_hw.control.oracle import Array, SequenceCost
+from disco_hw.tasks.circle import CircleCost
+from disco_hw.tasks.line.cost import AGAINST_M, FARTHEST_STEP_M, SLOW_DOWN_S, STANDING_M, TERMINAL_S, PathCost
+from disco_hw.tasks.line.table import PathTable
+from disco_hw.tasks.line.waypoints import Waypoints
+from disco_hw.tasks.timed_path import RESTS_M, TimedPathCost
+
+
+def path_along(waypoints: Waypoints, speed_m_s: float = 0.2) -> PathCost:
+    """The cost of following way-points."""
+    return PathCost(PathTable(waypoints.places_m), speed_m_s)
+
+
+def circle_cost(circle: CircleCost, step_s: float) -> SequenceCost:
+    """Cost of paths x, y, yaw (T + 1, K) and forward speeds (T, K) round a circle; see `CircleCost`."""
+
+    def cost(x: Array, y: Array, yaw: Array, forward: Array) -> Array:
+        x, y = x - circle.center_x_m, y - circle.center_y_m
+        off_edge = np.hypot(x[1:], y[1:]) - circle.radius_m
+        paper = np.hypot(off_edge, forward - circle.speed_m_s).sum(axis=0)
+        closest = np.maximum(x[1:] ** 2 + y[1:] ** 2, (circle.radius_m / 2.0) ** 2)
+        angle = (x[:-1] * y[1:] - y[:-1] * x[1:]) / closest
+        missing = circle.progress_part * circle.speed_m_s * len(forward) - circle.radius_m / step_s * angle.sum(axis=0)
+        last = circle.terminal_s / step_s * np.abs(off_edge[-1])
+        return np.asarray(paper + circle.progress_weight * np.maximum(missing, 0.0) + last)
+
+    return cost
+
+
+def facing_cost(yaw: Array, along_x: Array | float, along_y: Array | float) -> Array:
+    """Cost of a step for the part of the heading that is against the way."""
+    return AGAINST_M * np.maximum(-(np.cos(yaw) * along_x + np.sin(yaw) * along_y), 0.0)
+
+
+def path_cost(task: PathCost, place: float, step_s: float) -> SequenceCost:
+    """Cost of paths (T + 1, K) along way-points by arc length, from a place (entries of the table); see `PathCost`.
+
+    Every step moves the place by its projection on the path's direction there, within the place's piece.
+    """
+    path, table, count = task.path, task.path.table, len(task.path.table) - 1
+    place, first, last = path.piece(place)
+    endless = path.closed and not path.sharp_turns
+    weight = max(1.0, STANDING_M / task.speed_m_s)
+
+    def off(at: Array, x: Array, y: Array) -> tuple[Array, Array, Array, Array]:
+        """Offset from the path's point at a place, and the path's direction there."""
+        index = np.minimum(at, last - 1.0).astype(int)
+        part = (at - index)[:, None]
+        here, there = (table[i % count if path.closed else i] for i in (index, index + 1))
+        off_x, off_y = (np.column_stack([x, y]) - (1.0 - part) * here[:, :2] - part * there[:, :2]).T
+        return off_x, off_y, here[:, 2], here[:, 3]
+
+    def cost(x: Array, y: Array, yaw: Array, forward: Array) -> Array:
+        at, total = np.full(x.shape[1], place), np.zeros(x.shape[1])
+        for x_now, y_now, yaw_now, forward_now in zip(x[1:], y[1:], yaw[1:], forward, strict=True):
+            off_x, off_y, along_x, along_y = off(at, x_now, y_now)
+            along = np.clip(off_x * along_x + off_y * along_y, -FARTHEST_STEP_M, FARTHEST_STEP_M)
+            wanted = np.full(at.shape, task.speed_m_s)
+            if not endless:
+                wanted = np.minimum(wanted, (last - at) * path.spacing_m / SLOW_DOWN_S)
+            at = at + along / path.spacing_m
+            at = np.mod(at, last) if endless else np.clip(at, first, last)
+            off_x, off_y, along_x, along_y = off(at, x_now, y_now)
+            missing = weight * (wanted - np.minimum(along / step_s, forward_now))
+            total += np.hypot(np.hypot(off_x, off_y), missing) + facing_cost(yaw_now, along_x, along_y)
+        return np.asarray(total + TERMINAL_S / step_s * np.hypot(off_x, off_y))
+
+    return cost
+
+
+def timed_path_cost(path: TimedPathCost, time_s: float, step_s: float) -> SequenceCost:
+    """Cost of paths (T + 1, K) along way-points by time, which is `time_s` at the start; see `TimedPathCost`."""
+    due_s = path.waypoints.times_s
+    assert due_s is not None, "a path by time has times"
+
+    def cost(x: Array, y: Array, yaw: Array, forward: Array) -> Array:
+        times = time_s + step_s * np.arange(len(x))
+        there_x, there_y = (np.interp(times, due_s, column)[:, None] for column in path.waypoints.places_m.T)
+        length = np.hypot(np.diff(there_x, axis=0), np.diff(there_y, axis=0))
+        length = np.where(length < RESTS_M, np.inf, length)
+        facing = facing_cost(yaw[1:], np.diff(there_x, axis=0) / length, np.diff(there_y, axis=0) / length)
+        return np.asarray((np.hypot(x[1:] - there_x[1:], y[1:] - there_y[1:]) + facing).sum(axis=0))
+
+    return cost

@@ -1,0 +1,113 @@
+"""The seam to a task: what is none is refused by name, in Python and in compiled code; costs also run as they stand."""
+
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from numba import njit
+from numba.core.errors import TypingError
+
+from disco_hw.control.kernel.task_costs import follow, looks_up, row_of, stage_cost, terminal_cost
+from disco_hw.tasks import cost
+from disco_hw.tasks.circle import CircleCost, CircleTask
+from disco_hw.tasks.path import PathTask
+
+NOTHING = (np.float32(0.0),) * 5
+
+
+class Nonsense(NamedTuple):
+    """Terms without a cost."""
+
+    value: float
+
+
+@njit
+def staged(task):
+    zero, one = np.float32(0.0), np.float32(1.0)
+    return stage_cost(task, zero, 0, zero, zero, one, zero, one, zero, zero, (zero, zero, zero, zero, zero))
+
+
+@njit
+def ended(task):
+    zero, one = np.float32(0.0), np.float32(1.0)
+    return terminal_cost(task, zero, one, zero, one, zero, (zero, zero, zero, zero, zero))
+
+
+@njit
+def looks(task):
+    return looks_up(task)
+
+
+@njit
+def followed(task):
+    zero, one = np.float32(0.0), np.float32(1.0)
+    return follow(task, zero, one, zero, zero, (zero, zero, zero, one, zero))
+
+
+@njit
+def looked_up(task):
+    return row_of(task, np.float32(0.0))
+
+
+@pytest.mark.parametrize(
+    ("compiled", "plain", "count", "said"),
+    [
+        (staged, stage_cost, 10, "has no stage cost"),
+        (ended, terminal_cost, 6, "has no terminal cost"),
+        (followed, follow, 5, "has no table to follow"),
+        (looked_up, row_of, 1, "has no table"),
+    ],
+)
+def test_terms_without_a_cost_are_refused(compiled, plain, count, said):
+    with pytest.raises(TypeError, match=f"Nonsense {said}"):
+        plain(Nonsense(1.0), *[0.0] * count)
+    with pytest.raises(TypingError, match="No implementation of function"):
+        compiled(Nonsense(1.0))
+
+
+def test_what_is_no_named_tuple_is_no_terms():
+    with pytest.raises(TypeError, match="float is no named tuple of terms"):
+        looks_up(1.0)
+    with pytest.raises(TypingError, match="No implementation of function"):
+        looks(1.0)
+
+
+def test_a_circle_has_costs():
+    prepared = CircleCost(terminal_s=2.0).prepare(0.0, 0.0, 0.0, 0.0, None, 0.1, 50)
+    terms = prepared.terms
+    assert (prepared.begin, prepared.memory) == (0.0, 0.0)
+    # At 1 m from the centre, at rest, after a whole turn: nothing of the progress is missing.
+    assert staged(terms)[0] == pytest.approx((0.25**2 + 0.2**2) ** 0.5, rel=1e-5)
+    lost = 0.8 * 0.2 * 50
+    assert ended(terms) == pytest.approx(20.0 * 0.25 + lost, rel=1e-5)
+    paper = CircleCost().paper().prepare(0.0, 0.0, 0.0, 0.0, None, 0.1, 50).terms
+    assert ended(paper) == 0.0
+    assert looks(terms) is None
+
+
+@pytest.mark.parametrize(
+    "task", [CircleTask(), PathTask(path="p.csv", points=((0.0, 0.0), (2.0, 0.5)))], ids=["circle", "path"]
+)
+def test_a_cost_gives_as_it_stands_what_it_gives_compiled(task):
+    terms = task.planned("default").prepare(0.0, 0.9, 0.2, 0.3, None, 0.1, 50).terms
+    zero, one = np.float32(0.0), np.float32(1.0)
+    if hasattr(terms, "table"):
+        at = 4 * int(terms.row_of(zero))
+        found = (zero, *terms.table[at : at + 4])
+        assert looks(terms)
+        row = (zero, zero, zero, one, zero)
+        np.testing.assert_allclose(followed(terms), terms.follow(zero, one, zero, zero, row), rtol=1e-6)
+        assert looked_up(terms) == terms.row_of(zero)
+    else:
+        found = NOTHING
+        np.testing.assert_allclose(
+            staged(terms), terms.stage(zero, 0, zero, zero, one, zero, one, zero, zero, NOTHING), rtol=1e-6
+        )
+    assert terms.terminal(zero, one, zero, one, zero, found) > 0.0
+
+
+def test_what_costs_are_written_in_is_a_length():
+    assert cost.norm(3.0, 4.0) == 5.0
+    assert cost.norm_and_inverse(3.0, 4.0) == (5.0, 0.2)
+    assert cost.norm_and_inverse(0.0, 0.0) == pytest.approx((1e-15, 1e15))
+    assert cost.norm_of_three(2.0, 3.0, 6.0) == 7.0
