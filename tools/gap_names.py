@@ -26,6 +26,7 @@ from tools.gap_jobs import MODEL, Job, jobs  # first: it sets the threads of the
 import numpy as np
 
 from disco_hw.gap import GapReport, find_gap
+from disco_hw.gap.report.wording import as_text
 from disco_hw.log.drive import DriveLog
 from tools.gap_logs import LARGEST_RAD_S, simulated_drive
 
@@ -58,7 +59,7 @@ def answer(log: DriveLog, report: GapReport) -> dict[str, Any]:
         "log": digest(log),
         "names": [effect.name for effect in report.effects],
         "report": content,
-        "text": report.as_text(),
+        "text": as_text(report),
         "model": dict(zip(report.model.parameter_names, report.model.point(), strict=True)),
         "belief": None if belief is None else [list(belief.names), belief.mean(), belief.covariance()],
         "candidates": [[one.channel, one.name, one.gain, one.score, one.verdict] for one in report.candidates],

@@ -25,7 +25,8 @@ from disco_hw.experiments.metrics import Path as Track
 from disco_hw.experiments.metrics import circle_figures
 from disco_hw.experiments.simulated_time import SimulatedRun, virtual_robot
 from disco_hw.experiments.virtual import true_parameters
-from disco_hw.gap.report.findings import REPORTED_HORIZON_S, STAGES, GapReport
+from disco_hw.gap.report.findings import STAGES, GapReport
+from disco_hw.gap.report.wording import answer
 from disco_hw.gap.write_report import WRITTEN, gap
 from disco_hw.model import EffectSetting, Gaussian, Model
 from disco_hw.model.parameter import BASE_PARAMETERS
@@ -83,7 +84,7 @@ class GapExperimentResult:
             "hidden": {name: list(values) for name, values in self.hidden.items()},
             "found": [effect.name for effect in self.report.effects],
             "unnamed": [term.form for term in self.report.unnamed],
-            "gap_m": {stage: self.report.gap[stage][REPORTED_HORIZON_S].position_m for stage in STAGES},
+            "gap_m": {stage: self.report.at_horizon(stage).position_m for stage in STAGES},
             "circle": {run: asdict(lap) for run, lap in self.laps.items()},
             "cost_removed": 1.0 - self.laps["amended"].mean_cost / self.laps["given"].mean_cost,
         }
@@ -91,7 +92,7 @@ class GapExperimentResult:
     def as_text(self) -> str:
         """For a terminal."""
         lines = [
-            *self.report.answer(),
+            *answer(self.report),
             "",
             f"{'model':<20} {'cost':>8} {'rms d':>9} {'max d':>9} {'rms speed error':>16}",
         ]

@@ -4,20 +4,30 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.gap.data.gridded_drive import grid_drive
 from disco_hw.gap.data.layout import BASE_COUNT, BODY, DELAYED_BY, WHEEL, Layout
-from disco_hw.gap.report.amend import amended_model
+from disco_hw.gap.report.amend import amended_model, carried_terms, channel_estimates
 from disco_hw.gap.report.findings import GapReport
-from disco_hw.gap.search.analysis import GapAnalysis
+from disco_hw.gap.report.judge import (
+    blind_spot_findings,
+    candidate_evidence,
+    channel_findings,
+    effect_findings,
+    residue_sentences,
+    unnamed_findings,
+)
+from disco_hw.gap.search.analysis import GapAnalysis, final_fit
 from disco_hw.gap.search.candidates import candidates_of
 from disco_hw.gap.search.channel_search import search_body, search_wheels
-from disco_hw.gap.search.predictive_pruning import prune, pruning_sentences
+from disco_hw.gap.search.cross_validation import PredictionErrors
+from disco_hw.gap.search.predictive_pruning import prune
+from disco_hw.gap.search.stages import stage_predictions
 from disco_hw.gap.search.unnamed_terms import with_known_terms
+from disco_hw.gap.settings import DEFAULT_SETTINGS, GapSettings
 from disco_hw.log.drive import DriveLog, concatenate
 from disco_hw.log.errors import LogError
 from disco_hw.model import Model
@@ -32,49 +42,62 @@ def find_gap(
     progress: Progress | None = None,
     pictures: bool = False,
     top_rad_s: float | None = None,
+    settings: GapSettings = DEFAULT_SETTINGS,
 ) -> GapReport:
     """Find where logs and model disagree, name what is missing, amend the model and show the gap shrink.
 
     `logs`: one drive or several of one robot. `model`: nominal geometry, with the effects that are known already;
-    those are refitted, not reported. `progress` is told what is being done; `pictures` draws them too. `top_rad_s`: the
-    robot's largest wheel speed, without which it is not known to which speed limits the logs are blind. Raises LogError
-    if the logs hold too little to judge either channel.
+    those are refitted, not reported. `progress` hears what is being done; `pictures` draws them too. `top_rad_s`: the
+    robot's largest wheel speed, without which it is not known to which speed limits the logs are blind. `settings`: all
+    thresholds. Raises LogError if the logs hold too little to judge either channel.
     """
     began = time.perf_counter()
     say = progress or (lambda text: None)
     log = logs if isinstance(logs, DriveLog) else concatenate(logs)
-    analysis, notes = _searched(log, model, say)
-    analysis = replace(analysis, top_rad_s=top_rad_s)
+    analysis, notes = search(log, model, say, settings)
     say("intervals, blind spots and the gap on held-out data")
-    effects, unnamed = analysis.effects(), analysis.unnamed()
-    named = {effect.name: effect.parameters for effect in analysis.effects(given=True)}
-    amended, remarks = amended_model(model, named, analysis.terms(), analysis.parts())
-    gap = analysis.gap() if analysis.body is not None else {}
+    final = final_fit(analysis)
+    effects, unnamed = effect_findings(analysis, final), unnamed_findings(analysis)
+    named = {effect.name: effect.parameters for effect in effect_findings(analysis, final, given=True)}
+    amended, remarks = amended_model(model, named, carried_terms(analysis), channel_estimates(analysis, final))
+    gap = stage_predictions(analysis, final).table() if analysis.body is not None else {}
     return GapReport(
         sources=log.sources,
-        channels=analysis.channels(effects, (term.channel for term in unnamed)),
+        channels=channel_findings(analysis, effects, unnamed),
         effects=effects,
         unnamed=unnamed,
-        blind_spots=analysis.blind_spots(effects),
+        blind_spots=blind_spot_findings(analysis, effects, top_rad_s),
         gap=gap,
         model=amended,
-        residue=(*pruning_sentences(analysis), *analysis.residue()),
+        residue=residue_sentences(analysis),
         notes=(*log.notes, *notes, *remarks),
-        candidates=analysis.candidates(),
-        pictures=analysis.pictures(gap) if pictures else {},
+        candidates=candidate_evidence(analysis),
+        pictures=_drawn(analysis, gap) if pictures else {},
         seconds=time.perf_counter() - began,
+        settings=settings,
     )
+
+
+def _drawn(analysis: GapAnalysis, gap: dict[str, dict[float, PredictionErrors]]) -> dict[str, bytes]:
+    from disco_hw.gap.report import figures  # noqa: PLC0415  (matplotlib, slow to import)
+
+    return figures.pictures(analysis, gap)
 
 
 def missing_effects(log: DriveLog, model: Model) -> tuple[str, ...]:
     """Only the names of what a log shows and a model lacks, the surest first; raises LogError as `find_gap`."""
-    analysis, _ = _searched(log, model, lambda text: None)
-    return tuple(effect.name for effect in analysis.effects())
+    analysis, _ = search(log, model)
+    return tuple(effect.name for effect in effect_findings(analysis, final_fit(analysis)))
 
 
-def _searched(log: DriveLog, model: Model, say: Progress) -> tuple[GapAnalysis, list[str]]:
+def search(
+    log: DriveLog,
+    model: Model,
+    say: Progress = lambda text: None,
+    settings: GapSettings = DEFAULT_SETTINGS,
+) -> tuple[GapAnalysis, list[str]]:
     """Both channels searched, without what makes predictions worse; and notes on what could not be judged."""
-    drive = grid_drive(log)
+    drive = grid_drive(log, settings)
     if not (drive.has_poses or drive.has_commands):
         raise LogError(
             f"{', '.join(log.sources)}: too little to judge: it needs wheel samples with poses, or with commands, "

@@ -12,6 +12,7 @@ from disco_hw.errors import WorkError
 from disco_hw.gap.find import find_gap
 from disco_hw.gap.report.findings import GapReport
 from disco_hw.gap.report.page import page
+from disco_hw.gap.report.wording import as_text
 from disco_hw.log.load import load_drive
 from disco_hw.model import Model, load_model, save_model
 from disco_hw.outputs import as_json, refuse_directory
@@ -32,7 +33,7 @@ class GapResult:
 
     def as_text(self) -> str:
         """For a terminal."""
-        return f"{self.report.as_text()}\n\nwritten: {self.directory}/report.html, report.json, model.toml"
+        return f"{as_text(self.report)}\n\nwritten: {self.directory}/report.html, report.json, model.toml"
 
 
 def gap(

@@ -69,6 +69,7 @@ from dataclasses import replace
 from pathlib import Path
 import numpy as np
 from disco_hw.gap import find_gap
+from disco_hw.gap.report.wording import sentence
 from disco_hw.log.drive import Commands
 from disco_hw.model import Model, load_model, save_model
 from disco_hw.model.free_run import FreeRun
@@ -85,7 +86,7 @@ states = FreeRun(model, model.point()[None], 0.1).states(np.zeros(5), np.full((1
 estimate = report.effects[0].parameters if report.effects else {}
 print(json.dumps({
     "named": [effect.name for effect in report.effects],
-    "sentences": [effect.sentence() for effect in report.effects],
+    "sentences": [sentence(effect) for effect in report.effects],
     "k": {name: [e.value, e.low, e.high] for name, e in estimate.items()},
     "unnamed": [one.form for one in report.unnamed],
     "went_m": states[-1, 0],

@@ -5,10 +5,11 @@ from dataclasses import replace
 import numpy as np
 
 from disco_hw.gap.data.free_runs import read_angles
-from disco_hw.gap.data.gridded_drive import BLOCK_S, GRID_STEP_S, GriddedDrive, GridSamples
+from disco_hw.gap.data.gridded_drive import GriddedDrive, GridSamples
 from disco_hw.gap.data.layout import BODY
 from disco_hw.gap.noise.body_noise import BodyNoise
 from disco_hw.gap.noise.channels import BodyChannel
+from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S
 
 GEOMETRY = (0.06, 0.4, 0.1)
 NOISE = BodyNoise(0.004, 0.006, 1e-4, 1e-4, 1e-4, 1e-4, 0.3, 1e-4, 1e-3)
@@ -22,9 +23,13 @@ def line_of(speed_rad_s):
     t_s = GRID_STEP_S * np.arange(count)
     angle = np.concatenate([np.zeros((1, 2)), GRID_STEP_S * np.cumsum(speed[:-1], axis=0)])
     nodes = np.arange(0, count - 1, 2)
-    encoder = GridSamples(nodes, np.zeros(nodes.size), t_s[nodes], np.floor(t_s[nodes] / BLOCK_S).astype(np.int64))
+    encoder = GridSamples(
+        nodes, np.zeros(nodes.size), t_s[nodes], np.floor(t_s[nodes] / DEFAULT_SETTINGS.grid.block_s).astype(np.int64)
+    )
     poses = np.arange(4, count - 2, 4)
-    pose = GridSamples(poses, np.zeros(poses.size), t_s[poses], np.floor(t_s[poses] / BLOCK_S).astype(np.int64))
+    pose = GridSamples(
+        poses, np.zeros(poses.size), t_s[poses], np.floor(t_s[poses] / DEFAULT_SETTINGS.grid.block_s).astype(np.int64)
+    )
     return GriddedDrive(
         t_s, np.arange(count) == 0, speed.copy(), np.zeros(count), angle, speed, encoder, angle[nodes],
         2 * GRID_STEP_S, 0.0, 0.0, pose, np.zeros((poses.size, 3)),

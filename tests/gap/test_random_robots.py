@@ -2,11 +2,13 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from disco_hw.gap import find, write_report
+from disco_hw.gap.search.stages import stage_predictions
 from disco_hw.gap.write_report import WRITTEN
 from disco_hw.model import Model, load_model
 from tools.gap_logs import simulated_drive
@@ -18,8 +20,8 @@ MODEL = Model(0.061, 0.415, 0.238)
 def searched():
     """A log in which something is hidden, what the search finds in it, and the gap that is left, each made once."""
     log = simulated_drive({"motor_lag": 0.15}, 1, "circle")
-    analysis, notes = find._searched(log, MODEL, lambda text: None)
-    return log, analysis, notes, analysis.gap()
+    analysis, notes = find.search(log, MODEL)
+    return log, analysis, notes, stage_predictions(analysis).table()
 
 
 def robot_toml(generator):
@@ -49,14 +51,14 @@ def written(searched, monkeypatch, folder, seeds):
     slow = []
     monkeypatch.setattr(write_report, "load_drive", lambda *_: log)
     # Neither depends on the robot's limits, and each takes long.
-    monkeypatch.setattr(type(analysis), "gap", lambda self: gap)
-    monkeypatch.setattr(type(analysis), "pictures", lambda self, gap: {"picture": b"PNG"})
+    monkeypatch.setattr(find, "stage_predictions", lambda *_: SimpleNamespace(table=lambda: gap))
+    monkeypatch.setattr(find, "_drawn", lambda *_: {"picture": b"PNG"})
     for seed in seeds:
         (radius_m, axial_m, fastest_rad_s), text = robot_toml(np.random.default_rng([23, seed]))
         robot, out = folder / f"{seed}.toml", folder / str(seed)
         robot.write_text(text)
         here = of_geometry(analysis, radius_m, axial_m)
-        monkeypatch.setattr(find, "_searched", lambda *_, here=here: (here, notes))
+        monkeypatch.setattr(find, "search", lambda *_, here=here: (here, notes))
         result = write_report.gap([], robot, out)
         report = json.loads((out / "report.json").read_text())
         assert all(type(spot["blind"]) is bool for spot in report["blind_spots"])

@@ -15,20 +15,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from disco_hw.gap.data.sample_hold import undo_sample_hold
+from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S, GapSettings, GridSettings
 from disco_hw.log.drive import Commands, DriveLog
-
-GRID_STEP_S = 0.01
-BLOCK_S = 3.0
-LONGEST_S = 320.0
-_STRETCH_S = 20.0
-_SHORTEST_RUN_S = 1.0
-_LONGEST_SILENCE_S = 1.5
-_SPEED_SPAN_S = 0.03
-_EVEN_SAMPLES = 10
-_LONGEST_RESPONSE_S = 1.5
-_NO_COMMAND_RAD_S = 0.05
-_TURNING_RAD_S = 0.3
-_LOUD_RAD_S = 2.0
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -49,10 +37,6 @@ class GridSamples:
         return GridSamples(self.node[chosen], self.fraction[chosen], self.t_s[chosen], self.block[chosen])
 
 
-# Of wheels whose readings are held, 80 s of driving may leave this many that are new.
-_FEWEST_READINGS = 100
-
-
 @dataclass(frozen=True, slots=True)
 class GriddedDrive:
     """A drive on the grid.
@@ -61,7 +45,8 @@ class GriddedDrive:
     command is known; `angle_rad`, `speed_rad_s` (M, 2) measured. `encoder`: wheel samples with `encoder_angle_rad`
     (E, 2) laid on even times, its stamps scatter by `stamp_scatter_s`; `pose`: pose samples with `pose` (P, 3) x, y,
     yaw not wrapped within a run. `known_command` (M, 2) rad/s and `known_motion` (M, 3) m/s, m/s, rad/s: what the
-    terms without a name that a given model has add; None without.
+    terms without a name that a given model has add; None without. `settings` travel with the drive: what judges it
+    reads them there.
     """
 
     t_s: Array
@@ -80,17 +65,18 @@ class GriddedDrive:
     notes: tuple[str, ...] = ()
     known_command: Array | None = None
     known_motion: Array | None = None
+    settings: GapSettings = DEFAULT_SETTINGS
 
     @property
     def has_commands(self) -> bool:
         """Whether enough commands are known to judge the wheels."""
         known = np.count_nonzero(np.isfinite(self.command_rad_s[:, 0]))
-        return bool(known > 0.02 * self.t_s.size and self.encoder.t_s.size > _FEWEST_READINGS)
+        return bool(known > 0.02 * self.t_s.size and self.encoder.t_s.size > self.settings.grid.fewest_readings)
 
     @property
     def has_poses(self) -> bool:
         """Whether enough poses were measured to judge the body."""
-        return self.pose.t_s.size > 60
+        return self.pose.t_s.size > self.settings.grid.fewest_poses
 
     @property
     def duration_s(self) -> float:
@@ -98,18 +84,19 @@ class GriddedDrive:
         return float(self.t_s.size * GRID_STEP_S)
 
 
-def grid_drive(log: DriveLog) -> GriddedDrive:
+def grid_drive(log: DriveLog, settings: GapSettings = DEFAULT_SETTINGS) -> GriddedDrive:
     """Lay a drive on the grid; a log without wheel samples has an empty one."""
-    wheels, poses = undo_sample_hold(log.wheels), log.poses
+    grid_settings = settings.grid
+    wheels, poses = undo_sample_hold(log.wheels, grid_settings), log.poses
     notes: list[str] = []
     nodes_t, nodes_first, commands, changes, angles, speeds = [], [], [], [], [], []
     encoder_at, encoder_angle, pose_at, pose_values = [], [], [], []
     offset, foreign_s = 0, 0.0
-    runs = _runs(wheels.t_s, wheels.segment)
+    runs = _runs(wheels.t_s, wheels.segment, grid_settings)
     driven_s = sum(float(wheels.t_s[hi - 1] - wheels.t_s[lo]) for lo, hi in runs)
-    if driven_s > LONGEST_S:
-        runs = _spread(wheels.t_s, runs, driven_s)
-        notes.append(f"{driven_s:.0f} s of driving: {LONGEST_S:.0f} s of it, evenly spread, are judged")
+    if driven_s > grid_settings.longest_s:
+        runs = _spread(wheels.t_s, runs, driven_s, grid_settings)
+        notes.append(f"{driven_s:.0f} s of driving: {grid_settings.longest_s:.0f} s of it, evenly spread, are judged")
     for lo, hi in runs:
         t = wheels.t_s[lo:hi]
         angle = np.column_stack([wheels.left_angle_rad[lo:hi], wheels.right_angle_rad[lo:hi]])
@@ -118,9 +105,9 @@ def grid_drive(log: DriveLog) -> GriddedDrive:
         grid = t[0] + GRID_STEP_S * np.arange(int((t[-1] - t[0]) / GRID_STEP_S) + 1)
         at = np.column_stack([np.interp(grid, t, angle[:, side]) for side in (0, 1)])
         command, change = _command_cells(log.commands, segment, grid)
-        span_s = max(_SPEED_SPAN_S, float(np.median(np.diff(t))))
+        span_s = max(grid_settings.speed_span_s, float(np.median(np.diff(t))))
         speed = _speeds(grid, t, angle, span_s)
-        foreign = _foreign(command, speed, span_s)
+        foreign = _foreign(command, speed, span_s, grid_settings)
         command[foreign] = np.nan
         foreign_s += GRID_STEP_S * int(foreign.sum())
         nodes_t.append(grid)
@@ -129,17 +116,17 @@ def grid_drive(log: DriveLog) -> GriddedDrive:
         changes.append(change)
         angles.append(at)
         speeds.append(speed)
-        even = np.clip(even_times(t), grid[0], grid[-1])
+        even = np.clip(even_times(t, grid_settings.even_samples), grid[0], grid[-1])
         moved = np.column_stack([np.interp(t, grid, speed[:, side]) for side in (0, 1)]) * (even - t)[:, None]
-        encoder_at.append(_locate(even, grid, offset))
+        encoder_at.append(_locate(even, grid, offset, grid_settings.block_s))
         encoder_angle.append(angle + moved)
         here = (poses.segment == segment) & (poses.t_s >= grid[0] + 0.02) & (poses.t_s <= grid[-1] - GRID_STEP_S)
-        pose_at.append(_locate(poses.t_s[here], grid, offset))
+        pose_at.append(_locate(poses.t_s[here], grid, offset, grid_settings.block_s))
         yaw = np.unwrap(poses.yaw_rad[here]) if here.any() else np.empty(0)
         pose_values.append(np.column_stack([poses.x_m[here], poses.y_m[here], yaw]))
         offset += grid.size
     if not nodes_t:
-        return _empty()
+        return _empty(settings)
     if foreign_s > 0.0:
         notes.append(f"{foreign_s:.0f} s in which wheels and commands have nothing to do with each other are left out")
     encoder = _joined(encoder_at)
@@ -161,18 +148,19 @@ def grid_drive(log: DriveLog) -> GriddedDrive:
         pose=_joined(pose_at),
         pose_values=np.concatenate(pose_values),
         notes=tuple(notes),
+        settings=settings,
     )
 
 
-def even_times(t_s: Array) -> Array:
-    """Times (N,) without the jitter of their stamps: means over as many neighbours before as after.
+def even_times(t_s: Array, neighbours: int) -> Array:
+    """Times (N,) without the jitter of their stamps: means over as many `neighbours` before as after.
 
     Where samples are lost the stamp itself stays. Angles read by jittering stamps would make every response look
     weaker than it is; moved to even times by the measured speed they do not.
     """
     if t_s.size < 3:
         return t_s
-    half = np.minimum(np.minimum(np.arange(t_s.size), np.arange(t_s.size)[::-1]), _EVEN_SAMPLES)
+    half = np.minimum(np.minimum(np.arange(t_s.size), np.arange(t_s.size)[::-1]), neighbours)
     total = np.concatenate([[0.0], np.cumsum(t_s)])
     index = np.arange(t_s.size)
     even = (total[index + half + 1] - total[index - half]) / (2 * half + 1)
@@ -185,33 +173,35 @@ def _scatter(t_s: Array) -> float:
     return float(1.4826 * np.median(np.abs(steps - np.median(steps))) / 2.0**0.5)
 
 
-def _runs(t_s: Array, segment: Index) -> list[tuple[int, int]]:
+def _runs(t_s: Array, segment: Index, settings: GridSettings) -> list[tuple[int, int]]:
     """Stretches of one segment without silence, as half-open index ranges."""
     if t_s.size < 2:
         return []
-    breaks = np.flatnonzero((np.diff(segment) != 0) | (np.diff(t_s) > _LONGEST_SILENCE_S)) + 1
+    breaks = np.flatnonzero((np.diff(segment) != 0) | (np.diff(t_s) > settings.longest_silence_s)) + 1
     edges = [0, *breaks.tolist(), t_s.size]
     pairs = pairwise(edges)
-    return [(lo, hi) for lo, hi in pairs if hi - lo > 2 and t_s[hi - 1] - t_s[lo] >= _SHORTEST_RUN_S]
+    return [(lo, hi) for lo, hi in pairs if hi - lo > 2 and t_s[hi - 1] - t_s[lo] >= settings.shortest_run_s]
 
 
-def _spread(t_s: Array, runs: list[tuple[int, int]], driven_s: float) -> list[tuple[int, int]]:
-    """Stretches of `_STRETCH_S`, evenly spread over the runs, that add up to about `LONGEST_S`."""
+def _spread(t_s: Array, runs: list[tuple[int, int]], driven_s: float, settings: GridSettings) -> list[tuple[int, int]]:
+    """Stretches of `stretch_s`, evenly spread over the runs, that add up to about `longest_s`."""
     stretches = []
     for lo, hi in runs:
-        edges = np.arange(t_s[lo], t_s[hi - 1], _STRETCH_S)
+        edges = np.arange(t_s[lo], t_s[hi - 1], settings.stretch_s)
         cuts = [*np.searchsorted(t_s[lo:hi], edges).tolist(), hi - lo]
         stretches += [(lo + a, lo + b) for a, b in pairwise(cuts) if b - a > 2]
-    kept = np.unique(np.linspace(0, len(stretches) - 1, max(int(len(stretches) * LONGEST_S / driven_s), 1)).astype(int))
+    kept = np.unique(
+        np.linspace(0, len(stretches) - 1, max(int(len(stretches) * settings.longest_s / driven_s), 1)).astype(int)
+    )
     pieces = [stretches[k] for k in kept]
-    return [(lo, hi) for lo, hi in pieces if t_s[hi - 1] - t_s[lo] >= _SHORTEST_RUN_S]
+    return [(lo, hi) for lo, hi in pieces if t_s[hi - 1] - t_s[lo] >= settings.shortest_run_s]
 
 
-def _locate(t_s: Array, grid: Array, offset: int) -> GridSamples:
+def _locate(t_s: Array, grid: Array, offset: int, block_s: float) -> GridSamples:
     """Positions of times on a run's grid whose first node has index `offset`."""
     place = (t_s - grid[0]) / GRID_STEP_S
     node = np.clip(np.floor(place).astype(np.int64), 0, grid.size - 2)
-    return GridSamples(node + offset, place - node, t_s, np.floor(t_s / BLOCK_S).astype(np.int64))
+    return GridSamples(node + offset, place - node, t_s, np.floor(t_s / block_s).astype(np.int64))
 
 
 def _joined(parts: list[GridSamples]) -> GridSamples:
@@ -246,19 +236,19 @@ def _command_cells(commands: Commands, segment: int, grid: Array) -> tuple[Array
     return means, jumps
 
 
-def _foreign(command: Array, speed: Array, span_s: float) -> Mask:
+def _foreign(command: Array, speed: Array, span_s: float, settings: GridSettings) -> Mask:
     """Cells (M,) in which wheels turn long after the last command or rest under a large one: another master drives.
 
     A speed taken over `span_s` either side rises that much before the command that it follows.
     """
     asked = np.nan_to_num(np.abs(command).max(axis=1), nan=np.inf)
     turning = np.abs(speed).max(axis=1)
-    span = round(_LONGEST_RESPONSE_S / GRID_STEP_S)
+    span = round(settings.longest_response_s / GRID_STEP_S)
     before = maximum_filter1d(asked, span, origin=(span - 1) // 2)
     most = np.maximum(before, maximum_filter1d(asked, 2 * math.ceil(span_s / GRID_STEP_S) + 3))
     least = minimum_filter1d(asked, span, origin=(span - 1) // 2)
-    unasked = (most < _NO_COMMAND_RAD_S) & (turning > _TURNING_RAD_S)
-    unheard = (least > _LOUD_RAD_S) & np.isfinite(asked) & (turning < _NO_COMMAND_RAD_S)
+    unasked = (most < settings.no_command_rad_s) & (turning > settings.turning_rad_s)
+    unheard = (least > settings.loud_rad_s) & np.isfinite(asked) & (turning < settings.no_command_rad_s)
     return np.asarray(maximum_filter1d((unasked | unheard).astype(np.uint8), 2 * span) > 0)
 
 
@@ -276,7 +266,7 @@ def _quantum(angle: Array) -> float:
     return float(np.quantile(steps, 0.001)) if steps.size > 100 else 0.0
 
 
-def _empty() -> GriddedDrive:
+def _empty(settings: GapSettings) -> GriddedDrive:
     nothing, pairs = np.empty(0), np.empty((0, 2))
     samples = GridSamples(np.empty(0, np.int64), nothing, nothing, np.empty(0, np.int64))
     return GriddedDrive(
@@ -293,4 +283,5 @@ def _empty() -> GriddedDrive:
         0.0,
         samples,
         np.empty((0, 3)),
+        settings=settings,
     )

@@ -8,14 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.gap.data.gridded_drive import GRID_STEP_S
 from disco_hw.gap.data.layout import pose_sensor
+from disco_hw.gap.settings import GRID_STEP_S, GridSettings
 from disco_hw.jit import kernel_function
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
-
-_LEAD_S = 1.0
 
 
 @kernel_function
@@ -62,11 +60,11 @@ def displacement(
     return out
 
 
-def starts_of(first: NDArray[np.bool_], usable: NDArray[np.bool_], ahead_s: float, every_s: float = 0.2) -> Index:
-    """Nodes (K,), `every_s` apart, from which a prediction stays within its run and on usable nodes."""
-    ahead, stride = round(ahead_s / GRID_STEP_S), round(every_s / GRID_STEP_S)
+def starts_of(first: NDArray[np.bool_], usable: NDArray[np.bool_], ahead_s: float, settings: GridSettings) -> Index:
+    """Nodes (K,), `start_every_s` apart, from which a prediction stays within its run and on usable nodes."""
+    ahead, stride = round(ahead_s / GRID_STEP_S), round(settings.start_every_s / GRID_STEP_S)
     # What was commanded before a run is not known, and late wheels still follow it.
-    lead = round(_LEAD_S / GRID_STEP_S)
+    lead = round(settings.lead_s / GRID_STEP_S)
     begins = np.flatnonzero(first)
     ends = np.append(begins[1:], first.size)
     bad = np.concatenate([[0], np.cumsum(~usable)])

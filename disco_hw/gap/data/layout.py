@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from disco_hw.effects.effect import Channel, Effect, Parameter, Stage, asks_for
 from disco_hw.effects.registry import DELAY, MOTION_EFFECTS, REGISTRY, in_stages
-from disco_hw.gap.data.gridded_drive import GRID_STEP_S
+from disco_hw.gap.settings import GRID_STEP_S
 from disco_hw.model.coefficients import Base, Coefficients, Effects
 from disco_hw.model.parameter import BASE_PARAMETERS
 

@@ -11,16 +11,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from disco_hw.gap.settings import GridSettings
 from disco_hw.log.drive import Wheels
 
 Array = NDArray[np.float64]
 
-_HELD_SHARE = 0.3
-_TURNING_RAD_S = 0.05
-_LONGEST_PERIODS = 4.0
 
-
-def undo_sample_hold(wheels: Wheels) -> Wheels:
+def undo_sample_hold(wheels: Wheels, settings: GridSettings) -> Wheels:
     """The wheels' samples without repeated ones, angles integrated backwards; unchanged where nothing is held.
 
     Held are speeds from which the angles were derived, if the log repeats more than a third of those of turning wheels.
@@ -30,15 +27,15 @@ def undo_sample_hold(wheels: Wheels) -> Wheels:
     speed = np.column_stack([wheels.left_speed_rad_s, wheels.right_speed_rad_s])
     same_run = np.diff(wheels.segment) == 0
     repeated = (np.diff(speed, axis=0) == 0.0).all(axis=1) & same_run
-    turning = (np.abs(speed[1:]) > _TURNING_RAD_S).any(axis=1)
-    if turning.sum() < 20 or float(repeated[turning].mean()) < _HELD_SHARE:
+    turning = (np.abs(speed[1:]) > settings.held_turning_rad_s).any(axis=1)
+    if turning.sum() < 20 or float(repeated[turning].mean()) < settings.held_share:
         return wheels
     new = np.concatenate([[True], ~repeated])
     period_s = float(np.median(np.diff(wheels.t_s[new])))
     keep, last_s = new.copy(), wheels.t_s[0]
     # Wheels that rest repeat their zeros: those are measured too, as often as the robot measures.
     for k in range(1, wheels.t_s.size):
-        if not keep[k] and wheels.t_s[k] - last_s > _LONGEST_PERIODS * period_s:
+        if not keep[k] and wheels.t_s[k] - last_s > settings.held_periods * period_s:
             keep[k] = True
         if keep[k]:
             last_s = wheels.t_s[k]

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.gap.data.free_runs import pose_residual, read_angles, run_body, run_wheels
-from disco_hw.gap.data.gridded_drive import GRID_STEP_S, GriddedDrive, GridSamples
+from disco_hw.gap.data.gridded_drive import GriddedDrive, GridSamples
 from disco_hw.gap.data.layout import BASE_COUNT, BODY, WHEEL, Layout
 from disco_hw.gap.noise.body_noise import BodyGains, BodyMotion, BodyNoise, body_gains, whiten_body
 from disco_hw.gap.noise.wheel_noise import (
@@ -25,15 +25,7 @@ from disco_hw.gap.noise.wheel_noise import (
     wheel_gains,
     whiten_wheels,
 )
-
-WINDOW_S = 3.0
-ONSET_M_S = 0.05
-DRIFT_ONSET_M_S = 0.02
-_SHORTEST_WINDOW = 12
-_LONGEST_POSE_GAP_S = 2.0
-# How far a noise model is believed before a log speaks, in blocks: wheels wander as long as a log's blocks are and
-# longer, bodies do not (mean square of the scores of what is not there, over six dirty logs: 3.4 and 1.4).
-_TRUSTED_WHEEL_BLOCKS, _TRUSTED_BODY_BLOCKS = 1.0, 6.0
+from disco_hw.gap.settings import GRID_STEP_S, GapSettings
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -42,6 +34,10 @@ Mask = NDArray[np.bool_]
 
 class ResidualChannel(Protocol):
     """What fitting and selecting need of a channel; n is the number of its residuals."""
+
+    @property
+    def settings(self) -> GapSettings:
+        """The settings of the analysis."""
 
     @property
     def layout(self) -> Layout:
@@ -109,8 +105,11 @@ class WheelChannel:
         between = np.diff(jumps[place.node + 1], prepend=0.0)
         speed = drive.speed_rad_s[place.node]
         dt = np.maximum(dt, 0.0)
-        steady = steady_speeds(dt, speed)
-        motion = WheelMotion(dt, calm_speeds(dt, speed), steady, np.maximum(between, 0.0), first_of_run | resumed, good)
+        noise_settings = drive.settings.noise
+        steady = steady_speeds(dt, speed, noise_settings)
+        motion = WheelMotion(
+            dt, calm_speeds(dt, speed, noise_settings), steady, np.maximum(between, 0.0), first_of_run | resumed, good
+        )
         return cls(drive, motion, wheel_gains(noise, motion), np.ones((place.t_s.size, 2)), noise, geometry)
 
     def with_noise(self, noise: WheelNoise, use: Mask | None = None) -> WheelChannel:
@@ -130,6 +129,11 @@ class WheelChannel:
     def weighted(self, weight: Array) -> WheelChannel:
         """The same with other weights (E, 2)."""
         return replace(self, weight=weight)
+
+    @property
+    def settings(self) -> GapSettings:
+        """The settings of the analysis."""
+        return self.drive.settings
 
     @property
     def layout(self) -> Layout:
@@ -168,7 +172,7 @@ class WheelChannel:
     @property
     def trusted_blocks(self) -> float:
         """How many blocks of time that agree with the noise model it is worth."""
-        return _TRUSTED_WHEEL_BLOCKS
+        return self.settings.noise.trusted_wheel_blocks
 
     def angles(self, p: Array, extra: Array | None = None) -> Array:
         """Free-running wheel angles at the nodes, (M, 2)."""
@@ -199,7 +203,7 @@ class WheelChannel:
 
 @dataclass(frozen=True)
 class BodyChannel:
-    """Measured wheel angles in, poses out, in windows of `WINDOW_S` whose start pose is unknown."""
+    """Measured wheel angles in, poses out, in windows of `window_s` whose start pose is unknown."""
 
     drive: GriddedDrive
     samples: GridSamples
@@ -229,7 +233,7 @@ class BodyChannel:
         run = np.searchsorted(starts, samples.node, side="right") - 1
         rim = np.abs(drive.speed_rad_s).max(axis=1) * geometry[0]
         rolling = np.abs(drive.speed_rad_s).mean(axis=1) * geometry[0]
-        moving_s = np.cumsum(np.minimum(rolling / DRIFT_ONSET_M_S, 1.0)) * GRID_STEP_S
+        moving_s = np.cumsum(np.minimum(rolling / drive.settings.noise.drift_onset_m_s, 1.0)) * GRID_STEP_S
         channel = cls(
             drive,
             samples,
@@ -258,7 +262,7 @@ class BodyChannel:
         step[restart] = 0.0
         dt = np.diff(samples.t_s, prepend=samples.t_s[0])
         dt[restart] = 0.0
-        moving = np.minimum(rim_m_s[samples.node] / ONSET_M_S, 1.0)
+        moving = np.minimum(rim_m_s[samples.node] / self.settings.noise.slip_onset_m_s, 1.0)
         return BodyMotion(dt, step[:, 0], step[:, 1], predicted[:, 2], moving, v, omega, restart, self.use)
 
     def with_noise(self, noise: BodyNoise, geometry: Array | None = None, use: Mask | None = None) -> BodyChannel:
@@ -277,6 +281,11 @@ class BodyChannel:
     def weighted(self, weight: Array) -> BodyChannel:
         """The same with other weights (P, 3)."""
         return replace(self, weight=weight)
+
+    @property
+    def settings(self) -> GapSettings:
+        """The settings of the analysis."""
+        return self.drive.settings
 
     @property
     def layout(self) -> Layout:
@@ -315,7 +324,7 @@ class BodyChannel:
     @property
     def trusted_blocks(self) -> float:
         """How many blocks of time that agree with the noise model it is worth."""
-        return _TRUSTED_BODY_BLOCKS
+        return self.settings.noise.trusted_body_blocks
 
     def track(self, p: Array, extra: Array | None = None) -> Array:
         """Path at the nodes from the measured wheel angles, (M, 3)."""
@@ -360,18 +369,18 @@ def total_perturbation(drive: GriddedDrive, width: int, *perturbations: Array | 
 def _windows(drive: GriddedDrive) -> tuple[Index, Mask]:
     """Window of each kept pose, numbered from 0, and which poses are kept (those in windows that are too thin are not).
 
-    A window ends after `WINDOW_S`, with its run, and where poses fail to come for long.
+    A window ends after `window_s`, with its run, and where poses fail to come for long.
     """
-    t, node = drive.pose.t_s, drive.pose.node
+    t, node, settings = drive.pose.t_s, drive.pose.node, drive.settings.noise
     run = np.searchsorted(np.flatnonzero(drive.first), node, side="right")
     number = np.zeros(t.size, dtype=np.int64)
     current, begin = 0, 0
     for k in range(1, t.size):
-        if run[k] != run[k - 1] or t[k] - t[begin] > WINDOW_S or t[k] - t[k - 1] > _LONGEST_POSE_GAP_S:
+        if run[k] != run[k - 1] or t[k] - t[begin] > settings.window_s or t[k] - t[k - 1] > settings.longest_pose_gap_s:
             current, begin = current + 1, k
         number[k] = current
     sizes = np.bincount(number, minlength=current + 1)
-    keep = sizes[number] >= min(_SHORTEST_WINDOW, int(np.median(sizes)))
+    keep = sizes[number] >= min(settings.shortest_window, int(np.median(sizes)))
     _, renumbered = np.unique(number[keep], return_inverse=True)
     return renumbered.astype(np.int64), keep
 

@@ -14,38 +14,28 @@ from disco_hw.gap.data.gridded_drive import GriddedDrive
 from disco_hw.gap.noise.body_noise import BodyNoise, body_likelihood
 from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
 from disco_hw.gap.noise.wheel_noise import WheelNoise, wheel_likelihood, whiten_wheels
+from disco_hw.gap.settings import NoiseSettings
 
 Array = NDArray[np.float64]
 
-_HUBER = 3.0
-_PRIOR_SD = 2.0
-_STEP = 2e-2
-_OUTLIER = 5.0
-_SMOOTH_SAMPLES = 25
-_LOCAL_EXCESS = 1.4
-_REST_RAD_S = 0.05
 _READING, _COMMAND_STAMP = 2, 4
-_LEAST_JITTER_S = 1e-3
-_JITTER_RATIO = 2.0
-_JITTER_SHARE = 0.05
-_LARGEST_WHEEL_NOISE = (0.05, 1.0, 0.1, 0.05, 0.1, 0.1, 0.02)
 
 
-def _huber(white: Array) -> float:
-    """Sum of squares of whitened residuals that grow linearly beyond `_HUBER`."""
+def _huber(white: Array, limit: float) -> float:
+    """Sum of squares of whitened residuals that grow linearly beyond `limit`."""
     flat = white.ravel()
     beyond = np.abs(flat)
-    beyond = beyond[beyond > _HUBER] - _HUBER
+    beyond = beyond[beyond > limit] - limit
     return float(flat @ flat - beyond @ beyond)
 
 
-def _minimise(objective, start: Array, low: Array, high: Array, most: int) -> Array:  # type: ignore[no-untyped-def]
+def _minimise(objective, start: Array, low: Array, high: Array, most: int, step: float) -> Array:  # type: ignore[no-untyped-def]
     def slope(logs: Array) -> Array:
         # Central: a one-sided difference this wide would end the search some way off.
         out = np.empty(logs.size)
         for k in range(logs.size):
             ahead, behind = logs.copy(), logs.copy()
-            ahead[k], behind[k] = min(logs[k] + _STEP, high[k]), max(logs[k] - _STEP, low[k])
+            ahead[k], behind[k] = min(logs[k] + step, high[k]), max(logs[k] - step, low[k])
             out[k] = (objective(ahead) - objective(behind)) / max(ahead[k] - behind[k], 1e-9)
         return out
 
@@ -65,49 +55,54 @@ def largest_command_jitter_s(drive: GriddedDrive) -> float:
 
     More than that is no jitter but a response that the model does not have, and must not pass for noise.
     """
-    return _LEAST_JITTER_S + _JITTER_RATIO * drive.stamp_scatter_s + _JITTER_SHARE * drive.encoder_period_s
+    settings = drive.settings.noise
+    scattered_s = settings.command_jitter_ratio * drive.stamp_scatter_s
+    return settings.least_command_jitter_s + scattered_s + settings.command_jitter_share * drive.encoder_period_s
 
 
 def wheel_misfit(channel: WheelChannel, raw: Array) -> Callable[[Array], float]:
     """Minus the robust log likelihood of what a model leaves of the angles (E, 2), by logarithms of the noise (7,)."""
-    motion = channel.motion
+    motion, settings = channel.motion, channel.settings.noise
     # A wheel at rest reads the same however coarse its encoder is, and would speak for readings without error.
-    counted = motion.use & ~motion.restart & (np.abs(motion.speed_rad_s).max(axis=1) > _REST_RAD_S)
+    counted = motion.use & ~motion.restart & (np.abs(motion.speed_rad_s).max(axis=1) > settings.rest_rad_s)
     likelihood = wheel_likelihood(motion, counted, raw)
 
     def misfit(logs: Array) -> float:
         white, weight = likelihood(logs)
-        return 0.5 * _huber(white) - weight
+        return 0.5 * _huber(white, settings.huber) - weight
 
     return misfit
 
 
 def fit_wheel_noise(channel: WheelChannel, raw: Array) -> WheelNoise:
     """Noise of the wheels by maximum likelihood of what a model leaves of the angles, (E, 2)."""
-    drive = channel.drive
+    drive, settings = channel.drive, channel.settings.noise
     start = channel.noise.vector()
     misfit = wheel_misfit(channel, raw)
 
     def objective(logs: Array) -> float:
-        return misfit(logs) + _pull(logs, start)
+        return misfit(logs) + _pull(logs, start, settings.prior_sd)
 
     # A speed that may be wrong by any amount for any time would explain wheels that do not turn at all.
-    most = np.minimum(start + 5.0, WheelNoise(*_LARGEST_WHEEL_NOISE).vector())
+    most = np.minimum(start + 5.0, WheelNoise(*settings.largest_wheel_noise).vector())
     most[_COMMAND_STAMP] = min(most[_COMMAND_STAMP], math.log(largest_command_jitter_s(drive)))
     begin = np.minimum(start, most)
     least = begin - 5.0
     if drive.quantum_rad > 0.0:
         least[_READING] = max(least[_READING], math.log(drive.quantum_rad / math.sqrt(12.0)))
-    return WheelNoise.from_vector(_minimise(objective, np.maximum(begin, least), least, most, 25))
+    return WheelNoise.from_vector(
+        _minimise(objective, np.maximum(begin, least), least, most, settings.wheel_iterations, settings.difference_step)
+    )
 
 
-def _pull(logs: Array, start: Array) -> float:
+def _pull(logs: Array, start: Array, prior_sd: float) -> float:
     """A weak prior that keeps parameters the log says nothing about where they are."""
-    return 0.5 * float((((logs - start) / _PRIOR_SD) ** 2).sum())
+    return 0.5 * float((((logs - start) / prior_sd) ** 2).sum())
 
 
 def fit_body_noise(channel: BodyChannel, p: Array, extra: Array | None = None, iterations: int = 15) -> BodyNoise:
     """Noise of poses and body by maximum likelihood at a parameter vector and what unnamed terms add."""
+    settings = channel.settings.noise
     raw = channel.raw_residual(p, extra)
     rim = np.abs(channel.drive.speed_rad_s).max(axis=1) * channel.geometry[0]
     motion = channel.motion(rim)
@@ -116,16 +111,18 @@ def fit_body_noise(channel: BodyChannel, p: Array, extra: Array | None = None, i
 
     def objective(logs: Array) -> float:
         white, weight = likelihood(logs)
-        return 0.5 * _huber(white) - weight + _pull(logs, start)
+        return 0.5 * _huber(white, settings.huber) - weight + _pull(logs, start, settings.prior_sd)
 
-    return BodyNoise.from_vector(_minimise(objective, start, start - 5.0, start + 5.0, iterations))
+    return BodyNoise.from_vector(
+        _minimise(objective, start, start - 5.0, start + 5.0, iterations, settings.difference_step)
+    )
 
 
 def without_outliers(channel: BodyChannel, p: Array, extra: Array | None = None) -> BodyChannel:
     """The channel without poses that no noise of this size explains; found again until none is left."""
     for _ in range(3):
         white = channel.whitened(p, extra)
-        wild = channel.use & (np.abs(white).max(axis=1) > _OUTLIER)
+        wild = channel.use & (np.abs(white).max(axis=1) > channel.settings.noise.outlier)
         # A pose that jumps makes its successors look wild too: only the first of a row goes, then look again.
         wild &= ~np.concatenate([[False], wild[:-1]])
         if not wild.any() or wild.sum() > 0.1 * channel.use.sum():
@@ -134,31 +131,31 @@ def without_outliers(channel: BodyChannel, p: Array, extra: Array | None = None)
     return channel
 
 
-def local_weight(white: Array, use: NDArray[np.bool_]) -> Array:
+def local_weight(white: Array, use: NDArray[np.bool_], settings: NoiseSettings) -> Array:
     """Weights that bring stretches and samples with larger residuals than the noise model's down to its size.
 
-    `white` (S, k) whitened, not weighted; the local scale is the mean square over `2 _SMOOTH_SAMPLES + 1` samples.
+    `white` (S, k) whitened, not weighted; the local scale is the mean square over `2 smooth_samples + 1` samples.
     """
     clipped = np.minimum(white**2, 16.0) * use[:, None]
-    window = np.ones(2 * _SMOOTH_SAMPLES + 1)
+    window = np.ones(2 * settings.smooth_samples + 1)
     amount = np.convolve(use.astype(float), window, "same")
     weights = np.empty_like(white)
     for side in range(white.shape[1]):
         local = np.convolve(clipped[:, side], window, "same") / np.maximum(amount, 1.0)
-        weights[:, side] = 1.0 / np.sqrt(np.maximum(local / _LOCAL_EXCESS, 1.0))
+        weights[:, side] = 1.0 / np.sqrt(np.maximum(local / settings.local_excess, 1.0))
     tamed = np.abs(white) * weights
-    return np.asarray(weights * np.minimum(1.0, _HUBER / np.maximum(tamed, 1e-9)))
+    return np.asarray(weights * np.minimum(1.0, settings.huber / np.maximum(tamed, 1e-9)))
 
 
 def learn_wheel_noise(channel: WheelChannel, raw: Array) -> WheelChannel:
     """The channel with the noise of residuals `raw` (E, 2), and weights for what is noisier still."""
     channel = channel.with_noise(fit_wheel_noise(channel, raw))
     white = whiten_wheels(raw, channel.gains)
-    wild = channel.gains.use & (np.abs(white).max(axis=1) > 2.0 * _OUTLIER)
+    wild = channel.gains.use & (np.abs(white).max(axis=1) > 2.0 * channel.settings.noise.outlier)
     if 0 < wild.sum() < 0.02 * wild.size:
         channel = channel.with_noise(channel.noise, ~wild)
         white = whiten_wheels(raw, channel.gains)
-    return channel.weighted(local_weight(white, channel.gains.use))
+    return channel.weighted(local_weight(white, channel.gains.use, channel.settings.noise))
 
 
 def learn_body_noise(channel: BodyChannel, p: Array, extra: Array | None = None, iterations: int = 15) -> BodyChannel:
@@ -167,4 +164,4 @@ def learn_body_noise(channel: BodyChannel, p: Array, extra: Array | None = None,
     channel = without_outliers(replace(channel, geometry=geometry).with_noise(channel.noise), p, extra)
     channel = channel.with_noise(fit_body_noise(channel, p, extra, iterations))
     channel = without_outliers(channel, p, extra)
-    return channel.weighted(local_weight(channel.whitened(p, extra), channel.use))
+    return channel.weighted(local_weight(channel.whitened(p, extra), channel.use, channel.settings.noise))

@@ -15,15 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
+from disco_hw.gap.settings import WANDER_S, NoiseSettings
 from disco_hw.jit import kernel_function, scalar_function
 
 Array = NDArray[np.float64]
 
-WANDER_S = 20.0
 _START_VARIANCE = 0.04
-_CALM_S = 0.05
-_STEADY_S = 0.25
-_FEWEST_STEADY = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,17 +203,17 @@ def _whiten(
             slow += gain[k, side, 2] * surprise
 
 
-def calm_speeds(dt_s: Array, speed_rad_s: Array) -> Array:
-    """Measured speeds (E, 2) with less of their own noise: their mean over a tenth of a second.
+def calm_speeds(dt_s: Array, speed_rad_s: Array, settings: NoiseSettings) -> Array:
+    """Measured speeds (E, 2) with less of their own noise: their mean over `calm_s` either side.
 
     An error that acted on the measured speed itself would scale the very noise it is measured by, and look like a gain.
     """
-    return _mean(dt_s, speed_rad_s, _CALM_S, 0)
+    return _mean(dt_s, speed_rad_s, settings.calm_s, 0)
 
 
-def steady_speeds(dt_s: Array, speed_rad_s: Array) -> Array:
-    """What is expected of measured speeds (E, 2) as long as no model tells: their mean over half a second."""
-    return _mean(dt_s, speed_rad_s, _STEADY_S, _FEWEST_STEADY)
+def steady_speeds(dt_s: Array, speed_rad_s: Array, settings: NoiseSettings) -> Array:
+    """What is expected of measured speeds (E, 2) as long as no model tells: their mean over `steady_s` either side."""
+    return _mean(dt_s, speed_rad_s, settings.steady_s, settings.fewest_steady)
 
 
 def _mean(dt_s: Array, speed_rad_s: Array, span_s: float, fewest: int) -> Array:

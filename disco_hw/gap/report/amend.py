@@ -8,15 +8,32 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from disco_hw.gap.search.analysis import FinalFit, GapAnalysis
 from disco_hw.gap.search.channel_search import UnnamedTerm
-from disco_hw.gap.search.intervals import ChannelEstimates, ParameterEstimate
+from disco_hw.gap.search.intervals import Z95, ChannelEstimates, ParameterEstimate
 from disco_hw.model import EffectSetting, Gaussian, Model
 from disco_hw.model.parameter import BASE_PARAMETERS
 from disco_hw.model.terms import TERMS, effect_of
 
 Array = NDArray[np.float64]
 
-_Z95 = 1.96
+
+def channel_estimates(analysis: GapAnalysis, final: FinalFit) -> tuple[ChannelEstimates, ...]:
+    """Estimates of the channels, body first, with the unnamed terms under their names in a model."""
+    body = final.final_body
+    geometry = (1.0, 1.0) if body is None else (float(body.vector[0]), float(body.vector[1]))
+    both = ((analysis.body, final.final_body_estimates), (analysis.wheels, final.wheel_estimates))
+    return tuple(
+        with_terms_named(part, found.unnamed, geometry)
+        for found, part in both
+        if found is not None and part is not None
+    )
+
+
+def carried_terms(analysis: GapAnalysis) -> tuple[str, ...]:
+    """Names of the accepted unnamed terms that a model can carry."""
+    found = [found for found in (analysis.body, analysis.wheels) if found is not None]
+    return tuple(one.term.model_name for each in found for one in each.unnamed if one.term.model_name is not None)
 
 
 def with_terms_named(
@@ -98,7 +115,7 @@ def _known_terms(model: Model, base: Mapping[str, float]) -> dict[str, Parameter
             place = model.belief.names.index(key)
             deviation = abs(factor) * float(model.belief.covariance()[place, place]) ** 0.5
         value = setting.values["k"] * factor
-        found[setting.name] = ParameterEstimate(value, value - _Z95 * deviation, value + _Z95 * deviation)
+        found[setting.name] = ParameterEstimate(value, value - Z95 * deviation, value + Z95 * deviation)
     return found
 
 

@@ -18,10 +18,6 @@ from disco_hw.gap.search.least_squares import inverse, sensitivity, solve
 
 Array = NDArray[np.float64]
 
-# A limit shows only where more is asked: this share of what the robot can do, and no more than robots are held to.
-_MOST_OF_IT = 0.75
-_USUAL_INFLATION = 1.5
-
 
 @dataclass(frozen=True, slots=True)
 class BlindSpot:
@@ -83,7 +79,9 @@ def _limit(found: ChannelResult, name: str, top_rad_s: float | None) -> BlindSpo
         geometry = (float(channel.geometry[0]), float(channel.geometry[1]))
         largest = _largest(channel, effect.limited, geometry)
         if top_rad_s is not None:
-            possible = _MOST_OF_IT * float(effect.limited(np.array([[-top_rad_s, top_rad_s]]), geometry)[0])
+            possible = channel.settings.report.asked_share * float(
+                effect.limited(np.array([[-top_rad_s, top_rad_s]]), geometry)[0]
+            )
     enough = min(possible, _realistic(parameter))
     blind = largest is None or (largest < enough < math.inf)
     return BlindSpot(name, parameter.name, parameter.unit, largest, blind, experiment_of(name))
@@ -113,7 +111,7 @@ def _largest_tried(found: ChannelResult, effect: Effect) -> float | None:
         vector[layout.place[effect.columns[0]]] = limit
         moved = channel.residual(vector) - best.residual
         own = moved - slope @ solve(slope, slope.T @ moved)
-        enough = (limits.score + math.log(max(channel.count, 2))) * _USUAL_INFLATION
+        enough = (limits.score + math.log(max(channel.count, 2))) * channel.settings.report.usual_inflation
         ahead_m = found.selector.moves(channel.split(best.vector), channel.split(vector))
         if float(own @ own) > enough and ahead_m > limits.moves_m:
             return limit
@@ -144,7 +142,7 @@ def _size(found: ChannelResult, name: str, column: str) -> float | None:
     if information[first, first] <= 1e-9:
         return None
     covariance = inverse(information)
-    size = math.sqrt(threshold * _USUAL_INFLATION * float(covariance[first, first]))
+    size = math.sqrt(threshold * channel.settings.report.usual_inflation * float(covariance[first, first]))
     limit = max(abs(layout.low[places[0]]), abs(layout.high[places[0]]))
     if size >= limit:
         return None
@@ -166,6 +164,9 @@ def _by_trial(found: ChannelResult, column: str, trials: tuple[float, ...], thre
         vector[place] = size
         difference = channel.residual(vector) - best.residual
         enough = found.selector.moves(channel.split(best.vector), channel.split(vector))
-        if float(difference @ difference) > threshold * _USUAL_INFLATION and enough > found.selector.thresholds.moves_m:
+        if (
+            float(difference @ difference) > threshold * channel.settings.report.usual_inflation
+            and enough > found.selector.thresholds.moves_m
+        ):
             return size
     return None

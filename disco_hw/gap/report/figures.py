@@ -10,9 +10,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from disco_hw.gap.report.findings import REPORTED_HORIZON_S, STAGES
+from disco_hw.gap.noise.channels import WheelChannel
+from disco_hw.gap.report.findings import STAGES
+from disco_hw.gap.report.judge import regimes_of
 from disco_hw.gap.report.regimes import Regime
+from disco_hw.gap.search.analysis import GapAnalysis
+from disco_hw.gap.search.channel_search import ChannelResult
 from disco_hw.gap.search.cross_validation import PredictionErrors
+from disco_hw.gap.settings import GRID_STEP_S
 
 Array = NDArray[np.float64]
 
@@ -20,6 +25,38 @@ _COLOURS = {"nominal": "#b0b0b0", "refitted": "#d98c3f", "amended": "#2f7fc1", "
 _DPI = 110
 # Upper end of the axis of residuals, in units of the noise, at least.
 _LEAST_SHOWN = 4.0
+_STRETCH_S = 6.0
+
+
+def pictures(analysis: GapAnalysis, gap: dict[str, dict[float, PredictionErrors]]) -> dict[str, bytes]:
+    """All pictures of a report as PNG, by name."""
+    out: dict[str, bytes] = {}
+    if gap:
+        out["gap_by_horizon"] = gap_by_horizon(gap)
+        out["gap_by_regime"] = gap_by_regime(gap, analysis.drive.settings.prediction.reported_horizon_s)
+    for name, title, found in (
+        ("command_to_wheel", "command to wheel", analysis.wheels),
+        ("wheel_to_body", "wheel to body and pose sensor", analysis.body),
+    ):
+        if found is not None:
+            out[f"where_{name}"] = disagreement(title, regimes_of(found))
+    if analysis.wheels is not None:
+        out["worst_stretch"] = _worst_stretch(analysis.wheels)
+    return out
+
+
+def _worst_stretch(wheels: ChannelResult) -> bytes:
+    """Wheel speed over the six seconds in which the model as it was is furthest off."""
+    channel = wheels.channel
+    assert isinstance(channel, WheelChannel)
+    drive = channel.drive
+    angles = (channel.angles(wheels.base.vector), channel.angles(*wheels.selector.split(wheels.names)))
+    before, after = (np.gradient(angle, GRID_STEP_S, axis=0) for angle in angles)
+    size = np.where(np.isfinite(drive.command_rad_s[:, 0]), np.abs(before - drive.speed_rad_s).mean(axis=1), 0.0)
+    width = min(round(_STRETCH_S / GRID_STEP_S), size.size)
+    begin = int(np.argmax(np.convolve(size, np.ones(width), "valid")))
+    part = slice(begin, begin + width)
+    return stretch(drive.t_s[part], drive.speed_rad_s[part, 0], before[part, 0], after[part, 0], "left wheel, rad/s")
 
 
 def png(figure: Figure) -> bytes:
@@ -59,17 +96,17 @@ def gap_by_horizon(gap: dict[str, dict[float, PredictionErrors]]) -> bytes:
     return png(figure)
 
 
-def gap_by_regime(gap: dict[str, dict[float, PredictionErrors]]) -> bytes:
-    """Position error two seconds ahead by what the robot was doing."""
-    names = sorted(gap["refitted"][REPORTED_HORIZON_S].by_regime_m)
+def gap_by_regime(gap: dict[str, dict[float, PredictionErrors]], ahead_s: float) -> bytes:
+    """Position error `ahead_s` ahead by what the robot was doing."""
+    names = sorted(gap["refitted"][ahead_s].by_regime_m)
     figure = Figure(figsize=(9.0, 0.6 + 0.5 * max(len(names), 1)))
     axes = figure.add_subplot()
     for offset, stage in enumerate(("refitted", "amended", "floor")):
-        values = [1e3 * gap[stage][REPORTED_HORIZON_S].by_regime_m.get(name, 0.0) for name in names]
+        values = [1e3 * gap[stage][ahead_s].by_regime_m.get(name, 0.0) for name in names]
         rows = np.arange(len(names)) + 0.27 * (1 - offset)
         axes.barh(rows, values, height=0.25, color=_COLOURS[stage], label=stage)
     axes.set_yticks(range(len(names)), names)
-    axes.set_xlabel(f"position error {REPORTED_HORIZON_S:g} s ahead, mm")
+    axes.set_xlabel(f"position error {ahead_s:g} s ahead, mm")
     _legend_above(axes)
     return png(figure)
 

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 from typing import Any
 
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.report.blind_spots import BlindSpot
-from disco_hw.gap.search.cross_validation import WORSE, PredictionErrors, worse_by
+from disco_hw.gap.search.cross_validation import PredictionErrors, worse_by
 from disco_hw.gap.search.intervals import ParameterEstimate
+from disco_hw.gap.settings import DEFAULT_SETTINGS, GapSettings
 from disco_hw.model import Model
 
-REPORTED_HORIZON_S = 2.0
 STAGES = ("nominal", "refitted", "amended", "floor")
 ALL_IN_ONE = "separate"
 
@@ -36,10 +35,6 @@ class EffectFinding:
     evidence: float
     indistinguishable_from: tuple[str, ...] = ()
     experiment: str | None = None
-
-    def sentence(self) -> str:
-        """What it does, in words."""
-        return REGISTRY[self.name].sentence.format(**{name: e.value for name, e in self.parameters.items()})
 
 
 @dataclass(frozen=True)
@@ -81,6 +76,16 @@ class GapReport:
     notes: tuple[str, ...] = ()
     candidates: tuple[CandidateEvidence, ...] = ()
     pictures: dict[str, bytes] = field(default_factory=dict, repr=False)
+    settings: GapSettings = DEFAULT_SETTINGS
+
+    @property
+    def horizon_s(self) -> float:
+        """How far ahead the answer looks."""
+        return self.settings.prediction.reported_horizon_s
+
+    def at_horizon(self, stage: str) -> PredictionErrors:
+        """Errors of a stage as far ahead as the answer looks."""
+        return self.gap[stage][self.horizon_s]
 
     @property
     def verdict(self) -> str:
@@ -141,59 +146,24 @@ class GapReport:
 
     def _gap_dict(self) -> dict[str, Any]:
         if not self.gap:
-            return {"horizon_s": REPORTED_HORIZON_S, "held_out": True}
-        stages = {stage: _errors_dict(self.gap[stage][REPORTED_HORIZON_S]) for stage in STAGES}
+            return {"horizon_s": self.horizon_s, "held_out": True}
+        stages = {stage: _errors_dict(self.at_horizon(stage)) for stage in STAGES}
         horizons = [
             {"horizon_s": horizon, **{stage: _errors_dict(self.gap[stage][horizon]) for stage in STAGES}}
             for horizon in self.gap["nominal"]
         ]
         return {
-            "horizon_s": REPORTED_HORIZON_S, "held_out": True, **stages, "amended_is_worse": self.amended_is_worse,
+            "horizon_s": self.horizon_s, "held_out": True, **stages, "amended_is_worse": self.amended_is_worse,
             "horizons": horizons,
         }  # fmt: skip
-
-    def answer(self) -> list[str]:
-        """The answer in at most three lines."""
-        if self.effects:
-            first = "; ".join(effect.sentence() for effect in self.effects) + "."
-        elif self.unnamed:
-            first = f"Something is missing that has no name: {self.unnamed[0].form}."
-        elif self.residue:
-            first = "Something is missing that none of the known effects explains."
-        else:
-            first = "Nothing is missing that this log could show."
-        lines = [first[0].upper() + first[1:]]
-        if self.gap and not self._told:
-            lines.append(
-                f"No stretch of the logs is long enough to see how far {REPORTED_HORIZON_S:g} s predictions are off."
-            )
-        elif self.gap:
-            mm = {stage: 1e3 * self.gap[stage][REPORTED_HORIZON_S].position_m for stage in STAGES}
-            added = "adding it takes" if len(self.effects) + len(self.unnamed) == 1 else "the amended model takes"
-            worse = " Do not drive with it: it predicts worse than without." if self.amended_is_worse else ""
-            lines.append(
-                f"{added[0].upper()}{added[1:]} the {REPORTED_HORIZON_S:g} s position error from "
-                f"{mm['refitted']:.0f} mm (nominal {mm['nominal']:.0f} mm) to {mm['amended']:.0f} mm; "
-                f"noise alone gives {mm['floor']:.0f} mm.{worse}"
-            )
-        blind = [spot.name for spot in self.blind_spots if spot.blind]
-        if blind:
-            drive = f": `{self.drive}` would" if self.drive else ""
-            lines.append(f"This log could not have shown {', '.join(blind)} of realistic size{drive}.")
-        return lines
-
-    @property
-    def _told(self) -> bool:
-        """Whether the log has stretches as long as the horizon that is told."""
-        return math.isfinite(self.gap["refitted"][REPORTED_HORIZON_S].position_m)
 
     @property
     def amended_is_worse(self) -> bool:
         """Whether the amended model predicts held-out data worse than the refitted one, position or heading."""
         if not self.gap:
             return False
-        before, after = (self.gap[stage][REPORTED_HORIZON_S] for stage in ("refitted", "amended"))
-        return worse_by(before, after) > WORSE
+        before, after = (self.at_horizon(stage) for stage in ("refitted", "amended"))
+        return worse_by(before, after) > self.settings.prediction.worse
 
     @property
     def drive(self) -> str | None:
@@ -202,32 +172,6 @@ class GapReport:
         if not scripts:
             return None
         return f"disco-hw drive ROBOT.toml --script {scripts.pop() if len(scripts) == 1 else ALL_IN_ONE}"
-
-    def as_text(self) -> str:
-        """For a terminal."""
-        lines = [*self.answer(), ""]
-        for effect in self.effects:
-            values = ", ".join(f"{n} {e.value:.4g} [{e.low:.4g}, {e.high:.4g}]" for n, e in effect.parameters.items())
-            lines.append(f"{effect.channel}: {effect.name}: {values}{_confounded(effect)}")
-        lines += [f"{term.channel}: unnamed: {term.form}{_confounded(term)}" for term in self.unnamed]
-        lines += list(self.residue)
-        if self.gap:
-            lines += ["", f"{'ahead':>6} " + " ".join(f"{stage:>20}" for stage in STAGES)]
-            for horizon in self.gap["nominal"]:
-                cells = (_in_cell(self.gap[stage][horizon]) for stage in STAGES)
-                lines.append(f"{horizon:4g} s  " + " ".join(f"{cell:>20}" for cell in cells))
-        return "\n".join(lines)
-
-
-def _in_cell(errors: PredictionErrors) -> str:
-    if not math.isfinite(errors.position_m):
-        return "-"
-    return f"{1e3 * errors.position_m:9.1f} mm {errors.yaw_rad:6.3f} rad"
-
-
-def _confounded(finding: EffectFinding | UnnamedFinding) -> str:
-    same = ", ".join(finding.indistinguishable_from)
-    return f" (not to be told from {same})" if same else ""
 
 
 def _errors_dict(errors: PredictionErrors) -> dict[str, Any]:

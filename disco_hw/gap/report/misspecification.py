@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.effects.registry import REGISTRY
-from disco_hw.gap.data.gridded_drive import GRID_STEP_S
 from disco_hw.gap.data.layout import BODY
 from disco_hw.gap.noise.channels import BodyChannel
 from disco_hw.gap.search.candidates import CANDIDATES, indices
@@ -18,13 +17,10 @@ from disco_hw.gap.search.evidence import inflation
 from disco_hw.gap.search.least_squares import fit
 from disco_hw.gap.search.selection import Split
 from disco_hw.gap.search.unnamed_terms import Term, WithTerms
+from disco_hw.gap.settings import GRID_STEP_S
 
 Array = NDArray[np.float64]
 
-# As sure as the intervals of the report: 95 %.
-_SIGMAS = 1.96
-_MOST_TIMES = 9.9
-_LEVER_M = 0.2
 _UNITS = ("m/s ahead", "m/s to the side", "rad/s")
 
 
@@ -33,10 +29,10 @@ def misspecified_effects(found: ChannelResult) -> list[str]:
     channel = found.channel
     if not isinstance(channel, BodyChannel):
         return []
-    out = []
+    out, settings = [], channel.settings.report
     for name in found.names:
         perturbation = _perturbation_of(found.selector.split(found.names), name, channel)
-        level, axis = _middle(perturbation)
+        level, axis = _middle(perturbation, settings.lever_m)
         if level <= 0.0:
             continue
         # What saturates grows with less than its first power, what sets in late with more.
@@ -44,11 +40,11 @@ def misspecified_effects(found: ChannelResult) -> list[str]:
         wide = WithTerms.of(channel, (*(one.term for one in found.unnamed), Term("", more)))
         now = found.fit
         free = fit(wide, np.append(now.vector, 0.0), indices(wide, found.names))
-        if 2.0 * (now.cost - free.cost) < _SIGMAS**2 * inflation(free, wide, (free.vector.size - 1,)):
+        if 2.0 * (now.cost - free.cost) < settings.form_sigmas**2 * inflation(free, wide, (free.vector.size - 1,)):
             continue
         again = _perturbation_of(wide.split(free.vector), name, channel)
         share = float((again * perturbation).sum() / (perturbation**2).sum())
-        times = _ratio(share + 0.5 * float(free.vector[-1]), share + float(free.vector[-1]))
+        times = _ratio(share + 0.5 * float(free.vector[-1]), share + float(free.vector[-1]), settings.largest_ratio)
         out.append(
             f"wheel_to_body: {name} is {times:.1f} times as strong where it makes up {0.25 * level:.2g} "
             f"{_UNITS[axis]} as where it makes up {level:.2g}: 95 % sure that its form is another"
@@ -56,11 +52,11 @@ def misspecified_effects(found: ChannelResult) -> list[str]:
     return out
 
 
-def _ratio(small: float, large: float) -> float:
+def _ratio(small: float, large: float, most: float) -> float:
     """How much stronger where small, within what can be said."""
-    if large <= small / _MOST_TIMES:
-        return _MOST_TIMES
-    return max(small / large, 1.0 / _MOST_TIMES)
+    if large <= small / most:
+        return most
+    return max(small / large, 1.0 / most)
 
 
 def _perturbation_of(split: Split, name: str, channel: BodyChannel) -> Array:
@@ -89,9 +85,9 @@ def _velocity(channel: BodyChannel, vector: Array, extra: Array | None) -> Array
     return np.column_stack([ahead, left, step[:, 2]]) / GRID_STEP_S
 
 
-def _middle(perturbation: Array) -> tuple[float, int]:
+def _middle(perturbation: Array, lever_m: float) -> tuple[float, int]:
     """The size below which half of what an effect does is done, and the axis it acts on most."""
-    power = (perturbation * (1.0, 1.0, _LEVER_M)) ** 2
+    power = (perturbation * (1.0, 1.0, lever_m)) ** 2
     axis = int(np.argmax(power.sum(axis=0)))
     size = np.sort(np.abs(perturbation[:, axis]))
     share = np.cumsum(size**2)

@@ -7,7 +7,8 @@ import math
 from collections.abc import Iterable, Sequence
 from html import escape
 
-from disco_hw.gap.report.findings import REPORTED_HORIZON_S, STAGES, GapReport
+from disco_hw.gap.report.findings import STAGES, GapReport
+from disco_hw.gap.report.wording import answer
 
 _STYLE = """
 body{font:16px/1.5 system-ui,sans-serif;max-width:60rem;margin:2rem auto;padding:0 1rem;color:#222}
@@ -20,7 +21,7 @@ figure{margin:1.2rem 0}figcaption{color:#555;font-size:.9rem}h2{margin-top:2rem}
 _CAPTIONS = {
     "gap_by_horizon": "How far predictions are off, by how far ahead they look, on data not used for fitting; shaded: "
     "95 % intervals. The dashed line is what noise alone makes.",
-    "gap_by_regime": f"The same {REPORTED_HORIZON_S:g} s ahead, by what the robot was doing.",
+    "gap_by_regime": "The same as far ahead as the answer looks, by what the robot was doing.",
     "where_command_to_wheel": "Where commands and wheels disagree. Bars that end at the line hold nothing but noise.",
     "where_wheel_to_body": "Where wheels and poses disagree. Bars that end at the line hold nothing but noise.",
     "worst_stretch": "The stretch in which the wheels and the model as it was lie furthest apart.",
@@ -30,7 +31,7 @@ _CAPTIONS = {
 def page(report: GapReport) -> str:
     """The whole page."""
     parts = [
-        f'<div class="answer">{"".join(f"<p>{escape(line)}</p>" for line in report.answer())}</div>',
+        f'<div class="answer">{"".join(f"<p>{escape(line)}</p>" for line in answer(report))}</div>',
         f"<p>Verdict: <b>{report.verdict}</b>. Logs: {escape(', '.join(report.sources))}.</p>",
     ]
     parts += [_picture(name, picture) for name, picture in report.pictures.items()]
@@ -123,14 +124,16 @@ def _or_dash(speed_rad_s: float) -> str:
 
 
 def _by_regime(report: GapReport) -> str:
-    errors = [report.gap[stage][REPORTED_HORIZON_S].by_regime_m for stage in STAGES]
+    errors = [report.at_horizon(stage).by_regime_m for stage in STAGES]
     rows = [(name, *(f"{1e3 * of[name]:.1f} mm" if name in of else "" for of in errors)) for name in sorted(errors[0])]
-    return _table((f"position error {REPORTED_HORIZON_S:g} s ahead", *STAGES), rows)
+    return _table((f"position error {report.horizon_s:g} s ahead", *STAGES), rows)
 
 
 def _candidates(report: GapReport) -> str:
     rows = [(c.channel, c.name, f"{c.gain:.1f}", f"{c.score:.1f}", c.verdict) for c in report.candidates]
-    score = "score (4 accepts, up to 6 where the noise has heavy tails)"
+    selection = report.settings.selection
+    most = selection.named_score * selection.heaviest
+    score = f"score ({selection.named_score:g} accepts, up to {most:g} where the noise has heavy tails)"
     return _table(("channel", "effect", "gain, nats", score, "verdict"), rows)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.effects.registry import REGISTRY
-from disco_hw.gap.data.gridded_drive import GRID_STEP_S, GriddedDrive
+from disco_hw.gap.data.gridded_drive import GriddedDrive
 from disco_hw.gap.data.horizon import displacement, starts_of
 from disco_hw.gap.data.layout import BODY, DELAYED_BY, WHEEL
 from disco_hw.gap.noise.body_noise import BodyNoise
@@ -24,27 +24,9 @@ from disco_hw.gap.search.least_squares import Fit, fit, inverse
 from disco_hw.gap.search.richest_model import learn_saturated_body, learn_saturated_wheels
 from disco_hw.gap.search.selection import Names, Selector, Split, Thresholds
 from disco_hw.gap.search.unnamed_terms import Term, WithTerms, body_terms, places, places_near, wheel_terms
+from disco_hw.gap.settings import GRID_STEP_S, SelectionSettings
 
 Array = NDArray[np.float64]
-
-AHEAD_S = 2.0
-_MOST_TERMS = 2
-# A term that what is fitted already does nine tenths of would only pull against it.
-_LEAST_OWN = 0.1
-_WORTH_TRYING = 18.0
-_GAUSSIAN_KURTOSIS = 3.0
-_CLIPPED_AT = 6.0
-_HEAVIEST = 1.5
-# Of one parameter 4 takes twice the gain 13: by chance in one log of 3700, of about 18 names in one of 200.
-_NAMED_SCORE, _UNNAMED_SCORE = 4.0, 20.0
-# Where it moves predictions most, an effect moves them enough to matter, be it felt in few places only.
-_MOST_MOVED = 0.1
-_REST_RAD_S = 0.05
-_FAR_OFF = 1.5
-_CLEARLY = 6.0
-_ABOUT_TERMS = 110
-_NO_INFORMATION = 1e-3
-_ROUGH = Thresholds(score=20.0, moves_m=0.0)
 
 
 @dataclass(frozen=True)
@@ -86,11 +68,12 @@ class ChannelResult:
 
 
 def wheel_moves(channel: WheelChannel, geometry: Array) -> Callable[[Split, Split], float]:
-    """How far two fits of the wheels lie apart `AHEAD_S` ahead, m (lever arm of half the way)."""
+    """How far two fits of the wheels lie apart `ahead_s` ahead, m (lever arm of half the way)."""
     drive = channel.drive
+    settings = channel.settings.selection
     usable = np.isfinite(drive.command_rad_s[:, 0])
-    start = starts_of(drive.first, usable, AHEAD_S)
-    ahead = round(AHEAD_S / GRID_STEP_S)
+    start = starts_of(drive.first, usable, settings.ahead_s, channel.settings.grid)
+    ahead = round(settings.ahead_s / GRID_STEP_S)
 
     def moves(small: Split, big: Split) -> float:
         if not start.size:
@@ -101,15 +84,16 @@ def wheel_moves(channel: WheelChannel, geometry: Array) -> Callable[[Split, Spli
         forward = 0.5 * geometry[0] * step.sum(axis=1)
         yaw = geometry[0] / geometry[1] * (step[:, 1] - step[:, 0])
         lever = np.abs(0.25 * geometry[0] * way.sum(axis=1)) + abs(geometry[2])
-        return _where_most(forward**2 + (lever * yaw) ** 2)
+        return _where_most(forward**2 + (lever * yaw) ** 2, settings.most_moved_share)
 
     return moves
 
 
 def body_moves(channel: BodyChannel) -> Callable[[Split, Split], float]:
-    """How far two fits of the body lie apart `AHEAD_S` ahead, m."""
+    """How far two fits of the body lie apart `ahead_s` ahead, m."""
     drive = channel.drive
-    start = starts_of(drive.first, np.ones(drive.t_s.size, dtype=bool), AHEAD_S)
+    settings = channel.settings.selection
+    start = starts_of(drive.first, np.ones(drive.t_s.size, dtype=bool), settings.ahead_s, channel.settings.grid)
     heading = np.interp(drive.t_s[start], channel.samples.t_s, channel.measured[:, 2])
 
     def moves(small: Split, big: Split) -> float:
@@ -118,18 +102,20 @@ def body_moves(channel: BodyChannel) -> Callable[[Split, Split], float]:
         ends = []
         for p, extra in (small, big):
             ends.append(
-                displacement(p, drive.first, channel.track(p, extra), channel.moving_s, start, heading, AHEAD_S)
+                displacement(
+                    p, drive.first, channel.track(p, extra), channel.moving_s, start, heading, settings.ahead_s
+                )
             )
         apart = ends[1] - ends[0]
         lever = 0.5 * np.hypot(ends[1][:, 0], ends[1][:, 1])
-        return _where_most(apart[:, 0] ** 2 + apart[:, 1] ** 2 + (lever * apart[:, 2]) ** 2)
+        return _where_most(apart[:, 0] ** 2 + apart[:, 1] ** 2 + (lever * apart[:, 2]) ** 2, settings.most_moved_share)
 
     return moves
 
 
-def _where_most(squares: Array) -> float:
-    """Root of the mean of the largest tenth of some squares (n,)."""
-    few = max(round(_MOST_MOVED * squares.size), 1)
+def _where_most(squares: Array, share: float) -> float:
+    """Root of the mean of the largest `share` of some squares (n,)."""
+    few = max(round(share * squares.size), 1)
     return float(np.sqrt(np.partition(squares, squares.size - few)[-few:].mean()))
 
 
@@ -141,7 +127,8 @@ def search_wheels(drive: GriddedDrive, geometry: Array, start: Array, given: Nam
     """
     channel = WheelChannel.build(drive, WheelNoise(reading_rad=max(drive.quantum_rad, 2e-4)), geometry)
     moves = wheel_moves(channel, geometry)
-    rough = Selector(channel, moves, _ROUGH, given=given, start=start)
+    settings = drive.settings.selection
+    rough = Selector(channel, moves, Thresholds(settings.rough_score, 0.0), given=given, start=start)
     begin = tuple(dict.fromkeys((*given, *LATE)))
     responding(rough, begin)
     names = rough.greedy(begin, responding)
@@ -153,8 +140,8 @@ def search_wheels(drive: GriddedDrive, geometry: Array, start: Array, given: Nam
 
     def searched(channel: WheelChannel) -> ChannelResult:
         white = whiten_wheels(left, channel.gains)
-        rolling = np.abs(drive.speed_rad_s[drive.encoder.node]).max(axis=1) > _REST_RAD_S
-        limits = _thresholds(white, channel.gains.use & rolling)
+        rolling = np.abs(drive.speed_rad_s[drive.encoder.node]).max(axis=1) > settings.rest_rad_s
+        limits = _thresholds(white, channel.gains.use & rolling, settings)
         selector = Selector(channel, moves, limits, given=given, start=rough.fit(given).vector)
         selector.fits[frozenset(names)] = fit(channel, rough.fit(names).vector, indices(channel, names))
         richest = (white * channel.weight).ravel()
@@ -164,7 +151,7 @@ def search_wheels(drive: GriddedDrive, geometry: Array, start: Array, given: Nam
     found = searched(sound)
     # Where nothing known comes near, the noise is too little to compare what is all wrong: the family shows in the
     # noise that the best of it leaves, and what is left against the richest model.
-    return searched(plain) if found.fit.cost > _FAR_OFF * 0.5 * sound.count else found
+    return searched(plain) if found.fit.cost > settings.far_off * 0.5 * sound.count else found
 
 
 def responding(selector: Selector, names: Names) -> None:
@@ -191,14 +178,16 @@ def search_body(drive: GriddedDrive, start: Array, given: Names = ()) -> Channel
     channel = BodyChannel.build(drive, BodyNoise(), start)
     nominal = fit(channel, start, indices(channel, given))
     channel = learn_body_noise(channel, nominal.vector, iterations=4)
-    rough = Selector(channel, body_moves(channel), _ROUGH, given=given, start=nominal.vector)
+    settings = drive.settings.selection
+    limits = Thresholds(settings.rough_score, 0.0)
+    rough = Selector(channel, body_moves(channel), limits, given=given, start=nominal.vector)
     names = rough.greedy()
     rich = (*names, *(name for name in smooth_of(BODY) if name not in names))
     vector = fit(channel, rough.fit(names).vector, indices(channel, rich)).vector
     channel = learn_body_noise(channel, vector)
     perturbations = _body_perturbations(channel, rich, vector)
     channel, fullest, extra, many = learn_saturated_body(channel, rich, vector, perturbations)
-    limits = _thresholds(channel.whitened(fullest, extra), channel.use)
+    limits = _thresholds(channel.whitened(fullest, extra), channel.use, settings)
     selector = Selector(channel, body_moves(channel), limits, given=given, start=rough.fit(given).vector)
     richest = channel.residual(fullest, extra)
     found = ChannelResult(selector, selector.select(), channel, richest=richest, richest_parameters=many)
@@ -220,7 +209,8 @@ def _time_or_place(found: ChannelResult) -> ChannelResult:
     if set(alike) & set(placed.names) or not any(one.term.disc for one in placed.unnamed):
         return named
     better = _priced(named) - _priced(placed)
-    return replace(placed, either=alike if better < _CLEARLY else ()) if better > -_CLEARLY else named
+    clearly = found.channel.settings.selection.place_nats
+    return replace(placed, either=alike if better < clearly else ()) if better > -clearly else named
 
 
 def _priced(found: ChannelResult) -> float:
@@ -229,7 +219,7 @@ def _priced(found: ChannelResult) -> float:
     chosen = 0.0
     for one in found.unnamed:
         many += 4.0 if one.term.disc else 1.0
-        chosen += 0.0 if one.term.disc else math.log(_ABOUT_TERMS)
+        chosen += 0.0 if one.term.disc else math.log(found.channel.settings.terms.about_many)
     return found.fit.cost + 0.5 * many * math.log(max(found.channel.count, 2)) + chosen
 
 
@@ -242,19 +232,19 @@ def _body_perturbations(channel: BodyChannel, names: Names, vector: Array) -> It
         yield disc.perturbation
 
 
-def _thresholds(white: Array, use: NDArray[np.bool_]) -> Thresholds:
+def _thresholds(white: Array, use: NDArray[np.bool_], settings: SelectionSettings) -> Thresholds:
     """Thresholds for a channel: the heavier the noise's tails, the more it takes.
 
     Noise that comes in bursts wanders too, more slowly than any block that could show it.
     """
     sound = white[use]
-    sound = sound[np.abs(sound).max(axis=1) > _NO_INFORMATION]
+    sound = sound[np.abs(sound).max(axis=1) > settings.silent]
     if not sound.size:
-        return Thresholds(score=_NAMED_SCORE)
-    sound = np.clip(sound / np.sqrt((sound**2).mean()), -_CLIPPED_AT, _CLIPPED_AT)
-    heavy = float((sound**4).mean()) / _GAUSSIAN_KURTOSIS
-    times = min(max(heavy, 1.0), _HEAVIEST)
-    return Thresholds(score=times * _NAMED_SCORE, unnamed_score=times * _UNNAMED_SCORE)
+        return Thresholds(settings.named_score, settings.least_moved_m)
+    sound = np.clip(sound / np.sqrt((sound**2).mean()), -settings.clipped_at, settings.clipped_at)
+    heavy = float((sound**4).mean()) / settings.gaussian_kurtosis
+    times = min(max(heavy, 1.0), settings.heaviest)
+    return Thresholds(times * settings.named_score, settings.least_moved_m, times * settings.unnamed_score)
 
 
 def _wheel_options(found: ChannelResult) -> Iterator[Term]:
@@ -276,7 +266,7 @@ def with_unnamed(found: ChannelResult, options: Callable[[ChannelResult], Iterat
     terms: tuple[Term, ...] = ()
     proofs: tuple[EffectEvidence, ...] = ()
     plain = found.selector
-    while len(terms) < _MOST_TERMS:
+    while len(terms) < found.channel.settings.terms.most_terms:
         best, tried = best_term(found.fit, found.selector.channel, options(found))
         if best is None:
             break
@@ -316,7 +306,8 @@ def _extended(plain: Selector, channel: WithTerms) -> Array:
 
 def best_term(small: Fit, channel: ResidualChannel, options: Iterator[Term]) -> tuple[Term | None, int]:
     """The term that promises most to first order on top of a fit, if it may be worth it, and how many were tried."""
-    best, most, tried = None, _WORTH_TRYING, 0
+    settings = channel.settings.terms
+    best, most, tried = None, settings.worth_trying_nats, 0
     core, held = channel.split(small.vector)
     inner = channel.inner
     base = inner.residual(core, held)
@@ -333,7 +324,7 @@ def best_term(small: Fit, channel: ResidualChannel, options: Iterator[Term]) -> 
         across = small.jacobian.T @ column
         own = float(column @ column - across @ solved @ across)
         pull = float(column @ small.residual - across @ solved @ gradient)
-        gain = 0.5 * pull * pull / own if own > _LEAST_OWN * float(column @ column) else 0.0
+        gain = 0.5 * pull * pull / own if own > settings.least_own_share * float(column @ column) else 0.0
         if gain > most:
             best, most = term, gain
     return best, max(tried, 2)

@@ -7,10 +7,7 @@ from types import MappingProxyType
 
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.search.intervals import ChannelEstimates
-
-_SIGMAS = 3.0
-# Of gains that are none of an encoder fewer than one in a hundred comes so far by chance.
-_SURE_NATS = 3.0
+from disco_hw.gap.settings import SelectionSettings
 
 _MIMICS = {name: effect.mimics for name, effect in REGISTRY.items() if effect.mimics is not None}
 # The cause that shows in two channels: as a gain of the drive, and as unequal wheels.
@@ -25,7 +22,9 @@ OUTSIDE_TESTS: Mapping[frozenset[str], str] = MappingProxyType(
 )
 
 
-def one_encoder(wheels: ChannelEstimates, asymmetry: tuple[float, float], accepted: bool) -> tuple[bool, bool]:
+def one_encoder(
+    wheels: ChannelEstimates, asymmetry: tuple[float, float], accepted: bool, settings: SelectionSettings
+) -> tuple[bool, bool]:
     """Whether an encoder that counts wrong explains the wheels' gains, and whether it is the only explanation.
 
     An encoder's scale shows as a gain of its wheel and, with the opposite sign, as an asymmetry of half the difference;
@@ -41,9 +40,9 @@ def one_encoder(wheels: ChannelEstimates, asymmetry: tuple[float, float], accept
     spread = 0.5 * (gains[0].deviation + gains[1].deviation)
     value, deviation = asymmetry
     variance = deviation**2 + spread**2
-    possible = abs(value - expected) < _SIGMAS * variance**0.5
+    possible = abs(value - expected) < settings.encoder_sigmas * variance**0.5
     nats = 0.5 * (value**2 - (value - expected) ** 2) / variance
-    return possible, possible and (accepted or nats > _SURE_NATS)
+    return possible, possible and (accepted or nats > settings.encoder_nats)
 
 
 def confounded_with(names: tuple[str, ...], encoder_possible: bool) -> dict[str, tuple[str, ...]]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -11,29 +10,14 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from disco_hw.gap.data.free_runs import read_angles, run_body
-from disco_hw.gap.data.gridded_drive import BLOCK_S, GRID_STEP_S
 from disco_hw.gap.data.horizon import displacement, starts_of
 from disco_hw.gap.data.layout import ENCODER_COLUMNS
 from disco_hw.gap.noise.channels import BodyChannel, WheelChannel, total_perturbation
-from disco_hw.gap.noise.wheel_noise import WANDER_S
 from disco_hw.gap.search.least_squares import Fit, by_block, inverse, known
+from disco_hw.gap.settings import GRID_STEP_S, WANDER_S, GapSettings, PredictionSettings
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
-
-HORIZONS_S = (0.5, 1.0, 2.0, 5.0)
-FOLD_S = 21.0
-_FOLD_BLOCKS = round(FOLD_S / BLOCK_S)
-_REACH_S = 0.3
-_SLOW_M_S = 0.02
-_TURNING_RAD_S = 0.3
-_SPEEDING_M_S2 = 0.25
-_FIXED_SIGMAS = 5.0
-_RESAMPLES = 400
-# Held-out errors scatter by some percent between equally good models.
-WORSE = 1.05
-_FAR_WORSE, _SIGMAS = 1.25, 2.0
-_PATHS = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,10 +46,11 @@ def _ratios(before: PredictionErrors, after: PredictionErrors) -> tuple[float, f
     return after.position_m / before.position_m, after.yaw_rad / before.yaw_rad
 
 
-def clearly_worse(before: PredictionErrors, after: PredictionErrors) -> bool:
+def clearly_worse(before: PredictionErrors, after: PredictionErrors, settings: PredictionSettings) -> bool:
     """Whether errors after are larger by 5 % and by two standard deviations of what blocks scatter, or by a quarter."""
     for quantity, ratio in enumerate(_ratios(before, after)):
-        if ratio > _FAR_WORSE or (ratio > WORSE and _sigmas(before, after, quantity) > _SIGMAS):
+        sure = ratio > settings.worse and _sigmas(before, after, quantity) > settings.worse_sigmas
+        if sure or ratio > settings.far_worse:
             return True
     return False
 
@@ -104,8 +89,11 @@ class Chain:
 
 
 def smoothed_poses(channel: BodyChannel, p: Array) -> tuple[Array, Array]:
-    """Poses at all nodes (M, 3): averaged over `_REACH_S` along the wheels' path, and from the nearest sample alone."""
+    """Poses at all nodes (M, 3): averaged over `pose_reach_s` along the wheels' path, and from the nearest
+    sample alone.
+    """
     drive, samples = channel.drive, channel.samples
+    reach_s = channel.settings.prediction.pose_reach_s
     track = channel.track(p)
     at = np.empty((samples.t_s.size, 3))
     read_angles(track, samples.node, samples.fraction, at)
@@ -115,10 +103,10 @@ def smoothed_poses(channel: BodyChannel, p: Array) -> tuple[Array, Array]:
     run_sample = run_of[samples.node[good]]
     turned = measured[:, 2] - at[:, 2]
     centre = np.clip(np.searchsorted(t, drive.t_s), 0, t.size - 1)
-    reach = max(int(_REACH_S / max(float(np.median(np.diff(t))), 1e-3)), 1)
+    reach = max(int(reach_s / max(float(np.median(np.diff(t))), 1e-3)), 1)
     near = np.arange(-reach, reach + 1)
     members = np.clip(centre[:, None] + near[None, :], 0, t.size - 1)
-    valid = (np.abs(t[members] - drive.t_s[:, None]) <= _REACH_S) & (run_sample[members] == run_of[:, None])
+    valid = (np.abs(t[members] - drive.t_s[:, None]) <= reach_s) & (run_sample[members] == run_of[:, None])
     weight = valid / np.maximum(valid.sum(axis=1, keepdims=True), 1)
     angle = (turned[members] * weight).sum(axis=1)
     cosine, sine = np.cos(angle), np.sin(angle)
@@ -145,16 +133,16 @@ def find_starts(channel: BodyChannel, poses: tuple[Array, Array], ahead_s: float
     drive = channel.drive
     known = np.isfinite(drive.command_rad_s[:, 0]) if drive.has_commands else np.ones(drive.t_s.size, dtype=bool)
     smooth, alone = poses
-    node = starts_of(drive.first, known, ahead_s)
+    node = starts_of(drive.first, known, ahead_s, drive.settings.grid)
     ahead = round(ahead_s / GRID_STEP_S)
     node = node[np.isfinite(smooth[node, 0]) & np.isfinite(alone[node + ahead, 0])]
-    block = np.floor(drive.t_s[node] / FOLD_S).astype(np.int64)
+    block = np.floor(drive.t_s[node] / drive.settings.prediction.fold_s).astype(np.int64)
     return Starts(node, smooth[node], alone[node + ahead], block, tuple(_regimes(channel, node, ahead)))
 
 
 def _regimes(channel: BodyChannel, node: Index, ahead: int) -> list[str]:
     """What the robot mostly does between start and end."""
-    drive, p = channel.drive, channel.geometry
+    drive, p, settings = channel.drive, channel.geometry, channel.settings.prediction
     v = 0.5 * p[0] * drive.speed_rad_s.sum(axis=1)
     omega = p[0] / p[1] * (drive.speed_rad_s[:, 1] - drive.speed_rad_s[:, 0])
     size = np.concatenate([[0.0], np.cumsum(np.abs(v))])
@@ -163,13 +151,13 @@ def _regimes(channel: BodyChannel, node: Index, ahead: int) -> list[str]:
     out = []
     for k in node:
         mean, mean_turn = (size[k + ahead] - size[k]) / ahead, (turn[k + ahead] - turn[k]) / ahead
-        if mean < _SLOW_M_S and mean_turn < 0.05:
+        if mean < settings.standing_m_s and mean_turn < settings.standing_rad_s:
             out.append("standstill")
-        elif mean < _SLOW_M_S * 3 and mean_turn > 0.1:
+        elif mean < settings.standing_m_s * 3 and mean_turn > settings.spinning_rad_s:
             out.append("turning on the spot")
-        elif float(np.ptp(v[k : k + ahead])) > _SPEEDING_M_S2 * ahead * GRID_STEP_S * 0.5:
+        elif float(np.ptp(v[k : k + ahead])) > settings.speeding_m_s2 * ahead * GRID_STEP_S * 0.5:
             out.append("speeding up and braking")
-        elif mean_turn > _TURNING_RAD_S:
+        elif mean_turn > settings.turning_rad_s:
             out.append("curves")
         else:
             out.append("straight back" if signed[k + ahead] < signed[k] else "straight ahead")
@@ -205,13 +193,13 @@ def prediction_error(body: BodyChannel, starts: Starts, p: Array, track: Array, 
     return np.column_stack([cosine * dx + sine * dy - moved[:, 0], -sine * dx + cosine * dy - moved[:, 1], yaw])
 
 
-def fold_vectors(found: Fit, block: Index, neutral: Array) -> dict[int, Array]:
+def fold_vectors(found: Fit, block: Index, neutral: Array, settings: GapSettings) -> dict[int, Array]:
     """For each of two interleaved folds the vector fitted on the other one's data, to second order.
 
     What the other one's data say next to nothing about is as in `neutral`: a limit that was reached, or a patch of the
     floor that was crossed, in one fold only is not known in the other, unless its few data fix the value by themselves.
     """
-    fold = (block // _FOLD_BLOCKS) % 2
+    fold = (block // round(settings.prediction.fold_s / settings.grid.block_s)) % 2
     if not found.active or np.unique(fold).size < 2:
         return {0: found.vector, 1: found.vector}
     normal, gradient = by_block(found, fold)
@@ -219,8 +207,8 @@ def fold_vectors(found: Fit, block: Index, neutral: Array) -> dict[int, Array]:
     active = np.array(found.active)
     for held in (0, 1):
         vector = found.vector.copy()
-        told = known(normal[1 - held], normal.sum(axis=0))
-        told |= np.diag(normal[1 - held]) * vector[active] ** 2 > _FIXED_SIGMAS**2
+        told = known(normal[1 - held], normal.sum(axis=0), settings.fit)
+        told |= np.diag(normal[1 - held]) * vector[active] ** 2 > settings.prediction.fixed_sigmas**2
         here = normal[1 - held] if found.precision is None else normal[1 - held] + np.diag(found.precision)
         vector[active[told]] -= inverse(here[np.ix_(told, told)]) @ gradient[1 - held][told]
         vector[active[~told]] = neutral[active[~told]]
@@ -246,10 +234,10 @@ def errors_of(
         error[inside] = prediction_error(body, starts, chain.body, track, ahead_s)[inside]
         there = starts.node[inside] + ahead
         speed_error[inside] = (body.drive.speed_rad_s[there] - speed[there]).mean(axis=1)
-    return summarise(error, speed_error, starts)
+    return summarise(error, speed_error, starts, body.settings.prediction)
 
 
-def summarise(error: Array, speed_error: Array, starts: Starts) -> PredictionErrors:
+def summarise(error: Array, speed_error: Array, starts: Starts, settings: PredictionSettings) -> PredictionErrors:
     """Root mean squares, their bootstrap intervals over blocks, and position by regime."""
     position, yaw = error[:, 0] ** 2 + error[:, 1] ** 2, error[:, 2] ** 2
     if not position.size:
@@ -261,19 +249,19 @@ def summarise(error: Array, speed_error: Array, starts: Starts) -> PredictionErr
     by_regime = {str(name): float(np.sqrt(position[regimes == name].mean())) for name in np.unique(regimes)}
     return PredictionErrors(
         float(np.sqrt(position.mean())),
-        _interval(position, starts.block),
+        _interval(position, starts.block, settings.resamples),
         float(np.sqrt(yaw.mean())),
-        _interval(yaw, starts.block),
+        _interval(yaw, starts.block, settings.resamples),
         float(np.sqrt((speed_error**2).mean())),
         by_regime,
         squares,
     )
 
 
-def _interval(squares: Array, block: Index) -> tuple[float, float]:
+def _interval(squares: Array, block: Index, resamples: int) -> tuple[float, float]:
     label = np.unique(block, return_inverse=True)[1]
     sums, counts = np.bincount(label, squares), np.bincount(label)
-    draws = np.random.default_rng(0).integers(0, sums.size, (_RESAMPLES, sums.size))
+    draws = np.random.default_rng(0).integers(0, sums.size, (resamples, sums.size))
     means = np.sqrt(sums[draws].sum(axis=1) / counts[draws].sum(axis=1))
     low, high = np.quantile(means, (0.025, 0.975))
     return float(low), float(high)
@@ -289,12 +277,17 @@ def floor_errors(
     still = displacement(chain.body, begins, clean, body.moving_s, starts.node, starts.pose[:, 2], ahead_s)
     generator = np.random.default_rng(1)
     squares, speeds = [], []
-    for _ in range(_PATHS):
+    for _ in range(body.settings.prediction.floor_paths):
         extra, wander = _disturbance(body, wheels, generator)
         track, _ = chain_track(body, wheels, chain, extra)
         moved = displacement(chain.body, begins, track, body.moving_s, starts.node, starts.pose[:, 2], ahead_s)
         error = moved - still
-        averaged = np.sqrt(max(2.0 * _REACH_S / max(float(np.median(np.diff(body.samples.t_s))), 1e-3), 1.0))
+        averaged = np.sqrt(
+            max(
+                2.0 * body.settings.prediction.pose_reach_s / max(float(np.median(np.diff(body.samples.t_s))), 1e-3),
+                1.0,
+            )
+        )
         jitter = generator.standard_normal((starts.node.size, 6))
         first = jitter[:, :3] * (noise.position_m, noise.position_m, noise.yaw_rad) / averaged
         last = jitter[:, 3:] * (noise.position_m, noise.position_m, noise.yaw_rad)
@@ -305,7 +298,7 @@ def floor_errors(
         speeds.append(wander[starts.node + round(ahead_s / GRID_STEP_S)])
     stacked = np.stack(squares)
     root = np.sqrt((stacked**2).mean(axis=0))
-    return summarise(root, np.sqrt((np.stack(speeds) ** 2).mean(axis=0)), starts)
+    return summarise(root, np.sqrt((np.stack(speeds) ** 2).mean(axis=0)), starts, body.settings.prediction)
 
 
 def _disturbance(body: BodyChannel, wheels: WheelChannel | None, generator: np.random.Generator) -> tuple[Array, Array]:
@@ -314,7 +307,7 @@ def _disturbance(body: BodyChannel, wheels: WheelChannel | None, generator: np.r
     count = drive.t_s.size
     v = 0.5 * p[0] * drive.speed_rad_s.sum(axis=1)
     omega = p[0] / p[1] * (drive.speed_rad_s[:, 1] - drive.speed_rad_s[:, 0])
-    moving = np.minimum(np.abs(drive.speed_rad_s).max(axis=1) * p[0] / 0.05, 1.0)
+    moving = np.minimum(np.abs(drive.speed_rad_s).max(axis=1) * p[0] / drive.settings.noise.slip_onset_m_s, 1.0)
     slip = _correlated(generator, count, 3, noise.slip_correlation_s)
     extra = np.column_stack(
         [
@@ -337,8 +330,3 @@ def _correlated(generator: np.random.Generator, count: int, width: int, correlat
     keep = float(np.exp(-GRID_STEP_S / max(correlation_s, 1e-3)))
     noise = generator.standard_normal((count, width)) * np.sqrt(1.0 - keep * keep)
     return np.asarray(lfilter([1.0], [1.0, -keep], noise, axis=0))
-
-
-def per_horizon(measure: Callable[[float], PredictionErrors]) -> dict[float, PredictionErrors]:
-    """Errors at every horizon."""
-    return {horizon: measure(horizon) for horizon in HORIZONS_S}

@@ -17,9 +17,6 @@ from disco_hw.gap.search.least_squares import Fit, by_block, inverse, known
 
 Array = NDArray[np.float64]
 
-_BLOCK_LENGTHS = (1, 3, 9)
-_FEWEST_BLOCKS = 5
-
 
 @dataclass(frozen=True, slots=True)
 class EffectEvidence:
@@ -47,7 +44,7 @@ def held_out_by_block(found: Fit, channel: ResidualChannel) -> Array:
     out = cost.copy()
     for b in range(cost.size):
         # A parameter of which only this block knows stays where it is: leaving out cannot judge it.
-        told = known(total - normal[b], total)
+        told = known(total - normal[b], total, channel.settings.fit)
         step = np.zeros(told.size)
         step[told] = inverse((total - normal[b])[np.ix_(told, told)]) @ gradient[b][told]
         out[b] += gradient[b] @ step + 0.5 * step @ normal[b] @ step
@@ -66,9 +63,9 @@ def inflation(found: Fit, channel: ResidualChannel, added: tuple[int, ...]) -> f
     moved = covariance[:, places]
     weight = np.linalg.inv(covariance[np.ix_(places, places)])
     largest = 1.0
-    for length in _BLOCK_LENGTHS:
+    for length in channel.settings.selection.block_lengths:
         normal, gradient = by_block(found, channel.block, length)
-        if gradient.shape[0] < _FEWEST_BLOCKS:
+        if gradient.shape[0] < channel.settings.selection.fewest_blocks:
             continue
         scatter = float(np.einsum("bi,ij,bj->", gradient @ moved, weight, gradient @ moved))
         told = np.einsum("bij,ip,pq,jq->b", normal, moved, weight, moved)

@@ -23,8 +23,8 @@ _OF_TURNING = tuple(
     if effect.uses_geometry and effect.channel is Channel.COMMAND_TO_WHEEL
     for column in effect.columns
 )
-_Z95 = 1.96
-_RISE = 0.5 * _Z95**2
+Z95 = 1.96
+_RISE = 0.5 * Z95**2
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +38,7 @@ class ParameterEstimate:
     @property
     def deviation(self) -> float:
         """Standard deviation that the interval stands for."""
-        return max((self.high - self.low) / (2.0 * _Z95), 1e-9)
+        return max((self.high - self.low) / (2.0 * Z95), 1e-9)
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ def in_motion(wheels: ChannelEstimates, body: ChannelEstimates) -> ChannelEstima
 
 
 def _around(value: float, deviation: float) -> tuple[float, float]:
-    return value - _Z95 * deviation, value + _Z95 * deviation
+    return value - Z95 * deviation, value + Z95 * deviation
 
 
 def _profiled(found: ChannelResult, column: str, step: float) -> ParameterEstimate:

@@ -10,13 +10,10 @@ from numpy.typing import NDArray
 
 from disco_hw.gap.data.layout import Layout
 from disco_hw.gap.noise.channels import ResidualChannel
+from disco_hw.gap.settings import FitSettings
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
-_MOST_ITERATIONS = 12
-_GOOD_ENOUGH = 0.02
-_LEAST_INFORMATION = 1e-12
-_LEAST_TOLD = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,18 +45,18 @@ def inverse(matrix: Array) -> Array:
     """Inverse of a normal matrix, scaled first; directions without information get a large variance."""
     if not matrix.size:
         return matrix
-    scale = np.sqrt(np.maximum(np.diag(matrix), _LEAST_INFORMATION))
+    scale = np.sqrt(np.maximum(np.diag(matrix), 1e-12))
     unit = matrix / np.outer(scale, scale)
     values, vectors = np.linalg.eigh(unit)
     return np.asarray((vectors / np.maximum(values, 1e-10)) @ vectors.T / np.outer(scale, scale))
 
 
-def known(part: Array, whole: Array) -> NDArray[np.bool_]:
+def known(part: Array, whole: Array, settings: FitSettings) -> NDArray[np.bool_]:
     """Which parameters (A,) a part of a log tells about, from its normal matrix and the whole log's, (A, A) each.
 
     What is told next to nothing about, a limit that was reached elsewhere only, would be moved anywhere.
     """
-    return np.asarray(np.diag(part) > _LEAST_TOLD * np.diag(whole))
+    return np.asarray(np.diag(part) > settings.least_known_share * np.diag(whole))
 
 
 def jacobian(
@@ -90,9 +87,12 @@ def fit(
     channel: ResidualChannel,
     start: Array,
     active: tuple[int, ...],
-    iterations: int = _MOST_ITERATIONS,
+    iterations: int | None = None,
 ) -> Fit:
-    """Fit the `active` entries from `start`; what a log does not tell stays near what is expected."""
+    """Fit the `active` entries from `start`; what a log does not tell stays near what is expected.
+
+    Levenberg-Marquardt within bounds (Marquardt, 1963); `iterations` as in the settings unless said.
+    """
     layout = channel.layout
     chosen = list(active)
     low, high = layout.low[chosen], layout.high[chosen]
@@ -109,7 +109,8 @@ def fit(
     cost = total(now, vector)
     slope = jacobian(residual, vector, active, layout, now)
     damping = 1e-3
-    for _ in range(iterations if active else 0):
+    most = channel.settings.fit.iterations if iterations is None else iterations
+    for _ in range(most if active else 0):
         normal, gradient = slope.T @ slope, slope.T @ now
         if held:
             normal, gradient = normal + np.diag(precision), gradient + precision * (vector[chosen] - expected)
@@ -130,7 +131,7 @@ def fit(
             damping *= 10.0
         if better or damping < 1.0:
             slope = jacobian(residual, vector, active, layout, now)
-        if not better or gained < _GOOD_ENOUGH:
+        if not better or gained < channel.settings.fit.enough_nats:
             break
     return Fit(vector, active, 0.5 * float(now @ now), now, slope, precision if held else None)
 

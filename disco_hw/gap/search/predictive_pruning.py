@@ -11,44 +11,46 @@ from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from itertools import chain
 
-from disco_hw.effects.registry import REGISTRY
-from disco_hw.gap.report.findings import REPORTED_HORIZON_S
 from disco_hw.gap.search.analysis import GapAnalysis
 from disco_hw.gap.search.channel_search import ChannelResult
-from disco_hw.gap.search.cross_validation import WORSE, PredictionErrors, clearly_worse, worse_by
-
-_MOST_CHANGES = 4
+from disco_hw.gap.search.cross_validation import PredictionErrors, clearly_worse, worse_by
+from disco_hw.gap.search.stages import stage_predictions
 
 
 def prune(analysis: GapAnalysis) -> GapAnalysis:
     """The analysis without what makes its held-out predictions worse."""
     if analysis.body is None:
         return analysis
-    refitted = analysis.errors("refitted", REPORTED_HORIZON_S)
-    for _ in range(_MOST_CHANGES):
-        now = _amended(analysis)
-        if clearly_worse(refitted, now):
-            better = _best(refitted, worse_by(refitted, now), chain(_lacking_one(analysis), _swapped_one(analysis)))
+    settings = analysis.drive.settings.prediction
+    predictions = stage_predictions(analysis)
+    refitted = predictions.errors("refitted", settings.reported_horizon_s)
+    now = predictions.errors("amended", settings.reported_horizon_s)
+    for _ in range(settings.most_changes):
+        if clearly_worse(refitted, now, settings):
+            options = chain(_lacking_one(analysis), _swapped_one(analysis))
+            better = _best(refitted, worse_by(refitted, now), options)
         else:
-            better = _best(now, 1.0 / WORSE, _lacking_one(analysis))
-            if better is not None and not clearly_worse(_amended(better), now):
+            better = _best(now, 1.0 / settings.worse, _lacking_one(analysis))
+            if better is not None and not clearly_worse(better[1], now, settings):
                 better = None
         if better is None:
             break
-        analysis = better
+        analysis, now = better
     return analysis
 
 
-def _amended(analysis: GapAnalysis) -> PredictionErrors:
-    return analysis.errors("amended", REPORTED_HORIZON_S)
-
-
-def _best(than: PredictionErrors, below: float, options: Iterable[GapAnalysis]) -> GapAnalysis | None:
+def _best(
+    than: PredictionErrors, below: float, options: Iterable[GapAnalysis]
+) -> tuple[GapAnalysis, PredictionErrors] | None:
     """Of some analyses the one that predicts best, if its errors are less than `below` times those of another."""
-    ratios = [(worse_by(than, _amended(option)), place, option) for place, option in enumerate(options)]
-    if not ratios or not min(ratios)[0] < below:
-        return None
-    return min(ratios)[2]
+    best, least = None, below
+    for option in options:
+        horizon_s = option.drive.settings.prediction.reported_horizon_s
+        errors = stage_predictions(option).errors("amended", horizon_s)
+        ratio = worse_by(than, errors)
+        if ratio < least:
+            best, least = (option, errors), ratio
+    return best
 
 
 def _lacking_one(analysis: GapAnalysis) -> Iterator[GapAnalysis]:
@@ -85,12 +87,3 @@ def _changed(analysis: GapAnalysis, old: ChannelResult, new: ChannelResult, prun
     if old is analysis.wheels:
         return replace(analysis, wheels=new, pruned=pruned)
     return replace(analysis, body=new, pruned=pruned)
-
-
-def pruning_sentences(analysis: GapAnalysis) -> list[str]:
-    """Sentences on what was left out for its harm."""
-    return [
-        f"{REGISTRY[name].channel.value if name in REGISTRY else 'unnamed'}: {name} fits, and yet makes held-out "
-        "predictions worse: it only stands for what is missing"
-        for name in analysis.pruned
-    ]

@@ -13,23 +13,16 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from disco_hw.gap.data.free_runs import read_angles
-from disco_hw.gap.data.gridded_drive import GRID_STEP_S
 from disco_hw.gap.data.layout import DELAYED_BY, WHEEL
 from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
 from disco_hw.gap.noise.noise_fit import learn_body_noise, learn_wheel_noise, wheel_misfit
 from disco_hw.gap.noise.wheel_noise import WheelNoise, whiten_wheels
 from disco_hw.gap.search.candidates import LATE_COLUMNS, indices
 from disco_hw.gap.search.least_squares import sensitivity
+from disco_hw.gap.settings import GRID_STEP_S, FitSettings
 from disco_hw.jit import kernel_function
 
 Array = NDArray[np.float64]
-
-_RIDGE = 1e-2
-_ROUNDS = 2
-_HALVINGS = 4
-_BENDS = (0.02, 0.05, 0.1, 0.2, 0.35, 0.55, 0.75, 0.9)
-_RESPONSES_S = (0.02, 0.05, 0.12, 0.3)
-_SLEWS_S = (0.1, 0.2, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0)
 
 
 def learn_saturated_wheels(channel: WheelChannel, vector: Array) -> tuple[WheelChannel, Array, int]:
@@ -53,9 +46,9 @@ def learn_saturated_wheels(channel: WheelChannel, vector: Array) -> tuple[WheelC
     best, least = channel, raw
     for begin in (channel, channel.with_noise(WheelNoise(reading_rad=channel.noise.reading_rad))):
         learnt = begin
-        for _ in range(_ROUNDS):
+        for _ in range(channel.settings.fit.richest_rounds):
             slope = np.column_stack([(whiten_wheels(c, learnt.gains) * learnt.weight).ravel() for c in columns])
-            found = _ridge(slope, (whiten_wheels(raw, learnt.gains) * learnt.weight).ravel())
+            found = _ridge(slope, (whiten_wheels(raw, learnt.gains) * learnt.weight).ravel(), channel.settings.fit)
             left = raw + np.tensordot(np.stack(columns, axis=-1), found, axes=1)
             learnt = learn_wheel_noise(learnt, left)
             misfits.append(wheel_misfit(channel, left)(learnt.noise.vector()))
@@ -81,12 +74,12 @@ def learn_saturated_body(
         step = 1e-3 / size
         slopes.append(((channel.residual(vector, step * perturbation) - base) / step)[:, None])
         steps.append(perturbation)
-    found = _ridge(np.column_stack(slopes), base)
+    found = _ridge(np.column_stack(slopes), base, channel.settings.fit)
     chosen, layout = list(active), channel.layout
     perturbation = (
         np.tensordot(found[len(chosen) :], np.stack(steps), axes=1) if steps else np.zeros((channel.drive.t_s.size, 3))
     )
-    for halving in range(_HALVINGS):
+    for halving in range(channel.settings.fit.richest_halvings):
         share = 0.5**halving
         moved, extra = vector.copy(), share * perturbation
         moved[chosen] = np.clip(vector[chosen] + share * found[: len(chosen)], layout.low[chosen], layout.high[chosen])
@@ -95,11 +88,11 @@ def learn_saturated_body(
     return channel, vector, np.zeros_like(perturbation), found.size
 
 
-def _ridge(slope: Array, residual: Array) -> Array:
+def _ridge(slope: Array, residual: Array, settings: FitSettings) -> Array:
     """Coefficients that take most of a residual away; where columns look alike, small ones."""
     scale = np.maximum(np.sqrt((slope**2).sum(axis=0)), 1e-12)
     unit = slope / scale
-    normal = unit.T @ unit + _RIDGE * np.eye(unit.shape[1])
+    normal = unit.T @ unit + settings.ridge * np.eye(unit.shape[1])
     return np.asarray(-np.linalg.solve(normal, unit.T @ residual) / scale)
 
 
@@ -112,7 +105,7 @@ def _integrated(speed: Array, first: NDArray[np.bool_]) -> Array:
 
 def _wheel_shapes(channel: WheelChannel, vector: Array) -> Iterator[Array]:
     """Speeds (M, 2) of the wheels that a command may make in ways the named effects do not have."""
-    drive = channel.drive
+    drive, settings = channel.drive, channel.settings.fit
     raw = np.nan_to_num(drive.command_rad_s)
     late = max(round(WHEEL.at(vector, DELAYED_BY) / GRID_STEP_S), 0)
     asked = np.concatenate([np.repeat(raw[:1], late, axis=0), raw[: raw.shape[0] - late]])
@@ -121,18 +114,18 @@ def _wheel_shapes(channel: WheelChannel, vector: Array) -> Iterator[Array]:
     largest = float(np.abs(u).max(initial=0.0))
     if largest <= 0.0:
         return
-    for share in _BENDS:
+    for share in settings.bend_shares:
         yield np.sign(u) * np.maximum(np.abs(u) - share * largest, 0.0)
     other = u[:, ::-1]
     yield from (np.tanh(u / 0.05), u, np.abs(u), u * u, other, np.abs(other) * np.tanh(u / 0.05), np.abs(other) * u)
     # Not time: what wanders slowly would be taken for a trend, and the noise then for less than it is.
     yield from (u * np.sin(drive.angle_rad), u * np.cos(drive.angle_rad))
-    for response_s in _RESPONSES_S:
+    for response_s in settings.responses_s:
         behind = _slow(u, response_s) - u
         yield behind
         yield behind[:, ::-1]
         yield _slow(behind, response_s)
-    for full_s in _SLEWS_S:
+    for full_s in settings.slews_s:
         yield _slewed(asked, largest / full_s) - asked
 
 

@@ -12,19 +12,11 @@ from disco_hw.gap.noise.channels import ResidualChannel
 from disco_hw.gap.search.candidates import CANDIDATES, Candidate, candidates_of, indices, parameters_of
 from disco_hw.gap.search.evidence import EffectEvidence, compare
 from disco_hw.gap.search.least_squares import Fit, fit, sensitivity, solve
+from disco_hw.gap.settings import SelectionSettings
 
 Array = NDArray[np.float64]
 Names = tuple[str, ...]
 Split = tuple[Array, Array | None]
-
-_MOST_EFFECTS = 6
-_WORTH_FITTING = 8.0
-_LOCAL_SEARCHES = 4
-_GAINED = 0.5
-_POOR = 0.5
-_LARGE_PART = 0.25
-# Half a difference of BIC of 6: positive evidence, no more.
-_CLEARLY = 3.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,6 +42,11 @@ class Selector:
     start: Array | None = None
     fits: dict[frozenset[str], Fit] = field(default_factory=dict)
     proofs: dict[tuple[frozenset[str], frozenset[str]], EffectEvidence] = field(default_factory=dict)
+
+    @property
+    def settings(self) -> SelectionSettings:
+        """What decides between effects."""
+        return self.channel.settings.selection
 
     def fit(self, names: Names) -> Fit:
         """The best fit of a set, started from the best smaller ones known."""
@@ -109,18 +106,20 @@ class Selector:
         closer(lambda value: self._linear_gain(parent, new, value), spacing)
         best = max(gains, key=gains.__getitem__)
         found = self._at(parent.vector, active, new, best)
-        if parent.cost - found.cost < _WORTH_FITTING:
+        if parent.cost - found.cost < self.settings.worth_fitting_nats:
             return found
         refined = {best: found}
         step = new.profile.refine
-        for _ in range(_LOCAL_SEARCHES):
+        for _ in range(self.settings.profile_searches):
             centre = min(refined, key=lambda value: refined[value].cost)
             for value in (centre - step, centre + step):
                 if value not in refined:
                     refined[value] = self._at(refined[centre].vector, active, new, value, 2)
         return min(refined.values(), key=lambda option: option.cost)
 
-    def _at(self, start: Array, active: tuple[int, ...], new: Candidate, value: float, iterations: int = 12) -> Fit:
+    def _at(
+        self, start: Array, active: tuple[int, ...], new: Candidate, value: float, iterations: int | None = None
+    ) -> Fit:
         assert new.profile is not None
         vector = start.copy()
         vector[self.channel.layout.place[new.profile.column]] = value
@@ -177,7 +176,8 @@ class Selector:
         Such a fit scatters from block to block more than any noise, and the score alone would never take it.
         """
         lacking = self.fit(smaller).cost - 0.5 * self.channel.count
-        return lacking > _POOR * 0.5 * self.channel.count and gain > _LARGE_PART * lacking
+        poor = lacking > self.settings.poor_share * 0.5 * self.channel.count
+        return poor and gain > self.settings.large_share * lacking
 
     def promise(self, accepted: Names, name: str) -> float:
         """Gain in nats of one more effect, less half its parameters' price; fitted only if it may be worth it."""
@@ -186,7 +186,7 @@ class Selector:
         smooth = candidate.starts is None and candidate.profile is None
         if smooth and frozenset((*accepted, name)) not in self.fits:
             gain = self._linear_gain(self.fit(accepted), candidate)
-            if gain < _WORTH_FITTING:
+            if gain < self.settings.worth_fitting_nats:
                 return float(gain - price)
         return float(self.fit(accepted).cost - self.fit((*accepted, name)).cost - price)
 
@@ -199,7 +199,7 @@ class Selector:
     def greedy(self, begin: Names = (), settle: Callable[[Selector, Names], None] | None = None) -> Names:
         """Forward steps only, from a set that is kept; `settle` may better the fit of a set before the next step."""
         accepted = begin or self.given
-        while len(accepted) < _MOST_EFFECTS:
+        while len(accepted) < self.settings.most_effects:
             ranked = self.ranked(accepted)
             new = next((name for name in ranked if self.acceptable(accepted, (*accepted, name))), None)
             if new is None:
@@ -213,7 +213,7 @@ class Selector:
         """Forward, swap, backward, until nothing changes; from what is needed of a set to begin with."""
         accepted = self._backward(begin) if begin else self.given
         visited = {frozenset(accepted)}
-        while len(accepted) < _MOST_EFFECTS:
+        while len(accepted) < self.settings.most_effects:
             ranked = self.ranked(accepted)
             new = next((name for name in ranked if self.acceptable(accepted, (*accepted, name))), None)
             if new is None:
@@ -228,7 +228,7 @@ class Selector:
     def _swapped(self, accepted: Names) -> Names:
         """Replace single effects as long as that fits better by more than the parameters' price."""
         for _ in range(len(accepted)):
-            best, score = accepted, 2.0
+            best, score = accepted, self.settings.swap_nats
             for place, old in enumerate(accepted):
                 if old in self.given:
                     continue
@@ -248,7 +248,7 @@ class Selector:
     def rivals(self, accepted: Names, name: str) -> Names:
         """Effects that would do in place of an accepted one: not clearly worse, the price of parameters paid."""
         rest = tuple(other for other in accepted if other != name)
-        worth = self._worth(rest, accepted, name) - _CLEARLY
+        worth = self._worth(rest, accepted, name) - self.settings.rival_nats
         others = (other for other in candidates_of(self.channel.layout) if other not in accepted)
         return tuple(other for other in others if self.promise(rest, other) > worth)
 
@@ -279,6 +279,6 @@ class Selector:
         places = [layout.place[column] for column in columns]
         vector[places] = layout.neutral[places]
         option, key = fit(self.channel, vector, indices(self.channel, rest)), frozenset(rest)
-        if option.cost < self.fit(rest).cost - _GAINED:
+        if option.cost < self.fit(rest).cost - self.settings.better_nats:
             self.fits[key] = option
             self.proofs = {pair: proof for pair, proof in self.proofs.items() if key not in pair}

@@ -13,23 +13,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.gap.data.gridded_drive import GRID_STEP_S, GriddedDrive
+from disco_hw.gap.data.gridded_drive import GriddedDrive
 from disco_hw.gap.data.layout import Layout
 from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
+from disco_hw.gap.settings import GRID_STEP_S, GapSettings, TermSettings
 from disco_hw.model import EffectSetting
 from disco_hw.model.terms import BODY_FEATURES, BODY_TARGETS, COMMAND, COMMAND_FEATURES, TERMS, term_name
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
-
-_SPAN_NODES = 8
-_DISC_RADII_M = (0.5, 0.75, 1.0, 1.3)
-_DISC_SPACING_M = 0.4
-_DISC_STEPS_M = (-0.2, -0.1, 0.0, 0.1, 0.2)
-_DISC_SIZE_STEPS_M = (-0.15, -0.05, 0.0, 0.05, 0.15)
-_LEAST_INSIDE, _MOST_INSIDE = 0.03, 0.8
-_LARGEST_FLOOR_M2 = 60.0
-_LONGEST_S = 400.0
 
 
 @dataclass(frozen=True)
@@ -81,14 +73,14 @@ def motion(drive: GriddedDrive, p: Array) -> tuple[Array, Array, Array]:
     """Forward speed (m/s), yaw rate (rad/s) and acceleration (m/s^2) that the wheels tell, (M,) each."""
     speed = drive.speed_rad_s
     v = 0.5 * p[0] * speed.sum(axis=1)
-    return v, p[0] / p[1] * (speed[:, 1] - speed[:, 0]), np.gradient(smoothed(v), GRID_STEP_S)
+    return v, p[0] / p[1] * (speed[:, 1] - speed[:, 0]), np.gradient(smoothed(v, drive.settings.terms), GRID_STEP_S)
 
 
 def body_terms(channel: BodyChannel, p: Array) -> Iterator[Term]:
     """What may be added to the body's velocity; `p` is the vector of the channel."""
     drive = channel.drive
     v, w, a = motion(drive, p)
-    dw = np.gradient(smoothed(w), GRID_STEP_S)
+    dw = np.gradient(smoothed(w, drive.settings.terms), GRID_STEP_S)
     moving = np.minimum(np.abs(drive.speed_rad_s).max(axis=1) * p[0] / 0.05, 1.0)
     beyond = {"moving": moving, "domega/dt": dw, "v domega/dt": v * dw}
     for axis, target in enumerate(BODY_TARGETS):
@@ -130,20 +122,27 @@ def _with_place(name: str) -> str:
 
 def places(channel: BodyChannel, p: Array) -> Iterator[Term]:
     """Discs of the floor in which turning is different."""
-    drive = channel.drive
+    drive, settings = channel.drive, channel.settings.terms
     x, y = _where(channel)
     low_x, high_x, low_y, high_y = (*np.quantile(x, (0.02, 0.98)), *np.quantile(y, (0.02, 0.98)))
-    if (high_x - low_x) * (high_y - low_y) > _LARGEST_FLOOR_M2 or drive.t_s.size * GRID_STEP_S > _LONGEST_S:
+    if (high_x - low_x) * (
+        high_y - low_y
+    ) > settings.largest_floor_m2 or drive.t_s.size * GRID_STEP_S > settings.longest_s:
         return
-    across, along = (np.arange(low, high + 1e-9, _DISC_SPACING_M) for low, high in ((low_x, high_x), (low_y, high_y)))
-    yield from _discs(channel, p, ((cx, cy, radius) for cx in across for cy in along for radius in _DISC_RADII_M))
+    across, along = (
+        np.arange(low, high + 1e-9, settings.disc_spacing_m) for low, high in ((low_x, high_x), (low_y, high_y))
+    )
+    yield from _discs(
+        channel, p, ((cx, cy, radius) for cx in across for cy in along for radius in settings.disc_radii_m)
+    )
 
 
 def places_near(channel: BodyChannel, p: Array, disc: tuple[float, float, float]) -> Iterator[Term]:
     """Discs of the floor closer around one than `places` lie to each other."""
     x, y, radius = disc
-    sizes = [size for size in (radius + step for step in _DISC_SIZE_STEPS_M) if size > 0.0]
-    steps = _DISC_STEPS_M
+    settings = channel.settings.terms
+    sizes = [size for size in (radius + step for step in settings.disc_size_steps_m) if size > 0.0]
+    steps = settings.disc_steps_m
     yield from _discs(channel, p, ((x + dx, y + dy, size) for dx in steps for dy in steps for size in sizes))
 
 
@@ -156,6 +155,7 @@ def _where(channel: BodyChannel) -> tuple[Array, Array]:
 def _discs(channel: BodyChannel, p: Array, discs: Iterable[tuple[float, float, float]]) -> Iterator[Term]:
     """Those in which a good part of all turning was done, and outside of which too."""
     x, y = _where(channel)
+    settings = channel.settings.terms
     speed = channel.drive.speed_rad_s
     w = p[0] / p[1] * (speed[:, 1] - speed[:, 0])
     turning = np.abs(w)
@@ -165,7 +165,7 @@ def _discs(channel: BodyChannel, p: Array, discs: Iterable[tuple[float, float, f
         if centre != (centre_x, centre_y):
             centre, squares = (centre_x, centre_y), (x - centre_x) ** 2 + (y - centre_y) ** 2
         inside = squares < radius * radius
-        if _LEAST_INSIDE < float(turning @ inside) / turned < _MOST_INSIDE:
+        if settings.least_inside < float(turning @ inside) / turned < settings.most_inside:
             where = f"within {radius:.2f} m of ({centre_x:.2f}, {centre_y:.2f}) m"
             perturbation = _on(2, np.where(inside, w, 0.0))
             disc = (float(centre_x), float(centre_y), float(radius))
@@ -178,9 +178,9 @@ def _on(axis: int, feature: Array) -> Array:
     return perturbation
 
 
-def smoothed(values: Array) -> Array:
+def smoothed(values: Array, settings: TermSettings) -> Array:
     """Values at the nodes without what changes from one to the next."""
-    window = np.hanning(2 * _SPAN_NODES + 1)
+    window = np.hanning(2 * settings.smooth_nodes + 1)
     return np.convolve(values, window / window.sum(), "same")
 
 
@@ -209,6 +209,11 @@ class WithTerms:
             place={**plain.place, **{name: len(plain.columns) + k for k, name in enumerate(names)}},
         )
         return cls(inner, terms, layout)
+
+    @property
+    def settings(self) -> GapSettings:
+        """The settings of the analysis."""
+        return self.inner.settings
 
     @property
     def neutral(self) -> Array:

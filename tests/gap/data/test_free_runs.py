@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from disco_hw.gap.data.free_runs import pose_residual, run_body, run_wheels
-from disco_hw.gap.data.gridded_drive import GRID_STEP_S
 from disco_hw.gap.data.layout import BODY, WHEEL
+from disco_hw.gap.settings import GRID_STEP_S
 from disco_hw.model import EffectSetting, Model
 from disco_hw.model.free_run import FreeRun
 

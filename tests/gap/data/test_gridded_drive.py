@@ -5,7 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from disco_hw.gap.data.gridded_drive import GRID_STEP_S, even_times, grid_drive
+from disco_hw.gap.data.gridded_drive import even_times, grid_drive
+from disco_hw.gap.settings import GRID_STEP_S
 from disco_hw.log.drive import Commands, DriveLog, Gyro, Poses, Wheels
 
 
@@ -60,10 +61,10 @@ def test_even_times_take_the_jitter_of_stamps_out_and_keep_gaps():
     rng = np.random.default_rng(1)
     even = np.arange(500) * 0.02
     stamped = even + 0.003 * rng.standard_normal(500)
-    assert np.std(even_times(stamped)[20:-20] - even[20:-20]) < 0.001
+    assert np.std(even_times(stamped, 10)[20:-20] - even[20:-20]) < 0.001
     lost = np.concatenate([even[:200], even[200:] + 5.0])
-    np.testing.assert_allclose(np.diff(even_times(lost))[200:], 0.02, atol=0.012)
-    assert even_times(lost)[200] - even_times(lost)[199] > 4.9
+    np.testing.assert_allclose(np.diff(even_times(lost, 10))[200:], 0.02, atol=0.012)
+    assert even_times(lost, 10)[200] - even_times(lost, 10)[199] > 4.9
 
 
 def test_wheels_that_another_master_turns_are_left_out():

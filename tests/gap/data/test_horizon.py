@@ -1,11 +1,13 @@
 """Displacements ahead in the frame of the start."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from disco_hw.gap.data.gridded_drive import GRID_STEP_S
 from disco_hw.gap.data.horizon import displacement, starts_of
 from disco_hw.gap.data.layout import BODY
+from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S
 
 N = 1000
 ONE_RUN = np.arange(N) == 0
@@ -44,7 +46,7 @@ def test_a_latency_does_not_look_into_another_run(latency_s):
     track[250:500, 0] *= -1.0
     shifted = BODY.neutral.copy()
     shifted[BODY.place["pose_latency.latency_s"]] = latency_s
-    start = starts_of(first, np.ones(N, bool), 1.0, 0.01)
+    start = starts_of(first, np.ones(N, bool), 1.0, replace(DEFAULT_SETTINGS.grid, start_every_s=0.01))
     assert start.max() + 102 == N
     moved = displacement(shifted, first, track, np.zeros(N), start, np.zeros(start.size), 1.0)[:, 0]
     # Before a run begins nothing is known: a pose that is so late sees the robot stand.
@@ -58,7 +60,7 @@ def test_starts_stay_within_runs_and_on_known_nodes():
     first[[0, 500]] = True
     usable = np.ones(N, bool)
     usable[250] = False
-    start = starts_of(first, usable, 1.0)
+    start = starts_of(first, usable, 1.0, DEFAULT_SETTINGS.grid)
     ends = start + 100
     assert np.all((start < 500) == (ends < 500))
     assert not np.any((start <= 250) & (ends >= 250))

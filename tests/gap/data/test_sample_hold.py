@@ -3,6 +3,7 @@
 import numpy as np
 
 from disco_hw.gap.data.sample_hold import undo_sample_hold
+from disco_hw.gap.settings import DEFAULT_SETTINGS
 from disco_hw.log.drive import Wheels, integrate_angle
 
 
@@ -19,7 +20,7 @@ def held_log(hold=4, dt=0.05, count=400):
 
 def test_held_speeds_give_the_angle_at_their_updates():
     t, true_angle, wheels = held_log()
-    fresh = undo_sample_hold(wheels)
+    fresh = undo_sample_hold(wheels, DEFAULT_SETTINGS.grid)
     assert fresh.t_s.size == 100
     truth = np.interp(fresh.t_s, t, true_angle)
     error = fresh.left_angle_rad - truth
@@ -32,13 +33,13 @@ def test_measured_angles_and_fresh_speeds_stay():
     t = np.arange(200) * 0.02
     speed = np.cos(t)
     wheels = Wheels(t, np.sin(t), np.sin(t), speed, speed, np.zeros(200, np.int64), False, True)
-    assert undo_sample_hold(wheels) is wheels
+    assert undo_sample_hold(wheels, DEFAULT_SETTINGS.grid) is wheels
     _, _, held = held_log()
     measured = Wheels(
         held.t_s, held.left_angle_rad, held.right_angle_rad, held.left_speed_rad_s, held.right_speed_rad_s,
         held.segment, True, True,
     )  # fmt: skip
-    assert undo_sample_hold(measured) is measured
+    assert undo_sample_hold(measured, DEFAULT_SETTINGS.grid) is measured
 
 
 def test_nothing_is_integrated_across_a_change_of_segment():
@@ -48,5 +49,5 @@ def test_nothing_is_integrated_across_a_change_of_segment():
         t + 50.0 * segment, wheels.left_angle_rad, wheels.right_angle_rad, wheels.left_speed_rad_s,
         wheels.right_speed_rad_s, segment, False, True,
     )  # fmt: skip
-    fresh = undo_sample_hold(jumped)
+    fresh = undo_sample_hold(jumped, DEFAULT_SETTINGS.grid)
     assert np.abs(np.diff(fresh.left_angle_rad)).max() < 1.0

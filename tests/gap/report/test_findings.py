@@ -9,8 +9,9 @@ import pytest
 from disco_hw.gap.report.blind_spots import BlindSpot
 from disco_hw.gap.report.findings import STAGES, GapReport, UnnamedFinding
 from disco_hw.gap.report.page import page
-from disco_hw.gap.search.channel_search import _HEAVIEST, _NAMED_SCORE
+from disco_hw.gap.report.wording import answer, as_text
 from disco_hw.gap.search.cross_validation import PredictionErrors
+from disco_hw.gap.settings import DEFAULT_SETTINGS
 from disco_hw.model import Model
 from disco_hw.outputs import as_json
 
@@ -34,14 +35,14 @@ def report(amended_m, yaw_rad=0.02, blind=()):
 
 
 def test_the_answer_has_the_gap_before_and_after_and_the_noise():
-    assert report(0.014).answer()[1] == (
+    assert answer(report(0.014))[1] == (
         "Adding it takes the 2 s position error from 47 mm (nominal 60 mm) to 14 mm; noise alone gives 14 mm."
     )
 
 
 def test_a_model_that_predicts_worse_is_not_recommended():
     for worse in (report(0.052), report(0.014, yaw_rad=0.03)):
-        assert worse.answer()[1].endswith("Do not drive with it: it predicts worse than without.")
+        assert answer(worse)[1].endswith("Do not drive with it: it predicts worse than without.")
         assert worse.as_dict()["gap"]["amended_is_worse"]
     assert not report(0.048).as_dict()["gap"]["amended_is_worse"]
 
@@ -51,7 +52,7 @@ def test_one_drive_is_asked_for():
     assert report(0.014, blind=("turn_slip", "yaw_rate_limit")).drive == "disco-hw drive ROBOT.toml --script spins"
     several = report(0.014, blind=("turn_slip", "deadband"))
     assert several.drive == "disco-hw drive ROBOT.toml --script separate"
-    assert several.drive in several.answer()[2]
+    assert several.drive in answer(several)[2]
     assert several.drive in page(several)
 
 
@@ -67,15 +68,16 @@ def test_a_log_of_short_stretches_says_that_it_does_not_tell_the_gap():
     nan = PredictionErrors(math.nan, (math.nan, math.nan), math.nan, (math.nan, math.nan), math.nan, {})
     some = report(0.014)
     short = replace(some, gap={s: {h: e if h < 2.0 else nan for h, e in of.items()} for s, of in some.gap.items()})
-    assert short.answer()[1] == "No stretch of the logs is long enough to see how far 2 s predictions are off."
+    assert answer(short)[1] == "No stretch of the logs is long enough to see how far 2 s predictions are off."
     told = json.loads(as_json(short.as_dict()), parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
     assert told["gap"]["amended"]["position_rmse_m"] is None
     assert told["gap"]["amended"]["position_ci95_m"] == [None, None]
     assert told["gap"]["horizons"][0]["amended"]["position_rmse_m"] == 0.014
-    assert "nan" not in short.as_text()
+    assert "nan" not in as_text(short)
     assert "nan" not in page(short).replace("dominant", "")
 
 
 def test_the_page_names_the_score_that_a_name_takes():
-    accepts = f"score ({_NAMED_SCORE:g} accepts, up to {_HEAVIEST * _NAMED_SCORE:g} where"
+    selection = DEFAULT_SETTINGS.selection
+    accepts = f"score ({selection.named_score:g} accepts, up to {selection.heaviest * selection.named_score:g} where"
     assert accepts in page(report(0.014))

@@ -1,9 +1,13 @@
-"""Residuals by regime: each node lies where the wheels say it does, and what disagrees is told first."""
+"""Residuals by regime: each node lies where the wheels say it does, what disagrees comes first; what is left counts
+where the richest model still gains in several blocks of time.
+"""
+
+import math
 
 import numpy as np
 
 from disco_hw.gap.data.layout import BODY
-from disco_hw.gap.report.regimes import Regime, in_words, masks_at_nodes, regimes
+from disco_hw.gap.report.regimes import Regime, gain_by_block, in_words, masks_at_nodes, regimes
 from tests.gap.synthetic import body_channel, line_of
 
 
@@ -37,5 +41,20 @@ def test_a_fault_shows_in_its_regime_and_goes_with_its_effect():
 
 def test_only_what_is_louder_than_noise_is_worth_words():
     quiet, loud = Regime("straight", 1.1, 1.0, 100), Regime("turning left", 9.0, 1.0, 100)
-    assert in_words([quiet]) == "nowhere more than noise"
-    assert in_words([quiet, loud]) == "most turning left (3.0 times the noise)"
+    assert in_words([quiet], 1.5) == "nowhere more than noise"
+    assert in_words([quiet, loud], 1.5) == "most turning left (3.0 times the noise)"
+
+
+def test_gain_and_its_scatter_come_from_blocks():
+    block = np.repeat(np.arange(20), 30)
+    even = np.full(600, 0.1)
+    assert math.isclose(gain_by_block(even, block, 4)[0], 60.0)
+    assert gain_by_block(even, block, 4)[1] < 1e-9
+    once = np.where(block == 3, 2.0, 0.0)
+    total, spread = gain_by_block(once, block, 4)
+    assert total == 60.0
+    assert total < 3.0 * spread
+
+
+def test_too_few_blocks_say_nothing():
+    assert math.isinf(gain_by_block(np.ones(90), np.repeat(np.arange(3), 30), 4)[1])

@@ -13,6 +13,7 @@ from disco_hw.gap.data.layout import BODY, WHEEL
 from disco_hw.gap.find import find_gap
 from disco_hw.gap.noise.channels import WheelChannel
 from disco_hw.gap.noise.wheel_noise import WheelNoise
+from disco_hw.gap.report.wording import as_text
 from disco_hw.gap.search.channel_search import responding, search_body, wheel_moves
 from disco_hw.gap.search.selection import Selector
 from disco_hw.model import Model
@@ -51,7 +52,7 @@ def test_a_patch_that_is_left_for_good_is_told_with_the_change_it_looks_like():
     assert "within" in term.form
     assert term.indistinguishable_from == ("surface_change",)
     assert term.experiment == "drive again, later, where it was different"
-    assert "not to be told from surface_change" in report.as_text()
+    assert "not to be told from surface_change" in as_text(report)
     # Half of the log says nothing about it: its prediction is that of the plain model, not worse.
     assert not report.amended_is_worse
 

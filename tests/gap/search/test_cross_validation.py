@@ -5,12 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from disco_hw.gap.data.gridded_drive import BLOCK_S
 from disco_hw.gap.data.layout import BODY
 from disco_hw.gap.noise.channels import BodyChannel
 from disco_hw.gap.search.channel_search import indices
 from disco_hw.gap.search.cross_validation import (
-    FOLD_S,
     Chain,
     PredictionErrors,
     clearly_worse,
@@ -20,6 +18,7 @@ from disco_hw.gap.search.cross_validation import (
     smoothed_poses,
 )
 from disco_hw.gap.search.least_squares import fit
+from disco_hw.gap.settings import DEFAULT_SETTINGS
 from tests.gap.synthetic import NOISE, body_channel
 
 AHEAD_S = 2.0
@@ -55,12 +54,15 @@ def test_only_what_repeats_in_most_stretches_or_is_far_worse_is_clearly_worse():
         both = np.column_stack([squares, np.ones(len(squares))])
         return PredictionErrors(float(np.sqrt(np.mean(squares))), (0.0, 1.0), 1.0, (0.0, 1.0), 0.0, {}, both)
 
+    def clearly(before, after):
+        return clearly_worse(before, after, DEFAULT_SETTINGS.prediction)
+
     before = errors(1.0, 1.0, 1.0, 1.0, 1.0, 1.0)
-    assert clearly_worse(before, errors(1.2, 1.2, 1.1, 1.3, 1.2, 1.2))
-    assert not clearly_worse(before, errors(2.2, 0.9, 1.1, 0.9, 1.1, 1.0))
-    assert clearly_worse(before, errors(5.0, 0.9, 1.1, 0.9, 1.1, 1.0))
-    assert not clearly_worse(before, errors(1.05, 1.05, 1.05, 1.05, 1.05, 1.05))
-    assert not clearly_worse(errors(1.2, 1.2, 1.1, 1.3, 1.2, 1.2), before)
+    assert clearly(before, errors(1.2, 1.2, 1.1, 1.3, 1.2, 1.2))
+    assert not clearly(before, errors(2.2, 0.9, 1.1, 0.9, 1.1, 1.0))
+    assert clearly(before, errors(5.0, 0.9, 1.1, 0.9, 1.1, 1.0))
+    assert not clearly(before, errors(1.05, 1.05, 1.05, 1.05, 1.05, 1.05))
+    assert not clearly(errors(1.2, 1.2, 1.1, 1.3, 1.2, 1.2), before)
 
 
 def test_smoothed_poses_are_closer_to_the_truth_than_measured_ones():
@@ -82,7 +84,7 @@ def test_each_fold_is_predicted_by_what_was_fitted_on_the_other():
     spoilt[first, 2] *= 1.1
     shifted = BodyChannel.build(type(line)(**{**_fields(line), "pose_values": spoilt}), NOISE, channel.neutral)
     found = fit(shifted, channel.neutral, indices(shifted, ()))
-    vectors = fold_vectors(found, shifted.block, shifted.neutral)
+    vectors = fold_vectors(found, shifted.block, shifted.neutral, DEFAULT_SETTINGS)
     axle = {fold: vector[1] for fold, vector in vectors.items()}
     # Fold 0 holds that stretch: who predicts it has not seen it.
     assert axle[0] == pytest.approx(0.4, rel=0.01)
@@ -95,10 +97,10 @@ def test_what_a_fold_knows_nothing_about_is_not_in_its_prediction():
     found = fit(channel, with_slip(channel), indices(channel, ("turn_slip",)))
     # As if all turning had been done in fold 0: nothing elsewhere depends on the slip.
     column = found.active.index(place)
-    elsewhere = (channel.block // round(FOLD_S / BLOCK_S)) % 2 == 1
+    elsewhere = (channel.block // round(DEFAULT_SETTINGS.prediction.fold_s / DEFAULT_SETTINGS.grid.block_s)) % 2 == 1
     slope = found.jacobian.copy()
     slope[elsewhere, column] *= 1e-6
-    vectors = fold_vectors(replace(found, jacobian=slope), channel.block, channel.neutral)
+    vectors = fold_vectors(replace(found, jacobian=slope), channel.block, channel.neutral, DEFAULT_SETTINGS)
     assert vectors[0][place] == 0.0
     assert vectors[1][place] == pytest.approx(0.1, rel=0.2)
 

@@ -7,6 +7,7 @@ import pytest
 
 from disco_hw.gap.search.evidence import compare, held_out_by_block, inflation
 from disco_hw.gap.search.least_squares import Fit
+from disco_hw.gap.settings import DEFAULT_SETTINGS
 
 N, EACH = 3000, 50
 
@@ -19,7 +20,7 @@ def linear_fit(columns, y):
 
 
 def channel():
-    return SimpleNamespace(block=np.arange(N) // EACH, count=N, trusted_blocks=6.0)
+    return SimpleNamespace(settings=DEFAULT_SETTINGS, block=np.arange(N) // EACH, count=N, trusted_blocks=6.0)
 
 
 def test_white_noise_speaks_for_nothing_and_a_real_slope_for_itself():
@@ -84,7 +85,7 @@ def test_few_blocks_that_happen_to_scatter_do_not_take_the_evidence_away():
     # Nearly all is told in two of 20 blocks of nine.
     x = np.full((9000, 1), 0.02)
     x[:450] = x[4500:4950] = 1.0
-    wide = SimpleNamespace(block=np.arange(9000) // EACH, count=9000, trusted_blocks=6.0)
+    wide = SimpleNamespace(settings=DEFAULT_SETTINGS, block=np.arange(9000) // EACH, count=9000, trusted_blocks=6.0)
     factors = [inflation(linear_fit(x, rng.standard_normal(9000)), wide, (0,)) for _ in range(200)]
     assert np.quantile(factors, 0.95) < 2.0
     assert np.mean(factors) == pytest.approx(1.15, abs=0.15)

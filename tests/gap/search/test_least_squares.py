@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from disco_hw.gap.search.least_squares import by_block, fit, inverse, solve
+from disco_hw.gap.settings import DEFAULT_SETTINGS
 
 T = np.linspace(0.0, 4.0, 400)
 
@@ -17,7 +18,7 @@ def channel(truth, low=-10.0, high=10.0, noise=0.0, precision=0.0):
         step=np.array([1e-5, 1e-5]), low=np.full(2, low), high=np.full(2, high), neutral=np.zeros(2),
         precision=np.array([0.0, precision]),
     )  # fmt: skip
-    return SimpleNamespace(layout=layout, residual=lambda p: y - p[0] * np.exp(-p[1] * T))
+    return SimpleNamespace(settings=DEFAULT_SETTINGS, layout=layout, residual=lambda p: y - p[0] * np.exp(-p[1] * T))
 
 
 def test_a_smooth_curve_is_found_from_afar():

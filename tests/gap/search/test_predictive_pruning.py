@@ -6,8 +6,11 @@ from types import SimpleNamespace
 import pytest
 
 from disco_hw.gap import find_gap
+from disco_hw.gap.report.judge import residue_sentences
+from disco_hw.gap.search import predictive_pruning
 from disco_hw.gap.search.cross_validation import PredictionErrors
-from disco_hw.gap.search.predictive_pruning import prune, pruning_sentences
+from disco_hw.gap.search.predictive_pruning import prune
+from disco_hw.gap.settings import DEFAULT_SETTINGS
 from disco_hw.model import Model
 from tools.gap_logs import simulated_drive
 
@@ -31,11 +34,17 @@ class Whole:
     body: Part
     amended_m: dict
     pruned: tuple = ()
+    drive: object = field(default_factory=lambda: SimpleNamespace(settings=DEFAULT_SETTINGS))
 
     def errors(self, stage, ahead_s):
         names = frozenset((*self.wheels.names, *self.body.names))
         size = 0.1 if stage == "refitted" else self.amended_m.get(names, 0.1)
         return PredictionErrors(size, (size, size), size, (size, size), size, {})
+
+
+@pytest.fixture(autouse=True)
+def _predictions_of_the_parts(monkeypatch):
+    monkeypatch.setattr(predictive_pruning, "stage_predictions", lambda whole: whole)
 
 
 def told(amended_m, wheels, body=(), **rivals):
@@ -81,12 +90,13 @@ def test_what_the_given_model_has_stays():
 
 
 def test_what_was_left_out_is_said():
-    (said,) = pruning_sentences(Whole(Part(()), Part(()), {}, ("motor_lag",)))
+    (said,) = residue_sentences(Whole(None, None, {}, ("motor_lag",)))
     assert said.startswith("command_to_wheel: motor_lag fits")
     assert "worse" in said
 
 
 @pytest.mark.long
-def test_a_motor_with_a_slew_limit_is_not_given_a_gain_that_misleads():
+def test_a_motor_with_a_slew_limit_is_not_given_a_gain_that_misleads(monkeypatch):
+    monkeypatch.undo()
     report = find_gap(simulated_drive({"x_slew_limited_motor": 10.0}, seed=7002), Model(0.061, 0.415, 0.238))
     assert not report.amended_is_worse

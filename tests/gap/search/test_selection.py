@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from disco_hw.gap.data.gridded_drive import GRID_STEP_S
 from disco_hw.gap.data.layout import BODY
 from disco_hw.gap.noise.channels import WheelChannel
 from disco_hw.gap.noise.wheel_noise import WheelNoise
@@ -16,6 +15,7 @@ from disco_hw.gap.search.channel_search import body_moves, wheel_moves
 from disco_hw.gap.search.evidence import EffectEvidence
 from disco_hw.gap.search.least_squares import Fit
 from disco_hw.gap.search.selection import Selector, Thresholds
+from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S
 from tests.gap.synthetic import GEOMETRY, body_channel, line_of
 
 
@@ -119,7 +119,7 @@ def test_a_slow_drive_cannot_tell_lag_from_delay_and_says_so():
 
 def judged(gain=30.0, score=30.0, repeated=10.0, moved_m=0.01, misfit=0.0, count=1000):
     """Whether one effect is accepted on top of none: its gain, proof, what it moves, and what the fit without lacks."""
-    channel = SimpleNamespace(count=count, split=lambda vector: (vector, None))
+    channel = SimpleNamespace(settings=DEFAULT_SETTINGS, count=count, split=lambda vector: (vector, None))
     base = 0.5 * count * (1.0 + misfit)
     limits = Thresholds(score=20.0, moves_m=0.001)
     chosen = Selector(channel, lambda small, big: moved_m, limits)

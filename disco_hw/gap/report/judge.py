@@ -1,0 +1,150 @@
+"""From what was found to the findings of the report: which effects, how sure, and what they may be taken for."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+
+from disco_hw.effects.effect import Channel
+from disco_hw.effects.registry import REGISTRY
+from disco_hw.gap.report.blind_spots import BlindSpot, blind_spots, experiment_of
+from disco_hw.gap.report.findings import CandidateEvidence, ChannelFinding, EffectFinding, UnnamedFinding
+from disco_hw.gap.report.misspecification import misspecified_effects
+from disco_hw.gap.report.regimes import Regime, in_words, regimes, remaining_disagreements
+from disco_hw.gap.search.analysis import FinalFit, GapAnalysis
+from disco_hw.gap.search.candidates import candidates_of, parameters_of
+from disco_hw.gap.search.channel_search import ChannelResult
+from disco_hw.gap.search.confounding import (
+    ASYMMETRY,
+    ENCODER,
+    GAIN,
+    OUTSIDE_TESTS,
+    confounded_with,
+)
+from disco_hw.gap.search.intervals import ChannelEstimates
+
+
+def effect_findings(analysis: GapAnalysis, final: FinalFit, given: bool = False) -> tuple[EffectFinding, ...]:
+    """The effects that are missing, in order of evidence; with those `given` in the model, if asked."""
+    only = final.encoder_is_cause
+    out: list[EffectFinding] = []
+    for found, estimated in ((analysis.body, final.body_estimates), (analysis.wheels, final.wheel_estimates)):
+        if found is None or estimated is None:
+            continue
+        same = confounded_with(found.names, final.encoder_possible)
+        for name in found.names:
+            if name in found.selector.given and not given:
+                continue
+            if only and name in (GAIN, ASYMMETRY):
+                continue
+            out.append(_finding(name, found, estimated, same.get(name, ())))
+    if only and analysis.wheels is not None and final.wheel_estimates is not None:
+        values = {side: final.wheel_estimates.by_name[f"{GAIN}.{side}"] for side in ("left", "right")}
+        out.append(EffectFinding(ENCODER, REGISTRY[ENCODER].channel.value, values, _score(analysis.wheels, GAIN)))
+    return tuple(sorted(out, key=lambda effect: -effect.evidence))
+
+
+def _finding(name: str, found: ChannelResult, estimated: ChannelEstimates, same: tuple[str, ...]) -> EffectFinding:
+    values = {parameter.name: estimated.by_name[f"{name}.{parameter.name}"] for parameter in REGISTRY[name].parameters}
+    test = next((text for members, text in OUTSIDE_TESTS.items() if {name, *same} <= members and same), None)
+    rivals = tuple(other for other in found.selector.rivals(found.names, name) if other not in same)
+    if rivals:
+        test = "; ".join([*([test] if test else []), experiment_of(name)])
+        same = (*same, *rivals)
+    return EffectFinding(name, REGISTRY[name].channel.value, values, _score(found, name), same, test)
+
+
+def _score(found: ChannelResult, name: str) -> float:
+    """Evidence score of one accepted effect, the others kept."""
+    rest = tuple(other for other in found.names if other != name)
+    if name in found.selector.given:
+        return 0.0
+    return found.selector.evidence(rest, found.names).score
+
+
+def unnamed_findings(analysis: GapAnalysis) -> tuple[UnnamedFinding, ...]:
+    """What is missing and none of the named effects."""
+    out = []
+    for place, found in ((Channel.COMMAND_TO_WHEEL, analysis.wheels), (Channel.WHEEL_TO_BODY, analysis.body)):
+        if found is None:
+            continue
+        for one in found.unnamed:
+            same = found.either if one.term.disc is not None else ()
+            test = REGISTRY[same[0]].like_a_patch if same else None
+            in_model = one.term.model_name is not None
+            out.append(UnnamedFinding(place.value, one.form, one.evidence.score, in_model, same, test))
+    return tuple(out)
+
+
+def channel_findings(
+    analysis: GapAnalysis, effects: Iterable[EffectFinding], unnamed: Iterable[UnnamedFinding] = ()
+) -> tuple[ChannelFinding, ...]:
+    """Which channels disagree, and where."""
+    guilty = {effect.channel for effect in effects} | {term.channel for term in unnamed}
+    excess = analysis.drive.settings.report.excess
+    out = []
+    for place, found in ((Channel.COMMAND_TO_WHEEL, analysis.wheels), (Channel.WHEEL_TO_BODY, analysis.body)):
+        where = "not measured in this log" if found is None else in_words(regimes_of(found), excess)
+        out.append(ChannelFinding(place.value, place.value in guilty, where))
+    sensor = Channel.POSE_SENSOR.value
+    out.append(ChannelFinding(sensor, sensor in guilty, out[-1].where))
+    return tuple(out)
+
+
+def regimes_of(found: ChannelResult) -> list[Regime]:
+    """Residuals of a channel by regime, without anything that is missing and with all that was found."""
+    return regimes(found.channel, found.base.vector, *found.selector.split(found.names))
+
+
+def candidate_evidence(analysis: GapAnalysis) -> tuple[CandidateEvidence, ...]:
+    """Evidence of every named effect: of the accepted ones against their absence, of the others on top."""
+    out = []
+    for found in (analysis.body, analysis.wheels):
+        if found is None:
+            continue
+        selector = found.selector
+        for name in candidates_of(found.channel.layout):
+            if name in found.names:
+                rest = tuple(other for other in found.names if other != name)
+                gain, verdict = selector.fit(rest).cost - found.fit.cost, "accepted"
+                score = 0.0 if name in selector.given else selector.evidence(rest, found.names).score
+            else:
+                price = 0.5 * parameters_of((name,)) * math.log(max(found.channel.count, 2))
+                promise = selector.promise(found.names, name)
+                gain, score = promise + price, 2.0 * promise
+                enough = score > selector.thresholds.score
+                verdict = "moves a 2 s prediction too little, or in one stretch only" if enough else "not needed"
+                verdict = "makes held-out predictions worse" if name in analysis.pruned else verdict
+            out.append(CandidateEvidence(REGISTRY[name].channel.value, name, gain, score, verdict))
+    return tuple(sorted(out, key=lambda candidate: -candidate.score))
+
+
+def residue_sentences(analysis: GapAnalysis) -> tuple[str, ...]:
+    """What fits and was left out, and what is still missing after naming, by regime."""
+    out = [
+        f"{REGISTRY[name].channel.value if name in REGISTRY else 'unnamed'}: {name} fits, and yet makes held-out "
+        "predictions worse: it only stands for what is missing"
+        for name in analysis.pruned
+    ]
+    for found in (analysis.wheels, analysis.body):
+        if found is not None:
+            out += [*remaining_disagreements(found), *misspecified_effects(found)]
+    return tuple(out)
+
+
+def blind_spot_findings(
+    analysis: GapAnalysis, effects: Iterable[EffectFinding], top_rad_s: float | None
+) -> tuple[BlindSpot, ...]:
+    """Every effect that was not found, with the smallest size that would have been; blind ones first."""
+    named = {effect.name for effect in effects}
+    spots: list[BlindSpot] = []
+    for found in (analysis.wheels, analysis.body):
+        if found is not None:
+            spots += [spot for spot in blind_spots(found, top_rad_s) if spot.name not in named]
+    seen = {spot.name for spot in spots} | named
+    for name, effect in REGISTRY.items():
+        judged = analysis.wheels if effect.channel is Channel.COMMAND_TO_WHEEL else analysis.body
+        if name not in seen and judged is None:
+            first = effect.parameters[0]
+            spots.append(BlindSpot(name, first.name, first.unit, None, True, experiment_of(name)))
+    return tuple(sorted(spots, key=lambda spot: not spot.blind))

@@ -1,0 +1,321 @@
+"""Every threshold and choice of the gap analysis, in one place, with where each comes from.
+
+Marks: *measured*, on simulated or real logs with nothing hidden or something known; *literature*, with its source;
+*chosen*, by what is physically plausible or what costs little, without a study behind it. Sizes in SI units; the names
+carry the unit; "nats" are units of log likelihood. What belongs to one effect (where its fit starts, its ranges) is in
+that effect's file, not here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+# Compiled into the free runs and the filters, and so no settings.
+GRID_STEP_S = 0.01
+"""Grid of the free runs, s. Chosen: half the period of commands at 50 Hz."""
+WANDER_S = 20.0
+"""Correlation time of the slow error of a wheel's speed, s. Chosen: longer than any manoeuvre of a log."""
+
+
+@dataclass(frozen=True, slots=True)
+class GridSettings:
+    """How a log becomes a drive on an even grid."""
+
+    block_s: float = 3.0
+    """Blocks of time that are left out together. Chosen: as long as the windows of the poses."""
+    longest_s: float = 320.0
+    """Of a longer drive so much is judged, evenly spread. Chosen: it bounds how long a search takes."""
+    stretch_s: float = 20.0
+    """Length of the stretches that are picked of a long drive. Chosen: several manoeuvres each."""
+    shortest_run_s: float = 1.0
+    """Shorter runs are left out. Chosen: `lead_s` of each run is spent before it can be judged."""
+    longest_silence_s: float = 1.5
+    """Where wheel samples fail to come for longer, a run ends. Chosen."""
+    speed_span_s: float = 0.03
+    """Speeds are differences of the angle over so long either side, s. Chosen: a few encoder periods."""
+    even_samples: int = 10
+    """Time stamps are made even over so many neighbours either side. Chosen."""
+    longest_response_s: float = 1.5
+    """Wheels answer a command within this time. Chosen."""
+    no_command_rad_s: float = 0.05
+    """Below this nothing is asked, or turns. Chosen."""
+    turning_rad_s: float = 0.3
+    """Wheels that turn so fast without a command are driven by another master. Chosen."""
+    loud_rad_s: float = 2.0
+    """Wheels that rest under such a command do not listen to it. Chosen."""
+    fewest_readings: int = 100
+    """Fewer encoder readings do not judge the wheels. Chosen: 80 s of readings that are held leave as many."""
+    fewest_poses: int = 60
+    """Fewer poses do not judge the body. Chosen."""
+    held_share: float = 0.3
+    """Wheel speeds of which more than this share repeat the last one are held. Chosen: a Husky's do in most samples."""
+    held_turning_rad_s: float = 0.05
+    """Only wheels that turn faster say whether speeds are held. Chosen."""
+    held_periods: float = 4.0
+    """A value that is repeated for longer than so many periods was measured again. Chosen."""
+    lead_s: float = 1.0
+    """After a run's start so long nothing is predicted: what was commanded before is not known. Chosen."""
+    start_every_s: float = 0.2
+    """Predictions start so far apart. Chosen: neighbours then differ, and a minute has 300."""
+
+
+@dataclass(frozen=True, slots=True)
+class NoiseSettings:
+    """The noise of wheels, body and poses, learnt from the log itself."""
+
+    window_s: float = 3.0
+    """Poses are compared in windows of this length, the start of which is unknown. Chosen."""
+    shortest_window: int = 12
+    """Windows with fewer poses are left out, unless most are so thin. Chosen."""
+    longest_pose_gap_s: float = 2.0
+    """Where poses fail to come for longer, a window ends. Chosen."""
+    slip_onset_m_s: float = 0.05
+    """From this rim speed on the body slips as much as it ever does. Chosen."""
+    drift_onset_m_s: float = 0.02
+    """From this speed on the drift of a slope is whole. Chosen."""
+    trusted_wheel_blocks: float = 1.0
+    """How far the wheels' noise model is believed before a log speaks, in blocks of time. Measured: the mean square of
+    scores of what is not there is 3.4 over six dirty logs."""
+    trusted_body_blocks: float = 6.0
+    """The same for the body, whose noise wanders less. Measured: 1.4 over six dirty logs."""
+    calm_s: float = 0.05
+    """Half the span over which measured speeds are averaged for the quick error. Chosen."""
+    steady_s: float = 0.25
+    """Half the span over which they are averaged where no model tells what to expect. Chosen."""
+    fewest_steady: int = 3
+    """At least so many samples either side then. Chosen."""
+    huber: float = 3.0
+    """Whitened residuals beyond grow linearly. Literature: Huber's loss (1964); the size is chosen."""
+    prior_sd: float = 2.0
+    """Standard deviation of the logarithm of every noise parameter about its start. Chosen: a factor of seven."""
+    difference_step: float = 2e-2
+    """Step of the logarithms in central differences. Chosen."""
+    wheel_iterations: int = 25
+    """Steps of the search for the wheels' noise at most. Chosen: it is flat by then."""
+    outlier: float = 5.0
+    """Poses beyond so many standard deviations are left out. Chosen: one in two million by chance."""
+    smooth_samples: int = 25
+    """The local size of residuals is a mean over so many samples either side. Chosen."""
+    local_excess: float = 1.4
+    """Stretches with more than this mean square are weighed down. Chosen: white noise stays below."""
+    rest_rad_s: float = 0.05
+    """Wheels below rest, and read the same whatever the noise. Chosen."""
+    least_command_jitter_s: float = 1e-3
+    """Commands scatter by as much at least, s. Chosen."""
+    command_jitter_ratio: float = 2.0
+    """And by so many times what the encoder's stamps scatter. Chosen."""
+    command_jitter_share: float = 0.05
+    """And by this share of the encoder's period. Chosen. More than all that is a response, and no jitter."""
+    largest_wheel_noise: tuple[float, ...] = (0.05, 1.0, 0.1, 0.05, 0.1, 0.1, 0.02)
+    """Upper bounds in the order of `WheelNoise`. Chosen: beyond, wheels that do not turn would pass for noise."""
+
+
+@dataclass(frozen=True, slots=True)
+class FitSettings:
+    """Least squares, and the richest model of a channel, whose residual is noise."""
+
+    iterations: int = 12
+    """Steps of Levenberg-Marquardt at most. Chosen: nearly all fits end before."""
+    enough_nats: float = 0.02
+    """A step that gains less is the last one. Chosen."""
+    least_known_share: float = 1e-3
+    """A part of a log with less of the information about a parameter says nothing of it. Chosen."""
+    ridge: float = 1e-2
+    """Ridge of the richest model, on columns of unit length. Chosen: columns that look alike stay small."""
+    richest_rounds: int = 2
+    """How often its noise is learnt from what it leaves. Chosen."""
+    richest_halvings: int = 4
+    """How often its step is halved until it fits better. Chosen."""
+    bend_shares: tuple[float, ...] = (0.02, 0.05, 0.1, 0.2, 0.35, 0.55, 0.75, 0.9)
+    """Where the static response of a wheel may bend, shares of the largest command. Chosen: denser below."""
+    responses_s: tuple[float, ...] = (0.02, 0.05, 0.12, 0.3)
+    """Time constants of further responses. Chosen: factors of two and a half."""
+    slews_s: tuple[float, ...] = (0.1, 0.2, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0)
+    """How long wheels may take to the largest command where their change is limited. Chosen."""
+
+
+@dataclass(frozen=True, slots=True)
+class SelectionSettings:
+    """Which effects are accepted."""
+
+    ahead_s: float = 2.0
+    """What an effect moves is judged so far ahead. Chosen: about as far as a planner looks."""
+    most_moved_share: float = 0.1
+    """It is judged where it moves most, on this share of the predictions. Chosen: some are felt in few places only."""
+    least_moved_m: float = 1e-3
+    """What moves predictions less is not worth a name. Chosen: below what poses are measured to."""
+    named_score: float = 4.0
+    """Score that a named effect takes at least. Measured: of one parameter it takes twice the gain 13, by chance in one
+    log of 3700, of about 18 names in one of 200."""
+    unnamed_score: float = 20.0
+    """Score that a term without a name takes at least. Measured: with both, nothing was named in 446 of 450
+    logs with nothing hidden."""
+    rough_score: float = 20.0
+    """Score of the first, rough selection, whose noise is not learnt yet. Chosen."""
+    heaviest: float = 1.5
+    """Scores are raised by up to this factor where the noise has heavy tails. Chosen: noise in bursts wanders too, more
+    slowly than any block could show."""
+    gaussian_kurtosis: float = 3.0
+    """Fourth moment of noise without heavy tails. Literature: of the normal distribution."""
+    clipped_at: float = 6.0
+    """Whitened residuals beyond do not raise it further. Chosen."""
+    silent: float = 1e-3
+    """Whitened residuals below come of samples that say nothing. Chosen."""
+    most_effects: int = 6
+    """More effects are not named. Chosen."""
+    worth_fitting_nats: float = 8.0
+    """Gain to first order from which on an effect is fitted. Chosen: well below what acceptance takes."""
+    profile_searches: int = 4
+    """Rounds of the closer search of a profiled entry. Chosen."""
+    better_nats: float = 0.5
+    """A fit from another start replaces the one known if it is better by this. Chosen."""
+    poor_share: float = 0.5
+    """A fit lacks much if its cost is above the expected one by this share. Chosen."""
+    large_share: float = 0.25
+    """An effect that makes up this share of what such a fit lacks is taken whatever its score. Chosen."""
+    swap_nats: float = 2.0
+    """One effect replaces another if it fits better by this. Chosen."""
+    rival_nats: float = 3.0
+    """Effects that are worse by less would do as well. Literature: half a difference of BIC of 6, positive evidence
+    (Kass and Raftery, 1995)."""
+    block_lengths: tuple[int, ...] = (1, 3, 9)
+    """Neighbouring blocks taken as one for the sandwich variance. Chosen: 3, 9 and 27 s."""
+    fewest_blocks: int = 5
+    """Fewer blocks say nothing about their scatter. Chosen."""
+    rest_rad_s: float = 0.05
+    """Wheels below rest, and do not count for the tails of the noise. Chosen."""
+    far_off: float = 1.5
+    """Where the accepted set costs so many times what is expected, plainer noise is assumed. Chosen."""
+    place_nats: float = 6.0
+    """A patch of the floor and a change of all of it differ by less: either does. Chosen."""
+    encoder_sigmas: float = 3.0
+    """An encoder may be the cause if the body agrees within so many standard deviations. Chosen: one in 370."""
+    encoder_nats: float = 3.0
+    """And is the cause if it says so by this. Measured: of gains that are none of an encoder fewer than one in a
+    hundred comes so far by chance."""
+
+
+@dataclass(frozen=True, slots=True)
+class TermSettings:
+    """Unnamed terms, and patches of the floor."""
+
+    most_terms: int = 2
+    """More terms are not added. Chosen."""
+    least_own_share: float = 0.1
+    """A term of which what is fitted already does the rest is left out: it would only pull against it. Chosen."""
+    worth_trying_nats: float = 18.0
+    """Gain to first order from which on a term is fitted. Chosen: below what acceptance takes."""
+    about_many: int = 110
+    """Number of terms that the price of a choice among all assumes. Chosen: about as many as a usual log offers."""
+    smooth_nodes: int = 8
+    """Accelerations are taken of speeds averaged over so many nodes either side. Chosen: a tenth of a second."""
+    disc_radii_m: tuple[float, ...] = (0.5, 0.75, 1.0, 1.3)
+    """Sizes of patches. Chosen."""
+    disc_spacing_m: float = 0.4
+    """Distance of the centres that are tried. Chosen: half a patch."""
+    disc_steps_m: tuple[float, ...] = (-0.2, -0.1, 0.0, 0.1, 0.2)
+    """Closer around the best: offsets of the centre. Chosen."""
+    disc_size_steps_m: tuple[float, ...] = (-0.15, -0.05, 0.0, 0.05, 0.15)
+    """And of the radius. Chosen."""
+    least_inside: float = 0.03
+    """Share of all turning that must lie inside a patch. Chosen."""
+    most_inside: float = 0.8
+    """And at most. Chosen: outside of it the floor must be known too."""
+    largest_floor_m2: float = 60.0
+    """On larger floors no patch is sought. Chosen: there would be too many."""
+    longest_s: float = 400.0
+    """In longer logs neither. Chosen."""
+
+
+@dataclass(frozen=True, slots=True)
+class PredictionSettings:
+    """Free-running predictions on data that was not fitted."""
+
+    horizons_s: tuple[float, ...] = (0.5, 1.0, 2.0, 5.0)
+    """How far ahead. Chosen."""
+    reported_horizon_s: float = 2.0
+    """The one that the answer is about. Chosen: about as far as a planner looks."""
+    fold_s: float = 21.0
+    """Length of the stretches that are left out in turn. Chosen: seven blocks, longer than `WANDER_S`."""
+    pose_reach_s: float = 0.3
+    """A start pose is averaged over so long either side. Chosen."""
+    fixed_sigmas: float = 5.0
+    """A value that the other fold fixes to so many standard deviations is used, however few its data. Chosen."""
+    resamples: int = 400
+    """Bootstrap draws of an interval. Chosen."""
+    floor_paths: int = 3
+    """Simulated drives of the noise. Chosen: the error is averaged over hundreds of starts."""
+    worse: float = 1.05
+    """A larger ratio of errors is worse. Measured: equally good models scatter by some percent."""
+    far_worse: float = 1.25
+    """A larger ratio is worse whatever the scatter. Chosen."""
+    worse_sigmas: float = 2.0
+    """Standard deviations of the growth over blocks from which on it is worse. Chosen: one in twenty."""
+    most_changes: int = 4
+    """At most so many names are dropped or replaced as predictions are better without. Chosen."""
+    standing_m_s: float = 0.02
+    """Mean speed below which the robot stands; three times this, turns on the spot. Chosen."""
+    standing_rad_s: float = 0.05
+    """Mean yaw rate below which it stands. Chosen."""
+    spinning_rad_s: float = 0.1
+    """Mean yaw rate above which it turns on the spot. Chosen."""
+    turning_rad_s: float = 0.3
+    """Mean yaw rate above which it drives a curve. Chosen."""
+    speeding_m_s2: float = 0.25
+    """Mean acceleration above which it speeds up or brakes. Chosen."""
+
+
+@dataclass(frozen=True, slots=True)
+class ReportSettings:
+    """What is said of disagreements that are left, and of what a log could not show."""
+
+    usual_inflation: float = 1.5
+    """Inflation of the variance that is expected of an effect that is not there. Chosen."""
+    asked_share: float = 0.75
+    """A limit shows only where this share of what the robot can do is asked. Chosen."""
+    rest_rad_s: float = 0.1
+    """Regimes: wheels below rest. Chosen."""
+    speeding_rad_s2: float = 2.0
+    """Growth of the wheels' speed from which on they speed up or brake. Chosen."""
+    span_nodes: int = 10
+    """It is taken over so many nodes either side. Chosen."""
+    fewest_samples: int = 40
+    """Regimes with fewer samples are left out. Chosen."""
+    excess: float = 1.5
+    """Mean square of whitened residuals from which on a regime disagrees. Chosen: noise alone has one."""
+    louder: float = 1.1
+    """Something is left in a regime with so much more than the richest model leaves. Chosen."""
+    clear_sigmas: float = 3.0
+    """And so many standard deviations of the blocks. Chosen: one in 370."""
+    nats_each: float = 1.0
+    """And nats for each parameter of the richest model. Chosen: the price of Akaike's criterion."""
+    least_nats: float = 20.0
+    """And nats beside. Chosen."""
+    fewest_blocks: int = 4
+    """With fewer blocks their scatter is not known. Chosen."""
+    most_regimes: int = 3
+    """At most so many are listed, the loudest. Chosen."""
+    at_bound: float = 0.9
+    """A jitter of the commands above this share of its bound is no jitter. Chosen."""
+    form_sigmas: float = 1.96
+    """An effect has another form than its name's if this sure. Literature: 95 % of the normal distribution."""
+    largest_ratio: float = 9.9
+    """Ratios of strength beyond are not told apart. Chosen."""
+    lever_m: float = 0.2
+    """Lever by which yaw rates are compared with speeds. Chosen."""
+
+
+@dataclass(frozen=True, slots=True)
+class GapSettings:
+    """All of it; the defaults are what every figure of the documents was made with."""
+
+    grid: GridSettings = GridSettings()
+    noise: NoiseSettings = NoiseSettings()
+    fit: FitSettings = FitSettings()
+    selection: SelectionSettings = SelectionSettings()
+    terms: TermSettings = TermSettings()
+    prediction: PredictionSettings = PredictionSettings()
+    report: ReportSettings = ReportSettings()
+
+
+DEFAULT_SETTINGS = GapSettings()

@@ -1,0 +1,65 @@
+"""Every setting says where it comes from, and has its effect where it is used."""
+
+import inspect
+import re
+from dataclasses import FrozenInstanceError, fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from disco_hw.gap import find
+from disco_hw.gap.data.gridded_drive import grid_drive
+from disco_hw.gap.search.channel_search import body_moves
+from disco_hw.gap.search.selection import Selector
+from disco_hw.gap.settings import DEFAULT_SETTINGS, GapSettings
+from tests.gap.synthetic import body_channel
+from tools.gap_logs import simulated_drive
+
+GROUPS = [type(getattr(DEFAULT_SETTINGS, field.name)) for field in fields(GapSettings)]
+
+
+@pytest.mark.parametrize("group", GROUPS, ids=lambda group: group.__name__)
+def test_each_setting_says_where_it_comes_from(group):
+    source = inspect.getsource(group)
+    for field in fields(group):
+        said = re.search(rf'\n    {field.name}: [^\n]* = .*\n    """(.+?)"""', source, re.DOTALL)
+        assert said, field.name
+        assert re.search(r"\b(Chosen|Measured|Literature)\b", said.group(1)), field.name
+
+
+@pytest.mark.parametrize("group", GROUPS, ids=lambda group: group.__name__)
+def test_each_setting_is_used(group):
+    sources = "".join(path.read_text() for path in Path(find.__file__).parent.rglob("*.py"))
+    assert [field.name for field in fields(group) if not re.search(rf"\.{field.name}\b", sources)] == []
+
+
+def test_settings_are_frozen():
+    for group in (DEFAULT_SETTINGS, *(getattr(DEFAULT_SETTINGS, field.name) for field in fields(GapSettings))):
+        with pytest.raises(FrozenInstanceError):
+            setattr(group, fields(group)[0].name, None)
+
+
+def test_a_setting_of_the_grid_is_felt_in_the_drive():
+    log = simulated_drive({}, 1, "circle")
+    short = replace(DEFAULT_SETTINGS, grid=replace(DEFAULT_SETTINGS.grid, longest_s=20.0, stretch_s=5.0))
+    drive = grid_drive(log, short)
+    assert drive.settings is short
+    assert drive.duration_s < 30.0 < grid_drive(log).duration_s
+
+
+def test_a_setting_of_the_selection_is_felt_by_who_selects():
+    channel, drive = body_channel(turn_slip=0.08)
+    none = replace(DEFAULT_SETTINGS, selection=replace(DEFAULT_SETTINGS.selection, most_effects=0))
+    strict = type(channel).build(replace(drive, settings=none), channel.noise, channel.neutral)
+    assert Selector(channel, body_moves(channel)).select() == ("turn_slip",)
+    assert Selector(strict, body_moves(strict)).select() == ()
+
+
+def test_a_setting_of_the_noise_is_felt_by_the_channel():
+    channel, drive = body_channel()
+    assert np.unique(channel.window).size > 10
+    wide = replace(DEFAULT_SETTINGS, noise=replace(DEFAULT_SETTINGS.noise, window_s=1000.0))
+    assert (
+        np.unique(type(channel).build(replace(drive, settings=wide), channel.noise, channel.neutral).window).size == 1
+    )
