@@ -44,6 +44,10 @@ _MESSAGE_OPCODE = int(Opcode.MESSAGE)
 _FOOTER_BYTES = _HEAD.size + 8 + 8 + 4
 _LARGEST_OFFSET = 2**63 - 1
 _LARGEST = 256 * 1024 * 1024
+# Of what one tick after the other writes, a chunk shrinks to a tenth; more than this is made to exhaust a reader.
+_UNPACKED_FREE = 16 * 1024
+_UNPACKED_RATIO = 128
+_MOST_DAMAGE = 100
 _SEARCH_BYTES = 1024 * 1024
 _CHUNK_MARK = b"\x04\x00\x00\x00zstd"
 _CHUNK_MARK_AT = _HEAD.size + 8 + 8 + 8 + 4
@@ -129,13 +133,13 @@ def _walked(fd: int, size: int) -> tuple[Contents, bool]:
     After damage it goes on with the next whole chunk.
     """
     contents = Contents(size=size)
-    offset = len(MAGIC)
+    offset, unlisted = len(MAGIC), 0
     while offset < size:
         head = _read(fd, offset, _HEAD.size)
         opcode, length = _HEAD.unpack(head) if len(head) == _HEAD.size else (0, 0)
         follows = offset + _HEAD.size + length
         if opcode == Opcode.DATA_END:
-            return contents, True
+            return _with_unlisted(contents, unlisted), True
         trouble = ""
         if not Opcode.HEADER <= opcode <= Opcode.DATA_END:
             trouble = "no record"
@@ -149,17 +153,31 @@ def _walked(fd: int, size: int) -> tuple[Contents, bool]:
         if trouble and (opcode not in _FRONT_MATTER or follows > size):
             # Of a damaged chunk the length is in doubt as well.
             follows = _next_chunk(fd, offset + 1, size) or size
-        if trouble:
+        if trouble and len(contents.damage) < _MOST_DAMAGE:
             contents.damage.append(f"at byte {offset}: {trouble}; {follows - offset} bytes are lost")
+        elif trouble:
+            unlisted += 1
         offset = follows
+    _with_unlisted(contents, unlisted)
     contents.damage.append("the end is missing: the writer was killed or is still at work, or the file was cut")
     return contents, False
+
+
+def _with_unlisted(contents: Contents, count: int) -> Contents:
+    if count:
+        contents.damage.append(f"at {count} further places something is lost")
+    return contents
 
 
 def _next_chunk(fd: int, start: int, size: int) -> int | None:
     """Where the next chunk record seems to begin at or after `start`: its content has a name of compression in it."""
     at = start + _CHUNK_MARK_AT
     while at < size:
+        try:
+            # What a sparse file does not have need not be searched.
+            at = max(at, os.lseek(fd, at, os.SEEK_DATA))
+        except OSError:
+            return None
         block = _read(fd, at, _SEARCH_BYTES)
         found = block.find(_CHUNK_MARK)
         while found >= 0:
@@ -174,8 +192,8 @@ def _next_chunk(fd: int, start: int, size: int) -> int | None:
 def read_chunk(fd: int, chunk: ChunkRef) -> bytes:
     """The records inside a chunk, checked against its CRC; raises DamagedError."""
     record = _parse(Chunk, _content(fd, chunk.offset, chunk.length))
-    if record.uncompressed_size > _LARGEST:
-        raise DamagedError(f"a chunk that claims {record.uncompressed_size} bytes")
+    if record.uncompressed_size > min(_LARGEST, _UNPACKED_FREE + _UNPACKED_RATIO * len(record.data)):
+        raise DamagedError(f"a chunk that claims to be {record.uncompressed_size} bytes, packed in {len(record.data)}")
     try:
         data = _decompress(record)
     except _PARSE_ERRORS as error:

@@ -8,13 +8,16 @@ base64. Logs of before have those strings in the fields themselves, and are read
 
 from __future__ import annotations
 
+import functools
 import math
-from typing import Any
+from typing import Any, TypeVar, get_type_hints
 
 import msgspec
 
 from disco_hw.log.records import TOPICS, Plan, PlanFigures, Record, topic_of
 
+_LIMIT = 2**63
+_R = TypeVar("_R")
 _PLAN = topic_of(Plan)
 _NOT_FINITE = "not_finite"
 _NOT_FINITE_KEY = b'"not_finite":'
@@ -62,7 +65,10 @@ def _restored(data: bytes) -> bytes:
 
 
 class JsonDecoder:
-    """Decodes records of every topic; raises msgspec.MsgspecError on what is not such a record."""
+    """Decodes records of every topic; raises msgspec.MsgspecError on what is not such a record.
+
+    OverflowError: it is one, with an integer that 64 bits do not hold.
+    """
 
     def __init__(self) -> None:
         # Lax decoding is what turns the strings of the non-finite numbers back into floats.
@@ -73,13 +79,36 @@ class JsonDecoder:
         """The record of one message of `topic`."""
         if _NOT_FINITE_KEY in data:
             data = _restored(data)
-        return self._decoders[topic].decode(data)
+        return _within_64_bits(self._decoders[topic].decode(data))
 
     def decode_brief(self, topic: str, data: bytes) -> Record | PlanFigures:
         """The same, but of a plan the figures alone, which takes less than half of the time."""
         if topic != _PLAN:
             return self.decode(topic, data)
-        return self._plan_figures.decode(_restored(data) if _NOT_FINITE_KEY in data else data)
+        return _within_64_bits(self._plan_figures.decode(_restored(data) if _NOT_FINITE_KEY in data else data))
+
+
+@functools.cache
+def _integers(record_type: type) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Names of the fields that are integers, and that map to them."""
+    hints = get_type_hints(record_type)
+    return (
+        tuple(name for name, hint in hints.items() if hint is int),
+        tuple(name for name, hint in hints.items() if hint == dict[str, int]),
+    )
+
+
+def _within_64_bits(record: _R) -> _R:
+    """The record, if every integer of it has a place in an array of numpy's; raises OverflowError."""
+    plain, mapped = _integers(type(record))
+    for name in plain:
+        if not -_LIMIT <= getattr(record, name) < _LIMIT:
+            raise OverflowError(name)
+    for name in mapped:
+        for value in getattr(record, name).values():
+            if not -_LIMIT <= value < _LIMIT:
+                raise OverflowError(name)
+    return record
 
 
 def json_schema(record_type: type[Record]) -> bytes:

@@ -24,13 +24,6 @@ def drive_from_log(log: Log) -> DriveLog:
     left out with a note. A new segment starts where ticks are missing and where wheel samples failed to come for half a
     second. Raises LogError if there is none of the three, if the ticks' clock goes backwards, and for damage.
     """
-    try:
-        return _drive(log)
-    except OverflowError:
-        raise LogError(f"{log.path}: a time in it is beyond 64 bits of nanoseconds; leave this log out") from None
-
-
-def _drive(log: Log) -> DriveLog:
     notes: list[str] = []
     command = _columns(log, "/command")
     speeds = np.column_stack([_floats(command["left_rad_s"]), _floats(command["right_rad_s"])])

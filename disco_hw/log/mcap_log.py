@@ -114,7 +114,10 @@ class Ending:
     @staticmethod
     def from_text(text: dict[str, str]) -> Ending:
         """Read what `as_text` wrote; raises KeyError or ValueError on anything else."""
-        return Ending(int(text["t_ns"]), int(text["sequence"]), int(text["dropped_ticks"]))
+        ending = Ending(int(text["t_ns"]), int(text["sequence"]), int(text["dropped_ticks"]))
+        if abs(ending.t_ns) > _MAX_TIME_NS // 2 or not 0 <= ending.sequence <= _MAX_TIME_NS:
+            raise ValueError("an end in another age of the universe")
+        return ending
 
 
 class McapLog:

@@ -31,6 +31,8 @@ from disco_hw.log.mcap_log import ENDING, FORMAT, METADATA, RECOVERY, Ending, Me
 from disco_hw.log.records import TOPIC_BY_NAME, PlanFigures, Record
 
 _R = TypeVar("_R")
+_EARLIEST_NS, _LATEST_NS = -(2**63), 2**63 - 1
+_NO_TIME = "a time or count in it is beyond 64 bits; leave this log out"
 _RECOVER = "run `disco-hw log recover` and use the mended log"
 
 
@@ -184,7 +186,9 @@ class Log:
             topic = names[message.channel_id]
             try:
                 record = decode(topic, message.data)
-            except msgspec.MsgspecError as error:
+            except OverflowError:
+                raise LogError(f"{self._path}: {_NO_TIME}") from None
+            except (msgspec.MsgspecError, RecursionError) as error:
                 # Its checksum is right, so it was written like this: there is nothing to recover.
                 by = self._metadata.version or "another one"
                 raise LogError(
@@ -285,6 +289,8 @@ class Log:
             if (start is not None and chunk.end_time < start) or (end is not None and chunk.start_time >= end):
                 continue
             for message in self._chunk_messages(chunk, wanted):
+                if not _EARLIEST_NS <= message.log_time - offset <= _LATEST_NS:
+                    raise LogError(f"{self._path}: {_NO_TIME}")
                 if (start is None or message.log_time >= start) and (end is None or message.log_time < end):
                     yield message
 

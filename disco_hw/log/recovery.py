@@ -27,8 +27,8 @@ class Recovered:
 def recover(source: Path, target: Path) -> Recovered:
     """Copy all complete chunks, attachments and metadata; the source stays as it is.
 
-    Works on any MCAP file with zstd or no compression. Raises LogError if the source is no MCAP file or the target
-    exists or cannot be written; a half-written target is removed.
+    Works on any MCAP file with zstd or no compression. Raises LogError if the source is no MCAP file or has no message
+    that can be read, or the target exists or cannot be written; a half-written target is removed.
     """
     fd = open_file(source, LOG)
     try:
@@ -41,6 +41,8 @@ def recover(source: Path, target: Path) -> Recovered:
             with stream:
                 writer = Writer(stream, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
                 recovered = _copy(fd, contents, writer, source.name)
+            if not recovered.messages:
+                raise LogError(f"{source}: no message in it can be read; there is nothing to recover")
         except BaseException:
             target.unlink(missing_ok=True)
             raise

@@ -10,8 +10,10 @@ from hypothesis import strategies as st
 from mcap.opcode import Opcode
 from mcap.writer import CompressionType, Writer
 
+from disco_hw.log import container
 from disco_hw.log.container import MAGIC, DamagedError, messages, read_attachment, read_chunk, read_contents
 from disco_hw.log.errors import LogError
+from disco_hw.log.link import Attachment
 from tools.log_samples import ATTACHMENTS, drive_ticks, log_bytes
 
 WHOLE = log_bytes(drive_ticks(120), flush_every=10)
@@ -206,6 +208,109 @@ def test_what_is_no_mcap_file_is_refused_in_one_line(data):
         contents_of(data)
     assert str(refused.value).startswith("x.mcap: ")
     assert "\n" not in str(refused.value)
+
+
+def test_a_file_of_bombs_is_refused_chunk_by_chunk_without_unpacking_one():
+    bomb = chunk_record(bytes(2**20))
+    assert len(bomb) < 200
+    tracemalloc.start()
+    try:
+        contents = contents_of(MAGIC + 500 * bomb)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert contents.chunks == []
+    assert "a chunk that claims to be 1048576 bytes, packed in" in contents.damage[0]
+    assert peak < 2**21
+    # What is wrong in hundreds of places is not told of each.
+    assert len(contents.damage) == 102
+    assert contents.damage[-2:] == [
+        "at 400 further places something is lost",
+        "the end is missing: the writer was killed or is still at work, or the file was cut",
+    ]
+
+
+def test_a_chunk_may_be_packed_well(monkeypatch):
+    """At the limit it is read, a byte beyond it not."""
+    inner = bytes([Opcode.DATA_END]) + struct.pack("<Q", 30_000) + bytes(30_000)
+    packed = len(zstandard.compress(inner))
+    for free, read in ((len(inner) - 128 * packed, True), (len(inner) - 128 * packed - 1, False)):
+        monkeypatch.setattr(container, "_UNPACKED_FREE", free)
+        assert bool(contents_of(MAGIC + chunk_record(inner)).chunks) == read
+
+
+def test_the_holes_of_a_sparse_file_are_skipped():
+    with Opened(MAGIC) as fd:
+        os.ftruncate(fd, 2**43)
+        contents = read_contents(fd, "x")
+    assert contents.chunks == []
+    assert "are lost" in contents.damage[0]
+
+
+def test_a_chunk_behind_a_hole_is_found():
+    chunk = chunk_record(bytes([Opcode.DATA_END]) + struct.pack("<Q", 3) + bytes(3))
+    with Opened(MAGIC + b"\0") as fd:
+        os.pwrite(fd, chunk, 2**32 + 5)
+        contents = read_contents(fd, "x")
+    assert [found.offset for found in contents.chunks] == [2**32 + 5 + 9]
+
+
+def test_after_the_last_record_nothing_more_is_looked_for():
+    """What follows the end of the data, here a chunk once more, is no data."""
+    end = bytes([Opcode.DATA_END]) + struct.pack("<QI", 4, 0)
+    chunk = chunk_record(b"")
+    assert len(contents_of(MAGIC + chunk + end + chunk).chunks) == 1
+    assert len(contents_of(MAGIC + chunk + chunk).chunks) == 2
+
+
+def with_attached_chunk():
+    """A log in which another is attached, the place of the attached one, and that of its record's length."""
+    attached = chunk_record(bytes([Opcode.DATA_END]) + struct.pack("<Q", 2) + b"in")
+    data = bytearray(
+        log_bytes(drive_ticks(3), finish=False, attachments=(Attachment("log.mcap", "application/mcap", attached),))
+    )
+    at = data.index(attached)
+    # The record: opcode, length, log time, create time, then name, media type and data, each after its own length.
+    return data, at, at - 8 - 4 - len("application/mcap") - 4 - len("log.mcap") - 16 - 8
+
+
+def test_what_is_attached_and_damaged_is_no_part_of_the_log():
+    data, at, _ = with_attached_chunk()
+    data[at - 1 - 8] ^= 1
+    contents = contents_of(data)
+    assert len(contents.damage) == 2
+    assert sequences(data) == [1, 2, 3]
+    assert len(contents.chunks) == 1
+
+
+def test_what_is_attached_at_the_very_end_and_damaged_is_no_part_of_the_log():
+    data, at, length_at = with_attached_chunk()
+    (length,) = struct.unpack_from("<Q", data, length_at)
+    data[at - 1 - 8] ^= 1
+    cut = data[: length_at + 8 + length]
+    contents = contents_of(cut)
+    assert contents.chunks == []
+    assert contents.damage[0].endswith(f"; {9 + length} bytes are lost")
+
+
+@pytest.mark.parametrize("length", [2**63 - 1, 2**64 - 1])
+def test_what_follows_something_whose_length_cannot_be_is_found(length):
+    data, _, length_at = with_attached_chunk()
+    struct.pack_into("<Q", data, length_at, length)
+    assert sequences(data) == [1, 2, 3]
+    # The attached one has a mark of a chunk as well, and where the record ends is not known.
+    assert len(contents_of(data).chunks) == 2
+
+
+@pytest.mark.parametrize("with_size", [True, False])
+def test_chunks_are_read_whether_or_not_their_frame_says_how_long_it_is(with_size):
+    inner = bytes([Opcode.DATA_END]) + struct.pack("<Q", 400) + bytes(400)
+    body = zstandard.ZstdCompressor(write_content_size=with_size).compress(inner)
+    assert (zstandard.frame_content_size(body) == -1) is not with_size
+    for claims, read in ((len(inner), True), (len(inner) - 1, False), (len(inner) + 1, False)):
+        content = struct.pack("<QQQI", 0, 0, claims, 0) + b"\x04\0\0\0zstd" + struct.pack("<Q", len(body)) + body
+        data = MAGIC + bytes([Opcode.CHUNK]) + struct.pack("<Q", len(content)) + content
+        assert bool(contents_of(data).chunks) == read
 
 
 def test_the_files_of_other_writers_are_read():

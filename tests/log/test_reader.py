@@ -5,10 +5,13 @@ from hypothesis import strategies as st
 from mcap.writer import Writer
 
 from disco_hw.errors import InputError
+from disco_hw.log.commands import export, info
 from disco_hw.log.errors import LogError
 from disco_hw.log.load import load_drive
 from disco_hw.log.reader import Gap, open_log
 from disco_hw.log.records import Counters, Estimate, Event, Innovation, Plan
+from disco_hw.runtime.replay import replay
+from disco_hw.viewer.recording import Recording
 from tools.log_samples import (
     ANY_RECORD,
     ATTACHMENTS,
@@ -21,6 +24,7 @@ from tools.log_samples import (
     tick,
     write_log,
 )
+from tools.viewer_run import ROBOT_FILE
 
 
 @pytest.fixture
@@ -199,7 +203,13 @@ ABOUT = {"robot": "x", "version": "7.0", "part": "1", "start_ns": "0", "wall_off
 WHEELS = '{"t_ns":%d,"received_ns":5,"left_angle_rad":0,"right_angle_rad":0,"left_speed_rad_s":1,"right_speed_rad_s":1}'
 
 
-def hostile(path, about=None, wheels=WHEELS % 5, log_time=10**18):
+ESTIMATE = (
+    '{"t_ns":%d,"x_m":0,"y_m":0,"yaw_rad":0,"covariance":[1,0,0,0,1,0,0,0,1],"speed_m_s":0,"yaw_rate_rad_s":0,'
+    '"left_speed_rad_s":0,"right_speed_rad_s":0}'
+)
+
+
+def hostile(path, about=None, wheels=WHEELS % 5, log_time=10**18, estimate=ESTIMATE % 5):
     """A log that no recorder of ours has written."""
     with path.open("wb") as stream:
         writer = Writer(stream)
@@ -207,6 +217,8 @@ def hostile(path, about=None, wheels=WHEELS % 5, log_time=10**18):
         writer.add_metadata("disco-hw", ABOUT | (about or {}))
         channel = writer.register_channel("/wheels", "json", writer.register_schema("x", "jsonschema", b"{}"))
         writer.add_message(channel, log_time, wheels.encode(), 0, 1)
+        channel = writer.register_channel("/estimate", "json", 0)
+        writer.add_message(channel, log_time, estimate.encode(), 0, 1)
         writer.finish()
     return path
 
@@ -218,10 +230,91 @@ def test_times_that_no_clock_has_make_it_no_log_of_ours(tmp_path, name, value):
         open_log(hostile(tmp_path / "run.mcap", {name: value}))
 
 
-@pytest.mark.parametrize("change", [{"wheels": WHEELS % 10**25}, {"log_time": 2**64 - 1}])
-def test_a_record_at_a_time_that_no_clock_has_is_refused(tmp_path, change):
-    with pytest.raises(LogError, match=r"run\.mcap: a time in it is beyond 64 bits"):
-        load_drive(hostile(tmp_path / "run.mcap", **change))
+READERS = {
+    "info": lambda path, _: info(path, False),
+    "export": lambda path, out: export(path, out, False),
+    "drive": lambda path, _: load_drive(path),
+    "records": lambda path, _: list(open_log(path).records()),
+    "columns": lambda path, _: open_log(path).columns("/wheels"),
+    "view": lambda path, _: Recording(path, ROBOT_FILE),
+    "replay": lambda path, _: replay(path),
+}
+
+
+@pytest.mark.parametrize("reader", sorted(READERS))
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"wheels": WHEELS % 2**63, "estimate": ESTIMATE % 2**63},
+        {"wheels": WHEELS % 10**25, "estimate": ESTIMATE % 10**25},
+        {"log_time": 2**64 - 1},
+    ],
+)
+def test_a_record_at_a_time_that_no_clock_has_is_refused(tmp_path, change, reader):
+    path = hostile(tmp_path / "run.mcap", **change)
+    if reader == "info" and "wheels" in change:
+        # It counts and decodes nothing.
+        assert READERS[reader](path, None)
+        return
+    with pytest.raises(InputError) as refused:
+        READERS[reader](path, tmp_path / "out.csv")
+    assert "\n" not in str(refused.value)
+    if reader != "replay":
+        assert "run.mcap: a time or count in it is beyond 64 bits" in str(refused.value)
+
+
+@pytest.mark.parametrize(("t_ns", "read"), [(2**63 - 1, True), (-(2**63), True), (2**63, False), (-(2**63) - 1, False)])
+def test_the_largest_times_that_fit_are_read(tmp_path, t_ns, read):
+    path = hostile(tmp_path / "run.mcap", wheels=WHEELS % t_ns)
+    with open_log(path) as log:
+        if read:
+            assert log.columns("/wheels")["t_ns"].tolist() == [t_ns]
+        else:
+            with pytest.raises(LogError, match="beyond 64 bits"):
+                log.columns("/wheels")
+
+
+def test_a_count_that_no_array_holds_is_refused(tmp_path):
+    counts = Counters(1, loop={"ticks": 2**63})
+    path = write_log(tmp_path / "run.mcap", [(1, [counts])])
+    with open_log(path) as log, pytest.raises(LogError, match="beyond 64 bits"):
+        list(log.records())
+
+
+def test_a_record_nested_without_end_is_one_line(tmp_path):
+    deep = WHEELS[:-1] % 5 + ',"more":' + "[" * 7000 + "]" * 7000 + "}"
+    with open_log(hostile(tmp_path / "run.mcap", wheels=deep)) as log, pytest.raises(LogError, match="cannot be read"):
+        list(log.records())
+
+
+def test_thousands_of_channels_are_read(tmp_path):
+    path = tmp_path / "run.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        writer.add_metadata("disco-hw", ABOUT)
+        for k in range(20_000):
+            channel = writer.register_channel(f"/other/{k}", "json", 0)
+        channel = writer.register_channel("/wheels", "json", writer.register_schema("x", "jsonschema", b"{}"))
+        writer.add_message(channel, 10**18, (WHEELS % 5).encode(), 0, 1)
+        writer.finish()
+    with open_log(path) as log:
+        assert log.counts == {"/wheels": 1}
+
+
+@pytest.mark.parametrize("end", [{"t_ns": "9" * 30}, {"sequence": "-1"}, {"sequence": "x"}, {"sequence": "9" * 30}, {}])
+def test_a_last_word_that_is_none_is_none(tmp_path, end):
+    path = tmp_path / "run.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        writer.add_metadata("disco-hw", ABOUT | {"format": "2"})
+        writer.add_metadata("disco-hw-end", {"t_ns": "5", "sequence": "5", "dropped_ticks": "0"} | end if end else {})
+        channel = writer.register_channel("/wheels", "json", 0)
+        writer.add_message(channel, 10**18, (WHEELS % 5).encode(), 0, 1)
+        writer.finish()
+    with open_log(path) as log:
+        assert (log.ending, log.summary().ended) == (None, False)
 
 
 def test_of_a_record_that_was_written_otherwise_the_version_is_named(tmp_path):

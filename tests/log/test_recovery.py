@@ -5,6 +5,7 @@ import pytest
 from mcap.reader import make_reader
 
 from disco_hw.errors import InputError
+from disco_hw.log.container import MAGIC
 from disco_hw.log.errors import LogError
 from disco_hw.log.reader import open_log
 from disco_hw.log.recovery import recover
@@ -64,12 +65,23 @@ def test_the_source_is_not_touched_and_nothing_is_overwritten(tmp_path):
     assert source.read_bytes() == WHOLE[:20_000]
 
 
-@pytest.mark.parametrize("content", [b"", b"no log"])
-def test_what_is_no_log_leaves_no_target_behind(tmp_path, content):
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"", "empty file"),
+        (b"no log", "not an MCAP file"),
+        (MAGIC, "no message in it can be read; there is nothing to recover"),
+        (log_bytes([]), "no message in it can be read"),
+        (WHOLE[:2000], "no message in it can be read"),
+    ],
+    ids=["empty", "other", "magic alone", "no records", "cut before its first chunk"],
+)
+def test_of_nothing_nothing_is_recovered_and_no_target_left_behind(tmp_path, content, words):
     source, target = tmp_path / "x", tmp_path / "y"
     source.write_bytes(content)
-    with pytest.raises(LogError):
+    with pytest.raises(LogError, match=words) as refused:
         recover(source, target)
+    assert "\n" not in str(refused.value)
     assert not target.exists()
 
 
