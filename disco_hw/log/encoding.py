@@ -8,7 +8,6 @@ base64. Logs of before have those strings in the fields themselves, and are read
 
 from __future__ import annotations
 
-import functools
 import math
 from typing import Any, TypeVar, get_type_hints
 
@@ -88,7 +87,6 @@ class JsonDecoder:
         return _within_64_bits(self._plan_figures.decode(_restored(data) if _NOT_FINITE_KEY in data else data))
 
 
-@functools.cache
 def _integers(record_type: type) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Names of the fields that are integers, and that map to them."""
     hints = get_type_hints(record_type)
@@ -98,9 +96,14 @@ def _integers(record_type: type) -> tuple[tuple[str, ...], tuple[str, ...]]:
     )
 
 
+_INTEGERS: dict[type, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    record: _integers(record) for record in (PlanFigures, *(topic.record for topic in TOPICS))
+}
+
+
 def _within_64_bits(record: _R) -> _R:
     """The record, if every integer of it has a place in an array of numpy's; raises OverflowError."""
-    plain, mapped = _integers(type(record))
+    plain, mapped = _INTEGERS[type(record)]
     for name in plain:
         if not -_LIMIT <= getattr(record, name) < _LIMIT:
             raise OverflowError(name)
