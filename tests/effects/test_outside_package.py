@@ -7,7 +7,9 @@ import pytest
 
 from tests.effects.outside import ROOT, OutsidePackage, effect_of_the_page
 
-TURN_DROOP = Path(__file__).with_name("turn_droop.py").read_text(encoding="utf-8")
+TURN_DROOP, MAST_LEAN = (
+    Path(__file__).with_name(name).read_text(encoding="utf-8") for name in ("turn_droop.py", "mast_lean.py")
+)
 
 POINTS_DIFFER = """
 from disco_hw.tasks.circle import CircleCost
@@ -34,6 +36,70 @@ kernel.check_against_reference(model, state, kernel.CIRCLE, kernel.PLAN_SETTINGS
 @pytest.mark.long
 def test_a_wheel_effect_is_rolled_out_with_the_geometry_of_each_point(tmp_path):
     OutsidePackage(tmp_path, turn_droop=TURN_DROOP).printed(ROLLOUTS)
+
+
+EVERYWHERE = """
+import json, sys
+from pathlib import Path
+import numpy as np
+from disco_hw.effects.registry import REGISTRY
+from disco_hw.gap.data.layout import BODY, WHEEL, pose_sensor
+from disco_hw.gap.search.candidates import candidates_of, smooth_of
+from disco_hw.gap.search.confounding import OUTSIDE_TESTS, confounded_with
+from disco_hw.gap.search.intervals import _OF_TURNING
+from disco_hw.inference.checks import CHECKS
+from disco_hw.log import records
+from disco_hw.model import EffectSetting, Gaussian, Model, load_model, save_model
+from disco_hw.viewer.uncertainty import ParameterPoints
+
+names = ("turn_droop.k_s", "speed_drag.k_s2_m2")
+belief = Gaussian(names, np.array([0.5, 0.3]), np.diag([0.01, 0.01]))
+effects = (EffectSetting("turn_droop", {"k_s": 0.5}), EffectSetting("speed_drag", {"k_s2_m2": 0.3}))
+file = Path(sys.argv[1])
+save_model(Model(0.06, 0.4, 0.1, effects=effects, belief=belief), file)
+plan = records.Plan(0, 0, 0.1, (2.0,) * 10, (6.0,) * 10, path_x_m=(0.0,), path_y_m=(0.0,), path_yaw_rad=(0.0,))
+fan = ParameterPoints(load_model(file)).trajectories(plan, (2.0, 6.0))
+leaning = BODY.neutral.copy()
+leaning[BODY.place["mast_lean.left_m"]] = 0.03
+print(json.dumps({
+    "compete": [candidates_of(WHEEL), candidates_of(BODY)],
+    "smooth": [smooth_of(WHEEL), smooth_of(BODY)],
+    "fan_m": np.ptp(fan[:, -1], axis=0).tolist(),
+    "points": len(fan),
+    "confounded": confounded_with(("lateral_icr",), False),
+    "decided": OUTSIDE_TESTS[frozenset(("mast_lean", "lateral_icr"))],
+    "sits_left_m": pose_sensor(leaning).left_m,
+    "of_turning": _OF_TURNING,
+    "checks": {check.name: check.effects for check in CHECKS},
+}))
+"""
+
+
+def test_model_files_fan_competition_classes_and_checks_have_effects_of_other_packages(tmp_path):
+    package = OutsidePackage(tmp_path, turn_droop=TURN_DROOP, mast_lean=MAST_LEAN, speed_drag=effect_of_the_page())
+    found = json.loads(package.printed(EVERYWHERE, str(tmp_path / "model.toml")))
+    wheels, body = found["compete"]
+    assert "turn_droop" in wheels
+    assert "speed_drag" in body
+    assert "mast_lean" not in body
+    assert "turn_droop" in found["smooth"][0]
+    assert "speed_drag" in found["smooth"][1]
+    assert found["points"] == 5
+    assert min(found["fan_m"]) > 1e-3
+    assert found["confounded"] == {"lateral_icr": ["mast_lean", "pose_offset"]}
+    assert found["decided"] == "hold a plumb line to the mast"
+    assert found["sits_left_m"] == 0.03
+    assert "turn_droop.k_s" in found["of_turning"]
+    assert "speed_drag" in found["checks"]["shorter at speed"]
+
+
+def test_the_virtual_robot_refuses_to_hide_it_in_one_line(tmp_path):
+    package = OutsidePackage(tmp_path, turn_droop=TURN_DROOP)
+    robot = str(ROOT / "disco_hw/robots/wombot.toml")
+    done = package.python("-m", "disco_hw", "sim", robot, "--hide", "turn_droop=0.1")
+    assert done.returncode == 2, done.stderr
+    (line,) = done.stderr.strip().splitlines()
+    assert "turn_droop" in line
 
 
 REFUSALS = {
@@ -106,3 +172,52 @@ def test_the_effect_of_the_page_is_found_named_and_driven(tmp_path):
     assert found["sentences"] == [f"drag takes {value:.2f} v^3 of the speed"]
     v = found["rolled_m"]
     assert abs(found["went_m"] - (v - value * v**3)) < 1e-6
+
+
+SEARCH_WHEELS = """
+import json
+from dataclasses import replace
+import numpy as np
+from disco_hw.gap import find_gap
+from disco_hw.log.drive import Poses
+from disco_hw.model import Model
+from tools.gap_logs import simulated_drive
+
+RADIUS_M, AXIAL_M, K_S = 0.06, 0.4, 0.3
+log = simulated_drive({}, seed=905)
+# The wheels turn as commanded. So they show the effect if what was commanded is what it makes them turn by.
+mean = 0.5 * (log.commands.left_rad_s + log.commands.right_rad_s)
+half = 0.5 * (log.commands.right_rad_s - log.commands.left_rad_s)
+half = half / (1.0 - 2.0 * K_S * RADIUS_M / AXIAL_M * np.abs(half))
+none, no_segment = np.empty(0), np.empty(0, dtype=np.int64)
+log = replace(
+    log,
+    commands=replace(log.commands, left_rad_s=mean - half, right_rad_s=mean + half),
+    poses=Poses(none, none, none, none, no_segment),
+)
+report = find_gap(log, Model(RADIUS_M, AXIAL_M, 0.1), top_rad_s=8.0)
+print(json.dumps({
+    "named": [effect.name for effect in report.effects],
+    "k": [[e.value, e.low, e.high] for effect in report.effects for e in effect.parameters.values()],
+    "blind": [spot.name for spot in report.blind_spots],
+    "text": report.as_text(),
+}))
+without = find_gap(simulated_drive({}, seed=906), Model(RADIUS_M, AXIAL_M, 0.1))
+(spot,) = [spot for spot in without.blind_spots if spot.name == "turn_droop"]
+print(json.dumps([spot.smallest_visible, spot.experiment]))
+"""
+
+
+@pytest.mark.long
+def test_a_wheel_effect_is_found_told_and_has_a_blind_spot(tmp_path):
+    package = OutsidePackage(tmp_path, turn_droop=TURN_DROOP)
+    found, spot = map(json.loads, package.printed(SEARCH_WHEELS).splitlines())
+    assert found["named"] == ["turn_droop"], found
+    ((value, low, high),) = found["k"]
+    assert low < 0.3 < high, found
+    assert value == pytest.approx(0.3, rel=0.1)
+    assert "turn_droop" not in found["blind"]
+    assert "turning asks for more than the wheels give" in found["text"]
+    smallest, experiment = spot
+    assert 0.0 < smallest < 0.3
+    assert experiment == "disco-hw drive ROBOT.toml --script spins: turning on the spot at two rates"
