@@ -13,8 +13,11 @@ from typing import Any
 import numpy as np
 from llvmlite import ir  # type: ignore[import-untyped]
 from numba import njit, typeof, types
+from numba.core.base import BaseContext
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler
+from numba.core.typing.context import Context
+from numba.core.typing.templates import Signature
 from numba.extending import intrinsic, overload
 
 from disco_hw.jit.plugins import plugin_sources
@@ -116,14 +119,14 @@ def compiled_for(kernel: Callable[..., Any], *arguments: Any) -> Callable[..., A
 
 
 @_intrinsic
-def tune_loops(_context: Any) -> tuple[Any, Callable[..., Any]]:
+def tune_loops(_context: Context) -> tuple[Any, Callable[..., Any]]:
     """Let the loops of the calling function use the processor's widest vectors and its estimates of reciprocal roots.
 
     LLVM holds back to 256 bits on processors whose early kinds slowed down for 512; here every loop is long enough to
     gain. The arrays that the function is handed must not overlap: no loop checks for it, and sums stay in registers.
     """
 
-    def generate(context: Any, builder: Any, _signature: Any, _arguments: Any) -> Any:
+    def generate(context: BaseContext, builder: ir.IRBuilder, _signature: Signature, _arguments: list[ir.Value]) -> Any:
         # llvmlite knows no attributes with values; the set takes them all the same.
         set.add(builder.function.attributes, '"prefer-vector-width"="512"')
         if platform.machine() in ESTIMATES_ROOTS:
@@ -133,16 +136,16 @@ def tune_loops(_context: Any) -> tuple[Any, Callable[..., Any]]:
         for argument in builder.function.args:
             if isinstance(getattr(argument.type, "pointee", None), ir.FloatType):
                 argument.add_attribute("noalias")
-        return context.get_dummy_value()
+        return context.get_dummy_value()  # type: ignore[no-untyped-call]
 
     return types.void(), generate
 
 
 @_intrinsic
-def reciprocal_root(_context: Any, value: Any) -> tuple[Any, Callable[..., Any]]:
+def reciprocal_root(_context: Context, value: types.Type) -> tuple[Any, Callable[..., Any]]:
     """Reciprocal of a square root: to 11 bits or more in a loop with `tune_loops` that is float32, else exact."""
 
-    def generate(_c: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    def generate(_c: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: list[ir.Value]) -> Any:
         kind = arguments[0].type
         root = builder.module.declare_intrinsic("llvm.sqrt", [kind])
         one = ir.Constant(kind, 1.0)
@@ -152,20 +155,20 @@ def reciprocal_root(_context: Any, value: Any) -> tuple[Any, Callable[..., Any]]
 
 
 @_intrinsic
-def float_from_bits(_context: Any, _bits: Any) -> tuple[Any, Callable[..., Any]]:
+def float_from_bits(_context: Context, _bits: types.Type) -> tuple[Any, Callable[..., Any]]:
     """Reinterpret int32 bits as a float32."""
 
-    def generate(_c: Any, builder: Any, _s: Any, arguments: Any) -> Any:
+    def generate(_c: BaseContext, builder: ir.IRBuilder, _s: Signature, arguments: list[ir.Value]) -> Any:
         return builder.bitcast(arguments[0], ir.FloatType())
 
     return types.float32(types.int32), generate
 
 
 @_intrinsic
-def bits_of_float(_context: Any, _value: Any) -> tuple[Any, Callable[..., Any]]:
+def bits_of_float(_context: Context, _value: types.Type) -> tuple[Any, Callable[..., Any]]:
     """Reinterpret a float32 as its int32 bits."""
 
-    def generate(_c: Any, builder: Any, _s: Any, arguments: Any) -> Any:
+    def generate(_c: BaseContext, builder: ir.IRBuilder, _s: Signature, arguments: list[ir.Value]) -> Any:
         return builder.bitcast(arguments[0], ir.IntType(32))
 
     return types.int32(types.float32), generate
@@ -181,13 +184,13 @@ def cast_like(value: float, like: float) -> float:
 
 
 @specialise(cast_like)
-def _cast_like(value: Any, like: Any) -> Callable[..., Any]:
+def _cast_like(value: types.Type, like: types.Type) -> Callable[..., Any]:
     target = like if isinstance(like, types.Float) else float32
     return lambda value, like: target(value)
 
 
 @scalar_function
-def _newton(square: Any) -> Any:
+def _newton(square: float) -> tuple[float, float, float]:
     """Estimates of the reciprocal root and of the root of a number, and the factor that refines both."""
     estimate = reciprocal_root(square)
     root = square * estimate
@@ -195,7 +198,7 @@ def _newton(square: Any) -> Any:
 
 
 @scalar_function
-def quick_norm_and_inverse(x: Any, y: Any) -> Any:
+def quick_norm_and_inverse(x: float, y: float) -> tuple[float, float]:
     """Length of a vector and its reciprocal, by Newton's step from an estimate, to 2e-7; of zero, 1e-15 and 1e15."""
     square = x * x + (y * y + cast_like(1e-30, x))
     estimate, norm, step = _newton(square)
@@ -203,15 +206,18 @@ def quick_norm_and_inverse(x: Any, y: Any) -> Any:
 
 
 @scalar_function
-def quick_length(x: Any, y: Any, z: Any) -> Any:
+def quick_length(x: float, y: float, z: float) -> float:
     """Length of a vector of three, as of `quick_norm_and_inverse`."""
     square = x * x + (y * y + (z * z + cast_like(1e-30, x)))
+    norm: float
+    step: float
     _, norm, step = _newton(square)
     return norm * step
 
 
 @scalar_function
-def quick_norm(x: Any, y: Any) -> Any:
+def quick_norm(x: float, y: float) -> float:
     """Length of a vector, as of `quick_norm_and_inverse`."""
+    norm: float
     norm, _ = quick_norm_and_inverse(x, y)
     return norm
