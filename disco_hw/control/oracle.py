@@ -42,7 +42,7 @@ def pendulum_costs(length_m: float, mass_kg: float, angle_rad: float, speed_rad_
 
 
 def point_costs(
-    theta: model.Theta, start: model.State, commands: Array, past: Array, step_s: float, cost: SequenceCost,
+    theta: model.Theta, start: model.RobotState, commands: Array, past: Array, step_s: float, cost: SequenceCost,
     time_s: float = 0.0,
 ) -> Array:  # fmt: skip
     """Costs (K,) of command sequences (K, T, 2) under one parameter point; `past` (H, 2) are the commands before."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from disco_hw.effects.effect import Array, Channel, Driven, Effect, Parameter, Stage, Symptom, Value, Values
+from disco_hw.effects.effect import Array, Channel, CommandedDrive, Effect, Parameter, Stage, Symptom, Value, Values
 from disco_hw.jit import scalar_function
 
 
@@ -29,7 +29,7 @@ def term(recent: float, older: float, coefficients: tuple[float, float] | None) 
     return recent + coefficients[1] * (older - recent)
 
 
-def starts(driven: Driven) -> tuple[tuple[float, ...], ...]:
+def starts(driven: CommandedDrive) -> tuple[tuple[float, ...], ...]:
     """Where a fit begins."""
     return (0.03,), (0.12,), (0.3,)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from disco_hw.effects.effect import Array, Channel, Driven, Effect, Parameter, Stage, Value, Values
+from disco_hw.effects.effect import Array, Channel, CommandedDrive, Effect, Parameter, Stage, Value, Values
 from disco_hw.jit import scalar_function
 
 
@@ -28,7 +28,7 @@ def term(command: float, coefficients: tuple[float] | None) -> float:
     return command - min(max(command, -width), width)
 
 
-def starts(driven: Driven) -> tuple[tuple[float, ...], ...]:
+def starts(driven: CommandedDrive) -> tuple[tuple[float, ...], ...]:
     """Where a fit begins."""
     return ((0.2,),)
 

@@ -127,7 +127,7 @@ class Symptom(enum.Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Driven:
+class CommandedDrive:
     """A drive as the search for an effect sees it: `commands` (N, 2) rad/s, known ones; wheel radius and axial distance
     (m) of `geometry`; when its poses begin and end (s).
     """
@@ -156,7 +156,7 @@ class Scan:
     """
 
     parameter: str
-    values: Callable[[Driven], tuple[float, ...]]
+    values: Callable[[CommandedDrive], tuple[float, ...]]
     refine: float
 
 
@@ -229,7 +229,7 @@ class Effect:
     late_starts: tuple[float, ...] = ()
     like_a_patch: str | None = None
     mimics: Mimicked | None = None
-    starts: Callable[[Driven], tuple[tuple[float, ...], ...]] | None = None
+    starts: Callable[[CommandedDrive], tuple[tuple[float, ...], ...]] | None = None
     scan: Scan | None = None
     limited: Callable[[Array, tuple[float, float]], Array] | None = None
     trials: tuple[float, ...] = ()

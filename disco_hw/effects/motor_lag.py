@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from disco_hw.effects.effect import Array, Channel, Driven, Effect, Parameter, Stage, Symptom, Value, Values
+from disco_hw.effects.effect import Array, Channel, CommandedDrive, Effect, Parameter, Stage, Symptom, Value, Values
 from disco_hw.jit import scalar_function
 
 
@@ -33,7 +33,7 @@ def term(end: float, mean: float, speed: float, coefficients: tuple[float, float
     return end + error * left_at_end, end + error * left_in_mean
 
 
-def starts(driven: Driven) -> tuple[tuple[float, ...], ...]:
+def starts(driven: CommandedDrive) -> tuple[tuple[float, ...], ...]:
     """Where a fit begins."""
     return (0.05,), (0.25,)
 

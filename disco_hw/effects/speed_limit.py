@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from disco_hw.effects.effect import Array, Channel, Driven, Effect, Parameter, Stage, Value, Values
+from disco_hw.effects.effect import Array, Channel, CommandedDrive, Effect, Parameter, Stage, Value, Values
 from disco_hw.jit import scalar_function
 
 
@@ -35,7 +35,7 @@ def limited(commands: Array, geometry: tuple[float, float]) -> Array:
     return np.asarray(np.abs(commands).max(axis=1))
 
 
-def starts(driven: Driven) -> tuple[tuple[float, ...], ...]:
+def starts(driven: CommandedDrive) -> tuple[tuple[float, ...], ...]:
     """A fit begins where a part of what was commanded is cut."""
     largest = driven.largest_speed_rad_s
     return tuple((share * largest,) for share in (0.92, 0.75, 0.5)) if largest > 0.1 else ()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from disco_hw.effects.effect import Array, Channel, Driven, Effect, Parameter, Scan, Stage, Value, Values
+from disco_hw.effects.effect import Array, Channel, CommandedDrive, Effect, Parameter, Scan, Stage, Value, Values
 from disco_hw.jit import cast_like, scalar_function
 
 REST_RAD_S = 0.02
@@ -34,7 +34,7 @@ def term(command: float, speed: float, coefficients: tuple[float] | None) -> flo
     return cast_like(0.0, command) if stuck else command
 
 
-def thresholds(driven: Driven) -> tuple[float, ...]:
+def thresholds(driven: CommandedDrive) -> tuple[float, ...]:
     """Thresholds to try (rad/s)."""
     return tuple(np.arange(0.1, 2.05, 0.1).tolist())
 

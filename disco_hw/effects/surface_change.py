@@ -6,7 +6,18 @@ import math
 
 import numpy as np
 
-from disco_hw.effects.effect import Array, Channel, Driven, Effect, Parameter, Scan, Stage, Symptom, Value, Values
+from disco_hw.effects.effect import (
+    Array,
+    Channel,
+    CommandedDrive,
+    Effect,
+    Parameter,
+    Scan,
+    Stage,
+    Symptom,
+    Value,
+    Values,
+)
 from disco_hw.jit import cast_like, scalar_function
 
 
@@ -37,7 +48,7 @@ def term(
     return forward * (one + part * forward_change), turn * (one + part * turn_change)
 
 
-def times(driven: Driven) -> tuple[float, ...]:
+def times(driven: CommandedDrive) -> tuple[float, ...]:
     """Times to try (s); none in a drive too short to have been two."""
     first, last = driven.first_s, driven.last_s
     if last - first < 30.0:

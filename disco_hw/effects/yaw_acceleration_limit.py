@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from disco_hw.effects.effect import Array, Channel, Driven, Effect, Parameter, Stage, Value, Values
+from disco_hw.effects.effect import Array, Channel, CommandedDrive, Effect, Parameter, Stage, Value, Values
 from disco_hw.jit import cast_like, scalar_function
 
 # How long the fastest turn that was commanded takes to reach, where a fit begins (s).
@@ -54,7 +54,7 @@ def term(
     return middle - turning, middle + turning, mean_middle - mean_turning, mean_middle + mean_turning
 
 
-def starts(driven: Driven) -> tuple[tuple[float, ...], ...]:
+def starts(driven: CommandedDrive) -> tuple[tuple[float, ...], ...]:
     """A fit begins where the fastest turn that was commanded takes a while."""
     largest = driven.largest_yaw_rate_rad_s
     return tuple((0.92 * largest / rise_s,) for rise_s in RISES_S) if largest > 0.1 else ()

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from disco_hw.effects.effect import Array, Channel, Driven, Effect, Parameter, Stage, Value, Values
+from disco_hw.effects.effect import Array, Channel, CommandedDrive, Effect, Parameter, Stage, Value, Values
 from disco_hw.jit import cast_like, scalar_function
 
 
@@ -41,7 +41,7 @@ def limited(commands: Array, geometry: tuple[float, float]) -> Array:
     return np.asarray(np.abs(commands[:, 1] - commands[:, 0]) * geometry[0] / geometry[1])
 
 
-def starts(driven: Driven) -> tuple[tuple[float, ...], ...]:
+def starts(driven: CommandedDrive) -> tuple[tuple[float, ...], ...]:
     """A fit begins where a part of what was commanded is cut."""
     largest = driven.largest_yaw_rate_rad_s
     return tuple((share * largest,) for share in (0.92, 0.75, 0.5)) if largest > 0.1 else ()

@@ -24,7 +24,7 @@ _LEAST_LEFT = 1e-4
 
 
 @dataclass(frozen=True, slots=True)
-class Check:
+class ScoreTest:
     """One way to differ: a name and what it would look like."""
 
     name: str
@@ -42,19 +42,19 @@ class Check:
 
 
 CHECKS = (
-    Check("late positions", Symptom.LATE_POSITIONS),
-    Check("sideways with speed", Symptom.SIDEWAYS_WITH_SPEED),
-    Check("sideways in fast turns", Symptom.SIDEWAYS_IN_FAST_TURNS),
-    Check("forward with turning", Symptom.FORWARD_WITH_TURNING),
-    Check("downhill", Symptom.DOWNHILL),
-    Check("downhill across", Symptom.DOWNHILL),
-    Check("shorter at speed", Symptom.SHORTER_AT_SPEED),
-    Check("distance changes", Symptom.DISTANCE_CHANGES),
-    Check("turns on straights", Symptom.TURNS_ON_STRAIGHTS),
-    Check("less turn at speed", Symptom.LESS_TURN_AT_SPEED),
-    Check("late yaw", Symptom.LATE_YAW),
-    Check("left unlike right", Symptom.LEFT_UNLIKE_RIGHT),
-    Check("turning changes", Symptom.TURNING_CHANGES),
+    ScoreTest("late positions", Symptom.LATE_POSITIONS),
+    ScoreTest("sideways with speed", Symptom.SIDEWAYS_WITH_SPEED),
+    ScoreTest("sideways in fast turns", Symptom.SIDEWAYS_IN_FAST_TURNS),
+    ScoreTest("forward with turning", Symptom.FORWARD_WITH_TURNING),
+    ScoreTest("downhill", Symptom.DOWNHILL),
+    ScoreTest("downhill across", Symptom.DOWNHILL),
+    ScoreTest("shorter at speed", Symptom.SHORTER_AT_SPEED),
+    ScoreTest("distance changes", Symptom.DISTANCE_CHANGES),
+    ScoreTest("turns on straights", Symptom.TURNS_ON_STRAIGHTS),
+    ScoreTest("less turn at speed", Symptom.LESS_TURN_AT_SPEED),
+    ScoreTest("late yaw", Symptom.LATE_YAW),
+    ScoreTest("left unlike right", Symptom.LEFT_UNLIKE_RIGHT),
+    ScoreTest("turning changes", Symptom.TURNING_CHANGES),
 )
 _POSITION_CHECKS = 8
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.inference.checks import CHECKS, Check, Scores
+from disco_hw.inference.checks import CHECKS, Scores, ScoreTest
 from disco_hw.inference.estimates import estimates
 from disco_hw.inference.excitation import Excitation
 from disco_hw.inference.noise import Noise
@@ -42,7 +42,7 @@ class Predictive:
         return bool(largest > LARGEST_DEVIATION) or bool(self.edge)
 
     @property
-    def disagreements(self) -> list[tuple[Check, float]]:
+    def disagreements(self) -> list[tuple[ScoreTest, float]]:
         """The checks that disagree, the worst first, with their deviations."""
         order = np.argsort(-np.abs(self.deviations))
         return [(CHECKS[i], float(self.deviations[i])) for i in order if abs(self.deviations[i]) > LARGEST_DEVIATION]

@@ -16,7 +16,7 @@ class Base(NamedTuple):
     x_icr_m: Any
 
 
-class Term(Protocol):
+class TermCoefficients(Protocol):
     """Coefficients of a term without a name: k and steps a second, of one parameter point or arrays (L,) of many."""
 
     @property
@@ -34,11 +34,11 @@ class Coefficients(Protocol):
     """
 
     @property
-    def command_terms(self) -> tuple[Term, ...] | None:
+    def command_terms(self) -> tuple[TermCoefficients, ...] | None:
         """Terms that act on commands."""
 
     @property
-    def body_terms(self) -> tuple[Term, ...] | None:
+    def body_terms(self) -> tuple[TermCoefficients, ...] | None:
         """Terms that act on the body."""
 
 

@@ -13,7 +13,7 @@ from disco_hw import config
 from disco_hw.effects.effect import Effect, Parameter
 from disco_hw.effects.registry import MOTION_EFFECTS, REGISTRY
 from disco_hw.model.belief import Belief, Uniform
-from disco_hw.model.coefficients import Base, Coefficients, Effects, Term
+from disco_hw.model.coefficients import Base, Coefficients, Effects, TermCoefficients
 from disco_hw.model.parameter import BASE_PARAMETERS
 from disco_hw.model.terms import COMMAND, TERMS, effect_of, table_entry
 
@@ -171,7 +171,7 @@ def coefficient_tables(
     radius, axial, x_icr = theta[:, 0], theta[:, 1], theta[:, 2]
     base = Base(table(0.5 * radius), table(0.5 * radius / axial), table(x_icr))
     tables: dict[str, tuple[NDArray[np.floating], ...] | None] = dict.fromkeys(MOTION_EFFECTS)
-    terms: dict[bool, list[Term]] = {True: [], False: []}
+    terms: dict[bool, list[TermCoefficients]] = {True: [], False: []}
     column = len(BASE_PARAMETERS)
     for setting in model.effects:
         width = len(setting.effect.parameters)

@@ -20,7 +20,7 @@ Theta = Mapping[str, Value]
 
 
 @dataclass(frozen=True)
-class State:
+class RobotState:
     """Pose of the tracked point (m, rad) and wheel speeds (rad/s)."""
 
     x: Value
@@ -120,7 +120,7 @@ def _called(effect: Effect, theta: Theta, motion: Mapping[str, Value], step_s: f
 
 
 def wheel_targets(
-    theta: Theta, state: State, left: Value, right: Value, time_s: float, step_s: float
+    theta: Theta, state: RobotState, left: Value, right: Value, time_s: float, step_s: float
 ) -> tuple[Value, Value]:
     """Wheel speeds that the drive aims for (rad/s), from commands and the wheel speeds of the state."""
     u_left, u_right = left, right
@@ -137,7 +137,7 @@ def wheel_targets(
     return left, right
 
 
-def responded(theta: Theta, state: State, left: Value, right: Value, time_s: float, step_s: float) -> Values:
+def responded(theta: Theta, state: RobotState, left: Value, right: Value, time_s: float, step_s: float) -> Values:
     """Wheel speeds at the end of a step, left and right, and their means over it (rad/s), from what is aimed for."""
     end_left = mean_left = left
     end_right = mean_right = right
@@ -192,8 +192,8 @@ def body_velocity(
 
 
 def step(
-    theta: Theta, state: State, left: Value, right: Value, step_s: float, time_s: float = 0.0
-) -> tuple[State, Value, Value]:
+    theta: Theta, state: RobotState, left: Value, right: Value, step_s: float, time_s: float = 0.0
+) -> tuple[RobotState, Value, Value]:
     """One step of f_theta under the commands in force; also the forward speed over it (m/s) and the yaw rate (rad/s).
 
     The body keeps its velocity over the step, so the tracked point moves along an arc, which is exact: its chord lies
@@ -211,4 +211,4 @@ def step(
     for effect in _acting(theta, Stage.WORLD):
         rolling = {"wheel_sum": mean_left + mean_right, "difference": mean_right - mean_left, "time_s": time_s}
         x, y = _called(effect, theta, {"x": x, "y": y, **rolling}, step_s)
-    return State(x, y, state.yaw + omega * step_s, end_left, end_right), v, omega
+    return RobotState(x, y, state.yaw + omega * step_s, end_left, end_right), v, omega

@@ -20,11 +20,11 @@ from numpy.typing import NDArray
 from disco_hw.effects.effect import Channel, Effect, Parameter, Stage
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.jit import cast_like, scalar_function, specialise
-from disco_hw.model.coefficients import Base, Term
+from disco_hw.model.coefficients import Base, TermCoefficients
 
 Array = NDArray[np.float64]
 Feature = Callable[..., Any]
-Terms = tuple[Term, ...]
+Terms = tuple[TermCoefficients, ...]
 
 COMMAND = "command"
 BODY_TARGETS = ("v_x", "v_y", "omega")
@@ -197,9 +197,9 @@ _COMPILED: Mapping[str, Any] = MappingProxyType(
 )
 
 
-def table_entry(name: str, columns: tuple[NDArray[np.floating], ...]) -> Term:
+def table_entry(name: str, columns: tuple[NDArray[np.floating], ...]) -> TermCoefficients:
     """A term's coefficients, arrays (L,), in the form that the step takes."""
-    made: Term = _ENTRIES[name](*columns)
+    made: TermCoefficients = _ENTRIES[name](*columns)
     return made
 
 

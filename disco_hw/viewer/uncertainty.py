@@ -9,7 +9,7 @@ from disco_hw.control.parameter_points import unscented_points
 from disco_hw.effects.registry import DELAY
 from disco_hw.log.records import Plan
 from disco_hw.model import Model
-from disco_hw.model.plain import State, delayed, step, theta_of
+from disco_hw.model.plain import RobotState, delayed, step, theta_of
 
 Array = NDArray[np.float64]
 
@@ -45,7 +45,7 @@ class ParameterPoints:
             single = theta_of(self._names, points[0])
             commands = delayed(np.vstack((commands[:1], commands)), 1, single, plan.step_s)
         ones = np.ones(len(points))
-        state = State(
+        state = RobotState(
             plan.path_x_m[0] * ones,
             plan.path_y_m[0] * ones,
             plan.path_yaw_rad[0] * ones,

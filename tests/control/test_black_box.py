@@ -44,7 +44,7 @@ def test_costs_are_those_of_the_reference(each):
     )
     commands = np.random.default_rng(1).uniform(-6.0, 6.0, (K, T, 2))
     got = costs_of(skid_steer(theta=theta, weights=weights), commands)
-    start, past = physics.State(*START[:3], 0.0, 0.0), np.zeros((1, 2))
+    start, past = physics.RobotState(*START[:3], 0.0, 0.0), np.zeros((1, 2))
     cost = costs.circle_cost(CircleCost().paper(), STEP_S)
     for row, point in zip(got, theta, strict=True):
         named = physics.theta_of(MODEL.parameter_names, point)

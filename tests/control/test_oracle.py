@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from disco_hw.control import oracle, pendulum
-from disco_hw.model.plain import State
+from disco_hw.model.plain import RobotState
 from disco_hw.tasks.circle import CircleCost
 from disco_hw.tasks.line.waypoints import Waypoints
 from disco_hw.tasks.timed_path import TimedPathCost
@@ -27,7 +27,7 @@ def test_control_cost():
 
 
 def test_straight_ahead_past_a_circle():
-    start, commands = State(1.0, 0.0, 0.0, 0.0, 0.0), np.full((1, 2, 2), 2.0)
+    start, commands = RobotState(1.0, 0.0, 0.0, 0.0, 0.0), np.full((1, 2, 2), 2.0)
     cost = circle_cost(CircleCost(radius_m=1.0).paper(), 0.5)
     expected = math.hypot(0.1, 0.0) + math.hypot(0.2, 0.0)
     got = oracle.point_costs(THETA, start, commands, np.zeros((1, 2)), 0.5, cost)

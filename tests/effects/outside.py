@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
@@ -14,7 +15,17 @@ PAGE = ROOT / "docs/add-an-effect.md"
 
 def effect_of_the_page() -> str:
     """The file that docs/add-an-effect.md shows."""
-    (block,) = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), flags=re.DOTALL)
+    return _block("python")
+
+
+def entry_points_of_the_page() -> dict[str, str]:
+    """What the page has a package say of its effects."""
+    named: dict[str, str] = tomllib.loads(_block("toml"))["project"]["entry-points"]["disco_hw.effects"]
+    return named
+
+
+def _block(language: str) -> str:
+    (block,) = re.findall(rf"```{language}\n(.*?)```", PAGE.read_text(encoding="utf-8"), flags=re.DOTALL)
     return block
 
 

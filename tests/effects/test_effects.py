@@ -44,7 +44,7 @@ def by_reference(effects, commands, start=(0.0, 0.0, 0.0, 0.0, 0.0), time_s=0.0)
     model = Model(*BASE, effects=tuple(EffectSetting(name, values) for name, values in effects.items()))
     theta = plain.theta_of(model.parameter_names, model.point())
     in_force = plain.delayed(np.vstack([np.zeros((3, 2)), commands]), 3, theta, STEP_S)
-    states = [plain.State(*start)]
+    states = [plain.RobotState(*start)]
     for t, (left, right) in enumerate(in_force):
         states.append(plain.step(theta, states[-1], left, right, STEP_S, time_s + t * STEP_S)[0])
     return np.array([[s.x, s.y, s.yaw, s.wheel_left, s.wheel_right] for s in states])

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.effects.outside import ROOT, OutsidePackage, effect_of_the_page
+from tests.effects.outside import ROOT, OutsidePackage, effect_of_the_page, entry_points_of_the_page
 
 TURN_DROOP, MAST_LEAN = (
     Path(__file__).with_name(name).read_text(encoding="utf-8") for name in ("turn_droop.py", "mast_lean.py")
@@ -91,6 +91,11 @@ def test_model_files_fan_competition_classes_and_checks_have_effects_of_other_pa
     assert found["sits_left_m"] == 0.03
     assert "turn_droop.k_s" in found["of_turning"]
     assert "speed_drag" in found["checks"]["shorter at speed"]
+
+
+def test_the_page_names_the_module_that_it_shows():
+    assert entry_points_of_the_page() == {"speed_drag": "speed_drag"}
+    assert 'name="speed_drag"' in effect_of_the_page()
 
 
 def test_the_virtual_robot_refuses_to_hide_it_in_one_line(tmp_path):

@@ -31,7 +31,7 @@ def test_skid_steer_and_circle():
     theta = RNG.uniform([0.05, 0.3, -0.2], [0.1, 0.6, 0.3], (3, 1, 3))
     got = skid_steer_transition(0.1)(tensor(state), tensor(control), tensor(theta)).numpy()
     named = physics.theta_of(("wheel_radius_m", "axial_distance_m", "x_icr_m"), theta)
-    start = physics.State(state[..., 0], state[..., 1], state[..., 2], 0.0, 0.0)
+    start = physics.RobotState(state[..., 0], state[..., 1], state[..., 2], 0.0, 0.0)
     after, forward, _ = physics.step(named, start, control[:, 0], control[:, 1], 0.1)
     np.testing.assert_allclose(got, np.stack([after.x, after.y, after.yaw, forward], -1), atol=1e-12)
     circle = CircleCost(0.2, -0.1)

@@ -53,7 +53,7 @@ def test_fast_turns_of_several_radians_a_step_stay_exact():
     model = Model(0.5, 0.1, 0.0)
     states = run(model, (0.0, 0.0, 0.0, 0.0, 0.0), [(-4.0, 4.0), (-8.0, 7.0)] * 5)
     theta = plain.theta_of(model.parameter_names, model.point())
-    state = plain.State(0.0, 0.0, 0.0, 0.0, 0.0)
+    state = plain.RobotState(0.0, 0.0, 0.0, 0.0, 0.0)
     for left, right in [(-4.0, 4.0), (-8.0, 7.0)] * 5:
         state, _, _ = plain.step(theta, state, left, right, 0.1)
     assert abs(state.yaw) > 30.0

@@ -20,7 +20,7 @@ def compiled(effects, time_s=60.0):
 def by_reference(effects, time_s=60.0):
     model = Model(*BASE, effects=effects)
     theta = plain.theta_of(model.parameter_names, model.point())
-    states = [plain.State(0.0, 0.0, 0.0, 0.0, 0.0)]
+    states = [plain.RobotState(0.0, 0.0, 0.0, 0.0, 0.0)]
     for t, (left, right) in enumerate(DRIVE):
         states.append(plain.step(theta, states[-1], left, right, STEP_S, time_s + t * STEP_S)[0])
     return np.array([[s.x, s.y, s.yaw, s.wheel_left, s.wheel_right] for s in states])

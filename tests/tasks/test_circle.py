@@ -32,7 +32,7 @@ def on_circle():
     """State and wheel speeds of driving round the circle with s = 0.2 for ever."""
     omega = 0.2 / math.sqrt(0.75**2 - 0.238**2)
     inward = math.atan(0.238 * omega / 0.2)
-    state = physics.State(0.75, 0.0, math.pi / 2 + inward, 0.0, 0.0)
+    state = physics.RobotState(0.75, 0.0, math.pi / 2 + inward, 0.0, 0.0)
     sum_, difference = 0.2 / 0.061, omega * 0.415 / 0.061 / 2.0
     return state, sum_ - difference, sum_ + difference
 
@@ -41,13 +41,13 @@ def spinning():
     """State and wheel speeds of turning on the spot, about the offset centre of rotation, near the edge."""
     omega = 1.6
     difference = omega * 0.415 / 0.061 / 2.0
-    return physics.State(0.75, 0.238, math.pi, 0.0, 0.0), -difference, difference
+    return physics.RobotState(0.75, 0.238, math.pi, 0.0, 0.0), -difference, difference
 
 
 def test_the_papers_cost_of_standing_still_on_the_circle_is_s0():
     paper = CircleCost().paper()
     assert paper.instant_cost(0.0, 0.75, 0.0, 0.0) == pytest.approx(0.2)
-    assert sequence_cost(paper, physics.State(0.75, 0.0, 0.0, 0.0, 0.0), 0.0, 0.0) == pytest.approx(0.2 * T)
+    assert sequence_cost(paper, physics.RobotState(0.75, 0.0, 0.0, 0.0, 0.0), 0.0, 0.0) == pytest.approx(0.2 * T)
 
 
 def test_driving_round_costs_nothing_and_pays_for_no_progress():
@@ -56,7 +56,7 @@ def test_driving_round_costs_nothing_and_pays_for_no_progress():
 
 
 def test_progress_takes_the_reward_from_standing_and_from_spinning():
-    stand = (physics.State(0.75, 0.0, math.pi / 2, 0.0, 0.0), 0.0, 0.0)
+    stand = (physics.RobotState(0.75, 0.0, math.pi / 2, 0.0, 0.0), 0.0, 0.0)
     for trap in (stand, spinning()):
         assert sequence_cost(CircleCost(), *trap) > sequence_cost(CircleCost().paper(), *trap) + 0.05 * T
     assert sequence_cost(CircleCost(), *spinning()) > 0.3 * T

@@ -51,7 +51,7 @@ def test_the_peer_rolls_the_same_model_and_cost():
         state = mppi.F(state, control)
         total += mppi.running_cost(state, control)
     theta, weights = unscented_points(MODEL, settings.ut_alpha)
-    start = physics.State(0.7, 0.1, 1.2, 0.0, 0.0)
+    start = physics.RobotState(0.7, 0.1, 1.2, 0.0, 0.0)
     cost = costs.circle_cost(circle, settings.step_s)
     expected = [
         oracle.point_costs(

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.effects.effect import Channel as Place
-from disco_hw.effects.effect import Driven, Effect, Stage
+from disco_hw.effects.effect import CommandedDrive, Effect, Stage
 from disco_hw.effects.registry import REGISTRY, in_stages
 from disco_hw.gap.data.layout import Layout
 from disco_hw.gap.noise.channels import BodyChannel, ResidualChannel
@@ -55,13 +55,13 @@ class Candidate:
         return len(self.columns) + (self.profile is not None)
 
 
-def driven(channel: ResidualChannel) -> Driven:
+def driven(channel: ResidualChannel) -> CommandedDrive:
     """The drive of a channel as effects see it."""
     inner = channel.inner
     commands, geometry = inner.drive.command_rad_s, inner.geometry
     t_s = inner.samples.t_s if isinstance(inner, BodyChannel) else inner.drive.t_s
     known = commands[np.isfinite(commands[:, 0])]
-    return Driven(known, (float(geometry[0]), float(geometry[1])), float(t_s[0]), float(t_s[-1]))
+    return CommandedDrive(known, (float(geometry[0]), float(geometry[1])), float(t_s[0]), float(t_s[-1]))
 
 
 def _candidate(effect: Effect) -> Candidate:

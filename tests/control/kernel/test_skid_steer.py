@@ -153,7 +153,7 @@ def check_against_reference(model, state, task, plan_settings, seed):
     theta, point_weights = unscented_points(model, plan_settings.ut_alpha)
     weighed = point_weights != 0.0
     past = command_history(state.sent, now_ns, STEP_S, 8, (state.left_speed_rad_s, state.right_speed_rad_s))
-    start = physics.State(state.x_m, state.y_m, state.yaw_rad, state.left_speed_rad_s, state.right_speed_rad_s)
+    start = physics.RobotState(state.x_m, state.y_m, state.yaw_rad, state.left_speed_rad_s, state.right_speed_rad_s)
     cost = sequence_cost(task, disco._memory)
 
     def costs_of(sequences, x_m=0.0, y_m=0.0):
