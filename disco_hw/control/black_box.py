@@ -21,8 +21,18 @@ Transition = Callable[[Tensor, Tensor, Tensor], Tensor]
 StageCost = Callable[[Tensor, int], Tensor]
 TerminalCost = Callable[[Tensor], Tensor]
 
+WEIGHTS_SUM_TO = 1e-4
+"""By how much the weights of the points may miss a sum of one."""
 _BISECTIONS = 40
 _SEEDS_APART = 1_000_003
+
+
+def _shaped(name: str, result: Tensor, shape: torch.Size) -> Tensor:
+    """What a user's function returned; raises ValueError unless it has this shape."""
+    found = tuple(result.shape) if isinstance(result, Tensor) else type(result).__name__
+    if found != tuple(shape):
+        raise ValueError(f"{name} returned {found}; must return a tensor of shape {tuple(shape)}")
+    return result
 
 
 class BlackBoxDisco:
@@ -33,7 +43,8 @@ class BlackBoxDisco:
     (L, 1, p) or, for samples with draws of their own, (L, K, p). All are called on `device` in `dtype`.
     `theta`, `weights`: L parameter points as above and their weights (L,), as from `sigma_points`.
     `largest` bounds each control, `change` its change from one step to the next. All randomness comes from `seed` and
-    the number of the step, so a run can be repeated.
+    the number of the step, so a run can be repeated. Raises ValueError for points, weights, states and settings that
+    have no meaning, and for costs and states of another shape than the above.
     """
 
     def __init__(
@@ -42,6 +53,9 @@ class BlackBoxDisco:
         terminal_cost: TerminalCost | None = None, device: str = "cpu", dtype: torch.dtype = torch.float32,
         seed: int = 1,
     ) -> None:  # fmt: skip
+        for name, value in (("controls", controls), ("largest", largest), ("change", change)):
+            if not value > 0:
+                raise ValueError(f"{name}: {value}; must be above 0")
         self._transition, self._stage_cost, self._terminal_cost = transition, stage_cost, terminal_cost
         self._sampler, self._largest, self._change = sampler, largest, change
         self._device, self._dtype, self._seed = torch.device(device), dtype, seed
@@ -61,9 +75,23 @@ class BlackBoxDisco:
 
     def set_points(self, theta: NDArray[np.float64], weights: NDArray[np.float64]) -> None:
         """Plan under these parameter points from now on: (L, p) or (L, K, p), and weights (L,)."""
-        points = self._tensor(theta)
-        self._theta = points[:, None] if points.dim() == 2 else points
-        self._weights = self._tensor(weights)
+        points, shares = np.asarray(theta), np.asarray(weights)
+        samples = self._sampler.samples
+        if points.ndim not in (2, 3) or not points.size or (points.ndim == 3 and points.shape[1] not in (1, samples)):
+            raise ValueError(f"theta: shape {points.shape}; must be (L, p), or (L, {samples}, p), for each sample")
+        if shares.shape != points.shape[:1]:
+            raise ValueError(f"weights: shape {shares.shape}; must be {points.shape[:1]}, one for each point of theta")
+        if not (np.isfinite(points).all() and np.isfinite(shares).all()):
+            raise ValueError("theta, weights: must be finite")
+        if not math.isclose(shares.sum(), 1.0, rel_tol=0.0, abs_tol=WEIGHTS_SUM_TO):
+            raise ValueError(f"weights: sum to {shares.sum():g}; must sum to 1")
+        if self._sampler.risk != "mean" and shares.min() < 0.0:
+            raise ValueError(
+                f"weights: {shares.min():g} is negative, and risk {self._sampler.risk!r} has no meaning then; take "
+                "sigma points with alpha = 1, or risk 'mean'"
+            )
+        self._theta = self._tensor(points[:, None] if points.ndim == 2 else points)
+        self._weights = self._tensor(shares)
 
     def reset(self) -> None:
         """Forget the plan; the random numbers go on."""
@@ -75,6 +103,10 @@ class BlackBoxDisco:
 
         Raises NoValidControl, and keeps the last plan, if no sample has a finite cost.
         """
+        if np.ndim(state) != 1:
+            raise ValueError(f"state: shape {np.shape(state)}; must be (n,)")
+        if shift_steps < 0:
+            raise ValueError(f"shift_steps: {shift_steps}; must be 0 or more")
         sampler = self._sampler
         nominal = self._shifted(shift_steps if self.step_number else 0)
         drawn = self._noise()
@@ -126,9 +158,11 @@ class BlackBoxDisco:
         state = start.expand(points, samples, -1)
         costs = torch.zeros(points, samples, device=self._device, dtype=self._dtype)
         for t in range(commands.shape[1]):
-            state = self._transition(state, commands[:, t], self._theta)
-            costs = costs + self._stage_cost(state, t)
-        return costs if self._terminal_cost is None else costs + self._terminal_cost(state)
+            state = _shaped("transition", self._transition(state, commands[:, t], self._theta), state.shape)
+            costs = costs + _shaped("stage_cost", self._stage_cost(state, t), costs.shape)
+        if self._terminal_cost is None:
+            return costs
+        return costs + _shaped("terminal_cost", self._terminal_cost(state), costs.shape)
 
     def _combined(self, costs: Tensor) -> Tensor:
         """Costs (K,) of the samples from those under each point (L, K)."""

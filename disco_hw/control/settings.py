@@ -118,7 +118,9 @@ class DiscoSettings:
     def paper(cls, uncertainty: Uncertainty = "ut") -> DiscoSettings:
         """The paper's skid-steer experiment (appendix): white noise, control cost, UT with alpha = 0.5, Algorithm 1.
 
-        K = 400, T = 50, temperature 0.1, control authority 0.25 (rotations per second)^2.
+        K = 400, T = 50, temperature 0.1, control authority 0.25 (rotations per second)^2. Within a step the robot moves
+        along the exact arc, as in every mode; the published code takes an Euler step, straight along the heading that
+        the step begins with.
         """
         temperature = 0.1
         sampler = Sampler(

@@ -122,3 +122,66 @@ def test_the_pendulum_is_swung_up(device):
     for _ in range(120):
         angle, speed = pendulum.step(angle, speed, disco.plan(np.array([angle, speed]))[0, 0], 1.0, 1.0)
     assert math.cos(angle) > 0.95
+
+
+NEGATIVE = np.array([-0.5, *[0.25] * 6])
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"sampler": replace(SAMPLER, risk="cvar"), "weights": NEGATIVE}, "weights: -0.5 is negative, and risk 'cvar'"),
+        (
+            {"sampler": replace(SAMPLER, risk="worst"), "weights": NEGATIVE},
+            "-0.5 is negative, and risk 'worst'",
+        ),
+        ({"weights": WEIGHTS[1:]}, r"weights: shape \(6,\); must be \(7,\), one for each point of theta"),
+        ({"weights": np.full(7, 0.5)}, "weights: sum to 3.5; must sum to 1"),
+        ({"weights": np.full(7, math.nan)}, "theta, weights: must be finite"),
+        ({"theta": POINTS[0]}, r"theta: shape \(3,\); must be \(L, p\), or \(L, 64, p\)"),
+        ({"theta": np.ones((7, K - 1, 3))}, r"theta: shape \(7, 63, 3\); must be"),
+        ({"largest": 0.0}, "largest: 0.0; must be above 0"),
+        ({"largest": math.nan}, "largest: nan; must be above 0"),
+        ({"change": -1.0}, "change: -1.0; must be above 0"),
+    ],
+)
+def test_settings_without_a_meaning_are_refused(options, words):
+    with pytest.raises(ValueError, match=words):
+        skid_steer(**options)
+
+
+def test_negative_weights_have_a_meaning_for_the_mean():
+    assert np.isfinite(skid_steer(weights=NEGATIVE).plan(START)).all()
+
+
+@pytest.mark.parametrize("name", ["transition", "stage_cost", "terminal_cost"])
+def test_results_of_another_shape_are_refused(name):
+    given = {
+        "transition": skid_steer_transition(STEP_S),
+        "stage_cost": circle_cost(CircleCost()),
+        "terminal_cost": None,
+    }
+    wrong = {
+        "transition": lambda state, control, theta: state[:1],
+        "stage_cost": lambda state, t: state[..., 0].mean(),
+        "terminal_cost": lambda state: state[..., :1],
+    }
+    disco = BlackBoxDisco(**{**given, name: wrong[name]}, theta=POINTS, weights=WEIGHTS, controls=2, sampler=SAMPLER)
+    with pytest.raises(ValueError, match=rf"{name} returned \(.*\); must return a tensor of shape \(7, 64"):
+        disco.plan(START)
+
+
+def test_a_cost_that_is_no_tensor_is_refused():
+    disco = BlackBoxDisco(skid_steer_transition(STEP_S), lambda state, t: 0.0, POINTS, WEIGHTS, 2, SAMPLER)
+    with pytest.raises(ValueError, match=r"stage_cost returned float; must return a tensor of shape \(7, 64\)"):
+        disco.plan(START)
+
+
+def test_a_state_and_a_shift_that_are_none_are_refused():
+    disco = skid_steer()
+    with pytest.raises(ValueError, match=r"state: shape \(1, 4\); must be \(n,\)"):
+        disco.plan(START[None])
+    with pytest.raises(ValueError, match="shift_steps: -1; must be 0 or more"):
+        disco.plan(START, shift_steps=-1)
+    with pytest.raises(ValueError, match="controls: 0; must be above 0"):
+        BlackBoxDisco(skid_steer_transition(STEP_S), circle_cost(CircleCost()), POINTS, WEIGHTS, 0, SAMPLER)

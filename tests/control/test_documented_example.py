@@ -1,7 +1,15 @@
 """The example of docs/control.md, as it stands there."""
 
+import math
 import re
 from pathlib import Path
+
+import numpy as np
+import pytest
+
+from disco_hw.control import DiscoSettings
+from disco_hw.model import Model
+from disco_hw.model.free_run import FreeRun
 
 DOCUMENT = Path(__file__).parents[2] / "docs/control.md"
 
@@ -20,3 +28,19 @@ def test_the_document_begins_with_the_oracle():
     text = DOCUMENT.read_text("utf-8")
     assert "oracle.py" in text.splitlines()[2]
     assert text.index("oracle.py") < text.index("disco_hw.control.Disco")
+
+
+def test_it_is_said_that_paper_mode_moves_along_arcs():
+    assert "exact arc; the published code takes an Euler step" in DOCUMENT.read_text("utf-8")
+    assert "the published code takes an Euler step" in " ".join(str(DiscoSettings.paper.__doc__).split())
+
+
+@pytest.mark.parametrize("turn_rad_s", [0.0, 0.5, 2.0])
+def test_a_step_is_an_exact_arc(turn_rad_s):
+    model = Model(0.06, 0.4, 0.0)
+    v, step_s = 0.3, 0.1
+    left, right = ((v - 0.5 * side * 0.4 * turn_rad_s) / 0.06 for side in (1.0, -1.0))
+    pose = FreeRun(model, model.point()[None], step_s).states(np.zeros(5), np.full((1, 2), [left, right]), 0)[1, :3]
+    half = 0.5 * turn_rad_s * step_s
+    chord = v * step_s * (math.sin(half) / half if half else 1.0)
+    np.testing.assert_allclose(pose, [chord * math.cos(half), chord * math.sin(half), 2.0 * half], atol=1e-9)

@@ -1,0 +1,48 @@
+"""Where on a path a robot begins: on the branch that its heading fits, however near the others are."""
+
+import math
+
+import numpy as np
+import pytest
+
+from disco_hw.tasks.lemniscate import LemniscateTask
+from disco_hw.tasks.line.table import PathTable
+
+ANGLE = np.linspace(0.0, 2.0 * np.pi, 400)
+EIGHT = PathTable(np.column_stack([1.5 * np.sin(ANGLE), 0.75 * np.sin(2.0 * ANGLE)]))
+LEMNISCATE = PathTable(np.array(LemniscateTask(size_m=1.5).points()))
+DRAWS = 1000
+
+
+@pytest.mark.parametrize("path", [EIGHT, LEMNISCATE], ids=["eight", "lemniscate"])
+def test_a_start_near_a_self_crossing_is_on_the_branch_that_the_heading_fits(path):
+    rng = np.random.default_rng(7)
+    count = len(path.table) - 1
+    crossing = {0: 0, 1: count // 2}
+    wrong = 0
+    for draw in range(DRAWS):
+        # Within 0.3 m of the crossing along a branch, 5 cm beside it, and 15 degrees off its direction.
+        place = (crossing[draw % 2] + rng.integers(-15, 16)) % count
+        x, y, along_x, along_y = path.table[place]
+        beside_m, off_rad = rng.normal(0.0, 0.05), rng.normal(0.0, math.radians(15.0))
+        yaw = math.atan2(along_y, along_x) + off_rad
+        found = path.place(x - beside_m * along_y, y + beside_m * along_x, yaw, None)
+        wrong += abs(math.remainder(found - place, count)) > 30
+    assert wrong == 0
+
+
+def test_without_another_branch_the_nearest_place_is_taken_whatever_the_heading():
+    line = PathTable(np.array([[0.0, 0.0], [2.0, 0.0]]))
+    for yaw in (0.0, math.pi, -2.0, math.nan):
+        assert line.place(1.0, 0.2, yaw, None) == 50.0
+
+
+def test_a_branch_that_is_much_further_off_is_not_meant():
+    # Up and back at 0.5 m beside: whoever stands on the first leg begins there, even facing back.
+    hairpin = PathTable(np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 0.5], [0.0, 0.5]]))
+    assert hairpin.place(1.0, 0.02, math.pi, None) == 50.0
+
+
+@pytest.mark.parametrize("at", [(math.nan, 0.0), (0.0, math.inf)])
+def test_a_place_that_is_none_is_on_the_path_all_the_same(at):
+    assert 0.0 <= EIGHT.place(*at, 0.0, None) <= len(EIGHT.table)
