@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import sys
+from importlib import metadata
+from typing import Annotated
 
 import typer
 
@@ -12,9 +14,7 @@ from disco_hw.verbs.experiment import experiment_app
 
 app = typer.Typer(
     name="disco-hw",
-    help="Driver stack for a skid-steer robot: fusion, DISCO stochastic MPC, virtual robot, recording.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
 )
 for verb in (
@@ -36,10 +36,25 @@ app.command("import")(logs.import_log)
 app.add_typer(logs.log_app, name="log")
 
 
+def _version(asked: bool) -> None:
+    if asked:
+        print(f"disco-hw {metadata.version('disco-hw')}")
+        raise typer.Exit
+
+
+@app.callback()
+def disco_hw(
+    _: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+) -> None:
+    """Driver stack for a skid-steer robot: fusion, DISCO stochastic MPC, virtual robot, recording."""
+
+
 def main() -> None:
     """Entry point: bad input prints one line and exits with 2, failed work with 1."""
     try:
-        app()
+        app(prog_name="disco-hw")
     except InputError as error:
         print(f"disco-hw: {error}", file=sys.stderr)
         raise SystemExit(2) from None

@@ -6,6 +6,7 @@ sensor, given by its channel. Names that begin with `x_` are outside the list an
 
 from __future__ import annotations
 
+import difflib
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -339,7 +340,8 @@ def _spec(name: str) -> EffectSpec:
     try:
         return EFFECTS[name]
     except KeyError:
-        raise UnknownEffectError(f"{name!r} is no effect; the names are {', '.join(EFFECTS)}") from None
+        near = "".join(f"did you mean {one}? " for one in difflib.get_close_matches(name, EFFECTS, n=1))
+        raise UnknownEffectError(f"{name!r} is no effect; {near}the names are {', '.join(EFFECTS)}") from None
 
 
 def _complete(spec: EffectSpec, numbers: tuple[float, ...]) -> tuple[float, ...]:

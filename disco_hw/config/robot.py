@@ -10,6 +10,7 @@ import msgspec
 from msgspec import Meta
 
 from disco_hw.config.input_file import ROBOT_TOML, read_toml
+from disco_hw.config.words import in_words
 from disco_hw.errors import InputError
 from disco_hw.tasks import ReadField, RobotTask, UnknownKind, default_task, task_from
 
@@ -146,7 +147,7 @@ def load_robot_config(path: Path) -> RobotConfig:
     try:
         config = msgspec.convert(raw, RobotConfig)
     except msgspec.ValidationError as error:
-        raise InputError(f"{path}: {_in_words(str(error))}") from None
+        raise InputError(f"{path}: {in_words(error, RobotConfig, 'docs/robot.md')}") from None
     given = {name: getattr(config.prior, name) for name in raw.get("prior", {})}
     config = msgspec.structs.replace(config, prior=msgspec.structs.replace(prior_around(config.robot), **given))
     config = msgspec.structs.replace(config, task=_task_of(path, section))
@@ -181,21 +182,6 @@ def _task_of(path: Path, section: object) -> RobotTask:
     except msgspec.ValidationError as error:
         text, at, where = str(error).partition(" - at `$")
         raise InputError(f"{path}: {_in_words(text + (at or ' - at `$') + '.task' + (where or '`'))}") from None
-
-
-def _in_words(message: str) -> str:
-    """Turn msgspec's message into field, fault and remedy."""
-    text, _, where = message.partition(" - at `$")
-    field = where.rstrip("`").lstrip(".")
-    if text.startswith("Object contains unknown field"):
-        name = text.split("`")[1]
-        section = f"[{field}] " if field else ""
-        return f"{section}{name}: no such field; check the spelling or remove it (docs/robot.md lists every field)"
-    if text.startswith("Object missing required field"):
-        name = text.split("`")[1]
-        section = f"[{field}] " if field else ""
-        return f"{section}{name}: missing; add it (docs/robot.md says what it means)"
-    return f"{field or 'top level'}: {text[0].lower()}{text[1:]}; correct the value"
 
 
 def _check(path: Path, config: RobotConfig) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 from msgspec import Meta
 
 from disco_hw.config.input_file import MODEL_TOML, read_toml
+from disco_hw.config.words import in_words
 from disco_hw.errors import InputError
 from disco_hw.model.belief import Belief, Gaussian, Mixture, Uniform
 from disco_hw.model.model import EffectSetting, Model
@@ -64,9 +65,7 @@ def load_model(path: Path) -> Model:
     try:
         content = msgspec.convert(raw, _File)
     except msgspec.ValidationError as error:
-        text, _, where = str(error).partition(" - at `$")
-        field = where.rstrip("`").lstrip(".") or "top level"
-        raise InputError(f"{path}: {field}: {text[0].lower()}{text[1:]}; docs/control.md shows a whole file") from None
+        raise InputError(f"{path}: {in_words(error, _File, 'docs/control.md')}") from None
     try:
         return _model(content)
     except ValueError as error:

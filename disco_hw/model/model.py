@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw import config
+from disco_hw.config.words import nearest
 from disco_hw.effects.effect import Effect, Parameter
 from disco_hw.effects.registry import MOTION_EFFECTS, REGISTRY
 from disco_hw.model.belief import Belief, Uniform
@@ -32,8 +33,10 @@ class EffectSetting:
 
     def __post_init__(self) -> None:
         if self.name not in REGISTRY and self.name not in TERMS:
+            near = nearest(self.name, REGISTRY)
             raise ValueError(
-                f"unknown effect {self.name!r}; known are {', '.join(REGISTRY)}, and terms such as 'v_x += k v^3'"
+                f"unknown effect {self.name!r}; {f'did you mean {near}? ' if near else ''}known are "
+                f"{', '.join(REGISTRY)}, and terms such as 'v_x += k v^3'"
             )
         expected = [parameter.name for parameter in self.effect.parameters]
         for given in self.values:

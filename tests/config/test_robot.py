@@ -63,7 +63,7 @@ def test_shipped_robot_file_is_valid():
     ("change", "words"),
     [
         (("wheel_radius_m = 0.06\n", ""), ["wheel_radius_m", "missing", "add"]),
-        (("wheel_radius_m", "weel_radius_m"), ["weel_radius_m", "no such field", "spelling"]),
+        (("wheel_radius_m", "weel_radius_m"), ["weel_radius_m", "no such field", "did you mean wheel_radius_m?"]),
         (("wheel_radius_m = 0.06", "wheel_radius_m = -1.0"), ["robot.wheel_radius_m", "> 0.0"]),
         (("wheel_radius_m = 0.06", "wheel_radius_m = nan"), ["wheel_radius_m"]),
         (("wheel_radius_m = 0.06", 'wheel_radius_m = "six"'), ["robot.wheel_radius_m", "str", "float"]),

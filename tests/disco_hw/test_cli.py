@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
+from importlib import metadata
 
 import pytest
 
@@ -13,9 +15,10 @@ VERBS = [
 ]
 
 
-def disco(*arguments: str) -> subprocess.CompletedProcess[str]:
+def disco(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "disco_hw", *arguments]
     return subprocess.run(
-        [sys.executable, "-m", "disco_hw", *arguments], capture_output=True, text=True, timeout=60, check=False
+        command, capture_output=True, text=True, timeout=60, check=False, env={**os.environ, **environment}
     )
 
 
@@ -71,3 +74,37 @@ def test_the_estop_loads_neither_planner_nor_estimator():
     )
     result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=True)
     assert result.stdout.strip() == "[]"
+
+
+def test_the_version_is_the_packages():
+    result = disco("--version")
+    assert (result.returncode, result.stdout.strip()) == (0, f"disco-hw {metadata.version('disco-hw')}")
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_a_shell_gets_its_completion(shell):
+    result = disco("--show-completion", shell, _TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION="1")
+    assert result.returncode == 0, result.stderr
+    assert "_DISCO_HW_COMPLETE" in result.stdout
+
+
+def test_verbs_and_options_are_completed_and_nothing_heavy_is_loaded_for_it():
+    script = (
+        "import sys\nfrom disco_hw import cli\n"
+        "try:\n    cli.main()\nexcept SystemExit:\n    pass\n"
+        "heavy = {'numba', 'torch', 'scipy', 'matplotlib', 'numpy', 'can'}\n"
+        "print('heavy', sorted(heavy & set(sys.modules)))"
+    )
+
+    def completed(*words: str) -> list[str]:
+        told = {"_DISCO_HW_COMPLETE": "complete_bash", "COMP_WORDS": " ".join(words), "COMP_CWORD": str(len(words) - 1)}
+        command = [sys.executable, "-c", script.replace("cli.main()", "sys.argv = ['disco-hw']; cli.main()")]
+        result = subprocess.run(
+            command, capture_output=True, text=True, timeout=60, check=True, env={**os.environ, **told}
+        )
+        return result.stdout.split("\n")
+
+    assert {"run", "replay"} <= set(completed("disco-hw", "r"))
+    options = completed("disco-hw", "run", "--")
+    assert {"--model", "--link", "--adapt"} <= set(options)
+    assert "heavy []" in options
