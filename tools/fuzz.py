@@ -1,22 +1,33 @@
 """`make fuzz`: a long campaign of hostile files against everything that reads one; memory must not grow.
 
-Each reader gets files made from good ones by cutting, flipping, doubling and splicing, and with what
+Each reader and each verb gets files made from good ones by cutting, flipping, doubling and splicing, and with what
 parsers stumble over. It may read them or refuse them with one line; anything else is printed with the file kept.
+Verbs run in forked processes up to where their work begins, each call for 10 s and 1 GB of memory at most.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
+import io
+import json
+import os
 import random
 import resource
+import select
+import shutil
+import signal
 import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import disco_hw
+from mcap.reader import make_reader
+from mcap.writer import Writer
+
 from disco_hw.config import load_robot_config
 from disco_hw.config.input_file import FAULTS_TOML, read_toml
 from disco_hw.errors import InputError, WorkError
@@ -26,13 +37,16 @@ from disco_hw.log.reader import open_log
 from disco_hw.log.recovery import recover
 from disco_hw.model import load_model
 from sim.fault_schedule import FaultFileError, schedule_of
+from tools import verb_calls
+from tools.verb_calls import good_files
 
 GROWTH_LIMIT_MB = 30.0
 WARM_UP = 300
 SLOWEST_S = 5.0
-ROBOTS = Path(disco_hw.__file__).parent / "robots"
-CSV = "t_s,cmd_left_rad_s,cmd_right_rad_s,enc_left_rad_s,enc_right_rad_s,pose_x_m,pose_y_m,pose_yaw_rad,segment\n"
-FAULTS = 'seed = 3\n[[fault]]\nkind = "drop"\nat_s = 1\nfor_s = 2.5\nto = "host"\nid = 0x100\nprobability = 0.5\n'
+CALL_S = 10
+CALL_MB = 1000.0
+BATCH = 50
+LOST_S = 60.0
 TOKENS = (b"nan", b"inf", b"-1", b"1e999", b"0x", b"[[", b"]]", b"\x00", b"\xff", b'"', b"\n", b",", b"=", b"9" * 400)
 
 
@@ -54,20 +68,6 @@ READERS: dict[str, Callable[[Path], object]] = {
     "drive.csv": lambda path: read_csv(path, 2048.0),
     "run.mcap": _read_log,
 }
-
-
-def good_files() -> dict[str, bytes]:
-    """One sound file for each reader."""
-    from tools.log_samples import drive_ticks, log_bytes  # noqa: PLC0415 - the samples are the tests'
-
-    rows = "".join(f"{0.05 * k:.2f},1,1,1,1,{0.003 * k},0,0,0\n" for k in range(60))
-    return {
-        "robot.toml": (ROBOTS / "wombot.toml").read_bytes(),
-        "model.toml": (ROBOTS / "wombot_model.toml").read_bytes(),
-        "faults.toml": FAULTS.encode(),
-        "drive.csv": (CSV + rows).encode(),
-        "run.mcap": log_bytes(drive_ticks(40), flush_every=10),
-    }
 
 
 def mutated(good: bytes, chance: random.Random) -> bytes:
@@ -94,9 +94,139 @@ def mutated(good: bytes, chance: random.Random) -> bytes:
     return bytes(data)
 
 
+def mutated_log(good: bytes, chance: random.Random) -> bytes:
+    """A sound MCAP container in which a few messages, or a file that it carries, are hostile."""
+    sink, reader = io.BytesIO(), make_reader(io.BytesIO(good))
+    writer = Writer(sink)
+    writer.start(profile=(header := reader.get_header()).profile, library=header.library)
+    schemas: dict[int, int] = {}
+    channels: dict[int, int] = {}
+    for record in reader.iter_metadata():
+        writer.add_metadata(record.name, record.metadata)
+    for file in reader.iter_attachments():
+        data = mutated(file.data, chance) if chance.random() < 0.3 else file.data
+        writer.add_attachment(file.create_time, file.log_time, file.name, file.media_type, data)
+    for schema, channel, message in reader.iter_messages():
+        if channel.id not in channels:
+            if schema is not None and schema.id not in schemas:
+                schemas[schema.id] = writer.register_schema(schema.name, schema.encoding, schema.data)
+            channels[channel.id] = writer.register_channel(
+                channel.topic, channel.message_encoding, schemas.get(channel.schema_id, 0), channel.metadata
+            )
+        hit = chance.random() < 0.01
+        data = mutated(message.data, chance) if hit else message.data
+        log_time = chance.choice((0, 2**63, 2**64 - 1)) if chance.random() < 0.002 else message.log_time
+        writer.add_message(channels[channel.id], log_time, data, message.publish_time, message.sequence)
+    writer.finish()
+    return sink.getvalue()
+
+
+def hostile(name: str, good: bytes, chance: random.Random) -> bytes:
+    """A hostile relative of a good file of that name."""
+    return mutated_log(good, chance) if name.endswith(".mcap") and chance.random() < 0.5 else mutated(good, chance)
+
+
+def attack_verbs(count: int, seed: int, directory: Path) -> list[str]:
+    """Call verbs with so many hostile files; returns what went wrong, one line each."""
+    directory.mkdir(exist_ok=True)
+    ends: Counter[str] = Counter()
+    wrong: list[str] = []
+    with verb_calls.without_work():
+        for one in verb_calls.CALLS:
+            # What is imported here the processes have from the start.
+            verb_calls.write_good(directory)
+            verb_calls.call(one.argv(directory))
+        number = 0
+        while number < count:
+            batch = range(number, min(number + BATCH, count))
+            answers = _in_a_process(lambda at, seed=seed: _attacked(at, seed, directory), batch)
+            for at, answer in zip(batch, answers, strict=False):
+                ends[answer["end"]] += 1
+                if answer["trouble"]:
+                    kept = Path(f"fuzz-{seed}-{at}-{answer['name']}")
+                    kept.write_bytes(_input(at, seed)[2])
+                    wrong.append(f"{kept}: {answer['call']}: {answer['trouble']}")
+            number = batch.start + len(answers)
+    print(f"verbs: {number} files, " + ", ".join(f"{share} {words}" for words, share in sorted(ends.items())))
+    return wrong
+
+
+def _input(number: int, seed: int) -> tuple[verb_calls.Call, str, bytes]:
+    """The call, the name of the file to replace, and its hostile content."""
+    chance = random.Random(f"{seed} {number}")
+    one = chance.choice(verb_calls.CALLS)
+    name = chance.choice(one.reads)
+    return one, name, hostile(name, verb_calls.good_files()[name], chance)
+
+
+def _attacked(number: int, seed: int, directory: Path) -> dict[str, str]:
+    """How a call with a hostile file ended, and what was wrong about that."""
+    one, name, content = _input(number, seed)
+    shutil.rmtree(directory)
+    directory.mkdir()
+    verb_calls.write_good(directory)
+    (directory / name).write_bytes(content)
+    end, trouble = "", ""
+    # The peak of this call alone.
+    Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
+    signal.alarm(CALL_S)
+    try:
+        said = verb_calls.call(one.argv(directory))
+        end = "got to their work" if said.code in (None, 0, 1) else "refused in one line"
+        if said.code == 2 and len(said.errors.strip().splitlines()) != 1:
+            trouble = f"not one line: {said.errors!r}"
+    except BaseException:
+        # Anything but a refusal in words is what the fuzzer is looking for, an alarm in a loop that catches all too.
+        end, trouble = "failed", traceback.format_exc(limit=-3).replace("\n", " | ")
+    finally:
+        signal.alarm(0)
+    peak_mb = _peak_mb()
+    if peak_mb > CALL_MB:
+        trouble = trouble or f"took {peak_mb:.0f} MB"
+    return {"end": end, "name": name, "call": f"{one.verb} {one.arguments}", "trouble": trouble}
+
+
+class TooSlowError(BaseException):
+    """A call took over `CALL_S`."""
+
+
+def _in_a_process(job: Callable[[int], dict[str, str]], numbers: Sequence[int]) -> list[dict[str, str]]:
+    """What `job` returns for each number, made in a forked process; the last is of the one that did not come back."""
+    read_end, write_end = os.pipe()
+    child = os.fork()
+    if child == 0:
+        os.close(read_end)
+        signal.signal(signal.SIGALRM, _too_slow)
+        with os.fdopen(write_end, "w", encoding="utf-8") as answers:
+            for number in numbers:
+                print(json.dumps(job(number)), file=answers, flush=True)
+        os._exit(0)
+    os.close(write_end)
+    found: list[dict[str, str]] = []
+    with os.fdopen(read_end, encoding="utf-8") as lines:
+        while len(found) < len(numbers) and select.select([lines], [], [], LOST_S)[0] and (line := lines.readline()):
+            found.append(json.loads(line))
+    with contextlib.suppress(ProcessLookupError):
+        os.kill(child, signal.SIGKILL)
+    _, status = os.waitpid(child, 0)
+    if len(found) < len(numbers):
+        trouble = f"no answer in {LOST_S:g} s, or killed (wait status {status})"
+        found.append({"end": "failed", "name": "input", "call": "", "trouble": trouble})
+    return found
+
+
+def _too_slow(*_: object) -> None:
+    raise TooSlowError(f"over {CALL_S} s")
+
+
+def _peak_mb() -> float:
+    status = Path("/proc/self/status").read_text(encoding="ascii")
+    return int(status.split("VmHWM:")[1].split()[0]) / 1000.0
+
+
 def attack(seconds: float, seed: int, directory: Path, only: str | None = None) -> list[str]:
     """Read hostile files for so long; returns what went wrong, one line each."""
-    goods = {name: good for name, good in good_files().items() if only in (None, name)}
+    goods = {name: good for name, good in good_files().items() if name in READERS and only in (None, name)}
     chance = random.Random(seed)
     wrong: list[str] = []
     counts = dict.fromkeys(goods, 0)
@@ -108,7 +238,7 @@ def attack(seconds: float, seed: int, directory: Path, only: str | None = None) 
         for name, good in goods.items():
             number += 1
             path = directory / name
-            path.write_bytes(mutated(good, chance))
+            path.write_bytes(hostile(name, good, chance))
             began_s = time.monotonic()
             trouble = _trouble(name, path, refused)
             took_s = time.monotonic() - began_s
@@ -152,11 +282,13 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tools.fuzz", description=__doc__)
     parser.add_argument("--minutes", type=float, default=10.0)
     parser.add_argument("--seed", type=int, default=time.monotonic_ns() % 1_000_000)
+    parser.add_argument("--verbs", type=int, default=5000, help="how many files for the verbs")
     parser.add_argument("--only", choices=sorted(READERS))
     given = parser.parse_args()
     print(f"seed {given.seed}")
     with tempfile.TemporaryDirectory() as name:
-        wrong = attack(given.minutes * 60.0, given.seed, Path(name), given.only)
+        wrong = attack_verbs(given.verbs, given.seed, Path(name) / "verbs") if given.only is None else []
+        wrong += attack(given.minutes * 60.0, given.seed, Path(name), given.only)
     print("\n".join(wrong) or "no crash, no hang, no growth")
     return 1 if wrong else 0
 

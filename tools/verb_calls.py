@@ -18,7 +18,10 @@ from unittest.mock import patch
 
 import disco_hw
 from disco_hw import cli
+from disco_hw.log.link import Attachment
 from disco_hw.runtime.pipeline import NoPlanner
+from firmware_protocol.codec import Codec
+from tools.log_samples import drive_ticks, log_bytes
 
 ROBOTS = Path(disco_hw.__file__).parent / "robots"
 CSV = "t_s,cmd_left_rad_s,cmd_right_rad_s,enc_left_rad_s,enc_right_rad_s,pose_x_m,pose_y_m,pose_yaw_rad,segment\n"
@@ -80,11 +83,6 @@ _GOOD: dict[str, bytes] = {}
 
 
 def _make_good() -> dict[str, bytes]:
-    from disco_hw.log.link import Attachment  # noqa: PLC0415
-    from firmware_protocol.codec import Codec  # noqa: PLC0415
-    from tests.log.samples import log_bytes  # noqa: PLC0415 - the samples are the tests'
-    from tests.viewer.run import tick_records  # noqa: PLC0415
-
     shipped, model = (ROBOTS / "wombot.toml").read_bytes(), (ROBOTS / "wombot_model.toml").read_bytes()
     robot = shipped.decode()
     for old, new in (
@@ -110,7 +108,7 @@ def _make_good() -> dict[str, bytes]:
             "robot.key": b"000102030405060708090a0b0c0d0e0f\n",
             "drive.csv": (CSV + rows).encode(),
             "bus.log": frames.encode(),
-            "run.mcap": log_bytes([tick_records(tick) for tick in range(120)], flush_every=20, attachments=attached),
+            "run.mcap": log_bytes(drive_ticks(260), flush_every=50, attachments=attached),
         }
     )
     return _GOOD
@@ -149,6 +147,7 @@ _WORK = (
     "disco_hw.experiments.virtual.run_virtual_robot",
     "disco_hw.experiments.adapt.run_adapt",
     "disco_hw.experiments.circle.run_circle",
+    "disco_hw.experiments.gap._record",
     "disco_hw.gap.write_report.find_gap",
     "disco_hw.viewer.commands.serving",
 )

@@ -76,15 +76,20 @@ class JsonDecoder:
 
     def decode(self, topic: str, data: bytes) -> Record:
         """The record of one message of `topic`."""
-        if _NOT_FINITE_KEY in data:
-            data = _restored(data)
-        return _within_64_bits(self._decoders[topic].decode(data))
+        return _decoded(self._decoders[topic], data)
 
     def decode_brief(self, topic: str, data: bytes) -> Record | PlanFigures:
         """The same, but of a plan the figures alone, which takes less than half of the time."""
         if topic != _PLAN:
             return self.decode(topic, data)
-        return _within_64_bits(self._plan_figures.decode(_restored(data) if _NOT_FINITE_KEY in data else data))
+        return _decoded(self._plan_figures, data)
+
+
+def _decoded(decoder: msgspec.json.Decoder[_R], data: bytes) -> _R:
+    try:
+        return _within_64_bits(decoder.decode(_restored(data) if _NOT_FINITE_KEY in data else data))
+    except UnicodeDecodeError as error:
+        raise msgspec.DecodeError(f"not UTF-8: {error.reason}") from None
 
 
 def _integers(record_type: type) -> tuple[tuple[str, ...], tuple[str, ...]]:

@@ -78,7 +78,10 @@ def test_a_text_that_looks_like_a_number_stays_a_text():
         assert DECODER.decode("/event", encode_json(record)) == record
 
 
-@pytest.mark.parametrize("data", [b"", b"{", b"[]", b'{"t_ns":"x"}', b'{"t_ns":1}', b"\xff\xfe"])
+NOT_UTF8 = b'{"t_ns":1,"level":"a\xe3b","source":"s","text":"t"}'
+
+
+@pytest.mark.parametrize("data", [b"", b"{", b"[]", b'{"t_ns":"x"}', b'{"t_ns":1}', b"\xff\xfe", NOT_UTF8])
 def test_what_is_no_record_is_refused(data):
     with pytest.raises(msgspec.MsgspecError):
         DECODER.decode("/event", data)

@@ -1,5 +1,6 @@
 """A little of the campaign, and proof that it would tell."""
 
+import os
 import random
 
 import pytest
@@ -30,14 +31,45 @@ def test_what_gets_through_is_told_and_the_file_kept(tmp_path, monkeypatch, erro
     assert (tmp_path / wrong[0].partition(":")[0]).exists()
 
 
+def test_every_verb_reads_or_refuses_hostile_files(tmp_path):
+    assert fuzz.attack_verbs(150, 1, tmp_path / "verbs") == []
+
+
+@pytest.mark.parametrize(
+    ("fails", "words"),
+    [
+        (lambda argv: 1 / 0, "ZeroDivisionError"),
+        (lambda argv: fuzz.time.sleep(30), "TooSlowError"),
+        (lambda argv: fuzz.verb_calls.Said(2, "first\nsecond"), "not one line"),
+        (lambda argv: bytearray(1_200_000_000) and fuzz.verb_calls.Said(0, ""), "MB"),
+        (lambda argv: os._exit(3), "no answer"),
+    ],
+)
+def test_what_a_verb_lets_through_is_told_and_the_file_kept(tmp_path, monkeypatch, fails, words):
+    monkeypatch.setattr(fuzz, "CALL_S", 1)
+    monkeypatch.setattr(fuzz.verb_calls, "CALLS", fuzz.verb_calls.CALLS[:1])
+    parent, call = os.getpid(), fuzz.verb_calls.call
+    monkeypatch.setattr(fuzz.verb_calls, "call", lambda argv: call(argv) if os.getpid() == parent else fails(argv))
+    (wrong,) = fuzz.attack_verbs(1, 1, tmp_path / "verbs")
+    assert words in wrong
+    assert (tmp_path / wrong.partition(":")[0]).exists()
+
+
 def test_good_files_are_good(tmp_path):
-    for name, good in fuzz.good_files().items():
-        (tmp_path / name).write_bytes(good)
-        fuzz.READERS[name](tmp_path / name)
+    for name, read in fuzz.READERS.items():
+        (tmp_path / name).write_bytes(fuzz.good_files()[name])
+        read(tmp_path / name)
+
+
+def test_a_hostile_log_is_a_sound_container():
+    good = fuzz.good_files()["run.mcap"]
+    logs = [fuzz.mutated_log(good, random.Random(seed)) for seed in range(5)]
+    assert all(log.startswith(b"\x89MCAP0\r\n") and log.endswith(b"\x89MCAP0\r\n") for log in logs)
+    assert len(set(logs)) == 5
 
 
 def test_most_mutants_differ_and_the_same_seed_makes_the_same():
-    good = fuzz.FAULTS.encode()
+    good = fuzz.good_files()["faults.toml"]
     mutants = [fuzz.mutated(good, random.Random(seed)) for seed in range(100)]
     assert sum(mutant != good for mutant in mutants) > 90
     assert mutants == [fuzz.mutated(good, random.Random(seed)) for seed in range(100)]
