@@ -12,7 +12,7 @@ from msgspec import Meta
 from disco_hw.config.input_file import ROBOT_TOML, read_toml
 from disco_hw.config.words import in_words
 from disco_hw.errors import InputError
-from disco_hw.tasks import ReadField, RobotTask, UnknownKind, default_task, task_from
+from disco_hw.tasks import ReadField, RobotTask, UnknownKind, default_task, kinds, task_class, task_from
 
 Positive = Annotated[float, Meta(gt=0.0)]
 NonNegative = Annotated[float, Meta(ge=0.0)]
@@ -147,7 +147,7 @@ def load_robot_config(path: Path) -> RobotConfig:
     try:
         config = msgspec.convert(raw, RobotConfig)
     except msgspec.ValidationError as error:
-        raise InputError(f"{path}: {in_words(error, RobotConfig, 'docs/robot.md')}") from None
+        raise InputError(f"{path}: {in_words(error, [RobotConfig], 'docs/robot.md')}") from None
     given = {name: getattr(config.prior, name) for name in raw.get("prior", {})}
     config = msgspec.structs.replace(config, prior=msgspec.structs.replace(prior_around(config.robot), **given))
     config = msgspec.structs.replace(config, task=_task_of(path, section))
@@ -180,8 +180,8 @@ def _task_of(path: Path, section: object) -> RobotTask:
     except ReadField as error:
         raise InputError(f"{path}: [task] {error}") from None
     except msgspec.ValidationError as error:
-        text, at, where = str(error).partition(" - at `$")
-        raise InputError(f"{path}: {_in_words(text + (at or ' - at `$') + '.task' + (where or '`'))}") from None
+        words = in_words(error, [task_class(kind) for kind in kinds()], "docs/robot.md", "task")
+        raise InputError(f"{path}: {words}") from None
 
 
 def _check(path: Path, config: RobotConfig) -> None:

@@ -12,18 +12,19 @@ from msgspec import inspect
 _STEP = re.compile(r"\.(\w+)|\[\.*\d*\.*\]")
 
 
-def in_words(error: msgspec.ValidationError, kind: type, docs: str) -> str:
+def in_words(error: msgspec.ValidationError, kinds: Sequence[type], docs: str, within: str = "") -> str:
     """One line: the field, what is wrong, the values or the name that it could have; `docs` says what each means.
 
-    `kind` is the type that the table should have been converted to.
+    `kinds` are the types that the table could have been converted to, `within` is its section.
     """
+    roots = [inspect.type_info(kind) for kind in kinds]
     text, _, where = str(error).partition(" - at `$")
     place = where.rstrip("`")
-    field = place.lstrip(".")
-    here = _types_at(inspect.type_info(kind), place)
+    field = f"{within}{place}".lstrip(".")
+    here = _types_at(roots, place)
     found = re.match(r"Object (contains unknown|missing required) field `(.*)`", text)
     if found is None:
-        choices = _choices(here) or _tags(_types_at(inspect.type_info(kind), place.rpartition(".")[0]), field)
+        choices = _choices(here) or _tags(_types_at(roots, place.rpartition(".")[0]), field)
         remedy = f"write {_one_of(choices)}" if choices else "correct the value"
         return f"{field or 'top level'}: {text[:1].lower()}{text[1:]}; {remedy}"
     section, name = f"[{field}] " if field else "", found[2]
@@ -43,9 +44,9 @@ def nearest(name: str, known: Iterable[str]) -> str | None:
     return next(iter(difflib.get_close_matches(name, list(known), n=1)), None)
 
 
-def _types_at(root: inspect.Type, place: str) -> list[inspect.Type]:
+def _types_at(roots: Sequence[inspect.Type], place: str) -> list[inspect.Type]:
     """What may stand at a place as `.link.kind` or `.belief.mean[...]`."""
-    types = _members([root])
+    types = _members(roots)
     for step in _STEP.finditer(place):
         following: list[inspect.Type] = []
         for one in types:

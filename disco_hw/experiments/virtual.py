@@ -53,7 +53,8 @@ def run_sim(options: SimOptions) -> int:
         raise InputError(f"--start: {' '.join(map(str, options.start))} is no place; write finite numbers")
     ticks_per_rev = _whole_ticks(setup)
     x_m, y_m, yaw_rad = options.start or config.task.course().start
-    plant, key = true_parameters(setup, options.plant_seed), link_key(setup)
+    # The robot that a model without effects describes; what its motors should lack is hidden by the user.
+    plant, key = true_parameters(setup, options.plant_seed).with_ideal_motors(), link_key(setup)
     print(
         f"true wheel radius {plant.wheel_radius_m:.4f} m, axial distance {plant.axial_distance_m:.4f} m, "
         f"x_icr {plant.x_icr_m:.4f} m" + "".join(f", hidden {name} {values}" for name, values in effects.items()),

@@ -65,7 +65,7 @@ def load_model(path: Path) -> Model:
     try:
         content = msgspec.convert(raw, _File)
     except msgspec.ValidationError as error:
-        raise InputError(f"{path}: {in_words(error, _File, 'docs/control.md')}") from None
+        raise InputError(f"{path}: {in_words(error, [_File], 'docs/control.md')}") from None
     try:
         return _model(content)
     except ValueError as error:

@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 import disco_hw
 from disco_hw.cli import app
 from disco_hw.errors import InputError
+from disco_hw.experiments import virtual
 from disco_hw.experiments.virtual import SimOptions, run_sim, true_parameters
 from disco_hw.runtime.robot_setup import load_setup
 
@@ -28,6 +29,18 @@ def test_draws_have_the_posteriors_spread_parameter_by_parameter():
     drawn = np.array([(p.wheel_radius_m, p.axial_distance_m, p.x_icr_m) for p in plants])
     assert drawn.mean(0) == pytest.approx((0.061, 0.415, 0.238), abs=0.003)
     assert drawn.std(0) == pytest.approx((0.01225, 0.00949, 0.0114), rel=0.15)
+
+
+def test_the_plain_robot_is_the_one_that_its_model_describes(monkeypatch):
+    played = []
+    monkeypatch.setattr(virtual, "run_virtual_robot", played.append)
+    run_sim(SimOptions(ROBOT))
+    (options,) = played
+    assert options.plant == options.plant.with_ideal_motors()
+    assert options.effects == {}
+    run_sim(SimOptions(ROBOT, hide=("motor_lag=0.06",)))
+    assert played[1].plant == options.plant
+    assert set(played[1].effects) == {"motor_lag"}
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,121 @@
+"""The commands of the README's part "By hand", as they stand, one after the other in processes of their own."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+import signal
+import subprocess
+import sys
+import time
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+ROBOT = "disco_hw/robots/wombot.toml"
+pytestmark = [pytest.mark.hil, pytest.mark.long, pytest.mark.timeout(1200)]
+
+
+def commands_of_readme() -> list[list[str]]:
+    """The lines of the first block under "By hand" that call disco-hw, without their comments."""
+    block = (ROOT / "README.md").read_text("utf-8").split("## By hand\n")[1].split("```")[1]
+    return [shlex.split(line, comments=True) for line in block.splitlines() if re.match(r"disco-hw\s", line)]
+
+
+class Reader:
+    """Types the README's lines into a terminal; every line has to be there, and each that is there has to be typed."""
+
+    def __init__(self, directory: Path) -> None:
+        self._directory = directory
+        self.left = commands_of_readme()
+        (directory / "disco_hw").symlink_to(ROOT / "disco_hw")
+
+    def _command(self, line: str, **placeholders: str) -> list[str]:
+        words = line.split()
+        self.left.remove(words)
+        return [
+            sys.executable,
+            "-m",
+            "disco_hw",
+            *(placeholders.get(word.replace(".", "_"), word) for word in words[1:]),
+        ]
+
+    def type(self, line: str, **placeholders: str) -> str:
+        """Run a command to its end, which must be good."""
+        return self.untold(self._command(line, **placeholders))
+
+    def untold(self, command: list[str]) -> str:
+        result = subprocess.run(command, cwd=self._directory, capture_output=True, text=True, timeout=900, check=False)
+        assert result.returncode == 0, f"{command}: {result.stdout}\n{result.stderr}"
+        return result.stdout
+
+    @contextmanager
+    def another_terminal(self, line: str):
+        """Have a command run beside the others, and end it with Ctrl-C if it has not ended by itself."""
+        output = self._directory / "terminal.txt"
+        with output.open("ab") as sink:
+            process = subprocess.Popen(self._command(line), cwd=self._directory, stdout=sink, stderr=sink)
+        try:
+            yield process
+        finally:
+            if process.poll() is None:
+                process.send_signal(signal.SIGINT)
+            assert process.wait(30) == 0, output.read_text("utf-8", errors="replace")
+
+    def ctl(self, *words: str) -> str:
+        return self.untold([sys.executable, "-m", "disco_hw", "ctl", ROBOT, *words])
+
+    def wait(self, what: str, condition, timeout_s: float = 120.0) -> None:
+        deadline_s, status = time.monotonic() + timeout_s, None
+        while time.monotonic() < deadline_s:
+            result = subprocess.run(
+                [sys.executable, "-m", "disco_hw", "ctl", ROBOT, "status", "--json"],
+                cwd=self._directory, capture_output=True, text=True, timeout=60, check=False,
+            )  # fmt: skip
+            status = json.loads(result.stdout) if result.returncode == 0 else None
+            if status is not None and condition(status):
+                return
+            time.sleep(0.2)
+        raise AssertionError(f"not {what}: {status}")
+
+    def wait_for(self, state: str) -> None:
+        self.wait(state, lambda status: status["state"] == state)
+
+
+def test_the_readmes_commands_go_through(tmp_path):
+    reader = Reader(tmp_path)
+    with reader.another_terminal(f"disco-hw sim {ROBOT}"):
+        with reader.another_terminal(f"disco-hw run {ROBOT}"):
+            reader.wait_for("READY")
+            reader.type(f"disco-hw ctl {ROBOT} task radius_m=0.8 speed_m_s=0.3")
+            reader.type(f"disco-hw ctl {ROBOT} arm")
+            reader.wait_for("ARMED")
+            reader.ctl("start")
+            reader.wait("turning its wheels", lambda status: status["wheels"] and max(status["wheels"]) > 1.0)
+            assert "ESTOP" in reader.type(f"disco-hw estop {ROBOT}")
+            reader.wait_for("FAULT")
+            time.sleep(1.0)
+            reader.ctl("reset")
+            reader.wait_for("READY")
+            reader.type(f"disco-hw ctl {ROBOT} quit")
+        reader.type(f"disco-hw drive {ROBOT} --script excite --unattended --log drive.mcap")
+        inferred = reader.type(f"disco-hw infer drive.mcap --robot {ROBOT} -o model.toml")
+        assert "refuses" not in inferred
+        assert "missing_effects" not in (tmp_path / "model.toml").read_text("utf-8")
+        with reader.another_terminal(f"disco-hw run {ROBOT} --model model.toml"):
+            reader.wait_for("READY")
+            reader.ctl("arm")
+            reader.wait_for("ARMED")
+            reader.ctl("start")
+            reader.wait("driving", lambda status: status["wheels"] and max(status["wheels"]) > 1.0)
+            reader.ctl("stop")
+            reader.ctl("quit")
+    reader.untold([sys.executable, "-m", "disco_hw", "log", "export", "drive.mcap", "-o", "drive.csv"])
+    named = {"FILE": "drive.csv", "ROBOT_toml": ROBOT, "LOG_mcap": "imported.mcap"}
+    reader.type("disco-hw import FILE --robot ROBOT.toml -o LOG.mcap", **named)
+    (log, *_) = sorted((tmp_path / "logs").glob("wombot-*.mcap"))
+    assert "ended properly" in reader.type("disco-hw log info logs/wombot-*.mcap", **{"logs/wombot-*_mcap": str(log)})
+    assert not reader.left
