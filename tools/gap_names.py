@@ -78,6 +78,13 @@ def differences(before: Any, after: Any, path: str = "") -> Iterator[tuple[str, 
         yield path, before, after
 
 
+def _relative(old: Any, new: Any) -> float:
+    """Difference of two numbers over the larger one; 0 for what is no pair of numbers."""
+    if not all(isinstance(value, int | float) and math.isfinite(value) for value in (old, new)):
+        return 0.0
+    return abs(old - new) / max(abs(old), abs(new))
+
+
 def _is_nan(value: Any) -> bool:
     return isinstance(value, float) and math.isnan(value)
 
@@ -87,9 +94,10 @@ def compare(before: Mapping[str, Any], after: Mapping[str, Any], console: Consol
     shared = [key for key in after if key in before]
     foreign = [key for key in shared if before[key]["log"] != after[key]["log"]]
     named = [key for key in shared if before[key]["names"] != after[key]["names"]]
-    unequal = 0
+    unequal, largest = 0, 0.0
     for key in shared:
         found = list(differences(before[key], after[key]))
+        largest = max([largest, *(_relative(old, new) for _, old, new in found)])
         unequal += bool(found)
         for path, old, new in found[:8]:
             console.print(f"{key}: {path}: {old!r} -> {new!r}", highlight=False, markup=False, soft_wrap=True)
@@ -99,6 +107,7 @@ def compare(before: Mapping[str, Any], after: Mapping[str, Any], console: Consol
         console.print(f"the logs themselves differ, so nothing follows for: {', '.join(foreign)}", markup=False)
     equal = len(shared) - unequal
     console.print(f"{len(shared)} logs: other names in {len(named)}, equal to the last bit in {equal}")
+    console.print(f"largest difference of two numbers: {largest:.2g} of the larger one")
     return not unequal and bool(shared)
 
 

@@ -34,6 +34,7 @@ def test_equal_answers_are_equal_and_the_last_bit_is_not():
     equal, said = compared(other)
     assert not equal
     assert "report.effects[0].value: 0.1 -> 0.10000000000000002" in said
+    assert "largest difference of two numbers: 1.4e-16" in said
 
 
 def test_other_names_and_other_logs_are_said():

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from disco_hw.gap.noise.channels import WheelChannel
 from disco_hw.gap.report.findings import STAGES
 from disco_hw.gap.report.judge import regimes_of
-from disco_hw.gap.report.regimes import Regime
+from disco_hw.gap.report.misspecification import Regime
 from disco_hw.gap.search.analysis import GapAnalysis
 from disco_hw.gap.search.channel_search import ChannelResult
 from disco_hw.gap.search.cross_validation import PredictionErrors

@@ -9,8 +9,13 @@ from disco_hw.effects.effect import Channel
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.report.blind_spots import BlindSpot, blind_spots, experiment_of
 from disco_hw.gap.report.findings import CandidateEvidence, ChannelFinding, EffectFinding, UnnamedFinding
-from disco_hw.gap.report.misspecification import misspecified_effects
-from disco_hw.gap.report.regimes import Regime, in_words, regimes, remaining_disagreements
+from disco_hw.gap.report.misspecification import (
+    Regime,
+    in_words,
+    misspecified_effects,
+    regimes,
+    remaining_disagreements,
+)
 from disco_hw.gap.search.analysis import FinalFit, GapAnalysis
 from disco_hw.gap.search.candidates import candidates_of, parameters_of
 from disco_hw.gap.search.channel_search import ChannelResult

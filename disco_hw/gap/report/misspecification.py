@@ -1,16 +1,25 @@
-"""Whether a named effect of the body has the form that its name says: as strong where little of it acts as where much.
+"""Where simulation and data disagree: residuals by regime, what naming has left, and names whose form is another.
 
-A slip that saturates passes for one that grows for ever, weaker than it is at first and stronger than it is later.
+A stand-in of the right family and the wrong form leaves something. The accepted set is compared with the richest model
+of its channel, from which the noise was learnt: where that one still gains far more than its many parameters buy, in
+several blocks of time, something is left. And a named effect of the body has to be as strong where little of it acts as
+where much: a slip that saturates passes for one that grows for ever.
 """
 
 from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.effects.registry import REGISTRY
+from disco_hw.gap.data.gridded_drive import GriddedDrive, GridSamples
 from disco_hw.gap.data.layout import BODY
-from disco_hw.gap.noise.channels import BodyChannel
+from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
+from disco_hw.gap.noise.noise_fit import largest_command_jitter_s
 from disco_hw.gap.search.candidates import CANDIDATES, indices
 from disco_hw.gap.search.channel_search import ChannelResult
 from disco_hw.gap.search.evidence import inflation
@@ -20,6 +29,8 @@ from disco_hw.gap.search.unnamed_terms import Term, WithTerms
 from disco_hw.gap.settings import GRID_STEP_S
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Index = NDArray[np.int64]
 
 _UNITS = ("m/s ahead", "m/s to the side", "rad/s")
 
@@ -94,3 +105,125 @@ def _middle(perturbation: Array, lever_m: float) -> tuple[float, int]:
     if share[-1] <= 0.0:
         return 0.0, axis
     return float(size[np.searchsorted(share, 0.5 * share[-1])]), axis
+
+
+@dataclass(frozen=True, slots=True)
+class Regime:
+    """A part of the drive: mean square of the whitened residuals before and after, and how many samples."""
+
+    name: str
+    before: float
+    after: float
+    samples: int
+
+
+def masks(drive: GriddedDrive, samples: GridSamples) -> Mapping[str, Mask]:
+    """Which samples lie in which regime; regimes overlap."""
+    return {name: mask[samples.node] for name, mask in masks_at_nodes(drive).items()}
+
+
+def masks_at_nodes(drive: GriddedDrive) -> Mapping[str, Mask]:
+    """Which nodes (M,) lie in which regime; regimes overlap."""
+    speed, settings = drive.speed_rad_s, drive.settings.report
+    span = settings.span_nodes
+    mean, half = speed.mean(axis=1), 0.5 * (speed[:, 1] - speed[:, 0])
+    ahead = np.minimum(np.arange(speed.shape[0]) + span, speed.shape[0] - 1)
+    behind = np.maximum(np.arange(speed.shape[0]) - span, 0)
+    growth = (np.abs(speed[ahead]).max(axis=1) - np.abs(speed[behind]).max(axis=1)) / (2 * span * GRID_STEP_S)
+    size = np.abs(speed).max(axis=1)
+    moving = size > settings.rest_rad_s
+    steady = moving & (np.abs(growth) < settings.speeding_rad_s2)
+    middle = float(np.median(size[moving])) if moving.any() else 1.0
+    turning = np.abs(half) > 0.3
+    usual_turn = float(np.median(np.abs(half[turning]))) if turning.any() else 1.0
+    times = np.linspace(drive.t_s[0], drive.t_s[-1], 4)
+    return {
+        "standstill": ~moving,
+        "speeding up": moving & (growth >= settings.speeding_rad_s2),
+        "braking": moving & (growth <= -settings.speeding_rad_s2),
+        "slow": steady & (size <= middle),
+        "fast": steady & (size > middle),
+        "straight": steady & ~turning,
+        "turning left": turning & (half > 0),
+        "turning right": turning & (half < 0),
+        "turning slowly": turning & (np.abs(half) <= usual_turn),
+        "turning fast": turning & (np.abs(half) > usual_turn),
+        "driving ahead": moving & (mean > 0.3),
+        "driving back": moving & (mean < -0.3),
+        "early": drive.t_s <= times[1],
+        "late": drive.t_s >= times[2],
+    }
+
+
+def regimes(
+    channel: WheelChannel | BodyChannel, before: Array, after: Array, extra: Array | None = None
+) -> list[Regime]:
+    """Every regime with enough samples, from the vectors before and after, the one that improves most first."""
+    samples = channel.drive.encoder if isinstance(channel, WheelChannel) else channel.samples
+    use = channel.gains.use if isinstance(channel, WheelChannel) else channel.use
+    first = (channel.whitened(before) ** 2).mean(axis=1)
+    last = (channel.whitened(after, extra) ** 2).mean(axis=1)
+    found = []
+    for name, mask in masks(channel.drive, samples).items():
+        inside = mask & use
+        if inside.sum() >= channel.settings.report.fewest_samples:
+            found.append(Regime(name, float(first[inside].mean()), float(last[inside].mean()), int(inside.sum())))
+    return sorted(found, key=lambda regime: -(regime.before - regime.after) * regime.samples**0.5)
+
+
+def in_words(found: list[Regime], excess: float) -> str:
+    """The regimes that disagree most, with more than `excess` times the mean square of noise, for a person."""
+    loud = [regime for regime in found if regime.before > excess]
+    if not loud:
+        return "nowhere more than noise"
+    worst = sorted(loud, key=lambda regime: -regime.before)[:3]
+    return "most " + ", ".join(f"{r.name} ({r.before**0.5:.1f} times the noise)" for r in worst)
+
+
+def remaining_disagreements(found: ChannelResult) -> list[str]:
+    """Sentences on what a channel's accepted set leaves, the loudest regime first; none where nothing is left."""
+    channel = found.channel
+    is_wheels = isinstance(channel, WheelChannel)
+    name = "command_to_wheel" if is_wheels else "wheel_to_body"
+    out = [f"{name}: {regime} still disagrees: {times:.1f} times the noise" for times, regime in loud_regimes(found)]
+    if isinstance(channel, WheelChannel):
+        drive = channel.drive
+        if channel.noise.command_stamp_s > channel.settings.report.at_bound * largest_command_jitter_s(drive):
+            out.append(
+                f"{name}: speeding up and braking still disagree: as if commands came "
+                f"{1e3 * channel.noise.command_stamp_s:.0f} ms early or late at random, the encoder's time stamps "
+                f"scatter by {1e3 * drive.stamp_scatter_s:.1f} ms"
+            )
+    return out
+
+
+def loud_regimes(found: ChannelResult) -> list[tuple[float, str]]:
+    """Root mean square of what is left over the noise's, and name, of regimes in which something is left."""
+    channel, settings = found.channel, found.channel.settings.report
+    if found.richest is None:
+        return []
+    samples = channel.drive.encoder if isinstance(channel, WheelChannel) else channel.samples
+    use = channel.gains.use if isinstance(channel, WheelChannel) else channel.use
+    width = found.richest.size // use.size
+    now = (found.fit.residual.reshape(-1, width) ** 2).sum(axis=1)
+    best = (found.richest.reshape(-1, width) ** 2).sum(axis=1)
+    price = settings.least_nats + settings.nats_each * found.richest_parameters
+    loud = []
+    for name, mask in masks(channel.drive, samples).items():
+        inside = mask & use
+        if name == "standstill" or inside.sum() < settings.fewest_samples:
+            continue
+        gain, spread = gain_by_block(0.5 * (now - best)[inside], samples.block[inside], settings.fewest_blocks)
+        ratio = float(now[inside].sum() / max(best[inside].sum(), 1e-9))
+        if gain > price and gain > settings.clear_sigmas * spread and ratio > settings.louder:
+            loud.append((math.sqrt(ratio), name))
+    return sorted(loud, reverse=True)[: settings.most_regimes]
+
+
+def gain_by_block(gains: Array, block: Index, fewest: int) -> tuple[float, float]:
+    """Sum of gains (n,) in nats and its standard deviation from blocks of time; infinite if there are too few."""
+    sums = np.bincount(np.unique(block, return_inverse=True)[1], gains)
+    if sums.size < fewest:
+        return float(sums.sum()), math.inf
+    around = sums - sums.mean()
+    return float(sums.sum()), float(np.sqrt((around**2).sum() * sums.size / (sums.size - 1.0)))

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from disco_hw.gap.data.free_runs import read_angles, run_body
-from disco_hw.gap.data.horizon import displacement, starts_of
+from disco_hw.gap.data.free_runs import displacement, read_angles, run_body, starts_of
 from disco_hw.gap.data.layout import ENCODER_COLUMNS
 from disco_hw.gap.noise.channels import BodyChannel, WheelChannel, total_perturbation
 from disco_hw.gap.search.least_squares import Fit, by_block, inverse, known

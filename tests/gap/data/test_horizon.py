@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from disco_hw.gap.data.horizon import displacement, starts_of
+from disco_hw.gap.data.free_runs import displacement, starts_of
 from disco_hw.gap.data.layout import BODY
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S
 

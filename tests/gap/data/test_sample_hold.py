@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from disco_hw.gap.data.sample_hold import undo_sample_hold
+from disco_hw.gap.data.gridded_drive import undo_sample_hold
 from disco_hw.gap.settings import DEFAULT_SETTINGS
 from disco_hw.log.drive import Wheels, integrate_angle
 
