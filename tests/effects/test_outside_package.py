@@ -222,7 +222,7 @@ def test_a_wheel_effect_is_found_told_and_has_a_blind_spot(tmp_path):
     assert low < 0.3 < high, found
     assert value == pytest.approx(0.3, rel=0.1)
     assert "turn_droop" not in found["blind"]
-    assert "turning asks for more than the wheels give" in found["text"]
+    assert "Turning asks for more than the wheels give: 0.300 of it" in found["text"]
     smallest, experiment = spot
     assert 0.0 < smallest < 0.3
     assert experiment == "disco-hw drive ROBOT.toml --script spins: turning on the spot at two rates"
