@@ -26,6 +26,7 @@ from disco_hw.log.records import Record
 from disco_hw.log.writer_line import WriterLine
 
 _SENT_PER_TICK = 16
+_UNREAD_TICKS = 50
 _SILENCE_S = 0.7
 _PATIENCE_S = 2.0
 _START_PATIENCE_S = 15.0
@@ -220,7 +221,10 @@ class ProcessRecorder:
             self._delivery.drop(len(records))
             return
         self._delivery.put(self._sequence, len(records), frame(TICK, message))
-        self._exchange(_SENT_PER_TICK)
+        self._send(_SENT_PER_TICK)
+        if self._delivery.waiting_ticks > _UNREAD_TICKS:
+            # Only for who never polls: each look costs some microseconds.
+            self._read()
 
     def poll(self) -> RecorderStats:
         """Read what the writer says, replace it if it has ended or is silent for long, and return the counters."""
@@ -294,6 +298,10 @@ class ProcessRecorder:
 
     def _exchange(self, most: int) -> None:
         """Send what has not been sent, `most` ticks of it, and take in what is confirmed."""
+        self._send(most)
+        self._read()
+
+    def _send(self, most: int) -> None:
         line, delivery = self._line, self._delivery
         if line is None:
             return
@@ -309,6 +317,11 @@ class ProcessRecorder:
                 following = b""
             if following is None and self._end is not None:
                 line.send_end(self._end)
+
+    def _read(self) -> None:
+        line, delivery = self._line, self._delivery
+        if line is None:
+            return
         refusal = line.status.error
         if line.read():
             status = self._status = line.status
