@@ -1,5 +1,7 @@
 import os
 import socket
+import re
+import shutil
 import subprocess
 import sys
 from importlib.resources import files
@@ -129,3 +131,36 @@ def test_the_unit_restarts_watches_stops_and_does_not_arm():
         assert expected in unit
     commands = [value for key, value in unit if key.startswith("Exec")]
     assert not any(word in command for command in commands for word in (" arm", " ctl ", " start"))
+
+
+def test_the_unit_leaves_a_stranger_little_to_take_over(tmp_path):
+    analyse = shutil.which("systemd-analyze")
+    if analyse is None:
+        pytest.skip("systemd-analyze is not installed: apt-get install systemd")
+    unit = tmp_path / "disco-hw@wombot.service"
+    unit.write_text(UNIT.read_text(encoding="utf-8"), encoding="utf-8")
+    command = [analyse, "security", "--offline=true", "--no-pager", str(unit)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    exposure = re.search(r"Overall exposure level .*: ([0-9.]+)", done.stdout)
+    assert exposure, done.stderr
+    assert float(exposure[1]) <= 3.0
+
+
+def test_the_unit_keeps_what_driving_needs():
+    unit = dict(settings())
+    assert "RestrictRealtime" not in unit
+    assert "MemoryDenyWriteExecute" not in unit
+    assert not unit.keys() & {"PrivateDevices", "DevicePolicy", "DeviceAllow", "PrivateNetwork", "PrivateUsers"}
+    assert {"AF_CAN", "AF_UNIX"} <= set(unit["RestrictAddressFamilies"].split())
+    assert unit["SupplementaryGroups"] == "dialout"
+    filters = [value for key, value in settings() if key == "SystemCallFilter"]
+    # @resources has sched_setscheduler, @memlock has mlockall; both are in @system-service.
+    assert filters == ["@system-service", "~@privileged"]
+
+
+def test_each_measure_of_the_unit_says_what_it_is_for():
+    lines = UNIT.read_text(encoding="utf-8").split("# What it may not do")[1].splitlines()[1:]
+    explained = False
+    for line in lines:
+        explained = line.startswith("#") or (explained and bool(line))
+        assert explained or not line or line.startswith(("[", "WantedBy")), line
