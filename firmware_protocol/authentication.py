@@ -7,9 +7,6 @@ identifier (2) and the whole frame (8), little-endian; its first 48 bits go on t
 import re
 import struct
 
-from cryptography.hazmat.primitives.ciphers.algorithms import AES
-from cryptography.hazmat.primitives.cmac import CMAC
-
 from firmware_protocol.codec import Codec, EncodedFrame
 
 KEY_LENGTH = 16
@@ -32,6 +29,10 @@ def aes_cmac(key: bytes, message: bytes) -> bytes:
     """Return the 16-byte AES-CMAC of a message. Raises ValueError for a key that is not 16 bytes long."""
     if len(key) != KEY_LENGTH:
         raise ValueError(f"a key of {len(key)} bytes; AES-128 takes {KEY_LENGTH}")
+    # Only robots with a key need it: it takes 12 MB of what a daemon locks.
+    from cryptography.hazmat.primitives.ciphers.algorithms import AES  # noqa: PLC0415
+    from cryptography.hazmat.primitives.cmac import CMAC  # noqa: PLC0415
+
     mac = CMAC(AES(key))
     mac.update(message)
     return mac.finalize()
@@ -47,6 +48,8 @@ class Prover:
 
     def __init__(self, key: bytes, codec: Codec) -> None:
         """`key`: 16 bytes."""
+        # The library is loaded here, and not with the first command in the loop.
+        aes_cmac(key, b"")
         self._key = key
         self._nonce: bytes | None = None
         self._freshness: dict[bytes, dict[int, int]] = {}

@@ -16,6 +16,8 @@ from collections.abc import Callable, Collection, MutableMapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from disco_hw.errors import InputError
+
 _THREAD_COUNT_VARIABLES = (
     "OMP_NUM_THREADS",
     "OPENBLAS_NUM_THREADS",
@@ -30,6 +32,12 @@ _CAP_IPC_LOCK = 14
 _CAP_SYS_NICE = 23
 _OTHER_THREADS_BELOW = 10
 _STOLEN_COLUMN = 8
+_M_ARENA_MAX = -8
+_PTHREAD_ATTRIBUTES_BYTES = 64
+_STACK_BYTES = 1 << 20
+# The loop compiles nothing: of its 150 MB it needs none.
+_COMPILER = "libllvmlite"
+_LEAST_ADDRESS_SPACE_BYTES = 1_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,6 +69,29 @@ def limit_thread_pools(environment: MutableMapping[str, str] = os.environ) -> St
     if numpy_is_late:
         return Step("threads", False, "numpy was loaded before; start with OPENBLAS_NUM_THREADS=1 in the environment")
     return Step("threads", True, "numeric libraries use one thread")
+
+
+def spare_memory() -> None:
+    """Have what is to be locked stay small: one heap for all threads, and stacks of 1 MiB.
+
+    By itself the C library reserves 64 MiB for the heap of each thread and 8 MiB for its stack, and all of it counts as
+    locked. To be called before the first thread is made. Raises InputError where the process may not have the memory
+    that a daemon needs, which would otherwise end in some library.
+    """
+    limit_bytes = resource.getrlimit(resource.RLIMIT_AS)[0]
+    if limit_bytes != resource.RLIM_INFINITY and limit_bytes < _LEAST_ADDRESS_SPACE_BYTES:
+        raise InputError(
+            f"address space: limited to {limit_bytes / 1e6:.0f} MB, and compiling and driving take up to "
+            f"{_LEAST_ADDRESS_SPACE_BYTES / 1e6:.0f} MB; raise it with `ulimit -v unlimited` or LimitAS= in the service"
+        )
+    libc = ctypes.CDLL(None)
+    libc.mallopt(_M_ARENA_MAX, 1)
+    attributes = ctypes.create_string_buffer(_PTHREAD_ATTRIBUTES_BYTES)
+    libc.pthread_attr_init(attributes)
+    libc.pthread_attr_setstacksize(attributes, ctypes.c_size_t(_STACK_BYTES))
+    if hasattr(libc, "pthread_setattr_default_np"):
+        libc.pthread_setattr_default_np(attributes)
+    libc.pthread_attr_destroy(attributes)
 
 
 def enter(priority: int, cpus: Collection[int] = ()) -> tuple[Step, ...]:
@@ -127,10 +158,21 @@ def _lock_memory() -> Step:
     libc = ctypes.CDLL(None, use_errno=True)
 
     def lock() -> None:
+        # What compiling has left behind goes back first.
+        libc.malloc_trim(0)
         if libc.mlockall(_MCL_CURRENT | _MCL_FUTURE) != 0:
             raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
+        for start, end in _mappings(_COMPILER):
+            libc.munlock(ctypes.c_void_p(start), ctypes.c_size_t(end - start))
 
     return _try("memory", lock, "locked", "free some memory")
+
+
+def _mappings(library: str) -> list[tuple[int, int]]:
+    """First address and the one after the last of each part of this process's memory that is a file of this name."""
+    lines = Path("/proc/self/maps").read_text(encoding="utf-8").splitlines()
+    found = [line.split()[0].split("-") for line in lines if library in line.rpartition("/")[2]]
+    return [(int(start, 16), int(end, 16)) for start, end in found]
 
 
 def _set_fifo(name: str, priority: int) -> Step:

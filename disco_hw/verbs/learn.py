@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from disco_hw.config.named_files import check_named_files
 from disco_hw.verbs.options import (
     AsJson,
     Logs,
@@ -36,6 +37,7 @@ def infer(
 
     # Before the numeric libraries are loaded: on small matrices their pools of threads cost more than the work.
     limit_thread_pools()
+    check_named_files(robot, logs=logs)
     from disco_hw.inference.commands import infer_command
     from disco_hw.inference.infer import InferOptions
 
@@ -55,6 +57,7 @@ def gap(
     from disco_hw.daemon.realtime import limit_thread_pools
 
     limit_thread_pools()
+    check_named_files(robot, model, logs)
     from disco_hw.gap.write_report import gap as find_gap
 
     result = find_gap(logs, robot, out, model, progress_line)

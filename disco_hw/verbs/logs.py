@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from disco_hw.config.named_files import check_named_files
 from disco_hw.verbs.options import (
     AsJson,
     RobotOption,
@@ -23,6 +24,7 @@ def import_log(
     as_json: AsJson = False,
 ) -> None:
     """Write a foreign log as a log of ours, for `infer`, `gap` and Foxglove; `view` and `replay` need one of `run`."""
+    check_named_files(robot, logs=[log])
     from disco_hw.log.importing.commands import import_log as import_foreign
 
     result = import_foreign(log, robot, out)
@@ -32,6 +34,7 @@ def import_log(
 @log_app.command()
 def info(log: Annotated[Path, typer.Argument(metavar="LOG")], as_json: AsJson = False) -> None:
     """Say what a log holds and whether anything was lost."""
+    check_named_files(logs=[log])
     from disco_hw.log.commands import info as log_info
 
     print(log_info(log, as_json))
@@ -44,6 +47,7 @@ def recover(
     as_json: AsJson = False,
 ) -> None:
     """Copy everything whole from a damaged log into a new one."""
+    check_named_files(logs=[log])
     from disco_hw.log.commands import recover as log_recover
 
     print(log_recover(log, out, as_json))
@@ -56,6 +60,7 @@ def export(
     as_json: AsJson = False,
 ) -> None:
     """Write commands, encoders and poses as CSV."""
+    check_named_files(logs=[log])
     from disco_hw.log.commands import export as log_export
 
     print(log_export(log, out, as_json))

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from disco_hw.config.named_files import check_named_files
 from disco_hw.verbs.options import (
     AsJson,
     LinkOption,
@@ -42,10 +43,12 @@ def run(
     as_json: AsJson = False,
 ) -> None:
     """Run the on-robot daemon: connect, estimate, record; arm and start only when told to (`disco-hw ctl`)."""
-    from disco_hw.daemon.realtime import limit_thread_pools
+    from disco_hw.daemon.realtime import limit_thread_pools, spare_memory
 
     # Before the numeric libraries are loaded: a pool of threads in them costs the loop its deadlines.
     limit_thread_pools()
+    spare_memory()
+    check_named_files(robot, model)
     from disco_hw.daemon.daemon import DaemonOptions, run_daemon
 
     with _page(view, robot, model, port, link):
@@ -76,9 +79,11 @@ def drive(
     as_json: AsJson = False,
 ) -> None:
     """Drive by keyboard, gamepad or script, and record it for `infer` and `gap` (docs/drive.md)."""
-    from disco_hw.daemon.realtime import limit_thread_pools
+    from disco_hw.daemon.realtime import limit_thread_pools, spare_memory
 
     limit_thread_pools()
+    spare_memory()
+    check_named_files(robot, model)
     from disco_hw.drive.commands import DriveOptions, run_drive
 
     with _page(view or page, robot, model, port, link):
@@ -130,6 +135,7 @@ def check(
     as_json: AsJson = False,
 ) -> None:
     """Preflight: link, firmware match, latency, bus load, real-time settings, limits. Nothing moves."""
+    check_named_files(robot)
     from disco_hw.daemon.check import run_check
 
     report = run_check(robot, link)

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from disco_hw import outputs
+from disco_hw.config.named_files import check_named_files
 from disco_hw.errors import InputError
 from disco_hw.verbs.options import (
     AsJson,
@@ -73,18 +74,21 @@ def sim(
     list_faults: Annotated[bool, typer.Option("--list-faults", help="List the kinds of faults and exit.")] = False,
 ) -> None:
     """Run the virtual robot alone, behind a CAN bus or a serial line."""
-    from disco_hw.experiments.virtual import SimOptions, run_sim
-    from sim.effects import effects_table
-    from sim.fault_schedule import kinds_table
-
     if list_faults:
+        from sim.fault_schedule import kinds_table
+
         print(kinds_table())
         return
     if list_effects:
+        from sim.effects import effects_table
+
         print(effects_table())
         return
     if robot is None:
         raise InputError("sim: no ROBOT.toml given; name one, such as disco_hw/robots/wombot.toml")
+    check_named_files(robot, model)
+    from disco_hw.experiments.virtual import SimOptions, run_sim
+
     raise typer.Exit(
         run_sim(
             SimOptions(

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from disco_hw.config.named_files import check_named_files
 from disco_hw.errors import InputError
 from disco_hw.verbs.options import (
     AsJson,
@@ -35,18 +36,22 @@ def view(
     as_json: AsJson = False,
 ) -> None:
     """Show the page: a log, or the running daemon."""
-    from disco_hw.viewer import commands
-
     if live:
         if robot is None or log is not None:
             raise InputError("view --live: needs --robot ROBOT.toml and no LOG")
         if (snapshot, video, export) != (None, None, None):
             raise InputError("view --live: --snapshot, --video and --export are for a LOG; leave them out")
+        check_named_files(robot, model)
+        from disco_hw.viewer import commands
+
         raise typer.Exit(commands.view_live(robot, model, host, port, as_json=as_json, link=link))
     if log is None:
         raise InputError("view: give a LOG, or --live with --robot ROBOT.toml")
     if (model, link) != (None, None):
         raise InputError("view LOG: --model and --link are for --live, as a log has its own model; leave them out")
+    check_named_files(robot, logs=[log])
+    from disco_hw.viewer import commands
+
     if snapshot is not None:
         commands.snapshot_log(log, snapshot, at, robot)
     if video is not None:
@@ -72,6 +77,7 @@ def replay(
     from disco_hw.daemon.realtime import limit_thread_pools
 
     limit_thread_pools()
+    check_named_files(logs=[log])
     from disco_hw.runtime.replay import replay as replay_log
 
     report = replay_log(log, tolerance)

@@ -1,7 +1,7 @@
 import os
-import socket
 import re
 import shutil
+import socket
 import subprocess
 import sys
 from importlib.resources import files
