@@ -184,6 +184,7 @@ import json
 from dataclasses import replace
 import numpy as np
 from disco_hw.gap import find_gap
+from disco_hw.gap.report.wording import as_text
 from disco_hw.log.drive import Poses
 from disco_hw.model import Model
 from tools.gap_logs import simulated_drive
@@ -205,7 +206,7 @@ print(json.dumps({
     "named": [effect.name for effect in report.effects],
     "k": [[e.value, e.low, e.high] for effect in report.effects for e in effect.parameters.values()],
     "blind": [spot.name for spot in report.blind_spots],
-    "text": report.as_text(),
+    "text": as_text(report),
 }))
 without = find_gap(simulated_drive({}, seed=906), Model(RADIUS_M, AXIAL_M, 0.1))
 (spot,) = [spot for spot in without.blind_spots if spot.name == "turn_droop"]
