@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 from numba import config
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile
 
-from drivers.ownership import user_name, why_not_private
+from drivers.private_files import user_name, why_not_private
 
 _Dispatcher = TypeVar("_Dispatcher")
 _told: set[str] = set()

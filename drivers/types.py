@@ -7,7 +7,7 @@ Time stamps are nanoseconds of the host's monotonic clock unless the name says o
 from __future__ import annotations
 
 import enum
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -288,3 +288,18 @@ class Driver(Protocol):
 
     def estop(self, now_ns: int) -> tuple[OutgoingFrame, ...]:
         """Frames that stop the robot in any state."""
+
+
+@dataclass(frozen=True, slots=True)
+class MotorDriver:
+    """A motor controller that robot.toml can name: each file of `drivers.motor` that speaks to one holds a `DRIVER`.
+
+    `make` returns a fresh driver; its argument is the key of authenticated mode (16 bytes) or None. `authenticates`:
+    whether there is such a mode; without one `link.key_file` is refused. `is_default`: taken where robot.toml has no
+    `link.driver`.
+    """
+
+    name: str
+    make: Callable[[bytes | None], Driver]
+    authenticates: bool = False
+    is_default: bool = False

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from drivers.transmission import FrameTransmission
+from drivers.motor.reference_frames import FrameTransmission
 from firmware_protocol import _firmware
 from firmware_protocol.authentication import aes_cmac
 from firmware_protocol.codec import Codec

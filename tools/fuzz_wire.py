@@ -15,7 +15,7 @@ import tracemalloc
 from collections.abc import Callable
 from dataclasses import replace
 
-from drivers.reference import ReferenceDriver
+from drivers.motor.reference import ReferenceDriver
 from drivers.types import Frame, ReceivedFrame, WheelCommand
 from firmware_protocol.codec import PROTOCOL, Codec
 from firmware_protocol.e2e import crc8

@@ -13,6 +13,7 @@ from disco_hw.config.input_file import ROBOT_TOML, read_toml
 from disco_hw.config.words import in_words
 from disco_hw.errors import InputError
 from disco_hw.tasks import ReadField, RobotTask, UnknownKind, default_task, kinds, task_class, task_from
+from drivers.motor import UnknownDriverError, find_driver
 
 Positive = Annotated[float, Meta(gt=0.0)]
 NonNegative = Annotated[float, Meta(ge=0.0)]
@@ -45,9 +46,12 @@ class Prior(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 
 
 class Link(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """How the robot is reached; `options` go to the python-can interface as they are."""
+    """How the robot is reached; `options` go to the python-can interface as they are.
 
-    driver: Literal["reference"] = "reference"
+    `driver`: of `drivers.motor`; None is its default.
+    """
+
+    driver: str | None = None
     kind: Literal["can", "serial"] = "can"
     interface: str = "socketcan"
     channel: str = "can0"
@@ -211,6 +215,12 @@ def _check(path: Path, config: RobotConfig) -> None:
         )
     if control.telemetry_disarm_s <= control.telemetry_zero_s:
         refuse("control.telemetry_disarm_s", "not above telemetry_zero_s", "write a larger value")
+    try:
+        driver = find_driver(config.link.driver)
+    except UnknownDriverError as error:
+        raise InputError(f"{path}: link.driver: {error}") from None
+    if config.link.key_file is not None and not driver.authenticates:
+        refuse("link.key_file", f"the driver {driver.name} has no authenticated mode", "remove it")
     fault = config.task.fault()
     if fault is not None:
         refuse(f"task.{fault.field}", fault.fault, fault.remedy)

@@ -15,7 +15,6 @@ from disco_hw.daemon.control_client import send_request
 from disco_hw.daemon.link import make_link
 from disco_hw.daemon.realtime import can_lock_memory, can_use_fifo
 from disco_hw.errors import InputError, WorkError
-from disco_hw.runtime.assembly import make_driver
 from disco_hw.runtime.preflight import (
     Check,
     Level,
@@ -28,9 +27,11 @@ from disco_hw.runtime.preflight import (
 )
 from disco_hw.runtime.robot_setup import Setup, link_key, load_setup
 from disco_hw.runtime.situation import connection
-from drivers import words
+from drivers import status_texts
+from drivers.motor import make_driver
 from drivers.types import (
     Capabilities,
+    Driver,
     DriverState,
     LinkState,
     OutgoingFrame,
@@ -88,7 +89,7 @@ def run_check(robot: Path, link: str | None = None) -> CheckReport:
     try:
         checks.append(_link_check(transport))
         if checks[-1].level is Level.OK:
-            found = _ask_robot(transport, key)
+            found = _ask_robot(transport, make_driver(setup.config.link.driver, key))
             checks.append(_firmware_check(found))
             checks.append(_hearing_check(found))
             checks.append(check_round_trip(found.round_trips_s, 1.0 / control.rate_hz))
@@ -152,9 +153,8 @@ def _link_check(transport: Transport) -> Check:
     return Check("link", Level.OK, transport.name)
 
 
-def _ask_robot(transport: Transport, key: bytes | None) -> _Found:
+def _ask_robot(transport: Transport, driver: Driver) -> _Found:
     """Shake hands, listen for three seconds and time the answers to the driver's own clock requests."""
-    driver = make_driver(key)
     stopwatch = _Stopwatch()
     wheels = poses = 0
     told: list[RobotStatus] = []
@@ -215,7 +215,9 @@ def _firmware_check(found: _Found) -> Check:
     if found.state in {DriverState.REFUSED, DriverState.FAULT, DriverState.ESTOP}:
         return Check(name, Level.FAIL, f"{found.state.value}: {found.detail}")
     if found.told and found.told[-1].fault_code:
-        return Check(name, Level.FAIL, f"{found.state.value}: the robot reports {words.fault(found.told[-1].fault)}")
+        return Check(
+            name, Level.FAIL, f"{found.state.value}: the robot reports {status_texts.fault(found.told[-1].fault)}"
+        )
     capabilities = found.capabilities
     clock = "clock synchronised" if found.clock_synchronised else "clock NOT synchronised"
     version = f"{capabilities.firmware_version}, protocol {capabilities.protocol_major}.{capabilities.protocol_minor}"
@@ -232,7 +234,7 @@ def _hearing_check(found: _Found) -> Check:
     if not rejected:
         return Check(name, Level.OK, "the robot rejects nothing")
     level = Level.FAIL if last.reject_reason == "AUTHENTICATION" else Level.WARNING
-    return Check(name, level, f"the robot rejected {rejected} frames: {words.reject_reason(last.reject_reason)}")
+    return Check(name, level, f"the robot rejected {rejected} frames: {status_texts.reject_reason(last.reject_reason)}")
 
 
 def _telemetry_check(found: _Found) -> Check:

@@ -13,7 +13,7 @@ from disco_hw.daemon.control_client import send_request
 from disco_hw.daemon.socket_place import default_socket_path, passed_over
 from disco_hw.errors import InputError, WorkError
 from disco_hw.runtime.situation import advice, by_command, status_headline
-from drivers import words
+from drivers import status_texts
 
 ADAPT_ACTIONS = ("revert", "adapt")
 """Back to the belief of the model file, and learning again."""
@@ -84,7 +84,7 @@ def in_words(reply: dict[str, Any], robot: Path) -> str:
     lines = [
         ": ".join(status_headline(reply)),
         *(f"next: {sentence}" for sentence in advice(reply, by_command(robot))),
-        f"robot {reply['robot_state']}, link {reply['link']}, fault {words.fault(reply['fault'])}",
+        f"robot {reply['robot_state']}, link {reply['link']}, fault {status_texts.fault(reply['fault'])}",
         f"{' '.join(task['progress'])}, distance {task['distance_m'] * 1e3:.0f} mm, speed {task['speed_m_s']:.3f} m/s",
         f"loop lateness p99 {loop['lateness_us']['p99']:.0f} us, max {loop['lateness_us']['max']:.0f} us, "
         f"overruns {loop['overruns']}, skipped {loop['skipped']}",

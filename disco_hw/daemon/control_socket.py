@@ -20,7 +20,7 @@ import msgspec
 
 from disco_hw.daemon.socket_place import REMEDY, peer_uid
 from disco_hw.errors import InputError
-from drivers.ownership import why_not_private
+from drivers.private_files import why_not_private
 
 _MAX_CLIENTS = 8
 _ACCEPTS_PER_POLL = 4

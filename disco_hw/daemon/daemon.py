@@ -44,7 +44,7 @@ from disco_hw.log.link import Attachment
 from disco_hw.log.provenance import DBC, version
 from disco_hw.log.recorder import NullRecorder, ProcessRecorder, Recorder, Recording
 from disco_hw.runtime import records_of_tick
-from disco_hw.runtime.assembly import assemble_core, make_adaptation, make_driver, make_pipeline, make_planner
+from disco_hw.runtime.assembly import assemble_core, make_adaptation, make_pipeline, make_planner
 from disco_hw.runtime.core import CoreTick, DaemonCore
 from disco_hw.runtime.log_setup import kept_files
 from disco_hw.runtime.pilot import Pilot, TaskPilot
@@ -54,6 +54,7 @@ from disco_hw.runtime.situation import Ask, advice, by_command, headline
 from disco_hw.runtime.states import State
 from disco_hw.runtime.supervisor import Reply, UserRequest
 from disco_hw.runtime.task_change import TaskRefused, changed_task
+from drivers.motor import make_driver
 from drivers.types import Request, Transport
 from firmware_protocol.dbc import packaged_dbc
 
@@ -171,7 +172,8 @@ def _start(
         say("control socket", line)
     transport.open()
     stop.add("link", transport.close)
-    core = assemble_core(config, transport, make_driver(key), pipeline, recorder, pilot.needs_pose, adaptation)
+    driver = make_driver(config.link.driver, key)
+    core = assemble_core(config, transport, driver, pipeline, recorder, pilot.needs_pose, adaptation)
     daemon = Daemon(core, server, recorder, MonotonicClock(), signals, say, pilot, ask)
     stop.add("wheels", daemon.stop_wheels)
     if config.daemon.realtime_priority:

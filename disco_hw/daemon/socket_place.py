@@ -12,7 +12,7 @@ from itertools import count
 from pathlib import Path
 
 from disco_hw.errors import WorkError
-from drivers.ownership import placed_by, user_name, why_not_private
+from drivers.private_files import placed_by, user_name, why_not_private
 
 REMEDY = "set daemon.control_socket to a path in a directory of your own"
 _ROOT = 0

@@ -31,7 +31,7 @@ from disco_hw.runtime.states import State
 from disco_hw.runtime.supervisor import UserRequest
 from disco_hw.tasks import PlannedTask
 from disco_hw.tasks.circle import circle_task
-from drivers.reference import ReferenceDriver
+from drivers.motor.reference import ReferenceDriver
 from drivers.types import RobotLinkHealth, RobotStatus
 from firmware_protocol.codec import Codec
 from firmware_protocol.firmware_core import FirmwareConfig

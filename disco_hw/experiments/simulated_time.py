@@ -15,13 +15,14 @@ from disco_hw.log.link import Attachment
 from disco_hw.log.provenance import MODEL_TOML
 from disco_hw.log.recorder import MemoryRecorder, ProcessRecorder, Recording
 from disco_hw.model.file import model_text
-from disco_hw.runtime.assembly import assemble_core, make_adaptation, make_driver, make_pipeline
+from disco_hw.runtime.assembly import assemble_core, make_adaptation, make_pipeline
 from disco_hw.runtime.core import CoreTick, DaemonCore
 from disco_hw.runtime.log_setup import kept_files
 from disco_hw.runtime.pilot import Pilot, TaskPilot
 from disco_hw.runtime.pipeline import Planner
 from disco_hw.runtime.robot_setup import Setup
 from disco_hw.runtime.supervisor import UserRequest
+from drivers.motor import make_driver
 from firmware_protocol.firmware_core import FirmwareConfig
 from sim.body_dynamics import Pose
 from sim.in_process import RobotInProcess
@@ -79,7 +80,7 @@ class SimulatedRun:
         self.core: DaemonCore = assemble_core(
             setup.config,
             robot.host,
-            make_driver(),
+            make_driver(setup.config.link.driver),
             pipeline,
             self.recorder,
             self.pilot.needs_pose if needs_pose is None else needs_pose,

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import secrets
-
 from disco_hw import control
 from disco_hw.adaptation.adaptation import Adaptation, CheckedAdaptation
 from disco_hw.adaptation.guard import (
@@ -25,9 +23,7 @@ from disco_hw.runtime.pipeline import Pipeline, Planner
 from disco_hw.runtime.preflight import check_firmware_limits, check_task, failures
 from disco_hw.runtime.robot_setup import Setup, geometry
 from disco_hw.runtime.supervisor import Supervisor, SupervisorSettings
-from drivers.reference import ReferenceDriver
 from drivers.types import Driver, Transport
-from firmware_protocol.codec import Codec
 
 _REHEARSALS = 5
 
@@ -93,14 +89,6 @@ def odometry_parameters(model: Model) -> OdometryParameters:
     """Mean and covariance of the geometry, as the estimator wants them."""
     (wheel_radius_m, axial_distance_m, x_icr_m), covariance = geometry(model)
     return OdometryParameters(wheel_radius_m, axial_distance_m, x_icr_m, covariance)
-
-
-def make_driver(key: bytes | None = None) -> ReferenceDriver:
-    """The driver of the reference protocol; session ids are unpredictable, so that no old one fits by accident.
-
-    `key`: of authenticated mode, 16 bytes.
-    """
-    return ReferenceDriver(Codec(), lambda: secrets.randbits(16), key)
 
 
 def assemble_core(

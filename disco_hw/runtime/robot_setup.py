@@ -12,7 +12,7 @@ from disco_hw.config.input_file import KEY, read_bytes
 from disco_hw.config.link_option import link_fields
 from disco_hw.errors import InputError
 from disco_hw.model import Model, load_model
-from drivers.key_file import KeyFileError, key_of_file
+from drivers.private_files import KeyFileError, key_of_file
 
 Matrix3 = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
 

@@ -4,22 +4,63 @@ from __future__ import annotations
 
 import errno
 import socket
+import threading
 import time
+from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import can
+from can.interfaces import VALID_INTERFACES
 
-from drivers.transport.can_errors import decode_error_frame
-from drivers.transport.counters import Counters
-from drivers.transport.explain import error_number, explain_can
-from drivers.transport.own_frames import OwnFrames
-from drivers.transport.reconnecting import LinkLostError, LinkMuteError, TransmitBusyError
+from drivers.transport.reconnecting import (
+    MUTE_AFTER_S,
+    Counters,
+    LinkLostError,
+    LinkMuteError,
+    ReconnectingTransport,
+    TransmitBusyError,
+    TransportSettingsError,
+)
+from drivers.transport.serial import error_number, explain_port, plain
 from drivers.types import Frame, ReceivedFrame
 from firmware_protocol.serial_framing import MAX_CAN_ID, MAX_DATA
 
+_TX_TIMEOUT = 0x001
+_LOST_ARBITRATION = 0x002
+_CONTROLLER = 0x004
+_PROTOCOL = 0x008
+_TRANSCEIVER = 0x010
+_NO_ACK = 0x020
+_BUS_OFF = 0x040
+_BUS_ERROR = 0x080
+_RESTARTED = 0x100
+_COUNTERS = 0x200
+_CLASSES = (
+    (_TX_TIMEOUT, "transmit timeout"),
+    (_LOST_ARBITRATION, "arbitration lost"),
+    (_PROTOCOL, "protocol violation"),
+    (_TRANSCEIVER, "transceiver fault (wiring)"),
+    (_NO_ACK, "no acknowledgement: nobody else is on the bus, or at another bit rate"),
+    (_BUS_ERROR, "bus error"),
+)
+_CONTROLLER_STATES = (
+    (0x01, "receive overflow in the controller"),
+    (0x02, "transmit overflow in the controller"),
+    (0x04, "receive errors at warning level"),
+    (0x08, "transmit errors at warning level"),
+    (0x10, "receive errors at passive level"),
+    (0x20, "transmit errors at passive level"),
+)
+_RECEIVE_OVERFLOW = 0x01
+ECHO_NS = 1_000_000_000
+_NOT_HERE = (can.CanInterfaceNotImplementedError, ImportError, NameError)
+_OVER_A_TTY = ("slcan", "serial", "seeedstudio", "robotell")
+KIND = "can"
 READ_TIMEOUT_S = 0.1
 WRITE_TIMEOUT_S = 0.05
 MAX_STAMP_AGE_S = 1.0
@@ -28,6 +69,61 @@ _INTERFACE_UP_FLAG = 0x1
 _PROBE_TIMEOUT_S = 1.0
 _ECHO_OPTION = "receive_own_messages"
 _ECHOING_INTERFACES = frozenset({"udp_multicast"})
+SLCAN_BITRATES = (10_000, 20_000, 50_000, 83_300, 100_000, 125_000, 250_000, 500_000, 750_000, 1_000_000)
+MAY_STAY_MUTE = frozenset({"slcan", "serial", "seeedstudio", "robotell", "socketcand"})
+"""Interfaces over a serial port or a connection: these can be open and lead nowhere."""
+_FIELDS_OF_THEIR_OWN = ("interface", "channel", "bitrate", "ignore_config")
+_NEEDED_OPTIONS = {"socketcand": ("host", "port")}
+_PACKAGES = {
+    "canalystii": ("canalystii", "canalystii"),
+    "cantact": ("cantact", "cantact"),
+    "gs_usb": ("gs_usb", "gs-usb"),
+    "neovi": ("ics", "python-ics"),
+    "udp_multicast": ("msgpack", "msgpack"),
+}
+"""By interface: the module that it imports, and the package that holds it."""
+
+
+def make_transport(
+    *,
+    interface: str = "socketcan",
+    channel: str = "can0",
+    bitrate: int = 500_000,
+    options: Mapping[str, Any] = MappingProxyType({}),
+    **_of_other_media: Any,
+) -> ReconnectingTransport:
+    """Make a link over a CAN bus by the fields of robot.toml's [link].
+
+    Raises TransportSettingsError for an interface, option or bit rate (bit/s) that does not exist, and for an interface
+    whose Python package is not installed.
+    """
+    _check_can(interface, bitrate, options)
+    mute_after_s = MUTE_AFTER_S if interface in MAY_STAY_MUTE else None
+    return ReconnectingTransport(CanMedium(interface, channel, bitrate, options), mute_after_s=mute_after_s)
+
+
+def _check_can(interface: str, bitrate: int, options: Mapping[str, Any]) -> None:
+    if interface not in VALID_INTERFACES:
+        known = ", ".join(sorted(VALID_INTERFACES))
+        raise TransportSettingsError(f'link.interface: python-can has no interface "{interface}"; write one of {known}')
+    if interface == "slcan" and bitrate not in SLCAN_BITRATES:
+        known = ", ".join(map(str, SLCAN_BITRATES))
+        raise TransportSettingsError(f"link.bitrate: slcan has no {bitrate} bit/s; write one of {known}")
+    for name in _FIELDS_OF_THEIR_OWN:
+        if name in options:
+            raise TransportSettingsError(f"link.options: {name} has a field of its own; write it as link.{name}")
+    missing = [name for name in _NEEDED_OPTIONS.get(interface, ()) if name not in options]
+    if missing:
+        raise TransportSettingsError(
+            f"link.options: {interface} needs {' and '.join(missing)}; write options = "
+            '{ host = "192.168.1.5", port = 29536 }'
+        )
+    module, package = _PACKAGES.get(interface, (None, ""))
+    if module is not None and find_spec(module) is None:
+        raise TransportSettingsError(
+            f"link.interface: {interface} needs the Python package {package}, which is not installed; "
+            f"run: pip install {package}"
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,7 +280,7 @@ def monotonic_stamp_ns(timestamp_s: float, wall_now_ns: int, now_ns: int) -> int
 
 
 def is_busy(error: Exception) -> bool:
-    """Tell whether a send failed only for want of room in a queue, so that a later attempt may succeed."""
+    """Whether a send failed only for want of room in a queue, so that a later attempt may succeed."""
     if error_number(error) == errno.ENOBUFS or isinstance(error, TimeoutError):
         return True
     seen: BaseException | None = error
@@ -223,3 +319,111 @@ def require_working_interface(channel: str, sysfs: Path = Path("/sys/class/net")
             f"the interface is in bus-off; check wiring, termination and bit rate, then run: "
             f"sudo ip link set {channel} type can restart (or set it up with restart-ms 100)"
         )
+
+
+def explain_can(interface: str, channel: str, bitrate: int, error: BaseException) -> str:
+    """Say what went wrong with a CAN bus and what to do about it."""
+    number = error_number(error)
+    where = f"{interface} {channel}"
+    if isinstance(error, TypeError):
+        return f"{where}: link.options do not fit this interface ({error}); correct them"
+    if isinstance(error, _NOT_HERE):
+        return f"{where}: cannot be used here ({plain(error)}); install its maker's driver, or use another interface"
+    if type(error).__name__ == "NoBackendError":
+        return f"{where}: libusb is missing; run: sudo apt-get install libusb-1.0-0"
+    if interface == "socketcan":
+        virtual = channel.startswith("vcan")
+        bring_up = f"sudo ip link set {channel} up" + ("" if virtual else f" type can bitrate {bitrate}")
+        if number == errno.ENODEV and virtual:
+            return f"{where}: no such CAN interface; run: sudo ip link add dev {channel} type vcan && {bring_up}"
+        if number == errno.ENODEV:
+            return f"{where}: no such CAN interface; plug the adapter in and run: {bring_up}"
+        if number == errno.ENETDOWN:
+            return f"{where}: the interface is down; run: {bring_up}"
+        if number == errno.EAFNOSUPPORT:
+            return f"{where}: this kernel has no CAN; load it with: sudo modprobe can_raw, or use another interface"
+        if number == errno.ENOBUFS:
+            return f"{where}: transmit queue full; is anybody else on the bus? (ip -details link show {channel})"
+    if interface in _OVER_A_TTY and number is not None:
+        return explain_port(channel, error)
+    if number in (errno.ENOENT, errno.ECONNREFUSED):
+        return f"{where}: nothing listens there; start the other end first"
+    return f"{where}: {plain(error)}"
+
+
+class OwnFrames:
+    """For buses that hand a sender its own frames; a sending and a receiving thread may use it at once.
+
+    Each frame sent excuses one equal frame received within a second. So a second host is seen even if it sends the
+    same: of two equal frames only one is excused.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._sent: deque[tuple[int, Frame]] = deque()
+
+    def sent(self, now_ns: int, frame: Frame) -> None:
+        """Note a frame, before it is handed to the bus: its echo can be faster than the call that sends it."""
+        with self._lock:
+            self._forget(now_ns)
+            self._sent.append((now_ns, frame))
+
+    def not_sent(self, frame: Frame) -> None:
+        """Take back the newest note of a frame that the bus did not take."""
+        with self._lock:
+            for index in range(len(self._sent) - 1, -1, -1):
+                if self._sent[index][1] == frame:
+                    del self._sent[index]
+                    return
+
+    def is_echo(self, now_ns: int, frame: Frame) -> bool:
+        """Whether a received frame is one's own; each note counts once."""
+        with self._lock:
+            self._forget(now_ns)
+            for index, (_, sent) in enumerate(self._sent):
+                if sent == frame:
+                    del self._sent[index]
+                    return True
+        return False
+
+    def _forget(self, now_ns: int) -> None:
+        while self._sent and now_ns - self._sent[0][0] > ECHO_NS:
+            self._sent.popleft()
+
+
+@dataclass(frozen=True, slots=True)
+class CanBusError:
+    """One error frame in words; the error counters are None where the adapter does not report them."""
+
+    bus_off: bool
+    harmful: bool
+    receive_overflow: bool
+    text: str
+    tx_error_count: int | None
+    rx_error_count: int | None
+
+
+def decode_error_frame(error_class: int, data: bytes) -> CanBusError:
+    """Return the meaning of an error frame from its class bits (its identifier) and data; any length is accepted.
+
+    `harmful` is False for what only reports a recovery (controller active again, restarted) or counters.
+    """
+    detail = data.ljust(8, b"\0")
+    controller = detail[1] if error_class & _CONTROLLER else 0
+    words = [text for bit, text in _CLASSES if error_class & bit]
+    words += [text for bit, text in _CONTROLLER_STATES if controller & bit]
+    bus_off = bool(error_class & _BUS_OFF)
+    if bus_off:
+        words.insert(0, "bus-off: the controller has left the bus after too many errors")
+    harmful = bool(words)
+    if error_class & _RESTARTED:
+        words.append("controller restarted")
+    counted = bool(error_class & _COUNTERS)
+    return CanBusError(
+        bus_off=bus_off,
+        harmful=harmful,
+        receive_overflow=bool(controller & _RECEIVE_OVERFLOW),
+        text=", ".join(words) or "controller is error-active",
+        tx_error_count=detail[6] if counted else None,
+        rx_error_count=detail[7] if counted else None,
+    )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 
-from drivers.transport.counters import Counters
+from drivers.transport.reconnecting import Counters
 from drivers.types import LinkState, OutgoingFrame, ReceivedFrame, TransportStats
 
 QUEUE_CAPACITY = 4096

@@ -6,15 +6,15 @@ time sets its own policy first. They are the only place where a medium may block
 
 from __future__ import annotations
 
+import dataclasses
+import heapq
 import threading
 import time
 from collections import deque
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
-from drivers.transport.backoff import DEFAULT_BACKOFF, BackoffPolicy, next_delay_s
-from drivers.transport.counters import Counters
-from drivers.transport.transmit_queue import TransmitQueue
 from drivers.types import Frame, LinkState, OutgoingFrame, ReceivedFrame, TransportStats
 from firmware_protocol.serial_framing import MAX_CAN_ID, MAX_DATA
 
@@ -24,6 +24,107 @@ _BUSY_RETRY_S = 0.001
 _DRAIN_S = 0.1
 _JOIN_S = 1.0
 _MOST_PATIENT_S = 30.0
+MUTE_AFTER_S = 4.0
+
+
+@dataclass(frozen=True, slots=True)
+class BackoffPolicy:
+    """Delays that double from `first_s` to `longest_s`; a link that was up for `steady_s` starts afresh."""
+
+    first_s: float = 0.05
+    longest_s: float = 2.0
+    steady_s: float = 1.0
+
+
+DEFAULT_BACKOFF = BackoffPolicy()
+
+
+def next_delay_s(policy: BackoffPolicy, previous_s: float | None, up_for_s: float) -> float:
+    """Return the delay before the next attempt, in seconds.
+
+    `previous_s` is the delay before the attempt that has just failed, None if there was none; `up_for_s` how long the
+    link was up after it (0 if it never came up). A link that flaps keeps backing off.
+    """
+    if previous_s is None or up_for_s >= policy.steady_s:
+        return policy.first_s
+    return min(2.0 * previous_s, policy.longest_s)
+
+
+class TransmitQueue:
+    """Bounded queue in the order in which a CAN bus would send: lowest identifier first, equal ones as they came.
+
+    When it is full a more urgent frame takes the place of the least urgent one, so that an emergency stop always fits.
+    """
+
+    __slots__ = ("_capacity", "_front", "_heap", "_sequence")
+
+    def __init__(self, capacity: int) -> None:
+        self._capacity = capacity
+        self._heap: list[tuple[int, int, OutgoingFrame]] = []
+        self._sequence = 0
+        self._front = 0
+
+    def __len__(self) -> int:
+        return len(self._heap)
+
+    def push(self, outgoing: OutgoingFrame) -> OutgoingFrame | None:
+        """Queue a frame; return the frame that did not fit (the given or an earlier one), or None."""
+        self._sequence += 1
+        entry = (outgoing.frame.can_id, self._sequence, outgoing)
+        if len(self._heap) < self._capacity:
+            heapq.heappush(self._heap, entry)
+            return None
+        last = max(self._heap)
+        if last < entry:
+            return outgoing
+        self._heap[self._heap.index(last)] = entry
+        heapq.heapify(self._heap)
+        return last[2]
+
+    def pop(self) -> OutgoingFrame | None:
+        """Take out the frame to send next, or None."""
+        return heapq.heappop(self._heap)[2] if self._heap else None
+
+    def put_back(self, outgoing: OutgoingFrame) -> None:
+        """Return the frame taken out last: it stays the first of its identifier and counts against no limit."""
+        self._front -= 1
+        heapq.heappush(self._heap, (outgoing.frame.can_id, self._front, outgoing))
+
+    def expire(self, now_ns: int) -> int:
+        """Drop the frames whose deadline has passed; return how many."""
+        kept = [entry for entry in self._heap if entry[2].deadline_ns >= now_ns]
+        expired = len(self._heap) - len(kept)
+        if expired:
+            self._heap = kept
+            heapq.heapify(self._heap)
+        return expired
+
+    def clear(self) -> int:
+        """Drop everything; return how many frames."""
+        dropped = len(self._heap)
+        self._heap.clear()
+        return dropped
+
+
+class Counters:
+    """The counters of one transport, named as the fields of `TransportStats`."""
+
+    __slots__ = ("_counts", "_lock")
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._counts = {field.name: 0 for field in dataclasses.fields(TransportStats)}
+
+    def add(self, **increments: int) -> None:
+        """Add to counters by name. Raises KeyError for a name that `TransportStats` does not have."""
+        with self._lock:
+            for name, increment in increments.items():
+                self._counts[name] += increment
+
+    def snapshot(self) -> TransportStats:
+        """Return all counters as of one instant."""
+        with self._lock:
+            return TransportStats(**self._counts)
 
 
 class TransmitBusyError(Exception):
@@ -36,6 +137,10 @@ class LinkLostError(Exception):
 
 class LinkMuteError(LinkLostError):
     """The medium is open and nothing comes from it."""
+
+
+class TransportSettingsError(ValueError):
+    """Settings of a link that no device could satisfy; the message is one line: field, what is wrong, what to write."""
 
 
 class Connection(Protocol):

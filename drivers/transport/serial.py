@@ -2,21 +2,41 @@
 
 from __future__ import annotations
 
+import errno
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import serial
 
-from drivers.transport.counters import Counters
-from drivers.transport.explain import explain_mute, explain_port
-from drivers.transport.reconnecting import LinkMuteError, TransmitBusyError
+from drivers.transport.reconnecting import (
+    MUTE_AFTER_S,
+    Counters,
+    LinkMuteError,
+    ReconnectingTransport,
+    TransmitBusyError,
+)
 from drivers.types import Frame, ReceivedFrame
 from firmware_protocol.serial_framing import FrameDecoder, encode_frame
 
+_GONE = (errno.ENOENT, errno.ENODEV, errno.ENXIO, errno.EIO)
+KIND = "serial"
 READ_TIMEOUT_S = 0.1
 WRITE_TIMEOUT_S = 0.05
 _DELIMITER = b"\0"
+
+
+def make_transport(
+    *,
+    port: str = "/dev/ttyUSB0",
+    baud: int = 921_600,
+    dtr: bool = False,
+    rts: bool = False,
+    **_of_other_media: Any,
+) -> ReconnectingTransport:
+    """Make a link over a serial port by the fields of robot.toml's [link]; `baud` in bit/s."""
+    return ReconnectingTransport(SerialMedium(port, baud, dtr, rts), mute_after_s=MUTE_AFTER_S)
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,3 +127,42 @@ def ask_for_low_latency(port: serial.Serial) -> None:
     except (ValueError, OSError, NotImplementedError):
         # Pseudo-terminals, CDC-ACM and network ports have no such mode, and no latency timer either.
         return
+
+
+def error_number(error: BaseException) -> int | None:
+    """Return the errno of an error or of what caused it; python-can and pyserial hide it in several places."""
+    seen: BaseException | None = error
+    while seen is not None:
+        for attribute in ("error_code", "errno"):
+            number = getattr(seen, attribute, None)
+            if isinstance(number, int):
+                return number
+        seen = seen.__cause__ or seen.__context__
+    return None
+
+
+def explain_port(port: str, error: BaseException) -> str:
+    """Say what went wrong with a serial port and what to do about it."""
+    number = error_number(error)
+    if number in _GONE:
+        return f"{port}: no such device; plug the adapter in, or correct the port (ls /dev/serial/by-id shows them)"
+    if number in (errno.EACCES, errno.EPERM):
+        return f"{port}: permission denied; run: sudo usermod -aG dialout $USER, then log in again"
+    if number in (errno.EBUSY, errno.EAGAIN) or "exclusively lock" in str(error):
+        return f"{port}: in use by another program; stop it (sudo fuser {port} shows which)"
+    return f"{port}: {plain(error)}"
+
+
+def explain_mute(port: str, error: BaseException) -> str:
+    """Say what to look at when a serial port is open and nothing comes from it."""
+    return (
+        f"{port}: {error}; is the robot switched on, and is this its port? Adapters change their numbers: name it as "
+        "in /dev/serial/by-id. Some USB boards speak only with link.dtr = true"
+    )
+
+
+def plain(error: BaseException) -> str:
+    """Return an error's own text, with that of its cause where it has one."""
+    text = str(error) or type(error).__name__
+    cause = error.__cause__
+    return f"{text} ({cause})" if cause is not None and str(cause) else text

@@ -11,11 +11,12 @@ from disco_hw.daemon import check
 from disco_hw.errors import InputError
 from disco_hw.runtime.preflight import Level
 from disco_hw.runtime.robot_setup import load_setup
+from drivers.motor import make_driver
 from drivers.transport import connect_pair
 from drivers.types import Frame, OutgoingFrame
 from firmware_protocol.faults import FAULTS
 from tests.daemon.test_control_client import Daemon
-from tests.drivers.reference_robot import CONFIG, ReferenceRobot
+from tests.drivers.motor.reference_robot import CONFIG, ReferenceRobot
 from tests.robot import test_robot
 from tests.runtime.simulated import ROBOT_FILE
 
@@ -57,12 +58,12 @@ def brief(monkeypatch):
 
 @pytest.mark.parametrize("key", [b"", KEY])
 def test_a_robot_that_takes_what_it_is_sent(key):
-    found = check._ask_robot(RobotInTime(key), key or None)
+    found = check._ask_robot(RobotInTime(key), make_driver(None, key or None))
     assert check._hearing_check(found).level is Level.OK
 
 
 def test_a_key_that_is_not_the_robots_fails():
-    found = check._ask_robot(RobotInTime(KEY), KEY[::-1])
+    found = check._ask_robot(RobotInTime(KEY), make_driver(None, KEY[::-1]))
     heard = check._hearing_check(found)
     assert heard.level is Level.FAIL
     assert "link.key_file" in heard.text
@@ -71,7 +72,7 @@ def test_a_key_that_is_not_the_robots_fails():
 def test_a_fault_that_does_not_latch_fails_with_what_to_do():
     robot = RobotInTime(b"")
     robot.robot.inputs["right_temperature_c"] = 100.0
-    firmware = check._firmware_check(check._ask_robot(robot, None))
+    firmware = check._firmware_check(check._ask_robot(robot, make_driver(None)))
     assert (firmware.level, firmware.text) == (
         Level.FAIL,
         "standby: the robot reports OVER_TEMPERATURE_RIGHT: " + FAULTS["OVER_TEMPERATURE_RIGHT"].advice,
@@ -81,7 +82,7 @@ def test_a_fault_that_does_not_latch_fails_with_what_to_do():
 def test_what_else_the_robot_rejects_is_a_warning():
     robot = RobotInTime(b"")
     robot.disturb = Frame(0x101, bytes(8))
-    heard = check._hearing_check(check._ask_robot(robot, None))
+    heard = check._hearing_check(check._ask_robot(robot, make_driver(None)))
     assert heard.level is Level.WARNING
     assert "checksum" in heard.text
 

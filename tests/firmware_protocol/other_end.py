@@ -12,7 +12,7 @@ _FRAME_LIFE_NS = 100 * MS_NS
 
 
 class SimulatedEnd:
-    """A robot simulator (see `tests.drivers.reference_robot`) in simulated time, a millisecond a step."""
+    """A robot simulator (see `tests.drivers.motor.reference_robot`) in simulated time, a millisecond a step."""
 
     slack_s = 0.012
 

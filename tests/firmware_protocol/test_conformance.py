@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from tests.drivers.reference_robot import CONFIG, ReferenceRobot
+from tests.drivers.motor.reference_robot import CONFIG, ReferenceRobot
 from tests.firmware_protocol.conformance import FirmwareConformance
 from tests.firmware_protocol.other_end import SimulatedEnd
 from tests.firmware_protocol.protocol_host import ProtocolHost

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from disco_hw.experiments.fault_run import FaultRun
-from drivers.transport.factory import open_transport
+from drivers.transport import open_transport
 from drivers.types import LinkState
 from sim.fault_schedule import FaultSchedule
 from sim.hub import Hub

@@ -19,8 +19,7 @@ import pytest
 
 from drivers.transport import open_transport
 from drivers.transport.can import CanMedium
-from drivers.transport.counters import Counters
-from drivers.transport.reconnecting import LinkLostError
+from drivers.transport.reconnecting import Counters, LinkLostError
 from drivers.types import LinkState
 from tests.drivers.waiting import collect, outgoing, send, wait_until
 

@@ -17,8 +17,8 @@ from disco_hw.config.input_file import CANDUMP, read_lines
 from disco_hw.log.drive import Array, Commands, DriveLog, Gyro, Poses, Wheels
 from disco_hw.log.errors import LogError
 from drivers.device_clock import DeviceClock
-from drivers.reception import FrameReception
-from drivers.telemetry import POSE_MESSAGES, WHEEL_MESSAGES, Telemetry
+from drivers.motor.reference_frames import FrameReception
+from drivers.motor.reference_telemetry import POSE_MESSAGES, WHEEL_MESSAGES, Telemetry
 from drivers.types import Capabilities, Frame, ReceivedFrame
 from firmware_protocol.codec import Codec, Decoded
 

@@ -16,21 +16,118 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.transport.backoff import BackoffPolicy
 from drivers.transport.can import (
+    ECHO_NS,
     GARBAGE_LIMIT,
     CanConnection,
     CanMedium,
+    OwnFrames,
+    decode_error_frame,
     is_busy,
     monotonic_stamp_ns,
     require_working_interface,
 )
-from drivers.transport.counters import Counters
-from drivers.transport.own_frames import OwnFrames
-from drivers.transport.reconnecting import LinkLostError, ReconnectingTransport, TransmitBusyError
+from drivers.transport.reconnecting import (
+    BackoffPolicy,
+    Counters,
+    LinkLostError,
+    ReconnectingTransport,
+    TransmitBusyError,
+)
 from drivers.types import Frame, LinkState
 from tests.drivers.transport.pseudo_terminal import PseudoTerminal
 from tests.drivers.waiting import collect, median_send_s, outgoing, send, wait_until
+
+
+@pytest.mark.parametrize(
+    ("error_class", "data", "words"),
+    [
+        (0x0A8, "0000001900000000", "no acknowledgement"),
+        (0x08C, "0002090800000000", "protocol violation"),
+        (0x204, "0004000000006064", "receive errors at warning"),
+        (0x204, "0010000000008087", "receive errors at passive"),
+        (0x040, "0000000000000000", "bus-off"),
+        (0x001, "", "transmit timeout"),
+    ],
+)
+def test_frames_as_the_kernel_makes_them(error_class, data, words):
+    error = decode_error_frame(error_class, bytes.fromhex(data))
+    assert words in error.text
+    assert error.harmful
+    assert error.bus_off == (error_class == 0x040)
+
+
+def test_error_counters():
+    error = decode_error_frame(0x204, bytes.fromhex("0004000000006064"))
+    assert (error.tx_error_count, error.rx_error_count) == (0x60, 0x64)
+    assert decode_error_frame(0x04, bytes(8)).tx_error_count is None
+
+
+def test_recovery_is_no_error():
+    restarted = decode_error_frame(0x100, bytes(8))
+    assert not restarted.harmful
+    assert "restarted" in restarted.text
+    active = decode_error_frame(0x204, bytes.fromhex("0040000000000000"))
+    assert not active.harmful
+
+
+def test_overflow_in_the_controller_means_lost_frames():
+    assert decode_error_frame(0x04, b"\x00\x01").receive_overflow
+    assert not decode_error_frame(0x04, b"\x00\x02").receive_overflow
+
+
+@given(st.integers(0, 0x1FFFFFFF), st.binary(max_size=64))
+def test_anything_is_understood_somehow(error_class, data):
+    assert decode_error_frame(error_class, data).text
+
+
+A, B = Frame(0x100, b"\1"), Frame(0x100, b"\2")
+
+
+@pytest.fixture
+def own():
+    return OwnFrames()
+
+
+def test_each_frame_sent_excuses_one_that_is_equal(own):
+    own.sent(0, A)
+    own.sent(0, A)
+    assert [own.is_echo(1, A) for _ in range(3)] == [True, True, False]
+
+
+def test_another_frame_is_no_echo_and_takes_no_excuse(own):
+    own.sent(0, A)
+    assert not own.is_echo(1, B)
+    assert not own.is_echo(1, Frame(0x101, A.data))
+    assert own.is_echo(1, A)
+
+
+def test_an_excuse_ends_after_a_second(own):
+    own.sent(0, A)
+    own.sent(ECHO_NS, B)
+    assert not own.is_echo(ECHO_NS + 1, A)
+    assert own.is_echo(2 * ECHO_NS, B)
+
+
+def test_a_frame_that_was_not_sent_excuses_nothing(own):
+    for frame in (A, B, A):
+        own.sent(0, frame)
+    own.not_sent(A)
+    assert [own.is_echo(1, frame) for frame in (A, A, B)] == [True, False, True]
+    own.not_sent(B)
+
+
+@given(st.lists(st.tuples(st.sampled_from([A, B]), st.booleans()), max_size=40))
+def test_whoever_else_sends_is_heard_as_often_as_he_sends(events):
+    """Echoes and another host's frames of the same contents, in any order: what is not excused is as many as his."""
+    own = OwnFrames()
+    for frame, is_ours in events:
+        if is_ours:
+            own.sent(0, frame)
+    heard = [frame for frame, _ in events if not own.is_echo(1, frame)]
+    strangers = [frame for frame, is_ours in events if not is_ours]
+    assert sorted(heard, key=lambda frame: frame.data) == sorted(strangers, key=lambda frame: frame.data)
+
 
 FAST = BackoffPolicy(first_s=0.01, longest_s=0.05, steady_s=0.1)
 CHANNELS = (f"can-test-{number}" for number in itertools.count())

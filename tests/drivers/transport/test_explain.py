@@ -4,7 +4,8 @@ import can
 import pytest
 import serial
 
-from drivers.transport.explain import error_number, explain_can, explain_port
+from drivers.transport.can import explain_can
+from drivers.transport.serial import error_number, explain_port
 
 
 def caused(error, cause):

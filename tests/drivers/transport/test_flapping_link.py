@@ -7,9 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from drivers.transport.backoff import BackoffPolicy
 from drivers.transport.can import CanMedium
-from drivers.transport.reconnecting import LinkLostError, ReconnectingTransport
+from drivers.transport.reconnecting import BackoffPolicy, LinkLostError, ReconnectingTransport
 from drivers.transport.serial import SerialMedium
 from tests.drivers.transport.pseudo_terminal import PseudoTerminal
 from tests.drivers.waiting import wait_until

@@ -6,9 +6,7 @@ import time
 import pytest
 import serial
 
-from drivers.transport.backoff import BackoffPolicy
-from drivers.transport.counters import Counters
-from drivers.transport.reconnecting import ReconnectingTransport
+from drivers.transport.reconnecting import BackoffPolicy, Counters, ReconnectingTransport
 from drivers.transport.serial import SerialMedium, ask_for_low_latency
 from drivers.types import Frame, LinkState
 from firmware_protocol.serial_framing import FrameDecoder, encode_frame

@@ -1,0 +1,457 @@
+"""The driver of this project's own wheel controller, which speaks firmware_protocol/disco_robot.dbc.
+
+Its parts lie beside it: frames, arming, telemetry, and the watch over an armed robot.
+"""
+
+from __future__ import annotations
+
+import math
+import secrets
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from drivers import status_texts
+from drivers.device_clock import DEVICE_CLOCK_MODULUS_US, DeviceClock
+from drivers.motor import reference_telemetry as telemetry
+from drivers.motor.reference_arming import MESSAGES as HANDSHAKE_MESSAGES
+from drivers.motor.reference_arming import Arming, Handshake, HostState
+from drivers.motor.reference_frames import FrameReception, FrameTransmission
+from drivers.motor.reference_watch import ArmedWatch
+from drivers.types import (
+    Capabilities,
+    DriverState,
+    DriverStats,
+    MotorDriver,
+    OutgoingFrame,
+    Readings,
+    ReceivedFrame,
+    Request,
+    RobotStatus,
+    WheelCommand,
+)
+from firmware_protocol.codec import PROTOCOL_MAJOR, PROTOCOL_MINOR, Codec, Decoded
+
+SILENCE_NS = 500_000_000
+REFUSED_SILENCE_NS = 3_000_000_000
+# A little under 10 Hz, so that a loop whose ticks come early by some jitter does not skip one.
+HOST_STATE_PERIOD_NS = 90_000_000
+HELLO_PERIOD_NS = 200_000_000
+REFUSED_HELLO_PERIOD_NS = 1_000_000_000
+FAST_TIME_PERIOD_NS = 200_000_000
+TIME_PERIOD_NS = 1_000_000_000
+FAST_TIME_COUNT = 10
+ZERO_VALID_FOR_S = 0.1
+ESTOP_REPEATS = 3
+SHORTEST_VALID_FOR_S = 0.002
+_HOUSE_KEEPING_NS = 100_000_000
+_ESTOP_DEADLINE_NS = 1_000_000_000
+_PENDING_TIMES = 8
+_ONE_STOP_NS = 1_000_000_000
+_STATES = {
+    "BOOT": DriverState.HANDSHAKE,
+    "STANDBY": DriverState.STANDBY,
+    "READY": DriverState.STANDBY,
+    "ARMED": DriverState.STOPPING,
+    "STOPPING": DriverState.STOPPING,
+    "FAULT": DriverState.FAULT,
+    "ESTOP": DriverState.ESTOP,
+}
+_ON_THE_WAY = {DriverState.ARMING: "arming", DriverState.ARMED: "armed"}
+_MAY_ARM = frozenset(DriverState) - {
+    DriverState.DISCONNECTED,
+    DriverState.HANDSHAKE,
+    DriverState.REFUSED,
+    DriverState.FAULT,
+    DriverState.ESTOP,
+}
+
+
+class ReferenceDriver:
+    """Satisfies `drivers.types.Driver`; pure: no clock, thread or I/O, and no frame makes it raise.
+
+    `request(ARM)` leads from STANDBY or READY through a new session to ARMED; it is ignored, with the reason in
+    `detail`, before the handshake is complete. `transmit` raises ValueError for a command that is not finite or out of
+    the wire's range (callers clip first): it never reaches the wire.
+    """
+
+    def __init__(self, codec: Codec, draw_session: Callable[[], int], key: bytes | None = None) -> None:
+        """`draw_session` returns any non-negative integer, best at random: session ids are made of it.
+
+        With a `key` (16 bytes) commands are authenticated, and a robot that does not ask for that is refused.
+        """
+        self._codec = codec
+        self._has_key = key is not None
+        self._reception = FrameReception(codec)
+        self._transmission = FrameTransmission(codec, key)
+        self._clock = DeviceClock()
+        self._telemetry = telemetry.Telemetry(self._clock)
+        self._handlers = self._make_handlers()
+        self._arming = Arming(codec.dbc_hash, draw_session)
+        self._handshake = self._new_handshake()
+        self._blocker_bits = codec.choices("SESSION_STATE", "blockers")
+        self._status: RobotStatus | None = None
+        self._link_is_up = False
+        self._host_accepted = False
+        self._host_state: HostState | None = None
+        self._time_sequence = 0
+        self._time_requests: dict[int, int] = {}
+        self._commands_sent = 0
+        self._watch = ArmedWatch()
+        self._device_us: int | None = None
+        self._reported_clock_errors: int | None = None
+        self._clock_errors = 0
+        self._last_heard_ns = 0
+        self._events: list[str] = []
+        self._foreign_reported = False
+        self._now_ns = 0
+
+    @property
+    def state(self) -> DriverState:
+        """Where the driver is with its robot."""
+        if not self._link_is_up:
+            return DriverState.DISCONNECTED
+        if self._handshake.refusal is not None:
+            return DriverState.REFUSED
+        if self.capabilities is None or self._status is None:
+            return DriverState.HANDSHAKE
+        state = _STATES.get(self._status.state, DriverState.HANDSHAKE)
+        if self._arming.armed:
+            return DriverState.ARMED
+        if state is DriverState.STANDBY and self._arming.wanted is Request.ARM:
+            return DriverState.ARMING
+        return DriverState.READY if self._arming.ready else state
+
+    @property
+    def detail(self) -> str:
+        """One sentence for a person: why the state is what it is and what to do about it."""
+        state, status, note = self.state, self._status, self._arming.note
+        if state in _ON_THE_WAY:
+            return _ON_THE_WAY[state]
+        if state is DriverState.DISCONNECTED:
+            return f"the link is down; {note}" if note else "the link is down"
+        if self._handshake.refusal is not None:
+            return self._handshake.refusal
+        if state is DriverState.HANDSHAKE or status is None:
+            return self._handshake_detail()
+        match state:
+            case DriverState.FAULT:
+                return f"the robot reports {status_texts.fault(status.fault)}"
+            case DriverState.ESTOP:
+                return status_texts.estop(status.estop_source)
+            case DriverState.STOPPING if status.state == "ARMED":
+                return note or "the robot is armed, but not by us or no longer wanted: it is being stopped"
+        return note or f"the robot is in {status.state}"
+
+    @property
+    def capabilities(self) -> Capabilities | None:
+        """What the robot said in the handshake; None before it is complete."""
+        return self._handshake.capabilities
+
+    @property
+    def stats(self) -> DriverStats:
+        """A snapshot of the counters."""
+        reception = self._reception
+        return DriverStats(
+            frames_accepted=reception.accepted,
+            rejected_crc=reception.rejected_crc,
+            rejected_sequence=reception.rejected_sequence,
+            rejected_length=reception.rejected_length,
+            unknown_id=reception.unknown_id,
+            lost_frames=reception.lost,
+            implausible_ticks=self._telemetry.implausible_ticks,
+            implausible_values=self._telemetry.implausible_values,
+            commands_sent=self._commands_sent,
+            sessions=self._arming.sessions,
+            robot_clock_errors=self._clock_errors,
+            late_commands=self._watch.late,
+            silent_states=self._watch.silent,
+        )
+
+    @property
+    def clock_offset_ns(self) -> int | None:
+        """Host time minus device time, as estimated now; None before the first estimate."""
+        return self._clock.offset_ns(self._now_ns)
+
+    @property
+    def synced(self) -> bool:
+        """Whether samples are stamped with the device's time of measurement; before, with their reception."""
+        return self._clock.synced(self._now_ns)
+
+    def link_up(self, now_ns: int) -> None:
+        """The medium has come up (again): start the handshake; any session is void."""
+        self._now_ns = now_ns
+        self._restart("the link was lost")
+        self._link_is_up = True
+
+    def link_down(self, now_ns: int) -> None:
+        """The medium is gone: any session is void."""
+        self._now_ns = now_ns
+        self._restart("the link was lost")
+        self._link_is_up = False
+
+    def request(self, request: Request) -> None:
+        """Set what the host wants; held until changed. ARM and RESET are consumed, see `Arming`."""
+        if request is Request.ARM and self.state not in _MAY_ARM:
+            self._arming.note = f"not arming: {self.detail}"
+        elif request is not Request.READY or self._handshake.refusal is None:
+            self._arming.request(request)
+
+    def receive(self, now_ns: int, frames: Sequence[ReceivedFrame]) -> Readings:
+        """Take in received frames and return what they meant; frames that come while the link is down are ignored."""
+        self._now_ns = now_ns
+        collected: dict[str, list[Any]] = {}
+        stopped_ns = self._reception.outside_stop_ns
+        for received in frames if self._link_is_up else ():
+            decoded = self._reception.accept(received)
+            if decoded is None:
+                continue
+            self._last_heard_ns = min(received.t_ns, now_ns)
+            self._handle(decoded, received.t_ns, collected)
+        self._check_liveness(now_ns)
+        self._report_outside_stop(stopped_ns)
+        if self._reception.foreign is not None and not self._foreign_reported:
+            self._foreign_reported = True
+            self._events.append(f"another host is on the link: it sends {self._reception.foreign}; disconnect it")
+        events, self._events = tuple(self._events), []
+        return Readings(**{kind: tuple(samples) for kind, samples in collected.items()}, events=events)
+
+    def transmit(self, now_ns: int, command: WheelCommand | None) -> tuple[OutgoingFrame, ...]:
+        """Frames due now: the command (only while armed; zeros while arming) and house-keeping.
+
+        Raises ValueError for a command that is not finite, out of the wire's range, or valid for no time.
+        """
+        self._now_ns = now_ns
+        if command is not None:
+            _check(command)
+        if not self._link_is_up:
+            return ()
+        self._check_liveness(now_ns)
+        self._arming.step(now_ns)
+        frames = []
+        if self._arming.armed and command is not None:
+            frames.append(self._wheel_command(now_ns, "SPEED", command))
+        elif self._arming.needs_zeros:
+            frames.append(self._wheel_command(now_ns, "HOLD_ZERO", WheelCommand(0.0, 0.0, ZERO_VALID_FOR_S)))
+        else:
+            self._watch.rest()
+        return self._transmission.proved((*frames, *self._house_keeping(now_ns)))
+
+    def estop(self, now_ns: int) -> tuple[OutgoingFrame, ...]:
+        """Frames that stop the robot in any state; whatever was wanted is dropped."""
+        self._arming.request(Request.STANDBY)
+        frame = self._transmission.frame("ESTOP", now_ns, _ESTOP_DEADLINE_NS, reason="UNSPECIFIED")
+        return (frame,) * ESTOP_REPEATS
+
+    def _wheel_command(self, now_ns: int, mode: str, command: WheelCommand) -> OutgoingFrame:
+        frame = self._transmission.frame(
+            "WHEEL_COMMAND",
+            now_ns,
+            # Half of its validity may pass on the way; the firmware counts the whole from the reception.
+            round(0.5e9 * command.valid_for_s),
+            mode=mode,
+            left_speed=command.left_rad_s,
+            right_speed=command.right_rad_s,
+            valid_for=command.valid_for_s,
+            session=self._arming.session,
+        )
+        self._watch.sent(self._commands_sent, now_ns)
+        self._commands_sent += 1
+        return frame
+
+    def _house_keeping(self, now_ns: int) -> list[OutgoingFrame]:
+        frames = []
+        transmission = self._transmission
+        refused = self._handshake.refusal is not None
+        introduced = self._host_accepted and self.capabilities is not None and not refused
+        hello_period_ns = REFUSED_HELLO_PERIOD_NS if refused else HELLO_PERIOD_NS
+        if not introduced and transmission.due("HELLO_REQUEST", now_ns, hello_period_ns):
+            frames.append(
+                transmission.frame(
+                    "HELLO_REQUEST",
+                    now_ns,
+                    _HOUSE_KEEPING_NS,
+                    protocol_major=PROTOCOL_MAJOR,
+                    protocol_minor=PROTOCOL_MINOR,
+                    dbc_hash=self._codec.dbc_hash,
+                )
+            )
+        state = self._arming.host_state()
+        if state != self._host_state or transmission.due("HOST_STATE", now_ns, HOST_STATE_PERIOD_NS):
+            self._host_state = state
+            frames.append(
+                transmission.frame(
+                    "HOST_STATE",
+                    now_ns,
+                    _HOUSE_KEEPING_NS,
+                    request=state.request,
+                    session=state.session,
+                    challenge_answer=state.challenge_answer,
+                    host_fault=0,
+                )
+            )
+        time_period_ns = FAST_TIME_PERIOD_NS if self._clock.count < FAST_TIME_COUNT else TIME_PERIOD_NS
+        if transmission.due("TIME_REQUEST", now_ns, time_period_ns):
+            self._time_sequence = (self._time_sequence + 1) % 256
+            self._time_requests[self._time_sequence] = now_ns
+            if len(self._time_requests) > _PENDING_TIMES:
+                del self._time_requests[next(iter(self._time_requests))]
+            frames.append(transmission.frame("TIME_REQUEST", now_ns, _HOUSE_KEEPING_NS, sequence=self._time_sequence))
+        return frames
+
+    def _handle(self, decoded: Decoded, received_ns: int, collected: dict[str, list[Any]]) -> None:
+        handler = self._handlers.get(decoded.name)
+        if handler is None:
+            return
+        kind, handle = handler
+        sample = handle(decoded, received_ns)
+        if sample is not None:
+            collected.setdefault(kind, []).append(sample)
+
+    def _make_handlers(self) -> dict[str, tuple[str, Callable[[Decoded, int], Any]]]:
+        """By message name: the field of `Readings`, and what turns a frame and its reception (ns) into a sample."""
+        return {
+            **dict.fromkeys(telemetry.WHEEL_MESSAGES, ("wheels", self._telemetry.wheels)),
+            **dict.fromkeys(telemetry.POSE_MESSAGES, ("poses", self._telemetry.pose)),
+            **dict.fromkeys(HANDSHAKE_MESSAGES, ("", self._on_handshake)),
+            "SYSTEM_STATE": ("status", self._on_status),
+            "SESSION_STATE": ("", self._on_session),
+            "TIME_RESPONSE": ("", self._on_time),
+            "MAC_CHALLENGE": ("", self._on_challenge),
+            "MOTOR": ("motors", telemetry.motor),
+            "POWER": ("power", telemetry.power),
+            "LINK_HEALTH": ("link_health", telemetry.link_health),
+        }
+
+    def _on_challenge(self, decoded: Decoded, _received_ns: int) -> None:
+        self._transmission.challenge(int(decoded.values["nonce"]))
+
+    def _on_handshake(self, decoded: Decoded, _received_ns: int) -> None:
+        before, refusal = self.capabilities, self._handshake.refusal
+        self._handshake.take(decoded)
+        capabilities = self.capabilities
+        if capabilities is not None and capabilities != before:
+            self._telemetry.configure(capabilities)
+            self._events.append(
+                f"handshake complete: firmware {capabilities.firmware_version}, board {capabilities.board_id}, "
+                f"protocol {capabilities.protocol_major}.{capabilities.protocol_minor}, DBC {capabilities.dbc_hash:08x}"
+            )
+        if self._handshake.refusal not in (None, refusal):
+            self._arming.reset("the handshake was refused")
+            self._events.append(f"handshake refused: {self._handshake.refusal}")
+
+    def _on_status(self, decoded: Decoded, received_ns: int) -> RobotStatus:
+        values = decoded.values
+        names = {
+            signal: self._codec.choice_name("SYSTEM_STATE", signal, values[signal])
+            for signal in ("state", "fault", "estop_source", "stop_cause", "reject_reason")
+        }
+        status = RobotStatus(
+            t_ns=received_ns,
+            fault_code=int(values["fault"]),
+            session=int(values["session"]),
+            rejected_count=int(values["rejected_count"]),
+            **names,
+        )
+        before, self._status = self._status, status
+        if before is None or (before.state, before.fault) != (status.state, status.fault):
+            fault = f", fault {status_texts.fault(status.fault)}" if status.fault_code else ""
+            came_from = before.state if before is not None else "unknown"
+            self._events.append(f"robot {came_from} -> {status.state}{fault}")
+        self._arming.take_status(status.state, status.session, status.stop_cause, status.reject_reason)
+        self._watch.reported(int(values["last_command_counter"]), received_ns)
+        return status
+
+    def _on_session(self, decoded: Decoded, received_ns: int) -> None:
+        values = decoded.values
+        self._host_accepted = bool(values["host_accepted"])
+        bits = int(values["blockers"])
+        blockers = tuple(name for bit, name in self._blocker_bits.items() if bits & bit)
+        self._arming.take_session(int(values["challenge"]), int(values["session"]), blockers, received_ns)
+        self._count_clock_errors(int(values["clock_error_count"]))
+
+    def _report_outside_stop(self, before_ns: int | None) -> None:
+        """Say that somebody else sent an e-stop, once for frames that come within a second."""
+        newest_ns = self._reception.outside_stop_ns
+        if newest_ns is not None and (before_ns is None or newest_ns - before_ns > _ONE_STOP_NS):
+            self._events.append("e-stop from outside on the link, by `disco-hw estop` or another host")
+
+    def _count_clock_errors(self, reported: int) -> None:
+        before, self._reported_clock_errors = self._reported_clock_errors, reported
+        # A smaller count is that of a robot that has restarted meanwhile.
+        if before is not None and reported > before:
+            self._clock_errors += reported - before
+            self._events.append("the robot's controller found its clock set back and goes on with a time of its own")
+
+    def _on_time(self, decoded: Decoded, received_ns: int) -> None:
+        sent_ns = self._time_requests.pop(int(decoded.values["sequence"]), None)
+        if sent_ns is None:
+            return
+        device_us = int(decoded.values["receive_time"])
+        before_us, self._device_us = self._device_us, device_us
+        if not self._clock.add(sent_ns, received_ns, device_us):
+            return
+        if before_us is not None and (device_us - before_us) % DEVICE_CLOCK_MODULUS_US < DEVICE_CLOCK_MODULUS_US // 2:
+            why = "its clock leapt"
+            event = "the robot's clock leapt: this computer slept, or the controller's clock is over 200 ppm off"
+        else:
+            why = "the robot has restarted"
+            event = f"{why}: its clock was set back"
+        self._restart(why)
+        self._events.append(event)
+
+    def _check_liveness(self, now_ns: int) -> None:
+        """Start afresh with a robot that has fallen silent or has sample times that contradict its clock."""
+        refused = self._handshake.refusal is not None
+        known = refused or self._status is not None or self.capabilities is not None
+        if known and now_ns - self._last_heard_ns > (REFUSED_SILENCE_NS if refused else SILENCE_NS):
+            self._restart("the robot fell silent")
+            self._events.append("the robot fell silent: new handshake")
+        objection = self._watch.objection(now_ns) if self._arming.armed else None
+        if objection is not None:
+            self._arming.give_up(f"disarmed: {objection}")
+            self._events.append(f"disarmed: {objection}")
+        if self._telemetry.distrusts_clock:
+            self._clock.forget()
+            self._telemetry.restart()
+            self._events.append("sample times contradict the robot's clock: synchronising anew")
+
+    def _restart(self, why: str) -> None:
+        self._handshake = self._new_handshake()
+        self._reception.reset()
+        self._transmission.forget()
+        self._arming.reset(why)
+        self._telemetry.restart()
+        self._clock.forget()
+        self._time_requests.clear()
+        self._device_us = None
+        self._status = None
+        self._host_accepted = False
+        self._reported_clock_errors = None
+        self._foreign_reported = False
+
+    def _new_handshake(self) -> Handshake:
+        return Handshake(PROTOCOL_MAJOR, PROTOCOL_MINOR, self._codec.dbc_hash, has_key=self._has_key)
+
+    def _handshake_detail(self) -> str:
+        missing = self._handshake.missing
+        if len(missing) == 3:
+            return "no answer from the robot; is it switched on, and does it use the same bit rate?"
+        if missing:
+            return f"waiting for the robot's {', '.join(missing)}"
+        if self._status is None:
+            return "waiting for the robot's SYSTEM_STATE"
+        return f"the robot is in {self._status.state}"
+
+
+def _check(command: WheelCommand) -> None:
+    finite = math.isfinite(command.left_rad_s) and math.isfinite(command.right_rad_s)
+    if not finite or not command.valid_for_s >= SHORTEST_VALID_FOR_S:
+        raise ValueError(f"not a wheel command: {command}")
+
+
+def _make(key: bytes | None) -> ReferenceDriver:
+    # Session ids are unpredictable, so that no old one fits by accident.
+    return ReferenceDriver(Codec(), lambda: secrets.randbits(16), key)
+
+
+DRIVER = MotorDriver("reference", _make, authenticates=True, is_default=True)

@@ -1,0 +1,262 @@
+"""From the handshake to armed: who the robot is, what the host asks of it, and when it may command the wheels."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import msgspec
+
+from drivers import status_texts
+from drivers.types import Capabilities, Request
+from firmware_protocol.codec import Codec, Decoded
+from firmware_protocol.e2e import challenge_answer
+
+ARMING_TIMEOUT_NS = 1_500_000_000
+SESSION_REFUSED_AFTER_NS = 300_000_000
+_OPEN = ("READY", "ARMED")
+_LATCHED = ("FAULT", "ESTOP")
+_SESSIONS = 255
+MESSAGES = frozenset({"HELLO", "BUILD", "LIMITS"})
+_AUTHENTICATION = Codec().choice_value("HELLO", "capabilities", "AUTHENTICATION")
+
+
+class HostState(msgspec.Struct, frozen=True, gc=False):
+    """What HOST_STATE is to say."""
+
+    request: str
+    session: int
+    challenge_answer: int
+
+
+class Arming:
+    """Leads the robot from STANDBY to ARMED with a new session each time, and never again by itself.
+
+    A session serves one arming: as soon as the robot has left READY or ARMED, or the host has asked for less, it is
+    spent. ARM is consumed when the robot leaves ARMED, refuses to arm within 1.5 s, or has a fault or an emergency
+    stop; RESET is consumed when the robot leaves FAULT or ESTOP.
+    """
+
+    def __init__(self, dbc_hash: int, draw_session: Callable[[], int]) -> None:
+        """`draw_session` returns any non-negative integer, best at random."""
+        self._dbc_hash = dbc_hash
+        self._draw_session = draw_session
+        self.wanted = Request.STANDBY
+        self.session = 0
+        self.sessions = 0
+        self.note = ""
+        self._last_session = 0
+        self._session_since_ns = 0
+        self._opened = False
+        self._spent = False
+        self._was_armed = False
+        self._asked_ns: int | None = None
+        self._robot_state = "BOOT"
+        self._robot_session = 0
+        self._reject_reason = "NONE"
+        self._blockers: tuple[str, ...] = ()
+        self._challenge = (0, 0)
+        self._answer = challenge_answer(0, 0, dbc_hash)
+
+    @property
+    def armed(self) -> bool:
+        """Whether the robot is armed in our session and is to stay so."""
+        return self.wanted is Request.ARM and self._robot_state == "ARMED" and self._ours and not self._spent
+
+    @property
+    def needs_zeros(self) -> bool:
+        """Whether the robot waits for zero commands before it arms."""
+        return self.wanted is Request.ARM and self._robot_state == "READY" and self._ours and not self._spent
+
+    @property
+    def ready(self) -> bool:
+        """Whether our session is open and nothing else is asked of it."""
+        return self._robot_state == "READY" and self._ours and not self._spent
+
+    @property
+    def _ours(self) -> bool:
+        return self.session != 0 and self._robot_session == self.session
+
+    def request(self, request: Request) -> None:
+        """Set what the host wants; only asking for ARM keeps an armed session."""
+        if request is self.wanted:
+            return
+        if request is Request.ARM:
+            self.note = ""
+        elif self._opened and (self.wanted is Request.ARM or request is not Request.READY):
+            self._spent = True
+        self.wanted = request
+        self._asked_ns = None
+        self._was_armed = False
+
+    def give_up(self, why: str) -> None:
+        """End an arming or an armed session, with what `note` is to say."""
+        self.note = why
+        self._spent = self._opened
+        self._set_standby()
+
+    def reset(self, why: str) -> None:
+        """Void everything agreed with the robot: the link or the robot is another one."""
+        if self.wanted is Request.ARM:
+            self.note = f"disarmed: {why}"
+        self._void_session()
+        self._set_standby()
+        self._robot_state, self._robot_session = "BOOT", 0
+
+    def take_status(self, state: str, session: int, stop_cause: str, reject_reason: str) -> None:
+        """Take in SYSTEM_STATE, by the names of the DBC's value tables."""
+        before, self._robot_state = self._robot_state, state
+        self._robot_session = session
+        self._reject_reason = reject_reason
+        if self._ours and state in _OPEN:
+            self._opened = True
+        elif self._opened:
+            self._void_session()
+        if self.armed:
+            self._was_armed = True
+        elif self._was_armed or (self.wanted is Request.ARM and state in _LATCHED):
+            self.give_up(f"the robot disarmed itself: {status_texts.stop_cause(stop_cause)}" if self._was_armed else "")
+        if self.wanted is Request.RESET and before in _LATCHED and state not in _LATCHED:
+            self._set_standby()
+            self.note = ""
+
+    def take_session(self, challenge: int, session: int, blockers: tuple[str, ...], now_ns: int) -> None:
+        """Take in SESSION_STATE; `blockers` by the names of the DBC's value table."""
+        if self._challenge != (challenge, session):
+            self._challenge = (challenge, session)
+            self._answer = challenge_answer(challenge, session, self._dbc_hash)
+        self._blockers = blockers
+        refused = "SESSION" in blockers and self._robot_state == "STANDBY" and self.session != 0
+        if refused and now_ns - self._session_since_ns > SESSION_REFUSED_AFTER_NS:
+            # The robot has had this session before: it was opened and closed without our seeing it.
+            self._void_session()
+
+    def step(self, now_ns: int) -> None:
+        """Give up an arming that takes too long, and choose a session where one is needed."""
+        if self.wanted is Request.ARM and not self._was_armed:
+            if self._asked_ns is None:
+                self._asked_ns = now_ns
+            elif now_ns - self._asked_ns > ARMING_TIMEOUT_NS:
+                self.give_up(f"not armed within {ARMING_TIMEOUT_NS * 1e-9:g} s: {self._why_not()}")
+        wanted = self.wanted in (Request.READY, Request.ARM)
+        if wanted and self.session == 0 and self._robot_state in ("STANDBY", "READY"):
+            self._choose_session(now_ns)
+
+    def host_state(self) -> HostState:
+        """Return the fields of HOST_STATE to send now."""
+        if self._spent or self.wanted is Request.STANDBY:
+            return HostState("STANDBY", self.session, 0)
+        if self.wanted is Request.RESET:
+            return HostState("RESET", self.session, 0)
+        may_answer = self._ours and self._challenge[1] == self.session and self._robot_state in _OPEN
+        if self.wanted is Request.ARM and may_answer:
+            return HostState("ARM", self.session, self._answer)
+        return HostState("READY", self.session, 0)
+
+    def _choose_session(self, now_ns: int) -> None:
+        session = 1 + self._draw_session() % _SESSIONS
+        while session in (self._last_session, self._robot_session):
+            session = session % _SESSIONS + 1
+        self.session = self._last_session = session
+        self._session_since_ns = now_ns
+        self.sessions += 1
+
+    def _void_session(self) -> None:
+        self.session = 0
+        self._opened = self._spent = False
+
+    def _set_standby(self) -> None:
+        self.wanted = Request.STANDBY
+        self._was_armed = False
+
+    def _why_not(self) -> str:
+        if self._blockers:
+            reasons = ", ".join(status_texts.blocker(name) for name in self._blockers)
+            rejected = status_texts.reject_reason(self._reject_reason)
+            return f"{reasons} (last rejection: {rejected})" if rejected else reasons
+        return status_texts.reject_reason(self._reject_reason) or "the robot gave no reason"
+
+
+class Handshake:
+    """Gathers HELLO, BUILD and both pages of LIMITS, and judges them.
+
+    Another major version is refused. The same major version with another DBC hash may be read, but never armed.
+    `refusal` says why the robot must not be armed and what to do about it, None if nothing speaks against it so far;
+    `capabilities` is what the robot said of itself, None until it is complete or if its limits make no sense.
+    """
+
+    def __init__(self, major: int, minor: int, dbc_hash: int, *, has_key: bool = False) -> None:
+        """`has_key`: whether this host authenticates its commands; a robot that expects otherwise is refused."""
+        self._has_key = has_key
+        self._major = major
+        self._minor = minor
+        self._dbc_hash = dbc_hash
+        self._hello: dict[str, float] | None = None
+        self._build: dict[str, float] | None = None
+        self._pages: dict[int, dict[str, float]] = {}
+        self.refusal: str | None = None
+        self.capabilities: Capabilities | None = None
+
+    def take(self, decoded: Decoded) -> None:
+        """Take in a frame of one of `MESSAGES`."""
+        match decoded.name:
+            case "HELLO":
+                self._hello = decoded.values
+            case "BUILD":
+                self._build = decoded.values
+            case _:
+                self._pages[int(decoded.values["page"])] = decoded.values
+        self.refusal = self._judge()
+        self.capabilities = self._gather()
+
+    @property
+    def missing(self) -> tuple[str, ...]:
+        """What has not come yet, by message name."""
+        names = {"HELLO": self._hello, "BUILD": self._build, "LIMITS": len(self._pages) == 2 or None}
+        return tuple(name for name, value in names.items() if value is None)
+
+    def _judge(self) -> str | None:
+        if self._hello is not None and int(self._hello["protocol_major"]) != self._major:
+            theirs = f"{int(self._hello['protocol_major'])}.{int(self._hello['protocol_minor'])}"
+            return (
+                f"the robot speaks protocol {theirs}, this host {self._major}.{self._minor}; "
+                f"flash the firmware that matches this host, or install the host that matches the firmware"
+            )
+        if self._build is not None and int(self._build["dbc_hash"]) != self._dbc_hash:
+            return (
+                f"the robot's DBC hash is {int(self._build['dbc_hash']):08x}, this host's {self._dbc_hash:08x}: "
+                f"telemetry only; flash the firmware built from this host's disco_robot.dbc, "
+                f"or install the host that matches the firmware"
+            )
+        if self._hello is not None and bool(int(self._hello["capabilities"]) & _AUTHENTICATION) != self._has_key:
+            if self._has_key:
+                return (
+                    "the robot takes commands from anybody, and this host has a key: "
+                    "give the robot's firmware the key, or take link.key_file out of robot.toml"
+                )
+            return "the robot obeys only who holds its key: write link.key_file in robot.toml, the file with that key"
+        if len(self._pages) == 2 and not self._limits_make_sense():
+            return "the robot reports limits that make no sense (a zero among them); correct its configuration"
+        return None
+
+    def _gather(self) -> Capabilities | None:
+        hello, build = self._hello, self._build
+        if hello is None or build is None or self.missing or not self._limits_make_sense():
+            return None
+        speed, times = self._pages[0], self._pages[1]
+        return Capabilities(
+            protocol_major=int(hello["protocol_major"]),
+            protocol_minor=int(hello["protocol_minor"]),
+            firmware_version=".".join(str(int(hello[f"firmware_{part}"])) for part in ("major", "minor", "patch")),
+            dbc_hash=int(build["dbc_hash"]),
+            board_id=int(build["board_id"]),
+            max_wheel_speed_rad_s=speed["max_wheel_speed"],
+            max_wheel_acceleration_rad_s2=speed["max_wheel_acceleration"],
+            ticks_per_rev=int(speed["ticks_per_rev"]),
+            command_timeout_s=times["command_timeout"],
+            drive_off_timeout_s=times["drive_off_timeout"],
+            stop_deceleration_rad_s2=times["stop_deceleration"],
+        )
+
+    def _limits_make_sense(self) -> bool:
+        values = {name: value for page in self._pages.values() for name, value in page.items() if name != "page"}
+        return all(value > 0 for value in values.values())

@@ -1,0 +1,273 @@
+"""What every driver must do, whatever its controller: inherit `DriverConformance` and say how to make both ends.
+
+The robot simulator speaks the controller's bytes. It has: `receive(now_ns, frame)`, `step(now_ns)` at 1 kHz, `drain()`,
+`armed`, `speed_rad_s` and `angle` of the wheels as they really are, `press_estop(pressed)` and `break_down(broken)`.
+"""
+
+import itertools
+import math
+import random
+
+import pytest
+
+from drivers.types import Driver, DriverState, Request, WheelCommand
+from tests.drivers.motor.bench import Bench
+
+FORWARD = (3.0, 2.0)
+STILL = (DriverState.STANDBY, DriverState.READY)
+
+
+class DriverConformance:
+    """The suite; `watchdog_s` and `deceleration_rad_s2` are those of the controller."""
+
+    watchdog_s = 0.1
+    deceleration_rad_s2 = 20.0
+    frame_ids: range
+
+    def make_driver(self):
+        raise AssertionError("say how to make the driver")
+
+    def make_robot(self, first_ticks=(0, 0)):
+        raise AssertionError("say how to make its robot")
+
+    def near_the_wrap(self):
+        """First ticks of both wheels so that the left counter wraps forwards and the right backwards."""
+        raise AssertionError("say where the encoder's counter wraps")
+
+    @pytest.fixture
+    def bench(self):
+        return Bench(self.make_driver(), self.make_robot())
+
+    def stop_time_s(self, speed_rad_s):
+        return self.watchdog_s + speed_rad_s / self.deceleration_rad_s2 + 0.05
+
+    def test_satisfies_the_protocol(self, bench):
+        driver: Driver = bench.driver
+        assert driver.state is DriverState.DISCONNECTED
+        assert driver.capabilities is None
+        assert driver.detail
+
+    def test_introduces_itself_and_stays_still(self, bench):
+        bench.run_until(*STILL)
+        capabilities = bench.driver.capabilities
+        assert capabilities.ticks_per_rev > 0
+        assert capabilities.max_wheel_speed_rad_s > 0
+        bench.run(1.0, FORWARD)
+        assert bench.largest_speed == 0.0
+        assert not bench.robot.armed
+
+    def test_armed_the_wheels_follow_the_command_and_the_samples_say_so(self, bench):
+        bench.arm()
+        assert bench.robot.armed
+        assert bench.largest_speed == 0.0, "arming alone moves nothing"
+        bench.run(2.0, FORWARD)
+        assert bench.robot.speed == pytest.approx(FORWARD, abs=0.005)
+        last = bench.wheels[-1]
+        assert (last.left_speed_rad_s, last.right_speed_rad_s) == pytest.approx(FORWARD, abs=0.005)
+        resolution = 2 * math.pi / bench.driver.capabilities.ticks_per_rev
+        for wheel, name in enumerate(("left_angle_rad", "right_angle_rad")):
+            moved = getattr(last, name) - getattr(bench.wheels[0], name)
+            behind = bench.robot.speed[wheel] * (bench.now_ns - last.t_ns) * 1e-9
+            assert moved == pytest.approx(bench.robot.angle[wheel] - behind, abs=2 * resolution + 0.02)
+
+    def test_ready_opens_a_session_and_moves_nothing(self, bench):
+        bench.run_until(*STILL)
+        bench.driver.request(Request.READY)
+        bench.run_until(DriverState.READY)
+        bench.run(1.0, FORWARD)
+        assert bench.driver.state is DriverState.READY
+        assert bench.largest_speed == 0.0
+
+    def test_a_silent_host_stops_the_robot_and_is_not_armed_when_it_comes_back(self, bench):
+        bench.arm()
+        bench.run(1.0, FORWARD)
+        bench.host_runs = False
+        bench.run(self.stop_time_s(max(FORWARD)))
+        assert bench.robot.speed_rad_s < 0.05
+        assert not bench.robot.armed
+        bench.host_runs = True
+        bench.largest_speed = 0.0
+        bench.run(3.0)
+        assert bench.largest_speed == 0.0
+        assert bench.driver.state in STILL
+
+    def test_a_host_without_commands_stops_the_robot_and_arm_is_consumed(self, bench):
+        """Alive and talking, but no command: the house-keeping must not feed the watchdog."""
+        bench.arm()
+        bench.run(1.0, FORWARD)
+        bench.command = None
+        bench.run(self.stop_time_s(max(FORWARD)))
+        assert bench.robot.speed_rad_s < 0.05
+        bench.run_until(*STILL)
+        bench.run(3.0, FORWARD)
+        assert not bench.robot.armed
+        assert bench.driver.detail not in ("", "armed", "arming"), "it says why"
+
+    def test_disarms_on_request_while_moving(self, bench):
+        bench.arm()
+        bench.run(1.0, FORWARD)
+        bench.driver.request(Request.STANDBY)
+        assert bench.driver.state is DriverState.STOPPING
+        bench.run(self.stop_time_s(max(FORWARD)))
+        assert bench.robot.speed_rad_s < 0.05
+        bench.run_until(*STILL)
+        assert not bench.robot.armed
+
+    def test_arms_again_only_on_request(self, bench):
+        bench.arm()
+        sessions = bench.driver.stats.sessions
+        bench.driver.request(Request.READY)
+        bench.run_until(DriverState.READY)
+        bench.run(2.0, FORWARD)
+        assert bench.largest_speed == 0.0
+        bench.arm()
+        assert bench.driver.stats.sessions > sessions
+        bench.run(1.0)
+        assert bench.robot.speed_rad_s > 1.0
+
+    def test_a_fault_disarms_and_needs_reset_and_a_new_arming(self, bench):
+        bench.arm()
+        bench.run(0.5, FORWARD)
+        bench.robot.break_down(True)
+        bench.run_until(DriverState.FAULT)
+        bench.run(self.stop_time_s(max(FORWARD)))
+        assert bench.robot.speed_rad_s < 0.05
+        assert len(bench.driver.detail) > 10
+        bench.driver.request(Request.ARM)
+        bench.run(2.0)
+        assert bench.driver.state is DriverState.FAULT
+        bench.driver.request(Request.RESET)
+        bench.run(1.0)
+        assert bench.driver.state is DriverState.FAULT, "the cause is still there"
+        bench.driver.request(Request.STANDBY)
+        bench.robot.break_down(False)
+        bench.run(0.5)
+        bench.driver.request(Request.RESET)
+        bench.run_until(*STILL)
+        bench.largest_speed = 0.0
+        bench.run(2.0)
+        assert bench.largest_speed == 0.0
+        bench.arm()
+
+    @pytest.mark.parametrize("armed", [False, True])
+    def test_the_hosts_emergency_stop_latches_in_any_state(self, bench, armed):
+        bench.run_until(*STILL)
+        if armed:
+            bench.arm()
+            bench.run(0.5, FORWARD)
+        bench.send_estop()
+        bench.run(self.stop_time_s(max(FORWARD)))
+        assert bench.robot.speed_rad_s < 0.05
+        assert bench.driver.state is DriverState.ESTOP
+        bench.driver.request(Request.ARM)
+        bench.run(2.0, FORWARD)
+        assert bench.driver.state is DriverState.ESTOP
+        bench.driver.request(Request.RESET)
+        bench.run_until(*STILL)
+        bench.largest_speed = 0.0
+        bench.run(2.0)
+        assert bench.largest_speed == 0.0
+        bench.arm()
+
+    def test_the_emergency_stop_button_holds_until_released_and_reset(self, bench):
+        bench.arm()
+        bench.run(0.5, FORWARD)
+        bench.robot.press_estop(True)
+        bench.run_until(DriverState.ESTOP)
+        bench.run(self.stop_time_s(max(FORWARD)))
+        assert bench.robot.speed_rad_s < 0.05
+        bench.driver.request(Request.RESET)
+        bench.run(1.0)
+        assert bench.driver.state is DriverState.ESTOP
+        bench.driver.request(Request.STANDBY)
+        bench.robot.press_estop(False)
+        bench.run(1.0)
+        assert bench.driver.state is DriverState.ESTOP, "releasing the button alone is not enough"
+        bench.driver.request(Request.RESET)
+        bench.run_until(*STILL)
+        bench.largest_speed = 0.0
+        bench.run(2.0)
+        assert bench.largest_speed == 0.0
+
+    def test_encoders_wrap_in_both_directions(self):
+        bench = Bench(self.make_driver(), self.make_robot(first_ticks=self.near_the_wrap()))
+        bench.arm()
+        for command in ((4.0, -4.0), (-4.0, 4.0), (4.0, -4.0)):
+            bench.run(2.0, command)
+        samples = bench.wheels
+        for before, after in itertools.pairwise(samples):
+            allowed = 4.1 * (after.t_ns - before.t_ns) * 1e-9 + 0.01
+            assert abs(after.left_angle_rad - before.left_angle_rad) <= allowed
+            assert abs(after.right_angle_rad - before.right_angle_rad) <= allowed
+        assert samples[-1].left_angle_rad == pytest.approx(bench.robot.angle[0], abs=0.1)
+        assert bench.driver.stats.implausible_ticks == 0
+
+    def test_an_unplugged_line_stops_the_robot_and_nothing_moves_when_it_is_back(self, bench):
+        bench.arm()
+        bench.run(1.0, FORWARD)
+        bench.step()
+        bench.host_end.plug(False)
+        bench.run(self.stop_time_s(max(FORWARD)))
+        assert bench.driver.state is DriverState.DISCONNECTED
+        assert bench.robot.speed_rad_s < 0.05
+        bench.driver.request(Request.ARM)
+        bench.host_end.plug(True)
+        bench.largest_speed = 0.0
+        bench.run(3.0, FORWARD)
+        assert bench.driver.state in STILL
+        assert bench.largest_speed == 0.0
+        angle = bench.wheels[-1].left_angle_rad
+        assert angle > 1.0, "the angles go on from where they were"
+        bench.arm()
+        bench.run(1.0)
+        assert bench.wheels[-1].left_angle_rad > angle
+
+    @pytest.mark.parametrize("unplugged_after_ms", range(20))
+    def test_unplugged_at_any_instant(self, bench, unplugged_after_ms):
+        bench.arm()
+        bench.run(0.3 + unplugged_after_ms * 1e-3, FORWARD)
+        bench.host_end.plug(False)
+        bench.run(0.1)
+        bench.host_end.plug(True)
+        bench.run(1.0)
+        assert bench.driver.state in STILL
+        for before, after in itertools.pairwise(bench.wheels):
+            assert abs(after.left_angle_rad - before.left_angle_rad) < 0.5
+
+    def test_garbage_from_anybody_is_counted_and_never_raises(self, bench):
+        generator = random.Random(5)
+        bench.arm()
+        bench.command = WheelCommand(*FORWARD, 0.1)
+        for _ in range(2000):
+            for inject in (bench.inject_to_host, bench.inject_to_robot):
+                can_id = generator.choice((generator.randrange(0x800), generator.choice(self.frame_ids)))
+                if can_id != self.estop_id:
+                    inject(can_id, generator.randbytes(generator.choice((0, 1, 7, 8, 8, 8, 8))))
+            bench.step()
+        stats = bench.driver.stats
+        assert stats.rejected_crc
+        assert stats.unknown_id
+        assert stats.rejected_length
+        assert bench.largest_speed <= max(FORWARD) + 0.01
+        for sample in bench.wheels:
+            assert abs(sample.left_angle_rad) < 20.0
+
+    estop_id = 0x080
+
+    @pytest.mark.parametrize(
+        "command",
+        [
+            WheelCommand(math.nan, 0.0, 0.1),
+            WheelCommand(0.0, math.inf, 0.1),
+            WheelCommand(0.0, -math.inf, 0.1),
+            WheelCommand(0.0, 0.0, math.nan),
+            WheelCommand(0.0, 0.0, 0.0),
+            WheelCommand(0.0, 0.0, -1.0),
+        ],
+    )
+    def test_a_command_that_is_none_is_the_callers_error(self, bench, command):
+        bench.arm()
+        sent = bench.driver.stats.commands_sent
+        with pytest.raises(ValueError, match="not a wheel command"):
+            bench.driver.transmit(bench.now_ns, command)
+        assert bench.driver.stats.commands_sent == sent

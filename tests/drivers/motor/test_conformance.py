@@ -1,0 +1,34 @@
+"""The conformance suite for the reference driver, against the real C firmware core."""
+
+import itertools
+from dataclasses import replace
+
+from drivers.motor.reference import ReferenceDriver
+from firmware_protocol.codec import Codec
+from tests.drivers.motor.conformance import DriverConformance
+from tests.drivers.motor.reference_robot import CONFIG, ReferenceRobot
+
+
+class TestReferenceDriver(DriverConformance):
+    frame_ids = range(0x100, 0x162)
+
+    def make_driver(self):
+        return ReferenceDriver(Codec(), itertools.count(41).__next__)
+
+    def make_robot(self, first_ticks=(0, 0)):
+        return ReferenceRobot(first_ticks=first_ticks)
+
+    def near_the_wrap(self):
+        return (2**24 - 300, 300)
+
+
+class TestAuthenticatedReferenceDriver(TestReferenceDriver):
+    """The same with a key on both ends."""
+
+    key = bytes(range(16))
+
+    def make_driver(self):
+        return ReferenceDriver(Codec(), itertools.count(41).__next__, self.key)
+
+    def make_robot(self, first_ticks=(0, 0)):
+        return ReferenceRobot(replace(CONFIG, key=self.key), first_ticks=first_ticks)

@@ -1,0 +1,71 @@
+"""The registry of motor controllers: robot.toml's `link.driver` names one, and each name stands in one file."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+import drivers.motor
+from disco_hw.config import load_robot_config
+from disco_hw.errors import InputError
+from drivers.motor import UnknownDriverError, find_driver, make_driver, motor_drivers
+from drivers.types import DriverState
+
+ROOT = Path(__file__).parents[3]
+WOMBOT = ROOT / "disco_hw/robots/wombot.toml"
+
+
+def robot_toml(folder, link):
+    file = folder / "robot.toml"
+    text = WOMBOT.read_text(encoding="utf-8")
+    file.write_text(re.sub(r"(?m)^\[link\]\n(.+\n)*", f"[link]\n{link}\n", text))
+    return file
+
+
+def test_every_driver_is_made_by_its_name_and_begins_without_a_link():
+    for name, driver in motor_drivers().items():
+        assert driver.name == name
+        assert make_driver(name).state is DriverState.DISCONNECTED
+
+
+def test_exactly_one_driver_is_the_default():
+    (default,) = [driver for driver in motor_drivers().values() if driver.is_default]
+    assert find_driver(None) is default
+
+
+def test_a_name_that_no_driver_has_is_refused_with_those_that_there_are():
+    with pytest.raises(UnknownDriverError, match=f'no driver "oddrive"; write one of {", ".join(motor_drivers())}$'):
+        make_driver("oddrive")
+
+
+def test_robot_toml_with_an_unknown_driver_is_refused_in_one_line(tmp_path):
+    with pytest.raises(InputError) as refused:
+        load_robot_config(robot_toml(tmp_path, 'driver = "oddrive"'))
+    assert "robot.toml: link.driver: there is no driver" in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_robot_toml_may_name_each_driver(tmp_path):
+    for name in motor_drivers():
+        assert load_robot_config(robot_toml(tmp_path, f'driver = "{name}"')).link.driver == name
+
+
+def test_a_key_for_a_driver_that_does_not_authenticate_is_refused(tmp_path, monkeypatch):
+    (name,) = [driver.name for driver in motor_drivers().values() if driver.is_default]
+    file = robot_toml(tmp_path, f'driver = "{name}"\nkey_file = "robot.key"')
+    assert load_robot_config(file).link.key_file == "robot.key"
+    monkeypatch.setattr("disco_hw.config.robot.find_driver", lambda _name: drivers.motor.MotorDriver(name, None))
+    with pytest.raises(InputError, match=r"link\.key_file: .*no authenticated mode; remove it"):
+        load_robot_config(file)
+
+
+def test_no_other_file_names_a_driver():
+    # A curve on the page is called "reference" too; no driver is meant there.
+    files = [f for top in ("disco_hw", "drivers", "sim") for f in (ROOT / top).rglob("*.py") if "viewer" not in f.parts]
+    assert len(files) > 200
+    named = {name: [str(file.relative_to(ROOT)) for file in files if is_named(name, file)] for name in motor_drivers()}
+    assert named == {name: [f"drivers/motor/{name}.py"] for name in motor_drivers()}
+
+
+def is_named(name, file):
+    return re.search(rf"""["']{name}["']""", file.read_text(encoding="utf-8")) is not None

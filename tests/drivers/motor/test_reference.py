@@ -1,0 +1,425 @@
+"""What is particular to the reference driver; the rest is in the conformance suite."""
+
+import itertools
+from collections import Counter
+from dataclasses import replace
+
+import pytest
+
+from drivers.motor.reference import ESTOP_REPEATS, ReferenceDriver
+from drivers.types import DriverState, Frame, ReceivedFrame, Request, WheelCommand
+from firmware_protocol.codec import Codec
+from firmware_protocol.faults import FAULTS
+from tests.drivers.motor.bench import MS, START_NS, Bench
+from tests.drivers.motor.reference_robot import CONFIG, ReferenceRobot
+
+CODEC = Codec()
+STILL = (DriverState.STANDBY, DriverState.READY)
+
+
+def make_driver():
+    return ReferenceDriver(CODEC, itertools.count(3).__next__)
+
+
+def make_bench(robot=None, **options):
+    return Bench(make_driver(), robot or ReferenceRobot(), **options)
+
+
+def test_says_what_it_waits_for():
+    driver = make_driver()
+    assert driver.detail == "the link is down"
+    assert driver.transmit(0, None) == ()
+    driver.link_up(0)
+    assert driver.state is DriverState.HANDSHAKE
+    assert "no answer from the robot" in driver.detail
+    driver.request(Request.ARM)
+    assert driver.detail == "no answer from the robot; is it switched on, and does it use the same bit rate?"
+    bench = make_bench()
+    bench.driver = driver
+    bench.run_until(*STILL)
+    assert "not arming: no answer from the robot" in driver.detail
+    bench.run(1.0)
+    assert not bench.robot.armed, "a request made too early is not remembered"
+
+
+def test_another_major_version_is_refused():
+    bench = make_bench(ReferenceRobot(replace(CONFIG, protocol_major=2)))
+    bench.run_until(DriverState.REFUSED)
+    assert "the robot speaks protocol 2.0, this host 1.0" in bench.driver.detail
+    bench.driver.request(Request.ARM)
+    bench.run(3.0, (1.0, 1.0))
+    assert bench.driver.state is DriverState.REFUSED
+    assert bench.largest_speed == 0.0
+
+
+def test_another_dbc_is_refused_but_telemetry_is_shown():
+    bench = make_bench(ReferenceRobot(replace(CONFIG, dbc_hash=0x0BADCAFE)))
+    bench.run_until(DriverState.REFUSED)
+    assert "0badcafe" in bench.driver.detail
+    assert f"{CODEC.dbc_hash:08x}" in bench.driver.detail
+    for request in (Request.READY, Request.ARM):
+        bench.driver.request(request)
+        bench.run(2.0, (1.0, 1.0))
+    assert bench.driver.state is DriverState.REFUSED
+    assert bench.driver.stats.sessions == 0
+    assert bench.largest_speed == 0.0
+    assert len(bench.wheels) > 100
+    assert any("handshake refused" in event for event in bench.events)
+
+
+def test_a_robot_flashed_meanwhile_is_taken():
+    bench = make_bench(ReferenceRobot(replace(CONFIG, dbc_hash=0x0BADCAFE)))
+    bench.run_until(DriverState.REFUSED)
+    bench.robot = ReferenceRobot(boot_ns=bench.now_ns)
+    bench.run_until(*STILL, timeout_s=6.0)
+
+
+@pytest.mark.parametrize("rate_hz", [20, 50, 100])
+def test_arms_at_every_control_rate(rate_hz):
+    bench = make_bench(rate_hz=rate_hz)
+    bench.arm()
+    bench.run(2.0, (3.0, 2.0))
+    assert bench.driver.state is DriverState.ARMED
+    assert bench.robot.core.rejections["STATE"] <= 2
+
+
+def test_each_arming_has_a_session_of_its_own():
+    bench = make_bench()
+    sessions = []
+    for _ in range(4):
+        bench.arm()
+        sessions.append(bench.robot.session)
+        bench.driver.request(Request.STANDBY)
+        bench.run(0.3)
+    assert 0 not in sessions
+    assert len(set(sessions)) == 4
+
+
+def test_a_robot_that_falls_silent_starts_a_new_handshake():
+    bench = make_bench()
+    bench.arm()
+    bench.run(1.0, (3.0, 3.0))
+    bench.loses = lambda _: True
+    bench.run_until(DriverState.HANDSHAKE, timeout_s=0.6)
+    assert bench.driver.capabilities is None
+    bench.loses = None
+    bench.largest_speed = 0.0
+    bench.run_until(*STILL)
+    assert bench.driver.detail == "disarmed: the robot fell silent"
+    bench.run(2.0)
+    assert bench.largest_speed == 0.0
+
+
+def test_a_lossy_link_does_not_disarm():
+    """Three frames in a row may not be lost at 50 Hz: the fourth is out of sequence and the fifth comes too late."""
+    bench = make_bench(loses=lambda generator: generator.random() < 0.03)
+    bench.arm()
+    bench.run(10.0, (3.0, 2.0))
+    assert bench.driver.state is DriverState.ARMED
+    assert bench.driver.stats.lost_frames > 30
+    assert bench.driver.stats.implausible_ticks == 0
+    assert bench.wheels[-1].left_angle_rad == pytest.approx(bench.robot.angle[0], abs=0.2)
+
+
+def test_arming_is_given_up_with_the_robots_own_reason():
+    bench = make_bench()
+    bench.run_until(*STILL)
+    bench.robot.pushed = 1.0
+    bench.driver.request(Request.ARM)
+    assert bench.driver.state is DriverState.ARMING
+    bench.run_until(*STILL, timeout_s=1.6)
+    assert "not armed within 1.5 s" in bench.driver.detail
+    assert "the wheels are turning" in bench.driver.detail
+    bench.robot.pushed = 0.0
+    bench.run(2.0)
+    assert not bench.robot.armed
+
+
+def test_a_second_host_is_pointed_out_once_a_link():
+    bench = make_bench()
+    bench.run_until(*STILL)
+    other = CODEC.encode("TIME_REQUEST", 0, sequence=1)
+    told = "another host is on the link: it sends TIME_REQUEST; disconnect it"
+    for _ in range(3):
+        bench.inject_to_host(*other)
+        bench.run(0.1)
+    assert bench.events.count(told) == 1
+    bench.host_end.plug(False)
+    bench.run(0.1)
+    bench.host_end.plug(True)
+    bench.run(0.5)
+    assert bench.events.count(told) == 1
+    bench.inject_to_host(*other)
+    bench.run(0.1)
+    assert bench.events.count(told) == 2
+
+
+def test_a_second_host_that_commands_motion_stops_the_robot_but_never_drives_it():
+    bench = make_bench()
+    bench.arm()
+    bench.run(0.5, (1.0, 1.0))
+    for counter in range(400):
+        foreign = CODEC.encode(
+            "WHEEL_COMMAND", counter, mode="SPEED", left_speed=8, right_speed=8, valid_for=0.1, session=200
+        )
+        bench.inject_to_robot(*foreign)
+        bench.inject_to_host(*foreign)
+        bench.run(0.005)
+    assert bench.largest_speed < 1.01
+    assert bench.driver.state is not DriverState.ARMED
+    assert "another host is on the link: it sends WHEEL_COMMAND; disconnect it" in bench.events
+
+
+def test_an_estop_from_outside_is_no_second_host_and_is_said_once_a_stop():
+    """As `disco-hw estop` sends it beside the daemon: three frames, which the robot and the driver both receive."""
+    bench = make_bench()
+    bench.arm()
+    told = "e-stop from outside on the link, by `disco-hw estop` or another host"
+    for stops in (1, 2):
+        for _ in range(3):
+            bench.inject_to_robot(*CODEC.encode("ESTOP", reason="UNSPECIFIED"))
+            bench.inject_to_host(*CODEC.encode("ESTOP", reason="UNSPECIFIED"))
+            bench.run(0.02)
+        bench.run(2.0)
+        assert bench.events.count(told) == stops
+    assert bench.driver.state is DriverState.ESTOP
+    assert not any("another host is on the link" in event for event in bench.events)
+    assert bench.driver.stats.unknown_id == 0
+
+
+def test_a_second_host_is_pointed_out_even_if_it_sends_an_estop_first():
+    bench = make_bench()
+    bench.run_until(*STILL)
+    bench.inject_to_host(*CODEC.encode("ESTOP", reason="UNSPECIFIED"))
+    bench.inject_to_host(*CODEC.encode("TIME_REQUEST", 0, sequence=1))
+    bench.run(0.1)
+    assert "another host is on the link: it sends TIME_REQUEST; disconnect it" in bench.events
+
+
+def test_a_new_link_voids_everything_even_if_its_loss_went_unseen():
+    bench = make_bench()
+    bench.arm()
+    bench.run(2.0, (1.0, 1.0))
+    driver = bench.driver
+    bench.host_end.receive()
+    for renew in (driver.link_up, driver.link_down):
+        renew(bench.now_ns)
+        assert driver.capabilities is None
+        assert driver.clock_offset_ns is None
+        assert not driver.synced
+    driver.link_up(bench.now_ns)
+    assert driver.state is DriverState.HANDSHAKE
+    assert set(names(driver.transmit(bench.now_ns, WheelCommand(1.0, 1.0, 0.1)))) == {
+        "HELLO_REQUEST",
+        "HOST_STATE",
+        "TIME_REQUEST",
+    }
+
+
+def answer(name, counter=0, **signals):
+    return ReceivedFrame(START_NS, Frame(*CODEC.encode(name, counter, **signals)))
+
+
+def limits(page):
+    if page == 0:
+        return answer("LIMITS", page=0, max_wheel_speed=8, max_wheel_acceleration=20, ticks_per_rev=2048)
+    return answer("LIMITS", page=1, command_timeout=0.1, drive_off_timeout=0.5, stop_deceleration=20)
+
+
+def hello():
+    return answer(
+        "HELLO",
+        protocol_major=1,
+        protocol_minor=0,
+        firmware_major=0,
+        firmware_minor=1,
+        firmware_patch=0,
+        capabilities=0,
+    )
+
+
+def test_says_which_part_of_the_handshake_is_missing():
+    driver = make_driver()
+    driver.link_up(START_NS)
+    driver.receive(START_NS, [hello(), limits(0)])
+    assert driver.detail == "waiting for the robot's BUILD, LIMITS"
+    driver.receive(START_NS, [answer("BUILD", dbc_hash=CODEC.dbc_hash, board_id=1), limits(1)])
+    assert driver.capabilities is not None
+    assert driver.detail == "waiting for the robot's SYSTEM_STATE"
+    later_ns = START_NS + 400 * MS
+    assert "HELLO_REQUEST" in names(driver.transmit(later_ns, None)), "until the robot says that it has accepted us"
+
+
+def test_a_response_to_a_request_of_the_last_link_teaches_nothing():
+    driver = make_driver()
+    driver.link_up(START_NS)
+    driver.transmit(START_NS, None)
+    driver.link_up(START_NS)
+    driver.receive(START_NS, [answer("TIME_RESPONSE", sequence=1, receive_time=5)])
+    assert driver.clock_offset_ns is None
+    driver.transmit(START_NS, None)
+    driver.receive(START_NS, [answer("TIME_RESPONSE", sequence=2, receive_time=5)])
+    assert driver.clock_offset_ns == START_NS - 5_000
+
+
+@pytest.mark.parametrize("call", ["receive", "transmit"])
+def test_silence_is_noticed_by_each_half_of_a_tick(call):
+    bench = make_bench()
+    bench.run_until(*STILL)
+    driver, later_ns = bench.driver, bench.now_ns + 501 * MS
+    if call == "receive":
+        assert "the robot fell silent: new handshake" in driver.receive(later_ns, ()).events
+    else:
+        driver.transmit(later_ns, None)
+    assert driver.state is DriverState.HANDSHAKE
+
+
+def test_nothing_is_silent_that_was_never_heard():
+    bench = make_bench()
+    bench.loses = lambda _: True
+    bench.run(4.0)
+    assert bench.events == []
+
+
+@pytest.mark.parametrize(
+    ("protocol", "silence_ms"), [({}, 500), ({"dbc_hash": 0x0BADCAFE}, 3000), ({"protocol_major": 2}, 3000)]
+)
+def test_a_silence_counts_only_beyond_its_limit_which_is_longer_for_a_robot_that_was_refused(protocol, silence_ms):
+    """One that is refused says less, and should stay refused in words until it is gone."""
+    bench = make_bench(ReferenceRobot(replace(CONFIG, **protocol)))
+    bench.run_until(DriverState.REFUSED if protocol else DriverState.STANDBY)
+    heard_ns = bench.driver._last_heard_ns
+    assert bench.driver.receive(heard_ns + silence_ms * MS, ()).events == ()
+    assert bench.driver.receive(heard_ns + silence_ms * MS + 1, ()).events == ("the robot fell silent: new handshake",)
+    assert bench.driver.state is DriverState.HANDSHAKE
+
+
+def test_a_robot_that_has_shown_only_its_state_can_fall_silent_too():
+    driver, status = make_driver(), {"state": 1, "fault": 0, "session": 0, "estop_source": 0, "last_command_counter": 0}
+    driver.link_up(START_NS)
+    for counter in range(4):
+        frame = CODEC.encode("SYSTEM_STATE", counter, **status, rejected_count=0, reject_reason=0, stop_cause=0)
+        now_ns = START_NS + counter * MS
+        driver.receive(now_ns, [ReceivedFrame(now_ns, Frame(*frame))])
+    assert driver.capabilities is None
+    assert driver.receive(START_NS + 504 * MS, ()).events == ("the robot fell silent: new handshake",)
+
+
+def test_a_robot_that_has_shown_all_but_its_state_can_fall_silent_too():
+    driver = make_driver()
+    driver.link_up(START_NS)
+    build = answer("BUILD", dbc_hash=CODEC.dbc_hash, board_id=1)
+    driver.receive(START_NS, [hello(), limits(0), limits(1), build])
+    assert driver.capabilities is not None
+    assert "the robot fell silent: new handshake" in driver.receive(START_NS + 501 * MS, ()).events
+
+
+def test_a_robot_that_turns_out_to_be_another_is_commanded_no_more():
+    bench = make_bench()
+    bench.arm()
+    bench.run(0.5, (1.0, 1.0))
+    bench.inject_to_host(*CODEC.encode("BUILD", 0, dbc_hash=0x0BADCAFE, board_id=1))
+    bench.run_until(DriverState.REFUSED)
+    assert "WHEEL_COMMAND" not in names(bench.driver.transmit(bench.now_ns, WheelCommand(1.0, 1.0, 0.1)))
+    bench.run(1.0)
+    assert bench.robot.speed_rad_s == 0.0
+
+
+def test_an_emergency_stop_of_ours_ends_the_wish_to_be_armed():
+    bench = make_bench()
+    bench.arm()
+    bench.driver.estop(bench.now_ns)
+    assert bench.driver.state is DriverState.STOPPING
+    assert "no longer wanted" in bench.driver.detail
+    bench.run(1.0, (1.0, 1.0))
+    assert not bench.robot.armed, "even if the frames themselves are lost"
+
+
+def test_faults_and_emergency_stops_are_told_in_words():
+    bench = make_bench()
+    bench.arm()
+    bench.robot.press_estop(True)
+    bench.run_until(DriverState.ESTOP)
+    assert bench.driver.detail == "emergency stop button pressed; release it, then reset"
+    bench = make_bench()
+    bench.run_until(*STILL)
+    bench.robot.break_down(True)
+    bench.run_until(DriverState.FAULT)
+    assert bench.driver.detail == f"the robot reports OVER_CURRENT_LEFT: {FAULTS['OVER_CURRENT_LEFT'].advice}"
+    assert any(event == f"robot STANDBY -> FAULT, fault {bench.driver.detail[18:]}" for event in bench.events)
+
+
+def test_each_event_is_told_once():
+    bench = make_bench()
+    bench.arm()
+    bench.run(2.0)
+    told = [event for event in bench.events if not event.startswith("handshake complete: firmware 0.1.0, board 1")]
+    assert told == ["robot unknown -> STANDBY", "robot STANDBY -> READY", "robot READY -> ARMED"]
+    assert len(bench.events) == 4
+
+
+def test_slow_telemetry_is_handed_on():
+    bench = make_bench()
+    bench.run(6.0)
+    kinds = {
+        kind for readings in bench.readings for kind in ("motors", "power", "link_health") if getattr(readings, kind)
+    }
+    assert kinds == {"motors", "power", "link_health"}
+    *_, status = (status for readings in bench.readings for status in readings.status)
+    assert (status.state, status.fault, status.fault_code) == ("STANDBY", "NONE", 0)
+
+
+def test_commands_are_counted():
+    bench = make_bench()
+    bench.arm()
+    before = bench.driver.stats.commands_sent
+    bench.run(1.0, (1.0, 1.0))
+    assert bench.driver.stats.commands_sent - before == 50
+
+
+def names(frames):
+    return [CODEC.decode(outgoing.frame.can_id, outgoing.frame.data).name for outgoing in frames]
+
+
+def test_house_keeping_is_sent_as_often_as_it_should():
+    driver, robot = make_driver(), ReferenceRobot()
+    counts = []
+    bench = Bench(driver, robot)
+    transmit = driver.transmit
+    sent = []
+    bench.driver = type("Spy", (), {"__getattr__": lambda _, name: getattr(driver, name)})()
+    bench.driver.transmit = lambda now_ns, command: sent.extend(frames := transmit(now_ns, command)) or frames
+    for _ in range(4):
+        sent.clear()
+        bench.run(1.0)
+        counts.append(Counter(names(sent)))
+    assert counts[0]["TIME_REQUEST"] == 5
+    assert counts[3]["TIME_REQUEST"] == 1
+    assert counts[0]["HELLO_REQUEST"] in (1, 2)
+    assert counts[3]["HELLO_REQUEST"] == 0
+    assert all(10 <= count["HOST_STATE"] <= 13 for count in counts)
+    assert all(count["WHEEL_COMMAND"] == 0 for count in counts)
+
+
+def test_emergency_stop_frames():
+    driver = make_driver()
+    frames = driver.estop(1_000)
+    assert len(frames) == ESTOP_REPEATS == 3
+    assert {outgoing.frame.can_id for outgoing in frames} == {0x080}
+    assert all(outgoing.deadline_ns > 1_000 + 100 * MS for outgoing in frames)
+
+
+def test_a_command_leaves_in_time_or_not_at_all():
+    bench = make_bench()
+    bench.arm()
+    (command,) = (
+        outgoing
+        for outgoing in bench.driver.transmit(bench.now_ns, WheelCommand(1.0, 1.0, 0.1))
+        if outgoing.frame.can_id == CODEC.can_id("WHEEL_COMMAND")
+    )
+    assert command.deadline_ns == bench.now_ns + 50 * MS
+    values = CODEC.decode(command.frame.can_id, command.frame.data).values
+    assert values["valid_for"] == pytest.approx(0.1)
+    assert values["session"] == bench.robot.session
+    with pytest.raises(ValueError, match="left_speed"):
+        bench.driver.transmit(bench.now_ns, WheelCommand(70.0, 0.0, 0.1))

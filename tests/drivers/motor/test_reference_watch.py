@@ -1,0 +1,152 @@
+"""An armed robot whose commands come late, or whose state is not heard, is disarmed."""
+
+import itertools
+
+import pytest
+
+from drivers.motor.reference import ReferenceDriver
+from drivers.motor.reference_watch import LATE_NS, STATE_TIMEOUT_NS, ArmedWatch, CommandEcho
+from drivers.types import DriverState
+from firmware_protocol.codec import Codec
+from tests.drivers.motor.bench import MS, Bench
+from tests.drivers.motor.reference_robot import ReferenceRobot
+
+CODEC = Codec()
+
+
+def make_bench(**options):
+    return Bench(ReferenceDriver(CODEC, itertools.count(3).__next__), ReferenceRobot(), **options)
+
+
+def test_it_objects_to_late_commands_and_to_silence_and_forgets_at_rest():
+    watch = ArmedWatch()
+    assert watch.objection(10**12) is None
+    watch.sent(0, 0)
+    watch.reported(15, LATE_NS)
+    assert watch.objection(LATE_NS) is None
+    watch.reported(15, LATE_NS + 1)
+    assert "0.15 s late" in watch.objection(LATE_NS + 1)
+    watch.reported(0, LATE_NS + 1)
+    assert watch.objection(LATE_NS + 1 + STATE_TIMEOUT_NS) is None
+    assert "not sent its state for 0.5 s" in watch.objection(LATE_NS + 2 + STATE_TIMEOUT_NS)
+    assert (watch.late, watch.silent) == (1, 1)
+    watch.rest()
+    assert watch.objection(10**12) is None
+
+
+@pytest.mark.parametrize("rate_hz", [20, 50, 100])
+@pytest.mark.parametrize("growth", [0.05, 0.2, 1.0, 3.0])
+def test_commands_that_come_later_and_later_disarm(growth, rate_hz):
+    bench = make_bench(rate_hz=rate_hz)
+    bench.arm()
+    bench.run(1.0, (3.0, 3.0))
+    begin_ns = bench.now_ns
+    bench.lag_ns = lambda now_ns: growth * (now_ns - begin_ns)
+    # What arrives a time E after the beginning was sent growth / (1 + growth) * E ago; telemetry tells of it at 10 Hz.
+    told_ns = (150 * MS + bench.period_ns) * (1 + growth) / growth + 100 * MS + 2 * bench.period_ns
+    while bench.driver.state is DriverState.ARMED:
+        bench.step()
+        assert bench.now_ns - begin_ns < told_ns
+    under_way_ns = bench.lag_ns(bench.now_ns)
+    gave_up_ns = bench.now_ns
+    while bench.robot.armed:
+        bench.step()
+        assert bench.now_ns - gave_up_ns < under_way_ns + 110 * MS
+    bench.run(5.0)
+    assert not bench.robot.armed
+    assert bench.robot.speed_rad_s == 0.0
+
+
+def test_it_says_so_and_counts():
+    bench = make_bench()
+    bench.arm()
+    bench.run(1.0, (3.0, 3.0))
+    begin_ns = bench.now_ns
+    bench.lag_ns = lambda now_ns: 0.2 * (now_ns - begin_ns)
+    bench.run(3.0)
+    assert bench.driver.stats.late_commands == 1
+    assert "late" in bench.driver.detail
+    assert any("late" in event for event in bench.events)
+
+
+def test_a_link_that_is_slow_but_not_slower_and_slower_does_not_disarm():
+    bench = make_bench(lag_ns=lambda now_ns: 60 * MS, delay_ns=lambda generator: generator.uniform(2, 25) * MS)
+    bench.arm()
+    bench.run(20.0, (3.0, 3.0))
+    assert bench.driver.state is DriverState.ARMED
+    assert bench.driver.stats.late_commands == 0
+
+
+@pytest.mark.parametrize("rate_hz", [20, 50, 100])
+def test_lost_frames_are_no_lateness(rate_hz):
+    bench = make_bench(rate_hz=rate_hz, loses=lambda generator: generator.random() < (0.02 if rate_hz == 20 else 0.2))
+    bench.arm()
+    bench.run(20.0, (3.0, 3.0))
+    assert bench.driver.stats.late_commands == 0
+
+
+@pytest.mark.parametrize("lost", [("SYSTEM_STATE",), ("SYSTEM_STATE", "SESSION_STATE")])
+def test_armed_it_goes_on_hearing_the_robots_state_or_stops(lost):
+    """Armed is what the robot says it is: without its word for half a second nobody knows."""
+    bench = make_bench()
+    ids = [CODEC.can_id(name) for name in lost]
+    bench.arm()
+    bench.run(1.0, (3.0, 3.0))
+    drain = bench.robot.drain
+    bench.robot.drain = lambda: [frame for frame in drain() if frame.can_id not in ids]
+    bench.run(0.35)
+    assert bench.driver.state is DriverState.ARMED
+    bench.run(0.55)
+    assert not bench.robot.armed
+    assert bench.robot.speed_rad_s == 0.0
+    assert bench.driver.detail == "disarmed: the robot has not sent its state for 0.5 s"
+    assert sum("has not sent its state" in event for event in bench.events) == 1
+    lost_before = bench.driver.stats.lost_frames
+    bench.robot.drain = drain
+    bench.run(2.0)
+    assert bench.driver.stats.lost_frames > lost_before
+    assert not bench.robot.armed
+
+
+PERIOD_NS = 20_000_000
+
+
+def echo_of(count, first=0):
+    echo = CommandEcho()
+    for number in range(first, first + count):
+        echo.sent(number, number * PERIOD_NS)
+    return echo
+
+
+def test_the_oldest_command_not_taken_says_how_late_the_robot_is():
+    assert echo_of(10).late_ns(9, 10 * PERIOD_NS) == 0
+    assert echo_of(10).late_ns(7, 10 * PERIOD_NS) == 2 * PERIOD_NS
+    assert CommandEcho().late_ns(5, 10 * PERIOD_NS) == 0
+
+
+def test_none_taken_since_the_beginning():
+    assert echo_of(5, first=100).late_ns(99 % 16, 105 * PERIOD_NS) == 5 * PERIOD_NS
+
+
+def test_the_counter_is_followed_past_its_wrap():
+    echo = CommandEcho()
+    for number in range(200):
+        echo.sent(number, number * PERIOD_NS)
+        behind = number // 5
+        if number % 5 == 4:
+            assert echo.late_ns((number - behind) % 16, (number + 1) * PERIOD_NS) == behind * PERIOD_NS
+
+
+def test_a_gap_in_what_the_robot_tells_is_no_lateness():
+    echo = echo_of(1)
+    assert echo.late_ns(0, PERIOD_NS) == 0
+    for number in range(1, 40):
+        echo.sent(number, number * PERIOD_NS)
+    assert echo.late_ns(38 % 16, 40 * PERIOD_NS) == PERIOD_NS
+
+
+def test_what_was_sent_before_does_not_count_after_forgetting():
+    echo = echo_of(10)
+    echo.forget()
+    echo.sent(10, 500 * PERIOD_NS)
+    assert echo.late_ns(5, 501 * PERIOD_NS) == PERIOD_NS

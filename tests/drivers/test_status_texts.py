@@ -1,0 +1,36 @@
+import pytest
+
+from drivers import status_texts
+from firmware_protocol.codec import PROTOCOL
+
+
+def table(message, signal):
+    (layout,) = [layout for layout in PROTOCOL.messages if layout.name == message]
+    (found,) = [found for found in layout.signals if found.name == signal]
+    return [name for name in found.choices.values() if name != "NONE"]
+
+
+@pytest.mark.parametrize(
+    ("message", "signal", "say"),
+    [
+        ("SYSTEM_STATE", "fault", status_texts.fault),
+        ("SYSTEM_STATE", "stop_cause", status_texts.stop_cause),
+        ("SYSTEM_STATE", "reject_reason", status_texts.reject_reason),
+        ("SYSTEM_STATE", "estop_source", status_texts.estop),
+        ("SESSION_STATE", "blockers", status_texts.blocker),
+    ],
+)
+def test_every_code_of_the_dbc_has_a_sentence(message, signal, say):
+    names = table(message, signal)
+    assert names
+    sentences = {say(name) for name in names}
+    assert len(sentences) >= len(names) - 2
+    for name in names:
+        assert say(name) not in (name, say("NO_SUCH_CODE")), name
+
+
+def test_a_code_of_a_newer_firmware_is_shown_as_it_is():
+    assert status_texts.fault("UNKNOWN(12345)") == "UNKNOWN(12345)"
+    assert status_texts.stop_cause("UNKNOWN(15)") == "UNKNOWN(15)"
+    assert status_texts.reject_reason("NONE") is None
+    assert "reset" in status_texts.estop("UNKNOWN(9)")
