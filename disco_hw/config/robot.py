@@ -148,6 +148,9 @@ def load_robot_config(path: Path) -> RobotConfig:
     """
     raw = read_toml(path, ROBOT_TOML)
     section = raw.pop("task", {})
+    link = raw.get("link")
+    if isinstance(link, dict) and "driver" in link:
+        _check_driver(path, link["driver"])
     try:
         config = msgspec.convert(raw, RobotConfig)
     except msgspec.ValidationError as error:
@@ -188,6 +191,14 @@ def _task_of(path: Path, section: object) -> RobotTask:
         raise InputError(f"{path}: {words}") from None
 
 
+def _check_driver(path: Path, name: object) -> None:
+    """Refuse what is no name of a driver; the registry knows the names, the type of the field does not."""
+    try:
+        find_driver(str(name))
+    except UnknownDriverError as error:
+        raise InputError(f"{path}: link.driver: {error}") from None
+
+
 def _check(path: Path, config: RobotConfig) -> None:
     """Refuse what no single field shows."""
 
@@ -215,10 +226,7 @@ def _check(path: Path, config: RobotConfig) -> None:
         )
     if control.telemetry_disarm_s <= control.telemetry_zero_s:
         refuse("control.telemetry_disarm_s", "not above telemetry_zero_s", "write a larger value")
-    try:
-        driver = find_driver(config.link.driver)
-    except UnknownDriverError as error:
-        raise InputError(f"{path}: link.driver: {error}") from None
+    driver = find_driver(config.link.driver)
     if config.link.key_file is not None and not driver.authenticates:
         refuse("link.key_file", f"the driver {driver.name} has no authenticated mode", "remove it")
     fault = config.task.fault()

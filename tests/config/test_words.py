@@ -9,9 +9,13 @@ from disco_hw.config import RobotConfig, load_robot_config
 from disco_hw.config.words import nearest
 from disco_hw.errors import InputError
 from disco_hw.model.file import load_model
+from drivers.motor import motor_drivers
 from tests.config.test_robot import GOOD
 
 MODEL = "format = 1\n[base]\nwheel_radius_m = 0.06\naxial_distance_m = 0.4\n"
+
+
+DRIVERS = ("link", "driver", tuple(motor_drivers()))
 
 
 def fields_with_choices(kind):
@@ -36,11 +40,11 @@ def refusal(load, path, text):
 
 def test_there_are_such_fields():
     found = {(section, field) for section, field, _ in fields_with_choices(RobotConfig)}
-    assert found >= {("link", "kind"), ("link", "driver"), ("control", "mode"), ("control", "uncertainty")}
+    assert found >= {("link", "kind"), ("control", "mode"), ("control", "uncertainty")}
 
 
 @pytest.mark.parametrize("wrong", ['"usb"', "7", "[]"])
-@pytest.mark.parametrize(("section", "field", "values"), fields_with_choices(RobotConfig))
+@pytest.mark.parametrize(("section", "field", "values"), [*fields_with_choices(RobotConfig), DRIVERS])
 def test_every_choice_of_robot_toml_is_listed(tmp_path, section, field, values, wrong):
     said = refusal(load_robot_config, tmp_path / "robot.toml", GOOD + f"[{section}]\n{field} = {wrong}\n")
     assert f"{section}.{field}: " in said
