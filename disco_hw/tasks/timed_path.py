@@ -115,7 +115,7 @@ class TimedPathTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
 
     def course(self) -> LineCourse:
         """The line through the way-points."""
-        return line_course(self.points, "path")
+        return line_course(self.points, "timed path")
 
     def progress(self) -> TimedProgress:
         """The part of the way that is due."""

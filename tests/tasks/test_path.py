@@ -147,7 +147,7 @@ def test_a_piece_of_a_closed_path_goes_on_past_the_first_way_point():
     np.testing.assert_allclose(drop.table[point, :2], [1.5, 0.0], atol=0.02)
     assert drop.piece(0.0) == (count, point, point + count)
     assert drop.piece(point + 1.0) == (point + 1.0, point, point + count)
-    assert drop.place(0.02, 0.02, count - 1.0) == 1.0
+    assert drop.place(0.02, 0.02, 0.0, count - 1.0) == 1.0
 
 
 def test_a_turn_is_sharp_by_its_angle_over_a_length():

@@ -162,10 +162,10 @@ def test_a_task_on_the_feed_is_newer_than_a_status_from_before_it(page):
         ]
     )
     live._learn_task(status_with(radius_m=0.75))
-    assert live._snapshot().task.radius_m == 0.5
+    assert live._snapshot().task.settings["radius_m"] == 0.5
     live.take(ticks(51, 200))
     live._learn_task(status_with(radius_m=0.75))
-    assert live._snapshot().task.radius_m == 0.75
+    assert live._snapshot().task.settings["radius_m"] == 0.75
 
 
 def test_what_is_due_is_due_once_a_period():

@@ -1,0 +1,75 @@
+"""The lemniscate from robot.toml on: planned, driven, shown, changed, recorded and replayed, in simulated time."""
+
+from __future__ import annotations
+
+import shutil
+
+import numpy as np
+import pytest
+
+from disco_hw.daemon.loop import LoopStats
+from disco_hw.daemon.status import loop_figures, status
+from disco_hw.log import records
+from disco_hw.log.recorder import RecorderStats
+from disco_hw.runtime.replay import replay
+from disco_hw.runtime.robot_setup import load_setup
+from disco_hw.runtime.states import State
+from disco_hw.runtime.supervisor import UserRequest
+from disco_hw.runtime.task_change import TaskRefused, changed_task
+from disco_hw.viewer import curves
+from disco_hw.viewer.recording import Recording
+from sim.body_dynamics import Pose
+from tests.runtime.path_robot import ROBOTS
+from tests.runtime.simulated import simulated_stack
+from tests.runtime.test_replay import write_log
+
+FIGURE = 'kind = "lemniscate"\nsize_m = 0.9\nspeed_m_s = 0.25\n'
+
+
+def lemniscate_robot(directory):
+    circle = 'kind = "circle"\nradius_m = 0.75\nspeed_m_s = 0.2\n'
+    text = (ROBOTS / "wombot.toml").read_text()
+    assert circle in text
+    robot = directory / "robot.toml"
+    robot.write_text(text.replace(circle, FIGURE))
+    shutil.copy(ROBOTS / "wombot_model.toml", directory)
+    return robot
+
+
+def test_a_lemniscate_is_driven_changed_recorded_and_replayed_bit_for_bit(tmp_path):
+    robot_file = lemniscate_robot(tmp_path)
+    setup = load_setup(robot_file)
+    stack = simulated_stack(robot_file=robot_file, start=Pose(*setup.config.task.course().start))
+    stack.run(1.5)
+    with pytest.raises(TaskRefused, match="at most .* m/s, or widen it"):
+        changed_task(stack.core.task, {"speed_m_s": 3.0}, setup.config.robot, State.READY)
+    changed = changed_task(stack.core.task, {"size_m": 1.0, "speed_m_s": 0.3}, setup.config.robot, State.READY)
+    stack.core.set_task(changed)
+    stack.run(0.5, UserRequest.ARM)
+    stack.run(0.02, UserRequest.START)
+    places = []
+    for _ in range(1250):
+        stack.run(0.02)
+        places.append((stack.robot.truth.x_m, stack.robot.truth.y_m))
+    # 25 s at 0.3 m/s, of 5.24 m: both lobes, and the crossing twice.
+    assert stack.core.progress.laps > 1.05
+    off_m = changed.course().off_m(np.array(places))
+    assert np.sqrt(np.mean(off_m[100:] ** 2)) < 0.06
+    assert np.array(places)[:, 0].min() < -0.9
+    shown = status(stack.core, loop_figures(LoopStats()), RecorderStats())["task"]
+    assert shown["asked"]["kind"] == "lemniscate"
+    assert shown["labels"]["size_m"] == "Size (m)"
+    assert set(shown["limits"]) == {"size_m", "speed_m_s", "center_x_m", "center_y_m"}
+    told = [record for _, tick in stack.recorder.ticks for record in tick if isinstance(record, records.Task)]
+    assert [(record.kind, record.settings["size_m"]) for record in told] == [("lemniscate", 1.0)]
+    log = write_log(tmp_path / "run.mcap", stack.recorder.ticks, robot_file.read_text())
+    report = replay(log)
+    assert report.ok, report.as_text()
+    with Recording(log) as recording:
+        timeline, stage = recording.timeline, recording.stage
+        task = stage.task_at(timeline.tasks.last(timeline.last_ns))
+        assert task == changed
+        away = curves.distance(task, timeline, timeline.first_ns, timeline.last_ns)
+        asked = curves.speed(task, timeline, timeline.first_ns, timeline.last_ns)
+    assert np.nanmax(np.abs(away.values["distance (m)"])) < 0.2
+    assert set(asked.values["reference"]) == {0.3}
