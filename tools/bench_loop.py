@@ -9,8 +9,7 @@ import threading
 import time
 
 from disco_hw.daemon import realtime
-from disco_hw.daemon.clock import MonotonicClock
-from disco_hw.daemon.loop import Loop
+from disco_hw.daemon.loop import Loop, MonotonicClock
 from disco_hw.runtime.governor import Governor, WheelLimits
 from disco_hw.runtime.supervisor import Inputs, Supervisor, SupervisorSettings
 from drivers.types import DriverState, LinkState

@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from disco_hw.config import RobotConfig
-from disco_hw.daemon.client import socket_path
-from disco_hw.daemon.control_client import send_request
+from disco_hw.daemon.client import send_request, socket_path
 from disco_hw.daemon.link import make_link
 from disco_hw.daemon.realtime import can_lock_memory, can_use_fifo
 from disco_hw.errors import InputError, WorkError

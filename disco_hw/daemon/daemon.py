@@ -17,6 +17,7 @@ from disco_hw.adaptation.guard import check_adaptable
 from disco_hw.adaptation.link import ProcessLink
 from disco_hw.config import RobotConfig
 from disco_hw.daemon import realtime
+from disco_hw.daemon.async_printer import STANDARD_OUTPUT, AsyncPrinter
 from disco_hw.daemon.client import (
     ADAPT_ACTIONS,
     PAGE_ACTIONS,
@@ -25,20 +26,16 @@ from disco_hw.daemon.client import (
     recording_in_words,
     socket_path,
 )
-from disco_hw.daemon.clock import Clock, MonotonicClock
-from disco_hw.daemon.compile_progress import compile_progress
 from disco_hw.daemon.control_socket import ControlMessage, ControlServer
 from disco_hw.daemon.link import make_link
-from disco_hw.daemon.loop import Loop
+from disco_hw.daemon.loop import Clock, Loop, MonotonicClock
 from disco_hw.daemon.page_feed import ViewerFeed, WatchedRecorder, feed_path
-from disco_hw.daemon.signals import StopSignals
+from disco_hw.daemon.signals import StopPath, StopSignals
 from disco_hw.daemon.socket_place import passed_over
 from disco_hw.daemon.status import counters, loop_figures, status
-from disco_hw.daemon.stop_path import StopPath
 from disco_hw.daemon.systemd import Notifier
-from disco_hw.daemon.teller import STANDARD_OUTPUT, Teller
 from disco_hw.daemon.waiting import Waiting
-from disco_hw.daemon.warm_up import warm_up
+from disco_hw.daemon.warm_up import compile_progress, warm_up
 from disco_hw.log import records
 from disco_hw.log.link import Attachment
 from disco_hw.log.provenance import DBC, version
@@ -93,7 +90,7 @@ def run_daemon(options: DaemonOptions) -> int:
         refuse_missing_effects(setup)
     if options.adapt:
         check_adaptable(setup.model, setup.config.control.uncertainty)
-    with closing(Teller(STANDARD_OUTPUT, in_json if options.as_json else in_text)) as say:
+    with closing(AsyncPrinter(STANDARD_OUTPUT, in_json if options.as_json else in_text)) as say:
         return serve(
             setup,
             options.log_file,

@@ -20,7 +20,7 @@ import serial
 from disco_hw.config import Link
 from disco_hw.config.input_file import ROBOT_TOML, read_toml
 from disco_hw.config.link_option import link_fields, names_address
-from disco_hw.daemon.control_client import send_request
+from disco_hw.daemon.client import send_request
 from disco_hw.daemon.socket_place import believed_users, default_socket_path, passed_over
 from disco_hw.errors import InputError
 from drivers.transport import SerialMedium, open_transport

@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import Any
 
 from disco_hw.config import Link, RobotConfig
+from disco_hw.daemon.async_printer import STANDARD_ERROR, STANDARD_OUTPUT, AsyncPrinter
 from disco_hw.daemon.client import socket_path
-from disco_hw.daemon.clock import MonotonicClock
 from disco_hw.daemon.daemon import in_text, serve
-from disco_hw.daemon.teller import STANDARD_ERROR, STANDARD_OUTPUT, Teller
+from disco_hw.daemon.loop import MonotonicClock
 from disco_hw.drive.coverage import Coverage
 from disco_hw.drive.gamepad_source import GamepadSource
 from disco_hw.drive.hand_pilot import HandPilot
@@ -205,8 +205,8 @@ def _display(socket: Path, shown: bool) -> Iterator[Any]:
     In a terminal the table has the newest of them, so they are printed once it is gone.
     """
     if not shown:
-        with closing(Teller(STANDARD_ERROR, in_text)) as told:
-            yield told
+        with closing(AsyncPrinter(STANDARD_ERROR, in_text)) as printer:
+            yield printer
         return
     later: deque[str] = deque(maxlen=20)
 
@@ -221,8 +221,8 @@ def _display(socket: Path, shown: bool) -> Iterator[Any]:
         if sys.stdout.isatty():
             yield keep
         else:
-            with closing(Teller(STANDARD_OUTPUT, in_text)) as told:
-                yield told
+            with closing(AsyncPrinter(STANDARD_OUTPUT, in_text)) as printer:
+                yield printer
     finally:
         try:
             process.wait(_DISPLAY_TIMEOUT_S)

@@ -19,7 +19,7 @@ from collections import deque
 from dataclasses import dataclass
 from typing import Any
 
-from disco_hw.daemon.clock import Clock
+from disco_hw.daemon.loop import Clock
 from disco_hw.drive.source import INPUT_LIMIT_NS, ManualInput, RobotView
 from disco_hw.errors import InputError
 

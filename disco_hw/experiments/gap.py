@@ -30,7 +30,7 @@ from disco_hw.gap.report.wording import answer
 from disco_hw.gap.write_report import WRITTEN, gap
 from disco_hw.model import EffectSetting, Gaussian, Model
 from disco_hw.model.parameter import BASE_PARAMETERS
-from disco_hw.outputs import as_json, refuse_directory
+from disco_hw.reports.outputs import as_json, refuse_directory
 from disco_hw.runtime.assembly import make_planner
 from disco_hw.runtime.pipeline import NoPlanner
 from disco_hw.runtime.robot_setup import Setup, load_setup

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import disco_hw
-from disco_hw.daemon.control_client import send_request
+from disco_hw.daemon.client import send_request
 from disco_hw.errors import WorkError
 
 _POLL_S = 0.05

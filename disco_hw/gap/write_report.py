@@ -15,7 +15,7 @@ from disco_hw.gap.report.page import page
 from disco_hw.gap.report.wording import as_text
 from disco_hw.log.load import load_drive
 from disco_hw.model import Model, load_model, save_model
-from disco_hw.outputs import as_json, refuse_directory
+from disco_hw.reports.outputs import as_json, refuse_directory
 
 WRITTEN = ("report.json", "report.html", "model.toml")
 

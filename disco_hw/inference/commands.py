@@ -25,7 +25,7 @@ from disco_hw.inference.workers import LocalWorkers, Workers
 from disco_hw.log.drive import DriveLog
 from disco_hw.log.load import load_drive
 from disco_hw.model import Model, save_model
-from disco_hw.outputs import refuse_file
+from disco_hw.reports.outputs import refuse_file
 
 Search = Callable[[DriveLog, Model], AbstractContextManager[Callable[[], GapCheck]]]
 

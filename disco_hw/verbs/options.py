@@ -12,8 +12,8 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
-from disco_hw import outputs
 from disco_hw.config.link_option import FORMS
+from disco_hw.reports import outputs
 
 RobotFile = Annotated[Path, typer.Argument(metavar="ROBOT.toml", help="The robot's configuration (docs/robot.md).")]
 RobotOption = Annotated[Path, typer.Option("--robot", help="The robot's configuration (docs/robot.md).")]

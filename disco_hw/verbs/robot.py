@@ -24,7 +24,7 @@ PagePort = Annotated[int, typer.Option("--port", min=1, max=65535, help="Port of
 
 
 def _page(view: bool, robot: Path, model: Path | None, port: int, link: str | None) -> AbstractContextManager[object]:
-    from disco_hw.viewer.beside import page_beside
+    from disco_hw.viewer.page_process import page_beside
 
     return page_beside(robot, model, LOOPBACK, port, link) if view else nullcontext()
 

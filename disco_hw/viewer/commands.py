@@ -20,13 +20,13 @@ from disco_hw.daemon.client import socket_path
 from disco_hw.daemon.signals import StopSignals
 from disco_hw.errors import InputError
 from disco_hw.viewer.address import DEFAULT_PORT, LOOPBACK
-from disco_hw.viewer.desk import Desk
 from disco_hw.viewer.live import LivePage, run_live
-from disco_hw.viewer.marks import marks_of
+from disco_hw.viewer.operator_controls import Desk
 from disco_hw.viewer.recording import Recording
 from disco_hw.viewer.replay import ReplayPage, run_replay
 from disco_hw.viewer.server import serving
 from disco_hw.viewer.stage import stage_of_robot
+from disco_hw.viewer.timeline import marks_of
 
 
 def view_live(
@@ -111,7 +111,7 @@ def video_log(log: Path, out: Path, speed: float = 1.0, robot: Path | None = Non
 
 def export_log(log: Path, out: Path, robot: Path | None = None) -> None:
     """Write the log as one HTML file that plays without Python. Raises InputError for a bad file."""
-    from disco_hw.viewer.export import export_html  # noqa: PLC0415
+    from disco_hw.viewer.picture import export_html  # noqa: PLC0415
 
     with Recording(log, robot) as recording, _progress(f"writing {out.name}") as progress:
         _check_folder(out)

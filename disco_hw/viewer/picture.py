@@ -16,14 +16,15 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from disco_hw.errors import InputError
-from disco_hw.viewer import curves, scene, shapes
+from disco_hw.viewer import curves, scene
 from disco_hw.viewer.curves import Curves
 from disco_hw.viewer.plots import WINDOW_NS
 from disco_hw.viewer.recording import Recording
-from disco_hw.viewer.snapshot import Snapshot
+from disco_hw.viewer.scene import Scene
+from disco_hw.viewer.server import serving
+from disco_hw.viewer.snapshot import ParameterPoints, Snapshot
 from disco_hw.viewer.stage import Stage, model_in_force
 from disco_hw.viewer.timeline import Timeline
-from disco_hw.viewer.uncertainty import ParameterPoints
 
 Array = NDArray[np.float64]
 FRAMES_PER_S = 10
@@ -135,13 +136,13 @@ def _draw_scene(axes: Axes, snapshot: Snapshot, stage: Stage) -> None:
     axes.plot(*course.outline_m().T, color=_web(scene.TASK_COLOUR), linewidth=2.5)
     trail = snapshot.trail
     if len(trail) >= 2:
-        colours = shapes.distance_colours(course.off_m(trail), scene.TRAIL_FULL_M) / 255.0
+        colours = scene.distance_colours(course.off_m(trail), scene.TRAIL_FULL_M) / 255.0
         axes.add_collection(LineCollection(list(np.stack((trail[:-1], trail[1:]), axis=1)), colors=colours[1:], lw=1.5))
     if len(snapshot.poses):
         axes.plot(*snapshot.poses[:, :2].T, ".", color=_web(scene.POSES_COLOUR), markersize=3)
     if snapshot.fan is not None:
-        paths = shapes.fan_paths(snapshot.fan.weights, snapshot.fan.x_m, snapshot.fan.y_m)
-        shades = shapes.weight_colours(snapshot.fan.weights, scene.FAN_COLOUR, scene.FAN_PALEST) / 255.0
+        paths = scene.fan_paths(snapshot.fan.weights, snapshot.fan.x_m, snapshot.fan.y_m)
+        shades = scene.weight_colours(snapshot.fan.weights, scene.FAN_COLOUR, scene.FAN_PALEST) / 255.0
         for path, shade in zip(paths[::-1], shades[::-1], strict=True):
             axes.plot(*path.T, color=tuple(shade), linewidth=1.2)
     if snapshot.plan is not None:
@@ -153,7 +154,7 @@ def _draw_scene(axes: Axes, snapshot: Snapshot, stage: Stage) -> None:
         body, nose = _outline(snapshot.pose, stage.axial_distance_m)
         axes.fill(*body.T, color=_web(scene.BODY_COLOUR), alpha=0.8)
         axes.fill(*nose.T, color="gold")
-        ellipse = shapes.ellipse_points(*snapshot.pose[:2], snapshot.covariance[:2, :2])
+        ellipse = scene.ellipse_points(*snapshot.pose[:2], snapshot.covariance[:2, :2])
         axes.plot(*ellipse.T, color=_web(scene.ELLIPSE_COLOUR), linewidth=1.2)
     (x_m, y_m), reach = course.middle_m, 1.5 * course.reach_m + 0.3
     axes.set(
@@ -175,3 +176,39 @@ def _outline(pose: tuple[float, float, float], size_m: float) -> tuple[Array, Ar
 
 def _web(colour: tuple[int, int, int]) -> str:
     return "#{:02x}{:02x}{:02x}".format(*colour)
+
+
+PICTURES_PER_S = 10
+_REDRAW_PICTURES = 5
+_MOST_PICTURES = 6000
+
+
+def export_html(recording: Recording, path: Path, progress: Progress) -> None:
+    """Write the scene of the whole log, 10 pictures a second and at most 6000 of them, with a clock; no plots.
+
+    `progress` gets the part done. Raises InputError if the file cannot be written.
+    """
+    count = min(max(1, math.ceil(recording.duration_s * PICTURES_PER_S)), _MOST_PICTURES)
+    period_s = recording.duration_s / count
+    # Serialising needs a server; nobody can reach this one but from this machine, and it is gone at the end.
+    with serving(path.name, port=0) as page:
+        drawn = Scene(page.server, recording.stage)
+        clock = page.server.scene.add_label("/clock", "0.0 s", position=_clock_place(recording))
+        serializer = page.server.get_scene_serializer()
+        for number in range(count + 1):
+            t_s = number * period_s
+            drawn.show(recording.at(t_s), everything=number % _REDRAW_PICTURES == 0)
+            clock.text = f"{t_s:.1f} s"
+            serializer.insert_sleep(period_s)
+            progress(number / count)
+        text = serializer.as_html()
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror}); give another name") from None
+
+
+def _clock_place(recording: Recording) -> tuple[float, float, float]:
+    course = recording.stage.task.course()
+    x_m, y_m = course.middle_m
+    return (x_m, y_m + 1.2 * course.reach_m, 0.2)

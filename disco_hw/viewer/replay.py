@@ -10,13 +10,11 @@ from typing import Any
 import numpy as np
 import viser
 
-from disco_hw.viewer.excited import Excited
-from disco_hw.viewer.layers import add_layers
-from disco_hw.viewer.marks import KINDS, Mark, marks_of
 from disco_hw.viewer.panel import coverage_text, events_text, replay_text
 from disco_hw.viewer.plots import Plots
 from disco_hw.viewer.recording import Recording
-from disco_hw.viewer.scene import Scene
+from disco_hw.viewer.scene import Scene, add_layers
+from disco_hw.viewer.timeline import KINDS, Excited, Mark, marks_of
 
 SPEEDS = {"1/4": 0.25, "1/2": 0.5, "1": 1.0, "2": 2.0, "4": 4.0, "8": 8.0}
 STEP_S = 0.05

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import viser
@@ -10,10 +12,8 @@ from numpy.typing import NDArray
 
 from disco_hw.log import records
 from disco_hw.tasks import RobotTask
-from disco_hw.viewer import shapes
-from disco_hw.viewer.snapshot import Snapshot
+from disco_hw.viewer.snapshot import ParameterPoints, Snapshot
 from disco_hw.viewer.stage import Stage, model_in_force
-from disco_hw.viewer.uncertainty import ParameterPoints
 
 Array = NDArray[np.float64]
 Point = tuple[float, float, float]
@@ -101,16 +101,16 @@ class Scene:
             if snapshot.pose is not None:
                 x_m, y_m, yaw_rad = snapshot.pose
                 self._robot.position = (x_m, y_m, 0.0)
-                self._robot.wxyz = shapes.about_z(yaw_rad)
+                self._robot.wxyz = about_z(yaw_rad)
             for wheel, angle_rad in zip(self._wheels, snapshot.wheel_angles * 2, strict=True):
-                wheel.wxyz = shapes.about_y(angle_rad)
+                wheel.wxyz = about_y(angle_rad)
             self._draw("ellipse", self._ellipse(snapshot))
             self._draw("centre", self._centre(snapshot))
             if not everything:
                 return
             plan = snapshot.plan
             path = np.empty((0, 2)) if plan is None else np.column_stack((plan.path_x_m, plan.path_y_m))
-            self._draw("plan", shapes.segments(path, 0.012))
+            self._draw("plan", segments(path, 0.012))
             self._draw("points", self._points_paths(snapshot))
             self._draw("poses", _pose_marks(snapshot.poses))
             self._draw_fan(snapshot.fan)
@@ -196,7 +196,7 @@ class Scene:
     def _draw_fan(self, fan: records.Fan | None) -> None:
         paths = np.empty((0, 0, 2))
         if fan is not None and self.layers["fan"]:
-            paths = shapes.fan_paths(fan.weights, fan.x_m, fan.y_m)
+            paths = fan_paths(fan.weights, fan.x_m, fan.y_m)
         if not len(paths):
             self._drawn_fan = None
             if self._fan.visible:
@@ -204,10 +204,10 @@ class Scene:
             return
         if fan is self._drawn_fan or fan is None:
             return
-        colours = shapes.weight_colours(fan.weights, FAN_COLOUR, FAN_PALEST)
+        colours = weight_colours(fan.weights, FAN_COLOUR, FAN_PALEST)
         # The weightiest on top of the others.
         heights = np.linspace(0.0075, 0.004, len(paths))
-        lines = [shapes.segments(path, height) for path, height in zip(paths, heights, strict=True)]
+        lines = [segments(path, height) for path, height in zip(paths, heights, strict=True)]
         self._fan.points = np.concatenate(lines).astype(np.float32)
         self._fan.colors = np.repeat(np.repeat(colours[:, None], paths.shape[1] - 1, axis=0), 2, axis=1)
         self._fan.visible, self._drawn_fan = True, fan
@@ -217,8 +217,8 @@ class Scene:
         visible = self.layers["trail"] and len(trail) >= 2
         if visible:
             off_m = self._stage.task_at(snapshot.task).course().off_m(trail)
-            colours = shapes.distance_colours(off_m, TRAIL_FULL_M)
-            points = shapes.segments(trail, 4.0 * _GROUND_M)
+            colours = distance_colours(off_m, TRAIL_FULL_M)
+            points = segments(trail, 4.0 * _GROUND_M)
             self._trail.points = points.astype(np.float32)
             self._trail.colors = np.stack((colours[:-1], colours[1:]), axis=1)
             self._trail.visible = True
@@ -228,18 +228,18 @@ class Scene:
     def _ellipse(self, snapshot: Snapshot) -> Array:
         if snapshot.pose is None:
             return np.empty((0, 2, 3))
-        points = shapes.ellipse_points(snapshot.pose[0], snapshot.pose[1], snapshot.covariance[:2, :2])
-        return shapes.segments(points, 3.5 * self._wheel_radius)
+        points = ellipse_points(snapshot.pose[0], snapshot.pose[1], snapshot.covariance[:2, :2])
+        return segments(points, 3.5 * self._wheel_radius)
 
     def _centre(self, snapshot: Snapshot) -> Array:
         centre = None
         if snapshot.pose is not None:
-            centre = shapes.instant_centre(
+            centre = instant_centre(
                 snapshot.pose, snapshot.speed_m_s, snapshot.yaw_rate_rad_s, self._stage.x_icr_m, _CENTRE_LIMIT_M
             )
         if snapshot.pose is None or centre is None:
             return np.empty((0, 2, 3))
-        ray = shapes.segments(np.array((snapshot.pose[:2], centre)), 0.01)
+        ray = segments(np.array((snapshot.pose[:2], centre)), 0.01)
         return np.concatenate((ray, _crosses(np.array((centre,)), 0.04, 0.01)))
 
     def _points_paths(self, snapshot: Snapshot) -> Array:
@@ -250,11 +250,11 @@ class Scene:
             self._belief = snapshot.belief
         wheels = snapshot.wheel_speeds or (0.0, 0.0)
         paths = self._points.trajectories(snapshot.plan, wheels)
-        return np.concatenate([shapes.segments(path, 0.008) for path in paths]) if len(paths) else np.empty((0, 2, 3))
+        return np.concatenate([segments(path, 0.008) for path in paths]) if len(paths) else np.empty((0, 2, 3))
 
 
 def _line(task: RobotTask) -> Array:
-    return shapes.segments(task.course().outline_m(), _GROUND_M)
+    return segments(task.course().outline_m(), _GROUND_M)
 
 
 def _pose_marks(poses: Array) -> Array:
@@ -274,3 +274,98 @@ def _crosses(points: Array, arm_m: float, height_m: float) -> Array:
     for arm in (np.array((arm_m, arm_m)), np.array((arm_m, -arm_m))):
         strokes.append(np.stack((np.hstack((points - arm, height)), np.hstack((points + arm, height))), axis=1))
     return np.concatenate(strokes)
+
+
+Bytes = NDArray[np.uint8]
+
+ELLIPSE_95 = 5.991464547107979
+"""Squared Mahalanobis radius that holds 95 % of a Gaussian over the plane."""
+
+
+def circle_points(center_x_m: float, center_y_m: float, radius_m: float, count: int = 180) -> Array:
+    """Points (count + 1, 2) around a circle, the last on the first."""
+    angle = np.linspace(0.0, 2.0 * np.pi, count + 1)
+    return np.stack((center_x_m + radius_m * np.cos(angle), center_y_m + radius_m * np.sin(angle)), axis=1)
+
+
+def ellipse_points(x_m: float, y_m: float, covariance: Array, count: int = 48) -> Array:
+    """Points (count + 1, 2) on the 95 % ellipse of a position with this covariance (2, 2) m^2; (0, 2) if it is none."""
+    if not np.all(np.isfinite(covariance)):
+        return np.empty((0, 2))
+    variances, axes = np.linalg.eigh(0.5 * (covariance + covariance.T))
+    if variances[0] < 0.0:
+        return np.empty((0, 2))
+    circle = circle_points(0.0, 0.0, math.sqrt(ELLIPSE_95), count)
+    return np.asarray((circle * np.sqrt(variances)) @ axes.T + (x_m, y_m))
+
+
+def segments(points: Array, height_m: float) -> Array:
+    """Line segments (N - 1, 2, 3) along points (N, 2) at one height."""
+    lifted = np.column_stack((points, np.full(len(points), height_m)))
+    return np.stack((lifted[:-1], lifted[1:]), axis=1)
+
+
+def distance_colours(distance_m: Array, full_m: float) -> Bytes:
+    """Colours (N, 3) by distance to the task: purple on it, teal at half of `full_m`, yellow at it and beyond.
+
+    They differ in brightness too, so that everybody can tell them apart.
+    """
+    part = np.clip(np.abs(distance_m) / full_m, 0.0, 1.0)
+    ramps = ((68.0, 33.0, 253.0), (1.0, 145.0, 200.0), (84.0, 140.0, 30.0))
+    return np.stack([np.interp(part, (0.0, 0.5, 1.0), ramp) for ramp in ramps], axis=1).astype(np.uint8)
+
+
+def fan_paths(weights: Sequence[float], x_m: Sequence[float], y_m: Sequence[float]) -> Array:
+    """Paths (n, points, 2) of a fan that is recorded one path after the other; (0, 0, 2) if it does not divide."""
+    count = len(weights)
+    if not count or len(x_m) % count or len(x_m) != len(y_m) or len(x_m) < 2 * count:
+        return np.empty((0, 0, 2))
+    return np.stack((np.reshape(x_m, (count, -1)), np.reshape(y_m, (count, -1))), axis=-1)
+
+
+def weight_colours(weights: Sequence[float], colour: tuple[int, int, int], palest: float) -> Bytes:
+    """Colours (n, 3) by share of the largest weight: `colour` for that one, mixed with white down to `palest` of it."""
+    share = np.asarray(weights, np.float64)
+    largest = share.max(initial=0.0)
+    part = palest + (1.0 - palest) * (share / largest if largest > 0.0 else np.zeros_like(share))
+    return np.asarray(255.0 - part[:, None] * (255.0 - np.array(colour)), np.uint8)
+
+
+def instant_centre(
+    pose: tuple[float, float, float], speed_m_s: float, yaw_rate_rad_s: float, x_icr_m: float, farthest_m: float
+) -> tuple[float, float] | None:
+    """Where the body turns about, in the world; None when it is not a number or farther away than `farthest_m`.
+
+    In the body's frame it lies at (x_icr, v / omega): there the lateral velocity -omega x_icr of the tracked point and
+    the forward one v are both undone.
+    """
+    if not (math.isfinite(speed_m_s) and abs(yaw_rate_rad_s) * farthest_m > abs(speed_m_s)):
+        return None
+    x_m, y_m, yaw_rad = pose
+    forward, left = x_icr_m, speed_m_s / yaw_rate_rad_s
+    return (
+        x_m + forward * math.cos(yaw_rad) - left * math.sin(yaw_rad),
+        y_m + forward * math.sin(yaw_rad) + left * math.cos(yaw_rad),
+    )
+
+
+def about_z(yaw_rad: float) -> tuple[float, float, float, float]:
+    """Unit quaternion (w, x, y, z) of a turn about the vertical."""
+    return (math.cos(yaw_rad / 2.0), 0.0, 0.0, math.sin(yaw_rad / 2.0))
+
+
+def about_y(angle_rad: float) -> tuple[float, float, float, float]:
+    """Unit quaternion (w, x, y, z) of a turn about the axle, positive as a wheel turns that drives forward."""
+    return (math.cos(angle_rad / 2.0), 0.0, math.sin(angle_rad / 2.0), 0.0)
+
+
+def add_layers(gui: viser.GuiApi, scene: Scene, changed: Callable[[], None]) -> None:
+    """One checkbox a layer; `changed` is called after each click, the next snapshot is drawn with what is ticked."""
+    with gui.add_folder("Layers", expand_by_default=False):
+        for name, label in LAYERS.items():
+            box = gui.add_checkbox(label, scene.layers[name])
+
+            @box.on_update
+            def _(event: Any, name: str = name) -> None:
+                scene.layers[name] = bool(event.target.value)
+                changed()

@@ -190,7 +190,7 @@ OWN = {
     "disco_hw/experiments/live_stack.py": {"open", "read_text"},
     "disco_hw/jit/__init__.py": {"read_bytes"},
     "disco_hw/log/writer.py": {"os.open"},
-    "disco_hw/viewer/desk.py": {"read_text"},
+    "disco_hw/viewer/operator_controls.py": {"read_text"},
     "drivers/transport/can.py": {"read_text"},
     "sim/fault_schedule.py": {"tomllib.loads"},
     "sim/serial_line.py": {"os.open"},

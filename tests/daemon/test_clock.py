@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from disco_hw.daemon.clock import MonotonicClock, SimulatedClock
+from disco_hw.daemon.loop import MonotonicClock, SimulatedClock
 
 
 @pytest.mark.parametrize("spin_s", [0.0, 0.001])

@@ -4,7 +4,7 @@ import threading
 
 from numba import njit
 
-from disco_hw.daemon.compile_progress import compile_progress
+from disco_hw.daemon.warm_up import compile_progress
 
 
 def test_a_compilation_says_what_it_is_for_how_far_it_is_and_how_long_it_took():

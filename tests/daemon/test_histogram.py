@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from disco_hw.daemon.histogram import Histogram
+from disco_hw.daemon.loop import Histogram
 
 DURATIONS_NS = st.integers(0, 2**44 - 1) | st.integers(0, 300) | st.integers(0, 44).map(lambda bits: (1 << bits) - 1)
 

@@ -2,8 +2,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from disco_hw.daemon.clock import MonotonicClock, SimulatedClock
-from disco_hw.daemon.loop import Loop
+from disco_hw.daemon.loop import Loop, MonotonicClock, SimulatedClock
 
 PERIOD_NS = 20_000_000
 MS_NS = 1_000_000

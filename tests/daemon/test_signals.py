@@ -13,10 +13,10 @@ DAEMON = """
 import signal
 import sys
 import time
-from disco_hw.daemon.clock import MonotonicClock
+from disco_hw.daemon.loop import MonotonicClock
 from disco_hw.daemon.loop import Loop
 from disco_hw.daemon.signals import StopSignals
-from disco_hw.daemon.stop_path import StopPath
+from disco_hw.daemon.signals import StopPath
 
 def stop_wheels():
     print("stopping", flush=True)

@@ -11,7 +11,7 @@ import time
 
 import pytest
 
-from disco_hw.daemon.clock import SimulatedClock
+from disco_hw.daemon.loop import SimulatedClock
 from disco_hw.drive.keyboard import Keyboard, KeyHold
 from disco_hw.drive.source import RobotView
 from disco_hw.errors import InputError

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from disco_hw.daemon.control_client import send_request
+from disco_hw.daemon.client import send_request
 from disco_hw.drive.source import INPUT_LIMIT_NS
 from disco_hw.experiments.live_stack import disco_hw_process, running_stack, stands
 from disco_hw.log.reader import open_log
@@ -272,6 +272,6 @@ def page_beside(pid):
     for each in Path("/proc").glob("[0-9]*"):
         with suppress(OSError):
             parent = (each / "stat").read_text().rpartition(")")[2].split()[1]
-            if int(parent) == pid and b"disco_hw.viewer.beside" in (each / "cmdline").read_bytes():
+            if int(parent) == pid and b"disco_hw.viewer.page_process" in (each / "cmdline").read_bytes():
                 return int(each.name)
     raise AssertionError("no page beside the drive")

@@ -6,7 +6,7 @@ import pytest
 from disco_hw.control import Rollouts
 from disco_hw.runtime.records_of_tick import fan
 from disco_hw.runtime.supervisor import UserRequest
-from disco_hw.viewer.shapes import fan_paths
+from disco_hw.viewer.scene import fan_paths
 from tests.runtime.simulated import simulated_stack
 
 

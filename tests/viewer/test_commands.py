@@ -120,7 +120,9 @@ def test_a_page_is_served_until_it_is_told_to_end(log_file):
         line = process.stdout.readline()
         told = json.loads(line)
         assert told["ticks"] == 200
-        with urllib.request.urlopen(told["page"], timeout=10) as answer:
+        # As a browser does: the address carries the token, a cookie keeps it.
+        browser = urllib.request.build_opener(urllib.request.HTTPCookieProcessor())
+        with browser.open(told["page"], timeout=10) as answer:
             assert answer.status == 200
         process.send_signal(signal.SIGTERM)
         assert process.wait(10) == 0

@@ -3,8 +3,7 @@
 import pytest
 
 from disco_hw.log import records
-from disco_hw.viewer.excited import Excited
-from disco_hw.viewer.timeline import Timeline
+from disco_hw.viewer.timeline import Excited, Timeline
 from tools.viewer_run import PERIOD_NS
 
 TOP_RAD_S = 6.4

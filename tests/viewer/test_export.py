@@ -5,12 +5,12 @@ import re
 import pytest
 
 from disco_hw.errors import InputError
-from disco_hw.viewer import export
+from disco_hw.viewer import picture
 
 
 def test_the_file_is_whole_and_asks_nothing_of_a_network(recording, tmp_path):
     parts = []
-    export.export_html(recording, tmp_path / "run.html", parts.append)
+    picture.export_html(recording, tmp_path / "run.html", parts.append)
     text = (tmp_path / "run.html").read_text(encoding="utf-8")
     assert text.lstrip().lower().startswith("<!doctype html")
     assert not re.findall(r'<(?:script|link|img)[^>]+(?:src|href)="(?:https?:)?//', text)
@@ -19,12 +19,12 @@ def test_the_file_is_whole_and_asks_nothing_of_a_network(recording, tmp_path):
 
 
 def test_a_longer_log_gets_pictures_further_apart(recording, tmp_path, monkeypatch):
-    monkeypatch.setattr(export, "_MOST_PICTURES", 5)
+    monkeypatch.setattr(picture, "_MOST_PICTURES", 5)
     parts = []
-    export.export_html(recording, tmp_path / "run.html", parts.append)
+    picture.export_html(recording, tmp_path / "run.html", parts.append)
     assert len(parts) == 6
 
 
 def test_a_place_that_cannot_be_written_is_told(recording, tmp_path):
     with pytest.raises(InputError, match="cannot be written"):
-        export.export_html(recording, tmp_path / "none" / "run.html", lambda part: None)
+        picture.export_html(recording, tmp_path / "none" / "run.html", lambda part: None)

@@ -13,8 +13,8 @@ from disco_hw.drive.coverage import Coverage
 from disco_hw.log import records
 from disco_hw.runtime.task_change import asked_of
 from disco_hw.tasks.circle import CircleTask
-from disco_hw.viewer.desk import Desk
 from disco_hw.viewer.live import KEEP_S, LivePage, _Due
+from disco_hw.viewer.operator_controls import Desk
 from disco_hw.viewer.panel import live_details
 from disco_hw.viewer.server import serving
 from disco_hw.viewer.stage import stage_of_robot

@@ -1,6 +1,5 @@
 from disco_hw.log import records
-from disco_hw.viewer.marks import ADAPTED, EVENT, FAULT, GATED, OVERRUN, REJECTED_FRAMES, marks_of
-from disco_hw.viewer.timeline import Timeline
+from disco_hw.viewer.timeline import ADAPTED, EVENT, FAULT, GATED, OVERRUN, REJECTED_FRAMES, Timeline, marks_of
 from tools.viewer_run import FAULT_TICK, GATED_TICK, OVERRUN_TICK, PERIOD_NS, REJECTED_TICK, START_NS
 
 

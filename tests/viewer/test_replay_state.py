@@ -7,7 +7,7 @@ from disco_hw.daemon.status import loop_figures, status
 from disco_hw.log.recorder import RecorderStats
 from disco_hw.runtime.pipeline import Source
 from disco_hw.runtime.supervisor import UserRequest
-from disco_hw.viewer.desk import shown
+from disco_hw.viewer.operator_controls import shown
 from disco_hw.viewer.panel import escaped, replay_text
 from disco_hw.viewer.recording import Recording
 from disco_hw.viewer.replay import ReplayPage

@@ -98,8 +98,8 @@ def test_the_trail_is_coloured_by_the_distance_to_the_task_in_force(scene, shot)
     on_it = np.array(scene._trail.colors)[-1, 0]
     scene.show(replace(shot, task=record_of(0, CircleTask(radius_m=0.5))))
     off_it = np.asarray(scene._trail.colors)[-1, 0]
-    assert tuple(on_it) == tuple(scene_module.shapes.distance_colours(np.zeros(1), scene_module.TRAIL_FULL_M)[0])
-    assert tuple(off_it) == tuple(scene_module.shapes.distance_colours(np.full(1, 0.25), scene_module.TRAIL_FULL_M)[0])
+    assert tuple(on_it) == tuple(scene_module.distance_colours(np.zeros(1), scene_module.TRAIL_FULL_M)[0])
+    assert tuple(off_it) == tuple(scene_module.distance_colours(np.full(1, 0.25), scene_module.TRAIL_FULL_M)[0])
 
 
 def test_the_fan_is_shaded_by_weight_and_the_weightiest_lies_on_top(scene, shot):
@@ -154,7 +154,7 @@ def test_a_path_is_drawn_where_it_is_and_not_at_all_where_it_is_unknown(tmp_path
         scene = Scene(page.server, stage)
         scene.show(shot)
         np.testing.assert_allclose(np.asarray(scene._task.points)[:, :, :2], [[[3, 0], [4, 0]], [[4, 0], [4, 1]]])
-        far = tuple(scene_module.shapes.distance_colours(np.ones(1), scene_module.TRAIL_FULL_M)[0])
+        far = tuple(scene_module.distance_colours(np.ones(1), scene_module.TRAIL_FULL_M)[0])
         assert {tuple(colour) for colour in np.asarray(scene._trail.colors).reshape(-1, 3)} == {far}
         scene.knows_task = False
         scene.show(shot)

@@ -16,7 +16,7 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from disco_hw.errors import InputError
-from disco_hw.viewer.desk import Desk
+from disco_hw.viewer.operator_controls import Desk
 from disco_hw.viewer.server import Guard, serving
 
 SUBPROTOCOL = f"viser-v{viser.__version__}"

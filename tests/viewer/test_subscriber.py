@@ -8,7 +8,7 @@ import zmq
 
 from disco_hw.log.link import batch_encoder
 from disco_hw.log.records import Estimate
-from disco_hw.viewer.subscriber import FeedSubscriber
+from disco_hw.viewer.live import FeedSubscriber
 from tools.viewer_run import tick_records
 
 

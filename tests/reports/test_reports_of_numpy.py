@@ -36,7 +36,7 @@ from disco_hw.inference.gap_check import GapCheck
 from disco_hw.inference.predictive import Predictive
 from disco_hw.log.importing.commands import Imported
 from disco_hw.model import Model
-from disco_hw.outputs import as_json
+from disco_hw.reports.outputs import as_json
 from disco_hw.runtime.replay import ReplayReport
 from disco_hw.verbs.options import print_result
 

@@ -14,8 +14,8 @@ from websockets.sync.client import connect
 
 from disco_hw.daemon.client import SERVED
 from disco_hw.daemon.control_socket import ControlServer
-from disco_hw.viewer import desk as desk_module
-from disco_hw.viewer.desk import Desk, shown
+from disco_hw.viewer import operator_controls as desk_module
+from disco_hw.viewer.operator_controls import Desk, shown
 from disco_hw.viewer.server import serving
 from firmware_protocol.codec import Codec
 from firmware_protocol.serial_framing import encode_frame

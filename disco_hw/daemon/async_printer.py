@@ -12,7 +12,7 @@ STANDARD_OUTPUT, STANDARD_ERROR = 1, 2
 _MOST_LINES = 1000
 
 
-class Teller:
+class AsyncPrinter:
     """Writes a line for each sentence to a descriptor, from a thread of its own: called as `teller(topic, text)`.
 
     Who holds the output, by Ctrl-S, a pager or a connection that hangs, would hold up the control loop with it. What

@@ -18,7 +18,7 @@ import msgspec
 from websockets.asyncio.server import ServerConnection
 from websockets.exceptions import ConnectionClosed
 
-from disco_hw.daemon.control_client import send_request
+from disco_hw.daemon.client import send_request
 from disco_hw.daemon.emergency import stop_robot
 from disco_hw.daemon.socket_place import connect
 from disco_hw.errors import InputError, WorkError
@@ -62,7 +62,7 @@ class Desk:
 
         `token` lets the scene in under this machine's other name; without it the scene stays under the desk's.
         """
-        text = files("disco_hw.viewer").joinpath("desk.html").read_text(encoding="utf-8")
+        text = files("disco_hw.viewer").joinpath("operator_controls.html").read_text(encoding="utf-8")
         return text.replace("@@INSTANCE@@", instance).replace("@@TOKEN@@", token).encode()
 
     async def serve(self, connection: ServerConnection) -> None:

@@ -4,9 +4,9 @@ from contextlib import ExitStack, contextmanager
 
 import pytest
 
-from disco_hw.viewer.desk import Desk
+from disco_hw.viewer.operator_controls import Desk
 from disco_hw.viewer.server import serving
-from tests.viewer.test_desk import STATUS, Daemon
+from tests.viewer.test_operator_controls import STATUS, Daemon
 from tools.browser import chromium, keep, opened
 from tools.viewer_run import ROBOT_FILE
 

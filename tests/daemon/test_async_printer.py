@@ -10,7 +10,7 @@ import threading
 
 import pytest
 
-from disco_hw.daemon.teller import Teller
+from disco_hw.daemon.async_printer import AsyncPrinter
 
 
 def line_of(topic, text):
@@ -30,7 +30,7 @@ def pipe():
 
 def held(descriptor):
     """A teller, and whether telling it ten sentences ended although nobody reads."""
-    teller = Teller(descriptor, line_of, most=4)
+    teller = AsyncPrinter(descriptor, line_of, most=4)
     telling = threading.Thread(target=lambda: [teller("event", str(k)) for k in range(10)], daemon=True)
     telling.start()
     telling.join(10.0)
@@ -38,7 +38,7 @@ def held(descriptor):
 
 
 def test_everything_is_written_in_order_by_the_end(pipe):
-    teller = Teller(pipe[1], line_of)
+    teller = AsyncPrinter(pipe[1], line_of)
     for k in range(200):
         teller("event", f"{k} \udcff")
     teller.close()

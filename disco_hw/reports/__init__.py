@@ -1,0 +1,1 @@
+"""What every report shares: results as JSON, files that are written, style."""
