@@ -16,8 +16,7 @@ import pytest
 import disco_hw
 from disco_hw.config import load_robot_config
 from disco_hw.daemon import socket_place
-from disco_hw.daemon.client import ask, socket_path
-from disco_hw.daemon.control_client import send_request
+from disco_hw.daemon.client import ask, send_request, socket_path
 from disco_hw.daemon.control_socket import ControlServer
 from disco_hw.daemon.socket_place import believed_users, default_socket_path, passed_over
 from disco_hw.errors import WorkError
