@@ -18,7 +18,7 @@ import tempfile
 import time
 import tomllib
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -92,20 +92,14 @@ class Builder:
             return "does not compile"
         if mutated.read_bytes() == self.objects[name].read_bytes():
             return "same code"
-        others = [str(path) for other, path in self.objects.items() if other != name]
-        extension = target / "_firmware.abi3.so"
-        command = [
-            "gcc",
-            "-shared",
-            str(self.folder / "_firmware.o"),
-            str(mutated),
-            *others,
-            "-lm",
-            "-o",
-            str(extension),
-        ]
-        subprocess.run(command, check=True)
+        self.link(target, [mutated, *(path for other, path in self.objects.items() if other != name)])
         return None
+
+    def link(self, target: Path, objects: Iterable[Path]) -> None:
+        """Make the extension in a folder from these parts."""
+        extension = target / "_firmware.abi3.so"
+        parts = [str(self.folder / "_firmware.o"), *map(str, objects)]
+        subprocess.run(["gcc", "-shared", *parts, "-lm", "-o", str(extension)], check=True)
 
 
 def test_files(name: str) -> list[str]:
@@ -132,11 +126,23 @@ def child(folder: Path, files: Sequence[str]) -> int:
     os.chdir(ROOT)
     for one in files:
         # File by file, so that the others need not even be collected.
-        status = pytest.main(["-x", "-p", "no:cacheprovider", "-p", "no:xdist", "-p", "no:timeout",
+        status = pytest.main(["-x", "-p", "no:cacheprovider", "-n", "0", "-p", "no:timeout",
                               "--hypothesis-profile=mutants", f"--basetemp={folder}/t", one])  # fmt: skip
         if status != 0:
             return int(status)
     return 0
+
+
+def fork_child(folder: Path, files: Sequence[str]) -> int:
+    """Run the tests against the extension in `folder` in a process of their own; return its number."""
+    process = os.fork()
+    if process == 0:
+        status = 99
+        try:
+            status = child(folder, files)
+        finally:
+            os._exit(status)
+    return process
 
 
 def sanitizers_notice(name: str, mutant: Mutant, folder: Path) -> bool:
@@ -198,6 +204,12 @@ def sweep(names: Sequence[str], jobs: int, chosen: slice, report: Path | None = 
 
     with tempfile.TemporaryDirectory() as folder:
         builder = Builder(Path(folder))
+        unchanged = Path(folder) / "unchanged"
+        unchanged.mkdir()
+        builder.link(unchanged, builder.objects.values())
+        _, status = os.waitpid(fork_child(unchanged, test_files(names[0])), 0)
+        if status != 0:
+            raise RuntimeError("the unchanged core fails its tests: every mutant would pass for noticed")
         for name in names:
             for number, mutant in enumerate(list(mutants((FIRMWARE / name).read_text("utf-8")))[chosen]):
                 target = Path(folder) / f"{Path(name).stem}{number}"
@@ -208,14 +220,7 @@ def sweep(names: Sequence[str], jobs: int, chosen: slice, report: Path | None = 
                     continue
                 while len(running) >= jobs:
                     finish()
-                process = os.fork()
-                if process == 0:
-                    status = 99
-                    try:
-                        status = child(target, test_files(name))
-                    finally:
-                        os._exit(status)
-                running[process] = (name, mutant, target)
+                running[fork_child(target, test_files(name))] = (name, mutant, target)
         while running:
             finish()
     return results
