@@ -463,7 +463,8 @@ def _close_recorder(recorder: Recorder, say: Say) -> None:
     for sentence in recorder.news():
         say("recording", sentence)
     if stats.path:
-        say("recording", recording_in_words(asdict(stats)))
+        # No fault: of those `drive` makes a drive that is not whole.
+        say("log", recording_in_words(asdict(stats)))
 
 
 def in_text(topic: str, text: str) -> str:

@@ -17,6 +17,10 @@ from sim.effects import HiddenEffectError, parse_hidden_effects
 from sim.fault_schedule import FaultFileError, schedule_of
 from sim.plant_parameters import DrawError, PlantParameters, draw_plant_parameters
 
+# A board that slews no faster than the host makes a ramp of every step of a command, which is half a period of delay.
+_FIRMWARE_MARGIN = 10.0
+_MOST_ACCELERATION_RAD_S2 = 655.0
+
 
 @dataclass(frozen=True, slots=True)
 class SimOptions:
@@ -76,7 +80,9 @@ def run_sim(options: SimOptions) -> int:
             firmware=FirmwareConfig(
                 ticks_per_rev=ticks_per_rev,
                 max_wheel_speed_rad_s=config.robot.max_wheel_speed_rad_s,
-                max_wheel_acceleration_rad_s2=config.robot.max_wheel_acceleration_rad_s2,
+                max_wheel_acceleration_rad_s2=min(
+                    _FIRMWARE_MARGIN * config.robot.max_wheel_acceleration_rad_s2, _MOST_ACCELERATION_RAD_S2
+                ),
                 key=key or b"",
             ),
             truth_file=options.truth,
