@@ -143,3 +143,10 @@ def test_the_names_alone_are_those_of_the_report():
     log = simulated_drive({"pose_latency": 0.1, "motor_lag": 0.12}, seed=902, drive="poor")
     report = find_gap(log, MODEL)
     assert missing_effects(log, MODEL) == tuple(effect.name for effect in report.effects) != ()
+
+
+@pytest.mark.parametrize(("delay_s", "missing"), [(0.003, ()), (0.1, ("command_delay",))])
+def test_what_the_log_shows_and_no_prediction_needs_is_not_missing(delay_s, missing):
+    log = simulated_drive({"command_delay": delay_s}, seed=903, drive="rich")
+    assert [effect.name for effect in find_gap(log, MODEL).effects] == ["command_delay"]
+    assert missing_effects(log, MODEL) == missing
