@@ -68,7 +68,7 @@ class Reader:
     def ctl(self, *words: str) -> str:
         return self.untold([sys.executable, "-m", "disco_hw", "ctl", ROBOT, *words])
 
-    def wait(self, what: str, condition, timeout_s: float = 120.0) -> None:
+    def wait(self, what: str, condition, timeout_s: float = 400.0) -> None:
         deadline_s, status = time.monotonic() + timeout_s, None
         while time.monotonic() < deadline_s:
             result = subprocess.run(
