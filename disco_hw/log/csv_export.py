@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from disco_hw.log.csv_import import COMMAND, POSE, SEGMENT, SPEED, TICKS, TIME
 from disco_hw.log.drive import Array, DriveLog, Index
 from disco_hw.log.errors import LogError
+from disco_hw.log.importing.csv_drive import COMMAND, POSE, SEGMENT, SPEED, TICKS, TIME
 
 Cells = Callable[[float], list[str]]
 

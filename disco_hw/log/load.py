@@ -9,9 +9,9 @@ import numpy as np
 
 from disco_hw.config.input_file import LOG, begin_of
 from disco_hw.log.container import MAGIC
-from disco_hw.log.csv_import import read_csv
 from disco_hw.log.drive import DriveLog, concatenate
 from disco_hw.log.errors import LogError
+from disco_hw.log.importing.csv_drive import read_csv
 from disco_hw.log.mcap_drive import drive_from_log
 from disco_hw.log.reader import open_log
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from disco_hw.log.csv_export import write_csv
-from disco_hw.log.csv_import import read_csv
 from disco_hw.log.errors import LogError
+from disco_hw.log.importing.csv_drive import read_csv
 from disco_hw.log.mcap_drive import drive_from_log
 from disco_hw.log.reader import open_log
 from disco_hw.log.records import Command

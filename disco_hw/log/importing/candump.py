@@ -16,6 +16,7 @@ from disco_hw.config import Robot
 from disco_hw.config.input_file import CANDUMP, read_lines
 from disco_hw.log.drive import Array, Commands, DriveLog, Gyro, Poses, Wheels
 from disco_hw.log.errors import LogError
+from disco_hw.log.importing.registry import LogFormat
 from drivers.device_clock import DeviceClock
 from drivers.motor.reference_frames import FrameReception
 from drivers.motor.reference_telemetry import POSE_MESSAGES, WHEEL_MESSAGES, Telemetry
@@ -143,3 +144,6 @@ def _capabilities(robot: Robot) -> Capabilities:
         drive_off_timeout_s=0.0,
         stop_deceleration_rad_s2=0.0,
     )
+
+
+FORMAT = LogFormat("candump", lambda begin: begin.startswith(b"("), read_candump, order=10)

@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from disco_hw.errors import InputError
-from disco_hw.log.csv_import import read_csv
 from disco_hw.log.errors import LogError
+from disco_hw.log.importing.csv_drive import read_csv
 
 REAL_LOGS = "DISCO_HW_REAL_LOGS"
 HEADER = "t_s,cmd_left_rad_s,cmd_right_rad_s,enc_left_rad_s,enc_right_rad_s,pose_x_m,pose_y_m,pose_yaw_rad"

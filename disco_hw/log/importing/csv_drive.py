@@ -30,6 +30,7 @@ from disco_hw.log.drive import (
     integrate_angle,
 )
 from disco_hw.log.errors import LogError
+from disco_hw.log.importing.registry import LogFormat
 from disco_hw.log.plausible import length_fault, time_fault, yaw_fault
 
 COMMAND = ("cmd_left_rad_s", "cmd_right_rad_s")
@@ -235,3 +236,9 @@ def _wrapped(yaw: Array) -> Array:
     wrapped = np.pi - np.mod(np.pi - yaw, 2.0 * np.pi)
     # What is in range already stays as it was, to the last bit.
     return np.where((yaw > -np.pi) & (yaw <= np.pi), yaw, wrapped)
+
+
+# Last: any text may be meant as a table, and its reader says best what is wrong with it.
+FORMAT = LogFormat(
+    "csv", lambda begin: True, lambda path, robot: read_csv(path, robot.ticks_per_rev, robot.wheel_radius_m), order=1000
+)
