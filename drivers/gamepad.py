@@ -18,7 +18,7 @@ class GamepadError(Exception):
     """No usable gamepad; the message is one line that says what to do."""
 
 
-class Event(Protocol):
+class InputEvent(Protocol):
     """One input event as evdev has it."""
 
     type: int
@@ -39,7 +39,7 @@ class EventDevice(Protocol):
 
     name: str
 
-    def read(self) -> Iterable[Event]:
+    def read(self) -> Iterable[InputEvent]:
         """Events since the last call; raises BlockingIOError for none, another OSError when the device is gone."""
 
     def absinfo(self, axis_num: int) -> AxisInfo:
@@ -125,7 +125,7 @@ class Gamepad:
         """Close the device."""
         self._device.close()
 
-    def _take(self, event: Event) -> None:
+    def _take(self, event: InputEvent) -> None:
         if event.type == _EV_SYN:
             if self._dropping and event.code == _SYN_REPORT:
                 self._dropping = False

@@ -9,16 +9,19 @@ from __future__ import annotations
 import os
 import stat
 import sys
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, ParamSpec, TypeVar, cast
 
-from numba import config
+from numba import config, njit
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile
 
 from drivers.private_files import user_name, why_not_private
 
 _Dispatcher = TypeVar("_Dispatcher")
 _told: set[str] = set()
+P = ParamSpec("P")
+R = TypeVar("R")
 
 
 def kept_on_disk(dispatcher: _Dispatcher) -> _Dispatcher:
@@ -101,3 +104,12 @@ def _tell(line: str) -> None:
     if line not in _told:
         _told.add(line)
         print(f"disco-hw: {line}", file=sys.stderr)
+
+
+def compiled(function: Callable[P, R]) -> Callable[P, R]:
+    """Compile a function of numbers and arrays with numba; the machine code is kept on disk between processes.
+
+    A compiled function may call only compiled functions of its own file: the cache on disk is renewed when that file
+    changes, and not when another one does.
+    """
+    return cast(Callable[P, R], kept_on_disk(njit(nogil=True)(function)))

@@ -9,9 +9,9 @@ from pathlib import Path
 
 from firmware_protocol.firmware_core import FirmwareConfig
 from sim.app import VirtualRobotOptions, run_virtual_robot
-from sim.body_dynamics import Pose
+from sim.body_dynamics import BodyPose
 from sim.effects import HiddenEffectError, effects_table, parse_hidden_effects
-from sim.injection import COMMANDS
+from sim.fault_player import COMMANDS
 from sim.plant_parameters import PlantParameters
 
 
@@ -85,7 +85,7 @@ def _options(given: argparse.Namespace) -> VirtualRobotOptions:
         pacing=not given.no_pacing,
         port=given.port,
         baud=given.baud,
-        start=Pose(*given.start),
+        start=BodyPose(*given.start),
         plant=plant,
         effects=dict(parse_hidden_effects(given.hide).items),
         seed=given.seed,

@@ -17,24 +17,19 @@ import can
 
 from drivers.types import ReceivedFrame
 from firmware_protocol.firmware_core import FirmwareConfig
-from sim.body_dynamics import Pose
+from sim.body_dynamics import BodyPose
 from sim.command_socket import CommandSocket
-from sim.cpu_hogs import CpuHogs
 from sim.effects import HiddenEffectError, hidden_effects
-from sim.fault_player import BUS_ONLY, FaultPlayer
-from sim.fault_schedule import FaultSchedule, Room
-from sim.hub_link import HubLink
-from sim.injection import Injection
+from sim.fault_player import BUS_ONLY, CpuHogs, FaultPlayer, Injection
+from sim.fault_schedule import FaultSchedule, Site
+from sim.hub import HubLink
 from sim.plant import Plant
 from sim.plant_parameters import PlantParameters
+from sim.process import SocketPathError, StopSignal, TextRecord
 from sim.python_can_link import PythonCanLink
 from sim.robot_link import RobotLink
 from sim.serial_line import SerialLine, SerialPathError
-from sim.stop_signal import StopSignal
-from sim.text_record import TextRecord
-from sim.truth import TruthRecorder
-from sim.unix_listener import SocketPathError
-from sim.virtual_robot import STEP_US, DeviceClock, VirtualRobot
+from sim.virtual_robot import STEP_US, ControllerClock, TruthRecorder, VirtualRobot
 
 STEP_NS = STEP_US * 1000
 TRUTH_STEPS = 10
@@ -58,9 +53,9 @@ class VirtualRobotOptions:
     `firmware`: limits and identity of the controller. `start`: pose of the tracked point at the start. `effects`:
     hidden effects by name (see `sim.effects`). `seed`: all disturbances and noise. `challenge_seed`: arming
     challenges that are the same in every run, for tests alone; None draws them from the system. `truth_file`: CSV of
-    `sim.truth.COLUMNS` at 100 Hz. `bus_log`: every frame on the own bus or line, as candump does. `inject`: socket
-    for the commands of `sim.injection`. `ready_fd`: descriptor that gets the ready line too, and is then closed.
-    `faults`: what goes wrong, from the ready line on; of the faults of processes only `cpu_hog`.
+    `sim.virtual_robot.TRUTH_COLUMNS` at 100 Hz. `bus_log`: every frame on the own bus or line, as candump does.
+    `inject`: socket for the commands of `sim.fault_player`. `ready_fd`: descriptor that gets the ready line too, and is
+    then closed. `faults`: what goes wrong, from the ready line on; of the faults of processes only `cpu_hog`.
     `realtime_priority`: SCHED_FIFO priority where the system allows it; 0 for none.
     """
 
@@ -71,13 +66,13 @@ class VirtualRobotOptions:
     pacing: bool = True
     port: str | None = None
     baud: int = 921_600
-    start: Pose = field(default_factory=Pose)
+    start: BodyPose = field(default_factory=BodyPose)
     plant: PlantParameters = field(default_factory=PlantParameters)
     effects: Mapping[str, float | Sequence[float]] = field(default_factory=dict)
     seed: int = 0
     challenge_seed: int | None = None
     firmware: FirmwareConfig | None = None
-    clock: DeviceClock = field(default_factory=DeviceClock)
+    clock: ControllerClock = field(default_factory=ControllerClock)
     truth_file: Path | None = None
     bus_log: Path | None = None
     inject: Path | None = None
@@ -97,7 +92,7 @@ def run_virtual_robot(options: VirtualRobotOptions) -> int:
     """Run the virtual robot until SIGTERM or SIGINT; main thread only.
 
     Prints one line that begins with "ready" when a host can open the link. Returns 0 after a clean stop, 2 with one
-    line on stderr if an option cannot be used, 1 if a record could not be written to its end, which was told then.
+    line on stderr if an option cannot be used, 1 if a record could not be written to its end, which stderr says then.
     """
     stop = StopSignal()
     records: list[TextRecord] = []
@@ -141,7 +136,7 @@ class _Process:
         self._start_ns = time.monotonic_ns()
         if faults is not None:
             hogs = resources.enter_context(CpuHogs())
-            self._player = FaultPlayer(faults, self.robot, self.link, self._start_ns, _tell, hogs)
+            self._player = FaultPlayer(faults, self.robot, self.link, self._start_ns, _report, hogs)
 
     def filenos(self) -> list[int]:
         return [*self.link.filenos(), *([] if self._commands is None else [self._commands.fileno()])]
@@ -204,7 +199,7 @@ def _open_record(path: Path | None, records: list[TextRecord], resources: contex
     if path is None:
         return None
     try:
-        record = TextRecord(path, _tell)
+        record = TextRecord(path, _report)
     except OSError as error:
         raise OptionError(f"{error.filename}: {error.strerror}; choose another file") from None
     resources.callback(record.close)
@@ -218,7 +213,7 @@ def _check_faults(schedule: FaultSchedule, kind: str, interface: str) -> None:
         raise OptionError(f"faults: not on {interface}; only on the simulator's own bus (unixcan) or a serial line")
     for fault in schedule.faults:
         name = fault.kind.name
-        if fault.kind.room is Room.PROCESS and name != "cpu_hog":
+        if fault.kind.site is Site.PROCESS and name != "cpu_hog":
             raise OptionError(f"fault {fault.number}: {name}: other processes are not the simulator's; use tests/hil")
         if kind == "serial" and name in BUS_ONLY:
             raise OptionError(f"fault {fault.number}: {name}: a serial line has none; take it out or use a CAN bus")
@@ -287,5 +282,5 @@ def _announce(line: str, ready_fd: int | None) -> None:
         os.close(ready_fd)
 
 
-def _tell(line: str) -> None:
+def _report(line: str) -> None:
     print(line, file=sys.stderr, flush=True)

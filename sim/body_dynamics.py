@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from sim.compiled import compiled
+from drivers.kernel_cache import compiled
 from sim.effects import HiddenEffects
 from sim.plant_parameters import PlantParameters
 from sim.wheel_dynamics import WheelPieces
@@ -74,7 +74,7 @@ _BODY = np.dtype(
 )
 
 
-class Pose(msgspec.Struct, frozen=True, gc=False):
+class BodyPose(msgspec.Struct, frozen=True, gc=False):
     """Position (m) and yaw (rad, counter-clockwise, not wrapped) in the world frame."""
 
     x_m: float = 0.0
@@ -85,7 +85,7 @@ class Pose(msgspec.Struct, frozen=True, gc=False):
 class Body:
     """The body with its pose."""
 
-    def __init__(self, parameters: PlantParameters, effects: HiddenEffects, start: Pose) -> None:
+    def __init__(self, parameters: PlantParameters, effects: HiddenEffects, start: BodyPose) -> None:
         self._parameters = _parameter_record(parameters, effects)
         self._state = np.zeros(1, dtype=_BODY)
         # The same memory as plain numbers: reading a record field by field takes microseconds.
@@ -95,9 +95,9 @@ class Body:
         self._set(start)
 
     @property
-    def pose(self) -> Pose:
+    def pose(self) -> BodyPose:
         """The pose now."""
-        return Pose(*self._pose.tolist())
+        return BodyPose(*self._pose.tolist())
 
     @property
     def velocity(self) -> tuple[float, float, float]:
@@ -105,15 +105,15 @@ class Body:
         speed, lateral, yaw_rate = self._velocity.tolist()
         return speed, lateral, yaw_rate
 
-    def pose_at(self, t_us: int) -> Pose:
+    def pose_at(self, t_us: int) -> BodyPose:
         """The pose within the newest integration piece, at t_us: between its end points on a straight line."""
         x, y, yaw, last_x, last_y, last_yaw = self._poses.tolist()
         last_us, now_us = self._times_us.tolist()
         span = now_us - last_us
         if span == 0:
-            return Pose(x, y, yaw)
+            return BodyPose(x, y, yaw)
         part = (t_us - last_us) / span
-        return Pose(last_x + part * (x - last_x), last_y + part * (y - last_y), last_yaw + part * (yaw - last_yaw))
+        return BodyPose(last_x + part * (x - last_x), last_y + part * (y - last_y), last_yaw + part * (yaw - last_yaw))
 
     def advance(
         self,
@@ -145,9 +145,9 @@ class Body:
     def displace(self, dx_m: float, dy_m: float, dyaw_rad: float) -> None:
         """Put the body elsewhere at once: a step in the world frame and a turn about the tracked point."""
         pose = self.pose
-        self._set(Pose(pose.x_m + dx_m, pose.y_m + dy_m, pose.yaw_rad + dyaw_rad))
+        self._set(BodyPose(pose.x_m + dx_m, pose.y_m + dy_m, pose.yaw_rad + dyaw_rad))
 
-    def _set(self, pose: Pose) -> None:
+    def _set(self, pose: BodyPose) -> None:
         for name, value in (("x", pose.x_m), ("y", pose.y_m), ("yaw", pose.yaw_rad)):
             self._state[name] = value
             self._state[f"last_{name}"] = value

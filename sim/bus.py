@@ -14,15 +14,17 @@ import msgspec
 from msgspec.structs import replace
 
 from sim.bus_node import BusNode, ErrorState, TransmitOrder
-from sim.can_bits import (
+from sim.can_frame import (
     ACK_AND_END_BITS,
     ERROR_DELIMITER_BITS,
     ERROR_FLAG_BITS,
     INTERFRAME_BITS,
+    CanFrame,
+    candump_line,
     frame_bits,
+    protocol_error_frame,
     stuffed_bits,
 )
-from sim.can_frame import CanFrame, candump_line, protocol_error_frame
 
 RECOVERY_SEQUENCES = 128
 RECESSIVE_SEQUENCE_BITS = 11
@@ -62,7 +64,7 @@ class BusFault(Protocol):
         """Called once when `frame` starts on the wire."""
 
 
-class Delivery(msgspec.Struct, frozen=True, gc=False):
+class DeliveredFrame(msgspec.Struct, frozen=True, gc=False):
     """A frame that `receivers` have at `t_ns`; for a node's own error frames `sender` is that node."""
 
     t_ns: int
@@ -114,8 +116,8 @@ class CanBus:
         self._nodes: list[BusNode] = []
         self._recovering: list[BusNode] = []
         self._on_wire: _Transmission | None = None
-        self._delayed: list[tuple[int, int, Delivery]] = []
-        self._out: list[Delivery] = []
+        self._delayed: list[tuple[int, int, DeliveredFrame]] = []
+        self._out: list[DeliveredFrame] = []
         self._sequence = 0
 
     @property
@@ -188,7 +190,7 @@ class CanBus:
                 times.append(self._next_recovery_ns())
         return min(times) if times else None
 
-    def advance(self, until_ns: int) -> list[Delivery]:
+    def advance(self, until_ns: int) -> list[DeliveredFrame]:
         """Let time pass up to `until_ns` and return what was received meanwhile, in order of time.
 
         Raises ValueError if `until_ns` is in the past.
@@ -298,13 +300,13 @@ class CanBus:
             self._log(candump_line(end_ns, _LOG_CHANNEL, transmission.frame if intact else protocol_error_frame()))
         if intact:
             receivers.extend([node for node in senders if node.echo])
-            self._deliver(Delivery(end_ns, senders[0], transmission.frame, tuple(receivers)), transmission.fate)
+            self._deliver(DeliveredFrame(end_ns, senders[0], transmission.frame, tuple(receivers)), transmission.fate)
 
     def _listeners(self, senders: Sequence[BusNode]) -> list[BusNode]:
         """Who hears what these send, the senders left out."""
         return [node for node in self._nodes if node.state is not _BUS_OFF and node not in senders]
 
-    def _deliver(self, delivery: Delivery, fate: FrameFate) -> None:
+    def _deliver(self, delivery: DeliveredFrame, fate: FrameFate) -> None:
         receivers = delivery.receivers
         if fate is UNHARMED:
             for node in receivers:
@@ -316,7 +318,7 @@ class CanBus:
         if fate.data is not None:
             frame = replace(frame, data=fate.data)
         receivers = () if fate.lost else tuple(node for node in receivers if node.name not in fate.lost_at)
-        delivery = Delivery(delivery.t_ns + fate.delay_ns, delivery.sender, frame, receivers)
+        delivery = DeliveredFrame(delivery.t_ns + fate.delay_ns, delivery.sender, frame, receivers)
         for node in receivers:
             node.received += fate.copies
         for _ in range(fate.copies if receivers else 0):
@@ -327,7 +329,7 @@ class CanBus:
                 self._out.append(delivery)
 
     def _report(self, node: BusNode, error_frame: CanFrame) -> None:
-        self._out.append(Delivery(self._now_ns, node, error_frame, (node,)))
+        self._out.append(DeliveredFrame(self._now_ns, node, error_frame, (node,)))
 
     def _next_recovery_ns(self) -> int:
         """When on an idle bus the first recovering node will have seen enough recessive bits."""
@@ -354,7 +356,7 @@ class CanBus:
                 self._report(node, node.recover())
 
 
-def _delivery_time(delivery: Delivery) -> int:
+def _delivery_time(delivery: DeliveredFrame) -> int:
     return delivery.t_ns
 
 

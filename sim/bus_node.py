@@ -10,8 +10,7 @@ import enum
 import heapq
 from dataclasses import dataclass, field
 
-from sim.can_bits import arbitration_key
-from sim.can_frame import CanFrame, bus_off_frame, controller_error_frame, restarted_frame
+from sim.can_frame import CanFrame, arbitration_key, bus_off_frame, controller_error_frame, restarted_frame
 
 WARNING_LIMIT = 96
 PASSIVE_LIMIT = 128

@@ -10,7 +10,7 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from sim.unix_listener import bind_private
+from sim.process import bind_private
 
 MAX_COMMAND_BYTES = 4096
 

@@ -1,35 +1,42 @@
-"""Carries a fault schedule out on a virtual robot and its link: the hands of `sim.faults`."""
+"""Applies faults at run time, from a schedule or from text commands, to a virtual robot, its link and its processor."""
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Callable
+from types import TracebackType
 from typing import Protocol
 
-from sim.fault_schedule import Fault, FaultSchedule, Room
-from sim.faults import FaultTimeline, FrameFaults
-from sim.injection import Injection
-from sim.robot_faults import RobotFaults
-from sim.robot_link import RobotLink
-from sim.virtual_robot import VirtualRobot
+from drivers.types import Frame
+from firmware_protocol.firmware_core import ResetCause
+from sim.fault_schedule import FaultSchedule, ScheduledFault, Site
+from sim.faults import FaultTimeline, FrameFaults, RobotFaults
+from sim.robot_link import LinkFaultError, RobotLink
+from sim.virtual_robot import VirtualRobot, truth_row
 
+COMMANDS = """\
+bus_off [host|robot]          controllers of all hosts (default), or the robot's, leave the bus
+unplug SECONDS                break the line for so long
+estop_button on|off           press or release the button on the robot
+kidnap DX_M DY_M DYAW_RAD     carry the robot off
+babble ID RATE_HZ             another node sends frames of zeros under this identifier; RATE_HZ 0 ends it
+reboot [watchdog|brown_out]   restart the robot's controller
+state                         answer with the true state, as a line of the truth table
+"""
+MAX_BABBLE_HZ = 100_000.0
+MAX_UNPLUG_S = 3600.0
+_BABBLE_DATA = bytes(8)
 BUS_ONLY = ("bus_off", "babble")
-
-
-class ProcessFaults(Protocol):
-    """Whoever can do something to processes; a harness has all of them in its hands, the simulator few."""
-
-    def begin(self, fault: Fault) -> None:
-        """Let the fault begin."""
-
-    def end(self, fault: Fault) -> None:
-        """Take it back."""
+# A child of a real-time process would be one itself.
+_BUSY = "import os; os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))\nwhile True: pass"
 
 
 class FaultPlayer:
-    """Plays `schedule` from `start_ns` on; `tell` gets a line at each beginning and end.
+    """Plays `schedule` from `start_ns` on; `report` gets a line at each beginning and end.
 
     `frames.struck` counts the frames touched by each fault. Faults of processes go to `processes`; without it they are
-    told and nothing happens. Raises LinkFaultError at once if the link cannot have its frames changed.
+    reported and nothing happens. Raises LinkFaultError at once if the link cannot have its frames changed.
     """
 
     def __init__(
@@ -38,7 +45,7 @@ class FaultPlayer:
         robot: VirtualRobot,
         link: RobotLink,
         start_ns: int,
-        tell: Callable[[str], object] = lambda _line: None,
+        report: Callable[[str], object] = lambda _line: None,
         processes: ProcessFaults | None = None,
     ) -> None:
         self.timeline = FaultTimeline(schedule)
@@ -47,14 +54,14 @@ class FaultPlayer:
         self._link = link
         self._injection = Injection(robot, link)
         self._start_ns = start_ns
-        self._tell = tell
+        self._report = report
         self._processes = processes
         self._sensors = RobotFaults()
         self._unplug_until_ns = 0
         robot.faults = self._sensors
         link.tamper(self.frames)
 
-    def step(self, now_ns: int) -> tuple[tuple[Fault, ...], tuple[Fault, ...]]:
+    def step(self, now_ns: int) -> tuple[tuple[ScheduledFault, ...], tuple[ScheduledFault, ...]]:
         """Do what is due at `now_ns`; return the faults that have begun and ended."""
         begun, ended = self.timeline.step(now_ns - self._start_ns)
         if begun or ended:
@@ -62,20 +69,20 @@ class FaultPlayer:
             self.frames.set_active(active)
             self._sensors.set_active(active, begun)
             for fault in begun:
-                self._tell(f"fault {fault.number} begins: {fault}")
+                self._report(f"fault {fault.number} begins: {fault}")
                 self._begin(fault, now_ns)
             for fault in ended:
                 self._end(fault, now_ns)
                 if fault.kind.lasts:
-                    self._tell(f"fault {fault.number} ends: {fault.kind.name}")
+                    self._report(f"fault {fault.number} ends: {fault.kind.name}")
         if self.frames.broken:
             self.frames.broken = False
             self._link.unplug(max(self._unplug_until_ns, now_ns))
         self._injection.step(now_ns)
         return begun, ended
 
-    def _begin(self, fault: Fault, now_ns: int) -> None:
-        if fault.kind.room is Room.PROCESS and self._processes is not None:
+    def _begin(self, fault: ScheduledFault, now_ns: int) -> None:
+        if fault.kind.site is Site.PROCESS and self._processes is not None:
             self._processes.begin(fault)
         match fault.kind.name:
             case "unplug":
@@ -97,8 +104,8 @@ class FaultPlayer:
             case "estop_button":
                 self._do("estop_button on", now_ns)
 
-    def _end(self, fault: Fault, now_ns: int) -> None:
-        if fault.kind.room is Room.PROCESS and self._processes is not None:
+    def _end(self, fault: ScheduledFault, now_ns: int) -> None:
+        if fault.kind.site is Site.PROCESS and self._processes is not None:
             self._processes.end(fault)
         # Of two faults of a kind at once, the end of one is not that of the other.
         others = [other for other in self.timeline.active if other.kind is fault.kind]
@@ -115,4 +122,161 @@ class FaultPlayer:
     def _do(self, command: str, now_ns: int) -> None:
         answer = self._injection.execute(command, now_ns)
         if answer != "ok":
-            self._tell(answer)
+            self._report(answer)
+
+
+class Injection:
+    """Executes `COMMANDS` on a robot and its link, and keeps up what goes on over time."""
+
+    def __init__(self, robot: VirtualRobot, link: RobotLink) -> None:
+        self.refused = 0
+        self._robot = robot
+        self._link = link
+        self._babble: Frame | None = None
+        self._babble_period_ns = 0.0
+        self._babble_since_ns = 0
+        self._babble_count = 0
+        self._handlers: dict[str, Callable[[list[str], int], str]] = {
+            "bus_off": self._bus_off,
+            "unplug": self._unplug,
+            "estop_button": self._estop_button,
+            "kidnap": self._kidnap,
+            "babble": self._start_babble,
+            "reboot": self._reboot,
+            "state": self._state,
+        }
+
+    def execute(self, text: str, now_ns: int) -> str:
+        """Obey one command; return "ok", what was asked for, or "error: " and why."""
+        name, *arguments = text.split() or [""]
+        try:
+            handler = self._handlers.get(name)
+            if handler is None:
+                raise CommandError(f"{name!r} is no command; say one of {', '.join(self._handlers)}")
+            return handler(arguments, now_ns)
+        except (CommandError, LinkFaultError) as error:
+            self.refused += 1
+            return f"error: {error}"
+
+    def step(self, now_ns: int) -> None:
+        """Let the babbling node send what is due."""
+        if self._babble is None:
+            return
+        due = int((now_ns - self._babble_since_ns) / self._babble_period_ns)
+        for _ in range(due - self._babble_count):
+            self._link.babble(self._babble)
+        self._babble_count = max(due, self._babble_count)
+
+    def _bus_off(self, arguments: list[str], _now_ns: int) -> str:
+        _expect("bus_off", arguments, 0, 1)
+        self._link.force_bus_off(arguments[0] if arguments else "host")
+        return "ok"
+
+    def _unplug(self, arguments: list[str], now_ns: int) -> str:
+        _expect("unplug", arguments, 1, 1)
+        self._link.unplug(now_ns + round(_number("unplug", arguments[0], 0.0, MAX_UNPLUG_S) * 1e9))
+        return "ok"
+
+    def _estop_button(self, arguments: list[str], _now_ns: int) -> str:
+        _expect("estop_button", arguments, 1, 1)
+        if arguments[0] not in ("on", "off"):
+            raise CommandError(f"estop_button {arguments[0]}: say on or off")
+        self._robot.estop_button = arguments[0] == "on"
+        return "ok"
+
+    def _kidnap(self, arguments: list[str], _now_ns: int) -> str:
+        _expect("kidnap", arguments, 3, 3)
+        dx_m, dy_m, dyaw_rad = (_number("kidnap", argument, -1000.0, 1000.0) for argument in arguments)
+        self._robot.kidnap(dx_m, dy_m, dyaw_rad)
+        return "ok"
+
+    def _start_babble(self, arguments: list[str], now_ns: int) -> str:
+        _expect("babble", arguments, 2, 2)
+        try:
+            can_id = int(arguments[0], 0)
+        except ValueError:
+            raise CommandError(f"babble {arguments[0]}: not an identifier; write it as 0x100 or 256") from None
+        if not 0 <= can_id <= 0x7FF:
+            raise CommandError(f"babble {arguments[0]}: an identifier has 11 bits")
+        rate_hz = _number("babble", arguments[1], 0.0, MAX_BABBLE_HZ)
+        self._babble = None
+        if rate_hz > 0.0:
+            frame = Frame(can_id, _BABBLE_DATA)
+            self._link.babble(frame)
+            self._babble, self._babble_period_ns = frame, 1e9 / rate_hz
+            self._babble_since_ns, self._babble_count = now_ns, 0
+        return "ok"
+
+    def _reboot(self, arguments: list[str], _now_ns: int) -> str:
+        _expect("reboot", arguments, 0, 1)
+        causes = {"power_on": ResetCause.POWER_ON, "watchdog": ResetCause.WATCHDOG, "brown_out": ResetCause.BROWN_OUT}
+        cause = causes.get(arguments[0] if arguments else "power_on")
+        if cause is None:
+            raise CommandError(f"reboot {arguments[0]}: say one of {', '.join(causes)}")
+        self._robot.reboot(cause)
+        return "ok"
+
+    def _state(self, arguments: list[str], now_ns: int) -> str:
+        _expect("state", arguments, 0, 0)
+        return truth_row(self._robot, now_ns)
+
+
+class CommandError(Exception):
+    """A command that cannot be obeyed; the message is one line."""
+
+
+class ProcessFaults(Protocol):
+    """Whoever can do something to processes; a harness has all of them in its hands, the simulator few."""
+
+    def begin(self, fault: ScheduledFault) -> None:
+        """Let the fault begin."""
+
+    def end(self, fault: ScheduledFault) -> None:
+        """Take it back."""
+
+
+class CpuHogs:
+    """Starts and ends busy processes at normal priority; satisfies `sim.fault_player.ProcessFaults` for `cpu_hog`."""
+
+    def __init__(self) -> None:
+        self._busy: dict[int, list[subprocess.Popen[bytes]]] = {}
+
+    def __enter__(self) -> CpuHogs:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for number in tuple(self._busy):
+            self._stop(number)
+
+    def begin(self, fault: ScheduledFault) -> None:
+        """Start one process for each core."""
+        if fault.kind.name == "cpu_hog":
+            command = [sys.executable, "-S", "-c", _BUSY]
+            self._busy[fault.number] = [subprocess.Popen(command) for _ in range(fault["cores"])]
+
+    def end(self, fault: ScheduledFault) -> None:
+        """End them."""
+        self._stop(fault.number)
+
+    def _stop(self, number: int) -> None:
+        for process in self._busy.pop(number, []):
+            process.kill()
+            process.wait()
+
+
+def _expect(name: str, arguments: list[str], least: int, most: int) -> None:
+    if not least <= len(arguments) <= most:
+        usage = next(line.split("  ")[0] for line in COMMANDS.splitlines() if line.startswith(name))
+        raise CommandError(f"{name}: {len(arguments)} arguments given; usage: {usage}")
+
+
+def _number(name: str, text: str, least: float, most: float) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        raise CommandError(f"{name} {text}: not a number") from None
+    if not least <= value <= most:
+        raise CommandError(f"{name} {text}: not within {least:g} to {most:g}")
+    return value

@@ -17,7 +17,7 @@ class FaultFileError(Exception):
     """A schedule that cannot be used; the message is one line that names file, field and remedy."""
 
 
-class Room(enum.Enum):
+class Site(enum.Enum):
     """Where a fault strikes."""
 
     FRAMES = "frames"
@@ -28,7 +28,7 @@ class Room(enum.Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Parameter:
+class FaultParameter:
     """One parameter of a kind: a number within bounds, a whole one if `whole`, or one of `choices`."""
 
     name: str
@@ -44,94 +44,94 @@ class Kind:
     """A kind of fault. `lasts`: it has a duration `for_s`; otherwise it happens at `at_s` and is over."""
 
     name: str
-    room: Room
+    site: Site
     summary: str
-    parameters: tuple[Parameter, ...] = ()
+    parameters: tuple[FaultParameter, ...] = ()
     lasts: bool = True
 
 
-def _number(name: str, default: float, least: float, most: float, *, whole: bool = False) -> Parameter:
-    return Parameter(name, default, least, most, whole=whole)
+def _number(name: str, default: float, least: float, most: float, *, whole: bool = False) -> FaultParameter:
+    return FaultParameter(name, default, least, most, whole=whole)
 
 
-_TO = Parameter("to", "both", choices=("robot", "host", "both"))
-_ONE_SIDE = Parameter("to", "robot", choices=("robot", "host"))
+_TO = FaultParameter("to", "both", choices=("robot", "host", "both"))
+_ONE_SIDE = FaultParameter("to", "robot", choices=("robot", "host"))
 _ID = _number("id", -1, -1, 0x7FF, whole=True)
 _SOME = _number("probability", 0.3, 1e-6, 1.0)
 _LATE = _number("delay_s", 0.3, 1e-3, 10.0)
 _CORES = _number("cores", 2, 1, 1024, whole=True)
 _DROP = _number("drop_v", 6.0, 0.1, 100.0)
-_WHEEL = Parameter("wheel", "left", choices=("left", "right"))
-_PROCESS = Parameter("process", "daemon", choices=("daemon", "robot", "recorder", "viewer"))
+_WHEEL = FaultParameter("wheel", "left", choices=("left", "right"))
+_PROCESS = FaultParameter("process", "daemon", choices=("daemon", "robot", "recorder", "viewer"))
 _FRAMES = (_TO, _ID, _SOME)
 
 KINDS: Mapping[str, Kind] = MappingProxyType(
     {
         kind.name: kind
         for kind in (
-            Kind("drop", Room.FRAMES, "frames are lost", _FRAMES),
-            Kind("duplicate", Room.FRAMES, "frames come twice", _FRAMES),
+            Kind("drop", Site.FRAMES, "frames are lost", _FRAMES),
+            Kind("duplicate", Site.FRAMES, "frames come twice", _FRAMES),
             Kind(
-                "delay", Room.FRAMES, "frames come late, by `growth` s more with each second that it lasts",
+                "delay", Site.FRAMES, "frames come late, by `growth` s more with each second that it lasts",
                 (*_FRAMES, _number("delay_s", 0.05, 1e-4, 10.0), _number("growth", 0.0, 0.0, 10.0)),
             ),
-            Kind("reorder", Room.FRAMES, "frames overtake", (*_FRAMES, _number("window_s", 0.03, 1e-4, 1.0))),
-            Kind("flip_before_crc", Room.FRAMES, "a bit is wrong on the wire: the link's own check sees it", _FRAMES),
-            Kind("flip_after_crc", Room.FRAMES, "a bit is wrong behind the link's check: only E2E can see it", _FRAMES),
-            Kind("wrong_length", Room.FRAMES, "frames are cut short or padded behind the link's check", _FRAMES),
+            Kind("reorder", Site.FRAMES, "frames overtake", (*_FRAMES, _number("window_s", 0.03, 1e-4, 1.0))),
+            Kind("flip_before_crc", Site.FRAMES, "a bit is wrong on the wire: the link's own check sees it", _FRAMES),
+            Kind("flip_after_crc", Site.FRAMES, "a bit is wrong behind the link's check: only E2E can see it", _FRAMES),
+            Kind("wrong_length", Site.FRAMES, "frames are cut short or padded behind the link's check", _FRAMES),
             Kind(
-                "babble", Room.LINK, "another node sends zeros under an identifier",
+                "babble", Site.LINK, "another node sends zeros under an identifier",
                 (_number("id", 0x100, 0, 0x7FF, whole=True), _number("rate_hz", 400.0, 0.1, 100_000.0)),
             ),
             Kind(
-                "bus_off", Room.LINK, "a controller leaves the bus",
-                (Parameter("who", "host", choices=("host", "robot")),), lasts=False,
+                "bus_off", Site.LINK, "a controller leaves the bus",
+                (FaultParameter("who", "host", choices=("host", "robot")),), lasts=False,
             ),
-            Kind("one_way", Room.LINK, "nothing arrives on one side", (_ONE_SIDE,)),
-            Kind("unplug", Room.LINK, "the line is pulled out and put back in"),
-            Kind("unplug_mid_frame", Room.LINK, "the same, in the middle of a frame"),
-            Kind("encoder_stuck", Room.SENSORS, "an encoder does not count", (_WHEEL,)),
+            Kind("one_way", Site.LINK, "nothing arrives on one side", (_ONE_SIDE,)),
+            Kind("unplug", Site.LINK, "the line is pulled out and put back in"),
+            Kind("unplug_mid_frame", Site.LINK, "the same, in the middle of a frame"),
+            Kind("encoder_stuck", Site.SENSORS, "an encoder does not count", (_WHEEL,)),
             Kind(
-                "encoder_jump", Room.SENSORS, "an encoder's count jumps",
+                "encoder_jump", Site.SENSORS, "an encoder's count jumps",
                 (_WHEEL, _number("ticks", 5000, -(1 << 31), 1 << 31, whole=True)), lasts=False,
             ),
             Kind(
-                "encoder_wrap", Room.SENSORS, "an encoder's count has so many bits only",
+                "encoder_wrap", Site.SENSORS, "an encoder's count has so many bits only",
                 (_WHEEL, _number("bits", 10, 4, 31, whole=True)),
             ),
-            Kind("encoder_reversed", Room.SENSORS, "an encoder counts backwards", (_WHEEL,)),
-            Kind("pose_frozen", Room.SENSORS, "the pose sensor repeats its last pose under new stamps"),
+            Kind("encoder_reversed", Site.SENSORS, "an encoder counts backwards", (_WHEEL,)),
+            Kind("pose_frozen", Site.SENSORS, "the pose sensor repeats its last pose under new stamps"),
             Kind(
-                "pose_jump", Room.SENSORS, "measured poses are elsewhere",
+                "pose_jump", Site.SENSORS, "measured poses are elsewhere",
                 (_number("dx_m", 2.0, -1e3, 1e3), _number("dy_m", 0.0, -1e3, 1e3), _number("dyaw_rad", 0.0, -3.2, 3.2)),
             ),
-            Kind("pose_late", Room.SENSORS, "poses come later, with their true stamps", (_LATE,)),
-            Kind("pose_swapped", Room.SENSORS, "x and y of measured poses are exchanged"),
-            Kind("pose_nan", Room.SENSORS, "measured poses are not numbers"),
-            Kind("pose_silent", Room.SENSORS, "no poses are measured"),
+            Kind("pose_late", Site.SENSORS, "poses come later, with their true stamps", (_LATE,)),
+            Kind("pose_swapped", Site.SENSORS, "x and y of measured poses are exchanged"),
+            Kind("pose_nan", Site.SENSORS, "measured poses are not numbers"),
+            Kind("pose_silent", Site.SENSORS, "no poses are measured"),
             Kind(
-                "clock_jump", Room.ROBOT, "the controller's clock jumps", (_number("step_s", 1.0, -3600.0, 3600.0),),
+                "clock_jump", Site.ROBOT, "the controller's clock jumps", (_number("step_s", 1.0, -3600.0, 3600.0),),
                 lasts=False,
             ),
-            Kind("brown_out", Room.ROBOT, "the controller loses power for a moment", lasts=False),
+            Kind("brown_out", Site.ROBOT, "the controller loses power for a moment", lasts=False),
             Kind(
-                "reboot", Room.ROBOT, "the controller restarts",
-                (Parameter("cause", "power_on", choices=("power_on", "watchdog")),), lasts=False,
+                "reboot", Site.ROBOT, "the controller restarts",
+                (FaultParameter("cause", "power_on", choices=("power_on", "watchdog")),), lasts=False,
             ),
-            Kind("motor_stall", Room.ROBOT, "a wheel is blocked and draws 18 A", (_WHEEL,)),
-            Kind("battery_sag", Room.ROBOT, "the battery's voltage falls", (_DROP,)),
-            Kind("estop_button", Room.ROBOT, "the button on the robot is held down"),
-            Kind("cpu_hog", Room.PROCESS, "busy processes on so many cores", (_CORES,)),
-            Kind("disk_full", Room.PROCESS, "nothing more can be written to the log"),
-            Kind("sigstop", Room.PROCESS, "a process is frozen (SIGSTOP, then SIGCONT)", (_PROCESS,)),
-            Kind("sigkill", Room.PROCESS, "a process is killed (SIGKILL) and started again afterwards", (_PROCESS,)),
+            Kind("motor_stall", Site.ROBOT, "a wheel is blocked and draws 18 A", (_WHEEL,)),
+            Kind("battery_sag", Site.ROBOT, "the battery's voltage falls", (_DROP,)),
+            Kind("estop_button", Site.ROBOT, "the button on the robot is held down"),
+            Kind("cpu_hog", Site.PROCESS, "busy processes on so many cores", (_CORES,)),
+            Kind("disk_full", Site.PROCESS, "nothing more can be written to the log"),
+            Kind("sigstop", Site.PROCESS, "a process is frozen (SIGSTOP, then SIGCONT)", (_PROCESS,)),
+            Kind("sigkill", Site.PROCESS, "a process is killed (SIGKILL) and started again afterwards", (_PROCESS,)),
         )
     }
 )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
-class Fault:
+class ScheduledFault:
     """One fault of a schedule: from `begin_ns` to `end_ns` of the schedule's time, with its parameters by name."""
 
     number: int
@@ -144,8 +144,8 @@ class Fault:
         return self.values[name]
 
     def __str__(self) -> str:
-        told = "".join(f" {name}={_short(value)}" for name, value in self.values.items())
-        return f"{self.kind.name}{told}"
+        values = "".join(f" {name}={_short(value)}" for name, value in self.values.items())
+        return f"{self.kind.name}{values}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,7 +153,7 @@ class FaultSchedule:
     """Faults in the order in which they begin; `seed` decides whatever in them is left to chance."""
 
     seed: int
-    faults: tuple[Fault, ...]
+    faults: tuple[ScheduledFault, ...]
 
 
 def parse_schedule(text: str, name: str = "schedule") -> FaultSchedule:
@@ -182,10 +182,10 @@ def schedule_of(table: Mapping[str, Any], name: str) -> FaultSchedule:
     return FaultSchedule(seed, in_order([_fault(entry, f"{name}: fault {i}") for i, entry in enumerate(entries, 1)]))
 
 
-def in_order(faults: Sequence[Fault]) -> tuple[Fault, ...]:
+def in_order(faults: Sequence[ScheduledFault]) -> tuple[ScheduledFault, ...]:
     """The faults by their beginnings, numbered from 1 in that order."""
     ordered = sorted(faults, key=lambda fault: (fault.begin_ns, fault.end_ns, fault.kind.name))
-    return tuple(Fault(i, f.kind, f.begin_ns, f.end_ns, f.values) for i, f in enumerate(ordered, 1))
+    return tuple(ScheduledFault(i, f.kind, f.begin_ns, f.end_ns, f.values) for i, f in enumerate(ordered, 1))
 
 
 def write_schedule(schedule: FaultSchedule) -> str:
@@ -209,7 +209,7 @@ def kinds_table() -> str:
     )
 
 
-def _fault(entry: dict[str, Any], where: str) -> Fault:
+def _fault(entry: dict[str, Any], where: str) -> ScheduledFault:
     kind = KINDS.get(entry.get("kind", "")) if isinstance(entry.get("kind"), str) else None
     if kind is None:
         raise FaultFileError(f"{where}: kind: {entry.get('kind')!r} is none; say one of {', '.join(KINDS)}")
@@ -223,10 +223,10 @@ def _fault(entry: dict[str, Any], where: str) -> Fault:
     for_s = _bounded(entry.get("for_s"), f"{where}: for_s", 0.0, MAX_TIME_S) if kind.lasts else 0.0
     values = {name: _value(entry.get(name, p.default), p, f"{where}: {name}") for name, p in known.items()}
     begin_ns = round(at_s * 1e9)
-    return Fault(0, kind, begin_ns, begin_ns + round(for_s * 1e9), values)
+    return ScheduledFault(0, kind, begin_ns, begin_ns + round(for_s * 1e9), values)
 
 
-def _value(value: Any, parameter: Parameter, where: str) -> float | str:
+def _value(value: Any, parameter: FaultParameter, where: str) -> float | str:
     if parameter.choices:
         if value not in parameter.choices:
             raise FaultFileError(f"{where}: {value!r} is none; say one of {', '.join(parameter.choices)}")
@@ -263,7 +263,7 @@ def random_schedule(
     drawn over ranges in which a robot may or may not go on. The same seed gives the same schedule on any machine.
     """
     chance = random.Random(seed)
-    faults: list[Fault] = []
+    faults: list[ScheduledFault] = []
     now_s = chance.uniform(*quiet_s)
     while now_s < duration_s:
         kind = KINDS[chance.choice(list(kinds))]
@@ -271,7 +271,7 @@ def random_schedule(
         for_s = lasting_s[0] * ratio ** chance.random() if kind.lasts else 0.0
         begin_ns = round(now_s * 1e6) * 1000
         values = {p.name: _drawn(kind.name, p, chance) for p in kind.parameters}
-        faults.append(Fault(0, kind, begin_ns, begin_ns + round(for_s * 1e6) * 1000, values))
+        faults.append(ScheduledFault(0, kind, begin_ns, begin_ns + round(for_s * 1e6) * 1000, values))
         now_s += for_s + chance.uniform(*quiet_s)
     return FaultSchedule(seed, in_order(faults))
 
@@ -298,7 +298,7 @@ _FRAME_IDS = (-1, -1, -1, 0x100, 0x101, 0x110, 0x111, 0x118, 0x119, 0x130, 0x133
 _BABBLED_IDS = (0x000, 0x080, 0x100, 0x101, 0x110, 0x130, 0x7FF)
 
 
-def _drawn(kind: str, parameter: Parameter, chance: random.Random) -> float | str:
+def _drawn(kind: str, parameter: FaultParameter, chance: random.Random) -> float | str:
     if (kind, parameter.name) in _NOT_DRAWN:
         return parameter.default
     if parameter.choices:

@@ -1,7 +1,7 @@
-"""The simulated CAN bus between processes, in real time: whoever connects to a Unix socket is a node on it.
+"""The simulated CAN bus between processes, in real time: a client of a Unix socket is a node on it.
 
 Each packet on the socket is one Linux `struct can_frame`. Without threads: the owner waits on `fileno()` and
-`next_event_ns()` and calls `pump`.
+`next_event_ns()` and calls `pump`. `HubLink` is the virtual robot on a hub that its own process serves to others.
 """
 
 from __future__ import annotations
@@ -12,15 +12,16 @@ import socket
 import sys
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from sim.bus import BusFault, CanBus, Delivery
+from drivers.types import Frame, ReceivedFrame
+from sim.bus import BusFault, CanBus, DeliveredFrame
 from sim.bus_node import BusNode, TransmitOrder
 from sim.can_frame import ECHO_OWN_FRAMES, FRAME_BYTES, CanFrame, pack_frame, receive_overflow_frame, unpack_frame
-from sim.stop_signal import StopSignal
-from sim.unix_listener import SocketPathError, bind_private
+from sim.process import SocketPathError, StopSignal, bind_private
+from sim.robot_link import LinkFaultError, RobotNode
 
 CLIENT_TRANSMIT_QUEUE = 32
 READER_QUEUE = 1024
@@ -96,7 +97,7 @@ class Hub:
         times.extend(client.last_read_ns + READER_STALL_NS for client in self._held_up_by())
         return min(times) if times else None
 
-    def pump(self, now_ns: int) -> list[Delivery]:
+    def pump(self, now_ns: int) -> list[DeliveredFrame]:
         """Take in what clients wrote, let the bus run up to `now_ns`, and hand out what was received; never blocks.
 
         Returns the deliveries, for nodes that the owner has attached to `bus` itself.
@@ -122,7 +123,7 @@ class Hub:
         self._set_events()
         return len(self._inbox)
 
-    def advance(self, now_ns: int, admit: int | None = None) -> list[Delivery]:
+    def advance(self, now_ns: int, admit: int | None = None) -> list[DeliveredFrame]:
         """Let the oldest `admit` waiting frames (None: all) onto the bus and run it up to `now_ns`."""
         deliveries = self.bus.advance(now_ns)
         for _ in range(len(self._inbox) if admit is None else admit):
@@ -278,6 +279,90 @@ class Hub:
         del self._by_node[client.node]
         client.connection.close()
         self._leaving.append(client)
+
+
+class HubLink:
+    """A hub at `path` with the robot as a node; satisfies `sim.robot_link.RobotLink`.
+
+    `log` gets a line for every frame on the bus, as candump writes it. Raises SocketPathError if the hub cannot listen.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        now_ns: int,
+        *,
+        bitrate: int = 500_000,
+        pacing: bool = True,
+        log: Callable[[str], object] | None = None,
+    ) -> None:
+        self.hub = Hub(path, now_ns, bitrate=bitrate, pacing=pacing, log=log)
+        self._robot = RobotNode(self.hub.bus)
+        self.robot = self._robot.node
+
+    @property
+    def address(self) -> str:
+        """The hub's socket."""
+        return f"unixcan {self.hub.path}"
+
+    @property
+    def error_counters(self) -> tuple[int, int]:
+        """Error counters of the robot's node; the first is 256 at bus-off."""
+        return self._robot.error_counters
+
+    def filenos(self) -> list[int]:
+        """The hub's epoll descriptor."""
+        return [self.hub.fileno()]
+
+    def next_event_ns(self) -> int | None:
+        """When a frame ends, a restart is due, or clients may come back."""
+        times = [t for t in (self.hub.next_event_ns(), self._robot.restart_ns) if t is not None]
+        return min(times) if times else None
+
+    def collect(self, now_ns: int) -> int:
+        """Serve the sockets."""
+        return self.hub.collect(now_ns)
+
+    def advance(self, now_ns: int, admit: int | None = None) -> list[ReceivedFrame]:
+        """Run the bus up to `now_ns`; return the data frames that the robot's controller has received."""
+        return self._robot.take(now_ns, self.hub.advance(now_ns, admit))
+
+    def send(self, frames: Sequence[Frame]) -> None:
+        """Queue the robot's frames; the node counts those that do not fit."""
+        self._robot.send(frames)
+
+    def unplug(self, until_ns: int) -> None:
+        """Cut off all clients and refuse new ones until then."""
+        self.hub.unplug(until_ns)
+
+    def force_bus_off(self, who: str) -> None:
+        """Put all clients ("host") or the robot's controller ("robot") into bus-off."""
+        if who == "host":
+            self.hub.force_clients_bus_off()
+        elif who == "robot":
+            self.hub.bus.force_bus_off(self.robot)
+        else:
+            raise LinkFaultError(f"bus_off {who}: say host or robot")
+
+    def babble(self, frame: Frame) -> None:
+        """Send `frame` from a third node; if its queue is full it is on the bus as often as the bus allows."""
+        self._robot.babble(frame)
+
+    def tamper(self, fault: BusFault) -> None:
+        """Let `fault` decide what becomes of each frame."""
+        self.hub.bus.fault = fault
+
+    def summary(self) -> str:
+        """Counters in one line."""
+        robot = self.robot
+        return (
+            f"{self.hub.stats} robot: sent={robot.sent} received={robot.received} full={robot.refused_full} "
+            f"bus_off={robot.bus_off_count} error_frames={self.hub.bus.error_frames}"
+        )
+
+    def close(self) -> None:
+        """Close the hub and remove its socket."""
+        self.hub.close()
 
 
 def main() -> int:

@@ -1,27 +1,29 @@
 """The physical robot: wheel-speed setpoints in, encoder ticks, poses and motor readings out; the truth for scoring.
 
-Command -> wheels -> encoders and body -> pose sensor, each in a module of its own, integrated on an absolute time grid
-of `integration_step_us`. Everything random comes from the seed; the trajectory does not depend on how a run is cut
-into calls of `step`.
+Command -> wheels -> encoders and body -> pose sensor, integrated on an absolute time grid of `integration_step_us`.
+Everything random comes from the seed; disturbances belong to cells of that grid, so that the trajectory does not depend
+on how a run is cut into calls of `step`.
 """
 
 from __future__ import annotations
 
 import bisect
+import math
 from collections import deque
 
 import msgspec
 import numpy as np
+import numpy.typing as npt
 
-from sim.body_dynamics import Body, Pose
-from sim.disturbances import CELLS, Disturbances
+from drivers.kernel_cache import compiled
+from sim.body_dynamics import Body, BodyPose
 from sim.effects import HiddenEffects
-from sim.electrics import Battery, Electrics
-from sim.encoders import Encoders
 from sim.plant_parameters import PlantParameters
-from sim.pose_sensor import PoseMeasurement, PoseSensor, wrapped
-from sim.wheel_dynamics import Wheels
+from sim.sensors import Battery, Electrics, Encoders, PoseMeasurement, SampledPoseSensor, wrapped
+from sim.wheel_dynamics import WheelMotors
 
+CELLS = 1024
+Array = npt.NDArray[np.float64]
 ELECTRICS_STEP_US = 10_000
 
 
@@ -55,16 +57,16 @@ class Plant:
         parameters: PlantParameters | None = None,
         effects: HiddenEffects | None = None,
         seed: int = 0,
-        start: Pose | None = None,
+        start: BodyPose | None = None,
     ) -> None:
         self.parameters = parameters or PlantParameters()
         self.effects = effects or HiddenEffects()
         disturbance_seed, pose_seed = np.random.SeedSequence(seed).spawn(2)
         self._disturbances = Disturbances(self.parameters, disturbance_seed)
-        self._wheels = Wheels(self.parameters, self.effects, capacity=CELLS)
+        self._wheels = WheelMotors(self.parameters, self.effects, capacity=CELLS)
         self._encoders = Encoders(self.parameters, self.effects)
-        self._body = Body(self.parameters, self.effects, start or Pose())
-        self._pose_sensor = PoseSensor(self.parameters, self.effects, pose_seed)
+        self._body = Body(self.parameters, self.effects, start or BodyPose())
+        self._pose_sensor = SampledPoseSensor(self.parameters, self.effects, pose_seed)
         self._electrics = Electrics(self.parameters, self.effects)
         self._step_us = self.parameters.integration_step_us
         self._delay_us = round(self.effects.values("command_delay")[0] * 1e6)
@@ -181,3 +183,70 @@ class Plant:
 
 def _available_us(measurement: PoseMeasurement) -> int:
     return measurement.available_us
+
+
+class Disturbances:
+    """Blocks of `CELLS` grid cells, each `integration_step_us` long.
+
+    `wheel`: shape (CELLS, 2), relative error of the left and right wheel speed. `slip`: shape (CELLS, 3), velocity of
+    the body that the wheels do not cause: forward (m/s), left (m/s), yaw rate (rad/s). Row 0 is cell `first_cell`.
+
+    Each is an Ornstein-Uhlenbeck process; `volatility` > 0 multiplies it by exp(volatility q - volatility^2) with q
+    another such process of unit variance, which keeps the variance and makes the tails heavy and bursty.
+    """
+
+    def __init__(self, parameters: PlantParameters, seed: np.random.SeedSequence) -> None:
+        wheel_seed, slip_seed = seed.spawn(2)
+        self._wheel_generator = np.random.default_rng(wheel_seed)
+        self._slip_generator = np.random.default_rng(slip_seed)
+        p = parameters
+        dt = p.integration_step_us * 1e-6
+        fast = math.exp(-dt / p.wheel_disturbance_correlation_s)
+        slow = math.exp(-dt / p.wheel_wander_correlation_s)
+        slip = math.exp(-dt / p.slip_correlation_s)
+        burst = math.exp(-dt / p.volatility_correlation_s)
+        self._wheel_decay = np.array([fast, fast, slow, slow, burst])
+        self._slip_decay = np.array([slip, slip, slip, burst])
+        self._wheel_std = p.wheel_disturbance_std
+        self._wander_std = p.wheel_wander_std
+        self._slip_std = np.array([p.slip_std_x_m_s, p.slip_std_y_m_s, p.slip_std_yaw_rad_s])
+        self._volatility = p.volatility
+        self._wheel_last = self._wheel_generator.standard_normal(len(self._wheel_decay))
+        self._slip_last = self._slip_generator.standard_normal(len(self._slip_decay))
+        self.first_cell = 0
+        self.wheel = self._wheel_block()
+        self.slip = self._slip_block()
+
+    def move_to(self, cell: int) -> None:
+        """Make the block hold this cell; cells may only go up."""
+        while cell >= self.first_cell + CELLS:
+            self.first_cell += CELLS
+            self.wheel = self._wheel_block()
+            self.slip = self._slip_block()
+
+    def _wheel_block(self) -> Array:
+        unit = _correlated(self._wheel_generator, self._wheel_decay, self._wheel_last)
+        fast = self._wheel_std * unit[:, :2] * self._bursts(unit[:, 4:])
+        return np.ascontiguousarray(fast + self._wander_std * unit[:, 2:4])
+
+    def _slip_block(self) -> Array:
+        unit = _correlated(self._slip_generator, self._slip_decay, self._slip_last)
+        return np.ascontiguousarray(self._slip_std * unit[:, :3] * self._bursts(unit[:, 3:]))
+
+    def _bursts(self, unit: Array) -> Array:
+        return np.exp(self._volatility * unit - self._volatility**2)
+
+
+def _correlated(generator: np.random.Generator, decay: Array, last: Array) -> Array:
+    """Continue unit-variance AR(1) processes by one block, shape (CELLS, len(decay)); `last` is moved on in place."""
+    block = generator.standard_normal((CELLS, len(decay)))
+    _filter(block, decay, np.sqrt(1.0 - decay**2), last)
+    return block
+
+
+@compiled
+def _filter(block: Array, decay: Array, gain: Array, last: Array) -> None:
+    for row in range(block.shape[0]):
+        for column in range(block.shape[1]):
+            last[column] = decay[column] * last[column] + gain[column] * block[row, column]
+            block[row, column] = last[column]

@@ -105,7 +105,7 @@ class PythonCanLink:
         self._retry_ns = until_ns
 
     def force_bus_off(self, who: str) -> None:
-        """A controller cannot be told to fail through python-can."""
+        """A controller cannot be made to fail through python-can."""
         raise LinkFaultError(f"bus_off {who}: only on the simulator's own bus (interface unixcan)")
 
     def babble(self, frame: Frame) -> None:

@@ -22,8 +22,7 @@ from drivers.types import Frame, ReceivedFrame
 from firmware_protocol.serial_framing import FrameDecoder, encode_frame
 from sim.bus import UNHARMED, BusFault, FrameFate
 from sim.can_frame import CanFrame, candump_line
-from sim.faults import ROBOT_NODE
-from sim.robot_link import LinkFaultError
+from sim.robot_link import ROBOT_NODE, LinkFaultError
 
 BITS_PER_BYTE = 10
 BAUD_TOLERANCE = 0.03

@@ -1,6 +1,7 @@
 """The robot as the host sees it: the plant, the reference firmware core on its controller, and the controller's clock.
 
-Pure: call `VirtualRobot.step` at 1 kHz of robot time and carry the frames to and fro.
+Pure: call `VirtualRobot.step` at 1 kHz of robot time and carry the frames to and fro. `TruthRecorder` writes the truth
+that the host does not see, as CSV for scoring.
 """
 
 from __future__ import annotations
@@ -17,18 +18,37 @@ from firmware_protocol.firmware_core import (
     ResetCause,
     drawn_entropy,
 )
+from sim.faults import RobotFaults
 from sim.plant import Plant, TrueState
-from sim.pose_sensor import PoseMeasurement
-from sim.robot_faults import RobotFaults
+from sim.process import TextRecord
+from sim.sensors import PoseMeasurement
 
 STEP_US = 1000
 EARLIEST_JUMP_US = 10_000_000
-
 _RELEASED = FirmwareOutputs(0.0, 0.0, False, True, False, "BOOT", 0, 0, "NONE", "NONE", 0, 0, 0, 0, 0)
+TRUTH_COLUMNS = (
+    "t_ns",
+    "x_m",
+    "y_m",
+    "yaw_rad",
+    "left_speed_rad_s",
+    "right_speed_rad_s",
+    "left_setpoint_rad_s",
+    "right_setpoint_rad_s",
+    "speed_m_s",
+    "yaw_rate_rad_s",
+    "state",
+    "driver_enabled",
+    "brake",
+    "session",
+    "accepted_commands",
+    "fault",
+)
+FLUSH_NS = 1_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
-class DeviceClock:
+class ControllerClock:
     """The controller's microsecond counter: `start_us` at robot time 0, `skew_ppm` too fast."""
 
     start_us: int = 1_234_567_890
@@ -50,13 +70,17 @@ class VirtualRobot:
     """
 
     def __init__(
-        self, plant: Plant, config: FirmwareConfig, clock: DeviceClock | None = None, challenge_seed: int | None = None
+        self,
+        plant: Plant,
+        config: FirmwareConfig,
+        clock: ControllerClock | None = None,
+        challenge_seed: int | None = None,
     ) -> None:
         self.plant = plant
         self.estop_button = False
         self.faults: RobotFaults | None = None
         self._config = config
-        self._clock = clock or DeviceClock()
+        self._clock = clock or ControllerClock()
         self._clock_start_us = 0
         self._challenge_seed = challenge_seed
         self._reset_cause = ResetCause.POWER_ON
@@ -147,14 +171,14 @@ class VirtualRobot:
     def jump_clock(self, step_us: int) -> None:
         """Set the controller's clock forward, or back, though never to before its tenth second."""
         largest_us = max(0, self.device_us(self.now_us) - EARLIEST_JUMP_US)
-        self._clock = DeviceClock(self._clock.start_us + max(step_us, -largest_us), self._clock.skew_ppm)
+        self._clock = ControllerClock(self._clock.start_us + max(step_us, -largest_us), self._clock.skew_ppm)
 
     def reboot(self, cause: ResetCause = ResetCause.POWER_ON) -> None:
         """Restart the controller: it forgets everything, its clock begins anew, the wheels brake until it is up."""
         last_entropy, self._entropy = self._entropy, self._draw_entropy()
         self._reset_cause = cause
         self._clock_start_us = self.plant.now_us
-        self._clock = DeviceClock(0, self._clock.skew_ppm)
+        self._clock = ControllerClock(0, self._clock.skew_ppm)
         self._firmware = FirmwareCore(self._config, self._entropy, last_entropy)
         self._outputs = _RELEASED
 
@@ -163,3 +187,32 @@ class VirtualRobot:
             return drawn_entropy()
         self._challenge_seed += 1
         return self._challenge_seed
+
+
+def truth_row(robot: VirtualRobot, t_ns: int) -> str:
+    """The values of `TRUTH_COLUMNS` at the last step, which was at the monotonic time `t_ns`, separated by commas."""
+    truth, outputs = robot.truth, robot.outputs
+    return (
+        f"{t_ns},{truth.x_m:.6f},{truth.y_m:.6f},{truth.yaw_rad:.6f},"
+        f"{truth.left_speed_rad_s:.5f},{truth.right_speed_rad_s:.5f},"
+        f"{outputs.left_setpoint_rad_s:.5f},{outputs.right_setpoint_rad_s:.5f},"
+        f"{truth.speed_m_s:.6f},{truth.yaw_rate_rad_s:.6f},{outputs.state},"
+        f"{int(outputs.driver_enabled)},{int(outputs.brake)},{outputs.session},{outputs.accepted_commands},{outputs.fault}"
+    )
+
+
+class TruthRecorder:
+    """Writes `TRUTH_COLUMNS` as CSV; what is older than a second is on disk."""
+
+    def __init__(self, record: TextRecord) -> None:
+        self._record = record
+        record.line(",".join(TRUTH_COLUMNS))
+        record.flush()
+        self._flushed_ns = 0
+
+    def record(self, robot: VirtualRobot, t_ns: int) -> None:
+        """Write the state of the last step, which was at the monotonic time `t_ns`."""
+        self._record.line(truth_row(robot, t_ns))
+        if t_ns - self._flushed_ns >= FLUSH_NS:
+            self._flushed_ns = t_ns
+            self._record.flush()

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sim.compiled import compiled
+from drivers.kernel_cache import compiled
 from sim.effects import HiddenEffects
 from sim.plant_parameters import PlantParameters
 
@@ -75,7 +75,7 @@ _WHEEL = np.dtype(
 
 @dataclass(frozen=True, slots=True)
 class WheelPieces:
-    """What `Wheels.advance` fills: the ends of its integration pieces (us) and the wheel angles there (rad).
+    """What `WheelMotors.advance` fills: the ends of its integration pieces (us) and the wheel angles there (rad).
 
     times_us: shape (capacity,); angles: shape (capacity, 2), left and right.
     """
@@ -84,7 +84,7 @@ class WheelPieces:
     angles: Floats
 
 
-class Wheels:
+class WheelMotors:
     """Both wheels with motors and command handling."""
 
     def __init__(self, parameters: PlantParameters, effects: HiddenEffects, capacity: int) -> None:

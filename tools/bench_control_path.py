@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 import disco_hw
 from disco_hw.control import CommandLimits, Disco, DiscoSettings, PlannerState, SentCommand
 from disco_hw.experiments.circle import plants
-from disco_hw.experiments.plant import Plant
+from disco_hw.experiments.plant import KinematicPlant
 from disco_hw.model import Model, load_model
 from disco_hw.tasks.line.waypoints import load_waypoints
 from disco_hw.tasks.path import PathTask
@@ -98,7 +98,7 @@ def drive(model: Model, task: PathTask, theta: dict[str, float], facing: str, se
     """One drive from the first way-point: x, y (m), forward speed (m/s) and place in the table after each period."""
     path = task.planned("default")
     x_m, y_m, yaw_rad = task.course().start
-    plant = Plant(theta, (x_m, y_m, yaw_rad + TURNED_RAD[facing]), LAG_S, WHEEL_NOISE, seed)
+    plant = KinematicPlant(theta, (x_m, y_m, yaw_rad + TURNED_RAD[facing]), LAG_S, WHEEL_NOISE, seed)
     planner = Disco(model, path, DiscoSettings(), LIMITS, seed + 1)
     sent: list[SentCommand] = []
     rows = np.empty((round(duration_s * RATE_HZ), 4))

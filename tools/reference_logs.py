@@ -32,7 +32,7 @@ from disco_hw.runtime.assembly import make_planner, put_in_force
 from disco_hw.runtime.pipeline import NoPlanner, Planner
 from disco_hw.runtime.robot_setup import Setup, load_setup
 from disco_hw.runtime.supervisor import UserRequest
-from sim.body_dynamics import Pose
+from sim.body_dynamics import BodyPose
 from sim.plant_parameters import PlantParameters
 
 DIRECTORY = Path(__file__).parents[1] / "tests" / "runtime" / "reference_logs"
@@ -98,7 +98,7 @@ def planner() -> Planner:
 def simulated(chosen: Planner, needs_pose: bool = True) -> SimulatedRun:
     """The shipped robot on its circle."""
     shipped = load_setup(ROBOTS / "wombot.toml")
-    robot = virtual_robot(shipped, PlantParameters(), Pose(0.75, 0.0, 1.5707963))
+    robot = virtual_robot(shipped, PlantParameters(), BodyPose(0.75, 0.0, 1.5707963))
     return SimulatedRun(shipped, robot, chosen, needs_pose=needs_pose)
 
 

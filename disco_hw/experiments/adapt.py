@@ -26,7 +26,7 @@ from disco_hw.runtime.assembly import make_planner
 from disco_hw.runtime.robot_setup import Setup
 from disco_hw.runtime.supervisor import UserRequest
 from disco_hw.tasks.circle import CircleTask, circle_task
-from sim.body_dynamics import Pose
+from sim.body_dynamics import BodyPose
 from sim.plant_parameters import PlantParameters
 
 Array = NDArray[np.float64]
@@ -247,7 +247,7 @@ def drive(
         wheel_radius_m=float(mean[1]),
         axial_distance_m=float(mean[2]),
     )
-    start = Pose(task.center_x_m + task.radius_m, task.center_y_m, 0.5 * math.pi)
+    start = BodyPose(task.center_x_m + task.radius_m, task.center_y_m, 0.5 * math.pi)
     run = SimulatedRun(
         setup,
         virtual_robot(setup, plant, start, effects=effects, seed=seed),

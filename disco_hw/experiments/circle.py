@@ -20,7 +20,7 @@ from disco_hw.control.disco import Disco
 from disco_hw.control.plan import PlannerState, SentCommand
 from disco_hw.control.settings import ROTATION, CommandLimits, DiscoSettings
 from disco_hw.errors import InputError
-from disco_hw.experiments.plant import Plant
+from disco_hw.experiments.plant import KinematicPlant
 from disco_hw.model import Model, Uniform
 from disco_hw.model.parameter import BASE_PARAMETERS
 from disco_hw.tasks.circle import CircleCost, CircleTask
@@ -200,7 +200,7 @@ def planner_command(
 def drive(command: Command, theta: dict[str, float], options: CircleOptions, seed: int) -> Run:
     """Drive a plant with these parameters by a controller for the whole duration."""
     circle, period_s = CircleCost(), 1.0 / options.rate_hz
-    plant = Plant(theta, (circle.radius_m, 0.0, math.pi / 2), options.lag_s, options.wheel_noise, seed)
+    plant = KinematicPlant(theta, (circle.radius_m, 0.0, math.pi / 2), options.lag_s, options.wheel_noise, seed)
     count = round(options.duration_s * options.rate_hz)
     poses, speeds, commands = np.empty((count, 3)), np.empty(count), np.empty((count, 2))
     sent: list[SentCommand] = []

@@ -35,12 +35,12 @@ from drivers.motor.reference import ReferenceDriver
 from drivers.types import RobotLinkHealth, RobotStatus
 from firmware_protocol.codec import Codec
 from firmware_protocol.firmware_core import FirmwareConfig
-from sim.body_dynamics import Pose
+from sim.body_dynamics import BodyPose
 from sim.fault_player import FaultPlayer
-from sim.fault_schedule import Fault, FaultSchedule
+from sim.fault_schedule import FaultSchedule, ScheduledFault
+from sim.in_process import SimulatedCan
 from sim.plant import Plant, TrueState
 from sim.plant_parameters import PlantParameters
-from sim.simulated_can import SimulatedCan
 from sim.virtual_robot import VirtualRobot
 
 ROBOT_FILE = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
@@ -192,7 +192,7 @@ class LogReader:
 class FaultOutcome:
     """What became of one fault: `stopped_s` from its beginning to zero setpoints if the robot left ARMED."""
 
-    fault: Fault
+    fault: ScheduledFault
     armed_before: bool
     struck: bool = True
     stopped_s: float | None = None
@@ -248,7 +248,7 @@ class FaultRun:
             encoder_start_left_ticks=WRAP_SOON_TICKS, encoder_start_right_ticks=WRAP_SOON_TICKS
         )
         task = circle_task(self.config.task, "the campaign")
-        start = Pose(task.center_x_m + task.radius_m, task.center_y_m, 0.5 * math.pi)
+        start = BodyPose(task.center_x_m + task.radius_m, task.center_y_m, 0.5 * math.pi)
         parameters = replace(parameters, wheel_radius_m=0.061, axial_distance_m=0.415, x_icr_m=0.238)
         self.robot = VirtualRobot(
             Plant(parameters, None, seed, start),
@@ -307,7 +307,7 @@ class FaultRun:
         self.outcome.commands_accepted = monitor.commands_accepted
         return self.outcome
 
-    def begin(self, fault: Fault) -> None:
+    def begin(self, fault: ScheduledFault) -> None:
         """Do to the daemon what befalls its process."""
         name, process = fault.kind.name, fault.values.get("process")
         if name == "cpu_hog":
@@ -320,7 +320,7 @@ class FaultRun:
         elif process == "robot" and name == "sigkill":
             self.robot.reboot()
 
-    def end(self, fault: Fault) -> None:
+    def end(self, fault: ScheduledFault) -> None:
         """Let it go on, or start it again."""
         name, process = fault.kind.name, fault.values.get("process")
         if name == "cpu_hog":
@@ -358,7 +358,7 @@ class FaultRun:
             extra = (counters(core, self._loop, RecorderStats(), now_ns),)
         core.tick(now_ns, self._attendant.requests(now_ns, core.last), extra)
 
-    def _note_faults(self, begun: Sequence[Fault], ended: Sequence[Fault], armed: bool) -> None:
+    def _note_faults(self, begun: Sequence[ScheduledFault], ended: Sequence[ScheduledFault], armed: bool) -> None:
         for fault in begun:
             self._open.append(_Open(FaultOutcome(fault, armed), dict(self.log.counts), len(self.log.told)))
         for fault in ended:
@@ -416,9 +416,9 @@ class FaultRun:
     def _finish(self, opened: _Open) -> None:
         outcome, log = opened.outcome, self.log
         fault = outcome.fault
-        if fault.kind.room.value == "frames" or fault.kind.name == "one_way":
+        if fault.kind.site.value == "frames" or fault.kind.name == "one_way":
             outcome.struck = self._player.frames.struck.get(fault.number, 0) > 0
-        elif fault.kind.room.value == "process":
+        elif fault.kind.site.value == "process":
             outcome.struck = (fault.kind.name, fault.values.get("process")) in _DONE_TO_PROCESSES
         rises = {n: v - opened.counts.get(n, 0) for n, v in log.counts.items() if n not in _USUAL}
         changed = {n for n, rise in rises.items() if abs(rise) > _BY_CHANCE.get(n, 0)}

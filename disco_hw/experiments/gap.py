@@ -35,7 +35,7 @@ from disco_hw.runtime.assembly import make_planner
 from disco_hw.runtime.pipeline import NoPlanner
 from disco_hw.runtime.robot_setup import Setup, load_setup
 from disco_hw.tasks.circle import CircleTask, circle_task
-from sim.body_dynamics import Pose
+from sim.body_dynamics import BodyPose
 from sim.effects import HiddenEffectError, parse_hidden_effects
 from sim.in_process import RobotInProcess
 
@@ -191,7 +191,7 @@ def without_effects(amended: Model, given: Model) -> Model:
 
 def _robot(setup: Setup, options: GapExperimentOptions, hidden: Mapping[str, tuple[float, ...]]) -> RobotInProcess:
     parameters = true_parameters(setup, options.plant_seed)
-    start = Pose(*setup.config.task.course().start)
+    start = BodyPose(*setup.config.task.course().start)
     return virtual_robot(setup, parameters, start, effects=hidden, seed=options.seed)
 
 

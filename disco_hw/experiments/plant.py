@@ -12,7 +12,7 @@ import numpy as np
 SUBSTEP_S = 0.02
 
 
-class Plant:
+class KinematicPlant:
     """A skid-steer robot that starts at rest.
 
     `wheel_noise`: standard deviation of each wheel's speed relative to itself, white at 50 Hz.

@@ -24,7 +24,7 @@ from disco_hw.runtime.robot_setup import Setup
 from disco_hw.runtime.supervisor import UserRequest
 from drivers.motor import make_driver
 from firmware_protocol.firmware_core import FirmwareConfig
-from sim.body_dynamics import Pose
+from sim.body_dynamics import BodyPose
 from sim.in_process import RobotInProcess
 from sim.plant_parameters import PlantParameters
 from sim.virtual_robot import STEP_US
@@ -36,7 +36,7 @@ _CLOSING_S = 60.0
 def virtual_robot(
     setup: Setup,
     plant: PlantParameters,
-    start: Pose,
+    start: BodyPose,
     *,
     effects: Mapping[str, float | Sequence[float]] | None = None,
     seed: int = 1,

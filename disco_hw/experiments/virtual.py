@@ -12,7 +12,7 @@ from disco_hw.errors import InputError
 from disco_hw.runtime.robot_setup import Setup, geometry, link_key, load_setup
 from firmware_protocol.firmware_core import FirmwareConfig
 from sim.app import VirtualRobotOptions, run_virtual_robot
-from sim.body_dynamics import Pose
+from sim.body_dynamics import BodyPose
 from sim.effects import HiddenEffectError, parse_hidden_effects
 from sim.fault_schedule import FaultFileError, schedule_of
 from sim.plant_parameters import DrawError, PlantParameters, draw_plant_parameters
@@ -73,7 +73,7 @@ def run_sim(options: SimOptions) -> int:
             bitrate=config.link.bitrate,
             port=config.link.port,
             baud=config.link.baud,
-            start=Pose(x_m, y_m, yaw_rad),
+            start=BodyPose(x_m, y_m, yaw_rad),
             plant=plant,
             effects=effects,
             seed=options.seed,

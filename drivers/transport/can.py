@@ -19,11 +19,11 @@ from can.interfaces import VALID_INTERFACES
 
 from drivers.transport.reconnecting import (
     MUTE_AFTER_S,
-    Counters,
     LinkLostError,
     LinkMuteError,
     ReconnectingTransport,
     TransmitBusyError,
+    TransportCounters,
     TransportSettingsError,
 )
 from drivers.transport.serial import error_number, explain_port, plain
@@ -144,7 +144,7 @@ class CanMedium:
         """Interface and channel."""
         return f"{self.interface} {self.channel}"
 
-    def connect(self, counters: Counters) -> CanConnection:
+    def connect(self, counters: TransportCounters) -> CanConnection:
         """Open the bus. Raises what python-can raises, LinkLostError for a socketcan interface that cannot work yet."""
         options: dict[str, Any] = {}
         if self.interface == "socketcan":
@@ -178,7 +178,7 @@ class CanConnection:
     Whether a frame "is_rx" is not asked: on a virtual CAN every frame of another local process says it is not.
     """
 
-    def __init__(self, bus: can.BusABC, counters: Counters, own: OwnFrames | None = None) -> None:
+    def __init__(self, bus: can.BusABC, counters: TransportCounters, own: OwnFrames | None = None) -> None:
         """`own`: of a bus that hands a sender its own frames, which then are not received."""
         self._bus = bus
         self._counters = counters

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 
-from drivers.transport.reconnecting import Counters
+from drivers.transport.reconnecting import TransportCounters
 from drivers.types import LinkState, OutgoingFrame, ReceivedFrame, TransportStats
 
 QUEUE_CAPACITY = 4096
@@ -20,7 +20,7 @@ class InProcessTransport:
 
     def __init__(self, name: str) -> None:
         self._name = name
-        self._counters = Counters()
+        self._counters = TransportCounters()
         self._peer: InProcessTransport | None = None
         self._open = False
         self._plugged = True

@@ -106,7 +106,7 @@ class TransmitQueue:
         return dropped
 
 
-class Counters:
+class TransportCounters:
     """The counters of one transport, named as the fields of `TransportStats`."""
 
     __slots__ = ("_counts", "_lock")
@@ -163,7 +163,7 @@ class Medium(Protocol):
     def name(self) -> str:
         """Medium and address, for messages to a person."""
 
-    def connect(self, counters: Counters) -> Connection:
+    def connect(self, counters: TransportCounters) -> Connection:
         """Connect in bounded time, counting malformed input and bus errors in `counters`; raises if it cannot."""
 
     def explain(self, error: Exception) -> str:
@@ -186,7 +186,7 @@ class ReconnectingTransport:
         self._mute_after_s = mute_after_s
         self._patience_s = mute_after_s
         self._mute_words: str | None = None
-        self._counters = Counters()
+        self._counters = TransportCounters()
         self._changed = threading.Condition()
         self._writing = threading.Lock()
         self._state = LinkState.CLOSED

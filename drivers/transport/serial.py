@@ -12,10 +12,10 @@ import serial
 
 from drivers.transport.reconnecting import (
     MUTE_AFTER_S,
-    Counters,
     LinkMuteError,
     ReconnectingTransport,
     TransmitBusyError,
+    TransportCounters,
 )
 from drivers.types import Frame, ReceivedFrame
 from firmware_protocol.serial_framing import FrameDecoder, encode_frame
@@ -56,7 +56,7 @@ class SerialMedium:
         """Port and speed."""
         return f"serial {self.port} at {self.baud} Bd"
 
-    def connect(self, counters: Counters) -> SerialConnection:
+    def connect(self, counters: TransportCounters) -> SerialConnection:
         """Open the port for this process alone. Raises what pyserial raises."""
         port = open_port(self, timeout_s=READ_TIMEOUT_S, write_timeout_s=WRITE_TIMEOUT_S, exclusive=True)
         ask_for_low_latency(port)
@@ -70,7 +70,7 @@ class SerialMedium:
 class SerialConnection:
     """An open serial port; satisfies `drivers.transport.reconnecting.Connection`."""
 
-    def __init__(self, port: serial.Serial, counters: Counters) -> None:
+    def __init__(self, port: serial.Serial, counters: TransportCounters) -> None:
         self._port = port
         self._counters = counters
         self._decoder = FrameDecoder()

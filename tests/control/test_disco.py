@@ -19,7 +19,7 @@ from disco_hw.control import (
     SentCommand,
 )
 from disco_hw.control.kernel.replan import replan
-from disco_hw.experiments.plant import Plant
+from disco_hw.experiments.plant import KinematicPlant
 from disco_hw.model import EffectSetting, Gaussian, load_model
 from disco_hw.tasks.circle import CircleCost
 
@@ -36,7 +36,7 @@ def planner(model=MODEL, task=None, seed=3, limits=LIMITS, **changes):
 
 def drive(disco, seconds, start=(0.75, 0.0, math.pi / 2), period_s=0.1, wheel_noise=0.0, lag_s=0.1):
     """Drive a plant with the posterior's mean; returns instant costs and commands."""
-    plant = Plant(MEAN, start, lag_s, wheel_noise, 1)
+    plant = KinematicPlant(MEAN, start, lag_s, wheel_noise, 1)
     costs, commands, sent = [], [], ()
     for step in range(round(seconds / period_s)):
         now_ns = round(step * period_s * 1e9)
@@ -144,7 +144,7 @@ def test_delay_and_lag_in_the_model_help_a_plant_that_has_them():
     knowing, ignorant = planner(replace(MODEL, effects=effects)), planner()
     costs = []
     for disco in (knowing, ignorant):
-        plant = Plant(MEAN, (0.75, 0.0, math.pi / 2), 0.1, 0.0, 1)
+        plant = KinematicPlant(MEAN, (0.75, 0.0, math.pi / 2), 0.1, 0.0, 1)
         sent, queue, found = (), [(0.0, 0.0)] * 3, []
         for step in range(200):
             now_ns = step * PERIOD_NS

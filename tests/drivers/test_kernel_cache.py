@@ -1,5 +1,6 @@
 """Machine code on disk is loaded only from a directory of this user's own: a planted pickle is not run."""
 
+import math
 import os
 import pickle
 import subprocess
@@ -9,9 +10,11 @@ from pathlib import Path
 import numba
 import pytest
 
+from drivers.kernel_cache import compiled
+
 NOBODY = 65534
 KERNELS = {
-    "plant": "from sim.compiled import compiled as compile_kernel",
+    "plant": "from drivers.kernel_cache import compiled as compile_kernel",
     "model": "from disco_hw.jit import kernel_function as compile_kernel",
 }
 SOURCE = """
@@ -143,3 +146,14 @@ def test_a_pickle_beside_the_source_is_not_run_either_and_where_none_is_private_
     assert not loaded
     assert "kernels are compiled anew in each process" in told
     assert not marker.exists()
+
+
+def _hypotenuse(a, b):
+    return math.sqrt(a * a + b * b)
+
+
+def test_a_compiled_function_computes_what_its_source_says_and_is_compiled():
+    fast = compiled(_hypotenuse)
+    assert fast(3.0, 4.0) == 5.0
+    assert fast.py_func is _hypotenuse
+    assert len(fast.signatures) == 1

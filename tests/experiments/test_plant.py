@@ -5,20 +5,20 @@ import math
 import numpy as np
 import pytest
 
-from disco_hw.experiments.plant import SUBSTEP_S, Plant
+from disco_hw.experiments.plant import SUBSTEP_S, KinematicPlant
 
 THETA = {"wheel_radius_m": 0.06, "axial_distance_m": 0.4, "x_icr_m": 0.2}
 
 
 def test_equal_wheels_drive_straight_along_the_yaw():
-    plant = Plant(THETA, (1.0, 2.0, math.pi / 6), 0.0, 0.0, 1)
+    plant = KinematicPlant(THETA, (1.0, 2.0, math.pi / 6), 0.0, 0.0, 1)
     plant.advance(5.0, 5.0, 2.0)
     assert (plant.x_m, plant.y_m) == pytest.approx((1.0 + 0.6 * math.cos(math.pi / 6), 2.0 + 0.6 * 0.5))
     assert (plant.yaw_rad, plant.forward_m_s, *plant.wheels) == pytest.approx((math.pi / 6, 0.3, 5.0, 5.0))
 
 
 def test_a_turn_on_the_spot_leaves_the_point_of_rotation_where_it_is():
-    plant = Plant(THETA, (0.0, 0.0, 0.0), 0.0, 0.0, 1)
+    plant = KinematicPlant(THETA, (0.0, 0.0, 0.0), 0.0, 0.0, 1)
     for _ in range(30):
         plant.advance(-3.0, 3.0, 0.1)
     assert plant.yaw_rad == pytest.approx(3.0 * 0.06 * 6.0 / 0.4)
@@ -27,7 +27,7 @@ def test_a_turn_on_the_spot_leaves_the_point_of_rotation_where_it_is():
 
 
 def test_wheels_lag_by_the_time_constant():
-    plant = Plant(THETA, (0.0, 0.0, 0.0), 0.1, 0.0, 1)
+    plant = KinematicPlant(THETA, (0.0, 0.0, 0.0), 0.1, 0.0, 1)
     plant.advance(4.0, -2.0, 0.1)
     part = 1.0 - math.exp(-1.0)
     assert plant.wheels == pytest.approx((4.0 * part, -2.0 * part))
@@ -35,7 +35,7 @@ def test_wheels_lag_by_the_time_constant():
 
 def test_noise_is_relative_white_and_repeats_with_its_seed():
     def speeds(seed):
-        plant = Plant(THETA, (0.0, 0.0, 0.0), 0.0, 0.05, seed)
+        plant = KinematicPlant(THETA, (0.0, 0.0, 0.0), 0.0, 0.05, seed)
         found = []
         for _ in range(2000):
             plant.advance(5.0, 5.0, SUBSTEP_S)

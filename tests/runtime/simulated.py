@@ -10,11 +10,11 @@ from disco_hw.experiments.simulated_time import SimulatedRun, virtual_robot
 from disco_hw.runtime.assembly import make_planner
 from disco_hw.runtime.pipeline import Planner
 from disco_hw.runtime.robot_setup import load_setup
-from sim.body_dynamics import Pose
+from sim.body_dynamics import BodyPose
 from sim.plant_parameters import PlantParameters
 
 ROBOT_FILE = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
-START = Pose(0.75, 0.0, 1.5707963)
+START = BodyPose(0.75, 0.0, 1.5707963)
 
 
 def simulated_stack(
@@ -22,7 +22,7 @@ def simulated_stack(
     seed: int = 1,
     needs_pose: bool = True,
     robot_file: Path = ROBOT_FILE,
-    start: Pose = START,
+    start: BodyPose = START,
     hide: dict[str, float] | None = None,
     **changes: float,
 ) -> SimulatedRun:

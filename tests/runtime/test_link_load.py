@@ -7,8 +7,7 @@ from hypothesis import strategies as st
 from disco_hw.runtime.link_load import CyclicFrame, can_load, cyclic_frames, serial_load, worst_case_bits
 from firmware_protocol.dbc import packaged_dbc
 from firmware_protocol.serial_framing import encode_frame
-from sim.can_bits import frame_bits
-from sim.can_frame import CanFrame
+from sim.can_frame import CanFrame, frame_bits
 
 FRAMES = cyclic_frames(packaged_dbc(), 50.0)
 

@@ -19,7 +19,7 @@ from disco_hw.runtime.supervisor import UserRequest
 from disco_hw.tasks.path import PathTask
 from disco_hw.viewer.commands import snapshot_log
 from disco_hw.viewer.recording import Recording
-from sim.body_dynamics import Pose
+from sim.body_dynamics import BodyPose
 from tests.runtime.path_robot import path_robot
 from tests.runtime.simulated import simulated_stack
 
@@ -38,7 +38,7 @@ def write_log(path, setup, ticks):
 
 def started(robot_file):
     setup = load_setup(robot_file)
-    stack = simulated_stack(robot_file=robot_file, start=Pose(*setup.config.task.course().start))
+    stack = simulated_stack(robot_file=robot_file, start=BodyPose(*setup.config.task.course().start))
     stack.run(1.5)
     stack.run(0.5, UserRequest.ARM)
     stack.run(0.02, UserRequest.START)
@@ -99,7 +99,7 @@ def test_an_open_path_ends_with_the_robot_standing_and_is_replayed_and_shown_wit
 def test_another_speed_is_recorded_and_replayed(tmp_path):
     robot_file = path_robot(tmp_path, CORNER)
     setup = load_setup(robot_file)
-    stack = simulated_stack(robot_file=robot_file, start=Pose(0.0, 0.0, 0.0))
+    stack = simulated_stack(robot_file=robot_file, start=BodyPose(0.0, 0.0, 0.0))
     stack.run(1.5)
     stack.core.set_task(PathTask(path="path.csv", speed_m_s=0.15, points=setup.config.task.points))
     stack.run(0.5, UserRequest.ARM)

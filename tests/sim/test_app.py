@@ -20,8 +20,8 @@ from firmware_protocol.codec import Codec
 from firmware_protocol.serial_framing import FrameDecoder, encode_frame
 from sim.__main__ import main
 from sim.command_socket import send_command
-from sim.truth import COLUMNS
 from sim.unixcan import UnixCanBus
+from sim.virtual_robot import TRUTH_COLUMNS
 from tests.sim.minimal_host import MinimalHost
 
 
@@ -45,7 +45,7 @@ class Robot:
         return send_command(self.directory / "inject", text)
 
     def state(self):
-        row = dict(zip(COLUMNS, self.command("state").split(","), strict=True))
+        row = dict(zip(TRUTH_COLUMNS, self.command("state").split(","), strict=True))
         return {name: value if name == "state" else float(value) for name, value in row.items()}
 
     def wheel_speed(self):

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from sim.body_dynamics import Body, Pose
+from sim.body_dynamics import Body, BodyPose
 from sim.effects import hidden_effects
 from sim.plant_parameters import PlantParameters
 from sim.wheel_dynamics import WheelPieces
@@ -17,7 +17,7 @@ NEVER_US = 2**62
 def roll(left_rad_s, right_rad_s, seconds, start=None, slip=(0.0, 0.0, 0.0), parameters=None, **effects):
     """Turn the wheels at constant speeds for whole milliseconds; return the body and its path, shape (n, 3)."""
     count = round(seconds * 1000)
-    body = Body(parameters or PlantParameters(), hidden_effects(effects), start or Pose())
+    body = Body(parameters or PlantParameters(), hidden_effects(effects), start or BodyPose())
     times = np.arange(1, count + 1) * 1000
     angles = np.stack([times * 1e-6 * left_rad_s, times * 1e-6 * right_rad_s], axis=1)
     disturbance = np.tile(slip, (count, 1))
@@ -29,7 +29,7 @@ def roll(left_rad_s, right_rad_s, seconds, start=None, slip=(0.0, 0.0, 0.0), par
 
 
 def test_equal_wheels_drive_straight():
-    body, path = roll(3.0, 3.0, 2.0, start=Pose(1.0, 2.0, math.pi / 6))
+    body, path = roll(3.0, 3.0, 2.0, start=BodyPose(1.0, 2.0, math.pi / 6))
     travelled = 3.0 * R * 2.0
     expected = (1.0 + travelled * math.cos(math.pi / 6), 2.0 + travelled * 0.5)
     assert (body.pose.x_m, body.pose.y_m) == pytest.approx(expected, abs=1e-12)
@@ -64,7 +64,7 @@ def test_turning_on_the_spot_turns_about_the_icr():
 
 def test_a_step_may_be_of_any_length_without_changing_the_path():
     fine, _ = roll(2.0, 5.0, 1.0)
-    coarse = Body(PlantParameters(), hidden_effects({}), Pose())
+    coarse = Body(PlantParameters(), hidden_effects({}), BodyPose())
     pieces = WheelPieces(np.array([1_000_000]), np.array([[2.0, 5.0]]))
     coarse.advance(pieces, 0, 1, NEVER_US, np.zeros((1, 3)), 0, 1_000_000)
     for name in ("x_m", "y_m", "yaw_rad"):
@@ -109,8 +109,8 @@ def test_lateral_icr_moves_the_centre_of_rotation_to_the_left():
 def test_slope_drifts_in_the_world_frame_while_the_wheels_turn():
     drift = 0.02
     for yaw in (0.0, 2.0):
-        _, flat = roll(3.0, 3.0, 1.0, start=Pose(0, 0, yaw))
-        _, hill = roll(3.0, 3.0, 1.0, start=Pose(0, 0, yaw), slope=(drift, math.pi / 2))
+        _, flat = roll(3.0, 3.0, 1.0, start=BodyPose(0, 0, yaw))
+        _, hill = roll(3.0, 3.0, 1.0, start=BodyPose(0, 0, yaw), slope=(drift, math.pi / 2))
         np.testing.assert_allclose(hill[-1] - flat[-1], (0.0, drift, 0.0), atol=1e-9)
     assert np.all(roll(0.0, 0.0, 1.0, slope=drift)[1] == 0.0)
 
@@ -127,7 +127,7 @@ def accelerate(sign, **effects):
     times = np.arange(1, 2001) * 1000
     t = times * 1e-6
     angle = np.where(t < 1.0, 3.0 * t**2, 3.0 + 6.0 * (t - 1.0) - 3.0 * (t - 1.0) ** 2) * sign
-    body = Body(PlantParameters(), hidden_effects(effects), Pose())
+    body = Body(PlantParameters(), hidden_effects(effects), BodyPose())
     pieces = WheelPieces(times, np.stack([angle, angle], axis=1))
     body.advance(pieces, 0, 1000, NEVER_US, np.zeros((2000, 3)), 0, 1000)
     first = body.pose.x_m
@@ -161,8 +161,8 @@ def test_wheel_ripple_repeats_once_a_turn_and_averages_out():
 
 def test_the_carpet_slows_turns_on_its_disc_only():
     nominal = yaw_rate(-3.0, 3.0)
-    on = roll(-3.0, 3.0, 0.2, start=Pose(0.5, 0.1, 0.0), x_carpet_patch=0.2)[0]
-    off = roll(-3.0, 3.0, 0.2, start=Pose(3.0, 0.0, 0.0), x_carpet_patch=0.2)[0]
+    on = roll(-3.0, 3.0, 0.2, start=BodyPose(0.5, 0.1, 0.0), x_carpet_patch=0.2)[0]
+    off = roll(-3.0, 3.0, 0.2, start=BodyPose(3.0, 0.0, 0.0), x_carpet_patch=0.2)[0]
     assert on.velocity[2] == pytest.approx(nominal / 1.2)
     assert off.velocity[2] == pytest.approx(nominal)
 
@@ -174,7 +174,7 @@ def test_slip_disturbance_moves_a_driving_body_and_not_a_resting_one():
 
 
 def test_the_body_stops_after_the_piece_that_reaches_the_asked_time_and_knows_where_it_was_then():
-    body = Body(PlantParameters(), hidden_effects({}), Pose())
+    body = Body(PlantParameters(), hidden_effects({}), BodyPose())
     times = np.arange(1, 11) * 1000
     angles = np.stack([times * 3e-6, times * 3e-6], axis=1)
     reached = body.advance(WheelPieces(times, angles), 0, 10, 3500, np.zeros((10, 3)), 0, 1000)
@@ -184,9 +184,9 @@ def test_the_body_stops_after_the_piece_that_reaches_the_asked_time_and_knows_wh
 
 
 def test_displacement_is_a_step_in_the_world_frame():
-    body, _ = roll(3.0, 3.0, 0.5, start=Pose(0.0, 0.0, 1.0))
+    body, _ = roll(3.0, 3.0, 0.5, start=BodyPose(0.0, 0.0, 1.0))
     before = body.pose
     body.displace(0.5, -0.25, 0.1)
     after = body.pose
-    assert after == Pose(before.x_m + 0.5, before.y_m - 0.25, before.yaw_rad + 0.1)
+    assert after == BodyPose(before.x_m + 0.5, before.y_m - 0.25, before.yaw_rad + 0.1)
     assert body.pose_at(500_000) == after

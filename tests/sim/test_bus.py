@@ -2,10 +2,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sim.bus import CanBus, Delivery, FrameFate
+from sim.bus import CanBus, DeliveredFrame, FrameFate
 from sim.bus_node import ErrorState, TransmitOrder
-from sim.can_bits import frame_bits, stuffed_bits
-from sim.can_frame import CanFrame
+from sim.can_frame import CanFrame, frame_bits, stuffed_bits
 
 BIT_NS = 2000  # 500 kbit/s
 LONG_NS = 10**10
@@ -39,7 +38,7 @@ def test_a_frame_arrives_at_its_end_at_all_others():
     end_ns = 5_000 + (frame_bits(FRAME) - 3) * BIT_NS
     assert bus.advance(end_ns - 1) == []
     (delivery,) = bus.advance(end_ns)
-    assert delivery == Delivery(end_ns, a, FRAME, (b, c))
+    assert delivery == DeliveredFrame(end_ns, a, FRAME, (b, c))
     assert (a.sent, a.received, b.received, c.received) == (1, 0, 1, 1)
 
 
@@ -200,7 +199,7 @@ def test_forced_bus_off_is_reported_at_once():
     bus.advance(9_000)
     bus.force_bus_off(a)
     assert bus.next_event_ns() == 9_000
-    assert bus.advance(9_000) == [Delivery(9_000, a, CanFrame(0x040, bytes(8), error=True), (a,))]
+    assert bus.advance(9_000) == [DeliveredFrame(9_000, a, CanFrame(0x040, bytes(8), error=True), (a,))]
 
 
 def test_recovery_from_bus_off_takes_128_times_11_recessive_bits_after_the_request():
@@ -214,7 +213,7 @@ def test_recovery_from_bus_off_takes_128_times_11_recessive_bits_after_the_reque
     assert bus.next_event_ns() == due_ns
     assert bus.advance(due_ns - 1) == []
     (restarted,) = bus.advance(due_ns)
-    assert restarted == Delivery(due_ns, a, CanFrame(0x100, bytes(8), error=True), (a,))
+    assert restarted == DeliveredFrame(due_ns, a, CanFrame(0x100, bytes(8), error=True), (a,))
     assert a.state is ErrorState.ACTIVE
     assert bus.send(a, FRAME)
 

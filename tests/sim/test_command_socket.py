@@ -4,7 +4,7 @@ import threading
 import pytest
 
 from sim.command_socket import CommandSocket, main, send_command
-from sim.unix_listener import SocketPathError
+from sim.process import SocketPathError
 
 
 @pytest.fixture

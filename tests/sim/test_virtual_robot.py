@@ -1,17 +1,59 @@
 """In simulated time, with the real plant, the real C core and the real codec on both ends of a simulated CAN bus."""
 
+import csv
+import io
 import math
 
 import pytest
 
 from drivers.types import Frame
 from firmware_protocol.firmware_core import FirmwareConfig, ResetCause
+from sim.body_dynamics import BodyPose
 from sim.bus import CanBus
 from sim.can_frame import CanFrame
 from sim.plant import Plant
 from sim.plant_parameters import PlantParameters
-from sim.virtual_robot import DeviceClock, VirtualRobot
+from sim.process import TextRecord
+from sim.virtual_robot import FLUSH_NS, TRUTH_COLUMNS, ControllerClock, TruthRecorder, VirtualRobot, truth_row
 from tests.sim.minimal_host import MinimalHost
+
+
+@pytest.fixture
+def robot():
+    config = FirmwareConfig(ticks_per_rev=2048, max_wheel_speed_rad_s=8.0)
+    robot = VirtualRobot(Plant(start=BodyPose(1.0, -2.0, 0.5)), config)
+    robot.step(1000)
+    return robot
+
+
+def read(text):
+    return list(csv.DictReader(io.StringIO(text)))
+
+
+def test_row_has_the_columns_and_the_true_values(robot):
+    (row,) = read(",".join(TRUTH_COLUMNS) + "\n" + truth_row(robot, 42))
+    assert None not in row
+    assert None not in row.values()
+    truth = robot.truth
+    assert row["t_ns"] == "42"
+    assert (float(row["x_m"]), float(row["y_m"]), float(row["yaw_rad"])) == pytest.approx((1.0, -2.0, 0.5), abs=1e-5)
+    assert float(row["left_speed_rad_s"]) == pytest.approx(truth.left_speed_rad_s, abs=1e-4)
+    assert float(row["speed_m_s"]) == pytest.approx(truth.speed_m_s, abs=1e-5)
+    assert row["state"] == robot.outputs.state
+    assert (row["driver_enabled"], row["brake"], row["session"]) == ("0", "1", "0")
+
+
+def test_rows_are_on_disk_after_a_second_and_at_the_end(tmp_path, robot):
+    path = tmp_path / "truth.csv"
+    record = TextRecord(path, print)
+    recorder = TruthRecorder(record)
+    assert read(path.read_text()) == []
+    for t_ns in range(FLUSH_NS, 3 * FLUSH_NS, FLUSH_NS // 10):
+        recorder.record(robot, t_ns)
+    assert len(read(path.read_text())) >= 11
+    record.close()
+    assert len(read(path.read_text())) == 20
+
 
 CONFIG = FirmwareConfig(ticks_per_rev=2048, max_wheel_speed_rad_s=8.0, max_wheel_acceleration_rad_s2=20.0)
 
@@ -166,7 +208,7 @@ def test_poses_come_at_their_rate_and_late_with_the_device_time_of_the_sample(se
 
 
 def test_the_device_clock_has_its_own_start_and_speed():
-    clock = DeviceClock(start_us=5_000_000, skew_ppm=40.0)
+    clock = ControllerClock(start_us=5_000_000, skew_ppm=40.0)
     assert clock.at(0) == 5_000_000
     assert clock.at(1_000_000_000) == 5_000_000 + 1_000_040_000
     setup = Setup(clock=clock)

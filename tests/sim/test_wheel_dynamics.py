@@ -8,7 +8,7 @@ import pytest
 
 from sim.effects import hidden_effects
 from sim.plant_parameters import PlantParameters
-from sim.wheel_dynamics import Wheels
+from sim.wheel_dynamics import WheelMotors
 
 STILL = PlantParameters().noiseless()
 IDEAL = STILL.with_ideal_motors()
@@ -19,7 +19,7 @@ class Bench:
     """Wheels on a test bench: commanded, time advanced in steps, speeds and angles recorded."""
 
     def __init__(self, parameters, **effects):
-        self.wheels = Wheels(parameters, hidden_effects(effects), capacity=10)
+        self.wheels = WheelMotors(parameters, hidden_effects(effects), capacity=10)
         self.now_us = 0
         self.angles = (0.0, 0.0)
 
@@ -219,14 +219,14 @@ def test_the_slew_limited_motor_ramps():
 
 
 def test_disturbance_multiplies_the_true_speed_of_its_side():
-    wheels = Wheels(IDEAL, hidden_effects({}), capacity=10)
+    wheels = WheelMotors(IDEAL, hidden_effects({}), capacity=10)
     wheels.advance(5000, 6000, 2.0, 2.0, True, False, np.array([[0.1, -0.1]]), 5)
     assert wheels.speeds_rad_s == pytest.approx((2.2, 1.8))
     assert wheels.pieces.angles[0] == pytest.approx((2.2e-3, 1.8e-3))
 
 
 def test_pieces_end_on_the_grid_and_at_the_asked_time():
-    wheels = Wheels(IDEAL, hidden_effects({}), capacity=10)
+    wheels = WheelMotors(IDEAL, hidden_effects({}), capacity=10)
     count = wheels.advance(300, 2700, 1.0, 1.0, True, False, NO_DISTURBANCE, 0)
     assert wheels.pieces.times_us[:count].tolist() == [1000, 2000, 2700]
     assert wheels.pieces.angles[count - 1] == pytest.approx((2.4e-3, 2.4e-3))

@@ -19,7 +19,7 @@ import pytest
 
 from drivers.transport import open_transport
 from drivers.transport.can import CanMedium
-from drivers.transport.reconnecting import Counters, LinkLostError
+from drivers.transport.reconnecting import LinkLostError, TransportCounters
 from drivers.types import LinkState
 from tests.drivers.waiting import collect, outgoing, send, wait_until
 
@@ -87,7 +87,7 @@ def test_frames_that_this_protocol_has_not_are_counted_as_malformed(transport, o
 
 
 def test_the_stamp_is_the_kernels_not_that_of_reading(other):
-    connection = CanMedium("socketcan", VCAN, 500_000).connect(Counters())
+    connection = CanMedium("socketcan", VCAN, 500_000).connect(TransportCounters())
     try:
         connection.read()
         before_ns = time.monotonic_ns()
@@ -198,7 +198,7 @@ def test_a_real_bus_off_keeps_the_link_down_until_the_controller_is_restarted(sl
         wait_until(lambda: slcan.state() == "BUS-OFF", PATIENCE_S)
         wait_until(lambda: opened.stats.bus_off == 1 and opened.state is LinkState.CONNECTING, PATIENCE_S)
         with pytest.raises(LinkLostError, match="bus-off"):
-            CanMedium("socketcan", slcan.channel, 500_000).connect(Counters())
+            CanMedium("socketcan", slcan.channel, 500_000).connect(TransportCounters())
         time.sleep(1.0)
         assert opened.state is LinkState.CONNECTING, "what is sent now would be swallowed in silence"
         ip("set", slcan.channel, "down")

@@ -10,7 +10,7 @@ from disco_hw.control import oracle
 from disco_hw.control.disco import Disco
 from disco_hw.control.plan import PlannerState
 from disco_hw.control.settings import CommandLimits, DiscoSettings
-from disco_hw.experiments.plant import Plant
+from disco_hw.experiments.plant import KinematicPlant
 from disco_hw.model import load_model
 from disco_hw.model import plain as physics
 from disco_hw.tasks.circle import CircleCost, CircleTask
@@ -71,7 +71,7 @@ def test_the_planner_leaves_the_traps(start):
         "centre": (0.0, 0.0, 0.0),
     }
     place = places[start]
-    plant = Plant(MEAN, place, 0.1, 0.0, 1)
+    plant = KinematicPlant(MEAN, place, 0.1, 0.0, 1)
     disco = Disco(MODEL, CircleCost(), DiscoSettings(), CommandLimits(8.0, 20.0), 2)
     if start == "spinning":
         plant.wheels = (left, right)
@@ -90,7 +90,7 @@ def test_the_planner_leaves_the_traps(start):
 
 
 def test_the_horizon_of_half_the_length_no_longer_ends_in_a_trap():
-    plant = Plant(MEAN, (0.75, 0.0, math.pi / 2), 0.1, 0.0, 1)
+    plant = KinematicPlant(MEAN, (0.75, 0.0, math.pi / 2), 0.1, 0.0, 1)
     disco = Disco(MODEL, CircleCost(), DiscoSettings(step_s=0.05), CommandLimits(8.0, 20.0), 2)
     costs = []
     for step in range(200):

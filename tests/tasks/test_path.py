@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from disco_hw.control import CommandLimits, Disco, DiscoSettings, PlannerState, PlanOutcome
-from disco_hw.experiments.plant import Plant
+from disco_hw.experiments.plant import KinematicPlant
 from disco_hw.model import load_model
 from disco_hw.tasks.line.table import PathTable, sharp_turns
 from disco_hw.tasks.line.waypoints import Waypoints
@@ -23,7 +23,7 @@ CORNER = Waypoints(np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]]))
 
 def follow(task, seconds, start):
     """Drive along; returns poses (N, 3), speeds (N,) and places (N,) on the path."""
-    plant = Plant(MEAN, start, 0.1, 0.0, 1)
+    plant = KinematicPlant(MEAN, start, 0.1, 0.0, 1)
     disco = Disco(MODEL, task, DiscoSettings(), CommandLimits(8.0, 20.0), 2)
     found = []
     for step in range(round(seconds * 10)):
@@ -73,7 +73,7 @@ SPIN = 1.6 * MEAN["axial_distance_m"] / MEAN["wheel_radius_m"] / 2.0
 @pytest.mark.parametrize("trap", ["standing", "spinning"])
 def test_the_planner_leaves_the_traps(trap):
     task = path_along(ROUND, speed_m_s=0.2)
-    plant = Plant(MEAN, (0.0, 0.0, 0.0), 0.1, 0.0, 1)
+    plant = KinematicPlant(MEAN, (0.0, 0.0, 0.0), 0.1, 0.0, 1)
     disco = Disco(MODEL, task, DiscoSettings(), CommandLimits(8.0, 20.0), 2)
     if trap == "spinning":
         plant.wheels = (-SPIN, SPIN)

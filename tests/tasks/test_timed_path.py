@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from disco_hw.control import CommandLimits, Disco, DiscoSettings, PlannerState
-from disco_hw.experiments.plant import Plant
+from disco_hw.experiments.plant import KinematicPlant
 from disco_hw.model import load_model
 from disco_hw.tasks.line.waypoints import Waypoints
 from disco_hw.tasks.timed_path import TimedPathCost
@@ -20,7 +20,7 @@ ROUND = Waypoints(np.column_stack([np.sin(ANGLE), 1.0 - np.cos(ANGLE)]), 5.0 + 4
 
 def test_places_are_reached_at_their_times_after_waiting_for_the_first():
     task = TimedPathCost(ROUND)
-    plant = Plant(MEAN, (0.0, 0.0, 0.3), 0.1, 0.0, 1)
+    plant = KinematicPlant(MEAN, (0.0, 0.0, 0.3), 0.1, 0.0, 1)
     disco = Disco(MODEL, task, DiscoSettings(), CommandLimits(8.0, 20.0), 2)
     off = []
     for step in range(350):
@@ -39,7 +39,7 @@ SPIN = 1.6 * MEAN["axial_distance_m"] / MEAN["wheel_radius_m"] / 2.0
 @pytest.mark.parametrize("trap", ["standing", "spinning"])
 def test_the_planner_leaves_the_traps(trap):
     task = TimedPathCost(Waypoints(ROUND.places_m, 4.0 * ANGLE))
-    plant = Plant(MEAN, (0.0, 0.0, 0.0), 0.1, 0.0, 1)
+    plant = KinematicPlant(MEAN, (0.0, 0.0, 0.0), 0.1, 0.0, 1)
     disco = Disco(MODEL, task, DiscoSettings(), CommandLimits(8.0, 20.0), 2)
     if trap == "spinning":
         plant.wheels = (-SPIN, SPIN)
@@ -58,7 +58,7 @@ def test_the_planner_leaves_the_traps(trap):
 @pytest.mark.parametrize("yaw_rad", [0.0, math.pi])
 def test_it_is_followed_forwards(yaw_rad):
     task = TimedPathCost(Waypoints(ROUND.places_m, 4.0 * ANGLE))
-    plant = Plant(MEAN, (0.0, 0.0, yaw_rad), 0.1, 0.0, 1)
+    plant = KinematicPlant(MEAN, (0.0, 0.0, yaw_rad), 0.1, 0.0, 1)
     disco = Disco(MODEL, task, DiscoSettings(), CommandLimits(8.0, 20.0), 2)
     speeds, off = [], []
     for step in range(200):

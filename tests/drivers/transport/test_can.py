@@ -29,10 +29,10 @@ from drivers.transport.can import (
 )
 from drivers.transport.reconnecting import (
     BackoffPolicy,
-    Counters,
     LinkLostError,
     ReconnectingTransport,
     TransmitBusyError,
+    TransportCounters,
 )
 from drivers.types import Frame, LinkState
 from tests.drivers.transport.pseudo_terminal import PseudoTerminal
@@ -235,7 +235,7 @@ def test_the_bus_is_opened_as_asked_and_options_go_through_as_they_are(monkeypat
         CanMedium("slcan", "/dev/x", 125_000, {"sleep_after_open": 2.0, "tty_baudrate": 9600}),
     ):
         with pytest.raises(OSError, match="not here"):
-            medium.connect(Counters())
+            medium.connect(TransportCounters())
     plain = {"interface": "slcan", "channel": "/dev/x", "ignore_config": True, "bitrate": 125_000, "timeout": 0.1}
     assert asked == [
         {"interface": "virtual", "channel": "one", "ignore_config": True, "bitrate": 250_000, "rx_queue_size": 7},
@@ -272,7 +272,7 @@ def test_a_frame_that_found_no_room_excuses_no_other_hosts():
         def recv(self, timeout):
             return message(0x100, b"\1")
 
-    connection = CanConnection(Full(), Counters(), OwnFrames())
+    connection = CanConnection(Full(), TransportCounters(), OwnFrames())
     with pytest.raises(TransmitBusyError):
         connection.write(Frame(0x100, b"\1"))
     assert [received.frame for received in connection.read()] == [Frame(0x100, b"\1")]

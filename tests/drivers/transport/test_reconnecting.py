@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 from drivers.transport import reconnecting
 from drivers.transport.reconnecting import (
     BackoffPolicy,
-    Counters,
     LinkLostError,
     ReconnectingTransport,
     TransmitBusyError,
     TransmitQueue,
+    TransportCounters,
     next_delay_s,
 )
 from drivers.types import Frame, LinkState, OutgoingFrame, ReceivedFrame
@@ -39,7 +39,7 @@ def test_a_steady_link_starts_afresh_and_a_flapping_one_does_not():
 
 
 def test_nothing_is_lost_between_threads():
-    counters = Counters()
+    counters = TransportCounters()
 
     def count():
         for _ in range(2000):
@@ -56,7 +56,7 @@ def test_nothing_is_lost_between_threads():
 
 def test_a_counter_that_does_not_exist_is_a_programming_error():
     with pytest.raises(KeyError):
-        Counters().add(frames_lost=1)
+        TransportCounters().add(frames_lost=1)
 
 
 def frame(can_id, number=0, deadline_ns=100):

@@ -6,7 +6,7 @@ import time
 import pytest
 import serial
 
-from drivers.transport.reconnecting import BackoffPolicy, Counters, ReconnectingTransport
+from drivers.transport.reconnecting import BackoffPolicy, ReconnectingTransport, TransportCounters
 from drivers.transport.serial import SerialMedium, ask_for_low_latency
 from drivers.types import Frame, LinkState
 from firmware_protocol.serial_framing import FrameDecoder, encode_frame
@@ -186,7 +186,7 @@ def test_the_lines_are_set_before_the_port_is_opened(terminal, monkeypatch, dtr,
         really_open(port)
 
     monkeypatch.setattr(serial.Serial, "open", look)
-    SerialMedium(str(terminal.path), 115_200, dtr, rts).connect(Counters()).close()
+    SerialMedium(str(terminal.path), 115_200, dtr, rts).connect(TransportCounters()).close()
     assert seen == [(dtr, rts, True)]
 
 
@@ -204,7 +204,7 @@ def test_both_lines_are_low_unless_robot_toml_says_otherwise(terminal):
     port = SerialMedium(str(terminal.path), 115_200)
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(serial, "Serial", Port)
-        port.connect(Counters()).close()
+        port.connect(TransportCounters()).close()
     assert set(asked) == {("dtr", False), ("rts", False)}
 
 
