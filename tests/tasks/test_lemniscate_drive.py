@@ -18,7 +18,7 @@ from disco_hw.runtime.supervisor import UserRequest
 from disco_hw.runtime.task_change import TaskRefused, changed_task
 from disco_hw.viewer import curves
 from disco_hw.viewer.recording import Recording
-from sim.body_dynamics import Pose
+from sim.body_dynamics import BodyPose
 from tests.runtime.path_robot import ROBOTS
 from tests.runtime.simulated import simulated_stack
 from tests.runtime.test_replay import write_log
@@ -39,7 +39,7 @@ def lemniscate_robot(directory):
 def test_a_lemniscate_is_driven_changed_recorded_and_replayed_bit_for_bit(tmp_path):
     robot_file = lemniscate_robot(tmp_path)
     setup = load_setup(robot_file)
-    stack = simulated_stack(robot_file=robot_file, start=Pose(*setup.config.task.course().start))
+    stack = simulated_stack(robot_file=robot_file, start=BodyPose(*setup.config.task.course().start))
     stack.run(1.5)
     with pytest.raises(TaskRefused, match=r"at most .* m/s, or widen it"):
         changed_task(stack.core.task, {"speed_m_s": 3.0}, setup.config.robot, State.READY)
