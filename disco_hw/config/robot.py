@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import msgspec
 from msgspec import Meta
@@ -12,8 +12,13 @@ from msgspec import Meta
 from disco_hw.config.input_file import ROBOT_TOML, read_toml
 from disco_hw.config.words import in_words
 from disco_hw.errors import InputError
-from disco_hw.tasks import ReadField, RobotTask, UnknownKind, default_task, kinds, task_class, task_from
 from drivers.motor import UnknownDriverError, find_driver
+
+if TYPE_CHECKING:
+    from disco_hw.tasks import RobotTask
+else:
+    # Tasks bring numpy with them, which no command needs to say what its options are. `_task_of` checks the kind.
+    RobotTask = Any
 
 Positive = Annotated[float, Meta(gt=0.0)]
 NonNegative = Annotated[float, Meta(ge=0.0)]
@@ -126,6 +131,12 @@ class Drive(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     gamepad_silence_s: NonNegative = 2.0
 
 
+def _default_task() -> RobotTask:
+    from disco_hw.tasks import default_task  # noqa: PLC0415
+
+    return default_task()
+
+
 class RobotConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The whole of robot.toml."""
 
@@ -134,7 +145,7 @@ class RobotConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     link: Link = Link()
     control: Control = Control()
     estimation: Estimation = Estimation()
-    task: RobotTask = msgspec.field(default_factory=default_task)
+    task: RobotTask = msgspec.field(default_factory=_default_task)
     model: ModelFile = ModelFile()
     log: Log = Log()
     daemon: Daemon = Daemon()
@@ -178,6 +189,8 @@ def prior_around(robot: Robot) -> Prior:
 
 def _task_of(path: Path, section: object) -> RobotTask:
     """The task that [task] says; its kind knows which fields that has."""
+    from disco_hw.tasks import ReadField, UnknownKind, kinds, task_class, task_from  # noqa: PLC0415
+
     if not isinstance(section, dict):
         raise InputError(f"{path}: task: not a section; write [task] above its fields")
     try:

@@ -53,7 +53,8 @@ def robot(tmp_path):
 def test_a_question_and_a_stop_load_no_large_library(robot, verb):
     code, loaded, said = loaded_by(*(word.format(robot=robot) for word in verb))
     assert code == 1, said
-    assert not loaded & set(HEAVY)
+    # What a task is takes numpy, and `ctl` reads the whole of robot.toml.
+    assert not loaded & {*HEAVY, *(() if verb[0] == "ctl" else ("numpy",))}
 
 
 @pytest.mark.parametrize(
@@ -97,7 +98,7 @@ def test_what_drives_loads_nothing_that_it_does_not_use(module):
     unused = {"torch", "matplotlib", "cantools", "viser", "scipy.stats", "scipy.interpolate", "scipy.special",
               "scipy.optimize", "scipy.sparse", "scipy.ndimage", "scipy.signal", "scipy.spatial"}  # fmt: skip
     assert not loaded & unused
-    assert "filterpy.kalman" in loaded
+    assert "filterpy.kalman" in loaded or module != "disco_hw.daemon.daemon"
 
 
 def test_filterpys_statistics_are_there_for_who_asks_for_them():
