@@ -38,11 +38,11 @@ test: $(STAMP) chromium
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy & types=$$!; $(BIN)/python -m tools.compile_kernels & kernels=$$!; wait $$types && wait $$kernels
-	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 3 --dist loadgroup --no-loadscope-reorder -m "not long$(if $(CHROMIUM), or browser)"
+	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 3 --dist loadscope --no-loadscope-reorder -m "not long$(if $(CHROMIUM), or browser)"
 
 # Closed loops, studies, clusters and browsers: as much again.
 test-long: $(STAMP) chromium
-	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadgroup --no-loadscope-reorder -m long
+	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadscope --no-loadscope-reorder -m long
 
 # The peers that our figures stand beside, and nothing else needs: in an environment of their own, on top of ours.
 PEERS := .venv-bench

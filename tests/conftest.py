@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 from hypothesis import settings
+from xdist.scheduler import LoadScopeScheduling
 
 # The machine's load is not a property of the code: no example fails for being slow. A change is judged on the same
 # examples every time; `make fuzz` looks for new ones.
@@ -12,6 +13,22 @@ settings.register_profile("search", deadline=None, print_blob=True)
 settings.load_profile("project")
 
 ROBOT_TESTS = Path(__file__).parent / "robot"
+REAL_TIME = "tests/hil/"
+
+
+class FilesToWorkers(LoadScopeScheduling):
+    """Gives each worker whole files, for what their tests share, and one worker all stacks with real-time priority.
+
+    Side by side these would take the processors from each other. (`--dist loadgroup` does nothing with pytest 9.2.)
+    """
+
+    def _split_scope(self, nodeid: str) -> str:
+        return REAL_TIME if nodeid.startswith(REAL_TIME) else nodeid.split("::", 1)[0]
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config, log):
+    return FilesToWorkers(config, log) if config.getvalue("dist") == "loadscope" else None
 
 
 def pytest_ignore_collect(collection_path, config):
@@ -23,15 +40,9 @@ def pytest_ignore_collect(collection_path, config):
     return None
 
 
-@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config, items):
-    for item in items:
-        # With --dist loadgroup one worker runs all stacks with real-time priority, one after the other: side by side
-        # they would take the processors from each other. Other files stay whole, for what their tests share.
-        group = "realtime" if item.get_closest_marker("hil") else str(item.path.relative_to(ROBOT_TESTS.parent))
-        item.add_marker(pytest.mark.xdist_group(group))
-    # They take longest, so they begin first.
-    items.sort(key=lambda item: item.get_closest_marker("hil") is None)
+    # The stacks in real time take longest, so they begin first.
+    items.sort(key=lambda item: not item.nodeid.startswith(REAL_TIME))
     if not config.getoption("--robot"):
         return
     still = pytest.mark.skip(reason="turns the wheels; lift them off the ground and give --allow-motion")
