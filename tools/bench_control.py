@@ -20,7 +20,7 @@ from numba.core.runtime import _nrt_python, rtsys
 import disco_hw
 from disco_hw.control import CommandLimits, Disco, DiscoSettings, PlannerState, Sampler, SentCommand
 from disco_hw.control.black_box import BlackBoxDisco
-from disco_hw.control.kernel.replan import replan
+from disco_hw.control.kernel.step import disco_step
 from disco_hw.control.parameter_points import unscented_points
 from disco_hw.control.pendulum import PendulumPlanner, PendulumPoints
 from disco_hw.control.settings import ROTATION
@@ -196,7 +196,7 @@ def allocations(model: Model, steps: int = 200) -> dict[str, float]:
     arguments = planner.optimiser.arguments
     counted = {}
     _nrt_python.memsys_enable_stats()
-    for name, function in (("step", replan), ("empty", _empty)):
+    for name, function in (("step", disco_step), ("empty", _empty)):
         function(*arguments)
         before = rtsys.get_allocation_stats().alloc
         for _ in range(steps):

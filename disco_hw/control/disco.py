@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from disco_hw.control.command_history import command_history
-from disco_hw.control.kernel.blocks import BLOCK, aligned_zeros
-from disco_hw.control.kernel.skid_steer import WHEEL_ROWS, SkidSteer
+from disco_hw.control.kernel.layout import BLOCK, CHANNELS, WHEEL_ROWS, aligned_zeros
+from disco_hw.control.kernel.skid_steer import SkidSteer
 from disco_hw.control.optimiser import Optimiser
 from disco_hw.control.parameter_points import (
     drawn_points,
@@ -35,7 +35,6 @@ DELAYED_BY = DELAY.columns[0]
 # Steps kept beyond the longest delay that is believed in at first, for later beliefs.
 SPARE_HISTORY = 2
 SHORTEST_GAP_S = 1e-6
-CHANNELS = 2
 
 
 class Disco:

@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.control.kernel.blocks import BLOCK, STATE_ROWS, aligned_zeros, block_count
-from disco_hw.control.kernel.replan import ESS, SAMPLING, TEMPERATURE, Workspace, replan
+from disco_hw.control.kernel.layout import BLOCK, STATE_ROWS, Floats, System, aligned_zeros, block_count
 from disco_hw.control.kernel.sequences import Basis, Limits
+from disco_hw.control.kernel.step import ESS, SAMPLING, TEMPERATURE, Workspace, disco_step
 from disco_hw.control.settings import Sampler
 from disco_hw.control.spline import spline_basis
 from disco_hw.jit import compiled_for
+from disco_hw.tasks.cost import single
 
 Array = NDArray[np.float64]
 FIRST_TEMPERATURE = 0.1
-# Commands of all samples are kept for the update while they fit the second-level cache (numbers of four bytes).
-MOST_KEPT = 262_144
 
 
 class Optimiser:
@@ -42,7 +40,7 @@ class Optimiser:
         padded = blocks * int(BLOCK)
         self.step_number = 0
         self._before = np.zeros(channels, f32)
-        self._limits = Limits(f32(largest), f32(min(change, 4.0 * largest)), self._before)
+        self._limits = Limits(single(largest), single(min(change, 4.0 * largest)), self._before)
         commands_size = (history + horizon) * channels * int(BLOCK)
         self._samplings = np.zeros(1, SAMPLING)
         self._samplings[0] = (
@@ -51,7 +49,6 @@ class Optimiser:
             blocks,
             rows,
             history,
-            blocks * commands_size <= MOST_KEPT,
             sampler.with_nominal,
             sampler.beyond_end == "hold",
             sampler.update_from == "drawn",
@@ -61,13 +58,12 @@ class Optimiser:
             sampler.control_cost_weight / sampler.noise_std**2,
             {"mean": 1.0, "cvar": sampler.worst_part, "worst": 1e-6}[sampler.risk],
         )
-        kept = blocks if self._samplings["kept"][0] else 1
         self._work = Workspace(
             nominal=np.zeros((horizon, channels), f32),
             updated=np.zeros((horizon, channels), f32),
             before_update=np.zeros((horizon, channels), f32),
             noise=aligned_zeros(blocks * rows * int(BLOCK)),
-            commands=aligned_zeros(kept * commands_size).reshape(kept, commands_size),
+            commands=aligned_zeros(blocks * commands_size).reshape(blocks, commands_size),
             state=aligned_zeros(STATE_ROWS * int(BLOCK)),
             point_costs=aligned_zeros(points * padded),
             costs=aligned_zeros(padded),
@@ -80,8 +76,8 @@ class Optimiser:
         self._sampler = sampler
         self._valid = False
         self._replan: Callable[..., bool] | None = None
-        # What `replan` was last called with, for whoever wants to repeat a step.
-        self.arguments: tuple[Any, ...] = ()
+        # What `disco_step` was last called with, for whoever wants to repeat a step.
+        self.arguments: tuple[object, ...] = ()
         self.reset()
 
     def reset(self) -> None:
@@ -116,7 +112,7 @@ class Optimiser:
         blocks.reshape(len(blocks), -1, int(BLOCK))[:, : past.size] = past.reshape(-1, 1)
 
     def step(
-        self, shift_steps: float, gain: float, before: tuple[float, ...], system: Any, point_weights: NDArray[Any]
+        self, shift_steps: float, gain: float, before: tuple[float, ...], system: System, point_weights: Floats
     ) -> bool:
         """One step: the plan moves on by `shift_steps` and is improved; False if nothing valid came out.
 
@@ -132,7 +128,7 @@ class Optimiser:
             self._work, self._samplings, number, shift_steps, gain, self._basis, self._limits, system, point_weights
         )  # fmt: skip
         if self._replan is None:
-            self._replan = compiled_for(replan, *self.arguments)
+            self._replan = compiled_for(disco_step, *self.arguments)
         self._valid = self._replan(*self.arguments)
         return self._valid
 

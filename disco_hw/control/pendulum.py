@@ -8,22 +8,24 @@ that the paper used: the angle moves with the new speed, then the speed is cut. 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.control.kernel.blocks import BLOCK, U
+from disco_hw.control.kernel.layout import BLOCK, Floats, U
 from disco_hw.control.kernel.random_numbers import cos_sin_half_turns
-from disco_hw.control.kernel.rollout import roll_block
+from disco_hw.control.kernel.rollout import rolls_out
 from disco_hw.control.optimiser import Optimiser
 from disco_hw.control.plan import NoValidControl
 from disco_hw.control.settings import Sampler
-from disco_hw.jit import block_function, cast_like, scalar_function, specialise, tune_loops
+from disco_hw.jit import block_function, cast_like, scalar_function, tune_loops
+from disco_hw.tasks.cost import single
 
 Array = NDArray[np.float64]
+# Any: numbers or arrays of any shape, and the same come back.
+Values: TypeAlias = Any
 
 STEP_S = 0.05
 LARGEST_TORQUE_NM = 2.0
@@ -52,11 +54,11 @@ class PendulumTerms(NamedTuple):
     `gravity` is 3 g step / (2 l), `gain` 3 step / (m l^2); `each` is None or anything else.
     """
 
-    start: Any
-    gravity: Any
-    gain: Any
-    each: Any
-    step_s: Any
+    start: Floats
+    gravity: Floats
+    gain: Floats
+    each: bool | None
+    step_s: float
 
 
 def instant_cost(angle_rad: float, speed_rad_s: float) -> float:
@@ -65,8 +67,9 @@ def instant_cost(angle_rad: float, speed_rad_s: float) -> float:
 
 
 def step(
-    angle_rad: Any, speed_rad_s: Any, torque_nm: Any, length_m: Any, mass_kg: Any, gravity_m_s2: float = GRAVITY_M_S2
-) -> tuple[Any, Any]:
+    angle_rad: Values, speed_rad_s: Values, torque_nm: Values, length_m: Values, mass_kg: Values,
+    gravity_m_s2: float = GRAVITY_M_S2,
+) -> tuple[Values, Values]:  # fmt: skip
     """Angle and speed after one step, in numpy and for arrays of any shape; the torque is cut here."""
     torque = np.clip(torque_nm, -LARGEST_TORQUE_NM, LARGEST_TORQUE_NM)
     acceleration = 1.5 * gravity_m_s2 / length_m * np.sin(angle_rad) + 3.0 * torque / (mass_kg * length_m**2)
@@ -109,7 +112,7 @@ class PendulumPlanner:
             (1.5 * GRAVITY_M_S2 / length * STEP_S).astype(f32),
             (3.0 / (mass * length**2) * STEP_S).astype(f32),
             True if points.each else None,
-            f32(STEP_S),
+            single(STEP_S),
         )
         self._weights = points.weights.astype(f32)
 
@@ -124,7 +127,7 @@ class PendulumPlanner:
 
 
 @scalar_function
-def _value(table: Any, lane: Any, point: int, each: Any) -> Any:
+def _value(table: Floats, lane: int, point: int, each: bool | None) -> float:
     """Entry of a table for a sample: the point's, or the sample's own."""
     if each is None:
         return table[point]
@@ -132,15 +135,15 @@ def _value(table: Any, lane: Any, point: int, each: Any) -> Any:
 
 
 @scalar_function
-def _cos_sin(angle: Any) -> Any:
+def _cos_sin(angle: float) -> tuple[float, float]:
     """Cosine and sine of an angle."""
     return cos_sin_half_turns(angle * cast_like(1.0 / math.pi, angle))
 
 
 @block_function
 def _roll(
-    costs: Any, at: Any, point: int, horizon: int, commands: Any, state: Any, start: Any, gravity: Any, gain: Any,
-    step_s: Any, each: Any,
+    costs: Floats, at: int, point: int, horizon: int, commands: Floats, state: Floats, start: Floats,
+    gravity: Floats, gain: Floats, step_s: float, each: bool | None,
 ) -> None:  # fmt: skip
     """Roll the block's torques out with one parameter point, or each sample's own; writes `costs[at:at + BLOCK]`."""
     tune_loops()
@@ -173,21 +176,15 @@ def _roll(
         costs[at + b] = state[_TOTAL + b]
 
 
-@specialise(roll_block)
-def _roll_block(
-    system: Any, costs: Any, points: Any, padded: Any, block: Any, horizon: Any, commands: Any, state: Any
-) -> Callable[..., Any] | None:
-    if getattr(system, "instance_class", None) is not PendulumTerms:
-        return None
-
-    def roll_pendulum(
-        system: Any, costs: Any, points: Any, padded: Any, block: Any, horizon: Any, commands: Any, state: Any
-    ) -> None:
-        for i in range(points):
-            at = U(i * padded) + U(block) * BLOCK
-            _roll(
-                costs, at, i, horizon, commands, state, system.start, system.gravity, system.gain, system.step_s,
-                system.each,
-            )  # fmt: skip
-
-    return roll_pendulum
+@rolls_out(PendulumTerms)
+def roll_pendulum(
+    system: PendulumTerms, costs: Floats, points: int, padded: int, block: int, horizon: int, commands: Floats,
+    state: Floats,
+) -> None:  # fmt: skip
+    """Costs of one block of samples under all parameter points; see `roll_block`."""
+    for i in range(points):
+        at = U(i * padded) + U(block) * BLOCK
+        _roll(
+            costs, at, i, horizon, commands, state, system.start, system.gravity, system.gain, system.step_s,
+            system.each,
+        )  # fmt: skip

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.control import pendulum
-from disco_hw.control.kernel.blocks import BLOCK, block_count
+from disco_hw.control.kernel.layout import BLOCK, block_count
 from disco_hw.control.pendulum import PAPER_SAMPLER, PendulumPlanner, PendulumPoints
 from disco_hw.control.sigma_points import sigma_points
 from disco_hw.model import Belief, Gaussian, Uniform

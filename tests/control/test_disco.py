@@ -18,7 +18,7 @@ from disco_hw.control import (
     Sampler,
     SentCommand,
 )
-from disco_hw.control.kernel.replan import replan
+from disco_hw.control.kernel.step import disco_step
 from disco_hw.experiments.plant import KinematicPlant
 from disco_hw.model import EffectSetting, Gaussian, load_model
 from disco_hw.tasks.circle import CircleCost
@@ -305,10 +305,10 @@ def test_a_belief_set_between_plans_keeps_the_plan_compiles_nothing_and_repeats(
     for _ in range(2):
         disco = planner()
         plans = [disco.plan(0, TANGENT)]
-        compiled = len(replan.signatures)
+        compiled = len(disco_step.signatures)
         disco.set_belief(LEARNT)
         plans.append(disco.plan(20_000_000, msgspec.structs.replace(TANGENT, t_ns=20_000_000)))
-        assert len(replan.signatures) == compiled
+        assert len(disco_step.signatures) == compiled
         assert plans[1].diagnostics.outcome is PlanOutcome.PLANNED
         assert np.abs(plans[1].wheel_speeds - plans[0].wheel_speeds).max() < 1.0
         runs.append(plans[1].wheel_speeds)

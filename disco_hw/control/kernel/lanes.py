@@ -9,8 +9,9 @@ from llvmlite import ir  # type: ignore[import-untyped]
 from numba import types
 from numba.extending import intrinsic
 
-from disco_hw.control.kernel.blocks import BLOCK
+from disco_hw.control.kernel.layout import BLOCK
 
+# Any, here and below: numba's compiler and its code generator have no types.
 _intrinsic: Any = intrinsic
 _LANES = 16
 _FLOAT = ir.FloatType()

@@ -7,11 +7,10 @@ normal deviates. There is no state to save: a plan can be drawn again bit for bi
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 
-from disco_hw.control.kernel.blocks import BLOCK, U
+from disco_hw.control.kernel.layout import BLOCK, Floats, U
 from disco_hw.jit import (
     bits_of_float,
     block_function,
@@ -41,7 +40,7 @@ _COSINE = tuple(np.float32(c) for c in (1.0, -4.9347954, 4.0584474, -1.3320621, 
 
 
 @scalar_function
-def philox(c0: Any, c1: Any, c2: Any, c3: Any, k0: Any, k1: Any) -> Any:
+def philox(c0: int, c1: int, c2: int, c3: int, k0: int, k1: int) -> tuple[int, int, int, int]:
     """Philox 4x32-10: four uniform uint32 from a counter of four and a key of two uint32."""
     for _ in range(10):
         product0 = _M0 * np.uint64(c0)
@@ -58,7 +57,7 @@ def philox(c0: Any, c1: Any, c2: Any, c3: Any, k0: Any, k1: Any) -> Any:
 
 
 @scalar_function
-def natural_log(value: Any) -> Any:
+def natural_log(value: float) -> float:
     """Logarithm of a positive normal float32, relative error below 2e-7; branch-free, so that it vectorises."""
     bits = bits_of_float(value)
     # Exponent such that the mantissa lies in [sqrt(1/2), sqrt(2)).
@@ -73,7 +72,7 @@ def natural_log(value: Any) -> Any:
 
 
 @scalar_function
-def _cos_sin_part(part: Any, sign: Any) -> Any:
+def _cos_sin_part(part: float, sign: int) -> tuple[float, float]:
     """Cosine and sine of pi * part for |part| <= 1/2, absolute error below 2e-7, with the bits of `sign` flipped."""
     q = part * part
     c0, c1, c2, c3, c4 = _COSINE
@@ -87,7 +86,7 @@ def _cos_sin_part(part: Any, sign: Any) -> Any:
 
 
 @scalar_function
-def cos_sin_half_turns(half_turns: Any) -> Any:
+def cos_sin_half_turns(half_turns: float) -> tuple[float, float]:
     """Cosine and sine of pi * half_turns for |half_turns| < 2^22, absolute error below 3e-7 on top of its rounding."""
     # The sum's last bit is whether the nearest whole number is odd, and then both signs change.
     shifted = half_turns + _WHOLE
@@ -95,7 +94,7 @@ def cos_sin_half_turns(half_turns: Any) -> Any:
 
 
 @scalar_function
-def box_muller(bits0: Any, bits1: Any) -> Any:
+def box_muller(bits0: int, bits1: int) -> tuple[float, float]:
     """Two independent standard normal deviates (float32) from two uniform uint32; magnitude at most 5.8."""
     # 24 bits are exact in float32; the offset keeps zero out of the logarithm.
     uniform = (float32(int32(bits0 >> np.uint32(8))) + float32(0.5)) * _TO_UNIT
@@ -107,7 +106,7 @@ def box_muller(bits0: Any, bits1: Any) -> Any:
 
 
 @block_function
-def fill_normal_block(noise: Any, rows: int, block: int, step: int, seed: int, scale: float) -> None:
+def fill_normal_block(noise: Floats, rows: int, block: int, step: int, seed: int, scale: float) -> None:
     """Fill block `block` of `noise` (blocks, rows, BLOCK) float32, flat, with normal deviates.
 
     `rows` is a multiple of four, `scale` the standard deviation. A deviate depends on nothing but (seed, step, sample,

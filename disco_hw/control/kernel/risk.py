@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
-from disco_hw.control.kernel.blocks import BLOCK, U
+import numpy as np
+from numpy.typing import NDArray
+
+from disco_hw.control.kernel.layout import BLOCK, Floats, U
 from disco_hw.jit import block_function, cast_like, tune_loops
 
 
 @block_function
-def mean_over_points(costs: Any, point_costs: Any, weights: Any, blocks: int) -> None:
+def mean_over_points(costs: Floats, point_costs: Floats, weights: Floats, blocks: int) -> None:
     """Add the weighted mean over the points, `point_costs` (L, K'), to `costs` (K',)."""
     tune_loops()
     padded = blocks * int(BLOCK)
@@ -23,7 +25,9 @@ def mean_over_points(costs: Any, point_costs: Any, weights: Any, blocks: int) ->
 
 
 @block_function
-def worst_over_points(costs: Any, point_costs: Any, weights: Any, blocks: int, part: float, order: Any) -> None:
+def worst_over_points(
+    costs: Floats, point_costs: Floats, weights: Floats, blocks: int, part: float, order: NDArray[np.int64]
+) -> None:
     """Add the mean over the worst `part` of the points' weight (CVaR) to `costs`; weights are not negative.
 
     `order` (L,) is scratch. A part so small that the worst point fills it gives the worst point's cost.

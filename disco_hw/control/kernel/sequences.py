@@ -5,37 +5,43 @@ Commands lie as rows of BLOCK samples: row (history + t) * C + c is channel c at
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeAlias
 
-from disco_hw.control.kernel.blocks import BLOCK, U
+import numpy as np
+from numpy.typing import NDArray
+
 from disco_hw.control.kernel.lanes import row_sum
+from disco_hw.control.kernel.layout import BLOCK, Floats, U
 from disco_hw.jit import block_function, float32, scalar_function, tune_loops
+
+# Weights of the four knots that act at a step, or None for one knot a step.
+Taps: TypeAlias = tuple[float, float, float, float] | None
 
 
 class Basis(NamedTuple):
     """How noise at knots becomes noise over time: `first` (T,) int, `weights` (T, 4) or None for one knot a step."""
 
-    first: Any
-    weights: Any
+    first: NDArray[np.int64]
+    weights: Floats | None
 
 
 class Limits(NamedTuple):
     """Largest magnitude of a command, its largest change in a step, and the commands before the plan (C,)."""
 
-    largest: Any
-    change: Any
-    before: Any
+    largest: float
+    change: float
+    before: Floats
 
 
 @scalar_function
-def clip(value: Any, low: Any, high: Any) -> Any:
+def clip(value: float, low: float, high: float) -> float:
     """Value within [low, high]; NaN stays NaN."""
     value = low if value < low else value
     return high if value > high else value
 
 
 @scalar_function
-def _with_noise(middle: Any, noise: Any, at: Any, stride: Any, weights: Any) -> Any:
+def _with_noise(middle: float, noise: Floats, at: int, stride: int, weights: Taps) -> float:
     """`middle` plus the noise at index `at`: of four knots from there on by their weights, or of one alone for None."""
     if weights is None:
         return middle + noise[at]
@@ -47,7 +53,7 @@ def _with_noise(middle: Any, noise: Any, at: Any, stride: Any, weights: Any) -> 
 
 
 @scalar_function
-def _weights(weights: Any, t: int) -> Any:
+def _weights(weights: Floats | None, t: int) -> Taps:
     """Weights of the four knots that act at step t, or None."""
     if weights is None:
         return None
@@ -56,7 +62,14 @@ def _weights(weights: Any, t: int) -> Any:
 
 @block_function
 def expand(
-    commands: Any, state: Any, history: int, nominal: Any, noise: Any, first: Any, basis: Any, limits: Any
+    commands: Floats,
+    state: Floats,
+    history: int,
+    nominal: Floats,
+    noise: Floats,
+    first: int,
+    basis: Basis,
+    limits: Limits,
 ) -> None:
     """Commands of one block of samples: nominal (T, C) plus noise, within the limits of magnitude and change.
 
@@ -88,7 +101,7 @@ def expand(
 
 
 @block_function
-def add_control_cost(costs: Any, first: Any, commands: Any, history: int, nominal: Any, scale: float) -> None:
+def add_control_cost(costs: Floats, first: int, commands: Floats, history: int, nominal: Floats, scale: float) -> None:
     """Add scale * sum_t u_t (v_t - u_t) of one block's commands v about the nominal u to `costs[first:]`."""
     tune_loops()
     horizon, channels = nominal.shape
@@ -101,7 +114,7 @@ def add_control_cost(costs: Any, first: Any, commands: Any, history: int, nomina
 
 
 @scalar_function
-def _spread(pull: Any, row: Any, channels: int, weights: Any, value: Any) -> None:
+def _spread(pull: Floats, row: int, channels: int, weights: Taps, value: float) -> None:
     """Add a value at a step to the rows of the four knots that act there, or to that of its one knot for None."""
     if weights is None:
         pull[row] += value
@@ -111,7 +124,7 @@ def _spread(pull: Any, row: Any, channels: int, weights: Any, value: Any) -> Non
 
 
 @block_function
-def pull_on_knots(pull: Any, nominal: Any, basis: Any) -> None:
+def pull_on_knots(pull: Floats, nominal: Floats, basis: Basis) -> None:
     """How sum_t u_t eps_t grows with each row of noise, `pull` (R,): the nominal u (T, C) through the basis."""
     horizon, channels = nominal.shape
     for r in range(pull.size):
@@ -123,7 +136,7 @@ def pull_on_knots(pull: Any, nominal: Any, basis: Any) -> None:
 
 
 @block_function
-def add_drawn_control_cost(costs: Any, first: Any, noise: Any, at: Any, pull: Any, scale: float) -> None:
+def add_drawn_control_cost(costs: Floats, first: int, noise: Floats, at: int, pull: Floats, scale: float) -> None:
     """As `add_control_cost`, but of the noise as drawn, which begins at index `at` of `noise`, by `pull_on_knots`."""
     tune_loops()
     for r in range(U(pull.size)):
@@ -135,7 +148,7 @@ def add_drawn_control_cost(costs: Any, first: Any, noise: Any, at: Any, pull: An
 
 @block_function
 def add_weighted(
-    sums: Any, weights: Any, first_block: Any, blocks: int, values: Any, stride: Any, skip: Any, rows: int
+    sums: Floats, weights: Floats, first_block: int, blocks: int, values: Floats, stride: int, skip: int, rows: int
 ) -> None:
     """Add blocks of values, times their weights, to the rows of `sums`.
 
@@ -151,7 +164,7 @@ def add_weighted(
 
 
 @block_function
-def sum_lanes(sums: Any, rows: int) -> None:
+def sum_lanes(sums: Floats, rows: int) -> None:
     """Sum each row of BLOCK into its first entry, always in the same order."""
     tune_loops()
     for j in range(U(rows)):
@@ -159,7 +172,7 @@ def sum_lanes(sums: Any, rows: int) -> None:
 
 
 @scalar_function
-def mean_noise(sums: Any, t: int, c: int, channels: int, basis: Any) -> Any:
+def mean_noise(sums: Floats, t: int, c: int, channels: int, basis: Basis) -> float:
     """Noise at step t of channel c, from the rows of noise in the first entries of the rows of `sums`."""
     row = U(basis.first[t] * channels + c) * BLOCK
     return _with_noise(float32(0.0), sums, row, U(channels) * BLOCK, _weights(basis.weights, t))

@@ -6,25 +6,25 @@ Sums run over lanes in a fixed order, so that the same costs give the same weigh
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 
-from disco_hw.control.kernel.blocks import BLOCK, U
 from disco_hw.control.kernel.lanes import row_sum
+from disco_hw.control.kernel.layout import BLOCK, Floats, U
 from disco_hw.jit import block_function, float32, float_from_bits, int32, scalar_function, tune_loops
+from disco_hw.tasks.cost import single
 
 _LOG2_E = np.float32(math.log2(math.e))
 _LN2_HIGH = np.float32(0.693359375)
 _LN2_LOW = np.float32(math.log(2.0) - 0.693359375)
-_LOWEST = np.float32(-87.0)
-INVALID = np.float32(1e30)
+_LOWEST = single(-87.0)
+INVALID = single(1e30)
 
 _SUM, _SQUARES = U(0), BLOCK
 
 
 @scalar_function
-def exp_nonpositive(value: Any) -> Any:
+def exp_nonpositive(value: float) -> float:
     """Exponential of a float32 <= 0, relative error below 3e-7; anything below -87 counts as -87."""
     value = value if value > _LOWEST else _LOWEST
     whole = int32(value * _LOG2_E - float32(0.5))
@@ -41,7 +41,7 @@ def exp_nonpositive(value: Any) -> Any:
 
 
 @block_function
-def refuse_invalid(costs: Any, samples: int) -> Any:
+def refuse_invalid(costs: Floats, samples: int) -> tuple[float, int]:
     """Replace costs that are not finite by INVALID; returns the least cost and the number of finite ones."""
     least, count = INVALID, 0
     for k in range(U(samples)):
@@ -55,7 +55,15 @@ def refuse_invalid(costs: Any, samples: int) -> Any:
 
 
 @block_function
-def weigh(weights: Any, scratch: Any, costs: Any, blocks: int, samples: int, least: float, temperature: float) -> Any:
+def weigh(
+    weights: Floats,
+    scratch: Floats,
+    costs: Floats,
+    blocks: int,
+    samples: int,
+    least: float,
+    temperature: float,
+) -> tuple[float, float]:
     """Unnormalised weights exp(-(cost - least) / temperature); returns their sum and effective sample size.
 
     `scratch` holds two rows of BLOCK. Idle lanes of the last block get weight zero.
@@ -82,8 +90,15 @@ def weigh(weights: Any, scratch: Any, costs: Any, blocks: int, samples: int, lea
 
 @block_function
 def temperature_for(
-    target: float, weights: Any, scratch: Any, costs: Any, blocks: int, samples: int, least: float, guess: float
-) -> Any:
+    target: float,
+    weights: Floats,
+    scratch: Floats,
+    costs: Floats,
+    blocks: int,
+    samples: int,
+    least: float,
+    guess: float,
+) -> tuple[float, float, float]:
     """Temperature at which the effective sample size is `target` within 1 %; leaves the weights at it.
 
     Safeguarded secant in the logarithms of both, from `guess` (the last step's). Returns temperature, sum, size.

@@ -5,7 +5,7 @@ import pytest
 from numba import njit
 
 from disco_hw.control import oracle
-from disco_hw.control.kernel.blocks import BLOCK, aligned_zeros
+from disco_hw.control.kernel.layout import BLOCK, aligned_zeros
 from disco_hw.control.kernel.risk import mean_over_points, worst_over_points
 
 B = int(BLOCK)

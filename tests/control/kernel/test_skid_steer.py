@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from disco_hw.control import CommandLimits, Disco, DiscoSettings, PlannerState, Sampler, SentCommand, oracle
 from disco_hw.control.command_history import command_history
-from disco_hw.control.kernel.blocks import BLOCK
+from disco_hw.control.kernel.layout import BLOCK
 from disco_hw.control.parameter_points import unscented_points
 from disco_hw.control.spline import spline_basis
 from disco_hw.effects.registry import MOTION_EFFECTS

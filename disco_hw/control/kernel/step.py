@@ -1,17 +1,20 @@
-"""One step of DISCO, compiled: shift the last plan, sample, roll out, weigh, update. Nothing is allocated."""
+"""One step of DISCO, compiled: Algorithm 1 of the paper. Start reading at `disco_step`. Nothing is allocated."""
 
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from disco_hw.control.kernel.blocks import BLOCK, U
+from disco_hw.control.kernel.layout import BLOCK, Floats, System, U
 from disco_hw.control.kernel.random_numbers import fill_normal_block
 from disco_hw.control.kernel.risk import mean_over_points, worst_over_points
 from disco_hw.control.kernel.rollout import roll_block
 from disco_hw.control.kernel.sequences import (
+    Basis,
+    Limits,
     add_control_cost,
     add_drawn_control_cost,
     add_weighted,
@@ -29,31 +32,31 @@ ESS, TEMPERATURE, LEAST, MEAN, NOMINAL, VALID = range(6)
 class Workspace(NamedTuple):
     """Buffers of the step, float32 and flat unless said; C channels, R rows of noise, K' = blocks * BLOCK samples.
 
-    `nominal`, `updated`, `before_update` (T, C); `noise` (blocks, R, BLOCK); `commands` (blocks or 1,
-    (H + T) * C * BLOCK); `state` (STATE_ROWS, BLOCK); `point_costs` (L, K'); `costs`, `weights` (K',); `sums`
+    `nominal` (T, C) is U of the paper; `updated`, `before_update` (T, C); `noise` (blocks, R, BLOCK), E of the paper;
+    `commands` (blocks, (H + T) * C * BLOCK), V of the paper behind H steps from before the plan; `state`
+    (STATE_ROWS, BLOCK); `point_costs` (L, K'), S_i^k; `costs`, `weights` (K',), S^k and w_k; `sums`
     (T * C or R, BLOCK); `pull` (R,); `order` (L,) int64; `report` (6,) float64: effective sample size, temperature,
     least, mean and nominal cost, number of finite costs.
     """
 
-    nominal: Any
-    updated: Any
-    before_update: Any
-    noise: Any
-    commands: Any
-    state: Any
-    point_costs: Any
-    costs: Any
-    weights: Any
-    sums: Any
-    pull: Any
-    order: Any
-    report: Any
+    nominal: Floats
+    updated: Floats
+    before_update: Floats
+    noise: Floats
+    commands: Floats
+    state: Floats
+    point_costs: Floats
+    costs: Floats
+    weights: Floats
+    sums: Floats
+    pull: Floats
+    order: NDArray[np.int64]
+    report: NDArray[np.float64]
 
 
 # How is sampled and weighed. `with_nominal`: sample 0 is the nominal. `hold`: a shifted plan ends in its last command,
 # else in zero. `drawn`: the update is made from the noise as drawn, else as applied. `temperature` is 0 for
 # `target_ess`. `control_cost`: weight over variance. `worst_part`: of the points' weight that the cost is the mean of.
-# `kept`: all blocks' commands are kept from the rollout for the update, else worked out again.
 SAMPLING = np.dtype(
     [
         ("seed", "i8"),
@@ -61,7 +64,6 @@ SAMPLING = np.dtype(
         ("blocks", "i8"),
         ("rows", "i8"),
         ("history", "i8"),
-        ("kept", "?"),
         ("with_nominal", "?"),
         ("hold", "?"),
         ("drawn", "?"),
@@ -73,10 +75,47 @@ SAMPLING = np.dtype(
     ],
     align=True,
 )
+Sampling = np.record
+
+
+@kernel_function
+def disco_step(
+    work: Workspace, samplings: NDArray[np.void], step: int, shift_steps: float, gain: float, basis: Basis,
+    limits: Limits, system: System, point_weights: Floats,
+) -> bool:  # fmt: skip
+    """One pass through the loop of Algorithm 1, on the plan `work.nominal`; equations are numbered as in the paper.
+
+    False, and the shifted plan stays, if no sample has a finite cost. `samplings` (1,) of SAMPLING; `limits` bound the
+    commands; `system` is f_theta with its parameter points and the task; `point_weights` (L,) the points' weights.
+    """
+    sampling = samplings[0]
+    # RollControlActions: here by the time that has passed since the last step.
+    shift(work.nominal, work.updated, shift_steps, sampling.hold)
+    if charges_drawn(sampling):
+        pull_on_knots(work.pull, work.nominal, basis)
+    for block in range(sampling.blocks):
+        # Sample E^k, eps ~ N(0, Sigma), and V = U + E within the limits.
+        sample(work, sampling, step, block, basis, limits)
+        # lambda sum_t u_t' Sigma^-1 eps_t, of (9).
+        charge(work, sampling, block)
+        # Roll out f_theta (2) under every parameter point: S_theta(V) = phi + sum_t c, (5), for each k and i.
+        roll_block(
+            system, work.point_costs, point_weights.size, sampling.blocks * int(BLOCK), block, work.nominal.shape[0],
+            work.commands[block], work.state,
+        )  # fmt: skip
+    # S(V) = sum_i w_i^m S_theta(V; chi_i), (17); or the mean over its worst part.
+    if sampling.worst_part < float32(1.0):
+        worst_over_points(work.costs, work.point_costs, point_weights, sampling.blocks, sampling.worst_part, work.order)
+    else:
+        mean_over_points(work.costs, work.point_costs, point_weights, sampling.blocks)
+    # w_k = exp(-(S^k - rho) / lambda), and eta, their sum: (9) and (10).
+    eta = weigh_all(work, sampling)
+    # u_t += sum_k w_k eps_t^k / eta.
+    return eta > float32(0.0) and update(work, sampling, basis, limits, eta, float32(gain))
 
 
 @block_function
-def shift(nominal: Any, scratch: Any, steps: float, hold: bool) -> None:
+def shift(nominal: Floats, scratch: Floats, steps: float, hold: bool) -> None:
     """Move the sequence (T, C) on by a fraction of steps; beyond its end it holds the last command or is zero."""
     horizon, channels = nominal.shape
     whole = int(min(steps, float(horizon)))
@@ -95,33 +134,42 @@ def shift(nominal: Any, scratch: Any, steps: float, hold: bool) -> None:
 
 
 @block_function
-def sample_and_roll(work: Any, sampling: Any, step: int, basis: Any, limits: Any, system: Any, points: int) -> None:
-    """Draw all samples and cost them: writes `noise`, `point_costs` and, as far as the control cost goes, `costs`."""
-    nominal, history = work.nominal, sampling.history
-    horizon = nominal.shape[0]
-    padded = sampling.blocks * int(BLOCK)
-    charged = sampling.control_cost > float32(0.0)
-    if charged and sampling.drawn:
-        pull_on_knots(work.pull, nominal, basis)
-    for block in range(sampling.blocks):
-        fill_normal_block(work.noise, sampling.rows, block, step, sampling.seed, sampling.noise_std)
-        first_noise, first = U(block * sampling.rows) * BLOCK, U(block) * BLOCK
-        commands = work.commands[block if sampling.kept else 0]
-        if block == 0 and sampling.with_nominal:
-            for j in range(U(sampling.rows)):
-                work.noise[j * BLOCK] = float32(0.0)
-        for b in range(BLOCK):
-            work.costs[first + b] = float32(0.0)
-        expand(commands, work.state, history, nominal, work.noise, first_noise, basis, limits)
-        if charged and sampling.drawn:
-            add_drawn_control_cost(work.costs, first, work.noise, first_noise, work.pull, sampling.control_cost)
-        elif charged:
-            add_control_cost(work.costs, first, commands, history, nominal, sampling.control_cost)
-        roll_block(system, work.point_costs, points, padded, block, horizon, commands, work.state)
+def charges_drawn(sampling: Sampling) -> bool:
+    """Whether the control cost is of the noise as drawn."""
+    return sampling.drawn and sampling.control_cost > float32(0.0)
 
 
 @block_function
-def weigh_all(work: Any, sampling: Any) -> Any:
+def sample(work: Workspace, sampling: Sampling, step: int, block: int, basis: Basis, limits: Limits) -> None:
+    """Draw the noise of a block of samples and make their command sequences of it."""
+    first_noise = U(block * sampling.rows) * BLOCK
+    fill_normal_block(work.noise, sampling.rows, block, step, sampling.seed, sampling.noise_std)
+    if block == 0 and sampling.with_nominal:
+        for j in range(U(sampling.rows)):
+            work.noise[j * BLOCK] = float32(0.0)
+    expand(
+        work.commands[block], work.state, sampling.history, work.nominal, work.noise, first_noise, basis, limits
+    )  # fmt: skip
+
+
+@block_function
+def charge(work: Workspace, sampling: Sampling, block: int) -> None:
+    """Begin the costs of a block of samples with their control cost, or with zero."""
+    first = U(block) * BLOCK
+    for b in range(BLOCK):
+        work.costs[first + b] = float32(0.0)
+    if sampling.control_cost > float32(0.0):
+        if sampling.drawn:
+            first_noise = U(block * sampling.rows) * BLOCK
+            add_drawn_control_cost(work.costs, first, work.noise, first_noise, work.pull, sampling.control_cost)
+        else:
+            add_control_cost(
+                work.costs, first, work.commands[block], sampling.history, work.nominal, sampling.control_cost
+            )  # fmt: skip
+
+
+@block_function
+def weigh_all(work: Workspace, sampling: Sampling) -> float:
     """Weights from costs; fills the report. Returns the sum of the weights, or 0 if no cost is finite.
 
     Without a finite cost the effective sample size is 0, and there is no least and no mean cost.
@@ -150,7 +198,9 @@ def weigh_all(work: Any, sampling: Any) -> Any:
 
 
 @block_function
-def update(work: Any, sampling: Any, basis: Any, limits: Any, total: float, gain: float) -> Any:
+def update(
+    work: Workspace, sampling: Sampling, basis: Basis, limits: Limits, total: float, gain: float
+) -> bool:  # fmt: skip
     """Move `nominal` by `gain` towards the weighted mean of the samples' commands; False if that is not finite."""
     nominal, sums = work.nominal, work.sums
     horizon, channels = nominal.shape
@@ -160,15 +210,9 @@ def update(work: Any, sampling: Any, basis: Any, limits: Any, total: float, gain
     skip = U(sampling.history * channels)
     if sampling.drawn:
         add_weighted(sums, work.weights, U(0), sampling.blocks, work.noise, U(rows) * BLOCK, U(0), rows)
-    elif sampling.kept:
+    else:
         commands = work.commands.reshape(work.commands.size)
         add_weighted(sums, work.weights, U(0), sampling.blocks, commands, U(work.commands.shape[1]), skip, rows)
-    else:
-        commands = work.commands[0]
-        for block in range(sampling.blocks):
-            first_noise = U(block * sampling.rows) * BLOCK
-            expand(commands, work.state, sampling.history, nominal, work.noise, first_noise, basis, limits)
-            add_weighted(sums, work.weights, U(block), 1, commands, U(0), skip, rows)
     sum_lanes(sums, rows)
     finite = True
     for t in range(horizon):
@@ -186,30 +230,3 @@ def update(work: Any, sampling: Any, basis: Any, limits: Any, total: float, gain
                 work.before_update[t, c] = nominal[t, c]
                 nominal[t, c] = work.updated[t, c]
     return finite
-
-
-@kernel_function
-def replan(
-    work: Any,
-    samplings: Any,
-    step: int,
-    shift_steps: float,
-    gain: float,
-    basis: Any,
-    limits: Any,
-    system: Any,
-    point_weights: Any,
-) -> Any:
-    """One step of DISCO on `work.nominal`; False, and the shifted plan stays, if nothing valid came out.
-
-    `samplings` (1,) of SAMPLING; `limits` bound the commands; `system` is what is rolled out.
-    """
-    sampling = samplings[0]
-    shift(work.nominal, work.updated, shift_steps, sampling.hold)
-    sample_and_roll(work, sampling, step, basis, limits, system, point_weights.size)
-    if sampling.worst_part < float32(1.0):
-        worst_over_points(work.costs, work.point_costs, point_weights, sampling.blocks, sampling.worst_part, work.order)
-    else:
-        mean_over_points(work.costs, work.point_costs, point_weights, sampling.blocks)
-    total = weigh_all(work, sampling)
-    return total > float32(0.0) and update(work, sampling, basis, limits, total, float32(gain))

@@ -7,7 +7,7 @@ import pytest
 from numba import njit
 from numba.core.runtime import _nrt_python, rtsys
 
-from disco_hw.control.kernel.replan import replan, shift
+from disco_hw.control.kernel.step import disco_step, shift
 from disco_hw.control.pendulum import PAPER_SAMPLER, PendulumPlanner, PendulumPoints
 
 STEPS = np.arange(10)[:, None]
@@ -46,7 +46,7 @@ def test_the_step_allocates_nothing():
     arguments, counted = planner.optimiser.arguments, []
     _nrt_python.memsys_enable_stats()
     try:
-        for function in (replan, empty):
+        for function in (disco_step, empty):
             function(*arguments)
             before = rtsys.get_allocation_stats().alloc
             for _ in range(10):
