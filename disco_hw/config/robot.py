@@ -50,6 +50,9 @@ class Prior(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     axial_distance_m: Range = (0.1, 0.5)
 
 
+_OF_THE_PROTOCOL = ("driver", "key_file")
+
+
 class Link(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """How the robot is reached; `options` go to the python-can interface as they are.
 
@@ -67,6 +70,10 @@ class Link(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
     dtr: bool = False
     rts: bool = False
     key_file: str | None = None
+
+    def medium_fields(self) -> dict[str, Any]:
+        """What `drivers.transport.make_transport` takes: kind and address, not the protocol spoken over the link."""
+        return {name: value for name, value in msgspec.structs.asdict(self).items() if name not in _OF_THE_PROTOCOL}
 
 
 class Control(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

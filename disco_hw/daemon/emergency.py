@@ -102,7 +102,7 @@ def stop_robot(robot: Path, link: str | None = None) -> EstopOutcome:
         return EstopOutcome("link", str(error), None, confirmed, refused)
     frame_id, data = Codec().encode("ESTOP", reason=1)
     frame = Frame(frame_id, data)
-    way = _stop_over_serial if settings.kind == "serial" else _stop_over_can
+    way = _stop_over_serial if settings.kind == "serial" else _stop_over_transport
     address = settings.port if settings.kind == "serial" else f"{settings.interface} {settings.channel}"
     confirmed, link_error = False, None
     try:
@@ -153,14 +153,8 @@ def _socket_path(raw: dict[str, Any]) -> Path | None:
     return None
 
 
-def _stop_over_can(settings: Link, frame: Frame) -> bool:
-    transport = open_transport(
-        kind="can",
-        interface=settings.interface,
-        channel=settings.channel,
-        bitrate=settings.bitrate,
-        options=settings.options,
-    )
+def _stop_over_transport(settings: Link, frame: Frame) -> bool:
+    transport = open_transport(**settings.medium_fields())
     try:
         deadline_ns = time.monotonic_ns() + round(_CONNECT_S * 1e9)
         while transport.state is not LinkState.UP:

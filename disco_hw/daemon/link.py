@@ -9,18 +9,7 @@ from drivers.transport import ReconnectingTransport, TransportSettingsError, mak
 
 def make_link(setup: Setup) -> ReconnectingTransport:
     """Return the link that robot.toml names, not yet opened. Raises InputError for what no device could satisfy."""
-    link = setup.config.link
     try:
-        return make_transport(
-            link.kind,
-            interface=link.interface,
-            channel=link.channel,
-            bitrate=link.bitrate,
-            options=link.options,
-            port=link.port,
-            baud=link.baud,
-            dtr=link.dtr,
-            rts=link.rts,
-        )
+        return make_transport(**setup.config.link.medium_fields())
     except TransportSettingsError as error:
         raise InputError(f"{setup.robot_file}: {error}") from None

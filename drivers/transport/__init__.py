@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+import pkgutil
 from collections.abc import Callable, Mapping
+from functools import cache
+from importlib import import_module
 from types import MappingProxyType
 from typing import Any
 
-from drivers.transport import can, serial
 from drivers.transport.can import CanMedium
 from drivers.transport.inprocess import InProcessTransport, connect_pair
 from drivers.transport.reconnecting import ReconnectingTransport, TransportSettingsError
 from drivers.transport.serial import SerialMedium
 
 __all__ = [
-    "MEDIA",
     "CanMedium",
     "InProcessTransport",
     "ReconnectingTransport",
@@ -21,13 +22,19 @@ __all__ = [
     "TransportSettingsError",
     "connect_pair",
     "make_transport",
+    "media",
     "open_transport",
 ]
 
-MEDIA: Mapping[str, Callable[..., ReconnectingTransport]] = MappingProxyType(
-    {medium.KIND: medium.make_transport for medium in (can, serial)}
-)
-"""By `link.kind` of robot.toml: what makes a link of the fields of [link]; each takes its own and leaves the others."""
+
+@cache
+def media() -> Mapping[str, Callable[..., ReconnectingTransport]]:
+    """By `link.kind` of robot.toml: the `make_transport` of each module in this folder that has a `KIND`.
+
+    It makes a link of the fields of [link], of which it takes its own and leaves the others.
+    """
+    modules = (import_module(each.name) for each in pkgutil.iter_modules(__path__, f"{__name__}."))
+    return MappingProxyType({module.KIND: module.make_transport for module in modules if hasattr(module, "KIND")})
 
 
 def make_transport(kind: str, **fields: Any) -> ReconnectingTransport:
@@ -35,9 +42,9 @@ def make_transport(kind: str, **fields: Any) -> ReconnectingTransport:
 
     Raises TransportSettingsError for a kind that does not exist and for what its medium refuses.
     """
-    medium = MEDIA.get(kind)
+    medium = media().get(kind)
     if medium is None:
-        known = " or ".join(f'"{name}"' for name in MEDIA)
+        known = " or ".join(f'"{name}"' for name in media())
         raise TransportSettingsError(f'link.kind: "{kind}" is no kind of link; write {known}')
     return medium(**fields)
 
