@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from importlib import metadata
 from typing import Annotated
 
 import typer
@@ -38,6 +37,8 @@ app.add_typer(logs.log_app, name="log")
 
 def _version(asked: bool) -> None:
     if asked:
+        from importlib import metadata  # noqa: PLC0415 - slow to import, and needed here alone
+
         print(f"disco-hw {metadata.version('disco-hw')}")
         raise typer.Exit
 
