@@ -290,6 +290,19 @@ class Driver(Protocol):
         """Frames that stop the robot in any state."""
 
 
+class PoseSource(Protocol):
+    """Where measured poses come from; called in each tick of the control loop, so that it must not wait."""
+
+    def receive(self, now_ns: int, from_robot: Sequence[PoseSample]) -> Sequence[PoseSample]:
+        """Poses that came since the last call, oldest first; `from_robot` are those of the motor driver.
+
+        Never raises: what makes no sense is dropped and counted, and without poses the robot stops by itself.
+        """
+
+    def close(self) -> None:
+        """Release what it holds; safe to call twice."""
+
+
 @dataclass(frozen=True, slots=True)
 class MotorDriver:
     """A motor controller that robot.toml can name: each file of `drivers.motor` that speaks to one holds a `DRIVER`.

@@ -13,6 +13,7 @@ from disco_hw.config.input_file import ROBOT_TOML, read_toml
 from disco_hw.config.words import in_words
 from disco_hw.errors import InputError
 from drivers.motor import UnknownDriverError, find_driver
+from drivers.pose import DEFAULT, PoseSourceError, find_pose_source
 
 if TYPE_CHECKING:
     from disco_hw.tasks import RobotTask
@@ -74,6 +75,12 @@ class Link(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
     def medium_fields(self) -> dict[str, Any]:
         """What `drivers.transport.make_transport` takes: kind and address, not the protocol spoken over the link."""
         return {name: value for name, value in msgspec.structs.asdict(self).items() if name not in _OF_THE_PROTOCOL}
+
+
+class PoseInput(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Where measured poses come from: `source` is of `drivers.pose`."""
+
+    source: str = DEFAULT
 
 
 class Control(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -150,6 +157,7 @@ class RobotConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     robot: Robot
     prior: Prior = Prior()
     link: Link = Link()
+    pose: PoseInput = PoseInput()
     control: Control = Control()
     estimation: Estimation = Estimation()
     task: RobotTask = msgspec.field(default_factory=_default_task)
@@ -166,9 +174,7 @@ def load_robot_config(path: Path) -> RobotConfig:
     """
     raw = read_toml(path, ROBOT_TOML)
     section = raw.pop("task", {})
-    link = raw.get("link")
-    if isinstance(link, dict) and "driver" in link:
-        _check_driver(path, link["driver"])
+    _check_names(path, raw)
     try:
         config = msgspec.convert(raw, RobotConfig)
     except msgspec.ValidationError as error:
@@ -211,12 +217,15 @@ def _task_of(path: Path, section: object) -> RobotTask:
         raise InputError(f"{path}: {words}") from None
 
 
-def _check_driver(path: Path, name: object) -> None:
-    """Refuse what is no name of a driver; the registry knows the names, the type of the field does not."""
-    try:
-        find_driver(str(name))
-    except UnknownDriverError as error:
-        raise InputError(f"{path}: link.driver: {error}") from None
+def _check_names(path: Path, raw: dict[str, Any]) -> None:
+    """Refuse what is no name of a driver or pose source; the registries know the names, the fields' types do not."""
+    for section, field, find in (("link", "driver", find_driver), ("pose", "source", find_pose_source)):
+        found = raw.get(section)
+        if isinstance(found, dict) and field in found:
+            try:
+                find(str(found[field]))
+            except (UnknownDriverError, PoseSourceError) as error:
+                raise InputError(f"{path}: {section}.{field}: {error}") from None
 
 
 def _check(path: Path, config: RobotConfig) -> None:

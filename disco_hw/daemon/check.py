@@ -14,6 +14,7 @@ from disco_hw.daemon.client import send_request, socket_path
 from disco_hw.daemon.link import make_link
 from disco_hw.daemon.realtime import can_lock_memory, can_use_fifo
 from disco_hw.errors import InputError, WorkError
+from disco_hw.runtime.assembly import pose_source_of
 from disco_hw.runtime.preflight import (
     Check,
     Level,
@@ -34,6 +35,7 @@ from drivers.types import (
     DriverState,
     LinkState,
     OutgoingFrame,
+    PoseSource,
     ReceivedFrame,
     RobotStatus,
     Transport,
@@ -84,11 +86,12 @@ def run_check(robot: Path, link: str | None = None) -> CheckReport:
     control = setup.config.control
     priority = setup.config.daemon.realtime_priority
     checks += check_realtime(priority, can_use_fifo(), can_lock_memory(), os.cpu_count() or 1)
+    pose_source = pose_source_of(setup.config)
     transport.open()
     try:
         checks.append(_link_check(transport))
         if checks[-1].level is Level.OK:
-            found = _ask_robot(transport, make_driver(setup.config.link.driver, key))
+            found = _ask_robot(transport, make_driver(setup.config.link.driver, key), pose_source)
             checks.append(_firmware_check(found))
             checks.append(_hearing_check(found))
             checks.append(check_round_trip(found.round_trips_s, 1.0 / control.rate_hz))
@@ -98,6 +101,7 @@ def run_check(robot: Path, link: str | None = None) -> CheckReport:
                 checks.append(check_command_timing(control, found.capabilities))
     finally:
         transport.close()
+        pose_source.close()
     return CheckReport(tuple(checks))
 
 
@@ -152,7 +156,7 @@ def _link_check(transport: Transport) -> Check:
     return Check("link", Level.OK, transport.name)
 
 
-def _ask_robot(transport: Transport, driver: Driver) -> _Found:
+def _ask_robot(transport: Transport, driver: Driver, pose_source: PoseSource) -> _Found:
     """Shake hands, listen for three seconds and time the answers to the driver's own clock requests."""
     stopwatch = _Stopwatch()
     wheels = poses = 0
@@ -165,7 +169,7 @@ def _ask_robot(transport: Transport, driver: Driver) -> _Found:
         stopwatch.received(frames)
         readings = driver.receive(now_ns, frames)
         wheels += len(readings.wheels)
-        poses += len(readings.poses)
+        poses += len(pose_source.receive(now_ns, readings.poses))
         told += [status for status in readings.status if status.t_ns - start_ns > _SETTLED_S * 1e9]
         for outgoing in driver.transmit(now_ns, None):
             if transport.send(outgoing, now_ns):

@@ -171,6 +171,7 @@ def _start(
     stop.add("link", transport.close)
     driver = make_driver(config.link.driver, key)
     core = assemble_core(config, transport, driver, pipeline, recorder, pilot.needs_pose, adaptation)
+    stop.add("pose source", core.pose_source.close)
     daemon = Daemon(core, server, recorder, MonotonicClock(), signals, say, pilot, ask)
     stop.add("wheels", daemon.stop_wheels)
     if config.daemon.realtime_priority:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import msgspec
+
 from disco_hw import control
 from disco_hw.adaptation.adaptation import Adaptation, CheckedAdaptation
 from disco_hw.adaptation.guard import (
@@ -14,6 +16,7 @@ from disco_hw.adaptation.guard import (
 )
 from disco_hw.adaptation.link import AdapterLink
 from disco_hw.config import RobotConfig
+from disco_hw.errors import InputError
 from disco_hw.estimation import OdometryParameters, PoseFusion
 from disco_hw.log.recorder import Recorder
 from disco_hw.model import Model
@@ -23,7 +26,8 @@ from disco_hw.runtime.pipeline import Pipeline, Planner
 from disco_hw.runtime.preflight import check_firmware_limits, check_task, failures
 from disco_hw.runtime.robot_setup import Setup, geometry
 from disco_hw.runtime.supervisor import Supervisor, SupervisorSettings
-from drivers.types import Driver, Transport
+from drivers.pose import PoseSourceError, make_pose_source
+from drivers.types import Driver, PoseSource, Transport
 
 _REHEARSALS = 5
 
@@ -113,7 +117,16 @@ def assemble_core(
         # Who drives by hand, and so without a pose, does not do the task.
         return preflight(config, robot, with_task=needs_pose)
 
-    return DaemonCore(config, transport, driver, supervisor, pipeline, recorder, check, adaptation)
+    pose_source = pose_source_of(config)
+    return DaemonCore(config, transport, driver, supervisor, pipeline, recorder, check, adaptation, pose_source)
+
+
+def pose_source_of(config: RobotConfig) -> PoseSource:
+    """Return the pose source that robot.toml names. Raises InputError for one that cannot be had."""
+    try:
+        return make_pose_source(**msgspec.structs.asdict(config.pose))
+    except PoseSourceError as error:
+        raise InputError(f"robot.toml: pose.source: {error}") from None
 
 
 def preflight(config: RobotConfig, driver: Driver, with_task: bool = True) -> tuple[str, ...]:

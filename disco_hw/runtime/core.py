@@ -19,11 +19,13 @@ from disco_hw.runtime.plausibility import Plausibility
 from disco_hw.runtime.supervisor import Inputs, Output, Reply, Supervisor, UserRequest
 from disco_hw.runtime.task_change import record_of
 from disco_hw.tasks import RobotTask
+from drivers.pose.robot import RobotPoses
 from drivers.types import (
     Capabilities,
     Driver,
     DriverState,
     LinkState,
+    PoseSource,
     Readings,
     RobotStatus,
     Transport,
@@ -66,10 +68,12 @@ class DaemonCore:
         recorder: Recorder,
         preflight: Callable[[Driver], tuple[str, ...]],
         adaptation: Adaptation | None = None,
+        pose_source: PoseSource | None = None,
     ) -> None:
         self.config = config
         self.transport = transport
         self.driver = driver
+        self.pose_source = pose_source or RobotPoses()
         self.pipeline = pipeline
         self.recorder = recorder
         self.adaptation = adaptation or NoAdaptation()
@@ -115,6 +119,8 @@ class DaemonCore:
         self._follow_link(now_ns)
         frames = self.transport.receive()
         readings = self.driver.receive(now_ns, frames)
+        poses = self.pose_source.receive(now_ns, readings.poses)
+        readings = msgspec.structs.replace(readings, poses=tuple(poses))
         self._remember(now_ns, readings)
         output = self._supervisor.step(now_ns, self._inputs(now_ns, requests))
         mark("receive")

@@ -12,6 +12,7 @@ from disco_hw.errors import InputError
 from disco_hw.runtime.preflight import Level
 from disco_hw.runtime.robot_setup import load_setup
 from drivers.motor import make_driver
+from drivers.pose.robot import RobotPoses
 from drivers.transport import connect_pair
 from drivers.types import Frame, OutgoingFrame
 from firmware_protocol.faults import FAULTS
@@ -58,12 +59,12 @@ def brief(monkeypatch):
 
 @pytest.mark.parametrize("key", [b"", KEY])
 def test_a_robot_that_takes_what_it_is_sent(key):
-    found = check._ask_robot(RobotInTime(key), make_driver(None, key or None))
+    found = check._ask_robot(RobotInTime(key), make_driver(None, key or None), RobotPoses())
     assert check._hearing_check(found).level is Level.OK
 
 
 def test_a_key_that_is_not_the_robots_fails():
-    found = check._ask_robot(RobotInTime(KEY), make_driver(None, KEY[::-1]))
+    found = check._ask_robot(RobotInTime(KEY), make_driver(None, KEY[::-1]), RobotPoses())
     heard = check._hearing_check(found)
     assert heard.level is Level.FAIL
     assert "link.key_file" in heard.text
@@ -72,7 +73,7 @@ def test_a_key_that_is_not_the_robots_fails():
 def test_a_fault_that_does_not_latch_fails_with_what_to_do():
     robot = RobotInTime(b"")
     robot.robot.inputs["right_temperature_c"] = 100.0
-    firmware = check._firmware_check(check._ask_robot(robot, make_driver(None)))
+    firmware = check._firmware_check(check._ask_robot(robot, make_driver(None), RobotPoses()))
     assert (firmware.level, firmware.text) == (
         Level.FAIL,
         "standby: the robot reports OVER_TEMPERATURE_RIGHT: " + FAULTS["OVER_TEMPERATURE_RIGHT"].advice,
@@ -82,7 +83,7 @@ def test_a_fault_that_does_not_latch_fails_with_what_to_do():
 def test_what_else_the_robot_rejects_is_a_warning():
     robot = RobotInTime(b"")
     robot.disturb = Frame(0x101, bytes(8))
-    heard = check._hearing_check(check._ask_robot(robot, make_driver(None)))
+    heard = check._hearing_check(check._ask_robot(robot, make_driver(None), RobotPoses()))
     assert heard.level is Level.WARNING
     assert "checksum" in heard.text
 

@@ -1,0 +1,45 @@
+"""The tick takes its poses from the source that robot.toml names."""
+
+import pytest
+
+from disco_hw.errors import InputError
+from disco_hw.runtime import assembly
+from disco_hw.runtime.assembly import pose_source_of
+from disco_hw.runtime.pipeline import NoPlanner
+from disco_hw.runtime.robot_setup import load_setup
+from drivers.pose import PoseSourceError
+from drivers.pose.robot import RobotPoses
+from drivers.types import PoseSample
+from tests.runtime.simulated import ROBOT_FILE, simulated_stack
+
+
+class Elsewhere:
+    """Says in every tick that the robot is at one place."""
+
+    def receive(self, now_ns, from_robot):
+        return [PoseSample(now_ns, now_ns, 7.0, -3.0, 0.5, 0.01, 0.01)]
+
+    def close(self):
+        pass
+
+
+def test_the_estimate_rests_on_the_sources_poses_in_place_of_the_robots(monkeypatch):
+    monkeypatch.setattr(assembly, "pose_source_of", lambda _config: Elsewhere())
+    stack = simulated_stack(planner=NoPlanner())
+    last = stack.run(1.0)[-1]
+    estimate = last.pipeline.estimate
+    assert (estimate.x_m, estimate.y_m, estimate.yaw_rad) == pytest.approx((7.0, -3.0, 0.5), abs=1e-3)
+    assert estimate.pose_ok
+
+
+def test_the_robots_own_poses_are_the_default():
+    assert isinstance(pose_source_of(load_setup(ROBOT_FILE).config), RobotPoses)
+
+
+def test_a_source_that_cannot_be_had_is_bad_input(monkeypatch):
+    def refuse(**_fields):
+        raise PoseSourceError("port 5005: in use; choose another")
+
+    monkeypatch.setattr(assembly, "make_pose_source", refuse)
+    with pytest.raises(InputError, match=r"pose\.source: port 5005: in use; choose another$"):
+        pose_source_of(load_setup(ROBOT_FILE).config)
