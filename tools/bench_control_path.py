@@ -64,9 +64,9 @@ def run(seeds: int = 3, duration_s: float = 40.0, speed_m_s: float = 0.25) -> di
 
 def plan_times(model: Model, speed_m_s: float, steps: int = 500) -> dict[str, float]:
     """Milliseconds of a plan along the eight at the paper's size, as the robot moves on."""
-    path = PathTask(path="eight.csv", speed_m_s=speed_m_s, points=paths()["eight"]).planned("default")
-    x_m, y_m, *_ = path.table[0].tolist()
-    planner = Disco(model, path, DiscoSettings(), LIMITS)
+    cost = PathTask(path="eight.csv", speed_m_s=speed_m_s, points=paths()["eight"]).planned("default")
+    x_m, y_m, *_ = cost.path.table[0].tolist()
+    planner = Disco(model, cost, DiscoSettings(), LIMITS)
     with undisturbed():
         return summary(
             "control.path.plan_ms",
@@ -77,7 +77,7 @@ def plan_times(model: Model, speed_m_s: float, steps: int = 500) -> dict[str, fl
 def followed(task: PathTask, drives: list[Array], facing: str) -> dict[str, float]:
     """Root mean square and largest distance (mm), part of the time in reverse, mean and least way driven (m)."""
     settled = round(SETTLED_S[facing] * RATE_HZ)
-    course, path = task.course(), task.planned("default")
+    course, path = task.course(), task.planned("default").path
     off_mm = np.array([np.abs(course.off_m(rows[settled:, :2])) * 1e3 for rows in drives])
     reverse = np.array([rows[settled:, 2] < REVERSE_M_S for rows in drives])
     count = len(path.table) - 1
@@ -96,10 +96,10 @@ def followed(task: PathTask, drives: list[Array], facing: str) -> dict[str, floa
 
 def drive(model: Model, task: PathTask, theta: dict[str, float], facing: str, seed: int, duration_s: float) -> Array:
     """One drive from the first way-point: x, y (m), forward speed (m/s) and place in the table after each period."""
-    path = task.planned("default")
+    cost = task.planned("default")
     x_m, y_m, yaw_rad = task.course().start
     plant = KinematicPlant(theta, (x_m, y_m, yaw_rad + TURNED_RAD[facing]), LAG_S, WHEEL_NOISE, seed)
-    planner = Disco(model, path, DiscoSettings(), LIMITS, seed + 1)
+    planner = Disco(model, cost, DiscoSettings(), LIMITS, seed + 1)
     sent: list[SentCommand] = []
     rows = np.empty((round(duration_s * RATE_HZ), 4))
     place: Any = None
@@ -109,6 +109,6 @@ def drive(model: Model, task: PathTask, theta: dict[str, float], facing: str, se
         left, right = planner.plan(now_ns, state).at(now_ns)
         sent = [*sent[-20:], SentCommand(now_ns, left, right)]
         plant.advance(left, right, 1.0 / RATE_HZ)
-        place = path.place(plant.x_m, plant.y_m, place)
+        place = cost.path.place(plant.x_m, plant.y_m, plant.yaw_rad, place)
         rows[step] = plant.x_m, plant.y_m, plant.forward_m_s, place
     return rows

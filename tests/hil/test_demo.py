@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import time
 from pathlib import Path
@@ -15,6 +16,7 @@ from disco_hw.errors import WorkError
 from disco_hw.experiments import demo
 
 pytestmark = pytest.mark.hil
+LEFT_ARMED = "the daemon left ARMED for (STOPPING|READY)"
 
 
 def daemon():
@@ -69,7 +71,8 @@ def test_it_drives_anew_where_the_machines_host_held_the_daemon_up(tmp_path, mon
     said = " ".join(capsys.readouterr().out.split())
     assert report.success
     assert said.count("virtual robot pid") == 2
-    assert "the daemon left ARMED for STOPPING" in said
+    # Held up for 0.3 s, the daemon comes back just as the wheels come to a stand.
+    assert re.search(LEFT_ARMED, said)
     assert "the host of this virtual machine took 120 ms" in said
 
 
@@ -83,6 +86,6 @@ def test_it_drives_anew_where_the_machines_host_held_the_daemon_up(tmp_path, mon
 )
 def test_whatever_else_stops_it_ends_it(tmp_path, monkeypatch, capsys, stolen, act):
     monkeypatch.setattr(demo, "stolen_ms", Stolen(act=act, **stolen))
-    with pytest.raises(WorkError, match="left ARMED for STOPPING"):
+    with pytest.raises(WorkError, match=LEFT_ARMED):
         demo.run_demo(demo.DemoOptions(out=tmp_path, laps=0.2))
     assert capsys.readouterr().out.count("virtual robot pid") == 1

@@ -190,9 +190,9 @@ SEEDED_ROBOT = """
 import sys
 from pathlib import Path
 from sim.app import VirtualRobotOptions, run_virtual_robot
-from sim.body_dynamics import Pose
+from sim.body_dynamics import BodyPose
 sys.exit(run_virtual_robot(VirtualRobotOptions(
-    channel=sys.argv[1], truth_file=Path(sys.argv[2]), bus_log=Path(sys.argv[3]), start=Pose(3.0, 0.0, 1.57),
+    channel=sys.argv[1], truth_file=Path(sys.argv[2]), bus_log=Path(sys.argv[3]), start=BodyPose(3.0, 0.0, 1.57),
     challenge_seed=5)))
 """
 

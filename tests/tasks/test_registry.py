@@ -19,7 +19,8 @@ PACKAGE = Path(disco_hw.__file__).parent
 # path, as the recorder's status tells it, is no task.
 ELSEWHERE = {
     "circle": ("experiments/", "drive/scripts.py"),
-    "path": ("daemon/client.py", "viewer/panel.py"),
+    # The word is the name of a field there: of the way-points' file, of a reply.
+    "path": ("daemon/client.py", "viewer/panel.py", "config/named_files.py"),
 }
 
 
