@@ -225,9 +225,10 @@ def _why_stopped(operator: Operator, status: Mapping[str, Any], taken_ms: int) -
     What the host takes bit by bit over a whole drive excuses nothing, hence only the last half second.
     """
     words = f"the daemon left ARMED for {status['state']}: {status['detail']}"
-    if status["state"] != "STOPPING" or taken_ms < _STALL_MS:
+    # After a long stall the wheels may already stand at the first status: READY in place of STOPPING.
+    if status["state"] not in ("STOPPING", "READY") or taken_ms < _STALL_MS:
         return WorkError(words)
-    # The daemon may notice a stall before the robot has told it of its own stop.
+    # The daemon may notice a stall before the robot has reported its own stop.
     after = operator.wait_until("stopped", lambda status: bool(status["state"] != "STOPPING"), 5.0)
     if after["stop_cause"] not in _WATCHDOG:
         return WorkError(words)

@@ -89,3 +89,21 @@ def test_whatever_else_stops_it_ends_it(tmp_path, monkeypatch, capsys, stolen, a
     with pytest.raises(WorkError, match=LEFT_ARMED):
         demo.run_demo(demo.DemoOptions(out=tmp_path, laps=0.2))
     assert capsys.readouterr().out.count("virtual robot pid") == 1
+
+
+@pytest.mark.parametrize(
+    ("state", "cause", "anew"),
+    [
+        ("STOPPING", "COMMAND_TIMEOUT", True),
+        ("READY", "COMMAND_TIMEOUT", True),
+        ("READY", "DISARMED", False),
+        ("FAULT", "COMMAND_TIMEOUT", False),
+    ],
+)
+def test_a_stall_is_known_though_the_wheels_stand_at_the_first_status(state, cause, anew):
+    class Stopped:
+        def wait_until(self, what, accept, timeout_s):
+            return {"state": "READY", "stop_cause": cause}
+
+    status = {"state": state, "detail": "", "stop_cause": cause}
+    assert isinstance(demo._why_stopped(Stopped(), status, 120), demo._HostStallError) is anew

@@ -4,10 +4,13 @@ import os
 import random
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 from tools import fuzz
+
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(autouse=True)
@@ -37,7 +40,7 @@ def test_every_verb_reads_or_refuses_hostile_files(tmp_path):
     # In a process of its own: what other tests have loaded would count as memory that a verb took.
     program = "import sys, pathlib\nfrom tools import fuzz\nprint(fuzz.attack_verbs(150, 1, pathlib.Path(sys.argv[1])))"
     command = [sys.executable, "-c", program, str(tmp_path / "verbs")]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=250, check=False)
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=250, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines()[-1] == "[]"
 
