@@ -11,6 +11,7 @@ from disco_hw.config.robot import (
     Prior,
     Robot,
     RobotConfig,
+    load_daemon_address,
     load_robot_config,
 )
 
@@ -25,5 +26,6 @@ __all__ = [
     "Prior",
     "Robot",
     "RobotConfig",
+    "load_daemon_address",
     "load_robot_config",
 ]

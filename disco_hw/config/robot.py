@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 
 import msgspec
 from msgspec import Meta
@@ -173,15 +173,31 @@ def load_robot_config(path: Path) -> RobotConfig:
     Raises InputError with one line naming file, field and remedy.
     """
     raw = read_toml(path, ROBOT_TOML)
-    section = raw.pop("task", {})
+    config = _without_task(path, raw)
+    config = msgspec.structs.replace(config, task=_task_of(path, raw.get("task", {})))
+    _check_task(path, config)
+    return config
+
+
+def load_daemon_address(path: Path) -> tuple[str, str | None]:
+    """The robot's name and the control socket that robot.toml sets: what a request to the running daemon needs.
+
+    [task] is not looked at: a daemon can be asked and stopped whatever has been written there since it was started.
+    Raises InputError with one line naming file, field and remedy for any other section that is wrong.
+    """
+    config = _without_task(path, read_toml(path, ROBOT_TOML))
+    return config.robot.name, config.daemon.control_socket
+
+
+def _without_task(path: Path, raw: dict[str, Any]) -> RobotConfig:
+    """All that robot.toml says but [task], validated; `task` is None."""
     _check_names(path, raw)
     try:
-        config = msgspec.convert(raw, RobotConfig)
+        config = msgspec.convert({**raw, "task": None}, RobotConfig)
     except msgspec.ValidationError as error:
         raise InputError(f"{path}: {in_words(error, [RobotConfig], 'docs/robot.md')}") from None
     given = {name: getattr(config.prior, name) for name in raw.get("prior", {})}
     config = msgspec.structs.replace(config, prior=msgspec.structs.replace(prior_around(config.robot), **given))
-    config = msgspec.structs.replace(config, task=_task_of(path, section))
     _check(path, config)
     return config
 
@@ -228,41 +244,52 @@ def _check_names(path: Path, raw: dict[str, Any]) -> None:
                 raise InputError(f"{path}: {section}.{field}: {error}") from None
 
 
+def _refuse(path: Path, field: str, fault: str, remedy: str) -> NoReturn:
+    raise InputError(f"{path}: {field}: {fault}; {remedy}")
+
+
+def _check_values(path: Path, name: str, section: Any) -> None:  # Any: a section's struct, or a kind of task.
+    for field in section.__struct_fields__:
+        value = getattr(section, field)
+        if isinstance(value, float) and not math.isfinite(value):
+            _refuse(path, f"{name}.{field}", "not a finite number", "write a finite value")
+        if isinstance(value, str) and "\0" in value:
+            _refuse(path, f"{name}.{field}", "holds a NUL character, which no name has", "take it out")
+
+
 def _check(path: Path, config: RobotConfig) -> None:
-    """Refuse what no single field shows."""
-
-    def refuse(field: str, fault: str, remedy: str) -> None:
-        raise InputError(f"{path}: {field}: {fault}; {remedy}")
-
-    for section_name in config.__struct_fields__:
-        section = getattr(config, section_name)
-        for field in section.__struct_fields__:
-            value = getattr(section, field)
-            if isinstance(value, float) and not math.isfinite(value):
-                refuse(f"{section_name}.{field}", "not a finite number", "write a finite value")
-            if isinstance(value, str) and "\0" in value:
-                refuse(f"{section_name}.{field}", "holds a NUL character, which no name has", "take it out")
+    """Refuse what no single field of the sections but [task] shows."""
+    for name in config.__struct_fields__:
+        if name != "task":
+            _check_values(path, name, getattr(config, name))
     for field in config.prior.__struct_fields__:
         low, high = getattr(config.prior, field)
         if not (math.isfinite(low) and math.isfinite(high) and low < high):
-            refuse(f"prior.{field}", f"[{low}, {high}] is not a range", "write [low, high] with low < high")
+            _refuse(path, f"prior.{field}", f"[{low}, {high}] is not a range", "write [low, high] with low < high")
     control = config.control
     if control.command_valid_for_s < 1.5 / control.rate_hz:
-        refuse(
+        _refuse(
+            path,
             "control.command_valid_for_s",
             f"{control.command_valid_for_s} s is shorter than 1.5 control periods",
             f"write at least {1.5 / control.rate_hz:.3f} or raise rate_hz",
         )
     if control.telemetry_disarm_s <= control.telemetry_zero_s:
-        refuse("control.telemetry_disarm_s", "not above telemetry_zero_s", "write a larger value")
+        _refuse(path, "control.telemetry_disarm_s", "not above telemetry_zero_s", "write a larger value")
     driver = find_driver(config.link.driver)
     if config.link.key_file is not None and not driver.authenticates:
-        refuse("link.key_file", f"the driver {driver.name} has no authenticated mode", "remove it")
+        _refuse(path, "link.key_file", f"the driver {driver.name} has no authenticated mode", "remove it")
+
+
+def _check_task(path: Path, config: RobotConfig) -> None:
+    """Refuse what no single field of [task] shows."""
+    _check_values(path, "task", config.task)
     fault = config.task.fault()
     if fault is not None:
-        refuse(f"task.{fault.field}", fault.fault, fault.remedy)
+        _refuse(path, f"task.{fault.field}", fault.fault, fault.remedy)
     if config.task.speed_m_s > config.robot.max_wheel_speed_rad_s * config.robot.wheel_radius_m:
-        refuse(
+        _refuse(
+            path,
             "task.speed_m_s",
             f"{config.task.speed_m_s} m/s is above what the wheels can do",
             "lower it, or raise robot.max_wheel_speed_rad_s within the firmware's limit",

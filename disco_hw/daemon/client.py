@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from disco_hw.config import RobotConfig, load_robot_config
+from disco_hw.config import RobotConfig, load_daemon_address
 from disco_hw.daemon.socket_place import connect, default_socket_path, passed_over
 from disco_hw.errors import InputError, WorkError
 from disco_hw.runtime.situation import advice, by_command, status_headline
@@ -67,8 +67,11 @@ SERVED = (*ACTIONS, *PAGE_ACTIONS)
 
 def socket_path(config: RobotConfig) -> Path:
     """Where the daemon of this robot listens."""
-    configured = config.daemon.control_socket
-    return Path(configured) if configured is not None else default_socket_path(config.robot.name)
+    return _path_of(config.robot.name, config.daemon.control_socket)
+
+
+def _path_of(name: str, configured: str | None) -> Path:
+    return Path(configured) if configured is not None else default_socket_path(name)
 
 
 def ask(robot: Path, action: str, changes: Sequence[str] = (), unrecorded: bool = False) -> dict[str, Any]:
@@ -88,7 +91,7 @@ def ask(robot: Path, action: str, changes: Sequence[str] = (), unrecorded: bool 
         raise InputError(f"--unrecorded: only arm takes it, and not {action}; leave it out")
     request: dict[str, Any] = {"do": action} | dict(map(_change, changes)) | ({UNRECORDED: True} if unrecorded else {})
     try:
-        path = socket_path(load_robot_config(robot))
+        path = _path_of(*load_daemon_address(robot))
         for line in passed_over(path):
             print(f"disco-hw: {line}", file=sys.stderr)
         return send_request(path, request)

@@ -1,7 +1,6 @@
 """Where the page is unless its owner says otherwise, and the token without which it shows and does nothing."""
 
 import os
-import secrets
 
 LOOPBACK = "127.0.0.1"
 DEFAULT_PORT = 8080
@@ -17,6 +16,8 @@ def page_token() -> str:
     """
     given = os.environ.get(TOKEN_VARIABLE)
     if not given:
+        import secrets  # noqa: PLC0415 - slow to import for whoever only asks for the port
+
         return secrets.token_urlsafe(16)
     if len(given) < _SHORTEST or not given.replace("-", "").replace("_", "").isalnum() or not given.isascii():
         raise ValueError(f"{TOKEN_VARIABLE}: give {_SHORTEST} or more letters, digits, - and _, or unset it")

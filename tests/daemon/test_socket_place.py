@@ -31,7 +31,7 @@ ANSWER = b'{"ok": true, "text": "the stranger says", "robot_state": "ESTOP", "ro
 # The interpreter may lie where other users cannot read, so the command runs once before for what it imports.
 AS_USER = """
 import contextlib, os, sys
-import can.interfaces.virtual, sim.unixcan
+import can.interfaces.virtual, drivers.motor.reference, sim.unixcan
 from disco_hw.cli import main
 asked = sys.argv
 for verb in ("estop", "ctl"):

@@ -12,7 +12,8 @@ import pytest
 import disco_hw
 
 SHIPPED = Path(disco_hw.__file__).parent / "robots"
-HEAVY = ("scipy", "torch", "matplotlib", "numba", "cantools", "filterpy", "viser", "zmq", "mcap", "cryptography")
+HEAVY = ("scipy", "torch", "matplotlib", "numba", "cantools", "filterpy", "viser", "zmq", "mcap", "cryptography",
+         "pydantic", "rich")  # fmt: skip
 COUNT = """
 import contextlib, sys
 from disco_hw.cli import main
@@ -53,8 +54,17 @@ def robot(tmp_path):
 def test_a_question_and_a_stop_load_no_large_library(robot, verb):
     code, loaded, said = loaded_by(*(word.format(robot=robot) for word in verb))
     assert code == 1, said
-    # What a task is takes numpy, and `ctl` reads the whole of robot.toml.
-    assert not loaded & {*HEAVY, *(() if verb[0] == "ctl" else ("numpy",))}
+    assert not loaded & {*HEAVY, "numpy"}
+
+
+def test_a_daemon_is_asked_whatever_has_become_of_the_task_in_the_file_but_not_with_another_section_wrong(robot):
+    text = robot.read_text(encoding="utf-8")
+    robot.write_text(text.replace('kind = "circle"', 'kind = "none such"'))
+    code, loaded, said = loaded_by("ctl", robot, "stop")
+    assert (code, "no daemon listens there" in said, "numpy" in loaded) == (1, True, False)
+    robot.write_text(text + "rate_hz = 50\n")  # in [daemon]
+    code, _, said = loaded_by("ctl", robot, "stop")
+    assert (code, "rate_hz" in said) == (2, True)
 
 
 @pytest.mark.parametrize(
