@@ -20,6 +20,7 @@ from drivers.private_files import user_name, why_not_private
 
 _Dispatcher = TypeVar("_Dispatcher")
 _told: set[str] = set()
+_NOT_KEPT = "kernels are compiled anew in each process, as no directory to keep them is this user's alone"
 P = ParamSpec("P")
 R = TypeVar("R")
 
@@ -35,8 +36,13 @@ def kept_on_disk(dispatcher: _Dispatcher) -> _Dispatcher:
     try:
         compiled._cache = _KernelCache(compiled.py_func)
     except RuntimeError:
-        _tell("kernels are compiled anew in each process, as no directory to keep them is this user's alone")
+        _tell(_NOT_KEPT)
     return dispatcher
+
+
+def are_kernels_kept() -> bool:
+    """Whether there was a directory for every function so far that was to be kept."""
+    return _NOT_KEPT not in _told
 
 
 class _PrivateLocator:

@@ -26,6 +26,7 @@ from disco_hw.daemon.client import (
     recording_in_words,
     socket_path,
 )
+from disco_hw.daemon.compiling import compiled_elsewhere
 from disco_hw.daemon.control_socket import ControlMessage, ControlServer
 from disco_hw.daemon.link import make_link
 from disco_hw.daemon.loop import Clock, Loop, MonotonicClock
@@ -35,7 +36,7 @@ from disco_hw.daemon.socket_place import passed_over
 from disco_hw.daemon.status import counters, loop_figures, status
 from disco_hw.daemon.systemd import Notifier
 from disco_hw.daemon.waiting import Waiting
-from disco_hw.daemon.warm_up import compile_progress, warm_up
+from disco_hw.daemon.warm_up import warm_up
 from disco_hw.log import records
 from disco_hw.log.link import Attachment
 from disco_hw.log.provenance import DBC, version
@@ -120,9 +121,7 @@ def serve(
     """
     key, transport = link_key(setup), make_link(setup)
     # Before the signals are caught: whoever has enough of a compilation may break it off, as nothing is open yet.
-    with compile_progress(_compiled(setup), _progress):
-        planner = new_planner()
-        warm_up(make_pipeline(setup.config, setup.model, new_planner()))
+    planner = compiled_elsewhere(lambda: _warm_planner(setup, new_planner), _compiled(setup), _progress)
     pipeline = make_pipeline(setup.config, setup.model, planner)
     stop = StopPath()
     with StopSignals() as signals:
@@ -429,6 +428,13 @@ def _request(message: ControlMessage) -> UserRequest:
     if message.action == UserRequest.ARM.value and message.arguments.get("unrecorded") is True:
         return UserRequest.ARM_UNRECORDED
     return UserRequest(message.action)
+
+
+def _warm_planner(setup: Setup, new_planner: Callable[[], Planner]) -> Planner:
+    """A new planner, after all that it will need was run once."""
+    planner = new_planner()
+    warm_up(make_pipeline(setup.config, setup.model, new_planner()))
+    return planner
 
 
 def _compiled(setup: Setup) -> str:

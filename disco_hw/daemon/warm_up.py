@@ -7,13 +7,6 @@ was seen to hold the loop for 10 to 90 ms.
 from __future__ import annotations
 
 import math
-import threading
-import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from typing import Any
-
-from numba.core import event
 
 from disco_hw.runtime.pipeline import FollowTask, Off, Pipeline, Stand
 from drivers.types import PoseSample, Readings, WheelSample
@@ -41,56 +34,3 @@ def _readings(now_ns: int, tick: int) -> Readings:
     far_off = math.nan if tick == _TICKS - 2 else 1.0 if tick == _TICKS - 3 else 0.0
     pose = PoseSample(now_ns - _POSE_DELAY_NS, now_ns, far_off, 0.06 * angle, 0.5 * math.pi, 0.005, 0.01)
     return Readings(wheels=(wheels,), poses=(pose,) if tick > 1 else ())
-
-
-_COMPILE = "numba:compile"
-_EVERY_S = 1.0
-
-
-class _Compilation(event.Listener):
-    """Counts the functions that are compiled, and says so again and again from a thread that begins with the first."""
-
-    def __init__(self, what: str, say: Callable[[str], None], every_s: float) -> None:
-        self._what, self._say, self._every_s = what, say, every_s
-        self._count = 0
-        self._began_ns = 0
-        self._ended = threading.Event()
-        self._thread: threading.Thread | None = None
-
-    def on_start(self, event: Any) -> None:
-        if self._thread is None:
-            self._say(f"compiling {self._what}: about a minute, this once; the result is kept for the next start")
-            self._began_ns = time.monotonic_ns()
-            self._thread = threading.Thread(target=self._tell, name="compile progress", daemon=True)
-            self._thread.start()
-
-    def on_end(self, event: Any) -> None:
-        self._count += 1
-
-    def finish(self) -> None:
-        """End the thread, and say how long it took if anything was compiled."""
-        self._ended.set()
-        if self._thread is not None:
-            self._thread.join()
-            self._say(f"compiled {self._so_far()}")
-
-    def _tell(self) -> None:
-        while not self._ended.wait(self._every_s):
-            self._say(f"compiling: {self._so_far()}")
-
-    def _so_far(self) -> str:
-        return f"{self._count} functions, {(time.monotonic_ns() - self._began_ns) * 1e-9:.0f} s"
-
-
-@contextmanager
-def compile_progress(what: str, say: Callable[[str], None], every_s: float = _EVERY_S) -> Iterator[None]:
-    """Within the block, say through `say` what numba compiles and how far it is; nothing where its cache has it all.
-
-    `what`: for a person, as "the planner for a circle". `say` is called from a thread, which ends with the block.
-    """
-    compilation = _Compilation(what, say, every_s)
-    try:
-        with event.install_listener(_COMPILE, compilation):
-            yield
-    finally:
-        compilation.finish()
