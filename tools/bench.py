@@ -21,6 +21,7 @@ PARTS = (
     "bench_latency",
     "bench_log",
     "bench_loop",
+    "bench_start",
     "bench_viewer",
     "bench_wire",
 )
