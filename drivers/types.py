@@ -15,10 +15,11 @@ import msgspec
 
 
 class Frame(msgspec.Struct, frozen=True, gc=False):
-    """One classic CAN data frame with an 11-bit identifier; serial links tunnel the same frame."""
+    """One classic CAN data frame, `extended` with a 29-bit identifier; serial links tunnel those with 11 bits."""
 
     can_id: int
     data: bytes
+    extended: bool = False
 
 
 class ReceivedFrame(msgspec.Struct, frozen=True, gc=False):

@@ -1,0 +1,110 @@
+"""AgileX's CAN protocol v2 of Scout, Scout Mini, Bunker and Tracer: frames and what they mean.
+
+11-bit identifiers, big-endian, 500 kbit/s. Source: the vendor's ugv_sdk (protocol_v2) and the Scout manual. The error
+word is that of the SDK; the manual fills its first byte alone.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+
+from drivers.types import Frame
+
+MOTION_COMMAND, LIGHT_COMMAND, BRAKE, CONTROL_MODE, STATE_RESET, ASK_VERSION = 0x111, 0x121, 0x131, 0x421, 0x441, 0x411
+SYSTEM_STATE, MOTION_STATE, LIGHT_STATE, RC_STATE, ODOMETRY = 0x211, 0x221, 0x231, 0x241, 0x311
+VERSION, MOTOR_SPEED = 0x4A1, 0x281
+STANDBY, CAN_MODE, UART_MODE, RC_MODE = range(4)
+NORMAL, EMERGENCY_STOP, EXCEPTION = range(3)
+_I16 = (-32768, 32767)
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """A message: its name, the bytes by `struct`, and each field with what one step of it is worth."""
+
+    name: str
+    body: str
+    fields: tuple[tuple[str, float], ...]
+
+
+def _fields(text: str) -> tuple[tuple[str, float], ...]:
+    pairs = (word.partition(":") for word in text.split())
+    return tuple((name, float(scale) if scale else 1.0) for name, _, scale in pairs)
+
+
+_MOTION = _fields("linear_m_s:0.001 angular_rad_s:0.001 lateral_m_s:0.001 steering_rad:0.001")
+_LIGHT = _fields("enable front_mode front_value rear_mode rear_value")
+_LAYOUTS: dict[int, Layout] = {
+    MOTION_COMMAND: Layout("motion_command", "hhhh", _MOTION),
+    LIGHT_COMMAND: Layout("light_command", "BBBBBxxx", _LIGHT),
+    CONTROL_MODE: Layout("control_mode_config", "B", _fields("mode")),
+    STATE_RESET: Layout("state_reset", "B", _fields("error_clear_byte")),
+    SYSTEM_STATE: Layout("system_state", "BBhHxx", _fields("vehicle_state control_mode battery_v:0.1 error_code")),
+    MOTION_STATE: Layout("motion_state", "hhhh", _MOTION),
+    LIGHT_STATE: Layout("light_state", "BBBBBxxx", _LIGHT),
+    RC_STATE: Layout(
+        "rc_state", "Bbbbbbxx", _fields("switches stick_right_h stick_right_v stick_left_v stick_left_h var_a")
+    ),
+    ODOMETRY: Layout("odometry", "ii", _fields("left_mm right_mm")),
+    0x361: Layout("bms_basic", "BBHhh", _fields("soc_percent soh_percent bms_v:0.1 bms_a:0.1 bms_deg_c:0.1")),
+    0x362: Layout("bms_extended", "BBBB4x", _fields("alarm_1 alarm_2 warn_1 warn_2")),
+    MOTOR_SPEED: Layout("motor_speed", "hhhh", _fields("m1_m_s:0.001 m2_m_s:0.001 m3_m_s:0.001 m4_m_s:0.001")),
+    VERSION: Layout("version_response", "8s", _fields("bytes")),
+}
+_LAYOUTS |= {
+    first + motor: Layout(name, body, _fields(names))
+    for motor in range(8)
+    for first, name, body, names in (
+        (0x251, "actuator_high_speed", "hhi", "rpm current_a:0.1 pulses"),
+        (0x261, "actuator_low_speed", "HhbBxx", "driver_v:0.1 driver_deg_c motor_deg_c driver_state"),
+    )
+}
+LAYOUTS: Mapping[int, Layout] = MappingProxyType(_LAYOUTS)
+
+
+@dataclass(frozen=True, slots=True)
+class Decoded:
+    """A message by its name; `motor` counts from 0 for those that each motor sends."""
+
+    name: str
+    values: Mapping[str, float | int | bytes]
+    motor: int | None = None
+
+
+def motion(linear_m_s: float, angular_rad_s: float) -> Frame:
+    """Return the motion command: held to what the wire can say, rounded to 0.001."""
+    low, high = _I16
+    steps = (min(max(round(1000.0 * value), low), high) for value in (linear_m_s, angular_rad_s))
+    return Frame(MOTION_COMMAND, struct.pack(">hhhh", *steps, 0, 0))
+
+
+def control_mode(mode: int) -> Frame:
+    """Ask the base to listen to nobody (`STANDBY`) or to CAN (`CAN_MODE`); 8 bytes, as the vendor's SDK sends."""
+    return Frame(CONTROL_MODE, bytes([mode]).ljust(8, b"\0"))
+
+
+def clear_errors(which: int = 0) -> Frame:
+    """Clear all errors (0) or those of motor 1 to 4."""
+    return Frame(STATE_RESET, bytes([which]))
+
+
+def decode(frame: Frame) -> Decoded | None:
+    """Return what a frame says; None for an unknown one, and for one not of its full length.
+
+    CONTROL_MODE and STATE_RESET may have 1 or 8 bytes: the manual and the SDK disagree.
+    """
+    layout = LAYOUTS.get(frame.can_id)
+    if frame.extended or layout is None:
+        return None
+    length = struct.calcsize(">" + layout.body)
+    if len(frame.data) != length and not (length == 1 and len(frame.data) == 8):
+        return None
+    raw = struct.unpack_from(">" + layout.body, frame.data)
+    values = {
+        name: value * scale if scale != 1.0 else value for (name, scale), value in zip(layout.fields, raw, strict=True)
+    }
+    motor = (frame.can_id & 0xF) - 1 if frame.can_id >> 4 in (0x25, 0x26) else None
+    return Decoded(layout.name, MappingProxyType(values), motor)

@@ -1,0 +1,291 @@
+"""VESC over CAN and over a serial line: frames, packets and what they mean. Big-endian throughout.
+
+CAN: 29-bit identifier, command << 8 | controller. What is longer than a frame goes as a packet in fragments.
+Serial: 0x02 and one length byte, or 0x03 and two, then the payload, its CRC-16 and 0x03. Source: the vendor's
+documentation/comm_can.md and what its firmware 7.01 does.
+"""
+
+from __future__ import annotations
+
+import binascii
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+
+from drivers.types import Frame
+
+EVERYBODY = 255
+LARGEST_ID = 254
+MAX_PAYLOAD = 512
+_I32 = (-(2**31), 2**31 - 1)
+
+CAN_COMMANDS: Mapping[str, tuple[int, float]] = MappingProxyType(
+    {
+        "set_duty": (0, 1e5),
+        "set_current": (1, 1e3),
+        "set_brake_current": (2, 1e3),
+        "set_erpm": (3, 1.0),
+        "set_position": (4, 1e6),
+        "set_current_rel": (10, 1e5),
+        "set_brake_current_rel": (11, 1e5),
+        "set_handbrake": (12, 1e3),
+        "set_handbrake_rel": (13, 1e5),
+    }
+)
+"""By name: command number, and steps in a unit (duty, A, electrical rpm, degrees). Each moves or brakes at once."""
+PACKET_COMMANDS: Mapping[str, tuple[int, float]] = MappingProxyType(
+    {
+        "set_duty": (5, 1e5),
+        "set_current": (6, 1e3),
+        "set_brake_current": (7, 1e3),
+        "set_erpm": (8, 1.0),
+        "set_position": (9, 1e6),
+        "set_handbrake": (10, 1e3),
+    }
+)
+FW_VERSION, GET_VALUES, ALIVE, FORWARD_CAN, GET_VALUES_SELECTIVE = 0, 4, 30, 34, 50
+PING, PONG = 17, 18
+FILL, FILL_LONG, PROCESS, PROCESS_SHORT = 5, 6, 7, 8
+_FILL_BYTES, _FILL_REACH, _LONG_BYTES, _SHORT_BYTES = 7, 255, 6, 6
+
+
+def _fields(text: str) -> tuple[tuple[str, float], ...]:
+    pairs = (word.partition(":") for word in text.split())
+    return tuple((name, float(steps) if steps else 1.0) for name, _, steps in pairs)
+
+
+_STATUS: Mapping[int, tuple[str, str, tuple[tuple[str, float], ...]]] = MappingProxyType(
+    {
+        9: ("status", ">ihh", _fields("erpm current_a:10 duty:1000")),
+        14: ("status2", ">ii", _fields("ah:1e4 ah_charged:1e4")),
+        15: ("status3", ">ii", _fields("wh:1e4 wh_charged:1e4")),
+        16: ("status4", ">hhhh", _fields("t_fet_c:10 t_motor_c:10 current_in_a:10 pid_pos_deg:50")),
+        27: ("status5", ">ihxx", _fields("tachometer v_in:10")),
+        58: ("status6", ">hhhh", _fields("adc1_v:1000 adc2_v:1000 adc3_v:1000 ppm:1000")),
+    }
+)
+_VALUES: tuple[tuple[str, tuple[tuple[str, float], ...]], ...] = tuple(
+    (body, _fields(names))
+    for body, names in (
+        ("h", "t_fet_c:10"),
+        ("h", "t_motor_c:10"),
+        ("i", "current_motor_a:100"),
+        ("i", "current_in_a:100"),
+        ("i", "id_a:100"),
+        ("i", "iq_a:100"),
+        ("h", "duty:1000"),
+        ("i", "erpm"),
+        ("h", "v_in:10"),
+        ("i", "ah:1e4"),
+        ("i", "ah_charged:1e4"),
+        ("i", "wh:1e4"),
+        ("i", "wh_charged:1e4"),
+        ("i", "tachometer"),
+        ("i", "tachometer_abs"),
+        ("B", "fault"),
+        ("i", "pid_pos_deg:1e6"),
+        ("B", "controller_id"),
+        ("hhh", "t_mos1_c:10 t_mos2_c:10 t_mos3_c:10"),
+        ("i", "vd_v:1000"),
+        ("i", "vq_v:1000"),
+        ("B", "status_byte"),
+    )
+)
+"""Of COMM_GET_VALUES, in the order of the bits of the selective form's mask."""
+FAULT_AND_STATUS = 1 << 15 | 1 << 21
+TIMED_OUT, KILL_SWITCH = 1, 2
+
+
+@dataclass(frozen=True, slots=True)
+class Decoded:
+    """A status message of one controller, or its answer to a ping ("pong", without values)."""
+
+    controller: int
+    name: str
+    values: Mapping[str, float]
+
+
+def can_frame(command: int, controller: int, data: bytes) -> Frame:
+    """Return the frame of a command. Raises ValueError for a controller above 255."""
+    if not 0 <= controller <= EVERYBODY:
+        raise ValueError(f"no VESC: {controller}")
+    return Frame(command << 8 | controller, data, extended=True)
+
+
+def command(controller: int, name: str, value: float) -> Frame:
+    """Return the frame of one of `CAN_COMMANDS`, always of four bytes: rounded, held to what the wire can say."""
+    number, steps = CAN_COMMANDS[name]
+    return can_frame(number, controller, struct.pack(">i", _steps(value, steps)))
+
+
+def ping(controller: int, host: int) -> Frame:
+    """Ask whether a controller is there; it answers with "pong", and its timeout is not fed."""
+    return can_frame(PING, controller, bytes([host]))
+
+
+def decode(frame: Frame) -> Decoded | None:
+    """Return what a controller says of itself; None for anything else, and for a frame that is too short."""
+    if not frame.extended:
+        return None
+    number, controller = frame.can_id >> 8, frame.can_id & 0xFF
+    if number == PONG and len(frame.data) >= 1:
+        return Decoded(frame.data[0], "pong", MappingProxyType({}))
+    if number not in _STATUS:
+        return None
+    name, body, fields = _STATUS[number]
+    if len(frame.data) != struct.calcsize(body):
+        return None
+    return Decoded(controller, name, _scaled(fields, struct.unpack(body, frame.data)))
+
+
+def packet_command(name: str, value: float) -> bytes:
+    """Return the payload of one of `PACKET_COMMANDS`."""
+    number, steps = PACKET_COMMANDS[name]
+    return struct.pack(">Bi", number, _steps(value, steps))
+
+
+def ask_values(mask: int) -> bytes:
+    """Return the payload that asks for some of a controller's values; it feeds no timeout."""
+    return struct.pack(">BI", GET_VALUES_SELECTIVE, mask)
+
+
+def forward(controller: int, payload: bytes) -> bytes:
+    """Return the payload that makes the controller on the serial line pass `payload` to another one on its CAN."""
+    return bytes([FORWARD_CAN, controller]) + payload
+
+
+def values(payload: bytes) -> Mapping[str, float] | None:
+    """Return the values in an answer to GET_VALUES or its selective form; None for what is no whole answer."""
+    if payload[:1] == bytes([GET_VALUES]):
+        mask, offset = (1 << len(_VALUES)) - 1, 1
+    elif payload[:1] == bytes([GET_VALUES_SELECTIVE]) and len(payload) >= 5:
+        mask, offset = int.from_bytes(payload[1:5]), 5
+    else:
+        return None
+    found: dict[str, float] = {}
+    for bit, (body, fields) in enumerate(_VALUES):
+        if mask >> bit & 1:
+            try:
+                found |= _scaled(fields, struct.unpack_from(">" + body, payload, offset))
+            except struct.error:
+                return None
+            offset += struct.calcsize(">" + body)
+    return MappingProxyType(found)
+
+
+def fragments(controller: int, sender: int, payload: bytes, send_mode: int = 0) -> tuple[Frame, ...]:
+    """Return the CAN frames that carry a packet to a controller; `send_mode` 0 asks it to answer to `sender`."""
+    if len(payload) <= _SHORT_BYTES:
+        return (can_frame(PROCESS_SHORT, controller, bytes([sender, send_mode]) + payload),)
+    frames = []
+    at = 0
+    while at < len(payload):
+        if at < _FILL_REACH:
+            frames.append(can_frame(FILL, controller, bytes([at]) + payload[at : at + _FILL_BYTES]))
+            at += _FILL_BYTES
+        else:
+            frames.append(can_frame(FILL_LONG, controller, struct.pack(">H", at) + payload[at : at + _LONG_BYTES]))
+            at += _LONG_BYTES
+    end = struct.pack(">BBHH", sender, send_mode, len(payload), crc(payload))
+    return (*frames, can_frame(PROCESS, controller, end))
+
+
+class Reassembly:
+    """The packets that come to one CAN identifier in fragments, from any number of senders one after the other."""
+
+    def __init__(self, own_id: int) -> None:
+        self._own_id = own_id
+        self._buffer = bytearray(MAX_PAYLOAD)
+
+    def feed(self, frame: Frame) -> tuple[int, int, bytes] | None:
+        """Take in a frame; return sender, send mode and payload of the packet that it completes, if it does."""
+        number, to = frame.can_id >> 8, frame.can_id & 0xFF
+        data = frame.data
+        if not frame.extended or to != self._own_id:
+            return None
+        if number == FILL and len(data) >= 1:
+            self._put(data[0], data[1:])
+        elif number == FILL_LONG and len(data) >= 2:
+            self._put(int.from_bytes(data[:2]), data[2:])
+        elif number == PROCESS_SHORT and len(data) >= 2:
+            return data[0], data[1], data[2:]
+        elif number == PROCESS and len(data) == 6:
+            sender, mode, length, checksum = struct.unpack(">BBHH", data)
+            payload = bytes(self._buffer[:length])
+            if len(payload) == length and crc(payload) == checksum:
+                return sender, mode, payload
+        return None
+
+    def _put(self, at: int, data: bytes) -> None:
+        if at + len(data) <= MAX_PAYLOAD:
+            self._buffer[at : at + len(data)] = data
+
+
+def crc(payload: bytes) -> int:
+    """Return CRC-16/XMODEM."""
+    return binascii.crc_hqx(payload, 0)
+
+
+def packet(payload: bytes) -> bytes:
+    """Return the bytes of a packet on the serial line. Raises ValueError for an empty payload, or above 512 bytes."""
+    if not 1 <= len(payload) <= MAX_PAYLOAD:
+        raise ValueError(f"not a VESC payload: {len(payload)} bytes")
+    head = struct.pack(">BB", 2, len(payload)) if len(payload) <= 255 else struct.pack(">BH", 3, len(payload))
+    return head + payload + struct.pack(">HB", crc(payload), 3)
+
+
+class PacketDecoder:
+    """The packets in a stream of bytes; what is none is skipped byte by byte, and counted."""
+
+    def __init__(self) -> None:
+        self._pending = bytearray()
+        self.skipped = 0
+
+    def feed(self, received: bytes) -> list[bytes]:
+        """Take in bytes as they come; return the payloads of the packets that they complete."""
+        self._pending += received
+        found = []
+        at = 0
+        while at < len(self._pending):
+            length = self._length(at)
+            if length is None:
+                break
+            end = at + length
+            if length == 0 or not self._is_whole(at, end):
+                at += 1
+                self.skipped += 1
+                continue
+            found.append(bytes(self._pending[at + self._pending[at] : end - 3]))
+            at = end
+        del self._pending[:at]
+        return found
+
+    def _length(self, at: int) -> int | None:
+        """Of the packet that begins here: 0 if none does, None if more bytes are needed to know or to end it."""
+        pending = self._pending
+        start = pending[at]
+        if start not in (2, 3):
+            return 0
+        if len(pending) - at < start:
+            return None
+        payload = int.from_bytes(pending[at + 1 : at + start])
+        # A length that fits one byte is not said with two.
+        if not (255 if start == 3 else 1) <= payload <= MAX_PAYLOAD:
+            return 0
+        whole = start + payload + 3
+        return whole if len(pending) - at >= whole else None
+
+    def _is_whole(self, at: int, end: int) -> bool:
+        pending = self._pending
+        payload = bytes(pending[at + pending[at] : end - 3])
+        return pending[end - 1] == 3 and int.from_bytes(pending[end - 3 : end - 1]) == crc(payload)
+
+
+def _steps(value: float, steps: float) -> int:
+    low, high = _I32
+    return min(max(round(value * steps), low), high)
+
+
+def _scaled(fields: tuple[tuple[str, float], ...], raw: tuple[int, ...]) -> dict[str, float]:
+    return {name: value / steps if steps != 1.0 else value for (name, steps), value in zip(fields, raw, strict=True)}

@@ -1,0 +1,147 @@
+"""An AgileX base (Scout, Scout Mini, Bunker, Tracer) on CAN v2: it takes speeds of the body, not of the wheels.
+
+Lengths are not looked at, a mode that it does not know is taken as the number that it is, and the person with the
+remote control comes first. Source: the vendor's ugv_sdk protocol_v2 and the Scout manual; no firmware of it ran.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass, field
+
+from sim.can_frame import CanFrame
+
+TIMEOUT_MS = 500
+STANDBY, CAN_MODE, UART_MODE, RC_MODE = range(4)
+MOTORS = 8
+"""Bases with steering have up to eight; those here send the first four."""
+_PERIODS_MS = {0x211: 100, 0x221: 20, 0x311: 20, 0x251: 20, 0x261: 100, 0x241: 20, 0x361: 500}
+
+
+@dataclass(slots=True)
+class AgilexBase:
+    """One base. `commanded` is what it follows now: speed (m/s) and turn rate (rad/s)."""
+
+    vehicle_state: int = 0
+    control_mode: int = STANDBY
+    battery_decivolt: int = 264
+    error_code: int = 0
+    speeds: tuple[int, int, int, int] = (0, 0, 0, 0)
+    odometry_mm: tuple[int, int] = (0, 0)
+    rpm: list[int] = field(default_factory=lambda: [0] * MOTORS)
+    current_deciampere: list[int] = field(default_factory=lambda: [0] * MOTORS)
+    pulses: list[int] = field(default_factory=lambda: [0] * MOTORS)
+    driver_decivolt: list[int] = field(default_factory=lambda: [240] * MOTORS)
+    driver_deg_c: list[int] = field(default_factory=lambda: [30] * MOTORS)
+    motor_deg_c: list[int] = field(default_factory=lambda: [30] * MOTORS)
+    driver_state: list[int] = field(default_factory=lambda: [0x40] * MOTORS)
+    rc_switches: int = 0b10101010
+    rc_sticks: tuple[int, int, int, int, int] = (0, 0, 0, 0, 0)
+    rc_commanded: tuple[float, float] = (0.0, 0.0)
+    brake: int = 0
+    light: tuple[int, int, int, int, int] = (0, 0, 0, 0, 0)
+    version: bytes = b"SIM-2.0\0"
+    bms: tuple[int, int, int, int, int] = (80, 100, 264, -10, 250)
+    bms_alarms: tuple[int, int, int, int] = (0, 0, 0, 0)
+    motor_speeds: tuple[int, int, int, int] = (0, 0, 0, 0)
+    count: int = 0
+    last_motion_ms: int | None = None
+    asked_motion: tuple[int, int] = (0, 0)
+    obeyed: list[tuple[int, tuple[int, ...]]] = field(default_factory=list)
+    _now_ms: int = 0
+
+    @property
+    def commanded(self) -> tuple[float, float]:
+        """Speed (m/s) and turn rate (rad/s) that the base follows now."""
+        if self.vehicle_state != 0:
+            return 0.0, 0.0
+        if self.control_mode == RC_MODE:
+            return self.rc_commanded
+        if self.control_mode != CAN_MODE or self.last_motion_ms is None:
+            return 0.0, 0.0
+        if self._now_ms - self.last_motion_ms > TIMEOUT_MS:
+            return 0.0, 0.0
+        return 1e-3 * self.asked_motion[0], 1e-3 * self.asked_motion[1]
+
+    def receive(self, frame: CanFrame) -> list[CanFrame]:
+        """Take in one frame; return the replies."""
+        if frame.extended or frame.remote or frame.error:
+            return []
+        data = frame.data.ljust(8, b"\0")
+        match frame.can_id:
+            case 0x111:
+                linear, angular, lateral, steering = struct.unpack(">hhhh", data)
+                self.obeyed.append((frame.can_id, (linear, angular, lateral, steering)))
+                if self.control_mode == CAN_MODE:
+                    self.asked_motion, self.last_motion_ms = (linear, angular), self._now_ms
+            case 0x121:
+                self.light = struct.unpack(">BBBBB", data[:5])
+                self.obeyed.append((frame.can_id, self.light))
+            case 0x131:
+                self.brake = data[0]
+                self.obeyed.append((frame.can_id, (data[0],)))
+            case 0x421:
+                self.obeyed.append((frame.can_id, (data[0],)))
+                # Who holds the remote control decides.
+                if self.control_mode != RC_MODE:
+                    self.control_mode = data[0]
+                    self.asked_motion, self.last_motion_ms = (0, 0), None
+            case 0x441:
+                self.obeyed.append((frame.can_id, (data[0],)))
+                self.error_code = 0
+                if self.vehicle_state == 2:
+                    self.vehicle_state = 0
+            case 0x411 | 0x4A1:
+                if data[0] == 1:
+                    return [self.message(0x4A1)]
+        return []
+
+    def take_remote_control(self, speed_m_s: float, turn_rad_s: float) -> None:
+        """A person switches the remote control on and drives."""
+        self.control_mode, self.rc_commanded = RC_MODE, (speed_m_s, turn_rad_s)
+
+    def at(self, now_ms: int) -> None:
+        """Say what time it is before a frame is given."""
+        self._now_ms = now_ms
+
+    def step(self, now_ms: int) -> list[CanFrame]:
+        """Go through one millisecond; return the messages that are due."""
+        self._now_ms = now_ms
+        frames = []
+        for can_id, period in _PERIODS_MS.items():
+            if now_ms % period == 0:
+                numbers = range(4) if can_id in (0x251, 0x261) else range(1)
+                frames += [self.message(can_id + number) for number in numbers]
+        return frames
+
+    def message(self, can_id: int) -> CanFrame:
+        """A message of the base by its identifier."""
+        return CanFrame(can_id, self._body(can_id))
+
+    def _body(self, can_id: int) -> bytes:
+        match can_id:
+            case 0x211:
+                self.count = (self.count + 1) % 256
+                state = (self.vehicle_state, self.control_mode, self.battery_decivolt, self.error_code)
+                return struct.pack(">BBHHBB", *state, 0, (self.count - 1) % 256)
+            case 0x221:
+                return struct.pack(">hhhh", *self.speeds)
+            case 0x231:
+                return struct.pack(">BBBBBxxx", *self.light)
+            case 0x241:
+                return struct.pack(">Bbbbbbxx", self.rc_switches, *self.rc_sticks)
+            case 0x311:
+                return struct.pack(">ii", *self.odometry_mm)
+            case 0x361:
+                return struct.pack(">BBHhh", *self.bms)
+            case 0x362:
+                return struct.pack(">BBBB4x", *self.bms_alarms)
+            case 0x281:
+                return struct.pack(">hhhh", *self.motor_speeds)
+            case 0x4A1:
+                return self.version
+        motor = (can_id & 0xF) - 1
+        if can_id >> 4 == 0x25:
+            return struct.pack(">hhi", self.rpm[motor], self.current_deciampere[motor], self.pulses[motor])
+        temperatures = (self.driver_deg_c[motor], self.motor_deg_c[motor])
+        return struct.pack(">HhbBxx", self.driver_decivolt[motor], *temperatures, self.driver_state[motor])

@@ -1,0 +1,306 @@
+"""An ODrive on CAN Simple: a board of firmware 0.5 with its axes, or one axis of 0.6.
+
+What the open firmware 0.5.6 does with each frame, the weak parts included: any frame to a node feeds its watchdog, the
+length and RTR of a command are not looked at, a velocity is taken with an error latched, and clearing the errors of one
+axis clears those of the board. 0.6 is closed: the same is assumed of it, on one axis.
+Source: odriverobotics/ODrive, communication/can/can_simple.cpp and MotorControl/axis.cpp at fw-v0.5.6.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+
+from sim.can_frame import CanFrame
+
+CHECKS_PER_MS = 8
+IDLE, CLOSED_LOOP, POSITION_CONTROL, VELOCITY_CONTROL, PASSTHROUGH = 1, 8, 3, 2, 1
+WATCHDOG_ERROR = {"0.5": 0x800, "0.6": 0x0100_0000}
+ESTOP_ERROR = {"0.5": 0x4000, "0.6": 0x0200_0000}
+INVALID_STATE = 0x1
+_F32 = struct.Struct("<f")
+
+
+def f32(value: float) -> float:
+    """Round to what a 32-bit float holds."""
+    return float(_F32.unpack(_F32.pack(value))[0])
+
+
+@dataclass(slots=True)
+class Axis:
+    """One axis, fields by what they hold in the firmware; turns are of the motor."""
+
+    node_id: int
+    axis_state: int = IDLE
+    requested_state: int = 0
+    axis_error: int = 0
+    motor_error: int = 0
+    encoder_error: int = 0
+    controller_error: int = 0
+    sensorless_error: int = 0
+    disarm_reason: int = 0
+    control_mode: int = POSITION_CONTROL
+    input_mode: int = PASSTHROUGH
+    input_pos_turns: float = 0.0
+    input_vel_turns_s: float = 0.0
+    input_torque_nm: float = 0.0
+    vel_limit_turns_s: float = 100.0
+    current_limit_a: float = 20.0
+    traj_vel_limit: float = 2.0
+    traj_accel_limit: float = 0.5
+    traj_decel_limit: float = 0.5
+    pos_gain: float = 20.0
+    vel_gain: float = 0.16
+    vel_integrator_gain: float = 0.33
+    encoder_count: int = 0
+    count_in_cpr: int = 0
+    pos_turns: float = 0.0
+    vel_turns_s: float = 0.0
+    iq_setpoint_a: float = 0.0
+    iq_measured_a: float = 0.0
+    sensorless_pos: float = 0.0
+    sensorless_vel: float = 0.0
+    fet_deg_c: float = 30.0
+    motor_deg_c: float = 30.0
+    torque_target_nm: float = 0.0
+    torque_estimate_nm: float = 0.0
+    electrical_w: float = 0.0
+    mechanical_w: float = 0.0
+    procedure_result: int = 0
+    calibrated: bool = True
+    trajectory_done: bool = True
+    watchdog_enabled: bool = False
+    watchdog_timeout_s: float = 0.0
+    watchdog_left: int = 0
+    fed: int = 0
+    obeyed_states: list[int] = field(default_factory=list)
+
+    def feed(self) -> None:
+        """Let the watchdog run anew."""
+        self.fed += 1
+        self.watchdog_left = int(f32(f32(self.watchdog_timeout_s) * 1000.0 * CHECKS_PER_MS))
+
+    def check_watchdog(self, error: int) -> None:
+        """One of the 8 checks in a millisecond."""
+        if not self.watchdog_enabled:
+            return
+        if self.watchdog_left > 0:
+            self.watchdog_left -= 1
+        else:
+            self.fail(error)
+
+    def fail(self, error: int) -> None:
+        """Latch an error; a motor that runs is released."""
+        self.axis_error |= error
+        if self.axis_state != IDLE:
+            self.disarm_reason = error
+            self.axis_state = IDLE
+
+    def run_state_machine(self) -> None:
+        """Take the state asked for, once; with an error latched the axis stays idle."""
+        wanted, self.requested_state = self.requested_state, 0
+        if wanted == 0:
+            return
+        self.obeyed_states.append(wanted)
+        if wanted == CLOSED_LOOP and not self.calibrated:
+            self.fail(INVALID_STATE)
+        elif wanted == CLOSED_LOOP and self.axis_error == 0:
+            self.feed()
+            self.axis_state = CLOSED_LOOP
+        elif wanted != CLOSED_LOOP:
+            self.axis_state = wanted
+
+    @property
+    def velocity_turns_s(self) -> float | None:
+        """What the motor is to turn at; None where it is released and coasts."""
+        if self.axis_state != CLOSED_LOOP or self.control_mode != VELOCITY_CONTROL:
+            return None
+        return min(max(self.input_vel_turns_s, -self.vel_limit_turns_s), self.vel_limit_turns_s)
+
+
+_CYCLIC = {
+    "heartbeat": 0x01,
+    "encoder": 0x09,
+    "motor_error": 0x03,
+    "encoder_error": 0x04,
+    "controller_error": 0x1D,
+    "sensorless_error": 0x05,
+    "encoder_count": 0x0A,
+    "iq": 0x14,
+    "sensorless": 0x15,
+    "bus_vi": 0x17,
+}
+PERIODS = tuple(_CYCLIC)
+"""Cyclic messages in the order in which an axis sends those that are due."""
+_WRITES: dict[int, tuple[str, tuple[str, ...]]] = {
+    0x07: ("<i", ("requested_state",)),
+    0x0B: ("<ii", ("control_mode", "input_mode")),
+    0x0D: ("<ff", ("input_vel_turns_s", "input_torque_nm")),
+    0x0E: ("<f", ("input_torque_nm",)),
+    0x0F: ("<ff", ("vel_limit_turns_s", "current_limit_a")),
+    0x11: ("<f", ("traj_vel_limit",)),
+    0x12: ("<ff", ("traj_accel_limit", "traj_decel_limit")),
+    0x1A: ("<f", ("pos_gain",)),
+    0x1B: ("<ff", ("vel_gain", "vel_integrator_gain")),
+}
+"""By command: how its bytes are read, and the fields of the axis that they become."""
+
+
+class OdriveBoard:
+    """The axes of one board at their nodes, on a bus that they share."""
+
+    def __init__(self, generation: str, nodes: Sequence[int], periods_ms: dict[str, int] | None = None) -> None:
+        """`generation`: "0.5" or "0.6". `periods_ms`: by the names of `PERIODS`, 0 for never; what is left out is as
+        the firmware has it.
+        """
+        self.generation = generation
+        self.axes = [Axis(node) for node in nodes]
+        self.periods_ms = dict.fromkeys(PERIODS, 0) | {"heartbeat": 100, "encoder": 10} | (periods_ms or {})
+        self.bus_v, self.bus_a = 24.0, 0.0
+        self.version = (2, 4, 4, 58, 0, 6, 11, 0)
+        self.parameters: dict[int, bytes] = {}
+        self._sent_ms = {(axis.node_id, name): 0 for axis in self.axes for name in PERIODS}
+
+    def receive(self, frame: CanFrame) -> list[CanFrame]:
+        """Take in one frame; return the replies."""
+        if frame.extended or frame.error:
+            return []
+        node, command = frame.can_id >> 5, frame.can_id & 0x1F
+        axis = next((axis for axis in self.axes if axis.node_id == node), None)
+        if axis is None:
+            return []
+        data = frame.data.ljust(8, b"\0")
+        axis.feed()
+        if command == 0x1D and self.generation == "0.5":
+            return [self.message(axis, command)]
+        asked = (frame.remote or not frame.data) and command != 0x01
+        if asked and self._telemetry_body(axis, command) is not None:
+            return [self.message(axis, command)]
+        if command == 0x04 and self.generation == "0.6":
+            return self._parameter(axis, data)
+        self._obey(axis, command, data)
+        return []
+
+    def _obey(self, axis: Axis, command: int, data: bytes) -> None:
+        if command in _WRITES:
+            layout, names = _WRITES[command]
+            for name, value in zip(names, struct.unpack_from(layout, data), strict=True):
+                setattr(axis, name, value)
+            return
+        match command:
+            case 0x02:
+                axis.fail(ESTOP_ERROR[self.generation])
+            case 0x06 if self.generation == "0.5":
+                axis.node_id = struct.unpack_from("<I", data)[0]
+            case 0x0C:
+                axis.input_pos_turns, speed, torque = struct.unpack("<fhh", data)
+                axis.input_vel_turns_s = f32(speed * f32(0.001))
+                axis.input_torque_nm = f32(torque * f32(0.001))
+            case 0x18:
+                self.clear_errors()
+            case 0x19 if self.generation == "0.5":
+                axis.encoder_count = struct.unpack_from("<i", data)[0]
+            case 0x19:
+                axis.pos_turns = struct.unpack_from("<f", data)[0]
+
+    def clear_errors(self) -> None:
+        """Of every axis of the board, with all their parts; none is energised again by that."""
+        for axis in self.axes:
+            axis.axis_error = axis.motor_error = axis.encoder_error = 0
+            axis.controller_error = axis.sensorless_error = 0
+
+    def check_watchdogs(self) -> Iterable[tuple[Axis, int]]:
+        """Run one of the 8 checks in a millisecond; return the axes that failed by it and the error's bits."""
+        failed = []
+        for axis in self.axes:
+            before = axis.axis_error
+            axis.check_watchdog(WATCHDOG_ERROR[self.generation])
+            if axis.axis_error != before:
+                failed.append((axis, axis.axis_error & ~before))
+        return failed
+
+    def step(self, now_ms: int) -> list[CanFrame]:
+        """Go through one millisecond: watchdogs, states, cyclic messages; return the frames to send."""
+        for _ in range(CHECKS_PER_MS):
+            self.check_watchdogs()
+        for axis in self.axes:
+            axis.run_state_machine()
+        return self.cyclic(now_ms)
+
+    def cyclic(self, now_ms: int) -> list[CanFrame]:
+        """The frames due now, axis by axis."""
+        frames = []
+        for axis in self.axes:
+            for name, command in _CYCLIC.items():
+                period = self.periods_ms[name]
+                if period > 0 and now_ms - self._sent_ms[axis.node_id, name] >= period:
+                    self._sent_ms[axis.node_id, name] = now_ms
+                    frames.append(self.message(axis, command))
+        return frames
+
+    def message(self, axis: Axis, command: int) -> CanFrame:
+        """A telemetry message of an axis by its command number."""
+        return CanFrame(axis.node_id << 5 | command, self._telemetry_body(axis, command) or b"")
+
+    def _telemetry_body(self, axis: Axis, command: int) -> bytes | None:
+        """The data of a message; None for a command that asks for none in this generation."""
+        if command == 0x09:
+            return struct.pack("<ff", axis.pos_turns, axis.vel_turns_s)
+        if command == 0x14:
+            return struct.pack("<ff", axis.iq_setpoint_a, axis.iq_measured_a)
+        if command == 0x17:
+            return struct.pack("<ff", self.bus_v, self.bus_a)
+        return self._body_05(axis, command) if self.generation == "0.5" else self._body_06(axis, command)
+
+    def _body_05(self, axis: Axis, command: int) -> bytes | None:
+        match command:
+            case 0x01:
+                done = 0x80 if axis.trajectory_done else 0
+                flags = (
+                    int(axis.motor_error != 0),
+                    int(axis.encoder_error != 0),
+                    int(axis.controller_error != 0) | done,
+                )
+                return struct.pack("<IBBBB", axis.axis_error, axis.axis_state, *flags)
+            case 0x03:
+                return struct.pack("<Q", axis.motor_error)
+            case 0x04:
+                return struct.pack("<II", axis.encoder_error, 0)
+            case 0x05:
+                return struct.pack("<II", axis.sensorless_error, 0)
+            case 0x0A:
+                return struct.pack("<ii", axis.encoder_count, axis.count_in_cpr)
+            case 0x15:
+                return struct.pack("<ff", axis.sensorless_pos, axis.sensorless_vel)
+            case 0x1D:
+                return struct.pack("<II", axis.controller_error, 0)
+        return None
+
+    def _body_06(self, axis: Axis, command: int) -> bytes | None:
+        match command:
+            case 0x00:
+                return bytes(self.version)
+            case 0x01:
+                result = (axis.procedure_result, axis.trajectory_done)
+                return struct.pack("<IBBBx", axis.axis_error, axis.axis_state, *result)
+            case 0x03:
+                return struct.pack("<II", axis.axis_error, axis.disarm_reason)
+            case 0x15:
+                return struct.pack("<ff", axis.fet_deg_c, axis.motor_deg_c)
+            case 0x1C:
+                return struct.pack("<ff", axis.torque_target_nm, axis.torque_estimate_nm)
+            case 0x1D:
+                return struct.pack("<ff", axis.electrical_w, axis.mechanical_w)
+        return None
+
+    def _parameter(self, axis: Axis, data: bytes) -> list[CanFrame]:
+        """Read or write a parameter by its endpoint; an unknown endpoint is not answered."""
+        operation, endpoint, _ = struct.unpack_from("<BHB", data)
+        if endpoint not in self.parameters:
+            return []
+        if operation == 1:
+            self.parameters[endpoint] = data[4:]
+            return []
+        reply = struct.pack("<BHB", 0, endpoint, 0) + self.parameters[endpoint]
+        return [CanFrame(axis.node_id << 5 | 0x05, reply)]

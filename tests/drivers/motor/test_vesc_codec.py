@@ -1,0 +1,86 @@
+"""VESC's frames and packets: the examples of its documentation, what is refused, and that no bytes break a decoder."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers.motor import vesc_codec as codec
+from drivers.types import Frame
+
+
+def test_the_documented_frames():
+    assert codec.command(23, "set_erpm", 3000) == Frame(0x317, bytes.fromhex("00000BB8"), extended=True)
+    assert codec.command(23, "set_current", 51.0) == Frame(0x117, bytes.fromhex("0000C738"), extended=True)
+
+
+def test_a_command_is_held_to_what_the_wire_can_say():
+    assert codec.command(1, "set_current", 1e12).data.hex() == "7fffffff"
+    assert codec.command(1, "set_current", -1e12).data.hex() == "80000000"
+
+
+def test_status_is_read_in_its_units():
+    status = codec.decode(Frame(9 << 8 | 23, bytes.fromhex("00000BB8FFDF0064"), extended=True))
+    assert status is not None
+    assert (status.controller, status.name) == (23, "status")
+    assert dict(status.values) == {"erpm": 3000, "current_a": -3.3, "duty": 0.1}
+    other = codec.decode(Frame(27 << 8 | 23, bytes.fromhex("FFFFFFFA00F00000"), extended=True))
+    assert other is not None
+    assert dict(other.values) == {"tachometer": -6, "v_in": 24.0}
+
+
+def test_a_status_of_11_bits_or_too_short_is_none():
+    assert codec.decode(Frame(9 << 8 | 23, bytes(8))) is None
+    assert codec.decode(Frame(9 << 8 | 23, bytes(7), extended=True)) is None
+
+
+def test_a_pong_names_who_is_there():
+    assert codec.ping(23, 200) == Frame(17 << 8 | 23, b"\xc8", extended=True)
+    answer = codec.decode(Frame(18 << 8 | 200, bytes((23, 0)), extended=True))
+    assert answer is not None
+    assert (answer.controller, answer.name) == (23, "pong")
+
+
+def test_a_fault_is_read_from_an_answer_in_fragments():
+    payload = bytes.fromhex("32002080000501")
+    frames = codec.fragments(200, 23, payload, send_mode=1)
+    assert [frame.can_id >> 8 for frame in frames] == [5, 7]
+    reassembly = codec.Reassembly(200)
+    assert [reassembly.feed(frame) for frame in frames] == [None, (23, 1, payload)]
+    assert codec.values(payload) == {"fault": 5, "status_byte": codec.TIMED_OUT}
+
+
+def test_a_lost_fragment_is_no_packet():
+    frames = codec.fragments(200, 23, bytes(range(1, 40)), send_mode=1)
+    reassembly = codec.Reassembly(200)
+    assert [reassembly.feed(frame) for frame in (*frames[:2], *frames[3:])][-1] is None
+
+
+@pytest.mark.parametrize("length", [1, 7, 255, 256, 512])
+def test_a_packet_comes_back_whole_however_it_is_cut(length):
+    payload = bytes(k % 251 for k in range(length))
+    decoder = codec.PacketDecoder()
+    found = [packet for byte in codec.packet(payload) for packet in decoder.feed(bytes([byte]))]
+    assert (found, decoder.skipped) == ([payload], 0)
+
+
+@pytest.mark.parametrize("length", [0, 513])
+def test_a_payload_that_no_packet_holds_is_refused(length):
+    with pytest.raises(ValueError, match=str(length)):
+        codec.packet(bytes(length))
+
+
+@given(st.binary(max_size=60))
+def test_noise_costs_no_later_packet(noise):
+    decoder = codec.PacketDecoder()
+    decoder.feed(noise)
+    # However long a packet the noise has announced, zeros end it.
+    decoder.feed(bytes(codec.MAX_PAYLOAD + 6))
+    assert decoder.feed(codec.packet(b"\x1e")) == [b"\x1e"]
+
+
+@given(st.integers(0, 2**29 - 1), st.binary(max_size=8), st.booleans(), st.binary(max_size=80))
+def test_no_bytes_break_a_decoder(can_id, data, extended, payload):
+    frame = Frame(can_id, data, extended)
+    codec.decode(frame)
+    codec.Reassembly(can_id & 0xFF).feed(frame)
+    codec.values(payload)

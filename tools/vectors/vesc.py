@@ -1,0 +1,270 @@
+"""VESC: cases on CAN and on a serial line."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from drivers.motor import vesc_codec as codec
+from drivers.types import Frame
+from sim.can_frame import CanFrame
+from sim.devices.vesc import CHECK_MS, Vesc
+from tools.vectors.comparison import Case, Comparison, as_case, as_cases, of_driver, on_bus
+
+_OF_VALUES = {"current_a": "current_motor_a"}
+_STEP = 1
+_F32_STEP = 2.0**-23
+
+
+def check_can(case: Case) -> Comparison:
+    """A case of vesc_can."""
+    found = Comparison()
+    given, then = case["given"], case["then"]
+    topic = case["case"].partition(":")[0]
+    device = _device(given)
+    match case["kind"]:
+        case "sequence":
+            _check_timeout(found, device, given, then)
+        case "device_to_host" if "request" in given:
+            _check_answer(found, device, case)
+        case "device_to_host":
+            _check_status(found, device, case)
+        case _ if topic == "short_status":
+            frame = of_driver(case["frames"][0])
+            found.same("a short status", codec.decode(frame), None)
+            whole = codec.decode(Frame(frame.can_id, frame.data.ljust(8, b"\0"), extended=True))
+            found.same("its bytes", dict(whole.values) if whole else {}, then)
+        case kind:
+            if kind == "host_to_device":
+                _check_host(found, case)
+            _check_effect(found, device, case)
+    return found
+
+
+def check_uart(case: Case) -> Comparison:
+    """A case of vesc_uart."""
+    found = Comparison()
+    given, then = case["given"], case["then"]
+    device = _device(given)
+    match case["kind"]:
+        case "sequence":
+            _check_serial_timeout(found, device, given, then)
+        case "device_to_host":
+            _check_serial_answer(found, device, case)
+        case _ if "packets" in then:
+            received = bytes.fromhex(case["bytes"])
+            found.same("packets", [each.hex() for each in codec.PacketDecoder().feed(received)], then["packets"])
+            piecewise = codec.PacketDecoder()
+            single = [each.hex() for byte in received for each in piecewise.feed(bytes([byte]))]
+            found.same("byte by byte", single, then["packets"])
+            if case["kind"] == "host_to_device":
+                sendable = [bytes.fromhex(each) for each in then["packets"]]
+                found.same("bytes", b"".join(map(codec.packet, sendable)).hex(), case["bytes"])
+        case _ if "payload_bytes" in given:
+            try:
+                sent = codec.packet(bytes(given["payload_bytes"])).hex()
+            except ValueError:
+                sent = ""
+            found.same("sent", sent, then["sent"])
+        case kind:
+            if kind == "host_to_device":
+                _check_serial_host(found, case)
+            answer, frames = device.receive_bytes(bytes.fromhex(case["bytes"]))
+            _check_motor(found, device, then)
+            found.same("reply", answer.hex(), then["reply"])
+            if "can_frames" in then:
+                found.same("frames on CAN", as_cases(frames), then["can_frames"])
+    return found
+
+
+def _device(given: Mapping[str, Any]) -> Vesc:
+    device = Vesc(given.get("controller_id", 0))
+    for name, value in given.get("device_values", {}).items():
+        setattr(device.values, _OF_VALUES.get(name, name), value)
+    return device
+
+
+def _check_host(found: Comparison, case: Case) -> None:
+    given, frames = case["given"], case["frames"]
+    to = given.get("to", given["controller_id"])
+    if "host_id" in given:
+        if "payload" in given:
+            payload = bytes.fromhex(given["payload"])
+        elif given.get("comm") == "COMM_ALIVE":
+            payload = bytes([codec.ALIVE])
+        elif "erpm" in given:
+            payload = codec.packet_command("set_erpm", given["erpm"])
+        elif "milliampere" in given:
+            payload = codec.packet_command("set_brake_current", 1e-3 * given["milliampere"])
+        else:
+            found.same("ping", as_case(codec.ping(to, given["host_id"])), frames[0])
+            return
+        ours = codec.fragments(to, given["host_id"], payload, given.get("send_mode", 0))
+        found.same("fragments", as_cases(ours), frames)
+    elif "value" in given and "off_delay_s" not in given:
+        _check_value(found, codec.command(to, given["command"], given["value"]), frames[0])
+    elif "off_delay_s" not in given and "raw_i32" not in given:
+        theirs = int.from_bytes(bytes.fromhex(frames[0]["data"])[:4], signed=True)
+        number, steps = codec.CAN_COMMANDS[given["command"]]
+        found.same("number", frames[0]["id"] >> 8, number)
+        _check_value(found, codec.command(to, given["command"], theirs / steps), frames[0])
+
+
+def _check_value(found: Comparison, ours: Frame, theirs: Mapping[str, Any]) -> None:
+    found.same("identifier", {**as_case(ours), "data": ""}, {**theirs, "data": ""})
+    value = int.from_bytes(bytes.fromhex(theirs["data"]), signed=True)
+    found.within("steps", int.from_bytes(ours.data, signed=True), value, _STEP)
+
+
+def _check_effect(found: Comparison, device: Vesc, case: Case) -> None:
+    then = case["then"]
+    replies = [reply for frame in case["frames"] for reply in device.receive(on_bus(frame))]
+    _check_motor(found, device, then)
+    if "replies" in then:
+        found.same("replies", as_cases(replies), then["replies"])
+
+
+def _check_motor(found: Comparison, device: Vesc, then: Mapping[str, Any]) -> None:
+    found.same("motor", device.take_calls(), then["motor_calls"])
+    found.same("fed", device.fed > 0, then["timeout_fed"])
+
+
+def _check_status(found: Comparison, device: Vesc, case: Case) -> None:
+    frame, then = case["frames"][0], case["then"]
+    found.same("frame", as_case(device.status(frame["id"] >> 8)), frame)
+    decoded = codec.decode(of_driver(frame))
+    for name, value in then.items():
+        # The vendor's host keeps 32-bit floats.
+        ours = decoded.values[name] if decoded else float("nan")
+        found.within(name, ours, value, _F32_STEP * abs(value))
+
+
+def _check_answer(found: Comparison, device: Vesc, case: Case) -> None:
+    given, then = case["given"], case["then"]
+    mask = given.get("mask")
+    payload = bytes([codec.GET_VALUES]) if mask is None else codec.ask_values(mask)
+    asked = codec.fragments(given["controller_id"], given["host_id"], payload)
+    found.same("request", as_cases(asked), [given["request"]])
+    found.same("answer", as_cases(device.receive(on_bus(given["request"]))), case["frames"])
+    found.same("fed", device.fed > 0, then["timeout_fed"])
+    reassembly = codec.Reassembly(given["host_id"])
+    whole = [packet for frame in case["frames"] if (packet := reassembly.feed(of_driver(frame)))]
+    found.same("whole", [(packet[0], packet[2].hex()) for packet in whole], [(given["controller_id"], then["payload"])])
+    for packet in whole:
+        _check_values(found, packet[2], given)
+
+
+def _check_values(found: Comparison, payload: bytes, given: Mapping[str, Any]) -> None:
+    read = codec.values(payload)
+    if read is None:
+        found.differences.append(f"no values in {payload.hex()}")
+        return
+    steps = {name: 1.0 / each for _, fields in codec._VALUES for name, each in fields}
+    measured = dict(given.get("device_values", {}))
+    measured |= {f"t_mos{k + 1}_c": value for k, value in enumerate(measured.pop("t_mos_c", ()))}
+    for name, value in read.items():
+        if name in measured:
+            found.within(name, value, measured[name], steps[name] + _F32_STEP * abs(value))
+
+
+def _check_serial_host(found: Comparison, case: Case) -> None:
+    given = case["given"]
+    if "command" in given:
+        payload = codec.packet_command(given["command"], given["value"])
+        ours, theirs = (int.from_bytes(each[1:], signed=True) for each in (payload, bytes.fromhex(given["payload"])))
+        found.within("steps", ours, theirs, _STEP)
+        if ours == theirs:
+            found.same("bytes", codec.packet(payload).hex(), case["bytes"])
+    elif "forward_to" in given:
+        payload = codec.forward(given["forward_to"], bytes.fromhex(given["inner_payload"]))
+        found.same("bytes", codec.packet(payload).hex(), case["bytes"])
+    elif "payload" in given:
+        found.same("bytes", codec.packet(bytes.fromhex(given["payload"])).hex(), case["bytes"])
+
+
+def _check_serial_answer(found: Comparison, device: Vesc, case: Case) -> None:
+    given, then = case["given"], case["then"]
+    payload = bytes.fromhex(then["payload"])
+    request = bytes.fromhex(given["request"])
+    if "far_id" in given:
+        found.same("request", codec.packet(codec.forward(given["far_id"], codec.ask_values(given["mask"]))), request)
+        far = Vesc(given["far_id"])
+        far.values = device.values
+        _, frames = device.receive_bytes(request)
+        answers = [answer for frame in frames for answer in far.receive(frame)]
+        found.same("on CAN", as_cases(answers), given["can_frames_of_far_vesc"])
+        answer = b"".join(device.take_packet_answer(frame) for frame in answers)
+    else:
+        if "mask" in given:
+            found.same("request", codec.packet(codec.ask_values(given["mask"])), request)
+        device.firmware = payload[1:] if payload[:1] == b"\0" else device.firmware
+        device.timed_out = bool(then.get("status_byte", 0) & codec.TIMED_OUT)
+        device.values.kill_switch = bool(then.get("status_byte", 0) & codec.KILL_SWITCH)
+        answer, _ = device.receive_bytes(request)
+    found.same("answer", answer.hex(), case["bytes"])
+    found.same("packets", [each.hex() for each in codec.PacketDecoder().feed(answer)], [then["payload"]])
+    if payload[:1] != b"\0":
+        _check_values(found, payload, given)
+        for name in ("fault", "controller_id", "status_byte"):
+            if name in then:
+                found.same(name, (codec.values(payload) or {}).get(name), then[name])
+
+
+class _Clocked:
+    """Runs a device through the milliseconds of a case, noting what its timeout does."""
+
+    def __init__(self, device: Vesc, given: Mapping[str, Any]) -> None:
+        device.timeout_ms = given["timeout_ms"]
+        device.timeout_brake_current_a = given["timeout_brake_current_a"]
+        device.last_fed_ms = given["last_fed_at_ms"]
+        self.device = device
+        self.changes: list[list[object]] = []
+        self.brakes: list[list[float]] = []
+        self._was = False
+
+    def check(self, ms: int) -> None:
+        device = self.device
+        device.at(ms)
+        if ms % CHECK_MS:
+            return
+        current = device.check_timeout(ms)
+        if device.timed_out != self._was:
+            self._was = device.timed_out
+            self.changes.append([ms, self._was])
+        if current is not None:
+            if self.brakes and self.brakes[-1][1] == ms - CHECK_MS and self.brakes[-1][2] == current:
+                self.brakes[-1][1] = ms
+            else:
+                self.brakes.append([ms, ms, current])
+
+
+def _check_timeout(found: Comparison, device: Vesc, given: Mapping[str, Any], then: Mapping[str, Any]) -> None:
+    clocked = _Clocked(device, given)
+    obeyed = []
+    for ms in range(given["until_ms"]):
+        clocked.check(ms)
+        for at, can_id, data in given["sent_ms_id_data"]:
+            if at == ms:
+                device.receive(CanFrame(can_id, bytes.fromhex(data), extended=True))
+                obeyed += [[ms, *call] for call in device.take_calls()]
+    _check_clocked(found, clocked, then)
+    found.same("obeyed", obeyed, then["obeyed_ms_call_value"])
+
+
+def _check_serial_timeout(found: Comparison, device: Vesc, given: Mapping[str, Any], then: Mapping[str, Any]) -> None:
+    clocked = _Clocked(device, given)
+    events: list[list[object]] = []
+    for ms in range(given["until_ms"]):
+        clocked.check(ms)
+        for at, sent in given["sent_ms_bytes"]:
+            if at == ms:
+                answer, _ = device.receive_bytes(bytes.fromhex(sent))
+                events += [[ms, *call] for call in device.take_calls()]
+                events += [[ms, "reply", answer.hex()]] if answer else []
+    _check_clocked(found, clocked, then)
+    found.same("events", events, then["events_ms"])
+
+
+def _check_clocked(found: Comparison, clocked: _Clocked, then: Mapping[str, Any]) -> None:
+    found.same("timed out", clocked.changes, then["has_timeout_changes_ms"])
+    found.same("brake", clocked.brakes, then["brake_calls_from_to_ms_value"])
