@@ -22,6 +22,15 @@ class Frame(msgspec.Struct, frozen=True, gc=False):
     extended: bool = False
 
 
+MAX_EXTENDED_ID = 0x1FFF_FFFF
+_EXTENDED_FLAG = 0x8000_0000
+
+
+def socketcan_id(frame: Frame) -> int:
+    """The identifier with the flag of Linux's `can_id` for 29 bits: what a log keeps of a frame besides its data."""
+    return frame.can_id | _EXTENDED_FLAG if frame.extended else frame.can_id
+
+
 class ReceivedFrame(msgspec.Struct, frozen=True, gc=False):
     """A frame as it came in, with the host time of its reception (from the kernel where the medium gives one)."""
 
@@ -30,10 +39,16 @@ class ReceivedFrame(msgspec.Struct, frozen=True, gc=False):
 
 
 class OutgoingFrame(msgspec.Struct, frozen=True, gc=False):
-    """A frame to send, and the host time after which it must be dropped instead of sent late."""
+    """A frame to send, and the host time after which it must be dropped instead of sent late.
+
+    `rank`: its place among those that wait, lowest first and equal ones as they came; None: its identifier, in the
+    order in which a CAN bus would send. A driver whose frames must keep their order gives them one rank, below it an
+    e-stop's.
+    """
 
     frame: Frame
     deadline_ns: int
+    rank: int | None = None
 
 
 class LinkState(enum.Enum):

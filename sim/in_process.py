@@ -198,7 +198,7 @@ class HostTransport:
             self._counts["send_errors"] += 1
             return False
         frame = outgoing.frame
-        if not self._bus.send(self.node, CanFrame(frame.can_id, frame.data)):
+        if not self._bus.send(self.node, CanFrame(frame.can_id, frame.data, frame.extended)):
             self._counts["transmit_queue_full"] += 1
             return False
         self._counts["frames_sent"] += 1
@@ -225,7 +225,7 @@ class HostTransport:
                 continue
             counts["frames_received"] += 1
             counts["bytes_received"] += len(frame.data)
-            self._incoming.append(ReceivedFrame(delivery.t_ns, Frame(frame.can_id, frame.data)))
+            self._incoming.append(ReceivedFrame(delivery.t_ns, Frame(frame.can_id, frame.data, frame.extended)))
         while len(self._incoming) > RECEIVE_CAPACITY:
             self._incoming.popleft()
             counts["receive_overflow"] += 1

@@ -69,11 +69,11 @@ class PythonCanLink:
             message = self._receive()
             if message is None:
                 break
-            if message.is_error_frame or message.is_extended_id or message.is_remote_frame or message.is_fd:
+            if message.is_error_frame or message.is_remote_frame or message.is_fd:
                 self.ignored += 1
                 continue
             self.frames_in += 1
-            self._waiting.append(Frame(message.arbitration_id, bytes(message.data)))
+            self._waiting.append(Frame(message.arbitration_id, bytes(message.data), message.is_extended_id))
         return len(self._waiting)
 
     def advance(self, now_ns: int, admit: int | None = None) -> list[ReceivedFrame]:
@@ -90,7 +90,7 @@ class PythonCanLink:
                 continue
             try:
                 self._bus.send(
-                    can.Message(arbitration_id=frame.can_id, data=frame.data, is_extended_id=False), timeout=0
+                    can.Message(arbitration_id=frame.can_id, data=frame.data, is_extended_id=frame.extended), timeout=0
                 )
                 self.frames_out += 1
             except (can.CanError, OSError) as error:

@@ -91,7 +91,7 @@ class RobotNode:
                 self.restart_ns = None
                 self._bus.request_recovery(node)
         return [
-            ReceivedFrame(delivery.t_ns, Frame(delivery.frame.can_id, delivery.frame.data))
+            ReceivedFrame(delivery.t_ns, Frame(delivery.frame.can_id, delivery.frame.data, delivery.frame.extended))
             for delivery in deliveries
             if node in delivery.receivers and _is_for_robots(delivery.frame)
         ]
@@ -99,7 +99,7 @@ class RobotNode:
     def send(self, frames: Sequence[Frame]) -> None:
         """Queue the robot's frames; the node counts those that do not fit."""
         for frame in frames:
-            self._bus.send(self.node, CanFrame(frame.can_id, frame.data))
+            self._bus.send(self.node, CanFrame(frame.can_id, frame.data, frame.extended))
 
     def babble(self, frame: Frame) -> None:
         """Send `frame` from the faulty node; if its queue is full it is on the bus as often as the bus allows.
@@ -107,8 +107,8 @@ class RobotNode:
         Thrown off the bus by what it collides with, it comes back as soon as the bus allows.
         """
         self._bus.request_recovery(self._babbler)
-        self._bus.send(self._babbler, CanFrame(frame.can_id, frame.data))
+        self._bus.send(self._babbler, CanFrame(frame.can_id, frame.data, frame.extended))
 
 
 def _is_for_robots(frame: CanFrame) -> bool:
-    return not (frame.error or frame.remote or frame.extended)
+    return not (frame.error or frame.remote)

@@ -113,7 +113,9 @@ class VirtualRobot:
         return self._clock.at(robot_us - self._clock_start_us)
 
     def receive(self, now_us: int, frame: Frame) -> None:
-        """One frame from the link, at robot time `now_us`."""
+        """One frame from the link, at robot time `now_us`; the controller's filters let no 29-bit identifier in."""
+        if frame.extended:
+            return
         self._firmware.receive(self.device_us(now_us), frame.can_id, frame.data)
 
     def step(self, now_us: int, error_counters: tuple[int, int] = (0, 0)) -> Sequence[Frame]:

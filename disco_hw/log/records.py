@@ -21,7 +21,7 @@ Level = Literal["debug", "info", "warning", "error", "fatal"]
 
 
 class FrameIn(msgspec.Struct, frozen=True, gc=False):
-    """A frame as it came in at `t_ns`."""
+    """A frame as it came in at `t_ns`; bit 31 of `can_id` marks 29-bit identifiers, as in Linux."""
 
     t_ns: int
     can_id: int

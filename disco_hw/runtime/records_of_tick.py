@@ -13,7 +13,7 @@ from disco_hw.estimation import PoseUpdate
 from disco_hw.log import records
 from disco_hw.runtime.governor import Limited
 from disco_hw.runtime.pipeline import Source, Tick
-from drivers.types import OutgoingFrame, Readings, ReceivedFrame, WheelCommand
+from drivers.types import OutgoingFrame, Readings, ReceivedFrame, WheelCommand, socketcan_id
 
 _NO_NUMBERS = (float("nan"),) * 3
 _FAN_POINTS = 11
@@ -23,12 +23,12 @@ _FAN_DIGITS = 3
 def frames_in(frames: Sequence[ReceivedFrame]) -> Iterator[records.Record]:
     """The frames received."""
     for received in frames:
-        yield records.FrameIn(received.t_ns, received.frame.can_id, received.frame.data)
+        yield records.FrameIn(received.t_ns, socketcan_id(received.frame), received.frame.data)
 
 
 def frame_out(now_ns: int, outgoing: OutgoingFrame, sent: bool) -> records.Record:
     """One frame handed to the link."""
-    return records.FrameOut(now_ns, outgoing.frame.can_id, outgoing.frame.data, outgoing.deadline_ns, sent)
+    return records.FrameOut(now_ns, socketcan_id(outgoing.frame), outgoing.frame.data, outgoing.deadline_ns, sent)
 
 
 def samples(readings: Readings) -> Iterator[records.Record]:

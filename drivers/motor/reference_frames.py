@@ -49,6 +49,9 @@ class FrameReception:
         `foreign` names the last message seen that only a host sends: somebody else commands this robot. An e-stop does
         not count as that, as anybody may send one: `outside_stop_ns` is when the last was received.
         """
+        if received.frame.extended:
+            self.unknown_id += 1
+            return None
         decoded = self._codec.decode(received.frame.can_id, received.frame.data)
         if isinstance(decoded, DecodeFault):
             self._count(decoded, received.t_ns)

@@ -1,4 +1,4 @@
-"""Any CAN bus that python-can can open: classic frames with 11-bit identifiers."""
+"""Any CAN bus that python-can can open: classic frames with identifiers of 11 and 29 bits."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from drivers.transport.reconnecting import (
     TransportSettingsError,
 )
 from drivers.transport.serial import error_number, explain_port, plain
-from drivers.types import Frame, ReceivedFrame
+from drivers.types import MAX_EXTENDED_ID, Frame, ReceivedFrame
 from firmware_protocol.serial_framing import MAX_CAN_ID, MAX_DATA
 
 _TX_TIMEOUT = 0x001
@@ -99,7 +99,9 @@ def make_transport(
     """
     _check_can(interface, bitrate, options)
     mute_after_s = MUTE_AFTER_S if interface in MAY_STAY_MUTE else None
-    return ReconnectingTransport(CanMedium(interface, channel, bitrate, options), mute_after_s=mute_after_s)
+    return ReconnectingTransport(
+        CanMedium(interface, channel, bitrate, options), mute_after_s=mute_after_s, carries_extended=True
+    )
 
 
 def _check_can(interface: str, bitrate: int, options: Mapping[str, Any]) -> None:
@@ -206,24 +208,23 @@ class CanConnection:
             return ()
         data = bytes(message.data)
         if (
-            message.is_extended_id
-            or message.is_remote_frame
+            message.is_remote_frame
             or message.is_fd
-            or message.arbitration_id > MAX_CAN_ID
+            or message.arbitration_id > (MAX_EXTENDED_ID if message.is_extended_id else MAX_CAN_ID)
             or len(data) > MAX_DATA
             or len(data) != message.dlc
         ):
             self._counters.add(malformed=1)
             return ()
         self._garbage = 0
-        frame = Frame(message.arbitration_id, data)
+        frame = Frame(message.arbitration_id, data, message.is_extended_id)
         if self._own is not None and self._own.is_echo(now_ns, frame):
             return ()
         return (ReceivedFrame(monotonic_stamp_ns(message.timestamp, wall_now_ns, now_ns), frame),)
 
     def write(self, frame: Frame) -> None:
         """Send one frame, waiting 0.05 s at most; raises TransmitBusyError if there was no room."""
-        message = can.Message(arbitration_id=frame.can_id, data=frame.data, is_extended_id=False, check=True)
+        message = can.Message(arbitration_id=frame.can_id, data=frame.data, is_extended_id=frame.extended, check=True)
         if self._own is not None:
             self._own.sent(time.monotonic_ns(), frame)
         try:

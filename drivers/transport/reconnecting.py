@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from drivers.types import Frame, LinkState, OutgoingFrame, ReceivedFrame, TransportStats
+from drivers.types import MAX_EXTENDED_ID, Frame, LinkState, OutgoingFrame, ReceivedFrame, TransportStats
 from firmware_protocol.serial_framing import MAX_CAN_ID, MAX_DATA
 
 RECEIVE_CAPACITY = 4096
@@ -51,7 +51,9 @@ def next_delay_s(policy: BackoffPolicy, previous_s: float | None, up_for_s: floa
 
 
 class TransmitQueue:
-    """Bounded queue in the order in which a CAN bus would send: lowest identifier first, equal ones as they came.
+    """Bounded queue in the order of ranks, which are identifiers where a frame has none: as a CAN bus would send.
+
+    Lowest first, equal ones as they came.
 
     When it is full a more urgent frame takes the place of the least urgent one, so that an emergency stop always fits.
     """
@@ -70,7 +72,7 @@ class TransmitQueue:
     def push(self, outgoing: OutgoingFrame) -> OutgoingFrame | None:
         """Queue a frame; return the frame that did not fit (the given or an earlier one), or None."""
         self._sequence += 1
-        entry = (outgoing.frame.can_id, self._sequence, outgoing)
+        entry = (_rank(outgoing), self._sequence, outgoing)
         if len(self._heap) < self._capacity:
             heapq.heappush(self._heap, entry)
             return None
@@ -88,7 +90,7 @@ class TransmitQueue:
     def put_back(self, outgoing: OutgoingFrame) -> None:
         """Return the frame taken out last: it stays the first of its identifier and counts against no limit."""
         self._front -= 1
-        heapq.heappush(self._heap, (outgoing.frame.can_id, self._front, outgoing))
+        heapq.heappush(self._heap, (_rank(outgoing), self._front, outgoing))
 
     def expire(self, now_ns: int) -> int:
         """Drop the frames whose deadline has passed; return how many."""
@@ -104,6 +106,10 @@ class TransmitQueue:
         dropped = len(self._heap)
         self._heap.clear()
         return dropped
+
+
+def _rank(outgoing: OutgoingFrame) -> int:
+    return outgoing.frame.can_id if outgoing.rank is None else outgoing.rank
 
 
 class TransportCounters:
@@ -174,14 +180,23 @@ class ReconnectingTransport:
     """A `drivers.types.Transport` over any medium, which it connects again with back-off whenever it is lost.
 
     Whatever waits to be sent when the link is lost is dropped: nothing old is ever sent on a new link. A frame leaves
-    in the order of CAN identifiers, and is dropped when its deadline has passed or when it does not fit the queue.
+    in the order of `TransmitQueue`, and is dropped when its deadline has passed or when it does not fit the queue.
     """
 
     def __init__(
-        self, medium: Medium, *, backoff: BackoffPolicy = DEFAULT_BACKOFF, mute_after_s: float | None = None
+        self,
+        medium: Medium,
+        *,
+        backoff: BackoffPolicy = DEFAULT_BACKOFF,
+        mute_after_s: float | None = None,
+        carries_extended: bool = False,
     ) -> None:
-        """`mute_after_s`: a link on which no frame comes for so long is closed and connected again; None: never."""
+        """`mute_after_s`: a link on which no frame comes for so long is closed and connected again; None: never.
+
+        `carries_extended`: whether the medium has frames with 29-bit identifiers.
+        """
         self._medium = medium
+        self._carries_extended = carries_extended
         self._backoff = backoff
         self._mute_after_s = mute_after_s
         self._patience_s = mute_after_s
@@ -246,9 +261,11 @@ class ReconnectingTransport:
     def send(self, outgoing: OutgoingFrame, now_ns: int) -> bool:
         """Hand a frame to the sending thread; False (and a counter) if it expired, did not fit or the link is down.
 
-        Raises ValueError for what is no classic CAN frame with an 11-bit identifier.
+        Raises ValueError for what is no classic CAN frame, or none that this medium has.
         """
-        if not 0 <= outgoing.frame.can_id <= MAX_CAN_ID or len(outgoing.frame.data) > MAX_DATA:
+        extended = outgoing.frame.extended
+        largest = MAX_EXTENDED_ID if extended and self._carries_extended else -1 if extended else MAX_CAN_ID
+        if not 0 <= outgoing.frame.can_id <= largest or len(outgoing.frame.data) > MAX_DATA:
             raise ValueError(f"not a classic CAN frame: {outgoing.frame}")
         if outgoing.deadline_ns < now_ns:
             self._counters.add(expired=1)

@@ -439,8 +439,12 @@ def test_the_host_receives_what_the_robot_sends(link, bus):
     assert [bus.recv(1).arbitration_id for _ in range(2)] == [0x080, 0x100]
 
 
-def test_frames_that_are_not_for_robots_are_left_out(link, bus):
+def test_a_long_identifier_is_not_taken_for_the_short_one_of_its_number(link, bus):
     bus.send(can.Message(arbitration_id=0x100, is_extended_id=True, data=b"1"))
+    assert [received.frame for received in run(link, 0, 2 * MS)] == [Frame(0x100, b"1", extended=True)]
+
+
+def test_frames_that_are_not_for_robots_are_left_out(link, bus):
     bus.send(can.Message(arbitration_id=0x100, is_extended_id=False, is_remote_frame=True))
     send(bus)
     assert [received.frame for received in run(link, 0, 2 * MS)] == [ROBOT_FRAME]

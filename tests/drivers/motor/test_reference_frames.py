@@ -34,6 +34,13 @@ def test_a_sender_is_believed_after_three_good_frames_in_a_row():
     assert reception.accepted == 2
 
 
+def test_the_same_number_with_29_bits_is_somebody_elses():
+    reception = qualified()
+    frame = ticks(4).frame
+    assert reception.accept(ReceivedFrame(0, Frame(frame.can_id, frame.data, extended=True))) is None
+    assert (reception.unknown_id, reception.accepted) == (1, 1)
+
+
 def test_answers_are_believed_at_once_whatever_their_counter():
     """A controller flashed meanwhile counts from zero again; its answer must not pass for a repetition."""
     reception = FrameReception(CODEC)

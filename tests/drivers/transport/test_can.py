@@ -34,7 +34,7 @@ from drivers.transport.reconnecting import (
     TransmitBusyError,
     TransportCounters,
 )
-from drivers.types import Frame, LinkState
+from drivers.types import Frame, LinkState, OutgoingFrame
 from tests.drivers.transport.pseudo_terminal import PseudoTerminal
 from tests.drivers.waiting import collect, median_send_s, outgoing, send, wait_until
 
@@ -134,7 +134,9 @@ CHANNELS = (f"can-test-{number}" for number in itertools.count())
 
 
 def opened(interface, channel, bitrate=500_000, **options):
-    transport = ReconnectingTransport(CanMedium(interface, channel, bitrate, options), backoff=FAST)
+    transport = ReconnectingTransport(
+        CanMedium(interface, channel, bitrate, options), backoff=FAST, carries_extended=True
+    )
     transport.open()
     return transport
 
@@ -172,15 +174,25 @@ def test_frames_both_ways_with_monotonic_stamps_and_no_echo(virtual):
     assert [frame.frame.can_id for frame in collect(transport, 1)] == [0x111], "our own frame does not come back"
 
 
-def test_what_is_no_classic_11_bit_data_frame_is_counted_and_dropped(virtual):
+def test_frames_with_long_identifiers_pass_both_ways(virtual):
     transport, other = virtual
-    other.send(message(0x110, is_extended_id=True))
+    other.send(message(0x110, b"\x01", is_extended_id=True))
+    (received,) = collect(transport, 1)
+    assert received.frame == Frame(0x110, b"\x01", extended=True)
+    for can_id in (0x317, 0x1FFFFFFF):
+        send(transport, OutgoingFrame(Frame(can_id, b"\x02", extended=True), time.monotonic_ns() + 10**9))
+        heard = other.recv(5.0)
+        assert (heard.arbitration_id, heard.is_extended_id) == (can_id, True)
+
+
+def test_what_is_no_classic_data_frame_is_counted_and_dropped(virtual):
+    transport, other = virtual
     other.send(message(0x110, b"", is_remote_frame=True, dlc=2))
     other.send(message(0x110, bytes(16), is_fd=True, dlc=16))
     other.send(message(0x110, bytes(8), is_fd=True))
     other.send(message(0x7FF, bytes(8)))
     assert [received.frame for received in collect(transport, 1)] == [Frame(0x7FF, bytes(8))]
-    assert transport.stats.malformed == 4
+    assert transport.stats.malformed == 3
     assert transport.generation == 1
 
 
@@ -486,7 +498,7 @@ def test_slcan_sets_the_bit_rate_and_carries_frames(adapter):
         b"t1234aabb\r",
         b"t110900112233445566778\r",
         b"tFFF0\r",
-        b"T000001100\r",
+        b"T2000011zz\r",
         b"\x07\r",
     ],
 )

@@ -79,6 +79,14 @@ def test_lowest_identifier_first_and_equal_ones_as_they_came(can_ids):
     assert sent == sorted((can_id, number) for number, can_id in enumerate(can_ids))
 
 
+def test_frames_of_one_rank_keep_their_order_and_a_lower_rank_goes_first():
+    queue = TransmitQueue(8)
+    for can_id in (0x078, 0x06B, 0x06D, 0x067):
+        queue.push(OutgoingFrame(Frame(can_id, b""), 100, rank=0x7F))
+    queue.push(OutgoingFrame(Frame(0x7E2, b""), 100, rank=0))
+    assert [outgoing.frame.can_id for outgoing in drain(queue)] == [0x7E2, 0x078, 0x06B, 0x06D, 0x067]
+
+
 def test_a_frame_never_outlives_its_deadline():
     queue = TransmitQueue(4)
     queue.push(frame(1, deadline_ns=10))
@@ -409,7 +417,7 @@ def test_opening_twice_starts_one_pair_of_threads(transport, medium):
     assert len([thread for thread in threading.enumerate() if thread.name.startswith("scripted")]) == 2
 
 
-@pytest.mark.parametrize("frame", [Frame(0x800, b""), Frame(-1, b""), Frame(1, bytes(9))])
+@pytest.mark.parametrize("frame", [Frame(0x800, b""), Frame(-1, b""), Frame(1, bytes(9)), Frame(1, b"", extended=True)])
 def test_what_is_no_can_frame_is_the_callers_error(transport, frame):
     up(transport)
     with pytest.raises(ValueError, match="not a classic CAN frame"):
