@@ -7,3 +7,7 @@ class InputError(Exception):
 
 class WorkError(Exception):
     """The work itself failed: the message is one line that says what and why; commands exit with 1."""
+
+
+class LogError(InputError):
+    """A log cannot be made, read or mended; the message is one line: file, what is wrong, what to do."""

@@ -32,7 +32,7 @@ from disco_hw.config import load_robot_config
 from disco_hw.config.input_file import FAULTS_TOML, read_toml
 from disco_hw.errors import InputError, WorkError
 from disco_hw.log.importing.csv_drive import read_csv
-from disco_hw.log.mcap_drive import drive_from_log
+from disco_hw.log.load import drive_from_log
 from disco_hw.log.reader import open_log
 from disco_hw.log.recovery import recover
 from disco_hw.model import load_model

@@ -14,8 +14,7 @@ from typing import Protocol
 
 import msgspec
 
-from disco_hw.errors import WorkError
-from disco_hw.log.errors import LogError
+from disco_hw.errors import LogError, WorkError
 from disco_hw.log.spawn import spawn_at_normal_priority
 
 NAMES = ("x_icr_m", "wheel_radius_m", "axial_distance_m")

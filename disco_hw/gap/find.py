@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from disco_hw.errors import LogError
 from disco_hw.gap.data.gridded_drive import grid_drive
 from disco_hw.gap.data.layout import BASE_COUNT, BODY, DELAYED_BY, WHEEL, Layout
 from disco_hw.gap.report.amend import amended_model, carried_terms, channel_estimates
@@ -29,7 +30,6 @@ from disco_hw.gap.search.stages import stage_predictions
 from disco_hw.gap.search.unnamed_terms import with_known_terms
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GapSettings
 from disco_hw.log.drive import DriveLog, concatenate
-from disco_hw.log.errors import LogError
 from disco_hw.model import Model
 
 Array = NDArray[np.float64]

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import msgspec
 
-from disco_hw.log.csv_export import write_csv
-from disco_hw.log.mcap_drive import drive_from_log, ticks_per_rev
+from disco_hw.log.importing.csv_drive import write_csv
+from disco_hw.log.load import drive_from_log, ticks_per_rev
 from disco_hw.log.reader import LogSummary, open_log
 from disco_hw.log.recovery import recover as recover_log
 

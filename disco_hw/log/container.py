@@ -33,7 +33,7 @@ from mcap.records import (
     Statistics,
 )
 
-from disco_hw.log.errors import LogError
+from disco_hw.errors import LogError
 
 MAGIC = b"\x89MCAP0\r\n"
 

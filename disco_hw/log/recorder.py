@@ -18,12 +18,10 @@ from typing import Protocol
 
 import msgspec
 
-from disco_hw.log.delivery import Delivery
-from disco_hw.log.errors import LogError
-from disco_hw.log.keeper_link import KeeperLink
+from disco_hw.errors import LogError
 from disco_hw.log.link import ENCODE_ERRORS, TICK, Attachment, End, Launch, Start, WriterStatus, batch_encoder, frame
 from disco_hw.log.records import Record
-from disco_hw.log.writer_line import WriterLine
+from disco_hw.log.writer_link import Delivery, KeeperLink, WriterLine
 
 _SENT_PER_TICK = 16
 _UNREAD_TICKS = 50

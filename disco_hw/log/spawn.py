@@ -8,7 +8,7 @@ import subprocess
 import threading
 from collections.abc import Sequence
 
-from disco_hw.log.errors import LogError
+from disco_hw.errors import LogError
 
 
 def spawn_at_normal_priority(command: list[str], pass_fds: Sequence[int] = ()) -> subprocess.Popen[bytes]:

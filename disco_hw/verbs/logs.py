@@ -25,7 +25,7 @@ def import_log(
 ) -> None:
     """Write a foreign log as a log of ours, for `infer`, `gap` and Foxglove; `view` and `replay` need one of `run`."""
     check_named_files(robot, logs=[log])
-    from disco_hw.log.importing.commands import import_log as import_foreign
+    from disco_hw.log.importing.write import import_log as import_foreign
 
     result = import_foreign(log, robot, out)
     print_result(result.as_dict(), as_json, result.as_text())

@@ -22,9 +22,9 @@ from disco_hw.runtime.task_change import record_of, told_task
 from disco_hw.viewer.operator_controls import Desk
 from disco_hw.viewer.panel import coverage_text, events_text, live_details
 from disco_hw.viewer.plots import Plots
+from disco_hw.viewer.recording import Stage
 from disco_hw.viewer.scene import Scene, add_layers
 from disco_hw.viewer.snapshot import Snapshot, snapshot_at
-from disco_hw.viewer.stage import Stage
 from disco_hw.viewer.timeline import Items, Timeline
 
 _QUEUED_BATCHES = 200

@@ -19,11 +19,10 @@ from disco_hw.errors import InputError
 from disco_hw.viewer import curves, scene
 from disco_hw.viewer.curves import Curves
 from disco_hw.viewer.plots import WINDOW_NS
-from disco_hw.viewer.recording import Recording
+from disco_hw.viewer.recording import Recording, Stage, model_in_force
 from disco_hw.viewer.scene import Scene
 from disco_hw.viewer.server import serving
 from disco_hw.viewer.snapshot import ParameterPoints, Snapshot
-from disco_hw.viewer.stage import Stage, model_in_force
 from disco_hw.viewer.timeline import Timeline
 
 Array = NDArray[np.float64]

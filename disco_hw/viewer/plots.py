@@ -14,7 +14,7 @@ from disco_hw.model import Model
 from disco_hw.tasks import RobotTask, default_task
 from disco_hw.viewer import curves
 from disco_hw.viewer.curves import Curves
-from disco_hw.viewer.stage import Stage, model_in_force
+from disco_hw.viewer.recording import Stage, model_in_force
 from disco_hw.viewer.timeline import Timeline
 
 WINDOW_NS = 20_000_000_000

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from disco_hw.log import records
 from disco_hw.tasks import RobotTask
+from disco_hw.viewer.recording import Stage, model_in_force
 from disco_hw.viewer.snapshot import ParameterPoints, Snapshot
-from disco_hw.viewer.stage import Stage, model_in_force
 
 Array = NDArray[np.float64]
 Point = tuple[float, float, float]

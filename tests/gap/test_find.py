@@ -7,12 +7,12 @@ from functools import cache
 import numpy as np
 import pytest
 
+from disco_hw.errors import LogError
 from disco_hw.gap import find_gap
 from disco_hw.gap.find import missing_effects
 from disco_hw.gap.report.page import page
 from disco_hw.gap.search.selection import Selector
 from disco_hw.log.drive import DriveLog
-from disco_hw.log.errors import LogError
 from disco_hw.model import Model, load_model, save_model
 from tools.gap_logs import simulated_drive
 

@@ -33,7 +33,7 @@ def named(pid: int, module: str) -> bool:
 
 def keeper_of(stack: Stack) -> int:
     """The process that starts log writers."""
-    (keeper,) = [pid for pid in children(stack.daemon.process.pid) if named(pid, "disco_hw.log.keeper")]
+    (keeper,) = [pid for pid in children(stack.daemon.process.pid) if named(pid, "disco_hw.log.writer")]
     return keeper
 
 

@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from disco_hw.log.columns import to_columns
+from disco_hw.log.reader import to_columns
 from disco_hw.log.records import Command, Estimate, Event, FrameIn, LoopTiming, Plan
 from drivers.types import WheelSample
 from tools.log_samples import bits

@@ -2,8 +2,8 @@ import json
 
 import pytest
 
+from disco_hw.errors import LogError
 from disco_hw.log.commands import export, info, recover
-from disco_hw.log.errors import LogError
 from disco_hw.log.link import End
 from tools.log_samples import PERIOD_NS, drive_ticks, log_bytes, tick, write_log
 

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from mcap.opcode import Opcode
 from mcap.writer import CompressionType, Writer
 
+from disco_hw.errors import LogError
 from disco_hw.log import container
 from disco_hw.log.container import MAGIC, DamagedError, messages, read_attachment, read_chunk, read_contents
-from disco_hw.log.errors import LogError
 from disco_hw.log.link import Attachment
 from tools.log_samples import ATTACHMENTS, drive_ticks, log_bytes
 

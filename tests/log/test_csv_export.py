@@ -5,10 +5,9 @@ import resource
 import numpy as np
 import pytest
 
-from disco_hw.log.csv_export import write_csv
-from disco_hw.log.errors import LogError
-from disco_hw.log.importing.csv_drive import read_csv
-from disco_hw.log.mcap_drive import drive_from_log
+from disco_hw.errors import LogError
+from disco_hw.log.importing.csv_drive import read_csv, write_csv
+from disco_hw.log.load import drive_from_log
 from disco_hw.log.reader import open_log
 from disco_hw.log.records import Command
 from drivers.types import PoseSample, WheelSample

@@ -1,7 +1,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from disco_hw.log.delivery import Delivery
+from disco_hw.log.writer_link import Delivery
 
 STEP = st.one_of(
     st.just("put"),

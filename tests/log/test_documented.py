@@ -3,7 +3,7 @@
 import re
 from pathlib import Path
 
-from disco_hw.log.foxglove import VIEWS
+from disco_hw.log.mcap_log import VIEWS
 from disco_hw.log.records import TOPICS
 
 

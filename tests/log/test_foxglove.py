@@ -3,7 +3,7 @@ import typing
 
 import pytest
 
-from disco_hw.log.foxglove import VIEWS, views
+from disco_hw.log.mcap_log import VIEWS, views
 from disco_hw.log.records import Command, Estimate, Event, Level, Plan
 from drivers.types import PoseSample
 

@@ -1,9 +1,8 @@
 import numpy as np
 import pytest
 
-from disco_hw.errors import InputError
-from disco_hw.log.csv_export import write_csv
-from disco_hw.log.errors import LogError
+from disco_hw.errors import InputError, LogError
+from disco_hw.log.importing.csv_drive import write_csv
 from disco_hw.log.load import load_drive
 from disco_hw.log.recovery import recover
 from tools.log_samples import drive_ticks, log_bytes, write_log

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from disco_hw.log.drive import Commands, Poses, Wheels
-from disco_hw.log.plausible import length_fault, time_fault, yaw_fault
+from disco_hw.log.importing.csv_drive import length_fault, time_fault, yaw_fault
 
 RADIUS_M = 0.06
 TRACK_M = 0.31

@@ -4,9 +4,8 @@ import resource
 import pytest
 from mcap.reader import make_reader
 
-from disco_hw.errors import InputError
+from disco_hw.errors import InputError, LogError
 from disco_hw.log.container import MAGIC
-from disco_hw.log.errors import LogError
 from disco_hw.log.reader import open_log
 from disco_hw.log.recovery import recover
 from tools.log_samples import ATTACHMENTS, bits, drive_ticks, log_bytes

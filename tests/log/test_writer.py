@@ -11,9 +11,9 @@ import time
 import msgspec
 import pytest
 
+from disco_hw.errors import LogError
 from disco_hw.log import writer
 from disco_hw.log.commands import info
-from disco_hw.log.errors import LogError
 from disco_hw.log.reader import open_log
 from disco_hw.log.recorder import ProcessRecorder
 from tests.log.processes import RecordingProcess, SmallDisk, alive, drive, recording, size, wait_until
@@ -175,7 +175,7 @@ def test_a_disk_full_from_the_start_is_one_line(tmp_path):
 
 @pytest.mark.parametrize("arguments", [[], ["1"], ["a", "b"]])
 def test_wrong_usage_of_the_keeper_is_one_line(arguments):
-    command = [sys.executable, "-m", "disco_hw.log.keeper", *arguments]
+    command = [sys.executable, "-m", "disco_hw.log.writer", *arguments]
     done = subprocess.run(command, capture_output=True, text=True, timeout=30, check=False)
     assert done.returncode == 2
     assert len(done.stderr.splitlines()) == 1

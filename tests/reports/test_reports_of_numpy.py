@@ -34,7 +34,7 @@ from disco_hw.inference.checks import CHECKS
 from disco_hw.inference.commands import InferResult
 from disco_hw.inference.gap_check import GapCheck
 from disco_hw.inference.predictive import Predictive
-from disco_hw.log.importing.commands import Imported
+from disco_hw.log.importing.write import Imported
 from disco_hw.model import Model
 from disco_hw.reports.outputs import as_json
 from disco_hw.runtime.replay import ReplayReport

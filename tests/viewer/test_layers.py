@@ -4,9 +4,9 @@ from types import SimpleNamespace
 
 import pytest
 
+from disco_hw.viewer.recording import stage_of_robot
 from disco_hw.viewer.scene import LAYERS, Scene, add_layers
 from disco_hw.viewer.server import serving
-from disco_hw.viewer.stage import stage_of_robot
 from tools.viewer_run import ROBOT_FILE
 
 

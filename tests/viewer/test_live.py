@@ -16,8 +16,8 @@ from disco_hw.tasks.circle import CircleTask
 from disco_hw.viewer.live import KEEP_S, LivePage, _Due
 from disco_hw.viewer.operator_controls import Desk
 from disco_hw.viewer.panel import live_details
+from disco_hw.viewer.recording import stage_of_robot
 from disco_hw.viewer.server import serving
-from disco_hw.viewer.stage import stage_of_robot
 from tests.runtime.path_robot import path_robot
 from tools.viewer_run import PERIOD_NS, ROBOT_FILE, START_NS, pose_at, tick_records
 

@@ -2,7 +2,7 @@ import pytest
 
 from disco_hw.errors import InputError
 from disco_hw.log.reader import open_log
-from disco_hw.viewer.stage import stage_of_log, stage_of_robot
+from disco_hw.viewer.recording import stage_of_log, stage_of_robot
 from tools.viewer_run import MODEL_FILE, ROBOT_FILE
 
 

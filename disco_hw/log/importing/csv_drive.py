@@ -1,8 +1,9 @@
-"""The CSV of logged drives -> the arrays of a drive.
+"""The CSV of logged drives <-> the arrays of a drive.
 
 Header row, columns by name in any order: `t_s`, `cmd_left_rad_s`, `cmd_right_rad_s`, either `enc_*_rad_s` or
 cumulative `enc_*_ticks` or both, `pose_x_m`, `pose_y_m`, `pose_yaw_rad`, optional `imu_wz_rad_s`, optional `segment`.
-An empty cell is "no sample at that time".
+An empty cell is "no sample at that time". A log in degrees, millimetres or milliseconds is refused. What is written
+has every float in the shortest form that reads back to the same bits.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from __future__ import annotations
 import csv
 import math
 from array import array
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.config.input_file import DRIVE_CSV, read_lines
+from disco_hw.errors import LogError
 from disco_hw.log.drive import (
     Array,
     Commands,
@@ -29,9 +31,88 @@ from disco_hw.log.drive import (
     differentiate_angle,
     integrate_angle,
 )
-from disco_hw.log.errors import LogError
 from disco_hw.log.importing.registry import LogFormat
-from disco_hw.log.plausible import length_fault, time_fault, yaw_fault
+
+_LONGEST_PERIOD_S = 2.0
+_SHORTEST_PERIOD_S = 1e-4
+_WHEEL_RADIUS_M = (0.005, 1.5)
+_AGAINST_NOMINAL = 4.0
+_STANDS_STILL = 100.0
+_CHORD_ROLL_RAD = 2.0
+_ENOUGH_CHORDS = 5
+_LARGEST_TURN_RATIO = 3.0
+_LARGEST_YAW_RATE_RAD_S = 6.0
+
+
+def time_fault(t_s: Array) -> str | None:
+    """What is wrong with times that should be in seconds, or None."""
+    if t_s.size < 3:
+        return None
+    period_s = float(np.median(np.diff(t_s)))
+    if _SHORTEST_PERIOD_S <= period_s <= _LONGEST_PERIOD_S:
+        return None
+    return f"t_s: {period_s:.3g} from row to row, which does not look like seconds; write seconds"
+
+
+def yaw_fault(t_s: Array, yaw_rad: Array, segment: Index, wheels: Wheels, commands: Commands) -> str | None:
+    """Whether yaw, as written in the file, looks like degrees: field, fault and remedy, or None.
+
+    Yaw that stays within (-pi, pi] is taken as it is. Beyond, it may be radians that were not wrapped: they turn no
+    more than the wheels can make them (yaw change <= difference of the wheels' roll x radius / axial distance).
+    """
+    if not yaw_rad.size or np.abs(yaw_rad).max() <= np.pi + 0.01:
+        return None
+    steps = np.diff(yaw_rad)
+    usual = np.diff(segment) == 0
+    turned = float(np.abs(steps[usual]).sum())
+    _, roll = _roll(wheels, commands)
+    if roll.size:
+        possible = _LARGEST_TURN_RATIO * float(np.abs(np.diff(roll[:, 1] - roll[:, 0])).sum()) + np.pi
+        degrees = turned > possible
+    else:
+        rate = np.abs(steps[usual] / np.diff(t_s)[usual])
+        degrees = bool(rate.size) and float(np.quantile(rate, 0.9)) > _LARGEST_YAW_RATE_RAD_S
+    if not degrees:
+        return None
+    return f"pose_yaw_rad: {turned:.0f} rad of turning is more than the wheels can do, like degrees; write radians"
+
+
+def length_fault(poses: Poses, wheels: Wheels, commands: Commands, wheel_radius_m: float | None) -> str | None:
+    """Whether path and roll of the wheels give an impossible wheel radius: field, fault and remedy, or None.
+
+    The path is the sum of chords between poses that are 2 rad of forward roll apart, so that neither noise at rest nor
+    turning on the spot counts. `wheel_radius_m` is the nominal radius if known; within a factor of 4 is believed.
+    """
+    roll_t_s, roll = _roll(wheels, commands)
+    if poses.t_s.size < 2 or not roll.size:
+        return None
+    forward = np.concatenate(([0.0], np.cumsum(np.abs(np.diff(roll.mean(axis=1))))))
+    at_pose = np.interp(poses.t_s, roll_t_s, forward)
+    _, picked = np.unique(np.floor(at_pose / _CHORD_ROLL_RAD), return_index=True)
+    inside = np.diff(poses.segment[picked]) == 0
+    if np.count_nonzero(inside) < _ENOUGH_CHORDS:
+        return None
+    path_m = float(np.hypot(np.diff(poses.x_m[picked]), np.diff(poses.y_m[picked]))[inside].sum())
+    roll_rad = float(np.diff(at_pose[picked])[inside].sum())
+    radius_m = path_m / roll_rad
+    low, high = _WHEEL_RADIUS_M
+    if wheel_radius_m is not None:
+        low, high = wheel_radius_m / _AGAINST_NOMINAL, wheel_radius_m * _AGAINST_NOMINAL
+    # Poses that do not move at all are lifted wheels or a dead sensor, not a unit.
+    if low <= radius_m <= high or radius_m < low / _STANDS_STILL:
+        return None
+    fault = f"{path_m:.3g} m of path for {roll_rad:.3g} rad of wheel would be a wheel radius of {radius_m:.2g} m"
+    return f"pose_x_m, pose_y_m against the wheels: {fault}; write metres, rad/s and the encoder's true ticks_per_rev"
+
+
+def _roll(wheels: Wheels, commands: Commands) -> tuple[Array, Array]:
+    """Times (N,) and cumulative wheel angles (N, 2), from the commands where no wheels were measured."""
+    if wheels.t_s.size:
+        return wheels.t_s, np.column_stack([wheels.left_angle_rad, wheels.right_angle_rad])
+    t_s, segment = commands.t_s, commands.segment
+    left, right = np.nan_to_num(commands.left_rad_s), np.nan_to_num(commands.right_rad_s)
+    return t_s, np.column_stack([integrate_angle(t_s, left, segment), integrate_angle(t_s, right, segment)])
+
 
 COMMAND = ("cmd_left_rad_s", "cmd_right_rad_s")
 SPEED = ("enc_left_rad_s", "enc_right_rad_s")
@@ -242,3 +323,69 @@ def _wrapped(yaw: Array) -> Array:
 FORMAT = LogFormat(
     "csv", lambda begin: True, lambda path, robot: read_csv(path, robot.ticks_per_rev, robot.wheel_radius_m), order=1000
 )
+
+
+Cells = Callable[[float], list[str]]
+
+
+def write_csv(drive: DriveLog, path: Path, ticks_per_rev: int | None) -> int:
+    """Write one row for each time at which anything was recorded; return the number of rows.
+
+    The command cells hold the command in force, and are empty where none is; the others are empty where there is no
+    sample at that time. With `ticks_per_rev` the wheel angles are written as ticks. Raises LogError if the file exists
+    or cannot be written.
+    """
+    wheels, poses = drive.wheels, drive.poses
+    groups: list[tuple[tuple[str, ...], Cells]] = [
+        (COMMAND, _in_force(drive)),
+        (SPEED, _at(wheels.t_s, (wheels.left_speed_rad_s, wheels.right_speed_rad_s), repr)),
+        (POSE, _at(poses.t_s, (poses.x_m, poses.y_m, poses.yaw_rad), repr)),
+    ]
+    if ticks_per_rev is not None and wheels.angle_measured:
+        per_rad = ticks_per_rev / (2.0 * math.pi)
+        ticks = (np.rint(wheels.left_angle_rad * per_rad), np.rint(wheels.right_angle_rad * per_rad))
+        groups.insert(1, (TICKS, _at(wheels.t_s, ticks, lambda value: str(int(value)))))
+    times, segments = _rows(drive)
+    try:
+        with path.open("x", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file)
+            writer.writerow([TIME, *(name for names, _ in groups for name in names), SEGMENT])
+            for t_s, segment in zip(times.tolist(), segments.tolist(), strict=True):
+                writer.writerow([repr(t_s), *(cell for _, cells in groups for cell in cells(t_s)), segment])
+    except FileExistsError:
+        raise LogError(f"{path}: already exists; give another name") from None
+    except OSError as error:
+        # Half a table would pass for a whole one.
+        path.unlink(missing_ok=True)
+        raise LogError(f"{path}: cannot be written ({error.strerror}); give another place") from None
+    return times.size
+
+
+def _rows(drive: DriveLog) -> tuple[Array, Index]:
+    """All times in order, and their segments."""
+    parts = (drive.commands, drive.wheels, drive.poses)
+    times, first = np.unique(np.concatenate([part.t_s for part in parts]), return_index=True)
+    return times, np.concatenate([part.segment for part in parts])[first]
+
+
+def _at(t_s: Array, columns: tuple[Array, ...], text: Callable[[float], str]) -> Cells:
+    rows = dict(zip(t_s.tolist(), zip(*(column.tolist() for column in columns), strict=True), strict=True))
+    nothing = [""] * len(columns)
+
+    def cells(time: float) -> list[str]:
+        values = rows.get(time)
+        return nothing if values is None else [text(value) for value in values]
+
+    return cells
+
+
+def _in_force(drive: DriveLog) -> Cells:
+    commands = drive.commands
+
+    def cells(time: float) -> list[str]:
+        at = int(np.searchsorted(commands.t_s, time, side="right")) - 1
+        if at < 0 or math.isnan(commands.left_rad_s[at]):
+            return ["", ""]
+        return [repr(float(commands.left_rad_s[at])), repr(float(commands.right_rad_s[at]))]
+
+    return cells

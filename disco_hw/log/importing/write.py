@@ -1,17 +1,27 @@
-"""A drive's arrays -> our MCAP log, from which `drive_from_log` reads the same arrays again."""
+"""What `disco-hw import` does: a drive's arrays -> our MCAP log.
+
+`drive_from_log` reads the same arrays from it again.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import asdict, dataclass
 from itertools import groupby
 from pathlib import Path
+from typing import Any
 
+from disco_hw.config import load_robot_config
+from disco_hw.config.input_file import LOG, begin_of
+from disco_hw.config.input_file import ROBOT_TOML as ROBOT_FILE
+from disco_hw.errors import LogError
+from disco_hw.log.container import MAGIC
 from disco_hw.log.drive import DriveLog
-from disco_hw.log.errors import LogError
+from disco_hw.log.importing.registry import LONGEST_BEGIN_BYTES, format_of, log_formats
 from disco_hw.log.link import Attachment, End, Start, batch_encoder
 from disco_hw.log.mcap_log import McapLog
-from disco_hw.log.provenance import version
+from disco_hw.log.provenance import ROBOT_TOML, attachment, version
 from disco_hw.log.records import Command, Record
 from disco_hw.log.writer import LogFile
 from drivers.types import PoseSample, WheelSample
@@ -101,3 +111,46 @@ def _poses(drive: DriveLog) -> Iterator[_Timed]:
 
 def _ns(t_s: float) -> int:
     return round(t_s * 1e9)
+
+
+@dataclass(frozen=True, slots=True)
+class Imported:
+    """What was written where, and what a person should know of it."""
+
+    out: Path
+    records: int
+    segments: int
+    duration_s: float
+    notes: tuple[str, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """For machines."""
+        return {**asdict(self), "out": str(self.out)}
+
+    def as_text(self) -> str:
+        """For a person."""
+        written = f"{self.out}: {self.records} records, {self.duration_s:.1f} s, {self.segments} segments"
+        return "\n".join([written, *(f"note: {note}" for note in self.notes)])
+
+
+def import_log(path: Path, robot: Path, out: Path) -> Imported:
+    """Write a foreign log, of whichever format it is, as an MCAP log of ours.
+
+    robot.toml goes into the log. Raises LogError for what can be no such file, and InputError.
+    """
+    config = load_robot_config(robot)
+    begin = begin_of(path, LOG, LONGEST_BEGIN_BYTES)
+    if begin.startswith(MAGIC):
+        raise LogError(
+            f"{path}: an MCAP log; ours needs no import, and of others none can be imported yet: write a CSV"
+        )
+    log_format = format_of(begin)
+    if log_format is None:
+        names = ", ".join(each.name for each in log_formats())
+        raise LogError(f"{path}: none of the formats that can be imported ({names}); write a CSV")
+    drive = log_format.read(path, config.robot)
+    records = write_log(drive, out, config.robot.name, (attachment(robot, ROBOT_TOML, ROBOT_FILE),))
+    notes = drive.notes
+    if drive.gyro.t_s.size:
+        notes += (f"{path}: the gyro was left out; a log of ours has none",)
+    return Imported(out, records, drive.segments, drive.end_s, notes)

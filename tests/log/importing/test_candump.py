@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from disco_hw.config import Robot
-from disco_hw.log.errors import LogError
+from disco_hw.errors import LogError
 from disco_hw.log.importing.candump import read_candump
 from firmware_protocol.codec import Codec
 

@@ -5,9 +5,8 @@ import sys
 import numpy as np
 import pytest
 
-from disco_hw.errors import InputError
-from disco_hw.log.errors import LogError
-from disco_hw.log.importing.commands import import_log
+from disco_hw.errors import InputError, LogError
+from disco_hw.log.importing.write import import_log
 from disco_hw.log.load import load_drive
 from disco_hw.log.provenance import ROBOT_TOML
 from disco_hw.log.reader import open_log

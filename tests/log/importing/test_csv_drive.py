@@ -8,8 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from disco_hw.errors import InputError
-from disco_hw.log.errors import LogError
+from disco_hw.errors import InputError, LogError
 from disco_hw.log.importing.csv_drive import read_csv
 
 REAL_LOGS = "DISCO_HW_REAL_LOGS"
