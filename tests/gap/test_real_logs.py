@@ -61,10 +61,11 @@ def test_a_husky_on_tiles_answers_late_and_turns_about_a_point_behind_its_sensor
     assert ahead["amended"].position_m < 0.6 * ahead["refitted"].position_m
 
 
-def test_a_husky_on_tiles_is_predicted_to_40_mrad_a_second_ahead():
+def test_a_husky_on_tiles_is_predicted_to_22_mrad_and_17_mm_a_second_ahead():
     report = report_of(*HUSKY)
     assert report.gap["refitted"][1.0].yaw_rad > 0.120
-    assert report.gap["amended"][1.0].yaw_rad <= 0.040
+    assert report.gap["amended"][1.0].yaw_rad <= 0.022
+    assert report.gap["amended"][1.0].position_m <= 0.017
 
 
 @pytest.mark.parametrize("time_of_day", ["1504", "1613"])

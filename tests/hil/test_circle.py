@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import subprocess
 import sys
 import warnings
@@ -30,8 +31,9 @@ def test_demo_follows_the_circle(tmp_path, link, plant_seed):
     figures = json.loads(result.stdout)
     assert figures["success"]
     assert figures["circle"]["laps"] >= 0.98
-    assert figures["circle"]["settled_rms_distance_m"] < 0.05
-    assert figures["estimation"]["rms_position_m"] < 0.02
+    assert figures["circle"]["settled_rms_distance_m"] < 0.02
+    assert figures["estimation"]["rms_position_m"] < 0.01
+    assert figures["estimation"]["rms_yaw_rad"] < math.radians(1.0)
     assert figures["frames"]["rejected"] == 0
     assert (tmp_path / "demo.mcap").stat().st_size > 100_000
     assert (tmp_path / "circle.png").read_bytes().startswith(b"\x89PNG")
