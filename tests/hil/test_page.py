@@ -1,6 +1,7 @@
 """The live page of a running robot: it draws what is so, stops and drives the wheels, and cannot touch the loop."""
 
 import os
+import shutil
 import signal
 import socket
 import time
@@ -83,6 +84,27 @@ def test_the_page_draws_the_robot_survives_being_stopped_and_its_estop_stops_the
     later = [row.fastest for row in rows if row.t_s > stopped_s + 0.5]
     assert later
     assert max(later) < STILL_RAD_S
+
+
+@pytest.mark.timeout(300)
+def test_where_nothing_can_be_recorded_the_page_arms_only_after_a_second_press(tmp_path):
+    logs = tmp_path / "logs"
+    with (
+        chromium() as browser,
+        running_stack(tmp_path, run_arguments=("--log", str(logs / "run.mcap"))) as stack,
+        page_of(stack.robot_file, tmp_path / "page.txt") as (_, url),
+        opened(browser, url, 760, 560) as tab,
+    ):
+        stack.operator.wait_for("READY", 60.0)
+        shutil.rmtree(logs)
+        logs.write_text("in the way")
+        stack.operator.wait_until("recording broken", lambda status: status["recorder"]["fault"], 10.0)
+        tab.get_by_role("button", name="Arm", exact=True).click()
+        anyway = tab.get_by_role("button", name="Arm unrecorded")
+        anyway.wait_for()
+        assert stack.operator.status()["state"] == "READY"
+        anyway.click()
+        stack.operator.wait_for("ARMED", 5.0)
 
 
 def stop_the_page_for_a_while(stack, pid):
