@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 SOURCES := pyproject.toml setup.py constraints.txt firmware_protocol/build_firmware.py firmware_protocol/disco_robot.dbc \
 	$(wildcard firmware_protocol/firmware/*.c firmware_protocol/firmware/*.h)
 
-.PHONY: venv demo chromium test test-long bench gap-study soak fault-campaign fuzz firmware-check firmware-mutants socketcan-test clean
+.PHONY: venv demo chromium test test-long bench gap-study soak fault-campaign fuzz firmware-check firmware-mutants firmware-emulated cross-tools socketcan-test clean
 
 venv: $(STAMP)
 
@@ -40,8 +40,20 @@ test: $(STAMP) chromium
 	$(BIN)/mypy & types=$$!; $(BIN)/python -m tools.compile_kernels & kernels=$$!; wait $$types && wait $$kernels
 	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 3 --dist loadscope --no-loadscope-reorder -m "not long$(if $(CHROMIUM), or browser)"
 
+# The cross-compiler and emulator of a Cortex-M: 113 MB to download, 923 MB on disk. Without them their tests are skipped.
+cross-tools:
+	@command -v arm-none-eabi-gcc >/dev/null && command -v qemu-system-arm >/dev/null || \
+		{ [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null && echo "downloading the cross-compiler and the emulator, 113 MB" && \
+		timeout 900 sh -c 'apt-get -qq update && apt-get -qq -y --no-install-recommends install gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm' >/dev/null; } || \
+		echo "arm-none-eabi-gcc and qemu-system-arm could not be installed (Debian, root and its mirrors are needed); the emulated board's tests are skipped"
+
+# The firmware on an emulated Cortex-M3 and M4F: what it costs there, and what holds of it over its serial line.
+firmware-emulated: $(STAMP) cross-tools
+	$(BIN)/python -m tools.firmware_figures --check
+	$(BIN)/python -m pytest -n 0 -rs -m long tests/firmware_protocol/emulated
+
 # Closed loops, studies, clusters and browsers: as much again.
-test-long: $(STAMP) chromium
+test-long: $(STAMP) chromium cross-tools
 	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadscope --no-loadscope-reorder -m long
 
 # The peers that our figures stand beside, and nothing else needs: in an environment of their own, on top of ours.

@@ -20,6 +20,9 @@ HEADERS = (
     "states.h",
     "faults.h",
     "transmit.h",
+    "serial_framing.h",
+    "slcan.h",
+    "parameter_record.h",
     "firmware.h",
 )
 SOURCES = (
@@ -32,6 +35,8 @@ SOURCES = (
     "states.c",
     "faults.c",
     "transmit.c",
+    "serial_framing.c",
+    "slcan.c",
     "timebase.c",
     "reception.c",
     "host.c",

@@ -1,6 +1,7 @@
 """The C firmware core as a Python object: what the virtual robot runs and what the tests hold to account."""
 
 import enum
+import math
 import secrets
 from dataclasses import dataclass, field
 from typing import Any
@@ -8,12 +9,29 @@ from typing import Any
 import msgspec
 
 from firmware_protocol import _firmware
-from firmware_protocol.codec import PROTOCOL, PROTOCOL_MAJOR, Codec
+from firmware_protocol.codec import Codec
 
 _lib: Any = _firmware.lib
 _ffi: Any = _firmware.ffi
 _TICKS_MASK = 0xFFFF_FFFF
 _ENTROPY_MASK = 0xFFFF_FFFF_FFFF_FFFF
+_POSITION_UNIT_M = 0.0001
+_YAW_UNIT_RAD = 0.0001
+_DEVIATION_UNIT = 0.001
+_INT32 = (-0x8000_0000, 0x7FFF_FFFF)
+_UINT16 = (0, 0xFFFF)
+
+
+_DEFAULT: Any = _lib.disco_config_default(1, 1.0)
+
+
+def _default(name: str) -> float:
+    """Return a default as C has it, in the decimal digits that a float carries."""
+    return float(f"{getattr(_DEFAULT, name):.7g}")
+
+
+def _default_s(name: str) -> float:
+    return int(getattr(_DEFAULT, f"{name}_us")) / 1e6
 
 
 class ResetCause(enum.IntEnum):
@@ -26,7 +44,9 @@ class ResetCause(enum.IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class FirmwareConfig:
-    """What differs between robots; a value out of the bounds of `robot_config.c` makes the core refuse to leave FAULT.
+    """What differs between robots, with the defaults of `disco_config_default`.
+
+    A value out of the bounds of `robot_config.c` makes the core refuse to leave FAULT.
 
     `capabilities` is the sum of the bits in the DBC's value table; `dbc_hash` and `protocol_major` are other than the
     packaged DBC's only to play a robot that speaks another one. With a `key` (16 bytes) commands need a proof made
@@ -35,33 +55,33 @@ class FirmwareConfig:
 
     ticks_per_rev: int
     max_wheel_speed_rad_s: float
-    max_wheel_acceleration_rad_s2: float = 20.0
-    stop_deceleration_rad_s2: float = 20.0
-    still_speed_rad_s: float = 0.05
-    cycle_s: float = 0.001
-    command_timeout_s: float = 0.1
-    drive_off_timeout_s: float = 0.5
-    stop_timeout_s: float = 1.0
-    host_state_timeout_s: float = 0.5
-    host_forget_timeout_s: float = 5.0
-    reset_quiet_s: float = 0.5
-    under_voltage_v: float = 20.0
-    over_voltage_v: float = 30.0
-    over_current_a: float = 30.0
-    over_temperature_c: float = 80.0
-    stall_current_a: float = 15.0
-    encoder_check_current_a: float = 0.5
-    encoder_check_speed_rad_s: float = 1.0
-    voltage_debounce_s: float = 0.2
-    current_debounce_s: float = 0.1
-    temperature_debounce_s: float = 1.0
-    encoder_debounce_s: float = 0.3
-    fault_hold_s: float = 0.5
-    board_id: int = 1
-    firmware_version: tuple[int, int, int] = (0, 1, 0)
-    capabilities: int = 63
-    dbc_hash: int = PROTOCOL.dbc_hash
-    protocol_major: int = PROTOCOL_MAJOR
+    max_wheel_acceleration_rad_s2: float = _default("max_wheel_acceleration")
+    stop_deceleration_rad_s2: float = _default("stop_deceleration")
+    still_speed_rad_s: float = _default("still_speed")
+    cycle_s: float = _default_s("cycle")
+    command_timeout_s: float = _default_s("command_timeout")
+    drive_off_timeout_s: float = _default_s("drive_off_timeout")
+    stop_timeout_s: float = _default_s("stop_timeout")
+    host_state_timeout_s: float = _default_s("host_state_timeout")
+    host_forget_timeout_s: float = _default_s("host_forget_timeout")
+    reset_quiet_s: float = _default_s("reset_quiet")
+    under_voltage_v: float = _default("under_voltage")
+    over_voltage_v: float = _default("over_voltage")
+    over_current_a: float = _default("over_current")
+    over_temperature_c: float = _default("over_temperature")
+    stall_current_a: float = _default("stall_current")
+    encoder_check_current_a: float = _default("encoder_check_current")
+    encoder_check_speed_rad_s: float = _default("encoder_check_speed")
+    voltage_debounce_s: float = _default_s("voltage_debounce")
+    current_debounce_s: float = _default_s("current_debounce")
+    temperature_debounce_s: float = _default_s("temperature_debounce")
+    encoder_debounce_s: float = _default_s("encoder_debounce")
+    fault_hold_s: float = _default_s("fault_hold")
+    board_id: int = _DEFAULT.board_id
+    firmware_version: tuple[int, int, int] = (*_DEFAULT.firmware_version,)
+    capabilities: int = _DEFAULT.capabilities
+    dbc_hash: int = _DEFAULT.dbc_hash
+    protocol_major: int = _DEFAULT.protocol_major
     key: bytes = field(default=b"", repr=False)
 
 
@@ -118,6 +138,14 @@ def drawn_entropy() -> int:
     return 1 + secrets.randbelow(_ENTROPY_MASK)
 
 
+def _nearest(value: float, unit: float, bounds: tuple[int, int]) -> int:
+    """Return the number of units nearest to a value, within bounds; 0 for what is not a number."""
+    if math.isnan(value):
+        return 0
+    least, most = bounds
+    return math.floor(min(max(value / unit + 0.5, least), most))
+
+
 def _microseconds(seconds: float) -> int:
     return round(seconds * 1e6)
 
@@ -169,6 +197,7 @@ class FirmwareCore:
         "_frame",
         "_inputs",
         "_outputs",
+        "_pose",
         "_reasons",
         "_states",
         "_stop_causes",
@@ -188,6 +217,7 @@ class FirmwareCore:
         self._core = _ffi.new("disco_firmware_t *")
         self._inputs = _ffi.new("disco_inputs_t *")
         self._outputs = _ffi.new("disco_outputs_t *")
+        self._pose = _ffi.new("disco_pose_t *")
         self._frame = _ffi.new("disco_frame_t *")
         self._data = _ffi.buffer(self._frame.data)
         c_config = _ffi.new("disco_config_t *")
@@ -240,7 +270,19 @@ class FirmwareCore:
         self, x_m: float, y_m: float, yaw_rad: float, sample_us: int, position_std_m: float, yaw_std_rad: float
     ) -> None:
         """Queue one measured pose, true at `sample_us`; one that does not fit the frame is sent as not valid."""
-        _lib.disco_firmware_pose(self._core, x_m, y_m, yaw_rad, sample_us, position_std_m, yaw_std_rad)
+        deviations = (position_std_m, yaw_std_rad)
+        pose = self._pose
+        pose.x, pose.y = _nearest(x_m, _POSITION_UNIT_M, _INT32), _nearest(y_m, _POSITION_UNIT_M, _INT32)
+        pose.yaw = _nearest(yaw_rad, _YAW_UNIT_RAD, _INT32)
+        pose.position_std, pose.yaw_std = (_nearest(std, _DEVIATION_UNIT, _UINT16) for std in deviations)
+        # What fits only when rounded does not fit; written so that what is not a number is not valid.
+        pose.valid = (
+            abs(x_m) <= _POSITION_UNIT_M * 0x7F_FFFF
+            and abs(y_m) <= _POSITION_UNIT_M * 0x7F_FFFF
+            and abs(yaw_rad) <= _YAW_UNIT_RAD * 0x7FFF
+            and all(0.0 <= std <= _DEVIATION_UNIT * 0xFF for std in deviations)
+        )
+        _lib.disco_firmware_pose(self._core, pose, sample_us)
 
     def drain(self) -> list[tuple[int, bytes]]:
         """Return the frames to send (CAN id, data), oldest first, and forget them."""

@@ -1,6 +1,7 @@
 """Writes the C side of the protocol and the tables that Python runs on; --check only says whether they are current."""
 
 import argparse
+import math
 import re
 import sys
 import zlib
@@ -54,7 +55,7 @@ def _constants(protocol: Protocol) -> str:
         "/* Data ids of the end-to-end CRC; the handshake's are the same for every major version. */",
     ]
     lines += [_data_id(message) for message in protocol.messages if message.data_id is not None]
-    lines += ["", "/* Physical value of one raw unit. */"]
+    lines += ["", "/* Raw units in one physical unit (PER_UNIT), or the physical value of one raw unit (SCALE). */"]
     for message in protocol.messages:
         lines += _scales(message)
     return "\n".join([*lines, *_value_tables(protocol), "", "#endif", ""])
@@ -68,11 +69,20 @@ def _data_id(message: MessageLayout) -> str:
 
 def _scales(message: MessageLayout) -> list[str]:
     return [
-        f"#define DISCO_{message.name}_{signal.name.upper()}_SCALE ({float(signal.scale)!r})"
+        f"#define DISCO_{message.name}_{signal.name.upper()}_{_scale(signal.scale)}"
         + (f" /* {signal.unit} */" if signal.unit else "")
         for signal in message.signals
         if signal.scale != 1
     ]
+
+
+def _scale(scale: float) -> str:
+    """Return a scale's constant without a fraction, so that a controller needs no double for it."""
+    if scale > 1:
+        return f"SCALE ({round(scale)})"
+    if not math.isclose(scale * round(1 / scale), 1, rel_tol=1e-15):
+        raise ValueError(f"a scale of {scale} is not one over a whole number")
+    return f"PER_UNIT ({round(1 / scale)})"
 
 
 def _value_tables(protocol: Protocol) -> list[str]:

@@ -14,16 +14,27 @@ static uint8_t *put(uint8_t *target, uint64_t value, uint8_t bytes)
     return &target[bytes];
 }
 
-void disco_authentication_renew(disco_authentication_t *authentication)
+void disco_authentication_prepare(disco_authentication_t *authentication)
 {
     /* 16 bytes where a frame's proof takes 24: a nonce is never the MAC of a frame. */
     uint8_t message[16];
     uint8_t tag[DISCO_AES_BLOCK];
+    if (!authentication->required || authentication->prepared) {
+        return;
+    }
     authentication->draws++;
     (void)put(put(message, authentication->entropy, 8u), authentication->draws, 8u);
     disco_cmac(&authentication->key, message, sizeof(message), tag);
-    (void)memcpy(authentication->nonce, tag, sizeof(authentication->nonce));
+    (void)memcpy(authentication->next_nonce, tag, sizeof(authentication->next_nonce));
+    authentication->prepared = true;
+}
+
+void disco_authentication_renew(disco_authentication_t *authentication)
+{
+    disco_authentication_prepare(authentication);
+    (void)memcpy(authentication->nonce, authentication->next_nonce, sizeof(authentication->nonce));
     (void)memset(authentication->proofs, 0, sizeof(authentication->proofs));
+    authentication->prepared = false;
     authentication->nonce_shown = false;
 }
 
@@ -33,6 +44,7 @@ void disco_authentication_init(disco_authentication_t *authentication, bool requ
     *authentication = (disco_authentication_t){.required = required, .entropy = entropy};
     disco_cmac_init(&authentication->key, key);
     disco_authentication_renew(authentication);
+    disco_authentication_prepare(authentication);
 }
 
 void disco_authentication_offer(disco_authentication_t *authentication, disco_proof_index_t index,

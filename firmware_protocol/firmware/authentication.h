@@ -30,6 +30,8 @@ typedef struct {
     uint64_t entropy;
     uint64_t draws; /* makes each nonce another one */
     uint8_t nonce[DISCO_NONCE_LENGTH];
+    uint8_t next_nonce[DISCO_NONCE_LENGTH];
+    bool prepared; /* `next_nonce` is drawn */
     bool required;
     bool nonce_shown;
 } disco_authentication_t;
@@ -38,7 +40,10 @@ typedef struct {
 void disco_authentication_init(disco_authentication_t *authentication, bool required, const uint8_t *key,
                                uint64_t entropy);
 
-/* Draws a new nonce: nothing proved so far proves anything any more. */
+/* Draws the next nonce, once, where one is required: work for a cycle that has nothing else to do. */
+void disco_authentication_prepare(disco_authentication_t *authentication);
+
+/* Puts a new nonce in force: nothing proved so far proves anything any more. */
 void disco_authentication_renew(disco_authentication_t *authentication);
 
 /* Takes in the 8 bytes of a MAC frame: freshness, then the MAC. */

@@ -61,15 +61,18 @@ static void expand(uint8_t *round_keys, const uint8_t *key)
     }
 }
 
-/* SubBytes and ShiftRows: row r of the state, kept in columns, moves left by r. */
+/* ShiftRows: row r of the state, kept in columns, moves left by r. */
+static const uint8_t shifted_from[DISCO_AES_BLOCK] = {0u, 5u, 10u, 15u, 4u, 9u, 14u, 3u, 8u, 13u, 2u, 7u, 12u, 1u, 6u, 11u};
+
+/* SubBytes and ShiftRows. */
 static void substitute_and_shift(uint8_t *state)
 {
     uint8_t before[DISCO_AES_BLOCK];
     for (size_t i = 0u; i < BLOCK; i++) {
-        before[i] = s_box[state[i]];
+        before[i] = state[i];
     }
     for (size_t i = 0u; i < BLOCK; i++) {
-        state[i] = before[(i + (COLUMN * (i % COLUMN))) % BLOCK];
+        state[i] = s_box[before[shifted_from[i]]];
     }
 }
 

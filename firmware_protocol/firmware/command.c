@@ -4,6 +4,8 @@
 #define LENGTH (8u)
 #define ZEROS_TO_ARM (5u)
 #define VALID_FOR_UNIT_US (2000u)
+#define LEFT_UNIT (1.0f / (float)DISCO_WHEEL_COMMAND_LEFT_SPEED_PER_UNIT)   /* rad/s */
+#define RIGHT_UNIT (1.0f / (float)DISCO_WHEEL_COMMAND_RIGHT_SPEED_PER_UNIT) /* rad/s */
 
 static bool asks_for_motion(const struct disco_robot_wheel_command_t *frame)
 {
@@ -57,8 +59,7 @@ void disco_command_receive(disco_firmware_t *core, const uint8_t *data, bool crc
     command->last_accepted_cycles_us = core->cycles_us;
     command->mode = frame.mode;
     command->counter = frame.counter;
-    command->target = (disco_wheels_t){(float)frame.left_speed * (float)DISCO_WHEEL_COMMAND_LEFT_SPEED_SCALE,
-                                       (float)frame.right_speed * (float)DISCO_WHEEL_COMMAND_RIGHT_SPEED_SCALE};
+    command->target = (disco_wheels_t){(float)frame.left_speed * LEFT_UNIT, (float)frame.right_speed * RIGHT_UNIT};
     command->accepted_count++;
     if (command->zero_count < ZEROS_TO_ARM) {
         command->zero_count++;

@@ -5,14 +5,22 @@
 #define DISQUALIFY_AT (5u)
 #define MAX_DELTA (3u)
 
+/* What four bits shifted out of the CRC-8 add to it. */
+static const uint8_t crc8_of_nibble[16] = {0x00u, 0x2Fu, 0x5Eu, 0x71u, 0xBCu, 0x93u, 0xE2u, 0xCDu,
+                                           0x57u, 0x78u, 0x09u, 0x26u, 0xEBu, 0xC4u, 0xB5u, 0x9Au};
+
+static uint8_t crc8_byte(uint8_t crc, uint8_t byte)
+{
+    const uint8_t with = crc ^ byte;
+    const uint8_t high = (uint8_t)(((uint32_t)with << 4) ^ crc8_of_nibble[with >> 4]);
+    return (uint8_t)(((uint32_t)high << 4) ^ crc8_of_nibble[high >> 4]);
+}
+
 uint8_t disco_crc8(const uint8_t *data, size_t length)
 {
     uint8_t crc = 0xFFu;
     for (size_t i = 0u; i < length; i++) {
-        crc ^= data[i];
-        for (uint8_t bit = 0u; bit < 8u; bit++) {
-            crc = (uint8_t)(((crc & 0x80u) != 0u) ? (((uint32_t)crc << 1) ^ 0x2Fu) : ((uint32_t)crc << 1));
-        }
+        crc = crc8_byte(crc, data[i]);
     }
     return (uint8_t)(crc ^ 0xFFu);
 }
@@ -31,13 +39,12 @@ uint16_t disco_crc16(const uint8_t *data, size_t length)
 
 uint8_t disco_e2e_crc(const uint8_t *frame, uint16_t data_id)
 {
-    uint8_t protected_bytes[9];
-    for (uint8_t i = 0u; i < 7u; i++) {
-        protected_bytes[i] = frame[i + 1u];
+    uint8_t crc = 0xFFu;
+    for (uint8_t i = 1u; i < 8u; i++) {
+        crc = crc8_byte(crc, frame[i]);
     }
-    protected_bytes[7] = (uint8_t)(data_id & 0xFFu);
-    protected_bytes[8] = (uint8_t)(data_id >> 8);
-    return disco_crc8(protected_bytes, sizeof(protected_bytes));
+    crc = crc8_byte(crc8_byte(crc, (uint8_t)(data_id & 0xFFu)), (uint8_t)(data_id >> 8));
+    return (uint8_t)(crc ^ 0xFFu);
 }
 
 uint16_t disco_challenge_answer(uint16_t challenge, uint8_t session, uint32_t dbc_hash)

@@ -20,7 +20,7 @@
 #include "wheel_limits.h"
 #include "transmit.h"
 
-enum { DISCO_REJECT_REASONS = 16, DISCO_PERIODIC = 7 };
+enum { DISCO_REJECT_REASONS = 16, DISCO_PERIODIC = 7, DISCO_INTRODUCTION = 4 };
 
 typedef struct {
     float left_setpoint;  /* rad/s, after all limits; 0 while the driver is off */
@@ -94,9 +94,24 @@ typedef struct {
     uint8_t shown_state;
     uint8_t shown_session;
     bool shown_accepted;
+    uint8_t next_part; /* of the introduction */
     bool limits_changed;
     bool introduced;
 } disco_telemetry_t;
+
+/* A measured pose in the units of its frames. */
+typedef struct {
+    int32_t x;             /* 0.1 mm */
+    int32_t y;             /* 0.1 mm */
+    int32_t yaw;           /* 0.1 mrad */
+    uint16_t position_std; /* mm */
+    uint16_t yaw_std;      /* mrad */
+    bool valid;
+} disco_pose_t;
+
+/* The same from metres and radians; not valid where a value is not finite or a deviation below zero. A float tells
+ * 0.1 mm apart up to 800 m: whoever knows a pose better makes the struct himself. */
+disco_pose_t disco_pose(float x, float y, float yaw, float position_std, float yaw_std);
 
 typedef struct {
     disco_config_t config;
@@ -122,6 +137,7 @@ typedef struct {
     uint32_t bus_off_events;
     uint32_t clock_errors;
     uint32_t unknown_frames;
+    uint32_t parameter_writes; /* by the host, accepted */
     uint8_t state;
     uint8_t estop_source;
     uint8_t stop_cause;
@@ -147,10 +163,8 @@ void disco_firmware_receive(disco_firmware_t *core, uint64_t now_us, uint32_t ca
 void disco_firmware_step(disco_firmware_t *core, uint64_t now_us, const disco_inputs_t *inputs,
                          disco_outputs_t *outputs);
 
-/* Queues one measured pose: metres, radians, the time when it was true, standard deviations. One that does not fit its
- * frames, a deviation of more than 0.255 m or rad among them, is sent as not valid. */
-void disco_firmware_pose(disco_firmware_t *core, double x, double y, double yaw, uint64_t sample_us,
-                         double position_std, double yaw_std);
+/* Queues one measured pose, true at `sample_us`; one that does not fit its frames is sent as not valid. */
+void disco_firmware_pose(disco_firmware_t *core, const disco_pose_t *pose, uint64_t sample_us);
 
 bool disco_firmware_pop(disco_firmware_t *core, disco_frame_t *frame);
 

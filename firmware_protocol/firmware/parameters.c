@@ -1,9 +1,14 @@
 #include <math.h>
+#include <string.h>
 
 #include "core.h"
 #include "disco_robot.h"
+#include "parameter_record.h"
 
 #define LENGTH (8u)
+#define RECORD_FORMAT (1u)
+#define RECORD_ENTRY (6u) /* key and value */
+#define RECORD_SEALED (DISCO_RECORD_LENGTH - 2u)
 
 typedef struct {
     uint16_t key;
@@ -12,7 +17,7 @@ typedef struct {
     float maximum;
 } parameter_t;
 
-/* Writes last until the next start. The limits that the host was told in the handshake need a new firmware. */
+/* Writes last until the next start, unless the board keeps them. The limits that the host was told in the handshake need a new firmware. */
 static const parameter_t parameters[] = {
     {DISCO_KEY_OVER_CURRENT, true, 0.5f, 200.0f},
     {DISCO_KEY_OVER_TEMPERATURE, true, 30.0f, 120.0f},
@@ -55,6 +60,12 @@ static bool disarmed(const disco_firmware_t *core)
            (core->state == DISCO_STATE_ESTOP && !core->drive.enabled);
 }
 
+/* Written so that what is not a number is not. */
+static bool in_range(const parameter_t *parameter, float value)
+{
+    return (value >= parameter->minimum) && (value <= parameter->maximum);
+}
+
 static uint8_t judge_write(const disco_firmware_t *core, const parameter_t *parameter, float value)
 {
     uint8_t status = DISCO_STATUS_OK;
@@ -62,7 +73,7 @@ static uint8_t judge_write(const disco_firmware_t *core, const parameter_t *para
         status = DISCO_STATUS_READ_ONLY;
     } else if (!isfinite(value)) {
         status = DISCO_STATUS_NOT_FINITE;
-    } else if ((value < parameter->minimum) || (value > parameter->maximum)) {
+    } else if (!in_range(parameter, value)) {
         status = DISCO_STATUS_OUT_OF_RANGE;
     } else if (!disarmed(core)) {
         status = DISCO_STATUS_REFUSED_ARMED;
@@ -98,6 +109,7 @@ void disco_parameter_request(disco_firmware_t *core, const uint8_t *data)
             status = judge_write(core, parameter, request.value);
             if (status == DISCO_STATUS_OK) {
                 *stored = request.value;
+                core->parameter_writes++;
                 core->telemetry.limits_changed = true;
             }
         } else {
@@ -106,4 +118,52 @@ void disco_parameter_request(disco_firmware_t *core, const uint8_t *data)
         value = *stored;
     }
     disco_telemetry_parameter(core, status, request.key, value);
+}
+
+void disco_record_pack(const disco_config_t *config, uint8_t *record)
+{
+    disco_config_t copy = *config;
+    uint8_t *entry = &record[1];
+    (void)memset(record, 0, DISCO_RECORD_LENGTH);
+    record[0] = RECORD_FORMAT;
+    for (size_t i = 0u; i < (sizeof(parameters) / sizeof(parameters[0])); i++) {
+        if (parameters[i].writable) {
+            uint32_t bits;
+            (void)memcpy(&bits, slot(&copy, parameters[i].key), sizeof(bits));
+            entry[0] = (uint8_t)(parameters[i].key & 0xFFu);
+            entry[1] = (uint8_t)(parameters[i].key >> 8);
+            for (uint8_t byte = 0u; byte < 4u; byte++) {
+                entry[2u + byte] = (uint8_t)(bits >> (8u * byte));
+            }
+            entry = &entry[RECORD_ENTRY];
+        }
+    }
+    const uint16_t crc = disco_crc16(record, RECORD_SEALED);
+    record[RECORD_SEALED] = (uint8_t)(crc & 0xFFu);
+    record[RECORD_SEALED + 1u] = (uint8_t)(crc >> 8);
+}
+
+bool disco_record_unpack(const uint8_t *record, disco_config_t *config)
+{
+    const uint16_t crc = (uint16_t)(record[RECORD_SEALED] | ((uint32_t)record[RECORD_SEALED + 1u] << 8));
+    disco_config_t taken = *config;
+    bool sound = (disco_crc16(record, RECORD_SEALED) == crc) && (record[0] == RECORD_FORMAT);
+    for (size_t at = 1u; sound && ((at + RECORD_ENTRY) <= RECORD_SEALED); at += RECORD_ENTRY) {
+        const uint16_t key = (uint16_t)(record[at] | ((uint32_t)record[at + 1u] << 8));
+        uint32_t bits = 0u;
+        float value;
+        for (uint8_t byte = 0u; byte < 4u; byte++) {
+            bits |= (uint32_t)record[at + 2u + byte] << (8u * byte);
+        }
+        (void)memcpy(&value, &bits, sizeof(value));
+        if (key != 0u) {
+            const parameter_t *parameter = find(key);
+            sound = (parameter != NULL) && parameter->writable && in_range(parameter, value);
+            *slot(&taken, key) = value;
+        }
+    }
+    if (sound) {
+        *config = taken;
+    }
+    return sound;
 }

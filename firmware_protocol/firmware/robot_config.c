@@ -2,6 +2,45 @@
 
 #include <stddef.h>
 
+#include "protocol_constants.h"
+
+disco_config_t disco_config_default(uint16_t ticks_per_rev, float max_wheel_speed)
+{
+    return (disco_config_t){
+        .protocol_major = DISCO_PROTOCOL_MAJOR,
+        .capabilities = DISCO_CAPABILITIES_POSE | DISCO_CAPABILITIES_MOTOR_CURRENT |
+                        DISCO_CAPABILITIES_MOTOR_TEMPERATURE | DISCO_CAPABILITIES_POWER | DISCO_CAPABILITIES_BRAKE |
+                        DISCO_CAPABILITIES_ESTOP_BUTTON,
+        .firmware_version = {0u, 1u, 0u},
+        .board_id = 1u,
+        .dbc_hash = DISCO_DBC_HASH,
+        .ticks_per_rev = ticks_per_rev,
+        .max_wheel_speed = max_wheel_speed,
+        .max_wheel_acceleration = 20.0f,
+        .stop_deceleration = 20.0f,
+        .still_speed = 0.05f,
+        .cycle_us = 1000u,
+        .command_timeout_us = 100000u,
+        .drive_off_timeout_us = 500000u,
+        .stop_timeout_us = 1000000u,
+        .host_state_timeout_us = 500000u,
+        .host_forget_timeout_us = 5000000u,
+        .reset_quiet_us = 500000u,
+        .under_voltage = 20.0f,
+        .over_voltage = 30.0f,
+        .over_current = 30.0f,
+        .over_temperature = 80.0f,
+        .stall_current = 15.0f,
+        .encoder_check_current = 0.5f,
+        .encoder_check_speed = 1.0f,
+        .voltage_debounce_us = 200000u,
+        .current_debounce_us = 100000u,
+        .temperature_debounce_us = 1000000u,
+        .encoder_debounce_us = 300000u,
+        .fault_hold_us = 500000u,
+    };
+}
+
 typedef struct {
     float value;
     float minimum;

@@ -43,6 +43,9 @@ typedef struct {
     uint8_t key[16];
 } disco_config_t;
 
+/* The configuration of a robot of which no more is known than this; rad/s. Python's `FirmwareConfig` takes it from here. */
+disco_config_t disco_config_default(uint16_t ticks_per_rev, float max_wheel_speed);
+
 /* Whether every value is finite and within its bounds. */
 bool disco_config_valid(const disco_config_t *config);
 

@@ -1,4 +1,5 @@
 #include <math.h>
+#include <string.h>
 
 #include "core.h"
 #include "disco_robot.h"
@@ -9,6 +10,19 @@
 #define TIME_MASK (UINT64_C(0xFFFFFFFFFF))
 /* However often a host asks, the answer to HELLO_REQUEST leaves room for everything else. */
 #define HELLO_SPACING_US (20000u)
+/* A float is (fraction + implicit bit) * 2^(exponent - INTEGER_EXPONENT); from that exponent on, all are out of range. */
+#define FRACTION_BITS (23u)
+#define FRACTION_MASK (0x007FFFFFu)
+#define IMPLICIT_BIT (0x00800000u)
+#define EXPONENT_MASK (0xFFu)
+#define INTEGER_EXPONENT (150u)
+/* 24 bits by 10000 are 38: further down, nothing is left of them. */
+#define SMALLEST_SHIFT (39u)
+#define HIGH_TIME_MASK (0xFFu)
+#define FIRST_LIMITS (2u)
+#define LARGEST_POSITION (0x7FFFFF)
+#define BEYOND_POSITION (0x800000)
+#define BEYOND_YAW (0x8000)
 
 /* One transmit counter each. */
 enum {
@@ -39,41 +53,63 @@ enum {
                             DISCO_##NAME##_DATA_ID((core)->config.protocol_major));                        \
     } while (false)
 
-/* The raw value nearest to a physical one, within the signal's range; 0 for what is not a number. */
-static int32_t raw(double value, double scale, int32_t minimum, int32_t maximum)
+/* The raw value nearest to a physical one, within the signal's range; 0 for what is not a number. Exact, in integers: a
+ * float has too few bits for it, and a double costs a controller hundreds of instructions. */
+static int32_t raw(float value, uint32_t per_unit, int32_t minimum, int32_t maximum)
 {
-    const double rounded = floor((value / scale) + 0.5);
-    int32_t result = 0;
-    if (rounded <= (double)minimum) {
-        result = minimum;
-    } else if (rounded >= (double)maximum) {
-        result = maximum;
-    } else if (!isnan(rounded)) {
-        result = (int32_t)rounded;
+    uint32_t bits;
+    (void)memcpy(&bits, &value, sizeof(bits));
+    const bool negative = (bits >> 31) != 0u;
+    const uint32_t exponent = (bits >> FRACTION_BITS) & EXPONENT_MASK;
+    const uint32_t shift = INTEGER_EXPONENT - exponent;
+    int32_t result;
+    if (isnan(value)) {
+        result = 0;
+    } else if (exponent >= INTEGER_EXPONENT) {
+        result = negative ? minimum : maximum;
+    } else if (shift > SMALLEST_SHIFT) {
+        result = 0;
     } else {
-        /* not a number */
+        /* Halves go up, so that those of negative values go towards zero. */
+        const uint64_t half = UINT64_C(1) << (shift - 1u);
+        const uint64_t magnitude = (uint64_t)((bits & FRACTION_MASK) | IMPLICIT_BIT) * per_unit;
+        const uint64_t rounded = ((magnitude + half) - (negative ? 1u : 0u)) >> shift;
+        const uint32_t bound = (uint32_t)(negative ? -minimum : maximum);
+        const int32_t limited = (int32_t)((rounded < bound) ? (uint32_t)rounded : bound);
+        result = negative ? -limited : limited;
     }
     return result;
 }
 
-static int16_t raw_i16(double value, double scale)
+static int16_t raw_i16(float value, uint32_t per_unit)
 {
-    return (int16_t)raw(value, scale, INT16_MIN, INT16_MAX);
+    return (int16_t)raw(value, per_unit, INT16_MIN, INT16_MAX);
 }
 
-static uint16_t raw_u16(double value, double scale)
+static uint16_t raw_u16(float value, uint32_t per_unit)
 {
-    return (uint16_t)raw(value, scale, 0, UINT16_MAX);
+    return (uint16_t)raw(value, per_unit, 0, UINT16_MAX);
 }
 
-static int8_t raw_i8(double value)
+static int8_t raw_i8(float value)
 {
-    return (int8_t)raw(value, 1.0, INT8_MIN, INT8_MAX);
+    return (int8_t)raw(value, 1u, INT8_MIN, INT8_MAX);
 }
 
-static uint8_t raw_u8(double value, double scale)
+static uint16_t milliseconds(uint32_t us)
 {
-    return (uint8_t)raw(value, scale, 0, UINT8_MAX);
+    const uint32_t rounded = (us + (US_PER_MS / 2u)) / US_PER_MS;
+    return (uint16_t)((rounded < UINT16_MAX) ? rounded : UINT16_MAX);
+}
+
+/* The low bits of a time in larger units, as if the clock that is divided had 40 bits; in divisions of 32. */
+static uint16_t time_in(uint64_t now_us, uint32_t unit_us)
+{
+    const uint32_t high = (uint32_t)(now_us >> 32) & HIGH_TIME_MASK;
+    const uint32_t low = (uint32_t)now_us;
+    const uint32_t units = UINT32_MAX / unit_us; /* in 2^32, which no unit divides */
+    const uint32_t rest = 0u - (units * unit_us);
+    return (uint16_t)((high * units) + (low / unit_us) + (((high * rest) + (low % unit_us)) / unit_us));
 }
 
 static uint8_t saturated(uint16_t count)
@@ -89,9 +125,9 @@ static void send_wheels(disco_firmware_t *core)
         .right_valid = (uint8_t)(in->encoder_valid[1] && isfinite(in->wheel_speed[1])),
         .driver_enabled = core->drive.enabled,
         .limited = core->drive.limited,
-        .left_speed = raw_i16(in->wheel_speed[0], DISCO_WHEEL_SPEED_LEFT_SPEED_SCALE),
-        .right_speed = raw_i16(in->wheel_speed[1], DISCO_WHEEL_SPEED_RIGHT_SPEED_SCALE),
-        .sample_time = (uint16_t)((core->now_us & TIME_MASK) / (uint64_t)DISCO_WHEEL_SPEED_SAMPLE_TIME_SCALE),
+        .left_speed = raw_i16(in->wheel_speed[0], DISCO_WHEEL_SPEED_LEFT_SPEED_PER_UNIT),
+        .right_speed = raw_i16(in->wheel_speed[1], DISCO_WHEEL_SPEED_RIGHT_SPEED_PER_UNIT),
+        .sample_time = time_in(core->now_us, DISCO_WHEEL_SPEED_SAMPLE_TIME_SCALE),
     };
     struct disco_robot_wheel_ticks_t ticks = {
         .left_ticks = in->ticks[0] & TICKS_MASK,
@@ -105,8 +141,8 @@ static void send_motor(disco_firmware_t *core)
 {
     const disco_inputs_t *in = &core->inputs;
     struct disco_robot_motor_t motor = {
-        .left_current = raw_i16(in->current[0], DISCO_MOTOR_LEFT_CURRENT_SCALE),
-        .right_current = raw_i16(in->current[1], DISCO_MOTOR_RIGHT_CURRENT_SCALE),
+        .left_current = raw_i16(in->current[0], DISCO_MOTOR_LEFT_CURRENT_PER_UNIT),
+        .right_current = raw_i16(in->current[1], DISCO_MOTOR_RIGHT_CURRENT_PER_UNIT),
         .left_temperature = raw_i8(in->temperature[0]),
         .right_temperature = raw_i8(in->temperature[1]),
     };
@@ -157,8 +193,8 @@ static void send_power(disco_firmware_t *core)
 {
     const disco_inputs_t *in = &core->inputs;
     struct disco_robot_power_t power = {
-        .voltage = raw_u16(in->voltage, DISCO_POWER_VOLTAGE_SCALE),
-        .current = raw_i16(in->battery_current, DISCO_POWER_CURRENT_SCALE),
+        .voltage = raw_u16(in->voltage, DISCO_POWER_VOLTAGE_PER_UNIT),
+        .current = raw_i16(in->battery_current, DISCO_POWER_CURRENT_PER_UNIT),
         .temperature = raw_i8(in->battery_temperature),
     };
     SEND(core, POWER, power, power);
@@ -177,23 +213,28 @@ static void send_link_health(disco_firmware_t *core)
     SEND(core, LINK_HEALTH, link_health, health);
 }
 
-static void send_limits(disco_firmware_t *core)
+static void send_first_limits(disco_firmware_t *core)
 {
     const disco_config_t *config = &core->config;
-    struct disco_robot_limits_t first = {
+    struct disco_robot_limits_t limits = {
         .page = 0u,
-        .max_wheel_speed = raw_u16(config->max_wheel_speed, DISCO_LIMITS_MAX_WHEEL_SPEED_SCALE),
-        .max_wheel_acceleration = raw_u16(config->max_wheel_acceleration, DISCO_LIMITS_MAX_WHEEL_ACCELERATION_SCALE),
+        .max_wheel_speed = raw_u16(config->max_wheel_speed, DISCO_LIMITS_MAX_WHEEL_SPEED_PER_UNIT),
+        .max_wheel_acceleration = raw_u16(config->max_wheel_acceleration, DISCO_LIMITS_MAX_WHEEL_ACCELERATION_PER_UNIT),
         .ticks_per_rev = config->ticks_per_rev,
     };
-    struct disco_robot_limits_t second = {
+    SEND(core, LIMITS, limits, limits);
+}
+
+static void send_second_limits(disco_firmware_t *core)
+{
+    const disco_config_t *config = &core->config;
+    struct disco_robot_limits_t limits = {
         .page = 1u,
-        .command_timeout = raw_u16(config->command_timeout_us * 1.0e-6, DISCO_LIMITS_COMMAND_TIMEOUT_SCALE),
-        .drive_off_timeout = raw_u16(config->drive_off_timeout_us * 1.0e-6, DISCO_LIMITS_DRIVE_OFF_TIMEOUT_SCALE),
-        .stop_deceleration = raw_u16(config->stop_deceleration, DISCO_LIMITS_STOP_DECELERATION_SCALE),
+        .command_timeout = milliseconds(config->command_timeout_us),
+        .drive_off_timeout = milliseconds(config->drive_off_timeout_us),
+        .stop_deceleration = raw_u16(config->stop_deceleration, DISCO_LIMITS_STOP_DECELERATION_PER_UNIT),
     };
-    SEND(core, LIMITS, limits, first);
-    SEND(core, LIMITS, limits, second);
+    SEND(core, LIMITS, limits, limits);
 }
 
 static void send_hello(disco_firmware_t *core)
@@ -207,10 +248,13 @@ static void send_hello(disco_firmware_t *core)
         .firmware_patch = config->firmware_version[2],
         .capabilities = (uint8_t)(config->capabilities | (config->authenticated ? DISCO_CAPABILITIES_AUTHENTICATION : 0u)),
     };
-    struct disco_robot_build_t build = {.dbc_hash = config->dbc_hash, .board_id = config->board_id};
     SEND(core, HELLO, hello, hello);
+}
+
+static void send_build(disco_firmware_t *core)
+{
+    struct disco_robot_build_t build = {.dbc_hash = core->config.dbc_hash, .board_id = core->config.board_id};
     SEND(core, BUILD, build, build);
-    send_limits(core);
 }
 
 void disco_telemetry_time(disco_firmware_t *core, uint8_t sequence)
@@ -225,30 +269,43 @@ void disco_telemetry_parameter(disco_firmware_t *core, uint8_t status, uint16_t 
     SEND(core, PARAM_RESPONSE, param_response, response);
 }
 
-void disco_firmware_pose(disco_firmware_t *core, double x, double y, double yaw, uint64_t sample_us,
-                         double position_std, double yaw_std)
+disco_pose_t disco_pose(float x, float y, float yaw, float position_std, float yaw_std)
+{
+    const bool known = isfinite(x) && isfinite(y) && isfinite(yaw) && (position_std >= 0.0f) && (yaw_std >= 0.0f);
+    return (disco_pose_t){
+        .valid = known,
+        .x = raw(x, DISCO_POSE_POSITION_X_PER_UNIT, -BEYOND_POSITION, BEYOND_POSITION),
+        .y = raw(y, DISCO_POSE_POSITION_Y_PER_UNIT, -BEYOND_POSITION, BEYOND_POSITION),
+        .yaw = raw(yaw, DISCO_POSE_HEADING_YAW_PER_UNIT, -BEYOND_YAW, BEYOND_YAW),
+        .position_std = raw_u16(position_std, DISCO_POSE_HEADING_POSITION_STD_PER_UNIT),
+        .yaw_std = raw_u16(yaw_std, DISCO_POSE_HEADING_YAW_STD_PER_UNIT),
+    };
+}
+
+static int32_t within(int32_t value, int32_t minimum, int32_t maximum)
+{
+    const int32_t not_above = (value < maximum) ? value : maximum;
+    return (not_above > minimum) ? not_above : minimum;
+}
+
+void disco_firmware_pose(disco_firmware_t *core, const disco_pose_t *pose, uint64_t sample_us)
 {
     const uint64_t own_us = sample_us + (core->now_us - core->clock_us);
-    const double largest_x = DISCO_POSE_POSITION_X_SCALE * 0x7FFFFF;
-    const double largest_yaw = DISCO_POSE_HEADING_YAW_SCALE * INT16_MAX;
-    const double largest_position_std = DISCO_POSE_HEADING_POSITION_STD_SCALE * UINT8_MAX;
-    const double largest_yaw_std = DISCO_POSE_HEADING_YAW_STD_SCALE * UINT8_MAX;
-    /* Written so that what is not a number is not valid. A deviation that is cut off would have the host trust a pose
-     * more than its sensor does. */
-    const bool valid = (fabs(x) <= largest_x) && (fabs(y) <= largest_x) && (fabs(yaw) <= largest_yaw) &&
-                       (position_std >= 0.0) && (yaw_std >= 0.0) && (position_std <= largest_position_std) &&
-                       (yaw_std <= largest_yaw_std);
-    struct disco_robot_pose_position_t position = {
-        .valid = valid,
-        .x = raw(x, DISCO_POSE_POSITION_X_SCALE, -0x800000, 0x7FFFFF),
-        .y = raw(y, DISCO_POSE_POSITION_Y_SCALE, -0x800000, 0x7FFFFF),
-    };
+    const int32_t x = within(pose->x, -BEYOND_POSITION, LARGEST_POSITION);
+    const int32_t y = within(pose->y, -BEYOND_POSITION, LARGEST_POSITION);
+    const int32_t yaw = within(pose->yaw, INT16_MIN, INT16_MAX);
+    /* The least of a signed range has no positive counterpart. A deviation that is cut off would have the host trust a
+     * pose more than its sensor does. */
+    const bool valid = pose->valid && (x == pose->x) && (x != -BEYOND_POSITION) && (y == pose->y) &&
+                       (y != -BEYOND_POSITION) && (yaw == pose->yaw) && (yaw != INT16_MIN) &&
+                       (pose->position_std <= UINT8_MAX) && (pose->yaw_std <= UINT8_MAX);
+    struct disco_robot_pose_position_t position = {.valid = valid, .x = x, .y = y};
     struct disco_robot_pose_heading_t heading = {
         .valid = valid,
-        .yaw = raw_i16(yaw, DISCO_POSE_HEADING_YAW_SCALE),
-        .sample_time = (uint16_t)((own_us & TIME_MASK) / (uint64_t)DISCO_POSE_HEADING_SAMPLE_TIME_SCALE),
-        .position_std = raw_u8(position_std, DISCO_POSE_HEADING_POSITION_STD_SCALE),
-        .yaw_std = raw_u8(yaw_std, DISCO_POSE_HEADING_YAW_STD_SCALE),
+        .yaw = (int16_t)yaw,
+        .sample_time = time_in(own_us, DISCO_POSE_HEADING_SAMPLE_TIME_SCALE),
+        .position_std = saturated(pose->position_std),
+        .yaw_std = saturated(pose->yaw_std),
     };
     SEND(core, POSE_POSITION, pose_position, position);
     SEND(core, POSE_HEADING, pose_heading, heading);
@@ -269,11 +326,15 @@ static const periodic_t periodic[DISCO_PERIODIC] = {
     {send_link_health, DISCO_ROBOT_LINK_HEALTH_CYCLE_TIME_MS * US_PER_MS},
 };
 
+/* Whatever is due together goes out one a cycle, so that no cycle takes much longer than the others; but the wheels',
+ * which come first, in theirs. */
 static void send_periodic(disco_firmware_t *core)
 {
-    for (uint8_t i = 0u; i < (uint8_t)DISCO_PERIODIC; i++) {
+    uint8_t most = 2u;
+    for (uint8_t i = 0u; (i < (uint8_t)DISCO_PERIODIC) && (most > 0u); i++) {
         uint64_t *due_us = &core->telemetry.due_us[i];
         if (core->now_us >= *due_us) {
+            most--;
             periodic[i].send(core);
             *due_us += periodic[i].period_us;
             if (*due_us <= core->now_us) {
@@ -305,6 +366,10 @@ static void send_changes(disco_firmware_t *core)
     shown->shown_accepted = core->host.accepted;
 }
 
+static void (*const introduction[DISCO_INTRODUCTION])(disco_firmware_t *core) = {send_hello, send_build,
+                                                                                 send_first_limits, send_second_limits};
+
+/* One part a cycle. */
 static void introduce(disco_firmware_t *core)
 {
     disco_telemetry_t *telemetry = &core->telemetry;
@@ -320,18 +385,26 @@ static void introduce(disco_firmware_t *core)
         }
         core->host.hello_requested = false;
         telemetry->limits_changed = false;
-        send_hello(core);
+        telemetry->next_part = 0u;
     } else if (telemetry->limits_changed) {
         telemetry->limits_changed = false;
-        send_limits(core);
+        telemetry->next_part = (telemetry->next_part < FIRST_LIMITS) ? telemetry->next_part : FIRST_LIMITS;
     } else {
         /* nothing new */
+    }
+    if (telemetry->next_part < (uint8_t)DISCO_INTRODUCTION) {
+        introduction[telemetry->next_part](core);
+        telemetry->next_part++;
     }
 }
 
 void disco_telemetry_step(disco_firmware_t *core)
 {
+    const uint8_t queued = core->transmit.count;
     introduce(core);
     send_changes(core);
     send_periodic(core);
+    if (core->transmit.count == queued) {
+        disco_authentication_prepare(&core->authentication);
+    }
 }

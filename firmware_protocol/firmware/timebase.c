@@ -4,7 +4,7 @@
 /* How far the clock and the count of cycles may come apart, of which a tenth of a cycle is forgotten in each cycle. */
 #define TOLERANCE_US (20000)
 #define MOST_APART_US (2 * TOLERANCE_US)
-#define FORGOTTEN_PART (10)
+#define FORGOTTEN_PART (10u)
 
 static int64_t limited(int64_t value, int64_t limit)
 {
@@ -17,7 +17,8 @@ static void compare(disco_firmware_t *core, uint64_t clock_us)
     const int64_t cycle_us = (int64_t)core->config.cycle_us;
     const int64_t by_clock_us = limited((int64_t)(clock_us - core->cycle_clock_us), MOST_APART_US);
     const int64_t ahead_us = core->clock_ahead_us + by_clock_us - cycle_us;
-    core->clock_ahead_us = limited(ahead_us - limited(ahead_us, cycle_us / FORGOTTEN_PART), MOST_APART_US);
+    const int64_t forgotten_us = limited(ahead_us, (int64_t)(core->config.cycle_us / FORGOTTEN_PART));
+    core->clock_ahead_us = limited(ahead_us - forgotten_us, MOST_APART_US);
     core->clock_mismatch = limited(core->clock_ahead_us, TOLERANCE_US) != core->clock_ahead_us;
 }
 

@@ -5,6 +5,7 @@ import dataclasses
 import msgspec
 import pytest
 
+from firmware_protocol import _firmware
 from firmware_protocol.firmware_core import FirmwareConfig, FirmwareCore, FirmwareInputs, FirmwareOutputs, ResetCause
 from tests.firmware_protocol.bench import CODEC, CONFIG, FAULTS, Bench
 
@@ -88,8 +89,31 @@ def test_drain_gives_what_was_queued_once():
     core = FirmwareCore(CONFIG)
     core.step(1000, STILL)
     frames = core.drain()
-    assert [CODEC.decode(*frame).name for frame in frames[:4]] == ["HELLO", "BUILD", "LIMITS", "LIMITS"]
+    assert [CODEC.decode(*frame).name for frame in frames[:3]] == ["HELLO", "SYSTEM_STATE", "SESSION_STATE"]
     assert core.drain() == []
+
+
+def test_defaults_are_those_of_the_controller_in_decimal_digits():
+    config = FirmwareConfig(ticks_per_rev=2048, max_wheel_speed_rad_s=8.0)
+    assert dataclasses.asdict(config) == {
+        "ticks_per_rev": 2048, "max_wheel_speed_rad_s": 8.0, "max_wheel_acceleration_rad_s2": 20.0,
+        "stop_deceleration_rad_s2": 20.0, "still_speed_rad_s": 0.05, "cycle_s": 0.001, "command_timeout_s": 0.1,
+        "drive_off_timeout_s": 0.5, "stop_timeout_s": 1.0, "host_state_timeout_s": 0.5, "host_forget_timeout_s": 5.0,
+        "reset_quiet_s": 0.5, "under_voltage_v": 20.0, "over_voltage_v": 30.0, "over_current_a": 30.0,
+        "over_temperature_c": 80.0, "stall_current_a": 15.0, "encoder_check_current_a": 0.5,
+        "encoder_check_speed_rad_s": 1.0, "voltage_debounce_s": 0.2, "current_debounce_s": 0.1,
+        "temperature_debounce_s": 1.0, "encoder_debounce_s": 0.3, "fault_hold_s": 0.5, "board_id": 1,
+        "firmware_version": (0, 1, 0), "capabilities": 63, "dbc_hash": CODEC.dbc_hash, "protocol_major": 1, "key": b"",
+    }  # fmt: skip
+
+
+def test_a_core_made_with_the_defaults_has_the_very_configuration_of_c():
+    core = FirmwareCore(FirmwareConfig(ticks_per_rev=2048, max_wheel_speed_rad_s=8.0))
+    default = _firmware.lib.disco_config_default(2048, 8.0)
+    for name, _ in _firmware.ffi.typeof("disco_config_t").fields:
+        ours, theirs = getattr(core._core.config, name), getattr(default, name)
+        arrays = name in ("firmware_version", "key")
+        assert (list(ours) == list(theirs)) if arrays else (ours == theirs), name
 
 
 def test_counters_are_there_by_name():

@@ -1,3 +1,5 @@
+"""Serial framing, the host's in Python and the controller's in C: one behaviour, tested on both."""
+
 import random
 
 import pytest
@@ -5,27 +7,46 @@ from cobs import cobs
 from hypothesis import given
 from hypothesis import strategies as st
 
-from firmware_protocol.serial_framing import MAX_FRAME, FrameDecoder, crc16, encode_frame
+from firmware_protocol import _firmware, serial_framing
+from firmware_protocol.serial_framing import MAX_FRAME, crc16
+from tests.firmware_protocol import c_framing
 
 FRAMES = [(0x010, bytes.fromhex("0201020300")), (0x080, b""), (0x100, bytes(8)), (0x7FF, b"\xff" * 8), (0, b"\0")]
 
 
-def decode(*pieces):
-    decoder = FrameDecoder()
-    return [frame for piece in pieces for frame in decoder.feed(piece)], decoder.stats
+BOTH = [serial_framing, c_framing]
+
+
+@pytest.fixture(params=BOTH, ids=["python", "c"])
+def framing(request):
+    return request.param
+
+
+@pytest.fixture
+def decode(framing):
+    def decoded(*pieces):
+        decoder = framing.FrameDecoder()
+        return [frame for piece in pieces for frame in decoder.feed(piece)], decoder.stats
+
+    return decoded
+
+
+@pytest.fixture
+def encode_frame(framing):
+    return framing.encode_frame
 
 
 def raw_frame(body):
     return cobs.encode(body + crc16(body).to_bytes(2, "little")) + b"\0"
 
 
-def test_check_value_and_vector():
-    assert crc16(b"123456789") == 0x29B1
+def test_check_value_and_vector(encode_frame):
+    assert crc16(b"123456789") == _firmware.lib.disco_crc16(b"123456789", 9) == 0x29B1
     assert encode_frame(*FRAMES[0]) == bytes.fromhex("030110050201020303924800")
 
 
 @pytest.mark.parametrize(("can_id", "data"), FRAMES)
-def test_every_split_point(can_id, data):
+def test_every_split_point(decode, encode_frame, can_id, data):
     line = encode_frame(can_id, data) * 2
     for cut in range(len(line) + 1):
         for second in range(cut, len(line) + 1):
@@ -34,7 +55,7 @@ def test_every_split_point(can_id, data):
             assert (stats.frames, stats.malformed, stats.bytes) == (2, 0, len(line))
 
 
-def test_byte_by_byte():
+def test_byte_by_byte(decode, encode_frame):
     line = b"".join(encode_frame(*frame) for frame in FRAMES)
     frames, stats = decode(*(line[i : i + 1] for i in range(len(line))))
     assert frames == FRAMES
@@ -42,7 +63,7 @@ def test_byte_by_byte():
 
 
 @pytest.mark.parametrize(("can_id", "data"), FRAMES)
-def test_every_single_byte_corruption_is_found_and_costs_no_later_frame(can_id, data):
+def test_every_single_byte_corruption_is_found_and_costs_no_later_frame(decode, encode_frame, can_id, data):
     good = encode_frame(can_id, data)
     for position in range(len(good)):
         for value in range(256):
@@ -56,7 +77,7 @@ def test_every_single_byte_corruption_is_found_and_costs_no_later_frame(can_id, 
             assert stats.malformed >= 1
 
 
-def test_every_lost_byte_is_found_and_costs_at_most_the_next_frame():
+def test_every_lost_byte_is_found_and_costs_at_most_the_next_frame(decode, encode_frame):
     good = encode_frame(0x110, bytes.fromhex("8D306902B4FB2C01"))
     for position in range(len(good)):
         frames, _ = decode(good[:position] + good[position + 1 :], good, good)
@@ -65,42 +86,81 @@ def test_every_lost_byte_is_found_and_costs_at_most_the_next_frame():
 
 @given(st.lists(st.tuples(st.integers(0, 0x7FF), st.binary(max_size=8))), st.integers(0, 2**32))
 def test_round_trip_in_pieces_of_any_size(frames, seed):
-    generator = random.Random(seed)
-    line = b"".join(encode_frame(*frame) for frame in frames)
-    decoder, received = FrameDecoder(), []
-    while line:
-        size = generator.randint(1, 20)
-        received += decoder.feed(line[:size])
-        line = line[size:]
-    assert received == frames
+    for sender in BOTH:
+        for receiver in BOTH:
+            generator = random.Random(seed)
+            line = b"".join(sender.encode_frame(*frame) for frame in frames)
+            decoder, received = receiver.FrameDecoder(), []
+            while line:
+                size = generator.randint(1, 20)
+                received += decoder.feed(line[:size])
+                line = line[size:]
+            assert received == frames
+
+
+@given(st.integers(0, 0x7FF), st.binary(max_size=8))
+def test_both_write_the_same_bytes(can_id, data):
+    assert c_framing.encode_frame(can_id, data) == serial_framing.encode_frame(can_id, data)
+
+
+LINES = (
+    st.binary(max_size=100)
+    | st.lists(st.integers(0, 3), max_size=100).map(bytes)
+    | st.binary(max_size=12).map(raw_frame)
+)
+
+
+@given(st.lists(LINES))
+def test_both_make_the_same_of_anything(pieces):
+    """Pieces end where the line has a zero or the reader an end: of garbage, of little codes, and well sealed."""
+    outcomes = []
+    for framing in BOTH:
+        decoder = framing.FrameDecoder()
+        frames = [decoder.feed(piece) for piece in [*pieces, b"\0"]]
+        stats = decoder.stats
+        counted = ("frames", "stuffing_errors", "crc_errors", "length_errors", "unknown_kind", "bytes")
+        outcomes.append((frames, *(getattr(stats, name) for name in counted)))
+    assert outcomes[0] == outcomes[1]
+
+
+@pytest.mark.parametrize("length", [61, 62, 63, 64, 65, 66])
+def test_both_drop_what_is_too_long_from_the_same_length_on(length):
+    body = b"\1\x10\0" + b"a" * length
+    counted = []
+    for framing in BOTH:
+        decoder = framing.FrameDecoder()
+        decoder.feed(cobs.encode(body)[:length] + b"\0")
+        counted.append((decoder.stats.length_errors, decoder.stats.stuffing_errors))
+    assert counted[0] == counted[1] == ((0, 1) if length < MAX_FRAME else (1, 0))
 
 
 @given(st.lists(st.binary(max_size=200)))
 def test_garbage_gives_no_frame_and_no_exception_and_after_a_delimiter_all_is_well(pieces):
-    decoder = FrameDecoder()
-    for piece in pieces:
-        assert decoder.feed(piece) == []
-    decoder.feed(b"\0")
-    assert decoder.feed(encode_frame(0x100, b"\1\2")) == [(0x100, b"\1\2")]
+    for framing in BOTH:
+        decoder = framing.FrameDecoder()
+        for piece in pieces:
+            assert decoder.feed(piece) == []
+        decoder.feed(b"\0")
+        assert decoder.feed(framing.encode_frame(0x100, b"\1\2")) == [(0x100, b"\1\2")]
 
 
-def test_garbage_between_frames_is_counted():
+def test_garbage_between_frames_is_counted(decode, encode_frame):
     good = encode_frame(0x100, b"\1\2")
     frames, stats = decode(good, b"\x11garbage\0", good)
     assert len(frames) == 2
     assert stats.stuffing_errors == 1
 
 
-def test_an_endless_frame_is_dropped_and_takes_no_memory():
-    decoder = FrameDecoder()
+def test_an_endless_frame_is_dropped_and_takes_no_memory(framing):
+    decoder = framing.FrameDecoder()
     for _ in range(1000):
         decoder.feed(b"\x01" * 100)
         assert len(decoder._pending) < MAX_FRAME
-    assert decoder.feed(b"\0" + encode_frame(1, b"")) == [(1, b"")]
+    assert decoder.feed(b"\0" + framing.encode_frame(1, b"")) == [(1, b"")]
     assert decoder.stats.length_errors == 1
 
 
-def test_longest_frame_has_a_place():
+def test_longest_frame_has_a_place(encode_frame):
     assert len(encode_frame(0x7FF, b"\xff" * 8)) <= MAX_FRAME
 
 
@@ -115,24 +175,24 @@ def test_longest_frame_has_a_place():
     ],
     ids=["kind", "29-bit id", "9 bytes", "no header", "too long"],
 )
-def test_well_sealed_nonsense_is_counted(body, counter):
+def test_well_sealed_nonsense_is_counted(decode, body, counter):
     frames, stats = decode(raw_frame(body))
     assert frames == []
     assert stats.malformed == getattr(stats, counter) == 1
 
 
-def test_wrong_crc_is_counted():
+def test_wrong_crc_is_counted(decode):
     frames, stats = decode(cobs.encode(b"\1\x10\0abc\0\0") + b"\0")
     assert (frames, stats.crc_errors, stats.malformed) == ([], 1, 1)
 
 
-def test_delimiters_alone_are_silence():
+def test_delimiters_alone_are_silence(decode):
     frames, stats = decode(b"\0" * 100)
     assert (frames, stats.malformed, stats.bytes) == ([], 0, 100)
 
 
 def test_what_is_no_can_frame_is_not_encoded():
     with pytest.raises(ValueError, match="0x800"):
-        encode_frame(0x800, b"")
+        serial_framing.encode_frame(0x800, b"")
     with pytest.raises(ValueError, match="9 bytes"):
-        encode_frame(0x100, bytes(9))
+        serial_framing.encode_frame(0x100, bytes(9))

@@ -1,12 +1,17 @@
 """The core in authenticated mode: who has not the key stops the robot and does nothing else."""
 
+import struct
 from dataclasses import replace
 
 import pytest
+from cryptography.hazmat.primitives.ciphers import algorithms
+from cryptography.hazmat.primitives.cmac import CMAC
 
+from firmware_protocol import _firmware
 from firmware_protocol.authentication import Prover
 from tests.firmware_protocol.bench import CODEC, CONFIG, Bench
 
+lib, ffi = _firmware.lib, _firmware.ffi
 KEY = bytes(range(16))
 LOCKED = replace(CONFIG, key=KEY)
 AUTHENTICATION = 64
@@ -250,3 +255,44 @@ def test_damaged_commands_still_count_against_the_sender():
         bench.core.receive(bench.now_us, 0x100, bytes(damaged))
     assert bench.step().stop_cause == "E2E_DISQUALIFIED"
     assert (refused(bench), bench.core.rejections["CRC"]) == (0, 5)
+
+
+def test_the_nonces_are_the_draws_in_their_order_however_they_are_prepared():
+    """The nonce after this one is drawn in a cycle with nothing to send, or at once where there was none."""
+    entropy = 12345
+    a = ffi.new("disco_authentication_t *")
+    lib.disco_authentication_init(a, True, KEY, entropy)
+    nonces = [bytes(a.nonce)]
+    for prepares in (0, 1, 2, 0, 0, 3):
+        for _ in range(prepares):
+            lib.disco_authentication_prepare(a)
+        lib.disco_authentication_renew(a)
+        assert not a.nonce_shown
+        nonces.append(bytes(a.nonce))
+    cipher = [CMAC(algorithms.AES(KEY)) for _ in nonces]
+    for draw, one in enumerate(cipher, start=1):
+        one.update(struct.pack("<QQ", entropy, draw))
+    assert nonces == [one.finalize()[:6] for one in cipher]
+
+
+def test_the_next_nonce_is_drawn_in_a_cycle_with_nothing_to_send():
+    bench = Bench(LOCKED)
+    a = bench.core._core.authentication
+    bench.to_ready()
+    draws = a.draws
+    bench.ask("STANDBY")
+    bench.run_until("STANDBY")
+    sending = bench.messages("MAC_CHALLENGE", bench.now_us)
+    assert sending
+    assert (a.prepared, a.draws) == (False, draws)
+    bench.run(2)
+    assert (a.prepared, a.draws) == (True, draws + 1)
+    bench.run(50)
+    assert a.draws == draws + 1
+
+
+def test_without_a_key_no_nonce_is_ever_drawn():
+    bench = Bench()
+    bench.hello()
+    bench.run(100)
+    assert bench.core._core.authentication.draws == 0

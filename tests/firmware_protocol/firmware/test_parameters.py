@@ -3,8 +3,10 @@ import struct
 
 import pytest
 
+from firmware_protocol import _firmware
 from tests.firmware_protocol.bench import CODEC, CONFIG, MS, Bench, sealed
 
+lib, ffi = _firmware.lib, _firmware.ffi
 KEYS = CODEC.choices("PARAM_REQUEST", "key")
 DEFAULTS = {
     "OVER_CURRENT": CONFIG.over_current_a,
@@ -122,3 +124,97 @@ def test_a_damaged_request_is_not_answered():
     bench.step()
     assert bench.messages("PARAM_RESPONSE") == []
     assert bench.core.rejections["CRC"] == 1
+
+
+RECORD = 32
+
+
+def packed(**changes):
+    config = lib.disco_config_default(2048, 8.0)
+    for name, value in changes.items():
+        setattr(config, name, value)
+    record = ffi.new("uint8_t[]", b"\xee" * (RECORD + 4))
+    lib.disco_record_pack(ffi.new("disco_config_t *", config), record)
+    assert bytes(record[RECORD : RECORD + 4]) == b"\xee" * 4
+    return bytearray(record[0:RECORD])
+
+
+def unpacked(record):
+    """The configuration that is left, and whether the record was taken."""
+    config = ffi.new("disco_config_t *", lib.disco_config_default(2048, 8.0))
+    taken = lib.disco_record_unpack(bytes(record), config)
+    return config, taken
+
+
+def sealed_record(record):
+    record[30:] = lib.disco_crc16(bytes(record[:30]), 30).to_bytes(2, "little")
+    return record
+
+
+OTHER = {"over_current": 12.5, "over_temperature": 60.0, "under_voltage": 18.0, "stop_deceleration": 7.0}
+
+
+def test_what_was_written_is_kept_over_a_restart_and_nothing_else():
+    record = packed(**OTHER, max_wheel_speed=3.0)
+    config, taken = unpacked(record)
+    assert taken
+    assert {name: getattr(config, name) for name in OTHER} == OTHER
+    assert config.max_wheel_speed == 8.0
+    assert record[0] == 1
+    assert [int.from_bytes(record[at : at + 2], "little") for at in (1, 7, 13, 19)] == [1, 2, 3, 4]
+    assert struct.unpack("<f", record[3:7]) == (12.5,)
+    assert record[25:30] == bytes(5)
+
+
+@pytest.mark.parametrize("bit", range(8 * RECORD))
+def test_a_record_with_any_bit_turned_is_not_taken(bit):
+    record = packed(**OTHER)
+    record[bit // 8] ^= 1 << bit % 8
+    config, taken = unpacked(record)
+    assert not taken
+    assert config.over_current == 30.0
+
+
+@pytest.mark.parametrize("record", [bytes(RECORD), b"\xff" * RECORD], ids=["zeros", "erased flash"])
+def test_what_was_never_written_is_not_taken(record):
+    assert not unpacked(record)[1]
+
+
+@pytest.mark.parametrize(
+    ("at", "value"),
+    [
+        (0, b"\2"),
+        (1, b"\x63\0"),
+        (1, b"\1\1"),
+        (1, b"\5\0"),
+        (21, struct.pack("<f", math.nan)),
+        (21, struct.pack("<f", math.inf)),
+        (21, struct.pack("<f", 0.9)),
+        (21, struct.pack("<f", 655.5)),
+    ],
+    ids=["format", "unknown key", "high byte of the key", "read-only key", "nan", "inf", "too little", "too much"],
+)
+def test_a_well_sealed_record_of_nonsense_changes_nothing(at, value):
+    record = packed(**OTHER)
+    record[at : at + len(value)] = value
+    config, taken = unpacked(sealed_record(record))
+    assert not taken
+    assert config.over_current == 30.0
+
+
+def test_a_record_of_fewer_parameters_is_taken():
+    record = packed(**OTHER)
+    record[7:30] = bytes(23)
+    config, taken = unpacked(sealed_record(record))
+    assert taken
+    assert (config.over_current, config.over_temperature) == (12.5, 80.0)
+
+
+def test_only_a_write_that_was_accepted_is_to_be_kept():
+    bench = Bench()
+    ask(bench, "READ", 4)
+    ask(bench, "WRITE", 4, 1e6)
+    ask(bench, "WRITE", 5, 1.0)
+    assert bench.core._core.parameter_writes == 0
+    ask(bench, "WRITE", 4, 5.0)
+    assert bench.core._core.parameter_writes == 1

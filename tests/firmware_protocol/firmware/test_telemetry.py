@@ -1,8 +1,12 @@
 import dataclasses
 import itertools
 import math
+import struct
+from fractions import Fraction
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from firmware_protocol.codec import PROTOCOL_MAJOR, PROTOCOL_MINOR
 from firmware_protocol.firmware_core import FirmwareInputs
@@ -268,6 +272,7 @@ def test_what_the_handshake_says():
     bench = Bench(
         dataclasses.replace(CONFIG, board_id=77, firmware_version=(3, 4, 5), capabilities=8, command_timeout_s=0.08)
     )
+    bench.run(3)
     assert last(bench, "HELLO") == {
         "protocol_major": PROTOCOL_MAJOR,
         "protocol_minor": PROTOCOL_MINOR,
@@ -284,6 +289,110 @@ def test_what_the_handshake_says():
     assert second == pytest.approx(
         {"page": 1, "command_timeout": 0.08, "drive_off_timeout": 0.5, "stop_deceleration": 20.0}
     )
+
+
+def names_by_cycle(bench, since_us):
+    names = {}
+    for t_us, message in bench.sent:
+        if t_us >= since_us:
+            names.setdefault((t_us - since_us) // MS, []).append(message.name)
+    return names
+
+
+HANDSHAKE = ["HELLO", "BUILD", "LIMITS", "LIMITS"]
+
+
+def test_the_introduction_comes_a_frame_a_cycle():
+    """So that no cycle takes much longer than the others."""
+    bench = Bench()
+    bench.run(42)
+    bench.hello()
+    start = bench.now_us + MS
+    bench.run(20)
+    sent = names_by_cycle(bench, start)
+    assert [[name for name in sent.get(cycle, []) if name in HANDSHAKE] for cycle in range(5)] == [
+        ["HELLO"], ["BUILD"], ["LIMITS"], ["LIMITS"], [],
+    ]  # fmt: skip
+    assert [int(message.values["page"]) for message in bench.messages("LIMITS", start)] == [0, 1]
+
+
+@pytest.mark.parametrize(
+    ("after_cycles", "pages"), [(0, [0, 1]), (1, [0, 1]), (2, [0, 1]), (3, [0, 0, 1]), (4, [0, 1, 0, 1])]
+)
+def test_limits_that_change_during_the_introduction_are_told_once_more_if_at_all(after_cycles, pages):
+    bench = Bench()
+    bench.run(42)
+    bench.hello()
+    start = bench.now_us + MS
+    bench.run(after_cycles)
+    bench.send("PARAM_REQUEST", operation="WRITE", key=4, value=2.5)
+    bench.run(10)
+    limits = bench.messages("LIMITS", start)
+    assert [int(message.values["page"]) for message in limits] == pages
+    assert limits[-1].values["stop_deceleration"] == pytest.approx(2.5)
+
+
+def test_what_is_due_together_goes_out_two_a_cycle_the_wheels_first():
+    bench = Bench()
+    bench.hello()
+    bench.run(100)
+    start = bench.now_us + 5_000 * MS
+    bench.step(elapsed_us=5_000 * MS)
+    bench.run(4)
+    sent = names_by_cycle(bench, start)
+    # After a pause the first cycle has more to tell: the clocks have come apart.
+    assert [set(sent[cycle]) - {"SYSTEM_STATE", "SESSION_STATE", "HELLO"} for cycle in (0, 1, 2, 3)] == [
+        {"WHEEL_SPEED", "WHEEL_TICKS", "MOTOR"}, {"BUILD"}, {"POWER", "LIMITS"}, {"LINK_HEALTH", "LIMITS"},
+    ]  # fmt: skip
+    assert {"SYSTEM_STATE", "SESSION_STATE"} <= set(sent[1])
+
+
+def test_no_cycle_sends_more_than_six_frames():
+    bench = Bench()
+    bench.to_driving()
+    bench.command = None
+    bench.run(2500)
+    most = max(len(names) for names in names_by_cycle(bench, 0).values())
+    assert 3 <= most <= 6
+
+
+@given(st.floats(width=32) | st.integers(-40_000, 40_000).map(lambda halves: halves / 1000))
+def test_values_are_rounded_exactly_halves_up(value):
+    """As the 64-bit formula floor(value / scale + 1/2), without its 64 bits."""
+    bench = Bench()
+    bench.wheels_follow = False
+    bench.inputs.update(left_speed_rad_s=value, voltage_v=value, left_current_a=value, left_temperature_c=value)
+    bench.run(510)
+    # A float is what the board's sensors give.
+    (single,) = struct.unpack("f", struct.pack("f", value)) if abs(value) < 3e38 else (value,)
+
+    def expected(per_unit, least, most):
+        if math.isnan(single):
+            return 0
+        if math.isinf(single):
+            return most if single > 0 else least
+        return min(max(math.floor(Fraction(single) * per_unit + Fraction(1, 2)), least), most)
+
+    assert round(last(bench, "WHEEL_SPEED")["left_speed"] * 500) == expected(500, -32768, 32767)
+    assert round(last(bench, "POWER")["voltage"] * 100) == expected(100, 0, 65535)
+    assert round(last(bench, "MOTOR")["left_current"] * 100) == expected(100, -32768, 32767)
+    assert last(bench, "MOTOR")["left_temperature"] == expected(1, -128, 127)
+
+
+@pytest.mark.parametrize(
+    "now_us", [*(n << 32 for n in (1, 2, 255, 256)), (1 << 40) - 1, (1 << 40) + 19, 0xFFFFFFFF, 123_456_789_012]
+)
+@pytest.mark.parametrize("before_us", [0, 1, 3, 19, 20, 21])
+def test_sample_times_are_those_of_the_40_bit_clock(now_us, before_us):
+    bench = Bench()
+    bench.now_us = now_us - before_us - MS
+    # The core's own time has not come so far yet when it is told of a pose.
+    bench.step()
+    bench.core.pose(0.0, 0.0, 0.0, now_us, 0.0, 0.0)
+    own_us = now_us
+    bench.step(elapsed_us=10 * MS)
+    assert last(bench, "WHEEL_SPEED")["sample_time"] == bench.now_us % (1 << 40) // 20 % 65536 * 20
+    assert last(bench, "POSE_HEADING")["sample_time"] == own_us % (1 << 40) // 100 % 65536 * 100
 
 
 def test_a_hello_is_answered_from_20_ms_after_the_answer_before():

@@ -1,0 +1,228 @@
+"""The firmware on an emulated microcontroller: compiled for a Cortex-M and run by QEMU, its serial line a terminal.
+
+    python -m tools.emulated_board [--processor m4f] [--key FILE] [--slcan]     until Ctrl-C, for playing with
+
+Needs arm-none-eabi-gcc with newlib and qemu-system-arm; `make firmware-emulated` installs them on Debian.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import re
+import secrets
+import shutil
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from firmware_protocol.build_firmware import PACKAGE, SOURCES
+
+FIRMWARE = PACKAGE / "firmware"
+PORTS = PACKAGE / "ports"
+COMPILER = "arm-none-eabi-gcc"
+EMULATOR = "qemu-system-arm"
+FLAGS = ("-mthumb", "-Os", "-ffunction-sections", "-fdata-sections", "--specs=nano.specs")
+WARNINGS = ("-Wall", "-Wextra", "-Wdouble-promotion", "-Werror")
+SETTINGS = 0x2000_0000
+_REALTIME_PRIORITY = 30
+
+
+@dataclass(frozen=True, slots=True)
+class Processor:
+    """What to compile for, and QEMU's machine that runs it."""
+
+    flags: tuple[str, ...]
+    machine: str
+
+
+PROCESSORS = {
+    # QEMU has no board with an M0+; an M3 runs its instructions as they are.
+    "m0plus": Processor(("-mcpu=cortex-m0plus",), "mps2-an385"),
+    "m3": Processor(("-mcpu=cortex-m3",), "mps2-an385"),
+    "m4f": Processor(("-mcpu=cortex-m4", "-mfpu=fpv4-sp-d16", "-mfloat-abi=hard"), "mps2-an386"),
+}
+
+
+def missing() -> str:
+    """Return in one line what is missing to emulate a board; empty if nothing is."""
+    gone = [program for program in (COMPILER, EMULATOR) if shutil.which(program) is None]
+    if not gone:
+        return ""
+    return (
+        f"{' and '.join(gone)} not found: apt-get install gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm "
+        "(113 MB to download, 923 MB on disk), or run make firmware-emulated as root on Debian"
+    )
+
+
+def compile_for(processor: str, sources: Sequence[Path], target: Path, options: Sequence[str] = ()) -> Path:
+    """Link the core and these sources for a Cortex-M, with MPS2's memory; any warning is an error."""
+    command = [
+        COMPILER, "-std=c11", *PROCESSORS[processor].flags, *FLAGS, *WARNINGS, *options, "-nostartfiles",
+        "-Wl,--gc-sections", "-T", str(PORTS / "mps2" / "mps2.ld"), f"-I{FIRMWARE}", f"-I{PORTS}",
+        f"-I{PORTS / 'mps2'}", *(str(FIRMWARE / name) for name in SOURCES), *map(str, sources), "-lm",
+        "-o", str(target),
+    ]  # fmt: skip
+    subprocess.run(command, check=True)
+    return target
+
+
+def build_board(processor: str, folder: Path, *, slcan: bool = False) -> Path:
+    """Build the firmware of the MPS2 port; returns its ELF file."""
+    sources = [PORTS / "controller.c", *sorted((PORTS / "mps2").glob("*.c"))]
+    target = folder / f"board-{processor}{'-slcan' if slcan else ''}.elf"
+    return compile_for(processor, sources, target, ["-DDISCO_LINK_SLCAN"] if slcan else [])
+
+
+@dataclass(frozen=True, slots=True)
+class Truth:
+    """One line of the bench: what truly happens on the board, at `ms` of its clock in its start number `start`."""
+
+    start: int
+    ms: int
+    setpoints: tuple[float, float]
+    speeds: tuple[float, float]
+    pose: tuple[float, float, float]
+    state: int
+    accepted: int
+
+    @property
+    def fastest(self) -> float:
+        """Speed of the faster wheel, rad/s."""
+        return max(map(abs, self.speeds))
+
+
+class Bench:
+    """The test bench's line: what truly happens, 100 times a second, and what a person could do to the board."""
+
+    def __init__(self, path: Path) -> None:
+        self._socket = socket.socket(socket.AF_UNIX)
+        self._socket.connect(str(path))
+        self._socket.setblocking(False)
+        self._rest = b""
+        self.rows: list[Truth] = []
+
+    def do(self, what: str) -> None:
+        """r: restart, b: brown-out, h: hang, p: press or release the emergency stop."""
+        self._socket.sendall(what.encode())
+
+    def read(self) -> list[Truth]:
+        """Take in what has come, and return everything so far."""
+        with contextlib.suppress(BlockingIOError):
+            while data := self._socket.recv(1 << 16):
+                *lines, self._rest = (self._rest + data).split(b"\n")
+                self.rows += [row for line in lines if (row := _truth(line)) is not None]
+        return self.rows
+
+    def latest(self, within_s: float = 5.0) -> Truth:
+        """Wait for the next line."""
+        seen, deadline = len(self.read()), time.monotonic() + within_s
+        while len(self.read()) <= seen:
+            if time.monotonic() > deadline:
+                raise TimeoutError("the bench tells nothing")
+            time.sleep(0.005)
+        return self.rows[-1]
+
+    def close(self) -> None:
+        """Leave the line."""
+        self._socket.close()
+
+
+def _truth(line: bytes) -> Truth | None:
+    words = line.split()
+    if len(words) != 11:
+        return None
+    start, ms, *scaled, state, accepted = map(int, words)
+    left_set, right_set, left, right = (value * 1e-3 for value in scaled[:4])
+    x, y, yaw = (value * 1e-4 for value in scaled[4:])
+    return Truth(start, ms, (left_set, right_set), (left, right), (x, y, yaw), state, accepted)
+
+
+@dataclass(frozen=True, slots=True)
+class Board:
+    """A running board: the terminal of its serial line, its bench, and the emulator's process."""
+
+    port: str
+    bench: Bench
+    process: subprocess.Popen[str]
+
+
+def _settings(entropy: int, first_us: int, key: bytes) -> list[str]:
+    words = [entropy & 0xFFFF_FFFF, entropy >> 32, first_us, 1 if key else 0]
+    words += [int.from_bytes(key[i : i + 4], "little") for i in range(0, len(key), 4)]
+    return [
+        option
+        for place, word in enumerate(words)
+        for option in ("-device", f"loader,addr={SETTINGS + 4 * place:#x},data={word:#x},data-len=4")
+    ]
+
+
+@contextlib.contextmanager
+def running_board(
+    image: Path, processor: str, *, entropy: int | None = None, first_us: int = 0, key: bytes = b""
+) -> Iterator[Board]:
+    """Start QEMU with this image; it ends with the block. `first_us`: where the board's counter begins."""
+    drawn = secrets.randbits(63) if entropy is None else entropy
+    with tempfile.TemporaryDirectory(prefix="disco-hw-board-") as folder:
+        bench = Path(folder) / "bench"
+        command = [
+            EMULATOR, "-machine", PROCESSORS[processor].machine, "-kernel", str(image), "-display", "none",
+            "-monitor", "none", "-serial", "pty", "-serial", f"unix:{bench},server=on,wait=off",
+            *_settings(drawn, first_us, key),
+        ]  # fmt: skip
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+        try:
+            port = _port_of(process)
+            _prefer(process.pid)
+            yield Board(port, Bench(bench), process)
+        finally:
+            process.kill()
+            process.wait()
+            if process.stdout is not None:
+                process.stdout.close()
+
+
+def _prefer(process: int) -> None:
+    """Give all threads of the emulator priority: its clock is the computer's, and what is held up is late."""
+    for thread in os.listdir(f"/proc/{process}/task"):
+        with contextlib.suppress(OSError):
+            os.sched_setscheduler(int(thread), os.SCHED_FIFO, os.sched_param(_REALTIME_PRIORITY))
+
+
+def _port_of(process: subprocess.Popen[str]) -> str:
+    assert process.stdout is not None
+    said = ""
+    for line in process.stdout:
+        said += line
+        if found := re.search(r"redirected to (/dev/\S+)", line):
+            return found[1]
+    raise RuntimeError(f"the emulator did not start: {said.strip()}")
+
+
+def main() -> int:
+    """Run a board until Ctrl-C."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--processor", choices=[name for name in PROCESSORS if name != "m0plus"], default="m4f")
+    parser.add_argument("--slcan", action="store_true", help="speak SLCAN in the place of the serial framing")
+    parser.add_argument("--key", type=Path, metavar="FILE", help="the robot's key")
+    given = parser.parse_args()
+    if what := missing():
+        print(what, file=sys.stderr)
+        return 2
+    key = bytes.fromhex(given.key.read_text("utf-8")) if given.key else b""
+    with tempfile.TemporaryDirectory() as folder:
+        image = build_board(given.processor, Path(folder), slcan=given.slcan)
+        with running_board(image, given.processor, key=key) as board, contextlib.suppress(KeyboardInterrupt):
+            print(f"ready {board.port} ({given.processor})", flush=True)
+            board.process.wait()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

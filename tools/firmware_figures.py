@@ -1,0 +1,162 @@
+"""Measures on emulated processors what the firmware core costs, and prints the table of docs/port.md.
+
+    python -m tools.firmware_figures [--check | --write]
+
+Code and constants: the linked core at -Os, without the C library's helpers. RAM: one core. Stack: the deepest, without
+interrupts. A step is a cycle of 1 ms with the sending of what it queued; a reception is one frame.
+--check exits 1 if a figure has grown by a tenth or the worst step is more than three times the mean; --write puts the
+table into the document.
+"""
+
+import argparse
+import re
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+
+from firmware_protocol.build_firmware import SOURCES
+from tools.emulated_board import COMPILER, EMULATOR, FIRMWARE, FLAGS, PORTS, PROCESSORS, compile_for, missing
+
+DOCUMENT = Path(__file__).resolve().parent.parent / "docs" / "port.md"
+PROGRAM = Path(__file__).with_suffix(".c")
+GROWTH = 1.1
+WORST_TO_MEAN = 3.0
+# What a board calls of the core; the linker drops what none of these needs.
+ROOTS = (
+    "disco_firmware_init", "disco_firmware_step", "disco_firmware_receive", "disco_firmware_pop", "disco_firmware_pose",
+    "disco_pose", "disco_config_default",
+)  # fmt: skip
+LINK_ROOTS = (
+    "disco_serial_init", "disco_serial_feed", "disco_serial_encode", "disco_record_pack", "disco_record_unpack",
+)  # fmt: skip
+ROWS = {
+    "code": "code of the core, bytes",
+    "constants": "constants of the core, bytes",
+    "code_link": "code and constants with serial framing and parameter record, bytes",
+    "ram": "RAM of the core, bytes",
+    "stack": "deepest stack, bytes",
+    "step_mean": "instructions in a step, mean",
+    "step_worst": "instructions in a step, worst",
+    "reception_mean": "instructions in a reception, mean",
+    "reception_worst": "instructions in a reception, worst",
+    "key_step_mean": "with a key: in a step, mean",
+    "key_step_worst": "with a key: in a step, worst",
+    "key_reception_mean": "with a key: in a reception, mean",
+    "key_reception_worst": "with a key: in a reception, worst",
+}
+
+
+def sizes(processor: str, folder: Path, roots: tuple[str, ...]) -> tuple[int, int]:
+    """Return bytes of code and of constants that these functions need of the core."""
+    linked = folder / f"core-{processor}.o"
+    wanted = [f"-Wl,-u,{root}" for root in roots]
+    subprocess.run(
+        [COMPILER, "-std=c11", *PROCESSORS[processor].flags, *FLAGS[:-1], "-nostdlib", "-r", "-Wl,--gc-sections",
+         f"-Wl,-e,{roots[0]}", *wanted, *(str(FIRMWARE / name) for name in SOURCES), "-o", str(linked)],
+        check=True,
+    )  # fmt: skip
+    size = COMPILER.removesuffix("gcc") + "size"
+    listed = subprocess.run([size, "-A", str(linked)], capture_output=True, text=True, check=True).stdout
+    found = [(name, int(count)) for name, count in re.findall(r"^\.(\w+)\S*\s+(\d+)", listed, re.MULTILINE)]
+    assert not sum(count for name, count in found if name in ("bss", "data")), "the core has no variables of its own"
+    return tuple(sum(count for name, count in found if name == kind) for kind in ("text", "rodata"))  # type: ignore[return-value]
+
+
+def counted(processor: str, folder: Path, *, key: bool) -> dict[str, int]:
+    """Run the program of measurements; return what it prints."""
+    image = compile_for(
+        processor,
+        [PROGRAM, PORTS / "mps2" / "startup.c"],
+        folder / f"figures-{processor}.elf",
+        ["-DWITH_KEY"] if key else [],
+    )
+    command = [
+        EMULATOR, "-machine", PROCESSORS[processor].machine, "-kernel", str(image), "-display", "none", "-monitor",
+        "none", "-serial", "null", "-icount", "shift=10,sleep=off", "-semihosting-config", "enable=on,target=native",
+    ]  # fmt: skip
+    # Semihosting writes to standard error.
+    ran = subprocess.run(command, capture_output=True, text=True, timeout=300, check=True)
+    return {name: int(value) for name, value in re.findall(r"^(\w+) (\d+)$", ran.stdout + ran.stderr, re.MULTILINE)}
+
+
+def measure(processor: str) -> dict[str, int]:
+    """Return all figures of one processor, by the names of `ROWS`."""
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(scratch)
+        code, constants = sizes(processor, folder, ROOTS)
+        plain, proved = counted(processor, folder, key=False), counted(processor, folder, key=True)
+        for run in (plain, proved):
+            # The drive went as it should: armed, obeyed, stopped by the watchdog.
+            assert run["accepted"] > 300, run
+            assert run["watchdog_events"] == 1, run
+        figures = {"code": code, "constants": constants, "code_link": sum(sizes(processor, folder, ROOTS + LINK_ROOTS))}
+    figures |= {name: plain[name] for name in ROWS if name in plain}
+    figures["stack"] = max(plain["stack"], proved["stack"])
+    return figures | {name: proved[name.removeprefix("key_")] for name in ROWS if name.startswith("key_")}
+
+
+def table(figures: Mapping[str, Mapping[str, int]]) -> str:
+    """Return the figures as the document has them."""
+    lines = [f"| | {' | '.join(figures)} |", f"|---|{'---:|' * len(figures)}"]
+    lines += [f"| {words} | {' | '.join(str(of[name]) for of in figures.values())} |" for name, words in ROWS.items()]
+    return "\n".join(lines) + "\n"
+
+
+def documented(text: str) -> dict[str, dict[str, int]]:
+    """Return the figures that the document has, by processor."""
+    block = re.search(r"^\| \|(.*)\|\n\|-.*\n((?:\|.*\n)+)", text, re.MULTILINE)
+    assert block is not None, f"{DOCUMENT}: no table of figures"
+    processors = [name.strip() for name in block[1].split("|")]
+    names = {words: name for name, words in ROWS.items()}
+    figures: dict[str, dict[str, int]] = {processor: {} for processor in processors}
+    for line in block[2].splitlines():
+        words, *values = (cell.strip() for cell in line.strip("|").split("|"))
+        for processor, value in zip(processors, values, strict=True):
+            figures[processor][names[words]] = int(value)
+    return figures
+
+
+def complaints(new: Mapping[str, Mapping[str, int]], old: Mapping[str, Mapping[str, int]]) -> list[str]:
+    """Return what has grown by a tenth, and where the worst step is too far above the mean."""
+    found = [
+        f"{processor}: {ROWS[name]}: {value}, and {old[processor][name]} in {DOCUMENT.name}: more than a tenth more"
+        for processor, figures in new.items()
+        for name, value in figures.items()
+        if value > GROWTH * old[processor][name]
+    ]
+    for processor, figures in new.items():
+        for key in ("", "key_"):
+            worst, mean = figures[f"{key}step_worst"], figures[f"{key}step_mean"]
+            if worst > WORST_TO_MEAN * mean:
+                found.append(f"{processor}: the worst step, {key}{worst}, takes more than three times the mean, {mean}")
+    return found
+
+
+def main() -> int:
+    """Measure, print, and check or write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    given = parser.add_mutually_exclusive_group()
+    given.add_argument("--check", action="store_true")
+    given.add_argument("--write", action="store_true")
+    arguments = parser.parse_args()
+    if what := missing():
+        print(what, file=sys.stderr)
+        # Where it may not be installed, a build goes on without it.
+        return 0 if arguments.check else 2
+    figures = {processor: measure(processor) for processor in PROCESSORS}
+    print(table(figures))
+    text = DOCUMENT.read_text("utf-8")
+    if arguments.write:
+        before = re.search(r"^\| \|.*\|\n\|-.*\n(?:\|.*\n)+", text, re.MULTILINE)
+        assert before is not None, f"{DOCUMENT}: no table of figures"
+        DOCUMENT.write_text(text.replace(before[0], table(figures)), "utf-8")
+    elif arguments.check and (found := complaints(figures, documented(text))):
+        print("\n".join(found), file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
