@@ -37,7 +37,7 @@ def test_nothing_is_missing_in_a_log_with_nothing_hidden():
     [
         ("motor_lag", 0.12, "tau_s"),
         ("turn_slip", 0.09, "k_s"),
-        ("yaw_acceleration_limit", 2.0, "limit_rad_s2"),
+        pytest.param("yaw_acceleration_limit", 2.0, "limit_rad_s2", marks=pytest.mark.long),
     ],
 )
 def test_exactly_the_hidden_effect_is_named_and_the_gap_closes(name, size, parameter):
@@ -145,7 +145,9 @@ def test_the_names_alone_are_those_of_the_report():
     assert missing_effects(log, MODEL) == tuple(effect.name for effect in report.effects) != ()
 
 
-@pytest.mark.parametrize(("delay_s", "missing"), [(0.003, ()), (0.1, ("command_delay",))])
+@pytest.mark.parametrize(
+    ("delay_s", "missing"), [(0.003, ()), pytest.param(0.1, ("command_delay",), marks=pytest.mark.long)]
+)
 def test_what_the_log_shows_and_no_prediction_needs_is_not_missing(delay_s, missing):
     log = simulated_drive({"command_delay": delay_s}, seed=903, drive="rich")
     assert [effect.name for effect in find_gap(log, MODEL).effects] == ["command_delay"]

@@ -10,11 +10,14 @@ from disco_hw.model import EffectSetting, Model
 from disco_hw.model.free_run import FreeRun
 
 N = 800
-EFFECTS = (
+# Each compiles a model of its own: all of a channel in one.
+OF_WHEELS = (
     EffectSetting("motor_lag", {"tau_s": 0.1}),
     EffectSetting("deadband", {"width_rad_s": 0.3}),
     EffectSetting("speed_limit", {"limit_rad_s": 5.0}),
     EffectSetting("command_delay", {"delay_s": 0.05}),
+)
+OF_BODY = (
     EffectSetting("turn_slip", {"k_s": 0.1}),
     EffectSetting("side_slip", {"k_s": 0.1}),
     EffectSetting("wheel_radius_asymmetry", {"ratio": 0.02}),
@@ -22,9 +25,9 @@ EFFECTS = (
 )
 
 
-@pytest.mark.parametrize("effect", [*EFFECTS, None])
-def test_two_channels_in_a_row_are_the_model(effect):
-    model = Model(0.06, 0.4, 0.1, (effect,) if effect else ())
+@pytest.mark.parametrize("effects", [OF_WHEELS, OF_BODY, ()], ids=["wheels", "body", "none"])
+def test_two_channels_in_a_row_are_the_model(effects):
+    model = Model(0.06, 0.4, 0.1, effects)
     t = np.arange(N) * GRID_STEP_S
     commands = np.column_stack([4 * np.sin(0.8 * t), 6 * np.sin(0.5 * t) + 1])
     p = {"wheels": WHEEL.neutral.copy(), "body": BODY.neutral.copy()}

@@ -1,0 +1,101 @@
+"""`make test` in fresh clones of HEAD, one after the other, each with the conditions that it ran under.
+
+`python -m tools.clones 10 --busy` is ten, the last beside two busy processes; it exits with 1 if one of them failed.
+`--dry` only clones, and prints what would be done.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from disco_hw.daemon.realtime import stolen_ms
+
+COUNT = re.compile(r"\d+ (?:passed|failed|skipped|errors?)")
+# What would have the clone use this checkout's modules or compiled kernels.
+OF_THIS_CHECKOUT = ("PYTHONPATH", "NUMBA_CACHE_DIR", "VIRTUAL_ENV", "MAKEFLAGS")
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """How one clone did; `load` is the machine's over a minute, before and after."""
+
+    code: int
+    wall_s: float
+    cpu_s: float
+    load: tuple[float, float]
+    stolen_s: float
+    output: str
+
+    def in_words(self) -> str:
+        lines = self.output.splitlines()
+        counts = ", ".join(COUNT.findall(" ".join(lines[-3:]))) or "no counts"
+        told = [line for line in lines if line.startswith(("FAILED", "ERROR"))]
+        first = (
+            f"rc {self.code}, {self.wall_s:.0f} s wall, {self.cpu_s:.0f} s CPU, {counts}, load {self.load[0]:.1f} "
+            f"before and {self.load[1]:.1f} after, the host stole {self.stolen_s:.1f} s"
+        )
+        return "\n  ".join([first, *(told or (lines[-10:] if self.code else []))])
+
+
+def run(command: list[str], folder: Path) -> Outcome:
+    """Run a command to its end; its processes count where they were waited for."""
+    own = {name: value for name, value in os.environ.items() if name not in OF_THIS_CHECKOUT}
+    load, stolen, begin_s, used_s = os.getloadavg()[0], stolen_ms(), time.monotonic(), _children_cpu_s()
+    done = subprocess.run(
+        command, cwd=folder, env=own, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False
+    )
+    wall_s, cpu_s, stolen_s = time.monotonic() - begin_s, _children_cpu_s() - used_s, (stolen_ms() - stolen) * 1e-3
+    return Outcome(done.returncode, wall_s, cpu_s, (load, os.getloadavg()[0]), stolen_s, done.stdout)
+
+
+def _children_cpu_s() -> float:
+    return sum(resource.getrusage(resource.RUSAGE_CHILDREN)[:2])
+
+
+@contextmanager
+def busy(count: int) -> Iterator[None]:
+    """That many processes beside, which do nothing but compute."""
+    made = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(count)]
+    try:
+        yield
+    finally:
+        for process in made:
+            process.kill()
+            process.wait()
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("clones", type=int)
+    parser.add_argument("--busy", action="store_true", help="run the last one beside two busy processes")
+    parser.add_argument("--dry", action="store_true", help="clone, but only say what make would do")
+    asked = parser.parse_args()
+    command = ["make", "test", *(["-n"] if asked.dry else [])]
+    codes: list[int] = []
+    for number in range(1, asked.clones + 1):
+        beside = 2 if asked.busy and number == asked.clones else 0
+        with tempfile.TemporaryDirectory(prefix="clone") as folder, busy(beside):
+            subprocess.run(["git", "clone", "-q", ".", folder], check=True)
+            outcome = run(command, Path(folder))
+        codes.append(outcome.code)
+        print(
+            f"{number} of {asked.clones}{', beside two busy processes' * bool(beside)}: {outcome.in_words()}",
+            flush=True,
+        )
+    print(f"{codes.count(0)} of {asked.clones} passed")
+    return int(any(codes))
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
