@@ -9,7 +9,7 @@ from __future__ import annotations
 import enum
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import msgspec
 
@@ -191,7 +191,10 @@ class RobotLinkHealth(msgspec.Struct, frozen=True, gc=False):
 
 @dataclass(frozen=True, slots=True)
 class Capabilities:
-    """What the robot said of itself in the handshake; the limits are enforced by its firmware."""
+    """What is known of the controller: said by itself in the handshake, or, not `told`, declared in robot.toml.
+
+    A limit that neither says is None.
+    """
 
     protocol_major: int
     protocol_minor: int
@@ -199,11 +202,12 @@ class Capabilities:
     dbc_hash: int
     board_id: int
     max_wheel_speed_rad_s: float
-    max_wheel_acceleration_rad_s2: float
-    ticks_per_rev: int
+    max_wheel_acceleration_rad_s2: float | None
+    ticks_per_rev: int | None
     command_timeout_s: float
     drive_off_timeout_s: float
     stop_deceleration_rad_s2: float
+    told: bool = True
 
 
 class Readings(msgspec.Struct, frozen=True, gc=False):
@@ -320,15 +324,70 @@ class PoseSource(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
+class CyclicFrame:
+    """A frame of `length` data bytes that `sender` sends `rate_hz` times a second."""
+
+    name: str
+    sender: str
+    length: int
+    rate_hz: float
+
+
+@dataclass(frozen=True, slots=True)
+class SafetyCard:
+    """Who stops the robot when, in words for a person.
+
+    `reaction_s`: how long the wheels may still be driven after the host has fallen silent. `brakes`: whether they are
+    braked then, or coast. `unverified`: what this computer could not find out. `setup`: what the controller must be
+    set to.
+    """
+
+    host_silent: str
+    stops_by: str
+    reaction_s: float
+    brakes: bool
+    estop: str
+    unverified: tuple[str, ...] = ()
+    setup: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class SettingsFault:
+    """What no single field of a driver's settings shows: the field's name, what is wrong, what to write."""
+
+    field: str
+    fault: str
+    remedy: str
+
+
+class NoSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Of a driver that has no fields of its own in [link]."""
+
+    def fault(self) -> SettingsFault | None:
+        """Nothing can be wrong."""
+        return None
+
+
+@dataclass(frozen=True, slots=True)
 class MotorDriver:
     """A motor controller that robot.toml can name: each file of `drivers.motor` that speaks to one holds a `DRIVER`.
 
-    `make` returns a fresh driver; its argument is the key of authenticated mode (16 bytes) or None. `authenticates`:
-    whether there is such a mode; without one `link.key_file` is refused. `is_default`: taken where robot.toml has no
-    `link.driver`.
+    `settings`: a struct of its own fields in [link], with `fault()`; those of another driver are refused there. `make`
+    returns a fresh driver of these and of the key of authenticated mode (16 bytes) or None. `stop_frames`: the e-stop
+    for a connection beside the daemon's, which needs no answer; `stop_confirmation` makes what says, given each frame
+    that is heard then, whether the robot has confirmed it. `cyclic_frames` (of settings, command rate in Hz, whether
+    authenticated): what the link carries. `authenticates`: whether there is such a mode; without one `link.key_file` is
+    refused. `example`: its fields in [link] for a robot as the demonstration drives it; none where its controller is
+    not simulated. `is_default`: taken where robot.toml has no `link.driver`.
     """
 
     name: str
-    make: Callable[[bytes | None], Driver]
+    make: Callable[[Any, bytes | None], Driver]
+    stop_frames: Callable[[Any], tuple[Frame, ...]]
+    stop_confirmation: Callable[[Any], Callable[[Frame], bool]]
+    cyclic_frames: Callable[[Any, float, bool], tuple[CyclicFrame, ...]]
+    safety_card: Callable[[Any], SafetyCard]
+    settings: type[Any] = NoSettings
+    example: str = ""
     authenticates: bool = False
     is_default: bool = False

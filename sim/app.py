@@ -25,10 +25,13 @@ from sim.fault_schedule import FaultSchedule, Site
 from sim.hub import HubLink
 from sim.plant import Plant
 from sim.plant_parameters import PlantParameters
+from sim.pose_sender import PoseSender
 from sim.process import SocketPathError, StopSignal, TextRecord
 from sim.python_can_link import PythonCanLink
+from sim.robot import Robot
 from sim.robot_link import RobotLink
 from sim.serial_line import SerialLine, SerialPathError
+from sim.vendor_robot import Controller, VendorRobot
 from sim.virtual_robot import STEP_US, ControllerClock, TruthRecorder, VirtualRobot
 
 STEP_NS = STEP_US * 1000
@@ -50,7 +53,9 @@ class VirtualRobotOptions:
     taking their time on the wire if `pacing`; any other `interface` is joined through python-can. With kind "serial" it
     makes a pseudo-terminal, and a symbolic link to it at `port` unless that is None.
 
-    `firmware`: limits and identity of the controller. `start`: pose of the tracked point at the start. `effects`:
+    `firmware`: limits and identity of the reference controller; `controller` makes another one in its place, whose
+    robot's poses go to `pose_address` in datagrams of `drivers.pose.udp`. `start`: pose of the tracked point at the
+    start. `effects`:
     hidden effects by name (see `sim.effects`). `seed`: all disturbances and noise. `challenge_seed`: arming
     challenges that are the same in every run, for tests alone; None draws them from the system. `truth_file`: CSV of
     `sim.virtual_robot.TRUTH_COLUMNS` at 100 Hz. `bus_log`: every frame on the own bus or line, as candump does.
@@ -72,6 +77,8 @@ class VirtualRobotOptions:
     seed: int = 0
     challenge_seed: int | None = None
     firmware: FirmwareConfig | None = None
+    controller: Callable[[], Controller] | None = None
+    pose_address: tuple[str, int] | None = None
     clock: ControllerClock = field(default_factory=ControllerClock)
     truth_file: Path | None = None
     bus_log: Path | None = None
@@ -117,7 +124,7 @@ class _Process:
 
     def __init__(
         self,
-        robot: VirtualRobot,
+        robot: Robot,
         link: RobotLink,
         commands: CommandSocket | None,
         recorder: TruthRecorder | None,
@@ -181,6 +188,10 @@ def _set_up(options: VirtualRobotOptions, records: list[TextRecord], resources: 
     if options.faults is not None:
         _check_faults(options.faults, options.kind, options.interface)
     robot = _make_robot(options)
+    if isinstance(robot, VendorRobot) and options.pose_address is not None:
+        sender = PoseSender(options.pose_address)
+        resources.callback(sender.close)
+        robot.pose_sink = sender.send
     truth, bus = (_open_record(path, records, resources) for path in (options.truth_file, options.bus_log))
     recorder = None if truth is None else TruthRecorder(truth)
     log = None if bus is None else bus.line
@@ -219,8 +230,10 @@ def _check_faults(schedule: FaultSchedule, kind: str, interface: str) -> None:
             raise OptionError(f"fault {fault.number}: {name}: a serial line has none; take it out or use a CAN bus")
 
 
-def _make_robot(options: VirtualRobotOptions) -> VirtualRobot:
+def _make_robot(options: VirtualRobotOptions) -> Robot:
     plant = Plant(options.plant, hidden_effects(options.effects), options.seed, options.start)
+    if options.controller is not None:
+        return VendorRobot(plant, options.controller())
     try:
         return VirtualRobot(plant, options.firmware_config, options.clock, options.challenge_seed)
     except OverflowError as error:
@@ -232,7 +245,7 @@ def _rehearse(options: VirtualRobotOptions) -> None:
     robot = _make_robot(options)
     for step in range(1, WARM_UP_STEPS + 1):
         robot.step(step * STEP_US)
-    if robot.outputs.state == "FAULT":
+    if options.controller is None and robot.outputs.state == "FAULT":
         raise OptionError(f"{_given(options.firmware_config)}: out of the firmware's range; correct the value")
 
 

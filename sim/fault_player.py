@@ -12,8 +12,9 @@ from drivers.types import Frame
 from firmware_protocol.firmware_core import ResetCause
 from sim.fault_schedule import FaultSchedule, ScheduledFault, Site
 from sim.faults import FaultTimeline, FrameFaults, RobotFaults
+from sim.robot import Robot
 from sim.robot_link import LinkFaultError, RobotLink
-from sim.virtual_robot import VirtualRobot, truth_row
+from sim.virtual_robot import truth_row
 
 COMMANDS = """\
 bus_off [host|robot]          controllers of all hosts (default), or the robot's, leave the bus
@@ -42,7 +43,7 @@ class FaultPlayer:
     def __init__(
         self,
         schedule: FaultSchedule,
-        robot: VirtualRobot,
+        robot: Robot,
         link: RobotLink,
         start_ns: int,
         report: Callable[[str], object] = lambda _line: None,
@@ -128,7 +129,7 @@ class FaultPlayer:
 class Injection:
     """Executes `COMMANDS` on a robot and its link, and keeps up what goes on over time."""
 
-    def __init__(self, robot: VirtualRobot, link: RobotLink) -> None:
+    def __init__(self, robot: Robot, link: RobotLink) -> None:
         self.refused = 0
         self._robot = robot
         self._link = link

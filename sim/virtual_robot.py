@@ -21,6 +21,7 @@ from firmware_protocol.firmware_core import (
 from sim.faults import RobotFaults
 from sim.plant import Plant, TrueState
 from sim.process import TextRecord
+from sim.robot import Robot
 from sim.sensors import PoseMeasurement
 
 STEP_US = 1000
@@ -191,7 +192,7 @@ class VirtualRobot:
         return self._challenge_seed
 
 
-def truth_row(robot: VirtualRobot, t_ns: int) -> str:
+def truth_row(robot: Robot, t_ns: int) -> str:
     """The values of `TRUTH_COLUMNS` at the last step, which was at the monotonic time `t_ns`, separated by commas."""
     truth, outputs = robot.truth, robot.outputs
     return (
@@ -212,7 +213,7 @@ class TruthRecorder:
         record.flush()
         self._flushed_ns = 0
 
-    def record(self, robot: VirtualRobot, t_ns: int) -> None:
+    def record(self, robot: Robot, t_ns: int) -> None:
         """Write the state of the last step, which was at the monotonic time `t_ns`."""
         self._record.line(truth_row(robot, t_ns))
         if t_ns - self._flushed_ns >= FLUSH_NS:

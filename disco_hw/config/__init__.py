@@ -11,6 +11,7 @@ from disco_hw.config.robot import (
     Prior,
     Robot,
     RobotConfig,
+    link_of,
     load_daemon_address,
     load_robot_config,
 )
@@ -26,6 +27,7 @@ __all__ = [
     "Prior",
     "Robot",
     "RobotConfig",
+    "link_of",
     "load_daemon_address",
     "load_robot_config",
 ]

@@ -12,7 +12,7 @@ from msgspec import Meta
 from disco_hw.config.input_file import ROBOT_TOML, read_toml
 from disco_hw.config.words import in_words
 from disco_hw.errors import InputError
-from drivers.motor import UnknownDriverError, find_driver
+from drivers.motor import DriverFieldError, UnknownDriverError, find_driver, own_fields
 from drivers.pose import DEFAULT, PoseSourceError, find_pose_source
 
 if TYPE_CHECKING:
@@ -51,16 +51,18 @@ class Prior(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     axial_distance_m: Range = (0.1, 0.5)
 
 
-_OF_THE_PROTOCOL = ("driver", "key_file")
+_OF_THE_PROTOCOL = ("driver", "key_file", "of_driver")
 
 
 class Link(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """How the robot is reached; `options` go to the python-can interface as they are.
 
-    `driver`: of `drivers.motor`; None is its default.
+    `driver`: of `drivers.motor`; None is its default. `of_driver`: the fields that are this driver's own, which stand
+    in [link] beside the others; None where it is not made by `link_of`.
     """
 
     driver: str | None = None
+    of_driver: Any = None
     kind: Literal["can", "serial"] = "can"
     interface: str = "socketcan"
     channel: str = "can0"
@@ -76,11 +78,19 @@ class Link(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
         """What `drivers.transport.make_transport` takes: kind and address, not the protocol spoken over the link."""
         return {name: value for name, value in msgspec.structs.asdict(self).items() if name not in _OF_THE_PROTOCOL}
 
+    def settings(self) -> Any:
+        """The driver's own settings. Raises msgspec.ValidationError where it needs some that are not there."""
+        if self.of_driver is not None:
+            return self.of_driver
+        return msgspec.convert({}, find_driver(self.driver).settings)
+
 
 class PoseInput(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Where measured poses come from: `source` is of `drivers.pose`."""
 
     source: str = DEFAULT
+    address: str = "127.0.0.1"
+    port: Annotated[int, Meta(ge=1, le=65535)] = 5005
 
 
 class Control(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -192,14 +202,54 @@ def load_daemon_address(path: Path) -> tuple[str, str | None]:
 def _without_task(path: Path, raw: dict[str, Any]) -> RobotConfig:
     """All that robot.toml says but [task], validated; `task` is None."""
     _check_names(path, raw)
+    common, of_driver = _split_link(path, raw.get("link", {}))
     try:
-        config = msgspec.convert({**raw, "task": None}, RobotConfig)
+        config = msgspec.convert({**raw, "link": common, "task": None}, RobotConfig)
     except msgspec.ValidationError as error:
         raise InputError(f"{path}: {in_words(error, [RobotConfig], 'docs/robot.md')}") from None
+    config = msgspec.structs.replace(config, link=msgspec.structs.replace(config.link, of_driver=of_driver))
     given = {name: getattr(config.prior, name) for name in raw.get("prior", {})}
     config = msgspec.structs.replace(config, prior=msgspec.structs.replace(prior_around(config.robot), **given))
     _check(path, config)
     return config
+
+
+def _split_link(path: Path, section: Any) -> tuple[Any, Any]:
+    """The fields of [link] that every driver has, and the settings of the driver that it names."""
+    if not isinstance(section, dict):
+        return section, None
+    if "of_driver" in section:
+        raise InputError(f"{path}: link.of_driver: no such field; remove it")
+    name = section.get("driver")
+    try:
+        own = own_fields(name, section)
+    except DriverFieldError as error:
+        raise InputError(f"{path}: link.{error}; remove it, or name that driver") from None
+    kind = find_driver(name).settings
+    try:
+        settings = msgspec.convert(own, kind)
+    except msgspec.ValidationError as error:
+        raise InputError(f"{path}: {in_words(error, [kind], 'docs/robot.md', 'link')}") from None
+    fault = settings.fault()
+    if fault is not None:
+        raise InputError(f"{path}: link.{fault.field}: {fault.fault}; {fault.remedy}")
+    return {field: value for field, value in section.items() if field not in own}, settings
+
+
+def link_of(path: Path, section: dict[str, Any]) -> Link:
+    """[link] alone, of a robot.toml whose other sections may be broken; fields that are not its driver's are left out.
+
+    Raises InputError.
+    """
+    _check_names(path, {"link": section})
+    own = find_driver(section.get("driver")).settings.__struct_fields__
+    _, of_driver = _split_link(path, {name: section[name] for name in section if name in (*own, "driver")})
+    common = {name: section[name] for name in section if name in Link.__struct_fields__ and name != "of_driver"}
+    try:
+        link = msgspec.convert(common, Link)
+    except msgspec.ValidationError as error:
+        raise InputError(f"{path}: [link]: {error}") from None
+    return msgspec.structs.replace(link, of_driver=of_driver)
 
 
 def prior_around(robot: Robot) -> Prior:

@@ -23,12 +23,13 @@ from disco_hw.runtime.preflight import (
     check_link_load,
     check_realtime,
     check_round_trip,
+    check_safety,
     check_task,
 )
 from disco_hw.runtime.robot_setup import Setup, link_key, load_setup
 from disco_hw.runtime.situation import connection
 from drivers import status_texts
-from drivers.motor import make_driver
+from drivers.motor import find_driver, make_driver
 from drivers.types import (
     Capabilities,
     Driver,
@@ -41,7 +42,6 @@ from drivers.types import (
     Transport,
 )
 from firmware_protocol.codec import Codec, Decoded
-from firmware_protocol.dbc import packaged_dbc
 
 _LINK_TIMEOUT_S = 2.0
 _LISTEN_S = 3.0
@@ -82,19 +82,24 @@ def run_check(robot: Path, link: str | None = None) -> CheckReport:
     key, transport = link_key(setup), make_link(setup)
     refuse_beside_a_daemon(setup.config)
     checks = [_model_check(setup), check_task(setup.config.robot, setup.config.task)]
-    checks.append(check_link_load(setup.config.link, setup.config.control, packaged_dbc()))
+    checks.append(check_link_load(setup.config.link, setup.config.control))
     control = setup.config.control
     priority = setup.config.daemon.realtime_priority
     checks += check_realtime(priority, can_use_fifo(), can_lock_memory(), os.cpu_count() or 1)
+    named = setup.config.link
+    card = find_driver(named.driver).safety_card(named.settings())
+    checks += check_safety(setup.config.robot, card)
     pose_source = pose_source_of(setup.config)
     transport.open()
     try:
         checks.append(_link_check(transport))
         if checks[-1].level is Level.OK:
-            found = _ask_robot(transport, make_driver(setup.config.link.driver, key), pose_source)
+            found = _ask_robot(transport, make_driver(named.driver, named.settings(), key), pose_source)
             checks.append(_firmware_check(found))
-            checks.append(_hearing_check(found))
-            checks.append(check_round_trip(found.round_trips_s, 1.0 / control.rate_hz))
+            if found.capabilities is None or found.capabilities.told:
+                # Only a controller that says what it hears can be asked for that.
+                checks.append(_hearing_check(found))
+                checks.append(check_round_trip(found.round_trips_s, 1.0 / control.rate_hz))
             checks.append(_telemetry_check(found))
             if found.capabilities is not None:
                 checks += check_firmware_limits(setup.config.robot, found.capabilities)
@@ -222,6 +227,8 @@ def _firmware_check(found: _Found) -> Check:
             name, Level.FAIL, f"{found.state.value}: the robot reports {status_texts.fault(found.told[-1].fault)}"
         )
     capabilities = found.capabilities
+    if not capabilities.told:
+        return Check(name, Level.OK, f"{capabilities.firmware_version}, {found.state.value}")
     clock = "clock synchronised" if found.clock_synchronised else "clock NOT synchronised"
     version = f"{capabilities.firmware_version}, protocol {capabilities.protocol_major}.{capabilities.protocol_minor}"
     return Check(name, Level.OK, f"{version}, DBC {capabilities.dbc_hash:08x} matches, {found.state.value}, {clock}")

@@ -168,7 +168,7 @@ def _start(
         say("control socket", line)
     transport.open()
     stop.add("link", transport.close)
-    driver = make_driver(config.link.driver, key)
+    driver = make_driver(config.link.driver, config.link.settings(), key)
     core = assemble_core(config, transport, driver, pipeline, recorder, pilot.needs_pose, adaptation)
     stop.add("pose source", core.pose_source.close)
     daemon = Daemon(core, server, recorder, MonotonicClock(), signals, say, pilot, ask)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,16 +17,16 @@ from typing import Any
 import msgspec
 import serial
 
-from disco_hw.config import Link
+from disco_hw.config import Link, link_of
 from disco_hw.config.input_file import ROBOT_TOML, read_toml
 from disco_hw.config.link_option import link_fields, names_address
 from disco_hw.daemon.client import send_request
 from disco_hw.daemon.socket_place import believed_users, default_socket_path, passed_over
 from disco_hw.errors import InputError
+from drivers.motor import find_driver
 from drivers.transport import SerialMedium, open_transport
 from drivers.transport.serial import open_port
 from drivers.types import Frame, LinkState, OutgoingFrame
-from firmware_protocol.codec import Codec, Decoded
 from firmware_protocol.serial_framing import FrameDecoder, encode_frame
 
 _REPEATS = 3
@@ -100,13 +100,13 @@ def stop_robot(robot: Path, link: str | None = None) -> EstopOutcome:
         if daemon_error is not None:
             raise InputError(f"{error}; {_REMEDY}") from None
         return EstopOutcome("link", str(error), None, confirmed, refused)
-    frame_id, data = Codec().encode("ESTOP", reason=1)
-    frame = Frame(frame_id, data)
+    driver = find_driver(settings.driver)
+    frames, heard = driver.stop_frames(settings.settings()), driver.stop_confirmation(settings.settings())
     way = _stop_over_serial if settings.kind == "serial" else _stop_over_transport
     address = settings.port if settings.kind == "serial" else f"{settings.interface} {settings.channel}"
     confirmed, link_error = False, None
     try:
-        confirmed = way(settings, frame)
+        confirmed = way(settings, frames, heard)
     except Exception as error:  # whatever the medium raises, the daemon is asked as well
         link_error = str(error) or type(error).__name__
     daemon_confirmed, daemon_error = _ask_daemon(socket_path)
@@ -138,12 +138,8 @@ def _link_settings(robot: Path, raw: dict[str, Any], given: dict[str, Any]) -> L
     section = raw.get("link", {})
     if not isinstance(section, dict):
         raise InputError(f"{robot}: link: not a section")
-    section = {**section, **given}
-    try:
-        # A field that is none, misspelt or of another version, must not keep the stop from the robot.
-        return msgspec.convert({name: section[name] for name in section if name in Link.__struct_fields__}, Link)
-    except msgspec.ValidationError as error:
-        raise InputError(f"{robot}: [link]: {error}") from None
+    # A field that is none, misspelt or of another version, must not keep the stop from the robot.
+    return link_of(robot, {**section, **given})
 
 
 def _socket_path(raw: dict[str, Any]) -> Path | None:
@@ -153,7 +149,7 @@ def _socket_path(raw: dict[str, Any]) -> Path | None:
     return None
 
 
-def _stop_over_transport(settings: Link, frame: Frame) -> bool:
+def _stop_over_transport(settings: Link, frames: Sequence[Frame], heard: Callable[[Frame], bool]) -> bool:
     transport = open_transport(**settings.medium_fields())
     try:
         deadline_ns = time.monotonic_ns() + round(_CONNECT_S * 1e9)
@@ -162,50 +158,43 @@ def _stop_over_transport(settings: Link, frame: Frame) -> bool:
                 raise ConnectionError(transport.last_error or "the link did not come up")
             time.sleep(0.002)
         asked_ns = time.monotonic_ns()
-        for _ in range(_REPEATS):
+        for frame in _REPEATS * tuple(frames):
             now_ns = time.monotonic_ns()
             if not transport.send(OutgoingFrame(frame, now_ns + _FRAME_LIFE_NS), now_ns):
                 raise ConnectionError(transport.last_error or "the frame could not be queued")
         # What was under way before says nothing about this request.
-        return _confirmed(lambda: [(r.frame.can_id, r.frame.data) for r in transport.receive() if r.t_ns >= asked_ns])
+        return _confirmed(lambda: [r.frame for r in transport.receive() if r.t_ns >= asked_ns], heard)
     finally:
         transport.close()
 
 
-def _stop_over_serial(settings: Link, frame: Frame) -> bool:
+def _stop_over_serial(settings: Link, frames: Sequence[Frame], heard: Callable[[Frame], bool]) -> bool:
     # Not exclusive: the daemon may hold the port, and must not be able to keep the stop from the robot.
     medium = SerialMedium(settings.port, settings.baud, settings.dtr, settings.rts)
     with open_port(medium, timeout_s=0.01, write_timeout_s=0.5, exclusive=False) as port:
         # Opening threw away what came in before. The delimiter ends what another sender may be in the middle of.
-        port.write(b"\0" + _REPEATS * encode_frame(frame.can_id, frame.data))
+        port.write(b"\0" + _REPEATS * b"".join(encode_frame(frame.can_id, frame.data) for frame in frames))
         port.flush()
         decoder = FrameDecoder()
 
-        def receive() -> list[tuple[int, bytes]]:
+        def receive() -> list[Frame]:
             # Two readers of one port take bytes from each other, which pyserial reports as a lost device.
             with contextlib.suppress(serial.SerialException):
-                return decoder.feed(port.read(max(1, port.in_waiting)))
+                return [Frame(*each) for each in decoder.feed(port.read(max(1, port.in_waiting)))]
             return []
 
-        return _confirmed(receive)
+        return _confirmed(receive, heard)
 
 
-def _confirmed(receive: Callable[[], list[tuple[int, bytes]]]) -> bool:
-    """Whether the robot reports ESTOP within the waiting time."""
-    codec = Codec()
+def _confirmed(receive: Callable[[], list[Frame]], heard: Callable[[Frame], bool]) -> bool:
+    """Whether the robot reports the e-stop within the waiting time."""
     deadline_ns = time.monotonic_ns() + round(_CONFIRM_S * 1e9)
     while time.monotonic_ns() < deadline_ns:
-        if any(_says_estop(codec, can_id, data) for can_id, data in receive()):
+        # Each frame counts: several controllers confirm one after the other.
+        if True in [heard(frame) for frame in receive()]:
             return True
         time.sleep(0.002)
     return False
-
-
-def _says_estop(codec: Codec, can_id: int, data: bytes) -> bool:
-    decoded = codec.decode(can_id, data)
-    if not isinstance(decoded, Decoded) or decoded.name != "SYSTEM_STATE":
-        return False
-    return codec.choice_name("SYSTEM_STATE", "state", decoded.values["state"]) == "ESTOP"
 
 
 def _is_served(socket_path: Path) -> bool:

@@ -80,7 +80,7 @@ class SimulatedRun:
         self.core: DaemonCore = assemble_core(
             setup.config,
             robot.host,
-            make_driver(setup.config.link.driver),
+            make_driver(setup.config.link.driver, setup.config.link.settings()),
             pipeline,
             self.recorder,
             self.pilot.needs_pose if needs_pose is None else needs_pose,

@@ -5,14 +5,18 @@ from __future__ import annotations
 import math
 import sys
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 from disco_hw.config.input_file import FAULTS_TOML, read_toml
 from disco_hw.errors import InputError
 from disco_hw.runtime.robot_setup import Setup, geometry, link_key, load_setup
+from drivers.motor import find_driver
+from drivers.pose.udp import SOURCE as UDP_POSES
 from firmware_protocol.firmware_core import FirmwareConfig
 from sim.app import VirtualRobotOptions, run_virtual_robot
 from sim.body_dynamics import BodyPose
+from sim.devices import find_controller
 from sim.effects import HiddenEffectError, parse_hidden_effects
 from sim.fault_schedule import FaultFileError, schedule_of
 from sim.plant_parameters import DrawError, PlantParameters, draw_plant_parameters
@@ -56,6 +60,13 @@ def run_sim(options: SimOptions) -> int:
     if options.start is not None and not all(map(math.isfinite, options.start)):
         raise InputError(f"--start: {' '.join(map(str, options.start))} is no place; write finite numbers")
     ticks_per_rev = _whole_ticks(setup)
+    driver = find_driver(config.link.driver)
+    make_controller = None if driver.is_default else find_controller(driver.name)
+    if not driver.is_default and (make_controller is None or config.link.kind != "can"):
+        raise InputError(
+            f"{setup.robot_file}: link.driver: there is no simulator of {driver.name} on this kind of link"
+        )
+    controller = None if make_controller is None else partial(make_controller, config.link.settings(), ticks_per_rev)
     x_m, y_m, yaw_rad = options.start or config.task.course().start
     # The robot that a model without effects describes; what its motors should lack is hidden by the user.
     plant, key = true_parameters(setup, options.plant_seed).with_ideal_motors(), link_key(setup)
@@ -85,6 +96,8 @@ def run_sim(options: SimOptions) -> int:
                 ),
                 key=key or b"",
             ),
+            controller=controller,
+            pose_address=(config.pose.address, config.pose.port) if config.pose.source == UDP_POSES else None,
             truth_file=options.truth,
             bus_log=options.bus_log,
             inject=options.inject,

@@ -1,40 +1,13 @@
-"""How much of the link the protocol's cyclic frames take, computed from the DBC's cycle times."""
+"""How much of the link a protocol's cyclic frames take."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 
-from firmware_protocol.dbc import load_protocol
+from drivers.types import CyclicFrame
 
-_COMMANDS = ("WHEEL_COMMAND", "WHEEL_COMMAND_MAC")
-_AUTHENTICATION = ("WHEEL_COMMAND_MAC", "HOST_STATE_MAC", "MAC_CHALLENGE")
 _SERIAL_BITS_PER_BYTE = 10
 _SERIAL_OVERHEAD_BYTES = 7
-
-
-@dataclass(frozen=True, slots=True)
-class CyclicFrame:
-    """A frame of `length` data bytes that `sender` sends `rate_hz` times a second."""
-
-    name: str
-    sender: str
-    length: int
-    rate_hz: float
-
-
-def cyclic_frames(dbc: str, command_rate_hz: float, *, authenticated: bool = False) -> tuple[CyclicFrame, ...]:
-    """Return all frames with a cycle time (GenMsgCycleTime, ms) in the DBC's text, each page of a multiplexed one.
-
-    The wheel command counts at the rate of the control loop; proofs and their challenge only if `authenticated`.
-    """
-    frames = []
-    for message in load_protocol(dbc).messages:
-        if message.period_s is not None and (authenticated or message.name not in _AUTHENTICATION):
-            pages = {signal.page for signal in message.signals} - {None}
-            rate_hz = command_rate_hz if message.name in _COMMANDS else 1.0 / message.period_s
-            frames.append(CyclicFrame(message.name, message.sender, message.length, rate_hz * max(1, len(pages))))
-    return tuple(frames)
 
 
 def worst_case_bits(length: int) -> int:

@@ -9,9 +9,10 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from disco_hw.config import Control, Link, Robot
-from disco_hw.runtime.link_load import can_load, cyclic_frames, serial_load
+from disco_hw.runtime.link_load import can_load, serial_load
 from disco_hw.tasks import RobotTask
-from drivers.types import Capabilities
+from drivers.motor import find_driver
+from drivers.types import Capabilities, SafetyCard
 
 _SPEED_RESOLUTION_RAD_S = 0.002
 _ACCELERATION_RESOLUTION_RAD_S2 = 0.01
@@ -42,9 +43,9 @@ def failures(checks: Iterable[Check]) -> tuple[str, ...]:
     return tuple(check.text for check in checks if check.level is Level.FAIL)
 
 
-def check_link_load(link: Link, control: Control, dbc: str) -> Check:
-    """Compare the load of the link by the cyclic frames of the DBC (its text) with a budget of 40 %."""
-    frames = cyclic_frames(dbc, control.rate_hz, authenticated=link.key_file is not None)
+def check_link_load(link: Link, control: Control) -> Check:
+    """Compare the load of the link by the driver's cyclic frames with a budget of 40 %."""
+    frames = find_driver(link.driver).cyclic_frames(link.settings(), control.rate_hz, link.key_file is not None)
     if link.kind == "can":
         load = can_load(frames, link.bitrate)
         found = f"{load:.1%} of the bus at {link.bitrate / 1e3:g} kbit/s with the most stuff bits"
@@ -67,6 +68,12 @@ def check_firmware_limits(robot: Robot, capabilities: Capabilities) -> list[Chec
     )
     if errors:
         return [Check("firmware limits", Level.FAIL, error) for error in errors]
+    if not capabilities.told:
+        found = (
+            f"{robot.max_wheel_speed_rad_s:g} rad/s is within the {capabilities.max_wheel_speed_rad_s:g} that "
+            "robot.toml declares of the controller; it does not say so itself"
+        )
+        return [Check("firmware limits", Level.OK, found)]
     found = (
         f"{robot.max_wheel_speed_rad_s:g} rad/s and {robot.max_wheel_acceleration_rad_s2:g} rad/s^2 are within the "
         f"firmware's {capabilities.max_wheel_speed_rad_s:g} and {capabilities.max_wheel_acceleration_rad_s2:g}; "
@@ -96,6 +103,24 @@ def check_command_timing(control: Control, capabilities: Capabilities) -> Check:
         text = f"{found}{few} may be lost; raise control.rate_hz or control.command_valid_for_s"
         return Check("command timing", Level.WARNING, text)
     return Check("command timing", Level.OK, f"{found}{spare} in a row may be lost")
+
+
+def check_safety(robot: Robot, card: SafetyCard) -> list[Check]:
+    """The safety card: who stops the robot when, how far at full speed, and what could not be verified."""
+    speed_m_s = robot.max_wheel_speed_rad_s * robot.wheel_radius_m
+    driven_m = speed_m_s * card.reaction_s
+    if card.brakes:
+        braking_m = speed_m_s**2 / (2.0 * robot.max_wheel_acceleration_rad_s2 * robot.wheel_radius_m)
+        far = f"about {driven_m + braking_m:.2f} m at {speed_m_s:.2f} m/s"
+    else:
+        far = f"{driven_m:.2f} m at {speed_m_s:.2f} m/s, and then as far as the robot rolls"
+    checks = [
+        Check("stops when the host is silent", Level.OK, card.host_silent),
+        Check("stops by", Level.OK if card.brakes else Level.WARNING, f"{card.stops_by}; {far}"),
+        Check("e-stop", Level.OK, card.estop),
+    ]
+    checks += [Check("not verified", Level.WARNING, text) for text in card.unverified]
+    return checks + [Check("to be set in the controller", Level.OK, text) for text in card.setup]
 
 
 def check_realtime(priority: int, fifo_allowed: bool, memory_lock_allowed: bool, cpu_count: int) -> list[Check]:
@@ -153,15 +178,13 @@ def check_limits(
             f"robot.max_wheel_speed_rad_s: {max_wheel_speed_rad_s:g} is above the firmware's limit; "
             f"write at most {capabilities.max_wheel_speed_rad_s:g}, or flash a firmware with a higher limit"
         )
-    if (
-        not max_wheel_acceleration_rad_s2
-        <= capabilities.max_wheel_acceleration_rad_s2 + _ACCELERATION_RESOLUTION_RAD_S2
-    ):
+    acceleration = capabilities.max_wheel_acceleration_rad_s2
+    if acceleration is not None and not max_wheel_acceleration_rad_s2 <= acceleration + _ACCELERATION_RESOLUTION_RAD_S2:
         errors.append(
             f"robot.max_wheel_acceleration_rad_s2: {max_wheel_acceleration_rad_s2:g} is above the firmware's limit; "
-            f"write at most {capabilities.max_wheel_acceleration_rad_s2:g}, or flash a firmware with a higher limit"
+            f"write at most {acceleration:g}, or flash a firmware with a higher limit"
         )
-    if ticks_per_rev != capabilities.ticks_per_rev:
+    if capabilities.ticks_per_rev is not None and ticks_per_rev != capabilities.ticks_per_rev:
         errors.append(
             f"robot.ticks_per_rev: {ticks_per_rev:g} differs from the firmware's {capabilities.ticks_per_rev}; "
             f"write {capabilities.ticks_per_rev}, or flash the firmware for this encoder"

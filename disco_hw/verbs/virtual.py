@@ -21,6 +21,9 @@ from disco_hw.viewer.address import DEFAULT_PORT
 
 def demo(
     link: Annotated[str, typer.Option(help="can (mock bus) or serial (pseudo-terminal).")] = "can",
+    device: Annotated[
+        str | None, typer.Option(help="Motor controller to simulate in place of the project's own, such as odrive.")
+    ] = None,
     out: Annotated[Path, typer.Option(help="Directory for the log, the picture and the figures.")] = Path("out/demo"),
     laps: Annotated[float, typer.Option(min=0.5, max=100.0, help="Laps to drive.")] = 1.5,
     plant_seed: Annotated[int, typer.Option(min=0, help="Seed of the virtual robot's true parameters.")] = 1,
@@ -36,6 +39,7 @@ def demo(
     result = run_demo(
         DemoOptions(
             link=link,
+            device=device,
             out=out,
             laps=laps,
             plant_seed=plant_seed,

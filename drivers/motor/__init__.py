@@ -7,12 +7,21 @@ from collections.abc import Mapping
 from functools import cache
 from importlib import import_module
 from types import MappingProxyType
+from typing import Any
 
 from drivers.types import Driver, MotorDriver
 
 
 class UnknownDriverError(ValueError):
     """No driver has this name; the message lists the names that there are."""
+
+
+class DriverFieldError(ValueError):
+    """A field of [link] that belongs to another driver than the one named."""
+
+    def __init__(self, field: str, fault: str) -> None:
+        super().__init__(f"{field}: {fault}")
+        self.field, self.fault = field, fault
 
 
 @cache
@@ -36,9 +45,21 @@ def find_driver(name: str | None) -> MotorDriver:
     return known[name]
 
 
-def make_driver(name: str | None, key: bytes | None = None) -> Driver:
+def make_driver(name: str | None, settings: Any = None, key: bytes | None = None) -> Driver:
     """Make the driver that `link.driver` names, the default one for None.
 
-    `key` (16 bytes): of authenticated mode. Raises UnknownDriverError.
+    `settings`: of its type, None for its defaults. `key` (16 bytes): of authenticated mode. Raises UnknownDriverError.
     """
-    return find_driver(name).make(key)
+    found = find_driver(name)
+    return found.make(found.settings() if settings is None else settings, key)
+
+
+def own_fields(name: str | None, fields: Mapping[str, Any]) -> dict[str, Any]:
+    """Those of [link]'s fields that are the driver's own. Raises DriverFieldError for one of another driver's."""
+    found = find_driver(name)
+    own = {field: value for field, value in fields.items() if field in found.settings.__struct_fields__}
+    for other in motor_drivers().values():
+        for field in fields:
+            if field in other.settings.__struct_fields__ and field not in own:
+                raise DriverFieldError(field, f"a field of the driver {other.name}, and link.driver is {found.name}")
+    return own

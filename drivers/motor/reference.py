@@ -16,20 +16,25 @@ from drivers.motor import reference_telemetry as telemetry
 from drivers.motor.reference_arming import MESSAGES as HANDSHAKE_MESSAGES
 from drivers.motor.reference_arming import Arming, Handshake, HostState
 from drivers.motor.reference_frames import FrameReception, FrameTransmission
+from drivers.motor.reference_load import cyclic_frames
 from drivers.motor.reference_watch import ArmedWatch
 from drivers.types import (
     Capabilities,
     DriverState,
     DriverStats,
+    Frame,
     MotorDriver,
+    NoSettings,
     OutgoingFrame,
     Readings,
     ReceivedFrame,
     Request,
     RobotStatus,
+    SafetyCard,
     WheelCommand,
 )
 from firmware_protocol.codec import PROTOCOL_MAJOR, PROTOCOL_MINOR, Codec, Decoded
+from firmware_protocol.dbc import packaged_dbc
 
 SILENCE_NS = 500_000_000
 REFUSED_SILENCE_NS = 3_000_000_000
@@ -449,9 +454,47 @@ def _check(command: WheelCommand) -> None:
         raise ValueError(f"not a wheel command: {command}")
 
 
-def _make(key: bytes | None) -> ReferenceDriver:
+def _make(_settings: NoSettings, key: bytes | None) -> ReferenceDriver:
     # Session ids are unpredictable, so that no old one fits by accident.
     return ReferenceDriver(Codec(), lambda: secrets.randbits(16), key)
 
 
-DRIVER = MotorDriver("reference", _make, authenticates=True, is_default=True)
+def _stop_frames(_settings: NoSettings) -> tuple[Frame, ...]:
+    encoded = Codec().encode("ESTOP", reason=1)
+    return (Frame(encoded.can_id, encoded.data),)
+
+
+def _stop_confirmation(_settings: NoSettings) -> Callable[[Frame], bool]:
+    codec = Codec()
+
+    def heard(frame: Frame) -> bool:
+        decoded = None if frame.extended else codec.decode(frame.can_id, frame.data)
+        if not isinstance(decoded, Decoded) or decoded.name != "SYSTEM_STATE":
+            return False
+        return codec.choice_name("SYSTEM_STATE", "state", decoded.values["state"]) == "ESTOP"
+
+    return heard
+
+
+def _safety_card(_settings: NoSettings) -> SafetyCard:
+    return SafetyCard(
+        host_silent="the controller after 0.1 s without an accepted wheel command, by its watchdog that cannot be off",
+        stops_by="braking: it decelerates within its own limit, then brakes",
+        reaction_s=0.1,
+        brakes=True,
+        estop="a frame of any length, also from `disco-hw estop`: it decelerates, latched and confirmed",
+    )
+
+
+DRIVER = MotorDriver(
+    "reference",
+    _make,
+    stop_frames=_stop_frames,
+    stop_confirmation=_stop_confirmation,
+    cyclic_frames=lambda _settings, rate_hz, authenticated: cyclic_frames(
+        packaged_dbc(), rate_hz, authenticated=authenticated
+    ),
+    safety_card=_safety_card,
+    authenticates=True,
+    is_default=True,
+)

@@ -47,7 +47,8 @@ class Telemetry:
 
     def configure(self, capabilities: Capabilities) -> None:
         """Set encoder resolution and largest speed; the angles go on from where they are."""
-        limits = (capabilities.ticks_per_rev, capabilities.max_wheel_speed_rad_s)
+        # The reference firmware says both.
+        limits = (capabilities.ticks_per_rev or 1, capabilities.max_wheel_speed_rad_s)
         if limits != self._limits:
             self._limits = limits
             self._ticks = WheelTicks(*limits, start=self._ticks.angles if self._ticks is not None else (0.0, 0.0))

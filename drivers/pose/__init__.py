@@ -10,13 +10,12 @@ from types import MappingProxyType
 from typing import Any
 
 from drivers.pose import robot
+from drivers.pose.errors import PoseSourceError
 from drivers.types import PoseSource
 
+__all__ = ["DEFAULT", "PoseSourceError", "find_pose_source", "make_pose_source", "pose_sources"]
+
 DEFAULT = robot.SOURCE
-
-
-class PoseSourceError(ValueError):
-    """A source that cannot be had, by its name or its device; the message is one line with the remedy."""
 
 
 @cache

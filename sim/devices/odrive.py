@@ -8,10 +8,13 @@ Source: odriverobotics/ODrive, communication/can/can_simple.cpp and MotorControl
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
+from drivers.motor.odrive_settings import OdriveSettings
+from firmware_protocol.firmware_core import FirmwareInputs
 from sim.can_frame import CanFrame
 
 CHECKS_PER_MS = 8
@@ -304,3 +307,81 @@ class OdriveBoard:
             return []
         reply = struct.pack("<BHB", 0, endpoint, 0) + self.parameters[endpoint]
         return [CanFrame(axis.node_id << 5 | 0x05, reply)]
+
+
+class OdriveController:
+    """All axes of one robot: satisfies `sim.vendor_robot.Controller`. Firmware 0.6 has a board for each axis."""
+
+    brakes = False
+
+    def __init__(self, settings: OdriveSettings, ticks_per_rev: int) -> None:
+        self._settings = settings
+        self._ticks_per_rev = ticks_per_rev
+        self.boards = self._make_boards()
+        self.axes = self._axes_by_side()
+
+    @property
+    def wheels_rad_s(self) -> tuple[float | None, float | None]:
+        """The speeds that the motors hold; a side of which one motor is released has what the others hold."""
+        wheels = []
+        for side, direction in zip(self.axes, self._settings.direction, strict=True):
+            held = [speed for axis in side if (speed := axis.velocity_turns_s) is not None]
+            turns = sum(held) / len(held) if held else None
+            wheels.append(None if turns is None else direction * turns * 2.0 * math.pi / self._settings.gear)
+        return wheels[0], wheels[1]
+
+    @property
+    def state(self) -> str:
+        """In one word."""
+        axes = [axis for side in self.axes for axis in side]
+        if any(axis.axis_error for axis in axes):
+            return "FAULT"
+        return "ARMED" if any(axis.axis_state == CLOSED_LOOP for axis in axes) else "STANDBY"
+
+    @property
+    def obeyed(self) -> int:
+        """How many frames its axes have taken."""
+        return sum(axis.fed for side in self.axes for axis in side)
+
+    def receive(self, now_us: int, frame: CanFrame) -> Sequence[CanFrame]:
+        """Take in one frame; return the replies."""
+        return [reply for board in self.boards for reply in board.receive(frame)]
+
+    def step(self, now_us: int, inputs: FirmwareInputs) -> Sequence[CanFrame]:
+        """Go through one millisecond; an axis counts the turns of its motor from zero at its start."""
+        ticks = (inputs.left_ticks, inputs.right_ticks)
+        speeds = (inputs.left_speed_rad_s, inputs.right_speed_rad_s)
+        gear = self._settings.gear
+        for side, direction, counted, speed in zip(self.axes, self._settings.direction, ticks, speeds, strict=True):
+            for axis in side:
+                if inputs.estop_button:
+                    axis.fail(ESTOP_ERROR[self._settings.firmware])
+                axis.pos_turns = f32(direction * gear * counted / self._ticks_per_rev)
+                axis.vel_turns_s = f32(direction * gear * speed / (2.0 * math.pi))
+        return [frame for board in self.boards for frame in board.step(now_us // 1000)]
+
+    def restart(self) -> None:
+        """Switch off and on: nothing is asked, nothing latched, the watchdog as it is set."""
+        self.boards = self._make_boards()
+        self.axes = self._axes_by_side()
+
+    def _make_boards(self) -> list[OdriveBoard]:
+        settings = self._settings
+        left, right = settings.sides
+        pairs = list(zip(left, right, strict=True)) if settings.firmware == "0.5" else [(n,) for n in (*left, *right)]
+        periods = {"heartbeat": round(1000.0 * settings.heartbeat_s), "encoder": 10}
+        boards = [OdriveBoard(settings.firmware, nodes, periods) for nodes in pairs]
+        for axis in (axis for board in boards for axis in board.axes):
+            axis.watchdog_enabled, axis.watchdog_timeout_s = True, settings.watchdog_s
+            axis.vel_limit_turns_s = settings.vel_limit_turns_s
+        return boards
+
+    def _axes_by_side(self) -> tuple[list[Axis], list[Axis]]:
+        by_node = {axis.node_id: axis for board in self.boards for axis in board.axes}
+        left, right = self._settings.sides
+        return [by_node[node] for node in left], [by_node[node] for node in right]
+
+
+def make_controller(settings: OdriveSettings, ticks_per_rev: int) -> OdriveController:
+    """The controllers of a robot whose robot.toml has these settings, with the encoder on the wheel."""
+    return OdriveController(settings, ticks_per_rev)

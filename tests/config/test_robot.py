@@ -12,6 +12,7 @@ from disco_hw.tasks import kinds, task_class
 from disco_hw.tasks.circle import circle_task
 from disco_hw.tasks.path import PathTask
 from disco_hw.tasks.timed_path import TimedPathTask
+from drivers.motor import motor_drivers
 
 GOOD = """
 [robot]
@@ -126,7 +127,11 @@ def test_every_field_is_documented():
     for section in RobotConfig.__struct_fields__:
         assert f"[{section}]" in text
         for field in _fields_of(section):
-            assert f"\n{field} = " in text, f"[{section}] {field}"
+            # `of_driver` is what the driver's own fields become, not a field to write.
+            assert field == "of_driver" or f"\n{field} = " in text, f"[{section}] {field}"
+    for driver in motor_drivers().values():
+        for field in driver.settings.__struct_fields__:
+            assert f"\n{field} = " in text, f"{driver.name}: {field}"
 
 
 def _fields_of(section: str) -> tuple[str, ...]:

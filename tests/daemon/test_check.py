@@ -59,12 +59,12 @@ def brief(monkeypatch):
 
 @pytest.mark.parametrize("key", [b"", KEY])
 def test_a_robot_that_takes_what_it_is_sent(key):
-    found = check._ask_robot(RobotInTime(key), make_driver(None, key or None), RobotPoses())
+    found = check._ask_robot(RobotInTime(key), make_driver(None, None, key or None), RobotPoses())
     assert check._hearing_check(found).level is Level.OK
 
 
 def test_a_key_that_is_not_the_robots_fails():
-    found = check._ask_robot(RobotInTime(KEY), make_driver(None, KEY[::-1]), RobotPoses())
+    found = check._ask_robot(RobotInTime(KEY), make_driver(None, None, KEY[::-1]), RobotPoses())
     heard = check._hearing_check(found)
     assert heard.level is Level.FAIL
     assert "link.key_file" in heard.text

@@ -4,7 +4,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from disco_hw.runtime.link_load import CyclicFrame, can_load, cyclic_frames, serial_load, worst_case_bits
+from disco_hw.runtime.link_load import can_load, serial_load, worst_case_bits
+from drivers.motor.reference_load import cyclic_frames
+from drivers.types import CyclicFrame
 from firmware_protocol.dbc import packaged_dbc
 from firmware_protocol.serial_framing import encode_frame
 from sim.can_frame import CanFrame, frame_bits
@@ -28,15 +30,6 @@ def test_the_worst_case_is_the_published_one_and_nearly_reached():
     generator = random.Random(1)
     patterns = [bytes(generator.choice((0x78, 0x87, 0xC3, 0x3C, 0x1E, 0xE1)) for _ in range(8)) for _ in range(2000)]
     assert max(exact_bits(0x0F8, data) for data in patterns) >= 120
-
-
-def test_the_protocols_cyclic_frames_are_those_of_the_dbc():
-    by_name = {frame.name: frame for frame in FRAMES}
-    assert by_name["WHEEL_SPEED"] == CyclicFrame("WHEEL_SPEED", "ROBOT", 8, 100.0)
-    assert by_name["LIMITS"].rate_hz == 2.0
-    assert by_name["WHEEL_COMMAND"] == CyclicFrame("WHEEL_COMMAND", "HOST", 8, 50.0)
-    assert {frame.name: frame for frame in cyclic_frames(packaged_dbc(), 100.0)}["WHEEL_COMMAND"].rate_hz == 100.0
-    assert "ESTOP" not in by_name
 
 
 def test_can_load_is_bits_over_bit_rate():

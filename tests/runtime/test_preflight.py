@@ -19,9 +19,6 @@ from disco_hw.runtime.preflight import (
 from disco_hw.tasks.circle import CircleTask
 from disco_hw.tasks.path import PathTask
 from drivers.types import Capabilities
-from firmware_protocol.dbc import packaged_dbc
-
-DBC = packaged_dbc()
 
 
 def robot(**changes):
@@ -58,7 +55,7 @@ def capabilities(**changes):
     ],
 )
 def test_link_load_is_judged_by_its_budget(link, level):
-    check = check_link_load(link, Control(), DBC)
+    check = check_link_load(link, Control())
     assert check.level is level
     assert "%" in check.text
     if level is not Level.OK:
@@ -66,7 +63,7 @@ def test_link_load_is_judged_by_its_budget(link, level):
 
 
 def test_link_load_counts_the_control_rate():
-    slow, fast = (check_link_load(Link(), Control(rate_hz=rate_hz), DBC).text for rate_hz in (20.0, 100.0))
+    slow, fast = (check_link_load(Link(), Control(rate_hz=rate_hz)).text for rate_hz in (20.0, 100.0))
     assert float(fast.split("%")[0]) == pytest.approx(float(slow.split("%")[0]) + 80 * 135 / 5000, abs=0.15)
 
 

@@ -104,7 +104,7 @@ class TestToyDriver(DriverConformance):
     estop_id = toy.STOP_ID
 
     def make_driver(self):
-        return toy.DRIVER.make(None)
+        return toy.DRIVER.make(None, None)
 
     def make_robot(self, first_ticks=(0, 0)):
         return ToyController(first_ticks)
@@ -118,7 +118,7 @@ def test_robot_toml_may_not_ask_for_more_than_its_limits(tmp_path, max_speed_rad
     file = robot_toml(tmp_path, 'kind = "can"')
     robot = load_robot_config(file)
     ours = replace(robot.robot, max_wheel_speed_rad_s=max_speed_rad_s, ticks_per_rev=TICKS_PER_REV)
-    bench = Bench(toy.DRIVER.make(None), ToyController())
+    bench = Bench(toy.DRIVER.make(None, None), ToyController())
     bench.run_until(DriverState.STANDBY)
     errors = preflight(replace(robot, robot=ours), bench.driver, with_task=False)
     assert [error.partition(":")[0] for error in errors] == ["robot.max_wheel_speed_rad_s"] * refused

@@ -1,16 +1,20 @@
 """The registry of motor controllers: robot.toml's `link.driver` names one, and each name stands in one file."""
 
 import re
+import tomllib
+from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import pytest
 
-import drivers.motor
 from disco_hw.config import load_robot_config
 from disco_hw.errors import InputError
 from drivers.motor import UnknownDriverError, find_driver, make_driver, motor_drivers
 from drivers.types import DriverState
 
+OWN = {"odrive": "nodes = [3, 5]\nwatchdog_s = 0.1\nvel_limit_turns_s = 10.0\n"}
+"""The fields that a driver must have in [link]."""
 ROOT = Path(__file__).parents[3]
 WOMBOT = ROOT / "disco_hw/robots/wombot.toml"
 
@@ -25,7 +29,8 @@ def robot_toml(folder, link):
 def test_every_driver_is_made_by_its_name_and_begins_without_a_link():
     for name, driver in motor_drivers().items():
         assert driver.name == name
-        assert make_driver(name).state is DriverState.DISCONNECTED
+        settings = msgspec.convert(tomllib.loads(OWN.get(name, "")), driver.settings)
+        assert make_driver(name, settings).state is DriverState.DISCONNECTED
 
 
 def test_exactly_one_driver_is_the_default():
@@ -47,14 +52,34 @@ def test_robot_toml_with_an_unknown_driver_is_refused_in_one_line(tmp_path):
 
 def test_robot_toml_may_name_each_driver(tmp_path):
     for name in motor_drivers():
-        assert load_robot_config(robot_toml(tmp_path, f'driver = "{name}"')).link.driver == name
+        link = f'driver = "{name}"\n{OWN.get(name, "")}'
+        assert load_robot_config(robot_toml(tmp_path, link)).link.driver == name
+
+
+@pytest.mark.parametrize(
+    ("link", "said"),
+    [
+        ("nodes = [3, 5]", r"link\.nodes: a field of the driver odrive, and link.driver is reference; remove it"),
+        ('driver = "odrive"\nnodes = [3, 5]\nvel_limit_turns_s = 10.0', r"watchdog_s: missing; add it"),
+        ('driver = "odrive"\nnodes = [3, 5]\nvel_limit_turns_s = 10.0\nwatchdog_s = 0.0', r"link\.watchdog_s"),
+        ('driver = "odrive"\nnodes = [3, 3]\nvel_limit_turns_s = 10.0\nwatchdog_s = 0.1', r"link\.nodes: .*twice"),
+        ('driver = "odrive"\nnodes = [3, 63]\nvel_limit_turns_s = 9.0\nwatchdog_s = 0.1', r"link\.nodes: .*0 to 62"),
+        ("of_driver = 3", r"link\.of_driver: no such field"),
+        ("gears = 3", r"gears: no such field"),
+    ],
+)
+def test_a_field_that_is_not_the_drivers_or_is_wrong_is_refused_by_name(tmp_path, link, said):
+    with pytest.raises(InputError, match=said) as refused:
+        load_robot_config(robot_toml(tmp_path, link))
+    assert "\n" not in str(refused.value)
 
 
 def test_a_key_for_a_driver_that_does_not_authenticate_is_refused(tmp_path, monkeypatch):
     (name,) = [driver.name for driver in motor_drivers().values() if driver.is_default]
     file = robot_toml(tmp_path, f'driver = "{name}"\nkey_file = "robot.key"')
     assert load_robot_config(file).link.key_file == "robot.key"
-    monkeypatch.setattr("disco_hw.config.robot.find_driver", lambda _name: drivers.motor.MotorDriver(name, None))
+    mute = replace(find_driver(None), authenticates=False)
+    monkeypatch.setattr("disco_hw.config.robot.find_driver", lambda _name: mute)
     with pytest.raises(InputError, match=r"link\.key_file: .*no authenticated mode; remove it"):
         load_robot_config(file)
 

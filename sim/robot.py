@@ -1,0 +1,46 @@
+"""What the simulator runs: a robot seen through frames, whatever its controller."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+from drivers.types import Frame
+from firmware_protocol.firmware_core import FirmwareOutputs, ResetCause
+from sim.faults import RobotFaults
+from sim.plant import Plant, TrueState
+
+
+class Robot(Protocol):
+    """Satisfied by `sim.virtual_robot.VirtualRobot` and `sim.vendor_robot.VendorRobot`; pure, stepped at 1 kHz."""
+
+    plant: Plant
+    estop_button: bool
+    faults: RobotFaults | None
+
+    @property
+    def now_us(self) -> int:
+        """Robot time of the last step."""
+
+    @property
+    def outputs(self) -> FirmwareOutputs:
+        """What the controller wanted in the last cycle."""
+
+    @property
+    def truth(self) -> TrueState:
+        """The plant's true state at the last step."""
+
+    def receive(self, now_us: int, frame: Frame) -> None:
+        """One frame from the link, at robot time `now_us`."""
+
+    def step(self, now_us: int, error_counters: tuple[int, int] = (0, 0)) -> Sequence[Frame]:
+        """Move on to robot time `now_us`; return the frames that the controller sends, in order."""
+
+    def kidnap(self, dx_m: float, dy_m: float, dyaw_rad: float) -> None:
+        """Carry the robot off."""
+
+    def jump_clock(self, step_us: int) -> None:
+        """Set the controller's clock."""
+
+    def reboot(self, cause: ResetCause = ResetCause.POWER_ON) -> None:
+        """Restart the controller."""

@@ -1,0 +1,295 @@
+"""What every driver of a vendor's controller must do, against the byte-level simulator of that controller.
+
+These controllers know no session and tell no time: what the reference protocol proves is proved by the driver here.
+"""
+
+import math
+import random
+
+import pytest
+
+from drivers.types import DriverState, Request, WheelCommand
+from tests.drivers.motor.bench import START_NS
+from tests.drivers.motor.vendors import VENDORS
+
+FORWARD = (3.0, 2.0)
+STILL = (DriverState.STANDBY, DriverState.READY)
+COASTING_S = 2.5
+
+
+@pytest.fixture(params=VENDORS, ids=str)
+def vendor(request):
+    return request.param
+
+
+@pytest.fixture
+def bench(vendor):
+    bench = vendor.bench()
+    yield bench
+    assert not [frame for frame in bench.robot.received if vendor.is_forbidden(frame)]
+
+
+def command(left, right):
+    return WheelCommand(left, right, 0.1)
+
+
+def drive(bench, seconds=1.0):
+    bench.arm()
+    bench.run(seconds, FORWARD)
+    assert bench.robot.speed == pytest.approx(FORWARD, abs=0.02)
+
+
+def test_nothing_that_moves_is_sent_before_arming(vendor, bench):
+    bench.command = command(*FORWARD)
+    bench.run(2.0)
+    assert bench.driver.state in STILL
+    assert bench.largest_speed == 0.0
+    bench.driver.request(Request.READY)
+    bench.run(1.0)
+    assert bench.driver.state is DriverState.READY
+    sent = len(bench.robot.received)
+    assert sent, "the controller is asked who it is"
+    assert not [frame for frame in bench.robot.received if vendor.is_motion(frame)]
+
+
+def test_a_controller_that_is_not_there_is_waited_for(vendor):
+    bench = vendor.bench(loses=lambda _random: True)
+    bench.run(2.0)
+    assert bench.driver.state is DriverState.HANDSHAKE
+    assert bench.driver.capabilities is None
+    assert len(bench.driver.detail) > 10
+
+
+def test_armed_the_wheels_follow_and_the_samples_say_so(bench):
+    bench.arm()
+    assert bench.largest_speed == 0.0, "arming alone moves nothing"
+    bench.run(2.0, FORWARD)
+    last = bench.wheels[-1]
+    assert (last.left_speed_rad_s, last.right_speed_rad_s) == pytest.approx(FORWARD, abs=0.02)
+    for wheel, name in enumerate(("left_angle_rad", "right_angle_rad")):
+        moved = getattr(last, name) - getattr(bench.wheels[0], name)
+        behind = bench.robot.speed[wheel] * (bench.now_ns - last.t_ns) * 1e-9
+        assert moved == pytest.approx(bench.robot.angle[wheel] - behind, abs=0.05)
+
+
+def test_limits_are_those_declared_and_said_to_be(bench):
+    bench.run_until(*STILL)
+    found = bench.driver.capabilities
+    assert not found.told
+    assert found.ticks_per_rev is None
+    assert found.max_wheel_speed_rad_s > 0.0
+
+
+def test_a_silent_host_is_stopped_by_the_controller_and_nothing_moves_when_it_is_back(vendor, bench):
+    drive(bench)
+    bench.host_runs = False
+    bench.run(vendor.watchdog_s + COASTING_S)
+    assert bench.robot.speed_rad_s < 0.05
+    bench.host_runs = True
+    bench.largest_speed = 0.0
+    bench.run(3.0)
+    assert bench.largest_speed < 0.05
+    assert bench.driver.state in (*STILL, DriverState.FAULT)
+
+
+def test_without_commands_the_controllers_watchdog_is_not_fed(vendor, bench):
+    """Alive and listening, but no command: nothing else that the driver sends may keep the motors running."""
+    drive(bench)
+    bench.command = None
+    bench.run(vendor.watchdog_s + COASTING_S)
+    assert bench.robot.speed_rad_s < 0.05
+    bench.run(2.0, FORWARD)
+    assert bench.robot.speed_rad_s < 0.05
+    assert bench.driver.state is not DriverState.ARMED
+
+
+def test_disarming_ramps_down_and_says_so_until_it_stands(bench):
+    drive(bench)
+    bench.driver.request(Request.STANDBY)
+    assert bench.driver.state is DriverState.STOPPING
+    bench.run(0.1)
+    assert 0.5 < bench.robot.speed_rad_s < max(FORWARD), "it is slowed down, not let go"
+    bench.run_until(*STILL)
+    bench.run(0.2)
+    assert bench.robot.speed_rad_s < 0.05
+    assert bench.robot.controller.wheels_rad_s == (None, None) or bench.robot.controller.brakes
+
+
+def test_an_arming_that_is_taken_back_moves_nothing(bench):
+    bench.run_until(*STILL)
+    bench.driver.request(Request.ARM)
+    bench.run(0.05, FORWARD)
+    bench.driver.request(Request.STANDBY)
+    bench.run(2.0, FORWARD)
+    assert bench.driver.state in STILL
+    assert bench.largest_speed == 0.0
+
+
+def test_one_side_lost_stops_the_other_and_stays_a_fault(vendor, bench):
+    drive(bench)
+    vendor.lose_left(bench.robot)
+    bench.run_until(DriverState.FAULT, timeout_s=0.5)
+    bench.run(0.05)
+    assert bench.robot.controller.wheels_rad_s[1] in (None, 0.0)
+    assert len(bench.driver.detail) > 10
+    bench.driver.request(Request.ARM)
+    bench.run(COASTING_S, FORWARD)
+    assert bench.driver.state is DriverState.FAULT
+    assert bench.robot.speed_rad_s < 0.05
+
+
+def test_an_error_cleared_does_not_energise_again(vendor, bench):
+    drive(bench)
+    vendor.lose_left(bench.robot)
+    bench.run_until(DriverState.FAULT, timeout_s=0.5)
+    bench.run(COASTING_S)
+    bench.driver.request(Request.RESET)
+    bench.run_until(*STILL)
+    bench.largest_speed = 0.0
+    bench.run(2.0, FORWARD)
+    assert bench.largest_speed < 0.05
+    bench.arm()
+    bench.run(0.5, FORWARD)
+    assert bench.robot.speed == pytest.approx(FORWARD, abs=0.02)
+
+
+@pytest.mark.parametrize("when", ["before", "standby", "arming", "armed", "stopping", "fault"])
+def test_the_emergency_stop_stops_in_every_state(vendor, bench, when):
+    if when != "before":
+        bench.run_until(*STILL)
+    if when in ("armed", "stopping", "fault"):
+        drive(bench)
+    if when == "arming":
+        bench.driver.request(Request.ARM)
+        bench.run(0.045)
+    if when == "stopping":
+        bench.driver.request(Request.STANDBY)
+    if when == "fault":
+        vendor.lose_left(bench.robot)
+        bench.run_until(DriverState.FAULT, timeout_s=0.5)
+    bench.command = command(*FORWARD)
+    bench.send_estop()
+    bench.run(0.05)
+    assert bench.robot.controller.wheels_rad_s in ((None, None), (0.0, 0.0))
+    bench.run(COASTING_S)
+    assert bench.robot.speed_rad_s < 0.05
+    assert bench.driver.state is DriverState.ESTOP
+    bench.driver.request(Request.ARM)
+    bench.largest_speed = 0.0
+    bench.run(2.0)
+    assert bench.driver.state is DriverState.ESTOP
+    assert bench.largest_speed < 0.05
+    bench.driver.request(Request.RESET)
+    bench.run_until(*STILL)
+    bench.run(2.0)
+    assert bench.largest_speed < 0.05
+
+
+def test_an_emergency_stop_from_beside_the_daemon_stops_it_and_is_confirmed(vendor, bench):
+    from drivers.motor import find_driver
+
+    drive(bench)
+    found = find_driver(vendor.name)
+    heard = found.stop_confirmation(vendor.settings)
+    for frame in found.stop_frames(vendor.settings):
+        bench.inject_to_robot(frame.can_id, frame.data)
+    bench.run(0.05)
+    assert bench.robot.controller.wheels_rad_s in ((None, None), (0.0, 0.0))
+    confirmed = False
+    for _ in range(500):
+        bench.now_ns += 1_000_000
+        bench.robot.step(bench.now_ns)
+        frames = bench.robot.drain()
+        confirmed = confirmed or True in [heard(frame) for frame in frames]
+        for frame in frames:
+            bench._send(bench.robot_end, frame)
+    assert confirmed
+    bench.run(1.0, FORWARD)
+    assert bench.driver.state in (DriverState.ESTOP, DriverState.FAULT)
+    assert bench.driver.state is not DriverState.ARMED
+
+
+def test_a_line_unplugged_stops_the_robot_and_reconnection_never_arms(vendor, bench):
+    drive(bench)
+    bench.host_end.plug(False)
+    bench.run(vendor.watchdog_s + COASTING_S)
+    assert bench.driver.state is DriverState.DISCONNECTED
+    assert bench.robot.speed_rad_s < 0.05
+    bench.driver.request(Request.ARM)
+    bench.host_end.plug(True)
+    bench.largest_speed = 0.0
+    bench.run(3.0, FORWARD)
+    assert bench.driver.state in (*STILL, DriverState.FAULT)
+    assert bench.largest_speed < 0.05
+    assert bench.wheels[-1].left_angle_rad > 1.0, "the angles go on from where they were"
+
+
+@pytest.mark.parametrize("out_for_s", [0.03, 0.09, 0.15])
+def test_a_short_interruption_disarms_too(vendor, bench, out_for_s):
+    drive(bench)
+    bench.host_end.plug(False)
+    bench.run(out_for_s)
+    bench.host_end.plug(True)
+    bench.run(COASTING_S, FORWARD)
+    assert bench.driver.state is not DriverState.ARMED
+    assert bench.robot.speed_rad_s < 0.05
+    assert bench.robot.controller.wheels_rad_s in ((None, None), (0.0, 0.0))
+
+
+def test_a_brown_out_disarms_and_nothing_moves_after_it(bench):
+    drive(bench)
+    bench.robot.controller.restart()
+    bench.run(COASTING_S)
+    assert bench.driver.state is not DriverState.ARMED
+    bench.largest_speed = 0.0
+    bench.run(2.0, FORWARD)
+    assert bench.largest_speed < 0.05
+
+
+def test_telemetry_that_stops_while_armed_is_a_lost_controller(bench):
+    drive(bench)
+    bench.robot.drain = list
+    bench.run(1.0, FORWARD)
+    assert bench.driver.state is not DriverState.ARMED
+    assert not [frame for frame in bench.robot.received[-1:] if frame.data[:4] not in (bytes(4), b"\1\0\0\0")]
+
+
+def test_another_host_on_the_link_disarms_and_is_named(vendor, bench):
+    drive(bench)
+    bench.inject_to_host(vendor.foreign.can_id, vendor.foreign.data)
+    bench.run(0.1)
+    assert bench.driver.state is not DriverState.ARMED
+    assert any("another host" in event for event in bench.events)
+
+
+def test_garbage_is_counted_never_raises_and_never_moves_faster(bench):
+    generator = random.Random(5)
+    bench.arm()
+    bench.command = command(*FORWARD)
+    for _ in range(2000):
+        can_id = generator.randrange(0x800)
+        bench.inject_to_host(can_id, generator.randbytes(generator.choice((0, 1, 7, 8, 8))))
+        bench.step()
+        assert all(map(math.isfinite, bench.robot.speed))
+    assert bench.largest_speed <= max(FORWARD) + 0.02
+    assert bench.driver.stats.unknown_id
+
+
+@pytest.mark.parametrize("bad", [(math.nan, 0.0), (0.0, math.inf), (0.0, -math.inf)])
+def test_a_command_that_is_none_is_the_callers_error(bench, bad):
+    bench.arm()
+    sent = bench.driver.stats.commands_sent
+    with pytest.raises(ValueError, match="not a wheel command"):
+        bench.driver.transmit(bench.now_ns, command(*bad))
+    assert bench.driver.stats.commands_sent == sent
+
+
+def test_it_arms_again_only_on_request(bench):
+    drive(bench)
+    sessions = bench.driver.stats.sessions
+    bench.driver.request(Request.READY)
+    bench.run(3.0, FORWARD)
+    assert bench.robot.speed_rad_s < 0.05
+    bench.arm()
+    assert bench.driver.stats.sessions == sessions + 1
+    assert bench.now_ns > START_NS

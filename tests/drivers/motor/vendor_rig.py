@@ -1,0 +1,59 @@
+"""A vendor's simulated controllers with wheels that follow at once, or coast where they are released."""
+
+import math
+
+from firmware_protocol.firmware_core import FirmwareInputs
+from sim.can_frame import CanFrame
+
+TICKS_PER_REV = 4096
+COASTING_S = 0.5
+START_NS = 50_000 * 1_000_000
+
+
+class VendorRig:
+    """What `bench.Bench` steps; `controller` of `sim.devices`. `speeds` are the highest seen while `watch` is on."""
+
+    def __init__(self, controller):
+        self.controller = controller
+        self.speed = [0.0, 0.0]
+        self.angle = [0.0, 0.0]
+        self.pressed = False
+        self.received = []
+        self._outgoing = []
+        self._stuck = set()
+
+    @property
+    def speed_rad_s(self):
+        return max(map(abs, self.speed))
+
+    def receive(self, now_ns, frame):
+        self.received.append(frame)
+        self._outgoing += self.controller.receive(self._us(now_ns), CanFrame(frame.can_id, frame.data, frame.extended))
+
+    def step(self, now_ns):
+        for side, wanted in enumerate(self.controller.wheels_rad_s):
+            if wanted is not None and side not in self._stuck:
+                self.speed[side] = wanted
+            else:
+                self.speed[side] *= math.exp(-1e-3 / COASTING_S)
+            self.angle[side] += 1e-3 * self.speed[side]
+        ticks = [round(angle / (2 * math.pi) * TICKS_PER_REV) for angle in self.angle]
+        inputs = FirmwareInputs(
+            left_ticks=ticks[0],
+            right_ticks=ticks[1],
+            left_speed_rad_s=self.speed[0],
+            right_speed_rad_s=self.speed[1],
+            estop_button=self.pressed,
+        )
+        self._outgoing += self.controller.step(self._us(now_ns), inputs)
+
+    def drain(self):
+        frames, self._outgoing = self._outgoing, []
+        return frames
+
+    def press_estop(self, pressed):
+        self.pressed = pressed
+
+    @staticmethod
+    def _us(now_ns):
+        return (now_ns - START_NS) // 1000

@@ -1,0 +1,97 @@
+"""Every driver of a vendor's controller, with what the conformance suite must know to drive and to break it."""
+
+import tomllib
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import msgspec
+
+from drivers.motor import find_driver, make_driver
+from sim.can_frame import CanFrame
+from sim.devices import find_controller
+from tests.drivers.motor.bench import Bench
+from tests.drivers.motor.vendor_rig import TICKS_PER_REV, VendorRig
+
+
+@dataclass(frozen=True)
+class Vendor:
+    """A driver and its simulator, with the settings of its example and `changes` to them.
+
+    `watchdog_s`: after what silence the controller lets go. `lose_left`: break the left side alone. `is_motion`: of a
+    frame that moves a wheel; `is_forbidden`: one that no driver ever sends; `foreign`: one that another host would.
+    """
+
+    name: str
+    label: str
+    changes: str
+    watchdog_s: float
+    lose_left: Callable[[VendorRig], None]
+    is_motion: Callable[[CanFrame], bool]
+    is_forbidden: Callable[[CanFrame], bool]
+    foreign: CanFrame
+
+    @property
+    def settings(self):
+        driver = find_driver(self.name)
+        return msgspec.convert({**tomllib.loads(driver.example), **tomllib.loads(self.changes)}, driver.settings)
+
+    def bench(self, **options):
+        controller = find_controller(self.name)(self.settings, TICKS_PER_REV)
+        return Bench(make_driver(self.name, self.settings), VendorRig(controller), **options)
+
+    def __str__(self):
+        return self.label
+
+
+def fail_left_odrive(rig):
+    rig.controller.axes[0][0].fail(0x40 if rig.controller.boards[0].generation == "0.5" else 0x1000)
+
+
+def is_odrive_motion(frame):
+    """A velocity that is not zero, a position or torque, or a state that calibrates or spins."""
+    command = frame.can_id & 0x1F
+    if command == 0x07:
+        return frame.data[0] not in (1, 8)
+    return command in (0x0C, 0x0E) or (command == 0x0D and frame.data[:4] not in (bytes(4), b"\0\0\0\x80"))
+
+
+def is_odrive_forbidden(frame):
+    """What calibrates, spins, reboots, renames, moves the encoder's count, or writes a parameter."""
+    command = frame.can_id & 0x1F
+    if command == 0x07:
+        return frame.data[0] not in (1, 8)
+    return command in (0x06, 0x16, 0x19) or (command == 0x04 and frame.data[:1] == b"\1")
+
+
+VENDORS = (
+    Vendor(
+        "odrive",
+        "odrive-0.6",
+        "",
+        0.1,
+        fail_left_odrive,
+        is_odrive_motion,
+        is_odrive_forbidden,
+        CanFrame(3 << 5 | 0x0D, bytes(8)),
+    ),
+    Vendor(
+        "odrive",
+        "odrive-0.5",
+        'firmware = "0.5"\n',
+        0.1,
+        fail_left_odrive,
+        is_odrive_motion,
+        is_odrive_forbidden,
+        CanFrame(5 << 5 | 0x0D, bytes(8)),
+    ),
+    Vendor(
+        "odrive",
+        "odrive-four-axes",
+        "nodes = [[3, 5], [6, 7]]\n",
+        0.1,
+        fail_left_odrive,
+        is_odrive_motion,
+        is_odrive_forbidden,
+        CanFrame(6 << 5 | 0x0D, bytes(8)),
+    ),
+)

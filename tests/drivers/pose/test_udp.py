@@ -1,0 +1,78 @@
+"""Poses in datagrams: both forms, real sockets, hostile ones."""
+
+import json
+import socket
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers.pose import PoseSourceError, make_pose_source
+from drivers.pose.udp import pose_of
+
+NOW_NS = 100_000_000_000
+POSE = {"x_m": 1.0, "y_m": -2.0, "yaw_rad": 0.5, "position_std_m": 0.01, "yaw_std_rad": 0.02}
+
+
+@pytest.fixture
+def port():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened:
+        opened.bind(("127.0.0.1", 0))
+        return opened.getsockname()[1]
+
+
+@pytest.mark.parametrize("encode", [msgspec.json.encode, msgspec.msgpack.encode], ids=["json", "msgpack"])
+def test_a_datagram_is_a_pose_at_its_own_time(encode):
+    pose = pose_of(encode({**POSE, "age_s": 0.04}), NOW_NS)
+    assert (pose.t_ns, pose.received_ns) == (NOW_NS - 40_000_000, NOW_NS)
+    assert (pose.x_m, pose.y_m, pose.yaw_rad, pose.position_std_m, pose.yaw_std_rad) == tuple(POSE.values())
+    assert pose_of(encode({**POSE, "t_ns": NOW_NS - 7}), NOW_NS).t_ns == NOW_NS - 7
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"age_s": -1.0},
+        {"age_s": 11.0},
+        {"t_ns": NOW_NS + 1},
+        {},
+        {"age_s": 0.0, "x_m": "1"},
+        {"age_s": 0.0, "yaw_std_rad": -1.0},
+        {"age_s": 0.0, "x_m": None},
+    ],
+)
+def test_what_is_no_pose_of_now_is_none(change):
+    assert pose_of(json.dumps({**POSE, **change}).encode(), NOW_NS) is None
+
+
+@pytest.mark.parametrize("word", [b"NaN", b"1e999", b"-Infinity"])
+def test_a_number_that_is_not_finite_is_none(word):
+    text = json.dumps({**POSE, "age_s": 0.0}).encode().replace(b"-2.0", word)
+    assert pose_of(text, NOW_NS) is None
+
+
+@given(st.binary(max_size=200))
+def test_no_bytes_break_it(datagram):
+    assert pose_of(datagram, NOW_NS) is None
+
+
+def test_over_a_real_socket_in_order_and_the_malformed_counted(port):
+    source = make_pose_source("udp", port=port)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        for age_s in (0.01, 0.05):
+            sender.sendto(json.dumps({**POSE, "age_s": age_s}).encode(), ("127.0.0.1", port))
+        sender.sendto(b"hello", ("127.0.0.1", port))
+        assert [NOW_NS - pose.t_ns for pose in source.receive(NOW_NS, ())] == [50_000_000, 10_000_000]
+    assert source.malformed == 1
+    assert list(source.receive(NOW_NS, ())) == []
+    source.close()
+    source.close()
+    assert list(source.receive(NOW_NS, ())) == []
+
+
+def test_a_port_that_is_taken_is_refused_in_one_line(port):
+    first = make_pose_source("udp", port=port)
+    with pytest.raises(PoseSourceError, match=rf"127\.0\.0\.1:{port}: .*; choose another pose\.port"):
+        make_pose_source("udp", port=port)
+    first.close()
