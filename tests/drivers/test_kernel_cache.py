@@ -1,9 +1,10 @@
 """Machine code on disk is loaded only from a directory of this user's own: a planted pickle is not run."""
 
 import math
+import multiprocessing
 import os
 import pickle
-import subprocess
+import runpy
 import sys
 from pathlib import Path
 
@@ -48,14 +49,35 @@ def script(request, tmp_path):
     return path
 
 
+# Processes forked from one that has imported what is large, as each test needs several.
+FORKED = multiprocessing.get_context("forkserver")
+FORKED.set_forkserver_preload(["disco_hw.jit", "drivers.kernel_cache"])
+
+
+def run_script(script, out, **environment):
+    """Be a process of Python with this environment, which runs the script."""
+    os.environ.update(environment)
+    os.environ.pop("XDG_CACHE_HOME", None)
+    numba.config.reload_config()
+    for name in ("stdout", "stderr"):
+        setattr(sys, name, (out / name).open("w", encoding="utf-8"))
+    sys.argv = [str(script), "21"]
+    runpy.run_path(str(script), run_name="__main__")
+    sys.stdout.flush()
+    sys.stderr.flush()
+
+
 def run(script, cache, home):
-    environment = {**os.environ, "NUMBA_CACHE_DIR": str(cache or ""), "HOME": str(home)}
-    environment.pop("XDG_CACHE_HOME", None)
-    command = [sys.executable, str(script), "21"]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120, check=True)
-    value, loaded = done.stdout.split()
+    out = script.parents[1]
+    environment = {"NUMBA_CACHE_DIR": str(cache or ""), "HOME": str(home)}
+    process = FORKED.Process(target=run_script, args=(script, out), kwargs=environment)
+    process.start()
+    process.join(120.0)
+    said, told = ((out / name).read_text(encoding="utf-8") for name in ("stdout", "stderr"))
+    assert process.exitcode == 0, told
+    value, loaded = said.split()
     assert value == "42.0"
-    return loaded == "True", done.stderr
+    return loaded == "True", told
 
 
 def plant(cache, marker):
