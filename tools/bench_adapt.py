@@ -17,8 +17,7 @@ from disco_hw.adaptation.link import InForce, ProcessLink
 from disco_hw.adaptation.network import Training, train_network, training_range
 from disco_hw.adaptation.recursive import evidence
 from disco_hw.daemon.warm_up import warm_up
-from disco_hw.experiments.adapt import AdaptOptions, run_adapt
-from disco_hw.experiments.changing_robot import drive_through_change
+from disco_hw.experiments.adapt import AdaptOptions, drive_through_change, run_adapt
 from disco_hw.experiments.live_stack import FAST_START, FAST_TASK, running_stack
 from disco_hw.inference.noise import USUAL
 from disco_hw.runtime.assembly import make_adaptation, make_pipeline, make_planner, put_in_force

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 import disco_hw
 from disco_hw.control import CommandLimits, Disco, DiscoSettings, PlannerState, SentCommand
-from disco_hw.experiments.circle import plants
-from disco_hw.experiments.plant import KinematicPlant
+from disco_hw.experiments.circle import KinematicPlant, plants
 from disco_hw.model import Model, load_model
 from disco_hw.tasks.line.waypoints import load_waypoints
 from disco_hw.tasks.path import PathTask

@@ -13,7 +13,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 
-from disco_hw.drive.separating import separating
+from disco_hw.drive.scripts import separating
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap import find_gap
 from disco_hw.gap.report.blind_spots import BlindSpot

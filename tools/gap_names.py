@@ -26,7 +26,7 @@ from tools.gap_jobs import MODEL, Job, jobs  # first: it sets the threads of the
 import numpy as np
 
 from disco_hw.gap import GapReport, find_gap
-from disco_hw.gap.report.wording import as_text
+from disco_hw.gap.report.page import as_text
 from disco_hw.log.drive import DriveLog
 from tools.gap_logs import LARGEST_RAD_S, simulated_drive
 

@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 
 from disco_hw.inference.infer import Inference, InferOptions, infer
-from disco_hw.inference.region import Region
+from disco_hw.inference.rounds import Region
 from disco_hw.inference.simulate import draw_seeds
 from tools.infer_study import config, logged, plant
 

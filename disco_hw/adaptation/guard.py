@@ -14,7 +14,7 @@ from disco_hw.effects.effect import Channel
 from disco_hw.errors import InputError
 from disco_hw.log.records import BeliefChange
 from disco_hw.model import Gaussian, Model
-from disco_hw.model.parameter import BASE_PARAMETERS
+from disco_hw.model.model import BASE_PARAMETERS
 
 Array = NDArray[np.float64]
 

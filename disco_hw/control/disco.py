@@ -25,8 +25,7 @@ from disco_hw.effects.effect import Channel
 from disco_hw.effects.registry import DELAY
 from disco_hw.model import Belief, Model
 from disco_hw.model.free_run import FreeRun
-from disco_hw.model.model import coefficient_tables
-from disco_hw.model.parameter import BASE_PARAMETERS
+from disco_hw.model.model import BASE_PARAMETERS, coefficient_tables
 from disco_hw.model.step import integration_series
 from disco_hw.tasks import PlannedTask
 

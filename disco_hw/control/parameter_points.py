@@ -11,7 +11,7 @@ from disco_hw.control.sigma_points import sigma_points
 from disco_hw.effects.effect import Channel
 from disco_hw.effects.registry import DELAY
 from disco_hw.model import Belief, Mixture, Model
-from disco_hw.model.parameter import BASE_PARAMETERS, X_ICR
+from disco_hw.model.model import BASE_PARAMETERS, X_ICR
 from disco_hw.model.terms import effect_of
 
 Array = NDArray[np.float64]

@@ -1,4 +1,4 @@
-"""Tells sentences to whoever reads the output, and never waits for them."""
+"""Prints sentences without ever waiting for the reader, and says which are worth repeating."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ import os
 import queue
 import threading
 from collections.abc import Callable
+
+from disco_hw.runtime.states import State
 
 STANDARD_OUTPUT, STANDARD_ERROR = 1, 2
 _MOST_LINES = 1000
@@ -57,3 +59,24 @@ class AsyncPrinter:
             with contextlib.suppress(OSError):
                 while line:
                     line = line[os.write(self._descriptor, line) :]
+
+
+_WAITS_FOR_ROBOT = frozenset({State.DISCONNECTED, State.HANDSHAKE})
+_PATIENT_AFTER = 60
+_EVERY = 60
+
+
+class Waiting:
+    """Asked once a second; what stays the same for a minute is then said once a minute, as a journal is not endless."""
+
+    def __init__(self) -> None:
+        self._said = ""
+        self._repeated = 0
+
+    def is_worth_saying(self, state: State, words: str) -> bool:
+        """Tell whether these words of this state should be said now."""
+        if words != self._said:
+            self._said, self._repeated = words, 0
+            return True
+        self._repeated += 1
+        return state in _WAITS_FOR_ROBOT and (self._repeated < _PATIENT_AFTER or self._repeated % _EVERY == 0)

@@ -11,10 +11,9 @@ from typing import Any
 
 from disco_hw.config import RobotConfig
 from disco_hw.daemon.client import send_request, socket_path
-from disco_hw.daemon.link import make_link
 from disco_hw.daemon.realtime import can_lock_memory, can_use_fifo
 from disco_hw.errors import InputError, WorkError
-from disco_hw.runtime.assembly import pose_source_of
+from disco_hw.runtime.assembly import make_link, pose_source_of
 from disco_hw.runtime.preflight import (
     Check,
     Level,

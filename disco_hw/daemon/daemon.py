@@ -17,7 +17,7 @@ from disco_hw.adaptation.guard import check_adaptable
 from disco_hw.adaptation.link import ProcessLink
 from disco_hw.config import RobotConfig
 from disco_hw.daemon import realtime
-from disco_hw.daemon.async_printer import STANDARD_OUTPUT, AsyncPrinter
+from disco_hw.daemon.async_printer import STANDARD_OUTPUT, AsyncPrinter, Waiting
 from disco_hw.daemon.client import (
     ADAPT_ACTIONS,
     PAGE_ACTIONS,
@@ -28,26 +28,22 @@ from disco_hw.daemon.client import (
 )
 from disco_hw.daemon.compiling import compiled_elsewhere
 from disco_hw.daemon.control_socket import ControlMessage, ControlServer
-from disco_hw.daemon.link import make_link
 from disco_hw.daemon.loop import Clock, Loop, MonotonicClock
 from disco_hw.daemon.page_feed import ViewerFeed, WatchedRecorder, feed_path
-from disco_hw.daemon.signals import StopPath, StopSignals
+from disco_hw.daemon.signals import Notifier, StopPath, StopSignals
 from disco_hw.daemon.socket_place import passed_over
 from disco_hw.daemon.status import counters, loop_figures, status
-from disco_hw.daemon.systemd import Notifier
-from disco_hw.daemon.waiting import Waiting
 from disco_hw.daemon.warm_up import warm_up
 from disco_hw.log import records
 from disco_hw.log.link import Attachment
 from disco_hw.log.provenance import DBC, version
 from disco_hw.log.recorder import NullRecorder, ProcessRecorder, Recorder, Recording
 from disco_hw.runtime import records_of_tick
-from disco_hw.runtime.assembly import assemble_core, make_adaptation, make_pipeline, make_planner
+from disco_hw.runtime.assembly import assemble_core, make_adaptation, make_link, make_pipeline, make_planner
 from disco_hw.runtime.core import CoreTick, DaemonCore
-from disco_hw.runtime.log_setup import kept_files
 from disco_hw.runtime.pilot import Pilot, TaskPilot
 from disco_hw.runtime.pipeline import NoPlanner, Pipeline, Planner
-from disco_hw.runtime.robot_setup import Setup, link_key, load_setup, refuse_missing_effects
+from disco_hw.runtime.robot_setup import Setup, kept_files, link_key, load_setup, refuse_missing_effects
 from disco_hw.runtime.situation import Ask, advice, by_command, headline
 from disco_hw.runtime.states import State
 from disco_hw.runtime.supervisor import Reply, UserRequest

@@ -13,7 +13,7 @@ from types import MappingProxyType
 from disco_hw import effects
 from disco_hw.effects.effect import STAGE_GROUPS, Effect, Stage
 from disco_hw.errors import InputError
-from disco_hw.jit.plugins import plugin_modules
+from disco_hw.jit import plugin_modules
 
 
 def _discover() -> dict[str, Effect]:

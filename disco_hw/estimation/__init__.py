@@ -1,7 +1,7 @@
 """Fusion of wheel odometry and measured pose."""
 
+from disco_hw.estimation.correction import PoseReason
 from disco_hw.estimation.fusion import Estimate, FusionStats, PoseFusion, PoseUpdate
-from disco_hw.estimation.gate import PoseReason
 from disco_hw.estimation.odometry import OdometryParameters, Pose, advance
 
 __all__ = [

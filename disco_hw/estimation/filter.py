@@ -6,10 +6,8 @@ import msgspec
 
 from disco_hw.config import Estimation
 from disco_hw.estimation.belief import Belief, belief_at, motion_model, predict, rebased
-from disco_hw.estimation.correction import Correction, PoseCorrector, Triple
-from disco_hw.estimation.gate import Measurement, PoseReason, gate_limit
-from disco_hw.estimation.odometry import OdometryParameters, Pose, arc
-from disco_hw.estimation.wheels import WheelReading
+from disco_hw.estimation.correction import Correction, Measurement, PoseCorrector, PoseReason, Triple, gate_limit
+from disco_hw.estimation.odometry import OdometryParameters, Pose, WheelReading, arc
 
 # Without newer samples the wheels are taken to keep their speeds for so long, then to stand.
 MAX_EXTRAPOLATION_S = 0.2

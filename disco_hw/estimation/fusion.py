@@ -8,12 +8,17 @@ import msgspec
 
 from disco_hw.config import Estimation
 from disco_hw.estimation.belief import MAX_POSITION_VARIANCE, MAX_YAW_VARIANCE
-from disco_hw.estimation.correction import Triple
+from disco_hw.estimation.correction import PoseReason, Triple, screen
 from disco_hw.estimation.filter import Judgement, PoseFilter
-from disco_hw.estimation.gate import PoseReason, screen
 from disco_hw.estimation.history import RewindBuffer
-from disco_hw.estimation.odometry import Matrix3, OdometryParameters, Pose
-from disco_hw.estimation.wheels import FUTURE_TOLERANCE_NS, WheelReason, WheelTracker
+from disco_hw.estimation.odometry import (
+    FUTURE_TOLERANCE_NS,
+    Matrix3,
+    OdometryParameters,
+    Pose,
+    WheelReason,
+    WheelTracker,
+)
 from drivers.types import PoseSample, WheelSample
 
 GAP_INTERVALS = 3.0

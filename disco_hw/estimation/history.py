@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 
+from disco_hw.estimation.correction import Measurement, PoseReason
 from disco_hw.estimation.filter import FilterState, Judgement, PoseFilter
-from disco_hw.estimation.gate import Measurement, PoseReason
-from disco_hw.estimation.wheels import WheelReading
+from disco_hw.estimation.odometry import WheelReading
 
 Event = WheelReading | Measurement
 

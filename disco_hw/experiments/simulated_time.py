@@ -17,10 +17,9 @@ from disco_hw.log.recorder import MemoryRecorder, ProcessRecorder, Recording
 from disco_hw.model.file import model_text
 from disco_hw.runtime.assembly import assemble_core, make_adaptation, make_pipeline
 from disco_hw.runtime.core import CoreTick, DaemonCore
-from disco_hw.runtime.log_setup import kept_files
 from disco_hw.runtime.pilot import Pilot, TaskPilot
 from disco_hw.runtime.pipeline import Planner
-from disco_hw.runtime.robot_setup import Setup
+from disco_hw.runtime.robot_setup import Setup, kept_files
 from disco_hw.runtime.supervisor import UserRequest
 from drivers.motor import make_driver
 from firmware_protocol.firmware_core import FirmwareConfig

@@ -25,8 +25,7 @@ from disco_hw.gap.search.analysis import GapAnalysis, final_fit
 from disco_hw.gap.search.candidates import candidates_of
 from disco_hw.gap.search.channel_search import search_body, search_wheels
 from disco_hw.gap.search.cross_validation import PredictionErrors, worse_by
-from disco_hw.gap.search.predictive_pruning import prune
-from disco_hw.gap.search.stages import stage_predictions
+from disco_hw.gap.search.stages import prune, stage_predictions
 from disco_hw.gap.search.unnamed_terms import with_known_terms
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GapSettings
 from disco_hw.log.drive import DriveLog, concatenate

@@ -11,8 +11,7 @@ from disco_hw.config import load_robot_config
 from disco_hw.errors import WorkError
 from disco_hw.gap.find import find_gap
 from disco_hw.gap.report.findings import GapReport
-from disco_hw.gap.report.page import page
-from disco_hw.gap.report.wording import as_text
+from disco_hw.gap.report.page import as_text, page
 from disco_hw.log.load import load_drive
 from disco_hw.model import Model, load_model, save_model
 from disco_hw.reports.outputs import as_json, refuse_directory

@@ -1,22 +1,23 @@
-"""Where a log and the simulations could disagree: score tests for what a geometry leaves unexplained.
-
-For each way in which a robot can differ from the model, the whitened errors of displacement and yaw are compared with
-the pattern that the difference would leave, after everything that the geometry can absorb is taken out of it. The
-result is a t value; simulations of the same drive say how large it may be.
-"""
+"""Checks of an inference: what simulations leave unexplained, posterior prediction, and calibration of the widths."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_banded
+from scipy.stats import kstest
 
 from disco_hw.effects.effect import Symptom
 from disco_hw.effects.registry import REGISTRY
-from disco_hw.inference.estimates import Estimates, Whitening
+from disco_hw.inference.estimates import Estimates, Whitening, estimates
 from disco_hw.inference.excitation import Excitation
+from disco_hw.inference.noise import Noise
+from disco_hw.inference.rounds import Fitted, Simulate
+from disco_hw.inference.simulate import NAMES, Simulator, draw_seeds
+from disco_hw.inference.workers import Workers
 
 Array = NDArray[np.float64]
 
@@ -142,3 +143,128 @@ def _scores(whitened: tuple[Array, int]) -> Array:
     spread = max(float(error.std()), 1e-12)
     seen = length > _LEAST_LEFT * np.maximum(before, 1e-300)
     return np.asarray(np.where(seen, left.T @ error / np.where(seen, length, 1.0) / spread, 0.0))
+
+
+# On logs of robots without any difference the largest of all values stays below this (tools/infer_study.py).
+LARGEST_DEVIATION = 5.0
+_EDGE_DEVIATIONS = 1.5
+_OUTSIDE_SHARE = 0.01
+_EDGE_WIDTH = 0.1
+
+
+@dataclass(frozen=True)
+class Predictive:
+    """`deviations` (13,): how far the log's value of each of `CHECKS` is from the simulated ones, in their standard
+    deviations; `estimate_deviations` (3,) the same for the estimates of wheel radius, x_icr and kappa. `edge` names
+    parameters whose posterior is pressed against the prior's edge.
+    """
+
+    deviations: Array
+    estimate_deviations: Array
+    edge: tuple[str, ...]
+
+    @property
+    def outside_simulated(self) -> bool:
+        """Whether the log is unlike every simulation under the posterior."""
+        largest = max(np.abs(self.deviations).max(), np.abs(self.estimate_deviations).max())
+        return bool(largest > LARGEST_DEVIATION) or bool(self.edge)
+
+    @property
+    def disagreements(self) -> list[tuple[ScoreTest, float]]:
+        """The checks that disagree, the worst first, with their deviations."""
+        order = np.argsort(-np.abs(self.deviations))
+        return [(CHECKS[i], float(self.deviations[i])) for i in order if abs(self.deviations[i]) > LARGEST_DEVIATION]
+
+
+def predictive(
+    drive: Excitation,
+    noise: Noise,
+    simulator: Simulator,
+    draws: Array,
+    low: Array,
+    high: Array,
+    seed: int,
+    workers: Workers | None = None,
+    done: Callable[[int], None] = lambda _: None,
+) -> Predictive:
+    """Compare a log with simulations at posterior `draws` (n, 3), one each; `low`, `high` (3,) bound the prior.
+
+    `workers` and `done` as for `Simulator.summaries`.
+    """
+    weights = estimates(drive, noise)
+    scores = Scores(drive, weights)
+    seeds = draw_seeds(draws.shape[0], np.random.default_rng(seed))
+
+    def both(poses: Array) -> Array:
+        return np.column_stack([np.array([scores(one) for one in poses]), weights.raw(poses)])
+
+    simulated, fits = np.split(simulator.summaries(draws, seeds, both, workers, done), [len(CHECKS)], axis=1)
+    deviations = _deviations(scores(drive.pose), simulated)
+    fit_deviations = _deviations(weights.raw(drive.pose[None])[0], fits)
+    return Predictive(deviations, fit_deviations, edge_parameters(draws, low, high, weights.theta(drive.pose[None])[0]))
+
+
+def edge_parameters(draws: Array, low: Array, high: Array, estimate: Array) -> tuple[str, ...]:
+    """Parameters determined well (sd below a tenth of the range) that the prior cuts off.
+
+    Their mean is within 1.5 sd of an edge (the half of a Gaussian that an edge leaves has its mean 1.3 of its own sd
+    away from it), or the plain `estimate` (3,) is outside by a hundredth of the range.
+    """
+    span = high - low
+    mean, sd = draws.mean(axis=0), draws.std(axis=0)
+    pressed = np.minimum(mean - low, high - mean) < _EDGE_DEVIATIONS * sd
+    pressed |= np.minimum(estimate - low, high - estimate) < -_OUTSIDE_SHARE * span
+    pressed &= sd < _EDGE_WIDTH * span
+    return tuple(name for name, flag in zip(NAMES, pressed.tolist(), strict=True) if flag)
+
+
+def _deviations(observed: Array, simulated: Array) -> Array:
+    spread = simulated.std(axis=0)
+    seen = spread > 1e-12
+    return np.asarray(np.where(seen, (observed - simulated.mean(axis=0)) / np.where(seen, spread, 1.0), 0.0))
+
+
+LEVELS = (0.5, 0.8, 0.9, 0.95)
+_DRAWS = 200
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """From fresh simulations at parameters drawn from the last region.
+
+    `ranks` (n, 3) in [0, 1] of the true parameters among posterior draws, uniform if calibrated, and `p_values` (3,) of
+    the Kolmogorov-Smirnov test for that; `coverage` (levels,) of the joint highest-density regions of `LEVELS`.
+    """
+
+    ranks: Array
+    p_values: Array
+    coverage: Array
+
+
+def calibrate(fitted: Fitted, simulate: Simulate, count: int, seed: int) -> Calibration:
+    """Simulation-based calibration (Talts et al., 2018) and expected coverage, on `count` fresh simulations."""
+    rng = np.random.default_rng(seed)
+    truth = fitted.region.draw(count, rng)
+    statistics = simulate(truth, draw_seeds(count, rng))
+    draws, _ = fitted.draw(statistics, _DRAWS, rng)
+    # A rank between two draws is anywhere between them.
+    ranks = ((draws < truth[:, None]).sum(axis=1) + rng.random(truth.shape)) / (_DRAWS + 1.0)
+    mixtures = fitted.network.mixtures(statistics)
+    size = truth.shape[1]
+    unit = fitted.region.unit(draws.reshape(-1, size)).reshape(draws.shape)
+    density = mixtures.log_density(unit)
+    at_truth = mixtures.log_density(fitted.region.unit(truth)[:, None])[:, 0]
+    mass = (density > at_truth[:, None]).mean(axis=1)
+    return Calibration(
+        ranks,
+        np.array([float(kstest(column, "uniform").pvalue) for column in ranks.T]),
+        np.array([float((mass <= level).mean()) for level in LEVELS]),
+    )
+
+
+def effective_simulations(fitted: Fitted, observed: Array) -> float:
+    """How many simulations of the last region the posterior rests on: (sum w)^2 / sum w^2 with w its density there."""
+    mixtures = fitted.network.mixtures(observed[None])
+    log_weight = mixtures.log_density(fitted.region.unit(fitted.theta)[None])[0]
+    weight = np.exp(log_weight - log_weight.max())
+    return float(weight.sum() ** 2 / (weight**2).sum())

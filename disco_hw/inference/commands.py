@@ -1,10 +1,17 @@
-"""What `disco-hw infer` does."""
+"""What `disco-hw infer` does: the inference, and beside it, in another process, the search of `gap`.
+
+Fitted alone, the parameters absorb an effect that the model lacks, sharply and wrongly, and no width of the posterior
+shows it.
+"""
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict, dataclass, replace
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -12,20 +19,66 @@ from typing import Any
 import numpy as np
 
 from disco_hw.config import load_robot_config
-from disco_hw.errors import WorkError
-from disco_hw.inference.calibration import LEVELS
-from disco_hw.inference.checks import CHECKS
+from disco_hw.errors import InputError, WorkError
+from disco_hw.inference.checks import CHECKS, LEVELS
 from disco_hw.inference.dask_workers import dask_workers
 from disco_hw.inference.excitation import excitation
-from disco_hw.inference.gap_check import GapCheck, gap_check_beside
 from disco_hw.inference.infer import Inference, InferOptions, infer
-from disco_hw.inference.progress import Tell
 from disco_hw.inference.simulate import NAMES
-from disco_hw.inference.workers import LocalWorkers, Workers
+from disco_hw.inference.workers import LocalWorkers, Tell, Workers
 from disco_hw.log.drive import DriveLog
 from disco_hw.log.load import load_drive
 from disco_hw.model import Model, save_model
 from disco_hw.reports.outputs import refuse_file
+
+
+@dataclass(frozen=True, slots=True)
+class GapCheck:
+    """Names of `missing` effects, the surest first; `not_judged` says why the log could not be searched, if so."""
+
+    missing: tuple[str, ...] = ()
+    not_judged: str | None = None
+
+
+def gap_check(log: DriveLog, model: Model) -> GapCheck:
+    """Search a log for effects that a model lacks."""
+    from disco_hw.gap.find import missing_effects  # noqa: PLC0415  (slow to import, needed only in that process)
+
+    try:
+        return GapCheck(missing_effects(log, model))
+    except InputError as error:
+        return GapCheck(not_judged=str(error))
+
+
+@contextmanager
+def gap_check_beside(log: DriveLog, model: Model) -> Iterator[Callable[[], GapCheck]]:
+    """Begin the search in a process of its own; yields what waits for its result, which raises WorkError."""
+    context = get_context("spawn")
+    result, send = context.Pipe(duplex=False)
+    process = context.Process(target=_search, args=(send, log, model), name="gap-check", daemon=True)
+    process.start()
+    send.close()
+
+    def wait() -> GapCheck:
+        try:
+            found: GapCheck = result.recv()
+        except EOFError:
+            raise WorkError("the search for missing effects broke off; run `disco-hw gap` to see why") from None
+        return found
+
+    try:
+        yield wait
+    finally:
+        process.terminate()
+        process.join()
+        result.close()
+
+
+def _search(send: Connection, log: DriveLog, model: Model) -> None:
+    # Ctrl-C is for the parent, which ends this process.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    send.send(gap_check(log, model))
+
 
 Search = Callable[[DriveLog, Model], AbstractContextManager[Callable[[], GapCheck]]]
 

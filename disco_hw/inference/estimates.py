@@ -1,16 +1,4 @@
-"""Summary statistics that carry the information: closed-form estimates of the parameters.
-
-The change of yaw is linear in kappa = r_w / a_w; given yaw, displacement between two poses is linear in r_w and x_icr:
-
-    dyaw = kappa (roll_R - roll_L)
-    dp = r_w (roll_L + roll_R)/2 (cos yaw, sin yaw) - x_icr 2 sin(kappa (roll_R - roll_L)/2) (-sin yaw, cos yaw)
-
-Yaw is the measured one in the middle between the poses; the turn that x_icr multiplies is the wheels', because what is
-measured of it is mostly noise from one pose to the next.
-
-Noise of the sensor makes neighbouring displacements correlated (-R), slip adds q dt to each variance, so the weights of
-least squares come from a tridiagonal covariance, whose bidiagonal Cholesky factor whitens any series in one pass.
-"""
+"""The statistics that inference compares: closed-form estimates that carry the information, and the paper's."""
 
 from __future__ import annotations
 
@@ -21,9 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.inference.compiled import parallel_kernel
 from disco_hw.inference.excitation import Excitation
 from disco_hw.inference.noise import Noise
+from disco_hw.jit import parallel_kernel
 
 Array = NDArray[np.float64]
 
@@ -135,3 +123,23 @@ def estimates(drive: Excitation, noise: Noise) -> Estimates:
         whitening(drive, noise.position_m, slip_m),
         whitening(drive, noise.yaw_rad, noise.slip_yaw_rad_sqrt_s),
     )
+
+
+PAPER_STATISTICS = ("mean x", "mean y", "mean dx", "mean dy")
+
+
+@dataclass(frozen=True, slots=True)
+class PaperStatistics:
+    """Call it with poses (n, P, 3) for the statistics (n, 4), in metres; steps across runs do not count."""
+
+    starts: NDArray[np.bool_]
+
+    def __call__(self, poses: Array) -> Array:
+        """Means over all poses of the log."""
+        steps = np.diff(poses[:, :, :2], axis=1)[:, ~self.starts[1:]]
+        return np.column_stack([poses[:, :, :2].mean(axis=1), steps.mean(axis=1)])
+
+
+def paper_statistics(drive: Excitation) -> PaperStatistics:
+    """The statistics of a drive."""
+    return PaperStatistics(drive.starts)

@@ -12,10 +12,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from disco_hw.inference.calibration import LEVELS
-from disco_hw.inference.checks import CHECKS
+from disco_hw.inference.checks import CHECKS, LARGEST_DEVIATION, LEVELS
 from disco_hw.inference.infer import Inference
-from disco_hw.inference.predictive import LARGEST_DEVIATION
 from disco_hw.inference.simulate import NAMES
 
 Array = NDArray[np.float64]

@@ -10,12 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.inference.compiled import parallel_kernel
 from disco_hw.inference.excitation import Excitation
 from disco_hw.inference.noise import Noise
 from disco_hw.inference.workers import LocalWorkers, Workers
-from disco_hw.model.model import Model, coefficient_tables
-from disco_hw.model.parameter import BASE_PARAMETERS
+from disco_hw.jit import parallel_kernel
+from disco_hw.model.model import BASE_PARAMETERS, Model, coefficient_tables
 from disco_hw.model.step import axle_of, integration_from, integration_series, step, tracked_of
 from disco_hw.model.tables import base_point, effect_point
 

@@ -1,4 +1,4 @@
-"""Who does the work that can be shared out: threads of this process, or somebody else's computers."""
+"""Who does the work that can be shared out: this process's threads or a Dask cluster; and how far it is."""
 
 from __future__ import annotations
 
@@ -33,3 +33,26 @@ class LocalWorkers:
     def call(self, work: Callable[..., R], *arguments: Any) -> R:
         """As `Workers.call`, in the caller's thread."""
         return work(*arguments)
+
+
+Tell = Callable[[str, float], None]
+
+
+class Tally:
+    """Counts simulations of `total` and tells the stage with the share that is done, in [0, 1]."""
+
+    def __init__(self, total: int, tell: Tell) -> None:
+        self._total = total
+        self._tell = tell
+        self._done = 0
+        self._stage = ""
+
+    def stage(self, text: str) -> None:
+        """A new stage begins."""
+        self._stage = text
+        self.add(0)
+
+    def add(self, count: int) -> None:
+        """So many more simulations are done."""
+        self._done += count
+        self._tell(self._stage, min(self._done / self._total, 1.0))

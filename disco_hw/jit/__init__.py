@@ -6,6 +6,8 @@ import hashlib
 import platform
 from collections.abc import Callable
 from functools import cache
+from importlib.metadata import entry_points
+from importlib.util import find_spec
 from pathlib import Path
 from types import CellType, FunctionType
 from typing import Any
@@ -20,8 +22,27 @@ from numba.core.typing.context import Context
 from numba.core.typing.templates import Signature
 from numba.extending import intrinsic, overload
 
-from disco_hw.jit.plugins import plugin_sources
 from drivers.kernel_cache import kept_on_disk
+
+GROUP = "disco_hw.effects"
+
+
+@cache
+def plugin_modules() -> tuple[str, ...]:
+    """Names of the modules, each with an `EFFECT` and its `term`, sorted."""
+    return tuple(sorted({point.module for point in entry_points(group=GROUP)}))
+
+
+def plugin_sources() -> tuple[Path, ...]:
+    """Their files, for whoever keeps compiled code; raises ModuleNotFoundError for a module that is not there."""
+    found = []
+    for module in plugin_modules():
+        spec = find_spec(module)
+        if spec is None or spec.origin is None:
+            raise ModuleNotFoundError(f"{module}: named as an effect by an installed package, but not there")
+        found.append(Path(spec.origin))
+    return tuple(found)
+
 
 # No `nnan`, `ninf` (non-finite costs must stay visible), no `reassoc` (sums keep their order, so a run replays), no
 # `arcp` (a quotient by a root is exact but where `reciprocal_root` asks for an estimate).
@@ -90,6 +111,14 @@ def sources_fingerprint() -> str:
     for path in plugin_sources():
         digest.update(path.read_bytes())
     return digest.hexdigest()
+
+
+def parallel_kernel(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Compile an entry point as `kernel_function` does, without the interpreter's lock while it runs: for threads."""
+    kernel: Any = kernel_function(function)
+    kernel.targetoptions["nogil"] = True
+    compiled: Callable[..., Any] = kernel
+    return compiled
 
 
 def kernel_function(function: Callable[..., Any]) -> Callable[..., Any]:

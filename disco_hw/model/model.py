@@ -15,8 +15,14 @@ from disco_hw.effects.effect import Effect, Parameter
 from disco_hw.effects.registry import MOTION_EFFECTS, REGISTRY
 from disco_hw.model.belief import Belief, Uniform
 from disco_hw.model.coefficients import Base, Coefficients, Effects, TermCoefficients
-from disco_hw.model.parameter import BASE_PARAMETERS
 from disco_hw.model.terms import COMMAND, TERMS, effect_of, table_entry
+
+WHEEL_RADIUS = Parameter("wheel_radius_m", "m", 0.005, 2.0, 0.06, neutral=0.06)
+AXIAL_DISTANCE = Parameter("axial_distance_m", "m", 0.02, 5.0, 0.4, neutral=0.4)
+X_ICR = Parameter("x_icr_m", "m", -2.0, 2.0, 0.0)
+
+BASE_PARAMETERS = (WHEEL_RADIUS, AXIAL_DISTANCE, X_ICR)
+
 
 Array = NDArray[np.float64]
 

@@ -27,6 +27,7 @@ from disco_hw.runtime.preflight import check_firmware_limits, check_task, failur
 from disco_hw.runtime.robot_setup import Setup, geometry
 from disco_hw.runtime.supervisor import Supervisor, SupervisorSettings
 from drivers.pose import PoseSourceError, make_pose_source
+from drivers.transport import ReconnectingTransport, TransportSettingsError, make_transport
 from drivers.types import Driver, PoseSource, Transport
 
 _REHEARSALS = 5
@@ -137,3 +138,11 @@ def preflight(config: RobotConfig, driver: Driver, with_task: bool = True) -> tu
     if with_task:
         checks.append(check_task(config.robot, config.task))
     return failures(checks)
+
+
+def make_link(setup: Setup) -> ReconnectingTransport:
+    """Return the link that robot.toml names, not yet opened. Raises InputError for what no device could satisfy."""
+    try:
+        return make_transport(**setup.config.link.medium_fields())
+    except TransportSettingsError as error:
+        raise InputError(f"{setup.robot_file}: {error}") from None

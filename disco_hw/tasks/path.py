@@ -12,9 +12,14 @@ from msgspec import Meta
 
 from disco_hw.errors import InputError
 from disco_hw.tasks.line.cost import PathCost
-from disco_hw.tasks.line.course import LineCourse, line_course
-from disco_hw.tasks.line.progress import PathProgress
-from disco_hw.tasks.line.speed import speed_range, straight_fastest_m_s, straight_too_fast
+from disco_hw.tasks.line.course import (
+    LineCourse,
+    PathProgress,
+    line_course,
+    speed_range,
+    straight_fastest_m_s,
+    straight_too_fast,
+)
 from disco_hw.tasks.line.table import PathTable
 from disco_hw.tasks.line.waypoints import check_size, load_waypoints, points_of
 from disco_hw.tasks.task import Chassis, Editable, Point, Positive, TaskFault

@@ -16,9 +16,14 @@ from numpy.typing import NDArray
 from disco_hw.errors import InputError
 from disco_hw.tasks.cost import Found, norm, single
 from disco_hw.tasks.line.cost import AGAINST_M
-from disco_hw.tasks.line.course import LineCourse, line_course
-from disco_hw.tasks.line.progress import END_M, part_in_words
-from disco_hw.tasks.line.speed import straight_fastest_m_s, straight_too_fast
+from disco_hw.tasks.line.course import (
+    END_M,
+    LineCourse,
+    line_course,
+    part_in_words,
+    straight_fastest_m_s,
+    straight_too_fast,
+)
 from disco_hw.tasks.line.waypoints import Waypoints, check_size, load_waypoints, points_of
 from disco_hw.tasks.task import Array, Chassis, Editable, Point, Prepared, TaskFault
 

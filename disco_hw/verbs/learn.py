@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from disco_hw.config.named_files import check_named_files
+from disco_hw.config.command_line import check_named_files
 from disco_hw.verbs.options import (
     AsJson,
     Logs,

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from disco_hw.config.link_option import FORMS
+from disco_hw.config.command_line import FORMS
 from disco_hw.reports import outputs
 
 RobotFile = Annotated[Path, typer.Argument(metavar="ROBOT.toml", help="The robot's configuration (docs/robot.md).")]

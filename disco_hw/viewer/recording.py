@@ -16,9 +16,8 @@ from disco_hw.errors import InputError
 from disco_hw.log.reader import Log
 from disco_hw.log.records import TOPICS, BeliefChange, FrameIn, FrameOut, Plan, Task
 from disco_hw.model import Model
-from disco_hw.runtime.log_setup import setup_of_log
 from disco_hw.runtime.pipeline import Source
-from disco_hw.runtime.robot_setup import Setup, geometry, load_setup
+from disco_hw.runtime.robot_setup import Setup, geometry, load_setup, setup_of_log
 from disco_hw.runtime.task_change import task_of
 from disco_hw.tasks import RobotTask
 from disco_hw.viewer.snapshot import PLAN_AGE_NS, Snapshot, snapshot_at

@@ -184,7 +184,7 @@ OWN = {
     "disco_hw/config/input_file.py": {"os.open", "tomllib.loads"},
     "disco_hw/daemon/control_socket.py": {"os.open"},
     "disco_hw/daemon/realtime.py": {"read_text"},
-    "disco_hw/experiments/changing_robot.py": {"np.genfromtxt", "open"},
+    "disco_hw/experiments/adapt.py": {"np.genfromtxt", "open"},
     "disco_hw/experiments/circle_report.py": {"open"},
     "disco_hw/experiments/demo.py": {"read_text"},
     "disco_hw/experiments/live_stack.py": {"open", "read_text"},

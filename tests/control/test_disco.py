@@ -19,7 +19,7 @@ from disco_hw.control import (
     SentCommand,
 )
 from disco_hw.control.kernel.step import disco_step
-from disco_hw.experiments.plant import KinematicPlant
+from disco_hw.experiments.circle import KinematicPlant
 from disco_hw.model import EffectSetting, Gaussian, load_model
 from disco_hw.tasks.circle import CircleCost
 

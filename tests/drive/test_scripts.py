@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 
 from disco_hw.config import Robot
 from disco_hw.drive.script import room_needed
-from disco_hw.drive.scripts import SCRIPTS, STEP_S, STEPS, make_script
-from disco_hw.drive.separating import SEPARATING
+from disco_hw.drive.scripts import SCRIPTS, SEPARATING, STEP_S, STEPS, make_script
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.errors import InputError
 from disco_hw.tasks.circle import CircleTask

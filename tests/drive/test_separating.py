@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from disco_hw.drive.separating import PURPOSES, separating
+from disco_hw.drive.scripts import PURPOSES, separating
 
 TOP_RAD_S = 6.0
 

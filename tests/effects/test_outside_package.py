@@ -45,7 +45,7 @@ import numpy as np
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.data.layout import BODY, WHEEL, pose_sensor
 from disco_hw.gap.search.candidates import candidates_of, smooth_of
-from disco_hw.gap.search.confounding import OUTSIDE_TESTS, confounded_with
+from disco_hw.gap.search.intervals import OUTSIDE_TESTS, confounded_with
 from disco_hw.gap.search.intervals import _OF_TURNING
 from disco_hw.inference.checks import CHECKS
 from disco_hw.log import records
@@ -140,7 +140,7 @@ from dataclasses import replace
 from pathlib import Path
 import numpy as np
 from disco_hw.gap import find_gap
-from disco_hw.gap.report.wording import sentence
+from disco_hw.gap.report.page import sentence
 from disco_hw.log.drive import Commands
 from disco_hw.model import Model, load_model, save_model
 from disco_hw.model.free_run import FreeRun
@@ -184,7 +184,7 @@ import json
 from dataclasses import replace
 import numpy as np
 from disco_hw.gap import find_gap
-from disco_hw.gap.report.wording import as_text
+from disco_hw.gap.report.page import as_text
 from disco_hw.log.drive import Poses
 from disco_hw.model import Model
 from tools.gap_logs import simulated_drive

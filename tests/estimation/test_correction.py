@@ -8,8 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from disco_hw.estimation.belief import Belief
-from disco_hw.estimation.correction import FLOOR_VARIANCE, PoseCorrector
-from disco_hw.estimation.gate import Measurement
+from disco_hw.estimation.correction import FLOOR_VARIANCE, Measurement, PoseCorrector
 from disco_hw.estimation.odometry import Pose
 
 

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from disco_hw.config import Estimation
+from disco_hw.estimation.correction import Measurement, PoseReason, gate_limit
 from disco_hw.estimation.filter import MAX_EXTRAPOLATION_S, PoseFilter
-from disco_hw.estimation.gate import Measurement, PoseReason, gate_limit
-from disco_hw.estimation.odometry import OdometryParameters, Pose, advance
-from disco_hw.estimation.wheels import WheelReading
+from disco_hw.estimation.odometry import OdometryParameters, Pose, WheelReading, advance
 
 PARAMETERS = OdometryParameters(0.061, 0.415, 0.238)
 SETTINGS = Estimation(gate_lockout_count=5)

@@ -6,7 +6,7 @@ import msgspec
 import pytest
 from scipy.stats import chi2
 
-from disco_hw.estimation.gate import PoseReason, gate_limit, screen
+from disco_hw.estimation.correction import PoseReason, gate_limit, screen
 from drivers.types import PoseSample
 
 GOOD = PoseSample(t_ns=5, received_ns=7, x_m=1.0, y_m=-2.0, yaw_rad=3.0, position_std_m=0.01, yaw_std_rad=0.02)

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from disco_hw.estimation.wheels import MAX_WHEEL_SPEED_RAD_S, WheelReading, WheelReason, WheelTracker
+from disco_hw.estimation.odometry import MAX_WHEEL_SPEED_RAD_S, WheelReading, WheelReason, WheelTracker
 from drivers.types import WheelSample
 
 MS = 1_000_000

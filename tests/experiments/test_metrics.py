@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from disco_hw.experiments.metrics import Path, circle_figures, estimation_figures
+from disco_hw.experiments.circle_report import Path, circle_figures, estimation_figures
 from disco_hw.tasks.circle import CircleTask
 
 TASK = CircleTask()

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from disco_hw.experiments.plant import SUBSTEP_S, KinematicPlant
+from disco_hw.experiments.circle import SUBSTEP_S, KinematicPlant
 
 THETA = {"wheel_radius_m": 0.06, "axial_distance_m": 0.4, "x_icr_m": 0.2}
 

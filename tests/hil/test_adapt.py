@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from disco_hw.experiments.changing_robot import GROWTH, drive_through_change
+from disco_hw.experiments.adapt import GROWTH, drive_through_change
 from disco_hw.experiments.live_stack import FAST_START, FAST_TASK, running_stack
 from disco_hw.log.reader import open_log
 

@@ -8,8 +8,7 @@ import pytest
 
 from disco_hw.errors import InputError, WorkError
 from disco_hw.inference import commands
-from disco_hw.inference.commands import infer_command
-from disco_hw.inference.gap_check import GapCheck
+from disco_hw.inference.commands import GapCheck, infer_command
 from disco_hw.inference.infer import InferOptions
 from disco_hw.log.importing.write import import_log
 from disco_hw.model import load_model

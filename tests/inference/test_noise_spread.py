@@ -7,8 +7,8 @@ import pytest
 
 from disco_hw.inference.estimates import estimates
 from disco_hw.inference.excitation import excitation
+from disco_hw.inference.infer import noise_spread
 from disco_hw.inference.noise import Noise, measured_noise
-from disco_hw.inference.noise_spread import noise_spread
 from disco_hw.inference.simulate import NAMES, Simulator, draw_seeds
 from disco_hw.model import Model
 from tests.inference.drives import TRUTH, logged

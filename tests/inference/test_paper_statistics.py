@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from disco_hw.inference.paper_statistics import STATISTICS, PaperStatistics
+from disco_hw.inference.estimates import PAPER_STATISTICS, PaperStatistics
 
 
 def test_they_are_the_means_of_position_and_of_its_steps_in_time():
@@ -9,7 +9,7 @@ def test_they_are_the_means_of_position_and_of_its_steps_in_time():
     poses[0, :, 0] = [0.0, 1.0, 3.0, 6.0, 10.0]
     poses[1, :, 1] = [5.0, 5.0, 5.0, 5.0, 1.0]
     found = PaperStatistics(np.array([True, False, False, False, False]))(poses)
-    assert found.shape == (2, len(STATISTICS))
+    assert found.shape == (2, len(PAPER_STATISTICS))
     assert found[0] == pytest.approx([4.0, 0.0, 2.5, 0.0])
     assert found[1] == pytest.approx([0.0, 4.2, 0.0, -1.0])
 

@@ -1,9 +1,8 @@
 import numpy as np
 
-from disco_hw.inference.checks import CHECKS
+from disco_hw.inference.checks import CHECKS, Predictive, edge_parameters, predictive
 from disco_hw.inference.excitation import excitation
 from disco_hw.inference.infer import noise_of
-from disco_hw.inference.predictive import Predictive, edge_parameters, predictive
 from disco_hw.inference.simulate import NAMES, Simulator
 from disco_hw.model import Model
 from tests.inference.drives import TRUTH, logged

@@ -30,10 +30,8 @@ from disco_hw.gap.report.findings import (
 from disco_hw.gap.search.cross_validation import PredictionErrors
 from disco_hw.gap.search.intervals import ParameterEstimate
 from disco_hw.gap.write_report import GapResult
-from disco_hw.inference.checks import CHECKS
-from disco_hw.inference.commands import InferResult
-from disco_hw.inference.gap_check import GapCheck
-from disco_hw.inference.predictive import Predictive
+from disco_hw.inference.checks import CHECKS, Predictive
+from disco_hw.inference.commands import GapCheck, InferResult
 from disco_hw.log.importing.write import Imported
 from disco_hw.model import Model
 from disco_hw.reports.outputs import as_json

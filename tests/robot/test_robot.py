@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from disco_hw.daemon.check import refuse_beside_a_daemon
-from disco_hw.daemon.link import make_link
 from disco_hw.errors import InputError, WorkError
+from disco_hw.runtime.assembly import make_link
 from disco_hw.runtime.robot_setup import link_key, load_setup
 from tests.firmware_protocol.conformance import FirmwareConformance
 from tests.firmware_protocol.other_end import LinkEnd

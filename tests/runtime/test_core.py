@@ -11,7 +11,7 @@ from msgspec.structs import replace
 
 import disco_hw
 from disco_hw.control import NoValidControl
-from disco_hw.experiments.metrics import Path, circle_figures
+from disco_hw.experiments.circle_report import Path, circle_figures
 from disco_hw.log import records
 from disco_hw.runtime.assembly import make_planner
 from disco_hw.runtime.pipeline import NoPlanner, Source

@@ -10,10 +10,9 @@ from disco_hw.daemon.status import loop_figures, status
 from disco_hw.log.link import Attachment
 from disco_hw.log.recorder import ProcessRecorder, RecorderStats
 from disco_hw.log.recorder import Recording as Begin
-from disco_hw.runtime.log_setup import kept_files
 from disco_hw.runtime.pipeline import Source
 from disco_hw.runtime.replay import replay
-from disco_hw.runtime.robot_setup import load_setup
+from disco_hw.runtime.robot_setup import kept_files, load_setup
 from disco_hw.runtime.states import State
 from disco_hw.runtime.supervisor import UserRequest
 from disco_hw.tasks.path import PathTask

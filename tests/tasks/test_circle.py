@@ -10,7 +10,7 @@ from disco_hw.control import oracle
 from disco_hw.control.disco import Disco
 from disco_hw.control.plan import PlannerState
 from disco_hw.control.settings import CommandLimits, DiscoSettings
-from disco_hw.experiments.plant import KinematicPlant
+from disco_hw.experiments.circle import KinematicPlant
 from disco_hw.model import load_model
 from disco_hw.model import plain as physics
 from disco_hw.tasks.circle import CircleCost, CircleTask

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from disco_hw.control import CommandLimits, Disco, DiscoSettings, PlannerState, PlanOutcome
-from disco_hw.experiments.plant import KinematicPlant
+from disco_hw.experiments.circle import KinematicPlant
 from disco_hw.model import load_model
 from disco_hw.tasks.line.table import PathTable, sharp_turns
 from disco_hw.tasks.line.waypoints import Waypoints

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from disco_hw.tasks.circle import CircleTask
-from disco_hw.tasks.line.progress import END_M
+from disco_hw.tasks.line.course import END_M
 from disco_hw.tasks.path import PathTask
 from disco_hw.tasks.timed_path import TimedPathTask
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from disco_hw.control import CommandLimits, Disco, DiscoSettings, PlannerState
-from disco_hw.experiments.plant import KinematicPlant
+from disco_hw.experiments.circle import KinematicPlant
 from disco_hw.model import load_model
 from disco_hw.tasks.line.waypoints import Waypoints
 from disco_hw.tasks.timed_path import TimedPathCost

@@ -18,7 +18,7 @@ from disco_hw.effects.effect import Channel, Effect, Parameter, Stage, asks_for
 from disco_hw.effects.registry import DELAY, MOTION_EFFECTS, REGISTRY, in_stages
 from disco_hw.gap.settings import GRID_STEP_S
 from disco_hw.model.coefficients import Base, Coefficients, Effects
-from disco_hw.model.parameter import BASE_PARAMETERS
+from disco_hw.model.model import BASE_PARAMETERS
 
 Array = NDArray[np.float64]
 

@@ -12,7 +12,7 @@ from disco_hw.gap.search.analysis import FinalFit, GapAnalysis
 from disco_hw.gap.search.channel_search import UnnamedTerm
 from disco_hw.gap.search.intervals import Z95, ChannelEstimates, ParameterEstimate
 from disco_hw.model import EffectSetting, Gaussian, Model
-from disco_hw.model.parameter import BASE_PARAMETERS
+from disco_hw.model.model import BASE_PARAMETERS
 from disco_hw.model.terms import TERMS, effect_of
 
 Array = NDArray[np.float64]

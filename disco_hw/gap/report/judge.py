@@ -19,14 +19,14 @@ from disco_hw.gap.report.misspecification import (
 from disco_hw.gap.search.analysis import FinalFit, GapAnalysis
 from disco_hw.gap.search.candidates import candidates_of, parameters_of
 from disco_hw.gap.search.channel_search import ChannelResult
-from disco_hw.gap.search.confounding import (
+from disco_hw.gap.search.intervals import (
     ASYMMETRY,
     ENCODER,
     GAIN,
     OUTSIDE_TESTS,
+    ChannelEstimates,
     confounded_with,
 )
-from disco_hw.gap.search.intervals import ChannelEstimates
 
 
 def effect_findings(analysis: GapAnalysis, final: FinalFit, given: bool = False) -> tuple[EffectFinding, ...]:

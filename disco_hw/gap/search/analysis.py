@@ -10,9 +10,17 @@ from numpy.typing import NDArray
 from disco_hw.gap.data.gridded_drive import GriddedDrive
 from disco_hw.gap.search.candidates import indices
 from disco_hw.gap.search.channel_search import ChannelResult
-from disco_hw.gap.search.confounding import ASYMMETRY, ASYMMETRY_COLUMN, ENCODER, GAIN, one_encoder
 from disco_hw.gap.search.evidence import inflation
-from disco_hw.gap.search.intervals import ChannelEstimates, estimate_parameters, in_motion
+from disco_hw.gap.search.intervals import (
+    ASYMMETRY,
+    ASYMMETRY_COLUMN,
+    ENCODER,
+    GAIN,
+    ChannelEstimates,
+    estimate_parameters,
+    in_motion,
+    one_encoder,
+)
 from disco_hw.gap.search.least_squares import Fit, fit
 
 Array = NDArray[np.float64]

@@ -16,7 +16,7 @@ from disco_hw.config import Robot
 from disco_hw.config.input_file import CANDUMP, read_lines
 from disco_hw.errors import LogError
 from disco_hw.log.drive import Array, Commands, DriveLog, Gyro, Poses, Wheels
-from disco_hw.log.importing.registry import LogFormat
+from disco_hw.log.importing import LogFormat
 from drivers.device_clock import DeviceClock
 from drivers.motor.reference_frames import FrameReception
 from drivers.motor.reference_telemetry import POSE_MESSAGES, WHEEL_MESSAGES, Telemetry

@@ -31,7 +31,7 @@ from disco_hw.log.drive import (
     differentiate_angle,
     integrate_angle,
 )
-from disco_hw.log.importing.registry import LogFormat
+from disco_hw.log.importing import LogFormat
 
 _LONGEST_PERIOD_S = 2.0
 _SHORTEST_PERIOD_S = 1e-4

@@ -18,7 +18,7 @@ from disco_hw.config.input_file import ROBOT_TOML as ROBOT_FILE
 from disco_hw.errors import LogError
 from disco_hw.log.container import MAGIC
 from disco_hw.log.drive import DriveLog
-from disco_hw.log.importing.registry import LONGEST_BEGIN_BYTES, format_of, log_formats
+from disco_hw.log.importing import LONGEST_BEGIN_BYTES, format_of, log_formats
 from disco_hw.log.link import Attachment, End, Start, batch_encoder
 from disco_hw.log.mcap_log import McapLog
 from disco_hw.log.provenance import ROBOT_TOML, attachment, version

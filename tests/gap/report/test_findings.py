@@ -8,8 +8,7 @@ import pytest
 
 from disco_hw.gap.report.blind_spots import BlindSpot
 from disco_hw.gap.report.findings import STAGES, GapReport, UnnamedFinding
-from disco_hw.gap.report.page import page
-from disco_hw.gap.report.wording import answer, as_text
+from disco_hw.gap.report.page import answer, as_text, page
 from disco_hw.gap.search.cross_validation import PredictionErrors
 from disco_hw.gap.settings import DEFAULT_SETTINGS
 from disco_hw.model import Model

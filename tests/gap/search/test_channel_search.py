@@ -13,7 +13,7 @@ from disco_hw.gap.data.layout import BODY, WHEEL
 from disco_hw.gap.find import find_gap
 from disco_hw.gap.noise.channels import WheelChannel
 from disco_hw.gap.noise.wheel_noise import WheelNoise
-from disco_hw.gap.report.wording import as_text
+from disco_hw.gap.report.page import as_text
 from disco_hw.gap.search.channel_search import responding, search_body, wheel_moves
 from disco_hw.gap.search.selection import Selector
 from disco_hw.model import Model

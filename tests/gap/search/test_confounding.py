@@ -2,8 +2,7 @@
 
 from types import SimpleNamespace
 
-from disco_hw.gap.search.confounding import confounded_with, one_encoder
-from disco_hw.gap.search.intervals import ParameterEstimate
+from disco_hw.gap.search.intervals import ParameterEstimate, confounded_with, one_encoder
 from disco_hw.gap.settings import DEFAULT_SETTINGS
 
 SETTINGS = DEFAULT_SETTINGS.selection

@@ -7,9 +7,9 @@ import pytest
 
 from disco_hw.gap import find_gap
 from disco_hw.gap.report.judge import residue_sentences
-from disco_hw.gap.search import predictive_pruning
+from disco_hw.gap.search import stages
 from disco_hw.gap.search.cross_validation import PredictionErrors
-from disco_hw.gap.search.predictive_pruning import prune
+from disco_hw.gap.search.stages import prune
 from disco_hw.gap.settings import DEFAULT_SETTINGS
 from disco_hw.model import Model
 from tools.gap_logs import simulated_drive
@@ -44,7 +44,7 @@ class Whole:
 
 @pytest.fixture(autouse=True)
 def _predictions_of_the_parts(monkeypatch):
-    monkeypatch.setattr(predictive_pruning, "stage_predictions", lambda whole: whole)
+    monkeypatch.setattr(stages, "stage_predictions", lambda whole: whole)
 
 
 def told(amended_m, wheels, body=(), **rivals):

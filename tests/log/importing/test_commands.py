@@ -10,8 +10,8 @@ from disco_hw.log.importing.write import import_log
 from disco_hw.log.load import load_drive
 from disco_hw.log.provenance import ROBOT_TOML
 from disco_hw.log.reader import open_log
-from disco_hw.runtime.log_setup import setup_of_log
 from disco_hw.runtime.replay import replay
+from disco_hw.runtime.robot_setup import setup_of_log
 from disco_hw.viewer.recording import Recording
 from tests.inference.drives import TICKS_PER_REV, write_log
 from tests.inference.test_commands import ROBOT

@@ -4,7 +4,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
-from disco_hw.inference.compiled import parallel_kernel
+from disco_hw.jit import parallel_kernel
 
 MOST_TURNS = 2_000_000_000
 
