@@ -17,7 +17,8 @@ from tests.hil.stack import STILL_RAD_S
 pytestmark = pytest.mark.hil
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+# That each signal ends the loop is tested without a robot (tests/daemon/test_signals.py).
+@pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.long)])
 def test_a_signal_stops_the_wheels_before_the_process_ends(tmp_path, number):
     with running_stack(tmp_path) as stack:
         stack.drive()

@@ -79,7 +79,7 @@ def test_it_drives_anew_where_the_machines_host_held_the_daemon_up(tmp_path, mon
 @pytest.mark.parametrize(
     ("stolen", "act"),
     [
-        ({"taken_ms": 120}, disarm),
+        pytest.param({"taken_ms": 120}, disarm, marks=pytest.mark.long),
         ({"taken_ms": 0, "early_ms": 5000}, hold_up),
         pytest.param({"taken_ms": 90}, hold_up, marks=pytest.mark.long),
     ],

@@ -44,7 +44,14 @@ def test_estop_stops_and_latches(tmp_path, link, daemon):
         if daemon == "frozen":
             # The firmware's watchdog stops the robot by itself then; the e-stop must latch all the same.
             os.kill(stack.daemon.process.pid, signal.SIGSTOP)
-        code, output = estop(stack.robot_file, "--json")
+        robot_file = stack.robot_file
+        if daemon == "healthy":
+            # No more of robot.toml is needed than where the link is.
+            text = robot_file.read_text().replace("wheel_radius_m = 0.06", 'wheel_radius_m = "round"')
+            robot_file = tmp_path / "broken.toml"
+            robot_file.write_text(text)
+            assert "round" in text
+        code, output = estop(robot_file, "--json")
         told_s = time.monotonic()
         if daemon == "frozen":
             os.kill(stack.daemon.process.pid, signal.SIGCONT)
@@ -67,18 +74,6 @@ def test_estop_stops_and_latches(tmp_path, link, daemon):
     stopped = [row for row in rows if row.t_s > told_s + 0.5]
     assert any(row.state == "ESTOP" for row in rows)
     assert max(row.fastest for row in stopped) < STILL_RAD_S
-
-
-def test_estop_needs_no_more_of_robot_toml_than_the_link(tmp_path):
-    with running_stack(tmp_path) as stack:
-        stack.drive()
-        broken = tmp_path / "broken.toml"
-        text = stack.robot_file.read_text().replace("wheel_radius_m = 0.06", 'wheel_radius_m = "round"')
-        broken.write_text(text)
-        code, output = estop(broken)
-        assert code == 0, output
-        assert "ESTOP" in output
-        stack.operator.wait_for("FAULT", 3.0)
 
 
 def test_estop_without_a_robot_says_so_and_fails(tmp_path):

@@ -70,7 +70,8 @@ sys.exit(run_virtual_robot(VirtualRobotOptions(
     [
         pytest.param("protocol_major=2", ["protocol", "2"], marks=pytest.mark.long),
         ("dbc_hash=0x12345678", ["12345678"]),
-        ("max_wheel_speed_rad_s=4.0", ["max_wheel_speed_rad_s", "4"]),
+        # What is compared with robot.toml, and the words for it, have tests without a robot (tests/runtime).
+        pytest.param("max_wheel_speed_rad_s=4.0", ["max_wheel_speed_rad_s", "4"], marks=pytest.mark.long),
         pytest.param("ticks_per_rev=1024", ["ticks_per_rev", "1024"], marks=pytest.mark.long),
     ],
 )
