@@ -375,10 +375,11 @@ class MotorDriver:
     `settings`: a struct of its own fields in [link], with `fault()`; those of another driver are refused there. `make`
     returns a fresh driver of these and of the key of authenticated mode (16 bytes) or None. `stop_frames`: the e-stop
     for a connection beside the daemon's, which needs no answer; `stop_confirmation` makes what says, given each frame
-    that is heard then, whether the robot has confirmed it. `cyclic_frames` (of settings, command rate in Hz, whether
-    authenticated): what the link carries. `authenticates`: whether there is such a mode; without one `link.key_file` is
-    refused. `example`: its fields in [link] for a robot as the demonstration drives it; none where its controller is
-    not simulated. `is_default`: taken where robot.toml has no `link.driver`.
+    that is heard then, whether the robot has confirmed it. `slowest_rad_s`: the slowest wheel speed that it holds.
+    `cyclic_frames` (of settings, command rate in Hz, whether authenticated): what the link carries. `authenticates`:
+    whether there is such a mode; without one `link.key_file` is refused. `example`: its fields in [link] for a robot as
+    the demonstration drives it; none where its controller is not simulated. `is_default`: taken where robot.toml has
+    no `link.driver`.
     """
 
     name: str
@@ -387,6 +388,7 @@ class MotorDriver:
     stop_confirmation: Callable[[Any], Callable[[Frame], bool]]
     cyclic_frames: Callable[[Any, float, bool], tuple[CyclicFrame, ...]]
     safety_card: Callable[[Any], SafetyCard]
+    slowest_rad_s: Callable[[Any], float] = lambda _settings: 0.0
     settings: type[Any] = NoSettings
     example: str = ""
     authenticates: bool = False

@@ -334,6 +334,14 @@ def _check(path: Path, config: RobotConfig) -> None:
 def _check_task(path: Path, config: RobotConfig) -> None:
     """Refuse what no single field of [task] shows."""
     _check_values(path, "task", config.task)
+    slowest = find_driver(config.link.driver).slowest_rad_s(config.link.settings()) * config.robot.wheel_radius_m
+    if config.task.speed_m_s < slowest:
+        _refuse(
+            path,
+            "task.speed_m_s",
+            f"{config.task.speed_m_s} m/s is slower than the controller holds",
+            f"write at least {slowest:.2f}, or set the controller for less",
+        )
     fault = config.task.fault()
     if fault is not None:
         _refuse(path, f"task.{fault.field}", fault.fault, fault.remedy)

@@ -9,9 +9,11 @@ from __future__ import annotations
 
 import binascii
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
+from drivers.motor.vesc_settings import VescSettings
+from firmware_protocol.firmware_core import FirmwareInputs
 from sim.can_frame import CanFrame
 
 BUFFER = 520
@@ -341,3 +343,105 @@ class _PacketParser:
             found.append((payload, bytes(self._bytes[size + length : size + length + 4])))
             del self._bytes[:end]
         return found
+
+
+class VescController:
+    """All VESCs of one robot: satisfies `sim.vendor_robot.Controller`. Below its least speed a motor is let go."""
+
+    def __init__(self, settings: VescSettings, ticks_per_rev: int) -> None:
+        self._settings = settings
+        self._ticks_per_rev = ticks_per_rev
+        self._zero_ticks = (0, 0)
+        self._ticks = (0, 0)
+        self._now_ms = 0
+        self.sides = self._make()
+
+    @property
+    def brakes(self) -> bool:
+        """Whether every motor brakes."""
+        return all(_brakes(vesc) for side in self.sides for vesc in side)
+
+    @property
+    def wheels_rad_s(self) -> tuple[float | None, float | None]:
+        """The speeds that the motors hold, zero where they brake."""
+        wheels: list[float | None] = []
+        for side, direction in zip(self.sides, self._settings.direction, strict=True):
+            held = [speed for vesc in side if (speed := self._held_erpm(vesc)) is not None]
+            erpm = sum(held) / len(held) if held else None
+            wheels.append(None if erpm is None else direction * erpm / self._settings.erpm_per_rad_s)
+        return wheels[0], wheels[1]
+
+    @property
+    def state(self) -> str:
+        """In one word."""
+        vescs = [vesc for side in self.sides for vesc in side]
+        if any(vesc.values.fault for vesc in vescs):
+            return "FAULT"
+        return "ARMED" if any(not vesc.timed_out and vesc.fed for vesc in vescs) else "STANDBY"
+
+    @property
+    def obeyed(self) -> int:
+        """How many set commands they have taken."""
+        return sum(vesc.fed for side in self.sides for vesc in side)
+
+    def receive(self, now_us: int, frame: CanFrame) -> Sequence[CanFrame]:
+        """Take in one frame; return the replies."""
+        replies: list[CanFrame] = []
+        for side in self.sides:
+            for vesc in side:
+                vesc.at(now_us // 1000)
+                replies += vesc.receive(frame)
+                vesc.take_calls()
+        return replies
+
+    def step(self, now_us: int, inputs: FirmwareInputs) -> Sequence[CanFrame]:
+        """Go through one millisecond; a tachometer counts six in an electrical turn from zero at its start."""
+        self._now_ms = now_us // 1000
+        self._ticks = (inputs.left_ticks, inputs.right_ticks)
+        settings = self._settings
+        per_tick = 6.0 * settings.pole_pairs * settings.gear / self._ticks_per_rev
+        speeds = (inputs.left_speed_rad_s, inputs.right_speed_rad_s)
+        frames: list[CanFrame] = []
+        for side, vescs in enumerate(self.sides):
+            for vesc in vescs:
+                counted = settings.direction[side] * (self._ticks[side] - self._zero_ticks[side])
+                vesc.values.tachometer = round(per_tick * counted)
+                vesc.values.erpm = settings.direction[side] * speeds[side] * settings.erpm_per_rad_s
+                vesc.values.kill_switch = inputs.estop_button
+                frames += vesc.step(self._now_ms)
+        return frames
+
+    def restart(self) -> None:
+        """Switch off and on: the tachometers begin at zero."""
+        self._zero_ticks = self._ticks
+        self.sides = self._make()
+
+    def _make(self) -> tuple[list[Vesc], list[Vesc]]:
+        settings = self._settings
+        left, right = (
+            [Vesc(node, round(1e3 * settings.watchdog_s), settings.timeout_brake_current_a) for node in side]
+            for side in settings.sides
+        )
+        for vesc in (*left, *right):
+            vesc.status_ms = {9: 20, 27: 20, 16: 200}
+            vesc.last_fed_ms = self._now_ms
+        return left, right
+
+    def _held_erpm(self, vesc: Vesc) -> float | None:
+        if _brakes(vesc):
+            return 0.0
+        name, value = vesc.held
+        limit = self._settings.max_erpm
+        stopped = vesc.values.fault or vesc.values.kill_switch
+        lets_go = stopped or name != "set_erpm" or abs(value) < self._settings.min_erpm
+        return None if lets_go else min(max(value, -limit), limit)
+
+
+def _brakes(vesc: Vesc) -> bool:
+    name, value = vesc.held
+    return name == "set_brake_current" and value > 0.0 and not vesc.values.fault
+
+
+def make_controller(settings: VescSettings, ticks_per_rev: int) -> VescController:
+    """The controllers of a robot whose robot.toml has these settings, with the encoder on the wheel."""
+    return VescController(settings, ticks_per_rev)

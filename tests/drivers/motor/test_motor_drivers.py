@@ -13,8 +13,8 @@ from disco_hw.errors import InputError
 from drivers.motor import UnknownDriverError, find_driver, make_driver, motor_drivers
 from drivers.types import DriverState
 
-OWN = {"odrive": "nodes = [3, 5]\nwatchdog_s = 0.1\nvel_limit_turns_s = 10.0\n"}
-"""The fields that a driver must have in [link]."""
+OWN = {name: driver.example for name, driver in motor_drivers().items()}
+"""The fields that a driver has in [link] of a robot of its kind."""
 ROOT = Path(__file__).parents[3]
 WOMBOT = ROOT / "disco_hw/robots/wombot.toml"
 
@@ -29,7 +29,7 @@ def robot_toml(folder, link):
 def test_every_driver_is_made_by_its_name_and_begins_without_a_link():
     for name, driver in motor_drivers().items():
         assert driver.name == name
-        settings = msgspec.convert(tomllib.loads(OWN.get(name, "")), driver.settings)
+        settings = msgspec.convert(tomllib.loads(OWN[name]), driver.settings)
         assert make_driver(name, settings).state is DriverState.DISCONNECTED
 
 
@@ -52,7 +52,7 @@ def test_robot_toml_with_an_unknown_driver_is_refused_in_one_line(tmp_path):
 
 def test_robot_toml_may_name_each_driver(tmp_path):
     for name in motor_drivers():
-        link = f'driver = "{name}"\n{OWN.get(name, "")}'
+        link = f'driver = "{name}"\n{OWN[name]}'
         assert load_robot_config(robot_toml(tmp_path, link)).link.driver == name
 
 

@@ -18,7 +18,8 @@ class Vendor:
     """A driver and its simulator, with the settings of its example and `changes` to them.
 
     `watchdog_s`: after what silence the controller lets go. `lose_left`: break the left side alone. `is_motion`: of a
-    frame that moves a wheel; `is_forbidden`: one that no driver ever sends; `foreign`: one that another host would.
+    frame that moves a wheel; `is_forbidden`: one that no driver ever sends; `foreign`: one that another host would;
+    `mend`: takes away the cause of `lose_left`, where a reset does not.
     """
 
     name: str
@@ -29,6 +30,7 @@ class Vendor:
     is_motion: Callable[[CanFrame], bool]
     is_forbidden: Callable[[CanFrame], bool]
     foreign: CanFrame
+    mend: Callable[[VendorRig], None] = lambda _rig: None
 
     @property
     def settings(self):
@@ -63,6 +65,27 @@ def is_odrive_forbidden(frame):
     return command in (0x06, 0x16, 0x19) or (command == 0x04 and frame.data[:1] == b"\1")
 
 
+def fail_left_vesc(rig):
+    rig.controller.sides[0][0].values.fault = 4
+
+
+def mend_vesc(rig):
+    rig.controller.sides[0][0].values.fault = 0
+
+
+def is_vesc_motion(frame):
+    """Duty, current, speed, position: whatever is not zero moves at once."""
+    return frame.can_id >> 8 in (0, 1, 3, 4, 10) and frame.data != bytes(4)
+
+
+def is_vesc_forbidden(frame):
+    """Duty, position, shutdown, another bit rate, a packet that is no question, a length that is not the command's."""
+    command = frame.can_id >> 8
+    if command == 8:
+        return frame.data[2] != 50
+    return command in (0, 4, 5, 6, 7, 10, 31, 63) or (command < 14 and len(frame.data) != 4) or not frame.extended
+
+
 VENDORS = (
     Vendor(
         "odrive",
@@ -93,5 +116,27 @@ VENDORS = (
         is_odrive_motion,
         is_odrive_forbidden,
         CanFrame(6 << 5 | 0x0D, bytes(8)),
+    ),
+    Vendor(
+        "vesc",
+        "vesc",
+        "",
+        0.11,
+        fail_left_vesc,
+        is_vesc_motion,
+        is_vesc_forbidden,
+        CanFrame(3 << 8 | 23, bytes(4), extended=True),
+        mend_vesc,
+    ),
+    Vendor(
+        "vesc",
+        "vesc-four-braking",
+        "nodes = [[23, 24], [51, 52]]\ntimeout_brake_current_a = 10.0\n",
+        0.11,
+        fail_left_vesc,
+        is_vesc_motion,
+        is_vesc_forbidden,
+        CanFrame(3 << 8 | 52, bytes(4), extended=True),
+        mend_vesc,
     ),
 )

@@ -1,0 +1,475 @@
+"""The driver of VESC controllers on CAN, one or more a side.
+
+A VESC knows no armed state: the first speed that it is sent moves it. Armed is what this driver says it is: every
+controller has answered, its status is fresh, its motor stands, and zeros were sent for a while. Faults are asked for,
+as no status message tells them; the question feeds no timeout.
+"""
+
+from __future__ import annotations
+
+import enum
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+from drivers.motor import vesc_codec as codec
+from drivers.motor.vesc_settings import (
+    EXAMPLE,
+    FAULTS,
+    HOST_ID,
+    STANDS_ERPM,
+    VescSettings,
+    cyclic_frames,
+    safety_card,
+    slowest_rad_s,
+    stop_confirmation,
+    stop_frames,
+)
+from drivers.types import (
+    Capabilities,
+    DriverState,
+    DriverStats,
+    Frame,
+    MotorDriver,
+    OutgoingFrame,
+    Readings,
+    ReceivedFrame,
+    Request,
+    RobotStatus,
+    WheelCommand,
+    WheelSample,
+)
+
+ZEROS_TO_ARM = 10
+SILENT_NS = 100_000_000
+GONE_NS = 500_000_000
+ARMING_TIMEOUT_NS = 1_500_000_000
+BRAKING_NS = 3_000_000_000
+_PING_PERIOD_NS = 100_000_000
+_FAULT_PERIOD_NS = 50_000_000
+_FRAME_LIFE_NS = 50_000_000
+_ESTOP_LIFE_NS = 1_000_000_000
+_ESTOP_REPEATS = 3
+_ESTOP_RANK, _RANK = 0, 1
+_LONGEST_STEP_S = 0.1
+_SET_COMMANDS = frozenset(number for number, _ in codec.CAN_COMMANDS.values())
+_BRAKE = codec.CAN_COMMANDS["set_brake_current"][0]
+
+
+class _Stage(enum.Enum):
+    REST = "rest"
+    ARMING = "arming"
+    ARMED = "armed"
+    STOPPING = "stopping"
+    BRAKING = "braking"
+
+
+@dataclass(slots=True)
+class _Motor:
+    """What is known of one controller; steps are of its tachometer, six in an electrical turn."""
+
+    node: int
+    answered: bool = False
+    erpm: float = 0.0
+    erpm_ns: int | None = None
+    tachometer: int | None = None
+    tachometer_ns: int = 0
+    steps: int = 0
+    is_new: bool = False
+    fault: int | None = None
+    timed_out: bool = False
+    killed: bool = False
+
+
+class VescDriver:
+    """Satisfies `drivers.types.Driver`: pure, and no frame makes it raise."""
+
+    clock_offset_ns: int | None = None
+
+    def __init__(self, settings: VescSettings) -> None:
+        self._settings = settings
+        self._sides = [[_Motor(node) for node in side] for side in settings.sides]
+        self._motors = {motor.node: motor for side in self._sides for motor in side}
+        self._reassembly = codec.Reassembly(HOST_ID)
+        self.stats = DriverStats()
+        self._link_is_up = False
+        self._stage = _Stage.REST
+        self._stage_ns: int | None = None
+        self._wanted, self._note = Request.STANDBY, "it stands by"
+        self._fault: str | None = None
+        self._estopped = False
+        self._zeros = 0
+        self._speeds = (0.0, 0.0)
+        self._last_sent_ns = 0
+        self._pinged_ns = self._asked_ns = 0
+        self._next_asked = 0
+        self._foreign = False
+        self._events: list[str] = []
+
+    @property
+    def state(self) -> DriverState:
+        """Where the driver is with its controllers."""
+        if not self._link_is_up:
+            return DriverState.DISCONNECTED
+        if self._estopped or any(motor.killed for motor in self._all):
+            return DriverState.ESTOP
+        if not self._is_known:
+            return DriverState.HANDSHAKE
+        if self._fault is not None or any(motor.fault for motor in self._all):
+            return DriverState.FAULT
+        if self._stage is _Stage.ARMED:
+            return DriverState.ARMED
+        if self._stage in (_Stage.STOPPING, _Stage.BRAKING):
+            return DriverState.STOPPING
+        rest = {Request.ARM: DriverState.ARMING, Request.READY: DriverState.READY}
+        return rest.get(self._wanted, DriverState.STANDBY)
+
+    @property
+    def detail(self) -> str:
+        """For a person: why the state is what it is, and what to do about it."""
+        match self.state:
+            case DriverState.DISCONNECTED:
+                return "the link is down"
+            case DriverState.HANDSHAKE:
+                return self._missing()
+            case DriverState.ESTOP:
+                killed = any(motor.killed for motor in self._all)
+                return "its kill switch is pressed" if killed else "emergency stop; remove its cause, then reset"
+            case DriverState.FAULT:
+                said = [f"controller {motor.node}: {_words(motor.fault)}" for motor in self._all if motor.fault]
+                return f"{self._fault or '; '.join(said)}; remove the cause, then reset"
+            case DriverState.ARMED:
+                return "armed"
+        return self._note
+
+    @property
+    def capabilities(self) -> Capabilities | None:
+        """What robot.toml declares of the controllers; they tell nothing of that themselves."""
+        if not self._is_known:
+            return None
+        settings = self._settings
+        return Capabilities(
+            protocol_major=0,
+            protocol_minor=0,
+            firmware_version="VESC",
+            dbc_hash=0,
+            board_id=0,
+            max_wheel_speed_rad_s=settings.max_erpm / settings.erpm_per_rad_s,
+            max_wheel_acceleration_rad_s2=None,
+            ticks_per_rev=None,
+            command_timeout_s=settings.watchdog_s,
+            drive_off_timeout_s=settings.watchdog_s,
+            stop_deceleration_rad_s2=settings.stop_deceleration_rad_s2,
+            told=False,
+        )
+
+    def link_up(self, now_ns: int) -> None:
+        """The medium has come up (again): whatever was agreed is void."""
+        self._restart("the link was lost", now_ns)
+        self._link_is_up = True
+
+    def link_down(self, now_ns: int) -> None:
+        """The medium is gone: whatever was agreed is void."""
+        self._restart("the link was lost", now_ns)
+        self._link_is_up = False
+
+    def request(self, request: Request) -> None:
+        """Set what the host wants; ARM only from standing by, and consumed when the motors are let go."""
+        if request is self._wanted:
+            return
+        if request is Request.ARM:
+            if self.state not in (DriverState.STANDBY, DriverState.READY):
+                self._note = f"not arming: {self.detail}"
+                return
+            self.stats = replace(self.stats, sessions=self.stats.sessions + 1)
+            self._note, self._stage, self._stage_ns = "arming", _Stage.ARMING, None
+            self._zeros, self._speeds = 0, (0.0, 0.0)
+        elif self._wanted is Request.ARM and self._stage in (_Stage.ARMING, _Stage.ARMED):
+            self._note, self._stage, self._stage_ns = "stopping as asked", _Stage.STOPPING, None
+        self._wanted = request
+
+    def receive(self, now_ns: int, frames: Sequence[ReceivedFrame]) -> Readings:
+        """Take in received frames and return what they meant; frames that come while the link is down are ignored."""
+        wheels: list[WheelSample] = []
+        status: list[RobotStatus] = []
+        for received in frames if self._link_is_up else ():
+            if self._take_packet(received.frame):
+                continue
+            decoded = codec.decode(received.frame)
+            if decoded is None or decoded.controller not in self._motors:
+                self._count_unused(received.frame)
+                continue
+            self._count("frames_accepted")
+            motor = self._motors[decoded.controller]
+            match decoded.name:
+                case "pong":
+                    motor.answered = True
+                case "status":
+                    motor.erpm, motor.erpm_ns = decoded.values["erpm"], received.t_ns
+                    status.append(self._status(received.t_ns))
+                case "status5":
+                    self._take_tachometer(motor, int(decoded.values["tachometer"]), received.t_ns)
+                    if all(each.is_new and each.erpm_ns is not None for each in self._all):
+                        wheels.append(self._sample(received.t_ns))
+        if self._link_is_up:
+            self._check(now_ns)
+        events, self._events = tuple(self._events), []
+        return Readings(wheels=tuple(wheels), status=tuple(status[-1:]), events=events)
+
+    def transmit(self, now_ns: int, command: WheelCommand | None) -> tuple[OutgoingFrame, ...]:
+        """Frames due now: the command, or what stops; and the questions, which feed no timeout.
+
+        Raises ValueError for a command that is not finite or valid for no time.
+        """
+        if command is not None and not (
+            math.isfinite(command.left_rad_s) and math.isfinite(command.right_rad_s) and command.valid_for_s > 0.0
+        ):
+            raise ValueError(f"not a wheel command: {command}")
+        if not self._link_is_up:
+            return ()
+        asked = self._questions(now_ns)
+        match self._stage:
+            case _Stage.REST:
+                self._reset()
+                return asked
+            case _Stage.ARMING:
+                return (*self._arm(now_ns), *asked)
+            case _Stage.STOPPING:
+                return (*self._ramp(now_ns), *asked)
+            case _Stage.BRAKING:
+                return (*self._brake(now_ns), *asked)
+        if now_ns - self._last_sent_ns > self._settings.watchdog_s * 1e9:
+            # They have no armed state to fall out of: the next speed would move them again.
+            self._lose("no command for longer than the controllers' timeout")
+            return (*self._brake(now_ns), *asked)
+        if command is None:
+            return asked
+        self._speeds, self._last_sent_ns = (command.left_rad_s, command.right_rad_s), now_ns
+        self._count("commands_sent")
+        # Half of its validity may pass on the way.
+        life_ns = round(0.5e9 * command.valid_for_s)
+        return (*self._frames(now_ns, *self._velocity(self._speeds), life_ns=life_ns), *asked)
+
+    def estop(self, now_ns: int) -> tuple[OutgoingFrame, ...]:
+        """Frames that brake every motor in any state; the driver goes on with that until they stand."""
+        self._wanted, self._estopped = Request.STANDBY, True
+        self._stage, self._stage_ns, self._note = _Stage.BRAKING, now_ns, "emergency stop sent"
+        return tuple(
+            OutgoingFrame(frame, now_ns + _ESTOP_LIFE_NS, _ESTOP_RANK)
+            for frame in _ESTOP_REPEATS * stop_frames(self._settings)
+        )
+
+    @property
+    def _all(self) -> Sequence[_Motor]:
+        return tuple(self._motors.values())
+
+    @property
+    def _is_known(self) -> bool:
+        return all(m.answered and m.erpm_ns is not None and m.tachometer is not None for m in self._all)
+
+    @property
+    def _stands(self) -> bool:
+        return all(abs(motor.erpm) < STANDS_ERPM for motor in self._all)
+
+    def _missing(self) -> str:
+        silent = [str(motor.node) for motor in self._all if not motor.answered]
+        if silent:
+            return f"controller {', '.join(silent)} does not answer; is it switched on, at this bit rate, at this id?"
+        return "no status messages 1 and 5; switch them on, at 50 Hz (VESC Tool, App Settings, CAN)"
+
+    def _questions(self, now_ns: int) -> tuple[OutgoingFrame, ...]:
+        if not all(motor.answered for motor in self._all):
+            if now_ns - self._pinged_ns < _PING_PERIOD_NS:
+                return ()
+            self._pinged_ns = now_ns
+            return self._frames(now_ns, *(codec.ping(motor.node, HOST_ID) for motor in self._all))
+        if now_ns - self._asked_ns < _FAULT_PERIOD_NS:
+            return ()
+        self._asked_ns = now_ns
+        self._next_asked = (self._next_asked + 1) % len(self._all)
+        node = self._all[self._next_asked].node
+        return self._frames(now_ns, *codec.fragments(node, HOST_ID, codec.ask_values(codec.FAULT_AND_STATUS)))
+
+    def _arm(self, now_ns: int) -> tuple[OutgoingFrame, ...]:
+        """Zeros, for as long as the motors stand, until there were enough."""
+        self._stage_ns = now_ns if self._stage_ns is None else self._stage_ns
+        if not self._stands:
+            self._give_up("not armed: a motor turns; wait until it stands")
+            return ()
+        if any(motor.fault is None for motor in self._all):
+            # Nothing is known of its faults yet.
+            if now_ns - self._stage_ns > ARMING_TIMEOUT_NS:
+                self._give_up("not armed: a controller does not say whether it has a fault")
+            return ()
+        self._zeros += 1
+        if self._zeros > ZEROS_TO_ARM:
+            self._stage, self._note = _Stage.ARMED, "armed"
+        self._last_sent_ns = now_ns
+        return self._frames(now_ns, *self._velocity((0.0, 0.0)))
+
+    def _ramp(self, now_ns: int) -> tuple[OutgoingFrame, ...]:
+        """Slow down with the declared deceleration, then let go, then say nothing."""
+        elapsed_s = min(max(now_ns - self._last_sent_ns, 0) * 1e-9, _LONGEST_STEP_S)
+        self._last_sent_ns = now_ns
+        step = self._settings.stop_deceleration_rad_s2 * elapsed_s
+        left, right = (math.copysign(max(abs(speed) - step, 0.0), speed) for speed in self._speeds)
+        self._speeds = (left, right)
+        if max(abs(left), abs(right)) > slowest_rad_s(self._settings):
+            return self._frames(now_ns, *self._velocity(self._speeds))
+        # Below the slowest speed that it holds it would roll on: brake there.
+        self._stage, self._stage_ns = _Stage.BRAKING, now_ns
+        return self._brake(now_ns)
+
+    def _brake(self, now_ns: int) -> tuple[OutgoingFrame, ...]:
+        self._stage_ns = now_ns if self._stage_ns is None else self._stage_ns
+        known = all(motor.erpm_ns is not None for motor in self._all)
+        if (known and self._stands) or now_ns - self._stage_ns > BRAKING_NS:
+            self._stage = _Stage.REST
+            return self._frames(now_ns, *(codec.command(motor.node, "set_current", 0.0) for motor in self._all))
+        amperes = self._settings.brake_current_a
+        return self._frames(now_ns, *(codec.command(m.node, "set_brake_current", amperes) for m in self._all))
+
+    def _reset(self) -> None:
+        """Clear what is latched here; a controller ends its own fault when its cause has gone."""
+        if self._wanted is Request.RESET and not any(motor.fault or motor.killed for motor in self._all):
+            self._fault, self._estopped, self._wanted, self._note = None, False, Request.STANDBY, "it stands by"
+
+    def _velocity(self, speeds: tuple[float, float]) -> list[Frame]:
+        limit = self._settings.max_erpm
+        frames = []
+        for side, direction, speed in zip(self._sides, self._settings.direction, speeds, strict=True):
+            erpm = min(max(direction * speed * self._settings.erpm_per_rad_s, -limit), limit)
+            frames += [codec.command(motor.node, "set_erpm", erpm) for motor in side]
+        return frames
+
+    def _frames(self, now_ns: int, *frames: Frame, life_ns: int = _FRAME_LIFE_NS) -> tuple[OutgoingFrame, ...]:
+        return tuple(OutgoingFrame(frame, now_ns + life_ns, _RANK) for frame in frames)
+
+    def _take_packet(self, frame: Frame) -> bool:
+        """Whether the frame belongs to an answer for this host; what the answer says is taken."""
+        if not frame.extended or frame.can_id & 0xFF != HOST_ID or frame.can_id >> 8 == codec.PONG:
+            return False
+        found = self._reassembly.feed(frame)
+        if found is not None and found[0] in self._motors:
+            read: Mapping[str, float] = codec.values(found[2]) or {}
+            motor = self._motors[found[0]]
+            motor.fault = int(read["fault"]) if "fault" in read else motor.fault
+            byte = int(read.get("status_byte", 0))
+            motor.timed_out, motor.killed = bool(byte & codec.TIMED_OUT), bool(byte & codec.KILL_SWITCH)
+            self._count("frames_accepted")
+        return True
+
+    def _take_tachometer(self, motor: _Motor, tachometer: int, t_ns: int) -> None:
+        if motor.tachometer is not None:
+            moved = (tachometer - motor.tachometer + 2**31) % 2**32 - 2**31
+            fastest = 1.5 * self._settings.max_erpm / 10.0 * (t_ns - motor.tachometer_ns) * 1e-9
+            if abs(moved) <= fastest + 12:
+                motor.steps += moved
+            else:
+                self._count("implausible_ticks")
+                if self._stage in (_Stage.ARMING, _Stage.ARMED):
+                    self._lose(f"controller {motor.node} has restarted")
+        motor.tachometer, motor.tachometer_ns, motor.is_new = tachometer, t_ns, True
+
+    def _sample(self, t_ns: int) -> WheelSample:
+        per_step = 2.0 * math.pi / (6.0 * self._settings.pole_pairs * self._settings.gear)
+        angles, speeds = [], []
+        for side, direction in zip(self._sides, self._settings.direction, strict=True):
+            erpm = sum(motor.erpm for motor in side) / len(side)
+            # Ten of its steps a second are one electrical rpm: those counted earlier are carried on to the newest.
+            steps = [m.steps + m.erpm / 10.0 * (t_ns - m.tachometer_ns) * 1e-9 for m in side]
+            angles.append(direction * per_step * sum(steps) / len(side))
+            speeds.append(direction * erpm / self._settings.erpm_per_rad_s)
+        for motor in self._all:
+            motor.is_new = False
+        return WheelSample(t_ns, t_ns, angles[0], angles[1], speeds[0], speeds[1])
+
+    def _check(self, now_ns: int) -> None:
+        """Faults, silence and timeouts of an armed controller stop all."""
+        for motor in self._all:
+            age_ns = None if motor.erpm_ns is None else now_ns - motor.erpm_ns
+            if self._stage in (_Stage.ARMING, _Stage.ARMED, _Stage.STOPPING):
+                if motor.fault:
+                    self._lose(f"controller {motor.node}: {_words(motor.fault)}")
+                elif motor.killed:
+                    self._lose(f"controller {motor.node}: its kill switch is pressed")
+                elif age_ns is not None and age_ns > SILENT_NS:
+                    self._lose(f"controller {motor.node} fell silent")
+                elif self._stage is _Stage.ARMED and motor.timed_out and self._zeros_are_old(now_ns):
+                    self._lose(f"controller {motor.node}: its timeout ran out, no command came in time")
+            elif age_ns is not None and age_ns > GONE_NS and self._stage is _Stage.REST:
+                self._restart(f"controller {motor.node} fell silent", now_ns)
+                self._events.append(f"controller {motor.node} fell silent: asking anew")
+
+    def _zeros_are_old(self, now_ns: int) -> bool:
+        """Whether an answer of before the first command cannot be meant any more."""
+        return now_ns - (self._stage_ns or now_ns) > 2 * len(self._all) * _FAULT_PERIOD_NS + SILENT_NS
+
+    def _count_unused(self, frame: Frame) -> None:
+        number, to = frame.can_id >> 8, frame.can_id & 0xFF
+        ours = frame.extended and (to in self._motors or to == codec.EVERYBODY)
+        self._count("unknown_id")
+        if not (ours and number in _SET_COMMANDS):
+            return
+        if number == _BRAKE:
+            self._wanted, self._estopped, self._stage, self._stage_ns = Request.STANDBY, True, _Stage.BRAKING, None
+            self._events.append("e-stop from outside on the link, by `disco-hw estop` or another host")
+            return
+        if not self._foreign:
+            self._foreign = True
+            self._events.append(f"another host is on the link: it commands controller {to}; disconnect it")
+        if self._stage in (_Stage.ARMING, _Stage.ARMED):
+            self._lose(f"another host commands controller {to}; disconnect it")
+
+    def _status(self, t_ns: int) -> RobotStatus:
+        names = {DriverState.ARMED: "ARMED", DriverState.FAULT: "FAULT", DriverState.STOPPING: "STOPPING"}
+        names[DriverState.ESTOP] = "ESTOP" if self._stands else "STOPPING"
+        return RobotStatus(
+            t_ns=t_ns,
+            state=names.get(self.state, "STANDBY"),
+            fault_code=0,
+            fault="NONE",
+            estop_source="NONE",
+            stop_cause="NONE",
+            session=0,
+            rejected_count=0,
+            reject_reason="NONE",
+        )
+
+    def _give_up(self, why: str) -> None:
+        self._wanted, self._stage, self._stage_ns, self._note = Request.STANDBY, _Stage.REST, None, why
+
+    def _lose(self, why: str) -> None:
+        """One controller is lost: all brake, latched."""
+        self._give_up(f"disarmed: {why}")
+        self._stage, self._fault = _Stage.BRAKING, why
+        self._events.append(f"disarmed: {why}")
+
+    def _restart(self, why: str, now_ns: int) -> None:
+        if self._wanted is Request.ARM:
+            self._note = f"disarmed: {why}"
+        self._wanted, self._stage, self._stage_ns = Request.STANDBY, _Stage.REST, None
+        self._fault, self._foreign, self._pinged_ns = None, False, now_ns - _PING_PERIOD_NS
+        for motor in self._all:
+            motor.answered = motor.is_new = motor.timed_out = motor.killed = False
+            motor.erpm, motor.erpm_ns, motor.tachometer, motor.fault = 0.0, None, None, None
+
+    def _count(self, name: str) -> None:
+        self.stats = replace(self.stats, **{name: getattr(self.stats, name) + 1})
+
+
+def _words(fault: int | None) -> str:
+    return FAULTS.get(fault or 0, f"fault {fault}")
+
+
+DRIVER = MotorDriver(
+    "vesc",
+    lambda settings, _key: VescDriver(settings),
+    settings=VescSettings,
+    example=EXAMPLE,
+    stop_frames=stop_frames,
+    stop_confirmation=stop_confirmation,
+    cyclic_frames=cyclic_frames,
+    safety_card=safety_card,
+    slowest_rad_s=slowest_rad_s,
+)

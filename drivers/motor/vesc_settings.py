@@ -1,0 +1,147 @@
+"""What robot.toml says of VESC controllers, and what follows from that alone: e-stop, bus load, safety card."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec import Meta
+
+from drivers.motor import vesc_codec as codec
+from drivers.types import CyclicFrame, Frame, SafetyCard, SettingsFault
+
+HOST_ID = 253
+STATUS_PERIOD_S = 0.02
+STANDS_ERPM = 60.0
+EXAMPLE = """nodes = [23, 51]
+direction = [1, -1]
+gear = 20.0
+pole_pairs = 7
+max_erpm = 15000.0
+watchdog_s = 0.1
+brake_current_a = 20.0
+"""
+FAULTS = {
+    1: "the supply's voltage is too high",
+    2: "the supply's voltage is too low",
+    3: "the gate driver failed (DRV)",
+    4: "the motor's current is far too high",
+    5: "the power stage is too hot; let it cool",
+    6: "the motor is too hot; let it cool",
+    9: "its processor's voltage is too low",
+    10: "it was restarted by its own watchdog",
+    18: "the motor's phases are not balanced; check its cable",
+    27: "the encoder failed",
+}
+_Nodes = int | tuple[int, ...]
+_Sign = Literal[-1, 1]
+
+
+class VescSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Its fields in [link]: left before right; `gear` is motor turns per wheel turn, `pole_pairs` half the poles.
+
+    `watchdog_s` (App Settings, Timeout), `timeout_brake_current_a`, `max_erpm` and `min_erpm` (below which the speed
+    loop lets go) are what the controllers are set to.
+    """
+
+    nodes: tuple[_Nodes, _Nodes]
+    pole_pairs: Annotated[int, Meta(ge=1, le=100)]
+    max_erpm: Annotated[float, Meta(gt=0.0, le=1e6)]
+    watchdog_s: Annotated[float, Meta(gt=0.0, le=0.5)]
+    brake_current_a: Annotated[float, Meta(gt=0.0, le=500.0)]
+    timeout_brake_current_a: Annotated[float, Meta(ge=0.0, le=500.0)] = 0.0
+    min_erpm: Annotated[float, Meta(ge=0.0, le=1e5)] = 900.0
+    direction: tuple[_Sign, _Sign] = (1, 1)
+    gear: Annotated[float, Meta(gt=0.0, le=1000.0)] = 1.0
+    stop_deceleration_rad_s2: Annotated[float, Meta(gt=0.0, le=655.0)] = 10.0
+
+    @property
+    def sides(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
+        """The controllers on the left and on the right."""
+        left, right = ((side,) if isinstance(side, int) else side for side in self.nodes)
+        return left, right
+
+    @property
+    def all_nodes(self) -> tuple[int, ...]:
+        """Every controller, left before right."""
+        return (*self.sides[0], *self.sides[1])
+
+    @property
+    def erpm_per_rad_s(self) -> float:
+        """Electrical rpm at a wheel speed of 1 rad/s."""
+        return 60.0 / (2.0 * math.pi) * self.pole_pairs * self.gear
+
+    def fault(self) -> SettingsFault | None:
+        """What no single field shows."""
+        nodes = self.all_nodes
+        if not all(self.sides):
+            return SettingsFault("nodes", "a side has no controller", "write [left, right], such as [23, 51]")
+        if any(not 0 <= node <= codec.LARGEST_ID or node == HOST_ID for node in nodes):
+            return SettingsFault("nodes", f"an id is outside 0 to 254, or {HOST_ID}, which is this host's", "change it")
+        if len(set(nodes)) != len(nodes):
+            return SettingsFault("nodes", "an id stands there twice", "give each controller its own (VESC Tool)")
+        if self.min_erpm >= self.max_erpm:
+            return SettingsFault("max_erpm", "not above min_erpm", "write what the motor can turn")
+        return None
+
+
+def slowest_rad_s(settings: VescSettings) -> float:
+    """The slowest speed of a wheel that the speed loop holds."""
+    return settings.min_erpm / settings.erpm_per_rad_s
+
+
+def stop_frames(settings: VescSettings) -> tuple[Frame, ...]:
+    """Brake with the declared current, all at once; nothing latches it."""
+    return (codec.command(codec.EVERYBODY, "set_brake_current", settings.brake_current_a),)
+
+
+def stop_confirmation(settings: VescSettings) -> Callable[[Frame], bool]:
+    """Return what says, frame by frame heard, whether every motor stands: nothing else confirms a stop here."""
+    standing = dict.fromkeys(settings.all_nodes, False)
+
+    def heard(frame: Frame) -> bool:
+        decoded = codec.decode(frame)
+        if decoded is not None and decoded.name == "status" and decoded.controller in standing:
+            standing[decoded.controller] = abs(decoded.values["erpm"]) < STANDS_ERPM
+        return all(standing.values())
+
+    return heard
+
+
+def cyclic_frames(settings: VescSettings, command_rate_hz: float, _authenticated: bool) -> tuple[CyclicFrame, ...]:
+    """Speeds, two status messages at 50 Hz and the question for faults of every controller, as long 11-bit frames."""
+    frames: list[CyclicFrame] = []
+    for node in settings.all_nodes:
+        frames += [
+            # 29-bit identifiers take about 25 bits more than the load's formula counts: two bytes and a half.
+            CyclicFrame(f"SET_RPM of {node}", "HOST", 7, command_rate_hz),
+            CyclicFrame(f"STATUS of {node}", "ROBOT", 11, 1.0 / STATUS_PERIOD_S),
+            CyclicFrame(f"STATUS_5 of {node}", "ROBOT", 11, 1.0 / STATUS_PERIOD_S),
+            CyclicFrame(f"faults of {node}", "ROBOT", 11, 30.0),
+        ]
+    return tuple(frames)
+
+
+def safety_card(settings: VescSettings) -> SafetyCard:
+    """Who stops the robot when."""
+    brakes = settings.timeout_brake_current_a > 0.0
+    held = f"braking with {settings.timeout_brake_current_a:g} A"
+    return SafetyCard(
+        host_silent=f"each controller {settings.watchdog_s:g} s after the last set command, by its timeout",
+        stops_by=held if brakes else "coasting: timeout_brake_current_a is 0",
+        reaction_s=settings.watchdog_s + 0.01,
+        brakes=brakes,
+        estop=f"a frame to all: brakes with {settings.brake_current_a:g} A; nothing latches it but this driver, and "
+        "nothing confirms it but standing motors",
+        unverified=(
+            f"the timeout ({settings.watchdog_s:g} s), its brake current and the speeds are declared in robot.toml "
+            "and were not read back",
+            "not tried on hardware: the driver was tried against a simulator made from what the vendor's code does",
+        ),
+        setup=(
+            f"App Settings, General: Timeout {1e3 * settings.watchdog_s:g} ms, Timeout Brake Current "
+            f"{settings.timeout_brake_current_a:g} A, CAN status messages 1 and 5 at 50 Hz or more",
+        ),
+    )

@@ -1,0 +1,87 @@
+"""What is VESC's own: speeds that its loop does not hold, a host that pauses, restarts, status that is off."""
+
+import pytest
+
+from disco_hw.config import load_robot_config
+from disco_hw.errors import InputError
+from drivers.motor import find_driver
+from drivers.types import DriverState, Request
+from tests.drivers.motor.test_motor_drivers import OWN, robot_toml
+from tests.drivers.motor.vendors import VENDORS
+
+(VESC,) = [vendor for vendor in VENDORS if vendor.label == "vesc"]
+FORWARD = (3.0, 2.0)
+STILL = (DriverState.STANDBY, DriverState.READY)
+
+
+def test_a_task_that_needs_less_than_the_speed_loop_holds_is_refused_with_what_it_holds(tmp_path):
+    slow = OWN["vesc"].replace("gear = 20.0", "gear = 1.0")
+    with pytest.raises(InputError, match=r"task\.speed_m_s: 0\.2 m/s is slower .*; write at least 0\.81"):
+        load_robot_config(robot_toml(tmp_path, f'driver = "vesc"\n{slow}'))
+
+
+@pytest.mark.parametrize("pause_s", [0.13, 0.5])
+def test_a_host_that_paused_for_longer_than_the_timeout_is_disarmed(pause_s):
+    bench = VESC.bench()
+    bench.arm()
+    bench.run(1.0, FORWARD)
+    bench.host_runs = False
+    bench.run(pause_s)
+    bench.host_runs = True
+    bench.run(0.05)
+    assert bench.driver.state is not DriverState.ARMED
+    bench.run(1.0, FORWARD)
+    assert bench.robot.speed_rad_s < 0.05
+
+
+def test_a_controller_that_restarts_while_armed_is_lost():
+    bench = VESC.bench()
+    bench.arm()
+    bench.run(2.0, FORWARD)
+    bench.robot.controller.restart()
+    bench.run(0.1, FORWARD)
+    assert bench.driver.state is DriverState.FAULT
+    assert "restarted" in bench.driver.detail
+
+
+def test_status_messages_that_are_off_are_asked_for_by_name():
+    bench = VESC.bench()
+    for side in bench.robot.controller.sides:
+        side[0].status_ms[27] = 0
+    bench.run(1.0)
+    assert bench.driver.state is DriverState.HANDSHAKE
+    assert "status messages 1 and 5" in bench.driver.detail
+
+
+def test_it_does_not_arm_while_a_motor_turns():
+    bench = VESC.bench()
+    bench.run_until(*STILL)
+    bench.robot.speed = [2.0, 2.0]
+    bench.run(0.05)
+    bench.driver.request(Request.ARM)
+    bench.run(0.05, FORWARD)
+    assert bench.driver.state in STILL
+    assert "turns" in bench.driver.detail
+    assert not [frame for frame in bench.robot.received if VESC.is_motion(frame)]
+
+
+def test_a_fault_is_named_within_half_a_second():
+    bench = VESC.bench()
+    bench.run_until(*STILL)
+    bench.robot.controller.sides[1][0].values.fault = 6
+    bench.run(0.5)
+    assert bench.driver.state is DriverState.FAULT
+    assert bench.driver.detail == "controller 51: the motor is too hot; let it cool; remove the cause, then reset"
+
+
+def test_the_questions_for_faults_do_not_feed_the_timeout():
+    bench = VESC.bench()
+    bench.run_until(*STILL)
+    bench.run(2.0)
+    assert [vesc.fed for side in bench.robot.controller.sides for vesc in side] == [0, 0]
+
+
+def test_the_emergency_stop_is_one_frame_to_all():
+    settings = VESC.settings
+    (frame,) = find_driver("vesc").stop_frames(settings)
+    assert (frame.can_id, frame.extended, frame.data.hex()) == (0x2FF, True, "00004e20")
