@@ -17,6 +17,7 @@ import socket
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -31,7 +32,8 @@ EMULATOR = "qemu-system-arm"
 FLAGS = ("-mthumb", "-Os", "-ffunction-sections", "-fdata-sections", "--specs=nano.specs")
 WARNINGS = ("-Wall", "-Wextra", "-Wdouble-promotion", "-Werror")
 SETTINGS = 0x2000_0000
-_REALTIME_PRIORITY = 30
+_REALTIME_PRIORITY = 85
+_START_S = 20.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,31 +101,26 @@ class Truth:
 
 
 class Bench:
-    """The test bench's line: what truly happens, 100 times a second, and what a person could do to the board."""
+    """The test bench's line: what truly happens, 100 times a second, and what a person could do to the board.
+
+    `rows` is what it told so far. A thread reads it: a line that nobody reads holds up the board.
+    """
 
     def __init__(self, path: Path) -> None:
+        self.rows: list[Truth] = []
         self._socket = socket.socket(socket.AF_UNIX)
         self._socket.connect(str(path))
-        self._socket.setblocking(False)
-        self._rest = b""
-        self.rows: list[Truth] = []
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
 
     def do(self, what: str) -> None:
         """r: restart, b: brown-out, h: hang, p: press or release the emergency stop."""
         self._socket.sendall(what.encode())
 
-    def read(self) -> list[Truth]:
-        """Take in what has come, and return everything so far."""
-        with contextlib.suppress(BlockingIOError):
-            while data := self._socket.recv(1 << 16):
-                *lines, self._rest = (self._rest + data).split(b"\n")
-                self.rows += [row for line in lines if (row := _truth(line)) is not None]
-        return self.rows
-
     def latest(self, within_s: float = 5.0) -> Truth:
         """Wait for the next line."""
-        seen, deadline = len(self.read()), time.monotonic() + within_s
-        while len(self.read()) <= seen:
+        seen, deadline = len(self.rows), time.monotonic() + within_s
+        while len(self.rows) <= seen:
             if time.monotonic() > deadline:
                 raise TimeoutError("the bench tells nothing")
             time.sleep(0.005)
@@ -131,7 +128,16 @@ class Bench:
 
     def close(self) -> None:
         """Leave the line."""
+        with contextlib.suppress(OSError):
+            self._socket.shutdown(socket.SHUT_RDWR)
+        self._reader.join()
         self._socket.close()
+
+    def _read(self) -> None:
+        rest = b""
+        while data := self._socket.recv(1 << 16):
+            *lines, rest = (rest + data).split(b"\n")
+            self.rows += [row for line in lines if (row := _truth(line)) is not None]
 
 
 def _truth(line: bytes) -> Truth | None:
@@ -163,6 +169,12 @@ def _settings(entropy: int, first_us: int, key: bytes) -> list[str]:
     ]
 
 
+def _command(image: Path, processor: str, settings: list[str], *lines: str) -> list[str]:
+    serial = [option for line in lines for option in ("-serial", line)]
+    machine = ["-machine", PROCESSORS[processor].machine, "-kernel", str(image), "-display", "none", "-monitor", "none"]
+    return [EMULATOR, *machine, *serial, *settings]
+
+
 @contextlib.contextmanager
 def running_board(
     image: Path, processor: str, *, entropy: int | None = None, first_us: int = 0, key: bytes = b""
@@ -171,21 +183,41 @@ def running_board(
     drawn = secrets.randbits(63) if entropy is None else entropy
     with tempfile.TemporaryDirectory(prefix="disco-hw-board-") as folder:
         bench = Path(folder) / "bench"
-        command = [
-            EMULATOR, "-machine", PROCESSORS[processor].machine, "-kernel", str(image), "-display", "none",
-            "-monitor", "none", "-serial", "pty", "-serial", f"unix:{bench},server=on,wait=off",
-            *_settings(drawn, first_us, key),
-        ]  # fmt: skip
+        command = _command(image, processor, _settings(drawn, first_us, key), "pty", f"unix:{bench},server=on,wait=off")
         process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
         try:
             port = _port_of(process)
-            _prefer(process.pid)
-            yield Board(port, Bench(bench), process)
+            with contextlib.closing(Bench(bench)) as test_bench:
+                # When it tells something, all its threads are there.
+                test_bench.latest(_START_S)
+                _prefer(process.pid)
+                yield Board(port, test_bench, process)
         finally:
             process.kill()
             process.wait()
             if process.stdout is not None:
                 process.stdout.close()
+
+
+def run_fast(image: Path, processor: str, folder: Path, seconds: float, first_us: int = 0) -> tuple[bytes, list[Truth]]:
+    """Let a board run as fast as the computer can for so many seconds of its own clock, which counts instructions.
+
+    Returns what it sent over its serial line, and what its bench told.
+    """
+    line, bench = folder / "line", folder / "bench"
+    command = _command(image, processor, _settings(1, first_us, b""), f"file:{line}", f"file:{bench}")
+    process = subprocess.Popen([*command, "-icount", "shift=5,sleep=off"])
+    try:
+        # A line for each 10 ms.
+        least, size = round(100 * seconds), 0
+        while process.poll() is None and not (size > 20 * least and bench.read_bytes().count(b"\n") > least):
+            time.sleep(1.0)
+            size = bench.stat().st_size
+    finally:
+        process.kill()
+        process.wait()
+    rows = [row for text in bench.read_bytes().split(b"\n")[:-1] if (row := _truth(text)) is not None]
+    return line.read_bytes(), rows
 
 
 def _prefer(process: int) -> None:

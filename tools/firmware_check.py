@@ -67,7 +67,7 @@ def run_instrumented(tree: Path, flags: str) -> bool:
     environment = os.environ | {"CFLAGS": flags, "LDFLAGS": flags, "PYTHONPATH": str(tree)}
     build = [sys.executable, "firmware_protocol/build_firmware.py"]
     subprocess.run(build, cwd=tree, env=environment, check=True, capture_output=True)
-    tests = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "tests/firmware_protocol"]
+    tests = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-m", "not long", "tests/firmware_protocol"]
     return subprocess.run(tests, cwd=tree, env=environment, check=False).returncode == 0
 
 

@@ -47,6 +47,9 @@ FIRST = {
     "drive": ("firmware/test_drive",),
     "host": ("firmware/test_host",),
     "timebase": ("firmware/test_timebase",),
+    "serial_framing": ("test_serial_framing",),
+    "slcan": ("test_slcan",),
+    "robot_config": ("test_firmware_core", "firmware/test_robot_config"),
 }
 
 
@@ -106,7 +109,7 @@ def test_files(name: str) -> list[str]:
     """The fast tests, the likeliest to notice a change of this file first."""
     stem = Path(name).stem
     first = [TESTS / f"{part}.py" for part in FIRST.get(stem, (f"firmware/test_{stem}",))]
-    slow = {TESTS / "firmware" / "test_sanitizers.py"}
+    slow = {TESTS / "firmware" / "test_sanitizers.py", *TESTS.glob("emulated/*.py"), *TESTS.glob("ports/*.py")}
     others = [path for path in sorted(TESTS.rglob("test_*.py")) if path not in slow and path not in first]
     return [str(path) for path in (*first, *others)]
 

@@ -40,3 +40,9 @@ class TestAuthenticatedM4F(FirmwareConformance):
     @classmethod
     def make_end(cls, config):
         return BoardEnd("m4f", key=cls.key)
+
+
+class TestSlcanM4F(FirmwareConformance):
+    @classmethod
+    def make_end(cls, config):
+        return BoardEnd("m4f", slcan=True)

@@ -1,0 +1,169 @@
+/* STM32F4 with ST's HAL: USART2 by DMA and interrupt, TIM2 as the microsecond counter, TIM3 and TIM4 as encoders, TIM1 as
+ * the motors' PWM, IWDG. Compiled against stub headers in the tests; NOT RUN ON HARDWARE. The handles and the MX_..._Init
+ * functions are what CubeMX generates for these peripherals. */
+#include "port.h"
+
+#include "main.h"
+#include "queue.h"
+
+#define TICKS_PER_REV (2048u)
+#define MAX_WHEEL_SPEED (8.0f)
+#define TWO_PI (6.2831853f)
+#define PWM_FULL (1000.0f)
+#define CYCLE_S (0.001f)
+#define SPEED_FILTER (0.1f)
+#define RECORD_SECTOR FLASH_SECTOR_7
+#define RECORD_ADDRESS (0x08060000u)
+#define SENDING_BYTES (256u)
+
+static disco_queue_t received;
+static uint8_t incoming;
+static uint8_t sending[SENDING_BYTES];
+static uint16_t last_count[2];
+
+/* Memory that a reset leaves alone: the section .noinit of the linker script. */
+__attribute__((section(".noinit"))) static uint64_t last_entropy;
+
+/* Called by the HAL from the interrupt of USART2. */
+void HAL_UART_RxCpltCallback(UART_HandleTypeDef *uart)
+{
+    (void)disco_queue_put(&received, &incoming, 1u);
+    (void)HAL_UART_Receive_IT(uart, &incoming, 1u);
+}
+
+/* After an overrun the HAL has stopped receiving. */
+void HAL_UART_ErrorCallback(UART_HandleTypeDef *uart)
+{
+    (void)HAL_UART_Receive_IT(uart, &incoming, 1u);
+}
+
+disco_reset_cause_t port_start(disco_config_t *config)
+{
+    disco_reset_cause_t cause = DISCO_RESET_POWER_ON;
+    if (__HAL_RCC_GET_FLAG(RCC_FLAG_IWDGRST)) {
+        cause = DISCO_RESET_WATCHDOG;
+    } else if (__HAL_RCC_GET_FLAG(RCC_FLAG_BORRST) && !__HAL_RCC_GET_FLAG(RCC_FLAG_PORRST)) {
+        cause = DISCO_RESET_BROWN_OUT;
+    }
+    __HAL_RCC_CLEAR_RESET_FLAGS();
+    (void)HAL_Init();
+    SystemClock_Config();
+    MX_GPIO_Init(); /* driver off, brake on */
+    MX_DMA_Init();
+    MX_USART2_UART_Init();
+    MX_TIM1_Init();
+    MX_TIM2_Init();
+    MX_TIM3_Init();
+    MX_TIM4_Init();
+    MX_RNG_Init();
+    (void)HAL_TIM_Base_Start(&htim2); /* 1 MHz, 32 bits */
+    (void)HAL_TIM_Encoder_Start(&htim3, TIM_CHANNEL_ALL);
+    (void)HAL_TIM_Encoder_Start(&htim4, TIM_CHANNEL_ALL);
+    (void)HAL_TIM_PWM_Start(&htim1, TIM_CHANNEL_1);
+    (void)HAL_TIM_PWM_Start(&htim1, TIM_CHANNEL_2);
+    (void)HAL_UART_Receive_IT(&huart2, &incoming, 1u);
+    MX_IWDG_Init(); /* LSI / 4, reload 249: 31 ms */
+    config->ticks_per_rev = TICKS_PER_REV;
+    config->max_wheel_speed = MAX_WHEEL_SPEED;
+    config->board_id = 0x0411u;
+    return cause;
+}
+
+uint32_t port_now_us(void)
+{
+    return __HAL_TIM_GET_COUNTER(&htim2);
+}
+
+size_t port_receive(uint8_t *bytes, size_t most)
+{
+    return disco_queue_take(&received, bytes, most);
+}
+
+size_t port_send(const uint8_t *bytes, size_t count)
+{
+    size_t taken = (count < SENDING_BYTES) ? count : SENDING_BYTES;
+    if (huart2.gState != HAL_UART_STATE_READY) {
+        return 0u;
+    }
+    for (size_t i = 0u; i < taken; i++) {
+        sending[i] = bytes[i];
+    }
+    return (HAL_UART_Transmit_DMA(&huart2, sending, (uint16_t)taken) == HAL_OK) ? taken : 0u;
+}
+
+uint64_t port_entropy(uint64_t *last)
+{
+    uint32_t low = 0u;
+    uint32_t high = 0u;
+    /* Where the generator fails, 0 is left, and the core refuses the start. */
+    if ((HAL_RNG_GenerateRandomNumber(&hrng, &low) != HAL_OK) || (HAL_RNG_GenerateRandomNumber(&hrng, &high) != HAL_OK)) {
+        low = high = 0u;
+    }
+    *last = last_entropy;
+    last_entropy = ((uint64_t)high << 32) | low;
+    return last_entropy;
+}
+
+void port_measure(port_measurement_t *measurement)
+{
+    disco_inputs_t *inputs = &measurement->inputs;
+    const uint16_t count[2] = {(uint16_t)__HAL_TIM_GET_COUNTER(&htim3), (uint16_t)__HAL_TIM_GET_COUNTER(&htim4)};
+    for (uint8_t side = 0u; side < 2u; side++) {
+        /* The timer has 16 bits: the difference is right as long as fewer than 2^15 pass in a cycle. */
+        const int16_t moved = (int16_t)(uint16_t)(count[side] - last_count[side]);
+        last_count[side] = count[side];
+        inputs->ticks[side] += (uint32_t)(int32_t)moved;
+        const float speed = (float)moved * (TWO_PI / ((float)TICKS_PER_REV * CYCLE_S));
+        inputs->wheel_speed[side] += SPEED_FILTER * (speed - inputs->wheel_speed[side]);
+        inputs->encoder_valid[side] = true;
+        inputs->temperature[side] = 25.0f;
+    }
+    inputs->estop_button = HAL_GPIO_ReadPin(ESTOP_GPIO_Port, ESTOP_Pin) == GPIO_PIN_RESET; /* a broken wire stops */
+}
+
+void port_drive(const disco_outputs_t *outputs)
+{
+    /* Feed-forward alone: a speed loop of your own goes here, or into a timer's interrupt at 10 kHz. */
+    float part[2];
+    const float setpoint[2] = {outputs->left_setpoint, outputs->right_setpoint};
+    for (uint8_t side = 0u; side < 2u; side++) {
+        part[side] = outputs->driver_enabled ? setpoint[side] * (PWM_FULL / MAX_WHEEL_SPEED) : 0.0f;
+    }
+    __HAL_TIM_SET_COMPARE(&htim1, TIM_CHANNEL_1, (uint32_t)(part[0] < 0.0f ? -part[0] : part[0]));
+    __HAL_TIM_SET_COMPARE(&htim1, TIM_CHANNEL_2, (uint32_t)(part[1] < 0.0f ? -part[1] : part[1]));
+    HAL_GPIO_WritePin(LEFT_DIR_GPIO_Port, LEFT_DIR_Pin, part[0] < 0.0f ? GPIO_PIN_SET : GPIO_PIN_RESET);
+    HAL_GPIO_WritePin(RIGHT_DIR_GPIO_Port, RIGHT_DIR_Pin, part[1] < 0.0f ? GPIO_PIN_SET : GPIO_PIN_RESET);
+    HAL_GPIO_WritePin(ENABLE_GPIO_Port, ENABLE_Pin, outputs->driver_enabled ? GPIO_PIN_SET : GPIO_PIN_RESET);
+    HAL_GPIO_WritePin(BRAKE_GPIO_Port, BRAKE_Pin, outputs->brake ? GPIO_PIN_SET : GPIO_PIN_RESET);
+}
+
+void port_feed_watchdog(void)
+{
+    (void)HAL_IWDG_Refresh(&hiwdg);
+}
+
+bool port_load(uint8_t *record)
+{
+    const uint8_t *stored = (const uint8_t *)(uintptr_t)RECORD_ADDRESS;
+    for (uint8_t i = 0u; i < (uint8_t)DISCO_RECORD_LENGTH; i++) {
+        record[i] = stored[i];
+    }
+    /* Erased flash is no record: its CRC does not hold. */
+    return true;
+}
+
+/* Erasing takes longer than the watchdog allows, and stops all code in the same bank: the watchdog's reset after it is
+ * told as such. Keep the record in an EEPROM or FRAM, or erase at the start. Written here only into erased flash. */
+void port_store(const uint8_t *record)
+{
+    (void)HAL_FLASH_Unlock();
+    for (uint32_t i = 0u; i < (uint32_t)DISCO_RECORD_LENGTH; i++) {
+        (void)HAL_FLASH_Program(FLASH_TYPEPROGRAM_BYTE, RECORD_ADDRESS + i, record[i]);
+    }
+    (void)HAL_FLASH_Lock();
+}
+
+void port_wait(void)
+{
+    __WFI(); /* SysTick of the HAL wakes it each millisecond */
+}

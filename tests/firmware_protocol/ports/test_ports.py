@@ -1,0 +1,96 @@
+"""The ports compile, with the host's compiler and stubs of the vendors' declarations: no hardware has run them."""
+
+import re
+import subprocess
+
+import pytest
+
+from firmware_protocol.build_firmware import PACKAGE, SOURCES
+
+FIRMWARE, PORTS = PACKAGE / "firmware", PACKAGE / "ports"
+CONTRACT = (PORTS / "port.h").read_text("utf-8")
+STUBS = PORTS.parents[1] / "tests" / "firmware_protocol" / "ports" / "stubs"
+WARNINGS = ("-Wall", "-Wextra", "-Wdouble-promotion", "-Wstrict-prototypes", "-Werror", "-Wno-int-to-pointer-cast")
+SKELETONS = ("template", "stm32", "rp2040", "esp32")
+FRAMES = {"esp32"}
+
+
+def functions(text):
+    return set(re.findall(r"^[\w ]+[ *](port_\w+)\(", text, re.MULTILINE))
+
+
+def compiled(*arguments, options=()):
+    include = [f"-I{FIRMWARE}", f"-I{PORTS}"]
+    ran = subprocess.run(
+        ["cc", "-std=c11", *WARNINGS, *options, *include, *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert ran.returncode == 0, ran.stderr
+
+
+def test_the_contract_has_at_most_a_dozen_functions_and_each_is_explained():
+    assert 10 <= len(functions(CONTRACT)) <= 12
+    for name in functions(CONTRACT):
+        before = CONTRACT[: CONTRACT.index(f"{name}(")].rstrip().rsplit("\n", 2)
+        assert any("*/" in line or "port_" in line for line in before), name
+
+
+@pytest.mark.parametrize("port", [*SKELETONS, "mps2"])
+def test_a_port_is_the_contract_in_at_most_300_lines(port):
+    text = (PORTS / port / "port.c").read_text("utf-8")
+    assert functions(text) == functions(CONTRACT)
+    assert len(text.splitlines()) <= 300
+
+
+@pytest.mark.parametrize("port", SKELETONS)
+def test_a_skeleton_compiles_against_what_its_vendor_declares(port, tmp_path):
+    compiled(
+        "-c", PORTS / port / "port.c", "-o", tmp_path / "port.o", options=[f"-I{STUBS / port}", f"-I{PORTS / port}"]
+    )
+
+
+@pytest.mark.parametrize("port", ["stm32", "rp2040", "esp32"])
+def test_a_skeleton_says_that_no_hardware_has_run_it(port):
+    assert "NOT RUN ON HARDWARE" in " ".join((PORTS / port / "port.c").read_text("utf-8").split()).replace(" * ", " ")
+
+
+@pytest.mark.parametrize("link", [[], ["-DDISCO_LINK_SLCAN"], ["-DDISCO_LINK_CAN"]], ids=["serial", "slcan", "can"])
+def test_the_main_loop_compiles_for_each_kind_of_link(link, tmp_path):
+    compiled("-c", PORTS / "controller.c", "-o", tmp_path / "controller.o", options=link)
+
+
+def test_the_template_with_the_main_loop_and_the_core_is_a_whole_firmware(tmp_path):
+    sources = [FIRMWARE / name for name in SOURCES]
+    compiled(PORTS / "controller.c", PORTS / "template" / "port.c", *sources, "-lm", "-o", tmp_path / "firmware")
+
+
+def test_nothing_between_an_interrupt_and_the_main_loop_is_lost_or_torn(tmp_path):
+    program = tmp_path / "queue"
+    compiled(STUBS.parent / "queue_threads.c", "-pthread", "-O2", "-o", program)
+    ran = subprocess.run([str(program)], capture_output=True, text=True, timeout=120, check=False)
+    assert (ran.returncode, ran.stdout) == (0, "0 wrong, 0 left\n")
+
+
+def test_the_threads_of_the_queue_do_not_race(tmp_path):
+    program, probe = tmp_path / "queue", tmp_path / "probe.c"
+    probe.write_text("int main(void) { return 0; }\n")
+    sanitizer = ["-fsanitize=thread", "-O1", "-g", "-pthread"]
+    if subprocess.run(["cc", *sanitizer, str(probe), "-o", str(program)], capture_output=True, check=False).returncode:
+        pytest.skip("this compiler has no thread sanitizer")
+    if subprocess.run([str(program)], capture_output=True, check=False).returncode:
+        pytest.skip("the thread sanitizer does not run here")
+    compiled(STUBS.parent / "queue_threads.c", *sanitizer, "-o", program)
+    ran = subprocess.run([str(program)], capture_output=True, text=True, timeout=200, check=False)
+    assert ran.returncode == 0, ran.stderr
+
+
+def test_the_core_has_no_double():
+    """The cross-compiler says so, too: tools/emulated_board.py has it take -Wdouble-promotion for an error."""
+    for name in SOURCES:
+        if name == "disco_robot.c":
+            continue  # its doubles are in functions that nothing calls
+        text = re.sub(r"/\*.*?\*/", "", (FIRMWARE / name).read_text("utf-8"), flags=re.DOTALL)
+        assert not re.search(r"\bdouble\b|\b(floor|fabs|fmax|fmin|sqrt|round|lround)\(", text), name
+        assert not re.search(r"(?<![\w.])\d+\.\d+(e[+-]?\d+)?(?![\dfe.])", text), name
