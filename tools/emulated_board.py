@@ -108,6 +108,12 @@ class Bench:
 
     def __init__(self, path: Path) -> None:
         self.rows: list[Truth] = []
+        deadline = time.monotonic() + _START_S
+        # The emulator makes it after the terminal.
+        while not path.exists():
+            if time.monotonic() > deadline:
+                raise TimeoutError("the emulator makes no bench")
+            time.sleep(0.01)
         self._socket = socket.socket(socket.AF_UNIX)
         self._socket.connect(str(path))
         self._reader = threading.Thread(target=self._read, daemon=True)

@@ -104,10 +104,16 @@ def table(figures: Mapping[str, Mapping[str, int]]) -> str:
     return "\n".join(lines) + "\n"
 
 
+def found(text: str) -> re.Match[str]:
+    """Return where the document has its table of figures: the processors' names, and the rows."""
+    block = re.search(r"^\| \|( m0plus .*)\|\n\|-.*\n((?:\|.*\n)+)", text, re.MULTILINE)
+    assert block is not None, f"{DOCUMENT}: no table of figures"
+    return block
+
+
 def documented(text: str) -> dict[str, dict[str, int]]:
     """Return the figures that the document has, by processor."""
-    block = re.search(r"^\| \|(.*)\|\n\|-.*\n((?:\|.*\n)+)", text, re.MULTILINE)
-    assert block is not None, f"{DOCUMENT}: no table of figures"
+    block = found(text)
     processors = [name.strip() for name in block[1].split("|")]
     names = {words: name for name, words in ROWS.items()}
     figures: dict[str, dict[str, int]] = {processor: {} for processor in processors}
@@ -120,7 +126,7 @@ def documented(text: str) -> dict[str, dict[str, int]]:
 
 def complaints(new: Mapping[str, Mapping[str, int]], old: Mapping[str, Mapping[str, int]]) -> list[str]:
     """Return what has grown by a tenth, and where the worst step is too far above the mean."""
-    found = [
+    grown = [
         f"{processor}: {ROWS[name]}: {value}, and {old[processor][name]} in {DOCUMENT.name}: more than a tenth more"
         for processor, figures in new.items()
         for name, value in figures.items()
@@ -130,8 +136,8 @@ def complaints(new: Mapping[str, Mapping[str, int]], old: Mapping[str, Mapping[s
         for key in ("", "key_"):
             worst, mean = figures[f"{key}step_worst"], figures[f"{key}step_mean"]
             if worst > WORST_TO_MEAN * mean:
-                found.append(f"{processor}: the worst step, {key}{worst}, takes more than three times the mean, {mean}")
-    return found
+                grown.append(f"{processor}: the worst step, {key}{worst}, takes more than three times the mean, {mean}")
+    return grown
 
 
 def main() -> int:
@@ -149,11 +155,9 @@ def main() -> int:
     print(table(figures))
     text = DOCUMENT.read_text("utf-8")
     if arguments.write:
-        before = re.search(r"^\| \|.*\|\n\|-.*\n(?:\|.*\n)+", text, re.MULTILINE)
-        assert before is not None, f"{DOCUMENT}: no table of figures"
-        DOCUMENT.write_text(text.replace(before[0], table(figures)), "utf-8")
-    elif arguments.check and (found := complaints(figures, documented(text))):
-        print("\n".join(found), file=sys.stderr)
+        DOCUMENT.write_text(text.replace(found(text)[0], table(figures)), "utf-8")
+    elif arguments.check and (grown := complaints(figures, documented(text))):
+        print("\n".join(grown), file=sys.stderr)
         return 1
     return 0
 

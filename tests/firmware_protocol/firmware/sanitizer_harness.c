@@ -8,6 +8,8 @@
 #include "disco_robot.h"
 #include "firmware.h"
 #include "protocol_constants.h"
+#include "serial_framing.h"
+#include "slcan.h"
 
 static uint64_t seed;
 
@@ -28,20 +30,6 @@ static float mad_float(void)
 {
     static const float special[] = {NAN, INFINITY, -INFINITY, 3.4e38f, -3.4e38f, 1.0e-45f, -0.0f};
     return special[random_u32() % (sizeof(special) / sizeof(special[0]))];
-}
-
-static disco_config_t config(void)
-{
-    return (disco_config_t){
-        .protocol_major = DISCO_PROTOCOL_MAJOR, .dbc_hash = DISCO_DBC_HASH, .ticks_per_rev = 2048u,
-        .max_wheel_speed = 8.0f, .max_wheel_acceleration = 20.0f, .stop_deceleration = 20.0f, .still_speed = 0.05f,
-        .cycle_us = 1000u, .command_timeout_us = 100000u, .drive_off_timeout_us = 500000u, .stop_timeout_us = 1000000u,
-        .host_state_timeout_us = 500000u, .host_forget_timeout_us = 5000000u, .reset_quiet_us = 500000u,
-        .under_voltage = 20.0f, .over_voltage = 30.0f, .over_current = 30.0f, .over_temperature = 80.0f,
-        .stall_current = 15.0f, .encoder_check_current = 0.5f, .encoder_check_speed = 1.0f,
-        .voltage_debounce_us = 200000u, .current_debounce_us = 100000u, .temperature_debounce_us = 1000000u,
-        .encoder_debounce_us = 300000u, .fault_hold_us = 500000u,
-    };
 }
 
 static void receive(disco_firmware_t *core, uint64_t now, uint32_t id, uint8_t *data, uint16_t data_id)
@@ -146,11 +134,29 @@ static void intruder(disco_firmware_t *core, uint64_t now)
 }
 
 /* Arguments: cycles; random frames in each cycle of a flood, which lasts a tenth of the time; 1 for authenticated. */
+/* Random bytes for the decoders of both lines, from little text to endless one. */
+static void noise(void)
+{
+    static disco_serial_decoder_t serial;
+    static disco_slcan_t slcan;
+    uint8_t replies[DISCO_SLCAN_ENCODED];
+    disco_frame_t frame;
+    for (uint32_t i = 0u; i < 4u; i++) {
+        static const char letters[] = "tTrROLCSVNFZ0123456789ABCDEFabcdef\a";
+        const uint8_t letter = (uint8_t)letters[random_u32() % (sizeof(letters) - 1u)];
+        (void)disco_serial_feed(&serial, chance(12u) ? 0u : (uint8_t)random_u32(), &frame);
+        (void)disco_slcan_feed(&slcan, chance(12u) ? (uint8_t)'\r' : letter, &frame);
+    }
+    if (chance(4u)) {
+        (void)disco_slcan_reply(&slcan, replies);
+    }
+}
+
 int main(int argc, char **argv)
 {
     const uint32_t cycles = (uint32_t)strtoul(argv[1], NULL, 10);
     const uint32_t flood = (argc > 2) ? (uint32_t)strtoul(argv[2], NULL, 10) : 0u;
-    disco_config_t robot = config();
+    disco_config_t robot = disco_config_default(2048u, 8.0f);
     uint64_t frames = 0u;
     static disco_firmware_t core;
     uint32_t seen[7] = {0u};
@@ -194,7 +200,10 @@ int main(int argc, char **argv)
             now += chance(50u) ? (uint64_t)random_u32() * 16u : 0u;
             now -= now % 1000u;
         }
-        disco_firmware_pose(&core, mad ? mad_float() : 1.0, 2.0, mad ? mad_float() : 3.0, now, 0.01, 0.01);
+        const disco_pose_t pose =
+            disco_pose(mad ? mad_float() : 1.0f, 2.0f, mad ? mad_float() : 3.0f, 0.01f, mad ? mad_float() : 0.01f);
+        disco_firmware_pose(&core, &pose, now);
+        noise();
         disco_firmware_step(&core, now, &in, &out);
         seen[out.state]++;
         const bool may_move = out.state == DISCO_STATE_ARMED || out.state == DISCO_STATE_STOPPING ||

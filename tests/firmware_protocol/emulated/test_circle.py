@@ -1,0 +1,86 @@
+"""The paper's circle, driven by the real daemon through an emulated board, as closely as through the virtual robot."""
+
+import csv
+import math
+
+import pytest
+
+from disco_hw.experiments.live_stack import READY_TIMEOUT_S, Operator, disco_hw_process, write_robot_file
+from tools.emulated_board import build_board, missing, running_board
+
+pytestmark = [
+    pytest.mark.long,
+    pytest.mark.hil,
+    pytest.mark.timeout(400),
+    pytest.mark.skipif(bool(missing()), reason=missing() or "all there"),
+]
+RADIUS_M = 0.75
+LAPS = 1.25
+LAP_S = 2 * math.pi * RADIUS_M / 0.2
+START = ("0.75", "0.0", "1.5707963")
+
+
+def drive(directory, robot_file, others=()):
+    """Drive the circle with a daemon on this robot; return the daemon's last status while driving."""
+    log = directory / "run.mcap"
+    with disco_hw_process("daemon", ["run", str(robot_file), "--log", str(log)], directory / "daemon.txt") as daemon:
+        operator = Operator(directory / "control.sock", (daemon, *others))
+        operator.wait_for("READY", READY_TIMEOUT_S)
+        operator.tell("arm")
+        operator.wait_for("ARMED", 5.0)
+        operator.tell("start")
+        far = lambda status: status["state"] != "ARMED" or status["task"]["laps"] >= LAPS  # noqa: E731
+        status = operator.wait_until(f"{LAPS} laps", far, 4 * LAPS * LAP_S)
+        assert status["state"] == "ARMED", status["detail"]
+        operator.tell("stop")
+        operator.wait_for_standstill(5.0)
+        operator.tell("disarm")
+        operator.wait_for("READY", 5.0)
+        operator.tell("quit")
+        assert daemon.process.wait(20.0) == 0, daemon.last_words()
+    return status
+
+
+def rms_distance_m(poses):
+    """Of what lies behind the first quarter of a lap, to its end."""
+    turned, before, distances = 0.0, None, []
+    for x, y in poses:
+        angle = math.atan2(y, x)
+        if before is not None:
+            turned += math.remainder(angle - before, 2 * math.pi)
+        before = angle
+        if 0.25 * 2 * math.pi <= turned <= 1.2 * 2 * math.pi:
+            distances.append(math.hypot(x, y) - RADIUS_M)
+    assert turned >= 2 * math.pi * (LAPS - 0.05)
+    return math.sqrt(sum(distance**2 for distance in distances) / len(distances))
+
+
+@pytest.fixture(scope="module")
+def virtual_rms_m(tmp_path_factory):
+    directory = tmp_path_factory.mktemp("virtual")
+    robot_file, truth = write_robot_file(directory, "serial"), directory / "truth.csv"
+    arguments = ["sim", str(robot_file), "--truth", str(truth), "--start", *START]
+    with disco_hw_process("virtual robot", arguments, directory / "sim.txt") as robot:
+        drive(directory, robot_file, [robot])
+    with truth.open(newline="", encoding="utf-8") as file:
+        return rms_distance_m([(float(row["x_m"]), float(row["y_m"])) for row in csv.DictReader(file)])
+
+
+@pytest.mark.parametrize("processor", ["m3", "m4f"])
+def test_the_daemon_drives_the_circle_through_the_board_as_through_the_virtual_robot(
+    tmp_path, processor, virtual_rms_m, capsys
+):
+    with running_board(build_board(processor, tmp_path), processor) as board:
+        robot_file = write_robot_file(tmp_path, "serial")
+        text = robot_file.read_text("utf-8")
+        robot_file.write_text(text.replace(str(tmp_path / "tty"), board.port), "utf-8")
+        status = drive(tmp_path, robot_file)
+        rows = list(board.bench.rows)
+    assert {row.start for row in rows} == {1}
+    board_rms_m = rms_distance_m([row.pose[:2] for row in rows])
+    with capsys.disabled():
+        print(
+            f"\ncircle: {processor} {board_rms_m * 1e3:.1f} mm rms, virtual robot {virtual_rms_m * 1e3:.1f} mm, "
+            f"overruns {status['loop']['overruns']}, skipped {status['loop']['skipped']}"
+        )
+    assert board_rms_m <= 1.2 * virtual_rms_m
