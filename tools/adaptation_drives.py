@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from disco_hw.adaptation.link import Pose, Samples, Triple, Wheels
+from disco_hw.adaptation.link import PoseReading, Samples, Triple, WheelAngles
 from disco_hw.adaptation.samples import SampleWindow
 from disco_hw.inference.excitation import Excitation
 
@@ -47,12 +47,12 @@ def messages(
             yaw += dt * omega + slip[2]
         left, right = left + 0.02 * speed_left, right + 0.02 * speed_right
         now_ns = tick * TICK_NS
-        poses: tuple[Pose, ...] = ()
+        poses: tuple[PoseReading, ...] = ()
         if tick % 2 == 0:
             noise = rng.standard_normal(3) * (0.005, 0.005, 0.01)
             measured_yaw = math.remainder(yaw + noise[2], 2.0 * math.pi)
-            poses = (Pose(now_ns, x + noise[0], y + noise[1], measured_yaw),)
-        found.append(Samples(now_ns, (Wheels(now_ns, left, right),), poses))
+            poses = (PoseReading(now_ns, x + noise[0], y + noise[1], measured_yaw),)
+        found.append(Samples(now_ns, (WheelAngles(now_ns, left, right),), poses))
     return found
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from disco_hw.log.link import batch_encoder
 from disco_hw.log.mcap_log import McapLog
 from disco_hw.log.reader import open_log
-from disco_hw.log.recorder import ProcessRecorder, Recording
+from disco_hw.log.recorder import ProcessRecorder, RecordingSettings
 from disco_hw.log.records import Command, Estimate, FrameIn, FrameOut, Innovation, LoopTiming, Plan, Record
 from disco_hw.log.recovery import recover
 from disco_hw.log.writer import LogFile, Start
@@ -52,7 +52,7 @@ def _tick(k: int, now_ns: int) -> list[Record]:
 
 def _live(path: Path) -> dict[str, float]:
     """The recorder as the loop uses it, in real time, with the writer's process beside it."""
-    recorder = ProcessRecorder(Recording(path, "bench"))
+    recorder = ProcessRecorder(RecordingSettings(path, "bench"))
     # Linux gives the processor time of a child when it is waited for.
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     put_us, poll_us = [], []

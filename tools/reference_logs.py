@@ -26,7 +26,7 @@ from disco_hw.drive.source import ManualInput
 from disco_hw.experiments.simulated_time import SimulatedRun, virtual_robot
 from disco_hw.log.link import Attachment
 from disco_hw.log.provenance import MODEL_TOML, ROBOT_TOML, version
-from disco_hw.log.recorder import ProcessRecorder, Recording
+from disco_hw.log.recorder import ProcessRecorder, RecordingSettings
 from disco_hw.log.records import BeliefChange, FrameIn, FrameOut
 from disco_hw.runtime.assembly import make_planner, put_in_force
 from disco_hw.runtime.pipeline import NoPlanner, Planner
@@ -143,7 +143,7 @@ def write(name: str, directory: Path) -> Path:
     path = directory / f"{name}.mcap"
     path.unlink(missing_ok=True)
     recorder = ProcessRecorder(
-        Recording(path, "wombot", version=version(), attachments=attachments, queue_ticks=100_000)
+        RecordingSettings(path, "wombot", version=version(), attachments=attachments, queue_ticks=100_000)
     )
     for now_ns, recorded in stack.recorder.ticks:
         recorder.put(now_ns, [record for record in recorded if not isinstance(record, FrameIn | FrameOut)])

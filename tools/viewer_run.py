@@ -8,7 +8,7 @@ from disco_hw.config.input_file import MODEL_TOML as MODEL_KIND
 from disco_hw.config.input_file import ROBOT_TOML as ROBOT_KIND
 from disco_hw.log import records
 from disco_hw.log.provenance import MODEL_TOML, ROBOT_TOML, attachment
-from disco_hw.log.recorder import ProcessRecorder, Recording
+from disco_hw.log.recorder import ProcessRecorder, RecordingSettings
 from drivers.types import PoseSample, PowerSample, RobotLinkHealth, RobotStatus, WheelSample
 
 ROBOT_FILE = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
@@ -88,7 +88,7 @@ def tick_records(tick):
 def write_log(path, ticks=200, records_of=tick_records):
     """A log of the run, written by the real writer; `records_of(tick)` is what each tick holds."""
     attachments = (attachment(ROBOT_FILE, ROBOT_TOML, ROBOT_KIND), attachment(MODEL_FILE, MODEL_TOML, MODEL_KIND))
-    recorder = ProcessRecorder(Recording(path, "wombot", attachments=attachments, queue_ticks=100_000))
+    recorder = ProcessRecorder(RecordingSettings(path, "wombot", attachments=attachments, queue_ticks=100_000))
     for tick in range(ticks):
         recorder.put(*records_of(tick))
     stats = recorder.close(300.0)

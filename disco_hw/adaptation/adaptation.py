@@ -9,7 +9,17 @@ from typing import Any, Protocol
 import numpy as np
 
 from disco_hw.adaptation.guard import BeliefGuard, Geometry, Outcome
-from disco_hw.adaptation.link import NAMES, AdapterLink, InForce, Pose, Proposal, Range, Report, Samples, Wheels
+from disco_hw.adaptation.link import (
+    NAMES,
+    AdapterLink,
+    InForce,
+    PoseReading,
+    Proposal,
+    Range,
+    Report,
+    Samples,
+    WheelAngles,
+)
 from disco_hw.errors import WorkError
 from disco_hw.log import records
 from drivers.types import Readings
@@ -32,7 +42,7 @@ class Learnt:
 _NOTHING = Learnt()
 
 
-class Adaptation(Protocol):
+class GeometryAdaptation(Protocol):
     """Asked before and told after each tick of the core; no call waits for anything."""
 
     def step(self, now_ns: int) -> Learnt:
@@ -140,8 +150,8 @@ class CheckedAdaptation:
         self._link.send(
             Samples(
                 now_ns,
-                tuple(Wheels(w.t_ns, w.left_angle_rad, w.right_angle_rad) for w in readings.wheels),
-                tuple(Pose(p.t_ns, p.x_m, p.y_m, p.yaw_rad) for p in readings.poses),
+                tuple(WheelAngles(w.t_ns, w.left_angle_rad, w.right_angle_rad) for w in readings.wheels),
+                tuple(PoseReading(p.t_ns, p.x_m, p.y_m, p.yaw_rad) for p in readings.poses),
             )
         )
 

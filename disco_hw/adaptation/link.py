@@ -22,7 +22,7 @@ Triple = tuple[float, float, float]
 Nine = tuple[float, float, float, float, float, float, float, float, float]
 
 
-class Wheels(msgspec.Struct, frozen=True, array_like=True, gc=False):
+class WheelAngles(msgspec.Struct, frozen=True, array_like=True, gc=False):
     """Cumulative wheel angles (rad) at a time."""
 
     t_ns: int
@@ -30,7 +30,7 @@ class Wheels(msgspec.Struct, frozen=True, array_like=True, gc=False):
     right_rad: float
 
 
-class Pose(msgspec.Struct, frozen=True, array_like=True, gc=False):
+class PoseReading(msgspec.Struct, frozen=True, array_like=True, gc=False):
     """A measured pose (m, rad) at the time when it was true."""
 
     t_ns: int
@@ -43,8 +43,8 @@ class Samples(msgspec.Struct, frozen=True, tag="samples", gc=False):
     """What came in with the tick at `now_ns`."""
 
     now_ns: int
-    wheels: tuple[Wheels, ...] = ()
-    poses: tuple[Pose, ...] = ()
+    wheels: tuple[WheelAngles, ...] = ()
+    poses: tuple[PoseReading, ...] = ()
 
 
 class Range(msgspec.Struct, frozen=True, tag="range", gc=False):

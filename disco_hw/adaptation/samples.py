@@ -7,7 +7,7 @@ from bisect import insort
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.adaptation.link import Pose, Samples, Wheels
+from disco_hw.adaptation.link import PoseReading, Samples, WheelAngles
 from disco_hw.inference.excitation import Excitation, UnusableDriveError, excitation
 from disco_hw.log.drive import Commands, DriveLog, Gyro, Poses
 from disco_hw.log.drive import Wheels as WheelArrays
@@ -25,8 +25,8 @@ class SampleWindow:
 
     def __init__(self, length_s: float) -> None:
         self._length_ns = round(length_s * 1e9)
-        self._wheels: list[Wheels] = []
-        self._poses: list[Pose] = []
+        self._wheels: list[WheelAngles] = []
+        self._poses: list[PoseReading] = []
         self._zero_ns: int | None = None
 
     def add(self, samples: Samples) -> None:
@@ -85,7 +85,7 @@ def drive_of(
     return excitation(log, "encoders")
 
 
-def _insert(samples: list, sample: Wheels | Pose) -> None:  # type: ignore[type-arg]
+def _insert(samples: list, sample: WheelAngles | PoseReading) -> None:  # type: ignore[type-arg]
     if not samples or sample.t_ns > samples[-1].t_ns:
         samples.append(sample)
     elif all(sample.t_ns != other.t_ns for other in samples[-20:]):

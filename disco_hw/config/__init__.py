@@ -2,11 +2,11 @@
 
 from disco_hw.config.robot import (
     Control,
-    Daemon,
+    DaemonSettings,
     Drive,
     Estimation,
     Link,
-    Log,
+    LogSettings,
     ModelFile,
     Prior,
     Robot,
@@ -18,11 +18,11 @@ from disco_hw.config.robot import (
 
 __all__ = [
     "Control",
-    "Daemon",
+    "DaemonSettings",
     "Drive",
     "Estimation",
     "Link",
-    "Log",
+    "LogSettings",
     "ModelFile",
     "Prior",
     "Robot",

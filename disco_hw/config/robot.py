@@ -128,14 +128,14 @@ class ModelFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     file: str | None = None
 
 
-class Log(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class LogSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Where runs are recorded."""
 
     directory: str = "logs"
     enabled: bool = True
 
 
-class Daemon(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class DaemonSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The daemon's local side."""
 
     control_socket: str | None = None
@@ -172,8 +172,8 @@ class RobotConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     estimation: Estimation = Estimation()
     task: RobotTask = msgspec.field(default_factory=_default_task)
     model: ModelFile = ModelFile()
-    log: Log = Log()
-    daemon: Daemon = Daemon()
+    log: LogSettings = LogSettings()
+    daemon: DaemonSettings = DaemonSettings()
     drive: Drive = Drive()
 
 

@@ -37,7 +37,7 @@ from disco_hw.daemon.warm_up import warm_up
 from disco_hw.log import records
 from disco_hw.log.link import Attachment
 from disco_hw.log.provenance import DBC, version
-from disco_hw.log.recorder import NullRecorder, ProcessRecorder, Recorder, Recording
+from disco_hw.log.recorder import NullRecorder, ProcessRecorder, Recorder, RecordingSettings
 from disco_hw.runtime import records_of_tick
 from disco_hw.runtime.assembly import assemble_core, make_adaptation, make_link, make_pipeline, make_planner
 from disco_hw.runtime.core import CoreTick, DaemonCore
@@ -458,7 +458,7 @@ def _make_recorder(setup: Setup, log: Path | None) -> Recorder:
         return NullRecorder()
     attachments = [*kept_files(setup), Attachment(DBC, "text/plain", packaged_dbc().encode())]
     name = setup.config.robot.name
-    return ProcessRecorder(Recording(log, name, version=version(), attachments=tuple(attachments)))
+    return ProcessRecorder(RecordingSettings(log, name, version=version(), attachments=tuple(attachments)))
 
 
 def _close_recorder(recorder: Recorder, say: Say) -> None:

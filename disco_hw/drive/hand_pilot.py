@@ -18,7 +18,7 @@ from disco_hw.runtime.supervisor import Reply, UserRequest
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class DeadmanVerdict:
     """One tick's requests, the motion while motion is allowed, and a sentence where something changed."""
 
     requests: tuple[UserRequest, ...]
@@ -45,7 +45,7 @@ class Deadman:
         """Whether the press that began this stretch of driving still holds."""
         return self._engaged
 
-    def step(self, now_ns: int, newest: ManualInput | None, state: State) -> Verdict:
+    def step(self, now_ns: int, newest: ManualInput | None, state: State) -> DeadmanVerdict:
         """Judge the newest input (None: the device is gone) in the daemon's present state."""
         fresh = newest is not None and 0 <= now_ns - newest.t_ns <= self._limit_ns
         held = newest is not None and fresh and newest.deadman
@@ -55,8 +55,8 @@ class Deadman:
         self._seen_open = fresh and not held
         self._was_armed = state is State.ARMED
         if self._engaged and newest is not None:
-            return Verdict(requests, Manual(newest.left_rad_s, newest.right_rad_s), event)
-        return Verdict(requests, Stand(), event)
+            return DeadmanVerdict(requests, Manual(newest.left_rad_s, newest.right_rad_s), event)
+        return DeadmanVerdict(requests, Stand(), event)
 
     def refused(self, why: str) -> str:
         """Take in that the daemon refused to arm or start; returns the sentence for the person."""

@@ -174,7 +174,7 @@ class ScriptSource:
         self._driven = False
         self._driving = False
         self._over = False
-        self._limits = WheelLimits()
+        self._limits = ReachedLimits()
 
     @property
     def ended(self) -> str | None:
@@ -320,7 +320,7 @@ KEPT = 0.95
 _LARGEST = 1.0
 
 
-class WheelLimits:
+class ReachedLimits:
     """Shares of what was asked that each wheel reached forward and backward, in the manoeuvre where it reached least.
 
     Where nothing was observed, all of it counts as reached.

@@ -1,14 +1,14 @@
 """Fusion of wheel odometry and measured pose."""
 
 from disco_hw.estimation.correction import PoseReason
-from disco_hw.estimation.fusion import Estimate, FusionStats, PoseFusion, PoseUpdate
+from disco_hw.estimation.fusion import FusionStats, PoseEstimate, PoseFusion, PoseUpdate
 from disco_hw.estimation.odometry import OdometryParameters, Pose, advance
 
 __all__ = [
-    "Estimate",
     "FusionStats",
     "OdometryParameters",
     "Pose",
+    "PoseEstimate",
     "PoseFusion",
     "PoseReason",
     "PoseUpdate",

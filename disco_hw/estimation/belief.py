@@ -17,7 +17,7 @@ MAX_YAW_VARIANCE = math.pi**2 / 3.0
 MAX_POSITION_VARIANCE = 1e4
 
 
-class Belief(msgspec.Struct, frozen=True, gc=False):
+class PoseBelief(msgspec.Struct, frozen=True, gc=False):
     """Gaussian over (x, y, yaw) in m and rad.
 
     xx ... tt (t stands for yaw) are the six different entries of the covariance that would remain if the odometry's
@@ -87,27 +87,27 @@ def motion_model(settings: Estimation, parameters: OdometryParameters) -> Motion
     )
 
 
-def belief_at(pose: Pose, position_variance: float, yaw_variance: float, model: MotionModel) -> Belief:
+def belief_at(pose: Pose, position_variance: float, yaw_variance: float, model: MotionModel) -> PoseBelief:
     """A belief with independent x, y (the same variance, m^2) and yaw (rad^2), independent of the parameters."""
     sensitivity: Flat9 | None = None if model.parameter_root is None else (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     x, y, yaw = pose.x_m, pose.y_m, wrap(pose.yaw_rad)
-    return Belief(x, y, yaw, position_variance, 0.0, 0.0, position_variance, 0.0, yaw_variance, sensitivity)
+    return PoseBelief(x, y, yaw, position_variance, 0.0, 0.0, position_variance, 0.0, yaw_variance, sensitivity)
 
 
-def rebased(belief: Belief, model: MotionModel) -> Belief:
+def rebased(belief: PoseBelief, model: MotionModel) -> PoseBelief:
     """The same belief under other parameters, whose error has nothing to do with what those before have caused."""
     (xx, xy, xt), (_, yy, yt), (_, _, tt) = belief.covariance
     sensitivity: Flat9 | None = None if model.parameter_root is None else (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    return Belief(belief.x_m, belief.y_m, belief.yaw_rad, xx, xy, xt, yy, yt, tt, sensitivity)
+    return PoseBelief(belief.x_m, belief.y_m, belief.yaw_rad, xx, xy, xt, yy, yt, tt, sensitivity)
 
 
 def predict(
-    belief: Belief,
+    belief: PoseBelief,
     model: MotionModel,
     motion: Arc,
     extra_position_variance: float = 0.0,
     extra_yaw_variance: float = 0.0,
-) -> Belief:
+) -> PoseBelief:
     """Carry a belief through a motion: mean along the arc, P' = F P F' + Q, W' = F W + J.
 
     Q: slip displaces the tracked point by an isotropic error and turns the body about its centre of rotation by a yaw
@@ -162,7 +162,7 @@ def predict(
         total_tt += t0 * t0 + t1 * t1 + t2 * t2
 
     yaw = wrap(belief.yaw_rad + motion.turn_rad)
-    predicted = Belief(belief.x_m + dx, belief.y_m + dy, yaw, xx, xy, xt, yy, yt, tt, sensitivity)
+    predicted = PoseBelief(belief.x_m + dx, belief.y_m + dy, yaw, xx, xy, xt, yy, yt, tt, sensitivity)
     if total_xx > MAX_POSITION_VARIANCE or total_yy > MAX_POSITION_VARIANCE or total_tt > MAX_YAW_VARIANCE:
         return _scaled(
             predicted,
@@ -173,13 +173,13 @@ def predict(
     return predicted
 
 
-def _scaled(belief: Belief, x: float, y: float, t: float) -> Belief:
+def _scaled(belief: PoseBelief, x: float, y: float, t: float) -> PoseBelief:
     """Scale the error of each coordinate; D P D with D diagonal stays positive definite."""
     sensitivity = belief.sensitivity
     if sensitivity is not None:
         x0, x1, x2, y0, y1, y2, t0, t1, t2 = sensitivity
         sensitivity = (x * x0, x * x1, x * x2, y * y0, y * y1, y * y2, t * t0, t * t1, t * t2)
-    return Belief(
+    return PoseBelief(
         belief.x_m,
         belief.y_m,
         belief.yaw_rad,

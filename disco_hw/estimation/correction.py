@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.estimation.belief import MAX_POSITION_VARIANCE, MAX_YAW_VARIANCE, Belief, Flat9
+from disco_hw.estimation.belief import MAX_POSITION_VARIANCE, MAX_YAW_VARIANCE, Flat9, PoseBelief
 from disco_hw.estimation.odometry import Pose, wrap
 from drivers.types import PoseSample
 
@@ -162,7 +162,7 @@ class Correction(msgspec.Struct, frozen=True, gc=False):
     covariance S, `distance2` the squared Mahalanobis distance innovation' S^-1 innovation.
     """
 
-    belief: Belief
+    belief: PoseBelief
     innovation: Triple
     innovation_variance: Triple
     distance2: float
@@ -179,7 +179,7 @@ class PoseCorrector:
     def __init__(self) -> None:
         self._filter = ExtendedKalmanFilter(dim_x=3, dim_z=3)
 
-    def correct(self, belief: Belief, measurement: Measurement) -> Correction:
+    def correct(self, belief: PoseBelief, measurement: Measurement) -> Correction:
         """Fuse one pose; the caller decides by `distance2` whether to take the result."""
         pose = measurement.pose
         ekf = self._filter
@@ -201,7 +201,7 @@ class PoseCorrector:
         innovation_x, innovation_y, innovation_yaw = ekf.y.tolist()
         variance_x, variance_y, variance_yaw = ekf.S.diagonal().tolist()
         return Correction(
-            Belief(
+            PoseBelief(
                 x,
                 y,
                 wrap(yaw),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import msgspec
 
 from disco_hw.config import Estimation
-from disco_hw.estimation.belief import Belief, belief_at, motion_model, predict, rebased
+from disco_hw.estimation.belief import PoseBelief, belief_at, motion_model, predict, rebased
 from disco_hw.estimation.correction import Correction, Measurement, PoseCorrector, PoseReason, Triple, gate_limit
 from disco_hw.estimation.odometry import OdometryParameters, Pose, WheelReading, arc
 
@@ -37,8 +37,8 @@ class FilterState(msgspec.Struct, frozen=True, gc=False):
     t_ns: int
     left_rad: float
     right_rad: float
-    belief: Belief | None
-    candidate: Belief | None
+    belief: PoseBelief | None
+    candidate: PoseBelief | None
     candidate_count: int
     pose_t_ns: int | None
     reinitialisations: int
@@ -121,17 +121,19 @@ class PoseFilter:
             correction.distance2 / self._limit,
         )
 
-    def _fresh(self, measurement: Measurement) -> Belief:
+    def _fresh(self, measurement: Measurement) -> PoseBelief:
         return belief_at(measurement.pose, measurement.position_variance, measurement.yaw_variance, self._model)
 
-    def _candidate(self, state: FilterState, measurement: Measurement) -> tuple[Belief, int]:
+    def _candidate(self, state: FilterState, measurement: Measurement) -> tuple[PoseBelief, int]:
         if state.candidate is not None:
             correction = self._corrector.correct(state.candidate, measurement)
             if correction.distance2 <= self._limit:
                 return correction.belief, state.candidate_count + 1
         return self._fresh(measurement), 1
 
-    def _after(self, state: FilterState, measurement: Measurement, belief: Belief, judgement: Judgement) -> FilterState:
+    def _after(
+        self, state: FilterState, measurement: Measurement, belief: PoseBelief, judgement: Judgement
+    ) -> FilterState:
         return FilterState(
             state.t_ns,
             state.left_rad,

@@ -26,7 +26,7 @@ INTERVAL_WEIGHT = 0.1
 _UNKNOWN: Matrix3 = ((MAX_POSITION_VARIANCE, 0.0, 0.0), (0.0, MAX_POSITION_VARIANCE, 0.0), (0.0, 0.0, MAX_YAW_VARIANCE))
 
 
-class Estimate(msgspec.Struct, frozen=True, gc=False):
+class PoseEstimate(msgspec.Struct, frozen=True, gc=False):
     """Where the tracked body point is at `t_ns`, and how well this is known.
 
     World frame; `covariance` of (x, y, yaw) is 3x3, rows of floats, m and rad, symmetric and positive definite.
@@ -177,14 +177,14 @@ class PoseFusion:
             test_ratio=outcome.test_ratio,
         )
 
-    def estimate(self, now_ns: int) -> Estimate:
+    def estimate(self, now_ns: int) -> PoseEstimate:
         """Estimate the pose at `now_ns`.
 
         Beyond the newest sample the wheels are taken to keep their speeds for 0.2 s and then to stand; the uncertainty
         goes on growing. A time before the newest sample gets the pose of the newest sample.
         """
         if self._buffer is None:
-            return Estimate(now_ns, 0.0, 0.0, 0.0, _UNKNOWN, 0.0, 0.0, 0.0, 0.0, None, None, False, False, False, 0)
+            return PoseEstimate(now_ns, 0.0, 0.0, 0.0, _UNKNOWN, 0.0, 0.0, 0.0, 0.0, None, None, False, False, False, 0)
         wheels, state = self._buffer.newest_wheels, self._buffer.head()
         if now_ns > state.t_ns:
             state = self._filter.extrapolate(state, wheels, now_ns)
@@ -196,7 +196,7 @@ class PoseFusion:
         left, right = wheels.left_speed_rad_s, wheels.right_speed_rad_s
         wheel_age_s = _age_s(now_ns, wheels.t_ns)
         pose_age_s = None if state.pose_t_ns is None else _age_s(now_ns, state.pose_t_ns)
-        return Estimate(
+        return PoseEstimate(
             t_ns=now_ns,
             x_m=x_m,
             y_m=y_m,

@@ -13,7 +13,7 @@ from disco_hw.adaptation.link import AdapterLink
 from disco_hw.errors import WorkError
 from disco_hw.log.link import Attachment
 from disco_hw.log.provenance import MODEL_TOML
-from disco_hw.log.recorder import MemoryRecorder, ProcessRecorder, Recording
+from disco_hw.log.recorder import MemoryRecorder, ProcessRecorder, RecordingSettings
 from disco_hw.model.file import model_text
 from disco_hw.runtime.assembly import assemble_core, make_adaptation, make_pipeline
 from disco_hw.runtime.core import CoreTick, DaemonCore
@@ -131,7 +131,7 @@ class SimulatedRun:
         attachments = (*kept_files(setup), model)
         ticks = self.recorder.ticks
         recorder = ProcessRecorder(
-            Recording(path, self._setup.config.robot.name, attachments=attachments, queue_ticks=len(ticks) + 1)
+            RecordingSettings(path, self._setup.config.robot.name, attachments=attachments, queue_ticks=len(ticks) + 1)
         )
         for now_ns, records in ticks:
             recorder.put(now_ns, records)

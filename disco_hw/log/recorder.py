@@ -135,7 +135,7 @@ def wall_offset_ns() -> int:
 
 
 @dataclass(frozen=True, slots=True)
-class Recording:
+class RecordingSettings:
     """What a log begins with, and how many ticks may wait for the writer (`queue_ticks`) before more are dropped."""
 
     path: Path
@@ -155,7 +155,7 @@ class ProcessRecorder:
     LogError when the file exists or cannot be made; every later failure is counted, told by `news` and mended.
     """
 
-    def __init__(self, recording: Recording) -> None:
+    def __init__(self, recording: RecordingSettings) -> None:
         self._recording = recording
         self._encode = batch_encoder()
         self._delivery = Delivery(recording.queue_ticks)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import msgspec
 
 from disco_hw import control
-from disco_hw.adaptation.adaptation import Adaptation, CheckedAdaptation
+from disco_hw.adaptation.adaptation import CheckedAdaptation, GeometryAdaptation
 from disco_hw.adaptation.guard import (
     BeliefGuard,
     Geometry,
@@ -103,7 +103,7 @@ def assemble_core(
     pipeline: Pipeline,
     recorder: Recorder,
     needs_pose: bool = True,
-    adaptation: Adaptation | None = None,
+    adaptation: GeometryAdaptation | None = None,
 ) -> DaemonCore:
     """The daemon's tick over these parts; without `needs_pose` motion needs no pose, whatever robot.toml says."""
     supervisor = Supervisor(

@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 
 import msgspec
 
-from disco_hw.adaptation.adaptation import Adaptation, NoAdaptation
+from disco_hw.adaptation.adaptation import GeometryAdaptation, NoAdaptation
 from disco_hw.config import RobotConfig
 from disco_hw.log import records
 from disco_hw.log.recorder import Recorder
@@ -67,7 +67,7 @@ class DaemonCore:
         pipeline: Pipeline,
         recorder: Recorder,
         preflight: Callable[[Driver], tuple[str, ...]],
-        adaptation: Adaptation | None = None,
+        adaptation: GeometryAdaptation | None = None,
         pose_source: PoseSource | None = None,
     ) -> None:
         self.config = config

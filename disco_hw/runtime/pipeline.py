@@ -14,7 +14,7 @@ from typing import Protocol
 import msgspec
 
 from disco_hw.control import NoValidControl, PlannerState, Rollouts, SentCommand, WheelPlan
-from disco_hw.estimation import Estimate, OdometryParameters, PoseFusion, PoseUpdate
+from disco_hw.estimation import OdometryParameters, PoseEstimate, PoseFusion, PoseUpdate
 from disco_hw.model import Belief
 from disco_hw.runtime.governor import Governed, Governor
 from disco_hw.tasks import PlannedTask
@@ -109,7 +109,7 @@ class Tick(msgspec.Struct, frozen=True, gc=False):
 
     t_ns: int
     pose_updates: tuple[PoseUpdate, ...]
-    estimate: Estimate
+    estimate: PoseEstimate
     plan: WheelPlan | None
     plan_age_ns: int | None
     planner_failure: str | None
@@ -195,7 +195,7 @@ class Pipeline:
             command=command,
         )
 
-    def _replan(self, now_ns: int, estimate: Estimate) -> tuple[WheelPlan | None, str | None]:
+    def _replan(self, now_ns: int, estimate: PoseEstimate) -> tuple[WheelPlan | None, str | None]:
         if not self._following:
             self._planner.reset()
             self._following = True

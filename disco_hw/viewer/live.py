@@ -22,7 +22,7 @@ from disco_hw.runtime.task_change import record_of, told_task
 from disco_hw.viewer.operator_controls import Desk
 from disco_hw.viewer.panel import coverage_text, events_text, live_details
 from disco_hw.viewer.plots import Plots
-from disco_hw.viewer.recording import Stage
+from disco_hw.viewer.recording import ShownRobot
 from disco_hw.viewer.scene import Scene, add_layers
 from disco_hw.viewer.snapshot import Snapshot, snapshot_at
 from disco_hw.viewer.timeline import Items, Timeline
@@ -113,7 +113,7 @@ class _Due:
 class LivePage:
     """Everything on the live page; `step` waits for the feed and draws what has come."""
 
-    def __init__(self, server: viser.ViserServer, stage: Stage, socket: Path, desk: Desk) -> None:
+    def __init__(self, server: viser.ViserServer, stage: ShownRobot, socket: Path, desk: Desk) -> None:
         self.timeline = Timeline()
         self._server = server
         self._stage = stage

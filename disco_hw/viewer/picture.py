@@ -19,7 +19,7 @@ from disco_hw.errors import InputError
 from disco_hw.viewer import curves, scene
 from disco_hw.viewer.curves import Curves
 from disco_hw.viewer.plots import WINDOW_NS
-from disco_hw.viewer.recording import Recording, Stage, model_in_force
+from disco_hw.viewer.recording import Recording, ShownRobot, model_in_force
 from disco_hw.viewer.scene import Scene
 from disco_hw.viewer.server import serving
 from disco_hw.viewer.snapshot import ParameterPoints, Snapshot
@@ -130,7 +130,7 @@ def _draw(figure: Figure, recording: Recording, t_s: float) -> None:
             axes.legend(fontsize=7, loc="lower right", ncols=2)
 
 
-def _draw_scene(axes: Axes, snapshot: Snapshot, stage: Stage) -> None:
+def _draw_scene(axes: Axes, snapshot: Snapshot, stage: ShownRobot) -> None:
     course = stage.task_at(snapshot.task).course()
     axes.plot(*course.outline_m().T, color=_web(scene.TASK_COLOUR), linewidth=2.5)
     trail = snapshot.trail

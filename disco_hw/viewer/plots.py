@@ -14,7 +14,7 @@ from disco_hw.model import Model
 from disco_hw.tasks import RobotTask, default_task
 from disco_hw.viewer import curves
 from disco_hw.viewer.curves import Curves
-from disco_hw.viewer.recording import Stage, model_in_force
+from disco_hw.viewer.recording import ShownRobot, model_in_force
 from disco_hw.viewer.timeline import Timeline
 
 WINDOW_NS = 20_000_000_000
@@ -33,7 +33,7 @@ class _Plot:
 class Plots:
     """Curves of the 20 s before an instant; a folder that is closed costs what an open one does, so all are drawn."""
 
-    def __init__(self, gui: viser.GuiApi, stage: Stage) -> None:
+    def __init__(self, gui: viser.GuiApi, stage: ShownRobot) -> None:
         self._model = stage.model
         self._plots: list[_Plot] = []
         self._marginals: dict[str, viser.GuiUplotHandle] = {}

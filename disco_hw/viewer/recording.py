@@ -26,7 +26,7 @@ from drivers.types import MotorSample
 
 
 @dataclass(frozen=True, slots=True)
-class Stage:
+class ShownRobot:
     """The robot's name, its task, nominal size (m) and model.
 
     `x_icr_m` is the model's, `drive_top_rad_s` the fastest that a wheel is driven by hand.
@@ -51,21 +51,21 @@ def model_in_force(model: Model, change: BeliefChange | None) -> Model:
     return model if learnt is None else with_geometry(model, learnt)
 
 
-def stage_of_robot(robot_file: Path, model_file: Path | None = None) -> Stage:
+def stage_of_robot(robot_file: Path, model_file: Path | None = None) -> ShownRobot:
     """From robot.toml and the model it names; raises InputError."""
     return _stage(load_setup(robot_file, model_file))
 
 
-def stage_of_log(log: Log, robot_file: Path | None = None) -> Stage:
+def stage_of_log(log: Log, robot_file: Path | None = None) -> ShownRobot:
     """From the files kept in the log, or from `robot_file` instead; raises InputError if there is neither."""
     if robot_file is not None:
         return stage_of_robot(robot_file)
     return _stage(setup_of_log(log, "name the robot with --robot"))
 
 
-def _stage(setup: Setup) -> Stage:
+def _stage(setup: Setup) -> ShownRobot:
     robot = setup.config.robot
-    return Stage(
+    return ShownRobot(
         name=robot.name,
         task=setup.config.task,
         wheel_radius_m=robot.wheel_radius_m,
@@ -89,7 +89,7 @@ class Recording:
         try:
             if "/estimate" not in self._log.counts:
                 raise InputError(f"{path}: holds no estimates, so there is nothing to show; give a log of `run`")
-            self.stage: Stage = stage_of_log(self._log, robot_file)
+            self.stage: ShownRobot = stage_of_log(self._log, robot_file)
             self.timeline = Timeline()
             for now_ns, record in self._log.brief_records(_SHOWN):
                 self.timeline.add(now_ns, record)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from disco_hw.log import records
 from disco_hw.tasks import RobotTask
-from disco_hw.viewer.recording import Stage, model_in_force
+from disco_hw.viewer.recording import ShownRobot, model_in_force
 from disco_hw.viewer.snapshot import ParameterPoints, Snapshot
 
 Array = NDArray[np.float64]
@@ -62,7 +62,7 @@ class Scene:
     `show` moves what moves in every call and redraws long lines only where `everything` is True.
     """
 
-    def __init__(self, server: viser.ViserServer, stage: Stage) -> None:
+    def __init__(self, server: viser.ViserServer, stage: ShownRobot) -> None:
         self.layers = dict.fromkeys(LAYERS, True)
         self.knows_task = True
         self._server = server

@@ -2,12 +2,12 @@
 
 import pytest
 
-from disco_hw.drive.script import WheelLimits
+from disco_hw.drive.script import ReachedLimits
 
 
 def limits(**observed):
     """Manoeuvres with their samples (asked, measured) of the left wheel; the right one does as asked."""
-    found = WheelLimits()
+    found = ReachedLimits()
     for manoeuvre, samples in observed.items():
         for asked, measured in samples:
             found.observe(manoeuvre, (asked, asked), (measured, asked))

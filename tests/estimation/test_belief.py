@@ -11,7 +11,7 @@ from disco_hw.config import Estimation
 from disco_hw.estimation.belief import (
     MAX_POSITION_VARIANCE,
     MAX_YAW_VARIANCE,
-    Belief,
+    PoseBelief,
     belief_at,
     motion_model,
     predict,
@@ -30,7 +30,7 @@ TURNS = [(3.0, 3.0), (-2.0, 2.0), (3.0, 5.0), (-4.0, -3.0), (6.0, -1.0)]
 def belief_with(covariance, sensitivity=None, yaw=0.7):
     (xx, xy, xt), (_, yy, yt), (_, _, tt) = covariance.tolist()
     flat = None if sensitivity is None else tuple(sensitivity.ravel().tolist())
-    return Belief(1.0, -2.0, yaw, xx, xy, xt, yy, yt, tt, flat)
+    return PoseBelief(1.0, -2.0, yaw, xx, xy, xt, yy, yt, tt, flat)
 
 
 def end(state, left, right, parameters):

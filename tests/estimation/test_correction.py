@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from disco_hw.estimation.belief import Belief
+from disco_hw.estimation.belief import PoseBelief
 from disco_hw.estimation.correction import FLOOR_VARIANCE, Measurement, PoseCorrector
 from disco_hw.estimation.odometry import Pose
 
@@ -15,7 +15,7 @@ from disco_hw.estimation.odometry import Pose
 def belief_of(mean, covariance, sensitivity=None):
     (xx, xy, xt), (_, yy, yt), (_, _, tt) = covariance.tolist()
     flat = None if sensitivity is None else tuple(sensitivity.ravel().tolist())
-    return Belief(*mean, xx, xy, xt, yy, yt, tt, flat)
+    return PoseBelief(*mean, xx, xy, xt, yy, yt, tt, flat)
 
 
 def measured(x, y, yaw, position_variance=1e-4, yaw_variance=4e-4):

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from disco_hw.log.recorder import Recording
+from disco_hw.log.recorder import RecordingSettings
 from tools.log_samples import ATTACHMENTS, tick
 
 _RECORD = """
@@ -31,7 +31,7 @@ for k in range(1, 100_000):
 
 def recording(path, **changes):
     given = {"path": path, "robot": "wombot", "attachments": ATTACHMENTS, "flush_s": 0.05}
-    return Recording(**(given | changes))
+    return RecordingSettings(**(given | changes))
 
 
 def wait_until(condition, timeout_s=15.0):

@@ -8,8 +8,7 @@ import pytest
 from disco_hw.daemon.loop import LoopStats
 from disco_hw.daemon.status import loop_figures, status
 from disco_hw.log.link import Attachment
-from disco_hw.log.recorder import ProcessRecorder, RecorderStats
-from disco_hw.log.recorder import Recording as Begin
+from disco_hw.log.recorder import ProcessRecorder, RecorderStats, RecordingSettings
 from disco_hw.runtime.pipeline import Source
 from disco_hw.runtime.replay import replay
 from disco_hw.runtime.robot_setup import kept_files, load_setup
@@ -26,7 +25,7 @@ CORNER = "x_m,y_m\n0,0\n1.2,0\n1.2,0.8\n"
 
 
 def write_log(path, setup, ticks):
-    begin = Begin(path, "wombot", attachments=tuple(kept_files(setup)), queue_ticks=100_000)
+    begin = RecordingSettings(path, "wombot", attachments=tuple(kept_files(setup)), queue_ticks=100_000)
     recorder = ProcessRecorder(begin)
     for now_ns, got in ticks:
         recorder.put(now_ns, got)
@@ -121,7 +120,9 @@ def test_other_way_points_give_other_plans(tmp_path):
         else a
         for a in kept_files(setup)
     ]
-    recorder = ProcessRecorder(Begin(tmp_path / "run.mcap", "w", attachments=tuple(files), queue_ticks=10_000))
+    recorder = ProcessRecorder(
+        RecordingSettings(tmp_path / "run.mcap", "w", attachments=tuple(files), queue_ticks=10_000)
+    )
     for now_ns, got in stack.recorder.ticks:
         recorder.put(now_ns, got)
     recorder.close(30.0)

@@ -10,7 +10,7 @@ import disco_hw
 from disco_hw.errors import InputError
 from disco_hw.log.link import Attachment
 from disco_hw.log.provenance import MODEL_TOML, ROBOT_TOML
-from disco_hw.log.recorder import ProcessRecorder, Recording
+from disco_hw.log.recorder import ProcessRecorder, RecordingSettings
 from disco_hw.runtime.replay import replay
 from disco_hw.runtime.supervisor import UserRequest
 from tests.runtime.simulated import simulated_stack
@@ -36,7 +36,7 @@ def write_log(path: Path, ticks, robot: str | None = None, model: str | None = N
         Attachment(ROBOT_TOML, "application/toml", robot.encode()),
         Attachment(MODEL_TOML, "application/toml", model.encode()),
     )
-    recorder = ProcessRecorder(Recording(path, "wombot", attachments=attachments, queue_ticks=100_000))
+    recorder = ProcessRecorder(RecordingSettings(path, "wombot", attachments=attachments, queue_ticks=100_000))
     for now_ns, records in ticks:
         recorder.put(now_ns, records)
     stats = recorder.close(30.0)
@@ -97,7 +97,7 @@ def test_one_changed_bit_in_the_log_is_found(tmp_path, ticks):
 def test_a_log_without_ticks_or_robot_is_refused(tmp_path, ticks):
     with pytest.raises(InputError, match="holds no ticks"):
         replay(write_log(tmp_path / "empty.mcap", []))
-    recorder = ProcessRecorder(Recording(tmp_path / "bare.mcap", "wombot"))
+    recorder = ProcessRecorder(RecordingSettings(tmp_path / "bare.mcap", "wombot"))
     recorder.put(*ticks[0])
     recorder.close(30.0)
     with pytest.raises(InputError, match=r"carries no robot\.toml"):

@@ -1,8 +1,7 @@
 import pytest
 
 from disco_hw.errors import InputError
-from disco_hw.log.recorder import ProcessRecorder
-from disco_hw.log.recorder import Recording as Written
+from disco_hw.log.recorder import ProcessRecorder, RecordingSettings
 from disco_hw.viewer.recording import Recording
 from tools.viewer_run import ROBOT_FILE, plan_at, pose_at, tick_records
 
@@ -30,7 +29,7 @@ def test_an_instant_is_that_of_the_tick_before(recording, t_s, tick):
 
 
 def test_a_log_without_its_robot_needs_one(tmp_path):
-    recorder = ProcessRecorder(Written(tmp_path / "bare.mcap", "x"))
+    recorder = ProcessRecorder(RecordingSettings(tmp_path / "bare.mcap", "x"))
     recorder.put(*tick_records(0))
     recorder.close()
     with pytest.raises(InputError, match="--robot"):
@@ -41,7 +40,7 @@ def test_a_log_without_its_robot_needs_one(tmp_path):
 
 
 def test_a_log_without_estimates_is_told(tmp_path):
-    recorder = ProcessRecorder(Written(tmp_path / "empty.mcap", "x"))
+    recorder = ProcessRecorder(RecordingSettings(tmp_path / "empty.mcap", "x"))
     recorder.put(1, tick_records(0)[1][:2])
     recorder.close()
     with pytest.raises(InputError, match="no estimates"):
