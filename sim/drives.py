@@ -29,7 +29,7 @@ class UnknownDriveError(ValueError):
 
 
 @dataclass(frozen=True, slots=True)
-class CommandedDrive:
+class ScriptedDrive:
     """Commands held from their time until the next one.
 
     t_s, left_rad_s, right_rad_s: shape (n,), times from 0 in equal steps of `period_s`; phase: what each is for.
@@ -95,7 +95,7 @@ class _Tape:
         """Append standstill."""
         self.hold("rest", seconds, 0.0, 0.0)
 
-    def drive(self, name: str, steady: bool = False) -> CommandedDrive:
+    def drive(self, name: str, steady: bool = False) -> ScriptedDrive:
         """Put wanted speeds through the hand: tremor (unless `steady`), limits, and the slew of each manoeuvre."""
         wanted = np.concatenate(self._wanted)
         if not steady:
@@ -111,7 +111,7 @@ class _Tape:
             commands[k] = now
         period_s = 1.0 / self._vehicle.rate_hz
         t_s = np.arange(len(commands), dtype=np.float64) * period_s
-        return CommandedDrive(name, period_s, t_s, commands[:, 0], commands[:, 1], tuple(self._phase))
+        return ScriptedDrive(name, period_s, t_s, commands[:, 0], commands[:, 1], tuple(self._phase))
 
     def _tremor(self, shape: tuple[int, ...]) -> Floats:
         decay = math.exp(-1.0 / (TREMOR_S * self._vehicle.rate_hz))
@@ -199,7 +199,7 @@ def _free(tape: _Tape, seconds: float = 15.0) -> None:
     tape.rest()
 
 
-def _rich(tape: _Tape) -> CommandedDrive:
+def _rich(tape: _Tape) -> ScriptedDrive:
     blocks = [_straights, _spins, _arcs, _start_stops, _weave, _ramps, _free, _free, _free]
     tape.rest(2.0)
     for block in tape.generator.permutation(len(blocks)):
@@ -208,21 +208,21 @@ def _rich(tape: _Tape) -> CommandedDrive:
     return tape.drive("rich")
 
 
-def _only_free(tape: _Tape) -> CommandedDrive:
+def _only_free(tape: _Tape) -> ScriptedDrive:
     tape.rest(2.0)
     _free(tape, 140.0)
     tape.rest(2.0)
     return tape.drive("free")
 
 
-def _circle(tape: _Tape) -> CommandedDrive:
+def _circle(tape: _Tape) -> ScriptedDrive:
     tape.rest(1.5)
     tape.hold("circle", 60.0, 0.41, 0.12)
     tape.rest(1.5)
     return tape.drive("circle", steady=True)
 
 
-def _straight(tape: _Tape) -> CommandedDrive:
+def _straight(tape: _Tape) -> ScriptedDrive:
     tape.rest(1.5)
     for _ in range(4):
         _straights(tape)
@@ -230,7 +230,7 @@ def _straight(tape: _Tape) -> CommandedDrive:
     return tape.drive("straight", steady=True)
 
 
-def _poor(tape: _Tape) -> CommandedDrive:
+def _poor(tape: _Tape) -> ScriptedDrive:
     tape.rest(0.5)
     for _ in range(3):
         tape.hold("crawl", tape.about(4.0), tape.about(0.15), tape.about(0.03, 1.0))
@@ -238,7 +238,7 @@ def _poor(tape: _Tape) -> CommandedDrive:
     return tape.drive("poor")
 
 
-def _random_steps(tape: _Tape) -> CommandedDrive:
+def _random_steps(tape: _Tape) -> ScriptedDrive:
     """Random pairs of wheel speeds, each held for 6 s, evenly over what the wheels can do."""
     tape.rest(1.5)
     for _ in range(24):
@@ -248,7 +248,7 @@ def _random_steps(tape: _Tape) -> CommandedDrive:
     return tape.drive("random_steps", steady=True)
 
 
-DRIVES: Mapping[str, Callable[[_Tape], CommandedDrive]] = MappingProxyType(
+DRIVES: Mapping[str, Callable[[_Tape], ScriptedDrive]] = MappingProxyType(
     {
         "rich": _rich,
         "free": _only_free,
@@ -260,7 +260,7 @@ DRIVES: Mapping[str, Callable[[_Tape], CommandedDrive]] = MappingProxyType(
 )
 
 
-def make_drive(name: str, seed: int, vehicle: Vehicle | None = None) -> CommandedDrive:
+def make_drive(name: str, seed: int, vehicle: Vehicle | None = None) -> ScriptedDrive:
     """Make one of `DRIVES`.
 
     `rich`: about 150 s of everything that identification asks for, in random order; `free`: 140 s of a person with a

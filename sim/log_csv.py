@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from sim.drives import DRIVES, CommandedDrive, Vehicle, make_drive
+from sim.drives import DRIVES, ScriptedDrive, Vehicle, make_drive
 from sim.effects import HiddenEffects, effects_table, parse_hidden_effects
 from sim.plant import Plant
 from sim.plant_parameters import PlantParameters
@@ -84,7 +84,7 @@ def varied_parameters(parameters: PlantParameters, seed: int) -> PlantParameters
 
 
 def simulated_log(
-    drive: CommandedDrive,
+    drive: ScriptedDrive,
     parameters: PlantParameters | None = None,
     effects: HiddenEffects | None = None,
     seed: int = 0,
@@ -140,7 +140,7 @@ def write_csv(path: Path, rows: Sequence[Row]) -> None:
 
 
 def _run(
-    plant: Plant, drive: CommandedDrive, command_s: npt.NDArray[np.float64], reading_s: npt.NDArray[np.float64]
+    plant: Plant, drive: ScriptedDrive, command_s: npt.NDArray[np.float64], reading_s: npt.NDArray[np.float64]
 ) -> tuple[list[tuple[int, int]], list[PoseMeasurement]]:
     """Give each command at its time, read the encoders at theirs; collect ticks and poses."""
     command_us = np.round(command_s * 1e6).astype(np.int64).tolist()

@@ -9,7 +9,7 @@ import numpy as np
 from disco_hw.drive.script import Script
 from disco_hw.log.drive import Commands, DriveLog, Gyro, Poses, Wheels, differentiate_angle
 from disco_hw.runtime.governor import Governor, WheelLimits
-from sim.drives import CommandedDrive, make_drive
+from sim.drives import ScriptedDrive, make_drive
 from sim.effects import EFFECTS, HiddenEffects, hidden_effects
 from sim.log_csv import LogOptions, dirty_log_options, dirty_parameters, simulated_log, varied_parameters
 from sim.plant_parameters import PlantParameters
@@ -49,13 +49,13 @@ def simulated_drive(
     return as_drive(times - times[0], cells, parameters.ticks_per_rev)
 
 
-def then_scripted(drive: CommandedDrive, script: Script) -> CommandedDrive:
+def then_scripted(drive: ScriptedDrive, script: Script) -> ScriptedDrive:
     """A drive, and then a script as the commands that `disco-hw drive` sends: held to the usual acceleration."""
     t_s = np.arange(0.0, script.duration_s, drive.period_s)
     governor = Governor(WheelLimits(LARGEST_RAD_S, LARGEST_RAD_S2, LARGEST_RAD_S2), drive.period_s)
     sent = [governor.step(*script.at(float(t)), drive.period_s) for t in t_s]
     wheels = np.array([(command.left_rad_s, command.right_rad_s) for command in sent])
-    return CommandedDrive(
+    return ScriptedDrive(
         f"{drive.name} and {script.name}",
         drive.period_s,
         np.concatenate([drive.t_s, drive.duration_s + t_s]),
