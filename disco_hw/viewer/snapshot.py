@@ -33,7 +33,7 @@ class Snapshot:
     `pose` (x, y, yaw) m and rad, its `covariance` (3, 3); `speed_m_s`, `yaw_rate_rad_s`; `wheel_angles`,
     `wheel_speeds`, `command` (left, right) rad and rad/s; `plan` not older than half a second; `poses` (N, 3) measured
     in the last 3 s; `trail` (N, 2) of estimated positions; `fan` not older than 1.1 s; `task` where it is not the
-    robot.toml's (`ShownRobot.task_at` makes one of both), `belief` where another one than the model file's was in force.
+    robot.toml's (`ShownRobot.task_at` makes one of both), `belief` where it is another than the model file's.
     """
 
     t_ns: int
