@@ -4,8 +4,8 @@ import math
 from pathlib import Path
 
 import disco_hw
-from disco_hw.config.input_file import MODEL_TOML as MODEL_KIND
-from disco_hw.config.input_file import ROBOT_TOML as ROBOT_KIND
+from disco_hw.files import MODEL_TOML as MODEL_KIND
+from disco_hw.files import ROBOT_TOML as ROBOT_KIND
 from disco_hw.log import records
 from disco_hw.log.provenance import MODEL_TOML, ROBOT_TOML, attachment
 from disco_hw.log.recorder import ProcessRecorder, RecordingSettings

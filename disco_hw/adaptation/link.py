@@ -15,7 +15,7 @@ from typing import Protocol
 import msgspec
 
 from disco_hw.errors import LogError, WorkError
-from disco_hw.log.spawn import spawn_at_normal_priority
+from disco_hw.processes import spawn_at_normal_priority
 
 NAMES = ("x_icr_m", "wheel_radius_m", "axial_distance_m")
 Triple = tuple[float, float, float]

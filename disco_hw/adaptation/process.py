@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from disco_hw.daemon.realtime import limit_thread_pools
+from disco_hw.processes import limit_thread_pools
 
 if TYPE_CHECKING:
     from disco_hw.adaptation.adapter import Adapter

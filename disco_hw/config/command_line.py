@@ -7,9 +7,9 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from disco_hw.config.input_file import LOG, MODEL_TOML, WAY_POINTS, open_file, read_toml
 from disco_hw.config.robot import load_robot_config
 from disco_hw.errors import InputError
+from disco_hw.files import LOG, MODEL_TOML, WAY_POINTS, open_file, read_toml
 
 
 def check_named_files(robot: Path | None = None, model: Path | None = None, logs: Iterable[Path] = ()) -> None:

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 import msgspec
 from msgspec import Meta
 
-from disco_hw.config.input_file import ROBOT_TOML, read_toml
 from disco_hw.config.words import in_words
 from disco_hw.errors import InputError
+from disco_hw.files import ROBOT_TOML, read_toml
 from drivers.motor import DriverFieldError, UnknownDriverError, find_driver, own_fields
 from drivers.pose import DEFAULT, PoseSourceError, find_pose_source
 

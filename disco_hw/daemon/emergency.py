@@ -19,10 +19,10 @@ import serial
 
 from disco_hw.config import Link, link_of
 from disco_hw.config.command_line import link_fields, names_address
-from disco_hw.config.input_file import ROBOT_TOML, read_toml
 from disco_hw.daemon.client import send_request
 from disco_hw.daemon.socket_place import believed_users, default_socket_path, passed_over
 from disco_hw.errors import InputError
+from disco_hw.files import ROBOT_TOML, read_toml
 from drivers.motor import find_driver
 from drivers.transport import SerialMedium, open_transport
 from drivers.transport.serial import open_port

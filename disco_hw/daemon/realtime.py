@@ -12,19 +12,12 @@ import gc
 import os
 import resource
 import sys
-from collections.abc import Callable, Collection, MutableMapping
-from dataclasses import dataclass
+from collections.abc import Callable, Collection
 from pathlib import Path
 
 from disco_hw.errors import InputError
+from disco_hw.processes import Step
 
-_THREAD_COUNT_VARIABLES = (
-    "OMP_NUM_THREADS",
-    "OPENBLAS_NUM_THREADS",
-    "MKL_NUM_THREADS",
-    "NUMBA_NUM_THREADS",
-    "VECLIB_MAXIMUM_THREADS",
-)
 _SWITCH_INTERVAL_S = 0.0005
 _MCL_CURRENT = 1
 _MCL_FUTURE = 2
@@ -38,37 +31,6 @@ _STACK_BYTES = 1 << 20
 # The loop compiles nothing: of its 150 MB it needs none.
 _COMPILER = "libllvmlite"
 _LEAST_ADDRESS_SPACE_BYTES = 1_000_000_000
-
-
-@dataclass(frozen=True, slots=True)
-class Step:
-    """One measure: whether it was taken, and a line for a person with the remedy where it was not."""
-
-    name: str
-    done: bool
-    text: str
-
-    def __str__(self) -> str:
-        return f"{self.name}: {self.text}"
-
-
-def limit_thread_pools(environment: MutableMapping[str, str] = os.environ) -> Step:
-    """Hold the numeric libraries to one thread each; must come before they are imported to bind all of them.
-
-    Torch and numba are also held if they are imported already; a BLAS that is loaded keeps the threads it has.
-    """
-    numpy_is_late = "numpy" in sys.modules and environment.get("OPENBLAS_NUM_THREADS") != "1"
-    for name in _THREAD_COUNT_VARIABLES:
-        # Numba reads its variable again at each compilation and raises if it then differs from the threads it has.
-        if not (name.startswith("NUMBA") and "numba" in sys.modules):
-            environment[name] = "1"
-    for module_name, function in (("torch", "set_num_threads"), ("numba", "set_num_threads")):
-        module = sys.modules.get(module_name)
-        if module is not None:
-            getattr(module, function)(1)
-    if numpy_is_late:
-        return Step("threads", False, "numpy was loaded before; start with OPENBLAS_NUM_THREADS=1 in the environment")
-    return Step("threads", True, "numeric libraries use one thread")
 
 
 def spare_memory() -> None:

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from disco_hw.config.input_file import FAULTS_TOML, read_toml
 from disco_hw.errors import InputError
+from disco_hw.files import FAULTS_TOML, read_toml
 from disco_hw.runtime.robot_setup import Setup, geometry, link_key, load_setup
 from drivers.motor import find_driver
 from drivers.pose.udp import SOURCE as UDP_POSES

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.config.input_file import LOG, begin_of, parse_toml
 from disco_hw.errors import InputError, LogError
+from disco_hw.files import LOG, begin_of, parse_toml
 from disco_hw.log.container import MAGIC
 from disco_hw.log.drive import Array, Commands, DriveLog, Gyro, Index, Poses, Wheels, concatenate
 from disco_hw.log.importing.csv_drive import read_csv

@@ -6,7 +6,7 @@ import subprocess
 from importlib import metadata
 from pathlib import Path
 
-from disco_hw.config.input_file import FileKind, read_bytes
+from disco_hw.files import FileKind, read_bytes
 from disco_hw.log.link import Attachment
 
 ROBOT_TOML = "robot.toml"

@@ -14,8 +14,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.config.input_file import LOG, open_file
 from disco_hw.errors import LogError
+from disco_hw.files import LOG, open_file
 from disco_hw.log.container import (
     ChunkRef,
     Contents,

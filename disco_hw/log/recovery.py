@@ -8,8 +8,8 @@ from pathlib import Path
 
 from mcap.writer import CompressionType, Writer
 
-from disco_hw.config.input_file import LOG, open_file
 from disco_hw.errors import LogError
+from disco_hw.files import LOG, open_file
 from disco_hw.log.container import Contents, DamagedError, messages, read_attachment, read_chunk, read_contents
 from disco_hw.log.mcap_log import CHUNK_BYTES, LIBRARY, PROFILE, RECOVERY
 

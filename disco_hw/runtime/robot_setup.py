@@ -10,10 +10,10 @@ import msgspec
 
 from disco_hw.config import RobotConfig, load_robot_config
 from disco_hw.config.command_line import link_fields
-from disco_hw.config.input_file import KEY, WAY_POINTS, read_bytes
-from disco_hw.config.input_file import MODEL_TOML as MODEL_KIND
-from disco_hw.config.input_file import ROBOT_TOML as ROBOT_KIND
 from disco_hw.errors import InputError
+from disco_hw.files import KEY, WAY_POINTS, read_bytes
+from disco_hw.files import MODEL_TOML as MODEL_KIND
+from disco_hw.files import ROBOT_TOML as ROBOT_KIND
 from disco_hw.log.link import Attachment
 from disco_hw.log.provenance import MODEL_TOML, PATH_CSV, ROBOT_TOML, attachment
 from disco_hw.log.reader import Log

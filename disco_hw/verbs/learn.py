@@ -33,7 +33,7 @@ def infer(
     as_json: AsJson = False,
 ) -> None:
     """Infer the robot's parameters from logs of driving (BayesSim) and write a model with its posterior."""
-    from disco_hw.daemon.realtime import limit_thread_pools
+    from disco_hw.processes import limit_thread_pools
 
     # Before the numeric libraries are loaded: on small matrices their pools of threads cost more than the work.
     limit_thread_pools()
@@ -54,7 +54,7 @@ def gap(
     as_json: AsJson = False,
 ) -> None:
     """Find where simulation and logs disagree, name the missing effect, write the amended model, show the shrink."""
-    from disco_hw.daemon.realtime import limit_thread_pools
+    from disco_hw.processes import limit_thread_pools
 
     limit_thread_pools()
     check_named_files(robot, model, logs)

@@ -43,7 +43,8 @@ def run(
     as_json: AsJson = False,
 ) -> None:
     """Run the on-robot daemon: connect, estimate, record; arm and start only when told to (`disco-hw ctl`)."""
-    from disco_hw.daemon.realtime import limit_thread_pools, spare_memory
+    from disco_hw.daemon.realtime import spare_memory
+    from disco_hw.processes import limit_thread_pools
 
     # Before the numeric libraries are loaded: a pool of threads in them costs the loop its deadlines.
     limit_thread_pools()
@@ -79,7 +80,8 @@ def drive(
     as_json: AsJson = False,
 ) -> None:
     """Drive by keyboard, gamepad or script, and record it for `infer` and `gap` (docs/drive.md)."""
-    from disco_hw.daemon.realtime import limit_thread_pools, spare_memory
+    from disco_hw.daemon.realtime import spare_memory
+    from disco_hw.processes import limit_thread_pools
 
     limit_thread_pools()
     spare_memory()

@@ -74,7 +74,7 @@ def replay(
     as_json: AsJson = False,
 ) -> None:
     """Run estimator, planner and governor again on a log's samples and compare every output, by default bit for bit."""
-    from disco_hw.daemon.realtime import limit_thread_pools
+    from disco_hw.processes import limit_thread_pools
 
     limit_thread_pools()
     check_named_files(logs=[log])

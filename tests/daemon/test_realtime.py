@@ -107,7 +107,7 @@ def test_cpus_are_set_or_the_refusal_is_said():
 
 
 def test_libraries_not_loaded_yet_are_held_to_one_thread_by_the_environment():
-    script = "from disco_hw.daemon import realtime\nstep = realtime.limit_thread_pools()\n"
+    script = "from disco_hw import processes\nstep = processes.limit_thread_pools()\n"
     seen = run(script + "report([step], environment=dict(os.environ))", OMP_NUM_THREADS="4")
     assert seen["steps"][0][1] is True
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
@@ -117,9 +117,9 @@ def test_libraries_not_loaded_yet_are_held_to_one_thread_by_the_environment():
 def test_libraries_loaded_already_are_held_to_one_thread_and_still_work():
     script = """
 import numba, torch
-from disco_hw.daemon import realtime
+from disco_hw import processes
 numba.set_num_threads(numba.get_num_threads())
-step = realtime.limit_thread_pools()
+step = processes.limit_thread_pools()
 assert numba.njit(lambda x: x + 1)(1) == 2
 report([step], torch=torch.get_num_threads(), numba=numba.get_num_threads())
 """
@@ -129,7 +129,7 @@ report([step], torch=torch.get_num_threads(), numba=numba.get_num_threads())
 
 
 def test_a_blas_that_is_loaded_too_early_is_said():
-    script = "import numpy\nfrom disco_hw.daemon import realtime\nreport([realtime.limit_thread_pools()])"
+    script = "import numpy\nfrom disco_hw import processes\nreport([processes.limit_thread_pools()])"
     name, done, text = run(script, OPENBLAS_NUM_THREADS="2")["steps"][0]
     assert (name, done) == ("threads", False)
     assert "OPENBLAS_NUM_THREADS=1" in text

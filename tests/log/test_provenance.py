@@ -2,8 +2,8 @@ import re
 
 import pytest
 
-from disco_hw.config.input_file import MODEL_TOML, ROBOT_TOML
 from disco_hw.errors import InputError
+from disco_hw.files import MODEL_TOML, ROBOT_TOML
 from disco_hw.log.provenance import attachment, version
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from disco_hw import cli
-from disco_hw.config.input_file import LOG
+from disco_hw.files import LOG
 from tools.verb_calls import CALLS, call, good_files, without_work, write_good
 
 STUCK_S = 60

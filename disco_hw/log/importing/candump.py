@@ -13,8 +13,8 @@ import can
 import numpy as np
 
 from disco_hw.config import Robot
-from disco_hw.config.input_file import CANDUMP, read_lines
 from disco_hw.errors import LogError
+from disco_hw.files import CANDUMP, read_lines
 from disco_hw.log.drive import Array, Commands, DriveLog, Gyro, Poses, Wheels
 from disco_hw.log.importing import LogFormat
 from drivers.device_clock import DeviceClock

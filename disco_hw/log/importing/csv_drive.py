@@ -18,8 +18,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.config.input_file import DRIVE_CSV, read_lines
 from disco_hw.errors import LogError
+from disco_hw.files import DRIVE_CSV, read_lines
 from disco_hw.log.drive import (
     Array,
     Commands,

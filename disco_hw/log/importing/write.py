@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any
 
 from disco_hw.config import load_robot_config
-from disco_hw.config.input_file import LOG, begin_of
-from disco_hw.config.input_file import ROBOT_TOML as ROBOT_FILE
 from disco_hw.errors import LogError
+from disco_hw.files import LOG, begin_of
+from disco_hw.files import ROBOT_TOML as ROBOT_FILE
 from disco_hw.log.container import MAGIC
 from disco_hw.log.drive import DriveLog
 from disco_hw.log.importing import LONGEST_BEGIN_BYTES, format_of, log_formats

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from disco_hw.config.input_file import WAY_POINTS, read_lines
 from disco_hw.errors import InputError
+from disco_hw.files import WAY_POINTS, read_lines
 from disco_hw.tasks.task import FARTHEST_M, Array, Point
 
 LEAST_DISTANCE_M = 1e-6

@@ -5,7 +5,7 @@ import threading
 import pytest
 
 from disco_hw.errors import LogError
-from disco_hw.log.spawn import spawn_at_normal_priority
+from disco_hw.processes import spawn_at_normal_priority
 
 TELL = "import os; print(os.sched_getscheduler(0), os.getpriority(os.PRIO_PROCESS, 0))"
 

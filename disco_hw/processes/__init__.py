@@ -1,14 +1,55 @@
-"""Starts the writer's process from a thread that may be in the real-time class, without handing that class on."""
+"""How the processes of disco-hw are set up: one thread in numeric libraries, and children at a normal priority."""
 
 from __future__ import annotations
 
 import contextlib
 import os
 import subprocess
+import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import MutableMapping, Sequence
+from dataclasses import dataclass
 
 from disco_hw.errors import LogError
+
+_THREAD_COUNT_VARIABLES = (
+    "OMP_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "NUMBA_NUM_THREADS",
+    "VECLIB_MAXIMUM_THREADS",
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One measure: whether it was taken, and a line for a person with the remedy where it was not."""
+
+    name: str
+    done: bool
+    text: str
+
+    def __str__(self) -> str:
+        return f"{self.name}: {self.text}"
+
+
+def limit_thread_pools(environment: MutableMapping[str, str] = os.environ) -> Step:
+    """Hold the numeric libraries to one thread each; must come before they are imported to bind all of them.
+
+    Torch and numba are also held if they are imported already; a BLAS that is loaded keeps the threads it has.
+    """
+    numpy_is_late = "numpy" in sys.modules and environment.get("OPENBLAS_NUM_THREADS") != "1"
+    for name in _THREAD_COUNT_VARIABLES:
+        # Numba reads its variable again at each compilation and raises if it then differs from the threads it has.
+        if not (name.startswith("NUMBA") and "numba" in sys.modules):
+            environment[name] = "1"
+    for module_name, function in (("torch", "set_num_threads"), ("numba", "set_num_threads")):
+        module = sys.modules.get(module_name)
+        if module is not None:
+            getattr(module, function)(1)
+    if numpy_is_late:
+        return Step("threads", False, "numpy was loaded before; start with OPENBLAS_NUM_THREADS=1 in the environment")
+    return Step("threads", True, "numeric libraries use one thread")
 
 
 def spawn_at_normal_priority(command: list[str], pass_fds: Sequence[int] = ()) -> subprocess.Popen[bytes]:

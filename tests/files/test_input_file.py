@@ -12,7 +12,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from disco_hw.config.input_file import (
+from disco_hw.errors import InputError
+from disco_hw.files import (
     DRIVE_CSV,
     KEY,
     LONGEST_LINE,
@@ -24,7 +25,6 @@ from disco_hw.config.input_file import (
     read_lines,
     read_toml,
 )
-from disco_hw.errors import InputError
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -181,7 +181,7 @@ def test_any_text_is_read_or_refused_in_one_line(text):
 
 # Files that no user names: of the package, of the kernel, of this program's own processes, or written and not read.
 OWN = {
-    "disco_hw/config/input_file.py": {"os.open", "tomllib.loads"},
+    "disco_hw/files/__init__.py": {"os.open", "tomllib.loads"},
     "disco_hw/daemon/control_socket.py": {"os.open"},
     "disco_hw/daemon/realtime.py": {"read_text"},
     "disco_hw/experiments/adapt.py": {"np.genfromtxt", "open"},
