@@ -10,6 +10,7 @@ from types import NoneType, SimpleNamespace, UnionType
 import numpy as np
 import pytest
 
+from disco_hw.cli.options import print_result
 from disco_hw.daemon.check import Check, CheckReport, Level
 from disco_hw.daemon.emergency import EstopOutcome
 from disco_hw.drive.commands import DriveResult
@@ -36,7 +37,6 @@ from disco_hw.log.importing.write import Imported
 from disco_hw.model import Model
 from disco_hw.reports.outputs import as_json
 from disco_hw.runtime.replay import ReplayReport
-from disco_hw.verbs.options import print_result
 
 FLOATS = (np.float16, np.float32, np.float64, np.longdouble)
 INTEGERS = (np.int8, np.int16, np.int32, np.int64, np.uint8, np.uint16, np.uint32, np.uint64)

@@ -7,15 +7,15 @@ from typing import Annotated
 
 import typer
 
-from disco_hw.config.command_line import check_named_files
-from disco_hw.errors import InputError
-from disco_hw.reports import outputs
-from disco_hw.verbs.options import (
+from disco_hw.cli.options import (
     AsJson,
     LinkOption,
     ModelOption,
     View,
 )
+from disco_hw.config.command_line import check_named_files
+from disco_hw.errors import InputError
+from disco_hw.reports import outputs
 from disco_hw.viewer.address import DEFAULT_PORT
 
 

@@ -8,8 +8,7 @@ from typing import Annotated
 
 import typer
 
-from disco_hw.config.command_line import check_named_files
-from disco_hw.verbs.options import (
+from disco_hw.cli.options import (
     AsJson,
     LinkOption,
     LogFileOption,
@@ -18,6 +17,7 @@ from disco_hw.verbs.options import (
     View,
     print_result,
 )
+from disco_hw.config.command_line import check_named_files
 from disco_hw.viewer.address import DEFAULT_PORT, LOOPBACK
 
 PagePort = Annotated[int, typer.Option("--port", min=1, max=65535, help="Port of the page.")]

@@ -1,4 +1,7 @@
-"""The command `disco-hw`: gathers the verbs and turns errors into one line and an exit code."""
+"""The command `disco-hw`: a file for each group of verbs; here they are gathered and errors become an exit code.
+
+Verbs import what they need when they run, so that `estop` and `--help` need nothing else to be healthy.
+"""
 
 from __future__ import annotations
 
@@ -7,9 +10,9 @@ from typing import Annotated
 
 import typer
 
+from disco_hw.cli import logs, robot, virtual, watch
+from disco_hw.cli.experiment import experiment_app
 from disco_hw.errors import InputError, WorkError
-from disco_hw.verbs import learn, logs, robot, virtual, watch
-from disco_hw.verbs.experiment import experiment_app
 
 app = typer.Typer(
     name="disco-hw",
@@ -23,8 +26,8 @@ for verb in (
     robot.ctl,
     robot.check,
     robot.estop,
-    learn.infer,
-    learn.gap,
+    logs.infer,
+    logs.gap,
     watch.view,
     watch.replay,
     virtual.sim,
@@ -37,7 +40,7 @@ app.add_typer(logs.log_app, name="log")
 
 def _version(asked: bool) -> None:
     if asked:
-        from importlib import metadata  # noqa: PLC0415 - slow to import, and needed here alone
+        from importlib import metadata
 
         print(f"disco-hw {metadata.version('disco-hw')}")
         raise typer.Exit
