@@ -15,7 +15,7 @@ EFFECT = Effect(
     name="pose_latency",
     channel=Channel.POSE_SENSOR,
     stage=Stage.POSE_TIME,
-    parameters=(Parameter("latency_s", "s", -0.5, 2.0, 0.05, realistic=0.04),),
+    parameters=(Parameter("latency_s", "s", -1.0, 2.0, 0.05, realistic=0.04),),
     plain=plain,
     symptoms=(Symptom.LATE_POSITIONS, Symptom.LATE_YAW),
     excitation="fast steering and start-stops",

@@ -57,6 +57,14 @@ class GridSettings:
     """After a run's start so long nothing is predicted: what was commanded before is not known. Chosen."""
     start_every_s: float = 0.2
     """Predictions start so far apart. Chosen: neighbours then differ, and a minute has 300."""
+    most_pose_delay_s: float = 1.0
+    """Poses are stamped at most so much too early or too late. Chosen: a pose that is later than that is of no use."""
+    delay_step_s: float = 0.02
+    """The delay of poses is scanned in steps of this. Chosen: between them a parabola is exact enough to begin with."""
+    delay_span_s: float = 0.4
+    """Turns and ways between poses so far apart are compared with the wheels'. Chosen: several poses of a lidar."""
+    least_delay_nats: float = 0.05
+    """A delay stands out by so much per pose. Measured: steady circles 0.4, a robot that turns about 3."""
 
 
 @dataclass(frozen=True, slots=True)

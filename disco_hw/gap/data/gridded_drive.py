@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
+from disco_hw.gap.data.timing import pose_delay_s
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S, GapSettings, GridSettings
 from disco_hw.log.drive import Commands, DriveLog, Wheels
 
@@ -47,7 +48,7 @@ class GriddedDrive:
     (E, 2) laid on even times, its stamps scatter by `stamp_scatter_s`; `pose`: pose samples with `pose` (P, 3) x, y,
     yaw not wrapped within a run. `known_command` (M, 2) rad/s and `known_motion` (M, 3) m/s, m/s, rad/s: what the
     terms without a name that a given model has add; None without. `settings` travel with the drive: what judges it
-    reads them there.
+    reads them there. `pose_delay_s`: how much older than their stamps poses are at first sight, s.
     """
 
     t_s: Array
@@ -67,6 +68,7 @@ class GriddedDrive:
     known_command: Array | None = None
     known_motion: Array | None = None
     settings: GapSettings = DEFAULT_SETTINGS
+    pose_delay_s: float = 0.0
 
     @property
     def has_commands(self) -> bool:
@@ -150,6 +152,7 @@ def grid_drive(log: DriveLog, settings: GapSettings = DEFAULT_SETTINGS) -> Gridd
         pose_values=np.concatenate(pose_values),
         notes=tuple(notes),
         settings=settings,
+        pose_delay_s=pose_delay_s(wheels, poses, grid_settings),
     )
 
 

@@ -64,9 +64,32 @@ def driven(channel: ResidualChannel) -> CommandedDrive:
     return CommandedDrive(known, (float(geometry[0]), float(geometry[1])), float(t_s[0]), float(t_s[-1]))
 
 
+# What makes poses older than their stamps.
+OLD_POSE_COLUMNS = tuple(f"{effect.name}.{effect.parameters[0].name}" for effect in in_stages(Stage.POSE_TIME))
+
+
+def with_pose_delay(channel: BodyChannel, vector: Array) -> Array:
+    """A parameter vector with the poses' delay as it is at first sight."""
+    delayed = vector.copy()
+    places = [channel.layout.place[column] for column in OLD_POSE_COLUMNS]
+    delayed[places] = np.clip(channel.drive.pose_delay_s, channel.layout.low[places], channel.layout.high[places])
+    return delayed
+
+
+def _pose_starts(channel: ResidualChannel) -> Starts:
+    """Where the fit of a pose's age begins: without any, and at first sight."""
+    inner = channel.inner
+    assert isinstance(inner, BodyChannel)
+    neutral = inner.layout.neutral
+    seen = with_pose_delay(inner, neutral)
+    return tuple((float(vector[inner.layout.place[OLD_POSE_COLUMNS[0]]]),) for vector in (neutral, seen))
+
+
 def _candidate(effect: Effect) -> Candidate:
     scan, begin = effect.scan, effect.starts
     fitted = [p.name for p in effect.parameters if scan is None or p.name != scan.parameter]
+    if effect.stage is Stage.POSE_TIME:
+        return Candidate(effect.name, tuple(f"{effect.name}.{key}" for key in fitted), _pose_starts)
     return Candidate(
         effect.name,
         tuple(f"{effect.name}.{key}" for key in fitted),

@@ -18,7 +18,15 @@ from disco_hw.gap.noise.body_noise import BodyNoise
 from disco_hw.gap.noise.channels import BodyChannel, ResidualChannel, WheelChannel
 from disco_hw.gap.noise.noise_fit import learn_body_noise, learn_wheel_noise
 from disco_hw.gap.noise.wheel_noise import WheelNoise, whiten_wheels
-from disco_hw.gap.search.candidates import LATE, LATE_COLUMNS, LATE_STARTS_S, indices, parameters_of, smooth_of
+from disco_hw.gap.search.candidates import (
+    LATE,
+    LATE_COLUMNS,
+    LATE_STARTS_S,
+    indices,
+    parameters_of,
+    smooth_of,
+    with_pose_delay,
+)
 from disco_hw.gap.search.evidence import EffectEvidence, compare
 from disco_hw.gap.search.least_squares import Fit, fit, inverse
 from disco_hw.gap.search.richest_model import learn_saturated_body, learn_saturated_wheels
@@ -177,7 +185,9 @@ def search_body(drive: GriddedDrive, start: Array, given: Names = ()) -> Channel
     """Effects between measured wheel angles and measured poses; `start` and `given` as for the wheels."""
     channel = BodyChannel.build(drive, BodyNoise(), start)
     nominal = fit(channel, start, indices(channel, given))
-    channel = learn_body_noise(channel, nominal.vector, iterations=4)
+    # Noise that is learnt from poses that are laid beside the wrong wheels hides that they are.
+    delayed = fit(channel, with_pose_delay(channel, nominal.vector), indices(channel, given))
+    channel = learn_body_noise(channel, min(nominal, delayed, key=lambda one: one.cost).vector, iterations=4)
     settings = drive.settings.selection
     limits = Thresholds(settings.rough_score, 0.0)
     rough = Selector(channel, body_moves(channel), limits, given=given, start=nominal.vector)
