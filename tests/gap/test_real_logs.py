@@ -1,6 +1,7 @@
 """Measured logs of real robots, which are not part of this repository: what is known of them is found."""
 
 import os
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -101,3 +102,16 @@ def test_a_small_robot_under_a_camera_is_nearly_as_drawn():
     assert report.model.wheel_radius_m == pytest.approx(0.042, rel=0.03)
     assert report.model.axial_distance_m == pytest.approx(0.2, rel=0.03)
     assert report.gap["amended"][2.0].position_m <= report.gap["refitted"][2.0].position_m
+
+
+@pytest.mark.parametrize("shift_s", [-0.32, -0.2, -0.1, 0.1, 0.2, 0.32])
+def test_poses_of_a_small_robot_that_are_moved_in_time_are_found_moved_by_as_much(shift_s):
+    log = load_drive(Path(DATA) / "optiodom/free_20210103_0006_run01.csv", 2796.8, 0.042)
+    found = []
+    for by_s in (0.0, shift_s):
+        moved = replace(log, poses=replace(log.poses, t_s=log.poses.t_s + by_s))
+        report = find_gap(moved, Model(0.042, 0.2, 0.0))
+        found.append({effect.name: effect.parameters for effect in report.effects})
+    latency_s = [effects["pose_latency"]["latency_s"].value for effects in found]
+    assert latency_s[1] - latency_s[0] == pytest.approx(shift_s, abs=0.02)
+    assert set(found[1]) == set(found[0])

@@ -1,0 +1,55 @@
+"""The delay between poses and wheels at first sight, on wheels and poses made here by arcs."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from disco_hw.gap.data.timing import pose_delay_s
+from disco_hw.gap.settings import GridSettings
+from disco_hw.log.drive import Poses, Wheels
+
+RADIUS_M, TRACK_M = 0.11, 0.6
+
+
+def drive(older_s, turning=True, segments=1, noise_m=0.003, seed=0):
+    """Wheels at 50 Hz and poses at 12 Hz that are `older_s` older than their stamps, of a drive that nobody planned."""
+    rng = np.random.default_rng(seed)
+    t_s = np.arange(0.0, 60.0, 0.001)
+    tones = rng.uniform(0.3, 3.0, (2, 6)), rng.uniform(0.0, 6.0, (2, 6))
+    left, right = (4.0 + 1.5 * np.sin(np.outer(t_s, tones[0][side]) + tones[1][side]).sum(axis=1) for side in (0, 1))
+    if not turning:
+        left, right = np.full_like(t_s, 3.0), np.full_like(t_s, 4.0)
+    angle = np.cumsum(np.column_stack([left, right]), axis=0) * 0.001
+    yaw = RADIUS_M / TRACK_M * (angle[:, 1] - angle[:, 0])
+    speed = 0.5 * RADIUS_M * (left + right)
+    x, y = np.cumsum(speed * np.cos(yaw)) * 0.001, np.cumsum(speed * np.sin(yaw)) * 0.001
+    at, seen = np.arange(0, t_s.size, 20), np.arange(1000, t_s.size - 1000, 83)
+    cut = np.minimum(t_s * segments / 60.0, segments - 1).astype(np.int64)
+    wheels = Wheels(t_s[at], angle[at, 0], angle[at, 1], left[at], right[at], cut[at], True, True)
+    errors = rng.normal(0.0, noise_m, (3, seen.size))
+    yaw_seen = np.remainder(yaw[seen] + errors[2] + np.pi, 2.0 * np.pi) - np.pi
+    poses = Poses(t_s[seen] + older_s, x[seen] + errors[0], y[seen] + errors[1], yaw_seen, cut[seen])
+    return wheels, poses
+
+
+@pytest.mark.parametrize("older_s", [-0.85, -0.32, -0.013, 0.0, 0.1, 0.207, 0.9])
+def test_a_delay_of_either_sign_is_found_within_five_milliseconds(older_s):
+    assert pose_delay_s(*drive(older_s), GridSettings()) == pytest.approx(older_s, abs=0.005)
+
+
+def test_it_is_found_over_segments_and_beside_poses_that_jump():
+    wheels, poses = drive(0.25, segments=12)
+    jumps = np.where(np.arange(poses.t_s.size) % 25 == 0, 0.8, 0.0)
+    found = pose_delay_s(wheels, replace(poses, x_m=poses.x_m + jumps), GridSettings())
+    assert found == pytest.approx(0.25, abs=0.005)
+
+
+def test_a_steady_circle_has_no_delay_that_stands_out():
+    assert pose_delay_s(*drive(0.4, turning=False), GridSettings()) == 0.0
+
+
+def test_too_few_poses_have_none():
+    wheels, poses = drive(0.4)
+    few = Poses(poses.t_s[:50], poses.x_m[:50], poses.y_m[:50], poses.yaw_rad[:50], poses.segment[:50])
+    assert pose_delay_s(wheels, few, GridSettings()) == 0.0
