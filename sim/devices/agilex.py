@@ -6,9 +6,13 @@ remote control comes first. Source: the vendor's ugv_sdk protocol_v2 and the Sco
 
 from __future__ import annotations
 
+import math
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+from drivers.motor.agilex_settings import AgilexSettings
+from firmware_protocol.firmware_core import FirmwareInputs
 from sim.can_frame import CanFrame
 
 TIMEOUT_MS = 500
@@ -145,3 +149,65 @@ class AgilexBase:
             return struct.pack(">hhi", self.rpm[motor], self.current_deciampere[motor], self.pulses[motor])
         temperatures = (self.driver_deg_c[motor], self.motor_deg_c[motor])
         return struct.pack(">HhbBxx", self.driver_decivolt[motor], *temperatures, self.driver_state[motor])
+
+
+class AgilexController:
+    """One base: satisfies `sim.vendor_robot.Controller`. It makes wheel speeds of its own, by the track that it has."""
+
+    brakes = False
+
+    def __init__(self, settings: AgilexSettings, ticks_per_rev: int) -> None:
+        self._settings = settings
+        self._ticks_per_rev = ticks_per_rev
+        self._ticks = self._zero_ticks = (0, 0)
+        self.base = AgilexBase()
+
+    @property
+    def wheels_rad_s(self) -> tuple[float | None, float | None]:
+        """The speeds of its wheels: it always holds them."""
+        linear, angular = self.base.commanded
+        turn = 0.5 * self._settings.track_m * angular
+        return (linear - turn) / self._settings.wheel_radius_m, (linear + turn) / self._settings.wheel_radius_m
+
+    @property
+    def state(self) -> str:
+        """In one word."""
+        if self.base.vehicle_state or self.base.error_code:
+            return "FAULT"
+        return "ARMED" if self.base.control_mode == CAN_MODE else "STANDBY"
+
+    @property
+    def obeyed(self) -> int:
+        """How many commands it has taken."""
+        return len(self.base.obeyed)
+
+    def receive(self, now_us: int, frame: CanFrame) -> Sequence[CanFrame]:
+        """Take in one frame; return the replies."""
+        self.base.at(now_us // 1000)
+        return self.base.receive(frame)
+
+    def step(self, now_us: int, inputs: FirmwareInputs) -> Sequence[CanFrame]:
+        """Go through one millisecond; the odometry counts millimetres of each side from zero at the start."""
+        base, radius = self.base, self._settings.wheel_radius_m
+        self._ticks = (inputs.left_ticks, inputs.right_ticks)
+        per_tick = 2e3 * math.pi * radius / self._ticks_per_rev
+        left, right = (now - zero for now, zero in zip(self._ticks, self._zero_ticks, strict=True))
+        base.odometry_mm = (round(per_tick * left), round(per_tick * right))
+        linear = 0.5 * radius * (inputs.left_speed_rad_s + inputs.right_speed_rad_s)
+        angular = radius * (inputs.right_speed_rad_s - inputs.left_speed_rad_s) / self._settings.track_m
+        base.speeds = (round(1e3 * linear), round(1e3 * angular), 0, 0)
+        if inputs.estop_button:
+            base.vehicle_state = 1
+        elif base.vehicle_state == 1:
+            base.vehicle_state = 0
+        return base.step(now_us // 1000)
+
+    def restart(self) -> None:
+        """Switch off and on: standby, nothing counted."""
+        self._zero_ticks = self._ticks
+        self.base = AgilexBase()
+
+
+def make_controller(settings: AgilexSettings, ticks_per_rev: int) -> AgilexController:
+    """The base of a robot whose robot.toml has these settings, with the encoder on the wheel."""
+    return AgilexController(settings, ticks_per_rev)

@@ -51,8 +51,6 @@ def test_nothing_that_moves_is_sent_before_arming(vendor, bench):
     bench.driver.request(Request.READY)
     bench.run(1.0)
     assert bench.driver.state is DriverState.READY
-    sent = len(bench.robot.received)
-    assert sent, "the controller is asked who it is"
     assert not [frame for frame in bench.robot.received if vendor.is_motion(frame)]
 
 
@@ -116,7 +114,7 @@ def test_disarming_ramps_down_and_says_so_until_it_stands(bench):
     bench.run_until(*STILL)
     bench.run(0.2)
     assert bench.robot.speed_rad_s < 0.05
-    assert bench.robot.controller.wheels_rad_s == (None, None) or bench.robot.controller.brakes
+    assert no_wheel_is_driven(bench)
 
 
 def test_an_arming_that_is_taken_back_moves_nothing(bench):

@@ -65,6 +65,17 @@ def test_it_does_not_arm_while_a_motor_turns():
     assert not [frame for frame in bench.robot.received if VESC.is_motion(frame)]
 
 
+def test_it_is_armed_only_after_zeros_for_a_while():
+    bench = VESC.bench()
+    bench.run_until(*STILL)
+    bench.robot.received.clear()
+    bench.arm()
+    bench.run(0.02)
+    zeros = [frame for frame in bench.robot.received if frame.can_id == 3 << 8 | 23]
+    assert len(zeros) >= 10
+    assert {frame.data for frame in zeros} == {bytes(4)}
+
+
 def test_a_fault_is_named_within_half_a_second():
     bench = VESC.bench()
     bench.run_until(*STILL)

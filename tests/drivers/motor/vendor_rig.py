@@ -11,7 +11,7 @@ START_NS = 50_000 * 1_000_000
 
 
 class VendorRig:
-    """What `bench.Bench` steps; `controller` of `sim.devices`. `speeds` are the highest seen while `watch` is on."""
+    """What `bench.Bench` steps; `controller` of `sim.devices`. `stuck`: sides that roll whatever is asked."""
 
     def __init__(self, controller):
         self.controller = controller
@@ -20,7 +20,7 @@ class VendorRig:
         self.pressed = False
         self.received = []
         self._outgoing = []
-        self._stuck = set()
+        self.stuck = set()
 
     @property
     def speed_rad_s(self):
@@ -32,7 +32,7 @@ class VendorRig:
 
     def step(self, now_ns):
         for side, wanted in enumerate(self.controller.wheels_rad_s):
-            if wanted is not None and side not in self._stuck:
+            if wanted is not None and side not in self.stuck:
                 self.speed[side] = wanted
             else:
                 self.speed[side] *= math.exp(-1e-3 / COASTING_S)

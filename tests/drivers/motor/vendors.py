@@ -86,6 +86,21 @@ def is_vesc_forbidden(frame):
     return command in (0, 4, 5, 6, 7, 10, 31, 63) or (command < 14 and len(frame.data) != 4) or not frame.extended
 
 
+def fail_left_agilex(rig):
+    rig.controller.base.error_code, rig.controller.base.vehicle_state = 0x0010, 2
+
+
+def is_agilex_motion(frame):
+    """A speed that is not zero, or the mode in which the base obeys one."""
+    return (frame.can_id == 0x111 and frame.data[:4] != bytes(4)) or (frame.can_id == 0x421 and frame.data[0] != 0)
+
+
+def is_agilex_forbidden(frame):
+    """Lights, brakes, the serial mode, and a length that is not the command's."""
+    lengths = {0x111: 8, 0x421: 8, 0x441: 1}
+    return len(frame.data) != lengths.get(frame.can_id) or (frame.can_id == 0x421 and frame.data[0] > 1)
+
+
 VENDORS = (
     Vendor(
         "odrive",
@@ -138,5 +153,15 @@ VENDORS = (
         is_vesc_forbidden,
         CanFrame(3 << 8 | 52, bytes(4), extended=True),
         mend_vesc,
+    ),
+    Vendor(
+        "agilex",
+        "agilex",
+        "",
+        0.5,
+        fail_left_agilex,
+        is_agilex_motion,
+        is_agilex_forbidden,
+        CanFrame(0x111, b"\0\x10" + bytes(6)),
     ),
 )

@@ -1,0 +1,420 @@
+"""The driver of AgileX bases on CAN v2: Scout, Scout Mini, Bunker, Tracer.
+
+The base takes speed and turn rate of the body and makes wheel speeds of them by its own track: what the model learns as
+axial distance is base and inner factor together. Who holds the remote control comes first: then this driver stands by.
+"""
+
+from __future__ import annotations
+
+import enum
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+from drivers.motor import agilex_codec as codec
+from drivers.motor.agilex_settings import (
+    EXAMPLE,
+    TIMEOUT_S,
+    AgilexSettings,
+    cyclic_frames,
+    safety_card,
+    stands,
+    stop_confirmation,
+    stop_frames,
+)
+from drivers.types import (
+    Capabilities,
+    DriverState,
+    DriverStats,
+    Frame,
+    MotorDriver,
+    OutgoingFrame,
+    Readings,
+    ReceivedFrame,
+    Request,
+    RobotStatus,
+    WheelCommand,
+    WheelSample,
+)
+
+ZEROS_TO_ARM = 5
+SILENT_NS = 350_000_000
+MOTION_SILENT_NS = 100_000_000
+GONE_NS = 1_000_000_000
+ARMING_TIMEOUT_NS = 1_500_000_000
+STOPPING_NS = 3_000_000_000
+_MODE_SEEN_NS = 400_000_000
+_REPEAT_NS = 100_000_000
+_FRAME_LIFE_NS = 50_000_000
+_ESTOP_LIFE_NS = 1_000_000_000
+_ESTOP_REPEATS = 3
+_ESTOP_RANK, _RANK = 0, 1
+_LONGEST_STEP_S = 0.1
+_WARNINGS = 0x0606
+"""Bits of the error word that only warn, in the SDK's byte and in the manual's: battery low, remote control lost."""
+_MODES = {codec.STANDBY: "standby", codec.UART_MODE: "serial mode", codec.RC_MODE: "remote control"}
+_HOST_COMMANDS = frozenset({codec.MOTION_COMMAND, codec.CONTROL_MODE, codec.STATE_RESET, codec.BRAKE})
+
+
+class _Stage(enum.Enum):
+    REST = "rest"
+    ARMING = "arming"
+    ARMED = "armed"
+    STOPPING = "stopping"
+
+
+class AgilexDriver:
+    """Satisfies `drivers.types.Driver`: pure, and no frame makes it raise."""
+
+    clock_offset_ns: int | None = None
+
+    def __init__(self, settings: AgilexSettings) -> None:
+        self._settings = settings
+        self.stats = DriverStats()
+        self._link_is_up = False
+        self._stage = _Stage.REST
+        self._stage_ns: int | None = None
+        self._wanted, self._note = Request.STANDBY, "it stands by"
+        self._fault: str | None = None
+        self._estopped = False
+        self._state_ns: int | None = None
+        self._motion_ns: int | None = None
+        self._vehicle = self._mode = self._error = 0
+        self._stands = True
+        self._speed = (0.0, 0.0)
+        self._odometry: tuple[int, int] | None = None
+        self._odometry_ns = 0
+        self._moved_mm = (0, 0)
+        self._zeros = 0
+        self._speeds = (0.0, 0.0)
+        self._last_sent_ns = self._repeat_ns = 0
+        self._foreign = False
+        self._events: list[str] = []
+
+    @property
+    def state(self) -> DriverState:
+        """Where the driver is with its base."""
+        if not self._link_is_up:
+            return DriverState.DISCONNECTED
+        if self._estopped or self._vehicle == codec.EMERGENCY_STOP:
+            return DriverState.ESTOP
+        if self._state_ns is None or self._motion_ns is None or self._odometry is None:
+            return DriverState.HANDSHAKE
+        if self._fault is not None or self._is_faulty:
+            return DriverState.FAULT
+        if self._stage is _Stage.ARMED:
+            return DriverState.ARMED
+        if self._stage is _Stage.STOPPING or (self._stage is _Stage.REST and self._mode == codec.CAN_MODE):
+            return DriverState.STOPPING
+        rest = {Request.ARM: DriverState.ARMING, Request.READY: DriverState.READY}
+        return rest.get(self._wanted, DriverState.STANDBY)
+
+    @property
+    def detail(self) -> str:
+        """For a person: why the state is what it is, and what to do about it."""
+        match self.state:
+            case DriverState.DISCONNECTED:
+                return "the link is down"
+            case DriverState.HANDSHAKE:
+                return "no answer from the base; is it switched on, and the bus at 500 kbit/s?"
+            case DriverState.ESTOP:
+                pressed = self._vehicle == codec.EMERGENCY_STOP
+                return "a button on the base is pressed" if pressed else "emergency stop; remove its cause, then reset"
+            case DriverState.FAULT:
+                return f"{self._fault or self._fault_words}; remove the cause, then reset"
+            case DriverState.ARMED:
+                return "armed"
+            case DriverState.STANDBY | DriverState.READY if self._mode == codec.RC_MODE:
+                return "a person drives it by remote control; switch that off to drive it from here"
+        return self._note
+
+    @property
+    def capabilities(self) -> Capabilities | None:
+        """What robot.toml declares of the base; it tells nothing of that itself."""
+        if self._state_ns is None:
+            return None
+        return Capabilities(
+            protocol_major=2,
+            protocol_minor=0,
+            firmware_version="AgileX CAN v2",
+            dbc_hash=0,
+            board_id=0,
+            max_wheel_speed_rad_s=self._settings.max_speed_m_s / self._settings.wheel_radius_m,
+            max_wheel_acceleration_rad_s2=None,
+            ticks_per_rev=None,
+            command_timeout_s=TIMEOUT_S,
+            drive_off_timeout_s=TIMEOUT_S,
+            stop_deceleration_rad_s2=self._settings.stop_deceleration_rad_s2,
+            told=False,
+        )
+
+    def link_up(self, now_ns: int) -> None:
+        """The medium has come up (again): whatever was agreed is void."""
+        self._restart("the link was lost")
+        self._link_is_up = True
+
+    def link_down(self, now_ns: int) -> None:
+        """The medium is gone: whatever was agreed is void."""
+        self._restart("the link was lost")
+        self._link_is_up = False
+
+    def request(self, request: Request) -> None:
+        """Set what the host wants; ARM only from standing by, and consumed when the base leaves its CAN mode."""
+        if request is self._wanted:
+            return
+        if request is Request.ARM:
+            if self.state not in (DriverState.STANDBY, DriverState.READY) or self._mode == codec.RC_MODE:
+                self._note = f"not arming: {self.detail}"
+                return
+            self.stats = replace(self.stats, sessions=self.stats.sessions + 1)
+            self._note, self._stage, self._stage_ns = "arming", _Stage.ARMING, None
+            self._zeros, self._speeds = 0, (0.0, 0.0)
+        elif self._wanted is Request.ARM and self._stage in (_Stage.ARMING, _Stage.ARMED):
+            self._note, self._stage, self._stage_ns = "stopping as asked", _Stage.STOPPING, None
+        self._wanted = request
+
+    def receive(self, now_ns: int, frames: Sequence[ReceivedFrame]) -> Readings:
+        """Take in received frames and return what they meant; frames that come while the link is down are ignored."""
+        wheels: list[WheelSample] = []
+        status: list[RobotStatus] = []
+        for received in frames if self._link_is_up else ():
+            if not received.frame.extended and received.frame.can_id in _HOST_COMMANDS:
+                self._take_foreign(received.frame)
+                continue
+            decoded = codec.decode(received.frame)
+            if decoded is None:
+                known = received.frame.can_id in codec.LAYOUTS and not received.frame.extended
+                self._count("rejected_length" if known else "unknown_id")
+                continue
+            self._count("frames_accepted")
+            match decoded.name:
+                case "system_state":
+                    self._take_state(decoded, received.t_ns)
+                    status.append(self._status(received.t_ns))
+                case "motion_state":
+                    self._motion_ns, self._stands = received.t_ns, stands(decoded)
+                    self._speed = (float(decoded.values["linear_m_s"]), float(decoded.values["angular_rad_s"]))
+                case "odometry":
+                    self._take_odometry(int(decoded.values["left_mm"]), int(decoded.values["right_mm"]), received.t_ns)
+                    if self._motion_ns is not None:
+                        wheels.append(self._sample(received.t_ns))
+        if self._link_is_up:
+            self._check_silence(now_ns)
+        events, self._events = tuple(self._events), []
+        return Readings(wheels=tuple(wheels), status=tuple(status[-1:]), events=events)
+
+    def transmit(self, now_ns: int, command: WheelCommand | None) -> tuple[OutgoingFrame, ...]:
+        """Frames due now: the command, or what stops and leaves the CAN mode.
+
+        Raises ValueError for a command that is not finite or valid for no time.
+        """
+        if command is not None and not (
+            math.isfinite(command.left_rad_s) and math.isfinite(command.right_rad_s) and command.valid_for_s > 0.0
+        ):
+            raise ValueError(f"not a wheel command: {command}")
+        if not self._link_is_up:
+            return ()
+        match self._stage:
+            case _Stage.REST:
+                return self._rest(now_ns)
+            case _Stage.ARMING:
+                return self._arm(now_ns)
+            case _Stage.STOPPING:
+                return self._ramp(now_ns)
+        if now_ns - self._last_sent_ns > TIMEOUT_S * 1e9:
+            # The base stays in its CAN mode: the next command would move it again.
+            self._lose("no command for longer than the base's time-out")
+            return self._rest(now_ns)
+        if command is None:
+            return ()
+        self._speeds, self._last_sent_ns = (command.left_rad_s, command.right_rad_s), now_ns
+        self._count("commands_sent")
+        # Half of its validity may pass on the way.
+        return self._frames(now_ns, self._motion(self._speeds), life_ns=round(0.5e9 * command.valid_for_s))
+
+    def estop(self, now_ns: int) -> tuple[OutgoingFrame, ...]:
+        """Zero and standby in any state; whatever was wanted is dropped, and nothing is commanded again."""
+        self._wanted, self._stage, self._estopped = Request.STANDBY, _Stage.REST, True
+        self._note, self._repeat_ns = "emergency stop sent", 0
+        return tuple(
+            OutgoingFrame(frame, now_ns + _ESTOP_LIFE_NS, _ESTOP_RANK)
+            for frame in _ESTOP_REPEATS * stop_frames(self._settings)
+        )
+
+    @property
+    def _is_faulty(self) -> bool:
+        return self._vehicle == codec.EXCEPTION or bool(self._error & ~_WARNINGS)
+
+    @property
+    def _fault_words(self) -> str:
+        return f"the base reports an error ({self._error:#06x}); its manual's table of faults names it"
+
+    def _rest(self, now_ns: int) -> tuple[OutgoingFrame, ...]:
+        """Bring a base that listens to CAN to standby, standing; clear errors when asked."""
+        if self._wanted is Request.RESET:
+            if self._state_ns is not None and not self._is_faulty and self._vehicle == codec.NORMAL:
+                if self._fault is None or self._mode != codec.CAN_MODE:
+                    self._fault, self._estopped = None, False
+                    self._wanted, self._note = Request.STANDBY, "it stands by"
+                    return ()
+            elif now_ns - self._repeat_ns >= _REPEAT_NS:
+                self._repeat_ns = now_ns
+                return self._frames(now_ns, codec.clear_errors())
+        if self._mode == codec.CAN_MODE and now_ns - self._repeat_ns >= _REPEAT_NS:
+            self._repeat_ns = now_ns
+            return self._frames(now_ns, *stop_frames(self._settings))
+        return ()
+
+    def _arm(self, now_ns: int) -> tuple[OutgoingFrame, ...]:
+        self._stage_ns = now_ns if self._stage_ns is None else self._stage_ns
+        if not self._stands:
+            self._give_up("not armed: the base moves; wait until it stands")
+            return ()
+        if now_ns - self._stage_ns > ARMING_TIMEOUT_NS:
+            self._give_up("not armed: the base did not take its CAN mode; switch the remote control off")
+            return ()
+        self._last_sent_ns = now_ns
+        if self._mode != codec.CAN_MODE:
+            return self._frames(now_ns, codec.control_mode(codec.CAN_MODE))
+        self._zeros += 1
+        if self._zeros > ZEROS_TO_ARM:
+            self._stage, self._note = _Stage.ARMED, "armed"
+        return self._frames(now_ns, codec.motion(0.0, 0.0))
+
+    def _ramp(self, now_ns: int) -> tuple[OutgoingFrame, ...]:
+        """Slow down with the declared deceleration, stand, then leave the CAN mode."""
+        self._stage_ns = now_ns if self._stage_ns is None else self._stage_ns
+        elapsed_s = min(max(now_ns - self._last_sent_ns, 0) * 1e-9, _LONGEST_STEP_S)
+        self._last_sent_ns = now_ns
+        step = self._settings.stop_deceleration_rad_s2 * elapsed_s
+        left, right = (math.copysign(max(abs(speed) - step, 0.0), speed) for speed in self._speeds)
+        self._speeds = (left, right)
+        if left or right:
+            return self._frames(now_ns, self._motion(self._speeds))
+        if self._stands or now_ns - self._stage_ns > STOPPING_NS:
+            self._stage, self._repeat_ns = _Stage.REST, now_ns
+            return self._frames(now_ns, *stop_frames(self._settings))
+        return self._frames(now_ns, codec.motion(0.0, 0.0))
+
+    def _motion(self, speeds: tuple[float, float]) -> Frame:
+        """Of wheel speeds, by the nominal geometry; both scaled down where the base can do less."""
+        left, right = speeds
+        radius = self._settings.wheel_radius_m
+        scale = min(1.0, self._settings.max_speed_m_s / max(radius * max(abs(left), abs(right)), 1e-9))
+        linear = scale * radius * (left + right) / 2.0
+        return codec.motion(linear, scale * radius * (right - left) / self._settings.track_m)
+
+    def _frames(self, now_ns: int, *frames: Frame, life_ns: int = _FRAME_LIFE_NS) -> tuple[OutgoingFrame, ...]:
+        return tuple(OutgoingFrame(frame, now_ns + life_ns, _RANK) for frame in frames)
+
+    def _take_state(self, decoded: codec.Decoded, t_ns: int) -> None:
+        values = decoded.values
+        self._vehicle, self._mode = int(values["vehicle_state"]), int(values["control_mode"])
+        self._error, self._state_ns = int(values["error_code"]), t_ns
+        if self._stage in (_Stage.REST, _Stage.STOPPING):
+            return
+        if self._vehicle == codec.EMERGENCY_STOP:
+            self._lose("a button on the base was pressed")
+        elif self._is_faulty:
+            self._lose(self._fault_words)
+        elif self._stage is _Stage.ARMED and self._mode == codec.RC_MODE:
+            # A person has taken over, which is no fault.
+            self._give_up("disarmed: a person has taken the remote control")
+            self._events.append("disarmed: a person has taken the remote control")
+        elif self._stage is _Stage.ARMED and self._mode != codec.CAN_MODE:
+            self._lose(f"the base left its CAN mode by itself, for {_MODES.get(self._mode, self._mode)}")
+
+    def _take_odometry(self, left_mm: int, right_mm: int, t_ns: int) -> None:
+        if self._odometry is not None:
+            pairs = zip((left_mm, right_mm), self._odometry, strict=True)
+            moved = [(new - old + 2**31) % 2**32 - 2**31 for new, old in pairs]
+            fastest = 1.5e3 * self._settings.max_speed_m_s * (t_ns - self._odometry_ns) * 1e-9 + 10.0
+            if max(map(abs, moved)) <= fastest:
+                self._moved_mm = (self._moved_mm[0] + moved[0], self._moved_mm[1] + moved[1])
+            else:
+                self._count("implausible_ticks")
+                if self._stage in (_Stage.ARMING, _Stage.ARMED):
+                    self._lose("the base has restarted: its odometry jumped")
+        self._odometry, self._odometry_ns = (left_mm, right_mm), t_ns
+
+    def _sample(self, t_ns: int) -> WheelSample:
+        radius, track = self._settings.wheel_radius_m, self._settings.track_m
+        linear, angular = self._speed
+        left, right = (1e-3 * moved / radius for moved in self._moved_mm)
+        speeds = (linear - 0.5 * track * angular, linear + 0.5 * track * angular)
+        return WheelSample(t_ns, t_ns, left, right, speeds[0] / radius, speeds[1] / radius)
+
+    def _take_foreign(self, frame: Frame) -> None:
+        self._count("unknown_id")
+        is_stop = frame in stop_frames(self._settings)
+        if is_stop and frame.can_id == codec.CONTROL_MODE:
+            if self._stage is not _Stage.REST:
+                self._events.append("stopped from outside on the link, by `disco-hw estop` or another host")
+            self._wanted, self._stage, self._estopped = Request.STANDBY, _Stage.REST, True
+        if is_stop:
+            return
+        if not self._foreign:
+            self._foreign = True
+            self._events.append("another host is on the link: it commands the base; disconnect it")
+        if self._stage in (_Stage.ARMING, _Stage.ARMED):
+            self._lose("another host commands the base; disconnect it")
+
+    def _check_silence(self, now_ns: int) -> None:
+        if self._state_ns is None:
+            return
+        silent = now_ns - self._state_ns > SILENT_NS
+        silent = silent or (self._motion_ns is not None and now_ns - self._motion_ns > MOTION_SILENT_NS)
+        if silent and self._stage is not _Stage.REST:
+            self._lose("the base fell silent")
+        elif self._stage is _Stage.REST and now_ns - self._state_ns > GONE_NS:
+            self._restart("the base fell silent")
+            self._events.append("the base fell silent: waiting for it")
+
+    def _status(self, t_ns: int) -> RobotStatus:
+        names = {DriverState.ARMED: "ARMED", DriverState.FAULT: "FAULT", DriverState.STOPPING: "STOPPING"}
+        at_rest = self._stands and self._mode != codec.CAN_MODE
+        names[DriverState.ESTOP] = "ESTOP" if at_rest or self._vehicle == codec.EMERGENCY_STOP else "STOPPING"
+        return RobotStatus(
+            t_ns=t_ns,
+            state=names.get(self.state, "STANDBY"),
+            fault_code=0,
+            fault="NONE",
+            estop_source="NONE",
+            stop_cause="NONE",
+            session=0,
+            rejected_count=0,
+            reject_reason="NONE",
+        )
+
+    def _give_up(self, why: str) -> None:
+        self._wanted, self._stage, self._stage_ns, self._note = Request.STANDBY, _Stage.REST, None, why
+        # Standby is due at once where it still listens.
+        self._repeat_ns = 0
+
+    def _lose(self, why: str) -> None:
+        self._give_up(f"disarmed: {why}")
+        self._fault = why
+        self._events.append(f"disarmed: {why}")
+
+    def _restart(self, why: str) -> None:
+        if self._wanted is Request.ARM:
+            self._note = f"disarmed: {why}"
+        self._wanted, self._stage, self._stage_ns = Request.STANDBY, _Stage.REST, None
+        self._fault, self._foreign, self._repeat_ns = None, False, 0
+        self._state_ns = self._motion_ns = self._odometry = None
+        self._vehicle, self._mode, self._error, self._stands = codec.NORMAL, codec.STANDBY, 0, True
+
+    def _count(self, name: str) -> None:
+        self.stats = replace(self.stats, **{name: getattr(self.stats, name) + 1})
+
+
+DRIVER = MotorDriver(
+    "agilex",
+    lambda settings, _key: AgilexDriver(settings),
+    settings=AgilexSettings,
+    example=EXAMPLE,
+    stop_frames=stop_frames,
+    stop_confirmation=stop_confirmation,
+    cyclic_frames=cyclic_frames,
+    safety_card=safety_card,
+)

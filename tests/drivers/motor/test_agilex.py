@@ -1,0 +1,114 @@
+"""What is AgileX's own: remote control comes first, speeds of the body, a time-out of half a second, buttons."""
+
+import pytest
+
+from drivers.types import DriverState, Request
+from sim.devices.agilex import CAN_MODE, STANDBY
+from tests.drivers.motor.vendors import VENDORS
+
+(AGILEX,) = [vendor for vendor in VENDORS if vendor.name == "agilex"]
+FORWARD = (3.0, 2.0)
+STILL = (DriverState.STANDBY, DriverState.READY)
+
+
+@pytest.fixture
+def bench():
+    return AGILEX.bench()
+
+
+def test_a_person_who_takes_the_remote_control_drives_and_that_is_no_fault(bench):
+    bench.arm()
+    bench.run(0.5, FORWARD)
+    bench.robot.controller.base.take_remote_control(0.3, 0.0)
+    bench.run(0.3, FORWARD)
+    assert bench.driver.state in STILL
+    assert "remote control" in bench.driver.detail
+    assert bench.robot.speed == pytest.approx((5.0, 5.0))
+    bench.driver.request(Request.ARM)
+    bench.run(1.0)
+    assert bench.driver.state in STILL
+    assert bench.robot.speed == pytest.approx((5.0, 5.0)), "the person still drives"
+
+
+def test_after_the_person_has_let_go_it_does_not_drive_on(bench):
+    bench.arm()
+    bench.run(0.5, FORWARD)
+    bench.robot.controller.base.take_remote_control(0.3, 0.0)
+    bench.run(0.3, FORWARD)
+    bench.robot.controller.base.control_mode = CAN_MODE
+    bench.run(1.0, FORWARD)
+    assert bench.robot.speed_rad_s == 0.0
+    assert bench.robot.controller.base.control_mode == STANDBY
+
+
+def test_the_buttons_stop_it_and_need_a_reset(bench):
+    bench.arm()
+    bench.run(0.5, FORWARD)
+    bench.robot.press_estop(True)
+    bench.run(0.3, FORWARD)
+    assert bench.driver.state is DriverState.ESTOP
+    assert bench.robot.speed_rad_s == 0.0
+    bench.robot.press_estop(False)
+    bench.run(1.0, FORWARD)
+    assert bench.driver.state is DriverState.FAULT, "releasing the button alone is not enough"
+    assert bench.robot.speed_rad_s == 0.0
+    bench.driver.request(Request.RESET)
+    bench.run_until(*STILL)
+
+
+@pytest.mark.parametrize("warning", [0x0002, 0x0004, 0x0200, 0x0400])
+def test_a_warning_of_the_battery_or_the_remote_control_stops_nothing(bench, warning):
+    bench.arm()
+    bench.robot.controller.base.error_code = warning
+    bench.run(0.5, FORWARD)
+    assert bench.driver.state is DriverState.ARMED
+
+
+@pytest.mark.parametrize("error", [0x0001, 0x0008, 0x0100])
+def test_an_error_in_either_byte_stops_it(bench, error):
+    bench.arm()
+    bench.run(0.5, FORWARD)
+    bench.robot.controller.base.error_code = error
+    bench.run(0.3, FORWARD)
+    assert bench.driver.state is DriverState.FAULT
+    assert f"{error:#06x}" in bench.driver.detail
+    assert bench.robot.speed_rad_s == 0.0
+
+
+def test_turning_on_the_spot_is_a_turn_rate_by_the_nominal_track(bench):
+    bench.arm()
+    bench.run(0.5, (-2.0, 2.0))
+    linear, angular = bench.robot.controller.base.asked_motion
+    assert (linear, angular) == (0, round(1e3 * 0.06 * 4.0 / 0.31))
+    assert bench.robot.speed == pytest.approx((-2.0, 2.0), abs=0.02)
+
+
+def test_more_than_the_base_can_do_is_scaled_and_keeps_its_curve(bench):
+    bench.arm()
+    bench.run(0.3, (50.0, 25.0))
+    left, right = bench.robot.speed
+    assert 0.06 * left == pytest.approx(1.5, abs=0.01)
+    assert left / right == pytest.approx(2.0, abs=0.01)
+
+
+@pytest.mark.parametrize("pause_s", [0.55, 2.0])
+def test_a_host_that_paused_for_longer_than_the_time_out_is_disarmed(bench, pause_s):
+    bench.arm()
+    bench.run(0.5, FORWARD)
+    bench.host_runs = False
+    bench.run(pause_s)
+    bench.host_runs = True
+    bench.run(0.3, FORWARD)
+    assert bench.driver.state is DriverState.FAULT
+    assert bench.robot.speed_rad_s == 0.0
+
+
+def test_it_does_not_arm_while_the_base_moves(bench):
+    bench.run_until(*STILL)
+    bench.robot.stuck, bench.robot.speed = {0, 1}, [4.0, 4.0]
+    bench.run(0.1)
+    bench.driver.request(Request.ARM)
+    bench.run(0.3, FORWARD)
+    assert bench.driver.state in STILL
+    assert "moves" in bench.driver.detail
+    assert not [frame for frame in bench.robot.received if AGILEX.is_motion(frame)]
