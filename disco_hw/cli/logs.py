@@ -68,16 +68,20 @@ log_app = typer.Typer(help="Look into a log, mend it, hand it on.", no_args_is_h
 
 
 def import_log(
-    log: Annotated[Path, typer.Argument(metavar="FILE", help="A CSV file, or a candump of our protocol.")],
+    log: Annotated[Path, typer.Argument(metavar="FILE", help="A CSV, a candump of our protocol, or a bag of ROS.")],
     robot: RobotOption,
     out: Annotated[Path, typer.Option("-o", "--out", help="Where to write the MCAP log.")],
+    topic: Annotated[
+        list[str] | None,
+        typer.Option("--topic", metavar="ROLE=NAME", help="Read commands, wheels or poses of a bag from this topic."),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Write a foreign log as a log of ours, for `infer`, `gap` and Foxglove; `view` and `replay` need one of `run`."""
-    check_named_files(robot, logs=[log])
+    check_named_files(robot, logs=[] if log.is_dir() else [log])
     from disco_hw.log.importing.write import import_log as import_foreign
 
-    result = import_foreign(log, robot, out)
+    result = import_foreign(log, robot, out, topic or ())
     print_result(result.as_dict(), as_json, result.as_text())
 
 

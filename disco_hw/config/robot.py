@@ -155,6 +155,22 @@ class Drive(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     gamepad_silence_s: NonNegative = 2.0
 
 
+class Ros2(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What of a bag is read; what is left out is guessed. `pose_topic` "tf" is the chain from map to base frame.
+
+    `command_joints`: whose the numbers of a Float64MultiArray are, in its order.
+    """
+
+    command_topic: str = ""
+    wheel_topic: str = ""
+    pose_topic: str = ""
+    left_joints: list[str] = []
+    right_joints: list[str] = []
+    command_joints: list[str] = []
+    map_frame: str = ""
+    base_frame: str = ""
+
+
 def _default_task() -> RobotTask:
     from disco_hw.tasks import default_task  # noqa: PLC0415
 
@@ -175,6 +191,7 @@ class RobotConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     log: LogSettings = LogSettings()
     daemon: DaemonSettings = DaemonSettings()
     drive: Drive = Drive()
+    ros2: Ros2 = Ros2()
 
 
 def load_robot_config(path: Path) -> RobotConfig:

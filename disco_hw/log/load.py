@@ -15,6 +15,7 @@ from disco_hw.log.drive import Array, Commands, DriveLog, Gyro, Index, Poses, Wh
 from disco_hw.log.importing.csv_drive import read_csv
 from disco_hw.log.provenance import ROBOT_TOML
 from disco_hw.log.reader import Log, open_log
+from disco_hw.log.rosbag.bag import is_bag
 
 Mask = NDArray[np.bool_]
 
@@ -172,7 +173,10 @@ def _same(path: Path, other: Path) -> bool:
 
 
 def _load(path: Path, ticks_per_rev: float | None, wheel_radius_m: float | None) -> DriveLog:
-    if begin_of(path, LOG, len(MAGIC)) == MAGIC:
+    begin = begin_of(path, LOG, 64)
+    if is_bag(begin):
+        raise LogError(f"{path}: a rosbag; make it a log with `disco-hw import {path} --robot ROBOT.toml -o LOG.mcap`")
+    if begin.startswith(MAGIC):
         with open_log(path) as log:
             return drive_from_log(log)
     return read_csv(path, ticks_per_rev, wheel_radius_m)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
-from disco_hw.config import Robot
+from disco_hw.config import RobotConfig
 from disco_hw.log.drive import DriveLog
 
 LONGEST_BEGIN_BYTES = 64
@@ -19,15 +19,16 @@ LONGEST_BEGIN_BYTES = 64
 class LogFormat:
     """One format: `recognises` says of the first bytes of a file (64 at most) whether it is this one.
 
-    `read` takes path and robot.toml's [robot] and returns the arrays of the drive; it raises LogError with one line
+    `read` takes path and robot.toml and returns the arrays of the drive; it raises LogError with one line
     that names the file, the place and the remedy. Of two formats that recognise a file the one with the lower `order`
-    reads it; one that takes whatever is left comes last.
+    reads it; one that takes whatever is left comes last. `has_topics`: [ros2] and `--topic` say what of it is read.
     """
 
     name: str
     recognises: Callable[[bytes], bool]
-    read: Callable[[Path, Robot], DriveLog]
+    read: Callable[[Path, RobotConfig], DriveLog]
     order: int = 100
+    has_topics: bool = False
 
 
 @cache

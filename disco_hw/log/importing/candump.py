@@ -146,4 +146,6 @@ def _capabilities(robot: Robot) -> Capabilities:
     )
 
 
-FORMAT = LogFormat("candump", lambda begin: begin.startswith(b"("), read_candump, order=10)
+FORMAT = LogFormat(
+    "candump", lambda begin: begin.startswith(b"("), lambda path, config: read_candump(path, config.robot), order=10
+)

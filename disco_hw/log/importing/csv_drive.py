@@ -321,7 +321,10 @@ def _wrapped(yaw: Array) -> Array:
 
 # Last: any text may be meant as a table, and its reader says best what is wrong with it.
 FORMAT = LogFormat(
-    "csv", lambda begin: True, lambda path, robot: read_csv(path, robot.ticks_per_rev, robot.wheel_radius_m), order=1000
+    "csv",
+    lambda begin: True,
+    lambda path, config: read_csv(path, config.robot.ticks_per_rev, config.robot.wheel_radius_m),
+    order=1000,
 )
 
 

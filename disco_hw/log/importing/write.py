@@ -6,14 +6,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from disco_hw.config import load_robot_config
-from disco_hw.errors import LogError
+import msgspec
+
+from disco_hw.config import Ros2, load_robot_config
+from disco_hw.errors import InputError, LogError
 from disco_hw.files import LOG, begin_of
 from disco_hw.files import ROBOT_TOML as ROBOT_FILE
 from disco_hw.log.container import MAGIC
@@ -23,6 +25,7 @@ from disco_hw.log.link import Attachment, End, Start, batch_encoder
 from disco_hw.log.mcap_log import McapLog
 from disco_hw.log.provenance import ROBOT_TOML, attachment, version
 from disco_hw.log.records import Command, Record
+from disco_hw.log.rosbag.bag import METADATA
 from disco_hw.log.writer import LogFile
 from drivers.types import PoseSample, WheelSample
 
@@ -133,24 +136,43 @@ class Imported:
         return "\n".join([written, *(f"note: {note}" for note in self.notes)])
 
 
-def import_log(path: Path, robot: Path, out: Path) -> Imported:
+def import_log(path: Path, robot: Path, out: Path, topics: Sequence[str] = ()) -> Imported:
     """Write a foreign log, of whichever format it is, as an MCAP log of ours.
 
-    robot.toml goes into the log. Raises LogError for what can be no such file, and InputError.
+    robot.toml goes into the log. `topics`, of a bag: ROLE=NAME, ahead of robot.toml's [ros2]. Raises LogError for what
+    can be no such file, and InputError.
     """
     config = load_robot_config(robot)
-    begin = begin_of(path, LOG, LONGEST_BEGIN_BYTES)
-    if begin.startswith(MAGIC):
-        raise LogError(
-            f"{path}: an MCAP log; ours needs no import, and of others none can be imported yet: write a CSV"
-        )
+    begin = begin_of(_telling(path), LOG, LONGEST_BEGIN_BYTES)
     log_format = format_of(begin)
+    if begin.startswith(MAGIC) and (log_format is None or not log_format.has_topics):
+        raise LogError(f"{path}: an MCAP log; ours needs no import, and of others only those of ROS 2 can be imported")
     if log_format is None:
         names = ", ".join(each.name for each in log_formats())
         raise LogError(f"{path}: none of the formats that can be imported ({names}); write a CSV")
-    drive = log_format.read(path, config.robot)
+    if topics and not log_format.has_topics:
+        raise InputError(f"--topic: {path} is a {log_format.name}, which has no topics; leave it out")
+    drive = log_format.read(path, msgspec.structs.replace(config, ros2=_with_topics(config.ros2, topics)))
     records = write_log(drive, out, config.robot.name, (attachment(robot, ROBOT_TOML, ROBOT_FILE),))
     notes = drive.notes
     if drive.gyro.t_s.size:
         notes += (f"{path}: the gyro was left out; a log of ours has none",)
     return Imported(out, records, drive.segments, drive.end_s, notes)
+
+
+def _telling(path: Path) -> Path:
+    """The file that tells the format; a log that is a folder has one that says what it is."""
+    return path / METADATA if path.is_dir() and (path / METADATA).exists() else path
+
+
+def _with_topics(settings: Ros2, topics: Sequence[str]) -> Ros2:
+    fields = {"commands": "command_topic", "wheels": "wheel_topic", "poses": "pose_topic"}
+    given: dict[str, str] = {}
+    for one in topics:
+        role, _, name = one.partition("=")
+        if role not in fields or not name:
+            raise InputError(f"--topic: {one!r} is not ROLE=NAME; write commands=, wheels= or poses= and the topic")
+        if fields[role] in given:
+            raise InputError(f"--topic: {role} is given twice; give it once")
+        given[fields[role]] = name
+    return msgspec.structs.replace(settings, **given)

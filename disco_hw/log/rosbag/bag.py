@@ -1,0 +1,237 @@
+"""A bag of ROS 2 (MCAP, sqlite3) or ROS 1, read through `rosbags`: its topics, and their messages in one pass.
+
+The library is imported when a bag is opened. A bag is foreign bytes: whatever the library makes of damage becomes one
+line, and reading it may take 1.5 GiB of memory and no more.
+"""
+
+from __future__ import annotations
+
+import os
+import resource
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from disco_hw.errors import InputError, LogError
+from disco_hw.files import LOG, FileKind, open_file, read_bytes
+from disco_hw.log.container import MAGIC
+
+METADATA = "metadata.yaml"
+ROS1_MAGIC = b"#ROSBAG V"
+SQLITE_MAGIC = b"SQLite format 3\0"
+METADATA_BEGIN = b"rosbag2_bagfile_information"
+BAG_METADATA = FileKind("the metadata of a bag", 4 * 1024 * 1024, "give the path of a bag's folder or of its file")
+
+_MOST_MEMORY_BYTES = 1536 * 1024 * 1024
+_MOST_UNPACKED_RATIO = 256
+_MOST_TOPICS = 10_000
+_REMEDY = "mend it with `ros2 bag reindex`, `mcap recover` or `rosbag reindex`, or record it again"
+
+
+def is_bag(begin: bytes) -> bool:
+    """Whether a file that begins with these bytes is a bag; of a folder its metadata.yaml is looked at."""
+    if begin.startswith(MAGIC):
+        # Magic, opcode and length of the header, length of the profile, profile.
+        return begin[len(MAGIC) + 13 :].startswith(b"ros2")
+    return begin.startswith((ROS1_MAGIC, SQLITE_MAGIC, METADATA_BEGIN))
+
+
+@dataclass(frozen=True, slots=True)
+class BagTopic:
+    """A topic of a bag: ROS's name of its type, and whether messages of it can be read (`unreadable` says why not)."""
+
+    name: str
+    type: str
+    count: int
+    unreadable: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class BagMessage:
+    """One message, with the time of its recording."""
+
+    topic: str
+    log_ns: int
+    value: Any  # Any: a class that `rosbags` makes of the message's definition.
+
+
+@dataclass(frozen=True)
+class Bag:
+    """An open bag; its messages can be read as often as wanted."""
+
+    path: Path
+    topics: dict[str, BagTopic]
+    start_ns: int
+    end_ns: int
+    _reader: Any
+    _read: Callable[[bytes, str], Any]
+
+    def messages(self, topics: Collection[str], start_ns: int | None = None) -> Iterator[BagMessage]:
+        """Messages of these topics in the order of their recording; raises LogError for one that cannot be read."""
+        wanted = [one for one in self._reader.connections if one.topic in topics and self._is_readable(one)]
+        if not wanted:
+            return
+        with _in_one_line(self.path):
+            found = self._reader.messages(connections=wanted, start=start_ns)
+        while True:
+            with _in_one_line(self.path):
+                one = next(found, None)
+            if one is None:
+                return
+            connection, log_ns, data = one
+            with _in_one_line(self.path, f"a message of {connection.topic} ({connection.msgtype})"):
+                value = self._read(data, connection.msgtype)
+            yield BagMessage(connection.topic, log_ns, value)
+
+    def _is_readable(self, connection: Any) -> bool:  # Any: a connection of the library.
+        topic = self.topics[connection.topic]
+        return not topic.unreadable and topic.type == connection.msgtype
+
+
+@contextmanager
+def open_bag(path: Path) -> Iterator[Bag]:
+    """Open a bag: a folder with its metadata.yaml, or one .mcap, .db3 or .bag; raises LogError and InputError."""
+    try:
+        from rosbags import rosbag1, rosbag2  # noqa: PLC0415
+        from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
+    except ImportError:
+        raise InputError(f"{path}: reading a bag needs rosbags; pip install 'disco-hw[ros2]'") from None
+    path = path.parent if path.name == METADATA else path
+    is_ros1 = _check_files(path)
+    with _bounded_memory():
+        with _in_one_line(path):
+            reader = rosbag1.Reader(path) if is_ros1 else rosbag2.Reader(path)
+            reader.open()
+        try:
+            with _in_one_line(path):
+                # The messages that are used are the same from Humble to Kilted.
+                store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
+                topics = _topics(path, reader, store)
+                start_ns, end_ns = reader.start_time, reader.end_time
+            yield Bag(path, topics, start_ns, end_ns, reader, _decoder(store, is_ros1))
+        finally:
+            reader.close()
+
+
+def _decoder(store: Any, is_ros1: bool) -> Callable[[bytes, str], Any]:
+    read: Callable[[bytes, str], Any] = store.deserialize_ros1 if is_ros1 else store.deserialize_cdr
+    return read
+
+
+def _check_files(path: Path) -> bool:
+    """Refuse what the library would wait for or fill a disk with; return whether it is a bag of ROS 1."""
+    if path.is_dir():
+        _check_folder(path)
+        return False
+    descriptor = open_file(path, LOG)
+    try:
+        begin = os.pread(descriptor, 64, 0)
+    finally:
+        os.close(descriptor)
+    expected = {MAGIC: ".mcap", SQLITE_MAGIC: ".db3", ROS1_MAGIC: ".bag"}
+    suffix = next((suffix for magic, suffix in expected.items() if begin.startswith(magic)), None)
+    if suffix is None:
+        raise LogError(f"{path}: not a bag; give a bag's folder, or its .mcap, .db3 or .bag file")
+    if path.suffix != suffix:
+        raise LogError(f"{path}: its content is that of a {suffix} file; give it a name that ends in {suffix}")
+    return suffix == ".bag"
+
+
+def _check_folder(path: Path) -> None:
+    if not (path / METADATA).exists():
+        inside = sorted(one.name for one in path.glob("*") if one.suffix in {".mcap", ".db3", ".bag"})
+        remedy = f"give {path / inside[0]}" if inside else "give the folder or file of a bag"
+        raise LogError(f"{path}: a folder without {METADATA}, which a bag has when its recording ended; {remedy}")
+    content, _ = read_bytes(path / METADATA, BAG_METADATA)
+    unpacked_whole = b"compression_mode: FILE" in content.upper().replace(b"COMPRESSION_MODE", b"compression_mode")
+    for one in sorted(path.iterdir()):
+        if one.is_dir():
+            continue
+        os.close(open_file(one, LOG))
+        if unpacked_whole and one.suffix in {".zstd", ".zst"}:
+            _check_unpacked(one)
+
+
+def _check_unpacked(path: Path) -> None:
+    """The library unpacks a file that was compressed as a whole onto the disk."""
+    import zstandard  # noqa: PLC0415
+
+    most = min(LOG.most_bytes, _MOST_UNPACKED_RATIO * max(path.stat().st_size, 4096))
+    size = 0
+    with path.open("rb") as file, _in_one_line(path):
+        for block in zstandard.ZstdDecompressor().read_to_iter(file):
+            size += len(block)
+            if size > most:
+                raise LogError(f"{path}: unpacks to over {most // 2**20} MiB; unpack it with `zstd -d` and give that")
+
+
+def _topics(path: Path, reader: Any, store: Any) -> dict[str, BagTopic]:  # Any: the library's classes.
+    if len(reader.connections) > _MOST_TOPICS:
+        raise LogError(f"{path}: {len(reader.connections)} topics, over {_MOST_TOPICS}; record fewer")
+    topics: dict[str, BagTopic] = {}
+    for one in reader.connections:
+        former = topics.get(one.topic)
+        if former is not None and former.type != one.msgtype:
+            # Two publishers of different types: ROS itself lets nobody hear both.
+            continue
+        count = one.msgcount + (former.count if former is not None else 0)
+        topics[one.topic] = BagTopic(one.topic, one.msgtype, count, _define(store, one))
+    return topics
+
+
+def _define(store: Any, connection: Any) -> str:  # Any: the library's classes.
+    """Make a type known that the bag defines itself; why its messages cannot be read, or empty."""
+    from rosbags.interfaces import MessageDefinitionFormat  # noqa: PLC0415
+    from rosbags.typesys import get_types_from_idl, get_types_from_msg  # noqa: PLC0415
+
+    encoding = getattr(connection.ext, "serialization_format", "cdr")
+    if encoding != "cdr":
+        return f"it is encoded as {encoding}, not as CDR"
+    if connection.msgtype in store.fielddefs:
+        return ""
+    definition = connection.msgdef
+    if definition.format == MessageDefinitionFormat.NONE:
+        return f"its type {connection.msgtype} is not of ROS and the bag does not define it"
+    try:
+        if definition.format == MessageDefinitionFormat.MSG:
+            found = get_types_from_msg(definition.data, connection.msgtype)
+        else:
+            found = get_types_from_idl(definition.data)
+        store.register({name: fields for name, fields in found.items() if name not in store.fielddefs})
+    except Exception as error:
+        # Foreign text in the hands of a grammar; a type that nobody needs must not spoil the bag.
+        return f"the bag's definition of {connection.msgtype} cannot be read ({_words(error)})"
+    return "" if connection.msgtype in store.fielddefs else f"the bag does not define its type {connection.msgtype}"
+
+
+@contextmanager
+def _in_one_line(path: Path, what: str = "the bag") -> Iterator[None]:
+    """Whatever the library, and the libraries under it, raise of a foreign file."""
+    try:
+        yield
+    except InputError:
+        raise
+    except MemoryError:
+        most = f"{_MOST_MEMORY_BYTES / 2**30:.1f} GiB"
+        raise LogError(f"{path}: {what} needs over {most} of memory, as sizes in it say; {_REMEDY}") from None
+    except Exception as error:
+        raise LogError(f"{path}: {what} cannot be read ({_words(error)}); {_REMEDY}") from None
+
+
+def _words(error: Exception) -> str:
+    return " ".join(str(error).split())[:200].rstrip(".") or type(error).__name__
+
+
+@contextmanager
+def _bounded_memory() -> Iterator[None]:
+    """Chunks and lists that claim any size they like fail as a MemoryError instead of filling the machine."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+    used = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0]) * resource.getpagesize()
+    limits = [used + _MOST_MEMORY_BYTES, *(one for one in (soft, hard) if one != resource.RLIM_INFINITY)]
+    resource.setrlimit(resource.RLIMIT_AS, (min(limits), hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, (soft, hard))

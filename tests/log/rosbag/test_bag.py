@@ -1,0 +1,232 @@
+"""What is no bag, or a damaged or hostile one: one line that names the file and what to do."""
+
+import os
+import random
+import struct
+import subprocess
+import sys
+
+import msgspec
+import pytest
+
+pytest.importorskip("rosbags", reason="pip install 'disco-hw[ros2]'")
+
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from disco_hw.config import Ros2
+from disco_hw.errors import InputError, LogError
+from disco_hw.log.importing import format_of
+from disco_hw.log.load import load_drive
+from disco_hw.log.rosbag.drive import read_rosbag
+from tests.inference.drives import robot_config
+from tests.inference.test_commands import ROBOT
+from tests.log.rosbag.bags import BEGAN_NS, LEFT, RIGHT, bag, recorded
+
+
+def small(path, storage="mcap"):
+    with bag(path, storage) as maker:
+        for k in range(50):
+            t_ns = BEGAN_NS + k * 20_000_000
+            maker.write("/joint_states", maker.joints(t_ns, LEFT + RIGHT, [0.1 * k] * 4, [5.0] * 4), t_ns)
+    return path
+
+
+def file_of(folder):
+    return next(one for one in folder.iterdir() if one.suffix in {".mcap", ".db3"})
+
+
+def one_line(error):
+    return "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3", "ros1"])
+def test_bags_are_told_by_their_first_bytes(tmp_path, storage):
+    path = small(tmp_path / "b.bag", storage)
+    path = path if storage == "ros1" else file_of(path)
+    assert format_of(path.read_bytes()[:64]).name == "rosbag"
+    assert read_rosbag(path, robot_config()).wheels.t_s.size == 50
+
+
+def test_a_log_of_ours_is_no_bag():
+    assert (
+        format_of(b"\x89MCAP0\r\n\x01\x10" + bytes(7) + struct.pack("<I", 0) + b"\x08\0\0\0disco-hw").name != "rosbag"
+    )
+
+
+def test_what_infer_is_given_as_a_bag_is_to_be_imported_first(tmp_path):
+    with pytest.raises(LogError, match=r"a rosbag; make it a log with `disco-hw import"):
+        load_drive(file_of(small(tmp_path / "b")))
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3", "ros1"])
+@pytest.mark.parametrize("share", [0.01, 0.3, 0.7, 0.99])
+def test_a_truncated_bag_is_one_line(tmp_path, storage, share):
+    path = tmp_path / "b.bag"
+    recorded(path, storage)
+    path = path if storage == "ros1" else file_of(path)
+    os.truncate(path, int(share * path.stat().st_size))
+    with pytest.raises(LogError, match=r"b(\.\w+)+: .*cannot be read .*; mend it with") as error:
+        read_rosbag(path, robot_config())
+    assert one_line(error)
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3", "ros1"])
+def test_a_mutated_bag_is_a_drive_or_one_line(tmp_path, storage):
+    source = small(tmp_path / "b.bag", storage)
+    source = source if storage == "ros1" else file_of(source)
+    whole, rng = source.read_bytes(), random.Random(3)
+    for _ in range(60):
+        spoilt = bytearray(whole)
+        for _ in range(rng.choice((1, 3, 20))):
+            spoilt[rng.randrange(len(spoilt))] = rng.choice((0, 1, 0x7F, 0xFF, rng.randrange(256)))
+        source.write_bytes(spoilt)
+        said = str(source)
+        try:
+            read_rosbag(source, robot_config())
+        except InputError as error:
+            said = str(error)
+        assert "\n" not in said
+        assert str(source) in said
+
+
+@pytest.mark.parametrize("size", [2**31, 2**40, 2**62, 2**64 - 1])
+def test_a_record_that_claims_any_size_is_one_line(tmp_path, size):
+    path = file_of(small(tmp_path / "b"))
+    spoilt = bytearray(path.read_bytes())
+    # The first record after the header: its opcode, then its length.
+    header = struct.unpack_from("<Q", spoilt, 9)[0]
+    struct.pack_into("<Q", spoilt, 17 + header + 1, size)
+    # Without the index at the end the file is read through.
+    struct.pack_into("<Q", spoilt, len(spoilt) - 28, 0)
+    path.write_bytes(spoilt)
+    with pytest.raises(LogError) as error:
+        read_rosbag(path, robot_config())
+    assert one_line(error)
+
+
+def test_a_message_that_claims_a_list_of_any_size_is_one_line(tmp_path):
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    with Writer(tmp_path / "b", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        connection = writer.add_connection("/joint_states", "sensor_msgs/msg/JointState", typestore=store)
+        for size in (2**31 - 1, 2**32 - 1):
+            raw = b"\0\1\0\0" + struct.pack("<iII", 1, 0, 1) + b"\0\0\0\0" + struct.pack("<I", size)
+            writer.write(connection, BEGAN_NS, raw)
+    with pytest.raises(LogError, match=r"a message of /joint_states .* cannot be read|needs over") as error:
+        read_rosbag(tmp_path / "b", robot_config())
+    assert one_line(error)
+
+
+def test_a_chunk_that_unpacks_to_more_than_memory_is_one_line(tmp_path):
+    """3 GiB of zeros in 100 kB: in a process of its own, as what it takes must not stay."""
+    import zstandard
+
+    compressor = zstandard.ZstdCompressor(level=1).compressobj(size=3 * 2**30)
+    packed = b"".join(compressor.compress(bytes(2**24)) for _ in range(192)) + compressor.flush()
+    chunk = struct.pack("<QQQI", 0, 2**62, 3 * 2**30, 0) + struct.pack("<I", 4) + b"zstd"
+    chunk += struct.pack("<Q", len(packed)) + packed
+    magic, profile = b"\x89MCAP0\r\n", struct.pack("<I", 4) + b"ros2" + struct.pack("<I", 0)
+    records = [(1, profile), (6, chunk), (2, bytes(20))]
+    bomb = tmp_path / "bomb.mcap"
+    bomb.write_bytes(magic + b"".join(struct.pack("<BQ", op, len(data)) + data for op, data in records) + magic)
+    robot = tmp_path / "robot.toml"
+    robot.write_text(ROBOT)
+    command = [sys.executable, "-m", "disco_hw", "import", str(bomb), "--robot", str(robot), "-o", str(tmp_path / "o")]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=200)
+    assert done.returncode == 2, done.stderr
+    assert "bomb.mcap" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_a_bag_without_a_usable_topic_says_what_it_has(tmp_path):
+    with bag(tmp_path / "b") as maker:
+        maker.write("/twist_of_fate", maker.twist(0.0, 0.0), BEGAN_NS)
+    with pytest.raises(
+        LogError, match=r"/b: no topic with commands, wheels or poses; it has /twist_of_fate \(geometry"
+    ):
+        read_rosbag(tmp_path / "b", robot_config())
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"wheel_topic": "/joints"}, r"wheels: no topic /joints; it has /joint_states"),
+        (
+            {"pose_topic": "/joint_states"},
+            r"poses: /joint_states is of type sensor_msgs/msg/JointState, which holds no",
+        ),
+        ({"pose_topic": "tf"}, r"no transforms lead from map or .*; set ros2.map_frame"),
+    ],
+)
+def test_a_topic_that_is_not_there_is_named(tmp_path, settings, message):
+    with pytest.raises(LogError, match=message) as error:
+        read_rosbag(small(tmp_path / "b"), msgspec.structs.replace(robot_config(), ros2=Ros2(**settings)))
+    assert one_line(error)
+
+
+def custom(path, storage, definition="float32[2] drivers"):
+    """A bag with a message type that ROS itself has not."""
+    small_types = get_types_from_msg(definition, "my_msgs/msg/Drive")
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    store.register(small_types)
+    with Writer(path, version=8, storage_plugin=storage) as writer:
+        connection = writer.add_connection("/cmd_drive", "my_msgs/msg/Drive", typestore=store)
+        message = store.types["my_msgs/msg/Drive"]
+        for k in range(20):
+            import numpy as np
+
+            value = message(np.array([2.0, 5.0], dtype=np.float32))
+            writer.write(connection, BEGAN_NS + k * 20_000_000, store.serialize_cdr(value, "my_msgs/msg/Drive"))
+    return path
+
+
+@pytest.mark.parametrize("storage", [StoragePlugin.MCAP, StoragePlugin.SQLITE3])
+def test_a_type_that_the_bag_defines_is_read(tmp_path, storage):
+    drive = read_rosbag(custom(tmp_path / "b", storage), robot_config())
+    assert drive.commands.left_rad_s[0] == 2.0
+    assert drive.commands.right_rad_s[0] == 5.0
+
+
+def test_a_type_that_nobody_knows_is_named(tmp_path):
+    import apsw
+
+    folder = custom(tmp_path / "b", StoragePlugin.SQLITE3)
+    with apsw.Connection(str(file_of(folder))) as database:
+        database.execute("DELETE FROM message_definitions")
+    with pytest.raises(LogError, match=r"/cmd_drive: its type my_msgs/msg/Drive is not of ROS and the bag does not"):
+        read_rosbag(folder, msgspec.structs.replace(robot_config(), ros2=Ros2(command_topic="/cmd_drive")))
+
+
+def test_a_folder_without_its_metadata_names_the_file_to_give(tmp_path):
+    folder = small(tmp_path / "b")
+    (folder / "metadata.yaml").unlink()
+    with pytest.raises(LogError, match=r"a folder without metadata.yaml.*; give .*b\.mcap"):
+        read_rosbag(folder, robot_config())
+
+
+def test_a_pipe_in_a_bags_folder_holds_nobody_up(tmp_path):
+    folder = small(tmp_path / "b")
+    path = file_of(folder)
+    path.unlink()
+    os.mkfifo(path)
+    with pytest.raises(InputError, match="a pipe, not a plain file"):
+        read_rosbag(folder, robot_config())
+
+
+def test_a_command_on_what_is_no_bag_exits_with_two(tmp_path):
+    robot = tmp_path / "robot.toml"
+    robot.write_text(ROBOT)
+    for name, content in (("a.db3", b"SQLite format 3\0rubbish"), ("a.mcap", b"\x89MCAP0\r\n\x01"), ("d", None)):
+        path = tmp_path / name
+        path.mkdir() if content is None else path.write_bytes(content)
+        command = [sys.executable, "-m", "disco_hw", "import", str(path), "--robot", str(robot), "-o", "o.mcap"]
+        done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
+        assert done.returncode == 2
+        assert str(path) in done.stderr.replace("\n", "")
+        assert "Traceback" not in done.stderr
+
+
+def test_the_library_is_loaded_only_when_a_bag_is_read():
+    code = "import sys, disco_hw.log.importing.write as w; w.log_formats(); print('rosbags' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"

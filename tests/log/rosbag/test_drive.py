@@ -1,0 +1,258 @@
+"""Bags of a robot with four wheels and two SLAMs against the drive that they were made of."""
+
+import json
+import math
+import subprocess
+import sys
+
+import msgspec
+import numpy as np
+import pytest
+
+pytest.importorskip("rosbags", reason="pip install 'disco-hw[ros2]'")
+
+from rosbags.typesys import Stores
+
+from disco_hw.config import Ros2
+from disco_hw.errors import LogError
+from disco_hw.log.importing.write import import_log
+from disco_hw.log.load import load_drive
+from disco_hw.log.rosbag.drive import read_rosbag
+from tests.inference.drives import robot_config
+from tests.inference.test_commands import ROBOT
+from tests.log.rosbag.bags import BEGAN_NS, LATENCY_NS, LEFT, RIGHT, bag, recorded
+
+
+@pytest.fixture
+def robot(tmp_path):
+    path = tmp_path / "robot.toml"
+    path.write_text(ROBOT)
+    return path
+
+
+def config(**settings):
+    return msgspec.structs.replace(robot_config(), ros2=Ros2(**settings))
+
+
+def place(tmp_path, storage="mcap"):
+    return tmp_path / ("run.bag" if storage == "ros1" else "run")
+
+
+def said(drive, words):
+    return any(words in note for note in drive.notes)
+
+
+def chosen(drive):
+    """The rows of the table that are read: role, topic."""
+    return [tuple(line.split()[1:3]) for line in drive.notes[0].splitlines() if line.startswith("*")]
+
+
+def assert_same_wheels(drive, truth):
+    np.testing.assert_allclose(np.diff(drive.wheels.t_s), np.diff(truth.wheels.t_s), atol=1e-6)
+    np.testing.assert_allclose(drive.wheels.left_angle_rad, truth.wheels.left_angle_rad, atol=1e-9)
+    np.testing.assert_allclose(drive.wheels.right_speed_rad_s, truth.wheels.right_speed_rad_s, atol=1e-9)
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3", "ros1"])
+def test_four_wheels_commands_and_the_chain_of_frames_are_read(tmp_path, storage):
+    truth = recorded(place(tmp_path, storage), storage)
+    drive = read_rosbag(place(tmp_path, storage), robot_config())
+    assert chosen(drive) == [("commands", "/cmd_vel"), ("wheels", "/joint_states"), ("poses", "tf")]
+    assert_same_wheels(drive, truth)
+    given = np.isfinite(drive.commands.left_rad_s)
+    known = np.isfinite(truth.commands.left_rad_s)
+    np.testing.assert_allclose(drive.commands.left_rad_s[given], truth.commands.left_rad_s[known], atol=1e-9)
+    np.testing.assert_allclose(drive.commands.right_rad_s[given], truth.commands.right_rad_s[known], atol=1e-9)
+    at = np.searchsorted(truth.poses.t_s, drive.poses.t_s - LATENCY_NS * 1e-9 - 1e-6)
+    assert drive.poses.t_s.size >= truth.poses.t_s.size - 2
+    np.testing.assert_allclose(drive.poses.x_m, truth.poses.x_m[at], atol=5e-3)
+    np.testing.assert_allclose(np.unwrap(drive.poses.yaw_rad), np.unwrap(truth.poses.yaw_rad)[at], atol=2e-2)
+    assert drive.segments == 1
+
+
+@pytest.mark.parametrize("distro", [Stores.ROS2_HUMBLE, Stores.ROS2_JAZZY, Stores.ROS2_KILTED])
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_bags_of_all_releases_are_read(tmp_path, distro, storage):
+    truth = recorded(place(tmp_path), storage, distro)
+    assert_same_wheels(read_rosbag(place(tmp_path), robot_config()), truth)
+
+
+def test_every_topic_is_in_the_table_with_the_reason(tmp_path):
+    recorded(place(tmp_path))
+    table = read_rosbag(place(tmp_path), robot_config()).notes[0]
+    assert "left: front_left_wheel_joint, rear_left_wheel_joint; right: front_right_wheel_joint" in table
+    assert "map - odom - base_footprint - base_link" in table
+    assert "/rtabmap/odom" in table
+    assert "by frame and name the odometry of the wheels" in table
+    assert "/goal_pose" in table
+    assert "not where the robot is" in table
+    assert "camera" not in table
+
+
+def test_a_topic_that_is_asked_for_is_taken_instead(tmp_path):
+    truth = recorded(place(tmp_path))
+    drive = read_rosbag(place(tmp_path), config(pose_topic="/rtabmap/odom", wheel_topic="/odom"))
+    assert chosen(drive)[1:] == [("wheels", "/odom"), ("poses", "/rtabmap/odom")]
+    np.testing.assert_allclose(drive.poses.x_m, truth.poses.x_m, atol=1e-12)
+    np.testing.assert_allclose(drive.poses.t_s - drive.wheels.t_s[0], truth.poses.t_s - truth.wheels.t_s[0], atol=1e-6)
+    np.testing.assert_allclose(drive.wheels.left_speed_rad_s, truth.wheels.left_speed_rad_s, atol=1e-9)
+    assert not drive.wheels.angle_measured
+    assert said(drive, "has been through the robot's own kinematics")
+
+
+def test_without_joint_states_the_odometry_serves_and_that_is_said(tmp_path):
+    truth = recorded(place(tmp_path), leave=("/joint_states",))
+    drive = read_rosbag(place(tmp_path), robot_config())
+    assert ("wheels", "/odom") in chosen(drive)
+    np.testing.assert_allclose(drive.wheels.right_speed_rad_s, truth.wheels.right_speed_rad_s, atol=1e-9)
+    assert said(drive, "record /joint_states")
+
+
+def test_odometry_of_the_wheels_is_never_taken_for_a_measured_pose(tmp_path):
+    recorded(place(tmp_path), leave=("/rtabmap/odom", "/amcl_pose", "/tf"))
+    drive = read_rosbag(place(tmp_path), robot_config())
+    assert not drive.poses.t_s.size
+    assert said(drive, "no topic holds poses that were not made from the wheels")
+
+
+def test_names_of_joints_and_frames_that_nobody_guesses_can_be_set(tmp_path):
+    with bag(place(tmp_path)) as maker:
+        for k in range(100):
+            t_ns = BEGAN_NS + k * 20_000_000
+            maker.write("/joints", maker.joints(t_ns, ("a", "b"), (0.1 * k, 0.2 * k), (5.0, 10.0)), t_ns)
+            maker.write("/tf", maker.transforms(t_ns, ("hall", "rover", 0.006 * k, 0.0, 0.0, 0.0)), t_ns)
+    with pytest.raises(LogError, match="no topic with commands, wheels or poses"):
+        read_rosbag(place(tmp_path), robot_config())
+    names = {"left_joints": ["a"], "right_joints": ["b"], "map_frame": "hall", "base_frame": "rover"}
+    drive = read_rosbag(place(tmp_path), config(**names))
+    assert drive.wheels.right_angle_rad[-1] == pytest.approx(19.8)
+    assert drive.poses.x_m[-1] == pytest.approx(0.594)
+
+
+def test_a_gap_in_the_recording_starts_a_new_segment(tmp_path):
+    recorded(place(tmp_path), cut_s=(4.0, 7.0))
+    drive = read_rosbag(place(tmp_path), robot_config())
+    assert drive.segments == 2
+    assert np.diff(drive.wheels.t_s).max() == pytest.approx(3.0, abs=0.05)
+    # What was commanded last holds for half a second, as the controllers of ROS have it.
+    assert np.isnan(drive.commands.left_rad_s[np.searchsorted(drive.commands.t_s, 5.0) - 1])
+
+
+@pytest.mark.parametrize("by_s", [-30.0, 30.0])
+def test_a_clock_that_is_set_is_said_and_taken_out(tmp_path, by_s):
+    truth = recorded(place(tmp_path), clock=lambda t_s: by_s if t_s > 5.0 else 0.0)
+    drive = read_rosbag(place(tmp_path), robot_config())
+    assert said(drive, f"the clock of the stamps was set {'back' if by_s < 0 else 'ahead'} by 30 s")
+    assert_same_wheels(drive, truth)
+    assert drive.segments == 2
+    assert drive.poses.t_s[-1] == pytest.approx(drive.wheels.t_s[-1], abs=0.2)
+
+
+def test_a_simulated_clock_is_said_and_unstamped_commands_are_carried_over(tmp_path):
+    """A simulation at half the speed of time, whose clock began at 100 s."""
+    start_s = 100.0 - BEGAN_NS * 1e-9
+    truth = recorded(place(tmp_path), clock=lambda t_s: start_s - 0.5 * t_s)
+    drive = read_rosbag(place(tmp_path), robot_config())
+    assert said(drive, "a simulated clock, or one that was not set")
+    np.testing.assert_allclose(np.diff(drive.wheels.t_s), 0.5 * np.diff(truth.wheels.t_s), atol=1e-6)
+    given = drive.commands.t_s[np.isfinite(drive.commands.left_rad_s)]
+    wanted = 0.5 * (truth.commands.t_s[np.isfinite(truth.commands.left_rad_s)])
+    np.testing.assert_allclose(given - given[0], wanted - wanted[0], atol=2e-3)
+
+
+def test_messages_without_a_stamp_have_the_time_of_recording_and_that_is_said(tmp_path):
+    with bag(place(tmp_path)) as maker:
+        for k in range(200):
+            t_ns = BEGAN_NS + k * 20_000_000
+            stamp = 0 if k % 10 == 0 else t_ns
+            maker.write("/joint_states", maker.joints(stamp, LEFT + RIGHT, [0.1 * k] * 4, [5.0] * 4), t_ns)
+    drive = read_rosbag(place(tmp_path), robot_config())
+    assert said(drive, "20 of 200 messages have no stamp")
+    np.testing.assert_allclose(np.diff(drive.wheels.t_s), 0.02, atol=1e-6)
+
+
+def test_the_stamp_counts_not_the_recording(tmp_path):
+    """Messages that the network held up for a while and then let go at once."""
+    with bag(place(tmp_path)) as maker:
+        for k in range(200):
+            t_ns = BEGAN_NS + k * 20_000_000
+            held = BEGAN_NS + 120 * 20_000_000 if 80 <= k < 120 else t_ns
+            maker.write("/joint_states", maker.joints(t_ns, LEFT + RIGHT, [0.1 * k] * 4, [5.0] * 4), held + k)
+    drive = read_rosbag(place(tmp_path), robot_config())
+    np.testing.assert_allclose(np.diff(drive.wheels.t_s), 0.02, atol=1e-6)
+    assert drive.segments == 1
+
+
+def test_what_is_not_finite_is_left_out_and_counted(tmp_path):
+    with bag(place(tmp_path)) as maker:
+        for k in range(50):
+            t_ns = BEGAN_NS + k * 20_000_000
+            angle = math.nan if k == 7 else 0.1 * k
+            x = math.inf if k in {3, 4} else 0.0
+            maker.write("/joint_states", maker.joints(t_ns, LEFT + RIGHT, [angle] * 4, [5.0] * 4), t_ns)
+            maker.write("/slam/pose", maker.pose_stamped(t_ns, "map", x, 0.0, 0.0), t_ns)
+    drive = read_rosbag(place(tmp_path), robot_config())
+    assert (drive.wheels.t_s.size, drive.poses.t_s.size) == (49, 48)
+    assert said(drive, "poses, /slam/pose: 2 messages hold no finite value")
+    assert said(drive, "wheels: 1 messages lack a position or velocity")
+
+
+def test_positions_within_one_turn_are_made_continuous(tmp_path):
+    with bag(place(tmp_path)) as maker:
+        for k in range(200):
+            t_ns = BEGAN_NS + k * 20_000_000
+            angle = (0.1 * k + math.pi) % (2 * math.pi) - math.pi
+            maker.write("/joint_states", maker.joints(t_ns, LEFT + RIGHT, [angle] * 4, []), t_ns)
+    drive = read_rosbag(place(tmp_path), robot_config())
+    assert drive.wheels.left_angle_rad[-1] == pytest.approx(19.9)
+    np.testing.assert_allclose(drive.wheels.left_speed_rad_s[1:], 5.0, atol=1e-3)
+    assert not drive.wheels.speed_measured
+    assert said(drive, "stay within one turn")
+
+
+@pytest.mark.parametrize(
+    ("topic", "make"),
+    [
+        ("/wheel_cmds", lambda m, t: m.joints(t, LEFT + RIGHT, [], [1.0, 3.0, 4.0, 6.0])),
+        ("/base_controller/cmd_vel_out", lambda m, t: m.twist_stamped(t, 0.055 * 3.5, 0.055 * 3.0 / 0.4)),
+        ("/velocity_controller/commands", lambda m, t: array(m, [2.0, 5.0])),
+    ],
+)
+def test_the_controllers_own_commands_come_before_cmd_vel(tmp_path, topic, make):
+    with bag(place(tmp_path)) as maker:
+        for k in range(50):
+            t_ns = BEGAN_NS + k * 20_000_000
+            maker.write("/joint_states", maker.joints(t_ns, LEFT + RIGHT, [0.1 * k] * 4, [5.0] * 4), t_ns)
+            maker.write("/cmd_vel", maker.twist(0.0, 9.0), t_ns)
+            maker.write(topic, make(maker, t_ns), t_ns)
+    drive = read_rosbag(place(tmp_path), robot_config())
+    assert chosen(drive)[0] == ("commands", topic)
+    np.testing.assert_allclose(drive.commands.left_rad_s[:-1], 2.0)
+    np.testing.assert_allclose(drive.commands.right_rad_s[:-1], 5.0)
+
+
+def array(maker, values):
+    layout = maker.make("std_msgs/msg/MultiArrayLayout", [], 0)
+    return maker.make("std_msgs/msg/Float64MultiArray", layout, np.array(values))
+
+
+def test_the_command_imports_a_folder_and_infer_reads_it_as_any_log(robot, tmp_path):
+    truth = recorded(place(tmp_path))
+    out = tmp_path / "log.mcap"
+    command = [sys.executable, "-m", "disco_hw", "import", str(place(tmp_path)), "--robot", str(robot)]
+    command += ["-o", str(out), "--topic", "poses=/rtabmap/odom"]
+    done = subprocess.run([*command, "--json"], capture_output=True, text=True, check=True)
+    assert "*  poses     /rtabmap/odom" in json.loads(done.stdout)["notes"][0]
+    np.testing.assert_allclose(load_drive(out).poses.x_m, truth.poses.x_m, atol=1e-12)
+
+
+def test_no_topics_are_taken_for_what_has_none(robot, tmp_path):
+    (tmp_path / "a.csv").write_text("t_s\n")
+    with pytest.raises(Exception, match=r"--topic: .*a.csv is a csv, which has no topics"):
+        import_log(tmp_path / "a.csv", robot, tmp_path / "log.mcap", ["poses=/pose"])
+
+
+@pytest.mark.parametrize("topic", ["poses", "poses=", "pose=/x"])
+def test_a_topic_that_is_no_role_and_name_is_refused(robot, tmp_path, topic):
+    with pytest.raises(Exception, match="is not ROLE=NAME"):
+        recorded(place(tmp_path)) and import_log(place(tmp_path), robot, tmp_path / "log.mcap", [topic])
