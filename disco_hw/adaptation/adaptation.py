@@ -233,7 +233,7 @@ class CheckedAdaptation:
                 outcome, text = Outcome.REFUSED, f"the planner cannot take it: {error}"
             else:
                 self._tell(now_ns, verdict.belief, adapted=True)
-                found.append(_change(now_ns, "adapted", verdict.belief, text))
+                found.append(change_record(now_ns, "adapted", verdict.belief, text))
         self._counts[outcome.value] += 1
         if outcome in (Outcome.PUBLISHED, Outcome.CONFIRMING):
             events.append(f"adapt: {text}")
@@ -250,7 +250,7 @@ class CheckedAdaptation:
             self._counts["reverted"] += 1
             self._guard.restore()
             self._put_in_force(None)
-            found.append(_change(now_ns, "model", None, why))
+            found.append(change_record(now_ns, "model", None, why))
         found.append(records.Adaptation(now_ns, "reverted", f"the model file's belief is in force: {why}"))
         events.append(f"adapt: back to the model file's belief, as {why}")
         self._tell(now_ns, self._model, adapted=False, relearn=True)
@@ -279,7 +279,8 @@ class CheckedAdaptation:
         self._quiet = quiet
 
 
-def _change(now_ns: int, source: str, geometry: Geometry | None, why: str) -> records.Record:
+def change_record(now_ns: int, source: str, geometry: Geometry | None, why: str) -> records.Record:
+    """The record of a belief that goes into force; None is the model file's."""
     if geometry is None:
         return records.BeliefChange(now_ns, source, reason=why)
     mean, covariance = tuple(geometry.mean.tolist()), tuple(geometry.covariance.ravel().tolist())

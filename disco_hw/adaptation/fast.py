@@ -1,0 +1,144 @@
+"""Adaptation by the filter in the daemon's own thread: the geometry learnt from wheels and poses, twice a second.
+
+The filter takes a fraction of a millisecond for a pose, so that no process is needed; what goes into force is recorded
+in the same tick, and a replay reads it from the log.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from disco_hw.adaptation.adaptation import Learnt, change_record
+from disco_hw.adaptation.geometry_filter import GeometryFilter
+from disco_hw.adaptation.guard import Geometry
+from disco_hw.adaptation.link import NAMES
+from disco_hw.log import records
+from drivers.types import Readings
+
+PERIOD_S = 0.5
+NEWS_STD, NEWS_WIDTH = 0.1, 0.97
+"""A belief goes into force when its mean has moved by so many standard deviations, or its width by this factor."""
+LEAST_POSES = 10
+"""Poses taken before the first belief goes into force."""
+# The filter's order is wheel radius, axial distance, x_icr; that of NAMES begins with x_icr.
+_TO_NAMES, _FROM_NAMES = [2, 0, 1], [1, 2, 0]
+
+
+class FastAdaptation:
+    """Learns from `model`, within `low` and `high` (order of NAMES).
+
+    `put_in_force` makes planner and estimator use a geometry, None for the model file's; it raises ValueError for one
+    that they cannot take.
+    """
+
+    def __init__(
+        self, model: Geometry, low: np.ndarray, high: np.ndarray, put_in_force: Callable[[Geometry | None], None]
+    ) -> None:
+        self._model, self._in_force, self._put_in_force = model, model, put_in_force
+        order = np.ix_(_FROM_NAMES, _FROM_NAMES)
+        self._filter = GeometryFilter(
+            model.mean[_FROM_NAMES], model.covariance[order], low[_FROM_NAMES], high[_FROM_NAMES]
+        )
+        self._next_ns: int | None = None
+        self._poses = self._changes = self._carried = 0
+        self._adapted = self._paused = False
+        self._asked: str | None = None
+        self._text = "nothing driven yet"
+        self._counts = dict.fromkeys(("published", "refused", "reverted", "changes", "carried"), 0)
+
+    def step(self, now_ns: int) -> Learnt:
+        """Put in force what was learnt, twice a second."""
+        asked, self._asked = self._asked, None
+        if asked == "revert":
+            return self._revert(now_ns)
+        if asked == "adapt" and self._paused:
+            self._paused = False
+            self._filter.reset()
+            return Learnt(events=("adapt: learning again",))
+        if self._next_ns is None or now_ns < self._next_ns or self._paused:
+            self._next_ns = now_ns if self._next_ns is None else self._next_ns
+            return Learnt()
+        self._next_ns = now_ns + round(PERIOD_S * 1e9)
+        events = self._told()
+        filtered = self._filter
+        moved = filtered.poses > max(self._poses, LEAST_POSES)
+        self._poses = filtered.poses
+        geometry = Geometry(filtered.mean[_TO_NAMES], filtered.covariance[np.ix_(_TO_NAMES, _TO_NAMES)])
+        if not moved or not self._is_news(geometry):
+            return Learnt(events=events)
+        try:
+            self._put_in_force(geometry)
+        except ValueError as error:
+            self._counts["refused"] += 1
+            self._text = f"the planner cannot take it: {error}"
+            return Learnt((records.Adaptation(now_ns, "refused", self._text),), events)
+        self._in_force, self._adapted = geometry, True
+        self._counts["published"] += 1
+        self._text = f"learnt from {filtered.poses} poses"
+        return Learnt((change_record(now_ns, "adapted", geometry, self._text),), events)
+
+    def feed(self, now_ns: int, readings: Readings) -> None:
+        """Hand on what the tick received."""
+        self._filter.add(readings.wheels, readings.poses)
+
+    def ask(self, action: str) -> tuple[bool, str]:
+        """Obey at the next step."""
+        self._asked = action
+        if action == "revert":
+            return True, "back to the model file's belief; `ctl adapt` learns again"
+        return True, "learning" if self._paused else "was learning already"
+
+    def tend(self) -> None:
+        """Nothing runs beside the tick."""
+
+    def status(self) -> dict[str, Any]:
+        """What is in force and how learning goes."""
+        return {
+            "belief": "adapted" if self._adapted else "model",
+            "paused": self._paused,
+            "silent": False,
+            "text": self._text,
+            "mean": dict(zip(NAMES, self._in_force.mean.tolist(), strict=True)),
+            "std": dict(zip(NAMES, self._in_force.std.tolist(), strict=True)),
+            "covariance": self._in_force.covariance.ravel().tolist(),
+            "misfit": self._filter.misfit,
+            **self._counts,
+        }
+
+    def counts(self) -> dict[str, int]:
+        """Counters for the log."""
+        return dict(self._counts)
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+    def _is_news(self, geometry: Geometry) -> bool:
+        old = self._in_force
+        width = geometry.std / old.std
+        moved = np.abs(geometry.mean - old.mean) > NEWS_STD * np.minimum(geometry.std, old.std)
+        return bool(moved.any() or (width < NEWS_WIDTH).any() or (width > 1.0 / NEWS_WIDTH).any())
+
+    def _told(self) -> tuple[str, ...]:
+        """Sentences on what the filter noticed since the last time."""
+        found = []
+        if self._filter.changes > self._changes:
+            found.append("adapt: the robot drives otherwise than learnt; learning anew")
+        if self._filter.carried > self._carried:
+            found.append("adapt: the robot was carried")
+        self._changes, self._carried = self._filter.changes, self._filter.carried
+        self._counts["changes"], self._counts["carried"] = self._changes, self._carried
+        return tuple(found)
+
+    def _revert(self, now_ns: int) -> Learnt:
+        self._paused = True
+        found: list[records.Record] = []
+        if self._adapted:
+            self._adapted, self._in_force = False, self._model
+            self._counts["reverted"] += 1
+            self._put_in_force(None)
+            found.append(change_record(now_ns, "model", None, "asked for"))
+        found.append(records.Adaptation(now_ns, "reverted", "the model file's belief is in force: asked for"))
+        return Learnt(tuple(found), ("adapt: back to the model file's belief, as asked for",))
