@@ -99,9 +99,10 @@ class Control(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     rate_hz: Annotated[float, Meta(ge=20.0, le=100.0)] = 50.0
     mode: Literal["default", "paper"] = "default"
     uncertainty: Literal["ut", "mc", "joint", "point"] = "ut"
+    adaptation: Literal["off", "fast"] = "off"
     samples: Annotated[int, Meta(ge=8, le=1_000_000)] = 400
-    horizon: Annotated[int, Meta(ge=2, le=500)] = 50
-    step_s: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.1
+    horizon: Annotated[int, Meta(ge=2, le=500)] | None = None
+    step_s: Annotated[float, Meta(gt=0.0, le=1.0)] | None = None
     seed: Annotated[int, Meta(ge=0, le=2**63 - 1)] = 1
     command_valid_for_s: Annotated[float, Meta(ge=0.02, le=0.1)] = 0.1
     plan_tail_s: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.2

@@ -25,7 +25,7 @@ from disco_hw.effects.effect import Channel
 from disco_hw.effects.registry import DELAY
 from disco_hw.model import Belief, Model
 from disco_hw.model.free_run import FreeRun
-from disco_hw.model.model import BASE_PARAMETERS, coefficient_tables
+from disco_hw.model.model import BASE_PARAMETERS, X_ICR, coefficient_tables
 from disco_hw.model.step import integration_series
 from disco_hw.tasks import PlannedTask
 
@@ -102,6 +102,7 @@ class Disco:
         self._model = model
         self._mean_theta = mean_point(model)
         self._mean = FreeRun(model, self._mean_theta, step_s)
+        self._x_icr_m = float(self._mean_theta[0, model.parameter_names.index(X_ICR.name)])
         self._points = FreeRun(model, theta, step_s)
         late = [f"{s.name}.{s.effect.late_by}" for s in model.effects if s.effect.late_by is not None]
         self._response_s = sum(self._value(self._mean_theta, name) for name in late)
@@ -303,8 +304,9 @@ class Disco:
     def _system(self, state: PlannerState, start: Array, t0_ns: int, task_s: float, elapsed_s: float) -> SkidSteer:
         x, y, yaw, left, right = start.tolist()
         task, (origin_x, origin_y), begin, self._memory = self._task.prepare(
-            task_s, x, y, yaw, self._memory, self._settings.step_s, self._settings.sampler.horizon
-        )
+            task_s, x, y, yaw, self._memory, self._settings.step_s, self._settings.sampler.horizon,
+            self._x_icr_m,
+        )  # fmt: skip
         direction = (math.cos(yaw), math.sin(yaw)) if math.isfinite(yaw) else (math.nan, math.nan)
         self._start[:] = (x - origin_x, y - origin_y, *direction, left, right, elapsed_s, begin)
         if self._history:

@@ -53,6 +53,7 @@ class Optimiser:
             sampler.beyond_end == "hold",
             sampler.update_from == "drawn",
             sampler.noise_std,
+            sampler.wide,
             sampler.temperature or 0.0,
             sampler.target_ess,
             sampler.control_cost_weight / sampler.noise_std**2,

@@ -13,6 +13,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from disco_hw.adaptation.adaptation import GeometryAdaptation
 from disco_hw.adaptation.guard import check_adaptable
 from disco_hw.adaptation.link import ProcessLink
 from disco_hw.config import RobotConfig
@@ -39,7 +40,14 @@ from disco_hw.log.link import Attachment
 from disco_hw.log.provenance import DBC, version
 from disco_hw.log.recorder import NullRecorder, ProcessRecorder, Recorder, RecordingSettings
 from disco_hw.runtime import records_of_tick
-from disco_hw.runtime.assembly import assemble_core, make_adaptation, make_link, make_pipeline, make_planner
+from disco_hw.runtime.assembly import (
+    assemble_core,
+    make_adaptation,
+    make_fast_adaptation,
+    make_link,
+    make_pipeline,
+    make_planner,
+)
 from disco_hw.runtime.core import CoreTick, DaemonCore
 from disco_hw.runtime.pilot import Pilot, TaskPilot
 from disco_hw.runtime.pipeline import NoPlanner, Pipeline, Planner
@@ -155,7 +163,9 @@ def _start(
     if ask is not None and log is not None:
         stop.add("log", lambda: say("log", f"look at it: disco-hw view {log}, or disco-hw log info {log}"))
     stop.add("recorder", lambda: _close_recorder(recorder, say))
-    adaptation = make_adaptation(setup, pipeline, ProcessLink()) if adapt else None
+    adaptation: GeometryAdaptation | None = make_fast_adaptation(setup, pipeline)
+    if adapt:
+        adaptation = make_adaptation(setup, pipeline, ProcessLink())
     if adaptation is not None:
         stop.add("adapter", adaptation.close)
     for step in realtime.enter(config.daemon.realtime_priority):

@@ -15,7 +15,7 @@ from disco_hw.log.link import Attachment
 from disco_hw.log.provenance import MODEL_TOML
 from disco_hw.log.recorder import MemoryRecorder, ProcessRecorder, RecordingSettings
 from disco_hw.model.file import model_text
-from disco_hw.runtime.assembly import assemble_core, make_adaptation, make_pipeline
+from disco_hw.runtime.assembly import assemble_core, make_adaptation, make_fast_adaptation, make_pipeline
 from disco_hw.runtime.core import CoreTick, DaemonCore
 from disco_hw.runtime.pilot import Pilot, TaskPilot
 from disco_hw.runtime.pipeline import Planner
@@ -83,7 +83,9 @@ class SimulatedRun:
             pipeline,
             self.recorder,
             self.pilot.needs_pose if needs_pose is None else needs_pose,
-            adaptation=None if adapter is None else make_adaptation(setup, pipeline, adapter),
+            adaptation=make_fast_adaptation(setup, pipeline)
+            if adapter is None
+            else make_adaptation(setup, pipeline, adapter),
         )
         self._period_us = round(1e6 / setup.config.control.rate_hz)
 

@@ -6,6 +6,7 @@ import msgspec
 
 from disco_hw import control
 from disco_hw.adaptation.adaptation import CheckedAdaptation, GeometryAdaptation
+from disco_hw.adaptation.fast import FastAdaptation
 from disco_hw.adaptation.guard import (
     BeliefGuard,
     Geometry,
@@ -39,7 +40,7 @@ def make_planner(config: RobotConfig, model: Model) -> control.Disco:
     planner = control.Disco(
         model,
         task,
-        control.DiscoSettings.from_config(config.control),
+        control.DiscoSettings.from_config(config.control, config.task.speed_m_s),
         control.CommandLimits.of_robot(config.robot),
         config.control.seed,
     )
@@ -79,6 +80,25 @@ def make_adaptation(setup: Setup, pipeline: Pipeline, link: AdapterLink) -> Chec
         believed,
         lambda geometry: put_in_force(pipeline, setup.model, geometry),
         setup.config.robot.max_wheel_speed_rad_s,
+    )
+
+
+def make_fast_adaptation(setup: Setup, pipeline: Pipeline) -> FastAdaptation | None:
+    """The filter that learns the geometry in the tick itself, where robot.toml asks for it.
+
+    Raises InputError where the model does not allow it. `pipeline` has taken no step yet.
+    """
+    if setup.config.control.adaptation != "fast":
+        return None
+    check_adaptable(setup.model, setup.config.control.uncertainty)
+    believed = believed_geometry(setup.model)
+    for _ in range(_REHEARSALS):
+        put_in_force(pipeline, setup.model, believed)
+        put_in_force(pipeline, setup.model, None)
+    return FastAdaptation(
+        believed,
+        *possible_range(setup.config.prior),
+        lambda geometry: put_in_force(pipeline, setup.model, geometry),
     )
 
 

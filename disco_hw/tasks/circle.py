@@ -32,7 +32,11 @@ RADIUS_M = (0.1, 50.0)
 """Least and largest radius that a person may change it to."""
 # The radius over the distance from the centre below which progress stops growing.
 NEAR_CENTRE = 2.0
-_ZERO = single(0.0)
+# The last heading's error counts so many times the distance that it swings the tracked point by.
+TURN_WEIGHT = 2.0
+# Sine of the largest angle between heading and way: on a smaller circle the tracked point could only be turned about.
+MOST_TURNED = 0.95
+_ZERO, _TWO = single(0.0), single(2.0)
 
 
 class CircleTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -219,9 +223,11 @@ class CircleCost:
     for standing still and less for spinning about an offset centre of rotation. Progress takes the reward from both: it
     is R times the angle by which the tracked point moves on about the centre, zero in sum for any loop beside it; what
     the steps together miss of `progress_part` of s0 costs `progress_weight` times as much as the same miss of speed. A
-    robot that drives round pays nothing. The
-    last d counts as much as it would over `terminal_s` more: the way back to the edge begins with a loss, as turning in
-    pushes the tracked point out, and would else not pay within the horizon. `paper` has neither.
+    robot that drives round pays nothing. The last d counts as much as it would over `terminal_m` more of the way: the
+    way back to the edge begins with a loss, as turning in pushes the tracked point out, and would else not pay within
+    the horizon. With it counts the last heading, as x_icr times the sine of its error from the one in which the robot
+    goes round: the tracked point could else be swung to the edge at the end, and who is beside the edge would stay.
+    Facing against the way costs as much as being `against_m` off it. `paper` has none of these.
     """
 
     center_x_m: float = 0.0
@@ -230,17 +236,19 @@ class CircleCost:
     speed_m_s: float = 0.2
     progress_weight: float = 1.0
     progress_part: float = 0.8
-    terminal_s: float = 1.0
+    terminal_m: float = 0.2
+    against_m: float = 0.6
 
     def paper(self) -> CircleCost:
         """The same circle with the paper's cost alone."""
-        return replace(self, progress_weight=0.0, terminal_s=0.0)
+        return replace(self, progress_weight=0.0, terminal_m=0.0, against_m=0.0)
 
     def prepare(
-        self, time_s: float, x_m: float, y_m: float, yaw_rad: float, memory: float | None, step_s: float, horizon: int
-    ) -> Prepared:
+        self, time_s: float, x_m: float, y_m: float, yaw_rad: float, memory: float | None, step_s: float, horizon: int,
+        x_icr_m: float = 0.0,
+    ) -> Prepared:  # fmt: skip
         """Terms for the kernel; nothing depends on time or place. The memory is the angle swept (rad)."""
-        return _prepared(self, step_s, horizon)
+        return _prepared(self, step_s, horizon, x_icr_m)
 
     def instant_cost(self, time_s: float, x_m: float, y_m: float, forward_m_s: float) -> float:
         """The paper's instant cost of a state."""
@@ -252,7 +260,9 @@ class CircleTerms(NamedTuple):
     """The cost round the origin.
 
     Radius (m), speed (m/s); weight of lost progress, progress wanted by the end of the horizon (m/s times steps),
-    progress of a radian (m/s), largest reciprocal square of the radius; weight of the last distance.
+    progress of a radian (m/s), largest reciprocal square of the radius; weight of the last distance, and of the last
+    heading's error (m); what facing against the way costs (m). `turned_cos`, `turned_sin`: how far the robot's heading
+    is turned inwards from the way that the tracked point goes.
     """
 
     radius_m: float
@@ -262,6 +272,10 @@ class CircleTerms(NamedTuple):
     per_rad: float
     closest: float
     terminal_steps: float
+    terminal_turn_m: float
+    against_m: float
+    turned_cos: float
+    turned_sin: float
 
     def stage(
         self, memory: float, step: int, x_old: float, y_old: float, x: float, y: float,
@@ -272,16 +286,23 @@ class CircleTerms(NamedTuple):
         off_edge = rho - self.radius_m
         off_speed = forward - self.speed_m_s
         swept = memory + (x_old * y - y_old * x) * min(inverse * inverse, self.closest)
-        return math.sqrt(off_edge * off_edge + off_speed * off_speed), swept
+        along = (x * sin_yaw - y * cos_yaw) * inverse
+        against = self.against_m * max(-along, _ZERO)
+        return math.sqrt(off_edge * off_edge + off_speed * off_speed) + against, swept
 
     def terminal(self, memory: float, x: float, y: float, cos_yaw: float, sin_yaw: float, found: Found) -> float:
-        """The progress that is missing at the end, and the distance to the edge that is left."""
+        """The progress that is missing at the end, and the distance to the edge and the heading that are left."""
         lost = self.progress_weight * max(self.wanted - memory * self.per_rad, _ZERO)
-        return lost + self.terminal_steps * abs(norm(x, y) - self.radius_m)
+        rho, inverse = norm_and_inverse(x, y)
+        along, inwards = (x * sin_yaw - y * cos_yaw) * inverse, -(x * cos_yaw + y * sin_yaw) * inverse
+        turn = abs(inwards * self.turned_cos - along * self.turned_sin)
+        turn = turn if along * self.turned_cos + inwards * self.turned_sin > _ZERO else _TWO - turn
+        return lost + self.terminal_steps * norm(rho - self.radius_m, self.terminal_turn_m * turn)
 
 
 @lru_cache(maxsize=16)
-def _prepared(circle: CircleCost, step_s: float, horizon: int) -> Prepared:
+def _prepared(circle: CircleCost, step_s: float, horizon: int, x_icr_m: float) -> Prepared:
+    turned_sin = min(max(x_icr_m / circle.radius_m, -MOST_TURNED), MOST_TURNED)
     numbers = (
         circle.radius_m,
         circle.speed_m_s,
@@ -289,6 +310,10 @@ def _prepared(circle: CircleCost, step_s: float, horizon: int) -> Prepared:
         circle.progress_part * circle.speed_m_s * horizon,
         circle.radius_m / step_s,
         (NEAR_CENTRE / circle.radius_m) ** 2,
-        circle.terminal_s / step_s,
+        circle.terminal_m / (circle.speed_m_s * step_s),
+        TURN_WEIGHT * abs(x_icr_m),
+        circle.against_m,
+        math.sqrt(1.0 - turned_sin**2),
+        turned_sin,
     )
     return Prepared(CircleTerms(*map(single, numbers)), (circle.center_x_m, circle.center_y_m))

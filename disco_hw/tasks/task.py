@@ -121,12 +121,13 @@ class PlannedTask(Protocol):
     """A task as the planner takes it; immutable. The type of its terms decides which compiled cost is used."""
 
     def prepare(
-        self, time_s: float, x_m: float, y_m: float, yaw_rad: float, memory: float | None, step_s: float, horizon: int
-    ) -> Prepared:
+        self, time_s: float, x_m: float, y_m: float, yaw_rad: float, memory: float | None, step_s: float, horizon: int,
+        x_icr_m: float,
+    ) -> Prepared:  # fmt: skip
         """What a plan from here needs.
 
         `time_s` since the planner's start, the pose in the world, the memory that the last plan handed back (None at
-        the first), and the steps that will be planned.
+        the first), the steps that will be planned, and how far ahead of the tracked point the robot turns.
         """
 
     def instant_cost(self, time_s: float, x_m: float, y_m: float, forward_m_s: float) -> float:

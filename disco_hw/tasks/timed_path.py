@@ -192,8 +192,9 @@ class TimedPathCost:
         return np.asarray(x), np.asarray(y)
 
     def prepare(
-        self, time_s: float, x_m: float, y_m: float, yaw_rad: float, memory: float | None, step_s: float, horizon: int
-    ) -> Prepared:
+        self, time_s: float, x_m: float, y_m: float, yaw_rad: float, memory: float | None, step_s: float, horizon: int,
+        x_icr_m: float = 0.0,
+    ) -> Prepared:  # fmt: skip
         """Terms for the kernel, relative to where the robot should be now; there is no memory."""
         x, y = self._where(time_s + step_s * np.arange(horizon + 1))
         along_x, along_y = np.diff(x), np.diff(y)

@@ -115,7 +115,7 @@ def test_shifting_by_fractions_continues_the_plan():
 
 def test_the_predicted_path_starts_at_the_state_and_follows_the_mean_model():
     plan = planner().plan(0, TANGENT)
-    assert plan.trajectory.shape == (51, 3)
+    assert plan.trajectory.shape == (41, 3)
     np.testing.assert_allclose(plan.trajectory[0], [0.75, 0.0, math.pi / 2])
     left, right = plan.wheel_speeds[0]
     turned = plan.trajectory[1, 2] - plan.trajectory[0, 2]
@@ -192,15 +192,15 @@ def test_what_was_sampled_can_be_looked_at():
     disco = planner()
     plan = disco.plan(0, TANGENT)
     rollouts = disco.sampled_rollouts(30)
-    assert rollouts.wheel_speeds.shape == (30, 50, 2)
-    assert rollouts.trajectories.shape == (30, 51, 3)
+    assert rollouts.wheel_speeds.shape == (30, 40, 2)
+    assert rollouts.trajectories.shape == (30, 41, 3)
     assert np.all(np.diff(rollouts.weights) <= 0.0)
     assert 0.5 < rollouts.weights.sum() <= 1.0 + 1e-6
     every = disco.sampled_rollouts(400)
     np.testing.assert_allclose(every.weights.sum(), 1.0, rtol=1e-5)
     np.testing.assert_allclose(np.einsum("n,ntc->tc", every.weights, every.wheel_speeds), plan.wheel_speeds, atol=1e-3)
     points = disco.point_trajectories()
-    assert points.shape == (7, 51, 3)
+    assert points.shape == (7, 41, 3)
     np.testing.assert_allclose(points[0], plan.trajectory, atol=1e-9)
     assert np.abs(points[1] - points[0])[-1].max() > 0.01
 

@@ -20,11 +20,11 @@ def test_paper_mode_is_the_appendix_table():
 
 
 def test_from_config_takes_size_mode_and_uncertainty():
-    settings = DiscoSettings.from_config(Control(samples=64, horizon=20, step_s=0.2, uncertainty="mc"))
+    settings = DiscoSettings.from_config(Control(samples=64, horizon=20, step_s=0.2, uncertainty="mc"), 0.2)
     assert (settings.sampler.samples, settings.sampler.horizon, settings.step_s) == (64, 20, 0.2)
     assert settings.uncertainty == "mc"
-    assert settings.sampler.knots == 8
-    assert DiscoSettings.from_config(Control(mode="paper")).sampler.knots is None
+    assert settings.sampler.knots == 7
+    assert DiscoSettings.from_config(Control(mode="paper"), 0.2).sampler.knots is None
 
 
 def test_limits_of_the_robot():

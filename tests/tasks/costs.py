@@ -2,11 +2,24 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from disco_hw.control.oracle import Array, SequenceCost
-from disco_hw.tasks.circle import CircleCost
-from disco_hw.tasks.line.cost import AGAINST_M, FARTHEST_STEP_M, SLOW_DOWN_S, STANDING_M, TERMINAL_S, PathCost
+from disco_hw.tasks import circle as circle_file
+from disco_hw.tasks.circle import MOST_TURNED, CircleCost
+from disco_hw.tasks.line.cost import (
+    AGAINST_M,
+    FARTHEST_STEP_M,
+    SAME_X_ICR_M,
+    SLOW_DOWN_S,
+    STANDING_M,
+    TERMINAL_M,
+    TURN_WEIGHT,
+    PathCost,
+)
+from disco_hw.tasks.line.inverse import stable_yaw
 from disco_hw.tasks.line.table import PathTable
 from disco_hw.tasks.line.waypoints import Waypoints
 from disco_hw.tasks.timed_path import RESTS_M, TimedPathCost
@@ -17,8 +30,12 @@ def path_along(waypoints: Waypoints, speed_m_s: float = 0.2) -> PathCost:
     return PathCost(PathTable(waypoints.places_m), speed_m_s)
 
 
-def circle_cost(circle: CircleCost, step_s: float) -> SequenceCost:
-    """Cost of paths x, y, yaw (T + 1, K) and forward speeds (T, K) round a circle; see `CircleCost`."""
+def circle_cost(circle: CircleCost, step_s: float, x_icr_m: float = 0.0) -> SequenceCost:
+    """Cost of paths x, y, yaw (T + 1, K) and forward speeds (T, K) round a circle; see `CircleCost`.
+
+    A robot that goes round with its tracked point on the circle is turned inwards by asin(x_icr / radius).
+    """
+    inwards = math.asin(min(max(x_icr_m / circle.radius_m, -MOST_TURNED), MOST_TURNED))
 
     def cost(x: Array, y: Array, yaw: Array, forward: Array) -> Array:
         x, y = x - circle.center_x_m, y - circle.center_y_m
@@ -27,10 +44,18 @@ def circle_cost(circle: CircleCost, step_s: float) -> SequenceCost:
         closest = np.maximum(x[1:] ** 2 + y[1:] ** 2, (circle.radius_m / 2.0) ** 2)
         angle = (x[:-1] * y[1:] - y[:-1] * x[1:]) / closest
         missing = circle.progress_part * circle.speed_m_s * len(forward) - circle.radius_m / step_s * angle.sum(axis=0)
-        last = circle.terminal_s / step_s * np.abs(off_edge[-1])
-        return np.asarray(paper + circle.progress_weight * np.maximum(missing, 0.0) + last)
+        way = np.arctan2(y[1:], x[1:]) + 0.5 * math.pi
+        facing = circle.against_m * np.maximum(-np.cos(yaw[1:] - way), 0.0).sum(axis=0)
+        swung = circle_file.TURN_WEIGHT * abs(x_icr_m) * turned_away(yaw[-1] - way[-1] - inwards)
+        last = circle.terminal_m / (circle.speed_m_s * step_s) * np.hypot(off_edge[-1], swung)
+        return np.asarray(paper + facing + circle.progress_weight * np.maximum(missing, 0.0) + last)
 
     return cost
+
+
+def turned_away(angle: Array) -> Array:
+    """Sine of an angle up to a right one, and what it misses of 2 beyond."""
+    return np.where(np.cos(angle) > 0.0, np.abs(np.sin(angle)), 2.0 - np.abs(np.sin(angle)))
 
 
 def facing_cost(yaw: Array, along_x: Array | float, along_y: Array | float) -> Array:
@@ -38,15 +63,28 @@ def facing_cost(yaw: Array, along_x: Array | float, along_y: Array | float) -> A
     return AGAINST_M * np.maximum(-(np.cos(yaw) * along_x + np.sin(yaw) * along_y), 0.0)
 
 
-def path_cost(task: PathCost, place: float, step_s: float) -> SequenceCost:
+def path_cost(task: PathCost, place: float, step_s: float, x_icr_m: float = 0.0) -> SequenceCost:
     """Cost of paths (T + 1, K) along way-points by arc length, from a place (entries of the table); see `PathCost`.
 
-    Every step moves the place by its projection on the path's direction there, within the place's piece.
+    Every step moves the place by its projection on the path's direction there, within the place's piece. The last
+    heading is held against that of a robot that stays on the path.
     """
     path, table, count = task.path, task.path.table, len(task.path.table) - 1
     place, first, last = path.piece(place)
     endless = path.closed and not path.sharp_turns
     weight = max(1.0, STANDING_M / task.speed_m_s)
+
+    piece = table[np.arange(int(first), int(last)) % count]
+    along_rad = np.unwrap(np.arctan2(piece[:, 3], piece[:, 2]))
+    rounded_m = SAME_X_ICR_M * round(x_icr_m / SAME_X_ICR_M)
+    right = stable_yaw(along_rad, path.spacing_m, rounded_m, endless)
+
+    def turned(at: Array) -> Array:
+        """Heading (rad) of a robot on the path, at places: its sine beside the piece goes evenly from end to end."""
+        index = np.minimum(at, last - 1.0).astype(int)
+        along = along_rad[index - int(first)]
+        begin, end = (np.clip(right[index - int(first) + i] - along, -0.5 * math.pi, 0.5 * math.pi) for i in (0, 1))
+        return np.asarray(along + np.arcsin(np.sin(begin) + (at - index) * (np.sin(end) - np.sin(begin))))
 
     def off(at: Array, x: Array, y: Array) -> tuple[Array, Array, Array, Array]:
         """Offset from the path's point at a place, and the path's direction there."""
@@ -69,7 +107,8 @@ def path_cost(task: PathCost, place: float, step_s: float) -> SequenceCost:
             off_x, off_y, along_x, along_y = off(at, x_now, y_now)
             missing = weight * (wanted - np.minimum(along / step_s, forward_now))
             total += np.hypot(np.hypot(off_x, off_y), missing) + facing_cost(yaw_now, along_x, along_y)
-        return np.asarray(total + TERMINAL_S / step_s * np.hypot(off_x, off_y))
+        swung = TURN_WEIGHT * abs(rounded_m) * turned_away(yaw[-1] - turned(at))
+        return np.asarray(total + TERMINAL_M / (task.speed_m_s * step_s) * np.hypot(np.hypot(off_x, off_y), swung))
 
     return cost
 

@@ -76,7 +76,7 @@ def test_the_planner_leaves_the_traps(start):
     if start == "spinning":
         plant.wheels = (left, right)
         disco.plan(0, PlannerState(0, *place, left, right))
-        disco._optimiser.set_nominal(np.broadcast_to([left, right], (T, 2)))
+        disco._optimiser.set_nominal(np.broadcast_to([left, right], (disco.settings.sampler.horizon, 2)))
     travelled, costs = 0.0, []
     for step in range(1, 201):
         now_ns = step * 100_000_000

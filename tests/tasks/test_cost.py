@@ -73,7 +73,7 @@ def test_what_is_no_named_tuple_is_no_terms():
 
 
 def test_a_circle_has_costs():
-    prepared = CircleCost(terminal_s=2.0).prepare(0.0, 0.0, 0.0, 0.0, None, 0.1, 50)
+    prepared = CircleCost(terminal_m=0.4).prepare(0.0, 0.0, 0.0, 0.0, None, 0.1, 50)
     terms = prepared.terms
     assert (prepared.begin, prepared.memory) == (0.0, 0.0)
     # At 1 m from the centre, at rest, after a whole turn: nothing of the progress is missing.

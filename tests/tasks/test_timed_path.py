@@ -45,7 +45,7 @@ def test_the_planner_leaves_the_traps(trap):
         plant.wheels = (-SPIN, SPIN)
     # The trap is the plan that it starts from.
     disco.plan(0, PlannerState(0, 0.0, 0.0, 0.0, *plant.wheels))
-    disco.optimiser.set_nominal(np.broadcast_to(plant.wheels, (50, 2)))
+    disco.optimiser.set_nominal(np.broadcast_to(plant.wheels, (disco.settings.sampler.horizon, 2)))
     off = []
     for step in range(1, 151):
         now_ns = step * 100_000_000

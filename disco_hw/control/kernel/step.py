@@ -68,6 +68,7 @@ SAMPLING = np.dtype(
         ("hold", "?"),
         ("drawn", "?"),
         ("noise_std", "f4"),
+        ("wide", "f4"),
         ("temperature", "f4"),
         ("target_ess", "f4"),
         ("control_cost", "f4"),
@@ -76,6 +77,8 @@ SAMPLING = np.dtype(
     align=True,
 )
 Sampling = np.record
+# The lanes of a block from this one on are drawn `wide` times as wide: a fifth of all samples.
+WIDE_FROM = U(64)
 
 
 @kernel_function
@@ -144,6 +147,10 @@ def sample(work: Workspace, sampling: Sampling, step: int, block: int, basis: Ba
     """Draw the noise of a block of samples and make their command sequences of it."""
     first_noise = U(block * sampling.rows) * BLOCK
     fill_normal_block(work.noise, sampling.rows, block, step, sampling.seed, sampling.noise_std)
+    if sampling.wide > float32(1.0):
+        for j in range(U(sampling.rows)):
+            for b in range(WIDE_FROM, BLOCK):
+                work.noise[first_noise + j * BLOCK + b] *= sampling.wide
     if block == 0 and sampling.with_nominal:
         for j in range(U(sampling.rows)):
             work.noise[j * BLOCK] = float32(0.0)

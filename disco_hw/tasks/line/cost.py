@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.tasks.cost import Found, constant, helper, norm, norm_and_inverse, norm_of_three, single
+from disco_hw.tasks.cost import Found, constant, helper, norm_and_inverse, norm_of_three, single
+from disco_hw.tasks.line.inverse import stable_yaw
 from disco_hw.tasks.line.table import PathTable
 from disco_hw.tasks.task import Prepared
 
@@ -20,11 +22,15 @@ FARTHEST_STEP_M = 0.5
 AGAINST_M = 0.6
 # Standing costs at least as much as being so far off the path, however slow it is to be driven.
 STANDING_M = 0.4
-# The last distance counts as much as it would over so much longer: turning in pushes the tracked point out at first.
-TERMINAL_S = 1.0
+# The last distance counts as much as over so much more of the way: turning in pushes the tracked point out at first.
+TERMINAL_M = 0.2
+# The last heading's error counts so many times the distance that it swings the tracked point by.
+TURN_WEIGHT = 2.0
+# Beliefs this close share a table.
+SAME_X_ICR_M = 0.005
 # Entries of the table that rollouts see relative to the same point: few, as single precision tells 0.1 um of 1 m.
 NEAR = 50
-_ZERO, _ONE, _AGAINST = single(0.0), single(1.0), single(AGAINST_M)
+_ZERO, _ONE, _TWO, _AGAINST = single(0.0), single(1.0), single(2.0), single(AGAINST_M)
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +41,9 @@ class PathCost:
     direction; so a path may cross itself. The speed of that is the progress, but no more than the forward speed; so
     standing still or spinning costs the whole wanted speed, and driving backwards twice of it. Facing is AGAINST_M
     times the part of the heading that is against the path's direction: backwards would else be the easier way, for it
-    puts the tracked point before the axle. Wanted is `speed_m_s`, and less in the last second of an open path.
+    puts the tracked point before the axle. Wanted is `speed_m_s`, and less in the last second of an open path. The end
+    costs the distance that is left, over TERMINAL_M more of the way, together with the error of the heading from that
+    of a robot that stays on the path; else the tracked point would be swung to the path at the end.
 
     Where the way turns sharply, rollouts end at the end of the table's piece, the robot stops there, and then turns to
     the next, which it could not find by sampling as nothing is gained before the turn is half done.
@@ -45,8 +53,9 @@ class PathCost:
     speed_m_s: float = 0.2
 
     def prepare(
-        self, time_s: float, x_m: float, y_m: float, yaw_rad: float, memory: float | None, step_s: float, horizon: int
-    ) -> Prepared:
+        self, time_s: float, x_m: float, y_m: float, yaw_rad: float, memory: float | None, step_s: float, horizon: int,
+        x_icr_m: float = 0.0,
+    ) -> Prepared:  # fmt: skip
         """Terms for the kernel; the memory is the place on the path, in entries of the table.
 
         Rollouts count it from where they begin, and are relative to a point of the path nearby, so that a long path is
@@ -55,17 +64,19 @@ class PathCost:
         path = self.path
         place, first, last = path.piece(path.place(x_m, y_m, yaw_rad, memory))
         reach = horizon * math.ceil(FARTHEST_STEP_M / path.spacing_m) + 1
-        near = _nearby(path, int(place) // NEAR, reach)
+        x_icr_m = SAME_X_ICR_M * round(x_icr_m / SAME_X_ICR_M)
+        near = _nearby(path, int(place) // NEAR, reach, x_icr_m)
         low, high, end = place - reach, place + reach, math.inf
         if path.ends:
             low, high, end = max(low, first), min(high, last), last - place
         begin, rows = int(low) - near.first, int(high - low)
         terms = PathTerms(
             near.pieces[4 * begin : 4 * (begin + rows)],
+            near.turned[2 * begin : 2 * (begin + rows)],
             single(low - place),
             single(high - place),
             single(end),
-            *_numbers(path, self.speed_m_s, step_s),
+            *_numbers(path, self.speed_m_s, step_s, abs(x_icr_m)),
         )
         return Prepared(terms, near.origin_m, 0.0, place)
 
@@ -80,13 +91,16 @@ class PathTerms(NamedTuple):
     """The cost along the part of a path's table that can be reached within the horizon.
 
     `table` (4 M,): for each piece between two entries, from one to the next, where it begins, x and y (m), and how far
-    it goes in x and y (m). Places count in entries from where the robot is: `first` and `last` are the table's ends,
-    `end` is where the robot stops, or infinite. `per_m`: entries a metre; `speed_m_s`; `speed_per_entry`: progress
-    speed of one entry in a step (m/s); `slow_per_entry`: wanted speed for each entry left; `speed_weight`: of missing
-    speed; `terminal_steps`: weight of the last distance.
+    it goes in x and y (m). `turned` (2 M,): the sine by which a robot on the path is turned from each piece at its
+    begin, and by how much more at its end (`inverse.stable_yaw`). Places count in entries from where the robot is:
+    `first` and `last` are the table's ends, `end` is where the robot stops, or infinite. `per_m`: entries a metre;
+    `speed_m_s`; `speed_per_entry`: progress speed of one entry in a step (m/s); `slow_per_entry`: wanted speed for each
+    entry left; `speed_weight`: of missing speed; `terminal_steps`: weight of the last distance; `turn_m`: what the last
+    heading counts if it is straight across, and half of what it does backwards (m).
     """
 
     table: NDArray[np.float32]
+    turned: NDArray[np.float32]
     first: float
     last: float
     end: float
@@ -96,6 +110,7 @@ class PathTerms(NamedTuple):
     slow_per_entry: float
     speed_weight: float
     terminal_steps: float
+    turn_m: float
 
     def follow(self, memory: float, x: float, y: float, forward: float, found: Found) -> tuple[float, float]:
         """The place after a step, and what the step misses of the wanted speed, weighted."""
@@ -123,9 +138,16 @@ class PathTerms(NamedTuple):
         return norm_of_three(off_x, off_y, found[0]) + _AGAINST * against, memory
 
     def terminal(self, memory: float, x: float, y: float, cos_yaw: float, sin_yaw: float, found: Found) -> float:
-        """The last distance."""
-        off_x, off_y, _, _ = _offset(self.last, memory, x, y, found[1:])
-        return self.terminal_steps * norm(off_x, off_y)
+        """The last distance and the error of the last heading."""
+        off_x, off_y, along_x, along_y = _offset(self.last, memory, x, y, found[1:])
+        piece = np.floor(min(memory, self.last - _ONE))
+        row = np.int32(piece - self.first) * 2
+        sine = self.turned[row] + (memory - piece) * self.turned[row + 1]
+        cosine = math.sqrt(max(_ONE - sine * sine, _ZERO))
+        along, across = cos_yaw * along_x + sin_yaw * along_y, sin_yaw * along_x - cos_yaw * along_y
+        forwards, turn = along * cosine + across * sine, abs(across * cosine - along * sine)
+        turn = turn if forwards > _ZERO else _TWO - turn
+        return self.terminal_steps * norm_of_three(off_x, off_y, self.turn_m * turn)
 
 
 @helper
@@ -143,12 +165,13 @@ class _Nearby(NamedTuple):
     """Part of a path, flat as in PathTerms, from the entry `first` on and relative to `origin_m`."""
 
     pieces: NDArray[np.float32]
+    turned: NDArray[np.float32]
     first: int
     origin_m: tuple[float, float]
 
 
 @lru_cache(maxsize=8)
-def _nearby(path: PathTable, block: int, reach: int) -> _Nearby:
+def _nearby(path: PathTable, block: int, reach: int, x_icr_m: float) -> _Nearby:
     """The block of NEAR entries of a path, and `reach` more on both sides: round and round if it is closed."""
     table, count = path.table, len(path.table) - 1
     first, end = block * NEAR - reach, (block + 1) * NEAR + reach
@@ -159,12 +182,31 @@ def _nearby(path: PathTable, block: int, reach: int) -> _Nearby:
     # An open path's last entry is one of its own: it is not the first.
     origin = table[block * NEAR % count if path.closed else block * NEAR, :2]
     pieces = np.hstack([here - origin, there - here]).astype(np.float32)
+    turned = _turned(path, x_icr_m)[at].astype(np.float32)
     x_m, y_m = origin.tolist()
-    return _Nearby(pieces.reshape(-1), first, (x_m, y_m))
+    return _Nearby(pieces.reshape(-1), turned.reshape(-1), first, (x_m, y_m))
 
 
 @lru_cache(maxsize=8)
-def _numbers(path: PathTable, speed_m_s: float, step_s: float) -> tuple[float, ...]:
+def _turned(path: PathTable, x_icr_m: float) -> NDArray[np.float64]:
+    """Sine by which the robot is turned from every piece at its begin, and how much more at its end: (M, 2)."""
+    along = np.unwrap(np.arctan2(path.table[:-1, 3], path.table[:-1, 2]))
+    count = along.size
+    turned = np.empty((count, 2))
+    # A robot stops where the path turns sharply: what comes after says nothing of the heading before.
+    bounds = (
+        [*path.sharp_turns, path.sharp_turns[0] + count] if path.closed and path.ends else [0, *path.sharp_turns, count]
+    )
+    for begin, end in pairwise(bounds):
+        at = np.arange(begin, end) % count
+        yaw = stable_yaw(np.unwrap(along[at]), path.spacing_m, x_icr_m, path.closed and not path.ends)
+        turned[at] = np.column_stack([yaw[:-1], yaw[1:]]) - np.unwrap(along[at])[:, None]
+    sines = np.sin(np.clip(turned, -0.5 * math.pi, 0.5 * math.pi))
+    return np.column_stack([sines[:, 0], sines[:, 1] - sines[:, 0]])
+
+
+@lru_cache(maxsize=8)
+def _numbers(path: PathTable, speed_m_s: float, step_s: float, x_icr_m: float) -> tuple[float, ...]:
     """The terms from `per_m` on: those that no plan changes."""
     spacing = path.spacing_m
     return tuple(
@@ -175,6 +217,7 @@ def _numbers(path: PathTable, speed_m_s: float, step_s: float) -> tuple[float, .
             spacing / step_s,
             spacing / SLOW_DOWN_S,
             max(1.0, STANDING_M / speed_m_s),
-            TERMINAL_S / step_s,
+            TERMINAL_M / (speed_m_s * step_s),
+            TURN_WEIGHT * x_icr_m,
         )
     )

@@ -123,12 +123,12 @@ NUDGE_RAD_S, NUDGES_M, EDGE, STEEP = 1e-5, ((1e-5, 1e-5), (1e-5, -1e-5)), 2e-5, 
 FEW = 0.1
 
 
-def sequence_cost(task, place):
+def sequence_cost(task, place, x_icr_m):
     match task:
         case CircleCost():
-            return circle_cost(task, STEP_S)
+            return circle_cost(task, STEP_S, x_icr_m)
         case PathCost():
-            return path_cost(task, place, STEP_S)
+            return path_cost(task, place, STEP_S, x_icr_m)
         case TimedPathCost():
             return timed_path_cost(task, 0.0, STEP_S)
 
@@ -157,7 +157,7 @@ def check_against_reference(model, state, task, plan_settings, seed):
     weighed = point_weights != 0.0
     past = command_history(state.sent, now_ns, STEP_S, 8, (state.left_speed_rad_s, state.right_speed_rad_s))
     start = physics.RobotState(state.x_m, state.y_m, state.yaw_rad, state.left_speed_rad_s, state.right_speed_rad_s)
-    cost = sequence_cost(task, disco._memory)
+    cost = sequence_cost(task, disco._memory, disco._x_icr_m)
 
     def costs_of(sequences, x_m=0.0, y_m=0.0):
         names = model.parameter_names

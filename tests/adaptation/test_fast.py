@@ -1,0 +1,68 @@
+"""Fast adaptation in the daemon's tick: learnt, recorded, replayed bit for bit, taken back when asked."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from disco_hw.adaptation.guard import believed_geometry
+from disco_hw.experiments.simulated_time import SimulatedRun, virtual_robot
+from disco_hw.log.records import BeliefChange
+from disco_hw.runtime.assembly import make_planner
+from disco_hw.runtime.replay import replay
+from disco_hw.runtime.robot_setup import load_setup
+from sim.body_dynamics import BodyPose
+from sim.plant_parameters import PlantParameters
+
+ROBOT = Path(__file__).parents[2] / "disco_hw" / "robots" / "wombot.toml"
+
+
+def asked_to_adapt(directory):
+    """The shipped robot, which learns, and looks a short way ahead: plans are most of a log."""
+    text = ROBOT.read_text().replace(
+        "rate_hz = 50.0", 'rate_hz = 50.0\nadaptation = "fast"\nhorizon = 10\nstep_s = 0.3'
+    )
+    (directory / "robot.toml").write_text(text)
+    (directory / "wombot_model.toml").write_text(ROBOT.with_name("wombot_model.toml").read_text())
+    return load_setup(directory / "robot.toml")
+
+
+def driven(directory, seconds):
+    setup = asked_to_adapt(directory)
+    x_icr, radius, axial = believed_geometry(setup.model).mean.tolist()
+    plant = replace(
+        PlantParameters(ticks_per_rev=2048), x_icr_m=x_icr, wheel_radius_m=0.93 * radius, axial_distance_m=1.07 * axial
+    )
+    robot = virtual_robot(setup, plant, BodyPose(0.75, 0.0, 1.57), seed=1)
+    run = SimulatedRun(setup, robot, make_planner(setup.config, setup.model))
+    run.start()
+    run.run(seconds)
+    return run, (x_icr, 0.93 * radius, 1.07 * axial)
+
+
+def changes(run):
+    return [record for _, tick in run.recorder.ticks for record in tick if isinstance(record, BeliefChange)]
+
+
+def test_the_geometry_is_learnt_and_what_the_planner_used_is_in_the_log(tmp_path):
+    run, truth = driven(tmp_path, 15.0)
+    found = changes(run)
+    assert len(found) > 3
+    np.testing.assert_allclose(found[-1].mean, truth, rtol=0.04)
+    run.write_log(tmp_path / "drive.mcap")
+    report = replay(tmp_path / "drive.mcap")
+    assert report.ok, report.as_text()
+    assert report.ticks > 700
+
+
+def test_it_goes_back_to_the_model_file_and_stays_there_when_asked(tmp_path):
+    run, _ = driven(tmp_path, 6.0)
+    adaptation = run.core.adaptation
+    assert adaptation.status()["belief"] == "adapted"
+    assert adaptation.ask("revert")[0]
+    run.run(3.0)
+    assert adaptation.status()["belief"] == "model"
+    assert changes(run)[-1].source == "model"
+    assert adaptation.ask("adapt")[0]
+    run.run(3.0)
+    assert adaptation.status()["belief"] == "adapted"
