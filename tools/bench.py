@@ -22,6 +22,7 @@ PARTS = (
     "bench_log",
     "bench_loop",
     "bench_start",
+    "bench_tracking",
     "bench_viewer",
     "bench_wire",
 )

@@ -1,0 +1,140 @@
+"""What classical followers share: the place on the line, the wheels that a motion takes, and the shape of a plan."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from disco_hw.control.baselines.reference import Reference
+from disco_hw.control.plan import Diagnostics, PlannerState, PlanOutcome, Rollouts, WheelPlan
+from disco_hw.control.settings import CommandLimits
+
+Array = NDArray[np.float64]
+
+_STEPS, _STEP_S = 4, 0.1
+_LONGEST_GAP_S = 0.2
+
+
+@dataclass(frozen=True, slots=True)
+class Chassis:
+    """What is known of the robot: geometry (m), motor lag (s) and dead band (rad/s), the drive's limits."""
+
+    wheel_radius_m: float
+    axial_distance_m: float
+    x_icr_m: float
+    lag_s: float
+    dead_rad_s: float
+    limits: CommandLimits
+
+    def wheels(self, forward_m_s: float, turn_rad_s: float) -> Array:
+        """Wheel speeds (2,) of a motion."""
+        half = 0.5 * self.axial_distance_m * turn_rad_s
+        return np.array([forward_m_s - half, forward_m_s + half]) / self.wheel_radius_m
+
+
+@dataclass(frozen=True, slots=True)
+class Errors:
+    """Where the robot is beside its reference: at which `place`; the centre of rotation `left_m` of where it should be
+    and `yaw_rad` further round; the tracked point `off_m` to the left of the line, and that over time, `sum_m_s`.
+    """
+
+    place: int
+    left_m: float
+    yaw_rad: float
+    off_m: float
+    sum_m_s: float
+
+
+class Law(Protocol):
+    """A steering law."""
+
+    @property
+    def preview_s(self) -> float:
+        """How far ahead the reference motion is taken."""
+
+    @property
+    def largest_sum_m_s(self) -> float:
+        """Bound of the distance's integral."""
+
+    def turn(self, reference: Reference, errors: Errors, x_m: float, y_m: float, yaw_rad: float) -> tuple[float, float]:
+        """What to add to the reference's turning rate (rad/s), and the factor of its forward speed."""
+
+
+class Follower:
+    """Drives a line by a steering law: a planner without a belief.
+
+    The reference's wheel speeds are led by what the motors lag, and lifted over the dead band.
+    """
+
+    def __init__(self, reference: Reference, law: Law, chassis: Chassis) -> None:
+        self._reference, self._law, self._chassis = reference, law, chassis
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the place on the line and the integral."""
+        self._place: int | None = None
+        self._sum_m_s = 0.0
+        self._last_ns: int | None = None
+
+    def plan(self, now_ns: int, state: PlannerState) -> WheelPlan:
+        """Wheel speeds to hold from now on."""
+        reference, law, chassis = self._reference, self._law, self._chassis
+        self._place = reference.place(state.x_m, state.y_m, self._place)
+        errors = self._errors(now_ns, self._place, state)
+        spacing_s = reference.spacing_m / reference.speed_m_s
+        here = reference.ahead(self._place, law.preview_s * reference.speed_m_s)
+        there = reference.beyond(here, np.array([round(0.1 / spacing_s)])).item()
+        add, factor = law.turn(reference, errors, state.x_m, state.y_m, state.yaw_rad)
+        wheels = self._reference_wheels(here)
+        change = (self._reference_wheels(there) - wheels) / 0.1
+        now = chassis.wheels(reference.forward_m_s[here] * factor, reference.turn_rad_s[here] + add)
+        commands = now + chassis.lag_s * change
+        commands += np.copysign(chassis.dead_rad_s, commands) * np.minimum(np.abs(commands) / 0.05, 1.0)
+        # Too fast for a wheel: as fast as it can, on the same curve.
+        commands /= max(1.0, float(np.abs(commands).max()) / chassis.limits.speed_rad_s)
+        return self._held(now_ns, state, commands)
+
+    def _reference_wheels(self, place: int) -> Array:
+        return self._chassis.wheels(self._reference.forward_m_s[place], self._reference.turn_rad_s[place])
+
+    def _errors(self, now_ns: int, place: int, state: PlannerState) -> Errors:
+        reference, x_icr = self._reference, self._chassis.x_icr_m
+        off = reference.offset_m(place, state.x_m, state.y_m)
+        if self._last_ns is not None:
+            self._sum_m_s += off * min((now_ns - self._last_ns) * 1e-9, _LONGEST_GAP_S)
+        self._last_ns = now_ns
+        largest = self._law.largest_sum_m_s
+        self._sum_m_s = min(max(self._sum_m_s, -largest), largest)
+        at_x, at_y = reference.axle_m(place)
+        yaw = float(reference.yaw_rad[place])
+        to_x = state.x_m + x_icr * math.cos(state.yaw_rad) - at_x
+        to_y = state.y_m + x_icr * math.sin(state.yaw_rad) - at_y
+        left = to_y * math.cos(yaw) - to_x * math.sin(yaw)
+        return Errors(place, left, math.remainder(state.yaw_rad - yaw, 2.0 * math.pi), off, self._sum_m_s)
+
+    def _held(self, now_ns: int, state: PlannerState, commands: Array) -> WheelPlan:
+        chassis = self._chassis
+        forward = 0.5 * chassis.wheel_radius_m * float(commands.sum())
+        turn = chassis.wheel_radius_m * float(commands[1] - commands[0]) / chassis.axial_distance_m
+        yaw = state.yaw_rad + turn * _STEP_S * np.arange(_STEPS + 1)
+        x_step = _STEP_S * (forward * np.cos(yaw) + turn * chassis.x_icr_m * np.sin(yaw))
+        y_step = _STEP_S * (forward * np.sin(yaw) - turn * chassis.x_icr_m * np.cos(yaw))
+        x, y = (np.concatenate([[0.0], np.cumsum(step[:-1])]) for step in (x_step, y_step))
+        trajectory = np.column_stack([state.x_m + x, state.y_m + y, yaw])
+        nothing = Diagnostics(1.0, 0.0, 0.0, 0.0, 0.0, 1, outcome=PlanOutcome.PLANNED)
+        return WheelPlan(now_ns, _STEP_S, np.tile(commands, (_STEPS, 1)), trajectory, nothing)
+
+    def set_task(self, _task: object) -> None:
+        """A line is for good."""
+        raise TypeError("a follower keeps its line")
+
+    def set_belief(self, _belief: object) -> None:
+        """Nothing is believed."""
+
+    def sampled_rollouts(self, _count: int) -> Rollouts:
+        """None are sampled."""
+        return Rollouts(np.empty((0, _STEPS, 2)), np.empty((0, _STEPS + 1, 3)), np.empty(0))

@@ -1,0 +1,44 @@
+"""Classical followers: the reference is what keeps the tracked point on the line, and every law keeps to it."""
+
+import math
+
+import numpy as np
+import pytest
+
+from disco_hw.control.baselines.laws import Kanayama, LinearQuadratic, PurePursuit
+from disco_hw.control.baselines.reference import Reference
+from tools.foreign_plant import NOMINAL, ForeignRobot
+from tools.tracking import classical, drive, tracks
+
+SQUARE = np.array([[0.0, 0.0], [1.5, 0.0], [1.5, 1.5], [0.0, 1.5], [0.0, 0.0]])
+
+
+@pytest.mark.parametrize("x_icr_m", [0.238, 0.0, -0.2])
+def test_on_a_circle_the_robot_is_turned_inwards_by_what_its_tracked_point_slides(x_icr_m):
+    angle = np.linspace(0.0, 2.0 * math.pi, 1441)
+    reference = Reference(0.75 * np.column_stack([np.cos(angle), np.sin(angle)]), 0.2, x_icr_m)
+    inwards = reference.yaw_rad - reference.along_rad
+    np.testing.assert_allclose(inwards, math.asin(x_icr_m / 0.75), atol=0.015)
+
+
+def test_a_robot_that_moves_as_the_reference_stays_on_a_square_and_turns_before_its_corner():
+    reference = Reference(SQUARE, 0.2, 0.238)
+    step_s = reference.spacing_m / 0.2
+    before = reference.ahead(0, 1.45)
+    assert reference.yaw_rad[before] > 0.8
+    x, y = reference.places_m[0]
+    worst = 0.0
+    for place in range(len(reference.places_m) - 1):
+        yaw, forward, turn = reference.yaw_rad[place], reference.forward_m_s[place], reference.turn_rad_s[place]
+        x += step_s * (forward * math.cos(yaw) + turn * 0.238 * math.sin(yaw))
+        y += step_s * (forward * math.sin(yaw) - turn * 0.238 * math.cos(yaw))
+        worst = max(worst, math.hypot(x - reference.places_m[place + 1, 0], y - reference.places_m[place + 1, 1]))
+    assert worst < 0.03
+
+
+@pytest.mark.parametrize("law", [PurePursuit(), Kanayama(), LinearQuadratic()], ids=lambda law: type(law).__name__)
+def test_every_law_follows_every_way_with_the_nominal_robot(law):
+    for track in tracks().values():
+        driven = drive(classical(law), ForeignRobot(*NOMINAL), track, duration_s=20.0).after()
+        assert driven.rms_mm < 30.0
+        assert driven.speed_m_s > 0.15

@@ -1,0 +1,211 @@
+"""Drives of controllers on foreign robots, in simulated time, through the project's own estimator, governor and tick.
+
+Nobody is told a robot's wheel radius, axle and centre of rotation; its motor lag and dead band are known to all.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from disco_hw.adaptation.adaptation import NoAdaptation
+from disco_hw.adaptation.fast import FastAdaptation
+from disco_hw.adaptation.guard import believed_geometry
+from disco_hw.config import Estimation
+from disco_hw.control import CommandLimits, Disco, DiscoSettings
+from disco_hw.control.baselines.follower import Chassis, Follower, Law
+from disco_hw.control.baselines.reference import Reference
+from disco_hw.control.settings import ROTATION
+from disco_hw.estimation import OdometryParameters, PoseFusion
+from disco_hw.model import Gaussian, Model
+from disco_hw.model.model import EffectSetting
+from disco_hw.runtime.assembly import put_in_force
+from disco_hw.runtime.governor import Governor, WheelLimits
+from disco_hw.runtime.pipeline import FollowTask, Pipeline, Planner
+from disco_hw.tasks.circle import CircleCost, CircleCourse
+from disco_hw.tasks.lemniscate import LemniscateTask
+from disco_hw.tasks.line.cost import PathCost
+from disco_hw.tasks.line.course import LineCourse, line_course
+from disco_hw.tasks.line.table import PathTable
+from disco_hw.tasks.task import PlannedTask
+from drivers.types import Readings
+from tools.foreign_plant import NOMINAL, ForeignPlant, ForeignRobot
+
+Array = NDArray[np.float64]
+
+NAMES = ("wheel_radius_m", "axial_distance_m", "x_icr_m")
+LIMITS = CommandLimits(8.0, 20.0)
+SPREAD = 0.15
+TICK_MS = 20
+SETTLED_S, DURATION_S = 5.0, 30.0
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """A way to drive: its line, its cost, its way-points, where to start."""
+
+    course: LineCourse | CircleCourse
+    task: PlannedTask
+    points_m: Array
+
+    @property
+    def start(self) -> tuple[float, float, float]:
+        """On the line, along it."""
+        return self.course.start
+
+
+def line_track(points: tuple[tuple[float, float], ...], speed_m_s: float) -> Track:
+    """A line of way-points."""
+    places = np.array(points)
+    return Track(line_course(points, "line"), PathCost(PathTable(places), speed_m_s), places)
+
+
+def circle_track(radius_m: float, speed_m_s: float) -> Track:
+    """A circle round the origin."""
+    angle = np.linspace(0.0, 2.0 * math.pi, 721)
+    points = radius_m * np.column_stack([np.cos(angle), np.sin(angle)])
+    points[-1] = points[0]
+    cost = CircleCost(radius_m=radius_m, speed_m_s=speed_m_s)
+    return Track(CircleCourse(0.0, 0.0, radius_m), cost, points)
+
+
+def tracks(speed_m_s: float = 0.2) -> dict[str, Track]:
+    """The ways of the table."""
+    x = np.linspace(0.0, 8.0, 401)
+    slalom = tuple(zip(x.tolist(), (0.25 * np.sin(2.0 * math.pi * x / 1.8)).tolist(), strict=True))
+    return {
+        "circle": circle_track(0.75, speed_m_s),
+        "eight": line_track(LemniscateTask(size_m=1.5).points(), speed_m_s),
+        "square": line_track(((0.0, 0.0), (1.5, 0.0), (1.5, 1.5), (0.0, 1.5), (0.0, 0.0)), speed_m_s),
+        "slalom": line_track(slalom, speed_m_s),
+    }
+
+
+def belief(mean: tuple[float, ...] = NOMINAL, spread: float = SPREAD) -> Gaussian:
+    """What is believed of a robot's geometry before it drives."""
+    values = np.array(mean)
+    return Gaussian(NAMES, values, np.diag((spread / math.sqrt(3.0) * values) ** 2))
+
+
+def model(robot: ForeignRobot, known: bool = False) -> Model:
+    """The robot's lag and dead band with the nominal geometry; `known`: with its own."""
+    mean = (robot.radius_m, robot.axle_m, robot.x_icr_m) if known else NOMINAL
+    effects = [EffectSetting("motor_lag", {"tau_s": robot.lag_s})]
+    if robot.dead_rad_s:
+        effects.insert(0, EffectSetting("deadband", {"width_rad_s": robot.dead_rad_s}))
+    return Model(*mean, tuple(effects), belief(mean, 0.004 if known else SPREAD), "foreign")
+
+
+def fusion(mean: tuple[float, ...], spread: float = SPREAD) -> PoseFusion:
+    """The estimator with this geometry."""
+    rows = belief(mean, spread).covariance().tolist()
+    return PoseFusion(Estimation(), OdometryParameters(*mean, tuple(map(tuple, rows))), 0.1)
+
+
+@dataclass(frozen=True)
+class Contender:
+    """A planner for a robot and a track; whether it knows the geometry and whether it learns it."""
+
+    planner: Callable[[ForeignRobot, Track], Planner]
+    knows: bool = False
+    learns: bool = False
+
+
+def classical(law: Law, speed_m_s: float = 0.2, knows: bool = False) -> Contender:
+    """A follower with this law."""
+
+    def made(robot: ForeignRobot, track: Track) -> Planner:
+        geometry = (robot.radius_m, robot.axle_m, robot.x_icr_m) if knows else NOMINAL
+        chassis = Chassis(*geometry, robot.lag_s, robot.dead_rad_s, LIMITS)
+        return Follower(Reference(track.points_m, speed_m_s, geometry[2]), law, chassis)
+
+    return Contender(made, knows)
+
+
+def disco(settings: DiscoSettings, knows: bool = False, learns: bool = False, seed: int = 1) -> Contender:
+    """DISCO with these settings."""
+    return Contender(lambda robot, track: Disco(model(robot, knows), track.task, settings, LIMITS, seed), knows, learns)
+
+
+@dataclass(frozen=True, eq=False)
+class Drive:
+    """N ticks: time (s), true pose (N, 3), forward speed (m/s), commands (N, 2) rad/s, distance to the right (m)."""
+
+    t_s: Array
+    pose: Array
+    forward_m_s: Array
+    commands: Array
+    off_m: Array
+
+    def after(self, settled_s: float = SETTLED_S) -> Drive:
+        """The drive from a time on."""
+        part = self.t_s >= settled_s
+        return Drive(self.t_s[part], self.pose[part], self.forward_m_s[part], self.commands[part], self.off_m[part])
+
+    @property
+    def rms_mm(self) -> float:
+        """Of the distance."""
+        return 1e3 * float(np.sqrt(np.mean(self.off_m**2)))
+
+    @property
+    def signed_mm(self) -> float:
+        """Mean distance, positive to the right: outside of a circle."""
+        return 1e3 * float(self.off_m.mean())
+
+    @property
+    def speed_m_s(self) -> float:
+        """Length of the way over the time."""
+        length = np.hypot(*np.diff(self.pose[:, :2], axis=0).T).sum()
+        return float(length / (self.t_s[-1] - self.t_s[0]))
+
+    @property
+    def travel_rot_s2(self) -> float:
+        """How far a command moves in a second."""
+        span_s = self.t_s[-1] - self.t_s[0]
+        return float(np.abs(np.diff(self.commands, axis=0)).sum() / 2.0 / span_s / ROTATION)
+
+
+def drive(
+    contender: Contender, robot: ForeignRobot, track: Track, *, rate_hz: float = 50.0, duration_s: float = DURATION_S,
+    seed: int = 1, start: tuple[float, float, float] | None = None,
+) -> Drive:  # fmt: skip
+    """One drive from rest."""
+    plant = ForeignPlant(robot, start or track.start, seed)
+    mean, spread = ((robot.radius_m, robot.axle_m, robot.x_icr_m), 0.004) if contender.knows else (NOMINAL, SPREAD)
+    period_s = 1.0 / rate_hz
+    governor = Governor(WheelLimits(LIMITS.speed_rad_s, *[LIMITS.acceleration_rad_s2] * 2), period_s)
+    pipeline = Pipeline(fusion(mean, spread), contender.planner(robot, track), governor, 0.2)
+    adaptation = _learner(robot, pipeline) if contender.learns else NoAdaptation()
+    every_ms = round(1e3 * period_s)
+    rows: list[tuple[float, ...]] = []
+    wheels, poses = [], []
+    command = (0.0, 0.0)
+    while plant.now_ms < 1e3 * duration_s:
+        readings = plant.readings()
+        wheels += readings.wheels
+        poses += readings.poses
+        if plant.now_ms % every_ms == 0:
+            adaptation.step(plant.now_ns)
+            gathered = Readings(wheels=tuple(wheels), poses=tuple(poses))
+            tick = pipeline.step(plant.now_ns, gathered, FollowTask())
+            adaptation.feed(plant.now_ns, gathered)
+            wheels, poses = [], []
+            if tick.estimate.initialised:
+                command = (tick.command.left_rad_s, tick.command.right_rad_s)
+            rows.append((plant.now_ms * 1e-3, *plant.pose, plant.forward_m_s, *command))
+        plant.advance(*command, TICK_MS)
+    table = np.array(rows)
+    return Drive(table[:, 0], table[:, 1:4], table[:, 4], table[:, 5:7], track.course.off_m(table[:, 1:3]))
+
+
+def _learner(robot: ForeignRobot, pipeline: Pipeline) -> FastAdaptation:
+    """The filter beside this pipeline."""
+    believed = model(robot)
+    mean = believed_geometry(believed)
+    return FastAdaptation(
+        mean, 0.5 * mean.mean, 1.5 * mean.mean, lambda geometry: put_in_force(pipeline, believed, geometry)
+    )
