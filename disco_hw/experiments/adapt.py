@@ -27,6 +27,7 @@ from disco_hw.log import records
 from disco_hw.log.reader import open_log
 from disco_hw.log.recorder import MemoryRecorder
 from disco_hw.model.file import load_model, model_text
+from disco_hw.reports.style import write_png
 from disco_hw.runtime.assembly import make_planner
 from disco_hw.runtime.robot_setup import Setup
 from disco_hw.runtime.supervisor import UserRequest
@@ -166,7 +167,7 @@ class AdaptResult:
             bottom.plot(at_s, truth, color="k", linestyle="--", label="truth")
             bottom.set(xlabel="time (s)", ylabel=f"{name} (m)")
             bottom.legend()
-        figure.savefig(path, dpi=120)
+        write_png(figure, path)
 
     def _mean(self, name: str, *, adapted: bool, after: bool) -> float:
         options = self.options

@@ -22,6 +22,7 @@ from disco_hw.control.settings import ROTATION, CommandLimits, DiscoSettings
 from disco_hw.errors import InputError
 from disco_hw.model import Model, Uniform
 from disco_hw.model.model import BASE_PARAMETERS
+from disco_hw.reports.style import write_png
 from disco_hw.tasks.circle import CircleCost, CircleTask
 
 SUBSTEP_S = 0.02
@@ -172,7 +173,7 @@ class CircleResult:
         right.set(xlabel="x (m)", ylabel="y (m)", title="Paths of the first seed", aspect="equal")
         left.legend()
         right.legend()
-        figure.savefig(path, dpi=120)
+        write_png(figure, path)
 
 
 def run_circle(

@@ -15,6 +15,7 @@ from rich.table import Table
 from disco_hw.errors import WorkError
 from disco_hw.log.reader import Log, open_log
 from disco_hw.log.records import Counters
+from disco_hw.reports.style import write_png
 from disco_hw.tasks.circle import CircleTask
 
 Array = NDArray[np.float64]
@@ -204,7 +205,7 @@ class CircleReport:
         )
         axes.grid(alpha=0.3)
         axes.legend(loc="center")
-        figure.savefig(path, dpi=110)
+        write_png(figure, path)
 
 
 def load_circle_report(

@@ -31,6 +31,7 @@ from disco_hw.gap.write_report import WRITTEN, gap
 from disco_hw.model import EffectSetting, Gaussian, Model
 from disco_hw.model.model import BASE_PARAMETERS
 from disco_hw.reports.outputs import as_json, refuse_directory
+from disco_hw.reports.style import BASELINE, MAIN, REFERENCE, write_png
 from disco_hw.runtime.assembly import make_planner
 from disco_hw.runtime.pipeline import NoPlanner
 from disco_hw.runtime.robot_setup import Setup, load_setup
@@ -40,7 +41,7 @@ from sim.effects import HiddenEffectError, parse_hidden_effects
 from sim.in_process import RobotInProcess
 
 RUNS = ("given", "geometry refitted", "amended")
-_COLOURS = {"given": "#b0b0b0", "geometry refitted": "#d98c3f", "amended": "#2f7fc1"}
+_COLOURS = {"given": REFERENCE, "geometry refitted": BASELINE, "amended": MAIN}
 _SETTLING_S = 20.0
 Progress = Callable[[str], None]
 
@@ -133,7 +134,7 @@ class GapExperimentResult:
         speed.axhline(task.speed_m_s, color="black", linewidth=0.6)
         speed.set_xlabel("time, s")
         speed.set_ylabel("speed, m/s")
-        figure.savefig(path, dpi=110)
+        write_png(figure, path)
 
 
 def run_gap_experiment(options: GapExperimentOptions, progress: Progress = lambda text: None) -> GapExperimentResult:

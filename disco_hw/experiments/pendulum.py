@@ -22,6 +22,7 @@ from disco_hw.control.kernel.layout import BLOCK, block_count
 from disco_hw.control.pendulum import PAPER_SAMPLER, PendulumPlanner, PendulumPoints
 from disco_hw.control.sigma_points import sigma_points
 from disco_hw.model import Belief, Gaussian, Uniform
+from disco_hw.reports.style import write_png
 
 Array = NDArray[np.float64]
 Progress = Callable[[str], None]
@@ -105,7 +106,7 @@ class PendulumResult:
             axes.fill_between(time_s, mean - deviation, mean + deviation, color=colours[name], alpha=0.15, linewidth=0)
         axes.set(xlabel="time (s)", ylabel="instant cost", title="Pendulum swing-up, mean and standard deviation")
         axes.legend()
-        figure.savefig(path, dpi=120)
+        write_png(figure, path)
 
 
 def run_pendulum(options: PendulumOptions | None = None, progress: Progress | None = None) -> PendulumResult:

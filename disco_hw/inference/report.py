@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import base64
 import html
-import io
 from collections.abc import Iterable
 from typing import Any
 
@@ -15,16 +13,10 @@ from numpy.typing import NDArray
 from disco_hw.inference.checks import CHECKS, LARGEST_DEVIATION, LEVELS
 from disco_hw.inference.infer import Inference
 from disco_hw.inference.simulate import NAMES
+from disco_hw.reports import style
+from disco_hw.reports.style import ALARM, MAIN
 
 Array = NDArray[np.float64]
-
-_COLOUR = "#1f6f8b"
-_ALARM = "#c0392b"
-_STYLE = """
-body { font: 15px/1.5 sans-serif; max-width: 60em; margin: 2em auto; padding: 0 1em; color: #222 }
-table { border-collapse: collapse } td, th { padding: .25em .9em .25em 0; text-align: left } td.n { text-align: right }
-img { max-width: 100% } .warn { border-left: 4px solid #c0392b; padding-left: .8em }
-"""
 
 
 def report_html(inference: Inference, posterior: dict[str, dict[str, Any]], warnings: Iterable[str]) -> str:
@@ -43,7 +35,6 @@ def report_html(inference: Inference, posterior: dict[str, dict[str, Any]], warn
     drive = inference.drive
     noise = inference.noise
     parts = [
-        "<h1>What the drive says about the robot</h1>",
         f"<p>{drive.duration_s:.0f} s, {drive.t_s.size} poses, driven by {drive.source}; "
         f"{inference.fitted.simulations} simulations, of which the posterior rests on "
         f"{inference.effective_simulations:.0f}; seed {inference.options.seed}.</p>",
@@ -51,18 +42,18 @@ def report_html(inference: Inference, posterior: dict[str, dict[str, Any]], warn
         "<table><tr><th></th><th>mean (m)</th><th>sd</th><th>5 %</th><th>95 %</th></tr>",
         rows,
         "</table>",
-        _picture(pairs_figure(inference.draws), "Marginals and pairs of the posterior"),
+        style.picture(style.png(pairs_figure(inference.draws)), "Marginals and pairs of the posterior"),
         "<h2>What stays open</h2>",
         "".join(f"<p>{html.escape(line)}</p>" for line in inference.undetermined)
         or "<p>Nothing: the log determines all three parameters.</p>",
         "<h2>Does the log look like the simulations?</h2>",
         "<p>Each bar is one way to differ from the model: how far the log is from simulations under the posterior, in "
         f"their standard deviations. Beyond {LARGEST_DEVIATION:g} the model lacks something.</p>",
-        _picture(predictive_figure(inference.predictive.deviations), "Posterior predictive check"),
+        style.picture(style.png(predictive_figure(inference.predictive.deviations)), "Posterior predictive check"),
         "<h2>Can the widths be trusted?</h2>",
         "<p>Fresh simulations at known parameters: the rank of the truth among posterior draws should be uniform "
         f"({uniform}), and a region of a given probability should hold the truth that often.</p>",
-        _picture(calibration_figure(calibration.ranks), "Simulation-based calibration"),
+        style.picture(style.png(calibration_figure(calibration.ranks)), "Simulation-based calibration"),
         f"<table><tr><th>region</th><th>holds the truth</th></tr>{coverage}</table>",
         "<h2>Noise of this log</h2>",
         f"<p>Pose sensor {1e3 * noise.position_m:.2g} mm and {np.degrees(noise.yaw_rad):.2g}&deg;; slip "
@@ -70,8 +61,7 @@ def report_html(inference: Inference, posterior: dict[str, dict[str, Any]], warn
         f"{np.degrees(noise.slip_yaw_rad_sqrt_s):.2g}&deg; in yaw per square root of a second. The simulations have "
         "the same.</p>",
     ]
-    title = "<title>infer report</title>"
-    return f'<!doctype html><html lang="en"><meta charset="utf-8">{title}<style>{_STYLE}</style>{"".join(parts)}</html>'
+    return style.page("What the drive says about the robot", "".join(parts))
 
 
 def pairs_figure(draws: Array) -> Figure:
@@ -85,10 +75,10 @@ def pairs_figure(draws: Array) -> Figure:
                 axis.axis("off")
                 continue
             if row == column:
-                axis.hist(draws[:, row], bins=40, color=_COLOUR, density=True)
+                axis.hist(draws[:, row], bins=40, color=MAIN, density=True)
                 axis.set_yticks([])
             else:
-                axis.plot(draws[:2000, column], draws[:2000, row], ".", ms=1.5, alpha=0.4, color=_COLOUR)
+                axis.plot(draws[:2000, column], draws[:2000, row], ".", ms=1.5, alpha=0.4, color=MAIN)
             if row == 2:
                 axis.set_xlabel(NAMES[column])
             if column == 0 and row:
@@ -101,7 +91,7 @@ def predictive_figure(deviations: Array) -> Figure:
     """A bar for each of `CHECKS`."""
     figure = Figure(figsize=(7.5, 4.0), layout="constrained")
     axis = figure.subplots()
-    colours = [_ALARM if abs(value) > LARGEST_DEVIATION else _COLOUR for value in deviations]
+    colours = [ALARM if abs(value) > LARGEST_DEVIATION else MAIN for value in deviations]
     axis.barh([check.name for check in CHECKS], deviations, color=colours)
     axis.axvspan(-LARGEST_DEVIATION, LARGEST_DEVIATION, color="#ddd", zorder=0)
     axis.invert_yaxis()
@@ -117,14 +107,7 @@ def calibration_figure(ranks: Array) -> Figure:
     spread = 1.96 * np.sqrt(expected * (1.0 - 1.0 / bins))
     for axis, name, column in zip(figure.subplots(1, 3), NAMES, ranks.T, strict=True):
         axis.axhspan(expected - spread, expected + spread, color="#ddd")
-        axis.hist(column, bins=bins, range=(0.0, 1.0), color=_COLOUR)
+        axis.hist(column, bins=bins, range=(0.0, 1.0), color=MAIN)
         axis.set_xlabel(f"rank of {name}", fontsize=8)
         axis.set_yticks([])
     return figure
-
-
-def _picture(figure: Figure, title: str) -> str:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=110)
-    data = base64.b64encode(buffer.getvalue()).decode()
-    return f'<img alt="{html.escape(title)}" src="data:image/png;base64,{data}">'

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable
 
 import numpy as np
@@ -18,11 +17,11 @@ from disco_hw.gap.search.analysis import GapAnalysis
 from disco_hw.gap.search.channel_search import ChannelResult
 from disco_hw.gap.search.cross_validation import PredictionErrors
 from disco_hw.gap.settings import GRID_STEP_S
+from disco_hw.reports.style import BASELINE, FLOOR, MAIN, REFERENCE, png
 
 Array = NDArray[np.float64]
 
-_COLOURS = {"nominal": "#b0b0b0", "refitted": "#d98c3f", "amended": "#2f7fc1", "floor": "#60a060"}
-_DPI = 110
+_COLOURS = {"nominal": REFERENCE, "refitted": BASELINE, "amended": MAIN, "floor": FLOOR}
 # Upper end of the axis of residuals, in units of the noise, at least.
 _LEAST_SHOWN = 4.0
 _STRETCH_S = 6.0
@@ -57,13 +56,6 @@ def _worst_stretch(wheels: ChannelResult) -> bytes:
     begin = int(np.argmax(np.convolve(size, np.ones(width), "valid")))
     part = slice(begin, begin + width)
     return stretch(drive.t_s[part], drive.speed_rad_s[part, 0], before[part, 0], after[part, 0], "left wheel, rad/s")
-
-
-def png(figure: Figure) -> bytes:
-    """A figure as bytes."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=_DPI, bbox_inches="tight")
-    return buffer.getvalue()
 
 
 def _legend_above(axes: Axes) -> None:

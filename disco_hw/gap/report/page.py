@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import math
 from collections.abc import Iterable, Sequence
 from html import escape
@@ -10,6 +9,7 @@ from html import escape
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.report.findings import STAGES, EffectFinding, GapReport, UnnamedFinding
 from disco_hw.gap.search.cross_validation import PredictionErrors
+from disco_hw.reports import style
 
 
 def sentence(effect: EffectFinding) -> str:
@@ -78,14 +78,6 @@ def _confounded(finding: EffectFinding | UnnamedFinding) -> str:
     return f" (not to be told from {same})" if same else ""
 
 
-_STYLE = """
-body{font:16px/1.5 system-ui,sans-serif;max-width:60rem;margin:2rem auto;padding:0 1rem;color:#222}
-.answer p{font-size:1.25rem;margin:.3rem 0}
-table{border-collapse:collapse;margin:.6rem 0}td,th{padding:.2rem .8rem;text-align:left;border-bottom:1px solid #ddd}
-td.n{text-align:right;font-variant-numeric:tabular-nums}img{max-width:100%}
-figure{margin:1.2rem 0}figcaption{color:#555;font-size:.9rem}h2{margin-top:2rem}
-"""
-
 _CAPTIONS = {
     "gap_by_horizon": "How far predictions are off, by how far ahead they look, on data not used for fitting; shaded: "
     "95 % intervals. The dashed line is what noise alone makes.",
@@ -102,7 +94,9 @@ def page(report: GapReport) -> str:
         f'<div class="answer">{"".join(f"<p>{escape(line)}</p>" for line in answer(report))}</div>',
         f"<p>Verdict: <b>{report.verdict}</b>. Logs: {escape(', '.join(report.sources))}.</p>",
     ]
-    parts += [_picture(name, picture) for name, picture in report.pictures.items()]
+    parts += [
+        style.picture(data, name, _CAPTIONS.get(name, name.replace("_", " "))) for name, data in report.pictures.items()
+    ]
     if report.gap:
         parts.append("<h2>The gap by what the robot was doing</h2>" + _by_regime(report))
     parts.append("<h2>What is missing</h2>")
@@ -115,21 +109,7 @@ def page(report: GapReport) -> str:
     parts.append("<h2>What this log could not have shown</h2>" + _blind(report))
     if report.notes:
         parts.append("<h2>Notes</h2>" + _list(report.notes))
-    body = "\n".join(parts)
-    title = "What the model misses"
-    return (
-        f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{title}</title>'
-        f"<style>{_STYLE}</style></head><body><h1>{title}</h1>{body}</body></html>"
-    )
-
-
-def _picture(name: str, picture: bytes) -> str:
-    data = base64.b64encode(picture).decode("ascii")
-    caption = _CAPTIONS.get(name, name.replace("_", " "))
-    return (
-        f'<figure><img alt="{escape(name)}" src="data:image/png;base64,{data}">'
-        f"<figcaption>{escape(caption)}</figcaption></figure>"
-    )
+    return style.page("What the model misses", "\n".join(parts))
 
 
 def _list(items: Iterable[str]) -> str:

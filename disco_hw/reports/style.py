@@ -1,0 +1,52 @@
+"""The look of every report: one page with one style sheet, pictures inside it, one resolution, one set of colours."""
+
+from __future__ import annotations
+
+import base64
+import io
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+DPI = 110
+MAIN, ALARM, REFERENCE, BASELINE, FLOOR = "#2f7fc1", "#c0392b", "#b0b0b0", "#d98c3f", "#60a060"
+"""Colours of what a picture is about, what is wrong, what it started from, the next best, and what noise leaves."""
+
+_STYLE_SHEET = """
+body{font:15px/1.5 system-ui,sans-serif;max-width:60rem;margin:2rem auto;padding:0 1rem;color:#222}
+.answer{font-size:1.2rem;background:#f2f6fa;border-left:4px solid #2f7fc1;padding:.8rem 1rem}.answer p{margin:.2rem 0}
+.warn{border-left:4px solid #c0392b;padding-left:.8rem}
+table{border-collapse:collapse;margin:.6rem 0}td,th{padding:.2rem .8rem;text-align:left;border-bottom:1px solid #ddd}
+td.n{text-align:right;font-variant-numeric:tabular-nums}img{max-width:100%}
+figure{margin:1.2rem 0}figcaption{color:#555;font-size:.9rem}h2{margin-top:2rem}
+"""
+
+
+def page(title: str, body: str) -> str:
+    """A self-contained HTML page under its title; `body` is HTML."""
+    return (
+        f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title>'
+        f"<style>{_STYLE_SHEET}</style></head><body><h1>{escape(title)}</h1>{body}</body></html>"
+    )
+
+
+def picture(data: bytes, name: str, caption: str = "") -> str:
+    """A PNG's bytes as HTML, with a text for who cannot see it and a caption, if any, below."""
+    encoded = base64.b64encode(data).decode("ascii")
+    below = f"<figcaption>{escape(caption)}</figcaption>" if caption else ""
+    return f'<figure><img alt="{escape(name)}" src="data:image/png;base64,{encoded}">{below}</figure>'
+
+
+def png(figure: Figure) -> bytes:
+    """A figure as a PNG's bytes, cut to what is drawn."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=DPI, bbox_inches="tight")
+    return buffer.getvalue()
+
+
+def write_png(figure: Figure, path: Path) -> None:
+    """Write a figure to a PNG file. Raises OSError."""
+    path.write_bytes(png(figure))
