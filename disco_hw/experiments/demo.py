@@ -27,7 +27,7 @@ from disco_hw.config import load_robot_config
 from disco_hw.daemon.realtime import stolen_ms
 from disco_hw.errors import InputError, WorkError
 from disco_hw.experiments.circle_report import CircleReport, load_circle_report
-from disco_hw.experiments.live_stack import Operator, disco_hw_process, stands
+from disco_hw.experiments.live_stack import READY_TIMEOUT_S, Operator, disco_hw_process, stands
 from disco_hw.tasks.circle import circle_task
 from disco_hw.viewer.address import DEFAULT_PORT, LOOPBACK, TOKEN_VARIABLE, page_address, page_token
 from drivers.motor import motor_drivers
@@ -35,7 +35,7 @@ from drivers.pose.udp import SOURCE as UDP_POSES
 
 _DEVICES = {driver.name: driver.example for driver in motor_drivers().values() if driver.example}
 """By name of a driver whose controller can be simulated: the lines of [link] that it needs."""
-_START_TIMEOUT_S = 90.0
+_START_TIMEOUT_S = READY_TIMEOUT_S
 _POLL_S = 0.1
 _STOP_TIMEOUT_S = 10.0
 _STALL_MS = 100

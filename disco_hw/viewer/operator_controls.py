@@ -89,9 +89,13 @@ class Desk:
         except ConnectionClosed:
             pass
         finally:
-            telling.cancel()
+            # What was asked for, be it the last word, is asked all the same; only nobody waits for the answer any more.
+            await asyncio.sleep(0)
+            for task in (telling, *replies):
+                task.cancel()
             self._end_watching()
             await drive.let_go()
+            await asyncio.gather(telling, *replies, return_exceptions=True)
 
     def close(self) -> None:
         """End the threads; safe to call twice."""
@@ -101,9 +105,9 @@ class Desk:
     async def _ask(self, request: dict[str, Any], send: Send) -> None:
         loop = asyncio.get_running_loop()
         if request["do"] == "estop":
-            reply = await loop.run_in_executor(self._stopping, self.estop)
+            reply = await asyncio.shield(loop.run_in_executor(self._stopping, self.estop))
         elif request["do"] in REQUESTS:
-            reply = await loop.run_in_executor(self._asking, self.request, request)
+            reply = await asyncio.shield(loop.run_in_executor(self._asking, self.request, request))
         else:
             reply = {"do": request["do"], "ok": False, "error": "this page has no such request"}
         try:

@@ -1,5 +1,6 @@
 """The desk's way to the daemon, over a real page server and a real control socket."""
 
+import asyncio
 import json
 import os
 import pty
@@ -19,6 +20,7 @@ from disco_hw.viewer.operator_controls import Desk, shown
 from disco_hw.viewer.server import serving
 from firmware_protocol.codec import Codec
 from firmware_protocol.serial_framing import encode_frame
+from tests.drivers.waiting import wait_until
 from tests.viewer.test_server import get
 from tools.viewer_run import ROBOT_FILE
 
@@ -302,3 +304,34 @@ def test_a_latched_stop_and_a_drive_by_page_are_shown():
     assert said["estop"]
     assert "latched" in said["advice"][0]
     assert said["drive"] == {"by_page": True, "driving": False}
+
+
+def test_a_request_still_unanswered_when_the_browser_goes_goes_on_and_leaves_no_task(daemon, monkeypatch):
+    tasks, answer, asked, answered = [], Desk._ask, threading.Event(), threading.Event()
+
+    async def watched(self, *arguments):
+        tasks.append(asyncio.current_task())
+        await answer(self, *arguments)
+
+    def unanswered(_, request):
+        asked.set()
+        return {"ok": answered.wait(10.0)}
+
+    monkeypatch.setattr(Desk, "_ask", watched)
+    monkeypatch.setattr(Desk, "request", unanswered)
+    with desk_of(daemon.server.path) as (_, port):
+        with line_to(port) as line:
+            line.send(json.dumps({"do": "disarm"}))
+            assert asked.wait(10.0)
+        wait_until(tasks[0].done, 5.0)
+        answered.set()
+
+
+def test_an_estop_that_is_the_last_word_of_a_browser_is_made(daemon, monkeypatch):
+    stops = []
+    monkeypatch.setattr(Desk, "estop", lambda _: stops.append(True) or {"ok": True})
+    with desk_of(daemon.server.path) as (_, port):
+        for count in range(1, 11):
+            with line_to(port) as line:
+                line.send(json.dumps({"do": "estop"}))
+            wait_until(lambda count=count: len(stops) == count, 5.0)
