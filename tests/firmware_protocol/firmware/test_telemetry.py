@@ -8,10 +8,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from firmware_protocol import _firmware
 from firmware_protocol.codec import PROTOCOL_MAJOR, PROTOCOL_MINOR
 from firmware_protocol.firmware_core import FirmwareInputs
 from tests.firmware_protocol.bench import CODEC, CONFIG, MS, Bench
 
+lib, ffi = _firmware.lib, _firmware.ffi
 PERIODS_MS = {
     "WHEEL_SPEED": 10,
     "WHEEL_TICKS": 10,
@@ -514,6 +516,76 @@ def test_a_deviation_that_does_not_fit_makes_the_pose_not_valid(position_std_m, 
     assert seen["valid"] == valid
     assert seen["position_std"] == pytest.approx(min(position_std_m, 0.255))
     assert seen["yaw_std"] == pytest.approx(min(yaw_std_rad, 0.255))
+
+
+def in_units(x, y, yaw, position_std=0.0, yaw_std=0.0):
+    made = lib.disco_pose(x, y, yaw, position_std, yaw_std)
+    return bool(made.valid), (made.x, made.y, made.yaw, made.position_std, made.yaw_std)
+
+
+def test_a_board_that_reckons_in_floats_gets_the_units_of_the_frames():
+    assert in_units(1.23456, -800.0, -3.14159, 0.0104, 0.0206) == (True, (12346, -8_000_000, -31416, 10, 21))
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("place", range(5))
+def test_a_pose_in_floats_that_is_not_finite_fits_nowhere(bad, place):
+    values = [0.0] * 5
+    values[place] = bad
+    valid, units = in_units(*values)
+    # An infinite deviation is one beyond its frame.
+    assert not valid or units[place] > 255
+
+
+@pytest.mark.parametrize("place", [3, 4])
+def test_a_deviation_in_floats_below_zero_is_not_valid(place):
+    values = [0.0] * 5
+    values[place] = -0.001
+    assert not in_units(*values)[0]
+
+
+def sent_pose(**changes):
+    """What becomes of a pose in units that comes to the core."""
+    bench = Bench()
+    units = {"x": 0, "y": 0, "yaw": 0, "position_std": 0, "yaw_std": 0, "valid": True} | changes
+    lib.disco_firmware_pose(bench.core._core, ffi.new("disco_pose_t *", units), 0)
+    bench.step()
+    values = last(bench, "POSE_POSITION") | last(bench, "POSE_HEADING")
+    return int(values["valid"]), values
+
+
+FARTHEST = {"x": 0x7FFFFF, "y": 0x7FFFFF, "yaw": 0x7FFF}
+
+
+@pytest.mark.parametrize("name", FARTHEST)
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_pose_in_units_is_valid_to_the_edge_of_its_frames(name, sign):
+    scale = 0.0001
+    valid, values = sent_pose(**{name: sign * FARTHEST[name]})
+    assert (valid, values[name]) == (1, pytest.approx(sign * FARTHEST[name] * scale))
+    valid, values = sent_pose(**{name: sign * (FARTHEST[name] + 1)})
+    assert valid == 0
+    for beyond in (FARTHEST[name] + 2, 2**31 - 1):
+        valid, values = sent_pose(**{name: sign * beyond})
+        edge = FARTHEST[name] if sign > 0 else -FARTHEST[name] - 1
+        assert (valid, values[name]) == (0, pytest.approx(edge * scale))
+
+
+@pytest.mark.parametrize("name", ["position_std", "yaw_std"])
+def test_a_deviation_in_units_is_valid_to_the_edge_of_its_frame(name):
+    assert [sent_pose(**{name: value})[0] for value in (255, 256, 65535)] == [1, 0, 0]
+    assert sent_pose(**{name: 65535})[1][name] == pytest.approx(0.255)
+
+
+def test_a_pose_that_its_sensor_calls_lost_is_sent_as_not_valid():
+    assert sent_pose(valid=False)[0] == 0
+
+
+def test_timeouts_beyond_their_frame_end_at_its_edge():
+    bench = Bench(dataclasses.replace(CONFIG, drive_off_timeout_s=100.0, command_timeout_s=0.0204))
+    bench.run(4)
+    assert last(bench, "LIMITS")["drive_off_timeout"] == pytest.approx(65.535)
+    assert last(bench, "LIMITS")["command_timeout"] == pytest.approx(0.020)
 
 
 def test_pose_counters():
