@@ -33,7 +33,7 @@ _STARTING_S = 60.0
 
 @dataclass(frozen=True, slots=True)
 class Learnt:
-    """What adaptation has to tell of a tick: records for the log, sentences for a person."""
+    """What adaptation reports of a tick: records for the log, sentences for a person."""
 
     records: tuple[records.Record, ...] = ()
     events: tuple[str, ...] = ()
@@ -43,7 +43,7 @@ _NOTHING = Learnt()
 
 
 class GeometryAdaptation(Protocol):
-    """Asked before and told after each tick of the core; no call waits for anything."""
+    """Called before and after each tick of the core; no call waits for anything."""
 
     def step(self, now_ns: int) -> Learnt:
         """Take in what was learnt, and put in force what passed the checks."""
@@ -146,7 +146,7 @@ class CheckedAdaptation:
         return Learnt(tuple(found), tuple(events))
 
     def feed(self, now_ns: int, readings: Readings) -> None:
-        """Hand on what the tick received; a message goes with every tick, as it also tells the time."""
+        """Hand on what the tick received; a message goes with every tick, as it also carries the time."""
         self._link.send(
             Samples(
                 now_ns,
@@ -199,7 +199,7 @@ class CheckedAdaptation:
         self._link.close()
 
     def _begin(self, now_ns: int) -> None:
-        """Tell an adapter that knows nothing yet what it is about."""
+        """Send a new adapter the settings and the belief that it starts from."""
         mean, low, high = (tuple(values.tolist()) for values in (self._model.mean, self._guard.low, self._guard.high))
         self._link.send(Range(mean, low, high, self._wheel_rad_s))
         self._tell(now_ns, self._model, adapted=False)

@@ -41,8 +41,8 @@ def infer(
     from disco_hw.inference.commands import infer_command
     from disco_hw.inference.infer import InferOptions
 
-    with progress_bar() as tell:
-        result = infer_command(logs, robot, out, report, InferOptions(paper, simulations, seed), dask, tell)
+    with progress_bar() as report_progress:
+        result = infer_command(logs, robot, out, report, InferOptions(paper, simulations, seed), dask, report_progress)
     print_result(result.as_dict(), as_json, result.as_text())
 
 

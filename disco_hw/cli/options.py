@@ -40,16 +40,16 @@ def progress_bar() -> Iterator[Callable[[str, float], None]]:
     columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         work = bar.add_task("", total=1.0)
-        told = ""
+        shown = ""
 
-        def tell(stage: str, share: float) -> None:
-            nonlocal told
+        def report(stage: str, share: float) -> None:
+            nonlocal shown
             bar.update(work, description=stage, completed=share)
-            if stage != told and not console.is_terminal:
+            if stage != shown and not console.is_terminal:
                 progress_line(stage)
-            told = stage
+            shown = stage
 
-        yield tell
+        yield report
 
 
 def print_result(result: dict[str, Any], as_json: bool, text: str) -> None:

@@ -122,7 +122,7 @@ def ctl(
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Tell the running daemon what to do, or ask how it is."""
+    """Send the running daemon a command, or ask for its status."""
     from disco_hw.daemon.client import ask, in_words
 
     reply = ask(robot, do, changes or (), unrecorded)

@@ -69,7 +69,7 @@ def _choices(types: Sequence[inspect.Type]) -> list[str]:
 
 
 def _tags(types: Sequence[inspect.Type], field: str) -> list[str]:
-    """The values of the field that tells structs of a union apart."""
+    """The values of the field that distinguishes the structs of a union."""
     name = field.rpartition(".")[2]
     return [str(one.tag) for one in types if isinstance(one, inspect.StructType) and one.tag_field == name]
 

@@ -18,7 +18,7 @@ class AsyncPrinter:
     """Writes a line for each sentence to a descriptor, from a thread of its own: called as `teller(topic, text)`.
 
     Who holds the output, by Ctrl-S, a pager or a connection that hangs, would hold up the control loop with it. What
-    comes while a thousand lines wait is dropped and counted; a reader that has gone is told nothing more. The thread
+    comes while a thousand lines wait is dropped and counted; a reader that has gone gets nothing more. The thread
     begins with the first sentence, and so has the priority of who says that: one of normal priority could be set aside
     with the interpreter's lock in its hand, and the loop with it.
     """
@@ -74,7 +74,7 @@ class Waiting:
         self._repeated = 0
 
     def is_worth_saying(self, state: State, words: str) -> bool:
-        """Tell whether these words of this state should be said now."""
+        """Whether these words of this state should be said now."""
         if words != self._said:
             self._said, self._repeated = words, 0
             return True

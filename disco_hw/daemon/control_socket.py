@@ -66,7 +66,7 @@ class ControlServer:
     """The daemon's end. `poll()` for requests in each tick, e-stop first; `reply()` to each.
 
     Raises InputError if another daemon serves this socket, or the path cannot be used. What a dead daemon left behind
-    is replaced: whether one lives is told by a record lock, which the kernel drops with the process, however it ends.
+    is replaced: a record lock shows whether one lives, which the kernel drops with the process, however it ends.
     """
 
     def __init__(self, path: Path, actions: Collection[str], allowed_uids: Collection[int] | None = None) -> None:

@@ -87,8 +87,8 @@ class DaemonOptions:
 def run_daemon(options: DaemonOptions) -> int:
     """Run until SIGTERM, SIGINT or a quit request; returns the exit code, with the robot told to stop.
 
-    Raises InputError, before anything is opened, if a file or an option is wrong. An exception in the loop is told, the
-    robot stopped, and the exception passed on.
+    Raises InputError, before anything is opened, if a file or an option is wrong. An exception in the loop is reported,
+    the robot stopped, and the exception passed on.
     """
     setup = load_setup(options.robot, options.model, options.link)
     if not options.accept_missing_effects:
@@ -226,7 +226,7 @@ class Daemon:
         self._told_ready = False
 
     def run(self) -> int:
-        """Run the loop until told to stop; returns the exit code. An exception ends it and is told, never swallowed."""
+        """Run the loop until told to stop; returns the exit code. An exception is reported and ends it."""
         try:
             self._loop.run(self._tick, lambda: self._quit or self._signals.received is not None or self._pilot.done)
         except Exception as error:
@@ -286,12 +286,12 @@ class Daemon:
             elif message.action == "task":
                 self._change_task(message)
         wanted = self._pilot.step(now_ns, self._core.last)
-        told = tuple(records.Event(now_ns, "info", "drive", text) for text in wanted.events)
+        events = tuple(records.Event(now_ns, "info", "drive", text) for text in wanted.events)
         mark("control")
         tick = self._core.tick(
             now_ns,
             (*requests, *wanted.requests),
-            (self._timing(now_ns), *self._mind_recorder(now_ns), *self._every_second(now_ns), *self._fan, *told),
+            (self._timing(now_ns), *self._mind_recorder(now_ns), *self._every_second(now_ns), *self._fan, *events),
             mark,
             wanted.motion,
         )

@@ -95,7 +95,7 @@ class ViewerFeed:
             del self._pending[:-_MOST_RECORDS]
 
     def _notice_watchers(self) -> None:
-        """A first page subscribes, the last one leaves: the socket tells of both."""
+        """A first page subscribes, the last one leaves: the socket reports both."""
         with contextlib.suppress(zmq.Again):
             while True:
                 self._watched = self._socket.recv(zmq.NOBLOCK)[:1] == b"\x01"

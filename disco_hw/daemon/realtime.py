@@ -90,12 +90,12 @@ def stolen_ms(statistics: Path = Path("/proc/stat")) -> int:
 
 
 def can_use_fifo() -> bool:
-    """Tell whether SCHED_FIFO is allowed to this process, without using it."""
+    """Whether SCHED_FIFO is allowed to this process, without using it."""
     return _has_capability(_CAP_SYS_NICE) or resource.getrlimit(resource.RLIMIT_RTPRIO)[0] != 0
 
 
 def can_lock_memory() -> bool:
-    """Tell whether all memory, present and future, may be locked, without locking it."""
+    """Whether all memory, present and future, may be locked, without locking it."""
     unlimited = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] == resource.RLIM_INFINITY
     return _has_capability(_CAP_IPC_LOCK) or unlimited
 

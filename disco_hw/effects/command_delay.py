@@ -38,7 +38,7 @@ EFFECT = Effect(
     name="command_delay",
     channel=Channel.COMMAND_TO_WHEEL,
     stage=Stage.DELAY,
-    # A host that stamps commands or encoders late shows as a negative delay; better told than hidden in noise.
+    # A host that stamps commands or encoders late shows as a negative delay; better reported than hidden in noise.
     parameters=(Parameter("delay_s", "s", 0.0, 1.0, 0.05, realistic=0.04, least_fitted=-0.05),),
     plain=plain,
     coefficients=coefficients,

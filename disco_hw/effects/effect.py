@@ -66,8 +66,8 @@ class Stage(enum.Enum):
     TURN = "turn"
     LATERAL = "lateral speed that comes on top (m/s), None where the effect is absent"
     WORLD = "x and y (m) after the step"
-    ENCODERS = "angles or speeds of the wheels, left and right, as the encoders tell them"
-    POSE = "x, y and yaw as the pose sensor tells them"
+    ENCODERS = "angles or speeds of the wheels, left and right, as the encoders report them"
+    POSE = "x, y and yaw as the pose sensor reports them"
     POSE_TIME = "when a pose with the time stamp time_s was true"
     TERMS = "a command or a velocity of the body, by one of the terms without a name"
 
@@ -162,7 +162,7 @@ class Scan:
 
 @dataclass(frozen=True, slots=True)
 class Mimicked:
-    """Another effect, by the module that holds it, that no drive tells from this one, and what does (`decided_by`).
+    """Another effect, by its module, confounded with this one in every drive, and what decides (`decided_by`).
 
     `seen_too_as` is the effect of the other channel that the same cause shows as, if it shows in two; `seen_too` the
     value that its first parameter then has, from the values of the mimicked effect.
@@ -196,13 +196,13 @@ class Effect:
     (L, P) in the order of `parameters`, `base` (L, 3) the geometry; arrays of shape (L,). `order` is the place among
     the effects of a stage, ascending.
 
-    How it is told: `sentence` for a report, with `{parameter}` fields; `excitation`, the manoeuvre that shows it, and
-    `script`, the one of `disco-hw drive --script` that drives it; `symptoms`.
+    How it is reported: `sentence` for a report, with `{parameter}` fields; `excitation`, the manoeuvre that shows it,
+    and `script`, the one of `disco-hw drive --script` that drives it; `symptoms`.
 
     Traits: `uses_geometry`, whether its coefficients depend on the geometry; `may_turn_more`, whether it can make the
     robot turn faster than its wheels say; `late_by`, the parameter that is a time by which wheels are behind commands,
-    fitted from `late_starts`; `like_a_patch`, what tells it from a patch of the floor if that leaves the same traces;
-    `mimics`, an effect that competes in its place.
+    fitted from `late_starts`; `like_a_patch`, what decides between it and a patch of the floor if that leaves the same
+    traces; `mimics`, an effect that competes in its place.
 
     How it is searched for: all parameters from neutral; or from the best of `starts` for a drive; or one by a `scan`.
     `limited(commands, geometry)` is, for a limit, what it limits, (N,); `trials` are sizes to try in turn where it is

@@ -308,7 +308,7 @@ START = (0.75, 0.0, 1.5707963)
 @dataclass(frozen=True, slots=True)
 class LiveDrive:
     """Mean tracking costs on the plant's truth, over 20 s before the change and from 20 s after it on; what changed, by
-    its size before, as the robot believed it at last, how long after the change (s) it was first told, and what the
+    its size before, as the robot believed it at last, how long after the change (s) it was first reported, and what the
     loop missed.
     """
 

@@ -1,6 +1,6 @@
 """The paper's circle experiment, in simulation: what knowing the parameters' distribution is worth (second figure).
 
-The plant's parameters are drawn from the posterior. The paper does not tell the control period, the wheel limits, the
+The plant's parameters are drawn from the posterior. The paper does not state the control period, the wheel limits, the
 lag or the noise of its robot: they are options here, and part of the result.
 """
 
@@ -179,7 +179,7 @@ class CircleResult:
 def run_circle(
     model: Model, mode: str = "default", options: CircleOptions | None = None, progress: Progress | None = None
 ) -> CircleResult:
-    """Drive the circle with each curve's knowledge, over all seeds; `progress` is told after each curve.
+    """Drive the circle with each curve's knowledge, over all seeds; `progress` is called after each curve.
 
     `model` holds the posterior that the plants are drawn from; the prior is the paper's. Raises InputError for a model
     without a belief over the three base parameters.

@@ -138,7 +138,7 @@ class Attendant:
 
 
 class LogReader:
-    """Takes the place of the recorder and keeps, of what is recorded, what tells of trouble."""
+    """Takes the place of the recorder and keeps, of what is recorded, what shows trouble."""
 
     def __init__(self) -> None:
         self.counts: dict[str, int] = {}
@@ -148,7 +148,7 @@ class LogReader:
         self._sums: dict[str, int] = {}
 
     def put(self, now_ns: int, recorded: Sequence[records.Record]) -> None:
-        """Keep what tells of trouble."""
+        """Keep what shows trouble."""
         self.ticks += 1
         for record in recorded:
             if isinstance(record, records.Event):

@@ -110,7 +110,7 @@ class PendulumResult:
 
 
 def run_pendulum(options: PendulumOptions | None = None, progress: Progress | None = None) -> PendulumResult:
-    """Run all curves over all seeds; `progress` is told, in words, after each curve."""
+    """Run all curves over all seeds; `progress` is called with a text after each curve."""
     options = options or PendulumOptions()
     costs = {}
     for name in CURVES:

@@ -89,7 +89,7 @@ class NoiseSettings:
     calm_s: float = 0.05
     """Half the span over which measured speeds are averaged for the quick error. Chosen."""
     steady_s: float = 0.25
-    """Half the span over which they are averaged where no model tells what to expect. Chosen."""
+    """Half the span over which they are averaged where there is no model to say what to expect. Chosen."""
     fewest_steady: int = 3
     """At least so many samples either side then. Chosen."""
     huber: float = 3.0
@@ -308,7 +308,7 @@ class ReportSettings:
     form_sigmas: float = 1.96
     """An effect has another form than its name's if this sure. Literature: 95 % of the normal distribution."""
     largest_ratio: float = 9.9
-    """Ratios of strength beyond are not told apart. Chosen."""
+    """Ratios of strength beyond are not distinguished. Chosen."""
     lever_m: float = 0.2
     """Lever by which yaw rates are compared with speeds. Chosen."""
 

@@ -25,7 +25,7 @@ from disco_hw.inference.dask_workers import dask_workers
 from disco_hw.inference.excitation import excitation
 from disco_hw.inference.infer import Inference, InferOptions, infer
 from disco_hw.inference.simulate import NAMES
-from disco_hw.inference.workers import LocalWorkers, Tell, Workers
+from disco_hw.inference.workers import LocalWorkers, ReportProgress, Workers
 from disco_hw.log.drive import DriveLog
 from disco_hw.log.load import load_drive
 from disco_hw.model import Model, save_model
@@ -199,7 +199,7 @@ def infer_command(
     report: Path | None = None,
     options: InferOptions | None = None,
     dask: str | None = None,
-    tell: Tell = lambda *_: None,
+    report_progress: ReportProgress = lambda *_: None,
     search: Search = gap_check_beside,
 ) -> InferResult:
     """Infer the geometry from logs; write the model to `out` and, if asked for, a page with pictures to `report`.
@@ -219,8 +219,8 @@ def infer_command(
     nominal = Model.nominal(config.robot)
     excitation(drive)
     with search(drive, nominal) as searched, _workers(dask) as workers:
-        inference = infer(drive, config, options, tell, workers)
-        tell("search for missing effects", 1.0)
+        inference = infer(drive, config, options, report_progress, workers)
+        report_progress("search for missing effects", 1.0)
         found = searched()
     result = InferResult(inference, found, tuple(logs), robot, out, perf_counter() - began)
     if out is not None:

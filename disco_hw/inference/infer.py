@@ -20,11 +20,11 @@ from disco_hw.inference.checks import Calibration, Predictive, calibrate, effect
 from disco_hw.inference.density_network import Mixtures, NetworkSettings
 from disco_hw.inference.estimates import estimates, paper_statistics
 from disco_hw.inference.excitation import Excitation, excitation
+from disco_hw.inference.identifiability import undetermined
 from disco_hw.inference.noise import USUAL, Noise, measured_noise
 from disco_hw.inference.rounds import Fitted, Region, RoundSettings, run_rounds
 from disco_hw.inference.simulate import NAMES, Seeds, Simulator, Summary, draw_seeds, physical_range
-from disco_hw.inference.undetermined import undetermined
-from disco_hw.inference.workers import Tally, Tell, Workers
+from disco_hw.inference.workers import ReportProgress, Tally, Workers
 from disco_hw.log.drive import DriveLog
 from disco_hw.model import Gaussian, Mixture, Model
 
@@ -92,13 +92,13 @@ def infer(
     log: DriveLog,
     robot: RobotConfig,
     options: InferOptions | None = None,
-    tell: Tell = lambda *_: None,
+    report_progress: ReportProgress = lambda *_: None,
     workers: Workers | None = None,
 ) -> Inference:
     """Infer x_icr, wheel radius and axial distance from a drive; pure for a given seed, but for the time it takes.
 
-    `workers` run simulations and fits, by default on all cores; the result is the same. `tell` hears how far it is.
-    Raises InputError for a drive or options from which nothing can be inferred.
+    `workers` run simulations and fits, by default on all cores; the result is the same. `report_progress` gets stage
+    and share done. Raises InputError for a drive or options from which nothing can be inferred.
     """
     began = perf_counter()
     options = options or InferOptions()
@@ -116,7 +116,7 @@ def infer(
     summary: Summary = paper_statistics(drive) if options.paper else estimates(drive, noise)
     simulator = Simulator(nominal, drive, noise, known.factor)
     observed = summary(drive.pose[None])[0]
-    tally = Tally(simulations + PREDICTIVE_SIMULATIONS + CALIBRATION_SIMULATIONS, tell)
+    tally = Tally(simulations + PREDICTIVE_SIMULATIONS + CALIBRATION_SIMULATIONS, report_progress)
 
     def simulate(theta: Array, seeds: Seeds) -> Array:
         return simulator.summaries(theta, seeds, summary, workers, tally.add)

@@ -35,15 +35,15 @@ class LocalWorkers:
         return work(*arguments)
 
 
-Tell = Callable[[str, float], None]
+ReportProgress = Callable[[str, float], None]
 
 
 class Tally:
-    """Counts simulations of `total` and tells the stage with the share that is done, in [0, 1]."""
+    """Counts simulations of `total` and reports the stage with the share that is done, in [0, 1]."""
 
-    def __init__(self, total: int, tell: Tell) -> None:
+    def __init__(self, total: int, report_progress: ReportProgress) -> None:
         self._total = total
-        self._tell = tell
+        self._report_progress = report_progress
         self._done = 0
         self._stage = ""
 
@@ -55,4 +55,4 @@ class Tally:
     def add(self, count: int) -> None:
         """So many more simulations are done."""
         self._done += count
-        self._tell(self._stage, min(self._done / self._total, 1.0))
+        self._report_progress(self._stage, min(self._done / self._total, 1.0))

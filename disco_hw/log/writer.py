@@ -298,7 +298,7 @@ def _write(start: Start, launch: Launch, connection: socket.socket) -> None:
 
 
 def _say(channel: socket.socket, word: Started | Ended) -> None:
-    """Tell the recorder; one that is gone or does not read costs nothing."""
+    """Report to the recorder; one that is gone or does not read costs nothing."""
     with contextlib.suppress(OSError):
         channel.send(msgspec.msgpack.encode(word), socket.MSG_DONTWAIT)
 

@@ -152,7 +152,7 @@ class DaemonCore:
         return self.last
 
     def _follow_link(self, now_ns: int) -> None:
-        """Tell the driver when the link comes and goes; a link renewed between two ticks is both."""
+        """Notify the driver when the link comes and goes; a link renewed between two ticks is both."""
         up = self.transport.state is LinkState.UP
         renewed = self.transport.generation != self._generation
         if self._link_up and (not up or renewed):
@@ -214,18 +214,18 @@ class DaemonCore:
 
     def _planner_events(self, result: Tick) -> tuple[str, ...]:
         """Say when the planner begins and ceases to fail, or to plan from too few samples, not in every tick."""
-        told: list[str] = []
+        events: list[str] = []
         failing = result.planner_failure is not None
         if failing != self._planner_failing:
-            told.append(f"planner: {result.planner_failure}" if failing else "planner: recovered")
+            events.append(f"planner: {result.planner_failure}" if failing else "planner: recovered")
         self._planner_failing = failing
         if result.plan is not None:
             found = result.plan.diagnostics
             if found.collapsed != self._planner_collapsed:
                 few = f"planner: plans hang on {found.ess:.1f} effective samples, too few to be trusted"
-                told.append(few if found.collapsed else "planner: enough effective samples again")
+                events.append(few if found.collapsed else "planner: enough effective samples again")
             self._planner_collapsed = found.collapsed
-        return tuple(told)
+        return tuple(events)
 
     def _state_change(self, now_ns: int, output: Output) -> list[records.Record]:
         """The record of a change of state or of what is said of it, in the tick in which it happens."""

@@ -13,7 +13,7 @@ from disco_hw.runtime.supervisor import Reply, UserRequest
 
 @dataclass(frozen=True, slots=True)
 class PilotTick:
-    """What a pilot wants of one tick: requests as a person makes them, the motion, and what is to be told."""
+    """What a pilot wants of one tick: requests as a person makes them, the motion, and events to record."""
 
     requests: tuple[UserRequest, ...] = ()
     motion: Motion = FollowTask()  # noqa: RUF009 - it is frozen and empty
@@ -21,7 +21,7 @@ class PilotTick:
 
 
 class Pilot(Protocol):
-    """Asked once before and told once after each tick; it never waits and never raises on what a person does."""
+    """Called once before and once after each tick; it never waits and never raises on what a person does."""
 
     @property
     def needs_pose(self) -> bool:

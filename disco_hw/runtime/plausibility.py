@@ -1,7 +1,7 @@
 """Does the robot do what it should: wheels follow commands, the supply holds, poses change when the robot moves.
 
-Nothing is stopped here. It counts and tells what the rest of the stack tolerates: faults too short or too small for the
-firmware's own limits, before they grow.
+Nothing is stopped here. It counts and reports what the rest of the stack tolerates: faults too short or too small for
+the firmware's own limits, before they grow.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class PlausibilityStats:
 
 
 class Plausibility:
-    """Compares what the robot reports with what it was told; pure, one step a tick.
+    """Compares what the robot reports with what it was commanded; pure, one step a tick.
 
     A wheel follows if its speed lies within what it was commanded over the last 0.6 s, give or take 0.5 rad/s and a
     fifth; it does not after three samples in a row outside. The supply dips by 6 % below its mean over 10 s, and has

@@ -88,7 +88,7 @@ class Inputs(msgspec.Struct, frozen=True, gc=False):
 
 
 class Reply(msgspec.Struct, frozen=True, gc=False):
-    """The answer to one request, in words; accepted means begun, `Output.state` tells when it is done."""
+    """The answer to one request, in words; accepted means begun, `Output.state` shows when it is done."""
 
     request: UserRequest
     accepted: bool

@@ -60,15 +60,15 @@ def limits(robot: Robot, task: RobotTask) -> dict[str, tuple[float, float]]:
 
 
 def asked_of(task: RobotTask) -> dict[str, Any]:
-    """The task as the daemon's status tells it: its fields, and for what is read from a file a digest of that."""
+    """The task as the daemon's status gives it: its fields, and for what is read from a file a digest of that."""
     fields: dict[str, Any] = msgspec.to_builtins(task)
     read = tuple(fields.pop(name) for name in task.read_fields)
     digest = {"digest": digest_of(tuple(getattr(task, name) for name in task.read_fields))} if read else {}
     return {"kind": kind_of(task), **fields, **digest}
 
 
-def told_task(asked: Mapping[str, Any], robots: RobotTask) -> RobotTask | None:
-    """The task that `asked_of` told of; None for one with other way-points than those in `robots`, robot.toml's."""
+def task_in_status(asked: Mapping[str, Any], robots: RobotTask) -> RobotTask | None:
+    """The task that `asked_of` gave; None for one with other way-points than those in `robots`, robot.toml's."""
     if "digest" in asked:
         same = asked_of(robots)
         if (same["kind"], same.get("digest")) != (asked["kind"], asked["digest"]):
@@ -95,7 +95,7 @@ def record_of(t_ns: int, task: RobotTask) -> records.Task:
 
 
 def task_of(record: records.Task, robots: RobotTask) -> RobotTask:
-    """The task that a record tells of: `robots`, robot.toml's, with the values in the record."""
+    """The task of a record: `robots`, robot.toml's, with the values in the record."""
     return with_values(robots, record.values())
 
 

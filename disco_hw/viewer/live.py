@@ -18,7 +18,7 @@ from disco_hw.daemon.socket_place import believed_users
 from disco_hw.errors import WorkError
 from disco_hw.log.link import BatchDecoder
 from disco_hw.log.records import BeliefChange, Record
-from disco_hw.runtime.task_change import record_of, told_task
+from disco_hw.runtime.task_change import record_of, task_in_status
 from disco_hw.viewer.operator_controls import Desk
 from disco_hw.viewer.panel import coverage_text, events_text, live_details
 from disco_hw.viewer.plots import Plots
@@ -186,14 +186,14 @@ class LivePage:
         newest = self.timeline.last_ns
         if newest is None or status is None or not status.get("ok"):
             return
-        asked = told_task(status["task"]["asked"], self._stage.task)
+        asked = task_in_status(status["task"]["asked"], self._stage.task)
         self.scene.knows_task = asked is not None
         if asked is None:
             return
-        told = self.timeline.tasks.last(newest)
-        if told is not None and newest - told.t_ns < _STATUS_OLDER_NS:
+        record = self.timeline.tasks.last(newest)
+        if record is not None and newest - record.t_ns < _STATUS_OLDER_NS:
             return
-        if self._stage.task_at(told) != asked:
+        if self._stage.task_at(record) != asked:
             self.timeline.add(newest, record_of(newest, asked))
 
     def _learn_belief(self, status: dict[str, Any] | None) -> None:
@@ -201,19 +201,19 @@ class LivePage:
         newest = self.timeline.last_ns
         if newest is None or status is None or not status.get("ok"):
             return
-        told = self.timeline.beliefs.last(newest)
-        if told is not None and newest - told.t_ns < _STATUS_OLDER_NS:
+        record = self.timeline.beliefs.last(newest)
+        if record is not None and newest - record.t_ns < _STATUS_OLDER_NS:
             return
         adaptation = status["adaptation"]
         if adaptation is None:
             self.timeline.adaptations = Items()
         in_force = _belief_in_force(newest, adaptation)
-        if _geometry(told) != _geometry(in_force):
+        if _geometry(record) != _geometry(in_force):
             self.timeline.add(newest, in_force)
 
 
 def _belief_in_force(now_ns: int, adaptation: Mapping[str, Any] | None) -> BeliefChange:
-    """The belief that a status tells of."""
+    """The belief of a status."""
     if adaptation is None or adaptation["belief"] != "adapted":
         return BeliefChange(now_ns, "model")
     mean = adaptation["mean"]
@@ -221,7 +221,7 @@ def _belief_in_force(now_ns: int, adaptation: Mapping[str, Any] | None) -> Belie
 
 
 def _geometry(change: BeliefChange | None) -> tuple[tuple[float, ...], ...]:
-    """What tells two beliefs apart; the model file's is empty."""
+    """What distinguishes two beliefs; the model file's is empty."""
     return () if change is None or change.source == "model" else (change.mean, change.covariance)
 
 

@@ -58,7 +58,7 @@ class Desk:
         self._watch: asyncio.Task[None] | None = None
 
     def page(self, instance: str, token: str = "") -> bytes:
-        """The desk as HTML; `instance` is what this server tells of itself under any of its names.
+        """The desk as HTML; `instance` is what this server says of itself under any of its names.
 
         `token` lets the scene in under this machine's other name; without it the scene stays under the desk's.
         """
@@ -72,7 +72,7 @@ class Desk:
             await connection.send(json.dumps(message))
 
         drive = _DriveLine(self._socket, send)
-        telling = asyncio.create_task(self._tell(send))
+        sending = asyncio.create_task(self._send_status(send))
         self._begin_watching()
         replies: set[asyncio.Task[None]] = set()
         try:
@@ -91,11 +91,11 @@ class Desk:
         finally:
             # What was asked for, be it the last word, is asked all the same; only nobody waits for the answer any more.
             await asyncio.sleep(0)
-            for task in (telling, *replies):
+            for task in (sending, *replies):
                 task.cancel()
             self._end_watching()
             await drive.let_go()
-            await asyncio.gather(telling, *replies, return_exceptions=True)
+            await asyncio.gather(sending, *replies, return_exceptions=True)
 
     def close(self) -> None:
         """End the threads; safe to call twice."""
@@ -161,8 +161,8 @@ class Desk:
         except WorkError as error:
             return None, str(error)
 
-    async def _tell(self, send: Send) -> None:
-        """Tell the browser how things are; also how it notices that nobody is here any more."""
+    async def _send_status(self, send: Send) -> None:
+        """Send the browser the status; also how it notices that nobody is here any more."""
         while True:
             try:
                 await send(shown(self.status, self.error))

@@ -40,9 +40,9 @@ class ShownRobot:
     drive_top_rad_s: float
     model: Model
 
-    def task_at(self, told: Task | None) -> RobotTask:
+    def task_at(self, record: Task | None) -> RobotTask:
         """The task that is in force where this record of it is the newest; robot.toml's without one."""
-        return self.task if told is None else task_of(told, self.task)
+        return self.task if record is None else task_of(record, self.task)
 
 
 def model_in_force(model: Model, change: BeliefChange | None) -> Model:

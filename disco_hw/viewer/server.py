@@ -43,8 +43,8 @@ class Guard:
 
     Every request must carry the `token`, in its query or in the cookie that the first one gets. `local`: the name asked
     for must moreover be a loopback one, which defeats a foreign name that resolves to it. A WebSocket must come from a
-    page of this same server. `open` is False until the page is whole; its `port` tells its cookie from that of another
-    page, as a browser keeps the cookies of a host together. `alone`: no other program can listen on this port under
+    page of this same server. `open` is False until the page is whole; its `port` distinguishes its cookie from another
+    page's, as a browser keeps the cookies of a host together. `alone`: no other program can listen on this port under
     the other name of this machine, so that the desk may hand the token on to that name.
     """
 

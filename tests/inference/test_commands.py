@@ -50,7 +50,7 @@ def inferred(robot):
         folder / "model.toml",
         folder / "report.html",
         InferOptions(simulations=600, seed=2),
-        tell=lambda stage, share: said.append((stage, share)),
+        report_progress=lambda stage, share: said.append((stage, share)),
     )
     return folder, result, said
 

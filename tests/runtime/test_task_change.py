@@ -18,8 +18,8 @@ from disco_hw.runtime.task_change import (
     changed_task,
     limits,
     record_of,
+    task_in_status,
     task_of,
-    told_task,
 )
 from disco_hw.tasks.circle import RADIUS_M, CircleTask
 from disco_hw.tasks.path import PathTask
@@ -130,10 +130,10 @@ def test_a_status_and_a_record_tell_of_a_path_without_its_way_points():
     other = msgspec.structs.replace(LINE, speed_m_s=0.1)
     asked = asked_of(other)
     assert "points" not in asked
-    assert told_task(asked, LINE) == other
-    assert told_task(asked, msgspec.structs.replace(LINE, points=((0.0, 0.0), (2.0, 0.1)))) is None
-    assert told_task(asked, CircleTask()) is None
-    assert told_task(asked_of(CircleTask(radius_m=2.0)), LINE) == CircleTask(radius_m=2.0)
+    assert task_in_status(asked, LINE) == other
+    assert task_in_status(asked, msgspec.structs.replace(LINE, points=((0.0, 0.0), (2.0, 0.1)))) is None
+    assert task_in_status(asked, CircleTask()) is None
+    assert task_in_status(asked_of(CircleTask(radius_m=2.0)), LINE) == CircleTask(radius_m=2.0)
     assert task_of(record_of(7, other), LINE) == other
     assert other.in_words() == "path line.csv of 2.00 m at 0.1 m/s"
 
@@ -143,10 +143,10 @@ def test_of_way_points_by_time_nothing_can_be_changed():
         changed_task(TIMED, {"speed_m_s": 0.3}, ROBOT, State.READY)
     assert limits(ROBOT, TIMED) == {}
     assert TIMED.in_words() == "path line.csv of 2.00 m in 10 s, at most 0.2 m/s"
-    assert told_task(asked_of(TIMED), TIMED) == TIMED
-    assert told_task(asked_of(TIMED), msgspec.structs.replace(TIMED, times_s=(0.0, 11.0))) is None
-    assert told_task(asked_of(TIMED), LINE) is None
-    assert told_task(asked_of(LINE), TIMED) is None
+    assert task_in_status(asked_of(TIMED), TIMED) == TIMED
+    assert task_in_status(asked_of(TIMED), msgspec.structs.replace(TIMED, times_s=(0.0, 11.0))) is None
+    assert task_in_status(asked_of(TIMED), LINE) is None
+    assert task_in_status(asked_of(LINE), TIMED) is None
     assert task_of(record_of(7, TIMED), TIMED) == TIMED
 
 

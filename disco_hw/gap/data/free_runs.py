@@ -234,7 +234,7 @@ def _displace(
         y = track[j, 1] + g * (track[j + 1, 1] - track[j, 1]) - track[i, 1] - f * (track[i + 1, 1] - track[i, 1])
         yaw_start = track[i, 2] + f * (track[i + 1, 2] - track[i, 2])
         yaw = track[j, 2] + g * (track[j + 1, 2] - track[j, 2])
-        # The measured heading is the true one plus the bias: displacement is told in the measured frame.
+        # The measured heading is the true one plus the bias: displacement is given in the measured frame.
         turned = yaw_start + p[1]
         cosine, sine = math.cos(turned), math.sin(turned)
         moved = moving_s[min(start[k] + ahead, top)] - moving_s[start[k]]

@@ -42,7 +42,7 @@ _FAST_RAD_S = 1e6
 
 @dataclass(frozen=True)
 class Layout:
-    """Columns of a channel's vector, its neutral point, how each varies; `of_wheels` tells the channels apart.
+    """Columns of a channel's vector, its neutral point, how each varies; `of_wheels`: which of the two channels.
 
     `precision`: how surely an entry is near its neutral value before a log is looked at, mostly 0.
     """

@@ -212,7 +212,7 @@ def calm_speeds(dt_s: Array, speed_rad_s: Array, settings: NoiseSettings) -> Arr
 
 
 def steady_speeds(dt_s: Array, speed_rad_s: Array, settings: NoiseSettings) -> Array:
-    """What is expected of measured speeds (E, 2) as long as no model tells: their mean over `steady_s` either side."""
+    """Expected measured speeds (E, 2) as long as there is no model: their mean over `steady_s` either side."""
     return _mean(dt_s, speed_rad_s, settings.steady_s, settings.fewest_steady)
 
 

@@ -27,7 +27,7 @@ class ChannelFinding:
 
 @dataclass(frozen=True)
 class EffectFinding:
-    """An effect that is missing: its parameters, evidence (score), and what cannot be told from it."""
+    """An effect that is missing: its parameters, evidence (score), and what is confounded with it."""
 
     name: str
     channel: str
@@ -39,7 +39,7 @@ class EffectFinding:
 
 @dataclass(frozen=True)
 class UnnamedFinding:
-    """Something missing that is none of the named effects, as a term of the model, and what cannot be told from it."""
+    """Something missing that is none of the named effects, as a term of the model, and what is confounded with it."""
 
     channel: str
     form: str

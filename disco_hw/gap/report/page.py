@@ -75,7 +75,7 @@ def _in_cell(errors: PredictionErrors) -> str:
 
 def _confounded(finding: EffectFinding | UnnamedFinding) -> str:
     same = ", ".join(finding.indistinguishable_from)
-    return f" (not to be told from {same})" if same else ""
+    return f" (confounded with {same})" if same else ""
 
 
 _CAPTIONS = {
@@ -141,7 +141,7 @@ def _effects(report: GapReport) -> str:
         "channel",
         "parameters with 95 % intervals",
         "evidence",
-        "not to be told from",
+        "confounded with",
         "what would decide",
     )
     return _table(head, rows)

@@ -1,4 +1,4 @@
-"""What the searches of the channels ended with, and the one fit of it that everything is told from."""
+"""What the searches of the channels ended with, and the one fit of it that every finding rests on."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def _free_asymmetry(found: ChannelResult) -> tuple[float, float]:
 
 
 def _with_encoder(body: ChannelResult, wheels: ChannelResult) -> tuple[Fit, ChannelEstimates]:
-    """The body's fit with the scale of the encoders, as the wheels' gains tell it, in place of the asymmetry."""
+    """The body's fit with the scale of the encoders, as the wheels' gains give it, in place of the asymmetry."""
     names = tuple(name for name in body.names if name != ASYMMETRY)
     channel = body.selector.channel
     vector = body.fit.vector.copy()

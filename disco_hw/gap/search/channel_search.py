@@ -130,7 +130,7 @@ def _where_most(squares: Array, share: float) -> float:
 def search_wheels(drive: GriddedDrive, geometry: Array, start: Array, given: Names = ()) -> ChannelResult:
     """Effects between command and wheel.
 
-    `geometry` (3,) tells how far they move the robot; `start` is the vector without what is missing, in which effects
+    `geometry` (3,) is how far they move the robot; `start` is the vector without what is missing, in which effects
     `given` are known already.
     """
     channel = WheelChannel.build(drive, WheelNoise(reading_rad=max(drive.quantum_rad, 2e-4)), geometry)
@@ -208,7 +208,7 @@ def _time_or_place(found: ChannelResult) -> ChannelResult:
     """With unnamed terms; where the floor seems to have changed, a patch of it instead if that does as well.
 
     A patch that was left and not entered again looks like a change. No floor changes while one drives on it, so the
-    patch is told then, and that a change would do as well is kept.
+    patch is reported then, and that a change would do as well is kept.
     """
     named = with_unnamed(found, _body_options)
     alike = tuple(name for name in found.names if REGISTRY[name].like_a_patch and name not in found.selector.given)

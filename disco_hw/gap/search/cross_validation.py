@@ -206,11 +206,11 @@ def fold_vectors(found: Fit, block: Index, neutral: Array, settings: GapSettings
     active = np.array(found.active)
     for held in (0, 1):
         vector = found.vector.copy()
-        told = known(normal[1 - held], normal.sum(axis=0), settings.fit)
-        told |= np.diag(normal[1 - held]) * vector[active] ** 2 > settings.prediction.fixed_sigmas**2
+        determined = known(normal[1 - held], normal.sum(axis=0), settings.fit)
+        determined |= np.diag(normal[1 - held]) * vector[active] ** 2 > settings.prediction.fixed_sigmas**2
         here = normal[1 - held] if found.precision is None else normal[1 - held] + np.diag(found.precision)
-        vector[active[told]] -= inverse(here[np.ix_(told, told)]) @ gradient[1 - held][told]
-        vector[active[~told]] = neutral[active[~told]]
+        vector[active[determined]] -= inverse(here[np.ix_(determined, determined)]) @ gradient[1 - held][determined]
+        vector[active[~determined]] = neutral[active[~determined]]
         out[held] = vector
     return out
 

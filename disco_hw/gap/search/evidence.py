@@ -44,9 +44,9 @@ def held_out_by_block(found: Fit, channel: ResidualChannel) -> Array:
     out = cost.copy()
     for b in range(cost.size):
         # A parameter of which only this block knows stays where it is: leaving out cannot judge it.
-        told = known(total - normal[b], total, channel.settings.fit)
-        step = np.zeros(told.size)
-        step[told] = inverse((total - normal[b])[np.ix_(told, told)]) @ gradient[b][told]
+        information = known(total - normal[b], total, channel.settings.fit)
+        step = np.zeros(information.size)
+        step[information] = inverse((total - normal[b])[np.ix_(information, information)]) @ gradient[b][information]
         out[b] += gradient[b] @ step + 0.5 * step @ normal[b] @ step
     return out
 
@@ -54,7 +54,8 @@ def held_out_by_block(found: Fit, channel: ResidualChannel) -> Array:
 def inflation(found: Fit, channel: ResidualChannel, added: tuple[int, ...]) -> float:
     """Largest ratio over block lengths of the sandwich variance to the model's, for the added entries; at least 1.
 
-    What blocks tell is weighed against what is known of the channel: `trusted_blocks` of them in which the model holds.
+    The information in blocks is weighed against what is known of the channel: `trusted_blocks` of them in which the
+    model holds.
     """
     places = [found.active.index(index) for index in added if index in found.active]
     if not places:
@@ -68,12 +69,13 @@ def inflation(found: Fit, channel: ResidualChannel, added: tuple[int, ...]) -> f
         if gradient.shape[0] < channel.settings.selection.fewest_blocks:
             continue
         scatter = float(np.einsum("bi,ij,bj->", gradient @ moved, weight, gradient @ moved))
-        told = np.einsum("bij,ip,pq,jq->b", normal, moved, weight, moved)
-        if told.max() <= 0.0:
+        information = np.einsum("bij,ip,pq,jq->b", normal, moved, weight, moved)
+        if information.max() <= 0.0:
             continue
-        told = told / told.max()
-        # Where few blocks tell most, as few scatter: fitting takes one of them, and the rest says little of the noise.
-        blocks = float(told.sum() ** 2 / (told**2).sum())
+        information = information / information.max()
+        # Where few blocks hold most information, as few scatter: fitting takes one of them, and the rest says little of
+        # the noise.
+        blocks = float(information.sum() ** 2 / (information**2).sum())
         known = channel.trusted_blocks / len(places)
         largest = max(largest, (known + blocks * scatter / len(places)) / (known + blocks - 1.0))
     return largest

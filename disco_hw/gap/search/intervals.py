@@ -1,6 +1,6 @@
 """95 % intervals and the joint covariance of what was fitted, widened where the noise model is too narrow.
 
-And what a log cannot tell apart, by algebra: effects with the same equations, and one cause seen in two channels.
+And what is confounded by algebra: effects with the same equations, and one cause seen in two channels.
 """
 
 from __future__ import annotations
@@ -137,7 +137,7 @@ def one_encoder(
     """Whether an encoder that counts wrong explains the wheels' gains, and whether it is the only explanation.
 
     An encoder's scale shows as a gain of its wheel and, with the opposite sign, as an asymmetry of half the difference;
-    `asymmetry` is what the body alone tells of it, with its standard deviation, `accepted` if that is an effect of its
+    `asymmetry` is what the body alone gives for it, with its standard deviation, `accepted` if that is an effect of its
     own. Too small for that it still decides where it is clearly what the encoder would make it and clearly not none.
     """
     gains = [wheels.by_name.get(f"{GAIN}.{side}") for side in ("left", "right")]
@@ -155,7 +155,7 @@ def one_encoder(
 
 
 def confounded_with(names: tuple[str, ...], encoder_possible: bool) -> dict[str, tuple[str, ...]]:
-    """For each accepted effect what no drive can tell from it."""
+    """For each accepted effect what is confounded with it in every drive."""
     found: dict[str, tuple[str, ...]] = {}
     for other, mimicked in _MIMICS.items():
         if mimicked.effect.name in names and (mimicked.seen_too is None or encoder_possible):

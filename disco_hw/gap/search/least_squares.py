@@ -52,9 +52,9 @@ def inverse(matrix: Array) -> Array:
 
 
 def known(part: Array, whole: Array, settings: FitSettings) -> NDArray[np.bool_]:
-    """Which parameters (A,) a part of a log tells about, from its normal matrix and the whole log's, (A, A) each.
+    """Which parameters (A,) a part of a log determines, from its normal matrix and the whole log's, (A, A) each.
 
-    What is told next to nothing about, a limit that was reached elsewhere only, would be moved anywhere.
+    What is hardly determined, a limit that was reached elsewhere only, would be moved anywhere.
     """
     return np.asarray(np.diag(part) > settings.least_known_share * np.diag(whole))
 
@@ -89,7 +89,7 @@ def fit(
     active: tuple[int, ...],
     iterations: int | None = None,
 ) -> Fit:
-    """Fit the `active` entries from `start`; what a log does not tell stays near what is expected.
+    """Fit the `active` entries from `start`; what a log does not determine stays near what is expected.
 
     Levenberg-Marquardt within bounds (Marquardt, 1963); `iterations` as in the settings unless said.
     """

@@ -30,7 +30,7 @@ class Thresholds:
 
 @dataclass
 class Selector:
-    """Fits sets of effects of one channel, each once; `moves` tells how far a fit moves the prediction of another.
+    """Fits sets of effects of one channel, each once; `moves` gives how far a fit moves the prediction of another.
 
     Effects `given` are in from the beginning, with values of `start`.
     """

@@ -70,7 +70,7 @@ def late_commands(drive: GriddedDrive, late_s: float) -> Array:
 
 
 def motion(drive: GriddedDrive, p: Array) -> tuple[Array, Array, Array]:
-    """Forward speed (m/s), yaw rate (rad/s) and acceleration (m/s^2) that the wheels tell, (M,) each."""
+    """Forward speed (m/s), yaw rate (rad/s) and acceleration (m/s^2) from the wheels, (M,) each."""
     speed = drive.speed_rad_s
     v = 0.5 * p[0] * speed.sum(axis=1)
     return v, p[0] / p[1] * (speed[:, 1] - speed[:, 0]), np.gradient(smoothed(v, drive.settings.terms), GRID_STEP_S)

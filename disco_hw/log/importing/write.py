@@ -161,7 +161,7 @@ def import_log(path: Path, robot: Path, out: Path, topics: Sequence[str] = ()) -
 
 
 def _telling(path: Path) -> Path:
-    """The file that tells the format; a log that is a folder has one that says what it is."""
+    """The file that shows the format; a log that is a folder has one that says what it is."""
     return path / METADATA if path.is_dir() and (path / METADATA).exists() else path
 
 

@@ -120,7 +120,7 @@ class PathTerms(NamedTuple):
         along = min(max(off_x * along_x + off_y * along_y, -farthest), farthest) * self.per_m
         wanted = min(self.speed_m_s, (self.end - memory) * self.slow_per_entry)
         missing = self.speed_weight * (wanted - min(along * self.speed_per_entry, forward))
-        # In this order, so that what is no number becomes a place, and the cost tells of it.
+        # In this order, so that what is no number becomes a place, and the cost shows it.
         return min(self.last, max(self.first, memory + along)), missing
 
     def row_of(self, memory: float) -> int:

@@ -52,7 +52,7 @@ def test_a_patch_that_is_left_for_good_is_told_with_the_change_it_looks_like():
     assert "within" in term.form
     assert term.indistinguishable_from == ("surface_change",)
     assert term.experiment == "drive again, later, where it was different"
-    assert "not to be told from surface_change" in as_text(report)
+    assert "confounded with surface_change" in as_text(report)
     # Half of the log says nothing about it: its prediction is that of the plain model, not worse.
     assert not report.amended_is_worse
 
