@@ -1,7 +1,8 @@
 """Steering laws of path following: pure pursuit, Kanayama's, and a linear-quadratic regulator.
 
 All act on the centre of rotation, which moves as a unicycle, beside the reference motion of `Reference`; the integral
-is of the tracked point's distance from the line. Gains are what `python -m tools.tune_baselines` found.
+is of the tracked point's distance from the line. Gains are what
+`python -m tools.tune_baselines` found; those of the regulator are chosen.
 """
 
 from __future__ import annotations
