@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import os
-import socket
 import tempfile
 import time
 from collections import deque
@@ -27,14 +26,17 @@ from disco_hw.config import load_robot_config
 from disco_hw.daemon.realtime import stolen_ms
 from disco_hw.errors import InputError, WorkError
 from disco_hw.experiments.circle_report import CircleReport, load_circle_report
-from disco_hw.experiments.live_stack import READY_TIMEOUT_S, Operator, disco_hw_process, stands
+from disco_hw.experiments.live_stack import (
+    DEVICES,
+    READY_TIMEOUT_S,
+    Operator,
+    disco_hw_process,
+    stands,
+    with_device,
+)
 from disco_hw.tasks.circle import circle_task
 from disco_hw.viewer.address import DEFAULT_PORT, LOOPBACK, TOKEN_VARIABLE, page_address, page_token
-from drivers.motor import motor_drivers
-from drivers.pose.udp import SOURCE as UDP_POSES
 
-_DEVICES = {driver.name: driver.example for driver in motor_drivers().values() if driver.example}
-"""By name of a driver whose controller can be simulated: the lines of [link] that it needs."""
 _START_TIMEOUT_S = READY_TIMEOUT_S
 _POLL_S = 0.1
 _STOP_TIMEOUT_S = 10.0
@@ -70,8 +72,8 @@ def run_demo(options: DemoOptions) -> CircleReport:
         raise InputError(f"--link {options.link}: no such link; write can or serial")
     if options.uncertainty not in {"ut", "mc", "joint", "point"}:
         raise InputError(f"--uncertainty {options.uncertainty}: no such choice; write ut, mc, joint or point")
-    if options.device is not None and options.device not in _DEVICES:
-        raise InputError(f"--device {options.device}: no such device; write one of {', '.join(_DEVICES)}")
+    if options.device is not None and options.device not in DEVICES:
+        raise InputError(f"--device {options.device}: no such device; write one of {', '.join(DEVICES)}")
     if options.device is not None and options.link != "can":
         raise InputError(f"--link {options.link}: {options.device} is simulated on CAN alone; leave --link out")
     options.out.mkdir(parents=True, exist_ok=True)
@@ -127,19 +129,11 @@ def _write_robot_file(scratch: Path, options: DemoOptions) -> Path:
             raise WorkError(f"{shipped}: expected exactly one line '{old.strip()}'")
         text = text.replace(old, new)
     if options.device is not None:
-        text = text.replace("[link]\n", f'[link]\ndriver = "{options.device}"\n{_DEVICES[options.device]}')
-        text += f'\n[pose]\nsource = "{UDP_POSES}"\nport = {_free_port()}\n'
+        text = with_device(text, options.device)
     text += f'\n[daemon]\ncontrol_socket = "{scratch / "control.sock"}"\n'
     path = scratch / "robot.toml"
     path.write_text(text, encoding="utf-8")
     return path
-
-
-def _free_port() -> int:
-    """A port that nobody listens on now."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened:
-        opened.bind((LOOPBACK, 0))
-        return int(opened.getsockname()[1])
 
 
 class _HostStallError(WorkError):

@@ -17,12 +17,17 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import disco_hw
 from disco_hw.daemon.client import send_request
 from disco_hw.errors import WorkError
+from drivers.motor import motor_drivers
+from drivers.pose.udp import SOURCE as UDP_POSES
 
+DEVICES = MappingProxyType({driver.name: driver.example for driver in motor_drivers().values() if driver.example})
+"""By name of a driver whose controller can be simulated: its lines in [link]."""
 _POLL_S = 0.05
 _END_TIMEOUT_S = 10.0
 _STILL_RAD_S = 0.05
@@ -210,8 +215,23 @@ def read_truth(path: Path) -> list[TruthRow]:
         ]
 
 
-def write_robot_file(directory: Path, link: str = "can", task: str = "", model: str = "wombot_model.toml") -> Path:
-    """The shipped robot with addresses of its own."""
+def with_device(text: str, device: str) -> str:
+    """A robot.toml's text with another motor controller of `DEVICES`, whose poses come by datagrams."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened:
+        opened.bind(("127.0.0.1", 0))
+        port = opened.getsockname()[1]
+    text = text.replace("[link]\n", f'[link]\ndriver = "{device}"\n{DEVICES[device]}')
+    return text + f'\n[pose]\nsource = "{UDP_POSES}"\nport = {port}\n'
+
+
+def write_robot_file(
+    directory: Path,
+    link: str = "can",
+    task: str = "",
+    model: str = "wombot_model.toml",
+    device: str | None = None,
+) -> Path:
+    """The shipped robot with addresses of its own; `device`: another motor controller, of `DEVICES`."""
     shipped = Path(disco_hw.__file__).parent / "robots"
     text = (shipped / "wombot.toml").read_text(encoding="utf-8")
     for old, new in {
@@ -226,6 +246,8 @@ def write_robot_file(directory: Path, link: str = "can", task: str = "", model: 
     if task:
         before, rest = text.split("[task]\n")
         text = before + "[task]\n" + task + "\n[model]" + rest.split("[model]")[1]
+    if device is not None:
+        text = with_device(text, device)
     text += f'[daemon]\ncontrol_socket = "{directory / "control.sock"}"\n'
     path = directory / "robot.toml"
     path.write_text(text, encoding="utf-8")
@@ -241,9 +263,10 @@ def running_stack(
     sim_arguments: tuple[str, ...] = (),
     run_arguments: tuple[str, ...] = (),
     model: str = "wombot_model.toml",
+    device: str | None = None,
 ) -> Iterator[Stack]:
     """Virtual robot and daemon on one link; both end with the block."""
-    robot_file = write_robot_file(directory, link, task, model)
+    robot_file = write_robot_file(directory, link, task, model, device)
     simulator = [
         "sim", str(robot_file), "--truth", str(directory / "truth.csv"), "--inject", str(directory / "inject"),
         "--start", *map(str, start), *sim_arguments,
