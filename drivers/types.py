@@ -378,8 +378,8 @@ class MotorDriver:
     that is heard then, whether the robot has confirmed it. `slowest_rad_s`: the slowest wheel speed that it holds.
     `cyclic_frames` (of settings, command rate in Hz, whether authenticated): what the link carries. `authenticates`:
     whether there is such a mode; without one `link.key_file` is refused. `example`: its fields in [link] for a robot as
-    the demonstration drives it; none where its controller is not simulated. `is_default`: taken where robot.toml has
-    no `link.driver`.
+    the demonstration drives it; none where its controller is not simulated. `latches_stop`: whether the
+    controller itself keeps an e-stop until it is reset. `is_default`: taken where robot.toml has no `link.driver`.
     """
 
     name: str
@@ -391,5 +391,6 @@ class MotorDriver:
     slowest_rad_s: Callable[[Any], float] = lambda _settings: 0.0
     settings: type[Any] = NoSettings
     example: str = ""
+    latches_stop: bool = True
     authenticates: bool = False
     is_default: bool = False

@@ -40,7 +40,8 @@ _REMEDY = "give --link can:INTERFACE:CHANNEL or --link serial:PORT, or use the r
 class EstopOutcome:
     """What became of each way to stop the robot, and whether the robot said that it is in e-stop.
 
-    `file_error`: why robot.toml did not say where the link is, which --link then had to.
+    `latches`: whether its controller itself keeps the stop. `file_error`: why robot.toml did not say where the link is,
+    which --link then had to.
     """
 
     link: str
@@ -49,6 +50,7 @@ class EstopOutcome:
     confirmed: bool
     passed_over: tuple[str, ...] = ()
     file_error: str | None = None
+    latches: bool = True
 
     @property
     def sent(self) -> bool:
@@ -75,7 +77,11 @@ class EstopOutcome:
             *(f"daemon: {line}" for line in self.passed_over),
             f"daemon: {self.daemon_error or 'e-stop accepted'}",
         ]
-        if self.confirmed:
+        if self.confirmed and not self.latches:
+            lines.append(
+                "the robot stands; its controller latches nothing, so that the next command moves it: use its button"
+            )
+        elif self.confirmed:
             lines.append("the robot reports ESTOP; it stays latched until `disco-hw ctl ROBOT.toml reset`")
         elif self.sent:
             lines.append("sent, but the robot has not confirmed: look at the robot, use its button")
@@ -110,7 +116,9 @@ def stop_robot(robot: Path, link: str | None = None) -> EstopOutcome:
     except Exception as error:  # whatever the medium raises, the daemon is asked as well
         link_error = str(error) or type(error).__name__
     daemon_confirmed, daemon_error = _ask_daemon(socket_path)
-    return EstopOutcome(address, link_error, daemon_error, confirmed or daemon_confirmed, refused, file_error)
+    return EstopOutcome(
+        address, link_error, daemon_error, confirmed or daemon_confirmed, refused, file_error, driver.latches_stop
+    )
 
 
 def _read(robot: Path) -> tuple[dict[str, Any], str | None]:

@@ -413,6 +413,7 @@ DRIVER = MotorDriver(
     lambda settings, _key: AgilexDriver(settings),
     settings=AgilexSettings,
     example=EXAMPLE,
+    latches_stop=False,
     stop_frames=stop_frames,
     stop_confirmation=stop_confirmation,
     cyclic_frames=cyclic_frames,

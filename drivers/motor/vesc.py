@@ -467,6 +467,7 @@ DRIVER = MotorDriver(
     lambda settings, _key: VescDriver(settings),
     settings=VescSettings,
     example=EXAMPLE,
+    latches_stop=False,
     stop_frames=stop_frames,
     stop_confirmation=stop_confirmation,
     cyclic_frames=cyclic_frames,

@@ -203,3 +203,9 @@ def test_over_a_serial_port_that_the_option_names_the_stop_goes_out(tmp_path):
 def test_a_link_option_that_says_nothing_is_refused_with_what_to_write(tmp_path, option):
     with pytest.raises(InputError, match=f"--link {option}: .*write can, serial, can:INTERFACE:CHANNEL or serial:PORT"):
         stop_robot(robot_file(tmp_path, tmp_path / "none"), option)
+
+
+@pytest.mark.parametrize(("latches", "word"), [(True, "stays latched"), (False, "latches nothing")])
+def test_what_is_said_of_a_confirmed_stop_is_what_the_controller_does(latches, word):
+    outcome = emergency.EstopOutcome("can0", None, "not running", confirmed=True, latches=latches)
+    assert word in outcome.as_text()
