@@ -110,11 +110,13 @@ def recover(
 @log_app.command()
 def export(
     log: Annotated[Path, typer.Argument(metavar="LOG")],
-    out: Annotated[Path, typer.Option("-o", "--out", help="Where to write the CSV file.")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="Where to write the CSV file, or the bag's folder.")],
+    rosbag2: Annotated[bool, typer.Option("--rosbag2", help="Write a bag of ROS 2 instead (docs/ros2.md).")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Write commands, encoders and poses as CSV."""
+    """Write commands, encoders and poses as CSV, or as a bag of ROS 2."""
     check_named_files(logs=[log])
     from disco_hw.log.commands import export as log_export
+    from disco_hw.log.commands import export_rosbag
 
-    print(log_export(log, out, as_json))
+    print((export_rosbag if rosbag2 else log_export)(log, out, as_json))

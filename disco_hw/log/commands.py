@@ -9,9 +9,10 @@ from pathlib import Path
 import msgspec
 
 from disco_hw.log.importing.csv_drive import write_csv
-from disco_hw.log.load import drive_from_log, ticks_per_rev
+from disco_hw.log.load import drive_from_log, nominal_geometry, ticks_per_rev
 from disco_hw.log.reader import LogSummary, open_log
 from disco_hw.log.recovery import recover as recover_log
+from disco_hw.log.rosbag.export import write_rosbag
 
 
 def info(path: Path, as_json: bool) -> str:
@@ -39,6 +40,18 @@ def export(path: Path, out: Path, as_json: bool) -> str:
     if as_json:
         return json.dumps({"out": str(out), "rows": rows, "segments": drive.segments, "notes": drive.notes})
     return "\n".join([f"{out}: {rows} rows, {drive.segments} segments", *drive.notes])
+
+
+def export_rosbag(path: Path, out: Path, as_json: bool) -> str:
+    """Write commands, wheels and poses of a log as a bag of ROS 2; raises LogError, InputError without `rosbags`."""
+    with open_log(path) as log:
+        drive = drive_from_log(log)
+        times = (log.columns(topic).get("t_ns") for topic in ("/command", "/wheels", "/pose"))
+        first_ns = min(int(t_ns.min()) for t_ns in times if t_ns is not None and t_ns.size)
+        messages = write_rosbag(drive, out, first_ns + log.metadata.wall_offset_ns, nominal_geometry(log))
+    if as_json:
+        return json.dumps({"out": str(out), "messages": messages, "segments": drive.segments, "notes": drive.notes})
+    return "\n".join([f"{out}: {messages} messages, {drive.segments} segments", *drive.notes])
 
 
 def _end_in_words(summary: LogSummary) -> str:

@@ -77,6 +77,18 @@ def ticks_per_rev(log: Log) -> int | None:
     return value if isinstance(value, int) and value > 0 else None
 
 
+def nominal_geometry(log: Log) -> tuple[float, float] | None:
+    """Nominal wheel radius and axial distance (m) from the configuration kept in the log, or None."""
+    if ROBOT_TOML not in log.attachment_names():
+        return None
+    try:
+        robot = parse_toml(log.attachment(ROBOT_TOML), ROBOT_TOML)["robot"]
+        radius_m, axial_m = float(robot["wheel_radius_m"]), float(robot["axial_distance_m"])
+    except (InputError, KeyError, TypeError, ValueError):
+        return None
+    return (radius_m, axial_m) if radius_m > 0.0 and axial_m > 0.0 else None
+
+
 def _columns(log: Log, topic: str) -> dict[str, NDArray[np.generic]]:
     """A topic whose ticks' times do not decrease."""
     columns = log.columns(topic)

@@ -1,0 +1,59 @@
+"""A log of ours as a bag of ROS 2, read by the stock readers and imported again."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rosbags", reason="pip install 'disco-hw[ros2]'")
+
+from mcap.reader import make_reader
+from rosbags.highlevel import AnyReader
+
+from disco_hw.errors import LogError
+from disco_hw.log.commands import export_rosbag
+from disco_hw.log.importing.write import import_log
+from disco_hw.log.load import load_drive
+from disco_hw.log.rosbag.drive import read_rosbag
+from tests.inference.drives import robot_config, write_log
+from tests.inference.test_commands import ROBOT
+
+
+@pytest.fixture
+def log(tmp_path):
+    robot = tmp_path / "robot.toml"
+    robot.write_text(ROBOT)
+    return import_log(write_log(tmp_path / "log.csv", "poor"), robot, tmp_path / "log.mcap").out
+
+
+def test_what_is_exported_is_imported_again(log, tmp_path):
+    command = [sys.executable, "-m", "disco_hw", "log", "export", str(log), "-o", str(tmp_path / "bag"), "--rosbag2"]
+    subprocess.run(command, capture_output=True, text=True, check=True)
+    drive, back = load_drive(log), read_rosbag(tmp_path / "bag", robot_config())
+    for part in ("wheels", "poses"):
+        for name in getattr(drive, part).__slots__:
+            told, read = getattr(getattr(drive, part), name), getattr(getattr(back, part), name)
+            np.testing.assert_allclose(read, told, atol=1e-9, err_msg=f"{part}.{name}")
+    given = np.isfinite(back.commands.left_rad_s)
+    known = np.isfinite(drive.commands.left_rad_s)
+    np.testing.assert_array_equal(back.commands.left_rad_s[given], drive.commands.left_rad_s[known])
+
+
+def test_stock_readers_open_it(log, tmp_path):
+    export_rosbag(log, tmp_path / "bag", as_json=False)
+    with AnyReader([tmp_path / "bag"]) as reader:
+        kinds = {one.topic: one.msgtype for one in reader.connections}
+        assert kinds["/cmd_vel"] == "geometry_msgs/msg/TwistStamped"
+        assert kinds["/pose"] == "geometry_msgs/msg/PoseStamped"
+        first = next(raw for one, _, raw in reader.messages() if one.topic == "/joint_states")
+        assert reader.deserialize(first, "sensor_msgs/msg/JointState").name == ["left_wheel_joint", "right_wheel_joint"]
+        count = reader.message_count
+    with (tmp_path / "bag" / "bag.mcap").open("rb") as file:
+        assert sum(1 for _ in make_reader(file).iter_messages()) == count
+
+
+def test_a_bag_is_never_overwritten(log, tmp_path):
+    (tmp_path / "bag").mkdir()
+    with pytest.raises(LogError, match="bag: already exists; give another name"):
+        export_rosbag(log, tmp_path / "bag", as_json=False)
