@@ -17,7 +17,7 @@ from disco_hw.adaptation.fast import FastAdaptation
 from disco_hw.adaptation.guard import believed_geometry
 from disco_hw.config import Estimation
 from disco_hw.control import CommandLimits, Disco, DiscoSettings
-from disco_hw.control.baselines.follower import Chassis, Follower, Law
+from disco_hw.control.baselines.follower import Follower, Law, NominalRobot
 from disco_hw.control.baselines.reference import Reference
 from disco_hw.control.settings import ROTATION
 from disco_hw.estimation import OdometryParameters, PoseFusion
@@ -120,7 +120,7 @@ def classical(law: Law, speed_m_s: float = 0.2, knows: bool = False) -> Contende
 
     def made(robot: ForeignRobot, track: Track) -> Planner:
         geometry = (robot.radius_m, robot.axle_m, robot.x_icr_m) if knows else NOMINAL
-        chassis = Chassis(*geometry, robot.lag_s, robot.dead_rad_s, LIMITS)
+        chassis = NominalRobot(*geometry, robot.lag_s, robot.dead_rad_s, LIMITS)
         return Follower(Reference(track.points_m, speed_m_s, geometry[2]), law, chassis)
 
     return Contender(made, knows)

@@ -20,7 +20,7 @@ _LONGEST_GAP_S = 0.2
 
 
 @dataclass(frozen=True, slots=True)
-class Chassis:
+class NominalRobot:
     """What is known of the robot: geometry (m), motor lag (s) and dead band (rad/s), the drive's limits."""
 
     wheel_radius_m: float
@@ -70,7 +70,7 @@ class Follower:
     The reference's wheel speeds are led by what the motors lag, and lifted over the dead band.
     """
 
-    def __init__(self, reference: Reference, law: Law, chassis: Chassis) -> None:
+    def __init__(self, reference: Reference, law: Law, chassis: NominalRobot) -> None:
         self._reference, self._law, self._chassis = reference, law, chassis
         self.reset()
 
