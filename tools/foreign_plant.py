@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit
 
+from drivers.kernel_cache import compiled
 from drivers.types import PoseSample, Readings, WheelSample
 
 STEP_S = 0.001
@@ -60,7 +60,7 @@ def robots(first: int, count: int, spread: float = 0.15, **changes: Any) -> list
     return found
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def _advance(state: Any, left: float, right: float, numbers: Any, noise: Any) -> None:
     (radius, axle, x_icr, lag, dead, mass, inertia, push, push_at, relaxation, side, grip_std, grip_s, slope, gain) = (
         numbers

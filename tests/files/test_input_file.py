@@ -189,6 +189,8 @@ OWN = {
     "disco_hw/experiments/demo.py": {"read_text"},
     "disco_hw/experiments/live_stack.py": {"open", "read_text"},
     "disco_hw/jit/__init__.py": {"read_bytes"},
+    # This process's own memory.
+    "disco_hw/log/rosbag/bag.py": {"read_text"},
     "disco_hw/log/writer.py": {"os.open"},
     "disco_hw/viewer/operator_controls.py": {"read_text"},
     "drivers/transport/can.py": {"read_text"},

@@ -13,11 +13,11 @@ PROGRAM = """
 import sys
 from pathlib import Path
 from disco_hw.log.reader import open_log
-from disco_hw.log.recorder import ProcessRecorder, Recording
+from disco_hw.log.recorder import ProcessRecorder, RecordingSettings
 from disco_hw.log.records import Temperature
 
 log = Path(sys.argv[1])
-recorder = ProcessRecorder(Recording(log, "page"))
+recorder = ProcessRecorder(RecordingSettings(log, "page"))
 for k in range(10):
     recorder.put(k * 20_000_000, [Temperature(k * 20_000_000, 40.0 + k)])
 recorder.close(20.0)

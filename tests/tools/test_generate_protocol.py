@@ -35,7 +35,7 @@ def test_constants_say_what_the_dbc_says():
     constants = generated_files(packaged_dbc())["protocol_constants.h"]
     protocol = load_protocol(packaged_dbc())
     assert f"#define DISCO_DBC_HASH (0x{protocol.dbc_hash:08X}u)\n" in constants
-    assert "#define DISCO_WHEEL_COMMAND_LEFT_SPEED_SCALE (0.002) /* rad/s */\n" in constants
+    assert "#define DISCO_WHEEL_COMMAND_LEFT_SPEED_PER_UNIT (500) /* rad/s */\n" in constants
     assert "#define DISCO_STATE_ARMED (3u)\n" in constants
     assert "#define DISCO_HELLO_DATA_ID(major) ((uint16_t)0x140u)\n" in constants
 

@@ -160,7 +160,7 @@ def _check_unpacked(path: Path) -> None:
 
     most = min(LOG.most_bytes, _MOST_UNPACKED_RATIO * max(path.stat().st_size, 4096))
     size = 0
-    with path.open("rb") as file, _in_one_line(path):
+    with os.fdopen(open_file(path, LOG), "rb") as file, _in_one_line(path):
         for block in zstandard.ZstdDecompressor().read_to_iter(file):
             size += len(block)
             if size > most:
