@@ -38,6 +38,7 @@ from tools.step_times import summary, times_ms, undisturbed
 ROBOTS = Path(disco_hw.__file__).parent / "robots"
 PERIOD_NS = 20_000_000
 STEP_NS = 100_000_000
+PAPERS_SIZE = Sampler(samples=400, horizon=50)
 LARGEST_RAD_S = ROTATION
 SIZES = (400, 1600, 6400, 25_600)
 ROUNDS = 4
@@ -109,7 +110,7 @@ def skid_steer_pair(model: Model) -> tuple[Step, Step]:
     """A step of DISCO and of the peer on the paper's circle, with the cost that the paper gives."""
     from tools.control_peers import circle_mppi, circle_state  # noqa: PLC0415  (a peer for the benchmark only)
 
-    circle, settings = CircleCost().paper(), DiscoSettings()
+    circle, settings = CircleCost().paper(), DiscoSettings(sampler=PAPERS_SIZE)
     planner = Disco(model, circle, settings, CommandLimits(LARGEST_RAD_S))
     planner.warm_up()
     mppi = circle_mppi(model, circle, settings, LARGEST_RAD_S)
@@ -159,7 +160,12 @@ def scaling(model: Model, steps: int) -> dict[str, float]:
     """Time of a step for each number of samples, over what is in proportion to 400 samples: 1 is linear."""
     settings = DiscoSettings()
     planners = {
-        size: Disco(model, CircleCost(), replace(settings, sampler=Sampler(samples=size)), CommandLimits(LARGEST_RAD_S))
+        size: Disco(
+            model,
+            CircleCost(),
+            replace(settings, sampler=replace(PAPERS_SIZE, samples=size)),
+            CommandLimits(LARGEST_RAD_S),
+        )
         for size in SIZES
     }
     calls = [moving(number) for number in range(CALLS)]
@@ -189,7 +195,7 @@ def allocations(model: Model, steps: int = 200) -> dict[str, float]:
     `in_the_step`: allocations of the compiled step beyond those of an empty function with the same arguments, for which
     numba makes a record of each array that it is handed. `bytes_grown_per_step`: Python's memory after `steps` more.
     """
-    planner = Disco(model, CircleCost(), DiscoSettings(), CommandLimits(LARGEST_RAD_S))
+    planner = Disco(model, CircleCost(), DiscoSettings(sampler=PAPERS_SIZE), CommandLimits(LARGEST_RAD_S))
     planner.warm_up()
     for number in range(20):
         planner.plan(*moving(number))
@@ -218,7 +224,7 @@ def allocations(model: Model, steps: int = 200) -> dict[str, float]:
 def torch_times_ms(model: Model, device: str, samples: int, steps: int) -> np.ndarray:
     """Milliseconds of each step of the torch planner on the paper's circle, on a device."""
     theta, weights = unscented_points(model, 1.0)
-    sampler = Sampler(samples=samples)
+    sampler = replace(PAPERS_SIZE, samples=samples)
     planner = BlackBoxDisco(
         skid_steer_transition(DiscoSettings().step_s), circle_cost(CircleCost()), theta[:, :3], weights, 2, sampler,
         largest=LARGEST_RAD_S, device=device,
@@ -251,7 +257,7 @@ def contenders(model: Model, options: CircleOptions) -> dict[str, Callable[[dict
     """Every controller of the table, made from the plant's parameters and a seed."""
     from tools.control_peers import circle_command, circle_mppi  # noqa: PLC0415  (a peer for the benchmark only)
 
-    ours, paper = DiscoSettings(), DiscoSettings.paper()
+    ours, paper = DiscoSettings(sampler=PAPERS_SIZE), DiscoSettings.paper()
     bare = replace(model, belief=None)
     fast = replace(options, rate_hz=50.0)
     largest = options.largest_rot_s * ROTATION
