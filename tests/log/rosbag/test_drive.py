@@ -236,7 +236,7 @@ def array(maker, values):
     return maker.make("std_msgs/msg/Float64MultiArray", layout, np.array(values))
 
 
-def test_the_command_imports_a_folder_and_infer_reads_it_as_any_log(robot, tmp_path):
+def test_the_command_imports_a_folder_that_reads_as_any_log(robot, tmp_path):
     truth = recorded(place(tmp_path))
     out = tmp_path / "log.mcap"
     command = [sys.executable, "-m", "disco_hw", "import", str(place(tmp_path)), "--robot", str(robot)]
