@@ -6,12 +6,11 @@ axial distance is base and inner factor together. Who holds the remote control c
 
 from __future__ import annotations
 
-import enum
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 
 from drivers.motor import agilex_codec as codec
+from drivers.motor import vendor_parts as parts
 from drivers.motor.agilex_settings import (
     EXAMPLE,
     TIMEOUT_S,
@@ -22,6 +21,7 @@ from drivers.motor.agilex_settings import (
     stop_confirmation,
     stop_frames,
 )
+from drivers.motor.vendor_parts import Stage
 from drivers.types import (
     Capabilities,
     DriverState,
@@ -45,22 +45,10 @@ ARMING_TIMEOUT_NS = 1_500_000_000
 STOPPING_NS = 3_000_000_000
 _MODE_SEEN_NS = 400_000_000
 _REPEAT_NS = 100_000_000
-_FRAME_LIFE_NS = 50_000_000
-_ESTOP_LIFE_NS = 1_000_000_000
-_ESTOP_REPEATS = 3
-_ESTOP_RANK, _RANK = 0, 1
-_LONGEST_STEP_S = 0.1
 _WARNINGS = 0x0606
 """Bits of the error word that only warn, in the SDK's byte and in the manual's: battery low, remote control lost."""
 _MODES = {codec.STANDBY: "standby", codec.UART_MODE: "serial mode", codec.RC_MODE: "remote control"}
 _HOST_COMMANDS = frozenset({codec.MOTION_COMMAND, codec.CONTROL_MODE, codec.STATE_RESET, codec.BRAKE})
-
-
-class _Stage(enum.Enum):
-    REST = "rest"
-    ARMING = "arming"
-    ARMED = "armed"
-    STOPPING = "stopping"
 
 
 class AgilexDriver:
@@ -72,7 +60,7 @@ class AgilexDriver:
         self._settings = settings
         self.stats = DriverStats()
         self._link_is_up = False
-        self._stage = _Stage.REST
+        self._stage = Stage.REST
         self._stage_ns: int | None = None
         self._wanted, self._note = Request.STANDBY, "it stands by"
         self._fault: str | None = None
@@ -102,9 +90,9 @@ class AgilexDriver:
             return DriverState.HANDSHAKE
         if self._fault is not None or self._is_faulty:
             return DriverState.FAULT
-        if self._stage is _Stage.ARMED:
+        if self._stage is Stage.ARMED:
             return DriverState.ARMED
-        if self._stage is _Stage.STOPPING or (self._stage is _Stage.REST and self._mode == codec.CAN_MODE):
+        if self._stage is Stage.STOPPING or (self._stage is Stage.REST and self._mode == codec.CAN_MODE):
             return DriverState.STOPPING
         rest = {Request.ARM: DriverState.ARMING, Request.READY: DriverState.READY}
         return rest.get(self._wanted, DriverState.STANDBY)
@@ -133,19 +121,12 @@ class AgilexDriver:
         """What robot.toml declares of the base; it tells nothing of that itself."""
         if self._state_ns is None:
             return None
-        return Capabilities(
-            protocol_major=2,
-            protocol_minor=0,
-            firmware_version="AgileX CAN v2",
-            dbc_hash=0,
-            board_id=0,
-            max_wheel_speed_rad_s=self._settings.max_speed_m_s / self._settings.wheel_radius_m,
-            max_wheel_acceleration_rad_s2=None,
-            ticks_per_rev=None,
-            command_timeout_s=TIMEOUT_S,
-            drive_off_timeout_s=TIMEOUT_S,
-            stop_deceleration_rad_s2=self._settings.stop_deceleration_rad_s2,
-            told=False,
+        return parts.declared(
+            "AgileX CAN v2",
+            2,
+            self._settings.max_speed_m_s / self._settings.wheel_radius_m,
+            TIMEOUT_S,
+            self._settings.stop_deceleration_rad_s2,
         )
 
     def link_up(self, now_ns: int) -> None:
@@ -167,10 +148,10 @@ class AgilexDriver:
                 self._note = f"not arming: {self.detail}"
                 return
             self.stats = replace(self.stats, sessions=self.stats.sessions + 1)
-            self._note, self._stage, self._stage_ns = "arming", _Stage.ARMING, None
+            self._note, self._stage, self._stage_ns = "arming", Stage.ARMING, None
             self._zeros, self._speeds = 0, (0.0, 0.0)
-        elif self._wanted is Request.ARM and self._stage in (_Stage.ARMING, _Stage.ARMED):
-            self._note, self._stage, self._stage_ns = "stopping as asked", _Stage.STOPPING, None
+        elif self._wanted is Request.ARM and self._stage in (Stage.ARMING, Stage.ARMED):
+            self._note, self._stage, self._stage_ns = "stopping as asked", Stage.STOPPING, None
         self._wanted = request
 
     def receive(self, now_ns: int, frames: Sequence[ReceivedFrame]) -> Readings:
@@ -208,18 +189,15 @@ class AgilexDriver:
 
         Raises ValueError for a command that is not finite or valid for no time.
         """
-        if command is not None and not (
-            math.isfinite(command.left_rad_s) and math.isfinite(command.right_rad_s) and command.valid_for_s > 0.0
-        ):
-            raise ValueError(f"not a wheel command: {command}")
+        parts.check_command(command)
         if not self._link_is_up:
             return ()
         match self._stage:
-            case _Stage.REST:
+            case Stage.REST:
                 return self._rest(now_ns)
-            case _Stage.ARMING:
+            case Stage.ARMING:
                 return self._arm(now_ns)
-            case _Stage.STOPPING:
+            case Stage.STOPPING:
                 return self._ramp(now_ns)
         if now_ns - self._last_sent_ns > TIMEOUT_S * 1e9:
             # The base stays in its CAN mode: the next command would move it again.
@@ -230,16 +208,13 @@ class AgilexDriver:
         self._speeds, self._last_sent_ns = (command.left_rad_s, command.right_rad_s), now_ns
         self._count("commands_sent")
         # Half of its validity may pass on the way.
-        return self._frames(now_ns, self._motion(self._speeds), life_ns=round(0.5e9 * command.valid_for_s))
+        return parts.outgoing(now_ns, self._motion(self._speeds), life_ns=round(0.5e9 * command.valid_for_s))
 
     def estop(self, now_ns: int) -> tuple[OutgoingFrame, ...]:
         """Zero and standby in any state; whatever was wanted is dropped, and nothing is commanded again."""
-        self._wanted, self._stage, self._estopped = Request.STANDBY, _Stage.REST, True
+        self._wanted, self._stage, self._estopped = Request.STANDBY, Stage.REST, True
         self._note, self._repeat_ns = "emergency stop sent", 0
-        return tuple(
-            OutgoingFrame(frame, now_ns + _ESTOP_LIFE_NS, _ESTOP_RANK)
-            for frame in _ESTOP_REPEATS * stop_frames(self._settings)
-        )
+        return parts.estop_frames(now_ns, stop_frames(self._settings))
 
     @property
     def _is_faulty(self) -> bool:
@@ -259,10 +234,10 @@ class AgilexDriver:
                     return ()
             elif now_ns - self._repeat_ns >= _REPEAT_NS:
                 self._repeat_ns = now_ns
-                return self._frames(now_ns, codec.clear_errors())
+                return parts.outgoing(now_ns, codec.clear_errors())
         if self._mode == codec.CAN_MODE and now_ns - self._repeat_ns >= _REPEAT_NS:
             self._repeat_ns = now_ns
-            return self._frames(now_ns, *stop_frames(self._settings))
+            return parts.outgoing(now_ns, *stop_frames(self._settings))
         return ()
 
     def _arm(self, now_ns: int) -> tuple[OutgoingFrame, ...]:
@@ -275,26 +250,23 @@ class AgilexDriver:
             return ()
         self._last_sent_ns = now_ns
         if self._mode != codec.CAN_MODE:
-            return self._frames(now_ns, codec.control_mode(codec.CAN_MODE))
+            return parts.outgoing(now_ns, codec.control_mode(codec.CAN_MODE))
         self._zeros += 1
         if self._zeros > ZEROS_TO_ARM:
-            self._stage, self._note = _Stage.ARMED, "armed"
-        return self._frames(now_ns, codec.motion(0.0, 0.0))
+            self._stage, self._note = Stage.ARMED, "armed"
+        return parts.outgoing(now_ns, codec.motion(0.0, 0.0))
 
     def _ramp(self, now_ns: int) -> tuple[OutgoingFrame, ...]:
         """Slow down with the declared deceleration, stand, then leave the CAN mode."""
         self._stage_ns = now_ns if self._stage_ns is None else self._stage_ns
-        elapsed_s = min(max(now_ns - self._last_sent_ns, 0) * 1e-9, _LONGEST_STEP_S)
-        self._last_sent_ns = now_ns
-        step = self._settings.stop_deceleration_rad_s2 * elapsed_s
-        left, right = (math.copysign(max(abs(speed) - step, 0.0), speed) for speed in self._speeds)
-        self._speeds = (left, right)
-        if left or right:
-            return self._frames(now_ns, self._motion(self._speeds))
+        elapsed_ns, self._last_sent_ns = now_ns - self._last_sent_ns, now_ns
+        self._speeds = parts.slowed(self._speeds, self._settings.stop_deceleration_rad_s2, elapsed_ns)
+        if any(self._speeds):
+            return parts.outgoing(now_ns, self._motion(self._speeds))
         if self._stands or now_ns - self._stage_ns > STOPPING_NS:
-            self._stage, self._repeat_ns = _Stage.REST, now_ns
-            return self._frames(now_ns, *stop_frames(self._settings))
-        return self._frames(now_ns, codec.motion(0.0, 0.0))
+            self._stage, self._repeat_ns = Stage.REST, now_ns
+            return parts.outgoing(now_ns, *stop_frames(self._settings))
+        return parts.outgoing(now_ns, codec.motion(0.0, 0.0))
 
     def _motion(self, speeds: tuple[float, float]) -> Frame:
         """Of wheel speeds, by the nominal geometry; both scaled down where the base can do less."""
@@ -304,24 +276,21 @@ class AgilexDriver:
         linear = scale * radius * (left + right) / 2.0
         return codec.motion(linear, scale * radius * (right - left) / self._settings.track_m)
 
-    def _frames(self, now_ns: int, *frames: Frame, life_ns: int = _FRAME_LIFE_NS) -> tuple[OutgoingFrame, ...]:
-        return tuple(OutgoingFrame(frame, now_ns + life_ns, _RANK) for frame in frames)
-
     def _take_state(self, decoded: codec.Decoded, t_ns: int) -> None:
         values = decoded.values
         self._vehicle, self._mode = int(values["vehicle_state"]), int(values["control_mode"])
         self._error, self._state_ns = int(values["error_code"]), t_ns
-        if self._stage in (_Stage.REST, _Stage.STOPPING):
+        if self._stage in (Stage.REST, Stage.STOPPING):
             return
         if self._vehicle == codec.EMERGENCY_STOP:
             self._lose("a button on the base was pressed")
         elif self._is_faulty:
             self._lose(self._fault_words)
-        elif self._stage is _Stage.ARMED and self._mode == codec.RC_MODE:
+        elif self._stage is Stage.ARMED and self._mode == codec.RC_MODE:
             # A person has taken over, which is no fault.
             self._give_up("disarmed: a person has taken the remote control")
             self._events.append("disarmed: a person has taken the remote control")
-        elif self._stage is _Stage.ARMED and self._mode != codec.CAN_MODE:
+        elif self._stage is Stage.ARMED and self._mode != codec.CAN_MODE:
             self._lose(f"the base left its CAN mode by itself, for {_MODES.get(self._mode, self._mode)}")
 
     def _take_odometry(self, left_mm: int, right_mm: int, t_ns: int) -> None:
@@ -333,7 +302,7 @@ class AgilexDriver:
                 self._moved_mm = (self._moved_mm[0] + moved[0], self._moved_mm[1] + moved[1])
             else:
                 self._count("implausible_ticks")
-                if self._stage in (_Stage.ARMING, _Stage.ARMED):
+                if self._stage in (Stage.ARMING, Stage.ARMED):
                     self._lose("the base has restarted: its odometry jumped")
         self._odometry, self._odometry_ns = (left_mm, right_mm), t_ns
 
@@ -348,15 +317,15 @@ class AgilexDriver:
         self._count("unknown_id")
         is_stop = frame in stop_frames(self._settings)
         if is_stop and frame.can_id == codec.CONTROL_MODE:
-            if self._stage is not _Stage.REST:
+            if self._stage is not Stage.REST:
                 self._events.append("stopped from outside on the link, by `disco-hw estop` or another host")
-            self._wanted, self._stage, self._estopped = Request.STANDBY, _Stage.REST, True
+            self._wanted, self._stage, self._estopped = Request.STANDBY, Stage.REST, True
         if is_stop:
             return
         if not self._foreign:
             self._foreign = True
             self._events.append("another host is on the link: it commands the base; disconnect it")
-        if self._stage in (_Stage.ARMING, _Stage.ARMED):
+        if self._stage in (Stage.ARMING, Stage.ARMED):
             self._lose("another host commands the base; disconnect it")
 
     def _check_silence(self, now_ns: int) -> None:
@@ -364,9 +333,9 @@ class AgilexDriver:
             return
         silent = now_ns - self._state_ns > SILENT_NS
         silent = silent or (self._motion_ns is not None and now_ns - self._motion_ns > MOTION_SILENT_NS)
-        if silent and self._stage is not _Stage.REST:
+        if silent and self._stage is not Stage.REST:
             self._lose("the base fell silent")
-        elif self._stage is _Stage.REST and now_ns - self._state_ns > GONE_NS:
+        elif self._stage is Stage.REST and now_ns - self._state_ns > GONE_NS:
             self._restart("the base fell silent")
             self._events.append("the base fell silent: waiting for it")
 
@@ -374,20 +343,10 @@ class AgilexDriver:
         names = {DriverState.ARMED: "ARMED", DriverState.FAULT: "FAULT", DriverState.STOPPING: "STOPPING"}
         at_rest = self._stands and self._mode != codec.CAN_MODE
         names[DriverState.ESTOP] = "ESTOP" if at_rest or self._vehicle == codec.EMERGENCY_STOP else "STOPPING"
-        return RobotStatus(
-            t_ns=t_ns,
-            state=names.get(self.state, "STANDBY"),
-            fault_code=0,
-            fault="NONE",
-            estop_source="NONE",
-            stop_cause="NONE",
-            session=0,
-            rejected_count=0,
-            reject_reason="NONE",
-        )
+        return parts.status(t_ns, names.get(self.state, "STANDBY"))
 
     def _give_up(self, why: str) -> None:
-        self._wanted, self._stage, self._stage_ns, self._note = Request.STANDBY, _Stage.REST, None, why
+        self._wanted, self._stage, self._stage_ns, self._note = Request.STANDBY, Stage.REST, None, why
         # Standby is due at once where it still listens.
         self._repeat_ns = 0
 
@@ -399,7 +358,7 @@ class AgilexDriver:
     def _restart(self, why: str) -> None:
         if self._wanted is Request.ARM:
             self._note = f"disarmed: {why}"
-        self._wanted, self._stage, self._stage_ns = Request.STANDBY, _Stage.REST, None
+        self._wanted, self._stage, self._stage_ns = Request.STANDBY, Stage.REST, None
         self._fault, self._foreign, self._repeat_ns = None, False, 0
         self._state_ns = self._motion_ns = self._odometry = None
         self._vehicle, self._mode, self._error, self._stands = codec.NORMAL, codec.STANDBY, 0, True

@@ -7,12 +7,12 @@ gets velocities and nothing else. Never sent: what calibrates, moves before armi
 
 from __future__ import annotations
 
-import enum
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from drivers.motor import odrive_codec as codec
+from drivers.motor import vendor_parts as parts
 from drivers.motor.odrive_codec import AxisState, Generation
 from drivers.motor.odrive_settings import (
     ESTOP_ERROR,
@@ -25,6 +25,7 @@ from drivers.motor.odrive_settings import (
     stop_confirmation,
     stop_frames,
 )
+from drivers.motor.vendor_parts import Stage
 from drivers.types import (
     Capabilities,
     DriverState,
@@ -47,20 +48,8 @@ VERSION_TRIES = 3
 _VERSION_PERIOD_NS = 100_000_000
 _REPEAT_NS = 100_000_000
 _ALIVE_PERIOD_NS = 30_000_000
-_FRAME_LIFE_NS = 50_000_000
-_ESTOP_LIFE_NS = 1_000_000_000
-_ESTOP_REPEATS = 3
-_ESTOP_RANK, _RANK = 0, 1
-_LONGEST_STEP_S = 0.1
 _HOST_COMMANDS = frozenset({0x02, 0x06, 0x07, 0x0B, 0x0C, 0x0D, 0x0E, 0x0F, 0x16, 0x18, 0x19, 0x1A, 0x1B})
 _QUIET = frozenset({AxisState.UNDEFINED, AxisState.IDLE, AxisState.CLOSED_LOOP})
-
-
-class _Stage(enum.Enum):
-    REST = "rest"
-    ARMING = "arming"
-    ARMED = "armed"
-    STOPPING = "stopping"
 
 
 @dataclass(slots=True)
@@ -95,7 +84,7 @@ class OdriveDriver:
         self._refusal: str | None = None
         self._asked_version = 0
         self._asked_ns = 0
-        self._stage = _Stage.REST
+        self._stage = Stage.REST
         self._wanted = Request.STANDBY
         self._note = "it stands by"
         self._fault: str | None = None
@@ -121,9 +110,9 @@ class OdriveDriver:
             return DriverState.ESTOP
         if self._fault is not None or any(axis.error and not self._is_idle_watchdog(axis) for axis in self._all):
             return DriverState.FAULT
-        if self._stage is _Stage.ARMED:
+        if self._stage is Stage.ARMED:
             return DriverState.ARMED
-        if self._stage is _Stage.STOPPING or (self._stage is _Stage.REST and self._any_closed_loop):
+        if self._stage is Stage.STOPPING or (self._stage is Stage.REST and self._any_closed_loop):
             return DriverState.STOPPING
         rest = {Request.ARM: DriverState.ARMING, Request.READY: DriverState.READY}
         return rest.get(self._wanted, DriverState.STANDBY)
@@ -156,19 +145,12 @@ class OdriveDriver:
         if not self._known or self._refusal is not None:
             return None
         settings = self._settings
-        return Capabilities(
-            protocol_major=2 if self._generation is Generation.V06 else 0,
-            protocol_minor=0,
-            firmware_version=f"ODrive {settings.firmware}",
-            dbc_hash=0,
-            board_id=0,
-            max_wheel_speed_rad_s=2.0 * math.pi * settings.vel_limit_turns_s / settings.gear,
-            max_wheel_acceleration_rad_s2=None,
-            ticks_per_rev=None,
-            command_timeout_s=settings.watchdog_s,
-            drive_off_timeout_s=settings.watchdog_s,
-            stop_deceleration_rad_s2=settings.stop_deceleration_rad_s2,
-            told=False,
+        return parts.declared(
+            f"ODrive {settings.firmware}",
+            2 if self._generation is Generation.V06 else 0,
+            2.0 * math.pi * settings.vel_limit_turns_s / settings.gear,
+            settings.watchdog_s,
+            settings.stop_deceleration_rad_s2,
         )
 
     def link_up(self, now_ns: int) -> None:
@@ -190,9 +172,9 @@ class OdriveDriver:
                 self._note = f"not arming: {self.detail}"
                 return
             self.stats = replace(self.stats, sessions=self.stats.sessions + 1)
-            self._note, self._stage, self._arm_step, self._stage_ns = "arming", _Stage.ARMING, 0, None
+            self._note, self._stage, self._arm_step, self._stage_ns = "arming", Stage.ARMING, 0, None
             self._speeds = (0.0, 0.0)
-        elif self._wanted is Request.ARM and self._stage is not _Stage.REST:
+        elif self._wanted is Request.ARM and self._stage is not Stage.REST:
             self._stop("stopping as asked")
         self._wanted = request
 
@@ -229,18 +211,15 @@ class OdriveDriver:
 
         Raises ValueError for a command that is not finite or valid for no time.
         """
-        if command is not None and not (
-            math.isfinite(command.left_rad_s) and math.isfinite(command.right_rad_s) and command.valid_for_s > 0.0
-        ):
-            raise ValueError(f"not a wheel command: {command}")
+        parts.check_command(command)
         if not self._link_is_up:
             return ()
         match self._stage:
-            case _Stage.REST:
+            case Stage.REST:
                 return self._rest(now_ns)
-            case _Stage.ARMING:
+            case Stage.ARMING:
                 return self._arm(now_ns)
-            case _Stage.STOPPING:
+            case Stage.STOPPING:
                 return self._ramp(now_ns)
         if command is None:
             return ()
@@ -248,16 +227,13 @@ class OdriveDriver:
         self._last_sent_ns = now_ns
         self._count("commands_sent")
         # Half of its validity may pass on the way.
-        return self._frames(now_ns, *self._velocity(self._speeds), life_ns=round(0.5e9 * command.valid_for_s))
+        return parts.outgoing(now_ns, *self._velocity(self._speeds), life_ns=round(0.5e9 * command.valid_for_s))
 
     def estop(self, now_ns: int) -> tuple[OutgoingFrame, ...]:
         """Frames that stop every axis in any state; whatever was wanted is dropped, and nothing is commanded again."""
-        self._wanted, self._stage, self._estopped = Request.STANDBY, _Stage.REST, True
+        self._wanted, self._stage, self._estopped = Request.STANDBY, Stage.REST, True
         self._note = "emergency stop sent"
-        return tuple(
-            OutgoingFrame(frame, now_ns + _ESTOP_LIFE_NS, _ESTOP_RANK)
-            for frame in _ESTOP_REPEATS * stop_frames(self._settings)
-        )
+        return parts.estop_frames(now_ns, stop_frames(self._settings))
 
     @property
     def _all(self) -> Sequence[_Axis]:
@@ -275,7 +251,7 @@ class OdriveDriver:
         """Bring axes that are energised to idle; reset; learn the version; keep idle axes from a watchdog error."""
         if self._any_closed_loop and now_ns - self._repeat_ns >= _REPEAT_NS:
             self._repeat_ns = now_ns
-            return self._frames(now_ns, *self._state_frames(AxisState.IDLE))
+            return parts.outgoing(now_ns, *self._state_frames(AxisState.IDLE))
         if self._any_closed_loop:
             return ()
         if self._wanted is Request.RESET:
@@ -286,7 +262,7 @@ class OdriveDriver:
             return ()
         self._asked_ns = now_ns
         asked = codec.TELEMETRY[self._generation]["Get_Bus_Voltage_Current"].command
-        return self._frames(now_ns, *(codec.ask(axis.node, asked) for axis in self._all))
+        return parts.outgoing(now_ns, *(codec.ask(axis.node, asked) for axis in self._all))
 
     def _ask_version(self, now_ns: int) -> tuple[OutgoingFrame, ...]:
         if any(axis.heard_ns is None for axis in self._all) or now_ns - self._asked_ns < _VERSION_PERIOD_NS:
@@ -294,7 +270,7 @@ class OdriveDriver:
         self._asked_ns = now_ns
         self._asked_version += 1
         if self._asked_version <= VERSION_TRIES:
-            return self._frames(now_ns, *(codec.ask(axis.node, codec.GET_VERSION) for axis in self._all))
+            return parts.outgoing(now_ns, *(codec.ask(axis.node, codec.GET_VERSION) for axis in self._all))
         if self._generation is Generation.V05:
             # That generation does not know the question.
             self._introduce()
@@ -309,45 +285,42 @@ class OdriveDriver:
         if now_ns - self._repeat_ns < 2 * _REPEAT_NS:
             return ()
         self._repeat_ns = now_ns
-        return self._frames(now_ns, *self._clear_frames())
+        return parts.outgoing(now_ns, *self._clear_frames())
 
     def _arm(self, now_ns: int) -> tuple[OutgoingFrame, ...]:
         """One step in each tick: clear an idle watchdog's error, mode, zero velocity, closed loop, then zeros."""
         if self._stage_ns is None:
             self._stage_ns = now_ns
         if all(axis.beats_armed >= BEATS_TO_ARM for axis in self._all):
-            self._stage, self._note = _Stage.ARMED, "armed"
+            self._stage, self._note = Stage.ARMED, "armed"
             self._last_sent_ns, self._speeds = now_ns, (0.0, 0.0)
-            return self._frames(now_ns, *self._velocity((0.0, 0.0)))
+            return parts.outgoing(now_ns, *self._velocity((0.0, 0.0)))
         if now_ns - self._stage_ns > ARMING_TIMEOUT_NS:
             waiting = [str(axis.node) for axis in self._all if axis.beats_armed < BEATS_TO_ARM]
             self._give_up(f"node {', '.join(waiting)} did not go to closed loop; is it calibrated (odrivetool)?")
-            return self._frames(now_ns, *self._state_frames(AxisState.IDLE))
+            return parts.outgoing(now_ns, *self._state_frames(AxisState.IDLE))
         step, self._arm_step = self._arm_step, self._arm_step + 1
         if step == 0 and any(axis.error for axis in self._all):
-            return self._frames(now_ns, *self._clear_frames())
+            return parts.outgoing(now_ns, *self._clear_frames())
         if step <= 1:
             self._arm_step = 2
             mode = {"control_mode": codec.VELOCITY_CONTROL, "input_mode": codec.PASSTHROUGH}
-            return self._frames(now_ns, *self._each("Set_Controller_Mode", **mode))
+            return parts.outgoing(now_ns, *self._each("Set_Controller_Mode", **mode))
         if step == 3:
             for axis in self._all:
                 axis.beats_armed = 0
-            return self._frames(now_ns, *self._state_frames(AxisState.CLOSED_LOOP))
-        return self._frames(now_ns, *self._velocity((0.0, 0.0)))
+            return parts.outgoing(now_ns, *self._state_frames(AxisState.CLOSED_LOOP))
+        return parts.outgoing(now_ns, *self._velocity((0.0, 0.0)))
 
     def _ramp(self, now_ns: int) -> tuple[OutgoingFrame, ...]:
         """Slow down with the declared deceleration, then let the axes idle until they say that they do."""
-        elapsed_s = min(max(now_ns - self._last_sent_ns, 0) * 1e-9, _LONGEST_STEP_S)
-        self._last_sent_ns = now_ns
-        step = self._settings.stop_deceleration_rad_s2 * elapsed_s
-        left, right = (math.copysign(max(abs(speed) - step, 0.0), speed) for speed in self._speeds)
-        self._speeds = (left, right)
-        if left or right:
-            return self._frames(now_ns, *self._velocity(self._speeds))
+        elapsed_ns, self._last_sent_ns = now_ns - self._last_sent_ns, now_ns
+        self._speeds = parts.slowed(self._speeds, self._settings.stop_deceleration_rad_s2, elapsed_ns)
+        if any(self._speeds):
+            return parts.outgoing(now_ns, *self._velocity(self._speeds))
         if not self._any_closed_loop:
-            self._stage = _Stage.REST
-        return self._frames(now_ns, *self._velocity((0.0, 0.0)), *self._state_frames(AxisState.IDLE))
+            self._stage = Stage.REST
+        return parts.outgoing(now_ns, *self._velocity((0.0, 0.0)), *self._state_frames(AxisState.IDLE))
 
     def _velocity(self, speeds: tuple[float, float]) -> list[Frame]:
         limit = self._settings.vel_limit_turns_s
@@ -371,9 +344,6 @@ class OdriveDriver:
     def _clear_frames(self) -> list[Frame]:
         return self._each("Clear_Errors", **({"identify": 0} if self._generation is Generation.V06 else {}))
 
-    def _frames(self, now_ns: int, *frames: Frame, life_ns: int = _FRAME_LIFE_NS) -> tuple[OutgoingFrame, ...]:
-        return tuple(OutgoingFrame(frame, now_ns + life_ns, _RANK) for frame in frames)
-
     def _take_heartbeat(self, axis: _Axis, values: Mapping[str, float], t_ns: int) -> None:
         axis.heard_ns = t_ns
         axis.state, axis.error = int(values["axis_state"]), int(values["axis_error"])
@@ -385,12 +355,12 @@ class OdriveDriver:
             self._refusal = None
         energised = axis.state == AxisState.CLOSED_LOOP and axis.error == 0
         axis.beats_armed = axis.beats_armed + 1 if energised and self._arm_step > 3 else 0
-        if self._stage is _Stage.ARMING and axis.error and not self._is_idle_watchdog(axis):
+        if self._stage is Stage.ARMING and axis.error and not self._is_idle_watchdog(axis):
             self._lose(f"node {axis.node} did not arm: {self._words(axis)}")
-        elif self._stage is _Stage.ARMED and not energised:
+        elif self._stage is Stage.ARMED and not energised:
             what = self._words(axis) if axis.error else f"it left closed loop by itself, for state {axis.state}"
             self._lose(f"node {axis.node}: {what}")
-        elif self._stage is _Stage.STOPPING and axis.error:
+        elif self._stage is Stage.STOPPING and axis.error:
             self._lose(f"node {axis.node}: {self._words(axis)}")
 
     def _answer_of_another_generation(self, frame: Frame) -> codec.Decoded | None:
@@ -442,7 +412,7 @@ class OdriveDriver:
         for axis in self._all:
             if axis.heard_ns is not None and now_ns - axis.heard_ns > limit_ns:
                 why = f"node {axis.node} fell silent"
-                if self._stage is not _Stage.REST:
+                if self._stage is not Stage.REST:
                     self._lose(f"{why}: no heartbeat for {limit_ns * 1e-9:g} s")
                 elif now_ns - axis.heard_ns > max(2.0 * limit_ns, 5e8):
                     self._restart(why, now_ns)
@@ -457,7 +427,7 @@ class OdriveDriver:
             if not self._foreign:
                 self._foreign = True
                 self._events.append(f"another host is on the link: it commands node {node}; disconnect it")
-            if self._stage is not _Stage.REST and command != 0x02:
+            if self._stage is not Stage.REST and command != 0x02:
                 self._lose(f"another host commands node {node}; disconnect it")
         elif ours and len(frame.data) != 8:
             self._count("rejected_length")
@@ -467,16 +437,8 @@ class OdriveDriver:
     def _status(self, t_ns: int) -> RobotStatus:
         names = {DriverState.ARMED: "ARMED", DriverState.FAULT: "FAULT", DriverState.ESTOP: "ESTOP"}
         names[DriverState.STOPPING] = "STOPPING"
-        return RobotStatus(
-            t_ns=t_ns,
-            state="ESTOP" if self._all_in_estop else names.get(self.state, "STANDBY").replace("ESTOP", "STOPPING"),
-            fault_code=0,
-            fault="NONE",
-            estop_source="NONE",
-            stop_cause="NONE",
-            session=0,
-            rejected_count=0,
-            reject_reason="NONE",
+        return parts.status(
+            t_ns, "ESTOP" if self._all_in_estop else names.get(self.state, "STANDBY").replace("ESTOP", "STOPPING")
         )
 
     @property
@@ -486,10 +448,10 @@ class OdriveDriver:
     def _stop(self, why: str) -> None:
         """Ramp down and idle; from before the closed loop, idle at once."""
         self._note = why
-        self._stage, self._stage_ns = _Stage.STOPPING, None
+        self._stage, self._stage_ns = Stage.STOPPING, None
 
     def _give_up(self, why: str) -> None:
-        self._wanted, self._stage, self._stage_ns, self._note = Request.STANDBY, _Stage.REST, None, why
+        self._wanted, self._stage, self._stage_ns, self._note = Request.STANDBY, Stage.REST, None, why
         # Idle is due at once for all that are still energised.
         self._repeat_ns = 0
 
@@ -502,7 +464,7 @@ class OdriveDriver:
     def _restart(self, why: str, now_ns: int) -> None:
         if self._wanted is Request.ARM:
             self._note = f"disarmed: {why}"
-        self._wanted, self._stage, self._stage_ns = Request.STANDBY, _Stage.REST, None
+        self._wanted, self._stage, self._stage_ns = Request.STANDBY, Stage.REST, None
         self._known, self._refusal, self._fault, self._estopped, self._foreign = False, None, None, False, False
         self._asked_version, self._asked_ns, self._repeat_ns, self._arm_step = 0, now_ns - _VERSION_PERIOD_NS, 0, 0
         for axis in self._all:

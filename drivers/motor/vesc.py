@@ -7,12 +7,13 @@ as no status message tells them; the question feeds no timeout.
 
 from __future__ import annotations
 
-import enum
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
+from drivers.motor import vendor_parts as parts
 from drivers.motor import vesc_codec as codec
+from drivers.motor.vendor_parts import Stage
 from drivers.motor.vesc_settings import (
     EXAMPLE,
     FAULTS,
@@ -47,21 +48,8 @@ ARMING_TIMEOUT_NS = 1_500_000_000
 BRAKING_NS = 3_000_000_000
 _PING_PERIOD_NS = 100_000_000
 _FAULT_PERIOD_NS = 50_000_000
-_FRAME_LIFE_NS = 50_000_000
-_ESTOP_LIFE_NS = 1_000_000_000
-_ESTOP_REPEATS = 3
-_ESTOP_RANK, _RANK = 0, 1
-_LONGEST_STEP_S = 0.1
 _SET_COMMANDS = frozenset(number for number, _ in codec.CAN_COMMANDS.values())
 _BRAKE = codec.CAN_COMMANDS["set_brake_current"][0]
-
-
-class _Stage(enum.Enum):
-    REST = "rest"
-    ARMING = "arming"
-    ARMED = "armed"
-    STOPPING = "stopping"
-    BRAKING = "braking"
 
 
 @dataclass(slots=True)
@@ -93,7 +81,7 @@ class VescDriver:
         self._reassembly = codec.Reassembly(HOST_ID)
         self.stats = DriverStats()
         self._link_is_up = False
-        self._stage = _Stage.REST
+        self._stage = Stage.REST
         self._stage_ns: int | None = None
         self._wanted, self._note = Request.STANDBY, "it stands by"
         self._fault: str | None = None
@@ -117,9 +105,9 @@ class VescDriver:
             return DriverState.HANDSHAKE
         if self._fault is not None or any(motor.fault for motor in self._all):
             return DriverState.FAULT
-        if self._stage is _Stage.ARMED:
+        if self._stage is Stage.ARMED:
             return DriverState.ARMED
-        if self._stage in (_Stage.STOPPING, _Stage.BRAKING):
+        if self._stage in (Stage.STOPPING, Stage.BRAKING):
             return DriverState.STOPPING
         rest = {Request.ARM: DriverState.ARMING, Request.READY: DriverState.READY}
         return rest.get(self._wanted, DriverState.STANDBY)
@@ -148,19 +136,12 @@ class VescDriver:
         if not self._is_known:
             return None
         settings = self._settings
-        return Capabilities(
-            protocol_major=0,
-            protocol_minor=0,
-            firmware_version="VESC",
-            dbc_hash=0,
-            board_id=0,
-            max_wheel_speed_rad_s=settings.max_erpm / settings.erpm_per_rad_s,
-            max_wheel_acceleration_rad_s2=None,
-            ticks_per_rev=None,
-            command_timeout_s=settings.watchdog_s,
-            drive_off_timeout_s=settings.watchdog_s,
-            stop_deceleration_rad_s2=settings.stop_deceleration_rad_s2,
-            told=False,
+        return parts.declared(
+            "VESC",
+            0,
+            settings.max_erpm / settings.erpm_per_rad_s,
+            settings.watchdog_s,
+            settings.stop_deceleration_rad_s2,
         )
 
     def link_up(self, now_ns: int) -> None:
@@ -182,10 +163,10 @@ class VescDriver:
                 self._note = f"not arming: {self.detail}"
                 return
             self.stats = replace(self.stats, sessions=self.stats.sessions + 1)
-            self._note, self._stage, self._stage_ns = "arming", _Stage.ARMING, None
+            self._note, self._stage, self._stage_ns = "arming", Stage.ARMING, None
             self._zeros, self._speeds = 0, (0.0, 0.0)
-        elif self._wanted is Request.ARM and self._stage in (_Stage.ARMING, _Stage.ARMED):
-            self._note, self._stage, self._stage_ns = "stopping as asked", _Stage.STOPPING, None
+        elif self._wanted is Request.ARM and self._stage in (Stage.ARMING, Stage.ARMED):
+            self._note, self._stage, self._stage_ns = "stopping as asked", Stage.STOPPING, None
         self._wanted = request
 
     def receive(self, now_ns: int, frames: Sequence[ReceivedFrame]) -> Readings:
@@ -221,22 +202,19 @@ class VescDriver:
 
         Raises ValueError for a command that is not finite or valid for no time.
         """
-        if command is not None and not (
-            math.isfinite(command.left_rad_s) and math.isfinite(command.right_rad_s) and command.valid_for_s > 0.0
-        ):
-            raise ValueError(f"not a wheel command: {command}")
+        parts.check_command(command)
         if not self._link_is_up:
             return ()
         asked = self._questions(now_ns)
         match self._stage:
-            case _Stage.REST:
+            case Stage.REST:
                 self._reset()
                 return asked
-            case _Stage.ARMING:
+            case Stage.ARMING:
                 return (*self._arm(now_ns), *asked)
-            case _Stage.STOPPING:
+            case Stage.STOPPING:
                 return (*self._ramp(now_ns), *asked)
-            case _Stage.BRAKING:
+            case Stage.BRAKING:
                 return (*self._brake(now_ns), *asked)
         if now_ns - self._last_sent_ns > self._settings.watchdog_s * 1e9:
             # They have no armed state to fall out of: the next speed would move them again.
@@ -248,16 +226,13 @@ class VescDriver:
         self._count("commands_sent")
         # Half of its validity may pass on the way.
         life_ns = round(0.5e9 * command.valid_for_s)
-        return (*self._frames(now_ns, *self._velocity(self._speeds), life_ns=life_ns), *asked)
+        return (*parts.outgoing(now_ns, *self._velocity(self._speeds), life_ns=life_ns), *asked)
 
     def estop(self, now_ns: int) -> tuple[OutgoingFrame, ...]:
         """Frames that brake every motor in any state; the driver goes on with that until they stand."""
         self._wanted, self._estopped = Request.STANDBY, True
-        self._stage, self._stage_ns, self._note = _Stage.BRAKING, now_ns, "emergency stop sent"
-        return tuple(
-            OutgoingFrame(frame, now_ns + _ESTOP_LIFE_NS, _ESTOP_RANK)
-            for frame in _ESTOP_REPEATS * stop_frames(self._settings)
-        )
+        self._stage, self._stage_ns, self._note = Stage.BRAKING, now_ns, "emergency stop sent"
+        return parts.estop_frames(now_ns, stop_frames(self._settings))
 
     @property
     def _all(self) -> Sequence[_Motor]:
@@ -282,13 +257,13 @@ class VescDriver:
             if now_ns - self._pinged_ns < _PING_PERIOD_NS:
                 return ()
             self._pinged_ns = now_ns
-            return self._frames(now_ns, *(codec.ping(motor.node, HOST_ID) for motor in self._all))
+            return parts.outgoing(now_ns, *(codec.ping(motor.node, HOST_ID) for motor in self._all))
         if now_ns - self._asked_ns < _FAULT_PERIOD_NS:
             return ()
         self._asked_ns = now_ns
         self._next_asked = (self._next_asked + 1) % len(self._all)
         node = self._all[self._next_asked].node
-        return self._frames(now_ns, *codec.fragments(node, HOST_ID, codec.ask_values(codec.FAULT_AND_STATUS)))
+        return parts.outgoing(now_ns, *codec.fragments(node, HOST_ID, codec.ask_values(codec.FAULT_AND_STATUS)))
 
     def _arm(self, now_ns: int) -> tuple[OutgoingFrame, ...]:
         """Zeros, for as long as the motors stand, until there were enough."""
@@ -303,31 +278,28 @@ class VescDriver:
             return ()
         self._zeros += 1
         if self._zeros > ZEROS_TO_ARM:
-            self._stage, self._note = _Stage.ARMED, "armed"
+            self._stage, self._note = Stage.ARMED, "armed"
         self._last_sent_ns = now_ns
-        return self._frames(now_ns, *self._velocity((0.0, 0.0)))
+        return parts.outgoing(now_ns, *self._velocity((0.0, 0.0)))
 
     def _ramp(self, now_ns: int) -> tuple[OutgoingFrame, ...]:
         """Slow down with the declared deceleration, then let go, then say nothing."""
-        elapsed_s = min(max(now_ns - self._last_sent_ns, 0) * 1e-9, _LONGEST_STEP_S)
-        self._last_sent_ns = now_ns
-        step = self._settings.stop_deceleration_rad_s2 * elapsed_s
-        left, right = (math.copysign(max(abs(speed) - step, 0.0), speed) for speed in self._speeds)
-        self._speeds = (left, right)
-        if max(abs(left), abs(right)) > slowest_rad_s(self._settings):
-            return self._frames(now_ns, *self._velocity(self._speeds))
+        elapsed_ns, self._last_sent_ns = now_ns - self._last_sent_ns, now_ns
+        self._speeds = parts.slowed(self._speeds, self._settings.stop_deceleration_rad_s2, elapsed_ns)
+        if max(map(abs, self._speeds)) > slowest_rad_s(self._settings):
+            return parts.outgoing(now_ns, *self._velocity(self._speeds))
         # Below the slowest speed that it holds it would roll on: brake there.
-        self._stage, self._stage_ns = _Stage.BRAKING, now_ns
+        self._stage, self._stage_ns = Stage.BRAKING, now_ns
         return self._brake(now_ns)
 
     def _brake(self, now_ns: int) -> tuple[OutgoingFrame, ...]:
         self._stage_ns = now_ns if self._stage_ns is None else self._stage_ns
         known = all(motor.erpm_ns is not None for motor in self._all)
         if (known and self._stands) or now_ns - self._stage_ns > BRAKING_NS:
-            self._stage = _Stage.REST
-            return self._frames(now_ns, *(codec.command(motor.node, "set_current", 0.0) for motor in self._all))
+            self._stage = Stage.REST
+            return parts.outgoing(now_ns, *(codec.command(motor.node, "set_current", 0.0) for motor in self._all))
         amperes = self._settings.brake_current_a
-        return self._frames(now_ns, *(codec.command(m.node, "set_brake_current", amperes) for m in self._all))
+        return parts.outgoing(now_ns, *(codec.command(m.node, "set_brake_current", amperes) for m in self._all))
 
     def _reset(self) -> None:
         """Clear what is latched here; a controller ends its own fault when its cause has gone."""
@@ -341,9 +313,6 @@ class VescDriver:
             erpm = min(max(direction * speed * self._settings.erpm_per_rad_s, -limit), limit)
             frames += [codec.command(motor.node, "set_erpm", erpm) for motor in side]
         return frames
-
-    def _frames(self, now_ns: int, *frames: Frame, life_ns: int = _FRAME_LIFE_NS) -> tuple[OutgoingFrame, ...]:
-        return tuple(OutgoingFrame(frame, now_ns + life_ns, _RANK) for frame in frames)
 
     def _take_packet(self, frame: Frame) -> bool:
         """Whether the frame belongs to an answer for this host; what the answer says is taken."""
@@ -367,7 +336,7 @@ class VescDriver:
                 motor.steps += moved
             else:
                 self._count("implausible_ticks")
-                if self._stage in (_Stage.ARMING, _Stage.ARMED):
+                if self._stage in (Stage.ARMING, Stage.ARMED):
                     self._lose(f"controller {motor.node} has restarted")
         motor.tachometer, motor.tachometer_ns, motor.is_new = tachometer, t_ns, True
 
@@ -388,16 +357,16 @@ class VescDriver:
         """Faults, silence and timeouts of an armed controller stop all."""
         for motor in self._all:
             age_ns = None if motor.erpm_ns is None else now_ns - motor.erpm_ns
-            if self._stage in (_Stage.ARMING, _Stage.ARMED, _Stage.STOPPING):
+            if self._stage in (Stage.ARMING, Stage.ARMED, Stage.STOPPING):
                 if motor.fault:
                     self._lose(f"controller {motor.node}: {_words(motor.fault)}")
                 elif motor.killed:
                     self._lose(f"controller {motor.node}: its kill switch is pressed")
                 elif age_ns is not None and age_ns > SILENT_NS:
                     self._lose(f"controller {motor.node} fell silent")
-                elif self._stage is _Stage.ARMED and motor.timed_out and self._zeros_are_old(now_ns):
+                elif self._stage is Stage.ARMED and motor.timed_out and self._zeros_are_old(now_ns):
                     self._lose(f"controller {motor.node}: its timeout ran out, no command came in time")
-            elif age_ns is not None and age_ns > GONE_NS and self._stage is _Stage.REST:
+            elif age_ns is not None and age_ns > GONE_NS and self._stage is Stage.REST:
                 self._restart(f"controller {motor.node} fell silent", now_ns)
                 self._events.append(f"controller {motor.node} fell silent: asking anew")
 
@@ -412,43 +381,33 @@ class VescDriver:
         if not (ours and number in _SET_COMMANDS):
             return
         if number == _BRAKE:
-            self._wanted, self._estopped, self._stage, self._stage_ns = Request.STANDBY, True, _Stage.BRAKING, None
+            self._wanted, self._estopped, self._stage, self._stage_ns = Request.STANDBY, True, Stage.BRAKING, None
             self._events.append("e-stop from outside on the link, by `disco-hw estop` or another host")
             return
         if not self._foreign:
             self._foreign = True
             self._events.append(f"another host is on the link: it commands controller {to}; disconnect it")
-        if self._stage in (_Stage.ARMING, _Stage.ARMED):
+        if self._stage in (Stage.ARMING, Stage.ARMED):
             self._lose(f"another host commands controller {to}; disconnect it")
 
     def _status(self, t_ns: int) -> RobotStatus:
         names = {DriverState.ARMED: "ARMED", DriverState.FAULT: "FAULT", DriverState.STOPPING: "STOPPING"}
         names[DriverState.ESTOP] = "ESTOP" if self._stands else "STOPPING"
-        return RobotStatus(
-            t_ns=t_ns,
-            state=names.get(self.state, "STANDBY"),
-            fault_code=0,
-            fault="NONE",
-            estop_source="NONE",
-            stop_cause="NONE",
-            session=0,
-            rejected_count=0,
-            reject_reason="NONE",
-        )
+        return parts.status(t_ns, names.get(self.state, "STANDBY"))
 
     def _give_up(self, why: str) -> None:
-        self._wanted, self._stage, self._stage_ns, self._note = Request.STANDBY, _Stage.REST, None, why
+        self._wanted, self._stage, self._stage_ns, self._note = Request.STANDBY, Stage.REST, None, why
 
     def _lose(self, why: str) -> None:
         """One controller is lost: all brake, latched."""
         self._give_up(f"disarmed: {why}")
-        self._stage, self._fault = _Stage.BRAKING, why
+        self._stage, self._fault = Stage.BRAKING, why
         self._events.append(f"disarmed: {why}")
 
     def _restart(self, why: str, now_ns: int) -> None:
         if self._wanted is Request.ARM:
             self._note = f"disarmed: {why}"
-        self._wanted, self._stage, self._stage_ns = Request.STANDBY, _Stage.REST, None
+        self._wanted, self._stage, self._stage_ns = Request.STANDBY, Stage.REST, None
         self._fault, self._foreign, self._pinged_ns = None, False, now_ns - _PING_PERIOD_NS
         for motor in self._all:
             motor.answered = motor.is_new = motor.timed_out = motor.killed = False

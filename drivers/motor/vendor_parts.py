@@ -1,0 +1,84 @@
+"""What the drivers of vendors' controllers share: stages, the ramp of a stop, and words for what they do not know."""
+
+from __future__ import annotations
+
+import enum
+import math
+
+from drivers.types import Capabilities, Frame, OutgoingFrame, RobotStatus, WheelCommand
+
+_FRAME_LIFE_NS = 50_000_000
+_ESTOP_LIFE_NS = 1_000_000_000
+_ESTOP_REPEATS = 3
+_ESTOP_RANK, _RANK = 0, 1
+_LONGEST_STEP_S = 0.1
+
+
+class Stage(enum.Enum):
+    """Where a driver is between standing by and driving; BRAKING only where stopping ends with a brake."""
+
+    REST = "rest"
+    ARMING = "arming"
+    ARMED = "armed"
+    STOPPING = "stopping"
+    BRAKING = "braking"
+
+
+def check_command(command: WheelCommand | None) -> None:
+    """Raise ValueError for a command that is not finite or valid for no time."""
+    if command is not None and not (
+        math.isfinite(command.left_rad_s) and math.isfinite(command.right_rad_s) and command.valid_for_s > 0.0
+    ):
+        raise ValueError(f"not a wheel command: {command}")
+
+
+def slowed(speeds_rad_s: tuple[float, float], deceleration_rad_s2: float, elapsed_ns: int) -> tuple[float, float]:
+    """Speeds of both sides nearer to zero by the deceleration; a pause counts for 0.1 s at most."""
+    step = deceleration_rad_s2 * min(max(elapsed_ns, 0) * 1e-9, _LONGEST_STEP_S)
+    left, right = (math.copysign(max(abs(speed) - step, 0.0), speed) for speed in speeds_rad_s)
+    return left, right
+
+
+def outgoing(now_ns: int, *frames: Frame, life_ns: int = _FRAME_LIFE_NS) -> tuple[OutgoingFrame, ...]:
+    """Frames to be sent within `life_ns`, in this order, after any e-stop."""
+    return tuple(OutgoingFrame(frame, now_ns + life_ns, _RANK) for frame in frames)
+
+
+def estop_frames(now_ns: int, frames: tuple[Frame, ...]) -> tuple[OutgoingFrame, ...]:
+    """The frames of an e-stop, three times over, before all others."""
+    return tuple(OutgoingFrame(frame, now_ns + _ESTOP_LIFE_NS, _ESTOP_RANK) for frame in _ESTOP_REPEATS * frames)
+
+
+def declared(
+    firmware: str, major: int, fastest_rad_s: float, timeout_s: float, deceleration_rad_s2: float
+) -> Capabilities:
+    """What robot.toml says of a controller that tells nothing of itself."""
+    return Capabilities(
+        protocol_major=major,
+        protocol_minor=0,
+        firmware_version=firmware,
+        dbc_hash=0,
+        board_id=0,
+        max_wheel_speed_rad_s=fastest_rad_s,
+        max_wheel_acceleration_rad_s2=None,
+        ticks_per_rev=None,
+        command_timeout_s=timeout_s,
+        drive_off_timeout_s=timeout_s,
+        stop_deceleration_rad_s2=deceleration_rad_s2,
+        told=False,
+    )
+
+
+def status(t_ns: int, state: str) -> RobotStatus:
+    """A status of nothing but the state: these controllers know no sessions and count no refused frames."""
+    return RobotStatus(
+        t_ns=t_ns,
+        state=state,
+        fault_code=0,
+        fault="NONE",
+        estop_source="NONE",
+        stop_cause="NONE",
+        session=0,
+        rejected_count=0,
+        reject_reason="NONE",
+    )
