@@ -465,7 +465,7 @@ class OdriveDriver:
         if self._wanted is Request.ARM:
             self._note = f"disarmed: {why}"
         self._wanted, self._stage, self._stage_ns = Request.STANDBY, Stage.REST, None
-        self._known, self._refusal, self._fault, self._estopped, self._foreign = False, None, None, False, False
+        self._known, self._refusal, self._fault, self._foreign = False, None, None, False
         self._asked_version, self._asked_ns, self._repeat_ns, self._arm_step = 0, now_ns - _VERSION_PERIOD_NS, 0, 0
         for axis in self._all:
             axis.heard_ns = axis.pos_turns = None

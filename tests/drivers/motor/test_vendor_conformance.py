@@ -230,6 +230,24 @@ def test_a_line_unplugged_stops_the_robot_and_reconnection_never_arms(vendor, be
     assert bench.wheels[-1].left_angle_rad > 1.0, "the angles go on from where they were"
 
 
+def test_an_emergency_stop_is_latched_although_the_line_was_out_when_it_was_asked_for(bench):
+    drive(bench)
+    bench.host_end.plug(False)
+    bench.run(0.5)
+    bench.send_estop()
+    bench.run(COASTING_S)
+    bench.host_end.plug(True)
+    bench.run(3.0)
+    assert bench.driver.state is DriverState.ESTOP
+    bench.driver.request(Request.ARM)
+    bench.largest_speed = 0.0
+    bench.run(1.0, FORWARD)
+    assert bench.driver.state is DriverState.ESTOP
+    assert bench.largest_speed < 0.05
+    bench.driver.request(Request.RESET)
+    bench.run_until(*STILL)
+
+
 @pytest.mark.parametrize("out_for_s", [0.03, 0.09, 0.15])
 def test_a_short_interruption_disarms_too(vendor, bench, out_for_s):
     drive(bench)
