@@ -41,6 +41,9 @@ CARRIED_M, CARRIED_RAD, CARRIED_POSES = 0.15, 0.3, 6
 WORST_POSE_STD_M = 0.03
 """Poses worse than this are left to the fusion."""
 _GAP_NS = 300_000_000
+_WAIT_NS = 600_000_000
+"""Wheel samples wait so long for a pose, and a pose stamped later than that after them is none: the tick that takes
+them in must not have to follow seconds of wheels at once, nor keep them for ever."""
 _STANDS_RAD = 1e-4
 _ROUGH_M, _ROUGH_RAD = 2e-4, 5e-4
 _X, _Y, _YAW, _RADIUS, _AXLE, _X_ICR, _LEFT, _RIGHT = range(8)
@@ -95,9 +98,12 @@ class GeometryFilter:
         self._wheels.extend(
             sample for sample in wheels if math.isfinite(sample.left_angle_rad + sample.right_angle_rad)
         )
+        while self._wheels and self._wheels[-1].t_ns - self._wheels[0].t_ns > _WAIT_NS:
+            self._wheels.popleft()
+        newest_ns = self._wheels[-1].t_ns if self._wheels else self._at.t_ns if self._at is not None else 0
         for pose in poses:
             whole = math.isfinite(pose.x_m + pose.y_m + pose.yaw_rad)
-            if whole and pose.position_std_m <= WORST_POSE_STD_M:
+            if whole and pose.position_std_m <= WORST_POSE_STD_M and pose.t_ns - newest_ns <= _WAIT_NS:
                 self._poses.append(pose)
         while self._poses and self._wheels and self._wheels[-1].t_ns >= self._poses[0].t_ns:
             pose = self._poses.popleft()

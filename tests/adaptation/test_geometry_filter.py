@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -65,6 +66,29 @@ def test_another_axle_is_known_after_fifteen_seconds(factor):
     changed(plant, axle_m=factor * NOMINAL[1])
     drive(found, plant, TURN, 15.0)
     assert abs(found.mean[1] / NOMINAL[1] - factor) < 0.03
+
+
+def test_wheels_without_poses_are_not_kept_and_the_filter_learns_afterwards():
+    found, plant = learner(), ForeignPlant(ForeignRobot(*NOMINAL), (0.0, 0.0, 0.3), 1)
+    for _ in range(500):
+        found.add(plant.readings().wheels, ())
+        plant.advance(*TURN, 20)
+    assert len(found._wheels) < 100
+    drive(found, plant, TURN, 10.0)
+    assert found.poses > 100
+
+
+def test_a_pose_stamped_in_the_future_does_not_hold_up_those_after_it():
+    found, plant = learner(), ForeignPlant(ForeignRobot(*NOMINAL), (0.0, 0.0, 0.3), 1)
+    drive(found, plant, TURN, 2.0)
+    while not (readings := plant.readings()).poses:
+        found.add(readings.wheels, ())
+        plant.advance(*TURN, 20)
+    wrong = msgspec.structs.replace(readings.poses[0], t_ns=readings.poses[0].t_ns + 3_600_000_000_000)
+    found.add(readings.wheels, (wrong,))
+    before = found.poses
+    drive(found, plant, TURN, 4.0)
+    assert found.poses > before + 50
 
 
 def test_a_robot_that_stands_teaches_nothing():
