@@ -178,20 +178,23 @@ def _geometry(proposal: Proposal) -> Geometry:
     return Geometry(np.array(proposal.mean), 0.5 * (covariance + covariance.T))
 
 
-def check_adaptable(model: Model, uncertainty: str) -> None:
-    """Raise InputError for a model or a planner that cannot be adapted, with what to do."""
+def check_adaptable(model: Model, uncertainty: str, asked_by: str = "--adapt") -> None:
+    """Raise InputError for a model or a planner that cannot be adapted, with what to do.
+
+    `asked_by`: the option or field that asked for adaptation.
+    """
     if uncertainty == "point":
-        raise InputError('--adapt: control.uncertainty = "point" plans without a belief; write "ut" or "mc"')
+        raise InputError(f'{asked_by}: control.uncertainty = "point" plans without a belief; write "ut" or "mc"')
     if model.belief is None or not set(NAMES) <= set(model.belief.names):
         raise InputError(
-            "--adapt: the model has no belief over wheel radius, axial distance and x_icr; "
+            f"{asked_by}: the model has no belief over wheel radius, axial distance and x_icr; "
             "write one with `disco-hw infer`"
         )
     others = [s.name for s in model.effects if s.effect.channel is not Channel.COMMAND_TO_WHEEL]
     if others:
         raise InputError(
-            f"--adapt: the model has the effect {others[0]}, which adaptation would take for a change of the geometry; "
-            "run without --adapt"
+            f"{asked_by}: the model has the effect {others[0]}, which adaptation would take for a change of the "
+            f"geometry; leave {asked_by} out"
         )
 
 

@@ -11,7 +11,7 @@ from contextlib import closing
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from disco_hw.adaptation.adaptation import GeometryAdaptation
 from disco_hw.adaptation.guard import check_adaptable
@@ -41,6 +41,7 @@ from disco_hw.log.provenance import DBC, version
 from disco_hw.log.recorder import NullRecorder, ProcessRecorder, Recorder, RecordingSettings
 from disco_hw.runtime import records_of_tick
 from disco_hw.runtime.assembly import (
+    FAST_ASKED_BY,
     assemble_core,
     make_adaptation,
     make_fast_adaptation,
@@ -69,6 +70,8 @@ _WATCHED_FAN_NS = _SECOND_NS // 2
 _FAN_PATHS = 16
 
 Say = Callable[[str, str], None]
+Adapt = Literal["off", "fast", "network"]
+"""Who learns the geometry on the way: nobody, a filter in the tick, or a network in a process of its own."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,8 +96,10 @@ def run_daemon(options: DaemonOptions) -> int:
     setup = load_setup(options.robot, options.model, options.link)
     if not options.accept_missing_effects:
         refuse_missing_effects(setup)
-    if options.adapt:
-        check_adaptable(setup.model, setup.config.control.uncertainty)
+    adapt: Adapt = "network" if options.adapt else setup.config.control.adaptation
+    if adapt != "off":
+        asked_by = "--adapt" if options.adapt else FAST_ASKED_BY
+        check_adaptable(setup.model, setup.config.control.uncertainty, asked_by)
     with closing(AsyncPrinter(STANDARD_OUTPUT, in_json if options.as_json else in_text)) as say:
         return serve(
             setup,
@@ -102,7 +107,7 @@ def run_daemon(options: DaemonOptions) -> int:
             say,
             TaskPilot(),
             lambda: make_planner(setup.config, setup.model),
-            options.adapt,
+            adapt,
             by_command(options.robot),
         )
 
@@ -113,15 +118,15 @@ def serve(
     say: Say,
     pilot: Pilot,
     new_planner: Callable[[], Planner] = NoPlanner,
-    adapt: bool = False,
+    adapt: Adapt = "off",
     ask: Ask | None = None,
 ) -> int:
     """Run until SIGTERM, SIGINT, a quit request or the pilot's end, as `run_daemon`; returns the exit code.
 
     `say` is called in the loop, and so must not wait. `pilot` decides what the robot does while motion is allowed;
-    `new_planner` is called twice, as one planner is used up in the warm-up. `adapt`: learn the geometry on the way, in
-    a process of its own. `ask`: how a person asks for what comes next; with it the daemon says what it waits for, what
-    to do, and where the log is. Raises InputError.
+    `new_planner` is called twice, as one planner is used up in the warm-up. `adapt`: who learns the geometry on the
+    way; nobody where a person drives. `ask`: how a person asks for what comes next; with it the daemon says what it
+    waits for, what to do, and where the log is. Raises InputError.
     """
     key, transport = link_key(setup), make_link(setup)
     # Before the signals are caught: whoever has enough of a compilation may break it off, as nothing is open yet.
@@ -148,7 +153,7 @@ def _start(
     stop: StopPath,
     say: Say,
     pilot: Pilot,
-    adapt: bool,
+    adapt: Adapt,
     ask: Ask | None,
 ) -> Daemon:
     """Make everything, in the order that real time needs, and add to the stop path what must be undone."""
@@ -163,9 +168,12 @@ def _start(
     if ask is not None and log is not None:
         stop.add("log", lambda: say("log", f"look at it: disco-hw view {log}, or disco-hw log info {log}"))
     stop.add("recorder", lambda: _close_recorder(recorder, say))
-    adaptation: GeometryAdaptation | None = make_fast_adaptation(setup, pipeline)
-    if adapt:
-        adaptation = make_adaptation(setup, pipeline, ProcessLink())
+    adaptation: GeometryAdaptation | None = None
+    match adapt:
+        case "network":
+            adaptation = make_adaptation(setup, pipeline, ProcessLink())
+        case "fast":
+            adaptation = make_fast_adaptation(setup, pipeline)
     if adaptation is not None:
         stop.add("adapter", adaptation.close)
     for step in realtime.enter(config.daemon.realtime_priority):

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from disco_hw.adaptation.adaptation import GeometryAdaptation
 from disco_hw.adaptation.link import AdapterLink
 from disco_hw.errors import WorkError
 from disco_hw.log.link import Attachment
@@ -18,7 +19,7 @@ from disco_hw.model.file import model_text
 from disco_hw.runtime.assembly import assemble_core, make_adaptation, make_fast_adaptation, make_pipeline
 from disco_hw.runtime.core import CoreTick, DaemonCore
 from disco_hw.runtime.pilot import Pilot, TaskPilot
-from disco_hw.runtime.pipeline import Planner
+from disco_hw.runtime.pipeline import Pipeline, Planner
 from disco_hw.runtime.robot_setup import Setup, kept_files
 from disco_hw.runtime.supervisor import UserRequest
 from drivers.motor import make_driver
@@ -83,11 +84,15 @@ class SimulatedRun:
             pipeline,
             self.recorder,
             self.pilot.needs_pose if needs_pose is None else needs_pose,
-            adaptation=make_fast_adaptation(setup, pipeline)
-            if adapter is None
-            else make_adaptation(setup, pipeline, adapter),
+            adaptation=self._adaptation(setup, pipeline, adapter),
         )
         self._period_us = round(1e6 / setup.config.control.rate_hz)
+
+    @staticmethod
+    def _adaptation(setup: Setup, pipeline: Pipeline, adapter: AdapterLink | None) -> GeometryAdaptation | None:
+        if adapter is not None:
+            return make_adaptation(setup, pipeline, adapter)
+        return make_fast_adaptation(setup, pipeline) if setup.config.control.adaptation == "fast" else None
 
     def ticks(self, duration_s: float, *requests: UserRequest) -> Iterator[CoreTick]:
         """Let time pass and give every tick as it comes; the requests come with the first one."""

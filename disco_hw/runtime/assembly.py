@@ -31,6 +31,7 @@ from drivers.pose import PoseSourceError, make_pose_source
 from drivers.transport import ReconnectingTransport, TransportSettingsError, make_transport
 from drivers.types import Driver, PoseSource, Transport
 
+FAST_ASKED_BY = 'control.adaptation = "fast"'
 _REHEARSALS = 5
 
 
@@ -69,11 +70,7 @@ def make_adaptation(setup: Setup, pipeline: Pipeline, link: AdapterLink) -> Chec
     `pipeline` has taken no step yet.
     """
     check_adaptable(setup.model, setup.config.control.uncertainty)
-    believed = believed_geometry(setup.model)
-    # What runs for the first time loads code: three times as long as later, in a tick that then must not be late.
-    for _ in range(_REHEARSALS):
-        put_in_force(pipeline, setup.model, believed)
-        put_in_force(pipeline, setup.model, None)
+    believed = _rehearsed(setup, pipeline)
     return CheckedAdaptation(
         link,
         BeliefGuard(believed, *possible_range(setup.config.prior)),
@@ -83,23 +80,29 @@ def make_adaptation(setup: Setup, pipeline: Pipeline, link: AdapterLink) -> Chec
     )
 
 
-def make_fast_adaptation(setup: Setup, pipeline: Pipeline) -> FastAdaptation | None:
-    """The filter that learns the geometry in the tick itself, where robot.toml asks for it.
+def make_fast_adaptation(setup: Setup, pipeline: Pipeline) -> FastAdaptation:
+    """The filter that learns the geometry in the tick itself; raises InputError where the model does not allow it.
 
-    Raises InputError where the model does not allow it. `pipeline` has taken no step yet.
+    `pipeline` has taken no step yet.
     """
-    if setup.config.control.adaptation != "fast":
-        return None
-    check_adaptable(setup.model, setup.config.control.uncertainty)
+    check_adaptable(setup.model, setup.config.control.uncertainty, FAST_ASKED_BY)
+    return FastAdaptation(
+        _rehearsed(setup, pipeline),
+        *possible_range(setup.config.prior),
+        lambda geometry: put_in_force(pipeline, setup.model, geometry),
+    )
+
+
+def _rehearsed(setup: Setup, pipeline: Pipeline) -> Geometry:
+    """The model's geometry, after it was put in force and taken back some times.
+
+    What runs for the first time loads code: three times as long as later, in a tick that then must not be late.
+    """
     believed = believed_geometry(setup.model)
     for _ in range(_REHEARSALS):
         put_in_force(pipeline, setup.model, believed)
         put_in_force(pipeline, setup.model, None)
-    return FastAdaptation(
-        believed,
-        *possible_range(setup.config.prior),
-        lambda geometry: put_in_force(pipeline, setup.model, geometry),
-    )
+    return believed
 
 
 def put_in_force(pipeline: Pipeline, model: Model, learnt: Geometry | None) -> None:

@@ -30,6 +30,8 @@ def test_what_cannot_be_adapted_is_refused():
     check_adaptable(MODEL, "ut")
     with pytest.raises(InputError, match="uncertainty"):
         check_adaptable(MODEL, "point")
+    with pytest.raises(InputError, match=r"^control.adaptation: .*uncertainty"):
+        check_adaptable(MODEL, "point", "control.adaptation")
     with pytest.raises(InputError, match="no belief"):
         check_adaptable(replace(MODEL, belief=None), "ut")
     with pytest.raises(InputError, match="side_slip"):
