@@ -230,8 +230,12 @@ def write_robot_file(
     task: str = "",
     model: str = "wombot_model.toml",
     device: str | None = None,
+    control: str = "",
 ) -> Path:
-    """The shipped robot with addresses of its own; `device`: another motor controller, of `DEVICES`."""
+    """The shipped robot with addresses of its own.
+
+    `device`: another motor controller, of `DEVICES`. `control`: a line for that section.
+    """
     shipped = Path(disco_hw.__file__).parent / "robots"
     text = (shipped / "wombot.toml").read_text(encoding="utf-8")
     for old, new in {
@@ -248,6 +252,8 @@ def write_robot_file(
         text = before + "[task]\n" + task + "\n[model]" + rest.split("[model]")[1]
     if device is not None:
         text = with_device(text, device)
+    if control:
+        text = text.replace("[control]\n", f"[control]\n{control}\n")
     text += f'[daemon]\ncontrol_socket = "{directory / "control.sock"}"\n'
     path = directory / "robot.toml"
     path.write_text(text, encoding="utf-8")
@@ -264,9 +270,10 @@ def running_stack(
     run_arguments: tuple[str, ...] = (),
     model: str = "wombot_model.toml",
     device: str | None = None,
+    control: str = "",
 ) -> Iterator[Stack]:
     """Virtual robot and daemon on one link; both end with the block."""
-    robot_file = write_robot_file(directory, link, task, model, device)
+    robot_file = write_robot_file(directory, link, task, model, device, control)
     simulator = [
         "sim", str(robot_file), "--truth", str(directory / "truth.csv"), "--inject", str(directory / "inject"),
         "--start", *map(str, start), *sim_arguments,
