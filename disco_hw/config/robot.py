@@ -13,7 +13,9 @@ from disco_hw.config.words import in_words
 from disco_hw.errors import InputError
 from disco_hw.files import ROBOT_TOML, read_toml
 from drivers.motor import DriverFieldError, UnknownDriverError, find_driver, own_fields
+from drivers.motor.wiring import AS_TOLD, Wiring
 from drivers.pose import DEFAULT, PoseSourceError, find_pose_source
+from drivers.pose.convention import PoseConvention
 
 if TYPE_CHECKING:
     from disco_hw.tasks import RobotTask
@@ -91,6 +93,15 @@ class PoseInput(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     source: str = DEFAULT
     address: str = "127.0.0.1"
     port: Annotated[int, Meta(ge=1, le=65535)] = 5005
+    position_unit: Literal["m", "cm", "mm"] = "m"
+    yaw_unit: Literal["rad", "deg"] = "rad"
+    clockwise: bool = False
+    mirrored: bool = False
+    yaw_offset_rad: Annotated[float, Meta(ge=-7.0, le=7.0)] = 0.0
+
+    def convention(self) -> PoseConvention:
+        """In what units and about which axes the source speaks."""
+        return PoseConvention(self.position_unit, self.yaw_unit, self.clockwise, self.mirrored, self.yaw_offset_rad)
 
 
 class Control(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -184,6 +195,7 @@ class RobotConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     robot: Robot
     prior: Prior = Prior()
     link: Link = Link()
+    wheels: Wiring = AS_TOLD
     pose: PoseInput = PoseInput()
     control: Control = Control()
     estimation: Estimation = Estimation()

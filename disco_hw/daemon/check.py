@@ -13,7 +13,7 @@ from disco_hw.config import RobotConfig
 from disco_hw.daemon.client import send_request, socket_path
 from disco_hw.daemon.realtime import can_lock_memory, can_use_fifo
 from disco_hw.errors import InputError, WorkError
-from disco_hw.runtime.assembly import make_link, pose_source_of
+from disco_hw.runtime.assembly import driver_of, make_link, pose_source_of
 from disco_hw.runtime.preflight import (
     Check,
     Level,
@@ -28,7 +28,7 @@ from disco_hw.runtime.preflight import (
 from disco_hw.runtime.robot_setup import Setup, link_key, load_setup
 from disco_hw.runtime.situation import connection
 from drivers import status_texts
-from drivers.motor import find_driver, make_driver
+from drivers.motor import find_driver
 from drivers.types import (
     Capabilities,
     Driver,
@@ -93,7 +93,7 @@ def run_check(robot: Path, link: str | None = None) -> CheckReport:
     try:
         checks.append(_link_check(transport))
         if checks[-1].level is Level.OK:
-            found = _ask_robot(transport, make_driver(named.driver, named.settings(), key), pose_source)
+            found = _ask_robot(transport, driver_of(setup.config, key), pose_source)
             checks.append(_firmware_check(found))
             if found.capabilities is None or found.capabilities.told:
                 # Only a controller that says what it hears can be asked for that.

@@ -43,6 +43,7 @@ from disco_hw.runtime import records_of_tick
 from disco_hw.runtime.assembly import (
     FAST_ASKED_BY,
     assemble_core,
+    driver_of,
     make_adaptation,
     make_fast_adaptation,
     make_link,
@@ -57,7 +58,6 @@ from disco_hw.runtime.situation import Ask, advice, by_command, headline
 from disco_hw.runtime.states import State
 from disco_hw.runtime.supervisor import Reply, UserRequest
 from disco_hw.runtime.task_change import TaskRefused, changed_task
-from drivers.motor import make_driver
 from drivers.types import Request, Transport
 from firmware_protocol.dbc import packaged_dbc
 
@@ -182,7 +182,7 @@ def _start(
         say("control socket", line)
     transport.open()
     stop.add("link", transport.close)
-    driver = make_driver(config.link.driver, config.link.settings(), key)
+    driver = driver_of(config, key)
     core = assemble_core(config, transport, driver, pipeline, recorder, pilot.needs_pose, adaptation)
     stop.add("pose source", core.pose_source.close)
     daemon = Daemon(core, server, recorder, MonotonicClock(), signals, say, pilot, ask)

@@ -16,13 +16,12 @@ from disco_hw.log.link import Attachment
 from disco_hw.log.provenance import MODEL_TOML
 from disco_hw.log.recorder import MemoryRecorder, ProcessRecorder, RecordingSettings
 from disco_hw.model.file import model_text
-from disco_hw.runtime.assembly import assemble_core, make_adaptation, make_fast_adaptation, make_pipeline
+from disco_hw.runtime.assembly import assemble_core, driver_of, make_adaptation, make_fast_adaptation, make_pipeline
 from disco_hw.runtime.core import CoreTick, DaemonCore
 from disco_hw.runtime.pilot import Pilot, TaskPilot
 from disco_hw.runtime.pipeline import Pipeline, Planner
 from disco_hw.runtime.robot_setup import Setup, kept_files
 from disco_hw.runtime.supervisor import UserRequest
-from drivers.motor import make_driver
 from firmware_protocol.firmware_core import FirmwareConfig
 from sim.body_dynamics import BodyPose
 from sim.in_process import RobotInProcess
@@ -80,7 +79,7 @@ class SimulatedRun:
         self.core: DaemonCore = assemble_core(
             setup.config,
             robot.host,
-            make_driver(setup.config.link.driver, setup.config.link.settings()),
+            driver_of(setup.config),
             pipeline,
             self.recorder,
             self.pilot.needs_pose if needs_pose is None else needs_pose,

@@ -27,7 +27,10 @@ from disco_hw.runtime.pipeline import Pipeline, Planner
 from disco_hw.runtime.preflight import check_firmware_limits, check_task, failures
 from disco_hw.runtime.robot_setup import Setup, geometry
 from disco_hw.runtime.supervisor import Supervisor, SupervisorSettings
+from drivers.motor import make_driver
+from drivers.motor.wiring import rewired
 from drivers.pose import PoseSourceError, make_pose_source
+from drivers.pose.convention import converted
 from drivers.transport import ReconnectingTransport, TransportSettingsError, make_transport
 from drivers.types import Driver, PoseSource, Transport
 
@@ -148,9 +151,15 @@ def assemble_core(
 def pose_source_of(config: RobotConfig) -> PoseSource:
     """Return the pose source that robot.toml names. Raises InputError for one that cannot be had."""
     try:
-        return make_pose_source(**msgspec.structs.asdict(config.pose))
+        source = make_pose_source(**msgspec.structs.asdict(config.pose))
     except PoseSourceError as error:
         raise InputError(f"robot.toml: pose.source: {error}") from None
+    return converted(source, config.pose.convention())
+
+
+def driver_of(config: RobotConfig, key: bytes | None = None) -> Driver:
+    """Return the driver that robot.toml names, for wheels that are wired as it says."""
+    return rewired(make_driver(config.link.driver, config.link.settings(), key), config.wheels)
 
 
 def preflight(config: RobotConfig, driver: Driver, with_task: bool = True) -> tuple[str, ...]:

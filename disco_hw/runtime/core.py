@@ -14,7 +14,7 @@ from disco_hw.config import RobotConfig
 from disco_hw.log import records
 from disco_hw.log.recorder import Recorder
 from disco_hw.runtime import records_of_tick
-from disco_hw.runtime.pipeline import FollowTask, Motion, Off, Pipeline, Stand, Tick, untimed
+from disco_hw.runtime.pipeline import FollowTask, Motion, Off, Pipeline, Source, Stand, Tick, untimed
 from disco_hw.runtime.plausibility import Plausibility
 from disco_hw.runtime.supervisor import Inputs, Output, Reply, Supervisor, UserRequest
 from disco_hw.runtime.task_change import record_of
@@ -39,12 +39,16 @@ _FOLLOW_TASK = FollowTask()
 
 
 class CoreTick(msgspec.Struct, frozen=True, gc=False):
-    """What one tick did: the supervisor's verdict, the pipeline's work, the command sent (None if none was)."""
+    """What one tick did: the supervisor's verdict, the pipeline's work, the command sent (None if none was).
+
+    `readings`: what it worked from.
+    """
 
     output: Output
     pipeline: Tick
     command: WheelCommand | None
     events: tuple[str, ...]
+    readings: Readings = Readings()
 
     @property
     def replies(self) -> tuple[Reply, ...]:
@@ -148,7 +152,7 @@ class DaemonCore:
         )
         self.adaptation.feed(now_ns, readings)
         mark("record")
-        self.last = CoreTick(output, result, command, events)
+        self.last = CoreTick(output, result, command, events, readings)
         return self.last
 
     def _follow_link(self, now_ns: int) -> None:
@@ -198,7 +202,7 @@ class DaemonCore:
     def _command(self, output: Output, result: Tick) -> WheelCommand | None:
         """The command to send; while the robot is arming the driver sends the zeros that this takes."""
         may_command = output.motion_allowed or output.zero_only
-        if not may_command or self.driver.state is not DriverState.ARMED:
+        if not may_command or result.source is Source.OFF or self.driver.state is not DriverState.ARMED:
             return None
         governed = result.command
         return WheelCommand(governed.left_rad_s, governed.right_rad_s, self.config.control.command_valid_for_s)
