@@ -7,6 +7,7 @@ Time stamps are nanoseconds of the host's monotonic clock unless the name says o
 from __future__ import annotations
 
 import enum
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -133,7 +134,11 @@ class WheelSample(msgspec.Struct, frozen=True, gc=False):
 
 
 class PoseSample(msgspec.Struct, frozen=True, gc=False):
-    """A measured pose in the world frame; `t_ns` is when it was true, `received_ns` when it arrived."""
+    """A measured pose in the world frame; `t_ns` is when it was true, `received_ns` when it arrived.
+
+    `yaw_rad` and `yaw_std_rad` are both NaN where no heading was measured. The position is that of the point
+    `lever_x_m` ahead and `lever_y_m` to the left of the tracked one.
+    """
 
     t_ns: int
     received_ns: int
@@ -142,6 +147,13 @@ class PoseSample(msgspec.Struct, frozen=True, gc=False):
     yaw_rad: float
     position_std_m: float
     yaw_std_rad: float
+    lever_x_m: float = 0.0
+    lever_y_m: float = 0.0
+
+    @property
+    def has_heading(self) -> bool:
+        """Whether there is a heading beside the position."""
+        return not (math.isnan(self.yaw_rad) and math.isnan(self.yaw_std_rad))
 
 
 class MotorSample(msgspec.Struct, frozen=True, gc=False):

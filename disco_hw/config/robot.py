@@ -129,6 +129,7 @@ class Estimation(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     slip_std_rad_per_sqrt_rad: Positive = 0.05
     gate_probability: Probability = 0.999
     gate_lockout_count: Annotated[int, Meta(ge=2, le=1000)] = 10
+    heading_std_rad: Annotated[float, Meta(ge=0.005, le=0.3)] = 0.1
     pose_timeout_s: Positive = 1.0
     history_s: Annotated[float, Meta(gt=0.0, le=10.0)] = 1.0
     pose_required: bool = True

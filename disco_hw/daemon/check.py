@@ -27,6 +27,7 @@ from disco_hw.runtime.preflight import (
 )
 from disco_hw.runtime.robot_setup import Setup, link_key, load_setup
 from disco_hw.runtime.situation import connection
+from disco_hw.runtime.supervisor import FIND_HEADING
 from drivers import status_texts
 from drivers.motor import find_driver
 from drivers.types import (
@@ -119,6 +120,7 @@ class _Found:
     clock_synchronised: bool
     wheel_samples: int
     pose_samples: int
+    headings: int
     rejected: int
     told: tuple[RobotStatus, ...]
     round_trips_s: tuple[float, ...]
@@ -163,7 +165,7 @@ def _link_check(transport: Transport) -> Check:
 def _ask_robot(transport: Transport, driver: Driver, pose_source: PoseSource) -> _Found:
     """Shake hands, listen for three seconds and time the answers to the driver's own clock requests."""
     stopwatch = _Stopwatch()
-    wheels = poses = 0
+    wheels = poses = headings = 0
     told: list[RobotStatus] = []
     start_ns = time.monotonic_ns()
     driver.link_up(start_ns)
@@ -173,7 +175,9 @@ def _ask_robot(transport: Transport, driver: Driver, pose_source: PoseSource) ->
         stopwatch.received(frames)
         readings = driver.receive(now_ns, frames)
         wheels += len(readings.wheels)
-        poses += len(pose_source.receive(now_ns, readings.poses))
+        came = pose_source.receive(now_ns, readings.poses)
+        poses += len(came)
+        headings += sum(pose.has_heading for pose in came)
         told += [status for status in readings.status if status.t_ns - start_ns > _SETTLED_S * 1e9]
         for outgoing in driver.transmit(now_ns, None):
             if transport.send(outgoing, now_ns):
@@ -187,6 +191,7 @@ def _ask_robot(transport: Transport, driver: Driver, pose_source: PoseSource) ->
         clock_synchronised=driver.clock_offset_ns is not None,
         wheel_samples=wheels,
         pose_samples=poses,
+        headings=headings,
         rejected=stats.rejected_crc + stats.rejected_sequence + stats.rejected_length + transport.stats.malformed,
         told=tuple(told),
         round_trips_s=tuple(stopwatch.round_trips_s),
@@ -257,6 +262,8 @@ def _telemetry_check(found: _Found) -> Check:
         return Check(
             name, Level.WARNING, f"{rates}; without a pose the task does not start if estimation.pose_required"
         )
+    if not found.headings:
+        return Check(name, Level.WARNING, f"{rates}; heading not known; {FIND_HEADING}")
     if found.rejected:
         return Check(
             name, Level.WARNING, f"{rates}, {found.rejected} frames rejected; check the cable and other senders"

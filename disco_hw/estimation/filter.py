@@ -7,6 +7,7 @@ import msgspec
 from disco_hw.config import Estimation
 from disco_hw.estimation.belief import PoseBelief, belief_at, motion_model, predict, rebased
 from disco_hw.estimation.correction import Correction, Measurement, PoseCorrector, PoseReason, Triple, gate_limit
+from disco_hw.estimation.heading import HeadingSearch, any_heading, correct_search
 from disco_hw.estimation.odometry import OdometryParameters, Pose, WheelReading, arc
 
 # Without newer samples the wheels are taken to keep their speeds for so long, then to stand.
@@ -14,6 +15,10 @@ MAX_EXTRAPOLATION_S = 0.2
 # Standard deviation of motion that was not measured, as a part of its length: a wheel's turn since its last sample, and
 # the shape of the path between two samples with a gap in between.
 UNMEASURED_PART = 0.25
+# A heading that was known and is less certain than this counts as unknown, and positions alone find it anew.
+MAX_HEADING_STD_RAD = 0.3
+
+Belief = PoseBelief | HeadingSearch
 
 
 class Judgement(msgspec.Struct, frozen=True, gc=False):
@@ -29,20 +34,30 @@ class Judgement(msgspec.Struct, frozen=True, gc=False):
 class FilterState(msgspec.Struct, frozen=True, gc=False):
     """Everything that the future depends on, at one instant.
 
-    `belief` is None before there is any. `candidate` is the pose that the last rejected measurements agree on, and
-    `candidate_count` how many in a row do. `pose_t_ns` is the stamp of the last accepted pose, None before the first.
-    `judgement` is that of the pose at this very instant, None after wheel motion.
+    `belief` is None before there is any, and a search while the heading is not known. `candidate` is the pose that the
+    last rejected measurements agree on, and `candidate_count` how many in a row do. `pose_t_ns` is the stamp of
+    the last accepted pose, None before the first. `judgement` is that of the pose at this very instant, None after
+    wheel motion.
     """
 
     t_ns: int
     left_rad: float
     right_rad: float
-    belief: PoseBelief | None
-    candidate: PoseBelief | None
+    belief: Belief | None
+    candidate: Belief | None
     candidate_count: int
     pose_t_ns: int | None
     reinitialisations: int
     judgement: Judgement | None
+
+    @property
+    def heading_known(self) -> bool:
+        """Whether there is one heading that is certain enough to drive by."""
+        return isinstance(self.belief, PoseBelief) and _heading_is_known(self.belief)
+
+
+def _heading_is_known(belief: PoseBelief) -> bool:
+    return belief.covariance[2][2] <= MAX_HEADING_STD_RAD**2
 
 
 class PoseFilter:
@@ -51,7 +66,9 @@ class PoseFilter:
     def __init__(self, settings: Estimation, parameters: OdometryParameters) -> None:
         self.parameters = parameters
         self._model = motion_model(settings, parameters)
-        self._limit = gate_limit(settings.gate_probability)
+        self._pose_limit = gate_limit(settings.gate_probability)
+        self._position_limit = gate_limit(settings.gate_probability, with_heading=False)
+        self._found_variance = settings.heading_std_rad**2
         self._lockout_count = settings.gate_lockout_count
         self._pose_required = settings.pose_required
         self._corrector = PoseCorrector()
@@ -66,8 +83,8 @@ class PoseFilter:
         """A state of a filter with other parameters, as one of this filter."""
         return msgspec.structs.replace(
             state,
-            belief=None if state.belief is None else rebased(state.belief, self._model),
-            candidate=None if state.candidate is None else rebased(state.candidate, self._model),
+            belief=self._rebased(state.belief),
+            candidate=self._rebased(state.candidate),
         )
 
     def move(self, state: FilterState, t_ns: int, left_rad: float, right_rad: float, in_gap: bool) -> FilterState:
@@ -98,42 +115,63 @@ class PoseFilter:
     def fuse(self, state: FilterState, measurement: Measurement) -> FilterState:
         """Judge a pose at the state's instant, and correct the belief by it if it passes.
 
-        The first pose sets the belief. A pose outside the gate is compared with where the rejected poses before it
-        would be now: if `gate_lockout_count` in a row agree with one another, the robot is where they say.
+        The first pose sets the belief; where it has no heading, every heading is followed until motion shows which is
+        right. A pose outside the gate is compared with where the rejected poses before it would be now: if
+        `gate_lockout_count` in a row agree with one another, the robot is where they say.
         """
         if state.belief is None or state.pose_t_ns is None:
             return self._after(state, measurement, self._fresh(measurement), Judgement(PoseReason.INITIALISED))
-        correction = self._corrector.correct(state.belief, measurement)
-        if correction.distance2 <= self._limit:
-            return self._after(state, measurement, correction.belief, self._judged(PoseReason.ACCEPTED, correction))
+        if measurement.yaw_variance is None and isinstance(state.belief, PoseBelief) and not state.heading_known:
+            return self._after(state, measurement, self._fresh(measurement), Judgement(PoseReason.REINITIALISED))
+        belief, correction = self._corrected(state.belief, measurement)
+        limit = self._limit(measurement)
+        if correction.distance2 <= limit:
+            return self._after(state, measurement, belief, _judged(PoseReason.ACCEPTED, correction, limit))
         candidate, count = self._candidate(state, measurement)
         if count >= self._lockout_count:
-            return self._after(state, measurement, candidate, self._judged(PoseReason.REINITIALISED, correction))
-        judgement = self._judged(PoseReason.GATED, correction)
+            return self._after(state, measurement, candidate, _judged(PoseReason.REINITIALISED, correction, limit))
+        judgement = _judged(PoseReason.GATED, correction, limit)
         return msgspec.structs.replace(state, candidate=candidate, candidate_count=count, judgement=judgement)
 
-    def _judged(self, reason: PoseReason, correction: Correction) -> Judgement:
-        return Judgement(
-            reason,
-            correction.innovation,
-            correction.innovation_variance,
-            correction.distance2,
-            correction.distance2 / self._limit,
-        )
+    def _limit(self, measurement: Measurement) -> float:
+        return self._position_limit if measurement.yaw_variance is None else self._pose_limit
 
-    def _fresh(self, measurement: Measurement) -> PoseBelief:
-        return belief_at(measurement.pose, measurement.position_variance, measurement.yaw_variance, self._model)
+    def _fresh(self, measurement: Measurement) -> Belief:
+        if measurement.yaw_variance is not None and measurement.yaw_variance <= MAX_HEADING_STD_RAD**2:
+            ahead_x, ahead_y, _, _ = measurement.lever(measurement.pose.yaw_rad)
+            pose = measurement.pose
+            place = Pose(pose.x_m - ahead_x, pose.y_m - ahead_y, pose.yaw_rad)
+            return belief_at(place, measurement.position_variance, measurement.yaw_variance, self._model)
+        search = any_heading(measurement, self._model)
+        if measurement.yaw_variance is None:
+            return search
+        return self._settled(correct_search(search, measurement, self._corrector)[0])
 
-    def _candidate(self, state: FilterState, measurement: Measurement) -> tuple[PoseBelief, int]:
+    def _corrected(self, belief: Belief, measurement: Measurement) -> tuple[Belief, Correction]:
+        if isinstance(belief, PoseBelief):
+            correction = self._corrector.correct(belief, measurement)
+            return correction.belief, correction
+        search, best = correct_search(belief, measurement, self._corrector)
+        return self._settled(search), best
+
+    def _settled(self, search: HeadingSearch) -> Belief:
+        """One belief, once the headings that are left are close enough to one another."""
+        merged = search.merged()
+        return merged if merged.covariance[2][2] <= self._found_variance else search
+
+    def _candidate(self, state: FilterState, measurement: Measurement) -> tuple[Belief, int]:
         if state.candidate is not None:
-            correction = self._corrector.correct(state.candidate, measurement)
-            if correction.distance2 <= self._limit:
-                return correction.belief, state.candidate_count + 1
+            belief, correction = self._corrected(state.candidate, measurement)
+            if correction.distance2 <= self._limit(measurement):
+                return belief, state.candidate_count + 1
         return self._fresh(measurement), 1
 
-    def _after(
-        self, state: FilterState, measurement: Measurement, belief: PoseBelief, judgement: Judgement
-    ) -> FilterState:
+    def _rebased(self, belief: Belief | None) -> Belief | None:
+        if isinstance(belief, HeadingSearch):
+            return belief.each(lambda each: rebased(each, self._model))
+        return None if belief is None else rebased(belief, self._model)
+
+    def _after(self, state: FilterState, measurement: Measurement, belief: Belief, judgement: Judgement) -> FilterState:
         return FilterState(
             state.t_ns,
             state.left_rad,
@@ -159,10 +197,14 @@ class PoseFilter:
         left_turn, right_turn = left_rad - state.left_rad, right_rad - state.right_rad
         if left_turn or right_turn or position_variance or yaw_variance:
             motion = arc(self.parameters, left_turn, right_turn)
-            if belief is not None:
-                belief = predict(belief, self._model, motion, position_variance, yaw_variance)
-            if candidate is not None:
-                candidate = predict(candidate, self._model, motion, position_variance, yaw_variance)
+
+            def follow(before: PoseBelief) -> PoseBelief:
+                return predict(before, self._model, motion, position_variance, yaw_variance)
+
+            belief = belief.each(follow) if isinstance(belief, HeadingSearch) else belief and follow(belief)
+            candidate = (
+                candidate.each(follow) if isinstance(candidate, HeadingSearch) else candidate and follow(candidate)
+            )
         return FilterState(
             t_ns,
             left_rad,
@@ -174,3 +216,13 @@ class PoseFilter:
             state.reinitialisations,
             None,
         )
+
+
+def _judged(reason: PoseReason, correction: Correction, limit: float) -> Judgement:
+    return Judgement(
+        reason,
+        correction.innovation,
+        correction.innovation_variance,
+        correction.distance2,
+        correction.distance2 / limit,
+    )

@@ -10,6 +10,7 @@ from disco_hw.config import Estimation
 from disco_hw.estimation.belief import MAX_POSITION_VARIANCE, MAX_YAW_VARIANCE
 from disco_hw.estimation.correction import PoseReason, Triple, screen
 from disco_hw.estimation.filter import Judgement, PoseFilter
+from disco_hw.estimation.heading import HeadingSearch
 from disco_hw.estimation.history import RewindBuffer
 from disco_hw.estimation.odometry import (
     FUTURE_TOLERANCE_NS,
@@ -32,7 +33,8 @@ class PoseEstimate(msgspec.Struct, frozen=True, gc=False):
     World frame; `covariance` of (x, y, yaw) is 3x3, rows of floats, m and rad, symmetric and positive definite.
     `speed_m_s` is forward, of the centre of rotation; the tracked point also moves sideways by -yaw_rate * x_icr.
     Ages are those of the newest wheel sample and the newest accepted pose, None before the first. `pose_ok`: a pose was
-    accepted within the timeout, otherwise the estimate is prediction only. `wheels_ok`: the same for wheel samples.
+    accepted within the timeout and the heading is known; without the first the estimate is prediction only, without the
+    second its yaw says nothing (`heading_known` is False, the position holds). `wheels_ok`: as for wheel samples.
     Before `initialised`, pose and covariance say nothing (zeros, largest variances). `reinitialisations` counts how
     often the estimate has jumped to where agreeing poses say; a change means that a path through it is no motion.
     """
@@ -52,6 +54,7 @@ class PoseEstimate(msgspec.Struct, frozen=True, gc=False):
     wheels_ok: bool
     pose_ok: bool
     reinitialisations: int
+    heading_known: bool
 
     @property
     def pose(self) -> Pose:
@@ -184,14 +187,16 @@ class PoseFusion:
         goes on growing. A time before the newest sample gets the pose of the newest sample.
         """
         if self._buffer is None:
-            return PoseEstimate(now_ns, 0.0, 0.0, 0.0, _UNKNOWN, 0.0, 0.0, 0.0, 0.0, None, None, False, False, False, 0)
+            return PoseEstimate(
+                now_ns, 0.0, 0.0, 0.0, _UNKNOWN, 0.0, 0.0, 0.0, 0.0, None, None, False, False, False, 0, False
+            )
         wheels, state = self._buffer.newest_wheels, self._buffer.head()
         if now_ns > state.t_ns:
             state = self._filter.extrapolate(state, wheels, now_ns)
         x_m, y_m, yaw_rad, covariance = 0.0, 0.0, 0.0, _UNKNOWN
-        if state.belief is not None:
-            x_m, y_m, yaw_rad = state.belief.x_m, state.belief.y_m, state.belief.yaw_rad
-            covariance = state.belief.covariance
+        belief = state.belief.merged() if isinstance(state.belief, HeadingSearch) else state.belief
+        if belief is not None:
+            x_m, y_m, yaw_rad, covariance = belief.x_m, belief.y_m, belief.yaw_rad, belief.covariance
         parameters = self._filter.parameters
         left, right = wheels.left_speed_rad_s, wheels.right_speed_rad_s
         wheel_age_s = _age_s(now_ns, wheels.t_ns)
@@ -210,8 +215,9 @@ class PoseFusion:
             pose_age_s=pose_age_s,
             initialised=state.belief is not None,
             wheels_ok=wheel_age_s <= self._wheel_timeout_s,
-            pose_ok=pose_age_s is not None and pose_age_s <= self._pose_timeout_s,
+            pose_ok=pose_age_s is not None and pose_age_s <= self._pose_timeout_s and state.heading_known,
             reinitialisations=state.reinitialisations,
+            heading_known=state.heading_known,
         )
 
     def _note_arrival(self, now_ns: int) -> None:

@@ -40,7 +40,7 @@ def drive_from_log(log: Log) -> DriveLog:
         ("left_angle_rad", "right_angle_rad", "left_speed_rad_s", "right_speed_rad_s"),
         notes,
     )
-    pose_ns, pose = _samples(log, "/pose", ("x_m", "y_m", "yaw_rad"), notes)
+    pose_ns, pose = _poses(log, notes)
     starts = [int(t_ns[0]) for t_ns in (command_ns, wheel_ns, pose_ns) if t_ns.size]
     if not starts:
         raise LogError(f"{log.path}: holds no command, wheel sample or pose; nothing was driven in it")
@@ -111,6 +111,24 @@ def _samples(log: Log, topic: str, names: tuple[str, ...], notes: list[str]) -> 
     if not finite.all():
         notes.append(f"{log.path}: {np.count_nonzero(~finite)} records of {topic} are not finite and were left out")
     return _ordered(columns["t_ns"], values, finite, topic, notes)
+
+
+def _poses(log: Log, notes: list[str]) -> tuple[Index, Array]:
+    """Poses with a heading: whoever takes a drive as arrays compares headings."""
+    columns = _columns(log, "/pose")
+    values = np.column_stack([_floats(columns[name]) for name in ("x_m", "y_m", "yaw_rad")])
+    bare = np.isnan(values[:, 2]) & np.isnan(_floats(columns["yaw_std_rad"])) & np.isfinite(values[:, :2]).all(axis=1)
+    finite = np.asarray(np.isfinite(values).all(axis=1))
+    if bare.any():
+        notes.append(
+            f"{log.path}: {np.count_nonzero(bare)} positions without heading were left out: what needs poses needs "
+            "a source that measures the heading"
+        )
+    if not (finite | bare).all():
+        notes.append(
+            f"{log.path}: {np.count_nonzero(~(finite | bare))} records of /pose are not finite and were left out"
+        )
+    return _ordered(columns["t_ns"], values, finite, "/pose", notes)
 
 
 def _ordered(t_ns: NDArray[np.generic], values: Array, keep: Mask, what: str, notes: list[str]) -> tuple[Index, Array]:

@@ -126,7 +126,7 @@ class DaemonCore:
         poses = self.pose_source.receive(now_ns, readings.poses)
         readings = msgspec.structs.replace(readings, poses=tuple(poses))
         self._remember(now_ns, readings)
-        output = self._supervisor.step(now_ns, self._inputs(now_ns, requests))
+        output = self._supervisor.step(now_ns, self._inputs(now_ns, requests, motion))
         mark("receive")
         learnt = self.adaptation.step(now_ns)
         result = self.pipeline.step(now_ns, readings, _motion(output, motion), mark)
@@ -181,7 +181,8 @@ class DaemonCore:
             self._judged = capabilities
             self._preflight_errors = () if capabilities is None else self._preflight(self.driver)
 
-    def _inputs(self, now_ns: int, requests: Sequence[UserRequest]) -> Inputs:
+    def _inputs(self, now_ns: int, requests: Sequence[UserRequest], motion: Motion) -> Inputs:
+        estimate = None if self.last is None else self.last.pipeline.estimate
         wheels = self.newest_wheels
         speed = 0.0 if wheels is None else max(abs(wheels.left_speed_rad_s), abs(wheels.right_speed_rad_s))
         return Inputs(
@@ -192,11 +193,13 @@ class DaemonCore:
             driver_detail=self.driver.detail,
             telemetry_age_s=None if wheels is None else (now_ns - wheels.t_ns) * 1e-9,
             wheel_speed_rad_s=speed,
-            pose_ok=self.last is not None and self.last.pipeline.estimate.pose_ok,
+            pose_ok=estimate is not None and estimate.pose_ok,
             preflight_errors=self._preflight_errors,
             task_finished=self.progress.finished,
             requests=tuple(requests),
             recording_fault=self.recording_fault,
+            heading_missing=estimate is not None and estimate.initialised and not estimate.heading_known,
+            by_hand=not isinstance(motion, FollowTask),
         )
 
     def _command(self, output: Output, result: Tick) -> WheelCommand | None:

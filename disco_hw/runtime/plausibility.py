@@ -123,7 +123,7 @@ class Plausibility:
         events = []
         moving = any(max(abs(w.left_speed_rad_s), abs(w.right_speed_rad_s)) > MOVING_RAD_S for w in wheels)
         for sample in poses:
-            pose = (sample.x_m, sample.y_m, sample.yaw_rad)
+            pose = (sample.x_m, sample.y_m, sample.yaw_rad if sample.has_heading else 0.0)
             same = pose == self._pose and moving
             self._pose = pose
             self._repeats = self._repeats + 1 if same else 0

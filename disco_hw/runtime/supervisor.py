@@ -12,6 +12,7 @@ from disco_hw.runtime.situation import connection
 from disco_hw.runtime.states import PROBLEM, Condition, State, Transition, next_transition
 from drivers.types import DriverState, LinkState, Request
 
+FIND_HEADING = "the poses have none: drive a metre straight on, by hand on the page, and it is found"
 _IDLE = frozenset({DriverState.STANDBY, DriverState.READY})
 _MAY_MOVE = frozenset({DriverState.ARMING, DriverState.ARMED, DriverState.STOPPING})
 # Conditions as integers: flags cost a microsecond an operation in Python 3.11, and this runs in every tick.
@@ -69,7 +70,8 @@ class Inputs(msgspec.Struct, frozen=True, gc=False):
     magnitude of its two speeds. `link_error` is the link's newest error, with its remedy. `preflight_errors` and
     `daemon_error` are sentences for a person and hold for as long as they are given. `task_finished`: nothing of the
     task is left to drive. `recording_fault`: why nothing is recorded although it should be, which keeps the robot from
-    being armed unless that is asked for.
+    being armed unless that is asked for. `heading_missing`: positions come, and which way the robot faces is not known.
+    `by_hand`: a person drives, who sees that; nobody follows the task.
     """
 
     link_state: LinkState
@@ -85,6 +87,8 @@ class Inputs(msgspec.Struct, frozen=True, gc=False):
     requests: tuple[UserRequest, ...] = ()
     task_finished: bool = False
     recording_fault: str = ""
+    heading_missing: bool = False
+    by_hand: bool = False
 
 
 class Reply(msgspec.Struct, frozen=True, gc=False):
@@ -135,6 +139,7 @@ class Supervisor:
         self._state = State.DISCONNECTED
         self._generation: int | None = None
         self._running = False
+        self._by_hand = False
         self._start_pending = False
         self._arming: _Pending | None = None
         self._resetting: _Pending | None = None
@@ -256,6 +261,14 @@ class Supervisor:
             return "not armed; arm first"
         if self._state is State.ARMED and not seen & _TELEMETRY_FRESH:
             return "no fresh wheel samples"
+        return self._pose_fault(inputs)
+
+    def _pose_fault(self, inputs: Inputs) -> str | None:
+        """What of the pose keeps the task from being followed; nothing while nobody follows it."""
+        if inputs.by_hand:
+            return None
+        if inputs.heading_missing:
+            return f"heading not known; {FIND_HEADING}"
         if self._settings.pose_required and not inputs.pose_ok:
             return "no pose; check the pose sensor, or set estimation.pose_required = false"
         return None
@@ -306,15 +319,20 @@ class Supervisor:
         """Start the task once armed, and stop it without a pose and at its end."""
         if self._state is not State.ARMED:
             return
-        pose_missing = self._settings.pose_required and not inputs.pose_ok
-        if self._start_pending and pose_missing:
-            self._drop_pending("no pose")
+        pose_fault = self._pose_fault(inputs)
+        if self._start_pending and pose_fault is not None:
+            self._drop_pending(pose_fault)
         elif self._start_pending:
             self._start_pending, self._running = False, True
+            self._by_hand = inputs.by_hand
             self._events.append("task started")
-        elif self._running and pose_missing:
+        elif self._running and pose_fault is not None:
             self._running = False
-            self._events.append("task stopped: no pose")
+            self._events.append(f"task stopped: {pose_fault}")
+        elif self._running and inputs.by_hand is not self._by_hand:
+            # Whoever started one has not asked for the other.
+            self._running = False
+            self._events.append("stopped: start again to follow the task" if self._by_hand else "task stopped")
         elif self._running and inputs.task_finished:
             self._running = False
             self._events.append("task stopped: the path's end is reached")
@@ -333,6 +351,8 @@ class Supervisor:
     def _detail(self, inputs: Inputs, seen: int) -> str:
         match self._state:
             case State.READY:
+                if self._arming is None and inputs.heading_missing:
+                    return f"heading not known; {FIND_HEADING}"
                 return "arming" if self._arming is not None else "ready to be armed"
             case State.ARMED if not seen & _TELEMETRY_FRESH:
                 return "no fresh wheel samples: holding zero"

@@ -258,9 +258,10 @@ def _line(task: RobotTask) -> Array:
 
 
 def _pose_marks(poses: Array) -> Array:
-    """A short stroke along the heading for each measured pose (N, 3)."""
+    """A short stroke along the heading for each measured pose (N, 3); across, where it has none."""
     if not len(poses):
         return np.empty((0, 2, 3))
+    poses = np.nan_to_num(poses, nan=0.0)
     ahead = 0.03 * np.stack((np.cos(poses[:, 2]), np.sin(poses[:, 2])), axis=1)
     height = np.full((len(poses), 1), 0.006)
     start, end = np.hstack((poses[:, :2] - ahead, height)), np.hstack((poses[:, :2] + ahead, height))

@@ -1,7 +1,8 @@
 """Poses in UDP datagrams, one each, JSON or MessagePack, from any program that can send one.
 
 A map with `x_m`, `y_m`, `yaw_rad`, `position_std_m`, `yaw_std_rad`, and when it was true: `age_s` before it was sent,
-or `t_ns` on this computer's monotonic clock.
+or `t_ns` on this computer's monotonic clock. `yaw_rad` and `yaw_std_rad` are both left out, or null, where there
+is no heading.
 """
 
 from __future__ import annotations
@@ -26,9 +27,9 @@ OLDEST_S = 10.0
 class _Datagram(msgspec.Struct, frozen=True):
     x_m: float
     y_m: float
-    yaw_rad: float
     position_std_m: float
-    yaw_std_rad: float
+    yaw_rad: float | None = None
+    yaw_std_rad: float | None = None
     age_s: float | None = None
     t_ns: int | None = None
 
@@ -87,9 +88,17 @@ def pose_of(datagram: bytes, now_ns: int) -> PoseSample | None:
         t_ns = now_ns - round(1e9 * read.age_s) if 0.0 <= read.age_s <= OLDEST_S else None
     else:
         t_ns = read.t_ns
-    values = (read.x_m, read.y_m, read.yaw_rad, read.position_std_m, read.yaw_std_rad)
-    if t_ns is None or not 0 <= now_ns - t_ns <= OLDEST_S * 1e9 or not all(map(math.isfinite, values)):
+    position = (read.x_m, read.y_m, read.position_std_m)
+    if t_ns is None or not 0 <= now_ns - t_ns <= OLDEST_S * 1e9 or not all(map(math.isfinite, position)):
         return None
-    if read.position_std_m < 0.0 or read.yaw_std_rad < 0.0:
+    if read.yaw_rad is None and read.yaw_std_rad is None:
+        yaw_rad = yaw_std_rad = math.nan
+    elif read.yaw_rad is None or read.yaw_std_rad is None:
         return None
-    return PoseSample(t_ns, now_ns, *values)
+    else:
+        yaw_rad, yaw_std_rad = read.yaw_rad, read.yaw_std_rad
+        if not (math.isfinite(yaw_rad) and math.isfinite(yaw_std_rad)) or yaw_std_rad < 0.0:
+            return None
+    if read.position_std_m < 0.0:
+        return None
+    return PoseSample(t_ns, now_ns, read.x_m, read.y_m, yaw_rad, read.position_std_m, yaw_std_rad)

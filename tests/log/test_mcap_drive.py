@@ -74,6 +74,15 @@ def test_late_poses_are_put_in_order_and_doubles_and_broken_ones_left_out(tmp_pa
     assert any("have the time of another" in note for note in drive.notes)
 
 
+def test_positions_without_heading_are_left_out_and_said_to_be(tmp_path):
+    poses = [PoseSample(k * 10**7, k * 10**7, 1.0 * k, 0.0, math.nan, 0.02, math.nan) for k in range(1, 6)]
+    good = PoseSample(6 * 10**7, 6 * 10**7, 6.0, 0.0, 0.5, 0.02, 0.02)
+    drive = drive_of(tmp_path, [(k, [pose]) for k, pose in enumerate([*poses, good], start=1)])
+    assert drive.poses.x_m.tolist() == [6.0]
+    (note,) = drive.notes
+    assert "5 positions without heading were left out" in note
+
+
 @pytest.mark.parametrize("flush_every", [None, 5])
 def test_a_clock_that_goes_backwards_is_refused(tmp_path, flush_every):
     ticks = [(k * PERIOD_NS, tick(k)) for k in (*range(1, 61), *range(31, 70))]

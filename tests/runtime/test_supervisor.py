@@ -223,6 +223,47 @@ def test_without_pose_required_the_task_runs_on_odometry():
     assert bench.tick(pose_ok=False).motion_allowed
 
 
+@pytest.mark.parametrize("pose_required", [True, False])
+def test_without_a_heading_no_task_is_started_and_a_running_one_stops(pose_required):
+    bench = Bench(replace(SETTINGS, pose_required=pose_required)).armed()
+    out = bench.tick(START, heading_missing=True)
+    assert "heading not known" in refusal(out)
+    assert "drive a metre" in refusal(out)
+    assert not bench.tick(heading_missing=True, count=5).motion_allowed
+    running = Bench(replace(SETTINGS, pose_required=pose_required)).running()
+    out = running.tick(heading_missing=True)
+    assert (out.motion_allowed, out.zero_only) == (False, True)
+    assert "task stopped: heading not known" in out.events[-1]
+    assert not running.tick(heading_missing=False, count=5).motion_allowed
+
+
+def test_start_during_arming_is_dropped_where_the_heading_is_lost_meanwhile():
+    bench = Bench().ready()
+    bench.tick(ARM, START)
+    for _ in range(4):
+        assert not bench.tick(heading_missing=True).motion_allowed
+    assert not bench.tick(heading_missing=False, count=4).running
+
+
+def test_ready_says_that_the_heading_is_missing():
+    assert "drive a metre" in Bench().ready().tick(heading_missing=True).detail
+
+
+def test_by_hand_the_robot_moves_without_pose_and_heading():
+    bench = Bench().ready()
+    bench.tick(ARM, START, by_hand=True, heading_missing=True, pose_ok=False)
+    assert bench.tick(by_hand=True, heading_missing=True, pose_ok=False, count=4).motion_allowed
+
+
+@pytest.mark.parametrize("by_hand", [True, False])
+def test_who_started_by_hand_has_not_started_the_task_nor_the_other_way_round(by_hand):
+    bench = Bench().ready()
+    bench.tick(ARM, START, by_hand=by_hand)
+    assert bench.tick(by_hand=by_hand, count=4).motion_allowed
+    assert not bench.tick(by_hand=not by_hand).motion_allowed
+    assert not bench.tick(by_hand=by_hand, count=5).motion_allowed
+
+
 def test_start_during_arming_starts_once_armed():
     bench = Bench().ready()
     bench.tick(ARM, START)
@@ -405,6 +446,8 @@ ANY_INPUTS = st.builds(
     telemetry_age_s=st.sampled_from([0.01, 0.01, 0.01, 0.1, 0.2, None, math.nan]),
     wheel_speed_rad_s=st.sampled_from([0.0, 0.0, 1.0, math.nan]),
     pose_ok=st.sampled_from([True, True, True, False]),
+    heading_missing=st.sampled_from([False, False, False, True]),
+    by_hand=st.sampled_from([False, False, True]),
     requests=st.lists(st.sampled_from([ARM, ARM, START, START, *UserRequest]), max_size=3).map(tuple),
 )
 
@@ -429,7 +472,7 @@ def test_whatever_happens_motion_needs_everything(history):
             assert out.state is State.ARMED
             assert inputs.driver_state is DriverState.ARMED
             assert inputs.telemetry_age_s <= SETTINGS.telemetry_zero_s
-            assert inputs.pose_ok
+            assert inputs.by_hand or (inputs.pose_ok and not inputs.heading_missing)
             assert armed_by_user
             assert started_by_user
             assert not {DISARM, ESTOP} & set(inputs.requests)

@@ -31,6 +31,7 @@ VALUES = {
     "telemetry_age_s": AGES,
     "wheel_speed_rad_s": st.sampled_from([0.0, 0.049, 0.05, 3.0, float("nan")]),
     "pose_ok": st.booleans(),
+    "heading_missing": st.booleans(),
     "preflight_errors": st.sampled_from([(), ("limits differ",)]),
     "daemon_error": st.sampled_from([None, "boom"]),
     "recording_fault": st.sampled_from(["", "no room"]),
@@ -189,6 +190,7 @@ class SupervisorModel(RuleBasedStateMachine):
             assert inputs.driver_state is DriverState.ARMED
             assert fresh(inputs)
             assert inputs.pose_ok
+            assert not inputs.heading_missing
             assert not troubled(inputs)
             assert not self.estop_held()
             # Between the last time that it was not armed and now, somebody asked for it: arming, then starting.

@@ -40,10 +40,19 @@ def test_a_datagram_is_a_pose_at_its_own_time(encode):
         {"age_s": 0.0, "x_m": "1"},
         {"age_s": 0.0, "yaw_std_rad": -1.0},
         {"age_s": 0.0, "x_m": None},
+        {"age_s": 0.0, "yaw_rad": None},
+        {"age_s": 0.0, "yaw_std_rad": None},
     ],
 )
 def test_what_is_no_pose_of_now_is_none(change):
     assert pose_of(json.dumps({**POSE, **change}).encode(), NOW_NS) is None
+
+
+@pytest.mark.parametrize("encode", [msgspec.json.encode, msgspec.msgpack.encode], ids=["json", "msgpack"])
+def test_a_position_without_heading_is_one_and_says_so(encode):
+    for absent in ({}, {"yaw_rad": None, "yaw_std_rad": None}):
+        pose = pose_of(encode({"x_m": 1.0, "y_m": -2.0, "position_std_m": 0.01, "age_s": 0.0, **absent}), NOW_NS)
+        assert (pose.x_m, pose.y_m, pose.position_std_m, pose.has_heading) == (1.0, -2.0, 0.01, False)
 
 
 @pytest.mark.parametrize("word", [b"NaN", b"1e999", b"-Infinity"])
