@@ -335,14 +335,45 @@ class PoseSource(Protocol):
         """Release what it holds; safe to call twice."""
 
 
+class Exchange(Protocol):
+    """How a serial line is spoken on which one request is under way at a time, and a reply belongs to the last one.
+
+    A frame is a packet here: `can_id` says to whom it goes and what it is. `timeout_s`: how long the device may take to
+    begin; `quiet_s`: how long the line is left alone after a reply that did not come.
+    """
+
+    @property
+    def timeout_s(self) -> float:
+        """How long the device may take from the last byte of a request to the last of its reply, at infinite speed."""
+
+    @property
+    def quiet_s(self) -> float:
+        """Silence after which a device that is in the middle of a packet begins anew."""
+
+    def request(self, frame: Frame) -> bytes:
+        """The bytes of a packet on the line."""
+
+    def is_answered(self, frame: Frame) -> bool:
+        """Whether the device replies to it."""
+
+    def reply(self, frame: Frame, received: bytes) -> Frame | None:
+        """The reply to `frame` that the bytes received since then begin with; None if it is none, or not whole yet."""
+
+
 @dataclass(frozen=True, slots=True)
 class CyclicFrame:
-    """A frame of `length` data bytes that `sender` sends `rate_hz` times a second."""
+    """A frame of `length` data bytes that `sender` sends `rate_hz` times a second.
+
+    `line_bytes`: all of its bytes on a serial line, and `pause_s` how long that rests after it, where the driver speaks
+    a framing of its own there; None: the data and what the reference protocol's framing adds.
+    """
 
     name: str
     sender: str
     length: int
     rate_hz: float
+    line_bytes: int | None = None
+    pause_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -389,9 +420,11 @@ class MotorDriver:
     for a connection beside the daemon's, which needs no answer; `stop_confirmation` makes what says, given each frame
     that is heard then, whether the robot has confirmed it. `slowest_rad_s`: the slowest wheel speed that it holds.
     `cyclic_frames` (of settings, command rate in Hz, whether authenticated): what the link carries. `authenticates`:
-    whether there is such a mode; without one `link.key_file` is refused. `example`: its fields in [link] for a robot as
-    the demonstration drives it; none where its controller is not simulated. `latches_stop`: whether the
-    controller itself keeps an e-stop until it is reset. `is_default`: taken where robot.toml has no `link.driver`.
+    whether there is such a mode; without one `link.key_file` is refused. `kinds`: of links that it speaks over, the
+    usual one first. `exchange` makes what a serial line is spoken with; None: the reference protocol's frames.
+    `example`: its fields in [link] for a robot as the demonstration drives it; none where its controller is not
+    simulated. `latches_stop`: whether the controller itself keeps an e-stop until it is reset. `is_default`: taken
+    where robot.toml has no `link.driver`.
     """
 
     name: str
@@ -402,6 +435,8 @@ class MotorDriver:
     safety_card: Callable[[Any], SafetyCard]
     slowest_rad_s: Callable[[Any], float] = lambda _settings: 0.0
     settings: type[Any] = NoSettings
+    kinds: tuple[str, ...] = ("can",)
+    exchange: Callable[[Any], Exchange] | None = None
     example: str = ""
     latches_stop: bool = True
     authenticates: bool = False

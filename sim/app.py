@@ -265,7 +265,8 @@ def _open_link(options: VirtualRobotOptions, log: Callable[[str], object] | None
         if options.baud <= 0:
             raise OptionError(f"baud {options.baud}: not positive; give the line's rate in bit/s")
         path = None if options.port is None else Path(options.port)
-        return SerialLine(path, now_ns, baud=options.baud, pacing=options.pacing, log=log)
+        framed = options.controller is None
+        return SerialLine(path, now_ns, baud=options.baud, pacing=options.pacing, log=log, framed=framed)
     if options.bitrate <= 0:
         raise OptionError(f"bitrate {options.bitrate}: not positive; give the bus's rate in bit/s")
     if options.interface == "unixcan":

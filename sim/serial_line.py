@@ -55,6 +55,8 @@ class SerialLine:
     `path` becomes a symbolic link to the port that a host opens; None leaves the port under its own name (`port`).
     `baud` is the robot's rate in bit/s (8 data bits, no parity, 1 stop bit); `pacing` off makes bytes take no time.
     `log` gets a line for each frame whose last bit has passed, in either direction, as candump writes it.
+    `framed`: whether the line carries frames in the reference protocol's framing; otherwise what comes goes on as it
+    is, each piece as the data of a frame.
     Raises SerialPathError if `path` is taken by anything but a link to a terminal, ValueError for an impossible rate.
     """
 
@@ -66,6 +68,7 @@ class SerialLine:
         baud: int = 921_600,
         pacing: bool = True,
         log: Callable[[str], object] | None = None,
+        framed: bool = True,
     ) -> None:
         if baud <= 0:
             raise ValueError(f"baud must be positive, not {baud}")
@@ -77,6 +80,7 @@ class SerialLine:
         self._plug_in_ns: int | None = None
         self._noise = random.Random(0)
         self._decoder = FrameDecoder()
+        self._framed = framed
         self._waiting: deque[tuple[Frame, int]] = deque()
         self._to_robot: deque[ReceivedFrame] = deque()
         self._to_host: deque[tuple[int, bytes, Frame]] = deque()
@@ -161,7 +165,7 @@ class SerialLine:
         for frame in frames:
             fate = self._fate(ROBOT_NODE, frame)
             data = frame.data if fate.data is None else fate.data
-            encoded = _damaged(encode_frame(frame.can_id, data), fate)
+            encoded = _damaged(self._encoded(frame.can_id, data), fate)
             for _ in range(0 if fate.lost else fate.copies):
                 begin_ns = max(self._now_ns, self._to_host[-1][0]) if self._to_host else self._now_ns
                 self._to_host.append((begin_ns + fate.delay_ns + len(encoded) * self._byte_ns, encoded, frame))
@@ -243,9 +247,12 @@ class SerialLine:
         if self._baud_differs():
             self.stats.garbled_bytes += len(received)
             received = self._garbled(received)
-        for can_id, data in self._decoder.feed(received):
+        for can_id, data in self._decoder.feed(received) if self._framed else ((0, received),):
             self.stats.frames_in += 1
-            self._waiting.append((Frame(can_id, data), len(encode_frame(can_id, data))))
+            self._waiting.append((Frame(can_id, data), len(self._encoded(can_id, data))))
+
+    def _encoded(self, can_id: int, data: bytes) -> bytes:
+        return encode_frame(can_id, data) if self._framed else data
 
     def _write(self, encoded: bytes) -> None:
         if self._baud_differs():

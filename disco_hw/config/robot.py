@@ -77,8 +77,10 @@ class Link(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
     key_file: str | None = None
 
     def medium_fields(self) -> dict[str, Any]:
-        """What `drivers.transport.make_transport` takes: kind and address, not the protocol spoken over the link."""
-        return {name: value for name, value in msgspec.structs.asdict(self).items() if name not in _OF_THE_PROTOCOL}
+        """What `drivers.transport.make_transport` takes: kind and address, and how a serial line is spoken."""
+        fields = {name: value for name, value in msgspec.structs.asdict(self).items() if name not in _OF_THE_PROTOCOL}
+        exchange = find_driver(self.driver).exchange
+        return fields if exchange is None else {**fields, "exchange": exchange(self.settings())}
 
     def settings(self) -> Any:
         """The driver's own settings. Raises msgspec.ValidationError where it needs some that are not there."""
@@ -358,6 +360,11 @@ def _check(path: Path, config: RobotConfig) -> None:
     if control.telemetry_disarm_s <= control.telemetry_zero_s:
         _refuse(path, "control.telemetry_disarm_s", "not above telemetry_zero_s", "write a larger value")
     driver = find_driver(config.link.driver)
+    if config.link.kind not in driver.kinds:
+        known = " or ".join(f'"{kind}"' for kind in driver.kinds)
+        _refuse(
+            path, "link.kind", f'the driver {driver.name} does not speak over "{config.link.kind}"', f"write {known}"
+        )
     if config.link.key_file is not None and not driver.authenticates:
         _refuse(path, "link.key_file", f"the driver {driver.name} has no authenticated mode", "remove it")
 

@@ -10,7 +10,8 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,8 @@ from disco_hw.errors import InputError
 from disco_hw.files import ROBOT_TOML, read_toml
 from drivers.motor import find_driver
 from drivers.transport import SerialMedium, open_transport
-from drivers.transport.serial import open_port
+from drivers.transport.reconnecting import TransportCounters
+from drivers.transport.serial import ExchangeConnection, open_port
 from drivers.types import Frame, LinkState, OutgoingFrame
 from firmware_protocol.serial_framing import FrameDecoder, encode_frame
 
@@ -108,17 +110,28 @@ def stop_robot(robot: Path, link: str | None = None) -> EstopOutcome:
         return EstopOutcome("link", str(error), None, confirmed, refused)
     driver = find_driver(settings.driver)
     frames, heard = driver.stop_frames(settings.settings()), driver.stop_confirmation(settings.settings())
-    way = _stop_over_serial if settings.kind == "serial" else _stop_over_transport
-    address = settings.port if settings.kind == "serial" else f"{settings.interface} {settings.channel}"
-    confirmed, link_error = False, None
+    is_serial = settings.kind == "serial"
+    way = _stop_over_serial if is_serial else _stop_over_transport
+    address = settings.port if is_serial else f"{settings.interface} {settings.channel}"
+    outcome = EstopOutcome(address, None, None, False, refused, file_error, driver.latches_stop)
+    if is_serial and driver.exchange is not None:
+        # Two that speak at once on such a line spoil each other's packets: the daemon first, which has it.
+        daemon_confirmed, daemon_error = _ask_daemon(socket_path)
+        if daemon_error is None:
+            return replace(outcome, link_error="left to the daemon, which has it", confirmed=daemon_confirmed)
+        confirmed, link_error = _attempt(partial(_stop_over_exchange, settings, frames, heard))
+    else:
+        confirmed, link_error = _attempt(partial(way, settings, frames, heard))
+        daemon_confirmed, daemon_error = _ask_daemon(socket_path)
+    return replace(outcome, link_error=link_error, daemon_error=daemon_error, confirmed=confirmed or daemon_confirmed)
+
+
+def _attempt(way: Callable[[], bool]) -> tuple[bool, str | None]:
+    """Whether the robot confirmed, and why this way failed."""
     try:
-        confirmed = way(settings, frames, heard)
+        return way(), None
     except Exception as error:  # whatever the medium raises, the daemon is asked as well
-        link_error = str(error) or type(error).__name__
-    daemon_confirmed, daemon_error = _ask_daemon(socket_path)
-    return EstopOutcome(
-        address, link_error, daemon_error, confirmed or daemon_confirmed, refused, file_error, driver.latches_stop
-    )
+        return False, str(error) or type(error).__name__
 
 
 def _read(robot: Path) -> tuple[dict[str, Any], str | None]:
@@ -192,6 +205,31 @@ def _stop_over_serial(settings: Link, frames: Sequence[Frame], heard: Callable[[
             return []
 
         return _confirmed(receive, heard)
+
+
+def _stop_over_exchange(settings: Link, frames: Sequence[Frame], heard: Callable[[Frame], bool]) -> bool:
+    """Packet by packet, each with its reply, again and again until the robot confirms or the time is over."""
+    driver = find_driver(settings.driver)
+    assert driver.exchange is not None
+    medium = SerialMedium(settings.port, settings.baud, settings.dtr, settings.rts)
+    with open_port(medium, timeout_s=0.002, write_timeout_s=0.5, exclusive=False) as port:
+        line = ExchangeConnection(port, TransportCounters(), driver.exchange(settings.settings()))
+        deadline_ns = time.monotonic_ns() + round(_CONFIRM_S * 1e9)
+        went_out, confirmed = False, False
+        while not confirmed:
+            for frame in frames:
+                try:
+                    reply = line.exchange(frame)
+                except serial.SerialException:
+                    # Two readers of one port take bytes from each other, which pyserial reports as a lost device.
+                    if time.monotonic_ns() > deadline_ns and not went_out:
+                        raise
+                else:
+                    went_out = True
+                    confirmed = (reply is not None and heard(reply)) or confirmed
+            if time.monotonic_ns() > deadline_ns:
+                break
+    return confirmed
 
 
 def _confirmed(receive: Callable[[], list[Frame]], heard: Callable[[Frame], bool]) -> bool:

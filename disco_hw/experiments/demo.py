@@ -31,6 +31,7 @@ from disco_hw.experiments.live_stack import (
     READY_TIMEOUT_S,
     Operator,
     disco_hw_process,
+    link_of_device,
     stands,
     with_device,
 )
@@ -75,7 +76,7 @@ def run_demo(options: DemoOptions) -> CircleReport:
     if options.device is not None and options.device not in DEVICES:
         raise InputError(f"--device {options.device}: no such device; write one of {', '.join(DEVICES)}")
     if options.device is not None and options.link != "can":
-        raise InputError(f"--link {options.link}: {options.device} is simulated on CAN alone; leave --link out")
+        raise InputError(f"--link {options.link}: not beside --device, which brings its own; leave --link out")
     options.out.mkdir(parents=True, exist_ok=True)
     console = Console(stderr=not options.show_progress)
     with tempfile.TemporaryDirectory(prefix="disco-hw-demo-") as scratch:
@@ -168,7 +169,8 @@ def _drive(options: DemoOptions, files: _Files, console: Console) -> bool:
         disco_hw_process("daemon", daemon_arguments, files.daemon_output) as daemon,
     ):
         operator = Operator(files.socket, (robot, daemon))
-        console.print(f"virtual robot pid {robot.process.pid}, daemon pid {daemon.process.pid}, link {options.link}")
+        link = options.link if options.device is None else link_of_device(options.device)
+        console.print(f"virtual robot pid {robot.process.pid}, daemon pid {daemon.process.pid}, link {link}")
         if options.view:
             console.print(f"page {address}", soft_wrap=True)
         operator.wait_for("READY", _START_TIMEOUT_S)

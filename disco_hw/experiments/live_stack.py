@@ -23,11 +23,12 @@ from typing import Any
 import disco_hw
 from disco_hw.daemon.client import send_request
 from disco_hw.errors import WorkError
-from drivers.motor import motor_drivers
+from drivers.motor import find_driver, motor_drivers
 from drivers.pose.udp import SOURCE as UDP_POSES
 
 DEVICES = MappingProxyType({driver.name: driver.example for driver in motor_drivers().values() if driver.example})
 """By name of a driver whose controller can be simulated: its lines in [link]."""
+_VENDORS_BAUD = 115_200
 _POLL_S = 0.05
 _END_TIMEOUT_S = 10.0
 _STILL_RAD_S = 0.05
@@ -215,12 +216,19 @@ def read_truth(path: Path) -> list[TruthRow]:
         ]
 
 
+def link_of_device(device: str) -> str:
+    """The kind of link that a motor controller of `DEVICES` is usually on."""
+    return find_driver(device).kinds[0]
+
+
 def with_device(text: str, device: str) -> str:
     """A robot.toml's text with another motor controller of `DEVICES`, whose poses come by datagrams."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened:
         opened.bind(("127.0.0.1", 0))
         port = opened.getsockname()[1]
     text = text.replace("[link]\n", f'[link]\ndriver = "{device}"\n{DEVICES[device]}')
+    if link_of_device(device) == "serial":
+        text = text.replace('\nkind = "can"', '\nkind = "serial"').replace("baud = 921600", f"baud = {_VENDORS_BAUD}")
     return text + f'\n[pose]\nsource = "{UDP_POSES}"\nport = {port}\n'
 
 

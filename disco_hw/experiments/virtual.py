@@ -62,10 +62,8 @@ def run_sim(options: SimOptions) -> int:
     ticks_per_rev = _whole_ticks(setup)
     driver = find_driver(config.link.driver)
     make_controller = None if driver.is_default else find_controller(driver.name)
-    if not driver.is_default and (make_controller is None or config.link.kind != "can"):
-        raise InputError(
-            f"{setup.robot_file}: link.driver: there is no simulator of {driver.name} on this kind of link"
-        )
+    if not driver.is_default and make_controller is None:
+        raise InputError(f"{setup.robot_file}: link.driver: there is no simulator of {driver.name}")
     controller = None if make_controller is None else partial(make_controller, config.link.settings(), ticks_per_rev)
     x_m, y_m, yaw_rad = options.start or config.task.course().start
     # The robot that a model without effects describes; what its motors should lack is hidden by the user.

@@ -34,13 +34,15 @@ def can_load(frames: Iterable[CyclicFrame], bitrate: int) -> float:
 def serial_load(frames: Iterable[CyclicFrame], baud: int) -> float:
     """Return the part of a serial line at `baud` (bit/s) that the frames take in the busier of its two directions.
 
-    A frame is tunnelled with 7 bytes of kind, identifier, CRC, stuffing and delimiter; a byte is 10 bits on the line.
+    A frame is tunnelled with 7 bytes of kind, identifier, CRC, stuffing and delimiter, unless it says otherwise; a byte
+    is 10 bits on the line.
     """
     taken: dict[str, float] = {}
     for frame in frames:
-        bits = (frame.length + _SERIAL_OVERHEAD_BYTES) * _SERIAL_BITS_PER_BYTE
-        taken[frame.sender] = taken.get(frame.sender, 0.0) + bits * frame.rate_hz
-    return max(taken.values(), default=0.0) / baud
+        count = frame.length + _SERIAL_OVERHEAD_BYTES if frame.line_bytes is None else frame.line_bytes
+        busy_s = count * _SERIAL_BITS_PER_BYTE / baud + frame.pause_s
+        taken[frame.sender] = taken.get(frame.sender, 0.0) + busy_s * frame.rate_hz
+    return max(taken.values(), default=0.0)
 
 
 _SPEED_RESOLUTION_RAD_S = 0.002
@@ -81,7 +83,8 @@ def check_link_load(link: Link, control: Control) -> Check:
         remedy = "raise link.bitrate on both ends, or lower control.rate_hz"
     else:
         load = serial_load(frames, link.baud)
-        found = f"{load:.1%} of the busier direction at {link.baud} baud"
+        shared = any(frame.line_bytes is not None for frame in frames)
+        found = f"{load:.1%} of the {'line' if shared else 'busier direction'} at {link.baud} baud"
         remedy = "raise link.baud on both ends, or lower control.rate_hz"
     if load > _LOAD_LIMIT:
         return Check("link load", Level.FAIL, f"{found} is too much; {remedy}")

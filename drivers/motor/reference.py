@@ -495,6 +495,7 @@ DRIVER = MotorDriver(
         packaged_dbc(), rate_hz, authenticated=authenticated
     ),
     safety_card=_safety_card,
+    kinds=("can", "serial"),
     authenticates=True,
     is_default=True,
 )

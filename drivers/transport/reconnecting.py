@@ -21,6 +21,7 @@ from firmware_protocol.serial_framing import MAX_CAN_ID, MAX_DATA
 RECEIVE_CAPACITY = 4096
 TRANSMIT_CAPACITY = 64
 _BUSY_RETRY_S = 0.001
+_MOST_PACKET = 512
 _DRAIN_S = 0.1
 _JOIN_S = 1.0
 _MOST_PATIENT_S = 30.0
@@ -190,13 +191,19 @@ class ReconnectingTransport:
         backoff: BackoffPolicy = DEFAULT_BACKOFF,
         mute_after_s: float | None = None,
         carries_extended: bool = False,
+        carries_packets: bool = False,
     ) -> None:
         """`mute_after_s`: a link on which no frame comes for so long is closed and connected again; None: never.
 
-        `carries_extended`: whether the medium has frames with 29-bit identifiers.
+        `carries_extended`: whether the medium has frames with 29-bit identifiers; `carries_packets`: whether it has
+        none, but packets of up to 512 bytes.
         """
         self._medium = medium
-        self._carries_extended = carries_extended
+        self._largest = (
+            MAX_EXTENDED_ID if carries_packets else MAX_CAN_ID,
+            MAX_EXTENDED_ID if carries_extended or carries_packets else -1,
+        )
+        self._most_data = _MOST_PACKET if carries_packets else MAX_DATA
         self._backoff = backoff
         self._mute_after_s = mute_after_s
         self._patience_s = mute_after_s
@@ -263,9 +270,8 @@ class ReconnectingTransport:
 
         Raises ValueError for what is no classic CAN frame, or none that this medium has.
         """
-        extended = outgoing.frame.extended
-        largest = MAX_EXTENDED_ID if extended and self._carries_extended else -1 if extended else MAX_CAN_ID
-        if not 0 <= outgoing.frame.can_id <= largest or len(outgoing.frame.data) > MAX_DATA:
+        largest = self._largest[outgoing.frame.extended]
+        if not 0 <= outgoing.frame.can_id <= largest or len(outgoing.frame.data) > self._most_data:
             raise ValueError(f"not a classic CAN frame: {outgoing.frame}")
         if outgoing.deadline_ns < now_ns:
             self._counters.add(expired=1)

@@ -1,8 +1,9 @@
-"""A serial line (UART, USB adapter, pseudo-terminal) that tunnels CAN frames with COBS framing."""
+"""A serial line (UART, USB adapter, pseudo-terminal): CAN frames tunnelled with COBS framing, or exchanges."""
 
 from __future__ import annotations
 
 import errno
+import queue
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,18 +13,23 @@ import serial
 
 from drivers.transport.reconnecting import (
     MUTE_AFTER_S,
+    Connection,
     LinkMuteError,
     ReconnectingTransport,
     TransmitBusyError,
     TransportCounters,
 )
-from drivers.types import Frame, ReceivedFrame
+from drivers.types import Exchange, Frame, ReceivedFrame
 from firmware_protocol.serial_framing import FrameDecoder, encode_frame
 
 _GONE = (errno.ENOENT, errno.ENODEV, errno.ENXIO, errno.EIO)
 KIND = "serial"
 READ_TIMEOUT_S = 0.1
 WRITE_TIMEOUT_S = 0.05
+_EXCHANGE_READ_S = 0.002
+_BITS_PER_BYTE = 10
+_LONGEST_REPLY = 600
+_FULL = "the line takes no more bytes; is the other end reading?"
 _DELIMITER = b"\0"
 
 
@@ -33,10 +39,15 @@ def make_transport(
     baud: int = 921_600,
     dtr: bool = False,
     rts: bool = False,
+    exchange: Exchange | None = None,
     **_of_other_media: Any,
 ) -> ReconnectingTransport:
-    """Make a link over a serial port by the fields of robot.toml's [link]; `baud` in bit/s."""
-    return ReconnectingTransport(SerialMedium(port, baud, dtr, rts), mute_after_s=MUTE_AFTER_S)
+    """Make a link over a serial port by the fields of robot.toml's [link]; `baud` in bit/s.
+
+    `exchange`: how its driver speaks; None in frames tunnelled.
+    """
+    medium = SerialMedium(port, baud, dtr, rts, exchange)
+    return ReconnectingTransport(medium, mute_after_s=MUTE_AFTER_S, carries_packets=exchange is not None)
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,16 +61,20 @@ class SerialMedium:
     baud: int
     dtr: bool = False
     rts: bool = False
+    exchange: Exchange | None = None
 
     @property
     def name(self) -> str:
         """Port and speed."""
         return f"serial {self.port} at {self.baud} Bd"
 
-    def connect(self, counters: TransportCounters) -> SerialConnection:
+    def connect(self, counters: TransportCounters) -> Connection:
         """Open the port for this process alone. Raises what pyserial raises."""
-        port = open_port(self, timeout_s=READ_TIMEOUT_S, write_timeout_s=WRITE_TIMEOUT_S, exclusive=True)
+        timeout_s = READ_TIMEOUT_S if self.exchange is None else _EXCHANGE_READ_S
+        port = open_port(self, timeout_s=timeout_s, write_timeout_s=WRITE_TIMEOUT_S, exclusive=True)
         ask_for_low_latency(port)
+        if self.exchange is not None:
+            return ExchangeConnection(port, counters, self.exchange)
         return SerialConnection(port, counters)
 
     def explain(self, error: Exception) -> str:
@@ -97,12 +112,89 @@ class SerialConnection:
             self._port.write(encoded if self._line_is_clean else _DELIMITER + encoded)
         except serial.SerialTimeoutException as error:
             self._line_is_clean = False
-            raise TransmitBusyError("the line takes no more bytes; is the other end reading?") from error
+            raise TransmitBusyError(_FULL) from error
         self._line_is_clean = True
 
     def close(self) -> None:
         """Close the port."""
         self._port.close()
+
+
+class ExchangeConnection:
+    """An open serial port with one request at a time under way; satisfies `drivers.transport.reconnecting.Connection`.
+
+    Who writes also waits for the reply: the next request leaves when that is there or will not come any more. After one
+    that did not come, nothing is said for `exchange.quiet_s`, and what comes until then belongs to nobody.
+    """
+
+    def __init__(self, port: serial.Serial, counters: TransportCounters, exchange: Exchange) -> None:
+        self._port = port
+        self._counters = counters
+        self._exchange = exchange
+        self._replies: queue.SimpleQueue[ReceivedFrame] = queue.SimpleQueue()
+        # Whoever held the port before may have left half a packet, and half a reply.
+        self._quiet_until_ns = 0
+        self._rest()
+
+    def read(self) -> Sequence[ReceivedFrame]:
+        """Wait 0.1 s at most for a reply; its time stamp is when its last byte was read."""
+        try:
+            return [self._replies.get(timeout=READ_TIMEOUT_S)]
+        except queue.Empty:
+            return ()
+
+    def write(self, frame: Frame) -> None:
+        """Send one request and wait for its reply, which `read` returns. Raises when unplugged."""
+        reply = self.exchange(frame)
+        if reply is not None:
+            self._replies.put(ReceivedFrame(time.monotonic_ns(), reply))
+
+    def exchange(self, frame: Frame) -> Frame | None:
+        """Send one request and wait for its reply, for a bounded time; one that does not come is counted.
+
+        Raises TransmitBusyError if the line takes no more, and what pyserial raises when unplugged.
+        """
+        left_ns = self._quiet_until_ns - time.monotonic_ns()
+        if left_ns > 0:
+            time.sleep(left_ns * 1e-9)
+        self._port.reset_input_buffer()
+        request = self._exchange.request(frame)
+        try:
+            self._port.write(request)
+        except serial.SerialTimeoutException as error:
+            self._rest()
+            raise TransmitBusyError(_FULL) from error
+        if not self._exchange.is_answered(frame):
+            return None
+        reply = self._wait_for_reply(frame, len(request))
+        if reply is None:
+            self._rest()
+        return reply
+
+    def close(self) -> None:
+        """Close the port."""
+        self._port.close()
+
+    def _rest(self) -> None:
+        self._quiet_until_ns = time.monotonic_ns() + round(self._exchange.quiet_s * 1e9)
+
+    def _wait_for_reply(self, frame: Frame, sent_bytes: int) -> Frame | None:
+        received = b""
+        byte_s = _BITS_PER_BYTE / self._port.baudrate
+        deadline = time.monotonic() + self._exchange.timeout_s + sent_bytes * byte_s
+        latest = deadline + _LONGEST_REPLY * byte_s
+        while time.monotonic() < deadline and len(received) <= _LONGEST_REPLY:
+            more = self._port.read(max(1, self._port.in_waiting))
+            if not more:
+                continue
+            # What is still on its way when bytes come is no reason to give up.
+            deadline = min(max(deadline, time.monotonic() + self._exchange.quiet_s), latest)
+            received += more
+            reply = self._exchange.reply(frame, received)
+            if reply is not None:
+                return reply
+        self._counters.add(**{"malformed" if received else "receive_errors": 1})
+        return None
 
 
 def open_port(medium: SerialMedium, *, timeout_s: float, write_timeout_s: float, exclusive: bool) -> serial.Serial:

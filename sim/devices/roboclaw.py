@@ -8,9 +8,14 @@ of it ran.
 from __future__ import annotations
 
 import binascii
+import math
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+
+from drivers.motor.roboclaw_settings import RoboclawSettings
+from firmware_protocol.firmware_core import FirmwareInputs
+from sim.can_frame import CanFrame
 
 QUIET_US = 10_000
 
@@ -186,3 +191,103 @@ _GETTERS: dict[int, Callable[[RoboclawRegisters], bytes]] = {
     90: lambda r: (r.status & 0xFFFF).to_bytes(2) if r.short_status else r.status.to_bytes(4),
     202: lambda r: bytes([r.estop_lock]),
 }
+
+
+class RoboclawController:
+    """All boards of a robot on one serial line: satisfies `sim.vendor_robot.Controller`; frames carry the line's bytes.
+
+    Motors whose command has ended, by the serial timeout or an error, coast; zero duty brakes. `dead`: addresses of
+    boards without supply.
+    """
+
+    brakes = False
+
+    def __init__(self, settings: RoboclawSettings, ticks_per_rev: int) -> None:
+        self._settings = settings
+        self._counts_per_tick = settings.counts_per_rev / ticks_per_rev
+        self.boards = {address: Roboclaw(address) for address in settings.addresses}
+        self.dead: set[int] = set()
+        self._ticks = self._zero_ticks = (0, 0)
+        self._measured = (0.0, 0.0)
+        self._ramped: dict[tuple[int, int], float] = {}
+
+    @property
+    def wheels_rad_s(self) -> tuple[float | None, float | None]:
+        """The mean of what a side's motors hold; None where one is released."""
+        held: list[float | None] = []
+        for side, direction in zip(self._settings.sides, self._settings.direction, strict=True):
+            speeds = [self._ramped.get(place) for place in side]
+            known = [speed for speed in speeds if speed is not None]
+            mean = direction * sum(known) / len(side) / self._settings.counts_per_rad
+            held.append(mean if len(known) == len(side) else None)
+        return held[0], held[1]
+
+    @property
+    def state(self) -> str:
+        """In one word."""
+        if any(board.registers.status & 0xFFFF for board in self.boards.values()):
+            return "FAULT"
+        return "STANDBY" if all(board.command is None for board in self.boards.values()) else "ARMED"
+
+    @property
+    def obeyed(self) -> int:
+        """How many speed commands they have taken."""
+        return sum(command in _MOVING for board in self.boards.values() for command, _ in board.obeyed)
+
+    def receive(self, now_us: int, frame: CanFrame) -> Sequence[CanFrame]:
+        """Take in bytes from the line, which every board hears; return what one of them replies."""
+        replies = [
+            board.receive(now_us, frame.data) for address, board in self.boards.items() if address not in self.dead
+        ]
+        return [CanFrame(0, reply) for reply in replies if reply]
+
+    def step(self, now_us: int, inputs: FirmwareInputs) -> Sequence[CanFrame]:
+        """Go through one millisecond: the encoders count, timeouts run, speeds are ramped."""
+        self._ticks = (inputs.left_ticks, inputs.right_ticks)
+        self._measured = (inputs.left_speed_rad_s, inputs.right_speed_rad_s)
+        for number, (side, direction) in enumerate(zip(self._settings.sides, self._settings.direction, strict=True)):
+            ticks = self._ticks[number] - self._zero_ticks[number]
+            count = round(direction * ticks * self._counts_per_tick)
+            speed = direction * self._measured[number] * self._settings.counts_per_rad
+            for address, motor in side:
+                registers = self.boards[address].registers
+                setattr(registers, f"encoder_m{motor + 1}", count)
+                setattr(registers, f"speed_m{motor + 1}", round(speed))
+                self._ramp(address, motor, speed)
+        for board in self.boards.values():
+            if inputs.estop_button:
+                board.registers.status |= 1
+            elif board.registers.estop_lock == 0x55:
+                board.registers.status &= ~1
+            if board.registers.status & 0xFFFF:
+                board.command = None
+            board.step(now_us)
+        return ()
+
+    def restart(self) -> None:
+        """Switch off and on: counts, commands and a timeout that was not stored are gone."""
+        self._zero_ticks = self._ticks
+        self.boards = {address: Roboclaw(address) for address in self._settings.addresses}
+
+    def _ramp(self, address: int, motor: int, measured_counts_s: float) -> None:
+        board, place = self.boards[address], (address, motor)
+        if board.command is None or address in self.dead:
+            self._ramped.pop(place, None)
+            return
+        kind, *values = board.command
+        wanted = values[motor]
+        if kind == "duty":
+            qpps = (board.registers.pid_m1, board.registers.pid_m2)[motor][3]
+            self._ramped[place] = wanted / 32767.0 * qpps
+            return
+        now = self._ramped.get(place, measured_counts_s)
+        step = math.inf if board.accel is None else 1e-3 * board.accel
+        self._ramped[place] = now + min(max(wanted - now, -step), step)
+
+
+_MOVING = frozenset({34, 35, 36, 37, 40})
+
+
+def make_controller(settings: RoboclawSettings, ticks_per_rev: int) -> RoboclawController:
+    """The boards of a robot whose robot.toml has these settings."""
+    return RoboclawController(settings, ticks_per_rev)

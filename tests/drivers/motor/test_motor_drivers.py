@@ -19,6 +19,9 @@ ROOT = Path(__file__).parents[3]
 WOMBOT = ROOT / "disco_hw/robots/wombot.toml"
 
 
+ROBOCLAW = 'driver = "roboclaw"\nkind = "serial"\ncounts_per_rev = 8192.0\nwatchdog_s = 0.2\n'
+
+
 def robot_toml(folder, link):
     file = folder / "robot.toml"
     text = WOMBOT.read_text(encoding="utf-8")
@@ -52,7 +55,7 @@ def test_robot_toml_with_an_unknown_driver_is_refused_in_one_line(tmp_path):
 
 def test_robot_toml_may_name_each_driver(tmp_path):
     for name in motor_drivers():
-        link = f'driver = "{name}"\n{OWN[name]}'
+        link = f'driver = "{name}"\nkind = "{motor_drivers()[name].kinds[0]}"\n{OWN[name]}'
         assert load_robot_config(robot_toml(tmp_path, link)).link.driver == name
 
 
@@ -64,6 +67,11 @@ def test_robot_toml_may_name_each_driver(tmp_path):
         ('driver = "odrive"\nnodes = [3, 5]\nvel_limit_turns_s = 10.0\nwatchdog_s = 0.0', r"link\.watchdog_s"),
         ('driver = "odrive"\nnodes = [3, 3]\nvel_limit_turns_s = 10.0\nwatchdog_s = 0.1', r"link\.nodes: .*twice"),
         ('driver = "odrive"\nnodes = [3, 63]\nvel_limit_turns_s = 9.0\nwatchdog_s = 0.1', r"link\.nodes: .*0 to 62"),
+        (f'{ROBOCLAW}motors = ["127/1", "128/2"]', r'link\.motors: "127/1" is no motor; write'),
+        (f'{ROBOCLAW}motors = ["128/1", "128/1"]', r"link\.motors: a motor stands there twice"),
+        (f'{ROBOCLAW}motors = ["128/1", []]', r"link\.motors: a side has no motor"),
+        (f'{ROBOCLAW.replace("0.2", "0.25")}motors = ["128/1", "128/2"]', r"watchdog_s: 0\.25 is no multiple of 0\.1"),
+        (f'{ROBOCLAW.replace("serial", "can")}motors = ["128/1", "128/2"]', r'roboclaw does not .*; write "serial"'),
         ("of_driver = 3", r"link\.of_driver: no such field"),
         ("gears = 3", r"gears: no such field"),
     ],

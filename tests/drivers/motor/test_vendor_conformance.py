@@ -8,6 +8,7 @@ import random
 
 import pytest
 
+from drivers.motor import find_driver
 from drivers.types import DriverState, Frame, OutgoingFrame, Request, WheelCommand
 from tests.drivers.motor.bench import START_NS
 from tests.drivers.motor.vendors import VENDORS
@@ -190,26 +191,32 @@ def test_the_emergency_stop_stops_in_every_state(vendor, bench, when):
 
 
 def test_an_emergency_stop_from_beside_the_daemon_stops_it_and_is_confirmed(vendor, bench):
-    from drivers.motor import find_driver
-
     drive(bench)
     found = find_driver(vendor.name)
     heard = found.stop_confirmation(vendor.settings)
+    # A line that is one host's alone is taken only beside a daemon that is frozen.
+    bench.host_runs = found.exchange is None
+    bench.run(0.002)
     for frame in found.stop_frames(vendor.settings):
-        # Whoever is on the bus hears it too.
         bench.robot.receive(bench.now_ns, frame)
-        bench.robot_end.send(OutgoingFrame(frame, bench.now_ns), bench.now_ns)
+        if found.exchange is None:
+            # Whoever is on the bus hears it too.
+            bench.robot_end.send(OutgoingFrame(frame, bench.now_ns), bench.now_ns)
     bench.run(0.05)
     assert no_wheel_is_driven(bench)
     confirmed = False
-    for _ in range(500):
+    for step in range(500):
         bench.now_ns += 1_000_000
         bench.robot.step(bench.now_ns)
+        if found.exchange is not None and step % 10 == 0:
+            for frame in found.stop_frames(vendor.settings):
+                bench.robot.receive(bench.now_ns, frame)
         frames = bench.robot.drain()
         confirmed = confirmed or True in [heard(frame) for frame in frames]
         for frame in frames:
             bench._send(bench.robot_end, frame)
     assert confirmed
+    bench.host_runs = True
     bench.run(1.0, FORWARD)
     assert bench.driver.state in (DriverState.ESTOP, DriverState.FAULT)
     assert bench.driver.state is not DriverState.ARMED
@@ -279,6 +286,9 @@ def test_telemetry_that_stops_while_armed_is_a_lost_controller(vendor, bench):
 
 
 def test_another_host_on_the_link_disarms_and_is_named(vendor, bench):
+    if vendor.foreign is None:
+        assert find_driver(vendor.name).kinds == ("serial",), "only a line with two ends needs no such case"
+        return
     drive(bench)
     frame = Frame(vendor.foreign.can_id, vendor.foreign.data, vendor.foreign.extended)
     bench.robot_end.send(OutgoingFrame(frame, bench.now_ns), bench.now_ns)

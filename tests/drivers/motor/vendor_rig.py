@@ -11,10 +11,14 @@ START_NS = 50_000 * 1_000_000
 
 
 class VendorRig:
-    """What `bench.Bench` steps; `controller` of `sim.devices`. `stuck`: sides that roll whatever is asked."""
+    """What `bench.Bench` steps; `controller` of `sim.devices`. `stuck`: sides that roll whatever is asked.
 
-    def __init__(self, controller):
+    `exchange`: of a driver on a half-duplex line, where each request gets the reply that belongs to it.
+    """
+
+    def __init__(self, controller, exchange=None):
         self.controller = controller
+        self.exchange = exchange
         self.speed = [0.0, 0.0]
         self.angle = [0.0, 0.0]
         self.pressed = False
@@ -28,7 +32,13 @@ class VendorRig:
 
     def receive(self, now_ns, frame):
         self.received.append(frame)
-        self._outgoing += self.controller.receive(self._us(now_ns), CanFrame(frame.can_id, frame.data, frame.extended))
+        if self.exchange is None:
+            sent = CanFrame(frame.can_id, frame.data, frame.extended)
+            self._outgoing += self.controller.receive(self._us(now_ns), sent)
+            return
+        said = self.controller.receive(self._us(now_ns), CanFrame(0, self.exchange.request(frame)))
+        reply = self.exchange.reply(frame, b"".join(each.data for each in said))
+        self._outgoing += [] if reply is None else [reply]
 
     def step(self, now_ns):
         for side, wanted in enumerate(self.controller.wheels_rad_s):

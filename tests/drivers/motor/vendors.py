@@ -18,8 +18,8 @@ class Vendor:
     """A driver and its simulator, with the settings of its example and `changes` to them.
 
     `watchdog_s`: after what silence the controller lets go. `lose_left`: break the left side alone. `is_motion`: of a
-    frame that moves a wheel; `is_forbidden`: one that no driver ever sends; `foreign`: one that another host would;
-    `mend`: takes away the cause of `lose_left`, where a reset does not.
+    frame that moves a wheel; `is_forbidden`: one that no driver ever sends; `foreign`: one that another host would,
+    None on a line that is one host's alone; `mend`: takes away the cause of `lose_left`, where a reset does not.
     """
 
     name: str
@@ -29,7 +29,7 @@ class Vendor:
     lose_left: Callable[[VendorRig], None]
     is_motion: Callable[[CanFrame], bool]
     is_forbidden: Callable[[CanFrame], bool]
-    foreign: CanFrame
+    foreign: CanFrame | None
     mend: Callable[[VendorRig], None] = lambda _rig: None
 
     @property
@@ -39,7 +39,9 @@ class Vendor:
 
     def bench(self, **options):
         controller = find_controller(self.name)(self.settings, TICKS_PER_REV)
-        return Bench(make_driver(self.name, self.settings), VendorRig(controller), **options)
+        made = find_driver(self.name).exchange
+        rig = VendorRig(controller, None if made is None else made(self.settings))
+        return Bench(make_driver(self.name, self.settings), rig, **options)
 
     def __str__(self):
         return self.label
@@ -99,6 +101,28 @@ def is_agilex_forbidden(frame):
     """Lights, brakes, the serial mode, and a length that is not the command's."""
     lengths = {0x111: 8, 0x421: 8, 0x441: 1}
     return len(frame.data) != lengths.get(frame.can_id) or (frame.can_id == 0x421 and frame.data[0] > 1)
+
+
+def fail_left_roboclaw(rig):
+    rig.controller.boards[128].registers.status = 0x40
+
+
+def mend_roboclaw(rig):
+    rig.controller.boards[128].registers.status = 0
+
+
+def is_roboclaw_motion(frame):
+    """A speed or duty that is not zero."""
+    zeros = {40: frame.data[6:14], 34: frame.data[2:6]}
+    return frame.can_id & 0xFF in (32, 33, 34, 35, 36, 37, 40) and any(zeros.get(frame.can_id & 0xFF, b"!"))
+
+
+def is_roboclaw_forbidden(frame):
+    """All but the serial timeout, questions, ramped speeds, the stop, and the reset of an e-stop."""
+    command = frame.can_id & 0xFF
+    if command == 34:
+        return any(frame.data[2:6])
+    return command not in (14, 15, 21, 40, 55, 56, 78, 79, 90, 200)
 
 
 VENDORS = (
@@ -163,5 +187,27 @@ VENDORS = (
         is_agilex_motion,
         is_agilex_forbidden,
         CanFrame(0x111, b"\0\x10" + bytes(6)),
+    ),
+    Vendor(
+        "roboclaw",
+        "roboclaw",
+        "",
+        0.2,
+        fail_left_roboclaw,
+        is_roboclaw_motion,
+        is_roboclaw_forbidden,
+        None,
+        mend_roboclaw,
+    ),
+    Vendor(
+        "roboclaw",
+        "roboclaw-a-board-a-side",
+        'motors = [["128/1", "128/2"], ["129/1", "129/2"]]\n',
+        0.2,
+        lambda rig: rig.controller.dead.add(128),
+        is_roboclaw_motion,
+        is_roboclaw_forbidden,
+        None,
+        lambda rig: rig.controller.dead.clear(),
     ),
 )

@@ -1,0 +1,144 @@
+"""What is RoboClaw's own: its serial timeout, set and read back, stops before questions, and boards that restart."""
+
+import pytest
+
+from disco_hw.config import Control, Link
+from disco_hw.runtime.preflight import Level, check_link_load
+from drivers.motor.roboclaw_codec import SETTERS
+from drivers.types import DriverState, Request, WheelCommand
+from tests.drivers.motor.vendors import VENDORS
+
+ONE, TWO = (vendor for vendor in VENDORS if vendor.name == "roboclaw")
+FORWARD = (3.0, 2.0)
+STILL = (DriverState.STANDBY, DriverState.READY)
+STOP = SETTERS["duty_m1m2"].command
+
+
+@pytest.fixture(params=[ONE, TWO], ids=str)
+def bench(request):
+    return request.param.bench()
+
+
+def boards(bench):
+    return list(bench.robot.controller.boards.values())
+
+
+def drive(bench):
+    bench.arm()
+    bench.run(0.5, FORWARD)
+    assert bench.robot.speed == pytest.approx(FORWARD, abs=0.02)
+
+
+def test_the_serial_timeout_is_set_and_read_back_before_the_first_speed(bench):
+    assert [board.registers.timeout_ds for board in boards(bench)] == [0] * len(boards(bench))
+    bench.arm()
+    for board in boards(bench):
+        assert board.registers.timeout_ds == 2
+        commands = [command for command, _ in board.obeyed]
+        assert commands.index(14) < commands.index(40)
+
+
+def test_a_board_that_does_not_keep_its_timeout_is_not_armed(bench):
+    bench.run_until(*STILL)
+    take = bench.robot.receive
+    bench.robot.receive = lambda now_ns, frame: None if frame.can_id & 0xFF == 14 else take(now_ns, frame)
+    bench.driver.request(Request.ARM)
+    bench.run(2.5, FORWARD)
+    assert bench.driver.state in STILL
+    assert "serial timeout" in bench.driver.detail
+    assert bench.largest_speed == 0.0
+
+
+def test_the_first_thing_a_board_hears_is_a_stop(bench):
+    """One that still holds a speed, of a daemon that was killed, must not be fed by questions."""
+    bench.run(0.5)
+    for address in bench.robot.controller.boards:
+        assert next(frame for frame in bench.robot.received if frame.can_id >> 8 == address).can_id & 0xFF == STOP
+
+
+def test_a_speed_that_was_still_waiting_behind_the_stop_is_stopped_too(bench):
+    drive(bench)
+    waiting = bench.driver.transmit(bench.now_ns, WheelCommand(*FORWARD, 0.1))
+    bench.send_estop()
+    bench.run(0.001)
+    # The line was busy: what was queued before leaves behind the stop.
+    for outgoing in waiting:
+        bench.robot.receive(bench.now_ns, outgoing.frame)
+    assert {board.command[0] for board in boards(bench)} == {"speed"}
+    bench.run(0.3)
+    assert bench.robot.controller.wheels_rad_s == (0.0, 0.0)
+    assert bench.driver.state is DriverState.ESTOP
+
+
+def test_a_board_that_restarted_standing_is_known_by_its_timeout(bench):
+    bench.arm()
+    bench.run(0.3)
+    bench.robot.controller.restart()
+    bench.run(0.7)
+    assert bench.driver.state is DriverState.FAULT
+    assert "restarted" in bench.driver.detail
+
+
+def test_a_board_that_takes_no_commands_is_lost_though_it_answers(bench):
+    drive(bench)
+    take = bench.robot.receive
+    bench.robot.receive = lambda now_ns, frame: None if frame.can_id & 0xFF == 40 else take(now_ns, frame)
+    bench.run(0.3, FORWARD)
+    assert bench.driver.state is DriverState.FAULT
+    assert "does not take its commands" in bench.driver.detail
+    assert bench.robot.controller.wheels_rad_s == (0.0, 0.0)
+
+
+def test_its_e_stop_input_stops_it_and_needs_a_reset(bench):
+    drive(bench)
+    bench.robot.press_estop(True)
+    bench.run(0.3, FORWARD)
+    assert bench.driver.state is DriverState.ESTOP
+    assert "input" in bench.driver.detail
+    bench.robot.press_estop(False)
+    bench.run(2.0, FORWARD)
+    assert bench.driver.state is DriverState.FAULT
+    assert bench.robot.speed_rad_s < 0.05
+    bench.driver.request(Request.RESET)
+    bench.run_until(*STILL)
+
+
+def test_an_e_stop_that_the_board_latches_by_itself_is_reset_only_when_asked_to(bench):
+    for board in boards(bench):
+        board.registers.estop_lock = 0xAA
+    drive(bench)
+    bench.robot.press_estop(True)
+    bench.run(0.3)
+    bench.robot.press_estop(False)
+    bench.run(1.0)
+    assert bench.driver.state is DriverState.ESTOP
+    assert not [frame for frame in bench.robot.received if frame.can_id & 0xFF == 200]
+    bench.driver.request(Request.RESET)
+    bench.run_until(*STILL)
+
+
+def test_the_two_byte_status_of_older_firmware_is_taken(bench):
+    for board in boards(bench):
+        board.registers.short_status = True
+    drive(bench)
+    boards(bench)[0].registers.status = 0x4000
+    bench.run(0.3)
+    assert "voltage is too low" in bench.driver.detail
+
+
+def test_a_speed_beyond_what_the_board_can_do_is_held_to_it(bench):
+    for board in boards(bench):
+        board.registers.pid_m1 = board.registers.pid_m2 = (65536, 32768, 0, 6000)
+    bench.arm()
+    bench.run(1.0, (50.0, 2.0))
+    assert bench.robot.speed[0] == pytest.approx(6000 / ONE.settings.counts_per_rad, rel=1e-3)
+    assert bench.driver.capabilities.max_wheel_speed_rad_s == pytest.approx(6000 / ONE.settings.counts_per_rad)
+
+
+@pytest.mark.parametrize(
+    ("baud", "rate_hz", "level"),
+    [(38_400, 50.0, Level.FAIL), (38_400, 25.0, Level.WARNING), (115_200, 50.0, Level.OK)],
+)
+def test_a_line_that_is_too_slow_for_the_rate_is_refused(baud, rate_hz, level):
+    link = Link(driver=ONE.name, kind="serial", baud=baud, of_driver=ONE.settings)
+    assert check_link_load(link, Control(rate_hz=rate_hz)).level is level
