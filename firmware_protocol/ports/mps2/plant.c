@@ -2,22 +2,23 @@
 
 #include <math.h>
 
-/* The virtual robot's (sim/plant_parameters.py): the posterior mean of the paper's skid-steer robot. */
+/* Those of `disco-hw sim` (sim/plant_parameters.py): the posterior mean of the paper's skid-steer robot, whose motors follow
+ * their setpoints at once. */
 #define RADIUS_M (0.061f)
 #define AXIAL_DISTANCE_M (0.415f)
 #define X_ICR_M (0.238f)
-#define LAG_S (0.06f)
-#define MAX_ACCELERATION (60.0f)
 #define BRAKE_S (0.04f)
 #define COAST_S (1.5f)
 #define INERTIA (0.03f)
 #define DRY_FRICTION_NM (0.15f)
 #define NM_PER_A (0.25f)
-#define HOLD_RAD_S (0.02f)
+#define STANDING_RAD_S (0.02f)
 #define TICKS_PER_TURN (2048.0f)
 #define TWO_PI (6.2831853f)
 #define POSITION_STD_M (0.005f)
 #define YAW_STD_RAD (0.0087f)
+#define WHEEL_STD (0.015f)
+#define WHEEL_CORRELATION_S (0.15f)
 #define SLIP_CORRELATION_S (0.3f)
 #define SLIP_ONSET_M_S (0.05f)
 static const float slip_std[3] = {0.005f, 0.004f, 0.018f};
@@ -45,24 +46,28 @@ void plant_init(plant_t *plant)
     *plant = (plant_t){.x = 0.75f, .yaw = 1.5707963f, .noise = 2463534242u};
 }
 
-static float within(float value, float bound)
+/* One step of an Ornstein-Uhlenbeck process. */
+static void wander(plant_t *plant, float *value, float std, float part)
 {
-    return fminf(fmaxf(value, -bound), bound);
+    *value += (-*value * part) + (std * sqrtf(2.0f * part) * normal(plant));
 }
 
 static void turn_wheel(plant_t *plant, int side, float setpoint, const disco_outputs_t *outputs, float dt)
 {
     const float before = plant->speed[side];
-    float change;
+    float speed;
     if (outputs->driver_enabled) {
-        change = within((setpoint - before) * (dt / LAG_S), MAX_ACCELERATION * dt);
+        if (setpoint != 0.0f) {
+            wander(plant, &plant->uneven[side], WHEEL_STD, dt / WHEEL_CORRELATION_S);
+        }
+        speed = setpoint * (1.0f + plant->uneven[side]);
     } else {
-        change = -before * (dt / (outputs->brake ? BRAKE_S : COAST_S));
+        speed = before - (before * (dt / (outputs->brake ? BRAKE_S : COAST_S)));
+        if (fabsf(speed) < STANDING_RAD_S) {
+            speed = 0.0f;
+        }
     }
-    float speed = before + change;
-    if ((setpoint == 0.0f) && (fabsf(speed) < HOLD_RAD_S)) {
-        speed = 0.0f;
-    }
+    const float change = speed - before;
     plant->speed[side] = speed;
     plant->angle[side] += 0.5f * (before + speed) * dt;
     if (plant->angle[side] >= TWO_PI) {
@@ -88,8 +93,7 @@ void plant_step(plant_t *plant, const disco_outputs_t *outputs, float dt)
     }
     const float slipping = fminf(fastest / SLIP_ONSET_M_S, 1.0f);
     for (int i = 0; i < 3; i++) {
-        const float part = dt / SLIP_CORRELATION_S;
-        plant->slip[i] += (-plant->slip[i] * part) + (slip_std[i] * sqrtf(2.0f * part) * normal(plant));
+        wander(plant, &plant->slip[i], slip_std[i], dt / SLIP_CORRELATION_S);
     }
     const float turning = (right - left) / AXIAL_DISTANCE_M;
     const float forward = (0.5f * (left + right)) + (slipping * plant->slip[0]);

@@ -12,6 +12,7 @@ typedef struct {
     float angle[2]; /* rad, less whole turns */
     uint32_t turns[2];
     float current[2]; /* A */
+    float uneven[2];  /* part of the speed by which a wheel runs too fast */
     float slip[3];    /* m/s forward and left, rad/s */
     float x, y, yaw;  /* m, rad: the tracked point */
     uint32_t noise;

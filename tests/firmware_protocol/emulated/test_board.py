@@ -62,6 +62,17 @@ def test_a_firmware_that_hangs_is_restarted_by_the_hardware_watchdog(host):
     restarted_with(host, "h", "WATCHDOG_RESET")
 
 
+def test_it_drives_on_when_its_computer_has_held_up_the_emulator(host):
+    """Longer than the core lets a clock leap, shorter than it waits for a command."""
+    host.to_driving()
+    for _ in range(3):
+        os.kill(host.end.board.process.pid, signal.SIGSTOP)
+        host.run(0.06)
+        os.kill(host.end.board.process.pid, signal.SIGCONT)
+        host.run(0.2)
+    assert (host.state, host.fault) == ("ARMED", "NONE")
+
+
 def test_the_emergency_stop_button_stops_the_wheels(host):
     host.to_driving()
     host.end.bench.do("p")

@@ -2,6 +2,8 @@
 
 import csv
 import math
+import statistics
+from collections import defaultdict
 
 import pytest
 
@@ -11,11 +13,11 @@ from tools.emulated_board import build_board, missing, running_board
 pytestmark = [
     pytest.mark.long,
     pytest.mark.hil,
-    pytest.mark.timeout(400),
+    pytest.mark.timeout(700),
     pytest.mark.skipif(bool(missing()), reason=missing() or "all there"),
 ]
 RADIUS_M = 0.75
-LAPS = 1.25
+LAPS = 3.25
 LAP_S = 2 * math.pi * RADIUS_M / 0.2
 START = ("0.75", "0.0", "1.5707963")
 
@@ -41,46 +43,52 @@ def drive(directory, robot_file, others=()):
     return status
 
 
-def rms_distance_m(poses):
-    """Of what lies behind the first quarter of a lap, to its end."""
-    turned, before, distances = 0.0, None, []
+def mean_square_m2(poses):
+    """Of the distance from the circle behind the first quarter of a lap, and how far off that may be by chance.
+
+    The noise of wheels, ground and sensor makes even laps of one robot differ, by about a fifth: its standard error
+    comes from twelfths of a lap, which know little of one another.
+    """
+    turned, before, pieces = 0.0, None, defaultdict(list)
     for x, y in poses:
         angle = math.atan2(y, x)
         if before is not None:
             turned += math.remainder(angle - before, 2 * math.pi)
         before = angle
-        if 0.25 * 2 * math.pi <= turned <= 1.2 * 2 * math.pi:
-            distances.append(math.hypot(x, y) - RADIUS_M)
-    assert turned >= 2 * math.pi * (LAPS - 0.05)
-    return math.sqrt(sum(distance**2 for distance in distances) / len(distances))
+        laps = turned / (2 * math.pi)
+        if 0.25 <= laps < LAPS - 0.05:
+            pieces[int(12 * laps)].append((math.hypot(x, y) - RADIUS_M) ** 2)
+    assert laps >= LAPS - 0.05
+    means = [statistics.mean(piece) for piece in pieces.values()]
+    return statistics.mean(means), statistics.stdev(means) / math.sqrt(len(means))
 
 
 @pytest.fixture(scope="module")
-def virtual_rms_m(tmp_path_factory):
+def virtual_m2(tmp_path_factory):
     directory = tmp_path_factory.mktemp("virtual")
     robot_file, truth = write_robot_file(directory, "serial"), directory / "truth.csv"
     arguments = ["sim", str(robot_file), "--truth", str(truth), "--start", *START]
     with disco_hw_process("virtual robot", arguments, directory / "sim.txt") as robot:
         drive(directory, robot_file, [robot])
     with truth.open(newline="", encoding="utf-8") as file:
-        return rms_distance_m([(float(row["x_m"]), float(row["y_m"])) for row in csv.DictReader(file)])
+        return mean_square_m2([(float(row["x_m"]), float(row["y_m"])) for row in csv.DictReader(file)])
 
 
 @pytest.mark.parametrize("processor", ["m3", "m4f"])
 def test_the_daemon_drives_the_circle_through_the_board_as_through_the_virtual_robot(
-    tmp_path, processor, virtual_rms_m, capsys
+    tmp_path, processor, virtual_m2, capsys
 ):
-    with running_board(build_board(processor, tmp_path), processor) as board:
+    with running_board(build_board(processor, tmp_path), processor) as running:
         robot_file = write_robot_file(tmp_path, "serial")
         text = robot_file.read_text("utf-8")
-        robot_file.write_text(text.replace(str(tmp_path / "tty"), board.port), "utf-8")
+        robot_file.write_text(text.replace(str(tmp_path / "tty"), running.port), "utf-8")
         status = drive(tmp_path, robot_file)
-        rows = list(board.bench.rows)
+        rows = list(running.bench.rows)
     assert {row.start for row in rows} == {1}
-    board_rms_m = rms_distance_m([row.pose[:2] for row in rows])
+    board, board_error = mean_square_m2([row.pose[:2] for row in rows])
+    virtual, virtual_error = virtual_m2
     with capsys.disabled():
-        print(
-            f"\ncircle: {processor} {board_rms_m * 1e3:.1f} mm rms, virtual robot {virtual_rms_m * 1e3:.1f} mm, "
-            f"overruns {status['loop']['overruns']}, skipped {status['loop']['skipped']}"
-        )
-    assert board_rms_m <= 1.2 * virtual_rms_m
+        of = f"{1e3 * math.sqrt(board):.1f} mm rms, virtual robot {1e3 * math.sqrt(virtual):.1f} mm"
+        print(f"\ncircle: {processor} {of}, {status['loop']['overruns']} overruns, {status['loop']['skipped']} skipped")
+    # Within 20 %, and twice what chance adds to the difference.
+    assert board <= 1.2**2 * virtual + 2 * math.hypot(board_error, 1.2**2 * virtual_error)
