@@ -6,6 +6,10 @@ STAMP := $(VENV)/.installed
 SOURCES := pyproject.toml setup.py constraints.txt firmware_protocol/build_firmware.py firmware_protocol/disco_robot.dbc \
 	$(wildcard firmware_protocol/firmware/*.c firmware_protocol/firmware/*.h)
 
+# What is imported is compiled once and kept, whatever the shell says: every test that starts a process would compile
+# the libraries anew.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: venv demo chromium test test-long bench gap-study soak fault-campaign fuzz firmware-check firmware-mutants firmware-emulated cross-tools socketcan-test clean
 
 venv: $(STAMP)
