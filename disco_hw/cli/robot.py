@@ -51,9 +51,11 @@ def run(
     spare_memory()
     check_named_files(robot, model)
     from disco_hw.daemon.daemon import DaemonOptions, run_daemon
+    from disco_hw.drive.until_heading import task_pilot
 
     with _page(view, robot, model, port, link):
-        code = run_daemon(DaemonOptions(robot, model, link, log_file, as_json, accept_missing_effects, adapt))
+        options = DaemonOptions(robot, model, link, log_file, as_json, accept_missing_effects, adapt)
+        code = run_daemon(options, task_pilot)
     raise typer.Exit(code)
 
 

@@ -95,6 +95,9 @@ class PoseInput(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     source: str = DEFAULT
     address: str = "127.0.0.1"
     port: Annotated[int, Meta(ge=1, le=65535)] = 5005
+    latency_s: Annotated[float, Meta(ge=0.0, le=5.0)] = 0.0
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    offset: tuple[float, float] = (0.0, 0.0)
     position_unit: Literal["m", "cm", "mm"] = "m"
     yaw_unit: Literal["rad", "deg"] = "rad"
     clockwise: bool = False
@@ -103,7 +106,16 @@ class PoseInput(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
 
     def convention(self) -> PoseConvention:
         """In what units and about which axes the source speaks."""
-        return PoseConvention(self.position_unit, self.yaw_unit, self.clockwise, self.mirrored, self.yaw_offset_rad)
+        return PoseConvention(
+            self.position_unit,
+            self.yaw_unit,
+            self.clockwise,
+            self.mirrored,
+            self.yaw_offset_rad,
+            self.origin,
+            self.offset,
+            self.latency_s,
+        )
 
 
 class Control(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -334,7 +346,8 @@ def _refuse(path: Path, field: str, fault: str, remedy: str) -> NoReturn:
 def _check_values(path: Path, name: str, section: Any) -> None:  # Any: a section's struct, or a kind of task.
     for field in section.__struct_fields__:
         value = getattr(section, field)
-        if isinstance(value, float) and not math.isfinite(value):
+        numbers = value if isinstance(value, tuple) else (value,)
+        if any(isinstance(number, float) and not math.isfinite(number) for number in numbers):
             _refuse(path, f"{name}.{field}", "not a finite number", "write a finite value")
         if isinstance(value, str) and "\0" in value:
             _refuse(path, f"{name}.{field}", "holds a NUL character, which no name has", "take it out")

@@ -87,9 +87,10 @@ class DaemonOptions:
     adapt: bool = False
 
 
-def run_daemon(options: DaemonOptions) -> int:
+def run_daemon(options: DaemonOptions, make_pilot: Callable[[RobotConfig], Pilot] = lambda _config: TaskPilot()) -> int:
     """Run until SIGTERM, SIGINT or a quit request; returns the exit code, with the robot told to stop.
 
+    `make_pilot`: of who drives; the task alone, unless it is said.
     Raises InputError, before anything is opened, if a file or an option is wrong. An exception in the loop is reported,
     the robot stopped, and the exception passed on.
     """
@@ -105,7 +106,7 @@ def run_daemon(options: DaemonOptions) -> int:
             setup,
             options.log_file,
             say,
-            TaskPilot(),
+            make_pilot(setup.config),
             lambda: make_planner(setup.config, setup.model),
             adapt,
             by_command(options.robot),
@@ -302,6 +303,7 @@ class Daemon:
             (self._timing(now_ns), *self._mind_recorder(now_ns), *self._every_second(now_ns), *self._fan, *events),
             mark,
             wanted.motion,
+            wanted.by_hand,
         )
         self._answer(messages, tick.replies)
         self._fan = self._look_at_samples(now_ns) if tick.pipeline.plan is not None else ()
@@ -381,6 +383,7 @@ class Daemon:
         if self._ask is None:
             return
         known = {
+            **self._pilot.status(),
             "state": output.state.name,
             "running": output.running,
             "estop": output.estop,

@@ -130,7 +130,7 @@ class HandPilot:
         events = tuple(self._told)
         self._told.clear()
         self._messages += events
-        return PilotTick(verdict.requests, verdict.motion, events)
+        return PilotTick(verdict.requests, verdict.motion, events, by_hand=True)
 
     def learn(self, now_ns: int, tick: CoreTick, replies: Sequence[Reply]) -> None:
         """Count what was excited; take in that arming was refused."""

@@ -103,7 +103,7 @@ class SimulatedRun:
                 continue
             now_ns = self.now_us * 1000
             wanted = self.pilot.step(now_ns, self.core.last)
-            tick = self.core.tick(now_ns, (*requests, *wanted.requests), motion=wanted.motion)
+            tick = self.core.tick(now_ns, (*requests, *wanted.requests), motion=wanted.motion, by_hand=wanted.by_hand)
             self.pilot.learn(now_ns, tick, tick.replies[len(requests) :])
             requests = ()
             yield tick

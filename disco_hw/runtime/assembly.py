@@ -137,6 +137,7 @@ def assemble_core(
             telemetry_zero_s=config.control.telemetry_zero_s,
             telemetry_disarm_s=config.control.telemetry_disarm_s,
             pose_required=needs_pose and config.estimation.pose_required,
+            heading_required=needs_pose,
         )
     )
 

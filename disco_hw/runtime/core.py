@@ -114,11 +114,13 @@ class DaemonCore:
         extra_records: Sequence[records.Record] = (),
         mark: Callable[[str], None] = untimed,
         motion: Motion = _FOLLOW_TASK,
+        by_hand: bool = False,
     ) -> CoreTick:
         """Advance by one tick: receive, decide, estimate, plan, command, record.
 
         `extra_records` are recorded with the tick; `mark(stage)` is called at the end of each stage; `motion` is what
-        the robot does if the supervisor allows motion. Never raises on what the robot sent.
+        the robot does if the supervisor allows motion, `by_hand` with a person who sees it. Never raises on
+        what the robot sent.
         """
         self._follow_link(now_ns)
         frames = self.transport.receive()
@@ -126,7 +128,7 @@ class DaemonCore:
         poses = self.pose_source.receive(now_ns, readings.poses)
         readings = msgspec.structs.replace(readings, poses=tuple(poses))
         self._remember(now_ns, readings)
-        output = self._supervisor.step(now_ns, self._inputs(now_ns, requests, motion))
+        output = self._supervisor.step(now_ns, self._inputs(now_ns, requests, by_hand))
         mark("receive")
         learnt = self.adaptation.step(now_ns)
         result = self.pipeline.step(now_ns, readings, _motion(output, motion), mark)
@@ -181,7 +183,7 @@ class DaemonCore:
             self._judged = capabilities
             self._preflight_errors = () if capabilities is None else self._preflight(self.driver)
 
-    def _inputs(self, now_ns: int, requests: Sequence[UserRequest], motion: Motion) -> Inputs:
+    def _inputs(self, now_ns: int, requests: Sequence[UserRequest], by_hand: bool) -> Inputs:
         estimate = None if self.last is None else self.last.pipeline.estimate
         wheels = self.newest_wheels
         speed = 0.0 if wheels is None else max(abs(wheels.left_speed_rad_s), abs(wheels.right_speed_rad_s))
@@ -199,7 +201,7 @@ class DaemonCore:
             requests=tuple(requests),
             recording_fault=self.recording_fault,
             heading_missing=estimate is not None and estimate.initialised and not estimate.heading_known,
-            by_hand=not isinstance(motion, FollowTask),
+            by_hand=by_hand,
         )
 
     def _command(self, output: Output, result: Tick) -> WheelCommand | None:

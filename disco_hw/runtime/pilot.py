@@ -13,11 +13,15 @@ from disco_hw.runtime.supervisor import Reply, UserRequest
 
 @dataclass(frozen=True, slots=True)
 class PilotTick:
-    """What a pilot wants of one tick: requests as a person makes them, the motion, and events to record."""
+    """What a pilot wants of one tick: requests as a person makes them, the motion, and events to record.
+
+    `by_hand`: a person holds a deadman and sees where the robot goes, which needs no pose.
+    """
 
     requests: tuple[UserRequest, ...] = ()
     motion: Motion = FollowTask()  # noqa: RUF009 - it is frozen and empty
     events: tuple[str, ...] = ()
+    by_hand: bool = False
 
 
 class Pilot(Protocol):

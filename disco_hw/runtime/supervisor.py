@@ -53,11 +53,12 @@ class UserRequest(enum.Enum):
 
 @dataclass(frozen=True, slots=True)
 class SupervisorSettings:
-    """Ages, times and bounds of the supervisor."""
+    """Ages, times and bounds of the supervisor; what motion requires, unless it is by hand."""
 
     telemetry_zero_s: float
     telemetry_disarm_s: float
     pose_required: bool
+    heading_required: bool = True
     still_rad_s: float = 0.05
     arming_timeout_s: float = 2.0
     reset_timeout_s: float = 3.0
@@ -230,7 +231,8 @@ class Supervisor:
                 text = "already armed" if self._state is State.ARMED else "arming"
             case UserRequest.START:
                 refusal = "e-stop in the same instant" if estop_now else self._why_not_start(inputs, seen)
-                self._start_pending = self._start_pending or (refusal is None and not self._running)
+                if refusal is None and not (self._running or self._start_pending):
+                    self._start_pending, self._by_hand = True, inputs.by_hand
                 text = "starting" if self._state is State.ARMED else "starting once armed"
             case UserRequest.RESET:
                 refusal = "e-stop in the same instant" if estop_now else self._why_not_reset(inputs, seen)
@@ -267,7 +269,7 @@ class Supervisor:
         """What of the pose keeps the task from being followed; nothing while nobody follows it."""
         if inputs.by_hand:
             return None
-        if inputs.heading_missing:
+        if self._settings.heading_required and inputs.heading_missing:
             return f"heading not known; {FIND_HEADING}"
         if self._settings.pose_required and not inputs.pose_ok:
             return "no pose; check the pose sensor, or set estimation.pose_required = false"
@@ -320,11 +322,12 @@ class Supervisor:
         if self._state is not State.ARMED:
             return
         pose_fault = self._pose_fault(inputs)
-        if self._start_pending and pose_fault is not None:
+        if self._start_pending and inputs.by_hand is not self._by_hand:
+            self._drop_pending("another pilot's turn")
+        elif self._start_pending and pose_fault is not None:
             self._drop_pending(pose_fault)
         elif self._start_pending:
             self._start_pending, self._running = False, True
-            self._by_hand = inputs.by_hand
             self._events.append("task started")
         elif self._running and pose_fault is not None:
             self._running = False
@@ -351,7 +354,7 @@ class Supervisor:
     def _detail(self, inputs: Inputs, seen: int) -> str:
         match self._state:
             case State.READY:
-                if self._arming is None and inputs.heading_missing:
+                if self._arming is None and self._settings.heading_required and inputs.heading_missing:
                     return f"heading not known; {FIND_HEADING}"
                 return "arming" if self._arming is not None else "ready to be armed"
             case State.ARMED if not seen & _TELEMETRY_FRESH:

@@ -1,4 +1,4 @@
-"""In what units and about which axes a pose source speaks, where that is not metres, radians and counter-clockwise."""
+"""How a pose source speaks, where that is not in metres and radians of the tracked point in the world."""
 
 from __future__ import annotations
 
@@ -18,6 +18,8 @@ class PoseConvention(msgspec.Struct, frozen=True):
     """What a source sends: units; `clockwise` yaw; `mirrored`: its y is to the right of its x.
 
     `yaw_offset_rad` (counter-clockwise) is added to its yaw: where the sensor looks aside of the robot's forward.
+    `origin` is the pose of the sensor's frame in the world (x, y, yaw), `offset` the place of the sensor on the robot,
+    ahead of the tracked point and to its left, `latency_s` how old a sample is beyond what the source says.
     """
 
     position_unit: Literal["m", "cm", "mm"] = "m"
@@ -25,20 +27,46 @@ class PoseConvention(msgspec.Struct, frozen=True):
     clockwise: bool = False
     mirrored: bool = False
     yaw_offset_rad: float = 0.0
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    offset: tuple[float, float] = (0.0, 0.0)
+    latency_s: float = 0.0
 
     def converted(self, told: PoseSample) -> PoseSample:
-        """The sample in metres and radians, counter-clockwise, yaw in (-pi, pi]."""
+        """The pose of the tracked point in metres and radians, counter-clockwise, yaw in (-pi, pi].
+
+        Without a heading it is not known where the tracked point is: the position stays the sensor's, which the sample
+        then says by its lever arm.
+        """
         metres, radians = _METRES[self.position_unit], _RADIANS[self.yaw_unit]
-        yaw_rad = (-radians if self.clockwise else radians) * told.yaw_rad + self.yaw_offset_rad
-        return PoseSample(
-            told.t_ns,
-            told.received_ns,
-            metres * told.x_m,
-            (-metres if self.mirrored else metres) * told.y_m,
-            math.remainder(yaw_rad, 2.0 * math.pi),
+        x_m, y_m = metres * told.x_m, (-metres if self.mirrored else metres) * told.y_m
+        at_x, at_y, turn = self.origin
+        x_m, y_m = _turned(x_m, y_m, turn)
+        x_m, y_m = at_x + x_m, at_y + y_m
+        t_ns, std_m, yaw_std_rad = (
+            told.t_ns - round(1e9 * self.latency_s),
             metres * told.position_std_m,
             radians * told.yaw_std_rad,
         )
+        if not told.has_heading:
+            return PoseSample(t_ns, told.received_ns, x_m, y_m, math.nan, std_m, math.nan, *self.offset)
+        yaw_rad = (-radians if self.clockwise else radians) * told.yaw_rad + turn + self.yaw_offset_rad
+        if not math.isfinite(yaw_rad):
+            return PoseSample(t_ns, told.received_ns, x_m, y_m, yaw_rad, std_m, yaw_std_rad)
+        ahead_x, ahead_y = _turned(*self.offset, yaw_rad)
+        return PoseSample(
+            t_ns,
+            told.received_ns,
+            x_m - ahead_x,
+            y_m - ahead_y,
+            math.remainder(yaw_rad, 2.0 * math.pi),
+            math.hypot(std_m, math.hypot(*self.offset) * yaw_std_rad),
+            yaw_std_rad,
+        )
+
+
+def _turned(x: float, y: float, angle_rad: float) -> tuple[float, float]:
+    cosine, sine = math.cos(angle_rad), math.sin(angle_rad)
+    return cosine * x - sine * y, sine * x + cosine * y
 
 
 AS_OURS = PoseConvention()

@@ -68,3 +68,35 @@ def test_robot_toml_says_how_the_wheels_are_wired(load):
 def test_a_wrong_one_is_refused_by_its_name(load, text, named):
     with pytest.raises(InputError, match=named):
         load(text)
+
+
+def test_a_sensor_ahead_of_the_tracked_point_in_a_frame_of_its_own():
+    """Body at (3, 1) facing 120 degrees, sensor 0.5 m ahead and 0.2 m to the left, frame at (1, 2) turned by 90."""
+    body, yaw = (3.0, 1.0), math.radians(120.0)
+    cosine, sine = math.cos(yaw), math.sin(yaw)
+    sensor = (body[0] + 0.5 * cosine - 0.2 * sine, body[1] + 0.5 * sine + 0.2 * cosine)
+    # Turned back by 90 degrees: x' = y, y' = -x.
+    told = PoseSample(10**9, 2 * 10**9, sensor[1] - 2.0, -(sensor[0] - 1.0), yaw - math.pi / 2, 0.03, 0.1)
+    convention = PoseConvention(origin=(1.0, 2.0, math.pi / 2), offset=(0.5, 0.2), latency_s=0.25)
+    found = convention.converted(told)
+    assert (found.x_m, found.y_m, found.yaw_rad) == pytest.approx((*body, yaw))
+    assert (found.t_ns, found.received_ns) == (750_000_000, 2 * 10**9)
+    # Where the sensor is says less of where the tracked point is, the less certain the heading.
+    assert found.position_std_m == pytest.approx(math.hypot(0.03, 0.1 * math.hypot(0.5, 0.2)))
+    assert (found.lever_x_m, found.lever_y_m) == (0.0, 0.0)
+    bare = convention.converted(PoseSample(10**9, 2 * 10**9, told.x_m, told.y_m, math.nan, 0.03, math.nan))
+    assert (bare.x_m, bare.y_m) == pytest.approx(sensor)
+    assert (bare.lever_x_m, bare.lever_y_m, bare.position_std_m) == (0.5, 0.2, 0.03)
+    assert not bare.has_heading
+
+
+def test_robot_toml_says_where_the_sensor_is(load):
+    source = pose_source_of(load("[pose]\norigin = [1.0, 0.0, 0.0]\noffset = [0.5, 0.0]\nlatency_s = 0.1\n"))
+    (found,) = source.receive(3, [PoseSample(10**9, 2, 1.0, 2.0, 0.0, 5.0, 0.1)])
+    assert (found.t_ns, found.x_m, found.y_m) == (900_000_000, 1.5, 2.0)
+
+
+@pytest.mark.parametrize("line", ["offset = [nan, 0.0]", "origin = [0.0, inf, 0.0]"])
+def test_a_place_that_is_no_number_is_refused(load, line):
+    with pytest.raises(InputError, match=rf"pose\.{line.split()[0]}: not a finite number; write"):
+        load(f"[pose]\n{line}\n")
