@@ -192,6 +192,11 @@ class AgilexDriver:
         parts.check_command(command)
         if not self._link_is_up:
             return ()
+        late = now_ns - self._last_sent_ns > TIMEOUT_S * 1e9
+        if late and (self._stage is Stage.ARMED or (self._stage is Stage.STOPPING and any(self._speeds))):
+            # The base stays in its CAN mode: the next command would move it again.
+            self._lose("no command for longer than the base's time-out")
+            return self._rest(now_ns)
         match self._stage:
             case Stage.REST:
                 return self._rest(now_ns)
@@ -199,10 +204,6 @@ class AgilexDriver:
                 return self._arm(now_ns)
             case Stage.STOPPING:
                 return self._ramp(now_ns)
-        if now_ns - self._last_sent_ns > TIMEOUT_S * 1e9:
-            # The base stays in its CAN mode: the next command would move it again.
-            self._lose("no command for longer than the base's time-out")
-            return self._rest(now_ns)
         if command is None:
             return ()
         self._speeds, self._last_sent_ns = (command.left_rad_s, command.right_rad_s), now_ns

@@ -258,6 +258,11 @@ class RoboclawDriver:
         parts.check_command(command)
         if not self._link_is_up:
             return ()
+        late = now_ns - self._last_sent_ns > self._settings.watchdog_s * 1e9
+        if late and (self._stage is Stage.ARMED or (self._stage is Stage.STOPPING and any(self._speeds))):
+            # They have no armed state to fall out of: the next speed would move them again.
+            self._lose("no command for longer than the boards' serial timeout")
+            return self._brake(now_ns)
         match self._stage:
             case Stage.REST:
                 return (*self._reset(now_ns), *self._paced_questions(now_ns))
@@ -267,10 +272,6 @@ class RoboclawDriver:
                 return self._ramp(now_ns)
             case Stage.BRAKING:
                 return self._brake(now_ns)
-        if now_ns - self._last_sent_ns > self._settings.watchdog_s * 1e9:
-            # They have no armed state to fall out of: the next speed would move them again.
-            self._lose("no command for longer than the boards' serial timeout")
-            return self._brake(now_ns)
         if command is None:
             return ()
         self._speeds, self._last_sent_ns = (command.left_rad_s, command.right_rad_s), now_ns

@@ -206,6 +206,11 @@ class VescDriver:
         if not self._link_is_up:
             return ()
         asked = self._questions(now_ns)
+        late = now_ns - self._last_sent_ns > self._settings.watchdog_s * 1e9
+        if late and (self._stage is Stage.ARMED or (self._stage is Stage.STOPPING and any(self._speeds))):
+            # They have no armed state to fall out of: the next speed would move them again.
+            self._lose("no command for longer than the controllers' timeout")
+            return (*self._brake(now_ns), *asked)
         match self._stage:
             case Stage.REST:
                 self._reset()
@@ -216,10 +221,6 @@ class VescDriver:
                 return (*self._ramp(now_ns), *asked)
             case Stage.BRAKING:
                 return (*self._brake(now_ns), *asked)
-        if now_ns - self._last_sent_ns > self._settings.watchdog_s * 1e9:
-            # They have no armed state to fall out of: the next speed would move them again.
-            self._lose("no command for longer than the controllers' timeout")
-            return (*self._brake(now_ns), *asked)
         if command is None:
             return asked
         self._speeds, self._last_sent_ns = (command.left_rad_s, command.right_rad_s), now_ns

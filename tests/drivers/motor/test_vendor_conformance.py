@@ -95,6 +95,18 @@ def test_a_silent_host_is_stopped_by_the_controller_and_nothing_moves_when_it_is
     assert bench.driver.state in (*STILL, DriverState.FAULT)
 
 
+def test_asked_to_stand_by_after_a_pause_it_does_not_ramp_down_from_where_it_was(vendor, bench):
+    """The controllers have stopped long since: a ramp from the last speed would move them again."""
+    drive(bench)
+    bench.host_runs = False
+    bench.run(vendor.watchdog_s + COASTING_S)
+    bench.driver.request(Request.STANDBY)
+    bench.host_runs = True
+    bench.largest_speed = 0.0
+    bench.run(2.0)
+    assert bench.largest_speed < 0.05
+
+
 def test_without_commands_the_controllers_watchdog_is_not_fed(vendor, bench):
     """Alive and listening, but no command: nothing else that the driver sends may keep the motors running."""
     drive(bench)
