@@ -23,13 +23,13 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Origin, Subprotocol
 
-from disco_hw.daemon.page_feed import ViewerFeed, feed_path
+from disco_hw.daemon.page_feed import FeedSubscriber, ViewerFeed, feed_path
 from disco_hw.daemon.realtime import stolen_ms
 from disco_hw.experiments.live_stack import disco_hw_process, running_stack
 from disco_hw.log.reader import open_log
 from disco_hw.log.records import Plan
 from disco_hw.viewer.address import TOKEN_VARIABLE, page_token
-from disco_hw.viewer.live import FeedSubscriber, LivePage, run_live
+from disco_hw.viewer.live import LivePage, run_live
 from disco_hw.viewer.operator_controls import Desk
 from disco_hw.viewer.recording import Recording, stage_of_robot
 from disco_hw.viewer.replay import ReplayPage

@@ -57,6 +57,7 @@ CALLS = (
     Call("check", "robot.toml", (*_SETUP, "robot.key")),
     Call("ctl", "robot.toml status", ("robot.toml",)),
     Call("estop", "robot.toml", ("robot.toml",)),
+    Call("bridge ros2", "robot.toml --model model.toml", _SETUP),
     Call("infer", "drive.csv --robot robot.toml", ("robot.toml", "drive.csv")),
     Call("infer", "run.mcap --robot robot.toml", ("robot.toml", "run.mcap")),
     Call("gap", "drive.csv --robot robot.toml --model model.toml -o out", ("robot.toml", "model.toml", "drive.csv")),
@@ -141,6 +142,7 @@ def _after(name: str) -> Callable[..., Any]:
 
 
 _WORK = (
+    "disco_hw.bridge.ros2._join",
     "disco_hw.daemon.check.refuse_beside_a_daemon",
     "disco_hw.daemon.client.send_request",
     "disco_hw.daemon.daemon._make_recorder",

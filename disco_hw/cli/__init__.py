@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 
 from disco_hw.cli import logs, robot, virtual, watch
+from disco_hw.cli.bridge import bridge_app
 from disco_hw.cli.experiment import experiment_app
 from disco_hw.errors import InputError, WorkError
 
@@ -34,6 +35,7 @@ for verb in (
 ):
     app.command()(verb)
 app.add_typer(experiment_app, name="experiment")
+app.add_typer(bridge_app, name="bridge")
 app.command("import")(logs.import_log)
 app.add_typer(logs.log_app, name="log")
 

@@ -63,6 +63,9 @@ def drive(
     robot: RobotFile,
     gamepad: Annotated[bool, typer.Option("--gamepad", help="Drive with a gamepad instead of the keyboard.")] = False,
     page: Annotated[bool, typer.Option("--page", help="Drive from the page, which --view then serves.")] = False,
+    ros2: Annotated[
+        bool, typer.Option("--ros2", help="Drive by /cmd_vel, through `disco-hw bridge ros2` (docs/ros2.md).")
+    ] = False,
     script: Annotated[
         str | None,
         typer.Option(
@@ -99,6 +102,7 @@ def drive(
                 log_file=log_file,
                 gamepad=gamepad,
                 page=page,
+                ros2=ros2,
                 script=script,
                 unattended=unattended,
                 seconds=seconds,

@@ -90,7 +90,11 @@ class Link(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
 
 
 class PoseInput(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Where measured poses come from: `source` is of `drivers.pose`."""
+    """Where measured poses come from: `source` is of `drivers.pose`.
+
+    For `disco-hw bridge ros2`: the topic, the frame that its poses must be in, and the standard deviations of poses
+    that come without.
+    """
 
     source: str = DEFAULT
     address: str = "127.0.0.1"
@@ -103,6 +107,10 @@ class PoseInput(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     clockwise: bool = False
     mirrored: bool = False
     yaw_offset_rad: Annotated[float, Meta(ge=-7.0, le=7.0)] = 0.0
+    topic: str = "/pose"
+    frame: str = "map"
+    position_std_m: Positive = 0.02
+    yaw_std_rad: Positive = 0.02
 
     def convention(self) -> PoseConvention:
         """In what units and about which axes the source speaks."""
@@ -185,7 +193,8 @@ class Drive(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 class Ros2(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """What of a bag is read; what is left out is guessed. `pose_topic` "tf" is the chain from map to base frame.
 
-    `command_joints`: whose the numbers of a Float64MultiArray are, in its order.
+    `command_joints`: whose the numbers of a Float64MultiArray are, in its order. The last three are the bridge's; a
+    domain that is left out is $ROS_DOMAIN_ID, or 0.
     """
 
     command_topic: str = ""
@@ -196,6 +205,9 @@ class Ros2(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
     command_joints: list[str] = []
     map_frame: str = ""
     base_frame: str = ""
+    domain: Annotated[int, Meta(ge=0, le=232)] | None = None
+    namespace: Annotated[str, Meta(pattern="^(/?[A-Za-z][A-Za-z0-9_]*)*$")] = ""
+    localhost_only: bool = True
 
 
 def _default_task() -> RobotTask:

@@ -30,7 +30,7 @@ from disco_hw.daemon.client import (
 from disco_hw.daemon.compiling import compiled_elsewhere
 from disco_hw.daemon.control_socket import ControlMessage, ControlServer
 from disco_hw.daemon.loop import Clock, Loop, MonotonicClock
-from disco_hw.daemon.page_feed import ViewerFeed, WatchedRecorder, feed_path
+from disco_hw.daemon.page_feed import ViewerFeed, WatchedRecorder, feed_path, tick_feed_path
 from disco_hw.daemon.signals import Notifier, StopPath, StopSignals
 from disco_hw.daemon.socket_place import passed_over
 from disco_hw.daemon.status import counters, loop_figures, status
@@ -164,8 +164,10 @@ def _start(
     stop.add("control socket", server.close)
     feed = ViewerFeed(feed_path(server.path))
     stop.add("page feed", feed.close)
+    ticks = ViewerFeed(tick_feed_path(server.path), period_s=0.0)
+    stop.add("tick feed", ticks.close)
     log = _log_path(config, log_file)
-    recorder = WatchedRecorder(_make_recorder(setup, log), feed)
+    recorder = WatchedRecorder(_make_recorder(setup, log), feed, ticks)
     if ask is not None and log is not None:
         stop.add("log", lambda: say("log", f"look at it: disco-hw view {log}, or disco-hw log info {log}"))
     stop.add("recorder", lambda: _close_recorder(recorder, say))

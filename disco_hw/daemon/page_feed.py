@@ -1,4 +1,4 @@
-"""The daemon's side of the page: publishes what is recorded, some times a second, and never waits for who looks.
+"""The feed of the page and the bridges: publishes what is recorded, and never waits for who looks.
 
 Nobody looking costs one non-blocking receive a batch. Who does not keep up misses batches, sees that by their numbers,
 and holds up neither the loop nor the other pages.
@@ -11,21 +11,29 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
+import msgspec
 import zmq
 
-from disco_hw.errors import InputError
-from disco_hw.log.link import ENCODE_ERRORS, batch_encoder
+from disco_hw.daemon.socket_place import believed_users
+from disco_hw.errors import InputError, WorkError
+from disco_hw.log.link import ENCODE_ERRORS, BatchDecoder, batch_encoder
 from disco_hw.log.recorder import Recorder, RecorderStats
 from disco_hw.log.records import FrameIn, FrameOut, Plan, Record
 
 PERIOD_S = 0.05
 _QUEUED_BATCHES = 40
+_UNREAD_BATCHES = 200
 _MOST_RECORDS = 400
 
 
 def feed_path(control_socket: Path) -> Path:
-    """Where the feed of the daemon with this control socket is, in the same private directory."""
+    """Where the page's feed of the daemon with this control socket is, in the same private directory."""
     return control_socket.with_name(control_socket.name + ".view")
+
+
+def tick_feed_path(control_socket: Path) -> Path:
+    """Where the feed is that publishes each tick at once, for bridges."""
+    return control_socket.with_name(control_socket.name + ".tick")
 
 
 class ViewerFeed:
@@ -112,11 +120,12 @@ class ViewerFeed:
 
 
 class WatchedRecorder:
-    """A recorder whose records go to the page as well."""
+    """A recorder whose records go to the page as well, and to who wants each tick."""
 
-    def __init__(self, recorder: Recorder, feed: ViewerFeed) -> None:
+    def __init__(self, recorder: Recorder, feed: ViewerFeed, ticks: ViewerFeed | None = None) -> None:
         self._recorder = recorder
         self._feed = feed
+        self._ticks = ticks
 
     @property
     def watched(self) -> bool:
@@ -127,6 +136,8 @@ class WatchedRecorder:
         """Record the tick, then show it."""
         self._recorder.put(now_ns, records)
         self._feed.put(now_ns, records)
+        if self._ticks is not None:
+            self._ticks.put(now_ns, records)
 
     def poll(self) -> RecorderStats:
         """The recorder's counters."""
@@ -141,5 +152,65 @@ class WatchedRecorder:
         self._recorder.tend()
 
     def close(self, timeout_s: float = 5.0) -> RecorderStats:
-        """End the log; the feed is closed by who made it."""
+        """End the log; the feeds are closed by who made them."""
         return self._recorder.close(timeout_s)
+
+
+class FeedSubscriber:
+    """Receives batches; `missed` counts those that did not get through, `malformed` what is none of the daemon's."""
+
+    def __init__(self, path: Path) -> None:
+        self.missed = 0
+        self.malformed = 0
+        self._sequence = 0
+        self._decoder = BatchDecoder()
+        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        self._socket = self._context.socket(zmq.SUB)
+        self._socket.setsockopt(zmq.RCVHWM, _UNREAD_BATCHES)
+        self._socket.setsockopt(zmq.LINGER, 0)
+        self._socket.setsockopt(zmq.RECONNECT_IVL, 100)
+        self._socket.setsockopt(zmq.RECONNECT_IVL_MAX, 1000)
+        self._socket.setsockopt(zmq.SUBSCRIBE, b"")
+        self._path = path
+        self._connected = False
+
+    def receive(self, timeout_s: float) -> list[tuple[int, Record]]:
+        """Wait at most `timeout_s` for a batch; then everything that is there as (tick's time, record)."""
+        received: list[tuple[int, Record]] = []
+        self._connect()
+        if not self._socket.poll(round(timeout_s * 1e3)):
+            return received
+        while True:
+            try:
+                message = self._socket.recv(zmq.NOBLOCK)
+            except zmq.Again:
+                return received
+            try:
+                batch = self._decoder.batch(message)
+                records = [self._decoder.record(topic, data) for topic, data in batch.records]
+            except msgspec.MsgspecError:
+                self.malformed += 1
+                continue
+            self._count(batch.sequence)
+            received += [(batch.now_ns, record) for record in records]
+
+    def _connect(self) -> None:
+        if self._connected:
+            return
+        # Without a daemon there may be no directory yet; the page says what is wrong with another's.
+        with contextlib.suppress(OSError, WorkError):
+            believed_users(self._path)
+            self._socket.connect(f"ipc://{self._path}")
+            self._connected = True
+
+    def close(self) -> None:
+        """Disconnect; safe to call twice."""
+        if not self._socket.closed:
+            self._socket.close()
+            self._context.term()
+
+    def _count(self, sequence: int) -> None:
+        # The numbers begin anew with a new daemon, and the first one seen depends on when the page was opened.
+        if self._sequence and sequence > self._sequence:
+            self.missed += sequence - self._sequence - 1
+        self._sequence = sequence

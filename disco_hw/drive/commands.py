@@ -22,7 +22,7 @@ from disco_hw.drive.coverage import Coverage
 from disco_hw.drive.gamepad_source import GamepadSource
 from disco_hw.drive.hand_pilot import HandPilot
 from disco_hw.drive.keyboard import HELP, Keyboard, KeyHold
-from disco_hw.drive.page_source import PageSource
+from disco_hw.drive.page_source import PAD_WORDS, PageSource
 from disco_hw.drive.script import Script, ScriptSource, Unattended, in_table, room_needed
 from disco_hw.drive.scripts import make_script
 from disco_hw.drive.source import ManualSource
@@ -57,6 +57,7 @@ class DriveOptions:
     log_file: Path | None = None
     gamepad: bool = False
     page: bool = False
+    ros2: bool = False
     script: str | None = None
     unattended: bool = False
     seconds: float | None = None
@@ -99,7 +100,8 @@ def run_drive(options: DriveOptions) -> DriveResult:
     script = _script(options, config)
     log_file = options.log_file or _new_log(config)
     top_rad_s = config.drive.speed_share * config.robot.max_wheel_speed_rad_s
-    page = PageSource(top_rad_s, config.drive.turn_share) if options.page else None
+    words = "cmd_vel: ask the bridge to arm, then it drives; Ctrl-C ends" if options.ros2 else PAD_WORDS
+    page = PageSource(top_rad_s, config.drive.turn_share, words) if options.page or options.ros2 else None
     source = _source(options, config, script, top_rad_s, page)
     try:
         if not options.as_json:
@@ -141,7 +143,7 @@ def _announcement(options: DriveOptions, config: RobotConfig, script: Script | N
     if script is not None:
         room = room_needed(script.at, script.duration_s, config.robot)
         lines += [*in_table(script), f"{script.duration_s:.0f} s, needs {room.in_words()}"]
-    if not (options.gamepad or options.page or options.unattended):
+    if not (options.gamepad or options.page or options.ros2 or options.unattended):
         lines.append(HELP)
     return lines
 
@@ -149,7 +151,12 @@ def _announcement(options: DriveOptions, config: RobotConfig, script: Script | N
 def _source(
     options: DriveOptions, config: RobotConfig, script: Script | None, top_rad_s: float, page: PageSource | None
 ) -> ManualSource:
-    deadmen = {"--unattended": options.unattended, "--gamepad": options.gamepad, "--page": options.page}
+    deadmen = {
+        "--unattended": options.unattended,
+        "--gamepad": options.gamepad,
+        "--page": options.page,
+        "--ros2": options.ros2,
+    }
     chosen = [name for name, given in deadmen.items() if given]
     if len(chosen) > 1:
         raise InputError(f"{' and '.join(chosen)}: one deadman only; leave one of them out")
@@ -158,7 +165,7 @@ def _source(
         if not leads_to_virtual_robot(config.link):
             raise InputError(
                 f"--unattended: {_words(config.link)} may lead to a real robot; hold a deadman (keyboard, --gamepad, "
-                "--page), or start the virtual robot first"
+                "--page, --ros2), or start the virtual robot first"
             )
         held = Unattended()
     elif page is not None:

@@ -13,6 +13,8 @@ from typing import Any
 from disco_hw.drive.keyboard import wheel_speeds
 from disco_hw.drive.source import INPUT_LIMIT_NS, ManualInput, RobotView
 
+PAD_WORDS = "page: hold the pad to drive; Ctrl-C ends"
+
 
 @dataclass(frozen=True, slots=True)
 class Steering:
@@ -51,7 +53,10 @@ class PageSource:
     While one holds, the others are refused.
     """
 
-    def __init__(self, top_rad_s: float, turn_share: float, limit_ns: int = INPUT_LIMIT_NS) -> None:
+    def __init__(
+        self, top_rad_s: float, turn_share: float, words: str = PAD_WORDS, limit_ns: int = INPUT_LIMIT_NS
+    ) -> None:
+        self._words = words
         self._top_rad_s = top_rad_s
         self._turn_share = turn_share
         self._limit_ns = limit_ns
@@ -72,7 +77,7 @@ class PageSource:
     @property
     def words(self) -> str:
         """What to hold, and where."""
-        return "page: hold the pad to drive; Ctrl-C ends"
+        return self._words
 
     @property
     def task(self) -> str:

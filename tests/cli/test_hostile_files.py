@@ -23,8 +23,8 @@ WRITTEN = {
 }
 READ = {
     *((verb, "robot") for verb in ("run", "drive", "check", "ctl", "estop", "infer", "gap", "import", "view", "sim")),
-    *((verb, "robot") for verb in ("experiment circle", "experiment adapt", "experiment gap")),
-    *((verb, "model") for verb in ("run", "drive", "gap", "view", "sim")),
+    *((verb, "robot") for verb in ("experiment circle", "experiment adapt", "experiment gap", "bridge ros2")),
+    *((verb, "model") for verb in ("run", "drive", "gap", "view", "sim", "bridge ros2")),
     *((verb, "log") for verb in ("import", "log info", "log recover", "log export", "view", "replay")),
     *(("infer", "logs"), ("gap", "logs"), ("sim", "faults")),
 }

@@ -9,17 +9,16 @@ import time
 
 import pytest
 
-from disco_hw.daemon.page_feed import ViewerFeed, WatchedRecorder, feed_path
+from disco_hw.daemon.page_feed import FeedSubscriber, ViewerFeed, WatchedRecorder, feed_path
 from disco_hw.errors import InputError
 from disco_hw.log import records
 from disco_hw.log.recorder import MemoryRecorder
-from disco_hw.viewer.live import FeedSubscriber
 from tools.viewer_run import PERIOD_NS, tick_records
 
 _WATCH = """
 import sys
 from pathlib import Path
-from disco_hw.viewer.live import FeedSubscriber
+from disco_hw.daemon.page_feed import FeedSubscriber
 subscriber = FeedSubscriber(Path(sys.argv[1]))
 got = 0
 print("ready", flush=True)

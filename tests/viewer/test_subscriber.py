@@ -6,9 +6,9 @@ import msgspec
 import pytest
 import zmq
 
+from disco_hw.daemon.page_feed import FeedSubscriber
 from disco_hw.log.link import batch_encoder
 from disco_hw.log.records import Estimate
-from disco_hw.viewer.live import FeedSubscriber
 from tools.viewer_run import tick_records
 
 

@@ -1,0 +1,271 @@
+"""`disco-hw bridge ros2`: poses and commands in, odometry and state out, in a process beside the daemon, over DDS."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+from cyclonedds.core import DDSException, InstanceState, Policy, Qos, ReadCondition, SampleState, ViewState, WaitSet
+from cyclonedds.domain import Domain, DomainParticipant
+from cyclonedds.pub import DataWriter
+from cyclonedds.sub import DataReader
+from cyclonedds.topic import Topic
+from cyclonedds.util import duration
+
+from disco_hw.bridge import ros2_commands, ros2_poses
+from disco_hw.bridge import ros2_messages as msg
+from disco_hw.bridge import ros2_outgoing as out
+from disco_hw.config import RobotConfig
+from disco_hw.daemon.client import send_request, socket_path
+from disco_hw.daemon.page_feed import FeedSubscriber, tick_feed_path
+from disco_hw.daemon.signals import StopSignals
+from disco_hw.errors import InputError, WorkError
+from disco_hw.runtime.assembly import odometry_parameters
+from disco_hw.runtime.robot_setup import Setup, load_setup
+from drivers.pose.ros2 import SOURCE, bridge_address
+
+CMD_VEL, CTL, REPLY, ESTOP = "cmd_vel", "disco_hw/ctl", "disco_hw/reply", "disco_hw/estop"
+LOOPBACK = """<CycloneDDS><Domain><General><AllowMulticast>false</AllowMulticast>
+<Interfaces><NetworkInterface name="lo" multicast="false"/></Interfaces></General>
+<Discovery><ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>60</MaxAutoParticipantIndex>
+<Peers><Peer address="127.0.0.1"/></Peers></Discovery></Domain></CycloneDDS>"""
+_SECOND_NS = 1_000_000_000
+_WAIT_S = 0.05
+_MOST_AT_ONCE = 20
+
+_SENSOR = Qos(Policy.Reliability.BestEffort, Policy.Durability.Volatile, Policy.History.KeepLast(5))
+_RELIABLE = Qos(
+    Policy.Reliability.Reliable(duration(milliseconds=5)), Policy.Durability.Volatile, Policy.History.KeepLast(10)
+)
+_LATCHED = Qos(
+    Policy.Reliability.Reliable(duration(milliseconds=5)), Policy.Durability.TransientLocal, Policy.History.KeepLast(1)
+)
+
+_SAID: tuple[tuple[str, type, Qos], ...] = (
+    (out.ODOM, msg.Odometry, _RELIABLE),
+    (out.JOINT_STATES, msg.JointState, _RELIABLE),
+    (out.TF, msg.TFMessage, _RELIABLE),
+    (out.PLAN, msg.Path, _RELIABLE),
+    (out.POSE, msg.PoseWithCovarianceStamped, _RELIABLE),
+    (out.STATE, msg.String, _LATCHED),
+    (out.DIAGNOSTICS, msg.DiagnosticArray, _RELIABLE),
+    (REPLY, msg.String, _RELIABLE),
+)
+_Take = Callable[[Any, int], None]  # Any: a message of the reader's type.
+
+
+def run_ros2_bridge(robot: Path, model: Path | None = None, link: str | None = None) -> int:
+    """Run until SIGTERM or SIGINT; returns the exit code. The daemon may come and go.
+
+    Raises InputError for a bad file, and WorkError where DDS cannot be had.
+    """
+    setup = load_setup(robot, model, link)
+    with StopSignals() as signals, closing(Bridge(setup, link)) as bridge:
+        print(f"bridge: {bridge.where}", flush=True)
+        bridge.run(lambda: signals.received is not None)
+    return 0
+
+
+def wire_name(topic: str, namespace: str) -> str:
+    """The name on the wire of a topic, which is in the namespace unless it begins with a slash."""
+    return (
+        "rt" + topic
+        if topic.startswith("/")
+        else "/".join(("rt", *namespace.strip("/").split("/"), topic)).replace("//", "/")
+    )
+
+
+class Bridge:
+    """Both directions: what comes is taken in a thread of its own, so that it waits for nothing that goes out."""
+
+    def __init__(self, setup: Setup, link: str | None = None) -> None:
+        config = setup.config
+        parameters = odometry_parameters(setup.model)
+        self._setup, self._link, self._config = setup, link, config
+        self._domain, self._participant = _join(config)
+        self._outgoing = out.Outgoing(config, parameters)
+        self._feed = FeedSubscriber(tick_feed_path(socket_path(config)))
+        self._poses = ros2_poses.PoseInlet(config.pose)
+        self._speeds = ros2_commands.SpeedInlet(config.robot, config.drive, parameters)
+        self._pad = ros2_commands.DaemonPad(socket_path(config))
+        self._to_daemon = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self._to_daemon.setblocking(False)
+        self._unsent = self._malformed = self._unwritten = 0
+        self._heard_ns = self._next_diagnosis_ns = 0
+        self._failure: BaseException | None = None
+        self._ended = threading.Event()
+        # An e-stop must not wait behind a request that the daemon is slow to answer.
+        self._asking, self._stopping = ThreadPoolExecutor(1), ThreadPoolExecutor(1)
+        namespace = config.ros2.namespace
+        self._writers = {
+            name: DataWriter(self._participant, Topic(self._participant, wire_name(name, namespace), kind, qos), qos)
+            for name, kind, qos in _SAID
+        }
+        self._readers = list(self._make_readers(namespace))
+
+    @property
+    def where(self) -> str:
+        """Where it is to be found, in words."""
+        ros2 = self._config.ros2
+        heard = f"; poses from {self._config.pose.topic}" if self._config.pose.source == SOURCE else ""
+        reach = "this computer only" if ros2.localhost_only else "the network"
+        return f"ROS 2 domain {_domain(self._config)}, {reach}, namespace /{ros2.namespace.strip('/')}{heard}"
+
+    def run(self, should_stop: Callable[[], bool]) -> None:
+        """Carry both ways until told to stop; what fails on the way in is raised here."""
+        inward = threading.Thread(target=self._take_in, name="in", daemon=True)
+        inward.start()
+        try:
+            while not should_stop() and self._failure is None:
+                received = self._feed.receive(_WAIT_S)
+                mono_ns, wall_ns = time.monotonic_ns(), time.time_ns()
+                if received:
+                    self._heard_ns = mono_ns
+                    for topic, message in self._outgoing.messages(received, wall_ns - mono_ns):
+                        self._say(topic, message)
+                if mono_ns >= self._next_diagnosis_ns:
+                    self._next_diagnosis_ns = mono_ns + _SECOND_NS
+                    self._say(*self._diagnosis(mono_ns, wall_ns))
+        finally:
+            self._ended.set()
+            inward.join(2.0)
+        if self._failure is not None:
+            raise self._failure
+
+    def close(self) -> None:
+        """Leave; safe to call twice."""
+        self._ended.set()
+        for pool in (self._asking, self._stopping):
+            pool.shutdown(wait=False, cancel_futures=True)
+        self._feed.close()
+        self._pad.close()
+        self._to_daemon.close()
+
+    def _make_readers(self, namespace: str) -> Iterator[tuple[DataReader[Any], _Take]]:
+        # One for each type that a topic may have: only the one that the sender has is ever matched.
+        if self._config.pose.source == SOURCE:
+            for pose in ros2_poses.TYPES:
+                yield self._reader(self._config.pose.topic, pose, _SENSOR, namespace), self._take_pose
+        for speed in ros2_commands.TYPES:
+            yield self._reader(CMD_VEL, speed, _SENSOR, namespace), self._take_speed
+        yield self._reader(CTL, msg.String, _RELIABLE, namespace), self._take_request
+        yield self._reader(ESTOP, msg.Bool, _RELIABLE, namespace), self._take_estop
+
+    def _reader(self, topic: str, kind: Any, qos: Qos, namespace: str) -> DataReader[Any]:
+        return DataReader(self._participant, Topic(self._participant, wire_name(topic, namespace), kind), qos)
+
+    def _take_in(self) -> None:
+        try:
+            waiting = WaitSet(self._participant)
+            for reader, _ in self._readers:
+                waiting.attach(ReadCondition(reader, ViewState.Any | InstanceState.Any | SampleState.NotRead))
+            while not self._ended.is_set():
+                waiting.wait(duration(milliseconds=50))
+                for reader, take in self._readers:
+                    for message, sent_ns in self._samples(reader):
+                        take(message, sent_ns)
+        except BaseException as failure:
+            self._failure = failure
+
+    def _samples(self, reader: DataReader[Any]) -> Iterator[tuple[Any, int]]:
+        """What a reader has; what is none of its type is counted."""
+        try:
+            samples = reader.take(_MOST_AT_ONCE)
+        except DDSException:
+            return
+        except Exception:
+            # Whatever bytes a stranger sends under this type's name.
+            self._malformed += 1
+            return
+        for sample in samples:
+            if sample.sample_info.valid_data:
+                yield sample, sample.sample_info.source_timestamp
+
+    def _take_pose(self, message: ros2_poses.PoseMessage, sent_ns: int) -> None:
+        datagram = self._poses.datagram(message, sent_ns, time.monotonic_ns(), time.time_ns())
+        if datagram is None:
+            return
+        try:
+            self._to_daemon.sendto(datagram, bridge_address(self._config.pose.port))
+        except OSError:
+            # No daemon, or one that does not keep up: the next pose is worth more than this one.
+            self._unsent += 1
+
+    def _take_speed(self, message: msg.Twist | msg.TwistStamped, sent_ns: int) -> None:
+        now_ns = time.monotonic_ns()
+        request = self._speeds.request(message, sent_ns, now_ns, time.time_ns())
+        if request is not None:
+            self._pad.send(now_ns, request)
+
+    def _take_request(self, message: msg.String, _: int) -> None:
+        words = message.data.strip()
+        pool = self._stopping if words == "estop" else self._asking
+        pool.submit(self._answer, words)
+
+    def _take_estop(self, message: msg.Bool, _: int) -> None:
+        if message.data:
+            self._stopping.submit(self._answer, "estop")
+
+    def _answer(self, words: str) -> None:
+        """Ask the daemon; where it is driven by hand, arming lets the speeds drive, and is not the daemon's to do."""
+        reply: dict[str, Any]
+        if words == "arm" and self._is_hand_driven():
+            refusal = self._speeds.permit(time.monotonic_ns())
+            reply = {"do": words, "ok": refusal is None, "text": "cmd_vel drives"}
+            if refusal is not None:
+                reply = {"do": words, "ok": False, "error": refusal}
+        else:
+            if words != "status":
+                self._speeds.forbid()
+            reply = ros2_commands.asked(self._setup.robot_file, words, self._link)
+        self._say(REPLY, msg.String(json.dumps(reply)))
+
+    def _is_hand_driven(self) -> bool:
+        with contextlib.suppress(WorkError):
+            return "drive" in send_request(socket_path(self._config), {"do": "status"})
+        return False
+
+    def _diagnosis(self, mono_ns: int, wall_ns: int) -> out.Message:
+        figures = {"poses passed on": self._poses.passed, "poses not taken by the daemon": self._unsent}
+        figures |= {f"poses refused: {why}": count for why, count in self._poses.refused.items()}
+        figures |= {"speeds passed on": self._speeds.passed}
+        figures |= {f"speeds refused: {why}": count for why, count in self._speeds.refused.items()}
+        figures |= {"messages that were none": self._malformed, "messages not sent": self._unwritten}
+        figures |= {"ticks missed": self._feed.missed}
+        wrong = f"poses refused: {self._poses.why}" if self._poses.why else self._pad.refusal
+        heard = mono_ns - self._heard_ns < _SECOND_NS
+        return self._outgoing.diagnostics(wall_ns, heard, {name: str(count) for name, count in figures.items()}, wrong)
+
+    def _say(self, topic: str, message: object) -> None:
+        try:
+            self._writers[topic].write(message)
+        except DDSException:
+            self._unwritten += 1
+
+
+def _domain(config: RobotConfig) -> int:
+    if config.ros2.domain is not None:
+        return config.ros2.domain
+    given = os.environ.get("ROS_DOMAIN_ID", "0")
+    if not (given.isascii() and given.isdigit() and int(given) <= 232):
+        raise InputError(f"ROS_DOMAIN_ID: {given} is no domain; set it to a number from 0 to 232")
+    return int(given)
+
+
+def _join(config: RobotConfig) -> tuple[Domain | None, DomainParticipant]:
+    """Join the domain; beyond this computer as $CYCLONEDDS_URI says, or by multicast."""
+    number = _domain(config)
+    try:
+        domain = Domain(number, LOOPBACK) if config.ros2.localhost_only else None
+        return domain, DomainParticipant(number)
+    except DDSException as error:
+        raise WorkError(f"ROS 2 domain {number} cannot be joined ({error.msg}); see ros2.domain") from None

@@ -1,0 +1,77 @@
+"""Poses of ROS 2, from the process `disco-hw bridge ros2`, as nothing of ROS belongs into the control process.
+
+It sends datagrams as those of `udp` to a Unix socket, whose sender the kernel names: only this user and root count.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import socket
+import struct
+from collections.abc import Sequence
+from typing import Any
+
+from drivers.pose.errors import PoseSourceError
+from drivers.pose.udp import LONGEST_DATAGRAM, MOST_A_TICK, pose_of
+from drivers.types import PoseSample
+
+SOURCE = "ros2"
+_CREDENTIALS = struct.Struct("3i")
+_ROOT = 0
+
+
+def bridge_address(port: int) -> bytes:
+    """Where the daemon of this user hears the bridge: an abstract name, which vanishes with the daemon."""
+    return f"\0disco-hw/{os.geteuid()}/pose/{port}".encode()
+
+
+def make_pose_source(*, port: int = 5005, **_of_other_sources: Any) -> BridgePoses:
+    """By the fields of [pose]. Raises PoseSourceError where another daemon hears the bridge already."""
+    opened = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+    opened.setblocking(False)
+    opened.setsockopt(socket.SOL_SOCKET, socket.SO_PASSCRED, 1)
+    try:
+        opened.bind(bridge_address(port))
+    except OSError as error:
+        opened.close()
+        raise PoseSourceError(
+            f"the bridge's port {port}: {error.strerror}; choose another pose.port for one of the robots"
+        ) from None
+    return BridgePoses(opened)
+
+
+class BridgePoses:
+    """Satisfies `drivers.types.PoseSource`."""
+
+    def __init__(self, opened: socket.socket) -> None:
+        self._socket = opened
+        self._users = {os.geteuid(), _ROOT}
+        self.malformed = 0
+        self.foreign_users = 0
+
+    def receive(self, now_ns: int, from_robot: Sequence[PoseSample]) -> Sequence[PoseSample]:
+        """What came since the last call, oldest first; never waits and never raises."""
+        poses = []
+        with contextlib.suppress(OSError):
+            for _ in range(MOST_A_TICK):
+                datagram, ancillary, _, _ = self._socket.recvmsg(LONGEST_DATAGRAM, socket.CMSG_SPACE(_CREDENTIALS.size))
+                if _sender(ancillary) not in self._users:
+                    self.foreign_users += 1
+                elif (pose := pose_of(datagram, now_ns)) is None:
+                    self.malformed += 1
+                else:
+                    poses.append(pose)
+        return sorted(poses, key=lambda pose: pose.t_ns)
+
+    def close(self) -> None:
+        """Close the socket; safe to call twice."""
+        self._socket.close()
+
+
+def _sender(ancillary: Sequence[tuple[int, int, bytes]]) -> int | None:
+    """The user who sent a datagram, as the kernel says."""
+    for level, kind, data in ancillary:
+        if (level, kind) == (socket.SOL_SOCKET, socket.SCM_CREDENTIALS) and len(data) == _CREDENTIALS.size:
+            return int(_CREDENTIALS.unpack(data)[1])
+    return None

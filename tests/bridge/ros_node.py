@@ -1,0 +1,89 @@
+"""A node of ROS 2 in a process of its own: hears /odom and says what it is asked to; killed and stopped by tests.
+
+    python -m tests.bridge.ros_node DOMAIN KIND X Y YAW
+
+`echo` says where the robot is by its own odometry, from X Y YAW on; `nan`, `frame`, `flood`, `garbage` and `late` do
+that after 150 good ones wrongly, `speed` says speeds X (m/s) and YAW (rad/s), 20 a second. A line for
+each odometry heard.
+"""
+
+import math
+import sys
+import time
+
+from cyclonedds.core import Policy, Qos
+from cyclonedds.domain import Domain, DomainParticipant
+from cyclonedds.pub import DataWriter
+from cyclonedds.sub import DataReader
+from cyclonedds.topic import Topic
+
+from disco_hw.bridge import ros2_messages as msg
+from disco_hw.bridge.ros2 import LOOPBACK
+
+GOOD = 150
+
+
+def main(domain: str, kind: str, *start: str) -> None:
+    x, y, yaw = map(float, start)
+    _domain = Domain(int(domain), LOOPBACK)
+    participant = DomainParticipant(int(domain))
+    best_effort = Qos(Policy.Reliability.BestEffort, Policy.History.KeepLast(1))
+    odometry = DataReader(participant, Topic(participant, "rt/odom", msg.Odometry), best_effort)
+    if kind == "speed":
+        say = DataWriter(participant, Topic(participant, "rt/cmd_vel", msg.Twist))
+        while True:
+            say.write(msg.Twist(msg.Vector3(x, 0.0, 0.0), msg.Vector3(0.0, 0.0, yaw)))
+            time.sleep(0.05)
+    say = DataWriter(participant, Topic(participant, "rt/pose", msg.PoseStamped))
+    # The name of a pose and the bytes of something else, once it is time.
+    other = None
+    said = 0
+    while True:
+        for heard in odometry.take(10):
+            if not heard.sample_info.valid_data:
+                continue
+            said += 1
+            place, turned = heard.pose.pose.position, heard.pose.pose.orientation
+            east = x + math.cos(yaw) * place.x - math.sin(yaw) * place.y
+            north = y + math.sin(yaw) * place.x + math.cos(yaw) * place.y
+            half = 0.5 * (yaw + 2.0 * math.atan2(turned.z, turned.w))
+            pose = msg.Pose(msg.Point(east, north, 0.0), msg.Quaternion(0.0, 0.0, math.sin(half), math.cos(half)))
+            message = msg.PoseStamped(msg.Header(heard.header.stamp, "map"), pose)
+            times = 1
+            if said > GOOD:
+                if kind == "nan":
+                    pose.position.x = math.nan
+                elif kind == "frame":
+                    message.header.frame_id = "odom"
+                elif kind == "late":
+                    message.header.stamp = msg.Time(1, 0)
+                elif kind == "flood":
+                    times = 40
+                elif kind == "garbage" and other is None:
+                    other = DataWriter(participant, Topic(participant, "rt/pose", garbage_type()))
+            for _ in range(times):
+                (other or say).write(garbage_type()("x" * 300) if other else message)
+            print(f"{time.monotonic_ns()} {said} {place.x} {place.y}", flush=True)
+        time.sleep(0.001)
+
+
+_made = []
+
+
+def garbage_type():
+    """A message that says that it is a pose."""
+    if not _made:
+        from dataclasses import dataclass
+
+        from cyclonedds.idl import IdlStruct
+
+        @dataclass
+        class Garbage(IdlStruct, typename="geometry_msgs::msg::dds_::PoseStamped_"):
+            text: str
+
+        _made.append(Garbage)
+    return _made[0]
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

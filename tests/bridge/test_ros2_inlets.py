@@ -1,0 +1,185 @@
+"""Poses and speeds from ROS: what is passed on to the daemon, and what is refused for which reason."""
+
+import math
+
+import pytest
+
+pytest.importorskip("cyclonedds", reason="cyclonedds is not installed: make venv")
+
+from disco_hw.bridge import ros2_messages as msg
+from disco_hw.bridge.ros2_commands import SpeedInlet
+from disco_hw.bridge.ros2_poses import PoseInlet
+from disco_hw.config import Drive, PoseInput, Robot
+from disco_hw.drive.keyboard import wheel_speeds
+from disco_hw.drive.page_source import PageSource, steering_from
+from disco_hw.drive.source import RobotView
+from disco_hw.estimation.odometry import OdometryParameters
+from disco_hw.runtime.states import State
+from drivers.pose.udp import pose_of
+
+MONO_NS, WALL_NS = 50_000_000_000, 1_800_000_000_000_000_000
+MS = 1_000_000
+
+
+def pose_message(age_ns=20 * MS, frame="map", x=1.0, yaw=2.5, kind=msg.PoseStamped, covariance=None):
+    pose = msg.Pose(msg.Point(x, -2.0, 0.3), msg.Quaternion(0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2)))
+    header = msg.Header(msg.stamp_of(WALL_NS - age_ns), frame)
+    if kind is msg.PoseStamped:
+        return kind(header, pose)
+    spread = msg.PoseWithCovariance(pose, covariance or [0.0] * 36)
+    return kind(header, spread) if kind is msg.PoseWithCovarianceStamped else kind(header, "base_link", spread)
+
+
+def covariance(xx, yy, tt):
+    full = [0.0] * 36
+    full[0], full[7], full[35] = xx, yy, tt
+    return full
+
+
+@pytest.mark.parametrize("kind", [msg.PoseStamped, msg.PoseWithCovarianceStamped, msg.Odometry])
+def test_a_pose_reaches_the_daemon_at_its_own_time(kind):
+    inlet = PoseInlet(PoseInput(position_std_m=0.03, yaw_std_rad=0.04))
+    datagram = inlet.datagram(pose_message(kind=kind), 0, MONO_NS, WALL_NS)
+    pose = pose_of(datagram, MONO_NS + MS)
+    assert pose.t_ns == MONO_NS - 20 * MS
+    assert (pose.x_m, pose.y_m) == (1.0, -2.0)
+    assert pose.yaw_rad == pytest.approx(2.5)
+    assert (pose.position_std_m, pose.yaw_std_rad) == (0.03, 0.04)
+
+
+def test_a_covariance_becomes_standard_deviations_the_larger_of_the_position():
+    message = pose_message(kind=msg.Odometry, covariance=covariance(0.01, 0.04, 0.0009))
+    pose = pose_of(PoseInlet(PoseInput()).datagram(message, 0, MONO_NS, WALL_NS), MONO_NS)
+    assert (pose.position_std_m, pose.yaw_std_rad) == (pytest.approx(0.2), pytest.approx(0.03))
+
+
+@pytest.mark.parametrize(
+    ("message", "word"),
+    [
+        (pose_message(frame="odom"), "frame"),
+        (pose_message(frame=""), "frame"),
+        (pose_message(x=math.nan), "finite"),
+        (pose_message(x=math.inf), "finite"),
+        (pose_message(yaw=math.nan), "finite"),
+        (pose_message(age_ns=1100 * MS), "clock"),
+        (pose_message(age_ns=-60 * MS), "clock"),
+        (pose_message(age_ns=WALL_NS - 5_000_000_000), "clock"),
+        (pose_message(kind=msg.Odometry, covariance=covariance(-1.0, 1.0, 1.0)), "covariance"),
+        (pose_message(kind=msg.Odometry, covariance=covariance(1.0, math.nan, 1.0)), "covariance"),
+        (
+            msg.PoseStamped(msg.Header(msg.stamp_of(WALL_NS), "map"), msg.Pose(msg.Point(), msg.Quaternion(w=0.0))),
+            "heading",
+        ),
+    ],
+)
+def test_what_is_no_pose_is_refused_by_its_reason(message, word):
+    inlet = PoseInlet(PoseInput())
+    assert inlet.datagram(message, WALL_NS, MONO_NS, WALL_NS) is None
+    assert [word in reason for reason in inlet.refused] == [True]
+    assert word in inlet.why
+    # One that is well is still taken after it.
+    assert inlet.datagram(pose_message(age_ns=10 * MS), 0, MONO_NS, WALL_NS) is not None
+    assert inlet.why == ""
+
+
+def test_a_pose_without_a_stamp_has_the_time_at_which_it_was_sent():
+    message = pose_message()
+    message.header.stamp = msg.Time()
+    sent = PoseInlet(PoseInput()).datagram(message, WALL_NS - 70 * MS, MONO_NS, WALL_NS)
+    assert pose_of(sent, MONO_NS).t_ns == MONO_NS - 70 * MS
+    assert PoseInlet(PoseInput()).datagram(message, WALL_NS - 2000 * MS, MONO_NS, WALL_NS) is None
+
+
+def test_of_a_flood_and_of_repetitions_little_is_passed_on():
+    inlet = PoseInlet(PoseInput())
+    now = range(0, 100 * MS, MS // 10)
+    passed = [inlet.datagram(pose_message(20 * MS - t), 0, MONO_NS + t, WALL_NS + t) for t in now]
+    assert 20 <= sum(one is not None for one in passed) <= 26
+    assert inlet.datagram(pose_message(20 * MS), 0, MONO_NS + 200 * MS, WALL_NS + 200 * MS) is None
+
+
+PARAMETERS = OdometryParameters(0.1, 0.8, 0.0)
+ROBOT = Robot(
+    name="r",
+    wheel_radius_m=0.1,
+    axial_distance_m=0.8,
+    max_wheel_speed_rad_s=10.0,
+    max_wheel_acceleration_rad_s2=10.0,
+    ticks_per_rev=1000,
+)
+DRIVE = Drive(speed_share=0.5, turn_share=0.6)
+
+
+def twist(speed, turn):
+    return msg.Twist(msg.Vector3(speed, 0.0, 0.0), msg.Vector3(0.0, 0.0, turn))
+
+
+def inlet_that_may_drive():
+    inlet = SpeedInlet(ROBOT, DRIVE, PARAMETERS)
+    assert inlet.request(twist(0.0, 0.0), WALL_NS, MONO_NS, WALL_NS)["held"] is False
+    assert inlet.permit(MONO_NS) is None
+    for _ in range(2):
+        assert inlet.request(twist(0.0, 0.0), WALL_NS, MONO_NS, WALL_NS)["held"] is False
+    return inlet
+
+
+@pytest.mark.parametrize(("speed", "turn"), [(0.2, 0.0), (0.1, 0.3), (-0.2, -0.2), (0.0, 0.4)])
+def test_a_speed_becomes_the_wheel_speeds_that_make_it(speed, turn):
+    wanted = inlet_that_may_drive().request(twist(speed, turn), WALL_NS, MONO_NS, WALL_NS)
+    del wanted["do"]
+    steering = steering_from(wanted)
+    left, right = wheel_speeds(steering.forward, steering.left * 0.6, 5.0)
+    assert 0.1 * (left + right) / 2 == pytest.approx(speed)
+    assert 0.1 * (right - left) / 0.8 == pytest.approx(turn)
+
+
+def test_what_is_too_fast_is_slowed_down_on_the_same_curve():
+    wanted = inlet_that_may_drive().request(twist(3.0, 3.0), WALL_NS, MONO_NS, WALL_NS)
+    left, right = wheel_speeds(wanted["forward"], wanted["left"] * 0.6, 5.0)
+    assert max(abs(left), abs(right)) <= 5.0 + 1e-9
+    assert 0.1 * (right - left) / 0.8 == pytest.approx(0.1 * (left + right) / 2)
+
+
+def test_speeds_drive_only_once_arming_was_asked_for_while_they_came():
+    inlet = SpeedInlet(ROBOT, DRIVE, PARAMETERS)
+    assert "no speeds" in inlet.permit(MONO_NS)
+    for _ in range(5):
+        assert inlet.request(twist(0.1, 0.0), WALL_NS, MONO_NS, WALL_NS)["held"] is False
+
+
+def test_a_silence_takes_the_permission_away():
+    inlet = inlet_that_may_drive()
+    assert inlet.request(twist(0.1, 0.0), WALL_NS, MONO_NS, WALL_NS)["held"] is True
+    later = 201 * MS
+    for _ in range(5):
+        assert inlet.request(twist(0.1, 0.0), WALL_NS + later, MONO_NS + later, WALL_NS + later)["held"] is False
+
+
+@pytest.mark.parametrize("message", [twist(math.nan, 0.0), twist(0.1, math.inf)])
+def test_a_speed_that_is_none_takes_it_away_too(message):
+    inlet = inlet_that_may_drive()
+    assert inlet.request(message, WALL_NS, MONO_NS, WALL_NS) is None
+    assert inlet.request(twist(0.1, 0.0), WALL_NS, MONO_NS, WALL_NS)["held"] is False
+
+
+@pytest.mark.parametrize("age", [210 * MS, -60 * MS, 10_000 * MS])
+def test_an_old_speed_or_one_by_another_clock_is_refused(age):
+    inlet = inlet_that_may_drive()
+    assert inlet.request(twist(0.1, 0.0), WALL_NS - age, MONO_NS, WALL_NS) is None
+    stamped = msg.TwistStamped(msg.Header(msg.stamp_of(WALL_NS - age)), twist(0.1, 0.0))
+    assert inlet.request(stamped, WALL_NS, MONO_NS, WALL_NS) is None
+
+
+def test_the_daemons_deadman_counts_from_when_the_speed_was_sent():
+    inlet, page = inlet_that_may_drive(), PageSource(5.0, 0.6)
+    view = RobotView(State.READY, False)
+
+    def steer(now_ns, held, stamp_ns):
+        wanted = {"forward": 0.1, "left": 0.0, "held": held, "stamp": str(stamp_ns)}
+        return page.steer(now_ns, 1, steering_from(wanted))
+
+    steer(MONO_NS, False, MONO_NS)
+    request = inlet.request(twist(0.1, 0.0), WALL_NS - 150 * MS, MONO_NS, WALL_NS)
+    assert request["held"]
+    assert steer(MONO_NS, True, int(request["stamp"])) is None
+    assert MONO_NS - page.poll(MONO_NS, view).t_ns == 150 * MS

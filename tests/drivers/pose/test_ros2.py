@@ -1,0 +1,60 @@
+"""Poses from the bridge: a Unix socket that only this user and root can say something on."""
+
+import os
+import socket
+import subprocess
+import sys
+
+import msgspec
+import pytest
+
+from drivers.pose import PoseSourceError, make_pose_source
+from drivers.pose.ros2 import bridge_address
+
+PORT = 40_000 + os.getpid() % 20_000
+NOW_NS = 100_000_000_000
+POSE = {"x_m": 1.0, "y_m": -2.0, "yaw_rad": 0.5, "position_std_m": 0.01, "yaw_std_rad": 0.02}
+AS_A_STRANGER = """
+import os, socket, sys
+os.setuid(65534)
+socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM).sendto(sys.stdin.buffer.read(), bytes.fromhex(sys.argv[1]))
+"""
+
+
+@pytest.fixture
+def source():
+    made = make_pose_source("ros2", port=PORT)
+    yield made
+    made.close()
+
+
+def say(*datagrams):
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender:
+        for datagram in datagrams:
+            sender.sendto(datagram, bridge_address(PORT))
+
+
+def test_poses_come_in_the_order_of_their_times_and_the_rest_is_counted(source):
+    say(*(msgspec.msgpack.encode({**POSE, "t_ns": NOW_NS - age}) for age in (10, 50)), b"hello", b"")
+    assert [NOW_NS - pose.t_ns for pose in source.receive(NOW_NS, ())] == [50, 10]
+    assert (source.malformed, source.foreign_users) == (2, 0)
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can become somebody else")
+def test_what_another_user_says_does_not_count(source):
+    datagram = msgspec.msgpack.encode({**POSE, "t_ns": NOW_NS})
+    address = bridge_address(PORT).hex()
+    subprocess.run([sys.executable, "-c", AS_A_STRANGER, address], input=datagram, check=True, timeout=60)
+    assert list(source.receive(NOW_NS, ())) == []
+    assert source.foreign_users == 1
+
+
+def test_a_second_daemon_is_told_to_take_another_port(source):
+    with pytest.raises(PoseSourceError, match=rf"port {PORT}: .*; choose another pose\.port"):
+        make_pose_source("ros2", port=PORT)
+
+
+def test_a_source_that_was_closed_says_nothing_and_leaves_its_place(source):
+    source.close()
+    assert list(source.receive(NOW_NS, ())) == []
+    make_pose_source("ros2", port=PORT).close()

@@ -1,0 +1,116 @@
+"""The stack with poses from a node of ROS 2: it drives by them, and stops when node or bridge fail it in any way."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from contextlib import contextmanager
+
+import pytest
+
+pytest.importorskip("cyclonedds", reason="cyclonedds is not installed: make venv")
+
+from disco_hw.experiments import live_stack
+from disco_hw.experiments.live_stack import FAST_START, disco_hw_process
+
+pytestmark = [pytest.mark.hil, pytest.mark.timeout(400)]
+
+
+def domain():
+    """One for each worker of the suite, so that two never hear each other."""
+    return 100 + os.getpid() % 100
+
+
+def with_poses_of_ros(robot_file):
+    lines = f'[pose]\nsource = "ros2"\nport = {5100 + domain()}\n[ros2]\ndomain = {domain()}\n'
+    robot_file.write_text(robot_file.read_text(encoding="utf-8") + lines, encoding="utf-8")
+    return robot_file
+
+
+@contextmanager
+def node(kind, output, start=FAST_START):
+    """A node in a process of its own, which is killed at the end."""
+    with output.open("wb") as sink:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "tests.bridge.ros_node", str(domain()), kind, *map(str, start)], stdout=sink
+        )
+    try:
+        yield process
+    finally:
+        process.send_signal(signal.SIGCONT)
+        process.kill()
+        process.wait()
+
+
+@contextmanager
+def stack_with_bridge(directory, monkeypatch):
+    written = live_stack.write_robot_file
+    monkeypatch.setattr(live_stack, "write_robot_file", lambda *given: with_poses_of_ros(written(*given)))
+    with live_stack.running_stack(directory) as stack:
+        bridge = ["bridge", "ros2", str(stack.robot_file)]
+        with disco_hw_process("bridge", bridge, directory / "bridge.txt") as child:
+            yield stack, child.process
+
+
+def heard(output):
+    """(monotonic ns, number, x, y) of each odometry that the node heard."""
+    rows = [line.split() for line in output.read_text(encoding="utf-8").splitlines()]
+    return [(int(ns), int(number), float(x), float(y)) for ns, number, x, y in rows]
+
+
+def assert_stops(stack):
+    stack.operator.wait_until("without a pose", lambda status: not status["pose_ok"], 20.0)
+    stack.operator.wait_until("holding still", lambda status: not status["running"], 20.0)
+    stack.operator.wait_for_standstill(20.0)
+
+
+def test_it_drives_by_the_poses_of_a_node_that_hears_its_odometry_and_stops_when_the_node_dies(tmp_path, monkeypatch):
+    said = tmp_path / "node.txt"
+    with stack_with_bridge(tmp_path, monkeypatch) as (stack, _), node("echo", said) as process:
+        stack.drive()
+        status = stack.operator.wait_until("a metre further", lambda _: far(said) > 1.0, 30.0)
+        assert status["pose_ok"]
+        assert status["task"]["distance_m"] < 0.2
+        process.kill()
+        assert_stops(stack)
+
+
+def far(output):
+    rows = heard(output)
+    return max((abs(x) + abs(y) for _, _, x, y in rows), default=0.0)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("kind", ["nan", "frame", "late", "garbage"])
+def test_it_stops_when_the_nodes_poses_become_wrong(kind, tmp_path, monkeypatch):
+    with stack_with_bridge(tmp_path, monkeypatch) as (stack, _), node("echo", tmp_path / "good.txt") as good:
+        stack.drive()
+        with node(kind, tmp_path / "bad.txt"):
+            good.kill()
+            assert_stops(stack)
+
+
+@pytest.mark.long
+def test_a_flood_of_poses_stops_nothing_and_the_node_frozen_does(tmp_path, monkeypatch):
+    said = tmp_path / "node.txt"
+    with stack_with_bridge(tmp_path, monkeypatch) as (stack, _), node("flood", said) as process:
+        stack.drive()
+        stack.operator.wait_until("flooded for a while", lambda _: len(heard(said)) > 400, 60.0)
+        assert stack.operator.status()["running"]
+        process.send_signal(signal.SIGSTOP)
+        assert_stops(stack)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
+def test_it_stops_when_the_bridge_dies_or_freezes(how, tmp_path, monkeypatch):
+    with stack_with_bridge(tmp_path, monkeypatch) as (stack, bridge), node("echo", tmp_path / "node.txt"):
+        stack.drive()
+        bridge.send_signal(how)
+        assert_stops(stack)
+        time.sleep(0.5)
+        bridge.send_signal(signal.SIGCONT)
+        # Poses alone bring nothing back into motion.
+        time.sleep(1.0)
+        assert not stack.operator.status()["running"]
