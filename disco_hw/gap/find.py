@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,8 +13,8 @@ from numpy.typing import NDArray
 from disco_hw.errors import LogError
 from disco_hw.gap.data.gridded_drive import grid_drive
 from disco_hw.gap.data.layout import BASE_COUNT, BODY, DELAYED_BY, WHEEL, Layout
-from disco_hw.gap.report.amend import amended_model, carried_terms, channel_estimates
-from disco_hw.gap.report.findings import GapReport
+from disco_hw.gap.report.amend import amended_model, at_joint_fit, carried_terms, channel_estimates, simple_model
+from disco_hw.gap.report.findings import STAGES, GapReport
 from disco_hw.gap.report.judge import (
     blind_spot_findings,
     candidate_evidence,
@@ -21,11 +23,12 @@ from disco_hw.gap.report.judge import (
     residue_sentences,
     unnamed_findings,
 )
-from disco_hw.gap.search.analysis import GapAnalysis, final_fit
+from disco_hw.gap.search.analysis import FinalFit, GapAnalysis, final_fit
 from disco_hw.gap.search.candidates import candidates_of
 from disco_hw.gap.search.channel_search import search_body, search_wheels
-from disco_hw.gap.search.cross_validation import PredictionErrors, worse_by
-from disco_hw.gap.search.stages import prune, stage_predictions
+from disco_hw.gap.search.cross_validation import PredictionErrors, beats, clearly_worse, worse_by
+from disco_hw.gap.search.intervals import ChannelEstimates
+from disco_hw.gap.search.stages import StagePredictions, joint_predictions, prune, stage_predictions
 from disco_hw.gap.search.unnamed_terms import with_known_terms
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GapSettings
 from disco_hw.log.drive import DriveLog, concatenate
@@ -57,9 +60,10 @@ def find_gap(
     say("intervals, blind spots and the gap on held-out data")
     final = final_fit(analysis)
     effects, unnamed = effect_findings(analysis, final), unnamed_findings(analysis)
-    named = {effect.name: effect.parameters for effect in effect_findings(analysis, final, given=True)}
-    amended, remarks = amended_model(model, named, carried_terms(analysis), channel_estimates(analysis, final))
-    gap = stage_predictions(analysis, final).table() if analysis.body is not None else {}
+    predictions = joint_predictions(analysis, final) if analysis.body is not None else None
+    gap = {} if predictions is None else predictions.table()
+    offered = offered_stage(gap, bool(effects or unnamed), settings)
+    amended, remarks = _model_of(offered, model, analysis, final, predictions)
     return GapReport(
         sources=log.sources,
         channels=channel_findings(analysis, effects, unnamed),
@@ -68,6 +72,7 @@ def find_gap(
         blind_spots=blind_spot_findings(analysis, effects, top_rad_s),
         gap=gap,
         model=amended,
+        offered=offered,
         residue=residue_sentences(analysis),
         notes=(*log.notes, *notes, *remarks),
         candidates=candidate_evidence(analysis),
@@ -75,6 +80,45 @@ def find_gap(
         seconds=time.perf_counter() - began,
         settings=settings,
     )
+
+
+def offered_stage(gap: Mapping[str, Mapping[float, PredictionErrors]], found: bool, settings: GapSettings) -> str:
+    """The stage whose model is handed out: the amended one unless a plainer one predicts held-out data better.
+
+    Where predictions cannot be compared it is the amended one too.
+    """
+    horizon_s, prediction = settings.prediction.reported_horizon_s, settings.prediction
+    if not gap or not math.isfinite(gap["amended"][horizon_s].position_m):
+        return "amended"
+    refitted, timed, amended = (gap[stage][horizon_s] for stage in STAGES[1:4])
+    if beats(timed, amended, prediction) and beats(refitted, amended, prediction):
+        return "amended"
+    if not found and not clearly_worse(timed, amended, prediction):
+        return "amended"
+    return "timed" if beats(refitted, timed, prediction) else "refitted"
+
+
+def _model_of(
+    stage: str, model: Model, analysis: GapAnalysis, final: FinalFit, predictions: StagePredictions | None
+) -> tuple[Model, tuple[str, ...]]:
+    """The model of a stage with the joint Gaussian of its parameters, and notes."""
+    if predictions is not None and stage != "amended":
+        return simple_model(model, *predictions.joint[stage])
+    if predictions is not None:
+        of, joint = predictions.joint["amended"]
+
+        def moved(part: ChannelEstimates | None) -> ChannelEstimates | None:
+            return None if part is None else at_joint_fit(part, of, joint)
+
+        final = replace(
+            final,
+            body_estimates=moved(final.body_estimates),
+            wheel_estimates=moved(final.wheel_estimates),
+            final_body_estimates=moved(final.final_body_estimates),
+            final_body=None if final.final_body is None else replace(final.final_body, vector=joint.vectors[0]),
+        )
+    named = {effect.name: effect.parameters for effect in effect_findings(analysis, final, given=True)}
+    return amended_model(model, named, carried_terms(analysis), channel_estimates(analysis, final))
 
 
 def _drawn(analysis: GapAnalysis, gap: dict[str, dict[float, PredictionErrors]]) -> dict[str, bytes]:

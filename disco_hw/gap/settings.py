@@ -251,14 +251,27 @@ class PredictionSettings:
     """A value that the other fold fixes to so many standard deviations is used, however few its data. Chosen."""
     resamples: int = 400
     """Bootstrap draws of an interval. Chosen."""
-    floor_paths: int = 3
-    """Simulated drives of the noise. Chosen: the error is averaged over hundreds of starts."""
+    floor_draws: int = 20
+    """Draws of the sensors' noise at each start. Chosen: the error is averaged over hundreds of starts."""
+    joint_trust: float = 3.0
+    """Before the whole chain is fitted, channels are trusted to so many of their standard deviations. Measured: halves
+    of real logs predict each other best with 3 to 10."""
     worse: float = 1.05
     """A larger ratio of errors is worse. Measured: equally good models scatter by some percent."""
+    level: float = 1.01
+    """A mean ratio of errors up to this is level. Chosen: of two that predict alike the one that says why."""
     far_worse: float = 1.25
     """A larger ratio is worse whatever the scatter. Chosen."""
     worse_sigmas: float = 2.0
     """Standard deviations of the growth over blocks from which on it is worse. Chosen: one in twenty."""
+    fitted_horizons_s: tuple[float, ...] = (1.0, 2.0)
+    """Predictions so far ahead are what the whole chain is fitted to. Chosen: what the answer is about, and half."""
+    fit_huber: float = 3.0
+    """Errors of prediction beyond so many times the usual one count linearly. Literature: Huber (1964); size chosen."""
+    fit_rounds: int = 2
+    """How often the usual error is taken anew in such a fit. Chosen."""
+    fit_steps: int = 8
+    """Steps of a round at most. Chosen: it is flat by then."""
     most_changes: int = 4
     """At most so many names are dropped or replaced as predictions are better without. Chosen."""
     standing_m_s: float = 0.02

@@ -48,7 +48,9 @@ def test_exactly_the_hidden_effect_is_named_and_the_gap_closes(name, size, param
     assert estimate.low < estimate.value < estimate.high
     stages = {stage: errors[2.0].position_m for stage, errors in report.gap.items()}
     assert stages["amended"] < stages["refitted"]
-    assert stages["refitted"] - stages["amended"] > 0.8 * (stages["refitted"] - stages["floor"])
+    # The floor is the sensors' noise alone: wheels and ground of that robot err by more at random.
+    assert stages["refitted"] - stages["amended"] > 0.5 * (stages["refitted"] - stages["floor"])
+    assert report.offered == "amended"
 
 
 @pytest.mark.long
@@ -108,7 +110,7 @@ def test_report_and_model_can_be_written_and_read(tmp_path):
     report = report_of(("motor_lag", 0.12))
     content = json.loads(json.dumps(report.as_dict()))
     assert content["effects"][0]["channel"] == "command_to_wheel"
-    assert set(content["gap"]) >= {"horizon_s", "held_out", "nominal", "refitted", "amended", "floor"}
+    assert set(content["gap"]) >= {"horizon_s", "held_out", "nominal", "refitted", "timed", "amended", "floor"}
     save_model(report.model, tmp_path / "model.toml")
     assert load_model(tmp_path / "model.toml").parameter_names == report.model.parameter_names
     html = page(report)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from disco_hw.gap.search.analysis import FinalFit, GapAnalysis
 from disco_hw.gap.search.channel_search import UnnamedTerm
+from disco_hw.gap.search.end_to_end import Freed, JointFit
 from disco_hw.gap.search.intervals import Z95, ChannelEstimates, ParameterEstimate
 from disco_hw.model import EffectSetting, Gaussian, Model
 from disco_hw.model.model import BASE_PARAMETERS
@@ -28,6 +29,46 @@ def channel_estimates(analysis: GapAnalysis, final: FinalFit) -> tuple[ChannelEs
         for found, part in both
         if found is not None and part is not None
     )
+
+
+def at_joint_fit(part: ChannelEstimates, of: Freed, joint: JointFit) -> ChannelEstimates:
+    """A channel's estimates moved to where the fit of the whole chain has them, and by as much less sure."""
+    by_name, off = dict(part.by_name), np.zeros(len(part.fitted))
+    for name, old in part.by_name.items():
+        value = joint.value(name, of)
+        if value is None:
+            continue
+        deviation = float(np.hypot(old.deviation, value - old.value))
+        by_name[name] = ParameterEstimate(value, value - Z95 * deviation, value + Z95 * deviation)
+        if name in part.fitted:
+            off[part.fitted.index(name)] = value - old.value
+    return ChannelEstimates(by_name, part.fitted, part.covariance + np.diag(off**2))
+
+
+def simple_model(model: Model, of: Freed, joint: JointFit) -> tuple[Model, tuple[str, ...]]:
+    """The model with what a joint fit freed of it, geometry and effects with all their parameters, and its belief."""
+    deviations = dict(zip(joint.names, np.sqrt(np.diag(joint.covariance)), strict=True))
+    by_name = {}
+    for name, deviation in deviations.items():
+        value = joint.value(name, of)
+        assert value is not None
+        by_name[name] = ParameterEstimate(value, value - Z95 * float(deviation), value + Z95 * float(deviation))
+    named = [setting.name for setting in model.effects if setting.name not in TERMS]
+    named += [name.partition(".")[0] for name in joint.names if "." in name]
+    effects = {}
+    for name in dict.fromkeys(named):
+        effects[name] = {
+            key: estimate
+            for key in (p.name for p in effect_of(name).parameters)
+            if (estimate := by_name.get(f"{name}.{key}", _given(model, name, key))) is not None
+        }
+    return amended_model(model, effects, (), (ChannelEstimates(by_name, joint.names, joint.covariance),))
+
+
+def _given(model: Model, name: str, key: str) -> ParameterEstimate | None:
+    """What a model says of a parameter that was not fitted."""
+    values = [setting.values[key] for setting in model.effects if setting.name == name]
+    return ParameterEstimate(values[0], values[0], values[0]) if values else None
 
 
 def carried_terms(analysis: GapAnalysis) -> tuple[str, ...]:

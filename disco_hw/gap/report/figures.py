@@ -21,7 +21,7 @@ from disco_hw.reports.style import BASELINE, FLOOR, MAIN, REFERENCE, png
 
 Array = NDArray[np.float64]
 
-_COLOURS = {"nominal": REFERENCE, "refitted": BASELINE, "amended": MAIN, "floor": FLOOR}
+_COLOURS = {"nominal": REFERENCE, "refitted": "#9467bd", "timed": BASELINE, "amended": MAIN, "floor": FLOOR}
 # Upper end of the axis of residuals, in units of the noise, at least.
 _LEAST_SHOWN = 4.0
 _STRETCH_S = 6.0
@@ -83,7 +83,7 @@ def gap_by_horizon(gap: dict[str, dict[float, PredictionErrors]]) -> bytes:
             axes.fill_between(horizons, ends[:, 0], ends[:, 1], color=_COLOURS[stage], alpha=0.15, linewidth=0)
         axes.set_xlabel("predicted ahead, s")
         axes.set_ylabel(label)
-        axes.set_ylim(bottom=0.0)
+        axes.set_yscale("log")
         axes.legend(frameon=False)
     return png(figure)
 
@@ -93,7 +93,7 @@ def gap_by_regime(gap: dict[str, dict[float, PredictionErrors]], ahead_s: float)
     names = sorted(gap["refitted"][ahead_s].by_regime_m)
     figure = Figure(figsize=(9.0, 0.6 + 0.5 * max(len(names), 1)))
     axes = figure.add_subplot()
-    for offset, stage in enumerate(("refitted", "amended", "floor")):
+    for offset, stage in enumerate(("timed", "amended", "floor")):
         values = [1e3 * gap[stage][ahead_s].by_regime_m.get(name, 0.0) for name in names]
         rows = np.arange(len(names)) + 0.27 * (1 - offset)
         axes.barh(rows, values, height=0.25, color=_COLOURS[stage], label=stage)

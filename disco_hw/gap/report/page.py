@@ -42,13 +42,17 @@ def _gap_line(report: GapReport) -> str:
     horizon = f"{report.horizon_s:g} s"
     if not math.isfinite(report.at_horizon("refitted").position_m):
         return f"No stretch of the logs is long enough to see how far {horizon} predictions are off."
-    mm = {stage: 1e3 * report.at_horizon(stage).position_m for stage in STAGES}
-    added = "Adding it takes" if len(report.effects) + len(report.unnamed) == 1 else "The amended model takes"
-    worse = " Do not drive with it: it predicts worse than without." if report.amended_is_worse else ""
-    return (
-        f"{added} the {horizon} position error from {mm['refitted']:.0f} mm (nominal {mm['nominal']:.0f} mm) to "
-        f"{mm['amended']:.0f} mm; noise alone gives {mm['floor']:.0f} mm.{worse}"
+    off = {
+        stage: f"{1e3 * report.at_horizon(stage).position_m:.3g} mm and {report.at_horizon(stage).yaw_rad:.2g} rad"
+        for stage in STAGES
+    }
+    said = (
+        f"{horizon} ahead on held-out data the amended model errs by {off['amended']}, one with geometry, delay and "
+        f"lag alone (timed) by {off['timed']}; the sensors' noise makes {off['floor']}."
     )
+    if report.offered == "amended":
+        return said
+    return f"{said} The amended model does not beat it: model.toml is the {report.offered} one; drive with that."
 
 
 def as_text(report: GapReport) -> str:
@@ -80,7 +84,8 @@ def _confounded(finding: EffectFinding | UnnamedFinding) -> str:
 
 _CAPTIONS = {
     "gap_by_horizon": "How far predictions are off, by how far ahead they look, on data not used for fitting; shaded: "
-    "95 % intervals. The dashed line is what noise alone makes.",
+    "95 % intervals. nominal: the model as given; refitted: its geometry fitted; timed: a command delay and a lag "
+    "too, all a careful engineer fits by hand; amended: with what was found; floor: what the sensors' noise makes.",
     "gap_by_regime": "The same as far ahead as the answer looks, by what the robot was doing.",
     "where_command_to_wheel": "Where commands and wheels disagree. Bars that end at the line hold nothing but noise.",
     "where_wheel_to_body": "Where wheels and poses disagree. Bars that end at the line hold nothing but noise.",

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 
 from disco_hw.gap.data.free_runs import displacement, read_angles, run_body, starts_of
-from disco_hw.gap.data.layout import ENCODER_COLUMNS
+from disco_hw.gap.data.layout import BASE_COUNT, ENCODER_COLUMNS
 from disco_hw.gap.noise.channels import BodyChannel, WheelChannel, total_perturbation
+from disco_hw.gap.noise.sensor_noise import SensorNoise
 from disco_hw.gap.search.least_squares import Fit, by_block, inverse, known
-from disco_hw.gap.settings import GRID_STEP_S, WANDER_S, GapSettings, PredictionSettings
+from disco_hw.gap.settings import GRID_STEP_S, GapSettings, PredictionSettings
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -43,6 +43,12 @@ def worse_by(before: PredictionErrors, after: PredictionErrors) -> float:
 def _ratios(before: PredictionErrors, after: PredictionErrors) -> tuple[float, float]:
     """Errors after over those before, of position and of heading."""
     return after.position_m / before.position_m, after.yaw_rad / before.yaw_rad
+
+
+def beats(before: PredictionErrors, after: PredictionErrors, settings: PredictionSettings) -> bool:
+    """Whether errors after are no larger, of position and heading together and within 5 % of each; ties beat."""
+    ratios = _ratios(before, after)
+    return max(ratios) <= settings.worse and math.prod(ratios) ** 0.5 <= settings.level
 
 
 def clearly_worse(before: PredictionErrors, after: PredictionErrors, settings: PredictionSettings) -> bool:
@@ -163,20 +169,19 @@ def _regimes(channel: BodyChannel, node: Index, ahead: int) -> list[str]:
     return out
 
 
-def chain_track(
-    body: BodyChannel, wheels: WheelChannel | None, chain: Chain, extra: Array | None = None
-) -> tuple[Array, Array]:
+def chain_track(body: BodyChannel, wheels: WheelChannel | None, chain: Chain) -> tuple[Array, Array]:
     """Free run from commands to the path (M, 3), and wheel speeds (M, 2) on the way."""
     drive = body.drive
     p = chain.body.copy()
     scale = [body.layout.place[column] for column in ENCODER_COLUMNS]
-    perturbation = total_perturbation(drive, 3, drive.known_motion, chain.body_perturbation, extra)
+    perturbation = total_perturbation(drive, 3, drive.known_motion, chain.body_perturbation)
     if wheels is None or chain.wheels is None:
         return run_body(p, drive.angle_rad, drive.speed_rad_s, perturbation, drive.first, drive.t_s), drive.speed_rad_s
     q = chain.wheels.copy()
     q[[wheels.layout.place[column] for column in ENCODER_COLUMNS]] = 0.0
     p[scale] = 0.0
-    angle = wheels.angles(q, chain.wheels_perturbation)
+    # Limits of turning are of the robot's motion: with other wheels they are reached at other wheel speeds.
+    angle = replace(wheels, geometry=p[:BASE_COUNT]).angles(q, chain.wheels_perturbation)
     speed = np.gradient(angle, GRID_STEP_S, axis=0)
     speed[drive.first] = 0.0
     return run_body(p, angle, speed, perturbation, drive.first, drive.t_s), speed
@@ -266,66 +271,24 @@ def _interval(squares: Array, block: Index, resamples: int) -> tuple[float, floa
     return float(low), float(high)
 
 
-def floor_errors(
-    body: BodyChannel, wheels: WheelChannel | None, chain: Chain, ahead_s: float, poses: tuple[Array, Array]
-) -> PredictionErrors:
-    """What the amended model would err if it were exactly right, by simulating the noise that was estimated."""
+def floor_errors(body: BodyChannel, noise: SensorNoise, ahead_s: float, poses: tuple[Array, Array]) -> PredictionErrors:
+    """What a model that is exactly right would err so far ahead, as the sensors say a little else than what is true."""
     starts = find_starts(body, poses, ahead_s)
-    noise, begins = body.noise, body.drive.first
-    clean, _ = chain_track(body, wheels, chain)
-    still = displacement(chain.body, begins, clean, body.moving_s, starts.node, starts.pose[:, 2], ahead_s)
+    settings = body.settings.prediction
+    period_s = max(float(np.median(np.diff(body.samples.t_s))), 1e-3)
+    # The start is a mean over all poses within reach, the end a single one.
+    averaged = max(2.0 * settings.pose_reach_s / period_s, 1.0) ** 0.5
+    size = np.array([noise.position_m, noise.position_m, noise.yaw_rad])
+    cosine, sine = np.cos(starts.pose[:, 2]), np.sin(starts.pose[:, 2])
+    dx, dy = starts.end[:, 0] - starts.pose[:, 0], starts.end[:, 1] - starts.pose[:, 1]
+    ahead, left = cosine * dx + sine * dy, cosine * dy - sine * dx
     generator = np.random.default_rng(1)
-    squares, speeds = [], []
-    for _ in range(body.settings.prediction.floor_paths):
-        extra, wander = _disturbance(body, wheels, generator)
-        track, _ = chain_track(body, wheels, chain, extra)
-        moved = displacement(chain.body, begins, track, body.moving_s, starts.node, starts.pose[:, 2], ahead_s)
-        error = moved - still
-        averaged = np.sqrt(
-            max(
-                2.0 * body.settings.prediction.pose_reach_s / max(float(np.median(np.diff(body.samples.t_s))), 1e-3),
-                1.0,
-            )
-        )
-        jitter = generator.standard_normal((starts.node.size, 6))
-        first = jitter[:, :3] * (noise.position_m, noise.position_m, noise.yaw_rad) / averaged
-        last = jitter[:, 3:] * (noise.position_m, noise.position_m, noise.yaw_rad)
-        error += last - first
-        error[:, 0] += still[:, 1] * first[:, 2]
-        error[:, 1] -= still[:, 0] * first[:, 2]
-        squares.append(error)
-        speeds.append(wander[starts.node + round(ahead_s / GRID_STEP_S)])
-    stacked = np.stack(squares)
-    root = np.sqrt((stacked**2).mean(axis=0))
-    return summarise(root, np.sqrt((np.stack(speeds) ** 2).mean(axis=0)), starts, body.settings.prediction)
-
-
-def _disturbance(body: BodyChannel, wheels: WheelChannel | None, generator: np.random.Generator) -> tuple[Array, Array]:
-    """Velocities (M, 3) forward, left, yaw rate that wheels and ground add at random, and mean wheel speed error."""
-    drive, noise, p = body.drive, body.noise, body.geometry
-    count = drive.t_s.size
-    v = 0.5 * p[0] * drive.speed_rad_s.sum(axis=1)
-    omega = p[0] / p[1] * (drive.speed_rad_s[:, 1] - drive.speed_rad_s[:, 0])
-    moving = np.minimum(np.abs(drive.speed_rad_s).max(axis=1) * p[0] / drive.settings.noise.slip_onset_m_s, 1.0)
-    slip = _correlated(generator, count, 3, noise.slip_correlation_s)
-    extra = np.column_stack(
-        [
-            slip[:, 0] * (noise.slip_forward_m_s * moving + noise.relative * np.abs(v)),
-            slip[:, 1] * (noise.slip_left_m_s * moving + noise.relative * np.abs(v)),
-            slip[:, 2] * (noise.slip_yaw_rad_s * moving + noise.relative * np.abs(omega)),
-        ]
-    )
-    if wheels is None:
-        return extra, np.zeros(count)
-    quick = _correlated(generator, count, 2, wheels.noise.correlation_s) * wheels.noise.relative
-    slow = _correlated(generator, count, 2, WANDER_S) * wheels.noise.wander
-    error = (quick + slow) * drive.speed_rad_s
-    extra[:, 0] += 0.5 * p[0] * error.sum(axis=1)
-    extra[:, 2] += p[0] / p[1] * (error[:, 1] - error[:, 0])
-    return extra, error.mean(axis=1)
-
-
-def _correlated(generator: np.random.Generator, count: int, width: int, correlation_s: float) -> Array:
-    keep = float(np.exp(-GRID_STEP_S / max(correlation_s, 1e-3)))
-    noise = generator.standard_normal((count, width)) * np.sqrt(1.0 - keep * keep)
-    return np.asarray(lfilter([1.0], [1.0, -keep], noise, axis=0))
+    squares = np.zeros((starts.node.size, 3))
+    for _ in range(settings.floor_draws):
+        first, last = generator.standard_normal((2, starts.node.size, 3)) * size
+        first /= averaged
+        error = last - first
+        error[:, 0] += left * first[:, 2]
+        error[:, 1] -= ahead * first[:, 2]
+        squares += error**2 / settings.floor_draws
+    return summarise(np.sqrt(squares), np.full(starts.node.size, noise.wheel_rad_s), starts, settings)

@@ -77,6 +77,8 @@ def inflation(found: Fit, channel: ResidualChannel, added: tuple[int, ...]) -> f
         # the noise.
         blocks = float(information.sum() ** 2 / (information**2).sum())
         known = channel.trusted_blocks / len(places)
+        if known + blocks <= 1.0:
+            continue
         largest = max(largest, (known + blocks * scatter / len(places)) / (known + blocks - 1.0))
     return largest
 

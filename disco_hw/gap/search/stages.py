@@ -8,15 +8,18 @@ one that harms them goes or another that would do as well takes its place.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
+from disco_hw.gap.noise.sensor_noise import sensor_noise
 from disco_hw.gap.search.analysis import FinalFit, GapAnalysis, final_fit
+from disco_hw.gap.search.candidates import LATE_COLUMNS, LATE_STARTS_S, with_pose_delay
 from disco_hw.gap.search.channel_search import ChannelResult
 from disco_hw.gap.search.cross_validation import (
     Chain,
@@ -28,7 +31,9 @@ from disco_hw.gap.search.cross_validation import (
     smoothed_poses,
     worse_by,
 )
+from disco_hw.gap.search.end_to_end import Ahead, Freed, JointFit, Part
 from disco_hw.gap.search.intervals import GAIN
+from disco_hw.gap.search.least_squares import Fit
 
 Array = NDArray[np.float64]
 
@@ -37,80 +42,163 @@ Array = NDArray[np.float64]
 class StagePredictions:
     """For each stage the chains of the two folds, each fitted on the other one's data.
 
-    `whole`: the amended chain, fitted on all data; `poses` (M, 3) twice: smoothed, and of the nearest sample alone.
+    `poses` (M, 3) twice: smoothed, and of the nearest sample alone; `joint`: of stages that were fitted end to end,
+    what was freed and the fit on all data.
     """
 
     body: BodyChannel
     wheels: WheelChannel | None
     chains: Mapping[str, dict[int, Chain]]
-    whole: Chain
     poses: tuple[Array, Array]
+    joint: Mapping[str, tuple[Freed, JointFit]] = field(default_factory=dict)
 
     def errors(self, stage: str, ahead_s: float) -> PredictionErrors:
-        """Errors of one stage, `nominal`, `refitted` or `amended`, so far ahead on held-out data."""
+        """Errors of one stage so far ahead on held-out data."""
         return errors_of(self.body, self.wheels, self.chains[stage], ahead_s, self.poses)
 
-    def floor(self, ahead_s: float) -> PredictionErrors:
-        """What noise alone makes so far ahead."""
-        return floor_errors(self.body, self.wheels, self.whole, ahead_s, self.poses)
-
     def table(self) -> dict[str, dict[float, PredictionErrors]]:
-        """Errors by stage, with the floor, and horizon."""
+        """Errors by stage and horizon, with the floor, for which the wheels' path is that of the geometry alone."""
         horizons = self.body.settings.prediction.horizons_s
         table = {stage: {ahead_s: self.errors(stage, ahead_s) for ahead_s in horizons} for stage in self.chains}
-        table["floor"] = {ahead_s: self.floor(ahead_s) for ahead_s in horizons}
+        noise = sensor_noise(self.body, with_pose_delay(self.body, self.chains["refitted"][0].body))
+        table["floor"] = {ahead_s: floor_errors(self.body, noise, ahead_s, self.poses) for ahead_s in horizons}
         return table
 
 
 def stage_predictions(analysis: GapAnalysis, final: FinalFit | None = None) -> StagePredictions:
-    """The predictions of an analysis in which the body was judged; `final` is its final fit, if it is made already."""
+    """Predictions of `refitted` and `amended`, the channels fitted apart: quick, for names that compete.
+
+    Of an analysis in which the body was judged; `final` is its final fit, if it is made already.
+    """
     final = final_fit(analysis) if final is None else final
     body, wheels = analysis.body, analysis.wheels
     assert body is not None
     assert final.final_body is not None
     channel = body.channel
     assert isinstance(channel, BodyChannel)
-    settings, neutral = channel.settings, body.selector.channel.neutral
-    refitted = fold_vectors(body.base, channel.block, neutral, settings)
-    amended = fold_vectors(final.final_body, channel.block, neutral, settings)
-    wheel_channel = None
-    wheels_base = wheels_full = {0: analysis.nominal_wheels, 1: analysis.nominal_wheels}
-    if wheels is not None:
-        assert isinstance(wheels.channel, WheelChannel)
-        wheel_channel, wheels_neutral = wheels.channel, wheels.selector.channel.neutral
-        wheels_base = fold_vectors(wheels.base, wheel_channel.block, wheels_neutral, settings)
-        wheels_full = fold_vectors(wheels.fit, wheel_channel.block, wheels_neutral, settings)
+    wheel_channel = None if wheels is None else wheels.channel
+    assert wheel_channel is None or isinstance(wheel_channel, WheelChannel)
+    chains = {
+        stage: _chains(analysis, final, _by_fold(analysis, fits))
+        for stage, fits in (("refitted", _base(analysis)), ("amended", _whole(analysis, final)))
+    }
+    poses = smoothed_poses(channel, final.final_body.vector)
+    return StagePredictions(channel, wheel_channel, chains, poses)
 
-    def chain(of_body: Array, of_wheels: Array | None) -> Chain:
-        return _chain(body, wheels, of_body, of_wheels, final.encoder_is_cause)
 
-    def chains(of_body: dict[int, Array], of_wheels: dict[int, Array]) -> dict[int, Chain]:
-        return {held: chain(of_body[held], None if wheels is None else of_wheels[held]) for held in (0, 1)}
+def joint_predictions(analysis: GapAnalysis, final: FinalFit) -> StagePredictions:
+    """Predictions of every stage, each of which ends with a fit of the whole chain, from commands to poses.
 
-    nominal = {0: analysis.nominal_body, 1: analysis.nominal_body}
-    nominal_wheels = {0: analysis.nominal_wheels, 1: analysis.nominal_wheels}
-    return StagePredictions(
-        channel,
-        wheel_channel,
-        {
-            "nominal": chains(nominal, nominal_wheels),
-            "refitted": chains(refitted, wheels_base),
-            "amended": chains(amended, wheels_full),
-        },
-        chain(final.final_body.vector, wheels.fit.vector if wheels is not None else None),
-        smoothed_poses(channel, final.final_body.vector),
+    `nominal`: the model as given; `refitted`: its geometry, and the effects that it had; `timed`: also what makes
+    wheels late; `amended`: all that was found, beginning where the channels apart have it.
+    """
+    apart = stage_predictions(analysis, final)
+    ahead = Ahead.of(apart.body, apart.wheels, apart.poses)
+    trust = apart.body.settings.prediction.joint_trust**-2.0
+    base, whole = _base(analysis), _whole(analysis, final)
+    nominal = [analysis.nominal_body, analysis.nominal_wheels][: len(base)]
+    chains, joint = {"nominal": _chains(analysis, final, {0: nominal, 1: nominal})}, {}
+
+    def add(stage: str, of: Freed, folds: Mapping[int, Freed] | None = None) -> JointFit:
+        found = ahead.fit(of)
+        begin = dict.fromkeys((0, 1), of.at(found.vectors)) if folds is None else folds
+        chains[stage] = {held: of.chain(ahead.fit(begin[held], held).vectors) for held in (0, 1)}
+        joint[stage] = of, found
+        return found
+
+    def chain(vectors: Sequence[Array]) -> Chain:
+        return _chain(analysis, final, vectors)
+
+    parts = tuple(
+        Part(channel.layout, one.vector, one.active, np.zeros((len(one.active),) * 2))
+        for channel, one in zip((apart.body, apart.wheels), base, strict=False)
+        if channel is not None
     )
+    refitted = Freed(parts, lambda vectors: Chain(vectors[0], vectors[1] if len(vectors) > 1 else None))
+    found = add("refitted", refitted)
+    add("timed", _timed(ahead, refitted.at(found.vectors)))
+    of_all = tuple(
+        Part(one.selector.channel.layout, fitted.vector, fitted.active, trust * fitted.information())
+        for one, fitted in zip((analysis.body, analysis.wheels), whole, strict=False)
+        if one is not None
+    )
+    by_fold = {}
+    for held, vectors in _by_fold(analysis, whole).items():
+        inside = zip(of_all, vectors, whole, (apart.body, apart.wheels), strict=False)
+        by_fold[held] = tuple(
+            replace(part, vector=vector, information=trust * _information(one, channel, 1 - held))
+            for part, vector, one, channel in inside
+            if channel is not None
+        )
+    add("amended", Freed(of_all, chain), {held: Freed(parts, chain) for held, parts in by_fold.items()})
+    return StagePredictions(apart.body, apart.wheels, chains, apart.poses, joint)
 
 
-def _chain(
-    body: ChannelResult, wheels: ChannelResult | None, of_body: Array, of_wheels: Array | None, encoder_is_cause: bool
-) -> Chain:
-    """A chain of two vectors; where it is the encoders that count wrong, the wheels turn as commanded."""
-    core, perturbation = _split(body, of_body)
-    if wheels is None or of_wheels is None:
+def _information(found: Fit, channel: BodyChannel | WheelChannel, fold: int) -> Array:
+    """What the data of one fold say of the active entries of a fit, with what was expected of them, (A, A)."""
+    prediction, grid = channel.settings.prediction, channel.settings.grid
+    inside = (channel.block // round(prediction.fold_s / grid.block_s)) % 2 == fold
+    slope = found.jacobian[inside]
+    return np.asarray(slope.T @ slope) + (0.0 if found.precision is None else np.diag(found.precision))
+
+
+def _timed(ahead: Ahead, refitted: Freed) -> Freed:
+    """The same with what makes wheels late freed too, from the start that comes nearest; as it is without commands."""
+    if len(refitted.parts) == 1:
+        return refitted
+    body, wheels = refitted.parts
+    places = tuple(wheels.layout.place[column] for column in LATE_COLUMNS)
+    new = tuple(place for place in places if place not in wheels.active)
+    information = block_diag(wheels.information, np.zeros((len(new),) * 2))
+    # Wheels are never ahead of their command in a model that drives.
+    low = wheels.layout.low.copy()
+    low[list(places)] = np.maximum(low[list(places)], 0.0)
+    layout = replace(wheels.layout, low=low)
+    wider = replace(wheels, layout=layout, active=(*wheels.active, *new), information=information)
+    options = []
+    for late_s in LATE_STARTS_S:
+        vector = wider.vector.copy()
+        vector[list(places)] = late_s
+        options.append(replace(refitted, parts=(body, replace(wider, vector=vector))))
+    fitted = [option.at(ahead.fit(option).vectors) for option in options]
+    return min(fitted, key=lambda one: ahead.usual_cost(one.chain([part.vector for part in one.parts])))
+
+
+def _base(analysis: GapAnalysis) -> list[Fit]:
+    """Fits of both channels, or of the body, without anything that is missing."""
+    return [found.base for found in (analysis.body, analysis.wheels) if found is not None]
+
+
+def _whole(analysis: GapAnalysis, final: FinalFit) -> list[Fit]:
+    """Fits of both channels, or of the body, with all that was found."""
+    assert final.final_body is not None
+    return [final.final_body, *([] if analysis.wheels is None else [analysis.wheels.fit])]
+
+
+def _by_fold(analysis: GapAnalysis, fits: Sequence[Fit]) -> dict[int, list[Array]]:
+    """For each fold the vectors of the channels, fitted on the other one's data."""
+    channels = [found for found in (analysis.body, analysis.wheels) if found is not None]
+    settings = analysis.drive.settings
+    by_channel = [
+        fold_vectors(one, found.channel.block, found.selector.channel.neutral, settings)
+        for found, one in zip(channels, fits, strict=True)
+    ]
+    return {held: [vectors[held] for vectors in by_channel] for held in (0, 1)}
+
+
+def _chains(analysis: GapAnalysis, final: FinalFit, by_fold: Mapping[int, Sequence[Array]]) -> dict[int, Chain]:
+    return {held: _chain(analysis, final, vectors) for held, vectors in by_fold.items()}
+
+
+def _chain(analysis: GapAnalysis, final: FinalFit, vectors: Sequence[Array]) -> Chain:
+    """A chain of the channels' vectors; where it is the encoders that count wrong, the wheels turn as commanded."""
+    assert analysis.body is not None
+    core, perturbation = _split(analysis.body, vectors[0])
+    wheels = analysis.wheels
+    if wheels is None:
         return Chain(core, None, perturbation)
-    wheels_core, wheels_perturbation = _split(wheels, of_wheels)
-    if encoder_is_cause:
+    wheels_core, wheels_perturbation = _split(wheels, vectors[1])
+    if final.encoder_is_cause:
         places = [wheels.channel.layout.place[f"{GAIN}.{side}"] for side in ("left", "right")]
         wheels_core = wheels_core.copy()
         wheels_core[places] = 0.0

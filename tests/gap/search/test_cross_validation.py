@@ -7,6 +7,7 @@ import pytest
 
 from disco_hw.gap.data.layout import BODY
 from disco_hw.gap.noise.channels import BodyChannel
+from disco_hw.gap.noise.sensor_noise import sensor_noise
 from disco_hw.gap.search.channel_search import indices
 from disco_hw.gap.search.cross_validation import (
     Chain,
@@ -40,7 +41,7 @@ def test_the_right_model_errs_by_the_noise_alone_and_a_wrong_one_by_more():
     poses = smoothed_poses(channel, right)
     sound = errors_of(channel, None, both(right), AHEAD_S, poses)
     wrong = errors_of(channel, None, both(channel.neutral), AHEAD_S, poses)
-    floor = floor_errors(channel, None, Chain(right, None), AHEAD_S, poses)
+    floor = floor_errors(channel, sensor_noise(channel, channel.neutral), AHEAD_S, poses)
     # The pose at the end is a single measured one, that at the start a mean of many.
     assert sound.yaw_rad == pytest.approx(NOISE.yaw_rad, rel=0.25)
     assert sound.position_m == pytest.approx(floor.position_m, rel=0.2)

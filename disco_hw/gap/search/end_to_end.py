@@ -1,0 +1,163 @@
+"""The last fit: the whole chain at once, commands in and poses out, to its own predictions some seconds ahead.
+
+What is right of each channel alone need not be right of both in a row: where the true form is none of the known ones,
+each channel's best fit errs in its own way. Output-error method (Ljung, System Identification, 1999, ch. 3 and 7).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import block_diag
+from scipy.optimize import least_squares
+
+from disco_hw.gap.data.layout import Layout
+from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
+from disco_hw.gap.search.cross_validation import Chain, Starts, chain_track, find_starts, prediction_error
+from disco_hw.gap.search.least_squares import inverse
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+# A Gaussian's standard deviation over the median of its absolute values.
+_OF_MEDIAN = 1.4826
+_LEAST_SCALE = 1e-5
+# How surely entries of which nothing is known stay where they are: enough where predictions say nothing of them.
+_HARDLY = 1e-4
+# A fit begins inside its bounds, by this many difference steps.
+_INSIDE = 1e-6
+
+
+@dataclass(frozen=True)
+class Part:
+    """Of one channel's vector the `active` places that a fit frees; `information` (A, A) of what is known of them."""
+
+    layout: Layout
+    vector: Array
+    active: tuple[int, ...]
+    information: Array
+
+
+@dataclass(frozen=True)
+class Freed:
+    """What a fit of the chain frees: of each of its channels some entries; `chain` joins their vectors."""
+
+    parts: tuple[Part, ...]
+    chain: Callable[[Sequence[Array]], Chain]
+
+    def joined(self, of: Callable[[Part], Array]) -> Array:
+        """The freed entries of a vector of each channel, one after the other, (A,)."""
+        return np.concatenate([of(part)[list(part.active)] for part in self.parts])
+
+    def vectors(self, values: Array) -> list[Array]:
+        """The channels' vectors with freed values (A,)."""
+        counts = np.cumsum([len(part.active) for part in self.parts])
+        out = [part.vector.copy() for part in self.parts]
+        for vector, part, own in zip(out, self.parts, np.split(values, counts[:-1]), strict=True):
+            vector[list(part.active)] = own
+        return out
+
+    def at(self, vectors: Sequence[Array]) -> Freed:
+        """The same around other vectors."""
+        pairs = zip(self.parts, vectors, strict=True)
+        return replace(self, parts=tuple(replace(part, vector=vector) for part, vector in pairs))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Full names of the freed entries."""
+        return tuple(part.layout.columns[place] for part in self.parts for place in part.active)
+
+
+@dataclass(frozen=True)
+class JointFit:
+    """A chain's vectors after a fit of the whole, the cost, and by name the covariance (A, A) of what was freed."""
+
+    vectors: tuple[Array, ...]
+    cost: float
+    names: tuple[str, ...]
+    covariance: Array
+
+    def value(self, name: str, of: Freed) -> float | None:
+        """One entry by its full name; None if it is in no channel's vector."""
+        for vector, part in zip(self.vectors, of.parts, strict=True):
+            if name in part.layout.place:
+                return float(vector[part.layout.place[name]])
+        return None
+
+
+@dataclass(frozen=True)
+class Ahead:
+    """Predictions that fits are judged by: both channels, and starts by horizon."""
+
+    body: BodyChannel
+    wheels: WheelChannel | None
+    starts: tuple[tuple[float, Starts], ...]
+
+    @classmethod
+    def of(cls, body: BodyChannel, wheels: WheelChannel | None, poses: tuple[Array, Array]) -> Ahead:
+        """The predictions of a drive from smoothed `poses`, as far ahead as the settings say, where there are any."""
+        horizons = body.settings.prediction.fitted_horizons_s
+        every = [(ahead_s, find_starts(body, poses, ahead_s)) for ahead_s in horizons]
+        return cls(body, wheels, tuple((ahead_s, starts) for ahead_s, starts in every if starts.node.size))
+
+    def errors(self, chain: Chain) -> list[Array]:
+        """Measured minus predicted poses (K, 3) by horizon."""
+        track, _ = chain_track(self.body, self.wheels, chain)
+        return [prediction_error(self.body, starts, chain.body, track, ahead_s) for ahead_s, starts in self.starts]
+
+    def usual_cost(self, chain: Chain) -> float:
+        """How far off predictions usually are, on a scale that compares chains: log of the sizes of both errors."""
+        return sum(float(np.log(_usual(error)[1:]).sum()) for error in self.errors(chain))
+
+    def fit(self, of: Freed, left_out: int | None = None) -> JointFit:
+        """The freed values that predict best, one of the two folds `left_out` or none.
+
+        Errors of position and of heading are each measured in what they usually are at the start of a round; large ones
+        count linearly (Huber, 1964). Neighbouring predictions overlap, so that each counts for the time it adds.
+        """
+        settings = self.body.settings.prediction
+        chosen = [starts.block % 2 != left_out for _, starts in self.starts]
+        every_s = self.body.settings.grid.start_every_s
+        shares = [min(every_s / ahead_s, 1.0) ** 0.5 for ahead_s, _ in self.starts]
+        start, step = of.joined(lambda part: part.vector), of.joined(lambda part: part.layout.step)
+        low, high = of.joined(lambda part: part.layout.low), of.joined(lambda part: part.layout.high)
+        precision = block_diag(*(part.information for part in of.parts))
+        root = np.linalg.cholesky(precision + np.diag((_HARDLY / step) ** 2)).T
+        values, cost, normal = np.clip(start, low + _INSIDE * step, high - _INSIDE * step), math.inf, root.T @ root
+        for _ in range(settings.fit_rounds if any(mask.any() for mask in chosen) else 0):
+            units = [
+                _usual(error[mask]) / share
+                for error, mask, share in zip(self.errors(of.chain(of.vectors(values))), chosen, shares, strict=True)
+            ]
+
+            def residual(at: Array, units: list[Array] = units) -> Array:
+                errors = zip(self.errors(of.chain(of.vectors(at))), chosen, units, strict=True)
+                return np.asarray(
+                    np.hstack([*((e[mask] / unit).ravel() for e, mask, unit in errors), root @ (at - start)])
+                )
+
+            def slope(at: Array, residual: Callable[[Array], Array] = residual) -> Array:
+                base, columns = residual(at), []
+                for place, size in enumerate(np.where(at + step <= high, step, -step)):
+                    moved = at.copy()
+                    moved[place] += size
+                    columns.append((residual(moved) - base) / size)
+                return np.asarray(np.column_stack(columns))
+
+            found = least_squares(
+                residual, values, slope, bounds=(low, high), x_scale=10.0 * step, loss="huber",
+                f_scale=settings.fit_huber * max(shares), max_nfev=settings.fit_steps, ftol=1e-5, xtol=1e-8,
+            )  # fmt: skip
+            values, cost, normal = found.x, float(found.cost), np.asarray(found.jac.T @ found.jac)
+        return JointFit(tuple(of.vectors(values)), cost, of.names, inverse(normal))
+
+
+def _usual(error: Array) -> Array:
+    """Usual size of errors (K, 3): of position, twice, and of heading; (3,)."""
+    position = _OF_MEDIAN * float(np.median(np.abs(error[:, :2])))
+    heading = _OF_MEDIAN * float(np.median(np.abs(error[:, 2])))
+    return np.asarray(np.maximum(np.array([position, position, heading]), _LEAST_SCALE))

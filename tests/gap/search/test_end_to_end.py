@@ -1,0 +1,85 @@
+"""The last fit of the whole chain: it finds what predicts best, on the data that it may look at, and no more."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from disco_hw.gap.data.layout import BODY
+from disco_hw.gap.find import offered_stage
+from disco_hw.gap.noise.channels import BodyChannel
+from disco_hw.gap.search.cross_validation import Chain, PredictionErrors, smoothed_poses
+from disco_hw.gap.search.end_to_end import Ahead, Freed, Part
+from disco_hw.gap.settings import DEFAULT_SETTINGS
+from tests.gap.synthetic import GEOMETRY, NOISE, body_channel
+
+
+def geometry_of(vector, information=0.0):
+    part = Part(BODY, vector, (0, 1, 2), information * np.eye(3))
+    return Freed((part,), lambda vectors: Chain(vectors[0], None))
+
+
+def predictions(channel):
+    return Ahead.of(channel, None, smoothed_poses(channel, channel.neutral))
+
+
+def off(channel, by=(0.005, -0.03, 0.02)):
+    vector = channel.neutral.copy()
+    vector[:3] += by
+    return vector
+
+
+def test_the_geometry_that_predicts_is_found_from_one_that_does_not():
+    channel, _ = body_channel()
+    joint = predictions(channel).fit(geometry_of(off(channel)))
+    assert joint.names == ("wheel_radius_m", "axial_distance_m", "x_icr_m")
+    assert joint.vectors[0][:3] == pytest.approx(GEOMETRY, abs=2e-3)
+    deviations = np.sqrt(np.diag(joint.covariance))
+    assert (np.abs(joint.vectors[0][:3] - GEOMETRY) < 4.0 * deviations).all()
+
+
+def test_what_is_known_well_before_stays():
+    channel, _ = body_channel()
+    start = off(channel)
+    joint = predictions(channel).fit(geometry_of(start, information=1e12))
+    assert joint.vectors[0][:3] == pytest.approx(start[:3], rel=1e-3)
+
+
+def test_the_fold_that_is_left_out_is_not_looked_at():
+    channel, line = body_channel()
+    spoilt = line.pose_values.copy()
+    # In the first stretch of 21 s every turn is measured a tenth too large.
+    spoilt[line.pose.t_s < 21.0, 2] *= 1.1
+    ahead = predictions(BodyChannel.build(replace(line, pose_values=spoilt), NOISE, channel.neutral))
+    axle = {held: ahead.fit(geometry_of(channel.neutral), held).vectors[0][1] for held in (0, 1)}
+    assert axle[0] == pytest.approx(0.4, rel=0.01)
+    assert abs(axle[1] - 0.4) > 3.0 * abs(axle[0] - 0.4)
+
+
+def errors(position_m, yaw_rad):
+    return {2.0: PredictionErrors(position_m, (0.0, 1.0), yaw_rad, (0.0, 1.0), 0.0, {})}
+
+
+@pytest.mark.parametrize(
+    ("amended", "timed", "refitted", "offered"),
+    [
+        ((0.02, 0.02), (0.04, 0.04), (0.08, 0.08), "amended"),
+        # Level with one that knows no cause.
+        ((0.04, 0.04), (0.04, 0.04), (0.08, 0.08), "amended"),
+        ((0.02, 0.06), (0.04, 0.04), (0.08, 0.08), "timed"),
+        ((0.06, 0.02), (0.04, 0.04), (0.08, 0.08), "timed"),
+        ((0.041, 0.041), (0.04, 0.04), (0.08, 0.08), "timed"),
+        ((0.06, 0.06), (0.05, 0.05), (0.04, 0.04), "refitted"),
+        ((float("nan"), float("nan")), (0.04, 0.04), (0.08, 0.08), "amended"),
+    ],
+)
+def test_a_model_that_does_not_beat_plainer_ones_is_not_offered(amended, timed, refitted, offered):
+    gap = {"nominal": errors(1.0, 1.0), "refitted": errors(*refitted), "timed": errors(*timed)}
+    gap["amended"] = errors(*amended)
+    assert offered_stage(gap, True, DEFAULT_SETTINGS) == offered
+
+
+def test_without_anything_found_only_a_clearly_better_one_is_offered_in_its_place():
+    gap = {stage: errors(0.041, 0.041) for stage in ("nominal", "refitted", "amended")} | {"timed": errors(0.04, 0.04)}
+    assert offered_stage(gap, False, DEFAULT_SETTINGS) == "amended"
+    assert offered_stage({**gap, "timed": errors(0.02, 0.02)}, False, DEFAULT_SETTINGS) == "timed"
