@@ -26,6 +26,7 @@ for verb in (
     robot.drive,
     robot.ctl,
     robot.check,
+    robot.commission,
     robot.estop,
     logs.infer,
     logs.gap,

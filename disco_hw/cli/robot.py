@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -112,6 +113,36 @@ def drive(
         )
     print_result(result.as_dict(), as_json, result.as_text())
     if not result.completed:
+        raise typer.Exit(1)
+
+
+def commission(
+    robot: RobotFile,
+    stage: Annotated[
+        list[str] | None, typer.Option(help="Only this stage, or these: sides, turns, floor.", show_default=False)
+    ] = None,
+    write: Annotated[
+        bool | None, typer.Option("--write/--no-write", help="Mend robot.toml, or never; without it you are asked.")
+    ] = None,
+    link: LinkOption = None,
+    log_directory: Annotated[Path | None, typer.Option(help="Directory for the logs.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Guide the first drive: wheels up, then on the floor; finds wrong wiring, ticks and poses (docs/commission.md)."""
+    from disco_hw.daemon.realtime import spare_memory
+    from disco_hw.processes import limit_thread_pools
+
+    limit_thread_pools()
+    spare_memory()
+    check_named_files(robot)
+    from disco_hw.first_use.commission import CommissionOptions, run_commission
+
+    options = CommissionOptions(robot, link, write=write, log_directory=log_directory)
+    if stage:
+        options = replace(options, stages=tuple(stage))
+    result = run_commission(options)
+    print_result(result.as_dict(), as_json, result.as_text())
+    if not result.ok:
         raise typer.Exit(1)
 
 

@@ -146,6 +146,7 @@ _DIGITS = frozenset(b"%d" % digit for digit in range(1, 10))
 
 
 _MOST_BYTES = 4096
+_MOST_TYPED = 16
 _JOIN_TIMEOUT_S = 1.0
 
 
@@ -163,6 +164,7 @@ class Keyboard:
         self._arrived: deque[tuple[int, bytes]] = deque()
         self._ended: str | None = None
         self._gone = False
+        self._typed = ""
         try:
             self._former: list[Any] | None = termios.tcgetattr(descriptor)
         except termios.error:
@@ -208,6 +210,11 @@ class Keyboard:
         held = self._hold.at(now_ns)
         return held if self._ended is None else ManualInput(now_ns, 0.0, 0.0, deadman=False)
 
+    def typed(self) -> str:
+        """The printable keys that drive nothing, typed since it was asked last and seen by a poll."""
+        typed, self._typed = self._typed, ""
+        return typed
+
     def close(self) -> None:
         """Put the terminal back as it was."""
         former, self._former = self._former, None
@@ -235,6 +242,8 @@ class Keyboard:
         if keys and self._ended is None:
             # Any other key among them wins: it means stop.
             odd = [key for key in keys if key not in DIRECTIONS]
+            answers = "".join(key.decode("ascii", "ignore") for key in odd if len(key) == 1 and key.isalnum())
+            self._typed = (self._typed + answers)[-_MOST_TYPED:]
             # What came after this tick began counts as of its beginning.
             self._hold.press(KeyEvent(min(t_ns, now_ns), odd[-1] if odd else keys[-1]))
 

@@ -133,7 +133,7 @@ class DaemonCore:
         learnt = self.adaptation.step(now_ns)
         result = self.pipeline.step(now_ns, readings, _motion(output, motion), mark)
         command = self._command(output, result)
-        sent = self._send(now_ns, output, command)
+        sent = self._send(now_ns, output, command, silent=result.source is Source.SILENT)
         mark("send")
         doubts = self.plausibility.step(now_ns, readings.wheels, readings.poses, readings.power, command)
         events = (*readings.events, *output.events, *learnt.events, *self._planner_events(result), *doubts)
@@ -207,16 +207,16 @@ class DaemonCore:
     def _command(self, output: Output, result: Tick) -> WheelCommand | None:
         """The command to send; while the robot is arming the driver sends the zeros that this takes."""
         may_command = output.motion_allowed or output.zero_only
-        if not may_command or result.source is Source.OFF or self.driver.state is not DriverState.ARMED:
+        if not may_command or result.source is Source.SILENT or self.driver.state is not DriverState.ARMED:
             return None
         governed = result.command
         return WheelCommand(governed.left_rad_s, governed.right_rad_s, self.config.control.command_valid_for_s)
 
-    def _send(self, now_ns: int, output: Output, command: WheelCommand | None) -> list[records.Record]:
-        """Hand this tick's frames to the link; the e-stop goes before everything else."""
+    def _send(self, now_ns: int, output: Output, command: WheelCommand | None, silent: bool) -> list[records.Record]:
+        """Hand this tick's frames to the link; the e-stop goes before everything else, and even where all is silent."""
         if output.driver_request is not None:
             self.driver.request(output.driver_request)
-        outgoing = self.driver.transmit(now_ns, command)
+        outgoing = () if silent else self.driver.transmit(now_ns, command)
         if output.send_estop:
             outgoing = (*self.driver.estop(now_ns), *outgoing)
         return [records_of_tick.frame_out(now_ns, frame, self.transport.send(frame, now_ns)) for frame in outgoing]

@@ -86,6 +86,11 @@ class Manual:
     right_rad_s: float
 
 
+@dataclass(frozen=True, slots=True)
+class Silent:
+    """Send no frame at all, as a host that has died: the robot's own watchdog must stop it."""
+
+
 class Source(enum.Enum):
     """Who asked for a tick's wheel speeds."""
 
@@ -95,9 +100,10 @@ class Source(enum.Enum):
     TAIL = "tail"
     RAMP = "ramp"
     MANUAL = "manual"
+    SILENT = "silent"
 
 
-Motion = Off | Stand | FollowTask | Manual
+Motion = Off | Stand | FollowTask | Manual | Silent
 
 
 class Tick(msgspec.Struct, frozen=True, gc=False):
@@ -221,6 +227,8 @@ class Pipeline:
                 return Source.OFF, (0.0, 0.0)
             case Stand():
                 return Source.HOLD, (0.0, 0.0)
+            case Silent():
+                return Source.SILENT, (0.0, 0.0)
             case Manual(left_rad_s=left, right_rad_s=right):
                 return Source.MANUAL, (left, right)
             case FollowTask():
@@ -229,7 +237,7 @@ class Pipeline:
                 return Source.TAIL if new is None else Source.PLAN, self._plan.at(now_ns)
 
     def _govern(self, now_ns: int, source: Source, requested: tuple[float, float]) -> Governed:
-        if source is Source.OFF:
+        if source in {Source.OFF, Source.SILENT}:
             self._governor.reset()
         dt_s = 0.0 if self._last_ns is None else (now_ns - self._last_ns) * 1e-9
         self._last_ns = now_ns

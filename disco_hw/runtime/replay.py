@@ -18,7 +18,7 @@ from disco_hw.log.reader import Entry, open_log
 from disco_hw.log.records import BeliefChange, Command, Estimate, Innovation, Plan, Record, Task
 from disco_hw.runtime import records_of_tick
 from disco_hw.runtime.assembly import make_pipeline, make_planner, put_in_force
-from disco_hw.runtime.pipeline import FollowTask, Manual, Motion, Off, Pipeline, Source, Stand
+from disco_hw.runtime.pipeline import FollowTask, Manual, Motion, Off, Pipeline, Silent, Source, Stand
 from disco_hw.runtime.robot_setup import setup_of_log
 from disco_hw.runtime.task_change import task_of
 from drivers.types import PoseSample, Readings, WheelSample
@@ -129,6 +129,8 @@ def _motion(command: Command) -> Motion:
             return Off()
         case Source.HOLD:
             return Stand()
+        case Source.SILENT:
+            return Silent()
         case Source.MANUAL:
             return Manual(command.requested_left_rad_s, command.requested_right_rad_s)
         case Source.PLAN | Source.TAIL | Source.RAMP:

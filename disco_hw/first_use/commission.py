@@ -1,0 +1,199 @@
+"""`disco-hw commission`: the guided first drive over the daemon's own path, what it found, and robot.toml mended."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from disco_hw.config import load_robot_config
+from disco_hw.daemon.async_printer import STANDARD_ERROR, AsyncPrinter
+from disco_hw.daemon.daemon import in_text, serve
+from disco_hw.daemon.loop import MonotonicClock
+from disco_hw.drive.keyboard import Keyboard, KeyHold
+from disco_hw.errors import InputError, WorkError
+from disco_hw.first_use.judgement import Judgement, judge_floor, judge_sides, judge_turns
+from disco_hw.first_use.pilot import CommissionPilot
+from disco_hw.first_use.procedure import Procedure, Steps, floor, sides, turns
+from disco_hw.first_use.robot_text import in_toml, with_fields
+from disco_hw.runtime.robot_setup import Setup, load_setup
+from drivers.motor import find_driver
+
+_STANDARD_INPUT = 0
+_MOST_TRIES = 3
+_UP = "wheels off the ground"
+_DOWN = "on the floor, with one and a half metres free around it"
+
+
+@dataclass(frozen=True, slots=True)
+class Stage:
+    """A part of the drive: where the robot is, what is driven, and what that says of a robot."""
+
+    name: str
+    where: str
+    steps: Callable[[Any], Steps]
+    judge: Callable[[Any, Setup], Judgement]
+    raw_poses: bool = False
+
+
+def _judge_turns(seen: Any, setup: Setup) -> Judgement:
+    link = setup.config.link
+    card = find_driver(link.driver).safety_card(link.settings())
+    return judge_turns(seen, setup.config.wheels, card.reaction_s, card.brakes)
+
+
+STAGES = (
+    Stage("sides", _UP, sides, lambda seen, of: judge_sides(seen, of.config.wheels, of.config.robot)),
+    Stage("turns", _UP, turns, _judge_turns),
+    Stage(
+        "floor",
+        _DOWN,
+        floor,
+        lambda seen, of: judge_floor(seen, of.config.pose.convention(), of.config.robot),
+        raw_poses=True,
+    ),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class CommissionOptions:
+    """What `disco-hw commission` was asked; `write`: mend robot.toml, None asks; `stages`: names of `STAGES`."""
+
+    robot: Path
+    link: str | None = None
+    stages: tuple[str, ...] = tuple(stage.name for stage in STAGES)
+    write: bool | None = None
+    log_directory: Path | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class CommissionResult:
+    """What was found, by stage: figures, faults with whether they were mended, and the logs."""
+
+    stages: tuple[dict[str, Any], ...]
+    ok: bool
+
+    def as_dict(self) -> dict[str, Any]:
+        """The result for machines."""
+        return {"ok": self.ok, "stages": list(self.stages)}
+
+    def as_text(self) -> str:
+        """The result for a person."""
+        lines = []
+        for stage in self.stages:
+            lines += [f"{stage['name']}: {figure}" for figure in stage["figures"]]
+            lines += [f"{stage['name']}: {fault['name']}: {_how(fault)}" for fault in stage["faults"]]
+        return "\n".join([*lines, "commissioned" if self.ok else "not commissioned: mend what is named above"])
+
+
+def _how(fault: dict[str, Any]) -> str:
+    return "mended" if fault["mended"] else str(fault["text"])
+
+
+def as_sent(setup: Setup) -> Setup:
+    """The robot with its poses as the source sends them."""
+    plain = msgspec.structs.replace(
+        setup.config.pose, position_unit="m", yaw_unit="rad", clockwise=False, mirrored=False, yaw_offset_rad=0.0
+    )
+    return replace(setup, config=msgspec.structs.replace(setup.config, pose=plain))
+
+
+def run_commission(options: CommissionOptions, ask: Callable[[str], str] = input) -> CommissionResult:
+    """Guide a person through the stages; each is driven again after robot.toml was mended.
+
+    A stage begins only when the ones before it found nothing, or what they found was mended. `ask`: how a person is
+    asked between the drives. Raises InputError for wrong options and files, or without a terminal.
+    """
+    known = {stage.name: stage for stage in STAGES}
+    for name in options.stages:
+        if name not in known:
+            raise InputError(f"--stage {name}: no such stage; write one of {', '.join(known)}")
+    load_setup(options.robot, None, options.link)
+    if not os.isatty(_STANDARD_INPUT):
+        raise InputError("commission: standard input is no terminal; it needs a person's hand and eye: use a terminal")
+    told: list[dict[str, Any]] = []
+    for name in options.stages:
+        if not _through(known[name], options, ask, told):
+            return CommissionResult(tuple(told), ok=False)
+    return CommissionResult(tuple(told), ok=True)
+
+
+def _through(stage: Stage, options: CommissionOptions, ask: Callable[[str], str], told: list[dict[str, Any]]) -> bool:
+    """Drive one stage until it finds nothing; whether it did."""
+    ask(f"\n{stage.name}: put the robot {stage.where}, somebody at its stop button; then press Enter ")
+    for _ in range(_MOST_TRIES):
+        setup = load_setup(options.robot, None, options.link)
+        judgement = stage.judge(_drive(stage, setup, options), setup)
+        for line in (*judgement.figures, *(f"{fault.name.upper()}: {fault.text}" for fault in judgement.faults)):
+            _say("found", line)
+        mended = bool(judgement.edits) and all(fault.edits for fault in judgement.faults)
+        if mended:
+            mended = write_fields(options, judgement.edits, ask)
+        faults = [{"name": f.name, "text": f.text, "mended": mended} for f in judgement.faults]
+        told.append({"name": stage.name, "figures": list(judgement.figures), "faults": faults})
+        if not judgement.faults:
+            return True
+        if not mended:
+            return False
+        ask("mended; once more to see that it is right: press Enter ")
+    return False
+
+
+def write_fields(
+    options: CommissionOptions, edits: dict[tuple[str, str], Any], ask: Callable[[str], str] = input
+) -> bool:
+    """Offer to write fields into robot.toml, and write them, the file of before kept beside it; whether it was done.
+
+    What `load_robot_config` would refuse is not written: WorkError.
+    """
+    for (section, name), value in edits.items():
+        print(f"  [{section}] {name} = {in_toml(value)}", file=sys.stderr)
+    write = options.write
+    if write is None:
+        write = ask(f"write this into {options.robot}? [y/n] ").strip().lower() in {"y", "yes"}
+    if not write:
+        return False
+    old = options.robot.read_text(encoding="utf-8")
+    trial = options.robot.with_name(f".{options.robot.name}.new")
+    trial.write_text(with_fields(old, edits), encoding="utf-8")
+    try:
+        load_robot_config(trial)
+    except InputError as error:
+        trial.unlink()
+        raise WorkError(
+            f"{options.robot}: not changed, as the result would be refused ({error}); edit it by hand"
+        ) from None
+    options.robot.with_name(f"{options.robot.name}.before").write_text(old, encoding="utf-8")
+    trial.replace(options.robot)
+    return True
+
+
+def _drive(stage: Stage, setup: Setup, options: CommissionOptions) -> Any:
+    """One drive through the daemon; what its procedure returned. Raises WorkError if the person gave up."""
+    directory = options.log_directory or Path(setup.config.log.directory)
+    stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
+    log = directory / f"{setup.config.robot.name}-commission-{stage.name}-{stamp}.mcap"
+    keyboard = Keyboard(_STANDARD_INPUT, KeyHold(0.0), MonotonicClock())
+    pilot = CommissionPilot(Procedure(stage.steps(setup.config.robot)), keyboard, keyboard.typed)
+    try:
+        _say("keys", "hold the space bar to drive, let go to stop; Ctrl-D gives up")
+        with closing(AsyncPrinter(STANDARD_ERROR, in_text)) as say:
+            serve(as_sent(setup) if stage.raw_poses else setup, log, say, pilot)
+    finally:
+        keyboard.close()
+    if pilot.trouble is not None:
+        raise WorkError(f"commission: in the stage {stage.name}: {pilot.trouble}")
+    if pilot.procedure.action is not None:
+        raise WorkError(f"commission: ended in the stage {stage.name}; begin again with --stage {stage.name}")
+    return pilot.procedure.result
+
+
+def _say(topic: str, text: str) -> None:
+    print(in_text(topic, text), file=sys.stderr, flush=True)

@@ -1,0 +1,483 @@
+"""What the guided first drive says of the robot: faults with the lines of robot.toml that mend them, and figures; pure.
+
+A fault is judged against what robot.toml says already: what was mended once and is right now is no fault.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise, product
+from statistics import median
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from disco_hw.config import Robot
+from disco_hw.first_use.procedure import (
+    RUNAWAY_SHARE,
+    SIDES,
+    SLOWING,
+    FloorSeen,
+    SideSeen,
+    Track,
+    TurnsSeen,
+)
+from drivers.motor.wiring import Wiring
+from drivers.pose.convention import PoseConvention
+from drivers.types import PoseSample
+
+Edits = Mapping[tuple[str, str], Any]
+
+STILL_RAD_S = 0.05
+COUNTS_RAD = 0.1
+"""A wheel that was seen turning has moved its own encoder by more, another one by less."""
+TURN_TOLERANCE = 0.15
+"""What a person's eye and finger may miss of a turn."""
+POSE_STD_LEFT_M = 0.1
+SETTLED_S = 0.5
+
+
+@dataclass(frozen=True)
+class Fault:
+    """What is wrong, in words with the remedy; `edits`: fields of robot.toml, by section and name, that mend it."""
+
+    name: str
+    text: str
+    edits: Edits = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """Faults, and figures for a person: what was measured, in words."""
+
+    faults: tuple[Fault, ...] = ()
+    figures: tuple[str, ...] = ()
+
+    @property
+    def edits(self) -> dict[tuple[str, str], Any]:
+        """Those of all faults together."""
+        return {place: value for fault in self.faults for place, value in fault.edits.items()}
+
+
+def judge_sides(seen: Sequence[SideSeen], wiring: Wiring, robot: Robot) -> Judgement:
+    """Which motor and encoder is on which side, and which way round; `wiring`: what robot.toml says of that."""
+    faults: list[Fault] = []
+    figures = [_dead_band(side, one.track) for side, one in enumerate(seen)]
+    for side, one in enumerate(seen):
+        if one.ran_away:
+            limit = RUNAWAY_SHARE * robot.max_wheel_speed_rad_s
+            faults.append(
+                Fault(
+                    "runaway",
+                    f"asked for a slow start of the {SIDES[side]} side, a wheel came to more than {limit:.1f} rad/s; "
+                    "its controller and its encoder disagree about forward: exchange the encoder's channels A and B, "
+                    "or run the controller's own calibration",
+                )
+            )
+        if not one.seen:
+            faults.append(Fault(f"{SIDES[side]} still", _still(side, one.track)))
+    turned = ["lr".index(one.seen[0]) for one in seen if one.seen]
+    if len(turned) == 2 and turned[0] == turned[1]:
+        both = f"both commands turned the {SIDES[turned[0]]} side; give each side its own node, or look at the cables"
+        faults.append(Fault("one side for both", both))
+    if faults:
+        return Judgement(tuple(faults), tuple(figures))
+    return Judgement(tuple(_wiring_faults(seen, wiring)), tuple(figures))
+
+
+def _still(side: int, track: Track) -> str:
+    counted = [SIDES[k] for k, rad in enumerate(track.turned()) if abs(rad) > COUNTS_RAD]
+    if counted:
+        return f"nothing was seen turning, yet the {' and '.join(counted)} encoder counts; look again"
+    return (
+        f"the {SIDES[side]} side does not turn at {max(map(abs, track.commands[-1][1:]), default=0.0):.1f} rad/s; look "
+        "at its motor's cable, the motor supply and the controller's limits of current and speed"
+    )
+
+
+def _wiring_faults(seen: Sequence[SideSeen], old: Wiring) -> list[Fault]:
+    """Compare the wiring that was seen with the one that robot.toml says."""
+    motors, encoders = [0, 0], [0, 0]
+    dead: list[int] = []
+    swapped = crossed = False
+    for asked, one in enumerate(seen):
+        side, way = "lr".index(one.seen[0]), 1 if one.seen[1] == "f" else -1
+        channel = asked ^ old.sides_swapped
+        motors[side] = way * old.motor_direction[asked]
+        swapped = bool(channel ^ side)
+        counted = one.track.turned()
+        reader = max((0, 1), key=lambda k: abs(counted[k]))
+        if abs(counted[reader]) < COUNTS_RAD:
+            dead.append(side)
+            continue
+        own = reader ^ (old.sides_swapped != old.encoders_swapped)
+        crossed = swapped != bool(own ^ side)
+        encoders[side] = way * (1 if counted[reader] > 0.0 else -1) * old.encoder_direction[reader]
+    if dead:
+        names = " and ".join(SIDES[side] for side in dead)
+        return [Fault("encoder dead", f"the {names} wheel turned and its encoder did not count; look at its cable")]
+    faults = []
+    if swapped != old.sides_swapped:
+        faults.append(
+            Fault(
+                "sides swapped",
+                "the controller's left side drives the right wheels",
+                {("wheels", "sides_swapped"): swapped},
+            )
+        )
+    if crossed != old.encoders_swapped:
+        faults.append(
+            Fault(
+                "encoders swapped",
+                "the encoders of left and right are exchanged",
+                {("wheels", "encoders_swapped"): crossed},
+            )
+        )
+    for side in (0, 1):
+        motor_wrong = seen["lr".index(_side_of(seen, side))].seen[1] == "b"
+        if motor_wrong:
+            faults.append(
+                Fault(
+                    f"{SIDES[side]} motor reversed",
+                    f"forward turns the {SIDES[side]} wheels backward",
+                    {("wheels", "motor_direction"): motors},
+                )
+            )
+        elif encoders[side] != old.encoder_direction[side]:
+            faults.append(
+                Fault(
+                    f"{SIDES[side]} encoder reversed",
+                    f"the {SIDES[side]} encoder counts down when its wheel turns forward",
+                    {("wheels", "encoder_direction"): encoders},
+                )
+            )
+    if encoders != list(old.encoder_direction):
+        faults = [_with(fault, ("wheels", "encoder_direction"), encoders) for fault in faults]
+    if motors != list(old.motor_direction):
+        faults = [_with(fault, ("wheels", "motor_direction"), motors) for fault in faults]
+    return faults
+
+
+def _side_of(seen: Sequence[SideSeen], side: int) -> str:
+    """Which asked side turned this one, as a letter."""
+    return "lr"[next(asked for asked, one in enumerate(seen) if "lr".index(one.seen[0]) == side)]
+
+
+def _with(fault: Fault, place: tuple[str, str], value: Any) -> Fault:
+    return Fault(fault.name, fault.text, {**fault.edits, place: value})
+
+
+def _dead_band(side: int, track: Track) -> str:
+    """The command at which a wheel began to turn."""
+    begun = next(
+        (s.t_ns for s in track.wheels if max(abs(s.left_speed_rad_s), abs(s.right_speed_rad_s)) > STILL_RAD_S), None
+    )
+    if begun is None:
+        return f"{SIDES[side]}: never turned"
+    command = max((max(abs(left), abs(right)) for t_ns, left, right in track.commands if t_ns <= begun), default=0.0)
+    return f"{SIDES[side]}: begins to turn at a command of {command:.2f} rad/s"
+
+
+def judge_turns(seen: TurnsSeen, wiring: Wiring, reaction_s: float, brakes: bool) -> Judgement:
+    """Ticks a turn, and whether the robot stopped by itself; `reaction_s`: how soon the driver's safety card says."""
+    faults, figures = [], []
+    shares = [abs(track.turned()[side]) / (2.0 * math.pi) for side, track in enumerate(seen.turns)]
+    for side, share in enumerate(shares):
+        figures.append(f"{SIDES[side]}: one turn counted as {share:.2f} turns")
+    ratio = 1.0 / (0.5 * sum(shares)) if sum(shares) else math.inf
+    if min(shares) <= 0.0 or max(shares) / min(shares) > 1.0 + 2.0 * TURN_TOLERANCE:
+        faults.append(
+            Fault(
+                "turns differ", "the two sides count differently for one turn; compare their gears, encoders, settings"
+            )
+        )
+    elif abs(ratio - 1.0) > TURN_TOLERANCE:
+        faults.append(
+            Fault(
+                "wrong ticks",
+                f"the wheels make {ratio:.2f} turns for each that is counted: ticks_per_rev, gear or pole_pairs is "
+                "wrong; set it right where it stands, or let turn_ratio make up for it",
+                {("wheels", "turn_ratio"): _simple(wiring.turn_ratio * ratio)},
+            )
+        )
+    figures += [f"{name}: {text}" for name, text in _response(seen.watchdog)]
+    stopped = _stop_after_silence(seen.watchdog)
+    if stopped is None:
+        faults.append(
+            Fault(
+                "watchdog off",
+                "this computer fell silent and the wheels turned on: the controller's watchdog is off or far too long; "
+                "set it as `disco-hw check` says, and do not put the robot on the floor before",
+            )
+        )
+    else:
+        begun_s, still_s = stopped
+        how = "braking" if brakes else "coasting"
+        figures.append(f"watchdog: slowing {begun_s:.2f} s after the last command, {_standing(still_s)} ({how})")
+        if begun_s > reaction_s + SETTLED_S:
+            late = (
+                f"the robot began to stop {begun_s:.2f} s after the last command, and should within {reaction_s:.2f} s"
+            )
+            faults.append(Fault("watchdog late", f"{late}; set its time as `disco-hw check` says"))
+    return Judgement(tuple(faults), tuple(figures))
+
+
+def _standing(still_s: float | None) -> str:
+    return "still rolling at the end" if still_s is None else f"standing after {still_s:.2f} s"
+
+
+def _simple(ratio: float) -> float:
+    """A ratio of small numbers where one is as near as a person can tell, else two digits."""
+    near = [a / b for b in range(1, 9) for a in range(1, 9) if abs(a / b / ratio - 1.0) < 0.3 * TURN_TOLERANCE]
+    whole = [float(n) for n in range(2, 65) if min(abs(n / ratio - 1.0), abs(n * ratio - 1.0)) < 0.3 * TURN_TOLERANCE]
+    if whole:
+        return whole[0] if ratio > 1.0 else 1.0 / whole[0]
+    return min(near, key=lambda value: abs(value - ratio)) if near else float(f"{ratio:.2g}")
+
+
+def _stop_after_silence(track: Track) -> tuple[float, float | None] | None:
+    """When the wheels began to slow down and when they stood, since the last command (s); None if they went on."""
+    silent_ns = track.silent_ns or 0
+    ended_s = math.inf if track.ended_ns is None else (track.ended_ns - silent_ns) * 1e-9
+    before = [_faster(s.left_speed_rad_s, s.right_speed_rad_s) for s in track.wheels if s.t_ns <= silent_ns]
+    after = [
+        ((s.t_ns - silent_ns) * 1e-9, _faster(s.left_speed_rad_s, s.right_speed_rad_s))
+        for s in track.wheels
+        if s.t_ns > silent_ns
+    ]
+    steady = median(before[-20:]) if before else 0.0
+    slow = next((t_s for t_s, speed in after if speed < SLOWING * steady), None)
+    if slow is None or slow > ended_s + 0.05 or after[-1][1] > 0.5 * steady:
+        return None
+    return slow, next((t_s for t_s, speed in after if speed < STILL_RAD_S), None)
+
+
+def _faster(left: float, right: float) -> float:
+    return max(abs(left), abs(right))
+
+
+def _response(track: Track) -> list[tuple[str, str]]:
+    """How late the wheels follow a command: between the halves of the rises of command and speed."""
+    if not track.commands:
+        return []
+    top = max(_faster(left, right) for _, left, right in track.commands)
+    asked = next((t for t, left, right in track.commands if _faster(left, right) >= 0.5 * top), None)
+    came = next((s.t_ns for s in track.wheels if _faster(s.left_speed_rad_s, s.right_speed_rad_s) >= 0.5 * top), None)
+    if asked is None or came is None:
+        return [("command to wheel", "no response seen")]
+    return [("command to wheel", f"{max(0.0, (came - asked) * 1e-6):.0f} ms")]
+
+
+def judge_floor(seen: FloorSeen, told: PoseConvention, robot: Robot) -> Judgement:
+    """In what units and about which axes the poses are, where the sensor sits, and how late it is.
+
+    The poses are as the source sent them; `told` is what robot.toml says of them.
+    """
+    legs = (seen.straight, seen.left, seen.right, seen.straight_again)
+    if any(len(leg.poses) < 5 for leg in legs):
+        where = "no pose came" if not any(leg.poses for leg in legs) else "poses came only now and then"
+        return Judgement((Fault("no poses", f"{where} while driving; look at [pose] and at what sends them"),))
+    fits = [fit for choice in _CHOICES if (fit := _fit(seen, choice, robot)) is not None]
+    if not fits:
+        text = (
+            "the poses do not follow the robot in any units or axes; does the sensor see this robot, is its frame "
+            "fixed to the floor, and did the wheels slip?"
+        )
+        return Judgement((Fault("poses do not follow", text),))
+    # What robot.toml says is believed where it explains the drive.
+    best = min(
+        fits, key=lambda fit: (fit.mismatch_rad > _SAME_RAD, not _same_units(fit.convention, told), fit.mismatch_rad)
+    )
+    faults = list(_pose_faults(best, told))
+    figures = [
+        f"straight: the wheels say {best.wheels_m:.3f} m, the poses {best.poses_m:.3f} m",
+        f"half a turn by the nominal axle was {math.degrees(best.turned_rad):.0f} degrees",
+    ]
+    if not 0.75 < best.poses_m / best.wheels_m < 1.33:
+        faults.append(
+            Fault(
+                "wrong distance",
+                f"the wheels say {best.wheels_m:.2f} m where the poses say {best.poses_m:.2f} m: wheel_radius_m or the "
+                "ticks are wrong; measure the wheel, and count its turns again with its wheels up",
+            )
+        )
+    figures += _places(seen, best)
+    return Judgement(tuple(faults), tuple(figures))
+
+
+_SAME_RAD = 0.35
+_OFFSET_RAD = 0.2
+_QUARTER = 0.5 * math.pi
+_METRES: tuple[Literal["m", "cm", "mm"], ...] = ("m", "cm", "mm")
+_RADIANS: tuple[Literal["rad", "deg"], ...] = ("rad", "deg")
+_CHOICES = tuple(
+    PoseConvention(unit, yaw, clockwise, mirrored)
+    for unit, yaw, clockwise, mirrored in product(_METRES, _RADIANS, (False, True), (False, True))
+)
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """How well a convention explains the drive; `mismatch_rad`: of the sensor's heading in the two straights."""
+
+    convention: PoseConvention
+    mismatch_rad: float
+    wheels_m: float
+    poses_m: float
+    turned_rad: float
+
+
+def _same_units(found: PoseConvention, told: PoseConvention) -> bool:
+    return (found.position_unit, found.yaw_unit, found.clockwise, found.mirrored) == (
+        told.position_unit,
+        told.yaw_unit,
+        told.clockwise,
+        told.mirrored,
+    )
+
+
+def _fit(seen: FloorSeen, choice: PoseConvention, robot: Robot) -> _Fit | None:
+    """The drive in this convention; None where distance or turn cannot be so."""
+    wheels_m = _travel(seen.straight, robot)
+    dx, dy, heading = _displacement(seen.straight.poses, choice)
+    poses_m = math.hypot(dx, dy)
+    if wheels_m <= 0.0 or not 0.3 < poses_m / wheels_m < 3.0:
+        return None
+    left, right = _turn(seen.left.poses, choice), _turn(seen.right.poses, choice)
+    if not (0.2 < left / math.pi < 2.0 and 0.2 < -right / math.pi < 2.0):
+        return None
+    again_x, again_y, again_heading = _displacement(seen.straight_again.poses, choice)
+    first, second = math.atan2(dy, dx) - heading, math.atan2(again_y, again_x) - again_heading
+    offset = math.atan2(math.sin(first) + math.sin(second), math.cos(first) + math.cos(second))
+    near = _QUARTER * round(offset / _QUARTER)
+    offset = near if abs(offset - near) < _OFFSET_RAD else offset
+    return _Fit(
+        PoseConvention(
+            choice.position_unit,
+            choice.yaw_unit,
+            choice.clockwise,
+            choice.mirrored,
+            math.remainder(offset, 2 * math.pi),
+        ),
+        abs(math.remainder(first - second, 2.0 * math.pi)),
+        wheels_m,
+        poses_m,
+        0.5 * (left - right),
+    )
+
+
+def _travel(track: Track, robot: Robot) -> float:
+    left, right = track.turned()
+    return 0.5 * (left + right) * robot.wheel_radius_m
+
+
+def _displacement(poses: Sequence[PoseSample], choice: PoseConvention) -> tuple[float, float, float]:
+    """From the mean of the first poses, at rest, to that of the last; with the mean heading (m, m, rad)."""
+    rest = max(1, min(10, len(poses) // 4))
+    found = [choice.converted(pose) for pose in poses]
+    first, last = found[:rest], found[-rest:]
+    dx = _mean([p.x_m for p in last]) - _mean([p.x_m for p in first])
+    dy = _mean([p.y_m for p in last]) - _mean([p.y_m for p in first])
+    heading = math.atan2(_mean([math.sin(p.yaw_rad) for p in found]), _mean([math.cos(p.yaw_rad) for p in found]))
+    return dx, dy, heading
+
+
+def _mean(values: Sequence[float]) -> float:
+    return math.fsum(values) / len(values)
+
+
+def _turn(poses: Sequence[PoseSample], choice: PoseConvention) -> float:
+    """By how much the yaw has changed (rad), over the steps from pose to pose."""
+    factor = (-1.0 if choice.clockwise else 1.0) * (math.pi / 180.0 if choice.yaw_unit == "deg" else 1.0)
+    yaws = [factor * pose.yaw_rad for pose in poses]
+    return math.fsum(math.remainder(b - a, 2.0 * math.pi) for a, b in pairwise(yaws))
+
+
+def _pose_faults(found: _Fit, told: PoseConvention) -> list[Fault]:
+    names = {
+        "position_unit": ("pose in other units", f"positions come in {found.convention.position_unit}"),
+        "yaw_unit": ("yaw in other units", f"the yaw comes in {found.convention.yaw_unit}"),
+        "clockwise": ("yaw the other way round", _clockwise(found.convention.clockwise)),
+        "mirrored": ("axes mirrored", "left and right are exchanged in the source's frame"),
+    }
+    faults = [
+        Fault(name, f"{text}; robot.toml says otherwise", {("pose", key): getattr(found.convention, key)})
+        for key, (name, text) in names.items()
+        if getattr(found.convention, key) != getattr(told, key)
+    ]
+    offset = found.convention.yaw_offset_rad
+    if abs(math.remainder(offset - told.yaw_offset_rad, 2.0 * math.pi)) > _OFFSET_RAD:
+        faults.append(
+            Fault(
+                "sensor looks aside",
+                f"driving straight on, the yaw is {math.degrees(-offset):.0f} degrees off the way",
+                {("pose", "yaw_offset_rad"): round(offset, 4)},
+            )
+        )
+    return faults
+
+
+def _clockwise(clockwise: bool) -> str:
+    return "the yaw grows clockwise" if clockwise else "the yaw grows counter-clockwise"
+
+
+def _places(seen: FloorSeen, best: _Fit) -> list[str]:
+    """Where the sensor sits beside the centre of the turns, and how much later than the wheels it speaks."""
+    convention = best.convention
+    arms = [_arm([convention.converted(pose) for pose in track.poses]) for track in (seen.left, seen.right)]
+    forward, left = (_mean([arm[k] for arm in arms]) for k in (0, 1))
+    delays = [_delay_s(track, convention) for track in (seen.left, seen.right)]
+    ahead = "ahead of" if forward > 0.0 else "behind"
+    aside = "left" if left > 0.0 else "right"
+    late = "behind" if _mean(delays) > 0.0 else "ahead of"
+    lines = [
+        f"lever arm: the sensor is {abs(forward):.2f} m {ahead} and {abs(left):.2f} m to the {aside} of the point "
+        f"about which the robot turns (x_icr_m = {-forward:.2f})",
+        f"poses: {_rate(seen):.0f} a second, {_age_ms(seen):.0f} ms old when they come, their stamps "
+        f"{abs(1e3 * _mean(delays)):.0f} ms {late} the wheels'",
+    ]
+    if abs(left) > POSE_STD_LEFT_M:
+        lines.append("the sensor is far from the middle of the robot: the circle that it drives is not the robot's own")
+    return lines
+
+
+def _arm(poses: Sequence[PoseSample]) -> tuple[float, float]:
+    """Least squares of p = c + R(yaw) l: the arm l, forward and left (m)."""
+    rows, values = [], []
+    for pose in poses:
+        c, s = math.cos(pose.yaw_rad), math.sin(pose.yaw_rad)
+        rows += [[1.0, 0.0, c, -s], [0.0, 1.0, s, c]]
+        values += [pose.x_m, pose.y_m]
+    found = np.linalg.lstsq(np.array(rows), np.array(values), rcond=None)[0]
+    return float(found[2]), float(found[3])
+
+
+def _delay_s(track: Track, convention: PoseConvention) -> float:
+    """By how much the yaw of the poses lags behind the wheels' (s): the shift that fits best, to 5 ms."""
+    wheel_t = np.array([s.t_ns for s in track.wheels]) * 1e-9
+    turn = np.array([s.right_angle_rad - s.left_angle_rad for s in track.wheels])
+    poses = [convention.converted(pose) for pose in track.poses]
+    pose_t = np.array([pose.t_ns for pose in poses]) * 1e-9
+    yaw = np.unwrap([pose.yaw_rad for pose in poses])
+    shifts = np.arange(-0.3, 0.6, 0.005)
+    return float(min(shifts, key=lambda shift: _misfit(pose_t - shift, yaw, wheel_t, turn)))
+
+
+def _misfit(
+    at: NDArray[np.float64], yaw: NDArray[np.float64], t: NDArray[np.float64], turn: NDArray[np.float64]
+) -> float:
+    base = np.column_stack([np.ones_like(at), np.interp(at, t, turn)])
+    left = yaw - base @ np.linalg.lstsq(base, yaw, rcond=None)[0]
+    return float(left @ left)
+
+
+def _age_ms(seen: FloorSeen) -> float:
+    return median((pose.received_ns - pose.t_ns) * 1e-6 for pose in seen.straight.poses)
+
+
+def _rate(seen: FloorSeen) -> float:
+    poses = seen.straight.poses
+    return (len(poses) - 1) / max(1e-9, (poses[-1].t_ns - poses[0].t_ns) * 1e-9)

@@ -1,0 +1,344 @@
+"""The guided first drive as steps that wait for a person: what is asked of the wheels, tick by tick; pure.
+
+A step is a generator: it yields what it wants of the tick and gets what was seen in it, or a person's answer. A step
+that needs the deadman held begins anew when it was let go too early.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Generator
+from dataclasses import dataclass, field
+from typing import Any
+
+from disco_hw.config import Robot
+from drivers.types import PoseSample, WheelSample
+
+Wheels = tuple[float, float]
+
+SPEED_SHARE = 0.1
+"""Of the robot's largest wheel speed: what is driven at."""
+MOST_SHARE = 0.3
+"""Of it: the largest command, for wheels that need so much before they turn at all."""
+RUNAWAY_SHARE = 0.25
+"""Of it: a wheel that is measured faster has got out of hand."""
+SIDES = ("left", "right")
+_RAMP_S = 6.0
+_MOVED_RAD = 0.4
+_REST_S = 1.0
+_TURNS_LIMIT_S = 90.0
+_BEFORE_SILENCE_S = 1.5
+_SILENCE_S = 2.5
+_LONG_ENOUGH_S = 1.5
+SLOWING = 0.8
+"""A wheel is slowing down below this share of its speed."""
+_RESET_S = 3.0
+_STRAIGHT_M = 0.5
+_SHORT_M = 0.25
+
+
+@dataclass(frozen=True, slots=True)
+class Drive:
+    """Drive at these wheel speeds (rad/s, left and right) while the deadman is held; `todo`: for the person."""
+
+    wheels: Wheels
+    todo: str
+
+
+@dataclass(frozen=True, slots=True)
+class Silence:
+    """Send nothing at all, as a host that has died."""
+
+    todo: str
+
+
+@dataclass(frozen=True, slots=True)
+class Ask:
+    """Stand, and wait for one of the keys."""
+
+    question: str
+    keys: str
+
+
+@dataclass(frozen=True, slots=True)
+class Reset:
+    """Let go, and clear the fault that a silence has left."""
+
+    todo: str
+
+
+Action = Drive | Silence | Ask | Reset
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """What a tick saw: whether the wheels were driven in it, what was commanded (rad/s), and what came in.
+
+    `fault`: the robot has one; `silent`: nothing was sent; `held`: the person held the deadman.
+    """
+
+    now_ns: int
+    driving: bool
+    commanded: Wheels | None
+    wheels: tuple[WheelSample, ...] = ()
+    poses: tuple[PoseSample, ...] = ()
+    fault: bool = False
+    silent: bool = False
+    held: bool = True
+
+
+Steps = Generator[Action, Any, Any]
+
+
+@dataclass
+class Track:
+    """One stretch of driving: commands (t_ns, left, right), wheel samples and poses as they came."""
+
+    commands: list[tuple[int, float, float]] = field(default_factory=list)
+    wheels: list[WheelSample] = field(default_factory=list)
+    poses: list[PoseSample] = field(default_factory=list)
+    silent_ns: int | None = None
+    """When the last command before a silence was sent."""
+    ended_ns: int | None = None
+    """When frames were sent again, because the robot had stopped by itself or the person had let go."""
+
+    def add(self, seen: Seen) -> None:
+        """Take in a tick."""
+        if seen.commanded is not None:
+            self.commands.append((seen.now_ns, *seen.commanded))
+        self.wheels += seen.wheels
+        self.poses += seen.poses
+
+    def turned(self) -> Wheels:
+        """How far the wheels have turned since its beginning (rad)."""
+        if not self.wheels:
+            return 0.0, 0.0
+        first, last = self.wheels[0], self.wheels[-1]
+        return last.left_angle_rad - first.left_angle_rad, last.right_angle_rad - first.right_angle_rad
+
+    def fastest(self) -> float:
+        """The faster wheel of the newest sample, without its sign (rad/s)."""
+        if not self.wheels:
+            return 0.0
+        return max(abs(self.wheels[-1].left_speed_rad_s), abs(self.wheels[-1].right_speed_rad_s))
+
+
+@dataclass(frozen=True)
+class SideSeen:
+    """One side was asked to turn forward: what the person saw ("lf", "lb", "rf", "rb", "" for nothing), the track."""
+
+    seen: str
+    track: Track
+    ran_away: bool
+
+
+SAW = {"1": "lf", "2": "lb", "3": "rf", "4": "rb", "0": ""}
+
+
+def sides(robot: Robot) -> Steps:
+    """Wheels up, each side forward alone: which one turns, which way, and whose encoder counts how.
+
+    Returns a SideSeen each, left before right.
+    """
+    top = robot.max_wheel_speed_rad_s
+    found = []
+    for side in (0, 1):
+        track, ran_away = yield from _ramp(side, top)
+        key = yield Ask(
+            f"asked the {SIDES[side]} side to turn forward. What turned? "
+            "1 left forward, 2 left backward, 3 right forward, 4 right backward, 0 nothing",
+            "12340",
+        )
+        found.append(SideSeen(SAW[key], track, ran_away))
+    return found
+
+
+def _ramp(side: int, top_rad_s: float) -> Steps:
+    """Speed one side up until a wheel has moved; its track, with the stop, and whether a wheel ran away."""
+    todo = f"hold: the {SIDES[side]} side speeds up slowly"
+    while True:
+        track, start_ns, over = Track(), 0, False
+        while not over:
+            elapsed_s = (track.commands[-1][0] - start_ns) * 1e-9 if track.commands else 0.0
+            speed = top_rad_s * MOST_SHARE * min(1.0, elapsed_s / _RAMP_S)
+            seen: Seen = yield Drive((speed, 0.0) if side == 0 else (0.0, speed), todo)
+            if not seen.driving and track.commands:
+                break
+            if seen.driving:
+                start_ns = start_ns or seen.now_ns
+                track.add(seen)
+                over = elapsed_s >= _RAMP_S or _moved(track, top_rad_s)
+        ran_away = track.fastest() > RUNAWAY_SHARE * top_rad_s
+        if over or max(map(abs, track.turned())) > 0.25 * _MOVED_RAD:
+            seen = yield from _rest(track, _REST_S, "hold: it stops")
+            yield from _clear(seen)
+            return track, ran_away
+
+
+def _moved(track: Track, top_rad_s: float) -> bool:
+    far = max(map(abs, track.turned())) > _MOVED_RAD
+    return (far and track.fastest() >= SPEED_SHARE * top_rad_s) or track.fastest() > RUNAWAY_SHARE * top_rad_s
+
+
+def _rest(track: Track, seconds: float, todo: str) -> Steps:
+    """Hold zero for so long, recorded; a deadman that is let go here is as good. Returns the last tick."""
+    end_ns = 0
+    while True:
+        seen: Seen = yield Drive((0.0, 0.0), todo)
+        end_ns = end_ns or seen.now_ns + round(seconds * 1e9)
+        track.add(seen)
+        if seen.now_ns >= end_ns:
+            return seen
+
+
+@dataclass(frozen=True)
+class TurnsSeen:
+    """One turn of either side, as the person judged it, and the silence that the watchdog had to end."""
+
+    turns: tuple[Track, Track]
+    watchdog: Track
+
+
+def turns(robot: Robot) -> Steps:
+    """Wheels up: ticks a turn, by letting go after exactly one turn; then the watchdog. Returns a TurnsSeen."""
+    speed = SPEED_SHARE * robot.max_wheel_speed_rad_s
+    tracks = []
+    for side in (0, 1):
+        wheels = (speed, 0.0) if side == 0 else (0.0, speed)
+        todo = f"put a mark on the {SIDES[side]} wheel; hold, and let go when it has gone round exactly once"
+        while True:
+            track = yield from _until_let_go(wheels, todo)
+            key = yield Ask(f"was that one turn of the {SIDES[side]} wheel? y yes, n again", "yn")
+            if key == "y":
+                break
+        tracks.append(track)
+    watchdog = yield from _watchdog((speed, speed))
+    return TurnsSeen((tracks[0], tracks[1]), watchdog)
+
+
+def _until_let_go(wheels: Wheels, todo: str) -> Steps:
+    track = Track()
+    while True:
+        seen: Seen = yield Drive(wheels, todo)
+        if seen.driving:
+            track.add(seen)
+            if (seen.now_ns - track.commands[0][0]) * 1e-9 > _TURNS_LIMIT_S:
+                return track
+        elif track.commands:
+            return track
+
+
+def _watchdog(wheels: Wheels) -> Steps:
+    """Turn, then fall silent; the track says whether the robot stopped by itself."""
+    while True:
+        track = Track()
+        while not track.commands or (track.commands[-1][0] - track.commands[0][0]) * 1e-9 < _BEFORE_SILENCE_S:
+            seen: Seen = yield Drive(wheels, "hold: both sides turn, then this computer falls silent for a moment")
+            if not seen.driving and track.commands:
+                break
+            if seen.driving:
+                track.add(seen)
+        else:
+            track.silent_ns = seen.now_ns
+            while (seen.now_ns - track.silent_ns) * 1e-9 < _SILENCE_S:
+                seen = yield Silence("hold: the robot must stop by itself now")
+                if not (seen.silent or track.ended_ns):
+                    track.ended_ns = seen.now_ns
+                    if not seen.held and (seen.now_ns - track.silent_ns) * 1e-9 < _LONG_ENOUGH_S:
+                        break
+                track.wheels += seen.wheels
+            else:
+                yield from _clear(seen)
+                return track
+
+
+def _clear(seen: Seen) -> Steps:
+    """Have a fault cleared that was brought about on purpose."""
+    begun_ns = seen.now_ns
+    while seen.fault and (seen.now_ns - begun_ns) * 1e-9 < _RESET_S:
+        seen = yield Reset("let go: the controller reports what was done to it as a fault, which is cleared")
+
+
+@dataclass(frozen=True)
+class FloorSeen:
+    """The drive on the floor: straight, half a turn left, half a turn right, a quarter left, straight again."""
+
+    straight: Track
+    left: Track
+    right: Track
+    straight_again: Track
+
+
+def floor(robot: Robot) -> Steps:
+    """On the floor, half a metre straight, half a turn each way, a quarter, a quarter of a metre; a FloorSeen.
+
+    Each ends where the wheels say so, or after half as long again as it should take.
+    """
+    ahead, left, right = (1.0, 1.0), (-1.0, 1.0), (1.0, -1.0)
+    straight = yield from _leg(robot, ahead, _STRAIGHT_M, "half a metre straight on")
+    turned_left = yield from _leg(robot, left, 0.5 * math.pi * robot.axial_distance_m, "half a turn to the left")
+    turned_right = yield from _leg(robot, right, 0.5 * math.pi * robot.axial_distance_m, "half a turn to the right")
+    yield from _leg(robot, left, 0.25 * math.pi * robot.axial_distance_m, "a quarter turn to the left")
+    again = yield from _leg(robot, ahead, _SHORT_M, "a quarter of a metre straight on")
+    return FloorSeen(straight, turned_left, turned_right, again)
+
+
+def _leg(robot: Robot, shares: Wheels, travel_m: float, what: str) -> Steps:
+    """Both wheels at a tenth of the speed, one way each, until they have travelled so far; with a rest on both sides.
+
+    Let go on the way, it goes on from there with what is left.
+    """
+    speed = SPEED_SHARE * robot.max_wheel_speed_rad_s
+    wheels = (speed * shares[0], speed * shares[1])
+    limit_s = 1.5 * travel_m / (speed * robot.wheel_radius_m)
+    track, driven_ns, last_ns = Track(), 0, 0
+    while not track.commands or not _at_rest_long(track):
+        seen: Seen = yield Drive((0.0, 0.0), f"hold: {what}")
+        if seen.driving:
+            track.add(seen)
+    while driven_ns * 1e-9 < limit_s:
+        left, right = track.turned()
+        if 0.5 * (abs(left) + abs(right)) * robot.wheel_radius_m >= travel_m:
+            break
+        seen = yield Drive(wheels, f"hold: {what}")
+        driven_ns += seen.now_ns - last_ns if seen.driving and last_ns else 0
+        last_ns = seen.now_ns
+        track.add(seen)
+    yield from _rest(track, _REST_S, f"hold: {what}, done")
+    return track
+
+
+def _at_rest_long(track: Track) -> bool:
+    return (track.commands[-1][0] - track.commands[0][0]) * 1e-9 >= _REST_S
+
+
+class Procedure:
+    """Runs steps: `step` once a tick gives what is wanted, `answer` hands it a key; `result` is what they returned."""
+
+    def __init__(self, steps: Steps) -> None:
+        self._steps = steps
+        self._action: Action | None = next(steps)
+        self.result: Any = None
+
+    @property
+    def action(self) -> Action | None:
+        """What is wanted now; None when all is done."""
+        return self._action
+
+    def see(self, seen: Seen) -> None:
+        """Hand on what the tick saw; a question waits for its answer instead."""
+        if self._action is not None and not isinstance(self._action, Ask):
+            self._send(seen)
+
+    def answer(self, key: str) -> bool:
+        """Answer the question that waits; whether this key is one of its answers."""
+        if not isinstance(self._action, Ask) or key not in self._action.keys:
+            return False
+        self._send(key)
+        return True
+
+    def _send(self, value: Seen | str) -> None:
+        try:
+            self._action = self._steps.send(value)
+        except StopIteration as end:
+            self._action, self.result = None, end.value

@@ -1,0 +1,253 @@
+"""A virtual robot whose wiring, ticks or poses are wrong, and a person who looks at its wheels; in simulated time."""
+
+from __future__ import annotations
+
+import math
+import socket
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+
+import disco_hw
+from disco_hw.drive.source import ManualInput
+from disco_hw.errors import WorkError
+from disco_hw.experiments.live_stack import DEVICES
+from disco_hw.experiments.simulated_time import SimulatedRun
+from disco_hw.first_use.pilot import CommissionPilot
+from disco_hw.first_use.procedure import Ask, Drive, Procedure
+from disco_hw.runtime.pipeline import NoPlanner
+from disco_hw.runtime.robot_setup import load_setup
+from disco_hw.runtime.states import State
+from drivers.transport import connect_pair
+from drivers.types import OutgoingFrame
+from firmware_protocol.firmware_core import FirmwareConfig
+from sim.body_dynamics import BodyPose
+from sim.devices import find_controller
+from sim.effects import hidden_effects
+from sim.plant import Plant
+from sim.plant_parameters import PlantParameters
+from sim.pose_sender import PoseSender
+from sim.vendor_robot import VendorRobot
+from sim.virtual_robot import STEP_US, VirtualRobot
+
+SHIPPED = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
+
+
+@dataclass(frozen=True)
+class Miswiring:
+    """What is wrong, in the robot's own terms: signs and places of motors and encoders, true turns for each told one.
+
+    `dead_encoders`: sides whose encoder stands still. `pose`: what the sensor makes of (x, y, yaw).
+    """
+
+    swapped: bool = False
+    crossed: bool = False
+    motors: tuple[int, int] = (1, 1)
+    encoders: tuple[int, int] = (1, 1)
+    ratio: float = 1.0
+    dead_encoders: tuple[int, ...] = ()
+    pose: object = None
+
+
+class MiswiredPlant:
+    """A plant behind the wrong wires: everything but `physical` is as its controller sees it."""
+
+    def __init__(self, plant, wrong, sink):
+        self._plant, self._wrong, self._sink = plant, wrong, sink
+
+    def __getattr__(self, name):
+        return getattr(self._plant, name)
+
+    @property
+    def physical(self):
+        return self._plant.truth
+
+    def step(self, until_us, left, right, enabled=True, brake=False):
+        wrong = self._wrong
+        if wrong.swapped:
+            left, right = right, left
+        turned = [way * speed * wrong.ratio for way, speed in zip(wrong.motors, (left, right), strict=True)]
+        for pose in self._plant.step(until_us, *turned, enabled, brake):
+            x, y, yaw = (pose.x_m, pose.y_m, pose.yaw_rad)
+            if wrong.pose is not None:
+                x, y, yaw = wrong.pose(x, y, yaw)
+            self._sink(msgspec.structs.replace(pose, x_m=x, y_m=y, yaw_rad=yaw), until_us)
+        return []
+
+    def _told(self, of_sides):
+        wrong = self._wrong
+        told = [
+            0 if side in wrong.dead_encoders else way * value / wrong.ratio
+            for side, (way, value) in enumerate(zip(wrong.encoders, of_sides, strict=True))
+        ]
+        return told[::-1] if wrong.swapped != wrong.crossed else told
+
+    @property
+    def encoder_ticks(self):
+        left, right = self._told(self._plant.encoder_ticks)
+        return round(left), round(right)
+
+    @property
+    def measured_wheel_speeds_rad_s(self):
+        return tuple(self._told(self._plant.measured_wheel_speeds_rad_s))
+
+    @property
+    def truth(self):
+        """For a released motor, which rolls on as it did, as its own channel would say it."""
+        true = self._plant.truth
+        speeds = [
+            way * speed / self._wrong.ratio
+            for way, speed in zip(self._wrong.motors, (true.left_speed_rad_s, true.right_speed_rad_s), strict=True)
+        ]
+        if self._wrong.swapped:
+            speeds.reverse()
+        return msgspec.structs.replace(true, left_speed_rad_s=speeds[0], right_speed_rad_s=speeds[1])
+
+
+class MiswiredRobot:
+    """On an in-process link; its poses come by datagrams."""
+
+    def __init__(self, setup, plant, wrong, effects=None, seed=1):
+        self.sender = PoseSender((setup.config.pose.address, setup.config.pose.port))
+        self.plant = MiswiredPlant(
+            Plant(plant, hidden_effects(effects or {}), seed, BodyPose(0.3, -0.2, 0.5)), wrong, self.sender.send
+        )
+        config = setup.config
+        name = config.link.driver
+        if name in (None, "reference"):
+            robot = config.robot
+            firmware = FirmwareConfig(
+                ticks_per_rev=plant.ticks_per_rev,
+                max_wheel_speed_rad_s=robot.max_wheel_speed_rad_s,
+                max_wheel_acceleration_rad_s2=robot.max_wheel_acceleration_rad_s2,
+            )
+            self.board = VirtualRobot(self.plant, firmware)
+        else:
+            self.board = VendorRobot(self.plant, find_controller(name)(config.link.settings(), plant.ticks_per_rev))
+        self.host, self.link = connect_pair()
+        self.host.open()
+        self.link.open()
+        self._now_us = 0
+
+    def advance(self, until_us):
+        while self._now_us < until_us:
+            self._now_us += STEP_US
+            for received in self.link.receive():
+                self.board.receive(self._now_us, received.frame)
+            for frame in self.board.step(self._now_us):
+                self.link.send(OutgoingFrame(frame, 1 << 62), self._now_us * 1000)
+
+    def close(self):
+        self.sender.close()
+
+
+class Person:
+    """Holds the deadman while something is to be driven, looks at the wheels, answers; satisfies ManualSource."""
+
+    completed, words, task, ended = True, "a person", "", None
+
+    def __init__(self, plant):
+        self.plant, self.pilot = plant, None
+        self.angles, self.last_us = [0.0, 0.0], None
+        self._open_ns = self._asked_ns = None
+        self._from, self._held_ns, self._let_go = (0.0, 0.0), None, False
+        self.strokes = 0
+
+    @property
+    def action(self):
+        return self.pilot.procedure.action
+
+    def look(self):
+        true = self.plant.physical
+        now = true.t_us
+        if self.last_us is not None:
+            for side, speed in enumerate((true.left_speed_rad_s, true.right_speed_rad_s)):
+                self.angles[side] += speed * (now - self.last_us) * 1e-6
+        self.last_us = now
+        return list(self.angles)
+
+    def turned(self):
+        return [now - before for now, before in zip(self.angles, self._from, strict=True)]
+
+    def poll(self, now_ns, robot):
+        self.look()
+        wanted = self.action is not None and not isinstance(self.action, Ask)
+        counting = isinstance(self.action, Drive) and "exactly once" in self.action.todo
+        if counting and max(map(abs, self.turned())) >= 2.0 * math.pi:
+            self._let_go = True
+        if not counting:
+            self._let_go = False
+        held = wanted and not self._let_go and robot.state in (State.READY, State.ARMED)
+        if held and self._held_ns is None:
+            # Open once, then pressed.
+            self._held_ns, self._from = now_ns, tuple(self.angles)
+            self.strokes += 1
+            return ManualInput(now_ns, 0.0, 0.0, deadman=False)
+        if held and not robot.driving and isinstance(self.action, Drive) and now_ns - self._held_ns > 3_000_000_000:
+            held = False
+        if not held:
+            self._held_ns = None
+        return ManualInput(now_ns, 0.0, 0.0, deadman=held)
+
+    def keys(self):
+        if not isinstance(self.action, Ask):
+            self._asked_ns = None
+            return ""
+        self.strokes += 1
+        if "exactly" in self.action.question or "one turn" in self.action.question:
+            self._let_go, self._from = False, tuple(self.angles)
+            return "y"
+        turned = self.turned()
+        side = max((0, 1), key=lambda k: abs(turned[k]))
+        if abs(turned[side]) < 0.05:
+            return "0"
+        return str(1 + 2 * side + (turned[side] < 0.0))
+
+    def close(self):
+        pass
+
+
+def free_port():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened:
+        opened.bind(("127.0.0.1", 0))
+        return opened.getsockname()[1]
+
+
+def robot_file(directory, driver=None):
+    """The shipped robot with poses by datagrams and another controller."""
+    text = SHIPPED.read_text(encoding="utf-8").replace(
+        '"wombot_model.toml"', f'"{SHIPPED.parent / "wombot_model.toml"}"'
+    )
+    if driver not in (None, "reference"):
+        text = text.replace("[link]\n", f'[link]\ndriver = "{driver}"\n{DEVICES[driver]}')
+    path = directory / "robot.toml"
+    path.write_text(text + f'\n[pose]\nsource = "udp"\nport = {free_port()}\n', encoding="utf-8")
+    return path
+
+
+def stage(path, steps, wrong, plant=None, effects=None, seed=1, raw_poses=False, limit_s=300.0):
+    """Go through one stage of the guided drive; its result and the run."""
+    from disco_hw.first_use.commission import as_sent
+
+    setup = load_setup(path)
+    if raw_poses:
+        setup = as_sent(setup)
+    robot = MiswiredRobot(setup, plant or PlantParameters(), wrong, effects, seed)
+    person = Person(robot.plant)
+    pilot = CommissionPilot(Procedure(steps(setup.config.robot)), person, person.keys)
+    person.pilot = pilot
+    run = SimulatedRun(setup, robot, NoPlanner(), pilot)
+    run.where = []
+    try:
+        for tick in run.ticks(limit_s):
+            run.where.append((tick.command, robot.plant.physical))
+            if pilot.done:
+                break
+    finally:
+        robot.close()
+        run.core.pose_source.close()
+    assert pilot.done, f"stuck at {pilot.procedure.action}: {run.core.last.output}"
+    if pilot.trouble is not None:
+        raise WorkError(pilot.trouble)
+    return pilot.procedure.result, run, person
