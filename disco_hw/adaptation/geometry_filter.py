@@ -1,12 +1,16 @@
-"""An extended Kalman filter that learns the geometry with the pose: seconds after a change it follows.
+"""Extended Kalman filters that learn the geometry with the pose: seconds after a change they follow.
 
 State: x, y, yaw; wheel radius, axial distance, x_icr; and the slip of either wheel, which comes and goes by itself (a
 first-order Gauss-Markov process). Driven by the turns of the wheels, corrected by the poses at their own time stamps.
 
+One filter is believed. Beside it run some that say "the robot has just changed": copies whose parameters, all of them
+or one, were opened at different times. One that has explained the poses since then so much better that this outweighs
+how seldom a robot changes is believed from then on (a generalised likelihood ratio test for the time of a change,
+Willsky and Jones 1976; the least likely is replaced by a new one).
+
 What nothing excites stays as it is: a robot that stands gives no evidence at all, and the parameters may change only as
 far as the robot drives (the radius) or turns (the other two), so a straight line leaves axle and x_icr alone. When
-poses go on to disagree with what the filter predicts, the robot has changed, and the parameters are opened anew, never
-wider than they were believed at first; when they jump, it was carried, and the pose is taken anew as well.
+poses jump, the robot was carried: the pose is taken anew, and the parameters are opened.
 """
 
 from __future__ import annotations
@@ -28,14 +32,17 @@ DRIFT_PER_SQRT_M, DRIFT_PER_SQRT_RAD = 0.001, 0.002
 LEAST_STD = 0.002
 """A parameter is never believed closer than this, by its size."""
 OPENED = 0.12
-"""Standard deviation, by size, that a parameter is opened to when the robot has changed."""
-CHANGED_SIGMAS, CHANGED_S = 3.5, 1.0
-"""Innovations that go on to one side (forward, left or round), averaged over so long, mean a change beyond so many
-standard deviations of that average: those of a filter that knows its robot are white."""
+"""Standard deviation, by size, that a parameter is opened to where it may have changed."""
+KINDS = np.array([(1.0, 1.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)])
+"""What may change at once: all three, or one."""
+DOUBTERS, DOUBT_S, DOUBT_LASTS_S = 16, 0.5, 4.0
+"""Filters beside the one that is believed, how much driving lies between their beginnings, and how much proves none."""
+CHANGE_LOG_ODDS = -5.0
+"""Of a change of one kind having come with one of these beginnings."""
+MOST_BY_A_POSE = 2.0
+"""Log odds that one pose can win or lose for a change: a jolt, or a wrong pose, is short."""
 MISFIT_POSES = 50.0
-"""Over how many poses the size of the innovations is averaged, by which their standard deviations are scaled."""
-EXCITED_M, EXCITED_RAD = 0.03, 0.1
-"""Only a robot that has driven or turned so much in CHANGED_S can show that its radius, or axle and x_icr, changed."""
+"""Over how many poses the size of the innovations is averaged, by which standard deviations are scaled in that test."""
 CARRIED_M, CARRIED_RAD, CARRIED_POSES = 0.15, 0.3, 6
 """Poses so far from the prediction, so many in a row: the robot was carried."""
 WORST_POSE_STD_M = 0.03
@@ -45,9 +52,101 @@ _WAIT_NS = 600_000_000
 """Wheel samples wait so long for a pose, and a pose stamped later than that after them is none: the tick that takes
 them in must not have to follow seconds of wheels at once, nor keep them for ever."""
 _STANDS_RAD = 1e-4
+_SLIDING_S = 0.05
+"""How long the body's sideways speed lags behind its turning."""
+_STRIDE_S = 0.045
+"""Wheel samples between two poses are followed together, along one arc, for so long."""
 _ROUGH_M, _ROUGH_RAD = 2e-4, 5e-4
 _X, _Y, _YAW, _RADIUS, _AXLE, _X_ICR, _LEFT, _RIGHT = range(8)
 _THETA = slice(_RADIUS, _X_ICR + 1)
+_DRIVEN, _EVERY = [_RADIUS, _AXLE, _LEFT, _RIGHT], range(8)
+
+
+class _Bank:
+    """Some filters, each a row of `state` (N, 8) and `covariance` (N, 8, 8) in the order above."""
+
+    def __init__(self, theta: Array, covariance: Array) -> None:
+        self.state, self.covariance = np.zeros((1, 8)), np.zeros((1, 8, 8))
+        self.state[0, _THETA], self.covariance[0, _THETA, _THETA] = theta, covariance
+        self._turn_rad_s = np.zeros(1)
+
+    def predict(self, left: float, right: float, dt_s: float) -> None:
+        """Follow wheels that turned so far (rad)."""
+        state = self.state
+        _, _, yaw, radius, axle, x_icr, slip_left, slip_right = state.T
+        way_left, way_right = radius * left * (1.0 - slip_left), radius * right * (1.0 - slip_right)
+        way, turn = 0.5 * (way_left + way_right), (way_right - way_left) / axle
+        cosine, sine = np.cos(yaw + 0.5 * turn), np.sin(yaw + 0.5 * turn)
+        keep = math.exp(-dt_s / SLIP_S)
+
+        # Derivatives of way and turn by (radius, axle, slip left, slip right), then of the displacement.
+        by_way = np.stack([way / radius, 0.0 * way, -0.5 * radius * left, -0.5 * radius * right], axis=1)
+        by_turn = np.stack([turn / radius, -turn / axle, radius * left / axle, -radius * right / axle], axis=1)
+        x_by_turn = -0.5 * way * sine + x_icr * (sine + 0.5 * turn * cosine)
+        y_by_turn = 0.5 * way * cosine - x_icr * (cosine - 0.5 * turn * sine)
+        move_x, move_y = way * cosine + x_icr * turn * sine, way * sine - x_icr * turn * cosine
+        step = np.broadcast_to(np.eye(8), (len(state), 8, 8)).copy()
+        step[:, _X, _YAW], step[:, _Y, _YAW] = -move_y, move_x
+        step[:, _X, _X_ICR], step[:, _Y, _X_ICR] = turn * sine, -turn * cosine
+        step[:, _X, _DRIVEN] = by_way * cosine[:, None] + by_turn * x_by_turn[:, None]
+        step[:, _Y, _DRIVEN] = by_way * sine[:, None] + by_turn * y_by_turn[:, None]
+        step[:, _YAW, _DRIVEN] = by_turn
+        step[:, _LEFT, _LEFT] = step[:, _RIGHT, _RIGHT] = keep
+
+        noise = np.empty((len(state), 8))
+        distance = np.abs(way)
+        # A body that begins or ends a turn slides to its new motion.
+        slid_m = x_icr * _SLIDING_S * (turn / dt_s - self._turn_rad_s)
+        self._turn_rad_s = turn / dt_s
+        noise[:, _X] = noise[:, _Y] = _ROUGH_M**2 * distance / 0.01 + slid_m**2
+        noise[:, _YAW] = _ROUGH_RAD**2 * distance / 0.01
+        noise[:, _RADIUS] = (DRIFT_PER_SQRT_M * radius) ** 2 * distance
+        noise[:, _AXLE] = (DRIFT_PER_SQRT_RAD * axle) ** 2 * np.abs(turn)
+        noise[:, _X_ICR] = (DRIFT_PER_SQRT_RAD * x_icr) ** 2 * np.abs(turn)
+        noise[:, _LEFT:] = SLIP_STD**2 * (1.0 - keep * keep)
+        covariance = step @ self.covariance @ step.transpose(0, 2, 1)
+        covariance[:, _EVERY, _EVERY] += noise
+        self.covariance = covariance
+        state[:, _X] += move_x
+        state[:, _Y] += move_y
+        state[:, _YAW] += turn
+        state[:, _LEFT:] *= keep
+
+    def expect(self, pose: PoseSample) -> tuple[Array, Array]:
+        """Innovations (N, 3) of a pose, and their covariances (N, 3, 3)."""
+        innovation = np.array([pose.x_m, pose.y_m, pose.yaw_rad]) - self.state[:, :3]
+        innovation[:, 2] -= 2.0 * math.pi * np.round(innovation[:, 2] / (2.0 * math.pi))
+        variances = np.array([pose.position_std_m, pose.position_std_m, pose.yaw_std_rad]) ** 2
+        return innovation, self.covariance[:, :3, :3] + np.diag(variances)
+
+    def correct(self, innovation: Array, expected: Array, low: Array, high: Array) -> None:
+        """Take a pose in; the parameters stay between `low` and `high`."""
+        gain = np.linalg.solve(expected, self.covariance[:, :3]).transpose(0, 2, 1)
+        self.state += (gain @ innovation[:, :, None])[:, :, 0]
+        covariance = self.covariance - gain @ expected @ gain.transpose(0, 2, 1)
+        self.covariance = 0.5 * (covariance + covariance.transpose(0, 2, 1))
+        self.state[:, _THETA] = np.clip(self.state[:, _THETA], low, high)
+
+    def keep(self, rows: NDArray[np.int64]) -> None:
+        """Go on with these rows only, in this order; one may come twice."""
+        self.state, self.covariance = self.state[rows], self.covariance[rows]
+        self._turn_rad_s = self._turn_rad_s[rows]
+
+    def open(self, row: int, widest: Array) -> None:
+        """Let the parameters of a row be as wide as this (3,), or as they are."""
+        block = self.covariance[row, _THETA, _THETA]
+        block += np.diag(np.maximum(widest**2 - np.diag(block), 0.0))
+
+    def place(self, pose: PoseSample) -> None:
+        """Take the pose as it was measured; what is believed of the robot stays."""
+        self.state[:, :3] = pose.x_m, pose.y_m, pose.yaw_rad
+        self.state[:, _LEFT:] = 0.0
+        theta = self.covariance[:, _THETA, _THETA].copy()
+        self.covariance[:] = 0.0
+        self.covariance[:, _THETA, _THETA] = theta
+        spread = [pose.position_std_m**2, pose.position_std_m**2, pose.yaw_std_rad**2]
+        self.covariance[:, range(3), range(3)] = spread
+        self.covariance[:, _LEFT, _LEFT] = self.covariance[:, _RIGHT, _RIGHT] = SLIP_STD**2
 
 
 class GeometryFilter:
@@ -66,26 +165,22 @@ class GeometryFilter:
 
     def reset(self) -> None:
         """Believe again what was believed at first, of a robot that may be anywhere."""
-        self._state = np.zeros(8)
-        self._state[_THETA] = self._first
-        self._covariance = np.zeros((8, 8))
-        self._covariance[_THETA, _THETA] = self._first_covariance
+        self._bank = _Bank(self._first, self._first_covariance)
+        self._log_odds, self._age_s, self._moved_s = np.zeros(1), np.zeros(1), 0.0
         self._placed = False
         self._at: WheelSample | None = None
-        self._rolled_rad = 0.0
+        self._rolled_rad, self._due = 0.0, np.zeros(3)
         self._misfit, self._astray = 1.0, 0
-        self._one_sided, self._last_pose_ns = np.zeros(3), 0
-        self._way_m = self._turn_rad = 0.0
 
     @property
     def mean(self) -> Array:
         """Wheel radius, axial distance, x_icr (m)."""
-        return np.array(self._state[_THETA])
+        return np.array(self._bank.state[0, _THETA])
 
     @property
     def covariance(self) -> Array:
         """Of the mean, with the least standard deviation that is believed."""
-        found = self._covariance[_THETA, _THETA] + np.diag((LEAST_STD * self._state[_THETA]) ** 2)
+        found = self._bank.covariance[0, _THETA, _THETA] + np.diag((LEAST_STD * self.mean) ** 2)
         return np.asarray(0.5 * (found + found.T))
 
     @property
@@ -135,45 +230,17 @@ class GeometryFilter:
         if turned < _STANDS_RAD or not self._placed:
             return
         self._rolled_rad += turned
-        self._predict(left, right, (sample.t_ns - before.t_ns) * 1e-9)
+        self._due += (left, right, (sample.t_ns - before.t_ns) * 1e-9)
+        if self._due[2] > _STRIDE_S:
+            self._predict()
 
-    def _predict(self, left: float, right: float, dt_s: float) -> None:
-        state = self._state
-        _, _, yaw, radius, axle, x_icr, slip_left, slip_right = state.tolist()
-        way_left, way_right = radius * left * (1.0 - slip_left), radius * right * (1.0 - slip_right)
-        way, turn = 0.5 * (way_left + way_right), (way_right - way_left) / axle
-        cosine, sine = math.cos(yaw + 0.5 * turn), math.sin(yaw + 0.5 * turn)
-        keep = math.exp(-dt_s / SLIP_S)
-        state[_X] += way * cosine + x_icr * turn * sine
-        state[_Y] += way * sine - x_icr * turn * cosine
-        state[_YAW] += turn
-        state[_LEFT] *= keep
-        state[_RIGHT] *= keep
-
-        # Derivatives of way and turn by (radius, axle, slip left, slip right), then of the displacement.
-        by_way = (way / radius, 0.0, -0.5 * radius * left, -0.5 * radius * right)
-        by_turn = (turn / radius, -turn / axle, radius * left / axle, -radius * right / axle)
-        x_by_turn = -0.5 * way * sine + x_icr * (sine + 0.5 * turn * cosine)
-        y_by_turn = 0.5 * way * cosine - x_icr * (cosine - 0.5 * turn * sine)
-        step = np.eye(8)
-        step[_X, _YAW], step[_Y, _YAW] = -way * sine + x_icr * turn * cosine, way * cosine + x_icr * turn * sine
-        step[_X, _X_ICR], step[_Y, _X_ICR] = turn * sine, -turn * cosine
-        for column, d_way, d_turn in zip((_RADIUS, _AXLE, _LEFT, _RIGHT), by_way, by_turn, strict=True):
-            step[_X, column] = d_way * cosine + d_turn * x_by_turn
-            step[_Y, column] = d_way * sine + d_turn * y_by_turn
-            step[_YAW, column] = d_turn
-        step[_LEFT, _LEFT] = step[_RIGHT, _RIGHT] = keep
-        recent = math.exp(-dt_s / CHANGED_S)
-        self._way_m, self._turn_rad = recent * self._way_m + abs(way), recent * self._turn_rad + abs(turn)
-        covariance = step @ self._covariance @ step.T
-        distance = abs(way)
-        noise = [_ROUGH_M**2 * distance / 0.01, _ROUGH_M**2 * distance / 0.01, _ROUGH_RAD**2 * distance / 0.01]
-        noise.append((DRIFT_PER_SQRT_M * radius) ** 2 * distance)
-        noise.append((DRIFT_PER_SQRT_RAD * axle) ** 2 * abs(turn))
-        noise.append((DRIFT_PER_SQRT_RAD * x_icr) ** 2 * abs(turn))
-        noise += [SLIP_STD**2 * (1.0 - keep * keep)] * 2
-        covariance[np.diag_indices(8)] += noise
-        self._covariance = covariance
+    def _predict(self) -> None:
+        """Follow the wheels since the last prediction."""
+        left, right, dt_s = self._due.tolist()
+        self._due[:] = 0.0
+        self._moved_s += dt_s
+        if dt_s > 0.0:
+            self._bank.predict(left, right, dt_s)
 
     def _take(self, pose: PoseSample) -> None:
         if not self._placed:
@@ -182,63 +249,55 @@ class GeometryFilter:
         if self._rolled_rad < _STANDS_RAD:
             return
         self._rolled_rad = 0.0
-        state, covariance = self._state, self._covariance
-        measured = np.array([pose.x_m, pose.y_m, pose.yaw_rad])
-        innovation = measured - state[:3]
-        innovation[2] = math.remainder(float(innovation[2]), 2.0 * math.pi)
-        variances = np.array([pose.position_std_m, pose.position_std_m, pose.yaw_std_rad]) ** 2
-        expected = covariance[:3, :3] + np.diag(variances)
+        self._predict()
+        innovations, spreads = self._bank.expect(pose)
+        innovation, expected = innovations[0], spreads[0]
         far = math.hypot(*innovation[:2].tolist()) > max(CARRIED_M, 5.0 * math.sqrt(expected[0, 0] + expected[1, 1]))
         if far or abs(innovation[2]) > max(CARRIED_RAD, 5.0 * math.sqrt(expected[2, 2])):
             self._astray += 1
             if self._astray >= CARRIED_POSES:
                 self.carried += 1
-                self._open(True, True)
+                self._bank.open(0, self._widest())
                 self._place(pose)
             return
         self._astray = 0
         self.poses += 1
-        gain = np.linalg.solve(expected, covariance[:3]).T
-        misfit = float(innovation @ np.linalg.solve(expected, innovation)) / 3.0
-        self._misfit += (min(misfit, 20.0) - self._misfit) / MISFIT_POSES
-        changed = self._goes_on(pose.t_ns, innovation, expected)
-        state += gain @ innovation
-        covariance = covariance - gain @ expected @ gain.T
-        self._covariance = 0.5 * (covariance + covariance.T)
-        state[_THETA] = np.clip(state[_THETA], self._low, self._high)
-        driven, turned = self._way_m > EXCITED_M, self._turn_rad > EXCITED_RAD
-        if changed and (driven or turned):
+        squares = np.einsum("ni,ni->n", innovations, np.linalg.solve(spreads, innovations[:, :, None])[:, :, 0])
+        self._misfit += (min(float(squares[0]) / 3.0, 20.0) - self._misfit) / MISFIT_POSES
+        surprise = 0.5 * (squares / max(self._misfit, 1.0) + np.linalg.slogdet(spreads)[1])
+        self._log_odds += np.clip(surprise[0] - surprise, -MOST_BY_A_POSE, MOST_BY_A_POSE)
+        self._bank.correct(innovations, spreads, self._low, self._high)
+        best = int(np.argmax(self._log_odds))
+        if best:
             self.changes += 1
-            self._open(driven, turned)
+            self._only(best)
+        elif self._moved_s > DOUBT_S:
+            self._doubt()
 
-    def _goes_on(self, t_ns: int, innovation: Array, expected: Array) -> bool:
-        """Whether innovations have gone on to one side of the body for so long that the robot must have changed."""
-        elapsed_s, self._last_pose_ns = (t_ns - self._last_pose_ns) * 1e-9, t_ns
-        part = 1.0 - math.exp(-min(elapsed_s, 1.0) / CHANGED_S)
-        cosine, sine = math.cos(self._state[_YAW]), math.sin(self._state[_YAW])
-        x, y, yaw = innovation.tolist()
-        scale = np.sqrt(np.diag(expected) * max(self._misfit, 1.0))
-        self._one_sided += part * (
-            np.array([x * cosine + y * sine, y * cosine - x * sine, yaw]) / scale - self._one_sided
-        )
-        return bool(np.abs(self._one_sided).max() > CHANGED_SIGMAS * math.sqrt(part / (2.0 - part)))
+    def _doubt(self) -> None:
+        """Let new filters, one of each kind, say that the robot changes now; the least likely go."""
+        self._moved_s = 0.0
+        self._age_s[1:] += DOUBT_S
+        young = np.flatnonzero(self._age_s < DOUBT_LASTS_S)
+        kept = np.sort(young[np.argsort(-self._log_odds[young], kind="stable")[: 1 + DOUBTERS - len(KINDS)]])
+        self._bank.keep(np.concatenate([kept, np.zeros(len(KINDS), dtype=np.int64)]))
+        self._log_odds = np.concatenate([self._log_odds[kept], np.full(len(KINDS), CHANGE_LOG_ODDS)])
+        self._age_s = np.concatenate([self._age_s[kept], np.zeros(len(KINDS))])
+        for row, kind in enumerate(KINDS, start=len(kept)):
+            self._bank.open(row, self._widest() * kind)
+
+    def _only(self, row: int) -> None:
+        """Believe this filter, and forget the others."""
+        self._bank.keep(np.array([row]))
+        self._log_odds, self._age_s, self._moved_s = np.zeros(1), np.zeros(1), 0.0
+
+    def _widest(self) -> Array:
+        """Standard deviations (3,) of what may have changed, within the prior."""
+        return np.minimum(OPENED * np.abs(self.mean), (self._high - self._low) / math.sqrt(12.0))
 
     def _place(self, pose: PoseSample) -> None:
-        """Take the pose as it was measured; what is believed of the robot stays."""
-        self._state[:3] = pose.x_m, pose.y_m, pose.yaw_rad
-        self._state[_LEFT:] = 0.0
-        theta = self._covariance[_THETA, _THETA].copy()
-        self._covariance = np.zeros((8, 8))
-        self._covariance[_THETA, _THETA] = theta
-        spread = [pose.position_std_m**2, pose.position_std_m**2, pose.yaw_std_rad**2]
-        np.fill_diagonal(self._covariance[:3, :3], spread)
-        self._covariance[_LEFT, _LEFT] = self._covariance[_RIGHT, _RIGHT] = SLIP_STD**2
+        """Take the pose as it was measured."""
+        self._only(0)
+        self._bank.place(pose)
         self._placed, self._rolled_rad, self._astray = True, 0.0, 0
-
-    def _open(self, radius: bool, others: bool) -> None:
-        """Let parameters be as far from the mean as they may change at once, and not further than at first."""
-        self._one_sided[:] = 0.0
-        at_first = np.sqrt(np.diag(self._first_covariance))
-        widest = np.minimum(OPENED * np.abs(self._state[_THETA]), np.maximum(at_first, 0.0))
-        wider = np.maximum(widest**2 - np.diag(self._covariance)[_THETA], 0.0) * (radius, others, others)
-        self._covariance[_THETA, _THETA] += np.diag(wider)
+        self._due[:] = 0.0

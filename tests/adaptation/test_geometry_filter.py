@@ -1,5 +1,6 @@
 """The filter on a robot of other equations: how soon it knows a robot, that it follows a change, and that it rests."""
 
+import pickle
 from dataclasses import replace
 
 import msgspec
@@ -40,7 +41,7 @@ def changed(plant, **fields):
 
 def test_ten_seconds_of_turning_tell_the_geometry_and_how_well_it_is_known():
     inside = []
-    for seed, robot in enumerate(robots(200, 10)):
+    for seed, robot in enumerate(robots(200, 6)):
         found = learner()
         drive(found, ForeignPlant(robot, (0.0, 0.0, 0.3), seed), TURN, 10.0)
         error = found.mean - truth(robot)
@@ -49,23 +50,58 @@ def test_ten_seconds_of_turning_tell_the_geometry_and_how_well_it_is_known():
     assert np.mean(inside) > 0.75
 
 
-@pytest.mark.parametrize("factor", [0.85, 1.15])
-def test_another_wheel_is_known_after_two_and_a_half_seconds(factor):
-    found, plant = learner(), ForeignPlant(ForeignRobot(*NOMINAL), (0.0, 0.0, 0.3), 1)
-    drive(found, plant, TURN, 15.0)
-    changed(plant, radius_m=factor * NOMINAL[0])
-    means = drive(found, plant, TURN, 2.5)
-    assert abs(means[-1, 0] / NOMINAL[0] - factor) < 0.03
-    assert found.changes == 1
+@pytest.fixture(scope="module")
+def settled():
+    """Filters and plants of seven seeds that have turned for 10 s, pickled: each test has its own."""
+    found = []
+    for seed in range(61, 68):
+        known, plant = learner(), ForeignPlant(ForeignRobot(*NOMINAL), (0.0, 0.0, 0.3), seed)
+        drive(known, plant, TURN, 10.0)
+        found.append(pickle.dumps((known, plant)))
+    return found
 
 
 @pytest.mark.parametrize("factor", [0.85, 1.15])
-def test_another_axle_is_known_after_fifteen_seconds(factor):
-    found, plant = learner(), ForeignPlant(ForeignRobot(*NOMINAL), (0.0, 0.0, 0.3), 1)
-    drive(found, plant, TURN, 15.0)
-    changed(plant, axle_m=factor * NOMINAL[1])
-    drive(found, plant, TURN, 15.0)
-    assert abs(found.mean[1] / NOMINAL[1] - factor) < 0.03
+@pytest.mark.parametrize(("index", "field"), [(0, "radius_m"), (1, "axle_m"), (2, "x_icr_m")])
+def test_four_fifths_of_a_change_are_known_after_two_and_a_half_seconds(settled, index, field, factor):
+    known_part = []
+    for one in settled:
+        found, plant = pickle.loads(one)
+        changed(plant, **{field: factor * NOMINAL[index]})
+        drive(found, plant, TURN, 2.5)
+        known_part.append((found.mean[index] / NOMINAL[index] - 1.0) / (factor - 1.0))
+    assert np.median(known_part) > 0.8
+    assert np.median(known_part) < 1.25
+
+
+def test_a_robot_whose_belief_is_narrow_and_wrong_is_learnt(settled):
+    found, plant = pickle.loads(settled[0])
+    known = GeometryFilter(0.87 * MEAN, np.diag((0.005 * MEAN) ** 2), 0.5 * MEAN, 1.6 * MEAN)
+    drive(known, plant, TURN, 10.0)
+    assert np.abs(known.mean / MEAN - 1.0).max() < 0.03
+    assert found.changes == 0
+
+
+def test_beginning_and_ending_turns_is_no_change():
+    found, plant = learner(), ForeignPlant(ForeignRobot(*NOMINAL), (0.0, 0.0, 0.3), 2)
+    drive(found, plant, TURN, 8.0)
+    for _ in range(3):
+        drive(found, plant, TURN[::-1], 4.0)
+        drive(found, plant, TURN, 4.0)
+    assert found.changes == 0
+    assert np.abs(found.mean / MEAN - 1.0).max() < 0.03
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seconds", [4.0, 20.0])
+def test_the_intervals_hold_what_they_say(seconds):
+    inside = []
+    for seed, robot in enumerate(robots(3000, 40)):
+        found = learner()
+        drive(found, ForeignPlant(robot, (0.0, 0.0, 0.3), seed), TURN, seconds)
+        inside.append(np.abs(found.mean - truth(robot)) < 1.645 * np.sqrt(np.diag(found.covariance)))
+    # 85 % of 40 robots is what 90 % gives at least, at odds of 10 to 1.
+    assert (np.mean(inside, axis=0) >= 0.85).all()
 
 
 def test_wheels_without_poses_are_not_kept_and_the_filter_learns_afterwards():
@@ -96,16 +132,17 @@ def test_a_robot_that_stands_teaches_nothing():
     drive(found, plant, TURN, 10.0)
     drive(found, plant, STAND, 2.0)
     before, covariance = found.mean, found.covariance
-    drive(found, plant, STAND, 60.0)
+    drive(found, plant, STAND, 20.0)
     np.testing.assert_array_equal(found.mean, before)
     np.testing.assert_array_equal(found.covariance, covariance)
 
 
-def test_ten_minutes_of_straight_lines_and_standing_leave_axle_and_x_icr_alone():
+@pytest.mark.parametrize("minutes", [1, pytest.param(10, marks=pytest.mark.long)])
+def test_minutes_of_straight_lines_and_standing_leave_axle_and_x_icr_alone(minutes):
     found, plant = learner(), ForeignPlant(ForeignRobot(*NOMINAL), (0.0, 0.0, 0.3), 3)
-    drive(found, plant, TURN, 20.0)
+    drive(found, plant, TURN, 10.0)
     before = found.mean
-    for _ in range(10):
+    for _ in range(minutes):
         drive(found, plant, STRAIGHT, 40.0)
         drive(found, plant, STAND, 20.0)
     assert np.abs(found.mean / before - 1.0).max() < 0.015
@@ -115,8 +152,11 @@ def test_a_robot_that_was_carried_is_found_again():
     found, plant = learner(), ForeignPlant(ForeignRobot(*NOMINAL), (0.0, 0.0, 0.3), 1)
     drive(found, plant, TURN, 10.0)
     drive(found, plant, STAND, 2.0)
+    known = found.covariance
     plant.state[:3] = 2.0, -1.0, -2.0
-    drive(found, plant, TURN, 10.0)
+    drive(found, plant, TURN, 1.2)
+    assert found.covariance[1, 1] > 4.0 * known[1, 1]
+    drive(found, plant, TURN, 9.0)
     assert found.carried == 1
     assert np.abs(found.mean / MEAN - 1.0).max() < 0.03
 
