@@ -3,11 +3,13 @@
     python -m tests.bridge.ros_node DOMAIN KIND X Y YAW
 
 `echo` says where the robot is by its own odometry, from X Y YAW on; `nan`, `frame`, `flood`, `garbage` and `late` do
-that after 150 good ones wrongly, `speed` says speeds X (m/s) and YAW (rad/s), 20 a second. A line for
-each odometry heard.
+that after 150 good ones wrongly, `speed` says speeds X (m/s) and YAW (rad/s), 20 a second, asks the bridge
+for each line of its input, and writes the answers. A line for each odometry heard.
 """
 
+import contextlib
 import math
+import os
 import sys
 import time
 
@@ -30,10 +32,8 @@ def main(domain: str, kind: str, *start: str) -> None:
     best_effort = Qos(Policy.Reliability.BestEffort, Policy.History.KeepLast(1))
     odometry = DataReader(participant, Topic(participant, "rt/odom", msg.Odometry), best_effort)
     if kind == "speed":
-        say = DataWriter(participant, Topic(participant, "rt/cmd_vel", msg.Twist))
-        while True:
-            say.write(msg.Twist(msg.Vector3(x, 0.0, 0.0), msg.Vector3(0.0, 0.0, yaw)))
-            time.sleep(0.05)
+        drive(participant, msg.Twist(msg.Vector3(x, 0.0, 0.0), msg.Vector3(0.0, 0.0, yaw)))
+        return
     say = DataWriter(participant, Topic(participant, "rt/pose", msg.PoseStamped))
     # The name of a pose and the bytes of something else, once it is time.
     other = None
@@ -65,6 +65,23 @@ def main(domain: str, kind: str, *start: str) -> None:
                 (other or say).write(garbage_type()("x" * 300) if other else message)
             print(f"{time.monotonic_ns()} {said} {place.x} {place.y}", flush=True)
         time.sleep(0.001)
+
+
+def drive(participant, twist):
+    say = DataWriter(participant, Topic(participant, "rt/cmd_vel", msg.Twist))
+    reliable = Qos(Policy.Reliability.Reliable(0), Policy.History.KeepLast(10))
+    ask = DataWriter(participant, Topic(participant, "rt/disco_hw/ctl", msg.String), reliable)
+    replies = DataReader(participant, Topic(participant, "rt/disco_hw/reply", msg.String), reliable)
+    os.set_blocking(sys.stdin.fileno(), False)
+    while True:
+        say.write(twist)
+        with contextlib.suppress(BlockingIOError, TypeError):
+            for line in os.read(sys.stdin.fileno(), 1000).decode().splitlines():
+                ask.write(msg.String(line))
+        for reply in replies.take(10):
+            if reply.sample_info.valid_data:
+                print(reply.data, flush=True)
+        time.sleep(0.05)
 
 
 _made = []

@@ -5,14 +5,15 @@ import signal
 import subprocess
 import sys
 import time
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 
 import pytest
 
 pytest.importorskip("cyclonedds", reason="cyclonedds is not installed: make venv")
 
 from disco_hw.experiments import live_stack
-from disco_hw.experiments.live_stack import FAST_START, disco_hw_process
+from disco_hw.experiments.live_stack import FAST_START, disco_hw_process, stands
+from tests.hil.test_drive import Bench
 
 pytestmark = [pytest.mark.hil, pytest.mark.timeout(400)]
 
@@ -33,7 +34,10 @@ def node(kind, output, start=FAST_START):
     """A node in a process of its own, which is killed at the end."""
     with output.open("wb") as sink:
         process = subprocess.Popen(
-            [sys.executable, "-m", "tests.bridge.ros_node", str(domain()), kind, *map(str, start)], stdout=sink
+            [sys.executable, "-m", "tests.bridge.ros_node", str(domain()), kind, *map(str, start)],
+            stdin=subprocess.PIPE,
+            stdout=sink,
+            bufsize=0,
         )
     try:
         yield process
@@ -74,6 +78,42 @@ def test_it_drives_by_the_poses_of_a_node_that_hears_its_odometry_and_stops_when
         assert status["task"]["distance_m"] < 0.2
         process.kill()
         assert_stops(stack)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
+@pytest.mark.parametrize("whom", ["node", "bridge"])
+def test_speeds_drive_once_asked_to_arm_and_their_silence_disarms_for_good(whom, how, tmp_path):
+    said = tmp_path / "node.txt"
+    with ExitStack() as stack:
+        bench = Bench(tmp_path, stack)
+        with_poses_of_ros(bench.robot_file)
+        bench.drive("--ros2")
+        bench.ready()
+        bridge = stack.enter_context(
+            disco_hw_process("bridge", ["bridge", "ros2", str(bench.robot_file)], tmp_path / "bridge.txt")
+        )
+        speaker = stack.enter_context(node("speed", said, (0.15, 0.0, 0.3)))
+        operator = bench.operator
+        ask_until(speaker, said, "arm", '"ok": true')
+        operator.wait_until("driving", lambda status: status["drive"]["driving"] and not stands(status), 20.0)
+        {"node": speaker, "bridge": bridge.process}[whom].send_signal(how)
+        operator.wait_for("READY", 20.0)
+        operator.wait_for_standstill(20.0)
+        {"node": speaker, "bridge": bridge.process}[whom].send_signal(signal.SIGCONT)
+        time.sleep(1.0)
+        assert operator.status()["state"] == "READY"
+
+
+def ask_until(speaker, said, words, answer, timeout_s=30.0):
+    """Ask once a second, as who asks before the bridge is there is not heard."""
+    deadline = time.monotonic() + timeout_s
+    while time.monotonic() < deadline:
+        speaker.stdin.write(f"{words}\n".encode())
+        time.sleep(1.0)
+        if answer in said.read_text(encoding="utf-8"):
+            return
+    raise AssertionError(said.read_text(encoding="utf-8"))
 
 
 def far(output):
