@@ -10,7 +10,7 @@ SOURCES := pyproject.toml setup.py constraints.txt firmware_protocol/build_firmw
 # the libraries anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: venv demo chromium test test-long bench gap-study soak fault-campaign fuzz firmware-check firmware-mutants firmware-emulated cross-tools socketcan-test clean
+.PHONY: venv demo chromium test test-long bench gap-study soak fault-campaign fuzz firmware-check firmware-mutants firmware-emulated cross-tools socketcan-test ros clean
 
 venv: $(STAMP)
 
@@ -60,8 +60,17 @@ firmware-emulated: $(STAMP) cross-tools
 	$(BIN)/python -m tools.firmware_figures --check
 	$(BIN)/python -m pytest -n 0 -rs -m long tests/firmware_protocol/emulated
 
+# Real ROS 2, 230 MB, in an environment of its own. Its wheels are not made for each Python; without them its tests are
+# skipped.
+ROS := .venv-ros
+ros: $(STAMP)
+	@[ -e $(ROS)/.installed ] || { $(BIN)/python -m venv $(ROS) && $(ROS)/bin/python -m pip install --disable-pip-version-check \
+		--quiet --no-compile 'ros-jazzy-rclpy[fastrtps]' ros-jazzy-nav-msgs ros-jazzy-diagnostic-msgs ros-jazzy-sensor-msgs && \
+		touch $(ROS)/.installed; } || \
+		{ rm -rf $(ROS); echo "rclpy could not be installed for this Python; the tests against real ROS 2 are skipped"; }
+
 # Closed loops, studies, clusters and browsers: as much again.
-test-long: $(STAMP) chromium cross-tools
+test-long: $(STAMP) chromium cross-tools ros
 	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadscope --no-loadscope-reorder -m long
 
 # The peers that our figures stand beside, and nothing else needs: in an environment of their own, on top of ours.
@@ -107,4 +116,4 @@ socketcan-test: $(STAMP)
 	$(BIN)/python -m tools.socketcan_test
 
 clean:
-	rm -rf $(VENV) $(PEERS) build *.egg-info firmware_protocol/_firmware*
+	rm -rf $(VENV) $(PEERS) $(ROS) build *.egg-info firmware_protocol/_firmware*

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from contextlib import ExitStack, contextmanager
+from pathlib import Path
 
 import pytest
 
@@ -61,6 +62,70 @@ def heard(output):
     """(monotonic ns, number, x, y) of each odometry that the node heard."""
     rows = [line.split() for line in output.read_text(encoding="utf-8").splitlines()]
     return [(int(ns), int(number), float(x), float(y)) for ns, number, x, y in rows]
+
+
+RCLPY = Path(__file__).parents[2] / ".venv-ros" / "bin" / "python"
+real_ros = pytest.mark.skipif(not RCLPY.exists(), reason="no rclpy here: make test-long installs it where it can")
+
+
+@contextmanager
+def real_node(output, *arguments):
+    """A node of real ROS 2, with another DDS than ours, which is killed at the end."""
+    ros = {"ROS_DOMAIN_ID": str(domain()), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    clean = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    script = Path(__file__).parents[1] / "bridge" / "rclpy_node.py"
+    with output.open("wb") as sink:
+        process = subprocess.Popen(
+            [str(RCLPY), str(script), *map(str, arguments)], stdout=sink, stderr=subprocess.STDOUT, env={**clean, **ros}
+        )
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+
+
+@real_ros
+@pytest.mark.long
+def test_real_ros_gives_the_poses_hears_the_odometry_in_another_node_and_stops_it_by_dying(tmp_path, monkeypatch):
+    heard_by = tmp_path / "listener.txt"
+    with (
+        stack_with_bridge(tmp_path, monkeypatch) as (stack, _),
+        real_node(tmp_path / "node.txt", "echo", *FAST_START) as process,
+        real_node(heard_by, "listen"),
+    ):
+        stack.operator.wait_until("a pose", lambda status: status["pose_ok"], live_stack.READY_TIMEOUT_S)
+        stack.drive()
+        stack.operator.wait_until("on the circle", lambda status: status["pose"][1] > 1.0, 60.0)
+        assert stack.operator.status()["task"]["distance_m"] < 0.2
+        process.kill()
+        assert_stops(stack)
+    lines = [line.split() for line in heard_by.read_text(encoding="utf-8").splitlines()]
+    wanted = {
+        ("odom", "odom"),
+        ("joint_states", "left_wheel_joint,right_wheel_joint"),
+        ("plan", "map"),
+        ("diagnostics", "disco-hw:daemon"),
+    }
+    assert wanted <= {tuple(line) for line in lines}
+    assert sum(line[0] == "odom" for line in lines) > 200
+
+
+@real_ros
+@pytest.mark.long
+def test_real_ros_arms_and_drives_by_its_speeds(tmp_path):
+    with ExitStack() as stack:
+        bench = Bench(tmp_path, stack)
+        with_poses_of_ros(bench.robot_file)
+        bench.drive("--ros2")
+        bench.ready()
+        bridge = ["bridge", "ros2", str(bench.robot_file)]
+        stack.enter_context(disco_hw_process("bridge", bridge, tmp_path / "bridge.txt"))
+        process = stack.enter_context(real_node(tmp_path / "node.txt", "speed", 0.15, 0.3))
+        bench.operator.wait_until("driving", lambda status: status["drive"]["driving"] and not stands(status), 30.0)
+        process.kill()
+        bench.operator.wait_for("READY", 20.0)
+        bench.operator.wait_for_standstill(20.0)
 
 
 def assert_stops(stack):

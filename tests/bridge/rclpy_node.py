@@ -1,0 +1,78 @@
+"""A node of real ROS 2, for the Python of an environment that has rclpy; it imports nothing of ours.
+
+python rclpy_node.py echo X Y YAW      says where the robot is by its own odometry, from X Y YAW on
+python rclpy_node.py listen            a line for each message that the bridge says: topic, frame
+python rclpy_node.py speed V OMEGA     speeds, and a request to arm once a second until it is granted
+"""
+
+import math
+import sys
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseStamped, Twist
+from nav_msgs.msg import Odometry, Path
+from rclpy.qos import QoSProfile, qos_profile_sensor_data
+from sensor_msgs.msg import JointState
+from std_msgs.msg import String
+
+
+def echo(node, x, y, yaw):
+    say = node.create_publisher(PoseStamped, "/pose", 10)
+
+    def heard(message):
+        place, turned = message.pose.pose.position, message.pose.pose.orientation
+        pose = PoseStamped()
+        pose.header.stamp, pose.header.frame_id = message.header.stamp, "map"
+        pose.pose.position.x = x + math.cos(yaw) * place.x - math.sin(yaw) * place.y
+        pose.pose.position.y = y + math.sin(yaw) * place.x + math.cos(yaw) * place.y
+        half = 0.5 * (yaw + 2.0 * math.atan2(turned.z, turned.w))
+        pose.pose.orientation.z, pose.pose.orientation.w = math.sin(half), math.cos(half)
+        say.publish(pose)
+
+    node.create_subscription(Odometry, "/odom", heard, qos_profile_sensor_data)
+
+
+def listen(node):
+    def take(topic, frame):
+        return lambda message: print(topic, frame(message), flush=True)
+
+    def stamped(message):
+        return message.header.frame_id
+
+    reliable = QoSProfile(depth=10)
+    node.create_subscription(Odometry, "/odom", take("odom", stamped), reliable)
+    node.create_subscription(JointState, "/joint_states", take("joint_states", lambda m: ",".join(m.name)), reliable)
+    node.create_subscription(Path, "/plan", take("plan", stamped), reliable)
+    node.create_subscription(
+        DiagnosticArray, "/diagnostics", take("diagnostics", lambda m: m.status[0].name.replace(" ", "")), reliable
+    )
+
+
+def speed(node, forward, turn):
+    say, ask = node.create_publisher(Twist, "/cmd_vel", 10), node.create_publisher(String, "/disco_hw/ctl", 10)
+    granted = []
+
+    def reply(message):
+        print(message.data, flush=True)
+        granted.extend([message.data] if '"ok": true' in message.data else [])
+
+    def drive():
+        twist = Twist()
+        twist.linear.x, twist.angular.z = forward, turn
+        say.publish(twist)
+
+    node.create_subscription(String, "/disco_hw/reply", reply, 10)
+    node.create_timer(0.05, drive)
+    node.create_timer(1.0, lambda: granted or ask.publish(String(data="arm")))
+
+
+def main(kind, *numbers):
+    rclpy.init()
+    node = rclpy.create_node(f"test_{kind}")
+    {"echo": echo, "listen": listen, "speed": speed}[kind](node, *map(float, numbers))
+    rclpy.spin(node)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
