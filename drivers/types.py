@@ -423,8 +423,9 @@ class MotorDriver:
     whether there is such a mode; without one `link.key_file` is refused. `kinds`: of links that it speaks over, the
     usual one first. `exchange` makes what a serial line is spoken with; None: the reference protocol's frames.
     `example`: its fields in [link] for a robot as the demonstration drives it; none where its controller is not
-    simulated. `latches_stop`: whether the controller itself keeps an e-stop until it is reset. `is_default`: taken
-    where robot.toml has no `link.driver`.
+    simulated. `recognise`: of frames that were only listened to, the fields in [link] that they show, None if they are
+    not its controller's. `latches_stop`: whether the controller itself keeps an e-stop until it is reset. `is_default`:
+    taken where robot.toml has no `link.driver`.
     """
 
     name: str
@@ -438,6 +439,7 @@ class MotorDriver:
     kinds: tuple[str, ...] = ("can",)
     exchange: Callable[[Any], Exchange] | None = None
     example: str = ""
+    recognise: Callable[[Sequence[Frame]], dict[str, Any] | None] = lambda _frames: None
     latches_stop: bool = True
     authenticates: bool = False
     is_default: bool = False

@@ -26,6 +26,7 @@ for verb in (
     robot.drive,
     robot.ctl,
     robot.check,
+    robot.init,
     robot.commission,
     robot.estop,
     logs.infer,

@@ -17,6 +17,7 @@ from disco_hw.cli.options import (
     RobotFile,
     View,
     print_result,
+    progress_line,
 )
 from disco_hw.config.command_line import check_named_files
 from disco_hw.viewer.address import DEFAULT_PORT, LOOPBACK
@@ -114,6 +115,37 @@ def drive(
     print_result(result.as_dict(), as_json, result.as_text())
     if not result.completed:
         raise typer.Exit(1)
+
+
+def init(
+    out: Annotated[Path, typer.Option("-o", "--out", help="Where to write it.")] = Path("robot.toml"),
+    link: LinkOption = None,
+    driver: Annotated[str | None, typer.Option(help="The motor controller, where it is not to be heard.")] = None,
+    name: Annotated[str | None, typer.Option(help="The robot's name.")] = None,
+    wheel_radius_m: Annotated[float | None, typer.Option(min=0.0)] = None,
+    axial_distance_m: Annotated[float | None, typer.Option(min=0.0)] = None,
+    ticks_per_rev: Annotated[float | None, typer.Option(min=1.0)] = None,
+    max_wheel_speed_rad_s: Annotated[float | None, typer.Option(min=0.0)] = None,
+    pose_source: Annotated[str | None, typer.Option(help="Where measured poses come from.")] = None,
+    listen_s: Annotated[float, typer.Option(min=0.0, help="How long to listen on the link.")] = 3.0,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Write over a file that is there.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Ask nothing: what is not given is as usual.")] = False,
+) -> None:
+    """Write a robot.toml from what is heard on the robot's link, which is only listened to, and from what you say."""
+    import sys
+
+    from disco_hw.first_use.init import InitOptions, run_init
+
+    measures = {
+        "wheel_radius_m": wheel_radius_m,
+        "axial_distance_m": axial_distance_m,
+        "ticks_per_rev": ticks_per_rev,
+        "max_wheel_speed_rad_s": max_wheel_speed_rad_s,
+    }
+    given = tuple((field, value) for field, value in measures.items() if value is not None)
+    options = InitOptions(out, link, driver, name, given, listen_s, pose_source, overwrite)
+    written = run_init(options, None if yes or not sys.stdin.isatty() else input, progress_line)
+    print(f"written: {written}\nnext: disco-hw check {written}")
 
 
 def commission(

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Annotated
+from collections.abc import Callable, Sequence
+from typing import Annotated, Any
 
 import msgspec
 from msgspec import Meta
@@ -12,6 +12,7 @@ from drivers.motor import agilex_codec as codec
 from drivers.types import CyclicFrame, Frame, SafetyCard, SettingsFault
 
 TIMEOUT_S = 0.5
+_HEARD = 3
 STANDS_M_S, STANDS_RAD_S = 0.01, 0.02
 EXAMPLE = """wheel_radius_m = 0.06
 track_m = 0.31
@@ -69,6 +70,12 @@ def cyclic_frames(_settings: AgilexSettings, command_rate_hz: float, _authentica
         CyclicFrame("motion command", "HOST", 8, command_rate_hz),
         *(CyclicFrame(name, "ROBOT", 8, rate) for name, rate in sent.items()),
     )
+
+
+def recognise(frames: Sequence[Frame]) -> dict[str, Any] | None:
+    """Nothing but that it is one: a base says who it is by its state and its motion, and nothing of its measures."""
+    heard = [frame.can_id for frame in frames if codec.decode(frame) is not None]
+    return {} if min(heard.count(codec.SYSTEM_STATE), heard.count(codec.MOTION_STATE)) >= _HEARD else None
 
 
 def safety_card(settings: AgilexSettings) -> SafetyCard:

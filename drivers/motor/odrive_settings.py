@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 from msgspec import Meta
 
 from drivers.motor import odrive_codec as codec
 from drivers.motor.odrive_codec import Generation
+from drivers.motor.vendor_parts import in_sides
 from drivers.types import CyclicFrame, Frame, SafetyCard, SettingsFault
 
 WATCHDOG_ERROR = {Generation.V05: 0x800, Generation.V06: 0x0100_0000}
@@ -58,6 +59,7 @@ _ERRORS: Mapping[Generation, Mapping[int, str]] = MappingProxyType(
     }
 )
 
+_HEARD = 3
 _Nodes = int | tuple[int, ...]
 _Sign = Literal[-1, 1]
 
@@ -140,6 +142,19 @@ def cyclic_frames(settings: OdriveSettings, command_rate_hz: float, _authenticat
             CyclicFrame(f"Get_Encoder_Estimates of {node}", "ROBOT", 8, 100.0),
         ]
     return tuple(frames)
+
+
+def recognise(frames: Sequence[Frame]) -> dict[str, Any] | None:
+    """The nodes whose heartbeats and estimates were heard, split into left and right as they are numbered.
+
+    None if there are none: heartbeats alone could be another vendor's frames.
+    """
+    told = [one for frame in frames if (one := codec.decode(Generation.V06, frame)) is not None]
+    beats, estimates = (
+        [one.node for one in told if one.name == name] for name in ("Heartbeat", "Get_Encoder_Estimates")
+    )
+    nodes = sorted({node for node in beats if min(beats.count(node), estimates.count(node)) >= _HEARD})
+    return {"nodes": in_sides(nodes)} if len(nodes) > 1 else None
 
 
 def safety_card(settings: OdriveSettings) -> SafetyCard:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import enum
 import math
+from collections.abc import Sequence
+from typing import Any
 
 from drivers.types import Capabilities, Frame, OutgoingFrame, RobotStatus, WheelCommand
 
@@ -82,3 +84,10 @@ def status(t_ns: int, state: str) -> RobotStatus:
         rejected_count=0,
         reject_reason="NONE",
     )
+
+
+def in_sides(nodes: Sequence[int]) -> list[Any]:
+    """Ids heard on a bus as left and right, the lower half first: two numbers, or two lists."""
+    half = len(nodes) // 2
+    left, right = list(nodes[:half]), list(nodes[half:])
+    return [left[0], right[0]] if len(left) == len(right) == 1 else [left, right]

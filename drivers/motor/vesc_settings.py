@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Annotated, Literal
+from collections.abc import Callable, Sequence
+from typing import Annotated, Any, Literal
 
 import msgspec
 from msgspec import Meta
 
 from drivers.motor import vesc_codec as codec
+from drivers.motor.vendor_parts import in_sides
 from drivers.types import CyclicFrame, Frame, SafetyCard, SettingsFault
 
 HOST_ID = 253
@@ -122,6 +123,13 @@ def cyclic_frames(settings: VescSettings, command_rate_hz: float, _authenticated
             CyclicFrame(f"faults of {node}", "ROBOT", 11, 30.0),
         ]
     return tuple(frames)
+
+
+def recognise(frames: Sequence[Frame]) -> dict[str, Any] | None:
+    """The controllers whose status was heard, split into left and right as they are numbered; None for none."""
+    told = [codec.decode(frame) for frame in frames]
+    nodes = sorted({one.controller for one in told if one is not None and one.name == "status"})
+    return {"nodes": in_sides(nodes)} if len(nodes) > 1 else None
 
 
 def safety_card(settings: VescSettings) -> SafetyCard:

@@ -1,0 +1,215 @@
+"""`disco-hw init`: a robot.toml for a robot, from what is heard on its link and what its owner says."""
+
+from __future__ import annotations
+
+import time
+import tomllib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from disco_hw.config import load_robot_config
+from disco_hw.config.command_line import link_fields, names_address
+from disco_hw.errors import InputError, WorkError
+from disco_hw.first_use.robot_text import in_toml
+from drivers.motor import UnknownDriverError, find_driver, motor_drivers
+from drivers.transport import TransportSettingsError, make_transport
+from drivers.types import Frame, LinkState
+
+_POLL_S = 0.01
+_OPEN_S = 2.0
+_MOST_FRAMES = 20_000
+
+
+@dataclass(frozen=True, slots=True)
+class Question:
+    """A field of [robot]: what is asked of a person, the comment that is written beside it, and what is usual."""
+
+    name: str
+    asked: str
+    comment: str
+    usual: float
+
+
+QUESTIONS = (
+    Question("wheel_radius_m", "radius of a wheel, m", "nominal; `infer` learns what it really is", 0.06),
+    Question("axial_distance_m", "from left to right wheels, m", "nominal; a skid-steer seems wider", 0.31),
+    Question("ticks_per_rev", "encoder ticks a turn of a wheel", "what the controller counts in one turn", 2048.0),
+    Question("max_wheel_speed_rad_s", "fastest speed of a wheel, rad/s", "no command is ever faster than this", 8.0),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class InitOptions:
+    """What `disco-hw init` was asked; None of a field is asked for, or the usual where nobody is to be asked."""
+
+    out: Path
+    link: str | None = None
+    driver: str | None = None
+    name: str | None = None
+    measures: tuple[tuple[str, float], ...] = ()
+    listen_s: float = 3.0
+    pose_source: str | None = None
+    overwrite: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Heard:
+    """What was recognised on a link: the driver, and the fields in [link] that its frames show."""
+
+    driver: str
+    fields: dict[str, Any]
+
+
+def recognised(frames: Sequence[Frame]) -> tuple[Heard, ...]:
+    """The controllers whose frames these are, by the drivers' own judgement."""
+    found = ((driver.name, driver.recognise(frames)) for driver in motor_drivers().values())
+    return tuple(Heard(name, fields) for name, fields in found if fields is not None)
+
+
+def listen(link: dict[str, Any], seconds: float) -> list[Frame]:
+    """The frames that come over a link by themselves; nothing is sent. Raises InputError for what cannot be opened."""
+    try:
+        transport = make_transport(**link)
+    except TransportSettingsError as error:
+        raise InputError(f"--link: {error}") from None
+    frames: list[Frame] = []
+    transport.open()
+    try:
+        deadline_s = time.monotonic() + _OPEN_S
+        while transport.state is not LinkState.UP:
+            if time.monotonic() > deadline_s:
+                raise InputError(f"--link: {transport.name} cannot be opened: {transport.last_error or 'no answer'}")
+            time.sleep(_POLL_S)
+        end_s = time.monotonic() + seconds
+        while time.monotonic() < end_s and len(frames) < _MOST_FRAMES:
+            frames += [received.frame for received in transport.receive()]
+            time.sleep(_POLL_S)
+    finally:
+        transport.close()
+    return frames
+
+
+def run_init(options: InitOptions, ask: Callable[[str], str] | None, say: Callable[[str], None]) -> Path:
+    """Listen, ask, and write a robot.toml that `check` reads; the file written.
+
+    `ask` puts a question to a person, None where there is none. Raises InputError for wrong options, for a file that is
+    there already, and where it is not known which controller the robot has.
+    """
+    if options.out.exists() and not options.overwrite:
+        raise InputError(f"{options.out}: is there already; name another file, or give --overwrite")
+    link = link_fields(options.link)
+    heard = _controller(options, link, say)
+    text = robot_text(options, link, heard, _measures(options, ask))
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    trial = options.out.with_name(f".{options.out.name}.new")
+    trial.write_text(text, encoding="utf-8")
+    try:
+        load_robot_config(trial)
+    except InputError as error:
+        trial.unlink()
+        raise InputError(str(error).replace(str(trial), str(options.out))) from None
+    try:
+        trial.replace(options.out)
+    except OSError as error:
+        raise WorkError(f"{options.out}: cannot be written ({error.strerror})") from None
+    return options.out
+
+
+def _controller(options: InitOptions, link: dict[str, Any], say: Callable[[str], None]) -> Heard:
+    """The driver that was named, or the one whose frames are heard."""
+    found: tuple[Heard, ...] = ()
+    if names_address(link) and options.listen_s > 0.0:
+        say(f"listening for {options.listen_s:g} s; nothing is sent")
+        frames = listen(link, options.listen_s)
+        found = recognised(frames)
+        said = ", ".join(f"{one.driver} {one.fields or ''}".strip() for one in found)
+        say(f"{len(frames)} frames heard: {said or 'no controller that is known by its own frames'}")
+    if options.driver is not None:
+        try:
+            find_driver(options.driver)
+        except UnknownDriverError as error:
+            raise InputError(f"--driver: {error}") from None
+        return next((one for one in found if one.driver == options.driver), Heard(options.driver, {}))
+    if len(found) == 1:
+        return found[0]
+    why = "several controllers were heard" if found else "no controller was heard"
+    known = ", ".join(motor_drivers())
+    raise InputError(f"init: {why}; name it: --driver with one of {known} (one that only answers is never heard)")
+
+
+def _measures(options: InitOptions, ask: Callable[[str], str] | None) -> dict[str, float]:
+    given = dict(options.measures)
+    return {one.name: given[one.name] if one.name in given else _asked(one, ask) for one in QUESTIONS}
+
+
+def _asked(question: Question, ask: Callable[[str], str] | None) -> float:
+    while ask is not None:
+        answer = ask(f"{question.asked} [{question.usual:g}]: ").strip()
+        if not answer:
+            break
+        try:
+            return float(answer)
+        except ValueError:
+            continue
+    return question.usual
+
+
+def robot_text(options: InitOptions, link: dict[str, Any], heard: Heard, measures: dict[str, float]) -> str:
+    """The text of a robot.toml, with a comment where somebody must look."""
+    driver = find_driver(heard.driver)
+    lines = [
+        "# Written by `disco-hw init`; docs/robot.md says what every field means and what else there is.",
+        "# Next: `disco-hw check` on this file (nothing moves), then `disco-hw commission` (wheels off the ground).",
+        "[robot]",
+        f"name = {in_toml(options.name or 'robot')}",
+    ]
+    for question in QUESTIONS:
+        value = measures[question.name]
+        written = in_toml(int(value)) if question.name == "ticks_per_rev" and value == int(value) else in_toml(value)
+        lines.append(f"{question.name} = {written:<12}  # {question.comment}")
+    kind = link.get("kind", driver.kinds[0])
+    lines += ["", "[link]", f"driver = {in_toml(heard.driver)}", f"kind = {in_toml(kind)}"]
+    lines += [f"{name} = {in_toml(link[name])}" for name in ("interface", "channel", "port") if name in link]
+    if kind == "can":
+        lines.append("bitrate = 500000               # as the bus is set")
+    fields = {**tomllib.loads(driver.example), **heard.fields}
+    if "wheel_radius_m" in fields:
+        fields |= {"wheel_radius_m": measures["wheel_radius_m"], "track_m": measures["axial_distance_m"]}
+    if fields:
+        lines.append("# LOOK: what is not marked as heard is an example; write what your controller is set to.")
+    for name, value in fields.items():
+        note = "  # heard: see that left stands before right" if name in heard.fields else ""
+        lines.append(f"{name} = {in_toml(value)}{note}")
+    source = options.pose_source or ("robot" if driver.is_default else "udp")
+    lines += [
+        "",
+        "[pose]",
+        f"source = {in_toml(source)}               # where measured poses come from (docs/robot.md)",
+        "",
+        "[task]",
+        'kind = "circle"',
+        "radius_m = 1.0",
+        f"speed_m_s = {_task_speed(driver.slowest_rad_s(driver_settings(driver, fields)), measures):.3g}",
+        "",
+        "[log]",
+        'directory = "logs"',
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def driver_settings(driver: Any, fields: dict[str, Any]) -> Any:
+    """The driver's settings of these fields; raises InputError where they are none."""
+    try:
+        return msgspec.convert(fields, driver.settings)
+    except msgspec.ValidationError as error:
+        raise InputError(f"init: link: {error}; write the file by hand (docs/robot.md)") from None
+
+
+def _task_speed(slowest_rad_s: float, measures: dict[str, float]) -> float:
+    """A quarter of what the wheels can do, at most 0.2 m/s, and not below what the controller holds."""
+    radius_m, top = measures["wheel_radius_m"], measures["max_wheel_speed_rad_s"]
+    return min(0.8 * top * radius_m, max(1.5 * slowest_rad_s * radius_m, min(0.2, 0.25 * top * radius_m)))
