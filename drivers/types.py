@@ -10,7 +10,7 @@ import enum
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import msgspec
 
@@ -358,6 +358,14 @@ class Exchange(Protocol):
 
     def reply(self, frame: Frame, received: bytes) -> Frame | None:
         """The reply to `frame` that the bytes received since then begin with; None if it is none, or not whole yet."""
+
+
+@runtime_checkable
+class SaysWhy(Protocol):
+    """A pose source that knows why its poses come or fail to come."""
+
+    def news(self) -> Sequence[str]:
+        """Sentences for a person since the last call."""
 
 
 @dataclass(frozen=True, slots=True)

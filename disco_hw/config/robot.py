@@ -14,7 +14,8 @@ from disco_hw.errors import InputError
 from disco_hw.files import ROBOT_TOML, read_toml
 from drivers.motor import DriverFieldError, UnknownDriverError, find_driver, own_fields
 from drivers.motor.wiring import AS_TOLD, Wiring
-from drivers.pose import DEFAULT, PoseSourceError, find_pose_source
+from drivers.pose import DEFAULT, PoseSourceError, find_pose_source, pose_sources
+from drivers.pose import own_fields as own_pose_fields
 from drivers.pose.convention import PoseConvention
 
 if TYPE_CHECKING:
@@ -28,6 +29,7 @@ NonNegative = Annotated[float, Meta(ge=0.0)]
 Probability = Annotated[float, Meta(gt=0.0, lt=1.0)]
 Share = Annotated[float, Meta(gt=0.0, le=1.0)]
 Range = tuple[float, float]
+Datum = tuple[Annotated[float, Meta(ge=-90.0, le=90.0)], Annotated[float, Meta(ge=-180.0, le=180.0)]]
 
 
 class Robot(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -90,15 +92,19 @@ class Link(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
 
 
 class PoseInput(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Where measured poses come from: `source` is of `drivers.pose`.
+    """Where measured poses come from: `source` is of `drivers.pose`; None leaves what that source takes by itself.
 
-    For `disco-hw bridge ros2`: the topic, the frame that its poses must be in, and the standard deviations of poses
-    that come without.
+    `datum`: latitude and longitude (degrees) of the world frame's origin. For `disco-hw bridge ros2`: the topic, the
+    frame that its poses must be in, and the standard deviations of poses that come without.
     """
 
     source: str = DEFAULT
     address: str = "127.0.0.1"
     port: Annotated[int, Meta(ge=1, le=65535)] = 5005
+    device: str | None = None
+    baud: Annotated[int, Meta(ge=1200, le=4_000_000)] | None = None
+    datum: Datum | None = None
+    heading_std_rad: Annotated[float, Meta(gt=0.0, le=1.8)] | None = None
     latency_s: Annotated[float, Meta(ge=0.0, le=5.0)] = 0.0
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     offset: tuple[float, float] = (0.0, 0.0)
@@ -259,6 +265,7 @@ def load_daemon_address(path: Path) -> tuple[str, str | None]:
 def _without_task(path: Path, raw: dict[str, Any]) -> RobotConfig:
     """All that robot.toml says but [task], validated; `task` is None."""
     _check_names(path, raw)
+    _check_pose_fields(path, raw.get("pose"))
     common, of_driver = _split_link(path, raw.get("link", {}))
     try:
         config = msgspec.convert({**raw, "link": common, "task": None}, RobotConfig)
@@ -349,6 +356,20 @@ def _check_names(path: Path, raw: dict[str, Any]) -> None:
                 find(str(found[field]))
             except (UnknownDriverError, PoseSourceError) as error:
                 raise InputError(f"{path}: {section}.{field}: {error}") from None
+
+
+def _check_pose_fields(path: Path, section: Any) -> None:
+    """Refuse fields of another pose source."""
+    if not isinstance(section, dict):
+        return
+    name = str(section.get("source", DEFAULT))
+    own = own_pose_fields(name)
+    for other in pose_sources():
+        for field in sorted(own_pose_fields(other) - own):
+            if field in section:
+                _refuse(
+                    path, f"pose.{field}", f'a field of the source "{other}", and pose.source is "{name}"', "remove it"
+                )
 
 
 def _refuse(path: Path, field: str, fault: str, remedy: str) -> NoReturn:

@@ -28,6 +28,7 @@ from drivers.types import (
     PoseSource,
     Readings,
     RobotStatus,
+    SaysWhy,
     Transport,
     WheelCommand,
     WheelSample,
@@ -136,7 +137,9 @@ class DaemonCore:
         sent = self._send(now_ns, output, command, silent=result.source is Source.SILENT)
         mark("send")
         doubts = self.plausibility.step(now_ns, readings.wheels, readings.poses, readings.power, command)
-        events = (*readings.events, *output.events, *learnt.events, *self._planner_events(result), *doubts)
+        source = self.pose_source
+        said = [f"poses: {words}" for words in source.news()] if isinstance(source, SaysWhy) else []
+        events = (*readings.events, *said, *output.events, *learnt.events, *self._planner_events(result), *doubts)
         self._follow_progress(output, result)
         self.recorder.put(
             now_ns,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import pkgutil
 from collections.abc import Callable, Mapping
 from functools import cache
@@ -13,7 +14,7 @@ from drivers.pose import robot
 from drivers.pose.errors import PoseSourceError
 from drivers.types import PoseSource
 
-__all__ = ["DEFAULT", "PoseSourceError", "find_pose_source", "make_pose_source", "pose_sources"]
+__all__ = ["DEFAULT", "PoseSourceError", "find_pose_source", "make_pose_source", "own_fields", "pose_sources"]
 
 DEFAULT = robot.SOURCE
 
@@ -36,6 +37,12 @@ def find_pose_source(name: str) -> Callable[..., PoseSource]:
     return known[name]
 
 
+def own_fields(name: str) -> frozenset[str]:
+    """The fields of [pose] that the source of this name takes, and others may not. Raises PoseSourceError."""
+    parameters = inspect.signature(find_pose_source(name)).parameters.values()
+    return frozenset(each.name for each in parameters if each.kind is inspect.Parameter.KEYWORD_ONLY)
+
+
 def make_pose_source(source: str, **fields: Any) -> PoseSource:
-    """Make the source that `pose.source` names of the fields of [pose]. Raises PoseSourceError."""
-    return find_pose_source(source)(**fields)
+    """Make the source that `pose.source` names of the fields of [pose]; None is a default. Raises PoseSourceError."""
+    return find_pose_source(source)(**{name: value for name, value in fields.items() if value is not None})

@@ -8,7 +8,7 @@ from typing import Literal
 
 import msgspec
 
-from drivers.types import PoseSample, PoseSource
+from drivers.types import PoseSample, PoseSource, SaysWhy
 
 _METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 _RADIANS = {"rad": 1.0, "deg": math.pi / 180.0}
@@ -82,6 +82,10 @@ class ConvertedPoses:
     def receive(self, now_ns: int, from_robot: Sequence[PoseSample]) -> Sequence[PoseSample]:
         """The source's poses in our convention."""
         return [self._convention.converted(sample) for sample in self._source.receive(now_ns, from_robot)]
+
+    def news(self) -> Sequence[str]:
+        """What the source says."""
+        return self._source.news() if isinstance(self._source, SaysWhy) else ()
 
     def close(self) -> None:
         """Close the source."""

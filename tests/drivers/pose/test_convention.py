@@ -100,3 +100,13 @@ def test_robot_toml_says_where_the_sensor_is(load):
 def test_a_place_that_is_no_number_is_refused(load, line):
     with pytest.raises(InputError, match=rf"pose\.{line.split()[0]}: not a finite number; write"):
         load(f"[pose]\n{line}\n")
+
+
+@pytest.mark.parametrize(
+    ("line", "other"), [('device = "/dev/ttyUSB1"', "nmea"), ("port = 5006", "udp"), ("datum = [47.0, 8.0]", "nmea")]
+)
+def test_a_field_of_another_source_is_refused_by_name(load, line, other):
+    field = line.split()[0]
+    with pytest.raises(InputError, match=rf'pose\.{field}: a field of the source ".*", and pose\.source is "robot"'):
+        load(f"[pose]\n{line}\n")
+    assert load(f'[pose]\nsource = "{other}"\n{line}\n').pose.source == other

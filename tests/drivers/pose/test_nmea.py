@@ -1,0 +1,231 @@
+"""A GPS receiver: the vendors' own sentences, a library's, a real port and a real socket, and a reader killed."""
+
+import math
+import os
+import signal
+import socket
+import time
+import tty
+from datetime import UTC, datetime, timedelta
+
+import pytest
+
+from disco_hw.runtime.pipeline import NoPlanner
+from drivers.pose import PoseSourceError, make_pose_source
+from drivers.pose.nmea_reader import QUALITY_STD_M, Fixes, ReceiverClock, TangentPlane
+from tests.runtime.simulated import simulated_stack
+
+pytest.importorskip("pynmeagps", reason="pip install 'disco-hw[rtk]'")
+
+# From Trimble's, u-blox's and Hemisphere's interface descriptions; not made by any code of ours.
+GGA_DIFFERENTIAL = b"$GPGGA,172814.0,3723.46587704,N,12202.26957864,W,2,6,1.2,18.893,M,-25.669,M,2.0,0031*4F\r\n"
+GST = b"$GPGST,172814.0,0.006,0.023,0.020,273.6,0.023,0.020,0.031*6A\r\n"
+GGA_ALONE = b"$GPGGA,092725.00,4717.11399,N,00833.91590,E,1,08,1.01,499.6,M,48.0,M,,*5B\r\n"
+HDT = b"$GPHDT,123.456,T*32\r\n"
+VTG = b"$GPVTG,77.52,T,,M,0.004,N,0.008,K,A*06\r\n"
+RMC = b"$GPRMC,083559.00,A,4717.11437,N,00833.91522,E,0.004,77.52,091202,,,A*57\r\n"
+NOW_NS = 10**12
+
+
+def gga(time_s, latitude, longitude, quality=4, height=500.0):
+    """By the library pynmeagps, from numbers."""
+    from pynmeagps import GET, NMEAMessage
+
+    when = (datetime(2026, 1, 1, tzinfo=UTC) + timedelta(seconds=time_s)).time()
+    message = NMEAMessage(
+        "GN", "GGA", GET, time=when, lat=latitude, NS="N" if latitude >= 0 else "S", lon=longitude,
+        EW="E" if longitude >= 0 else "W", quality=quality, numSV=20, HDOP=0.6, alt=height, altUnit="M", sep=0.0,
+        sepUnit="M", diffAge="", diffStation="", hpnmeamode=1,
+    )  # fmt: skip
+    return message.serialize()
+
+
+def poses(found):
+    return [each for each in found if "said" not in each]
+
+
+def test_the_vendors_sentences_are_positions_with_their_quality():
+    fixes = Fixes()
+    (first,) = poses(fixes.take(GGA_ALONE, NOW_NS))
+    assert first == {"t_ns": NOW_NS, "x_m": 0.0, "y_m": 0.0, "position_std_m": pytest.approx(3.0 * 1.01)}
+    assert poses(fixes.take(VTG, NOW_NS)) == poses(fixes.take(RMC, NOW_NS)) == []
+    assert fixes.malformed == 0
+    differential = Fixes()
+    assert poses(differential.take(GGA_DIFFERENTIAL, NOW_NS))[0]["position_std_m"] == pytest.approx(0.8 * 1.2)
+    differential.take(GST, NOW_NS)
+    assert poses(differential.take(GGA_DIFFERENTIAL, NOW_NS))[0]["position_std_m"] == 0.023
+
+
+def test_east_and_north_agree_with_the_lengths_of_a_degree():
+    """WGS 84 at 45 degrees: 111 131.745 m of latitude, 78 846.806 m of longitude (Rapp, Geometric Geodesy)."""
+    fixes = Fixes(datum=(45.0, 7.0))
+    moved = [(45.0, 7.0), (45.0 + 1e-3, 7.0), (45.0, 7.0 + 1e-3), (45.0 - 2e-3, 7.0 - 2e-3)]
+    found = []
+    for k, (latitude, longitude) in enumerate(moved):
+        (pose,) = poses(fixes.take(gga(0.2 * k, latitude, longitude, height=0.0), NOW_NS + k * 200_000_000))
+        found.append((pose["x_m"], pose["y_m"]))
+    assert found[0] == pytest.approx((0.0, 0.0), abs=1e-3)
+    assert found[1] == pytest.approx((0.0, 111.1317), abs=3e-3)
+    assert found[2] == pytest.approx((78.8468, 0.0), abs=3e-3)
+    assert found[3] == pytest.approx((-157.69, -222.26), abs=0.02)
+    # A kilometre from its datum on the same ellipsoid, the plane is flat to a tenth of a metre.
+    assert TangentPlane(-33.0, 151.0, 20.0).east_north(-33.0, 151.0, 30.0) == pytest.approx((0.0, 0.0), abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    "broken",
+    [
+        GGA_ALONE.replace(b"*5B", b"*5C"),
+        GGA_ALONE[:30],
+        b"$GPGGA,092725.00,4717.11399,N,00833.91590,E,1,08,1.01,,M,48.0,M,,*4C\r\n",
+        b"$GPGGA,,,,,,0,00,99.99,,,,,,*48\r\n",
+        b"$GPGGA,1,2*00\r\n",
+        b"\xff\xfe$$$*\r\n",
+        b"$PUBX,00,hello*00\r\n",
+        b"",
+    ],
+)
+def test_what_is_no_fix_gives_none_and_breaks_nothing(broken):
+    assert poses(Fixes().take(broken, NOW_NS)) == []
+
+
+def test_a_datum_of_another_town_is_said():
+    fixes = Fixes(datum=(47.0, 8.5))
+    said = [each["said"] for each in fixes.take(GGA_ALONE, NOW_NS) if "said" in each]
+    assert "32097 m from the datum, and 838 m is the farthest; mend pose.datum" in said
+    assert len(fixes.take(GGA_ALONE, NOW_NS)) == 1
+
+
+@pytest.mark.parametrize("quality", [0, 6, 7, 8])
+def test_what_is_not_measured_is_not_used_and_said_so(quality):
+    fixes = Fixes()
+    (said,) = fixes.take(gga(1.0, 47.0, 8.0, quality=quality), NOW_NS)
+    assert f"fix quality {quality}" in said["said"]
+    assert "not used" in said["said"]
+    assert fixes.take(gga(1.2, 47.0, 8.0, quality=quality), NOW_NS) == []
+
+
+def test_the_deviation_follows_the_quality():
+    fixes = Fixes()
+    for k, (quality, std_m) in enumerate(QUALITY_STD_M.items()):
+        (pose,) = poses(fixes.take(gga(10.0 * k, 47.0, 8.0, quality=quality), NOW_NS + 10**10 * k))
+        assert pose["position_std_m"] == std_m
+
+
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_a_heading_goes_with_the_position_of_the_same_burst(order):
+    """Clockwise from north; the position is given as soon as it is clear that no heading comes."""
+    fixes = Fixes()
+    # That there are headings at all is known from the first on.
+    fixes.take(HDT, NOW_NS - 200_000_000)
+    lines = [(GGA_ALONE, NOW_NS + order[0] * 10_000_000), (HDT, NOW_NS + order[1] * 10_000_000)]
+    found = [pose for line, at in sorted(lines, key=lambda one: one[1]) for pose in poses(fixes.take(line, at))]
+    (pose,) = found
+    assert pose["yaw_rad"] == pytest.approx(math.radians(90.0 - 123.456))
+    assert pose["yaw_std_rad"] == 0.02
+    assert poses(fixes.take(GGA_ALONE, NOW_NS + 10**9)) == []
+    assert fixes.flush(NOW_NS + 10**9 + 10_000_000) == []
+    (bare,) = fixes.flush(NOW_NS + 10**9 + 70_000_000)
+    assert "yaw_rad" not in bare
+
+
+def test_a_fix_has_the_receivers_time_and_not_the_moods_of_the_line():
+    clock = ReceiverClock()
+    delays_s = [0.15, 0.05, 0.30, 0.05, 0.80, 0.06]
+    found = [clock.host_ns(100.0 + 0.2 * k, round(1e9 * (7.0 + 0.2 * k + late))) for k, late in enumerate(delays_s)]
+    # All as late as the least late one, once that was seen.
+    assert found[1:] == [pytest.approx(1e9 * (7.05 + 0.2 * k), abs=10) for k in range(1, 6)]
+    # Over midnight, and over a receiver that has found its time anew.
+    night = ReceiverClock()
+    night.host_ns(86_399.8, 10**9)
+    assert night.host_ns(0.0, 10**9 + 350_000_000) == pytest.approx(10**9 + 200_000_000, abs=10)
+    assert night.host_ns(18.0, 2 * 10**9) == 2 * 10**9
+
+
+@pytest.fixture
+def ended():
+    sources = []
+    yield sources.append
+    for source in sources:
+        source.close()
+
+
+def until(source, enough):
+    """Poses and news of the source until `enough(poses, news)`, within a generous time."""
+    found, said = [], []
+    end_s = time.monotonic() + 60.0
+    while not enough(found, said):
+        assert time.monotonic() < end_s, (found, said)
+        found += source.receive(time.monotonic_ns(), ())
+        said += source.news()
+        time.sleep(0.01)
+    return found, said
+
+
+def opened(source):
+    """Wait until it listens: what came before the port was open is thrown away."""
+    until(source, lambda _, said: any(words.endswith(": open") for words in said))
+
+
+def test_over_a_serial_port_that_goes_away(ended):
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    source = make_pose_source("nmea", device=os.ttyname(slave), baud=115_200)
+    ended(source)
+    _, said = until(source, lambda _, said: said)
+    assert said[0].endswith(": open")
+    os.write(master, b"half a line*00\r\n" + GGA_ALONE)
+    (pose,), said = until(source, lambda found, _: found)
+    assert (pose.x_m, pose.y_m, pose.has_heading) == (0.0, 0.0, False)
+    assert 0 <= time.monotonic_ns() - pose.t_ns < 60 * 10**9
+    assert any("fix quality 1" in words for words in said)
+    os.close(slave)
+    os.close(master)
+    _, said = until(source, lambda _, said: said)
+    assert "tried again until it is there" in said[-1]
+
+
+def test_over_tcp_with_a_server_that_comes_late_and_sends_garbage(ended):
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+        source = make_pose_source("nmea", device=f"socket://127.0.0.1:{port}", datum=(47.0, 8.5))
+        ended(source)
+        receiver, _ = server.accept()
+        opened(source)
+        with receiver:
+            receiver.sendall(bytes(range(256)) * 20 + b"\n" + GGA_ALONE)
+            (pose,), _ = until(source, lambda found, _: found)
+        assert (pose.x_m, pose.y_m) != (0.0, 0.0)
+        until(source, lambda _, said: any("tried again" in words for words in said))
+        again, _ = server.accept()
+        opened(source)
+        with again:
+            again.sendall(gga(40_000.0, 47.0, 8.5))
+            (pose,), _ = until(source, lambda found, _: found)
+            assert (pose.x_m, pose.y_m) == pytest.approx((0.0, 0.0), abs=1e-3)
+
+
+def test_a_reader_that_is_killed_is_said_and_one_whose_daemon_has_gone_ends(ended):
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        source = make_pose_source("nmea", device=f"socket://127.0.0.1:{server.getsockname()[1]}")
+        ended(source)
+        receiver, _ = server.accept()
+        opened(source)
+        stack = simulated_stack(NoPlanner())
+        stack.core.pose_source = source
+        receiver.sendall(GGA_ALONE)
+        until(source, lambda found, _: found)
+        os.kill(source._process.pid, signal.SIGKILL)
+        source._process.wait(60.0)
+        (tick, *_) = [tick for tick in stack.run(0.1) if any("has ended" in event for event in tick.events)]
+        assert "poses: the process that reads the GPS receiver has ended; restart the daemon" in tick.events
+        assert stack.run(1.0)[-1].pipeline.estimate.pose_ok is False
+        receiver.close()
+        orphan = make_pose_source("nmea", device="/dev/does/not/exist")
+        orphan._socket.close()
+        assert orphan._process.wait(60.0) == 0
+
+
+def test_without_a_device_it_says_what_to_write():
+    with pytest.raises(PoseSourceError, match=r'no device; write pose\.device = "/dev/serial'):
+        make_pose_source("nmea")
