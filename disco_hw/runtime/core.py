@@ -14,6 +14,7 @@ from disco_hw.config import RobotConfig
 from disco_hw.log import records
 from disco_hw.log.recorder import Recorder
 from disco_hw.runtime import records_of_tick
+from disco_hw.runtime.directions import Directions
 from disco_hw.runtime.pipeline import FollowTask, Motion, Off, Pipeline, Source, Stand, Tick, untimed
 from disco_hw.runtime.plausibility import Plausibility
 from disco_hw.runtime.supervisor import Inputs, Output, Reply, Supervisor, UserRequest
@@ -83,6 +84,9 @@ class DaemonCore:
         self.recorder = recorder
         self.adaptation = adaptation or NoAdaptation()
         self.plausibility = Plausibility()
+        robot = config.robot
+        self.directions: Directions | None = Directions(robot.wheel_radius_m, robot.axial_distance_m, config.wheels)
+        """None where somebody finds out how the wheels are wired."""
         self.task, self.course = config.task, config.task.course()
         self.progress = config.task.progress()
         self.newest_wheels: WheelSample | None = None
@@ -93,6 +97,7 @@ class DaemonCore:
         self._supervisor = supervisor
         self._preflight = preflight
         self._preflight_errors: tuple[str, ...] = ()
+        self._miswired: tuple[str, ...] = ()
         self._judged: Capabilities | None = None
         self._generation = 0
         self._link_up = False
@@ -137,6 +142,9 @@ class DaemonCore:
         sent = self._send(now_ns, output, command, silent=result.source is Source.SILENT)
         mark("send")
         doubts = self.plausibility.step(now_ns, readings.wheels, readings.poses, readings.power, command)
+        miswired = None if self.directions is None else self.directions.step(now_ns, readings.wheels, poses, command)
+        # Stopped in the next tick, and not armed again before the daemon has read what was mended.
+        self._miswired = self._miswired if miswired is None else (miswired,)
         source = self.pose_source
         said = [f"poses: {words}" for words in source.news()] if isinstance(source, SaysWhy) else []
         events = (*readings.events, *said, *output.events, *learnt.events, *self._planner_events(result), *doubts)
@@ -199,7 +207,7 @@ class DaemonCore:
             telemetry_age_s=None if wheels is None else (now_ns - wheels.t_ns) * 1e-9,
             wheel_speed_rad_s=speed,
             pose_ok=estimate is not None and estimate.pose_ok,
-            preflight_errors=self._preflight_errors,
+            preflight_errors=self._miswired or self._preflight_errors,
             task_finished=self.progress.finished,
             requests=tuple(requests),
             recording_fault=self.recording_fault,
