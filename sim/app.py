@@ -14,9 +14,11 @@ from pathlib import Path
 from typing import Literal
 
 import can
+import serial
 
 from drivers.types import ReceivedFrame
 from firmware_protocol.firmware_core import FirmwareConfig
+from sim.board import VERSION, BoardRobot, PlantLine
 from sim.body_dynamics import BodyPose
 from sim.command_socket import CommandSocket
 from sim.effects import HiddenEffectError, hidden_effects
@@ -37,6 +39,8 @@ from sim.virtual_robot import STEP_US, ControllerClock, TruthRecorder, VirtualRo
 STEP_NS = STEP_US * 1000
 TRUTH_STEPS = 10
 WARM_UP_STEPS = 200
+BOARD_S = 5.0
+NOT_OF_BOARDS = ("clock_jump", "brown_out", "reboot")
 MOST_STEPS_AT_ONCE = 200
 """After a pause the backlog is worked off in pieces of so many steps, so that signals and sockets are still served."""
 
@@ -52,6 +56,9 @@ class VirtualRobotOptions:
     With kind "can" and interface "unixcan" the process serves a bus of its own at the socket `channel`, with frames
     taking their time on the wire if `pacing`; any other `interface` is joined through python-can. With kind "serial" it
     makes a pseudo-terminal, and a symbolic link to it at `port` unless that is None.
+
+    `board`: serial port of the plant's line of a board whose firmware has one (docs/port.md); the board has a link of
+    its own, and nothing here serves one.
 
     `firmware`: limits and identity of the reference controller; `controller` makes another one in its place, whose
     robot's poses go to `pose_address` in datagrams of `drivers.pose.udp`. `start`: pose of the tracked point at the
@@ -71,6 +78,7 @@ class VirtualRobotOptions:
     pacing: bool = True
     port: str | None = None
     baud: int = 921_600
+    board: str | None = None
     start: BodyPose = field(default_factory=BodyPose)
     plant: PlantParameters = field(default_factory=PlantParameters)
     effects: Mapping[str, float | Sequence[float]] = field(default_factory=dict)
@@ -186,7 +194,10 @@ class _Process:
 
 def _set_up(options: VirtualRobotOptions, records: list[TextRecord], resources: contextlib.ExitStack) -> _Process:
     if options.faults is not None:
-        _check_faults(options.faults, options.kind, options.interface)
+        if options.board is not None:
+            _check_faults_of_board(options.faults)
+        else:
+            _check_faults(options.faults, options.kind, options.interface)
     robot = _make_robot(options)
     if isinstance(robot, VendorRobot) and options.pose_address is not None:
         sender = PoseSender(options.pose_address)
@@ -197,6 +208,8 @@ def _set_up(options: VirtualRobotOptions, records: list[TextRecord], resources: 
     log = None if bus is None else bus.line
     link = _open_link(options, log)
     resources.callback(link.close)
+    if isinstance(robot, BoardRobot):
+        _meet(robot, link, options)
     commands = None if options.inject is None else CommandSocket(options.inject)
     if commands is not None:
         resources.callback(commands.close)
@@ -230,8 +243,46 @@ def _check_faults(schedule: FaultSchedule, kind: str, interface: str) -> None:
             raise OptionError(f"fault {fault.number}: {name}: a serial line has none; take it out or use a CAN bus")
 
 
+def _check_faults_of_board(schedule: FaultSchedule) -> None:
+    for fault in schedule.faults:
+        name, site = fault.kind.name, fault.kind.site
+        if name != "cpu_hog" and (site in (Site.FRAMES, Site.LINK, Site.PROCESS) or name in NOT_OF_BOARDS):
+            raise OptionError(
+                f"fault {fault.number}: {name}: not with --board, whose link and clock are its own; leave it out"
+            )
+
+
+def _meet(robot: BoardRobot, link: RobotLink, options: VirtualRobotOptions) -> None:
+    """Wait until the board has said what it is."""
+    deadline = time.monotonic() + BOARD_S
+    while robot.about is None:
+        left_s = deadline - time.monotonic()
+        if left_s <= 0.0:
+            raise OptionError(
+                f"--board {options.board}: no plant's line answers here; name the board's second serial line, "
+                "and build its firmware with -DDISCO_PLANT_LINE (docs/port.md)"
+            )
+        select.select(link.filenos(), (), (), left_s)
+        now_ns = time.monotonic_ns()
+        link.collect(now_ns)
+        for received in link.advance(now_ns):
+            robot.receive(0, received.frame)
+    version, ticks = robot.about
+    if version != VERSION:
+        raise OptionError(
+            f"--board {options.board}: its plant's line is version {version}, and {VERSION} here; flash it anew"
+        )
+    if ticks != options.plant.ticks_per_rev:
+        raise OptionError(
+            f"--board {options.board}: it counts {ticks} ticks a turn, and robot.ticks_per_rev is "
+            f"{options.plant.ticks_per_rev}; correct one of them"
+        )
+
+
 def _make_robot(options: VirtualRobotOptions) -> Robot:
     plant = Plant(options.plant, hidden_effects(options.effects), options.seed, options.start)
+    if options.board is not None:
+        return BoardRobot(plant)
     if options.controller is not None:
         return VendorRobot(plant, options.controller())
     try:
@@ -261,6 +312,11 @@ def _given(config: FirmwareConfig) -> str:
 
 def _open_link(options: VirtualRobotOptions, log: Callable[[str], object] | None) -> RobotLink:
     now_ns = time.monotonic_ns()
+    if options.board is not None:
+        try:
+            return PlantLine(options.board)
+        except (OSError, serial.SerialException) as error:
+            raise OptionError(f"--board {options.board}: cannot be opened ({error}); check the port") from None
     if options.kind == "serial":
         if options.baud <= 0:
             raise OptionError(f"baud {options.baud}: not positive; give the line's rate in bit/s")

@@ -21,6 +21,7 @@ from sim.bus import BusFault, CanBus, DeliveredFrame
 from sim.bus_node import BusNode, TransmitOrder
 from sim.can_frame import ECHO_OWN_FRAMES, FRAME_BYTES, CanFrame, pack_frame, receive_overflow_frame, unpack_frame
 from sim.process import SocketPathError, StopSignal, bind_private
+from sim.python_can_link import Guest, JoinError, joined
 from sim.robot_link import LinkFaultError, RobotNode
 
 CLIENT_TRANSMIT_QUEUE = 32
@@ -371,21 +372,34 @@ def main() -> int:
     parser.add_argument("path", type=Path, help="socket to listen on")
     parser.add_argument("--bitrate", type=int, default=500_000, help="bit/s")
     parser.add_argument("--no-pacing", action="store_true", help="frames take no time")
-    arguments = parser.parse_args()
+    join = "let what is on this python-can interface be a node, as a board behind SLCAN"
+    parser.add_argument("--join", nargs="+", metavar=("INTERFACE CHANNEL", "KEY=JSON"), help=join)
+    given, now_ns = parser.parse_args(), time.monotonic_ns()
     stop = StopSignal()
     try:
-        hub = Hub(arguments.path, time.monotonic_ns(), bitrate=arguments.bitrate, pacing=not arguments.no_pacing)
-    except SocketPathError as error:
+        guest_link = joined(given.join, now_ns, given.bitrate) if given.join else None
+        hub = Hub(given.path, now_ns, bitrate=given.bitrate, pacing=not given.no_pacing)
+    except (SocketPathError, JoinError) as error:
         print(error, file=sys.stderr)
         return 2
-    print(f"ready {arguments.path}", flush=True)
+    guest = None if guest_link is None else Guest(hub.bus, guest_link)
+    print(f"ready {given.path}", flush=True)
     while not stop.requested:
-        due_ns = hub.next_event_ns()
+        times = [hub.next_event_ns(), None if guest is None else guest.link.next_event_ns()]
+        due_ns = min((t for t in times if t is not None), default=None)
         timeout_s = None if due_ns is None else max(0.0, (due_ns - time.monotonic_ns()) * 1e-9)
-        select.select((hub.fileno(), stop.fileno()), (), (), timeout_s)
-        hub.pump(time.monotonic_ns())
+        others = [] if guest is None else guest.link.filenos()
+        select.select((hub.fileno(), stop.fileno(), *others), (), (), timeout_s)
+        now_ns = time.monotonic_ns()
+        if guest is not None:
+            guest.take(now_ns)
+        deliveries = hub.pump(now_ns)
+        if guest is not None:
+            guest.give(deliveries)
     hub.close()
-    print(hub.stats, file=sys.stderr)
+    print(hub.stats, *([] if guest is None else [guest.link.summary()]), file=sys.stderr)
+    if guest is not None:
+        guest.link.close()
     return 0
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import sys
 from collections import deque
 from collections.abc import Sequence
@@ -11,21 +12,25 @@ from typing import Any
 import can
 
 from drivers.types import Frame, ReceivedFrame
-from sim.bus import BusFault
+from sim.bus import BusFault, CanBus, DeliveredFrame
+from sim.can_frame import CanFrame
 from sim.robot_link import LinkFaultError
 
 RETRY_NS = 500_000_000
 MAX_FRAMES_PER_READ = 64
+GUEST_QUEUE = 64
 
 
 class PythonCanLink:
     """A node on `interface` `channel`; satisfies `sim.robot_link.RobotLink`. It opens the bus again when that breaks.
 
+    `options`: what else the interface takes.
     A frame counts as received when it is read. Raises `can.CanError`, OSError or ValueError if it cannot be opened.
     """
 
-    def __init__(self, interface: str, channel: str, now_ns: int, *, bitrate: int = 500_000) -> None:
+    def __init__(self, interface: str, channel: str, now_ns: int, *, bitrate: int = 500_000, **options: Any) -> None:
         self._interface = interface
+        self._options = options
         self._channel = channel
         self._bitrate = bitrate
         self._now_ns = now_ns
@@ -128,8 +133,8 @@ class PythonCanLink:
         self._shut_down()
 
     def _open(self) -> can.BusABC:
-        options: dict[str, Any] = {} if self._interface == "socketcan" else {"bitrate": self._bitrate}
-        return can.Bus(interface=self._interface, channel=self._channel, ignore_config=True, **options)
+        rate: dict[str, Any] = {} if self._interface == "socketcan" else {"bitrate": self._bitrate}
+        return can.Bus(interface=self._interface, channel=self._channel, ignore_config=True, **rate, **self._options)
 
     def _reopen(self, now_ns: int) -> None:
         try:
@@ -161,3 +166,49 @@ class PythonCanLink:
                 bus.shutdown()
             except (can.CanError, OSError):
                 self.errors += 1
+
+
+class JoinError(Exception):
+    """What cannot be joined; the message is one line for the user."""
+
+
+def joined(words: Sequence[str], now_ns: int, bitrate: int) -> PythonCanLink:
+    """Open the bus of `[interface, channel, "key=JSON", ...]`. Raises JoinError."""
+    interface, *rest = words
+    channel, options = rest[0] if rest else "", {}
+    for word in rest[1:]:
+        key, _, value = word.partition("=")
+        try:
+            options[key] = json.loads(value)
+        except json.JSONDecodeError:
+            raise JoinError(f'--join: {word}: write KEY=JSON, such as sleep_after_open=0 or name="text"') from None
+    try:
+        return PythonCanLink(interface, channel, now_ns, bitrate=bitrate, **options)
+    except (can.CanError, OSError, ValueError, NotImplementedError, TypeError) as error:
+        raise JoinError(f"--join {' '.join(words)}: cannot be opened ({error}); check interface and channel") from None
+
+
+class Guest:
+    """A node of `bus` for whatever is on `link`: what one has, the other gets."""
+
+    def __init__(self, bus: CanBus, link: PythonCanLink) -> None:
+        self.link = link
+        self._bus = bus
+        self._node = bus.attach("guest", capacity=GUEST_QUEUE)
+
+    def take(self, now_ns: int) -> None:
+        """Put on the bus what has come over the link; what does not fit the node's queue is counted there."""
+        self.link.collect(now_ns)
+        for received in self.link.advance(now_ns):
+            frame = received.frame
+            self._bus.send(self._node, CanFrame(frame.can_id, frame.data, frame.extended))
+
+    def give(self, deliveries: Sequence[DeliveredFrame]) -> None:
+        """Send over the link what the node has received."""
+        self.link.send(
+            [
+                Frame(delivery.frame.can_id, delivery.frame.data, delivery.frame.extended)
+                for delivery in deliveries
+                if self._node in delivery.receivers and not (delivery.frame.error or delivery.frame.remote)
+            ]
+        )

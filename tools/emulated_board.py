@@ -1,6 +1,6 @@
 """The firmware on an emulated microcontroller: compiled for a Cortex-M and run by QEMU, its serial line a terminal.
 
-    python -m tools.emulated_board [--processor m4f] [--key FILE] [--slcan]     until Ctrl-C, for playing with
+    python -m tools.emulated_board [--processor m4f] [--key FILE] [--slcan] [--plant-line]   until Ctrl-C, to play with
 
 Needs arm-none-eabi-gcc with newlib and qemu-system-arm; `make firmware-emulated` installs them on Debian.
 """
@@ -13,6 +13,7 @@ import os
 import re
 import secrets
 import shutil
+import signal
 import socket
 import subprocess
 import sys
@@ -75,11 +76,15 @@ def compile_for(processor: str, sources: Sequence[Path], target: Path, options: 
     return target
 
 
-def build_board(processor: str, folder: Path, *, slcan: bool = False) -> Path:
-    """Build the firmware of the MPS2 port; returns its ELF file."""
+def build_board(processor: str, folder: Path, *, slcan: bool = False, plant_line: bool = False) -> Path:
+    """Build the firmware of the MPS2 port; returns its ELF file. `plant_line`: for a virtual robot outside."""
     sources = [PORTS / "controller.c", *sorted((PORTS / "mps2").glob("*.c"))]
-    target = folder / f"board-{processor}{'-slcan' if slcan else ''}.elf"
-    return compile_for(processor, sources, target, ["-DDISCO_LINK_SLCAN"] if slcan else [])
+    options = ["-DDISCO_LINK_SLCAN"] if slcan else []
+    if plant_line:
+        sources.append(PORTS / "plant_line.c")
+        options.append("-DDISCO_PLANT_LINE")
+    target = folder / f"board-{processor}{'-slcan' if slcan else ''}{'-plant' if plant_line else ''}.elf"
+    return compile_for(processor, sources, target, options)
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,7 +197,7 @@ def running_board(
         command = _command(image, processor, _settings(drawn, first_us, key), "pty", f"unix:{bench},server=on,wait=off")
         process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
         try:
-            port = _port_of(process)
+            (port,) = _ports_of(process, 1)
             with contextlib.closing(Bench(bench)) as test_bench:
                 # When it tells something, all its threads are there.
                 test_bench.latest(_START_S)
@@ -203,6 +208,22 @@ def running_board(
             process.wait()
             if process.stdout is not None:
                 process.stdout.close()
+
+
+@contextlib.contextmanager
+def running_bare_board(image: Path, processor: str) -> Iterator[tuple[str, str]]:
+    """Start QEMU with an image that has a plant's line; yields the terminals of the link and of that line."""
+    command = _command(image, processor, _settings(secrets.randbits(63), 0, b""), "pty", "pty")
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    try:
+        link, plant = _ports_of(process, 2)
+        _prefer(process.pid)
+        yield link, plant
+    finally:
+        process.kill()
+        process.wait()
+        if process.stdout is not None:
+            process.stdout.close()
 
 
 def run_fast(image: Path, processor: str, folder: Path, seconds: float, first_us: int = 0) -> tuple[bytes, list[Truth]]:
@@ -233,13 +254,14 @@ def _prefer(process: int) -> None:
             os.sched_setscheduler(int(thread), os.SCHED_FIFO, os.sched_param(_REALTIME_PRIORITY))
 
 
-def _port_of(process: subprocess.Popen[str]) -> str:
+def _ports_of(process: subprocess.Popen[str], count: int) -> list[str]:
     assert process.stdout is not None
-    said = ""
+    said, ports = "", []
     for line in process.stdout:
         said += line
-        if found := re.search(r"redirected to (/dev/\S+)", line):
-            return found[1]
+        ports += re.findall(r"redirected to (/dev/\S+)", line)
+        if len(ports) == count:
+            return ports
     raise RuntimeError(f"the emulator did not start: {said.strip()}")
 
 
@@ -248,15 +270,20 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--processor", choices=[name for name in PROCESSORS if name != "m0plus"], default="m4f")
     parser.add_argument("--slcan", action="store_true", help="speak SLCAN in the place of the serial framing")
+    parser.add_argument("--plant-line", action="store_true", help="leave the wheels to disco-hw sim --board")
     parser.add_argument("--key", type=Path, metavar="FILE", help="the robot's key")
     given = parser.parse_args()
     if what := missing():
         print(what, file=sys.stderr)
         return 2
     key = bytes.fromhex(given.key.read_text("utf-8")) if given.key else b""
-    with tempfile.TemporaryDirectory() as folder:
-        image = build_board(given.processor, Path(folder), slcan=given.slcan)
-        with running_board(image, given.processor, key=key) as board, contextlib.suppress(KeyboardInterrupt):
+    with tempfile.TemporaryDirectory() as folder, contextlib.suppress(KeyboardInterrupt):
+        image = build_board(given.processor, Path(folder), slcan=given.slcan, plant_line=given.plant_line)
+        if given.plant_line:
+            with running_bare_board(image, given.processor) as (link, plant):
+                print(f"ready {link} ({given.processor}), plant's line {plant}", flush=True)
+                signal.pause()
+        with running_board(image, given.processor, key=key) as board:
             print(f"ready {board.port} ({given.processor})", flush=True)
             board.process.wait()
     return 0

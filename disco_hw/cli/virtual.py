@@ -73,6 +73,12 @@ def sim(
     inject: Annotated[Path | None, typer.Option(help="Listen for faults to inject on this Unix socket.")] = None,
     bus_log: Annotated[Path | None, typer.Option(help="Write every frame to this file, as candump does.")] = None,
     faults: Annotated[Path | None, typer.Option(help="Let go wrong what this TOML schedule says.")] = None,
+    board: Annotated[
+        str | None,
+        typer.Option(
+            metavar="PORT", help="Be the wheels of a board on a desk, on its second serial line (docs/port.md)."
+        ),
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the sensors' and the ground's noise.")] = 1,
     list_effects: Annotated[bool, typer.Option("--list-effects", help="List the effects and exit.")] = False,
     list_faults: Annotated[bool, typer.Option("--list-faults", help="List the kinds of faults and exit.")] = False,
@@ -107,6 +113,7 @@ def sim(
                 bus_log=bus_log,
                 faults=faults,
                 seed=seed,
+                board=board,
             )
         )
     )

@@ -41,6 +41,7 @@ class SimOptions:
     bus_log: Path | None = None
     faults: Path | None = None
     seed: int = 1
+    board: str | None = None
 
 
 def run_sim(options: SimOptions) -> int:
@@ -64,6 +65,10 @@ def run_sim(options: SimOptions) -> int:
     make_controller = None if driver.is_default else find_controller(driver.name)
     if not driver.is_default and make_controller is None:
         raise InputError(f"{setup.robot_file}: link.driver: there is no simulator of {driver.name}")
+    if options.board is not None and not driver.is_default:
+        raise InputError(f"--board: {setup.robot_file} has link.driver {driver.name}; a board speaks our own protocol")
+    if options.board is not None and options.bus_log is not None:
+        raise InputError("--bus-log: not with --board, whose link is its own; take one of them out")
     controller = None if make_controller is None else partial(make_controller, config.link.settings(), ticks_per_rev)
     x_m, y_m, yaw_rad = options.start or config.task.course().start
     # The robot that a model without effects describes; what its motors should lack is hidden by the user.
@@ -82,6 +87,7 @@ def run_sim(options: SimOptions) -> int:
             bitrate=config.link.bitrate,
             port=config.link.port,
             baud=config.link.baud,
+            board=options.board,
             start=BodyPose(x_m, y_m, yaw_rad),
             plant=plant,
             effects=effects,

@@ -47,6 +47,7 @@ TIME_PERIOD_NS = 1_000_000_000
 FAST_TIME_COUNT = 10
 ZERO_VALID_FOR_S = 0.1
 ESTOP_REPEATS = 3
+_VIRTUAL_BOARD = 0x8000
 SHORTEST_VALID_FOR_S = 0.002
 _HOUSE_KEEPING_NS = 100_000_000
 _ESTOP_DEADLINE_NS = 1_000_000_000
@@ -337,7 +338,8 @@ class ReferenceDriver:
         if capabilities is not None and capabilities != before:
             self._telemetry.configure(capabilities)
             self._events.append(
-                f"handshake complete: firmware {capabilities.firmware_version}, board {capabilities.board_id}, "
+                f"handshake complete: firmware {capabilities.firmware_version}, "
+                f"{_board(capabilities.board_id)}, "
                 f"protocol {capabilities.protocol_major}.{capabilities.protocol_minor}, DBC {capabilities.dbc_hash:08x}"
             )
         if self._handshake.refusal not in (None, refusal):
@@ -446,6 +448,12 @@ class ReferenceDriver:
         if self._status is None:
             return "waiting for the robot's SYSTEM_STATE"
         return f"the robot is in {self._status.state}"
+
+
+def _board(board_id: int) -> str:
+    """Return a board's number in words: its top bit says that a plant's line takes the place of wheels."""
+    number = board_id & ~_VIRTUAL_BOARD
+    return f"board {number}" if number == board_id else f"board {number} with VIRTUAL wheels"
 
 
 def _check(command: WheelCommand) -> None:

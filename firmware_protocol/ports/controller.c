@@ -133,18 +133,36 @@ static void send(void)
 
 #endif
 
+static void measure(void)
+{
+#if defined(DISCO_PLANT_LINE)
+    plant_line_measure(&measurement);
+#else
+    port_measure(&measurement);
+#endif
+}
+
+static void drive(void)
+{
+#if defined(DISCO_PLANT_LINE)
+    plant_line_drive(&outputs, &core.config);
+#else
+    port_drive(&outputs);
+#endif
+}
+
 static void cycle(void)
 {
     static uint32_t stored;
     uint8_t record[DISCO_RECORD_LENGTH];
-    port_measure(&measurement);
+    measure();
     const uint64_t cycle_us = clock_us();
     if (measurement.posed) {
         disco_firmware_pose(&core, &measurement.pose, cycle_us - (uint32_t)(last_us - measurement.pose_us));
         measurement.posed = false;
     }
     disco_firmware_step(&core, cycle_us, &measurement.inputs, &outputs);
-    port_drive(&outputs);
+    drive();
     if (core.parameter_writes != stored) {
         stored = core.parameter_writes;
         disco_record_pack(&core.config, record);
@@ -161,6 +179,9 @@ int main(void)
     if (port_load(record)) {
         (void)disco_record_unpack(record, &config);
     }
+#if defined(DISCO_PLANT_LINE)
+    config.board_id |= DISCO_BOARD_VIRTUAL;
+#endif
     const uint64_t entropy = port_entropy(&last_entropy);
     disco_firmware_init(&core, &config, entropy, last_entropy);
     start_link();

@@ -1,4 +1,4 @@
-/* What a board must do for the controller: eleven functions.
+/* What a board must do for the controller: eleven functions, and two more for a board on a desk that drives a virtual robot.
  *
  * Concurrency: controller.c calls all of them from the main loop, one after the other, and nothing else may call
  * the core. An interrupt may call disco_queue_put or disco_queue_take (queue.h), each queue from one side only, and
@@ -61,5 +61,18 @@ void port_store(const uint8_t *record);
 
 /* Sleeps until the next interrupt; may return at once. A timer wakes it at least once in a cycle. */
 void port_wait(void);
+
+#if defined(DISCO_PLANT_LINE)
+/* For a board on a desk (docs/port.md), never for one in a robot: the bytes of a second serial line, over which a virtual
+ * robot takes the place of wheels. port_measure and port_drive are then left out, so that the driver stays as port_start
+ * has it, off; and the board tells its host that it is none of a real robot. Neither waits. */
+size_t port_plant_receive(uint8_t *bytes, size_t most);
+size_t port_plant_send(const uint8_t *bytes, size_t count);
+
+/* Their user, plant_line.c, in the place of the other two. */
+void plant_line_measure(port_measurement_t *measurement);
+void plant_line_drive(const disco_outputs_t *outputs, const disco_config_t *config);
+#define DISCO_BOARD_VIRTUAL (0x8000u) /* in BUILD.board_id */
+#endif
 
 #endif

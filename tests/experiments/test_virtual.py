@@ -12,6 +12,7 @@ import disco_hw
 from disco_hw.cli import app
 from disco_hw.errors import InputError
 from disco_hw.experiments import virtual
+from disco_hw.experiments.live_stack import with_device
 from disco_hw.experiments.virtual import SimOptions, run_sim, true_parameters
 from disco_hw.runtime.robot_setup import load_setup
 
@@ -73,3 +74,13 @@ def test_what_can_be_hidden_or_go_wrong_is_listed_without_a_robot(what):
 def test_a_robot_is_needed_to_run():
     with pytest.raises(InputError, match=r"no ROBOT\.toml given; name one"):
         CliRunner().invoke(app, ["sim"], catch_exceptions=False)
+
+
+def test_a_board_that_has_a_link_of_its_own_is_refused_what_the_simulators_link_does(tmp_path):
+    with pytest.raises(InputError, match="--bus-log: not with --board"):
+        run_sim(SimOptions(ROBOT, board="/dev/ttyUSB1", bus_log=tmp_path / "bus.log"))
+    vendors = tmp_path / "robot.toml"
+    text = ROBOT.read_text("utf-8").replace("wombot_model.toml", str(ROBOT.with_name("wombot_model.toml")))
+    vendors.write_text(with_device(text, "odrive"), "utf-8")
+    with pytest.raises(InputError, match=r"--board: .*robot\.toml has link\.driver odrive"):
+        run_sim(SimOptions(vendors, board="/dev/ttyUSB1"))

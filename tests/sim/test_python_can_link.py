@@ -1,12 +1,20 @@
 """On python-can's virtual bus, and on a real hub that dies and comes back."""
 
+import signal
+import subprocess
+import sys
+
 import can
 import pytest
 
+from drivers.transport import can as can_transport
 from drivers.types import Frame
 from sim.hub import Hub
-from sim.python_can_link import RETRY_NS, PythonCanLink
+from sim.python_can_link import RETRY_NS, JoinError, PythonCanLink, joined
 from sim.robot_link import LinkFaultError
+from tests.firmware_protocol.other_end import LinkEnd
+from tests.firmware_protocol.ports.posix_board import build_board, running_board
+from tests.firmware_protocol.protocol_host import ProtocolHost
 
 FRAME = Frame(0x100, bytes(range(8)))
 
@@ -113,3 +121,67 @@ def test_faults_of_the_own_bus_are_refused(link, bus):
 def test_what_cannot_be_opened_raises():
     with pytest.raises((can.CanError, OSError)):
         PythonCanLink("unixcan", "/nonexistent/hub", 0)
+
+
+class HubProcess:
+    """`python -m sim.hub --join slcan TERMINAL`, from its ready line on."""
+
+    def __init__(self, path, terminal, *options):
+        command = [sys.executable, "-m", "sim.hub", str(path), "--join", "slcan", terminal, *options]
+        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+    def __enter__(self):
+        assert self.process.stdout.readline().startswith("ready"), self.process.stderr.read()
+        return self
+
+    def __exit__(self, *_):
+        self.process.send_signal(signal.SIGTERM)
+        self.process.communicate(timeout=20)
+
+
+def drive_beside_another_node(path):
+    """Drive a board that is a node of the bus at `path`; then a third node stops it."""
+    transport = can_transport.make_transport(interface="unixcan", channel=str(path))
+    transport.open()
+    with can.Bus(interface="unixcan", channel=str(path)) as other:
+        host = ProtocolHost(LinkEnd(transport), first_session=5)
+        try:
+            host.settle()
+            host.to_driving()
+            assert (host.state, host.fault) == ("ARMED", "NONE")
+            host.wait_for("turning wheels", lambda: host.fastest > 1.0)
+            heard = set()
+            while (message := other.recv(0)) is not None:
+                heard.add(message.arbitration_id)
+            # What the robot says and what its host says: each node hears both.
+            assert {0x100, 0x101, 0x110, 0x111, 0x130, 0x133} <= heard
+            other.send(can.Message(arbitration_id=0x080, data=b"\1", is_extended_id=False))
+            host.wait_for_state("ESTOP", within_s=2.0)
+            host.wait_for("standing wheels", lambda: host.fastest == 0.0, 2.0)
+        finally:
+            host.end.close()
+
+
+@pytest.mark.hil
+def test_a_board_behind_slcan_sits_on_the_mock_bus_beside_other_nodes(tmp_path):
+    with (
+        running_board(build_board(tmp_path, "-DDISCO_LINK_SLCAN")) as board,
+        HubProcess(tmp_path / "bus", board.link, "sleep_after_open=0"),
+    ):
+        drive_beside_another_node(tmp_path / "bus")
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["slcan", "{folder}/none"], "cannot be opened"),
+        (["virtual", "bus", "sleep_after_open"], "write KEY=JSON"),
+        (["nonsense", "bus"], "cannot be opened"),
+        (["slcan"], "cannot be opened"),
+    ],
+)
+def test_what_cannot_be_joined_is_said_in_one_line(words, told, tmp_path):
+    words = [word.format(folder=tmp_path) for word in words]
+    with pytest.raises(JoinError, match=told) as error:
+        joined(words, 0, 500_000)
+    assert "\n" not in str(error.value)

@@ -63,11 +63,11 @@ typedef struct {
 #define settings (*(volatile settings_t *)0x20000000u)
 #define kept (*(volatile kept_t *)0x20001000u)
 
-static disco_queue_t received;
+static disco_queue_t received, bench_received;
 static plant_t plant;
 static disco_outputs_t driven;
 static disco_pose_t pose;
-static uint32_t stepped_us, posed_us, told_us;
+static uint32_t stepped_us, posed_us, told_us, fed_us;
 static bool pose_waits, button, held_up;
 
 static void restart(disco_reset_cause_t cause)
@@ -102,24 +102,25 @@ void bench_receive_handler(void)
 {
     BENCH->interrupt = UART_RECEIVED;
     while ((BENCH->state & UART_RECEIVED) != 0u) {
-        switch (BENCH->data) {
-        case 'r':
-            restart(DISCO_RESET_POWER_ON);
-            break;
-        case 'b':
-            restart(DISCO_RESET_BROWN_OUT);
-            break;
-        case 'h': /* hang: only the hardware watchdog helps */
-            for (;;) {
-            }
-            break;
-        case 'P':
-        case 'p':
-            button = !button;
-            break;
-        default:
-            break;
+        const uint8_t byte = (uint8_t)BENCH->data;
+        (void)disco_queue_put(&bench_received, &byte, 1u);
+    }
+}
+
+/* What a person could do. */
+static void obey(uint8_t what)
+{
+    if (what == (uint8_t)'r') {
+        restart(DISCO_RESET_POWER_ON);
+    } else if (what == (uint8_t)'b') {
+        restart(DISCO_RESET_BROWN_OUT);
+    } else if (what == (uint8_t)'h') {
+        for (;;) { /* only the hardware watchdog helps */
         }
+    } else if (what == (uint8_t)'p') {
+        button = !button;
+    } else {
+        /* nothing that we know */
     }
 }
 
@@ -142,7 +143,7 @@ disco_reset_cause_t port_start(disco_config_t *config)
     WATCHDOG->load = CLOCK_HZ / WATCHDOG_HZ;
     WATCHDOG->control = 3u;
     plant_init(&plant);
-    stepped_us = posed_us = told_us = settings.first_us;
+    stepped_us = posed_us = told_us = fed_us = settings.first_us;
     return cause;
 }
 
@@ -152,8 +153,8 @@ disco_reset_cause_t port_start(disco_config_t *config)
 uint32_t port_now_us(void)
 {
     const uint32_t read_us = COUNTER;
-    held_up = (read_us - stepped_us) > CYCLE_US;
-    return held_up ? (stepped_us + CYCLE_US) : read_us;
+    held_up = (read_us - fed_us) > CYCLE_US;
+    return held_up ? (fed_us + CYCLE_US) : read_us;
 }
 
 size_t port_receive(uint8_t *bytes, size_t most)
@@ -175,6 +176,19 @@ size_t port_send(const uint8_t *bytes, size_t count)
 {
     return send(LINK, bytes, count);
 }
+
+#if defined(DISCO_PLANT_LINE)
+/* The bench's place: there is nothing to tell of a plant that is elsewhere. */
+size_t port_plant_receive(uint8_t *bytes, size_t most)
+{
+    return disco_queue_take(&bench_received, bytes, most);
+}
+
+size_t port_plant_send(const uint8_t *bytes, size_t count)
+{
+    return send(BENCH, bytes, count);
+}
+#endif
 
 uint64_t port_entropy(uint64_t *last)
 {
@@ -226,6 +240,10 @@ static void tell_truth(uint32_t now_us)
 void port_measure(port_measurement_t *measurement)
 {
     const uint32_t now_us = port_now_us();
+    uint8_t what;
+    while (disco_queue_take(&bench_received, &what, 1u) == 1u) {
+        obey(what);
+    }
     plant_step(&plant, &driven, (float)(now_us - stepped_us) * 1.0e-6f);
     stepped_us = now_us;
     plant_read(&plant, &measurement->inputs);
@@ -255,6 +273,7 @@ void port_drive(const disco_outputs_t *outputs)
 void port_feed_watchdog(void)
 {
     WATCHDOG->clear = 1u;
+    fed_us = port_now_us();
 }
 
 bool port_load(uint8_t *record)

@@ -349,6 +349,12 @@ def test_faults_and_emergency_stops_are_told_in_words():
     assert any(event == f"robot STANDBY -> FAULT, fault {bench.driver.detail[18:]}" for event in bench.events)
 
 
+def test_a_board_whose_wheels_are_virtual_is_told_from_a_robots():
+    bench = make_bench(ReferenceRobot(replace(CONFIG, board_id=0x8003)))
+    bench.run_until(*STILL)
+    assert any("board 3 with VIRTUAL wheels" in event for event in bench.events)
+
+
 def test_each_event_is_told_once():
     bench = make_bench()
     bench.arm()

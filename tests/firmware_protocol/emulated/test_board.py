@@ -12,10 +12,14 @@ from pathlib import Path
 
 import pytest
 
+from drivers.transport import serial
 from firmware_protocol.serial_framing import FrameDecoder, encode_frame
 from tests.firmware_protocol.emulated.board_end import BoardEnd
+from tests.firmware_protocol.other_end import LinkEnd
 from tests.firmware_protocol.protocol_host import CODEC, ProtocolHost
-from tools.emulated_board import build_board, missing, run_fast, running_board
+from tests.sim.test_board import SimProcess
+from tests.sim.test_python_can_link import HubProcess, drive_beside_another_node
+from tools.emulated_board import build_board, missing, run_fast, running_bare_board, running_board
 
 ROOT = Path(__file__).parents[3]
 ARMED = 3
@@ -177,6 +181,38 @@ def test_a_host_that_freezes_stops_the_wheels_within_the_watchdogs_time(tmp_path
     after = [row for row in rows if row.ms >= first_zero_ms]
     assert {row.setpoints for row in after} == {(0.0, 0.0)}
     assert after[-1].speeds == (0.0, 0.0)
+
+
+@pytest.mark.parametrize("processor", ["m3", "m4f"])
+def test_it_drives_a_virtual_robot_over_its_plants_line(tmp_path, processor):
+    image = build_board(processor, tmp_path, plant_line=True)
+    with running_bare_board(image, processor) as (link, plant):
+        sim = SimProcess(tmp_path, plant)
+        transport = serial.make_transport(port=link)
+        transport.open()
+        host = ProtocolHost(LinkEnd(transport), first_session=3)
+        try:
+            host.settle()
+            host.to_driving()
+            before = host.latest["WHEEL_TICKS"]["left_ticks"]
+            host.wait_for("turning wheels", lambda: host.latest["WHEEL_TICKS"]["left_ticks"] - before > 2000, 30.0)
+            assert (host.state, host.fault) == ("ARMED", "NONE")
+            row = sim.row()
+            assert (row["state"], row["driver_enabled"]) == ("ARMED", "1")
+            assert float(row["left_speed_rad_s"]) > 1.0
+        finally:
+            host.end.close()
+            assert sim.end() == 0
+
+
+@pytest.mark.parametrize("processor", ["m3", "m4f"])
+def test_behind_slcan_it_sits_on_the_mock_bus_beside_other_nodes(tmp_path, processor):
+    image = build_board(processor, tmp_path, slcan=True)
+    with (
+        running_board(image, processor) as board,
+        HubProcess(tmp_path / "bus", board.port, "sleep_after_open=0"),
+    ):
+        drive_beside_another_node(tmp_path / "bus")
 
 
 @pytest.mark.parametrize("processor", ["m3", "m4f"])
