@@ -49,6 +49,20 @@ class FastAdaptation:
         self._text = "nothing driven yet"
         self._counts = dict.fromkeys(("published", "refused", "reverted", "changes", "carried"), 0)
 
+    @property
+    def in_force(self) -> Geometry:
+        """What the robot drives by."""
+        return self._in_force
+
+    @property
+    def adapted(self) -> bool:
+        """Whether that was learnt, and is not the model file's."""
+        return self._adapted
+
+    def stop(self) -> None:
+        """Learn no more until asked to; somebody else says what is in force."""
+        self._paused, self._adapted, self._in_force = True, False, self._model
+
     def step(self, now_ns: int) -> Learnt:
         """Put in force what was learnt, twice a second."""
         asked, self._asked = self._asked, None

@@ -138,7 +138,7 @@ class Control(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     rate_hz: Annotated[float, Meta(ge=20.0, le=100.0)] = 50.0
     mode: Literal["default", "paper"] = "default"
     uncertainty: Literal["ut", "mc", "joint", "point"] = "ut"
-    adaptation: Literal["off", "fast"] = "off"
+    adaptation: Literal["off", "fast", "audited"] = "off"
     samples: Annotated[int, Meta(ge=8, le=1_000_000)] = 400
     horizon: Annotated[int, Meta(ge=2, le=500)] | None = None
     step_s: Annotated[float, Meta(gt=0.0, le=1.0)] | None = None

@@ -41,10 +41,11 @@ from disco_hw.log.provenance import DBC, version
 from disco_hw.log.recorder import NullRecorder, ProcessRecorder, Recorder, RecordingSettings
 from disco_hw.runtime import records_of_tick
 from disco_hw.runtime.assembly import (
-    FAST_ASKED_BY,
+    ASKED_BY_FILE,
     assemble_core,
     driver_of,
     make_adaptation,
+    make_audited_adaptation,
     make_fast_adaptation,
     make_link,
     make_pipeline,
@@ -70,8 +71,9 @@ _WATCHED_FAN_NS = _SECOND_NS // 2
 _FAN_PATHS = 16
 
 Say = Callable[[str, str], None]
-Adapt = Literal["off", "fast", "network"]
-"""Who learns the geometry on the way: nobody, a filter in the tick, or a network in a process of its own."""
+Adapt = Literal["off", "fast", "audited", "network"]
+"""Who learns the geometry on the way: nobody, a filter in the tick, the same audited by a network in a process of its
+own, or that network alone."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +101,7 @@ def run_daemon(options: DaemonOptions, make_pilot: Callable[[RobotConfig], Pilot
         refuse_missing_effects(setup)
     adapt: Adapt = "network" if options.adapt else setup.config.control.adaptation
     if adapt != "off":
-        asked_by = "--adapt" if options.adapt else FAST_ASKED_BY
+        asked_by = "--adapt" if options.adapt else ASKED_BY_FILE
         check_adaptable(setup.model, setup.config.control.uncertainty, asked_by)
     with closing(AsyncPrinter(STANDARD_OUTPUT, in_json if options.as_json else in_text)) as say:
         return serve(
@@ -177,6 +179,8 @@ def _start(
             adaptation = make_adaptation(setup, pipeline, ProcessLink())
         case "fast":
             adaptation = make_fast_adaptation(setup, pipeline)
+        case "audited":
+            adaptation = make_audited_adaptation(setup, pipeline, ProcessLink())
     if adaptation is not None:
         stop.add("adapter", adaptation.close)
     for step in realtime.enter(config.daemon.realtime_priority):

@@ -16,7 +16,14 @@ from disco_hw.log.link import Attachment
 from disco_hw.log.provenance import MODEL_TOML
 from disco_hw.log.recorder import MemoryRecorder, ProcessRecorder, RecordingSettings
 from disco_hw.model.file import model_text
-from disco_hw.runtime.assembly import assemble_core, driver_of, make_adaptation, make_fast_adaptation, make_pipeline
+from disco_hw.runtime.assembly import (
+    assemble_core,
+    driver_of,
+    make_adaptation,
+    make_audited_adaptation,
+    make_fast_adaptation,
+    make_pipeline,
+)
 from disco_hw.runtime.core import CoreTick, DaemonCore
 from disco_hw.runtime.pilot import Pilot, TaskPilot
 from disco_hw.runtime.pipeline import Pipeline, Planner
@@ -89,9 +96,11 @@ class SimulatedRun:
 
     @staticmethod
     def _adaptation(setup: Setup, pipeline: Pipeline, adapter: AdapterLink | None) -> GeometryAdaptation | None:
+        wanted = setup.config.control.adaptation
         if adapter is not None:
-            return make_adaptation(setup, pipeline, adapter)
-        return make_fast_adaptation(setup, pipeline) if setup.config.control.adaptation == "fast" else None
+            make = make_audited_adaptation if wanted == "audited" else make_adaptation
+            return make(setup, pipeline, adapter)
+        return None if wanted == "off" else make_fast_adaptation(setup, pipeline)
 
     def ticks(self, duration_s: float, *requests: UserRequest) -> Iterator[CoreTick]:
         """Let time pass and give every tick as it comes; the requests come with the first one."""

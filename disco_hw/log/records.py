@@ -187,7 +187,8 @@ class Adaptation(msgspec.Struct, frozen=True, gc=False):
     """What became of one report of the adapter: `outcome` for machines, `text` for a person.
 
     published, confirming, agrees, refused: of a proposal, whose `mean` and `std` are given; idle: there was none;
-    reverted: back to the model file; lost: no adapter. `data_s` of driving that the proposal rests on.
+    reverted: back to the model file; lost: no adapter; audit: the network's estimate beside the filter's; taken_over:
+    the network drives from now on. `data_s` of driving that the proposal rests on.
     """
 
     t_ns: int

@@ -6,6 +6,7 @@ import msgspec
 
 from disco_hw import control
 from disco_hw.adaptation.adaptation import CheckedAdaptation, GeometryAdaptation
+from disco_hw.adaptation.audited import AuditedAdaptation
 from disco_hw.adaptation.fast import FastAdaptation
 from disco_hw.adaptation.guard import (
     BeliefGuard,
@@ -34,7 +35,7 @@ from drivers.pose.convention import converted
 from drivers.transport import ReconnectingTransport, TransportSettingsError, make_transport
 from drivers.types import Driver, PoseSource, Transport
 
-FAST_ASKED_BY = 'control.adaptation = "fast"'
+ASKED_BY_FILE = "control.adaptation"
 _REHEARSALS = 5
 
 
@@ -88,11 +89,23 @@ def make_fast_adaptation(setup: Setup, pipeline: Pipeline) -> FastAdaptation:
 
     `pipeline` has taken no step yet.
     """
-    check_adaptable(setup.model, setup.config.control.uncertainty, FAST_ASKED_BY)
+    check_adaptable(setup.model, setup.config.control.uncertainty, ASKED_BY_FILE)
     return FastAdaptation(
         _rehearsed(setup, pipeline),
         *possible_range(setup.config.prior),
         lambda geometry: put_in_force(pipeline, setup.model, geometry),
+    )
+
+
+def make_audited_adaptation(setup: Setup, pipeline: Pipeline, link: AdapterLink) -> AuditedAdaptation:
+    """The same filter with a density network at the end of `link` that audits it; raises InputError as above."""
+    check_adaptable(setup.model, setup.config.control.uncertainty, ASKED_BY_FILE)
+    return AuditedAdaptation(
+        _rehearsed(setup, pipeline),
+        *possible_range(setup.config.prior),
+        link,
+        lambda geometry: put_in_force(pipeline, setup.model, geometry),
+        setup.config.robot.max_wheel_speed_rad_s,
     )
 
 

@@ -215,7 +215,7 @@ class Timeline:
 FAULT, EVENT, OVERRUN, REJECTED_FRAMES, GATED = "fault", "event", "overrun", "rejected frames", "pose rejected"
 ADAPTED = "adaptation"
 KINDS = (FAULT, ADAPTED, EVENT, OVERRUN, REJECTED_FRAMES, GATED)
-_TELLING = frozenset({"refused", "reverted", "lost"})
+_TELLING = frozenset({"refused", "reverted", "lost", "taken_over"})
 _APART_NS = 500_000_000
 
 

@@ -73,6 +73,20 @@ def test_a_robot_unlike_its_model_file_drives_worse_where_nothing_is_learnt(tmp_
     assert cost > COST
 
 
+def test_the_network_audits_the_filter_from_a_process_of_its_own(tmp_path):
+    with running_stack(tmp_path, "can", CIRCLE, CIRCLE_START, control='adaptation = "audited"') as stack:
+        stack.start()
+        audited = stack.operator.wait_until("audited", lambda s: "agree" in s["adaptation"]["audit"], LOADING_S)
+        assert audited["adaptation"]["takeovers"] == 0
+        assert audited["adaptation"]["belief"] == "adapted"
+        stack.operator.tell("quit")
+        assert stack.daemon.process.wait(10.0) == 0
+    with open_log(tmp_path / "run.mcap") as log:
+        assert "audit" in list(log.columns("/adapt")["outcome"])
+    code, output = disco("replay", "--json", str(tmp_path / "run.mcap"), timeout_s=120.0)
+    assert code == 0, output
+
+
 def adapter_pid(daemon_pid: int) -> int:
     """The daemon's child that runs the adapter."""
     for stat in Path("/proc").glob("[0-9]*/stat"):
