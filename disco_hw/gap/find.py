@@ -74,7 +74,7 @@ def find_gap(
         model=amended,
         offered=offered,
         residue=residue_sentences(analysis),
-        notes=(*log.notes, *notes, *remarks),
+        notes=(*log.notes, *analysis.drive.notes, *notes, *remarks),
         candidates=candidate_evidence(analysis),
         pictures=_drawn(analysis, gap) if pictures else {},
         seconds=time.perf_counter() - began,

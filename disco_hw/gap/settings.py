@@ -63,6 +63,16 @@ class GridSettings:
     """The delay of poses is scanned in steps of this. Chosen: between them a parabola is exact enough to begin with."""
     delay_span_s: float = 0.4
     """Turns and ways between poses so far apart are compared with the wheels'. Chosen: several poses of a lidar."""
+    clock_stretch_s: float = 12.0
+    """A drift or jump of the poses' clock is looked for in stretches of this. Chosen: each with starts and turns."""
+    fewest_clock_stretches: int = 4
+    """In fewer of them it is not looked for. Chosen."""
+    clock_times_better: float = 2.0
+    """It explains so many times more of how the stretches' delays scatter than it leaves. Chosen."""
+    least_clock_error_s: float = 0.03
+    """A smaller one is none. Chosen: a pose of a robot that turns at 1 rad/s is then off by its usual noise."""
+    least_clock_nats: float = 0.02
+    """And the whole log fits by so much per pose better with it. Measured: drifting clocks 0.04 to 0.8."""
     least_delay_nats: float = 0.05
     """A delay stands out by so much per pose. Measured: steady circles 0.4, a robot that turns about 3."""
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
-from disco_hw.gap.data.timing import pose_delay_s
+from disco_hw.gap.data.timing import pose_clock
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S, GapSettings, GridSettings
 from disco_hw.log.drive import Commands, DriveLog, Wheels
 
@@ -90,8 +90,10 @@ class GriddedDrive:
 def grid_drive(log: DriveLog, settings: GapSettings = DEFAULT_SETTINGS) -> GriddedDrive:
     """Lay a drive on the grid; a log without wheel samples has an empty one."""
     grid_settings = settings.grid
-    wheels, poses = undo_sample_hold(log.wheels, grid_settings), log.poses
-    notes: list[str] = []
+    wheels = undo_sample_hold(log.wheels, grid_settings)
+    clock = pose_clock(wheels, log.poses, grid_settings)
+    poses = clock.corrected(log.poses)
+    notes: list[str] = [*clock.notes]
     nodes_t, nodes_first, commands, changes, angles, speeds = [], [], [], [], [], []
     encoder_at, encoder_angle, pose_at, pose_values = [], [], [], []
     offset, foreign_s = 0, 0.0
@@ -152,7 +154,7 @@ def grid_drive(log: DriveLog, settings: GapSettings = DEFAULT_SETTINGS) -> Gridd
         pose_values=np.concatenate(pose_values),
         notes=tuple(notes),
         settings=settings,
-        pose_delay_s=pose_delay_s(wheels, poses, grid_settings),
+        pose_delay_s=clock.delay_s,
     )
 
 

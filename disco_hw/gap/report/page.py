@@ -62,7 +62,7 @@ def as_text(report: GapReport) -> str:
         values = ", ".join(f"{n} {e.value:.4g} [{e.low:.4g}, {e.high:.4g}]" for n, e in effect.parameters.items())
         lines.append(f"{effect.channel}: {effect.name}: {values}{_confounded(effect)}")
     lines += [f"{term.channel}: unnamed: {term.form}{_confounded(term)}" for term in report.unnamed]
-    lines += list(report.residue)
+    lines += [*report.residue, *report.notes]
     if report.gap:
         lines += ["", f"{'ahead':>6} " + " ".join(f"{stage:>20}" for stage in STAGES)]
         for horizon in report.gap["nominal"]:

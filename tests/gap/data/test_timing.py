@@ -5,11 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from disco_hw.gap.data.timing import pose_delay_s
+from disco_hw.gap.data.timing import pose_clock, pose_delay_s
 from disco_hw.gap.settings import GridSettings
 from disco_hw.log.drive import Poses, Wheels
 
 RADIUS_M, TRACK_M = 0.11, 0.6
+
+
+def older_by(poses, by_s):
+    """Poses whose stamps come `by_s(t)` later still."""
+    return replace(poses, t_s=poses.t_s + by_s(poses.t_s))
 
 
 def drive(older_s, turning=True, segments=1, noise_m=0.003, seed=0):
@@ -53,3 +58,34 @@ def test_too_few_poses_have_none():
     wheels, poses = drive(0.4)
     few = Poses(poses.t_s[:50], poses.x_m[:50], poses.y_m[:50], poses.yaw_rad[:50], poses.segment[:50])
     assert pose_delay_s(wheels, few, GridSettings()) == 0.0
+
+
+def test_a_clock_that_drifts_is_made_even_and_said_to_drift():
+    wheels, poses = drive(0.1)
+    clock = pose_clock(wheels, older_by(poses, lambda t: 0.12 * (t - 30.0) / 60.0), GridSettings())
+    drift_s = clock.drift_s / clock.span_s
+    assert drift_s == pytest.approx(0.12 / 60.0, rel=0.1)
+    assert clock.delay_s == pytest.approx(0.1, abs=0.01)
+    (said,) = clock.notes
+    assert "drifts" in said
+    even = clock.corrected(older_by(poses, lambda t: 0.12 * (t - 30.0) / 60.0))
+    assert np.abs(even.t_s - poses.t_s).max() < 0.01
+
+
+@pytest.mark.parametrize("jump_s", [-0.3, 0.15])
+def test_a_clock_that_jumps_is_made_even_and_said_to_jump(jump_s):
+    wheels, poses = drive(0.0)
+    clock = pose_clock(wheels, older_by(poses, lambda t: jump_s * (t > 33.0)), GridSettings())
+    assert clock.jump_s == pytest.approx(jump_s, abs=0.02)
+    assert clock.jump_at_s == pytest.approx(33.0, abs=2.0)
+    assert "jumps" in clock.notes[0]
+    assert (np.diff(clock.corrected(older_by(poses, lambda t: jump_s * (t > 33.0))).t_s) > 0.0).all()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_an_even_clock_is_left_alone(seed):
+    wheels, poses = drive(0.2, seed=seed, noise_m=0.01)
+    clock = pose_clock(wheels, poses, GridSettings())
+    assert clock.notes == ()
+    assert clock.delay_s == pytest.approx(0.2, abs=0.01)
+    assert (clock.corrected(poses).t_s == poses.t_s).all()
