@@ -31,7 +31,7 @@ def term(recent: float, older: float, coefficients: tuple[float, float] | None) 
 
 def starts(driven: CommandedDrive) -> tuple[tuple[float, ...], ...]:
     """Where a fit begins."""
-    return (0.03,), (0.12,), (0.3,)
+    return (0.03,), (0.12,), (0.3,), (-0.1,), (-0.3,)
 
 
 EFFECT = Effect(
@@ -39,12 +39,12 @@ EFFECT = Effect(
     channel=Channel.COMMAND_TO_WHEEL,
     stage=Stage.DELAY,
     # A host that stamps commands or encoders late shows as a negative delay; better reported than hidden in noise.
-    parameters=(Parameter("delay_s", "s", 0.0, 1.0, 0.05, realistic=0.04, least_fitted=-0.05),),
+    parameters=(Parameter("delay_s", "s", 0.0, 1.0, 0.05, realistic=0.04, least_fitted=-1.0),),
     plain=plain,
     coefficients=coefficients,
     term=term,
     late_by="delay_s",
-    late_starts=(0.02, 0.1, 0.3),
+    late_starts=(0.02, 0.1, 0.3, -0.25),
     starts=starts,
     symptoms=(Symptom.LATE_YAW,),
     excitation="steps of the wheel command: start-stops and fast steering",

@@ -142,10 +142,8 @@ def pose_delay_s(wheels: Wheels, poses: Poses, settings: GridSettings) -> float:
     by those of the wheels (two regressions, robust by Huber's weights; their likelihoods, with unknown variances, are
     added). 0 where the poses are too few or where no delay stands out.
     """
-    delays = settings.delay_step_s * np.arange(
-        -round(settings.most_pose_delay_s / settings.delay_step_s),
-        round(settings.most_pose_delay_s / settings.delay_step_s) + 1,
-    )
+    steps = round(settings.most_pose_delay_s / settings.delay_step_s)
+    delays: Array = settings.delay_step_s * np.arange(-steps, steps + 1, dtype=np.float64)
     misfit = _misfits(wheels, poses, delays, settings)
     best = int(np.argmin(misfit))
     ordinary = misfit[np.isfinite(misfit)]
@@ -156,7 +154,7 @@ def pose_delay_s(wheels: Wheels, poses: Poses, settings: GridSettings) -> float:
 
 def _misfit_at(wheels: Wheels, poses: Poses, delay_s: float, settings: GridSettings) -> float:
     """Minus the log likelihood per pose at a delay; 0 where the poses are too few."""
-    misfit = float(_misfits(wheels, poses, np.array([delay_s]), settings)[0])
+    misfit = float(_misfits(wheels, poses, np.full(1, delay_s), settings)[0])
     return misfit if np.isfinite(misfit) else 0.0
 
 

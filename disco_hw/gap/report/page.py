@@ -14,8 +14,10 @@ from disco_hw.reports import style
 
 def sentence(effect: EffectFinding) -> str:
     """What a missing effect does, with its values."""
-    words: str = REGISTRY[effect.name].sentence
-    return words.format(**{name: e.value for name, e in effect.parameters.items()})
+    described = REGISTRY[effect.name]
+    said: str = described.sentence.format(**{name: e.value for name, e in effect.parameters.items()})
+    early = any(effect.parameters[p.name].value < p.low for p in described.parameters if p.least_fitted is not None)
+    return f"{said} (before they come: a clock stamps too late)" if early else said
 
 
 def answer(report: GapReport) -> list[str]:

@@ -7,9 +7,10 @@ from dataclasses import replace
 import pytest
 
 from disco_hw.gap.report.blind_spots import BlindSpot
-from disco_hw.gap.report.findings import STAGES, GapReport, UnnamedFinding
-from disco_hw.gap.report.page import answer, as_text, page
+from disco_hw.gap.report.findings import STAGES, EffectFinding, GapReport, UnnamedFinding
+from disco_hw.gap.report.page import answer, as_text, page, sentence
 from disco_hw.gap.search.cross_validation import PredictionErrors
+from disco_hw.gap.search.intervals import ParameterEstimate
 from disco_hw.gap.settings import DEFAULT_SETTINGS
 from disco_hw.model import Model
 from disco_hw.reports.outputs import as_json
@@ -84,3 +85,11 @@ def test_the_page_names_the_score_that_a_name_takes():
     selection = DEFAULT_SETTINGS.selection
     accepts = f"score ({selection.named_score:g} accepts, up to {selection.heaviest * selection.named_score:g} where"
     assert accepts in page(report(0.014))
+
+
+@pytest.mark.parametrize(("delay_s", "wrong"), [(0.12, False), (-0.17, True)])
+def test_a_response_before_its_command_is_said_to_be_a_wrong_clock(delay_s, wrong):
+    late = EffectFinding(
+        "command_delay", "command_to_wheel", {"delay_s": ParameterEstimate(delay_s, delay_s, delay_s)}, 9.0
+    )
+    assert ("clock" in sentence(late)) == wrong
