@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,12 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 _BETWEEN_LOGS_S = 10.0
+_WHEEL_COLUMNS = {
+    "enc_left_rad_s": "left_speed_rad_s",
+    "enc_right_rad_s": "right_speed_rad_s",
+    "enc_left_rad": "left_angle_rad",
+    "enc_right_rad": "right_angle_rad",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,6 +95,32 @@ class DriveLog:
         """Number of segments: one more than the highest in any array."""
         arrays = (self.commands.segment, self.wheels.segment, self.poses.segment, self.gyro.segment)
         return 1 + max((int(segment.max()) for segment in arrays if segment.size), default=-1)
+
+    def to_pandas(self) -> Any:
+        """All of it as one `pandas.DataFrame`, a row a sample in order of time, with the columns of our CSV.
+
+        `t_s`, `segment`, `cmd_left_rad_s`, ..., `imu_wz_rad_s`; what a row does not hold is NaN. Raises ImportError
+        without pandas, which nothing else needs.
+        """
+        import pandas  # noqa: PLC0415
+
+        frames = [pandas.DataFrame(columns) for columns in self._tables() if columns["t_s"].size]
+        if not frames:
+            return pandas.DataFrame({name: np.empty(0) for columns in self._tables() for name in columns})
+        joined = pandas.concat(frames, ignore_index=True)
+        return joined.sort_values("t_s", kind="stable", ignore_index=True)
+
+    def _tables(self) -> list[dict[str, NDArray[Any]]]:
+        of: list[tuple[Commands | Wheels | Poses | Gyro, dict[str, str]]] = [
+            (self.commands, {"cmd_left_rad_s": "left_rad_s", "cmd_right_rad_s": "right_rad_s"}),
+            (self.wheels, _WHEEL_COLUMNS),
+            (self.poses, {"pose_x_m": "x_m", "pose_y_m": "y_m", "pose_yaw_rad": "yaw_rad"}),
+            (self.gyro, {"imu_wz_rad_s": "yaw_rate_rad_s"}),
+        ]
+        return [
+            {"t_s": part.t_s, "segment": part.segment, **{name: getattr(part, field) for name, field in names.items()}}
+            for part, names in of
+        ]
 
 
 def concatenate(drives: Sequence[DriveLog]) -> DriveLog:

@@ -46,6 +46,26 @@ class FreeRun:
         return states
 
 
+def simulate(model: Model, commands: Array, step_s: float = 0.02, start: Array | None = None) -> Array:
+    """Where a model's point values lead: states (N + 1, 5) x, y (m), yaw (rad, not wrapped), wheel speeds (rad/s).
+
+    `commands` (N, 2): wheel speeds wanted, left and right (rad/s), each held for `step_s`; before them the wheels were
+    told to stand. `start` (5,): the first state, the origin at rest if None. Raises ValueError for other shapes and for
+    what is not finite.
+    """
+    wanted = np.asarray(commands, dtype=np.float64)
+    begin = np.zeros(5) if start is None else np.asarray(start, dtype=np.float64)
+    if wanted.ndim != 2 or wanted.shape[1] != 2 or begin.shape != (5,):
+        raise ValueError(
+            f"commands of shape (N, 2) and a start of shape (5,) are needed, not {wanted.shape}, {begin.shape}"
+        )
+    if not (np.isfinite(wanted).all() and np.isfinite(begin).all()):
+        raise ValueError("commands and start have to be finite numbers")
+    run = FreeRun(model, model.point()[None], step_s)
+    before = np.zeros((run.past_rows, 2))
+    return run.states(begin, np.vstack([before, wanted]), run.past_rows)
+
+
 @kernel_function
 def run_states(
     states: Array, commands: Array, history: int, time_s: float, point: int, base: Base, effects: Coefficients,
