@@ -10,7 +10,7 @@ SOURCES := pyproject.toml setup.py constraints.txt firmware_protocol/build_firmw
 # the libraries anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: venv demo chromium test test-long bench gap-study soak fault-campaign fuzz firmware-check firmware-mutants firmware-emulated cross-tools socketcan-test ros clean
+.PHONY: venv demo chromium test test-long bench gap-study soak fault-campaign fuzz firmware-check firmware-mutants firmware-emulated cross-tools socketcan-test ros dist-check docs clean
 
 venv: $(STAMP)
 
@@ -117,3 +117,18 @@ socketcan-test: $(STAMP)
 
 clean:
 	rm -rf $(VENV) $(PEERS) $(ROS) build *.egg-info firmware_protocol/_firmware*
+
+# What is handed out: sdist and wheel, the wheel installed into an empty environment, and the demonstration from there.
+DIST := .dist-check
+dist-check: $(BIN)/python
+	rm -rf $(DIST) && mkdir -p $(DIST)/elsewhere
+	$(PYTHON) -m venv $(DIST)/build && $(DIST)/build/bin/python -m pip install --quiet build
+	$(DIST)/build/bin/python -m build --outdir $(DIST)/dist .
+	$(PYTHON) -m venv $(DIST)/venv && PIP_CONSTRAINT=constraints.txt $(DIST)/venv/bin/python -m pip install --quiet $(DIST)/dist/*.whl
+	cd $(DIST)/elsewhere && ../venv/bin/disco-hw --version && ../venv/bin/disco-hw demo --laps 0.5
+
+# The documentation as a site, in an environment of its own.
+docs:
+	@test -x .docs-venv/bin/mkdocs || { $(PYTHON) -m venv .docs-venv && .docs-venv/bin/python -m pip install --quiet 'mkdocs-material>=9.5'; }
+	.docs-venv/bin/mkdocs build --strict --quiet --site-dir site
+	@echo "look at site/index.html"
