@@ -10,7 +10,7 @@ import enum
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import msgspec
 
@@ -205,7 +205,8 @@ class RobotLinkHealth(msgspec.Struct, frozen=True, gc=False):
 class Capabilities:
     """What is known of the controller: said by itself in the handshake, or, not `told`, declared in robot.toml.
 
-    A limit that neither says is None.
+    A limit that neither says is None. `watchdog`: whether the controller said how long it waits for a command, cannot
+    be set otherwise, or robot.toml declares it and nobody has looked.
     """
 
     protocol_major: int
@@ -220,6 +221,7 @@ class Capabilities:
     drive_off_timeout_s: float
     stop_deceleration_rad_s2: float
     told: bool = True
+    watchdog: Literal["told", "fixed", "declared"] = "told"
 
 
 class Readings(msgspec.Struct, frozen=True, gc=False):

@@ -24,6 +24,7 @@ from disco_hw.runtime.preflight import (
     check_round_trip,
     check_safety,
     check_task,
+    check_watchdog,
 )
 from disco_hw.runtime.robot_setup import Setup, link_key, load_setup
 from disco_hw.runtime.situation import connection
@@ -104,6 +105,7 @@ def run_check(robot: Path, link: str | None = None) -> CheckReport:
             if found.capabilities is not None:
                 checks += check_firmware_limits(setup.config.robot, found.capabilities)
                 checks.append(check_command_timing(control, found.capabilities))
+                checks.append(check_watchdog(found.capabilities))
     finally:
         transport.close()
         pose_source.close()

@@ -137,6 +137,17 @@ def check_command_timing(control: Control, capabilities: Capabilities) -> Check:
     return Check("command timing", Level.OK, f"{found}{spare} in a row may be lost")
 
 
+def check_watchdog(capabilities: Capabilities) -> Check:
+    """Whether how long the controller waits for a command is known of itself, or declared alone."""
+    waits = f"{capabilities.command_timeout_s:g} s"
+    match capabilities.watchdog:
+        case "told":
+            return Check("watchdog", Level.OK, f"{waits}, told by the controller")
+        case "fixed":
+            return Check("watchdog", Level.OK, f"{waits}, which cannot be set otherwise")
+    return Check("watchdog", Level.WARNING, f"{waits} is what robot.toml declares; it could not be read back")
+
+
 def check_safety(robot: Robot, card: SafetyCard) -> list[Check]:
     """The safety card: who stops the robot when, how far at full speed, and what could not be verified."""
     speed_m_s = robot.max_wheel_speed_rad_s * robot.wheel_radius_m

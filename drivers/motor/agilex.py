@@ -128,6 +128,7 @@ class AgilexDriver:
             self._settings.max_speed_m_s / self._settings.wheel_radius_m,
             TIMEOUT_S,
             self._settings.stop_deceleration_rad_s2,
+            "fixed",
         )
 
     def link_up(self, now_ns: int) -> None:

@@ -46,8 +46,10 @@ ARMING_TIMEOUT_NS = 1_500_000_000
 BEATS_TO_ARM = 2
 SILENT_BEATS = 3
 VERSION_TRIES = 3
+WATCHDOG_TRIES = 5
 _VERSION_PERIOD_NS = 100_000_000
 _REPEAT_NS = 100_000_000
+_SAME_TIMEOUT_S = 0.002
 _ALIVE_PERIOD_NS = 30_000_000
 _HOST_COMMANDS = frozenset({0x02, 0x06, 0x07, 0x0B, 0x0C, 0x0D, 0x0E, 0x0F, 0x16, 0x18, 0x19, 0x1A, 0x1B})
 _QUIET = frozenset({AxisState.UNDEFINED, AxisState.IDLE, AxisState.CLOSED_LOOP})
@@ -67,6 +69,8 @@ class _Axis:
     estimated_ns: int = 0
     moved_turns: float = 0.0
     is_new: bool = False
+    watchdog_on: bool | None = None
+    watchdog_s: float | None = None
 
 
 class OdriveDriver:
@@ -83,6 +87,8 @@ class OdriveDriver:
         self._link_is_up = False
         self._known = False
         self._refusal: str | None = None
+        self._introduced: str | None = None
+        self._asked_watchdog = 0
         self._asked_version = 0
         self._asked_ns = 0
         self._stage = Stage.REST
@@ -152,6 +158,7 @@ class OdriveDriver:
             2.0 * math.pi * settings.vel_limit_turns_s / settings.gear,
             settings.watchdog_s,
             settings.stop_deceleration_rad_s2,
+            "declared" if settings.watchdog_endpoints is None else "told",
         )
 
     def link_up(self, now_ns: int) -> None:
@@ -184,6 +191,9 @@ class OdriveDriver:
         wheels: list[WheelSample] = []
         status: list[RobotStatus] = []
         for received in frames if self._link_is_up else ():
+            if self._take_parameter(received.frame):
+                self._count("frames_accepted")
+                continue
             decoded = codec.decode(self._generation, received.frame)
             if decoded is None and self._generation is Generation.V05:
                 decoded = self._answer_of_another_generation(received.frame)
@@ -258,7 +268,7 @@ class OdriveDriver:
         if self._wanted is Request.RESET:
             return self._reset(now_ns)
         if not self._known and self._refusal is None:
-            return self._ask_version(now_ns)
+            return self._ask_version(now_ns) if self._introduced is None else self._ask_watchdog(now_ns)
         if now_ns - self._asked_ns < _ALIVE_PERIOD_NS:
             return ()
         self._asked_ns = now_ns
@@ -278,6 +288,40 @@ class OdriveDriver:
         else:
             self._refusal = 'the nodes do not answer for their version as 0.6 does; write link.firmware = "0.5"'
         return ()
+
+    def _ask_watchdog(self, now_ns: int) -> tuple[OutgoingFrame, ...]:
+        """Ask until every axis has said whether its watchdog is on and how long it waits; what it says is compared."""
+        if now_ns - self._asked_ns < _VERSION_PERIOD_NS:
+            return ()
+        self._asked_ns = now_ns
+        self._asked_watchdog += 1
+        endpoints = self._settings.watchdog_endpoints or ()
+        waiting = [axis.node for axis in self._all if axis.watchdog_on is None or axis.watchdog_s is None]
+        if self._asked_watchdog > WATCHDOG_TRIES:
+            self._refusal = f"node {waiting[0]} does not tell its watchdog; correct link.watchdog_endpoints"
+            return ()
+        return parts.outgoing(now_ns, *(codec.read_parameter(node, number) for node in waiting for number in endpoints))
+
+    def _take_parameter(self, frame: Frame) -> bool:
+        """Whether the frame answers for a watchdog, which is then judged."""
+        axis = self._by_node.get(codec.split(frame.can_id)[0])
+        if axis is None or self._settings.watchdog_endpoints is None or self._introduced is None:
+            return False
+        enabled, timeout = self._settings.watchdog_endpoints
+        is_on = codec.parameter(frame, axis.node, enabled, "bool")
+        timeout_s = codec.parameter(frame, axis.node, timeout, "f32")
+        if is_on is None and timeout_s is None:
+            return False
+        axis.watchdog_on = axis.watchdog_on if is_on is None else bool(is_on)
+        axis.watchdog_s = axis.watchdog_s if timeout_s is None else float(timeout_s)
+        wanted_s = self._settings.watchdog_s
+        if axis.watchdog_on is False:
+            self._refusal = f"node {axis.node}: its watchdog is off; set axis0.config.enable_watchdog (odrivetool)"
+        elif axis.watchdog_s is not None and not abs(axis.watchdog_s - wanted_s) <= _SAME_TIMEOUT_S:
+            self._refusal = f"node {axis.node}: its watchdog waits {axis.watchdog_s:g} s; set {wanted_s:g} s there"
+        elif not self._known and all(each.watchdog_on and each.watchdog_s is not None for each in self._all):
+            self._announce(f"{self._introduced}, watchdog {wanted_s:g} s")
+        return True
 
     def _reset(self, now_ns: int) -> tuple[OutgoingFrame, ...]:
         if not any(axis.error for axis in self._all) and self._repeat_ns and now_ns - self._repeat_ns >= _REPEAT_NS:
@@ -372,11 +416,16 @@ class OdriveDriver:
     def _take_version(self, values: Mapping[str, float]) -> None:
         if self._generation is Generation.V05:
             self._refusal = 'the nodes answer for their version, which 0.5 does not; write link.firmware = "0.6"'
-        elif not self._known:
+        elif self._introduced is None:
             version = ".".join(str(values[f"fw_{part}"]) for part in ("major", "minor", "revision"))
             self._introduce(f", firmware {version}")
 
     def _introduce(self, version: str = "") -> None:
+        self._introduced = version
+        if self._settings.watchdog_endpoints is None:
+            self._announce(version)
+
+    def _announce(self, version: str) -> None:
         self._known, self._note = True, "it stands by"
         nodes = ", ".join(str(axis.node) for axis in self._all)
         self._events.append(f"nodes {nodes} are there: ODrive {self._settings.firmware}{version}")
@@ -467,9 +516,10 @@ class OdriveDriver:
             self._note = f"disarmed: {why}"
         self._wanted, self._stage, self._stage_ns = Request.STANDBY, Stage.REST, None
         self._known, self._refusal, self._fault, self._foreign = False, None, None, False
+        self._introduced, self._asked_watchdog = None, 0
         self._asked_version, self._asked_ns, self._repeat_ns, self._arm_step = 0, now_ns - _VERSION_PERIOD_NS, 0, 0
         for axis in self._all:
-            axis.heard_ns = axis.pos_turns = None
+            axis.heard_ns = axis.pos_turns = axis.watchdog_on = axis.watchdog_s = None
             axis.state, axis.error, axis.beats_armed, axis.is_new = AxisState.UNDEFINED, 0, 0, False
 
     def _words(self, axis: _Axis) -> str:

@@ -62,12 +62,15 @@ _ERRORS: Mapping[Generation, Mapping[int, str]] = MappingProxyType(
 _HEARD = 3
 _Nodes = int | tuple[int, ...]
 _Sign = Literal[-1, 1]
+_Endpoint = Annotated[int, Meta(ge=0, le=65535)]
 
 
 class OdriveSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Its fields in [link]: left before right; `gear` is motor turns per wheel turn.
 
     `watchdog_s`, `vel_limit_turns_s` (of the motor), `heartbeat_s` and `firmware` are what the controller is set to.
+    `watchdog_endpoints`: of `axis0.config.enable_watchdog` and `axis0.config.watchdog_timeout` in the
+    flat_endpoints.json of that very firmware (0.6), to read the watchdog back; None: it is declared.
     """
 
     nodes: tuple[_Nodes, _Nodes]
@@ -77,6 +80,7 @@ class OdriveSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     direction: tuple[_Sign, _Sign] = (1, 1)
     gear: Annotated[float, Meta(gt=0.0, le=1000.0)] = 1.0
     heartbeat_s: Annotated[float, Meta(ge=0.005, le=0.2)] = 0.1
+    watchdog_endpoints: tuple[_Endpoint, _Endpoint] | None = None
     stop_deceleration_rad_s2: Annotated[float, Meta(gt=0.0, le=655.0)] = 10.0
 
     @property
@@ -102,6 +106,8 @@ class OdriveSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
             return SettingsFault("nodes", "a side has no node", "write [left, right], such as [3, 5]")
         if any(not 0 <= node <= codec.LARGEST_NODE for node in nodes):
             return SettingsFault("nodes", f"a node is outside 0 to {codec.LARGEST_NODE}", "write those of odrivetool")
+        if self.watchdog_endpoints is not None and self.firmware != "0.6":
+            return SettingsFault("watchdog_endpoints", "firmware 0.5 has none that CAN could read", "remove it")
         if len(set(nodes)) != len(nodes):
             return SettingsFault("nodes", "a node stands there twice", "write each motor's own")
         return None

@@ -186,6 +186,7 @@ class RoboclawDriver:
             self._fastest_rad_s,
             settings.watchdog_s,
             settings.stop_deceleration_rad_s2,
+            "told",
         )
 
     def link_up(self, now_ns: int) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import enum
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 from drivers.types import Capabilities, Frame, OutgoingFrame, RobotStatus, WheelCommand
 
@@ -52,9 +52,14 @@ def estop_frames(now_ns: int, frames: tuple[Frame, ...]) -> tuple[OutgoingFrame,
 
 
 def declared(
-    firmware: str, major: int, fastest_rad_s: float, timeout_s: float, deceleration_rad_s2: float
+    firmware: str,
+    major: int,
+    fastest_rad_s: float,
+    timeout_s: float,
+    deceleration_rad_s2: float,
+    watchdog: Literal["told", "fixed", "declared"] = "declared",
 ) -> Capabilities:
-    """What robot.toml says of a controller that tells nothing of itself."""
+    """What robot.toml says of a controller that tells nothing of itself but, perhaps, its watchdog."""
     return Capabilities(
         protocol_major=major,
         protocol_minor=0,
@@ -68,6 +73,7 @@ def declared(
         drive_off_timeout_s=timeout_s,
         stop_deceleration_rad_s2=deceleration_rad_s2,
         told=False,
+        watchdog=watchdog,
     )
 
 

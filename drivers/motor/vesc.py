@@ -43,12 +43,14 @@ from drivers.types import (
 )
 
 ZEROS_TO_ARM = 10
+TIMEOUT_TRIES = 5
 SILENT_NS = 100_000_000
 GONE_NS = 500_000_000
 ARMING_TIMEOUT_NS = 1_500_000_000
 BRAKING_NS = 3_000_000_000
 _PING_PERIOD_NS = 100_000_000
 _FAULT_PERIOD_NS = 50_000_000
+_SAME_TIMEOUT_S, _SAME_CURRENT_A = 0.002, 0.1
 _SET_COMMANDS = frozenset(number for number, _ in codec.CAN_COMMANDS.values())
 _BRAKE = codec.CAN_COMMANDS["set_brake_current"][0]
 
@@ -68,6 +70,13 @@ class _Motor:
     fault: int | None = None
     timed_out: bool = False
     killed: bool = False
+    timeout: tuple[float, float] | None = None
+    asked_timeout: int = 0
+
+    @property
+    def may_tell_timeout(self) -> bool:
+        """Whether its timeout is not known yet, and it has not been asked often enough to give up."""
+        return self.timeout is None and self.asked_timeout < TIMEOUT_TRIES
 
 
 class VescDriver:
@@ -102,6 +111,8 @@ class VescDriver:
             return DriverState.DISCONNECTED
         if self._estopped or any(motor.killed for motor in self._all):
             return DriverState.ESTOP
+        if self._refusal is not None:
+            return DriverState.REFUSED
         if not self._is_known:
             return DriverState.HANDSHAKE
         if self._fault is not None or any(motor.fault for motor in self._all):
@@ -119,6 +130,8 @@ class VescDriver:
         match self.state:
             case DriverState.DISCONNECTED:
                 return "the link is down"
+            case DriverState.REFUSED:
+                return self._refusal or ""
             case DriverState.HANDSHAKE:
                 return self._missing()
             case DriverState.ESTOP:
@@ -134,7 +147,7 @@ class VescDriver:
     @property
     def capabilities(self) -> Capabilities | None:
         """What robot.toml declares of the controllers; they tell nothing of that themselves."""
-        if not self._is_known:
+        if not self._is_known or self._refusal is not None:
             return None
         settings = self._settings
         return parts.declared(
@@ -143,6 +156,7 @@ class VescDriver:
             settings.max_erpm / settings.erpm_per_rad_s,
             settings.watchdog_s,
             settings.stop_deceleration_rad_s2,
+            "declared" if any(motor.timeout is None for motor in self._all) else "told",
         )
 
     def link_up(self, now_ns: int) -> None:
@@ -242,7 +256,27 @@ class VescDriver:
 
     @property
     def _is_known(self) -> bool:
-        return all(m.answered and m.erpm_ns is not None and m.tachometer is not None for m in self._all)
+        return all(
+            m.answered and m.erpm_ns is not None and m.tachometer is not None and not m.may_tell_timeout
+            for m in self._all
+        )
+
+    @property
+    def _refusal(self) -> str | None:
+        """What a controller's timeout is other than robot.toml declares."""
+        settings = self._settings
+        for motor in self._all:
+            if motor.timeout is None:
+                continue
+            timeout_s, brake_current_a = motor.timeout
+            named = f"controller {motor.node}: its timeout"
+            if timeout_s <= 0.0:
+                return f"{named} is off; set {1e3 * settings.watchdog_s:g} ms (VESC Tool, App Settings, General)"
+            if abs(timeout_s - settings.watchdog_s) > _SAME_TIMEOUT_S:
+                return f"{named} is {timeout_s:g} s; set {settings.watchdog_s:g} s there, or write link.watchdog_s"
+            if not abs(brake_current_a - settings.timeout_brake_current_a) <= _SAME_CURRENT_A:
+                return f"{named} brakes with {brake_current_a:g} A; write that in link.timeout_brake_current_a"
+        return None
 
     @property
     def _stands(self) -> bool:
@@ -263,6 +297,11 @@ class VescDriver:
         if now_ns - self._asked_ns < _FAULT_PERIOD_NS:
             return ()
         self._asked_ns = now_ns
+        mute = [motor for motor in self._all if motor.may_tell_timeout]
+        if mute and self._stage is Stage.REST:
+            motor = min(mute, key=lambda each: each.asked_timeout)
+            motor.asked_timeout += 1
+            return parts.outgoing(now_ns, *codec.fragments(motor.node, HOST_ID, bytes([codec.GET_APPCONF])))
         self._next_asked = (self._next_asked + 1) % len(self._all)
         node = self._all[self._next_asked].node
         return parts.outgoing(now_ns, *codec.fragments(node, HOST_ID, codec.ask_values(codec.FAULT_AND_STATUS)))
@@ -324,6 +363,7 @@ class VescDriver:
         if found is not None and found[0] in self._motors:
             read: Mapping[str, float] = codec.values(found[2]) or {}
             motor = self._motors[found[0]]
+            motor.timeout = codec.timeout(found[2], motor.node) or motor.timeout
             motor.fault = int(read["fault"]) if "fault" in read else motor.fault
             byte = int(read.get("status_byte", 0))
             motor.timed_out, motor.killed = bool(byte & codec.TIMED_OUT), bool(byte & codec.KILL_SWITCH)
@@ -414,6 +454,7 @@ class VescDriver:
         for motor in self._all:
             motor.answered = motor.is_new = motor.timed_out = motor.killed = False
             motor.erpm, motor.erpm_ns, motor.tachometer, motor.fault = 0.0, None, None, None
+            motor.timeout, motor.asked_timeout = None, 0
 
     def _count(self, name: str) -> None:
         self.stats = replace(self.stats, **{name: getattr(self.stats, name) + 1})

@@ -44,7 +44,8 @@ PACKET_COMMANDS: Mapping[str, tuple[int, float]] = MappingProxyType(
         "set_handbrake": (10, 1e3),
     }
 )
-FW_VERSION, GET_VALUES, ALIVE, FORWARD_CAN, GET_VALUES_SELECTIVE = 0, 4, 30, 34, 50
+FW_VERSION, GET_VALUES, GET_APPCONF, ALIVE, FORWARD_CAN, GET_VALUES_SELECTIVE = 0, 4, 17, 30, 34, 50
+_TIMEOUT = struct.Struct(">BIBIf")
 PING, PONG = 17, 18
 FILL, FILL_LONG, PROCESS, PROCESS_SHORT = 5, 6, 7, 8
 _FILL_BYTES, _FILL_REACH, _LONG_BYTES, _SHORT_BYTES = 7, 255, 6, 6
@@ -172,6 +173,18 @@ def values(payload: bytes) -> Mapping[str, float] | None:
                 return None
             offset += struct.calcsize(">" + body)
     return MappingProxyType(found)
+
+
+def timeout(payload: bytes, controller: int) -> tuple[float, float] | None:
+    """Return the timeout (s, 0 is off) and its brake current (A) in a controller's answer to GET_APPCONF; else None.
+
+    They stand behind the signature and the controller's id since firmware 4; what has another id there is laid out
+    otherwise.
+    """
+    if len(payload) < _TIMEOUT.size or payload[0] != GET_APPCONF:
+        return None
+    _, _, told, timeout_ms, brake_current_a = _TIMEOUT.unpack_from(payload)
+    return (1e-3 * timeout_ms, brake_current_a) if told == controller else None
 
 
 def fragments(controller: int, sender: int, payload: bytes, send_mode: int = 0) -> tuple[Frame, ...]:

@@ -374,6 +374,10 @@ class OdriveController:
         for axis in (axis for board in boards for axis in board.axes):
             axis.watchdog_enabled, axis.watchdog_timeout_s = True, settings.watchdog_s
             axis.vel_limit_turns_s = settings.vel_limit_turns_s
+        if settings.watchdog_endpoints is not None:
+            enabled, timeout = settings.watchdog_endpoints
+            for board in boards:
+                board.parameters = {enabled: b"\1\0\0\0", timeout: struct.pack("<f", settings.watchdog_s)}
         return boards
 
     def _axes_by_side(self) -> tuple[list[Axis], list[Axis]]:

@@ -17,6 +17,9 @@ from firmware_protocol.firmware_core import FirmwareInputs
 from sim.can_frame import CanFrame
 
 BUFFER = 520
+APPCONF_SIGNATURE = 3264926020
+_APPCONF_REST = 300
+"""Bytes of the application's settings that follow, of no meaning here."""
 CHECK_MS = 10
 _F32 = struct.Struct("<f")
 _CAN_SET = {
@@ -263,7 +266,7 @@ class Vesc:
 
     def _obey(self, payload: bytes, behind: bytes) -> tuple[bytes | None, list[CanFrame]]:
         """Carry out a packet; `behind` is what lies in memory behind it. Returns answer and frames for CAN."""
-        command = payload[0] if payload else None
+        command, brake_a = payload[0] if payload else None, self.timeout_brake_current_a
         if command in _PACKET_SET:
             name, scale = _PACKET_SET[command]
             raw = (payload[1:] + behind).ljust(4, b"\0")[:4]
@@ -274,6 +277,9 @@ class Vesc:
             return b"\0" + self.firmware, []
         elif command == 4:
             return b"\4" + self.answer_values((1 << 22) - 1), []
+        elif command == 17:
+            head = struct.pack(">BIBIf", 17, APPCONF_SIGNATURE, self.controller_id, self.timeout_ms, brake_a)
+            return head + bytes(_APPCONF_REST), []
         elif command == 50:
             mask = int.from_bytes(payload[1:5].ljust(4, b"\0"))
             return b"\x32" + mask.to_bytes(4) + self.answer_values(mask), []

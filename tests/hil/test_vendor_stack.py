@@ -18,11 +18,16 @@ ROLLS_S = 6.0
 """Until a robot that coasts stands: the simulated floor takes so long from 6 rad/s."""
 
 
-@pytest.mark.parametrize(
-    "fault",
-    ["SIGKILL", pytest.param("SIGSTOP", marks=pytest.mark.long), pytest.param("unplug", marks=pytest.mark.long)],
-)
-@pytest.mark.parametrize("device", DEVICES)
+def each_device(short, faults):
+    """Every device with every fault, all but `short` of them in the long run: what they share, one of them shows."""
+    return [
+        pytest.param(device, fault, marks=() if (device, fault) in short else pytest.mark.long)
+        for device in DEVICES
+        for fault in faults
+    ]
+
+
+@pytest.mark.parametrize(("device", "fault"), each_device({("odrive", "SIGKILL")}, ("SIGKILL", "SIGSTOP", "unplug")))
 def test_the_robot_stops_and_nothing_arms_again(tmp_path, device, fault):
     with running_stack(tmp_path, device=device) as stack:
         stack.drive()
@@ -48,8 +53,9 @@ def test_the_robot_stops_and_nothing_arms_again(tmp_path, device, fault):
     assert max(row.fastest for row in stopped) < STILL_RAD_S
 
 
-@pytest.mark.parametrize("daemon", [pytest.param("healthy", marks=pytest.mark.long), "frozen"])
-@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize(
+    ("device", "daemon"), each_device({("vesc", "frozen"), ("roboclaw", "frozen")}, ("healthy", "frozen"))
+)
 def test_an_estop_from_beside_stops_it_and_is_confirmed(tmp_path, device, daemon):
     with running_stack(tmp_path, device=device) as stack:
         stack.drive()

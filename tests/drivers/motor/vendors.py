@@ -84,7 +84,7 @@ def is_vesc_forbidden(frame):
     """Duty, position, shutdown, another bit rate, a packet that is no question, a length that is not the command's."""
     command = frame.can_id >> 8
     if command == 8:
-        return frame.data[2] != 50
+        return frame.data[2] not in (17, 50)
     return command in (0, 4, 5, 6, 7, 10, 31, 63) or (command < 14 and len(frame.data) != 4) or not frame.extended
 
 

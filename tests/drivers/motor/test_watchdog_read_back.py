@@ -1,0 +1,92 @@
+"""A controller whose watchdog is off, or other than robot.toml declares, is refused in words where it can be asked."""
+
+import struct
+
+import pytest
+
+from disco_hw.runtime.preflight import Level, check_watchdog
+from drivers.motor.vesc_codec import timeout
+from drivers.types import DriverState
+from tests.drivers.motor.vendors import VENDORS, Vendor
+
+BY_LABEL = {vendor.label: vendor for vendor in VENDORS}
+STILL = (DriverState.STANDBY, DriverState.READY)
+
+
+def readable_odrive():
+    vendor = BY_LABEL["odrive-0.6"]
+    return Vendor(vendor.name, vendor.label, "watchdog_endpoints = [220, 221]\n", *list(vars(vendor).values())[3:])
+
+
+def vescs(bench):
+    return [vesc for side in bench.robot.controller.sides for vesc in side]
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "said"),
+    [
+        ("timeout_ms", 0, "controller 51: its timeout is off"),
+        ("timeout_ms", 1000, "controller 51: its timeout is 1 s; set 0.1 s there"),
+        ("timeout_brake_current_a", 30.0, "brakes with 30 A"),
+    ],
+)
+def test_a_vesc_whose_timeout_is_another_is_refused(field, value, said):
+    bench = BY_LABEL["vesc"].bench()
+    setattr(vescs(bench)[1], field, value)
+    bench.run_until(DriverState.REFUSED)
+    assert said in bench.driver.detail
+    assert bench.driver.capabilities is None
+    assert not [frame for frame in bench.robot.received if BY_LABEL["vesc"].is_motion(frame)]
+
+
+def test_a_vesc_that_does_not_tell_is_driven_as_declared_and_said_to_be():
+    bench = BY_LABEL["vesc"].bench()
+    for vesc in vescs(bench):
+        obey = vesc._obey
+        vesc._obey = lambda payload, behind, obey=obey: (None, []) if payload[:1] == b"\x11" else obey(payload, behind)
+    bench.arm()
+    assert check_watchdog(bench.driver.capabilities).level is Level.WARNING
+
+
+@pytest.mark.parametrize("payload", [b"", b"\x11", struct.pack(">BIBIf", 17, 1, 24, 100, 0.0), b"\x32" + bytes(20)])
+def test_settings_of_another_layout_or_controller_tell_nothing(payload):
+    assert timeout(payload, 23) is None
+
+
+@pytest.mark.parametrize(
+    ("number", "value", "said"),
+    [
+        (220, bytes(4), "node 5: its watchdog is off"),
+        (221, struct.pack("<f", 2.0), "node 5: its watchdog waits 2 s; set 0.1 s there"),
+    ],
+)
+def test_an_odrive_whose_watchdog_is_another_is_refused(number, value, said):
+    bench = readable_odrive().bench()
+    bench.robot.controller.boards[1].parameters[number] = value
+    bench.run_until(DriverState.REFUSED)
+    assert said in bench.driver.detail
+
+
+def test_an_odrive_that_does_not_answer_for_the_endpoints_given_is_refused():
+    bench = readable_odrive().bench()
+    bench.robot.controller.boards[0].parameters.clear()
+    bench.run_until(DriverState.REFUSED)
+    assert "node 3 does not tell its watchdog; correct link.watchdog_endpoints" in bench.driver.detail
+
+
+@pytest.mark.parametrize(
+    ("vendor", "level", "words"),
+    [
+        (BY_LABEL["odrive-0.5"], Level.WARNING, "could not be read back"),
+        (readable_odrive(), Level.OK, "told by the controller"),
+        (BY_LABEL["vesc"], Level.OK, "told by the controller"),
+        (BY_LABEL["agilex"], Level.OK, "cannot be set otherwise"),
+        (BY_LABEL["roboclaw"], Level.OK, "told by the controller"),
+    ],
+)
+def test_the_check_says_whether_it_was_read_back(vendor, level, words):
+    bench = vendor.bench()
+    bench.run_until(*STILL)
+    found = check_watchdog(bench.driver.capabilities)
+    assert (found.level, words in found.text) == (level, True)
+    bench.arm()
