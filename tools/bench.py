@@ -14,6 +14,7 @@ from rich.table import Table
 
 PARTS = (
     "bench_adapt",
+    "bench_bridge",
     "bench_control",
     "bench_control_path",
     "bench_estimation",

@@ -1,6 +1,7 @@
 """Poses and speeds from ROS: what is passed on to the daemon, and what is refused for which reason."""
 
 import math
+import random
 
 import pytest
 
@@ -10,11 +11,13 @@ from disco_hw.bridge import ros2_messages as msg
 from disco_hw.bridge.ros2_commands import SpeedInlet
 from disco_hw.bridge.ros2_poses import PoseInlet
 from disco_hw.config import Drive, PoseInput, Robot
+from disco_hw.drive.hand_pilot import Deadman
 from disco_hw.drive.keyboard import wheel_speeds
 from disco_hw.drive.page_source import PageSource, steering_from
 from disco_hw.drive.source import RobotView
 from disco_hw.estimation.odometry import OdometryParameters
 from disco_hw.runtime.states import State
+from disco_hw.runtime.supervisor import UserRequest
 from drivers.pose.udp import pose_of
 
 MONO_NS, WALL_NS = 50_000_000_000, 1_800_000_000_000_000_000
@@ -183,3 +186,54 @@ def test_the_daemons_deadman_counts_from_when_the_speed_was_sent():
     assert request["held"]
     assert steer(MONO_NS, True, int(request["stamp"])) is None
     assert MONO_NS - page.poll(MONO_NS, view).t_ns == 150 * MS
+
+
+def said_by(kind, draw, struck_ns):
+    """(when it was sent, when it is heard, speed) of a node's speeds at 20 Hz, wrong in some way from a time on."""
+    for step in range(80):
+        sent = step * 50 * MS + draw.randrange(20 * MS)
+        if sent < struck_ns or kind == "none":
+            yield sent, sent + draw.randrange(5 * MS), 0.2
+        elif kind == "nan":
+            yield sent, sent + MS, math.nan
+        elif kind == "frozen":
+            # All that was kept back comes at once.
+            yield sent, struck_ns + 700 * MS + step * MS, 0.2
+        elif kind == "flood":
+            yield from ((sent + i * MS // 2, sent + i * MS // 2 + MS, 0.2) for i in range(60))
+
+
+@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("kind", ["none", "kill", "frozen", "nan", "flood"])
+def test_at_random_times_a_fault_disarms_within_the_deadmans_time_and_nothing_else_does(kind, seed):
+    draw = random.Random(f"{kind}{seed}")
+    struck_ns = draw.randrange(1000 * MS, 2500 * MS)
+    heard = sorted(said_by(kind, draw, struck_ns), key=lambda one: one[1])
+    inlet, page, deadman = SpeedInlet(ROBOT, DRIVE, PARAMETERS), PageSource(5.0, 0.6), Deadman()
+    state, armed_ns, disarmed_ns, last_good_ns = State.READY, [], [], 0
+    for now in range(0, 4000 * MS, 20 * MS):
+        while heard and heard[0][1] <= now:
+            sent, at, speed = heard.pop(0)
+            if sent <= struck_ns or kind in ("none", "flood"):
+                last_good_ns = sent
+            if 300 * MS < at < 350 * MS:
+                assert inlet.permit(MONO_NS + at) is None
+            request = inlet.request(twist(speed, 0.0), WALL_NS + sent, MONO_NS + at, WALL_NS + at)
+            if request is not None:
+                del request["do"]
+                page.steer(MONO_NS + now, 1, steering_from(request))
+        newest = page.poll(MONO_NS + now, RobotView(state, state is State.ARMED))
+        requests = deadman.step(MONO_NS + now, newest, state).requests
+        if UserRequest.ARM in requests:
+            state = State.ARMED
+            armed_ns.append(now)
+        elif UserRequest.DISARM in requests:
+            state = State.READY
+            disarmed_ns.append(now)
+    assert len(armed_ns) == 1
+    if kind in ("none", "flood"):
+        # At the very end nothing is said any more.
+        assert [now for now in disarmed_ns if now < last_good_ns + 200 * MS] == []
+    else:
+        (disarmed,) = disarmed_ns
+        assert struck_ns - 50 * MS < disarmed <= last_good_ns + 200 * MS + 20 * MS

@@ -1,20 +1,24 @@
-"""A node of ROS 2 in a process of its own: hears /odom and says what it is asked to; killed and stopped by tests.
+"""A node of ROS 2 in a process of its own: hears /odom, says what it is asked to, and is killed by tests and trials.
 
-    python -m tests.bridge.ros_node DOMAIN KIND X Y YAW
+    python -m tools.ros2_node DOMAIN KIND X Y YAW
 
-`echo` says where the robot is by its own odometry, from X Y YAW on; `nan`, `frame`, `flood`, `garbage` and `late` do
-that after 150 good ones wrongly, `speed` says speeds X (m/s) and YAW (rad/s), 20 a second, asks the bridge
-for each line of its input, and writes the answers. A line for each odometry heard.
+`echo` says where the robot is by its own odometry, from X Y YAW on; `nan`, `frame`, `flood`, `garbage` and `late` do so
+wrongly from SIGUSR1 on. A line for each odometry heard: its stamp (wall clock), when it was heard and answered
+(monotonic), in ns, and where it is (m). `speed` says speeds X (m/s) and YAW (rad/s), 20 a second, asks the bridge for
+each line of its input, and writes the answers.
 """
 
 import contextlib
 import math
 import os
+import signal
 import sys
 import time
+from dataclasses import dataclass
 
 from cyclonedds.core import Policy, Qos
 from cyclonedds.domain import Domain, DomainParticipant
+from cyclonedds.idl import IdlStruct
 from cyclonedds.pub import DataWriter
 from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
@@ -22,11 +26,16 @@ from cyclonedds.topic import Topic
 from disco_hw.bridge import ros2_messages as msg
 from disco_hw.bridge.ros2 import LOOPBACK
 
-GOOD = 150
+
+@dataclass
+class Garbage(IdlStruct, typename="geometry_msgs::msg::dds_::PoseStamped_"):
+    """A message that says that it is a pose."""
+
+    text: str
 
 
-def main(domain: str, kind: str, *start: str) -> None:
-    x, y, yaw = map(float, start)
+def main(domain: str, kind: str, east: str, north: str, heading: str) -> None:
+    x, y, yaw = float(east), float(north), float(heading)
     _domain = Domain(int(domain), LOOPBACK)
     participant = DomainParticipant(int(domain))
     best_effort = Qos(Policy.Reliability.BestEffort, Policy.History.KeepLast(1))
@@ -37,20 +46,21 @@ def main(domain: str, kind: str, *start: str) -> None:
     say = DataWriter(participant, Topic(participant, "rt/pose", msg.PoseStamped))
     # The name of a pose and the bytes of something else, once it is time.
     other = None
-    said = 0
+    wrong: list[int] = []
+    signal.signal(signal.SIGUSR1, lambda *_: wrong.append(1))
     while True:
         for heard in odometry.take(10):
             if not heard.sample_info.valid_data:
                 continue
-            said += 1
+            heard_ns = time.monotonic_ns()
             place, turned = heard.pose.pose.position, heard.pose.pose.orientation
-            east = x + math.cos(yaw) * place.x - math.sin(yaw) * place.y
-            north = y + math.sin(yaw) * place.x + math.cos(yaw) * place.y
+            at_x = x + math.cos(yaw) * place.x - math.sin(yaw) * place.y
+            at_y = y + math.sin(yaw) * place.x + math.cos(yaw) * place.y
             half = 0.5 * (yaw + 2.0 * math.atan2(turned.z, turned.w))
-            pose = msg.Pose(msg.Point(east, north, 0.0), msg.Quaternion(0.0, 0.0, math.sin(half), math.cos(half)))
+            pose = msg.Pose(msg.Point(at_x, at_y, 0.0), msg.Quaternion(0.0, 0.0, math.sin(half), math.cos(half)))
             message = msg.PoseStamped(msg.Header(heard.header.stamp, "map"), pose)
             times = 1
-            if said > GOOD:
+            if wrong:
                 if kind == "nan":
                     pose.position.x = math.nan
                 elif kind == "frame":
@@ -60,10 +70,11 @@ def main(domain: str, kind: str, *start: str) -> None:
                 elif kind == "flood":
                     times = 40
                 elif kind == "garbage" and other is None:
-                    other = DataWriter(participant, Topic(participant, "rt/pose", garbage_type()))
+                    other = DataWriter(participant, Topic(participant, "rt/pose", Garbage))
             for _ in range(times):
-                (other or say).write(garbage_type()("x" * 300) if other else message)
-            print(f"{time.monotonic_ns()} {said} {place.x} {place.y}", flush=True)
+                (other or say).write(Garbage("x" * 300) if other else message)
+            stamp_ns, said_ns = msg.time_of(heard.header.stamp), time.monotonic_ns()
+            print(f"{stamp_ns} {heard_ns} {said_ns} {place.x:.6f} {place.y:.6f}", flush=True)
         time.sleep(0.001)
 
 
@@ -82,24 +93,6 @@ def drive(participant, twist):
             if reply.sample_info.valid_data:
                 print(reply.data, flush=True)
         time.sleep(0.05)
-
-
-_made = []
-
-
-def garbage_type():
-    """A message that says that it is a pose."""
-    if not _made:
-        from dataclasses import dataclass
-
-        from cyclonedds.idl import IdlStruct
-
-        @dataclass
-        class Garbage(IdlStruct, typename="geometry_msgs::msg::dds_::PoseStamped_"):
-            text: str
-
-        _made.append(Garbage)
-    return _made[0]
 
 
 if __name__ == "__main__":

@@ -1,0 +1,137 @@
+"""The bridge to ROS 2: odometry to a subscriber, a pose to a wheel command, and the loop's lateness with and without.
+
+Simulator, daemon with the real planner, bridge and node are processes of their own on this machine. A pose's time is
+from when the node says it to when the first wheel command that knew it is on the wire; the loop runs at 50 Hz.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from disco_hw.daemon.client import send_request
+from disco_hw.experiments.live_stack import FAST_START, FAST_TASK, Operator, disco_hw_process, write_robot_file
+from disco_hw.log.reader import open_log
+from tools.bench_latency import READY_TIMEOUT_S, WHEEL_COMMAND
+
+DOMAIN = 90
+SETTLED_S = 2.0
+_NS = 1_000_000_000
+
+
+def run(seconds: float = 30.0) -> dict[str, float]:
+    """Return the figures in milliseconds."""
+    figures: dict[str, float] = {}
+    with tempfile.TemporaryDirectory() as name, circling(Path(name)) as (_, start_ns):
+        time.sleep(seconds)
+        end_ns = time.monotonic_ns()
+        status = send_request(Path(name) / "control.sock", {"do": "status"})
+        assert status["running"], status["detail"]
+        send_request(Path(name) / "control.sock", {"do": "quit"})
+        time.sleep(2.0)
+        figures |= _summary("bridge.odometry_from_tick", _odometry_ms(Path(name), start_ns, end_ns))
+        figures |= _summary("bridge.pose_to_command", _pose_to_command_ms(Path(name), start_ns, end_ns))
+        figures |= _summary("bridge.loop_lateness_with", _lateness_ms(Path(name), start_ns, end_ns))
+    with tempfile.TemporaryDirectory() as name, circling(Path(name), bridged=False) as (_, start_ns):
+        time.sleep(seconds)
+        figures |= _summary("bridge.loop_lateness_without", _lateness_ms(Path(name), start_ns, time.monotonic_ns()))
+    return figures
+
+
+@contextmanager
+def circling(directory: Path, bridged: bool = True) -> Iterator[tuple[Operator, int]]:
+    """The stack on its circle, by the poses of a node or without bridge; yields since when (monotonic, ns)."""
+    robot_file = write_robot_file(directory, task=FAST_TASK)
+    if bridged:
+        lines = f'[pose]\nsource = "ros2"\nport = {5100 + DOMAIN}\n[ros2]\ndomain = {DOMAIN}\n'
+        robot_file.write_text(robot_file.read_text(encoding="utf-8") + lines, encoding="utf-8")
+    start = list(map(str, FAST_START))
+    simulator = ["sim", str(robot_file), "--bus-log", str(directory / "bus.log"), "--start", *start]
+    with ExitStack() as stack:
+        children = [
+            stack.enter_context(disco_hw_process("virtual robot", simulator, directory / "sim.txt")),
+            stack.enter_context(
+                disco_hw_process(
+                    "daemon", ["run", str(robot_file), "--log", str(directory / "run.mcap")], directory / "daemon.txt"
+                )
+            ),
+        ]
+        if bridged:
+            bridge = ["bridge", "ros2", str(robot_file)]
+            children.append(stack.enter_context(disco_hw_process("bridge", bridge, directory / "bridge.txt")))
+            node = [sys.executable, "-m", "tools.ros2_node", str(DOMAIN), "echo", *start]
+            with (directory / "node.txt").open("wb") as output:
+                stack.callback(subprocess.Popen(node, stdout=output).kill)
+        operator = Operator(directory / "control.sock", children)
+        operator.wait_until("ready, with poses", lambda s: s["state"] == "READY" and s["pose_ok"], READY_TIMEOUT_S)
+        operator.tell("arm")
+        operator.wait_for("ARMED", 5.0)
+        operator.tell("start")
+        time.sleep(SETTLED_S)
+        yield operator, time.monotonic_ns()
+
+
+def _heard(directory: Path) -> np.ndarray:
+    """(N, 3): stamp (wall clock), heard and answered (monotonic, ns) of each odometry."""
+    rows = [line.split() for line in (directory / "node.txt").read_text(encoding="utf-8").splitlines()]
+    return np.array([list(map(int, row[:3])) for row in rows if len(row) == 5])
+
+
+def _odometry_ms(directory: Path, start_ns: int, end_ns: int) -> np.ndarray:
+    """From the tick that took a wheel sample to the node that heard the odometry of it."""
+    offset_ns = time.time_ns() - time.monotonic_ns()
+    with open_log(directory / "run.mcap") as log:
+        ticks = np.array([(entry.record.t_ns, entry.now_ns) for entry in log.records({"/wheels"})])
+    found = []
+    for stamp_ns, heard_ns, _ in _heard(directory):
+        if start_ns <= heard_ns <= end_ns:
+            nearest = int(np.abs(ticks[:, 0] + offset_ns - stamp_ns).argmin())
+            found.append((heard_ns - ticks[nearest, 1]) * 1e-6)
+    return np.array(found)
+
+
+def _pose_to_command_ms(directory: Path, start_ns: int, end_ns: int) -> np.ndarray:
+    """From a node's saying a pose to the next wheel command on the wire after the tick that took it."""
+    offset_ns = time.time_ns() - time.monotonic_ns()
+    said = _heard(directory)
+    on_wire = []
+    for line in (directory / "bus.log").read_text(encoding="utf-8").splitlines():
+        stamp, _, frame = line.split()
+        if int(frame.partition("#")[0], 16) == WHEEL_COMMAND:
+            on_wire.append(round(float(stamp[1:-1]) * _NS))
+    commands = np.array(on_wire)
+    found = []
+    with open_log(directory / "run.mcap") as log:
+        for entry in log.records({"/pose"}):
+            if start_ns <= entry.now_ns <= end_ns:
+                nearest = int(np.abs(said[:, 0] - offset_ns - entry.record.t_ns).argmin())
+                sent_ns = commands[np.searchsorted(commands, entry.now_ns)]
+                found.append((sent_ns - said[nearest, 2]) * 1e-6)
+    return np.array(found)
+
+
+def _lateness_ms(directory: Path, start_ns: int, end_ns: int) -> np.ndarray:
+    with open_log(directory / "run.mcap") as log:
+        ticks = [entry.record for entry in log.records({"/loop"}) if start_ns <= entry.now_ns <= end_ns]
+    return np.array([tick.lateness_ns * 1e-6 for tick in ticks])
+
+
+def _summary(key: str, values_ms: np.ndarray) -> dict[str, float]:
+    return {
+        f"{key}.p50_ms": float(np.percentile(values_ms, 50)),
+        f"{key}.p99_ms": float(np.percentile(values_ms, 99)),
+        f"{key}.max_ms": float(values_ms.max()),
+        f"{key}.count": float(len(values_ms)),
+    }
+
+
+if __name__ == "__main__":
+    for name, value in run(float(sys.argv[1]) if len(sys.argv) > 1 else 30.0).items():
+        print(f"{name:40} {value:10.3f}")
