@@ -25,7 +25,7 @@ $(STAMP): $(SOURCES) | $(BIN)/python
 	@touch $@
 
 demo: $(STAMP)
-	$(BIN)/disco-hw demo
+	$(BIN)/disco-hw demo --view
 
 # The page's tests need a browser and are skipped without one. CHROMIUM=install installs it on Debian, as root, and has
 # `make test` run them too.

@@ -17,9 +17,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
+from rich.console import Console, Group
 from rich.live import Live
 from rich.progress import BarColumn, Progress, TextColumn
+from rich.text import Text
 
 import disco_hw
 from disco_hw.config import load_robot_config
@@ -35,13 +36,15 @@ from disco_hw.experiments.live_stack import (
     stands,
     with_device,
 )
-from disco_hw.tasks.circle import circle_task
+from disco_hw.experiments.terminal_picture import NARROWEST, Point, circle_points, picture
+from disco_hw.tasks.circle import CircleTask, circle_task
 from disco_hw.viewer.address import DEFAULT_PORT, LOOPBACK, TOKEN_VARIABLE, page_address, page_token
 
 _START_TIMEOUT_S = READY_TIMEOUT_S
 _POLL_S = 0.1
 _STOP_TIMEOUT_S = 10.0
 _STALL_MS = 100
+_PICTURE_ROWS = 14
 _STALL_LOOK_BACK_S = 0.5
 _WATCHDOG = frozenset({"COMMAND_TIMEOUT", "COMMAND_EXPIRED", "HOST_SILENT"})
 
@@ -92,11 +95,31 @@ def run_demo(options: DemoOptions) -> CircleReport:
         stopped = _drive_undisturbed(options, files, console)
     task = circle_task(load_robot_config(_shipped_robot()).task, "the demonstration")
     report = load_circle_report(files.log, files.truth, task, options.laps, stopped)
-    picture = options.out / "circle.png"
-    report.draw(picture)
+    drawn = options.out / "circle.png"
+    report.draw(drawn)
     console.print(report.table())
-    console.print(f"log {files.log}   picture {picture}   truth {files.truth}")
+    console.print(f"log {files.log}   picture {drawn}   truth {files.truth}")
+    for line in what_next(options, files.log, drawn):
+        console.print(line, soft_wrap=True, highlight=False)
     return report
+
+
+def what_next(options: DemoOptions, log: Path, drawn: Path) -> list[str]:
+    """What to look at now, and what to type next."""
+    again = (
+        []
+        if options.view
+        else ["  disco-hw demo --view           the same, with the page in your browser while it drives"]
+    )
+    return [
+        f"look at {drawn}: the circle, what was driven, what was estimated",
+        "type next:",
+        f"  disco-hw view {log}    the drive again, on the page, with a bar to scrub",
+        f"  disco-hw replay {log}  the controller again on the recorded inputs, bit for bit",
+        *again,
+        "  disco-hw experiment gap        an effect hidden in the robot, found, named, and driven again with",
+        "  disco-hw init                  a robot.toml for a robot of your own",
+    ]
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,6 +186,8 @@ def _drive(options: DemoOptions, files: _Files, console: Console) -> bool:
     # The daemon hands the variable on to its page.
     os.environ[TOKEN_VARIABLE] = token = page_token()
     address = page_address(LOOPBACK, options.port, token)
+    if options.view:
+        console.print(f"page {address} (until the drive is over)", soft_wrap=True)
     daemon_arguments = ["run", str(files.robot), "--log", str(files.log), *_page(options), *_adapt(options)]
     with (
         disco_hw_process("virtual robot", simulator, files.simulator_output) as robot,
@@ -171,8 +196,6 @@ def _drive(options: DemoOptions, files: _Files, console: Console) -> bool:
         operator = Operator(files.socket, (robot, daemon))
         link = options.link if options.device is None else link_of_device(options.device)
         console.print(f"virtual robot pid {robot.process.pid}, daemon pid {daemon.process.pid}, link {link}")
-        if options.view:
-            console.print(f"page {address}", soft_wrap=True)
         operator.wait_for("READY", _START_TIMEOUT_S)
         operator.tell("arm")
         operator.wait_for("ARMED", 5.0)
@@ -210,7 +233,9 @@ def _watch_laps(operator: Operator, options: DemoOptions, limit_s: float, consol
     task = progress.add_task("circle", total=options.laps, figures="")
     deadline = time.monotonic() + limit_s
     next_line = 0.0
-    with Live(progress, console=console, refresh_per_second=4) if console.is_terminal else _nothing():
+    floor = _Floor(circle_task(load_robot_config(_shipped_robot()).task, "the demonstration"))
+    shown = Group(progress, floor) if console.width >= NARROWEST else progress
+    with Live(shown, console=console, refresh_per_second=4) if console.is_terminal else _nothing():
         while True:
             # Taken before a status is asked for: a daemon that is held up answers only afterwards.
             stolen.append((time.monotonic(), stolen_ms()))
@@ -220,6 +245,7 @@ def _watch_laps(operator: Operator, options: DemoOptions, limit_s: float, consol
             if status["state"] != "ARMED":
                 raise _why_stopped(operator, status, stolen_ms() - stolen[0][1])
             laps = float(status["task"]["laps"])
+            floor.driven.append((status["pose"][0], status["pose"][1]))
             figures = (
                 f"d {status['task']['distance_m'] * 1e3:4.0f} mm  v {status['task']['speed_m_s']:.3f} m/s  "
                 f"late p99 {status['loop']['lateness_us']['p99'] or 0.0:.0f} us"
@@ -233,6 +259,21 @@ def _watch_laps(operator: Operator, options: DemoOptions, limit_s: float, consol
             if time.monotonic() > deadline:
                 raise WorkError(f"only {laps:.2f} of {options.laps} laps were driven in {limit_s:.0f} s")
             time.sleep(_POLL_S)
+
+
+class _Floor:
+    """The task's circle and the way driven, as a picture that `rich` draws anew whenever it is shown."""
+
+    def __init__(self, task: CircleTask) -> None:
+        self.driven: list[Point] = []
+        self._task = task
+
+    def __rich__(self) -> Text:
+        task, reach_m = self._task, 1.3 * self._task.radius_m
+        centre = (task.center_x_m, task.center_y_m)
+        low, high = (centre[0] - reach_m, centre[1] - reach_m), (centre[0] + reach_m, centre[1] + reach_m)
+        layers = [circle_points(centre, task.radius_m), self.driven]
+        return Text("\n".join(picture(layers, low, high, _PICTURE_ROWS)))
 
 
 def _why_stopped(operator: Operator, status: Mapping[str, Any], taken_ms: int) -> WorkError:
