@@ -29,6 +29,7 @@ NonNegative = Annotated[float, Meta(ge=0.0)]
 Probability = Annotated[float, Meta(gt=0.0, lt=1.0)]
 Share = Annotated[float, Meta(gt=0.0, le=1.0)]
 Range = tuple[float, float]
+NatNetVersion = Literal["2.6", "2.7", "2.8", "2.9", "2.10", "2.11", "3.0", "3.1", "4.0", "4.1"]
 Datum = tuple[Annotated[float, Meta(ge=-90.0, le=90.0)], Annotated[float, Meta(ge=-180.0, le=180.0)]]
 
 
@@ -105,6 +106,12 @@ class PoseInput(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     baud: Annotated[int, Meta(ge=1200, le=4_000_000)] | None = None
     datum: Datum | None = None
     heading_std_rad: Annotated[float, Meta(gt=0.0, le=1.8)] | None = None
+    data_port: Annotated[int, Meta(ge=1, le=65535)] | None = None
+    group: str | None = None
+    server: str | None = None
+    natnet_version: NatNetVersion | None = None
+    body: Annotated[int, Meta(ge=0, le=2**31 - 1)] | None = None
+    up_axis: Literal["y", "z"] | None = None
     latency_s: Annotated[float, Meta(ge=0.0, le=5.0)] = 0.0
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     offset: tuple[float, float] = (0.0, 0.0)

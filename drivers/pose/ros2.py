@@ -26,8 +26,19 @@ def bridge_address(port: int) -> bytes:
     return f"\0disco-hw/{os.geteuid()}/pose/{port}".encode()
 
 
-def make_pose_source(*, port: int = 5005, **_of_other_sources: Any) -> BridgePoses:
-    """By the fields of [pose]. Raises PoseSourceError where another daemon hears the bridge already."""
+def make_pose_source(
+    *,
+    port: int = 5005,
+    topic: str = "",
+    frame: str = "",
+    position_std_m: float = 0.0,
+    yaw_std_rad: float = 0.0,
+    **_of_other_sources: Any,
+) -> BridgePoses:
+    """By the port of [pose]; the other fields are the bridge's.
+
+    Raises PoseSourceError where another daemon hears the bridge already.
+    """
     opened = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
     opened.setblocking(False)
     opened.setsockopt(socket.SOL_SOCKET, socket.SO_PASSCRED, 1)

@@ -1,7 +1,12 @@
 """Poses in datagrams: both forms, real sockets, hostile ones."""
 
 import json
+import re
+import shutil
 import socket
+import subprocess
+import time
+from pathlib import Path
 
 import msgspec
 import pytest
@@ -85,3 +90,41 @@ def test_a_port_that_is_taken_is_refused_in_one_line(port):
     with pytest.raises(PoseSourceError, match=rf"127\.0\.0\.1:{port}: .*; choose another pose\.port"):
         make_pose_source("udp", port=port)
     first.close()
+
+
+def sent_from_the_page(language, port):
+    """The page's sender in this language, to this port."""
+    page = (Path(__file__).parents[3] / "docs/poses.md").read_text(encoding="utf-8")
+    (code,) = re.findall(rf"```{language}\n(.*?)```", page, flags=re.DOTALL)
+    return code.replace("5005", str(port))
+
+
+def arrived(source):
+    end_s = time.monotonic() + 60.0
+    while not (poses := source.receive(NOW_NS, ())):
+        assert time.monotonic() < end_s
+        time.sleep(0.01)
+    source.close()
+    (pose,) = poses
+    return pose.x_m, pose.y_m, pose.yaw_rad, NOW_NS - pose.t_ns
+
+
+def test_the_pages_sender_in_python(port):
+    source, names = make_pose_source("udp", port=port), {}
+    exec(sent_from_the_page("python", port), names)
+    names["send"](1.5, -2.0, 0.25, 0.04)
+    assert arrived(source) == (1.5, -2.0, 0.25, 40_000_000)
+
+
+def test_the_pages_sender_in_cpp(port, tmp_path):
+    compiler = shutil.which("c++")
+    if compiler is None:
+        pytest.skip("no C++ compiler")
+    (tmp_path / "send.cpp").write_text(
+        sent_from_the_page("cpp", port) + "int main() { send_pose(1.5, -2.0, 0.25, 0.04); }\n", encoding="utf-8"
+    )
+    command = [compiler, "-std=c++11", "-Wall", "-Wextra", "-Werror", "-o", tmp_path / "send", tmp_path / "send.cpp"]
+    subprocess.run(command, check=True, timeout=120)
+    source = make_pose_source("udp", port=port)
+    subprocess.run([tmp_path / "send"], check=True, timeout=60)
+    assert arrived(source) == (1.5, -2.0, 0.25, 40_000_000)
