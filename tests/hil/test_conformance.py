@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from disco_hw.experiments.live_stack import READY_TIMEOUT_S, disco_hw_process, write_robot_file
+from disco_hw.experiments.live_stack import DEVICES, READY_TIMEOUT_S, disco_hw_process, write_robot_file
 from tests.drivers.waiting import wait_until
 
 pytestmark = [pytest.mark.hil, pytest.mark.long, pytest.mark.timeout(300)]
@@ -45,6 +45,17 @@ def test_the_virtual_robot_conforms(tmp_path, link, key, chosen, least):
         if key is None:
             code, found, output = conform(robot_file, "-k", "follows or introduces")
             assert (code, found) == (0, {"passed": 1, "skipped": 1}), output
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_each_vendors_simulated_controller_conforms(tmp_path, device):
+    robot_file = write_robot_file(tmp_path, device=device)
+    with disco_hw_process("virtual robot", ["sim", str(robot_file)], tmp_path / "sim.txt"):
+        wait_until(lambda: "ready" in (tmp_path / "sim.txt").read_text(), READY_TIMEOUT_S)
+        code, found, output = conform(robot_file, "--allow-motion", "-k", "vendor or introduces")
+        assert (code, found) == (0, {"passed": 12, "skipped": 1}), output
+        code, found, output = conform(robot_file, "-k", "before_it_is_armed or stands_and_stays or zeros")
+        assert (code, found) == (0, {"passed": 1, "skipped": 1}), output
 
 
 @pytest.mark.parametrize("key", [None, KEY])
