@@ -130,5 +130,5 @@ dist-check: $(BIN)/python
 # The documentation as a site, in an environment of its own.
 docs:
 	@test -x .docs-venv/bin/mkdocs || { $(PYTHON) -m venv .docs-venv && .docs-venv/bin/python -m pip install --quiet 'mkdocs-material>=9.5'; }
-	.docs-venv/bin/mkdocs build --strict --quiet --site-dir site
+	NO_MKDOCS_2_WARNING=1 .docs-venv/bin/mkdocs build --strict --quiet --site-dir site
 	@echo "look at site/index.html"

@@ -1,4 +1,4 @@
-"""The commands of the README's part "By hand", as they stand, one after the other in processes of their own."""
+"""The commands of the page "By hand" of the tutorial, as they stand, one after the other in processes of their own."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ pytestmark = [pytest.mark.hil, pytest.mark.long, pytest.mark.timeout(1200)]
 
 def commands_of_readme() -> list[list[str]]:
     """The lines of the first block under "By hand" that call disco-hw, without their comments."""
-    block = (ROOT / "README.md").read_text("utf-8").split("## By hand\n")[1].split("```")[1]
+    block = (ROOT / "docs" / "virtual-robot.md").read_text("utf-8").split("## By hand\n")[1].split("```")[1]
     return [shlex.split(line, comments=True) for line in block.splitlines() if re.match(r"disco-hw\s", line)]
 
 

@@ -1,0 +1,92 @@
+"""The documentation holds together: links lead somewhere, every page has its place, every command is one there is."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+
+import click
+import pytest
+import typer
+
+from disco_hw.cli import app
+
+ROOT = Path(__file__).parents[1]
+PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")])
+LINK = re.compile(r"\]\(([^)\s]+)\)")
+COMMAND = re.compile(r"^(?:\s*|.*`)(?:sudo )?(?:\.venv/bin/)?disco-hw +([^`]*)")
+
+
+def names(page: Path) -> str:
+    return str(page.relative_to(ROOT))
+
+
+def anchors(page: Path) -> set[str]:
+    """Of the headings, as GitHub and mkdocs make them."""
+    found = re.findall(r"^#+ +(.+)$", page.read_text(encoding="utf-8"), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.strip().lower()).replace(" ", "-") for heading in found}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=names)
+def test_every_link_leads_to_a_file_and_to_a_heading_in_it(page):
+    dead = []
+    for link in LINK.findall(page.read_text(encoding="utf-8")):
+        if link.startswith(("http://", "https://", "mailto:")):
+            continue
+        path, _, anchor = link.partition("#")
+        target = (page.parent / path).resolve() if path else page
+        if not target.exists() or (anchor and target.suffix == ".md" and anchor not in anchors(target)):
+            dead.append(link)
+    assert not dead
+
+
+def test_every_page_has_its_place_in_the_shelves_and_on_the_site():
+    index = (ROOT / "docs" / "index.md").read_text(encoding="utf-8")
+    site = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
+    pages = {page.name for page in (ROOT / "docs").glob("*.md")} - {"index.md"}
+    assert pages == {link for link in LINK.findall(index) if "/" not in link}
+    assert pages == set(re.findall(r": ([\w\-]+\.md)$", site, re.MULTILINE)) - {"index.md"}
+
+
+def commands_of(page: Path) -> list[str]:
+    """The calls of `disco-hw` in the page's blocks of code, without comments."""
+    blocks = re.findall(
+        r"^```(?:sh|bash|console)?\n(.*?)^```", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL
+    )
+    lines = [line for block in blocks for line in block.splitlines()]
+    return [found[1] for line in lines if (found := COMMAND.match(line)) is not None]
+
+
+def wrong_in(line: str) -> str | None:
+    """What of a call is not there: its verb, or an option."""
+    words = shlex.split(line, comments=True)
+    command: click.Command = typer.main.get_command(app)
+    while isinstance(command, click.Group):
+        if not words or words[0].startswith("-"):
+            break
+        verb, *words = words
+        if verb not in command.commands:
+            return f"there is no {verb}"
+        command = command.commands[verb]
+    known = {option for parameter in command.params for option in (*parameter.opts, *parameter.secondary_opts)}
+    options = {word.split("=")[0] for word in words if re.match(r"--?[a-z]", word)} - {"--help", "--install-completion"}
+    return f"{line}: no option {', '.join(sorted(options - known))}" if options - known else None
+
+
+@pytest.mark.parametrize("page", PAGES, ids=names)
+def test_every_command_of_a_page_is_one_that_there_is(page):
+    assert not [wrong for line in commands_of(page) if (wrong := wrong_in(line)) is not None]
+
+
+def test_a_wrong_command_would_be_seen():
+    assert wrong_in("drives ROBOT.toml") == "there is no drives"
+    assert "--scripts" in (wrong_in("drive ROBOT.toml --scripts excite") or "")
+    assert len([line for page in PAGES for line in commands_of(page)]) > 40
+
+
+def test_make_offers_what_the_pages_say():
+    targets = set(re.findall(r"^([a-z][\w\-]*):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
+    for page in PAGES:
+        said = set(re.findall(r"(?:^|`)make ([a-z][\w\-]*)", page.read_text(encoding="utf-8"), re.MULTILINE))
+        assert said <= targets, page
