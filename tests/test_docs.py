@@ -51,10 +51,10 @@ def test_every_page_has_its_place_in_the_shelves_and_on_the_site():
 
 def commands_of(page: Path) -> list[str]:
     """The calls of `disco-hw` in the page's blocks of code, without comments."""
-    blocks = re.findall(
-        r"^```(?:sh|bash|console)?\n(.*?)^```", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL
-    )
-    lines = [line for block in blocks for line in block.splitlines()]
+    text = page.read_text(encoding="utf-8")
+    blocks = re.findall(r"^```(?:sh|bash|console)?\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    # An arrow is a drawing's.
+    lines = [line for block in blocks for line in block.splitlines() if "<--" not in line]
     return [found[1] for line in lines if (found := COMMAND.match(line)) is not None]
 
 
