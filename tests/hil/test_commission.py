@@ -1,0 +1,81 @@
+"""`disco-hw commission` at a terminal, with a person played by a program: keys held, let go, and answers."""
+
+from __future__ import annotations
+
+import os
+import pty
+import select
+import subprocess
+import sys
+import time
+
+import pytest
+
+from disco_hw.experiments.live_stack import disco_hw_process, write_robot_file
+
+pytestmark = [pytest.mark.hil, pytest.mark.long, pytest.mark.timeout(400)]
+_REPEAT_S = 0.03
+
+
+class Terminal:
+    """Reads what the command says and types; a key held repeats as a terminal's does."""
+
+    def __init__(self, command, cwd):
+        self.master, slave = pty.openpty()
+        self.process = subprocess.Popen(
+            command, cwd=cwd, stdin=slave, stdout=slave, stderr=slave, start_new_session=True
+        )
+        os.close(slave)
+        self.said, self.holding, self._next_s = "", False, 0.0
+
+    def pump(self, until, timeout_s=120.0):
+        """Read, and repeat the key that is held, until `until` of what was said since this call; that text."""
+        begin, deadline_s = len(self.said), time.monotonic() + timeout_s
+        while not until(self.said[begin:]):
+            assert time.monotonic() < deadline_s, self.said[-2000:]
+            if select.select([self.master], [], [], _REPEAT_S / 2)[0]:
+                try:
+                    self.said += os.read(self.master, 65536).decode(errors="replace")
+                except OSError:
+                    break
+            if self.holding and time.monotonic() >= self._next_s:
+                self.type(" ")
+                self._next_s = time.monotonic() + _REPEAT_S
+        return self.said[begin:]
+
+    def type(self, keys):
+        os.write(self.master, keys.encode())
+
+    def wait(self, words, timeout_s=120.0):
+        return self.pump(lambda said: words in said, timeout_s)
+
+    def pause(self, seconds):
+        end_s = time.monotonic() + seconds
+        self.pump(lambda _said: time.monotonic() > end_s)
+
+
+def test_the_first_stage_goes_through_at_a_terminal(tmp_path):
+    robot_file = write_robot_file(tmp_path)
+    with disco_hw_process("virtual robot", ["sim", str(robot_file)], tmp_path / "sim.txt"):
+        command = [sys.executable, "-m", "disco_hw", "commission", str(robot_file), "--stage", "sides", "--no-write"]
+        terminal = Terminal(command, tmp_path)
+        try:
+            terminal.wait("press Enter")
+            terminal.type("\n")
+            terminal.wait("the left side speeds up slowly")
+            terminal.pause(3.0)
+            for side, answer in (("left", "1"), ("right", "3")):
+                terminal.holding = True
+                terminal.wait(f"asked the {side} side to turn forward")
+                terminal.holding = False
+                terminal.pause(0.5)
+                terminal.type(answer)
+                terminal.pause(1.0)
+            terminal.wait("commissioned")
+            assert terminal.process.wait(20.0) == 0
+        finally:
+            terminal.process.kill()
+            terminal.process.wait()
+            os.close(terminal.master)
+    assert "begins to turn at a command of" in terminal.said
+    assert list(tmp_path.glob("*commission-sides*.mcap")), terminal.said
