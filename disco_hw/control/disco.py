@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 
 from disco_hw.control.command_history import command_history
+from disco_hw.control.kernel.guide import Chassis, guide
 from disco_hw.control.kernel.layout import BLOCK, CHANNELS, WHEEL_ROWS, aligned_zeros
 from disco_hw.control.kernel.skid_steer import SkidSteer
 from disco_hw.control.optimiser import Optimiser
@@ -23,6 +25,7 @@ from disco_hw.control.plan import Array, Diagnostics, NoValidControl, PlannerSta
 from disco_hw.control.settings import CommandLimits, DiscoSettings
 from disco_hw.effects.effect import Channel
 from disco_hw.effects.registry import DELAY
+from disco_hw.jit import compiled_for
 from disco_hw.model import Belief, Model
 from disco_hw.model.free_run import FreeRun
 from disco_hw.model.model import BASE_PARAMETERS, X_ICR, coefficient_tables
@@ -72,6 +75,7 @@ class Disco:
             limits.acceleration_rad_s2 * step_s,
             seed,
         )
+        self._guide: Callable[..., None] | None = None
         self._begun_ns: int | None = None
         self._t0_ns: int | None = None
         self._failing_since_ns: int | None = None
@@ -105,7 +109,11 @@ class Disco:
         self._x_icr_m = float(self._mean_theta[0, model.parameter_names.index(X_ICR.name)])
         self._points = FreeRun(model, theta, step_s)
         late = [f"{s.name}.{s.effect.late_by}" for s in model.effects if s.effect.late_by is not None]
+        dead = [f"{s.name}.{s.effect.dead_by}" for s in model.effects if s.effect.dead_by is not None]
         self._response_s = sum(self._value(self._mean_theta, name) for name in late)
+        dead_rad_s = sum(self._value(self._mean_theta, name) for name in dead)
+        radius_m, axle_m = (self._value(self._mean_theta, one.name) for one in BASE_PARAMETERS if one is not X_ICR)
+        self._chassis = Chassis(radius_m, axle_m, self._x_icr_m, float(self._response_s), float(dead_rad_s))
         self._tables = coefficient_tables(model, theta, step_s, np.float32)
         found = equivalent_points(model, theta, step_s, self._pairs)
         self._ahead, self._scaled = (
@@ -213,7 +221,8 @@ class Disco:
         system = self._system(state, start, t0_ns, (t0_ns - begun_ns) * 1e-9, elapsed_s)
         shift_steps = 0.0 if self._t0_ns is None else (t0_ns - self._t0_ns) * 1e-9 / settings.step_s
         self._t0_ns = t0_ns
-        outcome, retries = self._improve(max(shift_steps, 0.0), before, system, first)
+        guided = self._draw_guide(system, before)
+        outcome, retries = self._improve(max(shift_steps, 0.0), before, system, first, guided)
         if outcome is PlanOutcome.STOPPING:
             self._stop(now_ns, before)
         else:
@@ -234,7 +243,7 @@ class Disco:
         return Diagnostics(ess, temperature, least, mean, nominal, int(valid), retries, collapsed, outcome)
 
     def _improve(
-        self, shift_steps: float, before: tuple[float, float], system: SkidSteer, first: bool
+        self, shift_steps: float, before: tuple[float, float], system: SkidSteer, first: bool, guided: bool
     ) -> tuple[PlanOutcome, int]:
         """Climb the ladder until a step is valid; returns how it went and the attempts beyond the first."""
         settings, optimiser = self._settings, self._optimiser
@@ -252,10 +261,25 @@ class Disco:
             usable = optimiser.step(0.0, 1.0, before, system, self._weights)
         if not usable:
             return PlanOutcome.STOPPING, retries
+        if guided and optimiser.guide_is_better(settings.guide_below):
+            optimiser.take_guide()
         if first or outcome is PlanOutcome.RESTARTED:
             for _ in range(settings.iterations_at_start - 1):
                 optimiser.step(0.0, 1.0, before, system, self._weights)
         return outcome, retries
+
+    def _draw_guide(self, system: SkidSteer, before: tuple[float, float]) -> bool:
+        """Set the guide for the next step; returns whether the task has a line to be guided along."""
+        if self._settings.guide_below <= 0.0 or not hasattr(system.task, "line_at"):
+            return False
+        optimiser = self._optimiser
+        commands, step_s = optimiser.work.guide, self._settings.step_s
+        arguments = commands, system.task, system.start, self._chassis, *before, optimiser.limits, step_s
+        if self._guide is None:
+            optimiser.sample_guide()
+            self._guide = compiled_for(guide, *arguments)
+        self._guide(*arguments)
+        return True
 
     def _stop(self, now_ns: int, before: tuple[float, float]) -> None:
         """Put a ramp to zero in the plan's place; raises NoValidControl when that has gone on for too long."""

@@ -50,6 +50,7 @@ class Optimiser:
             rows,
             history,
             sampler.with_nominal,
+            False,
             sampler.beyond_end == "hold",
             sampler.update_from == "drawn",
             sampler.noise_std,
@@ -61,6 +62,7 @@ class Optimiser:
         )
         self._work = Workspace(
             nominal=np.zeros((horizon, channels), f32),
+            guide=np.zeros((horizon, channels), f32),
             updated=np.zeros((horizon, channels), f32),
             before_update=np.zeros((horizon, channels), f32),
             noise=aligned_zeros(blocks * rows * int(BLOCK)),
@@ -106,6 +108,23 @@ class Optimiser:
     def set_nominal(self, commands: Array) -> None:
         """Continue from this plan, (T, C)."""
         self._work.nominal[:] = commands
+
+    def sample_guide(self) -> None:
+        """Let sample 1 be the commands that stand in `work.guide` at a step, from the next one on."""
+        self._samplings["with_guide"] = True
+
+    @property
+    def limits(self) -> Limits:
+        """Limits of commands and of their change in a step."""
+        return self._limits
+
+    def guide_is_better(self, below: float) -> bool:
+        """Whether the guide costs less than this part of what the plan did, in the last step."""
+        return bool(self._work.costs[1] < below * self._work.costs[0])
+
+    def take_guide(self) -> None:
+        """Continue from the guide."""
+        self._work.nominal[:] = self._work.guide
 
     def set_command_history(self, past: Array) -> None:
         """Set the commands before the plan, (history, C)."""
@@ -163,7 +182,10 @@ class Optimiser:
         chosen = np.argsort(-weights, kind="stable")[:limit]
         block, lane = np.divmod(chosen, int(BLOCK))
         noise = work.noise.reshape(work.weights.size // int(BLOCK), -1, int(BLOCK))[block, :, lane]
-        return self._applied(noise.astype(np.float64)), weights[chosen] / weights.sum()
+        commands = self._applied(noise.astype(np.float64))
+        if self._samplings["with_guide"]:
+            commands[chosen == 1] = work.guide
+        return commands, weights[chosen] / weights.sum()
 
     def _applied(self, noise: Array) -> Array:
         """Commands (n, T, C) within the limits, from the noise (n, R) of n samples."""

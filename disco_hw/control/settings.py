@@ -95,6 +95,8 @@ class DiscoSettings:
     latency_s: from the state to when a command made from it acts, beyond the model's command delay.
     gain_by_time: whether a plan moves only the part shift / step_s towards the new optimum when it is made anew within
     a step. Then the plan changes as fast at any rate, and more plans a second average out noise instead of adding it.
+    guide_below: where a steering law's commands cost less than this part of the plan, they take its place (tasks with
+    a line; kernel/guide.py); 0 without a guide.
     iterations_at_start: optimisation steps for the first plan after a reset.
     min_ess: effective sample size below which a step counts as collapsed: it is tried again, and reported.
     retries: further attempts after a step without a valid result; then the plan is dropped and planned anew.
@@ -109,6 +111,7 @@ class DiscoSettings:
     ut_alpha: float = 1.0
     latency_s: float = 0.0
     gain_by_time: bool = True
+    guide_below: float = 0.85
     iterations_at_start: int = 5
     min_ess: float = 3.0
     retries: int = 2
@@ -149,6 +152,7 @@ class DiscoSettings:
             common_draws=False,
             ut_alpha=0.5,
             gain_by_time=False,
+            guide_below=0.0,
             iterations_at_start=1,
             min_ess=0.0,
         )

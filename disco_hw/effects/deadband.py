@@ -43,6 +43,7 @@ EFFECT = Effect(
     coefficients=coefficients,
     term=term,
     starts=starts,
+    dead_by="width_rad_s",
     excitation="slow ramps of the wheel command through zero",
     script="ramps",
     sentence="the wheels ignore the first {width_rad_s:.2f} rad/s of every command",

@@ -201,8 +201,9 @@ class Effect:
 
     Traits: `uses_geometry`, whether its coefficients depend on the geometry; `may_turn_more`, whether it can make the
     robot turn faster than its wheels say; `late_by`, the parameter that is a time by which wheels are behind commands,
-    fitted from `late_starts`; `like_a_patch`, what decides between it and a patch of the floor if that leaves the same
-    traces; `mimics`, an effect that competes in its place.
+    fitted from `late_starts`; `dead_by`, the parameter that is what a drive takes off a command;
+    `like_a_patch`, what decides between it and a patch of the floor if that leaves the same traces; `mimics`, an effect
+    that competes in its place.
 
     How it is searched for: all parameters from neutral; or from the best of `starts` for a drive; or one by a `scan`.
     `limited(commands, geometry)` is, for a limit, what it limits, (N,); `trials` are sizes to try in turn where it is
@@ -226,6 +227,7 @@ class Effect:
     uses_geometry: bool = False
     may_turn_more: bool = False
     late_by: str | None = None
+    dead_by: str | None = None
     late_starts: tuple[float, ...] = ()
     like_a_patch: str | None = None
     mimics: Mimicked | None = None
@@ -236,7 +238,7 @@ class Effect:
 
     def __post_init__(self) -> None:
         keys = [parameter.name for parameter in self.parameters]
-        for key in (self.late_by, None if self.scan is None else self.scan.parameter):
+        for key in (self.late_by, self.dead_by, None if self.scan is None else self.scan.parameter):
             if key is not None and key not in keys:
                 raise ValueError(f"{self.name}: has no parameter {key!r}, only {', '.join(keys)}")
         try:

@@ -14,6 +14,14 @@ have two functions more, and the look-up happens between `follow` and `stage`:
     follow(self, memory, x, y, forward, found) -> memory, kept      where a sample is after the step
     row_of(self, memory) -> int32                                   the row of the table for a memory, within it
 
+Terms of a task with a line may say it, for the planner to follow it by a steering law (control/kernel/guide.py):
+
+    place_of(self, place, x, y) -> place                            beside a position, from the one before
+    line_at(self, place, ahead_m) -> x, y, head_x, head_y, along, speed
+
+the point so far on, the heading in which a robot stays on the line there, the cosine by which that is off the line,
+and the speed wanted; a place begins as a rollout's memory does.
+
 `found` holds what `follow` kept and the four numbers of that row; zeros without a table. Constants are made by
 `single`: any other number would pull the arithmetic up to double precision. Compiled, the functions below use estimates
 refined by a Newton step; as written here they are their oracle.

@@ -32,7 +32,8 @@ ESS, TEMPERATURE, LEAST, MEAN, NOMINAL, VALID = range(6)
 class Workspace(NamedTuple):
     """Buffers of the step, float32 and flat unless said; C channels, R rows of noise, K' = blocks * BLOCK samples.
 
-    `nominal` (T, C) is U of the paper; `updated`, `before_update` (T, C); `noise` (blocks, R, BLOCK), E of the paper;
+    `nominal` (T, C) is U of the paper; `guide` (T, C), commands within the limits for sample 1; `updated`,
+    `before_update` (T, C); `noise` (blocks, R, BLOCK), E of the paper;
     `commands` (blocks, (H + T) * C * BLOCK), V of the paper behind H steps from before the plan; `state`
     (STATE_ROWS, BLOCK); `point_costs` (L, K'), S_i^k; `costs`, `weights` (K',), S^k and w_k; `sums`
     (T * C or R, BLOCK); `pull` (R,); `order` (L,) int64; `report` (6,) float64: effective sample size, temperature,
@@ -40,6 +41,7 @@ class Workspace(NamedTuple):
     """
 
     nominal: Floats
+    guide: Floats
     updated: Floats
     before_update: Floats
     noise: Floats
@@ -54,9 +56,10 @@ class Workspace(NamedTuple):
     report: NDArray[np.float64]
 
 
-# How is sampled and weighed. `with_nominal`: sample 0 is the nominal. `hold`: a shifted plan ends in its last command,
-# else in zero. `drawn`: the update is made from the noise as drawn, else as applied. `temperature` is 0 for
-# `target_ess`. `control_cost`: weight over variance. `worst_part`: of the points' weight that the cost is the mean of.
+# How is sampled and weighed. `with_nominal`: sample 0 is the nominal. `with_guide`: sample 1 is the guide. `hold`: a
+# shifted plan ends in its last command, else in zero. `drawn`: the update is made from the noise as drawn, else as
+# applied. `temperature` is 0 for `target_ess`. `control_cost`: weight over variance. `worst_part`: of the points'
+# weight that the cost is the mean of.
 SAMPLING = np.dtype(
     [
         ("seed", "i8"),
@@ -65,6 +68,7 @@ SAMPLING = np.dtype(
         ("rows", "i8"),
         ("history", "i8"),
         ("with_nominal", "?"),
+        ("with_guide", "?"),
         ("hold", "?"),
         ("drawn", "?"),
         ("noise_std", "f4"),
@@ -157,6 +161,11 @@ def sample(work: Workspace, sampling: Sampling, step: int, block: int, basis: Ba
     expand(
         work.commands[block], work.state, sampling.history, work.nominal, work.noise, first_noise, basis, limits
     )  # fmt: skip
+    if block == 0 and sampling.with_guide:
+        horizon, channels = work.nominal.shape
+        for t in range(horizon):
+            for c in range(channels):
+                work.commands[0, U((sampling.history + t) * channels + c) * BLOCK + U(1)] = work.guide[t, c]
 
 
 @block_function

@@ -40,6 +40,16 @@ def row_of(terms: object, memory: float) -> int:
     raise TypeError(f"{type(terms).__name__} has no table")
 
 
+def place_of(terms: object, place: float, x: float, y: float) -> float:
+    """The place on the line beside a position: `place_of` of terms with a line; compiled code only."""
+    raise TypeError(f"{type(terms).__name__} has no line")
+
+
+def line_at(terms: object, place: float, ahead_m: float) -> tuple[float, float, float, float, float, float]:
+    """Where and how to be on the line: `line_at` of terms with a line; compiled code only."""
+    raise TypeError(f"{type(terms).__name__} has no line")
+
+
 def looks_up(terms: object) -> bool | None:
     """None for terms without a table, anything else for terms with one; a constant to the compiler."""
     raise TypeError(f"{type(terms).__name__} is no named tuple of terms")
@@ -59,6 +69,8 @@ specialise(stage_cost)(lambda terms, *_: _chosen(terms, "stage"))
 specialise(terminal_cost)(lambda terms, *_: _chosen(terms, "terminal"))
 specialise(follow)(lambda terms, *_: _chosen(terms, "follow"))
 specialise(row_of)(lambda terms, *_: _chosen(terms, "row_of"))
+specialise(place_of)(lambda terms, *_: _chosen(terms, "place_of"))
+specialise(line_at)(lambda terms, *_: _chosen(terms, "line_at"))
 
 
 @specialise(looks_up)

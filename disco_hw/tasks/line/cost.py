@@ -21,7 +21,7 @@ FARTHEST_STEP_M = 0.5
 # Facing straight against the way costs as much as being so far off it.
 AGAINST_M = 0.6
 # Standing costs at least as much as being so far off the path, however slow it is to be driven.
-STANDING_M = 0.4
+STANDING_M = 0.2
 # The last distance counts as much as over so much more of the way: turning in pushes the tracked point out at first.
 TERMINAL_M = 0.2
 # The last heading's error counts so many times the distance that it swings the tracked point by.
@@ -38,8 +38,9 @@ class PathCost:
     """Follow way-points by arc length: c = sqrt(e^2 + (progress - wanted)^2) + facing, e the distance to the path.
 
     The place on the path is carried along every rollout: each step moves it by the step's projection on the path's
-    direction; so a path may cross itself. The speed of that is the progress, but no more than the forward speed; so
-    standing still or spinning costs the whole wanted speed, and driving backwards twice of it. Facing is AGAINST_M
+    direction; so a path may cross itself. The speed of that is the progress, but no more than the forward speed and the
+    wanted one together: a robot that slides round a corner makes progress sideways, one that stands or drives backwards
+    makes none. Facing is AGAINST_M
     times the part of the heading that is against the path's direction: backwards would else be the easier way, for it
     puts the tracked point before the axle. Wanted is `speed_m_s`, and less in the last second of an open path. The end
     costs the distance that is left, over TERMINAL_M more of the way, together with the error of the heading from that
@@ -119,9 +120,31 @@ class PathTerms(NamedTuple):
         farthest = constant(FARTHEST_STEP_M, x)
         along = min(max(off_x * along_x + off_y * along_y, -farthest), farthest) * self.per_m
         wanted = min(self.speed_m_s, (self.end - memory) * self.slow_per_entry)
-        missing = self.speed_weight * (wanted - min(along * self.speed_per_entry, forward))
+        missing = self.speed_weight * (wanted - min(along * self.speed_per_entry, forward + wanted))
         # In this order, so that what is no number becomes a place, and the cost shows it.
         return min(self.last, max(self.first, memory + along)), missing
+
+    def place_of(self, place: float, x: float, y: float) -> float:
+        """The place beside a position, from the one before."""
+        row = 4 * _row(place, self.first, self.last)
+        piece = (self.table[row], self.table[row + 1], self.table[row + 2], self.table[row + 3])
+        off_x, off_y, along_x, along_y = _offset(self.last, place, x, y, piece)
+        along = min(max(off_x * along_x + off_y * along_y, -FARTHEST_STEP_M), FARTHEST_STEP_M) * self.per_m
+        return min(self.last, max(self.first, place + along))
+
+    def line_at(self, place: float, ahead_m: float) -> tuple[float, float, float, float, float, float]:
+        """The point so much further on, how a robot that stays on the path is turned there, and how fast it is."""
+        place = min(place + ahead_m * self.per_m, self.last)
+        index = _row(place, self.first, self.last)
+        row, part = 4 * index, place - np.floor(min(place, self.last - _ONE))
+        step_x, step_y = self.table[row + 2], self.table[row + 3]
+        _, per_m = norm_and_inverse(step_x, step_y)
+        sine = self.turned[2 * index] + part * self.turned[2 * index + 1]
+        cosine = math.sqrt(max(_ONE - sine * sine, _ZERO))
+        along_x, along_y = step_x * per_m, step_y * per_m
+        speed = min(self.speed_m_s, max((self.end - place) * self.slow_per_entry, _ZERO))
+        x, y = self.table[row] + part * step_x, self.table[row + 1] + part * step_y
+        return x, y, along_x * cosine - along_y * sine, along_y * cosine + along_x * sine, cosine, speed
 
     def row_of(self, memory: float) -> int:
         """The row of the table for a place."""
@@ -148,6 +171,12 @@ class PathTerms(NamedTuple):
         forwards, turn = along * cosine + across * sine, abs(across * cosine - along * sine)
         turn = turn if forwards > _ZERO else _TWO - turn
         return self.terminal_steps * norm_of_three(off_x, off_y, self.turn_m * turn)
+
+
+@helper
+def _row(place: float, first: float, last: float) -> int:
+    """The row of the table for a place."""
+    return int(np.floor(min(place, last - _ONE)) - first)
 
 
 @helper

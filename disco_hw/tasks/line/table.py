@@ -17,6 +17,8 @@ LOST_M = 1.0
 SHARP_RAD = math.radians(125.0)
 TURN_M = 0.15
 REACHED_M = 0.05
+# More than this between one entry and the next is a corner.
+CORNER_RAD = math.radians(20.0)
 # Branches of which none is further off than the nearest by so much may be meant; facing straight against one counts as
 # much as being so much further off it.
 BRANCHES_M = 0.3
@@ -47,12 +49,14 @@ class PathTable:
         at = np.linspace(0.0, distance[-1], count + 1)
         x, y = np.interp(at, distance, places[:, 0]), np.interp(at, distance, places[:, 1])
         closed = bool(np.hypot(*(places[0] - places[-1])) < SPACING_M)
+        spacing = float(distance[-1]) / count
+        corners = sharp_turns(np.column_stack([x, y]), closed, max(1, round(TURN_M / spacing)))
+        x, y = _rounded(np.column_stack([x, y]), closed).T
         step_x, step_y = np.diff(x), np.diff(y)
         length = np.maximum(np.hypot(step_x, step_y), 1e-12)
         along_x = np.append(step_x / length, (step_x / length)[0 if closed else -1])
         along_y = np.append(step_y / length, (step_y / length)[0 if closed else -1])
-        table, spacing = np.column_stack([x, y, along_x, along_y]), float(distance[-1]) / count
-        corners = sharp_turns(table[:, :2], closed, max(1, round(TURN_M / spacing)))
+        table = np.column_stack([x, y, along_x, along_y])
         bounds = [*corners, *(corner + count for corner in corners[:1])] if closed else [0, *corners, count]
         object.__setattr__(self, "_table", table)
         object.__setattr__(self, "_closed", closed)
@@ -140,6 +144,24 @@ class PathTable:
         branches = np.append(nearest, branches[distance[branches] < distance[nearest] + BRANCHES_M])
         along = self._table[branches, 2] * math.cos(yaw_rad) + self._table[branches, 3] * math.sin(yaw_rad)
         return int(branches[np.argmin(distance[branches] + 0.5 * AGAINST_BRANCH_M * (1.0 - along))])
+
+
+def _rounded(points: Array, closed: bool) -> Array:
+    """Points (M + 1, 2) with corners drawn in by a quarter of a piece, but for sharp ones, where the robot stops.
+
+    A place moves on by its piece's direction. Round the inside of a corner it would not move on at all until the robot
+    had got to the corner's outside.
+    """
+    steps = np.diff(points, axis=0)
+    ends = (steps[-2:], steps[:2]) if closed else (steps[[0, 0]], steps[[-1, -1]])
+    padded = np.vstack([ends[0], steps, ends[1]])
+    heading = np.unwrap(np.arctan2(padded[:, 1], padded[:, 0]))
+    # At each point over the two pieces that it joins, and over one more on either side.
+    here, around = heading[2:-1] - heading[1:-2], heading[3:] - heading[:-3]
+    at = np.flatnonzero((np.abs(here) > CORNER_RAD) & (np.abs(around) < SHARP_RAD))
+    rounded = points.copy()
+    rounded[at] += 0.25 * (padded[at + 2] - padded[at + 1])
+    return rounded
 
 
 def sharp_turns(points: Array, closed: bool, reach: int) -> list[int]:

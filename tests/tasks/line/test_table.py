@@ -46,3 +46,14 @@ def test_a_branch_that_is_much_further_off_is_not_meant():
 @pytest.mark.parametrize("at", [(math.nan, 0.0), (0.0, math.inf)])
 def test_a_place_that_is_none_is_on_the_path_all_the_same(at):
     assert 0.0 <= EIGHT.place(*at, 0.0, None) <= len(EIGHT.table)
+
+
+def test_a_corner_is_drawn_in_so_that_a_place_moves_on_round_its_inside():
+    path = PathTable(np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]]))
+    corner = path.table[50, :2]
+    assert np.hypot(*(corner - (1.0, 0.0))) == pytest.approx(0.02 * 0.25 * math.sqrt(2.0), rel=1e-6)
+    place = 49.0
+    for y_m in np.arange(0.0, 0.3, 0.02):
+        at = path.table[int(place)]
+        place += ((0.98 - at[0]) * at[2] + (y_m - at[1]) * at[3]) / path.spacing_m - (place - int(place))
+    assert place > 60.0

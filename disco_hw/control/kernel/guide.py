@@ -1,0 +1,104 @@
+"""The guide: one more sample, the commands of a steering law that follows the task's line from where the robot is.
+
+Samples lie around the last plan and cut the corners that it cuts. Turning before a corner comes first, then a worse
+cost, then a better one: no small change of a plan finds it. The law does at once, as it acts on the centre of rotation
+along the stable inverse (tasks/line/inverse.py) of the line. The guide is costed as every sample is; how the planner
+goes over to it is written in `Disco`.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from disco_hw.control.kernel.layout import Floats, Terms
+from disco_hw.control.kernel.sequences import Limits, clip
+from disco_hw.control.kernel.task_costs import line_at, place_of
+from disco_hw.jit import kernel_function, scalar_function
+
+# The law's gains (1/m): of the heading, and of the distance, which the robot comes back from at this angle a metre.
+YAW_PER_M, ANGLE_PER_M = 9.0, 3.3
+# Over so much of the way is the reference's turning taken; a corner is turned about within it.
+TURN_M = 0.04
+# Below this a command is lifted over the dead band in part, so that a wheel at rest does not chatter (rad/s).
+LIFTED_RAD_S = 0.05
+# A robot that faces elsewhere goes on at this part of its speed: turning on the spot by the middle of a bend, it could
+# turn for ever with the place that it is to go to.
+SLOWEST = 0.2
+
+
+class Chassis(NamedTuple):
+    """What the law knows of the robot: geometry (m), how long the wheels take (s), their dead band (rad/s)."""
+
+    wheel_radius_m: float
+    axial_distance_m: float
+    x_icr_m: float
+    response_s: float
+    dead_rad_s: float
+
+
+@kernel_function
+def guide(
+    commands: Floats, terms: Terms, start: Floats, chassis: Chassis, before_left: float, before_right: float,
+    limits: Limits, step_s: float,
+) -> None:  # fmt: skip
+    """Fill `commands` (T, 2) with the wheel speeds of the law (rad/s), from the state `start` (8,) of `SkidSteer`
+    and the commands before, within the limits.
+
+    The robot that it steers meanwhile is the chassis alone; `terms` are those of a task with a line.
+    """
+    x, y, cos_yaw, sin_yaw = float(start[0]), float(start[1]), float(start[2]), float(start[3])
+    wheel_left, wheel_right = float(start[4]), float(start[5])
+    place = float(start[7])
+    half_axle, x_icr_m, lead_s = 0.5 * chassis.axial_distance_m, chassis.x_icr_m, chassis.response_s
+    keep = math.exp(-step_s / lead_s) if lead_s > 0.0 else 0.0
+    settled = (1.0 - keep) * lead_s / step_s
+    for t in range(commands.shape[0]):
+        place = place_of(terms, place, x, y)
+        at_x, at_y, head_x, head_y, _, speed = line_at(terms, place, 0.0)
+        away_x, away_y = x - at_x + x_icr_m * (cos_yaw - head_x), y - at_y + x_icr_m * (sin_yaw - head_y)
+        back = math.atan(ANGLE_PER_M * (away_y * head_x - away_x * head_y))
+        off_rad = math.atan2(sin_yaw * head_x - cos_yaw * head_y, cos_yaw * head_x + sin_yaw * head_y) + back
+        # What the wheels are to do when the command acts.
+        _, _, from_x, from_y, along, _ = line_at(terms, place, speed * lead_s)
+        _, _, to_x, to_y, _, _ = line_at(terms, place, speed * lead_s + TURN_M)
+        bend = math.atan2(from_x * to_y - from_y * to_x, from_x * to_x + from_y * to_y) / TURN_M
+        turn = speed * (bend - YAW_PER_M * math.atan2(math.sin(off_rad), math.cos(off_rad)))
+        forward = speed * along * max(math.cos(off_rad), SLOWEST)
+        left, right = _within(
+            (forward - half_axle * turn) / chassis.wheel_radius_m,
+            (forward + half_axle * turn) / chassis.wheel_radius_m,
+            chassis.dead_rad_s,
+            limits.largest,
+        )
+        before_left = clip(left, before_left - limits.change, before_left + limits.change)
+        before_right = clip(right, before_right - limits.change, before_right + limits.change)
+        commands[t, 0], commands[t, 1] = before_left, before_right
+        left, right = _beyond(before_left, chassis.dead_rad_s), _beyond(before_right, chassis.dead_rad_s)
+        mean_left, mean_right = left + settled * (wheel_left - left), right + settled * (wheel_right - right)
+        wheel_left, wheel_right = left + keep * (wheel_left - left), right + keep * (wheel_right - right)
+        moved = 0.5 * chassis.wheel_radius_m * step_s * (mean_left + mean_right)
+        turned = chassis.wheel_radius_m * step_s * (mean_right - mean_left) / chassis.axial_distance_m
+        cos_half, sin_half = math.cos(0.5 * turned), math.sin(0.5 * turned)
+        cos_yaw, sin_yaw = cos_yaw * cos_half - sin_yaw * sin_half, sin_yaw * cos_half + cos_yaw * sin_half
+        x += moved * cos_yaw + turned * x_icr_m * sin_yaw
+        y += moved * sin_yaw - turned * x_icr_m * cos_yaw
+        cos_yaw, sin_yaw = cos_yaw * cos_half - sin_yaw * sin_half, sin_yaw * cos_half + cos_yaw * sin_half
+
+
+@scalar_function
+def _within(left: float, right: float, dead: float, largest: float) -> tuple[float, float]:
+    """Commands for these wheel speeds: lifted over the dead band; if one is too fast, both slower on the same curve."""
+    left, right = _lifted(left, dead), _lifted(right, dead)
+    scale = min(1.0, largest / max(abs(left), abs(right), 1e-6))
+    return left * scale, right * scale
+
+
+@scalar_function
+def _lifted(speed: float, dead: float) -> float:
+    return speed + math.copysign(dead, speed) * min(abs(speed) / LIFTED_RAD_S, 1.0)
+
+
+@scalar_function
+def _beyond(command: float, dead: float) -> float:
+    return math.copysign(max(abs(command) - dead, 0.0), command)

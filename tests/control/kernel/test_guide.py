@@ -1,0 +1,96 @@
+"""The guide: the law's commands keep to the line and to the limits, and the planner that has it keeps to corners."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from disco_hw.control import CommandLimits, Disco, DiscoSettings, PlannerState
+from disco_hw.model import Model
+from disco_hw.model.free_run import FreeRun
+from disco_hw.model.model import EffectSetting
+from disco_hw.tasks.line.cost import PathCost
+from disco_hw.tasks.line.table import PathTable
+from tools.foreign_plant import NOMINAL, ForeignRobot
+from tools.tracking import disco, drive, tracks
+
+SPEED_M_S, STEP_S = 0.2, 0.1
+SETTINGS = DiscoSettings.for_speed(SPEED_M_S, 50.0)
+LIMITS = CommandLimits(8.0, 20.0)
+LAG_S, DEAD_RAD_S = 0.15, 0.3
+EFFECTS = (EffectSetting("motor_lag", {"tau_s": LAG_S}), EffectSetting("deadband", {"width_rad_s": DEAD_RAD_S}))
+MODEL = Model(*NOMINAL, effects=EFFECTS)
+CORNER = PathCost(PathTable(np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]])), SPEED_M_S)
+STRAIGHT = PathCost(PathTable(np.array([[0.0, 0.0], [5.0, 0.0]])), SPEED_M_S)
+
+
+def guide_of(task, state, horizon=40, model=MODEL):
+    """The guide's commands (T, 2) and the states (T + 1, 5) that the model makes of them."""
+    settings = replace(SETTINGS, sampler=replace(SETTINGS.sampler, horizon=horizon))
+    planner = Disco(model, task, settings, LIMITS)
+    planner.plan(0, PlannerState(0, *state, 0.0, 0.0))
+    commands = planner.optimiser.work.guide.astype(float)
+    return commands, FreeRun(model, model.point()[None], STEP_S).states(np.array([*state, 0.0, 0.0]), commands, 0)
+
+
+def off_corner_m(places):
+    """Distance to the two legs of the corner."""
+    first = np.hypot(np.maximum(places[:, 0] - 1.0, 0.0), places[:, 1])
+    second = np.hypot(places[:, 0] - 1.0, np.minimum(places[:, 1], 0.0))
+    return np.minimum(np.abs(first), np.abs(second))
+
+
+def test_the_guide_turns_before_a_corner_and_keeps_to_it():
+    turned_rad = 2.0 * math.atan(math.exp(-0.4 / NOMINAL[2]))
+    _, states = guide_of(CORNER, (0.6, 0.0, turned_rad), horizon=50)
+    assert off_corner_m(states[:, :2]).max() < 0.02
+    assert states[-1, 1] > 0.3
+    before = states[np.argmax(states[:, 0] > 0.95)]
+    assert before[2] > 0.6
+
+
+@pytest.mark.parametrize("yaw_rad", [-2.0, 0.5, 1.9, 3.1])
+@pytest.mark.parametrize("y_m", [-0.4, 0.3])
+def test_the_guide_reaches_a_line_from_beside_it_whichever_way_it_faces(y_m, yaw_rad):
+    _, states = guide_of(STRAIGHT, (1.0, y_m, yaw_rad), horizon=120)
+    assert np.abs(states[-30:, 1]).max() < 0.02
+    assert np.all(np.diff(states[-30:, 0]) > 0.0)
+
+
+def test_the_guide_keeps_to_the_limits():
+    commands, _ = guide_of(CORNER, (0.5, 0.3, 3.0))
+    assert np.abs(commands).max() <= LIMITS.speed_rad_s + 1e-5
+    steps = np.abs(np.diff(np.vstack([[0.0, 0.0], commands]), axis=0))
+    assert steps.max() <= LIMITS.acceleration_rad_s2 * STEP_S + 1e-5
+    assert steps.max() > 0.5 * LIMITS.acceleration_rad_s2 * STEP_S
+
+
+def test_the_guide_is_costed_as_sample_one_and_handed_out_as_it_was():
+    planner = Disco(MODEL, CORNER, SETTINGS, LIMITS)
+    for tick in range(3):
+        planner.plan(tick * 100_000_000, PlannerState(tick * 100_000_000, 0.6, 0.3, 2.0, 0.0, 0.0))
+    work, history = planner.optimiser.work, 0
+    rows = work.commands[0].reshape(-1, 2, 80)[history:]
+    np.testing.assert_array_equal(rows[:, :, 1], work.guide)
+    sampled, weights = planner.optimiser.sampled_commands(400)
+    assert len(weights) == 400
+    assert any(np.array_equal(one, work.guide.astype(float)) for one in sampled)
+
+
+def test_without_a_guide_in_the_settings_there_is_none():
+    planner = Disco(MODEL, CORNER, replace(SETTINGS, guide_below=0.0), LIMITS)
+    planner.plan(0, PlannerState(0, 0.6, 0.3, 2.0, 0.0, 0.0))
+    assert not planner.optimiser.work.guide.any()
+    assert DiscoSettings.paper().guide_below == 0.0
+
+
+def test_with_the_guide_a_square_is_driven_close_to_its_corners():
+    robot, track = ForeignRobot(*NOMINAL), tracks()["square"]
+    found = {
+        below: drive(disco(replace(SETTINGS, guide_below=below), knows=True), robot, track, duration_s=20.0).after()
+        for below in (0.0, SETTINGS.guide_below)
+    }
+    assert found[SETTINGS.guide_below].rms_mm < min(10.0, 0.9 * found[0.0].rms_mm)
+    assert found[SETTINGS.guide_below].speed_m_s > 0.19
+    assert math.isclose(found[0.0].speed_m_s, SPEED_M_S, rel_tol=0.1)
