@@ -18,6 +18,7 @@ PARTS = (
     "bench_control",
     "bench_control_path",
     "bench_estimation",
+    "bench_import",
     "bench_inference",
     "bench_latency",
     "bench_log",

@@ -33,9 +33,14 @@ def view(
         str, typer.Option(help="Address to listen on; any but this host's own needs the token that is printed.")
     ] = LOOPBACK,
     port: Annotated[int, typer.Option(min=1, max=65535, help="Port of the page.")] = DEFAULT_PORT,
+    foxglove: Annotated[
+        bool, typer.Option("--foxglove", help="With --live: serve Foxglove, port 8765, instead of the page.")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Show the page: a log, or the running daemon."""
+    if foxglove:
+        _foxglove(live, robot, log, (model, link, snapshot, video, export), host, port, as_json)
     if live:
         if robot is None or log is not None:
             raise InputError("view --live: needs --robot ROBOT.toml and no LOG")
@@ -63,6 +68,29 @@ def view(
         raise typer.Exit(commands.view_log(log, robot, host, port, as_json))
     if as_json:
         print_result({"written": written}, as_json, "")
+
+
+def _foxglove(
+    live: bool,
+    robot: Path | None,
+    log: Path | None,
+    others: tuple[object, ...],
+    host: str,
+    port: int,
+    as_json: bool,
+) -> None:
+    if not live or robot is None or log is not None or any(other is not None for other in others):
+        raise InputError("view --foxglove: give --live and --robot ROBOT.toml, and of the rest --port alone")
+    if host != LOOPBACK:
+        raise InputError(f"--host {host}: Foxglove's protocol has no token; leave it out, and tunnel by ssh -L 8765")
+    check_named_files(robot)
+    try:
+        from disco_hw.bridge import foxglove as bridge
+    except ModuleNotFoundError as error:
+        if error.name != "foxglove":
+            raise
+        raise InputError("view --foxglove: needs foxglove-sdk; pip install 'disco-hw[foxglove]'") from None
+    raise typer.Exit(bridge.serve_foxglove(robot, host, bridge.DEFAULT_PORT if port == DEFAULT_PORT else port, as_json))
 
 
 def replay(

@@ -16,12 +16,17 @@ from dataclasses import dataclass
 from typing import IO, Any, Protocol, cast
 
 import msgspec
+from foxglove_schemas_protobuf.Color_pb2 import Color
 from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
+from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
 from foxglove_schemas_protobuf.Log_pb2 import Log
+from foxglove_schemas_protobuf.Point3_pb2 import Point3
 from foxglove_schemas_protobuf.Pose_pb2 import Pose
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
 from foxglove_schemas_protobuf.Quaternion_pb2 import Quaternion
+from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
 from google.protobuf.timestamp_pb2 import Timestamp
 from mcap.well_known import MessageEncoding, SchemaEncoding
@@ -30,7 +35,7 @@ from mcap_protobuf.schema import build_file_descriptor_set
 
 from disco_hw.log.encoding import encode_json, json_schema
 from disco_hw.log.link import Batch, BatchDecoder, End, Start
-from disco_hw.log.records import TOPICS, Estimate, Event, Plan, Record
+from disco_hw.log.records import TOPICS, Estimate, Event, Fan, Plan, Record
 from drivers.types import PoseSample
 
 VIEW_PREFIX = "/view/"
@@ -40,6 +45,7 @@ VIEWS: tuple[tuple[str, Any], ...] = (
     ("/view/transform", FrameTransform),
     ("/view/measured_pose", PoseInFrame),
     ("/view/plan", PosesInFrame),
+    ("/view/rollouts", SceneUpdate),
     ("/view/log", Log),
 )
 """Topics and their protobuf classes."""
@@ -77,6 +83,8 @@ def views(record: Record, wall_ns: int) -> list[tuple[str, bytes]]:
                 poses=[_pose(x, y, yaw) for x, y, yaw in path],
             )
             return [("/view/plan", plan.SerializeToString())]
+        case Fan() if record.weights:
+            return [("/view/rollouts", _rollouts(record, time).SerializeToString())]
         case Event():
             log = Log(
                 timestamp=time,
@@ -86,6 +94,23 @@ def views(record: Record, wall_ns: int) -> list[tuple[str, bytes]]:
             )
             return [("/view/log", log.SerializeToString())]
     return []
+
+
+def _rollouts(fan: Fan, time: Timestamp) -> SceneUpdate:
+    """A line for each sequence, the fainter the less it weighs."""
+    count = len(fan.x_m) // len(fan.weights)
+    points = [Point3(x=x, y=y, z=0.0) for x, y in zip(fan.x_m, fan.y_m, strict=True)]
+    lines = [
+        LinePrimitive(
+            type=LinePrimitive.LINE_STRIP,
+            pose=_pose(0.0, 0.0, 0.0),
+            thickness=0.005,
+            color=Color(r=0.3, g=0.5, b=0.9, a=0.15 + 0.85 * weight / fan.weights[0]),
+            points=points[k * count : (k + 1) * count],
+        )
+        for k, weight in enumerate(fan.weights)
+    ]
+    return SceneUpdate(entities=[SceneEntity(timestamp=time, id="rollouts", frame_id=_WORLD, lines=lines)])
 
 
 def _timestamp(wall_ns: int) -> Timestamp:

@@ -1,0 +1,107 @@
+"""Foxglove live: a client of its protocol is told of the topics and gets what the feed has; the layout names them."""
+
+import asyncio
+import json
+import re
+import struct
+import threading
+
+import pytest
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+
+pytest.importorskip("foxglove", reason="foxglove-sdk is not installed: make venv")
+from typer.testing import CliRunner
+from websockets.asyncio.client import connect
+
+from disco_hw.bridge.foxglove import LAYOUT, SCENE, Live
+from disco_hw.cli import app
+from disco_hw.config import load_robot_config
+from disco_hw.daemon.client import socket_path
+from disco_hw.daemon.page_feed import ViewerFeed, feed_path
+from disco_hw.errors import InputError
+from disco_hw.experiments.live_stack import write_robot_file
+from disco_hw.log.mcap_log import VIEWS
+from disco_hw.log.records import TOPIC_BY_NAME, DaemonState, Estimate, Event
+
+ESTIMATE = Estimate(7, 1.0, 2.0, 0.5, (0.0,) * 9, 0.25, 0.0, 0.0, 0.0)
+WANTED = {"/estimate", "/view/transform", SCENE}
+
+
+@pytest.fixture
+def live(tmp_path):
+    config = load_robot_config(write_robot_file(tmp_path))
+    feed = ViewerFeed(feed_path(socket_path(config)), period_s=0.0)
+    served = Live(config, "127.0.0.1", 0)
+    ended = threading.Event()
+
+    def serve():
+        now_ns = 0
+        while not ended.is_set():
+            now_ns += 1
+            feed.put(now_ns, [ESTIMATE, Event(now_ns, "info", "a", "b"), DaemonState(now_ns, "READY", "READY")])
+            served.step()
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    yield served
+    ended.set()
+    thread.join()
+    served.close()
+    feed.close()
+
+
+async def hear(url):
+    """The advertised channels by topic, and the first message of each wanted one."""
+    async with connect(url, subprotocols=["foxglove.sdk.v1"], max_size=None) as client:
+        channels, messages = {}, {}
+        while WANTED - set(messages):
+            said = await asyncio.wait_for(client.recv(), 30.0)
+            if isinstance(said, str):
+                for channel in json.loads(said).get("channels", []):
+                    channels[channel["topic"]] = channel
+                wanted = [one["id"] for one in channels.values() if one["topic"] in WANTED]
+                asked = [{"id": number, "channelId": number} for number in wanted]
+                await client.send(json.dumps({"op": "subscribe", "subscriptions": asked}))
+            elif said[0] == 1:
+                number, _ = struct.unpack("<IQ", said[1:13])
+                topic = next(one["topic"] for one in channels.values() if one["id"] == number)
+                messages.setdefault(topic, said[13:])
+        return channels, messages
+
+
+def test_a_client_is_told_of_all_topics_and_gets_what_the_daemon_records(live):
+    channels, messages = asyncio.run(hear(live.url))
+    assert {name for name, _ in VIEWS} | (set(TOPIC_BY_NAME) - {"/can/rx", "/can/tx"}) | {SCENE} == set(channels)
+    assert channels["/estimate"]["encoding"] == "json"
+    assert channels["/view/transform"]["schemaName"] == "foxglove.FrameTransform"
+    said = json.loads(messages["/estimate"])
+    assert (said["x_m"], said["y_m"], said["speed_m_s"]) == (1.0, 2.0, 0.25)
+    scene = SceneUpdate()
+    scene.ParseFromString(messages[SCENE])
+    task, robot = scene.entities
+    assert (task.frame_id, robot.frame_id) == ("world", "robot")
+    assert max(point.x for point in task.lines[0].points) == pytest.approx(0.75, abs=0.01)
+
+
+def test_a_port_that_is_taken_is_refused_in_one_line(live, tmp_path):
+    config = load_robot_config(write_robot_file(tmp_path))
+    with pytest.raises(InputError, match=r"--port \d+: cannot be listened to .*; choose another"):
+        Live(config, "127.0.0.1", int(live.url.rpartition(":")[2]))
+
+
+@pytest.mark.parametrize("words", [["run.mcap"], ["--live"], ["--live", "--robot", "r.toml", "--host", "0.0.0.0"]])
+def test_what_it_is_not_for_is_refused(words):
+    with pytest.raises(InputError):
+        CliRunner().invoke(app, ["view", "--foxglove", *words], catch_exceptions=False)
+
+
+def test_the_layout_names_topics_and_fields_that_there_are():
+    text = LAYOUT.read_text(encoding="utf-8")
+    panels = json.loads(text)["configById"]
+    views = {name for name, _ in VIEWS} | {SCENE}
+    assert set(panels["3D!scene"]["topics"]) <= views
+    assert panels["RosOut!log"]["topicToRender"] in views
+    for topic, field in re.findall(r'"value": "(/[a-z/]+)\.(\w+)"', text):
+        assert field in TOPIC_BY_NAME[topic].record.__struct_fields__, (topic, field)
+    placed = re.findall(r'"(?:first|second)": "([^"]+)"', text)
+    assert sorted(placed) == sorted(panels)
