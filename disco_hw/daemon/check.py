@@ -40,6 +40,7 @@ from drivers.types import (
     PoseSource,
     ReceivedFrame,
     RobotStatus,
+    SaysWhy,
     Transport,
 )
 from firmware_protocol.codec import Codec, Decoded
@@ -114,7 +115,7 @@ def run_check(robot: Path, link: str | None = None) -> CheckReport:
 
 @dataclass(frozen=True, slots=True)
 class _Found:
-    """What the robot answered."""
+    """What the robot answered; `pose_news` is the newest that the pose source said of itself, empty for nothing."""
 
     state: DriverState
     detail: str
@@ -123,6 +124,7 @@ class _Found:
     wheel_samples: int
     pose_samples: int
     headings: int
+    pose_news: str
     rejected: int
     told: tuple[RobotStatus, ...]
     round_trips_s: tuple[float, ...]
@@ -168,6 +170,7 @@ def _ask_robot(transport: Transport, driver: Driver, pose_source: PoseSource) ->
     """Shake hands, listen for three seconds and time the answers to the driver's own clock requests."""
     stopwatch = _Stopwatch()
     wheels = poses = headings = 0
+    pose_news = ""
     told: list[RobotStatus] = []
     start_ns = time.monotonic_ns()
     driver.link_up(start_ns)
@@ -180,6 +183,8 @@ def _ask_robot(transport: Transport, driver: Driver, pose_source: PoseSource) ->
         came = pose_source.receive(now_ns, readings.poses)
         poses += len(came)
         headings += sum(pose.has_heading for pose in came)
+        if isinstance(pose_source, SaysWhy):
+            pose_news = next(reversed(pose_source.news()), pose_news)
         told += [status for status in readings.status if status.t_ns - start_ns > _SETTLED_S * 1e9]
         for outgoing in driver.transmit(now_ns, None):
             if transport.send(outgoing, now_ns):
@@ -194,6 +199,7 @@ def _ask_robot(transport: Transport, driver: Driver, pose_source: PoseSource) ->
         wheel_samples=wheels,
         pose_samples=poses,
         headings=headings,
+        pose_news=pose_news,
         rejected=stats.rejected_crc + stats.rejected_sequence + stats.rejected_length + transport.stats.malformed,
         told=tuple(told),
         round_trips_s=tuple(stopwatch.round_trips_s),
@@ -261,8 +267,9 @@ def _telemetry_check(found: _Found) -> Check:
     if not found.wheel_samples:
         return Check(name, Level.FAIL, f"{rates}; check the encoders and the firmware")
     if not found.pose_samples:
+        why = found.pose_news and f"; {found.pose_news}"
         return Check(
-            name, Level.WARNING, f"{rates}; without a pose the task does not start if estimation.pose_required"
+            name, Level.WARNING, f"{rates}{why}; without a pose the task does not start if estimation.pose_required"
         )
     if not found.headings:
         return Check(name, Level.WARNING, f"{rates}; heading not known; {FIND_HEADING}")

@@ -53,6 +53,7 @@ def status(core: DaemonCore, loop: dict[str, Any], recorder: RecorderStats) -> d
         "stop_cause": "UNKNOWN" if robot is None else robot.stop_cause,
         "pose": [estimate.x_m, estimate.y_m, estimate.yaw_rad],
         "pose_ok": estimate.pose_ok,
+        "heading_known": estimate.heading_known,
         "wheels": None if wheels is None else [wheels.left_speed_rad_s, wheels.right_speed_rad_s],
         "command": [tick.pipeline.command.left_rad_s, tick.pipeline.command.right_rad_s],
         "source": tick.pipeline.source.value,

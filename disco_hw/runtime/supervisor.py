@@ -349,6 +349,15 @@ class Supervisor:
                 return "; ".join(inputs.preflight_errors)
             if self._estop_asked:
                 return "e-stop requested here"
+        age_s = inputs.telemetry_age_s
+        silent = age_s is None or not age_s <= self._settings.telemetry_disarm_s
+        if (
+            self._state is State.HANDSHAKE
+            and inputs.link_state is LinkState.UP
+            and inputs.driver_state in _IDLE
+            and silent
+        ):
+            return "it sends no wheel samples; check the encoders and the controller"
         return connection(inputs.link_state, inputs.link_error, inputs.driver_state, inputs.driver_detail)
 
     def _detail(self, inputs: Inputs, seen: int) -> str:

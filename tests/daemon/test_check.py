@@ -1,5 +1,6 @@
 """What `check` concludes from what a robot says; the verb as a whole is tested in tests/hil."""
 
+import math
 import time
 from dataclasses import replace
 from types import SimpleNamespace
@@ -14,7 +15,7 @@ from disco_hw.runtime.robot_setup import load_setup
 from drivers.motor import make_driver
 from drivers.pose.robot import RobotPoses
 from drivers.transport import connect_pair
-from drivers.types import Frame, OutgoingFrame
+from drivers.types import Frame, OutgoingFrame, PoseSample
 from firmware_protocol.faults import FAULTS
 from tests.daemon.test_control_client import Daemon
 from tests.drivers.motor.reference_robot import CONFIG, ReferenceRobot
@@ -86,6 +87,35 @@ def test_what_else_the_robot_rejects_is_a_warning():
     heard = check._hearing_check(check._ask_robot(robot, make_driver(None), RobotPoses()))
     assert heard.level is Level.WARNING
     assert "checksum" in heard.text
+
+
+class Antenna:
+    """Positions without heading from a source that says of itself what it does; none while it is `silent`."""
+
+    def __init__(self, silent):
+        self.silent, self._said = silent, ["/dev/ttyACM0: open", "fix quality 0: no fix"]
+
+    def receive(self, now_ns, from_robot):
+        return [] if self.silent else [PoseSample(now_ns, now_ns, 1.0, 2.0, math.nan, 0.02, math.nan)]
+
+    def news(self):
+        said, self._said = self._said, []
+        return said
+
+    def close(self):
+        pass
+
+
+def test_positions_without_heading_are_a_warning_with_what_to_do():
+    told = check._telemetry_check(check._ask_robot(RobotInTime(b""), make_driver(None), Antenna(silent=False)))
+    assert told.level is Level.WARNING
+    assert "heading not known; the poses have none: drive a metre" in told.text
+
+
+def test_a_pose_source_that_is_silent_says_why():
+    told = check._telemetry_check(check._ask_robot(RobotInTime(b""), make_driver(None), Antenna(silent=True)))
+    assert told.level is Level.WARNING
+    assert "0 pose samples a second; fix quality 0: no fix; without a pose" in told.text
 
 
 def test_the_conformance_suite_keeps_out_of_a_daemons_way_too(tmp_path):

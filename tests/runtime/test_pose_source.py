@@ -1,15 +1,20 @@
 """The tick takes its poses from the source that robot.toml names."""
 
+import msgspec
 import pytest
 
+from disco_hw.drive.coverage import Coverage
+from disco_hw.drive.hand_pilot import HandPilot
 from disco_hw.errors import InputError
 from disco_hw.runtime import assembly
 from disco_hw.runtime.assembly import pose_source_of
 from disco_hw.runtime.pipeline import NoPlanner
 from disco_hw.runtime.robot_setup import load_setup
+from disco_hw.runtime.supervisor import UserRequest
 from drivers.pose import PoseSourceError
 from drivers.pose.robot import RobotPoses
-from drivers.types import PoseSample
+from drivers.types import PoseSample, WheelSample
+from tests.drive.test_hand_pilot import Hand
 from tests.runtime.simulated import ROBOT_FILE, simulated_stack
 
 
@@ -30,6 +35,41 @@ def test_the_estimate_rests_on_the_sources_poses_in_place_of_the_robots(monkeypa
     estimate = last.pipeline.estimate
     assert (estimate.x_m, estimate.y_m, estimate.yaw_rad) == pytest.approx((7.0, -3.0, 0.5), abs=1e-3)
     assert estimate.pose_ok
+
+
+def recorded(stack, kind):
+    return [record for _, records in stack.recorder.ticks for record in records if isinstance(record, kind)]
+
+
+def test_without_poses_the_robot_is_driven_by_hand_and_recorded(monkeypatch):
+    stack = simulated_stack(NoPlanner())
+    stack.core.pose_source = Elsewhere()
+    monkeypatch.setattr(Elsewhere, "receive", lambda _self, _now_ns, _from_robot: [])
+    hand = Hand()
+    stack.pilot = HandPilot(hand, Coverage(8.0))
+    stack.run(1.5)
+    hand.held = True
+    assert stack.run(1.5)[-1].output.motion_allowed
+    assert recorded(stack, WheelSample)
+    assert not recorded(stack, PoseSample)
+
+
+def test_without_wheels_poses_are_recorded_and_nothing_is_armed(monkeypatch):
+    """Whoever pushes the robot, or drives it by its own remote control, has its poses; no blind motion."""
+    stack = simulated_stack(NoPlanner())
+    driver = stack.core.driver
+    heard = driver.receive
+    monkeypatch.setattr(driver, "receive", lambda *of: msgspec.structs.replace(heard(*of), wheels=()))
+    stack.core.pose_source = Elsewhere()
+    stack.pilot = HandPilot(Hand(), Coverage(8.0))
+    stack.run(1.5)
+    (reply,) = [reply for tick in stack.run(0.1, UserRequest.ARM) for reply in tick.replies]
+    assert (reply.accepted, reply.text) == (
+        False,
+        "not connected to the robot: it sends no wheel samples; check the encoders and the controller",
+    )
+    assert recorded(stack, PoseSample)
+    assert not recorded(stack, WheelSample)
 
 
 def test_the_robots_own_poses_are_the_default():
