@@ -432,6 +432,7 @@ class MotorDriver:
     `cyclic_frames` (of settings, command rate in Hz, whether authenticated): what the link carries. `authenticates`:
     whether there is such a mode; without one `link.key_file` is refused. `kinds`: of links that it speaks over, the
     usual one first. `exchange` makes what a serial line is spoken with; None: the reference protocol's frames.
+    `serial_field`: of the settings, one that belongs to a serial link, where it must be given, and to no other.
     `example`: its fields in [link] for a robot as the demonstration drives it; none where its controller is not
     simulated. `recognise`: of frames that were only listened to, the fields in [link] that they show, None if they are
     not its controller's. `latches_stop`: whether the controller itself keeps an e-stop until it is reset. `is_default`:
@@ -448,6 +449,7 @@ class MotorDriver:
     settings: type[Any] = NoSettings
     kinds: tuple[str, ...] = ("can",)
     exchange: Callable[[Any], Exchange] | None = None
+    serial_field: str = ""
     example: str = ""
     recognise: Callable[[Sequence[Frame]], dict[str, Any] | None] = lambda _frames: None
     latches_stop: bool = True

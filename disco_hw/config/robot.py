@@ -418,6 +418,10 @@ def _check(path: Path, config: RobotConfig) -> None:
         _refuse(
             path, "link.kind", f'the driver {driver.name} does not speak over "{config.link.kind}"', f"write {known}"
         )
+    field = driver.serial_field
+    if field and (getattr(config.link.settings(), field) is None) is (config.link.kind == "serial"):
+        remedy = "remove it" if config.link.kind != "serial" else "add it (docs/robot.md says what it is)"
+        _refuse(path, f"link.{field}", "belongs to a serial line, and to no other link", remedy)
     if config.link.key_file is not None and not driver.authenticates:
         _refuse(path, "link.key_file", f"the driver {driver.name} has no authenticated mode", "remove it")
 

@@ -19,8 +19,10 @@ from drivers.motor.vesc_settings import (
     FAULTS,
     HOST_ID,
     STANDS_ERPM,
+    VescExchange,
     VescSettings,
     cyclic_frames,
+    questions,
     recognise,
     safety_card,
     slowest_rad_s,
@@ -50,6 +52,7 @@ ARMING_TIMEOUT_NS = 1_500_000_000
 BRAKING_NS = 3_000_000_000
 _PING_PERIOD_NS = 100_000_000
 _FAULT_PERIOD_NS = 50_000_000
+_POLL_PERIOD_NS = 18_000_000
 _SAME_TIMEOUT_S, _SAME_CURRENT_A = 0.002, 0.1
 _SET_COMMANDS = frozenset(number for number, _ in codec.CAN_COMMANDS.values())
 _BRAKE = codec.CAN_COMMANDS["set_brake_current"][0]
@@ -189,7 +192,10 @@ class VescDriver:
         wheels: list[WheelSample] = []
         status: list[RobotStatus] = []
         for received in frames if self._link_is_up else ():
-            if self._take_packet(received.frame):
+            if self._take_packet(received):
+                if self._settings.uart_node is not None and all(each.is_new for each in self._all):
+                    status.append(self._status(received.t_ns))
+                    wheels.append(self._sample(received.t_ns))
                 continue
             decoded = codec.decode(received.frame)
             if decoded is None or decoded.controller not in self._motors:
@@ -294,7 +300,8 @@ class VescDriver:
                 return ()
             self._pinged_ns = now_ns
             return parts.outgoing(now_ns, *(codec.ping(motor.node, HOST_ID) for motor in self._all))
-        if now_ns - self._asked_ns < _FAULT_PERIOD_NS:
+        polled = self._settings.uart_node is not None
+        if now_ns - self._asked_ns < (_POLL_PERIOD_NS if polled else _FAULT_PERIOD_NS):
             return ()
         self._asked_ns = now_ns
         mute = [motor for motor in self._all if motor.may_tell_timeout]
@@ -302,6 +309,8 @@ class VescDriver:
             motor = min(mute, key=lambda each: each.asked_timeout)
             motor.asked_timeout += 1
             return parts.outgoing(now_ns, *codec.fragments(motor.node, HOST_ID, bytes([codec.GET_APPCONF])))
+        if polled:
+            return parts.outgoing(now_ns, *questions(self._settings))
         self._next_asked = (self._next_asked + 1) % len(self._all)
         node = self._all[self._next_asked].node
         return parts.outgoing(now_ns, *codec.fragments(node, HOST_ID, codec.ask_values(codec.FAULT_AND_STATUS)))
@@ -355,8 +364,9 @@ class VescDriver:
             frames += [codec.command(motor.node, "set_erpm", erpm) for motor in side]
         return frames
 
-    def _take_packet(self, frame: Frame) -> bool:
+    def _take_packet(self, received: ReceivedFrame) -> bool:
         """Whether the frame belongs to an answer for this host; what the answer says is taken."""
+        frame = received.frame
         if not frame.extended or frame.can_id & 0xFF != HOST_ID or frame.can_id >> 8 == codec.PONG:
             return False
         found = self._reassembly.feed(frame)
@@ -364,6 +374,9 @@ class VescDriver:
             read: Mapping[str, float] = codec.values(found[2]) or {}
             motor = self._motors[found[0]]
             motor.timeout = codec.timeout(found[2], motor.node) or motor.timeout
+            if "erpm" in read:
+                motor.erpm, motor.erpm_ns = read["erpm"], received.t_ns
+                self._take_tachometer(motor, int(read["tachometer"]), received.t_ns)
             motor.fault = int(read["fault"]) if "fault" in read else motor.fault
             byte = int(read.get("status_byte", 0))
             motor.timed_out, motor.killed = bool(byte & codec.TIMED_OUT), bool(byte & codec.KILL_SWITCH)
@@ -475,5 +488,8 @@ DRIVER = MotorDriver(
     stop_confirmation=stop_confirmation,
     cyclic_frames=cyclic_frames,
     safety_card=safety_card,
+    kinds=("can", "serial"),
+    exchange=VescExchange,
+    serial_field="uart_node",
     slowest_rad_s=slowest_rad_s,
 )

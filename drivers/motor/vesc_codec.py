@@ -95,6 +95,7 @@ _VALUES: tuple[tuple[str, tuple[tuple[str, float], ...]], ...] = tuple(
 )
 """Of COMM_GET_VALUES, in the order of the bits of the selective form's mask."""
 FAULT_AND_STATUS = 1 << 15 | 1 << 21
+ALL_OF_A_MOTOR = 1 << 7 | 1 << 13 | 1 << 17 | FAULT_AND_STATUS
 TIMED_OUT, KILL_SWITCH = 1, 2
 
 

@@ -44,7 +44,8 @@ class VescSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     """Its fields in [link]: left before right; `gear` is motor turns per wheel turn, `pole_pairs` half the poles.
 
     `watchdog_s` (App Settings, Timeout), `timeout_brake_current_a`, `max_erpm` and `min_erpm` (below which the speed
-    loop lets go) are what the controllers are set to.
+    loop lets go) are what the controllers are set to. `uart_node`: on a serial link, the controller at its end, through
+    which the others are reached on its CAN.
     """
 
     nodes: tuple[_Nodes, _Nodes]
@@ -54,6 +55,7 @@ class VescSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     brake_current_a: Annotated[float, Meta(gt=0.0, le=500.0)]
     timeout_brake_current_a: Annotated[float, Meta(ge=0.0, le=500.0)] = 0.0
     min_erpm: Annotated[float, Meta(ge=0.0, le=1e5)] = 900.0
+    uart_node: int | None = None
     direction: tuple[_Sign, _Sign] = (1, 1)
     gear: Annotated[float, Meta(gt=0.0, le=1000.0)] = 1.0
     stop_deceleration_rad_s2: Annotated[float, Meta(gt=0.0, le=655.0)] = 10.0
@@ -83,6 +85,8 @@ class VescSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
             return SettingsFault("nodes", f"an id is outside 0 to 254, or {HOST_ID}, which is this host's", "change it")
         if len(set(nodes)) != len(nodes):
             return SettingsFault("nodes", "an id stands there twice", "give each controller its own (VESC Tool)")
+        if self.uart_node is not None and self.uart_node not in nodes:
+            return SettingsFault("uart_node", f"{self.uart_node} is none of link.nodes", "write the one on the line")
         if self.min_erpm >= self.max_erpm:
             return SettingsFault("max_erpm", "not above min_erpm", "write what the motor can turn")
         return None
@@ -93,9 +97,66 @@ def slowest_rad_s(settings: VescSettings) -> float:
     return settings.min_erpm / settings.erpm_per_rad_s
 
 
+class VescExchange:
+    """Satisfies `drivers.types.Exchange`: what goes over CAN elsewhere, in packets through the controller on the line.
+
+    A command has no reply. A ping is asked as values, and a packet's answer comes as one fragment that holds it whole.
+    """
+
+    timeout_s = 0.03
+    quiet_s = 0.01
+
+    def __init__(self, settings: VescSettings) -> None:
+        self._on_the_line = settings.uart_node
+
+    def request(self, frame: Frame) -> bytes:
+        """The packet, forwarded where it is for another controller; for everybody both."""
+        to, payload = frame.can_id & 0xFF, self._payload(frame)
+        sent = b"" if to not in (self._on_the_line, codec.EVERYBODY) else codec.packet(payload)
+        return sent if to == self._on_the_line else sent + codec.packet(codec.forward(to, payload))
+
+    def is_answered(self, frame: Frame) -> bool:
+        """Questions are, commands are not."""
+        return frame.can_id >> 8 in (codec.PING, codec.PROCESS_SHORT)
+
+    def reply(self, frame: Frame, received: bytes) -> Frame | None:
+        """The first packet that answers this question, of this controller."""
+        to, asked = frame.can_id & 0xFF, self._payload(frame)
+        for payload in codec.PacketDecoder().feed(received):
+            if payload[0] == asked[0] == codec.GET_APPCONF and codec.timeout(payload, to) is None:
+                continue
+            if payload[0] == codec.GET_VALUES_SELECTIVE:
+                read = codec.values(payload)
+                if payload[:5] != asked or read is None or read.get("controller_id") != to:
+                    continue
+            elif payload[0] != asked[0]:
+                continue
+            if frame.can_id >> 8 == codec.PING:
+                return Frame(codec.PONG << 8 | HOST_ID, bytes((to, 0)), extended=True)
+            return Frame(codec.PROCESS_SHORT << 8 | HOST_ID, bytes((to, 1)) + payload, extended=True)
+        return None
+
+    def _payload(self, frame: Frame) -> bytes:
+        number = frame.can_id >> 8
+        if number == codec.PROCESS_SHORT:
+            return frame.data[2:]
+        if number == codec.PING:
+            return codec.ask_values(codec.ALL_OF_A_MOTOR)
+        name = next(name for name, (command, _) in codec.CAN_COMMANDS.items() if command == number)
+        # Both kinds of command have the value in the same steps.
+        return bytes([codec.PACKET_COMMANDS[name][0]]) + frame.data
+
+
 def stop_frames(settings: VescSettings) -> tuple[Frame, ...]:
-    """Brake with the declared current, all at once; nothing latches it."""
-    return (codec.command(codec.EVERYBODY, "set_brake_current", settings.brake_current_a),)
+    """Brake with the declared current, all at once; nothing latches it. On a serial line also: do the motors stand?"""
+    brake = codec.command(codec.EVERYBODY, "set_brake_current", settings.brake_current_a)
+    return (brake,) if settings.uart_node is None else (brake, *questions(settings))
+
+
+def questions(settings: VescSettings) -> tuple[Frame, ...]:
+    """On a serial line, for all that must be known of each motor; no status messages come there."""
+    ask = codec.ask_values(codec.ALL_OF_A_MOTOR)
+    return tuple(frame for node in settings.all_nodes for frame in codec.fragments(node, HOST_ID, ask))
 
 
 def stop_confirmation(settings: VescSettings) -> Callable[[Frame], bool]:
@@ -104,6 +165,9 @@ def stop_confirmation(settings: VescSettings) -> Callable[[Frame], bool]:
 
     def heard(frame: Frame) -> bool:
         decoded = codec.decode(frame)
+        if frame.can_id == codec.PROCESS_SHORT << 8 | HOST_ID and frame.data[0] in standing:
+            read = codec.values(frame.data[2:]) or {}
+            standing[frame.data[0]] = abs(read.get("erpm", math.inf)) < STANDS_ERPM
         if decoded is not None and decoded.name == "status" and decoded.controller in standing:
             standing[decoded.controller] = abs(decoded.values["erpm"]) < STANDS_ERPM
         return all(standing.values())
@@ -114,6 +178,12 @@ def stop_confirmation(settings: VescSettings) -> Callable[[Frame], bool]:
 def cyclic_frames(settings: VescSettings, command_rate_hz: float, _authenticated: bool) -> tuple[CyclicFrame, ...]:
     """Speeds, two status messages at 50 Hz and the question for faults of every controller, as long 11-bit frames."""
     frames: list[CyclicFrame] = []
+    if settings.uart_node is not None:
+        # Command, question and answer, each in a packet; forwarded ones wait for the controllers' own bus.
+        return tuple(
+            CyclicFrame(f"command and values of {node}", "LINE", 8, command_rate_hz, 12 + 12 + 26, 0.0015)
+            for node in settings.all_nodes
+        )
     for node in settings.all_nodes:
         frames += [
             # 29-bit identifiers take about 25 bits more than the load's formula counts: two bytes and a half.

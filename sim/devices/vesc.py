@@ -393,6 +393,8 @@ class VescController:
     def receive(self, now_us: int, frame: CanFrame) -> Sequence[CanFrame]:
         """Take in one frame; return the replies."""
         replies: list[CanFrame] = []
+        if self._settings.uart_node is not None:
+            return self._receive_bytes(now_us // 1000, frame.data)
         for side in self.sides:
             for vesc in side:
                 vesc.at(now_us // 1000)
@@ -415,12 +417,28 @@ class VescController:
                 vesc.values.erpm = settings.direction[side] * speeds[side] * settings.erpm_per_rad_s
                 vesc.values.kill_switch = inputs.estop_button
                 frames += vesc.step(self._now_ms)
-        return frames
+        # A serial line has no status messages.
+        return frames if settings.uart_node is None else ()
 
     def restart(self) -> None:
         """Switch off and on: the tachometers begin at zero."""
         self._zero_ticks = self._ticks
         self.sides = self._make()
+
+    def _receive_bytes(self, now_ms: int, received: bytes) -> Sequence[CanFrame]:
+        """Bytes from the serial line; what is forwarded goes over the bus between the controllers, and back."""
+        everyone = [vesc for side in self.sides for vesc in side]
+        for vesc in everyone:
+            vesc.at(now_ms)
+        (near,) = (vesc for vesc in everyone if vesc.controller_id == self._settings.uart_node)
+        out, forwarded = near.receive_bytes(received)
+        for frame in forwarded:
+            for vesc in everyone:
+                if vesc is not near:
+                    out += b"".join(near.take_packet_answer(answer) for answer in vesc.receive(frame))
+        for vesc in everyone:
+            vesc.take_calls()
+        return [CanFrame(0, out)] if out else []
 
     def _make(self) -> tuple[list[Vesc], list[Vesc]]:
         settings = self._settings

@@ -47,9 +47,12 @@ def test_the_virtual_robot_conforms(tmp_path, link, key, chosen, least):
             assert (code, found) == (0, {"passed": 1, "skipped": 1}), output
 
 
-@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("device", [*DEVICES, "vesc over a serial line"])
 def test_each_vendors_simulated_controller_conforms(tmp_path, device):
-    robot_file = write_robot_file(tmp_path, device=device)
+    robot_file = write_robot_file(tmp_path, device=device.split()[0])
+    if "serial" in device:
+        text = robot_file.read_text().replace('kind = "can"', 'kind = "serial"').replace("921600", "115200")
+        robot_file.write_text(text.replace('driver = "vesc"', 'driver = "vesc"\nuart_node = 23'))
     with disco_hw_process("virtual robot", ["sim", str(robot_file)], tmp_path / "sim.txt"):
         wait_until(lambda: "ready" in (tmp_path / "sim.txt").read_text(), READY_TIMEOUT_S)
         code, found, output = conform(robot_file, "--allow-motion", "-k", "vendor or introduces")

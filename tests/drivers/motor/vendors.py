@@ -33,14 +33,19 @@ class Vendor:
     mend: Callable[[VendorRig], None] = lambda _rig: None
 
     @property
+    def is_serial(self):
+        """Whether it is on a line with two ends, which no second host hears or speaks on."""
+        return self.foreign is None
+
+    @property
     def settings(self):
         driver = find_driver(self.name)
         return msgspec.convert({**tomllib.loads(driver.example), **tomllib.loads(self.changes)}, driver.settings)
 
     def bench(self, **options):
         controller = find_controller(self.name)(self.settings, TICKS_PER_REV)
-        made = find_driver(self.name).exchange
-        rig = VendorRig(controller, None if made is None else made(self.settings))
+        exchange = find_driver(self.name).exchange(self.settings) if self.is_serial else None
+        rig = VendorRig(controller, exchange)
         return Bench(make_driver(self.name, self.settings), rig, **options)
 
     def __str__(self):
@@ -176,6 +181,17 @@ VENDORS = (
         is_vesc_motion,
         is_vesc_forbidden,
         CanFrame(3 << 8 | 52, bytes(4), extended=True),
+        mend_vesc,
+    ),
+    Vendor(
+        "vesc",
+        "vesc-uart",
+        "uart_node = 51\n",
+        0.11,
+        fail_left_vesc,
+        is_vesc_motion,
+        is_vesc_forbidden,
+        None,
         mend_vesc,
     ),
     Vendor(
