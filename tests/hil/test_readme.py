@@ -1,4 +1,4 @@
-"""The commands of the page "By hand" of the tutorial, as they stand, one after the other in processes of their own."""
+"""The commands of the tutorial's part "By hand" and of the README's story, as they stand, in processes of their own."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ ROBOT = "disco_hw/robots/wombot.toml"
 pytestmark = [pytest.mark.hil, pytest.mark.long, pytest.mark.timeout(1200)]
 
 
-def commands_of_readme() -> list[list[str]]:
-    """The lines of the first block under "By hand" that call disco-hw, without their comments."""
-    block = (ROOT / "docs" / "virtual-robot.md").read_text("utf-8").split("## By hand\n")[1].split("```")[1]
+def commands_under(page: str, heading: str) -> list[list[str]]:
+    """The lines of the first block under a heading that call disco-hw, without their comments."""
+    block = (ROOT / page).read_text("utf-8").split(f"## {heading}\n")[1].split("```")[1]
     return [shlex.split(line, comments=True) for line in block.splitlines() if re.match(r"disco-hw\s", line)]
 
 
 class Reader:
-    """Types the README's lines into a terminal; every line has to be there, and each that is there has to be typed."""
+    """Types a page's lines into a terminal; every line has to be there, and each that is there has to be typed."""
 
-    def __init__(self, directory: Path) -> None:
+    def __init__(self, directory: Path, page: str, heading: str) -> None:
         self._directory = directory
-        self.left = commands_of_readme()
+        self.left = commands_under(page, heading)
         # At an address of its own: anybody on this computer may be driving the robot that the shipped file names.
         robots = directory / "disco_hw" / "robots"
         shutil.copytree(ROOT / "disco_hw" / "robots", robots)
@@ -106,8 +106,8 @@ class Reader:
         self.wait(state, lambda status: status["state"] == state)
 
 
-def test_the_readmes_commands_go_through(tmp_path):
-    reader = Reader(tmp_path)
+def test_the_tutorials_commands_go_through(tmp_path):
+    reader = Reader(tmp_path, "docs/virtual-robot.md", "By hand")
     with reader.another_terminal(f"disco-hw sim {ROBOT}"):
         with reader.another_terminal(f"disco-hw run {ROBOT}"):
             reader.wait_for("READY")
@@ -140,3 +140,34 @@ def test_the_readmes_commands_go_through(tmp_path):
     (log, *_) = sorted((tmp_path / "logs").glob("wombot-*.mcap"))
     assert "ended properly" in reader.type("disco-hw log info logs/wombot-*.mcap", **{"logs/wombot-*_mcap": str(log)})
     assert not reader.left
+
+
+def laps(status) -> float:
+    return float(status["task"]["laps"] or 0.0)
+
+
+def test_the_story_is_true(tmp_path):
+    reader = Reader(tmp_path, "README.md", "A story in ten lines")
+    with reader.another_terminal(f"disco-hw sim {ROBOT} --hide deadband=0.8"):
+        with reader.another_terminal(f"disco-hw run {ROBOT}"):
+            reader.wait_for("READY")
+            reader.ctl("arm")
+            reader.wait_for("ARMED")
+            reader.ctl("start")
+            time.sleep(30.0)
+            status = json.loads(reader.ctl("status", "--json"))
+            # At 0.2 m/s it would have driven more than a lap.
+            assert laps(status) < 0.7, status
+            reader.ctl("quit")
+        reader.type(f"disco-hw drive {ROBOT} --script excite --unattended --log drive.mcap")
+        said = reader.type(f"disco-hw gap drive.mcap --robot {ROBOT} -o out/gap")
+        assert "deadband" in said
+        with reader.another_terminal(f"disco-hw run {ROBOT} --model out/gap/model.toml"):
+            reader.wait_for("READY")
+            reader.ctl("arm")
+            reader.wait_for("ARMED")
+            reader.ctl("start")
+            reader.wait("round the circle", lambda status: laps(status) > 1.0, 180.0)
+            reader.ctl("quit")
+    # Run by tests/hil/test_gap_loop.py, with fewer laps.
+    assert reader.left == [["disco-hw", "experiment", "gap", "--hide", "deadband=0.8", "-o", "out/story"]]
