@@ -52,7 +52,7 @@ from disco_hw.runtime.assembly import (
     make_planner,
 )
 from disco_hw.runtime.core import CoreTick, DaemonCore
-from disco_hw.runtime.pilot import Pilot, TaskPilot
+from disco_hw.runtime.pilot import FindsWiring, Pilot, TaskPilot
 from disco_hw.runtime.pipeline import NoPlanner, Pipeline, Planner
 from disco_hw.runtime.robot_setup import Setup, kept_files, link_key, load_setup, refuse_missing_effects
 from disco_hw.runtime.situation import Ask, advice, by_command, headline
@@ -192,6 +192,8 @@ def _start(
     driver = driver_of(config, key)
     core = assemble_core(config, transport, driver, pipeline, recorder, pilot.needs_pose, adaptation)
     stop.add("pose source", core.pose_source.close)
+    if isinstance(pilot, FindsWiring):
+        core.directions = None
     daemon = Daemon(core, server, recorder, MonotonicClock(), signals, say, pilot, ask)
     stop.add("wheels", daemon.stop_wheels)
     if config.daemon.realtime_priority:

@@ -25,7 +25,7 @@ from disco_hw.runtime.assembly import (
     make_pipeline,
 )
 from disco_hw.runtime.core import CoreTick, DaemonCore
-from disco_hw.runtime.pilot import Pilot, TaskPilot
+from disco_hw.runtime.pilot import FindsWiring, Pilot, TaskPilot
 from disco_hw.runtime.pipeline import Pipeline, Planner
 from disco_hw.runtime.robot_setup import Setup, kept_files
 from disco_hw.runtime.supervisor import UserRequest
@@ -92,6 +92,8 @@ class SimulatedRun:
             self.pilot.needs_pose if needs_pose is None else needs_pose,
             adaptation=self._adaptation(setup, pipeline, adapter),
         )
+        if isinstance(self.pilot, FindsWiring):
+            self.core.directions = None
         self._period_us = round(1e6 / setup.config.control.rate_hz)
 
     @staticmethod

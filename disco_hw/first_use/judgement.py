@@ -241,7 +241,8 @@ def _simple(ratio: float) -> float:
 def _stop_after_silence(track: Track) -> tuple[float, float | None] | None:
     """When the wheels began to slow down and when they stood, since the last command (s); None if they went on."""
     silent_ns = track.silent_ns or 0
-    ended_s = math.inf if track.ended_ns is None else (track.ended_ns - silent_ns) * 1e-9
+    # What the robot said to be its own stop may show late; what began after the person had let go was not its own.
+    let_go_s = (track.ended_ns - silent_ns) * 1e-9 if track.let_go and track.ended_ns is not None else math.inf
     before = [_faster(s.left_speed_rad_s, s.right_speed_rad_s) for s in track.wheels if s.t_ns <= silent_ns]
     after = [
         ((s.t_ns - silent_ns) * 1e-9, _faster(s.left_speed_rad_s, s.right_speed_rad_s))
@@ -250,7 +251,7 @@ def _stop_after_silence(track: Track) -> tuple[float, float | None] | None:
     ]
     steady = median(before[-20:]) if before else 0.0
     slow = next((t_s for t_s, speed in after if speed < SLOWING * steady), None)
-    if slow is None or slow > ended_s + 0.05 or after[-1][1] > 0.5 * steady:
+    if slow is None or slow > let_go_s + 0.05 or after[-1][1] > 0.5 * steady:
         return None
     return slow, next((t_s for t_s, speed in after if speed < STILL_RAD_S), None)
 

@@ -41,6 +41,11 @@ class CommissionPilot:
         return False
 
     @property
+    def finds_wiring(self) -> bool:
+        """That is what it is for."""
+        return True
+
+    @property
     def done(self) -> bool:
         """Whether the procedure is over, or the person gave up."""
         return self.procedure.action is None or self._source.ended is not None or self.trouble is not None

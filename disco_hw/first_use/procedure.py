@@ -100,7 +100,9 @@ class Track:
     silent_ns: int | None = None
     """When the last command before a silence was sent."""
     ended_ns: int | None = None
-    """When frames were sent again, because the robot had stopped by itself or the person had let go."""
+    """When frames were sent again, because the robot had said that it stops by itself or the person had let go."""
+    let_go: bool = False
+    """Whether it was the person."""
 
     def add(self, seen: Seen) -> None:
         """Take in a tick."""
@@ -243,7 +245,7 @@ def _watchdog(wheels: Wheels) -> Steps:
             while (seen.now_ns - track.silent_ns) * 1e-9 < _SILENCE_S:
                 seen = yield Silence("hold: the robot must stop by itself now")
                 if not (seen.silent or track.ended_ns):
-                    track.ended_ns = seen.now_ns
+                    track.ended_ns, track.let_go = seen.now_ns, not seen.held
                     if not seen.held and (seen.now_ns - track.silent_ns) * 1e-9 < _LONG_ENOUGH_S:
                         break
                 track.wheels += seen.wheels

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from disco_hw.runtime.core import CoreTick
 from disco_hw.runtime.pipeline import FollowTask, Motion
@@ -46,6 +46,15 @@ class Pilot(Protocol):
 
     def status(self) -> dict[str, Any]:
         """What the daemon's status says in addition."""
+
+
+@runtime_checkable
+class FindsWiring(Protocol):
+    """A pilot that finds out how the wheels are wired and what poses mean, and is not stopped for what it looks for."""
+
+    @property
+    def finds_wiring(self) -> bool:
+        """True."""
 
 
 class TaskPilot:
