@@ -61,12 +61,14 @@ class Directions:
         if command is None:
             self._reset()
             return None
+        if self._found or (self._begun_ns is not None and now_ns - self._begun_ns > JUDGED_NS):
+            return None
         for sample in wheels:
             self._turned.append((sample.t_ns, sample.left_angle_rad, sample.right_angle_rad))
         asked = (command.left_rad_s, command.right_rad_s)
         if self._begun_ns is None:
             self._wait_for_motion(now_ns, wheels, poses, asked)
-        elif now_ns - self._begun_ns <= JUDGED_NS and not self._found:
+        else:
             signs = [math.copysign(1.0, speed) if abs(speed) > MOVES_RAD_S else 0.0 for speed in asked]
             self._reversed = self._reversed or any(a * b < 0.0 for a, b in zip(signs, self._signs, strict=True))
             self._signs = tuple(new or old for new, old in zip(signs, self._signs, strict=True))

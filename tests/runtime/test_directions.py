@@ -2,6 +2,7 @@
 
 import math
 import random
+import tracemalloc
 
 import pytest
 
@@ -155,3 +156,23 @@ def test_a_robot_that_is_wired_as_told_is_let_alone():
     run = simulated_stack()
     run.start()
     assert all(tick.output.motion_allowed for tick in run.ticks(6.0))
+
+
+def test_ten_minutes_of_driving_keep_no_more_than_the_first_seconds():
+    directions = Directions(RADIUS_M, TRACK_M, AS_TOLD)
+    command, floor = WheelCommand(2.0, 2.0, 0.1), Floor()
+
+    def drive(ticks):
+        for tick in ticks:
+            t_ns, turned = tick * TICK_NS, max(tick - 2, 0) * 0.04
+            floor.roll(0.04 * (tick > 2), 0.04 * (tick > 2))
+            wheels = WheelSample(t_ns, t_ns, turned, turned, 2.0 * (tick > 2), 2.0 * (tick > 2))
+            assert directions.step(t_ns, [wheels], [floor.pose(t_ns)], command) is None
+
+    tracemalloc.start()
+    drive(range(500))
+    before, _ = tracemalloc.get_traced_memory()
+    drive(range(500, 30_000))
+    after, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert after - before < 10_000
