@@ -5,7 +5,7 @@
 `echo` says where the robot is by its own odometry, from X Y YAW on; `nan`, `frame`, `flood`, `garbage` and `late` do so
 wrongly from SIGUSR1 on. A line for each odometry heard: its stamp (wall clock), when it was heard and answered
 (monotonic), in ns, and where it is (m). `speed` says speeds X (m/s) and YAW (rad/s), 20 a second, asks the bridge for
-each line of its input, and writes the answers.
+each line of its input, presses the e-stop for the line `button`, and writes the answers.
 """
 
 import contextlib
@@ -82,13 +82,17 @@ def drive(participant, twist):
     say = DataWriter(participant, Topic(participant, "rt/cmd_vel", msg.Twist))
     reliable = Qos(Policy.Reliability.Reliable(0), Policy.History.KeepLast(10))
     ask = DataWriter(participant, Topic(participant, "rt/disco_hw/ctl", msg.String), reliable)
+    button = DataWriter(participant, Topic(participant, "rt/disco_hw/estop", msg.Bool), reliable)
     replies = DataReader(participant, Topic(participant, "rt/disco_hw/reply", msg.String), reliable)
     os.set_blocking(sys.stdin.fileno(), False)
     while True:
         say.write(twist)
         with contextlib.suppress(BlockingIOError, TypeError):
             for line in os.read(sys.stdin.fileno(), 1000).decode().splitlines():
-                ask.write(msg.String(line))
+                if line == "button":
+                    button.write(msg.Bool(True))
+                else:
+                    ask.write(msg.String(line))
         for reply in replies.take(10):
             if reply.sample_info.valid_data:
                 print(reply.data, flush=True)

@@ -9,7 +9,6 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -104,7 +103,7 @@ class Bridge:
         self._failure: BaseException | None = None
         self._ended = threading.Event()
         # An e-stop must not wait behind a request that the daemon is slow to answer.
-        self._asking, self._stopping = ThreadPoolExecutor(1), ThreadPoolExecutor(1)
+        self._asking, self._stopping = ros2_commands.Errands(), ros2_commands.Errands()
         namespace = config.ros2.namespace
         self._writers = {
             name: DataWriter(self._participant, Topic(self._participant, wire_name(name, namespace), kind, qos), qos)
@@ -144,8 +143,8 @@ class Bridge:
     def close(self) -> None:
         """Leave; safe to call twice."""
         self._ended.set()
-        for pool in (self._asking, self._stopping):
-            pool.shutdown(wait=False, cancel_futures=True)
+        self._asking.close()
+        self._stopping.close()
         self._feed.close()
         self._pad.close()
         self._to_daemon.close()
@@ -208,12 +207,12 @@ class Bridge:
 
     def _take_request(self, message: msg.String, _: int) -> None:
         words = message.data.strip()
-        pool = self._stopping if words == "estop" else self._asking
-        pool.submit(self._answer, words)
+        errands = self._stopping if words == "estop" else self._asking
+        errands.add(self._answer, words)
 
     def _take_estop(self, message: msg.Bool, _: int) -> None:
         if message.data:
-            self._stopping.submit(self._answer, "estop")
+            self._stopping.add(self._answer, "estop")
 
     def _answer(self, words: str) -> None:
         """Ask the daemon; where it is driven by hand, arming lets the speeds drive, and is not the daemon's to do."""
@@ -239,6 +238,7 @@ class Bridge:
         figures |= {f"poses refused: {why}": count for why, count in self._poses.refused.items()}
         figures |= {"speeds passed on": self._speeds.passed}
         figures |= {f"speeds refused: {why}": count for why, count in self._speeds.refused.items()}
+        figures |= {"requests refused, too many": self._asking.refused + self._stopping.refused}
         figures |= {"messages that were none": self._malformed, "messages not sent": self._unwritten}
         figures |= {"ticks missed": self._feed.missed}
         wrong = f"poses refused: {self._poses.why}" if self._poses.why else self._pad.refusal

@@ -10,8 +10,10 @@ import contextlib
 import math
 import shlex
 import socket
+import threading
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -144,6 +146,26 @@ class DaemonPad:
                 for line in lines:
                     with contextlib.suppress(msgspec.MsgspecError):
                         self.refusal = str(msgspec.json.decode(line, type=dict[str, Any]).get("error", ""))
+
+
+class Errands:
+    """Runs one thing after the other in a thread of its own; of a flood it takes a few, and counts the rest."""
+
+    def __init__(self, most: int = 10) -> None:
+        self.refused = 0
+        self._pool = ThreadPoolExecutor(1)
+        self._room = threading.BoundedSemaphore(most)
+
+    def add(self, work: Callable[[str], None], words: str) -> None:
+        """Do `work(words)` when those before are done, unless too many are waiting."""
+        if not self._room.acquire(blocking=False):
+            self.refused += 1
+            return
+        self._pool.submit(work, words).add_done_callback(lambda _: self._room.release())
+
+    def close(self) -> None:
+        """Begin nothing more; safe to call twice."""
+        self._pool.shutdown(wait=False, cancel_futures=True)
 
 
 def asked(robot: Path, words: str, link: str | None) -> dict[str, Any]:

@@ -2,13 +2,14 @@
 
 import math
 import random
+import threading
 
 import pytest
 
 pytest.importorskip("cyclonedds", reason="cyclonedds is not installed: make venv")
 
 from disco_hw.bridge import ros2_messages as msg
-from disco_hw.bridge.ros2_commands import SpeedInlet
+from disco_hw.bridge.ros2_commands import Errands, SpeedInlet
 from disco_hw.bridge.ros2_poses import PoseInlet
 from disco_hw.config import Drive, PoseInput, Robot
 from disco_hw.drive.hand_pilot import Deadman
@@ -237,3 +238,22 @@ def test_at_random_times_a_fault_disarms_within_the_deadmans_time_and_nothing_el
     else:
         (disarmed,) = disarmed_ns
         assert struck_ns - 50 * MS < disarmed <= last_good_ns + 200 * MS + 20 * MS
+
+
+def test_of_a_flood_of_requests_a_few_are_taken_in_their_order():
+    errands, go, done, finished = Errands(most=3), threading.Event(), [], threading.Event()
+
+    def work(words):
+        assert go.wait(60.0)
+        done.append(words)
+        if words == "2":
+            finished.set()
+
+    for number in range(50):
+        errands.add(work, str(number))
+    go.set()
+    assert finished.wait(60.0)
+    assert done == ["0", "1", "2"]
+    assert errands.refused == 47
+    errands.close()
+    errands.close()

@@ -170,6 +170,30 @@ def test_speeds_drive_once_asked_to_arm_and_their_silence_disarms_for_good(whom,
         assert operator.status()["state"] == "READY"
 
 
+@pytest.mark.long
+@pytest.mark.parametrize("words", ["button", "estop"])
+def test_an_estop_from_ros_is_latched_until_it_is_reset(words, tmp_path):
+    said = tmp_path / "node.txt"
+    with ExitStack() as stack:
+        bench = Bench(tmp_path, stack)
+        with_poses_of_ros(bench.robot_file)
+        bench.drive("--ros2")
+        bench.ready()
+        bridge = ["bridge", "ros2", str(bench.robot_file)]
+        stack.enter_context(disco_hw_process("bridge", bridge, tmp_path / "bridge.txt"))
+        speaker, operator = stack.enter_context(node("speed", said, (0.15, 0.0, 0.3))), bench.operator
+        ask_until(speaker, said, "arm", '"ok": true')
+        operator.wait_until("driving", lambda status: status["drive"]["driving"] and not stands(status), 20.0)
+        speaker.stdin.write(f"{words}\n".encode())
+        operator.wait_until("stopped", lambda status: status["estop"], 10.0)
+        operator.wait_for_standstill(10.0)
+        speaker.stdin.write(b"arm\n")
+        time.sleep(1.0)
+        assert operator.status()["estop"]
+        ask_until(speaker, said, "reset", '"do": "reset", "ok": true')
+        operator.wait_for("READY", 10.0)
+
+
 def ask_until(speaker, said, words, answer, timeout_s=30.0):
     """Ask once a second, as who asks before the bridge is there is not heard."""
     deadline = time.monotonic() + timeout_s
