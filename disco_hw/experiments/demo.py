@@ -37,7 +37,8 @@ from disco_hw.experiments.live_stack import (
     with_device,
 )
 from disco_hw.experiments.terminal_picture import NARROWEST, Point, circle_points, picture
-from disco_hw.tasks.circle import CircleTask, circle_task
+from disco_hw.runtime.robot_setup import Setup, geometry, load_setup
+from disco_hw.tasks.circle import CircleTask, circle_task, inwards_sine
 from disco_hw.viewer.address import DEFAULT_PORT, LOOPBACK, TOKEN_VARIABLE, page_address, page_token
 
 _START_TIMEOUT_S = READY_TIMEOUT_S
@@ -173,15 +174,27 @@ def _drive_undisturbed(options: DemoOptions, files: _Files, console: Console) ->
     return _drive(options, files, console)
 
 
+def start_pose(setup: Setup) -> tuple[float, float, float]:
+    """On the circle, x, y (m), yaw (rad), in the heading in which the believed robot goes round.
+
+    Along the circle it would have to turn inwards first, which swings the tracked point out by x_icr_m^2 / radius_m.
+    """
+    task = circle_task(setup.config.task, "the demonstration")
+    (_, _, x_icr_m), _ = geometry(setup.model)
+    inwards_rad = math.asin(inwards_sine(task.radius_m, x_icr_m))
+    return task.center_x_m + task.radius_m, task.center_y_m, 0.5 * math.pi + inwards_rad
+
+
 def _drive(options: DemoOptions, files: _Files, console: Console) -> bool:
     """Drive and stop; returns whether daemon and robot both said that the robot stands, disarmed."""
     for old in (files.log, files.truth):
         old.unlink(missing_ok=True)
-    task = circle_task(load_robot_config(files.robot).task, "the demonstration")
+    setup = load_setup(files.robot)
+    task = circle_task(setup.config.task, "the demonstration")
     lap_s = 2.0 * math.pi * task.radius_m / task.speed_m_s
     simulator = [
         "sim", str(files.robot), "--plant-seed", str(options.plant_seed), "--truth", str(files.truth),
-        "--start", str(task.center_x_m + task.radius_m), str(task.center_y_m), "1.5707963",
+        "--start", *map(str, start_pose(setup)),
     ]  # fmt: skip
     # The daemon hands the variable on to its page.
     os.environ[TOKEN_VARIABLE] = token = page_token()

@@ -300,9 +300,14 @@ class CircleTerms(NamedTuple):
         return lost + self.terminal_steps * norm(rho - self.radius_m, self.terminal_turn_m * turn)
 
 
+def inwards_sine(radius_m: float, x_icr_m: float) -> float:
+    """Sine by which a robot that goes round a circle is turned inwards from the way of its tracked point."""
+    return min(max(x_icr_m / radius_m, -MOST_TURNED), MOST_TURNED)
+
+
 @lru_cache(maxsize=16)
 def _prepared(circle: CircleCost, step_s: float, horizon: int, x_icr_m: float) -> Prepared:
-    turned_sin = min(max(x_icr_m / circle.radius_m, -MOST_TURNED), MOST_TURNED)
+    turned_sin = inwards_sine(circle.radius_m, x_icr_m)
     numbers = (
         circle.radius_m,
         circle.speed_m_s,
