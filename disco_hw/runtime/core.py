@@ -15,6 +15,7 @@ from disco_hw.log import records
 from disco_hw.log.recorder import Recorder
 from disco_hw.runtime import records_of_tick
 from disco_hw.runtime.directions import Directions
+from disco_hw.runtime.headway import Headway
 from disco_hw.runtime.pipeline import FollowTask, Motion, Off, Pipeline, Source, Stand, Tick, untimed
 from disco_hw.runtime.plausibility import Plausibility
 from disco_hw.runtime.supervisor import Inputs, Output, Reply, Supervisor, UserRequest
@@ -89,6 +90,7 @@ class DaemonCore:
         """None where somebody finds out how the wheels are wired."""
         self.task, self.course = config.task, config.task.course()
         self.progress = config.task.progress()
+        self._headway = Headway(config.task.reference_speed_m_s)
         self.newest_wheels: WheelSample | None = None
         self.robot_status: RobotStatus | None = None
         self.last: CoreTick | None = None
@@ -110,6 +112,7 @@ class DaemonCore:
     def set_task(self, task: RobotTask) -> None:
         """Follow another task of the same kind from the next tick on, in which it is recorded."""
         self.task, self.course, self.progress = task, task.course(), task.progress()
+        self._headway = Headway(task.reference_speed_m_s)
         self.pipeline.set_task(task.planned(self.config.control.mode))
         self._task_changed = True
 
@@ -148,6 +151,7 @@ class DaemonCore:
         source = self.pose_source
         said = [f"poses: {words}" for words in source.news()] if isinstance(source, SaysWhy) else []
         events = (*readings.events, *said, *output.events, *learnt.events, *self._planner_events(result), *doubts)
+        events = (*events, *self._stays(now_ns, output, result))
         self._follow_progress(output, result)
         self.recorder.put(
             now_ns,
@@ -246,6 +250,15 @@ class DaemonCore:
                 events.append(few if found.collapsed else "planner: enough effective samples again")
             self._planner_collapsed = found.collapsed
         return tuple(events)
+
+    def _stays(self, now_ns: int, output: Output, result: Tick) -> tuple[str, ...]:
+        """Say when the task that runs does not get on."""
+        place, command = (result.estimate.x_m, result.estimate.y_m), result.command
+        follows = output.running and result.source in (Source.PLAN, Source.TAIL, Source.RAMP)
+        return self._headway.step(
+            now_ns, follows, place, (command.left_rad_s, command.right_rad_s), self.newest_wheels,
+            result.planner_failure,
+        )  # fmt: skip
 
     def _state_change(self, now_ns: int, output: Output) -> list[records.Record]:
         """The record of a change of state or of what is said of it, in the tick in which it happens."""

@@ -1,0 +1,68 @@
+"""No progress for five seconds is said once, with what stands in the way; standing on purpose is not."""
+
+import math
+
+import pytest
+
+from disco_hw.runtime.headway import Headway
+from disco_hw.runtime.supervisor import UserRequest
+from drivers.types import WheelSample
+from tests.runtime.simulated import simulated_stack
+
+TICK_NS = 20_000_000
+COMMAND = (0.4, -0.5)
+
+
+def said(seconds, speed_m_s=0.2, robot_m_s=0.0, wheels_rad_s=0.0, command=COMMAND, failure=None, running=True):
+    """What a headway says while the robot moves, its wheels turn and it is commanded like this; with the times."""
+    headway, found = Headway(speed_m_s), []
+    for tick in range(round(seconds * 50)):
+        now_ns = tick * TICK_NS
+        angle = wheels_rad_s * now_ns * 1e-9
+        wheels = WheelSample(now_ns, now_ns, angle, angle, wheels_rad_s, wheels_rad_s)
+        place = robot_m_s * now_ns * 1e-9, 0.0
+        found += [(now_ns * 1e-9, text) for text in headway.step(now_ns, running, place, command, wheels, failure)]
+    return found
+
+
+@pytest.mark.parametrize(
+    ("what", "words"),
+    [
+        ({}, "the wheels stand although asked for up to 0.50 rad/s"),
+        ({"command": (0.0, 0.0)}, "the planner asks for no motion"),
+        ({"failure": "nothing finite"}, "the planner has no plan: nothing finite"),
+        ({"wheels_rad_s": 2.0}, "the wheels have turned by 10.0 rad, and the pose has not moved"),
+    ],
+)
+def test_a_robot_that_stays_is_told_once_with_what_stands_in_the_way(what, words):
+    ((at_s, text),) = said(30.0, **what)
+    assert at_s == pytest.approx(5.0, abs=0.05)
+    assert text.startswith("task: no progress for 5 s: ")
+    assert words in text
+
+
+@pytest.mark.parametrize("speed_m_s", [0.2, 0.02])
+def test_a_robot_that_drives_is_not_told_of(speed_m_s):
+    assert said(60.0, speed_m_s=speed_m_s, robot_m_s=0.9 * speed_m_s) == []
+
+
+@pytest.mark.parametrize("what", [{"running": False}, {"speed_m_s": math.nan}])
+def test_what_does_not_run_or_may_rest_is_not_watched(what):
+    assert said(20.0, **what) == []
+
+
+def test_it_is_told_when_the_robot_gets_on_again():
+    headway, found = Headway(0.2), []
+    for tick in range(500):
+        x_m = 0.0 if tick < 300 else 0.004 * (tick - 300)
+        found += headway.step(tick * TICK_NS, True, (x_m, 0.0), COMMAND, None, None)
+    assert [text.split(":")[1] for text in found] == [" no progress for 5 s", " gets on again"]
+
+
+def test_the_daemon_says_that_a_robot_with_a_dead_band_unknown_to_its_model_stands():
+    stack = simulated_stack(hide={"deadband": 20.0})
+    stack.run(1.5)
+    stack.run(0.5, UserRequest.ARM)
+    stack.run(0.02, UserRequest.START)
+    events = [event for tick in stack.run(7.0) for event in tick.events]
+    assert [event for event in events if event.startswith("task: no progress for 5 s: the wheels stand")]
