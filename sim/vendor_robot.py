@@ -14,6 +14,7 @@ from firmware_protocol.firmware_core import FirmwareInputs, FirmwareOutputs, Res
 from sim.can_frame import CanFrame
 from sim.faults import RobotFaults
 from sim.plant import Plant, TrueState
+from sim.robot import sensor_inputs
 from sim.sensors import PoseMeasurement
 
 COASTING_S = 0.6
@@ -103,7 +104,7 @@ class VendorRobot:
         if self.pose_sink is not None:
             for pose in poses:
                 self.pose_sink(pose, now_us)
-        inputs = self._inputs(error_counters)
+        inputs = sensor_inputs(plant, self.estop_button, error_counters, ResetCause.POWER_ON)
         if faults is not None:
             inputs = faults.inputs(inputs, asked, enabled)
         frames, self._replies = [*self._replies, *self.controller.step(now_us, inputs)], []
@@ -134,28 +135,3 @@ class VendorRobot:
                 self._coasting[side] *= 1.0 - 1e-3 / COASTING_S
                 given.append(self._coasting[side])
         return given[0], given[1]
-
-    def _inputs(self, error_counters: tuple[int, int]) -> FirmwareInputs:
-        plant = self.plant
-        left_ticks, right_ticks = plant.encoder_ticks
-        left_speed, right_speed = plant.measured_wheel_speeds_rad_s
-        left_current, right_current = plant.motor_currents_a
-        left_temperature, right_temperature = plant.motor_temperatures_c
-        battery = plant.battery
-        return FirmwareInputs(
-            left_ticks=left_ticks,
-            right_ticks=right_ticks,
-            left_speed_rad_s=left_speed,
-            right_speed_rad_s=right_speed,
-            left_current_a=left_current,
-            right_current_a=right_current,
-            left_temperature_c=left_temperature,
-            right_temperature_c=right_temperature,
-            voltage_v=battery.voltage_v,
-            battery_current_a=battery.current_a,
-            battery_temperature_c=battery.temperature_c,
-            tx_error_count=error_counters[0],
-            rx_error_count=error_counters[1],
-            estop_button=self.estop_button,
-            reset_cause=ResetCause.POWER_ON,
-        )

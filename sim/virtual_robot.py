@@ -13,7 +13,6 @@ from drivers.types import Frame
 from firmware_protocol.firmware_core import (
     FirmwareConfig,
     FirmwareCore,
-    FirmwareInputs,
     FirmwareOutputs,
     ResetCause,
     drawn_entropy,
@@ -21,7 +20,7 @@ from firmware_protocol.firmware_core import (
 from sim.faults import RobotFaults
 from sim.plant import Plant, TrueState
 from sim.process import TextRecord
-from sim.robot import Robot
+from sim.robot import Robot, sensor_inputs
 from sim.sensors import PoseMeasurement
 
 STEP_US = 1000
@@ -140,28 +139,7 @@ class VirtualRobot:
             self._firmware.pose(
                 pose.x_m, pose.y_m, pose.yaw_rad, self.device_us(pose.sample_us), pose.position_std_m, pose.yaw_std_rad
             )
-        left_ticks, right_ticks = plant.encoder_ticks
-        left_speed, right_speed = plant.measured_wheel_speeds_rad_s
-        left_current, right_current = plant.motor_currents_a
-        left_temperature, right_temperature = plant.motor_temperatures_c
-        battery = plant.battery
-        inputs = FirmwareInputs(
-            left_ticks=left_ticks,
-            right_ticks=right_ticks,
-            left_speed_rad_s=left_speed,
-            right_speed_rad_s=right_speed,
-            left_current_a=left_current,
-            right_current_a=right_current,
-            left_temperature_c=left_temperature,
-            right_temperature_c=right_temperature,
-            voltage_v=battery.voltage_v,
-            battery_current_a=battery.current_a,
-            battery_temperature_c=battery.temperature_c,
-            tx_error_count=error_counters[0],
-            rx_error_count=error_counters[1],
-            estop_button=self.estop_button,
-            reset_cause=self._reset_cause,
-        )
+        inputs = sensor_inputs(plant, self.estop_button, error_counters, self._reset_cause)
         if faults is not None:
             inputs = faults.inputs(inputs, asked, outputs.driver_enabled)
         self._outputs = self._firmware.step(self.device_us(now_us), inputs)

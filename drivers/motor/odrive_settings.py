@@ -11,7 +11,7 @@ from msgspec import Meta
 
 from drivers.motor import odrive_codec as codec
 from drivers.motor.odrive_codec import Generation
-from drivers.motor.vendor_parts import in_sides
+from drivers.motor.vendor_parts import Nodes, Sign, in_sides, sides_of
 from drivers.types import CyclicFrame, Frame, SafetyCard, SettingsFault
 
 WATCHDOG_ERROR = {Generation.V05: 0x800, Generation.V06: 0x0100_0000}
@@ -60,8 +60,6 @@ _ERRORS: Mapping[Generation, Mapping[int, str]] = MappingProxyType(
 )
 
 _HEARD = 3
-_Nodes = int | tuple[int, ...]
-_Sign = Literal[-1, 1]
 _Endpoint = Annotated[int, Meta(ge=0, le=65535)]
 
 
@@ -73,11 +71,11 @@ class OdriveSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     flat_endpoints.json of that very firmware (0.6), to read the watchdog back; None: it is declared.
     """
 
-    nodes: tuple[_Nodes, _Nodes]
+    nodes: tuple[Nodes, Nodes]
     watchdog_s: Annotated[float, Meta(gt=0.0, le=0.5)]
     vel_limit_turns_s: Annotated[float, Meta(gt=0.0, le=1000.0)]
     firmware: Literal["0.5", "0.6"] = "0.6"
-    direction: tuple[_Sign, _Sign] = (1, 1)
+    direction: tuple[Sign, Sign] = (1, 1)
     gear: Annotated[float, Meta(gt=0.0, le=1000.0)] = 1.0
     heartbeat_s: Annotated[float, Meta(ge=0.005, le=0.2)] = 0.1
     watchdog_endpoints: tuple[_Endpoint, _Endpoint] | None = None
@@ -86,8 +84,7 @@ class OdriveSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     @property
     def sides(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
         """The nodes on the left and on the right."""
-        left, right = ((side,) if isinstance(side, int) else side for side in self.nodes)
-        return left, right
+        return sides_of(self.nodes)
 
     @property
     def all_nodes(self) -> tuple[int, ...]:

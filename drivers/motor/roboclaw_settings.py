@@ -5,16 +5,16 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable
-from typing import Annotated, Literal
+from typing import Annotated
 
 import msgspec
 from msgspec import Meta
 
 from drivers.motor import roboclaw_codec as codec
+from drivers.motor.vendor_parts import Sign
 from drivers.types import CyclicFrame, Frame, SafetyCard, SettingsFault
 
 STANDS_RAD_S = 0.1
-SLOW_ASKED_HZ = 50.0
 _TURNAROUND_S = 0.0009
 _MOTOR = re.compile(r"(\d{1,3})/([12])")
 EXAMPLE = """motors = ["128/1", "128/2"]
@@ -23,7 +23,6 @@ direction = [1, -1]
 watchdog_s = 0.2
 """
 _Motors = str | tuple[str, ...]
-_Sign = Literal[-1, 1]
 
 
 class RoboclawSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -37,7 +36,7 @@ class RoboclawSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
     motors: tuple[_Motors, _Motors]
     counts_per_rev: Annotated[float, Meta(gt=0.0, le=1e7)]
     watchdog_s: Annotated[float, Meta(ge=0.1, le=0.5)]
-    direction: tuple[_Sign, _Sign] = (1, 1)
+    direction: tuple[Sign, Sign] = (1, 1)
     acceleration_rad_s2: Annotated[float, Meta(gt=0.0, le=1000.0)] = 100.0
     stop_deceleration_rad_s2: Annotated[float, Meta(gt=0.0, le=655.0)] = 10.0
 

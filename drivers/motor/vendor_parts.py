@@ -14,6 +14,9 @@ _ESTOP_LIFE_NS = 1_000_000_000
 _ESTOP_REPEATS = 3
 _ESTOP_RANK, _RANK = 0, 1
 _LONGEST_STEP_S = 0.1
+Nodes = int | tuple[int, ...]
+"""Ids on CAN of one side's controllers, as robot.toml names them."""
+Sign = Literal[-1, 1]
 
 
 class Stage(enum.Enum):
@@ -90,6 +93,12 @@ def status(t_ns: int, state: str) -> RobotStatus:
         rejected_count=0,
         reject_reason="NONE",
     )
+
+
+def sides_of(nodes: tuple[Nodes, Nodes]) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """The ids on the left and on the right."""
+    left, right = ((side,) if isinstance(side, int) else side for side in nodes)
+    return left, right
 
 
 def in_sides(nodes: Sequence[int]) -> list[Any]:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import msgspec
 from msgspec import Meta
 
 from drivers.motor import vesc_codec as codec
-from drivers.motor.vendor_parts import in_sides
+from drivers.motor.vendor_parts import Nodes, Sign, in_sides, sides_of
 from drivers.types import CyclicFrame, Frame, SafetyCard, SettingsFault
 
 HOST_ID = 253
@@ -36,8 +36,6 @@ FAULTS = {
     18: "the motor's phases are not balanced; check its cable",
     27: "the encoder failed",
 }
-_Nodes = int | tuple[int, ...]
-_Sign = Literal[-1, 1]
 
 
 class VescSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -48,7 +46,7 @@ class VescSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     which the others are reached on its CAN.
     """
 
-    nodes: tuple[_Nodes, _Nodes]
+    nodes: tuple[Nodes, Nodes]
     pole_pairs: Annotated[int, Meta(ge=1, le=100)]
     max_erpm: Annotated[float, Meta(gt=0.0, le=1e6)]
     watchdog_s: Annotated[float, Meta(gt=0.0, le=0.5)]
@@ -56,15 +54,14 @@ class VescSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     timeout_brake_current_a: Annotated[float, Meta(ge=0.0, le=500.0)] = 0.0
     min_erpm: Annotated[float, Meta(ge=0.0, le=1e5)] = 900.0
     uart_node: int | None = None
-    direction: tuple[_Sign, _Sign] = (1, 1)
+    direction: tuple[Sign, Sign] = (1, 1)
     gear: Annotated[float, Meta(gt=0.0, le=1000.0)] = 1.0
     stop_deceleration_rad_s2: Annotated[float, Meta(gt=0.0, le=655.0)] = 10.0
 
     @property
     def sides(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
         """The controllers on the left and on the right."""
-        left, right = ((side,) if isinstance(side, int) else side for side in self.nodes)
-        return left, right
+        return sides_of(self.nodes)
 
     @property
     def all_nodes(self) -> tuple[int, ...]:
