@@ -60,8 +60,6 @@ WRONG = {
 }
 FAST = (
     ("sides", "reference", "sides swapped"),
-    ("sides", "vesc", "right motor reversed"),
-    ("sides", "odrive", "encoders swapped"),
     ("turns", "agilex", "wrong ticks"),
 )
 
@@ -134,6 +132,7 @@ def test_a_pose_wrong_in_every_way_is_mended_at_once(tmp_path):
     assert path.with_name("robot.toml.before").exists()
 
 
+@pytest.mark.long
 def test_an_encoder_that_does_not_count_is_named_and_nothing_is_written(tmp_path):
     # The reference firmware notices by itself; an ODrive's simulator does not look.
     with pytest.raises(WorkError, match="ENCODER_MISSING_RIGHT"):
