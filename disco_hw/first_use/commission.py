@@ -13,7 +13,7 @@ from typing import Any
 
 import msgspec
 
-from disco_hw.config import load_robot_config
+from disco_hw.config import Robot, load_robot_config
 from disco_hw.daemon.async_printer import STANDARD_ERROR, AsyncPrinter
 from disco_hw.daemon.daemon import in_text, serve
 from disco_hw.daemon.loop import MonotonicClock
@@ -38,7 +38,7 @@ class Stage:
 
     name: str
     where: str
-    steps: Callable[[Any], Steps]
+    steps: Callable[[Robot, float], Steps]
     judge: Callable[[Any, Setup], Judgement]
     raw_poses: bool = False
 
@@ -95,6 +95,12 @@ class CommissionResult:
 
 def _how(fault: dict[str, Any]) -> str:
     return "mended" if fault["mended"] else str(fault["text"])
+
+
+def slowest_rad_s(setup: Setup) -> float:
+    """The slowest true speed of a wheel that the controller holds."""
+    link = setup.config.link
+    return find_driver(link.driver).slowest_rad_s(link.settings()) * setup.config.wheels.turn_ratio
 
 
 def as_sent(setup: Setup) -> Setup:
@@ -181,7 +187,7 @@ def _drive(stage: Stage, setup: Setup, options: CommissionOptions) -> Any:
     stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
     log = directory / f"{setup.config.robot.name}-commission-{stage.name}-{stamp}.mcap"
     keyboard = Keyboard(_STANDARD_INPUT, KeyHold(0.0), MonotonicClock())
-    pilot = CommissionPilot(Procedure(stage.steps(setup.config.robot)), keyboard, keyboard.typed)
+    pilot = CommissionPilot(Procedure(stage.steps(setup.config.robot, slowest_rad_s(setup))), keyboard, keyboard.typed)
     try:
         _say("keys", "hold the space bar to drive, let go to stop; Ctrl-D gives up")
         with closing(AsyncPrinter(STANDARD_ERROR, in_text)) as say:

@@ -23,6 +23,7 @@ MOST_SHARE = 0.3
 RUNAWAY_SHARE = 0.25
 """Of it: a wheel that is measured faster has got out of hand."""
 SIDES = ("left", "right")
+_ABOVE_SLOWEST = 1.2
 _RAMP_S = 6.0
 _MOVED_RAD = 0.4
 _REST_S = 1.0
@@ -137,7 +138,12 @@ class SideSeen:
 SAW = {"1": "lf", "2": "lb", "3": "rf", "4": "rb", "0": ""}
 
 
-def sides(robot: Robot) -> Steps:
+def speed_of(robot: Robot, slowest_rad_s: float) -> float:
+    """A tenth of the robot's largest wheel speed, or a little above the slowest that its controller holds (rad/s)."""
+    return max(SPEED_SHARE * robot.max_wheel_speed_rad_s, _ABOVE_SLOWEST * slowest_rad_s)
+
+
+def sides(robot: Robot, _slowest_rad_s: float = 0.0) -> Steps:
     """Wheels up, each side forward alone: which one turns, which way, and whose encoder counts how.
 
     Returns a SideSeen each, left before right.
@@ -201,9 +207,9 @@ class TurnsSeen:
     watchdog: Track
 
 
-def turns(robot: Robot) -> Steps:
+def turns(robot: Robot, slowest_rad_s: float = 0.0) -> Steps:
     """Wheels up: ticks a turn, by letting go after exactly one turn; then the watchdog. Returns a TurnsSeen."""
-    speed = SPEED_SHARE * robot.max_wheel_speed_rad_s
+    speed = speed_of(robot, slowest_rad_s)
     tracks = []
     for side in (0, 1):
         wheels = (speed, 0.0) if side == 0 else (0.0, speed)
@@ -271,12 +277,13 @@ class FloorSeen:
     straight_again: Track
 
 
-def floor(robot: Robot) -> Steps:
+def floor(robot: Robot, slowest_rad_s: float = 0.0) -> Steps:
     """On the floor, half a metre straight, half a turn each way, a quarter, a quarter of a metre; a FloorSeen.
 
     Each ends where the wheels say so, or after half as long again as it should take.
     """
-    ahead, left, right = (1.0, 1.0), (-1.0, 1.0), (1.0, -1.0)
+    speed = speed_of(robot, slowest_rad_s)
+    ahead, left, right = (speed, speed), (-speed, speed), (speed, -speed)
     straight = yield from _leg(robot, ahead, _STRAIGHT_M, "half a metre straight on")
     turned_left = yield from _leg(robot, left, 0.5 * math.pi * robot.axial_distance_m, "half a turn to the left")
     turned_right = yield from _leg(robot, right, 0.5 * math.pi * robot.axial_distance_m, "half a turn to the right")
@@ -285,14 +292,12 @@ def floor(robot: Robot) -> Steps:
     return FloorSeen(straight, turned_left, turned_right, again)
 
 
-def _leg(robot: Robot, shares: Wheels, travel_m: float, what: str) -> Steps:
-    """Both wheels at a tenth of the speed, one way each, until they have travelled so far; with a rest on both sides.
+def _leg(robot: Robot, wheels: Wheels, travel_m: float, what: str) -> Steps:
+    """Both wheels at these speeds, one way each, until they have travelled so far; with a rest on both sides.
 
     Let go on the way, it goes on from there with what is left.
     """
-    speed = SPEED_SHARE * robot.max_wheel_speed_rad_s
-    wheels = (speed * shares[0], speed * shares[1])
-    limit_s = 1.5 * travel_m / (speed * robot.wheel_radius_m)
+    limit_s = 1.5 * travel_m / (max(wheels) * robot.wheel_radius_m)
     track, driven_ns, last_ns = Track(), 0, 0
     while not track.commands or not _at_rest_long(track):
         seen: Seen = yield Drive((0.0, 0.0), f"hold: {what}")

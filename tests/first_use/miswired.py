@@ -14,8 +14,9 @@ from disco_hw.drive.source import ManualInput
 from disco_hw.errors import WorkError
 from disco_hw.experiments.live_stack import DEVICES
 from disco_hw.experiments.simulated_time import SimulatedRun
+from disco_hw.first_use.commission import as_sent, slowest_rad_s
 from disco_hw.first_use.pilot import CommissionPilot
-from disco_hw.first_use.procedure import Ask, Drive, Procedure
+from disco_hw.first_use.procedure import Ask, Drive, Procedure, speed_of
 from disco_hw.runtime.pipeline import NoPlanner
 from disco_hw.runtime.robot_setup import load_setup
 from disco_hw.runtime.states import State
@@ -228,17 +229,15 @@ def robot_file(directory, driver=None):
 
 def stage(path, steps, wrong, plant=None, effects=None, seed=1, raw_poses=False, limit_s=300.0):
     """Go through one stage of the guided drive; its result and the run."""
-    from disco_hw.first_use.commission import as_sent
-
     setup = load_setup(path)
     if raw_poses:
         setup = as_sent(setup)
     robot = MiswiredRobot(setup, plant or PlantParameters(), wrong, effects, seed)
     person = Person(robot.plant)
-    pilot = CommissionPilot(Procedure(steps(setup.config.robot)), person, person.keys)
+    pilot = CommissionPilot(Procedure(steps(setup.config.robot, slowest_rad_s(setup))), person, person.keys)
     person.pilot = pilot
     run = SimulatedRun(setup, robot, NoPlanner(), pilot)
-    run.where = []
+    run.where, run.slow_rad_s = [], speed_of(setup.config.robot, slowest_rad_s(setup))
     try:
         for tick in run.ticks(limit_s):
             run.where.append((tick.command, robot.plant.physical))

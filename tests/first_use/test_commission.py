@@ -9,7 +9,7 @@ import pytest
 
 from disco_hw.errors import WorkError
 from disco_hw.first_use.commission import STAGES, CommissionOptions, write_fields
-from disco_hw.first_use.procedure import MOST_SHARE, SPEED_SHARE
+from disco_hw.first_use.procedure import MOST_SHARE
 from disco_hw.runtime.robot_setup import load_setup
 from sim.devices import odrive
 from sim.plant_parameters import PlantParameters
@@ -94,11 +94,12 @@ def check_near(run, name):
     assert all(max(abs(c.left_rad_s), abs(c.right_rad_s)) <= MOST_SHARE * top for c, _ in run.where if c is not None)
     if name != "floor" or lags:
         return
+    assert run.slow_rad_s <= MOST_SHARE * top
     first = run.where[0][1]
     x, y, yaw, farthest = first.x_m, first.y_m, first.yaw_rad, 0.0
     for command, true in run.where:
         left, right = (0.0, 0.0) if command is None else (command.left_rad_s, command.right_rad_s)
-        assert max(abs(left), abs(right)) <= 1.01 * SPEED_SHARE * top
+        assert max(abs(left), abs(right)) <= 1.01 * run.slow_rad_s
         v, w = (
             0.5 * plant.wheel_radius_m * (left + right),
             plant.wheel_radius_m * (right - left) / plant.axial_distance_m,
