@@ -14,11 +14,13 @@ from disco_hw.errors import LogError
 from disco_hw.gap.data.gridded_drive import grid_drive
 from disco_hw.gap.data.layout import BASE_COUNT, BODY, DELAYED_BY, WHEEL, Layout
 from disco_hw.gap.report.amend import amended_model, at_joint_fit, carried_terms, channel_estimates, simple_model
+from disco_hw.gap.report.doubtful import Measured, sort_out
 from disco_hw.gap.report.findings import STAGES, GapReport
 from disco_hw.gap.report.judge import (
     blind_spot_findings,
     candidate_evidence,
     channel_findings,
+    drifting_parameters,
     effect_findings,
     residue_sentences,
     unnamed_findings,
@@ -59,21 +61,24 @@ def find_gap(
     analysis, notes = search(log, model, say, settings)
     say("intervals, blind spots and the gap on held-out data")
     final = final_fit(analysis)
-    effects, unnamed = effect_findings(analysis, final), unnamed_findings(analysis)
+    named, unnamed = effect_findings(analysis, final), unnamed_findings(analysis)
+    geometry = final.final_body.vector if final.final_body is not None else analysis.nominal_body
+    effects, doubtful = sort_out(named, Measured(analysis.drive, (float(geometry[0]), float(geometry[1]))))
     predictions = joint_predictions(analysis, final) if analysis.body is not None else None
     gap = {} if predictions is None else predictions.table()
-    offered = offered_stage(gap, bool(effects or unnamed), settings)
+    offered = offered_stage(gap, bool(named or unnamed), settings)
     amended, remarks = _model_of(offered, model, analysis, final, predictions)
     return GapReport(
         sources=log.sources,
-        channels=channel_findings(analysis, effects, unnamed),
+        channels=channel_findings(analysis, named, unnamed),
         effects=effects,
         unnamed=unnamed,
-        blind_spots=blind_spot_findings(analysis, effects, top_rad_s),
+        blind_spots=blind_spot_findings(analysis, named, top_rad_s),
         gap=gap,
         model=amended,
         offered=offered,
-        residue=residue_sentences(analysis),
+        residue=(*residue_sentences(analysis), *drifting_parameters(analysis, final)),
+        doubtful=doubtful,
         notes=(*log.notes, *analysis.drive.notes, *notes, *remarks),
         candidates=candidate_evidence(analysis),
         pictures=_drawn(analysis, gap) if pictures else {},

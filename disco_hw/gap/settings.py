@@ -138,6 +138,8 @@ class FitSettings:
     """A step that gains less is the last one. Chosen."""
     least_known_share: float = 1e-3
     """A part of a log with less of the information about a parameter says nothing of it. Chosen."""
+    half_known_share: float = 0.1
+    """Halves of a log are compared in parameters of which each has so much of the information. Chosen."""
     ridge: float = 1e-2
     """Ridge of the richest model, on columns of unit length. Chosen: columns that look alike stay small."""
     richest_rounds: int = 2
@@ -332,6 +334,22 @@ class ReportSettings:
     """An effect has another form than its name's if this sure. Literature: 95 % of the normal distribution."""
     largest_ratio: float = 9.9
     """Ratios of strength beyond are not distinguished. Chosen."""
+    end_share: float = 0.01
+    """A value this close to where its fit had to end, in its range, is not believed. Chosen."""
+    wide_share: float = 0.8
+    """A half interval over so much of a value's distance from none says too little of it. Chosen: 2.5 deviations."""
+    limit_share: float = 0.5
+    """Of a limit, the same of half of it. Chosen."""
+    beyond_limit: float = 1.05
+    """Wheels that are faster than a limit by this are beyond it. Chosen: above what a reading errs by."""
+    beyond_s: float = 0.5
+    """For so long in all at least. Chosen."""
+    beyond_share: float = 0.005
+    """And for so much of the log. Chosen."""
+    drift_sigmas: float = 3.0
+    """A parameter whose halves of a log lie so many standard deviations apart drifts. Chosen: one in 370."""
+    drift_share: float = 0.1
+    """And by so much of itself. Chosen: less than that nobody drives differently for."""
     lever_m: float = 0.2
     """Lever by which yaw rates are compared with speeds. Chosen."""
 

@@ -50,6 +50,14 @@ class UnnamedFinding:
 
 
 @dataclass(frozen=True, slots=True)
+class Doubt:
+    """An effect that fits and is not told as found, and why."""
+
+    name: str
+    why: str
+
+
+@dataclass(frozen=True, slots=True)
 class CandidateEvidence:
     """What a candidate's fit promised on top of what was accepted, or, if accepted, is worth."""
 
@@ -74,6 +82,7 @@ class GapReport:
     seconds: float
     offered: str = "amended"
     residue: tuple[str, ...] = ()
+    doubtful: tuple[Doubt, ...] = ()
     notes: tuple[str, ...] = ()
     candidates: tuple[CandidateEvidence, ...] = ()
     pictures: dict[str, bytes] = field(default_factory=dict, repr=False)
@@ -93,7 +102,7 @@ class GapReport:
         """`effects_found`, `nothing_missing` or `unexplained`."""
         if self.effects:
             return "effects_found"
-        return "unexplained" if self.unnamed or self.residue else "nothing_missing"
+        return "unexplained" if self.unnamed or self.residue or self.doubtful else "nothing_missing"
 
     def as_dict(self) -> dict[str, Any]:
         """The content of report.json."""
@@ -127,6 +136,7 @@ class GapReport:
                 }
                 for term in self.unnamed
             ],
+            "doubtful": [{"name": doubt.name, "why": doubt.why} for doubt in self.doubtful],
             "residue": list(self.residue),
             "blind_spots": [
                 {

@@ -26,6 +26,7 @@ from disco_hw.gap.search.intervals import (
     OUTSIDE_TESTS,
     ChannelEstimates,
     confounded_with,
+    halves_of,
 )
 
 
@@ -134,6 +135,23 @@ def residue_sentences(analysis: GapAnalysis) -> tuple[str, ...]:
     for found in (analysis.wheels, analysis.body):
         if found is not None:
             out += [*remaining_disagreements(found), *misspecified_effects(found)]
+    return tuple(out)
+
+
+def drifting_parameters(analysis: GapAnalysis, final: FinalFit) -> tuple[str, ...]:
+    """Sentences on parameters of effects that are others early in a log than late: something warms up or wears."""
+    settings, out = analysis.drive.settings.report, []
+    for found, estimated in ((analysis.body, final.body_estimates), (analysis.wheels, final.wheel_estimates)):
+        if found is None or estimated is None:
+            continue
+        for name, half in halves_of(found).items():
+            apart = abs(half.late - half.early)
+            largest = max(abs(half.early), abs(half.late))
+            if "." in name and apart > max(settings.drift_sigmas * half.deviation, settings.drift_share * largest):
+                out.append(
+                    f"{name} drifts: {half.early:.3g} in the first half of the log, {half.late:.3g} in the second; "
+                    "its interval holds both"
+                )
     return tuple(out)
 
 

@@ -26,7 +26,7 @@ def answer(report: GapReport) -> list[str]:
         first = "; ".join(sentence(effect) for effect in report.effects) + "."
     elif report.unnamed:
         first = f"Something is missing that has no name: {report.unnamed[0].form}."
-    elif report.residue:
+    elif report.residue or report.doubtful:
         first = "Something is missing that none of the known effects explains."
     else:
         first = "Nothing is missing that this log could show."
@@ -64,6 +64,7 @@ def as_text(report: GapReport) -> str:
         values = ", ".join(f"{n} {e.value:.4g} [{e.low:.4g}, {e.high:.4g}]" for n, e in effect.parameters.items())
         lines.append(f"{effect.channel}: {effect.name}: {values}{_confounded(effect)}")
     lines += [f"{term.channel}: unnamed: {term.form}{_confounded(term)}" for term in report.unnamed]
+    lines += [f"doubtful: {doubt.name}: {doubt.why}" for doubt in report.doubtful]
     lines += [*report.residue, *report.notes]
     if report.gap:
         lines += ["", f"{'ahead':>6} " + " ".join(f"{stage:>20}" for stage in STAGES)]
@@ -108,6 +109,9 @@ def page(report: GapReport) -> str:
         parts.append("<h2>The gap by what the robot was doing</h2>" + _by_regime(report))
     parts.append("<h2>What is missing</h2>")
     parts.append(_effects(report))
+    if report.doubtful:
+        doubts = (f"{doubt.name}: {doubt.why}" for doubt in report.doubtful)
+        parts.append("<h2>What fits and is not to be believed</h2>" + _list(doubts))
     if report.residue:
         parts.append("<h2>What is still left</h2>" + _list(report.residue))
     if report.gap:

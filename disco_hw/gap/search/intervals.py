@@ -17,7 +17,7 @@ from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.search.candidates import CANDIDATES, indices
 from disco_hw.gap.search.channel_search import ChannelResult
 from disco_hw.gap.search.evidence import inflation
-from disco_hw.gap.search.least_squares import fit
+from disco_hw.gap.search.least_squares import by_block, fit, inverse
 from disco_hw.gap.settings import SelectionSettings
 
 Array = NDArray[np.float64]
@@ -62,6 +62,15 @@ def estimate_parameters(found: ChannelResult) -> ChannelEstimates:
     columns = channel.layout.columns
     factors = np.array([inflation(best, channel, (index,)) for index in best.active])
     covariance = best.covariance() * np.sqrt(np.outer(factors, factors))
+    # Halves of a log that disagree by more than their noise say how much more is unknown.
+    halves = halves_of(found)
+    more = np.ones(len(best.active))
+    for place, index in enumerate(best.active):
+        if columns[index] in halves:
+            half, own = halves[columns[index]], float(covariance[place, place])
+            excess = max(0.25 * (half.late - half.early) ** 2 - 0.25 * half.deviation**2, 0.0)
+            more[place] = (1.0 + excess / max(own, 1e-300)) ** 0.5
+    covariance = covariance * np.outer(more, more)
     deviations = np.sqrt(np.diag(covariance))
     by_name = {
         columns[index]: ParameterEstimate(
@@ -74,6 +83,47 @@ def estimate_parameters(found: ChannelResult) -> ChannelEstimates:
         if profile is not None:
             by_name[profile.column] = _profiled(found, profile.column, profile.refine)
     return ChannelEstimates(by_name, tuple(columns[index] for index in best.active), covariance)
+
+
+@dataclass(frozen=True, slots=True)
+class Halves:
+    """A parameter in the first and in the second half of a log, and the standard deviation of the difference."""
+
+    early: float
+    late: float
+    deviation: float
+
+
+def halves_of(found: ChannelResult) -> dict[str, Halves]:
+    """What each half of a log says of the parameters, to second order; without those of which one says little."""
+    best, channel, layout = found.fit, found.selector.channel, found.selector.channel.layout
+    if not best.active:
+        return {}
+    settings = channel.settings
+    normal, gradient = by_block(best, channel.block, settings.selection.block_lengths[1])
+    late = np.arange(normal.shape[0]) >= 0.5 * normal.shape[0]
+    if min(np.count_nonzero(late), np.count_nonzero(~late)) < 2:
+        return {}
+    parts = [(normal[inside], gradient[inside]) for inside in (~late, late)]
+    whole = np.diag(normal.sum(axis=0))
+    enough = np.all([np.diag(of.sum(axis=0)) > settings.fit.half_known_share * whole for of, _ in parts], axis=0)
+    places = np.array(best.active)[enough]
+    if not places.size:
+        return {}
+    values, variance = [], np.zeros(places.size)
+    for of, pulls in parts:
+        blocks = of[:, enough][:, :, enough]
+        covariance = inverse(blocks.sum(axis=0))
+        step = -covariance @ pulls[:, enough].sum(axis=0)
+        # How much more than the noise model says the blocks of a half scatter about what it says itself.
+        left = (pulls[:, enough] + blocks @ step) @ covariance
+        variance += np.maximum(np.diag(covariance), (left**2).sum(axis=0))
+        values.append(np.clip(best.vector[places] + step, layout.low[places], layout.high[places]))
+    columns = layout.columns
+    return {
+        columns[index]: Halves(float(first), float(second), float(deviation))
+        for index, first, second, deviation in zip(places, *values, np.sqrt(variance), strict=True)
+    }
 
 
 def in_motion(wheels: ChannelEstimates, body: ChannelEstimates) -> ChannelEstimates:

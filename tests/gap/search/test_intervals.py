@@ -5,9 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from disco_hw.gap.data.layout import BODY
+from disco_hw.gap.data.layout import BODY, WHEEL
+from disco_hw.gap.report.judge import drifting_parameters
+from disco_hw.gap.search.analysis import GapAnalysis, final_fit
 from disco_hw.gap.search.channel_search import ChannelResult, body_moves
-from disco_hw.gap.search.intervals import ChannelEstimates, ParameterEstimate, estimate_parameters, in_motion
+from disco_hw.gap.search.intervals import ChannelEstimates, ParameterEstimate, estimate_parameters, halves_of, in_motion
 from disco_hw.gap.search.selection import Selector
 from tests.gap.synthetic import body_channel
 
@@ -73,3 +75,31 @@ def test_a_limit_of_turning_is_no_better_known_than_the_geometry_that_it_is_told
     assert found.by_name[lag] == wheels.by_name[lag]
     assert found.covariance[0, 0] == pytest.approx(found.by_name[limit].deviation ** 2)
     np.testing.assert_array_equal(found.covariance.ravel()[1:], wheels.covariance.ravel()[1:])
+
+
+def changing(late_k_s):
+    """A drive whose turn slip is 0.08 in the first half and another later."""
+    channel, line = body_channel(turn_slip=0.08)
+    _, changed = body_channel(turn_slip=late_k_s)
+    second = line.pose.t_s > line.t_s[-1] / 2.0
+    poses = np.where(second[:, None], changed.pose_values, line.pose_values)
+    return type(channel).build(replace(line, pose_values=poses), channel.noise, channel.neutral)
+
+
+def test_halves_that_disagree_widen_the_interval_to_hold_both():
+    names = ("turn_slip",)
+    same, drifting = changing(0.08), changing(0.16)
+    found = [estimated(one, names).by_name["turn_slip.k_s"] for one in (same, drifting)]
+    half = halves_of(ChannelResult(Selector(drifting, body_moves(drifting)), names, drifting))["turn_slip.k_s"]
+    assert (half.early, half.late) == pytest.approx((0.08, 0.16), abs=0.03)
+    assert found[1].low < half.early < half.late < found[1].high
+    assert found[0].deviation < 0.3 * found[1].deviation
+
+
+def test_a_parameter_that_changes_along_a_log_is_said_to_drift_and_another_is_not():
+    for channel, drifts in ((changing(0.08), False), (changing(0.16), True)):
+        result = ChannelResult(Selector(channel, body_moves(channel)), ("turn_slip",), channel)
+        analysis = GapAnalysis(channel.drive, channel.neutral, WHEEL.neutral, result, None)
+        said = drifting_parameters(analysis, final_fit(analysis))
+        assert bool(said) == drifts
+        assert not drifts or said[0].startswith("turn_slip.k_s drifts: 0.0")
