@@ -96,11 +96,10 @@ def offered_stage(gap: Mapping[str, Mapping[float, PredictionErrors]], found: bo
     if not gap or not math.isfinite(gap["amended"][horizon_s].position_m):
         return "amended"
     refitted, timed, amended = (gap[stage][horizon_s] for stage in STAGES[1:4])
-    if beats(timed, amended, prediction) and beats(refitted, amended, prediction):
+    plainer, plain = ("refitted", refitted) if beats(timed, refitted, prediction) else ("timed", timed)
+    if beats(plain, amended, prediction) or (not found and not clearly_worse(plain, amended, prediction)):
         return "amended"
-    if not found and not clearly_worse(timed, amended, prediction):
-        return "amended"
-    return "timed" if beats(refitted, timed, prediction) else "refitted"
+    return plainer
 
 
 def _model_of(

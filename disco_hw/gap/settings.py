@@ -265,6 +265,8 @@ class PredictionSettings:
     """Bootstrap draws of an interval. Chosen."""
     floor_draws: int = 20
     """Draws of the sensors' noise at each start. Chosen: the error is averaged over hundreds of starts."""
+    rough_geometry: float = 0.1
+    """Without effects the geometry of the whole chain is that of the body within this share. Chosen."""
     joint_trust: float = 3.0
     """Before the whole chain is fitted, channels are trusted to so many of their standard deviations. Measured: halves
     of real logs predict each other best with 3 to 10."""

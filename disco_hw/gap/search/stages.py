@@ -110,7 +110,7 @@ def joint_predictions(analysis: GapAnalysis, final: FinalFit) -> StagePrediction
         return _chain(analysis, final, vectors)
 
     parts = tuple(
-        Part(channel.layout, one.vector, one.active, np.zeros((len(one.active),) * 2))
+        Part(channel.layout, one.vector, one.active, _roughly(channel, one))
         for channel, one in zip((apart.body, apart.wheels), base, strict=False)
         if channel is not None
     )
@@ -140,6 +140,14 @@ def _information(found: Fit, channel: BodyChannel | WheelChannel, fold: int) -> 
     inside = (channel.block // round(prediction.fold_s / grid.block_s)) % 2 == fold
     slope = found.jacobian[inside]
     return np.asarray(slope.T @ slope) + (0.0 if found.precision is None else np.diag(found.precision))
+
+
+def _roughly(channel: BodyChannel | WheelChannel, found: Fit) -> Array:
+    """That the geometry is about what the body alone has it to be, for logs with few commands; of the rest nothing."""
+    known = np.zeros(len(found.active))
+    share = channel.settings.prediction.rough_geometry
+    known[: len(channel.free)] = (share * found.vector[[0, 1, 1]][: len(channel.free)]) ** -2.0
+    return np.diag(known)
 
 
 def _timed(ahead: Ahead, refitted: Freed) -> Freed:
