@@ -52,7 +52,8 @@ def _constants(protocol: Protocol) -> str:
         f"#define DISCO_PROTOCOL_MINOR ({protocol.minor}u)",
         f"#define DISCO_DBC_HASH (0x{protocol.dbc_hash:08X}u)",
         "",
-        "/* Data ids of the end-to-end CRC; the handshake's are the same for every major version. */",
+        "/* Data ids of the end-to-end CRC; the handshake's are the same for every major version, as of version 0. */",
+        "#define DISCO_DATA_ID(can_id, major) ((uint16_t)((can_id) ^ ((uint32_t)(major) << 11)))",
     ]
     lines += [_data_id(message) for message in protocol.messages if message.data_id is not None]
     lines += ["", "/* Raw units in one physical unit (PER_UNIT), or the physical value of one raw unit (SCALE). */"]
@@ -62,9 +63,8 @@ def _constants(protocol: Protocol) -> str:
 
 
 def _data_id(message: MessageLayout) -> str:
-    any_major = message.data_id == message.can_id
-    value = f"0x{message.can_id:03X}u" if any_major else f"(0x{message.can_id:03X}u ^ ((uint32_t)(major) << 11))"
-    return f"#define DISCO_{message.name}_DATA_ID(major) ((uint16_t){value})"
+    major = "0u" if message.data_id == message.can_id else "major"
+    return f"#define DISCO_{message.name}_DATA_ID(major) DISCO_DATA_ID(0x{message.can_id:03X}u, {major})"
 
 
 def _scales(message: MessageLayout) -> list[str]:

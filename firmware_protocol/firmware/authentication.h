@@ -25,15 +25,15 @@ typedef struct {
 } disco_proof_t;
 
 typedef struct {
-    disco_cmac_key_t key;
-    disco_proof_t proofs[DISCO_PROOFS];
-    uint64_t entropy;
-    uint64_t draws; /* makes each nonce another one */
-    uint8_t nonce[DISCO_NONCE_LENGTH];
-    uint8_t next_nonce[DISCO_NONCE_LENGTH];
     bool prepared; /* `next_nonce` is drawn */
     bool required;
     bool nonce_shown;
+    uint8_t nonce[DISCO_NONCE_LENGTH];
+    uint8_t next_nonce[DISCO_NONCE_LENGTH];
+    uint64_t entropy;
+    uint64_t draws; /* makes each nonce another one */
+    disco_proof_t proofs[DISCO_PROOFS];
+    disco_cmac_key_t key;
 } disco_authentication_t;
 
 /* `entropy` must never be the same twice under one key: from a hardware generator, or a count of starts kept in flash. */

@@ -80,7 +80,7 @@ void disco_command_expire(disco_firmware_t *core)
 {
     disco_command_t *command = &core->command;
     (void)disco_e2e_expire(&command->e2e, core->now_us);
-    if ((core->now_us - command->last_accepted_us) > core->config.command_timeout_us) {
+    if (disco_elapsed_us(core->now_us, command->last_accepted_us) > core->config.command_timeout_us) {
         command->zero_count = 0u;
     }
 }
@@ -94,6 +94,6 @@ bool disco_command_enough_zeros(const disco_firmware_t *core)
 bool disco_command_older_than(const disco_firmware_t *core, uint32_t age_us)
 {
     const disco_command_t *command = &core->command;
-    return ((core->now_us - command->last_accepted_us) >= age_us) ||
-           ((core->cycles_us - command->last_accepted_cycles_us) > age_us);
+    return (disco_elapsed_us(core->now_us, command->last_accepted_us) >= age_us) ||
+           (disco_elapsed_us(core->cycles_us, command->last_accepted_cycles_us) > age_us);
 }

@@ -77,7 +77,7 @@ static void obey_command(disco_firmware_t *core)
 static bool may_decelerate(const disco_firmware_t *core)
 {
     const bool in_stop = (core->state == DISCO_STATE_STOPPING) || (core->state == DISCO_STATE_ESTOP);
-    const uint64_t since_stop_us = core->now_us - core->drive.stop_since_us;
+    const uint32_t since_stop_us = disco_elapsed_us(core->now_us, core->drive.stop_since_us);
     const bool done = disco_wheels_equal(core->drive.setpoint, standstill) && disco_wheels_still(core);
     return in_stop && !core->drive.brake && !done && (core->faults.latched == 0u) &&
            (since_stop_us < core->config.stop_timeout_us) && !disco_command_older_than(core, core->config.drive_off_timeout_us);

@@ -102,7 +102,7 @@ static uint32_t debounce_us(const disco_config_t *config, debounce_t kind)
 }
 
 static bool jumped(const disco_faults_t *faults, const disco_config_t *config, uint32_t wheel, uint32_t ticks,
-                   uint64_t now_us)
+                   uint32_t now_us)
 {
     const int32_t difference = (int32_t)(ticks - faults->last_ticks[wheel]);
     const float elapsed_s = (float)(now_us - faults->last_step_us) * 1.0e-6f;
@@ -111,7 +111,7 @@ static bool jumped(const disco_faults_t *faults, const disco_config_t *config, u
 }
 
 static bool wrong_direction(disco_faults_t *faults, const disco_config_t *config, uint32_t wheel, float setpoint,
-                            float speed, uint64_t now_us)
+                            float speed, uint32_t now_us)
 {
     const float proof = config->encoder_check_speed;
     const bool opposed = ((setpoint > proof) && (speed < -proof)) || ((setpoint < -proof) && (speed > proof));
@@ -133,7 +133,7 @@ static bool wrong_direction(disco_faults_t *faults, const disco_config_t *config
 }
 
 static uint32_t wheel_faults(disco_faults_t *faults, const disco_config_t *config, const disco_inputs_t *inputs,
-                             const disco_fault_context_t *context, uint32_t wheel, uint64_t now_us)
+                             const disco_fault_context_t *context, uint32_t wheel, uint32_t now_us)
 {
     const float setpoint = (wheel == 0u) ? context->setpoint.left : context->setpoint.right;
     const float speed = inputs->wheel_speed[wheel];
@@ -147,7 +147,7 @@ static uint32_t wheel_faults(disco_faults_t *faults, const disco_config_t *confi
     present |= bit_if(!(current <= config->over_current), SLOT_OVER_CURRENT + wheel);
     present |= bit_if(!(inputs->temperature[wheel] <= config->over_temperature), SLOT_OVER_TEMPERATURE + wheel);
     present |= bit_if(dead && (current > config->stall_current), SLOT_STALL + wheel);
-    present |= bit_if((dead && (current <= config->stall_current)) || !inputs->encoder_valid[wheel] || !isfinite(speed),
+    present |= bit_if((dead && (current <= config->stall_current)) || !inputs->encoder_valid[wheel] || !disco_finite(speed),
                       SLOT_ENCODER_MISSING + wheel);
     present |= bit_if(jumped(faults, config, wheel, inputs->ticks[wheel], now_us), SLOT_ENCODER_JUMP + wheel);
     present |= bit_if(wrong_direction(faults, config, wheel, context->driver_enabled ? setpoint : 0.0f, speed, now_us),
@@ -171,7 +171,7 @@ static uint32_t board_faults(const disco_config_t *config, const disco_inputs_t 
     return present;
 }
 
-static void settle(disco_faults_t *faults, const disco_config_t *config, uint32_t slot, uint64_t now_us)
+static void settle(disco_faults_t *faults, const disco_config_t *config, uint32_t slot, uint32_t now_us)
 {
     const uint32_t mask = UINT32_C(1) << slot;
     const fault_row_t *row = &rows[slot];
@@ -180,20 +180,22 @@ static void settle(disco_faults_t *faults, const disco_config_t *config, uint32_
         if ((now_us - faults->last_seen_us[slot]) >= config->fault_hold_us) {
             faults->active &= ~mask;
         }
-    } else if ((now_us - faults->since_us[slot]) >= debounce_us(config, row->debounce)) {
-        faults->active |= mask;
-        faults->last_seen_us[slot] = now_us;
-        if ((row->code & LATCHING) != 0u) {
-            faults->latched |= mask;
-        }
     } else {
-        /* not for long enough yet */
+        const uint32_t debounced_us = debounce_us(config, row->debounce);
+        if ((now_us - faults->since_us[slot]) >= debounced_us) {
+            /* However long it lasts, its time does not wrap. */
+            faults->since_us[slot] = now_us - debounced_us;
+            faults->last_seen_us[slot] = now_us;
+            faults->active |= mask;
+            faults->latched |= ((row->code & LATCHING) != 0u) ? mask : 0u;
+        }
     }
 }
 
 void disco_faults_step(disco_faults_t *faults, const disco_config_t *config, const disco_inputs_t *inputs,
-                       const disco_fault_context_t *context, uint64_t now_us)
+                       const disco_fault_context_t *context, uint64_t time_us)
 {
+    const uint32_t now_us = (uint32_t)time_us;
     uint32_t present = board_faults(config, inputs, context);
     if (!faults->started) {
         faults->started = true;

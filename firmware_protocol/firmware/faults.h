@@ -47,23 +47,23 @@ typedef struct {
 } disco_fault_context_t;
 
 typedef struct {
-    uint64_t since_us[DISCO_FAULT_SLOTS];
-    uint64_t last_seen_us[DISCO_FAULT_SLOTS];
-    uint64_t last_step_us;
-    uint64_t opposed_since_us[2];
-    float opposed_speed[2];
-    uint32_t last_ticks[2];
     uint32_t present;  /* the cause is there now, not yet debounced */
     uint32_t active;   /* debounced, or held */
     uint32_t latched;
     bool started;
+    uint32_t last_ticks[2];
+    float opposed_speed[2];
+    uint32_t opposed_since_us[2]; /* these are the low bits of times, and wrap after 71 minutes */
+    uint32_t last_step_us;
+    uint32_t since_us[DISCO_FAULT_SLOTS];
+    uint32_t last_seen_us[DISCO_FAULT_SLOTS];
 } disco_faults_t;
 
 void disco_faults_init(disco_faults_t *faults);
 
 /* Call once a cycle. */
 void disco_faults_step(disco_faults_t *faults, const disco_config_t *config, const disco_inputs_t *inputs,
-                       const disco_fault_context_t *context, uint64_t now_us);
+                       const disco_fault_context_t *context, uint64_t time_us);
 
 /* Forgets the latched faults whose cause is gone, except permanent ones. */
 void disco_faults_reset(disco_faults_t *faults);

@@ -113,31 +113,8 @@ typedef struct {
  * 0.1 mm apart up to 800 m: whoever knows a pose better makes the struct himself. */
 disco_pose_t disco_pose(float x, float y, float yaw, float position_std, float yaw_std);
 
+/* What is asked for most often comes first: a Cortex-M0+ reaches only the first bytes of a struct in one instruction. */
 typedef struct {
-    disco_config_t config;
-    disco_inputs_t inputs;
-    disco_faults_t faults;
-    disco_host_t host;
-    disco_session_t session;
-    disco_authentication_t authentication;
-    disco_command_t command;
-    disco_drive_t drive;
-    disco_telemetry_t telemetry;
-    disco_transmit_t transmit;
-    uint64_t now_us;         /* the core's own time, which only goes forwards */
-    uint64_t clock_us;       /* the caller's clock, when it last told */
-    uint64_t cycle_clock_us; /* the same, at the last cycle */
-    uint64_t cycles_us;      /* the second clock: cycles, each as long as it should be */
-    int64_t clock_ahead_us;  /* of the second clock, forgotten slowly */
-    uint32_t rejected[DISCO_REJECT_REASONS];
-    uint32_t rejected_total;
-    uint32_t crc_errors;
-    uint32_t sequence_errors;
-    uint32_t watchdog_events;
-    uint32_t bus_off_events;
-    uint32_t clock_errors;
-    uint32_t unknown_frames;
-    uint32_t parameter_writes; /* by the host, accepted */
     uint8_t state;
     uint8_t estop_source;
     uint8_t stop_cause;
@@ -148,6 +125,30 @@ typedef struct {
     bool inputs_known;
     bool clock_mismatch;
     bool entropy_valid;
+    disco_session_t session;
+    uint64_t now_us;         /* the core's own time, which only goes forwards */
+    uint64_t clock_us;       /* the caller's clock, when it last told */
+    uint64_t cycle_clock_us; /* the same, at the last cycle */
+    uint64_t cycles_us;      /* the second clock: cycles, each as long as it should be */
+    int32_t clock_ahead_us;  /* of the second clock, forgotten slowly */
+    uint32_t rejected_total;
+    uint32_t crc_errors;
+    uint32_t sequence_errors;
+    uint32_t watchdog_events;
+    disco_drive_t drive;
+    disco_host_t host;
+    disco_command_t command;
+    disco_config_t config;
+    disco_inputs_t inputs;
+    disco_telemetry_t telemetry;
+    uint32_t bus_off_events;
+    uint32_t clock_errors;
+    uint32_t unknown_frames;
+    uint32_t parameter_writes; /* by the host, accepted */
+    uint32_t rejected[DISCO_REJECT_REASONS];
+    disco_faults_t faults;
+    disco_transmit_t transmit;
+    disco_authentication_t authentication;
 } disco_firmware_t;
 
 /* `entropy` seeds the challenges and nonces, and must be another one at each start: take it from a hardware generator, or

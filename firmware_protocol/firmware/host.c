@@ -75,10 +75,10 @@ void disco_host_expire(disco_firmware_t *core)
     disco_host_t *host = &core->host;
     const disco_config_t *config = &core->config;
     (void)disco_e2e_expire(&host->e2e, core->now_us);
-    if ((core->now_us - host->last_state_us) > config->host_state_timeout_us) {
+    if (disco_elapsed_us(core->now_us, host->last_state_us) > config->host_state_timeout_us) {
         host->reset_pending = false;
     }
-    if ((core->now_us - host->last_frame_us) > config->host_forget_timeout_us) {
+    if (disco_elapsed_us(core->now_us, host->last_frame_us) > config->host_forget_timeout_us) {
         host->accepted = false;
         host->hash_mismatch = false;
         host->major_mismatch = false;

@@ -71,7 +71,7 @@ static uint8_t judge_write(const disco_firmware_t *core, const parameter_t *para
     uint8_t status = DISCO_STATUS_OK;
     if (!parameter->writable) {
         status = DISCO_STATUS_READ_ONLY;
-    } else if (!isfinite(value)) {
+    } else if (!disco_finite(value)) {
         status = DISCO_STATUS_NOT_FINITE;
     } else if (!in_range(parameter, value)) {
         status = DISCO_STATUS_OUT_OF_RANGE;

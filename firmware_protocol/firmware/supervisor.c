@@ -17,7 +17,7 @@ static uint32_t when(bool holds, disco_condition_t condition)
 
 static bool host_silent(const disco_firmware_t *core)
 {
-    return (core->now_us - core->host.last_state_us) > core->config.host_state_timeout_us;
+    return disco_elapsed_us(core->now_us, core->host.last_state_us) > core->config.host_state_timeout_us;
 }
 
 static bool session_fresh(const disco_firmware_t *core)
@@ -54,7 +54,7 @@ static uint32_t command_conditions(const disco_firmware_t *core)
     return when(disco_command_enough_zeros(core), DISCO_WHEN_ZERO_COMMANDS) |
            when(!command->e2e.qualified, DISCO_WHEN_COMMANDS_DISQUALIFIED) |
            when(disco_command_older_than(core, timeout_us), DISCO_WHEN_COMMAND_TIMEOUT) | when(expired, DISCO_WHEN_COMMAND_EXPIRED) |
-           when((core->now_us - command->last_motion_us) >= core->config.reset_quiet_us, DISCO_WHEN_NO_MOTION_ASKED);
+           when(disco_elapsed_us(core->now_us, command->last_motion_us) >= core->config.reset_quiet_us, DISCO_WHEN_NO_MOTION_ASKED);
 }
 
 static uint32_t conditions(const disco_firmware_t *core)
@@ -62,7 +62,7 @@ static uint32_t conditions(const disco_firmware_t *core)
     const bool still = disco_wheels_still(core);
     const disco_wheels_t standstill = {0.0f, 0.0f};
     const bool stopped = still && disco_wheels_equal(core->drive.setpoint, standstill);
-    const bool stop_timeout = (core->now_us - core->drive.stop_since_us) >= core->config.stop_timeout_us;
+    const bool stop_timeout = disco_elapsed_us(core->now_us, core->drive.stop_since_us) >= core->config.stop_timeout_us;
     return host_conditions(core) | command_conditions(core) |
            when(core->self_test_passed, DISCO_WHEN_SELF_TEST_PASSED) | when(still, DISCO_WHEN_WHEELS_STILL) |
            when(stopped, DISCO_WHEN_STOPPED) | when(stop_timeout, DISCO_WHEN_STOP_TIMEOUT) |

@@ -49,9 +49,14 @@ enum {
         uint8_t data_[LENGTH];                                                                             \
         (frame).counter = disco_transmit_counter(&(core)->transmit, NAME);                                 \
         (void)disco_robot_##name##_pack(data_, &(frame), LENGTH);                                          \
-        disco_transmit_send(&(core)->transmit, DISCO_ROBOT_##NAME##_FRAME_ID, data_,                       \
-                            DISCO_##NAME##_DATA_ID((core)->config.protocol_major));                        \
+        send_frame(core, DISCO_ROBOT_##NAME##_FRAME_ID, data_, DISCO_##NAME##_DATA_ID(1u) == DISCO_##NAME##_DATA_ID(0u)); \
     } while (false)
+
+static void send_frame(disco_firmware_t *core, uint16_t can_id, const uint8_t *data, bool any_major)
+{
+    const uint8_t major = any_major ? 0u : core->config.protocol_major;
+    disco_transmit_send(&core->transmit, can_id, data, DISCO_DATA_ID(can_id, major));
+}
 
 /* The raw value nearest to a physical one, within the signal's range; 0 for what is not a number. Exact, in integers: a
  * float has too few bits for it, and a double costs a controller hundreds of instructions. */
@@ -121,8 +126,8 @@ static void send_wheels(disco_firmware_t *core)
 {
     const disco_inputs_t *in = &core->inputs;
     struct disco_robot_wheel_speed_t speed = {
-        .left_valid = (uint8_t)(in->encoder_valid[0] && isfinite(in->wheel_speed[0])),
-        .right_valid = (uint8_t)(in->encoder_valid[1] && isfinite(in->wheel_speed[1])),
+        .left_valid = (uint8_t)(in->encoder_valid[0] && disco_finite(in->wheel_speed[0])),
+        .right_valid = (uint8_t)(in->encoder_valid[1] && disco_finite(in->wheel_speed[1])),
         .driver_enabled = core->drive.enabled,
         .limited = core->drive.limited,
         .left_speed = raw_i16(in->wheel_speed[0], DISCO_WHEEL_SPEED_LEFT_SPEED_PER_UNIT),
@@ -271,7 +276,7 @@ void disco_telemetry_parameter(disco_firmware_t *core, uint8_t status, uint16_t 
 
 disco_pose_t disco_pose(float x, float y, float yaw, float position_std, float yaw_std)
 {
-    const bool known = isfinite(x) && isfinite(y) && isfinite(yaw) && (position_std >= 0.0f) && (yaw_std >= 0.0f);
+    const bool known = disco_finite(x) && disco_finite(y) && disco_finite(yaw) && (position_std >= 0.0f) && (yaw_std >= 0.0f);
     return (disco_pose_t){
         .valid = known,
         .x = raw(x, DISCO_POSE_POSITION_X_PER_UNIT, -BEYOND_POSITION, BEYOND_POSITION),
@@ -373,7 +378,7 @@ static void (*const introduction[DISCO_INTRODUCTION])(disco_firmware_t *core) = 
 static void introduce(disco_firmware_t *core)
 {
     disco_telemetry_t *telemetry = &core->telemetry;
-    const uint64_t since_us = core->now_us - telemetry->hello_us;
+    const uint32_t since_us = disco_elapsed_us(core->now_us, telemetry->hello_us);
     const bool unknown = !core->host.accepted && (since_us >= (DISCO_ROBOT_HELLO_CYCLE_TIME_MS * US_PER_MS));
     const bool asked = core->host.hello_requested && (since_us >= HELLO_SPACING_US);
     if (!telemetry->introduced || unknown || asked) {

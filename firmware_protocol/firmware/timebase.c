@@ -4,22 +4,42 @@
 /* How far the clock and the count of cycles may come apart, of which a tenth of a cycle is forgotten in each cycle. */
 #define TOLERANCE_US (20000)
 #define MOST_APART_US (2 * TOLERANCE_US)
-#define FORGOTTEN_PART (10u)
+#define FORGOTTEN_PART (10)
 
-static int64_t limited(int64_t value, int64_t limit)
+static int32_t limited(int32_t value, int32_t limit)
 {
-    const int64_t not_above = (value < limit) ? value : limit;
+    const int32_t not_above = (value < limit) ? value : limit;
     return (not_above > -limit) ? not_above : -limit;
+}
+
+/* How much later than `before_us`, within MOST_APART_US. */
+static int32_t apart(uint64_t clock_us, uint64_t before_us)
+{
+    int32_t result = -MOST_APART_US;
+    if (clock_us >= before_us) {
+        const uint64_t later_us = clock_us - before_us;
+        result = (later_us < (uint64_t)MOST_APART_US) ? (int32_t)later_us : MOST_APART_US;
+    } else if ((before_us - clock_us) < (uint64_t)MOST_APART_US) {
+        result = -(int32_t)(before_us - clock_us);
+    } else {
+        /* far earlier */
+    }
+    return result;
 }
 
 static void compare(disco_firmware_t *core, uint64_t clock_us)
 {
-    const int64_t cycle_us = (int64_t)core->config.cycle_us;
-    const int64_t by_clock_us = limited((int64_t)(clock_us - core->cycle_clock_us), MOST_APART_US);
-    const int64_t ahead_us = core->clock_ahead_us + by_clock_us - cycle_us;
-    const int64_t forgotten_us = limited(ahead_us, (int64_t)(core->config.cycle_us / FORGOTTEN_PART));
+    const int32_t cycle_us = (int32_t)core->config.cycle_us;
+    const int32_t ahead_us = core->clock_ahead_us + apart(clock_us, core->cycle_clock_us) - cycle_us;
+    const int32_t forgotten_us = limited(ahead_us, cycle_us / FORGOTTEN_PART);
     core->clock_ahead_us = limited(ahead_us - forgotten_us, MOST_APART_US);
     core->clock_mismatch = limited(core->clock_ahead_us, TOLERANCE_US) != core->clock_ahead_us;
+}
+
+uint32_t disco_elapsed_us(uint64_t now_us, uint64_t since_us)
+{
+    const uint64_t elapsed_us = now_us - since_us;
+    return (elapsed_us < UINT32_MAX) ? (uint32_t)elapsed_us : UINT32_MAX;
 }
 
 void disco_time_advance(disco_firmware_t *core, uint64_t clock_us)

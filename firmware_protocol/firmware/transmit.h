@@ -14,11 +14,11 @@ typedef struct {
 } disco_frame_t;
 
 typedef struct {
-    disco_frame_t frames[DISCO_QUEUE_LENGTH];
-    uint32_t overflow_count;
     uint8_t first;
     uint8_t count;
     uint8_t counters[DISCO_COUNTERS]; /* the next counter of each message, by the caller's index */
+    uint32_t overflow_count;
+    disco_frame_t frames[DISCO_QUEUE_LENGTH];
 } disco_transmit_t;
 
 void disco_transmit_init(disco_transmit_t *queue);

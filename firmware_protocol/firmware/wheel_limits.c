@@ -1,10 +1,22 @@
 #include "wheel_limits.h"
 
 #include <math.h>
+#include <stdint.h>
+#include <string.h>
+
+#define FRACTION_BITS (23u)
+#define EXPONENT_MASK (0xFFu)
+
+bool disco_finite(float value)
+{
+    uint32_t bits;
+    (void)memcpy(&bits, &value, sizeof(bits));
+    return ((bits >> FRACTION_BITS) & EXPONENT_MASK) != EXPONENT_MASK;
+}
 
 float disco_largest(disco_wheels_t wheels)
 {
-    if (!isfinite(wheels.left) || !isfinite(wheels.right)) {
+    if (!disco_finite(wheels.left) || !disco_finite(wheels.right)) {
         return INFINITY;
     }
     return fmaxf(fabsf(wheels.left), fabsf(wheels.right));
@@ -24,7 +36,7 @@ disco_wheels_t disco_clamp_speed(disco_wheels_t wanted, float max_speed)
 {
     const float largest = disco_largest(wanted);
     disco_wheels_t clamped = wanted;
-    if (!isfinite(largest)) {
+    if (!disco_finite(largest)) {
         clamped = (disco_wheels_t){0.0f, 0.0f};
     } else if (largest > max_speed) {
         const float factor = max_speed / largest;

@@ -4,6 +4,10 @@
 
 #include <stdbool.h>
 
+/* Whether it is a number within a float's range, asked of its bits: without an FPU, each of the C library's comparisons is
+ * a call. */
+bool disco_finite(float value);
+
 typedef struct {
     float left;  /* rad/s */
     float right; /* rad/s */

@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pytest
 
+from firmware_protocol import _firmware
 from firmware_protocol.firmware_core import FirmwareCore, FirmwareInputs, ResetCause
 from tests.firmware_protocol.bench import CONFIG, FAULTS, MS, Bench
 
@@ -369,3 +370,27 @@ def test_every_fault_of_the_table_is_raised_somewhere():
     raised |= {"WATCHDOG_RESET", "BROWN_OUT_RESET", "SELF_TEST_FAILED", "CONFIG_INVALID", "NONE"}
     raised |= {"DBC_HASH_MISMATCH", "PROTOCOL_MAJOR_MISMATCH", "CLOCK_MISMATCH", "ENTROPY_INVALID"}
     assert raised == set(FAULTS)
+
+
+def test_a_fault_that_lasts_longer_than_its_times_have_bits_is_held_when_it_goes():
+    """The core's own step would need 71 minutes of cycles: here its detector is asked."""
+    lib, ffi = _firmware.lib, _firmware.ffi
+    config = ffi.new("disco_config_t *", lib.disco_config_default(2048, 8.0))
+    faults, context = ffi.new("disco_faults_t *"), ffi.new("disco_fault_context_t *")
+    lib.disco_faults_init(faults)
+
+    def step(time_us, voltage):
+        inputs = ffi.new("disco_inputs_t *", {"voltage": voltage, "encoder_valid": [True, True]})
+        lib.disco_faults_step(faults, config, inputs, context, time_us)
+        return lib.disco_faults_code(faults)
+
+    begin_us, wrap_us = 5_000_000, 1 << 32
+    assert step(begin_us, 25.0) == 0
+    assert step(begin_us + config.voltage_debounce_us - 1, 10.0) == 0
+    assert step(begin_us + config.voltage_debounce_us, 10.0) == FAULTS["UNDER_VOLTAGE"]
+    # Half-way, then just after its beginning has come round again: still seen, so still held for its time.
+    end_us = begin_us + wrap_us + 1000
+    assert step(begin_us + wrap_us // 2, 10.0) == FAULTS["UNDER_VOLTAGE"]
+    assert step(end_us, 10.0) == FAULTS["UNDER_VOLTAGE"]
+    assert step(end_us + config.fault_hold_us - 1, 25.0) == FAULTS["UNDER_VOLTAGE"]
+    assert step(end_us + config.fault_hold_us, 25.0) == 0
