@@ -56,7 +56,8 @@ _SLIDING_S = 0.05
 """How long the body's sideways speed lags behind its turning."""
 _STRIDE_S = 0.045
 """Wheel samples between two poses are followed together, along one arc, for so long."""
-_ROUGH_M, _ROUGH_RAD = 2e-4, 5e-4
+_ROUGH_M, _ROUGH_RAD = 5e-4, 5e-4
+"""Random part of a centimetre driven, to any side and in heading, which the wheels do not show."""
 _X, _Y, _YAW, _RADIUS, _AXLE, _X_ICR, _LEFT, _RIGHT = range(8)
 _THETA = slice(_RADIUS, _X_ICR + 1)
 _DRIVEN, _EVERY = [_RADIUS, _AXLE, _LEFT, _RIGHT], range(8)
