@@ -217,7 +217,10 @@ class Bridge:
     def _answer(self, words: str) -> None:
         """Ask the daemon; where it is driven by hand, arming lets the speeds drive, and is not the daemon's to do."""
         reply: dict[str, Any]
-        if words == "arm" and self._is_hand_driven():
+        refused = ros2_commands.refusal(words, self._config.ros2.may_move)
+        if refused is not None:
+            reply = {"do": words, "ok": False, "error": refused}
+        elif words == "arm" and self._is_hand_driven():
             refusal = self._speeds.permit(time.monotonic_ns())
             reply = {"do": words, "ok": refusal is None, "text": "cmd_vel drives"}
             if refusal is not None:

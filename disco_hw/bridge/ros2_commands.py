@@ -33,6 +33,7 @@ _AHEAD_NS = 50_000_000
 _OPENINGS = 2
 _CONNECT_S = 0.2
 _REPLY_BYTES = 1 << 16
+_ALWAYS = ("estop", "stop", "disarm", "status")
 
 
 class SpeedInlet:
@@ -166,6 +167,16 @@ class Errands:
     def close(self) -> None:
         """Begin nothing more; safe to call twice."""
         self._pool.shutdown(wait=False, cancel_futures=True)
+
+
+def refusal(words: str, may_move: bool) -> str | None:
+    """Why a request is not taken from ROS 2, where nobody knows who sends; stopping is always."""
+    if may_move or words.split(" ", 1)[0] in _ALWAYS:
+        return None
+    return (
+        "not taken from ROS 2, where anybody in the domain could have sent it; set ros2.may_move = true in robot.toml, "
+        "or use disco-hw ctl"
+    )
 
 
 def asked(robot: Path, words: str, link: str | None) -> dict[str, Any]:

@@ -206,8 +206,8 @@ class Drive(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 class Ros2(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """What of a bag is read; what is left out is guessed. `pose_topic` "tf" is the chain from map to base frame.
 
-    `command_joints`: whose the numbers of a Float64MultiArray are, in its order. The last three are the bridge's; a
-    domain that is left out is $ROS_DOMAIN_ID, or 0.
+    `command_joints`: whose the numbers of a Float64MultiArray are, in its order. The last four are the bridge's; a
+    domain that is left out is $ROS_DOMAIN_ID, or 0. `may_move`: whether what lets the robot move is taken from ROS 2.
     """
 
     command_topic: str = ""
@@ -221,6 +221,7 @@ class Ros2(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
     domain: Annotated[int, Meta(ge=0, le=232)] | None = None
     namespace: Annotated[str, Meta(pattern="^(/?[A-Za-z][A-Za-z0-9_]*)*$")] = ""
     localhost_only: bool = True
+    may_move: bool = False
 
 
 def _default_task() -> RobotTask:

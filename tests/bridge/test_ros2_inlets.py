@@ -9,9 +9,10 @@ import pytest
 pytest.importorskip("cyclonedds", reason="cyclonedds is not installed: make venv")
 
 from disco_hw.bridge import ros2_messages as msg
-from disco_hw.bridge.ros2_commands import Errands, SpeedInlet
+from disco_hw.bridge.ros2_commands import Errands, SpeedInlet, refusal
 from disco_hw.bridge.ros2_poses import PoseInlet
 from disco_hw.config import Drive, PoseInput, Robot
+from disco_hw.config.robot import Ros2
 from disco_hw.drive.hand_pilot import Deadman
 from disco_hw.drive.keyboard import wheel_speeds
 from disco_hw.drive.page_source import PageSource, steering_from
@@ -257,3 +258,14 @@ def test_of_a_flood_of_requests_a_few_are_taken_in_their_order():
     assert errands.refused == 47
     errands.close()
     errands.close()
+
+
+@pytest.mark.parametrize("words", ["estop", "stop", "disarm", "status"])
+def test_stopping_is_taken_from_whoever_asks(words):
+    assert refusal(words, False) is None
+
+
+@pytest.mark.parametrize("words", ["arm", "arm --unrecorded", "start", "reset", "task radius_m=1", "stopping", ""])
+def test_what_lets_the_robot_move_is_taken_only_where_robot_toml_says_so(words):
+    assert "ros2.may_move = true" in str(refusal(words, Ros2().may_move))
+    assert refusal(words, True) is None

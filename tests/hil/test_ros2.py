@@ -25,7 +25,7 @@ def domain():
 
 
 def with_poses_of_ros(robot_file):
-    lines = f'[pose]\nsource = "ros2"\nport = {5100 + domain()}\n[ros2]\ndomain = {domain()}\n'
+    lines = f'[pose]\nsource = "ros2"\nport = {5100 + domain()}\n[ros2]\ndomain = {domain()}\nmay_move = true\n'
     robot_file.write_text(robot_file.read_text(encoding="utf-8") + lines, encoding="utf-8")
     return robot_file
 
