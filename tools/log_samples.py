@@ -8,6 +8,7 @@ from pathlib import Path
 
 import msgspec
 from hypothesis import strategies as st
+from mcap.reader import make_reader
 
 from disco_hw.log.link import Attachment, Start, batch_encoder
 from disco_hw.log.mcap_log import McapLog
@@ -79,6 +80,15 @@ def log_bytes(ticks, finish=True, flush_every=None, numbers=False, end=None, **c
     if finish:
         log.finish()
     return sink.getvalue()
+
+
+def with_damaged_chunk(whole):
+    """The log with one bit of the data of its middle chunk turned over."""
+    chunks = make_reader(io.BytesIO(whole)).get_summary().chunk_indexes
+    chunk = chunks[len(chunks) // 2]
+    damaged = bytearray(whole)
+    damaged[chunk.chunk_start_offset + chunk.chunk_length // 2] ^= 1
+    return bytes(damaged)
 
 
 def drive_ticks(count):

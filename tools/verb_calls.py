@@ -55,6 +55,7 @@ CALLS = (
     Call("run", "robot.toml --model model.toml --accept-missing-effects", (*_SETUP, "robot.key")),
     Call("drive", "robot.toml --model model.toml --script steps --unattended", (*_SETUP, "robot.key")),
     Call("check", "robot.toml", (*_SETUP, "robot.key")),
+    Call("commission", "robot.toml --log-directory out", (*_SETUP, "robot.key")),
     Call("ctl", "robot.toml status", ("robot.toml",)),
     Call("estop", "robot.toml", ("robot.toml",)),
     Call("bridge ros2", "robot.toml --model model.toml", _SETUP),
@@ -156,7 +157,11 @@ _WORK = (
     "disco_hw.gap.write_report.find_gap",
     "disco_hw.viewer.commands.serving",
 )
-_ENDS_AFTER = ("disco_hw.inference.commands.excitation", "disco_hw.daemon.daemon.make_link")
+_ENDS_AFTER = (
+    "disco_hw.inference.commands.excitation",
+    "disco_hw.daemon.daemon.make_link",
+    "disco_hw.first_use.commission.link_key",
+)
 _WITHOUT = {
     "disco_hw.daemon.daemon.make_planner": lambda *_: NoPlanner(),
     "disco_hw.runtime.replay.make_planner": lambda *_: NoPlanner(),

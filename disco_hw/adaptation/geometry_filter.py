@@ -133,7 +133,7 @@ class _Bank:
         self.state, self.covariance = self.state[rows], self.covariance[rows]
         self._turn_rad_s = self._turn_rad_s[rows]
 
-    def open(self, row: int, widest: Array) -> None:
+    def widen(self, row: int, widest: Array) -> None:
         """Let the parameters of a row be as wide as this (3,), or as they are."""
         block = self.covariance[row, _THETA, _THETA]
         block += np.diag(np.maximum(widest**2 - np.diag(block), 0.0))
@@ -258,7 +258,7 @@ class GeometryFilter:
             self._astray += 1
             if self._astray >= CARRIED_POSES:
                 self.carried += 1
-                self._bank.open(0, self._widest())
+                self._bank.widen(0, self._widest())
                 self._place(pose)
             return
         self._astray = 0
@@ -285,7 +285,7 @@ class GeometryFilter:
         self._log_odds = np.concatenate([self._log_odds[kept], np.full(len(KINDS), CHANGE_LOG_ODDS)])
         self._age_s = np.concatenate([self._age_s[kept], np.zeros(len(KINDS))])
         for row, kind in enumerate(KINDS, start=len(kept)):
-            self._bank.open(row, self._widest() * kind)
+            self._bank.widen(row, self._widest() * kind)
 
     def _only(self, row: int) -> None:
         """Believe this filter, and forget the others."""

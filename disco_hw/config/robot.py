@@ -206,7 +206,7 @@ class Drive(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 class Ros2(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """What of a bag is read; what is left out is guessed. `pose_topic` "tf" is the chain from map to base frame.
 
-    `command_joints`: whose the numbers of a Float64MultiArray are, in its order. The last four are the bridge's; a
+    `command_joints`: whose the numbers of a Float64MultiArray are, in its order. The last five are the bridge's; a
     domain that is left out is $ROS_DOMAIN_ID, or 0. `may_move`: whether what lets the robot move is taken from ROS 2.
     """
 

@@ -19,11 +19,13 @@ from disco_hw.daemon.daemon import in_text, serve
 from disco_hw.daemon.loop import MonotonicClock
 from disco_hw.drive.keyboard import Keyboard, KeyHold
 from disco_hw.errors import InputError, WorkError
+from disco_hw.files import ROBOT_TOML, read_bytes
 from disco_hw.first_use.judgement import Judgement, judge_floor, judge_sides, judge_turns
 from disco_hw.first_use.pilot import CommissionPilot
 from disco_hw.first_use.procedure import Procedure, Steps, floor, sides, turns
 from disco_hw.first_use.robot_text import in_toml, with_fields
-from disco_hw.runtime.robot_setup import Setup, load_setup
+from disco_hw.reports.outputs import refuse_directory
+from disco_hw.runtime.robot_setup import Setup, link_key, load_setup
 from drivers.motor import find_driver
 
 _STANDARD_INPUT = 0
@@ -121,7 +123,9 @@ def run_commission(options: CommissionOptions, ask: Callable[[str], str] = input
     for name in options.stages:
         if name not in known:
             raise InputError(f"--stage {name}: no such stage; write one of {', '.join(known)}")
-    load_setup(options.robot, None, options.link)
+    setup = load_setup(options.robot, None, options.link)
+    refuse_directory(_log_directory(options, setup))
+    link_key(setup)
     if not os.isatty(_STANDARD_INPUT):
         raise InputError("commission: standard input is no terminal; it needs a person's hand and eye: use a terminal")
     told: list[dict[str, Any]] = []
@@ -157,7 +161,7 @@ def write_fields(
 ) -> bool:
     """Offer to write fields into robot.toml, and write them, the file of before kept beside it; whether it was done.
 
-    What `load_robot_config` would refuse is not written: WorkError.
+    What `load_robot_config` would refuse, or what cannot be written, raises WorkError; robot.toml is as it was.
     """
     for (section, name), value in edits.items():
         print(f"  [{section}] {name} = {in_toml(value)}", file=sys.stderr)
@@ -166,26 +170,28 @@ def write_fields(
         write = ask(f"write this into {options.robot}? [y/n] ").strip().lower() in {"y", "yes"}
     if not write:
         return False
-    old = options.robot.read_text(encoding="utf-8")
+    old, _ = read_bytes(options.robot, ROBOT_TOML)
     trial = options.robot.with_name(f".{options.robot.name}.new")
-    trial.write_text(with_fields(old, edits), encoding="utf-8")
     try:
+        trial.write_text(with_fields(old.decode(), edits), encoding="utf-8")
         load_robot_config(trial)
+        options.robot.with_name(f"{options.robot.name}.before").write_bytes(old)
+        trial.replace(options.robot)
     except InputError as error:
         trial.unlink()
         raise WorkError(
             f"{options.robot}: not changed, as the result would be refused ({error}); edit it by hand"
         ) from None
-    options.robot.with_name(f"{options.robot.name}.before").write_text(old, encoding="utf-8")
-    trial.replace(options.robot)
+    except OSError as error:
+        trial.unlink(missing_ok=True)
+        raise WorkError(f"{options.robot}: not changed ({error.strerror}); edit it by hand") from None
     return True
 
 
 def _drive(stage: Stage, setup: Setup, options: CommissionOptions) -> Any:
     """One drive through the daemon; what its procedure returned. Raises WorkError if the person gave up."""
-    directory = options.log_directory or Path(setup.config.log.directory)
     stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
-    log = directory / f"{setup.config.robot.name}-commission-{stage.name}-{stamp}.mcap"
+    log = _log_directory(options, setup) / f"{setup.config.robot.name}-commission-{stage.name}-{stamp}.mcap"
     keyboard = Keyboard(_STANDARD_INPUT, KeyHold(0.0), MonotonicClock())
     pilot = CommissionPilot(Procedure(stage.steps(setup.config.robot, slowest_rad_s(setup))), keyboard, keyboard.typed)
     try:
@@ -199,6 +205,10 @@ def _drive(stage: Stage, setup: Setup, options: CommissionOptions) -> Any:
     if pilot.procedure.action is not None:
         raise WorkError(f"commission: ended in the stage {stage.name}; begin again with --stage {stage.name}")
     return pilot.procedure.result
+
+
+def _log_directory(options: CommissionOptions, setup: Setup) -> Path:
+    return options.log_directory or Path(setup.config.log.directory)
 
 
 def _say(topic: str, text: str) -> None:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import os
 import time
-import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,9 +13,12 @@ import msgspec
 
 from disco_hw.config import load_robot_config
 from disco_hw.config.command_line import link_fields, names_address
-from disco_hw.errors import InputError, WorkError
+from disco_hw.errors import InputError
+from disco_hw.files import parse_toml
 from disco_hw.first_use.robot_text import in_toml
+from disco_hw.reports.outputs import refuse_file
 from drivers.motor import UnknownDriverError, find_driver, motor_drivers
+from drivers.pose import DEFAULT as POSE_SOURCE
 from drivers.transport import TransportSettingsError, make_transport
 from drivers.types import Frame, LinkState
 
@@ -97,25 +100,25 @@ def run_init(options: InitOptions, ask: Callable[[str], str] | None, say: Callab
     """Listen, ask, and write a robot.toml that `check` reads; the file written.
 
     `ask` puts a question to a person, None where there is none. Raises InputError for wrong options, for a file that is
-    there already, and where it is not known which controller the robot has.
+    there already or cannot be written, and where it is not known which controller the robot has.
     """
-    if options.out.exists() and not options.overwrite:
+    refuse_file(options.out)
+    if os.path.lexists(options.out) and not options.overwrite:
         raise InputError(f"{options.out}: is there already; name another file, or give --overwrite")
     link = link_fields(options.link)
     heard = _controller(options, link, say)
     text = robot_text(options, link, heard, _measures(options, ask))
-    options.out.parent.mkdir(parents=True, exist_ok=True)
     trial = options.out.with_name(f".{options.out.name}.new")
-    trial.write_text(text, encoding="utf-8")
     try:
+        options.out.parent.mkdir(parents=True, exist_ok=True)
+        trial.write_text(text, encoding="utf-8")
         load_robot_config(trial)
+        trial.replace(options.out)
     except InputError as error:
         trial.unlink()
         raise InputError(str(error).replace(str(trial), str(options.out))) from None
-    try:
-        trial.replace(options.out)
     except OSError as error:
-        raise WorkError(f"{options.out}: cannot be written ({error.strerror})") from None
+        raise InputError(f"{options.out}: cannot be written ({error.strerror}); give another path") from None
     return options.out
 
 
@@ -176,7 +179,7 @@ def robot_text(options: InitOptions, link: dict[str, Any], heard: Heard, measure
     lines += [f"{name} = {in_toml(link[name])}" for name in ("interface", "channel", "port") if name in link]
     if kind == "can":
         lines.append("bitrate = 500000               # as the bus is set")
-    fields = {**tomllib.loads(driver.example), **heard.fields}
+    fields = {**parse_toml(driver.example.encode(), driver.name), **heard.fields}
     if "wheel_radius_m" in fields:
         fields |= {"wheel_radius_m": measures["wheel_radius_m"], "track_m": measures["axial_distance_m"]}
     if fields:
@@ -184,7 +187,7 @@ def robot_text(options: InitOptions, link: dict[str, Any], heard: Heard, measure
     for name, value in fields.items():
         note = "  # heard: see that left stands before right" if name in heard.fields else ""
         lines.append(f"{name} = {in_toml(value)}{note}")
-    source = options.pose_source or ("robot" if driver.is_default else "udp")
+    source = options.pose_source or (POSE_SOURCE if driver.is_default else "udp")
     lines += [
         "",
         "[pose]",

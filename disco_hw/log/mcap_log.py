@@ -98,14 +98,15 @@ def views(record: Record, wall_ns: int) -> list[tuple[str, bytes]]:
 
 def _rollouts(fan: Fan, time: Timestamp) -> SceneUpdate:
     """A line for each sequence, the fainter the less it weighs."""
-    count = len(fan.x_m) // len(fan.weights)
-    points = [Point3(x=x, y=y, z=0.0) for x, y in zip(fan.x_m, fan.y_m, strict=True)]
+    # A broken plan must still be seen in the log: neither as many points as weights promise, nor a weight, are certain.
+    points = [Point3(x=x, y=y, z=0.0) for x, y in zip(fan.x_m, fan.y_m, strict=False)]
+    count, heaviest = len(points) // len(fan.weights), fan.weights[0] or 1.0
     lines = [
         LinePrimitive(
             type=LinePrimitive.LINE_STRIP,
             pose=_pose(0.0, 0.0, 0.0),
             thickness=0.005,
-            color=Color(r=0.3, g=0.5, b=0.9, a=0.15 + 0.85 * weight / fan.weights[0]),
+            color=Color(r=0.3, g=0.5, b=0.9, a=0.15 + 0.85 * weight / heaviest),
             points=points[k * count : (k + 1) * count],
         )
         for k, weight in enumerate(fan.weights)

@@ -17,6 +17,7 @@ STUCK_S = 60
 WRITTEN = {
     *((verb, "out") for verb in ("demo", "infer", "gap", "import", "log recover", "log export")),
     *(("run", "log_file"), ("drive", "log_file"), ("infer", "report")),
+    *(("init", "out"), ("commission", "log_directory")),
     *(("view", "snapshot"), ("view", "video"), ("view", "export")),
     *(("sim", "truth"), ("sim", "inject"), ("sim", "bus_log")),
     *((f"experiment {name}", "out") for name in ("pendulum", "circle", "adapt", "gap")),
@@ -26,7 +27,7 @@ READ = {
     *((verb, "robot") for verb in ("experiment circle", "experiment adapt", "experiment gap", "bridge ros2")),
     *((verb, "model") for verb in ("run", "drive", "gap", "view", "sim", "bridge ros2")),
     *((verb, "log") for verb in ("import", "log info", "log recover", "log export", "view", "replay")),
-    *(("infer", "logs"), ("gap", "logs"), ("sim", "faults")),
+    *(("infer", "logs"), ("gap", "logs"), ("sim", "faults"), ("commission", "robot")),
 }
 
 

@@ -7,8 +7,8 @@ import random
 
 import pytest
 
-from disco_hw.errors import WorkError
-from disco_hw.first_use.commission import STAGES, CommissionOptions, write_fields
+from disco_hw.errors import InputError, WorkError
+from disco_hw.first_use.commission import STAGES, CommissionOptions, run_commission, write_fields
 from disco_hw.first_use.procedure import MOST_SHARE
 from disco_hw.runtime.robot_setup import load_setup
 from sim.devices import odrive
@@ -193,6 +193,32 @@ def test_what_would_be_refused_is_not_written(tmp_path):
     with pytest.raises(WorkError, match="not changed"):
         write_fields(CommissionOptions(path, write=True), {("wheels", "turn_ratio"): -1.0})
     assert path.read_text(encoding="utf-8") == before
+
+
+def test_the_file_of_before_is_kept_byte_for_byte(tmp_path):
+    path = robot_file(tmp_path)
+    before = path.read_bytes().replace(b"\n", b"\r\n")
+    path.write_bytes(before)
+    assert write_fields(CommissionOptions(path, write=True), {("wheels", "sides_swapped"): True})
+    assert path.with_name(f"{path.name}.before").read_bytes() == before
+    assert load_setup(path).config.wheels.sides_swapped
+
+
+def test_a_place_that_cannot_be_written_is_one_line_and_leaves_robot_toml(tmp_path):
+    path = robot_file(tmp_path)
+    before = path.read_bytes()
+    path.with_name(f"{path.name}.before").mkdir()
+    there = sorted(tmp_path.iterdir())
+    with pytest.raises(WorkError, match=r"not changed \(Is a directory\)"):
+        write_fields(CommissionOptions(path, write=True), {("wheels", "sides_swapped"): True})
+    assert path.read_bytes() == before
+    assert sorted(tmp_path.iterdir()) == there
+
+
+def test_logs_that_could_not_be_kept_are_refused_before_anybody_is_asked(tmp_path):
+    path = robot_file(tmp_path)
+    with pytest.raises(InputError, match=r"is there and is no directory"):
+        run_commission(CommissionOptions(path, log_directory=path))
 
 
 def test_without_a_yes_nothing_is_written(tmp_path):

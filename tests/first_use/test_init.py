@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -59,6 +60,25 @@ def test_a_file_that_is_there_stays_unless_told_otherwise(tmp_path):
     assert out.read_text() == "mine"
     run_init(InitOptions(out, driver="reference", overwrite=True), None, quiet)
     assert "[robot]" in out.read_text(encoding="utf-8")
+
+
+UNFIT = {
+    "a directory": (lambda path: path, "is a directory"),
+    "under a file": (lambda path: Path(__file__) / "robot.toml", "is no directory"),
+    "a name that is too long": (lambda path: path / ("x" * 300), r"cannot be written \(File name too long\)"),
+    "a file system of the kernel": (lambda path: Path("/proc/self/robot.toml"), "cannot be written"),
+}
+
+
+@pytest.mark.parametrize(("place", "words"), UNFIT.values(), ids=UNFIT)
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_what_cannot_be_written_is_refused_in_one_line_and_nothing_is_left(tmp_path, place, words, overwrite):
+    out = place(tmp_path)
+    with pytest.raises(InputError, match=words) as refused:
+        run_init(InitOptions(out, driver="reference", overwrite=overwrite), None, quiet)
+    assert str(refused.value).startswith(f"{out}: ")
+    assert "\n" not in str(refused.value)
+    assert not list(tmp_path.iterdir())
 
 
 def test_without_a_controller_it_says_what_to_name(tmp_path):

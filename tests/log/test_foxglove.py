@@ -4,7 +4,7 @@ import typing
 import pytest
 
 from disco_hw.log.mcap_log import VIEWS, views
-from disco_hw.log.records import Command, Estimate, Event, Level, Plan
+from disco_hw.log.records import Command, Estimate, Event, Fan, Level, Plan
 from drivers.types import PoseSample
 
 WALL_NS = 1_700_000_000_123_456_789
@@ -56,6 +56,28 @@ def test_a_broken_estimate_is_shown_as_broken(broken):
     pose = shown(estimate(x_m=broken, yaw_rad=broken))["/view/estimate"].pose
     assert not math.isfinite(pose.position.x)
     assert math.isnan(pose.orientation.w)
+
+
+def test_rollouts_are_lines_the_fainter_the_less_they_weigh():
+    scene = shown(Fan(1, (0.5, 0.25), (0.0, 1.0, 2.0, 3.0), (4.0, 5.0, 6.0, 7.0)))["/view/rollouts"]
+    heavy, light = scene.entities[0].lines
+    assert [(point.x, point.y) for point in heavy.points] == [(0.0, 4.0), (1.0, 5.0)]
+    assert [(point.x, point.y) for point in light.points] == [(2.0, 6.0), (3.0, 7.0)]
+    assert (heavy.color.a, light.color.a) == pytest.approx((1.0, 0.575))
+
+
+@pytest.mark.parametrize(
+    ("fan", "points"),
+    [
+        (Fan(1, (0.0,), (1.0, 2.0), (3.0, 4.0)), 2),
+        (Fan(1, (math.nan,), (math.nan, math.inf), (3.0, 4.0)), 2),
+        (Fan(1, (1.0,), (1.0, 2.0), (3.0,)), 1),
+        (Fan(1, (1.0,), (), (3.0,)), 0),
+    ],
+)
+def test_broken_rollouts_are_shown_as_far_as_they_go(fan, points):
+    (line,) = shown(fan)["/view/rollouts"].entities[0].lines
+    assert len(line.points) == points
 
 
 def test_nothing_is_shown_of_a_plan_without_path_or_a_command():

@@ -21,6 +21,7 @@ from tools.log_samples import (
     drive_ticks,
     log_bytes,
     tick,
+    with_damaged_chunk,
     write_log,
 )
 from tools.viewer_run import ROBOT_FILE
@@ -112,10 +113,8 @@ def test_cut_at_every_tenth_the_log_reads_and_says_what_is_lost(tmp_path, tenth)
 
 
 def test_a_damaged_chunk_of_a_complete_log_is_an_error_with_the_remedy(tmp_path):
-    whole = bytearray(log_bytes(drive_ticks(300)))
-    whole[len(whole) // 2] ^= 1
     path = tmp_path / "bad.mcap"
-    path.write_bytes(whole)
+    path.write_bytes(with_damaged_chunk(log_bytes(drive_ticks(300))))
     with open_log(path) as log, pytest.raises(LogError, match=r"log recover") as refused:
         list(log.records())
     assert str(refused.value).count("\n") == 0

@@ -8,7 +8,7 @@ from disco_hw.errors import InputError, LogError
 from disco_hw.log.container import MAGIC
 from disco_hw.log.reader import open_log
 from disco_hw.log.recovery import recover
-from tools.log_samples import ATTACHMENTS, bits, drive_ticks, log_bytes
+from tools.log_samples import ATTACHMENTS, bits, drive_ticks, log_bytes, with_damaged_chunk
 
 WHOLE = log_bytes(drive_ticks(300), flush_every=10)
 
@@ -46,14 +46,23 @@ def test_a_recovered_log_is_whole_for_other_readers_too(tmp_path):
 
 def test_damage_inside_a_complete_log_costs_the_chunk(tmp_path):
     source, target = tmp_path / "bad.mcap", tmp_path / "mended.mcap"
-    damaged = bytearray(WHOLE)
-    damaged[len(WHOLE) // 2] ^= 1
-    source.write_bytes(damaged)
+    source.write_bytes(with_damaged_chunk(WHOLE))
     recovered = recover(source, target)
     assert len(recovered.lost) == 1
     assert len({tick for _, _, tick, _ in entries(target)}) == 290
     with open_log(target) as log:
         assert log.summary().missing_ticks == 10
+
+
+def test_damage_between_the_chunks_costs_nothing(tmp_path):
+    source, target, sound = tmp_path / "bad.mcap", tmp_path / "mended.mcap", tmp_path / "sound.mcap"
+    sound.write_bytes(WHOLE)
+    damaged = bytearray(WHOLE)
+    index = make_reader(io.BytesIO(WHOLE)).get_summary().chunk_indexes[9]
+    damaged[index.chunk_start_offset + index.chunk_length + index.message_index_length // 2] ^= 1
+    source.write_bytes(damaged)
+    assert not recover(source, target).lost
+    assert entries(target) == entries(source) == entries(sound)
 
 
 def test_the_source_is_not_touched_and_nothing_is_overwritten(tmp_path):

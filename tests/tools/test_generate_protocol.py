@@ -1,3 +1,4 @@
+import re
 import sys
 
 import pytest
@@ -37,7 +38,11 @@ def test_constants_say_what_the_dbc_says():
     assert f"#define DISCO_DBC_HASH (0x{protocol.dbc_hash:08X}u)\n" in constants
     assert "#define DISCO_WHEEL_COMMAND_LEFT_SPEED_PER_UNIT (500) /* rad/s */\n" in constants
     assert "#define DISCO_STATE_ARMED (3u)\n" in constants
-    assert "#define DISCO_HELLO_DATA_ID(major) ((uint16_t)0x140u)\n" in constants
+    assert "#define DISCO_DATA_ID(can_id, major) ((uint16_t)((can_id) ^ ((uint32_t)(major) << 11)))\n" in constants
+    made = re.findall(r"#define DISCO_(\w+)_DATA_ID\(major\) DISCO_DATA_ID\((0x\w+)u, (0u|major)\)\n", constants)
+    ids = {name: int(can_id, 16) ^ (protocol.major if major == "major" else 0) << 11 for name, can_id, major in made}
+    assert ids == {message.name: message.data_id for message in protocol.messages if message.data_id is not None}
+    assert ids["HELLO"] == 0x140
 
 
 def test_two_tables_under_one_name_are_refused():
