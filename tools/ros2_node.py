@@ -57,7 +57,7 @@ def main(domain: str, kind: str, east: str, north: str, heading: str) -> None:
             at_x = x + math.cos(yaw) * place.x - math.sin(yaw) * place.y
             at_y = y + math.sin(yaw) * place.x + math.cos(yaw) * place.y
             half = 0.5 * (yaw + 2.0 * math.atan2(turned.z, turned.w))
-            pose = msg.Pose(msg.Point(at_x, at_y, 0.0), msg.Quaternion(0.0, 0.0, math.sin(half), math.cos(half)))
+            pose = msg.RosPose(msg.Point(at_x, at_y, 0.0), msg.Quaternion(0.0, 0.0, math.sin(half), math.cos(half)))
             message = msg.PoseStamped(msg.Header(heard.header.stamp, "map"), pose)
             times = 1
             if wrong:

@@ -53,7 +53,7 @@ _SAID: tuple[tuple[str, type, Qos], ...] = (
     (out.ODOM, msg.Odometry, _RELIABLE),
     (out.JOINT_STATES, msg.JointState, _RELIABLE),
     (out.TF, msg.TFMessage, _RELIABLE),
-    (out.PLAN, msg.Path, _RELIABLE),
+    (out.PLAN, msg.RosPath, _RELIABLE),
     (out.POSE, msg.PoseWithCovarianceStamped, _RELIABLE),
     (out.STATE, msg.String, _LATCHED),
     (out.DIAGNOSTICS, msg.DiagnosticArray, _RELIABLE),

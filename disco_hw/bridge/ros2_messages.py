@@ -70,7 +70,7 @@ class Quaternion(IdlStruct, typename="geometry_msgs::msg::dds_::Quaternion_"):
 
 
 @dataclass
-class Pose(IdlStruct, typename="geometry_msgs::msg::dds_::Pose_"):
+class RosPose(IdlStruct, typename="geometry_msgs::msg::dds_::Pose_"):
     """Place and heading."""
 
     position: Point = field(default_factory=Point)
@@ -85,7 +85,7 @@ def _zeros() -> list[float]:
 class PoseWithCovariance(IdlStruct, typename="geometry_msgs::msg::dds_::PoseWithCovariance_"):
     """`covariance`: 6 x 6 of x, y, z and the rotations about them, row by row."""
 
-    pose: Pose = field(default_factory=Pose)
+    pose: RosPose = field(default_factory=RosPose)
     covariance: array[float64, 36] = field(default_factory=_zeros)
 
 
@@ -94,7 +94,7 @@ class PoseStamped(IdlStruct, typename="geometry_msgs::msg::dds_::PoseStamped_"):
     """A pose at a time."""
 
     header: Header = field(default_factory=Header)
-    pose: Pose = field(default_factory=Pose)
+    pose: RosPose = field(default_factory=RosPose)
 
 
 @dataclass
@@ -140,7 +140,7 @@ class Odometry(IdlStruct, typename="nav_msgs::msg::dds_::Odometry_"):
 
 
 @dataclass
-class Path(IdlStruct, typename="nav_msgs::msg::dds_::Path_"):
+class RosPath(IdlStruct, typename="nav_msgs::msg::dds_::Path_"):
     """Poses one after the other."""
 
     header: Header = field(default_factory=Header)

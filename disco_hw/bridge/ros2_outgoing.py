@@ -151,10 +151,10 @@ class Outgoing:
             y = estimate.y_m - (math.sin(yaw) * held.x_m + math.cos(yaw) * held.y_m)
             yield TF, msg.TFMessage([self._transform(self._map, ODOM_FRAME, (x, y, yaw), wall_ns)])
 
-    def _path(self, plan: records.Plan, wall_ns: int) -> msg.Path:
+    def _path(self, plan: records.Plan, wall_ns: int) -> msg.RosPath:
         header = msg.Header(msg.stamp_of(wall_ns), self._map)
         points = zip(plan.path_x_m, plan.path_y_m, plan.path_yaw_rad, strict=True)
-        return msg.Path(header, [msg.PoseStamped(header, _pose(*point)) for point in points])
+        return msg.RosPath(header, [msg.PoseStamped(header, _pose(*point)) for point in points])
 
     def _transform(self, parent: str, child: str, at: tuple[float, float, float], wall_ns: int) -> msg.TransformStamped:
         pose = _pose(*at)
@@ -162,9 +162,9 @@ class Outgoing:
         return msg.TransformStamped(msg.Header(msg.stamp_of(wall_ns), parent), child, place)
 
 
-def _pose(x_m: float, y_m: float, yaw_rad: float) -> msg.Pose:
+def _pose(x_m: float, y_m: float, yaw_rad: float) -> msg.RosPose:
     half = 0.5 * yaw_rad
-    return msg.Pose(msg.Point(x_m, y_m, 0.0), msg.Quaternion(0.0, 0.0, math.sin(half), math.cos(half)))
+    return msg.RosPose(msg.Point(x_m, y_m, 0.0), msg.Quaternion(0.0, 0.0, math.sin(half), math.cos(half)))
 
 
 def _six(covariance: Matrix3) -> list[float]:

@@ -63,8 +63,8 @@ class PoseInlet:
             return "not newer than the one before", None
         if mono_ns - self._passed_ns < _SHORTEST_NS:
             return "more than 250 a second", None
-        pose = message.pose if isinstance(message.pose, msg.Pose) else message.pose.pose
-        spread = None if isinstance(message.pose, msg.Pose) else message.pose.covariance
+        pose = message.pose if isinstance(message.pose, msg.RosPose) else message.pose.pose
+        spread = None if isinstance(message.pose, msg.RosPose) else message.pose.covariance
         place, turned = pose.position, pose.orientation
         norm = turned.x**2 + turned.y**2 + turned.z**2 + turned.w**2
         if not (math.isfinite(place.x + place.y + norm) and abs(norm - 1.0) < _UNIT_MARGIN):

@@ -20,7 +20,7 @@ from disco_hw.daemon.loop import MonotonicClock
 from disco_hw.drive.keyboard import Keyboard, KeyHold
 from disco_hw.errors import InputError, WorkError
 from disco_hw.files import ROBOT_TOML, read_bytes
-from disco_hw.first_use.judgement import Judgement, judge_floor, judge_sides, judge_turns
+from disco_hw.first_use.judgement import Findings, judge_floor, judge_sides, judge_turns
 from disco_hw.first_use.pilot import CommissionPilot
 from disco_hw.first_use.procedure import Procedure, Steps, floor, sides, turns
 from disco_hw.first_use.robot_text import in_toml, with_fields
@@ -35,26 +35,26 @@ _DOWN = "on the floor, with one and a half metres free around it"
 
 
 @dataclass(frozen=True, slots=True)
-class Stage:
+class GuidedStage:
     """A part of the drive: where the robot is, what is driven, and what that says of a robot."""
 
     name: str
     where: str
     steps: Callable[[Robot, float], Steps]
-    judge: Callable[[Any, Setup], Judgement]
+    judge: Callable[[Any, Setup], Findings]
     raw_poses: bool = False
 
 
-def _judge_turns(seen: Any, setup: Setup) -> Judgement:
+def _judge_turns(seen: Any, setup: Setup) -> Findings:
     link = setup.config.link
     card = find_driver(link.driver).safety_card(link.settings())
     return judge_turns(seen, setup.config.wheels, card.reaction_s, card.brakes)
 
 
 STAGES = (
-    Stage("sides", _UP, sides, lambda seen, of: judge_sides(seen, of.config.wheels, of.config.robot)),
-    Stage("turns", _UP, turns, _judge_turns),
-    Stage(
+    GuidedStage("sides", _UP, sides, lambda seen, of: judge_sides(seen, of.config.wheels, of.config.robot)),
+    GuidedStage("turns", _UP, turns, _judge_turns),
+    GuidedStage(
         "floor",
         _DOWN,
         floor,
@@ -135,7 +135,9 @@ def run_commission(options: CommissionOptions, ask: Callable[[str], str] = input
     return CommissionResult(tuple(told), ok=True)
 
 
-def _through(stage: Stage, options: CommissionOptions, ask: Callable[[str], str], told: list[dict[str, Any]]) -> bool:
+def _through(
+    stage: GuidedStage, options: CommissionOptions, ask: Callable[[str], str], told: list[dict[str, Any]]
+) -> bool:
     """Drive one stage until it finds nothing; whether it did."""
     ask(f"\n{stage.name}: put the robot {stage.where}, somebody at its stop button; then press Enter ")
     for _ in range(_MOST_TRIES):
@@ -188,7 +190,7 @@ def write_fields(
     return True
 
 
-def _drive(stage: Stage, setup: Setup, options: CommissionOptions) -> Any:
+def _drive(stage: GuidedStage, setup: Setup, options: CommissionOptions) -> Any:
     """One drive through the daemon; what its procedure returned. Raises WorkError if the person gave up."""
     stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
     log = _log_directory(options, setup) / f"{setup.config.robot.name}-commission-{stage.name}-{stamp}.mcap"

@@ -50,7 +50,7 @@ class Fault:
 
 
 @dataclass(frozen=True)
-class Judgement:
+class Findings:
     """Faults, and figures for a person: what was measured, in words."""
 
     faults: tuple[Fault, ...] = ()
@@ -62,7 +62,7 @@ class Judgement:
         return {place: value for fault in self.faults for place, value in fault.edits.items()}
 
 
-def judge_sides(seen: Sequence[SideSeen], wiring: Wiring, robot: Robot) -> Judgement:
+def judge_sides(seen: Sequence[SideSeen], wiring: Wiring, robot: Robot) -> Findings:
     """Which motor and encoder is on which side, and which way round; `wiring`: what robot.toml says of that."""
     faults: list[Fault] = []
     figures = [_dead_band(side, one.track) for side, one in enumerate(seen)]
@@ -84,8 +84,8 @@ def judge_sides(seen: Sequence[SideSeen], wiring: Wiring, robot: Robot) -> Judge
         both = f"both commands turned the {SIDES[turned[0]]} side; give each side its own node, or look at the cables"
         faults.append(Fault("one side for both", both))
     if faults:
-        return Judgement(tuple(faults), tuple(figures))
-    return Judgement(tuple(_wiring_faults(seen, wiring)), tuple(figures))
+        return Findings(tuple(faults), tuple(figures))
+    return Findings(tuple(_wiring_faults(seen, wiring)), tuple(figures))
 
 
 def _still(side: int, track: Track) -> str:
@@ -181,7 +181,7 @@ def _dead_band(side: int, track: Track) -> str:
     return f"{SIDES[side]}: begins to turn at a command of {command:.2f} rad/s"
 
 
-def judge_turns(seen: TurnsSeen, wiring: Wiring, reaction_s: float, brakes: bool) -> Judgement:
+def judge_turns(seen: TurnsSeen, wiring: Wiring, reaction_s: float, brakes: bool) -> Findings:
     """Ticks a turn, and whether the robot stopped by itself; `reaction_s`: how soon the driver's safety card says."""
     faults, figures = [], []
     shares = [abs(track.turned()[side]) / (2.0 * math.pi) for side, track in enumerate(seen.turns)]
@@ -222,7 +222,7 @@ def judge_turns(seen: TurnsSeen, wiring: Wiring, reaction_s: float, brakes: bool
                 f"the robot began to stop {begun_s:.2f} s after the last command, and should within {reaction_s:.2f} s"
             )
             faults.append(Fault("watchdog late", f"{late}; set its time as `disco-hw check` says"))
-    return Judgement(tuple(faults), tuple(figures))
+    return Findings(tuple(faults), tuple(figures))
 
 
 def _standing(still_s: float | None) -> str:
@@ -272,7 +272,7 @@ def _response(track: Track) -> list[tuple[str, str]]:
     return [("command to wheel", f"{max(0.0, (came - asked) * 1e-6):.0f} ms")]
 
 
-def judge_floor(seen: FloorSeen, told: PoseConvention, robot: Robot) -> Judgement:
+def judge_floor(seen: FloorSeen, told: PoseConvention, robot: Robot) -> Findings:
     """In what units and about which axes the poses are, where the sensor sits, and how late it is.
 
     The poses are as the source sent them; `told` is what robot.toml says of them.
@@ -280,14 +280,14 @@ def judge_floor(seen: FloorSeen, told: PoseConvention, robot: Robot) -> Judgemen
     legs = (seen.straight, seen.left, seen.right, seen.straight_again)
     if any(len(leg.poses) < 5 for leg in legs):
         where = "no pose came" if not any(leg.poses for leg in legs) else "poses came only now and then"
-        return Judgement((Fault("no poses", f"{where} while driving; look at [pose] and at what sends them"),))
+        return Findings((Fault("no poses", f"{where} while driving; look at [pose] and at what sends them"),))
     fits = [fit for choice in _CHOICES if (fit := _fit(seen, choice, robot)) is not None]
     if not fits:
         text = (
             "the poses do not follow the robot in any units or axes; does the sensor see this robot, is its frame "
             "fixed to the floor, and did the wheels slip?"
         )
-        return Judgement((Fault("poses do not follow", text),))
+        return Findings((Fault("poses do not follow", text),))
     # What robot.toml says is believed where it explains the drive.
     best = min(
         fits, key=lambda fit: (fit.mismatch_rad > _SAME_RAD, not _same_units(fit.convention, told), fit.mismatch_rad)
@@ -306,7 +306,7 @@ def judge_floor(seen: FloorSeen, told: PoseConvention, robot: Robot) -> Judgemen
             )
         )
     figures += _places(seen, best)
-    return Judgement(tuple(faults), tuple(figures))
+    return Findings(tuple(faults), tuple(figures))
 
 
 _SAME_RAD = 0.35

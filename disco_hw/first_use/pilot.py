@@ -7,7 +7,7 @@ from typing import Any
 
 from disco_hw.drive.hand_pilot import Deadman
 from disco_hw.drive.source import ManualInput, ManualSource, RobotView
-from disco_hw.first_use.procedure import Ask, Drive, Procedure, Reset, Seen, Silence
+from disco_hw.first_use.procedure import Ask, DriveWheels, Procedure, Reset, Seen, Silence
 from disco_hw.runtime.core import CoreTick
 from disco_hw.runtime.pilot import PilotTick
 from disco_hw.runtime.pipeline import Manual, Motion, Silent, Source
@@ -59,8 +59,8 @@ class CommissionPilot:
         action = self.procedure.action
         newest, self._held = held, held is not None and held.deadman
         if held is not None:
-            left, right = action.wheels if isinstance(action, Drive) else (0.0, 0.0)
-            newest = ManualInput(held.t_ns, left, right, held.deadman and isinstance(action, Drive | Silence))
+            left, right = action.wheels if isinstance(action, DriveWheels) else (0.0, 0.0)
+            newest = ManualInput(held.t_ns, left, right, held.deadman and isinstance(action, DriveWheels | Silence))
         verdict = self._deadman.step(now_ns, newest, state)
         motion: Motion = verdict.motion
         if isinstance(action, Silence) and isinstance(motion, Manual):
@@ -81,7 +81,9 @@ class CommissionPilot:
         self._driving = command is not None and tick.pipeline.source is Source.MANUAL
         commanded = (command.left_rad_s, command.right_rad_s) if command is not None and self._driving else None
         fault, silent = tick.output.state is State.FAULT, tick.pipeline.source is Source.SILENT
-        self._fault_ns = (self._fault_ns or now_ns) if fault and isinstance(self.procedure.action, Drive) else None
+        self._fault_ns = (
+            (self._fault_ns or now_ns) if fault and isinstance(self.procedure.action, DriveWheels) else None
+        )
         if self._fault_ns is not None and now_ns - self._fault_ns > _FAULT_NS:
             self.trouble = tick.output.detail
         self.procedure.see(

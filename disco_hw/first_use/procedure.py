@@ -39,7 +39,7 @@ _SHORT_M = 0.25
 
 
 @dataclass(frozen=True, slots=True)
-class Drive:
+class DriveWheels:
     """Drive at these wheel speeds (rad/s, left and right) while the deadman is held; `todo`: for the person."""
 
     wheels: Wheels
@@ -68,7 +68,7 @@ class Reset:
     todo: str
 
 
-Action = Drive | Silence | Ask | Reset
+Action = DriveWheels | Silence | Ask | Reset
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,7 +169,7 @@ def _ramp(side: int, top_rad_s: float) -> Steps:
         while not over:
             elapsed_s = (track.commands[-1][0] - start_ns) * 1e-9 if track.commands else 0.0
             speed = top_rad_s * MOST_SHARE * min(1.0, elapsed_s / _RAMP_S)
-            seen: Seen = yield Drive((speed, 0.0) if side == 0 else (0.0, speed), todo)
+            seen: Seen = yield DriveWheels((speed, 0.0) if side == 0 else (0.0, speed), todo)
             if not seen.driving and track.commands:
                 break
             if seen.driving:
@@ -192,7 +192,7 @@ def _rest(track: Track, seconds: float, todo: str) -> Steps:
     """Hold zero for so long, recorded; a deadman that is let go here is as good. Returns the last tick."""
     end_ns = 0
     while True:
-        seen: Seen = yield Drive((0.0, 0.0), todo)
+        seen: Seen = yield DriveWheels((0.0, 0.0), todo)
         end_ns = end_ns or seen.now_ns + round(seconds * 1e9)
         track.add(seen)
         if seen.now_ns >= end_ns:
@@ -227,7 +227,7 @@ def turns(robot: Robot, slowest_rad_s: float = 0.0) -> Steps:
 def _until_let_go(wheels: Wheels, todo: str) -> Steps:
     track = Track()
     while True:
-        seen: Seen = yield Drive(wheels, todo)
+        seen: Seen = yield DriveWheels(wheels, todo)
         if seen.driving:
             track.add(seen)
             if (seen.now_ns - track.commands[0][0]) * 1e-9 > _TURNS_LIMIT_S:
@@ -241,7 +241,9 @@ def _watchdog(wheels: Wheels) -> Steps:
     while True:
         track = Track()
         while not track.commands or (track.commands[-1][0] - track.commands[0][0]) * 1e-9 < _BEFORE_SILENCE_S:
-            seen: Seen = yield Drive(wheels, "hold: both sides turn, then this computer falls silent for a moment")
+            seen: Seen = yield DriveWheels(
+                wheels, "hold: both sides turn, then this computer falls silent for a moment"
+            )
             if not seen.driving and track.commands:
                 break
             if seen.driving:
@@ -300,14 +302,14 @@ def _leg(robot: Robot, wheels: Wheels, travel_m: float, what: str) -> Steps:
     limit_s = 1.5 * travel_m / (max(wheels) * robot.wheel_radius_m)
     track, driven_ns, last_ns = Track(), 0, 0
     while not track.commands or not _at_rest_long(track):
-        seen: Seen = yield Drive((0.0, 0.0), f"hold: {what}")
+        seen: Seen = yield DriveWheels((0.0, 0.0), f"hold: {what}")
         if seen.driving:
             track.add(seen)
     while driven_ns * 1e-9 < limit_s:
         left, right = track.turned()
         if 0.5 * (abs(left) + abs(right)) * robot.wheel_radius_m >= travel_m:
             break
-        seen = yield Drive(wheels, f"hold: {what}")
+        seen = yield DriveWheels(wheels, f"hold: {what}")
         driven_ns += seen.now_ns - last_ns if seen.driving and last_ns else 0
         last_ns = seen.now_ns
         track.add(seen)

@@ -27,7 +27,7 @@ MS = 1_000_000
 
 
 def pose_message(age_ns=20 * MS, frame="map", x=1.0, yaw=2.5, kind=msg.PoseStamped, covariance=None):
-    pose = msg.Pose(msg.Point(x, -2.0, 0.3), msg.Quaternion(0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2)))
+    pose = msg.RosPose(msg.Point(x, -2.0, 0.3), msg.Quaternion(0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2)))
     header = msg.Header(msg.stamp_of(WALL_NS - age_ns), frame)
     if kind is msg.PoseStamped:
         return kind(header, pose)
@@ -72,7 +72,7 @@ def test_a_covariance_becomes_standard_deviations_the_larger_of_the_position():
         (pose_message(kind=msg.Odometry, covariance=covariance(-1.0, 1.0, 1.0)), "covariance"),
         (pose_message(kind=msg.Odometry, covariance=covariance(1.0, math.nan, 1.0)), "covariance"),
         (
-            msg.PoseStamped(msg.Header(msg.stamp_of(WALL_NS), "map"), msg.Pose(msg.Point(), msg.Quaternion(w=0.0))),
+            msg.PoseStamped(msg.Header(msg.stamp_of(WALL_NS), "map"), msg.RosPose(msg.Point(), msg.Quaternion(w=0.0))),
             "heading",
         ),
     ],

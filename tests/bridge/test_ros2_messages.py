@@ -50,7 +50,7 @@ def filled(kind, seed=1):
 
 
 ELEMENTS = {
-    ("Path", "poses"): msg.PoseStamped,
+    ("RosPath", "poses"): msg.PoseStamped,
     ("TFMessage", "transforms"): msg.TransformStamped,
     ("DiagnosticStatus", "values"): msg.KeyValue,
     ("DiagnosticArray", "status"): msg.DiagnosticStatus,

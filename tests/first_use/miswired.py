@@ -16,7 +16,7 @@ from disco_hw.experiments.live_stack import DEVICES
 from disco_hw.experiments.simulated_time import SimulatedRun
 from disco_hw.first_use.commission import as_sent, slowest_rad_s
 from disco_hw.first_use.pilot import CommissionPilot
-from disco_hw.first_use.procedure import Ask, Drive, Procedure, speed_of
+from disco_hw.first_use.procedure import Ask, DriveWheels, Procedure, speed_of
 from disco_hw.runtime.pipeline import NoPlanner
 from disco_hw.runtime.robot_setup import load_setup
 from disco_hw.runtime.states import State
@@ -174,7 +174,7 @@ class Person:
     def poll(self, now_ns, robot):
         self.look()
         wanted = self.action is not None and not isinstance(self.action, Ask)
-        counting = isinstance(self.action, Drive) and "exactly once" in self.action.todo
+        counting = isinstance(self.action, DriveWheels) and "exactly once" in self.action.todo
         if counting and max(map(abs, self.turned())) >= 2.0 * math.pi:
             self._let_go = True
         if not counting:
@@ -185,7 +185,12 @@ class Person:
             self._held_ns, self._from = now_ns, tuple(self.angles)
             self.strokes += 1
             return ManualInput(now_ns, 0.0, 0.0, deadman=False)
-        if held and not robot.driving and isinstance(self.action, Drive) and now_ns - self._held_ns > 3_000_000_000:
+        if (
+            held
+            and not robot.driving
+            and isinstance(self.action, DriveWheels)
+            and now_ns - self._held_ns > 3_000_000_000
+        ):
             held = False
         if not held:
             self._held_ns = None
