@@ -24,6 +24,8 @@ SAMPLES = 3
 _OPPOSITE_PART = 0.25
 _CROSSED_COSINE, _STRAIGHT_COSINE = 0.97, 0.93
 _SLIP_PART = 0.15
+_UNKNOWN_PART = 0.2
+"""Of the way: a radius that is written down wrongly and slip that lasts, which every pose shows alike."""
 _ENOUGH, _MOST_OF_ONE = 10.0, 4.0
 """Of log-likelihood against what robot.toml says, in all and by one pose."""
 _LARGEST_TURN_RAD = 1.5
@@ -145,7 +147,7 @@ class Directions:
             far_m = 0.5 * self._radius_m * (abs(turned[0]) + abs(turned[1]))
             arc_std_m = 0.5 * self._track_m * pose.yaw_std_rad
             variance = 2.0 * (pose.position_std_m**2 + arc_std_m**2) + (_SLIP_PART * far_m) ** 2
-            off_told = self._off_m(ahead_m, yaw, turned, *told)
+            off_told = max(0.0, self._off_m(ahead_m, yaw, turned, *told) - _UNKNOWN_PART * far_m)
             for wired in self._evidence:
                 off = self._off_m(ahead_m, yaw, turned, *wired)
                 gain = 0.5 * (off_told**2 - off**2) / max(variance, 1e-9)

@@ -59,19 +59,20 @@ def test_following_a_path_costs_nothing_and_standing_costs_the_speed():
     for cost in (by_length, by_time):
         assert cost(moving, still, still, np.full((5, 1), 0.2))[0] == pytest.approx(0.0, abs=1e-9)
     # As dear as being STANDING_M beside it.
-    assert by_length(still, still, still, still[1:])[0] == pytest.approx(5 * 0.4)
+    assert by_length(still, still, still, still[1:])[0] == pytest.approx(5 * 0.2)
     assert by_time(still, still, still, still[1:])[0] == pytest.approx(0.02 * 15)
 
 
-def test_going_backwards_costs_twice_the_speed_and_facing():
+def test_going_backwards_costs_the_whole_speed_and_facing():
     line = Waypoints(np.array([[0.0, 0.0], [2.0, 0.0]]), np.array([0.0, 10.0]))
     moving, still = 0.02 * np.arange(6)[:, None], np.zeros((6, 1))
     back, across = np.full((6, 1), math.pi), np.full((6, 1), 0.5 * math.pi)
     by_length = path_cost(path_along(line, 0.2), 0.0, 0.1)
     by_time = timed_path_cost(TimedPathCost(line), 0.0, 0.1)
-    assert by_length(moving, still, back, np.full((5, 1), -0.2))[0] == pytest.approx(5 * (2 * 0.4 + 0.6))
-    # Sideways, as in turning about a point ahead, is no progress, but not against the way.
-    assert by_length(moving, still, across, still[1:])[0] == pytest.approx(5 * 0.4)
+    assert by_length(moving, still, back, np.full((5, 1), -0.2))[0] == pytest.approx(5 * (0.2 + 0.6))
+    # Sideways, as in sliding round a corner, is progress as long as the robot does not drive backwards.
+    assert by_length(moving, still, across, still[1:])[0] == pytest.approx(0.0, abs=1e-9)
+    assert by_length(moving, still, across, np.full((5, 1), -0.1))[0] == pytest.approx(5 * 0.1)
     assert by_time(moving, still, back, np.full((5, 1), -0.2))[0] == pytest.approx(5 * 0.6)
 
 
@@ -79,7 +80,7 @@ def test_the_last_distance_of_a_path_counts_for_a_second_more():
     line = Waypoints(np.array([[0.0, 0.0], [2.0, 0.0]]))
     beside, still = np.full((6, 1), 0.3), np.zeros((6, 1))
     cost = path_cost(path_along(line, 0.2), 50.0, 0.1)
-    expected = 5 * math.hypot(0.3, 0.4) + 10 * 0.3
+    expected = 5 * math.hypot(0.3, 0.2) + 10 * 0.3
     assert cost(np.ones((6, 1)), beside, still, still[1:])[0] == pytest.approx(expected)
 
 
@@ -93,7 +94,7 @@ def test_a_place_does_not_leave_its_piece():
     beyond = 0.02 * np.arange(5)
     wanted = np.array([0.02, *np.zeros(4)])
     along = np.array([0.2, *np.minimum(beyond[1:] / 0.1, 0.2)])
-    assert got == pytest.approx(np.hypot(beyond, 2.0 * (wanted - along)).sum() + 10 * beyond[-1])
+    assert got == pytest.approx(np.hypot(beyond, wanted - along).sum() + 10 * beyond[-1])
 
 
 def test_a_pendulum_that_balances_costs_nothing():

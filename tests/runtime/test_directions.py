@@ -11,6 +11,7 @@ from disco_hw.runtime.states import State
 from disco_hw.runtime.supervisor import UserRequest
 from drivers.motor.wiring import AS_TOLD, Wiring, rewired
 from drivers.types import PoseSample, WheelCommand, WheelSample
+from sim.plant_parameters import PlantParameters
 from tests.drivers.motor.vendors import VENDORS
 from tests.runtime.simulated import simulated_stack
 
@@ -176,3 +177,13 @@ def test_ten_minutes_of_driving_keep_no_more_than_the_first_seconds():
     after, _ = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert after - before < 10_000
+
+
+@pytest.mark.parametrize(("radius", "axle", "seed"), [(1.0, 1.0, 2), (0.85, 1.2, 3), (1.18, 0.8, 4), (1.15, 1.15, 5)])
+def test_a_robot_whose_geometry_is_written_down_wrongly_is_not_taken_for_miswired(radius, axle, seed):
+    told = PlantParameters()
+    run = simulated_stack(
+        seed=seed, wheel_radius_m=radius * told.wheel_radius_m, axial_distance_m=axle * told.axial_distance_m
+    )
+    run.start()
+    assert all("wheels." not in tick.output.detail for tick in run.ticks(4.0))

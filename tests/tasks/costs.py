@@ -105,7 +105,7 @@ def path_cost(task: PathCost, place: float, step_s: float, x_icr_m: float = 0.0)
             at = at + along / path.spacing_m
             at = np.mod(at, last) if endless else np.clip(at, first, last)
             off_x, off_y, along_x, along_y = off(at, x_now, y_now)
-            missing = weight * (wanted - np.minimum(along / step_s, forward_now))
+            missing = weight * (wanted - np.minimum(along / step_s, forward_now + wanted))
             total += np.hypot(np.hypot(off_x, off_y), missing) + facing_cost(yaw_now, along_x, along_y)
         swung = TURN_WEIGHT * abs(rounded_m) * turned_away(yaw[-1] - turned(at))
         return np.asarray(total + TERMINAL_M / (task.speed_m_s * step_s) * np.hypot(np.hypot(off_x, off_y), swung))
