@@ -271,12 +271,13 @@ class Disco:
     def _draw_guide(self, system: SkidSteer, before: tuple[float, float]) -> bool:
         """Set the guide for the next step; returns whether the task has a line to be guided along."""
         if self._settings.guide_below <= 0.0 or not hasattr(system.task, "line_at"):
+            self._optimiser.sample_guide(False)
             return False
         optimiser = self._optimiser
+        optimiser.sample_guide(True)
         commands, step_s = optimiser.work.guide, self._settings.step_s
         arguments = commands, system.task, system.start, self._chassis, *before, optimiser.limits, step_s
         if self._guide is None:
-            optimiser.sample_guide()
             self._guide = compiled_for(guide, *arguments)
         self._guide(*arguments)
         return True

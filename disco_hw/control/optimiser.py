@@ -109,9 +109,9 @@ class Optimiser:
         """Continue from this plan, (T, C)."""
         self._work.nominal[:] = commands
 
-    def sample_guide(self) -> None:
-        """Let sample 1 be the commands that stand in `work.guide` at a step, from the next one on."""
-        self._samplings["with_guide"] = True
+    def sample_guide(self, wanted: bool) -> None:
+        """Whether sample 1 is the commands that stand in `work.guide` at a step, from the next one on."""
+        self._samplings["with_guide"] = wanted
 
     @property
     def limits(self) -> Limits:

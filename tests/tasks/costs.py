@@ -63,7 +63,9 @@ def facing_cost(yaw: Array, along_x: Array | float, along_y: Array | float) -> A
     return AGAINST_M * np.maximum(-(np.cos(yaw) * along_x + np.sin(yaw) * along_y), 0.0)
 
 
-def path_cost(task: PathCost, place: float, step_s: float, x_icr_m: float = 0.0) -> SequenceCost:
+def path_cost(
+    task: PathCost, place: float, step_s: float, x_icr_m: float = 0.0, farthest_m: float = FARTHEST_STEP_M
+) -> SequenceCost:
     """Cost of paths (T + 1, K) along way-points by arc length, from a place (entries of the table); see `PathCost`.
 
     Every step moves the place by its projection on the path's direction there, within the place's piece. The last
@@ -98,7 +100,7 @@ def path_cost(task: PathCost, place: float, step_s: float, x_icr_m: float = 0.0)
         at, total = np.full(x.shape[1], place), np.zeros(x.shape[1])
         for x_now, y_now, yaw_now, forward_now in zip(x[1:], y[1:], yaw[1:], forward, strict=True):
             off_x, off_y, along_x, along_y = off(at, x_now, y_now)
-            along = np.clip(off_x * along_x + off_y * along_y, -FARTHEST_STEP_M, FARTHEST_STEP_M)
+            along = np.clip(off_x * along_x + off_y * along_y, -farthest_m, farthest_m)
             wanted = np.full(at.shape, task.speed_m_s)
             if not endless:
                 wanted = np.minimum(wanted, (last - at) * path.spacing_m / SLOW_DOWN_S)

@@ -17,7 +17,7 @@ from disco_hw.effects.registry import MOTION_EFFECTS
 from disco_hw.model import EffectSetting, Gaussian, Model
 from disco_hw.model import plain as physics
 from disco_hw.tasks.circle import CircleCost
-from disco_hw.tasks.line.cost import PathCost
+from disco_hw.tasks.line.cost import FARTHEST_STEP_M, PathCost
 from disco_hw.tasks.line.waypoints import Waypoints
 from disco_hw.tasks.timed_path import TimedPathCost
 from tests.tasks.costs import circle_cost, path_along, path_cost, timed_path_cost
@@ -123,25 +123,19 @@ NUDGE_RAD_S, NUDGES_M, EDGE, STEEP = 1e-5, ((1e-5, 1e-5), (1e-5, -1e-5)), 2e-5, 
 FEW = 0.1
 
 
-def sequence_cost(task, place, x_icr_m):
+def sequence_cost(task, place, x_icr_m, farther=1.0):
     match task:
         case CircleCost():
             return circle_cost(task, STEP_S, x_icr_m)
         case PathCost():
-            return path_cost(task, place, STEP_S, x_icr_m)
+            return path_cost(task, place, STEP_S, x_icr_m, farther * FARTHEST_STEP_M)
         case TimedPathCost():
             return timed_path_cost(task, 0.0, STEP_S)
 
 
-def check_against_reference(model, state, task, plan_settings, seed):
-    """Plan twice and check every cost, the weights and the update of the second step."""
-    disco = Disco(model, task, plan_settings, LIMITS, seed)
-    now_ns = state.t_ns
-    before = disco.plan(now_ns, state).wheel_speeds
-    disco.plan(now_ns, state)
+def sampled_commands(disco, before, sampler, state):
+    """The commands (K, T, 2) of the last step, of a plan that continued from `before`."""
     work = disco.optimiser.work
-
-    sampler = plan_settings.sampler
     noise = work.noise.reshape(-1, work.noise.size // work.weights.size, int(BLOCK)).swapaxes(0, 1)
     noise = noise.reshape(noise.shape[0], -1)[: sampler.knots * 2, : sampler.samples].astype(float)
     first, weights = spline_basis(sampler.knots, sampler.horizon)
@@ -152,14 +146,30 @@ def check_against_reference(model, state, task, plan_settings, seed):
     assert np.all(np.abs(anchor - (last.left_rad_s, last.right_rad_s)) <= 12.0)
     change = LIMITS.acceleration_rad_s2 * STEP_S
     commands = oracle.limited(before, spread, anchor, LIMITS.speed_rad_s, change)
+    if disco._guide is not None:
+        # What the guide is has its own tests.
+        commands[1] = work.guide
+    return commands
+
+
+def check_against_reference(model, state, task, plan_settings, seed):
+    """Plan twice and check every cost, the weights and the update of the second step."""
+    disco = Disco(model, task, plan_settings, LIMITS, seed)
+    now_ns = state.t_ns
+    before = disco.plan(now_ns, state).wheel_speeds
+    disco.plan(now_ns, state)
+    work = disco.optimiser.work
+
+    sampler, guided = plan_settings.sampler, disco._guide is not None
+    commands = sampled_commands(disco, before, sampler, state)
 
     theta, point_weights = unscented_points(model, plan_settings.ut_alpha)
     weighed = point_weights != 0.0
     past = command_history(state.sent, now_ns, STEP_S, 8, (state.left_speed_rad_s, state.right_speed_rad_s))
     start = physics.RobotState(state.x_m, state.y_m, state.yaw_rad, state.left_speed_rad_s, state.right_speed_rad_s)
-    cost = sequence_cost(task, disco._memory, disco._x_icr_m)
 
-    def costs_of(sequences, x_m=0.0, y_m=0.0):
+    def costs_of(sequences, x_m=0.0, y_m=0.0, farther=1.0):
+        cost = sequence_cost(task, disco._memory, disco._x_icr_m, farther)
         names = model.parameter_names
         begin = replace(start, x=start.x + x_m, y=start.y + y_m)
         return np.array(
@@ -174,6 +184,8 @@ def check_against_reference(model, state, task, plan_settings, seed):
     def beyond_single_precision(sequences):
         there_and_back = [(costs_of(sequences + NUDGE_RAD_S), costs_of(sequences - NUDGE_RAD_S))]
         there_and_back += [(costs_of(sequences, x, y), costs_of(sequences, -x, -y)) for x, y in NUDGES_M]
+        # Far off, a place moves on by the most that it may, which can be to just between two pieces.
+        there_and_back.append((costs_of(sequences, farther=1.0 + 1e-6), costs_of(sequences, farther=1.0 - 1e-6)))
         middle = costs_of(sequences)
         edge = [np.abs(there + back - 2.0 * middle) > EDGE for there, back in there_and_back]
         steep = [np.abs(there - back) > STEEP for there, back in there_and_back]
@@ -196,7 +208,9 @@ def check_against_reference(model, state, task, plan_settings, seed):
     assert report["cost_nominal"] == pytest.approx(mean[0], abs=1e-4, rel=RELATIVE)
     kernel_weights = oracle.softmax_weights(work.costs[: sampler.samples].astype(float), report["temperature"])
     assert report["ess"] == pytest.approx(oracle.effective_sample_size(kernel_weights), rel=1e-3)
-    np.testing.assert_allclose(work.nominal, oracle.updated(commands, kernel_weights), atol=2e-4)
+    taken = guided and work.costs[1] < plan_settings.guide_below * work.costs[0]
+    updated = commands[1] if taken else oracle.updated(commands, kernel_weights)
+    np.testing.assert_allclose(work.nominal, updated, atol=2e-4)
 
 
 def test_every_effect_that_moves_the_robot_is_tried():
