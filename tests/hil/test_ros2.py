@@ -94,8 +94,7 @@ def test_real_ros_gives_the_poses_hears_the_odometry_in_another_node_and_stops_i
         real_node(tmp_path / "node.txt", "echo", *FAST_START) as process,
         real_node(heard_by, "listen"),
     ):
-        stack.operator.wait_until("a pose", lambda status: status["pose_ok"], live_stack.READY_TIMEOUT_S)
-        stack.drive()
+        drive(stack)
         stack.operator.wait_until("on the circle", lambda status: status["pose"][1] > 1.0, 60.0)
         assert stack.operator.status()["task"]["distance_m"] < 0.2
         process.kill()
@@ -128,6 +127,11 @@ def test_real_ros_arms_and_drives_by_its_speeds(tmp_path):
         bench.operator.wait_for_standstill(20.0)
 
 
+def drive(stack):
+    stack.operator.wait_until("a pose", lambda status: status["pose_ok"], live_stack.READY_TIMEOUT_S)
+    stack.drive()
+
+
 def assert_stops(stack):
     stack.operator.wait_until("without a pose", lambda status: not status["pose_ok"], 20.0)
     stack.operator.wait_until("holding still", lambda status: not status["running"], 20.0)
@@ -137,7 +141,7 @@ def assert_stops(stack):
 def test_it_drives_by_the_poses_of_a_node_that_hears_its_odometry_and_stops_when_the_node_dies(tmp_path, monkeypatch):
     said = tmp_path / "node.txt"
     with stack_with_bridge(tmp_path, monkeypatch) as (stack, _), node("echo", said) as process:
-        stack.drive()
+        drive(stack)
         status = stack.operator.wait_until("a metre further", lambda _: far(said) > 1.0, 30.0)
         assert status["pose_ok"]
         assert status["task"]["distance_m"] < 0.2
@@ -214,7 +218,7 @@ def far(output):
 @pytest.mark.parametrize("kind", ["nan", "frame", "late", "garbage"])
 def test_it_stops_when_the_nodes_poses_become_wrong(kind, tmp_path, monkeypatch):
     with stack_with_bridge(tmp_path, monkeypatch) as (stack, _), node(kind, tmp_path / "node.txt") as process:
-        stack.drive()
+        drive(stack)
         process.send_signal(signal.SIGUSR1)
         assert_stops(stack)
 
@@ -223,7 +227,7 @@ def test_it_stops_when_the_nodes_poses_become_wrong(kind, tmp_path, monkeypatch)
 def test_a_flood_of_poses_stops_nothing_and_the_node_frozen_does(tmp_path, monkeypatch):
     said = tmp_path / "node.txt"
     with stack_with_bridge(tmp_path, monkeypatch) as (stack, _), node("flood", said) as process:
-        stack.drive()
+        drive(stack)
         process.send_signal(signal.SIGUSR1)
         stack.operator.wait_until("flooded for a while", lambda _: len(heard(said)) > 400, 60.0)
         assert stack.operator.status()["running"]
@@ -235,7 +239,7 @@ def test_a_flood_of_poses_stops_nothing_and_the_node_frozen_does(tmp_path, monke
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
 def test_it_stops_when_the_bridge_dies_or_freezes(how, tmp_path, monkeypatch):
     with stack_with_bridge(tmp_path, monkeypatch) as (stack, bridge), node("echo", tmp_path / "node.txt"):
-        stack.drive()
+        drive(stack)
         bridge.send_signal(how)
         assert_stops(stack)
         time.sleep(0.5)
