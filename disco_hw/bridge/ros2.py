@@ -98,7 +98,7 @@ class Bridge:
         self._pad = ros2_commands.DaemonPad(socket_path(config))
         self._to_daemon = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._to_daemon.setblocking(False)
-        self._unsent = self._malformed = self._unwritten = 0
+        self._unsent = self._malformed = self._unwritten = self._unread = 0
         self._heard_ns = self._next_diagnosis_ns = 0
         self._failure: BaseException | None = None
         self._ended = threading.Event()
@@ -180,6 +180,7 @@ class Bridge:
         try:
             samples = reader.take(_MOST_AT_ONCE)
         except DDSException:
+            self._unread += 1
             return
         except Exception:
             # Whatever bytes a stranger sends under this type's name.
@@ -242,7 +243,8 @@ class Bridge:
         figures |= {"speeds passed on": self._speeds.passed}
         figures |= {f"speeds refused: {why}": count for why, count in self._speeds.refused.items()}
         figures |= {"requests refused, too many": self._asking.refused + self._stopping.refused}
-        figures |= {"messages that were none": self._malformed, "messages not sent": self._unwritten}
+        figures |= {"messages that were none": self._malformed, "readers that failed": self._unread}
+        figures |= {"messages not sent": self._unwritten}
         figures |= {"ticks missed": self._feed.missed}
         wrong = f"poses refused: {self._poses.why}" if self._poses.why else self._pad.refusal
         heard = mono_ns - self._heard_ns < _SECOND_NS

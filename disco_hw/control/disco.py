@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from disco_hw.control.command_history import command_history
-from disco_hw.control.kernel.guide import Chassis, guide
+from disco_hw.control.kernel.guide import SteeredChassis, guide
 from disco_hw.control.kernel.layout import BLOCK, CHANNELS, WHEEL_ROWS, aligned_zeros
 from disco_hw.control.kernel.skid_steer import SkidSteer
 from disco_hw.control.optimiser import Optimiser
@@ -113,7 +113,7 @@ class Disco:
         self._response_s = sum(self._value(self._mean_theta, name) for name in late)
         dead_rad_s = sum(self._value(self._mean_theta, name) for name in dead)
         radius_m, axle_m = (self._value(self._mean_theta, one.name) for one in BASE_PARAMETERS if one is not X_ICR)
-        self._chassis = Chassis(radius_m, axle_m, self._x_icr_m, float(self._response_s), float(dead_rad_s))
+        self._chassis = SteeredChassis(radius_m, axle_m, self._x_icr_m, float(self._response_s), float(dead_rad_s))
         self._tables = coefficient_tables(model, theta, step_s, np.float32)
         found = equivalent_points(model, theta, step_s, self._pairs)
         self._ahead, self._scaled = (

@@ -27,7 +27,7 @@ LIFTED_RAD_S = 0.05
 SLOWEST = 0.2
 
 
-class Chassis(NamedTuple):
+class SteeredChassis(NamedTuple):
     """What the law knows of the robot: geometry (m), how long the wheels take (s), their dead band (rad/s)."""
 
     wheel_radius_m: float
@@ -39,7 +39,7 @@ class Chassis(NamedTuple):
 
 @kernel_function
 def guide(
-    commands: Floats, terms: Terms, start: Floats, chassis: Chassis, before_left: float, before_right: float,
+    commands: Floats, terms: Terms, start: Floats, chassis: SteeredChassis, before_left: float, before_right: float,
     limits: Limits, step_s: float,
 ) -> None:  # fmt: skip
     """Fill `commands` (T, 2) with the wheel speeds of the law (rad/s), from the state `start` (8,) of `SkidSteer`
