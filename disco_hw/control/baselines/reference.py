@@ -45,12 +45,13 @@ class Reference:
         closed = bool(np.hypot(*(places[0] - places[-1])) < SPACING_M)
         yaw = stable_yaw(along, spacing, self.x_icr_m, closed)[:-1]
         off = np.clip(yaw - along, -0.5 * math.pi, 0.5 * math.pi)
+        x_icr_m = math.copysign(max(abs(self.x_icr_m), SMALLEST_X_ICR_M), self.x_icr_m)
         values = {
             "places_m": places[:-1],
             "along_rad": along,
             "yaw_rad": yaw,
             "forward_m_s": self.speed_m_s * np.cos(off),
-            "turn_rad_s": self.speed_m_s * np.sin(off) / max(abs(self.x_icr_m), SMALLEST_X_ICR_M),
+            "turn_rad_s": self.speed_m_s * np.sin(off) / x_icr_m,
             "spacing_m": spacing,
             "closed": closed,
         }

@@ -46,3 +46,12 @@ def test_every_law_follows_every_way_with_the_nominal_robot(law):
         driven = drive(classical(law), ForeignRobot(*NOMINAL), track, duration_s=20.0).after()
         assert driven.rms_mm < LARGEST_MM[type(law)]
         assert driven.speed_m_s > 0.15
+
+
+@pytest.mark.parametrize("x_icr_m", [0.1, -0.1])
+def test_on_a_circle_the_reference_turns_as_the_circle_does(x_icr_m):
+    angle = np.linspace(0.0, 2.0 * math.pi, 400)
+    circle = np.column_stack([np.cos(angle), np.sin(angle)])
+    circle[-1] = circle[0]
+    # The heading is that at a piece's begin and the way's that of its middle: half a piece, 5 % here.
+    assert Reference(circle, 0.2, x_icr_m).turn_rad_s.mean() == pytest.approx(0.2, rel=0.06)
