@@ -21,13 +21,11 @@ import disco_hw
 from disco_hw.control import CommandLimits, Disco, DiscoSettings, PlannerState, Sampler, SentCommand
 from disco_hw.control.black_box import BlackBoxDisco
 from disco_hw.control.kernel.step import disco_step
-from disco_hw.control.parameter_points import unscented_points
+from disco_hw.control.parameter_points import sigma_points, unscented_points
 from disco_hw.control.pendulum import PendulumPlanner, PendulumPoints
 from disco_hw.control.settings import ROTATION
-from disco_hw.control.sigma_points import sigma_points
 from disco_hw.experiments.circle import CircleOptions, CircleResult, Command, drive, planner_command, plants
-from disco_hw.experiments.pendulum import POSTERIOR
-from disco_hw.experiments.torch_models import circle_cost, skid_steer_transition
+from disco_hw.experiments.pendulum import POSTERIOR, circle_cost, skid_steer_transition
 from disco_hw.jit import block_function, float32, tune_loops
 from disco_hw.model import Model, load_model
 from disco_hw.runtime.assembly import make_planner

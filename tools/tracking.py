@@ -17,8 +17,7 @@ from disco_hw.adaptation.fast import FastAdaptation
 from disco_hw.adaptation.guard import believed_geometry
 from disco_hw.config import Estimation
 from disco_hw.control import CommandLimits, Disco, DiscoSettings
-from disco_hw.control.baselines.follower import Follower, Law, NominalRobot
-from disco_hw.control.baselines.reference import Reference
+from disco_hw.control.baselines.follower import Follower, Law, NominalRobot, Reference
 from disco_hw.control.settings import ROTATION
 from disco_hw.estimation import OdometryParameters, PoseFusion
 from disco_hw.model import Gaussian, Model

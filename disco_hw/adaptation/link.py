@@ -234,7 +234,7 @@ class ProcessLink:
         with theirs:
             ours.setblocking(False)
             ours.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER_BYTES)
-            command = [sys.executable, "-m", "disco_hw.adaptation.process", str(theirs.fileno())]
+            command = [sys.executable, "-m", "disco_hw.adaptation.adapter", str(theirs.fileno())]
             try:
                 self._process = spawn_at_normal_priority(command, pass_fds=(theirs.fileno(),))
             except LogError as error:

@@ -11,8 +11,8 @@ from typing import Annotated
 import typer
 
 from disco_hw.cli import logs, robot, virtual, watch
-from disco_hw.cli.bridge import bridge_app
 from disco_hw.cli.experiment import experiment_app
+from disco_hw.cli.watch import bridge_app
 from disco_hw.errors import InputError, WorkError
 
 app = typer.Typer(

@@ -58,7 +58,7 @@ def gap(
 
     limit_thread_pools()
     check_named_files(robot, model, logs)
-    from disco_hw.gap.write_report import gap as find_gap
+    from disco_hw.gap.find import gap as find_gap
 
     result = find_gap(logs, robot, out, model, progress_line)
     print_result(result.as_dict(), as_json, result.as_text())

@@ -20,7 +20,7 @@ from disco_hw.cli.options import (
     progress_line,
 )
 from disco_hw.config.command_line import check_named_files
-from disco_hw.viewer.address import DEFAULT_PORT, LOOPBACK
+from disco_hw.viewer.page_process import DEFAULT_PORT, LOOPBACK
 
 PagePort = Annotated[int, typer.Option("--port", min=1, max=65535, help="Port of the page.")]
 
@@ -53,7 +53,7 @@ def run(
     spare_memory()
     check_named_files(robot, model)
     from disco_hw.daemon.daemon import DaemonOptions, run_daemon
-    from disco_hw.drive.until_heading import task_pilot
+    from disco_hw.drive.hand_pilot import task_pilot
 
     with _page(view, robot, model, port, link):
         options = DaemonOptions(robot, model, link, log_file, as_json, accept_missing_effects, adapt)

@@ -11,11 +11,12 @@ from disco_hw.cli.options import (
     AsJson,
     LinkOption,
     ModelOption,
+    RobotFile,
     print_result,
 )
 from disco_hw.config.command_line import check_named_files
 from disco_hw.errors import InputError
-from disco_hw.viewer.address import DEFAULT_PORT, LOOPBACK
+from disco_hw.viewer.page_process import DEFAULT_PORT, LOOPBACK
 
 
 def view(
@@ -112,3 +113,24 @@ def replay(
     print_result(report.as_dict(), as_json, report.as_text())
     if not report.ok:
         raise typer.Exit(1)
+
+
+bridge_app = typer.Typer(no_args_is_help=True, help="Carry poses, commands and state between the daemon and ROS 2.")
+
+
+@bridge_app.callback()
+def _bridge() -> None:
+    """Make `ros2` a word of its own."""
+
+
+@bridge_app.command()
+def ros2(robot: RobotFile, model: ModelOption = None, link: LinkOption = None) -> None:
+    """Poses and commands in, odometry and state out, beside a daemon that may come and go (docs/ros2.md)."""
+    check_named_files(robot, model)
+    try:
+        from disco_hw.bridge.ros2 import run_ros2_bridge
+    except ModuleNotFoundError as error:
+        if error.name != "cyclonedds":
+            raise
+        raise InputError("bridge ros2: needs cyclonedds; pip install 'disco-hw[ros2]'") from None
+    raise typer.Exit(run_ros2_bridge(robot, model, link))

@@ -8,7 +8,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from disco_hw.control.command_history import command_history
 from disco_hw.control.kernel.guide import SteeredChassis, guide
 from disco_hw.control.kernel.layout import BLOCK, CHANNELS, WHEEL_ROWS, aligned_zeros
 from disco_hw.control.kernel.skid_steer import SkidSteer
@@ -21,7 +20,16 @@ from disco_hw.control.parameter_points import (
     shared_pairs,
     unscented_points,
 )
-from disco_hw.control.plan import Array, Diagnostics, NoValidControl, PlannerState, PlanOutcome, Rollouts, WheelPlan
+from disco_hw.control.plan import (
+    Array,
+    Diagnostics,
+    NoValidControl,
+    PlannerState,
+    PlanOutcome,
+    Rollouts,
+    WheelPlan,
+    command_history,
+)
 from disco_hw.control.settings import CommandLimits, DiscoSettings
 from disco_hw.effects.effect import Channel
 from disco_hw.effects.registry import DELAY

@@ -27,7 +27,7 @@ from disco_hw.runtime.preflight import (
     check_watchdog,
 )
 from disco_hw.runtime.robot_setup import Setup, link_key, load_setup
-from disco_hw.runtime.situation import connection
+from disco_hw.runtime.states import connection
 from disco_hw.runtime.supervisor import FIND_HEADING
 from drivers import status_texts
 from drivers.motor import find_driver

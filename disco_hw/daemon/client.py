@@ -13,7 +13,7 @@ from typing import Any
 from disco_hw.config import RobotConfig, load_daemon_address
 from disco_hw.daemon.socket_place import connect, default_socket_path, passed_over
 from disco_hw.errors import InputError, WorkError
-from disco_hw.runtime.situation import advice, by_command, status_headline
+from disco_hw.runtime.states import advice, by_command, status_headline
 from drivers import status_texts
 
 _MAX_REPLY_BYTES = 1 << 20

@@ -27,14 +27,13 @@ from disco_hw.daemon.client import (
     recording_in_words,
     socket_path,
 )
-from disco_hw.daemon.compiling import compiled_elsewhere
+from disco_hw.daemon.compiling import compiled_elsewhere, warm_up
 from disco_hw.daemon.control_socket import ControlMessage, ControlServer
 from disco_hw.daemon.loop import Clock, Loop, MonotonicClock
 from disco_hw.daemon.page_feed import ViewerFeed, WatchedRecorder, feed_path, tick_feed_path
 from disco_hw.daemon.signals import Notifier, StopPath, StopSignals
 from disco_hw.daemon.socket_place import passed_over
 from disco_hw.daemon.status import counters, loop_figures, status
-from disco_hw.daemon.warm_up import warm_up
 from disco_hw.log import records
 from disco_hw.log.link import Attachment
 from disco_hw.log.provenance import DBC, version
@@ -55,8 +54,7 @@ from disco_hw.runtime.core import CoreTick, DaemonCore
 from disco_hw.runtime.pilot import FindsWiring, Pilot, TaskPilot
 from disco_hw.runtime.pipeline import NoPlanner, Pipeline, Planner
 from disco_hw.runtime.robot_setup import Setup, kept_files, link_key, load_setup, refuse_missing_effects
-from disco_hw.runtime.situation import Ask, advice, by_command, headline
-from disco_hw.runtime.states import State
+from disco_hw.runtime.states import Ask, State, advice, by_command, headline
 from disco_hw.runtime.supervisor import Reply, UserRequest
 from disco_hw.runtime.task_change import TaskRefused, changed_task
 from drivers.types import Request, Transport

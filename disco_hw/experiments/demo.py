@@ -26,7 +26,14 @@ import disco_hw
 from disco_hw.config import load_robot_config
 from disco_hw.daemon.realtime import stolen_ms
 from disco_hw.errors import InputError, WorkError
-from disco_hw.experiments.circle_report import CircleReport, load_circle_report
+from disco_hw.experiments.circle_report import (
+    NARROWEST,
+    CircleReport,
+    Point,
+    circle_points,
+    load_circle_report,
+    picture,
+)
 from disco_hw.experiments.live_stack import (
     DEVICES,
     READY_TIMEOUT_S,
@@ -36,10 +43,9 @@ from disco_hw.experiments.live_stack import (
     stands,
     with_device,
 )
-from disco_hw.experiments.terminal_picture import NARROWEST, Point, circle_points, picture
 from disco_hw.runtime.robot_setup import Setup, geometry, load_setup
 from disco_hw.tasks.circle import CircleTask, circle_task, inwards_sine
-from disco_hw.viewer.address import DEFAULT_PORT, LOOPBACK, TOKEN_VARIABLE, page_address, page_token
+from disco_hw.viewer.page_process import DEFAULT_PORT, LOOPBACK, TOKEN_VARIABLE, page_address, page_token
 
 _START_TIMEOUT_S = READY_TIMEOUT_S
 _POLL_S = 0.1

@@ -5,36 +5,43 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.errors import LogError
+from disco_hw.config import load_robot_config
+from disco_hw.errors import LogError, WorkError
 from disco_hw.gap.data.gridded_drive import grid_drive
 from disco_hw.gap.data.layout import BASE_COUNT, BODY, DELAYED_BY, WHEEL, Layout
 from disco_hw.gap.report.amend import amended_model, at_joint_fit, carried_terms, channel_estimates, simple_model
-from disco_hw.gap.report.doubtful import Measured, sort_out
 from disco_hw.gap.report.findings import STAGES, GapReport
 from disco_hw.gap.report.judge import (
+    Measured,
     blind_spot_findings,
     candidate_evidence,
     channel_findings,
     drifting_parameters,
     effect_findings,
     residue_sentences,
+    sort_out,
     unnamed_findings,
 )
+from disco_hw.gap.report.page import as_text, page
 from disco_hw.gap.search.analysis import FinalFit, GapAnalysis, final_fit
-from disco_hw.gap.search.candidates import candidates_of
 from disco_hw.gap.search.channel_search import search_body, search_wheels
 from disco_hw.gap.search.cross_validation import PredictionErrors, beats, clearly_worse, worse_by
 from disco_hw.gap.search.intervals import ChannelEstimates
+from disco_hw.gap.search.richest_model import candidates_of
 from disco_hw.gap.search.stages import StagePredictions, joint_predictions, prune, stage_predictions
 from disco_hw.gap.search.unnamed_terms import with_known_terms
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GapSettings
 from disco_hw.log.drive import DriveLog, concatenate
-from disco_hw.model import Model
+from disco_hw.log.load import load_drive
+from disco_hw.model import Model, load_model, save_model
+from disco_hw.reports.outputs import as_json, refuse_directory
 
 Array = NDArray[np.float64]
 Progress = Callable[[str], None]
@@ -191,3 +198,51 @@ def _vector(layout: Layout, model: Model) -> Array:
 def _given(model: Model, layout: Layout) -> tuple[str, ...]:
     """Effects of the model that compete in a channel."""
     return tuple(setting.name for setting in model.effects if setting.name in candidates_of(layout))
+
+
+WRITTEN = ("report.json", "report.html", "model.toml")
+
+
+@dataclass(frozen=True)
+class GapResult:
+    """A report and the directory it was written to."""
+
+    report: GapReport
+    directory: Path
+
+    def as_dict(self) -> dict[str, Any]:
+        """The content of report.json."""
+        return self.report.as_dict()
+
+    def as_text(self) -> str:
+        """For a terminal."""
+        return f"{as_text(self.report)}\n\nwritten: {self.directory}/report.html, report.json, model.toml"
+
+
+def gap(
+    logs: Sequence[Path],
+    robot: Path,
+    out: Path,
+    model: Path | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> GapResult:
+    """Find what a model misses in logs and write everything to the directory `out`.
+
+    Raises InputError for files that cannot be used and for an `out` that cannot be written, or where an input would be
+    written over; WorkError if it cannot be written after all.
+    """
+    refuse_directory(out, WRITTEN, [*logs, robot, *([model] if model is not None else [])])
+    config = load_robot_config(robot)
+    start = load_model(model) if model is not None else Model.nominal(config.robot)
+    drive = load_drive(list(logs), config.robot.ticks_per_rev, config.robot.wheel_radius_m)
+    report = find_gap(drive, start, progress, pictures=True, top_rad_s=config.robot.max_wheel_speed_rad_s)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        (out / "report.json").write_text(as_json(report.as_dict(), indent=1), encoding="utf-8")
+        (out / "report.html").write_text(page(report), encoding="utf-8")
+        save_model(report.model, out / "model.toml")
+        for name, picture in report.pictures.items():
+            (out / f"{name}.png").write_bytes(picture)
+    except OSError as error:
+        raise WorkError(f"{out}: cannot be written ({error.strerror}); give another directory") from None
+    return GapResult(report, out)

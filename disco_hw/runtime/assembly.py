@@ -6,8 +6,7 @@ import msgspec
 
 from disco_hw import control
 from disco_hw.adaptation.adaptation import CheckedAdaptation, GeometryAdaptation
-from disco_hw.adaptation.audited import AuditedAdaptation
-from disco_hw.adaptation.fast import FastAdaptation
+from disco_hw.adaptation.fast import AuditedAdaptation, FastAdaptation
 from disco_hw.adaptation.guard import (
     BeliefGuard,
     Geometry,

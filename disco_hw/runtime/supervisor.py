@@ -8,8 +8,7 @@ from dataclasses import dataclass
 
 import msgspec
 
-from disco_hw.runtime.situation import connection
-from disco_hw.runtime.states import PROBLEM, Condition, State, Transition, next_transition
+from disco_hw.runtime.states import PROBLEM, Condition, State, Transition, connection, next_transition
 from drivers.types import DriverState, LinkState, Request
 
 FIND_HEADING = "the poses have none: drive a metre straight on, by hand on the page, and it is found"

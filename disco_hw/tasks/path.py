@@ -20,8 +20,7 @@ from disco_hw.tasks.line.course import (
     straight_fastest_m_s,
     straight_too_fast,
 )
-from disco_hw.tasks.line.table import PathTable
-from disco_hw.tasks.line.waypoints import check_size, load_waypoints, points_of
+from disco_hw.tasks.line.table import PathTable, check_size, load_waypoints, points_of
 from disco_hw.tasks.task import Chassis, Editable, Point, Positive, TaskFault
 
 
@@ -64,7 +63,7 @@ class PathTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         check_size(file, found)
         if judged:
             # Loaded where it is needed alone: half of the daemon's commands need no path.
-            from disco_hw.tasks.line.hairpins import refuse_hairpins  # noqa: PLC0415
+            from disco_hw.tasks.line.course import refuse_hairpins  # noqa: PLC0415
 
             refuse_hairpins(file, found)
         return msgspec.structs.replace(self, points=points_of(found))

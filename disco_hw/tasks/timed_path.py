@@ -24,7 +24,7 @@ from disco_hw.tasks.line.course import (
     straight_fastest_m_s,
     straight_too_fast,
 )
-from disco_hw.tasks.line.waypoints import Waypoints, check_size, load_waypoints, points_of
+from disco_hw.tasks.line.table import Waypoints, check_size, load_waypoints, points_of
 from disco_hw.tasks.task import Array, Chassis, Editable, Point, Prepared, TaskFault
 
 # A place that moves by less in a step has no direction.

@@ -11,7 +11,7 @@ import numpy as np
 
 from disco_hw.daemon.client import recording_in_words
 from disco_hw.runtime.pipeline import Source
-from disco_hw.runtime.situation import fault_sentence, headline, in_words
+from disco_hw.runtime.states import fault_sentence, headline, in_words
 from disco_hw.tasks import RobotTask
 from disco_hw.viewer.snapshot import Snapshot
 

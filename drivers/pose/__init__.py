@@ -11,7 +11,7 @@ from types import MappingProxyType
 from typing import Any
 
 from drivers.pose import robot
-from drivers.pose.errors import PoseSourceError
+from drivers.pose.convention import PoseSourceError
 from drivers.types import PoseSource
 
 __all__ = ["DEFAULT", "PoseSourceError", "find_pose_source", "make_pose_source", "own_fields", "pose_sources"]

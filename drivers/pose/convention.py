@@ -95,3 +95,7 @@ class ConvertedPoses:
 def converted(source: PoseSource, convention: PoseConvention) -> PoseSource:
     """The source in our convention; itself where nothing is to be changed."""
     return source if convention == AS_OURS else ConvertedPoses(source, convention)
+
+
+class PoseSourceError(ValueError):
+    """A source that cannot be had, by its name or its device; the message is one line with the remedy."""

@@ -16,7 +16,7 @@ from typing import Any
 
 import msgspec
 
-from drivers.pose.errors import PoseSourceError
+from drivers.pose.convention import PoseSourceError
 from drivers.pose.udp import LONGEST_DATAGRAM, MOST_A_TICK, pose_of
 from drivers.types import PoseSample
 

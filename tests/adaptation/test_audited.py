@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from disco_hw.adaptation.audited import AuditedAdaptation
+from disco_hw.adaptation.fast import AuditedAdaptation
 from disco_hw.adaptation.guard import Geometry
 from disco_hw.adaptation.link import NAMES, Proposal, Report
 from disco_hw.log.records import Adaptation, BeliefChange

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from disco_hw.adaptation.link import Samples
-from disco_hw.adaptation.samples import SampleWindow
+from disco_hw.adaptation.network import SampleWindow
 from disco_hw.inference.excitation import UnusableDriveError
 from tools.adaptation_drives import messages
 

@@ -12,7 +12,7 @@ from disco_hw.control import NoValidControl, Sampler, oracle, pendulum
 from disco_hw.control.black_box import BlackBoxDisco
 from disco_hw.control.parameter_points import drawn_points, unscented_points
 from disco_hw.control.pendulum import PAPER_SAMPLER
-from disco_hw.experiments.torch_models import circle_cost, pendulum_cost, pendulum_transition, skid_steer_transition
+from disco_hw.experiments.pendulum import circle_cost, pendulum_cost, pendulum_transition, skid_steer_transition
 from disco_hw.model import load_model
 from disco_hw.model import plain as physics
 from disco_hw.tasks.circle import CircleCost

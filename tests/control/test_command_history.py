@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from disco_hw.control import SentCommand
-from disco_hw.control.command_history import command_history
+from disco_hw.control.plan import command_history
 
 MS = 1_000_000
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from disco_hw.control.sigma_points import sigma_points
+from disco_hw.control.parameter_points import sigma_points
 from disco_hw.model import load_model
 
 PAPER = load_model(Path(__file__).parents[2] / "disco_hw/robots/wombot_model.toml").belief

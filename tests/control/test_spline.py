@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import BSpline
 
-from disco_hw.control.spline import spline_basis
+from disco_hw.control.optimiser import spline_basis
 
 
 @pytest.mark.parametrize(("knots", "horizon"), [(4, 2), (5, 50), (8, 50), (8, 7), (30, 50)])

@@ -8,8 +8,7 @@ import msgspec
 import pytest
 
 from disco_hw.drive.coverage import Coverage
-from disco_hw.drive.hand_pilot import HandPilot
-from disco_hw.drive.until_heading import UntilHeading, task_pilot
+from disco_hw.drive.hand_pilot import HandPilot, UntilHeading, task_pilot
 from disco_hw.runtime.pilot import TaskPilot
 from disco_hw.runtime.pipeline import FollowTask, NoPlanner
 from disco_hw.runtime.states import State

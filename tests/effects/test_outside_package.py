@@ -44,7 +44,7 @@ from pathlib import Path
 import numpy as np
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.data.layout import BODY, WHEEL, pose_sensor
-from disco_hw.gap.search.candidates import candidates_of, smooth_of
+from disco_hw.gap.search.richest_model import candidates_of, smooth_of
 from disco_hw.gap.search.intervals import OUTSIDE_TESTS, confounded_with
 from disco_hw.gap.search.intervals import _OF_TURNING
 from disco_hw.inference.checks import CHECKS

@@ -4,8 +4,8 @@ import math
 
 import pytest
 
+from disco_hw.experiments.circle_report import circle_points, picture
 from disco_hw.experiments.demo import DemoOptions, what_next
-from disco_hw.experiments.terminal_picture import circle_points, picture
 
 
 def test_corners_come_to_lie_in_the_corners():

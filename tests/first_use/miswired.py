@@ -28,7 +28,7 @@ from sim.devices import find_controller
 from sim.effects import hidden_effects
 from sim.plant import Plant
 from sim.plant_parameters import PlantParameters
-from sim.pose_sender import PoseSender
+from sim.process import PoseSender
 from sim.vendor_robot import VendorRobot
 from sim.virtual_robot import STEP_US, VirtualRobot
 

@@ -7,9 +7,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from disco_hw.gap import find, write_report
+from disco_hw.gap import find
+from disco_hw.gap.find import WRITTEN
 from disco_hw.gap.search.stages import stage_predictions
-from disco_hw.gap.write_report import WRITTEN
 from disco_hw.model import Model, load_model
 from tools.gap_logs import simulated_drive
 
@@ -49,7 +49,7 @@ def written(searched, monkeypatch, folder, seeds):
     """Whether each of some random robots is judged as slow to turn; the files of all were written and are sound."""
     log, analysis, notes, gap = searched
     slow = []
-    monkeypatch.setattr(write_report, "load_drive", lambda *_: log)
+    monkeypatch.setattr(find, "load_drive", lambda *_: log)
     # Neither depends on the robot's limits, and each takes long.
     monkeypatch.setattr(find, "stage_predictions", lambda *_: SimpleNamespace(table=lambda: gap))
     monkeypatch.setattr(find, "_drawn", lambda *_: {"picture": b"PNG"})
@@ -59,7 +59,7 @@ def written(searched, monkeypatch, folder, seeds):
         robot.write_text(text)
         here = of_geometry(analysis, radius_m, axial_m)
         monkeypatch.setattr(find, "search", lambda *_, here=here: (here, notes))
-        result = write_report.gap([], robot, out)
+        result = find.gap([], robot, out)
         report = json.loads((out / "report.json").read_text())
         assert all(type(spot["blind"]) is bool for spot in report["blind_spots"])
         # What was asked of this robot's wheels is the same; a limit beyond it is one that the log is blind to.

@@ -8,7 +8,7 @@ import pytest
 import disco_hw
 from disco_hw.config import load_robot_config
 from disco_hw.errors import InputError
-from disco_hw.gap import write_report
+from disco_hw.gap import find
 
 
 class EnoughError(Exception):
@@ -22,11 +22,11 @@ def test_the_search_knows_what_the_robot_can_do(monkeypatch, tmp_path):
         vars(handed).update(options)
         raise EnoughError
 
-    monkeypatch.setattr(write_report, "load_drive", lambda *_: None)
-    monkeypatch.setattr(write_report, "find_gap", search)
+    monkeypatch.setattr(find, "load_drive", lambda *_: None)
+    monkeypatch.setattr(find, "find_gap", search)
     robot = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
     with pytest.raises(EnoughError):
-        write_report.gap([], robot, tmp_path)
+        find.gap([], robot, tmp_path)
     assert handed.top_rad_s == load_robot_config(robot).robot.max_wheel_speed_rad_s
 
 
@@ -34,13 +34,13 @@ def test_a_directory_that_cannot_be_used_is_refused_before_the_search(monkeypatc
     def search(*_, **__):
         raise EnoughError
 
-    monkeypatch.setattr(write_report, "load_drive", search)
+    monkeypatch.setattr(find, "load_drive", search)
     robot = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
     given = tmp_path / "model.toml"
     given.write_bytes((robot.parent / "wombot_model.toml").read_bytes())
     with pytest.raises(InputError, match="is there and is no directory"):
-        write_report.gap([], robot, given)
+        find.gap([], robot, given)
     with pytest.raises(InputError, match=r"model\.toml: would be written over, and is read here"):
-        write_report.gap([], robot, tmp_path, given)
+        find.gap([], robot, tmp_path, given)
     with pytest.raises(EnoughError):
-        write_report.gap([], robot, tmp_path / "gap", given)
+        find.gap([], robot, tmp_path / "gap", given)

@@ -95,7 +95,7 @@ def adapter_pid(daemon_pid: int) -> int:
             command = (stat.parent / "cmdline").read_bytes()
         except OSError:
             continue
-        if parent == daemon_pid and b"disco_hw.adaptation.process" in command:
+        if parent == daemon_pid and b"disco_hw.adaptation.adapter" in command:
             return int(stat.parent.name)
     raise AssertionError("no adapter runs")
 

@@ -19,6 +19,7 @@ from disco_hw.experiments.circle import CircleOptions, CircleResult, Run
 from disco_hw.experiments.circle_report import CircleReport
 from disco_hw.experiments.gap import RUNS, GapExperimentResult, Lap
 from disco_hw.experiments.pendulum import PendulumOptions, PendulumResult
+from disco_hw.gap.find import GapResult
 from disco_hw.gap.report.blind_spots import BlindSpot
 from disco_hw.gap.report.findings import (
     STAGES,
@@ -30,7 +31,6 @@ from disco_hw.gap.report.findings import (
 )
 from disco_hw.gap.search.cross_validation import PredictionErrors
 from disco_hw.gap.search.intervals import ParameterEstimate
-from disco_hw.gap.write_report import GapResult
 from disco_hw.inference.checks import CHECKS, Predictive
 from disco_hw.inference.commands import GapCheck, InferResult
 from disco_hw.log.importing.write import Imported

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from disco_hw.runtime.headway import Headway
+from disco_hw.runtime.plausibility import Headway
 from disco_hw.runtime.supervisor import UserRequest
 from drivers.types import WheelSample
 from tests.runtime.simulated import simulated_stack

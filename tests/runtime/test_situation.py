@@ -4,7 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from disco_hw.runtime.situation import (
+from disco_hw.runtime.states import (
+    State,
     advice,
     by_command,
     connection,
@@ -12,7 +13,6 @@ from disco_hw.runtime.situation import (
     in_words,
     next_step,
 )
-from disco_hw.runtime.states import State
 from drivers.types import DriverState, LinkState
 from firmware_protocol.faults import FAULTS
 

@@ -19,9 +19,8 @@ from disco_hw.tasks.line.cost import (
     TURN_WEIGHT,
     PathCost,
 )
-from disco_hw.tasks.line.inverse import stable_yaw
-from disco_hw.tasks.line.table import PathTable
-from disco_hw.tasks.line.waypoints import Waypoints
+from disco_hw.tasks.line.course import stable_yaw
+from disco_hw.tasks.line.table import PathTable, Waypoints
 from disco_hw.tasks.timed_path import RESTS_M, TimedPathCost
 
 

@@ -13,8 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.linalg import solve_continuous_are
 
-from disco_hw.control.baselines.follower import Errors
-from disco_hw.control.baselines.reference import Reference
+from disco_hw.control.baselines.follower import Errors, Reference
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,10 +7,13 @@ without a remainder, and a block's commands and state stay in the first-level ca
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+
+from disco_hw.jit import specialise
 
 Floats: TypeAlias = NDArray[np.float32]
 # Any: the compiler takes any named tuple with the functions of its kind, which differ in their fields.
@@ -58,3 +61,27 @@ def aligned_zeros(size: int, dtype: type = np.float32) -> NDArray[np.floating]:
 def block_count(samples: int) -> int:
     """Blocks needed for `samples`; the last one may be partly idle."""
     return math.ceil(samples / int(BLOCK))
+
+
+def roll_block(
+    system: System, costs: Floats, points: int, padded: int, block: int, horizon: int, commands: Floats, state: Floats
+) -> None:
+    """Costs of one block of samples under all parameter points; compiled code only.
+
+    `system` is the named tuple of a system's terms; its file gives the form for it with `rolls_out`. Writes
+    `costs[i * padded + block * BLOCK + b]` for parameter point i and sample b of the block, from the block's
+    `commands`; `state` is scratch of STATE_ROWS rows.
+    """
+    raise TypeError(f"{type(system).__name__} cannot be rolled out")
+
+
+def rolls_out(system_class: type) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Make a function the form of `roll_block` for the systems of a class."""
+
+    def register(function: Callable[..., None]) -> Callable[..., None]:
+        specialise(roll_block)(
+            lambda system, *_: function if getattr(system, "instance_class", None) is system_class else None
+        )
+        return function
+
+    return register

@@ -41,13 +41,22 @@ from disco_hw.control.kernel.layout import (
     U,
     X,
     Y,
+    rolls_out,
 )
-from disco_hw.control.kernel.rollout import rolls_out
 from disco_hw.control.kernel.task_costs import follow, looks_up, row_of, stage_cost, terminal_cost
 from disco_hw.jit import bits_of_float, block_function, cast_like, float_from_bits, scalar_function, tune_loops
 from disco_hw.model.coefficients import Base, Coefficients, Integration
-from disco_hw.model.compose import delay_steps, in_force, needs_change, wheels_follow
-from disco_hw.model.step import axle_of, body_step, integration_from, tracked_of, wheel_step
+from disco_hw.model.step import (
+    axle_of,
+    body_step,
+    delay_steps,
+    in_force,
+    integration_from,
+    needs_change,
+    tracked_of,
+    wheel_step,
+    wheels_follow,
+)
 from disco_hw.model.tables import base_point, effect_point, lane_base, lane_effects
 from disco_hw.tasks.cost import Found
 

@@ -8,10 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.control.kernel.layout import BLOCK, Floats, System, U
+from disco_hw.control.kernel.layout import BLOCK, Floats, System, U, roll_block
 from disco_hw.control.kernel.random_numbers import fill_normal_block
-from disco_hw.control.kernel.risk import mean_over_points, worst_over_points
-from disco_hw.control.kernel.rollout import roll_block
 from disco_hw.control.kernel.sequences import (
     Basis,
     Limits,
@@ -23,7 +21,14 @@ from disco_hw.control.kernel.sequences import (
     pull_on_knots,
     sum_lanes,
 )
-from disco_hw.control.kernel.weighting import INVALID, refuse_invalid, temperature_for, weigh
+from disco_hw.control.kernel.weighting import (
+    INVALID,
+    mean_over_points,
+    refuse_invalid,
+    temperature_for,
+    weigh,
+    worst_over_points,
+)
 from disco_hw.jit import block_function, float32, kernel_function
 
 ESS, TEMPERATURE, LEAST, MEAN, NOMINAL, VALID = range(6)

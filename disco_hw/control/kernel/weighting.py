@@ -8,10 +8,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
-from disco_hw.control.kernel.lanes import row_sum
 from disco_hw.control.kernel.layout import BLOCK, Floats, U
-from disco_hw.jit import block_function, float32, float_from_bits, int32, scalar_function, tune_loops
+from disco_hw.control.kernel.sequences import row_sum
+from disco_hw.jit import block_function, cast_like, float32, float_from_bits, int32, scalar_function, tune_loops
 from disco_hw.tasks.cost import single
 
 _LOG2_E = np.float32(math.log2(math.e))
@@ -127,3 +128,48 @@ def temperature_for(
         last_at, last_miss = at, miss
         at = at - miss / slope if slope > 1e-3 else (low - 1.0)
     return float32(math.exp(last_at)), total, size
+
+
+@block_function
+def mean_over_points(costs: Floats, point_costs: Floats, weights: Floats, blocks: int) -> None:
+    """Add the weighted mean over the points, `point_costs` (L, K'), to `costs` (K',)."""
+    tune_loops()
+    padded = blocks * int(BLOCK)
+    for i in range(weights.size):
+        weight = weights[i]
+        for block in range(blocks):
+            to, source = U(block) * BLOCK, U(i * padded) + U(block) * BLOCK
+            for b in range(BLOCK):
+                costs[to + b] += weight * point_costs[source + b]
+
+
+@block_function
+def worst_over_points(
+    costs: Floats, point_costs: Floats, weights: Floats, blocks: int, part: float, order: NDArray[np.int64]
+) -> None:
+    """Add the mean over the worst `part` of the points' weight (CVaR) to `costs`; weights are not negative.
+
+    `order` (L,) is scratch. A part so small that the worst point fills it gives the worst point's cost.
+    """
+    padded = blocks * int(BLOCK)
+    points = weights.size
+    for k in range(padded):
+        for i in range(points):
+            j = i
+            cost = point_costs[i * padded + k]
+            while j > 0:
+                before = point_costs[order[j - 1] * padded + k]
+                # What is no number comes first: a sequence without a cost under some point has none.
+                if math.isnan(before) or before >= cost:
+                    break
+                order[j] = order[j - 1]
+                j -= 1
+            order[j] = i
+        left = part
+        total = cast_like(0.0, part)
+        for i in range(points):
+            taken = min(left, weights[order[i]])
+            if taken > 0.0:
+                total += taken * point_costs[order[i] * padded + k]
+                left -= taken
+        costs[k] += total / (part - left)

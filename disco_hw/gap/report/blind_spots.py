@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from disco_hw.effects.effect import Effect, Parameter
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.noise.channels import WheelChannel
-from disco_hw.gap.search.candidates import CANDIDATES, LATE_COLUMNS, candidates_of
 from disco_hw.gap.search.channel_search import ChannelResult
 from disco_hw.gap.search.least_squares import inverse, sensitivity, solve
+from disco_hw.gap.search.richest_model import CANDIDATES, LATE_COLUMNS, candidates_of
 
 Array = NDArray[np.float64]
 

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.gap.data.gridded_drive import GriddedDrive
-from disco_hw.gap.search.candidates import indices
 from disco_hw.gap.search.channel_search import ChannelResult
 from disco_hw.gap.search.evidence import inflation
 from disco_hw.gap.search.intervals import (
@@ -22,6 +21,7 @@ from disco_hw.gap.search.intervals import (
     one_encoder,
 )
 from disco_hw.gap.search.least_squares import Fit, fit
+from disco_hw.gap.search.richest_model import indices
 
 Array = NDArray[np.float64]
 

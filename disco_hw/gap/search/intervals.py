@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from disco_hw.effects.effect import Channel
 from disco_hw.effects.registry import REGISTRY
-from disco_hw.gap.search.candidates import CANDIDATES, indices
 from disco_hw.gap.search.channel_search import ChannelResult
 from disco_hw.gap.search.evidence import inflation
 from disco_hw.gap.search.least_squares import by_block, fit, inverse
+from disco_hw.gap.search.richest_model import CANDIDATES, indices
 from disco_hw.gap.settings import SelectionSettings
 
 Array = NDArray[np.float64]

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.gap.noise.channels import ResidualChannel
-from disco_hw.gap.search.candidates import CANDIDATES, Candidate, candidates_of, indices, parameters_of
 from disco_hw.gap.search.evidence import EffectEvidence, compare
 from disco_hw.gap.search.least_squares import Fit, fit, sensitivity, solve
+from disco_hw.gap.search.richest_model import CANDIDATES, Candidate, candidates_of, indices, parameters_of
 from disco_hw.gap.settings import SelectionSettings
 
 Array = NDArray[np.float64]

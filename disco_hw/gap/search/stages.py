@@ -19,7 +19,6 @@ from scipy.linalg import block_diag
 from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
 from disco_hw.gap.noise.sensor_noise import sensor_noise
 from disco_hw.gap.search.analysis import FinalFit, GapAnalysis, final_fit
-from disco_hw.gap.search.candidates import LATE_COLUMNS, LATE_STARTS_S, with_pose_delay
 from disco_hw.gap.search.channel_search import ChannelResult
 from disco_hw.gap.search.cross_validation import (
     Chain,
@@ -34,6 +33,7 @@ from disco_hw.gap.search.cross_validation import (
 from disco_hw.gap.search.end_to_end import Ahead, Freed, JointFit, Part
 from disco_hw.gap.search.intervals import GAIN
 from disco_hw.gap.search.least_squares import Fit
+from disco_hw.gap.search.richest_model import LATE_COLUMNS, LATE_STARTS_S, with_pose_delay
 
 Array = NDArray[np.float64]
 

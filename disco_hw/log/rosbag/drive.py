@@ -24,8 +24,7 @@ from disco_hw.log.drive import (
     integrate_angle,
 )
 from disco_hw.log.importing.csv_drive import length_fault
-from disco_hw.log.rosbag.bag import Bag, BagMessage, open_bag
-from disco_hw.log.rosbag.clock import Stamps, timeline
+from disco_hw.log.rosbag.bag import Bag, BagMessage, Stamps, open_bag, timeline
 from disco_hw.log.rosbag.fields import Row, Take, finite, stamp_of, take_of, transform_row
 from disco_hw.log.rosbag.frames import Edge, Motion, poses, rotations
 from disco_hw.log.rosbag.topics import (

@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
+from disco_hw.control.baselines.follower import Reference
 from disco_hw.control.baselines.laws import Kanayama, LinearQuadratic, PurePursuit
-from disco_hw.control.baselines.reference import Reference
 from tools.foreign_plant import NOMINAL, ForeignRobot
 from tools.tracking import classical, drive, tracks
 

@@ -5,8 +5,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numba import njit
 
-from disco_hw.control.kernel.lanes import row_sum
 from disco_hw.control.kernel.layout import BLOCK, U
+from disco_hw.control.kernel.sequences import row_sum
 
 B = int(BLOCK)
 

@@ -6,7 +6,7 @@ from numba import njit
 
 from disco_hw.control import oracle
 from disco_hw.control.kernel.layout import BLOCK, aligned_zeros
-from disco_hw.control.kernel.risk import mean_over_points, worst_over_points
+from disco_hw.control.kernel.weighting import mean_over_points, worst_over_points
 
 B = int(BLOCK)
 

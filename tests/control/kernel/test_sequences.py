@@ -22,7 +22,7 @@ from disco_hw.control.kernel.sequences import (
     pull_on_knots,
     sum_lanes,
 )
-from disco_hw.control.spline import spline_basis
+from disco_hw.control.optimiser import spline_basis
 
 B, T, C, KNOTS, HISTORY = int(BLOCK), 12, 2, 5, 3
 FIRST, TAPS = spline_basis(KNOTS, T)

@@ -5,7 +5,7 @@ import itertools
 import pytest
 
 from drivers.motor.reference import ReferenceDriver
-from drivers.motor.reference_watch import LATE_NS, STATE_TIMEOUT_NS, ArmedWatch, CommandEcho
+from drivers.motor.reference_arming import LATE_NS, STATE_TIMEOUT_NS, ArmedWatch, CommandEcho
 from drivers.types import DriverState
 from firmware_protocol.codec import Codec
 from tests.drivers.motor.bench import MS, Bench

@@ -9,8 +9,8 @@ from disco_hw.gap.data.layout import WHEEL
 from disco_hw.gap.noise.body_noise import BodyMotion, BodyNoise, body_gains, body_likelihood, whiten_body
 from disco_hw.gap.noise.channels import WheelChannel
 from disco_hw.gap.noise.wheel_noise import WheelMotion, WheelNoise, wheel_gains, wheel_likelihood, whiten_wheels
-from disco_hw.gap.search.candidates import indices
 from disco_hw.gap.search.least_squares import fit
+from disco_hw.gap.search.richest_model import indices
 from disco_hw.gap.settings import GRID_STEP_S
 from tests.gap.synthetic import GEOMETRY, line_of
 
