@@ -1,4 +1,4 @@
-"""What the adapter's process does, without the process: samples in, about once a second a report out."""
+"""The adapter: samples in, about once a second a report out; and the process that it runs in."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Adaptation by the filter in the daemon's own thread: the geometry learnt from wheels and poses, twice a second.
+"""Adaptation by the filter in the daemon's own thread, twice a second, alone or audited by the density network.
 
 The filter takes a fraction of a millisecond for a pose, so that no process is needed; what goes into force is recorded
 in the same tick, and a replay reads it from the log.

@@ -1,4 +1,4 @@
-"""The density estimator of adaptation: trained once at the start, then conditioned on one window after the other.
+"""The density estimator of adaptation: trained once, then conditioned on the samples of one window after the other.
 
 BayesSim trains on repetitions of one drive; here every simulation has a drive of its own, and the statistics say what a
 drive was worth instead of what it was: the closed-form estimate, how well it is determined, and what it leaves

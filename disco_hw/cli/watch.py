@@ -1,4 +1,4 @@
-"""Verbs over what was recorded or is running: view, replay."""
+"""Verbs over what was recorded or is running: view, replay, bridge."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The sampling optimiser behind DISCO: owns the plan and the buffers, knows nothing of the system it optimises."""
+"""The sampling optimiser behind DISCO, which knows nothing of its system, and the splines that smooth its noise."""
 
 from __future__ import annotations
 

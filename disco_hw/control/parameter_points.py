@@ -1,4 +1,4 @@
-"""The parameter points that every command sequence is rolled out under, and their weights."""
+"""The parameter points that every command sequence is rolled out under, and their weights; sigma points among them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the planner takes and gives: the state it starts from and a plan as a function of time."""
+"""What the planner takes and gives: the state and the commands before it, and a plan as a function of time."""
 
 from __future__ import annotations
 

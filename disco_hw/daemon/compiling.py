@@ -1,4 +1,4 @@
-"""Compiles what a start needs: the planner's kernels, where no earlier start has kept them.
+"""What a start does before it matters: compiles kernels that no earlier start has kept, and warms the tick up.
 
 In a process of its own, which is gone afterwards: the compiler leaves 200 MB behind, and the control loop's process
 locks all that it has.

@@ -1,4 +1,4 @@
-"""The pilot that drives by hand or script: source, deadman and coverage in one tick; pure."""
+"""The pilots with a person in them: by hand or script, and by hand until the heading is known; pure."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The paper's pendulum experiment: five controllers swing the same pendulum up (first figure, first table).
+"""The paper's pendulum experiment: five controllers swing one pendulum up; and both systems as torch models.
 
 True parameters (IT-MPC) against DISCO with the unscented transform and with Monte Carlo, each under the prior and under
 the posterior. What the paper leaves open or prints wrongly is settled as in its published code: the cost

@@ -1,4 +1,4 @@
-"""`disco-hw init`: a robot.toml for a robot, from what is heard on its link and what its owner says."""
+"""`disco-hw init`: a robot.toml from what is heard on the link and what its owner says, edited in its text."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One call: logs and a model in, the report out."""
+"""The gap analysis as one call: logs and a model in, the report out; and what `disco-hw gap` writes of it."""
 
 from __future__ import annotations
 

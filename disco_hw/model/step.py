@@ -1,4 +1,4 @@
-"""The transition function f_theta: one step of the skid-steer robot with the effects its model has.
+"""The transition function f_theta: one step of the skid-steer robot with the terms of its effects put in line.
 
 Compiled scalar functions, generic in precision. An effect that is absent is None; the compiler sees that in the type of
 its argument and leaves nothing of it in the machine code. The same in numpy, for reading: `disco_hw.model.plain`.

@@ -1,4 +1,4 @@
-"""Does the robot do what it should: wheels follow commands, the supply holds, poses change when the robot moves.
+"""Does the robot do what it should: wheels follow commands, supply holds, poses change, and the task gets on.
 
 Nothing is stopped here. It counts and reports what the rest of the stack tolerates: faults too short or too small for
 the firmware's own limits, before they grow.

@@ -1,4 +1,4 @@
-"""The daemon's states and every way between them, as one table.
+"""The daemon's states and every way between them, as one table, and what each means for a person, in words.
 
 Rows are tried from top to bottom, one transition per step: what takes motion away stands above what gives it.
 `disco_hw.runtime.supervisor` computes the conditions and acts on the state. E-stop is shown in FAULT: the robot's

@@ -1,4 +1,4 @@
-"""The live page as a process of its own beside a daemon that is about to start in this one."""
+"""The live page as a process of its own beside a daemon, where it is found, and the token that opens it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From the handshake to armed: who the robot is, what the host asks of it, and when it may command the wheels."""
+"""The host's side of a session: handshake, arming, the cyclic frames, and the watch over an armed robot."""
 
 from __future__ import annotations
 

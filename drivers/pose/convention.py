@@ -1,4 +1,4 @@
-"""How a pose source speaks, where that is not in metres and radians of the tracked point in the world."""
+"""How a pose source speaks, where not in metres and radians of the tracked point; and why it cannot be had."""
 
 from __future__ import annotations
 

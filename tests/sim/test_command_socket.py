@@ -3,7 +3,8 @@ import threading
 
 import pytest
 
-from sim.process import CommandSocket, SocketPathError, main, send_command
+from sim.command_socket import CommandSocket, main, send_command
+from sim.process import SocketPathError
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""What classical followers share: the place on the line, the wheels that a motion takes, and the shape of a plan."""
+"""What classical followers share: the reference along the line, the place on it, the wheels of a motion, a plan."""
 
 from __future__ import annotations
 

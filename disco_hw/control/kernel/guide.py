@@ -2,7 +2,7 @@
 
 Samples lie around the last plan and cut the corners that it cuts. Turning before a corner comes first, then a worse
 cost, then a better one: no small change of a plan finds it. The law does at once, as it acts on the centre of rotation
-along the stable inverse (tasks/line/inverse.py) of the line. The guide is costed as every sample is; how the planner
+along the stable inverse (tasks/line/course.py) of the line. The guide is costed as every sample is; how the planner
 goes over to it is written in `Disco`.
 """
 

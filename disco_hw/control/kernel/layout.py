@@ -1,4 +1,4 @@
-"""How the buffers of the compiled step are laid out; docs/kernel.md draws it, and a test holds it against this file.
+"""How the buffers of the compiled step are laid out, and the call by which a system rolls one block of them out.
 
 Samples are the innermost dimension everywhere, in blocks of BLOCK: every loop over them becomes vector instructions
 without a remainder, and a block's commands and state stay in the first-level cache.

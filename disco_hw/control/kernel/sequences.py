@@ -1,4 +1,4 @@
-"""From noise to command sequences: nominal plus noise, within the limits, one block of samples at a time; and back.
+"""From noise to command sequences within the limits, one block of samples at a time; and back; and sums over a block.
 
 Commands lie as rows of BLOCK samples: row (history + t) * C + c is channel c at step t, for C channels.
 """

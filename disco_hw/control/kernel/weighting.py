@@ -1,4 +1,4 @@
-"""From costs to weights: softmax with a temperature that is given or found from a target effective sample size.
+"""From costs to weights: risk over parameter points, then softmax with a given or adapted temperature.
 
 Sums run over lanes in a fixed order, so that the same costs give the same weights bit for bit.
 """

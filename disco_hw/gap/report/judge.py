@@ -1,4 +1,4 @@
-"""From what was found to the findings of the report: which effects, how sure, and what they may be taken for."""
+"""From what was found to the findings: which effects, how sure, what else they may be, and which are doubtful."""
 
 from __future__ import annotations
 

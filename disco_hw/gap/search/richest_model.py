@@ -1,4 +1,4 @@
-"""The richest model of a channel: everything that has a name and everything that has none, fitted at once.
+"""The effects as they compete, and the richest model of a channel: all of them and all unnamed terms at once.
 
 What it leaves is noise. A noise model learnt from a poorer one takes what is missing for noise and hides it.
 """

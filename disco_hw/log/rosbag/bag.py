@@ -1,4 +1,4 @@
-"""A bag of ROS 2 (MCAP, sqlite3) or ROS 1, read through `rosbags`: its topics, and their messages in one pass.
+"""A bag of ROS 2 (MCAP, sqlite3) or ROS 1, read through `rosbags`: topics, messages in one pass, and their times.
 
 The library is imported when a bag is opened. A bag is foreign bytes: whatever the library makes of damage becomes one
 line, and reading it may take 1.5 GiB of memory and no more.

@@ -1,4 +1,4 @@
-"""The line through way-points as a course: its geometry, how far it has been driven, how fast it can be."""
+"""The line through way-points as a course: geometry, progress, speeds, hairpins, and headings that stay on it."""
 
 from __future__ import annotations
 

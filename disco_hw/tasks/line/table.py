@@ -1,4 +1,4 @@
-"""A path of way-points in equal pieces of arc length, and where on it a robot is."""
+"""Way-points from a CSV, and a path of them in equal pieces of arc length, with where on it a robot is."""
 
 from __future__ import annotations
 
