@@ -2,6 +2,8 @@
  * says to the link. The board's part is port.h. */
 #include "port.h"
 
+#include <string.h>
+
 #if defined(DISCO_LINK_SLCAN)
 #include "slcan.h"
 #elif !defined(DISCO_LINK_CAN)
@@ -16,6 +18,7 @@ static port_measurement_t measurement;
 static disco_outputs_t outputs;
 static uint64_t now_us;
 static uint32_t last_us;
+static uint8_t kept[DISCO_RECORD_LENGTH]; /* the record of the parameters, as it was stored last */
 
 /* The core's 64-bit clock from the counter's 32 bits; called far more often than the counter wraps. */
 static uint64_t clock_us(void)
@@ -30,12 +33,15 @@ static uint64_t clock_us(void)
 
 static void start_link(void) {}
 
-static void receive(void)
+/* Whether there may be more: a line that never falls silent must not hold up the cycle, so no turn takes all. */
+static bool receive(void)
 {
     disco_frame_t frame;
-    while (port_receive(&frame)) {
+    const bool came = port_receive(&frame);
+    if (came) {
         disco_firmware_receive(&core, clock_us(), frame.can_id, frame.data, frame.length);
     }
+    return came;
 }
 
 static void send(void)
@@ -84,19 +90,18 @@ static bool completes(uint8_t byte, disco_frame_t *frame)
 #endif
 }
 
-static void receive(void)
+/* Whether there may be more: a line that never falls silent must not hold up the cycle, so no turn takes all. */
+static bool receive(void)
 {
     uint8_t bytes[64];
     disco_frame_t frame;
-    size_t count = port_receive(bytes, sizeof(bytes));
-    while (count > 0u) {
-        for (size_t i = 0u; i < count; i++) {
-            if (completes(bytes[i], &frame)) {
-                disco_firmware_receive(&core, clock_us(), frame.can_id, frame.data, frame.length);
-            }
+    const size_t count = port_receive(bytes, sizeof(bytes));
+    for (size_t i = 0u; i < count; i++) {
+        if (completes(bytes[i], &frame)) {
+            disco_firmware_receive(&core, clock_us(), frame.can_id, frame.data, frame.length);
         }
-        count = (count == sizeof(bytes)) ? port_receive(bytes, sizeof(bytes)) : 0u;
     }
+    return count == sizeof(bytes);
 }
 
 static bool next_to_send(void)
@@ -151,10 +156,23 @@ static void drive(void)
 #endif
 }
 
+/* Flash wears out: what is written again as it was is not kept again. */
+static void keep_parameters(void)
+{
+    static uint32_t written;
+    uint8_t record[DISCO_RECORD_LENGTH];
+    if (core.parameter_writes != written) {
+        written = core.parameter_writes;
+        disco_record_pack(&core.config, record);
+        if (memcmp(record, kept, sizeof(record)) != 0) {
+            (void)memcpy(kept, record, sizeof(record));
+            port_store(record);
+        }
+    }
+}
+
 static void cycle(void)
 {
-    static uint32_t stored;
-    uint8_t record[DISCO_RECORD_LENGTH];
     measure();
     const uint64_t cycle_us = clock_us();
     if (measurement.posed) {
@@ -163,21 +181,16 @@ static void cycle(void)
     }
     disco_firmware_step(&core, cycle_us, &measurement.inputs, &outputs);
     drive();
-    if (core.parameter_writes != stored) {
-        stored = core.parameter_writes;
-        disco_record_pack(&core.config, record);
-        port_store(record);
-    }
+    keep_parameters();
 }
 
 int main(void)
 {
-    uint8_t record[DISCO_RECORD_LENGTH];
     uint64_t last_entropy = 0u;
     disco_config_t config = disco_config_default(2048u, 8.0f);
     measurement.inputs.reset_cause = (uint8_t)port_start(&config);
-    if (port_load(record)) {
-        (void)disco_record_unpack(record, &config);
+    if (port_load(kept)) {
+        (void)disco_record_unpack(kept, &config);
     }
 #if defined(DISCO_PLANT_LINE)
     config.board_id |= DISCO_BOARD_VIRTUAL;
@@ -189,7 +202,7 @@ int main(void)
     last_us = port_now_us();
     uint32_t due_us = last_us;
     for (;;) {
-        receive();
+        const bool more = receive();
         const int32_t behind_us = (int32_t)(port_now_us() - due_us);
         if (behind_us >= 0) {
             due_us += (behind_us < (int32_t)MOST_BEHIND_US) ? config.cycle_us : ((uint32_t)behind_us + config.cycle_us);
@@ -198,7 +211,9 @@ int main(void)
             port_feed_watchdog();
         } else {
             send();
-            port_wait();
+            if (!more) {
+                port_wait();
+            }
         }
     }
 }

@@ -1,0 +1,143 @@
+"""The main loop with the core, replayed under the sanitizers without a clock: whatever bytes come, it stays sound."""
+
+import itertools
+import random
+import re
+import struct
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from firmware_protocol.build_firmware import PACKAGE, SOURCES
+from firmware_protocol.codec import Codec
+from firmware_protocol.serial_framing import FrameDecoder, encode_frame
+
+FIRMWARE, PORTS = PACKAGE / "firmware", PACKAGE / "ports"
+PORT = Path(__file__).with_name("replay_port.c")
+FLAGS = ("-std=c11", "-O1", "-Wall", "-Wextra", "-Werror", f"-I{FIRMWARE}", f"-I{PORTS}")
+SANITIZERS = ("-fsanitize=undefined,address", "-fno-sanitize-recover=all")
+CODEC = Codec()
+LINE_US, USB_US = 11, 1
+"""Between bytes: of a serial line at 921600 Bd, and of USB."""
+HOST_IDS = (0x080, 0x0F0, 0x0F1, 0x0F2, 0x100, 0x101, 0x102, 0x150, 0x160)
+PLANT_IDS = (0x7E0, 0x7E1, 0x7E2, 0x7E3)
+
+
+def wire_text(can_id, data):
+    return f"t{can_id:03X}{len(data)}{data.hex()}\r".encode()
+
+
+def record(can_id, data):
+    return struct.pack("<HB8s", can_id, len(data), data)
+
+
+LINKS = {
+    "serial": ((), encode_frame),
+    "slcan": (("-DDISCO_LINK_SLCAN",), wire_text),
+    "can": (("-DDISCO_LINK_CAN",), record),
+    "plant": (("-DDISCO_PLANT_LINE",), encode_frame),
+}
+
+
+@pytest.fixture(scope="module")
+def core(tmp_path_factory):
+    """The core's objects, with the sanitizers if this compiler has them."""
+    folder = tmp_path_factory.mktemp("core")
+    probe = folder / "probe.c"
+    probe.write_text("int main(void) { return 0; }\n")
+    tried = subprocess.run(
+        ["cc", *SANITIZERS, str(probe), "-o", str(folder / "probe")], capture_output=True, check=False
+    )
+    flags = (*FLAGS, *(() if tried.returncode else SANITIZERS))
+    subprocess.run(["cc", *flags, "-c", *(str(FIRMWARE / name) for name in SOURCES)], cwd=folder, check=True)
+    return flags, sorted(map(str, folder.glob("*.o")))
+
+
+@pytest.fixture
+def replay(core, tmp_path):
+    """Compile the board for a kind of link and let it hear these bytes; what it said, its cycles and its stores."""
+    flags, objects = core
+
+    def replayed(link, heard, byte_us=LINE_US, plant=b""):
+        options, _ = LINKS[link]
+        sources = [PORTS / "controller.c", PORT, *([PORTS / "plant_line.c"] if link == "plant" else [])]
+        program, line, plant_line = tmp_path / "board", tmp_path / "line", tmp_path / "plant"
+        subprocess.run(["cc", *flags, *options, *map(str, sources), *objects, "-lm", "-o", str(program)], check=True)
+        line.write_bytes(heard)
+        plant_line.write_bytes(plant)
+        environment = {"LINK": str(line), "PLANT": str(plant_line), "BYTE_US": str(byte_us)}
+        ran = subprocess.run(
+            [str(program)], capture_output=True, env=environment | {"ASAN_OPTIONS": "detect_leaks=0"}, check=False
+        )
+        said = ran.stderr.decode()
+        assert ran.returncode == 0, said
+        cycles, stores = map(int, re.fullmatch(r"(\d+) cycles (\d+) stores\n", said).groups())
+        return ran.stdout, cycles, stores
+
+    return replayed
+
+
+def frames_of(link, said):
+    if link == "slcan":
+        lines = re.findall(rb"t([0-9A-F]{3})(\d)([0-9A-F]*)\r", said)
+        return [(int(can_id, 16), bytes.fromhex(data.decode())) for can_id, _, data in lines]
+    if link == "can":
+        return [(can_id, data[:length]) for can_id, length, data in struct.iter_unpack("<HB8s", said)]
+    return FrameDecoder().feed(said)
+
+
+def answers(link, said, name):
+    can_id = CODEC.can_id(name)
+    return [CODEC.decode(can_id, data).values for seen, data in frames_of(link, said) if seen == can_id]
+
+
+def garbage(draw, link, ids):
+    """Frames of random data, some with a sound CRC, some damaged, cut off or of a length that no frame has; noise."""
+    _, written = LINKS[link]
+    for number in itertools.count():
+        data = draw.randbytes(8 if draw.random() < 0.7 else draw.randint(0, 8))
+        if number % 4 == 0:
+            write, key, value = draw.choice(["READ", "WRITE"]), draw.randint(0, 9), draw.uniform(-9, 99)
+            sound = CODEC.encode("PARAM_REQUEST", number, operation=write, key=key, value=value)
+            yield written(sound.can_id, sound.data)
+            continue
+        piece = bytearray(written(draw.choice([*ids, draw.randrange(0x800)]), data))
+        if number % 4 == 1:
+            piece[draw.randrange(len(piece))] = draw.randrange(256)
+        elif number % 4 == 2 and link != "can":
+            piece = piece[: draw.randint(1, len(piece))] + draw.randbytes(draw.choice([0, 0, 100]))
+        yield bytes(piece)
+
+
+@pytest.mark.parametrize("link", LINKS)
+def test_garbage_on_its_lines_does_no_harm_and_it_answers_afterwards(replay, link):
+    draw = random.Random(24)
+    noise = b"".join(itertools.islice(garbage(draw, link, HOST_IDS), 4000))
+    end = {"slcan": b"\rC\rO\r", "can": b""}.get(link, b"\0")
+    opening = b"O\r" if link == "slcan" else b""
+    asked = CODEC.encode("TIME_REQUEST", 3, sequence=77)
+    plant = b"".join(itertools.islice(garbage(draw, "plant", PLANT_IDS), 4000))
+    said, cycles, _ = replay(link, opening + noise + end + LINKS[link][1](asked.can_id, asked.data), plant=plant)
+    assert cycles > 2000
+    assert answers(link, said, "TIME_RESPONSE")[-1]["sequence"] == 77
+
+
+@pytest.mark.parametrize("link", ["serial", "slcan", "can"])
+def test_a_line_that_never_falls_silent_does_not_hold_up_the_cycle(replay, link):
+    """As USB's can be: twice as fast as the core takes it in, for half a second without a gap."""
+    frame = LINKS[link][1](0x7FF, bytes(8))
+    heard = frame * (500_000 // len(frame))
+    _, cycles, _ = replay(link, heard, byte_us=USB_US)
+    assert cycles >= 2400
+
+
+def test_parameters_are_stored_when_they_change_and_not_each_time_they_are_written(replay):
+    """Flash wears out."""
+    values = [5.0] * 10 + [6.0] * 10 + [5.0]
+    asked = [CODEC.encode("PARAM_REQUEST", i, operation="WRITE", key=4, value=v) for i, v in enumerate(values)]
+    # 20 ms of silence between them.
+    heard = b"".join(bytes(2000) + encode_frame(frame.can_id, frame.data) for frame in asked)
+    said, _, stores = replay("serial", bytes(20_000) + heard)
+    assert [answer["value"] for answer in answers("serial", said, "PARAM_RESPONSE")] == values
+    assert stores == 3
