@@ -23,6 +23,7 @@ import disco_hw
 from disco_hw import cli
 from disco_hw.log.link import Attachment
 from disco_hw.runtime.pipeline import NoPlanner
+from drivers.motor import find_driver
 from firmware_protocol.codec import Codec
 from tools.log_samples import drive_ticks, log_bytes
 
@@ -59,6 +60,7 @@ CALLS = (
     Call("ctl", "robot.toml status", ("robot.toml",)),
     Call("estop", "robot.toml", ("robot.toml",)),
     Call("bridge ros2", "robot.toml --model model.toml", _SETUP),
+    Call("bridge ros2-base", "base.toml", ("base.toml", "model.toml")),
     Call("infer", "drive.csv --robot robot.toml", ("robot.toml", "drive.csv")),
     Call("infer", "run.mcap --robot robot.toml", ("robot.toml", "run.mcap")),
     Call("gap", "drive.csv --robot robot.toml --model model.toml -o out", ("robot.toml", "model.toml", "drive.csv")),
@@ -85,6 +87,7 @@ def good_files() -> dict[str, bytes]:
 
 
 _GOOD: dict[str, bytes] = {}
+_ON_ROS = f'driver = "ros2_base"\n{find_driver("ros2_base").example}'
 
 
 def _make_good() -> dict[str, bytes]:
@@ -107,6 +110,9 @@ def _make_good() -> dict[str, bytes]:
     _GOOD.update(
         {
             "robot.toml": robot.encode(),
+            "base.toml": shipped.replace(b"wombot_model", b"model").replace(
+                b"[link]\n", b"[link]\n" + _ON_ROS.encode()
+            ),
             "model.toml": model,
             "faults.toml": FAULTS.encode(),
             "path.csv": b"x_m,y_m\n0,0\n1,0\n2,0.5\n3,1.5\n",
@@ -143,7 +149,8 @@ def _after(name: str) -> Callable[..., Any]:
 
 
 _WORK = (
-    "disco_hw.bridge.ros2._join",
+    "disco_hw.bridge.ros2.join_domain",
+    "disco_hw.bridge.ros2_base.Clients",
     "disco_hw.daemon.check.refuse_beside_a_daemon",
     "disco_hw.daemon.client.send_request",
     "disco_hw.daemon.daemon._make_recorder",

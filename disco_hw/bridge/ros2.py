@@ -30,6 +30,7 @@ from disco_hw.daemon.signals import StopSignals
 from disco_hw.errors import InputError, WorkError
 from disco_hw.runtime.assembly import odometry_parameters
 from disco_hw.runtime.robot_setup import Setup, load_setup
+from drivers.motor.ros2_base_wire import Ros2BaseSettings
 from drivers.pose.ros2 import SOURCE, bridge_address
 
 CMD_VEL, CTL, REPLY, ESTOP = "cmd_vel", "disco_hw/ctl", "disco_hw/reply", "disco_hw/estop"
@@ -41,8 +42,8 @@ _SECOND_NS = 1_000_000_000
 _WAIT_S = 0.05
 _MOST_AT_ONCE = 20
 
-_SENSOR = Qos(Policy.Reliability.BestEffort, Policy.Durability.Volatile, Policy.History.KeepLast(5))
-_RELIABLE = Qos(
+SENSOR = Qos(Policy.Reliability.BestEffort, Policy.Durability.Volatile, Policy.History.KeepLast(5))
+RELIABLE = Qos(
     Policy.Reliability.Reliable(duration(milliseconds=5)), Policy.Durability.Volatile, Policy.History.KeepLast(10)
 )
 _LATCHED = Qos(
@@ -50,15 +51,16 @@ _LATCHED = Qos(
 )
 
 _SAID: tuple[tuple[str, type, Qos], ...] = (
-    (out.ODOM, msg.Odometry, _RELIABLE),
-    (out.JOINT_STATES, msg.JointState, _RELIABLE),
-    (out.TF, msg.TFMessage, _RELIABLE),
-    (out.PLAN, msg.RosPath, _RELIABLE),
-    (out.POSE, msg.PoseWithCovarianceStamped, _RELIABLE),
+    (out.ODOM, msg.Odometry, RELIABLE),
+    (out.JOINT_STATES, msg.JointState, RELIABLE),
+    (out.TF, msg.TFMessage, RELIABLE),
+    (out.PLAN, msg.RosPath, RELIABLE),
+    (out.POSE, msg.PoseWithCovarianceStamped, RELIABLE),
     (out.STATE, msg.String, _LATCHED),
-    (out.DIAGNOSTICS, msg.DiagnosticArray, _RELIABLE),
-    (REPLY, msg.String, _RELIABLE),
+    (out.DIAGNOSTICS, msg.DiagnosticArray, RELIABLE),
+    (REPLY, msg.String, RELIABLE),
 )
+_OF_THE_BASE = (out.ODOM, out.JOINT_STATES, out.TF)
 _Take = Callable[[Any, int], None]  # Any: a message of the reader's type.
 
 
@@ -90,7 +92,7 @@ class Bridge:
         config = setup.config
         parameters = odometry_parameters(setup.model)
         self._setup, self._link, self._config = setup, link, config
-        self._domain, self._participant = _join(config)
+        self._domain, self._participant = join_domain(config)
         self._outgoing = out.Outgoing(config, parameters)
         self._feed = FeedSubscriber(tick_feed_path(socket_path(config)))
         self._poses = ros2_poses.PoseInlet(config.pose)
@@ -105,9 +107,12 @@ class Bridge:
         # An e-stop must not wait behind a request that the daemon is slow to answer.
         self._asking, self._stopping = ros2_commands.Errands(), ros2_commands.Errands()
         namespace = config.ros2.namespace
+        # A base on ROS 2 says its own odometry, and takes /cmd_vel itself.
+        self._base_on_ros = isinstance(config.link.settings(), Ros2BaseSettings)
         self._writers = {
             name: DataWriter(self._participant, Topic(self._participant, wire_name(name, namespace), kind, qos), qos)
             for name, kind, qos in _SAID
+            if not (self._base_on_ros and name in _OF_THE_BASE)
         }
         self._readers = list(self._make_readers(namespace))
 
@@ -153,11 +158,11 @@ class Bridge:
         # One for each type that a topic may have: only the one that the sender has is ever matched.
         if self._config.pose.source == SOURCE:
             for pose in ros2_poses.TYPES:
-                yield self._reader(self._config.pose.topic, pose, _SENSOR, namespace), self._take_pose
-        for speed in ros2_commands.TYPES:
-            yield self._reader(CMD_VEL, speed, _SENSOR, namespace), self._take_speed
-        yield self._reader(CTL, msg.String, _RELIABLE, namespace), self._take_request
-        yield self._reader(ESTOP, msg.Bool, _RELIABLE, namespace), self._take_estop
+                yield self._reader(self._config.pose.topic, pose, SENSOR, namespace), self._take_pose
+        for speed in () if self._base_on_ros else ros2_commands.TYPES:
+            yield self._reader(CMD_VEL, speed, SENSOR, namespace), self._take_speed
+        yield self._reader(CTL, msg.String, RELIABLE, namespace), self._take_request
+        yield self._reader(ESTOP, msg.Bool, RELIABLE, namespace), self._take_estop
 
     def _reader(self, topic: str, kind: Any, qos: Qos, namespace: str) -> DataReader[Any]:
         return DataReader(self._participant, Topic(self._participant, wire_name(topic, namespace), kind), qos)
@@ -252,7 +257,8 @@ class Bridge:
 
     def _say(self, topic: str, message: object) -> None:
         try:
-            self._writers[topic].write(message)
+            if topic in self._writers:
+                self._writers[topic].write(message)
         except DDSException:
             self._unwritten += 1
 
@@ -266,7 +272,7 @@ def _domain(config: RobotConfig) -> int:
     return int(given)
 
 
-def _join(config: RobotConfig) -> tuple[Domain | None, DomainParticipant]:
+def join_domain(config: RobotConfig) -> tuple[Domain | None, DomainParticipant]:
     """Join the domain; beyond this computer as $CYCLONEDDS_URI says, or by multicast."""
     number = _domain(config)
     try:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
@@ -120,17 +122,33 @@ bridge_app = typer.Typer(no_args_is_help=True, help="Carry poses, commands and s
 
 @bridge_app.callback()
 def _bridge() -> None:
-    """Make `ros2` a word of its own."""
+    """Each verb below has a robot of its own."""
 
 
 @bridge_app.command()
 def ros2(robot: RobotFile, model: ModelOption = None, link: LinkOption = None) -> None:
     """Poses and commands in, odometry and state out, beside a daemon that may come and go (docs/ros2.md)."""
     check_named_files(robot, model)
-    try:
+    with _ros2_extra("ros2"):
         from disco_hw.bridge.ros2 import run_ros2_bridge
+    raise typer.Exit(run_ros2_bridge(robot, model, link))
+
+
+@bridge_app.command("ros2-base")
+def ros2_base(robot: RobotFile) -> None:
+    """Carry commands to a base that is reached over ROS 2 alone, and its odometry back (docs/ros2.md)."""
+    check_named_files(robot)
+    with _ros2_extra("ros2-base"):
+        from disco_hw.bridge.ros2_base import run_base_bridge
+    raise typer.Exit(run_base_bridge(robot))
+
+
+@contextmanager
+def _ros2_extra(word: str) -> Iterator[None]:
+    """Say what to install where DDS is not."""
+    try:
+        yield
     except ModuleNotFoundError as error:
         if error.name != "cyclonedds":
             raise
-        raise InputError("bridge ros2: needs cyclonedds; pip install 'disco-hw[ros2]'") from None
-    raise typer.Exit(run_ros2_bridge(robot, model, link))
+        raise InputError(f"bridge {word}: needs cyclonedds; pip install 'disco-hw[ros2]'") from None

@@ -25,6 +25,7 @@ WRITTEN = {
 READ = {
     *((verb, "robot") for verb in ("run", "drive", "check", "ctl", "estop", "infer", "gap", "import", "view", "sim")),
     *((verb, "robot") for verb in ("experiment circle", "experiment adapt", "experiment gap", "bridge ros2")),
+    ("bridge ros2-base", "robot"),
     *((verb, "model") for verb in ("run", "drive", "gap", "view", "sim", "bridge ros2")),
     *((verb, "log") for verb in ("import", "log info", "log recover", "log export", "view", "replay")),
     *(("infer", "logs"), ("gap", "logs"), ("sim", "faults"), ("commission", "robot")),

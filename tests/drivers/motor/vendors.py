@@ -130,6 +130,24 @@ def is_roboclaw_forbidden(frame):
     return command not in (14, 15, 21, 40, 55, 56, 78, 79, 90, 200)
 
 
+def lose_left_ros2_base(rig):
+    rig.controller.joints = False
+
+
+def mend_ros2_base(rig):
+    rig.controller.joints = True
+
+
+def is_ros2_base_motion(frame):
+    """Speeds that are not zero, or the bridge told to drive."""
+    return (frame.can_id == 0x012 and frame.data != bytes(8)) or (frame.can_id == 0x011 and frame.data != b"\0")
+
+
+def is_ros2_base_forbidden(frame):
+    """Whatever is none of the four frames of a host."""
+    return len(frame.data) != {0x010: 0, 0x011: 1, 0x012: 8, 0x013: 0}.get(frame.can_id)
+
+
 VENDORS = (
     Vendor(
         "odrive",
@@ -225,5 +243,16 @@ VENDORS = (
         is_roboclaw_forbidden,
         None,
         lambda rig: rig.controller.dead.clear(),
+    ),
+    Vendor(
+        "ros2_base",
+        "ros2-base",
+        "",
+        0.2,
+        lose_left_ros2_base,
+        is_ros2_base_motion,
+        is_ros2_base_forbidden,
+        CanFrame(0x012, bytes(8)),
+        mend_ros2_base,
     ),
 )

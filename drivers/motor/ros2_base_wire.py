@@ -1,0 +1,276 @@
+"""What the driver of bases on ROS 2 and the bridge say to each other on their local link, and the bridge's end of it.
+
+Frames as of CAN: the link may be recorded, watched and broken as any other. The bridge's end latches an e-stop, and
+stops the base when the commands fall silent; when the bridge itself dies, only the base's own time-out does.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+import zlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Annotated
+
+import msgspec
+from msgspec import Meta
+
+from drivers.types import CyclicFrame, Frame, SafetyCard, SettingsFault
+
+STOP, ENABLE, SPEEDS, RESET = 0x010, 0x011, 0x012, 0x013
+STATE, ANGLES, WHEELS = 0x110, 0x111, 0x112
+HOST_FRAMES = frozenset({STOP, ENABLE, SPEEDS, RESET})
+LENGTHS = {STOP: 0, ENABLE: 1, SPEEDS: 8, RESET: 0, STATE: 8, ANGLES: 8, WHEELS: 8}
+"""Data bytes of each frame.
+
+ENABLE: 1 to drive, 0 to stand by. SPEEDS: forward (m/s) and to the left (rad/s), float32. ANGLES: left and right,
+int32, 0.1 mrad, modulo 2^32. WHEELS, after the ANGLES of the same instant: left and right (2 mrad/s), int16, and how
+long ago both were true (0.1 ms), uint16. STATE: flags, why odometry was refused, a check sum of the settings. All of
+them big endian.
+"""
+DRIVING, LATCHED, BUTTON, ODOMETRY, HEARD, OTHERS, FELL_SILENT = (1 << bit for bit in range(7))
+DEADMAN_S = 0.2
+ZEROS_S = 0.5
+STEP_S = 0.02
+STANDS_M_S = 0.02
+_ANGLE_RAD, _SPEED_RAD_S, _AGE_S = 1e-4, 2e-3, 1e-4
+REFUSALS = (
+    "nothing is heard on link.wheels_topic",
+    "it is stamped by another clock, or late; synchronise the clocks of both computers and leave use_sim_time off",
+    "it lacks joints of link.left_joints or link.right_joints, or their positions",
+    "it is not finite, or turns faster than the base can",
+    "it comes out of order",
+)
+EXAMPLE = """wheel_radius_m = 0.06
+track_m = 0.31
+max_speed_m_s = 1.5
+watchdog_s = 0.5
+"""
+
+
+class Ros2BaseSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Its fields in [link]: the base takes speeds of the body, which these turn wheel speeds into and back.
+
+    `watchdog_s`: after what silence on its topic the base stops by itself, which nobody can read back. `wheels_topic`:
+    JointState where the joints are named, else Odometry. `stop_topic`: a Bool that is true while a button of the base
+    is pressed.
+    """
+
+    wheel_radius_m: Annotated[float, Meta(gt=0.0, le=2.0)]
+    track_m: Annotated[float, Meta(gt=0.0, le=5.0)]
+    max_speed_m_s: Annotated[float, Meta(gt=0.0, le=10.0)]
+    watchdog_s: Annotated[float, Meta(gt=0.0, le=1.0)]
+    stop_deceleration_rad_s2: Annotated[float, Meta(gt=0.0, le=655.0)] = 10.0
+    speed_topic: Annotated[str, Meta(min_length=1, max_length=200)] = "/cmd_vel"
+    speed_stamped: bool = False
+    wheels_topic: Annotated[str, Meta(max_length=200)] = ""
+    left_joints: Annotated[tuple[str, ...], Meta(max_length=8)] = ()
+    right_joints: Annotated[tuple[str, ...], Meta(max_length=8)] = ()
+    stop_topic: Annotated[str, Meta(max_length=200)] = ""
+
+    def fault(self) -> SettingsFault | None:
+        """Joints of one side alone, or a joint that stands there twice."""
+        joints = (*self.left_joints, *self.right_joints)
+        if bool(self.left_joints) is not bool(self.right_joints):
+            side = "right_joints" if self.left_joints else "left_joints"
+            return SettingsFault(side, "empty, and the other side's are not", "name those of both sides, or of none")
+        if len(set(joints)) < len(joints):
+            return SettingsFault("left_joints", "a joint stands there twice", "write each once, on its side")
+        return None
+
+    @property
+    def wheels_from(self) -> str:
+        """The topic that says how the wheels turn."""
+        return self.wheels_topic or ("/joint_states" if self.left_joints else "/odom")
+
+    @property
+    def fastest_rad_s(self) -> float:
+        """The wheel speed of the base's largest speed."""
+        return self.max_speed_m_s / self.wheel_radius_m
+
+    def stands(self, left_rad_s: float, right_rad_s: float) -> bool:
+        """Whether these are wheels of a base that does not move."""
+        return self.wheel_radius_m * max(abs(left_rad_s), abs(right_rad_s)) < STANDS_M_S
+
+    def check_sum(self) -> int:
+        """Of all fields: driver and bridge must have been started with the same."""
+        return zlib.crc32(msgspec.json.encode(self))
+
+
+@dataclass(frozen=True, slots=True)
+class Wheels:
+    """Angles (rad, cumulative) and speeds (rad/s) of both sides, and how long ago they were true."""
+
+    angles_rad: tuple[float, float]
+    speeds_rad_s: tuple[float, float]
+    age_s: float
+
+
+def speeds(linear_m_s: float, angular_rad_s: float) -> Frame:
+    """The command to the base."""
+    return Frame(SPEEDS, struct.pack(">ff", linear_m_s, angular_rad_s))
+
+
+def enable(drive: bool) -> Frame:
+    """To drive from now on, or to stand by."""
+    return Frame(ENABLE, bytes([drive]))
+
+
+def wheel_frames(wheels: Wheels) -> tuple[Frame, Frame]:
+    """What the wheels do, for the driver."""
+    angles = (round(angle / _ANGLE_RAD) % 2**32 for angle in wheels.angles_rad)
+    steps = (max(-32768, min(32767, round(speed / _SPEED_RAD_S))) for speed in wheels.speeds_rad_s)
+    age = max(0, min(65535, round(wheels.age_s / _AGE_S)))
+    return Frame(ANGLES, struct.pack(">II", *angles)), Frame(WHEELS, struct.pack(">hhHxx", *steps, age))
+
+
+def unpack_angles(data: bytes) -> tuple[int, int]:
+    """Left and right, in 0.1 mrad modulo 2^32."""
+    left, right = struct.unpack(">II", data)
+    return left, right
+
+
+def turned_rad(new: tuple[int, int], old: tuple[int, int]) -> tuple[float, float]:
+    """How far both wheels have turned between two ANGLES."""
+    left, right = (_ANGLE_RAD * ((one - other + 2**31) % 2**32 - 2**31) for one, other in zip(new, old, strict=True))
+    return left, right
+
+
+def unpack_wheels(data: bytes) -> tuple[tuple[float, float], float]:
+    """Speeds of left and right (rad/s), and their age (s)."""
+    left, right, age = struct.unpack(">hhHxx", data)
+    return (_SPEED_RAD_S * left, _SPEED_RAD_S * right), _AGE_S * age
+
+
+def unpack_state(data: bytes) -> tuple[int, int, int]:
+    """Flags, why odometry was refused (an index of REFUSALS), and the check sum of the settings."""
+    flags, refusal, check_sum = struct.unpack(">BBxxI", data)
+    return flags, min(refusal, len(REFUSALS) - 1), check_sum
+
+
+class BaseEnd:
+    """The bridge's end: which speeds the base is told now; pure. Who owns it says what is heard of the base."""
+
+    def __init__(self, settings: Ros2BaseSettings) -> None:
+        self.driving = self.latched = self.button = self.is_heard = self.others_speak = False
+        self.has_odometry = False
+        self.refusal = 0
+        self._check_sum = settings.check_sum()
+        self._fell_silent = False
+        self._fed_ns = 0
+        self._zeros_until_ns = 0
+        self.refused_speeds = 0
+
+    def receive(self, now_ns: int, frame: Frame) -> tuple[float, float] | None:
+        """Take in a frame of the driver; the speeds to say at once (m/s, rad/s), None for nothing."""
+        if frame.extended or LENGTHS.get(frame.can_id) != len(frame.data):
+            return None
+        match frame.can_id:
+            case 0x010:
+                self.latched = True
+                return self.stand_by(now_ns)
+            case 0x011 if frame.data[0] != 1:
+                return self.stand_by(now_ns)
+            case 0x011:
+                if not (self.driving or self.latched or self.button):
+                    # The time-out runs from here on, and only speeds feed it.
+                    self.driving, self._fell_silent, self._fed_ns = True, False, now_ns
+            case 0x012:
+                linear, angular = struct.unpack(">ff", frame.data)
+                self._check_silence(now_ns)
+                if self.driving and math.isfinite(linear + angular):
+                    self._fed_ns = now_ns
+                    return linear, angular
+                self.refused_speeds += 1
+            case 0x013:
+                self.latched = False
+        return None
+
+    def step(self, now_ns: int) -> tuple[float, float] | None:
+        """Each STEP_S: zeros after a stop and while one is latched; while it drives, None: only commands feed it."""
+        if self.button and self.driving:
+            return self.stand_by(now_ns)
+        self._check_silence(now_ns)
+        due = self.latched or self.button or now_ns < self._zeros_until_ns
+        return (0.0, 0.0) if due and not self.driving else None
+
+    def stand_by(self, now_ns: int) -> tuple[float, float]:
+        """Drive no longer; the zeros that stop the base."""
+        self.driving, self._zeros_until_ns = False, now_ns + round(ZEROS_S * 1e9)
+        return 0.0, 0.0
+
+    def state(self) -> Frame:
+        """How it is, for the driver."""
+        bits = (
+            self.driving, self.latched, self.button, self.has_odometry, self.is_heard, self.others_speak,
+            self._fell_silent,
+        )  # fmt: skip
+        flags = sum(1 << bit for bit, is_set in enumerate(bits) if is_set)
+        return Frame(STATE, struct.pack(">BBxxI", flags, self.refusal, self._check_sum))
+
+    def _check_silence(self, now_ns: int) -> None:
+        if self.driving and now_ns - self._fed_ns > DEADMAN_S * 1e9:
+            self._fell_silent = True
+            self.stand_by(now_ns)
+
+
+def stop_frames(_settings: Ros2BaseSettings) -> tuple[Frame, ...]:
+    """The e-stop, which the bridge latches."""
+    return (Frame(STOP, b""),)
+
+
+def stop_confirmation(settings: Ros2BaseSettings) -> Callable[[Frame], bool]:
+    """Return what says, frame by frame heard, whether the bridge has latched the stop and the base stands."""
+    said = {"latched": False, "stands": False}
+
+    def heard(frame: Frame) -> bool:
+        if frame.extended or LENGTHS.get(frame.can_id) != len(frame.data):
+            return False
+        if frame.can_id == STATE:
+            flags, _, _ = unpack_state(frame.data)
+            said["latched"] = bool(flags & LATCHED and not flags & DRIVING)
+        elif frame.can_id == WHEELS:
+            said["stands"] = settings.stands(*unpack_wheels(frame.data)[0])
+        return all(said.values())
+
+    return heard
+
+
+def cyclic_frames(_settings: Ros2BaseSettings, command_rate_hz: float, _authenticated: bool) -> tuple[CyclicFrame, ...]:
+    """The command, and what the bridge says of a base with 50 messages a second."""
+    return (
+        CyclicFrame("speeds", "HOST", 8, command_rate_hz),
+        *(CyclicFrame(name, "ROBOT", 8, rate) for name, rate in (("state", 20.0), ("angles", 50.0), ("wheels", 50.0))),
+    )
+
+
+def recognise(frames: Sequence[Frame]) -> dict[str, object] | None:
+    """Nothing: the bridge is started with the robot.toml that would be made."""
+    return None
+
+
+def safety_card(settings: Ros2BaseSettings) -> SafetyCard:
+    """Who stops the robot when."""
+    base_s = settings.watchdog_s
+    odometry = () if settings.left_joints else (
+        "the wheels are taken from an Odometry, which has been through the base's own kinematics: what that leaves "
+        "out, neither inference nor gap can see",
+    )  # fmt: skip
+    return SafetyCard(
+        host_silent=f"the bridge says zero {DEADMAN_S:g} s after the last command, or at once when the daemon dies; "
+        f"when the bridge or the network fails, only the base's own time-out of {base_s:g} s stops it",
+        stops_by=f"slowing down as the base does; at {settings.max_speed_m_s:g} m/s it has gone "
+        f"{(DEADMAN_S + base_s) * settings.max_speed_m_s:.2f} m before it begins, if command and network fail together",
+        reaction_s=DEADMAN_S + base_s,
+        brakes=True,
+        estop="zero speed, which the bridge repeats and latches until it is reset, as long as it lives and the network "
+        "carries it; whoever else may speak on the topic can move the base: use the button on it",
+        unverified=(
+            f"link.watchdog_s = {base_s:g} is declared: ROS 2 has no way to read it back. With the wheels up, kill the "
+            f"bridge while they turn: they must stop",
+            "nobody proves who speaks on a topic: other nodes are noticed and stop the robot, but not kept off",
+            *odometry,
+        ),
+        setup=(f"the base's time-out for {settings.speed_topic} (cmd_vel_timeout or the like): {base_s:g} s or less",),
+    )

@@ -1,0 +1,291 @@
+"""The bridge to a base on ROS 2: what it takes for wheels, when it lets the base drive, and who is let in."""
+
+import math
+import socket
+import struct
+
+import pytest
+
+pytest.importorskip("cyclonedds", reason="cyclonedds is not installed: make venv")
+
+from disco_hw.bridge import ros2_messages as msg
+from disco_hw.bridge.ros2_base import Clients, run_base_bridge
+from disco_hw.bridge.ros2_wheels import WheelInlet
+from disco_hw.config import load_robot_config
+from disco_hw.errors import InputError
+from drivers.motor import find_driver
+from drivers.motor import ros2_base_wire as wire
+from drivers.types import Frame
+from tests.first_use.miswired import robot_file
+
+MS = 1_000_000
+MONO_NS, WALL_NS = 50_000 * MS, 1_800_000_000_000 * MS
+JOINTS = {"left_joints": ("fl", "rl"), "right_joints": ("fr", "rr")}
+
+
+def settings(**fields):
+    given = {"wheel_radius_m": 0.1, "track_m": 0.5, "max_speed_m_s": 1.0, "watchdog_s": 0.5}
+    return wire.Ros2BaseSettings(**{**given, **fields})
+
+
+def joints(at_ms, angles=(1.0, 2.0), speeds=(0.5, 1.5), names=("fl", "fr", "rl", "rr", "arm"), stamp=True):
+    left, right = angles
+    position = {"fl": left - 0.1, "rl": left + 0.1, "fr": right, "rr": right, "arm": 9.0}
+    velocity = {"fl": speeds[0], "rl": speeds[0], "fr": speeds[1], "rr": speeds[1], "arm": 9.0} if speeds else {}
+    header = msg.Header(msg.stamp_of(WALL_NS + at_ms * MS) if stamp else msg.Time())
+    return msg.JointState(header, list(names), [position[n] for n in names], [velocity[n] for n in names if velocity])
+
+
+def odometry(at_ms, x, y, yaw, speed=0.0, turn=0.0):
+    turned = msg.Quaternion(0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2))
+    pose = msg.PoseWithCovariance(msg.RosPose(msg.Point(x, y, 0.0), turned))
+    twist = msg.TwistWithCovariance(msg.Twist(msg.Vector3(speed, 0.0, 0.0), msg.Vector3(0.0, 0.0, turn)))
+    return msg.Odometry(msg.Header(msg.stamp_of(WALL_NS + at_ms * MS), "odom"), "base_link", pose, twist)
+
+
+def taken(inlet, message, now_ms):
+    return inlet.wheels(message, WALL_NS + now_ms * MS, MONO_NS + now_ms * MS, WALL_NS + now_ms * MS)
+
+
+def test_joints_of_a_side_are_averaged_and_their_age_is_that_of_the_stamp():
+    wheels = taken(WheelInlet(settings(**JOINTS)), joints(-20), 0)
+    assert wheels.angles_rad == pytest.approx((1.0, 2.0))
+    assert wheels.speeds_rad_s == pytest.approx((0.5, 1.5))
+    assert wheels.age_s == pytest.approx(0.020)
+
+
+def test_a_message_without_a_stamp_counts_from_when_it_was_sent():
+    inlet = WheelInlet(settings(**JOINTS))
+    wheels = inlet.wheels(joints(0, stamp=False), WALL_NS - 30 * MS, MONO_NS, WALL_NS)
+    assert wheels.age_s == pytest.approx(0.030)
+
+
+def test_without_velocities_the_speeds_are_those_of_the_angles():
+    inlet = WheelInlet(settings(**JOINTS))
+    assert taken(inlet, joints(0, speeds=None), 0).speeds_rad_s == (0.0, 0.0)
+    assert taken(inlet, joints(20, (1.1, 1.9), None), 20).speeds_rad_s == pytest.approx((5.0, -5.0))
+
+
+def test_joints_of_an_arm_alone_are_nothing_and_not_refused():
+    inlet = WheelInlet(settings(**JOINTS))
+    assert taken(inlet, joints(0, names=("arm",)), 0) is None
+    assert not inlet.refused
+
+
+@pytest.mark.parametrize(
+    ("message", "reason"),
+    [
+        (joints(-600), "another clock"),
+        (joints(200), "another clock"),
+        (joints(0, names=("fl", "fr", "rl")), "lacks joints"),
+        (joints(0, (math.nan, 0.0)), "not finite"),
+        (joints(0, speeds=(0.0, math.inf)), "not finite"),
+        (joints(0, speeds=(0.0, 21.0)), "faster than the base can"),
+        (msg.JointState(joints(0).header, ["fl", "fr", "rl", "rr"], [], [0.0] * 4), "or their positions"),
+    ],
+)
+def test_wheels_that_cannot_be_are_refused_by_reason(message, reason):
+    inlet = WheelInlet(settings(**JOINTS))
+    assert taken(inlet, message, 0) is None
+    assert [reason in words for words in inlet.refused] == [True]
+    assert reason in wire.REFUSALS[inlet.why(MONO_NS)]
+    assert inlet.why(MONO_NS + 2000 * MS) == 0
+    assert taken(inlet, joints(40), 40) is not None, "what comes after is taken"
+
+
+def test_what_comes_out_of_order_is_refused():
+    inlet = WheelInlet(settings(**JOINTS))
+    assert taken(inlet, joints(0), 0)
+    assert taken(inlet, joints(-10), 10) is None
+    assert taken(inlet, joints(0), 10) is None
+    assert list(inlet.refused) == ["it comes out of order"]
+
+
+def test_odometry_is_turned_back_into_wheels_whatever_was_lost_between():
+    """An arc of 1.5 m to the left by 3 rad: the wheels of an ideal base with a track of 0.5 m."""
+    inlet, radius = WheelInlet(settings()), 0.5
+    taken(inlet, odometry(0, 3.0, -1.0, 3.0), 0)
+    for step in range(1, 31):
+        yaw = 3.0 + 0.1 * step
+        x = 3.0 + radius * (math.sin(yaw) - math.sin(3.0))
+        y = -1.0 - radius * (math.cos(yaw) - math.cos(3.0))
+        if step % 3 == 0:
+            wheels = taken(inlet, odometry(20 * step, x, y, yaw, 0.5, 1.0), 20 * step)
+    assert wheels.angles_rad == pytest.approx(((1.5 - 0.75) / 0.1, (1.5 + 0.75) / 0.1), rel=0.01)
+    assert wheels.speeds_rad_s == pytest.approx((2.5, 7.5))
+
+
+def test_odometry_with_a_pose_that_is_none_is_refused_and_forgotten():
+    inlet = WheelInlet(settings())
+    before = taken(inlet, odometry(0, 0.0, 0.0, 0.0), 0)
+    for x, yaw in ((math.nan, 0.0), (math.inf, 0.0), (0.0, math.nan), (1e308, 1.0)):
+        wheels = taken(inlet, odometry(20, x, 0.0, yaw), 20)
+        assert wheels is None or x == 1e308
+    assert before.angles_rad == (0.0, 0.0)
+
+
+def test_frames_carry_the_wheels_over_the_wrap_of_their_count():
+    for angles in ((-3.0, 5.0), (214_748.3647, -214_748.3), (1e6, -1e6)):
+        one, two = (wire.Wheels((angles[0] + more, angles[1] - more), (-2.0, 65.0), 0.0123) for more in (0.0, 1.5))
+        first, second = wire.wheel_frames(one), wire.wheel_frames(two)
+        turned = wire.turned_rad(wire.unpack_angles(second[0].data), wire.unpack_angles(first[0].data))
+        assert turned == pytest.approx((1.5, -1.5), abs=2e-4)
+        speeds, age_s = wire.unpack_wheels(first[1].data)
+        assert speeds == pytest.approx((-2.0, 65.0), abs=2e-3)
+        assert age_s == pytest.approx(0.0123)
+
+
+class TestBaseEnd:
+    """When speeds go out, and when zeros."""
+
+    @pytest.fixture
+    def end(self):
+        return wire.BaseEnd(settings())
+
+    def test_speeds_are_said_only_after_it_was_enabled(self, end):
+        assert end.receive(0, wire.speeds(0.5, 0.1)) is None
+        assert end.refused_speeds == 1
+        end.receive(0, wire.enable(True))
+        assert end.receive(0, wire.speeds(0.5, -0.25)) == (0.5, -0.25)
+
+    def test_only_speeds_feed_it_and_its_silence_needs_a_new_enabling(self, end):
+        end.receive(0, wire.enable(True))
+        end.receive(0, wire.speeds(0.5, 0.0))
+        for now_ms in range(20, 240, 20):
+            end.receive(now_ms * MS, wire.enable(True))
+            said = end.step(now_ms * MS)
+            assert said == (None if now_ms <= 200 else (0.0, 0.0))
+        assert not end.driving
+        assert wire.unpack_state(end.state().data)[0] & wire.FELL_SILENT
+        assert end.receive(300 * MS, wire.speeds(0.5, 0.0)) is None
+
+    def test_speeds_that_come_after_a_silence_are_refused_even_before_the_next_step(self, end):
+        end.receive(0, wire.enable(True))
+        assert end.receive(201 * MS, wire.speeds(0.5, 0.0)) is None
+
+    def test_after_standing_by_it_leaves_the_topic_to_others(self, end):
+        end.receive(0, wire.enable(True))
+        assert end.receive(0, wire.enable(False)) == (0.0, 0.0)
+        assert end.step(400 * MS) == (0.0, 0.0)
+        assert end.step(600 * MS) is None
+
+    def test_an_estop_is_held_with_zeros_until_it_is_reset(self, end):
+        end.receive(0, wire.enable(True))
+        (stop,) = wire.stop_frames(settings())
+        assert end.receive(0, stop) == (0.0, 0.0)
+        for now_ms in (1000, 100_000):
+            end.receive(now_ms * MS, wire.enable(True))
+            assert end.receive(now_ms * MS, wire.speeds(0.5, 0.0)) is None
+            assert end.step(now_ms * MS) == (0.0, 0.0)
+        end.receive(100_001 * MS, Frame(wire.RESET, b""))
+        assert not end.driving
+        assert end.step(100_700 * MS) is None
+
+    def test_a_button_of_the_base_stops_it_and_keeps_it_from_being_enabled(self, end):
+        end.receive(0, wire.enable(True))
+        end.button = True
+        assert end.step(20 * MS) == (0.0, 0.0)
+        end.receive(40 * MS, wire.enable(True))
+        assert not end.driving
+
+    @pytest.mark.parametrize("bad", [(math.nan, 0.0), (0.0, -math.inf)])
+    def test_speeds_that_are_none_are_not_said(self, end, bad):
+        end.receive(0, wire.enable(True))
+        assert end.receive(0, wire.speeds(*bad)) is None
+
+
+def packet(frame):
+    return struct.pack("=IB3x8s", frame.can_id, len(frame.data), frame.data)
+
+
+def connected(path):
+    client = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    client.connect(str(path))
+    client.settimeout(5.0)
+    return client
+
+
+def test_clients_hear_the_bridge_and_each_other_and_a_hang_up_is_told(tmp_path):
+    clients = Clients(tmp_path / "base")
+    one, other = connected(tmp_path / "base"), connected(tmp_path / "base")
+    for _ in range(3):
+        list(clients.receive(0.05))
+    one.send(packet(wire.enable(True)))
+    one.send(b"no frame")
+    ((_, frame),) = clients.receive(5.0)
+    assert frame == wire.enable(True)
+    assert other.recv(100) == packet(wire.enable(True)), "as on a bus"
+    clients.send(Frame(wire.STATE, bytes(8)))
+    assert one.recv(100) == other.recv(100) == packet(Frame(wire.STATE, bytes(8)))
+    one.close()
+    ((_, gone),) = clients.receive(5.0)
+    assert gone is None
+    clients.close()
+    other.close()
+    assert not (tmp_path / "base").exists()
+
+
+def test_who_does_not_read_holds_up_nobody(tmp_path):
+    clients = Clients(tmp_path / "base")
+    deaf = connected(tmp_path / "base")
+    list(clients.receive(0.05))
+    for _ in range(5000):
+        clients.send(Frame(wire.STATE, bytes(8)))
+    assert clients.dropped > 1000
+    deaf.close()
+    clients.close()
+
+
+def test_the_socket_of_a_bridge_that_was_killed_is_taken_over_and_a_living_ones_is_not(tmp_path):
+    path = tmp_path / "base"
+    killed = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    killed.bind(str(path))
+    killed.close()
+    clients = Clients(path)
+    assert path.stat().st_mode & 0o777 == 0o600
+    with pytest.raises(InputError, match="listens there; end it first"):
+        Clients(path)
+    clients.close()
+
+
+def refused(tmp_path, old, new, words):
+    file = robot_file(tmp_path, find_driver("ros2_base").name)
+    text = file.read_text(encoding="utf-8")
+    assert old in text
+    file.write_text(text.replace(old, new), encoding="utf-8")
+    with pytest.raises(InputError, match=words) as caught:
+        run_base_bridge(file)
+    assert str(caught.value).startswith(str(file))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("watchdog_s = 0.5\n", "", "watchdog_s: missing; add it"),
+        ("watchdog_s = 0.5", "watchdog_s = 0.0", r"link\.watchdog_s"),
+        ("watchdog_s = 0.5", "watchdog_s = 1.5", r"link\.watchdog_s"),
+        ("watchdog_s = 0.5", 'watchdog_s = 0.5\nleft_joints = ["l"]', r"link\.right_joints: empty, .*both sides"),
+        (
+            "watchdog_s = 0.5",
+            'watchdog_s = 0.5\nleft_joints = ["l"]\nright_joints = ["l"]',
+            "a joint stands there twice",
+        ),
+        ("watchdog_s = 0.5", "watchdog_s = 0.5\nnodes = [3, 5]", r"link\.nodes: a field of the driver odrive"),
+        ('interface = "unixcan"', 'interface = "socketcan"', r'link\.interface: .*; write "unixcan"'),
+        ("ros2_base", "agilex", "watchdog_s"),
+    ],
+)
+def test_what_robot_toml_lacks_is_one_line(tmp_path, old, new, words):
+    refused(tmp_path, old, new, words)
+
+
+def test_a_socket_that_others_could_have_placed_is_refused(tmp_path):
+    (tmp_path / "open").mkdir()
+    (tmp_path / "open").chmod(0o777)
+    file = robot_file(tmp_path, find_driver("ros2_base").name)
+    channel = load_robot_config(file).link.channel
+    text = file.read_text(encoding="utf-8").replace(channel, str(tmp_path / "open" / "base"))
+    file.write_text(text, encoding="utf-8")
+    with pytest.raises(InputError, match=r"link\.channel: .*others can write to it; write a path"):
+        run_base_bridge(file)
