@@ -34,7 +34,7 @@ from disco_hw.gap.search.analysis import FinalFit, GapAnalysis, final_fit
 from disco_hw.gap.search.channel_search import search_body, search_wheels
 from disco_hw.gap.search.cross_validation import PredictionErrors, beats, clearly_worse, worse_by
 from disco_hw.gap.search.intervals import ChannelEstimates
-from disco_hw.gap.search.richest_model import candidates_of
+from disco_hw.gap.search.richest_model import LATE_COLUMNS, candidates_of
 from disco_hw.gap.search.stages import StagePredictions, joint_predictions, prune, stage_predictions
 from disco_hw.gap.search.unnamed_terms import with_known_terms
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GapSettings
@@ -118,17 +118,23 @@ def _model_of(
     if predictions is not None:
         of, joint = predictions.joint["amended"]
 
-        def moved(part: ChannelEstimates | None) -> ChannelEstimates | None:
-            return None if part is None else at_joint_fit(part, of, joint)
+        def moved(part: ChannelEstimates | None, channel: int) -> ChannelEstimates | None:
+            return None if part is None else at_joint_fit(part, of.parts[channel], of, joint)
 
         final = replace(
             final,
-            body_estimates=moved(final.body_estimates),
-            wheel_estimates=moved(final.wheel_estimates),
-            final_body_estimates=moved(final.final_body_estimates),
+            body_estimates=moved(final.body_estimates, 0),
+            wheel_estimates=moved(final.wheel_estimates, 1),
+            final_body_estimates=moved(final.final_body_estimates, 0),
             final_body=None if final.final_body is None else replace(final.final_body, vector=joint.vectors[0]),
         )
     named = {effect.name: effect.parameters for effect in effect_findings(analysis, final, given=True)}
+    if final.wheel_estimates is not None:
+        values = final.wheel_estimates.by_name
+        for column in LATE_COLUMNS:
+            name, _, key = column.partition(".")
+            if name not in named and column in values:
+                named[name] = {key: values[column]}
     return amended_model(model, named, carried_terms(analysis), channel_estimates(analysis, final))
 
 

@@ -24,7 +24,7 @@ class GridSettings:
     block_s: float = 3.0
     """Blocks of time that are left out together. Chosen: as long as the windows of the poses."""
     longest_s: float = 320.0
-    """Of a longer drive so much is judged, evenly spread. Chosen: it bounds how long a search takes."""
+    """Of a longer drive so much is judged, stretches with commands first. Chosen: it bounds how long a search takes."""
     stretch_s: float = 20.0
     """Length of the stretches that are picked of a long drive. Chosen: several manoeuvres each."""
     shortest_run_s: float = 1.0

@@ -100,8 +100,11 @@ def grid_drive(log: DriveLog, settings: GapSettings = DEFAULT_SETTINGS) -> Gridd
     runs = _runs(wheels.t_s, wheels.segment, grid_settings)
     driven_s = sum(float(wheels.t_s[hi - 1] - wheels.t_s[lo]) for lo, hi in runs)
     if driven_s > grid_settings.longest_s:
-        runs = _spread(wheels.t_s, runs, driven_s, grid_settings)
-        notes.append(f"{driven_s:.0f} s of driving: {grid_settings.longest_s:.0f} s of it, evenly spread, are judged")
+        runs = _spread(wheels.t_s, runs, driven_s, _commanded(log.commands, wheels), grid_settings)
+        notes.append(
+            f"{driven_s:.0f} s of driving: {grid_settings.longest_s:.0f} s of it, evenly spread and those with "
+            "commands first, are judged"
+        )
     for lo, hi in runs:
         t = wheels.t_s[lo:hi]
         angle = np.column_stack([wheels.left_angle_rad[lo:hi], wheels.right_angle_rad[lo:hi]])
@@ -189,17 +192,42 @@ def _runs(t_s: Array, segment: Index, settings: GridSettings) -> list[tuple[int,
     return [(lo, hi) for lo, hi in pairs if hi - lo > 2 and t_s[hi - 1] - t_s[lo] >= settings.shortest_run_s]
 
 
-def _spread(t_s: Array, runs: list[tuple[int, int]], driven_s: float, settings: GridSettings) -> list[tuple[int, int]]:
-    """Stretches of `stretch_s`, evenly spread over the runs, that add up to about `longest_s`."""
+def _commanded(commands: Commands, wheels: Wheels) -> Mask:
+    """Whether the command is known at the wheels' samples, (N,)."""
+    last = np.searchsorted(commands.t_s, wheels.t_s, side="right") - 1
+    if not commands.t_s.size:
+        return np.zeros(wheels.t_s.size, dtype=bool)
+    known = np.isfinite(commands.left_rad_s[last]) & (commands.segment[last] == wheels.segment)
+    return np.asarray(known & (last >= 0))
+
+
+def _spread(
+    t_s: Array, runs: list[tuple[int, int]], driven_s: float, commanded: Mask, settings: GridSettings
+) -> list[tuple[int, int]]:
+    """Stretches of `stretch_s` of the runs that add up to about `longest_s`, neighbours joined.
+
+    Evenly spread over those in which commands are known; the others, which show nothing of the way from command to
+    wheel, only as far as these do not suffice.
+    """
     stretches = []
     for lo, hi in runs:
         edges = np.arange(t_s[lo], t_s[hi - 1], settings.stretch_s)
         cuts = [*np.searchsorted(t_s[lo:hi], edges).tolist(), hi - lo]
         stretches += [(lo + a, lo + b) for a, b in pairwise(cuts) if b - a > 2]
-    kept = np.unique(
-        np.linspace(0, len(stretches) - 1, max(int(len(stretches) * settings.longest_s / driven_s), 1)).astype(int)
-    )
-    pieces = [stretches[k] for k in kept]
+    most = max(int(len(stretches) * settings.longest_s / driven_s), 1)
+    known = np.array([bool(commanded[lo:hi].any()) for lo, hi in stretches])
+    kept: list[int] = []
+    for group in (np.flatnonzero(known), np.flatnonzero(~known)):
+        count = min(most - len(kept), group.size)
+        if count:
+            kept += group[np.unique(np.linspace(0, group.size - 1, count).astype(int))].tolist()
+    begins = {lo for lo, _ in runs}
+    pieces: list[tuple[int, int]] = []
+    for lo, hi in (stretches[k] for k in sorted(kept)):
+        if pieces and pieces[-1][1] == lo and lo not in begins:
+            pieces[-1] = (pieces[-1][0], hi)
+        else:
+            pieces.append((lo, hi))
     return [(lo, hi) for lo, hi in pieces if t_s[hi - 1] - t_s[lo] >= settings.shortest_run_s]
 
 

@@ -7,10 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from disco_hw.gap.search.analysis import FinalFit, GapAnalysis
 from disco_hw.gap.search.channel_search import UnnamedTerm
-from disco_hw.gap.search.end_to_end import Freed, JointFit
+from disco_hw.gap.search.end_to_end import Freed, JointFit, Part
 from disco_hw.gap.search.intervals import Z95, ChannelEstimates, ParameterEstimate
 from disco_hw.model import EffectSetting, Gaussian, Model
 from disco_hw.model.model import BASE_PARAMETERS
@@ -31,8 +32,11 @@ def channel_estimates(analysis: GapAnalysis, final: FinalFit) -> tuple[ChannelEs
     )
 
 
-def at_joint_fit(part: ChannelEstimates, of: Freed, joint: JointFit) -> ChannelEstimates:
-    """A channel's estimates moved to where the fit of the whole chain has them, and by as much less sure."""
+def at_joint_fit(part: ChannelEstimates, own: Part, of: Freed, joint: JointFit) -> ChannelEstimates:
+    """A channel's estimates moved to where the fit of the whole chain has them, and by as much less sure.
+
+    What the whole chain frees of the channel (`own`) beyond what was found in it comes with its own variance.
+    """
     by_name, off = dict(part.by_name), np.zeros(len(part.fitted))
     for name, old in part.by_name.items():
         value = joint.value(name, of)
@@ -42,7 +46,14 @@ def at_joint_fit(part: ChannelEstimates, of: Freed, joint: JointFit) -> ChannelE
         by_name[name] = ParameterEstimate(value, value - Z95 * deviation, value + Z95 * deviation)
         if name in part.fitted:
             off[part.fitted.index(name)] = value - old.value
-    return ChannelEstimates(by_name, part.fitted, part.covariance + np.diag(off**2))
+    new = [name for name in (own.layout.columns[place] for place in own.active) if name not in by_name]
+    places = [joint.names.index(name) for name in new]
+    added = joint.covariance[np.ix_(places, places)]
+    for name, variance in zip(new, np.diag(added), strict=True):
+        value, half = float(joint.value(name, of) or 0.0), Z95 * float(variance) ** 0.5
+        by_name[name] = ParameterEstimate(value, value - half, value + half)
+    covariance = block_diag(part.covariance + np.diag(off**2), added) if new else part.covariance + np.diag(off**2)
+    return ChannelEstimates(by_name, (*part.fitted, *new), covariance)
 
 
 def simple_model(model: Model, of: Freed, joint: JointFit) -> tuple[Model, tuple[str, ...]]:

@@ -41,6 +41,12 @@ class GapAnalysis:
     wheels: ChannelResult | None
     pruned: tuple[str, ...] = ()
 
+    @property
+    def found_any(self) -> bool:
+        """Whether anything is missing in the model, by name or without."""
+        channels = [found for found in (self.body, self.wheels) if found is not None]
+        return any(found.unnamed or set(found.names) - set(found.selector.given) for found in channels)
+
 
 @dataclass(frozen=True)
 class FinalFit:

@@ -32,7 +32,7 @@ from disco_hw.gap.search.cross_validation import (
 )
 from disco_hw.gap.search.end_to_end import Ahead, Freed, JointFit, Part
 from disco_hw.gap.search.intervals import GAIN
-from disco_hw.gap.search.least_squares import Fit
+from disco_hw.gap.search.least_squares import Fit, inverse
 from disco_hw.gap.search.richest_model import LATE_COLUMNS, LATE_STARTS_S, with_pose_delay
 
 Array = NDArray[np.float64]
@@ -86,25 +86,44 @@ def stage_predictions(analysis: GapAnalysis, final: FinalFit | None = None) -> S
     return StagePredictions(channel, wheel_channel, chains, poses)
 
 
+@dataclass(frozen=True)
+class _Fitted:
+    """A stage that was fitted end to end: what was freed, the fit on all data, and those on the data of one fold."""
+
+    of: Freed
+    joint: JointFit
+    folds: Mapping[int, JointFit]
+
+    @classmethod
+    def to(cls, ahead: Ahead, of: Freed, folds: Mapping[int, Freed] | None = None) -> _Fitted:
+        """Fit all data, and each of the `folds` from where it begins; without them, from the fit of all data."""
+        joint = ahead.fit(of)
+        begin = dict.fromkeys((0, 1), of.at(joint.vectors)) if folds is None else folds
+        return cls(of, joint, {held: ahead.fit(begin[held], held) for held in (0, 1)})
+
+    def at(self, held: int | None = None) -> Freed:
+        """What was freed, around the fit of all data or around that without one fold."""
+        return self.of.at((self.joint if held is None else self.folds[held]).vectors)
+
+    @property
+    def chains(self) -> dict[int, Chain]:
+        """The chains of the two folds."""
+        return {held: self.of.chain(fitted.vectors) for held, fitted in self.folds.items()}
+
+
 def joint_predictions(analysis: GapAnalysis, final: FinalFit) -> StagePredictions:
     """Predictions of every stage, each of which ends with a fit of the whole chain, from commands to poses.
 
     `nominal`: the model as given; `refitted`: its geometry, and the effects that it had; `timed`: also what makes
-    wheels late; `amended`: all that was found, beginning where the channels apart have it.
+    wheels late; `amended`: all that was found, from where the channels apart have it or, if held-out data are predicted
+    better so, on top of `timed`.
     """
     apart = stage_predictions(analysis, final)
     ahead = Ahead.of(apart.body, apart.wheels, apart.poses)
     trust = apart.body.settings.prediction.joint_trust**-2.0
     base, whole = _base(analysis), _whole(analysis, final)
     nominal = [analysis.nominal_body, analysis.nominal_wheels][: len(base)]
-    chains, joint = {"nominal": _chains(analysis, final, {0: nominal, 1: nominal})}, {}
-
-    def add(stage: str, of: Freed, folds: Mapping[int, Freed] | None = None) -> JointFit:
-        found = ahead.fit(of)
-        begin = dict.fromkeys((0, 1), of.at(found.vectors)) if folds is None else folds
-        chains[stage] = {held: of.chain(ahead.fit(begin[held], held).vectors) for held in (0, 1)}
-        joint[stage] = of, found
-        return found
+    chains = {"nominal": _chains(analysis, final, {0: nominal, 1: nominal})}
 
     def chain(vectors: Sequence[Array]) -> Chain:
         return _chain(analysis, final, vectors)
@@ -114,9 +133,10 @@ def joint_predictions(analysis: GapAnalysis, final: FinalFit) -> StagePrediction
         for channel, one in zip((apart.body, apart.wheels), base, strict=False)
         if channel is not None
     )
-    refitted = Freed(parts, lambda vectors: Chain(vectors[0], vectors[1] if len(vectors) > 1 else None))
-    found = add("refitted", refitted)
-    add("timed", _timed(ahead, refitted.at(found.vectors)))
+    refitted = _Fitted.to(
+        ahead, Freed(parts, lambda vectors: Chain(vectors[0], vectors[1] if len(vectors) > 1 else None))
+    )
+    timed = _Fitted.to(ahead, _timed(ahead, refitted.at()))
     of_all = tuple(
         Part(one.selector.channel.layout, fitted.vector, fitted.active, trust * fitted.information())
         for one, fitted in zip((analysis.body, analysis.wheels), whole, strict=False)
@@ -125,13 +145,44 @@ def joint_predictions(analysis: GapAnalysis, final: FinalFit) -> StagePrediction
     by_fold = {}
     for held, vectors in _by_fold(analysis, whole).items():
         inside = zip(of_all, vectors, whole, (apart.body, apart.wheels), strict=False)
-        by_fold[held] = tuple(
+        folded = tuple(
             replace(part, vector=vector, information=trust * _information(one, channel, 1 - held))
             for part, vector, one, channel in inside
             if channel is not None
         )
-    add("amended", Freed(of_all, chain), {held: Freed(parts, chain) for held, parts in by_fold.items()})
+        by_fold[held] = Freed(folded, chain)
+    options = [_Fitted.to(ahead, Freed(of_all, chain), by_fold)]
+    if analysis.found_any:
+        on_top = {held: _on_top(of, timed.at(held)) for held, of in by_fold.items()}
+        options.append(_Fitted.to(ahead, _on_top(options[0].of, timed.at()), on_top))
+
+    def size(option: _Fitted) -> float:
+        horizon_s = apart.body.settings.prediction.reported_horizon_s
+        errors = errors_of(apart.body, apart.wheels, option.chains, horizon_s, apart.poses)
+        return errors.position_m * errors.yaw_rad
+
+    stages = {"refitted": refitted, "timed": timed, "amended": min(options, key=size)}
+    chains |= {name: stage.chains for name, stage in stages.items()}
+    joint = {name: (stage.of, stage.joint) for name, stage in stages.items()}
     return StagePredictions(apart.body, apart.wheels, chains, apart.poses, joint)
+
+
+def _on_top(amended: Freed, timed: Freed) -> Freed:
+    """What was found freed on top of `timed`: its geometry and its lateness as free as there, the rest as trusted.
+
+    Where a channel's form is none of the known ones, its best fit may be far from what predicts best, and surer of it
+    than it should be.
+    """
+    parts = []
+    for own, plain in zip(amended.parts, timed.parts, strict=True):
+        active = (*plain.active, *(place for place in own.active if place not in plain.active))
+        others = [k for k, place in enumerate(own.active) if place not in plain.active]
+        trusted = inverse(inverse(own.information)[np.ix_(others, others)])
+        vector, low, both = own.vector.copy(), own.layout.low.copy(), list(plain.active)
+        vector[both], low[both] = plain.vector[both], plain.layout.low[both]
+        information = block_diag(plain.information, trusted) if others else plain.information
+        parts.append(Part(replace(own.layout, low=low), vector, active, information))
+    return replace(amended, parts=tuple(parts))
 
 
 def _information(found: Fit, channel: BodyChannel | WheelChannel, fold: int) -> Array:

@@ -1,12 +1,13 @@
 """A drive on the grid: commands exact in the mean, runs cut where nothing was measured, foreign stretches left out."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from disco_hw.gap.data.gridded_drive import even_times, grid_drive
-from disco_hw.gap.settings import GRID_STEP_S
+from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S
 from disco_hw.log.drive import Commands, DriveLog, Gyro, Poses, Wheels
 
 
@@ -83,3 +84,19 @@ def test_a_sudden_start_out_of_a_long_rest_is_no_other_master():
     line = grid_drive(drive(t, command, t, command))
     assert np.isfinite(line.command_rad_s[:-5]).all()
     assert not line.notes
+
+
+@pytest.mark.parametrize("commanded_s", [(100.0, 140.0), (0.0, 200.0)])
+def test_of_a_long_drive_the_stretches_with_commands_are_judged_first(commanded_s):
+    t = np.arange(0.0, 200.0, 0.02)
+    begin_s, end_s = commanded_s
+    speed = np.where((t >= begin_s) & (t < end_s), 2.0, 0.0)
+    command = np.where((t >= begin_s) & (t < end_s), 2.0, np.nan)
+    short = replace(DEFAULT_SETTINGS, grid=replace(DEFAULT_SETTINGS.grid, longest_s=60.0, stretch_s=10.0))
+    line = grid_drive(drive(t, command, t, speed), short)
+    known_s = GRID_STEP_S * np.isfinite(line.command_rad_s[:, 0]).sum()
+    assert known_s == pytest.approx(min(end_s - begin_s, 60.0), abs=2.0)
+    assert line.t_s.size * GRID_STEP_S == pytest.approx(60.0, abs=1.0)
+    # From the first to the last; neighbours are one run.
+    assert line.t_s[-1] - line.t_s[0] > 180.0
+    assert line.first.sum() == (3 if end_s < 200.0 else 6)

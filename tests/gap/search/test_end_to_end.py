@@ -10,6 +10,7 @@ from disco_hw.gap.find import offered_stage
 from disco_hw.gap.noise.channels import BodyChannel
 from disco_hw.gap.search.cross_validation import Chain, PredictionErrors, smoothed_poses
 from disco_hw.gap.search.end_to_end import Ahead, Freed, Part
+from disco_hw.gap.search.stages import _on_top
 from disco_hw.gap.settings import DEFAULT_SETTINGS
 from tests.gap.synthetic import GEOMETRY, NOISE, body_channel
 
@@ -54,6 +55,21 @@ def test_the_fold_that_is_left_out_is_not_looked_at():
     axle = {held: ahead.fit(geometry_of(channel.neutral), held).vectors[0][1] for held in (0, 1)}
     assert axle[0] == pytest.approx(0.4, rel=0.01)
     assert abs(axle[1] - 0.4) > 3.0 * abs(axle[0] - 0.4)
+
+
+def test_on_top_of_the_timed_model_a_channel_that_is_wrong_and_sure_does_not_hold_the_geometry():
+    channel, _ = body_channel(turn_slip=0.08)
+    ahead = predictions(channel)
+    slip = BODY.place["turn_slip.k_s"]
+    wrong = off(channel, (0.005, -0.05, 0.02))
+    wrong[slip] = 0.08
+    of = Freed((Part(BODY, wrong, (0, 1, 2, slip), 1e12 * np.eye(4)),), lambda vectors: Chain(vectors[0], None))
+    held = ahead.fit(of).vectors[0]
+    timed = geometry_of(channel.neutral)
+    free = ahead.fit(_on_top(of, timed.at(ahead.fit(timed).vectors))).vectors[0]
+    assert held[:3] == pytest.approx(wrong[:3], rel=1e-3)
+    assert free[:3] == pytest.approx(GEOMETRY, abs=2e-3)
+    assert free[slip] == pytest.approx(0.08, rel=1e-3)
 
 
 def errors(position_m, yaw_rad):
