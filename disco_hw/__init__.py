@@ -12,6 +12,10 @@ if TYPE_CHECKING:
     from disco_hw.config import Robot, RobotConfig
     from disco_hw.config import load_robot_config as load_robot
     from disco_hw.control import Disco
+    from disco_hw.control.black_box import BlackBoxDisco
+    from disco_hw.control.parameter_points import sigma_points
+    from disco_hw.daemon.daemon import run_robot
+    from disco_hw.experiments.own_controller import drive_virtual
     from disco_hw.gap import find_gap
     from disco_hw.inference.infer import infer
     from disco_hw.log.load import load_drive as read_log
@@ -21,31 +25,39 @@ if TYPE_CHECKING:
     __version__: str
 
 _PUBLIC = {
+    "BlackBoxDisco": ("disco_hw.control.black_box", "BlackBoxDisco"),
     "Disco": ("disco_hw.control", "Disco"),
     "Model": ("disco_hw.model", "Model"),
     "Robot": ("disco_hw.config", "Robot"),
     "RobotConfig": ("disco_hw.config", "RobotConfig"),
+    "drive_virtual": ("disco_hw.experiments.own_controller", "drive_virtual"),
     "find_gap": ("disco_hw.gap", "find_gap"),
     "infer": ("disco_hw.inference.infer", "infer"),
     "load_model": ("disco_hw.model", "load_model"),
     "load_robot": ("disco_hw.config", "load_robot_config"),
     "read_log": ("disco_hw.log.load", "load_drive"),
+    "run_robot": ("disco_hw.daemon.daemon", "run_robot"),
     "save_model": ("disco_hw.model", "save_model"),
+    "sigma_points": ("disco_hw.control.parameter_points", "sigma_points"),
     "simulate": ("disco_hw.model.free_run", "simulate"),
 }
 
 __all__ = [
+    "BlackBoxDisco",
     "Disco",
     "Model",
     "Robot",
     "RobotConfig",
     "__version__",
+    "drive_virtual",
     "find_gap",
     "infer",
     "load_model",
     "load_robot",
     "read_log",
+    "run_robot",
     "save_model",
+    "sigma_points",
     "simulate",
 ]
 

@@ -17,6 +17,7 @@ from disco_hw.adaptation.adaptation import GeometryAdaptation
 from disco_hw.adaptation.guard import check_adaptable
 from disco_hw.adaptation.link import ProcessLink
 from disco_hw.config import RobotConfig
+from disco_hw.control.law import Controller, Law
 from disco_hw.daemon import realtime
 from disco_hw.daemon.async_printer import STANDARD_OUTPUT, AsyncPrinter, Waiting
 from disco_hw.daemon.client import (
@@ -87,10 +88,35 @@ class DaemonOptions:
     adapt: bool = False
 
 
-def run_daemon(options: DaemonOptions, make_pilot: Callable[[RobotConfig], Pilot] = lambda _config: TaskPilot()) -> int:
+def run_robot(
+    robot: Path | str,
+    law: Law,
+    *,
+    model: Path | str | None = None,
+    link: str | None = None,
+    log: Path | str | None = None,
+) -> int:
+    """Run the daemon of `disco-hw run` with a control law of your own in DISCO's place; returns the exit code.
+
+    `law(state, task, model)` gives wheel speeds, left and right (rad/s), once a control period; the other arguments are
+    those of `disco-hw run`. Returns after Ctrl-C, SIGTERM or `disco-hw ctl ROBOT.toml quit`, with the robot told to
+    stop. Call it in the main thread, as it catches signals. Raises InputError.
+    """
+    realtime.spare_memory()
+    options = DaemonOptions(
+        Path(robot), None if model is None else Path(model), link, None if log is None else Path(log)
+    )
+    return run_daemon(options, law=law)
+
+
+def run_daemon(
+    options: DaemonOptions,
+    make_pilot: Callable[[RobotConfig], Pilot] = lambda _config: TaskPilot(),
+    law: Law | None = None,
+) -> int:
     """Run until SIGTERM, SIGINT or a quit request; returns the exit code, with the robot told to stop.
 
-    `make_pilot`: of who drives; the task alone, unless it is said.
+    `make_pilot`: of who drives; the task alone, unless it is said. `law`: plans in DISCO's place.
     Raises InputError, before anything is opened, if a file or an option is wrong. An exception in the loop is reported,
     the robot stopped, and the exception passed on.
     """
@@ -107,10 +133,14 @@ def run_daemon(options: DaemonOptions, make_pilot: Callable[[RobotConfig], Pilot
             options.log_file,
             say,
             make_pilot(setup.config),
-            lambda: make_planner(setup.config, setup.model),
+            lambda: make_planner(setup.config, setup.model) if law is None else _controller(law, setup),
             adapt,
             by_command(options.robot),
         )
+
+
+def _controller(law: Law, setup: Setup) -> Controller:
+    return Controller(law, setup.model, setup.config.task.planned(setup.config.control.mode))
 
 
 def serve(

@@ -22,9 +22,20 @@ pytestmark = [pytest.mark.hil, pytest.mark.long, pytest.mark.timeout(1200)]
 
 
 def commands_under(page: str, heading: str) -> list[list[str]]:
-    """The lines of the first block under a heading that call disco-hw, without their comments."""
-    block = (ROOT / page).read_text("utf-8").split(f"## {heading}\n")[1].split("```")[1]
-    return [shlex.split(line, comments=True) for line in block.splitlines() if re.match(r"disco-hw\s", line)]
+    """The lines of the blocks of commands under a heading that call disco-hw or a program that is the page's."""
+    blocks = re.findall(r"^```sh\n(.*?)^```", part_of(page, heading), re.MULTILINE | re.DOTALL)
+    lines = [line for block in blocks for line in block.splitlines()]
+    return [shlex.split(line, comments=True) for line in lines if re.match(r"disco-hw\s|python \w", line)]
+
+
+def programs_under(page: str, heading: str) -> list[str]:
+    """The blocks of Python under a heading."""
+    return re.findall(r"^```python\n(.*?)^```", part_of(page, heading), re.MULTILINE | re.DOTALL)
+
+
+def part_of(page: str, heading: str) -> str:
+    """A page from a heading to the next."""
+    return (ROOT / page).read_text("utf-8").split(f"## {heading}\n")[1].split("\n## ")[0]
 
 
 class Reader:
@@ -41,14 +52,10 @@ class Reader:
         self._environment = {**os.environ, "XDG_RUNTIME_DIR": str(directory)}
 
     def _command(self, line: str, **placeholders: str) -> list[str]:
-        words = line.split()
-        self.left.remove(words)
-        return [
-            sys.executable,
-            "-m",
-            "disco_hw",
-            *(placeholders.get(word.replace(".", "_"), word) for word in words[1:]),
-        ]
+        program, *words = line.split()
+        self.left.remove([program, *words])
+        begin = [sys.executable] if program == "python" else [sys.executable, "-m", "disco_hw"]
+        return [*begin, *(placeholders.get(word.replace(".", "_"), word) for word in words)]
 
     def type(self, line: str, **placeholders: str) -> str:
         """Run a command to its end, which must be good."""
@@ -139,6 +146,22 @@ def test_the_tutorials_commands_go_through(tmp_path):
     reader.type("disco-hw import FILE --robot ROBOT.toml -o LOG.mcap", **named)
     (log, *_) = sorted((tmp_path / "logs").glob("wombot-*.mcap"))
     assert "ended properly" in reader.type("disco-hw log info logs/wombot-*.mcap", **{"logs/wombot-*_mcap": str(log)})
+    assert not reader.left
+
+
+def test_a_law_of_ones_own_drives_the_virtual_robot(tmp_path):
+    page = "docs/my-controller.md"
+    reader = Reader(tmp_path, page, "On the robot")
+    (tmp_path / "my_controller.py").write_text(programs_under(page, "A controller in DISCO's place")[0], "utf-8")
+    (tmp_path / "run_mine.py").write_text(programs_under(page, "On the robot")[0], "utf-8")
+    with reader.another_terminal(f"disco-hw sim {ROBOT}"), reader.another_terminal("python run_mine.py"):
+        reader.wait_for("READY")
+        reader.type(f"disco-hw ctl {ROBOT} arm")
+        reader.wait_for("ARMED")
+        reader.type(f"disco-hw ctl {ROBOT} start")
+        reader.wait("on its way", lambda status: laps(status) > 0.2, 120.0)
+        reader.type(f"disco-hw ctl {ROBOT} quit")
+    assert "ended properly" in reader.untold([sys.executable, "-m", "disco_hw", "log", "info", "mine.mcap"])
     assert not reader.left
 
 

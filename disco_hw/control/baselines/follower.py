@@ -9,13 +9,13 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.control.plan import Diagnostics, PlannerState, PlanOutcome, Rollouts, WheelPlan
+from disco_hw.control.law import held_plan, no_rollouts
+from disco_hw.control.plan import PlannerState, Rollouts, WheelPlan
 from disco_hw.control.settings import CommandLimits
 from disco_hw.tasks.line.course import SMALLEST_X_ICR_M, stable_yaw
 
 Array = NDArray[np.float64]
 
-_STEPS, _STEP_S = 4, 0.1
 _LONGEST_GAP_S = 0.2
 
 
@@ -96,7 +96,8 @@ class Follower:
         commands += np.copysign(chassis.dead_rad_s, commands) * np.minimum(np.abs(commands) / 0.05, 1.0)
         # Too fast for a wheel: as fast as it can, on the same curve.
         commands /= max(1.0, float(np.abs(commands).max()) / chassis.limits.speed_rad_s)
-        return self._held(now_ns, state, commands)
+        base = chassis.wheel_radius_m, chassis.axial_distance_m, chassis.x_icr_m
+        return held_plan(now_ns, state, float(commands[0]), float(commands[1]), base)
 
     def _reference_wheels(self, place: int) -> Array:
         return self._chassis.wheels(self._reference.forward_m_s[place], self._reference.turn_rad_s[place])
@@ -116,18 +117,6 @@ class Follower:
         left = to_y * math.cos(yaw) - to_x * math.sin(yaw)
         return Errors(place, left, math.remainder(state.yaw_rad - yaw, 2.0 * math.pi), off, self._sum_m_s)
 
-    def _held(self, now_ns: int, state: PlannerState, commands: Array) -> WheelPlan:
-        chassis = self._chassis
-        forward = 0.5 * chassis.wheel_radius_m * float(commands.sum())
-        turn = chassis.wheel_radius_m * float(commands[1] - commands[0]) / chassis.axial_distance_m
-        yaw = state.yaw_rad + turn * _STEP_S * np.arange(_STEPS + 1)
-        x_step = _STEP_S * (forward * np.cos(yaw) + turn * chassis.x_icr_m * np.sin(yaw))
-        y_step = _STEP_S * (forward * np.sin(yaw) - turn * chassis.x_icr_m * np.cos(yaw))
-        x, y = (np.concatenate([[0.0], np.cumsum(step[:-1])]) for step in (x_step, y_step))
-        trajectory = np.column_stack([state.x_m + x, state.y_m + y, yaw])
-        nothing = Diagnostics(1.0, 0.0, 0.0, 0.0, 0.0, 1, outcome=PlanOutcome.PLANNED)
-        return WheelPlan(now_ns, _STEP_S, np.tile(commands, (_STEPS, 1)), trajectory, nothing)
-
     def set_task(self, _task: object) -> None:
         """A line is for good."""
         raise TypeError("a follower keeps its line")
@@ -137,7 +126,7 @@ class Follower:
 
     def sampled_rollouts(self, _count: int) -> Rollouts:
         """None are sampled."""
-        return Rollouts(np.empty((0, _STEPS, 2)), np.empty((0, _STEPS + 1, 3)), np.empty(0))
+        return no_rollouts()
 
 
 SPACING_M = 0.01

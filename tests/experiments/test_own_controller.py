@@ -1,0 +1,89 @@
+"""A law of one's own on the virtual robot, in simulated time; the programs of docs/my-controller.md as they stand."""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import disco_hw
+from disco_hw import drive_virtual
+from disco_hw.errors import InputError
+from disco_hw.log.reader import open_log
+
+ROOT = Path(disco_hw.__file__).parents[1]
+PAGE = ROOT / "docs" / "my-controller.md"
+ROBOT = ROOT / "disco_hw" / "robots" / "wombot.toml"
+
+
+def program(number):
+    return re.findall(r"^```python\n(.*?)^```", PAGE.read_text("utf-8"), re.DOTALL | re.MULTILINE)[number]
+
+
+def printed(number):
+    return re.findall(r"^```text\n(.*?)^```", PAGE.read_text("utf-8"), re.DOTALL | re.MULTILINE)[number]
+
+
+def run(text, directory):
+    environment = {**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{directory}"}
+    done = subprocess.run(
+        [sys.executable, "-c", text],
+        cwd=ROOT,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=900,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def figures(text):
+    """Laps and millimetres of each line."""
+    return [(float(laps), float(mm)) for laps, mm in re.findall(r"([\d.]+) laps, (\d+) mm", text)]
+
+
+def agree(said, ran):
+    """Rounding differs from one processor to the next, so the last digit may."""
+    assert len(said) == len(ran) > 0
+    np.testing.assert_allclose(ran, said, rtol=0.1, atol=2.0)
+
+
+def test_the_pages_law_drives_the_circle_as_the_page_says(tmp_path):
+    agree(figures(printed(0)), figures(run(program(0), tmp_path)))
+
+
+@pytest.mark.long
+@pytest.mark.timeout(900)
+def test_the_pages_comparison_with_disco_is_as_it_says(tmp_path):
+    (tmp_path / "my_controller.py").write_text(program(0), encoding="utf-8")
+    agree(figures(printed(1)), figures(run(program(1), tmp_path)))
+
+
+def test_a_law_that_has_no_answer_for_a_while_stops_the_robot_until_it_has_one(tmp_path):
+    begun_ns = []
+
+    def law(state, _task, _model):
+        begun_ns.append(state.t_ns)
+        return (math.nan, 2.0) if 2e9 < state.t_ns - begun_ns[0] < 4e9 else (2.0, 2.0)
+
+    drive = drive_virtual(ROBOT, law, 6.0, log=tmp_path / "mine.mcap")
+    moving = np.abs(np.nan_to_num(drive.commands)).max(axis=1) > 0.1
+    spans = [moving[(begin < drive.t_s) & (drive.t_s < end)] for begin, end in ((1.0, 2.0), (3.4, 4.0), (5.4, 6.0))]
+    assert [(span.all(), span.any()) for span in spans] == [(True, True), (False, False), (True, True)]
+    assert any("two finite wheel speeds" in event for event in drive.events)
+    with open_log(tmp_path / "mine.mcap") as log:
+        assert log.summary().missing_ticks == 0
+
+
+def test_an_effect_that_does_not_exist_is_refused_in_one_line():
+    with pytest.raises(InputError, match=r"^hide: .*rust") as refused:
+        drive_virtual(ROBOT, lambda *_: (0.0, 0.0), 1.0, hide={"rust": 1.0})
+    assert "\n" not in str(refused.value)
