@@ -122,7 +122,9 @@ def child(folder: Path, files: Sequence[str]) -> int:
 
     firmware_protocol.__path__.insert(0, str(folder))
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
-    signal.alarm(TIMEOUT_S)
+    # Of its own time, so that a busy computer kills no mutant; and one that waits for ever is ended, too.
+    resource.setrlimit(resource.RLIMIT_CPU, (TIMEOUT_S, TIMEOUT_S))
+    signal.alarm(10 * TIMEOUT_S)
     quiet = os.open(os.devnull, os.O_WRONLY)
     os.dup2(quiet, 1)
     os.dup2(quiet, 2)

@@ -16,8 +16,7 @@
 #define TICKS_PER_REV (2048u)
 #define MAX_WHEEL_SPEED (8.0f)
 #define TWO_PI (6.2831853f)
-#define SPEED_FILTER (0.1f)
-#define CYCLE_S (0.001f)
+#define SPEED_FILTER_S (0.01f)
 #define PWM_WRAP (1000u)
 #define WATCHDOG_MS (30u)
 #define LINK uart0
@@ -111,13 +110,18 @@ uint64_t port_entropy(uint64_t *last)
 
 void port_measure(port_measurement_t *measurement)
 {
+    static uint32_t measured_us;
     disco_inputs_t *inputs = &measurement->inputs;
+    /* Cycles that were late come one after the other: the time that passed is not always the cycle's. */
+    const uint32_t now_us = port_now_us();
+    const float passed_s = (float)(now_us - measured_us) * 1.0e-6f;
+    measured_us = now_us;
     for (uint8_t side = 0u; side < 2u; side++) {
         const int32_t count = quadrature_count(side);
-        const float speed = (float)(count - last_count[side]) * (TWO_PI / ((float)TICKS_PER_REV * CYCLE_S));
+        const float angle = (float)(count - last_count[side]) * (TWO_PI / (float)TICKS_PER_REV);
         last_count[side] = count;
         inputs->ticks[side] = (uint32_t)count;
-        inputs->wheel_speed[side] += SPEED_FILTER * (speed - inputs->wheel_speed[side]);
+        inputs->wheel_speed[side] += (angle - (inputs->wheel_speed[side] * passed_s)) / SPEED_FILTER_S;
         inputs->encoder_valid[side] = true;
         inputs->temperature[side] = 25.0f;
     }

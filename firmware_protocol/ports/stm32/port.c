@@ -10,8 +10,7 @@
 #define MAX_WHEEL_SPEED (8.0f)
 #define TWO_PI (6.2831853f)
 #define PWM_FULL (1000.0f)
-#define CYCLE_S (0.001f)
-#define SPEED_FILTER (0.1f)
+#define SPEED_FILTER_S (0.01f)
 #define RECORD_SECTOR FLASH_SECTOR_7
 #define RECORD_ADDRESS (0x08060000u)
 #define SENDING_BYTES (256u)
@@ -106,15 +105,20 @@ uint64_t port_entropy(uint64_t *last)
 
 void port_measure(port_measurement_t *measurement)
 {
+    static uint32_t measured_us;
     disco_inputs_t *inputs = &measurement->inputs;
+    /* Cycles that were late come one after the other: the time that passed is not always the cycle's. */
+    const uint32_t now_us = port_now_us();
+    const float passed_s = (float)(now_us - measured_us) * 1.0e-6f;
+    measured_us = now_us;
     const uint16_t count[2] = {(uint16_t)__HAL_TIM_GET_COUNTER(&htim3), (uint16_t)__HAL_TIM_GET_COUNTER(&htim4)};
     for (uint8_t side = 0u; side < 2u; side++) {
         /* The timer has 16 bits: the difference is right as long as fewer than 2^15 pass in a cycle. */
         const int16_t moved = (int16_t)(uint16_t)(count[side] - last_count[side]);
         last_count[side] = count[side];
         inputs->ticks[side] += (uint32_t)(int32_t)moved;
-        const float speed = (float)moved * (TWO_PI / ((float)TICKS_PER_REV * CYCLE_S));
-        inputs->wheel_speed[side] += SPEED_FILTER * (speed - inputs->wheel_speed[side]);
+        const float angle = (float)moved * (TWO_PI / (float)TICKS_PER_REV);
+        inputs->wheel_speed[side] += (angle - (inputs->wheel_speed[side] * passed_s)) / SPEED_FILTER_S;
         inputs->encoder_valid[side] = true;
         inputs->temperature[side] = 25.0f;
     }

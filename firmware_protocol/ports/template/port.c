@@ -4,22 +4,31 @@
 
 #include "queue.h"
 
-/* Filled by the interrupt of the serial line, emptied by the main loop. */
+/* Filled by the link's interrupt, emptied by the main loop. */
 static disco_queue_t received;
 
-/* The vendor's handler of the serial line's interrupt. Acknowledge the interrupt BEFORE reading: a byte that comes in
- * between raises it again. Read until nothing is left. Nothing else of the firmware may be called from here. */
+/* The vendor's handler of the link's interrupt. Acknowledge the interrupt BEFORE reading: what comes in between raises it
+ * again. Read until nothing is left. Nothing else of the firmware may be called from here. */
+#if defined(DISCO_LINK_CAN)
+void link_interrupt(const disco_frame_t *frame);
+void link_interrupt(const disco_frame_t *frame)
+{
+    /* Standard data frames only, of at most 8 bytes: what the bus calls 9 to 15 is 8. */
+    (void)disco_queue_put(&received, (const uint8_t *)frame, sizeof(*frame));
+}
+#else
 void link_interrupt(uint8_t byte);
 void link_interrupt(uint8_t byte)
 {
     (void)disco_queue_put(&received, &byte, 1u);
 }
+#endif
 
 disco_reset_cause_t port_start(disco_config_t *config)
 {
     /* 1. Motor driver off and brake on, before anything else. */
     /* 2. Clock tree from the crystal; a timer of 1 MHz that runs free; a timer interrupt of 1 kHz that wakes port_wait. */
-    /* 3. The serial line at 921 600 Bd, with its receive interrupt or DMA. */
+    /* 3. The link, with its receive interrupt or DMA: a serial line at 921 600 Bd, a bus at 500 kbit/s. */
     /* 4. The independent watchdog, 20 to 50 ms, from a clock of its own. */
     /* 5. What is special about this robot. */
     config->ticks_per_rev = 2048u;
@@ -35,6 +44,20 @@ uint32_t port_now_us(void)
     return 0u;
 }
 
+/* The link: the controller of a bus if compiled with -DDISCO_LINK_CAN; a serial line without it. Delete the other. */
+#if defined(DISCO_LINK_CAN)
+bool port_receive(disco_frame_t *frame)
+{
+    return disco_queue_take(&received, (uint8_t *)frame, sizeof(*frame)) == sizeof(*frame);
+}
+
+bool port_send(const disco_frame_t *frame)
+{
+    /* Into a transmit mailbox, lowest identifier first; false if none is free. Restart the controller after bus-off. */
+    (void)frame;
+    return false;
+}
+#else
 size_t port_receive(uint8_t *bytes, size_t most)
 {
     return disco_queue_take(&received, bytes, most);
@@ -47,6 +70,7 @@ size_t port_send(const uint8_t *bytes, size_t count)
     (void)count;
     return 0u;
 }
+#endif
 
 uint64_t port_entropy(uint64_t *last)
 {
@@ -57,7 +81,8 @@ uint64_t port_entropy(uint64_t *last)
 
 void port_measure(port_measurement_t *measurement)
 {
-    /* Called once in a cycle. Counts are cumulative and wrap at 2^32; forwards is positive. */
+    /* Called once in a cycle. Counts are cumulative and wrap at 2^32; forwards is positive. Cycles that were late come one
+     * after the other: a speed is a count over the time that passed, which is not always 1 ms. */
     disco_inputs_t *inputs = &measurement->inputs;
     for (uint8_t side = 0u; side < 2u; side++) {
         inputs->ticks[side] = 0u;

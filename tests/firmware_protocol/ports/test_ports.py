@@ -1,6 +1,7 @@
 """The ports compile, with the host's compiler and stubs of the vendors' declarations: no hardware has run them."""
 
 import re
+import shutil
 import subprocess
 
 import pytest
@@ -71,11 +72,12 @@ def test_the_main_loop_with_a_plants_line_never_measures_or_drives(tmp_path):
         assert not [name for name in absent if name in listed]
 
 
-@pytest.mark.parametrize("port", SKELETONS)
-def test_a_skeleton_compiles_against_what_its_vendor_declares(port, tmp_path):
-    compiled(
-        "-c", PORTS / port / "port.c", "-o", tmp_path / "port.o", options=[f"-I{STUBS / port}", f"-I{PORTS / port}"]
-    )
+@pytest.mark.parametrize(
+    ("port", "link"), [*((port, []) for port in SKELETONS), ("template", ["-DDISCO_LINK_CAN"])], ids=[*SKELETONS, "can"]
+)
+def test_a_skeleton_compiles_against_what_its_vendor_declares(port, link, tmp_path):
+    include = [f"-I{STUBS / port}", f"-I{PORTS / port}"]
+    compiled("-c", PORTS / port / "port.c", "-o", tmp_path / "port.o", options=[*include, *link])
 
 
 @pytest.mark.parametrize("port", ["stm32", "rp2040", "esp32"])
@@ -88,9 +90,17 @@ def test_the_main_loop_compiles_for_each_kind_of_link(link, tmp_path):
     compiled("-c", PORTS / "controller.c", "-o", tmp_path / "controller.o", options=link)
 
 
-def test_the_template_with_the_main_loop_and_the_core_is_a_whole_firmware(tmp_path):
-    sources = [FIRMWARE / name for name in SOURCES]
-    compiled(PORTS / "controller.c", PORTS / "template" / "port.c", *sources, "-lm", "-o", tmp_path / "firmware")
+def test_the_guides_commands_make_a_whole_firmware_of_the_template(tmp_path):
+    """As they stand where there is a cross-compiler, else with this computer's; a warning is an error here."""
+    guide = (PACKAGE.parent / "docs" / "port.md").read_text("utf-8")
+    (commands,) = re.findall(r"```sh\n(LINK=.*?)```", guide, re.DOTALL)
+    if shutil.which("arm-none-eabi-gcc") is None:
+        commands = re.sub(r"^CC=.*", "CC=cc", commands, flags=re.MULTILINE)
+    (tmp_path / "firmware_protocol").symlink_to(PACKAGE)
+    commands = commands.replace("-Wall", "-Wall -Werror")
+    ran = subprocess.run(["sh", "-ec", commands], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert ran.returncode == 0, ran.stderr
+    assert (tmp_path / "my_board.elf").exists()
 
 
 def test_nothing_between_an_interrupt_and_the_main_loop_is_lost_or_torn(tmp_path):
