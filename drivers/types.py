@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import enum
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from types import MappingProxyType
 from typing import Any, Literal, Protocol, runtime_checkable
 
 import msgspec
@@ -201,27 +202,63 @@ class RobotLinkHealth(msgspec.Struct, frozen=True, gc=False):
     watchdog_count: int
 
 
-@dataclass(frozen=True, slots=True)
-class Capabilities:
-    """What is known of the controller: said by itself in the handshake, or, not `told`, declared in robot.toml.
+SaidBy = Literal["device", "fixed", "robot.toml"]
+"""Who says something of a controller: itself, its documents of what cannot be set otherwise, or robot.toml alone."""
+SAID_BY_WORDS: Mapping[SaidBy, str] = MappingProxyType(
+    {
+        "device": "told by the controller",
+        "fixed": "which cannot be set otherwise",
+        "robot.toml": "declared in robot.toml, not told by the controller",
+    }
+)
 
-    A limit that neither says is None. `watchdog`: whether the controller said how long it waits for a command, cannot
-    be set otherwise, or robot.toml declares it and nobody has looked.
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """Which controller answers: its kind, its firmware's version where it is known, and what else it tells of itself.
+
+    `said_by` is of kind and version: where the controller tells neither, they are what robot.toml makes of its frames.
     """
 
-    protocol_major: int
-    protocol_minor: int
-    firmware_version: str
-    dbc_hash: int
-    board_id: int
-    max_wheel_speed_rad_s: float
-    max_wheel_acceleration_rad_s2: float | None
-    ticks_per_rev: int | None
-    command_timeout_s: float
-    drive_off_timeout_s: float
-    stop_deceleration_rad_s2: float
-    told: bool = True
-    watchdog: Literal["told", "fixed", "declared"] = "told"
+    controller: str
+    firmware: str
+    said_by: SaidBy
+    details: str = ""
+
+    def in_words(self) -> str:
+        """For a person: all of it, and who says it."""
+        version = self.firmware and f"firmware {self.firmware}"
+        known = ", ".join(text for text in (self.controller, version, self.details) if text)
+        return f"{known} ({SAID_BY_WORDS[self.said_by]})"
+
+
+@dataclass(frozen=True, slots=True)
+class Limit:
+    """One figure that a controller keeps to, and who says so."""
+
+    value: float
+    said_by: SaidBy
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """What a controller keeps to; a figure that nobody says is None.
+
+    `command_timeout_s`: how long it waits for a command before it stops the motors. `drive_off_timeout_s`: how long
+    until it takes the current off them then.
+    """
+
+    max_wheel_speed_rad_s: Limit
+    command_timeout_s: Limit
+    stop_deceleration_rad_s2: Limit
+    max_wheel_acceleration_rad_s2: Limit | None = None
+    ticks_per_rev: Limit | None = None
+    drive_off_timeout_s: Limit | None = None
+
+    def known(self) -> dict[str, Limit]:
+        """The figures that somebody says, by name."""
+        each = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {name: limit for name, limit in each.items() if limit is not None}
 
 
 class Readings(msgspec.Struct, frozen=True, gc=False):
@@ -294,8 +331,12 @@ class Driver(Protocol):
         """One sentence for a person: why the state is what it is and what to do about it."""
 
     @property
-    def capabilities(self) -> Capabilities | None:
-        """What the robot said in the handshake; None before it is complete."""
+    def identity(self) -> Identity | None:
+        """Which controller answers; None before the handshake is complete."""
+
+    @property
+    def limits(self) -> Limits | None:
+        """What the controller keeps to, and who says so; None before the handshake is complete."""
 
     @property
     def stats(self) -> DriverStats:
@@ -431,8 +472,9 @@ class MotorDriver:
     that is heard then, whether the robot has confirmed it. `slowest_rad_s`: the slowest wheel speed that it holds.
     `cyclic_frames` (of settings, command rate in Hz, whether authenticated): what the link carries. `authenticates`:
     whether there is such a mode; without one `link.key_file` is refused. `kinds`: of links that it speaks over, the
-    usual one first. `exchange` makes what a serial line is spoken with; None: the reference protocol's frames.
-    `serial_field`: of the settings, one that belongs to a serial link, where it must be given, and to no other.
+    usual one first. `tells_reception`: whether the controller counts the frames that it rejects and answers for its
+    clock, so that `check` can ask. `exchange` makes what a serial line is spoken with; None: the reference protocol's
+    frames. `serial_field`: of the settings, one that belongs to a serial link, where it must be given, and to no other.
     `example`: its fields in [link] for a robot as the demonstration drives it; none where its controller is not
     simulated. `recognise`: of frames that were only listened to, the fields in [link] that they show, None if they are
     not its controller's. `latches_stop`: whether the controller itself keeps an e-stop until it is reset. `is_default`:
@@ -454,4 +496,5 @@ class MotorDriver:
     recognise: Callable[[Sequence[Frame]], dict[str, Any] | None] = lambda _frames: None
     latches_stop: bool = True
     authenticates: bool = False
+    tells_reception: bool = False
     is_default: bool = False

@@ -32,9 +32,10 @@ from disco_hw.runtime.supervisor import FIND_HEADING
 from drivers import status_texts
 from drivers.motor import find_driver
 from drivers.types import (
-    Capabilities,
     Driver,
     DriverState,
+    Identity,
+    Limits,
     LinkState,
     OutgoingFrame,
     PoseSource,
@@ -89,24 +90,23 @@ def run_check(robot: Path, link: str | None = None) -> CheckReport:
     priority = setup.config.daemon.realtime_priority
     checks += check_realtime(priority, can_use_fifo(), can_lock_memory(), os.cpu_count() or 1)
     named = setup.config.link
-    card = find_driver(named.driver).safety_card(named.settings())
-    checks += check_safety(setup.config.robot, card)
+    kind = find_driver(named.driver)
+    checks += check_safety(setup.config.robot, kind.safety_card(named.settings()))
     pose_source = pose_source_of(setup.config)
     transport.open()
     try:
         checks.append(_link_check(transport))
         if checks[-1].level is Level.OK:
             found = _ask_robot(transport, driver_of(setup.config, key), pose_source)
-            checks.append(_firmware_check(found))
-            if found.capabilities is None or found.capabilities.told:
-                # Only a controller that says what it hears can be asked for that.
+            checks.append(_firmware_check(found, kind.tells_reception))
+            if kind.tells_reception:
                 checks.append(_hearing_check(found))
                 checks.append(check_round_trip(found.round_trips_s, 1.0 / control.rate_hz))
             checks.append(_telemetry_check(found))
-            if found.capabilities is not None:
-                checks += check_firmware_limits(setup.config.robot, found.capabilities)
-                checks.append(check_command_timing(control, found.capabilities))
-                checks.append(check_watchdog(found.capabilities))
+            if found.limits is not None:
+                checks += check_firmware_limits(setup.config.robot, found.limits)
+                checks.append(check_command_timing(control, found.limits))
+                checks.append(check_watchdog(found.limits))
     finally:
         transport.close()
         pose_source.close()
@@ -119,7 +119,8 @@ class _Found:
 
     state: DriverState
     detail: str
-    capabilities: Capabilities | None
+    identity: Identity | None
+    limits: Limits | None
     clock_synchronised: bool
     wheel_samples: int
     pose_samples: int
@@ -194,7 +195,8 @@ def _ask_robot(transport: Transport, driver: Driver, pose_source: PoseSource) ->
     return _Found(
         state=driver.state,
         detail=connection(transport.state, transport.last_error, driver.state, driver.detail),
-        capabilities=driver.capabilities,
+        identity=driver.identity,
+        limits=driver.limits,
         clock_synchronised=driver.clock_offset_ns is not None,
         wheel_samples=wheels,
         pose_samples=poses,
@@ -228,9 +230,9 @@ class _Stopwatch:
                     self.round_trips_s.append((received.t_ns - sent_ns) * 1e-9)
 
 
-def _firmware_check(found: _Found) -> Check:
+def _firmware_check(found: _Found, has_clock: bool) -> Check:
     name = "firmware"
-    if found.capabilities is None:
+    if found.identity is None:
         return Check(name, Level.FAIL, found.detail)
     if found.state in {DriverState.REFUSED, DriverState.FAULT, DriverState.ESTOP}:
         return Check(name, Level.FAIL, f"{found.state.value}: {found.detail}")
@@ -238,12 +240,8 @@ def _firmware_check(found: _Found) -> Check:
         return Check(
             name, Level.FAIL, f"{found.state.value}: the robot reports {status_texts.fault(found.told[-1].fault)}"
         )
-    capabilities = found.capabilities
-    if not capabilities.told:
-        return Check(name, Level.OK, f"{capabilities.firmware_version}, {found.state.value}")
-    clock = "clock synchronised" if found.clock_synchronised else "clock NOT synchronised"
-    version = f"{capabilities.firmware_version}, protocol {capabilities.protocol_major}.{capabilities.protocol_minor}"
-    return Check(name, Level.OK, f"{version}, DBC {capabilities.dbc_hash:08x} matches, {found.state.value}, {clock}")
+    clock = f", clock {'synchronised' if found.clock_synchronised else 'NOT synchronised'}" if has_clock else ""
+    return Check(name, Level.OK, f"{found.identity.in_words()}, {found.state.value}{clock}")
 
 
 def _hearing_check(found: _Found) -> Check:

@@ -15,6 +15,7 @@ from disco_hw.daemon.socket_place import connect, default_socket_path, passed_ov
 from disco_hw.errors import InputError, WorkError
 from disco_hw.runtime.states import advice, by_command, status_headline
 from drivers import status_texts
+from drivers.types import SAID_BY_WORDS, SaidBy
 
 _MAX_REPLY_BYTES = 1 << 20
 
@@ -124,6 +125,7 @@ def in_words(reply: dict[str, Any], robot: Path) -> str:
         ": ".join(status_headline(reply)),
         *(f"next: {sentence}" for sentence in advice(reply, by_command(robot))),
         f"robot {reply['robot_state']}, link {reply['link']}, fault {status_texts.fault(reply['fault'])}",
+        *controller_in_words(reply.get("controller")),
         f"{' '.join(task['progress'])}, distance {task['distance_m'] * 1e3:.0f} mm, speed {task['speed_m_s']:.3f} m/s",
         f"loop lateness p99 {loop['lateness_us']['p99']:.0f} us, max {loop['lateness_us']['max']:.0f} us, "
         f"overruns {loop['overruns']}, skipped {loop['skipped']}",
@@ -147,6 +149,17 @@ def in_words(reply: dict[str, Any], robot: Path) -> str:
     if recorder["last_error"] and recorder["last_error"] not in recorder["fault"]:
         lines.append(f"recording, last error: {recorder['last_error']}")
     return "\n".join(lines)
+
+
+def controller_in_words(controller: Mapping[str, Any] | None) -> tuple[str, ...]:
+    """Which controller a status speaks of, and its limits by who says them; nothing before it is known."""
+    if controller is None:
+        return ()
+    by_source: dict[SaidBy, list[str]] = {}
+    for name, limit in controller["limits"].items():
+        by_source.setdefault(limit["said_by"], []).append(f"{name} {limit['value']:g}")
+    limits = (f"{', '.join(said)} ({SAID_BY_WORDS[source]})" for source, said in by_source.items())
+    return (f"controller: {controller['words']}", f"limits: {'; '.join(limits)}")
 
 
 def recording_in_words(recorder: Mapping[str, Any]) -> str:

@@ -12,6 +12,7 @@ from disco_hw.log import records
 from disco_hw.log.recorder import RecorderStats
 from disco_hw.runtime.core import DaemonCore
 from disco_hw.runtime.task_change import asked_of, limits
+from drivers.types import Driver
 
 
 def loop_figures(loop: LoopStats) -> dict[str, Any]:
@@ -47,6 +48,7 @@ def status(core: DaemonCore, loop: dict[str, Any], recorder: RecorderStats) -> d
         "link": core.transport.state.value,
         "link_error": core.transport.last_error,
         "driver_state": core.driver.state.name,
+        "controller": _controller(core.driver),
         "robot_state": "UNKNOWN" if robot is None else robot.state,
         "robot_state_ns": None if robot is None else robot.t_ns,
         "fault": "UNKNOWN" if robot is None else robot.fault,
@@ -77,6 +79,14 @@ def status(core: DaemonCore, loop: dict[str, Any], recorder: RecorderStats) -> d
         "recorder": asdict(recorder),
         "adaptation": core.adaptation.status(),
     }
+
+
+def _controller(driver: Driver) -> dict[str, Any] | None:
+    identity, kept = driver.identity, driver.limits
+    if identity is None or kept is None:
+        return None
+    said = {name: asdict(limit) for name, limit in kept.known().items()}
+    return {**asdict(identity), "words": identity.in_words(), "limits": said}
 
 
 def _microseconds(summary: dict[str, float]) -> dict[str, float]:

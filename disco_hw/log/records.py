@@ -236,6 +236,23 @@ class Task(msgspec.Struct, frozen=True, gc=False):
         return kept | self.settings
 
 
+class Controller(msgspec.Struct, frozen=True, gc=False):
+    """Which motor controller answers from `t_ns` on, and what it keeps to.
+
+    `said_by`: who says kind and firmware, "device" or "robot.toml". Limits by name, with their units: what the
+    controller tells of itself, what cannot be set otherwise, and what robot.toml declares.
+    """
+
+    t_ns: int
+    controller: str
+    firmware: str
+    details: str
+    said_by: str
+    told: dict[str, float] = {}
+    fixed: dict[str, float] = {}
+    declared: dict[str, float] = {}
+
+
 Record = (
     FrameIn
     | FrameOut
@@ -257,6 +274,7 @@ Record = (
     | Adaptation
     | Task
     | Fan
+    | Controller
 )
 
 
@@ -289,6 +307,7 @@ TOPICS: tuple[Topic, ...] = (
     Topic("/plan/rollouts", Fan),
     Topic("/belief", BeliefChange),
     Topic("/adapt", Adaptation),
+    Topic("/controller", Controller),
 )
 
 TOPIC_INDEX: Mapping[type, int] = MappingProxyType({topic.record: index for index, topic in enumerate(TOPICS)})

@@ -177,9 +177,9 @@ def driver_of(config: RobotConfig, key: bytes | None = None) -> Driver:
 
 def preflight(config: RobotConfig, driver: Driver, with_task: bool = True) -> tuple[str, ...]:
     """What robot.toml asks that the robot's firmware or its wheels do not allow, in words; empty if they agree."""
-    if driver.capabilities is None:
+    if driver.limits is None:
         return ()
-    checks = check_firmware_limits(config.robot, driver.capabilities)
+    checks = check_firmware_limits(config.robot, driver.limits)
     if with_task:
         checks.append(check_task(config.robot, config.task))
     return failures(checks)

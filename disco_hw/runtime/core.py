@@ -22,9 +22,10 @@ from disco_hw.runtime.task_change import record_of
 from disco_hw.tasks import RobotTask
 from drivers.pose.robot import RobotPoses
 from drivers.types import (
-    Capabilities,
     Driver,
     DriverState,
+    Identity,
+    Limits,
     LinkState,
     PoseSource,
     Readings,
@@ -99,7 +100,8 @@ class DaemonCore:
         self._preflight = preflight
         self._preflight_errors: tuple[str, ...] = ()
         self._miswired: tuple[str, ...] = ()
-        self._judged: Capabilities | None = None
+        self._controller: tuple[Identity, Limits] | None = None
+        self._controller_changed = False
         self._generation = 0
         self._link_up = False
         self._planner_failing = self._planner_collapsed = False
@@ -156,6 +158,7 @@ class DaemonCore:
             now_ns,
             [
                 *records_of_tick.frames_in(frames),
+                *self._controller_change(now_ns),
                 *records_of_tick.samples(readings),
                 *records_of_tick.tick(result, command, self.config.control.command_valid_for_s),
                 *sent,
@@ -192,10 +195,15 @@ class DaemonCore:
             # Whoever asks whether the robot is in e-stop must not hear of one that has fallen silent since.
             self.robot_status = None
         # A controller can be exchanged or written anew while the link, to an adapter that stays, is up.
-        capabilities = self.driver.capabilities
-        if capabilities != self._judged:
-            self._judged = capabilities
-            self._preflight_errors = () if capabilities is None else self._preflight(self.driver)
+        identity, limits = self.driver.identity, self.driver.limits
+        controller = None if identity is None or limits is None else (identity, limits)
+        if controller != self._controller:
+            self._controller, self._controller_changed = controller, controller is not None
+            self._preflight_errors = () if controller is None else self._preflight(self.driver)
+
+    def _controller_change(self, now_ns: int) -> tuple[records.Record, ...]:
+        changed, self._controller_changed = self._controller_changed, False
+        return (records_of_tick.controller(now_ns, *self._controller),) if changed and self._controller else ()
 
     def _inputs(self, now_ns: int, requests: Sequence[UserRequest], by_hand: bool) -> Inputs:
         estimate = None if self.last is None else self.last.pipeline.estimate

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from disco_hw.config import Control, Link, Robot
 from disco_hw.tasks import RobotTask
 from drivers.motor import find_driver
-from drivers.types import Capabilities, CyclicFrame, SafetyCard
+from drivers.types import SAID_BY_WORDS, CyclicFrame, Limits, SafetyCard
 
 _SERIAL_BITS_PER_BYTE = 10
 _SERIAL_OVERHEAD_BYTES = 7
@@ -93,25 +93,23 @@ def check_link_load(link: Link, control: Control) -> Check:
     return Check("link load", Level.OK, found)
 
 
-def check_firmware_limits(robot: Robot, capabilities: Capabilities) -> list[Check]:
-    """Compare robot.toml's limits and encoder with what the firmware says of itself; a check for each difference."""
-    errors = check_limits(
-        capabilities, robot.max_wheel_speed_rad_s, robot.max_wheel_acceleration_rad_s2, robot.ticks_per_rev
-    )
+def check_firmware_limits(robot: Robot, limits: Limits) -> list[Check]:
+    """Compare robot.toml's limits and encoder with what the controller keeps to; a check for each difference."""
+    errors = check_limits(limits, robot.max_wheel_speed_rad_s, robot.max_wheel_acceleration_rad_s2, robot.ticks_per_rev)
     if errors:
         return [Check("firmware limits", Level.FAIL, error) for error in errors]
-    if not capabilities.told:
-        found = (
-            f"{robot.max_wheel_speed_rad_s:g} rad/s is within the {capabilities.max_wheel_speed_rad_s:g} that "
-            "robot.toml declares of the controller; it does not say so itself"
-        )
-        return [Check("firmware limits", Level.OK, found)]
-    found = (
-        f"{robot.max_wheel_speed_rad_s:g} rad/s and {robot.max_wheel_acceleration_rad_s2:g} rad/s^2 are within the "
-        f"firmware's {capabilities.max_wheel_speed_rad_s:g} and {capabilities.max_wheel_acceleration_rad_s2:g}; "
-        f"{capabilities.ticks_per_rev} ticks a turn"
+    speed, acceleration, ticks = (
+        limits.max_wheel_speed_rad_s,
+        limits.max_wheel_acceleration_rad_s2,
+        limits.ticks_per_rev,
     )
-    return [Check("firmware limits", Level.OK, found)]
+    found = [f"{robot.max_wheel_speed_rad_s:g} rad/s of {speed.value:g}, {SAID_BY_WORDS[speed.said_by]}"]
+    if acceleration is not None:
+        asked, said = robot.max_wheel_acceleration_rad_s2, SAID_BY_WORDS[acceleration.said_by]
+        found.append(f"{asked:g} rad/s^2 of {acceleration.value:g}, {said}")
+    if ticks is not None:
+        found.append(f"{ticks.value:g} ticks a turn, {SAID_BY_WORDS[ticks.said_by]}")
+    return [Check("firmware limits", Level.OK, "; ".join(found))]
 
 
 def check_task(robot: Robot, task: RobotTask) -> Check:
@@ -122,9 +120,9 @@ def check_task(robot: Robot, task: RobotTask) -> Check:
     return Check("task", Level.OK, f"{task.in_words()}; the wheels can do {task.fastest_m_s(robot):.2f} m/s on it")
 
 
-def check_command_timing(control: Control, capabilities: Capabilities) -> Check:
+def check_command_timing(control: Control, limits: Limits) -> Check:
     """Count how many commands in a row may be lost before the firmware stops the robot."""
-    timeout_s = min(control.command_valid_for_s, capabilities.command_timeout_s)
+    timeout_s = min(control.command_valid_for_s, limits.command_timeout_s.value)
     # The last command received holds for the timeout; the next that arrives must do so within it.
     spare = math.ceil(round(timeout_s * control.rate_hz, 6)) - 2
     found = f"the firmware stops {timeout_s * 1e3:g} ms after a command; at {control.rate_hz:g} Hz "
@@ -137,15 +135,13 @@ def check_command_timing(control: Control, capabilities: Capabilities) -> Check:
     return Check("command timing", Level.OK, f"{found}{spare} in a row may be lost")
 
 
-def check_watchdog(capabilities: Capabilities) -> Check:
+def check_watchdog(limits: Limits) -> Check:
     """Whether how long the controller waits for a command is known of itself, or declared alone."""
-    waits = f"{capabilities.command_timeout_s:g} s"
-    match capabilities.watchdog:
-        case "told":
-            return Check("watchdog", Level.OK, f"{waits}, told by the controller")
-        case "fixed":
-            return Check("watchdog", Level.OK, f"{waits}, which cannot be set otherwise")
-    return Check("watchdog", Level.WARNING, f"{waits} is what robot.toml declares; it could not be read back")
+    timeout = limits.command_timeout_s
+    said = f"{timeout.value:g} s, {SAID_BY_WORDS[timeout.said_by]}"
+    if timeout.said_by == "robot.toml":
+        return Check("watchdog", Level.WARNING, f"{said}; it could not be read back")
+    return Check("watchdog", Level.OK, said)
 
 
 def check_safety(robot: Robot, card: SafetyCard) -> list[Check]:
@@ -205,31 +201,36 @@ def check_round_trip(round_trips_s: Sequence[float], period_s: float) -> Check:
 
 
 def check_limits(
-    capabilities: Capabilities,
+    limits: Limits,
     max_wheel_speed_rad_s: float,
     max_wheel_acceleration_rad_s2: float,
     ticks_per_rev: float,
 ) -> list[str]:
-    """Compare robot.toml's limits with the firmware's; return a line for each that does not fit, none if all do.
+    """Compare robot.toml's limits with the controller's; return a line for each that does not fit, none if all do.
 
     A limit is to be refused at the start, not clipped in silence: a host that plans with more than the robot does
     plans wrongly. Equal within the resolution on the wire (0.002 rad/s, 0.01 rad/s^2) is within.
     """
     errors = []
-    if not max_wheel_speed_rad_s <= capabilities.max_wheel_speed_rad_s + _SPEED_RESOLUTION_RAD_S:
+    asked = (
+        ("max_wheel_speed_rad_s", max_wheel_speed_rad_s, limits.max_wheel_speed_rad_s, _SPEED_RESOLUTION_RAD_S),
+        (
+            "max_wheel_acceleration_rad_s2",
+            max_wheel_acceleration_rad_s2,
+            limits.max_wheel_acceleration_rad_s2,
+            _ACCELERATION_RESOLUTION_RAD_S2,
+        ),
+    )
+    for name, wanted, limit, resolution in asked:
+        if limit is not None and not wanted <= limit.value + resolution:
+            errors.append(
+                f"robot.{name}: {wanted:g} is above the controller's limit, {SAID_BY_WORDS[limit.said_by]}; "
+                f"write at most {limit.value:g}, or set the controller to more"
+            )
+    ticks = limits.ticks_per_rev
+    if ticks is not None and ticks_per_rev != ticks.value:
         errors.append(
-            f"robot.max_wheel_speed_rad_s: {max_wheel_speed_rad_s:g} is above the firmware's limit; "
-            f"write at most {capabilities.max_wheel_speed_rad_s:g}, or flash a firmware with a higher limit"
-        )
-    acceleration = capabilities.max_wheel_acceleration_rad_s2
-    if acceleration is not None and not max_wheel_acceleration_rad_s2 <= acceleration + _ACCELERATION_RESOLUTION_RAD_S2:
-        errors.append(
-            f"robot.max_wheel_acceleration_rad_s2: {max_wheel_acceleration_rad_s2:g} is above the firmware's limit; "
-            f"write at most {acceleration:g}, or flash a firmware with a higher limit"
-        )
-    if capabilities.ticks_per_rev is not None and ticks_per_rev != capabilities.ticks_per_rev:
-        errors.append(
-            f"robot.ticks_per_rev: {ticks_per_rev:g} differs from the firmware's {capabilities.ticks_per_rev}; "
-            f"write {capabilities.ticks_per_rev}, or flash the firmware for this encoder"
+            f"robot.ticks_per_rev: {ticks_per_rev:g} differs from the firmware's {ticks.value:g}; "
+            f"write {ticks.value:g}, or flash the firmware for this encoder"
         )
     return errors

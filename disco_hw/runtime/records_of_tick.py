@@ -13,7 +13,7 @@ from disco_hw.estimation import PoseUpdate
 from disco_hw.log import records
 from disco_hw.runtime.governor import Limited
 from disco_hw.runtime.pipeline import Source, Tick
-from drivers.types import OutgoingFrame, Readings, ReceivedFrame, WheelCommand, socketcan_id
+from drivers.types import Identity, Limits, OutgoingFrame, Readings, ReceivedFrame, SaidBy, WheelCommand, socketcan_id
 
 _NO_NUMBERS = (float("nan"),) * 3
 _FAN_POINTS = 11
@@ -29,6 +29,23 @@ def frames_in(frames: Sequence[ReceivedFrame]) -> Iterator[records.Record]:
 def frame_out(now_ns: int, outgoing: OutgoingFrame, sent: bool) -> records.Record:
     """One frame handed to the link."""
     return records.FrameOut(now_ns, socketcan_id(outgoing.frame), outgoing.frame.data, outgoing.deadline_ns, sent)
+
+
+def controller(now_ns: int, identity: Identity, limits: Limits) -> records.Record:
+    """Which controller answers, and what it keeps to."""
+    told: dict[SaidBy, dict[str, float]] = {"device": {}, "fixed": {}, "robot.toml": {}}
+    for name, limit in limits.known().items():
+        told[limit.said_by][name] = limit.value
+    return records.Controller(
+        now_ns,
+        identity.controller,
+        identity.firmware,
+        identity.details,
+        identity.said_by,
+        told["device"],
+        told["fixed"],
+        told["robot.toml"],
+    )
 
 
 def samples(readings: Readings) -> Iterator[records.Record]:

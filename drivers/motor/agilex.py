@@ -24,10 +24,12 @@ from drivers.motor.agilex_settings import (
 )
 from drivers.motor.vendor_parts import Stage
 from drivers.types import (
-    Capabilities,
     DriverState,
     DriverStats,
     Frame,
+    Identity,
+    Limit,
+    Limits,
     MotorDriver,
     OutgoingFrame,
     Readings,
@@ -118,17 +120,22 @@ class AgilexDriver:
         return self._note
 
     @property
-    def capabilities(self) -> Capabilities | None:
-        """What robot.toml declares of the base; it tells nothing of that itself."""
+    def identity(self) -> Identity | None:
+        """What answers as these bases do."""
         if self._state_ns is None:
             return None
-        return parts.declared(
-            "AgileX CAN v2",
-            2,
-            self._settings.max_speed_m_s / self._settings.wheel_radius_m,
-            TIMEOUT_S,
-            self._settings.stop_deceleration_rad_s2,
-            "fixed",
+        return Identity("AgileX base, CAN v2", "", "robot.toml")
+
+    @property
+    def limits(self) -> Limits | None:
+        """What robot.toml declares of the base, and the time-out of them all."""
+        if self.identity is None:
+            return None
+        settings = self._settings
+        return Limits(
+            max_wheel_speed_rad_s=Limit(settings.max_speed_m_s / settings.wheel_radius_m, "robot.toml"),
+            command_timeout_s=Limit(TIMEOUT_S, "fixed"),
+            stop_deceleration_rad_s2=Limit(settings.stop_deceleration_rad_s2, "robot.toml"),
         )
 
     def link_up(self, now_ns: int) -> None:

@@ -28,10 +28,12 @@ from drivers.motor.odrive_settings import (
 )
 from drivers.motor.vendor_parts import Stage
 from drivers.types import (
-    Capabilities,
     DriverState,
     DriverStats,
     Frame,
+    Identity,
+    Limit,
+    Limits,
     MotorDriver,
     OutgoingFrame,
     Readings,
@@ -87,7 +89,7 @@ class OdriveDriver:
         self._link_is_up = False
         self._known = False
         self._refusal: str | None = None
-        self._introduced: str | None = None
+        self._introduced, self._version = False, ""
         self._asked_watchdog = 0
         self._asked_version = 0
         self._asked_ns = 0
@@ -147,18 +149,26 @@ class OdriveDriver:
         return self._note
 
     @property
-    def capabilities(self) -> Capabilities | None:
-        """What robot.toml declares of the controller; it tells nothing of that itself."""
+    def identity(self) -> Identity | None:
+        """What answers as an ODrive; 0.5 does not tell its version."""
         if not self._known or self._refusal is not None:
             return None
+        if self._version:
+            return Identity("ODrive", self._version, "device")
+        return Identity("ODrive", self._settings.firmware, "robot.toml")
+
+    @property
+    def limits(self) -> Limits | None:
+        """What robot.toml declares, and the watchdog where it can be read back."""
+        if self.identity is None:
+            return None
         settings = self._settings
-        return parts.declared(
-            f"ODrive {settings.firmware}",
-            2 if self._generation is Generation.V06 else 0,
-            2.0 * math.pi * settings.vel_limit_turns_s / settings.gear,
-            settings.watchdog_s,
-            settings.stop_deceleration_rad_s2,
-            "declared" if settings.watchdog_endpoints is None else "told",
+        return Limits(
+            max_wheel_speed_rad_s=Limit(2.0 * math.pi * settings.vel_limit_turns_s / settings.gear, "robot.toml"),
+            command_timeout_s=Limit(
+                settings.watchdog_s, "robot.toml" if settings.watchdog_endpoints is None else "device"
+            ),
+            stop_deceleration_rad_s2=Limit(settings.stop_deceleration_rad_s2, "robot.toml"),
         )
 
     def link_up(self, now_ns: int) -> None:
@@ -268,7 +278,7 @@ class OdriveDriver:
         if self._wanted is Request.RESET:
             return self._reset(now_ns)
         if not self._known and self._refusal is None:
-            return self._ask_version(now_ns) if self._introduced is None else self._ask_watchdog(now_ns)
+            return self._ask_version(now_ns) if not self._introduced else self._ask_watchdog(now_ns)
         if now_ns - self._asked_ns < _ALIVE_PERIOD_NS:
             return ()
         self._asked_ns = now_ns
@@ -305,7 +315,7 @@ class OdriveDriver:
     def _take_parameter(self, frame: Frame) -> bool:
         """Whether the frame answers for a watchdog, which is then judged."""
         axis = self._by_node.get(codec.split(frame.can_id)[0])
-        if axis is None or self._settings.watchdog_endpoints is None or self._introduced is None:
+        if axis is None or self._settings.watchdog_endpoints is None or not self._introduced:
             return False
         enabled, timeout = self._settings.watchdog_endpoints
         is_on = codec.parameter(frame, axis.node, enabled, "bool")
@@ -320,7 +330,7 @@ class OdriveDriver:
         elif axis.watchdog_s is not None and not abs(axis.watchdog_s - wanted_s) <= _SAME_TIMEOUT_S:
             self._refusal = f"node {axis.node}: its watchdog waits {axis.watchdog_s:g} s; set {wanted_s:g} s there"
         elif not self._known and all(each.watchdog_on and each.watchdog_s is not None for each in self._all):
-            self._announce(f"{self._introduced}, watchdog {wanted_s:g} s")
+            self._announce(f", watchdog {wanted_s:g} s")
         return True
 
     def _reset(self, now_ns: int) -> tuple[OutgoingFrame, ...]:
@@ -416,19 +426,20 @@ class OdriveDriver:
     def _take_version(self, values: Mapping[str, float]) -> None:
         if self._generation is Generation.V05:
             self._refusal = 'the nodes answer for their version, which 0.5 does not; write link.firmware = "0.6"'
-        elif self._introduced is None:
+        elif not self._introduced:
             version = ".".join(str(values[f"fw_{part}"]) for part in ("major", "minor", "revision"))
-            self._introduce(f", firmware {version}")
+            self._introduce(version)
 
     def _introduce(self, version: str = "") -> None:
-        self._introduced = version
+        self._introduced, self._version = True, version
         if self._settings.watchdog_endpoints is None:
-            self._announce(version)
+            self._announce()
 
-    def _announce(self, version: str) -> None:
+    def _announce(self, watchdog: str = "") -> None:
         self._known, self._note = True, "it stands by"
         nodes = ", ".join(str(axis.node) for axis in self._all)
-        self._events.append(f"nodes {nodes} are there: ODrive {self._settings.firmware}{version}")
+        version = self._version and f", firmware {self._version}"
+        self._events.append(f"nodes {nodes} are there: ODrive {self._settings.firmware}{version}{watchdog}")
 
     def _take_estimate(self, axis: _Axis, values: Mapping[str, float], t_ns: int) -> None:
         position, speed = float(values["pos_turns"]), float(values["vel_turns_s"])
@@ -516,7 +527,7 @@ class OdriveDriver:
             self._note = f"disarmed: {why}"
         self._wanted, self._stage, self._stage_ns = Request.STANDBY, Stage.REST, None
         self._known, self._refusal, self._fault, self._foreign = False, None, None, False
-        self._introduced, self._asked_watchdog = None, 0
+        self._introduced, self._version, self._asked_watchdog = False, "", 0
         self._asked_version, self._asked_ns, self._repeat_ns, self._arm_step = 0, now_ns - _VERSION_PERIOD_NS, 0, 0
         for axis in self._all:
             axis.heard_ns = axis.pos_turns = axis.watchdog_on = axis.watchdog_s = None

@@ -17,10 +17,11 @@ from drivers.motor.reference_arming import MESSAGES as HANDSHAKE_MESSAGES
 from drivers.motor.reference_arming import ArmedWatch, Arming, Handshake, HostState, cyclic_frames
 from drivers.motor.reference_frames import FrameReception, FrameTransmission
 from drivers.types import (
-    Capabilities,
     DriverState,
     DriverStats,
     Frame,
+    Identity,
+    Limits,
     MotorDriver,
     NoSettings,
     OutgoingFrame,
@@ -45,7 +46,6 @@ TIME_PERIOD_NS = 1_000_000_000
 FAST_TIME_COUNT = 10
 ZERO_VALID_FOR_S = 0.1
 ESTOP_REPEATS = 3
-_VIRTUAL_BOARD = 0x8000
 SHORTEST_VALID_FOR_S = 0.002
 _HOUSE_KEEPING_NS = 100_000_000
 _ESTOP_DEADLINE_NS = 1_000_000_000
@@ -116,7 +116,7 @@ class ReferenceDriver:
             return DriverState.DISCONNECTED
         if self._handshake.refusal is not None:
             return DriverState.REFUSED
-        if self.capabilities is None or self._status is None:
+        if self.identity is None or self._status is None:
             return DriverState.HANDSHAKE
         state = _STATES.get(self._status.state, DriverState.HANDSHAKE)
         if self._arming.armed:
@@ -147,9 +147,14 @@ class ReferenceDriver:
         return note or f"the robot is in {status.state}"
 
     @property
-    def capabilities(self) -> Capabilities | None:
-        """What the robot said in the handshake; None before it is complete."""
-        return self._handshake.capabilities
+    def identity(self) -> Identity | None:
+        """What the robot said of itself in the handshake; None before it is complete."""
+        return self._handshake.identity
+
+    @property
+    def limits(self) -> Limits | None:
+        """What the robot said of its limits in the handshake; None before it is complete."""
+        return self._handshake.limits
 
     @property
     def stats(self) -> DriverStats:
@@ -266,7 +271,7 @@ class ReferenceDriver:
         frames = []
         transmission = self._transmission
         refused = self._handshake.refusal is not None
-        introduced = self._host_accepted and self.capabilities is not None and not refused
+        introduced = self._host_accepted and self.identity is not None and not refused
         hello_period_ns = REFUSED_HELLO_PERIOD_NS if refused else HELLO_PERIOD_NS
         if not introduced and transmission.due("HELLO_REQUEST", now_ns, hello_period_ns):
             frames.append(
@@ -330,16 +335,13 @@ class ReferenceDriver:
         self._transmission.challenge(int(decoded.values["nonce"]))
 
     def _on_handshake(self, decoded: Decoded, _received_ns: int) -> None:
-        before, refusal = self.capabilities, self._handshake.refusal
+        before, refusal = (self.identity, self.limits), self._handshake.refusal
         self._handshake.take(decoded)
-        capabilities = self.capabilities
-        if capabilities is not None and capabilities != before:
-            self._telemetry.configure(capabilities)
-            self._events.append(
-                f"handshake complete: firmware {capabilities.firmware_version}, "
-                f"{_board(capabilities.board_id)}, "
-                f"protocol {capabilities.protocol_major}.{capabilities.protocol_minor}, DBC {capabilities.dbc_hash:08x}"
-            )
+        identity, limits = self.identity, self.limits
+        ticks_per_rev = limits and limits.ticks_per_rev
+        if identity and limits and ticks_per_rev and (identity, limits) != before:
+            self._telemetry.configure(int(ticks_per_rev.value), limits.max_wheel_speed_rad_s.value)
+            self._events.append(f"handshake complete: firmware {identity.firmware}, {identity.details}")
         if self._handshake.refusal not in (None, refusal):
             self._arming.reset("the handshake was refused")
             self._events.append(f"handshake refused: {self._handshake.refusal}")
@@ -407,7 +409,7 @@ class ReferenceDriver:
     def _check_liveness(self, now_ns: int) -> None:
         """Start afresh with a robot that has fallen silent or has sample times that contradict its clock."""
         refused = self._handshake.refusal is not None
-        known = refused or self._status is not None or self.capabilities is not None
+        known = refused or self._status is not None or self.identity is not None
         if known and now_ns - self._last_heard_ns > (REFUSED_SILENCE_NS if refused else SILENCE_NS):
             self._restart("the robot fell silent")
             self._events.append("the robot fell silent: new handshake")
@@ -446,12 +448,6 @@ class ReferenceDriver:
         if self._status is None:
             return "waiting for the robot's SYSTEM_STATE"
         return f"the robot is in {self._status.state}"
-
-
-def _board(board_id: int) -> str:
-    """Return a board's number in words: its top bit says that a plant's line takes the place of wheels."""
-    number = board_id & ~_VIRTUAL_BOARD
-    return f"board {number}" if number == board_id else f"board {number} with VIRTUAL wheels"
 
 
 def _check(command: WheelCommand) -> None:
@@ -513,5 +509,6 @@ DRIVER = MotorDriver(
     recognise=_recognise,
     kinds=("can", "serial"),
     authenticates=True,
+    tells_reception=True,
     is_default=True,
 )

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import msgspec
 
 from drivers import status_texts
-from drivers.types import Capabilities, CyclicFrame, Request
+from drivers.types import CyclicFrame, Identity, Limit, Limits, Request
 from firmware_protocol.codec import Codec, Decoded
 from firmware_protocol.dbc import load_protocol
 from firmware_protocol.e2e import COUNTER_MODULUS, challenge_answer
@@ -128,6 +128,7 @@ _OPEN = ("READY", "ARMED")
 _LATCHED = ("FAULT", "ESTOP")
 _SESSIONS = 255
 MESSAGES = frozenset({"HELLO", "BUILD", "LIMITS"})
+_VIRTUAL_BOARD = 0x8000
 _AUTHENTICATION = Codec().choice_value("HELLO", "capabilities", "AUTHENTICATION")
 
 
@@ -292,7 +293,8 @@ class Handshake:
 
     Another major version is refused. The same major version with another DBC hash may be read, but never armed.
     `refusal` says why the robot must not be armed and what to do about it, None if nothing speaks against it so far;
-    `capabilities` is what the robot said of itself, None until it is complete or if its limits make no sense.
+    `identity` and `limits` are what the robot said of itself, None until all of it has come or if its limits make no
+    sense.
     """
 
     def __init__(self, major: int, minor: int, dbc_hash: int, *, has_key: bool = False) -> None:
@@ -305,7 +307,8 @@ class Handshake:
         self._build: dict[str, float] | None = None
         self._pages: dict[int, dict[str, float]] = {}
         self.refusal: str | None = None
-        self.capabilities: Capabilities | None = None
+        self.identity: Identity | None = None
+        self.limits: Limits | None = None
 
     def take(self, decoded: Decoded) -> None:
         """Take in a frame of one of `MESSAGES`."""
@@ -317,7 +320,7 @@ class Handshake:
             case _:
                 self._pages[int(decoded.values["page"])] = decoded.values
         self.refusal = self._judge()
-        self.capabilities = self._gather()
+        self._gather()
 
     @property
     def missing(self) -> tuple[str, ...]:
@@ -349,25 +352,34 @@ class Handshake:
             return "the robot reports limits that make no sense (a zero among them); correct its configuration"
         return None
 
-    def _gather(self) -> Capabilities | None:
+    def _gather(self) -> None:
         hello, build = self._hello, self._build
         if hello is None or build is None or self.missing or not self._limits_make_sense():
-            return None
+            self.identity = self.limits = None
+            return
         speed, times = self._pages[0], self._pages[1]
-        return Capabilities(
-            protocol_major=int(hello["protocol_major"]),
-            protocol_minor=int(hello["protocol_minor"]),
-            firmware_version=".".join(str(int(hello[f"firmware_{part}"])) for part in ("major", "minor", "patch")),
-            dbc_hash=int(build["dbc_hash"]),
-            board_id=int(build["board_id"]),
-            max_wheel_speed_rad_s=speed["max_wheel_speed"],
-            max_wheel_acceleration_rad_s2=speed["max_wheel_acceleration"],
-            ticks_per_rev=int(speed["ticks_per_rev"]),
-            command_timeout_s=times["command_timeout"],
-            drive_off_timeout_s=times["drive_off_timeout"],
-            stop_deceleration_rad_s2=times["stop_deceleration"],
+        protocol = f"{int(hello['protocol_major'])}.{int(hello['protocol_minor'])}"
+        self.identity = Identity(
+            "reference controller",
+            ".".join(str(int(hello[f"firmware_{part}"])) for part in ("major", "minor", "patch")),
+            "device",
+            f"{_board(int(build['board_id']))}, protocol {protocol}, DBC {int(build['dbc_hash']):08x}",
+        )
+        self.limits = Limits(
+            max_wheel_speed_rad_s=Limit(speed["max_wheel_speed"], "device"),
+            command_timeout_s=Limit(times["command_timeout"], "device"),
+            stop_deceleration_rad_s2=Limit(times["stop_deceleration"], "device"),
+            max_wheel_acceleration_rad_s2=Limit(speed["max_wheel_acceleration"], "device"),
+            ticks_per_rev=Limit(speed["ticks_per_rev"], "device"),
+            drive_off_timeout_s=Limit(times["drive_off_timeout"], "device"),
         )
 
     def _limits_make_sense(self) -> bool:
         values = {name: value for page in self._pages.values() for name, value in page.items() if name != "page"}
         return all(value > 0 for value in values.values())
+
+
+def _board(board_id: int) -> str:
+    """Return a board's number in words: its top bit says that a plant's line takes the place of wheels."""
+    number = board_id & ~_VIRTUAL_BOARD
+    return f"board {number}" if number == board_id else f"board {number} with VIRTUAL wheels"

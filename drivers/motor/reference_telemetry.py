@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from drivers.device_clock import DeviceClock, age_us
-from drivers.types import Capabilities, MotorSample, PoseSample, PowerSample, RobotLinkHealth, WheelSample
+from drivers.types import MotorSample, PoseSample, PowerSample, RobotLinkHealth, WheelSample
 from firmware_protocol.codec import Decoded
 
 LONGEST_APART_NS = 50_000_000
@@ -45,10 +45,9 @@ class Telemetry:
         """Whether sample times have contradicted the device's clock for so long that it must have restarted."""
         return self._odd_stamps >= DISTRUST_CLOCK_AFTER
 
-    def configure(self, capabilities: Capabilities) -> None:
+    def configure(self, ticks_per_rev: int, max_wheel_speed_rad_s: float) -> None:
         """Set encoder resolution and largest speed; the angles go on from where they are."""
-        # The reference firmware says both.
-        limits = (capabilities.ticks_per_rev or 1, capabilities.max_wheel_speed_rad_s)
+        limits = (ticks_per_rev, max_wheel_speed_rad_s)
         if limits != self._limits:
             self._limits = limits
             self._ticks = WheelTicks(*limits, start=self._ticks.angles if self._ticks is not None else (0.0, 0.0))

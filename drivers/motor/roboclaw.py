@@ -26,10 +26,12 @@ from drivers.motor.roboclaw_settings import (
 )
 from drivers.motor.vendor_parts import Stage
 from drivers.types import (
-    Capabilities,
     DriverState,
     DriverStats,
     Frame,
+    Identity,
+    Limit,
+    Limits,
     MotorDriver,
     OutgoingFrame,
     Readings,
@@ -175,18 +177,22 @@ class RoboclawDriver:
         return self._note
 
     @property
-    def capabilities(self) -> Capabilities | None:
-        """What the boards tell, and what robot.toml declares of them."""
+    def identity(self) -> Identity | None:
+        """What the first board says of itself."""
         if not self._is_known:
             return None
+        return Identity("RoboClaw", str(self._all[0].known["version"]["version"]).strip(), "device")
+
+    @property
+    def limits(self) -> Limits | None:
+        """The slowest board's fastest speed, the serial time-out that was read back, and what robot.toml declares."""
+        if self.identity is None:
+            return None
         settings = self._settings
-        return parts.declared(
-            str(self._all[0].known["version"]["version"]).strip(),
-            0,
-            self._fastest_rad_s,
-            settings.watchdog_s,
-            settings.stop_deceleration_rad_s2,
-            "told",
+        return Limits(
+            max_wheel_speed_rad_s=Limit(self._fastest_rad_s, "device"),
+            command_timeout_s=Limit(settings.watchdog_s, "device"),
+            stop_deceleration_rad_s2=Limit(settings.stop_deceleration_rad_s2, "robot.toml"),
         )
 
     def link_up(self, now_ns: int) -> None:

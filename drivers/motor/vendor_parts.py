@@ -1,4 +1,4 @@
-"""What the drivers of vendors' controllers share: stages, the ramp of a stop, and words for what they do not know."""
+"""What the drivers of vendors' controllers share: stages, the ramp of a stop, and how frames and ids are written."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import math
 from collections.abc import Sequence
 from typing import Any, Literal
 
-from drivers.types import Capabilities, Frame, OutgoingFrame, RobotStatus, WheelCommand
+from drivers.types import Frame, OutgoingFrame, RobotStatus, WheelCommand
 
 _FRAME_LIFE_NS = 50_000_000
 _ESTOP_LIFE_NS = 1_000_000_000
@@ -52,32 +52,6 @@ def outgoing(now_ns: int, *frames: Frame, life_ns: int = _FRAME_LIFE_NS) -> tupl
 def estop_frames(now_ns: int, frames: tuple[Frame, ...]) -> tuple[OutgoingFrame, ...]:
     """The frames of an e-stop, three times over, before all others."""
     return tuple(OutgoingFrame(frame, now_ns + _ESTOP_LIFE_NS, _ESTOP_RANK) for frame in _ESTOP_REPEATS * frames)
-
-
-def declared(
-    firmware: str,
-    major: int,
-    fastest_rad_s: float,
-    timeout_s: float,
-    deceleration_rad_s2: float,
-    watchdog: Literal["told", "fixed", "declared"] = "declared",
-) -> Capabilities:
-    """What robot.toml says of a controller that tells nothing of itself but, perhaps, its watchdog."""
-    return Capabilities(
-        protocol_major=major,
-        protocol_minor=0,
-        firmware_version=firmware,
-        dbc_hash=0,
-        board_id=0,
-        max_wheel_speed_rad_s=fastest_rad_s,
-        max_wheel_acceleration_rad_s2=None,
-        ticks_per_rev=None,
-        command_timeout_s=timeout_s,
-        drive_off_timeout_s=timeout_s,
-        stop_deceleration_rad_s2=deceleration_rad_s2,
-        told=False,
-        watchdog=watchdog,
-    )
 
 
 def status(t_ns: int, state: str) -> RobotStatus:

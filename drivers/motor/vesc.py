@@ -30,10 +30,12 @@ from drivers.motor.vesc_settings import (
     stop_frames,
 )
 from drivers.types import (
-    Capabilities,
     DriverState,
     DriverStats,
     Frame,
+    Identity,
+    Limit,
+    Limits,
     MotorDriver,
     OutgoingFrame,
     Readings,
@@ -148,18 +150,24 @@ class VescDriver:
         return self._note
 
     @property
-    def capabilities(self) -> Capabilities | None:
-        """What robot.toml declares of the controllers; they tell nothing of that themselves."""
+    def identity(self) -> Identity | None:
+        """What answers as VESCs do."""
         if not self._is_known or self._refusal is not None:
             return None
+        return Identity("VESC", "", "robot.toml")
+
+    @property
+    def limits(self) -> Limits | None:
+        """What robot.toml declares, and the time-out where all of them tell it."""
+        if self.identity is None:
+            return None
         settings = self._settings
-        return parts.declared(
-            "VESC",
-            0,
-            settings.max_erpm / settings.erpm_per_rad_s,
-            settings.watchdog_s,
-            settings.stop_deceleration_rad_s2,
-            "declared" if any(motor.timeout is None for motor in self._all) else "told",
+        return Limits(
+            max_wheel_speed_rad_s=Limit(settings.max_erpm / settings.erpm_per_rad_s, "robot.toml"),
+            command_timeout_s=Limit(
+                settings.watchdog_s, "robot.toml" if any(motor.timeout is None for motor in self._all) else "device"
+            ),
+            stop_deceleration_rad_s2=Limit(settings.stop_deceleration_rad_s2, "robot.toml"),
         )
 
     def link_up(self, now_ns: int) -> None:

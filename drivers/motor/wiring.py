@@ -12,10 +12,11 @@ import msgspec
 from msgspec import Meta
 
 from drivers.types import (
-    Capabilities,
     Driver,
     DriverState,
     DriverStats,
+    Identity,
+    Limits,
     MotorSample,
     OutgoingFrame,
     Readings,
@@ -64,9 +65,14 @@ class RewiredDriver:
         return self._driver.detail
 
     @property
-    def capabilities(self) -> Capabilities | None:
+    def identity(self) -> Identity | None:
         """The driver's."""
-        return self._driver.capabilities
+        return self._driver.identity
+
+    @property
+    def limits(self) -> Limits | None:
+        """The driver's."""
+        return self._driver.limits
 
     @property
     def stats(self) -> DriverStats:

@@ -128,9 +128,8 @@ def robot(talk):
 
 
 def test_it_is_found_and_says_what_it_is(robot):
-    found = robot.driver.capabilities
-    assert found.firmware_version
-    assert found.max_wheel_speed_rad_s > robot.speed_rad_s
+    assert robot.driver.identity.controller
+    assert robot.driver.limits.max_wheel_speed_rad_s.value > robot.speed_rad_s
 
 
 def test_nothing_turns_before_it_is_armed(robot):
@@ -179,7 +178,7 @@ def test_disarmed_it_comes_to_stand_and_stays(robot):
 @pytest.mark.motion
 def test_a_silent_host_is_stopped_by_the_controller_and_nothing_arms_again(robot):
     robot.drive()
-    time.sleep(robot.driver.capabilities.command_timeout_s + 2.0)
+    time.sleep(robot.driver.limits.command_timeout_s.value + 2.0)
     robot.run(0.2, robot.speed_rad_s, robot.speed_rad_s)
     assert robot.driver.state is not DriverState.ARMED
     robot.wait(robot.stands, "standing")

@@ -11,14 +11,20 @@ from msgspec.structs import replace
 
 import disco_hw
 from disco_hw.control import NoValidControl
+from disco_hw.daemon.client import in_words
+from disco_hw.daemon.loop import LoopStats
+from disco_hw.daemon.status import loop_figures, status
 from disco_hw.experiments.circle_report import Path, circle_figures
 from disco_hw.log import records
+from disco_hw.log.recorder import RecorderStats
+from disco_hw.runtime import records_of_tick
 from disco_hw.runtime.assembly import make_planner
 from disco_hw.runtime.pipeline import NoPlanner, Source
 from disco_hw.runtime.robot_setup import load_setup
 from disco_hw.runtime.states import State
 from disco_hw.runtime.supervisor import UserRequest
 from disco_hw.tasks.circle import CircleTask
+from drivers.types import Identity, Limit, Limits
 from firmware_protocol.firmware_core import FirmwareConfig
 from sim.effects import hidden_effects
 from sim.plant import Plant
@@ -132,6 +138,32 @@ def test_a_controller_exchanged_on_a_living_link_is_judged_anew(limits):
     stack.run(3.0)
     stack.run(0.1, UserRequest.RESET)
     assert stack.run(3.0)[-1].output.state is State.READY
+
+
+def test_the_log_says_which_controller_answers_and_who_says_its_limits():
+    stack = simulated_stack(NoPlanner(), needs_pose=False)
+    stack.run(3.0)
+
+    def recorded():
+        return [record for _, tick in stack.recorder.ticks for record in tick if isinstance(record, records.Controller)]
+
+    (first,) = recorded()
+    assert (first.controller, first.said_by) == ("reference controller", "device")
+    assert (first.told["max_wheel_speed_rad_s"], first.told["ticks_per_rev"]) == (8.0, 2048.0)
+    assert first.fixed == first.declared == {}
+    shown = status(stack.core, loop_figures(LoopStats()), RecorderStats())
+    assert shown["controller"]["limits"]["max_wheel_speed_rad_s"] == {"value": 8.0, "said_by": "device"}
+    assert "controller: reference controller, firmware" in in_words({**shown, "do": "status"}, ROBOT)
+    exchanged(stack, max_wheel_speed_rad_s=4.0)
+    stack.run(3.0)
+    assert recorded()[-1].told["max_wheel_speed_rad_s"] == 4.0
+
+
+def test_limits_are_recorded_under_who_says_them():
+    limits = Limits(Limit(15.0, "robot.toml"), Limit(0.5, "fixed"), Limit(10.0, "robot.toml"))
+    found = records_of_tick.controller(7, Identity("AgileX base", "", "robot.toml"), limits)
+    assert (found.t_ns, found.told, found.fixed) == (7, {}, {"command_timeout_s": 0.5})
+    assert found.declared == {"max_wheel_speed_rad_s": 15.0, "stop_deceleration_rad_s2": 10.0}
 
 
 @pytest.mark.parametrize("lost", ["link", "robot"])

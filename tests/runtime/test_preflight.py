@@ -18,7 +18,7 @@ from disco_hw.runtime.preflight import (
 )
 from disco_hw.tasks.circle import CircleTask
 from disco_hw.tasks.path import PathTask
-from drivers.types import Capabilities
+from drivers.types import Limit, Limits
 
 
 def robot(**changes):
@@ -26,21 +26,16 @@ def robot(**changes):
     return Robot(**{**values, "max_wheel_speed_rad_s": 8.0, **changes})
 
 
-def capabilities(**changes):
+def limits(said_by="device", **changes):
     values = {
-        "protocol_major": 1,
-        "protocol_minor": 0,
-        "firmware_version": "1.0.0",
-        "dbc_hash": 1,
-        "board_id": 1,
         "max_wheel_speed_rad_s": 8.0,
         "max_wheel_acceleration_rad_s2": 20.0,
         "ticks_per_rev": 2048,
         "command_timeout_s": 0.1,
-        "drive_off_timeout_s": 0.5,
         "stop_deceleration_rad_s2": 20.0,
     }
-    return Capabilities(**{**values, **changes})
+    said = {name: Limit(value, said_by) for name, value in {**values, **changes}.items() if value is not None}
+    return Limits(**said)
 
 
 @pytest.mark.parametrize(
@@ -68,9 +63,18 @@ def test_link_load_counts_the_control_rate():
 
 
 def test_limits_within_the_firmwares_are_ok():
-    (check,) = check_firmware_limits(robot(), capabilities())
+    (check,) = check_firmware_limits(robot(), limits())
     assert check.level is Level.OK
-    assert "8" in check.text
+    assert check.text.count("told by the controller") == 3, check.text
+
+
+def test_limits_that_nobody_has_looked_at_are_said_to_be_declared():
+    declared = limits("robot.toml", ticks_per_rev=None, max_wheel_acceleration_rad_s2=None)
+    (check,) = check_firmware_limits(robot(), declared)
+    assert check.text == "8 rad/s of 8, declared in robot.toml, not told by the controller"
+    (check,) = check_firmware_limits(robot(max_wheel_speed_rad_s=8.1), declared)
+    assert check.level is Level.FAIL
+    assert "declared in robot.toml" in check.text
 
 
 @pytest.mark.parametrize(
@@ -82,13 +86,13 @@ def test_limits_within_the_firmwares_are_ok():
     ],
 )
 def test_limits_beyond_the_firmwares_fail_and_name_the_field(changes, field):
-    (check,) = check_firmware_limits(robot(**changes), capabilities())
+    (check,) = check_firmware_limits(robot(**changes), limits())
     assert check.level is Level.FAIL
     assert field in check.text
 
 
 def test_each_difference_is_a_check_of_its_own():
-    checks = check_firmware_limits(robot(max_wheel_speed_rad_s=9.0, ticks_per_rev=1), capabilities())
+    checks = check_firmware_limits(robot(max_wheel_speed_rad_s=9.0, ticks_per_rev=1), limits())
     assert len(failures(checks)) == 2
 
 
@@ -107,7 +111,7 @@ def test_each_difference_is_a_check_of_its_own():
 )
 def test_command_timing_counts_what_may_be_lost(rate_hz, valid_for_s, timeout_s, level, words):
     control = Control(rate_hz=rate_hz, command_valid_for_s=valid_for_s)
-    check = check_command_timing(control, capabilities(command_timeout_s=timeout_s))
+    check = check_command_timing(control, limits(command_timeout_s=timeout_s))
     assert check.level is level
     assert words in check.text
 
@@ -118,7 +122,7 @@ def test_command_timing_agrees_with_a_count_of_periods(rate_hz, timeout_s):
     spare = 0
     while (spare + 2) / rate_hz < timeout_s - 1e-9:
         spare += 1
-    check = check_command_timing(Control(rate_hz=rate_hz), capabilities(command_timeout_s=timeout_s))
+    check = check_command_timing(Control(rate_hz=rate_hz), limits(command_timeout_s=timeout_s))
     if 1 / rate_hz < timeout_s:
         assert ("not one" if spare == 0 else str(spare)) in check.text.split("Hz")[1]
 
@@ -171,7 +175,7 @@ def test_a_task_that_is_too_fast_for_the_wheels_fails(task):
     assert "at most" in found.text
 
 
-ROBOT = Capabilities(1, 0, "0.1.0", 0x1234, 1, 8.0, 20.0, 2048, 0.1, 0.5, 20.0)
+ROBOT = limits()
 
 
 def test_within_or_equal_is_fine():

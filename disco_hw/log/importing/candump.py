@@ -20,7 +20,7 @@ from disco_hw.log.importing import LogFormat
 from drivers.device_clock import DeviceClock
 from drivers.motor.reference_frames import FrameReception
 from drivers.motor.reference_telemetry import POSE_MESSAGES, WHEEL_MESSAGES, Telemetry
-from drivers.types import Capabilities, Frame, ReceivedFrame
+from drivers.types import Frame, ReceivedFrame
 from firmware_protocol.codec import Codec, Decoded
 
 _COMMAND = "WHEEL_COMMAND"
@@ -36,7 +36,7 @@ def read_candump(path: Path, robot: Robot) -> DriveLog:
     """
     codec = Codec()
     reception, telemetry = FrameReception(codec), Telemetry(DeviceClock())
-    telemetry.configure(_capabilities(robot))
+    telemetry.configure(round(robot.ticks_per_rev), robot.max_wheel_speed_rad_s)
     commands: list[Row] = []
     wheels: list[Row] = []
     poses: list[Row] = []
@@ -128,22 +128,6 @@ def _table(rows: list[Row], width: int) -> Array:
     """Rows as an array (N, width) in order of time, the last of several with one time."""
     table = np.array(rows, dtype=np.float64).reshape(-1, width)
     return table[np.append(np.diff(table[:, 0]) > 0.0, True)] if rows else table
-
-
-def _capabilities(robot: Robot) -> Capabilities:
-    return Capabilities(
-        protocol_major=0,
-        protocol_minor=0,
-        firmware_version="",
-        dbc_hash=0,
-        board_id=0,
-        max_wheel_speed_rad_s=robot.max_wheel_speed_rad_s,
-        max_wheel_acceleration_rad_s2=robot.max_wheel_acceleration_rad_s2,
-        ticks_per_rev=round(robot.ticks_per_rev),
-        command_timeout_s=0.0,
-        drive_off_timeout_s=0.0,
-        stop_deceleration_rad_s2=0.0,
-    )
 
 
 FORMAT = LogFormat(

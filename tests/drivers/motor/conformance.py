@@ -44,14 +44,14 @@ class DriverConformance:
     def test_satisfies_the_protocol(self, bench):
         driver: Driver = bench.driver
         assert driver.state is DriverState.DISCONNECTED
-        assert driver.capabilities is None
+        assert driver.identity is driver.limits is None
         assert driver.detail
 
     def test_introduces_itself_and_stays_still(self, bench):
         bench.run_until(*STILL)
-        capabilities = bench.driver.capabilities
-        assert capabilities.ticks_per_rev > 0
-        assert capabilities.max_wheel_speed_rad_s > 0
+        assert bench.driver.identity.controller
+        assert bench.driver.limits.ticks_per_rev.value > 0
+        assert bench.driver.limits.max_wheel_speed_rad_s.value > 0
         bench.run(1.0, FORWARD)
         assert bench.largest_speed == 0.0
         assert not bench.robot.armed
@@ -64,7 +64,7 @@ class DriverConformance:
         assert bench.robot.speed == pytest.approx(FORWARD, abs=0.005)
         last = bench.wheels[-1]
         assert (last.left_speed_rad_s, last.right_speed_rad_s) == pytest.approx(FORWARD, abs=0.005)
-        resolution = 2 * math.pi / bench.driver.capabilities.ticks_per_rev
+        resolution = 2 * math.pi / bench.driver.limits.ticks_per_rev.value
         for wheel, name in enumerate(("left_angle_rad", "right_angle_rad")):
             moved = getattr(last, name) - getattr(bench.wheels[0], name)
             behind = bench.robot.speed[wheel] * (bench.now_ns - last.t_ns) * 1e-9

@@ -93,7 +93,7 @@ def test_another_generation_than_declared_is_refused(said, plays):
     bench.run(2.0)
     assert bench.driver.state is DriverState.REFUSED
     assert "link.firmware" in bench.driver.detail
-    assert bench.driver.capabilities is None
+    assert bench.driver.identity is bench.driver.limits is None
 
 
 def test_an_axis_that_calibrates_is_refused_until_it_has_done(bench):

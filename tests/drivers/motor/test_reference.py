@@ -101,7 +101,7 @@ def test_a_robot_that_falls_silent_starts_a_new_handshake():
     bench.run(1.0, (3.0, 3.0))
     bench.loses = lambda _: True
     bench.run_until(DriverState.HANDSHAKE, timeout_s=0.6)
-    assert bench.driver.capabilities is None
+    assert bench.driver.identity is bench.driver.limits is None
     bench.loses = None
     bench.largest_speed = 0.0
     bench.run_until(*STILL)
@@ -204,7 +204,7 @@ def test_a_new_link_voids_everything_even_if_its_loss_went_unseen():
     bench.host_end.receive()
     for renew in (driver.link_up, driver.link_down):
         renew(bench.now_ns)
-        assert driver.capabilities is None
+        assert driver.identity is driver.limits is None
         assert driver.clock_offset_ns is None
         assert not driver.synced
     driver.link_up(bench.now_ns)
@@ -244,7 +244,7 @@ def test_says_which_part_of_the_handshake_is_missing():
     driver.receive(START_NS, [hello(), limits(0)])
     assert driver.detail == "waiting for the robot's BUILD, LIMITS"
     driver.receive(START_NS, [answer("BUILD", dbc_hash=CODEC.dbc_hash, board_id=1), limits(1)])
-    assert driver.capabilities is not None
+    assert driver.identity is not None
     assert driver.detail == "waiting for the robot's SYSTEM_STATE"
     later_ns = START_NS + 400 * MS
     assert "HELLO_REQUEST" in names(driver.transmit(later_ns, None)), "until the robot says that it has accepted us"
@@ -301,7 +301,7 @@ def test_a_robot_that_has_shown_only_its_state_can_fall_silent_too():
         frame = CODEC.encode("SYSTEM_STATE", counter, **status, rejected_count=0, reject_reason=0, stop_cause=0)
         now_ns = START_NS + counter * MS
         driver.receive(now_ns, [ReceivedFrame(now_ns, Frame(*frame))])
-    assert driver.capabilities is None
+    assert driver.identity is driver.limits is None
     assert driver.receive(START_NS + 504 * MS, ()).events == ("the robot fell silent: new handshake",)
 
 
@@ -310,7 +310,7 @@ def test_a_robot_that_has_shown_all_but_its_state_can_fall_silent_too():
     driver.link_up(START_NS)
     build = answer("BUILD", dbc_hash=CODEC.dbc_hash, board_id=1)
     driver.receive(START_NS, [hello(), limits(0), limits(1), build])
-    assert driver.capabilities is not None
+    assert driver.identity is not None
     assert "the robot fell silent: new handshake" in driver.receive(START_NS + 501 * MS, ()).events
 
 

@@ -313,17 +313,18 @@ def take(handshake, *frames):
 def test_complete_with_the_last_frame_in_any_order(frames):
     handshake = Handshake(1, 0, 0xCAFE1234)
     for frame in frames:
-        assert handshake.capabilities is None
+        assert handshake.identity is handshake.limits is None
         assert handshake.missing
         take(handshake, frame)
     assert handshake.missing == ()
     assert handshake.refusal is None
-    capabilities = handshake.capabilities
-    assert capabilities.firmware_version == "2.0.7"
-    assert capabilities.dbc_hash == 0xCAFE1234
-    assert capabilities.ticks_per_rev == 2048
-    assert (capabilities.command_timeout_s, capabilities.drive_off_timeout_s) == (0.1, 0.5)
-    assert (capabilities.max_wheel_speed_rad_s, capabilities.stop_deceleration_rad_s2) == (8.0, 15.0)
+    identity, limits = handshake.identity, handshake.limits
+    assert (identity.firmware, identity.said_by) == ("2.0.7", "device")
+    assert identity.details == "board 9, protocol 1.3, DBC cafe1234"
+    assert {limit.said_by for limit in limits.known().values()} == {"device"}
+    assert limits.ticks_per_rev.value == 2048
+    assert (limits.command_timeout_s.value, limits.drive_off_timeout_s.value) == (0.1, 0.5)
+    assert (limits.max_wheel_speed_rad_s.value, limits.stop_deceleration_rad_s2.value) == (8.0, 15.0)
 
 
 def test_another_major_version_is_refused_at_the_first_frame():
@@ -334,7 +335,7 @@ def test_another_major_version_is_refused_at_the_first_frame():
 
 def test_another_hash_may_be_read_but_is_refused():
     handshake = take(Handshake(1, 0, 0x0000BEEF), *FRAMES)
-    assert handshake.capabilities is not None
+    assert handshake.limits is not None
     for words in ("cafe1234", "0000beef", "telemetry only", "flash"):
         assert words in handshake.refusal
 
@@ -350,7 +351,7 @@ def test_a_robot_flashed_meanwhile_is_accepted():
 def test_limits_that_make_no_sense_are_refused(page, name):
     broken = [(kind, {**values, name: 0} if values.get("page") == page else values) for kind, values in FRAMES]
     handshake = take(Handshake(1, 0, 0xCAFE1234), *broken)
-    assert handshake.capabilities is None
+    assert handshake.identity is handshake.limits is None
     assert "make no sense" in handshake.refusal
 
 

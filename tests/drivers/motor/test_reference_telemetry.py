@@ -18,12 +18,11 @@ from drivers.motor.reference_telemetry import (
     Telemetry,
     WheelTicks,
 )
-from drivers.types import Capabilities
 from firmware_protocol.codec import Decoded
 
 MS = 1_000_000
 BOOT_NS = 777 * MS
-CAPABILITIES = Capabilities(1, 0, "0.1.0", 0x1234, 1, 8.0, 20.0, 2048, 0.1, 0.5, 20.0)
+TICKS_PER_REV, MAX_SPEED_RAD_S = 2048, 8.0
 
 
 def synced_clock(now_ns):
@@ -36,7 +35,7 @@ def synced_clock(now_ns):
 
 def make(now_ns=None):
     made = Telemetry(synced_clock(now_ns) if now_ns is not None else DeviceClock())
-    made.configure(CAPABILITIES)
+    made.configure(TICKS_PER_REV, MAX_SPEED_RAD_S)
     return made
 
 
@@ -154,7 +153,7 @@ def test_nothing_is_known_of_angles_before_the_handshake():
 
 
 def ticks_of(speed_rad_s, elapsed_ms):
-    return int(speed_rad_s * elapsed_ms * 1e-3 / (2 * math.pi) * CAPABILITIES.ticks_per_rev)
+    return int(speed_rad_s * elapsed_ms * 1e-3 / (2 * math.pi) * TICKS_PER_REV)
 
 
 @given(
@@ -189,7 +188,7 @@ def test_angles_go_on_through_an_interruption():
     wheels(made, 0, 9_000 * MS, 9_000 * MS)
     before = wheels(made, 1, 9_010 * MS, 9_010 * MS, ticks=(20, 20))
     made.restart()
-    made.configure(CAPABILITIES)
+    made.configure(TICKS_PER_REV, MAX_SPEED_RAD_S)
     after = wheels(made, 2, 9_020 * MS, 9_020 * MS, ticks=(900_000, 3))
     assert (after.left_angle_rad, after.right_angle_rad) == (before.left_angle_rad, before.right_angle_rad)
 
@@ -198,7 +197,7 @@ def test_angles_go_on_when_other_limits_are_told():
     made = make()
     wheels(made, 0, 9_000 * MS, 9_000 * MS)
     before = wheels(made, 1, 9_010 * MS, 9_010 * MS, ticks=(20, 20))
-    made.configure(Capabilities(1, 0, "0.1.0", 0x1234, 1, 4.0, 20.0, 1024, 0.1, 0.5, 20.0))
+    made.configure(1024, 4.0)
     after = wheels(made, 2, 9_020 * MS, 9_020 * MS, ticks=(900_000, 3))
     assert (after.left_angle_rad, after.right_angle_rad) == (before.left_angle_rad, before.right_angle_rad)
 
@@ -206,7 +205,7 @@ def test_angles_go_on_when_other_limits_are_told():
 def test_the_same_limits_told_again_lose_no_motion():
     made = make()
     wheels(made, 0, 9_000 * MS, 9_000 * MS)
-    made.configure(CAPABILITIES)
+    made.configure(TICKS_PER_REV, MAX_SPEED_RAD_S)
     assert wheels(made, 1, 9_010 * MS, 9_010 * MS, ticks=(20, 20)).left_angle_rad > 0
 
 

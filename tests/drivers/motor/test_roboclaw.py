@@ -132,7 +132,7 @@ def test_a_speed_beyond_what_the_board_can_do_is_held_to_it(bench):
     bench.arm()
     bench.run(1.0, (50.0, 2.0))
     assert bench.robot.speed[0] == pytest.approx(6000 / ONE.settings.counts_per_rad, rel=1e-3)
-    assert bench.driver.capabilities.max_wheel_speed_rad_s == pytest.approx(6000 / ONE.settings.counts_per_rad)
+    assert bench.driver.limits.max_wheel_speed_rad_s.value == pytest.approx(6000 / ONE.settings.counts_per_rad)
 
 
 @pytest.mark.parametrize(

@@ -59,7 +59,7 @@ def test_a_controller_that_is_not_there_is_waited_for(vendor):
     bench = vendor.bench(loses=lambda _random: True)
     bench.run(2.0)
     assert bench.driver.state is DriverState.HANDSHAKE
-    assert bench.driver.capabilities is None
+    assert bench.driver.identity is bench.driver.limits is None
     assert len(bench.driver.detail) > 10
 
 
@@ -75,12 +75,24 @@ def test_armed_the_wheels_follow_and_the_samples_say_so(bench):
         assert moved == pytest.approx(bench.robot.angle[wheel] - behind, abs=0.05)
 
 
-def test_limits_are_those_declared_and_said_to_be(bench):
+TELLS = {
+    "odrive-0.5": ("ODrive, firmware 0.5 (declared", {}),
+    "odrive": ("ODrive, firmware 0.6.11 (told", {}),
+    "vesc": ("VESC (declared", {"command_timeout_s": "device"}),
+    "agilex": ("AgileX base, CAN v2 (declared", {"command_timeout_s": "fixed"}),
+    "roboclaw": ("RoboClaw, firmware USB", {"max_wheel_speed_rad_s": "device", "command_timeout_s": "device"}),
+}
+"""By label, or else by driver: who it is, who says so, and which limits do not stand in robot.toml alone."""
+
+
+def test_it_says_who_it_is_and_of_each_limit_whether_it_was_told_or_declared(vendor, bench):
     bench.run_until(*STILL)
-    found = bench.driver.capabilities
-    assert not found.told
-    assert found.ticks_per_rev is None
-    assert found.max_wheel_speed_rad_s > 0.0
+    identity, limits = bench.driver.identity, bench.driver.limits
+    begin, others = TELLS.get(str(vendor)) or TELLS[vendor.name]
+    assert identity.in_words().startswith(begin)
+    declared = dict.fromkeys(("max_wheel_speed_rad_s", "command_timeout_s", "stop_deceleration_rad_s2"), "robot.toml")
+    assert {name: limit.said_by for name, limit in limits.known().items()} == declared | others
+    assert all(limit.value > 0.0 for limit in limits.known().values())
 
 
 def test_a_silent_host_is_stopped_by_the_controller_and_nothing_moves_when_it_is_back(vendor, bench):

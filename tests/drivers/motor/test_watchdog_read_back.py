@@ -35,7 +35,7 @@ def test_a_vesc_whose_timeout_is_another_is_refused(field, value, said):
     setattr(vescs(bench)[1], field, value)
     bench.run_until(DriverState.REFUSED)
     assert said in bench.driver.detail
-    assert bench.driver.capabilities is None
+    assert bench.driver.identity is bench.driver.limits is None
     assert not [frame for frame in bench.robot.received if BY_LABEL["vesc"].is_motion(frame)]
 
 
@@ -45,7 +45,7 @@ def test_a_vesc_that_does_not_tell_is_driven_as_declared_and_said_to_be():
         obey = vesc._obey
         vesc._obey = lambda payload, behind, obey=obey: (None, []) if payload[:1] == b"\x11" else obey(payload, behind)
     bench.arm()
-    assert check_watchdog(bench.driver.capabilities).level is Level.WARNING
+    assert check_watchdog(bench.driver.limits).level is Level.WARNING
 
 
 @pytest.mark.parametrize("payload", [b"", b"\x11", struct.pack(">BIBIf", 17, 1, 24, 100, 0.0), b"\x32" + bytes(20)])
@@ -87,6 +87,6 @@ def test_an_odrive_that_does_not_answer_for_the_endpoints_given_is_refused():
 def test_the_check_says_whether_it_was_read_back(vendor, level, words):
     bench = vendor.bench()
     bench.run_until(*STILL)
-    found = check_watchdog(bench.driver.capabilities)
+    found = check_watchdog(bench.driver.limits)
     assert (found.level, words in found.text) == (level, True)
     bench.arm()
