@@ -62,6 +62,7 @@ class AgilexDriver:
     def __init__(self, settings: AgilexSettings) -> None:
         self._settings = settings
         self.stats = DriverStats()
+        self._attention = parts.Attention()
         self._link_is_up = False
         self._stage = Stage.REST
         self._stage_ns: int | None = None
@@ -339,13 +340,17 @@ class AgilexDriver:
             self._lose("another host commands the base; disconnect it")
 
     def _check_silence(self, now_ns: int) -> None:
+        self._attention.look(now_ns)
         if self._state_ns is None:
             return
-        silent = now_ns - self._state_ns > SILENT_NS
-        silent = silent or (self._motion_ns is not None and now_ns - self._motion_ns > MOTION_SILENT_NS)
+        silent_ns = self._attention.silent_ns(self._state_ns)
+        silent = silent_ns > SILENT_NS
+        silent = silent or (
+            self._motion_ns is not None and self._attention.silent_ns(self._motion_ns) > MOTION_SILENT_NS
+        )
         if silent and self._stage is not Stage.REST:
             self._lose("the base fell silent")
-        elif self._stage is Stage.REST and now_ns - self._state_ns > GONE_NS:
+        elif self._stage is Stage.REST and silent_ns > GONE_NS:
             self._restart("the base fell silent")
             self._events.append("the base fell silent: waiting for it")
 

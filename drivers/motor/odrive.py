@@ -86,6 +86,7 @@ class OdriveDriver:
         self._axes = [[_Axis(node) for node in side] for side in settings.sides]
         self._by_node = {axis.node: axis for side in self._axes for axis in side}
         self.stats = DriverStats()
+        self._attention = parts.Attention()
         self._link_is_up = False
         self._known = False
         self._refusal: str | None = None
@@ -469,13 +470,15 @@ class OdriveDriver:
         return WheelSample(t_ns, t_ns, angles[0], angles[1], speeds[0], speeds[1])
 
     def _check_silence(self, now_ns: int) -> None:
+        self._attention.look(now_ns)
         limit_ns = SILENT_BEATS * self._settings.heartbeat_s * 1e9
         for axis in self._all:
-            if axis.heard_ns is not None and now_ns - axis.heard_ns > limit_ns:
+            silent_ns = 0 if axis.heard_ns is None else self._attention.silent_ns(axis.heard_ns)
+            if silent_ns > limit_ns:
                 why = f"node {axis.node} fell silent"
                 if self._stage is not Stage.REST:
                     self._lose(f"{why}: no heartbeat for {limit_ns * 1e-9:g} s")
-                elif now_ns - axis.heard_ns > max(2.0 * limit_ns, 5e8):
+                elif silent_ns > max(2.0 * limit_ns, 5e8):
                     self._restart(why, now_ns)
                     self._events.append(f"{why}: new handshake")
                 return

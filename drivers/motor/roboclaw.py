@@ -127,6 +127,7 @@ class RoboclawDriver:
     def __init__(self, settings: RoboclawSettings) -> None:
         self._settings = settings
         self._boards = {address: _Board(address) for address in settings.addresses}
+        self._attention = parts.Attention()
         self.stats = DriverStats()
         self._link_is_up = False
         self._stage = Stage.BRAKING
@@ -463,10 +464,11 @@ class RoboclawDriver:
 
     def _check(self, now_ns: int) -> None:
         """Errors, silence, commands not taken and a timeout that is not the one set stop all."""
+        self._attention.look(now_ns)
         for board in self._all:
-            silent_ns = 0 if board.waits_ns is None else now_ns - board.waits_ns
+            silent_ns = 0 if board.waits_ns is None else self._attention.silent_ns(board.waits_ns)
             if self._stage in (Stage.ARMING, Stage.ARMED, Stage.STOPPING):
-                refused_ns = 0 if board.refuses_ns is None else now_ns - board.refuses_ns
+                refused_ns = 0 if board.refuses_ns is None else self._attention.silent_ns(board.refuses_ns)
                 timeout_ds = board.timeout_ds
                 if board.errors:
                     self._lose(_error(board))

@@ -14,6 +14,7 @@ _ESTOP_LIFE_NS = 1_000_000_000
 _ESTOP_REPEATS = 3
 _ESTOP_RANK, _RANK = 0, 1
 _LONGEST_STEP_S = 0.1
+_PAUSE_NS = 100_000_000
 Nodes = int | tuple[int, ...]
 """Ids on CAN of one side's controllers, as robot.toml names them."""
 Sign = Literal[-1, 1]
@@ -27,6 +28,26 @@ class Stage(enum.Enum):
     ARMED = "armed"
     STOPPING = "stopping"
     BRAKING = "braking"
+
+
+class Attention:
+    """Since when this host has looked at its controllers without a pause.
+
+    What was not heard in a pause is no silence of theirs: the host was not there, or has not read yet what came then.
+    """
+
+    def __init__(self) -> None:
+        self._looked_ns = self._since_ns = 0
+
+    def look(self, now_ns: int) -> None:
+        """The host looks, once in each tick."""
+        if now_ns - self._looked_ns > _PAUSE_NS:
+            self._since_ns = now_ns
+        self._looked_ns = now_ns
+
+    def silent_ns(self, heard_ns: int) -> int:
+        """How long nothing has come since `heard_ns`, of the time without a pause."""
+        return self._looked_ns - max(heard_ns, self._since_ns)
 
 
 def check_command(command: WheelCommand | None) -> None:

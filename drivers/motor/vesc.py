@@ -95,6 +95,7 @@ class VescDriver:
         self._motors = {motor.node: motor for side in self._sides for motor in side}
         self._reassembly = codec.Reassembly(HOST_ID)
         self.stats = DriverStats()
+        self._attention = parts.Attention()
         self._link_is_up = False
         self._stage = Stage.REST
         self._stage_ns: int | None = None
@@ -418,8 +419,9 @@ class VescDriver:
 
     def _check(self, now_ns: int) -> None:
         """Faults, silence and timeouts of an armed controller stop all."""
+        self._attention.look(now_ns)
         for motor in self._all:
-            age_ns = None if motor.erpm_ns is None else now_ns - motor.erpm_ns
+            age_ns = None if motor.erpm_ns is None else self._attention.silent_ns(motor.erpm_ns)
             if self._stage in (Stage.ARMING, Stage.ARMED, Stage.STOPPING):
                 if motor.fault:
                     self._lose(f"controller {motor.node}: {_words(motor.fault)}")

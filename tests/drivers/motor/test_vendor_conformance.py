@@ -107,6 +107,24 @@ def test_a_silent_host_is_stopped_by_the_controller_and_nothing_moves_when_it_is
     assert bench.driver.state in (*STILL, DriverState.FAULT)
 
 
+def test_a_host_that_was_frozen_blames_itself_and_not_a_controller_whose_replies_it_has_not_read_yet(vendor, bench):
+    """What the controllers sent meanwhile is read by a thread that comes back later than the loop."""
+    drive(bench)
+    bench.host_runs = False
+    bench.run(vendor.watchdog_s + COASTING_S)
+    bench.host_runs = True
+    late, bench.host_end.receive = bench.host_end.receive, lambda: ()
+    bench.run(0.05)
+    assert "silent" not in bench.driver.detail
+    assert "does not take" not in bench.driver.detail
+    bench.host_end.receive = late
+    bench.largest_speed = 0.0
+    bench.run(1.0)
+    assert "silent" not in f"{bench.driver.detail} {bench.events}"
+    assert bench.driver.state is not DriverState.ARMED
+    assert bench.largest_speed < 0.05
+
+
 def test_asked_to_stand_by_after_a_pause_it_does_not_ramp_down_from_where_it_was(vendor, bench):
     """The controllers have stopped long since: a ramp from the last speed would move them again."""
     drive(bench)
