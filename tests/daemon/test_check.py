@@ -74,7 +74,7 @@ def test_a_key_that_is_not_the_robots_fails():
 def test_a_fault_that_does_not_latch_fails_with_what_to_do():
     robot = RobotInTime(b"")
     robot.robot.inputs["right_temperature_c"] = 100.0
-    firmware = check._firmware_check(check._ask_robot(robot, make_driver(None), RobotPoses()))
+    firmware = check._firmware_check(check._ask_robot(robot, make_driver(None), RobotPoses()), has_clock=True)
     assert (firmware.level, firmware.text) == (
         Level.FAIL,
         "standby: the robot reports OVER_TEMPERATURE_RIGHT: " + FAULTS["OVER_TEMPERATURE_RIGHT"].advice,
