@@ -40,14 +40,16 @@ def encode_json(record: Record) -> bytes:
 
 
 def _finite(value: Any) -> bool:
-    if isinstance(value, list | tuple):
-        return all(map(_finite, value))
+    if isinstance(value, list | tuple | dict):
+        return all(map(_finite, value.values() if isinstance(value, dict) else value))
     return not isinstance(value, float) or math.isfinite(value)
 
 
 def _spelled(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_spelled(item) for item in value]
+    if isinstance(value, dict):
+        return {name: _spelled(item) for name, item in value.items()}
     if _finite(value):
         return value
     return "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"
@@ -136,7 +138,8 @@ def json_schema(record_type: type[Record]) -> bytes:
 
 def _may_be_missing(field: dict[str, Any]) -> bool:
     """Whether a field has numbers that need not be finite."""
-    return "number" in (field["type"], field.get("items", {}).get("type"))
+    # What an object's members are is left out of the plain form: they may be numbers.
+    return field["type"] == "object" or "number" in (field["type"], field.get("items", {}).get("type"))
 
 
 def _plain(schema: dict[str, Any], definitions: dict[str, Any]) -> dict[str, Any]:

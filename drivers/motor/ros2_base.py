@@ -13,10 +13,12 @@ from drivers.motor import ros2_base_wire as wire
 from drivers.motor import vendor_parts as parts
 from drivers.motor.vendor_parts import Stage
 from drivers.types import (
-    Capabilities,
     DriverState,
     DriverStats,
     Frame,
+    Identity,
+    Limit,
+    Limits,
     MotorDriver,
     OutgoingFrame,
     Readings,
@@ -44,6 +46,7 @@ class Ros2BaseDriver:
         self._settings = settings
         self._check_sum = settings.check_sum()
         self.stats = DriverStats()
+        self._attention = parts.Attention()
         self._link_is_up = False
         self._stage = Stage.REST
         self._stage_ns: int | None = None
@@ -102,13 +105,22 @@ class Ros2BaseDriver:
         return self._note
 
     @property
-    def capabilities(self) -> Capabilities | None:
-        """What robot.toml declares of the base; it tells nothing of that itself."""
+    def identity(self) -> Identity | None:
+        """What answers behind the bridge; a base tells nothing of itself on its topics."""
         if self._state_ns is None or self._is_foreign_bridge:
             return None
+        return Identity("ROS 2 base", "", "robot.toml")
+
+    @property
+    def limits(self) -> Limits | None:
+        """What robot.toml declares of the base; it tells nothing of that itself."""
+        if self.identity is None:
+            return None
         settings = self._settings
-        return parts.declared(
-            "ROS 2", 1, settings.fastest_rad_s, settings.watchdog_s, settings.stop_deceleration_rad_s2
+        return Limits(
+            max_wheel_speed_rad_s=Limit(settings.fastest_rad_s, "robot.toml"),
+            command_timeout_s=Limit(settings.watchdog_s, "robot.toml"),
+            stop_deceleration_rad_s2=Limit(settings.stop_deceleration_rad_s2, "robot.toml"),
         )
 
     def link_up(self, now_ns: int) -> None:
@@ -315,13 +327,15 @@ class Ros2BaseDriver:
             self._lose("another host commands the base; disconnect it")
 
     def _check_silence(self, now_ns: int) -> None:
+        self._attention.look(now_ns)
         if self._state_ns is None:
             return
-        silent = now_ns - self._state_ns > SILENT_NS
-        silent = silent or (self._wheels_ns is not None and now_ns - self._wheels_ns > SILENT_NS)
+        silent_ns = self._attention.silent_ns(self._state_ns)
+        silent = silent_ns > SILENT_NS
+        silent = silent or (self._wheels_ns is not None and self._attention.silent_ns(self._wheels_ns) > SILENT_NS)
         if silent and self._stage is not Stage.REST:
             self._lose("bridge or base fell silent")
-        elif self._stage is Stage.REST and now_ns - self._state_ns > GONE_NS:
+        elif self._stage is Stage.REST and silent_ns > GONE_NS:
             self._restart("the bridge fell silent")
             self._events.append("the bridge fell silent: waiting for it")
 

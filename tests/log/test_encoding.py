@@ -7,7 +7,7 @@ from hypothesis import given
 from jsonschema import Draft202012Validator
 
 from disco_hw.log.encoding import JsonDecoder, encode_json, json_schema
-from disco_hw.log.records import TOPICS, Estimate, Event, topic_of
+from disco_hw.log.records import TOPICS, Estimate, Event, Task, topic_of
 from tools.log_samples import ANY_RECORD, bits
 
 DECODER = JsonDecoder()
@@ -56,6 +56,14 @@ def test_a_field_that_is_not_finite_is_left_out_and_comes_back():
     }
     assert bits(DECODER.decode("/estimate", encode_json(record))) == bits(record)
     assert "not_finite" not in json.loads(encode_json(Estimate(1, 1.0, 1.0, 1.0, (), 1.0, 1.0, 1.0, 1.0)))
+
+
+def test_a_mapping_with_a_number_that_is_not_finite_is_left_out_and_comes_back():
+    record = Task(1, "circle", {"radius_m": math.nan, "speed_m_s": 0.5})
+    plain = json.loads(encode_json(record))
+    assert "settings" not in plain
+    assert json.loads(plain["not_finite"])["settings"] == {"radius_m": "NaN", "speed_m_s": 0.5}
+    assert bits(DECODER.decode("/task", encode_json(record))) == bits(record)
 
 
 def test_what_older_logs_hold_in_the_field_itself_is_read():

@@ -80,6 +80,7 @@ TELLS = {
     "odrive": ("ODrive, firmware 0.6.11 (told", {}),
     "vesc": ("VESC (declared", {"command_timeout_s": "device"}),
     "agilex": ("AgileX base, CAN v2 (declared", {"command_timeout_s": "fixed"}),
+    "ros2_base": ("ROS 2 base (declared", {}),
     "roboclaw": ("RoboClaw, firmware USB", {"max_wheel_speed_rad_s": "device", "command_timeout_s": "device"}),
 }
 """By label, or else by driver: who it is, who says so, and which limits do not stand in robot.toml alone."""
