@@ -171,8 +171,9 @@ class Drive:
 def drive(
     contender: Contender, robot: ForeignRobot, track: Track, *, rate_hz: float = 50.0, duration_s: float = DURATION_S,
     seed: int = 1, start: tuple[float, float, float] | None = None,
+    listen: Callable[[Readings], object] = lambda readings: None,
 ) -> Drive:  # fmt: skip
-    """One drive from rest."""
+    """One drive from rest; `listen` gets what the sensors say."""
     plant = ForeignPlant(robot, start or track.start, seed)
     mean, spread = ((robot.radius_m, robot.axle_m, robot.x_icr_m), 0.004) if contender.knows else (NOMINAL, SPREAD)
     period_s = 1.0 / rate_hz
@@ -185,6 +186,7 @@ def drive(
     command = (0.0, 0.0)
     while plant.now_ms < 1e3 * duration_s:
         readings = plant.readings()
+        listen(readings)
         wheels += readings.wheels
         poses += readings.poses
         if plant.now_ms % every_ms == 0:

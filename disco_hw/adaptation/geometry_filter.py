@@ -1,7 +1,9 @@
 """Extended Kalman filters that learn the geometry with the pose: seconds after a change they follow.
 
-State: x, y, yaw; wheel radius, axial distance, x_icr; and the slip of either wheel, which comes and goes by itself (a
-first-order Gauss-Markov process). Driven by the turns of the wheels, corrected by the poses at their own time stamps.
+State: x, y, yaw; wheel radius, axial distance, x_icr; the slip of either wheel, which comes and goes by itself (a
+first-order Gauss-Markov process); and how long the measured pose lags behind the wheels: tyres build up their force
+over some way, a body has inertia, a time stamp is not exact. Without it the yaw that a corner begins with looks like a
+larger axle. Driven by the turns of the wheels, corrected by the poses at their own time stamps.
 
 One filter is believed. Beside it run some that say "the robot has just changed": copies whose parameters, all of them
 or one, were opened at different times. One that has explained the poses since then so much better that this outweighs
@@ -27,6 +29,8 @@ Array = NDArray[np.float64]
 
 SLIP_STD, SLIP_S = 0.035, 0.2
 """Slip of a wheel as a part of its way, and how long it lasts."""
+LAG_S, LAG_STD_S, LAG_DRIFT_S = 0.03, 0.03, 0.003
+"""Of the pose behind the wheels: what is believed at first, and the random walk over a radian turned."""
 DRIFT_PER_SQRT_M, DRIFT_PER_SQRT_RAD = 0.001, 0.002
 """Random walk, by size: of the radius over a metre driven, of axle and x_icr over a radian turned."""
 LEAST_STD = 0.002
@@ -39,7 +43,7 @@ DOUBTERS, DOUBT_S, DOUBT_LASTS_S = 16, 0.5, 4.0
 """Filters beside the one that is believed, how much driving lies between their beginnings, and how much proves none."""
 CHANGE_LOG_ODDS = -5.0
 """Of a change of one kind having come with one of these beginnings."""
-MOST_BY_A_POSE = 2.0
+MOST_BY_A_POSE = 0.7
 """Log odds that one pose can win or lose for a change: a jolt, or a wrong pose, is short."""
 MISFIT_POSES = 50.0
 """Over how many poses the size of the innovations is averaged, by which standard deviations are scaled in that test."""
@@ -52,29 +56,32 @@ _WAIT_NS = 600_000_000
 """Wheel samples wait so long for a pose, and a pose stamped later than that after them is none: the tick that takes
 them in must not have to follow seconds of wheels at once, nor keep them for ever."""
 _STANDS_RAD = 1e-4
-_SLIDING_S = 0.05
+_SLIDING_S, _SLIDING_STD_S = 0.04, 0.04
 """How long the body's sideways speed lags behind its turning."""
 _STRIDE_S = 0.045
 """Wheel samples between two poses are followed together, along one arc, for so long."""
 _ROUGH_M, _ROUGH_RAD = 5e-4, 5e-4
 """Random part of a centimetre driven, to any side and in heading, which the wheels do not show."""
-_X, _Y, _YAW, _RADIUS, _AXLE, _X_ICR, _LEFT, _RIGHT = range(8)
+_X, _Y, _YAW, _RADIUS, _AXLE, _X_ICR, _LEFT, _RIGHT, _LAG = range(9)
+_SIZE = 9
 _THETA = slice(_RADIUS, _X_ICR + 1)
-_DRIVEN, _EVERY = [_RADIUS, _AXLE, _LEFT, _RIGHT], range(8)
+_SLIPS = slice(_LEFT, _RIGHT + 1)
+_DRIVEN, _EVERY = [_RADIUS, _AXLE, _LEFT, _RIGHT], range(_SIZE)
 
 
 class _Bank:
-    """Some filters, each a row of `state` (N, 8) and `covariance` (N, 8, 8) in the order above."""
+    """Some filters, each a row of `state` (N, 9) and `covariance` (N, 9, 9) in the order above."""
 
     def __init__(self, theta: Array, covariance: Array) -> None:
-        self.state, self.covariance = np.zeros((1, 8)), np.zeros((1, 8, 8))
+        self.state, self.covariance = np.zeros((1, _SIZE)), np.zeros((1, _SIZE, _SIZE))
         self.state[0, _THETA], self.covariance[0, _THETA, _THETA] = theta, covariance
-        self._turn_rad_s = np.zeros(1)
+        self.state[0, _LAG], self.covariance[0, _LAG, _LAG] = LAG_S, LAG_STD_S**2
+        self._velocity, self._sliding_rad_s = np.zeros((1, 3)), np.zeros(1)
 
     def predict(self, left: float, right: float, dt_s: float) -> None:
         """Follow wheels that turned so far (rad)."""
         state = self.state
-        _, _, yaw, radius, axle, x_icr, slip_left, slip_right = state.T
+        _, _, yaw, radius, axle, x_icr, slip_left, slip_right, _ = state.T
         way_left, way_right = radius * left * (1.0 - slip_left), radius * right * (1.0 - slip_right)
         way, turn = 0.5 * (way_left + way_right), (way_right - way_left) / axle
         cosine, sine = np.cos(yaw + 0.5 * turn), np.sin(yaw + 0.5 * turn)
@@ -85,53 +92,64 @@ class _Bank:
         by_turn = np.stack([turn / radius, -turn / axle, radius * left / axle, -radius * right / axle], axis=1)
         x_by_turn = -0.5 * way * sine + x_icr * (sine + 0.5 * turn * cosine)
         y_by_turn = 0.5 * way * cosine - x_icr * (cosine - 0.5 * turn * sine)
-        move_x, move_y = way * cosine + x_icr * turn * sine, way * sine - x_icr * turn * cosine
-        step = np.broadcast_to(np.eye(8), (len(state), 8, 8)).copy()
+        # A body that begins or ends a turn slides to its new motion.
+        lags_rad_s = turn / dt_s - self._sliding_rad_s
+        slides = 1.0 - math.exp(-dt_s / _SLIDING_S)
+        sideways = turn - lags_rad_s * _SLIDING_S * slides
+        self._sliding_rad_s = self._sliding_rad_s + slides * lags_rad_s
+        move_x, move_y = way * cosine + x_icr * sideways * sine, way * sine - x_icr * sideways * cosine
+        step = np.broadcast_to(np.eye(_SIZE), (len(state), _SIZE, _SIZE)).copy()
         step[:, _X, _YAW], step[:, _Y, _YAW] = -move_y, move_x
-        step[:, _X, _X_ICR], step[:, _Y, _X_ICR] = turn * sine, -turn * cosine
+        step[:, _X, _X_ICR], step[:, _Y, _X_ICR] = sideways * sine, -sideways * cosine
         step[:, _X, _DRIVEN] = by_way * cosine[:, None] + by_turn * x_by_turn[:, None]
         step[:, _Y, _DRIVEN] = by_way * sine[:, None] + by_turn * y_by_turn[:, None]
         step[:, _YAW, _DRIVEN] = by_turn
         step[:, _LEFT, _LEFT] = step[:, _RIGHT, _RIGHT] = keep
 
-        noise = np.empty((len(state), 8))
+        noise = np.empty((len(state), _SIZE))
         distance = np.abs(way)
-        # A body that begins or ends a turn slides to its new motion.
-        slid_m = x_icr * _SLIDING_S * (turn / dt_s - self._turn_rad_s)
-        self._turn_rad_s = turn / dt_s
+        slid_m = x_icr * _SLIDING_STD_S * (turn / dt_s - self._velocity[:, 2])
+        self._velocity = np.stack([move_x, move_y, turn], axis=1) / dt_s
         noise[:, _X] = noise[:, _Y] = _ROUGH_M**2 * distance / 0.01 + slid_m**2
         noise[:, _YAW] = _ROUGH_RAD**2 * distance / 0.01
         noise[:, _RADIUS] = (DRIFT_PER_SQRT_M * radius) ** 2 * distance
         noise[:, _AXLE] = (DRIFT_PER_SQRT_RAD * axle) ** 2 * np.abs(turn)
         noise[:, _X_ICR] = (DRIFT_PER_SQRT_RAD * x_icr) ** 2 * np.abs(turn)
-        noise[:, _LEFT:] = SLIP_STD**2 * (1.0 - keep * keep)
+        noise[:, _SLIPS] = SLIP_STD**2 * (1.0 - keep * keep)
+        noise[:, _LAG] = LAG_DRIFT_S**2 * np.abs(turn)
         covariance = step @ self.covariance @ step.transpose(0, 2, 1)
         covariance[:, _EVERY, _EVERY] += noise
         self.covariance = covariance
         state[:, _X] += move_x
         state[:, _Y] += move_y
         state[:, _YAW] += turn
-        state[:, _LEFT:] *= keep
+        state[:, _SLIPS] *= keep
 
     def expect(self, pose: PoseSample) -> tuple[Array, Array]:
         """Innovations (N, 3) of a pose, and their covariances (N, 3, 3)."""
-        innovation = np.array([pose.x_m, pose.y_m, pose.yaw_rad]) - self.state[:, :3]
+        lagging = self.state[:, :3] - self.state[:, _LAG, None] * self._velocity
+        innovation = np.array([pose.x_m, pose.y_m, pose.yaw_rad]) - lagging
         innovation[:, 2] -= 2.0 * math.pi * np.round(innovation[:, 2] / (2.0 * math.pi))
         variances = np.array([pose.position_std_m, pose.position_std_m, pose.yaw_std_rad]) ** 2
-        return innovation, self.covariance[:, :3, :3] + np.diag(variances)
+        with_all = self._with_pose()
+        return innovation, with_all[:, :3] - self._velocity[:, :, None] * with_all[:, _LAG, None] + np.diag(variances)
 
     def correct(self, innovation: Array, expected: Array, low: Array, high: Array) -> None:
         """Take a pose in; the parameters stay between `low` and `high`."""
-        gain = np.linalg.solve(expected, self.covariance[:, :3]).transpose(0, 2, 1)
+        gain = np.linalg.solve(expected, self._with_pose().transpose(0, 2, 1)).transpose(0, 2, 1)
         self.state += (gain @ innovation[:, :, None])[:, :, 0]
         covariance = self.covariance - gain @ expected @ gain.transpose(0, 2, 1)
         self.covariance = 0.5 * (covariance + covariance.transpose(0, 2, 1))
         self.state[:, _THETA] = np.clip(self.state[:, _THETA], low, high)
 
+    def _with_pose(self) -> Array:
+        """Covariances (N, 9, 3) of the state with the pose that is measured."""
+        return self.covariance[:, :, :3] - self.covariance[:, :, _LAG, None] * self._velocity[:, None]
+
     def keep(self, rows: NDArray[np.int64]) -> None:
         """Go on with these rows only, in this order; one may come twice."""
         self.state, self.covariance = self.state[rows], self.covariance[rows]
-        self._turn_rad_s = self._turn_rad_s[rows]
+        self._velocity, self._sliding_rad_s = self._velocity[rows], self._sliding_rad_s[rows]
 
     def widen(self, row: int, widest: Array) -> None:
         """Let the parameters of a row be as wide as this (3,), or as they are."""
@@ -140,13 +158,15 @@ class _Bank:
 
     def place(self, pose: PoseSample) -> None:
         """Take the pose as it was measured; what is believed of the robot stays."""
-        self.state[:, :3] = pose.x_m, pose.y_m, pose.yaw_rad
-        self.state[:, _LEFT:] = 0.0
-        theta = self.covariance[:, _THETA, _THETA].copy()
+        self.state[:, :3] = np.array([pose.x_m, pose.y_m, pose.yaw_rad]) + self.state[:, _LAG, None] * self._velocity
+        self.state[:, _SLIPS] = 0.0
+        theta, lag = self.covariance[:, _THETA, _THETA].copy(), self.covariance[:, _LAG, _LAG].copy()
         self.covariance[:] = 0.0
-        self.covariance[:, _THETA, _THETA] = theta
-        spread = [pose.position_std_m**2, pose.position_std_m**2, pose.yaw_std_rad**2]
-        self.covariance[:, range(3), range(3)] = spread
+        self.covariance[:, _THETA, _THETA], self.covariance[:, _LAG, _LAG] = theta, lag
+        spread = np.diag(np.array([pose.position_std_m, pose.position_std_m, pose.yaw_std_rad]) ** 2)
+        with_lag = self._velocity * lag[:, None]
+        self.covariance[:, :3, :3] = spread + self._velocity[:, :, None] * with_lag[:, None]
+        self.covariance[:, :3, _LAG] = self.covariance[:, _LAG, :3] = with_lag
         self.covariance[:, _LEFT, _LEFT] = self.covariance[:, _RIGHT, _RIGHT] = SLIP_STD**2
 
 

@@ -8,7 +8,10 @@ import numpy as np
 import pytest
 
 from disco_hw.adaptation.geometry_filter import GeometryFilter
+from disco_hw.control.baselines.laws import Kanayama
 from tools.foreign_plant import NOMINAL, ForeignPlant, ForeignRobot, robots
+from tools.tracking import classical, tracks
+from tools.tracking import drive as track
 
 MEAN = np.array(NOMINAL)
 TURN, STRAIGHT, STAND = (2.6, 4.6), (3.6, 3.6), (0.0, 0.0)
@@ -90,6 +93,20 @@ def test_beginning_and_ending_turns_is_no_change():
         drive(found, plant, TURN, 4.0)
     assert found.changes == 0
     assert np.abs(found.mean / MEAN - 1.0).max() < 0.03
+
+
+@pytest.mark.parametrize(("way", "number"), [("square", 1001), ("slalom", 1000)])
+def test_corners_are_no_change_and_teach_the_geometry(way, number):
+    robot, found = robots(number, 1)[0], learner()
+
+    def listen(readings):
+        found.add(readings.wheels, readings.poses)
+
+    track(classical(Kanayama()), robot, tracks()[way], duration_s=20.0, seed=number, listen=listen)
+    assert found.changes == 0
+    error = np.abs(found.mean - truth(robot))
+    assert (error < 0.03 * truth(robot)).all()
+    assert (error < 3.0 * np.sqrt(np.diag(found.covariance))).all()
 
 
 @pytest.mark.long
