@@ -129,6 +129,6 @@ dist-check: $(BIN)/python
 
 # The documentation as a site, in an environment of its own.
 docs:
-	@test -x .docs-venv/bin/mkdocs || { $(PYTHON) -m venv .docs-venv && .docs-venv/bin/python -m pip install --quiet 'mkdocs-material>=9.5'; }
+	@test -x .docs-venv/bin/mkdocs || { $(PYTHON) -m venv .docs-venv && .docs-venv/bin/python -m pip install --quiet 'mkdocs-material>=9.5' 'mkdocstrings[python]>=0.29' ruff; }
 	NO_MKDOCS_2_WARNING=1 .docs-venv/bin/mkdocs build --strict --quiet --site-dir site
 	@echo "look at site/index.html"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import subprocess
 import sys
 from importlib import metadata
@@ -34,6 +35,11 @@ def test_every_name_is_there_described_and_on_the_page(name):
     assert getattr(disco_hw, name).__doc__
     assert name in dir(disco_hw)
     assert f"`{name}" in PAGE
+
+
+def test_every_name_is_in_the_reference_that_is_made_from_docstrings():
+    made = re.findall(r"^::: disco_hw\.(\w+)$", (ROOT / "docs" / "api.md").read_text(encoding="utf-8"), re.MULTILINE)
+    assert sorted(made) == sorted(set(disco_hw.__all__) - {"__version__"})
 
 
 def test_any_other_name_is_not():
