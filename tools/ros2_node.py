@@ -2,7 +2,8 @@
 
     python -m tools.ros2_node DOMAIN KIND X Y YAW
 
-`echo` says where the robot is by its own odometry, from X Y YAW on; `nan`, `frame`, `flood`, `garbage` and `late` do so
+`echo` says where the robot is by its own odometry, from X Y YAW on; `tf` says where that odometry is in the map, dated
+ahead, as a localisation does; `nan`, `frame`, `flood`, `garbage` and `late` do so
 wrongly from SIGUSR1 on. A line for each odometry heard: its stamp (wall clock), when it was heard and answered
 (monotonic), in ns, and where it is (m). `speed` says speeds X (m/s) and YAW (rad/s), 20 a second, asks the bridge for
 each line of its input, presses the e-stop for the line `button`, and writes the answers.
@@ -44,6 +45,7 @@ def main(domain: str, kind: str, east: str, north: str, heading: str) -> None:
         drive(participant, msg.Twist(msg.Vector3(x, 0.0, 0.0), msg.Vector3(0.0, 0.0, yaw)))
         return
     say = DataWriter(participant, Topic(participant, "rt/pose", msg.PoseStamped))
+    transforms = DataWriter(participant, Topic(participant, "rt/tf", msg.TFMessage)) if kind == "tf" else None
     # The name of a pose and the bytes of something else, once it is time.
     other = None
     wrong: list[int] = []
@@ -60,6 +62,14 @@ def main(domain: str, kind: str, east: str, north: str, heading: str) -> None:
             pose = msg.RosPose(msg.Point(at_x, at_y, 0.0), msg.Quaternion(0.0, 0.0, math.sin(half), math.cos(half)))
             message = msg.PoseStamped(msg.Header(heard.header.stamp, "map"), pose)
             times = 1
+            if transforms is not None:
+                times = 0
+                turned = msg.Quaternion(0.0, 0.0, math.sin(0.5 * yaw), math.cos(0.5 * yaw))
+                # A correction that is new each time.
+                shift = msg.Vector3(x + 1e-6 * (heard_ns % 1000), y, 0.0)
+                ahead = msg.stamp_of(msg.time_of(heard.header.stamp) + 200_000_000)
+                one = msg.TransformStamped(msg.Header(ahead, "map"), "odom", msg.Transform(shift, turned))
+                transforms.write(msg.TFMessage([one]))
             if wrong:
                 if kind == "nan":
                     pose.position.x = math.nan

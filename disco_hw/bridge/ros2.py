@@ -34,6 +34,7 @@ from drivers.motor.ros2_base_wire import Ros2BaseSettings
 from drivers.pose.ros2 import SOURCE, bridge_address
 
 CMD_VEL, CTL, REPLY, ESTOP = "cmd_vel", "disco_hw/ctl", "disco_hw/reply", "disco_hw/estop"
+TF_STATIC = "/tf_static"
 LOOPBACK = """<CycloneDDS><Domain><General><AllowMulticast>false</AllowMulticast>
 <Interfaces><NetworkInterface name="lo" multicast="false"/></Interfaces></General>
 <Discovery><ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>60</MaxAutoParticipantIndex>
@@ -48,6 +49,13 @@ RELIABLE = Qos(
 )
 _LATCHED = Qos(
     Policy.Reliability.Reliable(duration(milliseconds=5)), Policy.Durability.TransientLocal, Policy.History.KeepLast(1)
+)
+
+_TRANSFORMS = Qos(Policy.Reliability.BestEffort, Policy.Durability.Volatile, Policy.History.KeepLast(100))
+_STATIC = Qos(
+    Policy.Reliability.Reliable(duration(milliseconds=5)),
+    Policy.Durability.TransientLocal,
+    Policy.History.KeepLast(100),
 )
 
 _SAID: tuple[tuple[str, type, Qos], ...] = (
@@ -96,6 +104,7 @@ class Bridge:
         self._outgoing = out.Outgoing(config, parameters)
         self._feed = FeedSubscriber(tick_feed_path(socket_path(config)))
         self._poses = ros2_poses.PoseInlet(config.pose)
+        self._transforms = ros2_poses.TransformInlet(config.pose, config.ros2.base_frame or out.BASE_FRAME)
         self._speeds = ros2_commands.SpeedInlet(config.robot, config.drive, parameters)
         self._pad = ros2_commands.DaemonPad(socket_path(config))
         self._to_daemon = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
@@ -110,7 +119,8 @@ class Bridge:
         # A base on ROS 2 says its own odometry, and takes /cmd_vel itself.
         self._base_on_ros = isinstance(config.link.settings(), Ros2BaseSettings)
         self._writers = {
-            name: DataWriter(self._participant, Topic(self._participant, wire_name(name, namespace), kind, qos), qos)
+            # A topic without qualities of its own, as one that is said may be heard too.
+            name: DataWriter(self._participant, Topic(self._participant, wire_name(name, namespace), kind), qos)
             for name, kind, qos in _SAID
             if not (self._base_on_ros and name in _OF_THE_BASE)
         }
@@ -156,7 +166,10 @@ class Bridge:
 
     def _make_readers(self, namespace: str) -> Iterator[tuple[DataReader[Any], _Take]]:
         # One for each type that a topic may have: only the one that the sender has is ever matched.
-        if self._config.pose.source == SOURCE:
+        if self._config.pose.source == SOURCE and self._config.pose.topic == ros2_poses.TRANSFORMS:
+            yield self._reader(out.TF, msg.TFMessage, _TRANSFORMS, namespace), self._take_transforms
+            yield self._reader(TF_STATIC, msg.TFMessage, _STATIC, namespace), self._take_static_transforms
+        elif self._config.pose.source == SOURCE:
             for pose in ros2_poses.TYPES:
                 yield self._reader(self._config.pose.topic, pose, SENSOR, namespace), self._take_pose
         for speed in () if self._base_on_ros else ros2_commands.TYPES:
@@ -194,6 +207,13 @@ class Bridge:
         for sample in samples:
             if sample.sample_info.valid_data:
                 yield sample, sample.sample_info.source_timestamp
+
+    def _take_transforms(self, message: msg.TFMessage, sent_ns: int, *, static: bool = False) -> None:
+        for pose in self._transforms.poses(message, sent_ns, time.time_ns(), static=static):
+            self._take_pose(pose, sent_ns)
+
+    def _take_static_transforms(self, message: msg.TFMessage, sent_ns: int) -> None:
+        self._take_transforms(message, sent_ns, static=True)
 
     def _take_pose(self, message: ros2_poses.PoseMessage, sent_ns: int) -> None:
         datagram = self._poses.datagram(message, sent_ns, time.monotonic_ns(), time.time_ns())
@@ -244,7 +264,9 @@ class Bridge:
 
     def _diagnosis(self, mono_ns: int, wall_ns: int) -> out.Message:
         figures = {"poses passed on": self._poses.passed, "poses not taken by the daemon": self._unsent}
-        figures |= {f"poses refused: {why}": count for why, count in self._poses.refused.items()}
+        figures |= {
+            f"poses refused: {why}": count for why, count in (self._poses.refused + self._transforms.refused).items()
+        }
         figures |= {"speeds passed on": self._speeds.passed}
         figures |= {f"speeds refused: {why}": count for why, count in self._speeds.refused.items()}
         figures |= {"requests refused, too many": self._asking.refused + self._stopping.refused}

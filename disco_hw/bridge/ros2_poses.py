@@ -6,13 +6,17 @@ A message's stamp is wall-clock time, the daemon's time is monotonic: an age say
 from __future__ import annotations
 
 import math
-from collections import Counter
-from collections.abc import Sequence
+from collections import Counter, deque
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 
 import msgspec
+import numpy as np
 
 from disco_hw.bridge import ros2_messages as msg
 from disco_hw.config import PoseInput
+from disco_hw.log.rosbag.frames import Edge, Motion, chain
+from disco_hw.log.rosbag.frames import poses as along
 
 TYPES = (msg.PoseStamped, msg.PoseWithCovarianceStamped, msg.Odometry)
 PoseMessage = msg.PoseStamped | msg.PoseWithCovarianceStamped | msg.Odometry
@@ -21,6 +25,11 @@ _AHEAD_NS = 50_000_000
 _OLDEST_NS = 1_000_000_000
 _SHORTEST_NS = 4_000_000
 _UNIT_MARGIN = 0.02
+TRANSFORMS = "tf"
+"""What `pose.topic` is for poses by the transforms of /tf and /tf_static."""
+_KEPT_NS = 3_000_000_000
+_MOST_KEPT, _MOST_EDGES = 1000, 500
+_REPEAT_NS, _REPEATED = 500_000_000, 3.0
 
 
 class PoseInlet:
@@ -94,3 +103,104 @@ def _stds(covariance: Sequence[float] | None) -> tuple[float, float] | None:
     if not (math.isfinite(xx + yy + tt) and min(xx, yy, tt) >= 0.0):
         return None
     return math.sqrt(max(xx, yy)), math.sqrt(tt)
+
+
+@dataclass(slots=True)
+class _Followed:
+    """Transforms of one edge: times (ns, wall clock) and position with quaternion, oldest first."""
+
+    parent: str
+    static: bool
+    rows: deque[tuple[int, tuple[float, ...]]] = field(default_factory=lambda: deque(maxlen=_MOST_KEPT))
+
+
+class TransformInlet:
+    """Makes poses of the chain of transforms from the map to the robot, as a listener of tf would see it.
+
+    One is made where the first moving edge, the localisation's correction, has come: at its own time, or at the newest
+    of the edges after it where it is dated ahead. An edge that only repeats itself says that the localisation lives and
+    has nothing new: twice a second, with three times the standard deviation.
+    """
+
+    def __init__(self, settings: PoseInput, base_frame: str) -> None:
+        self.refused: Counter[str] = Counter()
+        self._settings = settings
+        self._map, self._base = _frame(settings.frame), _frame(base_frame)
+        self._edges: dict[str, _Followed] = {}
+        self._chain: tuple[Edge, ...] | None = None
+        self._spoken_ns = 0
+
+    def poses(
+        self, message: msg.TFMessage, sent_ns: int, wall_ns: int, *, static: bool
+    ) -> Iterator[msg.PoseWithCovarianceStamped]:
+        """The poses that the transforms of a message bring; `sent_ns` is the time of those without a stamp."""
+        for each in message.transforms:
+            parent, child = _frame(each.header.frame_id), _frame(each.child_frame_id)
+            place, turned = each.transform.translation, each.transform.rotation
+            values = (place.x, place.y, place.z, turned.x, turned.y, turned.z, turned.w)
+            t_ns = msg.time_of(each.header.stamp) or sent_ns
+            before = self._edges.get(child)
+            if not math.isfinite(sum(values)) or abs(sum(q * q for q in values[3:]) - 1.0) > _UNIT_MARGIN:
+                self.refused["transforms that are not finite, or no rotation"] += 1
+            elif before is None and len(self._edges) >= _MOST_EDGES:
+                self.refused["transforms of too many frames"] += 1
+            elif self._keep(parent, child, t_ns, values, static=static):
+                pose = self._pose_by(child, wall_ns)
+                if pose is not None:
+                    yield pose
+
+    def _keep(self, parent: str, child: str, t_ns: int, values: tuple[float, ...], *, static: bool) -> bool:
+        """Whether this is a new transform of the edge."""
+        edge = self._edges.get(child)
+        if edge is None or edge.parent != parent or edge.static is not static:
+            edge = self._edges[child] = _Followed(parent, static)
+            self._chain = chain(((one.parent, name) for name, one in self._edges.items()), self._map, self._base)
+        if edge.rows and t_ns < edge.rows[-1][0] - _KEPT_NS:
+            # The sender's clock was set back, or its bag begins anew.
+            edge.rows.clear()
+        if edge.rows and t_ns <= edge.rows[-1][0] and not static:
+            self.refused["transforms not newer than the one before"] += 1
+            return False
+        edge.rows.append((t_ns, values))
+        while edge.rows[0][0] < t_ns - _KEPT_NS:
+            edge.rows.popleft()
+        return True
+
+    def _pose_by(self, child: str, wall_ns: int) -> msg.PoseWithCovarianceStamped | None:
+        """The chain's end now that `child` has moved; None unless that is the first edge that moves."""
+        if self._chain is None:
+            self.refused[f'transforms without a chain from "{self._map[:40]}" to "{self._base[:40]}"'] += 1
+            return None
+        moving = [name for _, name in self._chain if not self._edges[name].static]
+        if not moving or moving[0] != child:
+            return None
+        leading = self._edges[child].rows
+        after = [self._edges[name].rows for name in moving[1:]]
+        t_ns = min(leading[-1][0], wall_ns, *(rows[-1][0] for rows in after))
+        if any(t_ns < rows[0][0] for rows in after):
+            self.refused["transforms that the ones after them in the chain do not reach"] += 1
+            return None
+        repeated = bool(after) and len(leading) > 1 and leading[-1][1] == leading[-2][1]
+        if repeated and t_ns < self._spoken_ns + _REPEAT_NS:
+            return None
+        self._spoken_ns = t_ns
+        motions = [self._motion(name, t_ns if name == child else None) for _, name in self._chain]
+        x, y, yaw = along(motions)[1][0].tolist()
+        position, heading = self._settings.position_std_m, self._settings.yaw_std_rad
+        scale = _REPEATED if repeated else 1.0
+        covariance = [0.0] * 36
+        covariance[0] = covariance[7] = (scale * position) ** 2
+        covariance[35] = (scale * heading) ** 2
+        turned = msg.Quaternion(0.0, 0.0, math.sin(0.5 * yaw), math.cos(0.5 * yaw))
+        pose = msg.PoseWithCovariance(msg.RosPose(msg.Point(x, y, 0.0), turned), covariance)
+        return msg.PoseWithCovarianceStamped(msg.Header(msg.stamp_of(t_ns), self._settings.frame), pose)
+
+    def _motion(self, child: str, only_ns: int | None) -> Motion:
+        """The transforms of an edge for the chain; of the first, the newest alone, at the time of the pose."""
+        edge = self._edges[child]
+        rows = list(edge.rows) if only_ns is None else [(only_ns, edge.rows[-1][1])]
+        return Motion(np.array([t for t, _ in rows]), np.array([values for _, values in rows]), edge.static)
+
+
+def _frame(name: str) -> str:
+    return name.lstrip("/")

@@ -1,17 +1,29 @@
 """The bridge to a base on ROS 2: what it takes for wheels, when it lets the base drive, and who is let in."""
 
+import itertools
 import math
+import os
 import socket
 import struct
+import threading
+import time
 
+import msgspec
 import pytest
 
 pytest.importorskip("cyclonedds", reason="cyclonedds is not installed: make venv")
 
+from cyclonedds.domain import DomainParticipant
+from cyclonedds.pub import DataWriter
+from cyclonedds.sub import DataReader
+from cyclonedds.topic import Topic
+
 from disco_hw.bridge import ros2_messages as msg
-from disco_hw.bridge.ros2_base import Clients, run_base_bridge
+from disco_hw.bridge.ros2 import RELIABLE
+from disco_hw.bridge.ros2_base import BaseBridge, Clients, run_base_bridge
 from disco_hw.bridge.ros2_wheels import WheelInlet
 from disco_hw.config import load_robot_config
+from disco_hw.config.robot import Ros2
 from disco_hw.errors import InputError
 from drivers.motor import find_driver
 from drivers.motor import ros2_base_wire as wire
@@ -20,6 +32,7 @@ from tests.first_use.miswired import robot_file
 
 MS = 1_000_000
 MONO_NS, WALL_NS = 50_000 * MS, 1_800_000_000_000 * MS
+DOMAINS = itertools.count(10 + os.getpid() % 20 * 3)
 JOINTS = {"left_joints": ("fl", "rl"), "right_joints": ("fr", "rr")}
 
 
@@ -52,6 +65,10 @@ def test_joints_of_a_side_are_averaged_and_their_age_is_that_of_the_stamp():
     assert wheels.angles_rad == pytest.approx((1.0, 2.0))
     assert wheels.speeds_rad_s == pytest.approx((0.5, 1.5))
     assert wheels.age_s == pytest.approx(0.020)
+
+
+def test_a_stamp_a_little_ahead_is_now():
+    assert taken(WheelInlet(settings(**JOINTS)), joints(30), 0).age_s == 0.0
 
 
 def test_a_message_without_a_stamp_counts_from_when_it_was_sent():
@@ -159,6 +176,15 @@ class TestBaseEnd:
         assert wire.unpack_state(end.state().data)[0] & wire.FELL_SILENT
         assert end.receive(300 * MS, wire.speeds(0.5, 0.0)) is None
 
+    def test_speeds_in_time_keep_it_driving_and_a_new_enabling_forgets_the_silence(self, end):
+        end.receive(0, wire.enable(True))
+        for now_ms in range(0, 2000, 190):
+            assert end.receive(now_ms * MS, wire.speeds(0.5, 0.0)) == (0.5, 0.0)
+        end.step(3000 * MS)
+        assert wire.unpack_state(end.state().data)[0] & wire.FELL_SILENT
+        end.receive(3000 * MS, wire.enable(True))
+        assert not wire.unpack_state(end.state().data)[0] & wire.FELL_SILENT
+
     def test_speeds_that_come_after_a_silence_are_refused_even_before_the_next_step(self, end):
         end.receive(0, wire.enable(True))
         assert end.receive(201 * MS, wire.speeds(0.5, 0.0)) is None
@@ -246,6 +272,89 @@ def test_the_socket_of_a_bridge_that_was_killed_is_taken_over_and_a_living_ones_
     with pytest.raises(InputError, match="listens there; end it first"):
         Clients(path)
     clients.close()
+
+
+class OverDds:
+    """A bridge in this process, and a base beside it on the same domain; the daemon is a client."""
+
+    def __init__(self, tmp_path, stop_topic=""):
+        config = load_robot_config(robot_file(tmp_path, "ros2_base"))
+        self.settings = settings(stop_topic=stop_topic, **JOINTS)
+        number = next(DOMAINS)
+        config = msgspec.structs.replace(config, ros2=Ros2(domain=number))
+        self.clients = Clients(tmp_path / "base")
+        self.bridge = BaseBridge(config, self.settings, self.clients)
+        participant = DomainParticipant(number)
+        self.speeds = DataReader(participant, Topic(participant, "rt/cmd_vel", msg.Twist))
+        self.joints = DataWriter(participant, Topic(participant, "rt/joint_states", msg.JointState))
+        self.other = None
+        self.participant = participant
+        self.daemon = connected(tmp_path / "base")
+        self.ended = False
+        self.thread = threading.Thread(target=self.bridge.run, args=(lambda: self.ended,))
+        self.thread.start()
+
+    def end(self):
+        self.ended = True
+        self.thread.join()
+        self.daemon.close()
+        self.clients.close()
+
+    def send(self, *frames):
+        for frame in frames:
+            self.daemon.send(packet(frame))
+
+    def flags(self):
+        """Of the next STATE."""
+        while True:
+            received = self.daemon.recv(16)
+            if struct.unpack("=I", received[:4])[0] == wire.STATE:
+                return wire.unpack_state(received[8:])[0]
+
+    def until(self, condition, also=lambda: None):
+        """Say joints, and whatever `also` does, until the flags fulfil a condition; the speeds heard on the way."""
+        heard, deadline = [], time.monotonic() + 30.0
+        while not condition(self.flags()):
+            assert time.monotonic() < deadline
+            now = msg.Header(msg.stamp_of(time.time_ns()))
+            self.joints.write(msg.JointState(now, ["fl", "rl", "fr", "rr"], [0.0] * 4, [0.0] * 4))
+            also()
+            heard += [(each.linear.x, each.angular.z) for each in self.speeds.take(100)]
+        return heard
+
+
+@pytest.fixture
+def over_dds(tmp_path):
+    made = OverDds(tmp_path, "/button")
+    yield made
+    made.end()
+
+
+def test_over_dds_a_base_is_found_and_driven_until_another_node_speaks(over_dds):
+    over_dds.until(lambda flags: flags & wire.HEARD and flags & wire.ODOMETRY and not flags & wire.OTHERS)
+    over_dds.send(wire.enable(True))
+    over_dds.until(lambda flags: flags & wire.DRIVING)
+    heard = over_dds.until(
+        lambda flags: (0.25, -0.5) in [(one.linear.x, one.angular.z) for one in over_dds.speeds.take(10)],
+        lambda: over_dds.send(wire.speeds(0.25, -0.5)),
+    )
+    assert set(heard) <= {(0.25, -0.5), (0.0, 0.0)}
+    other = DataWriter(over_dds.participant, Topic(over_dds.participant, "rt/cmd_vel", msg.Twist))
+    over_dds.until(lambda flags: flags & wire.OTHERS, lambda: other.write(msg.Twist()))
+
+
+def test_over_dds_the_button_and_the_daemons_end_stop_the_base(over_dds):
+    over_dds.until(lambda flags: flags & wire.HEARD and flags & wire.ODOMETRY)
+    button = DataWriter(over_dds.participant, Topic(over_dds.participant, "rt/button", msg.Bool), RELIABLE)
+    over_dds.send(wire.enable(True), wire.speeds(0.25, 0.0))
+    over_dds.until(lambda flags: flags & wire.BUTTON and not flags & wire.DRIVING, lambda: button.write(msg.Bool(True)))
+    over_dds.until(lambda flags: not flags & wire.BUTTON, lambda: button.write(msg.Bool(False)))
+    over_dds.send(wire.enable(True))
+    over_dds.until(lambda flags: flags & wire.DRIVING)
+    watcher = connected(over_dds.clients._path)
+    over_dds.daemon.close()
+    over_dds.daemon = watcher
+    over_dds.until(lambda flags: not flags & (wire.DRIVING | wire.FELL_SILENT))
 
 
 def refused(tmp_path, old, new, words):

@@ -1,16 +1,19 @@
 """Poses and speeds from ROS: what is passed on to the daemon, and what is refused for which reason."""
 
 import math
+import os
 import random
 import threading
+import time
 
 import pytest
 
 pytest.importorskip("cyclonedds", reason="cyclonedds is not installed: make venv")
 
 from disco_hw.bridge import ros2_messages as msg
+from disco_hw.bridge.ros2 import Bridge
 from disco_hw.bridge.ros2_commands import Errands, SpeedInlet, refusal
-from disco_hw.bridge.ros2_poses import PoseInlet
+from disco_hw.bridge.ros2_poses import PoseInlet, TransformInlet
 from disco_hw.config import Drive, PoseInput, Robot
 from disco_hw.config.robot import Ros2
 from disco_hw.drive.hand_pilot import Deadman
@@ -18,9 +21,12 @@ from disco_hw.drive.keyboard import wheel_speeds
 from disco_hw.drive.page_source import PageSource, steering_from
 from disco_hw.drive.source import RobotView
 from disco_hw.estimation.odometry import OdometryParameters
+from disco_hw.runtime.robot_setup import load_setup
 from disco_hw.runtime.states import State
 from disco_hw.runtime.supervisor import UserRequest
+from drivers.pose.ros2 import make_pose_source
 from drivers.pose.udp import pose_of
+from tests.first_use.miswired import robot_file
 
 MONO_NS, WALL_NS = 50_000_000_000, 1_800_000_000_000_000_000
 MS = 1_000_000
@@ -269,3 +275,120 @@ def test_stopping_is_taken_from_whoever_asks(words):
 def test_what_lets_the_robot_move_is_taken_only_where_robot_toml_says_so(words):
     assert "ros2.may_move = true" in str(refusal(words, Ros2().may_move))
     assert refusal(words, True) is None
+
+
+class TestTransforms:
+    """map - odom by a localisation, odom - base_footprint by the wheels, base_footprint - base_link fixed."""
+
+    @pytest.fixture
+    def inlet(self):
+        inlet = TransformInlet(PoseInput(position_std_m=0.03, yaw_std_rad=0.04), "base_link")
+        assert not self.heard(inlet, 0, "base_footprint", "base_link", (0.1, 0.0, 0.0), static=True)
+        return inlet
+
+    def heard(self, inlet, at_ms, parent, child, place, static=False, now_ms=None):
+        """The poses that a transform at a time brings."""
+        turned = msg.Quaternion(0.0, 0.0, math.sin(place[2] / 2), math.cos(place[2] / 2))
+        header = msg.Header(msg.stamp_of(WALL_NS + at_ms * MS), parent)
+        one = msg.TransformStamped(header, child, msg.Transform(msg.Vector3(place[0], place[1], 0.0), turned))
+        now_ns = WALL_NS + (at_ms if now_ms is None else now_ms) * MS
+        return list(inlet.poses(msg.TFMessage([one]), now_ns, now_ns, static=static))
+
+    @staticmethod
+    def place(pose):
+        turned = pose.pose.pose.orientation
+        at = pose.pose.pose.position
+        return at.x, at.y, 2.0 * math.atan2(turned.z, turned.w)
+
+    def test_the_chain_is_followed_at_the_corrections_own_time(self, inlet):
+        self.heard(inlet, 0, "odom", "base_footprint", (1.0, 0.0, 0.0))
+        self.heard(inlet, 100, "odom", "/base_footprint", (2.0, 0.0, 0.2))
+        (pose,) = self.heard(inlet, 50, "map", "odom", (10.0, 5.0, math.pi / 2), now_ms=100)
+        assert msg.time_of(pose.header.stamp) == WALL_NS + 50 * MS
+        assert pose.header.frame_id == "map"
+        # Half way: 1.5 m and 0.1 rad in odom, and 0.1 m further to base_link.
+        x, y = 1.5 + 0.1 * math.cos(0.1), 0.1 * math.sin(0.1)
+        assert self.place(pose) == pytest.approx((10.0 - y, 5.0 + x, math.pi / 2 + 0.1))
+        assert pose.pose.covariance[0] == pytest.approx(0.03**2)
+        assert pose.pose.covariance[35] == pytest.approx(0.04**2)
+
+    def test_a_correction_dated_ahead_counts_from_the_newest_odometry_and_reaches_the_daemon(self, inlet):
+        self.heard(inlet, 0, "odom", "base_footprint", (1.0, 0.0, 0.0))
+        (pose,) = self.heard(inlet, 1000, "map", "odom", (1.0, 0.0, 0.0), now_ms=10)
+        assert msg.time_of(pose.header.stamp) == WALL_NS
+        datagram = PoseInlet(PoseInput()).datagram(pose, 0, MONO_NS, WALL_NS + 10 * MS)
+        passed = pose_of(datagram, MONO_NS)
+        assert (passed.t_ns, passed.x_m) == (MONO_NS - 10 * MS, pytest.approx(2.1))
+
+    def test_the_wheels_alone_bring_none(self, inlet):
+        self.heard(inlet, 0, "odom", "base_footprint", (1.0, 0.0, 0.0))
+        self.heard(inlet, 10, "map", "odom", (1.0, 0.0, 0.0))
+        assert not self.heard(inlet, 20, "odom", "base_footprint", (1.1, 0.0, 0.0))
+
+    def test_a_correction_that_repeats_itself_brings_two_a_second_and_weaker_ones(self, inlet):
+        poses = []
+        for at_ms in range(0, 3000, 20):
+            self.heard(inlet, at_ms, "odom", "base_footprint", (1.0, 0.0, 0.0))
+            poses += self.heard(inlet, at_ms + 5, "map", "odom", (1.0 if at_ms < 2000 else 2.0, 0.0, 0.0))
+        assert [round(math.sqrt(pose.pose.covariance[0]) / 0.03) for pose in poses] == [1, 3, 3, 3, 1, 3]
+
+    def test_a_single_edge_that_moves_brings_each(self):
+        inlet = TransformInlet(PoseInput(), "base_link")
+        poses = [self.heard(inlet, 20 * k, "map", "base_link", (1.0, 0.0, 0.0)) for k in range(5)]
+        assert [len(each) for each in poses] == [1] * 5
+
+    def test_static_transforms_alone_are_no_pose(self):
+        inlet = TransformInlet(PoseInput(), "base_link")
+        assert not self.heard(inlet, 0, "map", "base_link", (1.0, 0.0, 0.0), static=True)
+
+    @pytest.mark.parametrize(
+        ("at_ms", "place", "reason"),
+        [(100, (math.nan, 0.0, 0.0), "not finite"), (-500, (0.0, 0.0, 0.0), "do not reach")],
+    )
+    def test_transforms_that_make_no_pose_are_counted_by_reason(self, inlet, at_ms, place, reason):
+        self.heard(inlet, 0, "odom", "base_footprint", (1.0, 0.0, 0.0))
+        before = sum(inlet.refused.values())
+        assert not self.heard(inlet, at_ms, "map", "odom", place)
+        assert sum(inlet.refused.values()) == before + 1
+        assert reason in list(inlet.refused)[-1]
+
+    def test_a_missing_chain_and_a_circle_are_named_and_a_flood_of_frames_is_bounded(self, inlet):
+        assert not self.heard(inlet, 0, "odom", "base_footprint", (1.0, 0.0, 0.0))
+        assert not self.heard(inlet, 0, "base_link", "odom", (1.0, 0.0, 0.0))
+        assert any('without a chain from "map" to "base_link"' in why for why in inlet.refused)
+        for number in range(1000):
+            self.heard(inlet, 0, "map", f"frame{number}", (0.0, 0.0, 0.0))
+        assert inlet.refused["transforms of too many frames"] > 400
+
+    def test_a_clock_that_was_set_back_begins_anew(self, inlet):
+        self.heard(inlet, 60_000, "odom", "base_footprint", (1.0, 0.0, 0.0))
+        self.heard(inlet, 60_000, "map", "odom", (1.0, 0.0, 0.0))
+        self.heard(inlet, 0, "odom", "base_footprint", (1.0, 0.0, 0.0))
+        assert self.heard(inlet, 0, "map", "odom", (3.0, 0.0, 0.0))
+
+
+def test_over_dds_the_bridges_own_odometry_and_a_localisation_make_poses_for_the_daemon(tmp_path):
+    file = robot_file(tmp_path)
+    port = 5300 + os.getpid() % 200
+    text = file.read_text(encoding="utf-8").split("[pose]")[0]
+    text += f'[pose]\nsource = "ros2"\ntopic = "tf"\nport = {port}\n[ros2]\ndomain = {12 + os.getpid() % 20 * 3}\n'
+    file.write_text(f'{text}[daemon]\ncontrol_socket = "{tmp_path / "control"}"\n', encoding="utf-8")
+    daemon, bridge, ended = make_pose_source(port=port), Bridge(load_setup(file)), []
+    thread = threading.Thread(target=bridge.run, args=(lambda: bool(ended),))
+    thread.start()
+    heard, deadline = [], time.monotonic() + 30.0
+    while not heard and time.monotonic() < deadline:
+        now_ns = time.time_ns()
+        for parent, child, x, ahead_ns in (("odom", "base_link", 2.0, 0), ("map", "odom", 3.0, 200 * MS)):
+            place = msg.Transform(
+                msg.Vector3(x + 1e-12 * (now_ns % 1000), 0.0, 0.0), msg.Quaternion(0.0, 0.0, 0.0, 1.0)
+            )
+            header = msg.Header(msg.stamp_of(now_ns + ahead_ns), parent)
+            bridge._say("/tf", msg.TFMessage([msg.TransformStamped(header, child, place)]))
+        heard = daemon.receive(time.monotonic_ns(), ())
+        time.sleep(0.01)
+    ended.append(True)
+    thread.join()
+    bridge.close()
+    daemon.close()
+    assert heard[0].x_m == pytest.approx(5.0)

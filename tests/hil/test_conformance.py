@@ -47,7 +47,14 @@ def test_the_virtual_robot_conforms(tmp_path, link, key, chosen, least):
             assert (code, found) == (0, {"passed": 1, "skipped": 1}), output
 
 
-@pytest.mark.parametrize("device", [*DEVICES, "vesc over a serial line"])
+@pytest.mark.parametrize(
+    "device",
+    [
+        *(device for device in DEVICES if device != "ros2_base"),
+        "vesc over a serial line",
+        pytest.param("ros2_base", marks=pytest.mark.long),
+    ],
+)
 def test_each_vendors_simulated_controller_conforms(tmp_path, device):
     robot_file = write_robot_file(tmp_path, device=device.split()[0])
     if "serial" in device:

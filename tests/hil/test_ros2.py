@@ -150,6 +150,24 @@ def test_it_drives_by_the_poses_of_a_node_that_hears_its_odometry_and_stops_when
 
 
 @pytest.mark.long
+def test_it_drives_by_the_transforms_of_a_localisation_and_stops_when_that_dies(tmp_path, monkeypatch):
+    said, plain = tmp_path / "node.txt", with_poses_of_ros
+
+    def by_transforms(robot_file):
+        text = plain(robot_file).read_text(encoding="utf-8")
+        robot_file.write_text(text.replace('source = "ros2"\n', 'source = "ros2"\ntopic = "tf"\n'), encoding="utf-8")
+        return robot_file
+
+    monkeypatch.setitem(globals(), "with_poses_of_ros", by_transforms)
+    with stack_with_bridge(tmp_path, monkeypatch) as (stack, _), node("tf", said) as process:
+        drive(stack)
+        status = stack.operator.wait_until("a metre further", lambda _: far(said) > 1.0, 30.0)
+        assert status["task"]["distance_m"] < 0.2
+        process.kill()
+        assert_stops(stack)
+
+
+@pytest.mark.long
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
 @pytest.mark.parametrize("whom", ["node", "bridge"])
 def test_speeds_drive_once_asked_to_arm_and_their_silence_disarms_for_good(whom, how, tmp_path):

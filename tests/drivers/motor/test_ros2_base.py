@@ -1,0 +1,113 @@
+"""The driver of bases on ROS 2: what the conformance suite of all vendors does not ask of it."""
+
+import pytest
+
+from drivers.motor import find_driver
+from drivers.motor import ros2_base_wire as wire
+from drivers.types import DriverState, Request, WheelCommand
+from tests.drivers.motor.vendors import VENDORS
+
+(VENDOR,) = [vendor for vendor in VENDORS if vendor.name == "ros2_base"]
+FORWARD = (3.0, 2.0)
+
+
+@pytest.fixture
+def bench():
+    return VENDOR.bench()
+
+
+@pytest.fixture
+def end(bench):
+    """The bridge's end of the link."""
+    bench.run_until(DriverState.STANDBY)
+    return bench.robot.controller.end
+
+
+def test_wheel_speeds_become_those_of_the_body_by_the_nominal_geometry(bench):
+    bench.arm()
+    (sent,) = bench.driver.transmit(bench.now_ns, WheelCommand(10.0, 20.0, 0.1))
+    assert sent.frame == wire.speeds(0.06 * 15.0, 0.06 * 10.0 / 0.31)
+
+
+def test_what_the_base_cannot_do_is_slowed_down_on_the_same_curve(bench):
+    bench.arm()
+    (sent,) = bench.driver.transmit(bench.now_ns, WheelCommand(25.0, 50.0, 0.1))
+    assert sent.frame == wire.speeds(0.06 * 18.75, 0.06 * 12.5 / 0.31)
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [("others_speak", "another node speaks on /cmd_vel"), ("is_heard", "nobody hears /cmd_vel")],
+)
+def test_a_base_that_others_drive_or_that_hears_nobody_is_not_armed_and_disarmed(bench, end, fault, words):
+    setattr(end, fault, fault == "others_speak")
+    bench.run(0.2)
+    bench.driver.request(Request.ARM)
+    assert bench.driver.state is DriverState.STANDBY
+    assert words in bench.driver.detail
+    setattr(end, fault, fault != "others_speak")
+    bench.run(0.2)
+    bench.arm()
+    bench.run(0.5, FORWARD)
+    setattr(end, fault, fault == "others_speak")
+    bench.run(0.2)
+    assert bench.driver.state is DriverState.FAULT
+    assert words in bench.driver.detail
+    assert not end.driving
+
+
+def test_a_bridge_that_was_started_with_other_settings_is_refused(bench, end):
+    end._check_sum ^= 1
+    bench.run(0.2)
+    assert bench.driver.state is DriverState.HANDSHAKE
+    assert "another [link] of robot.toml" in bench.driver.detail
+    bench.driver.request(Request.ARM)
+    bench.run(0.5, FORWARD)
+    assert bench.largest_speed == 0.0
+
+
+def test_why_there_is_no_odometry_is_said(bench, end):
+    bench.robot.controller.joints = False
+    for refusal, words in enumerate(wire.REFUSALS):
+        end.refusal = refusal
+        bench.run(0.2)
+        assert bench.driver.state is DriverState.HANDSHAKE
+        assert bench.driver.detail == f"no odometry from /odom: {words}"
+
+
+def test_a_fault_stays_until_it_is_reset_although_its_cause_has_gone(bench, end):
+    bench.arm()
+    bench.robot.controller.joints = False
+    bench.run(0.5, FORWARD)
+    bench.robot.controller.joints = True
+    bench.run(1.0, FORWARD)
+    assert bench.driver.state is DriverState.FAULT
+    bench.driver.request(Request.RESET)
+    bench.run_until(DriverState.STANDBY)
+
+
+def test_after_a_pause_longer_than_the_bridge_waits_nothing_is_sent_that_moves(bench):
+    bench.arm()
+    bench.run(0.5, FORWARD)
+    sent = bench.driver.transmit(bench.now_ns + 220_000_000, WheelCommand(*FORWARD, 0.1))
+    assert bench.driver.state is DriverState.FAULT
+    assert not [one for one in sent if one.frame.can_id == wire.SPEEDS]
+
+
+def test_a_restart_of_the_base_alone_is_seen_by_its_angles(bench, end):
+    bench.arm()
+    bench.run(1.0, FORWARD)
+    bench.robot.controller._zero_ticks = (-50_000, 50_000)
+    bench.run(0.1, FORWARD)
+    assert bench.driver.state is DriverState.FAULT
+    assert "angles jumped" in bench.driver.detail
+    assert bench.driver.stats.implausible_ticks == 1
+
+
+def test_the_safety_card_says_who_stops_the_base_and_that_its_time_out_is_only_declared():
+    driver = find_driver("ros2_base")
+    card = driver.safety_card(VENDOR.settings)
+    assert card.reaction_s == pytest.approx(wire.DEADMAN_S + 0.5)
+    assert "only the base's own time-out of 0.5 s" in card.host_silent
+    assert any("declared" in words for words in card.unverified)
+    assert any("Odometry" in words for words in card.unverified), "without joints"
