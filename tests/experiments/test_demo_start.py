@@ -1,8 +1,13 @@
 """The demonstration begins in the heading in which the robot goes round, so that it does not swing off its circle."""
 
 import math
+from types import SimpleNamespace
 
+import pytest
+
+from disco_hw.errors import WorkError
 from disco_hw.experiments.demo import start_pose
+from disco_hw.experiments.live_stack import Operator
 from disco_hw.runtime.robot_setup import load_setup
 from disco_hw.runtime.supervisor import UserRequest
 from sim.body_dynamics import BodyPose
@@ -24,3 +29,21 @@ def test_the_robot_keeps_to_its_circle_from_the_start():
         off_m.append(abs(math.hypot(stack.robot.truth.x_m, stack.robot.truth.y_m) - 0.75))
     assert stack.core.progress.laps > 0.2
     assert max(off_m) < 0.03
+
+
+class Compiling:
+    """A daemon that compiles for so many looks at it, and then says nothing."""
+
+    def __init__(self, looks):
+        self.name, self.process, self.looks = "daemon", SimpleNamespace(poll=lambda: None), looks
+
+    def last_words(self):
+        self.looks -= 1
+        return "compiling: 7 functions, 3 s" if self.looks > 0 else "waiting"
+
+
+def test_the_time_in_which_a_first_start_compiles_does_not_count(tmp_path):
+    daemon = Compiling(looks=20)
+    with pytest.raises(WorkError, match=r"not READY within 0.2 s \(compiling: 7 functions, 3 s\)"):
+        Operator(tmp_path / "none", (daemon,)).wait_for("READY", 0.2)
+    assert daemon.looks <= 0
