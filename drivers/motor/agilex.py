@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from drivers.motor import agilex_codec as codec
+from drivers.motor import agilex_protocol as protocol
 from drivers.motor import vendor_parts as parts
-from drivers.motor.agilex_settings import (
+from drivers.motor.agilex_protocol import (
     EXAMPLE,
     TIMEOUT_S,
     AgilexSettings,
@@ -50,8 +50,8 @@ _MODE_SEEN_NS = 400_000_000
 _REPEAT_NS = 100_000_000
 _WARNINGS = 0x0606
 """Bits of the error word that only warn, in the SDK's byte and in the manual's: battery low, remote control lost."""
-_MODES = {codec.STANDBY: "standby", codec.UART_MODE: "serial mode", codec.RC_MODE: "remote control"}
-_HOST_COMMANDS = frozenset({codec.MOTION_COMMAND, codec.CONTROL_MODE, codec.STATE_RESET, codec.BRAKE})
+_MODES = {protocol.STANDBY: "standby", protocol.UART_MODE: "serial mode", protocol.RC_MODE: "remote control"}
+_HOST_COMMANDS = frozenset({protocol.MOTION_COMMAND, protocol.CONTROL_MODE, protocol.STATE_RESET, protocol.BRAKE})
 
 
 class AgilexDriver:
@@ -88,7 +88,7 @@ class AgilexDriver:
         """Where the driver is with its base."""
         if not self._link_is_up:
             return DriverState.DISCONNECTED
-        if self._estopped or self._vehicle == codec.EMERGENCY_STOP:
+        if self._estopped or self._vehicle == protocol.EMERGENCY_STOP:
             return DriverState.ESTOP
         if self._state_ns is None or self._motion_ns is None or self._odometry is None:
             return DriverState.HANDSHAKE
@@ -96,7 +96,7 @@ class AgilexDriver:
             return DriverState.FAULT
         if self._stage is Stage.ARMED:
             return DriverState.ARMED
-        if self._stage is Stage.STOPPING or (self._stage is Stage.REST and self._mode == codec.CAN_MODE):
+        if self._stage is Stage.STOPPING or (self._stage is Stage.REST and self._mode == protocol.CAN_MODE):
             return DriverState.STOPPING
         rest = {Request.ARM: DriverState.ARMING, Request.READY: DriverState.READY}
         return rest.get(self._wanted, DriverState.STANDBY)
@@ -110,13 +110,13 @@ class AgilexDriver:
             case DriverState.HANDSHAKE:
                 return "no answer from the base; is it switched on, and the bus at 500 kbit/s?"
             case DriverState.ESTOP:
-                pressed = self._vehicle == codec.EMERGENCY_STOP
+                pressed = self._vehicle == protocol.EMERGENCY_STOP
                 return "a button on the base is pressed" if pressed else "emergency stop; remove its cause, then reset"
             case DriverState.FAULT:
                 return f"{self._fault or self._fault_words}; remove the cause, then reset"
             case DriverState.ARMED:
                 return "armed"
-            case DriverState.STANDBY | DriverState.READY if self._mode == codec.RC_MODE:
+            case DriverState.STANDBY | DriverState.READY if self._mode == protocol.RC_MODE:
                 return "a person drives it by remote control; switch that off to drive it from here"
         return self._note
 
@@ -154,7 +154,7 @@ class AgilexDriver:
         if request is self._wanted:
             return
         if request is Request.ARM:
-            if self.state not in (DriverState.STANDBY, DriverState.READY) or self._mode == codec.RC_MODE:
+            if self.state not in (DriverState.STANDBY, DriverState.READY) or self._mode == protocol.RC_MODE:
                 self._note = f"not arming: {self.detail}"
                 return
             self.stats = replace(self.stats, sessions=self.stats.sessions + 1)
@@ -172,9 +172,9 @@ class AgilexDriver:
             if not received.frame.extended and received.frame.can_id in _HOST_COMMANDS:
                 self._take_foreign(received.frame)
                 continue
-            decoded = codec.decode(received.frame)
+            decoded = protocol.decode(received.frame)
             if decoded is None:
-                known = received.frame.can_id in codec.LAYOUTS and not received.frame.extended
+                known = received.frame.can_id in protocol.LAYOUTS and not received.frame.extended
                 self._count("rejected_length" if known else "unknown_id")
                 continue
             self._count("frames_accepted")
@@ -229,7 +229,7 @@ class AgilexDriver:
 
     @property
     def _is_faulty(self) -> bool:
-        return self._vehicle == codec.EXCEPTION or bool(self._error & ~_WARNINGS)
+        return self._vehicle == protocol.EXCEPTION or bool(self._error & ~_WARNINGS)
 
     @property
     def _fault_words(self) -> str:
@@ -238,15 +238,15 @@ class AgilexDriver:
     def _rest(self, now_ns: int) -> tuple[OutgoingFrame, ...]:
         """Bring a base that listens to CAN to standby, standing; clear errors when asked."""
         if self._wanted is Request.RESET:
-            if self._state_ns is not None and not self._is_faulty and self._vehicle == codec.NORMAL:
-                if self._fault is None or self._mode != codec.CAN_MODE:
+            if self._state_ns is not None and not self._is_faulty and self._vehicle == protocol.NORMAL:
+                if self._fault is None or self._mode != protocol.CAN_MODE:
                     self._fault, self._estopped = None, False
                     self._wanted, self._note = Request.STANDBY, "it stands by"
                     return ()
             elif now_ns - self._repeat_ns >= _REPEAT_NS:
                 self._repeat_ns = now_ns
-                return parts.outgoing(now_ns, codec.clear_errors())
-        if self._mode == codec.CAN_MODE and now_ns - self._repeat_ns >= _REPEAT_NS:
+                return parts.outgoing(now_ns, protocol.clear_errors())
+        if self._mode == protocol.CAN_MODE and now_ns - self._repeat_ns >= _REPEAT_NS:
             self._repeat_ns = now_ns
             return parts.outgoing(now_ns, *stop_frames(self._settings))
         return ()
@@ -260,12 +260,12 @@ class AgilexDriver:
             self._give_up("not armed: the base did not take its CAN mode; switch the remote control off")
             return ()
         self._last_sent_ns = now_ns
-        if self._mode != codec.CAN_MODE:
-            return parts.outgoing(now_ns, codec.control_mode(codec.CAN_MODE))
+        if self._mode != protocol.CAN_MODE:
+            return parts.outgoing(now_ns, protocol.control_mode(protocol.CAN_MODE))
         self._zeros += 1
         if self._zeros > ZEROS_TO_ARM:
             self._stage, self._note = Stage.ARMED, "armed"
-        return parts.outgoing(now_ns, codec.motion(0.0, 0.0))
+        return parts.outgoing(now_ns, protocol.motion(0.0, 0.0))
 
     def _ramp(self, now_ns: int) -> tuple[OutgoingFrame, ...]:
         """Slow down with the declared deceleration, stand, then leave the CAN mode."""
@@ -277,7 +277,7 @@ class AgilexDriver:
         if self._stands or now_ns - self._stage_ns > STOPPING_NS:
             self._stage, self._repeat_ns = Stage.REST, now_ns
             return parts.outgoing(now_ns, *stop_frames(self._settings))
-        return parts.outgoing(now_ns, codec.motion(0.0, 0.0))
+        return parts.outgoing(now_ns, protocol.motion(0.0, 0.0))
 
     def _motion(self, speeds: tuple[float, float]) -> Frame:
         """Of wheel speeds, by the nominal geometry; both scaled down where the base can do less."""
@@ -285,23 +285,23 @@ class AgilexDriver:
         radius = self._settings.wheel_radius_m
         scale = min(1.0, self._settings.max_speed_m_s / max(radius * max(abs(left), abs(right)), 1e-9))
         linear = scale * radius * (left + right) / 2.0
-        return codec.motion(linear, scale * radius * (right - left) / self._settings.track_m)
+        return protocol.motion(linear, scale * radius * (right - left) / self._settings.track_m)
 
-    def _take_state(self, decoded: codec.Decoded, t_ns: int) -> None:
+    def _take_state(self, decoded: protocol.Decoded, t_ns: int) -> None:
         values = decoded.values
         self._vehicle, self._mode = int(values["vehicle_state"]), int(values["control_mode"])
         self._error, self._state_ns = int(values["error_code"]), t_ns
         if self._stage in (Stage.REST, Stage.STOPPING):
             return
-        if self._vehicle == codec.EMERGENCY_STOP:
+        if self._vehicle == protocol.EMERGENCY_STOP:
             self._lose("a button on the base was pressed")
         elif self._is_faulty:
             self._lose(self._fault_words)
-        elif self._stage is Stage.ARMED and self._mode == codec.RC_MODE:
+        elif self._stage is Stage.ARMED and self._mode == protocol.RC_MODE:
             # A person has taken over, which is no fault.
             self._give_up("disarmed: a person has taken the remote control")
             self._events.append("disarmed: a person has taken the remote control")
-        elif self._stage is Stage.ARMED and self._mode != codec.CAN_MODE:
+        elif self._stage is Stage.ARMED and self._mode != protocol.CAN_MODE:
             self._lose(f"the base left its CAN mode by itself, for {_MODES.get(self._mode, self._mode)}")
 
     def _take_odometry(self, left_mm: int, right_mm: int, t_ns: int) -> None:
@@ -327,7 +327,7 @@ class AgilexDriver:
     def _take_foreign(self, frame: Frame) -> None:
         self._count("unknown_id")
         is_stop = frame in stop_frames(self._settings)
-        if is_stop and frame.can_id == codec.CONTROL_MODE:
+        if is_stop and frame.can_id == protocol.CONTROL_MODE:
             if self._stage is not Stage.REST:
                 self._events.append("stopped from outside on the link, by `disco-hw estop` or another host")
             self._wanted, self._stage, self._estopped = Request.STANDBY, Stage.REST, True
@@ -356,8 +356,8 @@ class AgilexDriver:
 
     def _status(self, t_ns: int) -> RobotStatus:
         names = {DriverState.ARMED: "ARMED", DriverState.FAULT: "FAULT", DriverState.STOPPING: "STOPPING"}
-        at_rest = self._stands and self._mode != codec.CAN_MODE
-        names[DriverState.ESTOP] = "ESTOP" if at_rest or self._vehicle == codec.EMERGENCY_STOP else "STOPPING"
+        at_rest = self._stands and self._mode != protocol.CAN_MODE
+        names[DriverState.ESTOP] = "ESTOP" if at_rest or self._vehicle == protocol.EMERGENCY_STOP else "STOPPING"
         return parts.status(t_ns, names.get(self.state, "STANDBY"))
 
     def _give_up(self, why: str) -> None:
@@ -376,7 +376,7 @@ class AgilexDriver:
         self._wanted, self._stage, self._stage_ns = Request.STANDBY, Stage.REST, None
         self._fault, self._foreign, self._repeat_ns = None, False, 0
         self._state_ns = self._motion_ns = self._odometry = None
-        self._vehicle, self._mode, self._error, self._stands = codec.NORMAL, codec.STANDBY, 0, True
+        self._vehicle, self._mode, self._error, self._stands = protocol.NORMAL, protocol.STANDBY, 0, True
 
     def _count(self, name: str) -> None:
         self.stats = replace(self.stats, **{name: getattr(self.stats, name) + 1})

@@ -11,13 +11,14 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from drivers.motor import odrive_codec as codec
+from drivers.motor import odrive_protocol as protocol
 from drivers.motor import vendor_parts as parts
-from drivers.motor.odrive_codec import AxisState, Generation
-from drivers.motor.odrive_settings import (
+from drivers.motor.odrive_protocol import (
     ESTOP_ERROR,
     EXAMPLE,
     WATCHDOG_ERROR,
+    AxisState,
+    Generation,
     OdriveSettings,
     cyclic_frames,
     error_words,
@@ -205,7 +206,7 @@ class OdriveDriver:
             if self._take_parameter(received.frame):
                 self._count("frames_accepted")
                 continue
-            decoded = codec.decode(self._generation, received.frame)
+            decoded = protocol.decode(self._generation, received.frame)
             if decoded is None and self._generation is Generation.V05:
                 decoded = self._answer_of_another_generation(received.frame)
             if decoded is None or decoded.node not in self._by_node:
@@ -283,8 +284,8 @@ class OdriveDriver:
         if now_ns - self._asked_ns < _ALIVE_PERIOD_NS:
             return ()
         self._asked_ns = now_ns
-        asked = codec.TELEMETRY[self._generation]["Get_Bus_Voltage_Current"].command
-        return parts.outgoing(now_ns, *(codec.ask(axis.node, asked) for axis in self._all))
+        asked = protocol.TELEMETRY[self._generation]["Get_Bus_Voltage_Current"].command
+        return parts.outgoing(now_ns, *(protocol.ask(axis.node, asked) for axis in self._all))
 
     def _ask_version(self, now_ns: int) -> tuple[OutgoingFrame, ...]:
         if any(axis.heard_ns is None for axis in self._all) or now_ns - self._asked_ns < _VERSION_PERIOD_NS:
@@ -292,7 +293,7 @@ class OdriveDriver:
         self._asked_ns = now_ns
         self._asked_version += 1
         if self._asked_version <= VERSION_TRIES:
-            return parts.outgoing(now_ns, *(codec.ask(axis.node, codec.GET_VERSION) for axis in self._all))
+            return parts.outgoing(now_ns, *(protocol.ask(axis.node, protocol.GET_VERSION) for axis in self._all))
         if self._generation is Generation.V05:
             # That generation does not know the question.
             self._introduce()
@@ -311,16 +312,18 @@ class OdriveDriver:
         if self._asked_watchdog > WATCHDOG_TRIES:
             self._refusal = f"node {waiting[0]} does not tell its watchdog; correct link.watchdog_endpoints"
             return ()
-        return parts.outgoing(now_ns, *(codec.read_parameter(node, number) for node in waiting for number in endpoints))
+        return parts.outgoing(
+            now_ns, *(protocol.read_parameter(node, number) for node in waiting for number in endpoints)
+        )
 
     def _take_parameter(self, frame: Frame) -> bool:
         """Whether the frame answers for a watchdog, which is then judged."""
-        axis = self._by_node.get(codec.split(frame.can_id)[0])
+        axis = self._by_node.get(protocol.split(frame.can_id)[0])
         if axis is None or self._settings.watchdog_endpoints is None or not self._introduced:
             return False
         enabled, timeout = self._settings.watchdog_endpoints
-        is_on = codec.parameter(frame, axis.node, enabled, "bool")
-        timeout_s = codec.parameter(frame, axis.node, timeout, "f32")
+        is_on = protocol.parameter(frame, axis.node, enabled, "bool")
+        timeout_s = protocol.parameter(frame, axis.node, timeout, "f32")
         if is_on is None and timeout_s is None:
             return False
         axis.watchdog_on = axis.watchdog_on if is_on is None else bool(is_on)
@@ -360,7 +363,7 @@ class OdriveDriver:
             return parts.outgoing(now_ns, *self._clear_frames())
         if step <= 1:
             self._arm_step = 2
-            mode = {"control_mode": codec.VELOCITY_CONTROL, "input_mode": codec.PASSTHROUGH}
+            mode = {"control_mode": protocol.VELOCITY_CONTROL, "input_mode": protocol.PASSTHROUGH}
             return parts.outgoing(now_ns, *self._each("Set_Controller_Mode", **mode))
         if step == 3:
             for axis in self._all:
@@ -386,13 +389,13 @@ class OdriveDriver:
             # Adding zero takes the sign off a zero.
             turns = min(max(turns, -limit), limit) + 0.0
             frames += [
-                codec.encode(self._generation, axis.node, "Set_Input_Vel", vel_turns_s=turns, torque_nm=0.0)
+                protocol.encode(self._generation, axis.node, "Set_Input_Vel", vel_turns_s=turns, torque_nm=0.0)
                 for axis in side
             ]
         return frames
 
     def _each(self, name: str, **values: int) -> list[Frame]:
-        return [codec.encode(self._generation, axis.node, name, **values) for axis in self._all]
+        return [protocol.encode(self._generation, axis.node, name, **values) for axis in self._all]
 
     def _state_frames(self, state: AxisState) -> list[Frame]:
         return self._each("Set_Axis_State", state=int(state))
@@ -419,9 +422,9 @@ class OdriveDriver:
         elif self._stage is Stage.STOPPING and axis.error:
             self._lose(f"node {axis.node}: {self._words(axis)}")
 
-    def _answer_of_another_generation(self, frame: Frame) -> codec.Decoded | None:
+    def _answer_of_another_generation(self, frame: Frame) -> protocol.Decoded | None:
         """What 0.5 never sends: an answer for the version."""
-        decoded = codec.decode(Generation.V06, frame)
+        decoded = protocol.decode(Generation.V06, frame)
         return decoded if decoded is not None and decoded.name == "Get_Version" else None
 
     def _take_version(self, values: Mapping[str, float]) -> None:
@@ -484,7 +487,7 @@ class OdriveDriver:
                 return
 
     def _count_unused(self, frame: Frame) -> None:
-        node, command = codec.split(frame.can_id)
+        node, command = protocol.split(frame.can_id)
         ours = not frame.extended and node in self._by_node
         if ours and command in _HOST_COMMANDS and frame.data:
             self._count("unknown_id")

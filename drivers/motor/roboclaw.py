@@ -10,9 +10,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-from drivers.motor import roboclaw_codec as codec
+from drivers.motor import roboclaw_protocol as protocol
 from drivers.motor import vendor_parts as parts
-from drivers.motor.roboclaw_settings import (
+from drivers.motor.roboclaw_protocol import (
     EXAMPLE,
     RoboclawExchange,
     RoboclawSettings,
@@ -70,7 +70,7 @@ _WORDS = {
     0x4000: "the main supply's voltage is too low",
     0x8000: "the main supply's voltage is too high",
 }
-_SETTER_NAMES = {layout.command: name for name, layout in codec.SETTERS.items()}
+_SETTER_NAMES = {layout.command: name for name, layout in protocol.SETTERS.items()}
 _TO_KNOW = ("version", "velocity_pid_m1", "velocity_pid_m2", "status", "serial_timeout", "speeds", "encoders")
 
 
@@ -83,7 +83,7 @@ class _Board:
     """
 
     address: int
-    known: dict[str, Mapping[str, codec.Value]] = field(default_factory=dict)
+    known: dict[str, Mapping[str, protocol.Value]] = field(default_factory=dict)
     counts: list[float] = field(default_factory=lambda: [0.0, 0.0])
     counts_ns: int = 0
     is_new: bool = False
@@ -237,11 +237,11 @@ class RoboclawDriver:
             if board is None or received.frame.extended:
                 self._count("unknown_id")
                 continue
-            name = codec.getter_name(command)
+            name = protocol.getter_name(command)
             if name is None:
                 self._take_acknowledgement(board, received.frame, received.t_ns)
                 continue
-            read = codec.reply(address, name, received.frame.data)
+            read = protocol.reply(address, name, received.frame.data)
             if read is None:
                 self._count("rejected_crc")
                 continue
@@ -423,7 +423,7 @@ class RoboclawDriver:
 
     def _take_acknowledgement(self, board: _Board, frame: Frame, t_ns: int) -> None:
         name = _SETTER_NAMES.get(frame.can_id & 0xFF)
-        if name is None or frame.data != codec.ACKNOWLEDGE:
+        if name is None or frame.data != protocol.ACKNOWLEDGE:
             self._count("unknown_id")
             return
         self._heard(board)
@@ -434,7 +434,7 @@ class RoboclawDriver:
             board.refuses_ns = None
             board.zeros += 1
 
-    def _take_counts(self, board: _Board, read: Mapping[str, codec.Value], t_ns: int) -> None:
+    def _take_counts(self, board: _Board, read: Mapping[str, protocol.Value], t_ns: int) -> None:
         before = board.known.get("encoders")
         if before is not None and board.is_known:
             fastest = 1.5 * board.fastest_counts_s * (t_ns - board.counts_ns) * 1e-9 + 100.0

@@ -11,7 +11,7 @@ import struct
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from drivers.motor.agilex_settings import AgilexSettings
+from drivers.motor.agilex_protocol import AgilexSettings
 from firmware_protocol.firmware_core import FirmwareInputs
 from sim.can_frame import CanFrame
 

@@ -13,7 +13,7 @@ import struct
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
-from drivers.motor.odrive_settings import OdriveSettings
+from drivers.motor.odrive_protocol import OdriveSettings
 from firmware_protocol.firmware_core import FirmwareInputs
 from sim.can_frame import CanFrame
 

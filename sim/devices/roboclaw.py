@@ -13,7 +13,7 @@ import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from drivers.motor.roboclaw_settings import RoboclawSettings
+from drivers.motor.roboclaw_protocol import RoboclawSettings
 from firmware_protocol.firmware_core import FirmwareInputs
 from sim.can_frame import CanFrame
 

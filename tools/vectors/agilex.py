@@ -6,7 +6,7 @@ import struct
 from collections.abc import Mapping
 from typing import Any
 
-from drivers.motor import agilex_codec as codec
+from drivers.motor import agilex_protocol as protocol
 from drivers.types import Frame
 from sim.devices.agilex import AgilexBase
 from tools.vectors.comparison import Case, Comparison, of_driver, on_bus
@@ -14,7 +14,7 @@ from tools.vectors.comparison import Case, Comparison, of_driver, on_bus
 _SWITCH = {1: "middle", 2: "up", 3: "down"}
 _STEP = 1
 _F32_STEP = 2.0**-24
-_COUNTED = (codec.SYSTEM_STATE, codec.LIGHT_STATE, codec.RC_STATE)
+_COUNTED = (protocol.SYSTEM_STATE, protocol.LIGHT_STATE, protocol.RC_STATE)
 
 
 def check(case: Case) -> Comparison:
@@ -28,13 +28,13 @@ def check(case: Case) -> Comparison:
             _check_telemetry(found, case["frames"][0], then)
         case "malformed", "short":
             frame = of_driver(case["frames"][0])
-            found.same("a short frame", codec.decode(frame), None)
+            found.same("a short frame", protocol.decode(frame), None)
             _check_meaning(found, Frame(frame.can_id, frame.data.ljust(8, b"\0")), then)
         case "malformed", "unknown_state":
             _check_telemetry(found, case["frames"][0], then)
         case "malformed", _:
             on_wire = on_bus(case["frames"][0])
-            decoded = None if on_wire.remote else codec.decode(of_driver(case["frames"][0]))
+            decoded = None if on_wire.remote else protocol.decode(of_driver(case["frames"][0]))
             found.same("known", decoded is not None, then["known"])
             base = AgilexBase(control_mode=1)
             found.same("taken", (base.receive(on_wire), base.obeyed), ([], []))
@@ -49,27 +49,27 @@ def _check_command(found: Comparison, case: Case) -> None:
     base = AgilexBase(control_mode=1)
     base.receive(on_bus(frame))
     arguments: tuple[int, ...] = (data[0],)
-    if can_id == codec.MOTION_COMMAND:
+    if can_id == protocol.MOTION_COMMAND:
         arguments = struct.unpack(">hhhh", data)
         found.same("their steps", arguments, tuple(then["raw_i16"]))
-        ours = struct.unpack(">hhhh", codec.motion(given["linear_m_s"], given["angular_rad_s"]).data)
+        ours = struct.unpack(">hhhh", protocol.motion(given["linear_m_s"], given["angular_rad_s"]).data)
         beyond = [abs(1000 * given[name]) > 32767 for name in ("linear_m_s", "angular_rad_s")]
         for step, theirs, out_of_range in zip(ours, arguments, beyond, strict=False):
             # Out of range the SDK wraps; a driver holds to the limit.
             found.within("steps", abs(step) - 32767 if out_of_range else step, 0 if out_of_range else theirs, _STEP)
-    elif can_id == codec.CONTROL_MODE:
-        ours_frame = codec.control_mode(given["mode"])
+    elif can_id == protocol.CONTROL_MODE:
+        ours_frame = protocol.control_mode(given["mode"])
         found.same("frame", ours_frame.data[: len(data)].hex(), frame["data"])
-    elif can_id == codec.STATE_RESET:
-        found.same("frame", codec.clear_errors(given["error_clear_byte"]).data.hex(), frame["data"][:2])
-    elif can_id == codec.LIGHT_COMMAND:
+    elif can_id == protocol.STATE_RESET:
+        found.same("frame", protocol.clear_errors(given["error_clear_byte"]).data.hex(), frame["data"][:2])
+    elif can_id == protocol.LIGHT_COMMAND:
         arguments = tuple(data[:5])
     found.same("obeyed", base.obeyed, [(can_id, arguments)])
     _check_meaning(found, of_driver(frame), then)
 
 
 def _check_meaning(found: Comparison, frame: Frame, then: Mapping[str, Any]) -> None:
-    decoded = codec.decode(frame)
+    decoded = protocol.decode(frame)
     if decoded is None:
         # Nothing of ours reads the brake of bases that have one, as the SDK does not.
         found.same("decoded", then.get("body"), "not decoded by the SDK")
@@ -84,7 +84,7 @@ def _check_meaning(found: Comparison, frame: Frame, then: Mapping[str, Any]) -> 
             found.same(name, value, then[name])
 
 
-def _in_their_words(decoded: codec.Decoded) -> dict[str, Any]:
+def _in_their_words(decoded: protocol.Decoded) -> dict[str, Any]:
     ours: dict[str, Any] = dict(decoded.values)
     if decoded.motor is not None:
         ours["motor"] = decoded.motor
@@ -111,7 +111,7 @@ def _check_telemetry(found: Comparison, frame: Mapping[str, Any], then: Mapping[
 
 
 def _load(base: AgilexBase, can_id: int, data: bytes) -> None:
-    """Put what a message says into the simulator; the layouts are read here, not by the codec."""
+    """Put what a message says into the simulator; the layouts are read here, not by the protocol."""
     motor = (can_id & 0xF) - 1
     match can_id:
         case 0x211:

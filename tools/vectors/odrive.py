@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any
 
-from drivers.motor import odrive_codec as codec
-from drivers.motor.odrive_codec import Generation
+from drivers.motor import odrive_protocol as protocol
+from drivers.motor.odrive_protocol import Generation
 from sim.devices.odrive import CHECKS_PER_MS, Axis, OdriveBoard
 from tools.vectors.comparison import Case, Comparison, as_case, as_cases, equal, f32, number, of_driver, on_bus
 
@@ -44,7 +44,7 @@ def check_06(case: Case) -> Comparison:
     given, then = case.get("given", {}), case.get("then", {})
     match case["kind"], case["case"].partition(":")[0]:
         case "host_to_device", "sdo_write":
-            frame = codec.write_parameter(given["node"], given["endpoint"], given["type"], given["value"])
+            frame = protocol.write_parameter(given["node"], given["endpoint"], given["type"], given["value"])
             found.same("frame", as_cases([frame]), case["frames"])
             board = OdriveBoard("0.6", [given["node"]])
             board.parameters[given["endpoint"]] = bytes(4)
@@ -59,17 +59,17 @@ def check_06(case: Case) -> Comparison:
             _check_telemetry(found, case, Generation.V06)
         case "malformed", "short_telemetry":
             frame = of_driver(case["frames"][0])
-            found.same("a short frame", codec.decode(Generation.V06, frame), None)
-            whole = codec.decode(Generation.V06, type(frame)(frame.can_id, frame.data.ljust(8, b"\0")))
+            found.same("a short frame", protocol.decode(Generation.V06, frame), None)
+            whole = protocol.decode(Generation.V06, type(frame)(frame.can_id, frame.data.ljust(8, b"\0")))
             values = {} if whole is None else whole.values
             found.same("its bytes", values, {name: then[name] for name in values})
         case "malformed", "unknown_or_unasked":
             # The library hears only what it has asked for; ours knows every telemetry message.
-            decoded = codec.decode(Generation.V06, of_driver(case["frames"][0]))
-            known = {layout.command for layout in codec.TELEMETRY[Generation.V06].values()}
+            decoded = protocol.decode(Generation.V06, of_driver(case["frames"][0]))
+            known = {layout.command for layout in protocol.TELEMETRY[Generation.V06].values()}
             found.same("known", decoded is not None, given["command_id"] in known)
         case "malformed", _:
-            heard = [codec.decode(Generation.V06, of_driver(frame)) for frame in case["frames"]]
+            heard = [protocol.decode(Generation.V06, of_driver(frame)) for frame in case["frames"]]
             found.same("from the node", [d for d in heard if d is not None and d.node == given["node"]], [])
         case _:
             _check_steps(found, case)
@@ -80,14 +80,14 @@ def _check_command(found: Comparison, case: Case, generation: Generation) -> Non
     """What our codec writes; other forms that the device takes as well are the simulator's alone."""
     given = case["given"]
     name, frame = given["command"], case["frames"][0]
-    layout = codec.COMMANDS[generation].get(name)
+    layout = protocol.COMMANDS[generation].get(name)
     if layout is None or frame.get("rtr") or 2 * layout.length != len(frame["data"]):
         return
     values = {field: number(value) for field, value in given.items() if field not in _TRUNCATED}
     for field, ours in _TRUNCATED.items():
         if field in given:
             values[ours] = int(f32(given[field] / f32(0.001)))
-    ours_frame = codec.encode(generation, given["node"], name, **{field: values[field] for field in layout.fields})
+    ours_frame = protocol.encode(generation, given["node"], name, **{field: values[field] for field in layout.fields})
     if name == "Set_Input_Pos" and as_case(ours_frame) != frame:
         # Feed-forwards are cut off by the vendor's host: a step of 0.001 either way.
         theirs = bytes.fromhex(frame["data"])
@@ -164,7 +164,7 @@ def _check_telemetry(found: Comparison, case: Case, generation: Generation) -> N
     given, then = case["given"], case["then"]
     node = given["node"]
     frame = case["frames"][0]
-    decoded = codec.decode(generation, of_driver(frame))
+    decoded = protocol.decode(generation, of_driver(frame))
     if decoded is None:
         found.differences.append("not decoded")
         return
@@ -178,7 +178,7 @@ def _check_telemetry(found: Comparison, case: Case, generation: Generation) -> N
         request = given["request"]
         command = request["id"] & _SILENT
         if not request.get("rtr") and not request["data"]:
-            found.same("request", as_case(codec.ask(node, command)), request)
+            found.same("request", as_case(protocol.ask(node, command)), request)
         fed_before = axis.fed
         found.same("reply", as_cases(board.receive(on_bus(request))), case["frames"])
         found.same("fed", axis.fed > fed_before, "watchdog_fed_nodes" not in then or node in then["watchdog_fed_nodes"])
@@ -203,7 +203,7 @@ def _load(board: OdriveBoard, axis: Axis, values: Mapping[str, Any]) -> None:
             setattr(axis, field, number(value))
         elif field in ("bus_v", "bus_a"):
             setattr(board, field, number(value))
-    names = codec.TELEMETRY[Generation.V06]["Get_Version"].fields
+    names = protocol.TELEMETRY[Generation.V06]["Get_Version"].fields
     if names[0] in values:
         board.version = (*(values[name] for name in names),)  # type: ignore[assignment]
 
@@ -211,10 +211,10 @@ def _load(board: OdriveBoard, axis: Axis, values: Mapping[str, Any]) -> None:
 def _check_parameter(found: Comparison, case: Case) -> None:
     given, then = case["given"], case["then"]
     node, endpoint, kind = given["node"], given["endpoint"], given["type"]
-    found.same("request", as_case(codec.read_parameter(node, endpoint)), given["request"])
+    found.same("request", as_case(protocol.read_parameter(node, endpoint)), given["request"])
     answers_it = given.get("reply_endpoint") == endpoint
     for frame in case["frames"]:
-        value = codec.parameter(of_driver(frame), node, endpoint, kind)
+        value = protocol.parameter(of_driver(frame), node, endpoint, kind)
         # The library does not compare the endpoint; ours takes no answer to another question.
         found.same("value", value, then["value"] if answers_it else None)
         board = OdriveBoard("0.6", [node])
@@ -236,10 +236,10 @@ def _check_story(found: Comparison, case: Case) -> None:
         if "host_sends" in step:
             _check_frames(found, board, step["host_sends"], step["then"])
         for frame in step.get("device_sends", ()):
-            node, command = codec.split(frame["id"])
+            node, command = protocol.split(frame["id"])
             axis = next(axis for axis in board.axes if axis.node_id == node)
             found.same(f"at {step.get('t_ms')} ms", as_case(board.message(axis, command)), frame)
-            found.same("decoded", codec.decode(Generation.V05, of_driver(frame)) is not None, True)
+            found.same("decoded", protocol.decode(Generation.V05, of_driver(frame)) is not None, True)
 
 
 def _check_steps(found: Comparison, case: Case) -> None:
@@ -252,7 +252,7 @@ def _check_steps(found: Comparison, case: Case) -> None:
             board.receive(on_bus(frame))
             found.same("taken", board.axes[0].fed, fed + 1)
         for frame in step.get("device_sends", ()):
-            decoded = codec.decode(Generation.V06, of_driver(frame))
+            decoded = protocol.decode(Generation.V06, of_driver(frame))
             if decoded is None:
                 found.differences.append(f"not decoded: {frame}")
             elif "sent_values" in step["then"]:

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from drivers.motor import roboclaw_codec as codec
+from drivers.motor import roboclaw_protocol as protocol
 from sim.devices.roboclaw import Roboclaw
 from tools.vectors.comparison import Case, Comparison
 
-_SETTER_BY_NUMBER = {layout.command: name for name, layout in codec.SETTERS.items()}
+_SETTER_BY_NUMBER = {layout.command: name for name, layout in protocol.SETTERS.items()}
 
 
 def check(case: Case) -> Comparison:
@@ -24,7 +24,7 @@ def check(case: Case) -> Comparison:
         case "malformed", "acknowledge":
             _check_setter(found, case)
             # Only the vendor's stricter host: a byte that is not 0xFF acknowledges nothing.
-            taken = bytes.fromhex(given["acknowledge"])[:1] == codec.ACKNOWLEDGE
+            taken = bytes.fromhex(given["acknowledge"])[:1] == protocol.ACKNOWLEDGE
             found.same("acknowledged", taken, then["arduino"]["accepted"] and then["arduino"]["requests_sent"] == 1)
         case "malformed", _:
             _check_replies(found, case)
@@ -36,14 +36,14 @@ def check(case: Case) -> Comparison:
 def _check_setter(found: Comparison, case: Case) -> None:
     given = case["given"]
     name = _SETTER_BY_NUMBER[given["command"]]
-    values = {field: _raw(field, given) for field in codec.SETTERS[name].fields}
-    packet = codec.set_bytes(given["address"], name, **values)
+    values = {field: _raw(field, given) for field in protocol.SETTERS[name].fields}
+    packet = protocol.set_bytes(given["address"], name, **values)
     found.same("bytes", packet.hex(), case["bytes"])
     board = Roboclaw(given["address"])
     answer = board.receive(0, bytes.fromhex(case["bytes"]))
     found.same("acknowledge", answer.hex(), case["then"].get("acknowledge_expected", "ff"))
     found.same("obeyed", board.obeyed, [(given["command"], tuple(values.values()))])
-    other = Roboclaw(codec.FIRST_ADDRESS + (given["address"] - codec.FIRST_ADDRESS + 1) % 8)
+    other = Roboclaw(protocol.FIRST_ADDRESS + (given["address"] - protocol.FIRST_ADDRESS + 1) % 8)
     found.same("another board", (other.receive(0, packet), other.obeyed), (b"", []))
 
 
@@ -51,7 +51,7 @@ def _raw(field: str, given: Mapping[str, Any]) -> int:
     """A field as it is on the wire."""
     match field:
         case "p" | "i" | "d":
-            return int(given[field] * codec.GAIN_STEPS)
+            return int(given[field] * protocol.GAIN_STEPS)
         case "timeout_ds":
             return int(given["timeout_s"] * 10)
         case "key":
@@ -61,14 +61,14 @@ def _raw(field: str, given: Mapping[str, Any]) -> int:
 
 def _check_getter(found: Comparison, case: Case) -> None:
     given = case["given"]
-    name = codec.getter_name(given["command"])
+    name = protocol.getter_name(given["command"])
     if name is None:
         found.differences.append(f"command {given['command']} is not known")
         return
     address, received = given["address"], bytes.fromhex(case["bytes"])
-    found.same("request", codec.ask_bytes(address, name).hex(), given["request"])
+    found.same("request", protocol.ask_bytes(address, name).hex(), given["request"])
     verdict = case["then"].get("both") or case["then"]["python"]
-    read = codec.reply(address, name, received)
+    read = protocol.reply(address, name, received)
     found.same("accepted", read is not None, verdict["accepted"])
     if read is None:
         return
@@ -86,7 +86,7 @@ def _in_their_words(values: Mapping[str, Any], theirs: Mapping[str, Any]) -> dic
     ours: dict[str, Any] = {}
     for name, value in values.items():
         if name in ("p", "i", "d"):
-            ours[name] = value / codec.GAIN_STEPS
+            ours[name] = value / protocol.GAIN_STEPS
         elif name == "timeout_ds":
             ours["timeout_s"] = value / 10
         elif name in theirs and isinstance(value, int) and value < 0 <= theirs[name]:
@@ -121,13 +121,13 @@ def _load(board: Roboclaw, name: str, values: Mapping[str, Any]) -> None:
 def _check_replies(found: Comparison, case: Case) -> None:
     """A driver reads each answer once, and throws away what is left before it asks again."""
     given, then = case["given"], case["then"]
-    name = codec.getter_name(given["command"])
+    name = protocol.getter_name(given["command"])
     if name is None:
         found.differences.append(f"command {given['command']} is not known")
         return
     verdict = then.get("both") or then["python"]
     replies = [case["bytes"]] if "bytes" in case else case["replies"][: verdict["requests_sent"]]
-    read = [codec.reply(given["address"], name, bytes.fromhex(each)) for each in replies]
+    read = [protocol.reply(given["address"], name, bytes.fromhex(each)) for each in replies]
     good = [each[0] for each in read if each is not None]
     if case["case"].startswith("u16_status"):
         # The vendor's hosts wait for four bytes; ours takes the two of older firmware.
@@ -147,17 +147,17 @@ def _check_late(found: Comparison, case: Case) -> None:
             late = bytes.fromhex(step["late_bytes"])
             continue
         if "host_sends_speeds" in step:
-            speeds = dict(zip(codec.SETTERS["speed_m1m2"].fields, step["host_sends_speeds"], strict=True))
-            sent = codec.set_bytes(address, "speed_m1m2", **speeds).hex()
+            speeds = dict(zip(protocol.SETTERS["speed_m1m2"].fields, step["host_sends_speeds"], strict=True))
+            sent = protocol.set_bytes(address, "speed_m1m2", **speeds).hex()
             found.same("speeds", [sent] * len(step["requests"]), step["requests"])
-            found.same("late bytes acknowledge", late[:1] == codec.ACKNOWLEDGE, step["then"]["accepted"])
+            found.same("late bytes acknowledge", late[:1] == protocol.ACKNOWLEDGE, step["then"]["accepted"])
             late = b""
             continue
-        name = codec.getter_name(step["host_asks"]) or ""
+        name = protocol.getter_name(step["host_asks"]) or ""
         for request in step["requests"]:
-            found.same("request", codec.ask_bytes(address, name).hex(), request)
+            found.same("request", protocol.ask_bytes(address, name).hex(), request)
         for answer in step["replies"]:
             if late:
-                found.same("late bytes first", codec.reply(address, name, late + bytes.fromhex(answer)), None)
-            found.same("flushed", codec.reply(address, name, bytes.fromhex(answer)) is not None, True)
+                found.same("late bytes first", protocol.reply(address, name, late + bytes.fromhex(answer)), None)
+            found.same("flushed", protocol.reply(address, name, bytes.fromhex(answer)) is not None, True)
         late = b""

@@ -4,7 +4,7 @@ import pytest
 
 from disco_hw.config import Control, Link
 from disco_hw.runtime.preflight import Level, check_link_load
-from drivers.motor.roboclaw_codec import SETTERS
+from drivers.motor.roboclaw_protocol import SETTERS
 from drivers.types import DriverState, Request, WheelCommand
 from tests.drivers.motor.vendors import VENDORS
 

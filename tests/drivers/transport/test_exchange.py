@@ -7,8 +7,8 @@ import tty
 
 import pytest
 
-from drivers.motor import roboclaw_codec as codec
-from drivers.motor.roboclaw_settings import RoboclawExchange, question, setting
+from drivers.motor import roboclaw_protocol as protocol
+from drivers.motor.roboclaw_protocol import RoboclawExchange, question, setting
 from drivers.transport.reconnecting import BackoffPolicy, ReconnectingTransport
 from drivers.transport.serial import SerialMedium
 from drivers.types import Frame, LinkState, OutgoingFrame
@@ -93,9 +93,9 @@ def test_replies_come_in_the_order_of_the_questions_and_each_is_read_as_its_own(
     send(transport, *ask(ENCODERS, SPEEDS, STATUS, STOP))
     replies = [received.frame for received in collect(transport, 4)]
     assert [reply.can_id for reply in replies] == [frame.can_id for frame in (ENCODERS, SPEEDS, STATUS, STOP)]
-    assert codec.reply(0x80, "encoders", replies[0].data)[0]["encoder_m1"] == 11
-    assert codec.reply(0x80, "speeds", replies[1].data)[0]["speed_m1"] == 22
-    assert replies[3] == Frame(STOP.can_id, codec.ACKNOWLEDGE)
+    assert protocol.reply(0x80, "encoders", replies[0].data)[0]["encoder_m1"] == 11
+    assert protocol.reply(0x80, "speeds", replies[1].data)[0]["speed_m1"] == 22
+    assert replies[3] == Frame(STOP.can_id, protocol.ACKNOWLEDGE)
 
 
 def test_no_request_leaves_before_the_reply_to_the_one_before_is_whole(line, transport):
@@ -119,7 +119,7 @@ def test_a_late_reply_is_nobodys(line, transport):
     [
         pytest.param(lambda reply: reply[:-1] + bytes([reply[-1] ^ 1]), id="crc"),
         pytest.param(
-            lambda reply: reply[:-2] + codec.with_crc(b"\x81" + ENCODERS.data[1:] + reply[:-2])[-2:], id="address"
+            lambda reply: reply[:-2] + protocol.with_crc(b"\x81" + ENCODERS.data[1:] + reply[:-2])[-2:], id="address"
         ),
         pytest.param(lambda reply: reply[:5], id="cut"),
         pytest.param(lambda reply: b"\xff" + reply, id="behind-a-late-acknowledgement"),

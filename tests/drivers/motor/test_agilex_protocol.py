@@ -4,51 +4,51 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.motor import agilex_codec as codec
+from drivers.motor import agilex_protocol as protocol
 from drivers.types import Frame
 
 
 def test_a_motion_command_is_in_thousandths():
-    assert codec.motion(0.15, -0.2) == Frame(0x111, bytes.fromhex("0096ff3800000000"))
+    assert protocol.motion(0.15, -0.2) == Frame(0x111, bytes.fromhex("0096ff3800000000"))
 
 
 def test_a_motion_command_is_held_to_what_the_wire_can_say():
-    assert codec.motion(40.0, -40.0).data.hex() == "7fff800000000000"
+    assert protocol.motion(40.0, -40.0).data.hex() == "7fff800000000000"
 
 
 def test_the_mode_is_asked_for_with_eight_bytes():
-    assert codec.control_mode(codec.CAN_MODE) == Frame(0x421, b"\1" + bytes(7))
+    assert protocol.control_mode(protocol.CAN_MODE) == Frame(0x421, b"\1" + bytes(7))
 
 
 def test_the_state_and_the_odometry_are_read():
-    state = codec.decode(Frame(0x211, bytes.fromhex("010301080004002a")))
+    state = protocol.decode(Frame(0x211, bytes.fromhex("010301080004002a")))
     assert state is not None
     assert state.values == {
-        "vehicle_state": codec.EMERGENCY_STOP,
-        "control_mode": codec.RC_MODE,
+        "vehicle_state": protocol.EMERGENCY_STOP,
+        "control_mode": protocol.RC_MODE,
         "battery_v": pytest.approx(26.4),
         "error_code": 4,
     }
-    odometry = codec.decode(Frame(0x311, bytes.fromhex("01000001ffffffff")))
+    odometry = protocol.decode(Frame(0x311, bytes.fromhex("01000001ffffffff")))
     assert odometry is not None
     assert odometry.values == {"left_mm": 2**24 + 1, "right_mm": -1}
 
 
 def test_each_motor_has_its_own_identifier():
-    motor = codec.decode(Frame(0x254, bytes.fromhex("ff9c000a00000064")))
+    motor = protocol.decode(Frame(0x254, bytes.fromhex("ff9c000a00000064")))
     assert motor is not None
     assert (motor.motor, motor.values["rpm"], motor.values["pulses"]) == (3, -100, 100)
 
 
 @pytest.mark.parametrize("can_id", [0x211, 0x221, 0x251, 0x311])
 def test_a_short_frame_is_none(can_id):
-    assert codec.decode(Frame(can_id, bytes(7))) is None
+    assert protocol.decode(Frame(can_id, bytes(7))) is None
 
 
 def test_a_29_bit_frame_is_none():
-    assert codec.decode(Frame(0x211, bytes(8), extended=True)) is None
+    assert protocol.decode(Frame(0x211, bytes(8), extended=True)) is None
 
 
 @given(st.integers(0, 0x7FF), st.binary(max_size=8), st.booleans())
 def test_no_frame_breaks_the_decoder(can_id, data, extended):
-    codec.decode(Frame(can_id, data, extended))
+    protocol.decode(Frame(can_id, data, extended))

@@ -7,31 +7,31 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.motor import odrive_codec as codec
-from drivers.motor.odrive_codec import Generation
+from drivers.motor import odrive_protocol as protocol
+from drivers.motor.odrive_protocol import Generation
 from drivers.types import Frame
 
 V05, V06 = Generation.V05, Generation.V06
 
 
 def test_a_velocity_is_the_documented_frame():
-    frame = codec.encode(V05, 3, "Set_Input_Vel", vel_turns_s=1.5, torque_nm=0.0)
+    frame = protocol.encode(V05, 3, "Set_Input_Vel", vel_turns_s=1.5, torque_nm=0.0)
     assert frame == Frame(0x06D, bytes.fromhex("0000C03F00000000"))
 
 
 def test_the_frames_of_arming_and_stopping():
-    assert codec.encode(V06, 3, "Set_Controller_Mode", control_mode=2, input_mode=1) == Frame(
+    assert protocol.encode(V06, 3, "Set_Controller_Mode", control_mode=2, input_mode=1) == Frame(
         0x06B, bytes.fromhex("0200000001000000")
     )
-    assert codec.encode(V06, 3, "Set_Axis_State", state=8) == Frame(0x067, bytes.fromhex("0800000000000000"))
-    assert codec.encode(V06, 3, "Estop") == Frame(0x062, b"")
-    assert codec.encode(V05, 3, "Clear_Errors") == Frame(0x078, b"")
-    assert codec.encode(V06, 3, "Clear_Errors", identify=0) == Frame(0x078, b"\0")
+    assert protocol.encode(V06, 3, "Set_Axis_State", state=8) == Frame(0x067, bytes.fromhex("0800000000000000"))
+    assert protocol.encode(V06, 3, "Estop") == Frame(0x062, b"")
+    assert protocol.encode(V05, 3, "Clear_Errors") == Frame(0x078, b"")
+    assert protocol.encode(V06, 3, "Clear_Errors", identify=0) == Frame(0x078, b"\0")
 
 
 def test_a_heartbeat_says_other_things_in_each_generation():
     frame = Frame(3 << 5 | 1, struct.pack("<IBBBB", 0x800, 1, 1, 0, 0x80))
-    old, new = codec.decode(V05, frame), codec.decode(V06, frame)
+    old, new = protocol.decode(V05, frame), protocol.decode(V06, frame)
     assert old is not None
     assert new is not None
     assert (old.node, old.values["axis_error"], old.values["axis_state"]) == (3, 0x800, 1)
@@ -41,35 +41,35 @@ def test_a_heartbeat_says_other_things_in_each_generation():
 
 @pytest.mark.parametrize("length", [0, 4, 7])
 def test_telemetry_that_is_too_short_is_none(length):
-    assert codec.decode(V05, Frame(3 << 5 | 9, bytes(length))) is None
+    assert protocol.decode(V05, Frame(3 << 5 | 9, bytes(length))) is None
 
 
 def test_a_29_bit_frame_is_none_of_ours():
-    assert codec.decode(V05, Frame(3 << 5 | 9, bytes(8), extended=True)) is None
+    assert protocol.decode(V05, Frame(3 << 5 | 9, bytes(8), extended=True)) is None
 
 
 def test_a_node_that_does_not_exist_is_refused():
     with pytest.raises(ValueError, match="63"):
-        codec.encode(V05, 63, "Estop")
+        protocol.encode(V05, 63, "Estop")
 
 
 def test_a_parameter_is_read_only_from_the_answer_to_its_own_endpoint():
-    assert codec.read_parameter(3, 0x102) == Frame(0x064, bytes.fromhex("0002010000000000"))
+    assert protocol.read_parameter(3, 0x102) == Frame(0x064, bytes.fromhex("0002010000000000"))
     answer = Frame(0x065, bytes.fromhex("00020100") + struct.pack("<f", 0.1))
-    assert codec.parameter(answer, 3, 0x102, "f32") == pytest.approx(0.1)
-    assert codec.parameter(answer, 3, 0x103, "f32") is None
-    assert codec.parameter(answer, 4, 0x102, "f32") is None
+    assert protocol.parameter(answer, 3, 0x102, "f32") == pytest.approx(0.1)
+    assert protocol.parameter(answer, 3, 0x103, "f32") is None
+    assert protocol.parameter(answer, 4, 0x102, "f32") is None
 
 
 @given(st.integers(0, 0x7FF), st.binary(max_size=8), st.sampled_from(Generation), st.booleans())
 def test_no_frame_breaks_the_decoder(can_id, data, generation, extended):
-    decoded = codec.decode(generation, Frame(can_id, data, extended))
+    decoded = protocol.decode(generation, Frame(can_id, data, extended))
     assert decoded is None or (decoded.node == can_id >> 5 and len(data) == 8)
 
 
-@given(st.floats(width=32, allow_nan=False), st.integers(0, codec.LARGEST_NODE))
+@given(st.floats(width=32, allow_nan=False), st.integers(0, protocol.LARGEST_NODE))
 def test_what_a_drive_says_is_read_as_it_was_meant(turns, node):
-    decoded = codec.decode(V05, Frame(node << 5 | 9, struct.pack("<ff", turns, -turns)))
+    decoded = protocol.decode(V05, Frame(node << 5 | 9, struct.pack("<ff", turns, -turns)))
     assert decoded is not None
     assert decoded.values["pos_turns"] == turns
     assert math.copysign(1.0, decoded.values["vel_turns_s"]) == -math.copysign(1.0, turns)

@@ -1,0 +1,375 @@
+"""ODrive's CAN Simple in firmware 0.5 and 0.6: frames and what they mean, in turns as on the wire.
+
+Identifier: node << 5 | command. All little-endian. Whoever sends an empty frame with the identifier of a telemetry
+message asks for that message. Source: the vendor's odrive-cansimple.dbc 0.5.6 and ODriveArduino 0.10.9.
+
+What robot.toml says of the axes follows the frames, with e-stop, bus load and safety card.
+"""
+
+from __future__ import annotations
+
+import enum
+import struct
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Annotated, Any, Literal
+
+import msgspec
+from msgspec import Meta
+
+from drivers.motor.vendor_parts import Nodes, Sign, in_sides, sides_of
+from drivers.types import CyclicFrame, Frame, SafetyCard, SettingsFault
+
+LARGEST_NODE = 0x3E
+_NODE_SHIFT, _COMMAND_MASK = 5, 0x1F
+Value = float | int
+
+
+class Generation(enum.Enum):
+    """Of the firmware; 0.6 and later speak the same."""
+
+    V05 = "0.5"
+    V06 = "0.6"
+
+
+class AxisState(enum.IntEnum):
+    """The states that a driver may meet; all others calibrate, search or spin the motor by themselves."""
+
+    UNDEFINED = 0
+    IDLE = 1
+    CLOSED_LOOP = 8
+
+
+VELOCITY_CONTROL = 2
+PASSTHROUGH = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """A message: its command number, the bytes by `struct`, and the names of the fields."""
+
+    command: int
+    body: str
+    fields: tuple[str, ...] = ()
+
+    @property
+    def length(self) -> int:
+        """Of the data in bytes."""
+        return struct.calcsize("<" + self.body)
+
+
+def _table(*layouts: tuple[str, int, str, str]) -> Mapping[str, Layout]:
+    made = {name: Layout(command, body, tuple(names.split())) for name, command, body, names in layouts}
+    return MappingProxyType(made)
+
+
+_COMMON_COMMANDS = (
+    ("Estop", 0x02, "", ""),
+    ("Set_Axis_State", 0x07, "I4x", "state"),
+    ("Set_Controller_Mode", 0x0B, "II", "control_mode input_mode"),
+    ("Set_Input_Pos", 0x0C, "fhh", "pos_turns vel_ff_milliturns_s torque_ff_mnm"),
+    ("Set_Input_Vel", 0x0D, "ff", "vel_turns_s torque_nm"),
+    ("Set_Input_Torque", 0x0E, "f4x", "torque_nm"),
+    ("Set_Limits", 0x0F, "ff", "vel_limit_turns_s current_limit_a"),
+    ("Set_Traj_Vel_Limit", 0x11, "f4x", "vel_limit"),
+    ("Set_Traj_Accel_Limits", 0x12, "ff", "accel decel"),
+    ("Set_Pos_Gain", 0x1A, "f4x", "pos_gain"),
+    ("Set_Vel_Gains", 0x1B, "ff", "vel_gain vel_integrator_gain"),
+)
+COMMANDS: Mapping[Generation, Mapping[str, Layout]] = MappingProxyType(
+    {
+        Generation.V05: _table(
+            *_COMMON_COMMANDS,
+            ("Set_Axis_Node_ID", 0x06, "I", "new_node_id"),
+            ("Clear_Errors", 0x18, "", ""),
+            ("Set_Linear_Count", 0x19, "i4x", "count"),
+        ),
+        Generation.V06: _table(
+            *_COMMON_COMMANDS,
+            ("Reboot", 0x16, "B", "action"),
+            ("Clear_Errors", 0x18, "B", "identify"),
+            ("Set_Absolute_Position", 0x19, "f4x", "pos_turns"),
+        ),
+    }
+)
+"""What a host may send. The driver uses Estop, Set_Axis_State, Set_Controller_Mode, Set_Input_Vel and Clear_Errors."""
+
+_VERSION_FIELDS = "protocol hw_major hw_minor hw_variant fw_major fw_minor fw_revision fw_unreleased"
+_COMMON_TELEMETRY = (
+    ("Get_Encoder_Estimates", 0x09, "ff", "pos_turns vel_turns_s"),
+    ("Get_Iq", 0x14, "ff", "iq_setpoint_a iq_measured_a"),
+    ("Get_Bus_Voltage_Current", 0x17, "ff", "bus_v bus_a"),
+)
+TELEMETRY: Mapping[Generation, Mapping[str, Layout]] = MappingProxyType(
+    {
+        Generation.V05: _table(
+            *_COMMON_TELEMETRY,
+            ("Heartbeat", 0x01, "IBBBB", "axis_error axis_state motor_flags encoder_flags controller_flags"),
+            ("Get_Motor_Error", 0x03, "Q", "motor_error"),
+            ("Get_Encoder_Error", 0x04, "I4x", "encoder_error"),
+            ("Get_Sensorless_Error", 0x05, "I4x", "sensorless_error"),
+            ("Get_Encoder_Count", 0x0A, "ii", "shadow_count count_in_cpr"),
+            ("Get_Sensorless_Estimates", 0x15, "ff", "sensorless_pos sensorless_vel"),
+            ("Get_Controller_Error", 0x1D, "I4x", "controller_error"),
+        ),
+        Generation.V06: _table(
+            *_COMMON_TELEMETRY,
+            (
+                "Get_Version",
+                0x00,
+                "8B",
+                _VERSION_FIELDS,
+            ),
+            ("Heartbeat", 0x01, "IBBBx", "axis_error axis_state procedure_result trajectory_done"),
+            ("Get_Error", 0x03, "II", "active_errors disarm_reason"),
+            ("Get_Temperature", 0x15, "ff", "fet_deg_c motor_deg_c"),
+            ("Get_Torques", 0x1C, "ff", "torque_target_nm torque_estimate_nm"),
+            ("Get_Powers", 0x1D, "ff", "electrical_w mechanical_w"),
+        ),
+    }
+)
+GET_VERSION = 0x00
+_BY_NUMBER = {
+    generation: {layout.command: (name, layout) for name, layout in table.items()}
+    for generation, table in TELEMETRY.items()
+}
+_SDO_VALUES = MappingProxyType({"f32": "f", "u32": "I", "i32": "i", "u16": "H", "u8": "B", "bool": "?"})
+_SDO_HEAD = struct.Struct("<BHB")
+SDO_REQUEST, SDO_REPLY = 0x04, 0x05
+
+
+@dataclass(frozen=True, slots=True)
+class Decoded:
+    """A telemetry message of one node, its fields by the names of `TELEMETRY`."""
+
+    node: int
+    name: str
+    values: Mapping[str, Value]
+
+
+def identifier(node: int, command: int) -> int:
+    """Return the CAN identifier. Raises ValueError for a node above 62."""
+    if not 0 <= node <= LARGEST_NODE:
+        raise ValueError(f"no ODrive node: {node}")
+    return node << _NODE_SHIFT | command
+
+
+def split(can_id: int) -> tuple[int, int]:
+    """Node and command of an 11-bit identifier."""
+    return can_id >> _NODE_SHIFT, can_id & _COMMAND_MASK
+
+
+def encode(generation: Generation, node: int, name: str, **values: Value) -> Frame:
+    """Return the frame of a command; `values` by the names of `COMMANDS`. Raises KeyError for one that is missing."""
+    layout = COMMANDS[generation][name]
+    data = struct.pack("<" + layout.body, *(values[field] for field in layout.fields))
+    return Frame(identifier(node, layout.command), data)
+
+
+def ask(node: int, command: int) -> Frame:
+    """Return the frame that asks for a telemetry message once; on 0.5 it feeds the watchdog."""
+    return Frame(identifier(node, command), b"")
+
+
+def decode(generation: Generation, frame: Frame) -> Decoded | None:
+    """Return what a node says; None for what is no telemetry, or not of its full length."""
+    node, command = split(frame.can_id)
+    known = _BY_NUMBER[generation].get(command)
+    if frame.extended or known is None or node > LARGEST_NODE:
+        return None
+    name, layout = known
+    if len(frame.data) != layout.length:
+        return None
+    values: dict[str, Value] = dict(zip(layout.fields, struct.unpack("<" + layout.body, frame.data), strict=True))
+    if generation is Generation.V06 and name == "Heartbeat":
+        values["trajectory_done"] = int(values["trajectory_done"]) & 1
+    return Decoded(node, name, values)
+
+
+def read_parameter(node: int, endpoint: int) -> Frame:
+    """Return the request (0.6) for a parameter; its number is of that very firmware's flat_endpoints.json."""
+    return Frame(identifier(node, SDO_REQUEST), _SDO_HEAD.pack(0, endpoint, 0) + bytes(4))
+
+
+def write_parameter(node: int, endpoint: int, kind: str, value: Value) -> Frame:
+    """Return the request (0.6) to set a parameter of a `kind` of "f32", "u32", "i32", "u16", "u8" or "bool"."""
+    body = struct.pack("<" + _SDO_VALUES[kind], value).ljust(4, b"\0")
+    return Frame(identifier(node, SDO_REQUEST), _SDO_HEAD.pack(1, endpoint, 0) + body)
+
+
+def parameter(frame: Frame, node: int, endpoint: int, kind: str) -> Value | None:
+    """Return the value in a reply (0.6); None for a frame that does not answer for this node and endpoint."""
+    if frame.extended or frame.can_id != identifier(node, SDO_REPLY) or len(frame.data) != 8:
+        return None
+    _, replied, _ = _SDO_HEAD.unpack(frame.data[:4])
+    value: Value = struct.unpack_from("<" + _SDO_VALUES[kind], frame.data, 4)[0]
+    return value if replied == endpoint else None
+
+
+WATCHDOG_ERROR = {Generation.V05: 0x800, Generation.V06: 0x0100_0000}
+EXAMPLE = """nodes = [3, 5]
+direction = [1, -1]
+gear = 8.0
+watchdog_s = 0.1
+vel_limit_turns_s = 15.0
+heartbeat_s = 0.02
+"""
+ESTOP_ERROR = {Generation.V05: 0x4000, Generation.V06: 0x0200_0000}
+_ERRORS: Mapping[Generation, Mapping[int, str]] = MappingProxyType(
+    {
+        Generation.V05: {
+            0x1: "invalid state: calibrate it with odrivetool first",
+            0x40: "the motor failed; read its error with odrivetool",
+            0x80: "the sensorless estimator failed",
+            0x100: "the encoder failed; check its cable and calibration",
+            0x200: "the controller failed, such as by overspeed",
+            0x800: "its watchdog ran out: no command came in time",
+            0x1000: "an end stop was pressed",
+            0x2000: "an end stop was pressed",
+            0x4000: "emergency stop",
+            0x40000: "too hot; let it cool",
+        },
+        Generation.V06: {
+            0x1: "still starting",
+            0x4: "it missed its own deadlines",
+            0x8: "no position or velocity estimate; check the encoder",
+            0x10: "its configuration is bad; mend it with odrivetool",
+            0x20: "the gate driver failed",
+            0x40: "an input is missing",
+            0x100: "the supply's voltage is too high",
+            0x200: "the supply's voltage is too low",
+            0x400: "the supply's current is too high",
+            0x1000: "the motor's current is too high",
+            0x2000: "the motor is too hot; let it cool",
+            0x4000: "the inverter is too hot; let it cool",
+            0x8000: "it turns faster than its limit",
+            0x0100_0000: "its watchdog ran out: no command came in time",
+            0x0200_0000: "emergency stop",
+            0x0400_0000: "the encoder contradicts the motor (spin-out)",
+            0x4000_0000: "calibration failed",
+        },
+    }
+)
+
+_HEARD = 3
+_Endpoint = Annotated[int, Meta(ge=0, le=65535)]
+
+
+class OdriveSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Its fields in [link]: left before right; `gear` is motor turns per wheel turn.
+
+    `watchdog_s`, `vel_limit_turns_s` (of the motor), `heartbeat_s` and `firmware` are what the controller is set to.
+    `watchdog_endpoints`: of `axis0.config.enable_watchdog` and `axis0.config.watchdog_timeout` in the
+    flat_endpoints.json of that very firmware (0.6), to read the watchdog back; None: it is declared.
+    """
+
+    nodes: tuple[Nodes, Nodes]
+    watchdog_s: Annotated[float, Meta(gt=0.0, le=0.5)]
+    vel_limit_turns_s: Annotated[float, Meta(gt=0.0, le=1000.0)]
+    firmware: Literal["0.5", "0.6"] = "0.6"
+    direction: tuple[Sign, Sign] = (1, 1)
+    gear: Annotated[float, Meta(gt=0.0, le=1000.0)] = 1.0
+    heartbeat_s: Annotated[float, Meta(ge=0.005, le=0.2)] = 0.1
+    watchdog_endpoints: tuple[_Endpoint, _Endpoint] | None = None
+    stop_deceleration_rad_s2: Annotated[float, Meta(gt=0.0, le=655.0)] = 10.0
+
+    @property
+    def sides(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
+        """The nodes on the left and on the right."""
+        return sides_of(self.nodes)
+
+    @property
+    def all_nodes(self) -> tuple[int, ...]:
+        """Every node, left before right."""
+        return (*self.sides[0], *self.sides[1])
+
+    @property
+    def generation(self) -> Generation:
+        """Of the firmware."""
+        return Generation(self.firmware)
+
+    def fault(self) -> SettingsFault | None:
+        """What no single field shows."""
+        nodes = self.all_nodes
+        if not all(self.sides):
+            return SettingsFault("nodes", "a side has no node", "write [left, right], such as [3, 5]")
+        if any(not 0 <= node <= LARGEST_NODE for node in nodes):
+            return SettingsFault("nodes", f"a node is outside 0 to {LARGEST_NODE}", "write those of odrivetool")
+        if self.watchdog_endpoints is not None and self.firmware != "0.6":
+            return SettingsFault("watchdog_endpoints", "firmware 0.5 has none that CAN could read", "remove it")
+        if len(set(nodes)) != len(nodes):
+            return SettingsFault("nodes", "a node stands there twice", "write each motor's own")
+        return None
+
+
+def error_words(generation: Generation, error: int) -> str:
+    """What the bits of an axis' error mean, for a person."""
+    said = [text for bit, text in _ERRORS[generation].items() if error & bit]
+    return "; ".join(said) or f"error {error:#x}"
+
+
+def stop_frames(settings: OdriveSettings) -> tuple[Frame, ...]:
+    """The e-stop to every node: it idles with an error that stays until it is cleared."""
+    return tuple(encode(settings.generation, node, "Estop") for node in settings.all_nodes)
+
+
+def stop_confirmation(settings: OdriveSettings) -> Callable[[Frame], bool]:
+    """Return what says, frame by frame heard, whether every node has reported the e-stop."""
+    waiting = set(settings.all_nodes)
+
+    def heard(frame: Frame) -> bool:
+        decoded = decode(settings.generation, frame)
+        beat = decoded if decoded is not None and decoded.name == "Heartbeat" else None
+        if beat is not None and int(beat.values["axis_error"]) & ESTOP_ERROR[settings.generation]:
+            waiting.discard(beat.node)
+        return not waiting
+
+    return heard
+
+
+def cyclic_frames(settings: OdriveSettings, command_rate_hz: float, _authenticated: bool) -> tuple[CyclicFrame, ...]:
+    """Velocities, heartbeats and encoder estimates (each 10 ms) of every node."""
+    frames: list[CyclicFrame] = []
+    for node in settings.all_nodes:
+        frames += [
+            CyclicFrame(f"Set_Input_Vel of {node}", "HOST", 8, command_rate_hz),
+            CyclicFrame(f"Heartbeat of {node}", "ROBOT", 8, 1.0 / settings.heartbeat_s),
+            CyclicFrame(f"Get_Encoder_Estimates of {node}", "ROBOT", 8, 100.0),
+        ]
+    return tuple(frames)
+
+
+def recognise(frames: Sequence[Frame]) -> dict[str, Any] | None:
+    """The nodes whose heartbeats and estimates were heard, split into left and right as they are numbered.
+
+    None if there are none: heartbeats alone could be another vendor's frames.
+    """
+    told = [one for frame in frames if (one := decode(Generation.V06, frame)) is not None]
+    beats, estimates = (
+        [one.node for one in told if one.name == name] for name in ("Heartbeat", "Get_Encoder_Estimates")
+    )
+    nodes = sorted({node for node in beats if min(beats.count(node), estimates.count(node)) >= _HEARD})
+    return {"nodes": in_sides(nodes)} if len(nodes) > 1 else None
+
+
+def safety_card(settings: OdriveSettings) -> SafetyCard:
+    """Who stops the robot when."""
+    return SafetyCard(
+        host_silent=f"each axis after {settings.watchdog_s:g} s without a frame, by its watchdog: it idles",
+        stops_by="coasting: an ODrive in idle does not brake",
+        reaction_s=settings.watchdog_s,
+        brakes=False,
+        estop="a frame to each axis (0x02): it idles and coasts, latched, reported in its heartbeat",
+        unverified=(
+            f"watchdog ({settings.watchdog_s:g} s), velocity limit and heartbeat period are declared in robot.toml "
+            "and were not read back; any frame to an axis may feed its watchdog",
+            "not tried on hardware: the driver was tried against a simulator made from the vendor's source",
+        ),
+        setup=(
+            f"odrv0.axis0.config.watchdog_timeout = {settings.watchdog_s:g}",
+            "odrv0.axis0.config.enable_watchdog = True",
+            f"odrv0.axis0.controller.config.vel_limit = {settings.vel_limit_turns_s:g}",
+            "heartbeat 10 to 100 ms, encoder 10 ms (axis0.config.can.*_rate_ms or *_msg_rate_ms); the same on axis1",
+        ),
+    )

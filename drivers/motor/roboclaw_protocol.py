@@ -1,0 +1,339 @@
+"""RoboClaw packet serial: the bytes of a command and of its reply. Big-endian.
+
+A command that sets something: address, command, arguments, CRC-16/XMODEM of all before; the reply is one byte, 0xFF,
+or nothing. A command that asks: address and command alone; the reply is data and the CRC of address, command and data.
+A reply names neither: it belongs to whoever asked last. Source: the vendor's user manual and its two host libraries.
+
+What robot.toml says of the boards follows, with exchange, e-stop, line load and safety card.
+"""
+
+from __future__ import annotations
+
+import binascii
+import math
+import re
+import struct
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Annotated
+
+import msgspec
+from msgspec import Meta
+
+from drivers.motor.vendor_parts import Sign
+from drivers.types import CyclicFrame, Frame, SafetyCard, SettingsFault
+
+FIRST_ADDRESS, LAST_ADDRESS = 0x80, 0x87
+ACKNOWLEDGE = b"\xff"
+QUIET_S = 0.010
+"""A pause of more than this between two bytes discards a packet that has begun."""
+NVM_KEY = 0xE22EAB7A
+_VERSION_END = b"\n\0"
+_LONGEST_VERSION = 48
+_CRC_BYTES = 2
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """A command's number, the bytes of its arguments or of its reply by `struct`, and the names of the fields."""
+
+    command: int
+    body: str
+    fields: tuple[str, ...] = ()
+
+    @property
+    def length(self) -> int:
+        """Of arguments or data in bytes, the CRC not counted."""
+        return struct.calcsize(">" + self.body)
+
+
+def _table(*layouts: tuple[str, int, str, str]) -> Mapping[str, Layout]:
+    made = {name: Layout(command, body, tuple(names.split())) for name, command, body, names in layouts}
+    return MappingProxyType(made)
+
+
+SETTERS = _table(
+    ("set_serial_timeout", 14, "B", "timeout_ds"),
+    ("reset_encoders", 20, "", ""),
+    ("set_velocity_pid_m1", 28, "IIII", "d p i qpps"),
+    ("set_velocity_pid_m2", 29, "IIII", "d p i qpps"),
+    ("duty_m1m2", 34, "hh", "duty_m1 duty_m2"),
+    ("speed_m1", 35, "i", "speed_counts_s"),
+    ("speed_m2", 36, "i", "speed_counts_s"),
+    ("speed_m1m2", 37, "ii", "speed_m1_counts_s speed_m2_counts_s"),
+    ("speed_accel_m1m2", 40, "Iii", "accel_counts_s2 speed_m1_counts_s speed_m2_counts_s"),
+    ("write_nvm", 94, "I", "key"),
+    ("reset_estop", 200, "", ""),
+    ("set_estop_lock", 201, "B", "state"),
+)
+"""What a host may set. The driver uses duty_m1m2, speed_accel_m1m2 and, when asked to reset, reset_estop."""
+GETTERS = _table(
+    ("serial_timeout", 15, "B", "timeout_ds"),
+    ("encoder_m1", 16, "iB", "encoder status"),
+    ("encoder_m2", 17, "iB", "encoder status"),
+    ("speed_of_m1", 18, "iB", "speed status"),
+    ("speed_of_m2", 19, "iB", "speed status"),
+    ("version", 21, "", "version"),
+    ("raw_speed_of_m1", 30, "iB", "speed status"),
+    ("raw_speed_of_m2", 31, "iB", "speed status"),
+    ("main_battery", 24, "H", "main_battery_decivolt"),
+    ("logic_battery", 25, "H", "logic_battery_decivolt"),
+    ("pwms", 48, "hh", "pwm_m1 pwm_m2"),
+    ("currents", 49, "hh", "current_m1_10ma current_m2_10ma"),
+    ("velocity_pid_m1", 55, "IIII", "p i d qpps"),
+    ("velocity_pid_m2", 56, "IIII", "p i d qpps"),
+    ("encoders", 78, "ii", "encoder_m1 encoder_m2"),
+    ("speeds", 79, "ii", "speed_m1 speed_m2"),
+    ("temperature_1", 82, "H", "temperature_decidegree"),
+    ("temperature_2", 83, "H", "temperature_decidegree"),
+    ("status", 90, "I", "status_u32"),
+    ("estop_lock", 202, "B", "estop_lock"),
+)
+GAIN_STEPS = 65536
+"""Of a velocity gain in one unit; the order of the gains differs between setting and asking."""
+_OLDER_STATUS = struct.Struct(">H")
+_GETTER_BY_NUMBER = {layout.command: (name, layout) for name, layout in GETTERS.items()}
+Value = float | int | str
+
+
+def set_bytes(address: int, name: str, **values: int) -> bytes:
+    """Return the bytes that set something; `values` by the names of `SETTERS`, held to what the wire can say.
+
+    Raises ValueError for an address outside 0x80 to 0x87.
+    """
+    layout = SETTERS[name]
+    arguments = [_held(values[field], code) for field, code in zip(layout.fields, layout.body, strict=True)]
+    return with_crc(_head(address, layout.command) + struct.pack(">" + layout.body, *arguments))
+
+
+def ask_bytes(address: int, name: str) -> bytes:
+    """Return the bytes that ask for something. Raises ValueError for an address outside 0x80 to 0x87."""
+    return _head(address, GETTERS[name].command)
+
+
+def with_crc(packet: bytes) -> bytes:
+    """Return the packet with the CRC of all its bytes."""
+    return packet + binascii.crc_hqx(packet, 0).to_bytes(2)
+
+
+def reply(address: int, name: str, received: bytes) -> tuple[Mapping[str, Value], int] | None:
+    """Return the fields of the reply that `received` begins with and how many bytes it has; None if it is none yet.
+
+    The status word has two bytes on older firmware and four on newer; a version text ends with a line feed and a zero.
+    """
+    layout = GETTERS[name]
+    head = _head(address, layout.command)
+    if name == "version":
+        end = received.find(_VERSION_END, 0, _LONGEST_VERSION)
+        if end < 0 or not _checks(head, received, end + 2):
+            return None
+        text = received[: end + 1].decode("ascii", "replace")
+        return MappingProxyType({"version": text}), end + 2 + _CRC_BYTES
+    if _checks(head, received, layout.length):
+        fields = zip(layout.fields, struct.unpack_from(">" + layout.body, received), strict=True)
+        return MappingProxyType(dict(fields)), layout.length + _CRC_BYTES
+    older = name == "status" and len(received) == _OLDER_STATUS.size + _CRC_BYTES
+    if older and _checks(head, received, _OLDER_STATUS.size):
+        return MappingProxyType({"status_u32": _OLDER_STATUS.unpack_from(received)[0]}), len(received)
+    return None
+
+
+def getter_name(command: int) -> str | None:
+    """Name of the command that asks with this number."""
+    return _GETTER_BY_NUMBER[command][0] if command in _GETTER_BY_NUMBER else None
+
+
+def reply_length(name: str) -> int:
+    """Of a reply in bytes with its CRC; the longest that it can be where it varies."""
+    return (_LONGEST_VERSION if name == "version" else GETTERS[name].length) + _CRC_BYTES
+
+
+def _head(address: int, command: int) -> bytes:
+    if not FIRST_ADDRESS <= address <= LAST_ADDRESS:
+        raise ValueError(f"no RoboClaw address: {address:#x}")
+    return bytes((address, command))
+
+
+def _checks(head: bytes, received: bytes, length: int) -> bool:
+    end = length + _CRC_BYTES
+    if len(received) < end:
+        return False
+    return binascii.crc_hqx(head + received[:length], 0) == int.from_bytes(received[length:end])
+
+
+def _held(value: int, code: str) -> int:
+    bits = 8 * struct.calcsize(">" + code)
+    low, high = (-(1 << bits - 1), (1 << bits - 1) - 1) if code.islower() else (0, (1 << bits) - 1)
+    return min(max(value, low), high)
+
+
+STANDS_RAD_S = 0.1
+_TURNAROUND_S = 0.0009
+_MOTOR = re.compile(r"(\d{1,3})/([12])")
+EXAMPLE = """motors = ["128/1", "128/2"]
+counts_per_rev = 8192.0
+direction = [1, -1]
+watchdog_s = 0.2
+"""
+_Motors = str | tuple[str, ...]
+
+
+class RoboclawSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Its fields in [link]: left before right.
+
+    `motors`: "ADDRESS/MOTOR", address 128 to 135, motor 1 or 2, one or more a side. `counts_per_rev`: of the encoder a
+    wheel turn, gear included. `watchdog_s`: the serial timeout, which the driver sets before each arming, in steps of
+    0.1 s. `acceleration_rad_s2`: what the boards ramp a wheel with.
+    """
+
+    motors: tuple[_Motors, _Motors]
+    counts_per_rev: Annotated[float, Meta(gt=0.0, le=1e7)]
+    watchdog_s: Annotated[float, Meta(ge=0.1, le=0.5)]
+    direction: tuple[Sign, Sign] = (1, 1)
+    acceleration_rad_s2: Annotated[float, Meta(gt=0.0, le=1000.0)] = 100.0
+    stop_deceleration_rad_s2: Annotated[float, Meta(gt=0.0, le=655.0)] = 10.0
+
+    @property
+    def sides(self) -> tuple[tuple[tuple[int, int], ...], tuple[tuple[int, int], ...]]:
+        """Address and motor (0 or 1) of each motor, on the left and on the right."""
+        left, right = ((side,) if isinstance(side, str) else side for side in self.motors)
+        return tuple(map(_place, left)), tuple(map(_place, right))
+
+    @property
+    def addresses(self) -> tuple[int, ...]:
+        """Of the boards, each once."""
+        return tuple(dict.fromkeys(address for side in self.sides for address, _ in side))
+
+    @property
+    def counts_per_rad(self) -> float:
+        """Encoder counts in a radian of the wheel."""
+        return self.counts_per_rev / (2.0 * math.pi)
+
+    @property
+    def timeout_ds(self) -> int:
+        """The serial timeout in the boards' steps of 0.1 s."""
+        return round(10.0 * self.watchdog_s)
+
+    def fault(self) -> SettingsFault | None:
+        """What no single field shows."""
+        named = [name for side in self.motors for name in ((side,) if isinstance(side, str) else side)]
+        wrong = [name for name in named if not _is_place(name)]
+        if wrong or not named or () in self.motors:
+            found = f'"{wrong[0]}" is no motor' if wrong else "a side has no motor"
+            return SettingsFault(
+                "motors", found, 'write [left, right] such as ["128/1", "128/2"], addresses 128 to 135'
+            )
+        places = [place for side in self.sides for place in side]
+        if len(set(places)) != len(places):
+            return SettingsFault("motors", "a motor stands there twice", "write each once")
+        if abs(10.0 * self.watchdog_s - self.timeout_ds) > 1e-6:
+            return SettingsFault("watchdog_s", f"{self.watchdog_s:g} is no multiple of 0.1", "write 0.2")
+        return None
+
+
+class RoboclawExchange:
+    """Satisfies `drivers.types.Exchange`; a frame's identifier is address and command, its data the packet."""
+
+    timeout_s = 0.02
+    quiet_s = 0.012
+
+    def request(self, frame: Frame) -> bytes:
+        """The packet as it stands."""
+        return frame.data
+
+    def is_answered(self, _frame: Frame) -> bool:
+        """Every packet is, by one byte or by what it asks for."""
+        return True
+
+    def reply(self, frame: Frame, received: bytes) -> Frame | None:
+        """The reply whole, with the CRC that fits this request alone; of a packet that sets something 0xFF."""
+        address, command = divmod(frame.can_id, 256)
+        name = getter_name(command)
+        if name is None:
+            return Frame(frame.can_id, ACKNOWLEDGE) if received[:1] == ACKNOWLEDGE else None
+        found = reply(address, name, received)
+        return None if found is None else Frame(frame.can_id, received[: found[1]])
+
+
+def setting(address: int, name: str, **values: int) -> Frame:
+    """The packet that sets something."""
+    return Frame(address << 8 | SETTERS[name].command, set_bytes(address, name, **values))
+
+
+def question(address: int, name: str) -> Frame:
+    """The packet that asks for something."""
+    return Frame(address << 8 | GETTERS[name].command, ask_bytes(address, name))
+
+
+def stop_frames(settings: RoboclawSettings) -> tuple[Frame, ...]:
+    """Zero duty for every board, and the question whether its motors stand; nothing latches it."""
+    return (
+        *(setting(address, "duty_m1m2", duty_m1=0, duty_m2=0) for address in settings.addresses),
+        *(question(address, "speeds") for address in settings.addresses),
+    )
+
+
+def stop_confirmation(settings: RoboclawSettings) -> Callable[[Frame], bool]:
+    """Return what says, reply by reply, whether every board took the stop and its motors stand since."""
+    taken = dict.fromkeys(settings.addresses, False)
+    standing = dict.fromkeys(settings.addresses, False)
+
+    def heard(frame: Frame) -> bool:
+        address, command = divmod(frame.can_id, 256)
+        if address in taken and command == SETTERS["duty_m1m2"].command:
+            taken[address] = True
+        elif address in taken and command == GETTERS["speeds"].command:
+            found = reply(address, "speeds", frame.data)
+            standing[address] = found is not None and stands(settings, found[0]["speed_m1"], found[0]["speed_m2"])
+        return all(taken.values()) and all(standing.values())
+
+    return heard
+
+
+def stands(settings: RoboclawSettings, *speeds_counts_s: Value) -> bool:
+    """Whether these motors' speeds are those of wheels at rest."""
+    return all(abs(float(speed)) < STANDS_RAD_S * settings.counts_per_rad for speed in speeds_counts_s)
+
+
+def cyclic_frames(settings: RoboclawSettings, command_rate_hz: float, _authenticated: bool) -> tuple[CyclicFrame, ...]:
+    """A command, speeds and counts of each board in each tick, and one question more; request and reply in turn."""
+    each = {"speed command": 16 + 1, "speeds": 2 + 10, "encoders": 2 + 10}
+    frames = [
+        CyclicFrame(f"{name} of {address}", "LINE", length, command_rate_hz, length, _TURNAROUND_S)
+        for address in settings.addresses
+        for name, length in each.items()
+    ]
+    return (*frames, CyclicFrame("status", "LINE", 8, command_rate_hz, 8, _TURNAROUND_S))
+
+
+def safety_card(settings: RoboclawSettings) -> SafetyCard:
+    """Who stops the robot when."""
+    return SafetyCard(
+        host_silent=f"each board {settings.watchdog_s:g} s after the last packet of any kind, by its serial timeout, "
+        "which is set and read back before each arming",
+        stops_by="stopping both motors, braking or coasting as the board is set",
+        reaction_s=settings.watchdog_s,
+        brakes=False,
+        estop="through the daemon first, as two must not speak at once; zero duty for every board, which nothing "
+        "latches but this driver and nothing confirms but standing motors: wire a button to S3, S4 or S5",
+        unverified=(
+            "whether a motor that is stopped brakes or coasts; which packets feed the timeout is the manual's word",
+            "not tried on hardware: the driver was tried against a simulator made from the manual and the vendor's "
+            "host libraries",
+        ),
+        setup=(
+            "Motion Studio: packet serial at link.baud, each board its own address, encoders and velocity PID tuned "
+            "(QPPS is taken as the fastest speed)",
+        ),
+    )
+
+
+def _is_place(name: str) -> bool:
+    found = _MOTOR.fullmatch(name)
+    return found is not None and FIRST_ADDRESS <= int(found[1]) <= LAST_ADDRESS
+
+
+def _place(name: str) -> tuple[int, int]:
+    address, _, motor = name.partition("/")
+    return int(address), int(motor) - 1
