@@ -31,6 +31,8 @@ ROOTS = (
 LINK_ROOTS = (
     "disco_serial_init", "disco_serial_feed", "disco_serial_encode", "disco_record_pack", "disco_record_unpack",
 )  # fmt: skip
+# The compiler's helpers for doubles and for divisions of 64 bits: hundreds of instructions each.
+SLOW = re.compile(r"__aeabi_(?:u?ldivmod|d\w+|\w*2d)\b")
 ROWS = {
     "code": "code of the core, bytes",
     "constants": "constants of the core, bytes",
@@ -57,8 +59,10 @@ def sizes(processor: str, folder: Path, roots: tuple[str, ...]) -> tuple[int, in
          f"-Wl,-e,{roots[0]}", *wanted, *(str(FIRMWARE / name) for name in SOURCES), "-o", str(linked)],
         check=True,
     )  # fmt: skip
-    size = COMPILER.removesuffix("gcc") + "size"
-    listed = subprocess.run([size, "-A", str(linked)], capture_output=True, text=True, check=True).stdout
+    tools = COMPILER.removesuffix("gcc")
+    wants = subprocess.run([f"{tools}objdump", "-r", str(linked)], capture_output=True, text=True, check=True).stdout
+    assert not SLOW.findall(wants), f"the core has doubles or divides 64 bits: {SLOW.findall(wants)}"
+    listed = subprocess.run([f"{tools}size", "-A", str(linked)], capture_output=True, text=True, check=True).stdout
     found = [(name, int(count)) for name, count in re.findall(r"^\.(\w+)\S*\s+(\d+)", listed, re.MULTILINE)]
     assert not sum(count for name, count in found if name in ("bss", "data")), "the core has no variables of its own"
     return tuple(sum(count for name, count in found if name == kind) for kind in ("text", "rodata"))  # type: ignore[return-value]

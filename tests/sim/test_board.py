@@ -21,7 +21,7 @@ from sim.fault_schedule import schedule_of
 from sim.plant import Plant
 from sim.plant_parameters import PlantParameters
 from tests.firmware_protocol.other_end import LinkEnd
-from tests.firmware_protocol.ports.posix_board import build_board, running_board
+from tests.firmware_protocol.ports.posix_board import build_board, prefer, running_board
 from tests.firmware_protocol.protocol_host import ProtocolHost
 
 
@@ -38,6 +38,7 @@ class SimProcess:
         command = [sys.executable, "-m", "disco_hw", "sim", str(robot_file), "--board", port]
         self.truth = folder / "truth.csv"
         self.process = subprocess.Popen([*command, "--truth", str(self.truth)], stdout=subprocess.PIPE, text=True)
+        prefer(self.process)
         assert self.process.stdout.readline().startswith(f"ready the board on plant's line {port}")
 
     def row(self):

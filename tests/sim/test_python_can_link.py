@@ -13,7 +13,7 @@ from sim.hub import Hub
 from sim.python_can_link import RETRY_NS, JoinError, PythonCanLink, joined
 from sim.robot_link import LinkFaultError
 from tests.firmware_protocol.other_end import LinkEnd
-from tests.firmware_protocol.ports.posix_board import build_board, running_board
+from tests.firmware_protocol.ports.posix_board import build_board, prefer, running_board
 from tests.firmware_protocol.protocol_host import ProtocolHost
 
 FRAME = Frame(0x100, bytes(range(8)))
@@ -129,6 +129,7 @@ class HubProcess:
     def __init__(self, path, terminal, *options):
         command = [sys.executable, "-m", "sim.hub", str(path), "--join", "slcan", terminal, *options]
         self.process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        prefer(self.process)
 
     def __enter__(self):
         assert self.process.stdout.readline().startswith("ready"), self.process.stderr.read()

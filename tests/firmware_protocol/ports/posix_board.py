@@ -24,6 +24,12 @@ def build_board(folder, *options):
     return program
 
 
+def prefer(process):
+    """Give a process that has just started priority: what a busy computer holds up looks to its peers like a hang."""
+    with contextlib.suppress(OSError):
+        os.sched_setscheduler(process.pid, os.SCHED_FIFO, os.sched_param(30))
+
+
 @dataclass(frozen=True)
 class Board:
     """A running board: the terminals of its link and of its plant's line."""
@@ -43,9 +49,7 @@ def running_board(program):
     (link, _), (plant, _) = ends
     environment = {"LINK": str(link), "PLANT": str(plant)}
     process = subprocess.Popen([str(program)], pass_fds=(link, plant), env=environment)
-    with contextlib.suppress(OSError):
-        # What a busy computer holds up is late, and looks to its peers like a board that hangs.
-        os.sched_setscheduler(process.pid, os.SCHED_FIFO, os.sched_param(30))
+    prefer(process)
     try:
         yield Board(os.ttyname(ends[0][1]), os.ttyname(ends[1][1]), process)
     finally:

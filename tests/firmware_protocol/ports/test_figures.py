@@ -1,6 +1,10 @@
 """The check of what the firmware costs: a tenth more is seen, and a worst step too far above the mean."""
 
-from tools.firmware_figures import DOCUMENT, ROWS, complaints, documented, table
+import pytest
+
+from tools import firmware_figures
+from tools.emulated_board import PROCESSORS, missing
+from tools.firmware_figures import DOCUMENT, ROWS, complaints, documented, measure, sizes, table
 
 FIGURES = documented(DOCUMENT.read_text("utf-8"))
 
@@ -34,3 +38,28 @@ def test_a_step_that_takes_more_than_three_times_the_mean_is_told():
         low = FIGURES["m4f"][f"{key}step_worst"] // 3 - 1
         (told,) = complaints(changed("m4f", f"{key}step_mean", low), FIGURES)
         assert "three times the mean" in told
+
+
+emulated = pytest.mark.skipif(bool(missing()), reason=missing() or "all there")
+
+
+@pytest.mark.long
+@emulated
+@pytest.mark.parametrize("processor", PROCESSORS)
+def test_what_is_measured_is_not_a_tenth_above_the_document(processor):
+    assert complaints({processor: measure(processor)}, FIGURES) == []
+
+
+@pytest.mark.long
+@emulated
+@pytest.mark.parametrize("operation", ["(uint32_t)(core->now_us / 1000u)", "(uint32_t)((double)core->now_us * 0.5)"])
+def test_a_core_that_divides_64_bits_or_has_doubles_is_not_measured(operation, tmp_path, monkeypatch):
+    for source in firmware_figures.FIRMWARE.iterdir():
+        (tmp_path / source.name).write_bytes(source.read_bytes())
+    step = tmp_path / "firmware.c"
+    text = step.read_text("utf-8")
+    step.write_text(text.replace("disco_supervise(core);", f"core->reject_reason += {operation};", 1), "utf-8")
+    assert step.read_text("utf-8") != text
+    monkeypatch.setattr(firmware_figures, "FIRMWARE", tmp_path)
+    with pytest.raises(AssertionError, match="doubles or divides 64 bits"):
+        sizes("m3", tmp_path, firmware_figures.ROOTS)
