@@ -18,6 +18,7 @@ from disco_hw.gap.data.gridded_drive import grid_drive
 from disco_hw.gap.data.layout import BASE_COUNT, BODY, DELAYED_BY, WHEEL, Layout
 from disco_hw.gap.report.amend import amended_model, at_joint_fit, carried_terms, channel_estimates, simple_model
 from disco_hw.gap.report.findings import STAGES, GapReport
+from disco_hw.gap.report.injection import finder, proved
 from disco_hw.gap.report.judge import (
     Measured,
     blind_spot_findings,
@@ -52,15 +53,17 @@ def find_gap(
     model: Model,
     progress: Progress | None = None,
     pictures: bool = False,
+    prove: bool = False,
     top_rad_s: float | None = None,
     settings: GapSettings = DEFAULT_SETTINGS,
 ) -> GapReport:
     """Find where logs and model disagree, name what is missing, amend the model and show the gap shrink.
 
     `logs`: one drive or several of one robot. `model`: nominal geometry, with the effects that are known already;
-    those are refitted, not reported. `progress` hears what is being done; `pictures` draws them too. `top_rad_s`: the
-    robot's largest wheel speed, without which it is not known to which speed limits the logs are blind. `settings`: all
-    thresholds. Raises LogError if the logs hold too little to judge either channel.
+    those are refitted, not reported. `progress` hears what is being done; `pictures` draws them too; `prove` puts
+    effects into the log to see whether those it is said to show are found. `top_rad_s`: the robot's largest wheel
+    speed, without which it is not known to which speed limits the logs are blind. `settings`: all thresholds. Raises
+    LogError if the logs hold too little to judge either channel.
     """
     began = time.perf_counter()
     say = progress or (lambda text: None)
@@ -74,13 +77,16 @@ def find_gap(
     predictions = joint_predictions(analysis, final) if analysis.body is not None else None
     gap = {} if predictions is None else predictions.table()
     offered = offered_stage(gap, bool(named or unnamed), settings)
-    amended, remarks = _model_of(offered, model, analysis, final, predictions)
+    spots = blind_spot_findings(analysis, named, top_rad_s)
+    if prove:
+        spots = proved(spots, finder(analysis, say), settings.report.proved_claims)
+    amended, remarks = model_of(offered, model, analysis, final, predictions)
     return GapReport(
         sources=log.sources,
         channels=channel_findings(analysis, named, unnamed),
         effects=effects,
         unnamed=unnamed,
-        blind_spots=blind_spot_findings(analysis, named, top_rad_s),
+        blind_spots=spots,
         gap=gap,
         model=amended,
         offered=offered,
@@ -109,7 +115,7 @@ def offered_stage(gap: Mapping[str, Mapping[float, PredictionErrors]], found: bo
     return plainer
 
 
-def _model_of(
+def model_of(
     stage: str, model: Model, analysis: GapAnalysis, final: FinalFit, predictions: StagePredictions | None
 ) -> tuple[Model, tuple[str, ...]]:
     """The model of a stage with the joint Gaussian of its parameters, and notes."""
@@ -241,7 +247,7 @@ def gap(
     config = load_robot_config(robot)
     start = load_model(model) if model is not None else Model.nominal(config.robot)
     drive = load_drive(list(logs), config.robot.ticks_per_rev, config.robot.wheel_radius_m)
-    report = find_gap(drive, start, progress, pictures=True, top_rad_s=config.robot.max_wheel_speed_rad_s)
+    report = find_gap(drive, start, progress, pictures=True, prove=True, top_rad_s=config.robot.max_wheel_speed_rad_s)
     try:
         out.mkdir(parents=True, exist_ok=True)
         (out / "report.json").write_text(as_json(report.as_dict(), indent=1), encoding="utf-8")

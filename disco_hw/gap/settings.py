@@ -306,6 +306,8 @@ class ReportSettings:
 
     usual_inflation: float = 1.5
     """Inflation of the variance that is expected of an effect that is not there. Chosen."""
+    proved_claims: int = 3
+    """So many claims of what a log shows are proved by putting the effect in. Chosen: each takes a search or two."""
     asked_share: float = 0.75
     """A limit shows only where this share of what the robot can do is asked. Chosen."""
     rest_rad_s: float = 0.1

@@ -9,7 +9,8 @@ import pytest
 
 from disco_hw.gap import find
 from disco_hw.gap.find import WRITTEN
-from disco_hw.gap.search.stages import stage_predictions
+from disco_hw.gap.search.analysis import final_fit
+from disco_hw.gap.search.stages import joint_predictions
 from disco_hw.model import Model, load_model
 from tools.gap_logs import simulated_drive
 
@@ -18,10 +19,11 @@ MODEL = Model(0.061, 0.415, 0.238)
 
 @pytest.fixture(scope="module")
 def searched():
-    """A log in which something is hidden, what the search finds in it, and the gap that is left, each made once."""
+    """A log in which something is hidden, what the search finds in it, and its predictions, each made once."""
     log = simulated_drive({"motor_lag": 0.15}, 1, "circle")
     analysis, notes = find.search(log, MODEL)
-    return log, analysis, notes, stage_predictions(analysis).table()
+    predictions = joint_predictions(analysis, final_fit(analysis))
+    return log, analysis, notes, SimpleNamespace(table=predictions.table().copy, joint=predictions.joint)
 
 
 def robot_toml(generator):
@@ -47,11 +49,12 @@ def of_geometry(analysis, radius_m, axial_m):
 
 def written(searched, monkeypatch, folder, seeds):
     """Whether each of some random robots is judged as slow to turn; the files of all were written and are sound."""
-    log, analysis, notes, gap = searched
+    log, analysis, notes, predictions = searched
     slow = []
     monkeypatch.setattr(find, "load_drive", lambda *_: log)
-    # Neither depends on the robot's limits, and each takes long.
-    monkeypatch.setattr(find, "stage_predictions", lambda *_: SimpleNamespace(table=lambda: gap))
+    # None depends on the robot's limits, and each takes long.
+    monkeypatch.setattr(find, "joint_predictions", lambda *_: predictions)
+    monkeypatch.setattr(find, "proved", lambda spots, *_: spots)
     monkeypatch.setattr(find, "_drawn", lambda *_: {"picture": b"PNG"})
     for seed in seeds:
         (radius_m, axial_m, fastest_rad_s), text = robot_toml(np.random.default_rng([23, seed]))

@@ -24,6 +24,7 @@ class BlindSpot:
     """An effect that was not found: the parameter that measures it, its smallest visible size, None if none is.
 
     For a limit it is the largest that would have been seen. `blind` if realistic sizes would have stayed hidden.
+    `proved`: whether a search found it when it was put into this very log; None if that was not tried.
     """
 
     name: str
@@ -32,6 +33,7 @@ class BlindSpot:
     smallest_visible: float | None
     blind: bool
     experiment: str
+    proved: bool | None = None
 
 
 def blind_spots(found: ChannelResult, top_rad_s: float | None = None) -> tuple[BlindSpot, ...]:
@@ -47,16 +49,25 @@ def blind_spots(found: ChannelResult, top_rad_s: float | None = None) -> tuple[B
             if effect.mimics is not None and effect.mimics.effect.name == spot.name:
                 parameter = next(p for p in effect.parameters if p.realistic is not None)
                 size = spot.smallest_visible
-                blind = size is None or size > _realistic(parameter)
-                spots.append(BlindSpot(other, parameter.name, spot.unit, size, blind, experiment_of(other)))
+                spots.append(
+                    BlindSpot(other, parameter.name, spot.unit, size, is_blind(other, size), experiment_of(other))
+                )
     return tuple(spots)
 
 
 def _spot(found: ChannelResult, name: str) -> BlindSpot:
     parameter = REGISTRY[name].parameters[0]
     size = _size(found, name, f"{name}.{parameter.name}")
-    blind = size is None or size > _realistic(parameter)
-    return BlindSpot(name, parameter.name, parameter.unit, size, blind, experiment_of(name))
+    return BlindSpot(name, parameter.name, parameter.unit, size, is_blind(name, size), experiment_of(name))
+
+
+def is_blind(name: str, size: float | None) -> bool:
+    """Whether realistic sizes stay hidden where this is the smallest visible one; of a limit, the largest."""
+    effect = REGISTRY[name]
+    realistic = _realistic(next((p for p in effect.parameters if p.realistic is not None), effect.parameters[0]))
+    if effect.is_limit:
+        return size is None or (size < realistic < math.inf)
+    return size is None or size > realistic
 
 
 def _realistic(parameter: Parameter) -> float:

@@ -146,6 +146,7 @@ class GapReport:
                     "smallest_visible": spot.smallest_visible,
                     "blind": spot.blind,
                     "experiment": spot.experiment,
+                    "proved": spot.proved,
                 }
                 for spot in self.blind_spots
             ],

@@ -196,10 +196,15 @@ def _candidates(report: GapReport) -> str:
     return _table(("channel", "effect", "gain, nats", score, "verdict"), rows)
 
 
+_PROOFS = {None: "", True: "put into this log, it is found", False: "put into this log, it is not found"}
+
+
 def _blind(report: GapReport) -> str:
     rows = []
     for spot in report.blind_spots:
         size = "never" if spot.smallest_visible is None else f"{spot.smallest_visible:.3g} {spot.unit}"
-        rows.append((spot.name, size, "blind to realistic sizes" if spot.blind else "", spot.experiment))
+        rows.append(
+            (spot.name, size, _PROOFS[spot.proved], "blind to realistic sizes" if spot.blind else "", spot.experiment)
+        )
     ask = f"<p>All of it in a minute: <code>{escape(report.drive)}</code>.</p>" if report.drive else ""
-    return ask + _table(("effect", "smallest visible", "", "the drive that shows it"), rows)
+    return ask + _table(("effect", "smallest visible", "proof", "", "the drive that shows it"), rows)

@@ -1,0 +1,146 @@
+"""What models learnt from one half of a measured log predict of the other, end to end: the table of `docs/gap.md`.
+
+`DISCO_HW_DATA=FOLDER python -m tools.gap_halves [NAME...]`: logs whose path holds a NAME, all without one. For either
+half: the stage that is offered, and the errors 2 s ahead on the half that was not seen, of every stage.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+
+# Each process works alone on one log: a second thread for its small matrices would only be in another one's way.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import numpy as np
+
+from disco_hw.gap.data.gridded_drive import GriddedDrive, grid_drive
+from disco_hw.gap.data.layout import BODY, DELAYED_BY, WHEEL, Layout
+from disco_hw.gap.find import model_of, offered_stage, search
+from disco_hw.gap.noise.body_noise import BodyNoise
+from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
+from disco_hw.gap.noise.wheel_noise import WheelNoise
+from disco_hw.gap.search.analysis import final_fit
+from disco_hw.gap.search.cross_validation import Chain, PredictionErrors, errors_of, smoothed_poses
+from disco_hw.gap.search.stages import joint_predictions
+from disco_hw.gap.search.unnamed_terms import with_known_terms
+from disco_hw.gap.settings import DEFAULT_SETTINGS
+from disco_hw.log.drive import DriveLog
+from disco_hw.log.load import load_drive
+from disco_hw.model import Model
+
+# Ticks per revolution, nominal wheel radius and axial distance (m) of the robots whose logs lie in a folder.
+ROBOTS = {
+    "husky": (2048.0, 0.161827, 0.480865),
+    "warthog": (2048.0, 0.3, 1.08),
+    "optiodom": (2796.8, 0.042, 0.2),
+}
+STAGES = ("refitted", "timed", "amended")
+
+
+@dataclass(frozen=True)
+class Half:
+    """What one half of a log taught: the stage offered, and by stage the errors 2 s ahead on the other half."""
+
+    log: str
+    half: int
+    offered: str
+    names: tuple[str, ...]
+    unseen: dict[str, PredictionErrors]
+    cpu_s: float
+
+    def ratios(self, stage: str) -> tuple[float, float]:
+        """Errors of a stage over those of `timed`, of position and of heading."""
+        one, timed = self.unseen[stage], self.unseen["timed"]
+        return one.position_m / timed.position_m, one.yaw_rad / timed.yaw_rad
+
+
+def between(log: DriveLog, low_s: float, high_s: float) -> DriveLog:
+    """The samples of a log in a span of time."""
+
+    def cut(part):  # type: ignore[no-untyped-def]
+        keep = (part.t_s >= low_s) & (part.t_s < high_s)
+        columns = {each.name: getattr(part, each.name) for each in fields(part)}
+        chosen = {name: value[keep] for name, value in columns.items() if isinstance(value, np.ndarray)}
+        return replace(part, **chosen)
+
+    return replace(log, commands=cut(log.commands), wheels=cut(log.wheels), poses=cut(log.poses), gyro=cut(log.gyro))
+
+
+def vector(layout: Layout, model: Model) -> np.ndarray:
+    """A model's parameters as a channel's vector."""
+    found = layout.neutral.copy()
+    for name, value in zip(model.parameter_names, model.point(), strict=True):
+        if name in layout.place:
+            found[layout.place[name]] = value
+    return found
+
+
+def unseen_errors(drive: GriddedDrive, models: dict[str, Model], ahead_s: float = 2.0) -> dict[str, PredictionErrors]:
+    """Errors of models on a drive, all from the same smoothed poses."""
+    poses, errors = None, {}
+    for stage, model in models.items():
+        body_vector, wheel_vector = vector(BODY, model), vector(WHEEL, model)
+        known = with_known_terms(drive, model.effects, body_vector, WHEEL.at(wheel_vector, DELAYED_BY))
+        body = BodyChannel.build(known, BodyNoise(), body_vector)
+        wheels = WheelChannel.build(known, WheelNoise(), body_vector[:3]) if drive.has_commands else None
+        poses = smoothed_poses(body, body_vector) if poses is None else poses
+        chain = Chain(body_vector, None if wheels is None else wheel_vector)
+        errors[stage] = errors_of(body, wheels, {0: chain, 1: chain}, ahead_s, poses)
+    return errors
+
+
+def halves(path: Path) -> Iterator[Half]:
+    """Both halves of a log, each learnt from and the other one predicted."""
+    ticks, radius_m, axial_m = ROBOTS[path.parent.name]
+    log, nominal = load_drive(path, ticks, radius_m), Model(radius_m, axial_m, 0.0)
+    middle_s = 0.5 * (float(log.wheels.t_s[0]) + float(log.wheels.t_s[-1]))
+    parts = between(log, -np.inf, middle_s), between(log, middle_s, np.inf)
+    for half in (0, 1):
+        began = time.process_time()
+        analysis, _ = search(parts[half], nominal)
+        if analysis.body is None:
+            continue
+        final = final_fit(analysis)
+        predictions = joint_predictions(analysis, final)
+        offered = offered_stage(predictions.table(), analysis.found_any, DEFAULT_SETTINGS)
+        cpu_s = time.process_time() - began
+        models = {stage: model_of(stage, nominal, analysis, final, predictions)[0] for stage in STAGES}
+        names = tuple(
+            name for found in (analysis.wheels, analysis.body) if found is not None
+            for name in (*found.names, *(term.form for term in found.unnamed))
+        )  # fmt: skip
+        errors = unseen_errors(grid_drive(parts[1 - half]), models)
+        yield Half(path.stem, half + 1, offered, names, errors, cpu_s)
+
+
+def row(of: Half) -> str:
+    """One line of the table: mm and mrad by stage, and the offered one against `timed`."""
+    cells = [f"{1e3 * of.unseen[stage].position_m:.1f} / {1e3 * of.unseen[stage].yaw_rad:.0f}" for stage in STAGES]
+    position, yaw = of.ratios(of.offered)
+    return f"| {of.log} {of.half} | {' | '.join(cells)} | {of.offered} | {position:.2f} / {yaw:.2f} |"
+
+
+def main(names: Sequence[str]) -> int:
+    folder = Path(os.environ["DISCO_HW_DATA"])
+    paths = [path for robot in ROBOTS for path in sorted((folder / robot).glob("*.csv"))]
+    paths = [path for path in paths if not names or any(name in str(path) for name in names)]
+    print("| log, half learnt from | refitted, mm / mrad | timed | amended | offered | offered over timed |")
+    print("|---|---|---|---|---|---|")
+    found = []
+    for path in paths:
+        for half in halves(path):
+            found.append(half)
+            print(row(half), flush=True)
+    worse = [half for half in found if half.offered != "timed" and max(half.ratios(half.offered)) > 1.05]
+    better = [half for half in found if min(half.ratios(half.offered)) < 0.8 and max(half.ratios(half.offered)) <= 1.05]
+    print(f"\noffered worse than timed by over 5 %: {len(worse)} of {len(found)}; better by 20 %: {len(better)}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
