@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import disco_hw
+import disco_hw.errors
 
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs" / "python.md").read_text(encoding="utf-8")
@@ -40,6 +41,17 @@ def test_every_name_is_there_described_and_on_the_page(name):
 def test_every_name_is_in_the_reference_that_is_made_from_docstrings():
     made = re.findall(r"^::: disco_hw\.(\w+)$", (ROOT / "docs" / "api.md").read_text(encoding="utf-8"), re.MULTILINE)
     assert sorted(made) == sorted(set(disco_hw.__all__) - {"__version__"})
+
+
+def test_files_are_named_by_text_as_the_page_does(tmp_path):
+    model = disco_hw.Model.nominal(disco_hw.load_robot(str(ROOT / "disco_hw/robots/wombot.toml")).robot)
+    disco_hw.save_model(model, str(tmp_path / "model.toml"))
+    assert disco_hw.load_model(str(tmp_path / "model.toml")) == model
+    (tmp_path / "drive.csv").write_text(CSV, encoding="utf-8")
+    for named in (str(tmp_path / "drive.csv"), [str(tmp_path / "drive.csv")]):
+        assert len(disco_hw.read_log(named).poses.t_s) == 2
+    with pytest.raises(disco_hw.errors.InputError, match=r"^nowhere.toml: "):
+        disco_hw.load_robot("nowhere.toml")
 
 
 def test_any_other_name_is_not():

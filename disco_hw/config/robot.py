@@ -248,11 +248,12 @@ class RobotConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     ros2: Ros2 = Ros2()
 
 
-def load_robot_config(path: Path) -> RobotConfig:
+def load_robot_config(path: Path | str) -> RobotConfig:
     """Read and validate robot.toml, and none of the files that it names.
 
     Raises InputError with one line naming file, field and remedy.
     """
+    path = Path(path)
     raw = read_toml(path, ROBOT_TOML)
     config = _without_task(path, raw)
     config = msgspec.structs.replace(config, task=_task_of(path, raw.get("task", {})))

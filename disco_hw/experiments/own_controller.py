@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from disco_hw.config import RobotConfig
 from disco_hw.control.law import Controller, Law
 from disco_hw.errors import InputError
 from disco_hw.experiments.simulated_time import SimulatedRun, virtual_robot
@@ -52,11 +54,12 @@ def drive_virtual(
 ) -> VirtualDrive:
     """Drive the task of a robot.toml on a virtual robot, in simulated time, from the task's start; see `VirtualDrive`.
 
-    The daemon's own tick: driver, firmware, estimation, limits and supervision are those of the real robot. `law`:
-    yours; DISCO if None. `hide`: effects that the plant has and the model lacks (`disco-hw sim --list-effects`). `log`:
-    an MCAP file to write. Raises InputError for wrong files and effects, WorkError if the robot refuses to start.
+    The daemon's own tick: estimation, limits and supervision are those of the real robot. Its controller is the
+    reference firmware, which sends the poses, whatever [link], [wheels] and [pose] say. `law`: yours; DISCO if None.
+    `hide`: effects that the plant has and the model lacks (`disco-hw sim --list-effects`). `log`: an MCAP file to
+    write. Raises InputError for wrong files and effects, WorkError if the robot refuses to start.
     """
-    setup = load_setup(Path(robot), None if model is None else Path(model))
+    setup = _at_the_reference_controller(load_setup(Path(robot), None if model is None else Path(model)))
     if log is not None:
         refuse_file(Path(log))
     start = BodyPose(*setup.config.task.course().start)
@@ -78,6 +81,12 @@ def drive_virtual(
         run.write_log(Path(log))
     table = np.array(rows, dtype=np.float64).reshape(-1, 7)
     return VirtualDrive(table[:, 0], table[:, 1:4], table[:, 4], table[:, 5:7], run.core.progress.laps, tuple(events))
+
+
+def _at_the_reference_controller(setup: Setup) -> Setup:
+    usual = {field.name: field.default for field in msgspec.structs.fields(RobotConfig)}
+    kept = {section: usual[section] for section in ("link", "wheels", "pose")}
+    return replace(setup, config=msgspec.structs.replace(setup.config, **kept))
 
 
 def _planner(setup: Setup, law: Law | None) -> Planner:

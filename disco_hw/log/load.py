@@ -159,14 +159,16 @@ _COPIED_SHARE = 0.5
 
 
 def load_drive(
-    paths: Path | Sequence[Path], ticks_per_rev: float | None = None, wheel_radius_m: float | None = None
+    paths: Path | str | Sequence[Path | str],
+    ticks_per_rev: float | None = None,
+    wheel_radius_m: float | None = None,
 ) -> DriveLog:
     """One log or several as one drive: our MCAP logs and CSV files, told apart by their content.
 
     `ticks_per_rev` and the nominal `wheel_radius_m` come from robot.toml and serve CSV files only. Raises LogError with
     one line for the first file that cannot be used, or that is there already.
     """
-    several = [paths] if isinstance(paths, Path) else list(paths)
+    several = [Path(path) for path in ([paths] if isinstance(paths, Path | str) else paths)]
     if not several:
         raise LogError("no log given; give at least one")
     for place, path in enumerate(several):

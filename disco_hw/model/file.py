@@ -59,8 +59,9 @@ class _File(msgspec.Struct, forbid_unknown_fields=True):
     belief: _BeliefSection | None = None
 
 
-def load_model(path: Path) -> Model:
+def load_model(path: Path | str) -> Model:
     """Read and validate a model file; raises InputError with one line naming file, field and remedy."""
+    path = Path(path)
     raw = read_toml(path, MODEL_TOML)
     try:
         content = msgspec.convert(raw, _File)
@@ -129,17 +130,17 @@ def _array(values: Vector | Matrix, what: str) -> np.ndarray:
         raise ValueError(f"{what} has rows of different lengths") from None
 
 
-def save_model(model: Model, path: Path) -> None:
+def save_model(model: Model, path: Path | str) -> None:
     """Write a model file that `load_model` reads back to the same numbers, bit for bit.
 
     Raises OSError; a file that was there is then as it was.
     """
-    text = model_text(model).encode()
-    if path.exists() and not path.is_file():
+    text, given = model_text(model).encode(), Path(path)
+    if given.exists() and not given.is_file():
         # A pipe or a terminal; nothing can take its place.
-        path.write_bytes(text)
+        given.write_bytes(text)
         return
-    target = path.resolve()
+    target = given.resolve()
     new = target.with_name(f".{target.name}.new")
     try:
         with new.open("wb") as file:

@@ -15,6 +15,7 @@ import pytest
 import disco_hw
 from disco_hw import drive_virtual
 from disco_hw.errors import InputError
+from disco_hw.experiments.live_stack import with_device
 from disco_hw.log.reader import open_log
 
 ROOT = Path(disco_hw.__file__).parents[1]
@@ -81,6 +82,14 @@ def test_a_law_that_has_no_answer_for_a_while_stops_the_robot_until_it_has_one(t
     assert any("two finite wheel speeds" in event for event in drive.events)
     with open_log(tmp_path / "mine.mcap") as log:
         assert log.summary().missing_ticks == 0
+
+
+def test_a_robot_with_another_controller_and_other_poses_is_played_too(tmp_path):
+    text = ROBOT.read_text("utf-8").replace('"wombot_model.toml"', f'"{ROBOT.parent / "wombot_model.toml"}"')
+    mine = tmp_path / "mine.toml"
+    mine.write_text(with_device(text, "odrive"), encoding="utf-8")
+    drive = drive_virtual(mine, lambda *_: (2.0, 2.0), 1.0)
+    assert drive.speeds[-1] > 0.05
 
 
 def test_an_effect_that_does_not_exist_is_refused_in_one_line():

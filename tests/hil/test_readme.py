@@ -1,4 +1,4 @@
-"""The commands of the tutorial's part "By hand" and of the README's story, as they stand, in processes of their own."""
+"""The commands of the tutorials and of the README's story, as they stand, in processes of their own."""
 
 from __future__ import annotations
 
@@ -169,16 +169,20 @@ def laps(status) -> float:
     return float(status["task"]["laps"] or 0.0)
 
 
-def test_the_story_is_true(tmp_path):
-    reader = Reader(tmp_path, "README.md", "A story in ten lines")
+def test_what_the_model_misses_is_found_and_driven_with(tmp_path):
+    page = "docs/find-what-is-missing.md"
+    reader = Reader(tmp_path, page, "The commands")
+    only_in_readme = [line for line in commands_under("README.md", "A story in ten lines") if line not in reader.left]
+    # Run by tests/hil/test_gap_loop.py, with fewer laps.
+    assert only_in_readme == [["disco-hw", "experiment", "gap", "--hide", "deadband=0.8", "-o", "out/story"]]
     with reader.another_terminal(f"disco-hw sim {ROBOT} --hide deadband=0.8"):
         with reader.another_terminal(f"disco-hw run {ROBOT}"):
             reader.wait_for("READY")
-            reader.ctl("arm")
+            reader.type(f"disco-hw ctl {ROBOT} arm")
             reader.wait_for("ARMED")
-            reader.ctl("start")
+            reader.type(f"disco-hw ctl {ROBOT} start")
             reader.wait("on its way", lambda status: laps(status) > 0.1, 600.0)
-            reader.ctl("quit")
+            reader.type(f"disco-hw ctl {ROBOT} quit")
         reader.type(f"disco-hw drive {ROBOT} --script excite --unattended --log drive.mcap")
         said = reader.type(f"disco-hw gap drive.mcap --robot {ROBOT} -o out/gap")
         assert "deadband" in said
@@ -189,5 +193,7 @@ def test_the_story_is_true(tmp_path):
             reader.ctl("start")
             reader.wait("round the circle", lambda status: laps(status) > 1.0, 600.0)
             reader.ctl("quit")
-    # Run by tests/hil/test_gap_loop.py, with fewer laps.
-    assert reader.left == [["disco-hw", "experiment", "gap", "--hide", "deadband=0.8", "-o", "out/story"]]
+    assert not reader.left
+    (program,) = programs_under(page, "The same in Python")
+    assert re.search(r"deadband \{'width_rad_s': 0\.(79|8|81)\}", reader.untold([sys.executable, "-c", program]))
+    assert (tmp_path / "amended.toml").exists()
