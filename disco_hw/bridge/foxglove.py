@@ -1,7 +1,6 @@
 """`disco-hw view --live --foxglove`: what the daemon records, live to Foxglove, from the feed of the page.
 
-The topics are those of a log, with the same schemas and clock, so that one layout serves both. What a log has not,
-as its writer knows no robot, is `/view/scene`: the task's course and the robot's body.
+The topics are those of a log, with the same schemas and clock, so that one layout serves both.
 """
 
 from __future__ import annotations
@@ -13,14 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import foxglove
-from foxglove_schemas_protobuf.Color_pb2 import Color
-from foxglove_schemas_protobuf.CubePrimitive_pb2 import CubePrimitive
-from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
-from foxglove_schemas_protobuf.Point3_pb2 import Point3
-from foxglove_schemas_protobuf.Pose_pb2 import Pose
-from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
-from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
 from mcap_protobuf.schema import build_file_descriptor_set
 
 from disco_hw.config import RobotConfig, load_robot_config
@@ -29,12 +21,12 @@ from disco_hw.daemon.page_feed import FeedSubscriber, feed_path
 from disco_hw.daemon.signals import StopSignals
 from disco_hw.errors import InputError
 from disco_hw.log.encoding import encode_json, json_schema
-from disco_hw.log.mcap_log import VIEWS, views
+from disco_hw.log.mcap_log import SCENE, VIEWS, scene_message, views
 from disco_hw.log.records import TOPICS, FrameIn, FrameOut, Record, topic_of
+from disco_hw.runtime.robot_setup import scene_of
 
 DEFAULT_PORT = 8765
 LAYOUT = Path(__file__).with_name("foxglove_layout.json")
-SCENE = "/view/scene"
 _SCENE_S = 1.0
 _WAIT_S = 0.1
 
@@ -57,7 +49,7 @@ class Live:
     """A Foxglove server fed like the page."""
 
     def __init__(self, config: RobotConfig, host: str, port: int) -> None:
-        self._scene = scene_of(config)
+        self._scene = scene_message(scene_of(config))
         self._feed = FeedSubscriber(feed_path(socket_path(config)))
         self._next_scene_s = 0.0
         # Its channels are closed when nobody holds it any more.
@@ -109,24 +101,3 @@ class Live:
 
 def _schema_of_record(record: type[Record]) -> foxglove.Schema:
     return foxglove.Schema(name=record.__name__, encoding="jsonschema", data=json_schema(record))
-
-
-def scene_of(config: RobotConfig) -> bytes:
-    """The task's course in the world's frame, and the robot's body in its own."""
-    line = LinePrimitive(
-        type=LinePrimitive.LINE_STRIP,
-        pose=Pose(),
-        thickness=0.02,
-        color=Color(r=0.2, g=0.6, b=0.3, a=1.0),
-        points=[Point3(x=x, y=y, z=0.0) for x, y in config.task.course().outline_m().tolist()],
-    )
-    width, radius = config.robot.axial_distance_m, config.robot.wheel_radius_m
-    body = CubePrimitive(
-        pose=Pose(position=Vector3(x=0.0, y=0.0, z=1.5 * radius)),
-        size=Vector3(x=1.5 * width, y=0.75 * width, z=radius),
-        color=Color(r=0.9, g=0.6, b=0.1, a=0.8),
-    )
-    task = SceneEntity(id="task", frame_id="world", lines=[line])
-    robot = SceneEntity(id="robot", frame_id="robot", frame_locked=True, cubes=[body])
-    scene: bytes = SceneUpdate(entities=[task, robot]).SerializeToString()
-    return scene

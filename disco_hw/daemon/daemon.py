@@ -54,7 +54,7 @@ from disco_hw.runtime.assembly import (
 from disco_hw.runtime.core import CoreTick, DaemonCore
 from disco_hw.runtime.pilot import FindsWiring, Pilot, TaskPilot
 from disco_hw.runtime.pipeline import NoPlanner, Pipeline, Planner
-from disco_hw.runtime.robot_setup import Setup, kept_files, link_key, load_setup, refuse_missing_effects
+from disco_hw.runtime.robot_setup import Setup, kept_files, link_key, load_setup, refuse_missing_effects, scene_of
 from disco_hw.runtime.states import Ask, State, advice, by_command, headline
 from disco_hw.runtime.supervisor import Reply, UserRequest
 from disco_hw.runtime.task_change import TaskRefused, changed_task
@@ -515,7 +515,8 @@ def _make_recorder(setup: Setup, log: Path | None) -> Recorder:
         return NullRecorder()
     attachments = [*kept_files(setup), Attachment(DBC, "text/plain", packaged_dbc().encode())]
     name = setup.config.robot.name
-    return ProcessRecorder(RecordingSettings(log, name, version=version(), attachments=tuple(attachments)))
+    scene = scene_of(setup.config)
+    return ProcessRecorder(RecordingSettings(log, name, version=version(), attachments=tuple(attachments), scene=scene))
 
 
 def _close_recorder(recorder: Recorder, say: Say) -> None:

@@ -32,6 +32,14 @@ class Attachment(msgspec.Struct, frozen=True):
     data: bytes
 
 
+class Scene(msgspec.Struct, frozen=True):
+    """What a viewer draws beside the records: the task's course in the world, and the size of the robot (m)."""
+
+    outline_m: tuple[tuple[float, float], ...]
+    axial_distance_m: float
+    wheel_radius_m: float
+
+
 class Start(msgspec.Struct, frozen=True):
     """Everything a writer must know; wall-clock time is monotonic time plus `wall_offset_ns` throughout the log.
 
@@ -48,6 +56,7 @@ class Start(msgspec.Struct, frozen=True):
     continues: str = ""
     continues_sequence: int = 0
     attachments: tuple[Attachment, ...] = ()
+    scene: Scene | None = None
     flush_s: float = 0.5
     beat_s: float = 0.2
     grace_s: float = 3.0

@@ -17,6 +17,7 @@ from typing import IO, Any, Protocol, cast
 
 import msgspec
 from foxglove_schemas_protobuf.Color_pb2 import Color
+from foxglove_schemas_protobuf.CubePrimitive_pb2 import CubePrimitive
 from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
 from foxglove_schemas_protobuf.Log_pb2 import Log
@@ -34,7 +35,7 @@ from mcap.writer import CompressionType, Writer
 from mcap_protobuf.schema import build_file_descriptor_set
 
 from disco_hw.log.encoding import encode_json, json_schema
-from disco_hw.log.link import Batch, BatchDecoder, End, Start
+from disco_hw.log.link import Batch, BatchDecoder, End, Scene, Start
 from disco_hw.log.records import TOPICS, Estimate, Event, Fan, Plan, Record
 from drivers.types import PoseSample
 
@@ -49,6 +50,8 @@ VIEWS: tuple[tuple[str, Any], ...] = (
     ("/view/log", Log),
 )
 """Topics and their protobuf classes."""
+SCENE = "/view/scene"
+"""A SceneUpdate once at the beginning of a file, where the recorder says what there is to see."""
 
 _LEVELS = {"debug": Log.DEBUG, "info": Log.INFO, "warning": Log.WARNING, "error": Log.ERROR, "fatal": Log.FATAL}
 _WORLD = "world"
@@ -94,6 +97,27 @@ def views(record: Record, wall_ns: int) -> list[tuple[str, bytes]]:
             )
             return [("/view/log", log.SerializeToString())]
     return []
+
+
+def scene_message(scene: Scene) -> bytes:
+    """A SceneUpdate in protobuf: the task's course in the world's frame, and the robot's body in its own."""
+    line = LinePrimitive(
+        type=LinePrimitive.LINE_STRIP,
+        pose=Pose(),
+        thickness=0.02,
+        color=Color(r=0.2, g=0.6, b=0.3, a=1.0),
+        points=[Point3(x=x, y=y, z=0.0) for x, y in scene.outline_m],
+    )
+    width, radius = scene.axial_distance_m, scene.wheel_radius_m
+    body = CubePrimitive(
+        pose=Pose(position=Vector3(x=0.0, y=0.0, z=1.5 * radius)),
+        size=Vector3(x=1.5 * width, y=0.75 * width, z=radius),
+        color=Color(r=0.9, g=0.6, b=0.1, a=0.8),
+    )
+    task = SceneEntity(id="task", frame_id=_WORLD, lines=[line])
+    robot = SceneEntity(id="robot", frame_id=_ROBOT, frame_locked=True, cubes=[body])
+    message: bytes = SceneUpdate(entities=[task, robot]).SerializeToString()
+    return message
 
 
 def _rollouts(fan: Fan, time: Timestamp) -> SceneUpdate:
@@ -263,7 +287,8 @@ class McapLog:
         for attachment in start.attachments:
             self._writer.add_attachment(wall_ns, wall_ns, attachment.name, attachment.media_type, attachment.data)
         self._channels = tuple(self._json_channel(topic.name, topic.record) for topic in TOPICS)
-        self._view_channels = self._register_views()
+        self._view_channels = self._register_views(() if start.scene is None else ((SCENE, SceneUpdate),))
+        self._scene = None if start.scene is None else scene_message(start.scene)
         self._writer.flush()  # type: ignore[no-untyped-call]
 
     @property
@@ -303,6 +328,11 @@ class McapLog:
         if not 0 <= log_time <= _MAX_TIME_NS:
             self._refuse(f"a tick at the impossible time {batch.now_ns}")
             return
+        if self._scene is not None:
+            # With the first tick, as each message belongs to one.
+            sequence, scene = batch.sequence & 0xFFFFFFFF, self._scene
+            self._writer.add_message(self._view_channels[SCENE], log_time, scene, log_time, sequence)
+            self._scene = None
         for topic_index, data in batch.records:
             self._write_record(batch, log_time, topic_index, data)
         if self._pending_bytes > CHUNK_BYTES:
@@ -350,10 +380,10 @@ class McapLog:
         )
         return self._writer.register_channel(topic, MessageEncoding.JSON, schema)
 
-    def _register_views(self) -> dict[str, int]:
+    def _register_views(self, more: tuple[tuple[str, Any], ...]) -> dict[str, int]:
         schemas: dict[str, int] = {}
         channels: dict[str, int] = {}
-        for topic, message_class in VIEWS:
+        for topic, message_class in (*VIEWS, *more):
             name = message_class.DESCRIPTOR.full_name
             if name not in schemas:
                 descriptor = build_file_descriptor_set(message_class).SerializeToString()

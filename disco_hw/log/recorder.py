@@ -19,7 +19,18 @@ from typing import Protocol
 import msgspec
 
 from disco_hw.errors import LogError
-from disco_hw.log.link import ENCODE_ERRORS, TICK, Attachment, End, Launch, Start, WriterStatus, batch_encoder, frame
+from disco_hw.log.link import (
+    ENCODE_ERRORS,
+    TICK,
+    Attachment,
+    End,
+    Launch,
+    Scene,
+    Start,
+    WriterStatus,
+    batch_encoder,
+    frame,
+)
 from disco_hw.log.records import Record
 from disco_hw.log.writer_link import Delivery, KeeperLink, WriterLine
 
@@ -142,6 +153,7 @@ class RecordingSettings:
     robot: str
     version: str = ""
     attachments: tuple[Attachment, ...] = ()
+    scene: Scene | None = None
     queue_ticks: int = 1000
     flush_s: float = 0.5
     offset_ns: int = field(default_factory=wall_offset_ns)
@@ -182,6 +194,7 @@ class ProcessRecorder:
             start_ns=0,
             wall_offset_ns=recording.offset_ns,
             attachments=recording.attachments,
+            scene=recording.scene,
             flush_s=recording.flush_s,
         )
         self._start = start

@@ -13,15 +13,17 @@ pytest.importorskip("foxglove", reason="foxglove-sdk is not installed: make venv
 from typer.testing import CliRunner
 from websockets.asyncio.client import connect
 
-from disco_hw.bridge.foxglove import LAYOUT, SCENE, Live
+from disco_hw.bridge.foxglove import LAYOUT, Live
 from disco_hw.cli import app
 from disco_hw.config import load_robot_config
+from disco_hw.daemon import daemon
 from disco_hw.daemon.client import socket_path
 from disco_hw.daemon.page_feed import ViewerFeed, feed_path
 from disco_hw.errors import InputError
 from disco_hw.experiments.live_stack import write_robot_file
-from disco_hw.log.mcap_log import VIEWS
+from disco_hw.log.mcap_log import SCENE, VIEWS
 from disco_hw.log.records import TOPIC_BY_NAME, DaemonState, Estimate, Event
+from disco_hw.runtime.robot_setup import load_setup, scene_of
 
 ESTIMATE = Estimate(7, 1.0, 2.0, 0.5, (0.0,) * 9, 0.25, 0.0, 0.0, 0.0)
 WANTED = {"/estimate", "/view/transform", SCENE}
@@ -81,6 +83,12 @@ def test_a_client_is_told_of_all_topics_and_gets_what_the_daemon_records(live):
     task, robot = scene.entities
     assert (task.frame_id, robot.frame_id) == ("world", "robot")
     assert max(point.x for point in task.lines[0].points) == pytest.approx(0.75, abs=0.01)
+
+
+def test_the_daemon_has_its_recorder_write_the_scene(tmp_path, monkeypatch):
+    setup = load_setup(write_robot_file(tmp_path))
+    monkeypatch.setattr(daemon, "ProcessRecorder", lambda settings: settings)
+    assert daemon._make_recorder(setup, tmp_path / "log.mcap").scene == scene_of(setup.config)
 
 
 def test_a_port_that_is_taken_is_refused_in_one_line(live, tmp_path):

@@ -9,9 +9,11 @@ import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
-from disco_hw.log.link import batch_encoder
-from disco_hw.log.mcap_log import CHUNK_BYTES, METADATA, McapLog, Metadata
+from disco_hw.log.link import Scene, batch_encoder
+from disco_hw.log.mcap_log import CHUNK_BYTES, METADATA, SCENE, McapLog, Metadata
+from disco_hw.log.reader import open_log
 from disco_hw.log.records import TOPIC_INDEX, TOPICS, Event, FrameIn
+from disco_hw.log.recovery import recover
 from tools.log_samples import ATTACHMENTS, PERIOD_NS, WALL_OFFSET_NS, drive_ticks, log_bytes, start, tick
 
 ENCODE = batch_encoder()
@@ -39,6 +41,23 @@ def test_another_reader_finds_index_statistics_and_every_message(driven):
     assert counts["/pose"] == counts["/view/measured_pose"] == 40
     assert counts["/event"] == counts["/view/log"] == 4
     assert set(counts) >= {topic.name for topic in TOPICS}
+
+
+def test_the_scene_is_there_once_with_the_first_tick_and_disturbs_no_count(driven, tmp_path):
+    seen = Scene(((0.0, 0.0), (3.0, 1.0)), 0.4, 0.1)
+    (tmp_path / "log.mcap").write_bytes(log_bytes(drive_ticks(200), scene=seen))
+    (tmp_path / "plain.mcap").write_bytes(driven)
+    with open_log(tmp_path / "log.mcap") as log, open_log(tmp_path / "plain.mcap") as plain:
+        assert log.summary().topics == plain.summary().topics
+        assert (log.summary().ticks, log.summary().missing_ticks, log.gaps()) == (200, 0, ())
+    recover(tmp_path / "log.mcap", tmp_path / "mended.mcap")
+    for name in ("log.mcap", "mended.mcap"):
+        (found,) = foreign((tmp_path / name).read_bytes()).iter_decoded_messages(topics=[SCENE])
+        assert (found.message.sequence, found.message.log_time) == (1, PERIOD_NS + WALL_OFFSET_NS)
+        task, robot = found.decoded_message.entities
+        assert [(point.x, point.y) for point in task.lines[0].points] == [(0.0, 0.0), (3.0, 1.0)]
+        assert (robot.frame_id, robot.frame_locked, task.frame_id) == ("robot", True, "world")
+    assert SCENE not in {channel.topic for channel in foreign(driven).get_summary().channels.values()}
 
 
 def test_another_reader_decodes_our_json_and_foxgloves_protobuf(driven):
