@@ -1,6 +1,6 @@
 """OptiTrack's datagrams, built here from the documented layout of each version and read alike by another's library.
 
-No recording of Motive was to be had.
+No recording of Motive was to be had, but what NaturalPoint's own client showed of one.
 """
 
 import math
@@ -10,6 +10,7 @@ import struct
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from drivers.pose import PoseSourceError, make_pose_source
 from drivers.pose.natnet import VERSIONS, parse_frame, plane_pose
@@ -98,6 +99,23 @@ def test_another_library_reads_the_same(version):
     assert theirs.suffix.timestamp == ours.timestamp_s
     assert (theirs.suffix.stamp_camera_mid_exposure or 0) == ours.exposed_ticks
     assert (theirs.suffix.stamp_transmit or 0) == ours.sent_ticks
+
+
+def test_a_frame_of_motive_as_its_makers_client_showed_it():
+    """Motive 2.1, NatNet 3.0: the figures that the tests of mje-nz/python_natnet hold of their recording."""
+    position, rotation = (0.1744466, 1.4471314, -0.7343040), (-0.05459423, 0.5099482, 0.04370357, -0.8573577)
+    exposed, sent, frequency = 1416497730518, 1416497748722, 3312787
+    datagram = frame(
+        (3, 0), [rigid_body((3, 0), 2, position, rotation)], timestamp_s=1356.117, exposed=exposed,
+        age_ticks=sent - exposed,
+    )  # fmt: skip
+    found = parse_frame(datagram, (3, 0))
+    x_m, y_m, yaw_rad = plane_pose(found.bodies[0], "y")
+    # Where the body's own x axis points to, seen from above: Motive's x to the right, its z towards the viewer.
+    forward = Rotation.from_quat(rotation).apply((1.0, 0.0, 0.0))
+    assert (x_m, y_m) == pytest.approx((0.1744466, 0.7343040))
+    assert yaw_rad == pytest.approx(math.atan2(-forward[2], forward[0]), abs=1e-6)
+    assert (found.sent_ticks - found.exposed_ticks) / frequency == pytest.approx(0.005495, abs=1e-6)
 
 
 def test_axes_that_are_z_up_already_stay():
