@@ -93,6 +93,8 @@ class Ros2BaseDriver:
                 return "no answer from the bridge; start disco-hw bridge ros2-base ROBOT.toml"
             case DriverState.HANDSHAKE if self._is_foreign_bridge:
                 return "the bridge was started with another [link] of robot.toml; start it again"
+            case DriverState.HANDSHAKE if self._flags & wire.ODOMETRY:
+                return self._unfit or "waiting for the first odometry"
             case DriverState.HANDSHAKE:
                 return f"no odometry from {self._settings.wheels_from}: {wire.REFUSALS[self._refusal]}"
             case DriverState.ESTOP:
@@ -212,7 +214,8 @@ class Ros2BaseDriver:
 
     @property
     def _is_alive(self) -> bool:
-        return bool(self._flags & wire.ODOMETRY) and self._raw is not None
+        """Whether it says its wheels, and hears speeds."""
+        return bool(self._flags & wire.ODOMETRY and self._flags & wire.HEARD) and self._raw is not None
 
     @property
     def _unfit(self) -> str | None:
