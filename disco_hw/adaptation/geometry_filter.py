@@ -44,7 +44,8 @@ DOUBTERS, DOUBT_S, DOUBT_LASTS_S = 16, 0.5, 4.0
 CHANGE_LOG_ODDS = -5.0
 """Of a change of one kind having come with one of these beginnings."""
 MOST_BY_A_POSE = 0.7
-"""Log odds that one pose can win or lose for a change: a jolt, or a wrong pose, is short."""
+"""Log odds that one pose can win or lose for a change: a jolt, or a wrong pose, is short. All of a pose's are scaled
+together, as what explains it best must stay ahead."""
 MISFIT_POSES = 50.0
 """Over how many poses the size of the innovations is averaged, by which standard deviations are scaled in that test."""
 CARRIED_M, CARRIED_RAD, CARRIED_POSES = 0.15, 0.3, 6
@@ -286,7 +287,8 @@ class GeometryFilter:
         squares = np.einsum("ni,ni->n", innovations, np.linalg.solve(spreads, innovations[:, :, None])[:, :, 0])
         self._misfit += (min(float(squares[0]) / 3.0, 20.0) - self._misfit) / MISFIT_POSES
         surprise = 0.5 * (squares / max(self._misfit, 1.0) + np.linalg.slogdet(spreads)[1])
-        self._log_odds += np.clip(surprise[0] - surprise, -MOST_BY_A_POSE, MOST_BY_A_POSE)
+        won = surprise[0] - surprise
+        self._log_odds += won * min(1.0, MOST_BY_A_POSE / max(float(np.abs(won).max()), MOST_BY_A_POSE))
         self._bank.correct(innovations, spreads, self._low, self._high)
         best = int(np.argmax(self._log_odds))
         if best:

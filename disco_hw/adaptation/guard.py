@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from enum import Enum
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.adaptation.link import NAMES, Proposal
-from disco_hw.config import Prior
+from disco_hw.config import Control, PoseInput, Prior
 from disco_hw.effects.effect import Channel
 from disco_hw.errors import InputError
 from disco_hw.log.records import BeliefChange
@@ -23,6 +24,8 @@ _RANGES = {parameter.name: parameter for parameter in BASE_PARAMETERS}
 _PHYSICAL_LOW = np.array([_RANGES[name].low for name in NAMES])
 _PHYSICAL_HIGH = np.array([_RANGES[name].high for name in NAMES])
 
+
+ASKED_BY_FILE = "control.adaptation"
 
 _LEAST_VARIANCE, _LARGEST_VARIANCE = 1e-14, 1e4
 
@@ -196,6 +199,49 @@ def check_adaptable(model: Model, uncertainty: str, asked_by: str = "--adapt") -
             f"{asked_by}: the model has the effect {others[0]}, which adaptation would take for a change of the "
             f"geometry; leave {asked_by} out"
         )
+
+
+LEAST_RATE_HZ, MOST_POSITION_STD_M, MOST_YAW_STD_RAD, MOST_LATENCY_S = 10.0, 0.01, 0.01, 0.3
+"""Poses from which the filter learns without being asked to."""
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """Which adaptation runs, and why."""
+
+    kind: Literal["off", "fast", "audited"]
+    why: str
+
+
+def choose_adaptation(control: Control, pose: PoseInput, model: Model) -> Choice:
+    """What `control.adaptation` asks for; for "auto" the filter where [pose] says poses that are good enough for it.
+
+    Raises InputError for one that is asked for and that the model does not allow.
+    """
+    asked = control.adaptation
+    if asked != "auto":
+        if asked != "off":
+            check_adaptable(model, control.uncertainty, ASKED_BY_FILE)
+        return Choice(asked, f'{ASKED_BY_FILE} = "{asked}"')
+    try:
+        check_adaptable(model, control.uncertainty, ASKED_BY_FILE)
+    except InputError as error:
+        return Choice("off", str(error))
+    if pose.rate_hz is None:
+        text = (
+            f"pose.rate_hz is not given; write it, pose.position_std_m and pose.yaw_std_rad where poses come at "
+            f"{LEAST_RATE_HZ:g} Hz or more with {MOST_POSITION_STD_M:g} m and {MOST_YAW_STD_RAD:g} rad or less"
+        )
+        return Choice("off", text)
+    if pose.rate_hz < LEAST_RATE_HZ:
+        return Choice("off", f"pose.rate_hz is {pose.rate_hz:g}, less than {LEAST_RATE_HZ:g}")
+    for name, most in (
+        ("position_std_m", MOST_POSITION_STD_M), ("yaw_std_rad", MOST_YAW_STD_RAD), ("latency_s", MOST_LATENCY_S),
+    ):  # fmt: skip
+        given = getattr(pose, name)
+        if given > most:
+            return Choice("off", f"pose.{name} is {given:g}, more than {most:g}")
+    return Choice("fast", f"poses at {pose.rate_hz:g} Hz with {pose.position_std_m:g} m and {pose.yaw_std_rad:g} rad")
 
 
 def believed_geometry(model: Model) -> Geometry:

@@ -96,7 +96,8 @@ class PoseInput(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     """Where measured poses come from: `source` is of `drivers.pose`; None leaves what that source takes by itself.
 
     `datum`: latitude and longitude (degrees) of the world frame's origin. For `disco-hw bridge ros2`: the topic, the
-    frame that its poses must be in, and the standard deviations of poses that come without.
+    frame that its poses must be in, and the standard deviations of poses that come without. By these, `rate_hz` (how
+    often poses come at least) and `latency_s` it is decided whether the geometry is learnt while driving.
     """
 
     source: str = DEFAULT
@@ -124,6 +125,7 @@ class PoseInput(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     frame: str = "map"
     position_std_m: Positive = 0.02
     yaw_std_rad: Positive = 0.02
+    rate_hz: Positive | None = None
 
     def convention(self) -> PoseConvention:
         """In what units and about which axes the source speaks."""
@@ -145,7 +147,7 @@ class Control(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     rate_hz: Annotated[float, Meta(ge=20.0, le=100.0)] = 50.0
     mode: Literal["default", "paper"] = "default"
     uncertainty: Literal["ut", "mc", "joint", "point"] = "ut"
-    adaptation: Literal["off", "fast", "audited"] = "off"
+    adaptation: Literal["auto", "off", "fast", "audited"] = "auto"
     samples: Annotated[int, Meta(ge=8, le=1_000_000)] = 400
     horizon: Annotated[int, Meta(ge=2, le=500)] | None = None
     step_s: Annotated[float, Meta(gt=0.0, le=1.0)] | None = None
@@ -367,6 +369,10 @@ def _check_names(path: Path, raw: dict[str, Any]) -> None:
                 raise InputError(f"{path}: {section}.{field}: {error}") from None
 
 
+# Whatever the source is, they say how good its poses are.
+_OF_EVERY_SOURCE = {"position_std_m", "yaw_std_rad"}
+
+
 def _check_pose_fields(path: Path, section: Any) -> None:
     """Refuse fields of another pose source."""
     if not isinstance(section, dict):
@@ -374,7 +380,7 @@ def _check_pose_fields(path: Path, section: Any) -> None:
     name = str(section.get("source", DEFAULT))
     own = own_pose_fields(name)
     for other in pose_sources():
-        for field in sorted(own_pose_fields(other) - own):
+        for field in sorted(own_pose_fields(other) - own - _OF_EVERY_SOURCE):
             if field in section:
                 _refuse(
                     path, f"pose.{field}", f'a field of the source "{other}", and pose.source is "{name}"', "remove it"

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from disco_hw.adaptation.guard import choose_adaptation
 from disco_hw.config import RobotConfig
 from disco_hw.daemon.client import send_request, socket_path
 from disco_hw.daemon.realtime import can_lock_memory, can_use_fifo
@@ -84,7 +85,7 @@ def run_check(robot: Path, link: str | None = None) -> CheckReport:
     setup = load_setup(robot, None, link)
     key, transport = link_key(setup), make_link(setup)
     refuse_beside_a_daemon(setup.config)
-    checks = [_model_check(setup), check_task(setup.config.robot, setup.config.task)]
+    checks = [_model_check(setup), _adaptation_check(setup), check_task(setup.config.robot, setup.config.task)]
     checks.append(check_link_load(setup.config.link, setup.config.control))
     control = setup.config.control
     priority = setup.config.daemon.realtime_priority
@@ -155,6 +156,14 @@ def _model_check(setup: Setup) -> Check:
         return Check("model", Level.WARNING, "none is named: plans use the nominal geometry and the whole prior")
     effects = ", ".join(effect.name for effect in setup.model.effects) or "none"
     return Check("model", Level.OK, f"{setup.model_file}, effects: {effects}")
+
+
+def _adaptation_check(setup: Setup) -> Check:
+    try:
+        chosen = choose_adaptation(setup.config.control, setup.config.pose, setup.model)
+    except InputError as error:
+        return Check("adaptation", Level.FAIL, str(error))
+    return Check("adaptation", Level.OK, f"{chosen.kind}, as {chosen.why}")
 
 
 def _link_check(transport: Transport) -> Check:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from disco_hw.adaptation.adaptation import GeometryAdaptation
-from disco_hw.adaptation.guard import check_adaptable
+from disco_hw.adaptation.guard import check_adaptable, choose_adaptation
 from disco_hw.adaptation.link import ProcessLink
 from disco_hw.config import RobotConfig
 from disco_hw.control.law import Controller, Law
@@ -41,7 +41,6 @@ from disco_hw.log.provenance import DBC, version
 from disco_hw.log.recorder import NullRecorder, ProcessRecorder, Recorder, RecordingSettings
 from disco_hw.runtime import records_of_tick
 from disco_hw.runtime.assembly import (
-    ASKED_BY_FILE,
     assemble_core,
     driver_of,
     make_adaptation,
@@ -123,10 +122,11 @@ def run_daemon(
     setup = load_setup(options.robot, options.model, options.link)
     if not options.accept_missing_effects:
         refuse_missing_effects(setup)
-    adapt: Adapt = "network" if options.adapt else setup.config.control.adaptation
-    if adapt != "off":
-        asked_by = "--adapt" if options.adapt else ASKED_BY_FILE
-        check_adaptable(setup.model, setup.config.control.uncertainty, asked_by)
+    adapt: Adapt = "network"
+    if options.adapt:
+        check_adaptable(setup.model, setup.config.control.uncertainty)
+    else:
+        adapt = choose_adaptation(setup.config.control, setup.config.pose, setup.model).kind
     with closing(AsyncPrinter(STANDARD_OUTPUT, in_json if options.as_json else in_text)) as say:
         return serve(
             setup,

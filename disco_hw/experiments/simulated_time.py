@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from disco_hw.adaptation.adaptation import GeometryAdaptation
+from disco_hw.adaptation.guard import choose_adaptation
 from disco_hw.adaptation.link import AdapterLink
 from disco_hw.errors import WorkError
 from disco_hw.log.link import Attachment
@@ -102,7 +103,8 @@ class SimulatedRun:
         if adapter is not None:
             make = make_audited_adaptation if wanted == "audited" else make_adaptation
             return make(setup, pipeline, adapter)
-        return None if wanted == "off" else make_fast_adaptation(setup, pipeline)
+        chosen = choose_adaptation(setup.config.control, setup.config.pose, setup.model)
+        return None if chosen.kind == "off" else make_fast_adaptation(setup, pipeline)
 
     def ticks(self, duration_s: float, *requests: UserRequest) -> Iterator[CoreTick]:
         """Let time pass and give every tick as it comes; the requests come with the first one."""

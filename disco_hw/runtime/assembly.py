@@ -8,6 +8,7 @@ from disco_hw import control
 from disco_hw.adaptation.adaptation import CheckedAdaptation, GeometryAdaptation
 from disco_hw.adaptation.fast import AuditedAdaptation, FastAdaptation
 from disco_hw.adaptation.guard import (
+    ASKED_BY_FILE,
     BeliefGuard,
     Geometry,
     believed_geometry,
@@ -34,7 +35,6 @@ from drivers.pose.convention import converted
 from drivers.transport import ReconnectingTransport, TransportSettingsError, make_transport
 from drivers.types import Driver, PoseSource, Transport
 
-ASKED_BY_FILE = "control.adaptation"
 _REHEARSALS = 5
 
 

@@ -1,12 +1,20 @@
 from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
 import disco_hw
-from disco_hw.adaptation.guard import Geometry, believed_geometry, check_adaptable, possible_range, with_geometry
-from disco_hw.config import Prior
+from disco_hw.adaptation.guard import (
+    Geometry,
+    believed_geometry,
+    check_adaptable,
+    choose_adaptation,
+    possible_range,
+    with_geometry,
+)
+from disco_hw.config import Control, PoseInput, Prior
 from disco_hw.errors import InputError
 from disco_hw.model import EffectSetting, Gaussian, load_model
 
@@ -36,6 +44,39 @@ def test_what_cannot_be_adapted_is_refused():
         check_adaptable(replace(MODEL, belief=None), "ut")
     with pytest.raises(InputError, match="side_slip"):
         check_adaptable(replace(MODEL, effects=(EffectSetting("side_slip", {"k_s": 0.1}),)), "ut")
+
+
+GOOD = PoseInput(rate_hz=25.0, position_std_m=0.005, yaw_std_rad=0.005, latency_s=0.05)
+
+
+def test_the_geometry_is_learnt_where_robot_toml_says_good_poses():
+    assert choose_adaptation(Control(), GOOD, MODEL).kind == "fast"
+    chosen = choose_adaptation(Control(), PoseInput(), MODEL)
+    assert chosen.kind == "off"
+    assert "pose.rate_hz" in chosen.why
+
+
+@pytest.mark.parametrize(
+    ("field", "value"), [("rate_hz", 9.0), ("position_std_m", 0.02), ("yaw_std_rad", 0.02), ("latency_s", 0.4)]
+)
+def test_poses_that_are_not_good_enough_are_named(field, value):
+    chosen = choose_adaptation(Control(), msgspec.structs.replace(GOOD, **{field: value}), MODEL)
+    assert chosen.kind == "off"
+    assert f"pose.{field} is {value:g}" in chosen.why
+
+
+def test_what_the_file_asks_for_counts_whatever_the_poses():
+    assert choose_adaptation(Control(adaptation="off"), GOOD, MODEL).kind == "off"
+    for asked in ("fast", "audited"):
+        assert choose_adaptation(Control(adaptation=asked), PoseInput(), MODEL).kind == asked
+    with pytest.raises(InputError, match=r"^control.adaptation: .*uncertainty"):
+        choose_adaptation(Control(adaptation="fast", uncertainty="point"), GOOD, MODEL)
+
+
+def test_a_model_that_cannot_be_adapted_is_left_alone_with_the_reason():
+    chosen = choose_adaptation(Control(uncertainty="point"), GOOD, MODEL)
+    assert chosen.kind == "off"
+    assert "uncertainty" in chosen.why
 
 
 def test_the_range_is_the_prior_as_far_as_it_is_possible():

@@ -75,6 +75,8 @@ def test_four_fifths_of_a_change_are_known_after_two_and_a_half_seconds(settled,
         known_part.append((found.mean[index] / NOMINAL[index] - 1.0) / (factor - 1.0))
     assert np.median(known_part) > 0.8
     assert np.median(known_part) < 1.25
+    # The wheels' size shows at once, and in nothing else.
+    assert index > 0 or min(known_part) > 0.8
 
 
 def test_a_robot_whose_belief_is_narrow_and_wrong_is_learnt(settled):

@@ -40,6 +40,7 @@ def test_check_fails_without_a_robot_and_says_what_to_do(tmp_path):
     code, output = disco("check", str(write_robot_file(tmp_path)))
     assert code == 1
     assert "fail  link" in output
+    assert "adaptation: off, as pose.rate_hz is not given" in output
 
 
 def test_check_and_a_second_daemon_keep_out_of_a_running_daemons_way(tmp_path):
