@@ -229,7 +229,7 @@ class Identity:
         """For a person: all of it, and who says it."""
         version = self.firmware and f"firmware {self.firmware}"
         known = ", ".join(text for text in (self.controller, version, self.details) if text)
-        return f"{known} ({SAID_BY_WORDS[self.said_by]})"
+        return f"{known} ({SAID_BY_WORDS.get(self.said_by, self.said_by)})"
 
 
 @dataclass(frozen=True, slots=True)

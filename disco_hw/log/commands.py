@@ -5,21 +5,28 @@ from __future__ import annotations
 import json
 from dataclasses import asdict
 from pathlib import Path
+from typing import cast
 
 import msgspec
 
 from disco_hw.log.importing.csv_drive import write_csv
 from disco_hw.log.load import drive_from_log, nominal_geometry, ticks_per_rev
 from disco_hw.log.reader import LogSummary, open_log
+from disco_hw.log.records import Controller
 from disco_hw.log.recovery import recover as recover_log
 from disco_hw.log.rosbag.export import write_rosbag
+from drivers.types import SAID_BY_WORDS, Identity, SaidBy
 
 
 def info(path: Path, as_json: bool) -> str:
     """What a log holds and what of it is lost; raises LogError."""
     with open_log(path) as log:
         summary = log.summary()
-    return msgspec.json.encode(summary).decode() if as_json else _in_words(summary)
+        if as_json:
+            return msgspec.json.encode(summary).decode()
+        answered = list(log.records(("/controller",))) if "/controller" in summary.topics else []
+    said = [_controller(entry.record) for entry in answered if isinstance(entry.record, Controller)]
+    return "\n".join([_in_words(summary), *dict.fromkeys(said)])
 
 
 def recover(path: Path, out: Path, as_json: bool) -> str:
@@ -52,6 +59,22 @@ def export_rosbag(path: Path, out: Path, as_json: bool) -> str:
     if as_json:
         return json.dumps({"out": str(out), "messages": messages, "segments": drive.segments, "notes": drive.notes})
     return "\n".join([f"{out}: {messages} messages, {drive.segments} segments", *drive.notes])
+
+
+def _controller(record: Controller) -> str:
+    """Which controller answered, and its limits by who says them."""
+    identity = Identity(record.controller, record.firmware, cast(SaidBy, record.said_by), record.details)
+    limits: dict[SaidBy, dict[str, float]] = {
+        "device": record.told,
+        "fixed": record.fixed,
+        "robot.toml": record.declared,
+    }
+    words = [
+        f"{', '.join(f'{name} {value:g}' for name, value in values.items())} ({SAID_BY_WORDS[said_by]})"
+        for said_by, values in limits.items()
+        if values
+    ]
+    return f"controller: {identity.in_words()}; {'; '.join(words)}"
 
 
 def _end_in_words(summary: LogSummary) -> str:

@@ -1,10 +1,12 @@
 import json
 
 import pytest
+from msgspec import structs
 
 from disco_hw.errors import LogError
 from disco_hw.log.commands import export, info, recover
 from disco_hw.log.link import End
+from disco_hw.log.records import Controller
 from tools.log_samples import PERIOD_NS, drive_ticks, log_bytes, tick, write_log
 
 
@@ -31,6 +33,19 @@ def test_info_says_what_a_log_holds(log):
     summary = json.loads(info(log, as_json=True))
     assert summary["topics"]["/wheels"]["count"] == 100
     assert (summary["complete"], summary["ended"]) == (True, True)
+
+
+def test_info_says_which_controller_answered_and_who_says_its_limits(tmp_path):
+    agilex = Controller(5, "AgileX base", "", "", "robot.toml", fixed={"command_timeout_s": 0.5}, declared={"x_m": 2.0})
+    later = structs.replace(agilex, t_ns=9, said_by="oracle")
+    ticks = [(PERIOD_NS, [*tick(1), agilex]), (2 * PERIOD_NS, [*tick(2), structs.replace(agilex, t_ns=6), later])]
+    lines = [line for line in info(write_log(tmp_path / "run.mcap", ticks), False).splitlines() if "AgileX" in line]
+    assert lines[0] == (
+        "controller: AgileX base (declared in robot.toml, not told by the controller); command_timeout_s 0.5 "
+        "(which cannot be set otherwise); x_m 2 (declared in robot.toml, not told by the controller)"
+    )
+    assert len(lines) == 2
+    assert "AgileX base (oracle)" in lines[1]
 
 
 def test_an_index_alone_does_not_prove_that_the_log_was_ended(tmp_path):
