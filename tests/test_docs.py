@@ -41,6 +41,12 @@ def test_every_link_leads_to_a_file_and_to_a_heading_in_it(page):
     assert not dead
 
 
+@pytest.mark.parametrize("page", PAGES, ids=names)
+def test_a_link_that_is_named_by_a_file_leads_to_that_file(page):
+    named = re.findall(r"\[`([\w./\-]+\.\w+)`\]\(([^)#\s]+)[^)]*\)", page.read_text(encoding="utf-8"))
+    assert not [(name, link) for name, link in named if not (page.parent / link).resolve().match(name.lstrip("./"))]
+
+
 def test_every_page_has_its_place_in_the_shelves_and_on_the_site():
     index = (ROOT / "docs" / "index.md").read_text(encoding="utf-8")
     site = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")

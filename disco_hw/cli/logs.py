@@ -77,7 +77,7 @@ def import_log(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Write a foreign log as a log of ours, for `infer`, `gap` and Foxglove; `view` and `replay` need one of `run`."""
+    """Convert a foreign log to MCAP for `infer`, `gap` and Foxglove; `view` and `replay` need a log of `run`."""
     check_named_files(robot, logs=[] if log.is_dir() else [log])
     from disco_hw.log.importing.write import import_log as import_foreign
 

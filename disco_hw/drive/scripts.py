@@ -25,8 +25,8 @@ _STRAIGHT = "wheel radius against gains, slope and unequal wheels: two speeds, b
 _SPIN = "axial distance against slip in turns, and where it turns about: two rates, both ways"
 _CURVE = "side slip and heading bias, which need speed and turning at once: two speeds, both ways"
 _START = "lag, delay, late poses and slip under acceleration"
-_STEER = "delay told from lag"
-_RAMP = "deadband told from stiction, slowly through zero"
+_STEER = "separates delay from lag"
+_RAMP = "separates deadband from stiction, slowly through zero"
 
 
 def _slow_straights(pieces: Pieces, each_s: float) -> list[Manoeuvre]:
@@ -232,12 +232,12 @@ def excite(top_rad_s: float) -> Script:
     for number in range(8):
         forward = 0.7 if number % 2 == 0 else -0.7
         found += [hold(f"start and stop {number + 1}", lag, 1.0, forward, 0.0), rest(0.8)]
-    steering = "delay told from lag, build-up of turning under load"
+    steering = "separates delay from lag, build-up of turning under load"
     found += [
         play("steering at 0.5 Hz", steering, 12.0, lambda t_s: (0.4, 0.35 * math.cos(math.pi * t_s))),
         rest(),
     ]
-    zero = "deadband told from stiction, slowly through zero"
+    zero = "separates deadband from stiction, slowly through zero"
     found += [
         play("ramp through zero", zero, 10.0, lambda t_s: (0.25 * _triangle(t_s / 10.0), 0.0)),
         play("turning ramp through zero", zero, 10.0, lambda t_s: (0.0, 0.25 * _triangle(t_s / 10.0))),

@@ -458,7 +458,7 @@ def _cause(line: WriterLine, code: int | None) -> str:
     if status.state == "failed":
         return status.error
     if status.state == "finished":
-        return "the log writer was told to end, and not by the recorder"
+        return "the log writer was ended by another program"
     how = "" if code is None else f" (signal {-code})" if code < 0 else f" (exit status {code})"
     return f"the log writer died{how}; {status.path} holds what it had written"
 

@@ -259,7 +259,7 @@ def test_a_writer_that_was_told_to_end_by_somebody_else_is_replaced(path):
     drive(recorder, 1, 5)
     os.kill(recorder.writer_pid, signal.SIGTERM)
     following = kept_going(recorder, 6, lambda stats: stats.writer_deaths == 1)
-    assert "told to end" in recorder.poll().last_error
+    assert "ended by another program" in recorder.poll().last_error
     following = kept_going(recorder, following, lambda stats: not stats.fault)
     recorder.close()
     assert recorded_ticks(path) + recorded_ticks(recorder.path) == list(range(1, following))

@@ -214,7 +214,7 @@ def doubt_of(effect: EffectFinding, measured: Measured) -> str | None:
             return f"{_written(parameter, estimate)} lies at the end of its range"
     if all(_unknown(parameter, estimate, settings) for parameter, estimate in pairs):
         said = " and ".join(_written(parameter, estimate) for parameter, estimate in pairs)
-        return f"{said} is not known well enough to be told from none"
+        return f"{said} is not known well enough to be distinguished from none"
     return _exceeded(described, pairs[0][1], measured)
 
 

@@ -156,7 +156,7 @@ def import_log(path: Path, robot: Path, out: Path, topics: Sequence[str] = ()) -
     records = write_log(drive, out, config.robot.name, (attachment(robot, ROBOT_TOML, ROBOT_FILE),))
     notes = drive.notes
     if drive.gyro.t_s.size:
-        notes += (f"{path}: the gyro was left out; a log of ours has none",)
+        notes += (f"{path}: the gyro was left out; the logs of disco-hw have no place for it",)
     return Imported(out, records, drive.segments, drive.end_s, notes)
 
 
