@@ -109,6 +109,7 @@ def test_a_written_value_is_in_force_and_told_in_limits():
     bench.run(100)
     pages = [message.values for message in bench.messages("LIMITS", since_us=before)]
     assert [page["page"] for page in pages] == [0, 1]
+    assert not [name for name in ("HELLO", "BUILD") if bench.messages(name, since_us=before)]
     assert pages[1]["stop_deceleration"] == 40.0
     bench.to_driving()
     start = bench.now_us
