@@ -33,7 +33,7 @@ from disco_hw.gap.report.judge import (
 from disco_hw.gap.report.page import as_text, page
 from disco_hw.gap.search.analysis import FinalFit, GapAnalysis, final_fit
 from disco_hw.gap.search.channel_search import search_body, search_wheels
-from disco_hw.gap.search.cross_validation import PredictionErrors, beats, clearly_worse, worse_by
+from disco_hw.gap.search.cross_validation import PredictionErrors, beats, beats_throughout, clearly_worse, worse_by
 from disco_hw.gap.search.intervals import ChannelEstimates
 from disco_hw.gap.search.richest_model import LATE_COLUMNS, candidates_of
 from disco_hw.gap.search.stages import StagePredictions, joint_predictions, prune, stage_predictions
@@ -103,14 +103,15 @@ def find_gap(
 def offered_stage(gap: Mapping[str, Mapping[float, PredictionErrors]], found: bool, settings: GapSettings) -> str:
     """The stage whose model is handed out: the amended one unless a plainer one predicts held-out data better.
 
-    Where predictions cannot be compared it is the amended one too.
+    Better too where the amended one is so by a single stretch only: another drive need not have its like. Where
+    predictions cannot be compared it is the amended one too.
     """
     horizon_s, prediction = settings.prediction.reported_horizon_s, settings.prediction
     if not gap or not math.isfinite(gap["amended"][horizon_s].position_m):
         return "amended"
     refitted, timed, amended = (gap[stage][horizon_s] for stage in STAGES[1:4])
     plainer, plain = ("refitted", refitted) if beats(timed, refitted, prediction) else ("timed", timed)
-    if beats(plain, amended, prediction) or (not found and not clearly_worse(plain, amended, prediction)):
+    if beats_throughout(plain, amended, prediction) or (not found and not clearly_worse(plain, amended, prediction)):
         return "amended"
     return plainer
 

@@ -47,7 +47,20 @@ def _ratios(before: PredictionErrors, after: PredictionErrors) -> tuple[float, f
 
 def beats(before: PredictionErrors, after: PredictionErrors, settings: PredictionSettings) -> bool:
     """Whether errors after are no larger, of position and heading together and within 5 % of each; ties beat."""
-    ratios = _ratios(before, after)
+    return _no_larger(_ratios(before, after), settings)
+
+
+def beats_throughout(before: PredictionErrors, after: PredictionErrors, settings: PredictionSettings) -> bool:
+    """Whether errors after beat those before whichever one block of time is left out: not by a single stretch."""
+    if not beats(before, after, settings):
+        return False
+    if before.squares is None or after.squares is None or len(before.squares) < 2:
+        return True
+    without = [np.maximum(of.sum(axis=0) - of, 1e-30) for of in (before.squares, after.squares)]
+    return all(_no_larger((float(a), float(b)), settings) for a, b in np.sqrt(without[1] / without[0]))
+
+
+def _no_larger(ratios: tuple[float, float], settings: PredictionSettings) -> bool:
     return max(ratios) <= settings.worse and math.prod(ratios) ** 0.5 <= settings.level
 
 

@@ -101,3 +101,15 @@ def test_without_anything_found_only_a_clearly_better_one_is_offered_in_its_plac
     gap = {stage: errors(0.041, 0.041) for stage in ("nominal", "refitted", "amended")} | {"timed": errors(0.04, 0.04)}
     assert offered_stage(gap, False, DEFAULT_SETTINGS) == "amended"
     assert offered_stage({**gap, "timed": errors(0.02, 0.02)}, False, DEFAULT_SETTINGS) == "timed"
+
+
+@pytest.mark.parametrize(("of_last", "offered"), [(0.5, "amended"), (1.2, "timed")])
+def test_a_model_that_is_better_by_one_stretch_only_is_not_offered(of_last, offered):
+    def by_block(*squares):
+        total = float(np.mean(squares)) ** 0.5
+        return {2.0: replace(errors(total, total)[2.0], squares=np.column_stack([squares, squares]))}
+
+    gap = {"nominal": by_block(9.0, 9.0, 9.0), "refitted": by_block(4.0, 4.0, 4.0), "timed": by_block(1.0, 1.0, 1.0)}
+    # In sum it is better either way.
+    gap["amended"] = by_block(0.1, 1.0, of_last)
+    assert offered_stage(gap, True, DEFAULT_SETTINGS) == offered
