@@ -1,11 +1,13 @@
 """The bridge to ROS 2: odometry to a subscriber, a pose to a wheel command, and the loop's lateness with and without.
 
 Simulator, daemon with the real planner, bridge and node are processes of their own on this machine. A pose's time is
-from when the node says it to when the first wheel command that knew it is on the wire; the loop runs at 50 Hz.
+from when the node says it to when the first wheel command that knew it is on the wire; the loop runs at 50 Hz. What
+the machine does beside makes lateness differ: its load is given with each, and the daemon's CPU time.
 """
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import tempfile
@@ -29,8 +31,8 @@ _NS = 1_000_000_000
 def run(seconds: float = 30.0) -> dict[str, float]:
     """Return the figures in milliseconds."""
     figures: dict[str, float] = {}
-    with tempfile.TemporaryDirectory() as name, circling(Path(name)) as (_, start_ns):
-        time.sleep(seconds)
+    with tempfile.TemporaryDirectory() as name, circling(Path(name)) as (daemon, start_ns):
+        figures |= _loop_for(seconds, daemon, "with")
         end_ns = time.monotonic_ns()
         status = send_request(Path(name) / "control.sock", {"do": "status"})
         assert status["running"], status["detail"]
@@ -39,15 +41,15 @@ def run(seconds: float = 30.0) -> dict[str, float]:
         figures |= _summary("bridge.odometry_from_tick", _odometry_ms(Path(name), start_ns, end_ns))
         figures |= _summary("bridge.pose_to_command", _pose_to_command_ms(Path(name), start_ns, end_ns))
         figures |= _summary("bridge.loop_lateness_with", _lateness_ms(Path(name), start_ns, end_ns))
-    with tempfile.TemporaryDirectory() as name, circling(Path(name), bridged=False) as (_, start_ns):
-        time.sleep(seconds)
+    with tempfile.TemporaryDirectory() as name, circling(Path(name), bridged=False) as (daemon, start_ns):
+        figures |= _loop_for(seconds, daemon, "without")
         figures |= _summary("bridge.loop_lateness_without", _lateness_ms(Path(name), start_ns, time.monotonic_ns()))
     return figures
 
 
 @contextmanager
-def circling(directory: Path, bridged: bool = True) -> Iterator[tuple[Operator, int]]:
-    """The stack on its circle, by the poses of a node or without bridge; yields since when (monotonic, ns)."""
+def circling(directory: Path, bridged: bool = True) -> Iterator[tuple[int, int]]:
+    """The stack on its circle, by a node's poses or without bridge; yields daemon's process and since when (ns)."""
     robot_file = write_robot_file(directory, task=FAST_TASK)
     if bridged:
         lines = f'[pose]\nsource = "ros2"\nport = {5100 + DOMAIN}\n[ros2]\ndomain = {DOMAIN}\n'
@@ -75,7 +77,24 @@ def circling(directory: Path, bridged: bool = True) -> Iterator[tuple[Operator, 
         operator.wait_for("ARMED", 5.0)
         operator.tell("start")
         time.sleep(SETTLED_S)
-        yield operator, time.monotonic_ns()
+        yield children[1].process.pid, time.monotonic_ns()
+
+
+def _loop_for(seconds: float, daemon: int, bridge: str) -> dict[str, float]:
+    """Let it run, and return the daemon's CPU time for a second of it (ms), and the machine's load and CPUs."""
+    before_s = _cpu_s(daemon)
+    time.sleep(seconds)
+    return {
+        f"bridge.daemon_cpu_ms_per_s_{bridge}": 1e3 * (_cpu_s(daemon) - before_s) / seconds,
+        f"bridge.load_{bridge}": os.getloadavg()[0],
+        "bridge.cpus": float(len(os.sched_getaffinity(0))),
+    }
+
+
+def _cpu_s(process: int) -> float:
+    """CPU time that a process has taken, in user space and in the kernel."""
+    fields = Path(f"/proc/{process}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def _heard(directory: Path) -> np.ndarray:
