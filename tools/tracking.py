@@ -20,6 +20,7 @@ from disco_hw.control import CommandLimits, Disco, DiscoSettings
 from disco_hw.control.baselines.follower import Follower, Law, NominalRobot, Reference
 from disco_hw.control.settings import ROTATION
 from disco_hw.estimation import OdometryParameters, PoseFusion
+from disco_hw.estimation.disturbance import DisturbanceEstimator
 from disco_hw.model import Gaussian, Model
 from disco_hw.model.model import EffectSetting
 from disco_hw.runtime.assembly import put_in_force
@@ -178,7 +179,9 @@ def drive(
     mean, spread = ((robot.radius_m, robot.axle_m, robot.x_icr_m), 0.004) if contender.knows else (NOMINAL, SPREAD)
     period_s = 1.0 / rate_hz
     governor = Governor(WheelLimits(LIMITS.speed_rad_s, *[LIMITS.acceleration_rad_s2] * 2), period_s)
-    pipeline = Pipeline(fusion(mean, spread), contender.planner(robot, track), governor, 0.2)
+    pipeline = Pipeline(
+        fusion(mean, spread), contender.planner(robot, track), governor, 0.2, DisturbanceEstimator()
+    )
     adaptation = _learner(robot, pipeline) if contender.learns else NoAdaptation()
     every_ms = round(1e3 * period_s)
     rows: list[tuple[float, ...]] = []

@@ -31,10 +31,12 @@ from disco_hw.control.plan import (
     command_history,
 )
 from disco_hw.control.settings import CommandLimits, DiscoSettings
+from disco_hw.control.wheel_loss import WheelLoss
 from disco_hw.effects.effect import Channel
 from disco_hw.effects.registry import DELAY
 from disco_hw.jit import compiled_for
 from disco_hw.model import Belief, Model
+from disco_hw.model.disturbance import NO_DISTURBANCE
 from disco_hw.model.free_run import FreeRun
 from disco_hw.model.model import BASE_PARAMETERS, X_ICR, coefficient_tables
 from disco_hw.model.step import integration_series
@@ -72,7 +74,9 @@ class Disco:
         self._series = integration_series(step_s, self._wide is not None, np.float32)
         self._pairs = shared_pairs(model, theta, step_s)
         self._take_points(model, theta)
-        self._start = np.zeros(8, np.float32)
+        self._start = np.zeros(11, np.float32)
+        self._loss = WheelLoss()
+        self._disturbance = NO_DISTURBANCE
         self._wheels = aligned_zeros(sampler.horizon * WHEEL_ROWS * int(BLOCK))
         self._optimiser = Optimiser(
             sampler,
@@ -114,6 +118,7 @@ class Disco:
         self._model = model
         self._mean_theta = mean_point(model)
         self._mean = FreeRun(model, self._mean_theta, step_s)
+        self._wheel_runs: dict[int, FreeRun] = {}
         self._x_icr_m = float(self._mean_theta[0, model.parameter_names.index(X_ICR.name)])
         self._points = FreeRun(model, theta, step_s)
         late = [f"{s.name}.{s.effect.late_by}" for s in model.effects if s.effect.late_by is not None]
@@ -201,6 +206,7 @@ class Disco:
         """Forget the last plan, as at a new start; the random numbers go on."""
         self._optimiser.reset()
         self._begun_ns = self._t0_ns = self._failing_since_ns = self._memory = None
+        self._loss.pause()
 
     def warm_up(self) -> None:
         """Compile everything that any method calls, or load it from disk; leaves the planner as after `reset`."""
@@ -220,6 +226,7 @@ class Disco:
         """
         settings = self._settings
         t0_ns = now_ns + round(settings.latency_s * 1e9)
+        self._follow_disturbance(now_ns, state)
         before = self._anchor(state)
         first = self._t0_ns is None
         begun_ns = now_ns if self._begun_ns is None else self._begun_ns
@@ -240,7 +247,7 @@ class Disco:
         return WheelPlan(
             t0_ns=t0_ns,
             step_s=settings.step_s,
-            wheel_speeds=wheel_speeds,
+            wheel_speeds=self._asked(wheel_speeds),
             trajectory=self._trajectory(self._mean, wheel_speeds, 0),
             diagnostics=self._diagnostics(retries, outcome),
         )
@@ -312,27 +319,64 @@ class Disco:
         The last ones sent; but no further from the measured wheel speeds than the wheels could be behind them, so that
         a plan does not run away from wheels that are held back.
         """
-        left, right = state.left_speed_rad_s, state.right_speed_rad_s
+        left, right = self._turning(state.left_speed_rad_s, state.right_speed_rad_s)
         if not state.sent:
             return left, right
-        last = state.sent[-1]
+        sent = np.array([[state.sent[-1].left_rad_s, state.sent[-1].right_rad_s]])
+        last_left, last_right = self._acting(sent)[0].tolist()
         slack = self._limits.acceleration_rad_s2 * (self._settings.step_s + self._response_s)
-        return (
-            min(max(last.left_rad_s, left - slack), left + slack),
-            min(max(last.right_rad_s, right - slack), right + slack),
-        )
+        return min(max(last_left, left - slack), left + slack), min(max(last_right, right - slack), right + slack)
 
     def _predicted(self, state: PlannerState, t0_ns: int, elapsed_s: float) -> Array:
         """State (5,) at `t0_ns`: x, y, yaw, wheel speeds, under the mean parameters and the commands already sent."""
-        start = np.array([state.x_m, state.y_m, state.yaw_rad, state.left_speed_rad_s, state.right_speed_rad_s])
+        wheels = state.left_speed_rad_s, state.right_speed_rad_s
+        start = np.array([state.x_m, state.y_m, state.yaw_rad, *self._turning(*wheels)])
         gap_s = (t0_ns - state.t_ns) * 1e-9
         if gap_s < SHORTEST_GAP_S:
             return start
         count = math.ceil(gap_s / self._settings.step_s)
         run = FreeRun(self._model, self._mean_theta, gap_s / count)
-        past = command_history(state.sent, t0_ns, gap_s / count, run.past_rows + count, (start[3], start[4]))
+        past = self._acting(command_history(state.sent, t0_ns, gap_s / count, run.past_rows + count, wheels))
         states = run.states(start, past, run.past_rows, elapsed_s - gap_s)
-        return np.asarray(states[-1])
+        return np.asarray(self._disturbance.shifted(states, self._x_icr_m, gap_s / count)[-1])
+
+    def _follow_disturbance(self, now_ns: int, state: PlannerState) -> None:
+        """Plan with this disturbance, and with what the wheels have lost of their commands since the last plan."""
+        if not self._settings.offset_free:
+            return
+        self._disturbance = state.disturbance
+        self._loss.step(now_ns, state, self._wheels_after)
+
+    def _wheels_after(self, wheels: tuple[float, float], gap_s: float, state: PlannerState) -> tuple[float, float]:
+        """Wheel speeds (rad/s) that the model makes of these and what was sent over so long up to the state."""
+        gap_ms = max(round(gap_s * 1e3), 1)
+        run = self._wheel_runs.get(gap_ms)
+        if run is None:
+            run = self._wheel_runs[gap_ms] = FreeRun(self._model, self._mean_theta, gap_ms * 1e-3)
+        sent = command_history(state.sent, state.t_ns, gap_ms * 1e-3, run.past_rows + 1, wheels)
+        start = np.array([0.0, 0.0, 0.0, *wheels])
+        left, right = run.states(start, self._loss.acting(sent), run.past_rows)[-1, 3:].tolist()
+        return left, right
+
+    def _turning(self, left_rad_s: float, right_rad_s: float) -> tuple[float, float]:
+        """Wheel speeds of an undisturbed robot that turns as this one does with these."""
+        return self._disturbance.turning(left_rad_s, right_rad_s, self._chassis.axial_distance_m)
+
+    def _acting(self, commands: Array) -> Array:
+        """Commands (N, 2) to an undisturbed robot that turns as this one does with these."""
+        if self._disturbance.is_none and self._loss.is_none:
+            return commands
+        acting = self._loss.acting(commands)
+        return np.column_stack(
+            self._disturbance.turning(acting[:, 0], acting[:, 1], self._chassis.axial_distance_m)
+        )
+
+    def _asked(self, commands: Array) -> Array:
+        """The inverse of `_acting`."""
+        if self._disturbance.is_none and self._loss.is_none:
+            return commands
+        left, right = self._disturbance.asked(commands[:, 0], commands[:, 1], self._chassis.axial_distance_m)
+        return self._loss.asked(np.column_stack([left, right]))
 
     def _system(self, state: PlannerState, start: Array, t0_ns: int, task_s: float, elapsed_s: float) -> SkidSteer:
         x, y, yaw, left, right = start.tolist()
@@ -341,9 +385,14 @@ class Disco:
             self._x_icr_m,
         )  # fmt: skip
         direction = (math.cos(yaw), math.sin(yaw)) if math.isfinite(yaw) else (math.nan, math.nan)
-        self._start[:] = (x - origin_x, y - origin_y, *direction, left, right, elapsed_s, begin)
+        found, step_s = self._disturbance, self._settings.step_s
+        carried = found.drift_x_m_s * step_s, found.drift_y_m_s * step_s
+        self._start[:] = (
+            x - origin_x, y - origin_y, *direction, left, right, elapsed_s, begin, *carried, found.left,
+        )  # fmt: skip
         if self._history:
-            self._earlier = command_history(state.sent, t0_ns, self._settings.step_s, self._history, (left, right))
+            wheels = state.left_speed_rad_s, state.right_speed_rad_s
+            self._earlier = self._acting(command_history(state.sent, t0_ns, step_s, self._history, wheels))
             self._optimiser.set_command_history(self._earlier)
         if self._settings.uncertainty in ("mc", "joint"):
             self._draw_points()
@@ -375,7 +424,7 @@ class Disco:
         trajectories = np.empty((len(commands), self._settings.sampler.horizon + 1, 3))
         for row, one in enumerate(commands):
             trajectories[row] = self._trajectory(self._mean, one, 0)
-        return Rollouts(commands, trajectories, weights)
+        return Rollouts(np.array([self._asked(one) for one in commands]), trajectories, weights)
 
     def point_trajectories(self) -> Array:
         """The last plan under each parameter point (sigma point or draw) that is shared: (L, T + 1, 3) x, y, yaw.
@@ -387,6 +436,6 @@ class Disco:
         return np.array([self._trajectory(self._points, wheel_speeds, point) for point in range(count)])
 
     def _trajectory(self, run: FreeRun, wheel_speeds: Array, point: int) -> Array:
-        return run.states(self._planned_from, self._with_past(wheel_speeds), self._history, self._elapsed_s, point)[
-            :, :3
-        ]
+        commands = self._with_past(wheel_speeds)
+        states = run.states(self._planned_from, commands, self._history, self._elapsed_s, point)
+        return self._disturbance.shifted(states, self._x_icr_m, self._settings.step_s)[:, :3]

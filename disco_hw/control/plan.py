@@ -10,6 +10,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from disco_hw.model.disturbance import NO_DISTURBANCE, Disturbance
+
 Array = NDArray[np.float64]
 
 
@@ -28,6 +30,7 @@ class SentCommand(msgspec.Struct, frozen=True, gc=False):
 class PlannerState(msgspec.Struct, frozen=True, gc=False):
     """Pose in the world frame and measured wheel speeds at `t_ns`, and the commands sent up to now, oldest first.
 
+    `disturbance`: how the robot moves beside its model.
     `elapsed_s`: time since the drive began, for effects that depend on it; None counts from the planner's start.
     """
 
@@ -39,6 +42,7 @@ class PlannerState(msgspec.Struct, frozen=True, gc=False):
     right_speed_rad_s: float
     sent: tuple[SentCommand, ...] = ()
     elapsed_s: float | None = None
+    disturbance: Disturbance = NO_DISTURBANCE
 
 
 class PlanOutcome(enum.Enum):

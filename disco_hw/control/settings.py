@@ -97,6 +97,8 @@ class DiscoSettings:
     a step. Then the plan changes as fast at any rate, and more plans a second average out noise instead of adding it.
     guide_below: where a steering law's commands cost less than this part of the plan, they take its place (tasks with
     a line; kernel/guide.py); 0 without a guide.
+    offset_free: whether rollouts move beside the model as the robot was found to (model/disturbance.py), and lose of a
+    command what its wheels were found to lose (wheel_loss.py).
     iterations_at_start: optimisation steps for the first plan after a reset.
     min_ess: effective sample size below which a step counts as collapsed: it is tried again, and reported.
     retries: further attempts after a step without a valid result; then the plan is dropped and planned anew.
@@ -112,6 +114,7 @@ class DiscoSettings:
     latency_s: float = 0.0
     gain_by_time: bool = True
     guide_below: float = 0.85
+    offset_free: bool = True
     iterations_at_start: int = 5
     min_ess: float = 3.0
     retries: int = 2
@@ -153,6 +156,7 @@ class DiscoSettings:
             ut_alpha=0.5,
             gain_by_time=False,
             guide_below=0.0,
+            offset_free=False,
             iterations_at_start=1,
             min_ess=0.0,
         )

@@ -20,6 +20,7 @@ from disco_hw.estimation.odometry import (
     WheelReason,
     WheelTracker,
 )
+from disco_hw.model.disturbance import Disturbance
 from drivers.types import PoseSample, WheelSample
 
 GAP_INTERVALS = 3.0
@@ -145,9 +146,28 @@ class PoseFusion:
 
     def set_parameters(self, parameters: OdometryParameters) -> None:
         """Follow the wheels with another geometry from now on; the present estimate and its uncertainty stay."""
+        disturbance = self._filter.disturbance
         self._filter = PoseFilter(self._settings, parameters)
+        self._filter.disturbance = disturbance
         if self._buffer is not None:
             self._buffer.set_filter(self._filter)
+
+    @property
+    def parameters(self) -> OdometryParameters:
+        """The geometry in force."""
+        return self._filter.parameters
+
+    @property
+    def wheels_rad_s(self) -> tuple[float, float]:
+        """Newest wheel speeds, left and right; zero before the first."""
+        if self._buffer is None:
+            return 0.0, 0.0
+        wheels = self._buffer.newest_wheels
+        return wheels.left_speed_rad_s, wheels.right_speed_rad_s
+
+    def set_disturbance(self, disturbance: Disturbance) -> None:
+        """Take the robot to move so beside its geometry from now on."""
+        self._filter.disturbance = disturbance
 
     def add_wheels(self, sample: WheelSample) -> None:
         """Take in a wheel sample; it must be newer than all before, otherwise it is dropped and counted."""

@@ -15,10 +15,12 @@ import msgspec
 
 from disco_hw.control import NoValidControl, PlannerState, Rollouts, SentCommand, WheelPlan
 from disco_hw.estimation import OdometryParameters, PoseEstimate, PoseFusion, PoseUpdate
+from disco_hw.estimation.disturbance import DisturbanceEstimator
 from disco_hw.model import Belief
+from disco_hw.model.disturbance import NO_DISTURBANCE, Disturbance
 from disco_hw.runtime.governor import Governed, Governor
 from disco_hw.tasks import PlannedTask
-from drivers.types import Readings
+from drivers.types import PoseSample, Readings
 
 HISTORY_NS = 2_000_000_000
 
@@ -135,8 +137,12 @@ class Pipeline:
     wheels ramp to zero. The governor runs in every tick, so that stopping obeys the acceleration limit as well.
     """
 
-    def __init__(self, fusion: PoseFusion, planner: Planner, governor: Governor, plan_tail_s: float) -> None:
+    def __init__(
+        self, fusion: PoseFusion, planner: Planner, governor: Governor, plan_tail_s: float,
+        disturbance: DisturbanceEstimator | None = None,
+    ) -> None:  # fmt: skip
         self._fusion = fusion
+        self._disturbance = disturbance
         self._planner = planner
         self._governor = governor
         self._plan_tail_ns = round(plan_tail_s * 1e9)
@@ -151,6 +157,11 @@ class Pipeline:
         """The estimator, for its counters."""
         return self._fusion
 
+    @property
+    def disturbance(self) -> Disturbance:
+        """How the robot moves beside its model, as far as is known."""
+        return NO_DISTURBANCE if self._disturbance is None else self._disturbance.value
+
     def set_task(self, task: PlannedTask) -> None:
         """Follow another task of the same kind; what is planned for the present one is dropped."""
         self._planner.set_task(task)
@@ -162,6 +173,9 @@ class Pipeline:
         Raises ValueError, with everything as it was, if the planner cannot take the belief.
         """
         self._planner.set_belief(belief)
+        if self._disturbance is not None:
+            self._disturbance.change_geometry(self._fusion.parameters, odometry, self._fusion.wheels_rad_s)
+            self._fusion.set_disturbance(self._disturbance.value)
         self._fusion.set_parameters(odometry)
 
     def rollouts(self, count: int) -> Rollouts | None:
@@ -178,7 +192,7 @@ class Pipeline:
         """
         for wheels in readings.wheels:
             self._fusion.add_wheels(wheels)
-        updates = tuple(self._fusion.add_pose(pose, now_ns) for pose in readings.poses)
+        updates = tuple(self._take_pose(pose, now_ns) for pose in readings.poses)
         estimate = self._fusion.estimate(now_ns)
         mark("estimate")
         plan, failure = None, None
@@ -201,6 +215,13 @@ class Pipeline:
             command=command,
         )
 
+    def _take_pose(self, pose: PoseSample, now_ns: int) -> PoseUpdate:
+        update = self._fusion.add_pose(pose, now_ns)
+        if self._disturbance is not None:
+            self._disturbance.take(pose, update, self._fusion.parameters, self._fusion.wheels_rad_s)
+            self._fusion.set_disturbance(self._disturbance.value)
+        return update
+
     def _replan(self, now_ns: int, estimate: PoseEstimate) -> tuple[WheelPlan | None, str | None]:
         if not self._following:
             self._planner.reset()
@@ -213,6 +234,7 @@ class Pipeline:
             left_speed_rad_s=estimate.left_speed_rad_s,
             right_speed_rad_s=estimate.right_speed_rad_s,
             sent=tuple(self._sent),
+            disturbance=self.disturbance,
         )
         try:
             plan = self._planner.plan(now_ns, state)

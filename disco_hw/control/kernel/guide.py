@@ -15,6 +15,7 @@ from disco_hw.control.kernel.layout import Floats, Terms
 from disco_hw.control.kernel.sequences import Limits, clip
 from disco_hw.control.kernel.task_costs import line_at, place_of
 from disco_hw.jit import kernel_function, scalar_function
+from disco_hw.model.disturbance import MOVES_RAD_S
 
 # The law's gains (1/m): of the heading, and of the distance, which the robot comes back from at this angle a metre.
 YAW_PER_M, ANGLE_PER_M = 9.0, 3.3
@@ -42,7 +43,7 @@ def guide(
     commands: Floats, terms: Terms, start: Floats, chassis: SteeredChassis, before_left: float, before_right: float,
     limits: Limits, step_s: float,
 ) -> None:  # fmt: skip
-    """Fill `commands` (T, 2) with the wheel speeds of the law (rad/s), from the state `start` (8,) of `SkidSteer`
+    """Fill `commands` (T, 2) with the wheel speeds of the law (rad/s), from the state `start` (11,) of `SkidSteer`
     and the commands before, within the limits.
 
     The robot that it steers meanwhile is the chassis alone; `terms` are those of a task with a line.
@@ -81,8 +82,10 @@ def guide(
         turned = chassis.wheel_radius_m * step_s * (mean_right - mean_left) / chassis.axial_distance_m
         cos_half, sin_half = math.cos(0.5 * turned), math.sin(0.5 * turned)
         cos_yaw, sin_yaw = cos_yaw * cos_half - sin_yaw * sin_half, sin_yaw * cos_half + cos_yaw * sin_half
-        x += moved * cos_yaw + turned * x_icr_m * sin_yaw
-        y += moved * sin_yaw - turned * x_icr_m * cos_yaw
+        aside = turned * x_icr_m - moved * start[10]
+        carried = min((abs(mean_left) + abs(mean_right)) / MOVES_RAD_S, 1.0)
+        x += moved * cos_yaw + aside * sin_yaw + carried * start[8]
+        y += moved * sin_yaw - aside * cos_yaw + carried * start[9]
         cos_yaw, sin_yaw = cos_yaw * cos_half - sin_yaw * sin_half, sin_yaw * cos_half + cos_yaw * sin_half
 
 

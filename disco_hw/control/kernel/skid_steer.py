@@ -7,6 +7,7 @@ them is costed. What is absent is None, in arguments of their own, as the compil
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -46,6 +47,7 @@ from disco_hw.control.kernel.layout import (
 from disco_hw.control.kernel.task_costs import follow, looks_up, row_of, stage_cost, terminal_cost
 from disco_hw.jit import bits_of_float, block_function, cast_like, float_from_bits, scalar_function, tune_loops
 from disco_hw.model.coefficients import Base, Coefficients, Integration
+from disco_hw.model.disturbance import MOVES_RAD_S
 from disco_hw.model.step import (
     axle_of,
     body_step,
@@ -58,7 +60,7 @@ from disco_hw.model.step import (
     wheels_follow,
 )
 from disco_hw.model.tables import base_point, effect_point, lane_base, lane_effects
-from disco_hw.tasks.cost import Found
+from disco_hw.tasks.cost import Found, constant
 
 Absent: TypeAlias = bool | None
 """None, or anything else: whether a part is there, known to the compiler."""
@@ -67,6 +69,8 @@ Pairs: TypeAlias = NDArray[np.int64] | None
 BasePair: TypeAlias = tuple[Base, Base] | None
 CostPlaces: TypeAlias = tuple[np.uintp, np.uintp] | None
 """Where the costs of a pair of points begin."""
+SLIDES_FROM_M, MOST_ASIDE = 0.005, 0.4
+"""The least way of a step, and the largest tangent, by which the angle is taken at which a robot slides aside."""
 Place: TypeAlias = tuple[float, float, float]
 """Tracked point x, y (m) and forward speed (m/s)."""
 
@@ -74,8 +78,10 @@ Place: TypeAlias = tuple[float, float, float]
 class SkidSteer(NamedTuple):
     """A skid-steer robot before its task.
 
-    `start` (8,): x, y relative to the task's origin (m), cos and sin of yaw, left and right wheel speed (rad/s), time
-    (s), the task's memory. `base`, `effects`: coefficient tables of L points; `each` is None, or anything else if the
+    `start` (11,): x, y relative to the task's origin (m), cos and sin of yaw, left and right wheel speed (rad/s), time
+    (s), the task's memory; how far the ground carries the robot in a step along x and y (m), in proportion to the size
+    of equivalent points, and how far it slides to the left for each metre forward (`model/disturbance.py`).
+    `base`, `effects`: coefficient tables of L points; `each` is None, or anything else if the
     tables hold points for every sample, (L, K'). `ahead`, `scaled` (L, 2) int or None: pairs of points that
     share a point's rollout, as `parameter_points.equivalent_points` finds them. `skip_mean`: None, or anything else if
     the first point has no weight, so that it is rolled out for its equivalent points alone and its cost is left as it
@@ -148,16 +154,21 @@ def _rolling(wheels: Floats, t: int, b: int, commands: Floats, late: int, horizo
 
 @scalar_function
 def _move(
-    state: Floats, b: int, rolling: Place, time_s: float, base: Base, effects: Coefficients, integration: Integration
-) -> None:
+    state: Floats, b: int, rolling: Place, time_s: float, base: Base, effects: Coefficients, integration: Integration,
+    start: Floats,
+) -> None:  # fmt: skip
     """Move sample b on by one step."""
     wheel_sum, difference, change = rolling
     axle_x, axle_y, cos_yaw, sin_yaw, forward, _ = body_step(
         state[AXLE_X + b], state[AXLE_Y + b], state[COS + b], state[SIN + b],
         wheel_sum, difference, change, time_s, base, effects, integration,
     )  # fmt: skip
-    state[AXLE_X + b] = axle_x
-    state[AXLE_Y + b] = axle_y
+    # The larger of both is the sum of the wheels' sizes.
+    turned = max(abs(wheel_sum), abs(difference)) * constant(1.0 / MOVES_RAD_S, forward)
+    carried = min(turned, constant(1.0, forward))
+    step_x, step_y = axle_x - state[AXLE_X + b], axle_y - state[AXLE_Y + b]
+    state[AXLE_X + b] = axle_x + (carried * start[8] - start[10] * step_y)
+    state[AXLE_Y + b] = axle_y + (carried * start[9] + start[10] * step_x)
     state[COS + b] = cos_yaw
     state[SIN + b] = sin_yaw
     state[FORWARD + b] = forward
@@ -326,13 +337,25 @@ def _costs(
         _cost(state, SCALED1, b, t, _scaled_place(state, b, base, scaled[1], start), task, last)
 
 
+@scalar_function
+def sliding_heading(cos_yaw: float, sin_yaw: float, forward_m: float, start: Floats) -> tuple[float, float]:
+    """Heading of an undisturbed robot that would go where this one slides to, which goes so far forward in a step."""
+    one = constant(1.0, forward_m)
+    way = max(forward_m, constant(SLIDES_FROM_M, forward_m))
+    aside = start[10] + (cos_yaw * start[9] - sin_yaw * start[8]) / way
+    aside = min(max(aside, -constant(MOST_ASIDE, forward_m)), constant(MOST_ASIDE, forward_m))
+    scale = one / math.sqrt(one + aside * aside)
+    return (cos_yaw - aside * sin_yaw) * scale, (sin_yaw + aside * cos_yaw) * scale
+
+
 @block_function
-def _end(costs: Floats, at: int, state: Floats, own: int, task: Terms) -> None:
+def _end(costs: Floats, at: int, state: Floats, own: int, start: Floats, step_s: float, task: Terms) -> None:
     """Write the costs of the rows from `own` on to `costs[at:at + BLOCK]`."""
     tune_loops()
     for b in range(BLOCK):
+        cos_yaw, sin_yaw = sliding_heading(state[COS + b], state[SIN + b], state[FORWARD + b] * step_s, start)
         costs[at + b] = state[own + TOTAL + b] + terminal_cost(
-            task, state[own + MEMORY + b], state[own + X + b], state[own + Y + b], state[COS + b], state[SIN + b],
+            task, state[own + MEMORY + b], state[own + X + b], state[own + Y + b], cos_yaw, sin_yaw,
             _found(looks_up(task), state, own, b),
         )  # fmt: skip
 
@@ -369,7 +392,8 @@ def _roll(
             for b in range(BLOCK):
                 here, acting = lane_base(base, at + b), lane_effects(effects, at + b)
                 _move(
-                    state, b, _rolling(wheels, t, b, commands, late, horizon, acting), time_s, here, acting, integration
+                    state, b, _rolling(wheels, t, b, commands, late, horizon, acting), time_s, here, acting,
+                    integration, start,
                 )  # fmt: skip
                 _follows(looks_up(task), state, b, here, skip_mean, ahead, scaled, start, task)
         else:
@@ -377,7 +401,8 @@ def _roll(
                 here, acting = lane_base(base, at + b), lane_effects(effects, at + b)
                 _costs(state, b, t - 1, here, skip_mean, ahead, scaled, start, task, None)
                 _move(
-                    state, b, _rolling(wheels, t, b, commands, late, horizon, acting), time_s, here, acting, integration
+                    state, b, _rolling(wheels, t, b, commands, late, horizon, acting), time_s, here, acting,
+                    integration, start,
                 )  # fmt: skip
                 _follows(looks_up(task), state, b, here, skip_mean, ahead, scaled, start, task)
         _look_ups(looks_up(task), state, skip_mean, ahead, scaled, task)
@@ -385,13 +410,13 @@ def _roll(
         _costs(state, b, horizon - 1, lane_base(base, at + b), skip_mean, ahead, scaled, start, task, True)
     # One after the other: a loop that wrote to all at once would not be vectorised.
     if skip_mean is None:
-        _end(costs, at, state, OWN, task)
+        _end(costs, at, state, OWN, start, integration.step_s, task)
     if ahead_at is not None:
-        _end(costs, ahead_at[0], state, AHEAD0, task)
-        _end(costs, ahead_at[1], state, AHEAD1, task)
+        _end(costs, ahead_at[0], state, AHEAD0, start, integration.step_s, task)
+        _end(costs, ahead_at[1], state, AHEAD1, start, integration.step_s, task)
     if scaled_at is not None:
-        _end(costs, scaled_at[0], state, SCALED0, task)
-        _end(costs, scaled_at[1], state, SCALED1, task)
+        _end(costs, scaled_at[0], state, SCALED0, start, integration.step_s, task)
+        _end(costs, scaled_at[1], state, SCALED1, start, integration.step_s, task)
 
 
 @scalar_function
