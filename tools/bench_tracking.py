@@ -31,6 +31,7 @@ def contenders() -> dict[str, Contender]:
         "disco_point": disco(replace(settings, uncertainty="point")),
         "disco_ut": disco(settings),
         "disco_adapting": disco(settings, learns=True),
+        "disco_offset_free": disco(replace(settings, offset_free=True), learns=True),
         "disco_truth": disco(settings, knows=True),
         "kanayama_truth": classical(Kanayama(), knows=True),
     }

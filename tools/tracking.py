@@ -113,6 +113,7 @@ class Contender:
     planner: Callable[[ForeignRobot, Track], Planner]
     knows: bool = False
     learns: bool = False
+    offset_free: bool = False
 
 
 def classical(law: Law, speed_m_s: float = 0.2, knows: bool = False) -> Contender:
@@ -128,7 +129,11 @@ def classical(law: Law, speed_m_s: float = 0.2, knows: bool = False) -> Contende
 
 def disco(settings: DiscoSettings, knows: bool = False, learns: bool = False, seed: int = 1) -> Contender:
     """DISCO with these settings."""
-    return Contender(lambda robot, track: Disco(model(robot, knows), track.task, settings, LIMITS, seed), knows, learns)
+
+    def made(robot: ForeignRobot, track: Track) -> Planner:
+        return Disco(model(robot, knows), track.task, settings, LIMITS, seed)
+
+    return Contender(made, knows, learns, settings.offset_free)
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,10 +184,10 @@ def drive(
     mean, spread = ((robot.radius_m, robot.axle_m, robot.x_icr_m), 0.004) if contender.knows else (NOMINAL, SPREAD)
     period_s = 1.0 / rate_hz
     governor = Governor(WheelLimits(LIMITS.speed_rad_s, *[LIMITS.acceleration_rad_s2] * 2), period_s)
-    pipeline = Pipeline(
-        fusion(mean, spread), contender.planner(robot, track), governor, 0.2, DisturbanceEstimator()
-    )
-    adaptation = _learner(robot, pipeline) if contender.learns else NoAdaptation()
+    planner = contender.planner(robot, track)
+    disturbance = DisturbanceEstimator() if contender.offset_free else None
+    pipeline = Pipeline(fusion(mean, spread), planner, governor, 0.2, disturbance)
+    adaptation = _learner(robot, pipeline, contender.offset_free) if contender.learns else NoAdaptation()
     every_ms = round(1e3 * period_s)
     rows: list[tuple[float, ...]] = []
     wheels, poses = [], []
@@ -206,10 +211,10 @@ def drive(
     return Drive(table[:, 0], table[:, 1:4], table[:, 4], table[:, 5:7], track.course.off_m(table[:, 1:3]))
 
 
-def _learner(robot: ForeignRobot, pipeline: Pipeline) -> FastAdaptation:
+def _learner(robot: ForeignRobot, pipeline: Pipeline, drifts: bool) -> FastAdaptation:
     """The filter beside this pipeline."""
     believed = model(robot)
     mean = believed_geometry(believed)
     return FastAdaptation(
-        mean, 0.5 * mean.mean, 1.5 * mean.mean, lambda geometry: put_in_force(pipeline, believed, geometry)
+        mean, 0.5 * mean.mean, 1.5 * mean.mean, lambda geometry: put_in_force(pipeline, believed, geometry), drifts
     )

@@ -35,12 +35,13 @@ class FastAdaptation:
     """
 
     def __init__(
-        self, model: Geometry, low: np.ndarray, high: np.ndarray, put_in_force: Callable[[Geometry | None], None]
-    ) -> None:
+        self, model: Geometry, low: np.ndarray, high: np.ndarray, put_in_force: Callable[[Geometry | None], None],
+        drifts: bool = False,
+    ) -> None:  # fmt: skip
         self._model, self._in_force, self._put_in_force = model, model, put_in_force
         order = np.ix_(_FROM_NAMES, _FROM_NAMES)
         self._filter = GeometryFilter(
-            model.mean[_FROM_NAMES], model.covariance[order], low[_FROM_NAMES], high[_FROM_NAMES]
+            model.mean[_FROM_NAMES], model.covariance[order], low[_FROM_NAMES], high[_FROM_NAMES], drifts
         )
         self._next_ns: int | None = None
         self._poses = self._changes = self._carried = 0

@@ -52,6 +52,8 @@ CARRIED_M, CARRIED_RAD, CARRIED_POSES = 0.15, 0.3, 6
 """Poses so far from the prediction, so many in a row: the robot was carried."""
 WORST_POSE_STD_M = 0.03
 """Poses worse than this are left to the fusion."""
+DRIFT_STD_M_S, DRIFT_WALK_M_S = 0.01, 0.001
+"""What the ground carries a robot on a slope by, in the world frame, and how it changes in a second."""
 _GAP_NS = 300_000_000
 _WAIT_NS = 600_000_000
 """Wheel samples wait so long for a pose, and a pose stamped later than that after them is none: the tick that takes
@@ -63,26 +65,29 @@ _STRIDE_S = 0.045
 """Wheel samples between two poses are followed together, along one arc, for so long."""
 _ROUGH_M, _ROUGH_RAD = 5e-4, 5e-4
 """Random part of a centimetre driven, to any side and in heading, which the wheels do not show."""
-_X, _Y, _YAW, _RADIUS, _AXLE, _X_ICR, _LEFT, _RIGHT, _LAG = range(9)
-_SIZE = 9
+_X, _Y, _YAW, _RADIUS, _AXLE, _X_ICR, _LEFT, _RIGHT, _LAG, _DRIFT_X, _DRIFT_Y = range(11)
+_SIZE = 11
+_DRIFTS = [_DRIFT_X, _DRIFT_Y]
 _THETA = slice(_RADIUS, _X_ICR + 1)
 _SLIPS = slice(_LEFT, _RIGHT + 1)
 _DRIVEN, _EVERY = [_RADIUS, _AXLE, _LEFT, _RIGHT], range(_SIZE)
 
 
 class _Bank:
-    """Some filters, each a row of `state` (N, 9) and `covariance` (N, 9, 9) in the order above."""
+    """Some filters, each a row of `state` (N, 11) and `covariance` (N, 11, 11) in the order above."""
 
-    def __init__(self, theta: Array, covariance: Array) -> None:
+    def __init__(self, theta: Array, covariance: Array, drifts: bool) -> None:
+        self._drifts = 1.0 if drifts else 0.0
         self.state, self.covariance = np.zeros((1, _SIZE)), np.zeros((1, _SIZE, _SIZE))
         self.state[0, _THETA], self.covariance[0, _THETA, _THETA] = theta, covariance
         self.state[0, _LAG], self.covariance[0, _LAG, _LAG] = LAG_S, LAG_STD_S**2
+        self.covariance[:, _DRIFTS, _DRIFTS] = self._drifts * DRIFT_STD_M_S**2
         self._velocity, self._sliding_rad_s = np.zeros((1, 3)), np.zeros(1)
 
     def predict(self, left: float, right: float, dt_s: float) -> None:
         """Follow wheels that turned so far (rad)."""
         state = self.state
-        _, _, yaw, radius, axle, x_icr, slip_left, slip_right, _ = state.T
+        _, _, yaw, radius, axle, x_icr, slip_left, slip_right = state[:, : _RIGHT + 1].T
         way_left, way_right = radius * left * (1.0 - slip_left), radius * right * (1.0 - slip_right)
         way, turn = 0.5 * (way_left + way_right), (way_right - way_left) / axle
         cosine, sine = np.cos(yaw + 0.5 * turn), np.sin(yaw + 0.5 * turn)
@@ -99,12 +104,14 @@ class _Bank:
         sideways = turn - lags_rad_s * _SLIDING_S * slides
         self._sliding_rad_s = self._sliding_rad_s + slides * lags_rad_s
         move_x, move_y = way * cosine + x_icr * sideways * sine, way * sine - x_icr * sideways * cosine
+        move_x, move_y = move_x + state[:, _DRIFT_X] * dt_s, move_y + state[:, _DRIFT_Y] * dt_s
         step = np.broadcast_to(np.eye(_SIZE), (len(state), _SIZE, _SIZE)).copy()
         step[:, _X, _YAW], step[:, _Y, _YAW] = -move_y, move_x
         step[:, _X, _X_ICR], step[:, _Y, _X_ICR] = sideways * sine, -sideways * cosine
         step[:, _X, _DRIVEN] = by_way * cosine[:, None] + by_turn * x_by_turn[:, None]
         step[:, _Y, _DRIVEN] = by_way * sine[:, None] + by_turn * y_by_turn[:, None]
         step[:, _YAW, _DRIVEN] = by_turn
+        step[:, _X, _DRIFT_X] = step[:, _Y, _DRIFT_Y] = dt_s
         step[:, _LEFT, _LEFT] = step[:, _RIGHT, _RIGHT] = keep
 
         noise = np.empty((len(state), _SIZE))
@@ -118,6 +125,7 @@ class _Bank:
         noise[:, _X_ICR] = (DRIFT_PER_SQRT_RAD * x_icr) ** 2 * np.abs(turn)
         noise[:, _SLIPS] = SLIP_STD**2 * (1.0 - keep * keep)
         noise[:, _LAG] = LAG_DRIFT_S**2 * np.abs(turn)
+        noise[:, _DRIFTS] = self._drifts * DRIFT_WALK_M_S**2 * dt_s
         covariance = step @ self.covariance @ step.transpose(0, 2, 1)
         covariance[:, _EVERY, _EVERY] += noise
         self.covariance = covariance
@@ -144,7 +152,7 @@ class _Bank:
         self.state[:, _THETA] = np.clip(self.state[:, _THETA], low, high)
 
     def _with_pose(self) -> Array:
-        """Covariances (N, 9, 3) of the state with the pose that is measured."""
+        """Covariances (N, 11, 3) of the state with the pose that is measured."""
         return self.covariance[:, :, :3] - self.covariance[:, :, _LAG, None] * self._velocity[:, None]
 
     def keep(self, rows: NDArray[np.int64]) -> None:
@@ -169,15 +177,19 @@ class _Bank:
         self.covariance[:, :3, :3] = spread + self._velocity[:, :, None] * with_lag[:, None]
         self.covariance[:, :3, _LAG] = self.covariance[:, _LAG, :3] = with_lag
         self.covariance[:, _LEFT, _LEFT] = self.covariance[:, _RIGHT, _RIGHT] = SLIP_STD**2
+        self.state[:, _DRIFTS] = 0.0
+        self.covariance[:, _DRIFTS, _DRIFTS] = self._drifts * DRIFT_STD_M_S**2
 
 
 class GeometryFilter:
     """Learns (wheel radius, axial distance, x_icr) from `mean` (3,) and `covariance` (3, 3), within `low` and `high`.
 
+    `drifts`: the ground may carry the robot, as on a slope; then a change of the geometry is known later.
     Pure: no clock, the same samples give the same numbers bit for bit.
     """
 
-    def __init__(self, mean: Array, covariance: Array, low: Array, high: Array) -> None:
+    def __init__(self, mean: Array, covariance: Array, low: Array, high: Array, drifts: bool = False) -> None:
+        self._drifts = drifts
         self._first, self._first_covariance = mean.copy(), covariance.copy()
         self._low, self._high = low, high
         self._wheels: deque[WheelSample] = deque()
@@ -187,7 +199,7 @@ class GeometryFilter:
 
     def reset(self) -> None:
         """Believe again what was believed at first, of a robot that may be anywhere."""
-        self._bank = _Bank(self._first, self._first_covariance)
+        self._bank = _Bank(self._first, self._first_covariance, self._drifts)
         self._log_odds, self._age_s, self._moved_s = np.zeros(1), np.zeros(1), 0.0
         self._placed = False
         self._at: WheelSample | None = None

@@ -148,6 +148,7 @@ class Control(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     mode: Literal["default", "paper"] = "default"
     uncertainty: Literal["ut", "mc", "joint", "point"] = "ut"
     adaptation: Literal["auto", "off", "fast", "audited"] = "auto"
+    disturbance: bool = False
     samples: Annotated[int, Meta(ge=8, le=1_000_000)] = 400
     horizon: Annotated[int, Meta(ge=2, le=500)] | None = None
     step_s: Annotated[float, Meta(gt=0.0, le=1.0)] | None = None

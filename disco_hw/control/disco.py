@@ -367,9 +367,7 @@ class Disco:
         if self._disturbance.is_none and self._loss.is_none:
             return commands
         acting = self._loss.acting(commands)
-        return np.column_stack(
-            self._disturbance.turning(acting[:, 0], acting[:, 1], self._chassis.axial_distance_m)
-        )
+        return np.column_stack(self._disturbance.turning(acting[:, 0], acting[:, 1], self._chassis.axial_distance_m))
 
     def _asked(self, commands: Array) -> Array:
         """The inverse of `_acting`."""

@@ -114,7 +114,7 @@ class DiscoSettings:
     latency_s: float = 0.0
     gain_by_time: bool = True
     guide_below: float = 0.85
-    offset_free: bool = True
+    offset_free: bool = False
     iterations_at_start: int = 5
     min_ess: float = 3.0
     retries: int = 2
@@ -156,7 +156,6 @@ class DiscoSettings:
             ut_alpha=0.5,
             gain_by_time=False,
             guide_below=0.0,
-            offset_free=False,
             iterations_at_start=1,
             min_ess=0.0,
         )
@@ -183,4 +182,6 @@ class DiscoSettings:
         horizon = settings.sampler.horizon if control.horizon is None else control.horizon
         step_s = settings.step_s if control.step_s is None else control.step_s
         sampler = replace(settings.sampler, samples=control.samples, horizon=horizon)
-        return replace(settings, sampler=sampler, step_s=step_s, uncertainty=control.uncertainty)
+        return replace(
+            settings, sampler=sampler, step_s=step_s, uncertainty=control.uncertainty, offset_free=control.disturbance
+        )

@@ -16,7 +16,7 @@ from disco_hw.estimation.odometry import OdometryParameters
 from disco_hw.model.disturbance import NO_DISTURBANCE, Disturbance
 from drivers.types import PoseSample
 
-BODY_PER_S, TURN_PER_S, WORLD_PER_S = 0.3, 0.4, 0.6
+BODY_PER_S, TURN_PER_S, WORLD_PER_S = 0.2, 0.25, 0.4
 """How fast the parts follow: of the body's way, of its turning, of the ground."""
 STABLE_PART = 0.25
 """Neither follows faster than this part of the rate at which poses correct the pose itself."""

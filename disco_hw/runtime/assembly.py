@@ -20,6 +20,7 @@ from disco_hw.adaptation.link import AdapterLink
 from disco_hw.config import RobotConfig
 from disco_hw.errors import InputError
 from disco_hw.estimation import OdometryParameters, PoseFusion
+from disco_hw.estimation.disturbance import DisturbanceEstimator
 from disco_hw.log.recorder import Recorder
 from disco_hw.model import Model
 from disco_hw.runtime.core import DaemonCore
@@ -64,6 +65,7 @@ def make_pipeline(config: RobotConfig, model: Model, planner: Planner) -> Pipeli
         planner=planner,
         governor=Governor(limits, 1.0 / config.control.rate_hz),
         plan_tail_s=config.control.plan_tail_s,
+        disturbance=DisturbanceEstimator() if config.control.disturbance else None,
     )
 
 
@@ -93,6 +95,7 @@ def make_fast_adaptation(setup: Setup, pipeline: Pipeline) -> FastAdaptation:
         _rehearsed(setup, pipeline),
         *possible_range(setup.config.prior),
         lambda geometry: put_in_force(pipeline, setup.model, geometry),
+        setup.config.control.disturbance,
     )
 
 

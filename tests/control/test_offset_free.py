@@ -1,0 +1,66 @@
+"""What no parameter explains leaves no offset: losses of the wheels, and drives on foreign robots."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from disco_hw.control import DiscoSettings, PlannerState, SentCommand
+from disco_hw.control.wheel_loss import LARGEST_RAD_S, WheelLoss
+from tools.foreign_plant import NOMINAL, ForeignRobot
+from tools.tracking import LIMITS, Contender, Disco, drive, model, tracks
+
+KEEP = float(np.exp(-0.02 / 0.15))
+
+
+@pytest.mark.parametrize("lost", [(0.2, 0.2), (-0.2, 0.15), (0.0, 0.3)])
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_what_either_wheel_loses_is_found_in_either_direction(lost, sign):
+    loss, speeds, wanted = WheelLoss(), np.zeros(2), sign * np.array([2.0, 4.0])
+
+    def after(wheels, gap_s, state):
+        return tuple(loss.acting(wanted[None])[0] * (1.0 - KEEP) + KEEP * np.array(wheels))
+
+    for k in range(300):
+        sent = (SentCommand(0, *wanted.tolist()),)
+        loss.step(20_000_000 * k, PlannerState(20_000_000 * k, 0.0, 0.0, 0.0, *speeds.tolist(), sent=sent), after)
+        speeds = (wanted - sign * np.array(lost)) * (1.0 - KEEP) + KEEP * speeds
+    assert loss.rad_s == pytest.approx(lost, abs=0.02)
+    commands = np.array([[0.0, 0.0], [0.3, -0.3], [2.0, -2.0], [5.0, 5.0]])
+    assert loss.asked(loss.acting(commands)) == pytest.approx(commands)
+
+
+def test_a_wheel_that_is_held_does_not_wind_the_loss_up():
+    loss = WheelLoss()
+    for k in range(500):
+        sent = (SentCommand(0, 3.0, 3.0),)
+        state = PlannerState(20_000_000 * k, 0.0, 0.0, 0.0, 0.0, 0.0, sent=sent)
+        loss.step(20_000_000 * k, state, lambda wheels, gap_s, state: (3.0, 3.0))
+    assert loss.rad_s == (LARGEST_RAD_S, LARGEST_RAD_S)
+
+
+EFFECTS = {
+    "slope": {"slope_m_s": 0.02},
+    "payload": {"mass_kg": 100.0, "inertia_kg_m2": 8.0, "x_icr_m": 0.21},
+    "unequal wheels": {"left_gain": 0.95},
+    "slower lag": {"lag_s": 0.25},
+    "wider dead band": {"dead_rad_s": 0.5},
+    "narrower dead band": {"dead_rad_s": 0.1},
+}
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("way", ["circle", "eight"])
+@pytest.mark.parametrize("effect", EFFECTS)
+def test_no_effect_leaves_more_than_four_millimetres(effect, way):
+    nominal = ForeignRobot(*NOMINAL)
+    settings = replace(DiscoSettings.for_speed(0.2, 50.0), offset_free=True)
+
+    def planner(robot, track):
+        return Disco(model(nominal), track.task, settings, LIMITS, 1)
+
+    contender = Contender(planner, learns=True, offset_free=True)
+    found = drive(contender, replace(nominal, **EFFECTS[effect]), tracks()[way]).after()
+    assert abs(found.signed_mm) < 4.0, found.rms_mm
