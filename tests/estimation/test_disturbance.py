@@ -40,6 +40,7 @@ def driven(true: Disturbance, duration_s: float, jump_m: float = 0.0):
     return estimator, math.hypot(found.x_m - x, found.y_m - y)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "true",
     [
