@@ -206,14 +206,14 @@ LEAST_RATE_HZ, MOST_POSITION_STD_M, MOST_YAW_STD_RAD, MOST_LATENCY_S = 10.0, 0.0
 
 
 @dataclass(frozen=True, slots=True)
-class Choice:
+class AdaptationChoice:
     """Which adaptation runs, and why."""
 
     kind: Literal["off", "fast", "audited"]
     why: str
 
 
-def choose_adaptation(control: Control, pose: PoseInput, model: Model) -> Choice:
+def choose_adaptation(control: Control, pose: PoseInput, model: Model) -> AdaptationChoice:
     """What `control.adaptation` asks for; for "auto" the filter where [pose] says poses that are good enough for it.
 
     Raises InputError for one that is asked for and that the model does not allow.
@@ -222,26 +222,28 @@ def choose_adaptation(control: Control, pose: PoseInput, model: Model) -> Choice
     if asked != "auto":
         if asked != "off":
             check_adaptable(model, control.uncertainty, ASKED_BY_FILE)
-        return Choice(asked, f'{ASKED_BY_FILE} = "{asked}"')
+        return AdaptationChoice(asked, f'{ASKED_BY_FILE} = "{asked}"')
     try:
         check_adaptable(model, control.uncertainty, ASKED_BY_FILE)
     except InputError as error:
-        return Choice("off", str(error))
+        return AdaptationChoice("off", str(error))
     if pose.rate_hz is None:
         text = (
             f"pose.rate_hz is not given; write it, pose.position_std_m and pose.yaw_std_rad where poses come at "
             f"{LEAST_RATE_HZ:g} Hz or more with {MOST_POSITION_STD_M:g} m and {MOST_YAW_STD_RAD:g} rad or less"
         )
-        return Choice("off", text)
+        return AdaptationChoice("off", text)
     if pose.rate_hz < LEAST_RATE_HZ:
-        return Choice("off", f"pose.rate_hz is {pose.rate_hz:g}, less than {LEAST_RATE_HZ:g}")
+        return AdaptationChoice("off", f"pose.rate_hz is {pose.rate_hz:g}, less than {LEAST_RATE_HZ:g}")
     for name, most in (
         ("position_std_m", MOST_POSITION_STD_M), ("yaw_std_rad", MOST_YAW_STD_RAD), ("latency_s", MOST_LATENCY_S),
     ):  # fmt: skip
         given = getattr(pose, name)
         if given > most:
-            return Choice("off", f"pose.{name} is {given:g}, more than {most:g}")
-    return Choice("fast", f"poses at {pose.rate_hz:g} Hz with {pose.position_std_m:g} m and {pose.yaw_std_rad:g} rad")
+            return AdaptationChoice("off", f"pose.{name} is {given:g}, more than {most:g}")
+    return AdaptationChoice(
+        "fast", f"poses at {pose.rate_hz:g} Hz with {pose.position_std_m:g} m and {pose.yaw_std_rad:g} rad"
+    )
 
 
 def believed_geometry(model: Model) -> Geometry:

@@ -17,7 +17,7 @@ Law = Callable[[PlannerState, Any, Model], tuple[float, float]]
 HELD_STEPS, _STEP_S = 4, 0.1
 
 
-class Controller:
+class LawController:
     """A planner that holds what a law says until it is asked again, one control period later.
 
     A law that raises NoValidControl, or whose answer is not two finite numbers, has no plan: the last one is followed

@@ -17,7 +17,7 @@ from disco_hw.adaptation.adaptation import GeometryAdaptation
 from disco_hw.adaptation.guard import check_adaptable, choose_adaptation
 from disco_hw.adaptation.link import ProcessLink
 from disco_hw.config import RobotConfig
-from disco_hw.control.law import Controller, Law
+from disco_hw.control.law import Law, LawController
 from disco_hw.daemon import realtime
 from disco_hw.daemon.async_printer import STANDARD_OUTPUT, AsyncPrinter, Waiting
 from disco_hw.daemon.client import (
@@ -139,8 +139,8 @@ def run_daemon(
         )
 
 
-def _controller(law: Law, setup: Setup) -> Controller:
-    return Controller(law, setup.model, setup.config.task.planned(setup.config.control.mode))
+def _controller(law: Law, setup: Setup) -> LawController:
+    return LawController(law, setup.model, setup.config.task.planned(setup.config.control.mode))
 
 
 def serve(

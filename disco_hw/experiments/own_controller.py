@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.config import RobotConfig
-from disco_hw.control.law import Controller, Law
+from disco_hw.control.law import Law, LawController
 from disco_hw.errors import InputError
 from disco_hw.experiments.simulated_time import SimulatedRun, virtual_robot
 from disco_hw.experiments.virtual import true_parameters
@@ -92,4 +92,4 @@ def _at_the_reference_controller(setup: Setup) -> Setup:
 def _planner(setup: Setup, law: Law | None) -> Planner:
     if law is None:
         return make_planner(setup.config, setup.model)
-    return Controller(law, setup.model, setup.config.task.planned(setup.config.control.mode))
+    return LawController(law, setup.model, setup.config.task.planned(setup.config.control.mode))

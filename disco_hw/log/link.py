@@ -32,7 +32,7 @@ class Attachment(msgspec.Struct, frozen=True):
     data: bytes
 
 
-class Scene(msgspec.Struct, frozen=True):
+class TaskScene(msgspec.Struct, frozen=True):
     """What a viewer draws beside the records: the task's course in the world, and the size of the robot (m)."""
 
     outline_m: tuple[tuple[float, float], ...]
@@ -56,7 +56,7 @@ class Start(msgspec.Struct, frozen=True):
     continues: str = ""
     continues_sequence: int = 0
     attachments: tuple[Attachment, ...] = ()
-    scene: Scene | None = None
+    scene: TaskScene | None = None
     flush_s: float = 0.5
     beat_s: float = 0.2
     grace_s: float = 3.0

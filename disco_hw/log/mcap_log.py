@@ -35,7 +35,7 @@ from mcap.writer import CompressionType, Writer
 from mcap_protobuf.schema import build_file_descriptor_set
 
 from disco_hw.log.encoding import encode_json, json_schema
-from disco_hw.log.link import Batch, BatchDecoder, End, Scene, Start
+from disco_hw.log.link import Batch, BatchDecoder, End, Start, TaskScene
 from disco_hw.log.records import TOPICS, Estimate, Event, Fan, Plan, Record
 from drivers.types import PoseSample
 
@@ -99,7 +99,7 @@ def views(record: Record, wall_ns: int) -> list[tuple[str, bytes]]:
     return []
 
 
-def scene_message(scene: Scene) -> bytes:
+def scene_message(scene: TaskScene) -> bytes:
     """A SceneUpdate in protobuf: the task's course in the world's frame, and the robot's body in its own."""
     line = LinePrimitive(
         type=LinePrimitive.LINE_STRIP,

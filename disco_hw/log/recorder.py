@@ -25,8 +25,8 @@ from disco_hw.log.link import (
     Attachment,
     End,
     Launch,
-    Scene,
     Start,
+    TaskScene,
     WriterStatus,
     batch_encoder,
     frame,
@@ -153,7 +153,7 @@ class RecordingSettings:
     robot: str
     version: str = ""
     attachments: tuple[Attachment, ...] = ()
-    scene: Scene | None = None
+    scene: TaskScene | None = None
     queue_ticks: int = 1000
     flush_s: float = 0.5
     offset_ns: int = field(default_factory=wall_offset_ns)

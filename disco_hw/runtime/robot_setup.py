@@ -14,7 +14,7 @@ from disco_hw.errors import InputError
 from disco_hw.files import KEY, WAY_POINTS, read_bytes
 from disco_hw.files import MODEL_TOML as MODEL_KIND
 from disco_hw.files import ROBOT_TOML as ROBOT_KIND
-from disco_hw.log.link import Attachment, Scene
+from disco_hw.log.link import Attachment, TaskScene
 from disco_hw.log.provenance import MODEL_TOML, PATH_CSV, ROBOT_TOML, attachment
 from disco_hw.log.reader import Log
 from disco_hw.model import Model, load_model
@@ -94,10 +94,10 @@ def geometry(model: Model) -> tuple[tuple[float, float, float], Matrix3]:
     )
 
 
-def scene_of(config: RobotConfig) -> Scene:
+def scene_of(config: RobotConfig) -> TaskScene:
     """The task's course and the robot's size, for whoever draws a log or a running robot."""
     outline = tuple((x, y) for x, y in config.task.course().outline_m().tolist())
-    return Scene(outline, config.robot.axial_distance_m, config.robot.wheel_radius_m)
+    return TaskScene(outline, config.robot.axial_distance_m, config.robot.wheel_radius_m)
 
 
 def kept_files(setup: Setup) -> list[Attachment]:

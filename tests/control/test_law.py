@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from disco_hw.control import NoValidControl, PlannerState
-from disco_hw.control.law import Controller
+from disco_hw.control.law import LawController
 from disco_hw.model import Model
 from disco_hw.model.free_run import simulate
 
@@ -23,14 +23,14 @@ def test_a_law_gets_state_task_and_model_and_its_wheel_speeds_are_held():
         asked.append(given)
         return 1.0, np.float64(2.0)
 
-    plan = Controller(law, MODEL, "task").plan(7, STATE)
+    plan = LawController(law, MODEL, "task").plan(7, STATE)
     assert asked == [(STATE, "task", MODEL)]
     assert [plan.at(7 + round(t_s * 1e9)) for t_s in (0.0, 0.1, 0.4)] == [(1.0, 2.0)] * 3
     assert plan.t0_ns == 7
 
 
 def test_the_pose_that_is_predicted_is_the_models():
-    plan = Controller(lambda *_: (3.0, 4.0), MODEL, None).plan(0, STATE)
+    plan = LawController(lambda *_: (3.0, 4.0), MODEL, None).plan(0, STATE)
     start = np.array([STATE.x_m, STATE.y_m, STATE.yaw_rad, 3.0, 4.0])
     states = simulate(MODEL, np.full((400, 2), (3.0, 4.0)), 0.001, start)
     np.testing.assert_allclose(plan.trajectory, states[::100, :3], atol=2e-3)
@@ -41,7 +41,7 @@ def test_the_pose_that_is_predicted_is_the_models():
 )
 def test_an_answer_that_is_not_two_numbers_is_no_plan(answer):
     with pytest.raises(NoValidControl, match="two finite wheel speeds"):
-        Controller(lambda *_: answer, MODEL, None).plan(0, STATE)
+        LawController(lambda *_: answer, MODEL, None).plan(0, STATE)
 
 
 def test_another_task_is_handed_on_and_a_law_with_a_memory_is_reset():
@@ -56,7 +56,7 @@ def test_another_task_is_handed_on_and_a_law_with_a_memory_is_reset():
             self.resets += 1
 
     law = Law()
-    controller = Controller(law, MODEL, "first")
+    controller = LawController(law, MODEL, "first")
     controller.reset()
     controller.plan(0, STATE)
     controller.set_task("second")

@@ -9,7 +9,7 @@ import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
-from disco_hw.log.link import Scene, batch_encoder
+from disco_hw.log.link import TaskScene, batch_encoder
 from disco_hw.log.mcap_log import CHUNK_BYTES, METADATA, SCENE, McapLog, Metadata
 from disco_hw.log.reader import open_log
 from disco_hw.log.records import TOPIC_INDEX, TOPICS, Event, FrameIn
@@ -44,7 +44,7 @@ def test_another_reader_finds_index_statistics_and_every_message(driven):
 
 
 def test_the_scene_is_there_once_with_the_first_tick_and_disturbs_no_count(driven, tmp_path):
-    seen = Scene(((0.0, 0.0), (3.0, 1.0)), 0.4, 0.1)
+    seen = TaskScene(((0.0, 0.0), (3.0, 1.0)), 0.4, 0.1)
     (tmp_path / "log.mcap").write_bytes(log_bytes(drive_ticks(200), scene=seen))
     (tmp_path / "plain.mcap").write_bytes(driven)
     with open_log(tmp_path / "log.mcap") as log, open_log(tmp_path / "plain.mcap") as plain:
