@@ -21,8 +21,7 @@ def known_by_good_poses(directory):
     """The shipped robot, which learns as its poses are good, and looks a short way ahead: plans are most of a log."""
     text = ROBOT.read_text().replace(
         "rate_hz = 50.0",
-        "rate_hz = 50.0\nhorizon = 10\nstep_s = 0.3\n"
-        "\n[pose]\nrate_hz = 25.0\nposition_std_m = 0.005\nyaw_std_rad = 0.01",
+        "rate_hz = 50.0\nhorizon = 25\n\n[pose]\nrate_hz = 25.0\nposition_std_m = 0.005\nyaw_std_rad = 0.01",
     )
     (directory / "robot.toml").write_text(text)
     (directory / "wombot_model.toml").write_text(ROBOT.with_name("wombot_model.toml").read_text())

@@ -333,6 +333,7 @@ OF_LONG_WAY = {
 }
 
 
+@pytest.mark.long
 @settings(max_examples=15)
 @example(
     LONG_WAY,
