@@ -222,7 +222,9 @@ def from_the_host(bus_log):
             yield float(time_s.strip("()")), int(can_id, 16), bytes.fromhex(data)
 
 
-@pytest.mark.parametrize("seeded", [False, True], ids=["entropy", "a seed asked for by name"])
+@pytest.mark.parametrize(
+    "seeded", [False, pytest.param(True, marks=pytest.mark.long)], ids=["entropy", "a seed asked for by name"]
+)
 def test_a_session_recorded_before_a_restart_does_not_arm_after_it(tmp_path, seeded):
     """Without a key. The robot with a seed, whose entropy repeats, shows that the recording is a good one."""
     robot_file = write_robot_file(tmp_path)

@@ -36,6 +36,7 @@ def test_what_gets_through_is_told_and_the_file_kept(tmp_path, monkeypatch, erro
     assert (tmp_path / wrong[0].partition(":")[0]).exists()
 
 
+@pytest.mark.long
 def test_every_verb_reads_or_refuses_hostile_files(tmp_path):
     # In a process of its own: what other tests have loaded would count as memory that a verb took.
     program = "import sys, pathlib\nfrom tools import fuzz\nprint(fuzz.attack_verbs(150, 1, pathlib.Path(sys.argv[1])))"
