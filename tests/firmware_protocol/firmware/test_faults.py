@@ -394,3 +394,17 @@ def test_a_fault_that_lasts_longer_than_its_times_have_bits_is_held_when_it_goes
     assert step(end_us, 10.0) == FAULTS["UNDER_VOLTAGE"]
     assert step(end_us + config.fault_hold_us - 1, 25.0) == FAULTS["UNDER_VOLTAGE"]
     assert step(end_us + config.fault_hold_us, 25.0) == 0
+
+
+@pytest.mark.parametrize("bad_steps", [7, 8])
+def test_a_fault_is_held_from_the_last_cycle_that_had_its_cause_though_its_debounce_is_one_cycle(bad_steps):
+    config = dataclasses.replace(CONFIG, voltage_debounce_s=0.001)
+    bench = Bench(config)
+    bench.inputs["voltage_v"] = config.under_voltage_v - 1.0
+    assert name_of(bench.run(bad_steps).fault) == "UNDER_VOLTAGE"
+    bench.inputs["voltage_v"] = config.under_voltage_v + 1.0
+    held = 0
+    while bench.step().fault:
+        held += 1
+        assert held < 10_000
+    assert held == round(config.fault_hold_s * 1e3) - 1
