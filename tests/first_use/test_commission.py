@@ -31,6 +31,10 @@ def clockwise(x, y, yaw):
     return x, y, -yaw
 
 
+def mirrored(x, y, yaw):
+    return x, -y, yaw
+
+
 def north_and_east(x, y, yaw):
     return x, -y, -yaw
 
@@ -56,7 +60,7 @@ WRONG = {
     "yaw in other units": Miswiring(pose=in_degrees),
     "yaw the other way round": Miswiring(pose=clockwise),
     "sensor looks aside": Miswiring(pose=turned_aside),
-    "axes mirrored": Miswiring(pose=north_and_east),
+    "axes mirrored": Miswiring(pose=mirrored),
 }
 FAST = (
     ("sides", "reference", "sides swapped"),
@@ -185,6 +189,12 @@ def test_twenty_sound_robots_have_no_fault(tmp_path, number):
 @pytest.mark.parametrize("wrong", WRONG)
 def test_every_fault_is_found_with_every_driver(tmp_path, driver, wrong):
     assert commissioned(robot_file(tmp_path, driver), WRONG[wrong]) == [wrong.removesuffix(" the other way")]
+
+
+@pytest.mark.long
+def test_axes_of_north_and_east_are_two_faults_for_each_is_a_field_of_its_own(tmp_path):
+    found = commissioned(robot_file(tmp_path), Miswiring(pose=north_and_east))
+    assert found == ["yaw the other way round", "axes mirrored"]
 
 
 def test_what_would_be_refused_is_not_written(tmp_path):
