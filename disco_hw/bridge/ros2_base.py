@@ -167,6 +167,7 @@ class BaseBridge:
         self._wheels = DataReader(self._participant, topic(settings.wheels_from, wheels), SENSOR)
         buttons = topic(settings.stop_topic, msg.Bool) if settings.stop_topic else None
         self._button = None if buttons is None else DataReader(self._participant, buttons, RELIABLE)
+        self.end.hears_button = self._button is None
         self._others_ns = self._wheels_ns = -_OTHERS_NS
         self._step_ns = self._state_ns = self._look_ns = 0
         self._unreadable = self._unwritten = 0
@@ -218,8 +219,15 @@ class BaseBridge:
         if any(True for _ in self._taken(self._others)):
             self._others_ns = now_ns
         if self._button is not None:
-            for message, _ in self._taken(self._button):
-                self.end.button = message.data
+            self._take_button(self._button)
+
+    def _take_button(self, reader: DataReader[Any]) -> None:
+        """A button that nobody speaks for, or whose word cannot be read, keeps the base where it is."""
+        unreadable = self._unreadable
+        for message, _ in self._taken(reader):
+            self.end.button, self.end.hears_button = message.data, True
+        if self._unreadable != unreadable or not reader.get_matched_publications():
+            self.end.hears_button = False
 
     def _say_due(self, now_ns: int) -> None:
         end = self.end
@@ -271,6 +279,7 @@ class BaseBridge:
             "odometry comes" if end.has_odometry else f"no odometry: {wire.REFUSALS[end.refusal]}",
             *(["e-stop"] if end.latched else []),
             *(["button pressed"] if end.button else []),
+            *([] if end.hears_button else [f"{topics.stop_topic} says nothing"]),
             "driving" if end.driving else "standing by",
         ]
         counts = {

@@ -98,8 +98,9 @@ class Ros2BaseDriver:
             case DriverState.HANDSHAKE:
                 return f"no odometry from {self._settings.wheels_from}: {wire.REFUSALS[self._refusal]}"
             case DriverState.ESTOP:
-                pressed = self._flags & wire.BUTTON
-                return "a button on the base is pressed" if pressed else "emergency stop; remove its cause, then reset"
+                if self._flags & wire.BUTTON:
+                    return f"a button on the base is pressed{self._or_unheard}"
+                return "emergency stop; remove its cause, then reset"
             case DriverState.FAULT:
                 return f"{self._fault}; remove the cause, then reset"
             case DriverState.ARMED:
@@ -213,6 +214,10 @@ class Ros2BaseDriver:
         return self._bridge_sum != self._check_sum
 
     @property
+    def _or_unheard(self) -> str:
+        return f", or {self._settings.stop_topic} says nothing" if self._settings.stop_topic else ""
+
+    @property
     def _is_alive(self) -> bool:
         """Whether it says its wheels, and hears speeds."""
         return bool(self._flags & wire.ODOMETRY and self._flags & wire.HEARD) and self._raw is not None
@@ -288,7 +293,7 @@ class Ros2BaseDriver:
         if self._stage in (Stage.REST, Stage.STOPPING):
             return
         if self._flags & wire.BUTTON:
-            self._lose("a button on the base was pressed")
+            self._lose(f"a button on the base was pressed{self._or_unheard}")
         elif self._flags & wire.LATCHED:
             self._lose("stopped from outside, by `disco-hw estop` or another host")
         elif self._unfit is not None:

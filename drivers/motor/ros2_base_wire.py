@@ -155,12 +155,18 @@ class BaseEnd:
     def __init__(self, settings: Ros2BaseSettings) -> None:
         self.driving = self.latched = self.button = self.is_heard = self.others_speak = False
         self.has_odometry = False
+        self.hears_button = True
         self.refusal = 0
         self._check_sum = settings.check_sum()
         self._fell_silent = False
         self._fed_ns = 0
         self._zeros_until_ns = 0
         self.refused_speeds = 0
+
+    @property
+    def is_held(self) -> bool:
+        """Whether a button is pressed, or nobody says that it is not."""
+        return self.button or not self.hears_button
 
     def receive(self, now_ns: int, frame: Frame) -> tuple[float, float] | None:
         """Take in a frame of the driver; the speeds to say at once (m/s, rad/s), None for nothing."""
@@ -173,7 +179,7 @@ class BaseEnd:
             case 0x011 if frame.data[0] != 1:
                 return self.stand_by(now_ns)
             case 0x011:
-                if not (self.driving or self.latched or self.button):
+                if not (self.driving or self.latched or self.is_held):
                     # The time-out runs from here on, and only speeds feed it.
                     self.driving, self._fell_silent, self._fed_ns = True, False, now_ns
             case 0x012:
@@ -189,7 +195,7 @@ class BaseEnd:
 
     def step(self, now_ns: int) -> tuple[float, float] | None:
         """Each STEP_S: zeros after a stop and while one is latched; while it drives, None: only commands feed it."""
-        if self.button and self.driving:
+        if self.is_held and self.driving:
             return self.stand_by(now_ns)
         self._check_silence(now_ns)
         due = self.latched or self.button or now_ns < self._zeros_until_ns
@@ -203,7 +209,7 @@ class BaseEnd:
     def state(self) -> Frame:
         """How it is, for the driver."""
         bits = (
-            self.driving, self.latched, self.button, self.has_odometry, self.is_heard, self.others_speak,
+            self.driving, self.latched, self.is_held, self.has_odometry, self.is_heard, self.others_speak,
             self._fell_silent,
         )  # fmt: skip
         flags = sum(1 << bit for bit, is_set in enumerate(bits) if is_set)

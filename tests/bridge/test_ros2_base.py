@@ -214,6 +214,14 @@ class TestBaseEnd:
         end.receive(40 * MS, wire.enable(True))
         assert not end.driving
 
+    def test_a_button_that_nobody_speaks_for_any_more_stops_it_and_leaves_the_topic_to_others(self, end):
+        end.receive(0, wire.enable(True))
+        end.hears_button = False
+        assert end.step(20 * MS) == (0.0, 0.0)
+        assert end.step(1000 * MS) is None
+        end.receive(1000 * MS, wire.enable(True))
+        assert not end.driving
+
     @pytest.mark.parametrize("bad", [(math.nan, 0.0), (0.0, -math.inf)])
     def test_speeds_that_are_none_are_not_said(self, end, bad):
         end.receive(0, wire.enable(True))
@@ -323,9 +331,9 @@ class OverDds:
         return heard
 
 
-@pytest.fixture
-def over_dds(tmp_path):
-    made = OverDds(tmp_path, "/button")
+@pytest.fixture(params=[""])
+def over_dds(tmp_path, request):
+    made = OverDds(tmp_path, request.param)
     yield made
     made.end()
 
@@ -343,9 +351,13 @@ def test_over_dds_a_base_is_found_and_driven_until_another_node_speaks(over_dds)
     over_dds.until(lambda flags: flags & wire.OTHERS, lambda: other.write(msg.Twist()))
 
 
+@pytest.mark.parametrize("over_dds", ["/button"], indirect=True)
 def test_over_dds_the_button_and_the_daemons_end_stop_the_base(over_dds):
-    over_dds.until(lambda flags: flags & wire.HEARD and flags & wire.ODOMETRY)
+    over_dds.until(lambda flags: flags & wire.HEARD and flags & wire.ODOMETRY and flags & wire.BUTTON)
+    over_dds.send(wire.enable(True))
+    over_dds.until(lambda flags: not flags & wire.DRIVING and flags & wire.BUTTON)
     button = DataWriter(over_dds.participant, Topic(over_dds.participant, "rt/button", msg.Bool), RELIABLE)
+    over_dds.until(lambda flags: not flags & wire.BUTTON, lambda: button.write(msg.Bool(False)))
     over_dds.send(wire.enable(True), wire.speeds(0.25, 0.0))
     over_dds.until(lambda flags: flags & wire.BUTTON and not flags & wire.DRIVING, lambda: button.write(msg.Bool(True)))
     over_dds.until(lambda flags: not flags & wire.BUTTON, lambda: button.write(msg.Bool(False)))
