@@ -232,11 +232,12 @@ class RoboclawSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
         return None
 
 
+@dataclass(frozen=True, slots=True)
 class RoboclawExchange:
     """Satisfies `drivers.types.Exchange`; a frame's identifier is address and command, its data the packet."""
 
-    timeout_s = 0.02
-    quiet_s = 0.012
+    timeout_s: float = 0.02
+    quiet_s: float = 0.012
 
     def request(self, frame: Frame) -> bytes:
         """The packet as it stands."""

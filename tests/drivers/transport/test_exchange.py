@@ -18,6 +18,8 @@ from tests.drivers.waiting import collect, send, wait_until
 FAST = BackoffPolicy(first_s=0.01, longest_s=0.05, steady_s=0.1)
 ENCODERS, SPEEDS, STATUS = (question(0x80, name) for name in ("encoders", "speeds", "status"))
 STOP = setting(0x80, "duty_m1m2", duty_m1=0, duty_m2=0)
+# Ten times what a board is given: a host that pauses for 20 ms makes no reply late here.
+PATIENT = RoboclawExchange(timeout_s=0.3, quiet_s=0.2)
 
 
 class Line:
@@ -77,7 +79,7 @@ def line(tmp_path):
 
 @pytest.fixture
 def transport(line):
-    medium = SerialMedium(str(line.path), 115_200, exchange=RoboclawExchange())
+    medium = SerialMedium(str(line.path), 115_200, exchange=PATIENT)
     transport = ReconnectingTransport(medium, backoff=FAST, carries_packets=True)
     transport.open()
     wait_until(lambda: transport.state is LinkState.UP)
@@ -107,7 +109,7 @@ def test_no_request_leaves_before_the_reply_to_the_one_before_is_whole(line, tra
 
 
 def test_a_late_reply_is_nobodys(line, transport):
-    pauses = iter((0.026, 0.0, 0.0))
+    pauses = iter((PATIENT.timeout_s + PATIENT.quiet_s / 2, 0.0, 0.0))
     line.spoil = lambda _request, reply: [(next(pauses), reply)]
     send(transport, *ask(ENCODERS, SPEEDS, STATUS))
     assert [received.frame.can_id for received in collect(transport, 2)] == [SPEEDS.can_id, STATUS.can_id]
