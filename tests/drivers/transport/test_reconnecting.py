@@ -3,6 +3,7 @@
 import queue
 import threading
 import time
+from types import SimpleNamespace
 
 import pytest
 from hypothesis import given
@@ -143,7 +144,10 @@ FAST = BackoffPolicy(first_s=0.001, longest_s=0.01, steady_s=0.05)
 
 
 class ScriptedMedium:
-    """Connections that obey: put a frame to receive it, put an exception to lose the link."""
+    """Connections that obey: put a frame to receive it, put an exception to lose the link.
+
+    A write waits until `may_write` is set, for half a minute at most.
+    """
 
     name = "scripted"
 
@@ -188,7 +192,7 @@ class ScriptedConnection:
 
     def write(self, frame):
         assert not self.closed
-        self.medium.may_write.wait(5.0)
+        self.medium.may_write.wait(30.0)
         if self.medium.write_error is not None:
             raise self.medium.write_error
         self.sent.append(frame)
@@ -301,9 +305,9 @@ def test_a_device_that_is_absent_or_flaps_is_tried_less_and_less_often(medium, f
 
 def test_an_idle_link_costs_nothing(transport):
     up(transport)
-    before_s = time.process_time()
+    before_s, cpu_before_s = time.monotonic(), time.process_time()
     time.sleep(0.3)
-    assert time.process_time() - before_s < 0.15
+    assert time.process_time() - cpu_before_s < 0.5 * (time.monotonic() - before_s)
 
 
 @pytest.mark.parametrize("frame", [Frame(0, b""), Frame(0x7FF, bytes(8))])
@@ -351,9 +355,10 @@ def test_a_late_frame_is_never_sent(transport, medium):
     assert transport.stats.expired == 1
     medium.may_write.clear()
     send(transport, outgoing(0x200, b"first"))
-    time.sleep(0.02)
-    send(transport, outgoing(0x100, b"late", valid_for_s=0.01), outgoing(0x101, b"good"))
-    time.sleep(0.03)
+    wait_until(transport._writing.locked)
+    # In time when it is handed over, too late when its turn comes.
+    assert transport.send(OutgoingFrame(Frame(0x100, b"late"), deadline_ns=1), now_ns=1)
+    send(transport, outgoing(0x101, b"good"))
     medium.may_write.set()
     wait_until(lambda: len(medium.sent) == 2)
     assert [frame.data for frame in medium.sent] == [b"first", b"good"]
@@ -365,9 +370,8 @@ def test_a_stalled_medium_never_blocks_the_caller_and_an_emergency_stop_still_fi
     medium.may_write.clear()
     send(transport, outgoing(0x300))
     wait_until(transport._writing.locked)
-    started = time.monotonic()
     taken = sum(transport.send(outgoing(0x200), time.monotonic_ns()) for _ in range(200))
-    assert time.monotonic() - started < 1.0
+    assert not medium.sent, "the caller waited for the medium"
     assert taken == reconnecting.TRANSMIT_CAPACITY
     assert transport.stats.transmit_queue_full == 200 - taken
     send(transport, outgoing(0x080))
@@ -398,7 +402,8 @@ def test_a_reader_that_falls_behind_gets_the_newest_and_the_loss_is_counted(tran
     assert (received[0].t_ns, received[-1].t_ns) == (10, total - 1)
 
 
-def test_closing_sends_what_is_queued_and_ends_the_threads(transport, medium):
+def test_closing_sends_what_is_queued_and_ends_the_threads(transport, medium, monkeypatch):
+    monkeypatch.setattr(reconnecting, "_DRAIN_S", 10.0)
     up(transport)
     frames = [outgoing(0x080, bytes((number,))) for number in range(20)]
     send(transport, *frames)
@@ -422,3 +427,33 @@ def test_what_is_no_can_frame_is_the_callers_error(transport, frame):
     up(transport)
     with pytest.raises(ValueError, match="not a classic CAN frame"):
         transport.send(OutgoingFrame(frame, 10), 1)
+
+
+def test_a_link_is_left_open_while_frames_come_and_connected_again_when_none_does(monkeypatch):
+    """Each read lasts 0.1 s by the link's clock; every fourth brings a frame, and after forty none does."""
+    now_ns, reads, second = [0], [0], threading.Event()
+    monkeypatch.setattr(reconnecting, "time", SimpleNamespace(monotonic_ns=lambda: now_ns[0]))
+
+    class Answering(ScriptedConnection):
+        def read(self):
+            now_ns[0] += 100_000_000
+            reads[0] += 1
+            return [ReceivedFrame(now_ns[0], Frame(1, b""))] if reads[0] % 4 == 0 and reads[0] <= 40 else ()
+
+    class Silent(ScriptedConnection):
+        def read(self):
+            second.set()
+            time.sleep(0.01)
+            return ()
+
+    medium = ScriptedMedium()
+    connections = iter((Answering(medium), Silent(medium)))
+    medium.connect = lambda _counters: next(connections)
+    transport = ReconnectingTransport(medium, backoff=FAST, mute_after_s=0.5)
+    transport.open()
+    try:
+        assert second.wait(10.0)
+        assert (reads[0], transport.generation) == (46, 2)
+        assert "no frame has come for 0.5 s" in transport.last_error
+    finally:
+        transport.close()
