@@ -1,0 +1,109 @@
+"""What each vendor's driver sends in a scripted day does not change by itself: every frame, its time, life and rank.
+
+Whoever means to change it looks at the frames of the phase that is named, and then writes the new sums here.
+"""
+
+import hashlib
+
+import pytest
+
+from drivers.types import DriverState, Request
+from tests.drivers.motor.vendors import VENDORS
+
+FORWARD = (3.0, 2.0)
+STILL = (DriverState.STANDBY, DriverState.READY)
+COASTING_S = 2.5
+PHASES = ("start", "arm", "run", "stop", "again", "fault", "reset", "reconnect", "estop", "after")
+SUMS = {
+    "odrive-0.6": "73f18e 13b82a e58728 0b1fbe d1d1f9 cc7cf9 c96b0a 7e7921 4981ca 530ff3",
+    "odrive-0.5": "f8fb0e 7a818c 4742e8 863b53 38186c 2ad8f0 ae4b7b 96e2a2 b94637 89b496",
+    "odrive-four-axes": "622062 8dc6fb 0b1527 49a5af 6054b9 83345d 0b6448 1bf6e1 519218 bb3ecd",
+    "vesc": "33fa55 1784b8 a84447 0c04fe b3efc0 f48e63 1edab4 c12f15 c920f5 31b8b2",
+    "vesc-four-braking": "abb1d5 22f891 0d471e 5b2f7f 9bcf26 cb5f6a 00beac 351d32 16921a 5039dc",
+    "vesc-uart": "5ccdae 20cbc8 ee78c3 45676a e55985 0207b0 4d268f 85df41 218ce9 9f845f",
+    "agilex": "e3b0c4 2d8bed 25fe17 bf6f49 ddae68 2650d2 a1a661 1df61c 52fd3f e3b0c4",
+    "roboclaw": "6e0c07 cfe96a 90c18e 36a953 49fbbb 3e1653 09f34c 18e5cc 54503c fce227",
+    "roboclaw-a-board-a-side": "a0866e 68a16a 241b5a 3728ce cb6c09 160366 877c7f aa6233 475c97 ba2d7a",
+    "ros2-base": "e3b0c4 1450c4 22d636 e0adb8 044fb4 a3d951 e3b0c4 c0479d 92ef1b fc4d1f",
+}
+"""SHA-256 of each phase's frames, its first six digits."""
+
+
+class Recorded:
+    """A bench whose driver's frames are kept by phase, whichever way they are asked for."""
+
+    def __init__(self, vendor):
+        self.phases = []
+        self.bench = vendor.bench()
+        driver = self.bench.driver
+        transmit, estop = driver.transmit, driver.estop
+        driver.transmit = lambda now_ns, command: self.keep(now_ns, transmit(now_ns, command))
+        driver.estop = lambda now_ns: self.keep(now_ns, estop(now_ns))
+
+    def begin(self):
+        self.phases.append([])
+
+    def keep(self, now_ns, sent):
+        for each in sent:
+            frame = each.frame
+            at_us, life_us = now_ns // 1000, (each.deadline_ns - now_ns) // 1000
+            kind = "x" if frame.extended else "s"
+            self.phases[-1].append(f"{at_us} {life_us} {each.rank} {frame.can_id:x}{kind} {frame.data.hex()}")
+        return sent
+
+
+def scripted_day(vendor):
+    """The frames of each phase, as lines."""
+    recorded = Recorded(vendor)
+    bench, begin = recorded.bench, recorded.begin
+    begin()  # start
+    bench.run_until(*STILL)
+    bench.run(0.5)
+    begin()  # arm
+    bench.arm()
+    begin()  # run
+    bench.run(1.0, FORWARD)
+    bench.run(0.5, (-1.0, 2.5))
+    begin()  # stop
+    bench.driver.request(Request.STANDBY)
+    bench.run_until(*STILL)
+    bench.run(COASTING_S)
+    begin()  # again
+    bench.arm()
+    bench.run(0.5, FORWARD)
+    begin()  # fault
+    vendor.lose_left(bench.robot)
+    bench.run_until(DriverState.FAULT, timeout_s=0.5)
+    bench.run(COASTING_S)
+    begin()  # reset
+    vendor.mend(bench.robot)
+    bench.driver.request(Request.RESET)
+    bench.run_until(*STILL)
+    bench.run(COASTING_S)
+    begin()  # reconnect
+    bench.arm()
+    bench.run(0.5, FORWARD)
+    bench.host_end.plug(False)
+    bench.run(COASTING_S)
+    bench.host_end.plug(True)
+    bench.run(COASTING_S)
+    begin()  # estop
+    bench.arm()
+    bench.run(0.5, FORWARD)
+    bench.send_estop()
+    bench.run(COASTING_S)
+    begin()  # after
+    bench.driver.request(Request.RESET)
+    bench.run_until(*STILL)
+    bench.run(0.5)
+    return recorded.phases
+
+
+def sums(vendor):
+    return [hashlib.sha256("\n".join(lines).encode()).hexdigest()[:6] for lines in scripted_day(vendor)]
+
+
+@pytest.mark.parametrize("vendor", VENDORS, ids=str)
+def test_every_frame_of_a_scripted_day_is_the_one_that_was_recorded(vendor):
+    found = dict(zip(PHASES, sums(vendor), strict=True))
+    assert found == dict(zip(PHASES, SUMS[str(vendor)].split(), strict=True))
