@@ -477,8 +477,7 @@ class MotorDriver:
     frames. `serial_field`: of the settings, one that belongs to a serial link, where it must be given, and to no other.
     `example`: its fields in [link] for a robot as the demonstration drives it; none where its controller is not
     simulated. `recognise`: of frames that were only listened to, the fields in [link] that they show, None if they are
-    not its controller's. `latches_stop`: whether the controller itself keeps an e-stop until it is reset. `is_default`:
-    taken where robot.toml has no `link.driver`.
+    not its controller's. `latches_stop`: whether the controller itself keeps an e-stop until it is reset.
     """
 
     name: str
@@ -497,4 +496,3 @@ class MotorDriver:
     latches_stop: bool = True
     authenticates: bool = False
     tells_reception: bool = False
-    is_default: bool = False

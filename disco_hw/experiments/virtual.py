@@ -11,7 +11,7 @@ from pathlib import Path
 from disco_hw.errors import InputError
 from disco_hw.files import FAULTS_TOML, read_toml
 from disco_hw.runtime.robot_setup import Setup, geometry, link_key, load_setup
-from drivers.motor import find_driver
+from drivers.motor import DEFAULT, find_driver
 from drivers.pose.udp import SOURCE as UDP_POSES
 from firmware_protocol.firmware_core import FirmwareConfig
 from sim.app import VirtualRobotOptions, run_virtual_robot
@@ -62,10 +62,10 @@ def run_sim(options: SimOptions) -> int:
         raise InputError(f"--start: {' '.join(map(str, options.start))} is no place; write finite numbers")
     ticks_per_rev = _whole_ticks(setup)
     driver = find_driver(config.link.driver)
-    make_controller = None if driver.is_default else find_controller(driver.name)
-    if not driver.is_default and make_controller is None:
+    make_controller = None if driver.name == DEFAULT else find_controller(driver.name)
+    if not driver.name == DEFAULT and make_controller is None:
         raise InputError(f"{setup.robot_file}: link.driver: there is no simulator of {driver.name}")
-    if options.board is not None and not driver.is_default:
+    if options.board is not None and not driver.name == DEFAULT:
         raise InputError(f"--board: {setup.robot_file} has link.driver {driver.name}; a board speaks our own protocol")
     if options.board is not None and options.bus_log is not None:
         raise InputError("--bus-log: not with --board, whose link is its own; take one of them out")

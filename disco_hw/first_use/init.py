@@ -17,7 +17,7 @@ from disco_hw.config.command_line import link_fields, names_address
 from disco_hw.errors import InputError
 from disco_hw.files import parse_toml
 from disco_hw.reports.outputs import refuse_file
-from drivers.motor import UnknownDriverError, find_driver, motor_drivers
+from drivers.motor import DEFAULT, UnknownDriverError, find_driver, motor_drivers
 from drivers.pose import DEFAULT as POSE_SOURCE
 from drivers.transport import TransportSettingsError, make_transport
 from drivers.types import Frame, LinkState
@@ -234,7 +234,7 @@ def robot_text(options: InitOptions, link: dict[str, Any], heard: Heard, measure
     for name, value in fields.items():
         note = "  # heard: see that left stands before right" if name in heard.fields else ""
         lines.append(f"{name} = {in_toml(value)}{note}")
-    source = options.pose_source or (POSE_SOURCE if driver.is_default else "udp")
+    source = options.pose_source or (POSE_SOURCE if driver.name == DEFAULT else "udp")
     lines += [
         "",
         "[pose]",

@@ -11,6 +11,8 @@ from typing import Any
 
 from drivers.types import Driver, MotorDriver
 
+DEFAULT = "reference"
+
 
 class UnknownDriverError(ValueError):
     """No driver has this name; the message lists the names that there are."""
@@ -28,21 +30,26 @@ class DriverFieldError(ValueError):
 def motor_drivers() -> Mapping[str, MotorDriver]:
     """By name: the `DRIVER` of each module in this folder that has one.
 
-    Found when first asked for, not on import: an e-stop needs none of them.
+    Found when first asked for, not on import: `find_driver` reads the one that is asked for, and an e-stop no other.
     """
-    modules = (import_module(each.name) for each in pkgutil.iter_modules(__path__, f"{__name__}."))
+    modules = (import_module(f"{__name__}.{name}") for name in _module_names())
     found: list[MotorDriver] = [module.DRIVER for module in modules if hasattr(module, "DRIVER")]
     return MappingProxyType({driver.name: driver for driver in sorted(found, key=lambda driver: driver.name)})
 
 
 def find_driver(name: str | None) -> MotorDriver:
     """Return the driver of this name, the default one for None. Raises UnknownDriverError for a name not known."""
-    known = motor_drivers()
-    if name is None:
-        return next(driver for driver in known.values() if driver.is_default)
-    if name not in known:
-        raise UnknownDriverError(f'there is no driver "{name}"; write one of {", ".join(known)}')
-    return known[name]
+    asked = DEFAULT if name is None else name
+    module = import_module(f"{__name__}.{asked}") if asked in _module_names() else None
+    found: MotorDriver | None = getattr(module, "DRIVER", None)
+    if found is None:
+        raise UnknownDriverError(f'there is no driver "{name}"; write one of {", ".join(motor_drivers())}')
+    return found
+
+
+def _module_names() -> list[str]:
+    """The modules of this folder; a driver's has its name."""
+    return [each.name for each in pkgutil.iter_modules(__path__)]
 
 
 def make_driver(name: str | None, settings: Any = None, key: bytes | None = None) -> Driver:
@@ -58,7 +65,8 @@ def own_fields(name: str | None, fields: Mapping[str, Any]) -> dict[str, Any]:
     """Those of [link]'s fields that are the driver's own. Raises DriverFieldError for one of another driver's."""
     found = find_driver(name)
     own = {field: value for field, value in fields.items() if field in found.settings.__struct_fields__}
-    for other in motor_drivers().values():
+    others = motor_drivers().values() if len(own) < len(fields) else ()
+    for other in others:
         for field in fields:
             if field in other.settings.__struct_fields__ and field not in own:
                 raise DriverFieldError(field, f"a field of the driver {other.name}, and link.driver is {found.name}")

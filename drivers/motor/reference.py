@@ -510,5 +510,4 @@ DRIVER = MotorDriver(
     kinds=("can", "serial"),
     authenticates=True,
     tells_reception=True,
-    is_default=True,
 )

@@ -1,6 +1,8 @@
 """The registry of motor controllers: robot.toml's `link.driver` names one, and each name stands in one file."""
 
 import re
+import subprocess
+import sys
 import tomllib
 from dataclasses import replace
 from pathlib import Path
@@ -10,7 +12,7 @@ import pytest
 
 from disco_hw.config import load_robot_config
 from disco_hw.errors import InputError
-from drivers.motor import UnknownDriverError, find_driver, make_driver, motor_drivers
+from drivers.motor import DEFAULT, UnknownDriverError, find_driver, make_driver, motor_drivers
 from drivers.types import DriverState
 
 OWN = {name: driver.example for name, driver in motor_drivers().items()}
@@ -36,9 +38,26 @@ def test_every_driver_is_made_by_its_name_and_begins_without_a_link():
         assert make_driver(name, settings).state is DriverState.DISCONNECTED
 
 
-def test_exactly_one_driver_is_the_default():
-    (default,) = [driver for driver in motor_drivers().values() if driver.is_default]
-    assert find_driver(None) is default
+def test_every_driver_is_found_by_its_name_and_none_without_one_is_the_default():
+    for name, driver in motor_drivers().items():
+        assert find_driver(name) is driver
+    assert find_driver(None) is motor_drivers()[DEFAULT]
+
+
+def test_what_needs_one_driver_reads_no_other():
+    """An e-stop is not to wait for five vendors' protocols."""
+    code = (
+        "import sys; from drivers.motor import find_driver, own_fields; find_driver(None); own_fields('vesc', {})\n"
+        "print(*sorted(name for name in sys.modules if name.startswith('drivers.motor.')))"
+    )
+    names = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
+    assert {"drivers.motor.reference", "drivers.motor.vesc"} <= set(names)
+    assert not {"drivers.motor.odrive", "drivers.motor.roboclaw", "drivers.motor.agilex"} & set(names)
+
+
+def test_a_module_beside_the_drivers_is_none():
+    with pytest.raises(UnknownDriverError, match='no driver "wiring"'):
+        find_driver("wiring")
 
 
 def test_a_name_that_no_driver_has_is_refused_with_those_that_there_are():
@@ -86,8 +105,7 @@ def test_a_field_that_is_not_the_drivers_or_is_wrong_is_refused_by_name(tmp_path
 
 
 def test_a_key_for_a_driver_that_does_not_authenticate_is_refused(tmp_path, monkeypatch):
-    (name,) = [driver.name for driver in motor_drivers().values() if driver.is_default]
-    file = robot_toml(tmp_path, f'driver = "{name}"\nkey_file = "robot.key"')
+    file = robot_toml(tmp_path, f'driver = "{DEFAULT}"\nkey_file = "robot.key"')
     assert load_robot_config(file).link.key_file == "robot.key"
     mute = replace(find_driver(None), authenticates=False)
     monkeypatch.setattr("disco_hw.config.robot.find_driver", lambda _name: mute)
@@ -100,7 +118,8 @@ def test_no_other_file_names_a_driver():
     files = [f for top in ("disco_hw", "drivers", "sim") for f in (ROOT / top).rglob("*.py") if "viewer" not in f.parts]
     assert len(files) > 200
     named = {name: [str(file.relative_to(ROOT)) for file in files if is_named(name, file)] for name in motor_drivers()}
-    assert named == {name: [f"drivers/motor/{name}.py"] for name in motor_drivers()}
+    assert sorted(named.pop(DEFAULT)) == ["drivers/motor/__init__.py", f"drivers/motor/{DEFAULT}.py"]
+    assert named == {name: [f"drivers/motor/{name}.py"] for name in motor_drivers() if name != DEFAULT}
 
 
 def is_named(name, file):
