@@ -463,6 +463,14 @@ class NoSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 @dataclass(frozen=True, slots=True)
+class LineQuestions:
+    """What finds a controller that only answers: frames that move and write nothing, and the speeds (bit/s) to try."""
+
+    frames: tuple[Frame, ...]
+    bauds: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
 class MotorDriver:
     """A motor controller that robot.toml can name: each file of `drivers.motor` that speaks to one holds a `DRIVER`.
 
@@ -476,8 +484,9 @@ class MotorDriver:
     clock, so that `check` can ask. `exchange` makes what a serial line is spoken with; None: the reference protocol's
     frames. `serial_field`: of the settings, one that belongs to a serial link, where it must be given, and to no other.
     `example`: its fields in [link] for a robot as the demonstration drives it; none where its controller is not
-    simulated. `recognise`: of frames that were only listened to, the fields in [link] that they show, None if they are
-    not its controller's. `latches_stop`: whether the controller itself keeps an e-stop until it is reset.
+    simulated. `recognise`: of frames that came, the fields in [link] that they show, None if they are not its
+    controller's; where it says nothing by itself, of the replies to `questions` on a serial line. `latches_stop`:
+    whether the controller itself keeps an e-stop until it is reset.
     """
 
     name: str
@@ -493,6 +502,7 @@ class MotorDriver:
     serial_field: str = ""
     example: str = ""
     recognise: Callable[[Sequence[Frame]], dict[str, Any] | None] = lambda _frames: None
+    questions: LineQuestions | None = None
     latches_stop: bool = True
     authenticates: bool = False
     tells_reception: bool = False

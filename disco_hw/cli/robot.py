@@ -128,10 +128,17 @@ def init(
     max_wheel_speed_rad_s: Annotated[float | None, typer.Option(min=0.0)] = None,
     pose_source: Annotated[str | None, typer.Option(help="Where measured poses come from.")] = None,
     listen_s: Annotated[float, typer.Option(min=0.0, help="How long to listen on the link.")] = 3.0,
+    ask: Annotated[
+        bool | None,
+        typer.Option(
+            "--ask/--no-ask",
+            help="Ask on a serial line for a controller that only answers (RoboClaw: its version); else you are asked.",
+        ),
+    ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Write over a file that is there.")] = False,
     yes: Annotated[bool, typer.Option("--yes", help="Ask nothing: what is not given is as usual.")] = False,
 ) -> None:
-    """Write a robot.toml from what is heard on the robot's link, which is only listened to, and from what you say."""
+    """Write a robot.toml from what is heard on the robot's link, and from what you say; nothing moves."""
     import sys
 
     from disco_hw.first_use.init import InitOptions, run_init
@@ -143,7 +150,7 @@ def init(
         "max_wheel_speed_rad_s": max_wheel_speed_rad_s,
     }
     given = tuple((field, value) for field, value in measures.items() if value is not None)
-    options = InitOptions(out, link, driver, name, given, listen_s, pose_source, overwrite)
+    options = InitOptions(out, link, driver, name, given, listen_s, pose_source, overwrite, ask)
     written = run_init(options, None if yes or not sys.stdin.isatty() else input, progress_line)
     print(f"written: {written}\nnext: disco-hw check {written}")
 

@@ -1,4 +1,4 @@
-"""`disco-hw init`: a robot.toml from what is heard on the link and what its owner says, edited in its text."""
+"""`disco-hw init`: a robot.toml from what is heard on the link, or answers there, and what its owner says."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import serial
 
 from disco_hw.config import load_robot_config
 from disco_hw.config.command_line import link_fields, names_address
@@ -19,8 +20,10 @@ from disco_hw.files import parse_toml
 from disco_hw.reports.outputs import refuse_file
 from drivers.motor import DEFAULT, UnknownDriverError, find_driver, motor_drivers
 from drivers.pose import DEFAULT as POSE_SOURCE
-from drivers.transport import TransportSettingsError, make_transport
-from drivers.types import Frame, LinkState
+from drivers.transport import SerialMedium, TransportSettingsError, make_transport
+from drivers.transport.reconnecting import TransportCounters
+from drivers.transport.serial import ExchangeConnection, open_port
+from drivers.types import Frame, LinkState, MotorDriver
 
 _SECTION = re.compile(r"^\s*\[([^\[\]]+)\]\s*(#.*)?$")
 
@@ -71,6 +74,8 @@ def _name_of(line: str) -> str | None:
 
 _POLL_S = 0.01
 _OPEN_S = 2.0
+_EXCHANGE_READ_S = 0.002
+_SILENT_S = 0.3
 _MOST_FRAMES = 20_000
 
 
@@ -94,7 +99,10 @@ QUESTIONS = (
 
 @dataclass(frozen=True, slots=True)
 class InitOptions:
-    """What `disco-hw init` was asked; None of a field is asked for, or the usual where nobody is to be asked."""
+    """What `disco-hw init` was asked; None of a field is asked for, or the usual where nobody is to be asked.
+
+    `may_ask`: whether a serial line may be asked for controllers that only answer; None asks the person.
+    """
 
     out: Path
     link: str | None = None
@@ -104,14 +112,16 @@ class InitOptions:
     listen_s: float = 3.0
     pose_source: str | None = None
     overwrite: bool = False
+    may_ask: bool | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Heard:
-    """What was recognised on a link: the driver, and the fields in [link] that its frames show."""
+    """What was recognised on a link: the driver, the fields in [link] that its frames show, a serial line's speed."""
 
     driver: str
     fields: dict[str, Any]
+    baud: int | None = None
 
 
 def recognised(frames: Sequence[Frame]) -> tuple[Heard, ...]:
@@ -143,6 +153,31 @@ def listen(link: dict[str, Any], seconds: float) -> list[Frame]:
     return frames
 
 
+def ask_on_line(port: str, driver: MotorDriver) -> Heard | None:
+    """Put a driver's questions, which move and write nothing, on a serial line; what the replies show.
+
+    Nothing is asked of a line on which anything speaks by itself. Raises InputError for a port that cannot be used.
+    """
+    assert driver.questions is not None
+    assert driver.exchange is not None
+    exchange = driver.exchange(driver_settings(driver, parse_toml(driver.example.encode(), driver.name)))
+    for baud in driver.questions.bauds:
+        medium = SerialMedium(port, baud)
+        try:
+            with open_port(medium, timeout_s=_EXCHANGE_READ_S, write_timeout_s=_OPEN_S, exclusive=True) as line:
+                time.sleep(_SILENT_S)
+                if line.in_waiting:
+                    return None
+                connection = ExchangeConnection(line, TransportCounters(), exchange)
+                replies = [connection.exchange(frame) for frame in driver.questions.frames]
+        except (serial.SerialException, OSError) as error:
+            raise InputError(f"--link: {medium.explain(error)}") from None
+        fields = driver.recognise([frame for frame in replies if frame is not None])
+        if fields is not None:
+            return Heard(driver.name, fields, baud)
+    return None
+
+
 def run_init(options: InitOptions, ask: Callable[[str], str] | None, say: Callable[[str], None]) -> Path:
     """Listen, ask, and write a robot.toml that `check` reads; the file written.
 
@@ -153,7 +188,7 @@ def run_init(options: InitOptions, ask: Callable[[str], str] | None, say: Callab
     if os.path.lexists(options.out) and not options.overwrite:
         raise InputError(f"{options.out}: is there already; name another file, or give --overwrite")
     link = link_fields(options.link)
-    heard = _controller(options, link, say)
+    heard = _controller(options, link, ask, say)
     text = robot_text(options, link, heard, _measures(options, ask))
     trial = options.out.with_name(f".{options.out.name}.new")
     try:
@@ -169,26 +204,58 @@ def run_init(options: InitOptions, ask: Callable[[str], str] | None, say: Callab
     return options.out
 
 
-def _controller(options: InitOptions, link: dict[str, Any], say: Callable[[str], None]) -> Heard:
-    """The driver that was named, or the one whose frames are heard."""
+def _controller(
+    options: InitOptions, link: dict[str, Any], ask: Callable[[str], str] | None, say: Callable[[str], None]
+) -> Heard:
+    """The driver that was named, or the one whose frames are heard, or that answers on a line where nobody speaks."""
     found: tuple[Heard, ...] = ()
+    if options.driver is not None:
+        try:
+            find_driver(options.driver)
+        except UnknownDriverError as error:
+            raise InputError(f"--driver: {error}") from None
     if names_address(link) and options.listen_s > 0.0:
         say(f"listening for {options.listen_s:g} s; nothing is sent")
         frames = listen(link, options.listen_s)
         found = recognised(frames)
         said = ", ".join(f"{one.driver} {one.fields or ''}".strip() for one in found)
         say(f"{len(frames)} frames heard: {said or 'no controller that is known by its own frames'}")
+        if not frames and "port" in link:
+            found = _answering(options, str(link["port"]), ask, say)
     if options.driver is not None:
-        try:
-            find_driver(options.driver)
-        except UnknownDriverError as error:
-            raise InputError(f"--driver: {error}") from None
         return next((one for one in found if one.driver == options.driver), Heard(options.driver, {}))
     if len(found) == 1:
         return found[0]
     why = "several controllers were heard" if found else "no controller was heard"
     known = ", ".join(motor_drivers())
-    raise InputError(f"init: {why}; name it: --driver with one of {known} (one that only answers is never heard)")
+    raise InputError(
+        f"init: {why}; name it: --driver with one of {known}"
+        + ("; or give --ask, which asks on the line for one that only answers" if "port" in link else "")
+    )
+
+
+def _answering(
+    options: InitOptions, port: str, ask: Callable[[str], str] | None, say: Callable[[str], None]
+) -> tuple[Heard, ...]:
+    """The controllers that answer on a silent line: of the driver named, or of all once somebody has allowed it."""
+    drivers = [driver for driver in motor_drivers().values() if driver.questions is not None]
+    if options.driver is not None:
+        drivers = [driver for driver in drivers if driver.name == options.driver]
+    if not drivers:
+        return ()
+    names = ", ".join(driver.name for driver in drivers)
+    allowed = options.may_ask if options.driver is None else options.may_ask is not False
+    if allowed is None and ask is not None:
+        say("a controller that is set to take single bytes as speeds could move: lift the wheels, or cut motor power")
+        allowed = ask(f"nobody speaks here by himself; ask for {names} (its version, no more)? [y/n] ").strip() == "y"
+    if not allowed:
+        return ()
+    found = [heard for driver in drivers if (heard := ask_on_line(port, driver)) is not None]
+    for heard in found:
+        say(f"answers at {heard.baud} baud: {heard.driver} {heard.fields}")
+    if not found:
+        say(f"no answer from {names}; is it switched on, and set to answer (packet serial)?")
+    return tuple(found)
 
 
 def _measures(options: InitOptions, ask: Callable[[str], str] | None) -> dict[str, float]:
@@ -226,6 +293,9 @@ def robot_text(options: InitOptions, link: dict[str, Any], heard: Heard, measure
     lines += [f"{name} = {in_toml(link[name])}" for name in ("interface", "channel", "port") if name in link]
     if kind == "can":
         lines.append("bitrate = 500000               # as the bus is set")
+    elif driver.questions is not None:
+        baud = heard.baud or driver.questions.bauds[0]
+        lines.append(f"baud = {baud:<20}   # {'it answered at this' if heard.baud else 'as the controller is set'}")
     fields = {**parse_toml(driver.example.encode(), driver.name), **heard.fields}
     if "wheel_radius_m" in fields:
         fields |= {"wheel_radius_m": measures["wheel_radius_m"], "track_m": measures["axial_distance_m"]}

@@ -14,10 +14,12 @@ from drivers.motor import roboclaw_protocol as protocol
 from drivers.motor import vendor_parts as parts
 from drivers.motor.roboclaw_protocol import (
     EXAMPLE,
+    QUESTIONS,
     RoboclawExchange,
     RoboclawSettings,
     cyclic_frames,
     question,
+    recognise,
     safety_card,
     setting,
     stands,
@@ -524,6 +526,8 @@ DRIVER = MotorDriver(
     example=EXAMPLE,
     kinds=("serial",),
     exchange=lambda _settings: RoboclawExchange(),
+    recognise=recognise,
+    questions=QUESTIONS,
     latches_stop=False,
     stop_frames=stop_frames,
     stop_confirmation=stop_confirmation,

@@ -13,16 +13,16 @@ import binascii
 import math
 import re
 import struct
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Annotated
+from typing import Annotated, Any
 
 import msgspec
 from msgspec import Meta
 
-from drivers.motor.vendor_parts import Sign
-from drivers.types import CyclicFrame, Frame, SafetyCard, SettingsFault
+from drivers.motor.vendor_parts import Sign, in_sides
+from drivers.types import CyclicFrame, Frame, LineQuestions, SafetyCard, SettingsFault
 
 FIRST_ADDRESS, LAST_ADDRESS = 0x80, 0x87
 ACKNOWLEDGE = b"\xff"
@@ -265,6 +265,27 @@ def setting(address: int, name: str, **values: int) -> Frame:
 def question(address: int, name: str) -> Frame:
     """The packet that asks for something."""
     return Frame(address << 8 | GETTERS[name].command, ask_bytes(address, name))
+
+
+QUESTIONS = LineQuestions(
+    tuple(question(address, "version") for address in range(FIRST_ADDRESS, LAST_ADDRESS + 1)), (115_200, 38_400)
+)
+"""The version, of each address; at the usual speeds of a UART, of which USB takes any. They feed a serial timeout."""
+
+
+def recognise(frames: Sequence[Frame]) -> dict[str, Any] | None:
+    """The motors of the boards that said their version: one board has both sides, of several the first half is left."""
+    version = GETTERS["version"].command
+    asked = [(frame.can_id >> 8, frame) for frame in frames if frame.can_id & 0xFF == version and not frame.extended]
+    boards = sorted(
+        {
+            address
+            for address, frame in asked
+            if FIRST_ADDRESS <= address <= LAST_ADDRESS and reply(address, "version", frame.data) is not None
+        }
+    )
+    motors = [f"{address}/{motor}" for address in boards for motor in (1, 2)]
+    return {"motors": in_sides(motors)} if motors else None
 
 
 def stop_frames(settings: RoboclawSettings) -> tuple[Frame, ...]:

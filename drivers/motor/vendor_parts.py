@@ -96,8 +96,8 @@ def sides_of(nodes: tuple[Nodes, Nodes]) -> tuple[tuple[int, ...], tuple[int, ..
     return left, right
 
 
-def in_sides(nodes: Sequence[int]) -> list[Any]:
-    """Ids heard on a bus as left and right, the lower half first: two numbers, or two lists."""
+def in_sides(nodes: Sequence[int | str]) -> list[Any]:
+    """What was heard of motors as left and right, the lower half first: two numbers, or two lists."""
     half = len(nodes) // 2
     left, right = list(nodes[:half]), list(nodes[half:])
     return [left[0], right[0]] if len(left) == len(right) == 1 else [left, right]

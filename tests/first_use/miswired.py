@@ -12,7 +12,7 @@ import msgspec
 import disco_hw
 from disco_hw.drive.source import ManualInput
 from disco_hw.errors import WorkError
-from disco_hw.experiments.live_stack import DEVICES
+from disco_hw.experiments.live_stack import with_device
 from disco_hw.experiments.simulated_time import SimulatedRun
 from disco_hw.first_use.commission import as_sent, slowest_rad_s
 from disco_hw.first_use.pilot import CommissionPilot
@@ -20,10 +20,12 @@ from disco_hw.first_use.procedure import Ask, DriveWheels, Procedure, speed_of
 from disco_hw.runtime.pipeline import NoPlanner
 from disco_hw.runtime.robot_setup import load_setup
 from disco_hw.runtime.states import State
+from drivers.motor import find_driver
 from drivers.transport import connect_pair
 from drivers.types import OutgoingFrame
 from firmware_protocol.firmware_core import FirmwareConfig
 from sim.body_dynamics import BodyPose
+from sim.can_frame import CanFrame
 from sim.devices import find_controller
 from sim.effects import hidden_effects
 from sim.plant import Plant
@@ -126,6 +128,8 @@ class MiswiredRobot:
             self.board = VirtualRobot(self.plant, firmware)
         else:
             self.board = VendorRobot(self.plant, find_controller(name)(config.link.settings(), plant.ticks_per_rev))
+        exchange = find_driver(name).exchange
+        self._exchange = None if exchange is None else exchange(config.link.settings())
         self.host, self.link = connect_pair()
         self.host.open()
         self.link.open()
@@ -135,9 +139,23 @@ class MiswiredRobot:
         while self._now_us < until_us:
             self._now_us += STEP_US
             for received in self.link.receive():
-                self.board.receive(self._now_us, received.frame)
+                self._take(received.frame)
             for frame in self.board.step(self._now_us):
-                self.link.send(OutgoingFrame(frame, 1 << 62), self._now_us * 1000)
+                self._send(frame)
+
+    def _take(self, frame):
+        """One frame from the host; on a half-duplex line its reply is there before the next one is said."""
+        if self._exchange is None:
+            self.board.receive(self._now_us, frame)
+            return
+        request = CanFrame(0, self._exchange.request(frame))
+        said = b"".join(each.data for each in self.board.controller.receive(self._now_us, request))
+        reply = self._exchange.reply(frame, said)
+        if reply is not None:
+            self._send(reply)
+
+    def _send(self, frame):
+        self.link.send(OutgoingFrame(frame, 1 << 62), self._now_us * 1000)
 
     def close(self):
         self.sender.close()
@@ -226,9 +244,11 @@ def robot_file(directory, driver=None):
         '"wombot_model.toml"', f'"{SHIPPED.parent / "wombot_model.toml"}"'
     )
     if driver not in (None, "reference"):
-        text = text.replace("[link]\n", f'[link]\ndriver = "{driver}"\n{DEVICES[driver]}')
+        text = with_device(text, driver)
+    else:
+        text += f'\n[pose]\nsource = "udp"\nport = {free_port()}\n'
     path = directory / "robot.toml"
-    path.write_text(text + f'\n[pose]\nsource = "udp"\nport = {free_port()}\n', encoding="utf-8")
+    path.write_text(text, encoding="utf-8")
     return path
 
 

@@ -15,7 +15,7 @@ from sim.devices import odrive
 from sim.plant_parameters import PlantParameters
 from tests.first_use.miswired import Miswiring, robot_file, stage
 
-DRIVERS = ("reference", "odrive", "vesc", "agilex")
+DRIVERS = ("reference", "odrive", "vesc", "agilex", "roboclaw")
 TOLD_WITHIN_M = 0.3
 
 
@@ -181,7 +181,7 @@ def sound_stages(tmp_path, number, driver):
 @pytest.mark.long
 @pytest.mark.parametrize("number", range(20))
 def test_twenty_sound_robots_have_no_fault(tmp_path, number):
-    assert sound_stages(tmp_path, number, DRIVERS[number % 4]) == []
+    assert sound_stages(tmp_path, number, DRIVERS[number % len(DRIVERS)]) == []
 
 
 @pytest.mark.long

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import os
+import select
 import subprocess
 import sys
+import threading
+import tty
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -14,7 +19,9 @@ from disco_hw.experiments.live_stack import disco_hw_process, write_robot_file
 from disco_hw.first_use.init import InitOptions, recognised, run_init
 from disco_hw.runtime.robot_setup import load_setup
 from drivers.motor import motor_drivers
+from drivers.motor.roboclaw_protocol import FIRST_ADDRESS, GETTERS, LAST_ADDRESS
 from drivers.types import Frame
+from sim.devices.roboclaw import Roboclaw
 from sim.plant_parameters import PlantParameters
 from tests.first_use.miswired import MiswiredRobot, Miswiring, robot_file
 
@@ -94,10 +101,91 @@ def test_what_no_robot_is_like_is_refused_and_nothing_is_left(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@contextmanager
+def line_with(*boards, says=b""):
+    """A serial port with these boards at its other end; its name, and all that they have heard."""
+    robot, host = os.openpty()
+    tty.setraw(host)
+    heard, ended = bytearray(), threading.Event()
+
+    def serve():
+        while not ended.is_set():
+            if says:
+                os.write(robot, says)
+            if not select.select([robot], [], [], 0.01)[0]:
+                continue
+            received = os.read(robot, 4096)
+            heard.extend(received)
+            for board in boards:
+                os.write(robot, board.receive(0, received))
+
+    served = threading.Thread(target=serve)
+    served.start()
+    try:
+        yield os.ttyname(host), heard
+    finally:
+        ended.set()
+        served.join()
+        os.close(host)
+        os.close(robot)
+
+
+def from_line(tmp_path, port, ask=None, **options):
+    return run_init(InitOptions(tmp_path / "robot.toml", f"serial:{port}", listen_s=0.1, **options), ask, quiet)
+
+
+ONE, TWO = ["128/1", "128/2"], [["128/1", "128/2"], ["129/1", "129/2"]]
+
+
+@pytest.mark.parametrize(("addresses", "motors"), [((0x80,), ONE), ((0x80, 0x81), TWO)])
+def test_a_roboclaw_is_found_by_its_version_and_by_nothing_that_moves_or_writes(tmp_path, addresses, motors):
+    boards = [Roboclaw(address) for address in addresses]
+    with line_with(*boards) as (port, heard):
+        out = from_line(tmp_path, port, may_ask=True)
+    link = load_robot_config(out).link
+    found = [list(side) if isinstance(side, tuple) else side for side in link.settings().motors]
+    assert (link.driver, link.port, link.baud, found) == ("roboclaw", port, 115_200, motors)
+    version = GETTERS["version"].command
+    assert bytes(heard) == b"".join(bytes((address, version)) for address in range(FIRST_ADDRESS, LAST_ADDRESS + 1))
+    assert not any(board.obeyed for board in boards)
+
+
+def test_a_silent_line_is_asked_only_with_somebodys_leave(tmp_path):
+    with line_with(Roboclaw()) as (port, heard):
+        for answers in (None, lambda _question: "n"):
+            with pytest.raises(InputError, match=r"no controller was heard; .* or give --ask"):
+                from_line(tmp_path, port, answers)
+        assert not heard
+        assert load_robot_config(from_line(tmp_path, port, lambda _question: "y" if "[y/n]" in _question else "")).link
+        assert heard
+
+
+def test_who_names_the_controller_has_given_leave(tmp_path):
+    with line_with(Roboclaw(0x83)) as (port, _heard):
+        assert load_robot_config(from_line(tmp_path, port, driver="roboclaw")).link.settings().motors == (
+            "131/1",
+            "131/2",
+        )
+
+
+def test_a_line_on_which_something_speaks_is_not_asked(tmp_path):
+    with line_with(Roboclaw(), says=b"$GPGGA,1*00\r\n") as (port, heard):
+        with pytest.raises(InputError, match="no controller was heard"):
+            from_line(tmp_path, port, may_ask=True)
+        assert not heard
+
+
 @pytest.mark.hil
-def test_from_the_bus_of_a_virtual_robot_to_a_file_that_check_accepts(tmp_path):
-    robot = write_robot_file(tmp_path, device="odrive")
-    bus, out = tmp_path / "bus", tmp_path / "mine.toml"
+@pytest.mark.parametrize(
+    ("device", "link", "shown"),
+    [
+        ("odrive", "can:unixcan:{}/bus", {"nodes": (3, 5)}),
+        pytest.param("roboclaw", "serial:{}/tty", {"motors": ("128/1", "128/2")}, marks=pytest.mark.long),
+    ],
+)
+def test_from_the_link_of_a_virtual_robot_to_a_file_that_check_accepts(tmp_path, device, link, shown):
+    robot = write_robot_file(tmp_path, device=device)
+    out = tmp_path / "mine.toml"
     with disco_hw_process("virtual robot", ["sim", str(robot)], tmp_path / "sim.txt"):
         command = [sys.executable, "-m", "disco_hw"]
         for _ in range(100):
@@ -106,8 +194,9 @@ def test_from_the_bus_of_a_virtual_robot_to_a_file_that_check_accepts(tmp_path):
                 "-o",
                 str(out),
                 "--link",
-                f"can:unixcan:{bus}",
+                link.format(tmp_path),
                 "--yes",
+                "--ask",
                 "--overwrite",
                 "--listen-s",
                 "1",
@@ -117,7 +206,8 @@ def test_from_the_bus_of_a_virtual_robot_to_a_file_that_check_accepts(tmp_path):
                 break
         assert done.returncode == 0, done.stderr
         config = load_robot_config(out)
-        assert (config.link.driver, config.link.settings().nodes) == ("odrive", (3, 5))
+        assert config.link.driver == device
+        assert {name: getattr(config.link.settings(), name) for name in shown} == shown
         checked = subprocess.run([*command, "check", str(out)], capture_output=True, text=True, timeout=60, check=False)
     assert "FAIL  link" not in checked.stdout
     assert "FAIL  firmware" not in checked.stdout, checked.stdout
