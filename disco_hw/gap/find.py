@@ -17,7 +17,7 @@ from disco_hw.errors import LogError, WorkError
 from disco_hw.gap.data.gridded_drive import grid_drive
 from disco_hw.gap.data.layout import BASE_COUNT, BODY, DELAYED_BY, WHEEL, Layout
 from disco_hw.gap.report.amend import amended_model, at_joint_fit, carried_terms, channel_estimates, simple_model
-from disco_hw.gap.report.findings import STAGES, GapReport
+from disco_hw.gap.report.findings import STAGES, GapReport, reached_horizon_s
 from disco_hw.gap.report.injection import finder, proved
 from disco_hw.gap.report.judge import (
     Measured,
@@ -106,7 +106,7 @@ def offered_stage(gap: Mapping[str, Mapping[float, PredictionErrors]], found: bo
     Better too where the amended one is so by a single stretch only: another drive need not have its like. Where
     predictions cannot be compared it is the amended one too.
     """
-    horizon_s, prediction = settings.prediction.reported_horizon_s, settings.prediction
+    horizon_s, prediction = reached_horizon_s(gap, settings.prediction), settings.prediction
     if not gap or not math.isfinite(gap["amended"][horizon_s].position_m):
         return "amended"
     refitted, timed, amended = (gap[stage][horizon_s] for stage in STAGES[1:4])
@@ -162,9 +162,9 @@ def missing_effects(log: DriveLog, model: Model) -> tuple[str, ...]:
     names = tuple(effect.name for effect in effect_findings(analysis, final))
     if analysis.body is None or not names:
         return names
-    stages, prediction = stage_predictions(analysis, final), DEFAULT_SETTINGS.prediction
-    refitted, amended = (stages.errors(stage, prediction.reported_horizon_s) for stage in ("refitted", "amended"))
-    return () if worse_by(amended, refitted) <= prediction.worse else names
+    stages = stage_predictions(analysis, final)
+    refitted, amended = (stages.errors(stage) for stage in ("refitted", "amended"))
+    return () if worse_by(amended, refitted) <= DEFAULT_SETTINGS.prediction.worse else names
 
 
 def search(

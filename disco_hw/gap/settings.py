@@ -55,6 +55,8 @@ class GridSettings:
     """A value that is repeated for longer than so many periods was measured again. Chosen."""
     lead_s: float = 1.0
     """After a run's start so long nothing is predicted: what was commanded before is not known. Chosen."""
+    lead_share: float = 0.25
+    """And of a short run so much of it at most. Chosen: windows of 2 s are predicted 1 s ahead."""
     start_every_s: float = 0.2
     """Predictions start so far apart. Chosen: neighbours then differ, and a minute has 300."""
     most_pose_delay_s: float = 1.0
@@ -159,7 +161,8 @@ class SelectionSettings:
     """Which effects are accepted."""
 
     ahead_s: float = 2.0
-    """What an effect moves is judged so far ahead. Chosen: about as far as a planner looks."""
+    """What an effect moves is judged so far ahead, or half or a quarter of it where runs are short. Chosen: about as
+    far as a planner looks."""
     most_moved_share: float = 0.1
     """It is judged where it moves most, on this share of the predictions. Chosen: some are felt in few places only."""
     least_moved_m: float = 1e-3
@@ -254,7 +257,8 @@ class PredictionSettings:
     horizons_s: tuple[float, ...] = (0.5, 1.0, 2.0, 5.0)
     """How far ahead. Chosen."""
     reported_horizon_s: float = 2.0
-    """The one that the answer is about. Chosen: about as far as a planner looks."""
+    """The one that the answer is about, or the longest below that runs are long enough for. Chosen: about as far as a
+    planner looks."""
     fold_s: float = 21.0
     """Length of the stretches that are left out in turn. Chosen: seven blocks, longer than `WANDER_S`."""
     pose_reach_s: float = 0.3

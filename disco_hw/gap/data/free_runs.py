@@ -265,11 +265,22 @@ def displacement(
 def starts_of(first: NDArray[np.bool_], usable: NDArray[np.bool_], ahead_s: float, settings: GridSettings) -> Index:
     """Nodes (K,), `start_every_s` apart, from which a prediction stays within its run and on usable nodes."""
     ahead, stride = round(ahead_s / GRID_STEP_S), round(settings.start_every_s / GRID_STEP_S)
-    # What was commanded before a run is not known, and late wheels still follow it.
-    lead = round(settings.lead_s / GRID_STEP_S)
     begins = np.flatnonzero(first)
     ends = np.append(begins[1:], first.size)
+    # What was commanded before a run is not known, and late wheels still follow it.
+    lead = np.minimum(round(settings.lead_s / GRID_STEP_S), (settings.lead_share * (ends - begins)).astype(np.int64))
     bad = np.concatenate([[0], np.cumsum(~usable)])
-    found = [np.arange(lo + lead, hi - ahead - 1, stride) for lo, hi in zip(begins, ends, strict=True)]
+    found = [np.arange(lo + at, hi - ahead - 1, stride) for lo, at, hi in zip(begins, lead, ends, strict=True)]
     start = np.concatenate(found) if found else np.empty(0, dtype=np.int64)
     return np.asarray(start[bad[start + ahead + 1] == bad[start]])
+
+
+def starts_as_far_as(
+    first: NDArray[np.bool_], usable: NDArray[np.bool_], ahead_s: float, settings: GridSettings
+) -> tuple[Index, float]:
+    """Starts of predictions `ahead_s` ahead, or of half or a quarter of it where runs are too short; and how far."""
+    for share in (1.0, 0.5, 0.25):
+        start = starts_of(first, usable, share * ahead_s, settings)
+        if start.size:
+            break
+    return start, share * ahead_s

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from disco_hw.gap.noise.channels import WheelChannel
-from disco_hw.gap.report.findings import STAGES
+from disco_hw.gap.report.findings import STAGES, reached_horizon_s
 from disco_hw.gap.report.judge import regimes_of
 from disco_hw.gap.report.misspecification import Regime
 from disco_hw.gap.search.analysis import GapAnalysis
@@ -32,7 +32,7 @@ def pictures(analysis: GapAnalysis, gap: dict[str, dict[float, PredictionErrors]
     out: dict[str, bytes] = {}
     if gap:
         out["gap_by_horizon"] = gap_by_horizon(gap)
-        out["gap_by_regime"] = gap_by_regime(gap, analysis.drive.settings.prediction.reported_horizon_s)
+        out["gap_by_regime"] = gap_by_regime(gap, reached_horizon_s(gap, analysis.drive.settings.prediction))
     for name, title, found in (
         ("command_to_wheel", "command to wheel", analysis.wheels),
         ("wheel_to_body", "wheel to body and pose sensor", analysis.body),

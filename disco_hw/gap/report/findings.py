@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -9,11 +11,18 @@ from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.report.blind_spots import BlindSpot
 from disco_hw.gap.search.cross_validation import PredictionErrors
 from disco_hw.gap.search.intervals import ParameterEstimate
-from disco_hw.gap.settings import DEFAULT_SETTINGS, GapSettings
+from disco_hw.gap.settings import DEFAULT_SETTINGS, GapSettings, PredictionSettings
 from disco_hw.model import Model
 
 STAGES = ("nominal", "refitted", "timed", "amended", "floor")
 ALL_IN_ONE = "separate"
+
+
+def reached_horizon_s(gap: Mapping[str, Mapping[float, PredictionErrors]], settings: PredictionSettings) -> float:
+    """How far ahead an answer looks: as the settings say, or the longest below that runs are long enough for."""
+    errors = gap.get("timed", {})
+    reached = [s for s, e in errors.items() if s <= settings.reported_horizon_s and math.isfinite(e.position_m)]
+    return max(reached, default=settings.reported_horizon_s)
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +100,7 @@ class GapReport:
     @property
     def horizon_s(self) -> float:
         """How far ahead the answer looks."""
-        return self.settings.prediction.reported_horizon_s
+        return reached_horizon_s(self.gap, self.settings.prediction)
 
     def at_horizon(self, stage: str) -> PredictionErrors:
         """Errors of a stage as far ahead as the answer looks."""

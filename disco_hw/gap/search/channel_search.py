@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.effects.registry import REGISTRY
-from disco_hw.gap.data.free_runs import displacement, starts_of
+from disco_hw.gap.data.free_runs import displacement, starts_as_far_as
 from disco_hw.gap.data.gridded_drive import GriddedDrive
 from disco_hw.gap.data.layout import BODY, DELAYED_BY, WHEEL
 from disco_hw.gap.noise.body_noise import BodyNoise
@@ -81,8 +81,8 @@ def wheel_moves(channel: WheelChannel, geometry: Array) -> Callable[[Split, Spli
     drive = channel.drive
     settings = channel.settings.selection
     usable = np.isfinite(drive.command_rad_s[:, 0])
-    start = starts_of(drive.first, usable, settings.ahead_s, channel.settings.grid)
-    ahead = round(settings.ahead_s / GRID_STEP_S)
+    start, ahead_s = starts_as_far_as(drive.first, usable, settings.ahead_s, channel.settings.grid)
+    ahead = round(ahead_s / GRID_STEP_S)
 
     def moves(small: Split, big: Split) -> float:
         if not start.size:
@@ -102,7 +102,8 @@ def body_moves(channel: BodyChannel) -> Callable[[Split, Split], float]:
     """How far two fits of the body lie apart `ahead_s` ahead, m."""
     drive = channel.drive
     settings = channel.settings.selection
-    start = starts_of(drive.first, np.ones(drive.t_s.size, dtype=bool), settings.ahead_s, channel.settings.grid)
+    everywhere = np.ones(drive.t_s.size, dtype=bool)
+    start, ahead_s = starts_as_far_as(drive.first, everywhere, settings.ahead_s, channel.settings.grid)
     heading = np.interp(drive.t_s[start], channel.samples.t_s, channel.measured[:, 2])
 
     def moves(small: Split, big: Split) -> float:
@@ -111,9 +112,7 @@ def body_moves(channel: BodyChannel) -> Callable[[Split, Split], float]:
         ends = []
         for p, extra in (small, big):
             ends.append(
-                displacement(
-                    p, drive.first, channel.track(p, extra), channel.moving_s, start, heading, settings.ahead_s
-                )
+                displacement(p, drive.first, channel.track(p, extra), channel.moving_s, start, heading, ahead_s)
             )
         apart = ends[1] - ends[0]
         lever = 0.5 * np.hypot(ends[1][:, 0], ends[1][:, 1])

@@ -158,6 +158,14 @@ def find_starts(channel: BodyChannel, poses: tuple[Array, Array], ahead_s: float
     return Starts(node, smooth[node], alone[node + ahead], block, tuple(_regimes(channel, node, ahead)))
 
 
+def judged_horizon_s(channel: BodyChannel, poses: tuple[Array, Array]) -> float:
+    """How far ahead stages are compared: as the answer looks, or the longest below that runs are long enough for."""
+    settings = channel.settings.prediction
+    shorter = sorted((each for each in settings.horizons_s if each <= settings.reported_horizon_s), reverse=True)
+    reached = (ahead_s for ahead_s in shorter if find_starts(channel, poses, ahead_s).node.size)
+    return next(reached, settings.reported_horizon_s)
+
+
 def _regimes(channel: BodyChannel, node: Index, ahead: int) -> list[str]:
     """What the robot mostly does between start and end."""
     drive, p, settings = channel.drive, channel.geometry, channel.settings.prediction

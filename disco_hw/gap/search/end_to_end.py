@@ -17,7 +17,14 @@ from scipy.optimize import least_squares
 
 from disco_hw.gap.data.layout import Layout
 from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
-from disco_hw.gap.search.cross_validation import Chain, Starts, chain_track, find_starts, prediction_error
+from disco_hw.gap.search.cross_validation import (
+    Chain,
+    Starts,
+    chain_track,
+    find_starts,
+    judged_horizon_s,
+    prediction_error,
+)
 from disco_hw.gap.search.least_squares import inverse
 
 Array = NDArray[np.float64]
@@ -99,8 +106,9 @@ class Ahead:
 
     @classmethod
     def of(cls, body: BodyChannel, wheels: WheelChannel | None, poses: tuple[Array, Array]) -> Ahead:
-        """The predictions of a drive from smoothed `poses`, as far ahead as the settings say, where there are any."""
-        horizons = body.settings.prediction.fitted_horizons_s
+        """The predictions of a drive from smoothed `poses`, as far ahead as the settings say, or runs are long."""
+        longest_s = judged_horizon_s(body, poses)
+        horizons = sorted({min(ahead_s, longest_s) for ahead_s in body.settings.prediction.fitted_horizons_s})
         every = [(ahead_s, find_starts(body, poses, ahead_s)) for ahead_s in horizons]
         return cls(body, wheels, tuple((ahead_s, starts) for ahead_s, starts in every if starts.node.size))
 

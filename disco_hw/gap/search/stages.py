@@ -27,6 +27,7 @@ from disco_hw.gap.search.cross_validation import (
     errors_of,
     floor_errors,
     fold_vectors,
+    judged_horizon_s,
     smoothed_poses,
     worse_by,
 )
@@ -52,8 +53,14 @@ class StagePredictions:
     poses: tuple[Array, Array]
     joint: Mapping[str, tuple[Freed, JointFit]] = field(default_factory=dict)
 
-    def errors(self, stage: str, ahead_s: float) -> PredictionErrors:
-        """Errors of one stage so far ahead on held-out data."""
+    @property
+    def judged_horizon_s(self) -> float:
+        """How far ahead stages are compared."""
+        return judged_horizon_s(self.body, self.poses)
+
+    def errors(self, stage: str, ahead_s: float | None = None) -> PredictionErrors:
+        """Errors of one stage on held-out data so far ahead, or as far as stages are compared."""
+        ahead_s = self.judged_horizon_s if ahead_s is None else ahead_s
         return errors_of(self.body, self.wheels, self.chains[stage], ahead_s, self.poses)
 
     def table(self) -> dict[str, dict[float, PredictionErrors]]:
@@ -157,8 +164,7 @@ def joint_predictions(analysis: GapAnalysis, final: FinalFit) -> StagePrediction
         options.append(_Fitted.to(ahead, _on_top(options[0].of, timed.at()), on_top))
 
     def size(option: _Fitted) -> float:
-        horizon_s = apart.body.settings.prediction.reported_horizon_s
-        errors = errors_of(apart.body, apart.wheels, option.chains, horizon_s, apart.poses)
+        errors = errors_of(apart.body, apart.wheels, option.chains, apart.judged_horizon_s, apart.poses)
         return errors.position_m * errors.yaw_rad
 
     stages = {"refitted": refitted, "timed": timed, "amended": min(options, key=size)}
@@ -277,8 +283,8 @@ def prune(analysis: GapAnalysis) -> GapAnalysis:
         return analysis
     settings = analysis.drive.settings.prediction
     predictions = stage_predictions(analysis)
-    refitted = predictions.errors("refitted", settings.reported_horizon_s)
-    now = predictions.errors("amended", settings.reported_horizon_s)
+    refitted = predictions.errors("refitted")
+    now = predictions.errors("amended")
     for _ in range(settings.most_changes):
         if clearly_worse(refitted, now, settings):
             options = chain(_lacking_one(analysis), _swapped_one(analysis))
@@ -299,8 +305,7 @@ def _best(
     """Of some analyses the one that predicts best, if its errors are less than `below` times those of another."""
     best, least = None, below
     for option in options:
-        horizon_s = option.drive.settings.prediction.reported_horizon_s
-        errors = stage_predictions(option).errors("amended", horizon_s)
+        errors = stage_predictions(option).errors("amended")
         ratio = worse_by(than, errors)
         if ratio < least:
             best, least = (option, errors), ratio

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from disco_hw.gap.data.free_runs import displacement, starts_of
+from disco_hw.gap.data.free_runs import displacement, starts_as_far_as, starts_of
 from disco_hw.gap.data.layout import BODY
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S
 
@@ -64,3 +64,22 @@ def test_starts_stay_within_runs_and_on_known_nodes():
     ends = start + 100
     assert np.all((start < 500) == (ends < 500))
     assert not np.any((start <= 250) & (ends >= 250))
+
+
+@pytest.mark.parametrize(("run_s", "ahead_s", "starts"), [(2.0, 1.0, 3), (2.0, 0.5, 5), (2.0, 2.0, 0), (10.0, 1.0, 40)])
+def test_of_a_short_run_a_quarter_is_spent_before_predictions_begin(run_s, ahead_s, starts):
+    cells = round(run_s / GRID_STEP_S)
+    first = np.arange(3 * cells) % cells == 0
+    found = starts_of(first, np.ones(3 * cells, bool), ahead_s, DEFAULT_SETTINGS.grid)
+    assert found.size == 3 * starts
+    if starts:
+        assert found[0] == min(cells / 4, 100)
+
+
+@pytest.mark.parametrize(("run_s", "reached_s"), [(10.0, 2.0), (2.0, 1.0), (1.0, 0.5), (0.3, 0.5)])
+def test_what_an_effect_moves_is_judged_as_far_ahead_as_runs_are_long(run_s, reached_s):
+    cells = round(run_s / GRID_STEP_S)
+    first = np.arange(3 * cells) % cells == 0
+    start, ahead_s = starts_as_far_as(first, np.ones(3 * cells, bool), 2.0, DEFAULT_SETTINGS.grid)
+    assert ahead_s == reached_s
+    assert bool(start.size) == (run_s > reached_s)

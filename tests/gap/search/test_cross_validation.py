@@ -16,10 +16,12 @@ from disco_hw.gap.search.cross_validation import (
     errors_of,
     floor_errors,
     fold_vectors,
+    judged_horizon_s,
     smoothed_poses,
 )
+from disco_hw.gap.search.end_to_end import Ahead
 from disco_hw.gap.search.least_squares import fit
-from disco_hw.gap.settings import DEFAULT_SETTINGS
+from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S
 from tests.gap.synthetic import NOISE, body_channel
 
 AHEAD_S = 2.0
@@ -108,3 +110,16 @@ def test_what_a_fold_knows_nothing_about_is_not_in_its_prediction():
 
 def _fields(line):
     return {name: getattr(line, name) for name in line.__slots__}
+
+
+@pytest.mark.parametrize(("window_s", "judged_s"), [(None, 2.0), (2.0, 1.0), (1.2, 0.5)])
+def test_stages_are_compared_as_far_ahead_as_runs_are_long(window_s, judged_s):
+    channel, line = body_channel()
+    if window_s is not None:
+        first = np.arange(line.t_s.size) % round(window_s / GRID_STEP_S) == 0
+        channel = BodyChannel.build(replace(line, first=first), NOISE, channel.neutral)
+    poses = smoothed_poses(channel, channel.neutral)
+    assert judged_horizon_s(channel, poses) == judged_s
+    ahead = Ahead.of(channel, None, poses)
+    assert [ahead_s for ahead_s, _ in ahead.starts] == ([1.0, 2.0] if window_s is None else [judged_s])
+    assert np.isfinite(errors_of(channel, None, both(channel.neutral), judged_s, poses).position_m)

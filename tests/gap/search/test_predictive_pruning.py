@@ -36,7 +36,7 @@ class Whole:
     pruned: tuple = ()
     drive: object = field(default_factory=lambda: SimpleNamespace(settings=DEFAULT_SETTINGS))
 
-    def errors(self, stage, ahead_s):
+    def errors(self, stage, ahead_s=None):
         names = frozenset((*self.wheels.names, *self.body.names))
         size = 0.1 if stage == "refitted" else self.amended_m.get(names, 0.1)
         return PredictionErrors(size, (size, size), size, (size, size), size, {})
