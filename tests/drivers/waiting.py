@@ -1,5 +1,7 @@
 """Waiting for other threads and processes in tests."""
 
+import random
+import socket
 import statistics
 import time
 
@@ -13,6 +15,20 @@ def wait_until(condition, timeout_s=10.0):
         assert time.monotonic() < deadline, f"waited {timeout_s} s in vain"
         time.sleep(0.002)
     return value
+
+
+def free_port(kind=socket.SOCK_STREAM):
+    """A port that nobody has, below those that the kernel hands to whoever asks for any: it stays free until used."""
+    while True:
+        port = random.SystemRandom().randrange(20_000, 32_000)
+        with socket.socket(socket.AF_INET6, kind) as probe:
+            try:
+                # Of both families at once.
+                probe.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 0)
+                probe.bind(("::", port))
+            except OSError:
+                continue
+            return port
 
 
 def outgoing(can_id=0x100, data=b"\x01", valid_for_s=5.0):

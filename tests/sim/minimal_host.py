@@ -8,11 +8,15 @@ from firmware_protocol.codec import PROTOCOL_MAJOR, PROTOCOL_MINOR, Codec, Decod
 
 
 class MinimalHost:
-    """Goes for `wanted` ("STANDBY", "READY", "ARM") and then commands `speeds`; `latest` holds what the robot sent."""
+    """Goes for `wanted` ("STANDBY", "READY", "ARM") and then commands `speeds`; `latest` holds what the robot sent.
 
-    def __init__(self, session=1):
+    `patience`: how many times as long its commands hold, and are apart, as those of a daemon.
+    """
+
+    def __init__(self, session=1, patience=1):
         self.codec = Codec()
         self.session = session
+        self._patience = patience
         self.wanted = "STANDBY"
         self.speeds = (0.0, 0.0)
         self.mode = "SPEED"
@@ -50,7 +54,7 @@ class MinimalHost:
             )
         if now_ms % 1000 == 7:
             frames.append(self._encode("TIME_REQUEST", sequence=now_ms // 1000 % 256))
-        if now_ms % 50 == 3:
+        if now_ms % (50 * self._patience) == 3:
             challenge = int(self.latest.get("SESSION_STATE", {}).get("challenge", 0))
             answer = binascii.crc_hqx(struct.pack("<HBI", challenge, self.session, self.codec.dbc_hash), 0xFFFF)
             frames.append(
@@ -58,7 +62,7 @@ class MinimalHost:
                     "HOST_STATE", request=self.wanted, session=self.session, challenge_answer=answer, host_fault=0
                 )
             )
-        if now_ms % 20 == 5 and self.wanted == "ARM":
+        if now_ms % (20 * self._patience) == 5 and self.wanted == "ARM":
             left, right = self.speeds if self.robot_state == "ARMED" else (0.0, 0.0)
             frames.append(
                 self._encode(
@@ -66,7 +70,7 @@ class MinimalHost:
                     mode=self.mode,
                     left_speed=left,
                     right_speed=right,
-                    valid_for=0.1,
+                    valid_for=0.1 * self._patience,
                     session=self.session,
                 )
             )

@@ -22,17 +22,32 @@ from sim.__main__ import main
 from sim.command_socket import send_command
 from sim.unixcan import UnixCanBus
 from sim.virtual_robot import TRUTH_COLUMNS
+from tests.drivers.waiting import wait_until
 from tests.sim.minimal_host import MinimalHost
+
+COMMAND_TIMEOUT_S = 0.5
+# The firmware gives its host as long as it can be told to: a test that is held up for 0.1 s has not let go.
+PATIENT = f"""
+import sys
+from firmware_protocol.firmware_core import FirmwareConfig
+from sim.__main__ import main
+from sim.app import VirtualRobotOptions
+VirtualRobotOptions.firmware_config = FirmwareConfig(
+    ticks_per_rev=2048, max_wheel_speed_rad_s=8.0, command_timeout_s={COMMAND_TIMEOUT_S}, drive_off_timeout_s=2.0,
+    host_state_timeout_s=2.0)
+sys.exit(main(sys.argv[1:]))
+"""
 
 
 class Robot:
-    def __init__(self, directory, *options):
+    def __init__(self, directory, *options, patient=False):
         self.directory = directory
         self.channel = directory / "bus"
         self.port = directory / "tty"
         self.process = subprocess.Popen(
             [
-                *(sys.executable, "-m", "sim", "--channel", str(self.channel), "--inject", str(directory / "inject")),
+                *(sys.executable, *(("-c", PATIENT) if patient else ("-m", "sim"))),
+                *("--channel", str(self.channel), "--inject", str(directory / "inject")),
                 *("--truth", str(directory / "truth.csv"), *options),
             ],
             stdout=subprocess.PIPE,
@@ -53,12 +68,13 @@ class Robot:
         return max(abs(state["left_speed_rad_s"]), abs(state["right_speed_rad_s"]))
 
     def truth(self):
-        rows = csv.DictReader(io.StringIO((self.directory / "truth.csv").read_text()))
+        whole_lines = (self.directory / "truth.csv").read_text().rpartition("\n")[0]
+        rows = csv.DictReader(io.StringIO(whole_lines))
         return [{name: value if name == "state" else float(value) for name, value in row.items()} for row in rows]
 
     def stop(self, number=signal.SIGTERM):
         self.process.send_signal(number)
-        _, errors = self.process.communicate(timeout=20)
+        _, errors = self.process.communicate(timeout=60)
         return self.process.returncode, errors
 
 
@@ -66,10 +82,10 @@ class Robot:
 def start(tmp_path):
     robots = []
 
-    def start(*options):
+    def start(*options, **patience):
         directory = tmp_path / str(len(robots))
         directory.mkdir()
-        robots.append(Robot(directory, *options))
+        robots.append(Robot(directory, *options, **patience))
         assert robots[-1].ready.startswith("ready "), robots[-1].process.communicate()
         return robots[-1]
 
@@ -131,28 +147,28 @@ def drive(port, host, seconds, until=lambda: False):
 
 def arm(port, host):
     host.wanted = "READY"
-    assert drive(port, host, 5, lambda: host.robot_state == "READY"), host.latest
+    assert drive(port, host, 30, lambda: host.robot_state == "READY"), host.latest
     host.wanted = "ARM"
-    assert drive(port, host, 5, lambda: host.robot_state == "ARMED"), host.latest
+    assert drive(port, host, 30, lambda: host.robot_state == "ARMED"), host.latest
 
 
 @pytest.fixture
 def host():
-    host = MinimalHost()
+    host = MinimalHost(patience=round(COMMAND_TIMEOUT_S / 0.1))
     host.now_ms = 0
     return host
 
 
 def test_drive_it_over_can_and_let_go(start, host):
-    robot = start()
+    robot = start(patient=True)
     port = CanPort(robot)
     arm(port, host)
     host.speeds = (2.0, 3.0)
-    assert drive(port, host, 5, lambda: robot.wheel_speed() > 2.9)
+    assert drive(port, host, 30, lambda: robot.wheel_speed() > 2.9)
     assert host.latest["WHEEL_SPEED"]["right_speed"] > 2.0
     # The pause is the simulator's, not the host's: what came meanwhile is let in as if it had come in time.
     robot.process.send_signal(signal.SIGSTOP)
-    drive(port, host, 0.3)
+    drive(port, host, 1.6 * COMMAND_TIMEOUT_S)
     robot.process.send_signal(signal.SIGCONT)
     drive(port, host, 0.3)
     assert robot.state()["state"] == "ARMED"
@@ -160,18 +176,18 @@ def test_drive_it_over_can_and_let_go(start, host):
 
 
 def test_drive_it_over_a_serial_line_and_let_go(start, host, tmp_path):
-    robot = start("--kind", "serial", "--port", str(tmp_path / "0" / "tty"))
+    robot = start("--kind", "serial", "--port", str(tmp_path / "0" / "tty"), patient=True)
     assert robot.ready.startswith(f"ready serial {robot.port} at 921600 Bd")
     port = SerialPort(robot)
     arm(port, host)
     host.speeds = (2.0, 3.0)
-    assert drive(port, host, 5, lambda: robot.wheel_speed() > 2.9)
+    assert drive(port, host, 30, lambda: robot.wheel_speed() > 2.9)
     assert robot.command("unplug 0.2") == "ok"
     with pytest.raises(OSError, match=r"."):
-        drive(port, host, 5)
+        drive(port, host, 30)
     vanish_and_see_it_stop(robot, port)
     again = SerialPort(robot)
-    assert drive(again, host, 5, lambda: host.robot_state == "STANDBY")
+    assert drive(again, host, 30, lambda: host.robot_state == "STANDBY")
     again.close()
     assert robot.stop()[0] == 0
     assert not os.path.lexists(robot.port)
@@ -180,7 +196,12 @@ def test_drive_it_over_a_serial_line_and_let_go(start, host, tmp_path):
 def vanish_and_see_it_stop(robot, port):
     """The host goes without a word: its descriptors are closed, as when it is killed."""
     port.close()
-    time.sleep(0.1 + 3.0 / 20.0 + 0.5)
+    # Judged by the robot's own record, whenever this test gets to look at it.
+    stands_by_ns = time.monotonic_ns() + round(1e9 * (COMMAND_TIMEOUT_S + 3.0 / 20.0 + 0.5))
+    wait_until(lambda: robot.truth()[-1]["t_ns"] > stands_by_ns + 200_000_000, 30.0)
+    after = [row for row in robot.truth() if row["t_ns"] > stands_by_ns]
+    assert max(abs(row[side]) for row in after for side in ("left_speed_rad_s", "right_speed_rad_s")) < 0.05
+    assert "ARMED" not in {row["state"] for row in after}
     assert robot.wheel_speed() < 0.05
     assert robot.state()["state"] != "ARMED"
 
@@ -191,7 +212,7 @@ def test_a_signal_ends_it_cleanly(start, number):
     for name in ("bus", "inject"):
         assert stat.S_IMODE((robot.directory / name).stat().st_mode) == 0o600
     with UnixCanBus(str(robot.channel)) as bus:
-        assert bus.recv(5) is not None
+        assert bus.recv(30) is not None
         code, errors = robot.stop(number)
         assert code == 0
         assert errors.startswith("stopped after ")
@@ -202,7 +223,7 @@ def test_a_signal_ends_it_cleanly(start, number):
 
 def read_to_the_end(bus):
     try:
-        while bus.recv(1):
+        while bus.recv(30):
             pass
     except can.CanError as error:
         return error
@@ -212,18 +233,17 @@ def read_to_the_end(bus):
 def test_the_record_has_no_gap_whatever_happens_to_the_process(start, tmp_path):
     before_ns = time.monotonic_ns()
     robot = start("--start", "1", "-2", "0.5", "--bus-log", str(tmp_path / "bus.log"))
-    time.sleep(1.2)
-    assert len(robot.truth()) >= 90
+    wait_until(lambda: len(robot.truth()) >= 90, 30.0)
     robot.process.send_signal(signal.SIGSTOP)
     time.sleep(0.5)
     robot.process.send_signal(signal.SIGCONT)
-    time.sleep(0.3)
+    resumed_ns = time.monotonic_ns()
+    wait_until(lambda: robot.truth()[-1]["t_ns"] > resumed_ns, 30.0)
     robot.stop()
     rows = robot.truth()
     times = [row["t_ns"] for row in rows]
     assert {int(after - before) for before, after in itertools.pairwise(times)} == {10_000_000}
     assert before_ns < times[0] < times[-1] < time.monotonic_ns()
-    assert time.monotonic_ns() - times[-1] < 2e9
     assert (rows[0]["x_m"], rows[0]["y_m"], rows[0]["yaw_rad"]) == pytest.approx((1.0, -2.0, 0.5), abs=1e-4)
     messages = list(can.LogReader(tmp_path / "bus.log"))
     assert len(messages) > 300
@@ -233,26 +253,25 @@ def test_the_record_has_no_gap_whatever_happens_to_the_process(start, tmp_path):
 def test_faults_at_run_time(start):
     robot = start()
     with UnixCanBus(str(robot.channel)) as bus:
-        assert bus.recv(10) is not None, "nothing comes before the bus knows of us"
+        assert bus.recv(30) is not None, "nothing comes before the bus knows of us"
         assert robot.command("bus_off") == "ok"
-        assert any(message.is_error_frame for message in iter(lambda: bus.recv(1), None))
-        assert robot.command("unplug 0.3") == "ok"
+        assert any(message.is_error_frame for message in iter(lambda: bus.recv(30), None))
+        assert robot.command("unplug 1.5") == "ok"
         assert isinstance(read_to_the_end(bus), can.CanOperationError)
         with pytest.raises(can.CanInitializationError):
             UnixCanBus(str(robot.channel))
-    time.sleep(0.4)
+    wait_until(robot.channel.exists, 30.0)
     assert robot.command("bus_off robot") == "ok"
-    time.sleep(0.05)
-    assert robot.state()["fault"] == Codec().choice_value("SYSTEM_STATE", "fault", "BUS_OFF")
+    bus_off = Codec().choice_value("SYSTEM_STATE", "fault", "BUS_OFF")
+    wait_until(lambda: robot.state()["fault"] == bus_off, 30.0)
     assert robot.command("kidnap 0.5 0 0") == "ok"
     assert robot.state()["x_m"] == pytest.approx(0.5, abs=0.01)
     assert robot.command("estop_button on") == "ok"
-    time.sleep(0.1)
-    assert robot.state()["state"] == "ESTOP"
+    wait_until(lambda: robot.state()["state"] == "ESTOP", 30.0)
     assert robot.command("nonsense").startswith("error: 'nonsense' is no command")
     assert robot.command("babble 0x100 200") == "ok"
     with UnixCanBus(str(robot.channel), can_filters=[{"can_id": 0x100, "can_mask": 0x7FF}]) as bus:
-        assert [bus.recv(1).arbitration_id for _ in range(20)] == [0x100] * 20
+        assert [bus.recv(30).arbitration_id for _ in range(20)] == [0x100] * 20
 
 
 def test_ready_descriptor(tmp_path):
@@ -268,7 +287,7 @@ def test_ready_descriptor(tmp_path):
         with os.fdopen(read_end) as ready:
             assert ready.read().startswith(f"ready unixcan {tmp_path / 'bus'}")
         process.terminate()
-        assert process.wait(10) == 0
+        assert process.wait(60) == 0
 
 
 @pytest.fixture

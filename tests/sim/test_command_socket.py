@@ -18,7 +18,7 @@ def serve_once(commands, execute):
     import select
 
     def run():
-        select.select([commands], [], [], 5)
+        select.select([commands], [], [], 30)
         commands.serve(execute)
 
     thread = threading.Thread(target=run)

@@ -347,7 +347,7 @@ def test_they_are_no_real_time_processes_though_their_parent_is():
         finally:
             os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
         pid = hogs._busy[1][0].pid
-        deadline = time.monotonic() + 10.0
+        deadline = time.monotonic() + 60.0
         while os.sched_getscheduler(pid) != os.SCHED_OTHER:
             assert time.monotonic() < deadline
             time.sleep(0.01)

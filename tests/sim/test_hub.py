@@ -383,14 +383,14 @@ def test_process_ends_cleanly_on_a_signal(tmp_path, number):
     ) as process:
         assert process.stdout.readline() == f"ready {path}\n"
         process.send_signal(number)
-        assert process.wait(10) == 0
+        assert process.wait(60) == 0
         assert "Traceback" not in process.stderr.read()
     assert not path.exists()
 
 
 def test_process_says_why_it_cannot_start(tmp_path):
     result = subprocess.run(
-        [sys.executable, "-m", "sim.hub", str(tmp_path)], capture_output=True, text=True, timeout=20, check=False
+        [sys.executable, "-m", "sim.hub", str(tmp_path)], capture_output=True, text=True, timeout=60, check=False
     )
     assert result.returncode == 2
     assert result.stderr == f"{tmp_path}: exists and is not a socket; remove it or choose another path\n"
@@ -436,7 +436,7 @@ def test_the_robot_receives_with_the_time_of_the_frames_end(link, bus):
 def test_the_host_receives_what_the_robot_sends(link, bus):
     link.send([ROBOT_FRAME, Frame(0x080, b"\x01")])
     assert run(link, 0, 2 * MS) == []
-    assert [bus.recv(1).arbitration_id for _ in range(2)] == [0x080, 0x100]
+    assert [bus.recv(30).arbitration_id for _ in range(2)] == [0x080, 0x100]
 
 
 def test_a_long_identifier_is_not_taken_for_the_short_one_of_its_number(link, bus):
@@ -463,7 +463,7 @@ def test_waiting_frames_can_be_let_in_a_few_at_a_time(link, bus):
 def test_a_host_in_bus_off_is_told_and_cut_off(link, bus):
     link.force_bus_off("host")
     run(link, 0, MS)
-    assert bus.recv(1).is_error_frame
+    assert bus.recv(30).is_error_frame
     send(bus)
     link.send([ROBOT_FRAME])
     assert run(link, MS, 5 * MS) == []
@@ -504,7 +504,7 @@ def test_nobody_else_can_be_put_into_bus_off(link):
 def test_unplugged_hosts_are_cut_off_for_a_while(link, bus):
     link.unplug(50 * MS)
     with pytest.raises(can.CanOperationError):
-        bus.recv(1)
+        bus.recv(30)
     with pytest.raises(can.CanInitializationError):
         UnixCanBus(str(link.hub.path))
     run(link, 0, 60 * MS)
@@ -514,7 +514,7 @@ def test_unplugged_hosts_are_cut_off_for_a_while(link, bus):
 def test_a_babbling_node_is_heard_by_robot_and_hosts(link, bus):
     link.babble(ROBOT_FRAME)
     assert [received.frame for received in run(link, 0, MS)] == [ROBOT_FRAME]
-    assert bus.recv(1).arbitration_id == 0x100
+    assert bus.recv(30).arbitration_id == 0x100
 
 
 def test_the_log_is_candump(tmp_path):

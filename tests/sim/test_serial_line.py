@@ -12,6 +12,7 @@ from firmware_protocol.serial_framing import FrameDecoder, encode_frame
 from sim.bus import FrameFate
 from sim.robot_link import LinkFaultError
 from sim.serial_line import SerialLine, SerialPathError
+from tests.drivers.waiting import wait_until
 
 MS = 1_000_000
 FRAME = Frame(0x110, bytes(range(1, 9)))
@@ -34,11 +35,15 @@ def host(line, now_ns=0, baud=921_600):
 
 def collect(line, now_ns, count=1):
     """Bytes cross a pseudo-terminal through a kernel thread: give it time."""
-    for _ in range(500):
-        if line.collect(now_ns) >= count:
-            return
-        time.sleep(0.001)
-    pytest.fail("nothing came")
+    wait_until(lambda: line.collect(now_ns) >= count, 30.0)
+
+
+def read(port, count):
+    """So many bytes, as soon as they have come; no more may have come with them."""
+    port.timeout = 30.0
+    received = port.read(count)
+    port.timeout = 0.2
+    return received + port.read(port.in_waiting)
 
 
 def test_only_the_owner_may_open_the_port(tmp_path, line):
@@ -66,9 +71,9 @@ def test_a_frame_to_the_host_takes_its_time(line):
         line.advance(5 * MS + FRAME_NS - 1)
         assert port.read(1) == b""
         line.advance(5 * MS + FRAME_NS)
-        assert port.read(100) == BYTES
+        assert read(port, len(BYTES)) == BYTES
         line.advance(5 * MS + 2 * FRAME_NS)
-        assert port.read(100) == BYTES
+        assert read(port, len(BYTES)) == BYTES
         assert line.next_event_ns() is None
 
 
@@ -78,7 +83,7 @@ def test_without_pacing_frames_take_no_time(tmp_path):
         line.advance(MS)
         line.send([FRAME])
         line.advance(MS)
-        assert port.read(100) == BYTES
+        assert read(port, len(BYTES)) == BYTES
         port.write(BYTES)
         collect(line, MS)
         assert [received.frame for received in line.advance(MS)] == [FRAME]
@@ -107,7 +112,7 @@ def test_opening_and_closing_is_noticed_again_and_again(line):
             line.advance(10 * round_ * MS)
             line.send([FRAME])
             line.advance((10 * round_ + 5) * MS)
-            assert port.read(100) == BYTES
+            assert read(port, len(BYTES)) == BYTES
         line.collect(10 * round_ * MS)
     assert line.stats.opened == 3
 
@@ -184,7 +189,8 @@ def test_with_different_baud_rates_only_garbage_arrives(line):
             line.send([FRAME])
             line.collect(step * 10 * MS)
         line.advance(900 * MS)
-        received = port.read(1000)
+        received = read(port, 20 * len(BYTES))
+        wait_until(lambda: line.collect(900 * MS) or line.stats.garbled_bytes == 40 * len(BYTES), 30.0)
         assert decoder.feed(received) == []
         assert len(received) == 20 * len(BYTES)
         assert line.advance(900 * MS) == []
@@ -209,7 +215,7 @@ def test_unplugging_takes_the_port_away_and_brings_a_new_one(tmp_path, line):
         line.advance(501 * MS)
         line.send([FRAME])
         line.advance(510 * MS)
-        assert again.read(100) == BYTES
+        assert read(again, len(BYTES)) == BYTES
 
 
 def test_the_link_replaces_one_of_a_dead_process_and_nothing_else(tmp_path):
@@ -295,8 +301,6 @@ def test_faults_on_the_way_to_the_robot_are_what_the_robot_reads(fate, expected)
     with serial.Serial(line.port, 921_600) as host:
         line.collect(1)
         host.write(encode_frame(0x100, b"abc"))
-        deadline = time.monotonic() + 5.0
-        while not line.collect(2):
-            assert time.monotonic() < deadline
+        wait_until(lambda: line.collect(2), 30.0)
         assert [received.frame.data for received in line.advance(3)] == expected
     line.close()

@@ -2,6 +2,7 @@
 
 import errno
 import multiprocessing
+import os
 import select
 import signal
 import socket
@@ -59,7 +60,7 @@ def test_what_is_sent_is_received(hub, message):
     before_s = time.time_ns() * 1e-9
     with UnixCanBus(hub) as a, UnixCanBus(hub) as b:
         a.send(message)
-        received = b.recv(5)
+        received = b.recv(30)
         assert received.equals(message, timestamp_delta=None, check_channel=False)
         assert before_s <= received.timestamp <= time.time_ns() * 1e-9
         assert received.channel == hub
@@ -75,10 +76,10 @@ def test_filters(hub):
     with UnixCanBus(hub) as a, UnixCanBus(hub, can_filters=[{"can_id": 0x120, "can_mask": 0x7F0}]) as b:
         for can_id in (0x11F, 0x120, 0x12F, 0x130, 0x121):
             a.send(can.Message(arbitration_id=can_id, is_extended_id=False))
-        assert [b.recv(5).arbitration_id for _ in range(3)] == [0x120, 0x12F, 0x121]
+        assert [b.recv(30).arbitration_id for _ in range(3)] == [0x120, 0x12F, 0x121]
         b.set_filters(None)
         a.send(can.Message(arbitration_id=0x130, is_extended_id=False))
-        assert b.recv(5).arbitration_id == 0x130
+        assert b.recv(30).arbitration_id == 0x130
 
 
 def test_receive_times_out(hub):
@@ -92,7 +93,7 @@ def test_receive_times_out(hub):
 def test_own_messages_on_request(hub):
     with UnixCanBus(hub, receive_own_messages=True) as bus:
         bus.send(MESSAGES[0])
-        assert bus.recv(5).arbitration_id == 0x123
+        assert bus.recv(30).arbitration_id == 0x123
 
 
 def test_descriptor_tells_of_waiting_frames(hub):
@@ -117,6 +118,7 @@ def test_a_full_transmit_buffer_is_enobufs(start_hub):
     path, process = start_hub()
     with UnixCanBus(path) as bus:
         process.send_signal(signal.SIGSTOP)
+        os.waitid(os.P_PID, process.pid, os.WSTOPPED)
         sent = 0
         with pytest.raises(can.CanOperationError) as error:  # noqa: PT012
             for _ in range(1000):
@@ -130,7 +132,7 @@ def test_a_full_transmit_buffer_is_enobufs(start_hub):
         assert time.monotonic() - start_s >= 0.05
         assert error.value.error_code == errno.ENOBUFS
         process.send_signal(signal.SIGCONT)
-        bus.send(MESSAGES[0], timeout=5)
+        bus.send(MESSAGES[0], timeout=30)
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
@@ -138,10 +140,10 @@ def test_death_of_the_hub_is_an_error_on_both_ways(start_hub, number):
     path, process = start_hub()
     with UnixCanBus(path) as bus:
         process.send_signal(number)
-        process.wait(10)
+        process.wait(60)
         for _ in range(2):
             with pytest.raises(can.CanOperationError, match=r"the hub has closed|Connection reset"):
-                bus.recv(5)
+                bus.recv(30)
             with pytest.raises(can.CanOperationError):
                 bus.send(MESSAGES[0])
 
@@ -173,7 +175,7 @@ def test_rubbish_from_the_other_end_is_an_error_not_a_crash(tmp_path):
             connection, _ = listener.accept()
             connection.send(pack_frame(CanFrame(1))[:4] + b"\x0f" + bytes(11))
             with pytest.raises(can.CanOperationError, match="is no CAN frame"):
-                bus.recv(1)
+                bus.recv(30)
             connection.close()
 
 
@@ -193,12 +195,12 @@ def test_twenty_thousand_frames_between_processes_arrive_all_and_in_order(start_
         sender.start()
         start.set()
         for number in range(FLOOD):
-            message = bus.recv(10)
+            message = bus.recv(60)
             assert message is not None, f"frame {number} is missing"
             assert int.from_bytes(message.data) == number
             assert message.arbitration_id == 0x100 + number % 7
         assert bus.recv(0.05) is None
-    sender.join(10)
+    sender.join(60)
     assert sender.exitcode == 0
 
 
@@ -209,7 +211,7 @@ def test_a_paced_hub_passes_on_what_the_bit_rate_allows(hub):
         start_s = time.monotonic()
         sender.start()
         for _ in range(count):
-            assert b.recv(5) is not None
+            assert b.recv(30) is not None
         took_s = time.monotonic() - start_s
         sender.join()
     # Not faster than the wire: 111 bits at least at 500 kbit/s.
