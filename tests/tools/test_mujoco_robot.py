@@ -1,0 +1,142 @@
+"""The robot in MuJoCo: it shares nothing with ours, behaves as such robots do, and what is hidden in it is there."""
+
+from __future__ import annotations
+
+import ast
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from disco_hw.log.load import load_drive
+from tools import mujoco_robot
+from tools.mujoco_robot import EFFECTS, STEPS_PER_S, TRACK_M, WHEEL_RADIUS_M, joystick, record
+
+pytest.importorskip("mujoco", reason="pip install 'disco-hw[mujoco]'")
+
+ROOT = Path(__file__).parents[2]
+SOURCE = Path(mujoco_robot.__file__)
+PER_S = STEPS_PER_S // mujoco_robot.STEPS_PER_COMMAND
+# Counts, halves and powers of ten say nothing of where they come from.
+NEUTRAL = {0.5, *map(float, range(13))} | {10.0**power for power in range(-9, 10)}
+
+
+def numbers(source: str) -> set[float]:
+    """Every number in a source, those in its texts too, without its sign."""
+    found: set[float] = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Constant) and type(node.value) in (int, float):
+            found.add(abs(float(node.value)))
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+            found |= {float(text) for text in re.findall(r"(?<![\w.])\d+\.?\d*(?:e-?\d+)?(?![\w.])", node.value)}
+    return found - NEUTRAL
+
+
+def held(left_rad_s: float, right_rad_s: float, seconds: float = 4.0) -> np.ndarray:
+    return np.tile([left_rad_s, right_rad_s], (round(seconds * PER_S), 1))
+
+
+def steady(recording: mujoco_robot.Recording) -> tuple[np.ndarray, float]:
+    """Speeds of the wheels (4,) and yaw rate over the last two seconds, rad/s."""
+    late = recording.truth_s > recording.truth_s[-1] - 2.0
+    slope = np.polyfit(recording.truth_s[late], np.c_[recording.turned, recording.truth[:, 2]][late], 1)[0]
+    return slope[:4], float(slope[4])
+
+
+def test_it_shares_no_constant_and_no_code_with_our_simulator_and_model():
+    source = SOURCE.read_text()
+    ours = [file for room in ("sim", "disco_hw/model", "disco_hw/effects") for file in (ROOT / room).rglob("*.py")]
+    assert len(ours) > 40
+    own = numbers(source)
+    both = {file.name: own & numbers(file.read_text()) for file in ours}
+    assert not {name: shared for name, shared in both.items() if shared}
+    imported = re.findall(r"^ *(?:from|import) ([\w.]+)", source, re.MULTILINE)
+    assert not [name for name in imported if name.startswith(("sim", "disco_hw.model", "disco_hw.effects", "tools"))]
+
+
+def test_constants_that_are_shared_would_be_seen():
+    assert numbers('X = 0.238\ny = \'<geom size="0.061 .1" mass="-20"/>\'') == {0.238, 0.061, 20.0}
+
+
+@pytest.mark.parametrize("wheels", [(-2.0, 2.0), (-4.0, 4.0), (1.0, 3.0), (4.5, 2.5)])
+def test_it_turns_as_skid_steer_robots_do(wheels):
+    """Effective over geometric track of published robots: 1.3 to 2.6."""
+    speeds, yaw_rate = steady(record({}, 1, held(*wheels)))
+    rolled = WHEEL_RADIUS_M * (speeds[[1, 3]].mean() - speeds[[0, 2]].mean())
+    assert 1.3 < rolled / yaw_rate / TRACK_M < 2.6
+    # The contact holds the turn up: the servos droop.
+    assert abs(speeds[1] - speeds[0]) < 0.95 * abs(wheels[1] - wheels[0])
+
+
+def test_it_stands_where_it_stands():
+    recording = record({}, 1, held(0.0, 0.0))
+    assert np.abs(recording.truth - recording.truth[0]).max() < 1e-4
+    assert np.abs(recording.turned).max() < 1e-3
+
+
+def test_wheels_settle_at_their_command_on_a_straight():
+    speeds, yaw_rate = steady(record({}, 1, held(3.0, 3.0)))
+    assert speeds == pytest.approx([3.0] * 4, rel=0.005)
+    assert abs(yaw_rate) < 1e-3
+
+
+def test_what_is_measured_is_the_truth_and_the_noise_that_is_stated():
+    recording = record({}, 3, joystick(3, 22.0))
+    seen = np.column_stack([np.interp(recording.pose_s, recording.truth_s, each) for each in recording.truth.T])
+    off = recording.pose - seen
+    off[:, 2] = np.arctan2(np.sin(off[:, 2]), np.cos(off[:, 2]))
+    assert off == pytest.approx(recording.noise, abs=1e-9)
+    stated = [mujoco_robot.POSITION_STD_M, mujoco_robot.POSITION_STD_M, mujoco_robot.YAW_STD_RAD]
+    assert off.std(axis=0) == pytest.approx(stated, rel=0.15)
+    assert np.ptp(recording.truth[:, :2]) > 1.0
+
+
+def test_a_delay_and_a_latency_are_there_to_the_step():
+    command = joystick(2, 6.0)
+    plain = record({}, 2, command)
+    steps = round(0.145 * STEPS_PER_S)
+    late = record({"command_delay": 0.145}, 2, command)
+    assert late.turned[steps:] == pytest.approx(plain.turned[:-steps], abs=1e-6)
+    assert np.abs(plain.turned).max() > 1.0
+    stamped = record({"pose_latency": 0.21}, 2, command)
+    assert stamped.pose_s == pytest.approx(plain.pose_s[: stamped.pose_s.size] + 0.21)
+    assert np.array_equal(stamped.pose, plain.pose[: stamped.pose_s.size])
+
+
+def test_each_other_effect_does_what_it_says():
+    straight, spin = held(3.0, 3.0, 3.0), held(-4.0, 4.0, 3.0)
+    plain, turning = record({}, 1, straight), record({}, 1, spin)
+    speeds, _ = steady(record({"dead_band": 0.57}, 1, straight))
+    assert speeds == pytest.approx([3.0 - 0.57] * 4, rel=0.005)
+    lagging = record({"motor_lag": 0.23}, 1, straight)
+    # What a lag costs of the way is the speed times its growth.
+    assert plain.turned[-1] - lagging.turned[-1] == pytest.approx(3.0 * (0.23 - 0.037), rel=0.03)
+    speeds, _ = steady(record({"unequal_wheels": 0.042}, 1, straight))
+    assert speeds[0] / speeds[1] == pytest.approx(1.042, rel=0.005)
+    assert record({"slope": 5.7}, 1, held(0.0, 0.0)).truth[-1, 0] > 0.01
+    assert abs(steady(record({"torque_limit": 5.7}, 1, spin))[1]) < 0.95 * abs(steady(turning)[1])
+    # Gently: at a blow the tyres slip.
+    reversals = 2.0 * np.tile(np.sin(np.arange(6.0 * PER_S) / PER_S * 2.0), (2, 1)).T
+
+    def play(hidden: mujoco_robot.Hidden) -> float:
+        """Within what the wheels' angles, from the motors, are off the way that was driven, in rad."""
+        driven = record(hidden, 1, reversals)
+        return float(np.ptp(driven.turned.mean(axis=1) - driven.truth[:, 0] / WHEEL_RADIUS_M))
+
+    assert play({"backlash": 0.11}) - play({}) == pytest.approx(0.11, rel=0.2)
+    for name in ("payload", "worn_tyre"):
+        moved = record({name: EFFECTS[name][0]}, 1, spin).truth[-1] - turning.truth[-1]
+        assert np.hypot(*moved[:2]) > 0.02
+
+
+def test_it_writes_a_log_of_ours(tmp_path, capsys):
+    path = tmp_path / "log.mcap"
+    assert mujoco_robot.main(["--hide", "slope=3", "--seed", "4", "--seconds", "9", "-o", str(path)]) == 0
+    written, driven = load_drive(path), record({"slope": 3.0}, 4, joystick(4, 9.0))
+    assert written.poses.x_m == pytest.approx(driven.pose[:, 0])
+    assert written.wheels.right_angle_rad == pytest.approx(driven.angle[:, 1])
+    assert written.commands.left_rad_s == pytest.approx(driven.command[:, 0])
+    with pytest.raises(SystemExit):
+        mujoco_robot.main(["--hide", "gravity", "-o", str(path)])
+    assert "no such effect" in capsys.readouterr().err

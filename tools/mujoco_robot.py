@@ -1,0 +1,292 @@
+"""A skid-steer robot in MuJoCo, as a truth that is not ours: `python -m tools.mujoco_robot --hide EFFECT=SIZE -o LOG`.
+
+Four wheels in contact with a floor, each on a velocity servo with a lag and a limited torque, driven by a script like a
+person with a joystick. It shares no constant and no equation with the virtual robot or with the model that the search
+for missing effects fits (`tests/tools/test_mujoco_robot.py` holds it to that): turning, slip and droop are what contact
+and servos make of them.
+
+Poses are of the base's middle and carry white noise of POSITION_STD_M on each axis and YAW_STD_RAD; encoders are those
+of the motors, the mean of a side's two, in steps of 2 pi / COUNTS_PER_TURN. Stamps are exact.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from disco_hw.log.drive import Commands, DriveLog, Gyro, Poses, Wheels, differentiate_angle
+from disco_hw.log.importing.write import write_log
+
+Array = NDArray[np.float64]
+
+STEPS_PER_S = 480
+STEPS_PER_COMMAND, STEPS_PER_READING = 12, 8
+STEPS_PER_POSE = 2 * STEPS_PER_READING
+WHEEL_RADIUS_M, TRACK_M, WHEELBASE_M = 0.133, 0.49, 0.43
+TOP_RAD_S = 5.3
+COUNTS_PER_TURN = 1470
+POSITION_STD_M, YAW_STD_RAD = 0.0062, 0.0073
+DURATION_S = 153.0
+SERVO_NM_S = 13.7
+"""Torque of a motor for each rad/s that its wheel is too slow."""
+SERVO_LAG_S = 0.037
+TORQUE_NM = 28.5
+DOWNHILL_RAD = 0.57
+"""Which way a slope falls, from the x axis."""
+
+EFFECTS = {
+    "command_delay": (0.145, "s from a command to the servos"),
+    "motor_lag": (0.23, "s, time constant of the servos in place of theirs"),
+    "dead_band": (0.57, "rad/s that dry friction of a motor takes from a wheel"),
+    "unequal_wheels": (0.042, "by so much the right wheels are larger"),
+    "pose_latency": (0.21, "s by which poses are stamped late"),
+    "slope": (5.7, "degrees that the floor falls"),
+    "payload": (14.5, "kg over the wheels of the left side"),
+    "torque_limit": (5.7, "N m of each motor"),
+    "worn_tyre": (0.37, "share that is left of the front left wheel's friction"),
+    "backlash": (0.11, "rad of play between motor and wheel"),
+}
+"""What can be hidden: a usual size, and what the size means."""
+Hidden = dict[str, float]
+
+_WHEELS = (("fl", 1, 1), ("fr", 1, -1), ("rl", -1, 1), ("rr", -1, -1))
+_MODEL = """
+<mujoco>
+  <compiler angle="radian"/>
+  <option timestep="{step_s}" integrator="implicitfast" cone="elliptic" impratio="9" gravity="{gravity}"/>
+  <worldbody>
+    <geom name="floor" type="plane" size="99 99 1" solref="0.0042 1"/>
+    <body name="base" pos="0 0 0.155"><freejoint/>
+      <geom type="box" size="0.29 0.165 0.055" mass="33" pos="0 0 0.033"/>{payload}{wheels}
+    </body>
+  </worldbody>
+  <actuator>{servos}
+  </actuator>
+</mujoco>"""
+_WHEEL = """
+      <body pos="{x} {y} -0.021">
+        <joint name="{name}" type="hinge" axis="0 1 0" damping="0.023" armature="0.105" frictionloss="{dry_nm}"/>
+        <geom type="sphere" size="0.011" mass="0.13" contype="0" conaffinity="0"/>
+        <body>{play}
+          <geom type="cylinder" size="{radius} 0.042" zaxis="0 1 0" mass="1.9" priority="1" condim="4"
+                friction="{friction} 0.0044 0.0011" solref="0.0042 1"/>
+        </body>
+      </body>"""
+_PLAY = """
+          <joint type="hinge" axis="0 1 0" limited="true" range="-{half} {half}" damping="0.0031"
+                 solreflimit="0.0042 1"/>"""
+_SERVO = """
+    <general joint="{name}" dyntype="filterexact" dynprm="{lag_s}" gainprm="{gain}" biastype="affine"
+             biasprm="0 0 -{gain}" forcerange="-{most} {most}"/>"""
+_PAYLOAD = '<geom type="box" size="0.07 0.07 0.07" mass="{}" pos="0 0.165 0.165"/>'
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """What was measured, and the truth beside it.
+
+    Times in s from the start; commands and counted angles (N, 2), left and right, in rad/s and rad; poses (P, 3) in m
+    and rad. `truth`: where the robot was at `truth_s`, (T, 3), its yaw not wrapped; `turned`: its wheels' angles there,
+    (T, 4), as in `_WHEELS`; `noise`: what was added to the poses, (P, 3).
+    """
+
+    command_s: Array
+    command: Array
+    wheel_s: Array
+    angle: Array
+    pose_s: Array
+    pose: Array
+    truth_s: Array
+    truth: Array
+    turned: Array
+    noise: Array
+    hidden: Hidden = field(default_factory=dict)
+
+    def as_drive(self) -> DriveLog:
+        """The log that a host would have: nothing of the truth."""
+        angle, segments = self.angle, np.zeros(self.wheel_s.size, dtype=np.int64)
+        speed = [differentiate_angle(self.wheel_s, angle[:, side], segments) for side in (0, 1)]
+        none = np.empty(0, dtype=np.int64)
+        zeros = [np.zeros(times.size, dtype=np.int64) for times in (self.command_s, self.pose_s)]
+        return DriveLog(
+            ("mujoco",),
+            Commands(self.command_s, self.command[:, 0], self.command[:, 1], zeros[0]),
+            Wheels(self.wheel_s, angle[:, 0], angle[:, 1], speed[0], speed[1], segments, True, False),
+            Poses(self.pose_s, self.pose[:, 0], self.pose[:, 1], self.pose[:, 2], zeros[1]),
+            Gyro(np.empty(0), np.empty(0), none),
+        )
+
+
+def mjcf(hidden: Hidden) -> str:
+    """The robot as MuJoCo's model text."""
+    tilt = math.radians(hidden.get("slope", 0.0))
+    pull = [9.81 * math.sin(tilt) * part for part in (math.cos(DOWNHILL_RAD), math.sin(DOWNHILL_RAD))]
+    wheels = "".join(
+        _WHEEL.format(
+            name=name,
+            x=front * WHEELBASE_M / 2,
+            y=left * TRACK_M / 2,
+            radius=WHEEL_RADIUS_M * (1.0 + (hidden.get("unequal_wheels", 0.0) if left < 0 else 0.0)),
+            friction=0.57 * (hidden.get("worn_tyre", 1.0) if name == "fl" else 1.0),
+            dry_nm=hidden.get("dead_band", 0.0) * SERVO_NM_S,
+            play=_PLAY.format(half=hidden["backlash"] / 2) if "backlash" in hidden else "",
+        )
+        for name, front, left in _WHEELS
+    )
+    servos = "".join(
+        _SERVO.format(
+            name=name,
+            lag_s=hidden.get("motor_lag", SERVO_LAG_S),
+            gain=SERVO_NM_S,
+            most=hidden.get("torque_limit", TORQUE_NM),
+        )
+        for name, *_ in _WHEELS
+    )
+    return _MODEL.format(
+        step_s=1.0 / STEPS_PER_S,
+        gravity=f"{pull[0]} {pull[1]} {-9.81 * math.cos(tilt)}",
+        payload=_PAYLOAD.format(hidden["payload"]) if "payload" in hidden else "",
+        wheels=wheels,
+        servos=servos,
+    )
+
+
+def joystick(seed: int, duration_s: float = DURATION_S) -> Array:
+    """Wheel-speed commands (N, 2) of a person who tries a robot out: straights, turns, arcs, weaving, pauses, stops.
+
+    A wish is held for some seconds and reached as fast as a thumb moves; the stick is never quite still.
+    """
+    rng = np.random.default_rng([seed, 4711])
+    rate = STEPS_PER_S // STEPS_PER_COMMAND
+    wishes: list[tuple[float, float, float]] = []
+    rows = np.zeros((0, 2))
+    while rows.shape[0] < duration_s * rate:
+        if not wishes:
+            wishes = _round(rng)
+        seconds, forward, turn = wishes.pop()
+        rows = np.concatenate([rows, np.tile([forward, turn], (round(seconds * rate), 1))])
+    rows = rows[: round(duration_s * rate)]
+    shaken = rows * (1.0 + 0.021 * _slow(rng, rows.shape, rate / 3))
+    stick, thumb, now = np.empty_like(shaken), rng.uniform(2.1, 4.3) / rate, np.zeros(2)
+    for k, wish in enumerate(shaken):
+        now = now + np.clip(wish - now, -thumb, thumb)
+        stick[k] = now
+    sides = np.column_stack([stick[:, 0] - stick[:, 1], stick[:, 0] + stick[:, 1]])
+    return TOP_RAD_S * np.clip(sides, -1.0, 1.0)
+
+
+def _round(rng: np.random.Generator) -> list[tuple[float, float, float]]:
+    """Half a minute or so of wishes in some order: seconds, and stick forward and to the left as shares."""
+    either = rng.choice([-1.0, 1.0], size=9)
+    wishes = [
+        (rng.uniform(2, 4), rng.uniform(0.37, 0.93), 0.0),
+        (rng.uniform(2, 3), -rng.uniform(0.27, 0.67), 0.0),
+        (rng.uniform(2, 4), 0.0, either[0] * rng.uniform(0.32, 0.57)),
+        (rng.uniform(1, 3), 0.0, -either[0] * rng.uniform(0.19, 0.44)),
+        *((rng.uniform(2, 5), rng.uniform(0.29, 0.66), side * rng.uniform(0.07, 0.29)) for side in either[1:5]),
+        (rng.uniform(2, 4), -rng.uniform(0.22, 0.43), either[5] * rng.uniform(0.07, 0.19)),
+        (rng.uniform(1, 2), rng.uniform(0.11, 0.27), either[6] * rng.uniform(0.09, 0.23)),
+    ]
+    wishes = [wishes[place] for place in rng.permutation(len(wishes))]
+    # A thumb lets go now and then, for a moment or longer.
+    rests = rng.random(len(wishes)) < 0.47
+    pauses = [[(rng.uniform(0.61, 1.9), 0.0, 0.0)] if rest else [] for rest in rests]
+    return [each for wish, pause in zip(wishes, pauses, strict=True) for each in (wish, *pause)]
+
+
+def _slow(rng: np.random.Generator, shape: tuple[int, ...], samples: float) -> Array:
+    """Noise of unit variance that stays alike for about so many samples."""
+    white = rng.standard_normal(shape)
+    keep = 1.0 - 1.0 / samples
+    for k in range(1, shape[0]):
+        white[k] = keep * white[k - 1] + math.sqrt(1.0 - keep * keep) * white[k]
+    return white
+
+
+def record(hidden: Hidden, seed: int, command: Array | None = None) -> Recording:
+    """Drive the robot with these effects hidden in it; `command`: (N, 2), in place of the joystick's.
+
+    Raises ValueError for an effect that does not exist, ImportError without mujoco.
+    """
+    import mujoco  # noqa: PLC0415  (of those who make such logs only)
+
+    unknown = set(hidden) - set(EFFECTS)
+    if unknown:
+        raise ValueError(f"no such effect: {', '.join(sorted(unknown))}; give some of {', '.join(EFFECTS)}")
+    command = joystick(seed) if command is None else command
+    model = mujoco.MjModel.from_xml_string(mjcf(hidden))
+    data = mujoco.MjData(model)
+    motors = [model.joint(name).qposadr[0] for name, *_ in _WHEELS]
+    waiting = deque([np.zeros(4)] * round(hidden.get("command_delay", 0.0) * STEPS_PER_S))
+    for _ in range(STEPS_PER_S):
+        mujoco.mj_step(model, data)
+    turned_before = data.qpos[motors].copy()
+    steps = command.shape[0] * STEPS_PER_COMMAND
+    where, turned = np.empty((steps, 3)), np.empty((steps, len(motors)))
+    for k in range(steps):
+        w, x, y, z = data.qpos[3:7]
+        where[k] = data.qpos[0], data.qpos[1], math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+        turned[k] = data.qpos[motors] - turned_before
+        left, right = command[k // STEPS_PER_COMMAND]
+        waiting.append(np.array([left, right, left, right]))
+        data.ctrl[:] = waiting.popleft()
+        mujoco.mj_step(model, data)
+    where[:, 2] = np.unwrap(where[:, 2])
+    now_s = np.arange(steps) / STEPS_PER_S
+    sides = np.column_stack([turned[:, [0, 2]].mean(axis=1), turned[:, [1, 3]].mean(axis=1)])
+    count = 2 * math.pi / COUNTS_PER_TURN
+    read, seen = np.arange(0, steps, STEPS_PER_READING), np.arange(0, steps, STEPS_PER_POSE)
+    noise = np.random.default_rng([seed, 1234]).standard_normal((seen.size, 3))
+    noise *= [POSITION_STD_M, POSITION_STD_M, YAW_STD_RAD]
+    pose = where[seen] + noise
+    pose[:, 2] = np.arctan2(np.sin(pose[:, 2]), np.cos(pose[:, 2]))
+    latency_s = hidden.get("pose_latency", 0.0)
+    inside = seen / STEPS_PER_S + latency_s <= now_s[-1]
+    return Recording(
+        command_s=np.arange(command.shape[0]) * STEPS_PER_COMMAND / STEPS_PER_S,
+        command=command,
+        wheel_s=now_s[read],
+        angle=np.round(sides[read] / count) * count,
+        pose_s=seen[inside] / STEPS_PER_S + latency_s,
+        pose=pose[inside],
+        truth_s=now_s,
+        truth=where,
+        turned=turned,
+        noise=noise[inside],
+        hidden=dict(hidden),
+    )
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="python -m tools.mujoco_robot", description=(__doc__ or "").split(":")[0])
+    about = "; ".join(f"{name}={usual} {meaning}" for name, (usual, meaning) in EFFECTS.items())
+    parser.add_argument("--hide", action="append", default=[], metavar="EFFECT[=SIZE]", help=about)
+    parser.add_argument("--seed", type=int, default=1, help="of drive and noise (1)")
+    parser.add_argument("--seconds", type=float, default=DURATION_S, help=f"length of the drive ({DURATION_S:g})")
+    parser.add_argument("-o", "--out", type=Path, required=True, help="log to write")
+    options = parser.parse_args(arguments)
+    hidden = {}
+    for text in options.hide:
+        name, _, size = text.partition("=")
+        if name not in EFFECTS:
+            parser.error(f"--hide {text}: no such effect; give some of {', '.join(EFFECTS)}")
+        try:
+            hidden[name] = float(size) if size else EFFECTS[name][0]
+        except ValueError:
+            parser.error(f"--hide {text}: {size} is no number")
+    driven = record(hidden, options.seed, joystick(options.seed, options.seconds))
+    records = write_log(driven.as_drive(), options.out, "mujoco")
+    print(f"{options.out}: {records} records")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
