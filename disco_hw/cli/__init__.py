@@ -5,6 +5,7 @@ Verbs import what they need when they run, so that `estop` and `--help` need not
 
 from __future__ import annotations
 
+import os
 import sys
 from typing import Annotated
 
@@ -14,6 +15,7 @@ from disco_hw.cli import logs, robot, virtual, watch
 from disco_hw.cli.experiment import experiment_app
 from disco_hw.cli.watch import bridge_app
 from disco_hw.errors import InputError, WorkError
+from disco_hw.processes import PARENT_VARIABLE, end_with_parent
 
 app = typer.Typer(
     name="disco-hw",
@@ -61,6 +63,9 @@ def disco_hw(
 
 def main() -> None:
     """Entry point: bad input prints one line and exits with 2, failed work with 1."""
+    parent = os.environ.pop(PARENT_VARIABLE, None)
+    if parent is not None:
+        end_with_parent(int(parent))
     try:
         app(prog_name="disco-hw")
     except InputError as error:

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import math
 import multiprocessing
+import os
+import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -16,6 +18,7 @@ from typing import Any, TypeVar
 
 from numba.core import event
 
+from disco_hw.processes import end_with_parent
 from disco_hw.runtime.pipeline import FollowTask, Off, Pipeline, Stand
 from drivers.kernel_cache import are_kernels_kept
 from drivers.types import PoseSample, Readings, WheelSample
@@ -107,7 +110,10 @@ def compiled_elsewhere(make: Callable[[], T], what: str, say: Callable[[str], No
 
 
 def _make_in_a_fork(make: Callable[[], object], what: str, say: Callable[[str], None]) -> None:
+    parent = os.getpid()
+
     def compile_all() -> None:
+        end_with_parent(parent, signal.SIGKILL)
         # Whatever is wrong is found, and said, by the caller's own attempt.
         with suppress(Exception), compile_progress(what, say):
             make()

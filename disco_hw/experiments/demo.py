@@ -8,13 +8,16 @@ from __future__ import annotations
 
 import math
 import os
+import signal
 import tempfile
+import threading
 import time
 from collections import deque
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 from rich.console import Console, Group
@@ -89,7 +92,7 @@ def run_demo(options: DemoOptions) -> CircleReport:
         raise InputError(f"--link {options.link}: not beside --device, which brings its own; leave --link out")
     options.out.mkdir(parents=True, exist_ok=True)
     console = Console(stderr=not options.show_progress)
-    with tempfile.TemporaryDirectory(prefix="disco-hw-demo-") as scratch:
+    with _ended_by_signals(), tempfile.TemporaryDirectory(prefix="disco-hw-demo-") as scratch:
         robot_file = _write_robot_file(Path(scratch), options)
         files = _Files(
             robot=robot_file,
@@ -165,6 +168,24 @@ def _write_robot_file(scratch: Path, options: DemoOptions) -> Path:
     path = scratch / "robot.toml"
     path.write_text(text, encoding="utf-8")
     return path
+
+
+@contextmanager
+def _ended_by_signals() -> Iterator[None]:
+    """Within the block, SIGTERM and SIGHUP end this process as Ctrl-C does: what was started is ended first."""
+
+    def end(number: int, _frame: FrameType | None) -> None:
+        raise SystemExit(128 + number)
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    former = {number: signal.signal(number, end) for number in (signal.SIGTERM, signal.SIGHUP)}
+    try:
+        yield
+    finally:
+        for number, handler in former.items():
+            signal.signal(number, handler)
 
 
 class _HostStallError(WorkError):

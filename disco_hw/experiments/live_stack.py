@@ -23,6 +23,7 @@ from typing import Any
 import disco_hw
 from disco_hw.daemon.client import send_request
 from disco_hw.errors import WorkError
+from disco_hw.processes import PARENT_VARIABLE
 from drivers.motor import find_driver, motor_drivers
 from drivers.pose.udp import SOURCE as UDP_POSES
 
@@ -50,13 +51,17 @@ class Child:
 
 @contextmanager
 def disco_hw_process(name: str, arguments: Sequence[str], output: Path) -> Iterator[Child]:
-    """A `disco-hw` process in a session of its own; SIGTERM at the end, SIGKILL if that is ignored."""
+    """A `disco-hw` process in a session of its own; SIGTERM at the end, SIGKILL if that is ignored.
+
+    SIGTERM too if the thread that entered is gone, whatever ended it.
+    """
     with output.open("wb") as sink:
         process = subprocess.Popen(
             [sys.executable, "-m", "disco_hw", *arguments],
             stdout=sink,
             stderr=subprocess.STDOUT,
             start_new_session=True,
+            env={**os.environ, PARENT_VARIABLE: str(os.getpid())},
         )
     try:
         yield Child(name, process, output)

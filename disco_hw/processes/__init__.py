@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import os
+import signal
 import subprocess
 import sys
 import threading
@@ -19,6 +21,23 @@ _THREAD_COUNT_VARIABLES = (
     "NUMBA_NUM_THREADS",
     "VECLIB_MAXIMUM_THREADS",
 )
+
+
+_LIBC = ctypes.CDLL(None)
+_PR_SET_PDEATHSIG = 1
+PARENT_VARIABLE = "DISCO_HW_ENDS_WITH"
+"""Of the environment: the process id of the parent with which a `disco-hw` that is started shall end."""
+
+
+def end_with_parent(parent: int, number: int = signal.SIGTERM) -> None:
+    """Have Linux send this process a signal when its parent ends, however that ends; an exec keeps it.
+
+    `parent`: its process id; if that is gone already, the signal comes at once. To be called in the child. "Ends" means
+    the thread that made the child.
+    """
+    _LIBC.prctl(_PR_SET_PDEATHSIG, number)
+    if os.getppid() != parent:
+        os.kill(os.getpid(), number)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,6 +1,7 @@
 """What is said while numba compiles, and which process compiles, with numba."""
 
 import os
+import signal
 import subprocess
 import sys
 import threading
@@ -50,6 +51,16 @@ def test_a_compilation_says_what_it_is_for_how_far_it_is_and_how_long_it_took():
     assert said == before, "what is compiled already needs no words"
 
 
+def ended(process, by):
+    """End a program while another process compiles for it; what came until all who could write had ended."""
+    with process:
+        own = process.stdout.readline().split()[0]
+        while process.stdout.readline().split()[0] == own:
+            pass
+        process.send_signal(by)
+        return process.communicate(timeout=60)[0]
+
+
 @pytest.fixture
 def start(tmp_path):
     """Starts a program that needs a kernel; returns its process, the processes that compiled, and its result."""
@@ -59,8 +70,10 @@ def start(tmp_path):
     (sources / "kernel.py").write_text(KERNEL)
     environment = dict(os.environ, NUMBA_CACHE_DIR=str(kept), PYTHONPATH=os.pathsep.join([str(sources), *sys.path]))
 
-    def run(program):
+    def run(program, ended_by=None):
         command = [sys.executable, "-c", program]
+        if ended_by is not None:
+            return ended(subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True), ended_by)
         done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=100, check=False)
         assert done.returncode == 0, done.stderr
         own, *said, result = done.stdout.splitlines()
@@ -81,3 +94,9 @@ def test_what_cannot_be_kept_is_compiled_by_the_process_itself(start):
     # A function that is in no file has no place beside it for its kernel.
     own, compiled_by, result = start(START.replace("from kernel import double", KERNEL))
     assert (compiled_by, result) == ({own}, "3.0")
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+def test_who_compiles_ends_with_the_process_that_it_compiles_for(start, number):
+    for_ever = "(double(1.5), time.sleep(3600))"
+    start("import time\n" + START.replace("double(1.5)", for_ever), ended_by=number)

@@ -1,6 +1,12 @@
 """The demonstration begins in the heading in which the robot goes round, so that it does not swing off its circle."""
 
 import math
+import os
+import re
+import select
+import signal
+import subprocess
+import sys
 from types import SimpleNamespace
 
 import pytest
@@ -47,3 +53,21 @@ def test_the_time_in_which_a_first_start_compiles_does_not_count(tmp_path):
     with pytest.raises(WorkError, match=r"not READY within 0.2 s \(compiling: 7 functions, 3 s\)"):
         Operator(tmp_path / "none", (daemon,)).wait_for("READY", 0.2)
     assert daemon.looks <= 0
+
+
+@pytest.mark.hil
+@pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGKILL, marks=pytest.mark.long)])
+def test_a_demonstration_that_is_ended_from_outside_leaves_no_process_behind(tmp_path, number):
+    command = [sys.executable, "-m", "disco_hw", "demo", "--out", str(tmp_path)]
+    scratch = tmp_path / "scratch"
+    scratch.mkdir()
+    environment = {**os.environ, "TMPDIR": str(scratch)}
+    with subprocess.Popen(command, stdout=subprocess.PIPE, env=environment, text=True) as demo:
+        began = next(found for line in demo.stdout if (found := re.search(r"robot pid (\d+), daemon pid (\d+)", line)))
+        children = [os.pidfd_open(int(pid)) for pid in began.groups()]
+        demo.send_signal(number)
+        assert demo.wait(60) in (-number, 128 + number)
+    for child in children:
+        assert select.select([child], [], [], 60.0)[0]
+        os.close(child)
+    assert number is signal.SIGKILL or not list(scratch.iterdir())
