@@ -321,7 +321,7 @@ class OverDds:
 
     def until(self, condition, also=lambda: None):
         """Say joints, and whatever `also` does, until the flags fulfil a condition; the speeds heard on the way."""
-        heard, deadline = [], time.monotonic() + 30.0
+        heard, deadline = [], time.monotonic() + 100.0
         while not condition(self.flags()):
             assert time.monotonic() < deadline
             now = msg.Header(msg.stamp_of(time.time_ns()))

@@ -376,7 +376,7 @@ def test_over_dds_the_bridges_own_odometry_and_a_localisation_make_poses_for_the
     daemon, bridge, ended = make_pose_source(port=port), Bridge(load_setup(file)), []
     thread = threading.Thread(target=bridge.run, args=(lambda: bool(ended),))
     thread.start()
-    heard, deadline = [], time.monotonic() + 30.0
+    heard, deadline = [], time.monotonic() + 100.0
     while not heard and time.monotonic() < deadline:
         now_ns = time.time_ns()
         for parent, child, x, ahead_ns in (("odom", "base_link", 2.0, 0), ("map", "odom", 3.0, 200 * MS)):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pty
+import select
 import threading
 import time
 import tty
@@ -139,7 +140,15 @@ def test_a_state_on_the_bus_from_before_the_request_confirms_nothing(tmp_path, m
         assert stop_robot(robot_file(tmp_path, tmp_path / "none")).confirmed is confirmed
 
 
-def test_a_state_on_the_serial_line_from_before_the_request_confirms_nothing(tmp_path):
+def frames_on(line, settle_s=0.1):
+    """What comes on a line until there are frames in it and nothing follows within that time."""
+    decoder, frames = FrameDecoder(), []
+    while not frames or select.select([line], [], [], settle_s)[0]:
+        frames += decoder.feed(os.read(line, 4096))
+    return frames
+
+
+def test_a_state_on_the_serial_line_from_before_the_request_confirms_nothing(tmp_path, monkeypatch):
     frame_id, data = Codec().encode("SYSTEM_STATE", **STATE)
     robot_end, host_end = pty.openpty()
     try:
@@ -147,7 +156,14 @@ def test_a_state_on_the_serial_line_from_before_the_request_confirms_nothing(tmp
         os.write(robot_end, encode_frame(frame_id, data))
         robot = robot_file(tmp_path, tmp_path / "none", **{"/tmp/disco-hw-wombot.tty": os.ttyname(host_end)})
         assert not stop_robot(robot, "serial").confirmed
-        answering = threading.Timer(0.2, os.write, (robot_end, encode_frame(frame_id, data)))
+        frames_on(robot_end)
+        monkeypatch.setattr(emergency, "_CONFIRM_S", 30.0)
+
+        def answer():
+            frames_on(robot_end, settle_s=0.0)
+            os.write(robot_end, encode_frame(frame_id, data))
+
+        answering = threading.Thread(target=answer)
         answering.start()
         assert stop_robot(robot, "serial").confirmed
         answering.join()
@@ -176,7 +192,7 @@ def test_without_a_file_that_can_be_read_the_option_says_where_the_link_is(tmp_p
     other = can.Bus(interface="virtual", channel=str(tmp_path))
     try:
         outcome = stop_robot(path, f"can:virtual:{tmp_path}")
-        heard = other.recv(1.0)
+        heard = other.recv(30.0)
     finally:
         other.shutdown()
     assert heard is not None
@@ -191,7 +207,7 @@ def test_over_a_serial_port_that_the_option_names_the_stop_goes_out(tmp_path):
     ours, theirs = pty.openpty()
     try:
         outcome = stop_robot(tmp_path / "none.toml", f"serial:{os.ttyname(theirs)}")
-        frames = FrameDecoder().feed(os.read(ours, 4096))
+        frames = frames_on(ours)
     finally:
         os.close(ours)
         os.close(theirs)

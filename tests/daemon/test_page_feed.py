@@ -36,7 +36,7 @@ def feed(tmp_path):
     made.close()
 
 
-def connected(feed, *subscribers, timeout_s=10.0):
+def connected(feed, *subscribers, timeout_s=60.0):
     """Tick until every subscriber has got something; returns the next tick's number."""
     deadline = time.monotonic() + timeout_s
     tick, waiting = 0, set(subscribers)
@@ -65,7 +65,7 @@ def test_records_arrive_whole_and_without_frames(feed, tmp_path, ticks_before):
     sent.append(records.Event(last_ns, "info", "daemon", "the last one"))
     feed.put(last_ns, sent[-1:])
     received = []
-    deadline = time.monotonic() + 5.0
+    deadline = time.monotonic() + 60.0
     while not received or received[-1][0] < last_ns:
         assert time.monotonic() < deadline
         received += subscriber.receive(0.1)
@@ -91,7 +91,7 @@ def test_the_feed_notices_that_everybody_left(feed, tmp_path):
     subscriber = FeedSubscriber(tmp_path / "control.sock.view")
     tick = connected(feed, subscriber)
     subscriber.close()
-    deadline = time.monotonic() + 5.0
+    deadline = time.monotonic() + 60.0
     while True:
         assert time.monotonic() < deadline, "it goes on publishing"
         before = feed.sent
@@ -114,20 +114,21 @@ def test_a_stopped_page_holds_up_neither_the_feed_nor_another_page(feed, tmp_pat
             feed.put(*tick_records(tick))
             tick += 1
         os.kill(process.pid, signal.SIGSTOP)
-        longest_s, seen = 0.0, 0
+        slow, seen = 0, 0
         for number in range(tick, tick + 12_000):
             now_ns, got = tick_records(number)
             begun = time.perf_counter()
             feed.put(now_ns, got)
-            longest_s = max(longest_s, time.perf_counter() - begun)
+            slow += time.perf_counter() - begun > 0.02
             if number % 20 == 0:
                 seen += len(other.receive(0.001))
-        assert longest_s < 1.0, "it waited"
+        # Once nothing more fits into the stopped page's socket each one would wait; a host that pauses makes few wait.
+        assert slow < 1000, "it waited"
         assert feed.refused == 0
-        seen += len(other.receive(0.2))
+        seen += len(other.receive(2.0))
         assert seen > 10_000, "the other page starved"
         os.kill(process.pid, signal.SIGCONT)
-        tick, deadline = tick + 12_000, time.monotonic() + 10.0
+        tick, deadline = tick + 12_000, time.monotonic() + 60.0
         missed = 0
         while missed == 0:
             assert time.monotonic() < deadline, "the stopped page does not know that it missed something"
@@ -156,7 +157,7 @@ def test_garbage_is_counted_by_the_subscriber(tmp_path):
     socket = context.socket(zmq.PUB)
     socket.bind(f"ipc://{tmp_path}/feed")
     subscriber = FeedSubscriber(tmp_path / "feed")
-    deadline = time.monotonic() + 5.0
+    deadline = time.monotonic() + 60.0
     while subscriber.malformed < 3:
         assert time.monotonic() < deadline
         for garbage in (b"", b"\xc1", b"\x93\x01\x02\x91\x92\x63\xc0"):

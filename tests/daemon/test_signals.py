@@ -12,7 +12,6 @@ STOP_SIGNALS = [signal.SIGTERM, signal.SIGINT, signal.SIGHUP]
 DAEMON = """
 import signal
 import sys
-import time
 from disco_hw.daemon.loop import MonotonicClock
 from disco_hw.daemon.loop import Loop
 from disco_hw.daemon.signals import StopSignals
@@ -20,7 +19,8 @@ from disco_hw.daemon.signals import StopPath
 
 def stop_wheels():
     print("stopping", flush=True)
-    time.sleep(0.3)
+    # Until the test has done what it does meanwhile.
+    sys.stdin.readline()
     print("wheels stand", flush=True)
 
 # Whoever runs these tests may have told its children to ignore the signal, as nohup does.
@@ -43,7 +43,7 @@ print(signals.received.name, flush=True)
 def daemon(hangup="SIG_DFL"):
     """A loop that runs in a process of its own, started with this disposition of SIGHUP."""
     command = [sys.executable, "-c", DAEMON, hangup]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as started:
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as started:
         try:
             assert started.stdout.readline() == "running\n"
             yield started
@@ -61,14 +61,14 @@ def test_under_nohup_the_loop_goes_on_after_a_hangup():
     with daemon("SIG_IGN") as process:
         process.send_signal(signal.SIGHUP)
         process.send_signal(signal.SIGTERM)
-        output, _ = process.communicate(timeout=10)
+        output, _ = process.communicate(timeout=60)
         assert output.splitlines()[-1] == "SIGTERM"
 
 
 @pytest.mark.parametrize("number", STOP_SIGNALS)
 def test_a_signal_stops_the_loop_and_the_stop_path_runs_in_order(process, number):
     process.send_signal(number)
-    output, _ = process.communicate(timeout=10)
+    output, _ = process.communicate(timeout=60)
     assert output.splitlines() == ["stopping", "wheels stand", "log closed", number.name]
     assert process.returncode == 0
 
@@ -78,7 +78,7 @@ def test_a_second_signal_does_not_break_the_stop_path_off(process, second):
     process.send_signal(signal.SIGTERM)
     assert process.stdout.readline() == "stopping\n"
     process.send_signal(second)
-    output, _ = process.communicate(timeout=10)
+    output, _ = process.communicate(timeout=60)
     assert output.splitlines() == ["wheels stand", "log closed", "SIGTERM"]
     assert process.returncode == 0
 

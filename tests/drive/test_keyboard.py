@@ -7,7 +7,6 @@ import os
 import select
 import termios
 import threading
-import time
 
 import pytest
 
@@ -16,6 +15,7 @@ from disco_hw.drive.keyboard import Keyboard, KeyHold
 from disco_hw.drive.source import RobotView
 from disco_hw.errors import InputError
 from disco_hw.runtime.states import State
+from tests.drivers.waiting import wait_until
 
 MS = 1_000_000
 VIEW = RobotView(State.READY, driving=False)
@@ -28,7 +28,10 @@ class Terminal:
         self.master, self.slave = os.openpty()
         self.before = termios.tcgetattr(self.slave)
         os.write(self.master, b"w" * 50)
-        assert os.read(self.master, 100) == b"w" * 50, "a terminal echoes"
+        echoed = b""
+        while len(echoed) < 50:
+            echoed += os.read(self.master, 100)
+        assert echoed == b"w" * 50, "a terminal echoes"
         self.clock = SimulatedClock()
         self.keyboard = Keyboard(self.slave, KeyHold(8.0), self.clock)
         self.poll(1000)
@@ -42,15 +45,13 @@ class Terminal:
 
     def type(self, keys):
         os.write(self.master, keys)
-        self.arrived()
+        self.arrived(len(keys))
         return self.poll()
 
-    def arrived(self):
-        """Wait for the reader, which lives in real time."""
-        deadline = time.monotonic() + 5.0
-        while not self.keyboard._arrived:
-            assert time.monotonic() < deadline
-            time.sleep(0.001)
+    def arrived(self, count):
+        """Wait until the reader, which lives in real time, has read so many bytes; 0: the end of the terminal."""
+        arrived = self.keyboard._arrived
+        wait_until(lambda: arrived and sum(len(data) for _, data in arrived) >= count)
 
     def close(self):
         self.keyboard.close()
@@ -117,7 +118,7 @@ def test_keys_count_from_when_they_came_not_from_when_they_are_polled(terminal):
     for _ in range(5):
         terminal.type(b"w")
     os.write(terminal.master, b"w")
-    terminal.arrived()
+    terminal.arrived(1)
     # The loop was held up for 300 ms with a key waiting.
     terminal.clock.advance_ns(300 * MS)
     assert not terminal.poll().deadman
@@ -127,7 +128,7 @@ def test_a_terminal_that_closes_is_a_device_that_is_gone(terminal):
     for _ in range(5):
         terminal.type(b"w")
     os.close(terminal.master)
-    terminal.arrived()
+    terminal.arrived(0)
     assert terminal.poll() is None
     assert terminal.keyboard.ended == "the terminal has closed"
     assert not terminal.keyboard.completed

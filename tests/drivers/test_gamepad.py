@@ -6,7 +6,6 @@ import errno
 import os
 import struct
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -20,6 +19,7 @@ from evdev.device import AbsInfo
 from evdev.eventio import EventIO
 
 from drivers.gamepad import Gamepad, GamepadError, GamepadMapping, open_gamepad
+from tests.drivers.waiting import wait_until
 
 EVENT = struct.Struct("@llHHi")
 LOW, HIGH = -32768, 32767
@@ -180,19 +180,13 @@ def test_a_device_that_goes_while_it_is_looked_at_is_passed_over(monkeypatch):
 def test_a_device_of_the_kernel_is_found_read_and_missed():
     axes = [(code, AbsInfo(0, LOW, HIGH, 0, 0, 0)) for code in (ecodes.ABS_X, ecodes.ABS_Y)]
     made = evdev.UInput({ecodes.EV_ABS: axes, ecodes.EV_KEY: [ecodes.BTN_TL, ecodes.BTN_SOUTH]}, name="made pad")
-    deadline = time.monotonic() + 5.0
-    while not (made.device and Path(made.device.path).exists()):
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
+    wait_until(lambda: made.device and Path(made.device.path).exists())
     pad = open_gamepad(GamepadMapping(), 0, made.device.path)
     made.write(*stick(ecodes.ABS_Y, LOW))
     made.write(*button(1))
     made.syn()
-    time.sleep(0.1)
-    state = pad.poll(1)
-    assert state.deadman
+    state = wait_until(lambda: (polled := pad.poll(1)) and polled.deadman and polled)
     assert state.forward == pytest.approx(1.0)
     made.close()
-    time.sleep(0.1)
-    assert pad.poll(2) is None
+    wait_until(lambda: pad.poll(2) is None)
     pad.close()

@@ -33,6 +33,7 @@ from sim.plant_parameters import PlantParameters
 from sim.process import PoseSender
 from sim.vendor_robot import VendorRobot
 from sim.virtual_robot import STEP_US, VirtualRobot
+from tests.drivers.waiting import free_port
 
 SHIPPED = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
 
@@ -232,12 +233,6 @@ class Person:
         pass
 
 
-def free_port():
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened:
-        opened.bind(("127.0.0.1", 0))
-        return opened.getsockname()[1]
-
-
 def robot_file(directory, driver=None):
     """The shipped robot with poses by datagrams and another controller."""
     text = SHIPPED.read_text(encoding="utf-8").replace(
@@ -246,7 +241,7 @@ def robot_file(directory, driver=None):
     if driver not in (None, "reference"):
         text = with_device(text, driver)
     else:
-        text += f'\n[pose]\nsource = "udp"\nport = {free_port()}\n'
+        text += f'\n[pose]\nsource = "udp"\nport = {free_port(socket.SOCK_DGRAM)}\n'
     path = directory / "robot.toml"
     path.write_text(text, encoding="utf-8")
     return path

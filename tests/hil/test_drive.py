@@ -99,10 +99,13 @@ def typing(master, key):
         process.wait()
 
 
-def assert_stands_in_time(t_s, wheels, silent_s):
-    """The wheels stand 200 ms plus the deceleration after the last input, and for the rest of the run."""
+def assert_stands_in_time(t_s, wheels, before_s, silent_s):
+    """The wheels stand 200 ms plus the deceleration after the last input, and for the rest of the run.
+
+    The input fell silent at some time between `before_s` and `silent_s`.
+    """
     size = np.abs(wheels).max(axis=1)
-    fastest = size[(t_s > silent_s - 0.2) & (t_s <= silent_s)].max()
+    fastest = size[(t_s > before_s - 0.2) & (t_s <= silent_s)].max()
     assert fastest > 1.5, "the robot was not driving when the input fell silent"
     by_s = silent_s + INPUT_LIMIT_NS * 1e-9 + fastest / DECELERATION_RAD_S2 + MOTOR_SETTLING_S + MARGIN_S
     assert t_s[-1] > by_s + 0.3, "the truth ends too early to tell"
@@ -150,6 +153,7 @@ def test_a_key_held_drives_and_a_frozen_typist_stops_the_robot(tmp_path):
             status = made.operator.wait_until("driving", lambda s: s["drive"]["driving"], 10.0)
             assert status["source"] == "manual"
             made.operator.wait_until("at speed", lambda s: min(s["wheels"]) > 2.5, 5.0)
+            before_s = time.monotonic()
             os.kill(typist.pid, signal.SIGSTOP)
             frozen_s = time.monotonic()
             made.operator.wait_for("READY", 5.0)
@@ -165,7 +169,7 @@ def test_a_key_held_drives_and_a_frozen_typist_stops_the_robot(tmp_path):
         t_s, wheels = made.truth()
     os.close(master)
     again_s = t_s[np.flatnonzero((t_s > frozen_s + 0.2) & (wheels.max(axis=1) < -0.2))[0]]
-    assert_stands_in_time(t_s[t_s < again_s - 0.1], wheels[t_s < again_s - 0.1], frozen_s)
+    assert_stands_in_time(t_s[t_s < again_s - 0.1], wheels[t_s < again_s - 0.1], before_s, frozen_s)
     assert np.abs(wheels[-1]).max() < STILL_RAD_S
 
 
@@ -177,12 +181,13 @@ def test_a_terminal_that_closes_stops_the_robot_and_ends(tmp_path):
         made.ready()
         with typing(master, "w"):
             made.operator.wait_until("at speed", lambda s: s["drive"]["driving"] and min(s["wheels"]) > 2.5, 10.0)
-        closed_s = time.monotonic()
+        before_s = time.monotonic()
         os.close(master)
+        closed_s = time.monotonic()
         assert process.wait(10.0) == 1
         time.sleep(1.0)
         t_s, wheels = made.truth()
-    assert_stands_in_time(t_s, wheels, closed_s)
+    assert_stands_in_time(t_s, wheels, before_s, closed_s)
     with open_log(made.log) as log:
         last = log.columns("/daemon/state")["state"][-1]
     assert last == "READY"

@@ -3,7 +3,6 @@
 import os
 import shutil
 import signal
-import socket
 import time
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
@@ -17,6 +16,7 @@ from disco_hw.experiments.live_stack import disco_hw_process, running_stack, sta
 from disco_hw.log.reader import open_log
 from disco_hw.runtime.robot_setup import load_setup
 from disco_hw.viewer import scene
+from tests.drivers.waiting import free_port
 from tests.hil.stack import DECELERATION_RAD_S2, STILL_RAD_S
 from tests.hil.test_drive import Bench
 from tests.viewer.camera import project, screenshot, shows
@@ -38,15 +38,10 @@ def address(output: Path, timeout_s: float = 60.0) -> str:
     raise AssertionError(f"no page: {output.read_text()}")
 
 
-def free_port() -> str:
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        return str(taken.getsockname()[1])
-
-
 @contextmanager
 def page_of(robot_file, output):
     """A live page in a process of its own, and its address."""
-    view = ["view", "--live", "--port", free_port(), "--robot", str(robot_file)]
+    view = ["view", "--live", "--port", str(free_port()), "--robot", str(robot_file)]
     with disco_hw_process("page", view, output) as page:
         yield page.process, address(output)
 
@@ -203,7 +198,7 @@ def test_a_request_that_the_page_died_with_is_said_to_have_no_answer(tmp_path):
 def test_the_pad_drives_while_it_is_held_and_seen(tmp_path):
     with chromium() as browser, ExitStack() as stack, (tmp_path / "drive.txt").open("wb") as output:
         bench = Bench(tmp_path, stack)
-        drive = bench.drive("--page", "--port", free_port(), stdout=output, stderr=output)
+        drive = bench.drive("--page", "--port", str(free_port()), stdout=output, stderr=output)
         url = address(tmp_path / "drive.txt")
         with opened(browser, url, 700, 620, scene=False) as tab:
             pad = tab.get_by_label("Pad: hold")

@@ -34,7 +34,7 @@ def recording(path, **changes):
     return RecordingSettings(**(given | changes))
 
 
-def wait_until(condition, timeout_s=15.0):
+def wait_until(condition, timeout_s=60.0):
     deadline = time.monotonic() + timeout_s
     while not condition():
         assert time.monotonic() < deadline, "waited in vain"

@@ -53,7 +53,7 @@ def test_what_is_put_is_in_the_log(path):
     assert stats.bytes == size(path)
 
 
-def kept_going(recorder, first, until, period_s=0.005, timeout_s=20.0):
+def kept_going(recorder, first, until, period_s=0.005, timeout_s=60.0):
     """Put ticks numbered from `first`, and look after the recorder, until `until(stats)`; returns the next number."""
     deadline = time.monotonic() + timeout_s
     while True:
@@ -76,8 +76,8 @@ def test_a_stopped_writer_is_told_within_a_second_replaced_and_nothing_is_lost(p
     recorder = ProcessRecorder(recording(path))
     following = kept_going(recorder, 1, lambda stats: stats.delivered_ticks > 5)
     stopped = recorder.writer_pid
+    polls_s = [time.monotonic()]
     os.kill(stopped, signal.SIGSTOP)
-    polls_s = []
     following = kept_going(recorder, following, lambda stats: polls_s.append(time.monotonic()) or stats.fault)
     (told,) = recorder.news()
     silent_s = float(re.search(r"the log writer has not answered for (\d+\.\d) s", told)[1])
@@ -342,7 +342,8 @@ def test_recorders_that_need_no_process():
 
 
 def test_the_wall_offset_is_that_of_the_wall_clock():
-    assert abs(time.monotonic_ns() + wall_offset_ns() - time.time_ns()) < 10**8
+    # Of several looks the best: between the clocks of one the host may pause.
+    assert min(abs(time.monotonic_ns() + wall_offset_ns() - time.time_ns()) for _ in range(20)) < 10**8
 
 
 def test_a_relative_path_works(tmp_path, monkeypatch):

@@ -122,10 +122,10 @@ def test_a_page_is_served_until_it_is_told_to_end(log_file):
         assert told["ticks"] == 200
         # As a browser does: the address carries the token, a cookie keeps it.
         browser = urllib.request.build_opener(urllib.request.HTTPCookieProcessor())
-        with browser.open(told["page"], timeout=10) as answer:
+        with browser.open(told["page"], timeout=60) as answer:
             assert answer.status == 200
         process.send_signal(signal.SIGTERM)
-        assert process.wait(10) == 0
+        assert process.wait(60) == 0
         assert process.stdout.read() == ""
     finally:
         process.kill()

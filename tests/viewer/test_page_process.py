@@ -3,12 +3,12 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
 
 from disco_hw.viewer.page_process import page_beside
+from tests.drivers.waiting import free_port, wait_until
 from tools.viewer_run import ROBOT_FILE
 
 _PARENT = """
@@ -19,18 +19,6 @@ with page_beside(Path(sys.argv[1]), None, "127.0.0.1", int(sys.argv[2])) as page
     print(page.pid, flush=True)
     time.sleep(60)
 """
-
-
-def free_port():
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        return taken.getsockname()[1]
-
-
-def wait_until(condition, timeout_s=20.0):
-    deadline = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < deadline, "waited in vain"
-        time.sleep(0.02)
 
 
 def listens(port):
@@ -46,7 +34,7 @@ def gone(pid):
 def test_the_page_lives_as_long_as_the_block():
     port = free_port()
     with page_beside(ROBOT_FILE, None, "127.0.0.1", port) as page:
-        wait_until(lambda: listens(port))
+        wait_until(lambda: listens(port), 60.0)
         assert os.getsid(page.pid) == page.pid
     assert page.returncode == 0
     assert not listens(port)
@@ -58,21 +46,21 @@ def test_the_page_ends_when_its_parent_is_killed():
         [sys.executable, "-c", _PARENT, str(ROBOT_FILE), str(port)], stdout=subprocess.PIPE, text=True
     )
     pid = int(parent.stdout.readline())
-    wait_until(lambda: listens(port))
+    wait_until(lambda: listens(port), 60.0)
     parent.send_signal(signal.SIGKILL)
     parent.wait()
-    wait_until(lambda: gone(pid))
+    wait_until(lambda: gone(pid), 60.0)
 
 
 def test_a_page_that_cannot_start_does_not_matter(tmp_path, capfd):
     with page_beside(tmp_path / "none.toml", None, "127.0.0.1", 0) as page:
-        assert page.wait(20) == 2
+        assert page.wait(60) == 2
     assert "none.toml" in capfd.readouterr().err
 
 
 def test_the_link_that_the_daemon_was_given_is_the_pages_too(capfd):
     with page_beside(ROBOT_FILE, None, "127.0.0.1", 0, "carrier pigeon") as page:
-        assert page.wait(20) == 2
+        assert page.wait(60) == 2
     assert "--link carrier pigeon" in capfd.readouterr().err
 
 
@@ -80,7 +68,9 @@ def test_what_the_page_says_is_none_of_the_blocks_output(capfd):
     port = free_port()
     said = []
     with page_beside(ROBOT_FILE, None, "127.0.0.1", port):
-        wait_until(lambda: said.append(capfd.readouterr()) or f":{port}/" in "".join(it.out + it.err for it in said))
+        wait_until(
+            lambda: said.append(capfd.readouterr()) or f":{port}/" in "".join(it.out + it.err for it in said), 60.0
+        )
     assert not any(it.out for it in said)
 
 
@@ -88,7 +78,7 @@ def test_a_page_that_hangs_is_ended_all_the_same():
     port = free_port()
     with page_beside(ROBOT_FILE, None, "127.0.0.1", port) as page:
         # From here on it would end in order.
-        wait_until(lambda: listens(port))
+        wait_until(lambda: listens(port), 60.0)
         os.kill(page.pid, signal.SIGSTOP)
     assert page.returncode == -signal.SIGKILL
 

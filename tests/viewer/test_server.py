@@ -34,7 +34,7 @@ def cookie_of(page):
 
 
 def get(port, path="/", host=None, **headers):
-    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=60)
     connection.request("GET", path, headers={"Host": host or f"127.0.0.1:{port}", **headers})
     response = connection.getresponse()
     body = response.read()
@@ -44,7 +44,7 @@ def get(port, path="/", host=None, **headers):
 
 def upgrade(port, origin, headers=None):
     address = f"ws://127.0.0.1:{port}/"
-    return connect(address, origin=origin, subprotocols=[SUBPROTOCOL], additional_headers=headers, open_timeout=10)
+    return connect(address, origin=origin, subprotocols=[SUBPROTOCOL], additional_headers=headers, open_timeout=60)
 
 
 def port_of(page):
@@ -59,7 +59,7 @@ def test_the_own_page_is_served_and_may_connect(page):
     for name in ("127.0.0.1", "localhost"):
         assert get(port, host=f"{name}:{port}", **cookie_of(page))[0].status == 200
     with upgrade(port, f"http://127.0.0.1:{port}", cookie_of(page)) as client:
-        assert client.recv(timeout=10)
+        assert client.recv(timeout=60)
 
 
 @pytest.mark.parametrize("path", ["/", "/index.html", "/desk", "/?token=", "/?token=wrong", "/instance/../"])
@@ -73,7 +73,7 @@ def test_another_user_of_this_machine_gets_nothing_without_the_token(page, path)
         with pytest.raises(InvalidStatus) as refused:
             connect(
                 f"ws://127.0.0.1:{port}{path}", origin=f"http://127.0.0.1:{port}", subprotocols=[SUBPROTOCOL],
-                additional_headers=headers, open_timeout=10,
+                additional_headers=headers, open_timeout=60,
             )  # fmt: skip
         assert refused.value.response.status_code == 403
 
@@ -92,8 +92,8 @@ def test_the_scene_gets_in_by_its_address_as_its_name_has_no_cookie(page):
     port, query = port_of(page), urlsplit(page.url).query
     assert get(port, f"/index.html?{query}", host=f"localhost:{port}")[0].status == 200
     address = f"ws://127.0.0.1:{port}/?{query}"
-    with connect(address, origin=f"http://127.0.0.1:{port}", subprotocols=[SUBPROTOCOL], open_timeout=10) as client:
-        assert client.recv(timeout=10)
+    with connect(address, origin=f"http://127.0.0.1:{port}", subprotocols=[SUBPROTOCOL], open_timeout=60) as client:
+        assert client.recv(timeout=60)
 
 
 def test_nobody_else_can_listen_where_a_browser_looks_for_localhost_first(page):
@@ -155,7 +155,7 @@ def test_a_client_that_asks_for_a_public_tunnel_gets_none(page, monkeypatch):
     monkeypatch.setattr(viser._viser, "ViserTunnel", lambda *arguments, **named: dug.append(arguments))
     port = port_of(page)
     with upgrade(port, f"http://127.0.0.1:{port}", cookie_of(page)) as client:
-        client.recv(timeout=10)
+        client.recv(timeout=60)
         client.send(msgspec.msgpack.encode({"type": "ShareUrlRequest"}))
         # Whatever it makes of the request happens in a thread of its own.
         time.sleep(0.5)
@@ -200,7 +200,7 @@ def test_another_address_needs_its_token():
         with pytest.raises(InvalidStatus), upgrade(port, "http://evil.example", headers={"Cookie": pair}):
             pass
         with upgrade(port, own, headers={"Cookie": pair}) as client:
-            assert client.recv(timeout=10)
+            assert client.recv(timeout=60)
 
 
 def test_two_pages_of_one_host_do_not_take_each_others_token():

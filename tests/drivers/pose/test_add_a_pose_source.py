@@ -14,6 +14,7 @@ from disco_hw.errors import InputError
 from drivers.pose import DEFAULT, PoseSourceError, make_pose_source, pose_sources
 from drivers.types import PoseSample
 from tests.config.test_robot import GOOD
+from tests.drivers.waiting import free_port
 
 ROOT = Path(__file__).parents[3]
 PAGE = ROOT / "docs/add-a-pose-source.md"
@@ -33,9 +34,7 @@ def _in_the_folder(tmp_path, monkeypatch):
 
 @pytest.fixture
 def port():
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
-        free.bind(("127.0.0.1", 0))
-        return free.getsockname()[1]
+    return free_port(socket.SOCK_DGRAM)
 
 
 def robot_toml(folder, section):

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from drivers.pose import PoseSourceError, make_pose_source
 from drivers.pose.natnet import VERSIONS, parse_frame, plane_pose
 from tests.drivers.pose.test_nmea import until
+from tests.drivers.waiting import free_port
 
 # Turned by 0.7 rad about Motive's upward axis y, at 1.5 m along x and 2 m towards the viewer (z).
 TURNED = (0.0, math.sin(0.35), 0.0, math.cos(0.35))
@@ -148,9 +149,7 @@ class Motive:
 
 @pytest.fixture
 def port():
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
-        free.bind(("127.0.0.1", 0))
-        return free.getsockname()[1]
+    return free_port(socket.SOCK_DGRAM)
 
 
 def test_by_multicast_with_the_exposures_age_and_a_lost_body(port):

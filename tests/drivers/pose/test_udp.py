@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 
 from drivers.pose import PoseSourceError, make_pose_source
 from drivers.pose.udp import pose_of
+from tests.drivers.waiting import free_port
 
 NOW_NS = 100_000_000_000
 POSE = {"x_m": 1.0, "y_m": -2.0, "yaw_rad": 0.5, "position_std_m": 0.01, "yaw_std_rad": 0.02}
@@ -22,9 +23,7 @@ POSE = {"x_m": 1.0, "y_m": -2.0, "yaw_rad": 0.5, "position_std_m": 0.01, "yaw_st
 
 @pytest.fixture
 def port():
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened:
-        opened.bind(("127.0.0.1", 0))
-        return opened.getsockname()[1]
+    return free_port(socket.SOCK_DGRAM)
 
 
 @pytest.mark.parametrize("encode", [msgspec.json.encode, msgspec.msgpack.encode], ids=["json", "msgpack"])

@@ -37,7 +37,7 @@ from drivers.transport.reconnecting import (
 )
 from drivers.types import Frame, LinkState, OutgoingFrame
 from tests.drivers.transport.pseudo_terminal import PseudoTerminal
-from tests.drivers.waiting import collect, median_send_s, outgoing, send, wait_until
+from tests.drivers.waiting import collect, free_port, median_send_s, outgoing, send, wait_until
 
 
 @pytest.mark.parametrize(
@@ -296,10 +296,8 @@ MULTICAST_GROUP = "ff11::6469:7363"
 
 
 def test_over_udp_multicast_own_frames_do_not_come_back_and_another_hosts_do():
-    # A port that the system says is free, so that runs side by side do not hear each other.
-    with socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as free:
-        free.bind(("::", 0))
-        port = free.getsockname()[1]
+    # A free port, so that runs side by side do not hear each other.
+    port = free_port(socket.SOCK_DGRAM)
     transport = opened("udp_multicast", MULTICAST_GROUP, port=port, hop_limit=0)
     other = can.Bus(interface="udp_multicast", channel=MULTICAST_GROUP, port=port, hop_limit=0, ignore_config=True)
     try:
