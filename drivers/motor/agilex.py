@@ -355,10 +355,8 @@ class AgilexDriver:
             self._events.append("the base fell silent: waiting for it")
 
     def _status(self, t_ns: int) -> RobotStatus:
-        names = {DriverState.ARMED: "ARMED", DriverState.FAULT: "FAULT", DriverState.STOPPING: "STOPPING"}
         at_rest = self._stands and self._mode != protocol.CAN_MODE
-        names[DriverState.ESTOP] = "ESTOP" if at_rest or self._vehicle == protocol.EMERGENCY_STOP else "STOPPING"
-        return parts.status(t_ns, names.get(self.state, "STANDBY"))
+        return parts.status(t_ns, self.state, at_rest or self._vehicle == protocol.EMERGENCY_STOP)
 
     def _give_up(self, why: str) -> None:
         self._wanted, self._stage, self._stage_ns, self._note = Request.STANDBY, Stage.REST, None, why

@@ -502,11 +502,7 @@ class OdriveDriver:
             self._count("unknown_id")
 
     def _status(self, t_ns: int) -> RobotStatus:
-        names = {DriverState.ARMED: "ARMED", DriverState.FAULT: "FAULT", DriverState.ESTOP: "ESTOP"}
-        names[DriverState.STOPPING] = "STOPPING"
-        return parts.status(
-            t_ns, "ESTOP" if self._all_in_estop else names.get(self.state, "STANDBY").replace("ESTOP", "STOPPING")
-        )
+        return parts.status(t_ns, self.state, self._all_in_estop)
 
     @property
     def _all_in_estop(self) -> bool:

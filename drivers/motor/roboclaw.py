@@ -485,10 +485,8 @@ class RoboclawDriver:
                 self._events.append(f"board {board.address} fell silent: asking anew")
 
     def _status(self, t_ns: int) -> RobotStatus:
-        names = {DriverState.ARMED: "ARMED", DriverState.FAULT: "FAULT", DriverState.STOPPING: "STOPPING"}
         at_rest = self._stands and all(board.stopped for board in self._all)
-        names[DriverState.ESTOP] = "ESTOP" if at_rest else "STOPPING"
-        return parts.status(t_ns, names.get(self.state, "STANDBY"))
+        return parts.status(t_ns, self.state, at_rest)
 
     def _begin_braking(self, note: str) -> None:
         self._wanted, self._note = Request.STANDBY, note

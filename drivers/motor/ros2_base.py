@@ -348,10 +348,8 @@ class Ros2BaseDriver:
             self._events.append("the bridge fell silent: waiting for it")
 
     def _status(self, t_ns: int) -> RobotStatus:
-        names = {DriverState.ARMED: "ARMED", DriverState.FAULT: "FAULT", DriverState.STOPPING: "STOPPING"}
         at_rest = self._flags & wire.LATCHED and self._settings.stands(*self._wheel_speeds)
-        names[DriverState.ESTOP] = "ESTOP" if at_rest or self._flags & wire.BUTTON else "STOPPING"
-        return parts.status(t_ns, names.get(self.state, "STANDBY"))
+        return parts.status(t_ns, self.state, bool(at_rest or self._flags & wire.BUTTON))
 
     def _give_up(self, why: str) -> None:
         self._wanted, self._stage, self._stage_ns, self._note = Request.STANDBY, Stage.REST, None, why

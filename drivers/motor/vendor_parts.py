@@ -1,13 +1,16 @@
-"""What the drivers of vendors' controllers share: stages, the ramp of a stop, and how frames and ids are written."""
+"""What the drivers of vendors' controllers share beside the permit to move: odometers, frames and ids as written."""
 
 from __future__ import annotations
 
 import enum
 import math
-from collections.abc import Sequence
+import struct
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import Any, Literal
 
-from drivers.types import Frame, OutgoingFrame, RobotStatus, WheelCommand
+from drivers.types import DriverState, DriverStats, Frame, OutgoingFrame, RobotStatus, WheelCommand, WheelSample
 
 _FRAME_LIFE_NS = 50_000_000
 _ESTOP_LIFE_NS = 1_000_000_000
@@ -50,6 +53,83 @@ class Attention:
         return self._looked_ns - max(heard_ns, self._since_ns)
 
 
+@dataclass(slots=True)
+class Odometer:
+    """What one motor has turned since the driver began, in the controller's counts.
+
+    `total` goes on over a restart of the controller; `speed` in counts/s carries it on from `t_ns`.
+    """
+
+    total: float = 0.0
+    speed: float = 0.0
+    t_ns: int = 0
+    last: float | None = None
+    is_new: bool = False
+
+    def take(self, count: float, t_ns: int, most: float) -> bool:
+        """Whether the count is within `most` of the one before, and taken; if not, it goes on from there."""
+        moved = 0.0 if self.last is None else count - self.last
+        plausible = abs(moved) <= most
+        self.total += moved if plausible else 0.0
+        self.last, self.t_ns, self.is_new = count, t_ns, True
+        return plausible
+
+    def take_wrapping(self, count: int, t_ns: int, most: float) -> bool:
+        """As `take`, of a count of 32 bits."""
+        last = count if self.last is None else int(self.last)
+        moved = (count - last + 2**31) % 2**32 - 2**31
+        self.last = None if self.last is None else count - moved
+        return self.take(count, t_ns, most)
+
+    def begin_anew(self) -> None:
+        """The controller may have restarted: the next count is compared with none before."""
+        self.last, self.is_new = None, False
+
+
+def wheel_sample(
+    t_ns: int, sides: Sequence[Sequence[Odometer]], direction: tuple[int, int], rad_per_count: float
+) -> WheelSample:
+    """The wheels of both sides, each the mean of its motors; what was counted earlier is carried on to `t_ns`."""
+    angles, speeds = [], []
+    for side, sign in zip(sides, direction, strict=True):
+        turned = [each.total + each.speed * (t_ns - each.t_ns) * 1e-9 for each in side]
+        angles.append(sign * rad_per_count * sum(turned) / len(side))
+        speeds.append(sign * rad_per_count * sum(each.speed for each in side) / len(side))
+        for each in side:
+            each.is_new = False
+    return WheelSample(t_ns, t_ns, angles[0], angles[1], speeds[0], speeds[1])
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """A message: its number, its bytes by `struct` without the byte order, and the names of the fields."""
+
+    command: int
+    order: str
+    body: str
+    fields: tuple[str, ...] = ()
+
+    @property
+    def length(self) -> int:
+        """Of the fields in bytes."""
+        return struct.calcsize(self.order + self.body)
+
+    def pack(self, *values: float) -> bytes:
+        """The bytes of the fields."""
+        return struct.pack(self.order + self.body, *values)
+
+    def unpack(self, data: bytes) -> dict[str, Any]:
+        """The fields by name, of bytes that begin with them."""
+        return dict(zip(self.fields, struct.unpack_from(self.order + self.body, data), strict=True))
+
+
+def layouts(order: str, *rows: tuple[str, int, str, str]) -> Mapping[str, Layout]:
+    """By name: each row has name, number, body and the fields' names."""
+    return MappingProxyType(
+        {name: Layout(command, order, body, tuple(names.split())) for name, command, body, names in rows}
+    )
+
+
 def check_command(command: WheelCommand | None) -> None:
     """Raise ValueError for a command that is not finite or valid for no time."""
     if command is not None and not (
@@ -70,16 +150,26 @@ def outgoing(now_ns: int, *frames: Frame, life_ns: int = _FRAME_LIFE_NS) -> tupl
     return tuple(OutgoingFrame(frame, now_ns + life_ns, _RANK) for frame in frames)
 
 
+def commanding(now_ns: int, command: WheelCommand, *frames: Frame) -> tuple[OutgoingFrame, ...]:
+    """The frames of a command: half of its validity may pass on the way."""
+    return outgoing(now_ns, *frames, life_ns=round(0.5e9 * command.valid_for_s))
+
+
 def estop_frames(now_ns: int, frames: tuple[Frame, ...]) -> tuple[OutgoingFrame, ...]:
     """The frames of an e-stop, three times over, before all others."""
     return tuple(OutgoingFrame(frame, now_ns + _ESTOP_LIFE_NS, _ESTOP_RANK) for frame in _ESTOP_REPEATS * frames)
 
 
-def status(t_ns: int, state: str) -> RobotStatus:
-    """A status of nothing but the state: these controllers know no sessions and count no refused frames."""
+def status(t_ns: int, state: DriverState, stop_confirmed: bool) -> RobotStatus:
+    """A status of nothing but the state: these controllers know no sessions and count no refused frames.
+
+    An e-stop that is not confirmed yet is a stop under way.
+    """
+    names = {DriverState.ARMED: "ARMED", DriverState.FAULT: "FAULT", DriverState.STOPPING: "STOPPING"}
+    names[DriverState.ESTOP] = "ESTOP" if stop_confirmed else "STOPPING"
     return RobotStatus(
         t_ns=t_ns,
-        state=state,
+        state=names.get(state, "STANDBY"),
         fault_code=0,
         fault="NONE",
         estop_source="NONE",
@@ -90,10 +180,21 @@ def status(t_ns: int, state: str) -> RobotStatus:
     )
 
 
+def counted(stats: DriverStats, name: str) -> DriverStats:
+    """The counters, with one more of `name`."""
+    return replace(stats, **{name: getattr(stats, name) + 1})
+
+
 def sides_of(nodes: tuple[Nodes, Nodes]) -> tuple[tuple[int, ...], tuple[int, ...]]:
     """The ids on the left and on the right."""
     left, right = ((side,) if isinstance(side, int) else side for side in nodes)
     return left, right
+
+
+def all_of(nodes: tuple[Nodes, Nodes]) -> tuple[int, ...]:
+    """Every id, left before right."""
+    left, right = sides_of(nodes)
+    return (*left, *right)
 
 
 def in_sides(nodes: Sequence[int | str]) -> list[Any]:

@@ -10,12 +10,13 @@ import msgspec
 from msgspec import Meta
 
 from drivers.motor import vesc_codec as codec
-from drivers.motor.vendor_parts import Nodes, Sign, in_sides, sides_of
+from drivers.motor.vendor_parts import Nodes, Sign, all_of, in_sides, sides_of
 from drivers.types import CyclicFrame, Frame, SafetyCard, SettingsFault
 
 HOST_ID = 253
 STATUS_PERIOD_S = 0.02
 STANDS_ERPM = 60.0
+_SAME_TIMEOUT_S, _SAME_CURRENT_A = 0.002, 0.1
 EXAMPLE = """nodes = [23, 51]
 direction = [1, -1]
 gear = 20.0
@@ -59,24 +60,14 @@ class VescSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     stop_deceleration_rad_s2: Annotated[float, Meta(gt=0.0, le=655.0)] = 10.0
 
     @property
-    def sides(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
-        """The controllers on the left and on the right."""
-        return sides_of(self.nodes)
-
-    @property
-    def all_nodes(self) -> tuple[int, ...]:
-        """Every controller, left before right."""
-        return (*self.sides[0], *self.sides[1])
-
-    @property
     def erpm_per_rad_s(self) -> float:
         """Electrical rpm at a wheel speed of 1 rad/s."""
         return 60.0 / (2.0 * math.pi) * self.pole_pairs * self.gear
 
     def fault(self) -> SettingsFault | None:
         """What no single field shows."""
-        nodes = self.all_nodes
-        if not all(self.sides):
+        nodes = all_of(self.nodes)
+        if not all(sides_of(self.nodes)):
             return SettingsFault("nodes", "a side has no controller", "write [left, right], such as [23, 51]")
         if any(not 0 <= node <= codec.LARGEST_ID or node == HOST_ID for node in nodes):
             return SettingsFault("nodes", f"an id is outside 0 to 254, or {HOST_ID}, which is this host's", "change it")
@@ -92,6 +83,18 @@ class VescSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
 def slowest_rad_s(settings: VescSettings) -> float:
     """The slowest speed of a wheel that the speed loop holds."""
     return settings.min_erpm / settings.erpm_per_rad_s
+
+
+def timeout_fault(settings: VescSettings, node: int, timeout_s: float, brake_current_a: float) -> str | None:
+    """What a controller's timeout, as it tells it, is other than robot.toml declares."""
+    named = f"controller {node}: its timeout"
+    if timeout_s <= 0.0:
+        return f"{named} is off; set {1e3 * settings.watchdog_s:g} ms (VESC Tool, App Settings, General)"
+    if abs(timeout_s - settings.watchdog_s) > _SAME_TIMEOUT_S:
+        return f"{named} is {timeout_s:g} s; set {settings.watchdog_s:g} s there, or write link.watchdog_s"
+    if not abs(brake_current_a - settings.timeout_brake_current_a) <= _SAME_CURRENT_A:
+        return f"{named} brakes with {brake_current_a:g} A; write that in link.timeout_brake_current_a"
+    return None
 
 
 class VescExchange:
@@ -153,12 +156,12 @@ def stop_frames(settings: VescSettings) -> tuple[Frame, ...]:
 def questions(settings: VescSettings) -> tuple[Frame, ...]:
     """On a serial line, for all that must be known of each motor; no status messages come there."""
     ask = codec.ask_values(codec.ALL_OF_A_MOTOR)
-    return tuple(frame for node in settings.all_nodes for frame in codec.fragments(node, HOST_ID, ask))
+    return tuple(frame for node in all_of(settings.nodes) for frame in codec.fragments(node, HOST_ID, ask))
 
 
 def stop_confirmation(settings: VescSettings) -> Callable[[Frame], bool]:
     """Return what says, frame by frame heard, whether every motor stands: nothing else confirms a stop here."""
-    standing = dict.fromkeys(settings.all_nodes, False)
+    standing = dict.fromkeys(all_of(settings.nodes), False)
 
     def heard(frame: Frame) -> bool:
         decoded = codec.decode(frame)
@@ -179,9 +182,9 @@ def cyclic_frames(settings: VescSettings, command_rate_hz: float, _authenticated
         # Command, question and answer, each in a packet; forwarded ones wait for the controllers' own bus.
         return tuple(
             CyclicFrame(f"command and values of {node}", "LINE", 8, command_rate_hz, 12 + 12 + 26, 0.0015)
-            for node in settings.all_nodes
+            for node in all_of(settings.nodes)
         )
-    for node in settings.all_nodes:
+    for node in all_of(settings.nodes):
         frames += [
             # 29-bit identifiers take about 25 bits more than the load's formula counts: two bytes and a half.
             CyclicFrame(f"SET_RPM of {node}", "HOST", 7, command_rate_hz),

@@ -12,6 +12,7 @@ import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
+from drivers.motor.vendor_parts import sides_of
 from drivers.motor.vesc_settings import VescSettings
 from firmware_protocol.firmware_core import FirmwareInputs
 from sim.can_frame import CanFrame
@@ -444,7 +445,7 @@ class VescController:
         settings = self._settings
         left, right = (
             [Vesc(node, round(1e3 * settings.watchdog_s), settings.timeout_brake_current_a) for node in side]
-            for side in settings.sides
+            for side in sides_of(settings.nodes)
         )
         for vesc in (*left, *right):
             vesc.status_ms = {9: 20, 27: 20, 16: 200}
