@@ -138,7 +138,8 @@ class PoseSample(msgspec.Struct, frozen=True, gc=False):
     """A measured pose in the world frame; `t_ns` is when it was true, `received_ns` when it arrived.
 
     `yaw_rad` and `yaw_std_rad` are both NaN where no heading was measured. The position is that of the point
-    `lever_x_m` ahead and `lever_y_m` to the left of the tracked one.
+    `lever_x_m` ahead and `lever_y_m` to the left of the tracked one. `source`: which of robot.toml's, 0 that of [pose],
+    then those of [[pose.also]].
     """
 
     t_ns: int
@@ -150,6 +151,7 @@ class PoseSample(msgspec.Struct, frozen=True, gc=False):
     yaw_std_rad: float
     lever_x_m: float = 0.0
     lever_y_m: float = 0.0
+    source: int = 0
 
     @property
     def has_heading(self) -> bool:

@@ -114,7 +114,8 @@ def main(robot: str, *start: str) -> None:
     # Kernels are compiled before anybody hears of the base.
     plant.step(1000, 0.0, 0.0)
     node = BaseNode(config, settings, plant)
-    poses = PoseSender((config.pose.address, config.pose.port)) if config.pose.source == UDP_POSES else None
+    named = config.pose.of(UDP_POSES)
+    poses = None if named is None else PoseSender((named.address, named.port))
 
     def restart(*_: object) -> None:
         node.zero_ticks = plant.encoder_ticks

@@ -103,8 +103,10 @@ class Bridge:
         self._domain, self._participant = join_domain(config)
         self._outgoing = out.Outgoing(config, parameters)
         self._feed = FeedSubscriber(tick_feed_path(socket_path(config)))
-        self._poses = ros2_poses.PoseInlet(config.pose)
-        self._transforms = ros2_poses.TransformInlet(config.pose, config.ros2.base_frame or out.BASE_FRAME)
+        self._pose = config.pose.of(SOURCE)
+        pose = self._pose or config.pose
+        self._poses = ros2_poses.PoseInlet(pose)
+        self._transforms = ros2_poses.TransformInlet(pose, config.ros2.base_frame or out.BASE_FRAME)
         self._speeds = ros2_commands.SpeedInlet(config.robot, config.drive, parameters)
         self._pad = ros2_commands.DaemonPad(socket_path(config))
         self._to_daemon = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
@@ -130,7 +132,7 @@ class Bridge:
     def where(self) -> str:
         """Where it is to be found, in words."""
         ros2 = self._config.ros2
-        heard = f"; poses from {self._config.pose.topic}" if self._config.pose.source == SOURCE else ""
+        heard = "" if self._pose is None else f"; poses from {self._pose.topic}"
         reach = "this computer only" if ros2.localhost_only else "the network"
         return f"ROS 2 domain {_domain(self._config)}, {reach}, namespace /{ros2.namespace.strip('/')}{heard}"
 
@@ -166,12 +168,12 @@ class Bridge:
 
     def _make_readers(self, namespace: str) -> Iterator[tuple[DataReader[Any], _Take]]:
         # One for each type that a topic may have: only the one that the sender has is ever matched.
-        if self._config.pose.source == SOURCE and self._config.pose.topic == ros2_poses.TRANSFORMS:
+        if self._pose is not None and self._pose.topic == ros2_poses.TRANSFORMS:
             yield self._reader(out.TF, msg.TFMessage, _TRANSFORMS, namespace), self._take_transforms
             yield self._reader(TF_STATIC, msg.TFMessage, _STATIC, namespace), self._take_static_transforms
-        elif self._config.pose.source == SOURCE:
+        elif self._pose is not None:
             for pose in ros2_poses.TYPES:
-                yield self._reader(self._config.pose.topic, pose, SENSOR, namespace), self._take_pose
+                yield self._reader(self._pose.topic, pose, SENSOR, namespace), self._take_pose
         for speed in () if self._base_on_ros else ros2_commands.TYPES:
             yield self._reader(CMD_VEL, speed, SENSOR, namespace), self._take_speed
         yield self._reader(CTL, msg.String, RELIABLE, namespace), self._take_request
@@ -217,10 +219,10 @@ class Bridge:
 
     def _take_pose(self, message: ros2_poses.PoseMessage, sent_ns: int) -> None:
         datagram = self._poses.datagram(message, sent_ns, time.monotonic_ns(), time.time_ns())
-        if datagram is None:
+        if datagram is None or self._pose is None:
             return
         try:
-            self._to_daemon.sendto(datagram, bridge_address(self._config.pose.port))
+            self._to_daemon.sendto(datagram, bridge_address(self._pose.port))
         except OSError:
             # No daemon, or one that does not keep up: the next pose is worth more than this one.
             self._unsent += 1

@@ -46,9 +46,10 @@ class Outgoing:
     def __init__(self, config: RobotConfig, parameters: OdometryParameters) -> None:
         self._config = config
         self._base = config.ros2.base_frame or BASE_FRAME
-        self._map = config.pose.frame
+        by_ros = config.pose.of(ROS2_POSES)
+        self._map = (by_ros or config.pose).frame
         # Who gives poses over ROS says where the map is; of others nobody there knows.
-        self._gives_map = config.pose.source != ROS2_POSES
+        self._gives_map = by_ros is None
         self._parameters = parameters
         self._model = motion_model(config.estimation, parameters)
         self._tracker = WheelTracker()

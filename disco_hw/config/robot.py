@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 
@@ -97,7 +98,8 @@ class PoseInput(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
 
     `datum`: latitude and longitude (degrees) of the world frame's origin. For `disco-hw bridge ros2`: the topic, the
     frame that its poses must be in, and the standard deviations of poses that come without. By these, `rate_hz` (how
-    often poses come at least) and `latency_s` it is decided whether the geometry is learnt while driving.
+    often poses come at least) and `latency_s` it is decided whether the geometry is learnt while driving. `also`:
+    further sources, whose poses are fused with these.
     """
 
     source: str = DEFAULT
@@ -126,6 +128,23 @@ class PoseInput(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     position_std_m: Positive = 0.02
     yaw_std_rad: Positive = 0.02
     rate_hz: Positive | None = None
+    also: Annotated[tuple[PoseInput, ...], Meta(max_length=3)] = ()
+
+    def every(self) -> tuple[PoseInput, ...]:
+        """This source and the further ones, in the order of their numbers."""
+        return (self, *self.also)
+
+    def labels(self) -> tuple[str, ...]:
+        """What the sources are called; those of one kind are numbered."""
+        names = [one.source for one in self.every()]
+        return tuple(
+            name if names.count(name) == 1 else f"{name} {names[: number + 1].count(name)}"
+            for number, name in enumerate(names)
+        )
+
+    def of(self, source: str) -> PoseInput | None:
+        """The first source of this kind; None where there is none."""
+        return next((one for one in self.every() if one.source == source), None)
 
     def convention(self) -> PoseConvention:
         """In what units and about which axes the source speaks."""
@@ -361,13 +380,27 @@ def _task_of(path: Path, section: object) -> RobotTask:
 
 def _check_names(path: Path, raw: dict[str, Any]) -> None:
     """Refuse what is no name of a driver or pose source; the registries know the names, the fields' types do not."""
-    for section, field, find in (("link", "driver", find_driver), ("pose", "source", find_pose_source)):
-        found = raw.get(section)
-        if isinstance(found, dict) and field in found:
-            try:
-                find(str(found[field]))
-            except (UnknownDriverError, PoseSourceError) as error:
-                raise InputError(f"{path}: {section}.{field}: {error}") from None
+    link = raw.get("link")
+    if isinstance(link, dict) and "driver" in link:
+        try:
+            find_driver(str(link["driver"]))
+        except UnknownDriverError as error:
+            raise InputError(f"{path}: link.driver: {error}") from None
+    for where, section in _pose_sections(raw.get("pose")):
+        try:
+            find_pose_source(str(section.get("source", DEFAULT)))
+        except PoseSourceError as error:
+            raise InputError(f"{path}: {where}.source: {error}") from None
+
+
+def _pose_sections(section: Any) -> Iterator[tuple[str, dict[str, Any]]]:
+    """[pose] and each of [[pose.also]], where they are what they should be, with their names."""
+    if isinstance(section, dict):
+        yield "pose", section
+        also = section.get("also")
+        for number, one in enumerate(also if isinstance(also, list) else ()):
+            if isinstance(one, dict):
+                yield f"pose.also[{number}]", one
 
 
 # Whatever the source is, they say how good its poses are.
@@ -375,17 +408,22 @@ _OF_EVERY_SOURCE = {"position_std_m", "yaw_std_rad"}
 
 
 def _check_pose_fields(path: Path, section: Any) -> None:
-    """Refuse fields of another pose source."""
-    if not isinstance(section, dict):
-        return
-    name = str(section.get("source", DEFAULT))
-    own = own_pose_fields(name)
-    for other in pose_sources():
-        for field in sorted(own_pose_fields(other) - own - _OF_EVERY_SOURCE):
-            if field in section:
-                _refuse(
-                    path, f"pose.{field}", f'a field of the source "{other}", and pose.source is "{name}"', "remove it"
-                )
+    """Refuse fields of another pose source, and what no further source has."""
+    for where, one in _pose_sections(section):
+        if one is not section and "source" not in one:
+            _refuse(path, where, "does not say which source", f"add source, one of {', '.join(pose_sources())}")
+        name = str(one.get("source", DEFAULT))
+        own = own_pose_fields(name)
+        for other in pose_sources():
+            for field in sorted(own_pose_fields(other) - own - _OF_EVERY_SOURCE):
+                if field in one:
+                    fault = f'a field of the source "{other}", and {where}.source is "{name}"'
+                    _refuse(path, f"{where}.{field}", fault, "remove it")
+        if one is not section and "also" in one:
+            _refuse(path, f"{where}.also", "sources are not nested", "write another [[pose.also]]")
+        if one is not section and "rate_hz" in one:
+            fault = "says whether the geometry is learnt, which it is from the poses of [pose] alone"
+            _refuse(path, f"{where}.rate_hz", fault, "remove it")
 
 
 def _refuse(path: Path, field: str, fault: str, remedy: str) -> NoReturn:
@@ -407,6 +445,8 @@ def _check(path: Path, config: RobotConfig) -> None:
     for name in config.__struct_fields__:
         if name != "task":
             _check_values(path, name, getattr(config, name))
+    for number, one in enumerate(config.pose.also):
+        _check_values(path, f"pose.also[{number}]", one)
     for field in config.prior.__struct_fields__:
         low, high = getattr(config.prior, field)
         if not (math.isfinite(low) and math.isfinite(high) and low < high):

@@ -53,7 +53,7 @@ def _types_at(roots: Sequence[inspect.Type], place: str) -> list[inspect.Type]:
             match one:
                 case inspect.StructType(fields=fields):
                     following += [field.type for field in fields if field.encode_name == step[1]]
-                case inspect.ListType(item_type=item) if step[1] is None:
+                case inspect.ListType(item_type=item) | inspect.VarTupleType(item_type=item) if step[1] is None:
                     following.append(item)
         types = _members(following)
     return types

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import math
 import os
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 from disco_hw.adaptation.guard import choose_adaptation
-from disco_hw.config import RobotConfig
+from disco_hw.config import PoseInput, RobotConfig
 from disco_hw.daemon.client import send_request, socket_path
 from disco_hw.daemon.realtime import can_lock_memory, can_use_fifo
 from disco_hw.errors import InputError, WorkError
+from disco_hw.estimation.sources import APART_STDS
 from disco_hw.runtime.assembly import driver_of, make_link, pose_source_of
 from disco_hw.runtime.preflight import (
     Check,
@@ -39,6 +43,7 @@ from drivers.types import (
     Limits,
     LinkState,
     OutgoingFrame,
+    PoseSample,
     PoseSource,
     ReceivedFrame,
     RobotStatus,
@@ -104,6 +109,7 @@ def run_check(robot: Path, link: str | None = None) -> CheckReport:
                 checks.append(_hearing_check(found))
                 checks.append(check_round_trip(found.round_trips_s, 1.0 / control.rate_hz))
             checks.append(_telemetry_check(found))
+            checks += pose_source_checks(setup.config.pose, found.poses)
             if found.limits is not None:
                 checks += check_firmware_limits(setup.config.robot, found.limits)
                 checks.append(check_command_timing(control, found.limits))
@@ -124,8 +130,7 @@ class _Found:
     limits: Limits | None
     clock_synchronised: bool
     wheel_samples: int
-    pose_samples: int
-    headings: int
+    poses: tuple[PoseSample, ...]
     pose_news: str
     rejected: int
     told: tuple[RobotStatus, ...]
@@ -179,7 +184,8 @@ def _link_check(transport: Transport) -> Check:
 def _ask_robot(transport: Transport, driver: Driver, pose_source: PoseSource) -> _Found:
     """Shake hands, listen for three seconds and time the answers to the driver's own clock requests."""
     stopwatch = _Stopwatch()
-    wheels = poses = headings = 0
+    wheels = 0
+    poses: list[PoseSample] = []
     pose_news = ""
     told: list[RobotStatus] = []
     start_ns = time.monotonic_ns()
@@ -191,8 +197,7 @@ def _ask_robot(transport: Transport, driver: Driver, pose_source: PoseSource) ->
         readings = driver.receive(now_ns, frames)
         wheels += len(readings.wheels)
         came = pose_source.receive(now_ns, readings.poses)
-        poses += len(came)
-        headings += sum(pose.has_heading for pose in came)
+        poses += came
         if isinstance(pose_source, SaysWhy):
             pose_news = next(reversed(pose_source.news()), pose_news)
         told += [status for status in readings.status if status.t_ns - start_ns > _SETTLED_S * 1e9]
@@ -208,13 +213,57 @@ def _ask_robot(transport: Transport, driver: Driver, pose_source: PoseSource) ->
         limits=driver.limits,
         clock_synchronised=driver.clock_offset_ns is not None,
         wheel_samples=wheels,
-        pose_samples=poses,
-        headings=headings,
+        poses=tuple(poses),
         pose_news=pose_news,
         rejected=stats.rejected_crc + stats.rejected_sequence + stats.rejected_length + transport.stats.malformed,
         told=tuple(told),
         round_trips_s=tuple(stopwatch.round_trips_s),
     )
+
+
+def pose_source_checks(told: PoseInput, poses: Sequence[PoseSample]) -> list[Check]:
+    """Each of several pose sources, heard for the time of listening on a robot that stands, and whether they agree."""
+    labels, every = told.labels(), told.every()
+    if len(labels) == 1:
+        return []
+    checks: list[Check] = []
+    for number, (label, named) in enumerate(zip(labels, every, strict=True)):
+        own = [pose for pose in poses if pose.source == number]
+        frame = f"frame at {list(named.origin)}, sensor at {list(named.offset)}"
+        if not own:
+            checks.append(Check(f"poses {label}", Level.WARNING, f"none came; {frame}; see that it sends"))
+            continue
+        age_s = median((pose.received_ns - pose.t_ns) * 1e-9 for pose in own)
+        heading = f"{own[-1].yaw_std_rad:.3g} rad" if own[-1].has_heading else "no heading"
+        text = (
+            f"{len(own) / _LISTEN_S:.0f} a second, {1e3 * age_s:.0f} ms old, {own[-1].position_std_m:.3g} m, {heading}"
+        )
+        checks.append(Check(f"poses {label}", Level.OK, f"{text}; {frame}"))
+    for one, other in combinations(range(len(labels)), 2):
+        apart = _apart(*([pose for pose in poses if pose.source == number] for number in (one, other)))
+        if apart:
+            text = f"{apart} beyond their stated noise; mend origin, offset or the standard deviations of one"
+            checks.append(Check(f"poses {labels[one]} and {labels[other]}", Level.FAIL, text))
+    return checks
+
+
+def _apart(one: Sequence[PoseSample], other: Sequence[PoseSample]) -> str:
+    """How far two sources differ, by the medians of what they said of a robot that stands; empty where they agree."""
+    if not one or not other:
+        return ""
+    dx, dy = (median(getattr(pose, name) for pose in one) - median(getattr(pose, name) for pose in other)
+              for name in ("x_m", "y_m"))  # fmt: skip
+    # Without a heading a position is the sensor's, which may be anywhere around.
+    lever_m = sum(math.hypot(each[-1].lever_x_m, each[-1].lever_y_m) for each in (one, other))
+    noise_m = APART_STDS * math.hypot(one[-1].position_std_m, other[-1].position_std_m)
+    if math.hypot(dx, dy) > noise_m + lever_m:
+        return f"{math.hypot(dx, dy):.2f} m apart,"
+    if one[-1].has_heading and other[-1].has_heading:
+        turn = abs(math.remainder(one[-1].yaw_rad - other[-1].yaw_rad, 2.0 * math.pi))
+        # Of single poses, as angles have no median.
+        if turn > 2.0 * APART_STDS * math.hypot(one[-1].yaw_std_rad, other[-1].yaw_std_rad):
+            return f"{turn:.2f} rad apart,"
+    return ""
 
 
 class _Stopwatch:
@@ -268,17 +317,15 @@ def _hearing_check(found: _Found) -> Check:
 
 def _telemetry_check(found: _Found) -> Check:
     name = "telemetry"
-    rates = (
-        f"{found.wheel_samples / _LISTEN_S:.0f} wheel and {found.pose_samples / _LISTEN_S:.0f} pose samples a second"
-    )
+    rates = f"{found.wheel_samples / _LISTEN_S:.0f} wheel and {len(found.poses) / _LISTEN_S:.0f} pose samples a second"
     if not found.wheel_samples:
         return Check(name, Level.FAIL, f"{rates}; check the encoders and the firmware")
-    if not found.pose_samples:
+    if not found.poses:
         why = found.pose_news and f"; {found.pose_news}"
         return Check(
             name, Level.WARNING, f"{rates}{why}; without a pose the task does not start if estimation.pose_required"
         )
-    if not found.headings:
+    if not any(pose.has_heading for pose in found.poses):
         return Check(name, Level.WARNING, f"{rates}; heading not known; {FIND_HEADING}")
     if found.rejected:
         return Check(

@@ -75,10 +75,21 @@ def status(core: DaemonCore, loop: dict[str, Any], recorder: RecorderStats) -> d
         "transport": asdict(core.transport.stats),
         "driver": asdict(core.driver.stats),
         "fusion": asdict(core.pipeline.fusion.stats),
+        "poses": _poses(core),
         "plausibility": asdict(core.plausibility.stats),
         "recorder": asdict(recorder),
         "adaptation": core.adaptation.status(),
     }
+
+
+def _poses(core: DaemonCore) -> list[dict[str, Any]]:
+    """Each pose source: its frame and place on the robot, and how it does."""
+    tick, sources = core.last, core.pipeline.fusion.sources
+    found = sources.status(0 if tick is None else tick.pipeline.t_ns)
+    return [
+        {**one, "origin": list(named.origin), "offset": list(named.offset)}
+        for one, named in zip(found, core.config.pose.every(), strict=True)
+    ]
 
 
 def _controller(driver: Driver) -> dict[str, Any] | None:
@@ -107,4 +118,5 @@ def counters(
         loop={"ticks": loop.ticks, "overruns": loop.overruns, "skipped": loop.skipped_periods, "stolen_ms": stolen_ms},
         adaptation=core.adaptation.counts(),
         entered=dict(core.entered),
+        poses=core.pipeline.fusion.sources.counts(),
     )

@@ -103,6 +103,7 @@ class Measurement(msgspec.Struct, frozen=True, gc=False):
     floored: bool
     lever_x_m: float = 0.0
     lever_y_m: float = 0.0
+    source: int = 0
 
     def lever(self, yaw_rad: float) -> tuple[float, float, float, float]:
         """The lever arm in the world (x, y) of a robot with this heading, and its derivative by the heading."""
@@ -139,6 +140,7 @@ def screen(sample: PoseSample) -> Measurement | PoseReason:
         floored=position_std_m > sample.position_std_m or (has_heading and yaw_std_rad > sample.yaw_std_rad),
         lever_x_m=sample.lever_x_m,
         lever_y_m=sample.lever_y_m,
+        source=sample.source,
     )
 
 

@@ -31,7 +31,7 @@ class DisturbanceEstimator:
 
     def __init__(self) -> None:
         self.value = NO_DISTURBANCE
-        self._before_ns: int | None = None
+        self._before_ns: dict[int, int] = {}
 
     def take(
         self, sample: PoseSample, update: PoseUpdate, parameters: OdometryParameters, wheels_rad_s: tuple[float, float]
@@ -39,11 +39,11 @@ class DisturbanceEstimator:
         """Take in what a pose did to the estimate of a robot with this geometry, its wheels turning so fast."""
         if update.reason is PoseReason.REINITIALISED:
             # The robot was carried: to other ground.
-            self.value, self._before_ns = NO_DISTURBANCE, None
+            self.value, self._before_ns = NO_DISTURBANCE, {}
             return
         if update.reason is not PoseReason.ACCEPTED or update.innovation is None or update.innovation_variance is None:
             return
-        before_ns, self._before_ns = self._before_ns, sample.t_ns
+        before_ns, self._before_ns[sample.source] = self._before_ns.get(sample.source), sample.t_ns
         carried = self.value.moving(*wheels_rad_s)
         if before_ns is None or sample.t_ns <= before_ns or carried == 0.0 or not sample.has_heading:
             return

@@ -16,6 +16,8 @@ MAX_EXTRAPOLATION_S = 0.2
 # Standard deviation of motion that was not measured, as a part of its length: a wheel's turn since its last sample, and
 # the shape of the path between two samples with a gap in between.
 UNMEASURED_PART = 0.25
+# Only after so many time-outs does one source take the estimate over from another: the task has stopped by then.
+TAKE_OVER_TIMEOUTS = 2.0
 # A heading that was known and is less certain than this counts as unknown, and positions alone find it anew.
 MAX_HEADING_STD_RAD = 0.3
 
@@ -36,9 +38,9 @@ class FilterState(msgspec.Struct, frozen=True, gc=False):
     """Everything that the future depends on, at one instant.
 
     `belief` is None before there is any, and a search while the heading is not known. `candidate` is the pose that the
-    last rejected measurements agree on, and `candidate_count` how many in a row do. `pose_t_ns` is the stamp of
-    the last accepted pose, None before the first. `judgement` is that of the pose at this very instant, None after
-    wheel motion.
+    last rejected measurements agree on, `candidate_count` how many in a row do, and `candidate_of` of which sources.
+    `pose_t_ns` is the stamp of the last accepted pose, None before the first, and `accepted` those of each source.
+    `judgement` is that of the pose at this very instant, None after wheel motion.
     """
 
     t_ns: int
@@ -50,6 +52,8 @@ class FilterState(msgspec.Struct, frozen=True, gc=False):
     pose_t_ns: int | None
     reinitialisations: int
     judgement: Judgement | None
+    candidate_of: frozenset[int] = frozenset()
+    accepted: tuple[tuple[int, int], ...] = ()
 
     @property
     def heading_known(self) -> bool:
@@ -72,6 +76,7 @@ class PoseFilter:
         self._position_limit = gate_limit(settings.gate_probability, with_heading=False)
         self._found_variance = settings.heading_std_rad**2
         self._lockout_count = settings.gate_lockout_count
+        self._take_over_ns = round(TAKE_OVER_TIMEOUTS * settings.pose_timeout_s * 1e9)
         self._pose_required = settings.pose_required
         self._corrector = PoseCorrector()
 
@@ -119,7 +124,8 @@ class PoseFilter:
 
         The first pose sets the belief; where it has no heading, every heading is followed until motion shows which is
         right. A pose outside the gate is compared with where the rejected poses before it would be now: if
-        `gate_lockout_count` in a row agree with one another, the robot is where they say.
+        `gate_lockout_count` in a row agree with one another, and every source that was believed of late is among them,
+        the robot is where they say.
         """
         if state.belief is None or state.pose_t_ns is None:
             return self._after(state, measurement, self._fresh(measurement), Judgement(PoseReason.INITIALISED))
@@ -129,11 +135,17 @@ class PoseFilter:
         limit = self._limit(measurement)
         if correction.distance2 <= limit:
             return self._after(state, measurement, belief, _judged(PoseReason.ACCEPTED, correction, limit))
-        candidate, count = self._candidate(state, measurement)
-        if count >= self._lockout_count:
+        candidate, count, sources = self._candidate(state, measurement)
+        if count >= self._lockout_count and not self._contested(state, measurement.t_ns, sources):
             return self._after(state, measurement, candidate, _judged(PoseReason.REINITIALISED, correction, limit))
         judgement = _judged(PoseReason.GATED, correction, limit)
-        return msgspec.structs.replace(state, candidate=candidate, candidate_count=count, judgement=judgement)
+        return msgspec.structs.replace(
+            state, candidate=candidate, candidate_count=count, candidate_of=sources, judgement=judgement
+        )
+
+    def _contested(self, state: FilterState, t_ns: int, sources: frozenset[int]) -> bool:
+        """Whether another source than these was believed of late."""
+        return any(each not in sources and t_ns - at_ns <= self._take_over_ns for each, at_ns in state.accepted)
 
     def _limit(self, measurement: Measurement) -> float:
         return self._position_limit if measurement.yaw_variance is None else self._pose_limit
@@ -161,12 +173,12 @@ class PoseFilter:
         merged = search.merged()
         return merged if merged.covariance[2][2] <= self._found_variance else search
 
-    def _candidate(self, state: FilterState, measurement: Measurement) -> tuple[Belief, int]:
+    def _candidate(self, state: FilterState, measurement: Measurement) -> tuple[Belief, int, frozenset[int]]:
         if state.candidate is not None:
             belief, correction = self._corrected(state.candidate, measurement)
             if correction.distance2 <= self._limit(measurement):
-                return belief, state.candidate_count + 1
-        return self._fresh(measurement), 1
+                return belief, state.candidate_count + 1, state.candidate_of | {measurement.source}
+        return self._fresh(measurement), 1, frozenset((measurement.source,))
 
     def _rebased(self, belief: Belief | None) -> Belief | None:
         if isinstance(belief, HeadingSearch):
@@ -184,6 +196,10 @@ class PoseFilter:
             measurement.t_ns,
             state.reinitialisations + (judgement.reason is PoseReason.REINITIALISED),
             judgement,
+            accepted=(
+                *(each for each in state.accepted if each[0] != measurement.source),
+                (measurement.source, measurement.t_ns),
+            ),
         )
 
     def _moved(
@@ -228,6 +244,8 @@ class PoseFilter:
             state.pose_t_ns,
             state.reinitialisations,
             None,
+            state.candidate_of,
+            state.accepted,
         )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import msgspec
@@ -20,6 +21,7 @@ from disco_hw.estimation.odometry import (
     WheelReason,
     WheelTracker,
 )
+from disco_hw.estimation.sources import PoseSources
 from disco_hw.model.disturbance import Disturbance
 from drivers.types import PoseSample, WheelSample
 
@@ -34,8 +36,9 @@ class PoseEstimate(msgspec.Struct, frozen=True, gc=False):
     World frame; `covariance` of (x, y, yaw) is 3x3, rows of floats, m and rad, symmetric and positive definite.
     `speed_m_s` is forward, of the centre of rotation; the tracked point also moves sideways by -yaw_rate * x_icr.
     Ages are those of the newest wheel sample and the newest accepted pose, None before the first. `pose_ok`: a pose was
-    accepted within the timeout and the heading is known; without the first the estimate is prediction only, without the
-    second its yaw says nothing (`heading_known` is False, the position holds). `wheels_ok`: as for wheel samples.
+    accepted within the timeout, the heading is known, and no two sources contradict each other; without the first the
+    estimate is prediction only, without the second its yaw says nothing (`heading_known` is False, the position holds).
+    `wheels_ok`: as for wheel samples.
     Before `initialised`, pose and covariance say nothing (zeros, largest variances). `reinitialisations` counts how
     often the estimate has jumped to where agreeing poses say; a change means that a path through it is no motion.
     """
@@ -127,8 +130,15 @@ class PoseFusion:
     a sample holds raises; what is refused is counted. Cost of a call: see RewindBuffer.
     """
 
-    def __init__(self, settings: Estimation, parameters: OdometryParameters, wheel_timeout_s: float) -> None:
+    def __init__(
+        self,
+        settings: Estimation,
+        parameters: OdometryParameters,
+        wheel_timeout_s: float,
+        sources: Sequence[str] = ("poses",),
+    ) -> None:
         self._settings = settings
+        self.sources = PoseSources(sources, settings.pose_timeout_s)
         self._filter = PoseFilter(settings, parameters)
         self._history_s = settings.history_s
         self._pose_timeout_s = settings.pose_timeout_s
@@ -179,7 +189,7 @@ class PoseFusion:
         self._counts["wheel_gaps"] += reading.after_gap
         self._counts["wheel_restarts"] += reading.restarted
         if self._buffer is None:
-            self._buffer = RewindBuffer(self._filter, reading, self._history_s)
+            self._buffer = RewindBuffer(self._filter, reading, self._history_s, len(self.sources.all))
         else:
             self._buffer.add_wheels(reading)
 
@@ -190,6 +200,10 @@ class PoseFusion:
         if isinstance(outcome, PoseReason):
             outcome = Judgement(outcome)
         self._counts[f"poses_{outcome.reason.value}"] += 1
+        stds = (sample.position_std_m, sample.yaw_std_rad)
+        self.sources.take(
+            sample.source, sample.t_ns, now_ns, stds, outcome.reason, outcome.innovation, outcome.innovation_variance
+        )
         return PoseUpdate(
             t_ns=sample.t_ns,
             age_s=(now_ns - sample.t_ns) / 1e9,
@@ -235,7 +249,10 @@ class PoseFusion:
             pose_age_s=pose_age_s,
             initialised=state.belief is not None,
             wheels_ok=wheel_age_s <= self._wheel_timeout_s,
-            pose_ok=pose_age_s is not None and pose_age_s <= self._pose_timeout_s and state.heading_known,
+            pose_ok=pose_age_s is not None
+            and pose_age_s <= self._pose_timeout_s
+            and state.heading_known
+            and not self.sources.contradiction,
             reinitialisations=state.reinitialisations,
             heading_known=state.heading_known,
         )

@@ -25,10 +25,10 @@ class RewindBuffer:
     One call runs each event in the buffer once at worst.
     """
 
-    def __init__(self, pose_filter: PoseFilter, first: WheelReading, history_s: float) -> None:
+    def __init__(self, pose_filter: PoseFilter, first: WheelReading, history_s: float, sources: int = 1) -> None:
         self._filter = pose_filter
         self._history_ns = round(history_s * 1e9)
-        self._max_poses = math.ceil(history_s * MAX_POSE_RATE_HZ)
+        self._max_poses = math.ceil(sources * history_s * MAX_POSE_RATE_HZ)
         self._max_events = self._max_poses + math.ceil(history_s * MAX_WHEEL_RATE_HZ) + 1
         self._poses = 0
         self._events: list[Event] = [first]
@@ -73,9 +73,13 @@ class RewindBuffer:
         if measurement.t_ns > self._newest_wheels.t_ns + self._history_ns:
             return PoseReason.NO_ODOMETRY
         index = self._index_after(measurement.t_ns, include_equal=True)
-        before = self._events[index - 1]
-        if before.t_ns == measurement.t_ns and isinstance(before, Measurement):
-            return PoseReason.DUPLICATE
+        # Of several sources at one instant the lowest is first, in whatever order they come.
+        while (before := self._events[index - 1]).t_ns == measurement.t_ns and isinstance(before, Measurement):
+            if before.source == measurement.source:
+                return PoseReason.DUPLICATE
+            if before.source < measurement.source:
+                break
+            index -= 1
         if self._poses >= self._max_poses:
             return PoseReason.OVERFLOW
         self._events.insert(index, measurement)

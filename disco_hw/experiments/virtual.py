@@ -101,7 +101,9 @@ def run_sim(options: SimOptions) -> int:
                 key=key or b"",
             ),
             controller=controller,
-            pose_address=(config.pose.address, config.pose.port) if config.pose.source == UDP_POSES else None,
+            pose_address=None
+            if (by_datagram := config.pose.of(UDP_POSES)) is None
+            else (by_datagram.address, by_datagram.port),
             truth_file=options.truth,
             bus_log=options.bus_log,
             inject=options.inject,

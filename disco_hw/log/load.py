@@ -119,6 +119,17 @@ def _poses(log: Log, notes: list[str]) -> tuple[Index, Array]:
     values = np.column_stack([_floats(columns[name]) for name in ("x_m", "y_m", "yaw_rad")])
     bare = np.isnan(values[:, 2]) & np.isnan(_floats(columns["yaw_std_rad"])) & np.isfinite(values[:, :2]).all(axis=1)
     finite = np.asarray(np.isfinite(values).all(axis=1))
+    source = columns["source"].astype(np.int64)
+    whole = np.bincount(source[finite]) if finite.any() else np.zeros(1, dtype=np.int64)
+    if np.count_nonzero(whole) > 1:
+        # Each has an error of its own that lasts: from one to the other is no motion.
+        kept = finite & (source == int(whole.argmax()))
+        notes.append(
+            f"{log.path}: poses of several sources; those of the one with most, number {int(whole.argmax())} of "
+            f"[pose], are used, {np.count_nonzero(finite & ~kept)} others left out"
+        )
+    else:
+        kept = finite
     if bare.any():
         notes.append(
             f"{log.path}: {np.count_nonzero(bare)} positions without heading were left out: what needs poses needs "
@@ -128,7 +139,7 @@ def _poses(log: Log, notes: list[str]) -> tuple[Index, Array]:
         notes.append(
             f"{log.path}: {np.count_nonzero(~(finite | bare))} records of /pose are not finite and were left out"
         )
-    return _ordered(columns["t_ns"], values, finite, "/pose", notes)
+    return _ordered(columns["t_ns"], values, kept, "/pose", notes)
 
 
 def _ordered(t_ns: NDArray[np.generic], values: Array, keep: Mask, what: str, notes: list[str]) -> tuple[Index, Array]:

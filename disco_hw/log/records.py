@@ -154,7 +154,7 @@ class Counters(msgspec.Struct, frozen=True, gc=False):
     """Every counter of the stack, about once a second: totals since the start by name, grouped by who counts.
 
     `entered`: how often the daemon has come into each of its states. `plausibility`: what the robot did although it was
-    told otherwise, and the rest of the stack tolerated.
+    told otherwise, and the rest of the stack tolerated. `poses`: of each source, where there are several.
     """
 
     t_ns: int
@@ -166,6 +166,7 @@ class Counters(msgspec.Struct, frozen=True, gc=False):
     adaptation: dict[str, int] = {}
     entered: dict[str, int] = {}
     plausibility: dict[str, int] = {}
+    poses: dict[str, int] = {}
 
 
 class BeliefChange(msgspec.Struct, frozen=True, gc=False):

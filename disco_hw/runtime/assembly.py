@@ -32,7 +32,7 @@ from disco_hw.runtime.supervisor import Supervisor, SupervisorSettings
 from drivers.motor import make_driver
 from drivers.motor.wiring import rewired
 from drivers.pose import PoseSourceError, make_pose_source
-from drivers.pose.convention import converted
+from drivers.pose.convention import SeveralPoses, converted
 from drivers.transport import ReconnectingTransport, TransportSettingsError, make_transport
 from drivers.types import Driver, PoseSource, Transport
 
@@ -61,7 +61,9 @@ def make_pipeline(config: RobotConfig, model: Model, planner: Planner) -> Pipeli
         max_deceleration_rad_s2=config.robot.max_wheel_acceleration_rad_s2,
     )
     return Pipeline(
-        fusion=PoseFusion(config.estimation, odometry_parameters(model), config.control.telemetry_zero_s),
+        fusion=PoseFusion(
+            config.estimation, odometry_parameters(model), config.control.telemetry_zero_s, config.pose.labels()
+        ),
         planner=planner,
         governor=Governor(limits, 1.0 / config.control.rate_hz),
         plan_tail_s=config.control.plan_tail_s,
@@ -165,12 +167,18 @@ def assemble_core(
 
 
 def pose_source_of(config: RobotConfig) -> PoseSource:
-    """Return the pose source that robot.toml names. Raises InputError for one that cannot be had."""
-    try:
-        source = make_pose_source(**msgspec.structs.asdict(config.pose))
-    except PoseSourceError as error:
-        raise InputError(f"robot.toml: pose.source: {error}") from None
-    return converted(source, config.pose.convention())
+    """Return the pose source that robot.toml names, or those. Raises InputError for one that cannot be had."""
+    opened: list[PoseSource] = []
+    for label, named in zip(config.pose.labels(), config.pose.every(), strict=True):
+        try:
+            source = make_pose_source(**msgspec.structs.asdict(named))
+        except PoseSourceError as error:
+            for one in opened:
+                one.close()
+            which = "" if named is config.pose else f" {label}"
+            raise InputError(f"robot.toml: pose.source{which}: {error}") from None
+        opened.append(converted(source, named.convention()))
+    return opened[0] if len(opened) == 1 else SeveralPoses(opened, config.pose.labels())
 
 
 def driver_of(config: RobotConfig, key: bytes | None = None) -> Driver:

@@ -150,7 +150,8 @@ class DaemonCore:
         # Stopped in the next tick, and not armed again before the daemon has read what was mended.
         self._miswired = self._miswired if miswired is None else (miswired,)
         source = self.pose_source
-        said = [f"poses: {words}" for words in source.news()] if isinstance(source, SaysWhy) else []
+        news = [*(source.news() if isinstance(source, SaysWhy) else ()), *self.pipeline.fusion.sources.news()]
+        said = [f"poses: {words}" for words in news]
         events = (*readings.events, *said, *output.events, *learnt.events, *self._planner_events(result), *doubts)
         events = (*events, *self._stays(now_ns, output, result))
         self._follow_progress(output, result)
@@ -169,7 +170,7 @@ class DaemonCore:
                 *extra_records,
             ],
         )
-        self.adaptation.feed(now_ns, readings)
+        self.adaptation.feed(now_ns, self._to_learn_from(readings))
         mark("record")
         self.last = CoreTick(output, result, command, events, readings)
         return self.last
@@ -224,7 +225,16 @@ class DaemonCore:
             recording_fault=self.recording_fault,
             heading_missing=estimate is not None and estimate.initialised and not estimate.heading_known,
             by_hand=by_hand,
+            poses_contradict=self.pipeline.fusion.sources.contradiction,
         )
+
+    def _to_learn_from(self, readings: Readings) -> Readings:
+        """With the poses of the first source alone, while they are believed: from one to another is no motion."""
+        sources = self.pipeline.fusion.sources
+        if len(sources.all) == 1:
+            return readings
+        first = tuple(pose for pose in readings.poses if pose.source == 0 and sources.is_good(0))
+        return msgspec.structs.replace(readings, poses=first)
 
     def _command(self, output: Output, result: Tick) -> WheelCommand | None:
         """The command to send; while the robot is arming the driver sends the zeros that this takes."""

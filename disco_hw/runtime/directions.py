@@ -136,7 +136,7 @@ class Directions:
         """What else than robot.toml says explains how the robot has moved since it stood."""
         start, told = self._pose, (False, (1, 1))
         for pose in poses:
-            if start is None or not pose.has_heading:
+            if start is None or not pose.has_heading or pose.source != start.source:
                 continue
             turned = self._moved(pose.t_ns)
             yaw = math.remainder(pose.yaw_rad - start.yaw_rad, 2.0 * math.pi)

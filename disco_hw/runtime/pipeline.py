@@ -193,6 +193,7 @@ class Pipeline:
         for wheels in readings.wheels:
             self._fusion.add_wheels(wheels)
         updates = tuple(self._take_pose(pose, now_ns) for pose in readings.poses)
+        self._fusion.sources.step(now_ns)
         estimate = self._fusion.estimate(now_ns)
         mark("estimate")
         plan, failure = None, None

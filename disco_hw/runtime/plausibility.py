@@ -52,8 +52,7 @@ class Plausibility:
         self._supply_v: float | None = None
         self._supply_ns = 0
         self._dipped = False
-        self._pose: tuple[float, float, float] | None = None
-        self._repeats = 0
+        self._poses: dict[int, tuple[tuple[float, float, float], int]] = {}
 
     @property
     def stats(self) -> PlausibilityStats:
@@ -124,10 +123,10 @@ class Plausibility:
         moving = any(max(abs(w.left_speed_rad_s), abs(w.right_speed_rad_s)) > MOVING_RAD_S for w in wheels)
         for sample in poses:
             pose = (sample.x_m, sample.y_m, sample.yaw_rad if sample.has_heading else 0.0)
-            same = pose == self._pose and moving
-            self._pose = pose
-            self._repeats = self._repeats + 1 if same else 0
-            if self._repeats == REPEATS:
+            before, repeats = self._poses.get(sample.source, (None, 0))
+            repeats = repeats + 1 if pose == before and moving else 0
+            self._poses[sample.source] = pose, repeats
+            if repeats == REPEATS:
                 self._counts["poses_frozen"] += 1
                 events.append("the measured pose stays the same to the last digit while the wheels turn")
         return events

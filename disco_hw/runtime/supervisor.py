@@ -71,7 +71,8 @@ class Inputs(msgspec.Struct, frozen=True, gc=False):
     `daemon_error` are sentences for a person and hold for as long as they are given. `task_finished`: nothing of the
     task is left to drive. `recording_fault`: why nothing is recorded although it should be, which keeps the robot from
     being armed unless that is asked for. `heading_missing`: positions come, and which way the robot faces is not known.
-    `by_hand`: a person drives, who sees that; nobody follows the task.
+    `by_hand`: a person drives, who sees that; nobody follows the task. `poses_contradict`: which two pose sources do,
+    in words, else empty.
     """
 
     link_state: LinkState
@@ -89,6 +90,7 @@ class Inputs(msgspec.Struct, frozen=True, gc=False):
     recording_fault: str = ""
     heading_missing: bool = False
     by_hand: bool = False
+    poses_contradict: str = ""
 
 
 class Reply(msgspec.Struct, frozen=True, gc=False):
@@ -268,6 +270,8 @@ class Supervisor:
         """What of the pose keeps the task from being followed; nothing while nobody follows it."""
         if inputs.by_hand:
             return None
+        if inputs.poses_contradict:
+            return f"{inputs.poses_contradict}; find out which is wrong and take it out of [pose]"
         if self._settings.heading_required and inputs.heading_missing:
             return f"heading not known; {FIND_HEADING}"
         if self._settings.pose_required and not inputs.pose_ok:

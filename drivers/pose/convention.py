@@ -97,5 +97,35 @@ def converted(source: PoseSource, convention: PoseConvention) -> PoseSource:
     return source if convention == AS_OURS else ConvertedPoses(source, convention)
 
 
+class SeveralPoses:
+    """Sources side by side, each in our convention already; satisfies `drivers.types.PoseSource`."""
+
+    def __init__(self, sources: Sequence[PoseSource], labels: Sequence[str]) -> None:
+        self._sources = tuple(zip(labels, sources, strict=True))
+
+    def receive(self, now_ns: int, from_robot: Sequence[PoseSample]) -> Sequence[PoseSample]:
+        """The poses of all of them by their stamps, each with the number of its source."""
+        found = [
+            msgspec.structs.replace(sample, source=number)
+            for number, (_, source) in enumerate(self._sources)
+            for sample in source.receive(now_ns, from_robot)
+        ]
+        return sorted(found, key=lambda sample: (sample.t_ns, sample.source))
+
+    def news(self) -> Sequence[str]:
+        """What they say, each under its name."""
+        return [
+            f"{label}: {words}"
+            for label, source in self._sources
+            if isinstance(source, SaysWhy)
+            for words in source.news()
+        ]
+
+    def close(self) -> None:
+        """Close all of them."""
+        for _, source in self._sources:
+            source.close()
+
+
 class PoseSourceError(ValueError):
     """A source that cannot be had, by its name or its device; the message is one line with the remedy."""

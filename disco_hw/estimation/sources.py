@@ -1,0 +1,239 @@
+"""Several pose sources beside one another: which are believed, and whether two contradict each other.
+
+The filter takes their poses in order of their stamps and gates each. What no gate shows is who of two is wrong:
+
+- Poses that leave the gate by a jump, from one pose to the next of the same source, are against wheels and other source
+  at once: that source is left out until its poses fit again.
+- Poses that drift apart, or disagree from the first on, do not tell who is right: the estimate is not to be driven by.
+"""
+
+from __future__ import annotations
+
+import enum
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from itertools import combinations
+from typing import Any
+
+from disco_hw.estimation.correction import PoseReason, Triple
+
+MEAN_WEIGHT = 0.2
+"""Of a pose in the running mean of its source's innovations."""
+LEAST_POSES = 10
+"""So many poses of a source make that mean worth a comparison; of as few in a row does a source come back."""
+LEAST_GATED = 3
+JUMP_PART = 0.7
+"""Of the squared way out of the gate, made at once."""
+APART_STDS = 3.0
+"""Two sources contradict each other where their mean innovations are further apart than this, by their own noise."""
+_NAN3 = (math.nan, math.nan, math.nan)
+
+
+class Standing(enum.Enum):
+    """What is held of a source."""
+
+    WAITING = "waiting"
+    GOOD = "good"
+    JUMPED = "jumped"
+    DEVIATES = "deviates"
+    LOST = "lost"
+
+
+@dataclass(slots=True)
+class Source:
+    """What one source has done; `came_ns` is when its newest pose came, `good_ns` the stamp of the newest accepted."""
+
+    label: str
+    standing: Standing = Standing.WAITING
+    came_ns: int | None = None
+    good_ns: int | None = None
+    latency_s: float = math.nan
+    position_std_m: float = math.nan
+    yaw_std_rad: float = math.nan
+    accepted: int = 0
+    outliers: int = 0
+    refused: int = 0
+    in_a_row: int = 0
+    """Accepted poses since the last that was not; of gated ones the negative."""
+    left_by_jump: bool = False
+    innovation: list[float] = field(default_factory=lambda: list(_NAN3))
+    variance: list[float] = field(default_factory=lambda: list(_NAN3))
+    means_of: int = 0
+    _last: Triple = _NAN3
+
+    def forget_course(self) -> None:
+        """The estimate is elsewhere now: what poses were off before says nothing."""
+        self.in_a_row, self.left_by_jump, self.means_of = 0, False, 0
+        self.innovation, self.variance, self._last = list(_NAN3), list(_NAN3), _NAN3
+
+    def judged(self, reason: PoseReason, innovation: Triple | None, variance: Triple | None) -> None:
+        """Take in what the filter made of a pose."""
+        if reason is PoseReason.GATED and innovation is not None and variance is not None:
+            if self.in_a_row > 0:
+                self.left_by_jump = self._jumped(innovation)
+            self.outliers += 1
+            self.in_a_row = min(self.in_a_row, 0) - 1
+        elif reason.accepted:
+            self.accepted += 1
+            self.in_a_row = max(self.in_a_row, 0) + 1
+            if reason is PoseReason.ACCEPTED and innovation is not None and variance is not None:
+                self._average(innovation, variance)
+                self._last = innovation
+        else:
+            self.refused += 1
+
+    def _jumped(self, innovation: Triple) -> bool:
+        """Whether nearly all of the way out of the gate was made since the pose before."""
+        step = whole = 0.0
+        for new, old, spread in zip(innovation, self._last, self.variance, strict=True):
+            if math.isfinite(new - old) and spread > 0.0:
+                step += (new - old) ** 2 / spread
+                whole += new**2 / spread
+        return step > JUMP_PART * whole > 0.0
+
+    def _average(self, innovation: Triple, variance: Triple) -> None:
+        self.means_of += 1
+        for index, (value, spread) in enumerate(zip(innovation, variance, strict=True)):
+            if math.isfinite(value):
+                old, old_spread = self.innovation[index], self.variance[index]
+                self.innovation[index] = old + MEAN_WEIGHT * (value - old) if math.isfinite(old) else value
+                self.variance[index] = (
+                    old_spread + MEAN_WEIGHT * (spread - old_spread) if math.isfinite(old_spread) else spread
+                )
+
+
+class PoseSources:
+    """Follows the sources of one estimate; pure, and the same calls give the same verdicts."""
+
+    def __init__(self, labels: Sequence[str], timeout_s: float) -> None:
+        self.all = tuple(Source(label) for label in labels)
+        self.contradiction = ""
+        """Which two contradict each other, in words, while the estimate must not be driven by; else empty."""
+        self._timeout_ns = round(timeout_s * 1e9)
+        self._said: list[str] = []
+
+    def take(
+        self, number: int, t_ns: int, now_ns: int, stds: tuple[float, float], reason: PoseReason,
+        innovation: Triple | None, variance: Triple | None,
+    ) -> None:  # fmt: skip
+        """Take in a pose of a source: stamp, arrival, standard deviations (m, rad) and what the filter made of it."""
+        if not 0 <= number < len(self.all):
+            return
+        source = self.all[number]
+        age_s = (now_ns - t_ns) * 1e-9
+        first = not math.isfinite(source.latency_s)
+        source.latency_s = age_s if first else source.latency_s + MEAN_WEIGHT * (age_s - source.latency_s)
+        source.came_ns, (source.position_std_m, source.yaw_std_rad) = now_ns, stds
+        if reason is PoseReason.REINITIALISED:
+            for one in self.all:
+                one.forget_course()
+        source.judged(reason, innovation, variance)
+        if reason.accepted:
+            source.good_ns = max(t_ns, source.good_ns or t_ns)
+
+    def step(self, now_ns: int) -> None:
+        """Judge the sources at the time of a tick; with one alone there is nothing to judge."""
+        if len(self.all) < 2:
+            return
+        for source in self.all:
+            self._judge(source, now_ns)
+        apart = self._apart()
+        if apart and not self.contradiction:
+            self._said.append(f"{apart}; the task stops, as nobody can say which is right")
+        if self.contradiction and not apart:
+            self._said.append("no source contradicts another any more")
+        self.contradiction = apart
+
+    def news(self) -> list[str]:
+        """Sentences for a person since the last call."""
+        said, self._said = self._said, []
+        return said
+
+    def is_good(self, number: int) -> bool:
+        """Whether poses of this source are believed; of a single one they always are."""
+        return len(self.all) < 2 or self.all[number].standing is Standing.GOOD
+
+    def counts(self) -> dict[str, int]:
+        """Accepted poses, outliers and refused ones of each source by name, where there are several."""
+        if len(self.all) < 2:
+            return {}
+        return {
+            f"{one.label} {name}": getattr(one, name)
+            for one in self.all
+            for name in ("accepted", "outliers", "refused")
+        }
+
+    def status(self, now_ns: int) -> list[dict[str, Any]]:
+        """Each source for a person or page; what is not known is None."""
+        return [
+            {
+                "source": one.label,
+                "standing": one.standing.value if len(self.all) > 1 else None,
+                "age_s": None if one.came_ns is None else (now_ns - one.came_ns) * 1e-9,
+                "latency_s": _known(one.latency_s),
+                "position_std_m": _known(one.position_std_m),
+                "yaw_std_rad": _known(one.yaw_std_rad),
+                "accepted": one.accepted,
+                "outliers": one.outliers,
+                "refused": one.refused,
+            }
+            for one in self.all
+        ]
+
+    def _judge(self, source: Source, now_ns: int) -> None:
+        before = source.standing
+        if source.came_ns is None:
+            return
+        if now_ns - source.came_ns > self._timeout_ns:
+            source.standing = Standing.LOST
+        elif source.in_a_row <= -LEAST_GATED and now_ns - (source.good_ns or 0) > self._timeout_ns:
+            source.standing = Standing.JUMPED if source.left_by_jump else Standing.DEVIATES
+        elif source.in_a_row >= LEAST_POSES or (source.in_a_row > 0 and before in (Standing.WAITING, Standing.LOST)):
+            source.standing = Standing.GOOD
+        if source.standing is before:
+            return
+        good = ", ".join(one.label for one in self.all if one.standing is Standing.GOOD)
+        going_on = f"going on with {good}" if good else "no other is left"
+        if source.standing is Standing.LOST:
+            source.forget_course()
+            self._said.append(f"{source.label}: lost, no pose for {self._timeout_ns * 1e-9:g} s; {going_on}")
+        elif source.standing is Standing.JUMPED:
+            self._said.append(f"{source.label}: jumped against the wheels and is left out; {going_on}")
+        elif source.standing is Standing.GOOD:
+            self._said.append(f"{source.label}: its poses are used")
+
+    def _apart(self) -> str:
+        """Which sources do not agree, and nobody knows who is right."""
+        live = [one for one in self.all if one.standing in (Standing.GOOD, Standing.DEVIATES)]
+        for one in live:
+            others = [other for other in live if other is not one and other.standing is Standing.GOOD]
+            if one.standing is Standing.DEVIATES and others:
+                return f"{one.label} and {others[0].label} contradict each other beyond their stated noise"
+        for one, other in combinations([one for one in live if one.means_of >= LEAST_POSES], 2):
+            words = _difference(one, other)
+            if words:
+                return f"{one.label} and {other.label} contradict each other: {words} beyond their stated noise"
+        return ""
+
+
+def _difference(one: Source, other: Source) -> str:
+    """By how much two sources differ, where that is more than their noise; else empty."""
+    (x, y, yaw), (xx, yy, tt) = _minus(one.innovation, other.innovation), _plus(one.variance, other.variance)
+    if x * x / xx + y * y / yy > APART_STDS**2:
+        return f"{math.hypot(x, y):.2f} m apart,"
+    if math.isfinite(yaw) and yaw * yaw / tt > APART_STDS**2:
+        return f"{abs(yaw):.2f} rad apart,"
+    return ""
+
+
+def _minus(one: Iterable[float], other: Iterable[float]) -> Iterator[float]:
+    return (a - b for a, b in zip(one, other, strict=True))
+
+
+def _plus(one: Iterable[float], other: Iterable[float]) -> Iterator[float]:
+    return (a + b for a, b in zip(one, other, strict=True))
+
+
+def _known(value: float) -> float | None:
+    return value if math.isfinite(value) else None

@@ -1,0 +1,182 @@
+"""The stack with two pose sources in robot.toml: the robot's own poses, and datagrams through a real socket."""
+
+import json
+import socket
+
+import pytest
+
+from disco_hw.config import load_robot_config
+from disco_hw.daemon.check import pose_source_checks
+from disco_hw.daemon.status import counters, status
+from disco_hw.errors import InputError
+from disco_hw.log import records
+from disco_hw.log.load import load_drive
+from disco_hw.log.recorder import RecorderStats
+from disco_hw.runtime.assembly import make_planner, pose_source_of
+from disco_hw.runtime.replay import replay
+from disco_hw.runtime.robot_setup import load_setup
+from disco_hw.runtime.supervisor import UserRequest
+from drivers.types import PoseSample
+from tests.runtime.simulated import ROBOT_FILE, simulated_stack
+
+
+@pytest.fixture
+def port():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened:
+        opened.bind(("127.0.0.1", 0))
+        return opened.getsockname()[1]
+
+
+def robot_toml(directory, lines):
+    path = directory / "robot.toml"
+    text = ROBOT_FILE.read_text(encoding="utf-8").replace(
+        'file = "wombot_model.toml"', f'file = "{ROBOT_FILE.parent / "wombot_model.toml"}"'
+    )
+    path.write_text(f"{text}\n{lines}", encoding="utf-8")
+    return path
+
+
+class Bench:
+    """The stack on its circle; datagrams say where the robot truly is, `off_m` east of it, or nothing for None."""
+
+    def __init__(self, directory, port):
+        also = f'[[pose.also]]\nsource = "udp"\nport = {port}\norigin = [1.0, 0.0, 0.0]\n'
+        file = robot_toml(directory, f'[pose]\nsource = "robot"\n{also}')
+        setup = load_setup(file)
+        self.stack = simulated_stack(make_planner(setup.config, setup.model), robot_file=file)
+        self.off_m = 0.0
+        self._sender = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._sender.connect(("127.0.0.1", port))
+        self._advance = self.stack.robot.advance
+        self.stack.robot.advance = self.advance
+
+    def advance(self, now_us):
+        self._advance(now_us)
+        if now_us % 100_000 == 0 and self.off_m is not None:
+            truth = self.stack.robot.truth
+            said = {"x_m": truth.x_m + self.off_m - 1.0, "y_m": truth.y_m, "position_std_m": 0.02, "age_s": 0.0}
+            self._sender.send(json.dumps(said).encode())
+
+    def start(self):
+        self.stack.run(1.5)
+        self.stack.run(0.5, UserRequest.ARM)
+        return self.stack.run(1.5, UserRequest.START)[-1].output.running
+
+    def close(self):
+        self._sender.close()
+        self.stack.core.pose_source.close()
+
+    def said(self):
+        return " | ".join(
+            record.text for _, tick in self.stack.recorder.ticks for record in tick if isinstance(record, records.Event)
+        )
+
+    def poses(self):
+        return [sample for _, tick in self.stack.recorder.ticks for sample in tick if isinstance(sample, PoseSample)]
+
+
+@pytest.fixture
+def bench(tmp_path, port):
+    made = Bench(tmp_path, port)
+    yield made
+    made.close()
+
+
+def test_both_are_fused_shown_recorded_and_replayed_bit_for_bit(bench, tmp_path):
+    assert bench.start()
+    bench.off_m = 0.6
+    bench.stack.run(1.5)
+    bench.off_m = None
+    last = bench.stack.run(1.5)[-1]
+    assert last.output.running
+    now = status(bench.stack.core, {}, RecorderStats())["poses"]
+    assert [one["source"] for one in now] == ["robot", "udp"]
+    assert [one["standing"] for one in now] == ["good", "lost"]
+    assert now[1]["origin"] == [1.0, 0.0, 0.0]
+    assert now[1]["outliers"] >= 12
+    assert now[0]["latency_s"] == pytest.approx(0.03, abs=0.02)
+    assert "poses: udp: jumped against the wheels and is left out; going on with robot" in bench.said()
+    assert "poses: udp: lost, no pose for 1 s; going on with robot" in bench.said()
+    assert {pose.source for pose in bench.poses()} == {0, 1}
+    log = tmp_path / "run.mcap"
+    bench.stack.write_log(log)
+    report = replay(log)
+    assert report.ok, report.as_text()
+    # What compares poses takes one source: from one to the other is no motion.
+    assert load_drive(log).poses.x_m.size == sum(pose.source == 0 for pose in bench.poses())
+
+
+def test_two_that_contradict_each_other_stop_the_task_and_say_so(bench):
+    bench.off_m = 0.0
+    assert bench.start()
+    for tenth in range(40):
+        bench.off_m = 0.005 * tenth
+        bench.stack.run(0.1)
+    assert not bench.stack.core.last.output.running
+    why = "udp and robot contradict each other beyond their stated noise; find out which is wrong and take it out of"
+    assert f"task stopped: {why} [pose]" in bench.said()
+
+
+def test_what_is_learnt_is_learnt_from_the_first_alone(bench):
+    fed = []
+    bench.stack.core.adaptation.feed = lambda _now_ns, readings: fed.extend(readings.poses)
+    bench.stack.run(2.0)
+    assert fed
+    assert {pose.source for pose in fed} == {0}
+
+
+def test_counters_of_each_are_recorded(bench):
+    bench.stack.run(1.5)
+    made = counters(bench.stack.core, LoopFigures(), RecorderStats(), 0)
+    assert made.poses["udp accepted"] > 5
+    assert made.poses["robot outliers"] == 0
+
+
+class LoopFigures:
+    ticks = overruns = skipped_periods = 0
+
+
+@pytest.mark.parametrize(
+    ("lines", "words"),
+    [
+        ('[[pose.also]]\nsource = "sonar"\n', r'pose\.also\[0\]\.source: there is no source "sonar"; write one of'),
+        ('[[pose.also]]\nport = 7\n', r"pose\.also\[0\]: does not say which source; add source, one of"),
+        ('[[pose.also]]\nsource = "udp"\nbaud = 9600\n', r'also\[0\]\.baud: a field of the source "nmea", and'),
+        ('[[pose.also]]\nsource = "udp"\nrate_hz = 50.0\n', r"also\[0\]\.rate_hz: .*; remove it"),
+        ('[[pose.also]]\nsource = "udp"\noffset = [inf, 0.0]\n', r"also\[0\]\.offset: not a finite number"),
+        ('[[pose.also]]\nsource = "udp"\nprot = 7\n', r"pose\.also.*prot: no such field; did you mean port"),
+        ('[[pose.also]]\nsource = "udp"\nposition_unit = "km"\n', r"pose\.also.*position_unit: .*write one of"),
+        ('[[pose.also]]\nsource = "udp"\n[[pose.also.also]]\nsource = "robot"\n', r"also\[0\]\.also: sources are not"),
+    ],
+)  # fmt: skip
+def test_a_further_source_that_is_wrong_is_one_line(tmp_path, lines, words):
+    with pytest.raises(InputError, match=words):
+        load_robot_config(robot_toml(tmp_path, lines))
+
+
+def test_two_of_one_kind_are_numbered_and_a_port_taken_twice_is_said(tmp_path, port):
+    lines = f'[pose]\nsource = "udp"\nport = {port}\n[[pose.also]]\nsource = "udp"\nport = {port}\n'
+    config = load_robot_config(robot_toml(tmp_path, lines))
+    assert config.pose.labels() == ("udp 1", "udp 2")
+    with pytest.raises(InputError, match=rf"pose\.source udp 2: 127\.0\.0\.1:{port}: Address already in use"):
+        pose_source_of(config)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as again:
+        # The first is closed with it.
+        again.bind(("127.0.0.1", port))
+
+
+def test_check_shows_each_and_that_two_disagree(tmp_path):
+    lines = (
+        '[pose]\nsource = "udp"\n[[pose.also]]\nsource = "robot"\n[[pose.also]]\nsource = "nmea"\noffset = [0.1, 0.0]\n'
+    )
+    told = load_robot_config(robot_toml(tmp_path, lines)).pose
+    poses = [PoseSample(t, t + 30_000_000, 1.0, 2.0, 0.5, 0.01, 0.02) for t in range(30)]
+    assert pose_source_checks(load_robot_config(ROBOT_FILE).pose, poses) == []
+    poses += [PoseSample(t, t + 5_000_000, 1.5, 2.0, 0.5, 0.01, 0.02, source=1) for t in range(9)]
+    found = {check.name: f"{check.level.value} {check.text}" for check in pose_source_checks(told, poses)}
+    assert found["poses udp"].startswith("ok 10 a second, 30 ms old, 0.01 m, 0.02 rad; frame at [0.0, 0.0, 0.0]")
+    assert found["poses nmea"].endswith("none came; frame at [0.0, 0.0, 0.0], sensor at [0.1, 0.0]; see that it sends")
+    assert "0.50 m apart, beyond their stated noise" in found["poses udp and robot"]
+    turned = [PoseSample(t, t, 1.0, 2.0, 0.9, 0.01, 0.02, source=1) for t in range(9)]
+    (last,) = [each for each in pose_source_checks(told, [*poses[:30], *turned]) if "apart" in each.text]
+    assert last.text.startswith("0.40 rad apart,")
