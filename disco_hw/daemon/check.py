@@ -188,6 +188,8 @@ def _ask_robot(transport: Transport, driver: Driver, pose_source: PoseSource) ->
     poses: list[PoseSample] = []
     pose_news = ""
     told: list[RobotStatus] = []
+    # What came while nobody listened would count as of the time of listening.
+    transport.receive()
     start_ns = time.monotonic_ns()
     driver.link_up(start_ns)
     end_ns = start_ns + round(_LISTEN_S * 1e9)

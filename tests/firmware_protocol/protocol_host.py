@@ -16,13 +16,15 @@ class ProtocolHost:
     """Sends `request` (a HOST_STATE's signals) every 50 ms and `command` (a WHEEL_COMMAND's) every 20 ms, if not None.
 
     `heard` keeps what came since it was cleared last: (time in ns, decoded frame). `proves`: whether commands are
-    proved where there is a key. `damaged` counts what came and could not be decoded.
+    proved where there is a key, and `valid_for_s` how long they hold unless a test says otherwise. `damaged` counts
+    what came and could not be decoded.
     """
 
-    def __init__(self, end, key=None, first_session=1):
+    def __init__(self, end, key=None, first_session=1, valid_for_s=0.1):
         self.end = end
         self.prover = Prover(key, CODEC) if key is not None else None
         self.proves = True
+        self.valid_for_s = valid_for_s
         self.request = None
         self.command = None
         self.heard = []
@@ -120,7 +122,8 @@ class ProtocolHost:
             answer = challenge_answer(self.challenge, session, CODEC.dbc_hash) if request == "ARM" else 0
         self.send("HOST_STATE", request=request, session=session, challenge_answer=answer, host_fault=host_fault)
 
-    def wheel_command(self, left=0.0, right=0.0, mode="SPEED", valid_for=0.1, session=None):
+    def wheel_command(self, left=0.0, right=0.0, mode="SPEED", valid_for=None, session=None):
+        valid_for = self.valid_for_s if valid_for is None else valid_for
         session = session if session is not None else (self.request or {}).get("session", 0)
         self.send("WHEEL_COMMAND", mode=mode, left_speed=left, right_speed=right, valid_for=valid_for, session=session)
 

@@ -59,7 +59,7 @@ def test_a_board_drives_a_virtual_robot_and_stops_when_it_goes(tmp_path, program
         sim = SimProcess(tmp_path, board.plant)
         transport = serial.make_transport(port=board.link)
         transport.open()
-        host = ProtocolHost(LinkEnd(transport), first_session=3)
+        host = ProtocolHost(LinkEnd(transport), first_session=3, valid_for_s=0.5)
         try:
             host.settle()
             assert host.latest["BUILD"]["board_id"] == 0x8007

@@ -145,7 +145,7 @@ def drive_beside_another_node(path):
     transport = can_transport.make_transport(interface="unixcan", channel=str(path))
     transport.open()
     with can.Bus(interface="unixcan", channel=str(path)) as other:
-        host = ProtocolHost(LinkEnd(transport), first_session=5)
+        host = ProtocolHost(LinkEnd(transport), first_session=5, valid_for_s=0.5)
         try:
             host.settle()
             host.to_driving()

@@ -34,6 +34,10 @@ disco_reset_cause_t port_start(disco_config_t *config)
     link_line = atoi(getenv("LINK"));
     plant_line = atoi(getenv("PLANT"));
     config->board_id = 7u;
+    /* As long as may be: a host of the tests that is held up for 0.1 s has not fallen silent. */
+    config->command_timeout_us = 500000u;
+    config->drive_off_timeout_us = 2000000u;
+    config->host_state_timeout_us = 2000000u;
     return DISCO_RESET_POWER_ON;
 }
 
