@@ -90,7 +90,7 @@ bench: $(PEERS)/.installed
 	$(PEERS)/bin/python -m tools.bench $(PARTS)
 
 gap-study: $(STAMP)
-	$(BIN)/python -m tools.gap_study
+	$(BIN)/python -m $(if $(filter mujoco,$(KIND)),tools.gap_mujoco,tools.gap_study $(KIND))
 
 soak: $(STAMP)
 	$(BIN)/python -m tools.soak --minutes 30

@@ -24,8 +24,8 @@ from tools import gap_jobs
 from tools.gap_jobs import KINDS, Job, Result, jobs
 from tools.gap_tables import summary, table, write
 
-_JUDGED = ("disco_hw/gap", "disco_hw/model", "disco_hw/log", "disco_hw/drive", "sim", "tools/gap_logs.py")
-_JUDGED_TOO = ("tools/gap_jobs.py",)
+_JUDGED = ("disco_hw/gap", "disco_hw/effects", "disco_hw/model", "disco_hw/log", "disco_hw/drive", "sim")
+_JUDGED_TOO = ("tools/gap_logs.py", "tools/gap_jobs.py", "tools/gap_mujoco.py", "tools/mujoco_robot.py")
 
 
 def revision() -> str:
