@@ -1,7 +1,8 @@
 """What models learnt from one half of a measured log predict of the other, end to end: the table of `docs/gap.md`.
 
 `DISCO_HW_DATA=FOLDER python -m tools.gap_halves [NAME...]`: logs whose path holds a NAME, all without one. For either
-half: the stage that is offered, and the errors 2 s ahead on the half that was not seen, of every stage.
+half: the stage that is offered, the errors 2 s ahead on the half that was not seen, of every stage, and how many of its
+95 % intervals hold what the other half says of the same parameters, where that knows them half as well or better.
 """
 
 from __future__ import annotations
@@ -24,8 +25,9 @@ from disco_hw.gap.find import model_of, offered_stage, search
 from disco_hw.gap.noise.body_noise import BodyNoise
 from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
 from disco_hw.gap.noise.wheel_noise import WheelNoise
-from disco_hw.gap.search.analysis import final_fit
+from disco_hw.gap.search.analysis import FinalFit, GapAnalysis, final_fit
 from disco_hw.gap.search.cross_validation import Chain, PredictionErrors, errors_of, smoothed_poses
+from disco_hw.gap.search.intervals import estimate_parameters
 from disco_hw.gap.search.stages import joint_predictions
 from disco_hw.gap.search.unnamed_terms import with_known_terms
 from disco_hw.gap.settings import DEFAULT_SETTINGS
@@ -51,6 +53,7 @@ class Half:
     offered: str
     names: tuple[str, ...]
     unseen: dict[str, PredictionErrors]
+    held: dict[str, bool]
     cpu_s: float
 
     def ratios(self, stage: str) -> tuple[float, float]:
@@ -94,43 +97,67 @@ def unseen_errors(drive: GriddedDrive, models: dict[str, Model], ahead_s: float 
     return errors
 
 
+def intervals_held(analysis: GapAnalysis, final: FinalFit, other: GapAnalysis) -> dict[str, bool]:
+    """Of each parameter that another half knows half as well or better: whether its interval holds that one's value."""
+    held = {}
+    for found, own, there in (
+        (analysis.body, final.body_estimates, other.body),
+        (analysis.wheels, final.wheel_estimates, other.wheels),
+    ):
+        if found is None or own is None or there is None:
+            continue
+        selector = there.plain or there.selector
+        same = estimate_parameters(replace(there, selector=selector, names=found.names, plain=None, unnamed=()))
+        for name, estimate in own.by_name.items():
+            value = same.by_name.get(name)
+            if value is not None and value.deviation <= 2.0 * estimate.deviation:
+                held[name] = estimate.low <= value.value <= estimate.high
+    return held
+
+
 def halves(path: Path) -> Iterator[Half]:
     """Both halves of a log, each learnt from and the other one predicted."""
     ticks, radius_m, axial_m = ROBOTS[path.parent.name]
     log, nominal = load_drive(path, ticks, radius_m), Model(radius_m, axial_m, 0.0)
     middle_s = 0.5 * (float(log.wheels.t_s[0]) + float(log.wheels.t_s[-1]))
     parts = between(log, -np.inf, middle_s), between(log, middle_s, np.inf)
-    for half in (0, 1):
+    analyses = []
+    for part in parts:
         began = time.process_time()
-        analysis, _ = search(parts[half], nominal)
+        analyses.append((search(part, nominal)[0], time.process_time() - began))
+    for half, (analysis, searched_s) in enumerate(analyses):
         if analysis.body is None:
             continue
+        began = time.process_time()
         final = final_fit(analysis)
         predictions = joint_predictions(analysis, final)
         offered = offered_stage(predictions.table(), analysis.found_any, DEFAULT_SETTINGS)
-        cpu_s = time.process_time() - began
+        cpu_s = searched_s + time.process_time() - began
+        held = intervals_held(analysis, final, analyses[1 - half][0])
         models = {stage: model_of(stage, nominal, analysis, final, predictions)[0] for stage in STAGES}
         names = tuple(
             name for found in (analysis.wheels, analysis.body) if found is not None
             for name in (*found.names, *(term.form for term in found.unnamed))
         )  # fmt: skip
         errors = unseen_errors(grid_drive(parts[1 - half]), models)
-        yield Half(path.stem, half + 1, offered, names, errors, cpu_s)
+        yield Half(path.stem, half + 1, offered, names, errors, held, cpu_s)
 
 
 def row(of: Half) -> str:
     """One line of the table: mm and mrad by stage, and the offered one against `timed`."""
     cells = [f"{1e3 * of.unseen[stage].position_m:.1f} / {1e3 * of.unseen[stage].yaw_rad:.0f}" for stage in STAGES]
     position, yaw = of.ratios(of.offered)
-    return f"| {of.log} {of.half} | {' | '.join(cells)} | {of.offered} | {position:.2f} / {yaw:.2f} |"
+    held = f"{sum(of.held.values())} of {len(of.held)}"
+    return f"| {of.log} {of.half} | {' | '.join(cells)} | {of.offered} | {position:.2f} / {yaw:.2f} | {held} |"
 
 
 def main(names: Sequence[str]) -> int:
     folder = Path(os.environ["DISCO_HW_DATA"])
     paths = [path for robot in ROBOTS for path in sorted((folder / robot).glob("*.csv"))]
     paths = [path for path in paths if not names or any(name in str(path) for name in names)]
-    print("| log, half learnt from | refitted, mm / mrad | timed | amended | offered | offered over timed |")
-    print("|---|---|---|---|---|---|")
+    head = "refitted, mm / mrad | timed | amended | offered | offered over timed | intervals hold"
+    print(f"| log, half learnt from | {head} |")
+    print("|---|---|---|---|---|---|---|")
     found = []
     for path in paths:
         for half in halves(path):
@@ -139,6 +166,12 @@ def main(names: Sequence[str]) -> int:
     worse = [half for half in found if half.offered != "timed" and max(half.ratios(half.offered)) > 1.05]
     better = [half for half in found if min(half.ratios(half.offered)) < 0.8 and max(half.ratios(half.offered)) <= 1.05]
     print(f"\noffered worse than timed by over 5 %: {len(worse)} of {len(found)}; better by 20 %: {len(better)}")
+    held = [inside for half in found for inside in half.held.values()]
+    print(f"95 % intervals that hold the other half's value: {sum(held)} of {len(held)}")
+    missed = sorted(
+        f"{half.log} {half.half} {name}" for half in found for name, inside in half.held.items() if not inside
+    )
+    print(f"not: {', '.join(missed)}; CPU {sum(half.cpu_s for half in found):.0f} s")
     return 0
 
 

@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +18,11 @@ from disco_hw.errors import LogError, WorkError
 from disco_hw.gap.data.gridded_drive import grid_drive
 from disco_hw.gap.data.layout import BASE_COUNT, BODY, DELAYED_BY, WHEEL, Layout
 from disco_hw.gap.report.amend import amended_model, at_joint_fit, carried_terms, channel_estimates, simple_model
-from disco_hw.gap.report.findings import STAGES, GapReport, reached_horizon_s
+from disco_hw.gap.report.findings import STAGES, GapReport, Provenance, reached_horizon_s
 from disco_hw.gap.report.injection import finder, proved
 from disco_hw.gap.report.judge import (
     Measured,
+    across_logs,
     blind_spot_findings,
     candidate_evidence,
     channel_findings,
@@ -33,14 +35,16 @@ from disco_hw.gap.report.judge import (
 from disco_hw.gap.report.page import as_text, page
 from disco_hw.gap.search.analysis import FinalFit, GapAnalysis, final_fit
 from disco_hw.gap.search.channel_search import search_body, search_wheels
-from disco_hw.gap.search.cross_validation import PredictionErrors, beats, beats_throughout, clearly_worse, worse_by
+from disco_hw.gap.search.cross_validation import PredictionErrors, beats, clearly_worse, surely_beats, worse_by
 from disco_hw.gap.search.intervals import ChannelEstimates
 from disco_hw.gap.search.richest_model import LATE_COLUMNS, candidates_of
 from disco_hw.gap.search.stages import StagePredictions, joint_predictions, prune, stage_predictions
 from disco_hw.gap.search.unnamed_terms import with_known_terms
+from disco_hw.gap.search.wheel_predictions import only_timed, wheel_table
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GapSettings
 from disco_hw.log.drive import DriveLog, concatenate
 from disco_hw.log.load import load_drive
+from disco_hw.log.provenance import version
 from disco_hw.model import Model, load_model, save_model
 from disco_hw.reports.outputs import as_json, refuse_directory
 
@@ -76,7 +80,9 @@ def find_gap(
     effects, doubtful = sort_out(named, Measured(analysis.drive, (float(geometry[0]), float(geometry[1]))))
     predictions = joint_predictions(analysis, final) if analysis.body is not None else None
     gap = {} if predictions is None else predictions.table()
-    offered = offered_stage(gap, bool(named or unnamed), settings)
+    wheels = wheel_table(analysis)
+    # Without poses the wheels decide, where geometry says nothing: as given, timed or amended.
+    offered = offered_stage(gap or _of_wheels(wheels), bool(named or unnamed), settings)
     spots = blind_spot_findings(analysis, named, top_rad_s)
     if prove:
         spots = proved(spots, finder(analysis, say), settings.report.proved_claims)
@@ -97,21 +103,27 @@ def find_gap(
         pictures=_drawn(analysis, gap) if pictures else {},
         seconds=time.perf_counter() - began,
         settings=settings,
+        wheels=wheels,
+        across=across_logs(analysis, log.begins_s),
     )
+
+
+def _of_wheels(wheels: Mapping[str, Mapping[float, PredictionErrors]]) -> dict[str, Mapping[float, PredictionErrors]]:
+    return {**wheels, "refitted": wheels["nominal"]} if wheels else {}
 
 
 def offered_stage(gap: Mapping[str, Mapping[float, PredictionErrors]], found: bool, settings: GapSettings) -> str:
     """The stage whose model is handed out: the amended one unless a plainer one predicts held-out data better.
 
-    Better too where the amended one is so by a single stretch only: another drive need not have its like. Where
-    predictions cannot be compared it is the amended one too.
+    Better too where the amended one is so by a single stretch only, or by little where few stretches tell: another
+    drive need not have their like. Where predictions cannot be compared it is the amended one too.
     """
     horizon_s, prediction = reached_horizon_s(gap, settings.prediction), settings.prediction
     if not gap or not math.isfinite(gap["amended"][horizon_s].position_m):
         return "amended"
     refitted, timed, amended = (gap[stage][horizon_s] for stage in STAGES[1:4])
     plainer, plain = ("refitted", refitted) if beats(timed, refitted, prediction) else ("timed", timed)
-    if beats_throughout(plain, amended, prediction) or (not found and not clearly_worse(plain, amended, prediction)):
+    if surely_beats(plain, amended, prediction) or (not found and not clearly_worse(plain, amended, prediction)):
         return "amended"
     return plainer
 
@@ -122,6 +134,11 @@ def model_of(
     """The model of a stage with the joint Gaussian of its parameters, and notes."""
     if predictions is not None and stage != "amended":
         return simple_model(model, *predictions.joint[stage])
+    if analysis.body is None and analysis.wheels is not None and stage != "amended":
+        if stage == "refitted":
+            return model, ()
+        timed = replace(analysis, wheels=only_timed(analysis.wheels))
+        return model_of("amended", model, timed, final_fit(timed), None)
     if predictions is not None:
         of, joint = predictions.joint["amended"]
 
@@ -249,6 +266,9 @@ def gap(
     start = load_model(model) if model is not None else Model.nominal(config.robot)
     drive = load_drive(list(logs), config.robot.ticks_per_rev, config.robot.wheel_radius_m)
     report = find_gap(drive, start, progress, pictures=True, prove=True, top_rad_s=config.robot.max_wheel_speed_rad_s)
+    made = datetime.now().astimezone().isoformat(timespec="minutes")
+    given = None if model is None else str(model)
+    report = replace(report, provenance=Provenance(config.robot.name, str(robot), given, made, version(), str(out)))
     try:
         out.mkdir(parents=True, exist_ok=True)
         (out / "report.json").write_text(as_json(report.as_dict(), indent=1), encoding="utf-8")

@@ -74,7 +74,8 @@ class DriveLog:
     """One or several drives; what was not measured has arrays of length 0.
 
     Times start near 0 and increase within each array. Nothing may be predicted across a change of `segment`, which is
-    numbered alike in all arrays. `notes` say what was ignored or filled in, for a person.
+    numbered alike in all arrays. `notes` say what was ignored or filled in, for a person. `begins_s`: when each of
+    several drives begins.
     """
 
     sources: tuple[str, ...]
@@ -83,6 +84,7 @@ class DriveLog:
     poses: Poses
     gyro: Gyro
     notes: tuple[str, ...] = ()
+    begins_s: tuple[float, ...] = (0.0,)
 
     @property
     def end_s(self) -> float:
@@ -162,6 +164,7 @@ def concatenate(drives: Sequence[DriveLog]) -> DriveLog:
         poses=Poses(**fields("poses", "x_m", "y_m", "yaw_rad"), segment=segments("poses")),
         gyro=Gyro(**fields("gyro", "yaw_rate_rad_s"), segment=segments("gyro")),
         notes=tuple(note for drive in drives for note in drive.notes),
+        begins_s=tuple(shift + begin for drive, shift in zip(drives, shifts, strict=True) for begin in drive.begins_s),
     )
 
 

@@ -36,6 +36,8 @@ def test_drives_follow_each_other_without_touching():
     assert joined.sources == ("a", "b")
     assert joined.notes == ("note of a", "note of b")
     assert joined.segments == 3
+    assert joined.begins_s == (0.0, joined.commands.t_s[11])
+    assert concatenate([joined, drive("c", 1.0)]).begins_s[:2] == joined.begins_s
     t_s, segment = joined.commands.t_s, joined.commands.segment
     assert (np.diff(t_s) > 0.0).all()
     assert t_s[11] - t_s[10] > 1.0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from disco_hw.effects.registry import REGISTRY
@@ -67,6 +67,32 @@ class Doubt:
 
 
 @dataclass(frozen=True, slots=True)
+class AcrossLogs:
+    """A parameter in each of several logs of one robot, as (value, low, high), and whether they differ."""
+
+    name: str
+    values: tuple[tuple[float, float, float], ...]
+    differs: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Provenance:
+    """Whose logs were searched, with which files, when (ISO 8601) and by which version; where the answer lies."""
+
+    robot: str
+    robot_file: str
+    model_file: str | None
+    date: str
+    version: str
+    directory: str
+
+    @property
+    def go_on(self) -> str:
+        """The command that drives with the model that is handed out."""
+        return f"disco-hw run {self.robot_file} --model {self.directory}/model.toml"
+
+
+@dataclass(frozen=True, slots=True)
 class CandidateEvidence:
     """What a candidate's fit promised on top of what was accepted, or, if accepted, is worth."""
 
@@ -79,7 +105,11 @@ class CandidateEvidence:
 
 @dataclass(frozen=True)
 class GapReport:
-    """What `find_gap` returns; `model` is the one of the stage `offered`: the amended one, if it predicts best."""
+    """What `find_gap` returns; `model` is the one of the stage `offered`: the amended one, if it predicts best.
+
+    `gap` holds errors of poses by stage and horizon, `wheels` those of the wheels alone; either is empty where it could
+    not be judged. `across`: what several logs say of each parameter.
+    """
 
     sources: tuple[str, ...]
     channels: tuple[ChannelFinding, ...]
@@ -96,11 +126,14 @@ class GapReport:
     candidates: tuple[CandidateEvidence, ...] = ()
     pictures: dict[str, bytes] = field(default_factory=dict, repr=False)
     settings: GapSettings = DEFAULT_SETTINGS
+    wheels: dict[str, dict[float, PredictionErrors]] = field(default_factory=dict)
+    across: tuple[AcrossLogs, ...] = ()
+    provenance: Provenance | None = None
 
     @property
     def horizon_s(self) -> float:
         """How far ahead the answer looks."""
-        return reached_horizon_s(self.gap, self.settings.prediction)
+        return reached_horizon_s(self.gap or self.wheels, self.settings.prediction)
 
     def at_horizon(self, stage: str) -> PredictionErrors:
         """Errors of a stage as far ahead as the answer looks."""
@@ -161,6 +194,16 @@ class GapReport:
             ],
             "drive": self.drive,
             "gap": self._gap_dict(),
+            "wheels": [
+                {"horizon_s": horizon, **{stage: _errors_dict(of[horizon]) for stage, of in self.wheels.items()}}
+                for horizon in self.wheels.get("nominal", ())
+            ],
+            "offered": self.offered,
+            "across_logs": [
+                {"name": each.name, "values_ci95": [list(value) for value in each.values], "differs": each.differs}
+                for each in self.across
+            ],
+            "provenance": None if self.provenance is None else asdict(self.provenance),
             "notes": list(self.notes),
             "seconds": self.seconds,
         }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +13,14 @@ from disco_hw.effects.effect import Channel, Effect, Parameter
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.data.gridded_drive import GriddedDrive
 from disco_hw.gap.report.blind_spots import BlindSpot, blind_spots, experiment_of
-from disco_hw.gap.report.findings import CandidateEvidence, ChannelFinding, Doubt, EffectFinding, UnnamedFinding
+from disco_hw.gap.report.findings import (
+    AcrossLogs,
+    CandidateEvidence,
+    ChannelFinding,
+    Doubt,
+    EffectFinding,
+    UnnamedFinding,
+)
 from disco_hw.gap.report.misspecification import (
     Regime,
     in_words,
@@ -28,10 +35,12 @@ from disco_hw.gap.search.intervals import (
     ENCODER,
     GAIN,
     OUTSIDE_TESTS,
+    Z95,
     ChannelEstimates,
     ParameterEstimate,
     confounded_with,
-    halves_of,
+    in_logs,
+    in_thirds,
 )
 from disco_hw.gap.search.richest_model import candidates_of, parameters_of
 from disco_hw.gap.settings import GRID_STEP_S, ReportSettings
@@ -146,19 +155,41 @@ def residue_sentences(analysis: GapAnalysis) -> tuple[str, ...]:
 
 
 def drifting_parameters(analysis: GapAnalysis, final: FinalFit) -> tuple[str, ...]:
-    """Sentences on parameters of effects that are others early in a log than late: something warms up or wears."""
+    """Sentences on parameters of effects that go one way along a log: something warms up or wears."""
     settings, out = analysis.drive.settings.report, []
     for found, estimated in ((analysis.body, final.body_estimates), (analysis.wheels, final.wheel_estimates)):
         if found is None or estimated is None:
             continue
-        for name, half in halves_of(found).items():
-            apart = abs(half.late - half.early)
-            largest = max(abs(half.early), abs(half.late))
-            if "." in name and apart > max(settings.drift_sigmas * half.deviation, settings.drift_share * largest):
+        for name, thirds in in_thirds(found).items():
+            early, middle, late = (float(value) for value in thirds.values)
+            far = abs(late - early) > settings.drift_share * max(abs(early), abs(late))
+            sure = abs(thirds.apart(0, 2)) > settings.drift_sigmas
+            if "." in name and far and sure and min(early, late) <= middle <= max(early, late):
                 out.append(
-                    f"{name} drifts: {half.early:.3g} in the first half of the log, {half.late:.3g} in the second; "
-                    "its interval holds both"
+                    f"{name} drifts: {early:.3g} in the first third of the log, {middle:.3g} in the second, "
+                    f"{late:.3g} in the last"
                 )
+    return tuple(out)
+
+
+def across_logs(analysis: GapAnalysis, begins_s: Sequence[float]) -> tuple[AcrossLogs, ...]:
+    """Every parameter that each of several logs tells, and whether they differ in it by more than their noise."""
+    settings, out = analysis.drive.settings.report, []
+    for found in (analysis.body, analysis.wheels):
+        if found is None or len(begins_s) < 2:
+            continue
+        for name, logs in in_logs(found, begins_s).items():
+            if logs.values.size != len(begins_s):
+                continue
+            low, high = int(np.argmin(logs.values)), int(np.argmax(logs.values))
+            # A point of turning near the axle is compared with the robot's size.
+            size = found.fit.vector[1] if name == "x_icr_m" else np.abs(logs.values).max()
+            share = settings.drift_share if "." in name else settings.differ_share
+            far = logs.values[high] - logs.values[low] > share * size
+            reach = Z95 * logs.deviations
+            ends = np.column_stack([logs.values, logs.values - reach, logs.values + reach]).tolist()
+            values = tuple((value, least, most) for value, least, most in ends)
+            out.append(AcrossLogs(name, values, bool(far and logs.apart(low, high) > settings.drift_sigmas)))
     return tuple(out)
 
 

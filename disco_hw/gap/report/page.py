@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 
 from disco_hw.effects.registry import REGISTRY
@@ -20,10 +20,15 @@ def sentence(effect: EffectFinding) -> str:
     return f"{said} (before they come: a clock stamps too late)" if early else said
 
 
+_MOST_NAMES = 3
+
+
 def answer(report: GapReport) -> list[str]:
-    """The answer in at most three lines."""
+    """The answer in at most four lines: what is missing, how far predictions are off, what to drive next, going on."""
     if report.effects:
-        first = "; ".join(sentence(effect) for effect in report.effects) + "."
+        more = len(report.effects) - _MOST_NAMES
+        first = "; ".join(sentence(effect) for effect in report.effects[:_MOST_NAMES])
+        first += f"; and {more} more, listed below." if more > 0 else "."
     elif report.unnamed:
         first = f"Something is missing that has no name: {report.unnamed[0].form}."
     elif report.residue or report.doubtful:
@@ -31,30 +36,36 @@ def answer(report: GapReport) -> list[str]:
     else:
         first = "Nothing is missing that this log could show."
     lines = [first[0].upper() + first[1:]]
-    if report.gap:
+    if report.gap or report.wheels:
         lines.append(_gap_line(report))
     blind = [spot.name for spot in report.blind_spots if spot.blind]
     if blind:
-        drive = f": `{report.drive}` would" if report.drive else ""
-        lines.append(f"This log could not have shown {', '.join(blind)} of realistic size{drive}.")
+        names = ", ".join(blind) if len(blind) <= _MOST_NAMES else f"{len(blind)} effects, listed below,"
+        ask = f"Drive next: `{report.drive}`; this" if report.drive else "This"
+        lines.append(f"{ask} log could not have shown {names} of realistic size.")
+    if report.provenance is not None:
+        lines.append(f"Go on: `{report.provenance.go_on}`.")
     return lines
 
 
 def _gap_line(report: GapReport) -> str:
-    horizon = f"{report.horizon_s:g} s"
-    if not math.isfinite(report.at_horizon("refitted").position_m):
+    horizon, of = f"{report.horizon_s:g} s", report.gap or report.wheels
+    if not math.isfinite(of["timed"][report.horizon_s].position_m):
         return f"No stretch of the logs is long enough to see how far {horizon} predictions are off."
     off = {
-        stage: f"{1e3 * report.at_horizon(stage).position_m:.3g} mm and {report.at_horizon(stage).yaw_rad:.2g} rad"
-        for stage in STAGES
+        stage: f"{1e3 * errors[report.horizon_s].position_m:.3g} mm and {errors[report.horizon_s].yaw_rad:.2g} rad"
+        for stage, errors in of.items()
     }
+    last = f"the sensors' noise makes {off['floor']}" if "floor" in off else f"the model as given by {off['nominal']}"
     said = (
-        f"{horizon} ahead on held-out data the amended model errs by {off['amended']}, one with geometry, delay and "
-        f"lag alone (timed) by {off['timed']}; the sensors' noise makes {off['floor']}."
+        f"{horizon} ahead on held-out data {'the amended model errs' if report.gap else 'the amended wheels err'} by "
+        f"{off['amended']}, {'one with geometry, delay and' if report.gap else 'with a delay and a'} "
+        f"lag alone (timed) by {off['timed']}; {last}."
     )
     if report.offered == "amended":
         return said
-    return f"{said} The amended model does not beat it: model.toml is the {report.offered} one; drive with that."
+    offered = report.offered if report.gap or report.offered == "timed" else "given"
+    return f"{said} The amended model does not beat it: model.toml is the {offered} one; drive with that."
 
 
 def as_text(report: GapReport) -> str:
@@ -65,13 +76,28 @@ def as_text(report: GapReport) -> str:
         lines.append(f"{effect.channel}: {effect.name}: {values}{_confounded(effect)}")
     lines += [f"{term.channel}: unnamed: {term.form}{_confounded(term)}" for term in report.unnamed]
     lines += [f"doubtful: {doubt.name}: {doubt.why}" for doubt in report.doubtful]
-    lines += [*report.residue, *report.notes]
-    if report.gap:
-        lines += ["", f"{'ahead':>6} " + " ".join(f"{stage:>20}" for stage in STAGES)]
-        for horizon in report.gap["nominal"]:
-            cells = (_in_cell(report.gap[stage][horizon]) for stage in STAGES)
+    lines += [*report.residue, *_logs_in_words(report), *report.notes]
+    of = report.gap or report.wheels
+    if of:
+        title = "" if report.gap else "way and heading that the wheels make:"
+        lines += [title, f"{'ahead':>6} " + " ".join(f"{stage:>20}" for stage in of)]
+        for horizon in of["nominal"]:
+            cells = (_in_cell(of[stage][horizon]) for stage in of)
             lines.append(f"{horizon:4g} s  " + " ".join(f"{cell:>20}" for cell in cells))
     return "\n".join(lines)
+
+
+def _logs_in_words(report: GapReport) -> list[str]:
+    """What several logs have in common, and what differs from one to the next."""
+    if len(report.sources) < 2:
+        return []
+    common = ", ".join(each.name for each in report.across if not each.differs)
+    out = [f"the same in all {len(report.sources)} logs, of the robot: {common}"] if common else []
+    for each in report.across:
+        if each.differs:
+            values = ", ".join(f"{value:.3g} [{low:.3g}, {high:.3g}]" for value, low, high in each.values)
+            out.append(f"differs from log to log, of the surface, the load or the day: {each.name}: {values}")
+    return out or ["no parameter is known well enough in each log to compare them"]
 
 
 def _in_cell(errors: PredictionErrors) -> str:
@@ -86,41 +112,88 @@ def _confounded(finding: EffectFinding | UnnamedFinding) -> str:
 
 
 _CAPTIONS = {
-    "gap_by_horizon": "How far predictions are off, by how far ahead they look, on data not used for fitting; shaded: "
-    "95 % intervals. nominal: the model as given; refitted: its geometry fitted; timed: a command delay and a lag "
-    "too, all a careful engineer fits by hand; amended: with what was found; floor: what the sensors' noise makes.",
+    "gap_by_horizon": "How far predictions are off, by how far ahead they look, on data not used for fitting; the "
+    "errors' axis is logarithmic; shaded: 95 % intervals.",
     "gap_by_regime": "The same as far ahead as the answer looks, by what the robot was doing.",
     "where_command_to_wheel": "Where commands and wheels disagree. Bars that end at the line hold nothing but noise.",
     "where_wheel_to_body": "Where wheels and poses disagree. Bars that end at the line hold nothing but noise.",
     "worst_stretch": "The stretch in which the wheels and the model as it was lie furthest apart.",
 }
+_DEFINITIONS = {
+    "nominal": "the model as given",
+    "refitted": "its wheel radius, axial distance and centre of turning fitted, from commands to poses",
+    "timed": "a command delay and a motor lag too: what a careful engineer fits by hand",
+    "amended": "with everything that was found",
+    "floor": "what the noise of the sensors makes of a perfect model",
+    "held out": "predicted by what was fitted on other stretches of the log",
+    "evidence": "twice the gain in log likelihood, less the price of the parameters",
+    "95 %": "an interval that holds the value in 95 of 100 such drives",
+}
 
 
 def page(report: GapReport) -> str:
-    """The whole page."""
-    parts = [
-        f'<div class="answer">{"".join(f"<p>{escape(line)}</p>" for line in answer(report))}</div>',
-        f"<p>Verdict: <b>{report.verdict}</b>. Logs: {escape(', '.join(report.sources))}.</p>",
-    ]
+    """The whole page: the answer, the definitions in the margin, pictures, findings; expert tables folded."""
+    lines = "".join(f"<p>{_with_code(line)}</p>" for line in answer(report))
+    words = "".join(f"<dt>{name}</dt><dd>{escape(text)}</dd>" for name, text in _DEFINITIONS.items())
+    parts = [f'<div class="answer">{lines}</div>', _whence(report), f"<aside><dl>{words}</dl></aside>"]
     parts += [
         style.picture(data, name, _CAPTIONS.get(name, name.replace("_", " "))) for name, data in report.pictures.items()
     ]
-    if report.gap:
-        parts.append("<h2>The gap by what the robot was doing</h2>" + _by_regime(report))
-    parts.append("<h2>What is missing</h2>")
-    parts.append(_effects(report))
+    parts.append("<h2>What is missing</h2>" + _effects(report))
     if report.doubtful:
         doubts = (f"{doubt.name}: {doubt.why}" for doubt in report.doubtful)
         parts.append("<h2>What fits and is not to be believed</h2>" + _list(doubts))
     if report.residue:
         parts.append("<h2>What is still left</h2>" + _list(report.residue))
-    if report.gap:
-        parts.append("<h2>The gap on data not used for fitting</h2>" + _gap(report))
-    parts.append("<h2>Evidence of every candidate</h2>" + _candidates(report))
-    parts.append("<h2>What this log could not have shown</h2>" + _blind(report))
+    if len(report.sources) > 1:
+        parts.append("<h2>What the logs share, and what differs</h2>" + _across(report))
     if report.notes:
         parts.append("<h2>Notes</h2>" + _list(report.notes))
+    parts.append("<h2>For experts</h2>")
+    if report.gap:
+        parts.append(_folded("The gap on data not used for fitting", _gap(report.gap)))
+        parts.append(_folded("The gap by what the robot was doing", _by_regime(report)))
+    if report.wheels:
+        parts.append(_folded("The wheels alone: the way and the heading that they make", _gap(report.wheels)))
+    parts.append(_folded("Evidence of every candidate", _candidates(report)))
+    parts.append(_folded("What this log could not have shown", _blind(report)))
     return style.page("What the model misses", "\n".join(parts))
+
+
+def _with_code(line: str) -> str:
+    """A line as HTML, what stands between backticks as code."""
+    pieces = escape(line).split("`")
+    return "".join(f"<code>{piece}</code>" if k % 2 else piece for k, piece in enumerate(pieces))
+
+
+def _whence(report: GapReport) -> str:
+    """Verdict, logs, and whose, when and by what."""
+    said = f"Verdict: <b>{report.verdict}</b>. Logs: {escape(', '.join(report.sources))}."
+    made = report.provenance
+    if made is not None:
+        model = "its nominal model" if made.model_file is None else made.model_file
+        said += f" Robot: {escape(made.robot)} ({escape(made.robot_file)}), compared with {escape(model)}. "
+        said += f"Made {escape(made.date)} by disco-hw {escape(made.version)} in {report.seconds:.0f} s."
+    return f"<p>{said}</p>"
+
+
+def _folded(title: str, content: str) -> str:
+    return f"<details><summary>{escape(title)}</summary>{content}</details>"
+
+
+def _across(report: GapReport) -> str:
+    """Every parameter that each log tells, log by log."""
+    if not report.across:
+        return "<p>No parameter is known well enough in each log to compare them.</p>"
+    rows = [
+        (
+            each.name,
+            "differs: of the surface, the load or the day" if each.differs else "the same: of the robot",
+            *(f"{value:.4g} [{low:.4g}, {high:.4g}]" for value, low, high in each.values),
+        )
+        for each in report.across
+    ]
+    return _table(("parameter", "from log to log", *report.sources), rows)
 
 
 def _list(items: Iterable[str]) -> str:
@@ -158,17 +231,17 @@ def _effects(report: GapReport) -> str:
     return _table(head, rows)
 
 
-def _gap(report: GapReport) -> str:
+def _gap(of: Mapping[str, Mapping[float, PredictionErrors]]) -> str:
     """Position, heading and wheel speed by horizon, with bootstrap intervals over stretches of time."""
     rows = []
-    for horizon in sorted(report.gap["nominal"]):
-        errors = [report.gap[stage][horizon] for stage in STAGES]
+    for horizon in sorted(of["nominal"]):
+        errors = [of[stage][horizon] for stage in of]
         rows += [
             (f"{horizon:g} s", "position, mm", *(_with_interval(e.position_m, e.position_ci, 1e3) for e in errors)),
             ("", "heading, mrad", *(_with_interval(e.yaw_rad, e.yaw_ci, 1e3) for e in errors)),
             ("", "wheel speed, rad/s", *(_or_dash(e.wheel_rad_s) for e in errors)),
         ]
-    return _table(("ahead", "error (root mean square)", *STAGES), rows)
+    return _table(("ahead", "error (root mean square)", *of), rows)
 
 
 def _with_interval(value: float, interval: tuple[float, float], factor: float) -> str:

@@ -60,6 +60,21 @@ def beats_throughout(before: PredictionErrors, after: PredictionErrors, settings
     return all(_no_larger((float(a), float(b)), settings) for a, b in np.sqrt(without[1] / without[0]))
 
 
+def stretches_telling(errors: PredictionErrors) -> float:
+    """How many stretches of time hold the errors, of position or of heading, whichever fewer (Kish, 1965)."""
+    if errors.squares is None:
+        return math.inf
+    return float((errors.squares.sum(axis=0) ** 2 / np.maximum((errors.squares**2).sum(axis=0), 1e-300)).min())
+
+
+def surely_beats(before: PredictionErrors, after: PredictionErrors, settings: PredictionSettings) -> bool:
+    """Whether errors after beat those before throughout and, where few stretches tell, by far."""
+    if not beats_throughout(before, after, settings):
+        return False
+    few = stretches_telling(before) < settings.fewest_stretches
+    return not few or math.prod(_ratios(before, after)) ** 0.5 <= settings.far_better
+
+
 def _no_larger(ratios: tuple[float, float], settings: PredictionSettings) -> bool:
     return max(ratios) <= settings.worse and math.prod(ratios) ** 0.5 <= settings.level
 
@@ -155,7 +170,7 @@ def find_starts(channel: BodyChannel, poses: tuple[Array, Array], ahead_s: float
     ahead = round(ahead_s / GRID_STEP_S)
     node = node[np.isfinite(smooth[node, 0]) & np.isfinite(alone[node + ahead, 0])]
     block = np.floor(drive.t_s[node] / drive.settings.prediction.fold_s).astype(np.int64)
-    return Starts(node, smooth[node], alone[node + ahead], block, tuple(_regimes(channel, node, ahead)))
+    return Starts(node, smooth[node], alone[node + ahead], block, tuple(regimes_driven(channel, node, ahead)))
 
 
 def judged_horizon_s(channel: BodyChannel, poses: tuple[Array, Array]) -> float:
@@ -166,7 +181,7 @@ def judged_horizon_s(channel: BodyChannel, poses: tuple[Array, Array]) -> float:
     return next(reached, settings.reported_horizon_s)
 
 
-def _regimes(channel: BodyChannel, node: Index, ahead: int) -> list[str]:
+def regimes_driven(channel: BodyChannel | WheelChannel, node: Index, ahead: int) -> list[str]:
     """What the robot mostly does between start and end."""
     drive, p, settings = channel.drive, channel.geometry, channel.settings.prediction
     v = 0.5 * p[0] * drive.speed_rad_s.sum(axis=1)

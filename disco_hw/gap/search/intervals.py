@@ -5,7 +5,7 @@ And what is confounded by algebra: effects with the same equations, and one caus
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 
@@ -62,15 +62,12 @@ def estimate_parameters(found: ChannelResult) -> ChannelEstimates:
     columns = channel.layout.columns
     factors = np.array([inflation(best, channel, (index,)) for index in best.active])
     covariance = best.covariance() * np.sqrt(np.outer(factors, factors))
-    # Halves of a log that disagree by more than their noise say how much more is unknown.
-    halves = halves_of(found)
-    more = np.ones(len(best.active))
-    for place, index in enumerate(best.active):
-        if columns[index] in halves:
-            half, own = halves[columns[index]], float(covariance[place, place])
-            excess = max(0.25 * (half.late - half.early) ** 2 - 0.25 * half.deviation**2, 0.0)
-            more[place] = (1.0 + excess / max(own, 1e-300)) ** 0.5
-    covariance = covariance * np.outer(more, more)
+    # A parameter that wanders along a log, or from log to log, is no better known than by how much: another drive
+    # finds it elsewhere.
+    wandering = wandered(found)
+    own = np.maximum(np.diag(covariance), 1e-300)
+    more = np.array([(wandering.get(columns[index], 0.0) / own[place]) for place, index in enumerate(best.active)])
+    covariance = covariance * np.sqrt(np.outer(1.0 + more, 1.0 + more))
     deviations = np.sqrt(np.diag(covariance))
     by_name = {
         columns[index]: ParameterEstimate(
@@ -86,43 +83,88 @@ def estimate_parameters(found: ChannelResult) -> ChannelEstimates:
 
 
 @dataclass(frozen=True, slots=True)
-class Halves:
-    """A parameter in the first and in the second half of a log, and the standard deviation of the difference."""
+class InParts:
+    """A parameter in the parts of a log, in order, with the standard deviation of each, (K,)."""
 
-    early: float
-    late: float
-    deviation: float
+    values: Array
+    deviations: Array
+
+    @property
+    def variance_between(self) -> float:
+        """Variance of the parameter from part to part beyond that of its estimates (DerSimonian and Laird, 1986)."""
+        weight = self.deviations**-2.0
+        total = float(weight.sum())
+        mean = float(weight @ self.values) / total
+        excess = float(weight @ (self.values - mean) ** 2) - (self.values.size - 1)
+        return max(excess, 0.0) / (total - float((weight**2).sum()) / total)
+
+    def apart(self, one: int, other: int) -> float:
+        """How far two parts lie apart, in standard deviations of the difference."""
+        return float((self.values[other] - self.values[one]) / np.hypot(self.deviations[one], self.deviations[other]))
 
 
-def halves_of(found: ChannelResult) -> dict[str, Halves]:
-    """What each half of a log says of the parameters, to second order; without those of which one says little."""
+def wandered(found: ChannelResult) -> dict[str, float]:
+    """Variance of each parameter along a log, by full name: the largest of what several divisions of it show."""
+    blocks = np.unique(found.selector.channel.block)
+    largest: dict[str, float] = {}
+    for count in found.channel.settings.report.compared_parts:
+        edges = np.linspace(0, blocks.size, count + 1)[1:-1]
+        parts = np.searchsorted(edges, np.arange(blocks.size), side="right")
+        for name, one in in_parts(found, parts).items():
+            largest[name] = max(one.variance_between, largest.get(name, 0.0))
+    return largest
+
+
+def in_thirds(found: ChannelResult) -> dict[str, InParts]:
+    """What each third of a log says of the parameters."""
+    count = np.unique(found.selector.channel.block).size
+    return in_parts(found, 3 * np.arange(count) // max(count, 1))
+
+
+def in_logs(found: ChannelResult, begins_s: Sequence[float]) -> dict[str, InParts]:
+    """What each of several logs that were searched together says, each `begins_s` on the time of the blocks."""
+    channel = found.selector.channel
+    ends_s = (np.unique(channel.block) + 1) * channel.settings.grid.block_s
+    return in_parts(found, np.searchsorted(begins_s, ends_s))
+
+
+def in_parts(found: ChannelResult, parts: NDArray[np.int64]) -> dict[str, InParts]:
+    """What each part of a log says of the parameters, to second order; without those of which one says little.
+
+    `parts` (B,): the part of each block of time of the channel, in order.
+    """
     best, channel, layout = found.fit, found.selector.channel, found.selector.channel.layout
-    if not best.active:
+    labels = np.unique(parts)
+    if not best.active or labels.size < 2:
         return {}
     settings = channel.settings
-    normal, gradient = by_block(best, channel.block, settings.selection.block_lengths[1])
-    late = np.arange(normal.shape[0]) >= 0.5 * normal.shape[0]
-    if min(np.count_nonzero(late), np.count_nonzero(~late)) < 2:
-        return {}
-    parts = [(normal[inside], gradient[inside]) for inside in (~late, late)]
+    each = settings.selection.block_lengths[1]
+    normal, gradient = by_block(best, channel.block)
     whole = np.diag(normal.sum(axis=0))
-    enough = np.all([np.diag(of.sum(axis=0)) > settings.fit.half_known_share * whole for of, _ in parts], axis=0)
+    inside = [parts == label for label in labels]
+    least = settings.fit.part_known_share / labels.size
+    enough = np.all([np.diag(normal[of].sum(axis=0)) > least * whole for of in inside], axis=0)
     places = np.array(best.active)[enough]
     if not places.size:
         return {}
-    values, variance = [], np.zeros(places.size)
-    for of, pulls in parts:
-        blocks = of[:, enough][:, :, enough]
+    values, deviations = [], []
+    for of in inside:
+        # Neighbouring blocks err together: a few are taken as one.
+        group = np.arange(np.count_nonzero(of)) // each
+        blocks = normal[of][:, enough][:, :, enough]
+        pulls = gradient[of][:, enough]
         covariance = inverse(blocks.sum(axis=0))
-        step = -covariance @ pulls[:, enough].sum(axis=0)
-        # How much more than the noise model says the blocks of a half scatter about what it says itself.
-        left = (pulls[:, enough] + blocks @ step) @ covariance
-        variance += np.maximum(np.diag(covariance), (left**2).sum(axis=0))
+        step = -covariance @ pulls.sum(axis=0)
+        # How much more than the noise model says the blocks of a part scatter about what it says itself.
+        left = np.zeros((group[-1] + 1, places.size))
+        np.add.at(left, group, (pulls + blocks @ step) @ covariance)
+        variance = np.maximum(np.diag(covariance), (left**2).sum(axis=0))
+        deviations.append(np.sqrt(variance))
         values.append(np.clip(best.vector[places] + step, layout.low[places], layout.high[places]))
     columns = layout.columns
     return {
-        columns[index]: Halves(float(first), float(second), float(deviation))
-        for index, first, second, deviation in zip(places, *values, np.sqrt(variance), strict=True)
+        columns[index]: InParts(np.array([of[k] for of in values]), np.array([of[k] for of in deviations]))
+        for k, index in enumerate(places)
     }
 
 

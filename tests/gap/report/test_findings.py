@@ -8,7 +8,7 @@ import pytest
 
 from disco_hw.gap.find import offered_stage
 from disco_hw.gap.report.blind_spots import BlindSpot
-from disco_hw.gap.report.findings import STAGES, EffectFinding, GapReport, UnnamedFinding
+from disco_hw.gap.report.findings import STAGES, AcrossLogs, EffectFinding, GapReport, Provenance, UnnamedFinding
 from disco_hw.gap.report.page import answer, as_text, page, sentence
 from disco_hw.gap.search.cross_validation import PredictionErrors
 from disco_hw.gap.search.intervals import ParameterEstimate
@@ -105,3 +105,61 @@ def test_a_log_of_short_runs_is_answered_as_far_ahead_as_it_reaches():
     assert offered_stage(short.gap, True, DEFAULT_SETTINGS) == "amended"
     worse = {**short.gap, "amended": short.gap["nominal"]}
     assert offered_stage(worse, True, DEFAULT_SETTINGS) == "timed"
+
+
+FIVE = ("turn_slip", "side_slip", "deadband", "stiction", "motor_lag")
+MADE = Provenance("scout", "scout.toml", None, "2026-11-23T20:00+00:00", "0.1.0+gabc", "out/gap")
+
+
+def test_the_page_says_whose_logs_when_and_by_which_version_and_how_to_go_on():
+    made = replace(report(0.014), provenance=MADE)
+    html = page(made)
+    for said in ("scout", "2026-11-23T20:00+00:00", "0.1.0+gabc", "its nominal model"):
+        assert said in html
+    assert "<code>disco-hw run scout.toml --model out/gap/model.toml</code>" in html
+    assert made.as_dict()["provenance"]["version"] == "0.1.0+gabc"
+    assert "Go on" not in page(report(0.014))
+
+
+def test_the_page_defines_its_words_in_the_margin_and_folds_what_is_for_experts():
+    html = page(report(0.014))
+    margin = html[html.index("<aside>") : html.index("</aside>")]
+    for stage in STAGES:
+        assert f"<dt>{stage}</dt>" in margin
+    folded = html[html.index("For experts") :]
+    assert folded.count("<details>") == folded.count("</details>") == 4
+    assert "Evidence of every candidate" in folded
+    assert "Evidence of every candidate" not in html[: html.index("For experts")]
+
+
+def test_an_answer_of_many_names_is_short():
+    lag = ParameterEstimate(0.2, 0.1, 0.3)
+    effects = tuple(EffectFinding("motor_lag", "command_to_wheel", {"tau_s": lag}, 9.0) for _ in range(5))
+    lines = answer(replace(report(0.014, blind=FIVE), effects=effects))
+    assert lines[0].endswith("; and 2 more, listed below.")
+    assert lines[0].count("time constant") == 3
+    assert "this log could not have shown 5 effects, listed below, of realistic size" in lines[2]
+    assert "side_slip" not in lines[2]
+    few = answer(replace(report(0.014, blind=("turn_slip",)), effects=effects[:3]))
+    assert few[0].count("time constant") == 3
+    assert "more" not in few[0]
+    assert few[2].startswith(
+        "Drive next: `disco-hw drive ROBOT.toml --script spins`; this log could not have shown turn_"
+    )
+
+
+def test_what_logs_share_is_told_apart_from_what_differs():
+    shared = AcrossLogs("wheel_radius_m", ((0.06, 0.059, 0.061), (0.0601, 0.059, 0.061)), False)
+    other = AcrossLogs("axial_distance_m", ((0.4, 0.39, 0.41), (0.5, 0.49, 0.51)), True)
+    both = replace(report(0.014), sources=("a.csv", "b.csv"), across=(shared, other))
+    text = as_text(both)
+    assert "the same in all 2 logs, of the robot: wheel_radius_m" in text
+    assert "of the surface, the load or the day: axial_distance_m: 0.4 [0.39, 0.41], 0.5 [0.49, 0.51]" in text
+    html = page(both)
+    assert "<th>a.csv</th><th>b.csv</th>" in html
+    assert html.count("the same: of the robot") == html.count("differs: of the surface") == 1
+    assert both.as_dict()["across_logs"][1] == {
+        "name": "axial_distance_m", "values_ci95": [[0.4, 0.39, 0.41], [0.5, 0.49, 0.51]], "differs": True,
+    }  # fmt: skip
+    assert "of the robot" not in as_text(replace(both, sources=("a.csv",)))
+    assert "to compare them" in as_text(replace(both, across=()))

@@ -12,12 +12,15 @@ from disco_hw.gap.search.channel_search import indices
 from disco_hw.gap.search.cross_validation import (
     Chain,
     PredictionErrors,
+    beats,
     clearly_worse,
     errors_of,
     floor_errors,
     fold_vectors,
     judged_horizon_s,
     smoothed_poses,
+    stretches_telling,
+    surely_beats,
 )
 from disco_hw.gap.search.end_to_end import Ahead
 from disco_hw.gap.search.least_squares import fit
@@ -123,3 +126,38 @@ def test_stages_are_compared_as_far_ahead_as_runs_are_long(window_s, judged_s):
     ahead = Ahead.of(channel, None, poses)
     assert [ahead_s for ahead_s, _ in ahead.starts] == ([1.0, 2.0] if window_s is None else [judged_s])
     assert np.isfinite(errors_of(channel, None, both(channel.neutral), judged_s, poses).position_m)
+
+
+def in_stretches(position, yaw):
+    """Errors whose squares in stretches of time are these."""
+    squares = np.column_stack([position, yaw]).astype(float)
+    size = np.sqrt(squares.mean(axis=0))
+    return PredictionErrors(size[0], (0.0, 1.0), size[1], (0.0, 1.0), 0.0, {}, squares)
+
+
+def test_what_few_stretches_tell_has_to_be_better_by_far():
+    settings = DEFAULT_SETTINGS.prediction
+    many, few = in_stretches([1.0] * 6, [1.0] * 6), in_stretches([1.0] * 6, [3.0, 3.0, 0.1, 0.1, 0.1, 0.1])
+
+    def times(of, factor):
+        return in_stretches(*(factor**2 * of.squares.T))
+
+    assert stretches_telling(many) == pytest.approx(6.0)
+    assert stretches_telling(few) == pytest.approx(6.4**2 / 18.04)
+    assert surely_beats(many, times(many, 0.9), settings)
+    assert not surely_beats(few, times(few, 0.9), settings)
+    assert not surely_beats(few, times(few, 0.71), settings)
+    assert surely_beats(few, times(few, 0.69), settings)
+
+
+def test_what_beats_by_one_stretch_alone_does_not_beat():
+    settings = DEFAULT_SETTINGS.prediction
+    before = in_stretches([1.0] * 6, [1.0] * 6)
+    for quantity in (0, 1):
+        after = [[1.0] * 6, [1.0] * 6]
+        after[quantity] = [0.01, 1.05, 1.05, 1.05, 1.05, 1.05]
+        assert beats(before, in_stretches(*after), settings)
+        assert not surely_beats(before, in_stretches(*after), settings)
+    # Heading may not pay for position.
+    assert not beats(before, in_stretches([0.25] * 6, [1.2] * 6), settings)
+    assert beats(before, in_stretches([0.25] * 6, [1.1] * 6), settings)

@@ -6,10 +6,18 @@ import numpy as np
 import pytest
 
 from disco_hw.gap.data.layout import BODY, WHEEL
-from disco_hw.gap.report.judge import drifting_parameters
+from disco_hw.gap.report.judge import across_logs, drifting_parameters
 from disco_hw.gap.search.analysis import GapAnalysis, final_fit
 from disco_hw.gap.search.channel_search import ChannelResult, body_moves
-from disco_hw.gap.search.intervals import ChannelEstimates, ParameterEstimate, estimate_parameters, halves_of, in_motion
+from disco_hw.gap.search.intervals import (
+    ChannelEstimates,
+    InParts,
+    ParameterEstimate,
+    estimate_parameters,
+    in_logs,
+    in_motion,
+    in_thirds,
+)
 from disco_hw.gap.search.selection import Selector
 from tests.gap.synthetic import body_channel
 
@@ -90,10 +98,33 @@ def test_halves_that_disagree_widen_the_interval_to_hold_both():
     names = ("turn_slip",)
     same, drifting = changing(0.08), changing(0.16)
     found = [estimated(one, names).by_name["turn_slip.k_s"] for one in (same, drifting)]
-    half = halves_of(ChannelResult(Selector(drifting, body_moves(drifting)), names, drifting))["turn_slip.k_s"]
-    assert (half.early, half.late) == pytest.approx((0.08, 0.16), abs=0.03)
-    assert found[1].low < half.early < half.late < found[1].high
+    result = ChannelResult(Selector(drifting, body_moves(drifting)), names, drifting)
+    early, late = in_logs(result, (0.0, 0.5 * drifting.drive.duration_s))["turn_slip.k_s"].values
+    assert (early, late) == pytest.approx((0.08, 0.16), abs=0.03)
+    assert found[1].low < early < late < found[1].high
     assert found[0].deviation < 0.3 * found[1].deviation
+
+
+def test_what_wanders_is_told_from_what_parts_know_badly():
+    wide, narrow = (InParts(np.array([1.0, 3.0]), np.full(2, deviation)) for deviation in (2.0, 0.1))
+    assert wide.variance_between == 0.0
+    # Half the squared difference, less the mean variance of the two.
+    assert narrow.variance_between == pytest.approx(2.0 - 0.01)
+    assert narrow.apart(0, 1) == pytest.approx(2.0 / (0.1 * 2.0**0.5))
+    assert narrow.apart(1, 0) == -narrow.apart(0, 1)
+    # A part that knows little weighs little.
+    assert InParts(np.array([1.0, 1.0, 9.0]), np.array([0.1, 0.1, 8.0])).variance_between == 0.0
+
+
+def test_each_of_several_logs_speaks_for_itself():
+    channel = changing(0.16)
+    result = ChannelResult(Selector(channel, body_moves(channel)), ("turn_slip",), channel)
+    found = in_logs(result, (0.0, 0.5 * channel.drive.duration_s))
+    assert found["turn_slip.k_s"].values == pytest.approx((0.08, 0.16), abs=0.03)
+    assert found["turn_slip.k_s"].apart(0, 1) > 3.0
+    assert abs(found["wheel_radius_m"].apart(0, 1)) < 3.0
+    assert in_logs(result, (0.0,)) == {}
+    assert in_thirds(result)["turn_slip.k_s"].values.size == 3
 
 
 def test_a_parameter_that_changes_along_a_log_is_said_to_drift_and_another_is_not():
@@ -103,3 +134,16 @@ def test_a_parameter_that_changes_along_a_log_is_said_to_drift_and_another_is_no
         said = drifting_parameters(analysis, final_fit(analysis))
         assert bool(said) == drifts
         assert not drifts or said[0].startswith("turn_slip.k_s drifts: 0.0")
+
+
+def test_logs_of_one_robot_differ_in_what_changed_between_them_alone():
+    for late_k_s, differs in ((0.08, set()), (0.16, {"turn_slip.k_s"})):
+        channel = changing(late_k_s)
+        result = ChannelResult(Selector(channel, body_moves(channel)), ("turn_slip",), channel)
+        analysis = GapAnalysis(channel.drive, channel.neutral, WHEEL.neutral, result, None)
+        found = across_logs(analysis, (0.0, 0.5 * channel.drive.duration_s))
+        assert {each.name for each in found} >= {"turn_slip.k_s", "wheel_radius_m", "x_icr_m"}
+        assert {each.name for each in found if each.differs} - {"axial_distance_m"} == differs
+        assert across_logs(analysis, (0.0,)) == ()
+        for each in found:
+            assert all(low < value < high for value, low, high in each.values)

@@ -1,0 +1,108 @@
+"""Wheels that are judged without poses: the way and the heading that they make, on stretches that were not fitted."""
+
+import numpy as np
+import pytest
+
+from disco_hw.gap.data.free_runs import run_wheels
+from disco_hw.gap.data.layout import BODY, WHEEL
+from disco_hw.gap.find import model_of, offered_stage
+from disco_hw.gap.noise.channels import WheelChannel
+from disco_hw.gap.noise.wheel_noise import WheelNoise
+from disco_hw.gap.report.findings import GapReport
+from disco_hw.gap.report.page import answer, as_text, page
+from disco_hw.gap.search.analysis import GapAnalysis, final_fit
+from disco_hw.gap.search.channel_search import ChannelResult, wheel_moves
+from disco_hw.gap.search.selection import Selector
+from disco_hw.gap.search.wheel_predictions import only_timed, wheel_table
+from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S
+from disco_hw.model import Model
+from tests.gap.synthetic import DRIVE, GEOMETRY, line_of
+
+MODEL = Model(*GEOMETRY)
+
+
+def analysed(names, **effects):
+    """Wheels that answer their commands with these first parameters of effects, and what was found of them."""
+    command = np.repeat(np.array(DRIVE * 3, dtype=float), 200, axis=0)
+    truth = WHEEL.neutral.copy()
+    for name, value in effects.items():
+        truth[next(place for column, place in WHEEL.place.items() if column.startswith(f"{name}."))] = value
+    plain = line_of(command)
+    start = np.zeros_like(command)
+    angle = run_wheels(truth, np.array(GEOMETRY), command, start, plain.first, plain.t_s, start)
+    speed = np.gradient(angle, GRID_STEP_S, axis=0)
+    line = type(plain)(
+        **{
+            **{name: getattr(plain, name) for name in plain.__slots__},
+            "angle_rad": angle,
+            "speed_rad_s": speed,
+            "encoder_angle_rad": angle[plain.encoder.node],
+        }
+    )
+    channel = WheelChannel.build(line, WheelNoise(reading_rad=1e-3), np.array(GEOMETRY))
+    selector = Selector(channel, wheel_moves(channel, np.array(GEOMETRY)))
+    body = BODY.neutral.copy()
+    body[:3] = GEOMETRY
+    return GapAnalysis(line, body, WHEEL.neutral, None, ChannelResult(selector, names, channel))
+
+
+def table_of(analysis):
+    table = wheel_table(analysis)
+    return table, offered_stage({**table, "refitted": table["nominal"]}, analysis.found_any, DEFAULT_SETTINGS)
+
+
+def report_of(analysis):
+    table, offered = table_of(analysis)
+    return GapReport(("log",), (), (), (), (), {}, MODEL, 1.0, offered, wheels=table)
+
+
+def test_wheels_with_a_dead_band_are_predicted_with_it_and_not_with_a_lag_alone():
+    analysis = analysed(("deadband",), deadband=1.0)
+    table, offered = table_of(analysis)
+    errors = {stage: of[2.0] for stage, of in table.items()}
+    # Each wheel loses 1 rad/s: 0.12 m in 2 s where both turn the same way, nothing where they turn against each other.
+    assert 0.05 < errors["nominal"].position_m < 0.12
+    assert errors["amended"].position_m < 0.02 * errors["nominal"].position_m
+    assert errors["amended"].yaw_rad < 0.02 * errors["timed"].yaw_rad
+    assert errors["amended"].wheel_rad_s < 0.1 * errors["nominal"].wheel_rad_s
+    assert offered == "amended"
+
+
+def test_a_lag_is_all_that_timed_wheels_need_and_they_are_offered_where_a_wrong_name_is_worse():
+    analysis = analysed(("deadband",), motor_lag=0.2)
+    table, offered = table_of(analysis)
+    assert table["timed"][2.0].position_m < 0.05 * table["nominal"][2.0].position_m
+    assert offered == "timed"
+    assert only_timed(analysis.wheels).fit.vector[WHEEL.place["motor_lag.tau_s"]] == pytest.approx(0.2, rel=0.02)
+    model, _ = model_of("timed", MODEL, analysis, final_fit(analysis), None)
+    values = {setting.name: setting.values for setting in model.effects}
+    assert values["motor_lag"]["tau_s"] == pytest.approx(0.2, rel=0.02)
+    assert "deadband" not in values
+    assert model_of("refitted", MODEL, analysis, final_fit(analysis), None)[0] == MODEL
+
+
+def test_a_wheel_that_turns_too_far_makes_way_forward_and_heading_to_its_other_side():
+    analysis = analysed((), wheel_gain=0.1)
+    errors = wheel_table(analysis)["nominal"][2.0]
+    # Of the left wheel alone, a tenth of what it was commanded: half its rim's way, and all of it over the axle.
+    turned = 0.1 * np.mean([abs(left) for left, _ in DRIVE]) * 2.0
+    assert errors.yaw_rad == pytest.approx(errors.position_m * 2.0 / GEOMETRY[1], rel=1e-6)
+    assert 0.5 < errors.position_m / (0.5 * GEOMETRY[0] * turned) < 1.5
+
+
+def test_a_log_without_poses_is_answered_with_the_way_that_its_wheels_make():
+    report = report_of(analysed(("deadband",), motor_lag=0.2))
+    line = answer(report)[1]
+    assert line.startswith("2 s ahead on held-out data the amended wheels err by ")
+    assert "with a delay and a lag alone (timed) by" in line
+    assert line.endswith("The amended model does not beat it: model.toml is the timed one; drive with that.")
+    assert "way and heading that the wheels make:" in as_text(report)
+    assert "The wheels alone" in page(report)
+    told = report.as_dict()
+    assert [row["horizon_s"] for row in told["wheels"]] == list(DEFAULT_SETTINGS.prediction.horizons_s)
+    assert told["offered"] == "timed"
+
+
+def test_without_commands_there_is_no_such_table():
+    analysis = analysed((), motor_lag=0.2)
+    assert wheel_table(GapAnalysis(analysis.drive, analysis.nominal_body, analysis.nominal_wheels, None, None)) == {}
