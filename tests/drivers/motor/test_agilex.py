@@ -1,5 +1,7 @@
 """What is AgileX's own: remote control comes first, speeds of the body, a time-out of half a second, buttons."""
 
+import dataclasses
+
 import pytest
 
 from drivers.types import DriverState, Request
@@ -112,3 +114,44 @@ def test_it_does_not_arm_while_the_base_moves(bench):
     assert bench.driver.state in STILL
     assert "moves" in bench.driver.detail
     assert not [frame for frame in bench.robot.received if AGILEX.is_motion(frame)]
+
+
+def test_a_button_pressed_while_it_slows_down_ends_that_and_its_release_moves_nothing(bench):
+    bench.arm()
+    bench.run(0.5, (20.0, 20.0))
+    bench.driver.request(Request.STANDBY)
+    bench.run(0.1)
+    bench.robot.press_estop(True)
+    bench.run(0.3)
+    bench.robot.press_estop(False)
+    bench.largest_speed = 0.0
+    bench.run(2.0)
+    assert bench.largest_speed < 0.05
+    assert bench.driver.state is DriverState.FAULT
+
+
+def test_a_person_who_takes_the_remote_control_while_it_slows_down_ends_that(bench):
+    bench.arm()
+    bench.run(0.5, (20.0, 20.0))
+    bench.driver.request(Request.STANDBY)
+    bench.run(0.1)
+    bench.robot.controller.base.take_remote_control(0.0, 0.0)
+    bench.run(0.2)
+    bench.robot.received.clear()
+    bench.robot.controller.base.control_mode = CAN_MODE
+    bench.run(0.5)
+    assert not [frame for frame in bench.robot.received if AGILEX.is_motion(frame)]
+    assert bench.driver.state in STILL
+
+
+def test_it_waits_for_the_wheels_to_stand_from_the_end_of_a_ramp_however_long_that_was():
+    bench = dataclasses.replace(AGILEX, changes="stop_deceleration_rad_s2 = 1.0").bench()
+    bench.arm()
+    bench.run(0.5, (4.0, 4.0))
+    bench.driver.request(Request.STANDBY)
+    bench.run(3.8)
+    bench.robot.stuck, bench.robot.speed = {0, 1}, [4.0, 4.0]
+    bench.run(1.0)
+    assert bench.robot.controller.base.control_mode == CAN_MODE, "standing by, it would brake no longer"
+    bench.run(3.0)
+    assert bench.robot.controller.base.control_mode == STANDBY
