@@ -114,3 +114,17 @@ def test_the_safety_card_says_who_stops_the_base_and_that_its_time_out_is_only_d
     assert "only the base's own time-out of 0.5 s" in card.host_silent
     assert any("declared" in words for words in card.unverified)
     assert any("Odometry" in words for words in card.unverified), "without joints"
+
+
+def test_odometry_that_stops_while_it_slows_down_is_a_fault_that_stays(bench, end):
+    bench.arm()
+    bench.run(0.5, (20.0, 20.0))
+    bench.driver.request(Request.STANDBY)
+    bench.run(0.1)
+    VENDOR.lose_left(bench.robot)
+    bench.run(0.4)
+    assert not end.driving
+    VENDOR.mend(bench.robot)
+    bench.run(1.0)
+    assert bench.driver.state is DriverState.FAULT
+    assert "no odometry" in bench.driver.detail
