@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shlex
+from functools import cache
 from pathlib import Path
 
 import click
@@ -64,10 +65,15 @@ def commands_of(page: Path) -> list[str]:
     return [found[1] for line in lines if (found := COMMAND.match(line)) is not None]
 
 
+@cache
+def whole_command() -> click.Command:
+    return typer.main.get_command(app)
+
+
 def wrong_in(line: str) -> str | None:
     """What of a call is not there: its verb, or an option."""
     words = shlex.split(line, comments=True)
-    command: click.Command = typer.main.get_command(app)
+    command = whole_command()
     while isinstance(command, click.Group):
         if not words or words[0].startswith("-"):
             break

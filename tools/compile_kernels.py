@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
+import math
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 import disco_hw
 from disco_hw.control import CommandLimits, Disco, DiscoSettings
+from disco_hw.control.pendulum import PAPER_SAMPLER, PendulumPlanner, PendulumPoints
+from disco_hw.effects.registry import MOTION_EFFECTS, REGISTRY
+from disco_hw.experiments.circle import CircleOptions, run_circle
 from disco_hw.gap.find import missing_effects
-from disco_hw.model import Model
+from disco_hw.model import EffectSetting, Model
+from disco_hw.model.free_run import FreeRun
 from disco_hw.runtime.assembly import make_planner
 from disco_hw.runtime.robot_setup import load_setup
 from disco_hw.tasks import task_from
+from disco_hw.tasks.circle import CircleCost
 from disco_hw.tasks.line.table import Waypoints
 from disco_hw.tasks.timed_path import TimedPathCost
 from tools.gap_logs import simulated_drive
@@ -24,16 +31,33 @@ ROBOT = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
 CORNER = Waypoints(np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]]), np.array([0.0, 5.0, 10.0]))
 
 
+def model_with_every_effect(values: Mapping[str, Mapping[str, float]], base: tuple[float, float, float]) -> Model:
+    """A model whose free run is kept, with these effects; all others are there too, and do nothing."""
+    neutral = {
+        name: {p.name: p.high if math.isinf(p.neutral) else p.neutral for p in REGISTRY[name].parameters}
+        for name in MOTION_EFFECTS
+    }
+    return Model(*base, effects=tuple(EffectSetting(name, dict(of)) for name, of in (neutral | dict(values)).items()))
+
+
 def plan_every_kind_of_task() -> None:
     setup = load_setup(ROBOT)
     make_planner(setup.config, setup.model)
     limits = CommandLimits.of_robot(setup.config.robot)
     for task in (task_from({"kind": "lemniscate"}).planned("default"), TimedPathCost(CORNER)):
         Disco(setup.model, task, DiscoSettings(), limits).warm_up()
+    # On the circle, whose functions are compiled by now, every other form that tests plan with.
+    lagging = replace(setup.model, effects=(EffectSetting("motor_lag", {"tau_s": 0.1}),))
+    Disco(lagging, CircleCost(), DiscoSettings(), CommandLimits(25.0, 40.0)).warm_up()
+    Disco(setup.model, CircleCost(), DiscoSettings(uncertainty="mc"), limits).warm_up()
+    run_circle(setup.model, options=CircleOptions(seeds=1, duration_s=0.1, largest_rot_s2=3.0))
+    PendulumPlanner(PendulumPoints(np.ones((5, 2)), np.full(5, 0.2)), PAPER_SAMPLER).plan(math.pi, 0.0)
 
 
 def search_a_log() -> None:
     missing_effects(simulated_drive({}, seed=1, drive="circle"), Model(0.061, 0.415, 0.238))
+    model = model_with_every_effect({}, (0.06, 0.4, 0.1))
+    FreeRun(model, model.point()[None], 0.1).states(np.zeros(5), np.zeros((4, 2)), 3)
 
 
 def main() -> int:

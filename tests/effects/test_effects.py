@@ -10,6 +10,7 @@ from disco_hw.effects.effect import Channel
 from disco_hw.effects.registry import MOTION_EFFECTS, REGISTRY
 from disco_hw.model import EffectSetting, Model, plain
 from disco_hw.model.free_run import FreeRun
+from tools.compile_kernels import model_with_every_effect
 
 NAMES = {
     Channel.COMMAND_TO_WHEEL: {
@@ -26,15 +27,9 @@ BASE = (0.06, 0.4, 0.1)
 STEP_S = 0.1
 
 
-def neutral(effect):
-    """Values at which an effect does nothing."""
-    return {p.name: p.high if math.isinf(p.neutral) else p.neutral for p in effect.parameters}
-
-
 def free_run(effects, commands, start=(0.0, 0.0, 0.0, 0.0, 0.0), time_s=0.0):
-    # All effects are there, the others at their neutral values: one kernel to compile, and neutral must be neutral.
-    values = {name: neutral(REGISTRY[name]) for name in MOTION_EFFECTS} | effects
-    model = Model(*BASE, effects=tuple(EffectSetting(name, given) for name, given in values.items()))
+    # All effects are there, the others at their neutral values: neutral must be neutral.
+    model = model_with_every_effect(effects, BASE)
     past = np.zeros((3, 2))
     run = FreeRun(model, model.point()[None], STEP_S)
     return run.states(np.array(start), np.vstack([past, commands]), 3, time_s)

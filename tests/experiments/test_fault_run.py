@@ -99,8 +99,15 @@ def test_the_table_counts_what_struck_an_armed_robot():
     assert "| `drop` | 2 | 1 | 1 | 0.30 s | 2 | 2 |" in markdown(summary(results))
 
 
-@pytest.mark.parametrize("growth", [0.1, 0.2, 1.0])
-@pytest.mark.parametrize("to", ["robot", "both"])
+@pytest.mark.parametrize(
+    ("to", "growth"),
+    [
+        ("robot", 0.1),
+        ("both", 1.0),
+        *(pytest.param(*case, marks=pytest.mark.long) for case in [("robot", 0.2), ("robot", 1.0), ("both", 0.1)]),
+        pytest.param("both", 0.2, marks=pytest.mark.long),
+    ],
+)
 def test_commands_that_come_later_and_later_end_in_a_stop(growth, to):
     """Each in its turn, so that neither counter nor watchdog notices."""
     text = f'[[fault]]\nat_s=4\nfor_s=10\nkind="delay"\nto="{to}"\nprobability=1\ndelay_s=0.001\ngrowth={growth}'

@@ -40,6 +40,12 @@ def test_every_feature_agrees_with_the_reference(target):
     np.testing.assert_allclose(compiled(effects), by_reference(effects), atol=1e-9)
 
 
+def three_terms(drag=0.0, droop=0.0, spin=0.0):
+    """One term of each kind, so that one kernel is compiled; at zero a term adds nothing."""
+    terms = {"v_x += k v^3": drag, "command += k u |u|": droop, "omega += k omega": spin}
+    return tuple(EffectSetting(name, {"k": k}) for name, k in terms.items())
+
+
 def test_each_single_term_adds_what_it_says():
     # Features one by one by hand: two plain libraries could share a slip in the pairing of names and formulas.
     u, other = np.array([2.0, -3.0]), np.array([-3.0, 2.0])
@@ -49,16 +55,15 @@ def test_each_single_term_adds_what_it_says():
     assert BODY_FEATURES["|v| omega"](-0.5, 2.0, 9.0, 9.0) == pytest.approx(1.0)
     assert BODY_FEATURES["omega / (2 + 5 |omega|)"](0.0, -2.0, 0.0, 0.0) == pytest.approx(-1.0 / 6.0)
     assert BODY_FEATURES["v |a|"](-0.5, 0.0, -2.0, 0.0) == pytest.approx(-1.0)
-    drag = (EffectSetting("v_x += k v^3", {"k": -0.4}),)
     v = 0.06 * 4.0
-    assert compiled(drag)[6, 0] == pytest.approx((v - 0.4 * v**3) * 0.3)
-    droop = (EffectSetting("command += k u |u|", {"k": -0.01}),)
-    assert compiled(droop)[6, 3:] == pytest.approx([3.84, 3.84])
-    assert compiled(droop)[12, 3:] == pytest.approx([-2.91, 1.96])
+    assert compiled(three_terms(drag=-0.4))[6, 0] == pytest.approx((v - 0.4 * v**3) * 0.3)
+    drooped = compiled(three_terms(droop=-0.01))
+    assert drooped[6, 3:] == pytest.approx([3.84, 3.84])
+    assert drooped[12, 3:] == pytest.approx([-2.91, 1.96])
 
 
 def test_a_term_on_the_yaw_rate_turns_about_the_axle():
-    spun = compiled((EffectSetting("omega += k omega", {"k": 0.5}),))
+    spun = compiled(three_terms(spin=0.5))
     wider = Model(0.06, 0.4 / 1.5, 0.1)
     same = FreeRun(wider, wider.point()[None], STEP_S).states(np.zeros(5), DRIVE, 0, 60.0)
     np.testing.assert_allclose(spun, same, atol=1e-9)

@@ -330,13 +330,12 @@ def test_a_bad_option_is_one_clear_line_and_exit_code_2(tmp_path, capsys, option
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("option", ["--truth", "--bus-log"])
-def test_a_full_disk_ends_the_record_not_the_robot(start, option):
-    robot = start(option, "/dev/full")
+def test_a_full_disk_ends_the_records_not_the_robot(start):
+    robot = start("--truth", "/dev/full", "--bus-log", "/dev/full")
     time.sleep(1.3)
     assert robot.state()["state"] == "STANDBY"
     code, errors = robot.stop()
     assert code == 1
     told = "/dev/full: No space left on device; nothing more is recorded in it"
-    assert errors.count(told) == 1
+    assert errors.count(told) == 2
     assert "Traceback" not in errors

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import threading
 import time
+from contextlib import contextmanager
 
 import can
 import pytest
@@ -20,12 +21,13 @@ from sim.unixcan import UnixCanBus
 FLOOD = 20_000
 
 
-@pytest.fixture
-def start_hub(tmp_path):
+@contextmanager
+def hubs(folder):
+    """Starts hubs, which end with the block."""
     processes = []
 
     def start(*options):
-        path = tmp_path / f"hub{len(processes)}"
+        path = folder / f"hub{len(processes)}"
         process = subprocess.Popen(
             [sys.executable, "-m", "sim.hub", str(path), *options], stdout=subprocess.PIPE, stderr=subprocess.PIPE
         )
@@ -33,15 +35,25 @@ def start_hub(tmp_path):
         assert process.stdout.readline() == f"ready {path}\n".encode()
         return str(path), process
 
-    yield start
-    for process in processes:
-        process.kill()
-        process.communicate()
+    try:
+        yield start
+    finally:
+        for process in processes:
+            process.kill()
+            process.communicate()
 
 
 @pytest.fixture
-def hub(start_hub):
-    return start_hub()[0]
+def start_hub(tmp_path):
+    with hubs(tmp_path) as start:
+        yield start
+
+
+@pytest.fixture(scope="module")
+def hub(tmp_path_factory):
+    """One hub for all that leave it as it was: each opens and closes its own buses."""
+    with hubs(tmp_path_factory.mktemp("hub")) as start:
+        yield start()[0]
 
 
 MESSAGES = [

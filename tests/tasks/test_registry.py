@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+from functools import cache
 from pathlib import Path
 
 import msgspec
@@ -68,6 +69,11 @@ def named_in(tree: ast.AST, kind: str, classes: set[str]) -> bool:
     return False
 
 
+@cache
+def parsed(path: Path) -> ast.Module:
+    return ast.parse(path.read_text("utf-8"))
+
+
 @pytest.mark.parametrize("kind", kinds())
 def test_a_kind_is_named_in_its_own_file_alone(kind):
     own = PACKAGE / "tasks" / f"{kind}.py"
@@ -76,7 +82,7 @@ def test_a_kind_is_named_in_its_own_file_alone(kind):
     for path in PACKAGE.rglob("*.py"):
         name = path.relative_to(PACKAGE).as_posix()
         if path != own and not name.startswith(ELSEWHERE.get(kind, ())):
-            found |= {name} if named_in(ast.parse(path.read_text("utf-8")), kind, classes) else set()
+            found |= {name} if named_in(parsed(path), kind, classes) else set()
     for path in PACKAGE.rglob("*.html"):
         found |= {path.name} if f'"{kind}"' in path.read_text("utf-8") else set()
     assert found == set()

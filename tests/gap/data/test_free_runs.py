@@ -6,28 +6,29 @@ import pytest
 from disco_hw.gap.data.free_runs import pose_residual, run_body, run_wheels
 from disco_hw.gap.data.layout import BODY, WHEEL
 from disco_hw.gap.settings import GRID_STEP_S
-from disco_hw.model import EffectSetting, Model
+from disco_hw.model import Model
 from disco_hw.model.free_run import FreeRun
+from tools.compile_kernels import model_with_every_effect
 
 N = 800
-# Each compiles a model of its own: all of a channel in one.
-OF_WHEELS = (
-    EffectSetting("motor_lag", {"tau_s": 0.1}),
-    EffectSetting("deadband", {"width_rad_s": 0.3}),
-    EffectSetting("speed_limit", {"limit_rad_s": 5.0}),
-    EffectSetting("command_delay", {"delay_s": 0.05}),
-)
-OF_BODY = (
-    EffectSetting("turn_slip", {"k_s": 0.1}),
-    EffectSetting("side_slip", {"k_s": 0.1}),
-    EffectSetting("wheel_radius_asymmetry", {"ratio": 0.02}),
-    EffectSetting("lateral_icr", {"offset_m": 0.03}),
-)
+BASE = (0.06, 0.4, 0.1)
+OF_WHEELS = {
+    "motor_lag": {"tau_s": 0.1},
+    "deadband": {"width_rad_s": 0.3},
+    "speed_limit": {"limit_rad_s": 5.0},
+    "command_delay": {"delay_s": 0.05},
+}
+OF_BODY = {
+    "turn_slip": {"k_s": 0.1},
+    "side_slip": {"k_s": 0.1},
+    "wheel_radius_asymmetry": {"ratio": 0.02},
+    "lateral_icr": {"offset_m": 0.03},
+}
 
 
-@pytest.mark.parametrize("effects", [OF_WHEELS, OF_BODY, ()], ids=["wheels", "body", "none"])
+@pytest.mark.parametrize("effects", [OF_WHEELS, OF_BODY, {}], ids=["wheels", "body", "none"])
 def test_two_channels_in_a_row_are_the_model(effects):
-    model = Model(0.06, 0.4, 0.1, effects)
+    model = model_with_every_effect(effects, BASE) if effects else Model(*BASE)
     t = np.arange(N) * GRID_STEP_S
     commands = np.column_stack([4 * np.sin(0.8 * t), 6 * np.sin(0.5 * t) + 1])
     p = {"wheels": WHEEL.neutral.copy(), "body": BODY.neutral.copy()}

@@ -74,7 +74,8 @@ def test_the_likelihood_of_the_wheels_is_that_of_their_whitened_residuals():
 
 def body_motion(count, rng):
     turned = np.cumsum(0.02 * rng.standard_normal(count))
-    steps = 0.02 * rng.standard_normal((2, count))
+    # Columns of a table, as those of a drive are.
+    steps = 0.02 * rng.standard_normal((count, 2)).T
     restart, use = np.arange(count) % 100 == 0, np.arange(count) % 23 != 7
     rest = rng.uniform(0, 1, (3, count))
     return BodyMotion(np.full(count, 0.04), *steps, turned, *rest, restart, use)
