@@ -118,14 +118,15 @@ socketcan-test: $(STAMP)
 clean:
 	rm -rf $(VENV) $(PEERS) $(ROS) build *.egg-info firmware_protocol/_firmware*
 
-# What is handed out: sdist and wheel, the wheel installed into an empty environment, and the demonstration from there.
+# What is handed out: sdist and wheel, the wheel installed into an empty environment, and the demonstration from there,
+# with nothing of this checkout on the path.
 DIST := .dist-check
 dist-check: $(BIN)/python
 	rm -rf $(DIST) && mkdir -p $(DIST)/elsewhere
 	$(PYTHON) -m venv $(DIST)/build && $(DIST)/build/bin/python -m pip install --quiet build
 	$(DIST)/build/bin/python -m build --outdir $(DIST)/dist .
-	$(PYTHON) -m venv $(DIST)/venv && PIP_CONSTRAINT=constraints.txt $(DIST)/venv/bin/python -m pip install --quiet $(DIST)/dist/*.whl
-	cd $(DIST)/elsewhere && ../venv/bin/disco-hw --version && ../venv/bin/disco-hw demo --laps 0.5
+	$(PYTHON) -m venv $(DIST)/venv && PIP_CONSTRAINT=constraints.txt env -u PYTHONPATH $(DIST)/venv/bin/python -m pip install --quiet $(DIST)/dist/*.whl
+	cd $(DIST)/elsewhere && unset PYTHONPATH && ../venv/bin/disco-hw --version && ../venv/bin/disco-hw demo --laps 0.5
 
 # The documentation as a site, in an environment of its own.
 docs:

@@ -14,12 +14,13 @@ from disco_hw.daemon.page_feed import FeedSubscriber, feed_path
 from disco_hw.log.records import BeliefChange, Record
 from disco_hw.runtime.task_change import record_of, task_in_status
 from disco_hw.viewer.operator_controls import Desk
-from disco_hw.viewer.panel import coverage_text, events_text, live_details
+from disco_hw.viewer.panel import coverage_text, events_text, live_details, live_summary
 from disco_hw.viewer.plots import Plots
 from disco_hw.viewer.recording import ShownRobot
-from disco_hw.viewer.scene import Scene, add_layers
+from disco_hw.viewer.scene import Scene
 from disco_hw.viewer.snapshot import Snapshot, snapshot_at
 from disco_hw.viewer.timeline import Items, Timeline
+from disco_hw.viewer.views import Views, add_layers, clear_of_phones
 
 MOVE_S = 0.1
 REDRAW_S = 0.5
@@ -53,14 +54,18 @@ class LivePage:
         self._move, self._redraw = _Due(MOVE_S), _Due(REDRAW_S)
         gui = server.gui
         gui.main_panel.dock_right()
-        self._details = gui.add_markdown("")
+        self._summary = gui.add_markdown("")
         with gui.add_folder("Excited so far", visible=False) as self._excited:
             self._coverage = gui.add_markdown("")
         self._plots = Plots(gui, stage)
         with gui.add_folder("Events"):
             self._events = gui.add_markdown("nothing yet")
+        with gui.add_folder("All figures", expand_by_default=False):
+            self._details = gui.add_markdown("")
         self.scene = Scene(server, stage)
-        add_layers(gui, self.scene, lambda: None)
+        self._views = Views(server, stage.task)
+        clear_of_phones(server)
+        add_layers(server, self.scene, lambda: None)
 
     def step(self) -> None:
         """Wait at most a tenth of a second for records, then draw what is due."""
@@ -86,11 +91,11 @@ class LivePage:
         snapshot = self._snapshot()
         if snapshot is not None:
             self.scene.show(snapshot, everything)
+            self._views.follow(snapshot.pose)
         if everything:
             behind_ms = None if snapshot is None else (time.monotonic_ns() - snapshot.t_ns) * 1e-6
-            _set(
-                self._details, live_details(status, snapshot, self._subscriber.missed, behind_ms, self.scene.knows_task)
-            )
+            _set(self._summary, live_summary(status, snapshot, self.scene.knows_task))
+            _set(self._details, live_details(status, snapshot, self._subscriber.missed, behind_ms))
             self._show_coverage(status)
             _set(self._events, events_text(snapshot, self.timeline.first_ns))
             if snapshot is not None:

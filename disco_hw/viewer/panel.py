@@ -19,21 +19,40 @@ _NO_NUMBER = "—"
 Rows = list[tuple[str, str]]
 
 
+def live_summary(status: Mapping[str, Any] | None, snapshot: Snapshot | None, knows_task: bool = True) -> str:
+    """Markdown of what matters first: distance, speed, battery, loop, and what is wrong with task or recording.
+
+    Without `knows_task` it says that the daemon follows another path than this page could draw.
+    """
+    rows: Rows = []
+    if not knows_task:
+        rows.append(("TASK NOT DRAWN", "the path's file has changed since the daemon read it; restart the daemon"))
+    if status is not None and status.get("ok"):
+        recorder = status["recorder"]
+        if recorder["fault"] or recorder["last_error"]:
+            what = "RECORDING FAILS" if recorder["fault"] else "recording failed"
+            rows.append((what, recorder["fault"] or recorder["last_error"]))
+        rows += [tuple(status["task"]["progress"]), ("distance", f"{number(status['task']['distance_m'], 3)} m")]
+    if snapshot is not None:
+        rows += [_speed(snapshot), _battery(snapshot)]
+    if status is not None and status.get("ok"):
+        loop = status["loop"]
+        late = f"{number(loop['lateness_us']['p99'], 0)} us late (99 %), {loop['overruns']} overruns"
+        rows.append(("loop", late))
+    return _table(rows)
+
+
 def live_details(
     status: Mapping[str, Any] | None,
     snapshot: Snapshot | None,
     missed: int,
     behind_ms: float | None,
-    knows_task: bool = True,
 ) -> str:
-    """Markdown of the figures: robot, link, loop, motion.
+    """Markdown of the other figures: robot, link, loop, motion.
 
-    `missed` batches of the feed did not reach this page; what it shows is `behind_ms` old. Without `knows_task` it says
-    that the daemon follows another path than this page could draw.
+    `missed` batches of the feed did not reach this page; what it shows is `behind_ms` old.
     """
     rows: Rows = [] if status is None or not status.get("ok") else _status_rows(status)
-    if not knows_task:
-        rows.insert(0, ("TASK NOT DRAWN", "the path's file has changed since the daemon read it; restart the daemon"))
     rows.append(("page is behind", f"{number(behind_ms, 0)} ms, {missed} batches missed"))
     if snapshot is not None:
         rows += [*health_rows(snapshot), *motion_rows(snapshot)]
@@ -41,7 +60,7 @@ def live_details(
 
 
 def _status_rows(status: Mapping[str, Any]) -> Rows:
-    task, loop = status["task"], status["loop"]
+    loop = status["loop"]
     robot = _robot(status["robot_state"], status["fault"], status["stop_cause"])
     link = status["link"] + (f": {status['link_error']}" if status["link_error"] else "")
     transport, driver = status["transport"], status["driver"]
@@ -51,26 +70,17 @@ def _status_rows(status: Mapping[str, Any]) -> Rows:
         ("link", link),
         ("frames", f"{transport['frames_received']} in, {transport['frames_sent']} out"),
         ("rejected, lost", f"{rejected + transport['malformed']}, {driver['lost_frames']}"),
-        tuple(task["progress"]),
-        ("distance", f"{number(task['distance_m'] * 1e3, 0)} mm"),
         ("loop late p99, max", f"{number(loop['lateness_us']['p99'], 0)}, {number(loop['lateness_us']['max'], 0)} us"),
         ("overruns, skipped", f"{loop['overruns']}, {loop['skipped']}"),
     ]
     recorder = status["recorder"]
     if recorder["path"]:
         rows.append(("recording", recording_in_words(recorder)))
-    if recorder["fault"] or recorder["last_error"]:
-        rows.append(
-            (
-                "RECORDING FAILS" if recorder["fault"] else "recording failed",
-                recorder["fault"] or recorder["last_error"],
-            )
-        )
     return rows
 
 
 def replay_text(snapshot: Snapshot, first_ns: int, task: RobotTask) -> str:
-    """Markdown for one instant of a log."""
+    """Markdown of what matters first at one instant of a log."""
     state, status = snapshot.state, snapshot.status
     head, detail = status.state if status is not None else "state not recorded", ""
     if state is not None:
@@ -82,17 +92,29 @@ def replay_text(snapshot: Snapshot, first_ns: int, task: RobotTask) -> str:
     if status is not None and status.fault != "NONE":
         lines += [f"**{escaped(fault_sentence(status.fault))}**", ""]
     rows: Rows = [("time", f"{(snapshot.t_ns - first_ns) * 1e-9:.3f} s")]
-    if status is not None:
-        rows.append(("robot", _robot(status.state, status.fault, status.stop_cause)))
-    rows += [
-        ("loop late", f"{number(snapshot.lateness_us, 0)} us"),
-        ("overruns, skipped", f"{snapshot.overruns}, {snapshot.skipped}"),
-    ]
     if snapshot.pose is not None:
         off_m = task.course().off_m(np.array([snapshot.pose[:2]]))[0]
-        rows.append(("distance", f"{number(off_m * 1e3, 0)} mm"))
-    rows += [*health_rows(snapshot), *motion_rows(snapshot)]
+        rows.append(("distance", f"{number(off_m, 3)} m"))
+    rows += [_speed(snapshot), _battery(snapshot)]
+    rows.append(("loop", f"{number(snapshot.lateness_us, 0)} us late, {snapshot.overruns} overruns"))
     return "\n".join([*lines, _table(rows)])
+
+
+def replay_details(snapshot: Snapshot) -> str:
+    """Markdown of the other figures at one instant of a log."""
+    status = snapshot.status
+    rows: Rows = [] if status is None else [("robot", _robot(status.state, status.fault, status.stop_cause))]
+    rows.append(("ticks skipped", str(snapshot.skipped)))
+    return _table([*rows, *health_rows(snapshot), *motion_rows(snapshot)])
+
+
+def _speed(snapshot: Snapshot) -> tuple[str, str]:
+    return "speed", f"{number(snapshot.speed_m_s, 3)} m/s, {number(snapshot.yaw_rate_rad_s, 2)} rad/s"
+
+
+def _battery(snapshot: Snapshot) -> tuple[str, str]:
+    current, warmth = number(snapshot.current_a, 1), number(snapshot.battery_c, 0)
+    return "battery", f"{number(snapshot.voltage_v, 1)} V, {current} A, {warmth} °C"
 
 
 def motion_rows(snapshot: Snapshot) -> Rows:
@@ -102,7 +124,6 @@ def motion_rows(snapshot: Snapshot) -> Rows:
         x_m, y_m, yaw_rad = snapshot.pose
         trust = "" if snapshot.pose_healthy else " (no fresh pose)"
         rows.append(("pose", f"{x_m:.3f}, {y_m:.3f} m, {math.degrees(yaw_rad):.1f}°{trust}"))
-    rows.append(("speed", f"{number(snapshot.speed_m_s, 3)} m/s, {number(snapshot.yaw_rate_rad_s, 2)} rad/s"))
     rows.append(("wheels", _pair(snapshot.wheel_speeds)))
     commanded = _pair(snapshot.command) if snapshot.in_force else "nothing in force"
     rows.append(("commanded", f"{commanded} ({snapshot.source})" if snapshot.source else commanded))
@@ -114,9 +135,8 @@ def motion_rows(snapshot: Snapshot) -> Rows:
 
 
 def health_rows(snapshot: Snapshot) -> Rows:
-    """What a snapshot says of battery, link and belief."""
-    current, warmth = number(snapshot.current_a, 1), number(snapshot.battery_c, 0)
-    rows: Rows = [("battery", f"{number(snapshot.voltage_v, 1)} V, {current} A, {warmth} °C")]
+    """What a snapshot says of link and belief."""
+    rows: Rows = []
     if snapshot.link is not None:
         it = snapshot.link
         rows.append(

@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 import viser
 
-from disco_hw.viewer.panel import coverage_text, events_text, replay_text
+from disco_hw.viewer.panel import coverage_text, events_text, replay_details, replay_text
 from disco_hw.viewer.plots import Plots
 from disco_hw.viewer.recording import Recording
-from disco_hw.viewer.scene import Scene, add_layers
+from disco_hw.viewer.scene import Scene
 from disco_hw.viewer.timeline import KINDS, Excited, Mark, marks_of
+from disco_hw.viewer.views import ScrubBar, Views, add_layers, clear_of_phones
 
 SPEEDS = {"1/4": 0.25, "1/2": 0.5, "1": 1.0, "2": 2.0, "4": 4.0, "8": 8.0}
 STEP_S = 0.05
@@ -42,6 +43,7 @@ class ReplayPage:
         gui = server.gui
         gui.main_panel.dock_right()
         self._add_controls(gui)
+        self._bar = self._scrub_bar(server)
         self._state = gui.add_markdown("")
         stage = recording.stage
         self._excited = Excited(recording.timeline, stage.drive_top_rad_s)
@@ -51,8 +53,12 @@ class ReplayPage:
         self._plots = Plots(gui, stage)
         with gui.add_folder("Events"):
             self._events = gui.add_markdown("")
+        with gui.add_folder("All figures", expand_by_default=False):
+            self._details = gui.add_markdown("")
         self.scene = Scene(server, recording.stage)
-        add_layers(gui, self.scene, self._redraw)
+        self._views = Views(server, stage.task)
+        clear_of_phones(server)
+        add_layers(server, self.scene, self._redraw)
 
     def go_to(self, t_s: float) -> None:
         """Go to a time, within the log."""
@@ -81,12 +87,15 @@ class ReplayPage:
         snapshot = self._recording.at(t_s)
         everything = not self.playing or now_s >= self._next_redraw_s
         self.scene.show(snapshot, everything)
+        self._views.follow(snapshot.pose)
+        self._bar.show(t_s)
         self._slider.value = round(t_s, 3)  # type: ignore[misc]
         if everything:
             self._next_redraw_s = now_s + REDRAW_S
             first_ns = self._recording.first_ns
             task = self._recording.stage.task_at(snapshot.task)
             self._state.content = replay_text(snapshot, first_ns, task)
+            self._details.content = replay_details(snapshot)
             if self._excited.driven:
                 self._coverage.content = coverage_text(self._excited.items(snapshot.t_ns))
             self._events.content = events_text(snapshot, first_ns)
@@ -138,6 +147,14 @@ class ReplayPage:
             if mark is not None:
                 self._play(False)
                 self.go_to(self._seconds(mark))
+
+    def _scrub_bar(self, server: viser.ViserServer) -> ScrubBar:
+        def go_to(t_s: float) -> None:
+            self._play(False)
+            self.go_to(t_s)
+
+        shown = [round(self._seconds(mark), 3) for mark in _spread(self._marks, _SLIDER_MARKS)]
+        return ScrubBar(server, max(self._recording.duration_s, 0.001), shown, go_to)
 
     def _seconds(self, mark: Mark) -> float:
         return (mark.t_ns - self._recording.first_ns) * 1e-9

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 import viser
@@ -28,6 +27,17 @@ POSES_COLOUR = (90, 90, 95)
 ELLIPSE_COLOUR = (120, 40, 200)
 CENTRE_COLOUR = (0, 0, 0)
 
+LAYER_COLOURS = {
+    "task": TASK_COLOUR,
+    "robot": BODY_COLOUR,
+    "trail": (68, 33, 253),
+    "plan": PLAN_COLOUR,
+    "fan": FAN_COLOUR,
+    "points": POINTS_COLOUR,
+    "ellipse": ELLIPSE_COLOUR,
+    "poses": POSES_COLOUR,
+    "centre": CENTRE_COLOUR,
+}
 TRAIL_FULL_M = 0.1
 """Distance to the task at which the trail is wholly yellow."""
 
@@ -42,7 +52,12 @@ LAYERS = {
     "poses": "Measured poses, 3 s",
     "centre": "Turning centre (ICR)",
 }
-_GROUND_M = 0.002
+# What lies on the floor, from below: a trail of many laps must hide neither the task nor the rollouts.
+_TRAIL_M, _POSES_M, _TASK_M, _FAN_M, _POINTS_M, _PLAN_M = 0.002, 0.003, 0.005, (0.0095, 0.007), 0.011, 0.013
+TRAIL_PALEST = 0.12
+_TRAIL_REACHES = 10.0
+"""The trail is palest this many times the task's reach behind the robot: a lap and a half of a circle."""
+LIGHT, DARK = (255.0, 255.0, 255.0), (20.0, 20.0, 24.0)
 _CENTRE_LIMIT_M = 5.0
 FAN_PALEST = 0.12
 _WHEEL_PARTS = (("front", 0.5), ("rear", -0.5))
@@ -65,6 +80,7 @@ class Scene:
     def __init__(self, server: viser.ViserServer, stage: ShownRobot) -> None:
         self.layers = dict.fromkeys(LAYERS, True)
         self.knows_task = True
+        self.background = LIGHT
         self._server = server
         self._stage = stage
         self._points = ParameterPoints(stage.model)
@@ -89,7 +105,7 @@ class Scene:
         self._fan = server.scene.add_line_segments(
             "/fan", empty, np.zeros((1, 2, 3), np.uint8), thickness=0.005, visible=False
         )
-        self._drawn_fan: records.Fan | None = None
+        self._drawn_fan: tuple[records.Fan, tuple[float, ...]] | None = None
 
     def show(self, snapshot: Snapshot, everything: bool = True) -> None:
         """Draw this instant."""
@@ -110,7 +126,7 @@ class Scene:
                 return
             plan = snapshot.plan
             path = np.empty((0, 2)) if plan is None else np.column_stack((plan.path_x_m, plan.path_y_m))
-            self._draw("plan", segments(path, 0.012))
+            self._draw("plan", segments(path, _PLAN_M))
             self._draw("points", self._points_paths(snapshot))
             self._draw("poses", _pose_marks(snapshot.poses))
             self._draw_fan(snapshot.fan)
@@ -202,23 +218,24 @@ class Scene:
             if self._fan.visible:
                 self._fan.visible = False
             return
-        if fan is self._drawn_fan or fan is None:
+        if fan is None or (fan, self.background) == self._drawn_fan:
             return
-        colours = weight_colours(fan.weights, FAN_COLOUR, FAN_PALEST)
+        colours = weight_colours(fan.weights, FAN_COLOUR, FAN_PALEST, self.background)
         # The weightiest on top of the others.
-        heights = np.linspace(0.0075, 0.004, len(paths))
+        heights = np.linspace(*_FAN_M, len(paths))
         lines = [segments(path, height) for path, height in zip(paths, heights, strict=True)]
         self._fan.points = np.concatenate(lines).astype(np.float32)
         self._fan.colors = np.repeat(np.repeat(colours[:, None], paths.shape[1] - 1, axis=0), 2, axis=1)
-        self._fan.visible, self._drawn_fan = True, fan
+        self._fan.visible, self._drawn_fan = True, (fan, self.background)
 
     def _draw_trail(self, snapshot: Snapshot) -> None:
         trail = snapshot.trail
         visible = self.layers["trail"] and len(trail) >= 2
         if visible:
-            off_m = self._stage.task_at(snapshot.task).course().off_m(trail)
-            colours = distance_colours(off_m, TRAIL_FULL_M)
-            points = segments(trail, 4.0 * _GROUND_M)
+            course = self._stage.task_at(snapshot.task).course()
+            near = distance_colours(course.off_m(trail), TRAIL_FULL_M)
+            colours = faded(near, trail, _TRAIL_REACHES * course.reach_m, self.background)
+            points = segments(trail, _TRAIL_M)
             self._trail.points = points.astype(np.float32)
             self._trail.colors = np.stack((colours[:-1], colours[1:]), axis=1)
             self._trail.visible = True
@@ -250,11 +267,11 @@ class Scene:
             self._belief = snapshot.belief
         wheels = snapshot.wheel_speeds or (0.0, 0.0)
         paths = self._points.trajectories(snapshot.plan, wheels)
-        return np.concatenate([segments(path, 0.008) for path in paths]) if len(paths) else np.empty((0, 2, 3))
+        return np.concatenate([segments(path, _POINTS_M) for path in paths]) if len(paths) else np.empty((0, 2, 3))
 
 
 def _line(task: RobotTask) -> Array:
-    return segments(task.course().outline_m(), _GROUND_M)
+    return segments(task.course().outline_m(), _TASK_M)
 
 
 def _pose_marks(poses: Array) -> Array:
@@ -263,7 +280,7 @@ def _pose_marks(poses: Array) -> Array:
         return np.empty((0, 2, 3))
     poses = np.nan_to_num(poses, nan=0.0)
     ahead = 0.03 * np.stack((np.cos(poses[:, 2]), np.sin(poses[:, 2])), axis=1)
-    height = np.full((len(poses), 1), 0.006)
+    height = np.full((len(poses), 1), _POSES_M)
     start, end = np.hstack((poses[:, :2] - ahead, height)), np.hstack((poses[:, :2] + ahead, height))
     return np.stack((start, end), axis=1)
 
@@ -324,12 +341,23 @@ def fan_paths(weights: Sequence[float], x_m: Sequence[float], y_m: Sequence[floa
     return np.stack((np.reshape(x_m, (count, -1)), np.reshape(y_m, (count, -1))), axis=-1)
 
 
-def weight_colours(weights: Sequence[float], colour: tuple[int, int, int], palest: float) -> Bytes:
-    """Colours (n, 3) by share of the largest weight: `colour` for that one, mixed with white down to `palest` of it."""
+def faded(colours: Bytes, trail: Array, length_m: float, background: tuple[float, ...] = LIGHT) -> Bytes:
+    """The colours (N, 3) of a trail (N, 2): the farther behind its end, the nearer to the background, to `length_m`."""
+    steps_m = np.hypot(*np.diff(trail, axis=0).T)
+    behind_m = np.append(np.cumsum(steps_m[::-1])[::-1], 0.0)
+    part = np.clip(1.0 - behind_m / length_m, TRAIL_PALEST, 1.0)[:, None]
+    return np.asarray(part * colours + (1.0 - part) * np.array(background), np.uint8)
+
+
+def weight_colours(
+    weights: Sequence[float], colour: tuple[int, int, int], palest: float, background: tuple[float, ...] = LIGHT
+) -> Bytes:
+    """Colours (n, 3) by share of the largest weight: `colour` for that one, near the `background` for the `palest`."""
     share = np.asarray(weights, np.float64)
     largest = share.max(initial=0.0)
     part = palest + (1.0 - palest) * (share / largest if largest > 0.0 else np.zeros_like(share))
-    return np.asarray(255.0 - part[:, None] * (255.0 - np.array(colour)), np.uint8)
+    ground = np.array(background)
+    return np.asarray(ground - part[:, None] * (ground - np.array(colour)), np.uint8)
 
 
 def instant_centre(
@@ -358,15 +386,3 @@ def about_z(yaw_rad: float) -> tuple[float, float, float, float]:
 def about_y(angle_rad: float) -> tuple[float, float, float, float]:
     """Unit quaternion (w, x, y, z) of a turn about the axle, positive as a wheel turns that drives forward."""
     return (math.cos(angle_rad / 2.0), 0.0, math.sin(angle_rad / 2.0), 0.0)
-
-
-def add_layers(gui: viser.GuiApi, scene: Scene, changed: Callable[[], None]) -> None:
-    """One checkbox a layer; `changed` is called after each click, the next snapshot is drawn with what is ticked."""
-    with gui.add_folder("Layers", expand_by_default=False):
-        for name, label in LAYERS.items():
-            box = gui.add_checkbox(label, scene.layers[name])
-
-            @box.on_update
-            def _(event: Any, name: str = name) -> None:
-                scene.layers[name] = bool(event.target.value)
-                changed()

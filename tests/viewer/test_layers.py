@@ -5,8 +5,9 @@ from types import SimpleNamespace
 import pytest
 
 from disco_hw.viewer.recording import stage_of_robot
-from disco_hw.viewer.scene import LAYERS, Scene, add_layers
+from disco_hw.viewer.scene import LAYER_COLOURS, LAYERS, Scene
 from disco_hw.viewer.server import serving
+from disco_hw.viewer.views import add_layers, legend
 from tools.viewer_run import ROBOT_FILE
 
 
@@ -32,14 +33,29 @@ def made(monkeypatch):
         changed = []
         boxes = Boxes(gui)
         scene = Scene(page.server, stage_of_robot(ROBOT_FILE))
-        add_layers(gui, scene, lambda: changed.append(True))
+        add_layers(page.server, scene, lambda: changed.append(True))
         yield scene, boxes.boxes, changed
 
 
 def test_there_is_one_ticked_box_a_layer(made):
     _, boxes, _ = made
-    assert list(boxes) == list(LAYERS.values())
-    assert all(box.value for box in boxes.values())
+    assert list(boxes) == [*LAYERS.values(), "Dark"]
+    assert [label for label, box in boxes.items() if not box.value] == ["Dark"]
+
+
+def test_the_legend_has_the_colour_of_each_layer_beside_its_name():
+    assert list(LAYER_COLOURS) == list(LAYERS)
+    for name, label in LAYERS.items():
+        assert f'rgb{LAYER_COLOURS[name]}"></span>{label}</div>' in legend()
+
+
+def test_dark_is_what_pale_lines_are_mixed_with(made):
+    scene, boxes, changed = made
+    before = scene.background
+    for function in boxes["Dark"].calls:
+        function(SimpleNamespace(target=SimpleNamespace(value=True)))
+    assert max(scene.background) < min(before)
+    assert changed == [True]
 
 
 @pytest.mark.parametrize("layer", LAYERS)

@@ -15,7 +15,7 @@ from disco_hw.runtime.task_change import asked_of
 from disco_hw.tasks.circle import CircleTask
 from disco_hw.viewer.live import KEEP_S, LivePage, _Due
 from disco_hw.viewer.operator_controls import Desk
-from disco_hw.viewer.panel import live_details
+from disco_hw.viewer.panel import live_summary
 from disco_hw.viewer.recording import stage_of_robot
 from disco_hw.viewer.server import serving
 from tests.runtime.path_robot import path_robot
@@ -45,7 +45,7 @@ def test_the_newest_instant_is_drawn(page):
     assert tuple(live.scene._robot.position[:2]) == pytest.approx(pose_at(50)[:2])
     assert live.scene._lines["plan"].visible
     assert live.scene._trail.points.shape == (50, 2, 3)
-    assert "24.5 V" in live._details.content
+    assert "24.5 V" in live._summary.content
     assert "armed on request" in live._events.content
 
 
@@ -186,5 +186,5 @@ def test_a_path_that_is_not_the_daemons_is_not_drawn_and_told(tmp_path):
         live._learn_task({"ok": True, "task": {"asked": asked_of(other)}})
         live.scene.show(live._snapshot())
         assert not live.scene._task.visible
-        assert "TASK NOT DRAWN" in live_details(None, None, 0, None, live.scene.knows_task)
+        assert "TASK NOT DRAWN" in live_summary(None, None, live.scene.knows_task)
         live.close()

@@ -10,7 +10,9 @@ from disco_hw.viewer.panel import (
     events_text,
     health_rows,
     live_details,
+    live_summary,
     number,
+    replay_details,
     replay_text,
 )
 from disco_hw.viewer.snapshot import snapshot_at
@@ -33,9 +35,9 @@ STATUS = {
 def test_the_details_say_where_every_tick_has_gone_and_what_fails():
     text = live_details(STATUS, None, 0, None)
     assert "| recording | run.mcap: 80 of 100 ticks, 7 waiting, 10 dropped, 3 lost with a deleted file |" in text
-    assert "FAILS" not in text
+    assert "FAILS" not in live_summary(STATUS, None)
     failing = STATUS | {"recorder": STATUS["recorder"] | {"fault": "nothing is being recorded: no room"}}
-    assert "| RECORDING FAILS | nothing is being recorded: no room |" in live_details(failing, None, 0, None)
+    assert "| RECORDING FAILS | nothing is being recorded: no room |" in live_summary(failing, None)
 
 
 def test_without_a_status_the_page_says_how_old_it_is():
@@ -47,16 +49,27 @@ def test_the_details_add_up_what_went_wrong(timeline):
     assert "| rejected, lost | 6, 5 |" in text
     assert "| loop late p99, max | 100, 900 us |" in text
     assert "| overruns, skipped | 7, 8 |" in text
-    assert "| battery | 24.5 V, 1.0 A, 30 °C |" in text
+    assert "battery" not in text
     assert "| bus errors | 0 sent, 0 received, 0 bus-off |" in text
     assert "rad/s (plan)" in text
+
+
+def test_what_matters_comes_first_in_metres_and_the_counters_after_it(timeline):
+    text = live_summary(STATUS, snapshot_at(timeline, START_NS + 50 * PERIOD_NS, plan_at(50)))
+    rows = [line.split("|")[1].strip() for line in text.splitlines()[2:]]
+    assert rows == ["laps", "distance", "speed", "battery", "loop"]
+    assert "| distance | 0.012 m |" in text
+    assert "| battery | 24.5 V, 1.0 A, 30 °C |" in text
+    assert "| loop | 100 us late (99 %), 7 overruns |" in text
 
 
 def test_a_replay_shows_the_same_motion_and_the_distance(timeline):
     text = replay_text(snapshot_at(timeline, START_NS + 70 * PERIOD_NS, None), START_NS, CircleTask(radius_m=0.5))
     assert text.startswith("### ARMED")
     assert "| time | 1.400 s |" in text
-    assert "| distance | 250 mm |" in text
+    assert "| distance | 0.250 m |" in text
+    assert "bus errors" not in text
+    assert "bus errors" in replay_details(snapshot_at(timeline, START_NS + 70 * PERIOD_NS, None))
     assert "Overcurrent" in text
 
 
@@ -123,7 +136,7 @@ def test_of_a_path_the_panel_tells_the_progress_and_the_side():
         "progress": ["progress", "2.00 of 8.00 m (25%)"],
         "asked": {"kind": "path"},
     }
-    text = live_details({**STATUS, "task": task}, None, 0, None)
+    text = live_summary({**STATUS, "task": task}, None)
     assert "| progress | 2.00 of 8.00 m (25%) |" in text
-    assert "| distance | -12 mm |" in text
-    assert "| laps | 1.50 |" in live_details(STATUS, None, 0, None)
+    assert "| distance | -0.012 m |" in text
+    assert "| laps | 1.50 |" in live_summary(STATUS, None)

@@ -102,6 +102,26 @@ def test_the_trail_is_coloured_by_the_distance_to_the_task_in_force(scene, shot)
     assert tuple(off_it) == tuple(scene_module.distance_colours(np.full(1, 0.25), scene_module.TRAIL_FULL_M)[0])
 
 
+def test_the_trail_lies_below_all_else_and_fades_behind_the_robot(scene, shot):
+    scene.show(shot)
+
+    def height(layer):
+        return np.asarray(node(scene, layer).points)[..., 2].min()
+
+    assert all(height("trail") < height(layer) for layer in ("task", "fan", "points", "plan", "poses"))
+    assert height("task") < height("fan") < height("plan")
+    around = np.linspace(0.0, 6.0 * math.pi, 600)
+    laps = replace(shot, trail=0.75 * np.column_stack((np.cos(around), np.sin(around))))
+    scene.show(laps)
+    darkest = np.asarray(scene._trail.colors)[:, 0].astype(int).min(axis=1)
+    assert (np.diff(darkest) <= 0).all()
+    assert darkest[0] > 220
+    assert darkest[-1] < 60
+    scene.background = scene_module.DARK
+    scene.show(laps)
+    assert np.asarray(scene._trail.colors)[0, 0].max() < 60
+
+
 def test_the_fan_is_shaded_by_weight_and_the_weightiest_lies_on_top(scene, shot):
     scene.show(shot)
     points, colours = np.asarray(scene._fan.points), np.asarray(scene._fan.colors).astype(int)
@@ -155,7 +175,7 @@ def test_a_path_is_drawn_where_it_is_and_not_at_all_where_it_is_unknown(tmp_path
         scene.show(shot)
         np.testing.assert_allclose(np.asarray(scene._task.points)[:, :, :2], [[[3, 0], [4, 0]], [[4, 0], [4, 1]]])
         far = tuple(scene_module.distance_colours(np.ones(1), scene_module.TRAIL_FULL_M)[0])
-        assert {tuple(colour) for colour in np.asarray(scene._trail.colors).reshape(-1, 3)} == {far}
+        assert tuple(np.asarray(scene._trail.colors)[-1, 1]) == far
         scene.knows_task = False
         scene.show(shot)
         assert not scene._task.visible

@@ -1,0 +1,179 @@
+"""How the scene is looked at: the legend with a box for each layer, the camera's views, and the bar of a replay."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import viser
+
+from disco_hw.tasks import RobotTask
+from disco_hw.viewer.scene import DARK, LAYER_COLOURS, LAYERS, LIGHT, Point, Scene, first_camera
+
+FREE, TOP, FOLLOW = "free", "top", "follow"
+VIEWS = (FREE, TOP, FOLLOW)
+PHONE_PX = 600
+_BAR_HEIGHT_PX, _MARGIN_PX = 96.0, 12.0
+# Looking straight down, no direction would be up on the screen.
+_SOUTH_M = 0.01
+
+
+def top_camera(task: RobotTask) -> tuple[Point, Point]:
+    """Where the camera is for a map of the whole task, north up, and what it looks at."""
+    course = task.course()
+    x_m, y_m = course.middle_m
+    return (x_m, y_m - _SOUTH_M, 1.0 + 2.2 * course.reach_m), (x_m, y_m, 0.0)
+
+
+def moved(camera: tuple[Point, Point], looks_at: tuple[float, float]) -> tuple[Point, Point]:
+    """The camera carried sideways until it looks at a place of the floor, from where it was beside that."""
+    (x_m, y_m, z_m), (at_x, at_y, at_z) = camera
+    to_x, to_y = looks_at
+    return (x_m + to_x - at_x, y_m + to_y - at_y, z_m), (to_x, to_y, at_z)
+
+
+class Views:
+    """The choice of a view, for each browser its own: free, from the top, or following the robot as it drives."""
+
+    def __init__(self, server: viser.ViserServer, task: RobotTask) -> None:
+        self._task = task
+        self._followers: set[int] = set()
+        self._place: tuple[float, float] | None = None
+        self._clients = server.get_clients
+        choice = server.gui.add_button_group("View", VIEWS)
+
+        @choice.on_click
+        def _(event: Any) -> None:
+            self.choose(event.client, event.target.value)
+
+    def choose(self, client: viser.ClientHandle, view: str) -> None:
+        """Look so from now on; a follower can still turn about the robot with the mouse."""
+        self._followers.discard(client.client_id)
+        if view == TOP:
+            _look(client, top_camera(self._task))
+        elif view == FREE:
+            _look(client, first_camera(self._task))
+        else:
+            self._followers.add(client.client_id)
+            if self._place is not None:
+                _look(client, moved(_camera(client), self._place))
+
+    def follow(self, pose: tuple[float, float, float] | None) -> None:
+        """The robot is here now."""
+        self._place = self._place if pose is None else pose[:2]
+        if self._place is None or not self._followers:
+            return
+        clients = self._clients()
+        for number in tuple(self._followers):
+            if number in clients:
+                _look(clients[number], moved(_camera(clients[number]), self._place))
+            else:
+                self._followers.discard(number)
+
+
+def _camera(client: viser.ClientHandle) -> tuple[Point, Point]:
+    x_m, y_m, z_m = map(float, client.camera.position)
+    at_x, at_y, at_z = map(float, client.camera.look_at)
+    return (x_m, y_m, z_m), (at_x, at_y, at_z)
+
+
+def _look(client: viser.ClientHandle, camera: tuple[Point, Point]) -> None:
+    with client.atomic():
+        client.camera.position, client.camera.look_at = camera
+
+
+def clear_of_phones(server: viser.ViserServer) -> None:
+    """On a browser as narrow as a phone the panel begins folded: it would hide the robot."""
+
+    @server.on_client_connect
+    def _(client: viser.ClientHandle) -> None:
+        seen = False
+
+        @client.camera.on_update
+        def _(camera: viser.CameraHandle) -> None:
+            nonlocal seen
+            if not seen and 0 < camera.image_width < PHONE_PX:
+                client.gui.main_panel.minimize()
+            seen = True
+
+
+def add_layers(server: viser.ViserServer, scene: Scene, changed: Callable[[], None]) -> None:
+    """The legend, one checkbox a layer, and dark or light; `changed` is called after each click."""
+    gui = server.gui
+    with gui.add_folder("Legend and layers", expand_by_default=False):
+        gui.add_html(legend())
+        for name, label in LAYERS.items():
+            box = gui.add_checkbox(label, scene.layers[name])
+
+            @box.on_update
+            def _(event: Any, name: str = name) -> None:
+                scene.layers[name] = bool(event.target.value)
+                changed()
+
+    dark = gui.add_checkbox("Dark", False)
+
+    @dark.on_update
+    def _(event: Any) -> None:
+        is_dark = bool(event.target.value)
+        gui.configure_theme(show_share_button=False, show_logo=False, dark_mode=is_dark)
+        scene.background = DARK if is_dark else LIGHT
+        changed()
+
+
+def legend() -> str:
+    """HTML: the colour of each layer beside its name; of the trail what its colours mean."""
+    rows = [
+        f'<div><span aria-hidden="true" style="display:inline-block;width:1.6em;height:0.5em;margin-right:0.6em;'
+        f'background:rgb{colour}"></span>{html.escape(LAYERS[name])}</div>'
+        for name, colour in LAYER_COLOURS.items()
+    ]
+    note = "<div>the trail fades; purple on the task, teal 0.05 m, yellow 0.1 m beside it and beyond</div>"
+    return f'<div style="font-size:0.85em;padding:0 0.8em 0.4em">{"".join(rows)}{note}</div>'
+
+
+class ScrubBar:
+    """A bar below the scene, as wide as each browser's picture, with the log's marks on it."""
+
+    def __init__(
+        self, server: viser.ViserServer, end_s: float, marks: Sequence[float], go_to: Callable[[float], None]
+    ) -> None:
+        self._end_s, self._marks, self._go_to = end_s, tuple(marks), go_to
+        self._bars: dict[int, tuple[viser.PanelHandle, viser.GuiSliderHandle[float]]] = {}
+        self._widths: dict[int, int] = {}
+        self._t_s = 0.0
+        server.on_client_connect(self._add)
+        server.on_client_disconnect(self._remove)
+
+    def show(self, t_s: float) -> None:
+        """The replay is here now."""
+        self._t_s = round(t_s, 3)
+        for _, slider in tuple(self._bars.values()):
+            slider.value = self._t_s  # type: ignore[misc]
+
+    def _add(self, client: viser.ClientHandle) -> None:
+        panel = client.gui.add_panel()
+        with panel.add_tab("Time and marks"):
+            slider = client.gui.add_slider("s", 0.0, self._end_s, 0.001, self._t_s, marks=self._marks)
+        self._bars[client.client_id] = (panel, slider)
+
+        @slider.on_update
+        def _(event: Any) -> None:
+            # Without a client it was moved from here.
+            if event.client is not None:
+                self._go_to(float(event.target.value))
+
+        @client.camera.on_update
+        def _(camera: viser.CameraHandle) -> None:
+            self._fit(client.client_id, camera.image_width)
+
+    def _fit(self, number: int, width_px: int) -> None:
+        if width_px and self._widths.get(number) != width_px and number in self._bars:
+            self._widths[number] = width_px
+            self._bars[number][0].float(
+                x=_MARGIN_PX, y=-_MARGIN_PX, width=max(160.0, width_px - 2.0 * _MARGIN_PX), height=_BAR_HEIGHT_PX
+            )
+
+    def _remove(self, client: viser.ClientHandle) -> None:
+        self._bars.pop(client.client_id, None)
+        self._widths.pop(client.client_id, None)
