@@ -8,6 +8,7 @@ the machine does beside makes lateness differ: its load is given with each, and 
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 import tempfile
@@ -70,7 +71,9 @@ def circling(directory: Path, bridged: bool = True) -> Iterator[tuple[int, int]]
             children.append(stack.enter_context(disco_hw_process("bridge", bridge, directory / "bridge.txt")))
             node = [sys.executable, "-m", "tools.ros2_node", str(DOMAIN), "echo", *start]
             with (directory / "node.txt").open("wb") as output:
-                stack.callback(subprocess.Popen(node, stdout=output).kill)
+                child = subprocess.Popen(node, stdout=output)
+                stack.callback(child.wait)
+                stack.callback(child.kill)
         operator = Operator(directory / "control.sock", children)
         operator.wait_until("ready, with poses", lambda s: s["state"] == "READY" and s["pose_ok"], READY_TIMEOUT_S)
         operator.tell("arm")
@@ -152,5 +155,7 @@ def _summary(key: str, values_ms: np.ndarray) -> dict[str, float]:
 
 
 if __name__ == "__main__":
+    # So that whoever breaks it off leaves no robot, daemon or node running.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
     for name, value in run(float(sys.argv[1]) if len(sys.argv) > 1 else 30.0).items():
         print(f"{name:40} {value:10.3f}")

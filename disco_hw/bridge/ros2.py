@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import json
 import os
 import socket
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -41,6 +43,7 @@ LOOPBACK = """<CycloneDDS><Domain><General><AllowMulticast>false</AllowMulticast
 <Peers><Peer address="127.0.0.1"/></Peers></Discovery></Domain></CycloneDDS>"""
 _SECOND_NS = 1_000_000_000
 _WAIT_S = 0.05
+_SWITCH_S = 0.0005
 _MOST_AT_ONCE = 20
 
 SENSOR = Qos(Policy.Reliability.BestEffort, Policy.Durability.Volatile, Policy.History.KeepLast(5))
@@ -138,6 +141,9 @@ class Bridge:
 
     def run(self, should_stop: Callable[[], bool]) -> None:
         """Carry both ways until told to stop; what fails on the way in is raised here."""
+        # Neither thread waits long for the other's Python, and what was imported is not looked through for garbage.
+        sys.setswitchinterval(_SWITCH_S)
+        gc.freeze()
         inward = threading.Thread(target=self._take_in, name="in", daemon=True)
         inward.start()
         try:

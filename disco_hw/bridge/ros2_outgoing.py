@@ -7,7 +7,7 @@ poses together goes out as `disco_hw/pose` in the map's frame.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from disco_hw.bridge import ros2_messages as msg
@@ -57,9 +57,12 @@ class Outgoing:
         self._state: records.DaemonState | None = None
         self._counters: records.Counters | None = None
 
-    def messages(self, received: Sequence[tuple[int, records.Record]], wall_offset_ns: int) -> list[Message]:
-        """What to say of these records; of wheels, estimates and plans only the newest. Wall minus monotonic time."""
-        out: list[Message] = []
+    def messages(self, received: Sequence[tuple[int, records.Record]], wall_offset_ns: int) -> Iterator[Message]:
+        """What to say of these records; of wheels, estimates and plans only the newest. Wall minus monotonic time.
+
+        Odometry comes first, and each is made when it is asked for: a plan takes longer than all others together.
+        """
+        states: list[Message] = []
         wheels: WheelSample | None = None
         newest: dict[type, records.Record] = {}
         for _, record in received:
@@ -69,18 +72,23 @@ class Outgoing:
             elif isinstance(record, records.DaemonState):
                 self._state = record
                 words = f"{record.state}{' running' if record.running else ''}{' e-stop' if record.estop else ''}"
-                out.append((STATE, msg.String(f"{words}: {record.reason}")))
+                states.append((STATE, msg.String(f"{words}: {record.reason}")))
             elif isinstance(record, records.Counters):
                 self._counters = record
+        return self._made(wheels, states, newest, wall_offset_ns)
+
+    def _made(
+        self, wheels: WheelSample | None, states: list[Message], newest: dict[type, records.Record], wall_offset_ns: int
+    ) -> Iterator[Message]:
         if wheels is not None and self._reckoned is not None:
-            out += self._of_wheels(wheels, self._reckoned.belief, wheels.t_ns + wall_offset_ns)
+            yield from self._of_wheels(wheels, self._reckoned.belief, wheels.t_ns + wall_offset_ns)
+        yield from states
         estimate = newest.get(records.Estimate)
         if isinstance(estimate, records.Estimate):
-            out += self._of_estimate(estimate, estimate.t_ns + wall_offset_ns)
+            yield from self._of_estimate(estimate, estimate.t_ns + wall_offset_ns)
         plan = newest.get(records.Plan)
         if isinstance(plan, records.Plan) and plan.path_x_m:
-            out.append((PLAN, self._path(plan, plan.t_ns + wall_offset_ns)))
-        return out
+            yield PLAN, self._path(plan, plan.t_ns + wall_offset_ns)
 
     def diagnostics(self, now_wall_ns: int, heard: bool, bridge: Mapping[str, str], wrong: str) -> Message:
         """How daemon and bridge are. `heard`: the daemon, of late; `wrong`: what the bridge has to complain of."""
@@ -111,7 +119,7 @@ class Outgoing:
         self._reckoned = _Reckoned(reading, belief)
         return sample
 
-    def _of_wheels(self, sample: WheelSample, belief: PoseBelief, wall_ns: int) -> list[Message]:
+    def _of_wheels(self, sample: WheelSample, belief: PoseBelief, wall_ns: int) -> Iterator[Message]:
         header = msg.Header(msg.stamp_of(wall_ns), ODOM_FRAME)
         moving = arc(self._parameters, sample.left_speed_rad_s, sample.right_speed_rad_s)
         speeds = msg.Twist(
@@ -129,14 +137,16 @@ class Outgoing:
             msg.PoseWithCovariance(_pose(belief.x_m, belief.y_m, belief.yaw_rad), _six(belief.covariance)),
             msg.TwistWithCovariance(speeds, _six(spread)),
         )
+        yield ODOM, odometry
         joints = msg.JointState(
             msg.Header(header.stamp),
             list(JOINTS),
             [sample.left_angle_rad, sample.right_angle_rad],
             [sample.left_speed_rad_s, sample.right_speed_rad_s],
         )
+        yield JOINT_STATES, joints
         transform = self._transform(ODOM_FRAME, self._base, (belief.x_m, belief.y_m, belief.yaw_rad), wall_ns)
-        return [(ODOM, odometry), (JOINT_STATES, joints), (TF, msg.TFMessage([transform]))]
+        yield TF, msg.TFMessage([transform])
 
     def _of_estimate(self, estimate: records.Estimate, wall_ns: int) -> Iterable[Message]:
         if not estimate.pose_healthy:

@@ -5,11 +5,14 @@ import json
 import re
 import struct
 import threading
+import types
+import typing
 
 import pytest
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
 pytest.importorskip("foxglove", reason="foxglove-sdk is not installed: make venv")
+from foxglove import layouts
 from typer.testing import CliRunner
 from websockets.asyncio.client import connect
 
@@ -113,3 +116,50 @@ def test_the_layout_names_topics_and_fields_that_there_are():
         assert field in TOPIC_BY_NAME[topic].record.__struct_fields__, (topic, field)
     placed = re.findall(r'"(?:first|second)": "([^"]+)"', text)
     assert sorted(placed) == sorted(panels)
+
+
+KINDS = {"3D": "ThreeDee", "Plot": "Plot", "StateTransitions": "StateTransitions", "RosOut": "Log"}
+
+
+def faults(value, kind, where):
+    """What Foxglove's own description of its panels does not have: fields, and values of the wrong kind."""
+    origin = typing.get_origin(kind)
+    if origin in (typing.Union, types.UnionType):
+        each = [faults(value, one, where) for one in typing.get_args(kind)]
+        return min(each, key=len)
+    if origin is typing.Literal:
+        return [] if value in typing.get_args(kind) else [f"{where}: {value!r} is none of {typing.get_args(kind)}"]
+    if origin in (list, tuple):
+        inner = typing.get_args(kind)
+        return [fault for one, of in zip(value, inner * len(value), strict=False) for fault in faults(one, of, where)]
+    if origin is dict:
+        return [
+            fault for name, one in value.items() for fault in faults(one, typing.get_args(kind)[1], f"{where}.{name}")
+        ]
+    if hasattr(kind, "_to_dict") and isinstance(value, dict):
+        hints = {
+            re.sub(r"_(\w)", lambda m: m[1].upper(), name): hint
+            for name, hint in typing.get_type_hints(kind, vars(layouts)).items()
+        }
+        return [
+            fault
+            for name, one in value.items()
+            for fault in (faults(one, hints[name], f"{where}.{name}") if name in hints else [f"{where}: no {name}"])
+        ]
+    if kind is float:
+        return [] if isinstance(value, int | float) else [f"{where}: {value!r} is no number"]
+    return (
+        [] if not isinstance(kind, type) or isinstance(value, kind) else [f"{where}: {value!r} is no {kind.__name__}"]
+    )
+
+
+def test_the_layout_is_one_by_foxgloves_own_description_of_its_panels():
+    for name, panel in json.loads(LAYOUT.read_text(encoding="utf-8"))["configById"].items():
+        config = getattr(layouts, KINDS.get(name.split("!")[0], "RawMessages") + "Config")
+        panel.pop("foxglovePanelTitle", None)
+        assert not faults(panel, config, name)
+        broken = {**panel, "wibble": 1}
+        assert faults(broken, config, name) == [f"{name}: no wibble"]
+        if name.startswith("Plot"):
+            assert faults({**panel, "legendDisplay": "nowhere"}, config, name)
+            assert faults({**panel, "isSynced": "yes"}, config, name)

@@ -89,14 +89,14 @@ def test_its_covariance_is_one_and_grows_with_the_way():
 def test_wheels_that_cannot_be_are_not_said():
     said = outgoing()
     driven(said)
-    assert said.messages([wheels(6.0, math.nan, 0.0)], OFFSET_NS) == []
-    assert said.messages([wheels(4.0, 17.0, 12.0)], OFFSET_NS) == []
+    assert list(said.messages([wheels(6.0, math.nan, 0.0)], OFFSET_NS)) == []
+    assert list(said.messages([wheels(4.0, 17.0, 12.0)], OFFSET_NS)) == []
 
 
 def test_the_map_is_where_the_estimate_and_the_odometry_agree():
     said = outgoing()
     driven(said)
-    newest = said.messages([estimate(5.0, 4.0, -1.0, 2.0)], OFFSET_NS)
+    newest = list(said.messages([estimate(5.0, 4.0, -1.0, 2.0)], OFFSET_NS))
     (pose,) = [one for topic, one in newest if topic == "disco_hw/pose"]
     assert (pose.header.frame_id, pose.pose.covariance[1], pose.pose.covariance[35]) == ("map", 0.001, 0.003)
     (transform,) = [one for topic, message in newest if topic == "/tf" for one in message.transforms]
@@ -112,7 +112,7 @@ def test_who_gives_poses_over_ros_says_where_the_map_is():
     said = outgoing("ros2")
     driven(said)
     assert [topic for topic, _ in said.messages([estimate(5.0, 4.0, -1.0, 2.0)], OFFSET_NS)] == ["disco_hw/pose"]
-    assert said.messages([estimate(5.0, 4.0, -1.0, 2.0, healthy=False)], OFFSET_NS) == []
+    assert list(said.messages([estimate(5.0, 4.0, -1.0, 2.0, healthy=False)], OFFSET_NS)) == []
 
 
 def test_a_plan_is_a_path_in_the_map():
@@ -144,3 +144,12 @@ def test_diagnostics_say_how_the_daemon_is_and_when_it_is_silent():
 )
 def test_topics_are_named_as_ros_does(topic, namespace, wire):
     assert wire_name(topic, namespace) == wire
+
+
+def test_odometry_is_said_before_a_plan_is_even_looked_at():
+    """A plan takes longer than all others together, and odometry is what a controller waits for."""
+    broken = records.Plan(7, 7, 0.1, (), (), path_x_m=(1.0,), path_y_m=(), path_yaw_rad=())
+    messages = outgoing().messages([wheels(0.0, 7.0, -3.0), (7, broken)], OFFSET_NS)
+    assert [next(messages)[0] for _ in range(3)] == ["odom", "joint_states", "/tf"]
+    with pytest.raises(ValueError, match="shorter"):
+        next(messages)

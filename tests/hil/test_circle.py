@@ -4,12 +4,18 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import subprocess
 import sys
 import warnings
+from pathlib import Path
 
 import pytest
+from mcap.reader import make_reader
 
+import disco_hw
+
+LAYOUT = Path(disco_hw.__file__).parent / "bridge" / "foxglove_layout.json"
 pytestmark = pytest.mark.hil
 
 
@@ -40,6 +46,7 @@ def test_demo_follows_the_circle(tmp_path, link, plant_seed, laps):
     assert figures["frames"]["rejected"] == 0
     assert (tmp_path / "demo.mcap").stat().st_size > 100_000
     assert (tmp_path / "circle.png").read_bytes().startswith(b"\x89PNG")
+    assert not shown_in_vain(tmp_path / "demo.mcap")
     replayed = subprocess.run(
         [sys.executable, "-m", "disco_hw", "replay", "--json", str(tmp_path / "demo.mcap")],
         capture_output=True,
@@ -48,3 +55,25 @@ def test_demo_follows_the_circle(tmp_path, link, plant_seed, laps):
         check=False,
     )
     assert replayed.returncode == 0, replayed.stdout + replayed.stderr
+
+
+def shown_in_vain(log):
+    """What a panel of the shipped Foxglove layout shows and the log does not hold: topics, and fields of messages."""
+    layout = LAYOUT.read_text(encoding="utf-8")
+    panels = json.loads(layout)["configById"]
+    fields = set(re.findall(r'"value": "(/[a-z/]+)\.([\w.]+)"', layout))
+    topics = {topic for topic, _ in fields} | set(panels["3D!scene"]["topics"])
+    topics |= {panels["RosOut!log"]["topicToRender"], panels["RawMessages!counters"]["topicPath"]}
+    with log.open("rb") as opened:
+        for _, channel, message in make_reader(opened).iter_messages(topics=list(topics)):
+            topics.discard(channel.topic)
+            for topic, path in [one for one in fields if one[0] == channel.topic]:
+                if _at(json.loads(message.data), path) is not None:
+                    fields.discard((topic, path))
+    return topics | fields
+
+
+def _at(message, path):
+    for step in path.split("."):
+        message = message.get(step) if isinstance(message, dict) else None
+    return message
