@@ -17,6 +17,10 @@ from disco_hw.control.pendulum import PAPER_SAMPLER, PendulumPlanner, PendulumPo
 from disco_hw.effects.registry import MOTION_EFFECTS, REGISTRY
 from disco_hw.experiments.circle import CircleOptions, run_circle
 from disco_hw.gap.find import missing_effects
+from disco_hw.inference.estimates import estimates
+from disco_hw.inference.excitation import excitation
+from disco_hw.inference.noise import USUAL
+from disco_hw.inference.simulate import Simulator
 from disco_hw.model import EffectSetting, Model
 from disco_hw.model.free_run import FreeRun
 from disco_hw.runtime.assembly import make_planner
@@ -49,13 +53,20 @@ def plan_every_kind_of_task() -> None:
     # On the circle, whose functions are compiled by now, every other form that tests plan with.
     lagging = replace(setup.model, effects=(EffectSetting("motor_lag", {"tau_s": 0.1}),))
     Disco(lagging, CircleCost(), DiscoSettings(), CommandLimits(25.0, 40.0)).warm_up()
-    Disco(setup.model, CircleCost(), DiscoSettings(uncertainty="mc"), limits).warm_up()
+    late = replace(setup.model, belief=None, effects=(EffectSetting("command_delay", {"delay_s": 0.25}),))
+    Disco(late, CircleCost(), DiscoSettings(), limits).warm_up()
+    for uncertainty in ("mc", "joint"):
+        Disco(setup.model, CircleCost(), DiscoSettings(uncertainty=uncertainty), limits).warm_up()
     run_circle(setup.model, options=CircleOptions(seeds=1, duration_s=0.1, largest_rot_s2=3.0))
     PendulumPlanner(PendulumPoints(np.ones((5, 2)), np.full(5, 0.2)), PAPER_SAMPLER).plan(math.pi, 0.0)
 
 
 def search_a_log() -> None:
-    missing_effects(simulated_drive({}, seed=1, drive="circle"), Model(0.061, 0.415, 0.238))
+    log, nominal = simulated_drive({}, seed=1, drive="circle"), Model(0.061, 0.415, 0.238)
+    missing_effects(log, nominal)
+    drive = excitation(log)
+    Simulator(nominal, drive, USUAL).poses(np.array([[0.238, 0.061, 0.415]]), np.zeros(1, np.uint32))
+    estimates(drive, USUAL).theta(drive.pose[None])
     model = model_with_every_effect({}, (0.06, 0.4, 0.1))
     FreeRun(model, model.point()[None], 0.1).states(np.zeros(5), np.zeros((4, 2)), 3)
 
