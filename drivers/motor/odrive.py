@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
+
+from msgspec.structs import replace
 
 from drivers.motor import odrive_protocol as protocol
 from drivers.motor import vendor_parts as parts
@@ -27,7 +29,7 @@ from drivers.motor.odrive_protocol import (
     stop_confirmation,
     stop_frames,
 )
-from drivers.motor.vendor_parts import Stage
+from drivers.motor.vendor_parts_permit import Controllers, MotionPermit, Stage
 from drivers.types import (
     DriverState,
     DriverStats,
@@ -53,8 +55,11 @@ WATCHDOG_TRIES = 5
 _VERSION_PERIOD_NS = 100_000_000
 _REPEAT_NS = 100_000_000
 _SAME_TIMEOUT_S = 0.002
+_STANDS_RAD_S = 0.1
 _ALIVE_PERIOD_NS = 30_000_000
-_HOST_COMMANDS = frozenset({0x02, 0x06, 0x07, 0x0B, 0x0C, 0x0D, 0x0E, 0x0F, 0x16, 0x18, 0x19, 0x1A, 0x1B})
+_CLOSED_LOOP_STEP = 3
+_ESTOP = 0x02
+_HOST_COMMANDS = frozenset({0x06, 0x07, 0x0B, 0x0C, 0x0D, 0x0E, 0x0F, 0x16, 0x18, 0x19, 0x1A, 0x1B})
 _QUIET = frozenset({AxisState.UNDEFINED, AxisState.IDLE, AxisState.CLOSED_LOOP})
 
 
@@ -67,11 +72,7 @@ class _Axis:
     state: int = AxisState.UNDEFINED
     error: int = 0
     beats_armed: int = 0
-    pos_turns: float | None = None
-    vel_turns_s: float = 0.0
-    estimated_ns: int = 0
-    moved_turns: float = 0.0
-    is_new: bool = False
+    turned: parts.Odometer = field(default_factory=parts.Odometer)
     watchdog_on: bool | None = None
     watchdog_s: float | None = None
 
@@ -87,68 +88,38 @@ class OdriveDriver:
         self._axes = [[_Axis(node) for node in side] for side in settings.sides]
         self._by_node = {axis.node: axis for side in self._axes for axis in side}
         self.stats = DriverStats()
-        self._attention = parts.Attention()
-        self._link_is_up = False
+        self._permit = MotionPermit()
         self._known = False
         self._refusal: str | None = None
         self._introduced, self._version = False, ""
         self._asked_watchdog = 0
         self._asked_version = 0
         self._asked_ns = 0
-        self._stage = Stage.REST
-        self._wanted = Request.STANDBY
-        self._note = "it stands by"
-        self._fault: str | None = None
-        self._estopped = False
-        self._arm_step = 0
-        self._stage_ns: int | None = None
-        self._last_sent_ns = 0
-        self._repeat_ns = 0
-        self._speeds = (0.0, 0.0)
-        self._foreign = False
-        self._events: list[str] = []
+        self._arm_step = self._repeat_ns = 0
 
     @property
     def state(self) -> DriverState:
         """Where the driver is with its axes."""
-        if not self._link_is_up:
-            return DriverState.DISCONNECTED
-        if self._refusal is not None:
-            return DriverState.REFUSED
-        if not self._known:
-            return DriverState.HANDSHAKE
-        if self._estopped or any(axis.error & ESTOP_ERROR[self._generation] for axis in self._by_node.values()):
-            return DriverState.ESTOP
-        if self._fault is not None or any(axis.error and not self._is_idle_watchdog(axis) for axis in self._all):
-            return DriverState.FAULT
-        if self._stage is Stage.ARMED:
-            return DriverState.ARMED
-        if self._stage is Stage.STOPPING or (self._stage is Stage.REST and self._any_closed_loop):
-            return DriverState.STOPPING
-        rest = {Request.ARM: DriverState.ARMING, Request.READY: DriverState.READY}
-        return rest.get(self._wanted, DriverState.STANDBY)
+        return self._permit.state(self._seen)
 
     @property
     def detail(self) -> str:
         """For a person: why the state is what it is, and what to do about it."""
-        match self.state:
-            case DriverState.DISCONNECTED:
-                return "the link is down"
-            case DriverState.REFUSED:
-                return self._refusal or ""
-            case DriverState.HANDSHAKE:
-                silent = [str(axis.node) for axis in self._all if axis.heard_ns is None]
-                if silent:
-                    return f"no heartbeat of node {', '.join(silent)}; is it switched on, at this bit rate, at this id?"
-                return "asking the nodes for their version"
-            case DriverState.ESTOP:
-                return "emergency stop; the wheels coast. Remove its cause, then reset"
-            case DriverState.FAULT:
-                said = [f"node {axis.node}: {self._words(axis)}" for axis in self._all if axis.error]
-                return f"{self._fault or '; '.join(said)}; remove the cause, then reset"
-            case DriverState.ARMED:
-                return "armed"
-        return self._note
+        return self._permit.detail(self._seen)
+
+    @property
+    def _seen(self) -> Controllers:
+        silent = ", ".join(str(axis.node) for axis in self._all if axis.heard_ns is None)
+        unheard = f"no heartbeat of node {silent}; is it switched on, at this bit rate, at this id?"
+        stopped = any(axis.error & ESTOP_ERROR[self._generation] for axis in self._all)
+        faulty = [axis for axis in self._all if axis.error and not self._is_idle_watchdog(axis)]
+        return Controllers(
+            missing=None if self._known else unheard if silent else "asking the nodes for their version",
+            refused=self._refusal,
+            stopped="emergency stop; the wheels coast. Remove its cause, then reset" if stopped else None,
+            faulty="; ".join(f"node {axis.node}: {self._words(axis)}" for axis in faulty) or None,
+            energised=self._any_closed_loop,
+        )
 
     @property
     def identity(self) -> Identity | None:
@@ -175,34 +146,24 @@ class OdriveDriver:
 
     def link_up(self, now_ns: int) -> None:
         """The medium has come up (again): whatever was agreed is void."""
-        self._restart("the link was lost", now_ns)
-        self._link_is_up = True
+        self._meet_anew(self._permit.linked(True), now_ns)
 
     def link_down(self, now_ns: int) -> None:
         """The medium is gone: whatever was agreed is void."""
-        self._restart("the link was lost", now_ns)
-        self._link_is_up = False
+        self._meet_anew(self._permit.linked(False), now_ns)
 
     def request(self, request: Request) -> None:
         """Set what the host wants; ARM only from standing by, and consumed when the axes leave their armed state."""
-        if request is self._wanted:
-            return
-        if request is Request.ARM:
-            if self.state not in (DriverState.STANDBY, DriverState.READY):
-                self._note = f"not arming: {self.detail}"
-                return
-            self.stats = replace(self.stats, sessions=self.stats.sessions + 1)
-            self._note, self._stage, self._arm_step, self._stage_ns = "arming", Stage.ARMING, 0, None
-            self._speeds = (0.0, 0.0)
-        elif self._wanted is Request.ARM and self._stage is not Stage.REST:
-            self._stop("stopping as asked")
-        self._wanted = request
+        before, self._permit = self._permit, self._permit.requested(request, self._seen)
+        if self._permit.wanted is Request.ARM is not before.wanted:
+            self._count("sessions")
+            self._arm_step = 0
 
     def receive(self, now_ns: int, frames: Sequence[ReceivedFrame]) -> Readings:
         """Take in received frames and return what they meant; frames that come while the link is down are ignored."""
         wheels: list[WheelSample] = []
         status: list[RobotStatus] = []
-        for received in frames if self._link_is_up else ():
+        for received in frames if self._permit.link_is_up else ():
             if self._take_parameter(received.frame):
                 self._count("frames_accepted")
                 continue
@@ -217,16 +178,16 @@ class OdriveDriver:
             match decoded.name:
                 case "Heartbeat":
                     self._take_heartbeat(axis, decoded.values, received.t_ns)
-                    status.append(self._status(received.t_ns))
+                    status.append(parts.status(received.t_ns, self.state, self._all_in_estop))
                 case "Get_Version":
                     self._take_version(decoded.values)
                 case "Get_Encoder_Estimates":
                     self._take_estimate(axis, decoded.values, received.t_ns)
-                    if all(each.is_new for each in self._all):
+                    if all(each.turned.is_new for each in self._all):
                         wheels.append(self._sample(received.t_ns))
-        if self._link_is_up:
+        if self._permit.link_is_up:
             self._check_silence(now_ns)
-        events, self._events = tuple(self._events), []
+        events, self._permit = self._permit.events, replace(self._permit, events=())
         return Readings(wheels=tuple(wheels), status=tuple(status[-1:]), events=events)
 
     def transmit(self, now_ns: int, command: WheelCommand | None) -> tuple[OutgoingFrame, ...]:
@@ -235,9 +196,9 @@ class OdriveDriver:
         Raises ValueError for a command that is not finite or valid for no time.
         """
         parts.check_command(command)
-        if not self._link_is_up:
+        if not self._permit.link_is_up:
             return ()
-        match self._stage:
+        match self._permit.stage:
             case Stage.REST:
                 return self._rest(now_ns)
             case Stage.ARMING:
@@ -246,16 +207,13 @@ class OdriveDriver:
                 return self._ramp(now_ns)
         if command is None:
             return ()
-        self._speeds = (command.left_rad_s, command.right_rad_s)
-        self._last_sent_ns = now_ns
+        self._permit = self._permit.commanded(now_ns, command)
         self._count("commands_sent")
-        # Half of its validity may pass on the way.
-        return parts.outgoing(now_ns, *self._velocity(self._speeds), life_ns=round(0.5e9 * command.valid_for_s))
+        return parts.commanding(now_ns, command, *self._velocity())
 
     def estop(self, now_ns: int) -> tuple[OutgoingFrame, ...]:
         """Frames that stop every axis in any state; whatever was wanted is dropped, and nothing is commanded again."""
-        self._wanted, self._stage, self._estopped = Request.STANDBY, Stage.REST, True
-        self._note = "emergency stop sent"
+        self._permit = self._permit.stopped()
         return parts.estop_frames(now_ns, stop_frames(self._settings))
 
     @property
@@ -277,7 +235,7 @@ class OdriveDriver:
             return parts.outgoing(now_ns, *self._state_frames(AxisState.IDLE))
         if self._any_closed_loop:
             return ()
-        if self._wanted is Request.RESET:
+        if self._permit.wanted is Request.RESET and (self._known or self._refusal is not None):
             return self._reset(now_ns)
         if not self._known and self._refusal is None:
             return self._ask_version(now_ns) if not self._introduced else self._ask_watchdog(now_ns)
@@ -339,7 +297,7 @@ class OdriveDriver:
 
     def _reset(self, now_ns: int) -> tuple[OutgoingFrame, ...]:
         if not any(axis.error for axis in self._all) and self._repeat_ns and now_ns - self._repeat_ns >= _REPEAT_NS:
-            self._fault, self._estopped, self._wanted, self._note = None, False, Request.STANDBY, "it stands by"
+            self._permit = self._permit.reset(self._seen)
             return ()
         if now_ns - self._repeat_ns < 2 * _REPEAT_NS:
             return ()
@@ -348,15 +306,18 @@ class OdriveDriver:
 
     def _arm(self, now_ns: int) -> tuple[OutgoingFrame, ...]:
         """One step in each tick: clear an idle watchdog's error, mode, zero velocity, closed loop, then zeros."""
-        if self._stage_ns is None:
-            self._stage_ns = now_ns
+        self._permit = self._permit.begun(now_ns)
+        unfit = self._why_unfit if self._arm_step <= _CLOSED_LOOP_STEP else None
+        if unfit is not None:
+            self._idle(self._permit.given_up(f"not armed: {unfit}"))
+            return ()
         if all(axis.beats_armed >= BEATS_TO_ARM for axis in self._all):
-            self._stage, self._note = Stage.ARMED, "armed"
-            self._last_sent_ns, self._speeds = now_ns, (0.0, 0.0)
-            return parts.outgoing(now_ns, *self._velocity((0.0, 0.0)))
-        if now_ns - self._stage_ns > ARMING_TIMEOUT_NS:
+            self._permit = self._permit.armed(now_ns)
+            return parts.outgoing(now_ns, *self._velocity())
+        if self._permit.lasts_ns(now_ns) > ARMING_TIMEOUT_NS:
             waiting = [str(axis.node) for axis in self._all if axis.beats_armed < BEATS_TO_ARM]
-            self._give_up(f"node {', '.join(waiting)} did not go to closed loop; is it calibrated (odrivetool)?")
+            why = f"node {', '.join(waiting)} did not go to closed loop; is it calibrated (odrivetool)?"
+            self._idle(self._permit.given_up(why))
             return parts.outgoing(now_ns, *self._state_frames(AxisState.IDLE))
         step, self._arm_step = self._arm_step, self._arm_step + 1
         if step == 0 and any(axis.error for axis in self._all):
@@ -365,26 +326,34 @@ class OdriveDriver:
             self._arm_step = 2
             mode = {"control_mode": protocol.VELOCITY_CONTROL, "input_mode": protocol.PASSTHROUGH}
             return parts.outgoing(now_ns, *self._each("Set_Controller_Mode", **mode))
-        if step == 3:
+        if step == _CLOSED_LOOP_STEP:
             for axis in self._all:
                 axis.beats_armed = 0
             return parts.outgoing(now_ns, *self._state_frames(AxisState.CLOSED_LOOP))
-        return parts.outgoing(now_ns, *self._velocity((0.0, 0.0)))
+        return parts.outgoing(now_ns, *self._velocity())
+
+    @property
+    def _why_unfit(self) -> str | None:
+        """Closed loop holds zero from its first moment: a wheel that turns would be braked as hard as can be."""
+        silent = [str(axis.node) for axis in self._all if axis.turned.last is None]
+        if silent:
+            return f"node {', '.join(silent)} sends no encoder estimates; switch them on (odrivetool)"
+        fastest = max(abs(axis.turned.speed) for axis in self._all) * 2.0 * math.pi / self._settings.gear
+        return "a motor turns; wait until it stands" if fastest > _STANDS_RAD_S else None
 
     def _ramp(self, now_ns: int) -> tuple[OutgoingFrame, ...]:
         """Slow down with the declared deceleration, then let the axes idle until they say that they do."""
-        elapsed_ns, self._last_sent_ns = now_ns - self._last_sent_ns, now_ns
-        self._speeds = parts.slowed(self._speeds, self._settings.stop_deceleration_rad_s2, elapsed_ns)
-        if any(self._speeds):
-            return parts.outgoing(now_ns, *self._velocity(self._speeds))
-        if not self._any_closed_loop:
-            self._stage = Stage.REST
-        return parts.outgoing(now_ns, *self._velocity((0.0, 0.0)), *self._state_frames(AxisState.IDLE))
+        self._permit = self._permit.slowed(now_ns, self._settings.stop_deceleration_rad_s2)
+        idle = [] if any(self._permit.speeds) else self._state_frames(AxisState.IDLE)
+        frames = (*self._velocity(), *idle)
+        if idle and not self._any_closed_loop:
+            self._permit = self._permit.rested()
+        return parts.outgoing(now_ns, *frames)
 
-    def _velocity(self, speeds: tuple[float, float]) -> list[Frame]:
+    def _velocity(self) -> list[Frame]:
         limit = self._settings.vel_limit_turns_s
         frames = []
-        for side, direction, speed in zip(self._axes, self._settings.direction, speeds, strict=True):
+        for side, direction, speed in zip(self._axes, self._settings.direction, self._permit.speeds, strict=True):
             turns = direction * speed * self._settings.gear / (2.0 * math.pi)
             # Adding zero takes the sign off a zero.
             turns = min(max(turns, -limit), limit) + 0.0
@@ -407,20 +376,22 @@ class OdriveDriver:
         axis.heard_ns = t_ns
         axis.state, axis.error = int(values["axis_state"]), int(values["axis_error"])
         if axis.state not in _QUIET:
-            self._restart(f"node {axis.node} calibrates or moves by itself (state {axis.state})", t_ns)
+            why = f"node {axis.node} calibrates or moves by itself (state {axis.state})"
+            self._meet_anew(self._permit.restarted(why), t_ns)
             self._refusal = f"node {axis.node} is in state {axis.state}: wait until odrivetool has done with it"
             return
         if self._refusal is not None and self._refusal.startswith(f"node {axis.node} is in state"):
             self._refusal = None
         energised = axis.state == AxisState.CLOSED_LOOP and axis.error == 0
-        axis.beats_armed = axis.beats_armed + 1 if energised and self._arm_step > 3 else 0
-        if self._stage is Stage.ARMING and axis.error and not self._is_idle_watchdog(axis):
-            self._lose(f"node {axis.node} did not arm: {self._words(axis)}")
-        elif self._stage is Stage.ARMED and not energised:
+        axis.beats_armed = axis.beats_armed + 1 if energised and self._arm_step > _CLOSED_LOOP_STEP else 0
+        stage = self._permit.stage
+        if stage is Stage.ARMING and axis.error and not self._is_idle_watchdog(axis):
+            self._idle(self._permit.lost(f"node {axis.node} did not arm: {self._words(axis)}"))
+        elif stage is Stage.ARMED and not energised:
             what = self._words(axis) if axis.error else f"it left closed loop by itself, for state {axis.state}"
-            self._lose(f"node {axis.node}: {what}")
-        elif self._stage is Stage.STOPPING and axis.error:
-            self._lose(f"node {axis.node}: {self._words(axis)}")
+            self._idle(self._permit.lost(f"node {axis.node}: {what}"))
+        elif stage is Stage.STOPPING and axis.error:
+            self._idle(self._permit.lost(f"node {axis.node}: {self._words(axis)}"))
 
     def _answer_of_another_generation(self, frame: Frame) -> protocol.Decoded | None:
         """What 0.5 never sends: an answer for the version."""
@@ -440,106 +411,77 @@ class OdriveDriver:
             self._announce()
 
     def _announce(self, watchdog: str = "") -> None:
-        self._known, self._note = True, "it stands by"
+        self._known = True
         nodes = ", ".join(str(axis.node) for axis in self._all)
         version = self._version and f", firmware {self._version}"
-        self._events.append(f"nodes {nodes} are there: ODrive {self._settings.firmware}{version}{watchdog}")
+        said = f"nodes {nodes} are there: ODrive {self._settings.firmware}{version}{watchdog}"
+        self._permit = replace(self._permit, note="it stands by").saying(said)
 
     def _take_estimate(self, axis: _Axis, values: Mapping[str, float], t_ns: int) -> None:
         position, speed = float(values["pos_turns"]), float(values["vel_turns_s"])
         if not (math.isfinite(position) and math.isfinite(speed)):
             self._count("implausible_values")
             return
-        if axis.pos_turns is not None:
-            moved = position - axis.pos_turns
-            # A 32-bit float's own steps grow with the distance.
-            fastest = 1.5 * self._settings.vel_limit_turns_s * (t_ns - axis.estimated_ns) * 1e-9
-            if abs(moved) <= fastest + 0.05 + 2.0**-22 * abs(position):
-                axis.moved_turns += moved
-            else:
-                self._count("implausible_ticks")
-        axis.pos_turns, axis.vel_turns_s, axis.estimated_ns, axis.is_new = position, speed, t_ns, True
+        # A 32-bit float's own steps grow with the distance.
+        fastest = 1.5 * self._settings.vel_limit_turns_s * (t_ns - axis.turned.t_ns) * 1e-9
+        if not axis.turned.take(position, t_ns, fastest + 0.05 + 2.0**-22 * abs(position)):
+            self._count("implausible_ticks")
+        axis.turned.speed = speed
 
     def _sample(self, t_ns: int) -> WheelSample:
-        per_turn = 2.0 * math.pi / self._settings.gear
-        angles, speeds = [], []
-        for side, direction in zip(self._axes, self._settings.direction, strict=True):
-            # Those estimated earlier are carried on to the newest at their speed.
-            turns = [a.moved_turns + a.vel_turns_s * (t_ns - a.estimated_ns) * 1e-9 for a in side]
-            angles.append(direction * per_turn * sum(turns) / len(side))
-            speeds.append(direction * per_turn * sum(axis.vel_turns_s for axis in side) / len(side))
-        for axis in self._all:
-            axis.is_new = False
-        return WheelSample(t_ns, t_ns, angles[0], angles[1], speeds[0], speeds[1])
+        turned = [[axis.turned for axis in side] for side in self._axes]
+        return parts.wheel_sample(t_ns, turned, self._settings.direction, 2.0 * math.pi / self._settings.gear)
 
     def _check_silence(self, now_ns: int) -> None:
-        self._attention.look(now_ns)
+        self._permit = self._permit.looked(now_ns)
         limit_ns = SILENT_BEATS * self._settings.heartbeat_s * 1e9
         for axis in self._all:
-            silent_ns = 0 if axis.heard_ns is None else self._attention.silent_ns(axis.heard_ns)
+            silent_ns = 0 if axis.heard_ns is None else self._permit.silent_ns(axis.heard_ns)
             if silent_ns > limit_ns:
                 why = f"node {axis.node} fell silent"
-                if self._stage is not Stage.REST:
-                    self._lose(f"{why}: no heartbeat for {limit_ns * 1e-9:g} s")
+                if self._permit.stage is not Stage.REST:
+                    self._idle(self._permit.lost(f"{why}: no heartbeat for {limit_ns * 1e-9:g} s"))
                 elif silent_ns > max(2.0 * limit_ns, 5e8):
-                    self._restart(why, now_ns)
-                    self._events.append(f"{why}: new handshake")
+                    self._meet_anew(self._permit.restarted(why, f"{why}: new handshake"), now_ns)
                 return
 
     def _count_unused(self, frame: Frame) -> None:
         node, command = protocol.split(frame.can_id)
         ours = not frame.extended and node in self._by_node
-        if ours and command in _HOST_COMMANDS and frame.data:
+        if ours and command == _ESTOP:
             self._count("unknown_id")
-            if not self._foreign:
-                self._foreign = True
-                self._events.append(f"another host is on the link: it commands node {node}; disconnect it")
-            if self._stage is not Stage.REST and command != 0x02:
-                self._lose(f"another host commands node {node}; disconnect it")
+            self._idle(self._permit.stop_heard())
+        elif ours and command in _HOST_COMMANDS and frame.data:
+            self._count("unknown_id")
+            self._permit = self._permit.command_heard(f"node {node}")
         elif ours and len(frame.data) != 8:
             self._count("rejected_length")
         else:
             self._count("unknown_id")
 
-    def _status(self, t_ns: int) -> RobotStatus:
-        return parts.status(t_ns, self.state, self._all_in_estop)
-
     @property
     def _all_in_estop(self) -> bool:
         return all(axis.error & ESTOP_ERROR[self._generation] for axis in self._all)
 
-    def _stop(self, why: str) -> None:
-        """Ramp down and idle; from before the closed loop, idle at once."""
-        self._note = why
-        self._stage, self._stage_ns = Stage.STOPPING, None
+    def _idle(self, permit: MotionPermit) -> None:
+        """Idle is due at once for all that are still energised."""
+        self._permit, self._repeat_ns = permit, 0
 
-    def _give_up(self, why: str) -> None:
-        self._wanted, self._stage, self._stage_ns, self._note = Request.STANDBY, Stage.REST, None, why
-        # Idle is due at once for all that are still energised.
-        self._repeat_ns = 0
-
-    def _lose(self, why: str) -> None:
-        """One axis is lost: zero and idle for all, latched."""
-        self._give_up(f"disarmed: {why}")
-        self._fault = why
-        self._events.append(f"disarmed: {why}")
-
-    def _restart(self, why: str, now_ns: int) -> None:
-        if self._wanted is Request.ARM:
-            self._note = f"disarmed: {why}"
-        self._wanted, self._stage, self._stage_ns = Request.STANDBY, Stage.REST, None
-        self._known, self._refusal, self._fault, self._foreign = False, None, None, False
+    def _meet_anew(self, permit: MotionPermit, now_ns: int) -> None:
+        self._idle(permit)
+        self._known, self._refusal = False, None
         self._introduced, self._version, self._asked_watchdog = False, "", 0
-        self._asked_version, self._asked_ns, self._repeat_ns, self._arm_step = 0, now_ns - _VERSION_PERIOD_NS, 0, 0
+        self._asked_version, self._asked_ns, self._arm_step = 0, now_ns - _VERSION_PERIOD_NS, 0
         for axis in self._all:
-            axis.heard_ns = axis.pos_turns = axis.watchdog_on = axis.watchdog_s = None
-            axis.state, axis.error, axis.beats_armed, axis.is_new = AxisState.UNDEFINED, 0, 0, False
+            axis.heard_ns = axis.watchdog_on = axis.watchdog_s = None
+            axis.state, axis.error, axis.beats_armed = AxisState.UNDEFINED, 0, 0
+            axis.turned.begin_anew()
 
     def _words(self, axis: _Axis) -> str:
         return error_words(self._generation, axis.error)
 
     def _count(self, name: str) -> None:
-        self.stats = replace(self.stats, **{name: getattr(self.stats, name) + 1})
+        self.stats = parts.counted(self.stats, name)
 
 
 DRIVER = MotorDriver(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import enum
 import math
 import struct
 from collections.abc import Mapping, Sequence
@@ -16,41 +15,9 @@ _FRAME_LIFE_NS = 50_000_000
 _ESTOP_LIFE_NS = 1_000_000_000
 _ESTOP_REPEATS = 3
 _ESTOP_RANK, _RANK = 0, 1
-_LONGEST_STEP_S = 0.1
-_PAUSE_NS = 100_000_000
 Nodes = int | tuple[int, ...]
 """Ids on CAN of one side's controllers, as robot.toml names them."""
 Sign = Literal[-1, 1]
-
-
-class Stage(enum.Enum):
-    """Where a driver is between standing by and driving; BRAKING only where stopping ends with a brake."""
-
-    REST = "rest"
-    ARMING = "arming"
-    ARMED = "armed"
-    STOPPING = "stopping"
-    BRAKING = "braking"
-
-
-class Attention:
-    """Since when this host has looked at its controllers without a pause.
-
-    What was not heard in a pause is no silence of theirs: the host was not there, or has not read yet what came then.
-    """
-
-    def __init__(self) -> None:
-        self._looked_ns = self._since_ns = 0
-
-    def look(self, now_ns: int) -> None:
-        """The host looks, once in each tick."""
-        if now_ns - self._looked_ns > _PAUSE_NS:
-            self._since_ns = now_ns
-        self._looked_ns = now_ns
-
-    def silent_ns(self, heard_ns: int) -> int:
-        """How long nothing has come since `heard_ns`, of the time without a pause."""
-        return self._looked_ns - max(heard_ns, self._since_ns)
 
 
 @dataclass(slots=True)
@@ -136,13 +103,6 @@ def check_command(command: WheelCommand | None) -> None:
         math.isfinite(command.left_rad_s) and math.isfinite(command.right_rad_s) and command.valid_for_s > 0.0
     ):
         raise ValueError(f"not a wheel command: {command}")
-
-
-def slowed(speeds_rad_s: tuple[float, float], deceleration_rad_s2: float, elapsed_ns: int) -> tuple[float, float]:
-    """Speeds of both sides nearer to zero by the deceleration; a pause counts for 0.1 s at most."""
-    step = deceleration_rad_s2 * min(max(elapsed_ns, 0) * 1e-9, _LONGEST_STEP_S)
-    left, right = (math.copysign(max(abs(speed) - step, 0.0), speed) for speed in speeds_rad_s)
-    return left, right
 
 
 def outgoing(now_ns: int, *frames: Frame, life_ns: int = _FRAME_LIFE_NS) -> tuple[OutgoingFrame, ...]:

@@ -133,3 +133,26 @@ def test_a_position_that_jumps_does_not_move_the_angle(bench):
     bench.run(0.2, (0.0, 0.0))
     assert bench.driver.stats.implausible_ticks >= 1
     assert bench.wheels[-1].left_angle_rad == pytest.approx(angle, abs=1.0)
+
+
+def test_it_does_not_arm_while_an_axis_turns(bench):
+    """The closed loop holds zero from its first moment: it would brake as hard as it can."""
+    bench.run_until(*STILL)
+    bench.robot.speed = [4.0, 4.0]
+    bench.run(0.1)
+    bench.robot.received.clear()
+    bench.driver.request(Request.ARM)
+    bench.run(0.3, FORWARD)
+    assert bench.driver.state in STILL
+    assert "turns" in bench.driver.detail
+    assert not [frame for frame in bench.robot.received if frame.can_id & 0x1F == 0x07 and frame.data[0] == CLOSED_LOOP]
+
+
+def test_it_does_not_arm_without_encoder_estimates(bench):
+    drain = bench.robot.drain
+    bench.robot.drain = lambda: [frame for frame in drain() if frame.can_id & 0x1F != 0x09]
+    bench.run_until(*STILL)
+    bench.driver.request(Request.ARM)
+    bench.run(0.3)
+    assert bench.driver.state in STILL
+    assert "no encoder estimates" in bench.driver.detail

@@ -371,3 +371,65 @@ def test_it_arms_again_only_on_request(bench):
     bench.arm()
     assert bench.driver.stats.sessions == sessions + 1
     assert bench.now_ns > START_NS
+
+
+def test_a_controller_that_fell_silent_while_it_drove_is_a_fault_until_a_reset_though_it_is_back(bench):
+    drive(bench)
+    drain = bench.robot.drain
+    bench.robot.drain = lambda: drain() and []
+    bench.run(COASTING_S)
+    assert bench.driver.state is DriverState.FAULT
+    bench.robot.drain = drain
+    bench.run(1.0)
+    assert bench.driver.state is DriverState.FAULT
+    assert "silent" in bench.driver.detail
+    bench.driver.request(Request.RESET)
+    bench.run_until(*STILL)
+
+
+def test_an_emergency_stop_is_not_reset_while_nothing_is_heard_of_the_controllers(bench):
+    drive(bench)
+    bench.send_estop()
+    bench.run(COASTING_S)
+    drain = bench.robot.drain
+    bench.robot.drain = lambda: drain() and []
+    bench.run(COASTING_S)
+    bench.driver.request(Request.RESET)
+    bench.run(1.0)
+    assert bench.driver.state is DriverState.ESTOP
+    bench.robot.drain = drain
+    bench.run_until(*STILL)
+
+
+def test_what_is_wanted_after_a_stop_is_not_forgotten_on_the_way(bench):
+    drive(bench)
+    bench.driver.request(Request.READY)
+    bench.run_until(*STILL)
+    bench.run(0.5)
+    assert bench.driver.state is DriverState.READY
+
+
+def test_another_host_that_commands_while_it_stops_is_a_fault(vendor, bench):
+    if vendor.is_serial:
+        return
+    drive(bench)
+    bench.driver.request(Request.STANDBY)
+    bench.run(0.05)
+    frame = Frame(vendor.foreign.can_id, vendor.foreign.data, vendor.foreign.extended)
+    bench.robot_end.send(OutgoingFrame(frame, bench.now_ns), bench.now_ns)
+    bench.run(0.05)
+    assert bench.driver.state is DriverState.FAULT
+    assert "another host" in bench.driver.detail
+
+
+def test_an_emergency_stop_that_is_heard_is_taken_at_once_and_said_once(vendor, bench):
+    if vendor.is_serial:
+        return
+    drive(bench)
+    for frame in 3 * find_driver(vendor.name).stop_frames(vendor.settings):
+        bench.robot_end.send(OutgoingFrame(frame, bench.now_ns), bench.now_ns)
+    bench.run(0.02)
+    assert bench.driver.state is DriverState.ESTOP
+    assert [event for event in bench.events if "outside" in event or "another host is" in event] == [
+        "stopped from outside on the link, by `disco-hw estop` or another host"
+    ]
