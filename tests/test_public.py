@@ -92,16 +92,55 @@ def test_a_log_becomes_a_table(tmp_path):
     assert set(table.segment) == {0}
 
 
-def test_the_first_program_of_the_page_runs():
-    program = PAGE.split("```python\n")[1].split("```")[0]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+def run(program, directory, timeout_s=120):
+    """What a program prints that is run in a directory."""
     done = subprocess.run(
         [sys.executable, "-c", program],
-        cwd=ROOT,
-        env=environment,
+        cwd=directory,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
         capture_output=True,
         text=True,
-        timeout=120,
-        check=True,
+        timeout=timeout_s,
+        check=False,
     )
-    assert done.stdout.startswith("a turn of ")
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_the_first_program_of_the_page_runs():
+    assert run(PAGE.split("```python\n")[1].split("```")[0], ROOT).startswith("a turn of ")
+
+
+def notebook(name):
+    return (ROOT / "docs" / "notebooks" / name).read_text(encoding="utf-8")
+
+
+@pytest.mark.long
+@pytest.mark.timeout(1800)
+def test_the_second_program_of_the_page_and_the_notebook_of_identification_run(tmp_path):
+    printed = run(notebook("identification.py"), tmp_path, 900)
+    found = {name: float(value) for name, value in re.findall(r"^(\w+): (\S+) \+-", printed, re.MULTILINE)}
+    assert found["wheel_radius_m"] == pytest.approx(0.0609, rel=0.05)
+    assert found["axial_distance_m"] == pytest.approx(0.416, rel=0.05)
+    (tmp_path / "identification.mcap").rename(tmp_path / "drive.mcap")
+    for name in ("wombot.toml", "wombot_model.toml"):
+        (tmp_path / name).write_bytes((ROOT / "disco_hw" / "robots" / name).read_bytes())
+    (tmp_path / "wombot.toml").rename(tmp_path / "robot.toml")
+    pytest.importorskip("pandas")
+    run(PAGE.split("```python\n")[2].split("```")[0], tmp_path, 900)
+    assert disco_hw.load_model(tmp_path / "model.toml").parameter_names
+
+
+@pytest.mark.long
+@pytest.mark.timeout(900)
+def test_the_notebook_of_control_runs(tmp_path):
+    off_m = [float(value) for value in re.findall(r"RMS distance (\S+) m", run(notebook("control.py"), tmp_path, 900))]
+    assert len(off_m) == 2
+    assert max(off_m) < 0.2
+
+
+@pytest.mark.long
+@pytest.mark.timeout(900)
+def test_the_notebook_of_a_new_effect_names_what_was_hidden(tmp_path):
+    assert 'name = "deadband"' in run(notebook("new_effect.py"), tmp_path, 900)
+    assert "deadband.width_rad_s" in disco_hw.load_model(tmp_path / "new_effect.toml").parameter_names
