@@ -168,6 +168,7 @@ class Control(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     uncertainty: Literal["ut", "mc", "joint", "point"] = "ut"
     adaptation: Literal["auto", "off", "fast", "audited"] = "auto"
     disturbance: bool = False
+    fallback: Literal["ramp", "pure_pursuit", "kanayama", "lqr"] = "ramp"
     samples: Annotated[int, Meta(ge=8, le=1_000_000)] = 400
     horizon: Annotated[int, Meta(ge=2, le=500)] | None = None
     step_s: Annotated[float, Meta(gt=0.0, le=1.0)] | None = None
@@ -486,6 +487,8 @@ def _check_task(path: Path, config: RobotConfig) -> None:
             f"{config.task.speed_m_s} m/s is slower than the controller holds",
             f"write at least {slowest:.2f}, or set the controller for less",
         )
+    if config.control.fallback != "ramp" and math.isnan(config.task.reference_speed_m_s):
+        _refuse(path, "control.fallback", "way-points by time have no speed to follow them at", 'write "ramp"')
     fault = config.task.fault()
     if fault is not None:
         _refuse(path, f"task.{fault.field}", fault.fault, fault.remedy)

@@ -186,6 +186,11 @@ class Disco:
         return self._task
 
     @property
+    def chassis(self) -> SteeredChassis:
+        """The robot in the mean of what is believed."""
+        return self._chassis
+
+    @property
     def settings(self) -> DiscoSettings:
         """How it is planned."""
         return self._settings

@@ -46,12 +46,14 @@ class PlannerState(msgspec.Struct, frozen=True, gc=False):
 
 
 class PlanOutcome(enum.Enum):
-    """How a plan came about: at once, after a retry, from scratch, or as a ramp to zero because nothing helped."""
+    """How a plan came about: at once, after a retry, from scratch, or, because nothing helped, as a ramp to zero or
+    from a classical follower."""
 
     PLANNED = "planned"
     RETRIED = "retried"
     RESTARTED = "restarted"
     STOPPING = "stopping"
+    FALLBACK = "fallback"
 
 
 class Diagnostics(msgspec.Struct, frozen=True):

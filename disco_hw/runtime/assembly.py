@@ -18,6 +18,7 @@ from disco_hw.adaptation.guard import (
 )
 from disco_hw.adaptation.link import AdapterLink
 from disco_hw.config import RobotConfig
+from disco_hw.control.baselines.fallback import LAWS, WithFallback
 from disco_hw.errors import InputError
 from disco_hw.estimation import OdometryParameters, PoseFusion
 from disco_hw.estimation.disturbance import DisturbanceEstimator
@@ -54,7 +55,10 @@ def make_planner(config: RobotConfig, model: Model) -> control.Disco:
 
 
 def make_pipeline(config: RobotConfig, model: Model, planner: Planner) -> Pipeline:
-    """Estimator, planner and governor with the limits of robot.toml."""
+    """Estimator, planner and governor with the limits of robot.toml; the planner with the fallback that it names."""
+    if isinstance(planner, control.Disco) and config.control.fallback != "ramp":
+        law, limits = LAWS[config.control.fallback], control.CommandLimits.of_robot(config.robot)
+        planner = WithFallback(planner, law, planner.task, limits)
     limits = WheelLimits(
         max_speed_rad_s=config.robot.max_wheel_speed_rad_s,
         max_acceleration_rad_s2=config.robot.max_wheel_acceleration_rad_s2,

@@ -104,7 +104,7 @@ class DaemonCore:
         self._controller_changed = False
         self._generation = 0
         self._link_up = False
-        self._planner_failing = self._planner_collapsed = False
+        self._planner_failing = self._planner_collapsed = self._fell_back = False
         self._state = supervisor.state
         self._said: tuple[str, bool, bool] | None = None
         self.entered: dict[str, int] = {}
@@ -262,6 +262,11 @@ class DaemonCore:
         self._planner_failing = failing
         if result.plan is not None:
             found = result.plan.diagnostics
+            fell_back = result.source is Source.FALLBACK
+            if fell_back is not self._fell_back:
+                law = self.config.control.fallback
+                events.append(f"planner: nothing valid found; {law} drives" if fell_back else "planner: drives again")
+            self._fell_back = fell_back
             if found.collapsed != self._planner_collapsed:
                 few = f"planner: plans hang on {found.ess:.1f} effective samples, too few to be trusted"
                 events.append(few if found.collapsed else "planner: enough effective samples again")
@@ -271,7 +276,7 @@ class DaemonCore:
     def _stays(self, now_ns: int, output: Output, result: Tick) -> tuple[str, ...]:
         """Say when the task that runs does not get on."""
         place, command = (result.estimate.x_m, result.estimate.y_m), result.command
-        follows = output.running and result.source in (Source.PLAN, Source.TAIL, Source.RAMP)
+        follows = output.running and result.source in (Source.PLAN, Source.TAIL, Source.FALLBACK, Source.RAMP)
         return self._headway.step(
             now_ns, follows, place, (command.left_rad_s, command.right_rad_s), self.newest_wheels,
             result.planner_failure,

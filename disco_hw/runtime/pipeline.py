@@ -13,7 +13,7 @@ from typing import Protocol
 
 import msgspec
 
-from disco_hw.control import NoValidControl, PlannerState, Rollouts, SentCommand, WheelPlan
+from disco_hw.control import NoValidControl, PlannerState, PlanOutcome, Rollouts, SentCommand, WheelPlan
 from disco_hw.estimation import OdometryParameters, PoseEstimate, PoseFusion, PoseUpdate
 from disco_hw.estimation.disturbance import DisturbanceEstimator
 from disco_hw.model import Belief
@@ -100,6 +100,7 @@ class Source(enum.Enum):
     HOLD = "hold"
     PLAN = "plan"
     TAIL = "tail"
+    FALLBACK = "fallback"
     RAMP = "ramp"
     MANUAL = "manual"
     SILENT = "silent"
@@ -257,7 +258,9 @@ class Pipeline:
             case FollowTask():
                 if self._plan is None or now_ns - self._plan_made_ns > self._plan_tail_ns:
                     return Source.RAMP, (0.0, 0.0)
-                return Source.TAIL if new is None else Source.PLAN, self._plan.at(now_ns)
+                steered = self._plan.diagnostics.outcome is PlanOutcome.FALLBACK
+                source = Source.TAIL if new is None else Source.FALLBACK if steered else Source.PLAN
+                return source, self._plan.at(now_ns)
 
     def _govern(self, now_ns: int, source: Source, requested: tuple[float, float]) -> Governed:
         if source in {Source.OFF, Source.SILENT}:

@@ -133,7 +133,7 @@ def _motion(command: Command) -> Motion:
             return Silent()
         case Source.MANUAL:
             return Manual(command.requested_left_rad_s, command.requested_right_rad_s)
-        case Source.PLAN | Source.TAIL | Source.RAMP:
+        case Source.PLAN | Source.TAIL | Source.FALLBACK | Source.RAMP:
             return FollowTask()
 
 

@@ -250,6 +250,13 @@ class CircleCost:
         """Terms for the kernel; nothing depends on time or place. The memory is the angle swept (rad)."""
         return _prepared(self, step_s, horizon, x_icr_m)
 
+    def line_m(self) -> Array:
+        """The circle as points (N, 2), counter-clockwise and closed."""
+        angle = np.linspace(0.0, 2.0 * math.pi, 361)
+        return np.array([self.center_x_m, self.center_y_m]) + self.radius_m * np.column_stack(
+            [np.cos(angle), np.sin(angle)]
+        )
+
     def instant_cost(self, time_s: float, x_m: float, y_m: float, forward_m_s: float) -> float:
         """The paper's instant cost of a state."""
         distance = math.hypot(x_m - self.center_x_m, y_m - self.center_y_m) - self.radius_m

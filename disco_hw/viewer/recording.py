@@ -77,7 +77,7 @@ def _stage(setup: Setup) -> ShownRobot:
 
 
 _UNSEEN = (FrameIn, FrameOut, MotorSample)
-_DRIVING = frozenset({Source.PLAN.value, Source.MANUAL.value})
+_DRIVING = frozenset({Source.PLAN.value, Source.FALLBACK.value, Source.MANUAL.value})
 _SHOWN = tuple(topic.name for topic in TOPICS if topic.record not in _UNSEEN)
 
 

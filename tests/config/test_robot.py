@@ -201,3 +201,14 @@ def test_every_form_of_uncertainty_can_be_asked_for(tmp_path):
         assert load(tmp_path, GOOD + f'[control]\nuncertainty = "{name}"\n').control.uncertainty == name
     with pytest.raises(InputError, match=r"control\.uncertainty: .*'both'"):
         load(tmp_path, GOOD + '[control]\nuncertainty = "both"\n')
+
+
+def test_way_points_by_time_take_no_fallback(tmp_path):
+    (tmp_path / "way.csv").write_text("t_s,x_m,y_m\n0,0,0\n10,1,0\n20,2,0\n")
+    file = tmp_path / "robot.toml"
+    task = '[task]\nkind = "timed_path"\npath = "way.csv"\n'
+    file.write_text(GOOD.split("[task]", maxsplit=1)[0] + task + '[control]\nfallback = "lqr"\n')
+    with pytest.raises(InputError, match=r"control\.fallback: way-points by time have no speed"):
+        load_robot_config(file)
+    file.write_text(file.read_text().replace('"lqr"', '"ramp"'))
+    assert load_robot_config(file).control.fallback == "ramp"

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from disco_hw.config import Estimation
-from disco_hw.control import NoValidControl
+from disco_hw.control import Diagnostics, NoValidControl
 from disco_hw.estimation import OdometryParameters, PoseFusion
 from disco_hw.runtime.governor import Governor, Limited, WheelLimits
 from disco_hw.runtime.pipeline import FollowTask, Manual, Off, Pipeline, Source, Stand
@@ -20,6 +20,7 @@ class StraightPlan:
 
     def __init__(self, t0_ns: int, speed: float) -> None:
         self.t0_ns, self.speed = t0_ns, speed
+        self.diagnostics = Diagnostics(1.0, 0.0, 0.0, 0.0, 0.0, 1)
 
     def at(self, t_ns: int) -> tuple[float, float]:
         return self.speed, self.speed

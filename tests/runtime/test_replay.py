@@ -7,10 +7,12 @@ from pathlib import Path
 import pytest
 
 import disco_hw
+from disco_hw.control.optimiser import Optimiser
 from disco_hw.errors import InputError
 from disco_hw.log.link import Attachment
 from disco_hw.log.provenance import MODEL_TOML, ROBOT_TOML
 from disco_hw.log.recorder import ProcessRecorder, RecordingSettings
+from disco_hw.runtime.pipeline import Source
 from disco_hw.runtime.replay import replay
 from disco_hw.runtime.supervisor import UserRequest
 from tests.runtime.simulated import simulated_stack
@@ -50,6 +52,36 @@ def test_the_same_robot_gives_the_same_bits(tmp_path, ticks):
     assert report.ok, report.as_text()
     assert report.ticks == len(ticks)
     assert report.values > 5000
+
+
+def test_a_follower_takes_over_from_a_planner_that_finds_nothing_and_replays_bit_for_bit(tmp_path, monkeypatch):
+    step = Optimiser.step
+
+    def failing(self, *arguments):
+        valid = step(self, *arguments)
+        return valid and not 60 <= self.step_number < 260
+
+    monkeypatch.setattr(Optimiser, "step", failing)
+    text = (ROBOTS / "wombot.toml").read_text().replace("rate_hz = 50.0", 'rate_hz = 50.0\nfallback = "lqr"')
+    text = text.replace("wombot_model.toml", str(ROBOTS / "wombot_model.toml"))
+    (tmp_path / "robot.toml").write_text(text)
+    stack = simulated_stack(robot_file=tmp_path / "robot.toml")
+    stack.run(1.5)
+    stack.run(0.5, UserRequest.ARM)
+    driven = stack.run(3.0, UserRequest.START)
+    sources = [tick.pipeline.source for tick in driven]
+    first, last = sources.index(Source.FALLBACK), len(sources) - sources[::-1].index(Source.FALLBACK)
+    assert set(sources[first:last]) == {Source.FALLBACK}
+    assert last - first > 40
+    assert sources[last:] == [Source.PLAN] * (len(sources) - last) != []
+    assert all(tick.command.left_rad_s > 0.5 for tick in driven[first:last])
+    said = [text for tick in driven for text in tick.events if text.startswith("planner")]
+    assert said == ["planner: nothing valid found; lqr drives", "planner: drives again"]
+    log = write_log(tmp_path / "run.mcap", stack.recorder.ticks, text)
+    report = replay(log)
+    assert report.ok, report.as_text()
+    other = write_log(tmp_path / "other.mcap", stack.recorder.ticks, text.replace('"lqr"', '"kanayama"'))
+    assert not replay(other).ok
 
 
 @pytest.mark.parametrize(

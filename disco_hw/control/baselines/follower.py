@@ -80,6 +80,20 @@ class Follower:
         self._sum_m_s = 0.0
         self._last_ns: int | None = None
 
+    @property
+    def x_icr_m(self) -> float:
+        """That of the robot that the line's headings were made for."""
+        return self._chassis.x_icr_m
+
+    def set_chassis(self, chassis: NominalRobot) -> None:
+        """Steer this robot from now on."""
+        self._chassis = chassis
+
+    def watch(self, state: PlannerState) -> None:
+        """Somebody else drives: keep the place on the line, as where a line crosses itself nothing else tells it."""
+        self._place = self._reference.place(state.x_m, state.y_m, self._place)
+        self._sum_m_s, self._last_ns = 0.0, None
+
     def plan(self, now_ns: int, state: PlannerState) -> WheelPlan:
         """Wheel speeds to hold from now on."""
         reference, law, chassis = self._reference, self._law, self._chassis

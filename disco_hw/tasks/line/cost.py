@@ -81,6 +81,10 @@ class PathCost:
         )
         return Prepared(terms, near.origin_m, 0.0, place)
 
+    def line_m(self) -> NDArray[np.float64]:
+        """The path as points (N, 2)."""
+        return self.path.table[:, :2]
+
     def instant_cost(self, time_s: float, x_m: float, y_m: float, forward_m_s: float) -> float:
         """Distance to the path and error of the longitudinal speed, as one length."""
         table = self.path.table
