@@ -48,6 +48,10 @@ MOST_BY_A_POSE = 0.7
 together, as what explains it best must stay ahead."""
 MISFIT_POSES = 50.0
 """Over how many poses the size of the innovations is averaged, by which standard deviations are scaled in that test."""
+RUN_POSES, RUNS, LARGEST_RUN = 25, 10.0, 6.0
+"""Innovations that are summed, over how many sums the size of these is averaged, and what one counts for at most: a
+body that slides by chance shows in no single innovation, but makes them alike for a while, as a change does. The
+test's variances are scaled by the square of that size, as it grows less than what slides add."""
 CARRIED_M, CARRIED_RAD, CARRIED_POSES = 0.15, 0.3, 6
 """Poses so far from the prediction, so many in a row: the robot was carried."""
 WORST_POSE_STD_M = 0.03
@@ -63,8 +67,8 @@ _SLIDING_S, _SLIDING_STD_S = 0.04, 0.04
 """How long the body's sideways speed lags behind its turning."""
 _STRIDE_S = 0.045
 """Wheel samples between two poses are followed together, along one arc, for so long."""
-_ROUGH_M, _ROUGH_RAD = 5e-4, 5e-4
-"""Random part of a centimetre driven, to any side and in heading, which the wheels do not show."""
+_ROUGH_M, _ASIDE_M, _ROUGH_RAD = 5e-4, 7e-4, 5e-4
+"""Random part of a centimetre driven, along it, to its sides and in heading, which the wheels do not show."""
 _X, _Y, _YAW, _RADIUS, _AXLE, _X_ICR, _LEFT, _RIGHT, _LAG, _DRIFT_X, _DRIFT_Y = range(11)
 _SIZE = 11
 _DRIFTS = [_DRIFT_X, _DRIFT_Y]
@@ -119,6 +123,7 @@ class _Bank:
         slid_m = x_icr * _SLIDING_STD_S * (turn / dt_s - self._velocity[:, 2])
         self._velocity = np.stack([move_x, move_y, turn], axis=1) / dt_s
         noise[:, _X] = noise[:, _Y] = _ROUGH_M**2 * distance / 0.01 + slid_m**2
+        aside_m2 = (_ASIDE_M**2 - _ROUGH_M**2) * distance / 0.01
         noise[:, _YAW] = _ROUGH_RAD**2 * distance / 0.01
         noise[:, _RADIUS] = (DRIFT_PER_SQRT_M * radius) ** 2 * distance
         noise[:, _AXLE] = (DRIFT_PER_SQRT_RAD * axle) ** 2 * np.abs(turn)
@@ -128,6 +133,8 @@ class _Bank:
         noise[:, _DRIFTS] = self._drifts * DRIFT_WALK_M_S**2 * dt_s
         covariance = step @ self.covariance @ step.transpose(0, 2, 1)
         covariance[:, _EVERY, _EVERY] += noise
+        across = np.stack([-sine, cosine], axis=1)
+        covariance[:, :2, :2] += aside_m2[:, None, None] * across[:, :, None] * across[:, None, :]
         self.covariance = covariance
         state[:, _X] += move_x
         state[:, _Y] += move_y
@@ -205,6 +212,7 @@ class GeometryFilter:
         self._at: WheelSample | None = None
         self._rolled_rad, self._due = 0.0, np.zeros(3)
         self._misfit, self._astray = 1.0, 0
+        self._run, self._run_poses, self._run_misfit = np.zeros(3), 0, 1.0
 
     @property
     def mean(self) -> Array:
@@ -298,7 +306,9 @@ class GeometryFilter:
         self.poses += 1
         squares = np.einsum("ni,ni->n", innovations, np.linalg.solve(spreads, innovations[:, :, None])[:, :, 0])
         self._misfit += (min(float(squares[0]) / 3.0, 20.0) - self._misfit) / MISFIT_POSES
-        surprise = 0.5 * (squares / max(self._misfit, 1.0) + np.linalg.slogdet(spreads)[1])
+        self._follow_run(innovation, expected)
+        scale = max(self._misfit, self._run_misfit**2, 1.0)
+        surprise = 0.5 * (squares / scale + np.linalg.slogdet(spreads)[1])
         won = surprise[0] - surprise
         self._log_odds += won * min(1.0, MOST_BY_A_POSE / max(float(np.abs(won).max()), MOST_BY_A_POSE))
         self._bank.correct(innovations, spreads, self._low, self._high)
@@ -308,6 +318,15 @@ class GeometryFilter:
             self._only(best)
         elif self._moved_s > DOUBT_S:
             self._doubt()
+
+    def _follow_run(self, innovation: Array, expected: Array) -> None:
+        """Take one innovation into the sum, and the sum into the mean of their sizes: 1 if they are independent."""
+        self._run += np.linalg.solve(np.linalg.cholesky(expected), innovation)
+        self._run_poses += 1
+        if self._run_poses == RUN_POSES:
+            size = min(float(self._run @ self._run) / (3.0 * RUN_POSES), LARGEST_RUN)
+            self._run_misfit += (size - self._run_misfit) / RUNS
+            self._run[:], self._run_poses = 0.0, 0
 
     def _doubt(self) -> None:
         """Let new filters, one of each kind, say that the robot changes now; the least likely go."""

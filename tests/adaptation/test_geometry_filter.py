@@ -97,6 +97,24 @@ def test_beginning_and_ending_turns_is_no_change():
     assert np.abs(found.mean / MEAN - 1.0).max() < 0.03
 
 
+def test_a_body_that_slides_by_chance_is_no_change():
+    # Forward, to the left (m/s) and in heading (rad/s) for 0.3 s at a time: what the virtual robot's body does.
+    std, keep = np.array([0.005, 0.004, 0.018]), np.exp(-0.02 / 0.3)
+    changes = 0
+    for seed in range(4):
+        chance, slip = np.random.default_rng(seed), np.zeros(3)
+        found, plant = learner(), ForeignPlant(ForeignRobot(*NOMINAL), (0.0, 0.0, 0.3), seed)
+        for _ in range(1500):
+            drive(found, plant, TURN, 0.02)
+            slip = keep * slip + np.sqrt(1.0 - keep**2) * std * chance.standard_normal(3)
+            cosine, sine = np.cos(plant.pose[2]), np.sin(plant.pose[2])
+            turned = cosine * slip[0] - sine * slip[1], sine * slip[0] + cosine * slip[1], slip[2]
+            plant.state[:3] += 0.02 * np.array(turned)
+        changes += found.changes
+        assert np.abs(found.mean / MEAN - 1.0).max() < 0.06
+    assert changes == 0
+
+
 @pytest.mark.parametrize(("way", "number"), [("square", 1001), ("slalom", 1000)])
 def test_corners_are_no_change_and_teach_the_geometry(way, number):
     robot, found = robots(number, 1)[0], learner()
