@@ -57,8 +57,8 @@ def make_planner(config: RobotConfig, model: Model) -> control.Disco:
 def make_pipeline(config: RobotConfig, model: Model, planner: Planner) -> Pipeline:
     """Estimator, planner and governor with the limits of robot.toml; the planner with the fallback that it names."""
     if isinstance(planner, control.Disco) and config.control.fallback != "ramp":
-        law, limits = LAWS[config.control.fallback], control.CommandLimits.of_robot(config.robot)
-        planner = WithFallback(planner, law, planner.task, limits)
+        largest = control.CommandLimits.of_robot(config.robot)
+        planner = WithFallback(planner, LAWS[config.control.fallback], planner.task, largest)
     limits = WheelLimits(
         max_speed_rad_s=config.robot.max_wheel_speed_rad_s,
         max_acceleration_rad_s2=config.robot.max_wheel_acceleration_rad_s2,

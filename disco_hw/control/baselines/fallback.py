@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from types import MappingProxyType
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import msgspec
 import numpy as np
@@ -28,6 +28,7 @@ LAWS: Mapping[str, Callable[[], Law]] = MappingProxyType(
 """By the names of `control.fallback`."""
 
 
+@runtime_checkable
 class Line(Protocol):
     """A planned task along a line at one speed."""
 
@@ -77,10 +78,9 @@ class WithFallback:
         self._follower = self._along(task)
 
     def _along(self, task: PlannedTask) -> Follower:
-        if not hasattr(task, "line_m") or not hasattr(task, "speed_m_s"):
+        if not isinstance(task, Line):
             raise TypeError(f"{type(task).__name__} has no line that a follower could drive")
-        line: Line = task
-        reference = Reference(line.line_m(), line.speed_m_s, self._planner.chassis.x_icr_m)
+        reference = Reference(task.line_m(), task.speed_m_s, self._planner.chassis.x_icr_m)
         return Follower(reference, self._law(), self._chassis())
 
     def _chassis(self) -> NominalRobot:
