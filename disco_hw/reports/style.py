@@ -23,7 +23,7 @@ table{border-collapse:collapse;margin:.6rem 0}td,th{padding:.2rem .8rem;text-ali
 td.n{text-align:right;font-variant-numeric:tabular-nums}img{max-width:100%}
 aside{float:right;width:14rem;margin:0 0 1rem 1.5rem;font-size:.85rem;color:#444;background:#fafafa;padding:0 .8rem}
 dt{font-weight:600}dd{margin:0 0 .3rem}details{margin:.5rem 0;overflow-x:auto}summary{cursor:pointer;font-weight:600}
-figure{margin:1.2rem 0}figcaption{color:#555;font-size:.9rem}h2{margin-top:2rem}
+figure{margin:1.2rem 0;overflow:hidden}figcaption{color:#555;font-size:.9rem}h2{margin-top:2rem}
 """
 
 
