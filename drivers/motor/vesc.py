@@ -56,6 +56,7 @@ class _Motor:
     node: int
     turned: parts.Odometer = field(default_factory=parts.Odometer)
     answered: bool = False
+    counted_after_ns: int = 0
     erpm_ns: int | None = None
     fault: int | None = None
     timed_out: bool = False
@@ -321,7 +322,10 @@ class VescDriver:
 
     def _take_tachometer(self, motor: _Motor, tachometer: int, t_ns: int) -> None:
         fastest = 1.5 * self._settings.max_erpm / _ERPM_PER_STEP_S
-        if not motor.turned.take_wrapping(tachometer, t_ns, fastest * (t_ns - motor.turned.t_ns) * 1e-9 + 12):
+        # Both may have been read late, after a pause of the host, but not before it looked last.
+        longest_ns = t_ns - min(motor.turned.t_ns, motor.counted_after_ns)
+        motor.counted_after_ns = self._permit.looked_ns
+        if not motor.turned.take_wrapping(tachometer, t_ns, fastest * longest_ns * 1e-9 + 12):
             self._count("implausible_ticks")
             if self._permit.is_driving:
                 self._permit = self._permit.lost(f"controller {motor.node} has restarted")

@@ -23,7 +23,7 @@ def test_a_signal_stops_the_wheels_before_the_process_ends(tmp_path, number):
     with running_stack(tmp_path) as stack:
         stack.drive()
         os.kill(stack.daemon.process.pid, number)
-        code = stack.daemon.process.wait(8.0)
+        code = stack.daemon.process.wait(60.0)
         ended_s = time.monotonic()
         time.sleep(0.3)
         rows = stack.truth()
@@ -40,7 +40,7 @@ def test_quit_stops_the_wheels_too(tmp_path):
     with running_stack(tmp_path) as stack:
         stack.drive()
         stack.operator.tell("quit")
-        assert stack.daemon.process.wait(8.0) == 0
+        assert stack.daemon.process.wait(60.0) == 0
         ended_s = time.monotonic()
         rows = stack.truth()
     assert next(row for row in reversed(rows) if row.t_s < ended_s).fastest < STILL_RAD_S
@@ -87,7 +87,7 @@ def test_an_exception_in_the_loop_stops_the_wheels_and_is_told(tmp_path, monkeyp
     error = "RuntimeError"
     with daemon_that_fails(monkeypatch, error), running_stack(tmp_path) as stack:
         stack.start()
-        code = stack.daemon.process.wait(8.0)
+        code = stack.daemon.process.wait(60.0)
         time.sleep(1.2)
         rows = stack.truth()
         output = (tmp_path / "daemon.txt").read_text()

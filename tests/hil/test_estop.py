@@ -23,7 +23,7 @@ def estop(robot_file, *arguments: str) -> tuple[int, str]:
         [sys.executable, "-m", "disco_hw", "estop", str(robot_file), *arguments],
         capture_output=True,
         text=True,
-        timeout=20,
+        timeout=60,
         check=False,
     )
     return result.returncode, result.stdout + result.stderr

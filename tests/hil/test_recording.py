@@ -81,7 +81,7 @@ def test_a_recorder_frozen_killed_and_deleted_on_the_way_is_told_counted_and_rep
         assert recorder["dropped_ticks"] == 0
         assert recorder["ticks"] == sum(recorder[f"{where}_ticks"] for where in ("delivered", "waiting", "lost"))
         stack.operator.tell("quit")
-        assert stack.daemon.process.wait(10.0) == 0
+        assert stack.daemon.process.wait(60.0) == 0
         output = (tmp_path / "daemon.txt").read_text()
     for words in ("has not answered for", "was ended", "signal 9", "deleted while it was written", "goes on in"):
         assert any(line.startswith("recording: ") and words in line for line in output.splitlines()), words

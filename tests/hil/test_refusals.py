@@ -169,7 +169,7 @@ def test_a_replayed_session_never_turns_a_wheel(tmp_path):
             stack.operator.tell("disarm")
             stack.operator.wait_for("READY", 5.0)
             stack.operator.tell("quit")
-            stack.daemon.process.wait(8.0)
+            stack.daemon.process.wait(60.0)
         finally:
             done.set()
             thread.join()
@@ -274,7 +274,7 @@ def test_garbage_on_a_serial_line_leaves_the_daemon_waiting(tmp_path):
             with pytest.raises(WorkError, match="refused to arm"):
                 operator.tell("arm")
             operator.tell("quit")
-            assert daemon.process.wait(10.0) == 0
+            assert daemon.process.wait(60.0) == 0
     finally:
         stop.set()
         thread.join()

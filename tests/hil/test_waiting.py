@@ -35,7 +35,7 @@ def test_without_a_robot_it_says_what_it_waits_for_what_to_do_and_where_the_log_
         assert status.splitlines()[0] == waits_for.removeprefix("state: ").split(". Check")[0]
         assert status.splitlines()[1] == "next: Check the robot's power and the cable to it."
         daemon.process.send_signal(signal.SIGTERM)
-        assert daemon.process.wait(20.0) == 0
+        assert daemon.process.wait(60.0) == 0
         assert lines_of_end(daemon)[-1] == f"log: look at it: disco-hw view {log}, or disco-hw log info {log}"
     _, report = disco("check", str(robot))
     assert f"fail  link: {status.splitlines()[0].removeprefix('DISCONNECTED: ')}" in report

@@ -41,7 +41,7 @@ def test_python_cans_viewer_shows_the_frames_in_a_terminal(tmp_path):
         environment = {**os.environ, "TERM": "xterm", "LINES": "40", "COLUMNS": "120"}
         with subprocess.Popen(viewer, stdin=slave, stdout=slave, stderr=slave, env=environment) as process:
             shown = b""
-            deadline = time.monotonic() + 10.0
+            deadline = time.monotonic() + 60.0
             while time.monotonic() < deadline and not {b"0x110", b"0x111"} <= set(re.findall(rb"0x\d{3}", shown)):
                 if select.select((master,), (), (), 0.1)[0]:
                     shown += os.read(master, 65536)

@@ -44,6 +44,20 @@ def test_a_controller_that_restarts_while_armed_is_lost():
     assert "restarted" in bench.driver.detail
 
 
+def test_counts_that_a_pause_of_the_host_has_brought_together_are_no_restart():
+    bench = VESC.bench()
+    bench.arm()
+    bench.run(2.0, (7.0, 7.0))
+    # Shorter than the timeout; what came meanwhile is read, and stamped, all at its end.
+    bench.host_runs, ends_ns = False, bench.now_ns + 80_000_000
+    bench.delay_ns = lambda _random: max(0, ends_ns - bench.now_ns)
+    bench.run(0.08)
+    bench.host_runs = True
+    bench.run(0.5)
+    assert bench.driver.state is DriverState.ARMED, bench.driver.detail
+    assert bench.driver.stats.implausible_ticks == 0
+
+
 def test_status_messages_that_are_off_are_asked_for_by_name():
     bench = VESC.bench()
     for side in bench.robot.controller.sides:
