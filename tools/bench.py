@@ -6,6 +6,7 @@ import importlib
 import json
 import os
 import platform
+import signal
 import sys
 from pathlib import Path
 
@@ -63,4 +64,6 @@ def _cpu() -> str:
 
 
 if __name__ == "__main__":
+    # So that whoever breaks it off leaves no robot, daemon or node running.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
     raise SystemExit(main())

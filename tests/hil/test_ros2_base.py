@@ -11,8 +11,10 @@ import pytest
 
 pytest.importorskip("cyclonedds", reason="cyclonedds is not installed: make venv")
 
+from disco_hw.config import load_robot_config
 from disco_hw.experiments.live_stack import FAST_START, FAST_TASK, READY_TIMEOUT_S, Operator, stands, write_robot_file
 from disco_hw.experiments.live_stack import disco_hw_process as process_of
+from tests.hil.test_ros2 import real_node, real_ros
 
 pytestmark = [pytest.mark.hil, pytest.mark.long, pytest.mark.timeout(400)]
 JOINTS = 'left_joints = ["fl", "rl"]\nright_joints = ["fr", "rr"]\n'
@@ -21,14 +23,14 @@ JOINTS = 'left_joints = ["fl", "rl"]\nright_joints = ["fr", "rr"]\n'
 class Base:
     """Node, bridge and daemon, each in a process of its own."""
 
-    def __init__(self, directory, stack, lines=JOINTS):
+    def __init__(self, directory, stack, lines=JOINTS, real=False):
         self.directory, self.stack = directory, stack
         self.robot_file = write_robot_file(directory, task=FAST_TASK, device="ros2_base")
         text = self.robot_file.read_text(encoding="utf-8").replace("watchdog_s = 0.5\n", f"watchdog_s = 0.5\n{lines}")
         text += f"[ros2]\ndomain = {100 + os.getpid() % 100}\n"
         self.robot_file.write_text(text, encoding="utf-8")
         self.said = directory / "node.txt"
-        self.node = self.begin_node()
+        self.node = self.begin_real_node() if real else self.begin_node()
         self.bridge = self.begin_bridge()
         daemon = ["run", str(self.robot_file), "--log", str(directory / "run.mcap")]
         self.daemon = stack.enter_context(process_of("daemon", daemon, directory / "daemon.txt")).process
@@ -42,6 +44,13 @@ class Base:
         self.stack.callback(node.wait)
         self.stack.callback(node.kill)
         return node
+
+    def begin_real_node(self):
+        """The base as a node of real ROS 2, with another DDS than ours."""
+        config = load_robot_config(self.robot_file)
+        settings = config.link.settings()
+        numbers = (config.pose.port, settings.wheel_radius_m, settings.track_m, *FAST_START)
+        return self.stack.enter_context(real_node(self.said, "base", *numbers))
 
     def begin_bridge(self):
         words = ["bridge", "ros2-base", str(self.robot_file)]
@@ -89,6 +98,21 @@ def test_it_drives_the_circle_and_stops_when_the_daemon_dies(tmp_path):
         base.wait_for_true_standstill()
         # The bridge goes on and says that nobody drives.
         assert (tmp_path / "bridge.txt").read_text(encoding="utf-8").splitlines()[-1].endswith("standing by")
+
+
+@real_ros
+def test_a_base_of_real_ros_is_driven_round_and_the_stack_stops_when_it_dies(tmp_path):
+    with ExitStack() as stack:
+        base = Base(tmp_path, stack, real=True)
+        base.drive()
+        base.operator.wait_until("half a circle on", lambda status: status["pose"][0] < -2.5, 120.0)
+        assert base.operator.status()["task"]["distance_m"] < 0.1
+        base.operator.tell("stop")
+        base.wait_for_true_standstill()
+        base.operator.tell("start")
+        base.operator.wait_until("at speed", lambda status: max(status["wheels"]) > 6.0, 20.0)
+        base.node.kill()
+        base.operator.wait_until("disarmed", lambda status: status["state"] != "ARMED", 60.0)
 
 
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
