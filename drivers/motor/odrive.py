@@ -85,7 +85,7 @@ class OdriveDriver:
     def __init__(self, settings: OdriveSettings) -> None:
         self._settings = settings
         self._generation = settings.generation
-        self._axes = [[_Axis(node) for node in side] for side in settings.sides]
+        self._axes = [[_Axis(node) for node in side] for side in parts.sides_of(settings.nodes)]
         self._by_node = {axis.node: axis for side in self._axes for axis in side}
         self.stats = DriverStats()
         self._permit = MotionPermit()

@@ -18,7 +18,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta
 
-from drivers.motor.vendor_parts import Nodes, Sign, in_sides, sides_of
+from drivers.motor.vendor_parts import Layout, Nodes, Sign, all_of, in_sides, layouts, sides_of
 from drivers.types import CyclicFrame, Frame, SafetyCard, SettingsFault
 
 LARGEST_NODE = 0x3E
@@ -45,25 +45,6 @@ VELOCITY_CONTROL = 2
 PASSTHROUGH = 1
 
 
-@dataclass(frozen=True, slots=True)
-class Layout:
-    """A message: its command number, the bytes by `struct`, and the names of the fields."""
-
-    command: int
-    body: str
-    fields: tuple[str, ...] = ()
-
-    @property
-    def length(self) -> int:
-        """Of the data in bytes."""
-        return struct.calcsize("<" + self.body)
-
-
-def _table(*layouts: tuple[str, int, str, str]) -> Mapping[str, Layout]:
-    made = {name: Layout(command, body, tuple(names.split())) for name, command, body, names in layouts}
-    return MappingProxyType(made)
-
-
 _COMMON_COMMANDS = (
     ("Estop", 0x02, "", ""),
     ("Set_Axis_State", 0x07, "I4x", "state"),
@@ -79,13 +60,15 @@ _COMMON_COMMANDS = (
 )
 COMMANDS: Mapping[Generation, Mapping[str, Layout]] = MappingProxyType(
     {
-        Generation.V05: _table(
+        Generation.V05: layouts(
+            "<",
             *_COMMON_COMMANDS,
             ("Set_Axis_Node_ID", 0x06, "I", "new_node_id"),
             ("Clear_Errors", 0x18, "", ""),
             ("Set_Linear_Count", 0x19, "i4x", "count"),
         ),
-        Generation.V06: _table(
+        Generation.V06: layouts(
+            "<",
             *_COMMON_COMMANDS,
             ("Reboot", 0x16, "B", "action"),
             ("Clear_Errors", 0x18, "B", "identify"),
@@ -103,7 +86,8 @@ _COMMON_TELEMETRY = (
 )
 TELEMETRY: Mapping[Generation, Mapping[str, Layout]] = MappingProxyType(
     {
-        Generation.V05: _table(
+        Generation.V05: layouts(
+            "<",
             *_COMMON_TELEMETRY,
             ("Heartbeat", 0x01, "IBBBB", "axis_error axis_state motor_flags encoder_flags controller_flags"),
             ("Get_Motor_Error", 0x03, "Q", "motor_error"),
@@ -113,7 +97,8 @@ TELEMETRY: Mapping[Generation, Mapping[str, Layout]] = MappingProxyType(
             ("Get_Sensorless_Estimates", 0x15, "ff", "sensorless_pos sensorless_vel"),
             ("Get_Controller_Error", 0x1D, "I4x", "controller_error"),
         ),
-        Generation.V06: _table(
+        Generation.V06: layouts(
+            "<",
             *_COMMON_TELEMETRY,
             (
                 "Get_Version",
@@ -163,7 +148,7 @@ def split(can_id: int) -> tuple[int, int]:
 def encode(generation: Generation, node: int, name: str, **values: Value) -> Frame:
     """Return the frame of a command; `values` by the names of `COMMANDS`. Raises KeyError for one that is missing."""
     layout = COMMANDS[generation][name]
-    data = struct.pack("<" + layout.body, *(values[field] for field in layout.fields))
+    data = layout.pack(*(values[field] for field in layout.fields))
     return Frame(identifier(node, layout.command), data)
 
 
@@ -181,7 +166,7 @@ def decode(generation: Generation, frame: Frame) -> Decoded | None:
     name, layout = known
     if len(frame.data) != layout.length:
         return None
-    values: dict[str, Value] = dict(zip(layout.fields, struct.unpack("<" + layout.body, frame.data), strict=True))
+    values: dict[str, Value] = layout.unpack(frame.data)
     if generation is Generation.V06 and name == "Heartbeat":
         values["trajectory_done"] = int(values["trajectory_done"]) & 1
     return Decoded(node, name, values)
@@ -275,24 +260,14 @@ class OdriveSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     stop_deceleration_rad_s2: Annotated[float, Meta(gt=0.0, le=655.0)] = 10.0
 
     @property
-    def sides(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
-        """The nodes on the left and on the right."""
-        return sides_of(self.nodes)
-
-    @property
-    def all_nodes(self) -> tuple[int, ...]:
-        """Every node, left before right."""
-        return (*self.sides[0], *self.sides[1])
-
-    @property
     def generation(self) -> Generation:
         """Of the firmware."""
         return Generation(self.firmware)
 
     def fault(self) -> SettingsFault | None:
         """What no single field shows."""
-        nodes = self.all_nodes
-        if not all(self.sides):
+        nodes = all_of(self.nodes)
+        if not all(sides_of(self.nodes)):
             return SettingsFault("nodes", "a side has no node", "write [left, right], such as [3, 5]")
         if any(not 0 <= node <= LARGEST_NODE for node in nodes):
             return SettingsFault("nodes", f"a node is outside 0 to {LARGEST_NODE}", "write those of odrivetool")
@@ -311,12 +286,12 @@ def error_words(generation: Generation, error: int) -> str:
 
 def stop_frames(settings: OdriveSettings) -> tuple[Frame, ...]:
     """The e-stop to every node: it idles with an error that stays until it is cleared."""
-    return tuple(encode(settings.generation, node, "Estop") for node in settings.all_nodes)
+    return tuple(encode(settings.generation, node, "Estop") for node in all_of(settings.nodes))
 
 
 def stop_confirmation(settings: OdriveSettings) -> Callable[[Frame], bool]:
     """Return what says, frame by frame heard, whether every node has reported the e-stop."""
-    waiting = set(settings.all_nodes)
+    waiting = set(all_of(settings.nodes))
 
     def heard(frame: Frame) -> bool:
         decoded = decode(settings.generation, frame)
@@ -331,7 +306,7 @@ def stop_confirmation(settings: OdriveSettings) -> Callable[[Frame], bool]:
 def cyclic_frames(settings: OdriveSettings, command_rate_hz: float, _authenticated: bool) -> tuple[CyclicFrame, ...]:
     """Velocities, heartbeats and encoder estimates (each 10 ms) of every node."""
     frames: list[CyclicFrame] = []
-    for node in settings.all_nodes:
+    for node in all_of(settings.nodes):
         frames += [
             CyclicFrame(f"Set_Input_Vel of {node}", "HOST", 8, command_rate_hz),
             CyclicFrame(f"Heartbeat of {node}", "ROBOT", 8, 1.0 / settings.heartbeat_s),

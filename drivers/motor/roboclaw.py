@@ -14,20 +14,7 @@ from msgspec.structs import replace
 from drivers.motor import roboclaw_protocol as protocol
 from drivers.motor import vendor_parts as parts
 from drivers.motor.roboclaw_board import TO_KNOW, Board
-from drivers.motor.roboclaw_protocol import (
-    EXAMPLE,
-    QUESTIONS,
-    RoboclawExchange,
-    RoboclawSettings,
-    cyclic_frames,
-    question,
-    recognise,
-    safety_card,
-    setting,
-    stands,
-    stop_confirmation,
-    stop_frames,
-)
+from drivers.motor.roboclaw_protocol import RoboclawExchange, RoboclawSettings, question, setting, stands, stop_frames
 from drivers.motor.vendor_parts_permit import Controllers, MotionPermit, Stage
 from drivers.types import (
     DriverState,
@@ -394,14 +381,14 @@ DRIVER = MotorDriver(
     "roboclaw",
     lambda settings, _key: RoboclawDriver(settings),
     settings=RoboclawSettings,
-    example=EXAMPLE,
+    example=protocol.EXAMPLE,
     kinds=("serial",),
     exchange=lambda _settings: RoboclawExchange(),
-    recognise=recognise,
-    questions=QUESTIONS,
+    recognise=protocol.recognise,
+    questions=protocol.QUESTIONS,
     latches_stop=False,
     stop_frames=stop_frames,
-    stop_confirmation=stop_confirmation,
-    cyclic_frames=cyclic_frames,
-    safety_card=safety_card,
+    stop_confirmation=protocol.stop_confirmation,
+    cyclic_frames=protocol.cyclic_frames,
+    safety_card=protocol.safety_card,
 )

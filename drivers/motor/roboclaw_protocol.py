@@ -21,7 +21,7 @@ from typing import Annotated, Any
 import msgspec
 from msgspec import Meta
 
-from drivers.motor.vendor_parts import Sign, in_sides
+from drivers.motor.vendor_parts import Sign, in_sides, layouts
 from drivers.types import CyclicFrame, Frame, LineQuestions, SafetyCard, SettingsFault
 
 FIRST_ADDRESS, LAST_ADDRESS = 0x80, 0x87
@@ -34,26 +34,8 @@ _LONGEST_VERSION = 48
 _CRC_BYTES = 2
 
 
-@dataclass(frozen=True, slots=True)
-class Layout:
-    """A command's number, the bytes of its arguments or of its reply by `struct`, and the names of the fields."""
-
-    command: int
-    body: str
-    fields: tuple[str, ...] = ()
-
-    @property
-    def length(self) -> int:
-        """Of arguments or data in bytes, the CRC not counted."""
-        return struct.calcsize(">" + self.body)
-
-
-def _table(*layouts: tuple[str, int, str, str]) -> Mapping[str, Layout]:
-    made = {name: Layout(command, body, tuple(names.split())) for name, command, body, names in layouts}
-    return MappingProxyType(made)
-
-
-SETTERS = _table(
+SETTERS = layouts(
+    ">",
     ("set_serial_timeout", 14, "B", "timeout_ds"),
     ("reset_encoders", 20, "", ""),
     ("set_velocity_pid_m1", 28, "IIII", "d p i qpps"),
@@ -68,7 +50,8 @@ SETTERS = _table(
     ("set_estop_lock", 201, "B", "state"),
 )
 """What a host may set. The driver uses duty_m1m2, speed_accel_m1m2 and, when asked to reset, reset_estop."""
-GETTERS = _table(
+GETTERS = layouts(
+    ">",
     ("serial_timeout", 15, "B", "timeout_ds"),
     ("encoder_m1", 16, "iB", "encoder status"),
     ("encoder_m2", 17, "iB", "encoder status"),
@@ -104,7 +87,7 @@ def set_bytes(address: int, name: str, **values: int) -> bytes:
     """
     layout = SETTERS[name]
     arguments = [_held(values[field], code) for field, code in zip(layout.fields, layout.body, strict=True)]
-    return with_crc(_head(address, layout.command) + struct.pack(">" + layout.body, *arguments))
+    return with_crc(_head(address, layout.command) + layout.pack(*arguments))
 
 
 def ask_bytes(address: int, name: str) -> bytes:
@@ -131,8 +114,7 @@ def reply(address: int, name: str, received: bytes) -> tuple[Mapping[str, Value]
         text = received[: end + 1].decode("ascii", "replace")
         return MappingProxyType({"version": text}), end + 2 + _CRC_BYTES
     if _checks(head, received, layout.length):
-        fields = zip(layout.fields, struct.unpack_from(">" + layout.body, received), strict=True)
-        return MappingProxyType(dict(fields)), layout.length + _CRC_BYTES
+        return MappingProxyType(layout.unpack(received)), layout.length + _CRC_BYTES
     older = name == "status" and len(received) == _OLDER_STATUS.size + _CRC_BYTES
     if older and _checks(head, received, _OLDER_STATUS.size):
         return MappingProxyType({"status_u32": _OLDER_STATUS.unpack_from(received)[0]}), len(received)

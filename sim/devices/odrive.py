@@ -14,6 +14,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 from drivers.motor.odrive_protocol import OdriveSettings
+from drivers.motor.vendor_parts import sides_of
 from firmware_protocol.firmware_core import FirmwareInputs
 from sim.can_frame import CanFrame
 
@@ -367,7 +368,7 @@ class OdriveController:
 
     def _make_boards(self) -> list[OdriveBoard]:
         settings = self._settings
-        left, right = settings.sides
+        left, right = sides_of(settings.nodes)
         pairs = list(zip(left, right, strict=True)) if settings.firmware == "0.5" else [(n,) for n in (*left, *right)]
         periods = {"heartbeat": round(1000.0 * settings.heartbeat_s), "encoder": 10}
         boards = [OdriveBoard(settings.firmware, nodes, periods) for nodes in pairs]
@@ -382,7 +383,7 @@ class OdriveController:
 
     def _axes_by_side(self) -> tuple[list[Axis], list[Axis]]:
         by_node = {axis.node_id: axis for board in self.boards for axis in board.axes}
-        left, right = self._settings.sides
+        left, right = sides_of(self._settings.nodes)
         return [by_node[node] for node in left], [by_node[node] for node in right]
 
 
