@@ -23,7 +23,7 @@ def test_without_faults_it_drives_and_nothing_is_told():
     assert run.core.plausibility.stats == PlausibilityStats()
 
 
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.long)])
 def test_random_faults_end_in_a_stop_or_are_tolerated(seed):
     kinds = tuple(kind for kind in KINDS if kind not in KINDS_LEFT_OUT)
     run = FaultRun(random_schedule(seed, 23.0, kinds=kinds, quiet_s=(3.0, 4.0)), seed=seed, **FAST)
