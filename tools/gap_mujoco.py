@@ -164,7 +164,8 @@ def row(of: Result) -> str:
     """One line of the table."""
     known = "" if of.truth is None else f"{of.truth:.3g}"
     found = "" if of.found is None else f"{of.found:.3g}"
-    others = [name for name in (*of.named, *of.unnamed) if name != NAMES.get(of.hidden, ("",))[0]]
+    # A pipe within a term would end the cell.
+    others = [name.replace("|", "\\|") for name in (*of.named, *of.unnamed) if name != NAMES.get(of.hidden, ("",))[0]]
     errors = [f"{of.unseen[stage][0]:.0f} / {of.unseen[stage][1]:.0f}" for stage in STAGES]
     position, yaw = of.over_timed(of.offered)
     floor = f"{of.floor[0]:.1f} / {of.floor[1]:.1f} | {of.injected[0]:.1f} / {of.injected[1]:.1f}"
