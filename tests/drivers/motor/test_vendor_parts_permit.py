@@ -21,7 +21,7 @@ STANDBY, READY, ARM, RESET = Request
 
 AT = {
     "rest": MotionPermit(link_is_up=True),
-    "ready": MotionPermit(link_is_up=True, wanted=READY),
+    "ready": MotionPermit(link_is_up=True, wanted=READY, speeds=(2.0, 1.0), zeros=9, since_ns=NOW - 3),
     "resetting": MotionPermit(link_is_up=True, wanted=RESET, fault="old"),
     "e-stopped": MotionPermit(link_is_up=True, estopped=True),
     "arming": MotionPermit(link_is_up=True, stage=ARMING, wanted=ARM, since_ns=NOW - 5, zeros=3, fed_ns=NOW - 20 * MS),
@@ -94,7 +94,7 @@ LATCHED_FAULT = {"note": "not arming: old; remove the cause, then reset"}
 LATCHED_STOP = {"note": "not arming: emergency stop; remove its cause, then reset"}
 OTHERWISE = {
     "rest": {**AT_REST, "arm": ARMS, "arm, unfit": {"note": "not arming: why"}},
-    "ready": {**AT_REST, "arm": ARMS, "arm, unfit": {"note": "not arming: why"}},
+    "ready": {**AT_REST, "begun": {}, "arm": ARMS, "arm, unfit": {"note": "not arming: why"}},
     "resetting": {
         **AT_REST,
         "arm": LATCHED_FAULT,
@@ -220,6 +220,20 @@ def test_whoever_else_is_on_the_link_is_said_once_and_again_after_a_restart():
     assert once.restarted("it restarted").command_heard("wheel 3").events == (SHARED, SHARED)
     stopped = AT["armed"].stop_heard()
     assert stopped.stop_heard().events == (STOPPED_FROM_OUTSIDE,)
+
+
+def test_an_emergency_stop_that_is_heard_again_stops_again():
+    assert replace(AT["e-stopped"], after_loss=BRAKING).stop_heard().stage is BRAKING
+
+
+@pytest.mark.parametrize("stage", [ARMING, ARMED, STOPPING, BRAKING])
+def test_what_is_latched_is_cleared_at_rest_alone(stage):
+    latched = replace(AT["resetting"], stage=stage)
+    assert latched.reset(WELL) == latched
+
+
+def test_driving_is_whatever_holds_speeds_or_is_about_to():
+    assert {stage for stage in Stage if MotionPermit(stage=stage).is_driving} == {ARMING, ARMED, STOPPING}
 
 
 @pytest.mark.parametrize(
