@@ -136,9 +136,10 @@ def check_after_full_disk(path, stats, words):
 
 
 def test_a_full_disk_ends_the_log_and_with_room_again_another_begins(tmp_path):
-    with SmallDisk(tmp_path, 160) as disk:
+    with SmallDisk(tmp_path, 4160) as disk:
         filler = disk / "filler"
-        filler.write_bytes(bytes(40_000))
+        # With 120 kB beside it; without it there is room for all that a slow machine has waiting by then.
+        filler.write_bytes(bytes(4040 * 1024))
         path = disk / "run.mcap"
         recorder = ProcessRecorder(recording(path))
         stats, given = fill(recorder)
