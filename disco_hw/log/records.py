@@ -254,6 +254,17 @@ class Controller(msgspec.Struct, frozen=True, gc=False):
     declared: dict[str, float] = {}
 
 
+class UnexplainedMotion(msgspec.Struct, frozen=True, gc=False):
+    """How the robot moves beside its model, as found by this tick: the fields of `model.disturbance.Disturbance`."""
+
+    t_ns: int
+    forward: float
+    left: float
+    curvature_per_m: float
+    drift_x_m_s: float
+    drift_y_m_s: float
+
+
 Record = (
     FrameIn
     | FrameOut
@@ -276,6 +287,7 @@ Record = (
     | Task
     | Fan
     | Controller
+    | UnexplainedMotion
 )
 
 
@@ -309,6 +321,7 @@ TOPICS: tuple[Topic, ...] = (
     Topic("/belief", BeliefChange),
     Topic("/adapt", Adaptation),
     Topic("/controller", Controller),
+    Topic("/disturbance", UnexplainedMotion),
 )
 
 TOPIC_INDEX: Mapping[type, int] = MappingProxyType({topic.record: index for index, topic in enumerate(TOPICS)})

@@ -113,7 +113,8 @@ class Tick(msgspec.Struct, frozen=True, gc=False):
     """What one tick made of its samples.
 
     `plan` is this tick's new plan or None, `plan_age_ns` the age of the one in force, `planner_failure` why there is no
-    new one; `requested` is what `source` wanted, `command` what the governor lets through (rad/s).
+    new one; `requested` is what `source` wanted, `command` what the governor lets through (rad/s); `disturbance` what
+    was planned with, None where none is estimated.
     """
 
     t_ns: int
@@ -125,6 +126,7 @@ class Tick(msgspec.Struct, frozen=True, gc=False):
     source: Source
     requested: tuple[float, float]
     command: Governed
+    disturbance: Disturbance | None = None
 
 
 def untimed(_stage: str) -> None:
@@ -215,6 +217,7 @@ class Pipeline:
             source=source,
             requested=requested,
             command=command,
+            disturbance=None if self._disturbance is None else self._disturbance.value,
         )
 
     def _take_pose(self, pose: PoseSample, now_ns: int) -> PoseUpdate:

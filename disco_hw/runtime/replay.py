@@ -15,7 +15,7 @@ import msgspec
 from disco_hw.adaptation.guard import geometry_of
 from disco_hw.errors import InputError
 from disco_hw.log.reader import Entry, open_log
-from disco_hw.log.records import BeliefChange, Command, Estimate, Innovation, Plan, Record, Task
+from disco_hw.log.records import BeliefChange, Command, Estimate, Innovation, Plan, Record, Task, UnexplainedMotion
 from disco_hw.runtime import records_of_tick
 from disco_hw.runtime.assembly import make_pipeline, make_planner, put_in_force
 from disco_hw.runtime.pipeline import FollowTask, Manual, Motion, Off, Pipeline, Silent, Source, Stand
@@ -23,8 +23,18 @@ from disco_hw.runtime.robot_setup import setup_of_log
 from disco_hw.runtime.task_change import task_of
 from drivers.types import PoseSample, Readings, WheelSample
 
-_TOPICS = ("/wheels", "/pose", "/estimate", "/estimate/innovation", "/plan", "/command", "/task", "/belief")
-_COMPARED = (Estimate, Innovation, Plan, Command)
+_TOPICS = (
+    "/wheels",
+    "/pose",
+    "/estimate",
+    "/estimate/innovation",
+    "/plan",
+    "/command",
+    "/task",
+    "/belief",
+    "/disturbance",
+)
+_COMPARED = (Estimate, Innovation, UnexplainedMotion, Plan, Command)
 # Whether a command went out is the driver's part, which is not replayed.
 _NOT_REPLAYED = {(Command, "in_force"), (Command, "valid_for_s")}
 _FLOAT = struct.Struct("<d")

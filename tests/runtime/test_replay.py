@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from msgspec import structs
 
 import disco_hw
 from disco_hw.control.optimiser import Optimiser
@@ -12,6 +13,7 @@ from disco_hw.errors import InputError
 from disco_hw.log.link import Attachment
 from disco_hw.log.provenance import MODEL_TOML, ROBOT_TOML
 from disco_hw.log.recorder import ProcessRecorder, RecordingSettings
+from disco_hw.log.records import UnexplainedMotion
 from disco_hw.runtime.pipeline import Source
 from disco_hw.runtime.replay import replay
 from disco_hw.runtime.supervisor import UserRequest
@@ -52,6 +54,31 @@ def test_the_same_robot_gives_the_same_bits(tmp_path, ticks):
     assert report.ok, report.as_text()
     assert report.ticks == len(ticks)
     assert report.values > 5000
+
+
+def test_what_no_parameter_explains_is_recorded_and_replays_bit_for_bit(tmp_path):
+    text = (ROBOTS / "wombot.toml").read_text().replace("rate_hz = 50.0", "rate_hz = 50.0\ndisturbance = true")
+    text = text.replace("wombot_model.toml", str(ROBOTS / "wombot_model.toml"))
+    (tmp_path / "robot.toml").write_text(text)
+    stack = simulated_stack(robot_file=tmp_path / "robot.toml")
+    stack.run(1.5)
+    stack.run(0.5, UserRequest.ARM)
+    stack.run(2.5, UserRequest.START)
+    ticks = stack.recorder.ticks
+    found = [one for _, records in ticks for one in records if isinstance(one, UnexplainedMotion)]
+    assert len(found) == len(ticks)
+    assert found[0].forward == 0.0 != found[-1].forward
+    assert abs(found[-1].drift_x_m_s) + abs(found[-1].drift_y_m_s) > 0.0
+    assert stack.core.last.pipeline.disturbance.forward == found[-1].forward
+    report = replay(write_log(tmp_path / "run.mcap", ticks, text))
+    assert report.ok, report.as_text()
+    wrong = [
+        (now, [structs.replace(one, left=0.1) if isinstance(one, UnexplainedMotion) else one for one in records])
+        for now, records in ticks
+    ]
+    report = replay(write_log(tmp_path / "wrong.mcap", wrong, text))
+    assert report.difference is not None
+    assert report.difference.field == "UnexplainedMotion.left"
 
 
 def test_a_follower_takes_over_from_a_planner_that_finds_nothing_and_replays_bit_for_bit(tmp_path, monkeypatch):
