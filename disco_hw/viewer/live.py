@@ -20,7 +20,7 @@ from disco_hw.viewer.recording import ShownRobot
 from disco_hw.viewer.scene import Scene
 from disco_hw.viewer.snapshot import Snapshot, snapshot_at
 from disco_hw.viewer.timeline import Items, Timeline
-from disco_hw.viewer.views import Views, add_layers, clear_of_phones
+from disco_hw.viewer.views import Views, add_layers
 
 MOVE_S = 0.1
 REDRAW_S = 0.5
@@ -64,7 +64,6 @@ class LivePage:
             self._details = gui.add_markdown("")
         self.scene = Scene(server, stage)
         self._views = Views(server, stage.task)
-        clear_of_phones(server)
         add_layers(server, self.scene, lambda: None)
 
     def step(self) -> None:

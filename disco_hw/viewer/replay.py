@@ -15,7 +15,7 @@ from disco_hw.viewer.plots import Plots
 from disco_hw.viewer.recording import Recording
 from disco_hw.viewer.scene import Scene
 from disco_hw.viewer.timeline import KINDS, Excited, Mark, marks_of
-from disco_hw.viewer.views import ScrubBar, Views, add_layers, clear_of_phones
+from disco_hw.viewer.views import ScrubBar, Views, add_layers
 
 SPEEDS = {"1/4": 0.25, "1/2": 0.5, "1": 1.0, "2": 2.0, "4": 4.0, "8": 8.0}
 STEP_S = 0.05
@@ -57,7 +57,6 @@ class ReplayPage:
             self._details = gui.add_markdown("")
         self.scene = Scene(server, recording.stage)
         self._views = Views(server, stage.task)
-        clear_of_phones(server)
         add_layers(server, self.scene, self._redraw)
 
     def go_to(self, t_s: float) -> None:

@@ -13,7 +13,6 @@ from disco_hw.viewer.scene import DARK, LAYER_COLOURS, LAYERS, LIGHT, Point, Sce
 
 FREE, TOP, FOLLOW = "free", "top", "follow"
 VIEWS = (FREE, TOP, FOLLOW)
-PHONE_PX = 600
 _BAR_HEIGHT_PX, _MARGIN_PX = 96.0, 12.0
 # Looking straight down, no direction would be up on the screen.
 _SOUTH_M = 0.01
@@ -81,21 +80,6 @@ def _camera(client: viser.ClientHandle) -> tuple[Point, Point]:
 def _look(client: viser.ClientHandle, camera: tuple[Point, Point]) -> None:
     with client.atomic():
         client.camera.position, client.camera.look_at = camera
-
-
-def clear_of_phones(server: viser.ViserServer) -> None:
-    """On a browser as narrow as a phone the panel begins folded: it would hide the robot."""
-
-    @server.on_client_connect
-    def _(client: viser.ClientHandle) -> None:
-        seen = False
-
-        @client.camera.on_update
-        def _(camera: viser.CameraHandle) -> None:
-            nonlocal seen
-            if not seen and 0 < camera.image_width < PHONE_PX:
-                client.gui.main_panel.minimize()
-            seen = True
 
 
 def add_layers(server: viser.ViserServer, scene: Scene, changed: Callable[[], None]) -> None:
