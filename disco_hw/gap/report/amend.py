@@ -39,7 +39,7 @@ def at_joint_fit(part: ChannelEstimates, own: Part, of: Freed, joint: JointFit) 
     """
     by_name, off = dict(part.by_name), np.zeros(len(part.fitted))
     for name, old in part.by_name.items():
-        value = joint.value(name, of)
+        value = joint.value(name, of, own)
         if value is None:
             continue
         deviation = float(np.hypot(old.deviation, value - old.value))
@@ -50,7 +50,7 @@ def at_joint_fit(part: ChannelEstimates, own: Part, of: Freed, joint: JointFit) 
     places = [joint.names.index(name) for name in new]
     added = joint.covariance[np.ix_(places, places)]
     for name, variance in zip(new, np.diag(added), strict=True):
-        value, half = float(joint.value(name, of) or 0.0), Z95 * float(variance) ** 0.5
+        value, half = float(joint.value(name, of, own) or 0.0), Z95 * float(variance) ** 0.5
         by_name[name] = ParameterEstimate(value, value - half, value + half)
     covariance = block_diag(part.covariance + np.diag(off**2), added) if new else part.covariance + np.diag(off**2)
     return ChannelEstimates(by_name, (*part.fitted, *new), covariance)

@@ -88,12 +88,17 @@ class JointFit:
     names: tuple[str, ...]
     covariance: Array
 
-    def value(self, name: str, of: Freed) -> float | None:
-        """One entry by its full name; None if it is in no channel's vector."""
-        for vector, part in zip(self.vectors, of.parts, strict=True):
-            if name in part.layout.place:
-                return float(vector[part.layout.place[name]])
-        return None
+    def value(self, name: str, of: Freed, own: Part | None = None) -> float | None:
+        """One entry by its full name, that of the part `own` if it has one; None if it is in no channel's vector.
+
+        Both channels number their unnamed terms alike.
+        """
+        found = [
+            (part is own, float(vector[part.layout.place[name]]))
+            for vector, part in zip(self.vectors, of.parts, strict=True)
+            if name in part.layout.place
+        ]
+        return next((value for is_own, value in found if is_own), found[0][1] if found else None)
 
 
 @dataclass(frozen=True)

@@ -5,11 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from disco_hw.gap.data.layout import BODY
+from disco_hw.gap.data.layout import BODY, WHEEL
 from disco_hw.gap.find import offered_stage
 from disco_hw.gap.noise.channels import BodyChannel
+from disco_hw.gap.report.amend import at_joint_fit
 from disco_hw.gap.search.cross_validation import Chain, PredictionErrors, smoothed_poses
-from disco_hw.gap.search.end_to_end import Ahead, Freed, Part
+from disco_hw.gap.search.end_to_end import Ahead, Freed, JointFit, Part
+from disco_hw.gap.search.intervals import ChannelEstimates, ParameterEstimate
 from disco_hw.gap.search.stages import _on_top
 from disco_hw.gap.settings import DEFAULT_SETTINGS
 from tests.gap.synthetic import GEOMETRY, NOISE, body_channel
@@ -113,3 +115,18 @@ def test_a_model_that_is_better_by_one_stretch_only_is_not_offered(of_last, offe
     # In sum it is better either way.
     gap["amended"] = by_block(0.1, 1.0, of_last)
     assert offered_stage(gap, True, DEFAULT_SETTINGS) == offered
+
+
+def test_a_term_of_the_wheels_keeps_its_number_though_the_body_has_one_of_the_same_name():
+    parts = []
+    for layout in (BODY, WHEEL):
+        longer = replace(
+            layout, columns=(*layout.columns, "term0"), place={**layout.place, "term0": len(layout.columns)}
+        )
+        parts.append(Part(longer, np.append(layout.neutral, 0.0), (), np.zeros((0, 0))))
+    of = Freed(tuple(parts), lambda vectors: Chain(*vectors))
+    vectors = tuple(np.append(part.vector[:-1], k) for part, k in zip(parts, (0.38, 0.12), strict=True))
+    joint = JointFit(vectors, 0.0, (), np.zeros((0, 0)))
+    before = ChannelEstimates({"term0": ParameterEstimate(0.1, 0.08, 0.12)}, ("term0",), np.array([[1e-4]]))
+    moved = [at_joint_fit(before, part, of, joint).by_name["term0"].value for part in parts]
+    assert moved == [0.38, 0.12]
