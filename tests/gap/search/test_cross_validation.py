@@ -161,3 +161,14 @@ def test_what_beats_by_one_stretch_alone_does_not_beat():
     # Heading may not pay for position.
     assert not beats(before, in_stretches([0.25] * 6, [1.2] * 6), settings)
     assert beats(before, in_stretches([0.25] * 6, [1.1] * 6), settings)
+
+
+def test_without_errors_by_stretch_the_whole_decides():
+    whole = PredictionErrors(1.0, (0.0, 1.0), 1.0, (0.0, 1.0), 0.0, {})
+    one = in_stretches([1.0], [1.0])
+    settings = DEFAULT_SETTINGS.prediction
+    assert surely_beats(whole, replace(whole, position_m=0.9), settings)
+    assert not surely_beats(whole, replace(whole, position_m=1.1), settings)
+    # A single stretch has to be better by far.
+    assert surely_beats(one, in_stretches([0.25], [0.25]), settings)
+    assert not surely_beats(one, in_stretches([0.81], [0.81]), settings)

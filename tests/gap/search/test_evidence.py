@@ -102,3 +102,13 @@ def test_the_cost_of_a_block_is_that_of_a_fit_without_it():
         coefficient = np.linalg.lstsq(x[~out], y[~out], rcond=None)[0]
         expected.append(0.5 * float(((x[out] @ coefficient - y[out]) ** 2).sum()))
     np.testing.assert_allclose(blocks, expected, rtol=1e-9)
+
+
+def test_a_score_is_twice_the_gain_over_its_inflation_less_the_price_of_its_parameters():
+    x = np.random.default_rng(7).standard_normal((N, 1))
+    y = 0.1 * x[:, 0] + np.random.default_rng(8).standard_normal(N)
+    small, big = linear_fit(np.empty((N, 0)), y), linear_fit(x, y)
+    proof = compare(small, big, channel(), 2.0)
+    expected = 2.0 * (small.cost - big.cost) / proof.inflation - 2.0 * np.log(N)
+    assert proof.score == pytest.approx(expected, rel=1e-12)
+    assert inflation(big, channel(), ()) == 1.0
