@@ -50,6 +50,8 @@ from drivers.types import (
 ARMING_TIMEOUT_NS = 1_500_000_000
 BEATS_TO_ARM = 2
 SILENT_BEATS = 3
+# Less, and a pause of the host of a few beats would be taken for the silence of an axis.
+SILENT_AT_LEAST_NS = 100_000_000
 VERSION_TRIES = 3
 WATCHDOG_TRIES = 5
 _VERSION_PERIOD_NS = 100_000_000
@@ -434,7 +436,7 @@ class OdriveDriver:
 
     def _check_silence(self, now_ns: int) -> None:
         self._permit = self._permit.looked(now_ns)
-        limit_ns = SILENT_BEATS * self._settings.heartbeat_s * 1e9
+        limit_ns = max(SILENT_BEATS * self._settings.heartbeat_s * 1e9, SILENT_AT_LEAST_NS)
         for axis in self._all:
             silent_ns = 0 if axis.heard_ns is None else self._permit.silent_ns(axis.heard_ns)
             if silent_ns > limit_ns:

@@ -126,6 +126,23 @@ def test_a_host_that_was_frozen_blames_itself_and_not_a_controller_whose_replies
     assert bench.largest_speed < 0.05
 
 
+@pytest.mark.parametrize("pause_s", [0.04, 0.06, 0.07, 0.08, 0.09])
+def test_a_host_that_pauses_for_less_than_any_watchdog_drives_on(vendor, bench, pause_s):
+    """Whatever came last before the pause; what the controllers sent meanwhile is read a tick after the loop is back."""
+    if pause_s + 0.04 > vendor.watchdog_s:
+        pytest.skip("its watchdog may stop it in such a pause")
+    drive(bench)
+    for _ in range(7):
+        bench.host_runs = False
+        bench.run(pause_s)
+        bench.host_runs = True
+        late, bench.host_end.receive = bench.host_end.receive, lambda: ()
+        bench.run(0.012)
+        bench.host_end.receive = late
+        bench.run(0.313)
+        assert bench.driver.state is DriverState.ARMED, f"{bench.driver.detail} {bench.events}"
+
+
 def test_asked_to_stand_by_after_a_pause_it_does_not_ramp_down_from_where_it_was(vendor, bench):
     """The controllers have stopped long since: a ramp from the last speed would move them again."""
     drive(bench)

@@ -261,8 +261,8 @@ def test_a_pause_of_the_host_is_no_silence_of_the_controllers():
     assert permit.silent_ns(0) == 100 * MS
     back = permit.looked(NOW + 201 * MS)
     assert back.silent_ns(NOW + 30 * MS) == 0
-    assert back.looked(NOW + 301 * MS).silent_ns(NOW + 30 * MS) == 100 * MS
-    assert permit.looked(NOW + 200 * MS).silent_ns(NOW + 30 * MS) == 170 * MS
+    assert back.looked(NOW + 261 * MS).silent_ns(NOW + 30 * MS) == 60 * MS
+    assert permit.looked(NOW + 175 * MS).silent_ns(NOW + 30 * MS) == 145 * MS
 
 
 def test_a_stage_lasts_since_its_first_tick():
