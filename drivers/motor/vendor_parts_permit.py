@@ -20,8 +20,8 @@ from msgspec.structs import replace
 from drivers.types import DriverState, Request, WheelCommand
 
 _LONGEST_STEP_S = 0.1
-# Longer than a period at the slowest rate, 50 ms; with the 20 ms between two messages still shorter than the 100 ms after
-# which the first driver calls its controllers silent.
+# Longer than a period at the slowest rate, 50 ms; with the 20 ms between two messages still shorter than the 100 ms
+# after which the first driver calls its controllers silent.
 _PAUSE_NS = 75_000_000
 STOPPED_FROM_OUTSIDE = "stopped from outside on the link, by `disco-hw estop` or another host"
 

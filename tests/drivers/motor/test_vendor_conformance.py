@@ -128,7 +128,7 @@ def test_a_host_that_was_frozen_blames_itself_and_not_a_controller_whose_replies
 
 @pytest.mark.parametrize("pause_s", [0.04, 0.06, 0.07, 0.08, 0.09])
 def test_a_host_that_pauses_for_less_than_any_watchdog_drives_on(vendor, bench, pause_s):
-    """Whatever came last before the pause; what the controllers sent meanwhile is read a tick after the loop is back."""
+    """Whatever came last before it; what the controllers sent meanwhile is read a tick after the loop is back."""
     if pause_s + 0.04 > vendor.watchdog_s:
         pytest.skip("its watchdog may stop it in such a pause")
     drive(bench)
