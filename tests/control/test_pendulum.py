@@ -62,7 +62,9 @@ def test_costs_and_update(theta, angle, speed, seed):
     np.testing.assert_allclose(plan, expected, atol=1e-3)
 
 
+@pytest.mark.long
 def test_every_sample_may_have_its_own_parameters():
+    """A kernel of its own; test_disco.py plans with such parameters of the robot."""
     theta = np.random.default_rng(1).uniform(0.5, 2.0, (2, K, 2))
     planner = PendulumPlanner(PendulumPoints(theta, np.full(2, 0.5), each=True), SAMPLER)
     planner.plan(math.pi, 0.0)
