@@ -41,7 +41,7 @@ class Standing(enum.Enum):
 
 
 @dataclass(slots=True)
-class Source:
+class TrackedSource:
     """What one source has done; `came_ns` is when its newest pose came, `good_ns` the stamp of the newest accepted."""
 
     label: str
@@ -107,7 +107,7 @@ class PoseSources:
     """Follows the sources of one estimate; pure, and the same calls give the same verdicts."""
 
     def __init__(self, labels: Sequence[str], timeout_s: float) -> None:
-        self.all = tuple(Source(label) for label in labels)
+        self.all = tuple(TrackedSource(label) for label in labels)
         self.contradiction = ""
         """Which two contradict each other, in words, while the estimate must not be driven by; else empty."""
         self._timeout_ns = round(timeout_s * 1e9)
@@ -181,7 +181,7 @@ class PoseSources:
             for one in self.all
         ]
 
-    def _judge(self, source: Source, now_ns: int) -> None:
+    def _judge(self, source: TrackedSource, now_ns: int) -> None:
         before = source.standing
         if source.came_ns is None:
             return
@@ -217,7 +217,7 @@ class PoseSources:
         return ""
 
 
-def _difference(one: Source, other: Source) -> str:
+def _difference(one: TrackedSource, other: TrackedSource) -> str:
     """By how much two sources differ, where that is more than their noise; else empty."""
     (x, y, yaw), (xx, yy, tt) = _minus(one.innovation, other.innovation), _plus(one.variance, other.variance)
     if x * x / xx + y * y / yy > APART_STDS**2:
