@@ -199,8 +199,8 @@ def test_what_another_user_made_first_is_passed_over_and_named(temporary, tmp_pa
     reason="a second user could not read this checkout",
 )
 def test_a_false_daemon_confirms_no_estop(tmp_path):
-    # The real command against the real /tmp, under the name of a user that this machine does not have.
-    uid = 61_234
+    # The real command against the real /tmp, under the name of a user whom this machine lacks, another in each run.
+    uid = 200_000_000 + os.getpid()
     taken = Path(f"/tmp/disco-hw-{uid}")
     home = Path(tempfile.mkdtemp(prefix="estop", dir="/tmp"))
     home.chmod(0o755)
