@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import importlib
 import json
-import os
-import platform
 import signal
 import sys
 from pathlib import Path
 
 from rich.console import Console
 from rich.table import Table
+
+from tools.results import machine
 
 PARTS = (
     "bench_adapt",
@@ -33,6 +33,7 @@ PARTS = (
 
 def main() -> int:
     figures: dict[str, float] = {}
+    parts: dict[str, list[str]] = {}
     console = Console()
     for part in sys.argv[1:] or PARTS:
         console.print(f"[bold]{part}[/bold]")
@@ -42,25 +43,13 @@ def main() -> int:
             table.add_row(key, f"{value:.4g}")
         console.print(table)
         figures |= found
-    result = {
-        "machine": {
-            "cpu": _cpu(),
-            "cores": os.cpu_count(),
-            "python": platform.python_version(),
-            "load": os.getloadavg()[0],
-        },
-        "figures": figures,
-    }
+        parts[part] = list(found)
+    result = {"machine": machine(), "parts": parts, "figures": figures}
     Path("bench.json").write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
-    console.print(f"{len(figures)} figures in bench.json")
+    console.print(
+        f"{len(figures)} figures in bench.json; python -m tools.results bench.json puts them into docs/results.md"
+    )
     return 0
-
-
-def _cpu() -> str:
-    for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
-        if line.startswith("model name"):
-            return line.partition(":")[2].strip()
-    return platform.processor()
 
 
 if __name__ == "__main__":

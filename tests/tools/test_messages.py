@@ -1,0 +1,61 @@
+"""The list of texts that a user can meet holds all of them, and nothing that is written for readers of the code."""
+
+import pytest
+
+from disco_hw.runtime.states import TRANSITIONS
+from firmware_protocol import faults
+from tools.messages import in_html, in_python, messages
+
+SOURCE = '''
+"""A module's own words."""
+LIMIT = 3
+"""Words about a constant."""
+
+def work(path, sent=None):
+    """Do the work."""
+    if sent is None:
+        raise InputError(f"{path}: not a file; give another, below {LIMIT:.2f} m")
+    reply = {"ok": False, "error": "not armed yet"}
+    option(help="how far to drive")
+    print("one", "--word", "line done")
+'''
+
+
+def test_what_a_user_meets_is_listed_and_documentation_is_not():
+    found = {(message.kind, message.text) for message in in_python(SOURCE, "disco_hw/some.py")}
+    assert found == {
+        ("refusal", "{path}: not a file; give another, below {LIMIT} m"),
+        ("said", "not armed yet"),
+        ("help", "how far to drive"),
+        ("said", "line done"),
+    }
+
+
+def test_of_a_page_its_texts_labels_and_what_its_script_says():
+    html = '<p>Press to stop</p><button title="Stop it now">Go</button>'
+    html += '<script>\nanswer(`${x}: no answer yet`, "no way");</script>'
+    found = [(message.line, message.text) for message in in_html(html, "page.html")]
+    assert sorted(found) == [
+        (1, "Go"),
+        (1, "Press to stop"),
+        (1, "Stop it now"),
+        (2, "${x}: no answer yet"),
+        (2, "no way"),
+    ]
+
+
+@pytest.fixture(scope="module")
+def listed():
+    return messages()
+
+
+def test_every_reason_of_a_transition_and_every_remedy_of_a_fault_is_on_the_list(listed):
+    texts = {message.text for message in listed}
+    assert {row.reason for row in TRANSITIONS if " " in row.reason} <= texts
+    assert [text for text in texts if "release the robot's own button" in text]
+    assert any(message.file == faults.__name__.replace(".", "/") + ".py" for message in listed)
+
+
+def test_no_refusal_speaks_of_what_only_its_programmers_know(listed):
+    private = ("NoneType", "AssertionError", "object at", "TODO")
+    assert not [message for message in listed if any(word in message.text for word in private)]

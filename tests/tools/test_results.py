@@ -1,0 +1,81 @@
+"""docs/results.md: its measured half is what the kept figures make, and every row of the other names its command."""
+
+import json
+import re
+
+import pytest
+
+from tools import results
+
+ROWS = [
+    [cell.strip() for cell in line.strip("|").split("|")]
+    for line in results.PAGE.read_text("utf-8").split("## Noted")[1].splitlines()
+    if line.startswith("| ") and not line.startswith("| what")
+]
+BENCH = {
+    "machine": {"date": "1 Jan 2026", "commit": "abc", "cpu": "a", "cores": 2, "python": "3.11", "load": 0.5},
+    "parts": {"bench_wire": ["wire.command_us"], "bench_log": ["log.us"]},
+    "figures": {"wire.command_us": 12.3456, "log.us": 7.0},
+}
+
+
+def test_the_page_is_what_the_kept_figures_make():
+    kept = json.loads(results.KEPT.read_text("utf-8"))
+    page = results.PAGE.read_text("utf-8")
+    assert kept
+    assert results.written(page, kept) == page
+
+
+def test_each_part_of_a_bench_has_its_command_and_a_new_run_takes_the_place_of_the_old(tmp_path, monkeypatch):
+    page, kept = tmp_path / "results.md", tmp_path / "figures.json"
+    page.write_text(f"above\n{results.BEGIN}\nold\n{results.END}\nbelow\n", "utf-8")
+    monkeypatch.setattr(results, "PAGE", page)
+    monkeypatch.setattr(results, "KEPT", kept)
+    file = tmp_path / "bench.json"
+    for value in (12.3456, 9.0):
+        file.write_text(json.dumps({**BENCH, "figures": {"wire.command_us": value, "log.us": 7.0}}), "utf-8")
+        assert results.main([str(file)]) == 0
+    text = page.read_text("utf-8")
+    assert (
+        "### `make bench PARTS=bench_wire`\n\n1 Jan 2026, `abc`, a, 2 cores, Python 3.11, load 0.5 at the end." in text
+    )
+    assert "| `wire.command_us` | 9 |" in text
+    assert "12.35" not in text
+    assert text.startswith("above\n")
+    assert text.endswith("\nbelow\n")
+    assert "old" not in text
+
+
+def test_a_study_needs_its_command_and_keeps_what_is_a_number():
+    study = {"revision": "f00", "figures": {"right": 198, "share": None, "yes": True, "bad": float("nan")}}
+    with pytest.raises(ValueError, match="--shown-by"):
+        results.runs_of(study, None)
+    (run,) = results.runs_of(study, "make gap-study").values()
+    assert run["figures"] == {"right": 198}
+    assert run["commit"] == "f00"
+
+
+def test_a_file_without_figures_is_one_line(tmp_path, capsys):
+    file = tmp_path / "x.json"
+    file.write_text("{}", "utf-8")
+    assert results.main([str(file)]) == 2
+    assert "no figures" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("row", ROWS, ids=lambda row: row[0][:40])
+def test_every_figure_in_words_has_its_day_and_a_command_that_is_there(row):
+    what, _, noted, shown_by = row
+    assert re.match(r"\d+ \w{3} `[0-9a-f]{7}`", noted), what
+    commands = re.findall(r"`([^`]+)`", shown_by)
+    assert commands, what
+    targets = set(re.findall(r"^([a-z][\w\-]*):", (results.ROOT / "Makefile").read_text("utf-8"), re.MULTILINE))
+    for command in commands:
+        words = command.removeprefix("sudo ").split()
+        if words[0] == "make":
+            assert {word for word in words[1:] if "=" not in word} <= targets, command
+        elif words[:2] == ["python", "-m"]:
+            assert (results.ROOT / (words[2].replace(".", "/") + ".py")).exists(), command
+        elif words[0] == "pytest":
+            assert all((results.ROOT / word).exists() for word in words[1:] if word.startswith("tests/")), command
+        else:
+            assert words[0] == "disco-hw", command
