@@ -33,7 +33,8 @@ EMULATOR = "qemu-system-arm"
 FLAGS = ("-mthumb", "-Os", "-ffunction-sections", "-fdata-sections", "--specs=nano.specs")
 WARNINGS = ("-Wall", "-Wextra", "-Wdouble-promotion", "-Werror")
 SETTINGS = 0x2000_0000
-_REALTIME_PRIORITY = 85
+# Below the loop of a daemon on this computer (80): what the emulator makes up for must not make that one late, too.
+_REALTIME_PRIORITY = 75
 _START_S = 20.0
 
 
