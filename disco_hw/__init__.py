@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from disco_hw.control import Disco
     from disco_hw.control.black_box import BlackBoxDisco
     from disco_hw.control.parameter_points import sigma_points
-    from disco_hw.daemon.daemon import run_robot
+    from disco_hw.daemon.run import run_robot
     from disco_hw.experiments.own_controller import drive_virtual
     from disco_hw.gap import find_gap
     from disco_hw.inference.infer import infer
@@ -36,7 +36,7 @@ _PUBLIC = {
     "load_model": ("disco_hw.model", "load_model"),
     "load_robot": ("disco_hw.config", "load_robot_config"),
     "read_log": ("disco_hw.log.load", "load_drive"),
-    "run_robot": ("disco_hw.daemon.daemon", "run_robot"),
+    "run_robot": ("disco_hw.daemon.run", "run_robot"),
     "save_model": ("disco_hw.model", "save_model"),
     "sigma_points": ("disco_hw.control.parameter_points", "sigma_points"),
     "simulate": ("disco_hw.model.free_run", "simulate"),

@@ -24,7 +24,7 @@ CASES: dict[str, tuple[str, ...]] = {
     "run_no_model": (*COMMAND, "run", ROBOT, "--model", "none.toml"),
     "replay_no_log": (*COMMAND, "replay", "none.mcap"),
     "infer_no_log": (*COMMAND, "infer", "none.mcap", "--robot", ROBOT),
-    "import_run": ("-c", "import disco_hw.daemon.daemon"),
+    "import_run": ("-c", "import disco_hw.daemon.run"),
     "import_check": ("-c", "import disco_hw.daemon.check"),
 }
 

@@ -153,7 +153,7 @@ _WORK = (
     "disco_hw.bridge.ros2_base.Clients",
     "disco_hw.daemon.check.refuse_beside_a_daemon",
     "disco_hw.daemon.client.send_request",
-    "disco_hw.daemon.daemon._make_recorder",
+    "disco_hw.daemon.run._make_recorder",
     "disco_hw.daemon.emergency.open_transport",
     "disco_hw.daemon.emergency.open_port",
     "disco_hw.daemon.emergency.send_request",
@@ -166,11 +166,11 @@ _WORK = (
 )
 _ENDS_AFTER = (
     "disco_hw.inference.commands.excitation",
-    "disco_hw.daemon.daemon.make_link",
+    "disco_hw.daemon.run.make_link",
     "disco_hw.first_use.commission.link_key",
 )
 _WITHOUT = {
-    "disco_hw.daemon.daemon.make_planner": lambda *_: NoPlanner(),
+    "disco_hw.daemon.run.make_planner": lambda *_: NoPlanner(),
     "disco_hw.runtime.replay.make_planner": lambda *_: NoPlanner(),
     "disco_hw.drive.commands.leads_to_virtual_robot": lambda _: True,
 }

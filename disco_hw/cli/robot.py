@@ -52,7 +52,7 @@ def run(
     limit_thread_pools()
     spare_memory()
     check_named_files(robot, model)
-    from disco_hw.daemon.daemon import DaemonOptions, run_daemon
+    from disco_hw.daemon.run import DaemonOptions, run_daemon
     from disco_hw.drive.hand_pilot import task_pilot
 
     with _page(view, robot, model, port, link):

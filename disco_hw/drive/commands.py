@@ -16,8 +16,8 @@ from typing import Any
 from disco_hw.config import Link, RobotConfig
 from disco_hw.daemon.async_printer import STANDARD_ERROR, STANDARD_OUTPUT, AsyncPrinter
 from disco_hw.daemon.client import socket_path
-from disco_hw.daemon.daemon import in_text, serve
 from disco_hw.daemon.loop import MonotonicClock
+from disco_hw.daemon.run import in_text, serve
 from disco_hw.drive.coverage import Coverage
 from disco_hw.drive.gamepad_source import GamepadSource
 from disco_hw.drive.hand_pilot import HandPilot

@@ -15,8 +15,8 @@ import msgspec
 
 from disco_hw.config import Robot, load_robot_config
 from disco_hw.daemon.async_printer import STANDARD_ERROR, AsyncPrinter
-from disco_hw.daemon.daemon import in_text, serve
 from disco_hw.daemon.loop import MonotonicClock
+from disco_hw.daemon.run import in_text, serve
 from disco_hw.drive.keyboard import Keyboard, KeyHold
 from disco_hw.errors import InputError, WorkError
 from disco_hw.files import ROBOT_TOML, read_bytes

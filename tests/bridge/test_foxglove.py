@@ -19,7 +19,7 @@ from websockets.asyncio.client import connect
 from disco_hw.bridge.foxglove import LAYOUT, Live
 from disco_hw.cli import app
 from disco_hw.config import load_robot_config
-from disco_hw.daemon import daemon
+from disco_hw.daemon import run
 from disco_hw.daemon.client import socket_path
 from disco_hw.daemon.page_feed import ViewerFeed, feed_path
 from disco_hw.errors import InputError
@@ -90,8 +90,8 @@ def test_a_client_is_told_of_all_topics_and_gets_what_the_daemon_records(live):
 
 def test_the_daemon_has_its_recorder_write_the_scene(tmp_path, monkeypatch):
     setup = load_setup(write_robot_file(tmp_path))
-    monkeypatch.setattr(daemon, "ProcessRecorder", lambda settings: settings)
-    assert daemon._make_recorder(setup, tmp_path / "log.mcap").scene == scene_of(setup.config)
+    monkeypatch.setattr(run, "ProcessRecorder", lambda settings: settings)
+    assert run._make_recorder(setup, tmp_path / "log.mcap").scene == scene_of(setup.config)
 
 
 def test_a_port_that_is_taken_is_refused_in_one_line(live, tmp_path):

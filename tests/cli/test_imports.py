@@ -100,7 +100,7 @@ def test_a_model_that_is_no_toml_is_refused_before_anything_heavy_is_loaded(robo
     assert not loaded & set(HEAVY)
 
 
-@pytest.mark.parametrize("module", ["disco_hw.daemon.daemon", "disco_hw.daemon.check"])
+@pytest.mark.parametrize("module", ["disco_hw.daemon.run", "disco_hw.daemon.check"])
 def test_what_drives_loads_nothing_that_it_does_not_use(module):
     command = [sys.executable, "-c", IMPORTED.format(module=module)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
@@ -108,7 +108,7 @@ def test_what_drives_loads_nothing_that_it_does_not_use(module):
     unused = {"torch", "matplotlib", "cantools", "viser", "scipy.stats", "scipy.interpolate", "scipy.special",
               "scipy.optimize", "scipy.sparse", "scipy.ndimage", "scipy.signal", "scipy.spatial"}  # fmt: skip
     assert not loaded & unused
-    assert "filterpy.kalman" in loaded or module != "disco_hw.daemon.daemon"
+    assert "filterpy.kalman" in loaded or module != "disco_hw.daemon.run"
 
 
 def test_filterpys_statistics_are_there_for_who_asks_for_them():

@@ -3,7 +3,7 @@
 import pytest
 
 from disco_hw.daemon.check import run_check
-from disco_hw.daemon.daemon import DaemonOptions, run_daemon
+from disco_hw.daemon.run import DaemonOptions, run_daemon
 from disco_hw.errors import InputError
 from disco_hw.runtime import assembly
 from disco_hw.runtime.robot_setup import load_setup

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import disco_hw
-from disco_hw.daemon import daemon
-from disco_hw.daemon.daemon import DaemonOptions, run_daemon
+from disco_hw.daemon import run
+from disco_hw.daemon.run import DaemonOptions, run_daemon
 from disco_hw.errors import InputError
 from disco_hw.model import EffectSetting, Gaussian, Model, load_model, save_model
 from disco_hw.runtime.robot_setup import geometry, link_key, load_setup
@@ -56,7 +56,7 @@ def test_what_the_belief_does_not_name_is_exact():
 def test_a_model_marked_as_lacking_an_effect_is_run_only_when_told_to(tmp_path, monkeypatch):
     marked = tmp_path / "model.toml"
     save_model(replace(load_model(ROBOT.parent / "wombot_model.toml"), missing_effects=("turn_slip",)), marked)
-    monkeypatch.setattr(daemon, "serve", lambda *_: 0)
+    monkeypatch.setattr(run, "serve", lambda *_: 0)
     words = r"model\.toml: missing_effects: the model lacks turn_slip.*--accept-missing-effects"
     with pytest.raises(InputError, match=words):
         run_daemon(DaemonOptions(robot=ROBOT, model=marked))
