@@ -39,13 +39,14 @@ def chromium():
 
 @contextmanager
 def opened(browser, url, width=800, height=540, scene=True):
-    """A page of the address, and what its console said is kept in `page.said`.
+    """A page of the address, and what its console said is kept in `page.said`; an error of its script fails the test.
 
     Without its `scene` a desk is as quick as with a graphics card; with it a mouse that moves waits for frames.
     """
     page = browser.new_page(viewport={"width": width, "height": height})
     page.set_default_timeout(120_000)
-    page.said = []
+    page.said, broken = [], []
+    page.on("pageerror", lambda error: broken.append(str(error)))
     page.on("console", lambda message: page.said.append(message.text))
     page.on("request", lambda request: page.said.append(f"request {request.url}"))
     if not scene:
@@ -55,6 +56,7 @@ def opened(browser, url, width=800, height=540, scene=True):
         yield page
     finally:
         page.close()
+    assert not broken, f"the page's script failed: {broken[:3]}"
 
 
 def keep(page, name):

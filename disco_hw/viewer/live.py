@@ -17,10 +17,10 @@ from disco_hw.viewer.operator_controls import Desk
 from disco_hw.viewer.panel import coverage_text, events_text, live_details, live_summary
 from disco_hw.viewer.plots import Plots
 from disco_hw.viewer.recording import ShownRobot
-from disco_hw.viewer.scene import Scene
+from disco_hw.viewer.scene import DARK, Scene
 from disco_hw.viewer.snapshot import Snapshot, snapshot_at
 from disco_hw.viewer.timeline import Items, Timeline
-from disco_hw.viewer.views import Views, add_layers
+from disco_hw.viewer.views import TaskEditor, Views, add_layers
 
 MOVE_S = 0.1
 REDRAW_S = 0.5
@@ -64,7 +64,8 @@ class LivePage:
             self._details = gui.add_markdown("")
         self.scene = Scene(server, stage)
         self._views = Views(server, stage.task)
-        add_layers(server, self.scene, lambda: None)
+        self.editor = TaskEditor(server, desk.drag)
+        add_layers(server, self.scene, self._shade)
 
     def step(self) -> None:
         """Wait at most a tenth of a second for records, then draw what is due."""
@@ -91,6 +92,7 @@ class LivePage:
         if snapshot is not None:
             self.scene.show(snapshot, everything)
             self._views.follow(snapshot.pose)
+        self.editor.show(self._stage.task_at(None if snapshot is None else snapshot.task), self._desk.draft)
         if everything:
             behind_ms = None if snapshot is None else (time.monotonic_ns() - snapshot.t_ns) * 1e-6
             _set(self._summary, live_summary(status, snapshot, self.scene.knows_task))
@@ -100,6 +102,9 @@ class LivePage:
             if snapshot is not None:
                 task = self._stage.task_at(snapshot.task)
                 self._plots.show(self.timeline, snapshot.t_ns, task, snapshot.belief)
+
+    def _shade(self) -> None:
+        self._desk.dark = self.scene.background == DARK
 
     def close(self) -> None:
         """Leave the feed."""

@@ -31,6 +31,7 @@ _REQUEST_TIMEOUT_S = 1.0
 _ESTOP_TIMEOUT_S = 0.5
 _DRIVE_TIMEOUT_S = 0.5
 _MOST_BYTES = 4096
+_MOST_M = 1e6
 
 _OPEN = {"do": "drive", "forward": 0, "left": 0, "held": False, "stamp": "0"}
 
@@ -40,12 +41,18 @@ Send = Callable[[Mapping[str, Any]], Awaitable[None]]
 class Desk:
     """Serves any number of browsers on the event loop of the page's server; `status` is the newest of the daemon.
 
+    `draft`: the fields of a task that is being edited and not yet asked for, None without one; the scene shows it, and
+    gives back by `drag` what was pulled there. `dark`: for a room without light.
+
     `robot_file`, and `link` where that overrides its kind, are needed to stop the robot on its link when the daemon
     does not answer.
     """
 
     def __init__(self, socket: Path, robot_file: Path, link: str | None = None) -> None:
         self.status: dict[str, Any] | None = None
+        self.dark = False
+        self.draft: dict[str, float] | None = None
+        self._drags = 0
         self.error = "not asked yet"
         self._socket = socket
         self._robot_file = robot_file
@@ -75,6 +82,7 @@ class Desk:
         sending = asyncio.create_task(self._send_status(send))
         self._begin_watching()
         replies: set[asyncio.Task[None]] = set()
+        edits = False
         try:
             async for message in connection:
                 request = _request(message)
@@ -82,6 +90,9 @@ class Desk:
                     await connection.close(1003, "not a request")
                 elif request["do"] == "drive":
                     await drive.ask(request)
+                elif request["do"] == "draft":
+                    self.draft = _numbers(request.get("values"))
+                    edits = self.draft is not None
                 else:
                     task = asyncio.create_task(self._ask(request, send))
                     replies.add(task)
@@ -94,8 +105,20 @@ class Desk:
             for task in (sending, *replies):
                 task.cancel()
             self._end_watching()
+            if edits:
+                self.draft = None
             await drive.let_go()
             await asyncio.gather(sending, *replies, return_exceptions=True)
+
+    def drag(self, values: Mapping[str, float]) -> None:
+        """Take what was pulled in the scene into the draft, to the centimetre and within the daemon's limits."""
+        draft, status = self.draft, self.status
+        if draft is None or status is None or not status.get("ok"):
+            return
+        limits = status["task"]["limits"]
+        within = {name: min(max(value, limits[name][0]), limits[name][1]) for name, value in values.items()}
+        self.draft = draft | {name: round(value, 2) for name, value in within.items()}
+        self._drags += 1
 
     def close(self) -> None:
         """End the threads; safe to call twice."""
@@ -165,7 +188,8 @@ class Desk:
         """Send the browser the status; also how it notices that nobody is here any more."""
         while True:
             try:
-                await send(shown(self.status, self.error))
+                drawn = {"dark": self.dark, "draft": self.draft, "drags": self._drags}
+                await send({**shown(self.status, self.error), **drawn})
             except ConnectionClosed:
                 return
             await asyncio.sleep(STATUS_S)
@@ -188,7 +212,7 @@ def shown(status: Mapping[str, Any] | None, error: str) -> dict[str, Any]:
         "estop": is_estop(status),
         "advice": (*advice(status), *_recording(status)),
         "next": next_step(status),
-        "task": {"asked": status["task"]["asked"], "limits": status["task"]["limits"]},
+        "task": {name: status["task"][name] for name in ("asked", "limits", "labels", "note")},
         "drive": None if drive is None else {"by_page": drive["by_page"], "driving": drive["driving"]},
     }
 
@@ -245,6 +269,17 @@ class _DriveLine:
         if self._writer is not None:
             self._writer.close()
             self._writer = None
+
+
+def _numbers(values: object) -> dict[str, float] | None:
+    """What a browser says of the task that it edits; None where that is nothing, or nothing but nonsense."""
+    if not isinstance(values, dict):
+        return None
+    return {
+        str(name): float(value)
+        for name, value in values.items()
+        if isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < _MOST_M
+    }
 
 
 def _request(message: str | bytes) -> dict[str, Any] | None:

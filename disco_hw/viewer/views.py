@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import viser
 
+from disco_hw.runtime.task_change import with_values
 from disco_hw.tasks import RobotTask
-from disco_hw.viewer.scene import DARK, LAYER_COLOURS, LAYERS, LIGHT, Point, Scene, first_camera
+from disco_hw.viewer.scene import DARK, LAYER_COLOURS, LAYERS, LIGHT, Point, Scene, first_camera, segments
 
+DRAFT_COLOUR = (0, 150, 60)
+_DRAFT_M = 0.015
 FREE, TOP, FOLLOW = "free", "top", "follow"
 VIEWS = (FREE, TOP, FOLLOW)
 _BAR_HEIGHT_PX, _MARGIN_PX = 96.0, 12.0
@@ -114,6 +119,75 @@ def legend() -> str:
     ]
     note = "<div>the trail fades; purple on the task, teal 0.05 m, yellow 0.1 m beside it and beyond</div>"
     return f'<div style="font-size:0.85em;padding:0 0.8em 0.4em">{"".join(rows)}{note}</div>'
+
+
+class TaskEditor:
+    """The task that is being edited, drawn beside the one in force, with balls to drag: its middle, and its size.
+
+    `dragged` takes the fields that a drag has changed, m.
+    """
+
+    def __init__(self, server: viser.ViserServer, dragged: Callable[[Mapping[str, float]], None]) -> None:
+        scene = server.scene
+        self._dragged = dragged
+        self._drawn: tuple[RobotTask, Mapping[str, float]] | None = None
+        self._line = scene.add_line_segments("/draft", np.zeros((1, 2, 3)), DRAFT_COLOUR, thickness=0.02, visible=False)
+        self.balls = {
+            name: scene.add_icosphere(
+                f"/draft_{name}", radius=1.0, color=DRAFT_COLOUR, visible=False, cast_shadow=False
+            )
+            for name in ("middle", "rim")
+        }
+        for name, ball in self.balls.items():
+
+            async def pulled(event: Any, name: str = name) -> None:
+                place = floor_under(_camera(event.client)[0], event.end_position)
+                if place is not None:
+                    self.pull(name, place)
+
+            ball.on_drag(pulled)
+
+    def pull(self, ball: str, place: tuple[float, float]) -> None:
+        """One of the balls was pulled to a place of the floor."""
+        if self._drawn is None:
+            return
+        values = self._drawn[1]
+        if ball == "middle":
+            self._dragged({"center_x_m": place[0], "center_y_m": place[1]})
+        else:
+            self._dragged({"radius_m": math.hypot(place[0] - values["center_x_m"], place[1] - values["center_y_m"])})
+
+    def show(self, task: RobotTask, draft: Mapping[str, float] | None) -> None:
+        """Draw the draft of a change of `task`, or nothing: no other field than these has a place on the floor."""
+        editable = draft is not None and {"center_x_m", "center_y_m"} <= draft.keys()
+        if not editable or draft is None:
+            if self._drawn is not None:
+                self._line.visible = self.balls["middle"].visible = self.balls["rim"].visible = False
+                self._drawn = None
+            return
+        if self._drawn == (task, draft):
+            return
+        self._drawn = (task, draft)
+        outline = with_values(task, draft).course().outline_m()
+        size_m = 0.04 + 0.03 * float(np.ptp(outline[:, 0]))
+        places = {"middle": (draft["center_x_m"], draft["center_y_m"])}
+        if "radius_m" in draft:
+            places["rim"] = (draft["center_x_m"] + draft["radius_m"], draft["center_y_m"])
+        self._line.points = segments(outline, _DRAFT_M).astype(np.float32)
+        self._line.visible = True
+        for name, (x_m, y_m) in places.items():
+            self.balls[name].position = (x_m, y_m, 0.0)
+            self.balls[name].radius = size_m
+            self.balls[name].visible = True
+
+
+def floor_under(eye: Point, seen: Point) -> tuple[float, float] | None:
+    """Where the floor is seen through a point from the camera; None where the look does not go down."""
+    down = eye[2] - seen[2]
+    if down <= 1e-6:
+        return None
+    part = eye[2] / down
+    return eye[0] + part * (seen[0] - eye[0]), eye[1] + part * (seen[1] - eye[1])
 
 
 class ScrubBar:

@@ -17,6 +17,7 @@ from disco_hw.viewer.live import KEEP_S, LivePage, _Due
 from disco_hw.viewer.operator_controls import Desk
 from disco_hw.viewer.panel import live_summary
 from disco_hw.viewer.recording import stage_of_robot
+from disco_hw.viewer.scene import DARK
 from disco_hw.viewer.server import serving
 from tests.runtime.path_robot import path_robot
 from tools.viewer_run import PERIOD_NS, ROBOT_FILE, START_NS, pose_at, tick_records
@@ -63,7 +64,7 @@ def test_a_drive_by_hand_shows_what_is_excited_and_what_is_missing(page):
     coverage = Coverage(6.4)
     for tick in range(251):
         coverage.add(tick * PERIOD_NS, 2.0, 2.0)
-    live._desk = SimpleNamespace(status={"ok": False, "drive": {"coverage": coverage.as_dict()}})
+    live._desk = SimpleNamespace(draft=None, status={"ok": False, "drive": {"coverage": coverage.as_dict()}})
     live.draw(everything=True)
     assert live._excited.visible
     assert live._coverage.content.startswith("**16 of 17 still missing**")
@@ -188,3 +189,41 @@ def test_a_path_that_is_not_the_daemons_is_not_drawn_and_told(tmp_path):
         assert not live.scene._task.visible
         assert "TASK NOT DRAWN" in live_summary(None, None, live.scene.knows_task)
         live.close()
+
+
+EDITED = {"center_x_m": 1.0, "center_y_m": -0.5, "radius_m": 2.0, "speed_m_s": 0.2}
+
+
+def test_a_task_that_is_edited_is_drawn_and_can_be_pulled_within_its_limits(page):
+    live, _ = page
+    live._desk.status = {"ok": False}
+    live._desk.draft = dict(EDITED)
+    live.draw(everything=True)
+    balls = live.editor.balls
+    assert all(ball.visible for ball in balls.values())
+    assert tuple(balls["rim"].position) == (3.0, -0.5, 0.0)
+    live._desk.status = {"ok": True, "task": {"limits": {name: [-5.0, 50.0] for name in EDITED}}}
+    live.editor.pull("middle", (0.504, 0.5))
+    assert live._desk.draft == {**EDITED, "center_x_m": 0.5, "center_y_m": 0.5}
+    live.editor.pull("rim", (-8.0, -0.5))
+    assert live._desk.draft["radius_m"] == 9.0
+    live.editor.pull("middle", (-99.0, 0.0))
+    assert live._desk.draft["center_x_m"] == -5.0
+    live._desk.draft = None
+    live._desk.status = {"ok": False}
+    live.draw(everything=True)
+    assert not any(ball.visible for ball in balls.values())
+
+
+def test_of_a_task_without_a_place_nothing_is_drawn_to_pull(page):
+    live, _ = page
+    live._desk.status, live._desk.draft = {"ok": False}, {"speed_m_s": 0.3}
+    live.draw(everything=True)
+    assert not any(ball.visible for ball in live.editor.balls.values())
+
+
+def test_the_desk_is_as_dark_as_the_scene(page):
+    live, _ = page
+    live.scene.background = DARK
+    live._shade()
+    assert live._desk.dark

@@ -26,7 +26,8 @@ from tools.viewer_run import ROBOT_FILE
 
 STATUS = {
     "ok": True, "state": "READY", "detail": "ready to be armed", "running": False, "estop": False, "fault": "NONE",
-    "robot_state": "READY", "task": {"asked": {"radius_m": 0.75}, "limits": {"radius_m": [0.1, 50.0]}},
+    "robot_state": "READY", "task": {"asked": {"radius_m": 0.75}, "limits": {"radius_m": [0.1, 50.0]},
+                                   "labels": {"radius_m": "Radius (m)"}, "note": "Radius 0.1 to 50 m."},
     "recorder": {"fault": ""},
 }  # fmt: skip
 

@@ -21,7 +21,10 @@ LINK_ERROR = (
     "sudo ip link set can0 up type can bitrate 500000"
 )
 LIMITS = {"asked": {"kind": "circle", "radius_m": 0.75, "speed_m_s": 0.2, "center_x_m": 0.0, "center_y_m": 0.0},
-          "limits": {name: [0.1, 50.0] for name in ("radius_m", "speed_m_s", "center_x_m", "center_y_m")}}  # fmt: skip
+          "limits": {name: [0.1, 50.0] for name in ("radius_m", "speed_m_s", "center_x_m", "center_y_m")},
+          "labels": {"radius_m": "Radius (m)", "speed_m_s": "Speed (m/s)", "center_x_m": "Centre x (m)",
+                     "center_y_m": "Centre y (m)"},
+          "note": "Radius 0.1 to 50 m; at 0.75 m at most 0.318 m/s."}  # fmt: skip
 WHOLE = {**STATUS, "task": LIMITS}
 HELD = {"by_page": True, "driving": False, "words": "hold the pad to drive; the robot is armed by holding, not by Arm"}
 STATES = {

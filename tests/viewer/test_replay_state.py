@@ -1,5 +1,8 @@
 """A replay says of each instant what the live page said then, and opens where the task starts."""
 
+import re
+from pathlib import Path
+
 import pytest
 
 from disco_hw.daemon.loop import LoopStats
@@ -7,12 +10,20 @@ from disco_hw.daemon.status import loop_figures, status
 from disco_hw.log.recorder import RecorderStats
 from disco_hw.runtime.pipeline import Source
 from disco_hw.runtime.supervisor import UserRequest
+from disco_hw.viewer import operator_controls
 from disco_hw.viewer.operator_controls import shown
 from disco_hw.viewer.panel import escaped, replay_text
 from disco_hw.viewer.recording import Recording
 from disco_hw.viewer.replay import ReplayPage
 from disco_hw.viewer.server import serving
 from tests.runtime.simulated import simulated_stack
+
+
+def read_of_the_task():
+    """What the desk's script reads of a status's task."""
+    page = Path(operator_controls.__file__).with_suffix(".html").read_text("utf-8")
+    (names,) = re.findall(r"const {([\w, ]+)} = status\.task;", page)
+    return set(names.split(", "))
 
 
 @pytest.fixture(scope="module")
@@ -24,6 +35,7 @@ def drive(tmp_path_factory):
     def let_pass(duration_s, *requests):
         for tick in stack.ticks(duration_s, *requests):
             said = shown(status(stack.core, loop, RecorderStats()), "")
+            assert read_of_the_task() <= said["task"].keys()
             live[tick.pipeline.t_ns] = (said["head"], said["detail"])
 
     let_pass(1.5)

@@ -8,7 +8,7 @@ import pytest
 from disco_hw.tasks.circle import CircleTask
 from disco_hw.viewer.scene import first_camera
 from disco_hw.viewer.server import serving
-from disco_hw.viewer.views import FOLLOW, FREE, TOP, ScrubBar, Views, moved, top_camera
+from disco_hw.viewer.views import FOLLOW, FREE, TOP, ScrubBar, Views, floor_under, moved, top_camera
 
 TASK = CircleTask(center_x_m=2.0, center_y_m=-1.0, radius_m=3.0)
 
@@ -70,3 +70,8 @@ def test_the_bar_is_as_wide_as_the_picture_and_shows_the_time():
         bar._remove(SimpleNamespace(client_id=7))
         bar.show(4.0)
         assert slider.value == 3.123
+
+
+def test_the_floor_is_under_what_is_seen_where_the_look_goes_down():
+    assert floor_under((0.0, -4.0, 2.0), (1.0, -2.0, 1.0)) == pytest.approx((2.0, 0.0))
+    assert floor_under((0.0, 0.0, 1.0), (1.0, 0.0, 1.0)) is None
