@@ -267,10 +267,10 @@ class AgilexDriver:
             self._end(self._permit.lost(f"the base left its CAN mode by itself, for {mode}"))
 
     def _take_odometry(self, left_mm: int, right_mm: int, t_ns: int) -> None:
-        fastest = 1.5e3 * self._settings.max_speed_m_s * (t_ns - self._driven_mm[0].t_ns) * 1e-9 + 10.0
+        fastest, looked_ns = 1.5e3 * self._settings.max_speed_m_s, self._permit.looked_ns
         left, right = self._driven_mm
-        is_left_plausible = left.take_wrapping(left_mm, t_ns, fastest)
-        if not (right.take_wrapping(right_mm, t_ns, fastest) and is_left_plausible):
+        is_left_plausible = left.take_wrapping(left_mm, t_ns, looked_ns, fastest, 10.0)
+        if not (right.take_wrapping(right_mm, t_ns, looked_ns, fastest, 10.0) and is_left_plausible):
             self._count("implausible_ticks")
             if self._permit.is_driving:
                 self._end(self._permit.lost("the base has restarted: its odometry jumped"))

@@ -425,8 +425,8 @@ class OdriveDriver:
             self._count("implausible_values")
             return
         # A 32-bit float's own steps grow with the distance.
-        fastest = 1.5 * self._settings.vel_limit_turns_s * (t_ns - axis.turned.t_ns) * 1e-9
-        if not axis.turned.take(position, t_ns, fastest + 0.05 + 2.0**-22 * abs(position)):
+        slack = 0.05 + 2.0**-22 * abs(position)
+        if not axis.turned.take(position, t_ns, self._permit.looked_ns, 1.5 * self._settings.vel_limit_turns_s, slack):
             self._count("implausible_ticks")
         axis.turned.speed = speed
 

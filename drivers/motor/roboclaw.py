@@ -324,7 +324,7 @@ class RoboclawDriver:
             board.zeros += 1
 
     def _take_counts(self, board: Board, read: Mapping[str, protocol.Value], t_ns: int) -> None:
-        if not board.take_counts(read, t_ns):
+        if not board.take_counts(read, t_ns, self._permit.looked_ns):
             self._count("implausible_ticks")
             if self._permit.is_driving:
                 self._stop(self._permit.lost(f"board {board.address} has restarted: its counts jumped"))

@@ -82,14 +82,14 @@ class Board:
         bit = self.errors & -self.errors
         return f"board {self.address}: {_WORDS.get(bit, f'error {self.errors:#06x}')}"
 
-    def take_counts(self, read: Mapping[str, protocol.Value], t_ns: int) -> bool:
+    def take_counts(self, read: Mapping[str, protocol.Value], t_ns: int, looked_ns: int) -> bool:
         """Whether its motors can have turned so far since they were counted last."""
         if not {"velocity_pid_m1", "velocity_pid_m2"} <= self.known.keys():
             return True
         first, second = self.turned
-        fastest = 1.5 * self.fastest_counts_s * (t_ns - first.t_ns) * 1e-9 + 100.0
-        is_first_plausible = first.take_wrapping(int(read["encoder_m1"]), t_ns, fastest)
-        return second.take_wrapping(int(read["encoder_m2"]), t_ns, fastest) and is_first_plausible
+        fastest = 1.5 * self.fastest_counts_s
+        is_first_plausible = first.take_wrapping(int(read["encoder_m1"]), t_ns, looked_ns, fastest, 100.0)
+        return second.take_wrapping(int(read["encoder_m2"]), t_ns, looked_ns, fastest, 100.0) and is_first_plausible
 
     def meet_anew(self) -> None:
         """Nothing is known of it but what its motors have turned."""

@@ -51,9 +51,8 @@ class Ros2BaseDriver:
         self._state_ns: int | None = None
         self._wheels_ns: int | None = None
         self._flags = self._refusal = self._bridge_sum = 0
-        self._raw: tuple[int, int] | None = None
+        self._turned = (parts.Odometer(), parts.Odometer())
         self._newest: tuple[int, int] | None = None
-        self._angles = (0.0, 0.0)
         self._wheel_speeds = (0.0, 0.0)
         self._repeat_ns = 0
 
@@ -87,7 +86,7 @@ class Ros2BaseDriver:
             return "the bridge was started with another [link] of robot.toml; start it again"
         if not self._flags & wire.ODOMETRY:
             return f"no odometry from {self._settings.wheels_from}: {wire.REFUSALS[self._refusal]}"
-        is_alive = self._flags & wire.HEARD and self._raw is not None
+        is_alive = self._flags & wire.HEARD and self._turned[0].last is not None
         return None if is_alive else self._unfit or "waiting for the first odometry"
 
     @property
@@ -276,21 +275,22 @@ class Ros2BaseDriver:
             )
 
     def _take_wheels(self, data: bytes, t_ns: int) -> list[WheelSample]:
-        """A sample of ANGLES and WHEELS; none where the wheels could not have turned so far."""
+        """A sample of ANGLES and WHEELS; what the wheels could not have turned is left out."""
         assert self._newest is not None
         self._wheel_speeds, age_s = wire.unpack_wheels(data)
-        true_ns = t_ns - round(age_s * 1e9)
-        if self._raw is not None and self._wheels_ns is not None:
-            left, right = wire.turned_rad(self._newest, self._raw)
-            most = 1.5 * self._settings.fastest_rad_s * (0.1 + (t_ns - self._wheels_ns) * 1e-9)
-            if max(abs(left), abs(right)) <= most:
-                self._angles = (self._angles[0] + left, self._angles[1] + right)
-            else:
-                self._count("implausible_ticks")
-                if self._permit.is_driving:
-                    self._permit = self._permit.lost("the base has restarted: its wheels' angles jumped")
-        self._raw, self._newest, self._wheels_ns = self._newest, None, t_ns
-        return [WheelSample(true_ns, t_ns, *self._angles, *self._wheel_speeds)]
+        fastest = 1.5 * self._settings.fastest_rad_s / wire.ANGLE_RAD
+        plausible = [
+            # Messages of a base do not come evenly.
+            side.take_wrapping(angle, t_ns, self._permit.looked_ns, fastest, 0.1 * fastest)
+            for side, angle in zip(self._turned, self._newest, strict=True)
+        ]
+        if not all(plausible):
+            self._count("implausible_ticks")
+            if self._permit.is_driving:
+                self._permit = self._permit.lost("the base has restarted: its wheels' angles jumped")
+        self._newest, self._wheels_ns = None, t_ns
+        angles = [wire.ANGLE_RAD * side.total for side in self._turned]
+        return [WheelSample(t_ns - round(age_s * 1e9), t_ns, angles[0], angles[1], *self._wheel_speeds)]
 
     def _take_foreign(self, frame: Frame) -> None:
         self._count("unknown_id")
@@ -319,7 +319,9 @@ class Ros2BaseDriver:
 
     def _meet_anew(self, permit: MotionPermit) -> None:
         self._end(permit)
-        self._state_ns = self._wheels_ns = self._raw = self._newest = None
+        self._state_ns = self._wheels_ns = self._newest = None
+        for side in self._turned:
+            side.begin_anew()
         self._flags, self._wheel_speeds = 0, (0.0, 0.0)
 
     def _count(self, name: str) -> None:

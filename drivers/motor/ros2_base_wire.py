@@ -34,7 +34,8 @@ DEADMAN_S = 0.2
 ZEROS_S = 0.5
 STEP_S = 0.02
 STANDS_M_S = 0.02
-_ANGLE_RAD, _SPEED_RAD_S, _AGE_S = 1e-4, 2e-3, 1e-4
+ANGLE_RAD = 1e-4
+_SPEED_RAD_S, _AGE_S = 2e-3, 1e-4
 REFUSALS = (
     "nothing is heard on link.wheels_topic",
     "it is stamped by another clock, or late; synchronise the clocks of both computers and leave use_sim_time off",
@@ -119,7 +120,7 @@ def enable(drive: bool) -> Frame:
 
 def wheel_frames(wheels: Wheels) -> tuple[Frame, Frame]:
     """What the wheels do, for the driver."""
-    angles = (round(angle / _ANGLE_RAD) % 2**32 for angle in wheels.angles_rad)
+    angles = (round(angle / ANGLE_RAD) % 2**32 for angle in wheels.angles_rad)
     steps = (max(-32768, min(32767, round(speed / _SPEED_RAD_S))) for speed in wheels.speeds_rad_s)
     age = max(0, min(65535, round(wheels.age_s / _AGE_S)))
     return Frame(ANGLES, struct.pack(">II", *angles)), Frame(WHEELS, struct.pack(">hhHxx", *steps, age))
@@ -128,12 +129,6 @@ def wheel_frames(wheels: Wheels) -> tuple[Frame, Frame]:
 def unpack_angles(data: bytes) -> tuple[int, int]:
     """Left and right, in 0.1 mrad modulo 2^32."""
     left, right = struct.unpack(">II", data)
-    return left, right
-
-
-def turned_rad(new: tuple[int, int], old: tuple[int, int]) -> tuple[float, float]:
-    """How far both wheels have turned between two ANGLES."""
-    left, right = (_ANGLE_RAD * ((one - other + 2**31) % 2**32 - 2**31) for one, other in zip(new, old, strict=True))
     return left, right
 
 

@@ -24,29 +24,36 @@ Sign = Literal[-1, 1]
 class Odometer:
     """What one motor has turned since the driver began, in the controller's counts.
 
-    `total` goes on over a restart of the controller; `speed` in counts/s carries it on from `t_ns`.
+    `total` goes on over a restart of the controller; `speed` in counts/s carries it on from `t_ns`, when the last count
+    was received; it is not older than `looked_ns`, when the host had looked before.
     """
 
     total: float = 0.0
     speed: float = 0.0
     t_ns: int = 0
+    looked_ns: int = 0
     last: float | None = None
     is_new: bool = False
 
-    def take(self, count: float, t_ns: int, most: float) -> bool:
-        """Whether the count is within `most` of the one before, and taken; if not, it goes on from there."""
+    def take(self, count: float, t_ns: int, looked_ns: int, fastest: float, slack: float) -> bool:
+        """Whether the motor can have turned so far since the count before; if not, it goes on from this one.
+
+        `fastest` in counts/s, and `slack` counts more. A pause of the host brings the stamps of two counts together,
+        but not before the host had looked last (`looked_ns`, now).
+        """
+        longest_s = (t_ns - min(self.t_ns, self.looked_ns)) * 1e-9
         moved = 0.0 if self.last is None else count - self.last
-        plausible = abs(moved) <= most
+        plausible = abs(moved) <= fastest * longest_s + slack
         self.total += moved if plausible else 0.0
-        self.last, self.t_ns, self.is_new = count, t_ns, True
+        self.last, self.t_ns, self.looked_ns, self.is_new = count, t_ns, looked_ns, True
         return plausible
 
-    def take_wrapping(self, count: int, t_ns: int, most: float) -> bool:
+    def take_wrapping(self, count: int, t_ns: int, looked_ns: int, fastest: float, slack: float) -> bool:
         """As `take`, of a count of 32 bits."""
         last = count if self.last is None else int(self.last)
         moved = (count - last + 2**31) % 2**32 - 2**31
         self.last = None if self.last is None else count - moved
-        return self.take(count, t_ns, most)
+        return self.take(count, t_ns, looked_ns, fastest, slack)
 
     def begin_anew(self) -> None:
         """The controller may have restarted: the next count is compared with none before."""

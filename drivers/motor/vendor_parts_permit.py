@@ -155,8 +155,8 @@ class MotionPermit(msgspec.Struct, frozen=True, kw_only=True):
         return replace(self, looked_ns=now_ns, attentive_ns=now_ns if paused else self.attentive_ns)
 
     def linked(self, is_up: bool) -> MotionPermit:
-        """The medium has come up or is gone: all is void but an e-stop."""
-        return replace(self.restarted("the link was lost"), link_is_up=is_up, fault=None)
+        """The medium has come up or is gone: all is void but what is latched."""
+        return replace(self.restarted("the link was lost"), link_is_up=is_up)
 
     def restarted(self, why: str, event: str | None = None) -> MotionPermit:
         """The controllers must be met anew; what is latched stays."""

@@ -56,7 +56,6 @@ class _Motor:
     node: int
     turned: parts.Odometer = field(default_factory=parts.Odometer)
     answered: bool = False
-    counted_after_ns: int = 0
     erpm_ns: int | None = None
     fault: int | None = None
     timed_out: bool = False
@@ -287,7 +286,10 @@ class VescDriver:
     def _brake(self, now_ns: int) -> tuple[OutgoingFrame, ...]:
         self._permit = self._permit.begun(now_ns)
         known = all(motor.erpm_ns is not None for motor in self._all)
-        if (known and self._stands) or self._permit.lasts_ns(now_ns) > BRAKING_NS:
+        # One that still says that it turns may be on a slope; of one that has fallen silent nobody knows.
+        says_it_turns = any(not m.stands and now_ns - (m.erpm_ns or 0) < SILENT_NS for m in self._all)
+        gives_up = self._permit.lasts_ns(now_ns) > BRAKING_NS and not says_it_turns
+        if (known and self._stands) or gives_up:
             self._permit = self._permit.rested()
             return parts.outgoing(now_ns, *(codec.command(motor.node, "set_current", 0.0) for motor in self._all))
         amperes = self._settings.brake_current_a
@@ -322,10 +324,7 @@ class VescDriver:
 
     def _take_tachometer(self, motor: _Motor, tachometer: int, t_ns: int) -> None:
         fastest = 1.5 * self._settings.max_erpm / _ERPM_PER_STEP_S
-        # Both may have been read late, after a pause of the host, but not before it looked last.
-        longest_ns = t_ns - min(motor.turned.t_ns, motor.counted_after_ns)
-        motor.counted_after_ns = self._permit.looked_ns
-        if not motor.turned.take_wrapping(tachometer, t_ns, fastest * longest_ns * 1e-9 + 12):
+        if not motor.turned.take_wrapping(tachometer, t_ns, self._permit.looked_ns, fastest, 12.0):
             self._count("implausible_ticks")
             if self._permit.is_driving:
                 self._permit = self._permit.lost(f"controller {motor.node} has restarted")

@@ -27,6 +27,7 @@ from disco_hw.config.robot import Ros2
 from disco_hw.errors import InputError
 from drivers.motor import find_driver
 from drivers.motor import ros2_base_wire as wire
+from drivers.motor.vendor_parts import Odometer
 from drivers.types import Frame
 from tests.first_use.miswired import robot_file
 
@@ -145,7 +146,12 @@ def test_frames_carry_the_wheels_over_the_wrap_of_their_count():
     for angles in ((-3.0, 5.0), (214_748.3647, -214_748.3), (1e6, -1e6)):
         one, two = (wire.Wheels((angles[0] + more, angles[1] - more), (-2.0, 65.0), 0.0123) for more in (0.0, 1.5))
         first, second = wire.wheel_frames(one), wire.wheel_frames(two)
-        turned = wire.turned_rad(wire.unpack_angles(second[0].data), wire.unpack_angles(first[0].data))
+        turned = []
+        for before, now in zip(*(wire.unpack_angles(frames[0].data) for frames in (first, second)), strict=True):
+            side = Odometer()
+            assert side.take_wrapping(before, 0, 0, 1e5, 0.0)
+            assert side.take_wrapping(now, 10**9, 0, 1e5, 0.0)
+            turned.append(wire.ANGLE_RAD * side.total)
         assert turned == pytest.approx((1.5, -1.5), abs=2e-4)
         speeds, age_s = wire.unpack_wheels(first[1].data)
         assert speeds == pytest.approx((-2.0, 65.0), abs=2e-3)

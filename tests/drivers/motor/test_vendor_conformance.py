@@ -143,6 +143,25 @@ def test_a_host_that_pauses_for_less_than_any_watchdog_drives_on(vendor, bench, 
         assert bench.driver.state is DriverState.ARMED, f"{bench.driver.detail} {bench.events}"
 
 
+def test_counts_that_a_pause_of_the_host_has_brought_together_are_no_restart(vendor, bench):
+    """The longest pause that no watchdog ends, at nearly full speed; what came in it is stamped at its end."""
+    bench.arm()
+    bench.run(1.0, (0.9 * bench.driver.limits.max_wheel_speed_rad_s.value,) * 2)
+    while bench.now_ns + bench.period_ns != bench._due_ns:
+        bench.step()
+    pause_s = vendor.watchdog_s - 0.05
+    bench.host_runs, ends_ns = False, bench.now_ns + round(pause_s * 1e9)
+    bench.delay_ns = lambda _random: max(0, ends_ns - bench.now_ns)
+    bench.run(pause_s)
+    bench.host_runs = True
+    bench.run(0.5)
+    assert bench.driver.state is DriverState.ARMED, bench.driver.detail
+    assert bench.driver.stats.implausible_ticks == 0
+    behind = bench.robot.speed[0] * (bench.now_ns - bench.wheels[-1].t_ns) * 1e-9
+    moved = bench.wheels[-1].left_angle_rad - bench.wheels[0].left_angle_rad
+    assert moved == pytest.approx(bench.robot.angle[0] - behind, abs=0.1)
+
+
 def test_asked_to_stand_by_after_a_pause_it_does_not_ramp_down_from_where_it_was(vendor, bench):
     """The controllers have stopped long since: a ramp from the last speed would move them again."""
     drive(bench)
@@ -310,6 +329,27 @@ def test_an_emergency_stop_is_latched_although_the_line_was_out_when_it_was_aske
     bench.largest_speed = 0.0
     bench.run(1.0, FORWARD)
     assert bench.driver.state is DriverState.ESTOP
+    assert bench.largest_speed < 0.05
+    bench.driver.request(Request.RESET)
+    bench.run_until(*STILL)
+
+
+def test_a_fault_is_latched_although_the_line_was_out_since(vendor, bench):
+    drive(bench)
+    vendor.lose_left(bench.robot)
+    bench.run_until(DriverState.FAULT, timeout_s=0.5)
+    why = bench.driver.detail
+    vendor.mend(bench.robot)
+    bench.host_end.plug(False)
+    bench.run(COASTING_S)
+    bench.robot.controller.restart()
+    bench.host_end.plug(True)
+    bench.run(3.0)
+    assert (bench.driver.state, bench.driver.detail) == (DriverState.FAULT, why)
+    bench.driver.request(Request.ARM)
+    bench.largest_speed = 0.0
+    bench.run(1.0, FORWARD)
+    assert bench.driver.state is DriverState.FAULT
     assert bench.largest_speed < 0.05
     bench.driver.request(Request.RESET)
     bench.run_until(*STILL)
