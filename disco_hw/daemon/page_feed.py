@@ -19,6 +19,7 @@ from disco_hw.errors import InputError, WorkError
 from disco_hw.log.link import ENCODE_ERRORS, BatchDecoder, batch_encoder
 from disco_hw.log.recorder import Recorder, RecorderStats
 from disco_hw.log.records import FrameIn, FrameOut, Plan, Record
+from drivers.types import WheelSample
 
 PERIOD_S = 0.05
 _QUEUED_BATCHES = 40
@@ -138,6 +139,11 @@ class WatchedRecorder:
         self._feed.put(now_ns, records)
         if self._ticks is not None:
             self._ticks.put(now_ns, records)
+
+    def announce(self, now_ns: int, wheels: Sequence[WheelSample]) -> None:
+        """Show who wants each tick the wheels of one that is yet to be planned; `put` brings them again."""
+        if self._ticks is not None:
+            self._ticks.put(now_ns, wheels)
 
     def poll(self) -> RecorderStats:
         """The recorder's counters."""

@@ -197,6 +197,7 @@ def _start(
     stop.add("link", transport.close)
     driver = driver_of(config, key)
     core = assemble_core(config, transport, driver, pipeline, recorder, pilot.needs_pose, adaptation)
+    core.announce = recorder.announce
     stop.add("pose source", core.pose_source.close)
     if isinstance(pilot, FindsWiring):
         core.directions = None

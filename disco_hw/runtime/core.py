@@ -41,6 +41,10 @@ STATUS_HOLDS_NS = 500_000_000
 _FOLLOW_TASK = FollowTask()
 
 
+def unannounced(_now_ns: int, _wheels: Sequence[WheelSample]) -> None:
+    """Nobody hears the wheels before the record of their tick."""
+
+
 class CoreTick(msgspec.Struct, frozen=True, gc=False):
     """What one tick did: the supervisor's verdict, the pipeline's work, the command sent (None if none was).
 
@@ -96,6 +100,8 @@ class DaemonCore:
         self.last: CoreTick | None = None
         self.recording_fault = ""
         """Why nothing is recorded although it should be, kept up to date by whoever looks after the recorder."""
+        self.announce: Callable[[int, Sequence[WheelSample]], None] = unannounced
+        """Hears the wheels of a tick before it is planned, for whoever cannot wait for its record; must not block."""
         self._supervisor = supervisor
         self._preflight = preflight
         self._preflight_errors: tuple[str, ...] = ()
@@ -138,6 +144,8 @@ class DaemonCore:
         poses = self.pose_source.receive(now_ns, readings.poses)
         readings = msgspec.structs.replace(readings, poses=tuple(poses))
         self._remember(now_ns, readings)
+        if readings.wheels:
+            self.announce(now_ns, readings.wheels)
         output = self._supervisor.step(now_ns, self._inputs(now_ns, requests, by_hand))
         mark("receive")
         learnt = self.adaptation.step(now_ns)

@@ -93,6 +93,14 @@ def test_wheels_that_cannot_be_are_not_said():
     assert list(said.messages([wheels(4.0, 17.0, 12.0)], OFFSET_NS)) == []
 
 
+def test_wheels_announced_before_their_tick_is_recorded_are_said_once():
+    said = outgoing()
+    first = list(said.messages([wheels(0.0, 7.0, -3.0)], OFFSET_NS))
+    later = list(said.messages([wheels(0.0, 7.0, -3.0), estimate(0.0, 1.0, 0.0, 0.0)], OFFSET_NS))
+    assert [topic for topic, _ in first] == ["odom", "joint_states", "/tf"]
+    assert [topic for topic, _ in later] == ["disco_hw/pose", "/tf"]
+
+
 def test_the_map_is_where_the_estimate_and_the_odometry_agree():
     said = outgoing()
     driven(said)

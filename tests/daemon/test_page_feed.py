@@ -13,6 +13,7 @@ from disco_hw.daemon.page_feed import FeedSubscriber, ViewerFeed, WatchedRecorde
 from disco_hw.errors import InputError
 from disco_hw.log import records
 from disco_hw.log.recorder import MemoryRecorder
+from drivers.types import WheelSample
 from tools.viewer_run import PERIOD_NS, tick_records
 
 _WATCH = """
@@ -200,3 +201,30 @@ def test_the_recorder_gets_everything_first(feed):
     both.put(now_ns + PERIOD_NS, got)
     assert memory.ticks == [(now_ns, tuple(got)), (now_ns + PERIOD_NS, tuple(got))]
     assert both.poll().ticks == both.close().ticks == 2
+
+
+def test_who_wants_each_tick_has_its_wheels_before_its_record(feed, tmp_path):
+    ticks = ViewerFeed(tmp_path / "control.sock.tick", period_s=0.0)
+    subscriber = FeedSubscriber(tmp_path / "control.sock.tick")
+    memory = MemoryRecorder()
+    recorder = WatchedRecorder(memory, feed, ticks)
+    now_ns, got = tick_records(connected(ticks, subscriber))
+    wheels = [record for record in got if isinstance(record, WheelSample)]
+    recorder.announce(now_ns, wheels)
+    assert wheels
+    assert received(subscriber, now_ns) == wheels
+    assert memory.ticks == []
+    recorder.put(now_ns, got)
+    assert [record for record in received(subscriber, now_ns) if isinstance(record, WheelSample)] == wheels
+    assert subscriber.missed == 0
+    subscriber.close()
+    ticks.close()
+
+
+def received(subscriber, now_ns, timeout_s=60.0):
+    deadline = time.monotonic() + timeout_s
+    while time.monotonic() < deadline:
+        batch = [record for tick_ns, record in subscriber.receive(0.1) if tick_ns == now_ns]
+        if batch:
+            return batch
+    raise AssertionError("nothing came through")

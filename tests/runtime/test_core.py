@@ -24,7 +24,7 @@ from disco_hw.runtime.robot_setup import load_setup
 from disco_hw.runtime.states import State
 from disco_hw.runtime.supervisor import UserRequest
 from disco_hw.tasks.circle import CircleTask
-from drivers.types import Identity, Limit, Limits
+from drivers.types import Identity, Limit, Limits, WheelSample
 from firmware_protocol.firmware_core import FirmwareConfig
 from sim.effects import hidden_effects
 from sim.plant import Plant
@@ -228,6 +228,29 @@ def test_a_planner_that_gives_up_is_followed_on_its_tail_then_the_wheels_ramp_do
     assert ticks[-1].output.state is State.ARMED
     told = [text for tick in ticks for text in tick.events if text.startswith("planner")]
     assert told == ["planner: planted"]
+
+
+def test_the_wheels_of_a_tick_are_announced_before_it_is_planned_and_recorded():
+    happened = []
+
+    class Planner:
+        def plan(self, now_ns, state):
+            happened.append(("plan", now_ns))
+            raise NoValidControl("planted")
+
+        def reset(self):
+            pass
+
+    stack = simulated_stack(Planner())
+    stack.core.announce = lambda now_ns, wheels: happened.append(("wheels", now_ns, *wheels))
+    stack.run(1.5)
+    stack.run(0.5, UserRequest.ARM)
+    stack.run(0.1, UserRequest.START)
+    planned = [k for k, (what, *_) in enumerate(happened) if what == "plan"]
+    assert planned
+    assert all(happened[k - 1][:2] == ("wheels", happened[k][1]) for k in planned)
+    recorded = [(now_ns, *(one for one in rows if type(one) is WheelSample)) for now_ns, rows in stack.recorder.ticks]
+    assert [told[1:] for told in happened if told[0] == "wheels"] == [tick for tick in recorded if len(tick) > 1]
 
 
 class Collapsing:
