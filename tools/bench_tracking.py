@@ -2,61 +2,191 @@
 
 Wheel radius, axle and x_icr of every robot are off by up to 15 %, and nobody is told; the motors' lag and dead band are
 known to all. From rest on the line; figures are of 5 to 30 s, at 50 plans a second. The gains of the classical ones
-were found on robots 0 to 4 (`python -m tools.tune_baselines`); these are robots 1000 on.
+were found on robots 0 to 4 (`python -m tools.tune_baselines`); these are robots 1000 on. Names that begin with `mujoco`
+drive the robot of `tools/mujoco_plant.py`.
+
+`python -m tools.bench_tracking disco_adapting circle,square 20` drives some of it; `... starts 20` begins anywhere.
 """
 
 from __future__ import annotations
 
+import math
+import sys
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
 
-from disco_hw.control import DiscoSettings
+from disco_hw.control import Disco, DiscoSettings, PlannerState, SentCommand
 from disco_hw.control.baselines.laws import Kanayama, LinearQuadratic, PurePursuit
-from tools.foreign_plant import robots
-from tools.tracking import Contender, classical, disco, drive, tracks
+from disco_hw.control.law import LawController
+from disco_hw.runtime.pipeline import Planner
+from disco_hw.tasks.circle import CircleCost
+from tools.foreign_plant import NOMINAL, ForeignPlant, ForeignRobot, robots
+from tools.mujoco_plant import MujocoPlant, mujoco_robots
+from tools.tracking import LIMITS, Contender, Drive, Track, classical, disco, drive, model, tracks
 
 FIRST = 1000
 SPEED_M_S, RATE_HZ = 0.2, 50.0
+MUJOCO = "mujoco_"
 
 
 def contenders() -> dict[str, Contender]:
     """The rows of the table."""
     settings = DiscoSettings.for_speed(SPEED_M_S, RATE_HZ)
+    integral = classical(PurePursuit(look_ahead_m=0.081, integral=3.04, preview_s=0.142))
+    adapting = disco(settings, learns=True)
+    offset_free = disco(replace(settings, offset_free=True), learns=True)
     return {
         "pure_pursuit": classical(PurePursuit()),
-        "pure_pursuit_integral": classical(PurePursuit(look_ahead_m=0.081, integral=3.04, preview_s=0.142)),
+        "pure_pursuit_integral": integral,
         "kanayama": classical(Kanayama()),
         "lqr": classical(LinearQuadratic()),
+        "pytorch_mppi": Contender(_peer),
         "disco_point": disco(replace(settings, uncertainty="point")),
         "disco_ut": disco(settings),
-        "disco_adapting": disco(settings, learns=True),
-        "disco_offset_free": disco(replace(settings, offset_free=True), learns=True),
+        "disco_ut_offset_free": disco(replace(settings, offset_free=True)),
+        "disco_adapting": adapting,
+        "disco_offset_free": offset_free,
         "disco_truth": disco(settings, knows=True),
         "kanayama_truth": classical(Kanayama(), knows=True),
+        MUJOCO + "pure_pursuit_integral": integral,
+        MUJOCO + "kanayama": classical(Kanayama()),
+        MUJOCO + "disco_adapting": adapting,
+        MUJOCO + "disco_offset_free": offset_free,
     }
 
 
-def run(count: int = 20, names: tuple[str, ...] | None = None) -> dict[str, float]:
-    """For each controller and way: median and worst RMS and median signed distance (mm), travel (rot/s^2), speed."""
+def _peer(robot: ForeignRobot, track: Track) -> Planner:
+    """pytorch_mppi with the paper's gains, ten times a second; its commands are held in between."""
+    from tools.control_peers import circle_command, circle_mppi  # noqa: PLC0415  (of those who installed [bench])
+
+    believed, settings = model(robot), DiscoSettings.paper()
+    assert isinstance(track.task, CircleCost)
+    mppi = circle_mppi(believed, track.task.paper(), settings, LIMITS.speed_rad_s)
+    command = circle_command(mppi, 1)
+    held, due_ns = (0.0, 0.0), 0
+
+    def law(state: PlannerState, _task: object, _model: object) -> tuple[float, float]:
+        nonlocal held, due_ns
+        if state.t_ns >= due_ns:
+            held, due_ns = command(state.t_ns, state), state.t_ns + round(settings.step_s * 1e9)
+        return held
+
+    return LawController(law, believed, track.task)
+
+
+def rows(count: int, names: tuple[str, ...], ways: tuple[str, ...]) -> Iterator[tuple[str, list[Drive]]]:
+    """The drives of these contenders, and what they are called, one way after the other."""
+    for name in names:
+        made: Callable[[int, int], list[ForeignRobot]] = robots
+        plant_of: Callable[..., ForeignPlant | MujocoPlant] = ForeignPlant
+        if name.startswith(MUJOCO):
+            made, plant_of = mujoco_robots, MujocoPlant
+        for way in ways:
+            # The peer's cost is the circle's alone.
+            if way != "circle" and name == "pytorch_mppi":
+                continue
+            yield (
+                f"tracking.{name}.{way}",
+                [
+                    drive(
+                        contenders()[name], robot, tracks(SPEED_M_S)[way], rate_hz=RATE_HZ, seed=seed, plant_of=plant_of
+                    ).after()
+                    for seed, robot in enumerate(made(FIRST, count))
+                ],
+            )
+
+
+def figures_of(drives: list[Drive]) -> dict[str, float]:
+    """Median and worst RMS and median signed distance (mm), travel (rot/s^2), speed (m/s)."""
+    return {
+        "rms_median_mm": float(np.median([one.rms_mm for one in drives])),
+        "rms_worst_mm": max(one.rms_mm for one in drives),
+        "signed_median_mm": float(np.median([one.signed_mm for one in drives])),
+        "travel_rot_s2": float(np.median([one.travel_rot_s2 for one in drives])),
+        "speed_m_s": float(np.median([one.speed_m_s for one in drives])),
+    }
+
+
+def run(count: int = 20) -> dict[str, float]:
+    """The figures of every controller on every way."""
+    return {
+        f"{key}.{field}": value
+        for key, drives in rows(count, tuple(contenders()), tuple(tracks(SPEED_M_S)))
+        for field, value in figures_of(drives).items()
+    } | starts(count)
+
+
+ON_THE_LINE_M, STAYS_S, SPARE_S, AROUND_M = 0.05, 3.0, 10.0, 1.0
+STARTS_RATE_HZ = 25.0
+
+
+def starts(count: int = 200, ways: tuple[str, ...] = ("circle", "eight", "square")) -> dict[str, float]:
+    """Random poses within AROUND_M of a line, the true pose given to the planner, with and without a dead band.
+
+    Seconds from the straight way to the line, at the task's speed, to the begin of STAYS_S within ON_THE_LINE_M of it,
+    driven forwards; and how many were later than SPARE_S, or went along the line backwards.
+    """
     figures: dict[str, float] = {}
-    for name, contender in contenders().items():
-        if names is not None and name not in names:
-            continue
-        for way, track in tracks(SPEED_M_S).items():
-            drives = [
-                drive(contender, robot, track, rate_hz=RATE_HZ, seed=seed).after()
-                for seed, robot in enumerate(robots(FIRST, count))
-            ]
-            key = f"tracking.{name}.{way}"
-            figures[f"{key}.rms_median_mm"] = float(np.median([one.rms_mm for one in drives]))
-            figures[f"{key}.rms_worst_mm"] = max(one.rms_mm for one in drives)
-            figures[f"{key}.signed_median_mm"] = float(np.median([one.signed_mm for one in drives]))
-            figures[f"{key}.travel_rot_s2"] = float(np.median([one.travel_rot_s2 for one in drives]))
-            figures[f"{key}.speed_m_s"] = float(np.median([one.speed_m_s for one in drives]))
+    for way in ways:
+        for dead_rad_s in (0.0, 0.8):
+            robot = ForeignRobot(*NOMINAL, dead_rad_s=dead_rad_s)
+            track = tracks(SPEED_M_S)[way]
+            planner = Disco(
+                model(robot, True), track.task, DiscoSettings.for_speed(SPEED_M_S, STARTS_RATE_HZ), LIMITS, 1
+            )
+            found = [_arrival_s(planner, robot, track, seed) for seed in range(count)]
+            late_s = np.array([late_s for late_s, _ in found])
+            figures |= {
+                f"starts.{way}.dead_{dead_rad_s:g}.late_median_s": float(np.median(late_s)),
+                f"starts.{way}.dead_{dead_rad_s:g}.late_worst_s": float(late_s.max()),
+                f"starts.{way}.dead_{dead_rad_s:g}.lost": float((late_s > SPARE_S).sum()),
+                f"starts.{way}.dead_{dead_rad_s:g}.backwards": float(sum(backwards for _, backwards in found)),
+            }
     return figures
 
 
+def _arrival_s(planner: Disco, robot: ForeignRobot, track: Track, seed: int) -> tuple[float, bool]:
+    """Seconds beyond the straight way to the line, at most twice SPARE_S; whether it went along the line backwards."""
+    rng = np.random.default_rng([seed, 99])
+    low, high = track.points_m.min(axis=0) - AROUND_M, track.points_m.max(axis=0) + AROUND_M
+    x_m, y_m = rng.uniform(low, high).tolist()
+    plant = ForeignPlant(robot, (x_m, y_m, float(rng.uniform(-math.pi, math.pi))), seed)
+    way_s = abs(float(track.course.off_m(np.array([[x_m, y_m]]))[0])) / SPEED_M_S
+    planner.reset()
+    period_ms = round(1e3 / STARTS_RATE_HZ)
+    sent: list[SentCommand] = []
+    off_m: list[float] = []
+    forward_m_s: list[float] = []
+    stays = round(STAYS_S * STARTS_RATE_HZ)
+    while plant.now_ms < 1e3 * (way_s + 2.0 * SPARE_S + STAYS_S):
+        left, right = plant.wheels_rad_s
+        state = PlannerState(plant.now_ns, *plant.pose, left, right, sent=tuple(sent[-50:]))
+        command = planner.plan(plant.now_ns, state).at(plant.now_ns)
+        sent.append(SentCommand(plant.now_ns, *command))
+        plant.advance(*command, period_ms)
+        off_m.append(abs(float(track.course.off_m(np.array([plant.pose[:2]]))[0])))
+        forward_m_s.append(plant.forward_m_s)
+        if len(off_m) >= stays and max(off_m[-stays:]) < ON_THE_LINE_M:
+            speed_m_s = float(np.mean(forward_m_s[-stays:]))
+            if abs(speed_m_s) > 0.5 * SPEED_M_S:
+                return plant.now_ms * 1e-3 - STAYS_S - way_s, speed_m_s < 0.0
+    return 2.0 * SPARE_S, False
+
+
+def main(arguments: list[str]) -> None:
+    """Print figures as they are found."""
+    if arguments[:1] == ["starts"]:
+        for key, value in starts(int(arguments[1])).items():
+            print(f"{key:60} {value:10.3g}")
+        return
+    names = tuple(arguments[0].split(",")) if arguments else tuple(contenders())
+    ways = tuple(arguments[1].split(",")) if len(arguments) > 1 else tuple(tracks(SPEED_M_S))
+    for key, drives in rows(int(arguments[2]) if len(arguments) > 2 else 6, names, ways):
+        found = figures_of(drives)
+        print(f"{key:45}", *(f"{field} {value:.3g} " for field, value in found.items()), flush=True)
+
+
 if __name__ == "__main__":
-    for key, value in run(6).items():
-        print(f"{key:60} {value:10.3g}")
+    main(sys.argv[1:])

@@ -23,9 +23,15 @@ _SAMPLES_EVERY, _POSES_EVERY = 20, 40
 _X, _Y, _YAW, _V, _SIDE, _OMEGA, _LEFT, _RIGHT, _FORCE_L, _FORCE_R, _ANGLE_L, _ANGLE_R, _GRIP_L, _GRIP_R = range(14)
 
 
+NOMINAL = (0.061, 0.415, 0.238)
+
+
 @dataclass(frozen=True, slots=True)
 class ForeignRobot:
-    """What the plant is made of: SI units. `grip_std` is slip as a part of the speed, correlated over `grip_s`."""
+    """What the plant is made of: SI units. `grip_std` is slip as a part of the speed, correlated over `grip_s`.
+
+    `believed`: the wheel radius, axle and x_icr that controllers are given of it.
+    """
 
     radius_m: float
     axle_m: float
@@ -46,9 +52,7 @@ class ForeignRobot:
     pose_late_s: float = 0.02
     slope_m_s: float = 0.0
     left_gain: float = 1.0
-
-
-NOMINAL = (0.061, 0.415, 0.238)
+    believed: tuple[float, float, float] = NOMINAL
 
 
 def robots(first: int, count: int, spread: float = 0.15, **changes: Any) -> list[ForeignRobot]:
@@ -119,6 +123,12 @@ class ForeignPlant:
         return float(self.state[_V])
 
     @property
+    def wheels_rad_s(self) -> tuple[float, float]:
+        """True speeds of the wheels."""
+        left, right = self.state[_LEFT : _RIGHT + 1].tolist()
+        return left, right
+
+    @property
     def now_ns(self) -> int:
         """Time."""
         return self.now_ms * 1_000_000
@@ -146,7 +156,7 @@ class ForeignPlant:
             poses.append(self._late.pop(0)[1])
         return Readings(wheels=tuple(wheels), poses=tuple(poses))
 
-    def advance(self, left_rad_s: float, right_rad_s: float, count: int) -> None:
+    def advance(self, left_rad_s: float, right_rad_s: float, count: int, /) -> None:
         """Hold these wheel commands for `count` milliseconds."""
         _advance(self.state, left_rad_s, right_rad_s, self._numbers, self._rng.standard_normal((count, 2)))
         self.now_ms += count

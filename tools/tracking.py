@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,7 +40,7 @@ Array = NDArray[np.float64]
 
 NAMES = ("wheel_radius_m", "axial_distance_m", "x_icr_m")
 LIMITS = CommandLimits(8.0, 20.0)
-SPREAD = 0.15
+SPREAD, KNOWN_SPREAD = 0.15, 0.004
 TICK_MS = 20
 SETTLED_S, DURATION_S = 5.0, 30.0
 
@@ -93,17 +94,48 @@ def belief(mean: tuple[float, ...] = NOMINAL, spread: float = SPREAD) -> Gaussia
 
 def model(robot: ForeignRobot, known: bool = False) -> Model:
     """The robot's lag and dead band with the nominal geometry; `known`: with its own."""
-    mean = (robot.radius_m, robot.axle_m, robot.x_icr_m) if known else NOMINAL
+    mean = _geometry(robot, known)
     effects = [EffectSetting("motor_lag", {"tau_s": robot.lag_s})]
     if robot.dead_rad_s:
         effects.insert(0, EffectSetting("deadband", {"width_rad_s": robot.dead_rad_s}))
-    return Model(*mean, tuple(effects), belief(mean, 0.004 if known else SPREAD), "foreign")
+    return Model(*mean, tuple(effects), belief(mean, KNOWN_SPREAD if known else SPREAD), "foreign")
+
+
+def _geometry(robot: ForeignRobot, known: bool) -> tuple[float, float, float]:
+    """Wheel radius, axle and x_icr that a controller is given."""
+    return (robot.radius_m, robot.axle_m, robot.x_icr_m) if known else robot.believed
 
 
 def fusion(mean: tuple[float, ...], spread: float = SPREAD) -> PoseFusion:
     """The estimator with this geometry."""
     rows = belief(mean, spread).covariance().tolist()
     return PoseFusion(Estimation(), OdometryParameters(*mean, tuple(map(tuple, rows))), 0.1)
+
+
+class Plant(Protocol):
+    """What is driven: true pose and speed, what the sensors say, and wheel speeds that are held for a while."""
+
+    @property
+    def now_ms(self) -> int:
+        """Time."""
+
+    @property
+    def pose(self) -> tuple[float, float, float]:
+        """x, y (m), yaw (rad)."""
+
+    @property
+    def forward_m_s(self) -> float:
+        """Speed along the body."""
+
+    @property
+    def now_ns(self) -> int:
+        """Time."""
+
+    def readings(self) -> Readings:
+        """Of this time."""
+
+    def advance(self, left_rad_s: float, right_rad_s: float, count: int, /) -> None:
+        """Hold these wheel speeds (rad/s) for `count` milliseconds."""
 
 
 @dataclass(frozen=True)
@@ -120,7 +152,7 @@ def classical(law: Law, speed_m_s: float = 0.2, knows: bool = False) -> Contende
     """A follower with this law."""
 
     def made(robot: ForeignRobot, track: Track) -> Planner:
-        geometry = (robot.radius_m, robot.axle_m, robot.x_icr_m) if knows else NOMINAL
+        geometry = _geometry(robot, knows)
         chassis = NominalRobot(*geometry, robot.lag_s, robot.dead_rad_s, LIMITS)
         return Follower(Reference(track.points_m, speed_m_s, geometry[2]), law, chassis)
 
@@ -178,10 +210,11 @@ def drive(
     contender: Contender, robot: ForeignRobot, track: Track, *, rate_hz: float = 50.0, duration_s: float = DURATION_S,
     seed: int = 1, start: tuple[float, float, float] | None = None,
     listen: Callable[[Readings], object] = lambda readings: None,
+    plant_of: Callable[[ForeignRobot, tuple[float, float, float], int], Plant] = ForeignPlant,
 ) -> Drive:  # fmt: skip
-    """One drive from rest; `listen` gets what the sensors say."""
-    plant = ForeignPlant(robot, start or track.start, seed)
-    mean, spread = ((robot.radius_m, robot.axle_m, robot.x_icr_m), 0.004) if contender.knows else (NOMINAL, SPREAD)
+    """One drive from rest; `listen` gets what the sensors say, `plant_of` makes the robot that is driven."""
+    plant = plant_of(robot, start or track.start, seed)
+    mean, spread = _geometry(robot, contender.knows), KNOWN_SPREAD if contender.knows else SPREAD
     period_s = 1.0 / rate_hz
     governor = Governor(WheelLimits(LIMITS.speed_rad_s, *[LIMITS.acceleration_rad_s2] * 2), period_s)
     planner = contender.planner(robot, track)

@@ -1,0 +1,84 @@
+"""The table of who follows a line best: its robots, and what it calls a drive that begins anywhere."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from disco_hw.control.baselines.laws import Kanayama
+from tools import bench_tracking
+from tools.foreign_plant import NOMINAL, ForeignPlant, ForeignRobot
+from tools.mujoco_plant import BEHIND_M, MujocoPlant, mujoco_robots
+from tools.tracking import classical, drive, tracks
+
+
+def test_a_robot_in_mujoco_turns_about_the_point_that_it_is_said_to():
+    pytest.importorskip("mujoco")
+    (robot,) = mujoco_robots(1000, 1, 0.0)
+    plant = MujocoPlant(robot, (1.0, 2.0, 0.5), 1)
+    assert plant.pose == (1.0, 2.0, 0.5)
+    poses, angles, forward = [], [], []
+    for _ in range(250):
+        plant.advance(0.0, 3.0, 20)
+        poses.append(plant.pose)
+        forward.append(plant.forward_m_s)
+        angles += [(one.left_angle_rad, one.right_angle_rad) for one in plant.readings().wheels]
+    late = np.array(poses[150:])
+    moved, yaw = np.diff(late[:, :2], axis=0), late[1:, 2]
+    turned = np.diff(late[:, 2])
+    aside = moved[:, 1] * np.cos(yaw) - moved[:, 0] * np.sin(yaw)
+    assert aside.sum() / turned.sum() == pytest.approx(-BEHIND_M, rel=0.1)
+    left, right = np.array(angles[-1]) - np.array(angles[150])
+    assert robot.radius_m * (right - left) / turned.sum() == pytest.approx(robot.axle_m, rel=0.1)
+    assert np.mean(forward[150:]) == pytest.approx(robot.radius_m * 0.5 * (left + right) / 2.0, rel=0.1)
+
+
+def test_what_is_believed_of_the_robots_in_mujoco_is_off():
+    found = np.array([one.believed for one in mujoco_robots(1000, 30)])
+    truth = np.array([(one.radius_m, one.axle_m, one.x_icr_m) for one in mujoco_robots(1000, 1)])
+    assert (np.abs(found / truth - 1.0) < 0.15).all()
+    assert (np.abs(found / truth - 1.0).max(axis=0) > 0.1).all()
+
+
+def test_a_follower_drives_the_robot_in_mujoco_round_its_circle():
+    pytest.importorskip("mujoco")
+    (robot,) = mujoco_robots(1000, 1, 0.0)
+    found = drive(classical(Kanayama()), robot, tracks()["circle"], duration_s=9.0, plant_of=MujocoPlant)
+    assert found.after(4.0).rms_mm < 20.0
+    assert found.after(4.0).speed_m_s > 0.15
+
+
+class Straight:
+    """A planner that drives straight on."""
+
+    def __init__(self, wheels_rad_s: float) -> None:
+        self._wheels_rad_s = wheels_rad_s
+
+    def reset(self) -> None:
+        """Nothing is kept."""
+
+    def plan(self, _now_ns, _state):
+        """Itself, as its own plan."""
+        return self
+
+    def at(self, _now_ns):
+        """The same at all times."""
+        return self._wheels_rad_s, self._wheels_rad_s
+
+
+@pytest.mark.parametrize(
+    ("wheels_rad_s", "arrives", "backwards"), [(3.4, True, False), (-3.4, True, True), (0.0, False, False)]
+)
+def test_a_drive_arrives_that_stays_on_the_line_and_one_in_reverse_is_seen(
+    monkeypatch, wheels_rad_s, arrives, backwards
+):
+    class OnTheLine(ForeignPlant):
+        def __init__(self, robot, _start, seed):
+            super().__init__(robot, (0.4, 0.0, 0.0) if wheels_rad_s >= 0.0 else (1.3, 0.0, 0.0), seed)
+
+    monkeypatch.setattr(bench_tracking, "ForeignPlant", OnTheLine)
+    track = tracks()["square"]
+    robot = ForeignRobot(*NOMINAL, dead_rad_s=0.0, grip_std=0.0)
+    late_s, went_back = bench_tracking._arrival_s(Straight(wheels_rad_s), robot, track, 1)
+    assert (late_s < bench_tracking.SPARE_S) == arrives
+    assert went_back == backwards
