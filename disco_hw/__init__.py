@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from disco_hw.control.black_box import BlackBoxDisco
     from disco_hw.control.parameter_points import sigma_points
     from disco_hw.daemon.run import run_robot
-    from disco_hw.experiments.own_controller import drive_virtual
+    from disco_hw.experiments.simulated_time import drive_virtual
     from disco_hw.gap import find_gap
     from disco_hw.inference.infer import infer
     from disco_hw.log.load import load_drive as read_log
@@ -30,7 +30,7 @@ _PUBLIC = {
     "Model": ("disco_hw.model", "Model"),
     "Robot": ("disco_hw.config", "Robot"),
     "RobotConfig": ("disco_hw.config", "RobotConfig"),
-    "drive_virtual": ("disco_hw.experiments.own_controller", "drive_virtual"),
+    "drive_virtual": ("disco_hw.experiments.simulated_time", "drive_virtual"),
     "find_gap": ("disco_hw.gap", "find_gap"),
     "infer": ("disco_hw.inference.infer", "infer"),
     "load_model": ("disco_hw.model", "load_model"),

@@ -29,10 +29,9 @@ from sim.plant import Plant
 from sim.plant_parameters import PlantParameters
 from sim.process import PoseSender, SocketPathError, StopSignal, TextRecord
 from sim.python_can_link import PythonCanLink
-from sim.robot import Robot
+from sim.robot import Controller, Robot, VendorRobot
 from sim.robot_link import RobotLink
 from sim.serial_line import SerialLine, SerialPathError
-from sim.vendor_robot import Controller, VendorRobot
 from sim.virtual_robot import STEP_US, ControllerClock, TruthRecorder, VirtualRobot
 
 STEP_NS = STEP_US * 1000

@@ -22,7 +22,7 @@ from disco_hw.adaptation.guard import believed_geometry
 from disco_hw.adaptation.link import NAMES
 from disco_hw.drive.coverage import Coverage
 from disco_hw.drive.hand_pilot import HandPilot
-from disco_hw.drive.source import ManualInput
+from disco_hw.drive.sources import ManualInput
 from disco_hw.experiments.simulated_time import SimulatedRun, virtual_robot
 from disco_hw.log.link import Attachment
 from disco_hw.log.provenance import MODEL_TOML, ROBOT_TOML, version

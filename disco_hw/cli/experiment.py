@@ -11,7 +11,7 @@ import typer
 
 from disco_hw.cli.options import AsJson, print_result, progress_line
 from disco_hw.errors import InputError
-from disco_hw.reports.outputs import refuse_directory
+from disco_hw.reports import refuse_directory
 
 experiment_app = typer.Typer(help="The paper's experiments, as table, CSV and PNG.", no_args_is_help=True)
 

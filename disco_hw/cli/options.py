@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from disco_hw.config.command_line import FORMS
-from disco_hw.reports import outputs
+from disco_hw.reports import as_json as json_of
 
 RobotFile = Annotated[Path, typer.Argument(metavar="ROBOT.toml", help="The robot's configuration (docs/robot.md).")]
 RobotOption = Annotated[Path, typer.Option("--robot", help="The robot's configuration (docs/robot.md).")]
@@ -54,4 +54,4 @@ def progress_bar() -> Iterator[Callable[[str, float], None]]:
 
 def print_result(result: dict[str, Any], as_json: bool, text: str) -> None:
     """Print the result once: as one JSON object, or as text."""
-    print(outputs.as_json(result) if as_json else text)
+    print(json_of(result) if as_json else text)

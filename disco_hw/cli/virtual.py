@@ -15,7 +15,7 @@ from disco_hw.cli.options import (
 )
 from disco_hw.config.command_line import check_named_files
 from disco_hw.errors import InputError
-from disco_hw.reports import outputs
+from disco_hw.reports import as_json as json_of
 from disco_hw.viewer.page_process import DEFAULT_PORT
 
 
@@ -51,7 +51,7 @@ def demo(
         )
     )
     if as_json:
-        print(outputs.as_json(result.as_dict()))
+        print(json_of(result.as_dict()))
     if not result.success:
         raise typer.Exit(1)
 

@@ -18,7 +18,7 @@ from typing import Any
 
 import msgspec
 
-from disco_hw.daemon.socket_place import REMEDY, peer_uid
+from disco_hw.daemon.client import REMEDY, peer_uid
 from disco_hw.errors import InputError
 from drivers.private_files import why_not_private
 

@@ -19,14 +19,13 @@ from disco_hw.config import RobotConfig
 from disco_hw.control.law import Law, LawController
 from disco_hw.daemon import realtime
 from disco_hw.daemon.async_printer import STANDARD_OUTPUT, AsyncPrinter
-from disco_hw.daemon.client import SERVED, recording_in_words, socket_path
+from disco_hw.daemon.client import SERVED, passed_over, recording_in_words, socket_path
 from disco_hw.daemon.compiling import compiled_elsewhere, warm_up
 from disco_hw.daemon.control_socket import ControlServer
 from disco_hw.daemon.daemon import Daemon, Say
 from disco_hw.daemon.loop import MonotonicClock
 from disco_hw.daemon.page_feed import ViewerFeed, WatchedRecorder, feed_path, tick_feed_path
 from disco_hw.daemon.signals import StopPath, StopSignals
-from disco_hw.daemon.socket_place import passed_over
 from disco_hw.log.link import Attachment
 from disco_hw.log.provenance import DBC, version
 from disco_hw.log.recorder import NullRecorder, ProcessRecorder, Recorder, RecordingSettings

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from disco_hw.daemon.loop import Clock
-from disco_hw.drive.source import INPUT_LIMIT_NS, ManualInput, RobotView
+from disco_hw.drive.sources import INPUT_LIMIT_NS, ManualInput, RobotView, wheel_speeds
 from disco_hw.errors import InputError
 
 # A held key begins to repeat after 0.15 to 0.7 s, depending on the terminal.
@@ -54,13 +54,6 @@ def parse(data: bytes) -> list[bytes]:
         keys.append(data[at:end])
         at = end
     return keys
-
-
-def wheel_speeds(forward: float, turn: float, top_rad_s: float) -> tuple[float, float]:
-    """Left and right wheel speed (rad/s) of a forward and a left-turn share, each in [-1, 1], at most `top_rad_s`."""
-    left, right = forward - turn, forward + turn
-    scale = top_rad_s / max(1.0, abs(left), abs(right))
-    return left * scale, right * scale
 
 
 class _Hold(enum.Enum):

@@ -22,7 +22,7 @@ from disco_hw.control.settings import ROTATION, CommandLimits, DiscoSettings
 from disco_hw.errors import InputError
 from disco_hw.model import Model, Uniform
 from disco_hw.model.model import BASE_PARAMETERS
-from disco_hw.reports.style import write_png
+from disco_hw.reports import write_png
 from disco_hw.tasks.circle import CircleCost, CircleTask
 
 SUBSTEP_S = 0.02

@@ -17,7 +17,7 @@ from rich.table import Table
 from disco_hw.errors import WorkError
 from disco_hw.log.reader import Log, open_log
 from disco_hw.log.records import Counters
-from disco_hw.reports.style import write_png
+from disco_hw.reports import write_png
 from disco_hw.tasks.circle import CircleTask
 
 Array = NDArray[np.float64]

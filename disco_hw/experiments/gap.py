@@ -30,8 +30,7 @@ from disco_hw.gap.report.findings import STAGES, GapReport
 from disco_hw.gap.report.page import answer
 from disco_hw.model import EffectSetting, Gaussian, Model
 from disco_hw.model.model import BASE_PARAMETERS
-from disco_hw.reports.outputs import as_json, refuse_directory
-from disco_hw.reports.style import BASELINE, MAIN, REFERENCE, write_png
+from disco_hw.reports import BASELINE, MAIN, REFERENCE, as_json, refuse_directory, write_png
 from disco_hw.runtime.assembly import make_planner
 from disco_hw.runtime.pipeline import NoPlanner
 from disco_hw.runtime.robot_setup import Setup, load_setup

@@ -25,7 +25,7 @@ from disco_hw.control.kernel.layout import BLOCK, block_count
 from disco_hw.control.parameter_points import sigma_points
 from disco_hw.control.pendulum import PAPER_SAMPLER, PendulumPlanner, PendulumPoints
 from disco_hw.model import Belief, Gaussian, Uniform
-from disco_hw.reports.style import write_png
+from disco_hw.reports import write_png
 from disco_hw.tasks.circle import CircleCost
 
 Array = NDArray[np.float64]

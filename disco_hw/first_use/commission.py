@@ -24,7 +24,7 @@ from disco_hw.first_use.init import in_toml, with_fields
 from disco_hw.first_use.judgement import Findings, judge_floor, judge_sides, judge_turns
 from disco_hw.first_use.pilot import CommissionPilot
 from disco_hw.first_use.procedure import Procedure, Steps, floor, sides, turns
-from disco_hw.reports.outputs import refuse_directory
+from disco_hw.reports import refuse_directory
 from disco_hw.runtime.robot_setup import Setup, link_key, load_setup
 from drivers.motor import find_driver
 

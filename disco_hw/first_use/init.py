@@ -17,7 +17,7 @@ from disco_hw.config import load_robot_config
 from disco_hw.config.command_line import link_fields, names_address
 from disco_hw.errors import InputError
 from disco_hw.files import parse_toml
-from disco_hw.reports.outputs import refuse_file
+from disco_hw.reports import refuse_file
 from drivers.motor import DEFAULT, UnknownDriverError, find_driver, motor_drivers
 from drivers.pose import DEFAULT as POSE_SOURCE
 from drivers.transport import SerialMedium, TransportSettingsError, make_transport

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from disco_hw.drive.hand_pilot import Deadman
-from disco_hw.drive.source import ManualInput, ManualSource, RobotView
+from disco_hw.drive.sources import ManualInput, ManualSource, RobotView
 from disco_hw.first_use.procedure import Ask, DriveWheels, Procedure, Reset, Seen, Silence
 from disco_hw.runtime.core import CoreTick
 from disco_hw.runtime.pilot import PilotTick

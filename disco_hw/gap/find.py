@@ -46,7 +46,7 @@ from disco_hw.log.drive import DriveLog, concatenate
 from disco_hw.log.load import load_drive
 from disco_hw.log.provenance import version
 from disco_hw.model import Model, load_model, save_model
-from disco_hw.reports.outputs import as_json, refuse_directory
+from disco_hw.reports import as_json, refuse_directory
 
 Array = NDArray[np.float64]
 Progress = Callable[[str], None]

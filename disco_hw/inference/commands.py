@@ -21,15 +21,14 @@ import numpy as np
 from disco_hw.config import load_robot_config
 from disco_hw.errors import InputError, WorkError
 from disco_hw.inference.checks import CHECKS, LEVELS
-from disco_hw.inference.dask_workers import dask_workers
 from disco_hw.inference.excitation import excitation
 from disco_hw.inference.infer import Inference, InferOptions, infer
 from disco_hw.inference.simulate import NAMES
-from disco_hw.inference.workers import LocalWorkers, ReportProgress, Workers
+from disco_hw.inference.workers import LocalWorkers, ReportProgress, Workers, dask_workers
 from disco_hw.log.drive import DriveLog
 from disco_hw.log.load import load_drive
 from disco_hw.model import Model, save_model
-from disco_hw.reports.outputs import refuse_file
+from disco_hw.reports import refuse_file
 
 
 @dataclass(frozen=True, slots=True)

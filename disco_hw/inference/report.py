@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from disco_hw.inference.checks import CHECKS, LARGEST_DEVIATION, LEVELS
 from disco_hw.inference.infer import Inference
 from disco_hw.inference.simulate import NAMES
-from disco_hw.reports import style
-from disco_hw.reports.style import ALARM, MAIN
+from disco_hw.reports import ALARM, MAIN, page, picture, png
 
 Array = NDArray[np.float64]
 
@@ -42,18 +41,18 @@ def report_html(inference: Inference, posterior: dict[str, dict[str, Any]], warn
         "<table><tr><th></th><th>mean (m)</th><th>sd</th><th>5 %</th><th>95 %</th></tr>",
         rows,
         "</table>",
-        style.picture(style.png(pairs_figure(inference.draws)), "Marginals and pairs of the posterior"),
+        picture(png(pairs_figure(inference.draws)), "Marginals and pairs of the posterior"),
         "<h2>What stays open</h2>",
         "".join(f"<p>{html.escape(line)}</p>" for line in inference.undetermined)
         or "<p>Nothing: the log determines all three parameters.</p>",
         "<h2>Does the log look like the simulations?</h2>",
         "<p>Each bar is one way to differ from the model: how far the log is from simulations under the posterior, in "
         f"their standard deviations. Beyond {LARGEST_DEVIATION:g} the model lacks something.</p>",
-        style.picture(style.png(predictive_figure(inference.predictive.deviations)), "Posterior predictive check"),
+        picture(png(predictive_figure(inference.predictive.deviations)), "Posterior predictive check"),
         "<h2>Can the widths be trusted?</h2>",
         "<p>Fresh simulations at known parameters: the rank of the truth among posterior draws should be uniform "
         f"({uniform}), and a region of a given probability should hold the truth that often.</p>",
-        style.picture(style.png(calibration_figure(calibration.ranks)), "Simulation-based calibration"),
+        picture(png(calibration_figure(calibration.ranks)), "Simulation-based calibration"),
         f"<table><tr><th>region</th><th>holds the truth</th></tr>{coverage}</table>",
         "<h2>Noise of this log</h2>",
         f"<p>Pose sensor {1e3 * noise.position_m:.2g} mm and {np.degrees(noise.yaw_rad):.2g}&deg;; slip "
@@ -61,7 +60,7 @@ def report_html(inference: Inference, posterior: dict[str, dict[str, Any]], warn
         f"{np.degrees(noise.slip_yaw_rad_sqrt_s):.2g}&deg; in yaw per square root of a second. The simulations have "
         "the same.</p>",
     ]
-    return style.page("What the drive says about the robot", "".join(parts))
+    return page("What the drive says about the robot", "".join(parts))
 
 
 def pairs_figure(draws: Array) -> Figure:

@@ -7,7 +7,7 @@ from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
 
-from sim.vendor_robot import Controller
+from sim.robot import Controller
 
 
 def find_controller(driver: str) -> Callable[[Any, int], Controller] | None:

@@ -15,10 +15,9 @@ import pytest
 
 import disco_hw
 from disco_hw.config import load_robot_config
-from disco_hw.daemon import socket_place
-from disco_hw.daemon.client import ask, send_request, socket_path
+from disco_hw.daemon import client
+from disco_hw.daemon.client import ask, believed_users, default_socket_path, passed_over, send_request, socket_path
 from disco_hw.daemon.control_socket import ControlServer
-from disco_hw.daemon.socket_place import believed_users, default_socket_path, passed_over
 from disco_hw.errors import WorkError
 
 ME = os.geteuid()
@@ -50,7 +49,7 @@ def temporary(monkeypatch):
     monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
     with tempfile.TemporaryDirectory(prefix="place", dir="/tmp") as name:
         Path(name).chmod(0o1777)
-        monkeypatch.setattr(socket_place, "_TEMPORARY", Path(name))
+        monkeypatch.setattr(client, "_TEMPORARY", Path(name))
         yield Path(name)
 
 
@@ -152,15 +151,15 @@ def test_a_directory_of_another_user_is_not_believed(tmp_path, monkeypatch):
     # Without a second user: the files are those of whoever runs this, and the client takes itself for another.
     directory = tmp_path / "run"
     directory.mkdir(mode=0o700)
-    monkeypatch.setattr(socket_place.os, "geteuid", lambda: ME + 4242)
-    monkeypatch.setattr(socket_place, "_ROOT", ME + 4243)
+    monkeypatch.setattr(client.os, "geteuid", lambda: ME + 4242)
+    monkeypatch.setattr(client, "_ROOT", ME + 4243)
     with pytest.raises(WorkError, match=rf"run: belongs to .*\({ME}\); nothing is sent there, set daemon\.control"):
         believed_users(directory / "x.sock")
 
 
 def test_a_listener_of_another_user_is_not_believed(tmp_path, monkeypatch):
     server = ControlServer(tmp_path / "x.sock", ["status"])
-    monkeypatch.setattr(socket_place, "peer_uid", lambda connection: NOBODY)
+    monkeypatch.setattr(client, "peer_uid", lambda connection: NOBODY)
     with pytest.raises(WorkError, match=r"a process of .*65534.* listens there; nothing is sent"):
         send_request(server.path, {"do": "status"})
     server.close()

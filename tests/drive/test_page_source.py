@@ -6,8 +6,7 @@ import pytest
 
 from disco_hw.drive.coverage import Coverage
 from disco_hw.drive.hand_pilot import HandPilot
-from disco_hw.drive.page_source import PageSource, Steering, steering_from
-from disco_hw.drive.source import INPUT_LIMIT_NS, RobotView
+from disco_hw.drive.sources import INPUT_LIMIT_NS, PageSource, RobotView, Steering, steering_from
 from disco_hw.runtime.pipeline import NoPlanner
 from disco_hw.runtime.states import State
 from tests.runtime.simulated import simulated_stack

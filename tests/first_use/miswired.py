@@ -10,7 +10,7 @@ from pathlib import Path
 import msgspec
 
 import disco_hw
-from disco_hw.drive.source import ManualInput
+from disco_hw.drive.sources import ManualInput
 from disco_hw.errors import WorkError
 from disco_hw.experiments.live_stack import with_device
 from disco_hw.experiments.simulated_time import SimulatedRun
@@ -31,7 +31,7 @@ from sim.effects import hidden_effects
 from sim.plant import Plant
 from sim.plant_parameters import PlantParameters
 from sim.process import PoseSender
-from sim.vendor_robot import VendorRobot
+from sim.robot import VendorRobot
 from sim.virtual_robot import STEP_US, VirtualRobot
 from tests.drivers.waiting import free_port
 

@@ -9,7 +9,7 @@ import pytest
 from disco_hw.cli.experiment import adapt, circle, pendulum
 from disco_hw.cli.options import print_result
 from disco_hw.errors import InputError
-from disco_hw.reports.outputs import as_json, refuse_directory, refuse_file
+from disco_hw.reports import as_json, refuse_directory, refuse_file
 
 
 @pytest.fixture

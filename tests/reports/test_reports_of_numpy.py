@@ -35,7 +35,7 @@ from disco_hw.inference.checks import CHECKS, Predictive
 from disco_hw.inference.commands import GapCheck, InferResult
 from disco_hw.log.importing.write import Imported
 from disco_hw.model import Model
-from disco_hw.reports.outputs import as_json
+from disco_hw.reports import as_json
 from disco_hw.runtime.replay import ReplayReport
 
 FLOATS = (np.float16, np.float32, np.float64, np.longdouble)

@@ -5,11 +5,11 @@ import re
 
 from matplotlib.figure import Figure
 
-from disco_hw.reports import style
+from disco_hw import reports
 
 
 def test_a_page_needs_no_other_file_and_a_title_is_no_markup():
-    made = style.page("a < b", style.picture(b"\x89PNG", "x & y", "1 < 2"))
+    made = reports.page("a < b", reports.picture(b"\x89PNG", "x & y", "1 < 2"))
     assert "<h1>a &lt; b</h1>" in made
     assert "<figcaption>1 &lt; 2</figcaption>" in made
     assert 'alt="x &amp; y"' in made
@@ -19,13 +19,13 @@ def test_a_page_needs_no_other_file_and_a_title_is_no_markup():
 
 
 def test_a_picture_without_a_caption_has_none():
-    assert "figcaption" not in style.picture(b"", "name")
+    assert "figcaption" not in reports.picture(b"", "name")
 
 
 def test_a_figure_is_written_as_the_png_that_a_page_would_hold(tmp_path):
     figure = Figure(figsize=(2.0, 1.0))
     figure.subplots().plot([0.0, 1.0])
     path = tmp_path / "figure.png"
-    style.write_png(figure, path)
-    assert path.read_bytes() == style.png(figure)
+    reports.write_png(figure, path)
+    assert path.read_bytes() == reports.png(figure)
     assert path.read_bytes().startswith(b"\x89PNG\r\n")

@@ -17,7 +17,7 @@ from disco_hw.gap.search.analysis import GapAnalysis
 from disco_hw.gap.search.channel_search import ChannelResult
 from disco_hw.gap.search.cross_validation import PredictionErrors
 from disco_hw.gap.settings import GRID_STEP_S
-from disco_hw.reports.style import BASELINE, FLOOR, MAIN, REFERENCE, png
+from disco_hw.reports import BASELINE, FLOOR, MAIN, REFERENCE, png
 
 Array = NDArray[np.float64]
 

@@ -6,10 +6,10 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 
+from disco_hw import reports
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.report.findings import STAGES, EffectFinding, GapReport, UnnamedFinding
 from disco_hw.gap.search.cross_validation import PredictionErrors
-from disco_hw.reports import style
 
 
 def sentence(effect: EffectFinding) -> str:
@@ -137,7 +137,8 @@ def page(report: GapReport) -> str:
     words = "".join(f"<dt>{name}</dt><dd>{escape(text)}</dd>" for name, text in _DEFINITIONS.items())
     parts = [f'<div class="answer">{lines}</div>', _whence(report), f"<aside><dl>{words}</dl></aside>"]
     parts += [
-        style.picture(data, name, _CAPTIONS.get(name, name.replace("_", " "))) for name, data in report.pictures.items()
+        reports.picture(data, name, _CAPTIONS.get(name, name.replace("_", " ")))
+        for name, data in report.pictures.items()
     ]
     parts.append("<h2>What is missing</h2>" + _effects(report))
     if report.doubtful:
@@ -157,7 +158,7 @@ def page(report: GapReport) -> str:
         parts.append(_folded("The wheels alone: the way and the heading that they make", _gap(report.wheels)))
     parts.append(_folded("Evidence of every candidate", _candidates(report)))
     parts.append(_folded("What this log could not have shown", _blind(report)))
-    return style.page("What the model misses", "\n".join(parts))
+    return reports.page("What the model misses", "\n".join(parts))
 
 
 def _with_code(line: str) -> str:

@@ -14,7 +14,7 @@ from disco_hw.gap.search.cross_validation import PredictionErrors
 from disco_hw.gap.search.intervals import ParameterEstimate
 from disco_hw.gap.settings import DEFAULT_SETTINGS
 from disco_hw.model import Model
-from disco_hw.reports.outputs import as_json
+from disco_hw.reports import as_json
 
 
 def errors(position_m, yaw_rad=0.02):

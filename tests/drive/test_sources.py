@@ -2,11 +2,9 @@
 
 import pytest
 
-from disco_hw.drive.gamepad_source import GamepadSource
 from disco_hw.drive.keyboard import Keyboard
-from disco_hw.drive.page_source import PageSource
 from disco_hw.drive.script import ScriptSource
-from disco_hw.drive.source import INPUT_LIMIT_NS, ManualInput, ManualSource, RobotView
+from disco_hw.drive.sources import INPUT_LIMIT_NS, GamepadSource, ManualInput, ManualSource, PageSource, RobotView
 from disco_hw.runtime.states import State
 
 
