@@ -59,6 +59,28 @@ def opened(browser, url, width=800, height=540, scene=True):
     assert not broken, f"the page's script failed: {broken[:3]}"
 
 
+_OPERATED = frozenset({
+    "button", "checkbox", "combobox", "link", "radio", "searchbox", "slider", "spinbutton", "switch", "tab", "textbox",
+})  # fmt: skip
+
+
+def unnamed(page):
+    """Of what can be operated, what a screen reader has no name for, or what no key reaches; by Chromium's own tree."""
+    session = page.context.new_cdp_session(page)
+    found = []
+    for node in session.send("Accessibility.getFullAXTree")["nodes"]:
+        role, said = node.get("role", {}).get("value"), node.get("name", {}).get("value", "").strip()
+        if node.get("ignored") or role not in _OPERATED:
+            continue
+        held = {each["name"]: each["value"].get("value") for each in node.get("properties", [])}
+        if not said:
+            found.append(f"{role} without a name")
+        if not held.get("focusable") and not held.get("disabled"):
+            found.append(f"{role} {said!r} that no key reaches")
+    session.detach()
+    return found
+
+
 def keep(page, name):
     """Keep a screenshot for a person to look at; a machine that is too busy to take one goes on without."""
     from playwright.sync_api import TimeoutError as TooBusy  # noqa: PLC0415 - a test dependency

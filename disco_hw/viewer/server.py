@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import errno
 import functools
+import gzip
 import hmac
 import http
 import io
@@ -17,6 +18,7 @@ from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager, nullcontext, redirect_stdout
 from dataclasses import dataclass
 from http.cookies import CookieError, SimpleCookie
+from importlib.resources import files
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
@@ -139,6 +141,10 @@ def _guarded(guard: Guard, desk: Desk | None) -> Iterator[None]:
                 response = _desk_answer(desk, instance, guard, request)
             if response is None:
                 response = process_request(connection, request)
+                if response is not None and not upgrade and urlsplit(request.path).path in {"/", "/index.html"}:
+                    response.body = _completed(response.body, response.headers.get("Content-Encoding") == "gzip")
+                    del response.headers["Content-Length"]
+                    response.headers["Content-Length"] = str(len(response.body))
             if response is not None:
                 response.headers["Referrer-Policy"] = "no-referrer"
                 response.headers["Content-Security-Policy"] = f"frame-ancestors {_framers(request)}"
@@ -157,6 +163,14 @@ def _guarded(guard: Guard, desk: Desk | None) -> Iterator[None]:
         yield
     finally:
         websockets.asyncio.server.serve = serve  # type: ignore[misc]
+
+
+@functools.lru_cache(maxsize=2)
+def _completed(page: bytes, zipped: bool) -> bytes:
+    """viser's page with ours added to its head."""
+    addition = files("disco_hw.viewer").joinpath("scene_page.html").read_bytes()
+    plain = (gzip.decompress(page) if zipped else page).replace(b"</head>", addition + b"</head>", 1)
+    return gzip.compress(plain) if zipped else plain
 
 
 def _desk_answer(desk: Desk, instance: str, guard: Guard, request: Request) -> Response | None:

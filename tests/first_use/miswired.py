@@ -129,7 +129,8 @@ class MiswiredRobot:
             self.board = VirtualRobot(self.plant, firmware)
         else:
             self.board = VendorRobot(self.plant, find_controller(name)(config.link.settings(), plant.ticks_per_rev))
-        exchange = find_driver(name).exchange
+        # VESC speaks on CAN and on a serial line, and asks for answers on the latter only.
+        exchange = find_driver(name).exchange if config.link.kind == "serial" else None
         self._exchange = None if exchange is None else exchange(config.link.settings())
         self.host, self.link = connect_pair()
         self.host.open()

@@ -7,7 +7,7 @@ import pytest
 from disco_hw.viewer.operator_controls import Desk
 from disco_hw.viewer.server import serving
 from tests.viewer.test_operator_controls import STATUS, Daemon
-from tools.browser import chromium, keep, opened
+from tools.browser import chromium, keep, opened, unnamed
 from tools.viewer_run import ROBOT_FILE
 
 pytestmark = [pytest.mark.long, pytest.mark.browser]
@@ -70,6 +70,22 @@ CUT_OFF = """() => [...document.querySelectorAll("body *:not(script)")].flatMap(
 })"""  # noqa: E501
 
 
+# All that can be operated, in the order of the page; what is disabled is left out.
+OPERATED = """() => [...document.querySelectorAll("button, input, [tabindex='0']")]
+  .filter(element => element.checkVisibility() && !element.disabled)
+  .map(element => element.id || element.textContent)"""
+
+
+def reached(tab):
+    """What the Tab key comes to, from the page's beginning on."""
+    tab.evaluate("() => { document.activeElement?.blur(); document.body.tabIndex = -1; document.body.focus(); }")
+    found = []
+    for _ in tab.evaluate(OPERATED):
+        tab.keyboard.press("Tab")
+        found.append(tab.evaluate("() => document.activeElement.id || document.activeElement.textContent"))
+    return found
+
+
 @pytest.fixture(scope="module")
 def browser():
     with chromium() as started:
@@ -105,6 +121,41 @@ def cut_off(tab, name):
     return found
 
 
+def test_a_dark_room_darkens_the_desk(browser, daemon):
+    desk = Desk(daemon.server.path, ROBOT_FILE)
+    with serving("test", port=0, desk=desk) as page, opened(browser, page.url, scene=False) as tab:
+        tab.locator("#state", has_text="READY").wait_for()
+        lightness = (
+            "() => getComputedStyle(document.querySelector('header')).backgroundColor.match(/\\d+/g).map(Number)"
+        )
+        assert min(tab.evaluate(lightness)) > 200
+        desk.dark = True
+        tab.locator("body.dark").wait_for()
+        assert max(tab.evaluate(lightness)) < 60
+        assert cut_off(tab, "dark") == []
+    desk.close()
+
+
+def test_what_is_dragged_in_the_scene_stands_in_the_form_and_escape_closes_it(browser, daemon):
+    daemon.status = WHOLE
+    desk = Desk(daemon.server.path, ROBOT_FILE)
+    with serving("test", port=0, desk=desk) as page, opened(browser, page.url, scene=False) as tab:
+        tab.locator("#state", has_text="READY").wait_for()
+        tab.locator("#taskbutton").click()
+        tab.get_by_text("drag the balls").wait_for()
+        tab.wait_for_timeout(500)
+        desk.drag({"radius_m": 1.234})
+        tab.wait_for_function("() => document.getElementById('radius_m').value === '1.23'")
+        tab.get_by_label("Centre x (m)").fill("0.4")
+        tab.wait_for_timeout(500)
+        assert desk.draft["center_x_m"] == 0.4
+        tab.keyboard.press("Escape")
+        tab.locator("#task").wait_for(state="hidden")
+        tab.wait_for_timeout(500)
+        assert desk.draft is None
+    desk.close()
+
+
 @pytest.mark.parametrize("name", STATES)
 def test_every_text_is_whole(browser, daemon, name):
     daemon.status = {**WHOLE, **STATES[name]}
@@ -117,7 +168,10 @@ def test_every_text_is_whole(browser, daemon, name):
         assert cut_off(tab, f"{name}, answered") == []
         if name == "ready":
             tab.locator("#taskbutton").click()
+            tab.get_by_label("Radius (m)").wait_for()
             assert cut_off(tab, "task") == []
+        assert unnamed(tab) == []
+        assert reached(tab) == tab.evaluate(OPERATED)
 
 
 def test_the_stop_button_stays_where_it_is_whatever_is_said(browser, daemon):

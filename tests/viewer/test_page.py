@@ -12,7 +12,7 @@ from disco_hw.viewer import scene
 from disco_hw.viewer.commands import export_log
 from disco_hw.viewer.replay import ReplayPage, run_replay
 from disco_hw.viewer.server import serving
-from tools.browser import chromium, keep, opened
+from tools.browser import chromium, keep, opened, unnamed
 from tools.viewer_run import FAULT_TICK, RADIUS_M, pose_at
 
 pytestmark = [pytest.mark.long, pytest.mark.browser]
@@ -120,6 +120,45 @@ def test_circle_and_robot_are_drawn_at_their_places_and_replay_is_sought(browser
             text for text in tab.said if text.startswith("request http") and served.url.split("?")[0] not in text
         ]
         assert elsewhere == []
+
+
+# Where things are: the picture, the panel's box, and heads of folds that only a mouse would reach.
+LAID_OUT = """() => {
+  const place = element => (({x, y, width, height}) => ({x, y, width, height}))(element.getBoundingClientRect());
+  const panel = [...document.querySelectorAll(".mantine-Paper-root")].find(box => box.textContent.includes("Play"));
+  return {canvas: place(document.querySelector("canvas")), panel: panel && place(panel),
+          mouse: [...document.querySelectorAll("[style*='cursor: pointer']")].filter(head => head.checkVisibility()
+            && head.tabIndex < 0 && !head.closest("button, label, [role=button], [role=tab], [role=slider]")
+            && !head.querySelector("input, [role=slider]")).map(head => head.outerHTML.slice(0, 120))};
+}"""
+
+
+@pytest.mark.parametrize("width", [390, 800, 1400])
+def test_every_control_has_a_name_and_keys_and_a_phone_sees_the_scene_and_the_panel(browser, replay, width):
+    page, served = replay
+    page.go_to(3.0)
+    with opened(browser, served.url, width, 844) as tab:
+        tab.get_by_role("button", name="Play").wait_for()
+        wait_for(tab, lambda: unnamed(tab) == [])
+        wait_for(tab, lambda: tab.evaluate(LAID_OUT)["mouse"] == [])
+        if width == 390:
+            wait_for(tab, lambda: not_covered(tab.evaluate(LAID_OUT)))
+            head = tab.get_by_role("button", name="Show or hide the panel")
+            before = tab.evaluate(LAID_OUT)["panel"]["height"]
+            head.focus(timeout=30_000)
+            head.press("Enter")
+            wait_for(tab, lambda: tab.evaluate(LAID_OUT)["canvas"]["height"] > 844 - 0.6 * before)
+        keep(tab, f"replay-{width}")
+
+
+def not_covered(there):
+    """The panel is as wide as the phone and begins where the picture ends, which has half of the screen."""
+    canvas, panel = there["canvas"], there["panel"]
+    return (
+        panel["width"] == canvas["width"] == 390
+        and abs(canvas["y"] + canvas["height"] - panel["y"]) < 2.0
+        and canvas["height"] > 0.5 * 844
+    )
 
 
 def test_an_exported_page_plays_from_the_file_alone(browser, log_file, tmp_path):
