@@ -142,7 +142,7 @@ def _guarded(guard: Guard, desk: Desk | None) -> Iterator[None]:
             if response is None:
                 response = process_request(connection, request)
                 if response is not None and not upgrade and urlsplit(request.path).path in {"/", "/index.html"}:
-                    response.body = _completed(response.body, response.headers.get("Content-Encoding") == "gzip")
+                    response.body = _completed(bytes(response.body), response.headers.get("Content-Encoding") == "gzip")
                     del response.headers["Content-Length"]
                     response.headers["Content-Length"] = str(len(response.body))
             if response is not None:
