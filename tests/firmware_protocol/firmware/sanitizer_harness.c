@@ -28,7 +28,7 @@ static bool chance(uint32_t one_in)
 
 static float mad_float(void)
 {
-    static const float special[] = {NAN, INFINITY, -INFINITY, 3.4e38f, -3.4e38f, 1.0e-45f, -0.0f};
+    static const float special[] = {NAN, INFINITY, -INFINITY, 3.4e38f, -3.4e38f, 1.0e7f, 1.0e-45f, -0.0f};
     return special[random_u32() % (sizeof(special) / sizeof(special[0]))];
 }
 

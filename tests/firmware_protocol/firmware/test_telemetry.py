@@ -527,6 +527,16 @@ def test_a_board_that_reckons_in_floats_gets_the_units_of_the_frames():
     assert in_units(1.23456, -800.0, -3.14159, 0.0104, 0.0206) == (True, (12346, -8_000_000, -31416, 10, 21))
 
 
+@pytest.mark.parametrize("far", [900.0, 2.0**23, 1e30])
+def test_a_pose_in_floats_ends_one_unit_beyond_its_frames_however_far_it_is(far):
+    assert in_units(far, far, far) == (True, (0x800000, 0x800000, 0x8000, 0, 0))
+    assert in_units(-far, -far, -far) == (True, (-0x800000, -0x800000, -0x8000, 0, 0))
+
+
+def test_halves_of_a_unit_go_up():
+    assert in_units(0.03125, -0.03125, 0.03125)[1][:3] == (313, -312, 313)
+
+
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("place", range(5))
 def test_a_pose_in_floats_that_is_not_finite_fits_nowhere(bad, place):
