@@ -68,7 +68,9 @@ class DeviceClock:
         if self._filter is None or restarted:
             self._start(middle_ns, device_us)
         shown_ns = self._shown(received_ns) if self.synced(received_ns) else None
-        self._count += 1
+        # Requests that were under way together waited for the same thing, and agree however wrong they are.
+        if self._count == 0 or sent_ns >= self._last_ns:
+            self._count += 1
         self._last_ns = received_ns
         self._window.append(_Exchange(middle_ns, self._deviation(middle_ns, device_us), received_ns - sent_ns))
         best = min(self._window, key=lambda exchange: exchange.round_trip_ns)
@@ -85,7 +87,7 @@ class DeviceClock:
 
     @property
     def count(self) -> int:
-        """Number of exchanges since the start or the device's last restart."""
+        """Number of exchanges, one after the other, since the start or the device's last restart."""
         return self._count
 
     @property

@@ -64,6 +64,23 @@ def test_synced_after_some_exchanges_and_no_longer_after_long_silence():
     assert not clock.synced(last_ns + HOLDOVER_NS)
 
 
+@pytest.mark.parametrize("open_after_s", [0.05, 0.3, 0.7, 0.91, 1.0, 2.5])
+def test_requests_that_waited_together_at_a_link_that_opens_late_make_it_no_wiser(open_after_s):
+    """As at an adapter that hands on nothing for a while after it was opened, and then all at once."""
+    clock, device = DeviceClock(), Device()
+    now_ns, opens_ns = START_NS, START_NS + round(open_after_s * SECOND)
+    synced_ns = None
+    for _ in range(30):
+        heard_ns = max(now_ns + 400_000, opens_ns)
+        clock.add(now_ns, heard_ns + 400_000, device.us(heard_ns))
+        now_ns += SECOND // 5
+        if clock.synced(now_ns):
+            assert clock.offset_ns(now_ns) == pytest.approx(device.true_offset_ns(now_ns), abs=1_000_000)
+            synced_ns = synced_ns or now_ns
+    assert synced_ns is not None
+    assert synced_ns <= opens_ns + SECOND
+
+
 @pytest.mark.parametrize("skew", [-150e-6, 0.0, 20e-6, 150e-6])
 @pytest.mark.parametrize("jitter_ns", [0.0, 300_000.0, 3_000_000.0])
 def test_offset_and_skew_under_jitter(skew, jitter_ns):
