@@ -15,7 +15,7 @@ from tools.compile_kernels import model_with_every_effect
 NAMES = {
     Channel.COMMAND_TO_WHEEL: {
         "motor_lag", "command_delay", "deadband", "stiction", "speed_limit", "yaw_rate_limit",
-        "yaw_acceleration_limit", "battery_sag", "wheel_gain",
+        "yaw_acceleration_limit", "battery_sag", "wheel_gain", "turning_load",
     },
     Channel.WHEEL_TO_BODY: {
         "encoder_scale", "wheel_radius_asymmetry", "turn_slip", "acceleration_slip", "side_slip", "lateral_icr",
@@ -82,6 +82,7 @@ def test_effects_describe_themselves(effect):
         ("yaw_acceleration_limit", {"limit_rad_s2": 2.0}, THERE_AND_BACK),
         ("battery_sag", {"loss": 0.5}, START_STOP),
         ("wheel_gain", {"left": -0.1, "right": 0.05}, TURN),
+        ("turning_load", {"load_rad_s": 0.4}, TURN),
         ("wheel_radius_asymmetry", {"ratio": 0.03}, STRAIGHT),
         ("turn_slip", {"k_s": 0.2}, SPIN),
         ("acceleration_slip", {"k_s2_m": 0.2}, START_STOP),
@@ -115,6 +116,15 @@ def test_yaw_rate_limit_keeps_the_mean_and_cuts_the_turn():
     states = free_run({"yaw_rate_limit": {"limit_rad_s": 0.3}}, TURN)
     assert states[-1, 2] / 2.0 == pytest.approx(0.3)
     assert states[-1, 3:].mean() == pytest.approx(3.5)
+
+
+def test_a_turning_load_takes_as_much_from_every_turn_and_nothing_from_a_straight():
+    for half in (-3.0, -0.6, 0.6, 3.0):
+        left, right = free_run({"turning_load": {"load_rad_s": 0.4}}, np.tile([2.0 - half, 2.0 + half], (3, 1)))[-1, 3:]
+        assert (0.5 * (left + right), 0.5 * (right - left)) == pytest.approx((2.0, half - math.copysign(0.4, half)))
+    # Where all of it is lost the robot drives straight on.
+    assert free_run({"turning_load": {"load_rad_s": 0.4}}, [[1.7, 2.3]])[-1, 3:] == pytest.approx([2.0, 2.0])
+    assert free_run({"turning_load": {"load_rad_s": 0.4}}, STRAIGHT)[-1, 3:] == pytest.approx([4.0, 4.0])
 
 
 def test_yaw_acceleration_limit_keeps_the_mean_and_ramps_the_turn():
