@@ -112,3 +112,34 @@ def test_a_score_is_twice_the_gain_over_its_inflation_less_the_price_of_its_para
     expected = 2.0 * (small.cost - big.cost) / proof.inflation - 2.0 * np.log(N)
     assert proof.score == pytest.approx(expected, rel=1e-12)
     assert inflation(big, channel(), ()) == 1.0
+
+
+@pytest.mark.parametrize("trusted", [0.5, 6.0])
+@pytest.mark.parametrize("added", [(0,), (0, 1)])
+def test_the_inflation_is_the_scatter_of_blocks_over_what_noise_alone_would_scatter(trusted, added):
+    rng = np.random.default_rng(9)
+    x = rng.standard_normal((N, 2)) * np.repeat(rng.uniform(0.2, 2.0, N // EACH), EACH)[:, None]
+    found = linear_fit(x, rng.standard_normal(N) + np.repeat(rng.standard_normal(N // EACH), EACH))
+    of = SimpleNamespace(settings=DEFAULT_SETTINGS, block=np.arange(N) // EACH, count=N, trusted_blocks=trusted)
+    covariance = np.linalg.inv(x.T @ x)
+    root = np.linalg.cholesky(np.linalg.inv(covariance[np.ix_(added, added)])).T @ covariance[list(added)]
+    expected = [1.0]
+    for length in DEFAULT_SETTINGS.selection.block_lengths:
+        group = of.block // length
+        blocks = [group == b for b in np.unique(group)]
+        if len(blocks) < DEFAULT_SETTINGS.selection.fewest_blocks:
+            continue
+        # What each block alone moves the estimate by, in units of its standard deviation, and what noise would.
+        squares = sum(((root @ x[b].T @ found.residual[b]) ** 2).sum() for b in blocks)
+        told = np.array([((root @ x[b].T) ** 2).sum() for b in blocks])
+        effective, known = told.sum() ** 2 / (told**2).sum(), trusted / len(added)
+        expected.append((known + effective * squares / len(added)) / (known + effective - 1.0))
+    assert len(expected) > 2
+    assert inflation(found, of, added) == pytest.approx(max(expected), rel=1e-6)
+    assert max(expected) > 1.5
+
+
+def test_without_blocks_enough_the_model_of_the_noise_is_believed():
+    few = SimpleNamespace(settings=DEFAULT_SETTINGS, block=np.zeros(N, dtype=int), count=N, trusted_blocks=0.0)
+    wander = np.repeat(np.random.default_rng(10).standard_normal(N // EACH), EACH)
+    assert inflation(linear_fit(np.ones((N, 1)), wander + 1.0), few, (0,)) == 1.0
