@@ -1,20 +1,30 @@
-"""What a log could not have shown: for each effect that was not found, the smallest size that would have been seen."""
+"""What a log could not have shown: for each effect that was not found, the smallest size that would have been seen.
+
+The boldest claims are proved: the effect is put into that very log, and the search is run again.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.effects.effect import Effect, Parameter
 from disco_hw.effects.registry import REGISTRY
-from disco_hw.gap.noise.channels import WheelChannel
-from disco_hw.gap.search.channel_search import ChannelResult
+from disco_hw.gap.data.free_runs import read_angles
+from disco_hw.gap.data.gridded_drive import GriddedDrive
+from disco_hw.gap.data.layout import BASE_COUNT, BODY, pose_sensor
+from disco_hw.gap.data.timing import pose_delay_s
+from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
+from disco_hw.gap.search.analysis import GapAnalysis
+from disco_hw.gap.search.channel_search import ChannelResult, search_body, search_wheels
 from disco_hw.gap.search.least_squares import inverse, sensitivity, solve
 from disco_hw.gap.search.richest_model import CANDIDATES, LATE_COLUMNS, candidates_of
+from disco_hw.gap.settings import GRID_STEP_S
+from disco_hw.log.drive import Poses, Wheels
 
 Array = NDArray[np.float64]
 
@@ -181,3 +191,158 @@ def _by_trial(found: ChannelResult, column: str, trials: tuple[float, ...], thre
         ):
             return size
     return None
+
+
+# Whether a search names an effect that was put into the log at a size.
+Finds = Callable[[BlindSpot, float], bool]
+
+# A claim whose size is missed by chance is made for twice that size, if it is found then.
+_TRIED = (1.0, 2.0)
+
+
+def proved(spots: Iterable[BlindSpot], finds: Finds, most: int) -> tuple[BlindSpot, ...]:
+    """Blind spots of which the `most` boldest claims, against what real robots show, are proved.
+
+    What is missed at its size and at twice that (of a limit, half) is not claimed: the log is blind to it.
+    """
+    spots = tuple(spots)
+    claims = [spot for spot in spots if spot.smallest_visible is not None and not spot.blind and _boldness(spot)]
+    claims = [spot for spot in claims if REGISTRY[spot.name].mimics is None]
+    judged: dict[str, BlindSpot] = {}
+    for spot in sorted(claims, key=_boldness, reverse=True)[:most]:
+        judged[spot.name] = _judged(spot, finds)
+    # What is another effect by algebra shows as that one does.
+    for spot in spots:
+        mimics = REGISTRY[spot.name].mimics
+        other = None if mimics is None else judged.get(mimics.effect.name)
+        if other is not None and spot.smallest_visible is not None:
+            judged[spot.name] = replace(
+                spot, smallest_visible=other.smallest_visible, blind=other.blind, proved=other.proved
+            )
+    done = (judged.get(spot.name, spot) for spot in spots)
+    return tuple(sorted(done, key=lambda spot: not spot.blind))
+
+
+def _judged(spot: BlindSpot, finds: Finds) -> BlindSpot:
+    assert spot.smallest_visible is not None
+    for times in _TRIED:
+        size = spot.smallest_visible / times if REGISTRY[spot.name].is_limit else spot.smallest_visible * times
+        if finds(spot, size):
+            return replace(spot, smallest_visible=size, blind=is_blind(spot.name, size), proved=True)
+    return replace(spot, smallest_visible=None, blind=True, proved=False)
+
+
+def _boldness(spot: BlindSpot) -> float:
+    """By how much a claimed size is below what real robots show; 0 where that is not known."""
+    realistic, size = REGISTRY[spot.name].parameters[0].realistic, spot.smallest_visible
+    if realistic is None or not size:
+        return 0.0
+    return size / realistic if REGISTRY[spot.name].is_limit else realistic / size
+
+
+def finder(analysis: GapAnalysis, say: Callable[[str], None]) -> Finds:
+    """The search of the channel in which an effect acts, on the log with the effect put in."""
+
+    def finds(spot: BlindSpot, size: float) -> bool:
+        say(f"proof of what this log shows: {spot.name} of {size:.3g} {spot.unit} is put in and searched for")
+        of_body = f"{spot.name}.{spot.parameter}" in BODY.place
+        found = analysis.body if of_body else analysis.wheels
+        assert found is not None
+        drive = with_effect(analysis.drive, found, with_size(found, spot.name, size))
+        given = found.selector.given
+        if of_body:
+            again = search_body(drive, analysis.nominal_body, given)
+        else:
+            body = analysis.nominal_body if analysis.body is None else analysis.body.fit.vector
+            again = search_wheels(drive, body[:BASE_COUNT], analysis.nominal_wheels, given)
+        new = [name for name in again.names if name not in given and name not in found.names]
+        return spot.name in again.names or any(spot.name in again.selector.rivals(again.names, name) for name in new)
+
+    return finds
+
+
+def with_size(found: ChannelResult, name: str, size: float) -> Array:
+    """The parameter vector of what a channel's search found, with an effect of this size on top."""
+    channel, candidate, vector = found.selector.channel, CANDIDATES[name], found.fit.vector.copy()
+    if candidate.profile is not None:
+        values = candidate.profile.values(channel)
+        vector[channel.layout.place[candidate.profile.column]] = values[len(values) // 2]
+    vector[channel.layout.place[REGISTRY[name].columns[0]]] = size
+    return vector
+
+
+def with_effect(drive: GriddedDrive, found: ChannelResult, vector: Array) -> GriddedDrive:
+    """A drive as it would have been measured, noise and all, had the robot been that of another parameter vector.
+
+    The difference of two free runs, at `vector` and at what was found, is put on what was measured: on the wheels'
+    angles or, motion by motion, on the poses. What one free run drifts from the measured path does not enter.
+    """
+    channel = found.selector.channel
+    inner, now, then = channel.inner, channel.split(found.fit.vector), channel.split(vector)
+    if isinstance(inner, WheelChannel):
+        more = inner.angles(*then) - inner.angles(*now)
+        speed = np.gradient(more, GRID_STEP_S, axis=0)
+        speed[drive.first] = 0.0
+        at = np.empty_like(drive.encoder_angle_rad)
+        read_angles(more, drive.encoder.node, drive.encoder.fraction, at)
+        return replace(
+            drive,
+            angle_rad=drive.angle_rad + more,
+            speed_rad_s=drive.speed_rad_s + speed,
+            encoder_angle_rad=drive.encoder_angle_rad + at,
+        )
+    assert isinstance(inner, BodyChannel)
+    moved = replace(drive, pose_values=_moved(drive, inner, now, then))
+    run = np.cumsum(drive.first).astype(np.int64)
+    (left, right), (left_speed, right_speed) = drive.angle_rad.T, drive.speed_rad_s.T
+    wheels = Wheels(drive.t_s, left, right, left_speed, right_speed, run, True, False)
+    x, y, yaw = moved.pose_values.T
+    poses = Poses(drive.pose.t_s, x, y, yaw, run[drive.pose.node])
+    return replace(moved, pose_delay_s=pose_delay_s(wheels, poses, drive.settings.grid))
+
+
+def _moved(
+    drive: GriddedDrive, channel: BodyChannel, now: tuple[Array, Array | None], then: tuple[Array, Array | None]
+) -> Array:
+    """Poses (P, 3) of a robot that moves as at `then`, from those of one that moves as at `now`."""
+    run = np.cumsum(drive.first)[drive.pose.node]
+    inside = np.diff(run, prepend=run[:1]) == 0
+    before, after = (_path(drive, channel, *one) for one in (now, then))
+    old, new = pose_sensor(now[0]), pose_sensor(then[0])
+    measured = drive.pose_values
+    turned = after[:, 2] - before[:, 2]
+    step = _rotated(np.diff(measured[:, :2], axis=0, prepend=measured[:1, :2]), _earlier(turned))
+    own = [
+        _rotated(np.diff(path[:, :2], axis=0, prepend=path[:1, :2]), -_earlier(path[:, 2])) for path in (before, after)
+    ]
+    step += _rotated(own[1] - own[0], _earlier(measured[:, 2] - old.bias_rad + turned))
+    # A drift of the world's has its directions, not the robot's.
+    rolled = np.interp(drive.pose.t_s, drive.t_s, channel.moving_s)
+    drift = np.array([new.drift_x_m_s - old.drift_x_m_s, new.drift_y_m_s - old.drift_y_m_s])
+    step += np.diff(rolled, prepend=rolled[:1])[:, None] * drift
+    step[~inside] = np.diff(measured[:, :2], axis=0, prepend=measured[:1, :2])[~inside]
+    place = measured[0, :2] + np.cumsum(step, axis=0)
+    return np.column_stack([place, measured[:, 2] + turned + new.bias_rad - old.bias_rad])
+
+
+def _path(drive: GriddedDrive, channel: BodyChannel, vector: Array, extra: Array | None) -> Array:
+    """Path (P, 3) that the sensor sees at the poses' time stamps, without bias and drift, each run from 0."""
+    begins = np.flatnonzero(drive.first)
+    run = np.searchsorted(begins, drive.pose.node, side="right") - 1
+    low, high = begins[run], np.append(begins[1:], drive.first.size)[run] - 1
+    late = pose_sensor(vector).late_s / GRID_STEP_S
+    place = np.clip(drive.pose.node + drive.pose.fraction - late, low, high - 1e-6)
+    node = np.floor(place).astype(np.int64)
+    out = np.empty((place.size, 3))
+    read_angles(channel.track(vector, extra), node, place - node, out)
+    return out
+
+
+def _earlier(values: Array) -> Array:
+    """Each value's predecessor; the first is its own."""
+    return np.concatenate([values[:1], values[:-1]])
+
+
+def _rotated(step: Array, angle: Array) -> Array:
+    cosine, sine = np.cos(angle), np.sin(angle)
+    return np.column_stack([cosine * step[:, 0] - sine * step[:, 1], sine * step[:, 0] + cosine * step[:, 1]])
