@@ -280,7 +280,7 @@ class Bridge:
         figures |= {"requests refused, too many": self._asking.refused + self._stopping.refused}
         figures |= {"messages that were none": self._malformed, "readers that failed": self._unread}
         figures |= {"messages not sent": self._unwritten}
-        figures |= {"ticks missed": self._feed.missed}
+        figures |= {"batches of the daemon missed": self._feed.missed}
         wrong = f"poses refused: {self._poses.why}" if self._poses.why else self._pad.refusal
         heard = mono_ns - self._heard_ns < _SECOND_NS
         return self._outgoing.diagnostics(wall_ns, heard, {name: str(count) for name, count in figures.items()}, wrong)

@@ -1,6 +1,7 @@
 """The stack with poses from a node of ROS 2: it drives by them, and stops when node or bridge fail it in any way."""
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -265,3 +266,62 @@ def test_it_stops_when_the_bridge_dies_or_freezes(how, tmp_path, monkeypatch):
         # Poses alone bring nothing back into motion.
         time.sleep(1.0)
         assert not stack.operator.status()["running"]
+
+
+_NODE = """
+import sys, time
+import msgspec
+from cyclonedds.pub import DataWriter
+from cyclonedds.sub import DataReader
+from cyclonedds.topic import Topic
+from disco_hw.bridge import ros2, ros2_messages
+from disco_hw.config import Ros2
+
+word, domain, localhost_only = sys.argv[1], int(sys.argv[2]), sys.argv[3] == "True"
+config = msgspec.defstruct("Config", [("ros2", Ros2)])(Ros2(domain=domain, localhost_only=localhost_only))
+joined = ros2.join_domain(config)
+topic = Topic(joined[1], "rt/who", ros2_messages.String)
+if word == "listen":
+    reader, heard, end_s = DataReader(joined[1], topic, ros2.RELIABLE), set(), time.monotonic() + 60.0
+    while time.monotonic() < end_s and len(heard) < 2:
+        before = len(heard)
+        heard |= {sample.data for sample in reader.take(20)}
+        if len(heard) > before:
+            end_s = time.monotonic() + 10.0
+        time.sleep(0.05)
+    print(*sorted(heard))
+else:
+    writer = DataWriter(joined[1], topic, ros2.RELIABLE)
+    while True:
+        writer.write(ros2_messages.String(word))
+        time.sleep(0.1)
+"""
+_TWO_COMPUTERS = """
+set -e
+ip link set lo up
+unshare -n sleep 100 & far=$!
+trap 'kill $(jobs -p)' EXIT
+until [ "$(readlink /proc/$far/ns/net)" != "$(readlink /proc/self/ns/net)" ]; do sleep 0.05; done
+ip link add v0 type veth peer name v1
+ip link set v1 netns $far
+ip addr add 10.9.0.1/24 dev v0
+ip link set v0 up
+nsenter -t $far -n sh -c 'ip link set lo up; ip addr add 10.9.0.2/24 dev v1; ip link set v1 up'
+nsenter -t $far -n "$PYTHON" -c "$NODE" far $1 False &
+"$PYTHON" -c "$NODE" near $1 $2 &
+"$PYTHON" -c "$NODE" listen $1 $2
+"""
+
+
+def _can_have_networks():
+    return shutil.which("ip") and not subprocess.run(["unshare", "-n", "true"], check=False).returncode
+
+
+@pytest.mark.long
+@pytest.mark.skipif(not _can_have_networks(), reason="networks of one's own take root and iproute2")
+@pytest.mark.parametrize(("localhost_only", "heard"), [(True, "near"), (False, "far near")])
+def test_nodes_on_another_computer_are_heard_only_where_robot_toml_lets_them(localhost_only, heard):
+    words = ["unshare", "-n", "bash", "-c", _TWO_COMPUTERS, "two computers", str(domain()), str(localhost_only)]
+    environment = {**os.environ, "PYTHON": sys.executable, "NODE": _NODE}
+    done = subprocess.run(words, env=environment, capture_output=True, text=True, timeout=200.0, check=False)
+    assert (done.stdout.strip(), done.returncode) == (heard, 0), done.stderr
