@@ -106,9 +106,15 @@ def slowest_rad_s(setup: Setup) -> float:
 
 
 def as_sent(setup: Setup) -> Setup:
-    """The robot with its poses as the source sends them."""
+    """The robot with its poses as the first source sends them, and without those of others."""
     plain = msgspec.structs.replace(
-        setup.config.pose, position_unit="m", yaw_unit="rad", clockwise=False, mirrored=False, yaw_offset_rad=0.0
+        setup.config.pose,
+        position_unit="m",
+        yaw_unit="rad",
+        clockwise=False,
+        mirrored=False,
+        yaw_offset_rad=0.0,
+        also=(),
     )
     return replace(setup, config=msgspec.structs.replace(setup.config, pose=plain))
 
@@ -128,6 +134,8 @@ def run_commission(options: CommissionOptions, ask: Callable[[str], str] = input
     link_key(setup)
     if not os.isatty(_STANDARD_INPUT):
         raise InputError("commission: standard input is no terminal; it needs a person's hand and eye: use a terminal")
+    if setup.config.pose.also:
+        _say("poses", "the first source alone is looked at; compare those of [[pose.also]] with it by `disco-hw check`")
     told: list[dict[str, Any]] = []
     for name in options.stages:
         if not _through(known[name], options, ask, told):

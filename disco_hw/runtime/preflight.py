@@ -150,9 +150,10 @@ def check_safety(robot: Robot, card: SafetyCard) -> list[Check]:
     driven_m = speed_m_s * card.reaction_s
     if card.brakes:
         braking_m = speed_m_s**2 / (2.0 * robot.max_wheel_acceleration_rad_s2 * robot.wheel_radius_m)
-        far = f"about {driven_m + braking_m:.2f} m at {speed_m_s:.2f} m/s"
+        stands_s = card.reaction_s + speed_m_s / (robot.max_wheel_acceleration_rad_s2 * robot.wheel_radius_m)
+        far = f"about {driven_m + braking_m:.2f} m and {stands_s:.2f} s at {speed_m_s:.2f} m/s"
     else:
-        far = f"{driven_m:.2f} m at {speed_m_s:.2f} m/s, and then as far as the robot rolls"
+        far = f"{driven_m:.2f} m, {card.reaction_s:.2f} s, at {speed_m_s:.2f} m/s, and then as far as the robot rolls"
     checks = [
         Check("stops when the host is silent", Level.OK, card.host_silent),
         Check("stops by", Level.OK if card.brakes else Level.WARNING, f"{card.stops_by}; {far}"),

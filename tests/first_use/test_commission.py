@@ -8,7 +8,7 @@ import random
 import pytest
 
 from disco_hw.errors import InputError, WorkError
-from disco_hw.first_use.commission import STAGES, CommissionOptions, run_commission, write_fields
+from disco_hw.first_use.commission import STAGES, CommissionOptions, as_sent, run_commission, write_fields
 from disco_hw.first_use.procedure import MOST_SHARE
 from disco_hw.runtime.robot_setup import load_setup
 from sim.devices import odrive
@@ -229,6 +229,21 @@ def test_logs_that_could_not_be_kept_are_refused_before_anybody_is_asked(tmp_pat
     path = robot_file(tmp_path)
     with pytest.raises(InputError, match=r"is there and is no directory"):
         run_commission(CommissionOptions(path, log_directory=path))
+
+
+def test_of_several_pose_sources_the_first_alone_is_looked_at_which_is_said(tmp_path, monkeypatch, capsys):
+    path = robot_file(tmp_path)
+    path.write_text(path.read_text(encoding="utf-8") + '[[pose.also]]\nsource = "robot"\n', encoding="utf-8")
+    setup = load_setup(path)
+    assert (len(setup.config.pose.also), as_sent(setup).config.pose.also) == (1, ())
+    monkeypatch.setattr("os.isatty", lambda _descriptor: True)
+
+    def goes_away(_question):
+        raise EOFError
+
+    with pytest.raises(EOFError):
+        run_commission(CommissionOptions(path, log_directory=tmp_path / "logs"), goes_away)
+    assert "first source alone is looked at" in capsys.readouterr().err
 
 
 def test_without_a_yes_nothing_is_written(tmp_path):

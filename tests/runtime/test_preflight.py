@@ -13,12 +13,13 @@ from disco_hw.runtime.preflight import (
     check_link_load,
     check_realtime,
     check_round_trip,
+    check_safety,
     check_task,
     failures,
 )
 from disco_hw.tasks.circle import CircleTask
 from disco_hw.tasks.path import PathTask
-from drivers.types import Limit, Limits
+from drivers.types import Limit, Limits, SafetyCard
 
 
 def robot(**changes):
@@ -202,3 +203,18 @@ def test_what_does_not_fit_is_one_line_with_field_and_remedy(speed, acceleration
 
 def test_every_error_is_told_at_once():
     assert len(check_limits(ROBOT, 9.0, 21.0, 1)) == 3
+
+
+@pytest.mark.parametrize(
+    ("brakes", "level", "said"),
+    [
+        (True, Level.OK, "its watchdog; about 0.14 m and 0.50 s at 0.48 m/s"),
+        (False, Level.WARNING, "its watchdog; 0.05 m, 0.10 s, at 0.48 m/s, and then as far as the robot rolls"),
+    ],
+)
+def test_the_safety_card_says_how_far_and_how_long_at_full_speed(brakes, level, said):
+    card = SafetyCard("the controller", "its watchdog", 0.1, brakes, "a frame")
+    (found,) = [
+        check for check in check_safety(robot(max_wheel_acceleration_rad_s2=20.0), card) if check.name == "stops by"
+    ]
+    assert (found.level, found.text) == (level, said)

@@ -3,11 +3,13 @@
 Whoever means to change it looks at the frames of the phase that is named, and then writes the new sums here.
 """
 
+import functools
 import hashlib
 
 import pytest
 
 from drivers.types import DriverState, Request
+from sim.can_frame import CanFrame
 from tests.drivers.motor.vendors import VENDORS
 
 FORWARD = (3.0, 2.0)
@@ -52,6 +54,7 @@ class Recorded:
         return sent
 
 
+@functools.cache
 def scripted_day(vendor):
     """The frames of each phase, as lines."""
     recorded = Recorded(vendor)
@@ -101,6 +104,43 @@ def scripted_day(vendor):
 
 def sums(vendor):
     return [hashlib.sha256("\n".join(lines).encode()).hexdigest()[:6] for lines in scripted_day(vendor)]
+
+
+NEVER_ASKED = (20, 22, 28, 29, 61, 62, 94, 98, 148, 201)
+"""Of a RoboClaw: to count anew, other PIDs, the non-volatile memory, modes of its pins and of its e-stop."""
+
+
+def as_frame(frame):
+    return CanFrame(int(frame[3][:-1], 16), bytes.fromhex(frame[4] if len(frame) > 4 else ""), frame[3][-1] == "x")
+
+
+@pytest.mark.parametrize("vendor", VENDORS, ids=str)
+def test_no_frame_of_a_scripted_day_moves_by_itself_calibrates_or_writes_what_stays(vendor):
+    sent = [as_frame(line.split(" ")) for lines in scripted_day(vendor) for line in lines]
+    assert len(sent) > 100
+    assert not [frame for frame in sent if vendor.is_forbidden(frame)]
+
+
+@pytest.mark.parametrize(
+    ("label", "frames"),
+    [
+        # Calibrate, search, home; position, torque, limits, gains, renaming, restarting, counting anew, parameters.
+        ("odrive-0.6", ["67 0300000000000000", "67 0400000000000000", "67 0b00000000000000", "6c 00000000", "6e 0000",
+                        "6f 00", "7a 00", "66 00", "76 00", "79 00", "64 01dc000001000000", "6b 0300000001000000"]),
+        # Duty, current, position, shutdown, bit rate, a packet that sets, a speed cut short.
+        ("vesc", ["17 00000000x", "117 00000001x", "417 00000000x", "1f17 x", "3f17 00x", "817 fe000dx", "317 0bb8x"]),
+        # The serial mode, lights, brakes, a mode of 1 byte.
+        ("agilex", ["421 0200000000000000", "121 0000000000000000", "131 00", "421 01"]),
+        ("roboclaw", [f"{0x8000 | command:x} 0000000000000000" for command in NEVER_ASKED]
+         + ["8022 8022000100010000"]),
+    ],
+)  # fmt: skip
+def test_what_no_driver_may_send_would_be_noticed(label, frames):
+    (vendor,) = [one for one in VENDORS if one.label == label]
+    for text in frames:
+        can_id, data = text.rstrip("x").split(" ")
+        frame = CanFrame(int(can_id, 16), bytes.fromhex(data), text.endswith("x"))
+        assert vendor.is_forbidden(frame), text
 
 
 @pytest.mark.parametrize("vendor", VENDORS, ids=str)

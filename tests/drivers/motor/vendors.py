@@ -1,5 +1,6 @@
 """Every driver of a vendor's controller, with what the conformance suite must know to drive and to break it."""
 
+import struct
 import tomllib
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -65,11 +66,15 @@ def is_odrive_motion(frame):
 
 
 def is_odrive_forbidden(frame):
-    """What calibrates, spins, reboots, renames, moves the encoder's count, or writes a parameter."""
-    command = frame.can_id & 0x1F
-    if command == 0x07:
-        return frame.data[0] not in (1, 8)
-    return command in (0x06, 0x16, 0x19) or (command == 0x04 and frame.data[:1] == b"\1")
+    """All but the stop, idle and closed loop, velocity control, velocities, the clearing of errors, and questions."""
+    command, data = frame.can_id & 0x1F, frame.data
+    if not data:
+        return command not in (0x00, 0x02, 0x17, 0x18)
+    if command in (0x07, 0x0B):
+        return (command, data) not in [(0x07, struct.pack("<II", state, 0)) for state in (1, 8)] and (
+            command != 0x0B or data != struct.pack("<II", 2, 1)
+        )
+    return (command, len(data)) not in ((0x0D, 8), (0x18, 1)) and not (command == 0x04 and data[0] == 0)
 
 
 def fail_left_vesc(rig):
@@ -86,11 +91,13 @@ def is_vesc_motion(frame):
 
 
 def is_vesc_forbidden(frame):
-    """Duty, position, shutdown, another bit rate, a packet that is no question, a length that is not the command's."""
-    command = frame.can_id >> 8
+    """All but the current of zero, brake currents, speeds, pings, and questions for values and settings."""
+    command, data = frame.can_id >> 8, frame.data
     if command == 8:
-        return frame.data[2] not in (17, 50)
-    return command in (0, 4, 5, 6, 7, 10, 31, 63) or (command < 14 and len(frame.data) != 4) or not frame.extended
+        return data[2] not in (17, 50)
+    if not frame.extended or command == 17:
+        return not frame.extended or len(data) != 1
+    return command not in (1, 2, 3) or len(data) != 4 or (command == 1 and any(data))
 
 
 def fail_left_agilex(rig):
