@@ -57,7 +57,7 @@ FIRST = {
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """What became of one mutant: "killed", "same code", "does not compile" or "SURVIVED"."""
+    """The result of one mutant: "killed", "same code", "does not compile" or "SURVIVED"."""
 
     file: str
     mutant: Mutant

@@ -31,7 +31,7 @@ _LEAST_VARIANCE, _LARGEST_VARIANCE = 1e-14, 1e4
 
 
 class Outcome(Enum):
-    """What became of a proposal."""
+    """What was done with a proposal."""
 
     PUBLISHED = "published"
     CONFIRMING = "confirming"

@@ -38,8 +38,8 @@ def serve_foxglove(robot: Path, host: str, port: int, as_json: bool = False) -> 
     """
     config = load_robot_config(robot)
     with StopSignals() as signals, closing(Live(config, host, port)) as live:
-        told = {"foxglove": live.url, "layout": str(LAYOUT)}
-        print(json.dumps(told) if as_json else f"foxglove: {live.url}, layout {LAYOUT}", flush=True)
+        where = {"foxglove": live.url, "layout": str(LAYOUT)}
+        print(json.dumps(where) if as_json else f"foxglove: {live.url}, layout {LAYOUT}", flush=True)
         while signals.received is None:
             live.step()
     return 0

@@ -15,7 +15,7 @@ _MOST_LINES = 1000
 
 
 class AsyncPrinter:
-    """Writes a line for each sentence to a descriptor, from a thread of its own: called as `teller(topic, text)`.
+    """Writes a line for each sentence to a descriptor, from a thread of its own: called as `say(topic, text)`.
 
     Who holds the output, by Ctrl-S, a pager or a connection that hangs, would hold up the control loop with it. What
     comes while a thousand lines wait is dropped and counted; a reader that has gone gets nothing more. The thread
@@ -34,7 +34,7 @@ class AsyncPrinter:
     def __call__(self, topic: str, text: str) -> None:
         """Have the sentence written."""
         if self._thread is None:
-            self._thread = threading.Thread(target=self._write, name="teller", daemon=True)
+            self._thread = threading.Thread(target=self._write, name="async printer", daemon=True)
             self._thread.start()
         if self._lines.qsize() < self._most:
             self._put(topic, text)

@@ -133,7 +133,7 @@ class _Found:
     poses: tuple[PoseSample, ...]
     pose_news: str
     rejected: int
-    told: tuple[RobotStatus, ...]
+    reported: tuple[RobotStatus, ...]
     round_trips_s: tuple[float, ...]
 
 
@@ -187,7 +187,7 @@ def _ask_robot(transport: Transport, driver: Driver, pose_source: PoseSource) ->
     wheels = 0
     poses: list[PoseSample] = []
     pose_news = ""
-    told: list[RobotStatus] = []
+    reported: list[RobotStatus] = []
     # What came while nobody listened would count as of the time of listening.
     transport.receive()
     start_ns = time.monotonic_ns()
@@ -202,7 +202,7 @@ def _ask_robot(transport: Transport, driver: Driver, pose_source: PoseSource) ->
         poses += came
         if isinstance(pose_source, SaysWhy):
             pose_news = next(reversed(pose_source.news()), pose_news)
-        told += [status for status in readings.status if status.t_ns - start_ns > _SETTLED_S * 1e9]
+        reported += [status for status in readings.status if status.t_ns - start_ns > _SETTLED_S * 1e9]
         for outgoing in driver.transmit(now_ns, None):
             if transport.send(outgoing, now_ns):
                 stopwatch.sent(outgoing)
@@ -218,14 +218,14 @@ def _ask_robot(transport: Transport, driver: Driver, pose_source: PoseSource) ->
         poses=tuple(poses),
         pose_news=pose_news,
         rejected=stats.rejected_crc + stats.rejected_sequence + stats.rejected_length + transport.stats.malformed,
-        told=tuple(told),
+        reported=tuple(reported),
         round_trips_s=tuple(stopwatch.round_trips_s),
     )
 
 
-def pose_source_checks(told: PoseInput, poses: Sequence[PoseSample]) -> list[Check]:
+def pose_source_checks(source: PoseInput, poses: Sequence[PoseSample]) -> list[Check]:
     """Each of several pose sources, heard for the time of listening on a robot that stands, and whether they agree."""
-    labels, every = told.labels(), told.every()
+    labels, every = source.labels(), source.every()
     if len(labels) == 1:
         return []
     checks: list[Check] = []
@@ -296,9 +296,9 @@ def _firmware_check(found: _Found, has_clock: bool) -> Check:
         return Check(name, Level.FAIL, found.detail)
     if found.state in {DriverState.REFUSED, DriverState.FAULT, DriverState.ESTOP}:
         return Check(name, Level.FAIL, f"{found.state.value}: {found.detail}")
-    if found.told and found.told[-1].fault_code:
+    if found.reported and found.reported[-1].fault_code:
         return Check(
-            name, Level.FAIL, f"{found.state.value}: the robot reports {status_texts.fault(found.told[-1].fault)}"
+            name, Level.FAIL, f"{found.state.value}: the robot reports {status_texts.fault(found.reported[-1].fault)}"
         )
     clock = f", clock {'synchronised' if found.clock_synchronised else 'NOT synchronised'}" if has_clock else ""
     return Check(name, Level.OK, f"{found.identity.in_words()}, {found.state.value}{clock}")
@@ -307,9 +307,9 @@ def _firmware_check(found: _Found, has_clock: bool) -> Check:
 def _hearing_check(found: _Found) -> Check:
     """Whether the robot takes what this host sends; a wrong key shows nowhere else."""
     name = "hearing"
-    if not found.told:
+    if not found.reported:
         return Check(name, Level.FAIL, "the robot did not say what it hears; check the firmware")
-    first, last = found.told[0], found.told[-1]
+    first, last = found.reported[0], found.reported[-1]
     rejected = (last.rejected_count - first.rejected_count) % 256
     if not rejected:
         return Check(name, Level.OK, "the robot rejects nothing")

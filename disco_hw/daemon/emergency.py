@@ -1,7 +1,7 @@
 """Stop the robot from outside, with as little as possible in the way.
 
 The frame goes out on the link by a connection of its own, beside the daemon's, and the daemon is asked as well; each
-way is tried whatever became of the other. A robot.toml whose other sections are broken still says where the link is;
+way is tried whether or not the other worked. A robot.toml whose other sections are broken still says where the link is;
 without one that can be read, the option --link does.
 """
 
@@ -39,7 +39,7 @@ _REMEDY = "give --link can:INTERFACE:CHANNEL or --link serial:PORT, or use the r
 
 @dataclass(frozen=True, slots=True)
 class EstopOutcome:
-    """What became of each way to stop the robot, and whether the robot said that it is in e-stop.
+    """The result of each way to stop the robot, and whether the robot said that it is in e-stop.
 
     `latches`: whether its controller itself keeps the stop. `file_error`: why robot.toml did not say where the link is,
     which --link then had to.

@@ -69,7 +69,7 @@ MIN_YAW_STD_RAD = 1e-3
 
 
 class PoseReason(enum.Enum):
-    """What became of a measured pose."""
+    """What the filter did with a measured pose."""
 
     ACCEPTED = "accepted"
     INITIALISED = "initialised"

@@ -25,7 +25,7 @@ Belief = PoseBelief | HeadingSearch
 
 
 class Judgement(msgspec.Struct, frozen=True, gc=False):
-    """What became of a pose; the numbers are those of PoseUpdate, None where there was nothing to compare with."""
+    """The filter's answer to a pose; numbers as in PoseUpdate, None where there was nothing to compare with."""
 
     reason: PoseReason
     innovation: Triple | None = None

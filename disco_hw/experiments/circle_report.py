@@ -333,6 +333,6 @@ def picture(layers: Sequence[Iterable[Point]], low: Point, high: Point, rows: in
 
 
 def circle_points(centre: Point, radius_m: float, count: int = 48) -> list[Point]:
-    """Points around a circle, far enough apart to be told from a line."""
+    """Points around a circle, far enough apart to differ from a line."""
     turns = (2.0 * math.pi * k / count for k in range(count))
     return [(centre[0] + radius_m * math.cos(turn), centre[1] + radius_m * math.sin(turn)) for turn in turns]

@@ -190,7 +190,7 @@ class LogReader:
 
 @dataclass
 class FaultOutcome:
-    """What became of one fault: `stopped_s` from its beginning to zero setpoints if the robot left ARMED."""
+    """The effect of one fault: `stopped_s` from its beginning to zero setpoints if the robot left ARMED."""
 
     fault: ScheduledFault
     armed_before: bool

@@ -95,15 +95,15 @@ class Datagrams:
     def receive(self, now_ns: int, from_robot: Sequence[PoseSample]) -> Sequence[PoseSample]:
         """What came over the port."""
         for pose in from_robot:
-            told: dict[str, Any] = {
+            message: dict[str, Any] = {
                 "x_m": pose.x_m,
                 "y_m": pose.y_m,
                 "position_std_m": pose.position_std_m,
                 "age_s": 1e-9 * (now_ns - pose.t_ns),
             }
             if self._has_heading:
-                told |= {"yaw_rad": pose.yaw_rad, "yaw_std_rad": pose.yaw_std_rad}
-            self._sender.send(json.dumps(told).encode())
+                message |= {"yaw_rad": pose.yaw_rad, "yaw_std_rad": pose.yaw_std_rad}
+            self._sender.send(json.dumps(message).encode())
         return self._source.receive(now_ns, ())
 
     def close(self) -> None:

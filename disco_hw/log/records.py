@@ -185,7 +185,7 @@ class BeliefChange(msgspec.Struct, frozen=True, gc=False):
 
 
 class Adaptation(msgspec.Struct, frozen=True, gc=False):
-    """What became of one report of the adapter: `outcome` for machines, `text` for a person.
+    """The result of one report of the adapter: `outcome` for machines, `text` for a person.
 
     published, confirming, agrees, refused: of a proposal, whose `mean` and `std` are given; idle: there was none;
     reverted: back to the model file; lost: no adapter; audit: the network's estimate beside the filter's; taken_over:

@@ -134,7 +134,7 @@ class Directions:
 
     def _by_poses(self, poses: Sequence[PoseSample]) -> str | None:
         """What else than robot.toml says explains how the robot has moved since it stood."""
-        start, told = self._pose, (False, (1, 1))
+        start, declared = self._pose, (False, (1, 1))
         for pose in poses:
             if start is None or not pose.has_heading or pose.source != start.source:
                 continue
@@ -147,10 +147,10 @@ class Directions:
             far_m = 0.5 * self._radius_m * (abs(turned[0]) + abs(turned[1]))
             arc_std_m = 0.5 * self._track_m * pose.yaw_std_rad
             variance = 2.0 * (pose.position_std_m**2 + arc_std_m**2) + (_SLIP_PART * far_m) ** 2
-            off_told = max(0.0, self._off_m(ahead_m, yaw, turned, *told) - _UNKNOWN_PART * far_m)
+            off_declared = max(0.0, self._off_m(ahead_m, yaw, turned, *declared) - _UNKNOWN_PART * far_m)
             for wired in self._evidence:
                 off = self._off_m(ahead_m, yaw, turned, *wired)
-                gain = 0.5 * (off_told**2 - off**2) / max(variance, 1e-9)
+                gain = 0.5 * (off_declared**2 - off**2) / max(variance, 1e-9)
                 self._evidence[wired] += min(max(gain, -_MOST_OF_ONE), _MOST_OF_ONE)
         wired = max(self._evidence, key=self._evidence.__getitem__)
         return self._words_of_wiring(*wired) if self._evidence[wired] > _ENOUGH else None
@@ -161,8 +161,8 @@ class Directions:
         left, right = signs[0] * left, signs[1] * right
         ahead = 0.5 * self._radius_m * (left + right)
         arc = 0.5 * self._radius_m * (right - left)
-        told = 0.5 * self._track_m * yaw_rad
-        return min(math.hypot(ahead_m - ahead, told - part * arc) for part in _TURNED_PARTS)
+        turned_m = 0.5 * self._track_m * yaw_rad
+        return min(math.hypot(ahead_m - ahead, turned_m - part * arc) for part in _TURNED_PARTS)
 
     def _again(self, words: str) -> str | None:
         """The words, once the same was found so a few times in a row; none are nothing found."""

@@ -39,7 +39,7 @@ class Pilot(Protocol):
         """Return what is wanted of the tick at `now_ns`; `last` is the tick before."""
 
     def learn(self, now_ns: int, tick: CoreTick, replies: Sequence[Reply]) -> None:
-        """Take in what became of it: the replies to its own requests."""
+        """Take in the result: the replies to its own requests."""
 
     def steer(self, now_ns: int, page: int, wanted: Mapping[str, Any]) -> str | None:
         """Take in how a page, known by a number, wants to drive; returns why that does not count, in words."""

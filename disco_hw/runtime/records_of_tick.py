@@ -34,18 +34,18 @@ def frame_out(now_ns: int, outgoing: OutgoingFrame, sent: bool) -> records.Recor
 
 def controller(now_ns: int, identity: Identity, limits: Limits) -> records.Record:
     """Which controller answers, and what it keeps to."""
-    told: dict[SaidBy, dict[str, float]] = {"device": {}, "fixed": {}, "robot.toml": {}}
+    by_origin: dict[SaidBy, dict[str, float]] = {"device": {}, "fixed": {}, "robot.toml": {}}
     for name, limit in limits.known().items():
-        told[limit.said_by][name] = limit.value
+        by_origin[limit.said_by][name] = limit.value
     return records.Controller(
         now_ns,
         identity.controller,
         identity.firmware,
         identity.details,
         identity.said_by,
-        told["device"],
-        told["fixed"],
-        told["robot.toml"],
+        by_origin["device"],
+        by_origin["fixed"],
+        by_origin["robot.toml"],
     )
 
 

@@ -60,7 +60,7 @@ class UnnamedFinding:
 
 @dataclass(frozen=True, slots=True)
 class Doubt:
-    """An effect that fits and is not told as found, and why."""
+    """An effect that fits and is not reported as found, and why."""
 
     name: str
     why: str

@@ -173,7 +173,7 @@ def drifting_parameters(analysis: GapAnalysis, final: FinalFit) -> tuple[str, ..
 
 
 def across_logs(analysis: GapAnalysis, begins_s: Sequence[float]) -> tuple[AcrossLogs, ...]:
-    """Every parameter that each of several logs tells, and whether they differ in it by more than their noise."""
+    """Every parameter that each of several logs determines, and whether they differ in it by more than their noise."""
     settings, out = analysis.drive.settings.report, []
     for found in (analysis.body, analysis.wheels):
         if found is None or len(begins_s) < 2:
@@ -225,7 +225,7 @@ class Measured:
 def sort_out(
     effects: Iterable[EffectFinding], measured: Measured
 ) -> tuple[tuple[EffectFinding, ...], tuple[Doubt, ...]]:
-    """Effects that may be told as found, and those that may not, each with the reason."""
+    """Effects that may be reported as found, and those that may not, each with the reason."""
     sure, doubtful = [], []
     for effect in effects:
         why = doubt_of(effect, measured)
@@ -237,7 +237,7 @@ def sort_out(
 
 
 def doubt_of(effect: EffectFinding, measured: Measured) -> str | None:
-    """Why an effect is not told as found; None if nothing speaks against it."""
+    """Why an effect is not reported as found; None if nothing speaks against it."""
     described, settings = REGISTRY[effect.name], measured.drive.settings.report
     pairs = [(parameter, effect.parameters[parameter.name]) for parameter in described.parameters]
     for parameter, estimate in pairs:

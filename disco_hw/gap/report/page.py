@@ -183,7 +183,7 @@ def _folded(title: str, content: str) -> str:
 
 
 def _across(report: GapReport) -> str:
-    """Every parameter that each log tells, log by log."""
+    """Every parameter that each log determines, log by log."""
     if not report.across:
         return "<p>No parameter is known well enough in each log to compare them.</p>"
     rows = [

@@ -1,6 +1,6 @@
 """How far off the wheels are on held-out stretches, from commands alone: what a log without poses is judged by.
 
-Their turns are told as the way and the heading that they make on the robot's geometry, in the units of the whole gap.
+Their turns are given as the way and the heading that they make on the robot's geometry, in the units of the whole gap.
 """
 
 from __future__ import annotations
