@@ -47,7 +47,7 @@ def steps(seeds: int = 12) -> dict[str, float]:
     figures: dict[str, float] = {}
     for index, field in enumerate(("radius_m", "axle_m", "x_icr_m")):
         for factor in (1.15, 0.85):
-            taken = np.array([_step_s(index, field, factor, seed) for seed in range(61, 61 + seeds)])
+            taken = np.array([step_known_s(index, field, factor, seed) for seed in range(61, 61 + seeds)])
             key = f"adapt.step.{field}_{factor:g}"
             for name, column in zip(("filter", "recursive"), taken.T, strict=True):
                 figures |= {f"{key}.{name}_median_s": float(np.median(column)), f"{key}.{name}_worst_s": column.max()}
@@ -59,7 +59,8 @@ CHANGED_AFTER_S, LONGEST_STEP_S = 10.0, 10.0
 _TO_MESSAGE, _FROM_MESSAGE = [2, 0, 1], [1, 2, 0]
 
 
-def _step_s(index: int, field: str, factor: float, seed: int) -> tuple[float, float]:
+def step_known_s(index: int, field: str, factor: float, seed: int) -> tuple[float, float]:
+    """Seconds until filter and recursive estimate know 80 % of a step of one length (`index`, `field`) by `factor`."""
     mean = np.array(NOMINAL)
     covariance = np.diag((0.15 / np.sqrt(3.0) * mean) ** 2)
     filtered, recursive = GeometryFilter(mean, covariance, 0.5 * mean, 1.6 * mean), Adapter()

@@ -1,4 +1,4 @@
-"""Verbs that repeat an experiment: table, CSV and PNG."""
+"""Verbs that repeat an experiment: table, CSV, and a picture as PNG, PDF and SVG."""
 
 from __future__ import annotations
 
@@ -13,23 +13,28 @@ from disco_hw.cli.options import AsJson, print_result, progress_line
 from disco_hw.errors import InputError
 from disco_hw.reports import refuse_directory
 
-experiment_app = typer.Typer(help="The paper's experiments, as table, CSV and PNG.", no_args_is_help=True)
+SeedOffset = Annotated[
+    int, typer.Option(min=0, help="First seed: 50 seeds at 50 are others than 50 at 0, and both are 100 at 0.")
+]
+
+experiment_app = typer.Typer(help="The paper's experiments, as table, CSV and picture.", no_args_is_help=True)
 
 
 @experiment_app.command()
 def pendulum(
     seeds: Annotated[int, typer.Option(min=1, help="Runs of each curve.")] = 50,
-    out: Annotated[Path, typer.Option("-o", "--out", help="Directory for CSV and PNG.")] = Path("out/pendulum"),
+    seed_offset: SeedOffset = 0,
+    out: Annotated[Path, typer.Option("-o", "--out", help="Directory for CSV and picture.")] = Path("out/pendulum"),
     as_json: AsJson = False,
 ) -> None:
     """Swing a pendulum up: true parameters; unscented transform and draws, each with prior and posterior."""
     from disco_hw.experiments.pendulum import PendulumOptions, run_pendulum
 
     refuse_directory(out)
-    result = run_pendulum(PendulumOptions(seeds=seeds), progress_line)
+    result = run_pendulum(PendulumOptions(seeds=seeds, seed_offset=seed_offset), progress_line)
     out.mkdir(parents=True, exist_ok=True)
     result.write_csv(out / "pendulum.csv")
-    result.write_png(out / "pendulum.png")
+    result.write_pictures(out / "pendulum.png")
     print_result({"curves": result.rows(), "options": asdict(result.options)}, as_json, result.table())
 
 
@@ -40,13 +45,14 @@ def circle(
     ] = None,
     mode: Annotated[str, typer.Option(help="default or paper.")] = "default",
     seeds: Annotated[int, typer.Option(min=1, help="Plants drawn from the posterior.")] = 8,
+    seed_offset: SeedOffset = 0,
     duration_s: Annotated[float, typer.Option(min=1.0, help="Length of a drive.")] = 40.0,
     rate_hz: Annotated[float, typer.Option(min=1.0, max=200.0, help="Plans a second.")] = 10.0,
     largest_rot_s: Annotated[float, typer.Option(min=0.1, help="Largest wheel speed, rotations a second.")] = 1.0,
     largest_rot_s2: Annotated[float, typer.Option(min=0.1, help="Largest change of it in a second.")] = math.inf,
     lag_s: Annotated[float, typer.Option(min=0.0, help="Lag of the plant's wheels.")] = 0.1,
     wheel_noise: Annotated[float, typer.Option(min=0.0, help="Noise of a wheel's speed, part of it.")] = 0.05,
-    out: Annotated[Path, typer.Option("-o", "--out", help="Directory for CSV and PNG.")] = Path("out/circle"),
+    out: Annotated[Path, typer.Option("-o", "--out", help="Directory for CSV and picture.")] = Path("out/circle"),
     as_json: AsJson = False,
 ) -> None:
     """Drive the circle knowing the prior, the posterior, a point estimate, or the truth."""
@@ -61,11 +67,11 @@ def circle(
             raise InputError(f"--{option} {value}: not a finite number; write one")
     refuse_directory(out)
     setup = load_setup(robot or Path(disco_hw.__file__).parent / "robots" / "wombot.toml")
-    options = CircleOptions(seeds, duration_s, rate_hz, largest_rot_s, largest_rot_s2, lag_s, wheel_noise)
+    options = CircleOptions(seeds, duration_s, rate_hz, largest_rot_s, largest_rot_s2, lag_s, wheel_noise, seed_offset)
     result = run_circle(setup.model, mode, options, progress_line)
     out.mkdir(parents=True, exist_ok=True)
     result.write_csv(out / "circle.csv")
-    result.write_png(out / "circle.png")
+    result.write_pictures(out / "circle.png")
     print_result({"curves": result.rows(), "mode": mode, "options": asdict(options)}, as_json, result.table())
 
 
@@ -78,7 +84,8 @@ def adapt(
         float, typer.Option(min=-0.3, max=0.3, help="By how much of its size the parameter changes.")
     ] = 0.15,
     seeds: Annotated[int, typer.Option(min=1, help="Runs of each.")] = 3,
-    out: Annotated[Path, typer.Option("-o", "--out", help="Directory for CSV and PNG.")] = Path("out/adapt"),
+    seed_offset: SeedOffset = 0,
+    out: Annotated[Path, typer.Option("-o", "--out", help="Directory for CSV and picture.")] = Path("out/adapt"),
     as_json: AsJson = False,
 ) -> None:
     """Let wheel radius or axial distance change on the way, and see what adaptation wins back."""
@@ -88,10 +95,10 @@ def adapt(
 
     refuse_directory(out)
     setup = load_setup(robot or Path(disco_hw.__file__).parent / "robots" / "wombot.toml")
-    result = run_adapt(setup, AdaptOptions(change=change, seeds=seeds), progress_line)
+    result = run_adapt(setup, AdaptOptions(change=change, seeds=seeds, seed_offset=seed_offset), progress_line)
     out.mkdir(parents=True, exist_ok=True)
     result.write_csv(out / "adapt.csv")
-    result.write_png(out / "adapt.png")
+    result.write_pictures(out / "adapt.png")
     print_result({"changes": result.rows()}, as_json, result.table())
 
 

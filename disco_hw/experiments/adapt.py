@@ -27,7 +27,7 @@ from disco_hw.log import records
 from disco_hw.log.reader import open_log
 from disco_hw.log.recorder import MemoryRecorder
 from disco_hw.model.file import load_model, model_text
-from disco_hw.reports import write_png
+from disco_hw.reports import write_pictures
 from disco_hw.runtime.assembly import make_planner
 from disco_hw.runtime.robot_setup import Setup
 from disco_hw.runtime.supervisor import UserRequest
@@ -53,7 +53,7 @@ _SMOOTH_S = 5.0
 @dataclass(frozen=True, slots=True)
 class AdaptOptions:
     """`change` of the parameter, by its size, at `change_s`; costs are means over `compared_s` before it, and over as
-    long from `settled_s` after it on. Seeds 1 to `seeds` are of the plant's noise.
+    long from `settled_s` after it on. `seeds` seeds after `seed_offset` are of the plant's noise.
     """
 
     change: float = 0.15
@@ -61,6 +61,7 @@ class AdaptOptions:
     settled_s: float = 20.0
     compared_s: float = 40.0
     seeds: int = 3
+    seed_offset: int = 0
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -131,7 +132,7 @@ class AdaptResult:
         named = [
             (f"{name}, {'adapting' if adapted else 'not adapting'}, seed {seed}", run)
             for (name, adapted), runs in self.runs.items()
-            for seed, run in enumerate(runs, start=1)
+            for seed, run in enumerate(runs, start=self.options.seed_offset + 1)
         ]
         with path.open("w", newline="", encoding="utf-8") as file:
             writer = csv.writer(file)
@@ -139,8 +140,10 @@ class AdaptResult:
             for step, t_s in enumerate(named[0][1].t_s):
                 writer.writerow([f"{t_s:.3f}", *(f"{run.cost[step]:.6g}" for _, run in named)])
 
-    def write_png(self, path: Path) -> None:
-        """Cost over time, smoothed and averaged over the seeds, and the belief of the first seed."""
+    def write_pictures(self, path: Path) -> None:
+        """Cost over time, smoothed and averaged over the seeds, and the belief of the first seed; a PNG file, and PDF
+        and SVG beside it.
+        """
         from matplotlib.figure import Figure  # noqa: PLC0415  (slow to import, needed only here)
 
         names = [name for name in dict.fromkeys(name for name, _ in self.runs) if any(CHANGES[name])]
@@ -151,7 +154,11 @@ class AdaptResult:
                 runs = self.runs[name, adapted]
                 label = "adapting" if adapted else "not adapting"
                 top.plot(runs[0].t_s, self._smooth(name, adapted), color=colour, label=label)
-            top.set(xlabel="time (s)", ylabel="tracking cost, mean of 5 s", title=f"{name} {self.options.change:+.0%}")
+            top.set(
+                xlabel="time (s)",
+                ylabel="tracking cost, mean of 5 s (m, with m/s)",
+                title=f"{name} {self.options.change:+.0%}",
+            )
             top.axvline(self.options.change_s, color="0.5", linestyle=":")
             top.legend()
             index = 1 if CHANGES[name][1] else 2
@@ -167,7 +174,7 @@ class AdaptResult:
             bottom.plot(at_s, truth, color="k", linestyle="--", label="truth")
             bottom.set(xlabel="time (s)", ylabel=f"{name} (m)")
             bottom.legend()
-        write_png(figure, path)
+        write_pictures(figure, path)
 
     def _mean(self, name: str, *, adapted: bool, after: bool) -> float:
         options = self.options
@@ -219,7 +226,7 @@ def run_adapt(setup: Setup, options: AdaptOptions | None = None, progress: Progr
         for adapted in (False, True):
             runs[name, adapted] = [
                 drive(setup, _effect(name, options), options, adapted=adapted, seed=seed)
-                for seed in range(1, options.seeds + 1)
+                for seed in range(options.seed_offset + 1, options.seed_offset + options.seeds + 1)
             ]
             if progress is not None:
                 cost = np.mean(

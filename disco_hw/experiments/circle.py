@@ -22,7 +22,7 @@ from disco_hw.control.settings import ROTATION, CommandLimits, DiscoSettings
 from disco_hw.errors import InputError
 from disco_hw.model import Model, Uniform
 from disco_hw.model.model import BASE_PARAMETERS
-from disco_hw.reports import write_png
+from disco_hw.reports import TWO_THIRDS, write_pictures
 from disco_hw.tasks.circle import CircleCost, CircleTask
 
 SUBSTEP_S = 0.02
@@ -77,8 +77,9 @@ MEMORY_S = 2.0
 class CircleOptions:
     """What the paper leaves open.
 
-    Seeds 0 to `seeds` - 1 draw plant and noise. `rate_hz` of replanning; `largest_rot_s` and `largest_rot_s2` bound a
-    wheel's command; `lag_s` and `wheel_noise` are the plant's; it starts on the circle, along it, at rest.
+    `seeds` seeds from `seed_offset` on draw plant and noise. `rate_hz` of replanning; `largest_rot_s` and
+    `largest_rot_s2` bound a wheel's command; `lag_s` and `wheel_noise` are the plant's; it starts on the circle, along
+    it, at rest.
     """
 
     seeds: int = 8
@@ -88,6 +89,7 @@ class CircleOptions:
     largest_rot_s2: float = math.inf
     lag_s: float = 0.1
     wheel_noise: float = 0.05
+    seed_offset: int = 0
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -157,8 +159,10 @@ class CircleResult:
             for step, values in enumerate(zip(*means.values(), strict=True)):
                 writer.writerow([f"{(step + 1) / self.options.rate_hz:.3f}", *(f"{value:.6g}" for value in values)])
 
-    def write_png(self, path: Path) -> None:
-        """Running mean of the instant cost over time, and the paths of the first seed."""
+    def write_pictures(self, path: Path) -> None:
+        """Running mean of the instant cost over time, where two thirds of the seeds lie, and the paths of the first;
+        a PNG file, and PDF and SVG beside it.
+        """
         from matplotlib.figure import Figure  # noqa: PLC0415  (slow to import, needed only here)
 
         figure = Figure(figsize=(11.0, 5.0), layout="constrained")
@@ -166,14 +170,17 @@ class CircleResult:
         picture = CircleTask().course().outline_m()
         right.plot(picture[:, 0], picture[:, 1], color="0.6", linestyle="--", label="circle")
         for name, runs in self.runs.items():
-            mean = _running_mean(self.costs(name)).mean(axis=0)
-            left.plot((np.arange(mean.size) + 1) / self.options.rate_hz, mean, label=name)
+            costs = _running_mean(self.costs(name))
+            time_s = (np.arange(costs.shape[1]) + 1) / self.options.rate_hz
+            (line,) = left.plot(time_s, costs.mean(axis=0), label=name)
+            low, high = np.quantile(costs, TWO_THIRDS, axis=0)
+            left.fill_between(time_s, low, high, color=line.get_color(), alpha=0.15, linewidth=0)
             right.plot(runs[0].poses[:, 0], runs[0].poses[:, 1], label=name, linewidth=1.0)
-        left.set(xlabel="time (s)", ylabel="mean instant cost so far", title=f"Circle, mode {self.mode}")
+        left.set(xlabel="time (s)", ylabel="mean instant cost so far (m, with m/s)", title=f"Circle, mode {self.mode}")
         right.set(xlabel="x (m)", ylabel="y (m)", title="Paths of the first seed", aspect="equal")
         left.legend()
         right.legend()
-        write_png(figure, path)
+        write_pictures(figure, path)
 
 
 def run_circle(
@@ -195,7 +202,7 @@ def run_circle(
     for name in CURVES:
         runs[name] = [
             drive(planner_command(_knowing(name, model, theta), task, settings, options, seed), theta, options, seed)
-            for seed, theta in enumerate(plants(model, options.seeds))
+            for seed, theta in enumerate(plants(model, options.seeds, options.seed_offset), start=options.seed_offset)
         ]
         result = CircleResult(options, circle, mode, {name: runs[name]})
         if progress is not None:
@@ -203,10 +210,10 @@ def run_circle(
     return CircleResult(options, circle, mode, runs)
 
 
-def plants(model: Model, count: int) -> list[dict[str, float]]:
-    """Parameters of `count` plants drawn from the model's belief, within physical ranges."""
+def plants(model: Model, count: int, first: int = 0) -> list[dict[str, float]]:
+    """Parameters of the plants `first` to `first + count` - 1 drawn from the model's belief, within physical ranges."""
     assert model.belief is not None
-    draws = model.belief.draw(count, np.random.default_rng(0))
+    draws = model.belief.draw(first + count, np.random.default_rng(0))[first:]
     full = model.complete(draws, model.belief.names)
     return [dict(zip(model.parameter_names, row, strict=True)) for row in full.tolist()]
 

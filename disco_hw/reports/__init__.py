@@ -121,6 +121,17 @@ def png(figure: Figure) -> bytes:
     return buffer.getvalue()
 
 
+TWO_THIRDS = (1.0 / 6.0, 5.0 / 6.0)
+"""Quantiles between which two thirds of the seeds lie."""
+
+
+def write_pictures(figure: Figure, path: Path) -> None:
+    """Write a figure to a PNG file, and to a PDF and an SVG file beside it. Raises OSError."""
+    write_png(figure, path)
+    figure.savefig(path.with_suffix(".pdf"), metadata={"CreationDate": None})
+    figure.savefig(path.with_suffix(".svg"), metadata={"Date": None})
+
+
 def write_png(figure: Figure, path: Path) -> None:
     """Write a figure to a PNG file. Raises OSError."""
     path.write_bytes(png(figure))

@@ -9,6 +9,7 @@ import pytest
 
 from disco_hw.adaptation.geometry_filter import GeometryFilter
 from disco_hw.control.baselines.laws import Kanayama
+from tools.bench_adapt import step_known_s
 from tools.foreign_plant import NOMINAL, ForeignPlant, ForeignRobot, robots
 from tools.tracking import classical, tracks
 from tools.tracking import drive as track
@@ -77,6 +78,14 @@ def test_four_fifths_of_a_change_are_known_after_two_and_a_half_seconds(settled,
     assert np.median(known_part) < 1.25
     # The wheels' size shows at once, and in nothing else.
     assert index > 0 or min(known_part) > 0.8
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("index", "field"), [(0, "radius_m"), (1, "axle_m")])
+def test_the_filter_knows_a_step_before_the_recursive_estimate_does(index, field):
+    taken_s = np.array([step_known_s(index, field, 0.85, seed) for seed in (61, 62, 63)])
+    filter_s, recursive_s = np.median(taken_s, axis=0)
+    assert filter_s < 0.8 * recursive_s
 
 
 def test_a_robot_whose_belief_is_narrow_and_wrong_is_learnt(settled):

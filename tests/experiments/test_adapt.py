@@ -77,7 +77,8 @@ def test_the_figures_are_what_they_say(tmp_path):
     assert row["half_back_s"] == pytest.approx(7.0 + 5.0 * 2.0 / 3.0, abs=0.05)
     assert np.isnan(nothing["won_back"])
     result.write_csv(tmp_path / "adapt.csv")
-    result.write_png(tmp_path / "adapt.png")
+    result.write_pictures(tmp_path / "adapt.png")
+    assert (tmp_path / "adapt.svg").exists()
     assert (tmp_path / "adapt.csv").read_text().startswith('t_s,"wheel radius, not adapting, seed 1"')
     assert "75%" in result.table()
 

@@ -51,6 +51,7 @@ def test_plants_are_drawn_from_the_posterior():
     np.testing.assert_allclose(drawn.mean(axis=0), MODEL.belief.mean(), atol=1e-3)
     np.testing.assert_allclose(np.cov(drawn.T), MODEL.belief.covariance(), atol=1.5e-5)
     assert plants(MODEL, 3) == plants(MODEL, 5)[:3]
+    assert plants(MODEL, 2, first=3) == plants(MODEL, 5)[3:]
 
 
 def test_a_robot_that_is_told_nothing_stands_at_the_cost_of_standing():
@@ -97,8 +98,10 @@ def test_table_csv_and_picture(short, tmp_path):
     # The running mean of the instant cost ends at the mean cost.
     for row in result.rows():
         assert float(rows[-1][row["controller"]]) == pytest.approx(row["mean_cost"], rel=1e-5)
-    result.write_png(tmp_path / "circle.png")
+    result.write_pictures(tmp_path / "circle.png")
     assert (tmp_path / "circle.png").read_bytes()[:4] == b"\x89PNG"
+    assert (tmp_path / "circle.pdf").read_bytes()[:4] == b"%PDF"
+    assert "<svg" in (tmp_path / "circle.svg").read_text()
 
 
 def test_a_model_without_the_posterior_is_refused():

@@ -62,9 +62,24 @@ def test_seeds_repeat(swings):
         assert not np.array_equal(result.costs[name][0], result.costs[name][1])
 
 
+def test_an_offset_goes_on_where_other_seeds_ended(swings):
+    result, _ = swings
+    last = run_pendulum(PendulumOptions(seeds=1, steps=15, seed_offset=2))
+    np.testing.assert_array_equal(last.costs["MC, posterior"], result.costs["MC, posterior"][2:, :15])
+
+
+def test_the_band_of_costs_is_never_below_zero(swings, tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr("disco_hw.experiments.pendulum.write_pictures", lambda figure, path: drawn.append(figure))
+    swings[0].write_pictures(tmp_path / "pendulum.png")
+    axes = drawn[0].axes[0]
+    assert "rad²/s²" in axes.get_ylabel()
+    assert all(band.get_paths()[0].vertices[:, 1].min() >= 0.0 for band in axes.collections)
+
+
 def test_table_csv_and_picture(swings, tmp_path):
     result, _ = swings
-    for said in (*CURVES, "3 seeds, 200 steps of 0.05 s"):
+    for said in (*CURVES, "3 seeds from 0 on, 200 steps of 0.05 s"):
         assert said in result.table()
     result.write_csv(tmp_path / "pendulum.csv")
     rows = list(csv.DictReader((tmp_path / "pendulum.csv").open()))
@@ -73,5 +88,7 @@ def test_table_csv_and_picture(swings, tmp_path):
     one = result.costs["UT, posterior"][:, 7]
     assert float(rows[7]["UT, posterior: mean"]) == pytest.approx(one.mean(), rel=1e-5)
     assert float(rows[7]["UT, posterior: std"]) == pytest.approx(one.std(), rel=1e-4)
-    result.write_png(tmp_path / "pendulum.png")
+    result.write_pictures(tmp_path / "pendulum.png")
     assert (tmp_path / "pendulum.png").read_bytes()[:4] == b"\x89PNG"
+    assert (tmp_path / "pendulum.pdf").read_bytes()[:4] == b"%PDF"
+    assert "<svg" in (tmp_path / "pendulum.svg").read_text()
