@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import os
 import signal
@@ -37,7 +38,7 @@ from disco_hw.viewer.server import serving
 from disco_hw.viewer.snapshot import Snapshot
 from drivers.types import WheelSample
 from tools.browser import chromium, opened
-from tools.viewer_run import PERIOD_NS, pose_at, tick_records, write_log
+from tools.viewer_run import PERIOD_NS, ROBOT_FILE, pose_at, tick_records, write_log
 
 _HAS_STAMP = "[...document.querySelectorAll('input')].some(input => /^[0-9]{6,}$/.test(input.value))"
 _WATCH_STAMP = """
@@ -53,6 +54,18 @@ const look = () => {
 };
 requestAnimationFrame(look);
 """
+_FIRST_PAINT = """async () => {
+  const painted = () => performance.getEntriesByName("first-contentful-paint")[0];
+  while (!painted()) await new Promise(later => setTimeout(later, 20));
+  return [painted().startTime, performance.timeOrigin];
+}"""
+_COUNT_FRAMES = """seconds => new Promise(done => {
+  let count = 0;
+  const end = performance.now() + 1e3 * seconds;
+  const next = () => { if (performance.now() >= end) done(count); else { count++; requestAnimationFrame(next); } };
+  requestAnimationFrame(next);
+})"""
+PAINTED_PX, PAINTED_S = (390, 1400), 10.0
 LONG_S = 600.0
 SPAN_S = 10.0
 TURNS = 5
@@ -69,7 +82,58 @@ _CAMERA = {
 def run() -> dict[str, float]:
     with tempfile.TemporaryDirectory(prefix="disco-hw-bench-") as scratch:
         directory = Path(scratch)
-        return {**_feed(directory), **_replay(directory), **_live(directory)}
+        return {**_feed(directory), **_replay(directory), **_live(directory), **painted(directory)}
+
+
+def painted(directory: Path) -> dict[str, float]:
+    """A browser that opens the live page at 50 Hz, drawing in software: until it shows something, and how often then.
+
+    From the call to the first contents of the desk, and of the scene; frames that the scene's window has drawn in a
+    second, over some seconds.
+    """
+    socket = directory / "painted.sock"
+    feed, desk, ending = ViewerFeed(feed_path(socket)), Desk(socket, ROBOT_FILE), threading.Event()
+
+    def keep_feeding() -> None:
+        begin_s = time.monotonic()
+        for tick in itertools.count():
+            if ending.wait(max(0.0, begin_s + tick * PERIOD_NS * 1e-9 - time.monotonic())):
+                return
+            feed.put(*tick_records(tick))
+
+    figures: dict[str, float] = {}
+    with serving("bench", port=0, desk=desk) as page:
+        live = LivePage(page.server, stage_of_robot(ROBOT_FILE), socket, desk)
+        threads = [threading.Thread(target=keep_feeding), threading.Thread(target=run_live, args=(live, ending.is_set))]
+        for thread in threads:
+            thread.start()
+        try:
+            with chromium() as browser:
+                for width in PAINTED_PX:
+                    with opened(browser, page.url, width, 900) as tab:
+                        figures |= {f"viewer.{name}_{width}px": value for name, value in _painted(tab).items()}
+        except pytest.skip.Exception as reason:
+            print(f"the browser's figures are left out: {reason}", file=sys.stderr)
+        finally:
+            ending.set()
+            for thread in threads:
+                thread.join()
+            feed.close()
+            desk.close()
+    return figures
+
+
+def _painted(tab: Any) -> dict[str, float]:
+    tab.frame_locator("#scene").locator("canvas").first.wait_for()
+    scene = next(frame for frame in tab.frames if "index.html" in frame.url)
+    desk_ms, desk_begin_ms = tab.evaluate(_FIRST_PAINT)
+    scene_ms, scene_begin_ms = scene.evaluate(_FIRST_PAINT)
+    tab.wait_for_timeout(5_000)
+    return {
+        "desk_painted_ms": desk_ms,
+        "scene_painted_ms": scene_begin_ms + scene_ms - desk_begin_ms,
+        "scene_frames_per_s": scene.evaluate(_COUNT_FRAMES, PAINTED_S) / PAINTED_S,
+    }
 
 
 def _feed(directory: Path) -> dict[str, float]:
@@ -302,5 +366,7 @@ def _cpu_s(pid: int) -> float:
 
 
 if __name__ == "__main__":
-    for key, value in run().items():
-        print(f"{key:<40} {value:10.3f}")
+    # `python -m tools.bench_viewer painted`: what a browser shows, alone.
+    with tempfile.TemporaryDirectory(prefix="disco-hw-bench-") as alone:
+        for key, value in (painted(Path(alone)) if sys.argv[1:] == ["painted"] else run()).items():
+            print(f"{key:<40} {value:10.3f}")

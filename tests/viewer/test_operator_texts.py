@@ -6,6 +6,7 @@ import pytest
 
 from disco_hw.viewer.operator_controls import Desk
 from disco_hw.viewer.server import serving
+from tests.viewer.camera import as_golden, off_golden, screenshot
 from tests.viewer.test_operator_controls import STATUS, Daemon
 from tools.browser import chromium, keep, opened, unnamed
 from tools.viewer_run import ROBOT_FILE
@@ -134,6 +135,21 @@ def test_a_dark_room_darkens_the_desk(browser, daemon):
         assert max(tab.evaluate(lightness)) < 60
         assert cut_off(tab, "dark") == []
     desk.close()
+
+
+@pytest.mark.parametrize("name", ["ready", "running", "estop", "by hand"])
+def test_the_desk_looks_as_it_did(browser, daemon, name):
+    daemon.status = {**WHOLE, **STATES[name]}
+    with desk_at(daemon.server.path) as url, opened(browser, url, scene=False) as tab:
+        tab.locator("#detail", has_text=daemon.status["detail"][:60]).wait_for()
+        # A frame that was not loaded shows now a sign for that, and now none; nor does a caret or a mouse belong here.
+        tab.add_style_tag(content="#scene { visibility: hidden; }")
+        for width in (390, 800, 1400):
+            tab.set_viewport_size({"width": width, "height": 480})
+            picture, kept = screenshot(tab), f"desk-{name.replace(' ', '-')}-{width}"
+            assert as_golden(picture, kept), (kept, off_golden(picture, kept))
+        tab.add_style_tag(content="#estop { background: #005500 !important; }")
+        assert not as_golden(screenshot(tab), kept)
 
 
 def test_what_is_dragged_in_the_scene_stands_in_the_form_and_escape_closes_it(browser, daemon):

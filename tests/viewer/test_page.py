@@ -12,6 +12,7 @@ from disco_hw.viewer import scene
 from disco_hw.viewer.commands import export_log
 from disco_hw.viewer.replay import ReplayPage, run_replay
 from disco_hw.viewer.server import serving
+from tests.viewer.camera import as_golden, off_golden
 from tools.browser import chromium, keep, opened, unnamed
 from tools.viewer_run import FAULT_TICK, RADIUS_M, pose_at
 
@@ -94,6 +95,7 @@ def test_circle_and_robot_are_drawn_at_their_places_and_replay_is_sought(browser
             # Behind the middle, clear of the ellipse that is drawn above the body.
             body = picture[pixel(x_m - 0.1 * math.cos(yaw_rad), y_m - 0.1 * math.sin(yaw_rad), 0.12)]
             assert like(body, scene.BODY_COLOUR), body
+        assert as_golden(picture, "scene"), off_golden(picture, "scene")
         for degrees in (100, 190, 280):
             x_m, y_m = (RADIUS_M * part(math.radians(degrees)) for part in (math.cos, math.sin))
             line = hue_near(picture, *pixel(x_m, y_m))
