@@ -29,6 +29,7 @@ from drivers.motor.odrive_protocol import (
     stop_confirmation,
     stop_frames,
 )
+from drivers.motor.odrive_questions import Questions
 from drivers.motor.vendor_parts_permit import Controllers, MotionPermit, Stage
 from drivers.types import (
     DriverState,
@@ -52,13 +53,8 @@ BEATS_TO_ARM = 2
 SILENT_BEATS = 3
 # Less, and a pause of the host of a few beats would be taken for the silence of an axis.
 SILENT_AT_LEAST_NS = 100_000_000
-VERSION_TRIES = 3
-WATCHDOG_TRIES = 5
-_VERSION_PERIOD_NS = 100_000_000
 _REPEAT_NS = 100_000_000
-_SAME_TIMEOUT_S = 0.002
 _STANDS_RAD_S = 0.1
-_ALIVE_PERIOD_NS = 30_000_000
 _CLOSED_LOOP_STEP = 3
 _ESTOP = 0x02
 _HOST_COMMANDS = frozenset({0x06, 0x07, 0x0B, 0x0C, 0x0D, 0x0E, 0x0F, 0x16, 0x18, 0x19, 0x1A, 0x1B})
@@ -75,8 +71,6 @@ class _Axis:
     error: int = 0
     beats_armed: int = 0
     turned: parts.Odometer = field(default_factory=parts.Odometer)
-    watchdog_on: bool | None = None
-    watchdog_s: float | None = None
 
 
 class OdriveDriver:
@@ -91,12 +85,7 @@ class OdriveDriver:
         self._by_node = {axis.node: axis for side in self._axes for axis in side}
         self.stats = DriverStats()
         self._permit = MotionPermit()
-        self._known = False
-        self._refusal: str | None = None
-        self._introduced, self._version = False, ""
-        self._asked_watchdog = 0
-        self._asked_version = 0
-        self._asked_ns = 0
+        self._questions = Questions(settings)
         self._arm_step = self._repeat_ns = 0
 
     @property
@@ -116,8 +105,8 @@ class OdriveDriver:
         stopped = any(axis.error & ESTOP_ERROR[self._generation] for axis in self._all)
         faulty = [axis for axis in self._all if axis.error and not self._is_idle_watchdog(axis)]
         return Controllers(
-            missing=None if self._known else unheard if silent else "asking the nodes for their version",
-            refused=self._refusal,
+            missing=None if self._questions.known else unheard if silent else "asking the nodes for their version",
+            refused=self._questions.refusal,
             stopped="emergency stop; the wheels coast. Remove its cause, then reset" if stopped else None,
             faulty="; ".join(f"node {axis.node}: {self._words(axis)}" for axis in faulty) or None,
             energised=self._any_closed_loop,
@@ -126,10 +115,10 @@ class OdriveDriver:
     @property
     def identity(self) -> Identity | None:
         """What answers as an ODrive; 0.5 does not tell its version."""
-        if not self._known or self._refusal is not None:
+        if not self._questions.known or self._questions.refusal is not None:
             return None
-        if self._version:
-            return Identity("ODrive", self._version, "device")
+        if self._questions.version:
+            return Identity("ODrive", self._questions.version, "device")
         return Identity("ODrive", self._settings.firmware, "robot.toml")
 
     @property
@@ -166,7 +155,8 @@ class OdriveDriver:
         wheels: list[WheelSample] = []
         status: list[RobotStatus] = []
         for received in frames if self._permit.link_is_up else ():
-            if self._take_parameter(received.frame):
+            if self._questions.take_parameter(received.frame):
+                self._announce()
                 self._count("frames_accepted")
                 continue
             decoded = protocol.decode(self._generation, received.frame)
@@ -182,7 +172,8 @@ class OdriveDriver:
                     self._take_heartbeat(axis, decoded.values, received.t_ns)
                     status.append(parts.status(received.t_ns, self.state, self._all_in_estop))
                 case "Get_Version":
-                    self._take_version(decoded.values)
+                    self._questions.take_version(decoded.values)
+                    self._announce()
                 case "Get_Encoder_Estimates":
                     self._take_estimate(axis, decoded.values, received.t_ns)
                     if all(each.turned.is_new for each in self._all):
@@ -237,65 +228,11 @@ class OdriveDriver:
             return parts.outgoing(now_ns, *self._state_frames(AxisState.IDLE))
         if self._any_closed_loop:
             return ()
-        if self._permit.wanted is Request.RESET and (self._known or self._refusal is not None):
+        if self._permit.wanted is Request.RESET and (self._questions.known or self._questions.refusal is not None):
             return self._reset(now_ns)
-        if not self._known and self._refusal is None:
-            return self._ask_version(now_ns) if not self._introduced else self._ask_watchdog(now_ns)
-        if now_ns - self._asked_ns < _ALIVE_PERIOD_NS:
-            return ()
-        self._asked_ns = now_ns
-        asked = protocol.TELEMETRY[self._generation]["Get_Bus_Voltage_Current"].command
-        return parts.outgoing(now_ns, *(protocol.ask(axis.node, asked) for axis in self._all))
-
-    def _ask_version(self, now_ns: int) -> tuple[OutgoingFrame, ...]:
-        if any(axis.heard_ns is None for axis in self._all) or now_ns - self._asked_ns < _VERSION_PERIOD_NS:
-            return ()
-        self._asked_ns = now_ns
-        self._asked_version += 1
-        if self._asked_version <= VERSION_TRIES:
-            return parts.outgoing(now_ns, *(protocol.ask(axis.node, protocol.GET_VERSION) for axis in self._all))
-        if self._generation is Generation.V05:
-            # That generation does not know the question.
-            self._introduce()
-        else:
-            self._refusal = 'the nodes do not answer for their version as 0.6 does; write link.firmware = "0.5"'
-        return ()
-
-    def _ask_watchdog(self, now_ns: int) -> tuple[OutgoingFrame, ...]:
-        """Ask until every axis has said whether its watchdog is on and how long it waits; what it says is compared."""
-        if now_ns - self._asked_ns < _VERSION_PERIOD_NS:
-            return ()
-        self._asked_ns = now_ns
-        self._asked_watchdog += 1
-        endpoints = self._settings.watchdog_endpoints or ()
-        waiting = [axis.node for axis in self._all if axis.watchdog_on is None or axis.watchdog_s is None]
-        if self._asked_watchdog > WATCHDOG_TRIES:
-            self._refusal = f"node {waiting[0]} does not tell its watchdog; correct link.watchdog_endpoints"
-            return ()
-        return parts.outgoing(
-            now_ns, *(protocol.read_parameter(node, number) for node in waiting for number in endpoints)
-        )
-
-    def _take_parameter(self, frame: Frame) -> bool:
-        """Whether the frame answers for a watchdog, which is then judged."""
-        axis = self._by_node.get(protocol.split(frame.can_id)[0])
-        if axis is None or self._settings.watchdog_endpoints is None or not self._introduced:
-            return False
-        enabled, timeout = self._settings.watchdog_endpoints
-        is_on = protocol.parameter(frame, axis.node, enabled, "bool")
-        timeout_s = protocol.parameter(frame, axis.node, timeout, "f32")
-        if is_on is None and timeout_s is None:
-            return False
-        axis.watchdog_on = axis.watchdog_on if is_on is None else bool(is_on)
-        axis.watchdog_s = axis.watchdog_s if timeout_s is None else float(timeout_s)
-        wanted_s = self._settings.watchdog_s
-        if axis.watchdog_on is False:
-            self._refusal = f"node {axis.node}: its watchdog is off; set axis0.config.enable_watchdog (odrivetool)"
-        elif axis.watchdog_s is not None and not abs(axis.watchdog_s - wanted_s) <= _SAME_TIMEOUT_S:
-            self._refusal = f"node {axis.node}: its watchdog waits {axis.watchdog_s:g} s; set {wanted_s:g} s there"
-        elif not self._known and all(each.watchdog_on and each.watchdog_s is not None for each in self._all):
-            self._announce(f", watchdog {wanted_s:g} s")
-        return True
+        due = self._questions.due(now_ns, all(axis.heard_ns is not None for axis in self._all))
+        self._announce()
+        return parts.outgoing(now_ns, *due)
 
     def _reset(self, now_ns: int) -> tuple[OutgoingFrame, ...]:
         if not any(axis.error for axis in self._all) and self._repeat_ns and now_ns - self._repeat_ns >= _REPEAT_NS:
@@ -380,10 +317,12 @@ class OdriveDriver:
         if axis.state not in _QUIET:
             why = f"node {axis.node} calibrates or moves by itself (state {axis.state})"
             self._meet_anew(self._permit.restarted(why), t_ns)
-            self._refusal = f"node {axis.node} is in state {axis.state}: wait until odrivetool has done with it"
+            self._questions.refusal = (
+                f"node {axis.node} is in state {axis.state}: wait until odrivetool has done with it"
+            )
             return
-        if self._refusal is not None and self._refusal.startswith(f"node {axis.node} is in state"):
-            self._refusal = None
+        if self._questions.refusal is not None and self._questions.refusal.startswith(f"node {axis.node} is in state"):
+            self._questions.refusal = None
         energised = axis.state == AxisState.CLOSED_LOOP and axis.error == 0
         axis.beats_armed = axis.beats_armed + 1 if energised and self._arm_step > _CLOSED_LOOP_STEP else 0
         stage = self._permit.stage
@@ -400,24 +339,10 @@ class OdriveDriver:
         decoded = protocol.decode(Generation.V06, frame)
         return decoded if decoded is not None and decoded.name == "Get_Version" else None
 
-    def _take_version(self, values: Mapping[str, float]) -> None:
-        if self._generation is Generation.V05:
-            self._refusal = 'the nodes answer for their version, which 0.5 does not; write link.firmware = "0.6"'
-        elif not self._introduced:
-            version = ".".join(str(values[f"fw_{part}"]) for part in ("major", "minor", "revision"))
-            self._introduce(version)
-
-    def _introduce(self, version: str = "") -> None:
-        self._introduced, self._version = True, version
-        if self._settings.watchdog_endpoints is None:
-            self._announce()
-
-    def _announce(self, watchdog: str = "") -> None:
-        self._known = True
-        nodes = ", ".join(str(axis.node) for axis in self._all)
-        version = self._version and f", firmware {self._version}"
-        said = f"nodes {nodes} are there: ODrive {self._settings.firmware}{version}{watchdog}"
-        self._permit = replace(self._permit, note="it stands by").saying(said)
+    def _announce(self) -> None:
+        said, self._questions.said = self._questions.said, None
+        if said is not None:
+            self._permit = replace(self._permit, note="it stands by").saying(said)
 
     def _take_estimate(self, axis: _Axis, values: Mapping[str, float], t_ns: int) -> None:
         position, speed = float(values["pos_turns"]), float(values["vel_turns_s"])
@@ -471,11 +396,10 @@ class OdriveDriver:
 
     def _meet_anew(self, permit: MotionPermit, now_ns: int) -> None:
         self._idle(permit)
-        self._known, self._refusal = False, None
-        self._introduced, self._version, self._asked_watchdog = False, "", 0
-        self._asked_version, self._asked_ns, self._arm_step = 0, now_ns - _VERSION_PERIOD_NS, 0
+        self._questions.begin_anew(now_ns)
+        self._arm_step = 0
         for axis in self._all:
-            axis.heard_ns = axis.watchdog_on = axis.watchdog_s = None
+            axis.heard_ns = None
             axis.state, axis.error, axis.beats_armed = AxisState.UNDEFINED, 0, 0
             axis.turned.begin_anew()
 
