@@ -146,6 +146,15 @@ def test_a_jump_is_more_than_three_times_the_fastest_wheel_and_sixteen_ticks(ela
             assert (bench.out.fault == FAULTS["ENCODER_JUMP_LEFT"]) == jump, ticks
 
 
+@pytest.mark.parametrize("ticks", [46, 47, -46, -47])
+def test_as_many_ticks_as_may_be_are_no_jump_and_one_more_is(ticks):
+    """A turn a second at most, of 1000 ticks: thirty in ten milliseconds, and sixteen."""
+    bench = Bench(dataclasses.replace(CONFIG, max_wheel_speed_rad_s=2.0 * math.pi, ticks_per_rev=1000))
+    bench.inputs["left_ticks"] = ticks
+    bench.step(elapsed_us=10 * MS)
+    assert (bench.out.fault == FAULTS["ENCODER_JUMP_LEFT"]) == (abs(ticks) > 46)
+
+
 @pytest.mark.parametrize("ticks", [16, 17])
 def test_sixteen_ticks_in_a_microsecond_are_no_jump(ticks):
     bench = Bench()
