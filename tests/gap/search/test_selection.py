@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from disco_hw.gap.data.layout import BODY
+from disco_hw.effects.registry import REGISTRY
+from disco_hw.gap.data.layout import BODY, WHEEL
 from disco_hw.gap.noise.channels import WheelChannel
 from disco_hw.gap.noise.wheel_noise import WheelNoise
 from disco_hw.gap.search.channel_search import body_moves, wheel_moves
 from disco_hw.gap.search.evidence import EffectEvidence
 from disco_hw.gap.search.least_squares import Fit
-from disco_hw.gap.search.richest_model import candidates_of
+from disco_hw.gap.search.richest_model import LATE, candidates_of
 from disco_hw.gap.search.selection import Selector, Thresholds
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S
 from tests.gap.synthetic import GEOMETRY, body_channel, line_of
@@ -63,6 +64,26 @@ def test_a_short_lag_with_a_delay_beside_it_is_not_taken_for_the_delay():
     both = ("motor_lag", "command_delay")
     assert not any(found.acceptable((name,), both) for name in both)
     assert found._backward(both) == ("motor_lag",)
+
+
+@pytest.mark.parametrize("hidden", ["turning_load", "deadband"])
+def test_what_only_turning_loses_is_told_from_what_every_wheel_loses(hidden):
+    rng = np.random.default_rng(12)
+    commands = np.repeat(rng.choice([-4.0, -2.0, -0.5, 0.0, 1.0, 3.0, 5.0], (40, 2)), 50, axis=0)
+    mean, half = commands.mean(axis=1), 0.5 * (commands[:, 1] - commands[:, 0])
+
+    def less(speed):
+        return np.sign(speed) * np.maximum(np.abs(speed) - 0.35, 0.0)
+
+    turned = np.column_stack([mean - less(half), mean + less(half)])
+    followed = turned if hidden == "turning_load" else less(commands)
+    line = replace(line_of(followed + 0.05 * rng.standard_normal(commands.shape)), command_rad_s=commands)
+    channel = WheelChannel.build(line, WheelNoise(), np.array(GEOMETRY))
+    found = Selector(channel, wheel_moves(channel, np.array(GEOMETRY)), Thresholds())
+    # Starts and stops within a cell of the grid look like a short delay.
+    assert [name for name in found.select() if name not in LATE] == [hidden]
+    (column,) = REGISTRY[hidden].columns
+    assert found.fit((hidden,)).vector[WHEEL.place[column]] == pytest.approx(0.35, abs=0.02)
 
 
 def test_given_effects_stay_and_are_not_selected_again():
