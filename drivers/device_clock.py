@@ -64,7 +64,9 @@ class DeviceClock:
         restarted = False
         if self._filter is not None:
             error_ns = self._deviation(middle_ns, device_us) - self._filter.at(middle_ns)
-            restarted = abs(error_ns) > RESTART_NS + (received_ns - sent_ns)
+            # What the estimate rests on may have waited on one of its two ways alone.
+            doubt_ns = min(exchange.round_trip_ns for exchange in self._window)
+            restarted = abs(error_ns) > RESTART_NS + doubt_ns + (received_ns - sent_ns)
         if self._filter is None or restarted:
             self._start(middle_ns, device_us)
         shown_ns = self._shown(received_ns) if self.synced(received_ns) else None
