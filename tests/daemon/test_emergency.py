@@ -19,11 +19,14 @@ from disco_hw.daemon.client import SERVED
 from disco_hw.daemon.control_socket import ControlServer
 from disco_hw.daemon.emergency import stop_robot
 from disco_hw.errors import InputError
+from drivers.motor import find_driver
 from drivers.types import Frame, LinkState, ReceivedFrame
 from firmware_protocol.codec import Codec
 from firmware_protocol.serial_framing import FrameDecoder, encode_frame
 
 SHIPPED = (Path(disco_hw.__file__).parent / "robots" / "wombot.toml").read_text(encoding="utf-8")
+
+UART_NODE = 51
 
 
 STATE = {
@@ -213,6 +216,30 @@ def test_over_a_serial_port_that_the_option_names_the_stop_goes_out(tmp_path):
         os.close(theirs)
     assert (outcome.link_error, outcome.sent, outcome.confirmed) == (None, True, False)
     assert {Codec().decode(can_id, data).name for can_id, data in frames} == {"ESTOP"}
+
+
+@pytest.mark.parametrize("name", ["roboclaw", "vesc"])
+def test_a_line_of_one_request_at_a_time_is_left_to_a_daemon_that_lives_and_taken_beside_a_dead_one(
+    tmp_path, daemon, name
+):
+    """Two that speak on such a line at once spoil each other's packets."""
+    ours, theirs = pty.openpty()
+    tty.setraw(theirs)
+    driver = find_driver(name)
+    own = driver.example + (f"uart_node = {UART_NODE}\n" if driver.serial_field else "")
+    link = f'interface = "virtual"\ndriver = "{name}"\n{own}'
+    serial = {'kind = "can"': 'kind = "serial"', "/tmp/disco-hw-wombot.tty": os.ttyname(theirs)}
+    try:
+        outcome = stop_robot(robot_file(tmp_path, daemon.socket, link=link, **serial))
+        assert (daemon.asked[0], outcome.sent) == ("estop", True)
+        assert "left to the daemon" in outcome.link_error
+        assert not select.select([ours], [], [], 0.0)[0], "nobody else speaks on the line"
+        outcome = stop_robot(robot_file(tmp_path, tmp_path / "none", link=link, **serial))
+        assert (outcome.link_error, outcome.sent) == (None, True)
+        assert os.read(ours, 4096)
+    finally:
+        os.close(ours)
+        os.close(theirs)
 
 
 @pytest.mark.parametrize("option", ["radio", "can:", "can:socketcan", "can::can0", "can:socketcan:", "serial:"])
