@@ -20,7 +20,7 @@ from tests.drivers.waiting import free_port
 from tests.hil.stack import DECELERATION_RAD_S2, STILL_RAD_S
 from tests.hil.test_drive import Bench
 from tests.viewer.camera import project, screenshot, shows
-from tests.viewer.test_page import wait_for
+from tests.viewer.test_page import scene_canvas, wait_for
 from tools.browser import chromium, keep, opened
 
 pytestmark = [pytest.mark.hil, pytest.mark.long, pytest.mark.browser]
@@ -150,15 +150,6 @@ def close_notices(tab):
     """The browser says that it draws without a graphics card, over the picture."""
     buttons = "document.querySelectorAll('.mantine-Notification-closeButton')"
     tab.frames[1].evaluate(f"for (const button of {buttons}) button.click()")
-
-
-def scene_canvas(tab):
-    """Where on the page the scene is drawn: the largest canvas of its frame."""
-    frame = tab.locator("#scene").bounding_box()
-    inside = tab.frames[1].evaluate("""() => [...document.querySelectorAll("canvas")].map(canvas => {
-        const {x, y, width, height} = canvas.getBoundingClientRect(); return {x, y, width, height};
-    }).reduce((one, other) => one.width * one.height > other.width * other.height ? one : other)""")
-    return {**inside, "x": inside["x"] + frame["x"], "y": inside["y"] + frame["y"]}
 
 
 def set_the_task(tab, stack):

@@ -10,11 +10,15 @@ import pytest
 
 from disco_hw.viewer import scene
 from disco_hw.viewer.commands import export_log
+from disco_hw.viewer.live import LivePage, run_live
+from disco_hw.viewer.operator_controls import Desk
+from disco_hw.viewer.recording import stage_of_robot
 from disco_hw.viewer.replay import ReplayPage, run_replay
 from disco_hw.viewer.server import serving
-from tests.viewer.camera import as_golden, off_golden
+from tests.viewer.camera import as_golden, off_golden, project
+from tests.viewer.test_operator_controls import STATUS, Daemon
 from tools.browser import chromium, keep, opened, unnamed
-from tools.viewer_run import FAULT_TICK, RADIUS_M, pose_at
+from tools.viewer_run import FAULT_TICK, RADIUS_M, ROBOT_FILE, pose_at, tick_records
 
 pytestmark = [pytest.mark.long, pytest.mark.browser]
 
@@ -171,3 +175,73 @@ def test_an_exported_page_plays_from_the_file_alone(browser, log_file, tmp_path)
         keep(tab, "export")
         asked = [text for text in tab.said if text.startswith("request") and "http" in text]
         assert asked == []
+
+
+_CIRCLE = {"radius_m": 0.75, "speed_m_s": 0.2, "center_x_m": 0.0, "center_y_m": 0.0}
+WHOLE_STATUS = {
+    **STATUS, "stop_cause": "NONE", "link": "up", "link_error": "", "adaptation": None,
+    "task": {"asked": {"kind": "circle", **_CIRCLE}, "limits": {name: [-50.0, 50.0] for name in _CIRCLE},
+             "labels": {**{name: name for name in _CIRCLE}, "center_x_m": "Centre x (m)"}, "note": "",
+             "progress": ["laps", "0.0"], "distance_m": 0.0},
+    "recorder": {"fault": "", "last_error": "", "path": ""},
+    "loop": {"lateness_us": {"p99": 1.0, "max": 2.0}, "overruns": 0, "skipped": 0},
+    "transport": {"frames_received": 0, "frames_sent": 0, "malformed": 0}, "driver": {"lost_frames": 0},
+}  # fmt: skip
+
+
+def test_the_circle_is_dragged_with_the_mouse_and_set(browser, tmp_path):
+    daemon = Daemon(tmp_path / "run")
+    daemon.status = WHOLE_STATUS
+    desk, ending = Desk(daemon.server.path, ROBOT_FILE), threading.Event()
+    with serving("test", port=0, desk=desk) as page:
+        live = LivePage(page.server, stage_of_robot(ROBOT_FILE), daemon.server.path, desk)
+        live.take([(now_ns, record) for now_ns, got in map(tick_records, range(20)) for record in got])
+        thread = threading.Thread(target=run_live, args=(live, ending.is_set))
+        thread.start()
+        try:
+            with opened(browser, page.url, 760, 600) as tab:
+                tab.get_by_role("button", name="Task…").click()
+                tab.get_by_text("drag the balls").wait_for()
+                wait_for(tab, lambda: live.editor.balls["middle"].visible)
+                tab.evaluate("() => { document.getElementById('task').style.visibility = 'hidden'; }")
+                tab.wait_for_timeout(3000)
+                drag(tab, (0.0, 0.0), (0.3, -0.2))
+                wait_for(tab, lambda: desk.draft["center_x_m"] == pytest.approx(0.3, abs=0.08))
+                assert desk.draft["center_y_m"] == pytest.approx(-0.2, abs=0.08)
+                keep(tab, "task-dragged")
+                tab.evaluate("() => { document.getElementById('task').style.visibility = ''; }")
+                wait_for(tab, lambda: float(tab.get_by_label("Centre x (m)").input_value()) == desk.draft["center_x_m"])
+                tab.get_by_role("button", name="Set the task").click()
+                wait_for(tab, lambda: any(action == "task" for action, _ in daemon.asked))
+                asked = next(arguments for action, arguments in daemon.asked if action == "task")
+                assert asked["center_x_m"] == desk.draft["center_x_m"]
+        finally:
+            ending.set()
+            thread.join()
+            desk.close()
+            daemon.close()
+
+
+def drag(tab, start, end):
+    """With the mouse, from a place of the floor to another, seen from the page's first camera."""
+    canvas = scene_canvas(tab)
+    eye, look_at = scene.first_camera(stage_of_robot(ROBOT_FILE).task)
+    places = [project((*place, 0.0), eye, look_at, canvas["width"], canvas["height"]) for place in (start, end)]
+    (x, y), to = [(column + canvas["x"], row + canvas["y"]) for column, row in places]
+    tab.mouse.move(x, y)
+    tab.wait_for_timeout(500)
+    tab.mouse.down()
+    tab.mouse.move(x + 4, y, steps=2)
+    tab.wait_for_timeout(300)
+    tab.mouse.move(*to, steps=4)
+    tab.wait_for_timeout(500)
+    tab.mouse.up()
+
+
+def scene_canvas(tab):
+    """Where on the page the scene is drawn: the largest canvas of its frame."""
+    frame = tab.locator("#scene").bounding_box()
+    inside = tab.frames[1].evaluate("""() => [...document.querySelectorAll("canvas")].map(canvas => {
+        const {x, y, width, height} = canvas.getBoundingClientRect(); return {x, y, width, height};
+    }).reduce((one, other) => one.width * one.height > other.width * other.height ? one : other)""")
+    return {**inside, "x": inside["x"] + frame["x"], "y": inside["y"] + frame["y"]}
