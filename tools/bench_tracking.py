@@ -120,9 +120,10 @@ def run(count: int = 20) -> dict[str, float]:
 
 ON_THE_LINE_M, STAYS_S, SPARE_S, AROUND_M = 0.05, 3.0, 10.0, 1.0
 STARTS_RATE_HZ = 25.0
+STARTED_WAYS = ("circle", "eight", "square")
 
 
-def starts(count: int = 200, ways: tuple[str, ...] = ("circle", "eight", "square")) -> dict[str, float]:
+def starts(count: int = 200, ways: tuple[str, ...] = STARTED_WAYS) -> dict[str, float]:
     """Random poses within AROUND_M of a line, the true pose given to the planner, with and without a dead band.
 
     Seconds from the straight way to the line, at the task's speed, to the begin of STAYS_S within ON_THE_LINE_M of it,
@@ -178,8 +179,9 @@ def _arrival_s(planner: Disco, robot: ForeignRobot, track: Track, seed: int) -> 
 def main(arguments: list[str]) -> None:
     """Print figures as they are found."""
     if arguments[:1] == ["starts"]:
-        for key, value in starts(int(arguments[1])).items():
-            print(f"{key:60} {value:10.3g}")
+        for way in arguments[2].split(",") if len(arguments) > 2 else STARTED_WAYS:
+            for key, value in starts(int(arguments[1]), (way,)).items():
+                print(f"{key:60} {value:10.3g}", flush=True)
         return
     names = tuple(arguments[0].split(",")) if arguments else tuple(contenders())
     ways = tuple(arguments[1].split(",")) if len(arguments) > 1 else tuple(tracks(SPEED_M_S))
