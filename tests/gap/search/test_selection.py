@@ -153,6 +153,10 @@ def judged(gain=30.0, score=30.0, repeated=10.0, moved_m=0.01, misfit=0.0, count
 def test_an_effect_is_accepted_only_if_every_condition_holds():
     assert judged() is True
     assert judged(gain=10.1) is True
+    # At the thresholds: twice the gain may be as large as the score asked for, the score has to be larger.
+    assert judged(gain=10.0) is True
+    assert judged(score=20.0) is False
+    assert judged(repeated=0.1) is True
     assert judged(gain=9.9) is False
     assert judged(score=19.9) is False
     assert judged(repeated=0.0) is False
@@ -164,7 +168,10 @@ def test_what_fits_badly_is_helped_by_a_large_part_of_what_it_lacks_whatever_its
     # 500 of 1000 residuals' half squares are expected: with a misfit of 2, 1000 are lacking.
     assert judged(score=-5.0, gain=260.0, misfit=2.0) is True
     assert judged(score=-5.0, gain=240.0, misfit=2.0) is False
+    assert judged(score=-5.0, gain=250.0, misfit=2.0) is False
     assert judged(score=-5.0, gain=200.0, misfit=0.45) is False
+    assert judged(score=-5.0, gain=200.0, misfit=0.5) is False
+    assert judged(score=-5.0, gain=200.0, misfit=0.6) is True
     assert judged(score=-5.0, gain=260.0, misfit=2.0, repeated=-1.0) is False
     assert judged(score=-5.0, gain=260.0, misfit=2.0, moved_m=0.0) is False
 
