@@ -143,3 +143,16 @@ def test_without_blocks_enough_the_model_of_the_noise_is_believed():
     few = SimpleNamespace(settings=DEFAULT_SETTINGS, block=np.zeros(N, dtype=int), count=N, trusted_blocks=0.0)
     wander = np.repeat(np.random.default_rng(10).standard_normal(N // EACH), EACH)
     assert inflation(linear_fit(np.ones((N, 1)), wander + 1.0), few, (0,)) == 1.0
+
+
+def test_what_repeats_is_what_is_left_without_the_block_that_says_most_however_little_that_is():
+    x = np.random.default_rng(11).standard_normal((N, 1))
+    y = 0.01 * (0.5 * x[:, 0] + np.random.default_rng(12).standard_normal(N))
+    small, big = linear_fit(np.empty((N, 0)), y), linear_fit(x, y)
+    blocks = held_out_by_block(small, channel()) - held_out_by_block(big, channel())
+    assert 0.0 < blocks.max() < 0.1
+    proof = compare(small, big, channel(), 1.0)
+    assert proof.repeated == pytest.approx(blocks.sum() - blocks.max(), rel=1e-9)
+    # A log of a single residual pays for a parameter as one of two.
+    single = SimpleNamespace(**{**vars(channel()), "count": 1})
+    assert compare(small, big, single, 1.0).score == pytest.approx(2.0 * proof.gain / proof.inflation - np.log(2.0))
