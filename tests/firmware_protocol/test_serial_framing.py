@@ -45,6 +45,14 @@ def test_check_value_and_vector(encode_frame):
     assert encode_frame(*FRAMES[0]) == bytes.fromhex("030110050201020303924800")
 
 
+def test_a_frame_with_every_checksum_is_taken(decode, encode_frame):
+    """Bytes of 0 among them, which the stuffing leaves out."""
+    frames = [(0x100, number.to_bytes(2, "little")) for number in range(1 << 16)]
+    taken, stats = decode(*(encode_frame(*frame) for frame in frames))
+    assert taken == frames
+    assert stats.malformed == 0
+
+
 @pytest.mark.parametrize(("can_id", "data"), FRAMES)
 def test_every_split_point(decode, encode_frame, can_id, data):
     line = encode_frame(can_id, data) * 2
