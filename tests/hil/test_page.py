@@ -51,12 +51,12 @@ def test_the_page_draws_the_robot_survives_being_stopped_and_its_estop_stops_the
     with chromium() as browser, running_stack(tmp_path) as stack:
         with page_of(stack.robot_file, tmp_path / "page.txt") as (page, url), opened(browser, url, 760, 560) as tab:
             stack.operator.wait_for("READY", 60.0)
-            tab.frame_locator("#scene").get_by_text("READY, no fault").wait_for()
+            tab.frame_locator("#scene").get_by_text("READY, no fault").wait_for(state="attached")
             assert_drawn(tab, stack)
             stack.drive()
             tab.get_by_text("ARMED · running").wait_for()
             drawn = tab.frame_locator("#scene")
-            wait_for(tab, lambda: "rad/s (plan)" in drawn.locator("body").inner_text())
+            wait_for(tab, lambda: "rad/s (plan)" in (drawn.locator("body").text_content() or ""))
             keep(tab, "live")
             stop_the_page_for_a_while(stack, page.pid)
             tab.get_by_role("button", name="E-STOP").click()
@@ -74,7 +74,7 @@ def test_the_page_draws_the_robot_survives_being_stopped_and_its_estop_stops_the
     with open_log(tmp_path / "run.mcap") as log:
         paths = log.columns("/plan/rollouts")["weights"]
         assert len(paths) >= 2
-        assert list(log.columns("/task")["radius_m"]) == [2.5]
+        assert list(log.columns("/task")["settings.radius_m"]) == [2.5]
     assert any(row.fastest > 5.0 for row in rows)
     later = [row.fastest for row in rows if row.t_s > stopped_s + 0.5]
     assert later
@@ -176,7 +176,7 @@ def test_a_request_that_the_page_died_with_is_said_to_have_no_answer(tmp_path):
         opened(browser, url, 760, 560) as tab,
     ):
         stack.operator.wait_for("READY", 60.0)
-        tab.frame_locator("#scene").get_by_text("READY, no fault").wait_for()
+        tab.frame_locator("#scene").get_by_text("READY, no fault").wait_for(state="attached")
         os.kill(page.pid, signal.SIGSTOP)
         tab.get_by_role("button", name="Arm", exact=True).click()
         os.kill(page.pid, signal.SIGKILL)

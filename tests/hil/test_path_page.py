@@ -20,7 +20,7 @@ def test_a_path_is_drawn_its_speed_changed_and_a_reload_changes_nothing(tmp_path
         with page_of(stack.robot_file, output) as (_, url), opened(browser, url, 900, 640) as tab:
             stack.operator.wait_for("READY", 60.0)
             drawn = tab.frame_locator("#scene")
-            drawn.get_by_text("READY, no fault").wait_for()
+            drawn.get_by_text("READY, no fault").wait_for(state="attached")
             assert_drawn(tab, stack, beside=(0.75, 0.0))
             tab.get_by_role("button", name="Task…").click()
             tab.get_by_text("Follows path.csv").wait_for()
@@ -31,7 +31,7 @@ def test_a_path_is_drawn_its_speed_changed_and_a_reload_changes_nothing(tmp_path
             tab.get_by_text("path path.csv of").wait_for()
             assert stack.operator.status()["task"]["asked"]["speed_m_s"] == 0.3
             stack.drive(until_rad_s=4.0)
-            wait_for(tab, lambda: "of 9.14 m" in drawn.locator("body").inner_text())
+            wait_for(tab, lambda: "of 9.14 m" in (drawn.locator("body").text_content() or ""))
             keep(tab, "path")
             before = stack.operator.status()
             for _ in range(3):
