@@ -193,6 +193,7 @@ OWN = {
     "disco_hw/log/rosbag/bag.py": {"read_text"},
     "disco_hw/log/writer.py": {"os.open"},
     "disco_hw/viewer/operator_controls.py": {"read_text"},
+    "disco_hw/viewer/server.py": {"read_bytes"},
     "drivers/transport/can.py": {"read_text"},
     "sim/fault_schedule.py": {"tomllib.loads"},
     "sim/serial_line.py": {"os.open"},

@@ -59,9 +59,9 @@ def test_an_input_is_not_written_over_by_whatever_name(tmp_path, file):
 
 def test_an_experiment_looks_at_its_directory_and_its_numbers_first(file):
     def drive(out, duration_s=2.0, lag_s=0.1, wheel_noise=0.05):
-        circle(None, "default", 1, duration_s, 10.0, 1.0, math.inf, lag_s, wheel_noise, out, False)
+        circle(None, seeds=1, duration_s=duration_s, lag_s=lag_s, wheel_noise=wheel_noise, out=out)
 
-    for begin in (lambda: pendulum(1, file, False), lambda: drive(file), lambda: adapt(None, 0.15, 1, file, False)):
+    for begin in (lambda: pendulum(seeds=1, out=file), lambda: drive(file), lambda: adapt(None, seeds=1, out=file)):
         with pytest.raises(InputError, match="is there and is no directory"):
             begin()
     for option, numbers in (("duration-s", {"duration_s": math.inf}), ("lag-s", {"lag_s": math.inf})):
