@@ -76,7 +76,15 @@ def _status_rows(status: Mapping[str, Any]) -> Rows:
     recorder = status["recorder"]
     if recorder["path"]:
         rows.append(("recording", recording_in_words(recorder)))
+    if len(status.get("poses", ())) > 1:
+        rows += [(f"poses {which}", _source(one)) for which, one in enumerate(status["poses"], 1)]
     return rows
+
+
+def _source(one: Mapping[str, Any]) -> str:
+    """How one of several pose sources does."""
+    age = "none yet" if one["age_s"] is None else f"the last {one['age_s']:.2f} s ago"
+    return f"{one['source']}: {one['standing']}, {age}, {one['outliers']} outliers"
 
 
 def replay_text(snapshot: Snapshot, first_ns: int, task: RobotTask) -> str:

@@ -1,6 +1,7 @@
 import math
 from dataclasses import asdict
 
+from disco_hw.estimation.sources import PoseSources, Standing
 from disco_hw.log import records
 from disco_hw.log.recorder import RecorderStats
 from disco_hw.tasks.circle import CircleTask
@@ -38,6 +39,16 @@ def test_the_details_say_where_every_tick_has_gone_and_what_fails():
     assert "FAILS" not in live_summary(STATUS, None)
     failing = STATUS | {"recorder": STATUS["recorder"] | {"fault": "nothing is being recorded: no room"}}
     assert "| RECORDING FAILS | nothing is being recorded: no room |" in live_summary(failing, None)
+
+
+def test_of_several_pose_sources_the_details_say_how_each_does():
+    status = PoseSources(("natnet", "nmea"), 0.5)
+    status.all[0].came_ns, status.all[0].standing, status.all[0].outliers = 1_000_000_000, Standing.GOOD, 3
+    text = live_details({**STATUS, "poses": status.status(1_020_000_000)}, None, 0, None)
+    assert "| poses 1 | natnet: good, the last 0.02 s ago, 3 outliers |" in text
+    assert "| poses 2 | nmea: waiting, none yet, 0 outliers |" in text
+    alone = PoseSources(("natnet",), 0.5).status(1_020_000_000)
+    assert "poses" not in live_details({**STATUS, "poses": alone}, None, 0, None)
 
 
 def test_without_a_status_the_page_says_how_old_it_is():
