@@ -135,7 +135,7 @@ def test_a_wrong_description_is_refused_in_one_line(tmp_path, text, line):
 
 
 SEARCH = """
-import json, sys
+import json, sys, tomllib
 from dataclasses import replace
 from pathlib import Path
 import numpy as np
@@ -160,6 +160,7 @@ print(json.dumps({
     "sentences": [sentence(effect) for effect in report.effects],
     "k": {name: [e.value, e.low, e.high] for name, e in estimate.items()},
     "unnamed": [one.form for one in report.unnamed],
+    "driven_with": tomllib.loads(Path(sys.argv[1]).read_text())["effects"][0]["k_s2_m2"],
     "went_m": states[-1, 0],
     "rolled_m": float(model.wheel_radius_m * 7.0),
 }))
@@ -175,8 +176,10 @@ def test_the_effect_of_the_page_is_found_named_and_driven(tmp_path):
     value, low, high = found["k"]["k_s2_m2"]
     assert low < 0.5 < high, found
     assert found["sentences"] == [f"drag takes {value:.2f} v^3 of the speed"]
-    v = found["rolled_m"]
-    assert abs(found["went_m"] - (v - value * v**3)) < 1e-6
+    # The model has the value of the last joint fit, commands to poses.
+    v, k = found["rolled_m"], found["driven_with"]
+    assert low < k < high
+    assert abs(found["went_m"] - (v - k * v**3)) < 1e-6
 
 
 SEARCH_WHEELS = """
