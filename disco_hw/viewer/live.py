@@ -144,7 +144,7 @@ class LivePage:
         record = self.timeline.beliefs.last(newest)
         if record is not None and newest - record.t_ns < _STATUS_OLDER_NS:
             return
-        adaptation = status["adaptation"]
+        adaptation = status.get("adaptation")
         if adaptation is None:
             self.timeline.adaptations = Items()
         in_force = _belief_in_force(newest, adaptation)

@@ -147,6 +147,14 @@ def test_a_belief_of_a_daemon_that_has_gone_is_not_the_next_ones(page):
     assert live._snapshot().adaptation is None
 
 
+def test_a_status_that_says_nothing_of_adaptation_leaves_the_models_belief(page):
+    live, _ = page
+    live.take(ticks(0, 51))
+    live._learn_belief({"ok": True})
+    assert live._snapshot().belief is None or live._snapshot().belief.source == "model"
+    assert live._snapshot().adaptation is None
+
+
 def test_a_task_on_the_feed_is_newer_than_a_status_from_before_it(page):
     live, _ = page
     live.take(ticks(0, 51))
