@@ -165,7 +165,7 @@ def send_request(path: Path, request: Mapping[str, Any], timeout_s: float = 2.0)
     except (FileNotFoundError, ConnectionRefusedError):
         raise WorkError(f"{path}: no daemon listens there; start it with `disco-hw run`") from None
     except OSError as error:
-        raise WorkError(f"{path}: {error.strerror or error}") from None
+        raise WorkError(f"{path}: the daemon cannot be asked ({error.strerror or error}); be its user") from None
     try:
         reply = json.loads(line)
     except ValueError:

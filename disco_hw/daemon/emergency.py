@@ -157,7 +157,7 @@ def _settings(robot: Path, raw: dict[str, Any], file_error: str | None, option: 
 def _link_settings(robot: Path, raw: dict[str, Any], given: dict[str, Any]) -> Link:
     section = raw.get("link", {})
     if not isinstance(section, dict):
-        raise InputError(f"{robot}: link: not a section")
+        raise InputError(f"{robot}: link: not a section; write [link] above its fields")
     # A field that is none, misspelt or of another version, must not keep the stop from the robot.
     return link_of(robot, {**section, **given})
 

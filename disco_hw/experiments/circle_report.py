@@ -218,7 +218,7 @@ def load_circle_report(
     command = log.columns("/command")
     driven = command["in_force"].astype(bool) & (command["source"] == "plan")
     if not driven.any():
-        raise WorkError(f"{log_file}: the planner never drove")
+        raise WorkError(f"{log_file}: the planner never drove; give the log of a run in which the task was started")
     first_ns, last_ns = int(command["t_ns"][driven][0]), int(command["t_ns"][driven][-1])
     truth = _between(_read_truth(truth_file), first_ns * 1e-9, last_ns * 1e-9)
     columns = log.columns("/estimate")
@@ -252,7 +252,7 @@ def _read_truth(path: FilePath) -> Path:
         return np.array([float(row[name]) for row in rows])
 
     if not rows:
-        raise WorkError(f"{path}: no truth was recorded")
+        raise WorkError(f"{path}: no row; let `disco-hw sim --truth` write it during the drive")
     return Path(column("t_ns") * 1e-9, column("x_m"), column("y_m"), column("yaw_rad"), column("speed_m_s"))
 
 

@@ -297,7 +297,10 @@ def _watch_laps(operator: Operator, options: DemoOptions, limit_s: float, consol
             if laps >= options.laps:
                 return
             if time.monotonic() > deadline:
-                raise WorkError(f"only {laps:.2f} of {options.laps} laps were driven in {limit_s:.0f} s")
+                raise WorkError(
+                    f"only {laps:.2f} of {options.laps} laps were driven in {limit_s:.0f} s; "
+                    "end what else keeps this computer busy, and try again"
+                )
             time.sleep(_POLL_S)
 
 
