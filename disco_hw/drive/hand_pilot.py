@@ -31,7 +31,7 @@ class Deadman:
 
     A press is a fresh input with the deadman held right after a fresh one with it open. So after a loss, a silence, a
     fault or a disarming by anybody, and at the start, the deadman must be seen open before it counts again: nothing
-    arms by itself. Whoever else arms the robot finds it disarmed again.
+    arms by itself. Whoever else arms the robot finds it disarmed again. Who holds on is asked once to let go.
     """
 
     def __init__(self, limit_ns: int = INPUT_LIMIT_NS) -> None:
@@ -39,6 +39,7 @@ class Deadman:
         self._seen_open = False
         self._engaged = False
         self._was_armed = False
+        self._asked_to_let_go = False
 
     @property
     def engaged(self) -> bool:
@@ -53,6 +54,8 @@ class Deadman:
         if state is State.ARMED and not self._engaged and not requests:
             requests = (UserRequest.DISARM,)
         self._seen_open = fresh and not held
+        if self._seen_open or self._engaged:
+            self._asked_to_let_go = False
         self._was_armed = state is State.ARMED
         if self._engaged and newest is not None:
             return DeadmanVerdict(requests, Manual(newest.left_rad_s, newest.right_rad_s), event)
@@ -60,13 +63,19 @@ class Deadman:
 
     def refused(self, why: str) -> str:
         """Take in that the daemon refused to arm or start; returns the sentence for the person."""
-        self._engaged = False
+        self._engaged, self._asked_to_let_go = False, True
         return f"not armed: {why}; release the deadman and press it again"
 
     def _press(self, held: bool, state: State) -> tuple[tuple[UserRequest, ...], str | None]:
-        if not (held and self._seen_open):
+        if not held:
             return (), None
+        if not self._seen_open:
+            if state is not State.READY or self._asked_to_let_go:
+                return (), None
+            self._asked_to_let_go = True
+            return (), "the deadman is held already; release it and press it again"
         if state is not State.READY:
+            self._asked_to_let_go = True
             return (), f"the robot is {state.value}, not ready; release the deadman and press it again once it is"
         self._engaged = True
         return (UserRequest.ARM, UserRequest.START), "deadman pressed: arming"
@@ -83,7 +92,7 @@ class Deadman:
                 return (UserRequest.DISARM,), f"no input for more than {limit_ms} ms: stopping"
             return (UserRequest.DISARM,), "deadman released: stopping"
         if state not in {State.READY, State.ARMED} or (self._was_armed and state is State.READY):
-            self._engaged = False
+            self._engaged, self._asked_to_let_go = False, True
             return (), "no longer armed; release the deadman and press it again"
         return (), None
 

@@ -27,6 +27,8 @@ from disco_hw.errors import InputError
 _FIRST_REPEAT_NS = 1_000_000_000
 # Shorter than this between two holds may be a stutter of the connection, and must not arm again.
 _RELEASE_NS = 500_000_000
+# Repeats of a key that does not count, after which its person is told.
+_VAIN_EVENTS = 10
 # No hand and no terminal repeats faster; pasted text does.
 _SHORTEST_REPEAT_NS = 10_000_000
 
@@ -87,6 +89,12 @@ class KeyHold:
         self._state = _Hold.LAPSED
         self._direction = (0.0, 0.0)
         self._last_ns: int | None = None
+        self._vain = 0
+
+    @property
+    def in_vain(self) -> bool:
+        """Whether a key has been held for a while that does not count before all keys were released."""
+        return self._vain >= _VAIN_EVENTS
 
     @property
     def words(self) -> str:
@@ -103,6 +111,7 @@ class KeyHold:
             self._state = _Hold.LAPSED
             if event.key in _DIGITS:
                 self._share = int(event.key) / 9.0
+        self._vain = self._vain + 1 if self._state is _Hold.LAPSED and event.key in DIRECTIONS else 0
         self._last_ns = event.t_ns
 
     def at(self, now_ns: int) -> ManualInput:
@@ -112,7 +121,7 @@ class KeyHold:
         if self._state is _Hold.HELD and now_ns - self._last_ns > self._limit_ns:
             self._state = _Hold.LAPSED
         if self._state is _Hold.LAPSED and now_ns - self._last_ns >= _RELEASE_NS:
-            self._state = _Hold.OPEN
+            self._state, self._vain = _Hold.OPEN, 0
         if self._state is not _Hold.HELD:
             return ManualInput(now_ns, 0.0, 0.0, deadman=False)
         forward, turn = self._direction
@@ -189,6 +198,11 @@ class Keyboard:
     def words(self) -> str:
         """The speed chosen, and what keeps a held key from counting."""
         return self._hold.words
+
+    @property
+    def in_vain(self) -> bool:
+        """Whether a key is held that does not count before all keys were released for half a second."""
+        return self._hold.in_vain
 
     @property
     def task(self) -> str:

@@ -203,7 +203,8 @@ def _drive(stage: GuidedStage, setup: Setup, options: CommissionOptions) -> Any:
     stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
     log = _log_directory(options, setup) / f"{setup.config.robot.name}-commission-{stage.name}-{stamp}.mcap"
     keyboard = Keyboard(_STANDARD_INPUT, KeyHold(0.0), MonotonicClock())
-    pilot = CommissionPilot(Procedure(stage.steps(setup.config.robot, slowest_rad_s(setup))), keyboard, keyboard.typed)
+    procedure = Procedure(stage.steps(setup.config.robot, slowest_rad_s(setup)))
+    pilot = CommissionPilot(procedure, keyboard, keyboard.typed, lambda: keyboard.in_vain)
     try:
         _say("keys", "hold the space bar to drive, let go to stop; Ctrl-D gives up")
         with closing(AsyncPrinter(STANDARD_ERROR, in_text)) as say:

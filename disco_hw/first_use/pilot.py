@@ -20,15 +20,24 @@ _FAULT_NS = 1_000_000_000
 class CommissionPilot:
     """Drives as the procedure says while the deadman of `source` is held; satisfies `disco_hw.runtime.pilot.Pilot`.
 
-    `keys`: those typed since it was asked last, for the procedure's questions.
+    `keys`: those typed since it was asked last, for the procedure's questions. `in_vain`: whether a key is held that
+    does not count, which the person is told once.
     """
 
-    def __init__(self, procedure: Procedure, source: ManualSource, keys: Callable[[], str]) -> None:
+    def __init__(
+        self,
+        procedure: Procedure,
+        source: ManualSource,
+        keys: Callable[[], str],
+        in_vain: Callable[[], bool] = lambda: False,
+    ) -> None:
         self.procedure = procedure
         self._source = source
         self._keys = keys
+        self._in_vain = in_vain
+        self._was_in_vain = False
         self._deadman = Deadman()
-        self._driving = self._held = False
+        self._driving = self._held = self._was_ready = False
         self._said = ""
         self._told: list[str] = []
         self._fault_ns: int | None = None
@@ -65,6 +74,10 @@ class CommissionPilot:
         motion: Motion = verdict.motion
         if isinstance(action, Silence) and isinstance(motion, Manual):
             motion = Silent()
+        self._was_ready |= state is State.READY
+        before, self._was_in_vain = self._was_in_vain, self._in_vain()
+        if self._was_in_vain and not before:
+            self._told.append("the key does not count yet: release all keys for half a second, then hold it again")
         events = [*self._told, *([verdict.event] if verdict.event is not None else []), *self._new_words()]
         self._told.clear()
         requests = verdict.requests
@@ -101,7 +114,8 @@ class CommissionPilot:
     def _new_words(self) -> list[str]:
         action = self.procedure.action
         words = "" if action is None else action.question if isinstance(action, Ask) else action.todo
-        if words == self._said:
+        # Who is told to hold a key before the robot is ready holds it in vain.
+        if words == self._said or not self._was_ready:
             return []
         self._said = words
         return [words] if words else []

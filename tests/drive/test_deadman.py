@@ -59,6 +59,23 @@ def test_a_deadman_held_from_the_start_counts_for_nothing_until_released():
     assert bench.tick(True).requests == ARM_START
 
 
+def test_who_holds_in_vain_is_asked_once_to_let_go_when_the_robot_is_ready():
+    bench = Bench()
+    bench.state = State.HANDSHAKE
+    assert [bench.tick(True).event for _ in range(50)] == [None] * 50
+    bench.state = State.READY
+    said = [bench.tick(True).event for _ in range(50)]
+    assert said[0] is not None
+    assert "release it and press it again" in said[0]
+    assert said[1:] == [None] * 49
+    bench.tick(False)
+    assert bench.tick(True).requests == ARM_START
+    # What says already that the deadman is to be let go is not said again.
+    assert "release the deadman" in bench.deadman.refused("no poses")
+    bench.state = State.READY
+    assert [bench.tick(True).event for _ in range(50)] == [None] * 50
+
+
 @pytest.mark.parametrize(
     ("loss", "words"),
     [

@@ -59,6 +59,20 @@ def test_a_held_key_drives_until_200_ms_after_its_last_repeat():
     assert after[-1].left_rad_s == 0.0
 
 
+def test_a_key_held_from_the_start_holds_nothing_which_can_be_told():
+    typist = Typist()
+    typist.keys = KeyHold(8.0)
+    typist.keys.at(typist.now_ns)
+    assert not any(held(typist.hold(UP, 300)))
+    assert not typist.keys.in_vain
+    assert not any(held(typist.hold(UP, 700, delay_ms=30)))
+    assert typist.keys.in_vain
+    typist.wait(500)
+    assert not typist.keys.in_vain
+    assert any(held(typist.hold(UP, 1000)))
+    assert not typist.keys.in_vain
+
+
 def test_a_tap_holds_nothing():
     typist = Typist()
     typist.press(UP)

@@ -9,7 +9,8 @@ import pytest
 
 from disco_hw.errors import InputError, WorkError
 from disco_hw.first_use.commission import STAGES, CommissionOptions, as_sent, run_commission, write_fields
-from disco_hw.first_use.procedure import MOST_SHARE
+from disco_hw.first_use.pilot import CommissionPilot
+from disco_hw.first_use.procedure import MOST_SHARE, Procedure
 from disco_hw.runtime.robot_setup import load_setup
 from sim.devices import odrive
 from sim.plant_parameters import PlantParameters
@@ -195,6 +196,21 @@ def test_every_fault_is_found_with_every_driver(tmp_path, driver, wrong):
 def test_axes_of_north_and_east_are_two_faults_for_each_is_a_field_of_its_own(tmp_path):
     found = commissioned(robot_file(tmp_path), Miswiring(pose=north_and_east))
     assert found == ["yaw the other way round", "axes mirrored"]
+
+
+def test_who_holds_a_key_that_does_not_count_is_told_once(tmp_path):
+    class Idle:
+        ended = None
+
+        def poll(self, _now_ns, _robot):
+            return None
+
+    vain = [False, True, True, False, True]
+    asked = iter(vain)
+    procedure = Procedure(STAGES[0].steps(load_setup(robot_file(tmp_path)).config.robot, 0.0))
+    pilot = CommissionPilot(procedure, Idle(), str, lambda: next(asked))
+    said = [[text for text in pilot.step(k, None).events if "release all keys" in text] for k in range(len(vain))]
+    assert list(map(len, said)) == [0, 1, 0, 0, 1]
 
 
 def test_what_would_be_refused_is_not_written(tmp_path):
