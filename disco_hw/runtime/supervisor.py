@@ -255,7 +255,7 @@ class Supervisor:
             case State.STOPPING:
                 return "still stopping; ask again when ready"
             case State.FAULT:
-                return f"{self._trouble}; mend it and reset first"
+                return self._trouble_and_remedy("mend it and reset first")
             case State.DISCONNECTED | State.HANDSHAKE:
                 return f"not connected to the robot: {self._words(inputs)}"
 
@@ -343,6 +343,10 @@ class Supervisor:
             self._running = False
             self._events.append("task stopped: the path's end is reached")
 
+    def _trouble_and_remedy(self, remedy: str) -> str:
+        """The trouble with its own remedy if it names one, else with this one."""
+        return self._trouble if self._trouble.endswith("then reset") else f"{self._trouble}; {remedy}"
+
     def _words(self, inputs: Inputs) -> str:
         """Return what a person should know of the present state."""
         if inputs.daemon_error is not None:
@@ -376,7 +380,7 @@ class Supervisor:
             case State.STOPPING:
                 return f"{self._stop_reason}; waiting until the robot is disarmed and its wheels are still"
             case State.FAULT:
-                return f"{self._trouble}; mend it, then reset"
+                return self._trouble_and_remedy("mend it, then reset")
             case State.DISCONNECTED | State.HANDSHAKE:
                 return self._words(inputs)
 

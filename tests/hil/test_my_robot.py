@@ -30,6 +30,9 @@ MOST_KEYS = 60
 MEASURES = {"radius of": "0.06", "left to right": "0.31", "encoder ticks": "2048", "fastest speed": "8"}
 """What `init` asks, in its order, and of the virtual robot the answers."""
 PATIENCE_S = 900.0
+STARVED = ("fell silent", "telemetry lost")
+"""What is said where the simulator got no processor for a tenth of a second: the reader begins anew."""
+MOST_ATTEMPTS = 3
 TYPED = (
     "disco-hw init -o ROBOT.toml --link can:socketcan:can0",
     "disco-hw check ROBOT.toml",
@@ -227,15 +230,11 @@ class Reader:
         raise AssertionError(f"{status}\n{terminal.said[-2000:]}")
 
 
-@pytest.mark.hil
-@pytest.mark.long
-@pytest.mark.timeout(5400)
-@pytest.mark.parametrize("driver", DRIVERS)
-def test_the_tutorial_goes_through_with_less_than_sixty_commands_and_keys(tmp_path, monkeypatch, driver):
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    reader = Reader(tmp_path, driver)
+def follow(directory, driver):
+    """The whole page, from its top to its end; the reader."""
+    reader = Reader(directory, driver)
     arguments = ["sim", str(reader.device), "--inject", str(reader.hidden / "inject")]
-    with disco_hw_process("virtual robot", arguments, tmp_path / "sim.txt") as robot:
+    with disco_hw_process("virtual robot", arguments, directory / "sim.txt") as robot:
         while "ready" not in robot.output.read_text("utf-8"):
             assert robot.process.poll() is None, robot.last_words()
             time.sleep(0.1)
@@ -246,6 +245,24 @@ def test_the_tutorial_goes_through_with_less_than_sixty_commands_and_keys(tmp_pa
         reader.run(TYPED[4])
         reader.run(TYPED[5])
         reader.circle()
+    return reader
+
+
+@pytest.mark.hil
+@pytest.mark.long
+@pytest.mark.timeout(5400)
+@pytest.mark.parametrize("driver", DRIVERS)
+def test_the_tutorial_goes_through_with_less_than_sixty_commands_and_keys(tmp_path, monkeypatch, driver):
+    for attempt in range(MOST_ATTEMPTS):
+        directory = tmp_path / str(attempt)
+        directory.mkdir()
+        monkeypatch.setenv("XDG_RUNTIME_DIR", str(directory))
+        try:
+            reader = follow(directory, driver)
+            break
+        except AssertionError as error:
+            if attempt == MOST_ATTEMPTS - 1 or not any(word in str(error) for word in STARVED):
+                raise
     assert not reader.left
     print(f"{driver}: {reader.commands} commands, {reader.keys} keys")
     assert reader.commands + reader.keys < MOST_KEYS

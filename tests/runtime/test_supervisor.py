@@ -76,6 +76,15 @@ def test_a_problem_means_fault_in_words_without_motion(start, changes, words):
     assert out.estop == (changes.get("driver_state") is DriverState.ESTOP)
 
 
+def test_a_fault_whose_words_end_with_the_remedy_is_told_it_once():
+    bench = Bench()
+    bench.running()
+    out = bench.tick(driver_state=DriverState.FAULT, driver_detail="node 3 fell silent; remove the cause, then reset")
+    assert out.detail == "node 3 fell silent; remove the cause, then reset"
+    assert refusal(bench.tick(ARM)).count("reset") == 1
+    assert bench.tick(daemon_error="it failed").detail.endswith("then reset")
+
+
 @pytest.mark.parametrize("start", ["ready", "armed", "running", "stopping"])
 def test_estop_means_fault_in_the_same_tick_and_its_frames_until_the_robot_shows_it(start):
     bench = Bench()
