@@ -200,10 +200,14 @@ class Reader:
 
     def drive(self):
         with self.type(TYPED[3]) as terminal:
-            terminal.wait("hold", PATIENCE_S)
-            terminal.pause(0.7)
-            with self.holding(terminal):
-                terminal.pump(lambda _said: terminal.process.poll() is not None, PATIENCE_S)
+            terminal.wait("keyboard, 50", PATIENCE_S)
+            while terminal.process.poll() is None:
+                # Held until it is over; where the repeats were late, let go and held again.
+                terminal.pause(0.7)
+                with self.holding(terminal):
+                    terminal.pump(
+                        lambda said: "release all keys" in said[200:] or terminal.process.poll() is not None, PATIENCE_S
+                    )
 
     def circle(self):
         with self.type(TYPED[6]) as terminal:
