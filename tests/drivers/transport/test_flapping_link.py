@@ -81,11 +81,11 @@ def test_descriptors_and_threads_stay_as_many(kind, request):
     transport.open()
     wait_until(lambda: len(medium.seen) > RECONNECTS, MINUTES_S)
     transport.close()
-    assert resources() == before
+    # The hub may just be hanging up, and what an earlier test left behind may end meanwhile.
+    wait_until(lambda: all(now <= then for now, then in zip(resources(), before, strict=True)))
     early, late = medium.seen[SETTLED : 2 * SETTLED], medium.seen[-SETTLED:]
     (early_files, early_threads), (late_files, late_threads) = (
         tuple(map(max, zip(*looks, strict=True))) for looks in (early, late)
     )
-    # The hub may just be hanging up.
     assert late_files <= early_files + 1
-    assert late_threads == early_threads
+    assert late_threads <= early_threads
