@@ -213,7 +213,7 @@ class Reader:
             self.until(terminal, lambda status: status["state"] == "ARMED")
             self.run(TYPED[8])
             self.until(terminal, lambda status: float(status["task"]["laps"] or 0.0) > 0.5)
-            assert "ESTOP" in self.run(TYPED[9])
+            assert "e-stop accepted" in self.run(TYPED[9])
             self.until(terminal, lambda status: status["state"] in ("FAULT", "READY", "DISARMED"))
             assert max(map(abs, self.wheels())) < 8.0
             self.press(terminal, "\x03")
