@@ -15,6 +15,9 @@ from disco_hw.experiments.live_stack import disco_hw_process, write_robot_file
 
 pytestmark = [pytest.mark.hil, pytest.mark.long, pytest.mark.timeout(400)]
 _REPEAT_S = 0.03
+_RELEASE_S = 0.8
+_IN_VAIN = ("release all keys", "release the deadman", "release it and press")
+"""What is said to whose key came too late: they let go and hold again."""
 
 
 class Terminal:
@@ -35,9 +38,12 @@ class Terminal:
             assert time.monotonic() < deadline_s, self.said[-2000:]
             if select.select([self.master], [], [], _REPEAT_S / 2)[0]:
                 try:
-                    self.said += os.read(self.master, 65536).decode(errors="replace")
+                    fresh = os.read(self.master, 65536).decode(errors="replace")
                 except OSError:
                     break
+                self.said += fresh
+                if any(words in fresh for words in _IN_VAIN):
+                    self._next_s = time.monotonic() + _RELEASE_S
             if self.holding and time.monotonic() >= self._next_s:
                 self.type(" ")
                 self._next_s = time.monotonic() + _REPEAT_S

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import os
 import re
+import signal
 import socket
 import sys
 import time
@@ -216,7 +217,9 @@ class Reader:
             assert "e-stop accepted" in self.run(TYPED[9])
             self.until(terminal, lambda status: status["state"] != "ARMED")
             assert max(map(abs, self.wheels())) < 8.0
-            self.press(terminal, "\x03")
+            # Ctrl-C: this terminal is not the one that the command was started from.
+            self.keys += 1
+            terminal.process.send_signal(signal.SIGINT)
 
     def until(self, terminal, holds):
         deadline_s, status = time.monotonic() + PATIENCE_S, None
