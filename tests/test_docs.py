@@ -11,7 +11,7 @@ import click
 import pytest
 import typer
 
-from disco_hw.cli import app
+from disco_hw.cli.app import app
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")])

@@ -1,6 +1,7 @@
-"""The command `disco-hw`: a file for each group of verbs; here they are gathered and errors become an exit code.
+"""The command `disco-hw`: a file for each group of verbs, gathered in `app`; here errors become an exit code.
 
-Verbs import what they need when they run, so that `estop` and `--help` need nothing else to be healthy.
+A stop that is written as in the documents goes past the command-line library, which takes as long to load and to list
+every verb as the stop itself.
 """
 
 from __future__ import annotations
@@ -8,60 +9,13 @@ from __future__ import annotations
 import gc
 import os
 import sys
-from typing import Annotated
+from collections.abc import Sequence
+from pathlib import Path
 
-import typer
-
-from disco_hw.cli import logs, robot, virtual, watch
-from disco_hw.cli.experiment import experiment_app
-from disco_hw.cli.watch import bridge_app
 from disco_hw.errors import InputError, WorkError
 from disco_hw.processes import PARENT_VARIABLE, end_with_parent
 
 _YOUNG_OBJECTS = 50_000
-
-app = typer.Typer(
-    name="disco-hw",
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-)
-for verb in (
-    virtual.demo,
-    robot.run,
-    robot.drive,
-    robot.ctl,
-    robot.check,
-    robot.init,
-    robot.commission,
-    robot.estop,
-    logs.infer,
-    logs.gap,
-    watch.view,
-    watch.replay,
-    virtual.sim,
-):
-    app.command()(verb)
-app.add_typer(experiment_app, name="experiment")
-app.add_typer(bridge_app, name="bridge")
-app.command("import")(logs.import_log)
-app.add_typer(logs.log_app, name="log")
-
-
-def _version(asked: bool) -> None:
-    if asked:
-        from importlib import metadata
-
-        print(f"disco-hw {metadata.version('disco-hw')}")
-        raise typer.Exit
-
-
-@app.callback()
-def disco_hw(
-    _: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and exit.")
-    ] = False,
-) -> None:
-    """Driver stack for a skid-steer robot: fusion, DISCO stochastic MPC, virtual robot, recording."""
 
 
 def main() -> None:
@@ -72,6 +26,11 @@ def main() -> None:
     # Imports make many objects and no garbage: looking for it on the way took a fourteenth of what `estop` computes.
     gc.set_threshold(_YOUNG_OBJECTS)
     try:
+        stop = plain_stop(sys.argv[1:])
+        if stop is not None:
+            raise SystemExit(stop_and_say(*stop))
+        from disco_hw.cli.app import app
+
         app(prog_name="disco-hw")
     except InputError as error:
         print(f"disco-hw: {error}", file=sys.stderr)
@@ -79,3 +38,36 @@ def main() -> None:
     except WorkError as error:
         print(f"disco-hw: {error}", file=sys.stderr)
         raise SystemExit(1) from None
+
+
+def plain_stop(words: Sequence[str]) -> tuple[Path, str | None, bool] | None:
+    """The robot file, --link and --json of `estop`; None for another verb, and for whatever needs help or an error."""
+    if not words or words[0] != "estop":
+        return None
+    files: list[str] = []
+    link, as_json = None, False
+    left = iter(words[1:])
+    for word in left:
+        if word == "--json":
+            as_json = True
+        elif word == "--link":
+            link = next(left, None)
+            if link is None:
+                return None
+        elif word.startswith("--link="):
+            link = word.removeprefix("--link=")
+        elif word.startswith("-"):
+            return None
+        else:
+            files.append(word)
+    return (Path(files[0]), link, as_json) if len(files) == 1 else None
+
+
+def stop_and_say(robot: Path, link: str | None, as_json: bool) -> int:
+    """Stop the robot, print what became of it, and return the exit code: 0 if at least one way worked."""
+    from disco_hw.daemon.emergency import stop_robot
+    from disco_hw.reports import as_json as json_of
+
+    outcome = stop_robot(robot, link)
+    print(json_of(outcome.as_dict()) if as_json else outcome.as_text())
+    return 0 if outcome.sent else 1

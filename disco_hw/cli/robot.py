@@ -9,6 +9,7 @@ from typing import Annotated
 
 import typer
 
+from disco_hw.cli import stop_and_say
 from disco_hw.cli.options import (
     AsJson,
     LinkOption,
@@ -228,9 +229,4 @@ def estop(
     as_json: AsJson = False,
 ) -> None:
     """Stop the robot now, whatever state anything else is in."""
-    from disco_hw.daemon.emergency import stop_robot
-
-    outcome = stop_robot(robot, link)
-    print_result(outcome.as_dict(), as_json, outcome.as_text())
-    if not outcome.sent:
-        raise typer.Exit(1)
+    raise typer.Exit(stop_and_say(robot, link, as_json))

@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 from websockets.asyncio.client import connect
 
 from disco_hw.bridge.foxglove import LAYOUT, Live
-from disco_hw.cli import app
+from disco_hw.cli.app import app
 from disco_hw.config import load_robot_config
 from disco_hw.daemon import run
 from disco_hw.daemon.client import socket_path

@@ -8,6 +8,10 @@ import sys
 from importlib import metadata
 
 import pytest
+from typer.testing import CliRunner
+
+from disco_hw.cli import plain_stop, robot
+from disco_hw.cli.app import app
 
 VERBS = [
     *("demo", "run", "sim", "drive", "ctl", "check", "replay", "estop"),
@@ -108,3 +112,25 @@ def test_verbs_and_options_are_completed_and_nothing_heavy_is_loaded_for_it():
     options = completed("disco-hw", "run", "--")
     assert {"--model", "--link", "--adapt"} <= set(options)
     assert "heavy []" in options
+
+
+@pytest.mark.parametrize(
+    "words",
+    ["R", "R --json", "--json R", "R --link can", "--link serial:/dev/ttyUSB0 R --json", "R --link=can:socketcan:can0",
+     "--link= R", "R --link --json", "R --link a --link b", "", "R --link", "R more", "R --jso", "R --json=1", "--help",
+     "R -x", "R -- --json", "-- R"],
+)  # fmt: skip
+def test_a_stop_that_goes_past_the_library_is_read_as_the_library_reads_it(monkeypatch, words):
+    asked = []
+    monkeypatch.setattr(robot, "stop_and_say", lambda *given: asked.append(given) or 0)
+    result = CliRunner().invoke(app, ["estop", *words.split()])
+    plain = plain_stop(["estop", *words.split()])
+    assert plain is None or asked == [plain]
+    # What the library refuses, explains or reads in a way of its own is left to it.
+    assert (plain is None) == (result.exit_code != 0 or not asked or "--" in words.split())
+
+
+def test_no_other_verb_is_taken_for_a_stop():
+    assert plain_stop([]) is None
+    assert plain_stop(["ctl", "robot.toml", "estop"]) is None
+    assert plain_stop(["--version"]) is None

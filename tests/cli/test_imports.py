@@ -55,6 +55,8 @@ def test_a_question_and_a_stop_load_no_large_library(robot, verb):
     code, loaded, said = loaded_by(*(word.format(robot=robot) for word in verb))
     assert code == 1, said
     assert not loaded & {*HEAVY, "numpy"}
+    # A stop does without the command-line library too.
+    assert (verb[0] == "estop") == (not loaded & {"typer", "click"})
 
 
 def test_a_daemon_is_asked_whatever_has_become_of_the_task_in_the_file_but_not_with_another_section_wrong(robot):

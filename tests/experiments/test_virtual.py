@@ -9,7 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 import disco_hw
-from disco_hw.cli import app
+from disco_hw.cli.app import app
 from disco_hw.errors import InputError
 from disco_hw.experiments import virtual
 from disco_hw.experiments.live_stack import with_device

@@ -5,7 +5,7 @@ import json
 import pytest
 from typer.testing import CliRunner
 
-from disco_hw.cli import app
+from disco_hw.cli.app import app
 from disco_hw.model import load_model
 
 # Compiling for two models takes most of it.
