@@ -11,7 +11,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -59,10 +59,17 @@ _FIRST_PAINT = """async () => {
   while (!painted()) await new Promise(later => setTimeout(later, 20));
   return [painted().startTime, performance.timeOrigin];
 }"""
+# Frames, and those of them in which the robot has moved: the page's library keeps what it draws where its tests look.
 _COUNT_FRAMES = """seconds => new Promise(done => {
-  let count = 0;
+  let frames = 0, moved = 0, before = "";
   const end = performance.now() + 1e3 * seconds;
-  const next = () => { if (performance.now() >= end) done(count); else { count++; requestAnimationFrame(next); } };
+  const next = () => {
+    if (performance.now() >= end) { done([frames, moved]); return; }
+    frames++;
+    const place = window.__viserMutable.nodeRefFromName["/robot"].position.toArray().join();
+    if (place !== before) { moved++; before = place; }
+    requestAnimationFrame(next);
+  };
   requestAnimationFrame(next);
 })"""
 PAINTED_PX, PAINTED_S = (390, 1400), 10.0
@@ -89,7 +96,7 @@ def painted(directory: Path) -> dict[str, float]:
     """A browser that opens the live page at 50 Hz, drawing in software: until it shows something, and how often then.
 
     From the call to the first contents of the desk, and of the scene; frames that the scene's window has drawn in a
-    second, over some seconds.
+    second, over some seconds, those in which the robot has moved, and the CPU time of the whole browser for a frame.
     """
     socket = directory / "painted.sock"
     feed, desk, ending = ViewerFeed(feed_path(socket)), Desk(socket, ROBOT_FILE), threading.Event()
@@ -129,11 +136,34 @@ def _painted(tab: Any) -> dict[str, float]:
     desk_ms, desk_begin_ms = tab.evaluate(_FIRST_PAINT)
     scene_ms, scene_begin_ms = scene.evaluate(_FIRST_PAINT)
     tab.wait_for_timeout(5_000)
+    begin_s, begin_cpu_s = time.monotonic(), _children_cpu_s()
+    frames, moved = scene.evaluate(_COUNT_FRAMES, PAINTED_S)
+    passed_s, cpu_s = time.monotonic() - begin_s, _children_cpu_s() - begin_cpu_s
     return {
         "desk_painted_ms": desk_ms,
         "scene_painted_ms": scene_begin_ms + scene_ms - desk_begin_ms,
-        "scene_frames_per_s": scene.evaluate(_COUNT_FRAMES, PAINTED_S) / PAINTED_S,
+        "scene_frames_per_s": frames / passed_s,
+        "scene_moves_per_s": moved / passed_s,
+        "browser_cpu_ms_per_frame": 1e3 * cpu_s / max(frames, 1),
     }
+
+
+def _children_cpu_s() -> float:
+    """CPU time of all processes below this one that live: the browser's."""
+    parents = {}
+    for directory in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):
+            fields = (directory / "stat").read_text(encoding="utf-8").rpartition(")")[2].split()
+            parents[int(directory.name)] = int(fields[1])
+    below, found = {os.getpid()}, set[int]()
+    while below:
+        below = {pid for pid, parent in parents.items() if parent in below}
+        found |= below
+    cpu_s = 0.0
+    for pid in found:
+        with suppress(OSError):
+            cpu_s += _cpu_s(pid)
+    return cpu_s
 
 
 def _feed(directory: Path) -> dict[str, float]:

@@ -22,7 +22,7 @@ from disco_hw.viewer.snapshot import Snapshot, snapshot_at
 from disco_hw.viewer.timeline import Items, Timeline
 from disco_hw.viewer.views import TaskEditor, Views, add_layers
 
-MOVE_S = 0.1
+MOVE_S = 0.05
 REDRAW_S = 0.5
 KEEP_S = 300.0
 _STATUS_OLDER_NS = 2_000_000_000
@@ -68,7 +68,7 @@ class LivePage:
         add_layers(server, self.scene, self._shade)
 
     def step(self) -> None:
-        """Wait at most a tenth of a second for records, then draw what is due."""
+        """Wait at most a twentieth of a second for records, then draw what is due."""
         self.take(self._subscriber.receive(MOVE_S))
         now_s = time.monotonic()
         if not self._server.get_clients():

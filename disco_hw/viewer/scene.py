@@ -15,6 +15,7 @@ from disco_hw.viewer.recording import ShownRobot, model_in_force
 from disco_hw.viewer.snapshot import ParameterPoints, Snapshot
 
 Array = NDArray[np.float64]
+Bytes = NDArray[np.uint8]
 Point = tuple[float, float, float]
 
 TASK_COLOUR = (40, 110, 230)
@@ -61,6 +62,14 @@ LIGHT, DARK = (255.0, 255.0, 255.0), (20.0, 20.0, 24.0)
 _CENTRE_LIMIT_M = 5.0
 FAN_PALEST = 0.12
 _WHEEL_PARTS = (("front", 0.5), ("rear", -0.5))
+# Widths in pixels, and lines instead of the library's grid: where no graphics card draws, a line of a width in metres
+# is drawn twice by a dear shader, and grid, shadows and environment map cost ten times as much as all else together.
+_WIDTH_PX = {
+    "task": 3.5, "trail": 4.0, "plan": 3.5, "fan": 1.5, "points": 1.5, "ellipse": 2.0, "centre": 1.5, "poses": 2.5,
+}  # fmt: skip
+_GRID_LIGHT, _GRID_DARK = ((236, 236, 236), (190, 190, 190)), ((34, 34, 40), (72, 72, 80))
+_TRAIL_STEP, _OLD_TRAIL_STEP = 0.05, 0.2
+"""Between two points of the trail that are drawn, in the task's reach: chords of a circle are off by 0.03 %, .5 %."""
 
 
 def first_camera(task: RobotTask) -> tuple[Point, Point]:
@@ -88,29 +97,20 @@ class Scene:
         self._wheel_radius = max(stage.wheel_radius_m, 0.01)
         self._add_ground()
         self._robot, self._wheels = self._add_robot()
-        empty = np.zeros((1, 2, 3))
+        empty, shades = np.zeros((1, 2, 3)), np.zeros((1, 2, 3), np.uint8)
         self._lines = {
-            name: server.scene.add_line_segments(f"/{name}", empty, colour, thickness=thickness, visible=False)
-            for name, colour, thickness in (
-                ("points", POINTS_COLOUR, 0.004),
-                ("plan", PLAN_COLOUR, 0.012),
-                ("ellipse", ELLIPSE_COLOUR, 0.006),
-                ("centre", CENTRE_COLOUR, 0.004),
-                ("poses", POSES_COLOUR, 0.008),
-            )
+            name: add_lines(server, name, empty, LAYER_COLOURS[name], _WIDTH_PX[name])
+            for name in ("points", "plan", "ellipse", "centre", "poses")
         }
-        self._trail = server.scene.add_line_segments(
-            "/trail", empty, np.zeros((1, 2, 3), np.uint8), thickness=0.014, visible=False
-        )
-        self._fan = server.scene.add_line_segments(
-            "/fan", empty, np.zeros((1, 2, 3), np.uint8), thickness=0.005, visible=False
-        )
+        self._trail = add_lines(server, "trail", empty, shades, _WIDTH_PX["trail"])
+        self._fan = add_lines(server, "fan", empty, shades, _WIDTH_PX["fan"])
         self._drawn_fan: tuple[records.Fan, tuple[float, ...]] | None = None
 
     def show(self, snapshot: Snapshot, everything: bool = True) -> None:
         """Draw this instant."""
         layers = self.layers
         with self._server.atomic():
+            self._shade_grid()
             self._draw_task(self._stage.task_at(snapshot.task))
             self._task.visible = layers["task"] and self.knows_task
             self._robot.visible = layers["robot"] and snapshot.pose is not None
@@ -137,20 +137,16 @@ class Scene:
         course = task.course()
         size_m = max(4.0, 2.0 * math.ceil(1.5 * course.reach_m + 1.0))
         scene.set_up_direction("+z")
-        scene.add_grid(
-            "/ground",
-            width=size_m,
-            height=size_m,
-            cell_size=0.1 if size_m <= 4.0 else 0.5,
-            section_size=1.0,
-            cell_color=(225, 225, 225),
-            section_color=(170, 170, 170),
-            shadow_opacity=0.0,
-            position=(*course.middle_m, 0.0),
-        )
-        self._task = scene.add_line_segments(
-            "/task", _line(task), TASK_COLOUR, thickness=max(0.012, 0.006 * course.reach_m)
-        )
+        scene.configure_default_lights(cast_shadow=False)
+        scene.configure_environment_map(None)
+        scene.add_light_ambient("/ambient", intensity=1.6)
+        cells, sections = grid_lines(course.middle_m, size_m, 0.1 if size_m <= 4.0 else 0.5)
+        self._grid = [
+            add_lines(self._server, name, lines, colour, 1.0, visible=True)
+            for name, lines, colour in zip(("cells", "ground"), (cells, sections), _GRID_LIGHT, strict=True)
+        ]
+        self._shaded = LIGHT
+        self._task = add_lines(self._server, "task", _line(task), TASK_COLOUR, _WIDTH_PX["task"], visible=True)
         self._drawn_task = task
         camera = self._server.initial_camera
         camera.position, camera.look_at = first_camera(task)
@@ -204,6 +200,13 @@ class Scene:
         elif node.visible:
             node.visible = False
 
+    def _shade_grid(self) -> None:
+        if self.background != self._shaded:
+            self._shaded = self.background
+            colours = _GRID_DARK if self.background == DARK else _GRID_LIGHT
+            for lines, colour in zip(self._grid, colours, strict=True):
+                lines.colors = np.array(colour, np.uint8)
+
     def _draw_task(self, task: RobotTask) -> None:
         if task != self._drawn_task:
             self._task.points = _line(task).astype(np.float32)
@@ -229,10 +232,10 @@ class Scene:
         self._fan.visible, self._drawn_fan = True, (fan, self.background)
 
     def _draw_trail(self, snapshot: Snapshot) -> None:
-        trail = snapshot.trail
-        visible = self.layers["trail"] and len(trail) >= 2
+        visible = self.layers["trail"] and len(snapshot.trail) >= 2
         if visible:
             course = self._stage.task_at(snapshot.task).course()
+            trail = sparse(snapshot.trail, course.reach_m)
             near = distance_colours(course.off_m(trail), TRAIL_FULL_M)
             colours = faded(near, trail, _TRAIL_REACHES * course.reach_m, self.background)
             points = segments(trail, _TRAIL_M)
@@ -270,6 +273,48 @@ class Scene:
         return np.concatenate([segments(path, _POINTS_M) for path in paths]) if len(paths) else np.empty((0, 2, 3))
 
 
+def add_lines(
+    server: viser.ViserServer,
+    name: str,
+    lines: Array,
+    colours: tuple[int, int, int] | Bytes,
+    width_px: float,
+    visible: bool = False,
+) -> viser.LineSegmentsHandle:
+    """Line segments (N, 2, 3) m of one width on the screen, whatever the distance."""
+    return server.scene.add_line_segments(
+        f"/{name}", lines, colours, thickness=width_px, thickness_units="screen", visible=visible
+    )
+
+
+def grid_lines(middle_m: tuple[float, float], size_m: float, cell_m: float) -> tuple[Array, Array]:
+    """Lines (N, 2, 3) of a square on the floor: every `cell_m`, and every metre, which the first leave out."""
+    reach = 0.5 * size_m
+    offsets = np.arange(round(size_m / cell_m) + 1) * cell_m - reach
+    at_metre = np.abs(offsets - np.round(offsets)) < 1e-9
+
+    def lines(offsets: Array) -> Array:
+        along, ends = np.repeat(offsets[:, None], 2, axis=1), np.tile((-reach, reach), (len(offsets), 1))
+        both = np.concatenate((np.stack((along, ends), axis=-1), np.stack((ends, along), axis=-1))) + middle_m
+        return np.concatenate((both, np.zeros((*both.shape[:2], 1))), axis=-1)
+
+    return lines(offsets[~at_metre]), lines(offsets[at_metre])
+
+
+def sparse(trail: Array, reach_m: float) -> Array:
+    """The points (N, 2) of a trail that are worth drawing, both ends among them: by distance, fewer where it is palest.
+
+    A growing trail keeps the points it has, but for those that fall behind.
+    """
+    driven_m = np.append(0.0, np.cumsum(np.hypot(*np.diff(trail, axis=0).T)))
+    old = driven_m[-1] - driven_m > _TRAIL_REACHES * reach_m
+    mark = np.floor(driven_m / (_TRAIL_STEP * reach_m))
+    mark[old] = np.floor(driven_m[old] / (_OLD_TRAIL_STEP * reach_m)) * (_OLD_TRAIL_STEP / _TRAIL_STEP)
+    kept = np.append(True, np.diff(mark) > 0.0)
+    kept[-1] = True
+    return np.asarray(trail[kept])
+
+
 def _line(task: RobotTask) -> Array:
     return segments(task.course().outline_m(), _TASK_M)
 
@@ -293,8 +338,6 @@ def _crosses(points: Array, arm_m: float, height_m: float) -> Array:
         strokes.append(np.stack((np.hstack((points - arm, height)), np.hstack((points + arm, height))), axis=1))
     return np.concatenate(strokes)
 
-
-Bytes = NDArray[np.uint8]
 
 ELLIPSE_95 = 5.991464547107979
 """Squared Mahalanobis radius that holds 95 % of a Gaussian over the plane."""

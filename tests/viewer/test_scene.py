@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from viser.infra import WebsockServer
 
 from disco_hw.log import records
 from disco_hw.runtime.task_change import record_of
@@ -95,9 +96,9 @@ def test_the_circle_is_the_tasks_and_follows_its_changes(scene, shot):
 
 def test_the_trail_is_coloured_by_the_distance_to_the_task_in_force(scene, shot):
     scene.show(shot)
-    on_it = np.array(scene._trail.colors)[-1, 0]
+    on_it = np.array(scene._trail.colors)[-1, 1]
     scene.show(replace(shot, task=record_of(0, CircleTask(radius_m=0.5))))
-    off_it = np.asarray(scene._trail.colors)[-1, 0]
+    off_it = np.asarray(scene._trail.colors)[-1, 1]
     assert tuple(on_it) == tuple(scene_module.distance_colours(np.zeros(1), scene_module.TRAIL_FULL_M)[0])
     assert tuple(off_it) == tuple(scene_module.distance_colours(np.full(1, 0.25), scene_module.TRAIL_FULL_M)[0])
 
@@ -120,6 +121,60 @@ def test_the_trail_lies_below_all_else_and_fades_behind_the_robot(scene, shot):
     scene.background = scene_module.DARK
     scene.show(laps)
     assert np.asarray(scene._trail.colors)[0, 0].max() < 60
+
+
+def test_the_trail_has_few_points_and_is_nowhere_beside_what_was_driven(scene, shot):
+    laps = np.linspace(0.0, 40.0 * math.pi, 15_000)
+    driven = 0.75 * np.column_stack((np.cos(laps), np.sin(laps)))
+    standing = np.repeat(driven[-1:], 3000, axis=0)
+    scene.show(replace(shot, trail=np.concatenate((driven, standing))))
+    points = np.asarray(scene._trail.points)[..., :2]
+    assert len(points) < 900
+    assert np.array_equal(points[1:, 0], points[:-1, 1])
+    assert points[0, 0] == pytest.approx(driven[0])
+    assert points[-1, 1] == pytest.approx(driven[-1])
+    off_m = 0.75 - np.hypot(*points.mean(axis=1).T)
+    assert off_m.max() < 0.005
+    assert off_m[-190:].max() < 0.0005
+
+
+def test_a_growing_trail_keeps_the_points_near_the_robot():
+    around = np.linspace(0.0, 2.0 * math.pi, 600)
+    driven = 0.75 * np.column_stack((np.cos(around), np.sin(around)))
+    shorter, longer = (scene_module.sparse(driven[:count], 0.75) for count in (550, 600))
+    assert longer[: len(shorter) - 1].tolist() == shorter[:-1].tolist()
+
+
+def test_nothing_is_drawn_that_costs_a_browser_without_a_graphics_card_ten_times_as_much(stage, monkeypatch):
+    sent = []
+    queue = WebsockServer.queue_message
+    monkeypatch.setattr(
+        WebsockServer, "queue_message", lambda self, message: (sent.append(message), queue(self, message))[1]
+    )
+    with serving("test", port=0) as page:
+        Scene(page.server, stage)
+    lines = [message.props.thickness_units for message in sent if hasattr(message, "props")
+             and hasattr(message.props, "thickness_units")]  # fmt: skip
+    assert len(lines) == 10
+    assert set(lines) == {"screen"}
+    assert not any(type(message).__name__ == "GridMessage" for message in sent)
+    said = {type(message).__name__: message for message in sent}
+    assert not said["EnableLightsMessage"].cast_shadow
+    assert said["EnvironmentMapMessage"].hdri_data is None
+
+
+def test_the_grid_has_a_line_every_metre_and_pales_in_the_dark(scene, shot):
+    cells, metres = scene_module.grid_lines((1.0, 2.0), 4.0, 0.5)
+    assert len(metres) == 2 * 5
+    assert len(cells) == 2 * 4
+    assert {float(x_m) for x_m in metres[:5, 0, 0]} == {-1.0, 0.0, 1.0, 2.0, 3.0}
+    assert metres[:5, :, 1].tolist() == [[0.0, 4.0]] * 5
+    scene.background = scene_module.DARK
+    scene.show(shot)
+    assert max(np.asarray(lines.colors).max() for lines in scene._grid) < 90
+    scene.background = scene_module.LIGHT
+    scene.show(shot)
+    assert min(np.asarray(lines.colors).min() for lines in scene._grid) > 180
 
 
 def test_the_fan_is_shaded_by_weight_and_the_weightiest_lies_on_top(scene, shot):
