@@ -9,40 +9,41 @@ from disco_hw.jit import cast_like, scalar_function
 
 
 def plain(left: Value, right: Value, values: Values) -> tuple[Value, Value]:
-    """d = (u_R - u_L) / 2 -> sign(d) max(|d| - load, 0); the mean of the wheel speeds is kept.
+    """u_L -> u_L + taken, u_R -> u_R - taken; taken = clip(d, -load, load), d half the difference of the rims.
 
     A servo of stiffness k (N m for each rad/s that a side is too slow) loses load = mu m g L / (8 k) to the Coulomb
     friction of four wheels that are dragged sideways, L their wheelbase and k that of a side's motors together: the
-    moment of scrub does not grow with the turn (Wong, Theory of Ground Vehicles, 2008, ch. 6).
+    moment of scrub does not grow with the turn (Wong, Theory of Ground Vehicles, 2008, ch. 6). What the floor holds
+    together are the rims: of wheels that are `unequal`, r_R = r (1 + unequal) and r_L = r (1 - unequal), the larger one
+    turns more slowly, d = ((1 + unequal) u_R - (1 - unequal) u_L) / 2.
     """
-    (load,) = values
-    mean, half = (left + right) / 2.0, (right - left) / 2.0
-    half = np.sign(half) * np.maximum(np.abs(half) - load, 0.0)
-    return mean - half, mean + half
+    load, unequal = values
+    half = (right - left) / 2.0 + unequal * (left + right) / 2.0
+    taken = np.clip(half, -load, load)
+    return left + taken, right - taken
 
 
 def coefficients(values: Array, base: Array, step_s: float) -> tuple[Array, ...]:
-    """The load, (L,)."""
-    return (values[:, 0],)
+    """The load and by how much the wheels are unequal, (L,) each."""
+    return values[:, 0], values[:, 1]
 
 
 @scalar_function
-def term(left: float, right: float, coefficients: tuple[float] | None) -> tuple[float, float]:
+def term(left: float, right: float, coefficients: tuple[float, float] | None) -> tuple[float, float]:
     """Wheel speeds that the load leaves of the commands (rad/s)."""
     if coefficients is None:
         return left, right
-    (load,) = coefficients
+    load, unequal = coefficients
     half = cast_like(0.5, left)
-    mean, difference = half * (left + right), half * (right - left)
-    difference -= min(max(difference, -load), load)
-    return mean - difference, mean + difference
+    taken = min(max(half * (right - left + unequal * (left + right)), -load), load)
+    return left + taken, right - taken
 
 
 def starts(driven: CommandedDrive) -> tuple[tuple[float, ...], ...]:
     """A fit begins where a part of the turning that was commanded is lost."""
     half = 0.5 * np.abs(driven.commands[:, 1] - driven.commands[:, 0])
     turning = half[half > 0.02 * driven.largest_speed_rad_s]
-    return tuple((share * float(np.median(turning)),) for share in (0.1, 0.4)) if turning.size else ()
+    return tuple((share * float(np.median(turning)), 0.0) for share in (0.1, 0.4)) if turning.size else ()
 
 
 EFFECT = Effect(
@@ -50,7 +51,10 @@ EFFECT = Effect(
     channel=Channel.COMMAND_TO_WHEEL,
     stage=Stage.COMMAND,
     order=45,
-    parameters=(Parameter("load_rad_s", "rad/s", 0.0, 5.0, 0.3, realistic=0.25),),
+    parameters=(
+        Parameter("load_rad_s", "rad/s", 0.0, 5.0, 0.3, realistic=0.25),
+        Parameter("unequal", "1", -0.2, 0.2, 0.0),
+    ),
     plain=plain,
     coefficients=coefficients,
     term=term,

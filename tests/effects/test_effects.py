@@ -82,7 +82,7 @@ def test_effects_describe_themselves(effect):
         ("yaw_acceleration_limit", {"limit_rad_s2": 2.0}, THERE_AND_BACK),
         ("battery_sag", {"loss": 0.5}, START_STOP),
         ("wheel_gain", {"left": -0.1, "right": 0.05}, TURN),
-        ("turning_load", {"load_rad_s": 0.4}, TURN),
+        ("turning_load", {"load_rad_s": 0.4, "unequal": 0.02}, TURN),
         ("wheel_radius_asymmetry", {"ratio": 0.03}, STRAIGHT),
         ("turn_slip", {"k_s": 0.2}, SPIN),
         ("acceleration_slip", {"k_s2_m": 0.2}, START_STOP),
@@ -118,13 +118,26 @@ def test_yaw_rate_limit_keeps_the_mean_and_cuts_the_turn():
     assert states[-1, 3:].mean() == pytest.approx(3.5)
 
 
+def loaded(left, right, unequal=0.0):
+    """Wheel speeds that a turning load of 0.4 rad/s leaves of constant commands."""
+    values = {"load_rad_s": 0.4, "unequal": unequal}
+    return free_run({"turning_load": values}, np.tile([left, right], (3, 1)))[-1, 3:]
+
+
 def test_a_turning_load_takes_as_much_from_every_turn_and_nothing_from_a_straight():
     for half in (-3.0, -0.6, 0.6, 3.0):
-        left, right = free_run({"turning_load": {"load_rad_s": 0.4}}, np.tile([2.0 - half, 2.0 + half], (3, 1)))[-1, 3:]
+        left, right = loaded(2.0 - half, 2.0 + half)
         assert (0.5 * (left + right), 0.5 * (right - left)) == pytest.approx((2.0, half - math.copysign(0.4, half)))
     # Where all of it is lost the robot drives straight on.
-    assert free_run({"turning_load": {"load_rad_s": 0.4}}, [[1.7, 2.3]])[-1, 3:] == pytest.approx([2.0, 2.0])
-    assert free_run({"turning_load": {"load_rad_s": 0.4}}, STRAIGHT)[-1, 3:] == pytest.approx([4.0, 4.0])
+    assert loaded(1.7, 2.3) == pytest.approx([2.0, 2.0])
+    assert loaded(4.0, 4.0) == pytest.approx([4.0, 4.0])
+
+
+@pytest.mark.parametrize("speed_rad_s", [-3.0, 0.5, 5.0])
+def test_a_turning_load_holds_the_rims_of_unequal_wheels_together(speed_rad_s):
+    left, right = loaded(speed_rad_s, speed_rad_s, unequal=0.03)
+    assert 1.03 * right == pytest.approx(0.97 * left)
+    assert 0.5 * (left + right) == pytest.approx(speed_rad_s)
 
 
 def test_yaw_acceleration_limit_keeps_the_mean_and_ramps_the_turn():

@@ -210,9 +210,12 @@ class Selector:
         return accepted
 
     def select(self, begin: Names = ()) -> Names:
-        """Forward, swap, backward, until nothing changes; from what is needed of a set to begin with."""
+        """Forward, swap, backward, until nothing changes; from what is needed of a set to begin with.
+
+        Swaps and drops may come back to a set that was there before: then it is the best of those on the way.
+        """
         accepted = self._backward(begin) if begin else self.given
-        visited = {frozenset(accepted)}
+        visited = {frozenset(accepted): accepted}
         while len(accepted) < self.settings.most_effects:
             ranked = self.ranked(accepted)
             new = next((name for name in ranked if self.acceptable(accepted, (*accepted, name))), None)
@@ -220,10 +223,13 @@ class Selector:
                 break
             larger = self._backward(self._swapped((*accepted, new)))
             if frozenset(larger) in visited:
-                break
-            visited.add(frozenset(larger))
-            accepted = larger
+                return min(visited.values(), key=self._priced)
+            visited[frozenset(larger)] = accepted = larger
         return accepted
+
+    def _priced(self, names: Names) -> float:
+        """Misfit of a set in nats with half the price of its parameters."""
+        return float(self.fit(names).cost + 0.5 * parameters_of(names) * np.log(self.channel.count))
 
     def _swapped(self, accepted: Names) -> Names:
         """Replace single effects as long as that fits better by more than the parameters' price."""

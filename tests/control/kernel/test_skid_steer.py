@@ -53,7 +53,7 @@ FULL = {
     "yaw_acceleration_limit": {"limit_rad_s2": st.floats(0.5, 50.0)},
     "battery_sag": {"loss": st.floats(0.0, 0.5)},
     "wheel_gain": {"left": st.floats(-0.1, 0.1), "right": st.floats(-0.1, 0.1)},
-    "turning_load": {"load_rad_s": st.floats(0.0, 1.5)},
+    "turning_load": {"load_rad_s": st.floats(0.0, 1.5), "unequal": st.floats(-0.05, 0.05)},
     "wheel_radius_asymmetry": {"ratio": st.floats(-0.05, 0.05)},
     "turn_slip": {"k_s": st.floats(-0.1, 0.3)},
     "acceleration_slip": {"k_s2_m": st.floats(-0.1, 0.3)},
