@@ -1,12 +1,14 @@
 """What models learnt from one half of a measured log predict of the other, end to end: the table of `docs/gap.md`.
 
-`DISCO_HW_DATA=FOLDER python -m tools.gap_halves [NAME...]`: logs whose path holds a NAME, all without one. For either
-half: the stage that is offered, the errors 2 s ahead on the half that was not seen, of every stage, and how many of its
-95 % intervals hold what the other half says of the same parameters, where that knows them half as well or better.
+`DISCO_HW_DATA=FOLDER python -m tools.gap_halves [--days] [NAME...]`: logs whose path holds a NAME, all without one. For
+either half: the stage that is offered, the errors 2 s ahead on the half that was not seen, of every stage, and how many
+of its 95 % intervals hold what the other half says of the same parameters, where that knows half as much of them.
+With `--days` the same of whole logs: each learnt from, and every other one of the same robot predicted.
 """
 
 from __future__ import annotations
 
+import argparse
 import os
 import sys
 import time
@@ -46,10 +48,9 @@ STAGES = ("refitted", "timed", "amended")
 
 @dataclass(frozen=True)
 class Half:
-    """What one half of a log taught: the stage offered, and by stage the errors 2 s ahead on the other half."""
+    """What a half of a log, or a log, taught: the stage offered, and by stage the errors 2 s ahead on another one."""
 
-    log: str
-    half: int
+    learnt_from: str
     offered: str
     names: tuple[str, ...]
     unseen: dict[str, PredictionErrors]
@@ -115,32 +116,70 @@ def intervals_held(analysis: GapAnalysis, final: FinalFit, other: GapAnalysis) -
     return held
 
 
+@dataclass(frozen=True)
+class Part:
+    """A log or a part of one, and what the search said of it."""
+
+    name: str
+    log: DriveLog
+    analysis: GapAnalysis
+    cpu_s: float
+
+    @classmethod
+    def search(cls, name: str, log: DriveLog, nominal: Model) -> Part:
+        """Search it."""
+        began = time.process_time()
+        analysis, _ = search(log, nominal)
+        return cls(name, log, analysis, time.process_time() - began)
+
+
+def read(path: Path) -> tuple[DriveLog, Model]:
+    """A log, and the model of its robot as drawn."""
+    ticks, radius_m, axial_m = ROBOTS[path.parent.name]
+    return load_drive(path, ticks, radius_m), Model(radius_m, axial_m, 0.0)
+
+
+def taught(part: Part, others: Sequence[Part], nominal: Model) -> Iterator[Half]:
+    """What a part taught of each of some others."""
+    began = time.process_time()
+    final = final_fit(part.analysis)
+    predictions = joint_predictions(part.analysis, final)
+    offered = offered_stage(predictions.table(), part.analysis.found_any, DEFAULT_SETTINGS)
+    cpu_s = part.cpu_s + time.process_time() - began
+    models = {stage: model_of(stage, nominal, part.analysis, final, predictions)[0] for stage in STAGES}
+    names = tuple(
+        name for found in (part.analysis.wheels, part.analysis.body) if found is not None
+        for name in (*found.names, *(term.form for term in found.unnamed))
+    )  # fmt: skip
+    for other in others:
+        held = intervals_held(part.analysis, final, other.analysis)
+        name = part.name if len(others) == 1 else f"{part.name} -> {other.name}"
+        yield Half(name, offered, names, unseen_errors(grid_drive(other.log), models), held, cpu_s)
+        cpu_s = 0.0
+
+
 def halves(path: Path) -> Iterator[Half]:
     """Both halves of a log, each learnt from and the other one predicted."""
-    ticks, radius_m, axial_m = ROBOTS[path.parent.name]
-    log, nominal = load_drive(path, ticks, radius_m), Model(radius_m, axial_m, 0.0)
+    log, nominal = read(path)
     middle_s = 0.5 * (float(log.wheels.t_s[0]) + float(log.wheels.t_s[-1]))
-    parts = between(log, -np.inf, middle_s), between(log, middle_s, np.inf)
-    analyses = []
-    for part in parts:
-        began = time.process_time()
-        analyses.append((search(part, nominal)[0], time.process_time() - began))
-    for half, (analysis, searched_s) in enumerate(analyses):
-        if analysis.body is None:
-            continue
-        began = time.process_time()
-        final = final_fit(analysis)
-        predictions = joint_predictions(analysis, final)
-        offered = offered_stage(predictions.table(), analysis.found_any, DEFAULT_SETTINGS)
-        cpu_s = searched_s + time.process_time() - began
-        held = intervals_held(analysis, final, analyses[1 - half][0])
-        models = {stage: model_of(stage, nominal, analysis, final, predictions)[0] for stage in STAGES}
-        names = tuple(
-            name for found in (analysis.wheels, analysis.body) if found is not None
-            for name in (*found.names, *(term.form for term in found.unnamed))
-        )  # fmt: skip
-        errors = unseen_errors(grid_drive(parts[1 - half]), models)
-        yield Half(path.stem, half + 1, offered, names, errors, held, cpu_s)
+    parts = [
+        Part.search(f"{path.stem} {number}", cut, nominal)
+        for number, cut in enumerate((between(log, -np.inf, middle_s), between(log, middle_s, np.inf)), 1)
+    ]
+    for part, other in (parts, parts[::-1]):
+        if part.analysis.body is not None:
+            yield from taught(part, (other,), nominal)
+
+
+def days(paths: Sequence[Path]) -> Iterator[Half]:
+    """Each log with poses learnt from and every other one of the same robot predicted."""
+    for robot in ROBOTS:
+        own = [(path, *read(path)) for path in paths if path.parent.name == robot]
+        parts = [Part.search(path.stem, log, nominal) for path, log, nominal in own if log.poses.t_s.size]
+        for part in parts:
+            others = [other for other in parts if other is not part]
+            if part.analysis.body is not None and others:
+                yield from taught(part, others, own[0][2])
 
 
 def row(of: Half) -> str:
@@ -148,32 +187,39 @@ def row(of: Half) -> str:
     cells = [f"{1e3 * of.unseen[stage].position_m:.1f} / {1e3 * of.unseen[stage].yaw_rad:.0f}" for stage in STAGES]
     position, yaw = of.ratios(of.offered)
     held = f"{sum(of.held.values())} of {len(of.held)}"
-    return f"| {of.log} {of.half} | {' | '.join(cells)} | {of.offered} | {position:.2f} / {yaw:.2f} | {held} |"
+    return f"| {of.learnt_from} | {' | '.join(cells)} | {of.offered} | {position:.2f} / {yaw:.2f} | {held} |"
 
 
-def main(names: Sequence[str]) -> int:
+def measured_logs(names: Sequence[str]) -> list[Path]:
+    """The logs under DISCO_HW_DATA whose path holds one of the names, shortest first; all without a name."""
     folder = Path(os.environ["DISCO_HW_DATA"])
-    paths = [path for robot in ROBOTS for path in sorted((folder / robot).glob("*.csv"))]
-    paths = [path for path in paths if not names or any(name in str(path) for name in names)]
+    paths = [path for robot in ROBOTS for path in (folder / robot).glob("*.csv")]
+    chosen = (path for path in paths if not names or any(name in str(path) for name in names))
+    return sorted(chosen, key=lambda path: path.stat().st_size)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="python -m tools.gap_halves", description=(__doc__ or "").split(":")[0])
+    parser.add_argument("names", nargs="*", metavar="NAME", help="logs whose path holds it (all)")
+    parser.add_argument("--days", action="store_true", help="whole logs of one robot predict each other")
+    options = parser.parse_args(arguments)
+    paths = measured_logs(options.names)
     head = "refitted, mm / mrad | timed | amended | offered | offered over timed | intervals hold"
-    print(f"| log, half learnt from | {head} |")
+    print(f"| learnt from | {head} |")
     print("|---|---|---|---|---|---|---|")
     found = []
-    for path in paths:
-        for half in halves(path):
-            found.append(half)
-            print(row(half), flush=True)
+    for half in days(paths) if options.days else (half for path in paths for half in halves(path)):
+        found.append(half)
+        print(row(half), flush=True)
     worse = [half for half in found if half.offered != "timed" and max(half.ratios(half.offered)) > 1.05]
     better = [half for half in found if min(half.ratios(half.offered)) < 0.8 and max(half.ratios(half.offered)) <= 1.05]
     print(f"\noffered worse than timed by over 5 %: {len(worse)} of {len(found)}; better by 20 %: {len(better)}")
     held = [inside for half in found for inside in half.held.values()]
-    print(f"95 % intervals that hold the other half's value: {sum(held)} of {len(held)}")
-    missed = sorted(
-        f"{half.log} {half.half} {name}" for half in found for name, inside in half.held.items() if not inside
-    )
+    print(f"95 % intervals that hold the other one's value: {sum(held)} of {len(held)}")
+    missed = sorted(f"{half.learnt_from} {name}" for half in found for name, inside in half.held.items() if not inside)
     print(f"not: {', '.join(missed)}; CPU {sum(half.cpu_s for half in found):.0f} s")
     return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(main())

@@ -1,0 +1,128 @@
+"""Whether measured logs whose poses or commands are moved in time are found moved by as much, and nothing else said.
+
+`DISCO_HW_DATA=FOLDER python -m tools.gap_shifts [NAME...]`: logs whose path holds a NAME, all without one. Poses are
+moved by -0.32 to 0.32 s and the channel from wheel to body is searched, commands by 0.1 to 0.4 s and that from command
+to wheel. Found: within 20 ms of what the log itself shows and the move; a name that the log itself has not is one too
+many.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+# Each process works alone on one log: a second thread for its small matrices would only be in another one's way.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+from disco_hw.gap.data.gridded_drive import grid_drive
+from disco_hw.gap.data.layout import BODY, WHEEL
+from disco_hw.gap.search.channel_search import ChannelResult, search_body, search_wheels
+from disco_hw.gap.search.richest_model import LATE, LATE_COLUMNS, OLD_POSE_COLUMNS
+from disco_hw.log.drive import DriveLog
+from tools.gap_halves import measured_logs, read, vector
+
+POSES_BY_S = (-0.32, -0.2, -0.1, 0.1, 0.2, 0.32)
+COMMANDS_BY_S = (0.1, 0.2, 0.4)
+WITHIN_S = 0.02
+POSE_TIME = tuple(column.partition(".")[0] for column in OLD_POSE_COLUMNS)
+
+
+@dataclass(frozen=True)
+class Shift:
+    """What one search said of a log moved by `moved_s`: how far it is found moved, and names that it has besides."""
+
+    log: str
+    part: str
+    moved_s: float
+    found_s: float
+    besides: tuple[str, ...]
+
+    @property
+    def found(self) -> bool:
+        """Whether the move was found."""
+        return abs(self.found_s - self.moved_s) <= WITHIN_S
+
+
+def told(found: ChannelResult) -> set[str]:
+    """Every name and form that a search of a channel came to."""
+    return {*found.names, *(form_of(term.form) for term in found.unnamed)}
+
+
+def form_of(text: str) -> str:
+    """A term as it is written, without its coefficient."""
+    target, _, rest = text.partition(" += ")
+    return f"{target} += k {rest.partition(' ')[2]}"
+
+
+def late_s(found: ChannelResult, columns: Sequence[str]) -> float:
+    """Sum of what was found of some delays, s; what has no name is none."""
+    place = found.selector.channel.layout.place
+    return sum(float(found.fit.vector[place[each]]) for each in columns if each.partition(".")[0] in found.names)
+
+
+def moved(log: DriveLog, part: str, by_s: float) -> DriveLog:
+    """The log with the stamps of its poses or commands moved."""
+    samples = getattr(log, part)
+    return replace(log, **{part: replace(samples, t_s=samples.t_s + by_s)})
+
+
+def compare(
+    log: str, part: str, searched: Mapping[float, ChannelResult], columns: Sequence[str], names: Sequence[str]
+) -> Iterator[Shift]:
+    """The moves of one part of a log against the log itself, which was moved by 0; commands that are late shorten the
+    answer.
+    """
+    plain, sign = searched[0.0], -1.0 if part == "commands" else 1.0
+    for by_s, one in searched.items():
+        if by_s:
+            found_s = sign * (late_s(one, columns) - late_s(plain, columns))
+            yield Shift(log, part, by_s, found_s, tuple(sorted(told(one) - told(plain) - set(names))))
+
+
+def shifts(path: Path) -> Iterator[Shift]:
+    """Every move of a log."""
+    log, nominal = read(path)
+    body, wheels = vector(BODY, nominal), vector(WHEEL, nominal)
+    drive = grid_drive(log)
+    geometry = body[:3]
+    if drive.has_poses:
+        searched = {by_s: search_body(grid_drive(moved(log, "poses", by_s)), body) for by_s in (0.0, *POSES_BY_S)}
+        geometry = searched[0.0].fit.vector[:3]
+        yield from compare(path.stem, "poses", searched, OLD_POSE_COLUMNS, POSE_TIME)
+    if drive.has_commands:
+        searched = {
+            by_s: search_wheels(grid_drive(moved(log, "commands", by_s)), geometry, wheels)
+            for by_s in (0.0, *COMMANDS_BY_S)
+        }
+        yield from compare(path.stem, "commands", searched, LATE_COLUMNS, LATE)
+
+
+def row(of: Shift) -> str:
+    """One line of the table."""
+    cells = (of.log, of.part, f"{of.moved_s:+.2f}", f"{of.found_s:+.3f}", "" if of.found else "no")
+    return f"| {' | '.join([*cells, ', '.join(of.besides).replace('|', chr(92) + '|')])} |"
+
+
+def main(names: Sequence[str]) -> int:
+    print("| log | moved | by, s | found, s | within 20 ms | named besides |")
+    print("|---|---|---|---|---|---|")
+    found: list[Shift] = []
+    began = time.process_time()
+    for path in measured_logs(names):
+        for shift in shifts(path):
+            found.append(shift)
+            print(row(shift), flush=True)
+    for part in ("poses", "commands"):
+        own = [shift for shift in found if shift.part == part]
+        alone = sum(not shift.besides for shift in own)
+        print(f"\n{part}: found within 20 ms {sum(shift.found for shift in own)} of {len(own)}, alone {alone}")
+    print(f"CPU {time.process_time() - began:.0f} s")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
