@@ -19,9 +19,8 @@ $(BIN)/python:
 		{ echo "Python >= 3.11 is needed: make PYTHON=/path/to/python3.11 $(MAKECMDGOALS)"; exit 2; }
 	$(PYTHON) -m venv $(VENV)
 
-# Without --no-compile half of the time goes into compiling twelve thousand files, of which a sixth is ever imported.
 $(STAMP): $(SOURCES) | $(BIN)/python
-	PIP_CONSTRAINT=constraints.txt $(BIN)/python -m pip install --disable-pip-version-check --quiet --no-compile -e '.[dev]'
+	$(BIN)/python tools/install.py '.[dev]'
 	@touch $@
 
 demo: $(STAMP)
