@@ -13,7 +13,7 @@ settings.register_profile("search", deadline=None, print_blob=True)
 settings.load_profile("project")
 
 ROBOT_TESTS = Path(__file__).parent / "robot"
-REAL_TIME = "tests/hil/"
+REAL_TIME = ("tests/hil/", "tests/firmware_protocol/emulated/")
 
 
 class FilesToWorkers(LoadScopeScheduling):
@@ -23,7 +23,7 @@ class FilesToWorkers(LoadScopeScheduling):
     """
 
     def _split_scope(self, nodeid: str) -> str:
-        return REAL_TIME if nodeid.startswith(REAL_TIME) else nodeid.split("::", 1)[0]
+        return REAL_TIME[0] if nodeid.startswith(REAL_TIME) else nodeid.split("::", 1)[0]
 
 
 @pytest.hookimpl(optionalhook=True)

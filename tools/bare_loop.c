@@ -1,11 +1,14 @@
-/* The yardstick of tools/soak.py: a thread that sleeps to the end of each period and does nothing else.
+/* A yardstick: a thread that sleeps to the end of each period and does nothing else.
  *
- *     bare_loop PERIOD_US PRIORITY
+ *     bare_loop PERIOD_US PRIORITY [CPU LEAST_US]
  *
- * Prints how late it woke (p50, p99, p99.9 and the longest, in us, as JSON) when its standard input is closed. */
+ * Prints how late it woke (p50, p99, p99.9 and the longest, in us, as JSON) when its standard input is closed. With a
+ * processor to stay on it prints, as it happens, from when to when (CLOCK_MONOTONIC, ns) it was not run for longer than
+ * LEAST_US: at the highest priority, a time in which nobody was. */
 #define _GNU_SOURCE
 #include <poll.h>
 #include <sched.h>
+#include <stdbool.h>
 #include <stdint.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -29,9 +32,20 @@ static double at_us(size_t count, double part)
 
 int main(int count_arguments, char **arguments)
 {
-    if (count_arguments != 3) {
-        fprintf(stderr, "usage: bare_loop PERIOD_US PRIORITY\n");
+    if (count_arguments != 3 && count_arguments != 5) {
+        fprintf(stderr, "usage: bare_loop PERIOD_US PRIORITY [CPU LEAST_US]\n");
         return 2;
+    }
+    const bool watches = count_arguments == 5;
+    const int64_t least_ns = watches ? 1000 * atoll(arguments[4]) : 0;
+    if (watches) {
+        cpu_set_t only;
+        CPU_ZERO(&only);
+        CPU_SET(atoi(arguments[3]), &only);
+        if (sched_setaffinity(0, sizeof only, &only) != 0) {
+            perror("bare_loop: CPU");
+            return 1;
+        }
     }
     const int64_t period_ns = 1000 * atoll(arguments[1]);
     const struct sched_param priority = {.sched_priority = atoi(arguments[2])};
@@ -50,10 +64,17 @@ int main(int count_arguments, char **arguments)
         const struct timespec due = {.tv_sec = due_ns / 1000000000, .tv_nsec = due_ns % 1000000000};
         clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &due, NULL);
         clock_gettime(CLOCK_MONOTONIC, &now);
-        late_ns[count++] = (int64_t)now.tv_sec * 1000000000 + now.tv_nsec - due_ns;
-        if (late_ns[count - 1] > period_ns)
-            due_ns += late_ns[count - 1] / period_ns * period_ns;
+        late_ns[count] = (int64_t)now.tv_sec * 1000000000 + now.tv_nsec - due_ns;
+        if (watches && late_ns[count] > least_ns) {
+            printf("%lld %lld\n", (long long)due_ns, (long long)(due_ns + late_ns[count]));
+            fflush(stdout);
+        }
+        if (late_ns[count] > period_ns)
+            due_ns += late_ns[count] / period_ns * period_ns;
+        count++;
     }
+    if (watches)
+        return 0;
     if (count == 0)
         return 1;
     qsort(late_ns, count, sizeof late_ns[0], ascending);

@@ -1,4 +1,7 @@
-"""The firmware on an emulated microcontroller: compiled for a Cortex-M and run by QEMU, its serial line a terminal.
+"""The firmware on an emulated microcontroller: compiled for a Cortex-M and run by QEMU.
+
+Its serial line is a socket, whose bytes whoever writes them delivers himself; or a terminal, as a program or a library
+may want one, whose bytes are carried by a thread of the kernel that has no priority and is late beside other work.
 
     python -m tools.emulated_board [--processor m4f] [--key FILE] [--slcan] [--plant-line]   until Ctrl-C, to play with
 
@@ -117,7 +120,6 @@ class Bench:
     def __init__(self, path: Path) -> None:
         self.rows: list[Truth] = []
         deadline = time.monotonic() + _START_S
-        # The emulator makes it after the terminal.
         while not path.exists():
             if time.monotonic() > deadline:
                 raise TimeoutError("the emulator makes no bench")
@@ -166,7 +168,7 @@ def _truth(line: bytes) -> Truth | None:
 
 @dataclass(frozen=True, slots=True)
 class Board:
-    """A running board: the terminal of its serial line, its bench, and the emulator's process."""
+    """A running board: its serial line as `link.port` names it, its bench, and the emulator's process."""
 
     port: str
     bench: Bench
@@ -193,16 +195,28 @@ def _command(image: Path, processor: str, settings: list[str], *lines: str) -> l
 
 @contextlib.contextmanager
 def running_board(
-    image: Path, processor: str, *, entropy: int | None = None, first_us: int = 0, key: bytes = b""
+    image: Path,
+    processor: str,
+    *,
+    entropy: int | None = None,
+    first_us: int = 0,
+    key: bytes = b"",
+    terminal: bool = False,
 ) -> Iterator[Board]:
-    """Start QEMU with this image; it ends with the block. `first_us`: where the board's counter begins."""
+    """Start QEMU with this image; it ends with the block.
+
+    `first_us`: where the board's counter begins. `terminal`: its serial line is a terminal, and no socket.
+    """
     drawn = secrets.randbits(63) if entropy is None else entropy
     with tempfile.TemporaryDirectory(prefix="disco-hw-board-") as folder:
-        bench = Path(folder) / "bench"
-        command = _command(image, processor, _settings(drawn, first_us, key), "pty", f"unix:{bench},server=on,wait=off")
+        link, bench = Path(folder) / "link", Path(folder) / "bench"
+        lines = [f"unix:{path},server=on,wait=off" for path in (link, bench)]
+        if terminal:
+            lines[0] = "pty"
+        command = _command(image, processor, _settings(drawn, first_us, key), *lines)
         process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
         try:
-            (port,) = _ports_of(process, 1)
+            port = _ports_of(process, 1)[0] if terminal else f"unix://{link}"
             with contextlib.closing(Bench(bench)) as test_bench:
                 # When it tells something, all its threads are there.
                 test_bench.latest(_START_S)
@@ -288,7 +302,7 @@ def main() -> int:
             with running_bare_board(image, given.processor) as (link, plant):
                 print(f"ready {link} ({given.processor}), plant's line {plant}", flush=True)
                 signal.pause()
-        with running_board(image, given.processor, key=key) as board:
+        with running_board(image, given.processor, key=key, terminal=True) as board:
             print(f"ready {board.port} ({given.processor})", flush=True)
             board.process.wait()
     return 0

@@ -1,15 +1,20 @@
-"""A serial line (UART, USB adapter, pseudo-terminal): CAN frames tunnelled with COBS framing, or exchanges."""
+"""A serial line (UART, USB adapter, pseudo-terminal, socket): CAN frames tunnelled with COBS framing, or exchanges."""
 
 from __future__ import annotations
 
+import array
 import errno
+import fcntl
 import queue
+import socket
+import termios
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import serial
+from serial.urlhandler import protocol_socket
 
 from drivers.transport.reconnecting import (
     MUTE_AFTER_S,
@@ -31,6 +36,8 @@ _BITS_PER_BYTE = 10
 _LONGEST_REPLY = 600
 _FULL = "the line takes no more bytes; is the other end reading?"
 _DELIMITER = b"\0"
+_TCP, _UNIX = "socket://", "unix://"
+_CONNECT_S = 5.0
 
 
 def make_transport(
@@ -54,7 +61,7 @@ def make_transport(
 class SerialMedium:
     """A serial port by its device name or pyserial URL, at `baud` bit/s, 8 data bits, no parity, 1 stop bit.
 
-    `dtr`, `rts`: the levels of these lines while the port is open.
+    `unix://PATH` is a serial line over a Unix socket. `dtr`, `rts`: the levels of these lines while the port is open.
     """
 
     port: str
@@ -197,12 +204,55 @@ class ExchangeConnection:
         return None
 
 
+class SocketPort(protocol_socket.Serial):  # type: ignore[misc]  # pyserial has no types
+    """A serial line over a socket, as serial servers and emulators have it: `socket://HOST:PORT` or `unix://PATH`.
+
+    pyserial's own, which has no Unix sockets and is never told of more than one byte that waits: a call a byte.
+    """
+
+    _socket: socket.socket | None
+
+    def open(self) -> None:
+        """Connect. Raises `serial.SerialException`."""
+        if not self.portstr.startswith(_UNIX):
+            super().open()
+            return
+        line = socket.socket(socket.AF_UNIX)
+        line.settimeout(_CONNECT_S)
+        try:
+            line.connect(self.portstr.removeprefix(_UNIX))
+        except OSError as error:
+            line.close()
+            raise serial.SerialException(f"could not connect: {error}") from error
+        line.setblocking(False)
+        self.logger, self._socket, self.is_open = None, line, True
+
+    @property
+    def in_waiting(self) -> int:
+        """Bytes that have come and were not read."""
+        if self._socket is None:
+            raise serial.PortNotOpenError
+        count = array.array("i", [0])
+        fcntl.ioctl(self._socket, termios.FIONREAD, count)
+        return count[0]
+
+    def close(self) -> None:
+        """Leave the line; safe to call twice."""
+        line, self._socket, self.is_open = self._socket, None, False
+        if line is not None:
+            line.close()
+
+
 def open_port(medium: SerialMedium, *, timeout_s: float, write_timeout_s: float, exclusive: bool) -> serial.Serial:
     """Open the port with its lines as `medium` says. Raises what pyserial raises.
 
     The lines are set before it is opened: pyserial would raise both, and boards that take that as a reset restart.
     """
-    port = serial.serial_for_url(medium.port, do_not_open=True, baudrate=medium.baud)
+    if medium.port.startswith((_TCP, _UNIX)):
+        port = SocketPort(baudrate=medium.baud)
+        port.port = medium.port
+    else:
+        port = serial.serial_for_url(medium.port, do_not_open=True, baudrate=medium.baud)
     port.timeout, port.write_timeout, port.exclusive = timeout_s, write_timeout_s, exclusive
     port.dtr, port.rts = medium.dtr, medium.rts
     port.open()
@@ -236,6 +286,8 @@ def error_number(error: BaseException) -> int | None:
 def explain_port(port: str, error: BaseException) -> str:
     """Say what went wrong with a serial port and what to do about it."""
     number = error_number(error)
+    if port.startswith((_TCP, _UNIX)) and number in (*_GONE, errno.ECONNREFUSED):
+        return f"{port}: nobody listens there; start the serial server or the emulator, or correct the port"
     if number in _GONE:
         return f"{port}: no such device; plug the adapter in, or correct the port (ls /dev/serial/by-id shows them)"
     if number in (errno.EACCES, errno.EPERM):

@@ -1,6 +1,7 @@
 """The serial transport on pseudo-terminals."""
 
 import re
+import socket
 import termios
 import time
 
@@ -8,7 +9,7 @@ import pytest
 import serial
 
 from drivers.transport.reconnecting import BackoffPolicy, ReconnectingTransport, TransportCounters
-from drivers.transport.serial import WRITE_TIMEOUT_S, SerialMedium, ask_for_low_latency
+from drivers.transport.serial import WRITE_TIMEOUT_S, SerialMedium, ask_for_low_latency, open_port
 from drivers.types import Frame, LinkState
 from firmware_protocol.serial_framing import FrameDecoder, encode_frame
 from tests.drivers.transport.pseudo_terminal import PseudoTerminal
@@ -222,3 +223,76 @@ def test_an_adapter_that_holds_bytes_back_is_told_not_to():
 def test_a_port_without_low_latency_is_used_as_it_is(error):
     ask_for_low_latency(FtdiPort(error))
     ask_for_low_latency(object())
+
+
+class Listener:
+    """The far end of a serial line over a socket, as an emulator or a serial server has it: one peer, then the next."""
+
+    def __init__(self, family, address):
+        self.server = socket.socket(family)
+        self.server.bind(address)
+        self.server.listen()
+        place = self.server.getsockname()
+        self.url = f"unix://{place}" if family is socket.AF_UNIX else f"socket://127.0.0.1:{place[1]}"
+        self.peer = None
+
+    def accept(self):
+        self.peer, _ = self.server.accept()
+
+    def received(self):
+        return FrameDecoder().feed(self.peer.recv(4096))
+
+    def close(self):
+        self.server.close()
+        if self.peer is not None:
+            self.peer.close()
+
+
+@pytest.fixture(params=["unix", "tcp"])
+def listener(request, tmp_path):
+    unix = request.param == "unix"
+    listener = Listener(socket.AF_UNIX, str(tmp_path / "line")) if unix else Listener(socket.AF_INET, ("127.0.0.1", 0))
+    yield listener
+    listener.close()
+
+
+def test_a_line_over_a_socket_carries_frames_both_ways_and_comes_back(listener):
+    transport = ReconnectingTransport(SerialMedium(listener.url, 115_200), backoff=FAST)
+    transport.open()
+    try:
+        for generation in (1, 2):
+            listener.accept()
+            wait_until(lambda: transport.state is LinkState.UP and transport.generation == generation)  # noqa: B023
+            listener.peer.sendall(LINE[:5])
+            time.sleep(0.002)
+            listener.peer.sendall(LINE[5:] + LINE)
+            assert [received.frame for received in collect(transport, 2)] == [FRAME, FRAME]
+            send(transport, outgoing(0x100, b"\x02"))
+            wait_until(lambda: listener.received() == [(0x100, b"\x02")])
+            listener.peer.close()
+        assert transport.stats.malformed == 0
+    finally:
+        transport.close()
+
+
+def test_what_waits_on_a_socket_is_read_at_once(listener):
+    """pyserial's own says that one byte waits, however many do: thousands of calls a second."""
+    with open_port(SerialMedium(listener.url, 115_200), timeout_s=1.0, write_timeout_s=1.0, exclusive=True) as port:
+        listener.accept()
+        listener.peer.sendall(20 * LINE)
+        assert port.read(1) == LINE[:1]
+        assert port.in_waiting == 20 * len(LINE) - 1
+        assert port.read(port.in_waiting) == (20 * LINE)[1:]
+    assert not port.is_open
+    with pytest.raises(serial.PortNotOpenError):
+        assert port.in_waiting
+
+
+def test_a_socket_at_which_nobody_listens_is_told_in_one_line(listener):
+    listener.close()
+    medium = SerialMedium(listener.url, 115_200)
+    with pytest.raises(serial.SerialException) as refused:
+        medium.connect(TransportCounters())
+    assert medium.explain(refused.value) == (
+        f"{listener.url}: nobody listens there; start the serial server or the emulator, or correct the port"
+    )

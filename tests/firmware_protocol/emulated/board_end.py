@@ -13,16 +13,19 @@ from tools.emulated_board import build_board, running_board
 
 
 class BoardEnd(LinkEnd):
-    """A board that runs until `close`, on its serial line; `bench` is its test bench."""
+    """A board that runs until `close`, on its serial line; `bench` is its test bench.
 
-    def __init__(self, processor, *, slcan=False, **settings):
+    python-can's slcan wants a terminal.
+    """
+
+    def __init__(self, processor, *, slcan=False, terminal=False, **settings):
         with contextlib.suppress(OSError):
             # For the transport's threads, too: a host that is late looks to the robot like a host that is silent.
             os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(20))
         with ExitStack() as stack:
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
             image = build_board(processor, folder, slcan=slcan)
-            self.board = stack.enter_context(running_board(image, processor, **settings))
+            self.board = stack.enter_context(running_board(image, processor, terminal=terminal or slcan, **settings))
             self.bench = self.board.bench
             self.slcan = slcan
             super().__init__(self.connected(), self.press_reset)

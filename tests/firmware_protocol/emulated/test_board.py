@@ -1,5 +1,6 @@
 """What no host can ask of a board: garbage, hosts that freeze, hangs, brown-outs, a clock that wraps."""
 
+import contextlib
 import os
 import random
 import signal
@@ -31,13 +32,25 @@ pytestmark = [
 ]
 
 
-@pytest.fixture(params=["m3", "m4f"])
-def host(request):
-    end = BoardEnd(request.param)
+@contextlib.contextmanager
+def settled(end):
     host = ProtocolHost(end, first_session=end.now_ns // 1000 % 255)
     host.settle()
     yield host
     end.close()
+
+
+@pytest.fixture(params=["m3", "m4f"])
+def host(request):
+    with settled(BoardEnd(request.param)) as host:
+        yield host
+
+
+@pytest.fixture(params=["m3", "m4f"])
+def host_at_a_terminal(request):
+    """A terminal, unlike a socket, has room for a second writer."""
+    with settled(BoardEnd(request.param, terminal=True)) as host:
+        yield host
 
 
 def restarted_with(host, what, fault):
@@ -105,7 +118,8 @@ def test_parameters_that_were_written_outlive_a_restart(host):
     assert ask(operation="READ", key=4, value=0.0) == 5.0
 
 
-def test_a_thousand_frames_of_garbage_move_nothing_and_leave_it_sound(host):
+def test_a_thousand_frames_of_garbage_move_nothing_and_leave_it_sound(host_at_a_terminal):
+    host = host_at_a_terminal
     draw = random.Random(24)
     pty = os.open(host.end.board.port, os.O_WRONLY | os.O_NOCTTY)
     host.request = host.command = None
@@ -209,7 +223,7 @@ def test_it_drives_a_virtual_robot_over_its_plants_line(tmp_path, processor):
 def test_behind_slcan_it_sits_on_the_mock_bus_beside_other_nodes(tmp_path, processor):
     image = build_board(processor, tmp_path, slcan=True)
     with (
-        running_board(image, processor) as board,
+        running_board(image, processor, terminal=True) as board,
         HubProcess(tmp_path / "bus", board.port, "sleep_after_open=0"),
     ):
         drive_beside_another_node(tmp_path / "bus")
