@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from disco_hw.errors import InputError
 from disco_hw.viewer import curves, scene
-from disco_hw.viewer.curves import Curves
-from disco_hw.viewer.plots import WINDOW_NS
+from disco_hw.viewer.curves import WINDOW_NS, Curves
 from disco_hw.viewer.recording import Recording, ShownRobot, model_in_force
 from disco_hw.viewer.scene import Scene
 from disco_hw.viewer.server import serving

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import viser
 
+from disco_hw.viewer.curves import Plots
 from disco_hw.viewer.panel import coverage_text, events_text, replay_details, replay_text
-from disco_hw.viewer.plots import Plots
 from disco_hw.viewer.recording import Recording
 from disco_hw.viewer.scene import Scene
 from disco_hw.viewer.timeline import KINDS, Excited, Mark, marks_of

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from disco_hw import cli
+from disco_hw.cli.app import app
 from disco_hw.files import LOG
 from tools.verb_calls import CALLS, call, good_files, without_work, write_good
 
@@ -78,15 +78,15 @@ def calling():
 def test_the_table_has_every_file_argument_of_every_verb():
     found = set()
 
-    def walk(app, words):
-        for one in app.registered_commands:
+    def walk(group_app, words):
+        for one in group_app.registered_commands:
             verb = " ".join([*words, one.name or one.callback.__name__])
             hints = typing.get_type_hints(one.callback)
             found.update((verb, name) for name, hint in hints.items() if "Path" in str(hint))
-        for group in app.registered_groups:
+        for group in group_app.registered_groups:
             walk(group.typer_instance, [*words, group.name])
 
-    walk(cli.app, [])
+    walk(app, [])
     assert found == READ | WRITTEN
     assert not READ & WRITTEN
     assert {verb for verb, _ in READ} == {one.verb for one in CALLS}

@@ -2,8 +2,7 @@ import numpy as np
 import pytest
 
 from disco_hw.tasks.circle import CircleTask
-from disco_hw.viewer.curves import Curves
-from disco_hw.viewer.plots import Plots, _columns
+from disco_hw.viewer.curves import Curves, Plots, _columns
 from disco_hw.viewer.server import serving
 from disco_hw.viewer.timeline import Timeline
 
@@ -33,3 +32,12 @@ def test_nothing_known_leaves_the_plots_as_they_are(plots):
     before = [plot.handle.data for plot in plots._plots]
     plots.show(Timeline(), 10, CircleTask(), None)
     assert all(np.array_equal(a, b) for a, b in zip(before, (p.handle.data for p in plots._plots), strict=True))
+
+
+def test_noise_below_a_centimetre_does_not_fill_a_plot_about_zero(plots):
+    ranges = {plot.handle.title: (plot.handle.scales or {}).get("y", {}).get("range") for plot in plots._plots}
+    about_zero = {"Distance to the circle (m)", "x (m)", "y (m)", "yaw (rad)"}
+    assert {title for title, found in ranges.items() if found} == about_zero
+    for title in about_zero:
+        assert ranges[title]["min"] == {"pad": 0.1, "soft": -0.01, "mode": 1}
+        assert ranges[title]["max"] == {"pad": 0.1, "soft": 0.01, "mode": 1}
