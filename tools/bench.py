@@ -1,4 +1,7 @@
-"""`make bench`: every benchmark of the project in one run on one machine; prints a table and writes bench.json."""
+"""`make bench`: every benchmark of the project in one run on one machine; prints a table and writes bench.json.
+
+The file is written after each part, so that what is broken off keeps what it has measured.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ import importlib
 import json
 import signal
 import sys
+import time
 from pathlib import Path
 
 from rich.console import Console
@@ -32,20 +36,29 @@ PARTS = (
 
 
 def main() -> int:
-    figures: dict[str, float] = {}
     parts: dict[str, list[str]] = {}
+    figures: dict[str, float] = {}
+    took_s: dict[str, float] = {}
+    about = machine()
     console = Console()
     for part in sys.argv[1:] or PARTS:
         console.print(f"[bold]{part}[/bold]")
+        begin_s = time.monotonic()
         found = importlib.import_module(f"tools.{part}").run()
+        took_s[part] = round(time.monotonic() - begin_s, 1)
         table = Table(show_header=False)
         for key, value in found.items():
             table.add_row(key, f"{value:.4g}")
         console.print(table)
         figures |= found
         parts[part] = list(found)
-    result = {"machine": machine(), "parts": parts, "figures": figures}
-    Path("bench.json").write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+        result = {
+            "machine": {**machine(), "load_before": about["load"]},
+            "parts": parts,
+            "took_s": took_s,
+            "figures": figures,
+        }
+        Path("bench.json").write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
     console.print(
         f"{len(figures)} figures in bench.json; python -m tools.results bench.json puts them into docs/results.md"
     )

@@ -2,11 +2,12 @@
 
     make bench PARTS=bench_wire && python -m tools.results bench.json
     python -m tools.results out/infer/recovery_rich.json --shown-by "python -m tools.infer_study"
+    disco-hw demo --json > demo.json && python -m tools.results demo.json --shown-by "disco-hw demo --json"
     python -m tools.results            # only writes the page again, from the figures that are kept
 
 What is kept is in docs/figures.json: for each command its newest run, with the date, the state of the code and the
-machine. Any file with {"figures": {name: number}} will do: bench.json and the studies write one. The other half of the
-page, what was noted in words, is written by hand and stays.
+machine. Any file with {"figures": {name: number}} will do: bench.json and the studies write one; and so will what a
+command has printed for its --json. The other half of the page, what was noted in words, is written by hand and stays.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ import os
 import platform
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -47,28 +48,39 @@ def runs_of(content: Mapping[str, Any], shown_by: str | None) -> dict[str, dict[
 
     Raises ValueError where there are no figures, or no command is known.
     """
-    figures = {
-        name: value
-        for name, value in (content.get("figures") or {}).items()
-        if isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-    }
+    figures = dict(_numbers(content.get("figures") or ({} if "parts" in content else content)))
     if not figures:
-        raise ValueError('no figures: it takes a file with {"figures": {name: number}}')
+        raise ValueError('no figures: it takes a file with {"figures": {name: number}}, or what a --json has printed')
     about = content.get("machine") or {
         **machine(),
         **({"commit": content["revision"]} if "revision" in content else {}),
     }
+    took_s: dict[str, float] = {}
     if "parts" in content:
         parts = {f"make bench PARTS={part}": names for part, names in content["parts"].items()}
+        took_s = {f"make bench PARTS={part}": seconds for part, seconds in content.get("took_s", {}).items()}
     elif shown_by:
         parts = {shown_by: list(figures)}
     else:
         raise ValueError("--shown-by: which command makes this file?")
     runs = {
-        command: {**about, "figures": {name: figures[name] for name in names if name in figures}}
+        command: {
+            **about,
+            **({"took_s": took_s[command]} if command in took_s else {}),
+            "figures": {name: figures[name] for name in names if name in figures},
+        }
         for command, names in parts.items()
     }
     return {command: run for command, run in runs.items() if run["figures"]}
+
+
+def _numbers(content: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, float]]:
+    """Every finite number in nested tables, by the names on the way to it joined by dots; lists are left out."""
+    for name, value in content.items():
+        if isinstance(value, Mapping):
+            yield from _numbers(value, f"{prefix}{name}.")
+        elif isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
+            yield f"{prefix}{name}", value
 
 
 def measured(kept: Mapping[str, Mapping[str, Any]]) -> str:
@@ -76,10 +88,12 @@ def measured(kept: Mapping[str, Mapping[str, Any]]) -> str:
     lines: list[str] = []
     for command, run in sorted(kept.items()):
         where = f"{run['date']}, `{run['commit']}`, {run['cpu']}, {run['cores']} cores, Python {run['python']}"
+        before = f"load {run['load_before']:g} before and " if "load_before" in run else "load "
+        took = f" It took {run['took_s']:.0f} s." if "took_s" in run else ""
         lines += [
             f"### `{command}`",
             "",
-            f"{where}, load {run['load']:g} at the end.",
+            f"{where}, {before}{run['load']:g} at the end.{took}",
             "",
             "| figure | value |",
             "|---|---|",

@@ -55,6 +55,21 @@ def test_a_study_needs_its_command_and_keeps_what_is_a_number():
     assert run["commit"] == "f00"
 
 
+def test_what_a_command_has_printed_as_json_is_kept_number_by_number():
+    printed = {"rms_m": 0.0075, "loop": {"overruns": 0, "late_us": {"p99": 3.5}}, "ok": True, "log": "a", "x": [1, 2]}
+    ((command, run),) = results.runs_of(printed, "disco-hw demo --json").items()
+    assert command == "disco-hw demo --json"
+    assert run["figures"] == {"rms_m": 0.0075, "loop.overruns": 0, "loop.late_us.p99": 3.5}
+
+
+def test_a_part_says_how_long_it_took_and_what_else_the_machine_did():
+    about = {**BENCH["machine"], "load_before": 0.25}
+    runs = results.runs_of({**BENCH, "machine": about, "took_s": {"bench_wire": 61.2}}, None)
+    text = results.measured(runs)
+    assert "load 0.25 before and 0.5 at the end. It took 61 s.\n" in text
+    assert text.count("It took") == 1
+
+
 def test_a_file_without_figures_is_one_line(tmp_path, capsys):
     file = tmp_path / "x.json"
     file.write_text("{}", "utf-8")
