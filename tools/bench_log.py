@@ -11,12 +11,12 @@ from pathlib import Path
 
 import numpy as np
 
+from disco_hw.log.commands import recover_log
 from disco_hw.log.link import batch_encoder
 from disco_hw.log.mcap_log import McapLog
 from disco_hw.log.reader import open_log
 from disco_hw.log.recorder import ProcessRecorder, RecordingSettings
 from disco_hw.log.records import Command, Estimate, FrameIn, FrameOut, Innovation, LoopTiming, Plan, Record
-from disco_hw.log.recovery import recover
 from disco_hw.log.writer import LogFile, Start
 from drivers.types import PoseSample, WheelSample
 
@@ -108,7 +108,7 @@ def _long(directory: Path) -> dict[str, float]:
         "log.ten_minutes_mb": path.stat().st_size / 1e6,
         "log.open_ten_minutes_ms": _milliseconds(lambda: open_log(path).close()),
         "log.open_cut_ten_minutes_ms": _milliseconds(lambda: open_log(cut).close()),
-        "log.recover_ten_minutes_ms": _milliseconds(lambda: recover(cut, directory / "mended.mcap")),
+        "log.recover_ten_minutes_ms": _milliseconds(lambda: recover_log(cut, directory / "mended.mcap")),
     }
     with open_log(path) as opened:
         figures["log.columns_ten_minutes_ms"] = _milliseconds(lambda: opened.columns("/estimate"))

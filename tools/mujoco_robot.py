@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.log.drive import Commands, DriveLog, Gyro, Poses, Wheels, differentiate_angle
-from disco_hw.log.importing.write import write_log
+from disco_hw.log.importing import write_log
 
 Array = NDArray[np.float64]
 

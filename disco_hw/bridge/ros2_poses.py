@@ -15,8 +15,8 @@ import numpy as np
 
 from disco_hw.bridge import ros2_messages as msg
 from disco_hw.config import PoseInput
-from disco_hw.log.rosbag.frames import Edge, Motion, chain
-from disco_hw.log.rosbag.frames import poses as along
+from disco_hw.log.frames import Edge, Motion, chain
+from disco_hw.log.frames import poses as along
 
 TYPES = (msg.PoseStamped, msg.PoseWithCovarianceStamped, msg.Odometry)
 PoseMessage = msg.PoseStamped | msg.PoseWithCovarianceStamped | msg.Odometry

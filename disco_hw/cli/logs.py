@@ -79,7 +79,7 @@ def import_log(
 ) -> None:
     """Convert a foreign log to MCAP for `infer`, `gap` and Foxglove; `view` and `replay` need a log of `run`."""
     check_named_files(robot, logs=[] if log.is_dir() else [log])
-    from disco_hw.log.importing.write import import_log as import_foreign
+    from disco_hw.log.importing import import_log as import_foreign
 
     result = import_foreign(log, robot, out, topic or ())
     print_result(result.as_dict(), as_json, result.as_text())

@@ -26,8 +26,7 @@ from disco_hw.daemon.daemon import Daemon, Say
 from disco_hw.daemon.loop import MonotonicClock
 from disco_hw.daemon.page_feed import ViewerFeed, WatchedRecorder, feed_path, tick_feed_path
 from disco_hw.daemon.signals import StopPath, StopSignals
-from disco_hw.log.link import Attachment
-from disco_hw.log.provenance import DBC, version
+from disco_hw.log.link import DBC, Attachment, version
 from disco_hw.log.recorder import NullRecorder, ProcessRecorder, Recorder, RecordingSettings
 from disco_hw.runtime.assembly import (
     assemble_core,

@@ -1,20 +1,30 @@
-"""What `disco-hw log info`, `recover` and `export` do; each returns the text to print."""
+"""What `disco-hw log info`, `recover` and `export` do; the verbs return the text to print."""
 
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
+import math
+import os
+import shutil
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from heapq import merge
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import msgspec
+import numpy as np
+from mcap.writer import CompressionType, Writer
 
+from disco_hw.errors import InputError, LogError
+from disco_hw.files import LOG, open_file
+from disco_hw.log.container import Contents, DamagedError, messages, read_attachment, read_chunk, read_contents
+from disco_hw.log.drive import DriveLog
 from disco_hw.log.importing.csv_drive import write_csv
 from disco_hw.log.load import drive_from_log, nominal_geometry, ticks_per_rev
+from disco_hw.log.mcap_log import CHUNK_BYTES, LIBRARY, PROFILE, RECOVERY
 from disco_hw.log.reader import LogSummary, open_log
 from disco_hw.log.records import Controller
-from disco_hw.log.recovery import recover as recover_log
-from disco_hw.log.rosbag.export import write_rosbag
 from drivers.types import SAID_BY_WORDS, Identity, SaidBy
 
 
@@ -101,3 +111,188 @@ def _in_words(summary: LogSummary) -> str:
     lines += [f"  attached: {name}, {size} bytes" for name, size in summary.attachments.items()]
     lines += [f"lost: {loss}" for loss in summary.damage]
     return "\n".join(lines)
+
+
+@dataclass(frozen=True, slots=True)
+class Recovered:
+    """What a recovery has brought over, and in words what was lost."""
+
+    messages: int
+    chunks: int
+    attachments: int
+    lost: tuple[str, ...]
+
+
+def recover_log(source: Path, target: Path) -> Recovered:
+    """Copy all complete chunks, attachments and metadata; the source stays as it is.
+
+    Works on any MCAP file with zstd or no compression. Raises LogError if the source is no MCAP file or has no message
+    that can be read, or the target exists or cannot be written; a half-written target is removed.
+    """
+    fd = open_file(source, LOG)
+    try:
+        contents = read_contents(fd, str(source))
+        try:
+            stream = target.open("xb")
+        except FileExistsError:
+            raise LogError(f"{target}: already exists; give another name") from None
+        try:
+            with stream:
+                writer = Writer(stream, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
+                recovered = _copy(fd, contents, writer, source.name)
+            if not recovered.messages:
+                raise LogError(f"{source}: no message in it can be read; there is nothing to recover")
+        except BaseException:
+            target.unlink(missing_ok=True)
+            raise
+    except OSError as error:
+        raise LogError(f"{source} -> {target}: {error.strerror}; give a place that can be written to") from None
+    finally:
+        os.close(fd)
+    return recovered
+
+
+def _copy(fd: int, contents: Contents, writer: Writer, name: str) -> Recovered:
+    lost = list(contents.damage)
+    writer.start(profile=PROFILE, library=LIBRARY)
+    for metadata in contents.metadata:
+        writer.add_metadata(metadata.name, metadata.metadata)
+    attachments = 0
+    for ref in contents.attachments:
+        try:
+            writer.add_attachment(ref.log_time, ref.log_time, ref.name, ref.media_type, read_attachment(fd, ref))
+            attachments += 1
+        except DamagedError as damage:
+            lost.append(str(damage))
+    schemas = {
+        schema.id: writer.register_schema(schema.name, schema.encoding, schema.data)
+        for schema in contents.schemas.values()
+    }
+    channels = {
+        channel.id: writer.register_channel(
+            channel.topic, channel.message_encoding, schemas.get(channel.schema_id, 0), channel.metadata
+        )
+        for channel in contents.channels.values()
+    }
+    count, chunks = 0, 0
+    for chunk in contents.chunks:
+        try:
+            found = list(messages(read_chunk(fd, chunk)))
+        except DamagedError as damage:
+            lost.append(f"at byte {chunk.offset}: {damage}; {chunk.length} bytes are lost")
+            continue
+        chunks += 1
+        for message in found:
+            if message.channel_id in channels:
+                writer.add_message(
+                    channels[message.channel_id],
+                    message.log_time,
+                    message.data,
+                    message.publish_time,
+                    message.sequence,
+                )
+                count += 1
+    writer.add_metadata(RECOVERY, {"source": name, "lost": "\n".join(lost)})
+    writer.finish()  # type: ignore[no-untyped-call]
+    return Recovered(count, chunks, attachments, tuple(lost))
+
+
+MAP_FRAME, BASE_FRAME = "map", "base_link"
+JOINTS = ("left_wheel_joint", "right_wheel_joint")
+COMMAND_TOPIC, WHEEL_TOPIC, POSE_TOPIC, TWIST_TOPIC = "/wheel_commands", "/joint_states", "/pose", "/cmd_vel"
+
+_EARLIEST_NS = 1_000_000_000
+_Timed = tuple[int, str, Any]  # Any: a message, whose class `rosbags` makes.
+
+
+def write_rosbag(drive: DriveLog, path: Path, start_ns: int, geometry: tuple[float, float] | None) -> int:
+    """Write a new folder with an MCAP file and metadata.yaml; return the number of messages.
+
+    `start_ns`: the wall-clock time of the drive's time 0. Wheel speeds that were commanded are JointState messages, one
+    without velocities where none is in force; with `geometry`, nominal wheel radius and axial distance (m), also
+    TwistStamped. Raises LogError if the path exists or cannot be written, InputError without `rosbags`.
+    """
+    try:
+        from rosbags.rosbag2 import StoragePlugin, Writer  # noqa: PLC0415
+        from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
+    except ImportError:
+        raise InputError(f"{path}: writing a bag needs rosbags; pip install 'disco-hw[ros2]'") from None
+    if path.exists():
+        raise LogError(f"{path}: already exists; give another name")
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    make = _Messages(store.types, max(start_ns, _EARLIEST_NS))
+    count = 0
+    try:
+        with Writer(path, version=8, storage_plugin=StoragePlugin.MCAP) as writer:
+            connections: dict[str, Any] = {}  # Any: the library's.
+            for t_ns, topic, message in make.all_of(drive, geometry):
+                kind = message.__msgtype__
+                if topic not in connections:
+                    connections[topic] = writer.add_connection(topic, kind, typestore=store)
+                writer.write(connections[topic], t_ns, store.serialize_cdr(message, kind))
+                count += 1
+    except OSError as error:
+        # Half a bag would pass for a whole one.
+        shutil.rmtree(path, ignore_errors=True)
+        raise LogError(f"{path}: cannot be written ({error.strerror}); give another place") from None
+    return count
+
+
+class _Messages:
+    """Makes messages of a drive's samples, stamped with wall-clock time."""
+
+    def __init__(self, types: Any, start_ns: int) -> None:  # Any: the library's classes by their names.
+        self._types = types
+        self._start_ns = start_ns
+
+    def all_of(self, drive: DriveLog, geometry: tuple[float, float] | None) -> Iterator[_Timed]:
+        """All messages in order of time."""
+        parts = [self._commands(drive), self._wheels(drive), self._poses(drive)]
+        if geometry is not None:
+            parts.append(self._twists(drive, *geometry))
+        return merge(*parts, key=lambda one: one[0])
+
+    def _commands(self, drive: DriveLog) -> Iterator[_Timed]:
+        part = drive.commands
+        for t_s, left, right in zip(part.t_s.tolist(), part.left_rad_s, part.right_rad_s, strict=True):
+            speeds = [] if math.isnan(left) else [left, right]
+            yield self._joints(t_s, COMMAND_TOPIC, [], speeds)
+
+    def _twists(self, drive: DriveLog, radius_m: float, axial_m: float) -> Iterator[_Timed]:
+        part = drive.commands
+        vector = self._types["geometry_msgs/msg/Vector3"]
+        for t_s, left, right in zip(part.t_s.tolist(), part.left_rad_s, part.right_rad_s, strict=True):
+            if math.isnan(left):
+                continue
+            forward = vector(0.5 * radius_m * (left + right), 0.0, 0.0)
+            turning = vector(0.0, 0.0, radius_m * (right - left) / axial_m)
+            twist = self._types["geometry_msgs/msg/Twist"](forward, turning)
+            t_ns, header = self._header(t_s, BASE_FRAME)
+            yield t_ns, TWIST_TOPIC, self._types["geometry_msgs/msg/TwistStamped"](header, twist)
+
+    def _wheels(self, drive: DriveLog) -> Iterator[_Timed]:
+        part = drive.wheels
+        columns = (part.t_s, part.left_angle_rad, part.right_angle_rad, part.left_speed_rad_s, part.right_speed_rad_s)
+        for t_s, left, right, left_speed, right_speed in zip(*(one.tolist() for one in columns), strict=True):
+            yield self._joints(t_s, WHEEL_TOPIC, [left, right], [left_speed, right_speed])
+
+    def _poses(self, drive: DriveLog) -> Iterator[_Timed]:
+        part = drive.poses
+        columns = (part.t_s, part.x_m, part.y_m, part.yaw_rad)
+        for t_s, x_m, y_m, yaw_rad in zip(*(one.tolist() for one in columns), strict=True):
+            t_ns, header = self._header(t_s, MAP_FRAME)
+            position = self._types["geometry_msgs/msg/Point"](x_m, y_m, 0.0)
+            half = 0.5 * yaw_rad
+            rotation = self._types["geometry_msgs/msg/Quaternion"](0.0, 0.0, math.sin(half), math.cos(half))
+            pose = self._types["geometry_msgs/msg/Pose"](position, rotation)
+            yield t_ns, POSE_TOPIC, self._types["geometry_msgs/msg/PoseStamped"](header, pose)
+
+    def _joints(self, t_s: float, topic: str, positions: list[float], speeds: list[float]) -> _Timed:
+        t_ns, header = self._header(t_s, "")
+        arrays = (np.array(positions, dtype=np.float64), np.array(speeds, dtype=np.float64), np.empty(0))
+        return t_ns, topic, self._types["sensor_msgs/msg/JointState"](header, list(JOINTS), *arrays)
+
+    def _header(self, t_s: float, frame: str) -> tuple[int, Any]:
+        t_ns = self._start_ns + round(t_s * 1e9)
+        stamp = self._types["builtin_interfaces/msg/Time"](*divmod(t_ns, 1_000_000_000))
+        return t_ns, self._types["std_msgs/msg/Header"](stamp, frame)

@@ -13,9 +13,9 @@ from disco_hw.files import LOG, begin_of, parse_toml
 from disco_hw.log.container import MAGIC
 from disco_hw.log.drive import Array, Commands, DriveLog, Gyro, Index, Poses, Wheels, concatenate
 from disco_hw.log.importing.csv_drive import read_csv
-from disco_hw.log.provenance import ROBOT_TOML
+from disco_hw.log.importing.rosbag_file import is_bag
+from disco_hw.log.link import ROBOT_TOML
 from disco_hw.log.reader import Log, open_log
-from disco_hw.log.rosbag.bag import is_bag
 
 Mask = NDArray[np.bool_]
 

@@ -190,7 +190,7 @@ OWN = {
     "disco_hw/experiments/live_stack.py": {"open", "read_text"},
     "disco_hw/jit/__init__.py": {"read_bytes"},
     # This process's own memory.
-    "disco_hw/log/rosbag/bag.py": {"read_text"},
+    "disco_hw/log/importing/rosbag_file.py": {"read_text"},
     "disco_hw/log/writer.py": {"os.open"},
     "disco_hw/viewer/operator_controls.py": {"read_text"},
     "disco_hw/viewer/server.py": {"read_bytes"},

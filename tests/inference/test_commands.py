@@ -10,7 +10,7 @@ from disco_hw.errors import InputError, WorkError
 from disco_hw.inference import commands
 from disco_hw.inference.commands import GapCheck, infer_command
 from disco_hw.inference.infer import InferOptions
-from disco_hw.log.importing.write import import_log
+from disco_hw.log.importing import import_log
 from disco_hw.model import load_model
 from tests.inference.drives import TICKS_PER_REV, TRUTH, write_log
 

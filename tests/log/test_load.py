@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 
 from disco_hw.errors import InputError, LogError
+from disco_hw.log.commands import recover_log
 from disco_hw.log.importing.csv_drive import write_csv
 from disco_hw.log.load import load_drive
-from disco_hw.log.recovery import recover
 from tools.log_samples import drive_ticks, log_bytes, write_log
 
 
@@ -67,7 +67,7 @@ def test_a_log_and_its_copy_are_one_drive(tmp_path, share):
     whole, cut, mended = (tmp_path / name for name in ("whole.mcap", "cut.mcap", "mended.mcap"))
     whole.write_bytes(data)
     cut.write_bytes(data[: int(len(data) * share)])
-    recover(cut, mended)
+    recover_log(cut, mended)
     with pytest.raises(LogError, match=r"mended\.mcap: holds what .*whole\.mcap holds, which would count twice"):
         load_drive([whole, mended])
 

@@ -9,11 +9,11 @@ import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
+from disco_hw.log.commands import recover_log
 from disco_hw.log.link import TaskScene, batch_encoder
 from disco_hw.log.mcap_log import CHUNK_BYTES, METADATA, SCENE, McapLog, Metadata
 from disco_hw.log.reader import open_log
 from disco_hw.log.records import TOPIC_INDEX, TOPICS, Event, FrameIn
-from disco_hw.log.recovery import recover
 from tools.log_samples import ATTACHMENTS, PERIOD_NS, WALL_OFFSET_NS, drive_ticks, log_bytes, start, tick
 
 ENCODE = batch_encoder()
@@ -50,7 +50,7 @@ def test_the_scene_is_there_once_with_the_first_tick_and_disturbs_no_count(drive
     with open_log(tmp_path / "log.mcap") as log, open_log(tmp_path / "plain.mcap") as plain:
         assert log.summary().topics == plain.summary().topics
         assert (log.summary().ticks, log.summary().missing_ticks, log.gaps()) == (200, 0, ())
-    recover(tmp_path / "log.mcap", tmp_path / "mended.mcap")
+    recover_log(tmp_path / "log.mcap", tmp_path / "mended.mcap")
     for name in ("log.mcap", "mended.mcap"):
         (found,) = foreign((tmp_path / name).read_bytes()).iter_decoded_messages(topics=[SCENE])
         assert (found.message.sequence, found.message.log_time) == (1, PERIOD_NS + WALL_OFFSET_NS)

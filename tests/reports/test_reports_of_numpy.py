@@ -33,7 +33,7 @@ from disco_hw.gap.search.cross_validation import PredictionErrors
 from disco_hw.gap.search.intervals import ParameterEstimate
 from disco_hw.inference.checks import CHECKS, Predictive
 from disco_hw.inference.commands import GapCheck, InferResult
-from disco_hw.log.importing.write import Imported
+from disco_hw.log.importing import Imported
 from disco_hw.model import Model
 from disco_hw.reports import as_json
 from disco_hw.runtime.replay import ReplayReport

@@ -1,16 +1,35 @@
-"""Foreign logs -> our MCAP log: the formats, each a module here with a `FORMAT`, told apart by their first bytes."""
+"""`disco-hw import`: a foreign log -> our MCAP log.
+
+The formats are modules here, each with a `FORMAT`, told apart by their first bytes. A format gives the arrays of a
+drive; here they become records of the log; `drive_from_log` reads the same arrays from it again.
+"""
 
 from __future__ import annotations
 
 import importlib
+import math
 import pkgutil
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
 from functools import cache
+from itertools import groupby
 from pathlib import Path
+from typing import Any
 
-from disco_hw.config import RobotConfig
+import msgspec
+
+from disco_hw.config import RobotConfig, Ros2, load_robot_config
+from disco_hw.errors import InputError, LogError
+from disco_hw.files import LOG, begin_of
+from disco_hw.files import ROBOT_TOML as ROBOT_FILE
+from disco_hw.log.container import MAGIC
 from disco_hw.log.drive import DriveLog
+from disco_hw.log.importing.rosbag_file import METADATA
+from disco_hw.log.link import ROBOT_TOML, Attachment, End, Start, attachment, batch_encoder, version
+from disco_hw.log.mcap_log import McapLog
+from disco_hw.log.records import Command, Record
+from disco_hw.log.writer import LogFile
+from drivers.types import PoseSample, WheelSample
 
 LONGEST_BEGIN_BYTES = 64
 
@@ -43,3 +62,152 @@ def log_formats() -> tuple[LogFormat, ...]:
 def format_of(begin: bytes) -> LogFormat | None:
     """The format of a file that begins with these bytes, None if it is none of them."""
     return next((each for each in log_formats() if each.recognises(begin)), None)
+
+
+SOURCE = "import"
+_LONGEST_COMMAND_S = 0.5
+_LONGEST_S = 9e9
+"""Nanoseconds of more do not fit into the 64 bits that a log has for them."""
+
+_Timed = tuple[int, int, Record]
+
+
+def write_log(drive: DriveLog, path: Path, robot: str, attachments: tuple[Attachment, ...] = ()) -> int:
+    """Write a new log and return how many records it has; its time 0 is the drive's.
+
+    A change of segment leaves out a tick's number, as lost ticks do. Raises LogError if the file exists or cannot be
+    written.
+    """
+    if drive.end_s > _LONGEST_S:
+        raise LogError(f"{', '.join(drive.sources)}: its times span {drive.end_s:.3g} s; mend the clock that jumps")
+    encode = batch_encoder()
+    try:
+        file = LogFile(path)
+    except FileExistsError:
+        raise LogError(f"{path}: already exists; give another name") from None
+    except OSError as error:
+        raise LogError(f"{path}: cannot be created ({error.strerror}); give another place") from None
+    try:
+        log = McapLog(file, Start(str(path), robot, version(), 0, 0, part=0, attachments=attachments))
+        last_ns, last_tick = 0, 0
+        for tick, (t_ns, samples) in enumerate(groupby(_samples(drive), key=lambda sample: sample[0])):
+            together = list(samples)
+            segment = max(sample[1] for sample in together)
+            last_ns, last_tick = t_ns, tick + segment
+            log.write(encode(last_tick, t_ns, [record for _, _, record in together]))
+        log.end(End(last_ns, last_tick, 0))
+        log.finish()
+        file.sync()
+    except BaseException as error:
+        # Half a log would only be in the way of the next try.
+        path.unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            raise LogError(f"{path}: cannot be written ({error.strerror}); give another place") from None
+        raise
+    finally:
+        file.close()
+    return log.records
+
+
+def _samples(drive: DriveLog) -> Iterator[_Timed]:
+    """Records with their time (ns) and segment, in order of time."""
+    return iter(sorted([*_commands(drive), *_wheels(drive), *_poses(drive)], key=lambda sample: sample[0]))
+
+
+def _commands(drive: DriveLog) -> Iterator[_Timed]:
+    part = drive.commands
+    rows = zip(
+        *(column.tolist() for column in (part.t_s, part.segment, part.left_rad_s, part.right_rad_s)), strict=True
+    )
+    for t_s, segment, left, right in rows:
+        t_ns = _ns(t_s)
+        known = not math.isnan(left)
+        now_left, now_right = (left, right) if known else (0.0, 0.0)
+        yield (
+            t_ns,
+            segment,
+            Command(t_ns, now_left, now_right, now_left, now_right, _LONGEST_COMMAND_S, in_force=known, source=SOURCE),
+        )
+
+
+def _wheels(drive: DriveLog) -> Iterator[_Timed]:
+    part = drive.wheels
+    columns = (part.left_angle_rad, part.right_angle_rad, part.left_speed_rad_s, part.right_speed_rad_s)
+    values = zip(*(column.tolist() for column in columns), strict=True)
+    for t_s, segment, row in zip(part.t_s.tolist(), part.segment.tolist(), values, strict=True):
+        t_ns = _ns(t_s)
+        yield t_ns, segment, WheelSample(t_ns, t_ns, *row)
+
+
+def _poses(drive: DriveLog) -> Iterator[_Timed]:
+    part = drive.poses
+    columns = (part.t_s, part.segment, part.x_m, part.y_m, part.yaw_rad)
+    for t_s, segment, x_m, y_m, yaw_rad in zip(*(column.tolist() for column in columns), strict=True):
+        t_ns = _ns(t_s)
+        yield t_ns, segment, PoseSample(t_ns, t_ns, x_m, y_m, yaw_rad, math.nan, math.nan)
+
+
+def _ns(t_s: float) -> int:
+    return round(t_s * 1e9)
+
+
+@dataclass(frozen=True, slots=True)
+class Imported:
+    """What was written where, and what a person should know of it."""
+
+    out: Path
+    records: int
+    segments: int
+    duration_s: float
+    notes: tuple[str, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """For machines."""
+        return {**asdict(self), "out": str(self.out)}
+
+    def as_text(self) -> str:
+        """For a person."""
+        written = f"{self.out}: {self.records} records, {self.duration_s:.1f} s, {self.segments} segments"
+        return "\n".join([written, *(f"note: {note}" for note in self.notes)])
+
+
+def import_log(path: Path, robot: Path, out: Path, topics: Sequence[str] = ()) -> Imported:
+    """Write a foreign log, of whichever format it is, as an MCAP log of ours.
+
+    robot.toml goes into the log. `topics`, of a bag: ROLE=NAME, ahead of robot.toml's [ros2]. Raises LogError for what
+    can be no such file, and InputError.
+    """
+    config = load_robot_config(robot)
+    begin = begin_of(_telling(path), LOG, LONGEST_BEGIN_BYTES)
+    log_format = format_of(begin)
+    if begin.startswith(MAGIC) and (log_format is None or not log_format.has_topics):
+        raise LogError(f"{path}: an MCAP log; ours needs no import, and of others only those of ROS 2 can be imported")
+    if log_format is None:
+        names = ", ".join(each.name for each in log_formats())
+        raise LogError(f"{path}: none of the formats that can be imported ({names}); write a CSV")
+    if topics and not log_format.has_topics:
+        raise InputError(f"--topic: {path} is a {log_format.name}, which has no topics; leave it out")
+    drive = log_format.read(path, msgspec.structs.replace(config, ros2=_with_topics(config.ros2, topics)))
+    records = write_log(drive, out, config.robot.name, (attachment(robot, ROBOT_TOML, ROBOT_FILE),))
+    notes = drive.notes
+    if drive.gyro.t_s.size:
+        notes += (f"{path}: the gyro was left out; the logs of disco-hw have no place for it",)
+    return Imported(out, records, drive.segments, drive.end_s, notes)
+
+
+def _telling(path: Path) -> Path:
+    """The file that shows the format; a log that is a folder has one that says what it is."""
+    return path / METADATA if path.is_dir() and (path / METADATA).exists() else path
+
+
+def _with_topics(settings: Ros2, topics: Sequence[str]) -> Ros2:
+    fields = {"commands": "command_topic", "wheels": "wheel_topic", "poses": "pose_topic"}
+    given: dict[str, str] = {}
+    for one in topics:
+        role, _, name = one.partition("=")
+        if role not in fields or not name:
+            raise InputError(f"--topic: {one!r} is not ROLE=NAME; write commands=, wheels= or poses= and the topic")
+        if fields[role] in given:
+            raise InputError(f"--topic: {role} is given twice; give it once")
+        given[fields[role]] = name
+    return msgspec.structs.replace(settings, **given)

@@ -1,19 +1,441 @@
-"""Bags of ROS 2 (MCAP and sqlite3) and ROS 1: docs/ros2.md says which topics are read."""
+"""Bags of ROS 2 (MCAP, sqlite3) and ROS 1: the chosen topics -> the arrays of a drive; see docs/ros2.md."""
 
 from __future__ import annotations
 
+import math
+from array import array
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
-from disco_hw.config import RobotConfig
-from disco_hw.log.drive import DriveLog
+import numpy as np
+
+from disco_hw.config import Robot, RobotConfig
+from disco_hw.errors import LogError
+from disco_hw.log.drive import (
+    Array,
+    Commands,
+    DriveLog,
+    Gyro,
+    Index,
+    Poses,
+    Wheels,
+    differentiate_angle,
+    integrate_angle,
+)
+from disco_hw.log.frames import Edge, Motion, poses, rotations
 from disco_hw.log.importing import LogFormat
-from disco_hw.log.rosbag.bag import is_bag
+from disco_hw.log.importing.csv_drive import length_fault
+from disco_hw.log.importing.rosbag_file import Bag, BagMessage, Stamps, is_bag, open_bag, timeline
+from disco_hw.log.importing.rosbag_topics import (
+    ARRAY,
+    COMMANDS,
+    DRIVERS,
+    JOINTS,
+    ODOMETRY,
+    POSES,
+    ROLES,
+    TF,
+    TRANSFORMS,
+    TWIST,
+    WHEELS,
+    Choice,
+    choose,
+)
+
+_LONGEST_SILENCE_NS = 500_000_000
+_LONGEST_COMMAND_NS = 500_000_000
+_LONGEST_PAUSE_NS = 2_000_000_000
+_LARGEST_STEP_RAD = 20.0 * math.pi
+_MOST_MESSAGES = 20_000_000
 
 
-def _read(path: Path, config: RobotConfig) -> DriveLog:
-    from disco_hw.log.rosbag.drive import read_rosbag  # noqa: PLC0415
+@dataclass(slots=True)
+class _Column:
+    """What one topic, or one edge of the transforms, has given."""
 
-    return read_rosbag(path, config)
+    width: int
+    log_ns: array[int] = field(default_factory=lambda: array("q"))
+    stamp_ns: array[int] = field(default_factory=lambda: array("q"))
+    values: array[float] = field(default_factory=lambda: array("d"))
+    left_out: int = 0
+
+    def add(self, log_ns: int, stamp_ns: int, row: Row | None) -> None:
+        """Keep a row, or count that there was none."""
+        if row is None:
+            self.left_out += 1
+            return
+        self.log_ns.append(log_ns)
+        self.stamp_ns.append(stamp_ns)
+        self.values.extend(row)
+
+    def stamps(self) -> Stamps:
+        """The times of its rows."""
+        return Stamps(np.array(self.log_ns, dtype=np.int64), np.array(self.stamp_ns, dtype=np.int64))
+
+    def table(self) -> Array:
+        """Its rows, (N, width)."""
+        return np.array(self.values, dtype=np.float64).reshape(-1, self.width)
 
 
-FORMAT = LogFormat("rosbag", is_bag, _read, order=20, has_topics=True)
+def read_rosbag(path: Path, config: RobotConfig) -> DriveLog:
+    """Commands, wheels and poses of a bag; the table of its topics is the first note. Raises LogError and InputError.
+
+    Times are those of the messages' headers, see `timeline`. A new segment begins where the wheels were silent for half
+    a second, where a clock was set, and where an encoder was. A command counts until the next one, half a second at
+    most, as the controllers of ROS have it.
+    """
+    with open_bag(path) as bag:
+        choice = choose(bag, config.ros2)
+        columns = _columns(bag, choice, config)
+    return _assembled(path, choice, columns, config.robot)
+
+
+def _columns(bag: Bag, choice: Choice, config: RobotConfig) -> dict[str, _Column]:
+    """One pass through the chosen topics."""
+    columns: dict[str, _Column] = {}
+    takes: dict[str, list[tuple[str, Take]]] = {}
+    for role in ROLES:
+        used = choice.used(role)
+        if used is not None and used.topic != TF:
+            width, take = take_of(role, used.type, choice, config)
+            columns[role] = _Column(width)
+            takes.setdefault(used.topic, []).append((role, take))
+    by_tf = choice.used(POSES) is not None and POSES not in columns
+    edges = {edge: _Column(7) for edge in choice.edges} if by_tf else {}
+    static: set[Edge] = set()
+    transforms = {one.name for one in bag.topics.values() if one.type in TRANSFORMS} if by_tf else set()
+    for number, message in enumerate(bag.messages({*takes, *transforms})):
+        if number >= _MOST_MESSAGES:
+            raise LogError(f"{bag.path}: over {_MOST_MESSAGES} messages of its topics; cut it with `ros2 bag convert`")
+        for role, take in takes.get(message.topic, ()):
+            columns[role].add(message.log_ns, stamp_of(message.value), _finite(take, message, bag.path))
+        if message.topic in transforms:
+            for one in message.value.transforms:
+                edge = (one.header.frame_id.lstrip("/"), one.child_frame_id.lstrip("/"))
+                if edge in edges:
+                    edges[edge].add(message.log_ns, stamp_of(one), finite(transform_row(one.transform)))
+                    if message.topic.endswith("static"):
+                        static.add(edge)
+    return columns | {_edge_name(edge, edge in static): column for edge, column in edges.items()}
+
+
+def _edge_name(edge: Edge, static: bool) -> str:
+    return f"{'/tf_static' if static else '/tf'} {edge[0]} - {edge[1]}"
+
+
+def _finite(take: Take, message: BagMessage, path: Path) -> Row | None:
+    try:
+        return finite(take(message.value))
+    except (IndexError, ValueError, TypeError, AttributeError, OverflowError) as error:
+        raise LogError(
+            f"{path}: {message.topic}: a message is not as its type has it ({error}); name another topic"
+        ) from None
+
+
+def _assembled(path: Path, choice: Choice, columns: dict[str, _Column], robot: Robot) -> DriveLog:
+    notes = [choice.as_text()]
+    for name, column in columns.items():
+        used = choice.used(name)
+        if column.left_out:
+            label = f"{name}, {used.topic}" if used is not None else name
+            notes.append(f"{label}: {column.left_out} messages hold no finite value and were left out")
+        if not column.log_ns and used is not None:
+            raise LogError(f"{path}: {used.topic}: none of its messages holds {name}; name another with --topic")
+    static = {name for name in columns if name.startswith("/tf_static")}
+    times = timeline({name: one.stamps() for name, one in columns.items() if one.log_ns and name not in static})
+    notes += times.notes
+    arrays = {name: _ordered(name, times.t_ns[name], columns[name].table(), notes) for name in times.t_ns}
+    pose_ns, pose = _pose_table(path, choice, columns, arrays, static)
+    nothing: tuple[Index, Array] = (np.empty(0, dtype=np.int64), np.empty((0, 4)))
+    command_ns, command = _expired(*arrays.get(COMMANDS, (nothing[0], np.empty((0, 2)))))
+    wheel_ns, wheel = arrays.get(WHEELS, nothing)
+    wheel_ns, wheel, measured = _measured_columns(path, wheel_ns, wheel, notes)
+    began_ns = min(int(t_ns[0]) for t_ns in (command_ns, wheel_ns, pose_ns) if t_ns.size)
+    breaks_ns = np.unique(
+        np.concatenate([times.breaks_ns, _pauses(wheel_ns, (command_ns, pose_ns)), _steps(wheel_ns, wheel)])
+    )
+    if breaks_ns.size:
+        notes.append(
+            f"{breaks_ns.size} times the wheels paused, or a clock or encoder was set; new segments begin there"
+        )
+
+    def when(t_ns: Index) -> tuple[Array, Index]:
+        return (t_ns - began_ns).astype(np.float64) * 1e-9, np.searchsorted(breaks_ns, t_ns, side="right").astype(
+            np.int64
+        )
+
+    (command_s, command_segment), (pose_s, pose_segment) = when(command_ns), when(pose_ns)
+    commands = Commands(command_s, command[:, 0], command[:, 1], command_segment)
+    wheels = _wheels(*when(wheel_ns), wheel, measured)
+    drive_poses = Poses(pose_s, pose[:, 0], pose[:, 1], pose[:, 2], pose_segment)
+    fault = length_fault(drive_poses, wheels, commands, robot.wheel_radius_m)
+    if fault is not None:
+        notes.append(f"poses and wheels do not fit together: {fault.rpartition(';')[0]}; see which topics were read")
+    notes += _of_the_choice(choice)
+    none = np.empty(0)
+    gyro = Gyro(none, none, np.empty(0, dtype=np.int64))
+    return DriveLog((str(path),), commands, wheels, drive_poses, gyro, tuple(notes))
+
+
+def _of_the_choice(choice: Choice) -> list[str]:
+    """What the kind of the chosen topics means for whoever reads the results."""
+    notes = []
+    command, wheel = choice.used(COMMANDS), choice.used(WHEELS)
+    if command is None:
+        notes.append("no topic holds commands: effects between command and wheel cannot be seen")
+    elif command.type in TWIST:
+        notes.append(
+            f"{command.topic} is a motion of the body: made wheel speeds with robot.toml's wheel_radius_m and "
+            "axial_distance_m, which must be those that the robot's own controller uses"
+        )
+    if wheel is not None and wheel.type == ODOMETRY:
+        notes.append(
+            f"no topic holds the wheels: {wheel.topic} has been through the robot's own kinematics, was turned back "
+            "with robot.toml's, and hides what that leaves out; record /joint_states"
+        )
+    if wheel is None:
+        notes.append("no topic holds the wheels; record /joint_states")
+    if choice.used(POSES) is None:
+        notes.append(
+            "no topic holds poses that were not made from the wheels; record those of a SLAM or motion capture"
+        )
+    return notes
+
+
+def _ordered(name: str, t_ns: Index, table: Array, notes: list[str]) -> tuple[Index, Array]:
+    """In order of time, the first of several with one time."""
+    unique, first = np.unique(t_ns, return_index=True)
+    if unique.size < t_ns.size:
+        notes.append(f"{name}: {t_ns.size - unique.size} messages have the time of another and were left out")
+    return unique, table[first]
+
+
+def _pose_table(
+    path: Path,
+    choice: Choice,
+    columns: dict[str, _Column],
+    arrays: dict[str, tuple[Index, Array]],
+    static: set[str],
+) -> tuple[Index, Array]:
+    used = choice.used(POSES)
+    if used is None:
+        return np.empty(0, dtype=np.int64), np.empty((0, 3))
+    if used.topic != TF:
+        t_ns, values = arrays[POSES]
+        rotation = rotations(values[:, 3:])
+        return t_ns, np.column_stack([values[:, :2], np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0])])
+    motions = []
+    for edge in choice.edges:
+        name = next(_edge_name(edge, one) for one in (True, False) if _edge_name(edge, one) in columns)
+        if not columns[name].log_ns:
+            raise LogError(f"{path}: no usable transform {edge[0]} - {edge[1]}; name another topic with --topic poses=")
+        t_ns, values = arrays.get(name, (np.zeros(1, dtype=np.int64), columns[name].table()))
+        motions.append(Motion(t_ns, values, name in static))
+    t_ns, table = poses(motions)
+    if not t_ns.size:
+        raise LogError(f"{path}: the transforms of {used.why} never overlap in time; name another topic for poses")
+    return t_ns, table
+
+
+def _expired(t_ns: Index, speeds: Array) -> tuple[Index, Array]:
+    """Commands with a row of NaN where one has run out before the next came."""
+    speeds = np.where(np.isfinite(speeds), speeds, np.nan)
+    ends = t_ns + _LONGEST_COMMAND_NS
+    late = np.append(np.diff(t_ns) > _LONGEST_COMMAND_NS, True) if t_ns.size else np.empty(0, dtype=bool)
+    late &= np.isfinite(speeds).all(axis=1)
+    times = np.concatenate([t_ns, ends[late]])
+    rows = np.concatenate([speeds, np.full((np.count_nonzero(late), 2), np.nan)])
+    order = np.argsort(times, kind="stable")
+    return times[order], rows[order]
+
+
+def _measured_columns(
+    path: Path, t_ns: Index, wheel: Array, notes: list[str]
+) -> tuple[Index, Array, tuple[bool, bool]]:
+    """Rows in which everything is there that the wheels measure at all, and whether that is angles, and speeds."""
+    angles, speeds = (np.isfinite(wheel[:, part]).all(axis=1) for part in (slice(0, 2), slice(2, 4)))
+    has_angle, has_speed = (
+        bool(2 * np.count_nonzero(angles) > t_ns.size),
+        bool(2 * np.count_nonzero(speeds) > t_ns.size),
+    )
+    kept = (angles | (not has_angle)) & (speeds | (not has_speed))
+    if t_ns.size and not (has_angle or has_speed):
+        raise LogError(
+            f"{path}: wheels: most messages have neither position nor velocity of all wheels; "
+            "set ros2.left_joints and ros2.right_joints"
+        )
+    if not kept.all():
+        notes.append(f"wheels: {np.count_nonzero(~kept)} messages lack a position or velocity and were left out")
+    wheel = wheel[kept]
+    if has_angle and has_speed and (wheel[:, 2:] == 0.0).all() and np.ptp(wheel[:, 0]) > 1.0:
+        notes.append("wheels: the velocities are all zero while the wheels turn; they were taken from the positions")
+        has_speed = False
+    return t_ns[kept], _unwrapped(wheel, has_angle, notes), (has_angle, has_speed)
+
+
+def _unwrapped(wheel: Array, has_angle: bool, notes: list[str]) -> Array:
+    """Angles that a driver gives within one turn, made continuous."""
+    angles = wheel[:, :2]
+    if not has_angle or not angles.size:
+        return wheel
+    within = np.ptp(angles, axis=0).max() <= 2.0 * math.pi + 1e-6
+    if within and (np.abs(np.diff(angles, axis=0)) > math.pi).any():
+        notes.append("wheels: the positions stay within one turn; they were made continuous")
+        return np.column_stack([np.unwrap(angles, axis=0), wheel[:, 2:]])
+    return wheel
+
+
+def _pauses(wheel_ns: Index, others: Sequence[Index]) -> Index:
+    """Where nothing is known of the wheels for half a second; without wheels, of anything for two."""
+    if wheel_ns.size:
+        return wheel_ns[1:][np.diff(wheel_ns) > _LONGEST_SILENCE_NS]
+    all_ns = np.sort(np.concatenate(others))
+    return np.asarray(all_ns[1:][np.diff(all_ns) > _LONGEST_PAUSE_NS])
+
+
+def _steps(wheel_ns: Index, wheel: Array) -> Index:
+    """Where an encoder was set: a step of more than ten turns."""
+    steps = np.abs(np.diff(wheel[:, :2], axis=0)).max(axis=1, initial=0.0)
+    return np.asarray(wheel_ns[1:][steps > _LARGEST_STEP_RAD])
+
+
+def _wheels(t_s: Array, segment: Index, wheel: Array, measured: tuple[bool, bool]) -> Wheels:
+    has_angle, has_speed = measured
+    (left, right), (left_speed, right_speed) = wheel[:, :2].T, wheel[:, 2:].T
+    if not has_angle:
+        left, right = (integrate_angle(t_s, speed, segment) for speed in (left_speed, right_speed))
+    if not has_speed:
+        left_speed, right_speed = (differentiate_angle(t_s, angle, segment) for angle in (left, right))
+    return Wheels(t_s, left, right, left_speed, right_speed, segment, has_angle, has_speed)
+
+
+Row = tuple[float, ...]
+Take = Callable[[Any], Row | None]
+
+
+def finite(row: Row | None) -> Row | None:
+    """A row without infinities, else None. NaN stands for what is not known, and stays."""
+    return None if row is None or any(map(math.isinf, row)) else row
+
+
+def stamp_of(message: Any) -> int:
+    """The header's stamp, ns; 0 without a header."""
+    header = getattr(message, "header", None)
+    return int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec) if header is not None else 0
+
+
+def take_of(role: str, kind: str, choice: Choice, config: RobotConfig) -> tuple[int, Take]:
+    """How many numbers a message of this type gives in this role, and how."""
+    if role == POSES:
+        return 7, _odometry_pose if kind == ODOMETRY else _measured_pose
+    if role == WHEELS:
+        return 4, _joint_wheels(choice) if kind == JOINTS else _odometry_wheels(config.robot)
+    if kind == JOINTS:
+        return 2, _joint_command(choice)
+    if kind == ARRAY:
+        return 2, _array_command(choice, config.ros2.command_joints)
+    if kind in TWIST:
+        return 2, _twist_command(config.robot)
+    return 2, _drivers if DRIVERS.fullmatch(kind) else _wheel_speeds
+
+
+def _wheel_pair(robot: Robot, forward: float, turning: float) -> Row:
+    """Left and right wheel speeds of a motion, rad/s."""
+    half = 0.5 * robot.axial_distance_m * turning
+    return (forward - half) / robot.wheel_radius_m, (forward + half) / robot.wheel_radius_m
+
+
+def _twist_command(robot: Robot) -> Take:
+    def take(message: Any) -> Row:
+        twist = getattr(message, "twist", message)
+        return _wheel_pair(robot, float(twist.linear.x), float(twist.angular.z))
+
+    return take
+
+
+def _mean_of(values: Any, names: Sequence[str], wanted: Sequence[str]) -> float:
+    """Mean over several joints; NaN where the array does not hold one of them."""
+    found = [float(values[names.index(name)]) for name in wanted if names.index(name) < len(values)]
+    return sum(found) / len(found) if len(found) == len(wanted) else math.nan
+
+
+def _joint_wheels(choice: Choice) -> Take:
+    wanted = {*choice.left_joints, *choice.right_joints}
+
+    def take(message: Any) -> Row | None:
+        names = list(message.name)
+        # Other joints of the robot may come in messages of their own.
+        if not wanted <= set(names):
+            return None
+        sides = (choice.left_joints, choice.right_joints)
+        return tuple(_mean_of(values, names, side) for values in (message.position, message.velocity) for side in sides)
+
+    return take
+
+
+def _joint_command(choice: Choice) -> Take:
+    def take(message: Any) -> Row | None:
+        names = list(message.name)
+        if not {*choice.left_joints, *choice.right_joints} <= set(names):
+            return None
+        if not len(message.velocity):
+            # No speed: from here on nothing is commanded.
+            return math.nan, math.nan
+        return tuple(_mean_of(message.velocity, names, side) for side in (choice.left_joints, choice.right_joints))
+
+    return take
+
+
+def _array_command(choice: Choice, joints: Sequence[str]) -> Take:
+    def take(message: Any) -> Row | None:
+        if not joints:
+            return (float(message.data[0]), float(message.data[1])) if len(message.data) == 2 else None
+        return tuple(_mean_of(message.data, list(joints), side) for side in (choice.left_joints, choice.right_joints))
+
+    return take
+
+
+def _drivers(message: Any) -> Row | None:
+    """Drive of Clearpath's bases: left and right in rad/s where the mode is that of a velocity (0)."""
+    return None if getattr(message, "mode", 0) != 0 else (float(message.drivers[0]), float(message.drivers[1]))
+
+
+def _wheel_speeds(message: Any) -> Row:
+    return float(message.velocity_left), float(message.velocity_right)
+
+
+def _odometry_wheels(robot: Robot) -> Take:
+    def take(message: Any) -> Row:
+        twist = message.twist.twist
+        return (math.nan, math.nan, *_wheel_pair(robot, float(twist.linear.x), float(twist.angular.z)))
+
+    return take
+
+
+def _odometry_pose(message: Any) -> Row | None:
+    return _space(message.pose.pose)
+
+
+def _measured_pose(message: Any) -> Row | None:
+    return _space(getattr(message.pose, "pose", message.pose))
+
+
+def _space(pose: Any) -> Row | None:
+    return _place(pose.position, pose.orientation)
+
+
+def transform_row(transform: Any) -> Row | None:
+    """Position and quaternion (7,) of a transform."""
+    return _place(transform.translation, transform.rotation)
+
+
+def _place(position: Any, rotation: Any) -> Row | None:
+    row = (position.x, position.y, position.z, rotation.x, rotation.y, rotation.z, rotation.w)
+    length = math.hypot(*row[3:])
+    # A quaternion of zeros is what a publisher leaves that never set it.
+    return None if not (math.isfinite(sum(row)) and 0.5 < length < 2.0) else row
+
+
+FORMAT = LogFormat("rosbag", is_bag, read_rosbag, order=20, has_topics=True)

@@ -8,8 +8,7 @@ import pytest
 
 import disco_hw.log.importing
 from disco_hw.errors import LogError
-from disco_hw.log.importing import format_of, log_formats
-from disco_hw.log.importing.write import import_log
+from disco_hw.log.importing import format_of, import_log, log_formats
 from disco_hw.log.load import load_drive
 from tests.inference.test_commands import ROBOT
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from disco_hw.errors import LogError
-from disco_hw.log.importing.write import write_log
+from disco_hw.log.importing import write_log
 from disco_hw.log.load import load_drive
 from tests.inference.drives import logged
 

@@ -15,12 +15,12 @@ from rosbags.typesys import Stores
 
 from disco_hw.config import Ros2
 from disco_hw.errors import LogError
-from disco_hw.log.importing.write import import_log
+from disco_hw.log.importing import import_log
+from disco_hw.log.importing.rosbag import read_rosbag
 from disco_hw.log.load import load_drive
-from disco_hw.log.rosbag.drive import read_rosbag
 from tests.inference.drives import robot_config
 from tests.inference.test_commands import ROBOT
-from tests.log.rosbag.bags import BEGAN_NS, LATENCY_NS, LEFT, RIGHT, bag, recorded
+from tests.log.importing.bags import BEGAN_NS, LATENCY_NS, LEFT, RIGHT, bag, recorded
 
 
 @pytest.fixture

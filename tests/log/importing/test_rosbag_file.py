@@ -17,11 +17,11 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from disco_hw.config import Ros2
 from disco_hw.errors import InputError, LogError
 from disco_hw.log.importing import format_of
+from disco_hw.log.importing.rosbag import read_rosbag
 from disco_hw.log.load import load_drive
-from disco_hw.log.rosbag.drive import read_rosbag
 from tests.inference.drives import robot_config
 from tests.inference.test_commands import ROBOT
-from tests.log.rosbag.bags import BEGAN_NS, LEFT, RIGHT, bag, recorded
+from tests.log.importing.bags import BEGAN_NS, LEFT, RIGHT, bag, recorded
 
 
 def small(path, storage="mcap"):
@@ -227,6 +227,6 @@ def test_a_command_on_what_is_no_bag_exits_with_two(tmp_path):
 
 
 def test_the_library_is_loaded_only_when_a_bag_is_read():
-    code = "import sys, disco_hw.log.importing.write as w; w.log_formats(); print('rosbags' in sys.modules)"
+    code = "import sys, disco_hw.log.importing as w; w.log_formats(); print('rosbags' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"

@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 
 from disco_hw.config import Ros2
 from disco_hw.errors import LogError
-from disco_hw.log.rosbag.bag import Bag, BagMessage, BagTopic
-from disco_hw.log.rosbag.frames import BASE_FRAMES, MAP_FRAMES, ODOM_FRAMES, Edge, chain
+from disco_hw.log.frames import BASE_FRAMES, MAP_FRAMES, ODOM_FRAMES, Edge, chain
+from disco_hw.log.importing.rosbag_file import Bag, BagMessage, BagTopic
 
 TF = "tf"
 """What stands for a chain of transforms where a topic's name is asked for."""
