@@ -20,19 +20,17 @@ from drivers.types import ReceivedFrame
 from firmware_protocol.firmware_core import FirmwareConfig
 from sim.board import VERSION, BoardRobot, PlantLine
 from sim.body_dynamics import BodyPose
-from sim.command_socket import CommandSocket
 from sim.effects import HiddenEffectError, hidden_effects
 from sim.fault_player import BUS_ONLY, CpuHogs, FaultPlayer, Injection
 from sim.fault_schedule import FaultSchedule, Site
 from sim.hub import HubLink
 from sim.plant import Plant
 from sim.plant_parameters import PlantParameters
-from sim.process import PoseSender, SocketPathError, StopSignal, TextRecord
+from sim.process import CommandSocket, PoseSender, SocketPathError, StopSignal, TextRecord
 from sim.python_can_link import PythonCanLink
-from sim.robot import Controller, Robot, VendorRobot
 from sim.robot_link import RobotLink
 from sim.serial_line import SerialLine, SerialPathError
-from sim.virtual_robot import STEP_US, ControllerClock, TruthRecorder, VirtualRobot
+from sim.virtual_robot import STEP_US, Controller, ControllerClock, Robot, TruthRecorder, VendorRobot, VirtualRobot
 
 STEP_NS = STEP_US * 1000
 TRUTH_STEPS = 10

@@ -1,6 +1,6 @@
 """A virtual robot around somebody's board: the plant here, the firmware there, and between them the plant's line.
 
-The other end is firmware_protocol/ports/plant_line.c. `BoardRobot` satisfies `sim.robot.Robot`, `PlantLine`
+The other end is firmware_protocol/ports/plant_line.c. `BoardRobot` satisfies `sim.virtual_robot.Robot`, `PlantLine`
 `sim.robot_link.RobotLink`; the frames between them are those of this line, and the board's own link is not seen here.
 """
 

@@ -12,9 +12,8 @@ from drivers.types import Frame
 from firmware_protocol.firmware_core import ResetCause
 from sim.fault_schedule import FaultSchedule, ScheduledFault, Site
 from sim.faults import FaultTimeline, FrameFaults, RobotFaults
-from sim.robot import Robot
 from sim.robot_link import LinkFaultError, RobotLink
-from sim.virtual_robot import truth_row
+from sim.virtual_robot import Robot, truth_row
 
 COMMANDS = """\
 bus_off [host|robot]          controllers of all hosts (default), or the robot's, leave the bus

@@ -18,7 +18,7 @@ from disco_hw.adaptation.guard import Geometry, believed_geometry, possible_rang
 from disco_hw.adaptation.link import InForce, PoseReading, ProcessLink, Samples, WheelAngles
 from disco_hw.adaptation.network import Training, train_network, training_range
 from disco_hw.adaptation.recursive import evidence
-from disco_hw.daemon.compiling import warm_up
+from disco_hw.daemon.run import warm_up
 from disco_hw.experiments.adapt import AdaptOptions, drive_through_change, run_adapt
 from disco_hw.experiments.live_stack import FAST_START, FAST_TASK, running_stack
 from disco_hw.inference.noise import USUAL

@@ -8,7 +8,7 @@ import sys
 import threading
 import time
 
-from disco_hw.daemon import realtime
+from disco_hw import processes
 from disco_hw.daemon.loop import Loop, MonotonicClock
 from disco_hw.runtime.governor import Governor, WheelLimits
 from disco_hw.runtime.supervisor import Inputs, Supervisor, SupervisorSettings
@@ -32,12 +32,12 @@ def run(seconds: float = 10.0) -> dict[str, float]:
 def measure(mode: str, seconds: float) -> dict[str, float]:
     allowed = True
     if mode == "realtime":
-        allowed = all(step.done for step in realtime.enter(PRIORITY))
+        allowed = all(step.done for step in processes.enter(PRIORITY))
     finished = threading.Event()
     receiver = threading.Thread(target=_receive, args=(finished,))
     receiver.start()
     if mode == "realtime":
-        allowed = realtime.raise_loop_thread(PRIORITY).done and allowed
+        allowed = processes.raise_loop_thread(PRIORITY).done and allowed
     loop = Loop(MonotonicClock(), RATE_HZ)
     body = _Body(loop)
     end_ns = time.monotonic_ns() + round(seconds * 1e9)

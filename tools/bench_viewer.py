@@ -25,10 +25,10 @@ from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Origin, Subprotocol
 
 from disco_hw.daemon.page_feed import FeedSubscriber, ViewerFeed, feed_path
-from disco_hw.daemon.realtime import stolen_ms
 from disco_hw.experiments.live_stack import disco_hw_process, running_stack
 from disco_hw.log.reader import open_log
 from disco_hw.log.records import Plan
+from disco_hw.processes import stolen_ms
 from disco_hw.viewer.live import LivePage, run_live
 from disco_hw.viewer.operator_controls import Desk
 from disco_hw.viewer.page_process import TOKEN_VARIABLE, page_token

@@ -19,7 +19,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from disco_hw.daemon.realtime import stolen_ms
+from disco_hw.processes import stolen_ms
 
 COUNT = re.compile(r"\d+ (?:passed|failed|skipped|errors?)")
 # What would have the clone use this checkout's modules or compiled kernels.

@@ -27,7 +27,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from disco_hw.daemon.realtime import can_lock_memory
+from disco_hw.processes import can_lock_memory
 from firmware_protocol.build_firmware import PACKAGE, SOURCES
 
 FIRMWARE = PACKAGE / "firmware"

@@ -16,9 +16,9 @@ import time
 from pathlib import Path
 from typing import Any
 
-from disco_hw.daemon.realtime import stolen_ms
 from disco_hw.errors import WorkError
 from disco_hw.experiments.live_stack import Operator, disco_hw_process, write_robot_file
+from disco_hw.processes import stolen_ms
 
 WANTED_P999_US = 1000.0
 PERIOD_US = 20_000

@@ -22,7 +22,7 @@ from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
-from disco_hw.bridge import ros2_commands, ros2_poses
+from disco_hw.bridge import ros2_commands, ros2_inlets
 from disco_hw.bridge import ros2_messages as msg
 from disco_hw.bridge import ros2_outgoing as out
 from disco_hw.config import RobotConfig
@@ -108,8 +108,8 @@ class Bridge:
         self._feed = FeedSubscriber(tick_feed_path(socket_path(config)))
         self._pose = config.pose.of(SOURCE)
         pose = self._pose or config.pose
-        self._poses = ros2_poses.PoseInlet(pose)
-        self._transforms = ros2_poses.TransformInlet(pose, config.ros2.base_frame or out.BASE_FRAME)
+        self._poses = ros2_inlets.PoseInlet(pose)
+        self._transforms = ros2_inlets.TransformInlet(pose, config.ros2.base_frame or out.BASE_FRAME)
         self._speeds = ros2_commands.SpeedInlet(config.robot, config.drive, parameters)
         self._pad = ros2_commands.DaemonPad(socket_path(config))
         self._to_daemon = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
@@ -174,11 +174,11 @@ class Bridge:
 
     def _make_readers(self, namespace: str) -> Iterator[tuple[DataReader[Any], _Take]]:
         # One for each type that a topic may have: only the one that the sender has is ever matched.
-        if self._pose is not None and self._pose.topic == ros2_poses.TRANSFORMS:
+        if self._pose is not None and self._pose.topic == ros2_inlets.TRANSFORMS:
             yield self._reader(out.TF, msg.TFMessage, _TRANSFORMS, namespace), self._take_transforms
             yield self._reader(TF_STATIC, msg.TFMessage, _STATIC, namespace), self._take_static_transforms
         elif self._pose is not None:
-            for pose in ros2_poses.TYPES:
+            for pose in ros2_inlets.TYPES:
                 yield self._reader(self._pose.topic, pose, SENSOR, namespace), self._take_pose
         for speed in () if self._base_on_ros else ros2_commands.TYPES:
             yield self._reader(CMD_VEL, speed, SENSOR, namespace), self._take_speed
@@ -223,7 +223,7 @@ class Bridge:
     def _take_static_transforms(self, message: msg.TFMessage, sent_ns: int) -> None:
         self._take_transforms(message, sent_ns, static=True)
 
-    def _take_pose(self, message: ros2_poses.PoseMessage, sent_ns: int) -> None:
+    def _take_pose(self, message: ros2_inlets.PoseMessage, sent_ns: int) -> None:
         datagram = self._poses.datagram(message, sent_ns, time.monotonic_ns(), time.time_ns())
         if datagram is None or self._pose is None:
             return

@@ -27,7 +27,7 @@ from cyclonedds.util import duration
 
 from disco_hw.bridge import ros2_messages as msg
 from disco_hw.bridge.ros2 import RELIABLE, SENSOR, join_domain, wire_name
-from disco_hw.bridge.ros2_wheels import WheelInlet
+from disco_hw.bridge.ros2_inlets import WheelInlet
 from disco_hw.config import RobotConfig, load_robot_config
 from disco_hw.daemon.client import peer_uid
 from disco_hw.daemon.signals import StopSignals

@@ -46,8 +46,7 @@ def run(
     as_json: AsJson = False,
 ) -> None:
     """Run the on-robot daemon: connect, estimate, record; arm and start only when told to (`disco-hw ctl`)."""
-    from disco_hw.daemon.realtime import spare_memory
-    from disco_hw.processes import limit_thread_pools
+    from disco_hw.processes import limit_thread_pools, spare_memory
 
     # Before the numeric libraries are loaded: a pool of threads in them costs the loop its deadlines.
     limit_thread_pools()
@@ -88,8 +87,7 @@ def drive(
     as_json: AsJson = False,
 ) -> None:
     """Drive by keyboard, gamepad or script, and record it for `infer` and `gap` (docs/drive.md)."""
-    from disco_hw.daemon.realtime import spare_memory
-    from disco_hw.processes import limit_thread_pools
+    from disco_hw.processes import limit_thread_pools, spare_memory
 
     limit_thread_pools()
     spare_memory()
@@ -169,8 +167,7 @@ def commission(
     as_json: AsJson = False,
 ) -> None:
     """Guide the first drive: wheels up, then on the floor; finds wrong wiring, ticks and poses (docs/commission.md)."""
-    from disco_hw.daemon.realtime import spare_memory
-    from disco_hw.processes import limit_thread_pools
+    from disco_hw.processes import limit_thread_pools, spare_memory
 
     limit_thread_pools()
     spare_memory()

@@ -10,14 +10,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 import msgspec
 from msgspec import Meta
 
-from disco_hw.config.words import in_words
 from disco_hw.errors import InputError
-from disco_hw.files import ROBOT_TOML, read_toml
+from disco_hw.files import ROBOT_TOML, in_words, read_toml
 from drivers.motor import DriverFieldError, UnknownDriverError, find_driver, own_fields
 from drivers.motor.wiring import AS_TOLD, Wiring
-from drivers.pose import DEFAULT, PoseSourceError, find_pose_source, pose_sources
+from drivers.pose import DEFAULT, PoseConvention, PoseSourceError, find_pose_source, pose_sources
 from drivers.pose import own_fields as own_pose_fields
-from drivers.pose.convention import PoseConvention
 
 if TYPE_CHECKING:
     from disco_hw.tasks import RobotTask

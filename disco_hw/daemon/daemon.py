@@ -6,14 +6,13 @@ import gc
 from collections.abc import Callable
 from typing import Any
 
-from disco_hw.daemon import realtime
+from disco_hw import processes
 from disco_hw.daemon.async_printer import Waiting
 from disco_hw.daemon.client import ADAPT_ACTIONS, PAGE_ACTIONS, UNRECORDED_REMEDY
-from disco_hw.daemon.control_socket import ControlMessage, ControlServer
+from disco_hw.daemon.control_socket import ControlMessage, ControlServer, counters, loop_figures, status
 from disco_hw.daemon.loop import Clock, Loop
 from disco_hw.daemon.page_feed import WatchedRecorder
 from disco_hw.daemon.signals import Notifier, StopSignals
-from disco_hw.daemon.status import counters, loop_figures, status
 from disco_hw.log import records
 from disco_hw.runtime import records_of_tick
 from disco_hw.runtime.core import CoreTick, DaemonCore
@@ -61,7 +60,7 @@ class Daemon:
         self._notifier = Notifier()
         self._signals = signals
         self._pilot = pilot
-        self._stolen_before_ms = realtime.stolen_ms()
+        self._stolen_before_ms = processes.stolen_ms()
         self._quit = False
         self._failed = False
         self._next_second_ns = 0
@@ -209,7 +208,7 @@ class Daemon:
         last = self._core.last
         if last is not None:
             self._tell_state(last)
-        stolen_ms = realtime.stolen_ms() - self._stolen_before_ms
+        stolen_ms = processes.stolen_ms() - self._stolen_before_ms
         return (counters(self._core, self._loop.stats, self._recorder_stats, now_ns, stolen_ms),)
 
     def _tell_state(self, last: CoreTick) -> None:

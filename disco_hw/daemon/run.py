@@ -1,26 +1,37 @@
-"""What `disco-hw run` does: makes the daemon in the order that real time needs, runs it, and undoes it all after."""
+"""What `disco-hw run` does: makes the daemon in the order that real time needs, runs it, and undoes it all after.
+
+Kernels that no earlier start has kept are compiled first, in a process of its own that is gone afterwards: the compiler
+leaves 200 MB behind, and the control loop's process locks all that it has.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import json
+import math
+import multiprocessing
+import os
+import signal
 import sys
-from collections.abc import Callable
-from contextlib import closing
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager, suppress
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal, TypeVar
 
+from numba.core import event
+
+from disco_hw import processes
 from disco_hw.adaptation.adaptation import GeometryAdaptation
 from disco_hw.adaptation.guard import check_adaptable, choose_adaptation
 from disco_hw.adaptation.link import ProcessLink
 from disco_hw.config import RobotConfig
 from disco_hw.control.law import Law, LawController
-from disco_hw.daemon import realtime
 from disco_hw.daemon.async_printer import STANDARD_OUTPUT, AsyncPrinter
 from disco_hw.daemon.client import SERVED, passed_over, recording_in_words, socket_path
-from disco_hw.daemon.compiling import compiled_elsewhere, warm_up
 from disco_hw.daemon.control_socket import ControlServer
 from disco_hw.daemon.daemon import Daemon, Say
 from disco_hw.daemon.loop import MonotonicClock
@@ -28,6 +39,7 @@ from disco_hw.daemon.page_feed import ViewerFeed, WatchedRecorder, feed_path, ti
 from disco_hw.daemon.signals import StopPath, StopSignals
 from disco_hw.log.link import DBC, Attachment, version
 from disco_hw.log.recorder import NullRecorder, ProcessRecorder, Recorder, RecordingSettings
+from disco_hw.processes import end_with_parent
 from disco_hw.runtime.assembly import (
     assemble_core,
     driver_of,
@@ -39,10 +51,11 @@ from disco_hw.runtime.assembly import (
     make_planner,
 )
 from disco_hw.runtime.pilot import FindsWiring, Pilot, TaskPilot
-from disco_hw.runtime.pipeline import NoPlanner, Pipeline, Planner
+from disco_hw.runtime.pipeline import FollowTask, NoPlanner, Off, Pipeline, Planner, Stand
 from disco_hw.runtime.robot_setup import Setup, kept_files, link_key, load_setup, refuse_missing_effects, scene_of
 from disco_hw.runtime.states import Ask, by_command
-from drivers.types import Transport
+from drivers.kernel_cache import are_kernels_kept
+from drivers.types import PoseSample, Readings, Transport, WheelSample
 from firmware_protocol.dbc import packaged_dbc
 
 Adapt = Literal["off", "fast", "audited", "network"]
@@ -77,7 +90,7 @@ def run_robot(
     those of `disco-hw run`. Returns after Ctrl-C, SIGTERM or `disco-hw ctl ROBOT.toml quit`, with the robot told to
     stop. Call it in the main thread, as it catches signals. Raises InputError.
     """
-    realtime.spare_memory()
+    processes.spare_memory()
     options = DaemonOptions(
         Path(robot), None if model is None else Path(model), link, None if log is None else Path(log)
     )
@@ -187,7 +200,7 @@ def _start(
             adaptation = make_audited_adaptation(setup, pipeline, ProcessLink())
     if adaptation is not None:
         stop.add("adapter", adaptation.close)
-    for step in realtime.enter(config.daemon.realtime_priority):
+    for step in processes.enter(config.daemon.realtime_priority):
         say("real time", str(step))
     for line in passed_over(server.path):
         say("control socket", line)
@@ -202,7 +215,7 @@ def _start(
     daemon = Daemon(core, server, recorder, MonotonicClock(), signals, say, pilot, ask)
     stop.add("wheels", daemon.stop_wheels)
     if config.daemon.realtime_priority:
-        say("real time", str(realtime.raise_loop_thread(config.daemon.realtime_priority)))
+        say("real time", str(processes.raise_loop_thread(config.daemon.realtime_priority)))
     say("daemon", f"{transport.name}, control socket {server.path}")
     if ask is not None:
         say("log", f"recording to {log}" if log is not None else "nothing is recorded, as log.enabled is false")
@@ -263,3 +276,131 @@ def in_text(topic: str, text: str) -> str:
 def in_json(topic: str, text: str) -> str:
     """A sentence of the daemon for machines."""
     return json.dumps({"topic": topic, "text": text})
+
+
+T = TypeVar("T")
+
+_COMPILE = "numba:compile"
+_EVERY_S = 1.0
+
+
+class _Compilation(event.Listener):
+    """Counts the functions that are compiled, and says so again and again from a thread that begins with the first."""
+
+    def __init__(self, what: str, say: Callable[[str], None], every_s: float) -> None:
+        self._what, self._say, self._every_s = what, say, every_s
+        self._count = 0
+        self._began_ns = 0
+        self._ended = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def on_start(self, event: Any) -> None:
+        if self._thread is None:
+            self._say(f"compiling {self._what}: about a minute, this once; the result is kept for the next start")
+            self._began_ns = time.monotonic_ns()
+            self._thread = threading.Thread(target=self._tell, name="compile progress", daemon=True)
+            self._thread.start()
+
+    def on_end(self, event: Any) -> None:
+        self._count += 1
+
+    def finish(self) -> None:
+        """End the thread, and say how long it took if anything was compiled."""
+        self._ended.set()
+        if self._thread is not None:
+            self._thread.join()
+            self._say(f"compiled {self._so_far()}")
+
+    def _tell(self) -> None:
+        while not self._ended.wait(self._every_s):
+            self._say(f"compiling: {self._so_far()}")
+
+    def _so_far(self) -> str:
+        return f"{self._count} functions, {(time.monotonic_ns() - self._began_ns) * 1e-9:.0f} s"
+
+
+@contextmanager
+def compile_progress(what: str, say: Callable[[str], None], every_s: float = _EVERY_S) -> Iterator[None]:
+    """Within the block, say through `say` what numba compiles and how far it is; nothing where its cache has it all.
+
+    `what`: for a person, as "the planner for a circle". `say` is called from a thread, which ends with the block.
+    """
+    compilation = _Compilation(what, say, every_s)
+    try:
+        with event.install_listener(_COMPILE, compilation):
+            yield
+    finally:
+        compilation.finish()
+
+
+class _NothingKeptError(Exception):
+    """Something would have been compiled."""
+
+
+class _Refusal(event.Listener):
+    """Ends the first compilation before it begins."""
+
+    def on_start(self, event: Any) -> None:
+        raise _NothingKeptError
+
+    def on_end(self, event: Any) -> None:
+        pass
+
+
+def compiled_elsewhere(make: Callable[[], T], what: str, say: Callable[[str], None]) -> T:
+    """Return `make()`, after another process has compiled and kept on disk all that it needs.
+
+    `make` is called up to three times, once in a fork of this process; so it must open nothing, and no thread may run
+    yet. Where nothing can be kept, or the other process fails, this process compiles by itself. `what` and `say` as
+    for `compile_progress`.
+    """
+    if are_kernels_kept():
+        try:
+            with event.install_listener(_COMPILE, _Refusal()):
+                return make()
+        except _NothingKeptError:
+            _make_in_a_fork(make, what, say)
+    with compile_progress(what, say):
+        return make()
+
+
+def _make_in_a_fork(make: Callable[[], object], what: str, say: Callable[[str], None]) -> None:
+    parent = os.getpid()
+
+    def compile_all() -> None:
+        end_with_parent(parent, signal.SIGKILL)
+        # Whatever is wrong is found, and said, by the caller's own attempt.
+        with suppress(Exception), compile_progress(what, say):
+            make()
+
+    process = multiprocessing.get_context("fork").Process(target=compile_all, daemon=True)
+    process.start()
+    try:
+        process.join()
+    finally:
+        process.kill()
+
+
+_PERIOD_NS = 20_000_000
+_POSE_DELAY_NS = 30_000_000
+_TICKS = 60
+_WHEEL_RAD_S = 2.0
+_ON_THE_WAY = 20
+
+
+def warm_up(pipeline: Pipeline) -> None:
+    """Drive a pipeline that is thrown away afterwards through standing, driving, late and absurd poses."""
+    pipeline.step(0, Readings(), Off())
+    for tick in range(1, _TICKS):
+        now_ns = tick * _PERIOD_NS
+        pipeline.step(now_ns, _readings(now_ns, tick), FollowTask() if tick > _ON_THE_WAY else Stand())
+        pipeline.rollouts(1)
+
+
+def _readings(now_ns: int, tick: int) -> Readings:
+    speed = _WHEEL_RAD_S if tick > _ON_THE_WAY else 0.0
+    angle = _WHEEL_RAD_S * max(0, tick - _ON_THE_WAY) * _PERIOD_NS * 1e-9
+    wheels = WheelSample(now_ns, now_ns, angle, 1.5 * angle, speed, 1.5 * speed)
+    far_off = math.nan if tick == _TICKS - 2 else 1.0 if tick == _TICKS - 3 else 0.0
+    pose = PoseSample(now_ns - _POSE_DELAY_NS, now_ns, far_off, 0.06 * angle, 0.5 * math.pi, 0.005, 0.01)
+    return Readings(wheels=(wheels,), poses=(pose,) if tick > 1 else ())

@@ -10,8 +10,7 @@ import msgspec
 from disco_hw.config import Estimation
 from disco_hw.estimation.belief import MAX_POSITION_VARIANCE, MAX_YAW_VARIANCE
 from disco_hw.estimation.correction import PoseReason, Triple, screen
-from disco_hw.estimation.filter import Judgement, PoseFilter
-from disco_hw.estimation.heading import HeadingSearch
+from disco_hw.estimation.filter import HeadingSearch, Judgement, PoseFilter
 from disco_hw.estimation.history import RewindBuffer
 from disco_hw.estimation.odometry import (
     FUTURE_TOLERANCE_NS,

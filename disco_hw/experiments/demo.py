@@ -27,7 +27,6 @@ from rich.text import Text
 
 import disco_hw
 from disco_hw.config import load_robot_config
-from disco_hw.daemon.realtime import stolen_ms
 from disco_hw.errors import InputError, WorkError
 from disco_hw.experiments.circle_report import (
     NARROWEST,
@@ -46,6 +45,7 @@ from disco_hw.experiments.live_stack import (
     stands,
     with_device,
 )
+from disco_hw.processes import stolen_ms
 from disco_hw.runtime.robot_setup import Setup, geometry, load_setup
 from disco_hw.tasks.circle import CircleTask, circle_task, inwards_sine
 from disco_hw.viewer.page_process import DEFAULT_PORT, LOOPBACK, TOKEN_VARIABLE, page_address, page_token

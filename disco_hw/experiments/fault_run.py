@@ -17,8 +17,8 @@ import disco_hw
 from disco_hw.config import RobotConfig
 from disco_hw.control import NoValidControl, PlannerState, Rollouts, WheelPlan
 from disco_hw.control.plan import Diagnostics
+from disco_hw.daemon.control_socket import counters
 from disco_hw.daemon.loop import LoopStats
-from disco_hw.daemon.status import counters
 from disco_hw.experiments.wheel_monitor import WheelMonitor
 from disco_hw.log import records
 from disco_hw.log.recorder import RecorderStats

@@ -26,7 +26,7 @@ from disco_hw.first_use.procedure import (
     TurnsSeen,
 )
 from drivers.motor.wiring import Wiring
-from drivers.pose.convention import PoseConvention
+from drivers.pose import PoseConvention
 from drivers.types import PoseSample
 
 Edits = Mapping[tuple[str, str], Any]

@@ -16,15 +16,30 @@ from numpy.typing import NDArray
 
 from disco_hw.config import RobotConfig
 from disco_hw.errors import InputError
-from disco_hw.inference.checks import Calibration, Predictive, calibrate, effective_simulations, predictive
+from disco_hw.inference.checks import (
+    Calibration,
+    Predictive,
+    calibrate,
+    effective_simulations,
+    predictive,
+    undetermined,
+)
 from disco_hw.inference.density_network import Mixtures, NetworkSettings
 from disco_hw.inference.estimates import estimates, paper_statistics
 from disco_hw.inference.excitation import Excitation, excitation
-from disco_hw.inference.identifiability import undetermined
 from disco_hw.inference.noise import USUAL, Noise, measured_noise
 from disco_hw.inference.rounds import Fitted, Region, RoundSettings, run_rounds
-from disco_hw.inference.simulate import NAMES, Seeds, Simulator, Summary, draw_seeds, physical_range
-from disco_hw.inference.workers import ReportProgress, Tally, Workers
+from disco_hw.inference.simulate import (
+    NAMES,
+    ReportProgress,
+    Seeds,
+    Simulator,
+    Summary,
+    Tally,
+    Workers,
+    draw_seeds,
+    physical_range,
+)
 from disco_hw.log.drive import DriveLog
 from disco_hw.model import Gaussian, Mixture, Model
 

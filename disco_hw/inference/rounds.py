@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.inference.density_network import DensityNetwork, Mixtures, NetworkSettings, train
-from disco_hw.inference.simulate import Seeds, draw_seeds
-from disco_hw.inference.workers import LocalWorkers, Workers
+from disco_hw.inference.simulate import LocalWorkers, Seeds, Workers, draw_seeds
 
 Array = NDArray[np.float64]
 Simulate = Callable[[Array, Seeds], Array]

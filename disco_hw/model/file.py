@@ -11,9 +11,8 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from disco_hw.config.words import in_words
 from disco_hw.errors import InputError
-from disco_hw.files import MODEL_TOML, read_toml
+from disco_hw.files import MODEL_TOML, in_words, read_toml
 from disco_hw.model.belief import Belief, Gaussian, Mixture, Uniform
 from disco_hw.model.model import EffectSetting, Model
 

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw import config
-from disco_hw.config.words import nearest
 from disco_hw.effects.effect import Effect, Parameter
 from disco_hw.effects.registry import MOTION_EFFECTS, REGISTRY
+from disco_hw.files import nearest
 from disco_hw.model.belief import Belief, Uniform
 from disco_hw.model.coefficients import Base, Coefficients, Effects, TermCoefficients
 from disco_hw.model.terms import COMMAND, TERMS, effect_of, table_entry

@@ -12,7 +12,7 @@ from typing import Any
 
 from drivers import status_texts
 from drivers.device_clock import DEVICE_CLOCK_MODULUS_US, DeviceClock
-from drivers.motor import reference_telemetry as telemetry
+from drivers.motor import reference_frames as telemetry
 from drivers.motor.reference_arming import MESSAGES as HANDSHAKE_MESSAGES
 from drivers.motor.reference_arming import ArmedWatch, Arming, Handshake, HostState, cyclic_frames
 from drivers.motor.reference_frames import FrameReception, FrameTransmission

@@ -1,20 +1,23 @@
-"""Pose sources, one file each, of which robot.toml's `pose.source` names one; see docs/add-a-pose-source.md."""
+"""Pose sources, one file each, of which robot.toml's `pose.source` names one, and the convention each may speak in.
+
+docs/add-a-pose-source.md says what a source is.
+"""
 
 from __future__ import annotations
 
 import inspect
+import math
 import pkgutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from importlib import import_module
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Literal
+
+import msgspec
 
 from drivers.pose import robot
-from drivers.pose.convention import PoseSourceError
-from drivers.types import PoseSource
-
-__all__ = ["DEFAULT", "PoseSourceError", "find_pose_source", "make_pose_source", "own_fields", "pose_sources"]
+from drivers.types import PoseSample, PoseSource, SaysWhy
 
 DEFAULT = robot.SOURCE
 
@@ -46,3 +49,124 @@ def own_fields(name: str) -> frozenset[str]:
 def make_pose_source(source: str, **fields: Any) -> PoseSource:
     """Make the source that `pose.source` names of the fields of [pose]; None is a default. Raises PoseSourceError."""
     return find_pose_source(source)(**{name: value for name, value in fields.items() if value is not None})
+
+
+_METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+_RADIANS = {"rad": 1.0, "deg": math.pi / 180.0}
+
+
+class PoseConvention(msgspec.Struct, frozen=True):
+    """What a source sends: units; `clockwise` yaw; `mirrored`: its y is to the right of its x.
+
+    `yaw_offset_rad` (counter-clockwise) is added to its yaw: where the sensor looks aside of the robot's forward.
+    `origin` is the pose of the sensor's frame in the world (x, y, yaw), `offset` the place of the sensor on the robot,
+    ahead of the tracked point and to its left, `latency_s` how old a sample is beyond what the source says.
+    """
+
+    position_unit: Literal["m", "cm", "mm"] = "m"
+    yaw_unit: Literal["rad", "deg"] = "rad"
+    clockwise: bool = False
+    mirrored: bool = False
+    yaw_offset_rad: float = 0.0
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    offset: tuple[float, float] = (0.0, 0.0)
+    latency_s: float = 0.0
+
+    def converted(self, told: PoseSample) -> PoseSample:
+        """The pose of the tracked point in metres and radians, counter-clockwise, yaw in (-pi, pi].
+
+        Without a heading it is not known where the tracked point is: the position stays the sensor's, which the sample
+        then says by its lever arm.
+        """
+        metres, radians = _METRES[self.position_unit], _RADIANS[self.yaw_unit]
+        x_m, y_m = metres * told.x_m, (-metres if self.mirrored else metres) * told.y_m
+        at_x, at_y, turn = self.origin
+        x_m, y_m = _turned(x_m, y_m, turn)
+        x_m, y_m = at_x + x_m, at_y + y_m
+        t_ns, std_m, yaw_std_rad = (
+            told.t_ns - round(1e9 * self.latency_s),
+            metres * told.position_std_m,
+            radians * told.yaw_std_rad,
+        )
+        if not told.has_heading:
+            return PoseSample(t_ns, told.received_ns, x_m, y_m, math.nan, std_m, math.nan, *self.offset)
+        yaw_rad = (-radians if self.clockwise else radians) * told.yaw_rad + turn + self.yaw_offset_rad
+        if not math.isfinite(yaw_rad):
+            return PoseSample(t_ns, told.received_ns, x_m, y_m, yaw_rad, std_m, yaw_std_rad)
+        ahead_x, ahead_y = _turned(*self.offset, yaw_rad)
+        return PoseSample(
+            t_ns,
+            told.received_ns,
+            x_m - ahead_x,
+            y_m - ahead_y,
+            math.remainder(yaw_rad, 2.0 * math.pi),
+            math.hypot(std_m, math.hypot(*self.offset) * yaw_std_rad),
+            yaw_std_rad,
+        )
+
+
+def _turned(x: float, y: float, angle_rad: float) -> tuple[float, float]:
+    cosine, sine = math.cos(angle_rad), math.sin(angle_rad)
+    return cosine * x - sine * y, sine * x + cosine * y
+
+
+AS_OURS = PoseConvention()
+
+
+class ConvertedPoses:
+    """A source behind a convention; satisfies `drivers.types.PoseSource`."""
+
+    def __init__(self, source: PoseSource, convention: PoseConvention) -> None:
+        self._source = source
+        self._convention = convention
+
+    def receive(self, now_ns: int, from_robot: Sequence[PoseSample]) -> Sequence[PoseSample]:
+        """The source's poses in our convention."""
+        return [self._convention.converted(sample) for sample in self._source.receive(now_ns, from_robot)]
+
+    def news(self) -> Sequence[str]:
+        """What the source says."""
+        return self._source.news() if isinstance(self._source, SaysWhy) else ()
+
+    def close(self) -> None:
+        """Close the source."""
+        self._source.close()
+
+
+def converted(source: PoseSource, convention: PoseConvention) -> PoseSource:
+    """The source in our convention; itself where nothing is to be changed."""
+    return source if convention == AS_OURS else ConvertedPoses(source, convention)
+
+
+class SeveralPoses:
+    """Sources side by side, each in our convention already; satisfies `drivers.types.PoseSource`."""
+
+    def __init__(self, sources: Sequence[PoseSource], labels: Sequence[str]) -> None:
+        self._sources = tuple(zip(labels, sources, strict=True))
+
+    def receive(self, now_ns: int, from_robot: Sequence[PoseSample]) -> Sequence[PoseSample]:
+        """The poses of all of them by their stamps, each with the number of its source."""
+        found = [
+            msgspec.structs.replace(sample, source=number)
+            for number, (_, source) in enumerate(self._sources)
+            for sample in source.receive(now_ns, from_robot)
+        ]
+        return sorted(found, key=lambda sample: (sample.t_ns, sample.source))
+
+    def news(self) -> Sequence[str]:
+        """What they say, each under its name."""
+        return [
+            f"{label}: {words}"
+            for label, source in self._sources
+            if isinstance(source, SaysWhy)
+            for words in source.news()
+        ]
+
+    def close(self) -> None:
+        """Close all of them."""
+        for _, source in self._sources:
+            source.close()
+
+
+class PoseSourceError(ValueError):
+    """A source that cannot be had, by its name or its device; the message is one line with the remedy."""

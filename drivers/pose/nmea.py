@@ -1,6 +1,9 @@
-"""Positions of a GPS receiver that speaks NMEA 0183, on a serial port or over TCP: what the daemon sees of them.
+"""Positions of a GPS receiver that speaks NMEA 0183, on a serial port or over TCP.
 
-The receiver is read by a process of its own (`drivers.pose.nmea_reader`), as ports and networks block.
+The receiver is read by a process of its own, which runs this file, as ports and networks block: NMEA sentences in,
+positions in a local tangent plane out. Taken are GGA (position and quality), GST (its standard deviation) and HDT
+(heading of two antennas). RMC and VTG give a course over ground, which is no heading for a robot that drives backward
+and turns on the spot: the estimator finds that better from the positions.
 """
 
 from __future__ import annotations
@@ -8,20 +11,25 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import json
+import math
+import os
 import socket
 import subprocess
 import sys
-from collections.abc import Sequence
+import time
+from collections import deque
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import msgspec
 
-from drivers.pose.convention import PoseSourceError
+from drivers.pose import PoseSourceError
 from drivers.pose.udp import LONGEST_DATAGRAM, MOST_A_TICK, pose_of
 from drivers.types import PoseSample
 
 SOURCE = "nmea"
-_READER = "drivers.pose.nmea_reader"
+_READER = "drivers.pose.nmea"
 _END_TIMEOUT_S = 1.0
 
 
@@ -115,3 +123,249 @@ class NmeaPoses:
     def _keep_words(self, message: bytes) -> None:
         with contextlib.suppress(msgspec.MsgspecError):
             self._said.append(_WORDS.decode(message).said)
+
+
+DAY_S = 86_400.0
+QUALITY_STD_M = {1: 3.0, 2: 0.8, 3: 2.0, 4: 0.02, 5: 0.4}
+"""Of a coordinate, where the receiver says none (GST), by the quality of GGA: 1 alone, 2 differential, 3 precise, 4 RTK
+with whole wavelengths, 5 without. 0 is no fix; 6, 7 and 8 are reckoned, typed in and simulated: no measurement."""
+FARTHEST_M = 838.0
+"""As far as the estimator and the frames of a pose go."""
+_LEAST_STD_M = 0.005
+_GST_HOLDS_S = 2.5
+_PAIR_NS = 60_000_000
+_HEADING_HOLDS_NS = 2_000_000_000
+_CLOCK_WINDOW_S = 30.0
+_SEMI_MAJOR_M, _FLATTENING = 6_378_137.0, 1.0 / 298.257223563
+_LONGEST_LINE = 256
+_SILENT_S = 3.0
+_READ_S = 0.05
+_RETRY_S = (0.5, 1.0, 2.0, 5.0)
+
+
+@dataclass(frozen=True)
+class TangentPlane:
+    """East and north (m) of the datum, on the WGS 84 ellipsoid at the datum's height."""
+
+    latitude_deg: float
+    longitude_deg: float
+    height_m: float
+
+    def east_north(self, latitude_deg: float, longitude_deg: float, height_m: float) -> tuple[float, float]:
+        """Where a place is, by geocentric coordinates."""
+        here, datum = _geocentric(latitude_deg, longitude_deg, height_m), _geocentric(*self._datum)
+        dx, dy, dz = (a - b for a, b in zip(here, datum, strict=True))
+        latitude, longitude = math.radians(self.latitude_deg), math.radians(self.longitude_deg)
+        outward = math.cos(longitude) * dx + math.sin(longitude) * dy
+        east = -math.sin(longitude) * dx + math.cos(longitude) * dy
+        return east, -math.sin(latitude) * outward + math.cos(latitude) * dz
+
+    @property
+    def _datum(self) -> tuple[float, float, float]:
+        return self.latitude_deg, self.longitude_deg, self.height_m
+
+
+def _geocentric(latitude_deg: float, longitude_deg: float, height_m: float) -> tuple[float, float, float]:
+    latitude, longitude = math.radians(latitude_deg), math.radians(longitude_deg)
+    squared = _FLATTENING * (2.0 - _FLATTENING)
+    curve = _SEMI_MAJOR_M / math.sqrt(1.0 - squared * math.sin(latitude) ** 2)
+    across = (curve + height_m) * math.cos(latitude)
+    upward = ((1.0 - squared) * curve + height_m) * math.sin(latitude)
+    return across * math.cos(longitude), across * math.sin(longitude), upward
+
+
+class ReceiverClock:
+    """The host's time of a fix: the receiver's own time, shifted by the least delay seen lately.
+
+    A line is late by the port's and the network's moods; the receiver's stamps are not. What all lines are late by,
+    `pose.latency_s` says.
+    """
+
+    def __init__(self) -> None:
+        self._offsets: deque[tuple[float, float]] = deque()
+        self._days, self._last_s = 0.0, 0.0
+
+    def host_ns(self, time_of_day_s: float, arrival_ns: int) -> int:
+        """When a fix of this time was true, at the latest."""
+        if time_of_day_s < self._last_s - 0.5 * DAY_S:
+            self._days += DAY_S
+        elif abs(time_of_day_s - self._last_s) > 0.5:
+            # The receiver has found its time anew, or was away: nothing is known of its clock.
+            self._offsets.clear()
+        self._last_s = time_of_day_s
+        told_s = self._days + time_of_day_s
+        self._offsets.append((told_s, arrival_ns * 1e-9 - told_s))
+        while told_s - self._offsets[0][0] > _CLOCK_WINDOW_S:
+            self._offsets.popleft()
+        return min(arrival_ns, round(1e9 * (told_s + min(offset for _, offset in self._offsets))))
+
+
+@dataclass
+class Fixes:
+    """What sentences mean: `take` them with their arrival, and `flush` now and then; pure, and raises nothing.
+
+    What they give is a datagram's map (`drivers.pose.udp`), or {"said": sentence} where something changed for the worse
+    or the better. A heading belongs to the position that came within 60 ms of it.
+    """
+
+    datum: tuple[float, float] | None = None
+    heading_std_rad: float = 0.02
+    malformed: int = 0
+    _plane: TangentPlane | None = None
+    _quality: int | None = None
+    _gst: tuple[float, float] | None = None
+    _heading: tuple[int, float] | None = None
+    _waiting: dict[str, Any] | None = None
+    _waits_since_ns: int = 0
+    _far: bool = False
+    _clock: ReceiverClock = field(default_factory=ReceiverClock)
+
+    def take(self, line: bytes, arrival_ns: int) -> list[dict[str, Any]]:
+        """Take in one line as it came."""
+        from pynmeagps import NMEAReader  # noqa: PLC0415
+        from pynmeagps.exceptions import NMEAMessageError, NMEAParseError, NMEATypeError  # noqa: PLC0415
+
+        ready = self.flush(arrival_ns)
+        try:
+            said = NMEAReader.parse(line)
+        except (NMEAParseError, NMEAMessageError, NMEATypeError, ValueError, IndexError, KeyError):
+            self.malformed += 1
+            return ready
+        kind = "" if said is None else said.msgID
+        if kind == "GST":
+            self._take_deviation(said)
+        elif kind == "HDT" and isinstance(said.headingT, float) and 0.0 <= said.headingT <= 360.0:
+            self._heading = (arrival_ns, said.headingT)
+            if self._waiting is not None:
+                ready += self._with_heading(self._waiting, said.headingT)
+                self._waiting = None
+        elif kind == "GGA":
+            ready += self._take_position(said, arrival_ns)
+        return ready
+
+    def flush(self, now_ns: int) -> list[dict[str, Any]]:
+        """Give the position that has waited for a heading long enough."""
+        if self._waiting is None or now_ns - self._waits_since_ns < _PAIR_NS:
+            return []
+        waiting, self._waiting = self._waiting, None
+        return [waiting]
+
+    def _take_deviation(self, said: Any) -> None:
+        time_s, deviations = _time_of_day_s(said.time), (said.stdLat, said.stdLong)
+        if time_s is not None and all(isinstance(one, float) and one > 0.0 for one in deviations):
+            self._gst = (time_s, max(deviations))
+
+    def _take_position(self, said: Any, arrival_ns: int) -> list[dict[str, Any]]:
+        quality, time_s = said.quality, _time_of_day_s(said.time)
+        words = self._quality_words(quality)
+        place = (said.lat, said.lon, said.alt)
+        if quality not in QUALITY_STD_M or time_s is None or not all(isinstance(one, float) for one in place):
+            return words
+        height_m = said.alt + (said.sep if isinstance(said.sep, float) else 0.0)
+        if self._plane is None:
+            latitude, longitude = self.datum or (said.lat, said.lon)
+            self._plane = TangentPlane(latitude, longitude, height_m)
+            words.append({"said": f"datum: latitude {latitude:.8f}, longitude {longitude:.8f}"})
+        east_m, north_m = self._plane.east_north(said.lat, said.lon, height_m)
+        words += self._range_words(math.hypot(east_m, north_m))
+        position = {
+            "t_ns": self._clock.host_ns(time_s, arrival_ns),
+            "x_m": east_m,
+            "y_m": north_m,
+            "position_std_m": self._deviation_m(quality, time_s, said.HDOP),
+        }
+        if self._heading is None or arrival_ns - self._heading[0] > _HEADING_HOLDS_NS:
+            return [*words, position]
+        if arrival_ns - self._heading[0] < _PAIR_NS:
+            return [*words, *self._with_heading(position, self._heading[1])]
+        self._waiting, self._waits_since_ns = position, arrival_ns
+        return words
+
+    def _deviation_m(self, quality: int, time_s: float, hdop: Any) -> float:
+        if self._gst is not None and abs(math.remainder(time_s - self._gst[0], DAY_S)) < _GST_HOLDS_S:
+            return max(self._gst[1], _LEAST_STD_M)
+        usual = QUALITY_STD_M[quality]
+        return usual * max(hdop, 1.0) if isinstance(hdop, float) else usual
+
+    def _with_heading(self, position: dict[str, Any], heading_deg: float) -> list[dict[str, Any]]:
+        """Clockwise from north, as the receiver says it, to counter-clockwise from east."""
+        yaw_rad = math.remainder(math.radians(90.0 - heading_deg), math.tau)
+        return [{**position, "yaw_rad": yaw_rad, "yaw_std_rad": self.heading_std_rad}]
+
+    def _range_words(self, away_m: float) -> list[dict[str, Any]]:
+        before, self._far = self._far, away_m > FARTHEST_M
+        if self._far is before or not self._far:
+            return []
+        return [{"said": f"{away_m:.0f} m from the datum, and {FARTHEST_M:.0f} m is the farthest; mend pose.datum"}]
+
+    def _quality_words(self, quality: int) -> list[dict[str, Any]]:
+        before, self._quality = self._quality, quality
+        if quality == before:
+            return []
+        names = {0: "no fix: the antenna needs a free sky", 4: "RTK fix", 5: "RTK without whole wavelengths"}
+        unused = "" if quality in QUALITY_STD_M else "; its positions are not used"
+        return [{"said": f"fix quality {quality}: {names.get(quality, 'not RTK')}{unused}"}]
+
+
+def _time_of_day_s(said: Any) -> float | None:
+    if not hasattr(said, "microsecond"):
+        return None
+    return float(3600.0 * said.hour + 60.0 * said.minute + said.second + 1e-6 * said.microsecond)
+
+
+def _lines(device: str, baud: int) -> Iterator[tuple[bytes, str | None]]:
+    """Lines as they come, empty ones where none has come for a moment, and words where something is wrong; endless."""
+    import serial  # noqa: PLC0415
+
+    tries = 0
+    while True:
+        try:
+            with serial.serial_for_url(device, baudrate=baud, timeout=_READ_S) as port:
+                yield b"", f"{device}: open"
+                heard_s, kept, told = time.monotonic(), b"", False
+                while True:
+                    kept += port.read(max(1, min(port.in_waiting, _LONGEST_LINE)))
+                    *lines, kept = kept.split(b"\n")
+                    for line in lines:
+                        if line.startswith(b"$"):
+                            heard_s, told, tries = time.monotonic(), False, 0
+                        yield line + b"\n", None
+                    kept = kept[-_LONGEST_LINE:]
+                    if time.monotonic() - heard_s > _SILENT_S and not told:
+                        told = True
+                        yield b"", f"{device}: no NMEA sentence for {_SILENT_S:.0f} s; check the receiver and pose.baud"
+                    yield b"", None
+        except (OSError, ValueError) as error:
+            # serial.SerialException is an OSError.
+            yield b"", f"{device}: {error}; tried again until it is there"
+        wait_s = _RETRY_S[min(tries, len(_RETRY_S) - 1)]
+        tries += 1
+        until_s = time.monotonic() + wait_s
+        while time.monotonic() < until_s:
+            time.sleep(_READ_S)
+            yield b"", None
+
+
+def main(descriptor: int, settings: dict[str, Any]) -> None:
+    """Read until the daemon has gone."""
+    to_daemon = socket.socket(fileno=descriptor)
+    parent, last_words = os.getppid(), ""
+    datum = settings["datum"]
+    fixes = Fixes(None if datum is None else tuple(datum), settings["heading_std_rad"])
+    for line, words in _lines(settings["device"], settings["baud"]):
+        now_ns = time.monotonic_ns()
+        ready = fixes.take(line, now_ns) if line else fixes.flush(now_ns)
+        if words is not None and words != last_words:
+            ready.append({"said": words})
+        last_words = words or last_words
+        if os.getppid() != parent:
+            return
+        try:
+            for each in ready:
+                to_daemon.send(json.dumps(each).encode())
+        except OSError:
+            return
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]), json.loads(sys.argv[2]))

@@ -12,7 +12,7 @@ import struct
 from collections.abc import Sequence
 from typing import Any
 
-from drivers.pose.convention import PoseSourceError
+from drivers.pose import PoseSourceError
 from drivers.pose.udp import LONGEST_DATAGRAM, MOST_A_TICK, pose_of
 from drivers.types import PoseSample
 

@@ -15,7 +15,7 @@ from typing import Any
 
 import msgspec
 
-from drivers.pose.convention import PoseSourceError
+from drivers.pose import PoseSourceError
 from drivers.types import PoseSample
 
 SOURCE = "udp"

@@ -7,7 +7,7 @@ from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
 
-from sim.robot import Controller
+from sim.virtual_robot import Controller
 
 
 def find_controller(driver: str) -> Callable[[Any, int], Controller] | None:

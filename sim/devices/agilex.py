@@ -152,7 +152,7 @@ class AgilexBase:
 
 
 class AgilexController:
-    """One base: satisfies `sim.robot.Controller`. It makes wheel speeds of its own, by the track that it has."""
+    """One base: satisfies `virtual_robot.Controller`. It makes wheel speeds of its own, by the track that it has."""
 
     brakes = False
 

@@ -311,7 +311,7 @@ class OdriveBoard:
 
 
 class OdriveController:
-    """All axes of one robot: satisfies `sim.robot.Controller`. Firmware 0.6 has a board for each axis."""
+    """All axes of one robot: satisfies `sim.virtual_robot.Controller`. Firmware 0.6 has a board for each axis."""
 
     brakes = False
 

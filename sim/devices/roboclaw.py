@@ -194,7 +194,7 @@ _GETTERS: dict[int, Callable[[RoboclawRegisters], bytes]] = {
 
 
 class RoboclawController:
-    """All boards of a robot on one serial line: satisfies `sim.robot.Controller`; frames carry the line's bytes.
+    """All boards of a robot on one serial line: satisfies `virtual_robot.Controller`; frames carry the line's bytes.
 
     Motors whose command has ended, by the serial timeout or an error, coast; zero duty brakes. `dead`: addresses of
     boards without supply.

@@ -18,7 +18,7 @@ WHEELS_MS, STATE_MS, STEP_MS = 20, 50, 20
 
 
 class Ros2BaseController:
-    """Satisfies `sim.robot.Controller`. `joints`: whether the base says how all of its wheels turn."""
+    """Satisfies `sim.virtual_robot.Controller`. `joints`: whether the base says how all of its wheels turn."""
 
     brakes = False
 

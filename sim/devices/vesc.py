@@ -353,7 +353,7 @@ class _PacketParser:
 
 
 class VescController:
-    """All VESCs of one robot: satisfies `sim.robot.Controller`. Below its least speed a motor is let go."""
+    """All VESCs of one robot: satisfies `sim.virtual_robot.Controller`. Below its least speed a motor is let go."""
 
     def __init__(self, settings: VescSettings, ticks_per_rev: int) -> None:
         self._settings = settings

@@ -21,7 +21,7 @@ from cyclonedds.topic import Topic
 from disco_hw.bridge import ros2_messages as msg
 from disco_hw.bridge.ros2 import RELIABLE
 from disco_hw.bridge.ros2_base import BaseBridge, Clients, run_base_bridge
-from disco_hw.bridge.ros2_wheels import WheelInlet
+from disco_hw.bridge.ros2_inlets import WheelInlet
 from disco_hw.config import load_robot_config
 from disco_hw.config.robot import Ros2
 from disco_hw.errors import InputError

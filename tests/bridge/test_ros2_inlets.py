@@ -13,7 +13,7 @@ pytest.importorskip("cyclonedds", reason="cyclonedds is not installed: make venv
 from disco_hw.bridge import ros2_messages as msg
 from disco_hw.bridge.ros2 import Bridge
 from disco_hw.bridge.ros2_commands import Errands, SpeedInlet, refusal
-from disco_hw.bridge.ros2_poses import PoseInlet, TransformInlet
+from disco_hw.bridge.ros2_inlets import PoseInlet, TransformInlet
 from disco_hw.config import Drive, PoseInput, Robot
 from disco_hw.config.robot import Ros2
 from disco_hw.drive.hand_pilot import Deadman

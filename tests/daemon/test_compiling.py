@@ -9,7 +9,7 @@ import threading
 import pytest
 from numba import njit
 
-from disco_hw.daemon.compiling import compile_progress
+from disco_hw.daemon.run import compile_progress
 
 KERNEL = """
 from drivers.kernel_cache import compiled
@@ -20,7 +20,7 @@ def double(x):
 """
 START = """
 import os
-from disco_hw.daemon.compiling import compiled_elsewhere
+from disco_hw.daemon.run import compiled_elsewhere
 from kernel import double
 
 print(os.getpid(), flush=True)

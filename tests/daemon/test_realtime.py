@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from disco_hw.daemon.realtime import can_lock_memory, can_use_fifo, stolen_ms
+from disco_hw.processes import can_lock_memory, can_use_fifo, stolen_ms
 
 FIFO_ALLOWED = pytest.mark.skipif(not can_use_fifo(), reason="this user may not use SCHED_FIFO")
 REPORT = """

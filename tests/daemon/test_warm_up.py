@@ -11,7 +11,7 @@ import pytest
 
 from disco_hw.config import Estimation
 from disco_hw.control import NoValidControl
-from disco_hw.daemon.compiling import warm_up
+from disco_hw.daemon.run import warm_up
 from disco_hw.estimation import OdometryParameters, PoseFusion
 from disco_hw.runtime.governor import Governor, WheelLimits
 from disco_hw.runtime.pipeline import Pipeline

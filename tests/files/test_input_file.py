@@ -183,7 +183,7 @@ def test_any_text_is_read_or_refused_in_one_line(text):
 OWN = {
     "disco_hw/files/__init__.py": {"os.open", "tomllib.loads"},
     "disco_hw/daemon/control_socket.py": {"os.open"},
-    "disco_hw/daemon/realtime.py": {"read_text"},
+    "disco_hw/processes/__init__.py": {"read_text"},
     "disco_hw/experiments/adapt.py": {"np.genfromtxt", "open"},
     "disco_hw/experiments/circle_report.py": {"open"},
     "disco_hw/experiments/demo.py": {"read_text"},

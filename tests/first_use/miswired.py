@@ -31,8 +31,7 @@ from sim.effects import hidden_effects
 from sim.plant import Plant
 from sim.plant_parameters import PlantParameters
 from sim.process import PoseSender
-from sim.robot import VendorRobot
-from sim.virtual_robot import STEP_US, VirtualRobot
+from sim.virtual_robot import STEP_US, VendorRobot, VirtualRobot
 from tests.drivers.waiting import free_port
 
 SHIPPED = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"

@@ -76,7 +76,7 @@ def test_the_virtual_robot_draws_anew_at_each_restart(tmp_path, key):
         (tmp_path / "key").chmod(0o600)
         robot_file.write_text(robot_file.read_text().replace("[link]\n", '[link]\nkey_file = "key"\n'))
     socket = tmp_path / "inject"
-    restart = f"{sys.executable} -m sim.command_socket {socket} reboot"
+    restart = f"{sys.executable} -m sim.process {socket} reboot"
     with disco_hw_process("virtual robot", ["sim", str(robot_file), "--inject", str(socket)], tmp_path / "sim.txt"):
         wait_until(lambda: "ready" in (tmp_path / "sim.txt").read_text(), READY_TIMEOUT_S)
         code, found, output = conform(robot_file, "--allow-motion", f"--allow-restart={restart}", "-k", "restart")

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from disco_hw.errors import InputError, WorkError
-from disco_hw.inference import workers as module
+from disco_hw.inference import simulate as module
 from disco_hw.inference.infer import InferOptions, infer
-from disco_hw.inference.workers import dask_workers
+from disco_hw.inference.simulate import dask_workers
 from tests.inference.drives import logged, robot_config
 
 pytestmark = pytest.mark.long

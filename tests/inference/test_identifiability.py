@@ -1,7 +1,7 @@
 import numpy as np
 
+from disco_hw.inference.checks import driven, undetermined
 from disco_hw.inference.excitation import excitation
-from disco_hw.inference.identifiability import driven, undetermined
 from tests.inference.drives import logged
 
 LOW, HIGH = np.array([0.0, 0.0, 0.1]), np.array([0.5, 0.5, 0.5])

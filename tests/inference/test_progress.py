@@ -1,4 +1,4 @@
-from disco_hw.inference.workers import Tally
+from disco_hw.inference.simulate import Tally
 
 
 def test_stages_and_shares_are_told_as_simulations_are_counted():

@@ -3,7 +3,7 @@ import time
 
 import pytest
 
-from disco_hw.inference.workers import LocalWorkers
+from disco_hw.inference.simulate import LocalWorkers
 
 
 def slower_at_first(shared, item):

@@ -7,7 +7,7 @@ import pytest
 
 from disco_hw.config import load_robot_config
 from disco_hw.daemon.check import pose_source_checks
-from disco_hw.daemon.status import counters, status
+from disco_hw.daemon.control_socket import counters, status
 from disco_hw.errors import InputError
 from disco_hw.log import records
 from disco_hw.log.load import load_drive

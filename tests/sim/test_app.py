@@ -19,7 +19,7 @@ from drivers.types import Frame
 from firmware_protocol.codec import Codec
 from firmware_protocol.serial_framing import FrameDecoder, encode_frame
 from sim.__main__ import main
-from sim.command_socket import send_command
+from sim.process import send_command
 from sim.unixcan import UnixCanBus
 from sim.virtual_robot import TRUTH_COLUMNS
 from tests.drivers.waiting import wait_until

@@ -3,8 +3,7 @@ import threading
 
 import pytest
 
-from sim.command_socket import CommandSocket, main, send_command
-from sim.process import SocketPathError
+from sim.process import CommandSocket, SocketPathError, main, send_command
 
 
 @pytest.fixture

@@ -7,8 +7,8 @@ import shutil
 import numpy as np
 import pytest
 
+from disco_hw.daemon.control_socket import loop_figures, status
 from disco_hw.daemon.loop import LoopStats
-from disco_hw.daemon.status import loop_figures, status
 from disco_hw.log import records
 from disco_hw.log.recorder import RecorderStats
 from disco_hw.runtime.replay import replay

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from disco_hw.daemon.control_socket import loop_figures, status
 from disco_hw.daemon.loop import LoopStats
-from disco_hw.daemon.status import loop_figures, status
 from disco_hw.log.recorder import RecorderStats
 from disco_hw.runtime.pipeline import Source
 from disco_hw.runtime.supervisor import UserRequest

@@ -18,8 +18,7 @@ from disco_hw.files import CANDUMP, read_lines
 from disco_hw.log.drive import Array, Commands, DriveLog, Gyro, Poses, Wheels
 from disco_hw.log.importing import LogFormat
 from drivers.device_clock import DeviceClock
-from drivers.motor.reference_frames import FrameReception
-from drivers.motor.reference_telemetry import POSE_MESSAGES, WHEEL_MESSAGES, Telemetry
+from drivers.motor.reference_frames import POSE_MESSAGES, WHEEL_MESSAGES, FrameReception, Telemetry
 from drivers.types import Frame, ReceivedFrame
 from firmware_protocol.codec import Codec, Decoded
 

@@ -5,8 +5,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.device_clock import DeviceClock
-from drivers.motor import reference_telemetry as telemetry
-from drivers.motor.reference_telemetry import (
+from drivers.motor import reference_frames as telemetry
+from drivers.motor.reference_frames import (
     DISTRUST_CLOCK_AFTER,
     LONGEST_APART_NS,
     REANCHOR_AFTER,

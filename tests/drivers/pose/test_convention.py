@@ -10,7 +10,7 @@ from disco_hw.config import load_robot_config
 from disco_hw.errors import InputError
 from disco_hw.runtime.assembly import driver_of, pose_source_of
 from drivers.motor.wiring import RewiredDriver
-from drivers.pose.convention import PoseConvention
+from drivers.pose import PoseConvention
 from drivers.types import PoseSample
 
 ROBOT = """[robot]

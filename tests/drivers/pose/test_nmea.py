@@ -12,7 +12,7 @@ import pytest
 
 from disco_hw.runtime.pipeline import NoPlanner
 from drivers.pose import PoseSourceError, make_pose_source
-from drivers.pose.nmea_reader import QUALITY_STD_M, Fixes, ReceiverClock, TangentPlane
+from drivers.pose.nmea import QUALITY_STD_M, Fixes, ReceiverClock, TangentPlane
 from tests.runtime.simulated import simulated_stack
 
 pytest.importorskip("pynmeagps", reason="pip install 'disco-hw[rtk]'")
