@@ -17,7 +17,7 @@ from pathlib import Path
 import msgspec
 
 import disco_hw
-from disco_hw.adaptation.adaptation import Learnt, NoAdaptation
+from disco_hw.adaptation import Learnt, NoAdaptation
 from disco_hw.adaptation.guard import believed_geometry
 from disco_hw.adaptation.link import NAMES
 from disco_hw.drive.coverage import Coverage

@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from disco_hw.adaptation.link import FromAdapter, InForce, LinkStats, Proposal, Report, Samples, ToAdapter
 from disco_hw.adaptation.network import SampleWindow
 from disco_hw.adaptation.recursive import Evidence, Judged, RecursiveGeometry, RunningNoise, evidence, to_linear
-from disco_hw.inference.excitation import UnusableDriveError
-from disco_hw.inference.noise import measured_noise
+from disco_hw.inference.excitation import UnusableDriveError, measured_noise
 from disco_hw.processes import limit_thread_pools
 
 if TYPE_CHECKING:
@@ -291,7 +290,7 @@ def _train(adapter: Adapter, about: Range) -> None:
 
     # Loads torch: seconds, in which samples already come in.
     from disco_hw.adaptation.network import Training, train_network, training_range  # noqa: PLC0415
-    from disco_hw.inference.noise import USUAL  # noqa: PLC0415
+    from disco_hw.inference.excitation import USUAL  # noqa: PLC0415
     from disco_hw.model import Model  # noqa: PLC0415
 
     mean, low, high = (np.array(values) for values in (about.mean, about.low, about.high))

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from disco_hw.adaptation.adaptation import CheckedAdaptation, Learnt, change_record
+from disco_hw.adaptation import CheckedAdaptation, Learnt, change_record
 from disco_hw.adaptation.geometry_filter import GeometryFilter
 from disco_hw.adaptation.guard import BeliefGuard, Geometry, Outcome
 from disco_hw.adaptation.link import NAMES, AdapterLink

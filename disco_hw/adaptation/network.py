@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from disco_hw.adaptation.link import NAMES, PoseReading, Samples, WheelAngles
 from disco_hw.adaptation.recursive import Evidence, evidence, from_linear, to_linear
 from disco_hw.inference.density_network import DensityNetwork, NetworkSettings, train
-from disco_hw.inference.excitation import STEP_S, Excitation, UnusableDriveError, excitation
-from disco_hw.inference.noise import Noise
+from disco_hw.inference.excitation import STEP_S, Excitation, Noise, UnusableDriveError, excitation
 from disco_hw.inference.simulate import Simulator, draw_seeds
 from disco_hw.log.drive import Commands, DriveLog, Gyro, Poses
 from disco_hw.log.drive import Wheels as WheelArrays

@@ -24,8 +24,7 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_banded
 
 from disco_hw.inference.estimates import Whitening, whitening
-from disco_hw.inference.excitation import Excitation
-from disco_hw.inference.noise import USUAL, Noise
+from disco_hw.inference.excitation import USUAL, Excitation, Noise
 
 Array = NDArray[np.float64]
 

@@ -16,7 +16,7 @@ from disco_hw.cli.options import (
     progress_bar,
     progress_line,
 )
-from disco_hw.config.command_line import check_named_files
+from disco_hw.config import check_named_files
 
 
 def infer(

@@ -10,14 +10,14 @@ from typing import Annotated, Any
 
 import typer
 
-from disco_hw.config.command_line import FORMS
+from disco_hw.config import LINK_FORMS
 from disco_hw.reports import as_json as json_of
 
 RobotFile = Annotated[Path, typer.Argument(metavar="ROBOT.toml", help="The robot's configuration (docs/robot.md).")]
 RobotOption = Annotated[Path, typer.Option("--robot", help="The robot's configuration (docs/robot.md).")]
 ModelOption = Annotated[Path | None, typer.Option("--model", help="Use this model.toml instead of robot.toml's.")]
 LinkOption = Annotated[
-    str | None, typer.Option("--link", metavar="LINK", help=f"Use this link instead of robot.toml's: {FORMS}.")
+    str | None, typer.Option("--link", metavar="LINK", help=f"Use this link instead of robot.toml's: {LINK_FORMS}.")
 ]
 LogFileOption = Annotated[Path | None, typer.Option("--log", help="Record to this file.")]
 Logs = Annotated[list[Path], typer.Argument(metavar="LOG...", help="Logs of driving: MCAP or CSV.")]

@@ -20,7 +20,7 @@ from disco_hw.cli.options import (
     print_result,
     progress_line,
 )
-from disco_hw.config.command_line import check_named_files
+from disco_hw.config import check_named_files
 from disco_hw.viewer.page_process import DEFAULT_PORT, LOOPBACK
 
 PagePort = Annotated[int, typer.Option("--port", min=1, max=65535, help="Port of the page.")]

@@ -16,7 +16,7 @@ from disco_hw.cli.options import (
     RobotFile,
     print_result,
 )
-from disco_hw.config.command_line import check_named_files
+from disco_hw.config import check_named_files
 from disco_hw.errors import InputError
 from disco_hw.viewer.page_process import DEFAULT_PORT, LOOPBACK
 

@@ -1,4 +1,11 @@
-"""robot.toml and the one reader of every file that a user names."""
+"""robot.toml, and what a command line says of the robot: the files it names, and --link."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
 
 from disco_hw.config.robot import (
     Control,
@@ -17,8 +24,11 @@ from disco_hw.config.robot import (
     load_daemon_address,
     load_robot_config,
 )
+from disco_hw.errors import InputError
+from disco_hw.files import LOG, MODEL_TOML, WAY_POINTS, open_file, read_toml
 
 __all__ = [
+    "LINK_FORMS",
     "Control",
     "DaemonSettings",
     "Drive",
@@ -31,7 +41,51 @@ __all__ = [
     "Robot",
     "RobotConfig",
     "Ros2",
+    "check_named_files",
+    "link_fields",
     "link_of",
     "load_daemon_address",
     "load_robot_config",
+    "names_address",
 ]
+
+
+def check_named_files(robot: Path | None = None, model: Path | None = None, logs: Iterable[Path] = ()) -> None:
+    """Raise InputError for the first file that is missing or no such file, or a robot.toml that is wrong.
+
+    Of `robot` the model that it names counts too, unless `model` overrides it, and the way-points of its task. What a
+    model, way-points or a log say is not looked at.
+    """
+    if robot is not None:
+        config = load_robot_config(robot)
+        path = getattr(config.task, "path", None)
+        if path is not None:
+            os.close(open_file(robot.parent / path, WAY_POINTS))
+        if model is None and config.model.file is not None:
+            model = robot.parent / config.model.file
+    if model is not None:
+        read_toml(model, MODEL_TOML)
+    for log in logs:
+        os.close(open_file(log, LOG))
+
+
+LINK_FORMS = "can, serial, can:INTERFACE:CHANNEL or serial:PORT"
+
+
+def link_fields(option: str | None) -> dict[str, Any]:
+    """The fields of robot.toml's [link] that the option sets; raises InputError for one that says nothing."""
+    match None if option is None else option.split(":"):
+        case None:
+            return {}
+        case ["can" | "serial" as kind]:
+            return {"kind": kind}
+        case ["can", interface, *channel] if interface and any(channel):
+            return {"kind": "can", "interface": interface, "channel": ":".join(channel), "options": {}}
+        case ["serial", *port] if any(port):
+            return {"kind": "serial", "port": ":".join(port)}
+    raise InputError(f"--link {option}: not a link; write {LINK_FORMS}")
+
+
+def names_address(fields: dict[str, Any]) -> bool:
+    """Whether the fields say where the robot is, not only over what it is reached."""
+    return len(fields) > 1

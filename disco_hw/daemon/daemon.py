@@ -15,8 +15,7 @@ from disco_hw.daemon.page_feed import WatchedRecorder
 from disco_hw.daemon.signals import Notifier, StopSignals
 from disco_hw.log import records
 from disco_hw.runtime import records_of_tick
-from disco_hw.runtime.core import CoreTick, DaemonCore
-from disco_hw.runtime.pilot import Pilot
+from disco_hw.runtime.core import CoreTick, DaemonCore, Pilot
 from disco_hw.runtime.states import Ask, State, advice, headline
 from disco_hw.runtime.supervisor import Reply, UserRequest
 from disco_hw.runtime.task_change import TaskRefused, changed_task

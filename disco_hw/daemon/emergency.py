@@ -18,8 +18,7 @@ from typing import Any
 import msgspec
 import serial
 
-from disco_hw.config import Link, link_of
-from disco_hw.config.command_line import link_fields, names_address
+from disco_hw.config import Link, link_fields, link_of, names_address
 from disco_hw.daemon.client import believed_users, default_socket_path, passed_over, send_request
 from disco_hw.errors import InputError
 from disco_hw.files import ROBOT_TOML, read_toml

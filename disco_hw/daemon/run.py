@@ -25,7 +25,7 @@ from typing import Any, Literal, TypeVar
 from numba.core import event
 
 from disco_hw import processes
-from disco_hw.adaptation.adaptation import GeometryAdaptation
+from disco_hw.adaptation import GeometryAdaptation
 from disco_hw.adaptation.guard import check_adaptable, choose_adaptation
 from disco_hw.adaptation.link import ProcessLink
 from disco_hw.config import RobotConfig
@@ -50,7 +50,7 @@ from disco_hw.runtime.assembly import (
     make_pipeline,
     make_planner,
 )
-from disco_hw.runtime.pilot import FindsWiring, Pilot, TaskPilot
+from disco_hw.runtime.core import FindsWiring, Pilot, TaskPilot
 from disco_hw.runtime.pipeline import FollowTask, NoPlanner, Off, Pipeline, Planner, Stand
 from disco_hw.runtime.robot_setup import Setup, kept_files, link_key, load_setup, refuse_missing_effects, scene_of
 from disco_hw.runtime.states import Ask, by_command

@@ -25,8 +25,7 @@ from disco_hw.errors import WorkError
 from disco_hw.experiments.simulated_time import SimulatedRun, virtual_robot
 from disco_hw.experiments.virtual import true_parameters
 from disco_hw.runtime.assembly import make_planner
-from disco_hw.runtime.core import CoreTick
-from disco_hw.runtime.pilot import TaskPilot
+from disco_hw.runtime.core import CoreTick, TaskPilot
 from disco_hw.runtime.pipeline import Planner
 from disco_hw.runtime.robot_setup import Setup, load_setup
 from disco_hw.runtime.supervisor import UserRequest

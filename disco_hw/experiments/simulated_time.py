@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.adaptation.adaptation import GeometryAdaptation
+from disco_hw.adaptation import GeometryAdaptation
 from disco_hw.adaptation.guard import choose_adaptation
 from disco_hw.adaptation.link import AdapterLink
 from disco_hw.config import RobotConfig
@@ -35,8 +35,7 @@ from disco_hw.runtime.assembly import (
     make_pipeline,
     make_planner,
 )
-from disco_hw.runtime.core import CoreTick, DaemonCore
-from disco_hw.runtime.pilot import FindsWiring, Pilot, TaskPilot
+from disco_hw.runtime.core import CoreTick, DaemonCore, FindsWiring, Pilot, TaskPilot
 from disco_hw.runtime.pipeline import Pipeline, Planner
 from disco_hw.runtime.robot_setup import Setup, kept_files, load_setup
 from disco_hw.runtime.supervisor import UserRequest

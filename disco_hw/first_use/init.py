@@ -13,8 +13,7 @@ from typing import Any
 import msgspec
 import serial
 
-from disco_hw.config import load_robot_config
-from disco_hw.config.command_line import link_fields, names_address
+from disco_hw.config import link_fields, load_robot_config, names_address
 from disco_hw.errors import InputError
 from disco_hw.files import parse_toml
 from disco_hw.reports import refuse_file

@@ -8,8 +8,7 @@ from typing import Any
 from disco_hw.drive.hand_pilot import Deadman
 from disco_hw.drive.sources import ManualInput, ManualSource, RobotView
 from disco_hw.first_use.procedure import Ask, DriveWheels, Procedure, Reset, Seen, Silence
-from disco_hw.runtime.core import CoreTick
-from disco_hw.runtime.pilot import PilotTick
+from disco_hw.runtime.core import CoreTick, PilotTick
 from disco_hw.runtime.pipeline import Manual, Motion, Silent, Source
 from disco_hw.runtime.states import State
 from disco_hw.runtime.supervisor import Reply, UserRequest
@@ -18,7 +17,7 @@ _FAULT_NS = 1_000_000_000
 
 
 class CommissionPilot:
-    """Drives as the procedure says while the deadman of `source` is held; satisfies `disco_hw.runtime.pilot.Pilot`.
+    """Drives as the procedure says while the deadman of `source` is held; satisfies `disco_hw.runtime.core.Pilot`.
 
     `keys`: those typed since it was asked last, for the procedure's questions. `in_vain`: whether a key is held that
     does not count, which the person is told once.

@@ -13,8 +13,7 @@ from scipy.stats import kstest
 from disco_hw.effects.effect import Symptom
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.inference.estimates import Estimates, Whitening, estimates
-from disco_hw.inference.excitation import Excitation
-from disco_hw.inference.noise import Noise
+from disco_hw.inference.excitation import Excitation, Noise
 from disco_hw.inference.rounds import Fitted, Simulate
 from disco_hw.inference.simulate import NAMES, Simulator, Workers, draw_seeds
 

@@ -9,8 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.inference.excitation import Excitation
-from disco_hw.inference.noise import Noise
+from disco_hw.inference.excitation import Excitation, Noise
 from disco_hw.jit import parallel_kernel
 
 Array = NDArray[np.float64]

@@ -26,8 +26,7 @@ from disco_hw.inference.checks import (
 )
 from disco_hw.inference.density_network import Mixtures, NetworkSettings
 from disco_hw.inference.estimates import estimates, paper_statistics
-from disco_hw.inference.excitation import Excitation, excitation
-from disco_hw.inference.noise import USUAL, Noise, measured_noise
+from disco_hw.inference.excitation import USUAL, Excitation, Noise, excitation, measured_noise
 from disco_hw.inference.rounds import Fitted, Region, RoundSettings, run_rounds
 from disco_hw.inference.simulate import (
     NAMES,

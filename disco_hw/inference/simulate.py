@@ -18,8 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.errors import InputError, WorkError
-from disco_hw.inference.excitation import Excitation
-from disco_hw.inference.noise import Noise
+from disco_hw.inference.excitation import Excitation, Noise
 from disco_hw.jit import parallel_kernel
 from disco_hw.model.model import BASE_PARAMETERS, Model, coefficient_tables
 from disco_hw.model.step import axle_of, integration_from, integration_series, step, tracked_of

@@ -5,7 +5,7 @@ from __future__ import annotations
 import msgspec
 
 from disco_hw import control
-from disco_hw.adaptation.adaptation import CheckedAdaptation, GeometryAdaptation
+from disco_hw.adaptation import CheckedAdaptation, GeometryAdaptation
 from disco_hw.adaptation.fast import AuditedAdaptation, FastAdaptation
 from disco_hw.adaptation.guard import (
     ASKED_BY_FILE,

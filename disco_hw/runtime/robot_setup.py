@@ -8,8 +8,7 @@ from tempfile import TemporaryDirectory
 
 import msgspec
 
-from disco_hw.config import RobotConfig, load_robot_config
-from disco_hw.config.command_line import link_fields
+from disco_hw.config import RobotConfig, link_fields, load_robot_config
 from disco_hw.errors import InputError
 from disco_hw.files import KEY, WAY_POINTS, read_bytes
 from disco_hw.files import MODEL_TOML as MODEL_KIND

@@ -14,8 +14,7 @@ from typing import Any
 from rich.console import Console
 from rich.progress import Progress
 
-from disco_hw.config import load_robot_config
-from disco_hw.config.command_line import link_fields
+from disco_hw.config import link_fields, load_robot_config
 from disco_hw.daemon.client import socket_path
 from disco_hw.daemon.signals import StopSignals
 from disco_hw.errors import InputError

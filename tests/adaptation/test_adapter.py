@@ -7,7 +7,7 @@ import pytest
 from disco_hw.adaptation.adapter import Adapter
 from disco_hw.adaptation.link import InForce
 from disco_hw.adaptation.network import Training, train_network, training_range
-from disco_hw.inference.noise import USUAL
+from disco_hw.inference.excitation import USUAL
 from disco_hw.model import Model
 from tools.adaptation_drives import TRUTH, messages
 

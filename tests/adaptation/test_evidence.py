@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from disco_hw.adaptation.recursive import evidence, from_linear
-from disco_hw.inference.noise import Noise
+from disco_hw.inference.excitation import Noise
 from tools.adaptation_drives import TRUTH, excited
 
 NOISE = Noise(0.005, 0.01, 0.004, 0.004, 0.012)

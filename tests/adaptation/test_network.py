@@ -6,7 +6,7 @@ import pytest
 
 from disco_hw.adaptation.network import Training, train_network, training_range
 from disco_hw.adaptation.recursive import evidence
-from disco_hw.inference.noise import USUAL, Noise
+from disco_hw.inference.excitation import USUAL, Noise
 from disco_hw.inference.simulate import Simulator, draw_seeds
 from disco_hw.model import Model
 from tools.adaptation_drives import TRUTH, excited

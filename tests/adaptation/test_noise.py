@@ -1,7 +1,7 @@
 import pytest
 
 from disco_hw.adaptation.recursive import RunningNoise
-from disco_hw.inference.noise import USUAL, Noise
+from disco_hw.inference.excitation import USUAL, Noise
 
 OTHER = Noise(0.02, 0.03, 0.02, 0.02, 0.05)
 

@@ -1,6 +1,6 @@
 import pytest
 
-from disco_hw.config.command_line import link_fields, names_address
+from disco_hw.config import link_fields, names_address
 from disco_hw.errors import InputError
 
 

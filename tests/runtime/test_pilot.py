@@ -7,7 +7,7 @@ from dataclasses import replace
 import msgspec
 import pytest
 
-from disco_hw.runtime.pilot import PilotTick, TaskPilot
+from disco_hw.runtime.core import PilotTick, TaskPilot
 from disco_hw.runtime.pipeline import FollowTask, Manual, NoPlanner, Source
 from disco_hw.runtime.robot_setup import load_setup
 from disco_hw.runtime.states import State
