@@ -32,7 +32,7 @@ def run(seconds: float = 10.0) -> dict[str, float]:
 def measure(mode: str, seconds: float) -> dict[str, float]:
     allowed = True
     if mode == "realtime":
-        allowed = all(step.done for step in processes.enter(PRIORITY))
+        allowed = all(step.done for step in processes.enter_real_time(PRIORITY))
     finished = threading.Event()
     receiver = threading.Thread(target=_receive, args=(finished,))
     receiver.start()

@@ -200,7 +200,7 @@ def _start(
             adaptation = make_audited_adaptation(setup, pipeline, ProcessLink())
     if adaptation is not None:
         stop.add("adapter", adaptation.close)
-    for step in processes.enter(config.daemon.realtime_priority):
+    for step in processes.enter_real_time(config.daemon.realtime_priority):
         say("real time", str(step))
     for line in passed_over(server.path):
         say("control socket", line)

@@ -119,7 +119,7 @@ _COMPLETED_TOLERANCE_LAPS = 0.02
 class LoopFigures:
     """Loop period and lateness in microseconds at p50, p99, p99.9 and maximum, and what was missed.
 
-    `stolen_ms`: as of `realtime.stolen_ms`, since the daemon's start.
+    `stolen_ms`: as of `processes.stolen_ms`, since the daemon's start.
     """
 
     period_us: tuple[float, ...]

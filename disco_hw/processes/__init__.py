@@ -1,6 +1,6 @@
 """How the processes of disco-hw are set up: threads of the numeric libraries, children, and as real-time ones.
 
-Measured on a loaded two-core machine at 50 Hz, the steps of `enter` together move the worst wake-up from 13 ms to 3.5
+Measured on a loaded two-core machine at 50 Hz, the steps of `enter_real_time` together move the worst wake-up from 13 ms to 3.5
 ms late; a second thread in the numeric libraries alone loses nearly every deadline, because the loop then waits for a
 worker of normal priority.
 """
@@ -157,7 +157,7 @@ def spare_memory() -> None:
     libc.pthread_attr_destroy(attributes)
 
 
-def enter(priority: int, cpus: Collection[int] = ()) -> tuple[Step, ...]:
+def enter_real_time(priority: int, cpus: Collection[int] = ()) -> tuple[Step, ...]:
     """Take every measure, in the order that lets threads made later inherit them; never raises for a refused one.
 
     To be called when everything is imported, warmed up and allocated, before the link's threads are made, and after
@@ -176,7 +176,7 @@ def enter(priority: int, cpus: Collection[int] = ()) -> tuple[Step, ...]:
 
 
 def raise_loop_thread(priority: int) -> Step:
-    """Give the calling thread SCHED_FIFO at `priority` (1 to 98), above the threads made since `enter`."""
+    """Give the calling thread SCHED_FIFO at `priority` (1 to 98), above the threads made since `enter_real_time`."""
     return _set_fifo("loop thread", priority)
 
 

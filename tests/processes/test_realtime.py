@@ -40,7 +40,7 @@ def run(script, **environment):
 @FIFO_ALLOWED
 @pytest.mark.skipif(not can_lock_memory(), reason="this user may not lock memory")
 def test_everything_allowed_is_done_and_said():
-    seen = run("from disco_hw.daemon import realtime\nreport(realtime.enter(80))")
+    seen = run("from disco_hw import processes\nreport(processes.enter_real_time(80))")
     assert all(done for _, done, _ in seen["steps"])
     assert [name for name, _, _ in seen["steps"]] == ["interpreter", "garbage collector", "memory", "scheduler"]
     assert (seen["policy"], seen["priority"]) == (os.SCHED_FIFO, 70)
@@ -53,12 +53,12 @@ def test_everything_allowed_is_done_and_said():
 @FIFO_ALLOWED
 def test_threads_made_later_inherit_and_the_loop_thread_goes_above_them():
     seen = run("""
-from disco_hw.daemon import realtime
-steps = realtime.enter(80)
+from disco_hw import processes
+steps = processes.enter_real_time(80)
 inherited = []
 thread = threading.Thread(target=lambda: inherited.append(os.sched_getparam(0).sched_priority))
 thread.start(); thread.join()
-report([*steps, realtime.raise_loop_thread(80)], inherited=inherited)
+report([*steps, processes.raise_loop_thread(80)], inherited=inherited)
 """)
     assert seen["inherited"] == [70]
     assert seen["priority"] == 80
@@ -67,12 +67,12 @@ report([*steps, realtime.raise_loop_thread(80)], inherited=inherited)
 @FIFO_ALLOWED
 @pytest.mark.parametrize("priority", [1, 5])
 def test_a_low_priority_still_makes_a_valid_one_for_the_threads(priority):
-    seen = run(f"from disco_hw.daemon import realtime\nreport(realtime.enter({priority}))")
+    seen = run(f"from disco_hw import processes\nreport(processes.enter_real_time({priority}))")
     assert (seen["policy"], seen["priority"]) == (os.SCHED_FIFO, 1)
 
 
 def test_priority_zero_leaves_scheduler_and_memory_alone_and_says_so():
-    seen = run("from disco_hw.daemon import realtime\nreport(realtime.enter(0))")
+    seen = run("from disco_hw import processes\nreport(processes.enter_real_time(0))")
     assert seen["policy"] == os.SCHED_OTHER
     assert seen["locked_kib"] == 0
     assert seen["steps"][-1][1:] == [False, "scheduler: left alone, as daemon.realtime_priority is 0"]
@@ -82,12 +82,12 @@ def test_priority_zero_leaves_scheduler_and_memory_alone_and_says_so():
 def test_what_is_refused_is_said_with_the_remedy_and_the_rest_is_still_done():
     script = """
 import resource
-from disco_hw.daemon import realtime
+from disco_hw import processes
 resource.setrlimit(resource.RLIMIT_MEMLOCK, (8 << 20, 8 << 20))
 resource.setrlimit(resource.RLIMIT_RTPRIO, (0, 0))
 """
-    able = "[realtime.can_use_fifo(), realtime.can_lock_memory()]"
-    ending = f"report([*realtime.enter(80), realtime.raise_loop_thread(80)], able={able})"
+    able = "[processes.can_use_fifo(), processes.can_lock_memory()]"
+    ending = f"report([*processes.enter_real_time(80), processes.raise_loop_thread(80)], able={able})"
     seen = run(script + AS_NOBODY + ending)
     texts = {name: text for name, done, text in seen["steps"] if not done}
     assert set(texts) == {"memory", "scheduler", "loop thread"}
@@ -101,8 +101,8 @@ resource.setrlimit(resource.RLIMIT_RTPRIO, (0, 0))
 
 def test_cpus_are_set_or_the_refusal_is_said():
     cpu = min(os.sched_getaffinity(0))
-    assert run(f"from disco_hw.daemon import realtime\nreport(realtime.enter(0, [{cpu}]))")["cpus"] == [cpu]
-    steps = run("from disco_hw.daemon import realtime\nreport(realtime.enter(0, [100000]))")["steps"]
+    assert run(f"from disco_hw import processes\nreport(processes.enter_real_time(0, [{cpu}]))")["cpus"] == [cpu]
+    steps = run("from disco_hw import processes\nreport(processes.enter_real_time(0, [100000]))")["steps"]
     assert next(step[:2] for step in steps if step[0] == "cpus") == ["cpus", False]
 
 
