@@ -359,7 +359,7 @@ def _microseconds(summary: dict[str, float]) -> dict[str, float]:
 def counters(
     core: DaemonCore, loop: LoopStats, recorder: RecorderStats, now_ns: int, stolen_ms: int = 0
 ) -> records.Counters:
-    """Every counter of the stack as one record for the log; `stolen_ms` as of `processes.stolen_ms`, since the start."""
+    """Every counter of the stack as one record for the log; `stolen_ms`: of `processes.stolen_ms`, since the start."""
     return records.Counters(
         t_ns=now_ns,
         transport=asdict(core.transport.stats),

@@ -1,8 +1,8 @@
 """How the processes of disco-hw are set up: threads of the numeric libraries, children, and as real-time ones.
 
-Measured on a loaded two-core machine at 50 Hz, the steps of `enter_real_time` together move the worst wake-up from 13 ms to 3.5
-ms late; a second thread in the numeric libraries alone loses nearly every deadline, because the loop then waits for a
-worker of normal priority.
+Measured on a loaded two-core machine at 50 Hz, the steps of `enter_real_time` together move the worst wake-up from 13
+ms to 3.5 ms late; a second thread in the numeric libraries alone loses nearly every deadline, because the loop then
+waits for a worker of normal priority.
 """
 
 from __future__ import annotations
