@@ -188,18 +188,6 @@ def in_order(faults: Sequence[ScheduledFault]) -> tuple[ScheduledFault, ...]:
     return tuple(ScheduledFault(i, f.kind, f.begin_ns, f.end_ns, f.values) for i, f in enumerate(ordered, 1))
 
 
-def write_schedule(schedule: FaultSchedule) -> str:
-    """The schedule as TOML that `parse_schedule` reads back."""
-    lines = [f"seed = {schedule.seed}"]
-    for fault in schedule.faults:
-        lines += ["", "[[fault]]", f'kind = "{fault.kind.name}"', f"at_s = {fault.begin_ns * 1e-9!r}"]
-        if fault.kind.lasts:
-            lines.append(f"for_s = {(fault.end_ns - fault.begin_ns) * 1e-9!r}")
-        for name, value in fault.values.items():
-            lines.append(f'{name} = "{value}"' if isinstance(value, str) else f"{name} = {value!r}")
-    return "\n".join(lines) + "\n"
-
-
 def kinds_table() -> str:
     """One line for each kind: its name, what happens, its parameters with their defaults."""
     width = max(map(len, KINDS))

@@ -159,11 +159,6 @@ class Hub:
         for client in self._clients.values():
             self.bus.force_bus_off(client.node)
 
-    def request_clients_recovery(self) -> None:
-        """Ask for the recovery of all clients that are bus-off, as `ip link set can0 type can restart` does."""
-        for client in self._clients.values():
-            self.bus.request_recovery(client.node)
-
     def close(self) -> None:
         """Close all connections and remove the socket; safe to call twice."""
         if not self._epoll.closed:

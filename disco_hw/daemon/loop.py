@@ -45,27 +45,6 @@ class MonotonicClock:
                 time.sleep((remaining_ns - self._spin_ns) * 1e-9)
 
 
-class SimulatedClock:
-    """A clock that stands still except when slept on or advanced."""
-
-    def __init__(self, start_ns: int = 0) -> None:
-        self._now_ns = start_ns
-
-    def now_ns(self) -> int:
-        """Return the present simulated time in nanoseconds."""
-        return self._now_ns
-
-    def sleep_until_ns(self, deadline_ns: int) -> None:
-        """Jump to `deadline_ns`; do nothing if it has passed."""
-        self._now_ns = max(self._now_ns, deadline_ns)
-
-    def advance_ns(self, duration_ns: int) -> None:
-        """Let `duration_ns` nanoseconds pass, as work would; raises ValueError if negative."""
-        if duration_ns < 0:
-            raise ValueError("time does not run backwards")
-        self._now_ns += duration_ns
-
-
 _MANTISSA_BITS = 7
 _HALF = 1 << (_MANTISSA_BITS - 1)
 _LARGEST_BITS = 44

@@ -76,10 +76,6 @@ class Governor:
         self._left_rad_s = 0.0
         self._right_rad_s = 0.0
 
-    def ramp_to_zero(self, dt_s: float) -> Governed:
-        """Return the next command of a stop within the limits, `dt_s` after the last one."""
-        return self.step(0.0, 0.0, dt_s)
-
     def step(self, desired_left_rad_s: float, desired_right_rad_s: float, dt_s: float) -> Governed:
         """Return the command nearest to the desired one that the limits allow `dt_s` after the last one.
 

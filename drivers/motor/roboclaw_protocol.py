@@ -126,11 +126,6 @@ def getter_name(command: int) -> str | None:
     return _GETTER_BY_NUMBER[command][0] if command in _GETTER_BY_NUMBER else None
 
 
-def reply_length(name: str) -> int:
-    """Of a reply in bytes with its CRC; the longest that it can be where it varies."""
-    return (_LONGEST_VERSION if name == "version" else GETTERS[name].length) + _CRC_BYTES
-
-
 def _head(address: int, command: int) -> bytes:
     if not FIRST_ADDRESS <= address <= LAST_ADDRESS:
         raise ValueError(f"no RoboClaw address: {address:#x}")

@@ -4,7 +4,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from disco_hw.daemon.loop import MonotonicClock, SimulatedClock
+from disco_hw.daemon.loop import MonotonicClock
+from tests.daemon.simulated_clock import SimulatedClock
 
 
 @pytest.mark.parametrize("spin_s", [0.0, 0.001])

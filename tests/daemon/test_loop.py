@@ -2,7 +2,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from disco_hw.daemon.loop import Loop, MonotonicClock, SimulatedClock
+from disco_hw.daemon.loop import Loop, MonotonicClock
+from tests.daemon.simulated_clock import SimulatedClock
 
 PERIOD_NS = 20_000_000
 MS_NS = 1_000_000

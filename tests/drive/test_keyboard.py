@@ -10,11 +10,11 @@ import threading
 
 import pytest
 
-from disco_hw.daemon.loop import SimulatedClock
 from disco_hw.drive.keyboard import Keyboard, KeyHold
 from disco_hw.drive.sources import RobotView
 from disco_hw.errors import InputError
 from disco_hw.runtime.states import State
+from tests.daemon.simulated_clock import SimulatedClock
 from tests.drivers.waiting import wait_until
 
 MS = 1_000_000

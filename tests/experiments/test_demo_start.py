@@ -11,7 +11,6 @@ from types import SimpleNamespace
 
 import pytest
 
-from disco_hw.daemon.loop import SimulatedClock
 from disco_hw.errors import WorkError
 from disco_hw.experiments import live_stack
 from disco_hw.experiments.demo import start_pose
@@ -19,6 +18,7 @@ from disco_hw.experiments.live_stack import Operator
 from disco_hw.runtime.robot_setup import load_setup
 from disco_hw.runtime.supervisor import UserRequest
 from sim.body_dynamics import BodyPose
+from tests.daemon.simulated_clock import SimulatedClock
 from tests.runtime.simulated import ROBOT_FILE, simulated_stack
 
 QUARTER_S = 0.5 * math.pi * 0.75 / 0.2

@@ -80,7 +80,7 @@ def test_speed_limit_keeps_the_curvature(left, right):
 def test_zero_stays_zero(durations_s):
     governor = Governor(LIMITS, PERIOD_S)
     for dt_s in durations_s:
-        governed = governor.ramp_to_zero(dt_s)
+        governed = governor.step(0.0, 0.0, dt_s)
         assert (governed.left_rad_s, governed.right_rad_s) == (0.0, 0.0)
 
 
@@ -90,7 +90,7 @@ def test_a_command_that_is_not_finite_ramps_to_zero_and_is_counted(left0, right0
     reference = governor_at(left0, right0)
     for count in range(1, 31):
         governed = governor.step(bad, 1.0, PERIOD_S) if bad_is_left else governor.step(1.0, bad, PERIOD_S)
-        ramp = reference.ramp_to_zero(PERIOD_S)
+        ramp = reference.step(0.0, 0.0, PERIOD_S)
         assert (governed.left_rad_s, governed.right_rad_s) == (ramp.left_rad_s, ramp.right_rad_s)
         assert Limited.NOT_FINITE in governed.limited
         assert governor.not_finite_count == count
@@ -103,7 +103,7 @@ def test_acceleration_from_standstill_and_deceleration_use_their_own_limits():
     assert (governed.left_rad_s, governed.right_rad_s) == pytest.approx((0.4, 0.2))
     assert governed.limited == Limited.ACCELERATION
     governor = governor_at(8.0, 4.0)
-    governed = governor.ramp_to_zero(PERIOD_S)
+    governed = governor.step(0.0, 0.0, PERIOD_S)
     assert (governed.left_rad_s, governed.right_rad_s) == pytest.approx((7.4, 3.7))
 
 

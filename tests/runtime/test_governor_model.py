@@ -69,7 +69,7 @@ class GovernorModel(RuleBasedStateMachine):
     @precondition(lambda self: max(map(abs, self.last)) > 0.0)
     @rule(dt_s=st.floats(0.001, 0.05))
     def ramp(self, dt_s):
-        command = self.governor.ramp_to_zero(dt_s)
+        command = self.governor.step(0.0, 0.0, dt_s)
         self.expect(command, (0.0, 0.0), dt_s)
 
     @rule()

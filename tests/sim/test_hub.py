@@ -298,19 +298,6 @@ def test_bus_off_of_the_clients(hub):
     assert a.received() == []
 
 
-def test_recovery_of_the_clients(hub):
-    a, b = Client(hub), Client(hub)
-    hub.force_clients_bus_off()
-    hub.request_clients_recovery()
-    hub.pump(T0 + LONG_NS)
-    assert [frame.can_id for frame in a.received()] == [0x040, 0x100]
-    a.send(FRAME)
-    hub.pump(T0 + LONG_NS)
-    hub.pump(T0 + 2 * LONG_NS)
-    assert b.received()[-1] == FRAME
-    assert {node.state for node in hub.bus.nodes} == {ErrorState.ACTIVE}
-
-
 def test_unplugged_clients_are_cut_off_and_refused_for_a_while(hub):
     a = Client(hub)
     a.send(FRAME)
