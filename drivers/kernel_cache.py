@@ -19,7 +19,7 @@ from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataC
 from drivers.private_files import user_name, why_not_private
 
 _Dispatcher = TypeVar("_Dispatcher")
-_told: set[str] = set()
+_printed: set[str] = set()
 _NOT_KEPT = "kernels are compiled anew in each process, as no directory to keep them is this user's alone"
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -42,7 +42,7 @@ def kept_on_disk(dispatcher: _Dispatcher) -> _Dispatcher:
 
 def are_kernels_kept() -> bool:
     """Whether there was a directory for every function so far that was to be kept."""
-    return _NOT_KEPT not in _told
+    return _NOT_KEPT not in _printed
 
 
 class _PrivateLocator:
@@ -107,8 +107,8 @@ def _why_not_believed(cache_path: str) -> str | None:
 
 
 def _tell(line: str) -> None:
-    if line not in _told:
-        _told.add(line)
+    if line not in _printed:
+        _printed.add(line)
         print(f"disco-hw: {line}", file=sys.stderr)
 
 

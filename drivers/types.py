@@ -208,18 +208,18 @@ SaidBy = Literal["device", "fixed", "robot.toml"]
 """Who says something of a controller: itself, its documents of what cannot be set otherwise, or robot.toml alone."""
 SAID_BY_WORDS: Mapping[SaidBy, str] = MappingProxyType(
     {
-        "device": "told by the controller",
+        "device": "reported by the controller",
         "fixed": "which cannot be set otherwise",
-        "robot.toml": "declared in robot.toml, not told by the controller",
+        "robot.toml": "declared in robot.toml, not reported by the controller",
     }
 )
 
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """Which controller answers: its kind, its firmware's version where it is known, and what else it tells of itself.
+    """Which controller answers: its kind, its firmware's version where it is known, and what else it reports of itself.
 
-    `said_by` is of kind and version: where the controller tells neither, they are what robot.toml makes of its frames.
+    `said_by` is of kind and version: where the controller reports neither, they are what robot.toml says.
     """
 
     controller: str

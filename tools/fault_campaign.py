@@ -71,7 +71,7 @@ def run_seed(seed: int, duration_s: float, cycle_us: int, planner: str) -> dict[
                 "armed": fault.armed_before,
                 "stopped_s": fault.stopped_s,
                 "counters": list(fault.counters),
-                "told": list(fault.told[:3]),
+                "told": list(fault.events[:3]),
             }
             for fault in outcome.faults
         ],

@@ -142,7 +142,7 @@ class LogReader:
 
     def __init__(self) -> None:
         self.counts: dict[str, int] = {}
-        self.told: list[tuple[int, str]] = []
+        self.events: list[tuple[int, str]] = []
         self.ticks = 0
         self._robot: dict[str, int] = {}
         self._sums: dict[str, int] = {}
@@ -152,9 +152,9 @@ class LogReader:
         self.ticks += 1
         for record in recorded:
             if isinstance(record, records.Event):
-                self.told.append((now_ns, record.text))
+                self.events.append((now_ns, record.text))
             elif isinstance(record, records.DaemonState):
-                self.told.append((now_ns, f"{record.previous} -> {record.state}: {record.reason}"))
+                self.events.append((now_ns, f"{record.previous} -> {record.state}: {record.reason}"))
             elif isinstance(record, records.Counters):
                 for group in ("transport", "driver", "fusion", "plausibility", "loop", "entered"):
                     for name, value in getattr(record, group).items():
@@ -197,7 +197,7 @@ class FaultOutcome:
     struck: bool = True
     stopped_s: float | None = None
     counters: tuple[str, ...] = ()
-    told: tuple[str, ...] = ()
+    events: tuple[str, ...] = ()
 
 
 @dataclass
@@ -216,7 +216,7 @@ class FaultRunResult:
 class _Open:
     outcome: FaultOutcome
     counts: dict[str, int]
-    told: int
+    events: int
     left_armed: bool = False
 
 
@@ -338,7 +338,7 @@ class FaultRun:
         self.core = assemble_core(config, self.can.host, driver, make_pipeline(config, setup.model, planner), self.log)
         self.can.host.open()
         if self.now_us:
-            self.log.told.append((self.now_us * 1000, "the daemon was started"))
+            self.log.events.append((self.now_us * 1000, "the daemon was started"))
 
     def _tick_if_able(self, now_ns: int) -> None:
         self._next_tick_us += self._period_us
@@ -360,7 +360,7 @@ class FaultRun:
 
     def _note_faults(self, begun: Sequence[ScheduledFault], ended: Sequence[ScheduledFault], armed: bool) -> None:
         for fault in begun:
-            self._open.append(_Open(FaultOutcome(fault, armed), dict(self.log.counts), len(self.log.told)))
+            self._open.append(_Open(FaultOutcome(fault, armed), dict(self.log.counts), len(self.log.events)))
         for fault in ended:
             opened = next(o for o in self._open if o.outcome.fault is fault)
             self._closing.append((self.now_us + round(SETTLED_S * 1e6), opened))
@@ -423,5 +423,5 @@ class FaultRun:
         rises = {n: v - opened.counts.get(n, 0) for n, v in log.counts.items() if n not in _USUAL}
         changed = {n for n, rise in rises.items() if abs(rise) > _BY_CHANCE.get(n, 0)}
         outcome.counters = tuple(sorted(changed))
-        outcome.told = tuple(text for _, text in log.told[opened.told :])
+        outcome.events = tuple(text for _, text in log.events[opened.events :])
         self.outcome.faults.append(outcome)

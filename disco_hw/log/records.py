@@ -241,7 +241,7 @@ class Controller(msgspec.Struct, frozen=True, gc=False):
     """Which motor controller answers from `t_ns` on, and what it keeps to.
 
     `said_by`: who says kind and firmware, "device" or "robot.toml". Limits by name, with their units: what the
-    controller tells of itself, what cannot be set otherwise, and what robot.toml declares.
+    controller reports of itself, what cannot be set otherwise, and what robot.toml declares.
     """
 
     t_ns: int

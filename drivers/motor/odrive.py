@@ -114,7 +114,7 @@ class OdriveDriver:
 
     @property
     def identity(self) -> Identity | None:
-        """What answers as an ODrive; 0.5 does not tell its version."""
+        """What answers as an ODrive; 0.5 does not report its version."""
         if not self._questions.known or self._questions.refusal is not None:
             return None
         if self._questions.version:

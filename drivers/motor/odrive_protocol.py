@@ -320,9 +320,9 @@ def recognise(frames: Sequence[Frame]) -> dict[str, Any] | None:
 
     None if there are none: heartbeats alone could be another vendor's frames.
     """
-    told = [one for frame in frames if (one := decode(Generation.V06, frame)) is not None]
+    decoded = [one for frame in frames if (one := decode(Generation.V06, frame)) is not None]
     beats, estimates = (
-        [one.node for one in told if one.name == name] for name in ("Heartbeat", "Get_Encoder_Estimates")
+        [one.node for one in decoded if one.name == name] for name in ("Heartbeat", "Get_Encoder_Estimates")
     )
     nodes = sorted({node for node in beats if min(beats.count(node), estimates.count(node)) >= _HEARD})
     return {"nodes": in_sides(nodes)} if len(nodes) > 1 else None

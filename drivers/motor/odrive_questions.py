@@ -111,7 +111,7 @@ class Questions:
         endpoints = self._settings.watchdog_endpoints or ()
         waiting = [node for node, one in self._watchdogs.items() if one.is_on is None or one.timeout_s is None]
         if self._watchdog_tries > WATCHDOG_TRIES:
-            self.refusal = f"node {waiting[0]} does not tell its watchdog; correct link.watchdog_endpoints"
+            self.refusal = f"node {waiting[0]} does not report its watchdog; correct link.watchdog_endpoints"
             return []
         return [protocol.read_parameter(node, number) for node in waiting for number in endpoints]
 

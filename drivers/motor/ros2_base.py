@@ -1,7 +1,7 @@
 """The driver of bases that are reached over ROS 2 alone: speeds of the body out, joint states or odometry in.
 
 It speaks to `disco-hw bridge ros2-base`, a process of its own, as nothing of ROS belongs into the control process. A
-base tells nothing of its time-out, its limits or of who else commands it: the weakest safety of all drivers here.
+base reports nothing of its time-out, its limits or of who else commands it: the weakest safety of all drivers here.
 """
 
 from __future__ import annotations
@@ -91,14 +91,14 @@ class Ros2BaseDriver:
 
     @property
     def identity(self) -> Identity | None:
-        """What answers behind the bridge; a base tells nothing of itself on its topics."""
+        """What answers behind the bridge; a base reports nothing of itself on its topics."""
         if self._state_ns is None or self._is_foreign_bridge:
             return None
         return Identity("ROS 2 base", "", "robot.toml")
 
     @property
     def limits(self) -> Limits | None:
-        """What robot.toml declares of the base; it tells nothing of that itself."""
+        """What robot.toml declares of the base; it reports nothing of that itself."""
         if self.identity is None:
             return None
         settings = self._settings

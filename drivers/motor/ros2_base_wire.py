@@ -145,7 +145,7 @@ def unpack_state(data: bytes) -> tuple[int, int, int]:
 
 
 class BaseEnd:
-    """The bridge's end: which speeds the base is told now; pure. Who owns it says what is heard of the base."""
+    """The bridge's end: which speeds the base is commanded now; pure. Who owns it says what is heard of the base."""
 
     def __init__(self, settings: Ros2BaseSettings) -> None:
         self.driving = self.latched = self.button = self.is_heard = self.others_speak = False

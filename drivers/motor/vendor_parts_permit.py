@@ -1,6 +1,6 @@
 """Whether the robot may move, for the drivers of vendors' controllers: one value, and what may happen to it.
 
-These controllers know no session, latch little and tell no host that another one drives them. What the reference
+These controllers know no session, latch little and report to no host that another one drives them. What the reference
 protocol proves in the controller is kept here: arming only when asked and only from rest, the ramp of a stop, a fault
 and an e-stop that stay until a reset, and that nothing re-arms by itself. A driver says what its controllers are like
 (`Controllers`) and what happened; which frames that makes is the driver's own.
@@ -88,7 +88,7 @@ class MotionPermit(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def is_driving(self) -> bool:
-        """Whether controllers are, or were just, told to hold speeds: whatever is wrong with one then stops all."""
+        """Whether controllers hold speeds by command, or did just now: whatever is wrong with one then stops all."""
         return self.stage in _DRIVING
 
     def state(self, seen: Controllers) -> DriverState:

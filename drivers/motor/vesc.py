@@ -2,7 +2,7 @@
 
 A VESC knows no armed state: the first speed that it is sent moves it. Armed is what this driver says it is: every
 controller has answered, its status is fresh, its motor stands, and zeros were sent for a while. Faults are asked for,
-as no status message tells them; the question feeds no timeout.
+as no status message has them; the question feeds no timeout.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class _Motor:
         return abs(_ERPM_PER_STEP_S * self.turned.speed) < declared.STANDS_ERPM
 
     @property
-    def may_tell_timeout(self) -> bool:
+    def may_report_timeout(self) -> bool:
         """Whether its timeout is not known yet, and it has not been asked often enough to give up."""
         return self.timeout is None and self.asked_timeout < TIMEOUT_TRIES
 
@@ -122,13 +122,13 @@ class VescDriver:
 
     @property
     def limits(self) -> Limits | None:
-        """What robot.toml declares, and the time-out where all of them tell it."""
+        """What robot.toml declares, and the time-out where all of them report it."""
         if self.identity is None:
             return None
-        settings, told = self._settings, all(motor.timeout is not None for motor in self._all)
+        settings, reported = self._settings, all(motor.timeout is not None for motor in self._all)
         return Limits(
             max_wheel_speed_rad_s=Limit(settings.max_erpm / settings.erpm_per_rad_s, "robot.toml"),
-            command_timeout_s=Limit(settings.watchdog_s, "device" if told else "robot.toml"),
+            command_timeout_s=Limit(settings.watchdog_s, "device" if reported else "robot.toml"),
             stop_deceleration_rad_s2=Limit(settings.stop_deceleration_rad_s2, "robot.toml"),
         )
 
@@ -222,9 +222,9 @@ class VescDriver:
 
     @property
     def _refusal(self) -> str | None:
-        told = ((motor.node, motor.timeout) for motor in self._all if motor.timeout is not None)
+        timeouts = ((motor.node, motor.timeout) for motor in self._all if motor.timeout is not None)
         return next(
-            (why for node, timeout in told if (why := declared.timeout_fault(self._settings, node, *timeout))), None
+            (why for node, timeout in timeouts if (why := declared.timeout_fault(self._settings, node, *timeout))), None
         )
 
     @property
@@ -232,8 +232,12 @@ class VescDriver:
         silent = [str(motor.node) for motor in self._all if not motor.answered]
         if silent:
             return f"controller {', '.join(silent)} does not answer; is it switched on, at this bit rate, at this id?"
-        told = all(m.erpm_ns is not None and m.turned.last is not None and not m.may_tell_timeout for m in self._all)
-        return None if told else "no status messages 1 and 5; switch them on, at 50 Hz (VESC Tool, App Settings, CAN)"
+        complete = all(
+            m.erpm_ns is not None and m.turned.last is not None and not m.may_report_timeout for m in self._all
+        )
+        return (
+            None if complete else "no status messages 1 and 5; switch them on, at 50 Hz (VESC Tool, App Settings, CAN)"
+        )
 
     def _questions(self, now_ns: int) -> tuple[OutgoingFrame, ...]:
         if not all(motor.answered for motor in self._all):
@@ -245,7 +249,7 @@ class VescDriver:
         if now_ns - self._asked_ns < (_POLL_PERIOD_NS if polled else _FAULT_PERIOD_NS):
             return ()
         self._asked_ns = now_ns
-        mute = [motor for motor in self._all if motor.may_tell_timeout]
+        mute = [motor for motor in self._all if motor.may_report_timeout]
         if mute and self._permit.stage is Stage.REST:
             motor = min(mute, key=lambda each: each.asked_timeout)
             motor.asked_timeout += 1

@@ -184,8 +184,8 @@ def timeout(payload: bytes, controller: int) -> tuple[float, float] | None:
     """
     if len(payload) < _TIMEOUT.size or payload[0] != GET_APPCONF:
         return None
-    _, _, told, timeout_ms, brake_current_a = _TIMEOUT.unpack_from(payload)
-    return (1e-3 * timeout_ms, brake_current_a) if told == controller else None
+    _, _, answering, timeout_ms, brake_current_a = _TIMEOUT.unpack_from(payload)
+    return (1e-3 * timeout_ms, brake_current_a) if answering == controller else None
 
 
 def fragments(controller: int, sender: int, payload: bytes, send_mode: int = 0) -> tuple[Frame, ...]:

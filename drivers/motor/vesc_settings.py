@@ -86,7 +86,7 @@ def slowest_rad_s(settings: VescSettings) -> float:
 
 
 def timeout_fault(settings: VescSettings, node: int, timeout_s: float, brake_current_a: float) -> str | None:
-    """What a controller's timeout, as it tells it, is other than robot.toml declares."""
+    """How the timeout that a controller reports differs from what robot.toml declares."""
     named = f"controller {node}: its timeout"
     if timeout_s <= 0.0:
         return f"{named} is off; set {1e3 * settings.watchdog_s:g} ms (VESC Tool, App Settings, General)"
@@ -197,8 +197,8 @@ def cyclic_frames(settings: VescSettings, command_rate_hz: float, _authenticated
 
 def recognise(frames: Sequence[Frame]) -> dict[str, Any] | None:
     """The controllers whose status was heard, split into left and right as they are numbered; None for none."""
-    told = [codec.decode(frame) for frame in frames]
-    nodes = sorted({one.controller for one in told if one is not None and one.name == "status"})
+    decoded = [codec.decode(frame) for frame in frames]
+    nodes = sorted({one.controller for one in decoded if one is not None and one.name == "status"})
     return {"nodes": in_sides(nodes)} if len(nodes) > 1 else None
 
 
@@ -215,7 +215,7 @@ def safety_card(settings: VescSettings) -> SafetyCard:
         "nothing confirms it but standing motors",
         unverified=(
             "the speeds are declared in robot.toml and were not read back; the timeout and its brake current are, "
-            "where the firmware tells them",
+            "where the firmware reports them",
             "not tried on hardware: the driver was tried against a simulator made from what the vendor's code does",
         ),
         setup=(

@@ -121,21 +121,33 @@ class RewiredDriver:
             left, right = right, left
         return WheelCommand(left, right, command.valid_for_s)
 
-    def _wheels(self, told: WheelSample) -> WheelSample:
+    def _wheels(self, sample: WheelSample) -> WheelSample:
         wiring = self._wiring
-        left, right = (told.left_angle_rad, told.left_speed_rad_s), (told.right_angle_rad, told.right_speed_rad_s)
+        left, right = (
+            (sample.left_angle_rad, sample.left_speed_rad_s),
+            (sample.right_angle_rad, sample.right_speed_rad_s),
+        )
         if wiring.sides_swapped != wiring.encoders_swapped:
             left, right = right, left
         on_left, on_right = (wiring.turn_ratio * direction for direction in wiring.encoder_direction)
         return WheelSample(
-            told.t_ns, told.received_ns, on_left * left[0], on_right * right[0], on_left * left[1], on_right * right[1]
+            sample.t_ns,
+            sample.received_ns,
+            on_left * left[0],
+            on_right * right[0],
+            on_left * left[1],
+            on_right * right[1],
         )
 
-    def _motors(self, told: MotorSample) -> MotorSample:
+    def _motors(self, sample: MotorSample) -> MotorSample:
         if not self._wiring.sides_swapped:
-            return told
+            return sample
         return MotorSample(
-            told.t_ns, told.right_current_a, told.left_current_a, told.right_temperature_c, told.left_temperature_c
+            sample.t_ns,
+            sample.right_current_a,
+            sample.left_current_a,
+            sample.right_temperature_c,
+            sample.left_temperature_c,
         )
 
 

@@ -72,31 +72,31 @@ class PoseConvention(msgspec.Struct, frozen=True):
     offset: tuple[float, float] = (0.0, 0.0)
     latency_s: float = 0.0
 
-    def converted(self, told: PoseSample) -> PoseSample:
+    def converted(self, sample: PoseSample) -> PoseSample:
         """The pose of the tracked point in metres and radians, counter-clockwise, yaw in (-pi, pi].
 
         Without a heading it is not known where the tracked point is: the position stays the sensor's, which the sample
         then says by its lever arm.
         """
         metres, radians = _METRES[self.position_unit], _RADIANS[self.yaw_unit]
-        x_m, y_m = metres * told.x_m, (-metres if self.mirrored else metres) * told.y_m
+        x_m, y_m = metres * sample.x_m, (-metres if self.mirrored else metres) * sample.y_m
         at_x, at_y, turn = self.origin
         x_m, y_m = _turned(x_m, y_m, turn)
         x_m, y_m = at_x + x_m, at_y + y_m
         t_ns, std_m, yaw_std_rad = (
-            told.t_ns - round(1e9 * self.latency_s),
-            metres * told.position_std_m,
-            radians * told.yaw_std_rad,
+            sample.t_ns - round(1e9 * self.latency_s),
+            metres * sample.position_std_m,
+            radians * sample.yaw_std_rad,
         )
-        if not told.has_heading:
-            return PoseSample(t_ns, told.received_ns, x_m, y_m, math.nan, std_m, math.nan, *self.offset)
-        yaw_rad = (-radians if self.clockwise else radians) * told.yaw_rad + turn + self.yaw_offset_rad
+        if not sample.has_heading:
+            return PoseSample(t_ns, sample.received_ns, x_m, y_m, math.nan, std_m, math.nan, *self.offset)
+        yaw_rad = (-radians if self.clockwise else radians) * sample.yaw_rad + turn + self.yaw_offset_rad
         if not math.isfinite(yaw_rad):
-            return PoseSample(t_ns, told.received_ns, x_m, y_m, yaw_rad, std_m, yaw_std_rad)
+            return PoseSample(t_ns, sample.received_ns, x_m, y_m, yaw_rad, std_m, yaw_std_rad)
         ahead_x, ahead_y = _turned(*self.offset, yaw_rad)
         return PoseSample(
             t_ns,
-            told.received_ns,
+            sample.received_ns,
             x_m - ahead_x,
             y_m - ahead_y,
             math.remainder(yaw_rad, 2.0 * math.pi),

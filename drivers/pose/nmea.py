@@ -193,11 +193,11 @@ class ReceiverClock:
             # The receiver has found its time anew, or was away: nothing is known of its clock.
             self._offsets.clear()
         self._last_s = time_of_day_s
-        told_s = self._days + time_of_day_s
-        self._offsets.append((told_s, arrival_ns * 1e-9 - told_s))
-        while told_s - self._offsets[0][0] > _CLOCK_WINDOW_S:
+        receiver_s = self._days + time_of_day_s
+        self._offsets.append((receiver_s, arrival_ns * 1e-9 - receiver_s))
+        while receiver_s - self._offsets[0][0] > _CLOCK_WINDOW_S:
             self._offsets.popleft()
-        return min(arrival_ns, round(1e9 * (told_s + min(offset for _, offset in self._offsets))))
+        return min(arrival_ns, round(1e9 * (receiver_s + min(offset for _, offset in self._offsets))))
 
 
 @dataclass
@@ -322,17 +322,17 @@ def _lines(device: str, baud: int) -> Iterator[tuple[bytes, str | None]]:
         try:
             with serial.serial_for_url(device, baudrate=baud, timeout=_READ_S) as port:
                 yield b"", f"{device}: open"
-                heard_s, kept, told = time.monotonic(), b"", False
+                heard_s, kept, said_silent = time.monotonic(), b"", False
                 while True:
                     kept += port.read(max(1, min(port.in_waiting, _LONGEST_LINE)))
                     *lines, kept = kept.split(b"\n")
                     for line in lines:
                         if line.startswith(b"$"):
-                            heard_s, told, tries = time.monotonic(), False, 0
+                            heard_s, said_silent, tries = time.monotonic(), False, 0
                         yield line + b"\n", None
                     kept = kept[-_LONGEST_LINE:]
-                    if time.monotonic() - heard_s > _SILENT_S and not told:
-                        told = True
+                    if time.monotonic() - heard_s > _SILENT_S and not said_silent:
+                        said_silent = True
                         yield b"", f"{device}: no NMEA sentence for {_SILENT_S:.0f} s; check the receiver and pose.baud"
                     yield b"", None
         except (OSError, ValueError) as error:

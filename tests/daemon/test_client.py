@@ -55,6 +55,6 @@ def test_a_status_says_of_each_limit_who_says_it():
         "stop_deceleration_rad_s2": {"value": 10.0, "said_by": "robot.toml"},
     }
     assert controller_in_words({"words": "AgileX base", "limits": limits})[1] == (
-        "limits: max_wheel_speed_rad_s 15, stop_deceleration_rad_s2 10 (declared in robot.toml, not told by the "
-        "controller); command_timeout_s 0.5 (which cannot be set otherwise)"
+        "limits: max_wheel_speed_rad_s 15, stop_deceleration_rad_s2 10 (declared in robot.toml, not reported by "
+        "the controller); command_timeout_s 0.5 (which cannot be set otherwise)"
     )

@@ -60,7 +60,7 @@ def test_what_each_fault_comes_to_is_seen_in_a_counter(fault, stops):
     assert seen.armed_before
     assert (seen.stopped_s is not None) == stops
     assert seen.counters
-    assert seen.told or not stops
+    assert seen.events or not stops
 
 
 @pytest.mark.parametrize(
@@ -79,7 +79,7 @@ def test_a_fault_too_short_to_stop_for_is_counted_and_told(fault, counter):
     assert seen.armed_before
     assert seen.stopped_s is None
     assert f"plausibility.{counter}" in seen.counters
-    assert seen.told
+    assert seen.events
 
 
 def test_the_same_seeds_give_the_same_run():
@@ -117,4 +117,4 @@ def test_commands_that_come_later_and_later_end_in_a_stop(growth, to):
     # Found when commands are 0.15 s late; then what is on its way, the watchdog's 0.1 s and the ramp.
     assert seen.stopped_s < 0.15 * (1 + growth) / growth + 0.25 + 0.15 * (1 + growth) + 0.1 + 0.4
     assert "driver.late_commands" in seen.counters
-    assert any("late" in text for text in seen.told)
+    assert any("late" in text for text in seen.events)

@@ -46,8 +46,8 @@ def test_info_says_which_controller_answered_and_who_says_its_limits(tmp_path):
     ticks = [(PERIOD_NS, [*tick(1), agilex]), (2 * PERIOD_NS, [*tick(2), structs.replace(agilex, t_ns=6), later])]
     lines = [line for line in info(write_log(tmp_path / "run.mcap", ticks), False).splitlines() if "AgileX" in line]
     assert lines[0] == (
-        "controller: AgileX base (declared in robot.toml, not told by the controller); command_timeout_s 0.5 "
-        "(which cannot be set otherwise); x_m 2 (declared in robot.toml, not told by the controller)"
+        "controller: AgileX base (declared in robot.toml, not reported by the controller); command_timeout_s 0.5 "
+        "(which cannot be set otherwise); x_m 2 (declared in robot.toml, not reported by the controller)"
     )
     assert len(lines) == 2
     assert "AgileX base (oracle)" in lines[1]

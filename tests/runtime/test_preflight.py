@@ -66,13 +66,13 @@ def test_link_load_counts_the_control_rate():
 def test_limits_within_the_firmwares_are_ok():
     (check,) = check_firmware_limits(robot(), limits())
     assert check.level is Level.OK
-    assert check.text.count("told by the controller") == 3, check.text
+    assert check.text.count("reported by the controller") == 3, check.text
 
 
 def test_limits_that_nobody_has_looked_at_are_said_to_be_declared():
     declared = limits("robot.toml", ticks_per_rev=None, max_wheel_acceleration_rad_s2=None)
     (check,) = check_firmware_limits(robot(), declared)
-    assert check.text == "8 rad/s of 8, declared in robot.toml, not told by the controller"
+    assert check.text == "8 rad/s of 8, declared in robot.toml, not reported by the controller"
     (check,) = check_firmware_limits(robot(max_wheel_speed_rad_s=8.1), declared)
     assert check.level is Level.FAIL
     assert "declared in robot.toml" in check.text

@@ -71,17 +71,17 @@ def test_an_odrive_that_does_not_answer_for_the_endpoints_given_is_refused():
     bench = readable_odrive().bench()
     bench.robot.controller.boards[0].parameters.clear()
     bench.run_until(DriverState.REFUSED)
-    assert "node 3 does not tell its watchdog; correct link.watchdog_endpoints" in bench.driver.detail
+    assert "node 3 does not report its watchdog; correct link.watchdog_endpoints" in bench.driver.detail
 
 
 @pytest.mark.parametrize(
     ("vendor", "level", "words"),
     [
         (BY_LABEL["odrive-0.5"], Level.WARNING, "could not be read back"),
-        (readable_odrive(), Level.OK, "told by the controller"),
-        (BY_LABEL["vesc"], Level.OK, "told by the controller"),
+        (readable_odrive(), Level.OK, "reported by the controller"),
+        (BY_LABEL["vesc"], Level.OK, "reported by the controller"),
         (BY_LABEL["agilex"], Level.OK, "cannot be set otherwise"),
-        (BY_LABEL["roboclaw"], Level.OK, "told by the controller"),
+        (BY_LABEL["roboclaw"], Level.OK, "reported by the controller"),
     ],
 )
 def test_the_check_says_whether_it_was_read_back(vendor, level, words):
