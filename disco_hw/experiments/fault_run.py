@@ -145,7 +145,6 @@ class LogReader:
         self.events: list[tuple[int, str]] = []
         self.ticks = 0
         self._robot: dict[str, int] = {}
-        self._sums: dict[str, int] = {}
 
     def put(self, now_ns: int, recorded: Sequence[records.Record]) -> None:
         """Keep what shows trouble."""
@@ -204,7 +203,6 @@ class FaultOutcome:
 class FaultRunResult:
     """What one run showed."""
 
-    simulated_s: float = 0.0
     moving_s: float = 0.0
     commands_seen: int = 0
     commands_accepted: int = 0
@@ -302,7 +300,6 @@ class FaultRun:
                 self._check_estimate(truth)
                 self._check_telemetry(now_us)
                 self._close_faults(now_us)
-        self.outcome.simulated_s = self.now_us * 1e-6
         self.outcome.commands_seen = monitor.commands_seen
         self.outcome.commands_accepted = monitor.commands_accepted
         return self.outcome

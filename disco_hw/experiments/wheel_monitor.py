@@ -84,7 +84,6 @@ class WheelMonitor:
     violations: list[str] = field(default_factory=list)
     commands_seen: int = 0
     commands_accepted: int = 0
-    commands_refused: int = 0
     _last: Outputs | None = None
     _last_us: int = 0
     _targets: tuple[Pair, ...] = ((0.0, 0.0),)

@@ -39,8 +39,6 @@ from disco_hw.log.link import Batch, BatchDecoder, End, Start, TaskScene
 from disco_hw.log.records import TOPICS, Estimate, Event, Fan, Plan, Record
 from drivers.types import PoseSample
 
-VIEW_PREFIX = "/view/"
-
 VIEWS: tuple[tuple[str, Any], ...] = (
     ("/view/estimate", PoseInFrame),
     ("/view/transform", FrameTransform),

@@ -180,7 +180,6 @@ class ProcessRecorder:
         self._retries = 0
         self._retry_s = 0.0
         self._patience_s = _PATIENCE_S
-        self._stopped_s = 0.0
         self._next_part = 1
         self._continues = ""
         self._frozen = False

@@ -26,9 +26,6 @@ from drivers.types import CyclicFrame, Frame, LineQuestions, SafetyCard, Setting
 
 FIRST_ADDRESS, LAST_ADDRESS = 0x80, 0x87
 ACKNOWLEDGE = b"\xff"
-QUIET_S = 0.010
-"""A pause of more than this between two bytes discards a packet that has begun."""
-NVM_KEY = 0xE22EAB7A
 _VERSION_END = b"\n\0"
 _LONGEST_VERSION = 48
 _CRC_BYTES = 2
