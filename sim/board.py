@@ -22,7 +22,7 @@ from firmware_protocol.codec import Codec
 from firmware_protocol.firmware_core import FirmwareInputs, FirmwareOutputs, ResetCause
 from firmware_protocol.serial_framing import FrameDecoder, encode_frame
 from sim.bus import BusFault
-from sim.faults import RobotFaults
+from sim.injected_faults import RobotFaults
 from sim.plant import Plant, TrueState
 from sim.robot_link import LinkFaultError
 from sim.sensors import PoseMeasurement

@@ -11,7 +11,7 @@ from typing import Protocol
 from drivers.types import Frame
 from firmware_protocol.firmware_core import ResetCause
 from sim.fault_schedule import FaultSchedule, ScheduledFault, Site
-from sim.faults import FaultTimeline, FrameFaults, RobotFaults
+from sim.injected_faults import FaultTimeline, FrameFaults, RobotFaults
 from sim.robot_link import LinkFaultError, RobotLink
 from sim.virtual_robot import Robot, truth_row
 

@@ -22,7 +22,7 @@ from firmware_protocol.firmware_core import (
     drawn_entropy,
 )
 from sim.can_frame import CanFrame
-from sim.faults import RobotFaults
+from sim.injected_faults import RobotFaults
 from sim.plant import Plant, TrueState
 from sim.process import TextRecord
 from sim.sensors import PoseMeasurement

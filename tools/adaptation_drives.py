@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from disco_hw.adaptation.link import PoseReading, Samples, Triple, WheelAngles
-from disco_hw.adaptation.network import SampleWindow
+from disco_hw.adaptation.adapter_link import PoseReading, Samples, Triple, WheelAngles
+from disco_hw.adaptation.recursive import SampleWindow
 from disco_hw.inference.excitation import Excitation
 
 TRUTH = (0.238, 0.061, 0.415)

@@ -13,9 +13,9 @@ import numpy as np
 
 import disco_hw
 from disco_hw.adaptation.adapter import Adapter
+from disco_hw.adaptation.adapter_link import InForce, PoseReading, ProcessLink, Samples, WheelAngles
 from disco_hw.adaptation.geometry_filter import GeometryFilter
 from disco_hw.adaptation.guard import Geometry, believed_geometry, possible_range
-from disco_hw.adaptation.link import InForce, PoseReading, ProcessLink, Samples, WheelAngles
 from disco_hw.adaptation.network import Training, train_network, training_range
 from disco_hw.adaptation.recursive import evidence
 from disco_hw.daemon.run import warm_up

@@ -31,9 +31,9 @@ from mcap.writer import Writer
 from disco_hw.config import load_robot_config
 from disco_hw.errors import InputError, WorkError
 from disco_hw.files import FAULTS_TOML, read_toml
-from disco_hw.log.commands import recover_log
 from disco_hw.log.importing.csv_drive import read_csv
 from disco_hw.log.load import drive_from_log
+from disco_hw.log.log_command import recover_log
 from disco_hw.log.reader import open_log
 from disco_hw.model import load_model
 from sim.fault_schedule import FaultFileError, schedule_of

@@ -18,13 +18,13 @@ import msgspec
 
 import disco_hw
 from disco_hw.adaptation import Learnt, NoAdaptation
+from disco_hw.adaptation.adapter_link import NAMES
 from disco_hw.adaptation.guard import believed_geometry
-from disco_hw.adaptation.link import NAMES
 from disco_hw.drive.coverage import Coverage
 from disco_hw.drive.hand_pilot import HandPilot
 from disco_hw.drive.sources import ManualInput
 from disco_hw.experiments.simulated_time import SimulatedRun, virtual_robot
-from disco_hw.log.link import MODEL_TOML, ROBOT_TOML, Attachment, version
+from disco_hw.log.messages import MODEL_TOML, ROBOT_TOML, Attachment, version
 from disco_hw.log.recorder import ProcessRecorder, RecordingSettings
 from disco_hw.log.records import BeliefChange, FrameIn, FrameOut
 from disco_hw.runtime.assembly import make_planner, put_in_force

@@ -21,7 +21,7 @@ import typer.main
 
 import disco_hw
 from disco_hw import cli
-from disco_hw.log.link import Attachment
+from disco_hw.log.messages import Attachment
 from disco_hw.runtime.pipeline import NoPlanner
 from drivers.motor import find_driver
 from firmware_protocol.codec import Codec
@@ -165,14 +165,14 @@ _WORK = (
     "disco_hw.viewer.commands.serving",
 )
 _ENDS_AFTER = (
-    "disco_hw.inference.commands.excitation",
+    "disco_hw.inference.infer_command.excitation",
     "disco_hw.daemon.run.make_link",
     "disco_hw.first_use.commission.link_key",
 )
 _WITHOUT = {
     "disco_hw.daemon.run.make_planner": lambda *_: NoPlanner(),
     "disco_hw.runtime.replay.make_planner": lambda *_: NoPlanner(),
-    "disco_hw.drive.commands.leads_to_virtual_robot": lambda _: True,
+    "disco_hw.drive.drive_command.leads_to_virtual_robot": lambda _: True,
 }
 
 

@@ -8,8 +8,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from disco_hw.adaptation.guard import BeliefGuard, Geometry, Outcome
-from disco_hw.adaptation.link import (
+from disco_hw.adaptation.adapter_link import (
     NAMES,
     AdapterLink,
     InForce,
@@ -20,6 +19,7 @@ from disco_hw.adaptation.link import (
     Samples,
     WheelAngles,
 )
+from disco_hw.adaptation.guard import BeliefGuard, Geometry, Outcome
 from disco_hw.errors import WorkError
 from disco_hw.log import records
 from drivers.types import Readings

@@ -15,10 +15,28 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.adaptation.link import FromAdapter, InForce, LinkStats, Proposal, Report, Samples, ToAdapter
-from disco_hw.adaptation.network import SampleWindow
-from disco_hw.adaptation.recursive import Evidence, Judged, RecursiveGeometry, RunningNoise, evidence, to_linear
-from disco_hw.inference.excitation import UnusableDriveError, measured_noise
+from disco_hw.adaptation.adapter_link import (
+    MAX_PACKET_BYTES,
+    FromAdapter,
+    InForce,
+    LinkStats,
+    Proposal,
+    Range,
+    Report,
+    Samples,
+    ToAdapter,
+)
+from disco_hw.adaptation.recursive import (
+    Evidence,
+    Judged,
+    RecursiveGeometry,
+    RunningNoise,
+    SampleWindow,
+    evidence,
+    to_linear,
+)
+from disco_hw.inference.excitation import USUAL, UnusableDriveError, measured_noise
+from disco_hw.model import Model
 from disco_hw.processes import limit_thread_pools
 
 if TYPE_CHECKING:
@@ -248,10 +266,6 @@ class InlineLink:
         """Nothing is open."""
 
 
-if TYPE_CHECKING:
-    from disco_hw.adaptation.adapter import Adapter
-    from disco_hw.adaptation.link import Range
-
 _NICE = 10
 
 
@@ -260,14 +274,6 @@ def main(descriptor: int) -> int:
     limit_thread_pools()
     with contextlib.suppress(OSError):
         os.nice(_NICE)
-    # Imported late: the numeric libraries read their limits when they are loaded.
-    from disco_hw.adaptation.adapter import Adapter  # noqa: PLC0415
-    from disco_hw.adaptation.link import (  # noqa: PLC0415
-        MAX_PACKET_BYTES,
-        Range,
-        ToAdapter,
-    )
-
     decode, encode = msgspec.msgpack.Decoder(ToAdapter).decode, msgspec.msgpack.Encoder().encode
     adapter = Adapter()
     begun = False
@@ -286,12 +292,8 @@ def main(descriptor: int) -> int:
 
 def _train(adapter: Adapter, about: Range) -> None:
     """Train the network while the recursive estimate serves alone, then hand it over."""
-    import numpy as np  # noqa: PLC0415
-
     # Loads torch: seconds, in which samples already come in.
     from disco_hw.adaptation.network import Training, train_network, training_range  # noqa: PLC0415
-    from disco_hw.inference.excitation import USUAL  # noqa: PLC0415
-    from disco_hw.model import Model  # noqa: PLC0415
 
     mean, low, high = (np.array(values) for values in (about.mean, about.low, about.high))
     training = Training(*training_range(mean, low, high), about.wheel_rad_s)

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from disco_hw.adaptation import CheckedAdaptation, Learnt, change_record
+from disco_hw.adaptation.adapter_link import NAMES, AdapterLink
 from disco_hw.adaptation.geometry_filter import GeometryFilter
 from disco_hw.adaptation.guard import BeliefGuard, Geometry, Outcome
-from disco_hw.adaptation.link import NAMES, AdapterLink
 from disco_hw.log import records
 from drivers.types import Readings
 

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.adaptation.link import NAMES, Proposal
+from disco_hw.adaptation.adapter_link import NAMES, Proposal
 from disco_hw.config import Control, PoseInput, Prior
 from disco_hw.effects.effect import Channel
 from disco_hw.errors import InputError

@@ -38,8 +38,8 @@ def infer(
     # Before the numeric libraries are loaded: on small matrices their pools of threads cost more than the work.
     limit_thread_pools()
     check_named_files(robot, logs=logs)
-    from disco_hw.inference.commands import infer_command
     from disco_hw.inference.infer import InferOptions
+    from disco_hw.inference.infer_command import infer_command
 
     with progress_bar() as report_progress:
         result = infer_command(logs, robot, out, report, InferOptions(paper, simulations, seed), dask, report_progress)
@@ -89,7 +89,7 @@ def import_log(
 def info(log: Annotated[Path, typer.Argument(metavar="LOG")], as_json: AsJson = False) -> None:
     """Say what a log holds and whether anything was lost."""
     check_named_files(logs=[log])
-    from disco_hw.log.commands import info as log_info
+    from disco_hw.log.log_command import info as log_info
 
     print(log_info(log, as_json))
 
@@ -102,7 +102,7 @@ def recover(
 ) -> None:
     """Copy everything whole from a damaged log into a new one."""
     check_named_files(logs=[log])
-    from disco_hw.log.commands import recover as log_recover
+    from disco_hw.log.log_command import recover as log_recover
 
     print(log_recover(log, out, as_json))
 
@@ -116,7 +116,7 @@ def export(
 ) -> None:
     """Write commands, encoders and poses as CSV, or as a bag of ROS 2."""
     check_named_files(logs=[log])
-    from disco_hw.log.commands import export as log_export
-    from disco_hw.log.commands import export_rosbag
+    from disco_hw.log.log_command import export as log_export
+    from disco_hw.log.log_command import export_rosbag
 
     print((export_rosbag if rosbag2 else log_export)(log, out, as_json))

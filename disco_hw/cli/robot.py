@@ -92,7 +92,7 @@ def drive(
     limit_thread_pools()
     spare_memory()
     check_named_files(robot, model)
-    from disco_hw.drive.commands import DriveOptions, run_drive
+    from disco_hw.drive.drive_command import DriveOptions, run_drive
 
     with _page(view or page, robot, model, port, link):
         result = run_drive(

@@ -16,7 +16,7 @@ from disco_hw.adaptation.guard import choose_adaptation
 from disco_hw.config import PoseInput, RobotConfig
 from disco_hw.daemon.client import send_request, socket_path
 from disco_hw.errors import InputError, WorkError
-from disco_hw.estimation.sources import APART_STDS
+from disco_hw.estimation.pose_sources import APART_STDS
 from disco_hw.processes import can_lock_memory, can_use_fifo
 from disco_hw.runtime.assembly import driver_of, make_link, pose_source_of
 from disco_hw.runtime.preflight import (

@@ -26,8 +26,8 @@ from numba.core import event
 
 from disco_hw import processes
 from disco_hw.adaptation import GeometryAdaptation
+from disco_hw.adaptation.adapter_link import ProcessLink
 from disco_hw.adaptation.guard import check_adaptable, choose_adaptation
-from disco_hw.adaptation.link import ProcessLink
 from disco_hw.config import RobotConfig
 from disco_hw.control.law import Law, LawController
 from disco_hw.daemon.async_printer import STANDARD_OUTPUT, AsyncPrinter
@@ -37,7 +37,7 @@ from disco_hw.daemon.daemon import Daemon, Say
 from disco_hw.daemon.loop import MonotonicClock
 from disco_hw.daemon.page_feed import ViewerFeed, WatchedRecorder, feed_path, tick_feed_path
 from disco_hw.daemon.signals import StopPath, StopSignals
-from disco_hw.log.link import DBC, Attachment, version
+from disco_hw.log.messages import DBC, Attachment, version
 from disco_hw.log.recorder import NullRecorder, ProcessRecorder, Recorder, RecordingSettings
 from disco_hw.processes import end_with_parent
 from disco_hw.runtime.assembly import (

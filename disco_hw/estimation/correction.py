@@ -15,8 +15,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.estimation.belief import MAX_POSITION_VARIANCE, MAX_YAW_VARIANCE, Flat9, PoseBelief
 from disco_hw.estimation.odometry import Pose, wrap
+from disco_hw.estimation.pose_belief import MAX_POSITION_VARIANCE, MAX_YAW_VARIANCE, Flat9, PoseBelief
 from drivers.types import PoseSample
 
 

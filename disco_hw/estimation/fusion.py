@@ -8,7 +8,6 @@ from dataclasses import dataclass, fields
 import msgspec
 
 from disco_hw.config import Estimation
-from disco_hw.estimation.belief import MAX_POSITION_VARIANCE, MAX_YAW_VARIANCE
 from disco_hw.estimation.correction import PoseReason, Triple, screen
 from disco_hw.estimation.filter import HeadingSearch, Judgement, PoseFilter
 from disco_hw.estimation.history import RewindBuffer
@@ -20,7 +19,8 @@ from disco_hw.estimation.odometry import (
     WheelReason,
     WheelTracker,
 )
-from disco_hw.estimation.sources import PoseSources
+from disco_hw.estimation.pose_belief import MAX_POSITION_VARIANCE, MAX_YAW_VARIANCE
+from disco_hw.estimation.pose_sources import PoseSources
 from disco_hw.model.disturbance import Disturbance
 from drivers.types import PoseSample, WheelSample
 

@@ -16,13 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.adaptation import GeometryAdaptation
+from disco_hw.adaptation.adapter_link import AdapterLink
 from disco_hw.adaptation.guard import choose_adaptation
-from disco_hw.adaptation.link import AdapterLink
 from disco_hw.config import RobotConfig
 from disco_hw.control.law import Law, LawController
 from disco_hw.errors import InputError, WorkError
 from disco_hw.experiments.virtual import true_parameters
-from disco_hw.log.link import MODEL_TOML, Attachment
+from disco_hw.log.messages import MODEL_TOML, Attachment
 from disco_hw.log.recorder import MemoryRecorder, ProcessRecorder, RecordingSettings
 from disco_hw.model.file import model_text
 from disco_hw.reports import refuse_file

@@ -19,7 +19,7 @@ from typing import Protocol
 import msgspec
 
 from disco_hw.errors import LogError
-from disco_hw.log.link import (
+from disco_hw.log.messages import (
     ENCODE_ERRORS,
     TICK,
     Attachment,

@@ -6,6 +6,7 @@ import msgspec
 
 from disco_hw import control
 from disco_hw.adaptation import CheckedAdaptation, GeometryAdaptation
+from disco_hw.adaptation.adapter_link import AdapterLink
 from disco_hw.adaptation.fast import AuditedAdaptation, FastAdaptation
 from disco_hw.adaptation.guard import (
     ASKED_BY_FILE,
@@ -16,12 +17,11 @@ from disco_hw.adaptation.guard import (
     possible_range,
     with_geometry,
 )
-from disco_hw.adaptation.link import AdapterLink
 from disco_hw.config import RobotConfig
 from disco_hw.control.baselines.fallback import LAWS, WithFallback
 from disco_hw.errors import InputError
 from disco_hw.estimation import OdometryParameters, PoseFusion
-from disco_hw.estimation.disturbance import DisturbanceEstimator
+from disco_hw.estimation.disturbance_estimator import DisturbanceEstimator
 from disco_hw.log.recorder import Recorder
 from disco_hw.model import Model
 from disco_hw.runtime.core import DaemonCore

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from disco_hw.adaptation import CheckedAdaptation, NoAdaptation
+from disco_hw.adaptation.adapter_link import InForce, LinkStats, Proposal, Range, Report, Samples
 from disco_hw.adaptation.guard import BeliefGuard, Geometry
-from disco_hw.adaptation.link import InForce, LinkStats, Proposal, Range, Report, Samples
 from disco_hw.log import records
 from drivers.types import PoseSample, Readings, WheelSample
 

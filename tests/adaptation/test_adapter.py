@@ -1,11 +1,13 @@
 import math
+import subprocess
+import sys
 from functools import cache
 
 import numpy as np
 import pytest
 
 from disco_hw.adaptation.adapter import Adapter
-from disco_hw.adaptation.link import InForce
+from disco_hw.adaptation.adapter_link import InForce
 from disco_hw.adaptation.network import Training, train_network, training_range
 from disco_hw.inference.excitation import USUAL
 from disco_hw.model import Model
@@ -128,3 +130,8 @@ def test_what_lies_outside_the_training_range_is_doubted():
     wide = tuple((np.diag([0.1, 0.1, 0.2]) ** 2).ravel().tolist())
     found = proposals(run(begun(wide, network()), messages(15.0, truth=far)))
     assert "outside what was simulated" in found[-1].doubt
+
+
+def test_the_adapter_takes_samples_before_torch_is_loaded():
+    program = "import sys, disco_hw.adaptation.adapter; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", program], check=False, timeout=120).returncode == 0

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from disco_hw.adaptation.adapter_link import NAMES, Proposal, Report
 from disco_hw.adaptation.fast import AuditedAdaptation
 from disco_hw.adaptation.guard import Geometry
-from disco_hw.adaptation.link import NAMES, Proposal, Report
 from disco_hw.log.records import Adaptation, BeliefChange
 from tests.adaptation.test_adaptation import FakeLink
 from tools.foreign_plant import NOMINAL, ForeignPlant, ForeignRobot

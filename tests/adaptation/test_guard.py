@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from disco_hw.adaptation.adapter_link import Proposal
 from disco_hw.adaptation.guard import BeliefGuard, Geometry, Outcome
-from disco_hw.adaptation.link import Proposal
 
 S = 1_000_000_000
 MEAN = np.array([0.238, 0.061, 0.415])

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from disco_hw.adaptation.link import Samples
-from disco_hw.adaptation.network import SampleWindow
+from disco_hw.adaptation.adapter_link import Samples
+from disco_hw.adaptation.recursive import SampleWindow
 from disco_hw.inference.excitation import UnusableDriveError
 from tools.adaptation_drives import messages
 

@@ -87,7 +87,7 @@ def test_a_stamp_is_wall_clock_time_to_the_nanosecond():
 
 def test_the_control_process_imports_none_of_it():
     source = (
-        "import sys, disco_hw.daemon.run, disco_hw.drive.commands; from drivers.pose import pose_sources; "
+        "import sys, disco_hw.daemon.run, disco_hw.drive.drive_command; from drivers.pose import pose_sources; "
         "pose_sources(); "
         "print([name for name in sys.modules if name.split('.')[0] in ('cyclonedds', 'rosbags', 'foxglove') "
         "or name.startswith('disco_hw.bridge')])"

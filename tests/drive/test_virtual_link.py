@@ -5,7 +5,7 @@ import os
 import pytest
 
 from disco_hw.config import Link
-from disco_hw.drive.commands import leads_to_virtual_robot
+from disco_hw.drive.drive_command import leads_to_virtual_robot
 
 
 @pytest.mark.parametrize(

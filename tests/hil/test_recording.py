@@ -11,7 +11,7 @@ import pytest
 
 from disco_hw.errors import WorkError
 from disco_hw.experiments.live_stack import READY_TIMEOUT_S, Stack, running_stack
-from disco_hw.log.commands import info
+from disco_hw.log.log_command import info
 from disco_hw.log.reader import open_log
 from tests.hil.stack import disco
 

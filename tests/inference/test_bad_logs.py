@@ -8,9 +8,9 @@ import sys
 import pytest
 
 from disco_hw.errors import InputError
-from disco_hw.inference.commands import infer_command
+from disco_hw.inference.infer_command import infer_command
 from tests.inference.drives import write_log
-from tests.inference.test_commands import ROBOT, finds
+from tests.inference.test_infer_command import ROBOT, finds
 
 
 @pytest.fixture(scope="module")

@@ -4,8 +4,8 @@ import time
 import pytest
 
 from disco_hw.errors import WorkError
-from disco_hw.inference import commands
-from disco_hw.inference.commands import gap_check_beside
+from disco_hw.inference import infer_command
+from disco_hw.inference.infer_command import gap_check_beside
 from disco_hw.model import Model
 from tests.inference.drives import logged, robot_config
 
@@ -22,7 +22,7 @@ def test_a_log_that_cannot_be_searched_is_not_judged(monkeypatch):
     short = type(nothing)(
         ("short",), *(cut(part) for part in (nothing.commands, nothing.wheels, nothing.poses)), nothing.gyro
     )
-    found = commands.gap_check(short, NOMINAL)
+    found = infer_command.gap_check(short, NOMINAL)
     assert found.missing == ()
     assert "too little to judge" in found.not_judged
 
@@ -37,7 +37,7 @@ def die(send, log, model):
 
 
 def test_a_search_that_breaks_off_is_an_error_of_the_work(monkeypatch):
-    monkeypatch.setattr(commands, "_search", die)
+    monkeypatch.setattr(infer_command, "_search", die)
     with gap_check_beside(logged("poor"), NOMINAL) as searched, pytest.raises(WorkError, match="broke off"):
         searched()
 
@@ -47,7 +47,7 @@ def sleep(send, log, model):
 
 
 def test_leaving_early_ends_the_search(monkeypatch):
-    monkeypatch.setattr(commands, "_search", sleep)
+    monkeypatch.setattr(infer_command, "_search", sleep)
     began = time.monotonic()
     with pytest.raises(KeyboardInterrupt), gap_check_beside(logged("poor"), NOMINAL):
         raise KeyboardInterrupt

@@ -1,7 +1,7 @@
 import numpy as np
 
 from disco_hw.inference.checks import CHECKS
-from disco_hw.inference.commands import calibration_figure, pairs_figure, predictive_figure
+from disco_hw.inference.report import calibration_figure, pairs_figure, predictive_figure
 
 
 def test_the_bars_beyond_the_limit_are_marked():

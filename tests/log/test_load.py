@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 
 from disco_hw.errors import InputError, LogError
-from disco_hw.log.commands import recover_log
 from disco_hw.log.importing.csv_drive import write_csv
 from disco_hw.log.load import load_drive
+from disco_hw.log.log_command import recover_log
 from tools.log_samples import drive_ticks, log_bytes, write_log
 
 

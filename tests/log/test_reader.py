@@ -5,8 +5,8 @@ from hypothesis import strategies as st
 from mcap.writer import Writer
 
 from disco_hw.errors import InputError, LogError
-from disco_hw.log.commands import export, info
 from disco_hw.log.load import load_drive
+from disco_hw.log.log_command import export, info
 from disco_hw.log.reader import Gap, open_log
 from disco_hw.log.records import Counters, Estimate, Event, Innovation, Plan
 from disco_hw.runtime.replay import replay

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from disco_hw.errors import LogError
-from disco_hw.log.commands import info
+from disco_hw.log.log_command import info
 from disco_hw.log.reader import open_log
 from disco_hw.log.recorder import (
     MemoryRecorder,

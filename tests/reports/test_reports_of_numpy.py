@@ -13,7 +13,7 @@ import pytest
 from disco_hw.cli.options import print_result
 from disco_hw.daemon.check import Check, CheckReport, Level
 from disco_hw.daemon.emergency import EstopOutcome
-from disco_hw.drive.commands import DriveResult
+from disco_hw.drive.drive_command import DriveResult
 from disco_hw.experiments.adapt import CHANGES, AdaptOptions, AdaptResult, AdaptRun
 from disco_hw.experiments.circle import CircleOptions, CircleResult, Run
 from disco_hw.experiments.circle_report import CircleReport
@@ -32,7 +32,7 @@ from disco_hw.gap.report.findings import (
 from disco_hw.gap.search.cross_validation import PredictionErrors
 from disco_hw.gap.search.intervals import ParameterEstimate
 from disco_hw.inference.checks import CHECKS, Predictive
-from disco_hw.inference.commands import GapCheck, InferResult
+from disco_hw.inference.infer_command import GapCheck, InferResult
 from disco_hw.log.importing import Imported
 from disco_hw.model import Model
 from disco_hw.reports import as_json

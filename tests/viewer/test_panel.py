@@ -1,7 +1,7 @@
 import math
 from dataclasses import asdict
 
-from disco_hw.estimation.sources import PoseSources, Standing
+from disco_hw.estimation.pose_sources import PoseSources, Standing
 from disco_hw.log import records
 from disco_hw.log.recorder import RecorderStats
 from disco_hw.tasks.circle import CircleTask

@@ -10,7 +10,7 @@ import disco_hw.log.importing
 from disco_hw.errors import LogError
 from disco_hw.log.importing import format_of, import_log, log_formats
 from disco_hw.log.load import load_drive
-from tests.inference.test_commands import ROBOT
+from tests.inference.test_infer_command import ROBOT
 
 PAGE = Path(__file__).parents[3] / "docs" / "add-a-log-format.md"
 

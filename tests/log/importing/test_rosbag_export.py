@@ -12,12 +12,12 @@ from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
 from disco_hw.errors import LogError
-from disco_hw.log.commands import export_rosbag
 from disco_hw.log.importing import import_log
 from disco_hw.log.importing.rosbag import read_rosbag
 from disco_hw.log.load import load_drive
+from disco_hw.log.log_command import export_rosbag
 from tests.inference.drives import robot_config, write_log
-from tests.inference.test_commands import ROBOT
+from tests.inference.test_infer_command import ROBOT
 
 
 @pytest.fixture

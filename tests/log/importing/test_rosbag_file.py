@@ -20,7 +20,7 @@ from disco_hw.log.importing import format_of
 from disco_hw.log.importing.rosbag import read_rosbag
 from disco_hw.log.load import load_drive
 from tests.inference.drives import robot_config
-from tests.inference.test_commands import ROBOT
+from tests.inference.test_infer_command import ROBOT
 from tests.log.importing.bags import BEGAN_NS, LEFT, RIGHT, bag, recorded
 
 

@@ -7,9 +7,9 @@ from contextlib import nullcontext
 import pytest
 
 from disco_hw.errors import InputError, WorkError
-from disco_hw.inference import commands
-from disco_hw.inference.commands import GapCheck, infer_command
+from disco_hw.inference import infer_command as verb
 from disco_hw.inference.infer import InferOptions
+from disco_hw.inference.infer_command import GapCheck, infer_command
 from disco_hw.log.importing import import_log
 from disco_hw.model import load_model
 from tests.inference.drives import TICKS_PER_REV, TRUTH, write_log
@@ -141,7 +141,7 @@ def test_the_text_names_every_parameter_and_progress_is_told(inferred):
 @pytest.fixture
 def known(inferred, monkeypatch):
     """The inference is that of the circle, whatever the log."""
-    monkeypatch.setattr(commands, "infer", lambda *_: inferred[1].inference)
+    monkeypatch.setattr(verb, "infer", lambda *_: inferred[1].inference)
 
 
 def test_a_log_unlike_the_simulations_is_warned_of_with_the_next_step(robot, tmp_path):

@@ -8,7 +8,7 @@ import pytest
 
 from disco_hw.config import Estimation
 from disco_hw.estimation import OdometryParameters, PoseFusion
-from disco_hw.estimation.disturbance import LEFT, DisturbanceEstimator
+from disco_hw.estimation.disturbance_estimator import LEFT, DisturbanceEstimator
 from disco_hw.model.disturbance import NO_DISTURBANCE, Disturbance
 from drivers.types import PoseSample, WheelSample
 

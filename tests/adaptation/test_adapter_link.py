@@ -6,8 +6,8 @@ import sys
 import msgspec
 import pytest
 
-from disco_hw.adaptation import link as link_module
-from disco_hw.adaptation.link import ProcessLink, Report, Samples
+from disco_hw.adaptation import adapter_link as link_module
+from disco_hw.adaptation.adapter_link import ProcessLink, Report, Samples
 
 
 @pytest.fixture

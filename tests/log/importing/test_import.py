@@ -7,14 +7,14 @@ import pytest
 
 from disco_hw.errors import InputError, LogError
 from disco_hw.log.importing import import_log
-from disco_hw.log.link import ROBOT_TOML
 from disco_hw.log.load import load_drive
+from disco_hw.log.messages import ROBOT_TOML
 from disco_hw.log.reader import open_log
 from disco_hw.runtime.replay import replay
 from disco_hw.runtime.robot_setup import setup_of_log
 from disco_hw.viewer.recording import Recording
 from tests.inference.drives import TICKS_PER_REV, write_log
-from tests.inference.test_commands import ROBOT
+from tests.inference.test_infer_command import ROBOT
 from tests.log.importing.test_candump import dumped
 
 

@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from disco_hw.config import Estimation
-from disco_hw.estimation.belief import (
+from disco_hw.estimation.odometry import OdometryParameters, Pose, arc, moved
+from disco_hw.estimation.pose_belief import (
     MAX_POSITION_VARIANCE,
     MAX_YAW_VARIANCE,
     PoseBelief,
@@ -16,7 +17,6 @@ from disco_hw.estimation.belief import (
     motion_model,
     predict,
 )
-from disco_hw.estimation.odometry import OdometryParameters, Pose, arc, moved
 
 THETA = np.array([[0.15, 0.03, -0.03], [0.03, 0.09, -0.04], [-0.03, -0.04, 0.13]]) * 1e-3
 GEOMETRY = (0.061, 0.415, 0.238)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from disco_hw.drive.commands import DriveOptions, DriveResult, run_drive
+from disco_hw.drive.drive_command import DriveOptions, DriveResult, run_drive
 from disco_hw.errors import InputError
 from disco_hw.experiments.live_stack import write_robot_file
 
@@ -50,7 +50,7 @@ def test_nobody_drives_a_robot_that_may_be_real_unattended(tmp_path, interface, 
 
 def test_without_a_terminal_one_line_says_what_to_use(tmp_path, monkeypatch):
     with (tmp_path / "nothing").open("w+b") as file:
-        monkeypatch.setattr("disco_hw.drive.commands._STANDARD_INPUT", file.fileno())
+        monkeypatch.setattr("disco_hw.drive.drive_command._STANDARD_INPUT", file.fileno())
         with pytest.raises(InputError, match="no terminal; use a terminal, --gamepad or --script with --unattended"):
             run_drive(DriveOptions(write_robot_file(tmp_path)))
 
@@ -67,7 +67,7 @@ def test_the_terminal_is_put_back_when_the_daemon_cannot_start(tmp_path, monkeyp
 
     master, slave = os.openpty()
     before = termios.tcgetattr(slave)
-    monkeypatch.setattr("disco_hw.drive.commands._STANDARD_INPUT", slave)
+    monkeypatch.setattr("disco_hw.drive.drive_command._STANDARD_INPUT", slave)
     robot = write_robot_file(tmp_path)
     (tmp_path / "control.sock").write_text("in the way")
     with pytest.raises(InputError, match="not a socket"):
@@ -85,7 +85,7 @@ def test_the_result_is_for_people_and_machines():
 
 @pytest.mark.parametrize("said", [("event", "armed"), ("recording", "the log writer died (signal 9)")])
 def test_a_drive_whose_log_is_not_whole_is_not_completed(tmp_path, monkeypatch, said):
-    monkeypatch.setattr("disco_hw.drive.commands.serve", lambda _setup, _log, say, _pilot: say(*said))
+    monkeypatch.setattr("disco_hw.drive.drive_command.serve", lambda _setup, _log, say, _pilot: say(*said))
     result = run_drive(DriveOptions(write_robot_file(tmp_path), page=True, as_json=True))
     whole = said[0] != "recording"
     assert result.completed is whole
