@@ -24,7 +24,7 @@ WHEEL_COLOUR = (45, 45, 50)
 PLAN_COLOUR = (250, 140, 0)
 POINTS_COLOUR = (150, 110, 200)
 FAN_COLOUR = (0, 105, 125)
-POSES_COLOUR = (90, 90, 95)
+POSES_COLOUR = (125, 125, 132)
 ELLIPSE_COLOUR = (120, 40, 200)
 CENTRE_COLOUR = (0, 0, 0)
 
@@ -67,7 +67,8 @@ _WHEEL_PARTS = (("front", 0.5), ("rear", -0.5))
 _WIDTH_PX = {
     "task": 3.5, "trail": 4.0, "plan": 3.5, "fan": 1.5, "points": 1.5, "ellipse": 2.0, "centre": 1.5, "poses": 2.5,
 }  # fmt: skip
-_GRID_LIGHT, _GRID_DARK = ((236, 236, 236), (190, 190, 190)), ((34, 34, 40), (72, 72, 80))
+_GRID_LIGHT, _GRID_DARK = ((236, 236, 236), (190, 190, 190)), ((40, 40, 46), (76, 76, 84))
+_CENTRE_IN_THE_DARK = (225, 225, 225)
 _TRAIL_STEP, _OLD_TRAIL_STEP = 0.05, 0.2
 """Between two points of the trail that are drawn, in the task's reach: chords of a circle are off by 0.03 %, .5 %."""
 
@@ -110,7 +111,7 @@ class Scene:
         """Draw this instant."""
         layers = self.layers
         with self._server.atomic():
-            self._shade_grid()
+            self._shade()
             self._draw_task(self._stage.task_at(snapshot.task))
             self._task.visible = layers["task"] and self.knows_task
             self._robot.visible = layers["robot"] and snapshot.pose is not None
@@ -200,12 +201,14 @@ class Scene:
         elif node.visible:
             node.visible = False
 
-    def _shade_grid(self) -> None:
+    def _shade(self) -> None:
         if self.background != self._shaded:
             self._shaded = self.background
             colours = _GRID_DARK if self.background == DARK else _GRID_LIGHT
             for lines, colour in zip(self._grid, colours, strict=True):
                 lines.colors = np.array(colour, np.uint8)
+            centre = _CENTRE_IN_THE_DARK if self.background == DARK else CENTRE_COLOUR
+            self._lines["centre"].colors = np.array(centre, np.uint8)
 
     def _draw_task(self, task: RobotTask) -> None:
         if task != self._drawn_task:

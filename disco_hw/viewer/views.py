@@ -114,6 +114,7 @@ def legend() -> str:
     """HTML: the colour of each layer beside its name; of the trail what its colours mean."""
     rows = [
         f'<div><span aria-hidden="true" style="display:inline-block;width:1.6em;height:0.5em;margin-right:0.6em;'
+        f"border:1px solid #8888;"
         f'background:rgb{colour}"></span>{html.escape(LAYERS[name])}</div>'
         for name, colour in LAYER_COLOURS.items()
     ]

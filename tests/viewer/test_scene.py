@@ -163,7 +163,7 @@ def test_nothing_is_drawn_that_costs_a_browser_without_a_graphics_card_ten_times
     assert said["EnvironmentMapMessage"].hdri_data is None
 
 
-def test_the_grid_has_a_line_every_metre_and_pales_in_the_dark(scene, shot):
+def test_the_grid_has_a_line_every_metre_and_is_seen_in_the_dark_as_the_turning_centre_is(scene, shot):
     cells, metres = scene_module.grid_lines((1.0, 2.0), 4.0, 0.5)
     assert len(metres) == 2 * 5
     assert len(cells) == 2 * 4
@@ -172,9 +172,11 @@ def test_the_grid_has_a_line_every_metre_and_pales_in_the_dark(scene, shot):
     scene.background = scene_module.DARK
     scene.show(shot)
     assert max(np.asarray(lines.colors).max() for lines in scene._grid) < 90
+    assert np.asarray(scene._lines["centre"].colors).min() > 180
     scene.background = scene_module.LIGHT
     scene.show(shot)
     assert min(np.asarray(lines.colors).min() for lines in scene._grid) > 180
+    assert np.asarray(scene._lines["centre"].colors).max() == 0
 
 
 def test_the_fan_is_shaded_by_weight_and_the_weightiest_lies_on_top(scene, shot):
