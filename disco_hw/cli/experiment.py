@@ -106,7 +106,7 @@ def adapt(
 def gap(
     hide: Annotated[
         list[str] | None,
-        typer.Option(metavar="EFFECT=VALUE", help="Hide this in the virtual robot; more than one goes."),
+        typer.Option(metavar="EFFECT=VALUE", help="Hide this effect in the virtual robot; may be repeated."),
     ] = None,
     robot: Annotated[Path | None, typer.Option(help="robot.toml to drive; the shipped robot's if none.")] = None,
     laps: Annotated[float, typer.Option(min=0.5, max=20.0, help="Laps of each circle.")] = 1.5,

@@ -117,14 +117,16 @@ def drive(
 
 
 def init(
-    out: Annotated[Path, typer.Option("-o", "--out", help="Where to write it.")] = Path("robot.toml"),
+    out: Annotated[Path, typer.Option("-o", "--out", help="Where to write the robot.toml.")] = Path("robot.toml"),
     link: LinkOption = None,
     driver: Annotated[str | None, typer.Option(help="The motor controller, where it is not to be heard.")] = None,
     name: Annotated[str | None, typer.Option(help="The robot's name.")] = None,
-    wheel_radius_m: Annotated[float | None, typer.Option(min=0.0)] = None,
-    axial_distance_m: Annotated[float | None, typer.Option(min=0.0)] = None,
-    ticks_per_rev: Annotated[float | None, typer.Option(min=1.0)] = None,
-    max_wheel_speed_rad_s: Annotated[float | None, typer.Option(min=0.0)] = None,
+    wheel_radius_m: Annotated[float | None, typer.Option(min=0.0, help="Radius of a wheel, m.")] = None,
+    axial_distance_m: Annotated[float | None, typer.Option(min=0.0, help="From left to right wheels, m.")] = None,
+    ticks_per_rev: Annotated[float | None, typer.Option(min=1.0, help="Encoder ticks a turn of a wheel.")] = None,
+    max_wheel_speed_rad_s: Annotated[
+        float | None, typer.Option(min=0.0, help="Fastest speed of a wheel, rad/s.")
+    ] = None,
     pose_source: Annotated[str | None, typer.Option(help="Where measured poses come from.")] = None,
     listen_s: Annotated[float, typer.Option(min=0.0, help="How long to listen on the link.")] = 3.0,
     ask: Annotated[

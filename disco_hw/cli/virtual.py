@@ -72,7 +72,7 @@ def sim(
     truth: Annotated[Path | None, typer.Option(help="Write the true motion to this CSV file.")] = None,
     inject: Annotated[Path | None, typer.Option(help="Listen for faults to inject on this Unix socket.")] = None,
     bus_log: Annotated[Path | None, typer.Option(help="Write every frame to this file, as candump does.")] = None,
-    faults: Annotated[Path | None, typer.Option(help="Let go wrong what this TOML schedule says.")] = None,
+    faults: Annotated[Path | None, typer.Option(help="Inject the faults of this TOML schedule.")] = None,
     board: Annotated[
         str | None,
         typer.Option(

@@ -28,12 +28,14 @@ def view(
     model: ModelOption = None,
     link: LinkOption = None,
     snapshot: Annotated[Path | None, typer.Option(help="Write a picture of the log instead.")] = None,
-    at: Annotated[float | None, typer.Option(metavar="SECONDS", help="Where in the log; its end if not given.")] = None,
+    at: Annotated[
+        float | None, typer.Option(metavar="SECONDS", help="When in the log the picture is of; its end if not given.")
+    ] = None,
     video: Annotated[Path | None, typer.Option(help="Write a clip of the log instead.")] = None,
     speed: Annotated[float, typer.Option(min=0.1, max=1000.0, help="How much faster the clip runs.")] = 1.0,
     export: Annotated[Path | None, typer.Option(help="Write one HTML file that plays without Python instead.")] = None,
     host: Annotated[
-        str, typer.Option(help="Address to listen on; any but this host's own needs the token that is printed.")
+        str, typer.Option(help="Address to listen on; on every one the page asks for the token of the printed address.")
     ] = LOOPBACK,
     port: Annotated[int, typer.Option(min=1, max=65535, help="Port of the page.")] = DEFAULT_PORT,
     foxglove: Annotated[

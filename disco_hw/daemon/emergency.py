@@ -33,7 +33,10 @@ _REPEATS = 3
 _CONNECT_S = 1.0
 _CONFIRM_S = 0.5
 _FRAME_LIFE_NS = 1_000_000_000
-_REMEDY = "give --link can:INTERFACE:CHANNEL or --link serial:PORT, or use the robot's own e-stop button, now"
+_REMEDY = (
+    "to stop it all the same give --link can:INTERFACE:CHANNEL or --link serial:PORT, "
+    "or use the robot's own e-stop button, now"
+)
 
 
 @dataclass(frozen=True, slots=True)

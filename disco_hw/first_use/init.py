@@ -246,7 +246,7 @@ def _answering(
     allowed = options.may_ask if options.driver is None else options.may_ask is not False
     if allowed is None and ask is not None:
         say("a controller that is set to take single bytes as speeds could move: lift the wheels, or cut motor power")
-        allowed = ask(f"nobody speaks here by himself; ask for {names} (its version, no more)? [y/n] ").strip() == "y"
+        allowed = ask(f"nothing is sent here unasked; ask for {names} (its version, no more)? [y/n] ").strip() == "y"
     if not allowed:
         return ()
     found = [heard for driver in drivers if (heard := ask_on_line(port, driver)) is not None]

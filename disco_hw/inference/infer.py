@@ -170,12 +170,15 @@ def infer(
 
 def prior_region(robot: RobotConfig) -> Region:
     """The prior of robot.toml as far as it is physically possible; raises InputError if nothing of it is."""
-    low, high = physical_range()
+    possible = np.column_stack(physical_range())
     ranges = np.array([getattr(robot.prior, name) for name in NAMES])
-    low, high = np.maximum(low, ranges[:, 0]), np.minimum(high, ranges[:, 1])
-    for name, lowest, highest, given in zip(NAMES, low, high, ranges.tolist(), strict=True):
+    low, high = np.maximum(possible[:, 0], ranges[:, 0]), np.minimum(possible[:, 1], ranges[:, 1])
+    for name, lowest, highest, given, within in zip(NAMES, low, high, ranges.tolist(), possible, strict=True):
         if lowest >= highest:
-            raise InputError(f"robot.toml: prior.{name}: {given} is physically impossible; write a possible range")
+            raise InputError(
+                f"robot.toml: prior.{name}: {given} is physically impossible; write a range within "
+                f"[{within[0]:g}, {within[1]:g}]"
+            )
     return Region.box(low, high)
 
 

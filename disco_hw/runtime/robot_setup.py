@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
 
 import msgspec
 
@@ -14,9 +15,12 @@ from disco_hw.files import KEY, WAY_POINTS, read_bytes
 from disco_hw.files import MODEL_TOML as MODEL_KIND
 from disco_hw.files import ROBOT_TOML as ROBOT_KIND
 from disco_hw.log.messages import MODEL_TOML, PATH_CSV, ROBOT_TOML, Attachment, TaskScene, attachment
-from disco_hw.log.reader import Log
 from disco_hw.model import Model, load_model
 from drivers.private_files import KeyFileError, key_of_file
+
+if TYPE_CHECKING:
+    # It brings the libraries of the log's format, which a daemon does without.
+    from disco_hw.log.reader import Log
 
 Matrix3 = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
 

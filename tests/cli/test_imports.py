@@ -107,8 +107,9 @@ def test_what_drives_loads_nothing_that_it_does_not_use(module):
     command = [sys.executable, "-c", IMPORTED.format(module=module)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
     loaded = set(done.stdout.split())
-    unused = {"torch", "matplotlib", "cantools", "viser", "scipy.stats", "scipy.interpolate", "scipy.special",
-              "scipy.optimize", "scipy.sparse", "scipy.ndimage", "scipy.signal", "scipy.spatial"}  # fmt: skip
+    unused = {"torch", "matplotlib", "cantools", "viser", "google", "mcap", "scipy.stats", "scipy.interpolate",
+              "scipy.special", "scipy.optimize", "scipy.sparse", "scipy.ndimage", "scipy.signal",
+              "scipy.spatial"}  # fmt: skip
     assert not loaded & unused
     assert "filterpy.kalman" in loaded or module != "disco_hw.daemon.run"
 

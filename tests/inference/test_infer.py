@@ -77,7 +77,7 @@ def test_too_few_simulations_are_refused():
 
 
 def test_an_impossible_prior_is_refused():
-    with pytest.raises(InputError, match=r"prior\.wheel_radius_m.*impossible"):
+    with pytest.raises(InputError, match=r"prior\.wheel_radius_m.*impossible; write a range within \[0\.\d+, \d"):
         prior_region(robot_config(wheel_radius_m=(-1.0, 0.001)))
 
 
