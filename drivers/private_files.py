@@ -8,7 +8,7 @@ import stat
 from collections.abc import Collection
 from pathlib import Path
 
-from firmware_protocol.authentication import parse_key
+from firmware_protocol.protection import parse_key
 
 _MAKE = "make one with `(umask 077; openssl rand -hex 16 > FILE)`"
 _OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import msgspec
 
-from firmware_protocol import e2e
+from firmware_protocol import protection
 from firmware_protocol.dbc import MessageLayout, SignalLayout, packaged_protocol
 
 _FLOAT = struct.Struct("<f")
@@ -127,14 +127,14 @@ class Codec:
             raise ValueError(f"{name}: no such signal: {', '.join(remaining)}")
         if layout.data_id is None:
             return EncodedFrame(layout.can_id, bits.to_bytes(layout.length, "little"))
-        protected = (bits >> 8 | counter % e2e.COUNTER_MODULUS).to_bytes(layout.length - 1, "little")
-        return EncodedFrame(layout.can_id, bytes((e2e.crc8(protected, layout.data_id),)) + protected)
+        protected = (bits >> 8 | counter % protection.COUNTER_MODULUS).to_bytes(layout.length - 1, "little")
+        return EncodedFrame(layout.can_id, bytes((protection.crc8(protected, layout.data_id),)) + protected)
 
     def decode(self, can_id: int, data: bytes) -> Decoded | DecodeFault:
         """Unpack one received frame; whatever the wire brings, the answer is a value and never an exception.
 
         A message without E2E header (the emergency stop) is accepted with any length; missing bytes read as zero.
-        The counter is returned, not judged: that is `e2e.E2EReceiver`'s part.
+        The counter is returned, not judged: that is `protection.E2EReceiver`'s part.
         """
         plan = self._by_id.get(can_id)
         if plan is None:
@@ -144,7 +144,7 @@ class Codec:
         if plan.crc_suffix:
             if len(data) != layout.length:
                 return DecodeFault(FaultReason.LENGTH, layout.name, can_id)
-            if e2e.crc8h2f(data[1:] + plan.crc_suffix) != data[0]:
+            if protection.crc8h2f(data[1:] + plan.crc_suffix) != data[0]:
                 return DecodeFault(FaultReason.CRC, layout.name, can_id)
             counter = data[1] & 0x0F
         elif len(data) > _MAX_DATA:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from firmware_protocol.e2e import data_id
+from firmware_protocol.protection import data_id
 
 if TYPE_CHECKING:
     import cantools.database.can

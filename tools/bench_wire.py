@@ -10,8 +10,8 @@ import numpy as np
 
 from drivers.motor.reference_frames import FrameTransmission
 from firmware_protocol import _firmware
-from firmware_protocol.authentication import aes_cmac
 from firmware_protocol.codec import Codec
+from firmware_protocol.protection import aes_cmac
 
 COMMAND = {"mode": "SPEED", "left_speed": 1.5, "right_speed": -0.75, "valid_for": 0.1, "session": 7}
 SAMPLE = {"left_valid": 1, "right_valid": 1, "driver_enabled": 1, "limited": 0, "left_speed": 1.0, "right_speed": 2.0}

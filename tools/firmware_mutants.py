@@ -173,7 +173,7 @@ def load_the_rest() -> None:
     import hypothesis.stateful  # noqa: PLC0415
     import pytest  # noqa: F401, PLC0415
 
-    import firmware_protocol.authentication  # noqa: F401, PLC0415
+    import firmware_protocol.protection  # noqa: F401, PLC0415
 
     hypothesis.settings.register_profile("mutants", derandomize=True, deadline=None, database=None, max_examples=60)
 

@@ -18,8 +18,8 @@ from dataclasses import replace
 from drivers.motor.reference import ReferenceDriver
 from drivers.types import Frame, ReceivedFrame, WheelCommand
 from firmware_protocol.codec import PROTOCOL, Codec
-from firmware_protocol.e2e import crc8
 from firmware_protocol.firmware_core import FirmwareConfig, FirmwareCore, FirmwareInputs
+from firmware_protocol.protection import crc8
 from firmware_protocol.serial_framing import FrameDecoder, encode_frame
 
 GROWTH_LIMIT_KB = 256.0

@@ -11,7 +11,7 @@ from drivers import status_texts
 from drivers.types import CyclicFrame, Identity, Limit, Limits, Request
 from firmware_protocol.codec import Codec, Decoded
 from firmware_protocol.dbc import load_protocol
-from firmware_protocol.e2e import COUNTER_MODULUS, challenge_answer
+from firmware_protocol.protection import COUNTER_MODULUS, challenge_answer
 
 _REMEMBERED = 256
 STATE_TIMEOUT_NS = 500_000_000

@@ -20,9 +20,8 @@ from drivers.types import (
     RobotLinkHealth,
     WheelSample,
 )
-from firmware_protocol.authentication import Prover
 from firmware_protocol.codec import PROTOCOL, Codec, Decoded, DecodeFault, EncodedFrame, FaultReason
-from firmware_protocol.e2e import COUNTER_MODULUS, E2EReceiver, E2EStatus
+from firmware_protocol.protection import COUNTER_MODULUS, E2EReceiver, E2EStatus, Prover
 
 TIMEOUT_NS = 500_000_000
 SLOW_TIMEOUT_NS = 5_000_000_000

@@ -3,10 +3,9 @@
 import math
 
 from firmware_protocol import _firmware
-from firmware_protocol.authentication import PROVED, Prover
 from firmware_protocol.codec import Codec, Decoded
-from firmware_protocol.e2e import challenge_answer, data_id
 from firmware_protocol.firmware_core import FirmwareConfig, FirmwareCore, FirmwareInputs
+from firmware_protocol.protection import PROVED, Prover, challenge_answer, data_id
 
 MS = 1000
 CODEC = Codec()

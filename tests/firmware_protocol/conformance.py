@@ -8,8 +8,8 @@ import math
 import pytest
 
 from drivers.device_clock import MAX_SKEW
-from firmware_protocol.authentication import Prover
 from firmware_protocol.codec import PROTOCOL
+from firmware_protocol.protection import Prover
 from tests.firmware_protocol.protocol_host import CODEC, ProtocolHost
 
 NEVER_CYCLIC = {"HELLO", "BUILD", "LIMITS", "TIME_RESPONSE", "PARAM_RESPONSE", "POSE_POSITION", "POSE_HEADING"}

@@ -2,9 +2,8 @@
 
 import itertools
 
-from firmware_protocol.authentication import PROVED, Prover
 from firmware_protocol.codec import PROTOCOL_MAJOR, PROTOCOL_MINOR, Codec, Decoded
-from firmware_protocol.e2e import challenge_answer
+from firmware_protocol.protection import PROVED, Prover, challenge_answer
 
 STATE_PERIOD_NS = 50_000_000
 COMMAND_PERIOD_NS = 20_000_000

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from firmware_protocol import _firmware
 from firmware_protocol.codec import PROTOCOL, PROTOCOL_MAJOR, PROTOCOL_MINOR, Codec, Decoded, DecodeFault, FaultReason
 from firmware_protocol.dbc import packaged_dbc
-from firmware_protocol.e2e import crc8
+from firmware_protocol.protection import crc8
 
 ffi, lib = _firmware.ffi, _firmware.lib
 CODEC = Codec()

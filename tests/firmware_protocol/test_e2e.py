@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from firmware_protocol import _firmware
-from firmware_protocol.e2e import E2EReceiver, E2EStatus, challenge_answer, crc8, crc8h2f, data_id
+from firmware_protocol.protection import E2EReceiver, E2EStatus, challenge_answer, crc8, crc8h2f, data_id
 
 ffi, lib = _firmware.ffi, _firmware.lib
 TIMEOUT_US = 500_000

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from drivers.motor.reference import ReferenceDriver
 from drivers.types import DriverState, Frame, ReceivedFrame, Request, WheelCommand
-from firmware_protocol import e2e
+from firmware_protocol import protection
 from firmware_protocol.codec import PROTOCOL, Codec
 from tests.drivers.motor.bench import MS, START_NS
 
@@ -20,7 +20,7 @@ def protected(can_id, payload):
     if layout.data_id is None:
         return Frame(can_id, payload[:1])
     body = payload[1:]
-    return Frame(can_id, bytes((e2e.crc8(body, layout.data_id),)) + body)
+    return Frame(can_id, bytes((protection.crc8(body, layout.data_id),)) + body)
 
 
 CAN_IDS = [layout.can_id for layout in PROTOCOL.messages]

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from drivers.motor.reference_arming import ARMING_TIMEOUT_NS, SESSION_REFUSED_AFTER_NS, Arming, Handshake
 from drivers.types import Request
-from firmware_protocol import e2e
+from firmware_protocol import protection
 from firmware_protocol.codec import Decoded
 
 HASH = 0xCAFE1234
@@ -47,7 +47,7 @@ def test_the_way_up_step_by_step():
     assert one.host_state().request == "READY", "no ARM without an answer to the challenge"
     one.take_session(0x1234, one.session, ("CHALLENGE", "ZERO_COMMANDS"), 0)
     assert one.host_state().request == "ARM"
-    assert one.host_state().challenge_answer == e2e.challenge_answer(0x1234, one.session, HASH)
+    assert one.host_state().challenge_answer == protection.challenge_answer(0x1234, one.session, HASH)
     assert one.needs_zeros
     assert not one.armed
     report(one, "ARMED")

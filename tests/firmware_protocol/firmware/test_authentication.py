@@ -8,7 +8,7 @@ from cryptography.hazmat.primitives.ciphers import algorithms
 from cryptography.hazmat.primitives.cmac import CMAC
 
 from firmware_protocol import _firmware
-from firmware_protocol.authentication import Prover
+from firmware_protocol.protection import Prover
 from tests.firmware_protocol.bench import CODEC, CONFIG, Bench
 
 lib, ffi = _firmware.lib, _firmware.ffi

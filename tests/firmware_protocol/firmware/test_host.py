@@ -5,8 +5,8 @@ import itertools
 
 import pytest
 
-from firmware_protocol.e2e import challenge_answer
 from firmware_protocol.firmware_core import FirmwareCore, FirmwareInputs
+from firmware_protocol.protection import challenge_answer
 from tests.firmware_protocol.bench import CODEC, CONFIG, FAULTS, MS, Bench, sealed
 
 

@@ -1,5 +1,5 @@
 from firmware_protocol import _firmware
-from firmware_protocol.e2e import crc8
+from firmware_protocol.protection import crc8
 
 ffi, lib = _firmware.ffi, _firmware.lib
 
