@@ -90,10 +90,11 @@ def drive(directory, robot_file, others=()):
     Returns how many overruns were the daemon's own, or the emulator's; and what its log says of its loop, in words.
     """
     with watched_processors(directory) as paused:
-        log = run(directory, robot_file, others)
+        parts = run(directory, robot_file, others)
         pauses = paused()
-    recorded = open_log(log)
-    loop, stolen_ms = recorded.columns("/loop"), recorded.columns("/counters")["loop.stolen_ms"][-1]
+    loop = joined([part.columns("/loop") for part in parts])
+    assert np.all(np.diff(loop["tick"]) == 1), "the log lacks ticks"
+    stolen_ms = parts[-1].columns("/counters")["loop.stolen_ms"][-1]
     own = own_overruns(*overran(loop), pauses)
     within = [to - since for since, to in pauses if to > loop["t_ns"][0] and since < loop["t_ns"][-1]]
     return own, (
@@ -105,7 +106,7 @@ def drive(directory, robot_file, others=()):
 
 
 def run(directory, robot_file, others):
-    """The drive itself; returns its log."""
+    """The drive itself; returns its log: more than one where a computer was too busy to write, and it began anew."""
     log = directory / "run.mcap"
     with disco_hw_process("daemon", ["run", str(robot_file), "--log", str(log)], directory / "daemon.txt") as daemon:
         operator = Operator(directory / "control.sock", (daemon, *others))
@@ -120,7 +121,13 @@ def run(directory, robot_file, others):
         operator.wait_for("READY", 5.0)
         operator.tell("quit")
         assert daemon.process.wait(20.0) == 0, daemon.last_words()
-    return log
+    return [open_log(part) for part in (log, *sorted(directory.glob("run.part*.mcap")))]
+
+
+def joined(parts):
+    """Columns of several logs, one after the other; a stage that one of them has not is 0 there."""
+    names = {name for part in parts for name in part}
+    return {name: np.concatenate([part.get(name, np.zeros(len(part["tick"]))) for part in parts]) for name in names}
 
 
 def arm(operator):
