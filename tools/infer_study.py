@@ -1,6 +1,7 @@
 """Recovery study of `infer`: robots drawn from the prior's plausible part, errors and coverage; pictures on request.
 
 python -m tools.infer_study --plants 20 --drive rich --out out/infer
+python -m tools.infer_study --plants 40 --foreign --out out/infer     # tools/foreign_plant.py, its slip over 0.15 s
 """
 
 from __future__ import annotations
@@ -16,14 +17,17 @@ from matplotlib.figure import Figure
 from disco_hw.config import Robot, RobotConfig
 from disco_hw.inference.infer import InferOptions, infer
 from disco_hw.inference.simulate import NAMES
-from disco_hw.log.drive import DriveLog
+from disco_hw.log.drive import Commands, DriveLog, Gyro, Poses, Wheels
 from disco_hw.log.load import load_drive
 from sim.drives import make_drive
 from sim.log_csv import simulated_log, write_csv
 from sim.plant_parameters import PlantParameters
+from tools.foreign_plant import ForeignPlant, ForeignRobot
 
 PLAUSIBLE = {"x_icr_m": (0.0, 0.3), "wheel_radius_m": (0.04, 0.10), "axial_distance_m": (0.2, 0.5)}
 LEVEL = 0.9
+SLIP_S = 0.15
+READ_S = 0.02
 
 
 def config() -> RobotConfig:
@@ -49,11 +53,50 @@ def logged(parameters: PlantParameters, drive: str, seed: int) -> DriveLog:
         return load_drive(path, parameters.ticks_per_rev)
 
 
-def recover(seed: int, drive: str, simulations: int | None = None) -> dict[str, object]:
+def foreign_robot(seed: int) -> ForeignRobot:
+    """A robot with inertia, tyres that relax and slip that keeps its direction for a while; of this study's range."""
+    rng = np.random.default_rng([seed, 41])
+    x_icr_m, radius_m, axial_m = (float(rng.uniform(*span)) for span in PLAUSIBLE.values())
+    return ForeignRobot(radius_m, axial_m, x_icr_m, grip_s=SLIP_S)
+
+
+def foreign_log(robot: ForeignRobot, drive: str, seed: int) -> DriveLog:
+    """One drive of a foreign robot, from what its sensors said."""
+    script = make_drive(drive, seed)
+    plant = ForeignPlant(robot, (0.0, 0.0, 0.0), seed)
+    wheels: list[tuple[float, ...]] = []
+    poses: list[tuple[float, ...]] = []
+    for command in zip(script.left_rad_s.tolist(), script.right_rad_s.tolist(), strict=True):
+        for _ in range(round(script.period_s / READ_S)):
+            read = plant.readings()
+            wheels += [
+                (w.t_ns * 1e-9, w.left_angle_rad, w.right_angle_rad, w.left_speed_rad_s, w.right_speed_rad_s)
+                for w in read.wheels
+            ]
+            poses += [(p.t_ns * 1e-9, p.x_m, p.y_m, p.yaw_rad) for p in read.poses]
+            plant.advance(*command, round(READ_S * 1e3))
+    wheel_columns, pose_columns = np.array(wheels).T, np.array(poses).T
+    one = [np.zeros(size, dtype=np.int64) for size in (script.t_s.size, wheel_columns.shape[1], pose_columns.shape[1])]
+    return DriveLog(
+        sources=("foreign",),
+        commands=Commands(script.t_s, script.left_rad_s, script.right_rad_s, one[0]),
+        wheels=Wheels(*wheel_columns, one[1], True, True),
+        poses=Poses(*pose_columns, one[2]),
+        gyro=Gyro(np.empty(0), np.empty(0), np.empty(0, dtype=np.int64)),
+    )
+
+
+def recover(seed: int, drive: str, simulations: int | None = None, foreign: bool = False) -> dict[str, object]:
     """Infer one robot from one drive of it."""
-    parameters = plant(seed)
-    result = infer(logged(parameters, drive, seed), config(), InferOptions(simulations=simulations, seed=seed))
-    truth = np.array([getattr(parameters, name) for name in NAMES])
+    if foreign:
+        robot = foreign_robot(seed)
+        truth = np.array([robot.x_icr_m, robot.radius_m, robot.axle_m])
+        log = foreign_log(robot, drive, seed)
+    else:
+        parameters = plant(seed)
+        truth = np.array([getattr(parameters, name) for name in NAMES])
+        log = logged(parameters, drive, seed)
+    result = infer(log, config(), InferOptions(simulations=simulations, seed=seed))
     low, high = np.quantile(result.draws, [0.5 - LEVEL / 2, 0.5 + LEVEL / 2], axis=0)
     return {
         "seed": seed,

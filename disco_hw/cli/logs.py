@@ -38,12 +38,15 @@ def infer(
     # Before the numeric libraries are loaded: on small matrices their pools of threads cost more than the work.
     limit_thread_pools()
     check_named_files(robot, logs=logs)
+    from disco_hw.daemon.run import compile_beforehand
     from disco_hw.inference.infer import InferOptions
     from disco_hw.inference.infer_command import infer_command
 
     with progress_bar() as report_progress:
         result = infer_command(logs, robot, out, report, InferOptions(paper, simulations, seed), dask, report_progress)
     print_result(result.as_dict(), as_json, result.as_text())
+    if out is not None:
+        compile_beforehand(robot, out, progress_line)
 
 
 def gap(
@@ -58,10 +61,12 @@ def gap(
 
     limit_thread_pools()
     check_named_files(robot, model, logs)
+    from disco_hw.daemon.run import compile_beforehand
     from disco_hw.gap.find import gap as find_gap
 
     result = find_gap(logs, robot, out, model, progress_line)
     print_result(result.as_dict(), as_json, result.as_text())
+    compile_beforehand(robot, out / "model.toml", progress_line)
 
 
 log_app = typer.Typer(help="Look into a log, mend it, hand it on.", no_args_is_help=True)

@@ -215,9 +215,11 @@ def check(
     """Preflight: link, firmware match, latency, bus load, real-time settings, limits. Nothing moves."""
     check_named_files(robot)
     from disco_hw.daemon.check import run_check
+    from disco_hw.daemon.run import compile_beforehand
 
     report = run_check(robot, link)
     print_result(report.as_dict(), as_json, report.as_text())
+    compile_beforehand(robot, None, progress_line)
     if not report.ok:
         raise typer.Exit(1)
 

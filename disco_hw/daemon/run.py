@@ -37,6 +37,7 @@ from disco_hw.daemon.daemon import Daemon, Say
 from disco_hw.daemon.loop import MonotonicClock
 from disco_hw.daemon.page_feed import ViewerFeed, WatchedRecorder, feed_path, tick_feed_path
 from disco_hw.daemon.signals import StopPath, StopSignals
+from disco_hw.errors import InputError
 from disco_hw.log.messages import DBC, Attachment, version
 from disco_hw.log.recorder import NullRecorder, ProcessRecorder, Recorder, RecordingSettings
 from disco_hw.processes import end_with_parent
@@ -150,7 +151,7 @@ def serve(
     """
     key, transport = link_key(setup), make_link(setup)
     # Before the signals are caught: whoever has enough of a compilation may break it off, as nothing is open yet.
-    planner = compiled_elsewhere(lambda: _warm_planner(setup, new_planner), _compiled(setup), _progress)
+    planner = compiled_elsewhere(lambda: warm_planner(setup, new_planner), planner_in_words(setup), _progress)
     pipeline = make_pipeline(setup.config, setup.model, planner)
     stop = StopPath()
     with StopSignals() as signals:
@@ -223,19 +224,6 @@ def _start(
     return daemon
 
 
-def _warm_planner(setup: Setup, new_planner: Callable[[], Planner]) -> Planner:
-    """A new planner, after all that it will need was run once."""
-    planner = new_planner()
-    warm_up(make_pipeline(setup.config, setup.model, new_planner()))
-    return planner
-
-
-def _compiled(setup: Setup) -> str:
-    """What the planner is compiled for, in words."""
-    effects = ", ".join(effect.name for effect in setup.model.effects)
-    return f"the planner for this task{f' and a model with {effects}' if effects else ''}"
-
-
 def _progress(text: str) -> None:
     """Write a line to standard error at once; for the time before the loop, when waiting harms nobody."""
     with contextlib.suppress(OSError):
@@ -296,7 +284,7 @@ class _Compilation(event.Listener):
 
     def on_start(self, event: Any) -> None:
         if self._thread is None:
-            self._say(f"compiling {self._what}: about a minute, this once; the result is kept for the next start")
+            self._say(f"compiling {self._what}: some seconds, this once; the result is kept")
             self._began_ns = time.monotonic_ns()
             self._thread = threading.Thread(target=self._tell, name="compile progress", daemon=True)
             self._thread.start()
@@ -379,6 +367,35 @@ def _make_in_a_fork(make: Callable[[], object], what: str, say: Callable[[str], 
         process.join()
     finally:
         process.kill()
+
+
+def compile_beforehand(robot: Path, model: Path | None, say: Callable[[str], None]) -> None:
+    """Compile and keep what `run` will need for these files, so that no start waits for it.
+
+    Nothing is done where it is kept already, where nothing can be kept, and for files that `run` would refuse.
+    """
+    if not are_kernels_kept():
+        return
+    try:
+        setup = load_setup(robot, model)
+        refuse_missing_effects(setup)
+    except InputError:
+        return
+    with compile_progress(planner_in_words(setup), say):
+        warm_planner(setup, lambda: make_planner(setup.config, setup.model))
+
+
+def planner_in_words(setup: Setup) -> str:
+    """What a planner is compiled for."""
+    effects = ", ".join(effect.name for effect in setup.model.effects)
+    return f"the planner for this task{f' and a model with {effects}' if effects else ''}"
+
+
+def warm_planner(setup: Setup, new_planner: Callable[[], Planner]) -> Planner:
+    """A new planner, after all that it will need was run once, by another one."""
+    planner = new_planner()
+    warm_up(make_pipeline(setup.config, setup.model, new_planner()))
+    return planner
 
 
 _PERIOD_NS = 20_000_000

@@ -16,12 +16,11 @@ import numpy as np
 from llvmlite import ir  # type: ignore[import-untyped]
 from numba import njit, typeof, types
 from numba.core.base import BaseContext
-from numba.core.codegen import JITCodeLibrary
-from numba.core.compiler import Compiler
 from numba.core.typing.context import Context
 from numba.core.typing.templates import Signature
 from numba.extending import intrinsic, overload
 
+from disco_hw.jit.compiler import Callee, CalleeCompiler, KernelCompiler
 from drivers.kernel_cache import kept_on_disk
 
 GROUP = "disco_hw.effects"
@@ -50,16 +49,24 @@ FAST_MATH = {"contract", "nsz"}
 
 INLINED: dict[str, Any] = {"fastmath": FAST_MATH, "error_model": "numpy", "forceinline": True}
 
-scalar_function: Callable[..., Any] = njit(**INLINED)
+
+def scalar_function(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Compile a function into the callers that it has in kernels, each with a copy of its own."""
+    return Callee(function, targetoptions=INLINED)
+
+
 _intrinsic: Any = intrinsic
 _typeof: Any = typeof
 
 # Where an estimate of a reciprocal root is good for 11 bits, which one Newton step makes 22; ARM's is good for 8.
 ESTIMATES_ROOTS = ("x86_64", "AMD64")
 
-# A function with loops of its own, too large to be worth a copy in every caller. What is not said here numba would take
-# over from whichever function calls it first.
-block_function: Callable[..., Any] = njit(fastmath=FAST_MATH, error_model="numpy", forceinline=False)
+
+def block_function(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Compile a function with loops of its own, too large to be worth a copy in every caller of a kernel."""
+    # What is not said here numba would take over from whichever function calls it first.
+    return Callee(function, targetoptions={**INLINED, "forceinline": False})
+
 
 # The compiler's scalar types, as casts.
 int32: Any = types.int32
@@ -69,35 +76,9 @@ float32: Any = types.float32
 
 def specialise(function: Callable[..., Any]) -> Callable[..., Any]:
     """Register compiled forms of `function`, chosen by the types of its arguments."""
-    options: Any = INLINED
+    options: Any = {**INLINED, "pipeline_class": CalleeCompiler}
     decorator: Callable[..., Any] = overload(function, jit_options=options, strict=False)
     return decorator
-
-
-class _SelfContained(JITCodeLibrary):
-    """Machine code that calls nothing but what is in it.
-
-    A process may hold other copies of the functions that a kernel calls: those that they were compiled to before the
-    kernel was, or another kernel's. They differ in how sums of products are rounded, and the linker takes whichever
-    came first, unless the kernel's own have no symbol. So a kernel gives the same bits in the process that compiled it
-    as in one that loads it.
-    """
-
-    def _optimize_final_module(self) -> None:
-        libraries = (library._get_module_for_linking() for library in self._linking_libraries)
-        called = {function.name for library in libraries for function in library.functions}
-        for function in self._final_module.functions:
-            if function.name in called and not function.is_declaration:
-                function.linkage = "private"
-        super()._optimize_final_module()  # type: ignore[no-untyped-call]
-
-
-class _KernelCompiler(Compiler):
-    def __init__(self, typing: Any, target: Any, library: Any, *rest: Any) -> None:
-        if library is None:
-            library = _SelfContained(target.codegen(), "kernel")  # type: ignore[no-untyped-call]
-            library.enable_object_caching()
-        super().__init__(typing, target, library, *rest)  # type: ignore[no-untyped-call]
 
 
 @cache
@@ -131,7 +112,7 @@ def kernel_function(function: Callable[..., Any]) -> Callable[..., Any]:
     code = function.__code__.replace(co_freevars=("sources",))
     keyed = FunctionType(code, function.__globals__, function.__name__, None, (CellType(sources_fingerprint()),))
     keyed.__qualname__, keyed.__module__, keyed.__doc__ = function.__qualname__, function.__module__, function.__doc__
-    options: Any = {"fastmath": FAST_MATH, "error_model": "numpy", "pipeline_class": _KernelCompiler}
+    options: Any = {"fastmath": FAST_MATH, "error_model": "numpy", "pipeline_class": KernelCompiler}
     compiled: Callable[..., Any] = kept_on_disk(njit(**options)(keyed))
     return compiled
 

@@ -5,11 +5,19 @@ import signal
 import subprocess
 import sys
 import threading
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from numba import njit
 
-from disco_hw.daemon.run import compile_progress
+import disco_hw
+from disco_hw.cli import logs, robot
+from disco_hw.daemon import check, run
+from disco_hw.daemon.run import compile_beforehand, compile_progress
+from disco_hw.gap import find
+from disco_hw.inference import infer_command
+from disco_hw.model import EffectSetting, load_model, save_model
 
 KERNEL = """
 from drivers.kernel_cache import compiled
@@ -100,3 +108,59 @@ def test_what_cannot_be_kept_is_compiled_by_the_process_itself(start):
 def test_who_compiles_ends_with_the_process_that_it_compiles_for(start, number):
     for_ever = "(double(1.5), time.sleep(3600))"
     start("import time\n" + START.replace("double(1.5)", for_ever), ended_by=number)
+
+
+ROBOT = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
+
+
+def test_what_a_start_will_need_is_compiled_beforehand_with_words_and_nothing_for_files_that_it_refuses(
+    tmp_path, monkeypatch
+):
+    made, said = [], []
+
+    def make(config, model):
+        made.append([effect.name for effect in model.effects])
+        njit(lambda x: x + 1.0)(2.0)
+
+    monkeypatch.setattr(run, "make_planner", make)
+    monkeypatch.setattr(run, "make_pipeline", lambda *_: None)
+    monkeypatch.setattr(run, "warm_up", lambda _: None)
+    shipped = load_model(ROBOT.parent / "wombot_model.toml")
+    with_deadband = replace(shipped, effects=(EffectSetting("deadband", {"width_rad_s": 0.5}),))
+    save_model(with_deadband, tmp_path / "model.toml")
+    compile_beforehand(ROBOT, tmp_path / "model.toml", said.append)
+    # One planner to drive with, and one that is used up in the rehearsal.
+    assert made == [["deadband"]] * 2
+    assert said[0].startswith("compiling the planner for this task and a model with deadband")
+    save_model(replace(shipped, missing_effects=("motor_lag",)), tmp_path / "marked.toml")
+    for refused in (tmp_path / "marked.toml", tmp_path / "none.toml"):
+        compile_beforehand(ROBOT, refused, said.append)
+    assert len(made) == 2
+
+
+class Result:
+    ok = True
+
+    def as_dict(self):
+        return {}
+
+    def as_text(self):
+        return ""
+
+
+@pytest.mark.parametrize(
+    ("verb", "model"),
+    [
+        (lambda out: robot.check(ROBOT), lambda _: None),
+        (lambda out: logs.gap([ROBOT], ROBOT, out), lambda out: out / "model.toml"),
+        (lambda out: logs.infer([ROBOT], ROBOT, out), lambda out: out),
+    ],
+    ids=["check", "gap", "infer"],
+)
+def test_check_gap_and_infer_compile_for_the_model_that_they_read_or_wrote(tmp_path, monkeypatch, verb, model):
+    asked = []
+    for module, name in ((check, "run_check"), (find, "gap"), (infer_command, "infer_command")):
+        monkeypatch.setattr(module, name, lambda *_: Result())
+    monkeypatch.setattr(run, "compile_beforehand", lambda robot_file, model, say: asked.append(model))
+    verb(tmp_path)
+    assert asked == [model(tmp_path)]

@@ -1,5 +1,6 @@
 """How kernels are compiled: what the compiling process runs is what later ones load."""
 
+import gc
 import os
 import subprocess
 import sys
@@ -7,6 +8,7 @@ import sys
 import numpy as np
 import pytest
 from numba import config, njit
+from numba.core.target_extension import CPU, jit_registry
 
 from disco_hw.jit import block_function, kernel_function, tune_loops
 
@@ -62,6 +64,18 @@ def test_what_a_kernel_calls_can_be_called_from_elsewhere_too(tmp_path, monkeypa
     njit(once)(values)
     double(values)
     np.testing.assert_array_equal(values, 16.0)
+
+
+def test_what_a_kernel_calls_is_lowered_and_no_more(tmp_path, monkeypatch):
+    monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path))
+    collecting, jit_of_overloads = gc.isenabled(), jit_registry[CPU]
+    kernel_function(twice)(np.ones(3))
+    (called,) = double.overloads.values()
+    code = str(called.library._get_module_for_linking())
+    assert called.fndesc.llvm_func_name in code
+    assert called.fndesc.llvm_cpython_wrapper_name not in code
+    assert called.fndesc.llvm_cfunc_wrapper_name not in code
+    assert (gc.isenabled(), jit_registry[CPU]) == (collecting, jit_of_overloads)
 
 
 @pytest.mark.long
