@@ -24,6 +24,12 @@ def infer(
     robot: RobotOption,
     out: Annotated[Path | None, typer.Option("-o", "--out", help="Write the model with its posterior here.")] = None,
     paper: Annotated[bool, typer.Option("--paper", help="The paper's statistics and 1000 simulations.")] = False,
+    random_features: Annotated[
+        bool, typer.Option("--random-features", help="With --paper: its mixture on random Fourier features (MDRFF).")
+    ] = False,
+    cross_correlation: Annotated[
+        bool, typer.Option("--cross-correlation", help="With --paper: its statistics of steps against actions.")
+    ] = False,
     simulations: Annotated[int | None, typer.Option(min=200, help="Simulations in all.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of simulations and networks.")] = 1,
     report: Annotated[Path | None, typer.Option(help="Write diagnostics with pictures to this HTML file.")] = None,
@@ -42,8 +48,9 @@ def infer(
     from disco_hw.inference.infer import InferOptions
     from disco_hw.inference.infer_command import infer_command
 
+    options = InferOptions(paper, simulations, seed, random_features, cross_correlation)
     with progress_bar() as report_progress:
-        result = infer_command(logs, robot, out, report, InferOptions(paper, simulations, seed), dask, report_progress)
+        result = infer_command(logs, robot, out, report, options, dask, report_progress)
     print_result(result.as_dict(), as_json, result.as_text())
     if out is not None:
         compile_beforehand(robot, out, progress_line)

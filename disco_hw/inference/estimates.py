@@ -142,3 +142,36 @@ class PaperStatistics:
 def paper_statistics(drive: Excitation) -> PaperStatistics:
     """The statistics of a drive."""
     return PaperStatistics(drive.starts)
+
+
+CROSS_CORRELATION = (
+    *(f"<d{state}, {wheel}>" for state in ("x", "y", "yaw") for wheel in ("left", "right")),
+    *(f"{moment} d{state}" for moment in ("mean", "variance of") for state in ("x", "y", "yaw")),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class CrossCorrelation:
+    """BayesSim's statistics (Ramos, Possas, Fox, RSS 2019, section IV): steps of the state against actions.
+
+    Call it with poses (n, P, 3) for the statistics (n, 12) in the order of `CROSS_CORRELATION`: inner products of the
+    steps in x, y (m) and yaw (rad) with what either wheel rolled meanwhile (rad), over their number; means and
+    variances of the steps. Steps across runs do not count.
+    """
+
+    starts: NDArray[np.bool_]
+    roll_rad: Array
+
+    def __call__(self, poses: Array) -> Array:
+        """Means over all steps of the log."""
+        inside = ~self.starts[1:]
+        steps = np.diff(poses, axis=1)[:, inside]
+        middle, difference = self.roll_rad[1:][inside].T
+        wheels = np.column_stack([middle - 0.5 * difference, middle + 0.5 * difference])
+        products = np.einsum("nps,pw->nsw", steps, wheels) / wheels.shape[0]
+        return np.column_stack([products.reshape(poses.shape[0], -1), steps.mean(axis=1), steps.var(axis=1)])
+
+
+def cross_correlation(drive: Excitation) -> CrossCorrelation:
+    """The statistics of a drive."""
+    return CrossCorrelation(drive.starts, drive.roll_rad)

@@ -25,7 +25,7 @@ from disco_hw.inference.checks import (
     undetermined,
 )
 from disco_hw.inference.density_network import Mixtures, NetworkSettings
-from disco_hw.inference.estimates import estimates, paper_statistics
+from disco_hw.inference.estimates import cross_correlation, estimates, paper_statistics
 from disco_hw.inference.excitation import USUAL, Excitation, Noise, excitation, measured_noise
 from disco_hw.inference.rounds import Fitted, Region, RoundSettings, run_rounds
 from disco_hw.inference.simulate import (
@@ -58,17 +58,23 @@ _EXCLUDED_SHARE = 0.01
 DEFAULT_ROUNDS = RoundSettings()
 # One round over the whole prior, as the paper has it; five components, as its pendulum's posterior.
 PAPER_ROUNDS = RoundSettings(shares=(1.0,), network=NetworkSettings(components=5, hidden=48))
+FOURIER_FEATURES = 200
 
 
 @dataclass(frozen=True, slots=True)
 class InferOptions:
     """`paper`: the paper's statistics, commands as input, one round; `simulations`: over all rounds, None for 3000
     (paper: 1000).
+
+    `random_features` and `cross_correlation` are BayesSim's other density and statistics, for `paper` alone: a mixture
+    on random Fourier features (MDRFF) in place of the network, and steps of the state against actions.
     """
 
     paper: bool = False
     simulations: int | None = None
     seed: int = 1
+    random_features: bool = False
+    cross_correlation: bool = False
 
 
 @dataclass(frozen=True)
@@ -117,6 +123,8 @@ def infer(
     began = perf_counter()
     options = options or InferOptions()
     simulations = options.simulations or (PAPER_SIMULATIONS if options.paper else DEFAULT_SIMULATIONS)
+    if not options.paper and (options.random_features or options.cross_correlation):
+        raise InputError("--random-features and --cross-correlation are the paper's: give --paper too")
     if simulations < _FEWEST_SIMULATIONS:
         raise InputError(f"--simulations {simulations}: too few to train a network; give {_FEWEST_SIMULATIONS} or more")
     prior = prior_region(robot)
@@ -127,7 +135,9 @@ def infer(
     known = noise_spread(Simulator(nominal, drive, measured), plain, options.seed + 4)
     noise = known.noise
     _check_inside(prior, plain, known.fit_std)
-    summary: Summary = paper_statistics(drive) if options.paper else estimates(drive, noise)
+    summary: Summary = estimates(drive, noise)
+    if options.paper:
+        summary = cross_correlation(drive) if options.cross_correlation else paper_statistics(drive)
     simulator = Simulator(nominal, drive, noise, known.factor)
     observed = summary(drive.pose[None])[0]
     tally = Tally(simulations + PREDICTIVE_SIMULATIONS + CALIBRATION_SIMULATIONS, report_progress)
@@ -136,6 +146,8 @@ def infer(
         return simulator.summaries(theta, seeds, summary, workers, tally.add)
 
     settings = PAPER_ROUNDS if options.paper else DEFAULT_ROUNDS
+    if options.random_features:
+        settings = replace(settings, network=replace(settings.network, fourier=FOURIER_FEATURES))
     fitted = run_rounds(simulate, observed, prior, simulations, settings, options.seed, tally.stage, workers)
     rng = np.random.default_rng([options.seed, 1])
     draws, outside = fitted.draw(observed[None], POSTERIOR_DRAWS, rng)

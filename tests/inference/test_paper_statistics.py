@@ -1,7 +1,10 @@
 import numpy as np
 import pytest
 
-from disco_hw.inference.estimates import PAPER_STATISTICS, PaperStatistics
+from disco_hw.errors import InputError
+from disco_hw.inference.density_network import NetworkSettings, train
+from disco_hw.inference.estimates import CROSS_CORRELATION, PAPER_STATISTICS, CrossCorrelation, PaperStatistics
+from disco_hw.inference.infer import InferOptions, infer
 
 
 def test_they_are_the_means_of_position_and_of_its_steps_in_time():
@@ -25,3 +28,40 @@ def test_the_jump_between_two_runs_does_not_count():
     poses[0, 2:, 0] = 100.0
     found = PaperStatistics(np.array([True, False, True, False]))(poses)
     assert found[0, 2] == 0.0
+
+
+def test_steps_are_correlated_with_what_either_wheel_rolled():
+    # Three steps, of which the second leads from one run to the next.
+    starts = np.array([True, False, True, False])
+    poses = np.zeros((1, 4, 3))
+    poses[0, :, 0] = [0.0, 2.0, 50.0, 53.0]
+    poses[0, :, 2] = [0.0, 0.5, 9.0, 8.9]
+    roll = np.array([[9.0, 9.0], [1.0, 0.4], [9.0, 9.0], [2.0, -0.2]])
+    found = dict(zip(CROSS_CORRELATION, CrossCorrelation(starts, roll)(poses)[0], strict=True))
+    # The wheels roll 0.8 and 1.2, then 2.1 and 1.9.
+    assert found["<dx, left>"] == pytest.approx((2.0 * 0.8 + 3.0 * 2.1) / 2)
+    assert found["<dx, right>"] == pytest.approx((2.0 * 1.2 + 3.0 * 1.9) / 2)
+    assert found["<dyaw, right>"] == pytest.approx((0.5 * 1.2 - 0.1 * 1.9) / 2)
+    assert found["<dy, left>"] == 0.0
+    assert found["mean dx"] == pytest.approx(2.5)
+    assert found["variance of dx"] == pytest.approx(0.25)
+
+
+def test_random_features_learn_a_density_that_no_line_fits_and_are_not_trained():
+    rng = np.random.default_rng(1)
+    statistics = rng.uniform(-2.0, 2.0, (1500, 1))
+    targets = np.sin(1.5 * statistics) ** 2 + 0.1 * rng.standard_normal((1500, 1))
+    settings = NetworkSettings(members=1, components=1, fourier=60)
+    network = train(statistics[:1200], targets[:1200], settings, seed=1)
+    score = network.mixtures(statistics[1200:]).log_density(targets[1200:, None])[:, 0].mean()
+    of_a_line = -0.5 * np.log(2.0 * np.pi * np.e * targets.var())
+    assert score > of_a_line + 0.6
+    trained = dict(network.stack.named_parameters())
+    assert "last" in trained
+    assert not {"first", "frequencies", "phases"} & set(trained)
+
+
+@pytest.mark.parametrize("option", ["random_features", "cross_correlation"])
+def test_what_is_the_papers_is_refused_without_it(option):
+    with pytest.raises(InputError, match="give --paper too"):
+        infer(None, None, InferOptions(**{option: True}))
