@@ -58,9 +58,8 @@ def check_named_files(robot: Path | None = None, model: Path | None = None, logs
     """
     if robot is not None:
         config = load_robot_config(robot)
-        path = getattr(config.task, "path", None)
-        if path is not None:
-            os.close(open_file(robot.parent / path, WAY_POINTS))
+        if config.task.file is not None:
+            os.close(open_file(robot.parent / config.task.file, WAY_POINTS))
         if model is None and config.model.file is not None:
             model = robot.parent / config.model.file
     if model is not None:

@@ -77,7 +77,7 @@ def test_armed_the_wheels_follow_and_the_samples_say_so(bench):
 
 TELLS = {
     "odrive-0.5": ("ODrive, firmware 0.5 (declared", {}),
-    "odrive": ("ODrive, firmware 0.6.11 (told", {}),
+    "odrive": ("ODrive, firmware 0.6.11 (reported", {}),
     "vesc": ("VESC (declared", {"command_timeout_s": "device"}),
     "agilex": ("AgileX base, CAN v2 (declared", {"command_timeout_s": "fixed"}),
     "ros2_base": ("ROS 2 base (declared", {}),
@@ -86,7 +86,7 @@ TELLS = {
 """By label, or else by driver: who it is, who says so, and which limits do not stand in robot.toml alone."""
 
 
-def test_it_says_who_it_is_and_of_each_limit_whether_it_was_told_or_declared(vendor, bench):
+def test_it_says_who_it_is_and_of_each_limit_whether_it_was_reported_or_declared(vendor, bench):
     bench.run_until(*STILL)
     identity, limits = bench.driver.identity, bench.driver.limits
     begin, others = TELLS.get(str(vendor)) or TELLS[vendor.name]
