@@ -27,10 +27,10 @@ QUIET_AT_END_S = 5.0
 
 def run_seed(seed: int, duration_s: float, cycle_us: int, planner: str) -> dict[str, Any]:
     """One run; returns its figures as plain data."""
-    from disco_hw.experiments.fault_run import ROBOT_FILE, FaultRun  # noqa: PLC0415
     from disco_hw.runtime.assembly import make_planner  # noqa: PLC0415 - in the worker, after its niceness is set
     from disco_hw.runtime.robot_setup import load_setup  # noqa: PLC0415
     from sim.fault_schedule import KINDS, random_schedule  # noqa: PLC0415
+    from tools.fault_run import ROBOT_FILE, FaultRun  # noqa: PLC0415
 
     kinds = tuple(name for name in KINDS if name not in KINDS_LEFT_OUT)
     schedule = random_schedule(seed, duration_s - QUIET_AT_END_S, kinds=kinds)

@@ -9,10 +9,10 @@ import numpy as np
 from disco_hw.drive.script import Script
 from disco_hw.log.drive import Commands, DriveLog, Gyro, Poses, Wheels, differentiate_angle
 from disco_hw.runtime.governor import Governor, WheelLimits
-from sim.drives import ScriptedDrive, make_drive
 from sim.effects import EFFECTS, HiddenEffects, hidden_effects
-from sim.log_csv import LogOptions, dirty_log_options, dirty_parameters, simulated_log, varied_parameters
 from sim.plant_parameters import PlantParameters
+from tools.simulated_drives import ScriptedDrive, make_drive
+from tools.simulated_log import LogOptions, dirty_log_options, dirty_parameters, simulated_log, varied_parameters
 
 # What a robot.toml sets if it says nothing else.
 LARGEST_RAD_S, LARGEST_RAD_S2 = 8.0, 20.0
@@ -66,7 +66,7 @@ def then_scripted(drive: ScriptedDrive, script: Script) -> ScriptedDrive:
 
 
 def as_drive(t_s: np.ndarray, cells: np.ndarray, ticks_per_rev: int) -> DriveLog:
-    """Rows of a log (N,), (N, 7) as a drive; the columns are those of `sim.log_csv` after the time."""
+    """Rows of a log (N,), (N, 7) as a drive; the columns are those of `tools.simulated_log` after the time."""
 
     def group(first: int, last: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         there = np.isfinite(cells[:, first])

@@ -19,10 +19,10 @@ from disco_hw.inference.infer import InferOptions, infer
 from disco_hw.inference.simulate import NAMES
 from disco_hw.log.drive import Commands, DriveLog, Gyro, Poses, Wheels
 from disco_hw.log.load import load_drive
-from sim.drives import make_drive
-from sim.log_csv import simulated_log, write_csv
 from sim.plant_parameters import PlantParameters
 from tools.foreign_plant import ForeignPlant, ForeignRobot
+from tools.simulated_drives import make_drive
+from tools.simulated_log import simulated_log, write_csv
 
 PLAUSIBLE = {"x_icr_m": (0.0, 0.3), "wheel_radius_m": (0.04, 0.10), "axial_distance_m": (0.2, 0.5)}
 LEVEL = 0.9

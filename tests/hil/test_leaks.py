@@ -12,12 +12,12 @@ from pathlib import Path
 
 import pytest
 
-from disco_hw.experiments.fault_run import FaultRun
 from drivers.transport import open_transport
 from drivers.types import LinkState
 from sim.fault_schedule import FaultSchedule
 from sim.hub import Hub
 from sim.serial_line import SerialLine
+from tools.fault_run import FaultRun
 
 pytestmark = pytest.mark.long
 

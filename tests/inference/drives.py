@@ -9,10 +9,10 @@ from tempfile import TemporaryDirectory
 from disco_hw.config import Prior, Robot, RobotConfig
 from disco_hw.log.drive import DriveLog
 from disco_hw.log.load import load_drive
-from sim.drives import make_drive
 from sim.effects import hidden_effects
-from sim.log_csv import simulated_log, write_csv
 from sim.plant_parameters import PlantParameters
+from tools.simulated_drives import make_drive
+from tools.simulated_log import simulated_log, write_csv
 
 TRUTH = {"x_icr_m": 0.12, "wheel_radius_m": 0.06, "axial_distance_m": 0.45}
 TICKS_PER_REV = 2048

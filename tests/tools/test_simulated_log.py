@@ -10,9 +10,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sim.drives import make_drive
 from sim.effects import EFFECTS, hidden_effects
-from sim.log_csv import (
+from sim.plant_parameters import PlantParameters
+from tools.simulated_drives import make_drive
+from tools.simulated_log import (
     COLUMNS,
     LogOptions,
     dirty_log_options,
@@ -22,7 +23,6 @@ from sim.log_csv import (
     varied_parameters,
     write_csv,
 )
-from sim.plant_parameters import PlantParameters
 
 IDEAL = PlantParameters().with_ideal_motors()
 EXACT = LogOptions(lateness_s=0.0, stamp_jitter_s=0.0)
@@ -174,7 +174,7 @@ def test_bad_input_is_one_line_and_exit_code_2(tmp_path, capsys, arguments, says
 
 def test_help_runs_as_a_module_and_lists_every_effect():
     done = subprocess.run(
-        [sys.executable, "-m", "sim.log_csv", "--help"], capture_output=True, text=True, timeout=60, check=True
+        [sys.executable, "-m", "tools.simulated_log", "--help"], capture_output=True, text=True, timeout=60, check=True
     )
     assert all(f"{name}=" in done.stdout for name in EFFECTS)
 

@@ -17,11 +17,11 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from sim.drives import DRIVES, ScriptedDrive, Vehicle, make_drive
 from sim.effects import HiddenEffects, effects_table, parse_hidden_effects
 from sim.plant import Plant
 from sim.plant_parameters import PlantParameters
 from sim.sensors import PoseMeasurement
+from tools.simulated_drives import DRIVES, ScriptedDrive, Vehicle, make_drive
 
 COLUMNS = (
     "t_s",
@@ -199,7 +199,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         drive = make_drive(options.drive, options.seed, Vehicle(options.max_wheel_speed))
         parameters = _parameters(options)
     except ValueError as error:
-        print(f"log_csv: {error}", file=sys.stderr)
+        print(f"simulated_log: {error}", file=sys.stderr)
         return 2
     log_options = dirty_log_options() if options.dirty else LogOptions()
     rows = simulated_log(drive, parameters, effects, options.seed, log_options)
@@ -208,7 +208,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if options.truth is not None:
             options.truth.write_text(_truth(parameters, effects), encoding="utf-8")
     except OSError as error:
-        print(f"log_csv: {error.filename}: cannot be written ({error.strerror}); give another path", file=sys.stderr)
+        print(
+            f"simulated_log: {error.filename}: cannot be written ({error.strerror}); give another path", file=sys.stderr
+        )
         return 2
     print(f"{options.output}: {len(rows)} rows, {drive.duration_s:.0f} s of {drive.name}")
     return 0
@@ -233,7 +235,7 @@ def _parameters(options: argparse.Namespace) -> PlantParameters:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="python -m sim.log_csv",
+        prog="python -m tools.simulated_log",
         description=(__doc__ or "").split("\n\n", maxsplit=1)[0],
         epilog=f"effects for --hide (NAME=VALUE or NAME=VALUE,VALUE):\n\n{effects_table()}",
         formatter_class=argparse.RawDescriptionHelpFormatter,

@@ -4,10 +4,10 @@ import dataclasses
 
 import pytest
 
-from disco_hw.experiments.wheel_monitor import WheelMonitor, crc8h2f, read_command
 from drivers.types import Frame
 from firmware_protocol.codec import Codec
 from firmware_protocol.firmware_core import FirmwareOutputs
+from tools.wheel_monitor import WheelMonitor, crc8h2f, read_command
 
 BASE = FirmwareOutputs(0.0, 0.0, True, False, False, "ARMED", 0, 7, "NONE", "NONE", 0, 10, 0, 0, 0)
 CODEC = Codec()

@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from sim.drives import DRIVES, UnknownDriveError, Vehicle, make_drive
+from tools.simulated_drives import DRIVES, UnknownDriveError, Vehicle, make_drive
 
 SEEDS = range(4)
 

@@ -19,7 +19,6 @@ from disco_hw.control import NoValidControl, PlannerState, Rollouts, WheelPlan
 from disco_hw.control.plan import Diagnostics
 from disco_hw.daemon.control_socket import counters
 from disco_hw.daemon.loop import LoopStats
-from disco_hw.experiments.wheel_monitor import WheelMonitor
 from disco_hw.log import records
 from disco_hw.log.recorder import RecorderStats
 from disco_hw.model import Belief
@@ -42,6 +41,7 @@ from sim.in_process import SimulatedCan
 from sim.plant import Plant, TrueState
 from sim.plant_parameters import PlantParameters
 from sim.virtual_robot import VirtualRobot
+from tools.wheel_monitor import WheelMonitor
 
 ROBOT_FILE = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
 SETTLED_S = 2.5
