@@ -34,7 +34,6 @@ from disco_hw.runtime.preflight import (
 from disco_hw.runtime.robot_setup import Setup, link_key, load_setup
 from disco_hw.runtime.states import connection
 from disco_hw.runtime.supervisor import FIND_HEADING
-from drivers import status_texts
 from drivers.motor import find_driver
 from drivers.types import (
     Driver,
@@ -50,6 +49,7 @@ from drivers.types import (
     SaysWhy,
     Transport,
 )
+from firmware_protocol import status_codes
 from firmware_protocol.codec import Codec, Decoded
 
 _LINK_TIMEOUT_S = 2.0
@@ -298,7 +298,7 @@ def _firmware_check(found: _Found, has_clock: bool) -> Check:
         return Check(name, Level.FAIL, f"{found.state.value}: {found.detail}")
     if found.reported and found.reported[-1].fault_code:
         return Check(
-            name, Level.FAIL, f"{found.state.value}: the robot reports {status_texts.fault(found.reported[-1].fault)}"
+            name, Level.FAIL, f"{found.state.value}: the robot reports {status_codes.fault(found.reported[-1].fault)}"
         )
     clock = f", clock {'synchronised' if found.clock_synchronised else 'NOT synchronised'}" if has_clock else ""
     return Check(name, Level.OK, f"{found.identity.in_words()}, {found.state.value}{clock}")
@@ -314,7 +314,7 @@ def _hearing_check(found: _Found) -> Check:
     if not rejected:
         return Check(name, Level.OK, "the robot rejects nothing")
     level = Level.FAIL if last.reject_reason == "AUTHENTICATION" else Level.WARNING
-    return Check(name, level, f"the robot rejected {rejected} frames: {status_texts.reject_reason(last.reject_reason)}")
+    return Check(name, level, f"the robot rejected {rejected} frames: {status_codes.reject_reason(last.reject_reason)}")
 
 
 def _telemetry_check(found: _Found) -> Check:

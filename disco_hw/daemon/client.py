@@ -22,9 +22,9 @@ from typing import Any
 from disco_hw.config import RobotConfig, load_daemon_address
 from disco_hw.errors import InputError, WorkError
 from disco_hw.runtime.states import advice, by_command, status_headline
-from drivers import status_texts
 from drivers.private_files import placed_by, user_name, why_not_private
 from drivers.types import SAID_BY_WORDS, SaidBy
+from firmware_protocol import status_codes
 
 REMEDY = "set daemon.control_socket to a path in a directory of your own"
 _ROOT = 0
@@ -247,7 +247,7 @@ def in_words(reply: dict[str, Any], robot: Path) -> str:
     lines = [
         ": ".join(status_headline(reply)),
         *(f"next: {sentence}" for sentence in advice(reply, by_command(robot))),
-        f"robot {reply['robot_state']}, link {reply['link']}, fault {status_texts.fault(reply['fault'])}",
+        f"robot {reply['robot_state']}, link {reply['link']}, fault {status_codes.fault(reply['fault'])}",
         *controller_in_words(reply.get("controller")),
         f"{' '.join(task['progress'])}, distance {task['distance_m'] * 1e3:.0f} mm, speed {task['speed_m_s']:.3f} m/s",
         f"loop lateness p99 {loop['lateness_us']['p99']:.0f} us, max {loop['lateness_us']['max']:.0f} us, "

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from drivers.types import DriverState, LinkState
-from firmware_protocol import faults
+from firmware_protocol import status_codes
 
 
 class State(enum.Enum):
@@ -194,7 +194,7 @@ def advice(status: Mapping[str, Any], ask: Ask = by_button) -> tuple[str, ...]:
 
 def fault_sentence(name: str) -> str:
     """Return what a fault is and what to do about it."""
-    todo = faults.advice(name) or "not known here: look it up where the robot's firmware comes from"
+    todo = status_codes.advice(name) or "not known here: look it up where the robot's firmware comes from"
     return f"{in_words(name)}. {todo[0].upper()}{todo[1:]}."
 
 

@@ -10,7 +10,6 @@ import secrets
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from drivers import status_texts
 from drivers.device_clock import DEVICE_CLOCK_MODULUS_US, DeviceClock
 from drivers.motor import reference_frames as telemetry
 from drivers.motor.reference_arming import MESSAGES as HANDSHAKE_MESSAGES
@@ -32,6 +31,7 @@ from drivers.types import (
     SafetyCard,
     WheelCommand,
 )
+from firmware_protocol import status_codes
 from firmware_protocol.codec import PROTOCOL_MAJOR, PROTOCOL_MINOR, Codec, Decoded
 from firmware_protocol.dbc import packaged_dbc
 
@@ -139,9 +139,9 @@ class ReferenceDriver:
             return self._handshake_detail()
         match state:
             case DriverState.FAULT:
-                return f"the robot reports {status_texts.fault(status.fault)}"
+                return f"the robot reports {status_codes.fault(status.fault)}"
             case DriverState.ESTOP:
-                return status_texts.estop(status.estop_source)
+                return status_codes.estop(status.estop_source)
             case DriverState.STOPPING if status.state == "ARMED":
                 return note or "the robot is armed, but not by us or no longer wanted: it is being stopped"
         return note or f"the robot is in {status.state}"
@@ -361,7 +361,7 @@ class ReferenceDriver:
         )
         before, self._status = self._status, status
         if before is None or (before.state, before.fault) != (status.state, status.fault):
-            fault = f", fault {status_texts.fault(status.fault)}" if status.fault_code else ""
+            fault = f", fault {status_codes.fault(status.fault)}" if status.fault_code else ""
             came_from = before.state if before is not None else "unknown"
             self._events.append(f"robot {came_from} -> {status.state}{fault}")
         self._arming.take_status(status.state, status.session, status.stop_cause, status.reject_reason)

@@ -7,8 +7,8 @@ from collections.abc import Callable
 
 import msgspec
 
-from drivers import status_texts
 from drivers.types import CyclicFrame, Identity, Limit, Limits, Request
+from firmware_protocol import status_codes
 from firmware_protocol.codec import Codec, Decoded
 from firmware_protocol.dbc import load_protocol
 from firmware_protocol.protection import COUNTER_MODULUS, challenge_answer
@@ -226,7 +226,7 @@ class Arming:
         if self.armed:
             self._was_armed = True
         elif self._was_armed or (self.wanted is Request.ARM and state in _LATCHED):
-            self.give_up(f"the robot disarmed itself: {status_texts.stop_cause(stop_cause)}" if self._was_armed else "")
+            self.give_up(f"the robot disarmed itself: {status_codes.stop_cause(stop_cause)}" if self._was_armed else "")
         if self.wanted is Request.RESET and before in _LATCHED and state not in _LATCHED:
             self._set_standby()
             self.note = ""
@@ -282,10 +282,10 @@ class Arming:
 
     def _why_not(self) -> str:
         if self._blockers:
-            reasons = ", ".join(status_texts.blocker(name) for name in self._blockers)
-            rejected = status_texts.reject_reason(self._reject_reason)
+            reasons = ", ".join(status_codes.blocker(name) for name in self._blockers)
+            rejected = status_codes.reject_reason(self._reject_reason)
             return f"{reasons} (last rejection: {rejected})" if rejected else reasons
-        return status_texts.reject_reason(self._reject_reason) or "the robot gave no reason"
+        return status_codes.reject_reason(self._reject_reason) or "the robot gave no reason"
 
 
 class Handshake:

@@ -16,7 +16,7 @@ from drivers.motor import make_driver
 from drivers.pose.robot import RobotPoses
 from drivers.transport import connect_pair
 from drivers.types import Frame, OutgoingFrame, PoseSample
-from firmware_protocol.faults import FAULTS
+from firmware_protocol.status_codes import FAULTS
 from tests.daemon.test_control_client import Daemon
 from tests.drivers.motor.reference_robot import CONFIG, ReferenceRobot
 from tests.robot import test_robot

@@ -8,9 +8,9 @@ import pytest
 from firmware_protocol import _firmware
 from firmware_protocol.build_firmware import PACKAGE
 from firmware_protocol.codec import PROTOCOL, Codec, EncodedFrame
-from firmware_protocol.faults import FAULTS
 from firmware_protocol.protection import Prover, challenge_answer, crc8
 from firmware_protocol.serial_framing import encode_frame
+from firmware_protocol.status_codes import FAULTS
 
 TEXT = (Path(PACKAGE) / "README.md").read_text("utf-8")
 CODEC = Codec()

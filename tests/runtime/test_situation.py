@@ -14,7 +14,7 @@ from disco_hw.runtime.states import (
     next_step,
 )
 from drivers.types import DriverState, LinkState
-from firmware_protocol.faults import FAULTS
+from firmware_protocol.status_codes import FAULTS
 
 STATUS = {"estop": False, "robot_state": "READY", "fault": "NONE", "state": "READY", "running": False}
 

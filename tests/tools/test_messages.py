@@ -3,7 +3,7 @@
 import pytest
 
 from disco_hw.runtime.states import TRANSITIONS
-from firmware_protocol import faults
+from firmware_protocol import status_codes
 from tools.messages import in_html, in_python, messages
 
 SOURCE = '''
@@ -53,7 +53,7 @@ def test_every_reason_of_a_transition_and_every_remedy_of_a_fault_is_on_the_list
     texts = {message.text for message in listed}
     assert {row.reason for row in TRANSITIONS if " " in row.reason} <= texts
     assert [text for text in texts if "release the robot's own button" in text]
-    assert any(message.file == faults.__name__.replace(".", "/") + ".py" for message in listed)
+    assert any(message.file == status_codes.__name__.replace(".", "/") + ".py" for message in listed)
 
 
 def test_no_refusal_speaks_of_what_only_its_programmers_know(listed):

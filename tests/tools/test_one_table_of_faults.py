@@ -2,11 +2,11 @@
 
 from pathlib import Path
 
-from firmware_protocol.faults import FAULTS
+from firmware_protocol.status_codes import FAULTS
 
 ROOT = Path(__file__).parents[2]
 # Where the table stands, and the page on which it is printed, equal to it by test_readme.py.
-HOMES = {"firmware_protocol/faults.py", "firmware_protocol/README.md"}
+HOMES = {"firmware_protocol/status_codes.py", "firmware_protocol/README.md"}
 
 
 def test_no_other_file_holds_a_remedy_or_lists_the_faults():

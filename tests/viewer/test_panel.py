@@ -19,7 +19,7 @@ from disco_hw.viewer.panel import (
 from disco_hw.viewer.snapshot import snapshot_at
 from disco_hw.viewer.timeline import Timeline
 from drivers.types import RobotStatus
-from firmware_protocol.faults import advice
+from firmware_protocol.status_codes import advice
 from tools.viewer_run import PERIOD_NS, START_NS, plan_at
 
 RECORDED = RecorderStats(ticks=90, dropped_ticks=10, delivered_ticks=80, waiting_ticks=7, lost_ticks=3, path="run.mcap")

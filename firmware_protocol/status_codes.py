@@ -1,8 +1,10 @@
-"""Every fault that a controller can report: its code and name, whether it latches, and what a person does about it.
+"""What the codes in a robot's status mean and what to do about each: faults, causes of a stop, refusals, e-stops.
 
-Codes and names are the DBC's value table, and how a fault ends is a bit of its code; the remedies stand here alone. The
-page, `ctl`, `check`, the log's events and the table in README.md take their words from this table.
+Codes and names are the DBC's value tables, and how a fault ends is a bit of its code; the remedies stand here alone.
+The page, `ctl`, `check`, the log's events and the table in README.md take their words from this file.
 """
+
+from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -36,6 +38,47 @@ _REMEDIES: Mapping[str, str] = {
     "WATCHDOG_RESET": "the controller hung and restarted: look for the cause in its firmware",
     "BROWN_OUT_RESET": "the controller lost its supply and restarted: check battery, fuse and wiring",
     "SELF_TEST_FAILED": "the controller failed its own test: if it does so again, do not drive, replace it",
+}
+_STOP_CAUSES: Mapping[str, str] = {
+    "REQUESTED": "it was asked to",
+    "COMMAND_TIMEOUT": "no wheel command arrived in time; the link or this host was too slow",
+    "COMMAND_EXPIRED": "the last wheel command had expired; the link or this host was too slow",
+    "E2E_DISQUALIFIED": "too many damaged or repeated frames from this host; check the link",
+    "HOST_FAULT": "this host reported a fault",
+    "HOST_SILENT": "this host was silent; check the link",
+    "FAULT": "it has a fault",
+    "ESTOP": "emergency stop",
+    "SESSION_CHANGED": "another session was opened; is a second host connected?",
+}
+_REJECT_REASONS: Mapping[str, str] = {
+    "LENGTH": "a frame had the wrong length",
+    "CRC": "a frame's checksum was wrong",
+    "REPEATED": "a frame was repeated; is a second host connected?",
+    "SEQUENCE": "frames were lost or out of order",
+    "NOT_QUALIFIED": "it has not yet seen enough good frames in a row",
+    "SESSION": "a command was of another session; is a second host connected?",
+    "STATE": "a command came in a state that takes none",
+    "MODE": "a command had a mode that does not exist",
+    "VALIDITY": "a command was valid for no time at all",
+    "NONZERO_BEFORE_ARMED": "a command asked for motion before arming; is a second host connected?",
+    "CHALLENGE": "the answer to its challenge was wrong; do both ends use the same DBC?",
+    "HANDSHAKE": "the handshake was refused; do both ends use the same DBC?",
+    "AUTHENTICATION": "a command was not proved with the robot's key; is it the same in link.key_file?",
+}
+_BLOCKERS: Mapping[str, str] = {
+    "FAULT": "it has a fault",
+    "ESTOP": "emergency stop",
+    "WHEELS_MOVING": "the wheels are turning",
+    "HANDSHAKE": "the handshake is not complete",
+    "HOST_STATE": "it does not trust this host's frames yet",
+    "SESSION": "the session is not a new one",
+    "CHALLENGE": "its challenge is not answered yet",
+    "ZERO_COMMANDS": "it has not yet seen enough zero commands in a row",
+}
+_ESTOP_SOURCES: Mapping[str, str] = {
+    "FRAME": "emergency stop by a frame on the link; reset when it is safe",
+    "BUTTON": "emergency stop button pressed; release it, then reset",
+    "LINE": "emergency stop line open; close it, then reset",
 }
 
 
@@ -84,3 +127,29 @@ def advice(name: str) -> str:
     """Return what to do about a fault; empty for one that this version does not know, and for none."""
     fault = FAULTS.get(name)
     return "" if fault is None else fault.advice
+
+
+def fault(name: str) -> str:
+    """A fault of SYSTEM_STATE.fault and what to do about it; the name alone for one that this version does not know."""
+    todo = advice(name)
+    return f"{name}: {todo}" if todo else name
+
+
+def stop_cause(name: str) -> str:
+    """Why the robot stopped by itself, by the name in SYSTEM_STATE.stop_cause."""
+    return _STOP_CAUSES.get(name, name)
+
+
+def reject_reason(name: str) -> str | None:
+    """Why the robot last rejected a frame, by the name in SYSTEM_STATE.reject_reason; None if it never did."""
+    return None if name == "NONE" else _REJECT_REASONS.get(name, name)
+
+
+def blocker(name: str) -> str:
+    """What keeps the robot from the next step towards motion, by a name in SESSION_STATE.blockers."""
+    return _BLOCKERS.get(name, name)
+
+
+def estop(source: str) -> str:
+    """Who stopped the robot, by the name in SYSTEM_STATE.estop_source, and what to do about it."""
+    return _ESTOP_SOURCES.get(source, "emergency stop; reset when it is safe")

@@ -1,6 +1,6 @@
 import pytest
 
-from drivers import status_texts
+from firmware_protocol import status_codes
 from firmware_protocol.codec import PROTOCOL
 
 
@@ -13,11 +13,11 @@ def table(message, signal):
 @pytest.mark.parametrize(
     ("message", "signal", "say"),
     [
-        ("SYSTEM_STATE", "fault", status_texts.fault),
-        ("SYSTEM_STATE", "stop_cause", status_texts.stop_cause),
-        ("SYSTEM_STATE", "reject_reason", status_texts.reject_reason),
-        ("SYSTEM_STATE", "estop_source", status_texts.estop),
-        ("SESSION_STATE", "blockers", status_texts.blocker),
+        ("SYSTEM_STATE", "fault", status_codes.fault),
+        ("SYSTEM_STATE", "stop_cause", status_codes.stop_cause),
+        ("SYSTEM_STATE", "reject_reason", status_codes.reject_reason),
+        ("SYSTEM_STATE", "estop_source", status_codes.estop),
+        ("SESSION_STATE", "blockers", status_codes.blocker),
     ],
 )
 def test_every_code_of_the_dbc_has_a_sentence(message, signal, say):
@@ -30,7 +30,7 @@ def test_every_code_of_the_dbc_has_a_sentence(message, signal, say):
 
 
 def test_a_code_of_a_newer_firmware_is_shown_as_it_is():
-    assert status_texts.fault("UNKNOWN(12345)") == "UNKNOWN(12345)"
-    assert status_texts.stop_cause("UNKNOWN(15)") == "UNKNOWN(15)"
-    assert status_texts.reject_reason("NONE") is None
-    assert "reset" in status_texts.estop("UNKNOWN(9)")
+    assert status_codes.fault("UNKNOWN(12345)") == "UNKNOWN(12345)"
+    assert status_codes.stop_cause("UNKNOWN(15)") == "UNKNOWN(15)"
+    assert status_codes.reject_reason("NONE") is None
+    assert "reset" in status_codes.estop("UNKNOWN(9)")

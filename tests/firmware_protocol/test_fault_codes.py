@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import pytest
 
-from drivers import status_texts
-from firmware_protocol.faults import _REMEDIES, FAULTS, advice
+from firmware_protocol import status_codes
 from firmware_protocol.firmware_core import ResetCause
+from firmware_protocol.status_codes import _REMEDIES, FAULTS, advice
 from tests.firmware_protocol.bench import CODEC, CONFIG, MS, Bench
 
 SIDES = {"LEFT": 0, "RIGHT": 1}
@@ -141,4 +141,4 @@ def test_what_ends_a_fault_is_said_with_the_remedy():
     assert FAULTS["SELF_TEST_FAILED"].advice.endswith("; then restart the controller")
     assert not any(word in fault.remedy for fault in FAULTS.values() for word in ("reset", "clear"))
     assert advice("NONE") == advice("NO_SUCH_FAULT") == ""
-    assert status_texts.fault("BUS_OFF") == f"BUS_OFF: {FAULTS['BUS_OFF'].advice}"
+    assert status_codes.fault("BUS_OFF") == f"BUS_OFF: {FAULTS['BUS_OFF'].advice}"
