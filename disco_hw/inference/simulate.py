@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from disco_hw.errors import InputError, WorkError
 from disco_hw.inference.excitation import Excitation, Noise
 from disco_hw.jit import parallel_kernel
+from disco_hw.model.coefficients import base_point, effect_point
 from disco_hw.model.model import BASE_PARAMETERS, Model, coefficient_tables
 from disco_hw.model.step import axle_of, integration_from, integration_series, step, tracked_of
-from disco_hw.model.tables import base_point, effect_point
 
 Array = NDArray[np.float64]
 Seeds = NDArray[np.uint32]

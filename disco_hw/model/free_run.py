@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 
 from disco_hw.effects.registry import DELAY
 from disco_hw.jit import compiled_for, kernel_function
-from disco_hw.model.coefficients import Base, Coefficients
+from disco_hw.model.coefficients import Base, Coefficients, base_point, effect_point
 from disco_hw.model.model import Model, coefficient_tables
 from disco_hw.model.step import axle_of, delay_steps, in_force, integration_from, integration_series, step, tracked_of
-from disco_hw.model.tables import base_point, effect_point
 
 Array = NDArray[np.float64]
 

@@ -20,11 +20,10 @@ from numpy.typing import NDArray
 from disco_hw.effects.effect import Channel, Effect, Parameter, Stage
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.jit import cast_like, scalar_function, specialise
-from disco_hw.model.coefficients import Base, TermCoefficients
+from disco_hw.model.coefficients import Base, TermCoefficients, Terms
 
 Array = NDArray[np.float64]
 Feature = Callable[..., Any]
-Terms = tuple[TermCoefficients, ...]
 
 COMMAND = "command"
 BODY_TARGETS = ("v_x", "v_y", "omega")
@@ -203,25 +202,6 @@ def table_entry(name: str, columns: tuple[NDArray[np.floating], ...]) -> TermCoe
     return made
 
 
-def terms_point(terms: Terms | None, i: int) -> Terms | None:
-    """Coefficients of all terms at point i; None if there are none."""
-    if terms is None:
-        return None
-    kinds: list[Any] = [type(term) for term in terms]
-    return tuple(kind(term.k[i], term.per_s[i]) for kind, term in zip(kinds, terms, strict=True))
-
-
-# What is overloaded is chosen by numba's types; those of tuples have fields that its annotations do not know.
-@specialise(terms_point)
-def _terms_point(terms: Any, i: types.Type) -> Callable[..., Any]:
-    if isinstance(terms, types.NoneType):
-        return lambda terms, i: None
-    kinds = [kind.instance_class for kind in terms.types]
-    scope = {kind.__name__: kind for kind in kinds}
-    parts = "".join(f"{kind.__name__}(terms[{n}].k[i], terms[{n}].per_s[i]), " for n, kind in enumerate(kinds))
-    return _made("terms_point", "terms, i", [f"return ({parts})"], scope)
-
-
 def add_to_commands(left: float, right: float, time_s: float, terms: Terms | None) -> tuple[float, float]:
     """Both commands (rad/s) with the terms that act on them."""
     if terms is None:
@@ -234,6 +214,7 @@ def add_to_commands(left: float, right: float, time_s: float, terms: Terms | Non
     return new_left, new_right
 
 
+# What is overloaded is chosen by numba's types; those of tuples have fields that its annotations do not know.
 @specialise(add_to_commands)
 def _add_to_commands(left: types.Type, right: types.Type, time_s: types.Type, terms: Any) -> Callable[..., Any]:
     if isinstance(terms, types.NoneType):

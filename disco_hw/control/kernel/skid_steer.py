@@ -46,7 +46,15 @@ from disco_hw.control.kernel.layout import (
 )
 from disco_hw.control.kernel.task_costs import follow, looks_up, row_of, stage_cost, terminal_cost
 from disco_hw.jit import bits_of_float, block_function, cast_like, float_from_bits, scalar_function, tune_loops
-from disco_hw.model.coefficients import Base, Coefficients, Integration
+from disco_hw.model.coefficients import (
+    Base,
+    Coefficients,
+    Integration,
+    base_point,
+    effect_point,
+    lane_base,
+    lane_effects,
+)
 from disco_hw.model.disturbance import MOVES_RAD_S
 from disco_hw.model.step import (
     axle_of,
@@ -59,7 +67,6 @@ from disco_hw.model.step import (
     wheel_step,
     wheels_follow,
 )
-from disco_hw.model.tables import base_point, effect_point, lane_base, lane_effects
 from disco_hw.tasks.cost import Found, constant
 
 Absent: TypeAlias = bool | None
