@@ -189,10 +189,10 @@ class VendorRobot:
         self.plant.kidnap(dx_m, dy_m, dyaw_rad)
 
     def jump_clock(self, step_us: int) -> None:
-        """Nothing: these controllers tell no time."""
+        """Nothing: these controllers send no time."""
 
     def reboot(self, cause: ResetCause = ResetCause.POWER_ON) -> None:
-        """Restart the controller: it forgets everything, and the wheels roll until it is told again."""
+        """Restart the controller: it forgets everything, and the wheels roll until the next command."""
         self.controller.restart()
 
     def _setpoints(self, wanted: tuple[float | None, float | None]) -> tuple[float, float]:

@@ -169,7 +169,7 @@ def _live() -> dict[str, float]:
                 stack.start()
                 time.sleep(LIVE_S)
                 loop = stack.operator.status()["loop"]
-                stack.operator.tell("quit")
+                stack.operator.request("quit")
         for figure in ("p50", "p99", "p999", "max"):
             figures[f"adapt.loop_{name}.lateness_{figure}_us"] = loop["lateness_us"][figure]
             figures[f"adapt.loop_{name}.duration_{figure}_us"] = loop["duration_us"][figure]

@@ -76,9 +76,9 @@ def circling(directory: Path, bridged: bool = True) -> Iterator[tuple[int, int]]
                 stack.callback(child.kill)
         operator = Operator(directory / "control.sock", children)
         operator.wait_until("ready, with poses", lambda s: s["state"] == "READY" and s["pose_ok"], READY_TIMEOUT_S)
-        operator.tell("arm")
+        operator.request("arm")
         operator.wait_for("ARMED", 5.0)
-        operator.tell("start")
+        operator.request("start")
         time.sleep(SETTLED_S)
         yield children[1].process.pid, time.monotonic_ns()
 

@@ -46,9 +46,9 @@ def _drive(directory: Path, link: str, seconds: float) -> None:
     ):
         operator = Operator(directory / "control.sock", (robot, host))
         operator.wait_for("READY", READY_TIMEOUT_S)
-        operator.tell("arm")
+        operator.request("arm")
         operator.wait_for("ARMED", 5.0)
-        operator.tell("start")
+        operator.request("start")
         time.sleep(SETTLED_S + seconds)
 
 

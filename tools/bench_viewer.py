@@ -282,7 +282,7 @@ def _live(directory: Path) -> dict[str, float]:
             figures["viewer.bus_to_browser_ms_p50"] = float(np.quantile(drawn_ms, 0.5))
             figures["viewer.bus_to_browser_ms_p99"] = float(np.quantile(drawn_ms, 0.99))
             figures["viewer.bus_to_browser_frames"] = len(drawn_ms)
-        stack.operator.tell("quit")
+        stack.operator.request("quit")
         stack.daemon.process.wait(10.0)
     figures["viewer.page_cpu_percent"] = float(np.median(cpu_percent))
     figures["viewer.sample_to_page_ms_p50"] = float(np.quantile(ages_ms, 0.5))

@@ -114,7 +114,7 @@ class Truth:
 class Bench:
     """The test bench's line: what truly happens, 100 times a second, and what a person could do to the board.
 
-    `rows` is what it told so far. A thread reads it: a line that nobody reads holds up the board.
+    `rows` is what it printed so far. A thread reads it: a line that nobody reads holds up the board.
     """
 
     def __init__(self, path: Path) -> None:
@@ -138,7 +138,7 @@ class Bench:
         seen, deadline = len(self.rows), time.monotonic() + within_s
         while len(self.rows) <= seen:
             if time.monotonic() > deadline:
-                raise TimeoutError("the bench tells nothing")
+                raise TimeoutError("the bench prints nothing")
             time.sleep(0.005)
         return self.rows[-1]
 
@@ -218,7 +218,7 @@ def running_board(
         try:
             port = _ports_of(process, 1)[0] if terminal else f"unix://{link}"
             with contextlib.closing(Bench(bench)) as test_bench:
-                # When it tells something, all its threads are there.
+                # When it prints something, all its threads are there.
                 test_bench.latest(_START_S)
                 _prefer(process.pid)
                 yield Board(port, test_bench, process)
@@ -248,7 +248,7 @@ def running_bare_board(image: Path, processor: str) -> Iterator[tuple[str, str]]
 def run_fast(image: Path, processor: str, folder: Path, seconds: float, first_us: int = 0) -> tuple[bytes, list[Truth]]:
     """Let a board run as fast as the computer can for so many seconds of its own clock, which counts instructions.
 
-    Returns what it sent over its serial line, and what its bench told.
+    Returns what it sent over its serial line, and what its bench printed.
     """
     line, bench = folder / "line", folder / "bench"
     command = _command(image, processor, _settings(1, first_us, b""), f"file:{line}", f"file:{bench}")

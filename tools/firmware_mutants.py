@@ -3,7 +3,7 @@
     python -m tools.firmware_mutants [--only FILE.c ...] [--jobs 2] [--report FILE]
 
 A mutant that compiles to the same machine code as the original is none. One that passes the tests is run under the
-sanitizers too. Those that cannot be told from the original
+sanitizers too. Those that cannot be distinguished from the original
 by any frame or setpoint are in firmware_equivalents.toml, each with its reason. Exits 1 if any other survives.
 """
 

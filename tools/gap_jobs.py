@@ -112,7 +112,7 @@ class Result:
 
 
 def jobs(kind: str, seeds: Iterable[int]) -> Iterator[Job]:
-    """Logs of one kind, seed by seed, so that a study that is broken off has seen every effect alike."""
+    """Logs of one kind, seed by seed, so that a study that is broken off has seen every effect equally often."""
     for seed in seeds:
         if kind in ("none", "dirty"):
             yield Job(kind, {}, seed)

@@ -101,7 +101,7 @@ def write_log(path, ticks, **changes):
 
 
 def bits(value):
-    """A value with its floats replaced by their bits; every NaN is alike."""
+    """A value with its floats replaced by their bits; every NaN is the same."""
     if isinstance(value, float):
         return "nan" if math.isnan(value) else struct.pack("<d", value)
     if isinstance(value, list | tuple):

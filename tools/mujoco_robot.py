@@ -203,7 +203,7 @@ def _round(rng: np.random.Generator) -> list[tuple[float, float, float]]:
 
 
 def _slow(rng: np.random.Generator, shape: tuple[int, ...], samples: float) -> Array:
-    """Noise of unit variance that stays alike for about so many samples."""
+    """Noise of unit variance that stays the same for about so many samples."""
     white = rng.standard_normal(shape)
     keep = 1.0 - 1.0 / samples
     for k in range(1, shape[0]):

@@ -164,9 +164,9 @@ def one(operator: Operator, parts: Parts, fault: str, wait_s: float) -> tuple[fl
     if status["running"]:
         return 0.0, "it began to drive by itself"
     if status["state"] == "READY":
-        operator.tell("arm")
+        operator.request("arm")
         operator.wait_for("ARMED", 5.0)
-    operator.tell("start")
+    operator.request("start")
     operator.wait_until("moving", lambda now: not stands(now), 10.0)
     time.sleep(wait_s)
     status = operator.status()
@@ -177,7 +177,7 @@ def one(operator: Operator, parts: Parts, fault: str, wait_s: float) -> tuple[fl
     if fault == "flood":
         time.sleep(FLOOD_S)
         running = operator.status()["running"]
-        operator.tell("stop")
+        operator.request("stop")
         return 0.0, "" if running else "a flood stopped it"
     operator.wait_until("standing", lambda now: stands(now) and not now["running"], 10.0)
     return time.monotonic() - struck_s, ""

@@ -108,11 +108,11 @@ def _start_again(operator: Operator, state: str) -> None:
     try:
         match state:
             case "READY":
-                operator.tell("arm")
+                operator.request("arm")
             case "FAULT":
-                operator.tell("reset")
+                operator.request("reset")
             case "ARMED":
-                operator.tell("start")
+                operator.request("start")
     except WorkError as error:
         print(error, file=sys.stderr)
 

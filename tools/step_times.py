@@ -35,7 +35,7 @@ def undisturbed() -> Iterator[bool]:
 
 
 def times_ms(call: Callable[[int], object], count: int, left_out: int = 20) -> np.ndarray:
-    """Milliseconds that each of `count` calls takes, after `left_out` more; a call is told its number."""
+    """Milliseconds that each of `count` calls takes, after `left_out` more; a call is given its number."""
     taken_ns = np.empty(count + left_out)
     for number in range(count + left_out):
         if number % IN_A_ROW == IN_A_ROW - 1:

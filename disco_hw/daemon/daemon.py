@@ -70,7 +70,7 @@ class Daemon:
         self._told_ready = False
 
     def run(self) -> int:
-        """Run the loop until told to stop; returns the exit code. An exception is reported and ends it."""
+        """Run the loop until asked to stop; returns the exit code. An exception is reported and ends it."""
         try:
             self._loop.run(self._tick, lambda: self._quit or self._signals.received is not None or self._pilot.done)
         except Exception as error:
@@ -97,7 +97,7 @@ class Daemon:
             try:
                 tick = self._core.tick(now_ns, requests)
             except Exception:
-                # Even where the tick itself fails while stopping, the robot is told to stop before that is passed on.
+                # Even where the tick itself fails while stopping, a stop is sent to the robot before that is passed on.
                 self._send_stop()
                 raise
             requests = ()

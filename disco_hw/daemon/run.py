@@ -88,8 +88,8 @@ def run_robot(
     """Run the daemon of `disco-hw run` with a control law of your own in DISCO's place; returns the exit code.
 
     `law(state, task, model)` gives wheel speeds, left and right (rad/s), once a control period; the other arguments are
-    those of `disco-hw run`. Returns after Ctrl-C, SIGTERM or `disco-hw ctl ROBOT.toml quit`, with the robot told to
-    stop. Call it in the main thread, as it catches signals. Raises InputError.
+    those of `disco-hw run`. Returns after Ctrl-C, SIGTERM or `disco-hw ctl ROBOT.toml quit`, after a stop was
+    sent to the robot. Call it in the main thread, as it catches signals. Raises InputError.
     """
     processes.spare_memory()
     options = DaemonOptions(
@@ -103,7 +103,7 @@ def run_daemon(
     make_pilot: Callable[[RobotConfig], Pilot] = lambda _config: TaskPilot(),
     law: Law | None = None,
 ) -> int:
-    """Run until SIGTERM, SIGINT or a quit request; returns the exit code, with the robot told to stop.
+    """Run until SIGTERM, SIGINT or a quit request; returns the exit code, after a stop was sent to the robot.
 
     `make_pilot`: of who drives; the task alone, unless it is said. `law`: plans in DISCO's place.
     Raises InputError, before anything is opened, if a file or an option is wrong. An exception in the loop is reported,

@@ -1,6 +1,6 @@
 """What a drive has excited so far, and what is still missing for inference and the search for gaps; pure.
 
-The list is what separates pairs of parameters and effects that look alike otherwise: both turning directions, two
+The list is what separates pairs of parameters and effects that look the same otherwise: both turning directions, two
 speeds, backwards, starts and stops, steering, slow ramps through zero, rests.
 """
 

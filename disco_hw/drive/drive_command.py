@@ -108,12 +108,12 @@ def run_drive(options: DriveOptions) -> DriveResult:
         lost: list[str] = []
         with _display(socket_path(config), shown=not options.as_json) as say:
 
-            def tell(topic: str, text: str) -> None:
+            def report(topic: str, text: str) -> None:
                 if topic == "recording":
                     lost.append(text)
                 say(topic, text)
 
-            serve(setup, log_file, tell, HandPilot(source, coverage, page))
+            serve(setup, log_file, report, HandPilot(source, coverage, page))
     finally:
         source.close()
     return DriveResult(

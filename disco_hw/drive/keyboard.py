@@ -27,7 +27,7 @@ from disco_hw.errors import InputError
 _FIRST_REPEAT_NS = 1_000_000_000
 # Shorter than this between two holds may be a stutter of the connection, and must not arm again.
 _RELEASE_NS = 500_000_000
-# Repeats of a key that does not count, after which its person is told.
+# Repeats of a key that does not count, after which the operator is warned.
 _VAIN_EVENTS = 10
 # No hand and no terminal repeats faster; pasted text does.
 _SHORTEST_REPEAT_NS = 10_000_000

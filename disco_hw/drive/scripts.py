@@ -2,7 +2,7 @@
 
 `circle` is the paper's drive. `steps` follows the protocol of norlab-ulaval's DRIVE: find the wheels' limits, then hold
 wheel speeds drawn evenly within them, 6 s each. `excite` takes two minutes to show what inference and the search for
-gaps need to tell parameters and effects from each other. The others show in at most a minute
+gaps need to distinguish parameters and effects. The others show in at most a minute
 what another drive could not: each effect of the model names the one for it, and `separate` is all of them in one.
 Their shares are of the largest wheel speed: (forward, turn to the left).
 """
@@ -163,7 +163,7 @@ def circle(robot: Robot, task: CircleTask, top_rad_s: float) -> Script:
             "drive.speed_share"
         )
     laps_s = _LAPS * 2.0 * math.pi / yaw_rate_rad_s
-    purpose = "the paper's drive; cannot tell the wheel radius from slip, nor left from right"
+    purpose = "the paper's drive; cannot distinguish the wheel radius from slip, nor left from right"
     return Script("circle", (rest(1.0), Manoeuvre("circle to the left", purpose, laps_s, _held(left, right)), rest()))
 
 
@@ -194,7 +194,7 @@ def steps(top_rad_s: float, seed: int, settling_s: float = 0.0, count: int = STE
 
 
 def excite(top_rad_s: float) -> Script:
-    """A short drive after which nearly all parameters and effects can be told apart; it ends near its start.
+    """A short drive after which nearly all parameters and effects can be distinguished; it ends near its start.
 
     Shares below are of `top_rad_s`: (forward, turn to the left).
     """
@@ -210,7 +210,7 @@ def excite(top_rad_s: float) -> Script:
         ("fast reverse", -0.95, 3.0),
     ):
         found += [hold(name, radius, duration_s, forward, 0.0), rest()]
-    axle = "axial distance; two rates tell it from slip in turns, both ways tell latency from a heading bias"
+    axle = "axial distance; two rates separate it from slip in turns, both ways separate latency from a heading bias"
     for name, turn, duration_s in (
         ("slow turn left", 0.3, 5.0),
         ("slow turn right", -0.3, 5.0),

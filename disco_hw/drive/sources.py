@@ -244,7 +244,7 @@ class PageSource:
         if newest is not None and now_ns - newest.t_ns <= self._limit_ns:
             return newest
         if self._holder is not None:
-            # Told once with its age, so that the stop has its reason; the next hold begins with an open pad.
+            # Reported once with its age, so that the stop has its reason; the next hold begins with an open pad.
             self._holder, self._newest = None, None
             self._open_ns.clear()
             return newest

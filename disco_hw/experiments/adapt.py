@@ -345,7 +345,7 @@ def drive_through_change(directory: Path, changes: str, *, adapt: bool) -> LiveD
         first_s = first_truth_s(directory / "truth.csv")
         end_s = first_s + CHANGE_S + SETTLED_S + COMPARED_S
         status = stack.operator.wait_until("the end", lambda s: newest_truth_s(directory / "truth.csv") > end_s, 200.0)
-        stack.operator.tell("quit")
+        stack.operator.request("quit")
         assert stack.daemon.process.wait(10.0) == 0
     table = np.genfromtxt(directory / "truth.csv", delimiter=",", skip_header=1, usecols=(0, 1, 2, 8))
     t_s = table[:, 0] * 1e-9 - first_s - CHANGE_S

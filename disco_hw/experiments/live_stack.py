@@ -89,8 +89,8 @@ class Operator:
         self._check_alive()
         return send_request(self._socket, {"do": "status"}, timeout_s=2.0)
 
-    def tell(self, what: str) -> None:
-        """Have the daemon do something; raises WorkError in its words if it refuses."""
+    def request(self, what: str) -> None:
+        """Send one request such as "arm"; raises WorkError with the daemon's reason if it refuses."""
         reply = send_request(self._socket, {"do": what}, timeout_s=2.0)
         if not reply.get("ok"):
             raise WorkError(f"the daemon refused to {what}: {reply.get('error')}")
@@ -195,9 +195,9 @@ class Stack:
     def start(self) -> None:
         """Arm and start the task."""
         self.operator.wait_for("READY", READY_TIMEOUT_S)
-        self.operator.tell("arm")
+        self.operator.request("arm")
         self.operator.wait_for("ARMED", 5.0)
-        self.operator.tell("start")
+        self.operator.request("start")
 
     def inject(self, command: str) -> str:
         """Do something to the robot or its link; returns the simulator's answer."""

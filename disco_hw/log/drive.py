@@ -73,8 +73,8 @@ class Gyro:
 class DriveLog:
     """One or several drives; what was not measured has arrays of length 0.
 
-    Times start near 0 and increase within each array. Nothing may be predicted across a change of `segment`, which is
-    numbered alike in all arrays. `notes` say what was ignored or filled in, for a person. `begins_s`: when each of
+    Times start near 0 and increase within each array. Nothing may be predicted across a change of `segment`, which has
+    the same numbers in all arrays. `notes` say what was ignored or filled in, for a person. `begins_s`: when each of
     several drives begins.
     """
 

@@ -174,7 +174,7 @@ def load_drive(
     ticks_per_rev: float | None = None,
     wheel_radius_m: float | None = None,
 ) -> DriveLog:
-    """One log or several as one drive: our MCAP logs and CSV files, told apart by their content.
+    """One log or several as one drive: our MCAP logs and CSV files, recognised by their content.
 
     `ticks_per_rev` and the nominal `wheel_radius_m` come from robot.toml and serve CSV files only. Raises LogError with
     one line for the first file that cannot be used, or that is there already.

@@ -153,8 +153,8 @@ class Event(msgspec.Struct, frozen=True, gc=False):
 class Counters(msgspec.Struct, frozen=True, gc=False):
     """Every counter of the stack, about once a second: totals since the start by name, grouped by who counts.
 
-    `entered`: how often the daemon has come into each of its states. `plausibility`: what the robot did although it was
-    told otherwise, and the rest of the stack tolerated. `poses`: of each source, where there are several.
+    `entered`: how often the daemon has come into each of its states. `plausibility`: what the robot did against its
+    commands, and the rest of the stack tolerated. `poses`: of each source, where there are several.
     """
 
     t_ns: int

@@ -48,8 +48,8 @@ def simulate(model: Model, commands: Array, step_s: float = 0.02, start: Array |
     """Where a model's point values lead: states (N + 1, 5) x, y (m), yaw (rad, not wrapped), wheel speeds (rad/s).
 
     `commands` (N, 2): wheel speeds wanted, left and right (rad/s), each held for `step_s`; before them the wheels were
-    told to stand. `start` (5,): the first state, the origin at rest if None. Raises ValueError for other shapes and for
-    what is not finite.
+    commanded to stand. `start` (5,): the first state, the origin at rest if None. Raises ValueError for other
+    shapes and for what is not finite.
     """
     wanted = np.asarray(commands, dtype=np.float64)
     begin = np.zeros(5) if start is None else np.asarray(start, dtype=np.float64)

@@ -46,12 +46,12 @@ def _per_100(t: float) -> float:
     return cast_like(0.01, t) * t
 
 
-# Written for scalars and arrays alike; in compiled code, where these stand for themselves.
+# Written for scalars and arrays; in compiled code, where these stand for themselves.
 for _shared in (_sign, _soft, _per_100):
     specialise(_shared)(lambda *_, shared=_shared: shared)
 
 
-# Of a wheel's command u and that of the other wheel (rad/s), at a time t (s). Written for scalars and arrays alike.
+# Of a wheel's command u and that of the other wheel (rad/s), at a time t (s). Written for scalars and arrays.
 COMMAND_FEATURES: Mapping[str, Feature] = MappingProxyType(
     {
         "u |u|": lambda u, other, t: u * abs(u),

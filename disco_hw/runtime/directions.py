@@ -25,7 +25,7 @@ _OPPOSITE_PART = 0.25
 _CROSSED_COSINE, _STRAIGHT_COSINE = 0.97, 0.93
 _SLIP_PART = 0.15
 _UNKNOWN_PART = 0.2
-"""Of the way: a radius that is written down wrongly and slip that lasts, which every pose shows alike."""
+"""Of the way: a radius that is written down wrongly and slip that lasts, which every pose shows equally."""
 _ENOUGH, _MOST_OF_ONE = 10.0, 4.0
 """Of log-likelihood against what robot.toml says, in all and by one pose."""
 _LARGEST_TURN_RAD = 1.5

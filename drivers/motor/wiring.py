@@ -1,6 +1,6 @@
 """How the wheels are wired to the controller's two sides, where that is not as the controller believes.
 
-For every driver alike: what its own fields in [link], or the controller's settings, have right needs nothing here.
+For every driver: what its own fields in [link], or the controller's settings, have right needs nothing here.
 """
 
 from __future__ import annotations

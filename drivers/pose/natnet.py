@@ -183,8 +183,8 @@ def make_pose_source(
 class NatNetPoses:
     """Satisfies `drivers.types.PoseSource` and `drivers.types.SaysWhy`.
 
-    With a server's address it asks that one once a second, which makes a server that sends unicast go on, and tells the
-    version and the clock's frequency.
+    With a server's address it asks that one once a second, which keeps a server that sends unicast going, and whose
+    answer has the version and the clock's frequency.
     """
 
     def __init__(

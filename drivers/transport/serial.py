@@ -207,7 +207,7 @@ class ExchangeConnection:
 class SocketPort(protocol_socket.Serial):  # type: ignore[misc]  # pyserial has no types
     """A serial line over a socket, as serial servers and emulators have it: `socket://HOST:PORT` or `unix://PATH`.
 
-    pyserial's own, which has no Unix sockets and is never told of more than one byte that waits: a call a byte.
+    pyserial's own, which has no Unix sockets and never knows of more than one waiting byte: a call a byte.
     """
 
     _socket: socket.socket | None

@@ -85,7 +85,7 @@ class Roboclaw:
                 packet = bytes(self._pending[:length])
                 del self._pending[:length]
                 if binascii.crc_hqx(packet[:-2], 0) != int.from_bytes(packet[-2:]):
-                    # What is behind cannot be told apart from it.
+                    # What follows cannot be distinguished from it.
                     self._pending.clear()
                     break
                 if address == self.address:

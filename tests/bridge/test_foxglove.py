@@ -1,4 +1,4 @@
-"""Foxglove live: a client of its protocol is told of the topics and gets what the feed has; the layout names them."""
+"""Foxglove live: a client of its protocol gets the topics and what the feed has; the layout names them."""
 
 import asyncio
 import json
@@ -74,7 +74,7 @@ async def hear(url):
         return channels, messages
 
 
-def test_a_client_is_told_of_all_topics_and_gets_what_the_daemon_records(live):
+def test_a_client_gets_all_topics_and_what_the_daemon_records(live):
     channels, messages = asyncio.run(hear(live.url))
     assert {name for name, _ in VIEWS} | (set(TOPIC_BY_NAME) - {"/can/rx", "/can/tx"}) | {SCENE} == set(channels)
     assert channels["/estimate"]["encoding"] == "json"

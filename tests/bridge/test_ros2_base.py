@@ -245,7 +245,7 @@ def connected(path):
     return client
 
 
-def test_clients_hear_the_bridge_and_each_other_and_a_hang_up_is_told(tmp_path):
+def test_clients_hear_the_bridge_and_each_other_and_a_hang_up_is_reported(tmp_path):
     clients = Clients(tmp_path / "base")
     one, other = connected(tmp_path / "base"), connected(tmp_path / "base")
     for _ in range(3):

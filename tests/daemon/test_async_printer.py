@@ -50,8 +50,8 @@ def test_everything_is_written_in_order_by_the_end(pipe):
 def test_a_terminal_that_is_held_by_ctrl_s_holds_nobody_up():
     master, slave = pty.openpty()
     termios.tcflow(slave, termios.TCOOFF)
-    teller, told = held(slave)
-    assert told
+    teller, reported = held(slave)
+    assert reported
     teller.close(0.1)
     termios.tcflow(slave, termios.TCOON)
     teller.close(10.0)
@@ -68,14 +68,14 @@ def test_a_terminal_that_is_held_by_ctrl_s_holds_nobody_up():
 
 def test_a_pipe_that_nobody_reads_holds_nobody_up(pipe):
     os.write(pipe[1], b"x" * fcntl.fcntl(pipe[1], fcntl.F_GETPIPE_SZ))
-    teller, told = held(pipe[1])
-    assert told
+    teller, reported = held(pipe[1])
+    assert reported
     assert teller.dropped >= 5
 
 
 def test_a_reader_that_has_gone_is_no_error(pipe):
     os.close(pipe[0])
-    teller, told = held(pipe[1])
-    assert told
+    teller, reported = held(pipe[1])
+    assert reported
     teller.close()
     assert not teller._thread.is_alive()

@@ -107,15 +107,15 @@ class Antenna:
 
 
 def test_positions_without_heading_are_a_warning_with_what_to_do():
-    told = check._telemetry_check(check._ask_robot(RobotInTime(b""), make_driver(None), Antenna(silent=False)))
-    assert told.level is Level.WARNING
-    assert "heading not known; the poses have none: drive a metre" in told.text
+    reported = check._telemetry_check(check._ask_robot(RobotInTime(b""), make_driver(None), Antenna(silent=False)))
+    assert reported.level is Level.WARNING
+    assert "heading not known; the poses have none: drive a metre" in reported.text
 
 
 def test_a_pose_source_that_is_silent_says_why():
-    told = check._telemetry_check(check._ask_robot(RobotInTime(b""), make_driver(None), Antenna(silent=True)))
-    assert told.level is Level.WARNING
-    assert "0 pose samples a second; fix quality 0: no fix; without a pose" in told.text
+    reported = check._telemetry_check(check._ask_robot(RobotInTime(b""), make_driver(None), Antenna(silent=True)))
+    assert reported.level is Level.WARNING
+    assert "0 pose samples a second; fix quality 0: no fix; without a pose" in reported.text
 
 
 def test_the_conformance_suite_keeps_out_of_a_daemons_way_too(tmp_path):

@@ -37,7 +37,7 @@ def test_absurd_spin_is_refused(spin_s):
 
 
 @given(st.lists(st.tuples(st.booleans(), st.integers(0, 10**12))))
-def test_simulated_clock_moves_only_when_told_and_never_back(moves):
+def test_simulated_clock_moves_only_when_asked_and_never_back(moves):
     clock = SimulatedClock(7)
     expected_ns = 7
     for is_sleep, value_ns in moves:

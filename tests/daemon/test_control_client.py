@@ -78,7 +78,7 @@ def test_no_daemon_is_one_clear_line(tmp_path):
         send_request(tmp_path / "robot.sock", {"do": "status"})
 
 
-def test_what_a_dead_daemon_left_is_told_as_no_daemon(tmp_path):
+def test_what_a_dead_daemon_left_is_reported_as_no_daemon(tmp_path):
     path = tmp_path / "robot.sock"
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as dead:
         dead.bind(str(path))
@@ -119,7 +119,7 @@ def test_a_stranger_that_drips_without_end_is_given_up(tmp_path):
     ("answer", "words"),
     [(b"", "hung up"), (b"half", "hung up"), (b"HTTP/1.1 400\n", "is not a disco"), (b"5\n", "is not")],
 )
-def test_a_stranger_on_the_socket_is_told(tmp_path, answer, words):
+def test_a_stranger_on_the_socket_is_reported(tmp_path, answer, words):
     path = tmp_path / "robot.sock"
     thread = raw_server(path, answer)
     with pytest.raises(WorkError, match=words):
@@ -127,6 +127,6 @@ def test_a_stranger_on_the_socket_is_told(tmp_path, answer, words):
     thread.join()
 
 
-def test_a_path_that_cannot_be_is_told(tmp_path):
+def test_a_path_that_cannot_be_is_reported(tmp_path):
     with pytest.raises(WorkError, match="too long"):
         send_request(tmp_path / ("x" * 200), {"do": "status"})

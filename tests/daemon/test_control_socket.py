@@ -297,7 +297,7 @@ def test_other_users_are_hung_up_on(tmp_path):
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="needs root to become another user")
-def test_another_user_is_told_apart_even_when_the_files_let_it_in():
+def test_another_user_is_distinguished_even_when_the_files_let_it_in():
     with tempfile.TemporaryDirectory() as directory:
         server = ControlServer(Path(directory) / "robot.sock", ACTIONS)
         server.path.chmod(0o666)

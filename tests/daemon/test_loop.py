@@ -10,7 +10,7 @@ MS_NS = 1_000_000
 
 
 class Run:
-    """A loop at 50 Hz on a simulated clock whose ticks last as long as told, then nothing."""
+    """A loop at 50 Hz on a simulated clock whose ticks last as long as given, then nothing."""
 
     def __init__(self, durations_ns, wake_late_ns=()):
         self.clock = LateClock(wake_late_ns)

@@ -188,7 +188,7 @@ def test_the_socket_is_its_owners_alone(feed, tmp_path):
     assert stat.S_IMODE(path.stat().st_mode) & 0o077 == 0
 
 
-def test_a_path_that_cannot_be_used_is_told_in_one_line(tmp_path):
+def test_a_path_that_cannot_be_used_is_reported_in_one_line(tmp_path):
     with pytest.raises(InputError, match=r"shorten daemon\.control_socket"):
         ViewerFeed(tmp_path / ("x" * 120))
 

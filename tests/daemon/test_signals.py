@@ -23,7 +23,7 @@ def stop_wheels():
     sys.stdin.readline()
     print("wheels stand", flush=True)
 
-# Whoever runs these tests may have told its children to ignore the signal, as nohup does.
+# Whoever runs these tests may have set its children to ignore the signal, as nohup does.
 signal.signal(signal.SIGHUP, getattr(signal, sys.argv[1]))
 path = StopPath()
 path.add("log", lambda: print("log closed", flush=True))

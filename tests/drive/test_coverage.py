@@ -125,9 +125,9 @@ def test_a_gap_counts_as_a_tenth_of_a_second_at_most():
 
 def test_words_and_json_agree():
     coverage = covered(lambda _t: (3.0, 3.0), 10.0)
-    told = coverage.as_dict()
-    assert "straight slow" not in told["missing"]
-    assert len(told["missing"]) == len(told["items"]) - 1
+    reported = coverage.as_dict()
+    assert "straight slow" not in reported["missing"]
+    assert len(reported["missing"]) == len(reported["items"]) - 1
     assert "1 of 17 excited" in coverage.in_words()
     assert "straight fast 0/2 s" in coverage.in_words()
 

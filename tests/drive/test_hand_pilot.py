@@ -107,30 +107,30 @@ def test_no_number_is_a_stop():
 
 def test_the_status_says_what_is_going_on():
     bench = Bench().driving()
-    told = bench.stack.pilot.status()["drive"]
-    assert told["driving"]
-    assert told["words"] == "words"
-    assert any("deadman pressed" in text for text in told["messages"])
-    assert told["coverage"]["missing"]
+    reported = bench.stack.pilot.status()["drive"]
+    assert reported["driving"]
+    assert reported["words"] == "words"
+    assert any("deadman pressed" in text for text in reported["messages"])
+    assert reported["coverage"]["missing"]
     bench.run(0.1, held=False)
     assert any("released" in text for text in bench.stack.pilot.status()["drive"]["messages"])
 
 
-def test_a_press_while_not_ready_is_told_and_sends_nothing():
+def test_a_press_while_not_ready_is_reported_and_sends_nothing():
     bench = Bench()
     bench.run(1.5)
     bench.stack.robot.link.plug(False)
     bench.run(0.1)
     ticks = bench.run(0.5, held=True)
     assert all(tick.command is None for tick in ticks)
-    assert any("not ready" in text for text in told(bench))
+    assert any("not ready" in text for text in reported(bench))
 
 
-def test_a_refusal_is_told_and_needs_a_new_press():
+def test_a_refusal_is_reported_and_needs_a_new_press():
     bench = Bench().driving()
     bench.stack.pilot.learn(0, bench.stack.core.last, [Reply(UserRequest.ARM, False, "no fresh wheel samples")])
     assert bench.run(0.02)[0].output.state is State.STOPPING
-    assert any("no fresh wheel samples" in text for text in told(bench))
+    assert any("no fresh wheel samples" in text for text in reported(bench))
     assert bench.run(1.5)[-1].output.state is State.READY
 
 
@@ -144,7 +144,7 @@ def test_without_a_planner_a_task_does_nothing():
     assert all(tick.command.left_rad_s == tick.command.right_rad_s == 0.0 for tick in ticks)
 
 
-def told(bench):
+def reported(bench):
     return bench.stack.pilot.status()["drive"]["messages"]
 
 
@@ -172,5 +172,5 @@ def test_steps_are_driven_within_the_limits_that_the_robot_showed():
     for number in (0, 1):
         here = driven[round((search_s - 0.6 + (number + 0.5) * STEP_S) * 50)]
         assert here == pytest.approx(np.array(steps[number].wheels(0.0)) * 5.0 / 6.4, abs=0.08)
-    told = [float(number) for number in re.findall(r"[-+]\d\.\d", bench.hand.task)]
-    assert told == pytest.approx([-5.0, 5.0, -5.0, 5.0], abs=0.15)
+    reported = [float(number) for number in re.findall(r"[-+]\d\.\d", bench.hand.task)]
+    assert reported == pytest.approx([-5.0, 5.0, -5.0, 5.0], abs=0.15)

@@ -59,7 +59,7 @@ def test_a_held_key_drives_until_200_ms_after_its_last_repeat():
     assert after[-1].left_rad_s == 0.0
 
 
-def test_a_key_held_from_the_start_holds_nothing_which_can_be_told():
+def test_a_key_held_from_the_start_holds_nothing_and_is_reported():
     typist = Typist()
     typist.keys = KeyHold(8.0)
     typist.keys.at(typist.now_ns)

@@ -1,4 +1,4 @@
-"""Each script holds what it says it tells apart, both ways, and nothing that would blur it."""
+"""Each script holds what it says it distinguishes, both ways, and nothing that would blur it."""
 
 import numpy as np
 import pytest

@@ -73,11 +73,11 @@ def run(script, cache, home):
     process = FORKED.Process(target=run_script, args=(script, out), kwargs=environment)
     process.start()
     process.join(120.0)
-    said, told = ((out / name).read_text(encoding="utf-8") for name in ("stdout", "stderr"))
-    assert process.exitcode == 0, told
+    said, reported = ((out / name).read_text(encoding="utf-8") for name in ("stdout", "stderr"))
+    assert process.exitcode == 0, reported
     value, loaded = said.split()
     assert value == "42.0"
-    return loaded == "True", told
+    return loaded == "True", reported
 
 
 def plant(cache, marker):
@@ -122,9 +122,9 @@ def test_a_pickle_in_a_directory_that_others_can_write_to_is_not_run(script, tmp
     plant(cache, marker)
     place = cache if opened == "the directory named" else next(cache.iterdir())
     place.chmod(0o777)
-    loaded, told = run(script, cache, home)
+    loaded, reported = run(script, cache, home)
     assert not loaded
-    assert told == f"disco-hw: {place}: others can write to it; kernels there are not loaded but compiled anew\n"
+    assert reported == f"disco-hw: {place}: others can write to it; kernels there are not loaded but compiled anew\n"
     assert not marker.exists()
     # It is kept in the next directory, which is this user's alone.
     assert run(script, cache, home)[0]
@@ -147,9 +147,9 @@ def test_a_pickle_of_another_user_is_not_run(script, tmp_path):
     plant(cache, marker)
     for path in (next(cache.rglob("*.nbi")), next(cache.iterdir())):
         os.chown(path, NOBODY, NOBODY)
-        loaded, told = run(script, cache, tmp_path)
+        loaded, reported = run(script, cache, tmp_path)
         assert not loaded or path.is_dir()
-        assert f"{path}: belongs to nobody (65534)" in told
+        assert f"{path}: belongs to nobody (65534)" in reported
         assert not marker.exists()
         os.chown(path, 0, 0)
 
@@ -164,9 +164,9 @@ def test_a_pickle_beside_the_source_is_not_run_either_and_where_none_is_private_
     assert str(beside) in run(script, None, home)[1]
     (module,) = (home / ".cache" / "numba").iterdir()
     module.chmod(0o777)
-    loaded, told = run(script, None, home)
+    loaded, reported = run(script, None, home)
     assert not loaded
-    assert "kernels are compiled anew in each process" in told
+    assert "kernels are compiled anew in each process" in reported
     assert not marker.exists()
 
 

@@ -54,7 +54,7 @@ def test_plants_are_drawn_from_the_posterior():
     assert plants(MODEL, 2, first=3) == plants(MODEL, 5)[3:]
 
 
-def test_a_robot_that_is_told_nothing_stands_at_the_cost_of_standing():
+def test_a_robot_without_commands_stands_at_the_cost_of_standing():
     asked = []
 
     def command(now_ns, state):
@@ -71,14 +71,16 @@ def test_a_robot_that_is_told_nothing_stands_at_the_cost_of_standing():
 @pytest.fixture(scope="module")
 def short():
     # Bounded acceleration, as a real robot's: its planner is compiled already.
-    told = []
-    return run_circle(MODEL, "default", CircleOptions(seeds=8, duration_s=6.0, largest_rot_s2=3.0), told.append), told
+    reported = []
+    return run_circle(
+        MODEL, "default", CircleOptions(seeds=8, duration_s=6.0, largest_rot_s2=3.0), reported.append
+    ), reported
 
 
-def test_every_curve_is_driven_and_told(short):
-    result, told = short
+def test_every_curve_is_driven_and_reported(short):
+    result, reported = short
     assert tuple(result.runs) == CURVES
-    assert [line.split(":")[0] for line in told] == list(CURVES)
+    assert [line.split(":")[0] for line in reported] == list(CURVES)
     cost = {row["controller"]: row["steady_cost"] for row in result.rows()}
     # Who knows the robot is on the way after six seconds from rest. The truth is worth something over many plants, not
     # on one that happens to be the posterior's mean.

@@ -38,17 +38,17 @@ def test_figures_of_costs_that_are_known():
 
 @pytest.fixture(scope="module")
 def swings():
-    told = []
-    return run_pendulum(PendulumOptions(seeds=3, steps=200), told.append), told
+    reported = []
+    return run_pendulum(PendulumOptions(seeds=3, steps=200), reported.append), reported
 
 
 def test_the_papers_ordering(swings):
-    result, told = swings
-    assert [line.rsplit(":", 1)[0] for line in told] == list(CURVES)
+    result, reported = swings
+    assert [line.rsplit(":", 1)[0] for line in reported] == list(CURVES)
     mean = {name: costs.mean() for name, costs in result.costs.items()}
     for posterior in ("UT, posterior", "MC, posterior"):
         assert mean[posterior] < 0.5 * min(mean["UT, prior"], mean["MC, prior"])
-    # Three seeds do not tell the two apart to better than a few per cent.
+    # Three seeds do not separate the two to better than a few per cent.
     assert mean["UT, posterior"] < 1.05 * mean["true parameters"]
     # It swings up, and stays up.
     assert all(result.costs[name][:, -50:].mean() < 1.0 for name in ("true parameters", "UT, posterior"))

@@ -41,4 +41,4 @@ def assert_stopped_in_time(rows: list[TruthRow], cut_s: float) -> None:
     assert not late_asks, f"asked for {late_asks[0].asked} rad/s {late_asks[0].t_s - last_accepted.t_s:.3f} s later"
     turning = [row for row in rows if row.t_s > stands_by and row.fastest >= STILL_RAD_S]
     assert not turning, f"{turning[0].fastest} rad/s {turning[0].t_s - last_accepted.t_s:.3f} s later"
-    assert rows[-1].t_s > stands_by + 0.5, "the truth ends too early to tell"
+    assert rows[-1].t_s > stands_by + 0.5, "the truth ends too early to judge"

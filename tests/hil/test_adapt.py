@@ -45,7 +45,7 @@ def driven_otherwise(directory, adaptation):
         begun_s = newest_truth_s(directory / "truth.csv")
         end_s = begun_s + SETTLED_S + JUDGED_S
         stack.operator.wait_until("the end", lambda s: newest_truth_s(directory / "truth.csv") > end_s, 120.0)
-        stack.operator.tell("quit")
+        stack.operator.request("quit")
         assert stack.daemon.process.wait(10.0) == 0
     table = np.genfromtxt(directory / "truth.csv", delimiter=",", skip_header=1, usecols=(0, 1, 2, 8))
     table = table[table[:, 0] * 1e-9 > begun_s + SETTLED_S]
@@ -79,7 +79,7 @@ def test_the_network_audits_the_filter_from_a_process_of_its_own(tmp_path):
         audited = stack.operator.wait_until("audited", lambda s: "agree" in s["adaptation"]["audit"], LOADING_S)
         assert audited["adaptation"]["takeovers"] == 0
         assert audited["adaptation"]["belief"] == "adapted"
-        stack.operator.tell("quit")
+        stack.operator.request("quit")
         assert stack.daemon.process.wait(10.0) == 0
     with open_log(tmp_path / "run.mcap") as log:
         assert "audit" in list(log.columns("/adapt")["outcome"])
@@ -109,22 +109,22 @@ def test_an_adapter_that_freezes_and_dies_leaves_belief_and_loop(tmp_path):
         pid = adapter_pid(stack.daemon.process.pid)
 
         os.kill(pid, signal.SIGSTOP)
-        frozen = operator.wait_until("told of the silence", lambda s: s["adaptation"]["silent"], SILENT_S)
+        frozen = operator.wait_until("report of the silence", lambda s: s["adaptation"]["silent"], SILENT_S)
         assert frozen["adaptation"]["belief"] == "adapted"
         os.kill(pid, signal.SIGCONT)
         operator.wait_until("heard again", lambda s: not s["adaptation"]["silent"], SILENT_S)
 
         os.kill(pid, signal.SIGKILL)
-        dead = operator.wait_until("told of the death", lambda s: s["adaptation"]["link"]["deaths"] == 1, SILENT_S)
+        dead = operator.wait_until("report of the death", lambda s: s["adaptation"]["link"]["deaths"] == 1, SILENT_S)
         assert (dead["adaptation"]["belief"], dead["state"], dead["running"]) == ("adapted", "ARMED", True)
         time.sleep(1.0)
         assert operator.status()["source"] == "plan"
 
-        operator.tell("revert")
+        operator.request("revert")
         operator.wait_until("the model's belief", lambda s: s["adaptation"]["belief"] == "model", 2.0)
-        operator.tell("disarm")
+        operator.request("disarm")
         operator.wait_until("a new adapter", lambda s: s["adaptation"]["link"]["alive"], 15.0)
-        operator.tell("quit")
+        operator.request("quit")
         assert stack.daemon.process.wait(10.0) == 0
 
     with open_log(tmp_path / "run.mcap") as log:

@@ -39,7 +39,7 @@ def test_a_signal_stops_the_wheels_before_the_process_ends(tmp_path, number):
 def test_quit_stops_the_wheels_too(tmp_path):
     with running_stack(tmp_path) as stack:
         stack.drive()
-        stack.operator.tell("quit")
+        stack.operator.request("quit")
         assert stack.daemon.process.wait(60.0) == 0
         ended_s = time.monotonic()
         rows = stack.truth()
@@ -83,7 +83,7 @@ def daemon_that_fails(monkeypatch, error: str):
     monkeypatch.undo()
 
 
-def test_an_exception_in_the_loop_stops_the_wheels_and_is_told(tmp_path, monkeypatch):
+def test_an_exception_in_the_loop_stops_the_wheels_and_is_reported(tmp_path, monkeypatch):
     error = "RuntimeError"
     with daemon_that_fails(monkeypatch, error), running_stack(tmp_path) as stack:
         stack.start()

@@ -108,7 +108,7 @@ def assert_stands_in_time(t_s, wheels, before_s, silent_s):
     fastest = size[(t_s > before_s - 0.2) & (t_s <= silent_s)].max()
     assert fastest > 1.5, "the robot was not driving when the input fell silent"
     by_s = silent_s + INPUT_LIMIT_NS * 1e-9 + fastest / DECELERATION_RAD_S2 + MOTOR_SETTLING_S + MARGIN_S
-    assert t_s[-1] > by_s + 0.3, "the truth ends too early to tell"
+    assert t_s[-1] > by_s + 0.3, "the truth ends too early to judge"
     late = size[t_s > by_s]
     assert late.max() < STILL_RAD_S, f"{late.max()} rad/s"
 
@@ -117,9 +117,9 @@ def test_a_script_is_driven_unattended_and_recorded_as_executed(tmp_path, monkey
     with bench(tmp_path) as made:
         arguments = ["--script", "steps", "--seed", "1", "--seconds", "14", "--unattended", "--json"]
         process = made.drive(*arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
-        told, complaints = process.communicate(timeout=60)
+        reported, complaints = process.communicate(timeout=60)
         assert process.returncode == 0, complaints.decode()
-        result = json.loads(told)
+        result = json.loads(reported)
         _, wheels = made.truth()
     assert result["completed"]
     assert result["ended"] == "script steps completed"
@@ -139,8 +139,8 @@ def test_a_script_is_driven_unattended_and_recorded_as_executed(tmp_path, monkey
     assert replay(made.log).ok
     with open_log(made.log) as log:
         assert {"off", "hold", "manual"} == set(log.columns("/command")["source"])
-        told = [entry.record.text for entry in log.records(["/event"])]
-    assert any(text.startswith("step 1") and "found: left -" in text for text in told)
+        reported = [entry.record.text for entry in log.records(["/event"])]
+    assert any(text.startswith("step 1") and "found: left -" in text for text in reported)
 
 
 def test_a_key_held_drives_and_a_frozen_typist_stops_the_robot(tmp_path):
@@ -161,7 +161,7 @@ def test_a_key_held_drives_and_a_frozen_typist_stops_the_robot(tmp_path):
             time.sleep(0.3)
             assert made.operator.status()["state"] == "READY"
         time.sleep(0.8)
-        # A new hold of the key drives again, backwards; then the program is told to end.
+        # A new hold of the key drives again, backwards; then the program is asked to end.
         with typing(master, "x"):
             made.operator.wait_until("reversing", lambda s: max(s["wheels"]) < -2.0, 10.0)
             os.write(master, b"\x04")

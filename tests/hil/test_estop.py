@@ -61,9 +61,9 @@ def test_estop_stops_and_latches(tmp_path, link, daemon):
         assert outcome["confirmed"]
         stack.operator.wait_for("FAULT", 3.0)
         with pytest.raises(WorkError, match="refused to arm"):
-            stack.operator.tell("arm")
+            stack.operator.request("arm")
         time.sleep(0.6)
-        stack.operator.tell("reset")
+        stack.operator.request("reset")
         stack.operator.wait_for("READY", 5.0)
         rows = stack.truth()
         said = (tmp_path / "daemon.txt").read_text()

@@ -27,7 +27,7 @@ def test_a_path_is_driven_to_its_end_and_the_log_needs_no_other_file(tmp_path):
         code, output = disco("ctl", str(stack.robot_file), "status")
         assert code == 0, output
         assert "of 0.86 m" in output
-        stack.operator.tell("quit")
+        stack.operator.request("quit")
         stack.daemon.process.wait(10.0)
         rows = stack.truth()
     assert max(row.fastest for row in rows) > 2.0

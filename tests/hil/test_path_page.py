@@ -1,4 +1,4 @@
-"""The live page of a robot that follows a path: it is drawn, its progress told, and its speed alone can be changed."""
+"""The live page of a robot that follows a path: it is drawn, its progress shown, and its speed alone can be changed."""
 
 import pytest
 

@@ -59,12 +59,12 @@ def ticks_in(path: Path) -> list[int]:
         return [entry.tick for entry in log.records(("/loop",))]
 
 
-def test_a_recorder_frozen_killed_and_deleted_on_the_way_is_told_counted_and_replaced(tmp_path):
+def test_a_recorder_frozen_killed_and_deleted_on_the_way_is_reported_counted_and_replaced(tmp_path):
     first, second, third, fourth = (tmp_path / f"run{part}.mcap" for part in ("", ".part2", ".part3", ".part4"))
     with running_stack(tmp_path) as stack:
         stack.drive(until_rad_s=2.0)
         os.kill(writer_of(stack), signal.SIGSTOP)
-        frozen = stack.operator.wait_until("told", lambda status: status["recorder"]["fault"], 10.0)
+        frozen = stack.operator.wait_until("report of the fault", lambda status: status["recorder"]["fault"], 10.0)
         assert "the log writer has not answered for" in frozen["recorder"]["fault"]
         code, text = disco("ctl", str(stack.robot_file), "status")
         assert (code, "recording " in text) == (0, True)
@@ -80,7 +80,7 @@ def test_a_recorder_frozen_killed_and_deleted_on_the_way_is_told_counted_and_rep
         assert recorder["path"] == str(fourth)
         assert recorder["dropped_ticks"] == 0
         assert recorder["ticks"] == sum(recorder[f"{where}_ticks"] for where in ("delivered", "waiting", "lost"))
-        stack.operator.tell("quit")
+        stack.operator.request("quit")
         assert stack.daemon.process.wait(60.0) == 0
         output = (tmp_path / "daemon.txt").read_text()
     for words in ("has not answered for", "was ended", "signal 9", "deleted while it was written", "goes on in"):
@@ -101,9 +101,9 @@ def test_a_recorder_frozen_killed_and_deleted_on_the_way_is_told_counted_and_rep
     assert gone[0] <= kept[-1] + 1
     assert f"{len(gone)} lost with a deleted file" in output
     # What the killed writer had not confirmed was given to the third.
-    told = [*events_in(first), *events_in(second), *events_gone, *events_in(fourth)]
-    assert any("has not answered" in text for text in told)
-    assert any("deleted" in text for text in told)
+    reported = [*events_in(first), *events_in(second), *events_gone, *events_in(fourth)]
+    assert any("has not answered" in text for text in reported)
+    assert any("deleted" in text for text in reported)
     assert "ended properly" not in info(first, as_json=False)
     assert f"continues {first}" in info(second, as_json=False)
 
@@ -114,9 +114,9 @@ def test_where_nothing_can_be_recorded_arming_is_refused_unless_that_is_asked_fo
         stack.operator.wait_for("READY", READY_TIMEOUT_S)
         shutil.rmtree(logs)
         logs.write_text("in the way")
-        stack.operator.wait_until("told", lambda status: status["recorder"]["fault"], 10.0)
+        stack.operator.wait_until("report of the fault", lambda status: status["recorder"]["fault"], 10.0)
         with pytest.raises(WorkError, match=r"nothing is being recorded: .*; mend that, or arm with --unrecorded"):
-            stack.operator.tell("arm")
+            stack.operator.request("arm")
         code, text = disco("ctl", str(stack.robot_file), "arm")
         assert code == 1
         assert "refused: nothing is being recorded" in text
@@ -128,9 +128,9 @@ def test_where_nothing_can_be_recorded_arming_is_refused_unless_that_is_asked_fo
         stack.operator.wait_for("ARMED", 5.0)
         logs.unlink()
         wait_for_recording(stack, 1)
-        stack.operator.tell("disarm")
+        stack.operator.request("disarm")
         stack.operator.wait_for("READY", 5.0)
-        stack.operator.tell("arm")
+        stack.operator.request("arm")
 
 
 def test_a_keeper_frozen_or_killed_is_made_again_while_disarmed(tmp_path):
@@ -142,4 +142,4 @@ def test_a_keeper_frozen_or_killed_is_made_again_while_disarmed(tmp_path):
             os.kill(writer, signal.SIGKILL)
             wait_for_recording(stack, deaths)
             assert keeper_of(stack) != keeper
-        stack.operator.tell("arm")
+        stack.operator.request("arm")

@@ -87,7 +87,7 @@ def test_a_firmware_that_does_not_fit_is_refused_in_words(tmp_path, change, word
                 for word in words:
                     assert word in status["detail"]
                 with pytest.raises(WorkError, match="refused to arm"):
-                    operator.tell("arm")
+                    operator.request("arm")
             code, output = disco("check", str(robot_file))
             assert code == 1
             for word in words:
@@ -130,7 +130,7 @@ def test_forgeries_on_the_bus_never_turn_a_wheel(tmp_path, armed):
     with running_stack(tmp_path) as stack:
         stack.operator.wait_for("READY", READY_TIMEOUT_S)
         if armed:
-            stack.operator.tell("arm")
+            stack.operator.request("arm")
             stack.operator.wait_for("ARMED", 5.0)
         session = int(stack.inject("state").split(",")[13])
         with can.Bus(interface="unixcan", channel=str(tmp_path / "bus")) as bus:
@@ -166,9 +166,9 @@ def test_a_replayed_session_never_turns_a_wheel(tmp_path):
         thread.start()
         try:
             stack.drive()
-            stack.operator.tell("disarm")
+            stack.operator.request("disarm")
             stack.operator.wait_for("READY", 5.0)
-            stack.operator.tell("quit")
+            stack.operator.request("quit")
             stack.daemon.process.wait(60.0)
         finally:
             done.set()
@@ -201,13 +201,13 @@ sys.exit(run_virtual_robot(VirtualRobotOptions(
 @contextmanager
 def virtual_robot(folder, robot_file, name, seeded):
     """One life of the controller, as a process; yields where its truth and its bus are recorded."""
-    truth, bus, told = folder / f"{name}.csv", folder / f"{name}.log", folder / f"{name}.txt"
+    truth, bus, reported = folder / f"{name}.csv", folder / f"{name}.log", folder / f"{name}.txt"
     command = ["-m", "disco_hw", "sim", str(robot_file), "--truth", str(truth), "--bus-log", str(bus)]
     if seeded:
         command = ["-c", SEEDED_ROBOT, str(folder / "bus"), str(truth), str(bus)]
-    with told.open("wb") as output, subprocess.Popen([sys.executable, *command], stdout=output) as robot:
+    with reported.open("wb") as output, subprocess.Popen([sys.executable, *command], stdout=output) as robot:
         try:
-            wait_until(lambda: "ready" in told.read_text(), READY_TIMEOUT_S)
+            wait_until(lambda: "ready" in reported.read_text(), READY_TIMEOUT_S)
             yield truth, bus
         finally:
             robot.terminate()
@@ -230,8 +230,8 @@ def test_a_session_recorded_before_a_restart_does_not_arm_after_it(tmp_path, see
     robot_file = write_robot_file(tmp_path)
     drive = ["drive", str(robot_file), "--script", "circle", "--unattended", "--seconds", "4"]
     with virtual_robot(tmp_path, robot_file, "first", seeded) as (truth, bus_log):
-        _, told = disco(*drive, "--log", str(tmp_path / "drive.mcap"))
-    assert "script circle completed" in told
+        _, reported = disco(*drive, "--log", str(tmp_path / "drive.mcap"))
+    assert "script circle completed" in reported
     assert max(row.fastest for row in read_truth(truth)) > 1.0
     sent = list(from_the_host(bus_log))
     with virtual_robot(tmp_path, robot_file, "second", seeded) as (truth, _):
@@ -272,8 +272,8 @@ def test_garbage_on_a_serial_line_leaves_the_daemon_waiting(tmp_path):
             status = operator.wait_until("counting", lambda s: s["transport"]["malformed"] > 200, READY_TIMEOUT_S)
             assert status["state"] == "HANDSHAKE"
             with pytest.raises(WorkError, match="refused to arm"):
-                operator.tell("arm")
-            operator.tell("quit")
+                operator.request("arm")
+            operator.request("quit")
             assert daemon.process.wait(60.0) == 0
     finally:
         stop.set()
@@ -304,7 +304,7 @@ def test_a_bad_path_gets_one_line_and_exit_code_2(tmp_path, verb, csv, words):
     assert words in output
 
 
-def test_a_daemon_can_be_told_to_stop_when_the_path_is_gone(tmp_path):
+def test_a_daemon_can_be_asked_to_stop_when_the_path_is_gone(tmp_path):
     path = path_robot(tmp_path)
     (tmp_path / "path.csv").unlink()
     code, output = disco("ctl", str(path), "disarm")

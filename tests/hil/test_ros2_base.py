@@ -66,9 +66,9 @@ class Base:
         operator = self.operator
         operator.wait_for("READY", READY_TIMEOUT_S)
         operator.wait_until("a pose", lambda status: status["pose_ok"], 30.0)
-        operator.tell("arm")
+        operator.request("arm")
         operator.wait_for("ARMED", 10.0)
-        operator.tell("start")
+        operator.request("start")
         operator.wait_until("at speed", lambda status: status["wheels"] and max(status["wheels"]) > 6.0, 20.0)
 
     def truth(self):
@@ -107,9 +107,9 @@ def test_a_base_of_real_ros_is_driven_round_and_the_stack_stops_when_it_dies(tmp
         base.drive()
         base.operator.wait_until("half a circle on", lambda status: status["pose"][0] < -2.5, 120.0)
         assert base.operator.status()["task"]["distance_m"] < 0.1
-        base.operator.tell("stop")
+        base.operator.request("stop")
         base.wait_for_true_standstill()
-        base.operator.tell("start")
+        base.operator.request("start")
         base.operator.wait_until("at speed", lambda status: max(status["wheels"]) > 6.0, 20.0)
         base.node.kill()
         base.operator.wait_until("disarmed", lambda status: status["state"] != "ARMED", 60.0)
@@ -137,7 +137,7 @@ def test_it_stops_whoever_dies_or_freezes_and_does_not_go_on_by_itself(tmp_path,
         base.wait_for_true_standstill()
         at_rest = base.operator.wait_until("at rest", lambda status: status["state"] in ("READY", "FAULT"), 60.0)
         if at_rest["state"] == "FAULT":
-            base.operator.tell("reset")
+            base.operator.request("reset")
             base.operator.wait_for("READY", 30.0)
         time.sleep(1.0)
         assert stands(base.operator.status())
@@ -153,7 +153,7 @@ def test_it_keeps_to_the_circle_by_joint_states_and_by_odometry(tmp_path, lines)
         base.operator.wait_until("half a circle on", lambda status: status["pose"][0] < -2.5, 120.0)
         base.operator.wait_until("round again", lambda status: status["pose"][0] > 2.5, 120.0)
         assert base.operator.status()["task"]["distance_m"] < 0.1
-        base.operator.tell("stop")
+        base.operator.request("stop")
         base.wait_for_true_standstill()
 
 

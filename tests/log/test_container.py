@@ -222,7 +222,7 @@ def test_a_file_of_bombs_is_refused_chunk_by_chunk_without_unpacking_one():
     assert contents.chunks == []
     assert "a chunk that claims to be 1048576 bytes, packed in" in contents.damage[0]
     assert peak < 2**21
-    # What is wrong in hundreds of places is not told of each.
+    # What is wrong in hundreds of places is not reported one by one.
     assert len(contents.damage) == 102
     assert contents.damage[-2:] == [
         "at 400 further places something is lost",

@@ -34,7 +34,7 @@ def test_every_record_is_strict_json_that_obeys_its_schema(record):
 
 
 @pytest.mark.parametrize("topic", TOPICS, ids=lambda topic: topic.name)
-def test_a_schema_tells_its_own_messages_from_others(topic):
+def test_a_schema_distinguishes_its_own_messages_from_others(topic):
     validator = VALIDATORS[topic.name]
     Draft202012Validator.check_schema(validator.schema)
     assert not validator.is_valid({})

@@ -10,7 +10,7 @@ from tools.log_samples import drive_ticks, log_bytes, write_log
 
 @pytest.fixture
 def mcap(tmp_path):
-    # The name says nothing: what a file is, its content tells.
+    # The name says nothing: what a file is, its content says.
     return write_log(tmp_path / "log.dat", drive_ticks(100))
 
 

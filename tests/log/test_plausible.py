@@ -47,7 +47,7 @@ def test_too_few_times_say_nothing():
 
 
 @pytest.mark.parametrize("known", ["wheels", "commands", "neither"])
-def test_degrees_are_told_from_radians_that_were_not_wrapped(known):
+def test_degrees_are_distinguished_from_radians_that_were_not_wrapped(known):
     poses, wheels, commands = circle(duration_s=120.0)
     wheels = wheels if known == "wheels" else NO_WHEELS
     commands = commands if known == "commands" else NO_COMMANDS

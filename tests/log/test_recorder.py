@@ -72,15 +72,15 @@ def all_accounted(stats, given):
     return True
 
 
-def test_a_stopped_writer_is_told_within_a_second_replaced_and_nothing_is_lost(path):
+def test_a_stopped_writer_is_reported_within_a_second_replaced_and_nothing_is_lost(path):
     recorder = ProcessRecorder(recording(path))
     following = kept_going(recorder, 1, lambda stats: stats.delivered_ticks > 5)
     stopped = recorder.writer_pid
     polls_s = [time.monotonic()]
     os.kill(stopped, signal.SIGSTOP)
     following = kept_going(recorder, following, lambda stats: polls_s.append(time.monotonic()) or stats.fault)
-    (told,) = recorder.news()
-    silent_s = float(re.search(r"the log writer has not answered for (\d+\.\d) s", told)[1])
+    (reported,) = recorder.news()
+    silent_s = float(re.search(r"the log writer has not answered for (\d+\.\d) s", reported)[1])
     # Within a second, but for what this machine withheld from the one who looks.
     assert silent_s < 0.9 + max(later - earlier for earlier, later in pairwise(polls_s))
     following = kept_going(recorder, following, lambda stats: stats.writer_deaths == 1)
@@ -151,7 +151,7 @@ def test_a_writer_that_is_only_slow_goes_on_with_its_file(path):
 
 
 @pytest.mark.parametrize("what", ["file", "directory"])
-def test_a_file_deleted_while_it_is_written_is_told_counted_and_begun_anew(path, what):
+def test_a_file_deleted_while_it_is_written_is_reported_counted_and_begun_anew(path, what):
     recorder = ProcessRecorder(recording(path))
     following = kept_going(recorder, 1, lambda stats: stats.delivered_ticks > 20)
     if what == "file":
@@ -254,7 +254,7 @@ def test_a_writer_killed_is_noticed_and_replaced_by_another_part(path):
         assert (log.metadata.part, log.summary().missing_ticks) == (2, 0)
 
 
-def test_a_writer_that_was_told_to_end_by_somebody_else_is_replaced(path):
+def test_a_writer_that_was_asked_to_end_by_somebody_else_is_replaced(path):
     recorder = ProcessRecorder(recording(path))
     drive(recorder, 1, 5)
     os.kill(recorder.writer_pid, signal.SIGTERM)
@@ -267,7 +267,7 @@ def test_a_writer_that_was_told_to_end_by_somebody_else_is_replaced(path):
         assert (log.complete, log.summary().ended) == (True, False)
 
 
-def test_close_waits_no_longer_than_told_and_the_writer_finishes_by_itself(path):
+def test_close_waits_no_longer_than_asked_and_the_writer_finishes_by_itself(path):
     recorder = ProcessRecorder(recording(path))
     drive(recorder, 1, 20)
     wait_until(lambda: recorder.poll().written > 0)

@@ -97,7 +97,7 @@ GOOD = model_text(
         ('kind = "gaussian"', 'kind = "cauchy"', "belief: invalid value 'cauchy'|belief.kind: invalid value 'cauchy'"),
     ],
 )
-def test_faults_are_told_in_one_line_with_the_file(tmp_path, old, new, fault):
+def test_faults_are_reported_in_one_line_with_the_file(tmp_path, old, new, fault):
     assert old in GOOD
     with pytest.raises(InputError, match=fault) as error:
         read(tmp_path, GOOD.replace(old, new, 1))
@@ -124,7 +124,7 @@ def test_mixture_lists_must_agree(tmp_path):
         read(tmp_path, GOOD.split("[belief]")[0] + text)
 
 
-def test_unreadable_files_are_told(tmp_path):
+def test_unreadable_files_are_reported(tmp_path):
     with pytest.raises(InputError, match=r"cannot be read.*give the path of a model file"):
         load_model(tmp_path / "missing.toml")
     with pytest.raises(InputError, match="not valid TOML"):

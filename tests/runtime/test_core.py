@@ -226,8 +226,8 @@ def test_a_planner_that_gives_up_is_followed_on_its_tail_then_the_wheels_ramp_do
     assert set(sources[tail[-1] + 1 :]) == {Source.RAMP}
     assert ticks[-1].pipeline.command.left_rad_s == 0.0
     assert ticks[-1].output.state is State.ARMED
-    told = [text for tick in ticks for text in tick.events if text.startswith("planner")]
-    assert told == ["planner: planted"]
+    reported = [text for tick in ticks for text in tick.events if text.startswith("planner")]
+    assert reported == ["planner: planted"]
 
 
 def test_the_wheels_of_a_tick_are_announced_before_it_is_planned_and_recorded():
@@ -250,7 +250,9 @@ def test_the_wheels_of_a_tick_are_announced_before_it_is_planned_and_recorded():
     assert planned
     assert all(happened[k - 1][:2] == ("wheels", happened[k][1]) for k in planned)
     recorded = [(now_ns, *(one for one in rows if type(one) is WheelSample)) for now_ns, rows in stack.recorder.ticks]
-    assert [told[1:] for told in happened if told[0] == "wheels"] == [tick for tick in recorded if len(tick) > 1]
+    assert [reported[1:] for reported in happened if reported[0] == "wheels"] == [
+        tick for tick in recorded if len(tick) > 1
+    ]
 
 
 class Collapsing:
@@ -270,14 +272,14 @@ class Collapsing:
         self.inner.reset()
 
 
-def test_plans_that_hang_on_too_few_samples_are_told_once():
+def test_plans_that_hang_on_too_few_samples_are_reported_once():
     setup = load_setup(ROBOT)
     stack = simulated_stack(Collapsing(make_planner(setup.config, setup.model), 2_500_000_000, 3_000_000_000))
     stack.run(1.5)
     stack.run(0.5, UserRequest.ARM)
     ticks = stack.run(2.0, UserRequest.START)
-    told = [text for tick in ticks for text in tick.events if text.startswith("planner")]
-    assert told == [
+    reported = [text for tick in ticks for text in tick.events if text.startswith("planner")]
+    assert reported == [
         "planner: plans hang on 1.2 effective samples, too few to be trusted",
         "planner: enough effective samples again",
     ]

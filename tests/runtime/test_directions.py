@@ -61,12 +61,12 @@ class Floor:
         return PoseSample(t_ns, t_ns, x, y, yaw, self._noise_m, 0.005)
 
 
-def first_doubt(vendor, told, true, speeds, seconds=3.0):
+def first_doubt(vendor, reported, true, speeds, seconds=3.0):
     """Seconds of motion until something is found, and what; None where nothing is."""
     bench = vendor.bench()
     # What robot.toml says stands before a robot that is wired as the driver believes: the other way round is as true.
     bench.driver = rewired(bench.driver, true)
-    watch, floor = Directions(RADIUS_M, TRACK_M, told), Floor()
+    watch, floor = Directions(RADIUS_M, TRACK_M, reported), Floor()
     bench.arm()
     seen, before, moving_ns = len(bench.wheels), list(bench.robot.angle), None
     for tick in range(round(seconds / 0.02)):
@@ -153,7 +153,7 @@ def test_the_daemons_tick_stops_the_robot_and_says_what_to_change(wiring):
     assert not refused.accepted
 
 
-def test_a_robot_that_is_wired_as_told_is_let_alone():
+def test_a_robot_that_is_wired_as_declared_is_let_alone():
     run = simulated_stack()
     run.start()
     assert all(tick.output.motion_allowed for tick in run.ticks(6.0))
@@ -181,9 +181,9 @@ def test_ten_minutes_of_driving_keep_no_more_than_the_first_seconds():
 
 @pytest.mark.parametrize(("radius", "axle", "seed"), [(1.0, 1.0, 2), (0.85, 1.2, 3), (1.18, 0.8, 4), (1.15, 1.15, 5)])
 def test_a_robot_whose_geometry_is_written_down_wrongly_is_not_taken_for_miswired(radius, axle, seed):
-    told = PlantParameters()
+    reported = PlantParameters()
     run = simulated_stack(
-        seed=seed, wheel_radius_m=radius * told.wheel_radius_m, axial_distance_m=axle * told.axial_distance_m
+        seed=seed, wheel_radius_m=radius * reported.wheel_radius_m, axial_distance_m=axle * reported.axial_distance_m
     )
     run.start()
     assert all("wheels." not in tick.output.detail for tick in run.ticks(4.0))

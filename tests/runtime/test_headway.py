@@ -34,7 +34,7 @@ def said(seconds, speed_m_s=0.2, robot_m_s=0.0, wheels_rad_s=0.0, command=COMMAN
         ({"wheels_rad_s": 2.0}, "the wheels have turned by 10.0 rad, and the pose has not moved"),
     ],
 )
-def test_a_robot_that_stays_is_told_once_with_what_stands_in_the_way(what, words):
+def test_a_robot_that_stays_is_reported_once_with_what_stands_in_the_way(what, words):
     ((at_s, text),) = said(30.0, **what)
     assert at_s == pytest.approx(5.0, abs=0.05)
     assert text.startswith("task: no progress for 5 s: ")
@@ -42,7 +42,7 @@ def test_a_robot_that_stays_is_told_once_with_what_stands_in_the_way(what, words
 
 
 @pytest.mark.parametrize("speed_m_s", [0.2, 0.02])
-def test_a_robot_that_drives_is_not_told_of(speed_m_s):
+def test_a_robot_that_drives_is_not_reported(speed_m_s):
     assert said(60.0, speed_m_s=speed_m_s, robot_m_s=0.9 * speed_m_s) == []
 
 
@@ -51,7 +51,7 @@ def test_what_does_not_run_or_may_rest_is_not_watched(what):
     assert said(20.0, **what) == []
 
 
-def test_it_is_told_when_the_robot_gets_on_again():
+def test_it_is_reported_when_the_robot_gets_on_again():
     headway, found = Headway(0.2), []
     for tick in range(500):
         x_m = 0.0 if tick < 300 else 0.004 * (tick - 300)

@@ -1,4 +1,4 @@
-"""One tick: who asks for the wheel speeds, what the governor makes of it, and what the planner is told."""
+"""One tick: who asks for the wheel speeds, what the governor makes of it, and what the planner is given."""
 
 from __future__ import annotations
 

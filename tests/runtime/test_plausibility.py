@@ -18,13 +18,13 @@ def wheels(t_ns: int, left: float, right: float) -> WheelSample:
 
 
 def drive(watch: Plausibility, speeds, commands, first: int = 0) -> list[str]:
-    """Ticks with one wheel sample each; returns what was told."""
-    told = []
+    """Ticks with one wheel sample each; returns what was reported."""
+    reported = []
     for number, ((left, right), command) in enumerate(zip(speeds, commands, strict=True), first):
         now_ns = number * TICK_NS
         sent = None if command is None else WheelCommand(*command, 0.1)
-        told += watch.step(now_ns, (wheels(now_ns, left, right),), (), (), sent)
-    return told
+        reported += watch.step(now_ns, (wheels(now_ns, left, right),), (), (), sent)
+    return reported
 
 
 def lagging(commands, delay: int, tau_s: float):
@@ -53,9 +53,9 @@ def test_a_wheel_that_stands_for_a_moment_is_counted_once(side, name):
     watch, commands = Plausibility(), [(3.0, -3.0)] * 60
     stalled = [(3.0, -3.0)] * 40 + [tuple(0.0 if i == side else v for i, v in enumerate((3.0, -3.0)))] * 6
     stalled += [(3.0, -3.0)] * 14
-    told = drive(watch, stalled, commands)
-    assert len(told) == 1
-    assert f"the {name} wheel does not follow: 0.0 rad/s" in told[0]
+    reported = drive(watch, stalled, commands)
+    assert len(reported) == 1
+    assert f"the {name} wheel does not follow: 0.0 rad/s" in reported[0]
     assert watch.stats.wheels_not_following == 1
 
 
@@ -86,9 +86,9 @@ def power(seconds: float, volts: float) -> tuple[PowerSample, ...]:
 def test_a_dip_of_the_supply_is_counted_once_and_again_after_it_has_recovered():
     watch = Plausibility()
     volts = [25.0] * 20 + [23.0] * 3 + [24.9] * 10 + [23.0] * 2
-    told = [text for i, v in enumerate(volts) for text in watch.step(i * TICK_NS, (), (), power(0.1 * i, v), None)]
+    reported = [text for i, v in enumerate(volts) for text in watch.step(i * TICK_NS, (), (), power(0.1 * i, v), None)]
     assert watch.stats == PlausibilityStats(supply_dips=2)
-    assert told[0] == "the supply dipped from 25.0 V to 23.0 V"
+    assert reported[0] == "the supply dipped from 25.0 V to 23.0 V"
 
 
 def test_a_battery_that_runs_down_under_load_is_no_dip():

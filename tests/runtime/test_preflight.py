@@ -201,7 +201,7 @@ def test_what_does_not_fit_is_one_line_with_field_and_remedy(speed, acceleration
     assert "\n" not in line
 
 
-def test_every_error_is_told_at_once():
+def test_every_error_is_reported_at_once():
     assert len(check_limits(ROBOT, 9.0, 21.0, 1)) == 3
 
 

@@ -52,7 +52,7 @@ def _parsed(schema):
     return json.loads(schema)
 
 
-def test_a_changed_build_is_told_by_tick_and_field(monkeypatch):
+def test_a_changed_build_is_reported_by_tick_and_field(monkeypatch):
     def longer(parameters, left_rad, right_rad):
         return arc(parameters, 1.001 * left_rad, right_rad)
 

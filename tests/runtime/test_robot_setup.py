@@ -53,7 +53,7 @@ def test_what_the_belief_does_not_name_is_exact():
     assert np.array(covariance) == pytest.approx(np.diag([0.0, 0.0, 4e-4]))
 
 
-def test_a_model_marked_as_lacking_an_effect_is_run_only_when_told_to(tmp_path, monkeypatch):
+def test_a_model_marked_as_lacking_an_effect_is_run_only_when_asked_to(tmp_path, monkeypatch):
     marked = tmp_path / "model.toml"
     save_model(replace(load_model(ROBOT.parent / "wombot_model.toml"), missing_effects=("turn_slip",)), marked)
     monkeypatch.setattr(run, "serve", lambda *_: 0)

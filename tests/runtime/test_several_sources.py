@@ -169,14 +169,14 @@ def test_check_shows_each_and_that_two_disagree(tmp_path):
     lines = (
         '[pose]\nsource = "udp"\n[[pose.also]]\nsource = "robot"\n[[pose.also]]\nsource = "nmea"\noffset = [0.1, 0.0]\n'
     )
-    told = load_robot_config(robot_toml(tmp_path, lines)).pose
+    reported = load_robot_config(robot_toml(tmp_path, lines)).pose
     poses = [PoseSample(t, t + 30_000_000, 1.0, 2.0, 0.5, 0.01, 0.02) for t in range(30)]
     assert pose_source_checks(load_robot_config(ROBOT_FILE).pose, poses) == []
     poses += [PoseSample(t, t + 5_000_000, 1.5, 2.0, 0.5, 0.01, 0.02, source=1) for t in range(9)]
-    found = {check.name: f"{check.level.value} {check.text}" for check in pose_source_checks(told, poses)}
+    found = {check.name: f"{check.level.value} {check.text}" for check in pose_source_checks(reported, poses)}
     assert found["poses udp"].startswith("ok 10 a second, 30 ms old, 0.01 m, 0.02 rad; frame at [0.0, 0.0, 0.0]")
     assert found["poses nmea"].endswith("none came; frame at [0.0, 0.0, 0.0], sensor at [0.1, 0.0]; see that it sends")
     assert "0.50 m apart, beyond their stated noise" in found["poses udp and robot"]
     turned = [PoseSample(t, t, 1.0, 2.0, 0.9, 0.01, 0.02, source=1) for t in range(9)]
-    (last,) = [each for each in pose_source_checks(told, [*poses[:30], *turned]) if "apart" in each.text]
+    (last,) = [each for each in pose_source_checks(reported, [*poses[:30], *turned]) if "apart" in each.text]
     assert last.text.startswith("0.40 rad apart,")

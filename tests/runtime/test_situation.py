@@ -1,4 +1,4 @@
-"""Every fault and state of the protocol is told with what to do about it."""
+"""Every fault and state of the protocol is reported with what to do about it."""
 
 from pathlib import Path
 
@@ -91,7 +91,7 @@ def test_a_fault_and_a_latched_stop_come_before_everything_else():
     assert advice({**STATUS, "robot_state": "ESTOP"}) == both[:1]
 
 
-def test_a_fault_that_is_not_known_here_is_told_all_the_same():
+def test_an_unknown_fault_is_reported_too():
     assert advice({**STATUS, "fault": "NEW_TROUBLE"})[0].startswith("New trouble. Not known here")
 
 

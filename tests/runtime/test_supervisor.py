@@ -76,7 +76,7 @@ def test_a_problem_means_fault_in_words_without_motion(start, changes, words):
     assert out.estop == (changes.get("driver_state") is DriverState.ESTOP)
 
 
-def test_a_fault_whose_words_end_with_the_remedy_is_told_it_once():
+def test_a_fault_whose_words_end_with_the_remedy_has_it_once():
     bench = Bench()
     bench.running()
     out = bench.tick(driver_state=DriverState.FAULT, driver_detail="node 3 fell silent; remove the cause, then reset")

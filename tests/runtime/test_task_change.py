@@ -87,13 +87,13 @@ def test_at_the_fastest_speed_the_outer_wheel_is_at_its_limit():
     assert outer_rad_s == pytest.approx(ROBOT.max_wheel_speed_rad_s)
 
 
-def test_a_record_tells_the_whole_task():
+def test_a_record_holds_the_whole_task():
     task = CircleTask(center_x_m=1.0, center_y_m=-2.0, radius_m=0.5, speed_m_s=0.1)
     assert task_of(record_of(7, task), CircleTask()) == task
     assert record_of(7, task).t_ns == 7
 
 
-def test_a_record_tells_the_kind_and_what_can_be_changed():
+def test_a_record_holds_the_kind_and_what_can_be_changed():
     assert record_of(7, CircleTask()).kind == "circle"
     assert record_of(7, LINE) == records.Task(7, "path", {"speed_m_s": 0.2})
     assert record_of(7, TIMED) == records.Task(7, "timed_path", {})
@@ -126,7 +126,7 @@ def test_of_a_path_only_the_speed_can_be_changed():
         changed_task(LINE, {"speed_m_s": 0.3}, ROBOT, State.ARMED)
 
 
-def test_a_status_and_a_record_tell_of_a_path_without_its_way_points():
+def test_a_status_and_a_record_hold_a_path_without_its_way_points():
     other = msgspec.structs.replace(LINE, speed_m_s=0.1)
     asked = asked_of(other)
     assert "points" not in asked
@@ -157,8 +157,8 @@ def test_another_circle_is_driven_recorded_and_replayed_bit_for_bit(tmp_path):
     stack.run(0.5, UserRequest.ARM)
     stack.run(6.0, UserRequest.START)
     stack.run(0.5, UserRequest.DISARM)
-    told = [record for _, tick in stack.recorder.ticks for record in tick if isinstance(record, records.Task)]
-    assert [task_of(record, CircleTask()) for record in told] == [stack.core.task]
+    reported = [record for _, tick in stack.recorder.ticks for record in tick if isinstance(record, records.Task)]
+    assert [task_of(record, CircleTask()) for record in reported] == [stack.core.task]
     estimate = stack.core.last.pipeline.estimate
     off_new, off_old = (math.hypot(estimate.x_m - x, estimate.y_m) - r for x, r in ((0.25, 0.5), (0.0, 0.75)))
     assert abs(off_new) < 0.07 < abs(off_old)

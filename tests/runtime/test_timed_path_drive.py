@@ -37,8 +37,8 @@ def test_way_points_are_met_at_their_times_to_the_end_and_replayed_and_shown_wit
     assert np.hypot(*(places[240:290] - (0.9, 0.0)).T).max() < 0.1
     assert 11.0 < 0.02 * len(places) < 14.0
     assert np.hypot(*(places[-1] - (1.4, 0.7))) < 0.08
-    told = [text for _, tick in stack.recorder.ticks for text in (getattr(r, "text", "") for r in tick)]
-    assert "task stopped: the path's end is reached" in told
+    reported = [text for _, tick in stack.recorder.ticks for text in (getattr(r, "text", "") for r in tick)]
+    assert "task stopped: the path's end is reached" in reported
     stack.run(0.5)
     assert stack.core.last.output.state is State.ARMED
     assert stack.core.last.pipeline.source is Source.HOLD

@@ -26,7 +26,7 @@ from tests.drivers.waiting import wait_until
 from tests.sim.minimal_host import MinimalHost
 
 COMMAND_TIMEOUT_S = 0.5
-# The firmware gives its host as long as it can be told to: a test that is held up for 0.1 s has not let go.
+# The firmware gives its host as long as it can be set to: a test that is held up for 0.1 s has not let go.
 PATIENT = f"""
 import sys
 from firmware_protocol.firmware_core import FirmwareConfig
@@ -336,6 +336,6 @@ def test_a_full_disk_ends_the_records_not_the_robot(start):
     assert robot.state()["state"] == "STANDBY"
     code, errors = robot.stop()
     assert code == 1
-    told = "/dev/full: No space left on device; nothing more is recorded in it"
-    assert errors.count(told) == 2
+    reported = "/dev/full: No space left on device; nothing more is recorded in it"
+    assert errors.count(reported) == 2
     assert "Traceback" not in errors

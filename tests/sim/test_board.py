@@ -65,7 +65,7 @@ def test_a_board_drives_a_virtual_robot_and_stops_when_it_goes(tmp_path, program
             assert host.latest["BUILD"]["board_id"] == 0x8007
             before = host.latest["WHEEL_TICKS"]["left_ticks"]
             host.to_driving()
-            # What the plant's wheels did is what the board counts, and what its pose sensor saw is what it tells.
+            # What the plant's wheels did is what the board counts, and what its pose sensor saw is what it sends.
             host.wait_for("a pose", lambda: host.latest.get("POSE_POSITION", {}).get("valid") == 1)
             host.wait_for("turning wheels", lambda: host.latest["WHEEL_TICKS"]["left_ticks"] - before > 500, 20.0)
             assert host.latest["POWER"]["voltage"] == pytest.approx(25.0, abs=0.5)
@@ -105,17 +105,17 @@ def said(left, right, *, flags=1, state=3):
 
 
 def test_the_wheels_turn_as_the_board_says_until_it_falls_silent():
-    robot, told = robot_at_rest(), []
+    robot, reported = robot_at_rest(), []
     for step in range(1, 1001):
         if step <= 500:
             for frame in said(2.0, 3.0):
                 robot.receive(step * 1000, frame)
-        told += [frame.can_id for frame in robot.step(step * 1000)]
+        reported += [frame.can_id for frame in robot.step(step * 1000)]
         if step == 500:
             assert robot.outputs.state == "ARMED"
             assert robot.outputs.accepted_commands == 9
             assert robot.truth.right_speed_rad_s == pytest.approx(3.0, rel=0.05)
-    assert told.count(WHEELS) == 500
+    assert reported.count(WHEELS) == 500
     assert robot.silent
     assert not robot.outputs.driver_enabled
     assert robot.outputs.brake
@@ -131,14 +131,14 @@ def test_setpoints_that_are_no_numbers_turn_nothing(value):
     assert robot.outputs.left_setpoint_rad_s == robot.outputs.right_setpoint_rad_s == 0.0
 
 
-def test_a_pose_is_told_with_its_age_and_never_better_than_it_is():
+def test_a_pose_is_reported_with_its_age_and_never_better_than_it_is():
     robot = robot_at_rest()
-    told = [frame for step in range(1, 101) for frame in robot.step(step * 1000)]
-    heading = next(frame for frame in told if frame.can_id == HEADING)
+    reported = [frame for step in range(1, 101) for frame in robot.step(step * 1000)]
+    heading = next(frame for frame in reported if frame.can_id == HEADING)
     _, age, position_mm, yaw_mrad = struct.unpack("<fHBB", heading.data)
     assert age == pytest.approx(300, abs=11)
     assert (position_mm, yaw_mrad) == (5, 9) or position_mm == yaw_mrad == 0
-    assert sum(frame.can_id == POSITION for frame in told) == sum(frame.can_id == HEADING for frame in told)
+    assert sum(frame.can_id == POSITION for frame in reported) == sum(frame.can_id == HEADING for frame in reported)
 
 
 class NeverStopped:
@@ -183,9 +183,9 @@ def refused(capsys, **options):
 def test_a_line_on_which_no_virtual_robot_is_awaited_is_refused(line, capsys, monkeypatch):
     monkeypatch.setattr(app, "BOARD_S", 0.3)
     port = line(0x130, bytes(8))
-    told = refused(capsys, board=port)
-    assert f"--board {port}: no plant's line answers here" in told
-    assert "-DDISCO_PLANT_LINE" in told
+    reported = refused(capsys, board=port)
+    assert f"--board {port}: no plant's line answers here" in reported
+    assert "-DDISCO_PLANT_LINE" in reported
 
 
 @pytest.mark.parametrize(("about", "words"), [(b"\x01\x00\x00\x04", "1024 ticks"), (b"\x02\x00\x00\x08", "version 2")])

@@ -27,8 +27,8 @@ class Rig:
         self.robot = VirtualRobot(Plant(), FirmwareConfig(ticks_per_rev=2048, max_wheel_speed_rad_s=8.0))
         self.can = SimulatedCan()
         self.can.host.open()
-        self.told = []
-        self.player = FaultPlayer(self.schedule, self.robot, self.can, 0, self.told.append, processes)
+        self.reported = []
+        self.player = FaultPlayer(self.schedule, self.robot, self.can, 0, self.reported.append, processes)
         self.ms = 0
         self.heard = []
 
@@ -50,7 +50,7 @@ def test_one_way_loss_silences_one_side_and_ends():
     assert len(rig.heard) <= 1
     rig.run(300)
     assert len(rig.heard) > 20
-    assert rig.told == ["fault 1 begins: one_way to=host", "fault 1 ends: one_way"]
+    assert rig.reported == ["fault 1 begins: one_way to=host", "fault 1 ends: one_way"]
     assert rig.player.frames.struck[1] > 20
 
 
@@ -129,25 +129,25 @@ def test_a_line_may_be_out_for_hours():
     rig = Rig('kind="unplug"\nat_s=0.05\nfor_s=5000')
     rig.run(100)
     assert rig.can.host.node is None
-    assert rig.told == ["fault 1 begins: unplug"]
+    assert rig.reported == ["fault 1 begins: unplug"]
 
 
 class Processes:
     def __init__(self):
-        self.told = []
+        self.reported = []
 
     def begin(self, fault):
-        self.told.append(("+", fault.kind.name))
+        self.reported.append(("+", fault.kind.name))
 
     def end(self, fault):
-        self.told.append(("-", fault.kind.name))
+        self.reported.append(("-", fault.kind.name))
 
 
 def test_faults_of_processes_go_to_whoever_has_them_in_hand():
     processes = Processes()
     rig = Rig('kind="sigstop"\nat_s=0.01\nfor_s=0.01', 'kind="drop"\nat_s=0.01\nfor_s=0.01', processes=processes)
     rig.run(50)
-    assert processes.told == [("+", "sigstop"), ("-", "sigstop")]
+    assert processes.reported == [("+", "sigstop"), ("-", "sigstop")]
 
 
 @pytest.mark.parametrize(
@@ -228,7 +228,7 @@ def test_unplug_lasts_as_long_as_asked(tmp_path, link, injection):
     assert (tmp_path / "hub").exists()
 
 
-def test_babble_at_its_rate_until_told_to_stop(link, injection):
+def test_babble_at_its_rate_until_asked_to_stop(link, injection):
     assert injection.execute("babble 0x100 200", 0) == "ok"
     frames = babbled(injection, link, 1000)
     assert len(frames) == pytest.approx(200, abs=2)

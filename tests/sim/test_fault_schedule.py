@@ -18,12 +18,12 @@ from sim.fault_schedule import (
 @contextmanager
 def one_line_at_most():
     """Nothing is raised but the one line for the user."""
-    told = ""
+    reported = ""
     try:
         yield
     except FaultFileError as error:
-        told = str(error)
-    assert "\n" not in told
+        reported = str(error)
+    assert "\n" not in reported
 
 
 def test_a_schedule_is_in_order_with_defaults_and_numbers():

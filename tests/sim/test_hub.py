@@ -157,7 +157,7 @@ def test_a_full_bus_slows_its_sender_down_and_loses_nothing(hub):
     assert now_ns - T0 > 1000 * 60 * 2000
 
 
-def test_a_reader_that_never_reads_is_bounded_counted_and_told(hub):
+def test_a_reader_that_never_reads_is_bounded_counted_and_reported(hub):
     robot = hub.bus.attach("robot", capacity=64)
     sleeper, reader = Client(hub), Client(hub)
     got, now_ns = 0, T0
@@ -447,7 +447,7 @@ def test_waiting_frames_can_be_let_in_a_few_at_a_time(link, bus):
     assert len(link.advance(9 * MS)) == 1
 
 
-def test_a_host_in_bus_off_is_told_and_cut_off(link, bus):
+def test_a_host_in_bus_off_is_reported_and_cut_off(link, bus):
     link.force_bus_off("host")
     run(link, 0, MS)
     assert bus.recv(30).is_error_frame

@@ -142,16 +142,16 @@ def names(faults):
     return [fault.kind.name for fault in faults]
 
 
-def test_the_timeline_tells_each_beginning_and_end_once():
+def test_the_timeline_reports_each_beginning_and_end_once():
     timeline = FaultTimeline(
         schedule('kind="drop"\nat_s=0.01\nfor_s=0.02', 'kind="brown_out"\nat_s=0.015', 'kind="unplug"\nat_s=1\nfor_s=1')
     )
-    told = []
+    reported = []
     for ms in range(0, 50):
         begun, ended = timeline.step(ms * MS)
-        told += [(ms, "+", name) for name in names(begun)] + [(ms, "-", name) for name in names(ended)]
+        reported += [(ms, "+", name) for name in names(begun)] + [(ms, "-", name) for name in names(ended)]
         assert names(timeline.active) == (["drop"] if 10 <= ms < 30 else [])
-    assert told == [(10, "+", "drop"), (15, "+", "brown_out"), (15, "-", "brown_out"), (30, "-", "drop")]
+    assert reported == [(10, "+", "drop"), (15, "+", "brown_out"), (15, "-", "brown_out"), (30, "-", "drop")]
     assert not timeline.done
     begun, ended = timeline.step(5000 * MS)
     assert (names(begun), names(ended)) == (["unplug"], ["unplug"])

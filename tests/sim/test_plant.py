@@ -260,7 +260,7 @@ def test_time_cannot_go_back():
         plant.step(4000, 0.0, 0.0)
 
 
-def test_wheel_disturbance_shows_in_ticks_and_pose_alike():
+def test_wheel_disturbance_shows_in_ticks_and_in_the_pose():
     plant = Plant(replace(STILL, wheel_disturbance_std=0.015).with_ideal_motors(), seed=4)
     speeds = []
     for _ in range(4000):

@@ -31,8 +31,8 @@ def test_signal_wakes_and_is_remembered(number):
 
 
 def test_lines_are_there_after_flush_and_close(tmp_path):
-    told = []
-    record = TextRecord(tmp_path / "record", told.append)
+    reported = []
+    record = TextRecord(tmp_path / "record", reported.append)
     record.line("one")
     record.flush()
     assert (tmp_path / "record").read_text() == "one\n"
@@ -40,20 +40,20 @@ def test_lines_are_there_after_flush_and_close(tmp_path):
     record.close()
     record.close()
     assert (tmp_path / "record").read_text() == "one\ntwo\n"
-    assert (told, record.error) == ([], None)
+    assert (reported, record.error) == ([], None)
 
 
 @pytest.mark.parametrize("end", ["flush", "close"])
-def test_a_full_disk_is_told_once_and_nothing_raises(end):
-    told = []
-    record = TextRecord(Path("/dev/full"), told.append)
+def test_a_full_disk_is_reported_once_and_nothing_raises(end):
+    reported = []
+    record = TextRecord(Path("/dev/full"), reported.append)
     record.line("one")
     getattr(record, end)()
     record.line("two" * 100_000)
     record.flush()
     record.close()
-    assert told == ["/dev/full: No space left on device; nothing more is recorded in it"]
-    assert record.error == told[0]
+    assert reported == ["/dev/full: No space left on device; nothing more is recorded in it"]
+    assert record.error == reported[0]
 
 
 def test_an_impossible_path_raises(tmp_path):

@@ -173,7 +173,7 @@ def test_a_board_behind_slcan_sits_on_the_mock_bus_beside_other_nodes(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "reported"),
     [
         (["slcan", "{folder}/none"], "cannot be opened"),
         (["virtual", "bus", "sleep_after_open"], "write KEY=JSON"),
@@ -181,8 +181,8 @@ def test_a_board_behind_slcan_sits_on_the_mock_bus_beside_other_nodes(tmp_path):
         (["slcan"], "cannot be opened"),
     ],
 )
-def test_what_cannot_be_joined_is_said_in_one_line(words, told, tmp_path):
+def test_what_cannot_be_joined_is_said_in_one_line(words, reported, tmp_path):
     words = [word.format(folder=tmp_path) for word in words]
-    with pytest.raises(JoinError, match=told) as error:
+    with pytest.raises(JoinError, match=reported) as error:
         joined(words, 0, 500_000)
     assert "\n" not in str(error.value)

@@ -151,7 +151,7 @@ def test_ticks_are_whole_and_never_more_than_one_behind_the_angle():
     assert behind.max() < 1.0
 
 
-def test_the_count_starts_where_it_is_told_to():
+def test_the_count_starts_where_it_is_set():
     parameters = PlantParameters(encoder_start_left_ticks=2**24 - 3, encoder_start_right_ticks=-7)
     encoders = Encoders(parameters, hidden_effects({}))
     assert encoders.ticks == (2**24 - 3, -7)

@@ -108,7 +108,7 @@ def test_own_messages_on_request(hub):
         assert bus.recv(30).arbitration_id == 0x123
 
 
-def test_descriptor_tells_of_waiting_frames(hub):
+def test_descriptor_is_readable_while_frames_wait(hub):
     with UnixCanBus(hub) as a, UnixCanBus(hub) as b:
         assert select.select([b.fileno()], [], [], 0)[0] == []
         a.send(MESSAGES[0])

@@ -176,7 +176,7 @@ def test_the_estop_button_stops_and_latches(setup):
     assert setup.wheel_speed() == 0.0
 
 
-def test_ticks_and_pose_tell_what_the_plant_does(setup):
+def test_ticks_and_pose_show_what_the_plant_does(setup):
     setup.arm()
     setup.host.speeds = (3.0, 3.0)
     setup.run(2000)
@@ -269,7 +269,7 @@ def challenges(**options):
 
 def test_every_start_and_every_restart_draws_a_challenge_of_its_own():
     seen = [challenge for _ in range(3) for challenge in challenges()]
-    assert len(set(seen)) >= len(seen) - 1, "of 65535; two alike may happen, three hardly ever"
+    assert len(set(seen)) >= len(seen) - 1, "of 65535; two equal ones may happen, three hardly ever"
 
 
 def test_only_a_seed_that_is_asked_for_by_name_repeats_them():

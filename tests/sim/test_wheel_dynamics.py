@@ -90,7 +90,7 @@ def test_the_loop_works_off_the_load_of_turning():
     assert bench.wheels.torques_nm[1] == pytest.approx(0.15 + 3 * 0.02 + 0.25, abs=0.01)
 
 
-def test_a_wheel_that_is_told_to_stop_stands_still():
+def test_a_wheel_that_is_commanded_to_stop_stands_still():
     bench = Bench(STILL)
     bench.run(0.5, -3.0, 5.0)
     assert np.all(bench.run(1.0, 0.0, 0.0)[-1] == 0.0)

@@ -102,7 +102,7 @@ def test_the_stamp_is_the_kernels_not_that_of_reading(other):
         connection.close()
 
 
-def test_the_kernels_filter_lets_through_what_it_is_told(other):
+def test_the_kernels_filter_lets_through_what_it_is_set_to(other):
     with can.Bus(VCAN, "socketcan", can_filters=[{"can_id": 0x120, "can_mask": 0x7F0}]) as bus:
         for can_id in (0x11F, 0x120, 0x12F, 0x130):
             other.send(can_id)
@@ -129,7 +129,7 @@ def test_an_interface_that_goes_down_is_waited_for(transport):
     assert not transport.send(outgoing(), time.monotonic_ns())
     ip("set", VCAN, "up")
     wait_until(lambda: transport.state is LinkState.UP and transport.generation > generation, PATIENCE_S)
-    # A raw socket keeps the error of the time when the interface was down until it has been told once.
+    # A raw socket keeps the error of the time when the interface was down until it has been read once.
     RawSocket().send(0x110, b"again")
     assert collect(transport, 1, PATIENCE_S)[-1].frame.data == b"again"
 

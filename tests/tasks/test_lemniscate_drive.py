@@ -60,8 +60,8 @@ def test_a_lemniscate_is_driven_changed_recorded_and_replayed_bit_for_bit(tmp_pa
     assert shown["asked"]["kind"] == "lemniscate"
     assert shown["labels"]["size_m"] == "Size (m)"
     assert set(shown["limits"]) == {"size_m", "speed_m_s", "center_x_m", "center_y_m"}
-    told = [record for _, tick in stack.recorder.ticks for record in tick if isinstance(record, records.Task)]
-    assert [(record.kind, record.settings["size_m"]) for record in told] == [("lemniscate", 1.0)]
+    reported = [record for _, tick in stack.recorder.ticks for record in tick if isinstance(record, records.Task)]
+    assert [(record.kind, record.settings["size_m"]) for record in reported] == [("lemniscate", 1.0)]
     log = write_log(tmp_path / "run.mcap", stack.recorder.ticks, robot_file.read_text())
     report = replay(log)
     assert report.ok, report.as_text()

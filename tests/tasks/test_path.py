@@ -176,7 +176,7 @@ def test_a_path_without_length_is_refused():
 
 @pytest.mark.parametrize("broken", [{"x_m": math.nan}, {"y_m": -math.inf}, {"yaw_rad": math.nan}])
 @pytest.mark.parametrize("waypoints", [EIGHT, BACK, CORNER])
-def test_a_state_that_is_none_is_told_and_forgotten(waypoints, broken):
+def test_a_state_that_is_none_is_reported_and_forgotten(waypoints, broken):
     disco = Disco(MODEL, path_along(waypoints), DiscoSettings(), CommandLimits(8.0, 20.0), 2)
     good = PlannerState(0, 0.1, 0.0, 0.0, 0.0, 0.0)
     disco.plan(0, good)

@@ -17,7 +17,7 @@ from disco_hw.tasks.path import PathTask
 
 PACKAGE = Path(disco_hw.__file__).parent
 # The experiments are the paper's and ours on the circle, and one of the scripts to drive by hand is its circle. A log's
-# path, as the recorder's status tells it, is no task.
+# path, as the recorder's status holds it, is no task.
 ELSEWHERE = {
     "circle": ("experiments/", "drive/scripts.py"),
     # The word is the name of a field there: of the way-points' file, of a reply.

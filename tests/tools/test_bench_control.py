@@ -30,7 +30,7 @@ def test_the_ratio_is_of_times_in_the_same_run():
     assert figures["control.x_bare_loop_ms.min"] > 0.01
 
 
-def test_calls_are_told_their_number_and_summed_up():
+def test_calls_are_given_their_number_and_summed_up():
     numbers = []
     with undisturbed():
         taken = times_ms(numbers.append, 5, left_out=2)

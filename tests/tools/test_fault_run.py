@@ -13,7 +13,7 @@ from tools.fault_run import FaultRun
 FAST = {"cycle_us": 5000}
 
 
-def test_without_faults_it_drives_and_nothing_is_told():
+def test_without_faults_it_drives_and_nothing_is_reported():
     run = FaultRun(FaultSchedule(0, ()), **FAST)
     outcome = run.run(6.0)
     assert outcome.violations == []
@@ -73,7 +73,7 @@ def test_what_each_fault_comes_to_is_seen_in_a_counter(fault, stops):
         ('kind="pose_frozen"\nfor_s=0.15', "poses_frozen"),
     ],
 )
-def test_a_fault_too_short_to_stop_for_is_counted_and_told(fault, counter):
+def test_a_fault_too_short_to_stop_for_is_counted_and_reported(fault, counter):
     run = FaultRun(parse_schedule(f"[[fault]]\nat_s=4\n{fault}"), seed=3, **FAST)
     (seen,) = run.run(9.0).faults
     assert seen.armed_before

@@ -1,4 +1,4 @@
-"""A little of the campaign, and proof that it would tell."""
+"""A little of the campaign, and proof that it would report."""
 
 import os
 import random
@@ -26,7 +26,7 @@ def test_hostile_files_are_read_or_refused_in_one_line(tmp_path):
     ("error", "words"),
     [(IndexError("out of range"), "IndexError"), (fuzz.InputError("first\nsecond"), "more than one line")],
 )
-def test_what_gets_through_is_told_and_the_file_kept(tmp_path, monkeypatch, error, words):
+def test_what_gets_through_is_reported_and_the_file_kept(tmp_path, monkeypatch, error, words):
     def fail(path):
         raise error
 
@@ -56,7 +56,7 @@ def test_every_verb_reads_or_refuses_hostile_files(tmp_path):
         (lambda argv: os._exit(3), "no answer"),
     ],
 )
-def test_what_a_verb_lets_through_is_told_and_the_file_kept(tmp_path, monkeypatch, fails, words):
+def test_what_a_verb_lets_through_is_reported_and_the_file_kept(tmp_path, monkeypatch, fails, words):
     monkeypatch.setattr(fuzz, "CALL_S", 1 if words == "TooSlowError" else 60)
     monkeypatch.setattr(fuzz.verb_calls, "CALLS", fuzz.verb_calls.CALLS[:1])
     parent, call = os.getpid(), fuzz.verb_calls.call

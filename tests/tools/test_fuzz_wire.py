@@ -11,7 +11,7 @@ def test_a_short_campaign_is_sound(name):
     assert campaign(name, 1500, 1) == []
 
 
-def test_what_raises_or_keeps_what_it_is_given_is_told(monkeypatch):
+def test_what_raises_or_keeps_what_it_is_given_is_reported(monkeypatch):
     kept = []
 
     def keep(generator: random.Random):

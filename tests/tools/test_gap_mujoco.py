@@ -101,6 +101,6 @@ def test_the_search_names_a_delay_and_a_latency_of_a_robot_that_is_not_ours(tmp_
     nothing, delay, latency = results
     assert delay.right
     assert latency.right
-    # What is told of the robot as it is, is no delay that one would notice.
+    # What is reported of the robot as it is, is no delay that one would notice.
     assert nothing.named.get("command_delay", {"delay_s": 0.0})["delay_s"] < 0.05
     assert nothing.named.get("pose_latency", {"latency_s": 0.0})["latency_s"] < 0.05

@@ -1,4 +1,4 @@
-"""What uv is told of pip's settings, and that pip installs where uv cannot."""
+"""What uv is given of pip's settings, and that pip installs where uv cannot."""
 
 import subprocess
 import sys
@@ -10,7 +10,7 @@ from tools import install
 from tools.install import uv_variables
 
 
-def test_uv_is_told_what_pip_is():
+def test_uv_is_given_what_pip_is():
     settings = (
         ":env:.find-links='/wheels /more'\n"
         "global.cert='/certificates.crt'\n"

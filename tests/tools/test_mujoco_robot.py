@@ -65,7 +65,7 @@ def test_it_turns_as_skid_steer_robots_do(wheels):
     speeds, yaw_rate = steady(record({}, 1, held(*wheels)))
     rolled = WHEEL_RADIUS_M * (speeds[[1, 3]].mean() - speeds[[0, 2]].mean())
     assert 1.3 < rolled / yaw_rate / TRACK_M < 2.6
-    # The contact holds the turn up, and the servos droop alike, however fast they are asked to turn.
+    # The contact holds the turn up, and the servos droop equally, however fast they are asked to turn.
     short = abs(wheels[1] - wheels[0]) - abs(speeds[[1, 3]].mean() - speeds[[0, 2]].mean())
     assert 0.34 < short / 2.0 < 0.44
 

@@ -1,4 +1,4 @@
-"""Scores that tell a sharper posterior from a blunter one, whatever lies outside the region."""
+"""Scores that distinguish a sharper posterior from a blunter one, whatever lies outside the region."""
 
 import numpy as np
 import pytest

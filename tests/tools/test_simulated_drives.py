@@ -45,7 +45,7 @@ def test_the_seed_decides_the_drive(name):
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_the_rich_drive_contains_what_tells_effects_apart(seed):
+def test_the_rich_drive_contains_what_distinguishes_effects(seed):
     drive = make_drive("rich", seed)
     assert 140.0 <= drive.duration_s <= 160.0
     for phase, share in (("straight slow", 0.35), ("straight fast", 0.95), ("reverse slow", -0.35)):

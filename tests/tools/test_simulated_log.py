@@ -95,7 +95,7 @@ def test_the_seed_decides_everything_and_counters_start_anywhere():
     assert len(starts) == 2
 
 
-def test_time_stamps_jitter_as_told():
+def test_time_stamps_jitter_as_asked():
     log = columns(simulated_log(CIRCLE, IDEAL, seed=1, options=LogOptions(lateness_s=0.0, stamp_jitter_s=0.002)))
     for name, period_s in (("cmd_left_rad_s", 0.02), ("enc_left_ticks", 0.02), ("pose_x_m", 0.04)):
         off = np.diff(log["t_s"][~np.isnan(log[name])]) - period_s
@@ -143,10 +143,10 @@ def test_the_command_writes_log_and_truth(tmp_path, capsys):
     arguments = [str(log), "--drive", "poor", "--seed", "4", "--hide", "turn_slip=0.1", "--hide", "wheel_gain=0.02,0"]
     assert main([*arguments, "--vary", "--truth", str(truth)]) == 0
     assert "rows" in capsys.readouterr().out
-    told = json.loads(truth.read_text(), parse_constant=pytest.fail)
-    assert told["effects"] == {"turn_slip": [0.1], "wheel_gain": [0.02, 0.0]}
-    assert told["parameters"]["wheel_radius_m"] == varied_parameters(PlantParameters(), 4).wheel_radius_m
-    assert told["parameters"]["max_motor_torque_nm"] is None
+    reported = json.loads(truth.read_text(), parse_constant=pytest.fail)
+    assert reported["effects"] == {"turn_slip": [0.1], "wheel_gain": [0.02, 0.0]}
+    assert reported["parameters"]["wheel_radius_m"] == varied_parameters(PlantParameters(), 4).wheel_radius_m
+    assert reported["parameters"]["max_motor_torque_nm"] is None
     before = log.read_bytes()
     assert main([*arguments, "--vary"]) == 0
     assert log.read_bytes() == before

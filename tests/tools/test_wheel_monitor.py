@@ -1,4 +1,4 @@
-"""The monitor sees what it is there for: each violation that it can tell, committed once."""
+"""The monitor sees what it is there for: each violation that it can see, committed once."""
 
 import dataclasses
 
@@ -90,23 +90,23 @@ def test_a_robot_that_obeys_is_left_alone():
         ),
     ],
 )
-def test_each_violation_is_told(commit, words):
+def test_each_violation_is_reported(commit, words):
     scene = Scene()
     commit(scene)
     assert any(words in text for text in scene.monitor.violations), scene.monitor.violations
 
 
-@pytest.mark.parametrize(("cycles_armed", "told"), [(21, False), (24, True)])
-def test_the_watchdog_runs_from_the_instant_of_arming(cycles_armed, told):
+@pytest.mark.parametrize(("cycles_armed", "reported"), [(21, False), (24, True)])
+def test_the_watchdog_runs_from_the_instant_of_arming(cycles_armed, reported):
     scene = Scene(state="READY", driver_enabled=False)
     for _ in range(3):
         scene.step()
     for _ in range(cycles_armed):
         scene.step(state="ARMED", driver_enabled=True)
-    assert any("ARMED 0.1" in text for text in scene.monitor.violations) is told, scene.monitor.violations
+    assert any("ARMED 0.1" in text for text in scene.monitor.violations) is reported, scene.monitor.violations
 
 
-def test_an_arming_without_a_command_shortly_before_is_told():
+def test_an_arming_without_a_command_shortly_before_is_reported():
     scene = Scene(state="READY", driver_enabled=False)
     for _ in range(23):
         scene.step()
@@ -115,14 +115,14 @@ def test_an_arming_without_a_command_shortly_before_is_told():
     assert any("armed 0.120 s after" in text for text in scene.monitor.violations), scene.monitor.violations
 
 
-def test_a_stop_that_does_not_slow_down_is_told():
+def test_a_stop_that_does_not_slow_down_is_reported():
     scene = Scene(left_setpoint_rad_s=2.0, right_setpoint_rad_s=2.0)
     for _ in range(5):
         scene.step(state="STOPPING")
     assert any("is due" in text for text in scene.monitor.violations)
 
 
-def test_a_command_of_an_ended_session_is_told():
+def test_a_command_of_an_ended_session_is_reported():
     scene = Scene()
     scene.step(state="STOPPING", driver_enabled=False)
     scene.accept(command(0.0, 0.0, 2), state="STANDBY")

@@ -1,6 +1,6 @@
 """`disco-hw import`: a foreign log -> our MCAP log.
 
-The formats are modules here, each with a `FORMAT`, told apart by their first bytes. A format gives the arrays of a
+The formats are modules here, each with a `FORMAT`, recognised by their first bytes. A format gives the arrays of a
 drive; here they become records of the log; `drive_from_log` reads the same arrays from it again.
 """
 

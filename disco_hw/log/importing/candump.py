@@ -31,7 +31,7 @@ def read_candump(path: Path, robot: Robot) -> DriveLog:
     """Commands, wheels and poses of a dump, stamped with their reception; raises LogError.
 
     A command counts until the next one or as long as it is valid; frames that fail their check are left out, with a
-    note. Ticks per revolution and the largest speed, which tell a jump from motion, are robot.toml's.
+    note. Ticks per revolution and the largest speed, which distinguish a jump from motion, are robot.toml's.
     """
     codec = Codec()
     reception, telemetry = FrameReception(codec), Telemetry(DeviceClock())
@@ -75,7 +75,7 @@ def _frames(path: Path) -> Iterator[ReceivedFrame]:
         with can.CanutilsLogReader(cast(TextIO, read_lines(path, CANDUMP))) as reader:
             for number, message in enumerate(reader, start=1):
                 t_ns = round(message.timestamp * 1e9)
-                # Since the first frame: nanoseconds since 1970 are more than a float can tell apart.
+                # Since the first frame: nanoseconds since 1970 need more digits than a float has.
                 first_ns = first_ns or t_ns
                 if t_ns < last_ns:
                     raise LogError(f"{path}: frame {number}: the clock goes backwards; sort the lines by time")

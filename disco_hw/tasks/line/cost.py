@@ -28,7 +28,7 @@ TERMINAL_M = 0.2
 TURN_WEIGHT = 2.0
 # Beliefs this close share a table.
 SAME_X_ICR_M = 0.005
-# Entries of the table that rollouts see relative to the same point: few, as single precision tells 0.1 um of 1 m.
+# Entries of the table that rollouts see relative to the same point: few, as single precision resolves 0.1 um of 1 m.
 NEAR = 50
 _ZERO, _ONE, _TWO, _AGAINST = single(0.0), single(1.0), single(2.0), single(AGAINST_M)
 

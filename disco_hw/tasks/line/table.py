@@ -172,18 +172,18 @@ def sharp_turns(points: Array, closed: bool, reach: int) -> list[int]:
     """Indices of points (M + 1, 2) where the way turns by more than SHARP_RAD from `reach` points to the next `reach`.
 
     The sharpest of any that are within `reach` of one another; in rising order. The last point of a closed way is its
-    first, and not told again.
+    first, and not listed again.
     """
     count = len(points) - 1
     index = np.arange(count) if closed else np.arange(1, count)
     before, after = index - reach, index + reach
     before, after = (before % count, after % count) if closed else (np.maximum(before, 0), np.minimum(after, count))
     came, goes = points[index] - points[before], points[after] - points[index]
-    alike = (came * goes).sum(axis=1)
-    sharp = alike < math.cos(SHARP_RAD) * np.hypot(*came.T) * np.hypot(*goes.T)
+    cosine = (came * goes).sum(axis=1)
+    sharp = cosine < math.cos(SHARP_RAD) * np.hypot(*came.T) * np.hypot(*goes.T)
     found: list[int] = []
     # Where the way turns back, points before the turn look as sharp, but not over as long a way.
-    for at in np.flatnonzero(sharp)[np.argsort(alike[sharp], kind="stable")]:
+    for at in np.flatnonzero(sharp)[np.argsort(cosine[sharp], kind="stable")]:
         apart = [abs(int(index[at]) - other) for other in found]
         if all(min(gap, count - gap) > reach if closed else gap > reach for gap in apart):
             found.append(int(index[at]))

@@ -66,7 +66,7 @@ class Bench:
             self.step()
 
     def arm(self):
-        """Bring the robot from wherever it rests to ARMED; from then on the host sends zeros until it is told more."""
+        """Bring the robot from wherever it rests to ARMED; from then on the host sends zeros until it is given more."""
         self.command = self.command or WheelCommand(0.0, 0.0, 0.1)
         self.run_until(DriverState.STANDBY, DriverState.READY)
         self.driver.request(Request.ARM)

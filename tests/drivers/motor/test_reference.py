@@ -139,19 +139,19 @@ def test_a_second_host_is_pointed_out_once_a_link():
     bench = make_bench()
     bench.run_until(*STILL)
     other = CODEC.encode("TIME_REQUEST", 0, sequence=1)
-    told = "another host is on the link: it sends TIME_REQUEST; disconnect it"
+    reported = "another host is on the link: it sends TIME_REQUEST; disconnect it"
     for _ in range(3):
         bench.inject_to_host(*other)
         bench.run(0.1)
-    assert bench.events.count(told) == 1
+    assert bench.events.count(reported) == 1
     bench.host_end.plug(False)
     bench.run(0.1)
     bench.host_end.plug(True)
     bench.run(0.5)
-    assert bench.events.count(told) == 1
+    assert bench.events.count(reported) == 1
     bench.inject_to_host(*other)
     bench.run(0.1)
-    assert bench.events.count(told) == 2
+    assert bench.events.count(reported) == 2
 
 
 def test_a_second_host_that_commands_motion_stops_the_robot_but_never_drives_it():
@@ -174,14 +174,14 @@ def test_an_estop_from_outside_is_no_second_host_and_is_said_once_a_stop():
     """As `disco-hw estop` sends it beside the daemon: three frames, which the robot and the driver both receive."""
     bench = make_bench()
     bench.arm()
-    told = "e-stop from outside on the link, by `disco-hw estop` or another host"
+    reported = "e-stop from outside on the link, by `disco-hw estop` or another host"
     for stops in (1, 2):
         for _ in range(3):
             bench.inject_to_robot(*CODEC.encode("ESTOP", reason="UNSPECIFIED"))
             bench.inject_to_host(*CODEC.encode("ESTOP", reason="UNSPECIFIED"))
             bench.run(0.02)
         bench.run(2.0)
-        assert bench.events.count(told) == stops
+        assert bench.events.count(reported) == stops
     assert bench.driver.state is DriverState.ESTOP
     assert not any("another host is on the link" in event for event in bench.events)
     assert bench.driver.stats.unknown_id == 0
@@ -335,7 +335,7 @@ def test_an_emergency_stop_of_ours_ends_the_wish_to_be_armed():
     assert not bench.robot.armed, "even if the frames themselves are lost"
 
 
-def test_faults_and_emergency_stops_are_told_in_words():
+def test_faults_and_emergency_stops_are_reported_in_words():
     bench = make_bench()
     bench.arm()
     bench.robot.press_estop(True)
@@ -349,18 +349,18 @@ def test_faults_and_emergency_stops_are_told_in_words():
     assert any(event == f"robot STANDBY -> FAULT, fault {bench.driver.detail[18:]}" for event in bench.events)
 
 
-def test_a_board_whose_wheels_are_virtual_is_told_from_a_robots():
+def test_a_board_whose_wheels_are_virtual_is_distinguished_from_a_robots():
     bench = make_bench(ReferenceRobot(replace(CONFIG, board_id=0x8003)))
     bench.run_until(*STILL)
     assert any("board 3 with VIRTUAL wheels" in event for event in bench.events)
 
 
-def test_each_event_is_told_once():
+def test_each_event_is_reported_once():
     bench = make_bench()
     bench.arm()
     bench.run(2.0)
-    told = [event for event in bench.events if not event.startswith("handshake complete: firmware 0.1.0, board 1")]
-    assert told == ["robot unknown -> STANDBY", "robot STANDBY -> READY", "robot READY -> ARMED"]
+    reported = [event for event in bench.events if not event.startswith("handshake complete: firmware 0.1.0, board 1")]
+    assert reported == ["robot unknown -> STANDBY", "robot STANDBY -> READY", "robot READY -> ARMED"]
     assert len(bench.events) == 4
 
 

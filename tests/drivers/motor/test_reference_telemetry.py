@@ -115,7 +115,7 @@ def test_a_gap_longer_than_the_sample_times_wrap_allows_the_motion_of_its_length
 
 
 def test_receptions_in_a_batch_do_not_make_motion_implausible():
-    """A loop that was held up reads five samples at once; their own times tell how far apart they are."""
+    """A loop that was held up reads five samples at once; their own times say how far apart they are."""
     made = make()
     for counter in range(5):
         step = int(8.0 * 0.01 / (2 * math.pi) * 2048)
@@ -193,7 +193,7 @@ def test_angles_go_on_through_an_interruption():
     assert (after.left_angle_rad, after.right_angle_rad) == (before.left_angle_rad, before.right_angle_rad)
 
 
-def test_angles_go_on_when_other_limits_are_told():
+def test_angles_go_on_when_other_limits_are_reported():
     made = make()
     wheels(made, 0, 9_000 * MS, 9_000 * MS)
     before = wheels(made, 1, 9_010 * MS, 9_010 * MS, ticks=(20, 20))
@@ -202,7 +202,7 @@ def test_angles_go_on_when_other_limits_are_told():
     assert (after.left_angle_rad, after.right_angle_rad) == (before.left_angle_rad, before.right_angle_rad)
 
 
-def test_the_same_limits_told_again_lose_no_motion():
+def test_the_same_limits_reported_again_lose_no_motion():
     made = make()
     wheels(made, 0, 9_000 * MS, 9_000 * MS)
     made.configure(TICKS_PER_REV, MAX_SPEED_RAD_S)

@@ -87,14 +87,14 @@ def test_a_restart_that_only_the_clock_shows_is_noticed():
     assert bench.driver.state in STILL
 
 
-def test_a_clock_that_leaps_ahead_is_told_from_a_restart():
+def test_a_clock_that_leaps_ahead_is_distinguished_from_a_restart():
     """By three laps of the sample times, so that only the clock shows it."""
     bench = make_bench(ReferenceRobot(boot_ns=START_NS - 10**10))
     bench.run(4.0)
     bench.robot.boot_ns -= 3 * 1_310_720_000
     bench.run(3.0)
-    told = "the robot's clock leapt: this computer slept, or the controller's clock is over 200 ppm off"
-    assert bench.events.count(told) == 1
+    reported = "the robot's clock leapt: this computer slept, or the controller's clock is over 200 ppm off"
+    assert bench.events.count(reported) == 1
     assert not any("restarted" in event for event in bench.events)
     assert bench.driver.state in STILL
 
@@ -103,12 +103,12 @@ def test_a_controller_whose_clock_goes_back_is_counted_and_goes_on():
     bench = make_bench(ReferenceRobot(boot_ns=START_NS - 10**10))
     bench.arm()
     bench.run(1.0, (3.0, 3.0))
-    told = "the robot's controller found its clock set back and goes on with a time of its own"
+    reported = "the robot's controller found its clock set back and goes on with a time of its own"
     for times in (1, 2):
         bench.robot.boot_ns += 15 * 10**6
         bench.run(1.0)
         assert bench.driver.stats.robot_clock_errors == times
-        assert bench.events.count(told) == times
+        assert bench.events.count(reported) == times
     assert bench.driver.state is DriverState.ARMED
     bench.robot.boot_ns += 2 * 10**9
     bench.run(0.4)

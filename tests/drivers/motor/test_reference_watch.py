@@ -42,7 +42,7 @@ def test_commands_that_come_later_and_later_disarm(growth, rate_hz):
     bench.run(1.0, (3.0, 3.0))
     begin_ns = bench.now_ns
     bench.lag_ns = lambda now_ns: growth * (now_ns - begin_ns)
-    # What arrives a time E after the beginning was sent growth / (1 + growth) * E ago; telemetry tells of it at 10 Hz.
+    # What arrives a time E after the beginning was sent growth / (1 + growth) * E ago; telemetry reports it at 10 Hz.
     told_ns = (150 * MS + bench.period_ns) * (1 + growth) / growth + 100 * MS + 2 * bench.period_ns
     while bench.driver.state is DriverState.ARMED:
         bench.step()
@@ -137,7 +137,7 @@ def test_the_counter_is_followed_past_its_wrap():
             assert echo.late_ns((number - behind) % 16, (number + 1) * PERIOD_NS) == behind * PERIOD_NS
 
 
-def test_a_gap_in_what_the_robot_tells_is_no_lateness():
+def test_a_gap_in_telemetry_is_no_lateness():
     echo = echo_of(1)
     assert echo.late_ns(0, PERIOD_NS) == 0
     for number in range(1, 40):

@@ -1,6 +1,6 @@
 """What every driver of a vendor's controller must do, against the byte-level simulator of that controller.
 
-These controllers know no session and tell no time: what the reference protocol proves is proved by the driver here.
+These controllers know no session and send no time: what the reference protocol proves is proved by the driver here.
 """
 
 import math

@@ -39,7 +39,7 @@ def test_a_vesc_whose_timeout_is_another_is_refused(field, value, said):
     assert not [frame for frame in bench.robot.received if BY_LABEL["vesc"].is_motion(frame)]
 
 
-def test_a_vesc_that_does_not_tell_is_driven_as_declared_and_said_to_be():
+def test_a_vesc_that_does_not_answer_is_driven_as_declared_and_said_to_be():
     bench = BY_LABEL["vesc"].bench()
     for vesc in vescs(bench):
         obey = vesc._obey
@@ -49,7 +49,7 @@ def test_a_vesc_that_does_not_tell_is_driven_as_declared_and_said_to_be():
 
 
 @pytest.mark.parametrize("payload", [b"", b"\x11", struct.pack(">BIBIf", 17, 1, 24, 100, 0.0), b"\x32" + bytes(20)])
-def test_settings_of_another_layout_or_controller_tell_nothing(payload):
+def test_settings_of_another_layout_or_controller_are_not_used(payload):
     assert timeout(payload, 23) is None
 
 

@@ -12,7 +12,7 @@ from drivers.types import DriverState, MotorSample, Readings, WheelCommand, Whee
 
 
 class Miswired:
-    """A controller whose own sides answer as `wiring` says: it turns what it is told, and tells what it turns."""
+    """A controller whose own sides answer as `wiring` says: it turns as commanded, and reports what it turns."""
 
     state, detail = DriverState.ARMED, "a test's"
 
@@ -54,16 +54,16 @@ def test_whatever_the_wiring_the_wheels_do_what_is_asked_and_say_what_they_do(wi
     controller = Miswired(wiring)
     driver = rewired(controller, wiring)
     driver.transmit(0, WheelCommand(0.5, -0.3, 0.1))
-    (told,) = driver.receive(0, ()).wheels
+    (reported,) = driver.receive(0, ()).wheels
     assert controller.true == pytest.approx((0.5, -0.3))
-    assert (told.left_speed_rad_s, told.right_speed_rad_s) == pytest.approx((0.5, -0.3))
-    assert (told.left_angle_rad, told.right_angle_rad) == pytest.approx((5.0, -3.0))
+    assert (reported.left_speed_rad_s, reported.right_speed_rad_s) == pytest.approx((0.5, -0.3))
+    assert (reported.left_angle_rad, reported.right_angle_rad) == pytest.approx((5.0, -3.0))
 
 
 def test_currents_change_sides_with_the_motors():
-    told = rewired(Miswired(Wiring(sides_swapped=True)), Wiring(sides_swapped=True)).receive(0, ()).motors[0]
-    assert (told.left_current_a, told.right_current_a) == (3, 2)
-    assert (told.left_temperature_c, told.right_temperature_c) == (5, 4)
+    reported = rewired(Miswired(Wiring(sides_swapped=True)), Wiring(sides_swapped=True)).receive(0, ()).motors[0]
+    assert (reported.left_current_a, reported.right_current_a) == (3, 2)
+    assert (reported.left_temperature_c, reported.right_temperature_c) == (5, 4)
 
 
 def test_without_a_wiring_the_driver_stays_itself():

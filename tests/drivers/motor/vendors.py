@@ -146,7 +146,7 @@ def mend_ros2_base(rig):
 
 
 def is_ros2_base_motion(frame):
-    """Speeds that are not zero, or the bridge told to drive."""
+    """Speeds that are not zero, or the bridge commanded to drive."""
     return (frame.can_id == 0x012 and frame.data != bytes(8)) or (frame.can_id == 0x011 and frame.data != b"\0")
 
 

@@ -33,16 +33,16 @@ def load(tmp_path):
 
 
 def test_millimetres_degrees_and_a_compass():
-    told = PoseSample(1, 2, 1500.0, -200.0, 30.0, 5.0, 2.0)
-    found = PoseConvention("mm", "deg", clockwise=True, mirrored=True, yaw_offset_rad=math.pi / 2).converted(told)
+    reported = PoseSample(1, 2, 1500.0, -200.0, 30.0, 5.0, 2.0)
+    found = PoseConvention("mm", "deg", clockwise=True, mirrored=True, yaw_offset_rad=math.pi / 2).converted(reported)
     assert (found.t_ns, found.received_ns) == (1, 2)
     assert (found.x_m, found.y_m, found.yaw_rad) == pytest.approx((1.5, 0.2, math.pi / 3))
     assert (found.position_std_m, found.yaw_std_rad) == pytest.approx((0.005, math.radians(2.0)))
 
 
 def test_a_yaw_beyond_a_turn_is_the_same_yaw():
-    told = PoseSample(1, 2, 0.0, 0.0, 350.0, 0.0, 0.0)
-    assert PoseConvention(yaw_unit="deg").converted(told).yaw_rad == pytest.approx(math.radians(-10.0))
+    reported = PoseSample(1, 2, 0.0, 0.0, 350.0, 0.0, 0.0)
+    assert PoseConvention(yaw_unit="deg").converted(reported).yaw_rad == pytest.approx(math.radians(-10.0))
 
 
 def test_robot_toml_says_it_and_the_source_converts(load):
@@ -76,15 +76,15 @@ def test_a_sensor_ahead_of_the_tracked_point_in_a_frame_of_its_own():
     cosine, sine = math.cos(yaw), math.sin(yaw)
     sensor = (body[0] + 0.5 * cosine - 0.2 * sine, body[1] + 0.5 * sine + 0.2 * cosine)
     # Turned back by 90 degrees: x' = y, y' = -x.
-    told = PoseSample(10**9, 2 * 10**9, sensor[1] - 2.0, -(sensor[0] - 1.0), yaw - math.pi / 2, 0.03, 0.1)
+    reported = PoseSample(10**9, 2 * 10**9, sensor[1] - 2.0, -(sensor[0] - 1.0), yaw - math.pi / 2, 0.03, 0.1)
     convention = PoseConvention(origin=(1.0, 2.0, math.pi / 2), offset=(0.5, 0.2), latency_s=0.25)
-    found = convention.converted(told)
+    found = convention.converted(reported)
     assert (found.x_m, found.y_m, found.yaw_rad) == pytest.approx((*body, yaw))
     assert (found.t_ns, found.received_ns) == (750_000_000, 2 * 10**9)
     # Where the sensor is says less of where the tracked point is, the less certain the heading.
     assert found.position_std_m == pytest.approx(math.hypot(0.03, 0.1 * math.hypot(0.5, 0.2)))
     assert (found.lever_x_m, found.lever_y_m) == (0.0, 0.0)
-    bare = convention.converted(PoseSample(10**9, 2 * 10**9, told.x_m, told.y_m, math.nan, 0.03, math.nan))
+    bare = convention.converted(PoseSample(10**9, 2 * 10**9, reported.x_m, reported.y_m, math.nan, 0.03, math.nan))
     assert (bare.x_m, bare.y_m) == pytest.approx(sensor)
     assert (bare.lever_x_m, bare.lever_y_m, bare.position_std_m) == (0.5, 0.2, 0.03)
     assert not bare.has_heading

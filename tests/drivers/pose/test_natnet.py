@@ -1,4 +1,4 @@
-"""OptiTrack's datagrams, built here from the documented layout of each version and read alike by another's library.
+"""OptiTrack's datagrams, built here from the documented layout of each version and read equally by another's library.
 
 No recording of Motive was to be had, but what NaturalPoint's own client showed of one.
 """

@@ -49,7 +49,7 @@ def test_what_another_user_says_does_not_count(source):
     assert source.foreign_users == 1
 
 
-def test_a_second_daemon_is_told_to_take_another_port(source):
+def test_a_second_daemon_is_asked_to_take_another_port(source):
     with pytest.raises(PoseSourceError, match=rf"port {PORT}: .*; choose another pose\.port"):
         make_pose_source("ros2", port=PORT)
 

@@ -215,7 +215,7 @@ def test_error_frames_are_counted_and_bus_off_is_a_lost_link(virtual):
 
 
 def test_a_file_in_the_users_home_changes_nothing(tmp_path, monkeypatch):
-    """python-can reads settings from ~/.canrc, can.ini and its environment, unless it is told not to."""
+    """python-can reads settings from ~/.canrc, can.ini and its environment, unless it is set not to."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(can.util, "CONFIG_FILES", [str(tmp_path / "can.ini")])
     (tmp_path / "can.ini").write_text("[default]\nreceive_own_messages = True\n")
@@ -573,7 +573,7 @@ def test_a_stamp_of_another_clock_counts_as_the_reception(timestamp_s):
     assert monotonic_stamp_ns(timestamp_s, 1_700_000_000_000_000_000, 5_000) == 5_000
 
 
-def test_want_of_room_is_told_from_a_dead_line():
+def test_want_of_room_is_distinguished_from_a_dead_line():
     assert is_busy(can.CanOperationError("no room", errno.ENOBUFS))
     assert is_busy(can.CanOperationError("Transmit buffer full"))
     assert is_busy(can.CanTimeoutError())

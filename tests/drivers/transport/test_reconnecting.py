@@ -271,7 +271,7 @@ def test_an_error_while_sending_makes_the_link_anew(transport, medium):
 
 
 @pytest.mark.parametrize("way", ["read", "write"])
-def test_the_loss_is_told_in_the_mediums_words(medium, way):
+def test_the_loss_is_reported_in_the_mediums_words(medium, way):
     transport = ReconnectingTransport(medium, backoff=BackoffPolicy(first_s=5.0))
     try:
         up(transport)

@@ -213,7 +213,7 @@ class FtdiPort:
         self.low_latency = wanted
 
 
-def test_an_adapter_that_holds_bytes_back_is_told_not_to():
+def test_an_adapter_that_holds_bytes_back_is_set_not_to():
     port = FtdiPort()
     ask_for_low_latency(port)
     assert port.low_latency
@@ -288,7 +288,7 @@ def test_what_waits_on_a_socket_is_read_at_once(listener):
         assert port.in_waiting
 
 
-def test_a_socket_at_which_nobody_listens_is_told_in_one_line(listener):
+def test_a_socket_at_which_nobody_listens_is_reported_in_one_line(listener):
     listener.close()
     medium = SerialMedium(listener.url, 115_200)
     with pytest.raises(serial.SerialException) as refused:

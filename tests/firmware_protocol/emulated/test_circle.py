@@ -111,15 +111,15 @@ def run(directory, robot_file, others):
     with disco_hw_process("daemon", ["run", str(robot_file), "--log", str(log)], directory / "daemon.txt") as daemon:
         operator = Operator(directory / "control.sock", (daemon, *others))
         arm(operator)
-        operator.tell("start")
+        operator.request("start")
         far = lambda status: status["state"] != "ARMED" or status["task"]["laps"] >= LAPS  # noqa: E731
         status = operator.wait_until(f"{LAPS} laps", far, 4 * LAPS * LAP_S)
         assert status["state"] == "ARMED", status["detail"]
-        operator.tell("stop")
+        operator.request("stop")
         operator.wait_for_standstill(5.0)
-        operator.tell("disarm")
+        operator.request("disarm")
         operator.wait_for("READY", 5.0)
-        operator.tell("quit")
+        operator.request("quit")
         assert daemon.process.wait(20.0) == 0, daemon.last_words()
     return [open_log(part) for part in (log, *sorted(directory.glob("run.part*.mcap")))]
 
@@ -137,7 +137,7 @@ def arm(operator):
     """
     for attempt in range(2):
         operator.wait_for("READY", READY_TIMEOUT_S)
-        operator.tell("arm")
+        operator.request("arm")
         try:
             operator.wait_for("ARMED", 5.0)
         except WorkError:

@@ -29,14 +29,14 @@ def test_a_csv_file_becomes_a_log_with_the_robots_file_in_it(robot, tmp_path):
     source, out = write_log(tmp_path / "log.csv", "poor"), tmp_path / "log.mcap"
     command = [sys.executable, "-m", "disco_hw", "import", str(source), "--robot", str(robot), "-o", str(out), "--json"]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
-    told = json.loads(done.stdout)
+    reported = json.loads(done.stdout)
     with open_log(out) as log:
         assert log.attachment(ROBOT_TOML) == robot.read_bytes()
-        assert sum(topic.count for topic in log.summary().topics.values()) >= told["records"]
+        assert sum(topic.count for topic in log.summary().topics.values()) >= reported["records"]
     assert np.array_equal(load_drive(out).poses.x_m, load_drive(source, TICKS_PER_REV).poses.x_m)
 
 
-def test_a_candump_is_told_from_a_csv_file_by_its_content(robot, tmp_path):
+def test_a_candump_is_distinguished_from_a_csv_file_by_its_content(robot, tmp_path):
     found = import_log(dumped(tmp_path / "dump.csv"), robot, tmp_path / "log.mcap")
     assert found.segments == 1
     assert found.duration_s == pytest.approx(9.95, abs=0.3)
@@ -49,12 +49,12 @@ def test_our_own_logs_need_no_import(robot, tmp_path):
         import_log(tmp_path / "log.mcap", robot, tmp_path / "again.mcap")
 
 
-def test_what_cannot_be_opened_is_told(robot, tmp_path):
+def test_what_cannot_be_opened_is_reported(robot, tmp_path):
     with pytest.raises(InputError, match=r"cannot be read \(No such file"):
         import_log(tmp_path / "none.csv", robot, tmp_path / "log.mcap")
 
 
-def test_a_file_that_the_logs_robot_names_and_the_log_lacks_is_told(robot, tmp_path):
+def test_a_file_that_the_logs_robot_names_and_the_log_lacks_is_reported(robot, tmp_path):
     robot.write_text(ROBOT + '[model]\nfile = "model.toml"\n')
     import_log(write_log(tmp_path / "log.csv", "poor"), robot, tmp_path / "log.mcap")
     with (

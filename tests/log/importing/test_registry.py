@@ -35,7 +35,7 @@ def robot(tmp_path):
     return path
 
 
-def test_formats_are_told_apart_by_their_first_bytes():
+def test_formats_are_distinguished_by_their_first_bytes():
     assert format_of(b"(1700000000.1) can0 110#01").name == "candump"
     assert format_of(b"t_s,cmd_left_rad_s").name == "csv"
     assert log_formats()[-1].name == "csv"

@@ -33,8 +33,8 @@ def test_what_is_exported_is_imported_again(log, tmp_path):
     drive, back = load_drive(log), read_rosbag(tmp_path / "bag", robot_config())
     for part in ("wheels", "poses"):
         for name in getattr(drive, part).__slots__:
-            told, read = getattr(getattr(drive, part), name), getattr(getattr(back, part), name)
-            np.testing.assert_allclose(read, told, atol=1e-9, err_msg=f"{part}.{name}")
+            reported, read = getattr(getattr(drive, part), name), getattr(getattr(back, part), name)
+            np.testing.assert_allclose(read, reported, atol=1e-9, err_msg=f"{part}.{name}")
     given = np.isfinite(back.commands.left_rad_s)
     known = np.isfinite(drive.commands.left_rad_s)
     np.testing.assert_array_equal(back.commands.left_rad_s[given], drive.commands.left_rad_s[known])

@@ -41,7 +41,7 @@ def one_line(error):
 
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3", "ros1"])
-def test_bags_are_told_by_their_first_bytes(tmp_path, storage):
+def test_bags_are_recognised_by_their_first_bytes(tmp_path, storage):
     path = small(tmp_path / "b.bag", storage)
     path = path if storage == "ros1" else file_of(path)
     assert format_of(path.read_bytes()[:64]).name == "rosbag"

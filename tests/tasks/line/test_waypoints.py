@@ -45,7 +45,7 @@ def test_columns_by_name_in_any_order_others_ignored(tmp_path):
         ("x_m,y_m,t_s\n0,0,0\n1,1,1\n2,2,1\n", "line 4: t_s does not increase; sort"),
     ],
 )
-def test_faults_are_told_in_one_line(tmp_path, text, fault):
+def test_faults_are_reported_in_one_line(tmp_path, text, fault):
     with pytest.raises(InputError, match=fault) as error:
         read(tmp_path, text)
     assert "\n" not in str(error.value)
@@ -119,7 +119,7 @@ def test_what_a_robot_cannot_meet_is_refused(tmp_path, text, fault):
     assert "\n" not in str(error.value)
 
 
-def test_a_pose_can_be_told_wherever_a_robot_is_asked_to_go():
+def test_a_pose_can_be_expressed_wherever_a_robot_is_asked_to_go():
     database = load_file(Path(firmware_protocol.__file__).parent / "disco_robot.dbc")
     position = database.get_message_by_name("POSE_POSITION")
     for name in "xy":
