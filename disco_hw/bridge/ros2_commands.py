@@ -201,4 +201,4 @@ def asked(robot: Path, words: str, link: str | None) -> dict[str, Any]:
         outcome = stop_robot(robot, link)
     except InputError as error:
         return {"do": action, "ok": False, "error": f"NOT SENT: {error}"}
-    return {"do": action, "ok": outcome.sent, "text" if outcome.sent else "error": outcome.as_text()}
+    return {"do": action, "ok": outcome.confirmed, "text" if outcome.confirmed else "error": outcome.as_text()}

@@ -64,10 +64,10 @@ def plain_stop(words: Sequence[str]) -> tuple[Path, str | None, bool] | None:
 
 
 def stop_and_say(robot: Path, link: str | None, as_json: bool) -> int:
-    """Stop the robot, print what became of it, and return the exit code: 0 if at least one way worked."""
+    """Stop the robot, print the outcome, and return the exit code: 0 only if the robot confirmed that it is stopped."""
     from disco_hw.daemon.emergency import stop_robot
     from disco_hw.reports import as_json as json_of
 
     outcome = stop_robot(robot, link)
     print(json_of(outcome.as_dict()) if as_json else outcome.as_text())
-    return 0 if outcome.sent else 1
+    return 0 if outcome.confirmed else 1

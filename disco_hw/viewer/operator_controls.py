@@ -157,8 +157,8 @@ class Desk:
             outcome = stop_robot(self._robot_file, self._link)
         except InputError as error:
             return {"do": "estop", "ok": False, "error": f"{refused}; NOT SENT: {error}"}
-        words = "text" if outcome.sent else "error"
-        return {"do": "estop", "ok": outcome.sent, words: f"{refused}; {outcome.as_text()}"}
+        words = "text" if outcome.confirmed else "error"
+        return {"do": "estop", "ok": outcome.confirmed, words: f"{refused}; {outcome.as_text()}"}
 
     def _begin_watching(self) -> None:
         self._watchers += 1

@@ -14,6 +14,7 @@ import can
 import pytest
 
 import disco_hw
+from disco_hw.cli import stop_and_say
 from disco_hw.daemon import emergency
 from disco_hw.daemon.client import SERVED
 from disco_hw.daemon.control_socket import ControlServer
@@ -252,3 +253,12 @@ def test_a_link_option_that_says_nothing_is_refused_with_what_to_write(tmp_path,
 def test_what_is_said_of_a_confirmed_stop_is_what_the_controller_does(latches, word):
     outcome = emergency.EstopOutcome("can0", None, "not running", confirmed=True, latches=latches)
     assert word in outcome.as_text()
+
+
+@pytest.mark.parametrize("confirmed", [True, False])
+def test_only_a_robot_that_confirms_ends_the_command_with_0(tmp_path, daemon, confirmed, capsys):
+    after = time.monotonic_ns() + 10**10
+    daemon.status = {**daemon.status, "robot_state": "ESTOP", "robot_state_ns": after if confirmed else 0}
+    robot = robot_file(tmp_path, daemon.socket, link="interface = 7")
+    assert stop_and_say(robot, None, as_json=False) == (0 if confirmed else 1)
+    assert ("has not confirmed" in capsys.readouterr().out) is not confirmed

@@ -174,7 +174,9 @@ def test_the_estop_takes_the_link_that_the_daemon_was_given(tmp_path):
     robot = robot_elsewhere(tmp_path)
     robot.write_text(robot.read_text().replace("/tmp/disco-hw-wombot.tty", os.ttyname(slave)))
     with closing(Desk(tmp_path / "none.sock", robot, "serial")) as desk:
-        assert desk.estop()["ok"]
+        reply = desk.estop()
+        assert not reply["ok"], "nobody answers on this line, so nothing confirms that the robot stopped"
+        assert "sent, but the robot has not confirmed" in reply["error"]
     frame = encode_frame(*Codec().encode("ESTOP", reason=1))
     assert frame in os.read(master, 4096)
     os.close(master)
