@@ -33,6 +33,8 @@ _VENDORS_BAUD = 115_200
 _POLL_S = 0.05
 _END_TIMEOUT_S = 10.0
 _STILL_RAD_S = 0.05
+_STARTS = 3
+_CAUSES_OF_THIS_HOST = ("COMMAND_TIMEOUT", "COMMAND_EXPIRED", "HOST_SILENT")
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,7 +174,11 @@ class TruthRow:
         return max(abs(self.setpoints[0]), abs(self.setpoints[1]))
 
 
-def _faster_than(speed_rad_s: float, status: dict[str, Any]) -> bool:
+def _stopped_for_this_host(status: Mapping[str, Any]) -> bool:
+    return status["state"] != "ARMED" and status["stop_cause"] in _CAUSES_OF_THIS_HOST
+
+
+def _faster_than(speed_rad_s: float, status: Mapping[str, Any]) -> bool:
     return status["wheels"] is not None and max(map(abs, status["wheels"])) > speed_rad_s
 
 
@@ -188,9 +194,20 @@ class Stack:
     _end: ExitStack = field(repr=False)
 
     def drive(self, until_rad_s: float = 6.0, timeout_s: float = 10.0) -> None:
-        """Arm, start, and wait until the faster wheel has come up to speed."""
+        """Arm, start, and wait until the faster wheel has come up to speed.
+
+        A robot that stops because this busy machine sent it nothing in time is started again, twice at most.
+        """
+        fast = partial(_faster_than, until_rad_s)
+        for _ in range(_STARTS - 1):
+            self.start()
+            status = self.operator.wait_until(
+                "at speed", lambda status: fast(status) or _stopped_for_this_host(status), timeout_s
+            )
+            if fast(status):
+                return
         self.start()
-        self.operator.wait_until("at speed", partial(_faster_than, until_rad_s), timeout_s)
+        self.operator.wait_until("at speed", fast, timeout_s)
 
     def start(self) -> None:
         """Arm and start the task."""
