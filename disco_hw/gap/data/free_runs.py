@@ -26,15 +26,15 @@ Mask = NDArray[np.bool_]
 
 
 @scalar_function
-def _at(command: Any, node: int, begin: int, late_cells: float, side: int) -> Any:
-    """Command of the cell at `node`, `late_cells` earlier; before the run's first it is that one."""
+def _at(command: Any, node: int, begin: int, end: int, late_cells: float, side: int) -> Any:
+    """Command of the cell at `node`, `late_cells` earlier; before the run's first and after its last it is that one."""
     place = node - late_cells
     below = math.floor(place)
     part = place - below
-    low = min(max(below, begin), command.shape[0] - 1)
+    low = min(max(below, begin), end)
     if part == 0.0:
         return command[low, side]
-    high = min(max(below + 1, begin), command.shape[0] - 1)
+    high = min(max(below + 1, begin), end)
     return command[low, side] + part * (command[high, side] - command[low, side])
 
 
@@ -42,10 +42,14 @@ def _at(command: Any, node: int, begin: int, late_cells: float, side: int) -> An
 def _run_wheels(
     effects: Any, late: float, command: Array, extra: Array, first: Mask, t_s: Array, start: Array, angle: Array
 ) -> None:
-    begin = 0
+    begin = end = 0
     left_speed, right_speed = 0.0, 0.0
     known = False
     for i in range(command.shape[0]):
+        if i > end or i == 0:
+            end = i
+            while end + 1 < command.shape[0] and not first[end + 1]:
+                end += 1
         if first[i] or not known:
             begin = i
             angle[i, 0] = 0.0 if first[i] else angle[i - 1, 0]
@@ -54,7 +58,7 @@ def _run_wheels(
             known = not math.isnan(command[i, 0])
             continue
         cell = i - 1
-        left, right = _at(command, cell, begin, late, 0), _at(command, cell, begin, late, 1)
+        left, right = _at(command, cell, begin, end, late, 0), _at(command, cell, begin, end, late, 1)
         if math.isnan(command[cell, 0]) or math.isnan(left) or math.isnan(right):
             known = False
             angle[i, 0], angle[i, 1] = angle[i - 1, 0], angle[i - 1, 1]

@@ -86,6 +86,14 @@ class GriddedDrive:
         """Time covered by the grid."""
         return float(self.t_s.size * GRID_STEP_S)
 
+    def late_commands(self, late_s: float) -> Array:
+        """Commands at the nodes (M, 2) that are in force after a dead time, negative of commands that are stamped late.
+
+        Zero where none is known, before the first and after the last as these.
+        """
+        raw = np.nan_to_num(self.command_rad_s)
+        return raw[np.clip(np.arange(raw.shape[0]) - round(late_s / GRID_STEP_S), 0, raw.shape[0] - 1)]
+
 
 def grid_drive(log: DriveLog, settings: GapSettings = DEFAULT_SETTINGS) -> GriddedDrive:
     """Lay a drive on the grid; a log without wheel samples has an empty one."""

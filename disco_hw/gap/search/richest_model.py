@@ -110,9 +110,7 @@ def _integrated(speed: Array, first: NDArray[np.bool_]) -> Array:
 def _wheel_shapes(channel: WheelChannel, vector: Array) -> Iterator[Array]:
     """Speeds (M, 2) of the wheels that a command may make in ways the named effects do not have."""
     drive, settings = channel.drive, channel.settings.fit
-    raw = np.nan_to_num(drive.command_rad_s)
-    late = max(round(WHEEL.at(vector, DELAYED_BY) / GRID_STEP_S), 0)
-    asked = np.concatenate([np.repeat(raw[:1], late, axis=0), raw[: raw.shape[0] - late]])
+    asked = drive.late_commands(WHEEL.at(vector, DELAYED_BY))
     response_s = sum(WHEEL.at(vector, column) for column in LATE_COLUMNS if column != DELAYED_BY)
     u = _slow(asked, max(response_s, 1e-3))
     largest = float(np.abs(u).max(initial=0.0))

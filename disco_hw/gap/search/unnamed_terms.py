@@ -43,7 +43,7 @@ class Term:
 def wheel_terms(channel: WheelChannel, late_s: float) -> Iterator[Term]:
     """What may be added to both wheels' commands; `late_s` is the dead time that was found."""
     drive = channel.drive
-    u = late_commands(drive, late_s)
+    u = drive.late_commands(late_s)
     other, t = u[:, ::-1], drive.t_s[:, None]
     for form, feature in COMMAND_FEATURES.items():
         name = term_name(COMMAND, form)
@@ -60,13 +60,6 @@ def wheel_terms(channel: WheelChannel, late_s: float) -> Iterator[Term]:
     }
     for form, perturbation in features.items():
         yield Term(_with_place(term_name(COMMAND, form)), perturbation)
-
-
-def late_commands(drive: GriddedDrive, late_s: float) -> Array:
-    """Commands at the nodes (M, 2) that are in force after a dead time; zero where none is known."""
-    raw = np.nan_to_num(drive.command_rad_s)
-    late = max(round(late_s / GRID_STEP_S), 0)
-    return np.concatenate([np.repeat(raw[:1], late, axis=0), raw[: raw.shape[0] - late]])
 
 
 def motion(drive: GriddedDrive, p: Array) -> tuple[Array, Array, Array]:
@@ -99,7 +92,7 @@ def body_terms(channel: BodyChannel, p: Array) -> Iterator[Term]:
 
 def with_known_terms(drive: GriddedDrive, effects: Iterable[EffectSetting], p: Array, late_s: float) -> GriddedDrive:
     """The drive with what the terms among a given model's effects add; `p` is its vector of the body."""
-    u, (v, w, a) = late_commands(drive, late_s), motion(drive, p)
+    u, (v, w, a) = drive.late_commands(late_s), motion(drive, p)
     command = motion_perturbation = None
     for setting in effects:
         term = TERMS.get(setting.name)

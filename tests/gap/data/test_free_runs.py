@@ -59,6 +59,20 @@ def test_a_command_that_is_not_known_stops_the_prediction():
     assert angle[99, 0] > angle[60, 0] + 0.5
 
 
+@pytest.mark.parametrize("late_s", [-0.4, -0.03, 0.03, 0.4])
+def test_commands_that_are_moved_do_not_look_into_another_run(late_s):
+    # Two runs, the first at 2 rad/s, the second at -3: whichever way they are moved, each keeps its own commands.
+    first = np.isin(np.arange(100), (0, 50))
+    commands = np.repeat([[2.0, 2.0], [-3.0, -3.0]], 50, axis=0)
+    p = WHEEL.neutral.copy()
+    p[WHEEL.place["command_delay.delay_s"]] = late_s
+    angle = run_wheels(
+        p, np.array([0.06, 0.4, 0.0]), commands, np.zeros((100, 2)), first, np.arange(100) * GRID_STEP_S, commands
+    )
+    along = np.arange(50) * GRID_STEP_S
+    np.testing.assert_allclose(angle[:, 0], np.concatenate([2.0 * along, -3.0 * along]), atol=1e-9)
+
+
 def test_however_fast_it_turns_the_path_is_that_of_every_cells_mean_heading():
     rng = np.random.default_rng(3)
     count = 4000

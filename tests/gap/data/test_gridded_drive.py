@@ -36,6 +36,18 @@ def test_a_command_that_changes_within_a_cell_counts_by_its_share():
     assert line.command_rad_s[cell - 1, 0] == pytest.approx(0.0, abs=1e-9)
 
 
+@pytest.mark.parametrize("cells", [-7, 0, 7])
+def test_commands_in_force_are_earlier_ones_or_later_ones_where_their_stamps_are_late(cells):
+    t = np.arange(0.0, 10.0, 0.02)
+    line = grid_drive(drive(t, np.sin(t), t, np.sin(t)))
+    own, in_force = np.nan_to_num(line.command_rad_s), line.late_commands(cells * GRID_STEP_S)
+    assert in_force.shape == own.shape
+    node = np.arange(20, own.shape[0] - 20)
+    np.testing.assert_array_equal(in_force[node], own[node - cells])
+    edge = own[0] if cells > 0 else own[-1]
+    np.testing.assert_array_equal(in_force[0 if cells > 0 else -1], edge)
+
+
 def test_silence_and_segments_cut_runs():
     t = np.concatenate([np.arange(0.0, 8.0, 0.02), np.arange(11.0, 20.0, 0.02)])
     line = grid_drive(drive(t, np.full(t.size, 1.0), t, np.full(t.size, 1.0)))
