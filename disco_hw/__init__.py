@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from disco_hw.inference.infer import infer
     from disco_hw.log.load import load_drive as read_log
     from disco_hw.model import Model, load_model, save_model
-    from disco_hw.model.free_run import simulate
+    from disco_hw.model.step import simulate
 
     __version__: str
 
@@ -39,7 +39,7 @@ _PUBLIC = {
     "run_robot": ("disco_hw.daemon.run", "run_robot"),
     "save_model": ("disco_hw.model", "save_model"),
     "sigma_points": ("disco_hw.control.parameter_points", "sigma_points"),
-    "simulate": ("disco_hw.model.free_run", "simulate"),
+    "simulate": ("disco_hw.model.step", "simulate"),
 }
 
 __all__ = [

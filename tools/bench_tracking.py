@@ -18,7 +18,7 @@ from dataclasses import replace
 import numpy as np
 
 from disco_hw.control import Disco, DiscoSettings, PlannerState, SentCommand
-from disco_hw.control.baselines.laws import Kanayama, LinearQuadratic, PurePursuit
+from disco_hw.control.baselines import Kanayama, LinearQuadratic, PurePursuit
 from disco_hw.control.law import LawController
 from disco_hw.runtime.pipeline import Planner
 from disco_hw.tasks.circle import CircleCost

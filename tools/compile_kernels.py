@@ -21,7 +21,7 @@ from disco_hw.inference.estimates import estimates
 from disco_hw.inference.excitation import USUAL, excitation
 from disco_hw.inference.simulate import Simulator
 from disco_hw.model import EffectSetting, Model
-from disco_hw.model.free_run import FreeRun
+from disco_hw.model.step import FreeRun
 from disco_hw.runtime.assembly import make_planner
 from disco_hw.runtime.robot_setup import load_setup
 from disco_hw.tasks import task_from

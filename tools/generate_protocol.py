@@ -11,7 +11,7 @@ import cantools
 import msgspec
 from cantools.database.can.c_source import generate
 
-from firmware_protocol.dbc import MessageLayout, Protocol, Tables, load_protocol
+from firmware_protocol.codec import MessageLayout, Protocol, Tables, load_protocol
 
 ROOT = Path(__file__).resolve().parent.parent
 DBC = ROOT / "firmware_protocol" / "disco_robot.dbc"

@@ -18,7 +18,7 @@ from disco_hw.adaptation.fast import FastAdaptation
 from disco_hw.adaptation.guard import believed_geometry
 from disco_hw.config import Estimation
 from disco_hw.control import CommandLimits, Disco, DiscoSettings
-from disco_hw.control.baselines.follower import Follower, Law, NominalRobot, Reference
+from disco_hw.control.baselines import Follower, Law, NominalRobot, Reference
 from disco_hw.control.settings import ROTATION
 from disco_hw.estimation import OdometryParameters, PoseFusion
 from disco_hw.estimation.disturbance_estimator import DisturbanceEstimator

@@ -1,7 +1,7 @@
 """Finds the gains of the classical followers on training robots: `python -m tools.tune_baselines`.
 
 The simplex of Nelder and Mead over the logarithms of the gains; what is made small is the mean RMS distance over robots
-and ways. Robots 0 to 4: the benchmark judges on others. What it prints is what `control/baselines/laws.py` holds.
+and ways. Robots 0 to 4: the benchmark judges on others. What it prints is what `control/baselines.py` holds.
 """
 
 from __future__ import annotations
@@ -12,8 +12,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.optimize import minimize
 
-from disco_hw.control.baselines.follower import Law
-from disco_hw.control.baselines.laws import Kanayama, LinearQuadratic, PurePursuit
+from disco_hw.control.baselines import Kanayama, Law, LinearQuadratic, PurePursuit
 from tools.foreign_plant import robots
 from tools.tracking import classical, drive, tracks
 

@@ -18,7 +18,7 @@ from mcap_protobuf.schema import build_file_descriptor_set
 from disco_hw.config import RobotConfig, load_robot_config
 from disco_hw.daemon.client import socket_path
 from disco_hw.daemon.page_feed import FeedSubscriber, feed_path
-from disco_hw.daemon.signals import StopSignals
+from disco_hw.daemon.process import StopSignals
 from disco_hw.errors import InputError
 from disco_hw.log.encoding import encode_json, json_schema
 from disco_hw.log.mcap_log import SCENE, VIEWS, scene_message, views

@@ -37,9 +37,8 @@ from disco_hw.effects.registry import DELAY
 from disco_hw.jit import compiled_for
 from disco_hw.model import Belief, Model
 from disco_hw.model.disturbance import NO_DISTURBANCE
-from disco_hw.model.free_run import FreeRun
 from disco_hw.model.model import BASE_PARAMETERS, X_ICR, coefficient_tables
-from disco_hw.model.step import integration_series
+from disco_hw.model.step import FreeRun, integration_series
 from disco_hw.tasks import PlannedTask
 
 NARROW_TURN_RAD = 0.4

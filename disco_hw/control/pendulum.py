@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.control.kernel.layout import BLOCK, Floats, U, rolls_out
-from disco_hw.control.kernel.random_numbers import cos_sin_half_turns
+from disco_hw.control.kernel.sequences import cos_sin_half_turns
 from disco_hw.control.optimiser import Optimiser
 from disco_hw.control.plan import NoValidControl
 from disco_hw.control.settings import Sampler

@@ -7,12 +7,11 @@ from collections.abc import Callable
 from typing import Any
 
 from disco_hw import processes
-from disco_hw.daemon.async_printer import Waiting
 from disco_hw.daemon.client import ADAPT_ACTIONS, PAGE_ACTIONS, UNRECORDED_REMEDY
 from disco_hw.daemon.control_socket import ControlMessage, ControlServer, counters, loop_figures, status
 from disco_hw.daemon.loop import Clock, Loop
 from disco_hw.daemon.page_feed import WatchedRecorder
-from disco_hw.daemon.signals import Notifier, StopSignals
+from disco_hw.daemon.process import Notifier, StopSignals, Waiting
 from disco_hw.log import records
 from disco_hw.runtime import records_of_tick
 from disco_hw.runtime.core import CoreTick, DaemonCore, Pilot

@@ -30,13 +30,12 @@ from disco_hw.adaptation.adapter_link import ProcessLink
 from disco_hw.adaptation.guard import check_adaptable, choose_adaptation
 from disco_hw.config import RobotConfig
 from disco_hw.control.law import Law, LawController
-from disco_hw.daemon.async_printer import STANDARD_OUTPUT, AsyncPrinter
 from disco_hw.daemon.client import SERVED, passed_over, recording_in_words, socket_path
 from disco_hw.daemon.control_socket import ControlServer
 from disco_hw.daemon.daemon import Daemon, Say
 from disco_hw.daemon.loop import MonotonicClock
 from disco_hw.daemon.page_feed import ViewerFeed, WatchedRecorder, feed_path, tick_feed_path
-from disco_hw.daemon.signals import StopPath, StopSignals
+from disco_hw.daemon.process import STANDARD_OUTPUT, AsyncPrinter, StopPath, StopSignals
 from disco_hw.errors import InputError
 from disco_hw.log.messages import DBC, Attachment, version
 from disco_hw.log.recorder import NullRecorder, ProcessRecorder, Recorder, RecordingSettings
@@ -57,7 +56,7 @@ from disco_hw.runtime.robot_setup import Setup, kept_files, link_key, load_setup
 from disco_hw.runtime.states import Ask, by_command
 from drivers.kernel_cache import are_kernels_kept
 from drivers.types import PoseSample, Readings, Transport, WheelSample
-from firmware_protocol.dbc import packaged_dbc
+from firmware_protocol.codec import packaged_dbc
 
 Adapt = Literal["off", "fast", "audited", "network"]
 """Who learns the geometry on the way: nobody, a filter in the tick, the same audited by a network in a process of its

@@ -14,16 +14,15 @@ from typing import Any
 import msgspec
 
 from disco_hw.config import Robot, load_robot_config
-from disco_hw.daemon.async_printer import STANDARD_ERROR, AsyncPrinter
 from disco_hw.daemon.loop import MonotonicClock
+from disco_hw.daemon.process import STANDARD_ERROR, AsyncPrinter
 from disco_hw.daemon.run import in_text, serve
 from disco_hw.drive.keyboard import Keyboard, KeyHold
 from disco_hw.errors import InputError, WorkError
 from disco_hw.files import ROBOT_TOML, read_bytes
 from disco_hw.first_use.init import in_toml, with_fields
 from disco_hw.first_use.judgement import Findings, judge_floor, judge_sides, judge_turns
-from disco_hw.first_use.pilot import CommissionPilot
-from disco_hw.first_use.procedure import Procedure, Steps, floor, sides, turns
+from disco_hw.first_use.procedure import CommissionPilot, Procedure, Steps, floor, sides, turns
 from disco_hw.reports import refuse_directory
 from disco_hw.runtime.robot_setup import Setup, link_key, load_setup
 from drivers.motor import find_driver

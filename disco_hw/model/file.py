@@ -13,8 +13,7 @@ from msgspec import Meta
 
 from disco_hw.errors import InputError
 from disco_hw.files import MODEL_TOML, in_words, read_toml
-from disco_hw.model.belief import Belief, Gaussian, Mixture, Uniform
-from disco_hw.model.model import EffectSetting, Model
+from disco_hw.model.model import Belief, EffectSetting, Gaussian, Mixture, Model, Uniform
 
 FORMAT = 1
 Vector = list[float]

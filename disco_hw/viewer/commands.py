@@ -16,7 +16,7 @@ from rich.progress import Progress
 
 from disco_hw.config import link_fields, load_robot_config
 from disco_hw.daemon.client import socket_path
-from disco_hw.daemon.signals import StopSignals
+from disco_hw.daemon.process import StopSignals
 from disco_hw.errors import InputError
 from disco_hw.viewer.live import LivePage, run_live
 from disco_hw.viewer.operator_controls import Desk

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from disco_hw.log.records import BeliefChange
 from disco_hw.model import Model
-from disco_hw.model.belief import Belief, Gaussian, Mixture, Uniform
+from disco_hw.model.model import Belief, Gaussian, Mixture, Uniform
 from disco_hw.tasks import RobotTask, default_task
 from disco_hw.viewer.recording import ShownRobot, model_in_force
 from disco_hw.viewer.timeline import COMMAND, ESTIMATE, INNOVATION, PLANNER, WHEELS, Series, Timeline

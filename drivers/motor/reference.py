@@ -32,8 +32,7 @@ from drivers.types import (
     WheelCommand,
 )
 from firmware_protocol import status_codes
-from firmware_protocol.codec import PROTOCOL_MAJOR, PROTOCOL_MINOR, Codec, Decoded
-from firmware_protocol.dbc import packaged_dbc
+from firmware_protocol.codec import PROTOCOL_MAJOR, PROTOCOL_MINOR, Codec, Decoded, packaged_dbc
 
 SILENCE_NS = 500_000_000
 REFUSED_SILENCE_NS = 3_000_000_000

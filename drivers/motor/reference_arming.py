@@ -9,8 +9,7 @@ import msgspec
 
 from drivers.types import CyclicFrame, Identity, Limit, Limits, Request
 from firmware_protocol import status_codes
-from firmware_protocol.codec import Codec, Decoded
-from firmware_protocol.dbc import load_protocol
+from firmware_protocol.codec import Codec, Decoded, load_protocol
 from firmware_protocol.protection import COUNTER_MODULUS, challenge_answer
 
 _REMEMBERED = 256

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from disco_hw.adaptation.geometry_filter import GeometryFilter
-from disco_hw.control.baselines.laws import Kanayama
+from disco_hw.control.baselines import Kanayama
 from tools.bench_adapt import step_known_s
 from tools.foreign_plant import NOMINAL, ForeignPlant, ForeignRobot, robots
 from tools.tracking import classical, tracks

@@ -9,7 +9,7 @@ import pytest
 
 from disco_hw.control import DiscoSettings
 from disco_hw.model import Model
-from disco_hw.model.free_run import FreeRun
+from disco_hw.model.step import FreeRun
 
 DOCUMENT = Path(__file__).parents[2] / "docs/control.md"
 TUTORIAL = DOCUMENT.with_name("my-controller.md")

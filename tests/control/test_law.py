@@ -10,7 +10,7 @@ import pytest
 from disco_hw.control import NoValidControl, PlannerState
 from disco_hw.control.law import LawController
 from disco_hw.model import Model
-from disco_hw.model.free_run import simulate
+from disco_hw.model.step import simulate
 
 STATE = PlannerState(7, 0.3, -0.2, 0.5, 1.0, 1.0)
 MODEL = Model(0.06, 0.4, 0.2)

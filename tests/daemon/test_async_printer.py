@@ -11,7 +11,7 @@ import threading
 
 import pytest
 
-from disco_hw.daemon.async_printer import AsyncPrinter
+from disco_hw.daemon.process import AsyncPrinter
 
 
 def line_of(topic, text):

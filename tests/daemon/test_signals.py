@@ -6,7 +6,7 @@ from contextlib import contextmanager
 
 import pytest
 
-from disco_hw.daemon.signals import StopSignals
+from disco_hw.daemon.process import StopSignals
 
 STOP_SIGNALS = [signal.SIGTERM, signal.SIGINT, signal.SIGHUP]
 DAEMON = """
@@ -14,8 +14,8 @@ import signal
 import sys
 from disco_hw.daemon.loop import MonotonicClock
 from disco_hw.daemon.loop import Loop
-from disco_hw.daemon.signals import StopSignals
-from disco_hw.daemon.signals import StopPath
+from disco_hw.daemon.process import StopSignals
+from disco_hw.daemon.process import StopPath
 
 def stop_wheels():
     print("stopping", flush=True)

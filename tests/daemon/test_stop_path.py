@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from disco_hw.daemon.signals import StepOutcome, StopPath
+from disco_hw.daemon.process import StepOutcome, StopPath
 
 ERRORS = [None, RuntimeError("broken"), OSError(5, "unplugged"), SystemExit(3), KeyboardInterrupt(), RecursionError()]
 

@@ -8,7 +8,7 @@ from importlib.resources import files
 
 import pytest
 
-from disco_hw.daemon.signals import Notifier
+from disco_hw.daemon.process import Notifier
 
 UNIT = files("disco_hw") / "daemon" / "systemd" / "disco-hw@.service"
 SECOND_NS = 1_000_000_000
@@ -105,7 +105,7 @@ def test_a_process_started_like_a_service_reports_ready(tmp_path):
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listener:
         listener.bind(str(tmp_path / "notify"))
         listener.settimeout(10.0)
-        script = "from disco_hw.daemon.signals import Notifier\nNotifier().ready()"
+        script = "from disco_hw.daemon.process import Notifier\nNotifier().ready()"
         environment = {**os.environ, "NOTIFY_SOCKET": str(tmp_path / "notify")}
         subprocess.run([sys.executable, "-c", script], env=environment, check=True)
         assert listener.recv(64) == b"READY=1"

@@ -1,4 +1,4 @@
-from disco_hw.daemon.async_printer import Waiting
+from disco_hw.daemon.process import Waiting
 from disco_hw.runtime.states import State
 
 

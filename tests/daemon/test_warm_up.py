@@ -49,5 +49,5 @@ def test_nothing_is_compiled_while_the_robot_is_driven(uncertainty):
     run = subprocess.run(command, cwd=Path(__file__).parents[2], capture_output=True, text=True, check=False)
     assert run.returncode == 0, run.stderr
     reported = json.loads(run.stdout)
-    assert "disco_hw.model.free_run.run_states" in reported["before"]
+    assert "disco_hw.model.step.run_states" in reported["before"]
     assert reported["after"] == reported["before"]

@@ -9,7 +9,7 @@ from disco_hw.effects import encoder_scale, heading_bias, pose_latency, pose_off
 from disco_hw.effects.effect import Channel
 from disco_hw.effects.registry import MOTION_EFFECTS, REGISTRY
 from disco_hw.model import EffectSetting, Model, plain
-from disco_hw.model.free_run import FreeRun
+from disco_hw.model.step import FreeRun
 from tools.compile_kernels import model_with_every_effect
 
 NAMES = {

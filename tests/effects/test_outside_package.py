@@ -45,8 +45,8 @@ import numpy as np
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.data.layout import BODY, WHEEL, pose_sensor
 from disco_hw.gap.search.richest_model import candidates_of, smooth_of
-from disco_hw.gap.search.intervals import OUTSIDE_TESTS, confounded_with
-from disco_hw.gap.search.intervals import _OF_TURNING
+from disco_hw.gap.search.analysis import OUTSIDE_TESTS, confounded_with
+from disco_hw.gap.search.analysis import _OF_TURNING
 from disco_hw.inference.checks import CHECKS
 from disco_hw.log import records
 from disco_hw.model import EffectSetting, Gaussian, Model, load_model, save_model
@@ -143,7 +143,7 @@ from disco_hw.gap import find_gap
 from disco_hw.gap.report.page import sentence
 from disco_hw.log.drive import Commands
 from disco_hw.model import Model, load_model, save_model
-from disco_hw.model.free_run import FreeRun
+from disco_hw.model.step import FreeRun
 from tools.gap_logs import simulated_drive
 
 log = simulated_drive({"x_speed_squared_drag": 0.5}, seed=905)

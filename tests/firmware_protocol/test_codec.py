@@ -9,8 +9,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from firmware_protocol import _firmware
-from firmware_protocol.codec import PROTOCOL, PROTOCOL_MAJOR, PROTOCOL_MINOR, Codec, Decoded, DecodeFault, FaultReason
-from firmware_protocol.dbc import packaged_dbc
+from firmware_protocol.codec import (
+    PROTOCOL,
+    PROTOCOL_MAJOR,
+    PROTOCOL_MINOR,
+    Codec,
+    Decoded,
+    DecodeFault,
+    FaultReason,
+    packaged_dbc,
+)
 from firmware_protocol.protection import crc8
 
 ffi, lib = _firmware.ffi, _firmware.lib

@@ -2,8 +2,8 @@ import re
 
 import pytest
 
-from firmware_protocol import dbc
-from firmware_protocol.dbc import dbc_hash, load_protocol, packaged_dbc, packaged_protocol
+from firmware_protocol import codec
+from firmware_protocol.codec import dbc_hash, load_protocol, packaged_dbc, packaged_protocol
 
 TEXT = packaged_dbc()
 
@@ -79,10 +79,10 @@ def test_the_written_tables_are_those_of_the_packaged_dbc():
 @pytest.mark.parametrize("change", ["another DBC", "no tables", "broken tables"])
 def test_tables_of_another_dbc_or_none_are_not_used(monkeypatch, change):
     text = TEXT.replace("VAL_ 304 state", "VAL_ 304  state") if change == "another DBC" else TEXT
-    names = {"another DBC": dbc.TABLES, "no tables": "nowhere.json", "broken tables": "disco_robot.dbc"}
+    names = {"another DBC": codec.TABLES, "no tables": "nowhere.json", "broken tables": "disco_robot.dbc"}
     read = []
-    monkeypatch.setattr(dbc, "TABLES", names[change])
-    monkeypatch.setattr(dbc, "packaged_dbc", lambda: text)
-    monkeypatch.setattr(dbc, "load_protocol", lambda got: read.append(got) or load_protocol(got))
+    monkeypatch.setattr(codec, "TABLES", names[change])
+    monkeypatch.setattr(codec, "packaged_dbc", lambda: text)
+    monkeypatch.setattr(codec, "load_protocol", lambda got: read.append(got) or load_protocol(got))
     assert packaged_protocol.__wrapped__() == load_protocol(TEXT)
     assert read == [text]

@@ -9,8 +9,7 @@ import pytest
 
 from disco_hw.errors import InputError, WorkError
 from disco_hw.first_use.commission import STAGES, CommissionOptions, as_sent, run_commission, write_fields
-from disco_hw.first_use.pilot import CommissionPilot
-from disco_hw.first_use.procedure import MOST_SHARE, Procedure
+from disco_hw.first_use.procedure import MOST_SHARE, CommissionPilot, Procedure
 from disco_hw.runtime.robot_setup import load_setup
 from sim.devices import odrive
 from sim.plant_parameters import PlantParameters

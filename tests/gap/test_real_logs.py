@@ -14,7 +14,7 @@ from disco_hw.gap import find_gap
 from disco_hw.gap.data.gridded_drive import grid_drive
 from disco_hw.log.load import load_drive
 from disco_hw.model import Model
-from disco_hw.model.free_run import FreeRun
+from disco_hw.model.step import FreeRun
 
 DATA = os.environ.get("DISCO_HW_DATA")
 pytestmark = pytest.mark.skipif(DATA is None, reason="set DISCO_HW_DATA to a folder with measured logs")

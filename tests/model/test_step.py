@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from disco_hw.model import Model, plain
-from disco_hw.model.free_run import FreeRun
+from disco_hw.model.step import FreeRun
 
 
 def run(model, start, commands, step_s=0.1):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from disco_hw.model import EffectSetting, Gaussian, Model, load_model, plain, save_model
-from disco_hw.model.free_run import FreeRun
+from disco_hw.model.step import FreeRun
 from disco_hw.model.terms import BODY_FEATURES, COMMAND_FEATURES, TERMS
 
 BASE = (0.06, 0.4, 0.1)

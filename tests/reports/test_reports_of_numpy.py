@@ -29,8 +29,8 @@ from disco_hw.gap.report.findings import (
     GapReport,
     UnnamedFinding,
 )
+from disco_hw.gap.search.analysis import ParameterEstimate
 from disco_hw.gap.search.cross_validation import PredictionErrors
-from disco_hw.gap.search.intervals import ParameterEstimate
 from disco_hw.inference.checks import CHECKS, Predictive
 from disco_hw.inference.infer_command import GapCheck, InferResult
 from disco_hw.log.importing import Imported

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from disco_hw.control.baselines.laws import Kanayama
+from disco_hw.control.baselines import Kanayama
 from tools import bench_tracking
 from tools.foreign_plant import NOMINAL, ForeignPlant, ForeignRobot
 from tools.mujoco_plant import BEHIND_M, MujocoPlant, mujoco_robots

@@ -3,7 +3,7 @@ import sys
 
 import pytest
 
-from firmware_protocol.dbc import load_protocol, packaged_dbc
+from firmware_protocol.codec import load_protocol, packaged_dbc
 from tools import generate_protocol
 from tools.generate_protocol import FIRMWARE, generated_files, main
 

@@ -42,9 +42,13 @@ from disco_hw.control.kernel.layout import (
     U,
     X,
     Y,
+    follow,
+    looks_up,
     rolls_out,
+    row_of,
+    stage_cost,
+    terminal_cost,
 )
-from disco_hw.control.kernel.task_costs import follow, looks_up, row_of, stage_cost, terminal_cost
 from disco_hw.jit import bits_of_float, block_function, cast_like, float_from_bits, scalar_function, tune_loops
 from disco_hw.model.coefficients import (
     Base,

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.control.kernel.layout import BLOCK, Floats, System, U, roll_block
-from disco_hw.control.kernel.random_numbers import fill_normal_block
 from disco_hw.control.kernel.sequences import (
     Basis,
     Limits,
@@ -17,6 +16,7 @@ from disco_hw.control.kernel.sequences import (
     add_drawn_control_cost,
     add_weighted,
     expand,
+    fill_normal_block,
     mean_noise,
     pull_on_knots,
     sum_lanes,

@@ -9,8 +9,8 @@ from typing import Any
 
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.report.blind_spots import BlindSpot
+from disco_hw.gap.search.analysis import ParameterEstimate
 from disco_hw.gap.search.cross_validation import PredictionErrors
-from disco_hw.gap.search.intervals import ParameterEstimate
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GapSettings, PredictionSettings
 from disco_hw.model import Model
 

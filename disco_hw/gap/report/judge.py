@@ -28,20 +28,21 @@ from disco_hw.gap.report.misspecification import (
     regimes,
     remaining_disagreements,
 )
-from disco_hw.gap.search.analysis import FinalFit, GapAnalysis
-from disco_hw.gap.search.channel_search import ChannelResult
-from disco_hw.gap.search.intervals import (
+from disco_hw.gap.search.analysis import (
     ASYMMETRY,
     ENCODER,
     GAIN,
     OUTSIDE_TESTS,
     Z95,
     ChannelEstimates,
+    FinalFit,
+    GapAnalysis,
     ParameterEstimate,
     confounded_with,
     in_logs,
     in_thirds,
 )
+from disco_hw.gap.search.channel_search import ChannelResult
 from disco_hw.gap.search.richest_model import candidates_of, parameters_of
 from disco_hw.gap.settings import GRID_STEP_S, ReportSettings
 

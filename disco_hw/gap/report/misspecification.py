@@ -21,10 +21,9 @@ from disco_hw.gap.data.layout import BODY
 from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
 from disco_hw.gap.noise.noise_fit import largest_command_jitter_s
 from disco_hw.gap.search.channel_search import ChannelResult
-from disco_hw.gap.search.evidence import inflation
 from disco_hw.gap.search.least_squares import fit
 from disco_hw.gap.search.richest_model import CANDIDATES, indices
-from disco_hw.gap.search.selection import Split
+from disco_hw.gap.search.selection import Split, inflation
 from disco_hw.gap.search.unnamed_terms import Term, WithTerms
 from disco_hw.gap.settings import GRID_STEP_S
 

@@ -1,29 +1,260 @@
-"""What the searches of the channels ended with, and the one fit of it that every finding rests on."""
+"""What the searches of the channels ended with, the one fit of it that every finding rests on, and its intervals.
+
+95 % intervals and the joint covariance of what was fitted are widened where the noise model is too narrow. Here is
+also what is confounded by algebra: effects with the same equations, and one cause seen in two channels.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
 
+from disco_hw.effects.effect import Channel
+from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.data.gridded_drive import GriddedDrive
 from disco_hw.gap.search.channel_search import ChannelResult
-from disco_hw.gap.search.evidence import inflation
-from disco_hw.gap.search.intervals import (
-    ASYMMETRY,
-    ASYMMETRY_COLUMN,
-    ENCODER,
-    GAIN,
-    ChannelEstimates,
-    estimate_parameters,
-    in_motion,
-    one_encoder,
-)
-from disco_hw.gap.search.least_squares import Fit, fit
-from disco_hw.gap.search.richest_model import indices
+from disco_hw.gap.search.least_squares import Fit, by_block, fit, inverse
+from disco_hw.gap.search.richest_model import CANDIDATES, indices
+from disco_hw.gap.search.selection import inflation
+from disco_hw.gap.settings import SelectionSettings
 
 Array = NDArray[np.float64]
+
+# Of the robot's turning, which act on the wheels: known in wheel speeds, times radius over axial distance.
+_OF_TURNING = tuple(
+    column
+    for effect in REGISTRY.values()
+    if effect.uses_geometry and effect.channel is Channel.COMMAND_TO_WHEEL
+    for column in effect.columns
+)
+Z95 = 1.96
+_RISE = 0.5 * Z95**2
+
+
+@dataclass(frozen=True, slots=True)
+class ParameterEstimate:
+    """A parameter with its 95 % interval."""
+
+    value: float
+    low: float
+    high: float
+
+    @property
+    def deviation(self) -> float:
+        """Standard deviation that the interval stands for."""
+        return max((self.high - self.low) / (2.0 * Z95), 1e-9)
+
+
+@dataclass(frozen=True)
+class ChannelEstimates:
+    """Parameters of a channel by full name, and the covariance (A, A) of the fitted ones in order of `fitted`."""
+
+    by_name: dict[str, ParameterEstimate]
+    fitted: tuple[str, ...]
+    covariance: Array
+
+
+def estimate_parameters(found: ChannelResult) -> ChannelEstimates:
+    """Intervals of all parameters that a channel's accepted set frees."""
+    best, channel = found.fit, found.selector.channel
+    columns = channel.layout.columns
+    factors = np.array([inflation(best, channel, (index,)) for index in best.active])
+    covariance = best.covariance() * np.sqrt(np.outer(factors, factors))
+    # A parameter that wanders along a log, or from log to log, is no better known than by how much: another drive
+    # finds it elsewhere.
+    wandering = wandered(found)
+    own = np.maximum(np.diag(covariance), 1e-300)
+    more = np.array([(wandering.get(columns[index], 0.0) / own[place]) for place, index in enumerate(best.active)])
+    covariance = covariance * np.sqrt(np.outer(1.0 + more, 1.0 + more))
+    deviations = np.sqrt(np.diag(covariance))
+    by_name = {
+        columns[index]: ParameterEstimate(
+            float(best.vector[index]), *_around(float(best.vector[index]), float(deviation))
+        )
+        for index, deviation in zip(best.active, deviations, strict=True)
+    }
+    for name in found.names:
+        profile = CANDIDATES[name].profile
+        if profile is not None:
+            by_name[profile.column] = _profiled(found, profile.column, profile.refine)
+    return ChannelEstimates(by_name, tuple(columns[index] for index in best.active), covariance)
+
+
+@dataclass(frozen=True, slots=True)
+class InParts:
+    """A parameter in the parts of a log, in order, with the standard deviation of each, (K,)."""
+
+    values: Array
+    deviations: Array
+
+    @property
+    def variance_between(self) -> float:
+        """Variance of the parameter from part to part beyond that of its estimates (DerSimonian and Laird, 1986)."""
+        weight = self.deviations**-2.0
+        total = float(weight.sum())
+        mean = float(weight @ self.values) / total
+        excess = float(weight @ (self.values - mean) ** 2) - (self.values.size - 1)
+        return max(excess, 0.0) / (total - float((weight**2).sum()) / total)
+
+    def apart(self, one: int, other: int) -> float:
+        """How far two parts lie apart, in standard deviations of the difference."""
+        return float((self.values[other] - self.values[one]) / np.hypot(self.deviations[one], self.deviations[other]))
+
+
+def wandered(found: ChannelResult) -> dict[str, float]:
+    """Variance of each parameter along a log, by full name: the largest of what several divisions of it show."""
+    blocks = np.unique(found.selector.channel.block)
+    largest: dict[str, float] = {}
+    for count in found.channel.settings.report.compared_parts:
+        edges = np.linspace(0, blocks.size, count + 1)[1:-1]
+        parts = np.searchsorted(edges, np.arange(blocks.size), side="right")
+        for name, one in in_parts(found, parts).items():
+            largest[name] = max(one.variance_between, largest.get(name, 0.0))
+    return largest
+
+
+def in_thirds(found: ChannelResult) -> dict[str, InParts]:
+    """What each third of a log says of the parameters."""
+    count = np.unique(found.selector.channel.block).size
+    return in_parts(found, 3 * np.arange(count) // max(count, 1))
+
+
+def in_logs(found: ChannelResult, begins_s: Sequence[float]) -> dict[str, InParts]:
+    """What each of several logs that were searched together says, each `begins_s` on the time of the blocks."""
+    channel = found.selector.channel
+    ends_s = (np.unique(channel.block) + 1) * channel.settings.grid.block_s
+    return in_parts(found, np.searchsorted(begins_s, ends_s))
+
+
+def in_parts(found: ChannelResult, parts: NDArray[np.int64]) -> dict[str, InParts]:
+    """What each part of a log says of the parameters, to second order; without those of which one says little.
+
+    `parts` (B,): the part of each block of time of the channel, in order.
+    """
+    best, channel, layout = found.fit, found.selector.channel, found.selector.channel.layout
+    labels = np.unique(parts)
+    if not best.active or labels.size < 2:
+        return {}
+    settings = channel.settings
+    each = settings.selection.block_lengths[1]
+    normal, gradient = by_block(best, channel.block)
+    whole = np.diag(normal.sum(axis=0))
+    inside = [parts == label for label in labels]
+    least = settings.fit.part_known_share / labels.size
+    enough = np.all([np.diag(normal[of].sum(axis=0)) > least * whole for of in inside], axis=0)
+    places = np.array(best.active)[enough]
+    if not places.size:
+        return {}
+    values, deviations = [], []
+    for of in inside:
+        # Neighbouring blocks err together: a few are taken as one.
+        group = np.arange(np.count_nonzero(of)) // each
+        blocks = normal[of][:, enough][:, :, enough]
+        pulls = gradient[of][:, enough]
+        covariance = inverse(blocks.sum(axis=0))
+        step = -covariance @ pulls.sum(axis=0)
+        # How much more than the noise model says the blocks of a part scatter about what it says itself.
+        left = np.zeros((group[-1] + 1, places.size))
+        np.add.at(left, group, (pulls + blocks @ step) @ covariance)
+        variance = np.maximum(np.diag(covariance), (left**2).sum(axis=0))
+        deviations.append(np.sqrt(variance))
+        values.append(np.clip(best.vector[places] + step, layout.low[places], layout.high[places]))
+    columns = layout.columns
+    return {
+        columns[index]: InParts(np.array([of[k] for of in values]), np.array([of[k] for of in deviations]))
+        for k, index in enumerate(places)
+    }
+
+
+def in_motion(wheels: ChannelEstimates, body: ChannelEstimates) -> ChannelEstimates:
+    """The wheels' estimates, where those of the robot's motion are no better known than its geometry in `body`."""
+    slope = np.zeros(len(body.fitted))
+    for name, sign in (("wheel_radius_m", 1.0), ("axial_distance_m", -1.0)):
+        if name in body.fitted:
+            slope[body.fitted.index(name)] = sign / body.by_name[name].value
+    of_ratio = float(slope @ body.covariance @ slope)
+    moved = {name: wheels.by_name[name] for name in _OF_TURNING if name in wheels.by_name}
+    added = np.array([moved[name].value if name in moved else 0.0 for name in wheels.fitted])
+    by_name = {
+        name: ParameterEstimate(
+            each.value, *_around(each.value, float(np.hypot(each.deviation, each.value * of_ratio**0.5)))
+        )
+        for name, each in moved.items()
+    }
+    covariance = wheels.covariance + of_ratio * np.outer(added, added)
+    return ChannelEstimates({**wheels.by_name, **by_name}, wheels.fitted, covariance)
+
+
+def _around(value: float, deviation: float) -> tuple[float, float]:
+    return value - Z95 * deviation, value + Z95 * deviation
+
+
+def _profiled(found: ChannelResult, column: str, step: float) -> ParameterEstimate:
+    """Interval in which the profile of the cost rises by no more than 1.92 nats."""
+    selector, best = found.selector, found.fit
+    channel = selector.channel
+    place = channel.layout.place[column]
+    active = indices(channel, found.names)
+    edges = []
+    for sign in (-1.0, 1.0):
+        reach = step
+        while True:
+            vector = best.vector.copy()
+            vector[place] += sign * reach
+            if fit(channel, vector, active, 1).cost > best.cost + _RISE or reach > 64.0 * step:
+                break
+            reach *= 2.0
+        edges.append(float(best.vector[place] + sign * reach))
+    return ParameterEstimate(float(best.vector[place]), edges[0], edges[1])
+
+
+_MIMICS = {name: effect.mimics for name, effect in REGISTRY.items() if effect.mimics is not None}
+# The cause that shows in two channels: as a gain of the drive, and as unequal wheels.
+ENCODER, _SHOWN = next((name, one) for name, one in _MIMICS.items() if one.seen_too is not None)
+GAIN = _SHOWN.effect.name
+ASYMMETRY = _SHOWN.seen_too_as.EFFECT.name
+ASYMMETRY_COLUMN = REGISTRY[ASYMMETRY].columns[0]
+
+# What decides between the members of a class lies outside such logs.
+OUTSIDE_TESTS: Mapping[frozenset[str], str] = MappingProxyType(
+    {frozenset((name, mimicked.effect.name)): mimicked.decided_by for name, mimicked in _MIMICS.items()}
+)
+
+
+def one_encoder(
+    wheels: ChannelEstimates, asymmetry: tuple[float, float], accepted: bool, settings: SelectionSettings
+) -> tuple[bool, bool]:
+    """Whether an encoder that counts wrong explains the wheels' gains, and whether it is the only explanation.
+
+    An encoder's scale shows as a gain of its wheel and, with the opposite sign, as an asymmetry of half the difference;
+    `asymmetry` is what the body alone gives for it, with its standard deviation, `accepted` if that is an effect of its
+    own. Too small for that it still decides where it is clearly what the encoder would make it and clearly not none.
+    """
+    gains = [wheels.by_name.get(f"{GAIN}.{side}") for side in ("left", "right")]
+    if gains[0] is None or gains[1] is None:
+        return False, False
+    left, right = gains[0].value, gains[1].value
+    assert _SHOWN.seen_too is not None
+    expected = _SHOWN.seen_too((left, right))
+    spread = 0.5 * (gains[0].deviation + gains[1].deviation)
+    value, deviation = asymmetry
+    variance = deviation**2 + spread**2
+    possible = abs(value - expected) < settings.encoder_sigmas * variance**0.5
+    nats = 0.5 * (value**2 - (value - expected) ** 2) / variance
+    return possible, possible and (accepted or nats > settings.encoder_nats)
+
+
+def confounded_with(names: tuple[str, ...], encoder_possible: bool) -> dict[str, tuple[str, ...]]:
+    """For each accepted effect what is confounded with it in every drive."""
+    found: dict[str, tuple[str, ...]] = {}
+    for other, mimicked in _MIMICS.items():
+        if mimicked.effect.name in names and (mimicked.seen_too is None or encoder_possible):
+            found[mimicked.effect.name] = (*found.get(mimicked.effect.name, ()), other)
+    return found
 
 
 @dataclass(frozen=True)

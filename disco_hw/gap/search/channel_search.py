@@ -18,7 +18,6 @@ from disco_hw.gap.noise.body_noise import BodyNoise
 from disco_hw.gap.noise.channels import BodyChannel, ResidualChannel, WheelChannel
 from disco_hw.gap.noise.noise_fit import learn_body_noise, learn_wheel_noise
 from disco_hw.gap.noise.wheel_noise import WheelNoise, whiten_wheels
-from disco_hw.gap.search.evidence import EffectEvidence, compare
 from disco_hw.gap.search.least_squares import Fit, fit, inverse
 from disco_hw.gap.search.richest_model import (
     LATE,
@@ -31,7 +30,7 @@ from disco_hw.gap.search.richest_model import (
     smooth_of,
     with_pose_delay,
 )
-from disco_hw.gap.search.selection import Names, Selector, Split, Thresholds
+from disco_hw.gap.search.selection import EffectEvidence, Names, Selector, Split, Thresholds, compare
 from disco_hw.gap.search.unnamed_terms import Term, WithTerms, body_terms, places, places_near, wheel_terms
 from disco_hw.gap.settings import GRID_STEP_S, SelectionSettings
 

@@ -18,7 +18,7 @@ from scipy.linalg import block_diag
 
 from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
 from disco_hw.gap.noise.sensor_noise import sensor_noise
-from disco_hw.gap.search.analysis import FinalFit, GapAnalysis, final_fit
+from disco_hw.gap.search.analysis import GAIN, FinalFit, GapAnalysis, final_fit
 from disco_hw.gap.search.channel_search import ChannelResult
 from disco_hw.gap.search.cross_validation import (
     Chain,
@@ -32,7 +32,6 @@ from disco_hw.gap.search.cross_validation import (
     worse_by,
 )
 from disco_hw.gap.search.end_to_end import Ahead, Freed, JointFit, Part
-from disco_hw.gap.search.intervals import GAIN
 from disco_hw.gap.search.least_squares import Fit, inverse
 from disco_hw.gap.search.richest_model import LATE_COLUMNS, LATE_STARTS_S, with_pose_delay
 

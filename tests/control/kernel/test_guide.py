@@ -10,7 +10,7 @@ import pytest
 import disco_hw
 from disco_hw.control import CommandLimits, Disco, DiscoSettings, PlannerState
 from disco_hw.model import load_model
-from disco_hw.model.free_run import FreeRun
+from disco_hw.model.step import FreeRun
 from disco_hw.tasks.line.cost import PathCost
 from disco_hw.tasks.line.table import PathTable
 from tools.foreign_plant import NOMINAL, ForeignRobot

@@ -6,7 +6,7 @@ from numba import njit
 from scipy import stats
 
 from disco_hw.control.kernel.layout import BLOCK, aligned_zeros
-from disco_hw.control.kernel.random_numbers import cos_sin_half_turns, fill_normal_block, philox
+from disco_hw.control.kernel.sequences import cos_sin_half_turns, fill_normal_block, philox
 
 
 @njit

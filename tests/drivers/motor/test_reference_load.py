@@ -2,7 +2,7 @@
 
 from drivers.motor.reference_arming import cyclic_frames
 from drivers.types import CyclicFrame
-from firmware_protocol.dbc import packaged_dbc
+from firmware_protocol.codec import packaged_dbc
 
 
 def test_the_protocols_cyclic_frames_are_those_of_the_dbc():

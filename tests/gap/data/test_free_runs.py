@@ -7,7 +7,7 @@ from disco_hw.gap.data.free_runs import pose_residual, run_body, run_wheels
 from disco_hw.gap.data.layout import BODY, WHEEL
 from disco_hw.gap.settings import GRID_STEP_S
 from disco_hw.model import Model
-from disco_hw.model.free_run import FreeRun
+from disco_hw.model.step import FreeRun
 from tools.compile_kernels import model_with_every_effect
 
 N = 800

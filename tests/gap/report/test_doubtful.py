@@ -5,7 +5,7 @@ import pytest
 
 from disco_hw.gap.report.findings import EffectFinding
 from disco_hw.gap.report.judge import Measured, doubt_of, sort_out
-from disco_hw.gap.search.intervals import ParameterEstimate
+from disco_hw.gap.search.analysis import ParameterEstimate
 from tests.gap.synthetic import line_of
 
 GEOMETRY = (0.06, 0.4)

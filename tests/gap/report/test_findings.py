@@ -10,8 +10,8 @@ from disco_hw.gap.find import offered_stage
 from disco_hw.gap.report.blind_spots import BlindSpot
 from disco_hw.gap.report.findings import STAGES, AcrossLogs, EffectFinding, GapReport, Provenance, UnnamedFinding
 from disco_hw.gap.report.page import answer, as_text, page, sentence
+from disco_hw.gap.search.analysis import ParameterEstimate
 from disco_hw.gap.search.cross_validation import PredictionErrors
-from disco_hw.gap.search.intervals import ParameterEstimate
 from disco_hw.gap.settings import DEFAULT_SETTINGS
 from disco_hw.model import Model
 from disco_hw.reports import as_json

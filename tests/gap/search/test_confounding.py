@@ -2,7 +2,7 @@
 
 from types import SimpleNamespace
 
-from disco_hw.gap.search.intervals import ParameterEstimate, confounded_with, one_encoder
+from disco_hw.gap.search.analysis import ParameterEstimate, confounded_with, one_encoder
 from disco_hw.gap.settings import DEFAULT_SETTINGS
 
 SETTINGS = DEFAULT_SETTINGS.selection

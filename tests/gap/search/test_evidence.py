@@ -5,8 +5,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from disco_hw.gap.search.evidence import compare, held_out_by_block, inflation
 from disco_hw.gap.search.least_squares import Fit
+from disco_hw.gap.search.selection import compare, held_out_by_block, inflation
 from disco_hw.gap.settings import DEFAULT_SETTINGS
 
 N, EACH = 3000, 50

@@ -7,17 +7,18 @@ import pytest
 
 from disco_hw.gap.data.layout import BODY, WHEEL
 from disco_hw.gap.report.judge import across_logs, drifting_parameters
-from disco_hw.gap.search.analysis import GapAnalysis, final_fit
-from disco_hw.gap.search.channel_search import ChannelResult, body_moves
-from disco_hw.gap.search.intervals import (
+from disco_hw.gap.search.analysis import (
     ChannelEstimates,
+    GapAnalysis,
     InParts,
     ParameterEstimate,
     estimate_parameters,
+    final_fit,
     in_logs,
     in_motion,
     in_thirds,
 )
+from disco_hw.gap.search.channel_search import ChannelResult, body_moves
 from disco_hw.gap.search.selection import Selector
 from tests.gap.synthetic import body_channel
 

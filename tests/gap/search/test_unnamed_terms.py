@@ -9,7 +9,7 @@ import pytest
 from disco_hw.control import CommandLimits, Disco, DiscoSettings, PlannerState, Sampler, SentCommand
 from disco_hw.gap import find_gap
 from disco_hw.model import Model, load_model, save_model
-from disco_hw.model.free_run import FreeRun
+from disco_hw.model.step import FreeRun
 from disco_hw.tasks.circle import CircleCost
 from tools.gap_logs import simulated_drive
 

@@ -12,8 +12,8 @@ from disco_hw.gap.report.findings import GapReport
 from disco_hw.gap.report.page import answer, as_text, page
 from disco_hw.gap.search.analysis import GapAnalysis, final_fit
 from disco_hw.gap.search.channel_search import ChannelResult, wheel_moves
+from disco_hw.gap.search.cross_validation import only_timed, wheel_table
 from disco_hw.gap.search.selection import Selector
-from disco_hw.gap.search.wheel_predictions import only_timed, wheel_table
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S
 from disco_hw.model import Model
 from tests.gap.synthetic import DRIVE, GEOMETRY, line_of

@@ -5,8 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from disco_hw.control.baselines.follower import Reference
-from disco_hw.control.baselines.laws import Kanayama, LinearQuadratic, PurePursuit
+from disco_hw.control.baselines import Kanayama, LinearQuadratic, PurePursuit, Reference
 from tools.foreign_plant import NOMINAL, ForeignRobot
 from tools.tracking import classical, drive, tracks
 

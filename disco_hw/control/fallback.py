@@ -12,8 +12,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.control.baselines.follower import Follower, Law, NominalRobot, Reference
-from disco_hw.control.baselines.laws import Kanayama, LinearQuadratic, PurePursuit
+from disco_hw.control.baselines import Follower, Kanayama, Law, LinearQuadratic, NominalRobot, PurePursuit, Reference
 from disco_hw.control.kernel.guide import SteeredChassis
 from disco_hw.control.plan import NoValidControl, PlannerState, PlanOutcome, Rollouts, WheelPlan
 from disco_hw.control.settings import CommandLimits
