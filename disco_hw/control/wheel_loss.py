@@ -1,9 +1,11 @@
-"""How much slower wheels turn than their commands and the model say: an observer with an integral, for either wheel.
+"""How much slower wheels turn than their commands and the model say: an observer with an integral of what is missing.
 
-A dead band, a motor's gain or a battery that the model has wrong lose a part of every command. The wheels' speeds as
-the model makes them of the commands are followed, corrected by the measured ones; the loss is the integral of what
-that corrects (a Luenberger observer of a constant disturbance at the input). It goes with the command's sign, so that
-it stays when a wheel turns back.
+A dead band, a motor's gain or a battery that the model has wrong lose a part of either wheel's command. Wheels that
+scrub over the floor while the robot turns lose a part of the difference between them: the outer one turns slower, the
+inner one faster, and one that is asked to stand is dragged along. The wheels' speeds as the model makes them of the
+commands are followed, corrected by the measured ones; the losses are the integral of what that corrects (a Luenberger
+observer of constant disturbances at the input), shared out between the three in proportion to what they act. Each goes
+with the sign of what it is a loss of, so that it stays when a wheel or the robot turns the other way.
 """
 
 from __future__ import annotations
@@ -19,31 +21,37 @@ Array = NDArray[np.float64]
 Wheels = tuple[float, float]
 
 CORRECTED_S, FOLLOWED_S = 0.3, 0.5
-"""Time constants of the speeds and of the loss."""
+"""Time constants of the speeds and of the losses."""
 LARGEST_RAD_S = 0.6
 WHOLE_RAD_S = 1.0
-"""A command of this size loses all of it, a smaller one in proportion, so that one of zero stays zero."""
+"""A command, or half a difference, of this size loses all of it, a smaller one in proportion, so that one of zero stays
+zero."""
 LONGEST_GAP_S = 0.2
 
 
 class WheelLoss:
-    """What either wheel loses of its command (rad/s); negative where it turns faster than the model says."""
+    """What either wheel, and half the difference of the two, lose of a command (rad/s); negative where they gain."""
 
     def __init__(self) -> None:
-        self._loss = np.zeros(2)
+        self._loss, self._turn = np.zeros(2), 0.0
         self._speeds: Wheels | None = None
         self._last_ns = 0
 
     @property
     def rad_s(self) -> Wheels:
-        """Left and right."""
+        """Of the left wheel's command and of the right one's."""
         left, right = self._loss.tolist()
         return left, right
 
     @property
+    def turn_rad_s(self) -> float:
+        """Of half the difference between the two."""
+        return self._turn
+
+    @property
     def is_none(self) -> bool:
         """Whether nothing was lost so far."""
-        return not self._loss.any()
+        return self._turn == 0.0 and not self._loss.any()
 
     def pause(self) -> None:
         """Something else moves the robot for a while; what is known of its wheels stays."""
@@ -62,17 +70,51 @@ class WheelLoss:
         missing = expected - measured
         if not np.isfinite(missing).all():
             return
-        sign = np.clip(np.array((last.left_rad_s, last.right_rad_s)) / WHOLE_RAD_S, -1.0, 1.0)
-        self._loss = np.clip(self._loss + gap_s / FOLLOWED_S * sign * missing, -LARGEST_RAD_S, LARGEST_RAD_S)
+        # Missing is sign * loss of a wheel, and `turns` * turn more on the right one and less on the left one.
+        sides = np.array([last.left_rad_s, last.right_rad_s])
+        turns = float(_part(0.5 * (sides[1] - sides[0])))
+        sign = _part(_turned(sides, self._turn, _lessened))
+        share = turns * turns / (1.0 + 2.0 * turns * turns)
+        apart = float(missing[1] - missing[0])
+        own = missing + share * apart * _OUTWARDS
+        follow = gap_s / FOLLOWED_S
+        self._loss = np.clip(self._loss + follow * sign * own, -LARGEST_RAD_S, LARGEST_RAD_S)
+        turn = self._turn + follow * turns * float(own[1] - own[0])
+        self._turn = min(max(turn, -LARGEST_RAD_S), LARGEST_RAD_S)
         left, right = (expected - min(gap_s / CORRECTED_S, 1.0) * missing).tolist()
         self._speeds = left, right
 
     def acting(self, commands: Array) -> Array:
         """Commands (N, 2) to a robot that loses nothing and turns as this one does with these."""
-        return commands - self._loss * np.clip(commands / WHOLE_RAD_S, -1.0, 1.0)
+        return _lessened(_turned(commands, self._turn, _lessened), self._loss)
 
     def asked(self, commands: Array) -> Array:
         """The inverse of `acting`."""
-        small = commands / (1.0 - self._loss / WHOLE_RAD_S)
-        large = commands + np.sign(commands) * self._loss
-        return np.where(np.abs(small) < WHOLE_RAD_S, small, large)
+        return _turned(_greater(commands, self._loss), self._turn, _greater)
+
+
+_OUTWARDS = np.array([1.0, -1.0])
+
+
+def _part(commands: Array) -> Array:
+    """How much of its loss commands have, and which way."""
+    return np.clip(commands / WHOLE_RAD_S, -1.0, 1.0)
+
+
+def _lessened(commands: Array, loss: Array | float) -> Array:
+    return commands - loss * _part(commands)
+
+
+def _greater(commands: Array, loss: Array | float) -> Array:
+    """The inverse of `_lessened`."""
+    small = commands / (1.0 - loss / WHOLE_RAD_S)
+    large = commands + np.sign(commands) * loss
+    return np.where(np.abs(small) < WHOLE_RAD_S, small, large)
+
+
+def _turned(commands: Array, turn: float, change: Callable[[Array, float], Array]) -> Array:
+    """Commands (..., 2) of which half the difference between left and right is changed."""
+    half = 0.5 * (commands[..., 1] - commands[..., 0])
+    more = (change(half, turn) - half)[..., None]
+    turned: Array = commands - more * _OUTWARDS
+    return turned

@@ -15,21 +15,55 @@ from tools.tracking import LIMITS, Contender, Disco, drive, model, tracks
 KEEP = float(np.exp(-0.02 / 0.15))
 
 
+def losing(lost, turn, wanted_at, periods):
+    """The losses found of a robot whose wheels lose `lost` (rad/s), and `turn` of half their difference."""
+    loss, speeds = WheelLoss(), np.zeros(2)
+
+    def after(wheels, gap_s, state):
+        wanted = np.array([[state.sent[-1].left_rad_s, state.sent[-1].right_rad_s]])
+        return tuple(loss.acting(wanted)[0] * (1.0 - KEEP) + KEEP * np.array(wheels))
+
+    for k in range(periods):
+        wanted = wanted_at(k)
+        sent = (SentCommand(0, *wanted.tolist()),)
+        loss.step(20_000_000 * k, PlannerState(20_000_000 * k, 0.0, 0.0, 0.0, *speeds.tolist(), sent=sent), after)
+        apart = turn * np.clip(0.5 * (wanted[1] - wanted[0]), -1.0, 1.0)
+        loaded = wanted + np.array([apart, -apart])
+        speeds = (loaded - np.clip(loaded, -1.0, 1.0) * lost) * (1.0 - KEEP) + KEEP * speeds
+    return loss
+
+
 @pytest.mark.parametrize("lost", [(0.2, 0.2), (-0.2, 0.15), (0.0, 0.3)])
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_what_either_wheel_loses_is_found_in_either_direction(lost, sign):
-    loss, speeds, wanted = WheelLoss(), np.zeros(2), sign * np.array([2.0, 4.0])
+    def to_either_side(k):
+        return sign * np.array([2.0, 4.0] if k // 100 % 2 else [4.0, 2.0])
 
-    def after(wheels, gap_s, state):
-        return tuple(loss.acting(wanted[None])[0] * (1.0 - KEEP) + KEEP * np.array(wheels))
-
-    for k in range(300):
-        sent = (SentCommand(0, *wanted.tolist()),)
-        loss.step(20_000_000 * k, PlannerState(20_000_000 * k, 0.0, 0.0, 0.0, *speeds.tolist(), sent=sent), after)
-        speeds = (wanted - sign * np.array(lost)) * (1.0 - KEEP) + KEEP * speeds
+    loss = losing(lost, 0.0, to_either_side, 600)
     assert loss.rad_s == pytest.approx(lost, abs=0.02)
-    commands = np.array([[0.0, 0.0], [0.3, -0.3], [2.0, -2.0], [5.0, 5.0]])
+    assert loss.turn_rad_s == pytest.approx(0.0, abs=0.02)
+    commands = np.array([[0.0, 0.0], [0.3, -0.3], [2.0, -2.0], [5.0, 5.0], [0.1, 4.0]])
     assert loss.asked(loss.acting(commands)) == pytest.approx(commands)
+
+
+@pytest.mark.parametrize("wanted", [(0.0, 3.2), (3.0, 0.1), (-2.5, 0.0), (2.0, 5.0)])
+def test_an_inner_wheel_that_the_robot_drags_along_is_planned_with(wanted):
+    loss = losing((0.0, 0.0), 0.4, lambda k: np.array(wanted), 500)
+    half = 0.5 * (wanted[1] - wanted[0])
+    apart = 0.4 * min(max(half, -1.0), 1.0)
+    assert loss.acting(np.array([wanted]))[0] == pytest.approx([wanted[0] + apart, wanted[1] - apart], abs=0.02)
+    straight = np.array([[0.0, 0.0], [4.0, 4.0]])
+    assert loss.acting(straight)[0] == pytest.approx([0.0, 0.0])
+    assert loss.asked(loss.acting(np.array([wanted]))) == pytest.approx(np.array([wanted]))
+
+
+def test_what_turning_takes_is_told_from_what_the_wheels_lose():
+    def weaving(k):
+        return np.array([(2.0, 4.0), (4.0, 2.0), (3.0, 3.0)][k // 100 % 3])
+
+    loss = losing((0.2, 0.1), 0.3, weaving, 900)
+    assert loss.rad_s == pytest.approx((0.2, 0.1), abs=0.02)
+    assert loss.turn_rad_s == pytest.approx(0.3, abs=0.02)
 
 
 def test_a_wheel_that_is_held_does_not_wind_the_loss_up():
