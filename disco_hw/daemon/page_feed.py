@@ -21,7 +21,7 @@ from disco_hw.log.recorder import Recorder, RecorderStats
 from disco_hw.log.records import FrameIn, FrameOut, Plan, Record
 from drivers.types import WheelSample
 
-PERIOD_S = 0.05
+PERIOD_S = 0.04
 _QUEUED_BATCHES = 40
 _UNREAD_BATCHES = 200
 _MOST_RECORDS = 400
@@ -81,7 +81,8 @@ class ViewerFeed:
             self._gather(records)
         if now_ns < self._next_ns:
             return
-        self._next_ns = now_ns + self._period_ns
+        # On a grid: a period counted from this tick would grow to the next whole tick, every time.
+        self._next_ns = max(self._next_ns + self._period_ns, now_ns)
         self._notice_watchers()
         if self._watched and (self._pending or self._plan is not None):
             self._publish(now_ns)

@@ -22,7 +22,7 @@ from disco_hw.viewer.snapshot import Snapshot, snapshot_at
 from disco_hw.viewer.timeline import Items, Timeline
 from disco_hw.viewer.views import TaskEditor, Views, add_layers
 
-MOVE_S = 0.05
+WAIT_S = 0.05
 REDRAW_S = 0.5
 KEEP_S = 300.0
 _STATUS_OLDER_NS = 2_000_000_000
@@ -51,7 +51,7 @@ class LivePage:
         self._stage = stage
         self._desk = desk
         self._subscriber = FeedSubscriber(feed_path(socket))
-        self._move, self._redraw = _Due(MOVE_S), _Due(REDRAW_S)
+        self._redraw = _Due(REDRAW_S)
         gui = server.gui
         gui.main_panel.dock_right()
         self._summary = gui.add_markdown("")
@@ -68,13 +68,10 @@ class LivePage:
         add_layers(server, self.scene, self._shade)
 
     def step(self) -> None:
-        """Wait at most a twentieth of a second for records, then draw what is due."""
-        self.take(self._subscriber.receive(MOVE_S))
-        now_s = time.monotonic()
-        if not self._server.get_clients():
-            return
-        if self._move(now_s):
-            self.draw(self._redraw(now_s))
+        """Wait at most a twentieth of a second for records, then draw: each batch of the feed moves the robot."""
+        self.take(self._subscriber.receive(WAIT_S))
+        if self._server.get_clients():
+            self.draw(self._redraw(time.monotonic()))
 
     def take(self, received: list[tuple[int, Record]]) -> None:
         """Take in records of the feed."""

@@ -66,6 +66,7 @@ _WHEEL_PARTS = (("front", 0.5), ("rear", -0.5))
 # is drawn twice by a dear shader, and grid, shadows and environment map cost ten times as much as all else together.
 _WIDTH_PX = {
     "task": 3.5, "trail": 4.0, "plan": 3.5, "fan": 1.5, "points": 1.5, "ellipse": 2.0, "centre": 1.5, "poses": 2.5,
+    "grid": 1.5,
 }  # fmt: skip
 _GRID_LIGHT, _GRID_DARK = ((236, 236, 236), (190, 190, 190)), ((40, 40, 46), (76, 76, 84))
 _CENTRE_IN_THE_DARK = (225, 225, 225)
@@ -143,7 +144,7 @@ class Scene:
         scene.add_light_ambient("/ambient", intensity=1.6)
         cells, sections = grid_lines(course.middle_m, size_m, 0.1 if size_m <= 4.0 else 0.5)
         self._grid = [
-            add_lines(self._server, name, lines, colour, 1.0, visible=True)
+            add_lines(self._server, name, lines, colour, _WIDTH_PX["grid"], visible=True)
             for name, lines, colour in zip(("cells", "ground"), (cells, sections), _GRID_LIGHT, strict=True)
         ]
         self._shaded = LIGHT

@@ -49,6 +49,17 @@ def connected(feed, *subscribers, timeout_s=60.0):
     return tick
 
 
+def test_a_loop_whose_ticks_are_late_now_and_then_is_shown_25_times_a_second(feed, tmp_path):
+    subscriber = FeedSubscriber(tmp_path / "control.sock.view")
+    first = connected(feed, subscriber)
+    sent = feed.sent
+    for tick in range(first, first + 500):
+        now_ns, got = tick_records(tick)
+        feed.put(now_ns + tick % 7 * 50_000, got)
+    subscriber.close()
+    assert feed.sent - sent == pytest.approx(250, abs=2)
+
+
 @pytest.mark.parametrize("ticks_before", range(5))
 def test_records_arrive_whole_and_without_frames(feed, tmp_path, ticks_before):
     subscriber = FeedSubscriber(tmp_path / "control.sock.view")

@@ -84,6 +84,19 @@ def like(colour, wanted):
     return np.argmax(colour) == np.argmax(wanted) and np.argmin(colour) == np.argmin(wanted) and np.ptp(colour) > 60
 
 
+def test_a_browser_without_a_graphics_card_draws_few_pixels_and_its_notice_goes(browser, replay):
+    _, served = replay
+    with opened(browser, served.url, 1400, 900) as page:
+        page.wait_for_function("window.__viserMutable?.canvas?.width")
+        assert page.evaluate("""() => {
+          const {canvas} = window.__viserMutable;
+          return [canvas.getContext("webgl2").getContextAttributes().antialias, canvas.width * canvas.height <= 5e5];
+        }""") == [False, True]
+        notice = page.get_by_text("Software WebGL rendering detected")
+        notice.wait_for()
+        notice.wait_for(state="detached")
+
+
 def test_circle_and_robot_are_drawn_at_their_places_and_replay_is_sought(browser, replay):
     page, served = replay
     with opened(browser, served.url) as tab:
