@@ -283,7 +283,7 @@ class ProcessRecorder:
     def _await_first_writer(self) -> None:
         deadline_s = time.monotonic() + _START_PATIENCE_S
         self._launch()
-        while self._line is not None and not (self._line.heard and self._line.status.state == "recording"):
+        while self._line is not None and not self._line.recording:
             self._exchange(0)
             self._keeper.read()
             if self._line.ended or time.monotonic() > deadline_s or not self._keeper.alive:
@@ -357,7 +357,7 @@ class ProcessRecorder:
         if line.ending and not self._delivery.waiting_ticks:
             return
         if silent_s < _SILENCE_S:
-            if line.heard:
+            if line.recording:
                 self._recovered()
             return
         if line.heard:
@@ -444,7 +444,7 @@ class ProcessRecorder:
             written=status.records,
             bytes=status.bytes,
             writer_deaths=self._deaths,
-            writer_alive=line is not None and line.heard and not line.ended,
+            writer_alive=line is not None and line.recording,
             path=status.path,
             fault=self._fault,
             last_error=self._last_error,

@@ -42,6 +42,11 @@ class WriterLine:
         self._heard_s = time.monotonic()
 
     @property
+    def recording(self) -> bool:
+        """Whether the writer said last that it records; what it says of a failure comes before it hangs up."""
+        return self.heard and not self.ended and self.status.state == "recording"
+
+    @property
     def full(self) -> bool:
         """Whether a frame is on its way in part."""
         return bool(self._rest)

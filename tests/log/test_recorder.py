@@ -267,6 +267,19 @@ def test_a_writer_that_was_asked_to_end_by_somebody_else_is_replaced(path):
         assert (log.complete, log.summary().ended) == (True, False)
 
 
+def test_a_writer_that_says_it_has_failed_ends_no_fault(path):
+    recorder = ProcessRecorder(recording(path))
+    drive(recorder, 1, 5)
+    shutil.rmtree(path.parent)
+    path.parent.write_text("in the way")
+    seen = []
+    # Polled as fast as can be, so that each writer's last words are read before its hanging up.
+    wait_until(lambda: seen.append(recorder.poll()) or seen[-1].writer_deaths >= 4)
+    faults = [stats.fault for stats in seen]
+    assert all(faults[faults.index(next(filter(None, faults))) :])
+    recorder.close()
+
+
 def test_close_waits_no_longer_than_asked_and_the_writer_finishes_by_itself(path):
     recorder = ProcessRecorder(recording(path))
     drive(recorder, 1, 20)
