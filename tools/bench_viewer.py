@@ -32,10 +32,9 @@ from disco_hw.processes import stolen_ms
 from disco_hw.viewer.live import LivePage, run_live
 from disco_hw.viewer.operator_controls import Desk
 from disco_hw.viewer.page_process import TOKEN_VARIABLE, page_token
-from disco_hw.viewer.recording import Recording, stage_of_robot
+from disco_hw.viewer.recording import Recording, Snapshot, stage_of_robot
 from disco_hw.viewer.replay import ReplayPage
 from disco_hw.viewer.server import serving
-from disco_hw.viewer.snapshot import Snapshot
 from drivers.types import WheelSample
 from tools.browser import chromium, opened
 from tools.viewer_run import PERIOD_NS, ROBOT_FILE, pose_at, tick_records, write_log

@@ -9,9 +9,7 @@ from typing import Annotated
 
 import typer
 
-from disco_hw.cli import logs, robot, virtual, watch
-from disco_hw.cli.experiment import experiment_app
-from disco_hw.cli.watch import bridge_app
+from disco_hw.cli import logs, robot, virtual
 
 app = typer.Typer(
     name="disco-hw",
@@ -29,13 +27,13 @@ for verb in (
     robot.estop,
     logs.infer,
     logs.gap,
-    watch.view,
-    watch.replay,
+    logs.view,
+    logs.replay,
     virtual.sim,
 ):
     app.command()(verb)
-app.add_typer(experiment_app, name="experiment")
-app.add_typer(bridge_app, name="bridge")
+app.add_typer(virtual.experiment_app, name="experiment")
+app.add_typer(robot.bridge_app, name="bridge")
 app.command("import")(logs.import_log)
 app.add_typer(logs.log_app, name="log")
 

@@ -1,8 +1,9 @@
-"""Verbs for whoever stands beside the robot: run, drive, ctl, check, estop."""
+"""Verbs for whoever stands beside the robot: run, drive, init, commission, ctl, check, estop, bridge."""
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -21,6 +22,7 @@ from disco_hw.cli.options import (
     progress_line,
 )
 from disco_hw.config import check_named_files
+from disco_hw.errors import InputError
 from disco_hw.viewer.page_process import DEFAULT_PORT, LOOPBACK
 
 PagePort = Annotated[int, typer.Option("--port", min=1, max=65535, help="Port of the page.")]
@@ -231,3 +233,40 @@ def estop(
 ) -> None:
     """Stop the robot now, whatever state anything else is in."""
     raise typer.Exit(stop_and_say(robot, link, as_json))
+
+
+bridge_app = typer.Typer(no_args_is_help=True, help="Carry poses, commands and state between the daemon and ROS 2.")
+
+
+@bridge_app.callback()
+def _bridge() -> None:
+    """Each verb below has a robot of its own."""
+
+
+@bridge_app.command()
+def ros2(robot: RobotFile, model: ModelOption = None, link: LinkOption = None) -> None:
+    """Poses and commands in, odometry and state out, beside a daemon that may come and go (docs/ros2.md)."""
+    check_named_files(robot, model)
+    with _ros2_extra("ros2"):
+        from disco_hw.bridge.ros2 import run_ros2_bridge
+    raise typer.Exit(run_ros2_bridge(robot, model, link))
+
+
+@bridge_app.command("ros2-base")
+def ros2_base(robot: RobotFile) -> None:
+    """Carry commands to a base that is reached over ROS 2 alone, and its odometry back (docs/ros2.md)."""
+    check_named_files(robot)
+    with _ros2_extra("ros2-base"):
+        from disco_hw.bridge.ros2_base import run_base_bridge
+    raise typer.Exit(run_base_bridge(robot))
+
+
+@contextmanager
+def _ros2_extra(word: str) -> Iterator[None]:
+    """Say what to install where DDS is not."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        if error.name != "cyclonedds":
+            raise
+        raise InputError(f"bridge {word}: needs cyclonedds; pip install 'disco-hw[ros2]'") from None

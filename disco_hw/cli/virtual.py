@@ -1,21 +1,19 @@
-"""Verbs that need no robot: demo, sim."""
+"""Verbs that need no robot: demo, sim, and the experiments: table, CSV, and a picture as PNG, PDF and SVG."""
 
 from __future__ import annotations
 
+import math
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from disco_hw.cli.options import (
-    AsJson,
-    LinkOption,
-    ModelOption,
-    View,
-)
+from disco_hw.cli.options import AsJson, LinkOption, ModelOption, View, print_result, progress_line
 from disco_hw.config import check_named_files
 from disco_hw.errors import InputError
 from disco_hw.reports import as_json as json_of
+from disco_hw.reports import refuse_directory
 from disco_hw.viewer.page_process import DEFAULT_PORT
 
 
@@ -116,4 +114,124 @@ def sim(
                 board=board,
             )
         )
+    )
+
+
+SeedOffset = Annotated[
+    int, typer.Option(min=0, help="First seed: 50 seeds at 50 are others than 50 at 0, and both are 100 at 0.")
+]
+
+experiment_app = typer.Typer(help="The paper's experiments, as table, CSV and picture.", no_args_is_help=True)
+
+
+@experiment_app.command()
+def pendulum(
+    seeds: Annotated[int, typer.Option(min=1, help="Runs of each curve.")] = 50,
+    seed_offset: SeedOffset = 0,
+    out: Annotated[Path, typer.Option("-o", "--out", help="Directory for CSV and picture.")] = Path("out/pendulum"),
+    as_json: AsJson = False,
+) -> None:
+    """Swing a pendulum up: true parameters; unscented transform and draws, each with prior and posterior."""
+    from disco_hw.experiments.pendulum import PendulumOptions, run_pendulum
+
+    refuse_directory(out)
+    result = run_pendulum(PendulumOptions(seeds=seeds, seed_offset=seed_offset), progress_line)
+    out.mkdir(parents=True, exist_ok=True)
+    result.write_csv(out / "pendulum.csv")
+    result.write_pictures(out / "pendulum.png")
+    print_result({"curves": result.rows(), "options": asdict(result.options)}, as_json, result.table())
+
+
+@experiment_app.command()
+def circle(
+    robot: Annotated[
+        Path | None, typer.Option(help="robot.toml whose model to use; the shipped robot's if none.")
+    ] = None,
+    mode: Annotated[str, typer.Option(help="default or paper.")] = "default",
+    seeds: Annotated[int, typer.Option(min=1, help="Plants drawn from the posterior.")] = 8,
+    seed_offset: SeedOffset = 0,
+    duration_s: Annotated[float, typer.Option(min=1.0, help="Length of a drive.")] = 40.0,
+    rate_hz: Annotated[float, typer.Option(min=1.0, max=200.0, help="Plans a second.")] = 10.0,
+    largest_rot_s: Annotated[float, typer.Option(min=0.1, help="Largest wheel speed, rotations a second.")] = 1.0,
+    largest_rot_s2: Annotated[float, typer.Option(min=0.1, help="Largest change of it in a second.")] = math.inf,
+    lag_s: Annotated[float, typer.Option(min=0.0, help="Lag of the plant's wheels.")] = 0.1,
+    wheel_noise: Annotated[float, typer.Option(min=0.0, help="Noise of a wheel's speed, part of it.")] = 0.05,
+    out: Annotated[Path, typer.Option("-o", "--out", help="Directory for CSV and picture.")] = Path("out/circle"),
+    as_json: AsJson = False,
+) -> None:
+    """Drive the circle knowing the prior, the posterior, a point estimate, or the truth."""
+    import disco_hw
+    from disco_hw.experiments.circle import CircleOptions, run_circle
+    from disco_hw.runtime.robot_setup import load_setup
+
+    if mode not in {"default", "paper"}:
+        raise InputError(f"--mode {mode}: no such mode; write default or paper")
+    for option, value in (("duration-s", duration_s), ("lag-s", lag_s), ("wheel-noise", wheel_noise)):
+        if not math.isfinite(value):
+            raise InputError(f"--{option} {value}: not a finite number; write one")
+    refuse_directory(out)
+    setup = load_setup(robot or Path(disco_hw.__file__).parent / "robots" / "wombot.toml")
+    options = CircleOptions(seeds, duration_s, rate_hz, largest_rot_s, largest_rot_s2, lag_s, wheel_noise, seed_offset)
+    result = run_circle(setup.model, mode, options, progress_line)
+    out.mkdir(parents=True, exist_ok=True)
+    result.write_csv(out / "circle.csv")
+    result.write_pictures(out / "circle.png")
+    print_result({"curves": result.rows(), "mode": mode, "options": asdict(options)}, as_json, result.table())
+
+
+@experiment_app.command()
+def adapt(
+    robot: Annotated[
+        Path | None, typer.Option(help="robot.toml whose model to use; the shipped robot's if none.")
+    ] = None,
+    change: Annotated[
+        float, typer.Option(min=-0.3, max=0.3, help="By how much of its size the parameter changes.")
+    ] = 0.15,
+    seeds: Annotated[int, typer.Option(min=1, help="Runs of each.")] = 3,
+    seed_offset: SeedOffset = 0,
+    out: Annotated[Path, typer.Option("-o", "--out", help="Directory for CSV and picture.")] = Path("out/adapt"),
+    as_json: AsJson = False,
+) -> None:
+    """Let wheel radius or axial distance change on the way, and see what adaptation wins back."""
+    import disco_hw
+    from disco_hw.experiments.adapt import AdaptOptions, run_adapt
+    from disco_hw.runtime.robot_setup import load_setup
+
+    refuse_directory(out)
+    setup = load_setup(robot or Path(disco_hw.__file__).parent / "robots" / "wombot.toml")
+    result = run_adapt(setup, AdaptOptions(change=change, seeds=seeds, seed_offset=seed_offset), progress_line)
+    out.mkdir(parents=True, exist_ok=True)
+    result.write_csv(out / "adapt.csv")
+    result.write_pictures(out / "adapt.png")
+    print_result({"changes": result.rows()}, as_json, result.table())
+
+
+@experiment_app.command()
+def gap(
+    hide: Annotated[
+        list[str] | None,
+        typer.Option(metavar="EFFECT=VALUE", help="Hide this effect in the virtual robot; may be repeated."),
+    ] = None,
+    robot: Annotated[Path | None, typer.Option(help="robot.toml to drive; the shipped robot's if none.")] = None,
+    laps: Annotated[float, typer.Option(min=0.5, max=20.0, help="Laps of each circle.")] = 1.5,
+    script: Annotated[str, typer.Option(help="Script whose log is searched (docs/drive.md).")] = "excite",
+    plant_seed: Annotated[
+        int | None, typer.Option(min=0, help="Draw the true geometry from the model's posterior with this seed.")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the sensors' and the ground's noise.")] = 1,
+    out: Annotated[Path, typer.Option("-o", "--out", help="Directory for log, report, table and picture.")] = Path(
+        "out/gap"
+    ),
+    as_json: AsJson = False,
+) -> None:
+    """Hide an effect in the virtual robot, find it in a log, and drive the circle without and with it in the model."""
+    import disco_hw
+    from disco_hw.experiments.gap import GapExperimentOptions, run_gap_experiment
+
+    shipped = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
+    hidden = tuple(hide or ("deadband=0.8",))
+    options = GapExperimentOptions(robot or shipped, hidden, out, laps, script, plant_seed, seed)
+    result = run_gap_experiment(options, progress_line)
+    print_result(
+        result.as_dict(), as_json, f"{result.as_text()}\n\nwritten: {out}/experiment.png, report.html, drive.mcap"
     )

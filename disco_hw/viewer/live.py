@@ -16,9 +16,8 @@ from disco_hw.runtime.task_change import record_of, task_in_status
 from disco_hw.viewer.curves import Plots
 from disco_hw.viewer.operator_controls import Desk
 from disco_hw.viewer.panel import coverage_text, events_text, live_details, live_summary
-from disco_hw.viewer.recording import ShownRobot
+from disco_hw.viewer.recording import ShownRobot, Snapshot, snapshot_at
 from disco_hw.viewer.scene import DARK, Scene
-from disco_hw.viewer.snapshot import Snapshot, snapshot_at
 from disco_hw.viewer.timeline import Items, Timeline
 from disco_hw.viewer.views import TaskEditor, Views, add_layers
 

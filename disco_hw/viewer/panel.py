@@ -13,7 +13,7 @@ from disco_hw.daemon.client import recording_in_words
 from disco_hw.runtime.pipeline import Source
 from disco_hw.runtime.states import fault_sentence, headline, in_words
 from disco_hw.tasks import RobotTask
-from disco_hw.viewer.snapshot import Snapshot
+from disco_hw.viewer.recording import Snapshot
 
 _NO_NUMBER = "—"
 Rows = list[tuple[str, str]]

@@ -18,10 +18,9 @@ from numpy.typing import NDArray
 from disco_hw.errors import InputError
 from disco_hw.viewer import curves, scene
 from disco_hw.viewer.curves import WINDOW_NS, Curves
-from disco_hw.viewer.recording import Recording, ShownRobot, model_in_force
+from disco_hw.viewer.recording import ParameterPoints, Recording, ShownRobot, Snapshot, model_in_force
 from disco_hw.viewer.scene import Scene
 from disco_hw.viewer.server import serving
-from disco_hw.viewer.snapshot import ParameterPoints, Snapshot
 from disco_hw.viewer.timeline import Timeline
 
 Array = NDArray[np.float64]

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from disco_hw.log import records
 from disco_hw.tasks import RobotTask
-from disco_hw.viewer.recording import ShownRobot, model_in_force
-from disco_hw.viewer.snapshot import ParameterPoints, Snapshot
+from disco_hw.viewer.recording import ParameterPoints, ShownRobot, Snapshot, model_in_force
 
 Array = NDArray[np.float64]
 Bytes = NDArray[np.uint8]

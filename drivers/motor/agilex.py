@@ -23,7 +23,7 @@ from drivers.motor.agilex_protocol import (
     stop_confirmation,
     stop_frames,
 )
-from drivers.motor.vendor_parts_permit import Controllers, MotionPermit, Stage
+from drivers.motor.vendor_parts import Controllers, MotionPermit, Stage
 from drivers.types import (
     DriverState,
     DriverStats,

@@ -30,7 +30,7 @@ from drivers.motor.odrive_protocol import (
     stop_frames,
 )
 from drivers.motor.odrive_questions import Questions
-from drivers.motor.vendor_parts_permit import Controllers, MotionPermit, Stage
+from drivers.motor.vendor_parts import Controllers, MotionPermit, Stage
 from drivers.types import (
     DriverState,
     DriverStats,

@@ -50,7 +50,7 @@ from disco_hw.gap.search.analysis import _OF_TURNING
 from disco_hw.inference.checks import CHECKS
 from disco_hw.log import records
 from disco_hw.model import EffectSetting, Gaussian, Model, load_model, save_model
-from disco_hw.viewer.snapshot import ParameterPoints
+from disco_hw.viewer.recording import ParameterPoints
 
 names = ("turn_droop.k_s", "speed_drag.k_s2_m2")
 belief = Gaussian(names, np.array([0.5, 0.3]), np.diag([0.01, 0.01]))

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from disco_hw.cli.experiment import adapt, circle, pendulum
 from disco_hw.cli.options import print_result
+from disco_hw.cli.virtual import adapt, circle, pendulum
 from disco_hw.errors import InputError
 from disco_hw.reports import as_json, refuse_directory, refuse_file
 

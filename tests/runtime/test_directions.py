@@ -6,7 +6,7 @@ import tracemalloc
 
 import pytest
 
-from disco_hw.runtime.directions import Directions
+from disco_hw.runtime.plausibility import Directions
 from disco_hw.runtime.states import State
 from disco_hw.runtime.supervisor import UserRequest
 from drivers.motor.wiring import AS_TOLD, Wiring, rewired

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from disco_hw.cli.watch import view
+from disco_hw.cli.logs import view
 from disco_hw.errors import InputError
 from disco_hw.viewer import picture, scene
 from disco_hw.viewer.commands import export_log, in_figures, snapshot_log, video_log

@@ -16,7 +16,7 @@ from disco_hw.viewer.panel import (
     replay_details,
     replay_text,
 )
-from disco_hw.viewer.snapshot import snapshot_at
+from disco_hw.viewer.recording import snapshot_at
 from disco_hw.viewer.timeline import Timeline
 from drivers.types import RobotStatus
 from firmware_protocol.status_codes import advice

@@ -11,10 +11,9 @@ from disco_hw.log import records
 from disco_hw.runtime.task_change import record_of
 from disco_hw.tasks.circle import CircleTask
 from disco_hw.viewer import scene as scene_module
-from disco_hw.viewer.recording import stage_of_robot
+from disco_hw.viewer.recording import snapshot_at, stage_of_robot
 from disco_hw.viewer.scene import LAYERS, Scene, first_camera
 from disco_hw.viewer.server import serving
-from disco_hw.viewer.snapshot import snapshot_at
 from disco_hw.viewer.timeline import Timeline
 from tests.runtime.path_robot import path_robot
 from tools.viewer_run import PERIOD_NS, ROBOT_FILE, START_NS, plan_at, pose_at

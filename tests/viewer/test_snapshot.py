@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from disco_hw.log import records
-from disco_hw.viewer.snapshot import PLAN_AGE_NS, snapshot_at, thinned
+from disco_hw.viewer.recording import PLAN_AGE_NS, snapshot_at, thinned
 from disco_hw.viewer.timeline import Timeline
 from tools.viewer_run import LEFT_RAD_S, PERIOD_NS, RIGHT_RAD_S, START_NS, plan_at, pose_at
 

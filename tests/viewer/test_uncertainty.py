@@ -5,7 +5,7 @@ from disco_hw.control.parameter_points import unscented_points
 from disco_hw.log import records
 from disco_hw.model import Gaussian, Model, load_model
 from disco_hw.model.step import FreeRun
-from disco_hw.viewer.snapshot import ParameterPoints
+from disco_hw.viewer.recording import ParameterPoints
 from tools.viewer_run import MODEL_FILE, plan_at
 
 
