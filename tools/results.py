@@ -1,4 +1,4 @@
-"""`python -m tools.results bench.json`: keeps measured figures, and writes the measured half of docs/results.md.
+"""`python -m tools.results bench.json`: keeps measured figures, and writes the last part of docs/results.md.
 
     make bench PARTS=bench_wire && python -m tools.results bench.json
     python -m tools.results out/infer/recovery_rich.json --shown-by "python -m tools.infer_study"
@@ -7,7 +7,7 @@
 
 What is kept is in docs/figures.json: for each command its newest run, with the date, the state of the code and the
 machine. Any file with {"figures": {name: number}} will do: bench.json and the studies write one; and so will what a
-command has printed for its --json. The other half of the page, what was noted in words, is written by hand and stays.
+command has printed for its --json. The rest of the page, what was noted in words, is written by hand and stays.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import json
 import math
 import os
 import platform
+import re
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping
@@ -27,6 +28,7 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "results.md"
 KEPT = ROOT / "docs" / "figures.json"
+_QUANTILE = re.compile(r"(.+)\.(p\d+(?:\.\d+)?)")
 BEGIN, END = "<!-- begin: written by `python -m tools.results` -->", "<!-- end -->"
 
 
@@ -84,7 +86,7 @@ def _numbers(content: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str
 
 
 def measured(kept: Mapping[str, Mapping[str, Any]]) -> str:
-    """Markdown: a table for each command."""
+    """Markdown: a table for each command, the quantiles of one figure in one row."""
     lines: list[str] = []
     for command, run in sorted(kept.items()):
         where = f"{run['date']}, `{run['commit']}`, {run['cpu']}, {run['cores']} cores, Python {run['python']}"
@@ -98,13 +100,17 @@ def measured(kept: Mapping[str, Mapping[str, Any]]) -> str:
             "| figure | value |",
             "|---|---|",
         ]
-        lines += [f"| `{name}` | {value:.4g} |" for name, value in run["figures"].items()]
+        rows: dict[str, list[str]] = {}
+        for name, value in run["figures"].items():
+            one = _QUANTILE.fullmatch(name)
+            rows.setdefault(one[1] if one else name, []).append(f"{one[2]} {value:.4g}" if one else f"{value:.4g}")
+        lines += [f"| `{name}` | {', '.join(values)} |" for name, values in rows.items()]
         lines.append("")
     return "\n".join(lines).strip() or "Nothing yet."
 
 
 def written(page: str, kept: Mapping[str, Mapping[str, Any]]) -> str:
-    """The page with its measured half anew. Raises ValueError if the page has no place for it."""
+    """The page with its part of printed figures anew. Raises ValueError if the page has no place for it."""
     before, begin, rest = page.partition(BEGIN)
     _, end, after = rest.partition(END)
     if not begin or not end:

@@ -1,4 +1,4 @@
-"""docs/results.md: its measured half is what the kept figures make, and every row of the other names its command."""
+"""docs/results.md: its last part is what the kept figures make, and every row before names its command."""
 
 import json
 import re
@@ -9,7 +9,7 @@ from tools import results
 
 ROWS = [
     [cell.strip() for cell in line.strip("|").split("|")]
-    for line in results.PAGE.read_text("utf-8").split("## Noted")[1].splitlines()
+    for line in results.PAGE.read_text("utf-8").split(results.BEGIN)[0].splitlines()
     if line.startswith("| ") and not line.startswith("| what")
 ]
 BENCH = {
@@ -68,6 +68,12 @@ def test_a_part_says_how_long_it_took_and_what_else_the_machine_did():
     text = results.measured(runs)
     assert "load 0.25 before and 0.5 at the end. It took 61 s.\n" in text
     assert text.count("It took") == 1
+
+
+def test_the_quantiles_of_a_figure_stand_in_one_row_in_their_order():
+    figures = {"wire.us.p50": 1.5, "wire.us.p99": 20.0, "wire.us.p99.9": 300.0, "wire.p5x": 4.0}
+    text = results.measured({"make bench": {**BENCH["machine"], "figures": figures}})
+    assert "| `wire.us` | p50 1.5, p99 20, p99.9 300 |\n| `wire.p5x` | 4 |" in text
 
 
 def test_a_file_without_figures_is_one_line(tmp_path, capsys):
