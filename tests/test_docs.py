@@ -97,6 +97,14 @@ def test_a_wrong_command_would_be_seen():
     assert len([line for page in PAGES for line in commands_of(page)]) > 40
 
 
+@pytest.mark.parametrize("page", [page for page in PAGES if not page.name.startswith("add-a")], ids=names)
+def test_every_tool_and_test_that_a_page_names_is_there(page):
+    text = page.read_text(encoding="utf-8")
+    paths = {f"{module.replace('.', '/')}.py" for module in re.findall(r"python -m (tools[.\w]+)\b", text)}
+    paths |= set(re.findall(r"\btests/[\w/\-.]*\w", text))
+    assert [path for path in paths if not (ROOT / path).exists()] == []
+
+
 def test_make_offers_what_the_pages_say():
     targets = set(re.findall(r"^([a-z][\w\-]*):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
     for page in PAGES:
