@@ -200,7 +200,9 @@ def kinds_table() -> str:
 def _fault(entry: dict[str, Any], where: str) -> ScheduledFault:
     kind = KINDS.get(entry.get("kind", "")) if isinstance(entry.get("kind"), str) else None
     if kind is None:
-        raise FaultFileError(f"{where}: kind: {entry.get('kind')!r} is none; say one of {', '.join(KINDS)}")
+        raise FaultFileError(
+            f"{where}: kind: {entry.get('kind')!r} is no kind of fault; write one of {', '.join(KINDS)}"
+        )
     where = f"{where}: {kind.name}"
     known = {parameter.name: parameter for parameter in kind.parameters}
     unknown = set(entry) - set(known) - {"kind", "at_s"} - ({"for_s"} if kind.lasts else set())
@@ -217,7 +219,9 @@ def _fault(entry: dict[str, Any], where: str) -> ScheduledFault:
 def _value(value: Any, parameter: FaultParameter, where: str) -> float | str:
     if parameter.choices:
         if value not in parameter.choices:
-            raise FaultFileError(f"{where}: {value!r} is none; say one of {', '.join(parameter.choices)}")
+            raise FaultFileError(
+                f"{where}: {value!r} is not possible here; write one of {', '.join(parameter.choices)}"
+            )
         return str(value)
     number = _bounded(value, where, parameter.least, parameter.most)
     if parameter.whole and number != int(number):

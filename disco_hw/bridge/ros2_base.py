@@ -67,7 +67,9 @@ def run_base_bridge(robot: Path) -> int:
     if not isinstance(settings, wire.Ros2BaseSettings):
         raise InputError(f"{robot}: link.driver: drives no base on ROS 2; this bridge is not needed")
     if config.link.interface != INTERFACE:
-        raise InputError(f'{robot}: link.interface: "{config.link.interface}" does not lead here; write "{INTERFACE}"')
+        raise InputError(
+            f'{robot}: link.interface: "{config.link.interface}" does not lead to this bridge; write "{INTERFACE}"'
+        )
     try:
         clients = Clients(Path(config.link.channel))
     except InputError as error:

@@ -79,7 +79,7 @@ def drive(
     unattended: Annotated[
         bool, typer.Option("--unattended", help="Let the script hold the deadman: for virtual robots.")
     ] = False,
-    seconds: Annotated[float | None, typer.Option(min=0.1, help="Break the script off after so long.")] = None,
+    seconds: Annotated[float | None, typer.Option(min=0.1, help="End the script after so many seconds.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the random steps.")] = 1,
     model: ModelOption = None,
     link: LinkOption = None,
@@ -121,7 +121,9 @@ def drive(
 def init(
     out: Annotated[Path, typer.Option("-o", "--out", help="Where to write the robot.toml.")] = Path("robot.toml"),
     link: LinkOption = None,
-    driver: Annotated[str | None, typer.Option(help="The motor controller, where it is not to be heard.")] = None,
+    driver: Annotated[
+        str | None, typer.Option(help="The motor controller's driver, where listening does not find it.")
+    ] = None,
     name: Annotated[str | None, typer.Option(help="The robot's name.")] = None,
     wheel_radius_m: Annotated[float | None, typer.Option(min=0.0, help="Radius of a wheel, m.")] = None,
     axial_distance_m: Annotated[float | None, typer.Option(min=0.0, help="From left to right wheels, m.")] = None,
@@ -139,7 +141,7 @@ def init(
         ),
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Write over a file that is there.")] = False,
-    yes: Annotated[bool, typer.Option("--yes", help="Ask nothing: what is not given is as usual.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Ask nothing: take the usual value of what is not given.")] = False,
 ) -> None:
     """Write a robot.toml from what is heard on the robot's link, and from what you say; nothing moves."""
     import sys

@@ -194,7 +194,9 @@ def run_circle(
     options = options or CircleOptions()
     base = {parameter.name for parameter in BASE_PARAMETERS}
     if model.belief is None or set(model.belief.names) != base:
-        raise InputError("the model has no belief over wheel radius, axial distance and x_icr; name a file that does")
+        raise InputError(
+            "the model has no belief over wheel radius, axial distance and x_icr; name a file that has one"
+        )
     circle = CircleCost()
     task = circle.paper() if mode == "paper" else circle
     settings = DiscoSettings.paper() if mode == "paper" else DiscoSettings()

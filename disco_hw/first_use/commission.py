@@ -134,7 +134,7 @@ def run_commission(options: CommissionOptions, ask: Callable[[str], str] = input
     if not os.isatty(_STANDARD_INPUT):
         raise InputError("commission: standard input is no terminal; it needs a person's hand and eye: use a terminal")
     if setup.config.pose.also:
-        _say("poses", "the first source alone is looked at; compare those of [[pose.also]] with it by `disco-hw check`")
+        _say("poses", "only the first source is examined; `disco-hw check` compares those of [[pose.also]] with it")
     told: list[dict[str, Any]] = []
     for name in options.stages:
         if not _through(known[name], options, ask, told):

@@ -218,7 +218,7 @@ class Metadata:
         """Read what `as_text` wrote; raises KeyError or ValueError on anything else."""
         start_ns, wall_offset_ns = int(text["start_ns"]), int(text["wall_offset_ns"])
         if max(abs(start_ns), abs(wall_offset_ns)) > _MAX_TIME_NS // 2:
-            raise ValueError("times of another age of the universe")
+            raise ValueError("times beyond what 64 bits of ns hold")
         former = text.get("continues_sequence")
         return Metadata(
             text["robot"],
@@ -249,7 +249,7 @@ class Ending:
         """Read what `as_text` wrote; raises KeyError or ValueError on anything else."""
         ending = Ending(int(text["t_ns"]), int(text["sequence"]), int(text["dropped_ticks"]))
         if abs(ending.t_ns) > _MAX_TIME_NS // 2 or not 0 <= ending.sequence <= _MAX_TIME_NS:
-            raise ValueError("an end in another age of the universe")
+            raise ValueError("an end time or tick number beyond 64 bits")
         return ending
 
 

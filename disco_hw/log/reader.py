@@ -359,7 +359,9 @@ def _contents(fd: int, path: Path) -> Contents:
     try:
         return read_contents(fd, str(path))
     except OSError as error:
-        raise LogError(f"{path}: cannot be read ({error.strerror})") from None
+        raise LogError(
+            f"{path}: cannot be read ({error.strerror}); mend its permissions, or give another log"
+        ) from None
 
 
 def _metadata(contents: Contents, path: Path) -> Metadata:

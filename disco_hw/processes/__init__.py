@@ -167,7 +167,14 @@ def enter_real_time(priority: int, cpus: Collection[int] = ()) -> tuple[Step, ..
     """
     steps = [_set_switch_interval(), _freeze_garbage()]
     if cpus:
-        steps.append(_try("cpus", lambda: os.sched_setaffinity(0, cpus), f"runs on {sorted(cpus)}", "name CPUs it has"))
+        steps.append(
+            _try(
+                "cpus",
+                lambda: os.sched_setaffinity(0, cpus),
+                f"runs on {sorted(cpus)}",
+                "name CPUs that this computer has",
+            )
+        )
     if priority == 0:
         return (*steps, Step("scheduler", False, "left alone, as daemon.realtime_priority is 0"))
     steps.append(_lock_memory())

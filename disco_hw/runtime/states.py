@@ -94,7 +94,7 @@ TRANSITIONS: tuple[Transition, ...] = (
     _row(_from(S.ARMED), S.STOPPING, C.DISARM_ASKED, C.NONE, "disarm requested"),
     _row(_from(S.ARMED), S.STOPPING, C.TELEMETRY_LOST, C.NONE, "telemetry lost"),
     _row(_from(S.ARMED), S.STOPPING, C.NONE, C.ROBOT_ARMED, "the robot is no longer armed"),
-    _row(_from(S.READY), S.STOPPING, C.ROBOT_MAY_MOVE, C.ARM_PENDING, "the robot is armed unasked"),
+    _row(_from(S.READY), S.STOPPING, C.ROBOT_MAY_MOVE, C.ARM_PENDING, "the robot armed without being asked"),
     _row(_from(S.HANDSHAKE), S.STOPPING, C.ROBOT_MAY_MOVE, C.NONE, "the robot was found armed"),
     # The robot restarted or fell silent.
     _row(_from(S.READY, S.STOPPING), S.HANDSHAKE, C.NONE, C.ROBOT_TALKS, "the robot started a new handshake"),

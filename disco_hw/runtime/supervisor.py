@@ -224,19 +224,19 @@ class Supervisor:
                 text = "stopping the task" if self._running else "no task is running"
                 self._running = self._start_pending = False
             case UserRequest.ARM | UserRequest.ARM_UNRECORDED:
-                refusal = "e-stop in the same instant" if estop_now else self._why_not_arm(inputs, seen)
+                refusal = "an e-stop was asked for at the same time" if estop_now else self._why_not_arm(inputs, seen)
                 if refusal is None and request is UserRequest.ARM and self._state is not State.ARMED:
                     refusal = inputs.recording_fault or None
                 if refusal is None and self._state is State.READY and self._arming is None:
                     self._arming = _Pending(now_ns)
                 text = "already armed" if self._state is State.ARMED else "arming"
             case UserRequest.START:
-                refusal = "e-stop in the same instant" if estop_now else self._why_not_start(inputs, seen)
+                refusal = "an e-stop was asked for at the same time" if estop_now else self._why_not_start(inputs, seen)
                 if refusal is None and not (self._running or self._start_pending):
                     self._start_pending, self._by_hand = True, inputs.by_hand
                 text = "starting" if self._state is State.ARMED else "starting once armed"
             case UserRequest.RESET:
-                refusal = "e-stop in the same instant" if estop_now else self._why_not_reset(inputs, seen)
+                refusal = "an e-stop was asked for at the same time" if estop_now else self._why_not_reset(inputs, seen)
                 if refusal is None:
                     self._estop_asked, self._resetting = False, self._resetting or _Pending(now_ns)
                 text = "resetting"

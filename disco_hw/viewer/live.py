@@ -54,7 +54,7 @@ class LivePage:
         gui = server.gui
         gui.main_panel.dock_right()
         self._summary = gui.add_markdown("")
-        with gui.add_folder("Excited so far", visible=False) as self._excited:
+        with gui.add_folder("Motions driven so far", visible=False) as self._excited:
             self._coverage = gui.add_markdown("")
         self._plots = Plots(gui, stage)
         with gui.add_folder("Events"):

@@ -48,7 +48,7 @@ class ReplayPage:
         stage = recording.stage
         self._excited = Excited(recording.timeline, stage.drive_top_rad_s)
         if self._excited.driven:
-            with gui.add_folder("Excited so far"):
+            with gui.add_folder("Motions driven so far"):
                 self._coverage = gui.add_markdown("")
         self._plots = Plots(gui, stage)
         with gui.add_folder("Events"):

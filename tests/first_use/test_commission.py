@@ -258,7 +258,7 @@ def test_of_several_pose_sources_the_first_alone_is_looked_at_which_is_said(tmp_
 
     with pytest.raises(EOFError):
         run_commission(CommissionOptions(path, log_directory=tmp_path / "logs"), goes_away)
-    assert "first source alone is looked at" in capsys.readouterr().err
+    assert "only the first source is examined" in capsys.readouterr().err
 
 
 def test_without_a_yes_nothing_is_written(tmp_path):

@@ -64,7 +64,7 @@ def test_all_kinds_are_drawn_in_time():
         ("fault = [3]", ["fault", "[[fault]]"]),
         ("[[fault]]\nat_s = 1", ["fault 1", "kind", "None"]),
         ("[[fault]]\nkind = []", ["fault 1", "kind"]),
-        ('[[fault]]\nkind = "dorp"', ["fault 1", "dorp", "say one of drop"]),
+        ('[[fault]]\nkind = "dorp"', ["fault 1", "dorp", "write one of drop"]),
         ('[[fault]]\nkind = "drop"\nfor_s = 1', ["drop", "at_s", "missing"]),
         ('[[fault]]\nkind = "drop"\nat_s = 1', ["drop", "for_s", "missing"]),
         ('[[fault]]\nkind = "drop"\nat_s = nan\nfor_s = 1', ["at_s", "nan"]),

@@ -84,7 +84,9 @@ def _frames(path: Path) -> Iterator[ReceivedFrame]:
                     yield ReceivedFrame(t_ns - first_ns, Frame(message.arbitration_id, bytes(message.data)))
     except (ValueError, IndexError, OverflowError) as error:
         if whole:
-            raise LogError(f"{path}: after {whole} frames a line is none ({error}); take that line out") from None
+            raise LogError(
+                f"{path}: after {whole} frames comes a line that is no frame ({error}); take it out"
+            ) from None
         raise LogError(f"{path}: not a candump ({error}); record with `candump -l`") from None
 
 

@@ -90,7 +90,7 @@ def test_frames_that_fail_their_check_are_left_out_and_counted(tmp_path):
         ("(2.0) can0 7FF#00\n(1.0) can0 7FF#00\n", "frame 2: the clock goes backwards"),
         ("(x) can0 7FF#00\n", "not a candump"),
         ("(inf) can0 7FF#00\n", "not a candump"),
-        ("(1.0) can0 7FF#00\n(1.1) can0 7FF#00\n(1.", "after 2 frames a line is none .*; take that line out"),
+        ("(1.0) can0 7FF#00\n(1.1) can0 7FF#00\n(1.", "after 2 frames comes a line that is no frame .*; take it out"),
     ],
 )
 def test_what_is_no_such_dump_is_refused(tmp_path, text, message):
