@@ -84,16 +84,17 @@ class Reader:
         return f"can:{link['interface']}:{link['channel']}"
 
     @contextmanager
-    def type(self, line):
-        """The page's next command in a terminal; it has to end well."""
-        assert self.left.pop(0) == line
+    def type(self, line, *, again=False, may_fail=False):
+        """The page's next command in a terminal, or that of before `again`; it has to end well unless it `may_fail`."""
+        assert again or self.left.pop(0) == line
         self.commands += 1
         words = line.replace("ROBOT.toml", "robot.toml").replace("can:socketcan:can0", self.link).split()
         terminal = Terminal([sys.executable, "-m", "disco_hw", *words[1:]], self.directory)
         try:
             yield terminal
             terminal.pump(lambda _said: terminal.process.poll() is not None, PATIENCE_S)
-            assert terminal.process.wait(10.0) == 0, f"{line}: {terminal.said[-3000:]}"
+            code = terminal.process.wait(10.0)
+            assert code == 0 or may_fail, f"{line}: {terminal.said[-3000:]}"
         finally:
             terminal.process.kill()
             terminal.process.wait()
@@ -103,6 +104,15 @@ class Reader:
         with self.type(line) as terminal:
             pass
         return terminal.said
+
+    def check(self):
+        """Typed anew where nothing failed but the round trip: a busy computer holds up the one that answers."""
+        for again in (False, True, True, True, True):
+            with self.type(TYPED[1], again=again, may_fail=True) as terminal:
+                pass
+            if re.findall(r"^fail +([^:]+):", terminal.said, re.MULTILINE) != ["round trip"]:
+                break
+        assert terminal.process.returncode == 0, terminal.said
 
     def press(self, terminal, keys):
         self.keys += len(keys)
@@ -243,7 +253,7 @@ def follow(directory, driver):
             assert robot.process.poll() is None, robot.last_words()
             time.sleep(0.1)
         reader.settings()
-        reader.run(TYPED[1])
+        reader.check()
         reader.first_drive()
         reader.drive()
         reader.run(TYPED[4])

@@ -141,11 +141,13 @@ def test_circle_and_robot_are_drawn_at_their_places_and_replay_is_sought(browser
         assert elsewhere == []
 
 
-# Where things are: the picture, the panel's box, and heads of folds that only a mouse would reach.
+# Where things are: the picture, the boxes of panel and bar of time, and heads of folds that only a mouse would reach.
 LAID_OUT = """() => {
   const place = element => (({x, y, width, height}) => ({x, y, width, height}))(element.getBoundingClientRect());
-  const panel = [...document.querySelectorAll(".mantine-Paper-root")].find(box => box.textContent.includes("Play"));
-  return {canvas: place(document.querySelector("canvas")), panel: panel && place(panel),
+  const boxes = [...document.querySelectorAll(".mantine-Paper-root")];
+  const panel = boxes.find(box => box.textContent.includes("Play"));
+  const bar = boxes.find(box => box.textContent.startsWith("Time and marks"));
+  return {canvas: place(document.querySelector("canvas")), panel: panel && place(panel), bar: bar && place(bar),
           mouse: [...document.querySelectorAll("[style*='cursor: pointer']")].filter(head => head.checkVisibility()
             && head.tabIndex < 0 && !head.closest("button, label, [role=button], [role=tab], [role=slider]")
             && !head.querySelector("input, [role=slider]")).map(head => head.outerHTML.slice(0, 120))};
@@ -167,7 +169,14 @@ def test_every_control_has_a_name_and_keys_and_a_phone_sees_the_scene_and_the_pa
             head.focus(timeout=30_000)
             head.press("Enter")
             wait_for(tab, lambda: tab.evaluate(LAID_OUT)["canvas"]["height"] > 844 - 0.6 * before)
+        else:
+            wait_for(tab, lambda: as_wide_as_the_picture(tab.evaluate(LAID_OUT)))
         keep(tab, f"replay-{width}")
+
+
+def as_wide_as_the_picture(there):
+    """The bar of time, but for a margin on either side."""
+    return there["bar"] and there["bar"]["width"] == pytest.approx(there["canvas"]["width"] - 24.0, abs=1.0)
 
 
 def not_covered(there):
