@@ -26,7 +26,7 @@ def found(places):
     return hairpin(PathTable(places))
 
 
-# Where the planner stopped for good in simulated drives (docs/robot.md).
+# Where the planner stopped for good in simulated drives (docs/paths.md).
 STUCK = [
     *(((90, 90), apart_m) for apart_m in (0.05, 0.1, 0.15, 0.2)),
     *(((110, 110), apart_m) for apart_m in (0.15, 0.3)),
