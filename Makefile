@@ -38,11 +38,13 @@ ifeq ($(CHROMIUM),install)
 endif
 
 # One thread of linear algebra a process: pools of them on two cores only wait for one another. The types are checked
-# beside the compiler and the tests, in what these leave of the processors.
+# beside the compiler and the tests, in what these leave of the processors. The tests are collected once before, so that
+# their modules are rewritten and compiled by one process, not by each of the three.
 test: $(STAMP) chromium
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	nice $(BIN)/mypy & types=$$!; \
+		$(BIN)/python -m pytest -n 0 --collect-only > /dev/null 2>&1 & \
 		$(BIN)/python -m tools.compile_kernels && \
 		OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 3 --dist loadscope --no-loadscope-reorder -m "not long$(if $(CHROMIUM), or browser)"; \
 		tests=$$?; wait $$types && exit $$tests
