@@ -37,7 +37,7 @@ def live_summary(status: Mapping[str, Any] | None, snapshot: Snapshot | None, kn
         rows += [_speed(snapshot), _battery(snapshot)]
     if status is not None and status.get("ok"):
         loop = status["loop"]
-        late = f"{number(loop['lateness_us']['p99'], 0)} us late (99 %), {loop['overruns']} overruns"
+        late = f"{number(loop['lateness_us']['p99'], 0)} us late (99 %), {_overruns(loop['overruns'])}"
         rows.append(("loop", late))
     return _table(rows)
 
@@ -104,7 +104,7 @@ def replay_text(snapshot: Snapshot, first_ns: int, task: RobotTask) -> str:
         off_m = task.course().off_m(np.array([snapshot.pose[:2]]))[0]
         rows.append(("distance", f"{number(off_m, 3)} m"))
     rows += [_speed(snapshot), _battery(snapshot)]
-    rows.append(("loop", f"{number(snapshot.lateness_us, 0)} us late, {snapshot.overruns} overruns"))
+    rows.append(("loop", f"{number(snapshot.lateness_us, 0)} us late, {_overruns(snapshot.overruns)}"))
     return "\n".join([*lines, _table(rows)])
 
 
@@ -114,6 +114,10 @@ def replay_details(snapshot: Snapshot) -> str:
     rows: Rows = [] if status is None else [("robot", _robot(status.state, status.fault, status.stop_cause))]
     rows.append(("ticks skipped", str(snapshot.skipped)))
     return _table([*rows, *health_rows(snapshot), *motion_rows(snapshot)])
+
+
+def _overruns(count: int) -> str:
+    return f"{count} overrun{'' if count == 1 else 's'}"
 
 
 def _speed(snapshot: Snapshot) -> tuple[str, str]:
