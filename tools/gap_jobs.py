@@ -18,7 +18,9 @@ from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap import find_gap
 from disco_hw.gap.report.blind_spots import BlindSpot
 from disco_hw.gap.search.analysis import ParameterEstimate
+from disco_hw.log.drive import DriveLog
 from disco_hw.model import Model
+from tools import strange_robot
 from tools.gap_logs import LARGEST_RAD_S, NAMED, realistic, simulated_drive
 
 MODEL = Model(0.061, 0.415, 0.238)
@@ -43,6 +45,7 @@ KINDS = {
     "weak": "a quarter of the realistic size",
     "outside": "an effect outside the list",
     "forms": "a named family in another form",
+    "strange": "a form that no dictionary holds, on a robot of its own: called by no wrong name",
     "circle": "one effect, on a steady circle only: named, alone or in a class, or said to be invisible",
     "asked": "the same robot, circle and then `--script separate`",
 }
@@ -85,6 +88,7 @@ class Result:
     cpu_s: float
     alike: list[str] = field(default_factory=list)
     too_small: list[str] = field(default_factory=list)
+    timed_mm: float | None = None
 
     @property
     def told(self) -> bool:
@@ -97,6 +101,8 @@ class Result:
         named, hidden = set(self.named), {ALIKE.get(name, name) for name in self.hidden}
         if self.kind == "outside":
             return not named and bool(self.unnamed)
+        if self.kind == "strange":
+            return named <= {*strange_robot.MOTORS, *strange_robot.KIN.get(self.hidden[0], ())}
         if self.kind == "forms":
             return bool(named & FORMS[self.hidden[0]]) and bool(self.residue or self.unnamed)
         if self.kind == "circle":
@@ -106,9 +112,13 @@ class Result:
 
     @property
     def closed(self) -> float | None:
-        """Share of the removable gap that went; None where less than 1 mm could be removed."""
-        removable = self.refitted_mm - self.floor_mm
-        return (self.refitted_mm - self.amended_mm) / removable if removable > 1.0 else None
+        """Share of the removable gap that went; None where less than 1 mm could be removed.
+
+        Of a strange robot, whose motors have a lag and a delay besides, it is the gap of the timed model.
+        """
+        before_mm = self.timed_mm if self.kind == "strange" and self.timed_mm is not None else self.refitted_mm
+        removable = before_mm - self.floor_mm
+        return (before_mm - self.amended_mm) / removable if removable > 1.0 else None
 
 
 def jobs(kind: str, seeds: Iterable[int]) -> Iterator[Job]:
@@ -119,6 +129,9 @@ def jobs(kind: str, seeds: Iterable[int]) -> Iterator[Job]:
         elif kind == "pairs":
             first, second = np.random.default_rng([77, seed]).choice(NAMED, 2, replace=False)
             yield Job(kind, realistic(str(first), seed) | realistic(str(second), seed + 1000), seed)
+        elif kind == "strange":
+            for form in strange_robot.FORMS:
+                yield Job(kind, {form: tuple(strange_robot.drawn(form, seed).values())}, seed)
         else:
             for name in {"outside": OUTSIDE, "forms": tuple(FORMS)}.get(kind, NAMED):
                 yield Job(kind, realistic(name, seed, 0.25 if kind == "weak" else 1.0), seed)
@@ -126,11 +139,9 @@ def jobs(kind: str, seeds: Iterable[int]) -> Iterator[Job]:
 
 def work(job: Job) -> Result:
     """Make one log and search it."""
-    circle = job.kind in ("circle", "asked")
-    script = separating("separate", TOP_RAD_S) if job.kind == "asked" else None
-    log = simulated_drive(job.hidden, job.seed, "circle" if circle else "rich", job.kind == "dirty", script=script)
+    log, model = _log(job), Model(*strange_robot.NOMINAL) if job.kind == "strange" else MODEL
     began = time.process_time()
-    report = find_gap(log, MODEL, top_rad_s=LARGEST_RAD_S)
+    report = find_gap(log, model, top_rad_s=LARGEST_RAD_S)
     cpu_s = time.process_time() - began
     mm = {stage: 1e3 * errors[2.0].position_m for stage, errors in report.gap.items()}
     errors, covered = [], []
@@ -149,7 +160,16 @@ def work(job: Job) -> Result:
             spot.name for spot in report.blind_spots
             if spot.name in job.hidden and too_small(spot, job.hidden[spot.name])
         ],
+        mm["timed"],
     )  # fmt: skip
+
+
+def _log(job: Job) -> DriveLog:
+    if job.kind == "strange":
+        return strange_robot.record(next(iter(job.hidden)), job.seed).log
+    circle = job.kind in ("circle", "asked")
+    script = separating("separate", TOP_RAD_S) if job.kind == "asked" else None
+    return simulated_drive(job.hidden, job.seed, "circle" if circle else "rich", job.kind == "dirty", script=script)
 
 
 def too_small(spot: BlindSpot, hidden: float | tuple[float, ...]) -> bool:

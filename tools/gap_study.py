@@ -25,7 +25,9 @@ from tools.gap_jobs import KINDS, Job, Result, jobs
 from tools.gap_tables import summary, table, write
 
 _JUDGED = ("disco_hw/gap", "disco_hw/effects", "disco_hw/model", "disco_hw/log", "disco_hw/drive", "sim")
-_JUDGED_TOO = ("tools/gap_logs.py", "tools/gap_jobs.py", "tools/gap_mujoco.py", "tools/mujoco_robot.py")
+_JUDGED_TOO = (
+    "tools/gap_logs.py", "tools/gap_jobs.py", "tools/gap_mujoco.py", "tools/mujoco_robot.py", "tools/strange_robot.py",
+)  # fmt: skip
 
 
 def revision() -> str:

@@ -11,6 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.stats import binomtest
 
+from tools import strange_robot
 from tools.gap_jobs import FORMS, KINDS, NAMED, OUTSIDE, Result
 
 
@@ -42,6 +43,8 @@ def summary(results: Sequence[Result]) -> dict[str, float]:
         closed = [result.closed for result in of if result.closed is not None]
         if closed and kind not in ("none", "dirty"):
             figures[f"gap.{kind}.closed_median"] = float(np.median(closed))
+            figures[f"gap.{kind}.closed_by_half"] = float(np.mean(np.array(closed) >= 0.5))
+            figures[f"gap.{kind}.closed_of"] = len(closed)
         errors = [error for result in of for error in result.errors]
         covered = [inside for result in of for inside in result.covered]
         if errors and kind in ("single", "pairs", "weak"):
@@ -84,7 +87,7 @@ def per_effect(results: Sequence[Result]) -> list[str]:
     kinds = [kind for kind in KINDS if kind not in ("none", "dirty", "pairs")]
     kinds = [kind for kind in kinds if any(result.kind == kind for result in results)]
     lines = ["| hidden | " + " | ".join(kinds) + " |", "|---" * (len(kinds) + 1) + "|"]
-    for name in (*NAMED, *OUTSIDE, *FORMS):
+    for name in (*NAMED, *OUTSIDE, *FORMS, *strange_robot.FORMS):
         cells = []
         for kind in kinds:
             of = [result.right for result in results if result.kind == kind and result.hidden == [name]]

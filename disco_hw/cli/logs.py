@@ -64,6 +64,12 @@ def gap(
     robot: RobotOption,
     out: Annotated[Path, typer.Option("-o", "--out", help="Directory for report, pictures and amended model.")],
     model: ModelOption = None,
+    fleet: Annotated[
+        bool, typer.Option("--fleet", help="Search each log by itself, and end in one table of all.")
+    ] = False,
+    dask: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="As --fleet, on the Dask cluster of this scheduler.")
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Find where simulation and logs disagree, name the missing effect, write the amended model, show the shrink."""
@@ -71,8 +77,20 @@ def gap(
 
     limit_thread_pools()
     check_named_files(robot, model, logs)
-    from disco_hw.daemon.run import compile_beforehand
     from disco_hw.gap.find import gap as find_gap
+    from disco_hw.gap.find import gap_fleet
+
+    if dask is not None:
+        from disco_hw.inference.simulate import dask_workers
+
+        with dask_workers(dask) as workers:
+            table = gap_fleet(logs, robot, out, model, progress_line, workers.map)
+    elif fleet:
+        table = gap_fleet(logs, robot, out, model, progress_line)
+    if fleet or dask is not None:
+        print_result(table.as_dict(), as_json, table.as_text())
+        return
+    from disco_hw.daemon.run import compile_beforehand
 
     result = find_gap(logs, robot, out, model, progress_line)
     print_result(result.as_dict(), as_json, result.as_text())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
@@ -19,7 +19,14 @@ from disco_hw.gap.data.gridded_drive import grid_drive
 from disco_hw.gap.data.layout import BASE_COUNT, BODY, DELAYED_BY, WHEEL, Layout
 from disco_hw.gap.report.amend import amended_model, at_joint_fit, carried_terms, channel_estimates, simple_model
 from disco_hw.gap.report.blind_spots import finder, proved
-from disco_hw.gap.report.findings import STAGES, GapReport, Provenance, reached_horizon_s
+from disco_hw.gap.report.findings import (
+    STAGES,
+    FleetResult,
+    FleetRow,
+    GapReport,
+    Provenance,
+    reached_horizon_s,
+)
 from disco_hw.gap.report.judge import (
     Measured,
     across_logs,
@@ -267,14 +274,50 @@ def gap(
     Raises InputError for files that cannot be used and for an `out` that cannot be written, or where an input would be
     written over; WorkError if it cannot be written after all.
     """
-    refuse_directory(out, WRITTEN, [*logs, robot, *([model] if model is not None else [])])
-    config = load_robot_config(robot)
-    start = load_model(model) if model is not None else Model.nominal(config.robot)
-    drive = load_drive(list(logs), config.robot.ticks_per_rev, config.robot.wheel_radius_m)
-    report = find_gap(drive, start, progress, pictures=True, prove=True, top_rad_s=config.robot.max_wheel_speed_rad_s)
+    task, loaded = _prepared(logs, robot, out, model)
+    drive = loaded(list(logs))
+    return _written(task.report(drive, progress), robot, model, out, task.robot_name)
+
+
+@dataclass(frozen=True)
+class _Task:
+    """What every log of a robot is searched with."""
+
+    model: Model
+    top_rad_s: float
+    robot_name: str
+
+    def report(self, drive: DriveLog, progress: Progress | None = None) -> GapReport:
+        """What is missing in a drive, with pictures and proofs."""
+        return find_gap(drive, self.model, progress, pictures=True, prove=True, top_rad_s=self.top_rad_s)
+
+
+def _searched(task: _Task, drive: DriveLog) -> GapReport | str:
+    """The report of one log of a fleet, or in one line why there is none."""
+    try:
+        return task.report(drive)
+    except LogError as error:
+        return str(error)
+
+
+def _prepared(
+    logs: Sequence[Path], robot: Path, out: Path, model: Path | None, names: Sequence[str] = WRITTEN
+) -> tuple[_Task, Callable[[list[Path]], DriveLog]]:
+    """How to search logs of a robot, and what loads them; refuses what cannot be read or written."""
+    refuse_directory(out, names, [*logs, robot, *([model] if model is not None else [])])
+    config = load_robot_config(robot).robot
+    start = load_model(model) if model is not None else Model.nominal(config)
+
+    def loaded(paths: list[Path]) -> DriveLog:
+        return load_drive(paths, config.ticks_per_rev, config.wheel_radius_m)
+
+    return _Task(start, config.max_wheel_speed_rad_s, config.name), loaded
+
+
+def _written(report: GapReport, robot: Path, model: Path | None, out: Path, robot_name: str) -> GapResult:
     made = datetime.now().astimezone().isoformat(timespec="minutes")
     given = None if model is None else str(model)
-    report = replace(report, provenance=Provenance(config.robot.name, str(robot), given, made, version(), str(out)))
+    report = replace(report, provenance=Provenance(robot_name, str(robot), given, made, version(), str(out)))
     try:
         out.mkdir(parents=True, exist_ok=True)
         (out / "report.json").write_text(as_json(report.as_dict(), indent=1), encoding="utf-8")
@@ -283,5 +326,55 @@ def gap(
         for name, picture in report.pictures.items():
             (out / f"{name}.png").write_bytes(picture)
     except OSError as error:
-        raise WorkError(f"{out}: cannot be written ({error.strerror}); give another directory") from None
+        raise _unwritten(out, error) from None
     return GapResult(report, out)
+
+
+def _unwritten(out: Path, error: OSError) -> WorkError:
+    return WorkError(f"{out}: cannot be written ({error.strerror}); give another directory")
+
+
+FLEET_WRITTEN = ("fleet.json", "fleet.txt")
+
+Spread = Callable[[Callable[[_Task, DriveLog], GapReport | str], _Task, Sequence[DriveLog]], Iterable[GapReport | str]]
+
+
+def gap_fleet(
+    logs: Sequence[Path],
+    robot: Path,
+    out: Path,
+    model: Path | None = None,
+    progress: Progress | None = None,
+    spread: Spread | None = None,
+) -> FleetResult:
+    """Search each log by itself, all of one kind of robot; a directory for each below `out`, and one table of all.
+
+    `spread` does the searches, in the order of the logs, in this process without it. A log that holds too little to be
+    judged gets a row that says so. Raises as `gap` does.
+    """
+    task, loaded = _prepared(logs, robot, out, model, FLEET_WRITTEN)
+    drives, say = [loaded([log]) for log in logs], progress or (lambda text: None)
+    # Logs of two directories may have one name.
+    stems = [log.stem for log in logs]
+    places = [
+        out / (stem if stems.count(stem) == 1 else f"{stem}-{1 + stems[:k].count(stem)}")
+        for k, stem in enumerate(stems)
+    ]
+    for place in places:
+        refuse_directory(place, WRITTEN, logs)
+    rows = []
+    done = (_searched(task, drive) for drive in drives) if spread is None else spread(_searched, task, drives)
+    for log, place, found in zip(logs, places, done, strict=True):
+        if isinstance(found, str):
+            rows.append(FleetRow(log, place, None, found))
+        else:
+            rows.append(FleetRow(log, place, _written(found, robot, model, place, task.robot_name).report))
+        say(f"{len(rows)} of {len(logs)}: {log}")
+    result = FleetResult(tuple(rows), out)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        (out / "fleet.json").write_text(as_json(result.as_dict(), indent=1), encoding="utf-8")
+        (out / "fleet.txt").write_text(f"{result.table()}\n", encoding="utf-8")
+    except OSError as error:
+        raise _unwritten(out, error) from None
+    return result

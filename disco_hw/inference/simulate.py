@@ -273,4 +273,4 @@ def dask_workers(address: str) -> Iterator[DaskWorkers]:
             raise WorkError(f"--dask {address}: a worker lacks {error.name}; install disco-hw there too") from None
         except (distributed.KilledWorker, distributed.client.FutureCancelledError, OSError) as error:
             reason = str(error).partition("\n")[0]
-            raise WorkError(f"--dask {address}: the cluster was lost ({reason}); start it again, then infer") from None
+            raise WorkError(f"--dask {address}: the cluster was lost ({reason}); start it again, then this") from None

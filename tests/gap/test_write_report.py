@@ -1,14 +1,27 @@
-"""What the command hands to the search."""
+"""What the command hands to the search, and what it makes of a fleet's logs."""
 
+import json
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from typer.testing import CliRunner
 
 import disco_hw
+from disco_hw.cli.app import app
 from disco_hw.config import load_robot_config
-from disco_hw.errors import InputError
+from disco_hw.effects.registry import REGISTRY
+from disco_hw.errors import InputError, LogError
 from disco_hw.gap import find
+from disco_hw.gap.report.findings import STAGES, Doubt, EffectFinding, GapReport, UnnamedFinding
+from disco_hw.gap.search.analysis import ParameterEstimate
+from disco_hw.gap.search.cross_validation import PredictionErrors
+from disco_hw.log.importing import write_log
+from disco_hw.model import Model
+from tools.mujoco_robot import joystick
+from tools.strange_robot import record
+
+ROBOT = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
 
 
 class EnoughError(Exception):
@@ -44,3 +57,122 @@ def test_a_directory_that_cannot_be_used_is_refused_before_the_search(monkeypatc
         find.gap([], robot, tmp_path, given)
     with pytest.raises(EnoughError):
         find.gap([], robot, tmp_path / "gap", given)
+
+
+def report_of(name, timed_m, amended_m, offered="amended"):
+    """A report that found one effect, a form without a name and a doubt, with errors that its name tells apart."""
+    sizes = dict(zip(STAGES, (0.09, 0.08, timed_m, amended_m, 0.004), strict=True))
+
+    def errors(stage, ahead_s):
+        at = 0.5 * ahead_s * sizes[stage]
+        return PredictionErrors(at, (at, at), 2.0 * at, (at, at), 0.1, {})
+
+    gap = {stage: {ahead_s: errors(stage, ahead_s) for ahead_s in (0.5, 1.0, 2.0, 5.0)} for stage in STAGES}
+    effect = EffectFinding(
+        name, "command_to_wheel", {REGISTRY[name].parameters[0].name: ParameterEstimate(0.1234, 0.1, 0.15)}, 50.0
+    )
+    return GapReport(
+        (name,), (), (effect,), (UnnamedFinding("wheel_to_body", "v_x += 3 v", 30.0),), (), gap, Model(0.06, 0.4),
+        1.0, offered, doubtful=(Doubt("slope", "at its bound"),),
+    )  # fmt: skip
+
+
+@pytest.fixture
+def fleet(monkeypatch, tmp_path):
+    """Three logs, two of one name and one too short, and the reports that a search would make of them."""
+    logs = [tmp_path / "monday" / "drive.mcap", tmp_path / "tuesday" / "drive.mcap", tmp_path / "short.mcap"]
+    for log in logs:
+        log.parent.mkdir(exist_ok=True)
+        log.write_bytes(b"a log")
+    reports = {logs[0]: report_of("motor_lag", 0.020, 0.010), logs[1]: report_of("deadband", 0.030, 0.040, "timed")}
+
+    def search(log, *_, **__):
+        if log not in reports:
+            raise LogError(f"{log}: too little to judge")
+        return reports[log]
+
+    monkeypatch.setattr(find, "load_drive", lambda paths, *_: paths[0])
+    monkeypatch.setattr(find, "find_gap", search)
+    return logs
+
+
+def test_a_fleet_ends_in_one_table_with_a_row_for_each_log(fleet, tmp_path):
+    out = tmp_path / "out"
+    said = []
+    result = find.gap_fleet(fleet, ROBOT, out, progress=said.append)
+    head, monday, tuesday, short = (out / "fleet.txt").read_text().splitlines()
+    assert head.split() == ["log", "found", "doubtful", "ahead", "timed", "offered", "floor", "model"]
+    assert monday.split("  ")[0] == str(fleet[0])
+    # Offered is what model.toml holds, and errors are told where the answer looks: 2 s ahead.
+    columns = [head.index(f"  {name}") + 2 for name in head.split()[1:]]
+    cut = [
+        [line[a:b].strip() for a, b in zip(columns, [*columns[1:], None], strict=True)] for line in (monday, tuesday)
+    ]
+    assert cut == [
+        [
+            "motor_lag 0.123; v_x += 3 v",
+            "slope",
+            "2 s",
+            "20.0 mm 40 mrad",
+            "10.0 mm 20 mrad",
+            "4.0 mm 8 mrad",
+            "amended",
+        ],
+        ["deadband 0.123; v_x += 3 v", "slope", "2 s", "30.0 mm 60 mrad", "30.0 mm 60 mrad", "4.0 mm 8 mrad", "timed"],
+    ]
+    assert short.endswith(f"not judged: {fleet[2]}: too little to judge")
+    assert result.as_text().startswith(head)
+    assert [text.partition(":")[0] for text in said] == ["1 of 3", "2 of 3", "3 of 3"]
+
+
+def test_a_fleet_s_json_has_the_numbers_and_every_log_its_report(fleet, tmp_path):
+    out = tmp_path / "out"
+    answer = CliRunner().invoke(
+        app, ["gap", *map(str, fleet), "--robot", str(ROBOT), "-o", str(out), "--fleet", "--json"]
+    )
+    assert answer.exit_code == 0, answer.output
+    content = json.loads((out / "fleet.json").read_text())
+    assert json.loads(answer.stdout) == content
+    monday, tuesday, short = content["logs"]
+    assert monday["effects"] == {"motor_lag": {"tau_s": [0.1234, 0.1, 0.15]}}
+    assert (monday["verdict"], monday["unnamed"], monday["doubtful"]) == ("effects_found", ["v_x += 3 v"], ["slope"])
+    assert (monday["horizon_s"], monday["judged_by"], monday["offered"]) == (2.0, "poses", "amended")
+    assert monday["held_out"]["amended"]["position_rmse_m"] == pytest.approx(0.010)
+    assert tuesday["held_out"]["timed"]["yaw_rmse_rad"] == pytest.approx(0.060)
+    assert short == {"log": str(fleet[2]), "verdict": "not_judged", "why_not": f"{fleet[2]}: too little to judge"}
+    assert [Path(row["directory"]).name for row in (monday, tuesday)] == ["drive-1", "drive-2"]
+    for row, name in ((monday, "motor_lag"), (tuesday, "deadband")):
+        assert json.loads((Path(row["directory"]) / "report.json").read_text())["effects"][0]["name"] == name
+        assert (Path(row["directory"]) / "model.toml").exists()
+    assert not (out / "short").exists()
+
+
+def test_reports_of_a_fleet_are_written_over_no_log(fleet, tmp_path):
+    inside = tmp_path / "out" / "drive" / "model.toml"
+    inside.parent.mkdir(parents=True)
+    inside.write_bytes(b"a log too")
+    with pytest.raises(InputError, match="would be written over, and is read here"):
+        find.gap_fleet([fleet[0], inside], ROBOT, tmp_path / "out")
+
+
+# Each worker imports and compiles the search anew.
+@pytest.mark.long
+@pytest.mark.timeout(900)
+def test_a_cluster_makes_the_same_table(tmp_path):
+    distributed = pytest.importorskip("distributed")
+    logs = [tmp_path / f"drive{seed}.mcap" for seed in (1, 2)]
+    for seed, log in enumerate(logs, 1):
+        write_log(record("hysteresis", seed, joystick(seed, 40.0)).log, log, "strange")
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, host="127.0.0.1", dashboard_address=None
+    ) as cluster:
+        cluster.wait_for_workers(2)
+        address = ["--dask", cluster.scheduler_address]
+        answer = CliRunner().invoke(
+            app, ["gap", *map(str, logs), "--robot", str(ROBOT), "-o", str(tmp_path / "far"), *address]
+        )
+    assert answer.exit_code == 0, answer.output
+    here = find.gap_fleet(logs, ROBOT, tmp_path / "here")
+    assert (tmp_path / "far" / "fleet.txt").read_text() == (tmp_path / "here" / "fleet.txt").read_text()
+    assert here.table() in answer.output
+    assert (tmp_path / "far" / "drive2" / "report.html").stat().st_size > 10_000

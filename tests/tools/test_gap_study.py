@@ -13,6 +13,7 @@ from disco_hw.gap.search.analysis import ParameterEstimate
 from tools import gap_jobs, gap_study, gap_tables
 from tools.gap_jobs import Job, Result, jobs
 from tools.gap_logs import NAMED
+from tools.strange_robot import FORMS
 
 pytestmark = pytest.mark.long
 
@@ -51,6 +52,9 @@ def test_what_counts_as_right_depends_on_the_kind():
     assert result("outside", ("x_motor_droop",), (), unnamed=["u |u|"]).right
     assert not result("forms", ("x_slew_limited_motor",), ("motor_lag",)).right
     assert result("forms", ("x_slew_limited_motor",), ("motor_lag",), residue=1).right
+    assert result("strange", ("hysteresis",), ("motor_lag", "command_delay"), unnamed=["u |u|"]).right
+    assert not result("strange", ("hysteresis",), ("motor_lag", "deadband")).right
+    assert result("strange", ("stribeck_friction",), ("deadband",)).right
     assert result("circle", ("turn_slip",), (), blind=["turn_slip"]).right
     assert not result("circle", ("turn_slip",), (), blind=["slope"]).right
     assert not result("circle", ("turn_slip",), ("slope",), blind=["turn_slip"]).right
@@ -72,6 +76,16 @@ def test_a_miss_that_the_report_calls_too_small_is_counted_beside_and_never_as_r
     limit = BlindSpot("speed_limit", "limit_rad_s", "rad/s", 6.0, False, "")
     assert gap_jobs.too_small(limit, 7.0)
     assert not gap_jobs.too_small(limit, 5.0)
+
+
+def test_the_gap_of_a_strange_robot_is_that_of_the_timed_model():
+    strange = result("strange", ("backlash",), (), timed_mm=24.0, amended_mm=19.0)
+    assert strange.closed == pytest.approx(0.5)
+    assert result(timed_mm=24.0).closed == pytest.approx(25.0 / 26.0)
+    figures = gap_tables.summary([strange, result("strange", ("backlash",), (), timed_mm=24.0, amended_mm=20.0)])
+    assert (figures["gap.strange.closed_by_half"], figures["gap.strange.closed_of"]) == (0.5, 2)
+    assert any(line.startswith("| `backlash` |") for line in gap_tables.per_effect([strange]))
+    assert [next(iter(job.hidden)) for job in jobs("strange", [7])] == list(FORMS)
 
 
 def test_a_study_goes_on_where_it_was_broken_off(tmp_path, monkeypatch):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from typing import Any
 
 from disco_hw.effects.registry import REGISTRY
@@ -244,3 +245,92 @@ def _errors_dict(errors: PredictionErrors) -> dict[str, Any]:
         "wheel_rmse_rad_s": errors.wheel_rad_s,
         "by_regime_m": errors.by_regime_m,
     }
+
+
+_COLUMNS = ("log", "found", "doubtful", "ahead", "timed", "offered", "floor", "model")
+
+
+@dataclass(frozen=True)
+class FleetRow:
+    """What one log of a fleet was found to lack, `directory` with its report, or why there is none."""
+
+    log: Path
+    directory: Path
+    report: GapReport | None
+    why_not: str = ""
+
+    def as_dict(self) -> dict[str, Any]:
+        """The row in fleet.json."""
+        report = self.report
+        if report is None:
+            return {"log": str(self.log), "verdict": "not_judged", "why_not": self.why_not}
+        errors = report.gap or report.wheels
+        return {
+            "log": str(self.log),
+            "verdict": report.verdict,
+            "effects": {
+                effect.name: {name: [e.value, e.low, e.high] for name, e in effect.parameters.items()}
+                for effect in report.effects
+            },
+            "unnamed": [term.form for term in report.unnamed],
+            "doubtful": [doubt.name for doubt in report.doubtful],
+            "offered": report.offered,
+            "horizon_s": report.horizon_s,
+            "held_out": {stage: _errors_dict(of[report.horizon_s]) for stage, of in errors.items()},
+            "judged_by": "poses" if report.gap else "wheels",
+            "directory": str(self.directory),
+        }  # fmt: skip
+
+    def cells(self) -> tuple[str, ...]:
+        """The row in words, by column."""
+        report = self.report
+        if report is None:
+            return (str(self.log), f"not judged: {self.why_not}", *[""] * (len(_COLUMNS) - 2))
+        values = [
+            f"{effect.name} {', '.join(f'{e.value:.3g}' for e in effect.parameters.values())}"
+            for effect in report.effects
+        ]
+        errors, horizon_s = report.gap or report.wheels, report.horizon_s
+
+        def cell(stage: str) -> str:
+            if stage not in errors or not math.isfinite(errors[stage][horizon_s].position_m):
+                return "-"
+            error = errors[stage][horizon_s]
+            return f"{1e3 * error.position_m:.1f} mm {1e3 * error.yaw_rad:.0f} mrad"
+
+        # Wheels without poses have no geometry to refit: as given is what they have in its place.
+        offered = report.offered if report.offered in errors else "nominal"
+        return (
+            str(self.log),
+            "; ".join([*values, *(term.form for term in report.unnamed)]) or "nothing",
+            ", ".join(doubt.name for doubt in report.doubtful) or "-",
+            f"{horizon_s:g} s",
+            cell("timed"),
+            cell(offered),
+            cell("floor"),
+            report.offered,
+        )
+
+
+@dataclass(frozen=True)
+class FleetResult:
+    """One row a log, and the directory that they were written to."""
+
+    rows: tuple[FleetRow, ...]
+    directory: Path
+
+    def as_dict(self) -> dict[str, Any]:
+        """The content of fleet.json."""
+        return {"logs": [row.as_dict() for row in self.rows]}
+
+    def table(self) -> str:
+        """One line a log under a line of headings; errors are held out, as far ahead as the row says."""
+        lines = [_COLUMNS, *(row.cells() for row in self.rows)]
+        judged = [line for row, line in zip((None, *self.rows), lines, strict=True) if row is None or row.report]
+        widths = [max(len(line[k]) for line in (lines if k == 0 else judged)) for k in range(len(_COLUMNS))]
+        padded = ("  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)) for line in lines)
+        return "\n".join(line.rstrip() for line in padded)
+
+    def as_text(self) -> str:
+        """For a terminal."""
+        return f"{self.table()}\n\nwritten: {self.directory}/fleet.txt, fleet.json, and a directory for each log"
