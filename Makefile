@@ -10,7 +10,7 @@ SOURCES := pyproject.toml setup.py constraints.txt firmware_protocol/build_firmw
 # the libraries anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: venv demo chromium test test-long bench gap-study soak fault-campaign fuzz firmware-check firmware-mutants firmware-emulated cross-tools socketcan-test ros dist-check docs clean
+.PHONY: venv demo chromium test test-long bench gap-study soak fault-campaign fuzz firmware-check firmware-mutants firmware-emulated cross-tools socketcan-test test-arm ros dist-check docs clean
 
 venv: $(STAMP)
 
@@ -115,6 +115,10 @@ firmware-mutants: $(STAMP)
 
 socketcan-test: $(STAMP)
 	$(BIN)/python -m tools.socketcan_test
+
+# Firmware core, estimation and kernels on aarch64, emulated where this is none: 240 MB to download.
+test-arm: $(STAMP)
+	nice -n 19 $(BIN)/python -m tools.test_arm
 
 clean:
 	rm -rf $(VENV) $(PEERS) $(ROS) build *.egg-info firmware_protocol/_firmware*
