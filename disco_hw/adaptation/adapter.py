@@ -178,7 +178,7 @@ class Adapter:
             return
         if float(drive.moving_s.sum()) > _SETTLED_S * _LEAST_MOVING:
             self._noise_s = now_s
-            self._noise.add(measured_noise(drive, judged.mean))
+            self._noise.add(measured_noise(drive, judged.mean).about_the_point())
 
     def _judge_in_force(self, seen: Evidence) -> None:
         """Score the newest driving under the belief in force and under the model file's; what is older counts less."""

@@ -196,8 +196,8 @@ def evidence(drive: Excitation, noise: Noise) -> Evidence:
     in_x = np.column_stack([steps[:, 0], along * cosine, across * sine])
     in_y = np.column_stack([steps[:, 1], along * sine, -across * cosine])
     turned = np.column_stack([steps[:, 2], drive.roll_rad[:, 1]])
-    x, y = np.hsplit(_whitened(np.hstack([in_x, in_y]), whitening(drive, noise.position_m, slip_m)), 2)
-    yaw = _whitened(turned, whitening(drive, noise.yaw_rad, noise.slip_yaw_rad_sqrt_s))
+    x, y = np.hsplit(_whitened(np.hstack([in_x, in_y]), whitening(drive, noise.position_m, slip_m, drive.moving_s)), 2)
+    yaw = _whitened(turned, whitening(drive, noise.yaw_rad, noise.slip_yaw_rad_sqrt_s, drive.moving_s))
     x, y, yaw = (np.where(inside[:, None], part, 0.0) for part in (x, y, yaw))
 
     information = np.zeros((drive.t_s.size, 3, 3))

@@ -156,10 +156,13 @@ def circle(
     largest_rot_s2: Annotated[float, typer.Option(min=0.1, help="Largest change of it in a second.")] = math.inf,
     lag_s: Annotated[float, typer.Option(min=0.0, help="Lag of the plant's wheels.")] = 0.1,
     wheel_noise: Annotated[float, typer.Option(min=0.0, help="Noise of a wheel's speed, part of it.")] = 0.05,
+    belief_scale: Annotated[
+        float, typer.Option(min=0.1, max=10.0, help="Times the posterior's standard deviations, of plants too.")
+    ] = 1.0,
     out: Annotated[Path, typer.Option("-o", "--out", help="Directory for CSV and picture.")] = Path("out/circle"),
     as_json: AsJson = False,
 ) -> None:
-    """Drive the circle knowing the prior, the posterior, a point estimate, or the truth."""
+    """Drive the circle knowing the prior, the posterior, its mean alone, a point estimate, or the truth."""
     import disco_hw
     from disco_hw.experiments.circle import CircleOptions, run_circle
     from disco_hw.runtime.robot_setup import load_setup
@@ -171,7 +174,9 @@ def circle(
             raise InputError(f"--{option} {value}: not a finite number; write one")
     refuse_directory(out)
     setup = load_setup(robot or Path(disco_hw.__file__).parent / "robots" / "wombot.toml")
-    options = CircleOptions(seeds, duration_s, rate_hz, largest_rot_s, largest_rot_s2, lag_s, wheel_noise, seed_offset)
+    options = CircleOptions(
+        seeds, duration_s, rate_hz, largest_rot_s, largest_rot_s2, lag_s, wheel_noise, seed_offset, belief_scale
+    )
     result = run_circle(setup.model, mode, options, progress_line)
     out.mkdir(parents=True, exist_ok=True)
     result.write_csv(out / "circle.csv")

@@ -20,7 +20,7 @@ from disco_hw.control.disco import Disco
 from disco_hw.control.plan import PlannerState, SentCommand
 from disco_hw.control.settings import ROTATION, CommandLimits, DiscoSettings
 from disco_hw.errors import InputError
-from disco_hw.model import Model, Uniform
+from disco_hw.model import Gaussian, Model, Uniform
 from disco_hw.model.model import BASE_PARAMETERS
 from disco_hw.reports import TWO_THIRDS, write_pictures
 from disco_hw.tasks.circle import CircleCost, CircleTask
@@ -69,7 +69,7 @@ Progress = Callable[[str], None]
 Command = Callable[[int, PlannerState], tuple[float, float]]
 
 POINT_ESTIMATE = {"x_icr_m": 0.12, "wheel_radius_m": 0.06, "axial_distance_m": 0.47}
-CURVES = ("prior", "posterior", "point estimate", "true parameters")
+CURVES = ("prior", "posterior", "posterior mean", "point estimate", "true parameters")
 MEMORY_S = 2.0
 
 
@@ -77,7 +77,8 @@ MEMORY_S = 2.0
 class CircleOptions:
     """What the paper leaves open.
 
-    `seeds` seeds from `seed_offset` on draw plant and noise. `rate_hz` of replanning; `largest_rot_s` and
+    `seeds` seeds from `seed_offset` on draw plant and noise. `belief_scale` multiplies the posterior's standard
+    deviations, for the plants that are drawn as for those who know it. `rate_hz` of replanning; `largest_rot_s` and
     `largest_rot_s2` bound a wheel's command; `lag_s` and `wheel_noise` are the plant's; it starts on the circle, along
     it, at rest.
     """
@@ -90,6 +91,7 @@ class CircleOptions:
     lag_s: float = 0.1
     wheel_noise: float = 0.05
     seed_offset: int = 0
+    belief_scale: float = 1.0
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -197,6 +199,9 @@ def run_circle(
         raise InputError(
             "the model has no belief over wheel radius, axial distance and x_icr; name a file that has one"
         )
+    if options.belief_scale != 1.0:
+        covariance = options.belief_scale**2 * model.belief.covariance()
+        model = replace(model, belief=Gaussian(model.belief.names, model.belief.mean(), covariance))
     circle = CircleCost()
     task = circle.paper() if mode == "paper" else circle
     settings = DiscoSettings.paper() if mode == "paper" else DiscoSettings()
@@ -230,6 +235,9 @@ def _knowing(name: str, model: Model, theta: dict[str, float]) -> Model:
             return replace(model, belief=Uniform(tuple(p.name for p in BASE_PARAMETERS), low, high))
         case "posterior":
             return model
+        case "posterior mean":
+            assert model.belief is not None
+            return bare.with_point(dict(zip(model.belief.names, model.belief.mean().tolist(), strict=True)))
         case "point estimate":
             return bare.with_point(POINT_ESTIMATE)
         case _:

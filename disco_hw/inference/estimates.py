@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.inference.excitation import Excitation, Noise
+from disco_hw.inference.excitation import Excitation, Noise, slip_intensity
 from disco_hw.jit import parallel_kernel
 
 Array = NDArray[np.float64]
@@ -28,9 +28,11 @@ class Whitening(NamedTuple):
     carry: Array
 
 
-def whitening(drive: Excitation, sensor: float, slip: float) -> Whitening:
-    """Factor for increments with the sensor's standard deviation and the slip per square root of second in motion."""
-    variance = 2.0 * sensor**2 + slip**2 * drive.moving_s
+def whitening(drive: Excitation, sensor: float, slip: float, grown_s: Array) -> Whitening:
+    """Factor for increments with the sensor's standard deviation and the slip per square root of second of its clock,
+    `grown_s` (P,) from pose to pose.
+    """
+    variance = 2.0 * sensor**2 + slip**2 * grown_s
     diagonal, carry = np.ones(variance.size), np.zeros(variance.size)
     starts = drive.starts
     begins = True
@@ -115,12 +117,13 @@ class Estimates:
 
 def estimates(drive: Excitation, noise: Noise) -> Estimates:
     """The statistics of a drive, weighted for its noise."""
-    slip_m = math.sqrt(0.5 * (noise.slip_forward_m_sqrt_s**2 + noise.slip_left_m_sqrt_s**2))
+    slip_m = math.sqrt(0.5 * (noise.slip_forward_m_sqrt_s**2 + noise.about_the_point().slip_left_m_sqrt_s ** 2))
+    _, grown_s = slip_intensity(drive, noise.speed_share)
     return Estimates(
         drive.roll_rad,
         drive.run_pose,
-        whitening(drive, noise.position_m, slip_m),
-        whitening(drive, noise.yaw_rad, noise.slip_yaw_rad_sqrt_s),
+        whitening(drive, noise.position_m, slip_m, grown_s),
+        whitening(drive, noise.yaw_rad, noise.slip_yaw_rad_sqrt_s, grown_s),
     )
 
 

@@ -5,8 +5,8 @@ A run is a stretch of poses without a gap in which the wheels are known througho
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from itertools import pairwise, product
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -231,7 +231,12 @@ def _commanded(commands: Commands, segment: int) -> _Roll:
 
 
 _LAGS_S = (0.0, 0.1, 0.2, 0.4, 0.8, 1.6, 3.0)
-_CORRELATIONS_S = (1e-3, 0.1, 0.2, 0.3, 0.5)
+_CORRELATIONS_S = (1e-3, 0.03, 0.06, 0.1, 0.15, 0.2, 0.3, 0.4, 0.55, 0.75)
+_SPEED_SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)
+# Lags short enough for a body that turns to keep its direction, long enough for slip to show beside the sensor.
+_SHAPE_LAGS_S = (0.15, 1.0)
+# A squared error counts up to so many variances in what tells the shape of the noise.
+_LARGEST_SQUARE = 9.0
 _FEWEST_WINDOWS = 12
 _LEAST_RATIO = 0.5
 # Of a window, the part at either end over which positions are averaged.
@@ -249,7 +254,12 @@ _MEAN_OF_HELD_SQUARE = 0.995
 @dataclass(frozen=True, slots=True)
 class Noise:
     """Standard deviations: of a measured position (m, per axis) and yaw (rad), independent from sample to sample; of
-    the slip of a moving body forward, left (m per sqrt(s)) and in yaw (rad per sqrt(s)), a random walk.
+    the slip of a moving body forward, left (m per sqrt(s)) and in yaw (rad per sqrt(s)).
+
+    Slip is a random speed that keeps its direction for `correlation_s` (an Ornstein-Uhlenbeck process; 0: a random
+    walk); the standard deviations are of what it adds up to over longer times. Of its variance the part `speed_share`
+    grows with the square of the wheels' speed. Slip in yaw turns the body about a point `lever_m` before the tracked
+    one, as unequal grip of the wheels does about the centre of rotation.
     """
 
     position_m: float
@@ -257,9 +267,12 @@ class Noise:
     slip_forward_m_sqrt_s: float
     slip_left_m_sqrt_s: float
     slip_yaw_rad_sqrt_s: float
+    correlation_s: float = 0.0
+    lever_m: float = 0.0
+    speed_share: float = 0.0
 
     def vector(self) -> Array:
-        """The five numbers in order, (5,)."""
+        """The five standard deviations in order, (5,)."""
         return np.array(
             [
                 self.position_m,
@@ -270,43 +283,97 @@ class Noise:
             ]
         )
 
+    def scales(self) -> Array:
+        """The five standard deviations, the correlation time and the lever, (7,)."""
+        return np.append(self.vector(), [self.correlation_s, self.lever_m])
+
+    def about_the_point(self) -> Noise:
+        """The same variances without a lever."""
+        left = np.hypot(self.slip_left_m_sqrt_s, self.lever_m * self.slip_yaw_rad_sqrt_s)
+        return replace(self, slip_left_m_sqrt_s=float(left), lever_m=0.0)
+
 
 USUAL = Noise(0.005, 0.01, 0.005, 0.005, 0.015)
+
+
+def slip_intensity(drive: Excitation, speed_share: float) -> tuple[Array, Array]:
+    """Growth of the slip's variance beside its mean while moving: at each node (M,), and up to each pose from the one
+    before (P,), s.
+    """
+    window = np.ones(2 * _MOVING_SPREAD_STEPS + 1) / (2 * _MOVING_SPREAD_STEPS + 1)
+    square = np.convolve((drive.wheel_rad_s**2).mean(axis=1), window, mode="same")
+    usual = float(square @ drive.moving) / max(float(drive.moving.sum()), 1.0)
+    intensity = drive.moving * (1.0 - speed_share + speed_share * square / max(usual, 1e-12))
+    grown_s = np.concatenate([[0.0], np.cumsum(intensity) * drive.step_s])
+    at_pose = grown_s[drive.node] + drive.fraction * np.diff(grown_s)[drive.node]
+    return intensity, np.where(drive.starts, 0.0, np.diff(at_pose, prepend=0.0))
+
+
+@dataclass(frozen=True, slots=True)
+class _Windows:
+    """Errors over windows of one lag (W, 3): forward, left, yaw; time in motion and on the slip's clock (W,), s;
+    `growth` of a random walk from the mean of one end to that of the other, beside that from end to end; `sensor`: how
+    often the sensor's variance is in the error's; `independent`: how many windows count, as they overlap by half.
+    """
+
+    error: Array
+    moving_s: Array
+    intensity: Array
+    growth: float
+    sensor: float
+    independent: float
 
 
 def measured_noise(drive: Excitation, theta: Array) -> Noise:
     """The noise in what a geometry leaves unexplained; `theta` (3,) is x_icr, wheel radius, axial distance (m).
 
     Errors of predicted displacement over several lags: sensor noise adds the same variance to each, slip one that grows
-    with the time in motion (structure function). Errors beyond three standard deviations are held there, so that jumps
-    of the sensor do not count.
+    with the time in motion (structure function), slower at first the longer it keeps its direction. Errors beyond three
+    standard deviations are held there, so that jumps of the sensor do not count.
     """
     error = _errors(drive, theta)
-    moved = np.concatenate([np.cumsum(drive.moving_s[lo:hi]) for lo, hi in _bounds(drive)])
-    rows: list[tuple[float, float, float, Array]] = []
+    by_speed_s = slip_intensity(drive, 1.0)[1]
+    rows: list[_Windows] = []
+    shape: list[_Windows] = []
     period_s = float(np.median(np.diff(drive.t_s)[~drive.starts[1:]]))
     for lag in sorted({max(1, round(lag_s / period_s)) for lag_s in _LAGS_S}):
-        ends = max(1, round(_ENDS * lag))
-        squares, moving = _windows(drive, error, moved, lag, ends)
+        windows = _windows(drive, error, by_speed_s, lag)
         length_s = lag * period_s
-        for chosen in (moving < 0.05 * length_s, moving > 0.9 * length_s):
+        for moves, chosen in (
+            (False, windows.moving_s < 0.05 * length_s),
+            (True, windows.moving_s > 0.9 * length_s),
+        ):
             if np.count_nonzero(chosen) >= _FEWEST_WINDOWS:
-                # Windows overlap by half.
-                independent = 0.5 * np.count_nonzero(chosen) if lag > 1 else float(np.count_nonzero(chosen))
-                # A random walk from the mean of one end to that of the other grows by a third of an end less.
-                time_s = float(np.mean(moving[chosen])) * (1.0 - (ends - 1) / (3.0 * lag))
-                rows.append((time_s, 2.0 / ends, independent, _variance(squares[chosen])))
+                part = _chosen(windows, chosen, 0.5 if lag > 1 else 1.0)
+                rows.append(part)
+                if moves and _SHAPE_LAGS_S[0] < length_s < _SHAPE_LAGS_S[1]:
+                    shape.append(part)
     if len(rows) < 3:
         return USUAL
-    times_s, sensor, counts = np.array([row[:3] for row in rows]).T
-    variances = np.array([row[3] for row in rows])
-    forward, left, yaw = (_two_terms(times_s, sensor, counts, variances[:, axis]) for axis in range(3))
-    position = 0.5 * (forward[0] + left[0])
+    times_s = np.array([float(np.mean(row.moving_s)) * row.growth for row in rows])
+    sensor, counts = np.array([(row.sensor, row.independent) for row in rows]).T
+    variances = np.array([_variance(row.error**2) for row in rows])
+    sensors, slips, correlation_s = _two_terms(times_s, sensor, counts, variances)
+    lever_m = _lever(shape, slips[2], correlation_s)
     # Short drives say little of the smaller one; wheels that slip one way on a floor slip the other way too.
-    least = _LEAST_RATIO**2 * max(forward[1], left[1])
-    forward, left = (forward[0], max(forward[1], least)), (left[0], max(left[1], least))
-    found = np.sqrt([position, yaw[0], forward[1], left[1], yaw[1]])
-    return Noise(*np.clip(found, _SMALLEST, _LARGEST).tolist())
+    least = _LEAST_RATIO**2 * max(slips[0], slips[1])
+    forward, left = max(slips[0], least), max(slips[1], least)
+    left = max(left - lever_m**2 * slips[2], _LEAST_RATIO**2 * least)
+    found = np.sqrt([0.5 * (sensors[0] + sensors[1]), sensors[2], forward, left, slips[2]])
+    share = _speed_share(shape, sensors, slips, correlation_s)
+    white = Noise(*np.clip(found, _SMALLEST, _LARGEST).tolist())
+    return replace(white, correlation_s=correlation_s, lever_m=lever_m, speed_share=share)
+
+
+def _chosen(windows: _Windows, chosen: NDArray[np.bool_], independent: float) -> _Windows:
+    return _Windows(
+        windows.error[chosen],
+        windows.moving_s[chosen],
+        windows.intensity[chosen],
+        windows.growth,
+        windows.sensor,
+        independent * np.count_nonzero(chosen),
+    )
 
 
 def _variance(squares: Array) -> Array:
@@ -316,25 +383,67 @@ def _variance(squares: Array) -> Array:
     return held
 
 
-def _two_terms(time_s: Array, sensor: Array, counts: Array, variance: Array) -> tuple[float, float]:
-    """Sensor variance R and slip variance q per second in `variance = sensor R + q time`, both not negative.
+def _grown(time_s: Array, correlation_s: float) -> Array:
+    """Time after which a random walk has grown as far as slip that keeps its direction for a while."""
+    return np.asarray(time_s + correlation_s * np.expm1(-time_s / correlation_s))
 
-    Slip that keeps its direction for a while grows slower at first, as time - tau (1 - exp(-time / tau)); its rate
-    later on is what parameters feel. Errors are relative to the variance and fall with the number of windows.
+
+def _two_terms(time_s: Array, sensor: Array, counts: Array, variances: Array) -> tuple[Array, Array, float]:
+    """Sensor variances R (axes,), slip variances q (axes,) per second, and the correlation time of slip in
+    `variance = sensor R + q grown(time)`; `variances` (rows, axes). R and q are not negative.
+
+    Slip that keeps its direction for a while grows slower at first; its rate later on is what parameters feel. Errors
+    are relative to the variance and fall with the number of windows.
     """
-    precision = np.sqrt(counts)
-    scale = precision / np.maximum(variance, 1e-12)
-    best, best_cost = (0.0, 0.0), np.inf
-    for tau_s, use in product(_CORRELATIONS_S, ((True, True), (True, False), (False, True))):
-        grown = time_s + tau_s * np.expm1(-time_s / tau_s)
-        columns = np.column_stack([sensor, grown])[:, use]
-        solution, *_ = np.linalg.lstsq(columns * scale[:, None], variance * scale, rcond=None)
-        cost = float(np.sum((columns @ solution * scale - variance * scale) ** 2))
+    scales = np.sqrt(counts)[:, None] / np.maximum(variances, 1e-12)
+    axes = range(variances.shape[1])
+    best_cost = np.inf
+    for tau_s in _CORRELATIONS_S:
+        columns = np.column_stack([sensor, _grown(time_s, tau_s)])
+        fits = [_not_negative(columns * scales[:, [axis]], variances[:, axis] * scales[:, axis]) for axis in axes]
+        cost = sum(fit[1] for fit in fits)
+        if cost < best_cost:
+            best_cost, best_tau_s, best = cost, tau_s, np.array([fit[0] for fit in fits])
+    return best[:, 0], best[:, 1], best_tau_s
+
+
+def _not_negative(columns: Array, values: Array) -> tuple[Array, float]:
+    """Coefficients (2,) of least squares that are not negative, and the sum of squares that is left."""
+    best, best_cost = np.zeros(2), np.inf
+    for use in ([True, True], [True, False], [False, True]):
+        solution, *_ = np.linalg.lstsq(columns[:, use], values, rcond=None)
+        cost = float(np.sum((columns[:, use] @ solution - values) ** 2))
         if (solution >= 0.0).all() and cost < best_cost:
-            full = np.zeros(2)
-            full[list(use)] = solution
-            best, best_cost = (float(full[0]), float(full[1])), cost
-    return best
+            best, best_cost = np.zeros(2), cost
+            best[use] = solution
+    return best, best_cost
+
+
+def _lever(windows: list[_Windows], slip_yaw: float, correlation_s: float) -> float:
+    """How far before the tracked point slip turns the body (m): errors to the left go with those of yaw."""
+    together = grown = 0.0
+    for one in windows:
+        left, yaw = one.error[:, 1], one.error[:, 2]
+        spread = _variance(one.error[:, 1:] ** 2)
+        usual = (left**2 < _LARGEST_SQUARE * spread[0]) & (yaw**2 < _LARGEST_SQUARE * spread[1])
+        weight = 1.0 / max(spread[0] * spread[1], 1e-24)
+        times_s = _grown(one.moving_s * one.growth, correlation_s)
+        together -= weight * float((left * yaw)[usual].sum()) / one.independent
+        grown += weight * slip_yaw * float(times_s[usual].sum()) / one.independent
+    return together / grown if grown > 0.0 else 0.0
+
+
+def _speed_share(windows: list[_Windows], sensors: Array, slips: Array, correlation_s: float) -> float:
+    """The part of the slip's variance that grows with the square of speed, by likelihood."""
+    costs = []
+    for share in _SPEED_SHARES:
+        cost = 0.0
+        for one in windows:
+            grown_s = _grown(one.moving_s * one.growth, correlation_s) * (1.0 - share + share * one.intensity)
+            variance = np.maximum(one.sensor * sensors + grown_s[:, None] * slips, 1e-12)
+            cost += float((np.log(variance) + np.minimum(one.error**2 / variance, _LARGEST_SQUARE)).sum())
+        costs.append(cost)
+    return _SPEED_SHARES[int(np.argmin(costs))] if windows else 0.0
 
 
 def _bounds(drive: Excitation) -> list[tuple[int, int]]:
@@ -365,13 +474,15 @@ def _without_jumps(error: Array) -> Array:
     return np.where(apart > _JUMP * np.maximum(np.median(apart, axis=0), 1e-9), middle, error)
 
 
-def _windows(drive: Excitation, error: Array, moved_s: Array, lag: int, ends: int) -> tuple[Array, Array]:
-    """Squared errors over windows of `lag` poses: forward, left, yaw (W, 3); and the time in motion (W,).
+def _windows(drive: Excitation, error: Array, by_speed_s: Array, lag: int) -> _Windows:
+    """Errors over windows of `lag` poses; `by_speed_s` (P,) as `slip_intensity` gives it for slip that is all by speed.
 
-    From the mean of `ends` poses to the mean of the `ends` that are `lag` later, which quietens the sensor.
+    From the mean of some poses to the mean of as many that are `lag` later, which quietens the sensor.
     """
-    squares, moving = [], []
+    ends = max(1, round(_ENDS * lag))
+    errors, moving, by_speed = [np.empty((0, 3))], [np.empty(0)], [np.empty(0)]
     stride = max(1, lag // 2)
+    moved_s, grown_s = np.cumsum(drive.moving_s), np.cumsum(by_speed_s)
     for lo, hi in _bounds(drive):
         if hi - lo < lag + ends:
             continue
@@ -381,8 +492,16 @@ def _windows(drive: Excitation, error: Array, moved_s: Array, lag: int, ends: in
         yaw = drive.pose[start + lag // 2, 2]
         cosine, sine = np.cos(yaw), np.sin(yaw)
         forward, left = step[:, 0] * cosine + step[:, 1] * sine, step[:, 1] * cosine - step[:, 0] * sine
-        squares.append(np.column_stack([forward, left, step[:, 2]]) ** 2)
+        errors.append(np.column_stack([forward, left, step[:, 2]]))
         moving.append(moved_s[start + lag] - moved_s[start])
-    if not squares:
-        return np.empty((0, 3)), np.empty(0)
-    return np.concatenate(squares), np.concatenate(moving)
+        by_speed.append(grown_s[start + lag] - grown_s[start])
+    moving_s = np.concatenate(moving)
+    return _Windows(
+        np.concatenate(errors),
+        moving_s,
+        np.concatenate(by_speed) / np.maximum(moving_s, 1e-9),
+        # A random walk from the mean of one end to that of the other grows by a third of an end less.
+        1.0 - (ends - 1) / (3.0 * lag),
+        2.0 / ends,
+        0.0,
+    )

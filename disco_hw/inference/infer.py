@@ -223,12 +223,14 @@ _REPEATS = 48
 # What vanishes in a simulation counts as a third, what explodes as three times.
 _LARGEST_RATIO = 3.0
 _SMALLEST_VARIANCE = 1e-8
+_SMALLEST_SCALE = 1e-4
 
 
 @dataclass(frozen=True, slots=True)
 class NoiseSpread:
-    """Noise without the bias of its measurement, and `factor` (5, 5), lower triangular, of the covariance of its
-    logarithms in the order of `Noise.vector`; `fit_std` (3,) is the scatter of the plain estimates of the parameters.
+    """Noise without the bias of its measurement, and `factor` (7, 7), lower triangular, of the covariance of its
+    logarithms, and of its lever, in the order of `Noise.scales`; `fit_std` (3,) is the scatter of the plain estimates
+    of the parameters.
     """
 
     noise: Noise
@@ -239,17 +241,21 @@ class NoiseSpread:
 def noise_spread(simulator: Simulator, theta: Array, seed: int, repeats: int = _REPEATS) -> NoiseSpread:
     """Measure the noise of `repeats` simulations at `theta` (3,), which all have the simulator's own.
 
-    The logarithm of what is measured scatters about that of the truth as it does here (parametric bootstrap).
+    The logarithm of what is measured scatters about that of the truth as it does here (parametric bootstrap); of the
+    lever, what is measured itself.
     """
     drive, noise = simulator.drive, simulator.noise
     poses = simulator.poses(np.tile(theta, (repeats, 1)), draw_seeds(repeats, np.random.default_rng(seed)))
     fits = estimates(drive, noise).theta(poses)
     found = [measured_noise(replace(drive, pose=pose), fit) for pose, fit in zip(poses, fits, strict=True)]
-    ratio = np.array([one.vector() for one in found]) / noise.vector()
+    measured, truth = np.array([one.scales() for one in found]), noise.scales()
+    ratio = np.maximum(measured[:, :-1], _SMALLEST_SCALE) / np.maximum(truth[:-1], _SMALLEST_SCALE)
     log_ratio = np.log(np.clip(ratio, 1.0 / _LARGEST_RATIO, _LARGEST_RATIO))
-    covariance = np.cov(log_ratio.T) + _SMALLEST_VARIANCE * np.eye(log_ratio.shape[1])
-    mean = noise.vector() * np.exp(-log_ratio.mean(axis=0))
-    return NoiseSpread(Noise(*mean.tolist()), np.asarray(np.linalg.cholesky(covariance)), fits.std(axis=0))
+    off = np.column_stack([log_ratio, measured[:, -1] - truth[-1]])
+    covariance = np.cov(off.T) + _SMALLEST_VARIANCE * np.eye(off.shape[1])
+    mean = np.append(truth[:-1] * np.exp(-log_ratio.mean(axis=0)), truth[-1] - off[:, -1].mean()).tolist()
+    factor = np.asarray(np.linalg.cholesky(covariance))
+    return NoiseSpread(replace(Noise(*mean), speed_share=noise.speed_share), factor, fits.std(axis=0))
 
 
 Component = tuple[float, Array, Array]

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.errors import InputError, WorkError
-from disco_hw.inference.excitation import Excitation, Noise
+from disco_hw.inference.excitation import Excitation, Noise, slip_intensity
 from disco_hw.jit import parallel_kernel
 from disco_hw.model.coefficients import base_point, effect_point
 from disco_hw.model.model import BASE_PARAMETERS, Model, coefficient_tables
@@ -41,7 +41,7 @@ def simulate_kernel(
     noise_scale: Any,
     noise_spread: Any,
     wheel: Any,
-    moving: Any,
+    intensity: Any,
     node: Any,
     fraction: Any,
     starts: Any,
@@ -52,21 +52,23 @@ def simulate_kernel(
     """Measured poses (n, P, 3) of n simulations, one for each row of `base` and `effects` and each of `seeds`.
 
     Every run starts at its pose of `starts` (runs, 3). Slip is added after every step of a moving robot: forward, to
-    the left, and in yaw about the tracked point, so that where random turning has its centre says nothing of x_icr.
-    Every simulation has a noise of its own: `noise_scale` (5,) as `Noise.vector`, times exp(`noise_spread` (5, 5) z).
+    the left, and in yaw about the lever's end; its variance is that of the noise times `intensity` (M,), and it keeps
+    its direction for the correlation time. Every simulation has a noise of its own: `noise_scale` (7,) as
+    `Noise.scales`, times exp(`noise_spread` (7, 7) z); the lever, last, plus that in its place.
     """
     integration = integration_from(series, True)
     root = math.sqrt(integration.step_s)
-    unit, noise = np.empty(5), np.empty(5)
+    unit, noise, wander = np.empty(7), np.empty(7), np.empty(3)
     for i in range(seeds.shape[0]):
         np.random.seed(seeds[i])
-        for row in range(5):
+        for row in range(7):
             unit[row] = np.random.standard_normal()
             exponent = 0.0
             for column in range(row + 1):
                 exponent += noise_spread[row, column] * unit[column]
-            noise[row] = noise_scale[row] * math.exp(exponent)
-        slip_forward, slip_left, slip_yaw = noise[2] * root, noise[3] * root, noise[4] * root
+            noise[row] = noise_scale[row] * math.exp(exponent) if row < 6 else noise_scale[row] + exponent
+        keep = math.exp(-integration.step_s / max(noise[5], 1e-4))
+        fresh, long_run = math.sqrt(1.0 - keep * keep), math.sqrt((1.0 - keep) / (1.0 + keep))
         here, effects_here = base_point(base, i), effect_point(effects, i)
         for run in range(run_node.shape[0] - 1):
             x, y, yaw = starts[run, 0], starts[run, 1], starts[run, 2]
@@ -74,6 +76,8 @@ def simulate_kernel(
             axle_x, axle_y = axle_of(x, y, cos_yaw, sin_yaw, here)
             wheel_left, wheel_right = wheel[run_node[run], 0], wheel[run_node[run], 1]
             sample, last = run_pose[run], run_pose[run + 1]
+            for axis in range(3):
+                wander[axis] = np.random.standard_normal()
             for k in range(run_node[run], run_node[run + 1]):
                 before_x, before_y, before_yaw = x, y, yaw
                 axle_x, axle_y, cos_yaw, sin_yaw, wheel_left, wheel_right, _, turn = step(
@@ -82,11 +86,16 @@ def simulate_kernel(
                 )  # fmt: skip
                 yaw = yaw + (turn + turn) * integration.step_s
                 x, y = tracked_of(axle_x, axle_y, cos_yaw, sin_yaw, here)
-                if moving[k] > 0.0:
-                    along, across = slip_forward * np.random.standard_normal(), slip_left * np.random.standard_normal()
+                if intensity[k] > 0.0:
+                    size = long_run * root * math.sqrt(intensity[k])
+                    for axis in range(3):
+                        wander[axis] = keep * wander[axis] + fresh * np.random.standard_normal()
+                    slip_yaw = size * noise[4] * wander[2]
+                    along = size * noise[2] * wander[0]
+                    across = size * noise[3] * wander[1] - noise[6] * slip_yaw
                     x += along * cos_yaw - across * sin_yaw
                     y += along * sin_yaw + across * cos_yaw
-                    yaw += slip_yaw * np.random.standard_normal()
+                    yaw += slip_yaw
                     cos_yaw, sin_yaw = math.cos(yaw), math.sin(yaw)
                     axle_x, axle_y = axle_of(x, y, cos_yaw, sin_yaw, here)
                 while sample < last and node[sample] == k:
@@ -101,13 +110,14 @@ def simulate_kernel(
 class Simulator:
     """Simulations of one drive; pure: the same points and seeds give the same poses, however they are shared out.
 
-    `noise_spread` (5, 5), lower triangular: how far the logarithms of the noise vary from simulation to simulation.
+    `noise_spread` (7, 7), lower triangular: how far the logarithms of the noise, and its lever, vary from simulation
+    to simulation.
     """
 
     model: Model
     drive: Excitation
     noise: Noise
-    noise_spread: Array = field(default_factory=lambda: np.zeros((5, 5)))
+    noise_spread: Array = field(default_factory=lambda: np.zeros((7, 7)))
 
     def poses(self, theta: Array, seeds: Seeds) -> Array:
         """Measured poses (n, P, 3), yaw not wrapped; `theta` (n, 3) in the order of `NAMES`, `seeds` (n,)."""
@@ -122,10 +132,10 @@ class Simulator:
             base,
             effects,
             integration_series(drive.step_s, wide=True),
-            self.noise.vector(),
+            self.noise.scales(),
             self.noise_spread,
             drive.wheel_rad_s,
-            drive.moving,
+            slip_intensity(drive, self.noise.speed_share)[0],
             drive.node,
             drive.fraction,
             drive.pose[drive.run_pose[:-1]],

@@ -54,6 +54,26 @@ def test_plants_are_drawn_from_the_posterior():
     assert plants(MODEL, 2, first=3) == plants(MODEL, 5)[3:]
 
 
+def test_a_wider_belief_is_that_of_plants_and_controllers_alike(monkeypatch):
+    known = {}
+
+    def noted(model, task, settings, options, seed):
+        known.setdefault(len(known), model)
+        return lambda now_ns, state: (0.0, 0.0)
+
+    monkeypatch.setattr("disco_hw.experiments.circle.planner_command", noted)
+    run_circle(MODEL, "default", CircleOptions(seeds=1, duration_s=1.0, belief_scale=3.0))
+    models = dict(zip(CURVES, known.values(), strict=True))
+    np.testing.assert_allclose(models["posterior"].belief.covariance(), 9.0 * MODEL.belief.covariance())
+    assert models["posterior mean"].belief is None
+    of_mean = dict(zip(MODEL.parameter_names, models["posterior mean"].point(), strict=True))
+    of_truth = dict(zip(MODEL.parameter_names, models["true parameters"].point(), strict=True))
+    (plain,) = plants(MODEL, 1)
+    for name, value in zip(MODEL.belief.names, MODEL.belief.mean(), strict=True):
+        assert of_mean[name] == pytest.approx(value)
+        assert of_truth[name] - value == pytest.approx(3.0 * (plain[name] - value))
+
+
 def test_a_robot_without_commands_stands_at_the_cost_of_standing():
     asked = []
 

@@ -20,7 +20,7 @@ def test_a_noiseless_log_gives_the_true_parameters():
 def test_whitening_is_the_inverse_of_the_covariances_factor():
     drive = excitation(logged("poor"))
     lo, hi = drive.run_pose[:2]
-    factor = whitening(drive, 0.005, 0.01)
+    factor = whitening(drive, 0.005, 0.01, drive.moving_s)
     inner = slice(lo + 1, hi)
     bidiagonal = np.diag(factor.diagonal[inner]) + np.diag(factor.carry[inner][1:], -1)
     variance = 2.0 * 0.005**2 + 0.01**2 * drive.moving_s[inner]

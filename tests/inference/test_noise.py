@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -53,8 +55,39 @@ def test_slip_that_keeps_its_direction_for_a_while_is_rated_by_what_it_grows_to(
     time_s = np.array([0.04, 0.12, 0.2, 0.4, 0.8, 1.6, 3.0])
     weight = np.full(time_s.size, 2.0)
     variance = weight * sensor + rate * (time_s - tau_s * (1.0 - np.exp(-time_s / tau_s)))
-    found = _two_terms(time_s, weight, np.full(time_s.size, 50.0), variance)
-    assert found == pytest.approx((sensor, rate), rel=1e-3)
+    sensors, rates, found_s = _two_terms(time_s, weight, np.full(time_s.size, 50.0), np.outer(variance, [1.0, 4.0]))
+    assert sensors == pytest.approx([sensor, 4.0 * sensor], rel=1e-3)
+    assert rates == pytest.approx([rate, 4.0 * rate], rel=1e-3)
+    assert found_s == tau_s
+
+
+def found_in_simulations(true, count=6):
+    """The noise found in simulated rich drives that have this one."""
+    drive = excitation(logged("rich"))
+    seeds = np.arange(count, dtype=np.uint32)
+    poses = Simulator(Model(0.06, 0.4), drive, true).poses(np.repeat(THETA[None], count, axis=0), seeds)
+    return [measured_noise(with_poses(drive, one), THETA) for one in poses]
+
+
+@pytest.mark.parametrize(("true_s", "low_s", "high_s"), [(0.0, 0.0, 0.06), (0.15, 0.08, 0.25), (0.5, 0.3, 0.8)])
+def test_how_long_slip_keeps_its_direction_is_found(true_s, low_s, high_s):
+    found = found_in_simulations(replace(TRUE, correlation_s=true_s))
+    assert low_s <= np.median([one.correlation_s for one in found]) <= high_s
+    # What it adds up to is the same, however long it lasts.
+    rates = np.median([one.vector() for one in found], axis=0)[2:]
+    assert rates == pytest.approx(TRUE.vector()[2:], rel=0.3)
+
+
+@pytest.mark.parametrize("true_m", [0.0, 0.2])
+def test_about_which_point_slip_turns_the_body_is_found(true_m):
+    found = found_in_simulations(replace(TRUE, lever_m=true_m))
+    assert np.mean([one.lever_m for one in found]) == pytest.approx(true_m, abs=0.04)
+
+
+@pytest.mark.parametrize("true_share", [0.0, 1.0])
+def test_whether_slip_grows_with_speed_is_found(true_share):
+    found = found_in_simulations(replace(TRUE, speed_share=true_share))
+    assert np.mean([one.speed_share for one in found]) == pytest.approx(true_share, abs=0.3)
 
 
 def test_one_minute_of_a_circle_tells_the_slip_without_bias():

@@ -32,14 +32,14 @@ def test_it_is_the_scatter_of_what_is_measured_on_other_drives_like_it(circle):
     ]
     known = noise_spread(circle, THETA, 1, repeats=60)
     told = np.sqrt(np.diag(known.factor @ known.factor.T))
-    assert told == pytest.approx(np.std(logs, axis=0), rel=0.4)
+    assert told[:5] == pytest.approx(np.std(logs, axis=0), rel=0.4)
     # The slip of one minute is told several times worse than the sensor's noise.
-    assert told[2:].min() > 2.0 * told[:2].max()
+    assert told[2:5].min() > 2.0 * told[:2].max()
     assert np.log(known.noise.vector() / TRUE.vector()) == pytest.approx(-np.mean(logs, axis=0), abs=0.06)
 
 
 def test_simulations_draw_their_noise_from_it(circle):
-    factor = np.diag([1e-4, 1e-4, 0.5, 0.5, 0.5])
+    factor = np.diag([1e-4, 1e-4, 0.5, 0.5, 0.5, 0.5, 1e-4])
     seeds = draw_seeds(400, np.random.default_rng(2))
     theta = np.tile(THETA, (seeds.size, 1))
     weights = estimates(circle.drive, TRUE)

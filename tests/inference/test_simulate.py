@@ -52,6 +52,31 @@ def test_noise_has_the_size_it_says():
     assert poses[:, -1, 2].std() == pytest.approx(yaw_sd, rel=0.15)
 
 
+def test_slip_that_lasts_and_grows_with_speed_adds_up_to_as_much():
+    noise = Noise(0.0, 0.0, 0.0, 0.0, 0.014, correlation_s=0.2, speed_share=1.0)
+    sim = simulator(noise)
+    poses = sim.poses(np.repeat(THETA, 400, axis=0), draw_seeds(400, np.random.default_rng(1)))
+    yaw_sd = 0.014 * np.sqrt(sim.drive.moving_s.sum())
+    assert poses[:, -1, 2].std() == pytest.approx(yaw_sd, rel=0.15)
+    steps = np.diff(poses[:, :, 2] - poses[:, :, 2].mean(axis=0), axis=1)
+    lasting = (steps[:, 1:] * steps[:, :-1]).sum() / (steps**2).sum()
+    period_s = float(np.median(np.diff(sim.drive.t_s)))
+    assert lasting == pytest.approx(np.exp(-period_s / 0.2), abs=0.15)
+
+
+def test_slip_in_yaw_turns_the_body_about_the_end_of_its_lever():
+    sim = simulator(Noise(0.0, 0.0, 0.0, 0.0, 0.014, lever_m=TRUTH["x_icr_m"]))
+    poses = sim.poses(np.repeat(THETA, 50, axis=0), draw_seeds(50, np.random.default_rng(1)))
+    ahead = TRUTH["x_icr_m"] * np.stack([np.cos(poses[..., 2]), np.sin(poses[..., 2])], axis=-1)
+    # The centre of rotation goes where it heads: never sideways.
+    steps = np.diff(poses[..., :2] + ahead, axis=1)
+    middle = 0.5 * (poses[:, 1:, 2] + poses[:, :-1, 2])
+    sideways = steps[..., 1] * np.cos(middle) - steps[..., 0] * np.sin(middle)
+    of_the_point = np.diff(poses[..., :2], axis=1)
+    lateral = of_the_point[..., 1] * np.cos(middle) - of_the_point[..., 0] * np.sin(middle)
+    assert np.abs(sideways).mean() < 0.05 * np.abs(lateral).mean()
+
+
 def test_progress_is_told_of_every_simulation():
     done = []
     sim = simulator()
