@@ -156,3 +156,31 @@ def test_what_repeats_is_what_is_left_without_the_block_that_says_most_however_l
     # A log of a single residual pays for a parameter as one of two.
     single = SimpleNamespace(**{**vars(channel()), "count": 1})
     assert compare(small, big, single, 1.0).score == pytest.approx(2.0 * proof.gain / proof.inflation - np.log(2.0))
+
+
+def test_blocks_that_say_nothing_of_a_parameter_hide_no_scatter_of_the_others():
+    x = np.ones((N, 1))
+    # Of every length that is looked at, one block knows nothing.
+    x[: 9 * EACH] = 0.0
+    wander = np.repeat(np.random.default_rng(13).standard_normal(N // EACH), EACH)
+    assert inflation(linear_fit(x, wander), channel(), (0,)) > 5.0
+
+
+def test_scatter_counts_as_long_as_more_than_one_block_speaks():
+    x = np.full((N, 1), 0.0447)
+    x[:EACH] = 1.0
+    told = np.array([(x[channel().block == b] ** 2).sum() for b in range(N // EACH)])
+    assert 1.2 < told.sum() ** 2 / (told**2).sum() < 1.3
+    wander = np.repeat(np.random.default_rng(14).standard_normal(N // EACH), EACH)
+    untrusted = SimpleNamespace(**{**vars(channel()), "trusted_blocks": 0.0})
+    assert inflation(linear_fit(x, wander), untrusted, (0,)) > 5.0
+
+
+def test_evidence_is_divided_by_the_scatter_of_what_is_added_and_of_nothing_else():
+    rng = np.random.default_rng(15)
+    x = np.column_stack([np.ones(N), rng.standard_normal(N)])
+    y = np.repeat(rng.standard_normal(N // EACH), EACH) + rng.standard_normal(N)
+    small, big = linear_fit(x[:, :1], y), linear_fit(x, y)
+    own, all_of_it = inflation(big, channel(), (1,)), inflation(big, channel(), (0, 1))
+    assert all_of_it > 3.0 * own
+    assert compare(small, big, channel(), 1.0).inflation == own

@@ -13,7 +13,7 @@ from disco_hw.gap.noise.channels import WheelChannel
 from disco_hw.gap.noise.wheel_noise import WheelNoise
 from disco_hw.gap.search.channel_search import body_moves, wheel_moves
 from disco_hw.gap.search.least_squares import Fit
-from disco_hw.gap.search.richest_model import LATE, candidates_of
+from disco_hw.gap.search.richest_model import LATE, Profile, candidates_of
 from disco_hw.gap.search.selection import EffectEvidence, Selector, Thresholds
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S
 from tests.gap.synthetic import GEOMETRY, body_channel, line_of
@@ -269,3 +269,61 @@ def test_a_search_that_comes_back_to_where_it_was_ends_with_the_best_set_on_its_
     # One that is next to nothing worth is not the best, as its price is paid.
     channel, _ = body_channel(turn_slip=0.08)
     assert Circling(channel, body_moves(channel), Thresholds()).select(("turn_slip",)) == ("turn_slip",)
+
+
+def test_the_price_of_an_effect_is_that_of_all_its_parameters():
+    channel = SimpleNamespace(settings=DEFAULT_SETTINGS, count=1000)
+    fitted = Selector(channel, lambda small, big: 1.0)
+    for names, cost in ((frozenset(), 700.0), (frozenset({"wheel_gain"}), 650.0)):
+        fitted.fits[names] = Fit(np.zeros(1), (), cost, np.empty(0), np.empty((0, 0)))
+    # Left and right: half of 2 ln(1000).
+    assert fitted.promise((), "wheel_gain") == pytest.approx(50.0 - np.log(1000))
+    assert fitted._worth((), ("wheel_gain",), "wheel_gain") == pytest.approx(50.0 - np.log(1000))
+    assert fitted._priced(("wheel_gain",)) == pytest.approx(650.0 + np.log(1000))
+    assert fitted._priced(()) == 700.0
+
+
+def test_what_promises_nothing_to_first_order_is_not_fitted():
+    found = selector()
+    assert found.promise((), "turn_slip") < 0.0
+    assert frozenset({"turn_slip"}) not in found.fits
+    # What begins from several starts promises nothing to first order: it is fitted.
+    found.promise((), "pose_latency")
+    assert frozenset({"pose_latency"}) in found.fits
+    slipping = selector(turn_slip=0.08)
+    assert slipping.promise((), "turn_slip") > 0.0
+    assert frozenset({"turn_slip"}) in slipping.fits
+
+
+class Scanned(Selector):
+    """A search of one entry whose gain to first order is largest at 34.3 and whose fit is best at 35.4."""
+
+    def _linear_gain(self, parent, new, value=None):
+        return 100.0 - (value - 34.3) ** 2
+
+    def _at(self, start, active, new, value, iterations=None):
+        return Fit(np.array([value]), (), (value - 35.4) ** 2, np.empty(0), np.empty((0, 0)))
+
+
+def test_a_profiled_entry_is_searched_closer_to_first_order_and_then_by_fits():
+    scanned = Scanned(SimpleNamespace(settings=DEFAULT_SETTINGS), lambda small, big: 1.0)
+    new = SimpleNamespace(profile=Profile("entry", lambda channel: tuple(10.0 * k for k in range(7)), 0.5))
+    worth = DEFAULT_SETTINGS.selection.worth_fitting_nats
+
+    def found(cost):
+        parent = Fit(np.zeros(1), (), cost, np.empty(0), np.empty((0, 0)))
+        return float(scanned._profiled(parent, (), new).vector[0])
+
+    assert found(100.0) == pytest.approx(35.4, abs=0.3)
+    # Where nothing is gained the first fit is enough.
+    assert found(worth) == pytest.approx(34.3, abs=0.3)
+
+
+def test_a_set_is_settled_after_every_step_and_the_steps_end_where_nothing_is_accepted():
+    found = Selector(SimpleNamespace(settings=DEFAULT_SETTINGS), lambda small, big: 1.0)
+    found.ranked = lambda accepted: [name for name in ("side_slip", "turn_slip", "slope") if name not in accepted]
+    found.acceptable = lambda smaller, larger: larger[-1] != "slope"
+    settled = []
+    assert found.greedy(settle=lambda of, names: settled.append(names)) == ("side_slip", "turn_slip")
+    assert settled == [("side_slip",), ("side_slip", "turn_slip")]
+    assert found.greedy(("turn_slip",)) == ("turn_slip", "side_slip")
