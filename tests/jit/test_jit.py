@@ -2,15 +2,18 @@
 
 import gc
 import os
+import re
 import subprocess
 import sys
 
+import llvmlite.binding as llvm
 import numpy as np
 import pytest
-from numba import config, njit
+from numba import config, float32, njit
 from numba.core.target_extension import CPU, jit_registry
 
-from disco_hw.jit import block_function, kernel_function, tune_loops
+from disco_hw import jit
+from disco_hw.jit import block_function, kernel_function, quick_norm_and_inverse, tune_loops
 
 PLANS = """
 from pathlib import Path
@@ -87,3 +90,49 @@ def test_plans_are_the_same_bits_from_the_process_that_compiles_as_from_one_that
     )
     assert compiled.stdout == loaded.stdout
     assert compiled.stdout.strip()
+
+
+def inverse_lengths(x, y, found):
+    tune_loops()
+    for i in range(x.size):
+        found[i] = quick_norm_and_inverse(x[i], y[i])[1]
+
+
+def test_inverse_lengths_are_good_to_single_precision():
+    x, y = np.random.default_rng(1).uniform(-5.0, 5.0, (2, 1000)).astype(np.float32)
+    found = np.empty_like(x)
+    block_function(inverse_lengths)(x, y, found)
+    np.testing.assert_allclose(found, 1.0 / np.hypot(x.astype(float), y), rtol=3e-7)
+
+
+FOUR_ROOTS = """
+define <4 x float> @f(<4 x float> %x) #0 {
+  %root = call <4 x float> @llvm.sqrt.v4f32(<4 x float> %x)
+  %inverse = fdiv arcp <4 x float> <float 1.0, float 1.0, float 1.0, float 1.0>, %root
+  ret <4 x float> %inverse
+}
+declare <4 x float> @llvm.sqrt.v4f32(<4 x float>)
+attributes #0 = { ESTIMATES }
+"""
+
+
+@pytest.mark.parametrize(
+    ("machine", "triple", "processor", "expected"),
+    [
+        ("aarch64", "aarch64-unknown-linux-gnu", "cortex-a72", ["frsqrte", "frsqrts"]),
+        ("x86_64", "x86_64-unknown-linux-gnu", "x86-64-v3", ["vrsqrtps"]),
+    ],
+)
+def test_each_processor_estimates_reciprocal_roots_in_its_own_way(monkeypatch, machine, triple, processor, expected):
+    monkeypatch.setattr(jit.platform, "machine", lambda: machine)
+    function = block_function(inverse_lengths)
+    row = float32[::1]
+    function.compile((row, row, row))
+    (lowered,) = function.overloads.values()
+    (estimates,) = set(re.findall(r'"reciprocal-estimates"="[^"]*"', str(lowered.library._get_module_for_linking())))
+    llvm.initialize_all_targets()
+    llvm.initialize_all_asmprinters()
+    target = llvm.Target.from_triple(triple).create_target_machine(cpu=processor, opt=3)
+    code = target.emit_assembly(llvm.parse_assembly(FOUR_ROOTS.replace("ESTIMATES", estimates)))
+    assert re.findall(r"\bv?f?r?sqrt[a-z]*", code) == expected
+    assert "div" not in code
