@@ -2,7 +2,8 @@
 
 The emulator is QEMU without KVM, so that it runs everywhere; it sees this machine's files read-only, and this very
 Python runs in it. What it needs comes from Debian by apt-get and stays in build/socketcan. Needs root, and there a
-Debian or Ubuntu on x86-64. Exits with what pytest said, 2 with one line where it cannot be done.
+Debian or Ubuntu on x86-64, or a Debian on ARM, which nobody has tried. Exits with what pytest said, 2 with one line
+where it cannot be done.
 """
 
 import contextlib
@@ -15,13 +16,33 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import dataclass
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 BUILD = ROOT / "build" / "socketcan"
 INTERFACE = "vcan0"
+
+
+@dataclass(frozen=True)
+class Emulator:
+    """An emulator of a kind of machine.
+
+    Its program, Debian's package of it, its own arguments; the machine's serial line, and Debian's package of a kernel.
+    """
+
+    program: str
+    package: str
+    arguments: tuple[str, ...]
+    console: str
+    kernel: str
+
+
+EMULATORS = {
+    "x86_64": Emulator("qemu-system-x86_64", "qemu-system-x86", (), "ttyS0", "linux-image-amd64"),
+    "aarch64": Emulator("qemu-system-aarch64", "qemu-system-arm", ("-machine", "virt"), "ttyAMA0", "linux-image-arm64"),
+}
 TOOLS = {
-    "qemu-system-x86_64": "qemu-system-x86",
     "busybox": "busybox-static",
     "cpio": "cpio",
     "depmod": "kmod",
@@ -70,18 +91,25 @@ def kernel_has_vcan() -> bool:
     return True
 
 
-def fetch() -> tuple[Path, str]:
+def emulator_here() -> Emulator:
+    """The emulator of such a machine as this."""
+    found = EMULATORS.get(platform.machine())
+    if found is None or shutil.which("apt-get") is None:
+        raise CannotError("this kernel has no vcan, and the emulator is prepared for Debian on x86-64 or ARM; skipped")
+    return found
+
+
+def fetch(emulator: Emulator) -> tuple[Path, str]:
     """Get the tools and Debian's kernel; return where it is unpacked, and its release."""
-    if platform.machine() != "x86_64" or shutil.which("apt-get") is None:
-        raise CannotError("this kernel has no vcan, and the emulator is prepared for Debian on x86-64 only; skipped")
-    missing = [package for tool, package in TOOLS.items() if shutil.which(tool) is None]
+    tools = {emulator.program: emulator.package, **TOOLS}
+    missing = [package for tool, package in tools.items() if shutil.which(tool) is None]
     if missing:
         run("apt-get", "update", "-qq")
         run("apt-get", "install", "-y", "-qq", "--no-install-recommends", *missing)
-    said = run("apt-cache", "depends", "linux-image-amd64").stdout
+    said = run("apt-cache", "depends", emulator.kernel).stdout
     found = re.search(r"Depends: linux-image-(\S+)", said)
     if found is None:
-        raise CannotError("apt-cache knows no linux-image-amd64; run apt-get update")
+        raise CannotError(f"apt-cache knows no {emulator.kernel}; run apt-get update")
     release = found.group(1)
     unpacked = BUILD / release
     if not (unpacked / "boot" / f"vmlinuz-{release}").exists():
@@ -154,16 +182,21 @@ busybox poweroff -f
     return image
 
 
-def emulate() -> int:
-    """Boot, run the tests, come back with their exit status."""
-    unpacked, release = fetch()
-    image = initial_ram_disk(unpacked, release)
-    command = [
-        "qemu-system-x86_64", "-accel", "tcg,thread=multi", "-cpu", "max", "-m", "1024", "-smp", "2", "-nographic",
-        "-no-reboot", "-nic", "none", "-kernel", str(unpacked / "boot" / f"vmlinuz-{release}"), "-initrd", str(image),
-        "-append", "console=ttyS0 quiet panic=-1",
+def boot_command(emulator: Emulator, unpacked: Path, release: str, image: Path) -> list[str]:
+    """What boots the kernel in the emulator, with this machine's files to read."""
+    return [
+        emulator.program, *emulator.arguments, "-accel", "tcg,thread=multi", "-cpu", "max", "-m", "1024", "-smp", "2",
+        "-nographic", "-no-reboot", "-nic", "none", "-kernel", str(unpacked / "boot" / f"vmlinuz-{release}"),
+        "-initrd", str(image), "-append", f"console={emulator.console} quiet panic=-1",
         "-virtfs", "local,path=/,mount_tag=root,security_model=none,readonly=on,multidevs=remap",
     ]  # fmt: skip
+
+
+def emulate() -> int:
+    """Boot, run the tests, come back with their exit status."""
+    emulator = emulator_here()
+    unpacked, release = fetch(emulator)
+    command = boot_command(emulator, unpacked, release, initial_ram_disk(unpacked, release))
     # A file named kvm may exist and not work: the emulator alone runs everywhere.
     with subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT) as guest:
         assert guest.stdout is not None
