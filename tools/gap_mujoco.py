@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import re
 import sys
 import time
 from collections.abc import Iterable, Sequence
@@ -16,6 +17,9 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.signal import lfilter
 
 from disco_hw.gap.data.gridded_drive import grid_drive
 from disco_hw.gap.find import model_of, offered_stage, search
@@ -24,9 +28,20 @@ from disco_hw.gap.search.analysis import final_fit
 from disco_hw.gap.search.stages import joint_predictions
 from disco_hw.gap.settings import DEFAULT_SETTINGS
 from disco_hw.model import Model
+from disco_hw.model.terms import BODY_FEATURES
 from tools.gap_halves import STAGES, unseen_errors
 from tools.gap_study import revision
-from tools.mujoco_robot import DOWNHILL_RAD, EFFECTS, TRACK_M, WHEEL_RADIUS_M, Hidden, Recording, record
+from tools.mujoco_robot import (
+    DOWNHILL_RAD,
+    EFFECTS,
+    STEPS_PER_COMMAND,
+    STEPS_PER_S,
+    TRACK_M,
+    WHEEL_RADIUS_M,
+    Hidden,
+    Recording,
+    record,
+)
 
 AHEAD_S = 2.0
 UNSEEN = 1000
@@ -83,15 +98,19 @@ class Result:
         return one[0] / timed[0], one[1] / timed[1]
 
 
-def truth_of(hidden: str, recording: Recording) -> float | None:
+def truth_of(hidden: str, recording: Recording, beside: Sequence[str] = ()) -> float | None:
     """What is true of the parameter that stands for what was hidden.
 
-    A payload's is what the true motion shows: the forward speed of the middle that turning makes.
+    A delay and a lag are those that the true wheels show, the servo's own included. A payload's is what the true motion
+    shows: the forward speed of the middle that turning makes, with the forms that the search has `beside` it, as a
+    share of a curve depends on what else has a share in it.
     """
     if hidden not in NAMES:
         return None
     size = EFFECTS[hidden][0]
     match hidden:
+        case "command_delay" | "motor_lag":
+            return response_of(recording)[hidden]
         case "unequal_wheels":
             return size / (2.0 + size)
         case "slope":
@@ -101,9 +120,38 @@ def truth_of(hidden: str, recording: Recording) -> float | None:
             t_s, (x, y, yaw) = recording.truth_s[every], recording.truth[every].T
             way = np.gradient(x, t_s) * np.cos(yaw) + np.gradient(y, t_s) * np.sin(yaw)
             wheels = np.gradient(recording.turned[every].mean(axis=1), t_s)
-            causes = np.column_stack([wheels, np.gradient(yaw, t_s)])
+            rate = np.gradient(yaw, t_s)
+            speed = WHEEL_RADIUS_M * wheels
+            forms = [re.sub(r"abs\((\w+)\)", r"|\1|", form.split(" ", 3)[3]) for form in beside if form[:4] == "v_x "]
+            known = [
+                BODY_FEATURES[form](speed, rate, np.gradient(speed, t_s), t_s)
+                for form in forms
+                if form in BODY_FEATURES
+            ]
+            causes = np.column_stack([wheels, rate, *known])
             return float(np.linalg.lstsq(causes, way, rcond=None)[0][1])
     return size
+
+
+def response_of(recording: Recording) -> dict[str, float]:
+    """Delay and time constant (s) by which the true wheels follow, the mean of both sides, which turning leaves alone.
+
+    Least squares on how far they turn from one twentieth of a second to the next, without any noise.
+    """
+    t_s, asked = recording.truth_s, recording.command.mean(axis=1)
+    asked = np.repeat(asked, STEPS_PER_COMMAND)[: t_s.size]
+    every = slice(None, None, STEPS_PER_S // 20)
+    turned = np.diff(recording.turned.mean(axis=1)[every])
+
+    def off(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        delay_s, lag_s, gain = values
+        keep = math.exp(-1.0 / (STEPS_PER_S * lag_s))
+        speed = lfilter([1.0 - keep], [1.0, -keep], np.interp(t_s - delay_s, t_s, asked))
+        # Angles are those before a step, as recorded.
+        return np.asarray(np.diff(gain * (np.cumsum(speed) - speed)[every] / STEPS_PER_S) - turned)
+
+    delay_s, lag_s, _ = least_squares(off, [0.05, 0.08, 1.0], x_scale=[0.01, 0.01, 0.01], diff_step=1e-3).x
+    return {"command_delay": float(delay_s), "motor_lag": float(lag_s)}
 
 
 def injected_floor(recording: Recording) -> tuple[float, float]:
@@ -151,7 +199,7 @@ def work(hidden: str, seed: int) -> Result:
         named={each.name: {key: part.value for key, part in each.parameters.items()} for each in named},
         unnamed=[term.form for term in unnamed],
         doubtful=[doubt.name for doubt in doubtful],
-        truth=truth_of(hidden, seen),
+        truth=truth_of(hidden, seen, [term.form for term in unnamed]),
         offered=offered,
         unseen={stage: (1e3 * errors.position_m, 1e3 * errors.yaw_rad) for stage, errors in unseen.items()},
         floor=(1e3 * floor.position_m, 1e3 * floor.yaw_rad),

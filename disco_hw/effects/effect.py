@@ -52,7 +52,8 @@ class Stage(enum.Enum):
 
     Both ask by name for what they need: `left`, `right` (commands, rad/s), or `command` and the wheel's `speed` of one
     wheel at a time; of the response `end_left`, `end_right`, `mean_left`, `mean_right` and `wheel_left`, `wheel_right`
-    (at the start), or `end`, `mean` and `speed` of one wheel at a time; of the body `wheel_sum`, `difference` (of right
+    (at the start), with `left` and `right` what is aimed for, or `end`, `mean` and `speed` of one wheel at a time; of
+    the body `wheel_sum`, `difference` (of right
     and left, rad/s), `change` (of the sum over the step), `forward` (m/s), `turn` (half the yaw rate, rad/s), `x`, `y`;
     and the time at the step's start, `time_s`.
     """
@@ -89,7 +90,10 @@ STAGE_GROUPS = (
 )
 
 _WHEELS = ("left", "right", "command", "speed", "wheel_left", "wheel_right", "time_s")
-_RESPONSE = ("end_left", "end_right", "mean_left", "mean_right", "end", "mean", "speed", "wheel_left", "wheel_right")
+_RESPONSE = (
+    "left", "right", "end_left", "end_right", "mean_left", "mean_right", "end", "mean", "speed", "wheel_left",
+    "wheel_right",
+)  # fmt: skip
 _ROLLING = ("wheel_sum", "difference", "change", "time_s")
 _BODY = (*_ROLLING, "forward", "turn")
 # What `term` and `plain` of a stage may ask for.

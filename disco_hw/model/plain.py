@@ -149,7 +149,8 @@ def responded(theta: Theta, state: RobotState, left: Value, right: Value, time_s
             end_right, mean_right = _called(effect, theta, of_right, step_s)
         else:
             both = {
-                "end_left": end_left, "end_right": end_right, "mean_left": mean_left, "mean_right": mean_right,
+                "left": left, "right": right, "end_left": end_left, "end_right": end_right,
+                "mean_left": mean_left, "mean_right": mean_right,
                 "wheel_left": state.wheel_left, "wheel_right": state.wheel_right, "time_s": time_s,
             }  # fmt: skip
             end_left, end_right, mean_left, mean_right = _called(effect, theta, both, step_s)

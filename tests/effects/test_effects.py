@@ -16,6 +16,7 @@ NAMES = {
     Channel.COMMAND_TO_WHEEL: {
         "motor_lag", "command_delay", "deadband", "stiction", "speed_limit", "yaw_rate_limit",
         "yaw_acceleration_limit", "battery_sag", "wheel_gain", "turning_load",
+        "turning_buildup",
     },
     Channel.WHEEL_TO_BODY: {
         "encoder_scale", "wheel_radius_asymmetry", "turn_slip", "acceleration_slip", "side_slip", "lateral_icr",
@@ -83,6 +84,7 @@ def test_effects_describe_themselves(effect):
         ("battery_sag", {"loss": 0.5}, START_STOP),
         ("wheel_gain", {"left": -0.1, "right": 0.05}, TURN),
         ("turning_load", {"load_rad_s": 0.4, "unequal": 0.02}, TURN),
+        ("turning_buildup", {"limit_rad_s2": 1.5, "at_once_rad_s": 0.4, "shared": 0.7}, THERE_AND_BACK),
         ("wheel_radius_asymmetry", {"ratio": 0.03}, STRAIGHT),
         ("turn_slip", {"k_s": 0.2}, SPIN),
         ("acceleration_slip", {"k_s2_m": 0.2}, START_STOP),
@@ -116,6 +118,36 @@ def test_yaw_rate_limit_keeps_the_mean_and_cuts_the_turn():
     states = free_run({"yaw_rate_limit": {"limit_rad_s": 0.3}}, TURN)
     assert states[-1, 2] / 2.0 == pytest.approx(0.3)
     assert states[-1, 3:].mean() == pytest.approx(3.5)
+
+
+def built_up(commands, **values):
+    """Half the difference of the wheels and their mean, step by step, where turning builds up by 1 rad/s^2."""
+    given = {"limit_rad_s2": 1.0, "at_once_rad_s": 0.0, "shared": 0.0} | values
+    wheels = free_run({"turning_buildup": given}, np.array(commands))[1:, 3:]
+    return 0.5 * (wheels[:, 1] - wheels[:, 0]), wheels.mean(axis=1)
+
+
+def test_turning_builds_up_slowly_and_falls_at_once():
+    half, mean = built_up([[-1.0, 3.0]] * 6 + [[1.0, 1.0]] * 2 + [[3.0, -1.0]] * 3)
+    assert half == pytest.approx([0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.0, 0.0, -0.1, -0.2, -0.3])
+    assert mean == pytest.approx([1.0] * 11)
+    # Turning the other way begins from none.
+    half, _ = built_up([[-1.0, 1.0]] * 5 + [[1.0, -1.0]] * 2)
+    assert half[4:] == pytest.approx([0.5, -0.1, -0.2])
+
+
+def test_turning_is_there_at_once_up_to_what_it_says():
+    half, _ = built_up([[-2.0, 2.0]] * 3, at_once_rad_s=0.7)
+    assert half == pytest.approx([0.8, 0.9, 1.0])
+    half, _ = built_up([[-0.5, 0.5]] * 3, at_once_rad_s=0.7)
+    assert half == pytest.approx([0.5] * 3)
+
+
+def test_motors_that_give_all_to_a_turn_leave_the_mean_behind_by_what_the_turn_lacks():
+    half, mean = built_up([[-0.5, 2.5]] * 8, shared=1.0)
+    assert half == pytest.approx(0.1 * np.arange(1, 9))
+
+    assert mean == pytest.approx([0.0, 0.0, 0.0, 0.0, 0.0, 0.1, 0.2, 0.3])
 
 
 def loaded(left, right, unequal=0.0):

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from tools import gap_mujoco
-from tools.gap_mujoco import Result, injected_floor, table
-from tools.mujoco_robot import Recording
+from tools.gap_mujoco import Result, injected_floor, response_of, table, truth_of
+from tools.mujoco_robot import Recording, joystick
 
 LATENCY = {"pose_latency": {"latency_s": 0.2}}
 
@@ -68,6 +68,39 @@ def test_the_noise_that_was_put_in_makes_what_it_must():
     position = math.sqrt(2.0 * size**2 * (1.0 + 1.0 / averaged) + (way * yaw_size) ** 2 / averaged)
     yaw = yaw_size * math.sqrt(1.0 + 1.0 / averaged)
     assert injected_floor(recording) == pytest.approx((1e3 * position, 1e3 * yaw), rel=0.02)
+
+
+def test_the_response_of_true_wheels_is_told_whatever_turning_loses():
+    command = joystick(5, 30.0)
+    t_s = np.arange(command.shape[0] * 12) / 480.0
+    asked = np.repeat(command, 12, axis=0)
+    late = np.vstack([np.zeros((48, 2)), asked[:-48]])
+    speed, wheels = np.zeros(2), np.zeros((t_s.size, 2))
+    for k, wish in enumerate(late):
+        speed = speed + (wish - speed) * -math.expm1(-1.0 / (480.0 * 0.17))
+        wheels[k] = speed
+    wheels += 0.2 * np.sign(wheels[:, 1:] - wheels[:, :1]) * [1.0, -1.0]
+    turned = (np.cumsum(wheels, axis=0) - wheels)[:, [0, 1, 0, 1]] / 480.0
+    nothing, truth = np.zeros((0, 3)), np.zeros((t_s.size, 3))
+    recording = Recording(t_s[::12], command, t_s, turned, t_s[:0], nothing, t_s, truth, turned, nothing)
+    found = response_of(recording)
+    assert found["command_delay"] == pytest.approx(0.1, abs=0.003)
+    assert found["motor_lag"] == pytest.approx(0.17, abs=0.003)
+
+
+def test_what_a_payload_does_is_told_beside_the_forms_that_have_a_share_in_it():
+    t_s = np.arange(48 * 2000) / 480.0
+    rate, wheels = 0.5 * np.sin(0.7 * t_s), 3.0 + np.sin(0.31 * t_s)
+    yaw = np.cumsum(rate) / 480.0
+    way = 0.13 * wheels - 0.2 * rate + 0.4 * rate**3
+    x, y = np.cumsum(way * np.cos(yaw)) / 480.0, np.cumsum(way * np.sin(yaw)) / 480.0
+    turned = np.tile((np.cumsum(wheels) / 480.0)[:, None], (1, 4))
+    nothing = np.zeros((0, 3))
+    truth = np.column_stack([x, y, yaw])
+    recording = Recording(t_s[:0], nothing, t_s[:0], nothing, t_s[:0], nothing, t_s, truth, turned, nothing)
+    assert truth_of("payload", recording, ["v_x += 0.3 omega^3"]) == pytest.approx(-0.2, abs=0.003)
+    # Without it the share of the cube lies in the line: 0.4 times 3/4 of the square of the rate's amplitude.
+    assert truth_of("payload", recording, ["omega += 0.3 abs(omega)"]) == pytest.approx(-0.125, abs=0.003)
 
 
 def test_a_study_goes_on_where_it_was_broken_off(tmp_path, monkeypatch):

@@ -54,6 +54,9 @@ FULL = {
     "battery_sag": {"loss": st.floats(0.0, 0.5)},
     "wheel_gain": {"left": st.floats(-0.1, 0.1), "right": st.floats(-0.1, 0.1)},
     "turning_load": {"load_rad_s": st.floats(0.0, 1.5), "unequal": st.floats(-0.05, 0.05)},
+    "turning_buildup": {
+        "limit_rad_s2": st.floats(0.3, 30.0), "at_once_rad_s": st.floats(0.0, 2.0), "shared": st.floats(0.0, 1.2),
+    },
     "wheel_radius_asymmetry": {"ratio": st.floats(-0.05, 0.05)},
     "turn_slip": {"k_s": st.floats(-0.1, 0.3)},
     "acceleration_slip": {"k_s2_m": st.floats(-0.1, 0.3)},
@@ -61,7 +64,7 @@ FULL = {
     "lateral_icr": {"offset_m": st.floats(-0.1, 0.1)},
     "slope": {"drift_x_m_s": st.floats(-0.05, 0.05), "drift_y_m_s": st.floats(-0.05, 0.05)},
     "surface_change": {"track": st.floats(-0.2, 0.3), "time_s": st.floats(0.0, 8.0), "radius": st.floats(-0.05, 0.05)},
-}
+}  # fmt: skip
 EFFECTS = st.fixed_dictionaries({name: st.fixed_dictionaries(values) for name, values in FULL.items()})
 SD = np.array([0.003, 0.02, 0.02])
 BELIEF_NAMES = ("wheel_radius_m", "axial_distance_m", "x_icr_m")
@@ -331,6 +334,7 @@ OF_LONG_WAY = {
     "speed_limit": {"limit_rad_s": 7.97758228652401},
     "wheel_gain": {"left": 0.030486864105775724, "right": 0.0},
     "yaw_rate_limit": {"limit_rad_s": 1.5},
+    "turning_buildup": {"limit_rad_s2": 100.0, "at_once_rad_s": 0.0, "shared": 0.0},
 }
 
 
