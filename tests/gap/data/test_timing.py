@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from disco_hw.gap.data import timing
 from disco_hw.gap.data.timing import pose_clock, pose_delay_s
 from disco_hw.gap.settings import GridSettings
 from disco_hw.log.drive import Poses, Wheels
@@ -15,6 +16,11 @@ RADIUS_M, TRACK_M = 0.11, 0.6
 def older_by(poses, by_s):
     """Poses whose stamps come `by_s(t)` later still."""
     return replace(poses, t_s=poses.t_s + by_s(poses.t_s))
+
+
+def later(wheels, poses, by_s):
+    """The same drive, begun so much later."""
+    return replace(wheels, t_s=wheels.t_s + by_s), replace(poses, t_s=poses.t_s + by_s)
 
 
 def drive(older_s, turning=True, segments=1, noise_m=0.003, seed=0):
@@ -61,23 +67,25 @@ def test_too_few_poses_have_none():
 
 
 def test_a_clock_that_drifts_is_made_even_and_said_to_drift():
-    wheels, poses = drive(0.1)
-    clock = pose_clock(wheels, older_by(poses, lambda t: 0.12 * (t - 30.0) / 60.0), GridSettings())
+    wheels, poses = later(*drive(0.1), 400.0)
+    clock = pose_clock(wheels, older_by(poses, lambda t: 0.12 * (t - 430.0) / 60.0), GridSettings())
     drift_s = clock.drift_s / clock.span_s
     assert drift_s == pytest.approx(0.12 / 60.0, rel=0.1)
     assert clock.delay_s == pytest.approx(0.1, abs=0.01)
     (said,) = clock.notes
     assert "drifts" in said
-    even = clock.corrected(older_by(poses, lambda t: 0.12 * (t - 30.0) / 60.0))
+    even = clock.corrected(older_by(poses, lambda t: 0.12 * (t - 430.0) / 60.0))
     assert np.abs(even.t_s - poses.t_s).max() < 0.01
 
 
 @pytest.mark.parametrize("jump_s", [-0.3, 0.15])
 def test_a_clock_that_jumps_is_made_even_and_said_to_jump(jump_s):
-    wheels, poses = drive(0.0)
+    wheels, poses = drive(0.2)
     clock = pose_clock(wheels, older_by(poses, lambda t: jump_s * (t > 33.0)), GridSettings())
     assert clock.jump_s == pytest.approx(jump_s, abs=0.02)
     assert clock.jump_at_s == pytest.approx(33.0, abs=2.0)
+    # Half of a jump before it and half of it after: the delay is that of the middle.
+    assert clock.delay_s == pytest.approx(0.2 + 0.5 * jump_s, abs=0.01)
     assert "jumps" in clock.notes[0]
     assert (np.diff(clock.corrected(older_by(poses, lambda t: jump_s * (t > 33.0))).t_s) > 0.0).all()
 
@@ -89,3 +97,20 @@ def test_an_even_clock_is_left_alone(seed):
     assert clock.notes == ()
     assert clock.delay_s == pytest.approx(0.2, abs=0.01)
     assert (clock.corrected(poses).t_s == poses.t_s).all()
+
+
+def test_stretches_that_scatter_as_much_as_they_drift_are_believed_nothing(monkeypatch):
+    wheels, poses = drive(0.5)
+    delays = 0.5 + np.array([-0.08, 0.05, -0.06, 0.07, -0.04, 0.09])
+    monkeypatch.setattr(timing, "_by_stretch", lambda *_: (np.linspace(5.0, 55.0, delays.size), delays))
+    monkeypatch.setattr(timing, "_misfit_at", lambda *_: pytest.fail("a clock was tried"))
+    assert pose_clock(wheels, poses, GridSettings()) == timing.PoseClock(pose_delay_s(wheels, poses, GridSettings()))
+
+
+def test_poses_are_compared_over_no_silence_and_no_segment():
+    t_s = np.array([0.0, 0.2, 0.4, 0.6, 1.9, 2.1, 2.3, 2.5])
+    nothing = np.zeros(t_s.size)
+    poses = Poses(t_s, nothing, nothing, nothing, np.array([0, 0, 0, 0, 0, 0, 1, 1]))
+    # The first that is 0.3 s later, where that is hardly more than 0.3 s.
+    pairs = [each.tolist() for each in timing._pairs(poses, 0.3)]
+    assert pairs == [[0, 1], [2, 3]]
