@@ -1,7 +1,7 @@
 """Counts what a compiled planner step executes and holds, beside its time: `python -m tools.step_instructions`.
 
-A step is run one instruction at a time, by ptrace: the count is the same whatever else the machine does. Linux on
-x86-64 or aarch64, not under an emulator.
+A step is run one instruction at a time, by ptrace: load changes the times, not the count. Linux on x86-64 or aarch64,
+not under an emulator.
 """
 
 from __future__ import annotations

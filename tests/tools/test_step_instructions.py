@@ -1,4 +1,4 @@
-"""Counting instructions: the same number every time, more for more work, nothing for a call that does nothing."""
+"""Counting instructions: as many every time, more for more work."""
 
 import pytest
 
