@@ -28,9 +28,9 @@ from matplotlib.figure import Figure
 
 from disco_hw.config import Prior, Robot, RobotConfig
 from disco_hw.errors import InputError
-from disco_hw.inference.checks import CHECKS, LARGEST_DEVIATION, Scores
+from disco_hw.inference.checks import CHECKS, LARGEST_DEVIATION, LARGEST_UNEXPLAINED, Scores
 from disco_hw.inference.estimates import estimates
-from disco_hw.inference.excitation import excitation
+from disco_hw.inference.excitation import excitation, unexplained_share
 from disco_hw.inference.infer import InferOptions, infer, noise_of, noise_spread
 from disco_hw.inference.simulate import NAMES, Simulator, draw_seeds
 from disco_hw.log.drive import Commands, DriveLog, Gyro, Poses, Wheels
@@ -182,6 +182,7 @@ def closed_form(seed: int, kind: str, drive: str) -> dict[str, object]:
     scores = Scores(driven, weights)
     simulated = np.array([scores(one) for one in poses[:SCORED]])
     spread = simulated.std(axis=0)
+    unexplained = unexplained_share(driven, found)
     deviations = (scores(driven.pose) - simulated.mean(axis=0)) / np.where(spread > 1e-12, spread, np.inf)
     return {
         "seed": seed,
@@ -189,7 +190,8 @@ def closed_form(seed: int, kind: str, drive: str) -> dict[str, object]:
         "mean": mean.tolist(),
         "sd": sd.tolist(),
         "inside": (np.abs(mean - truth) < WITHIN * sd).tolist(),
-        "outside_simulated": bool(np.abs(deviations).max() > LARGEST_DEVIATION),
+        "outside_simulated": bool(np.abs(deviations).max() > LARGEST_DEVIATION or unexplained > LARGEST_UNEXPLAINED),
+        "unexplained": unexplained,
         "disagreements": [
             check.name for check, off in zip(CHECKS, deviations, strict=True) if abs(off) > LARGEST_DEVIATION
         ],

@@ -13,7 +13,7 @@ from scipy.stats import kstest
 from disco_hw.effects.effect import Symptom
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.inference.estimates import Estimates, Whitening, estimates
-from disco_hw.inference.excitation import Excitation, Noise
+from disco_hw.inference.excitation import Excitation, Noise, unexplained_share
 from disco_hw.inference.rounds import Fitted, Simulate
 from disco_hw.inference.simulate import NAMES, Simulator, Workers, draw_seeds
 
@@ -145,6 +145,8 @@ def _scores(whitened: tuple[Array, int]) -> Array:
 
 # On logs of robots without any difference the largest of all values stays below this (tools/infer_study.py).
 LARGEST_DEVIATION = 5.0
+# More than this of the motion within a second, and no geometry and no slip of a usable robot is behind it.
+LARGEST_UNEXPLAINED = 0.5
 _EDGE_DEVIATIONS = 1.5
 _OUTSIDE_SHARE = 0.01
 _EDGE_WIDTH = 0.1
@@ -154,18 +156,20 @@ _EDGE_WIDTH = 0.1
 class Predictive:
     """`deviations` (13,): how far the log's value of each of `CHECKS` is from the simulated ones, in their standard
     deviations; `estimate_deviations` (3,) the same for the estimates of wheel radius, x_icr and kappa. `edge` names
-    parameters whose posterior is pressed against the prior's edge.
+    parameters whose posterior is pressed against the prior's edge. `unexplained` is the part of the motion that counts
+    as noise, and that no comparison with simulations which have that noise could find.
     """
 
     deviations: Array
     estimate_deviations: Array
     edge: tuple[str, ...]
+    unexplained: float = 0.0
 
     @property
     def outside_simulated(self) -> bool:
         """Whether the log is unlike every simulation under the posterior."""
         largest = max(np.abs(self.deviations).max(), np.abs(self.estimate_deviations).max())
-        return bool(largest > LARGEST_DEVIATION) or bool(self.edge)
+        return bool(largest > LARGEST_DEVIATION) or bool(self.edge) or self.unexplained > LARGEST_UNEXPLAINED
 
     @property
     def disagreements(self) -> list[tuple[ScoreTest, float]]:
@@ -199,7 +203,9 @@ def predictive(
     simulated, fits = np.split(simulator.summaries(draws, seeds, both, workers, done), [len(CHECKS)], axis=1)
     deviations = _deviations(scores(drive.pose), simulated)
     fit_deviations = _deviations(weights.raw(drive.pose[None])[0], fits)
-    return Predictive(deviations, fit_deviations, edge_parameters(draws, low, high, weights.theta(drive.pose[None])[0]))
+    plain = weights.theta(drive.pose[None])[0]
+    edge = edge_parameters(draws, low, high, plain)
+    return Predictive(deviations, fit_deviations, edge, unexplained_share(drive, plain))
 
 
 def edge_parameters(draws: Array, low: Array, high: Array, estimate: Array) -> tuple[str, ...]:

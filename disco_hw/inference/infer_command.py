@@ -20,7 +20,7 @@ import numpy as np
 
 from disco_hw.config import load_robot_config
 from disco_hw.errors import InputError, WorkError
-from disco_hw.inference.checks import CHECKS, LEVELS
+from disco_hw.inference.checks import CHECKS, LARGEST_UNEXPLAINED, LEVELS
 from disco_hw.inference.excitation import excitation
 from disco_hw.inference.infer import Inference, InferOptions, infer
 from disco_hw.inference.simulate import NAMES, LocalWorkers, ReportProgress, Workers, dask_workers
@@ -155,6 +155,7 @@ def diagnostics(inference: Inference) -> dict[str, Any]:
             zip((check.name for check in CHECKS), inference.predictive.deviations.tolist(), strict=True)
         ),
         "outside_region": inference.outside_region,
+        "unexplained": round(inference.predictive.unexplained, 4),
         "noise": asdict(inference.noise),
         "driven_by": inference.drive.source,
         "poses": int(inference.drive.t_s.size),
@@ -173,6 +174,11 @@ def _disagreements(inference: Inference) -> list[str]:
         f"warning: the posterior of {name} is pressed against the prior's edge; widen prior.{name} in robot.toml"
         for name in check.edge
     ]
+    if check.unexplained > LARGEST_UNEXPLAINED:
+        lines.append(
+            f"warning: {check.unexplained:.0%} of the motion within a second is not the wheels' in any geometry; "
+            "are the poses and wheels those of one drive, on one clock?"
+        )
     if check.outside_simulated:
         lines.append(
             "warning: the log lies outside what was simulated, so the parameters may have absorbed what the model lacks"

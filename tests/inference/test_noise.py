@@ -4,7 +4,14 @@ import numpy as np
 import pytest
 
 from disco_hw.inference.estimates import estimates
-from disco_hw.inference.excitation import USUAL, Noise, _two_terms, excitation, measured_noise
+from disco_hw.inference.excitation import (
+    USUAL,
+    Noise,
+    _two_terms,
+    excitation,
+    measured_noise,
+    unexplained_share,
+)
 from disco_hw.inference.simulate import NAMES, Simulator
 from disco_hw.model import Model
 from tests.inference.drives import TRUTH, logged
@@ -101,3 +108,13 @@ def test_one_minute_of_a_circle_tells_the_slip_without_bias():
     ratio = np.array(found) / TRUE.vector()
     assert np.median(ratio, axis=0) == pytest.approx(1.0, abs=0.15)
     assert np.quantile(ratio, 0.1, axis=0).min() > 0.6
+
+
+def test_the_poses_of_another_drive_are_not_taken_for_slip():
+    own, other = excitation(logged("rich")), excitation(logged("rich", seed=2))
+    poses = min(own.pose.shape[0], other.pose.shape[0])
+    assert poses > 0.9 * own.pose.shape[0]
+    swapped = own.pose.copy()
+    swapped[:poses] = other.pose[:poses]
+    assert unexplained_share(own, THETA) < 0.15
+    assert unexplained_share(with_poses(own, swapped), THETA) > 0.8

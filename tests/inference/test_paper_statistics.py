@@ -5,6 +5,7 @@ from disco_hw.errors import InputError
 from disco_hw.inference.density_network import NetworkSettings, train
 from disco_hw.inference.estimates import CROSS_CORRELATION, PAPER_STATISTICS, CrossCorrelation, PaperStatistics
 from disco_hw.inference.infer import InferOptions, infer
+from tests.inference.drives import logged, robot_config
 
 
 def test_they_are_the_means_of_position_and_of_its_steps_in_time():
@@ -65,3 +66,11 @@ def test_random_features_learn_a_density_that_no_line_fits_and_are_not_trained()
 def test_what_is_the_papers_is_refused_without_it(option):
     with pytest.raises(InputError, match="give --paper too"):
         infer(None, None, InferOptions(**{option: True}))
+
+
+def test_what_is_asked_for_is_what_learns():
+    options = InferOptions(paper=True, simulations=200, random_features=True, cross_correlation=True)
+    found = infer(logged("poor"), robot_config(), options)
+    assert found.observed.size == len(CROSS_CORRELATION)
+    assert found.fitted.statistics.shape[1] == len(CROSS_CORRELATION)
+    assert "frequencies" in dict(found.fitted.network.stack.named_buffers())
