@@ -1,6 +1,7 @@
 """What the command hands to the search, and what it makes of a fleet's logs."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -13,7 +14,7 @@ from disco_hw.config import load_robot_config
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.errors import InputError, LogError
 from disco_hw.gap import find
-from disco_hw.gap.report.findings import STAGES, Doubt, EffectFinding, GapReport, UnnamedFinding
+from disco_hw.gap.report.findings import STAGES, Doubt, EffectFinding, FleetRow, GapReport, UnnamedFinding
 from disco_hw.gap.search.analysis import ParameterEstimate
 from disco_hw.gap.search.cross_validation import PredictionErrors
 from disco_hw.log.importing import write_log
@@ -105,6 +106,8 @@ def test_a_fleet_ends_in_one_table_with_a_row_for_each_log(fleet, tmp_path):
     assert monday.split("  ")[0] == str(fleet[0])
     # Offered is what model.toml holds, and errors are told where the answer looks: 2 s ahead.
     columns = [head.index(f"  {name}") + 2 for name in head.split()[1:]]
+    # What could not be judged makes no column wider.
+    assert columns[1] - columns[0] == len("motor_lag 0.123; v_x += 3 v") + 2
     cut = [
         [line[a:b].strip() for a, b in zip(columns, [*columns[1:], None], strict=True)] for line in (monday, tuesday)
     ]
@@ -153,6 +156,18 @@ def test_reports_of_a_fleet_are_written_over_no_log(fleet, tmp_path):
     inside.write_bytes(b"a log too")
     with pytest.raises(InputError, match="would be written over, and is read here"):
         find.gap_fleet([fleet[0], inside], ROBOT, tmp_path / "out")
+
+
+def test_a_log_of_a_fleet_without_poses_is_told_by_its_wheels():
+    found = report_of("motor_lag", 0.020, 0.010)
+    wheels = {stage: found.gap[stage] for stage in ("nominal", "timed", "amended")}
+    bare = replace(found, gap={}, wheels=wheels, effects=(), unnamed=(), doubtful=(), offered="refitted")
+    row = FleetRow(Path("lifted.mcap"), Path("out/lifted"), bare)
+    assert row.cells() == (
+        "lifted.mcap", "nothing", "-", "2 s", "20.0 mm 40 mrad", "90.0 mm 180 mrad", "-", "refitted",
+    )  # fmt: skip
+    assert row.as_dict()["judged_by"] == "wheels"
+    assert row.as_dict()["held_out"]["timed"]["position_rmse_m"] == pytest.approx(0.020)
 
 
 # Each worker imports and compiles the search anew.
