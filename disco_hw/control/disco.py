@@ -43,6 +43,8 @@ from disco_hw.tasks import PlannedTask
 
 NARROW_TURN_RAD = 0.4
 DELAYED_BY = DELAY.columns[0]
+# A plan stands that in its first half gets nowhere further away than this part of the way that it is to go.
+NOWHERE = 0.25
 # Steps kept beyond the longest delay that is believed in at first, for later beliefs.
 SPARE_HISTORY = 2
 SHORTEST_GAP_S = 1e-6
@@ -87,6 +89,7 @@ class Disco:
             seed,
         )
         self._guide: Callable[..., None] | None = None
+        self._guided_until_ns: int | None = None
         self._begun_ns: int | None = None
         self._t0_ns: int | None = None
         self._failing_since_ns: int | None = None
@@ -209,7 +212,7 @@ class Disco:
     def reset(self) -> None:
         """Forget the last plan, as at a new start; the random numbers go on."""
         self._optimiser.reset()
-        self._begun_ns = self._t0_ns = self._failing_since_ns = self._memory = None
+        self._begun_ns = self._t0_ns = self._failing_since_ns = self._memory = self._guided_until_ns = None
         self._loss.pause()
 
     def warm_up(self) -> None:
@@ -246,13 +249,16 @@ class Disco:
             self._stop(now_ns, before)
         else:
             self._failing_since_ns = None
-        wheel_speeds = self._optimiser.nominal()
         self._planned_from, self._elapsed_s = start, elapsed_s
+        trajectory = self._trajectory(self._mean, self._optimiser.nominal(), 0)
+        if guided and self._is_to_be_guided(now_ns, system, trajectory):
+            self._optimiser.take_guide()
+            trajectory = self._trajectory(self._mean, self._optimiser.nominal(), 0)
         return WheelPlan(
             t0_ns=t0_ns,
             step_s=settings.step_s,
-            wheel_speeds=self._asked(wheel_speeds),
-            trajectory=self._trajectory(self._mean, wheel_speeds, 0),
+            wheel_speeds=self._asked(self._optimiser.nominal()),
+            trajectory=trajectory,
             diagnostics=self._diagnostics(retries, outcome),
         )
 
@@ -300,6 +306,22 @@ class Disco:
             self._guide = compiled_for(guide, *arguments)
         self._guide(*arguments)
         return True
+
+    def _is_to_be_guided(self, now_ns: int, system: SkidSteer, trajectory: Array) -> bool:
+        """Whether the guide has the robot: for a horizon from a plan on that stands, as across the line or far off it.
+
+        Turning in from there costs more than standing for as long as is planned, or is put off from plan to plan.
+        """
+        if not self._optimiser.guide_is_valid:
+            return False
+        settings = self._settings
+        horizon_s = settings.sampler.horizon * settings.step_s
+        half = settings.sampler.horizon // 2
+        way_m = system.task.way_ahead_m(half * settings.step_s)
+        moved_m = np.hypot(*(trajectory[1 : half + 1, :2] - trajectory[0, :2]).T).max()
+        if moved_m < NOWHERE * way_m:
+            self._guided_until_ns = now_ns + round(horizon_s * 1e9)
+        return self._guided_until_ns is not None and now_ns < self._guided_until_ns
 
     def _stop(self, now_ns: int, before: tuple[float, float]) -> None:
         """Put a ramp to zero in the plan's place; raises NoValidControl when that has gone on for too long."""

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from disco_hw.control.kernel.layout import BLOCK, STATE_ROWS, Floats, System, aligned_zeros, block_count
 from disco_hw.control.kernel.sequences import Basis, Limits
 from disco_hw.control.kernel.step import ESS, SAMPLING, TEMPERATURE, Workspace, disco_step
+from disco_hw.control.kernel.weighting import INVALID
 from disco_hw.control.settings import Sampler
 from disco_hw.jit import compiled_for
 from disco_hw.tasks.cost import single
@@ -147,6 +148,11 @@ class Optimiser:
     def guide_is_better(self, below: float) -> bool:
         """Whether the guide costs less than this part of what the plan did, in the last step."""
         return bool(self._work.costs[1] < below * self._work.costs[0])
+
+    @property
+    def guide_is_valid(self) -> bool:
+        """Whether the guide had a cost in the last step."""
+        return bool(self._work.costs[1] < INVALID)
 
     def take_guide(self) -> None:
         """Continue from the guide."""

@@ -96,7 +96,7 @@ class DiscoSettings:
     gain_by_time: whether a plan moves only the part shift / step_s towards the new optimum when it is made anew within
     a step. Then the plan changes as fast at any rate, and more plans a second average out noise instead of adding it.
     guide_below: where a steering law's commands cost less than this part of the plan, they take its place (tasks with
-    a line; kernel/guide.py); 0 without a guide.
+    a line; kernel/guide.py); for a horizon also where the plan stands, whatever they cost; 0 without a guide.
     offset_free: whether rollouts move beside the model as the robot was found to (model/disturbance.py), and lose of a
     command what its wheels were found to lose (wheel_loss.py).
     iterations_at_start: optimisation steps for the first plan after a reset.

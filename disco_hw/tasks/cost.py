@@ -18,9 +18,11 @@ Terms of a task with a line may say it, for the planner to follow it by a steeri
 
     place_of(self, place, x, y) -> place                            beside a position, from the one before
     line_at(self, place, ahead_m) -> x, y, head_x, head_y, along, speed
+    way_ahead_m(self, time_s) -> m                                  not compiled
 
 the point so far on, the heading in which a robot stays on the line there, the cosine by which that is off the line,
-and the speed wanted; a place begins as a rollout's memory does.
+and the speed wanted; a place begins as a rollout's memory does. And how far a robot on the line goes in so long: the
+law has one whose plan stands.
 
 `found` holds what `follow` kept and the four numbers of that row; zeros without a table. Constants are made by
 `single`: any other number would pull the arithmetic up to double precision. Compiled, the functions below use estimates

@@ -59,12 +59,13 @@ def guide(
         away_x, away_y = x - at_x + x_icr_m * (cos_yaw - head_x), y - at_y + x_icr_m * (sin_yaw - head_y)
         back = math.atan(ANGLE_PER_M * (away_y * head_x - away_x * head_y))
         off_rad = math.atan2(sin_yaw * head_x - cos_yaw * head_y, cos_yaw * head_x + sin_yaw * head_y) + back
+        returning = math.sin(back) * math.sin(back)
         # What the wheels are to do when the command acts.
         _, _, from_x, from_y, along, _ = line_at(terms, place, speed * lead_s)
         _, _, to_x, to_y, _, _ = line_at(terms, place, speed * lead_s + TURN_M)
         bend = math.atan2(from_x * to_y - from_y * to_x, from_x * to_x + from_y * to_y) / TURN_M
         turn = speed * (bend - YAW_PER_M * math.atan2(math.sin(off_rad), math.cos(off_rad)))
-        forward = speed * along * max(math.cos(off_rad), SLOWEST)
+        forward = speed * (along + (1.0 - along) * returning) * max(math.cos(off_rad), SLOWEST)
         left, right = _within(
             (forward - half_axle * turn) / chassis.wheel_radius_m,
             (forward + half_axle * turn) / chassis.wheel_radius_m,

@@ -150,6 +150,10 @@ class PathTerms(NamedTuple):
         x, y = self.table[row] + part * step_x, self.table[row + 1] + part * step_y
         return x, y, along_x * cosine - along_y * sine, along_y * cosine + along_x * sine, cosine, speed
 
+    def way_ahead_m(self, time_s: float) -> float:
+        """How far a robot on the path goes in so long; Python only."""
+        return float(min(self.speed_m_s * time_s, max(self.end, 0.0) / self.per_m))
+
     def row_of(self, memory: float) -> int:
         """The row of the table for a place."""
         row: int = np.int32(np.floor(min(memory, self.last - _ONE)) - self.first)  # type: ignore[assignment]

@@ -13,6 +13,7 @@ from disco_hw.model import load_model
 from disco_hw.model.step import FreeRun
 from disco_hw.tasks.line.cost import PathCost
 from disco_hw.tasks.line.table import PathTable
+from tools.bench_tracking import starts
 from tools.foreign_plant import NOMINAL, ForeignRobot
 from tools.tracking import disco, drive, tracks
 
@@ -83,6 +84,32 @@ def test_without_a_guide_in_the_settings_there_is_none():
     planner.plan(0, PlannerState(0, 0.6, 0.3, 2.0, 0.0, 0.0))
     assert not planner.optimiser.work.guide.any()
     assert DiscoSettings.paper().guide_below == 0.0
+
+
+def test_a_plan_that_stands_gives_way_to_the_guide_for_a_horizon():
+    still = replace(SETTINGS, guide_below=1e-6, sampler=replace(SETTINGS.sampler, noise_std=1e-4))
+    planner = Disco(MODEL, STRAIGHT, still, LIMITS)
+    straight_on = np.full((SETTINGS.sampler.horizon, 2), SPEED_M_S / 0.061)
+
+    def planned(now_s):
+        now_ns = round(now_s * 1e9)
+        return planner.plan(now_ns, PlannerState(now_ns, 1.0, 0.0, 1.57, 3.0, 3.0)).wheel_speeds
+
+    def planned_from_straight_on(now_s):
+        planned(now_s)
+        planner.optimiser.set_nominal(straight_on)
+        # Made anew at the same time, a plan stays as it is.
+        return planned(now_s)
+
+    np.testing.assert_array_equal(planned(0.0), planner.optimiser.work.guide)
+    np.testing.assert_array_equal(planned_from_straight_on(3.9), planner.optimiser.work.guide)
+    np.testing.assert_allclose(planned_from_straight_on(4.1), straight_on, atol=0.01)
+
+
+@pytest.mark.long
+def test_nothing_keeps_the_robot_standing_beside_or_across_a_square():
+    figures = starts(8, ("square",))
+    assert {figures[f"starts.square.dead_{dead}.lost"] for dead in ("0", "0.8")} == {0.0}
 
 
 @pytest.mark.long
