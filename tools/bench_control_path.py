@@ -18,7 +18,7 @@ import disco_hw
 from disco_hw.control import CommandLimits, Disco, DiscoSettings, PlannerState, SentCommand
 from disco_hw.experiments.circle import KinematicPlant, plants
 from disco_hw.model import Model, load_model
-from disco_hw.tasks.line.table import load_waypoints
+from disco_hw.tasks.line import load_waypoints
 from disco_hw.tasks.path import PathTask
 from tools.step_times import summary, times_ms, undisturbed
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from disco_hw.control import Disco, DiscoSettings, PlannerState, SentCommand
 from disco_hw.control.baselines import Kanayama, LinearQuadratic, PurePursuit
-from disco_hw.control.law import LawController
+from disco_hw.control.plan import LawController
 from disco_hw.runtime.pipeline import Planner
 from disco_hw.tasks.circle import CircleCost
 from tools.foreign_plant import NOMINAL, ForeignPlant, ForeignRobot, robots

@@ -26,7 +26,7 @@ from disco_hw.runtime.assembly import make_planner
 from disco_hw.runtime.robot_setup import load_setup
 from disco_hw.tasks import task_from
 from disco_hw.tasks.circle import CircleCost
-from disco_hw.tasks.line.table import Waypoints
+from disco_hw.tasks.line import Waypoints
 from disco_hw.tasks.timed_path import TimedPathCost
 from tools.gap_logs import simulated_drive
 

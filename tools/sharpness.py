@@ -13,8 +13,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from disco_hw.inference.density_network import Region
 from disco_hw.inference.infer import Inference, InferOptions, infer
-from disco_hw.inference.rounds import Region
 from disco_hw.inference.simulate import draw_seeds
 from tools.infer_study import config, logged, plant
 

@@ -29,9 +29,9 @@ from disco_hw.runtime.governor import Governor, WheelLimits
 from disco_hw.runtime.pipeline import FollowTask, Pipeline, Planner
 from disco_hw.tasks.circle import CircleCost, CircleCourse
 from disco_hw.tasks.lemniscate import LemniscateTask
+from disco_hw.tasks.line import PathTable
 from disco_hw.tasks.line.cost import PathCost
 from disco_hw.tasks.line.course import LineCourse, line_course
-from disco_hw.tasks.line.table import PathTable
 from disco_hw.tasks.task import PlannedTask
 from drivers.types import Readings
 from tools.foreign_plant import NOMINAL, ForeignPlant, ForeignRobot

@@ -17,8 +17,8 @@ import numpy as np
 
 from disco_hw.bridge import ros2_messages as msg
 from disco_hw.config import PoseInput
-from disco_hw.log.frames import Edge, Motion, chain
-from disco_hw.log.frames import poses as along
+from disco_hw.log.drive import Edge, Motion, chain
+from disco_hw.log.drive import poses as along
 from drivers.motor.ros2_base_wire import REFUSALS, Ros2BaseSettings, Wheels
 
 TYPES = (msg.PoseStamped, msg.PoseWithCovarianceStamped, msg.Odometry)

@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_continuous_are
 
-from disco_hw.control.law import held_plan, no_rollouts
-from disco_hw.control.plan import PlannerState, Rollouts, WheelPlan
+from disco_hw.control.plan import PlannerState, Rollouts, WheelPlan, held_plan, no_rollouts
 from disco_hw.control.settings import CommandLimits
 from disco_hw.tasks.line.course import SMALLEST_X_ICR_M, stable_yaw
 

@@ -8,8 +8,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from disco_hw.control.kernel import BLOCK, CHANNELS, WHEEL_ROWS, aligned_zeros
 from disco_hw.control.kernel.guide import SteeredChassis, guide
-from disco_hw.control.kernel.layout import BLOCK, CHANNELS, WHEEL_ROWS, aligned_zeros
 from disco_hw.control.kernel.skid_steer import SkidSteer
 from disco_hw.control.optimiser import Optimiser
 from disco_hw.control.parameter_points import (

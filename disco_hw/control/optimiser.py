@@ -7,10 +7,9 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.control.kernel.layout import BLOCK, STATE_ROWS, Floats, System, aligned_zeros, block_count
+from disco_hw.control.kernel import BLOCK, STATE_ROWS, Floats, System, aligned_zeros, block_count
 from disco_hw.control.kernel.sequences import Basis, Limits
-from disco_hw.control.kernel.step import ESS, SAMPLING, TEMPERATURE, Workspace, disco_step
-from disco_hw.control.kernel.weighting import INVALID
+from disco_hw.control.kernel.step import ESS, INVALID, SAMPLING, TEMPERATURE, Workspace, disco_step
 from disco_hw.control.settings import Sampler
 from disco_hw.jit import compiled_for
 from disco_hw.tasks.cost import single

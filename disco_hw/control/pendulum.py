@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.control.kernel.layout import BLOCK, Floats, U, rolls_out
+from disco_hw.control.kernel import BLOCK, Floats, U, rolls_out
 from disco_hw.control.kernel.sequences import cos_sin_half_turns
 from disco_hw.control.optimiser import Optimiser
 from disco_hw.control.plan import NoValidControl

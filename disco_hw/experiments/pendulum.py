@@ -23,7 +23,7 @@ from torch import Tensor
 
 from disco_hw.control import pendulum
 from disco_hw.control.black_box import StageCost, Transition
-from disco_hw.control.kernel.layout import BLOCK, block_count
+from disco_hw.control.kernel import BLOCK, block_count
 from disco_hw.control.parameter_points import sigma_points
 from disco_hw.control.pendulum import PAPER_SAMPLER, PendulumPlanner, PendulumPoints
 from disco_hw.model import Belief, Gaussian, Uniform

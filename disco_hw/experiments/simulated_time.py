@@ -19,7 +19,7 @@ from disco_hw.adaptation import GeometryAdaptation
 from disco_hw.adaptation.adapter_link import AdapterLink
 from disco_hw.adaptation.guard import choose_adaptation
 from disco_hw.config import RobotConfig
-from disco_hw.control.law import Law, LawController
+from disco_hw.control.plan import Law, LawController
 from disco_hw.errors import InputError, WorkError
 from disco_hw.experiments.virtual import true_parameters
 from disco_hw.log.messages import MODEL_TOML, Attachment

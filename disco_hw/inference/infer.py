@@ -24,10 +24,9 @@ from disco_hw.inference.checks import (
     predictive,
     undetermined,
 )
-from disco_hw.inference.density_network import Mixtures, NetworkSettings
+from disco_hw.inference.density_network import Fitted, Mixtures, NetworkSettings, Region, RoundSettings, run_rounds
 from disco_hw.inference.estimates import cross_correlation, estimates, paper_statistics
 from disco_hw.inference.excitation import USUAL, Excitation, Noise, excitation, measured_noise
-from disco_hw.inference.rounds import Fitted, Region, RoundSettings, run_rounds
 from disco_hw.inference.simulate import (
     NAMES,
     ReportProgress,

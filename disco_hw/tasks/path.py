@@ -11,6 +11,7 @@ import numpy as np
 from msgspec import Meta
 
 from disco_hw.errors import InputError
+from disco_hw.tasks.line import PathTable, check_size, load_waypoints, points_of
 from disco_hw.tasks.line.cost import PathCost
 from disco_hw.tasks.line.course import (
     LineCourse,
@@ -20,7 +21,6 @@ from disco_hw.tasks.line.course import (
     straight_fastest_m_s,
     straight_too_fast,
 )
-from disco_hw.tasks.line.table import PathTable, check_size, load_waypoints, points_of
 from disco_hw.tasks.task import Chassis, Editable, Point, Positive, TaskFault
 
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from disco_hw.errors import InputError
 from disco_hw.tasks.cost import Found, norm, single
+from disco_hw.tasks.line import Waypoints, check_size, load_waypoints, points_of
 from disco_hw.tasks.line.cost import AGAINST_M
 from disco_hw.tasks.line.course import (
     END_M,
@@ -24,7 +25,6 @@ from disco_hw.tasks.line.course import (
     straight_fastest_m_s,
     straight_too_fast,
 )
-from disco_hw.tasks.line.table import Waypoints, check_size, load_waypoints, points_of
 from disco_hw.tasks.task import Array, Chassis, Editable, Point, Prepared, TaskFault
 
 # A place that moves by less in a step has no direction.

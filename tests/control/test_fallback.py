@@ -10,11 +10,10 @@ import pytest
 from disco_hw.control import CommandLimits, NoValidControl, PlannerState
 from disco_hw.control.fallback import LAWS, WithFallback
 from disco_hw.control.kernel.guide import SteeredChassis
-from disco_hw.control.law import held_plan
-from disco_hw.control.plan import PlanOutcome
+from disco_hw.control.plan import PlanOutcome, held_plan
 from disco_hw.tasks.circle import CircleCost
+from disco_hw.tasks.line import PathTable
 from disco_hw.tasks.line.cost import PathCost
-from disco_hw.tasks.line.table import PathTable
 from disco_hw.tasks.timed_path import TimedPathCost
 
 BASE = (0.061, 0.415, 0.238)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from disco_hw.control import NoValidControl, PlannerState
-from disco_hw.control.law import LawController
+from disco_hw.control.plan import LawController
 from disco_hw.model import Model
 from disco_hw.model.step import simulate
 

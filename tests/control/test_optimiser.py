@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from disco_hw.control.kernel.layout import BLOCK
+from disco_hw.control.kernel import BLOCK
 from disco_hw.control.optimiser import FIRST_TEMPERATURE, Optimiser
 from disco_hw.control.pendulum import LARGEST_TORQUE_NM, PAPER_SAMPLER, STEP_S, PendulumTerms
 

@@ -8,7 +8,7 @@ import pytest
 from disco_hw.control import oracle, pendulum
 from disco_hw.model.plain import RobotState
 from disco_hw.tasks.circle import CircleCost
-from disco_hw.tasks.line.table import Waypoints
+from disco_hw.tasks.line import Waypoints
 from disco_hw.tasks.timed_path import TimedPathCost
 from tests.tasks.costs import circle_cost, path_along, path_cost, timed_path_cost
 

@@ -9,7 +9,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from disco_hw.control import NoValidControl, oracle, pendulum
-from disco_hw.control.kernel.layout import BLOCK
+from disco_hw.control.kernel import BLOCK
 from disco_hw.control.pendulum import PAPER_SAMPLER, PendulumPlanner, PendulumPoints
 
 K, T = 160, 30

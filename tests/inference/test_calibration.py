@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from disco_hw.inference.checks import LEVELS, calibrate, effective_simulations
-from disco_hw.inference.density_network import Mixtures, NetworkSettings
-from disco_hw.inference.rounds import Region, RoundSettings, run_rounds
+from disco_hw.inference.density_network import Mixtures, NetworkSettings, Region, RoundSettings, run_rounds
 
 SMALL = NetworkSettings(members=2, hidden=16, epochs=60)
 SD = 0.05

@@ -2,9 +2,8 @@ import numpy as np
 import pytest
 
 from disco_hw.control.parameter_points import moments, moving_names
-from disco_hw.inference.density_network import Mixtures
+from disco_hw.inference.density_network import Mixtures, Region
 from disco_hw.inference.infer import belief_of
-from disco_hw.inference.rounds import Region
 from disco_hw.inference.simulate import NAMES
 
 LOW, HIGH = np.array([0.0, 0.0, 0.1]), np.array([0.5, 0.5, 0.5])

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from disco_hw.inference.rounds import Region
+from disco_hw.inference.density_network import Region
 
 LOW, HIGH = np.array([0.0, 0.0, 0.1]), np.array([0.5, 0.5, 0.5])
 

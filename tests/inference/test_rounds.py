@@ -3,8 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from disco_hw.inference.density_network import NetworkSettings
-from disco_hw.inference.rounds import Region, RoundSettings, run_rounds
+from disco_hw.inference.density_network import NetworkSettings, Region, RoundSettings, run_rounds
 
 PRIOR = Region.box(np.zeros(2), np.ones(2))
 SMALL = NetworkSettings(members=2, hidden=16, epochs=40)

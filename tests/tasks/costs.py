@@ -9,6 +9,7 @@ import numpy as np
 from disco_hw.control.oracle import Array, SequenceCost
 from disco_hw.tasks import circle as circle_file
 from disco_hw.tasks.circle import MOST_TURNED, CircleCost
+from disco_hw.tasks.line import PathTable, Waypoints
 from disco_hw.tasks.line.cost import (
     AGAINST_M,
     FARTHEST_STEP_M,
@@ -20,7 +21,6 @@ from disco_hw.tasks.line.cost import (
     PathCost,
 )
 from disco_hw.tasks.line.course import stable_yaw
-from disco_hw.tasks.line.table import PathTable, Waypoints
 from disco_hw.tasks.timed_path import RESTS_M, TimedPathCost
 
 

@@ -10,7 +10,7 @@ import pytest
 from disco_hw.control import CommandLimits, Disco, DiscoSettings, PlannerState, PlanOutcome
 from disco_hw.experiments.circle import KinematicPlant
 from disco_hw.model import load_model
-from disco_hw.tasks.line.table import PathTable, Waypoints, sharp_turns
+from disco_hw.tasks.line import PathTable, Waypoints, sharp_turns
 from tests.tasks.costs import path_along
 
 MODEL = load_model(Path(__file__).parents[2] / "disco_hw/robots/wombot_model.toml")

@@ -9,7 +9,7 @@ import pytest
 from disco_hw.control import CommandLimits, Disco, DiscoSettings, PlannerState
 from disco_hw.experiments.circle import KinematicPlant
 from disco_hw.model import load_model
-from disco_hw.tasks.line.table import Waypoints
+from disco_hw.tasks.line import Waypoints
 from disco_hw.tasks.timed_path import TimedPathCost
 
 MODEL = load_model(FilePath(__file__).parents[2] / "disco_hw/robots/wombot_model.toml")

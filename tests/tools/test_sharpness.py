@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from disco_hw.inference.density_network import Mixtures
-from disco_hw.inference.rounds import Region
+from disco_hw.inference.density_network import Mixtures, Region
 from tools.sharpness import _least_squares, _log_inside, compared, paired, summary
 
 BOX = Region.box(np.full(3, -1.0), np.ones(3))

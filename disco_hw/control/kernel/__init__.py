@@ -1,1 +1,181 @@
-"""The compiled step of DISCO; docs/kernel.md draws how its buffers are laid out."""
+"""The compiled step of DISCO: how its buffers are laid out (docs/kernel.md draws it), and what it calls.
+
+That is a system's rollout of a block and a task's cost. Samples are the innermost dimension everywhere, in blocks of
+BLOCK: every loop over them becomes vector instructions without a remainder, and a block's commands and state stay in
+the first-level cache.
+
+What the functions of a task are is written in disco_hw/tasks/cost.py; they are chosen by the type of the task's terms.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from disco_hw.jit import cast_like, quick_length, quick_norm, quick_norm_and_inverse, specialise
+from disco_hw.tasks import cost
+from disco_hw.tasks.cost import Found
+
+Floats: TypeAlias = NDArray[np.float32]
+# Any: the compiler takes any named tuple with the functions of its kind, which differ in their fields.
+Terms: TypeAlias = Any
+"""The terms of a task's cost (disco_hw/tasks/cost.py)."""
+# Any: as above; SkidSteer and PendulumTerms are two.
+System: TypeAlias = Any
+"""What is rolled out: a named tuple for which `roll_block` has a form."""
+
+# All indices in the hot loops are unsigned: a signed one is checked for wrap-around at every access. All buffers are
+# flat with rows at constant distances, which spares the compiler most checks for overlap.
+U = np.uintp
+BLOCK = U(80)
+
+# The rows of a block's state, in the order of docs/kernel.md. What all points of a rollout share:
+AXLE_X, AXLE_Y, COS, SIN, FORWARD = (U(row) * BLOCK for row in range(5))
+# Then ten rows for the rollout's own point and for each of the four that are equivalent to it.
+OWN, AHEAD0, AHEAD1, SCALED0, SCALED1 = (U(row) * BLOCK for row in (5, 15, 25, 35, 45))
+# Within those ten: the tracked point, the task's memory, the cost so far; then, for a task with a table, what was kept
+# for the cost, the row to look up, and the four numbers found there, of one sample after the other.
+X, Y, MEMORY, TOTAL, KEPT, ROW, FOUND = (U(row) * BLOCK for row in range(7))
+COLUMNS = U(4)
+STATE_ROWS = 55
+
+# While the wheels are turned, the state's first rows hold their speeds.
+LEFT, RIGHT = U(0) * BLOCK, BLOCK
+# The wheels' motion: for every step a row of their sum and one of right minus left; then a row of the sum's change.
+SUM, DIFFERENCE = U(0) * BLOCK, BLOCK
+WHEEL_STRIDE = U(2) * BLOCK
+WHEEL_ROWS = 3
+
+CHANNELS = 2
+"""Commands of a skid-steer robot: left and right."""
+
+_CACHE_LINE = 64
+
+
+def aligned_zeros(size: int, dtype: type = np.float32) -> NDArray[np.floating]:
+    """A flat array of zeros that starts on a cache line, so that no vector of a row straddles two."""
+    raw = np.zeros(size * np.dtype(dtype).itemsize + _CACHE_LINE, np.uint8)
+    offset = -raw.ctypes.data % _CACHE_LINE
+    return raw[offset : offset + size * np.dtype(dtype).itemsize].view(dtype)
+
+
+def block_count(samples: int) -> int:
+    """Blocks needed for `samples`; the last one may be partly idle."""
+    return math.ceil(samples / int(BLOCK))
+
+
+def roll_block(
+    system: System, costs: Floats, points: int, padded: int, block: int, horizon: int, commands: Floats, state: Floats
+) -> None:
+    """Costs of one block of samples under all parameter points; compiled code only.
+
+    `system` is the named tuple of a system's terms; its file gives the form for it with `rolls_out`. Writes
+    `costs[i * padded + block * BLOCK + b]` for parameter point i and sample b of the block, from the block's
+    `commands`; `state` is scratch of STATE_ROWS rows.
+    """
+    raise TypeError(f"{type(system).__name__} cannot be rolled out")
+
+
+def rolls_out(system_class: type) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Make a function the form of `roll_block` for the systems of a class."""
+
+    def register(function: Callable[..., None]) -> Callable[..., None]:
+        specialise(roll_block)(
+            lambda system, *_: function if getattr(system, "instance_class", None) is system_class else None
+        )
+        return function
+
+    return register
+
+
+_registered: set[Callable[..., object]] = set()
+
+
+def stage_cost(
+    terms: object, memory: float, step: int, x_old: float, y_old: float, x: float, y: float,
+    cos_yaw: float, sin_yaw: float, forward: float, found: Found,
+) -> tuple[float, float]:  # fmt: skip
+    """Cost of one step of a rollout and the task's memory after it: `stage` of the terms; compiled code only."""
+    raise TypeError(f"{type(terms).__name__} has no stage cost")
+
+
+def terminal_cost(
+    terms: object, memory: float, x: float, y: float, cos_yaw: float, sin_yaw: float, found: Found
+) -> float:
+    """Cost of the state that a rollout ends in: `terminal` of the terms; compiled code only."""
+    raise TypeError(f"{type(terms).__name__} has no terminal cost")
+
+
+def follow(terms: object, memory: float, x: float, y: float, forward: float, found: Found) -> tuple[float, float]:
+    """The memory after a step, and a number to keep for its cost: `follow` of terms with a table; compiled only."""
+    raise TypeError(f"{type(terms).__name__} has no table to follow")
+
+
+def row_of(terms: object, memory: float) -> int:
+    """The table's row for a memory: `row_of` of terms with a table; compiled code only."""
+    raise TypeError(f"{type(terms).__name__} has no table")
+
+
+def place_of(terms: object, place: float, x: float, y: float) -> float:
+    """The place on the line beside a position: `place_of` of terms with a line; compiled code only."""
+    raise TypeError(f"{type(terms).__name__} has no line")
+
+
+def line_at(terms: object, place: float, ahead_m: float) -> tuple[float, float, float, float, float, float]:
+    """Where and how to be on the line: `line_at` of terms with a line; compiled code only."""
+    raise TypeError(f"{type(terms).__name__} has no line")
+
+
+def looks_up(terms: object) -> bool | None:
+    """None for terms without a table, anything else for terms with one; a constant to the compiler."""
+    raise TypeError(f"{type(terms).__name__} is no named tuple of terms")
+
+
+def _chosen(terms: Any, name: str) -> Callable[..., object] | None:
+    """The function of that name of the terms whose numba type this is; None if they have none."""
+    for function in cost.HELPERS:
+        if function not in _registered:
+            _registered.add(function)
+            specialise(function)(lambda *_, _function=function: _function)
+    found: Callable[..., object] | None = getattr(getattr(terms, "instance_class", None), name, None)
+    return found
+
+
+specialise(stage_cost)(lambda terms, *_: _chosen(terms, "stage"))
+specialise(terminal_cost)(lambda terms, *_: _chosen(terms, "terminal"))
+specialise(follow)(lambda terms, *_: _chosen(terms, "follow"))
+specialise(row_of)(lambda terms, *_: _chosen(terms, "row_of"))
+specialise(place_of)(lambda terms, *_: _chosen(terms, "place_of"))
+specialise(line_at)(lambda terms, *_: _chosen(terms, "line_at"))
+
+
+@specialise(looks_up)
+def _looks_up(terms: Any) -> Callable[[Any], bool | None] | None:
+    fields = getattr(getattr(terms, "instance_class", None), "_fields", None)
+    if fields is None:
+        return None
+    return (lambda terms: True) if "table" in fields else (lambda terms: None)
+
+
+@specialise(cost.norm)
+def _norm(x: Any, y: Any) -> Callable[..., float]:
+    return lambda x, y: quick_norm(x, y)  # noqa: PLW0108 - the compiler wants Python code
+
+
+@specialise(cost.norm_and_inverse)
+def _norm_and_inverse(x: Any, y: Any) -> Callable[..., tuple[float, float]]:
+    return lambda x, y: quick_norm_and_inverse(x, y)  # noqa: PLW0108 - the compiler wants Python code
+
+
+@specialise(cost.norm_of_three)
+def _norm_of_three(x: Any, y: Any, z: Any) -> Callable[..., float]:
+    return lambda x, y, z: quick_length(x, y, z)  # noqa: PLW0108 - the compiler wants Python code
+
+
+@specialise(cost.constant)
+def _constant(value: Any, like: Any) -> Callable[..., float]:
+    return lambda value, like: cast_like(value, like)  # noqa: PLW0108 - the compiler wants Python code

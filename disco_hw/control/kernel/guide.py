@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from disco_hw.control.kernel.layout import Floats, Terms, line_at, place_of
+from disco_hw.control.kernel import Floats, Terms, line_at, place_of
 from disco_hw.control.kernel.sequences import Limits, clip
 from disco_hw.jit import kernel_function, scalar_function
 from disco_hw.model.disturbance import MOVES_RAD_S

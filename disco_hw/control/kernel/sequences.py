@@ -19,7 +19,7 @@ from numba import types
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from disco_hw.control.kernel.layout import BLOCK, Floats, U
+from disco_hw.control.kernel import BLOCK, Floats, U
 from disco_hw.jit import (
     bits_of_float,
     block_function,

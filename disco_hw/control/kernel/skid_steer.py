@@ -13,7 +13,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.control.kernel.layout import (
+from disco_hw.control.kernel import (
     AHEAD0,
     AHEAD1,
     AXLE_X,

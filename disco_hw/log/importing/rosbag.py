@@ -17,14 +17,17 @@ from disco_hw.log.drive import (
     Array,
     Commands,
     DriveLog,
+    Edge,
     Gyro,
     Index,
+    Motion,
     Poses,
     Wheels,
     differentiate_angle,
     integrate_angle,
+    poses,
+    rotations,
 )
-from disco_hw.log.frames import Edge, Motion, poses, rotations
 from disco_hw.log.importing import LogFormat
 from disco_hw.log.importing.csv_drive import length_fault
 from disco_hw.log.importing.rosbag_file import Bag, BagMessage, Stamps, is_bag, open_bag, timeline

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 from disco_hw.config import Ros2
 from disco_hw.errors import LogError
-from disco_hw.log.frames import BASE_FRAMES, MAP_FRAMES, ODOM_FRAMES, Edge, chain
+from disco_hw.log.drive import BASE_FRAMES, MAP_FRAMES, ODOM_FRAMES, Edge, chain
 from disco_hw.log.importing.rosbag_file import Bag, BagMessage, BagTopic
 
 TF = "tf"

@@ -1,1 +1,289 @@
-"""What kinds of tasks share that follow a line of way-points: its table, course, progress and cost, and their file."""
+"""What kinds of tasks share that follow a line of way-points: here their file and the line as a table, with where on it
+a robot is; course, progress and cost lie beside it.
+
+The table is the way-points of a CSV in equal pieces of arc length.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from disco_hw.errors import InputError
+from disco_hw.files import WAY_POINTS, read_lines
+from disco_hw.tasks.task import FARTHEST_M, Array, Point
+
+SPACING_M = 0.02
+LOOK_BACK_M = 0.3
+LOOK_AHEAD_M = 1.0
+LOST_M = 1.0
+# Where the way turns by more than SHARP from one TURN_M to the next, the robot stops, within REACHED_M, and turns.
+SHARP_RAD = math.radians(125.0)
+TURN_M = 0.15
+REACHED_M = 0.05
+# More than this between one entry and the next is a corner.
+CORNER_RAD = math.radians(20.0)
+# Branches of which none is further off than the nearest by so much may be meant; facing straight against one counts as
+# much as being so much further off it.
+BRANCHES_M = 0.3
+AGAINST_BRANCH_M = 0.6
+
+
+@dataclass(frozen=True, eq=False)
+class PathTable:
+    """Way-points (N, 2) in equal pieces of arc length.
+
+    Where the way turns sharply it is cut into pieces: the robot stops at a piece's end and turns to the next. The path
+    is closed if its last way-point is its first. Raises ValueError for way-points closer than the table's spacing
+    throughout.
+    """
+
+    places_m: Array
+    _table: Array = field(init=False, repr=False)
+    _closed: bool = field(init=False, repr=False)
+    _spacing_m: float = field(init=False, repr=False)
+    _bounds: Array = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        places = self.places_m
+        distance = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(places, axis=0).T))])
+        count = round(distance[-1] / SPACING_M)
+        if count < 1:
+            raise ValueError(f"the path is {distance[-1]} m long; it must be longer than {SPACING_M} m")
+        at = np.linspace(0.0, distance[-1], count + 1)
+        x, y = np.interp(at, distance, places[:, 0]), np.interp(at, distance, places[:, 1])
+        closed = bool(np.hypot(*(places[0] - places[-1])) < SPACING_M)
+        spacing = float(distance[-1]) / count
+        corners = sharp_turns(np.column_stack([x, y]), closed, max(1, round(TURN_M / spacing)))
+        x, y = _rounded(np.column_stack([x, y]), closed).T
+        step_x, step_y = np.diff(x), np.diff(y)
+        length = np.maximum(np.hypot(step_x, step_y), 1e-12)
+        along_x = np.append(step_x / length, (step_x / length)[0 if closed else -1])
+        along_y = np.append(step_y / length, (step_y / length)[0 if closed else -1])
+        table = np.column_stack([x, y, along_x, along_y])
+        bounds = [*corners, *(corner + count for corner in corners[:1])] if closed else [0, *corners, count]
+        object.__setattr__(self, "_table", table)
+        object.__setattr__(self, "_closed", closed)
+        object.__setattr__(self, "_spacing_m", spacing)
+        object.__setattr__(self, "_bounds", np.array(bounds, dtype=float))
+
+    @property
+    def table(self) -> Array:
+        """The path in equal pieces of arc length: x, y (m) and the unit tangent of the piece that begins there."""
+        return self._table
+
+    @property
+    def closed(self) -> bool:
+        """Whether the path's end is its beginning."""
+        return self._closed
+
+    @property
+    def sharp_turns(self) -> tuple[int, ...]:
+        """Entries of the table at which the robot stops to turn."""
+        ends = slice(0, -1) if self._closed else slice(1, -1)
+        return tuple(self._bounds.astype(int)[ends].tolist())
+
+    @property
+    def ends(self) -> bool:
+        """Whether rollouts end somewhere: at the path's end or before a sharp turn."""
+        return bool(self._bounds.size)
+
+    @property
+    def spacing_m(self) -> float:
+        """Arc length between two entries of the table."""
+        return self._spacing_m
+
+    def piece(self, place: float) -> tuple[float, float, float]:
+        """The piece that a place is on: the place, not less than the piece's first entry; its first and last entry.
+
+        A piece of a closed path may go past the table's end, and so may the place. A path without sharp turns is one
+        piece; of a closed one, which has no end, the last entry is the first again.
+        """
+        bounds, count = self._bounds, len(self._table) - 1
+        if not bounds.size:
+            return place % count, 0.0, float(count)
+        if self._closed:
+            place = place % count
+            place += count if place < bounds[0] else 0.0
+        at = min(int(np.searchsorted(bounds, place, side="right")), bounds.size - 1)
+        return place, float(bounds[at - 1]), float(bounds[at])
+
+    def place(self, x_m: float, y_m: float, yaw_rad: float, before: float | None) -> float:
+        """Entry of the table nearest to a pose: near the one before, or anywhere without one or off the path.
+
+        Near the one before means on the same piece; at the end of a piece the next one begins. Where several branches
+        pass by, the first place is on the one that the heading fits.
+        """
+        count, spacing = len(self._table) - 1, self._spacing_m
+        if before is not None:
+            here, first, last = self.piece(before)
+            low, high = round(here - LOOK_BACK_M / spacing), round(here + LOOK_AHEAD_M / spacing)
+            if self._bounds.size:
+                low, high = max(low, int(first)), min(high, int(last))
+            if low >= 0 and high <= count:
+                rows = self._table[low : high + 1]
+            else:
+                rows = self._table[np.arange(low, high + 1) % count]
+            square = (rows[:, 0] - x_m) ** 2 + (rows[:, 1] - y_m) ** 2
+            nearest = int(square.argmin())
+            if square[nearest] < LOST_M**2:
+                found = float(low + nearest)
+                if self._bounds.size and (self._closed or last < count) and (last - found) * spacing <= REACHED_M:
+                    found = last
+                return found % count if self._closed else found
+        return float(self._branch(x_m, y_m, yaw_rad))
+
+    def _branch(self, x_m: float, y_m: float, yaw_rad: float) -> int:
+        """Entry where the branch is nearest whose distance and direction together fit a pose best."""
+        distance = np.hypot(self._table[:, 0] - x_m, self._table[:, 1] - y_m)
+        nearest = int(np.argmin(distance))
+        if not (math.isfinite(yaw_rad) and math.isfinite(distance[nearest])):
+            return nearest
+        if self._closed:
+            before, after = np.roll(distance[:-1], 1), np.roll(distance[:-1], -1)
+            before, after = np.append(before, before[0]), np.append(after, after[0])
+        else:
+            before, after = np.append(np.inf, distance[:-1]), np.append(distance[1:], np.inf)
+        branches = np.flatnonzero((distance <= before) & (distance < after))
+        branches = np.append(nearest, branches[distance[branches] < distance[nearest] + BRANCHES_M])
+        along = self._table[branches, 2] * math.cos(yaw_rad) + self._table[branches, 3] * math.sin(yaw_rad)
+        return int(branches[np.argmin(distance[branches] + 0.5 * AGAINST_BRANCH_M * (1.0 - along))])
+
+
+def _rounded(points: Array, closed: bool) -> Array:
+    """Points (M + 1, 2) with corners drawn in by a quarter of a piece, but for sharp ones, where the robot stops.
+
+    A place moves on by its piece's direction. Round the inside of a corner it would not move on at all until the robot
+    had got to the corner's outside.
+    """
+    steps = np.diff(points, axis=0)
+    ends = (steps[-2:], steps[:2]) if closed else (steps[[0, 0]], steps[[-1, -1]])
+    padded = np.vstack([ends[0], steps, ends[1]])
+    heading = np.unwrap(np.arctan2(padded[:, 1], padded[:, 0]))
+    # At each point over the two pieces that it joins, and over one more on either side.
+    here, around = heading[2:-1] - heading[1:-2], heading[3:] - heading[:-3]
+    at = np.flatnonzero((np.abs(here) > CORNER_RAD) & (np.abs(around) < SHARP_RAD))
+    rounded = points.copy()
+    rounded[at] += 0.25 * (padded[at + 2] - padded[at + 1])
+    return rounded
+
+
+def sharp_turns(points: Array, closed: bool, reach: int) -> list[int]:
+    """Indices of points (M + 1, 2) where the way turns by more than SHARP_RAD from `reach` points to the next `reach`.
+
+    The sharpest of any that are within `reach` of one another; in rising order. The last point of a closed way is its
+    first, and not listed again.
+    """
+    count = len(points) - 1
+    index = np.arange(count) if closed else np.arange(1, count)
+    before, after = index - reach, index + reach
+    before, after = (before % count, after % count) if closed else (np.maximum(before, 0), np.minimum(after, count))
+    came, goes = points[index] - points[before], points[after] - points[index]
+    cosine = (came * goes).sum(axis=1)
+    sharp = cosine < math.cos(SHARP_RAD) * np.hypot(*came.T) * np.hypot(*goes.T)
+    found: list[int] = []
+    # Where the way turns back, points before the turn look as sharp, but not over as long a way.
+    for at in np.flatnonzero(sharp)[np.argsort(cosine[sharp], kind="stable")]:
+        apart = [abs(int(index[at]) - other) for other in found]
+        if all(min(gap, count - gap) > reach if closed else gap > reach for gap in apart):
+            found.append(int(index[at]))
+    return sorted(found)
+
+
+LEAST_DISTANCE_M = 1e-6
+SHORTEST_M = 0.1
+LONGEST_M = 2000.0
+MOST_POINTS = 10_000
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Waypoints:
+    """Places (N, 2) in the world frame (m) and times (N,) from the start (s), or None.
+
+    `lines`: where in their file they are, if they are from one.
+    """
+
+    places_m: Array
+    times_s: Array | None = None
+    lines: tuple[int, ...] = ()
+
+
+def load_waypoints(path: Path) -> Waypoints:
+    """Read a CSV with columns x_m, y_m and perhaps t_s, by name, in any order; other columns are ignored.
+
+    Raises InputError with one line naming file, place and remedy: a file that cannot be read, a missing column, a cell
+    that is not a finite number, fewer than two way-points, one repeated, times that do not increase.
+    """
+    lines, columns = _columns(path)
+    places = np.column_stack([columns["x_m"], columns["y_m"]])
+    times = columns.get("t_s")
+    if times is None:
+        apart = np.hypot(*np.diff(places, axis=0).T)
+        if np.any(apart < LEAST_DISTANCE_M):
+            line = lines[int(np.argmax(apart < LEAST_DISTANCE_M)) + 1]
+            raise InputError(f"{path}: line {line}: the same way-point again; remove it, or give times in t_s")
+    elif np.any(np.diff(times) <= 0.0):
+        line = lines[int(np.argmax(np.diff(times) <= 0.0)) + 1]
+        raise InputError(f"{path}: line {line}: t_s does not increase; sort the way-points by time")
+    return Waypoints(places, times, tuple(lines))
+
+
+def _columns(path: Path) -> tuple[list[int], dict[str, Array]]:
+    """The lines of the rows, and the columns that there are of x_m, y_m and t_s."""
+    reader = csv.reader(read_lines(path, WAY_POINTS), skipinitialspace=True)
+    lines: list[int] = []
+    try:
+        header = next(reader, [])
+        for name in ("x_m", "y_m"):
+            if name not in header:
+                raise InputError(
+                    f"{path}: line 1: column {name}: missing; name x_m and y_m there, with a comma between"
+                )
+        places = {name: header.index(name) for name in ("x_m", "y_m", "t_s") if name in header}
+        columns: dict[str, list[float]] = {name: [] for name in places}
+        for row in reader:
+            if not row:
+                continue
+            if len(lines) == MOST_POINTS:
+                raise InputError(f"{path}: over {MOST_POINTS} way-points; write at most {MOST_POINTS}")
+            lines.append(reader.line_num)
+            for name, place in places.items():
+                columns[name].append(_number(path, reader.line_num, name, row[place] if place < len(row) else None))
+    except csv.Error as error:
+        raise InputError(f"{path}: cannot be read ({error}); give the path of a CSV of way-points") from None
+    if len(lines) < 2:
+        raise InputError(f"{path}: {len(lines)} way-points; write at least two")
+    return lines, {name: np.array(column) for name, column in columns.items()}
+
+
+def check_size(path: Path, found: Waypoints) -> None:
+    """Raise InputError for a shorter or longer path, and places further off, than can be followed."""
+    length_m = float(np.hypot(*np.diff(found.places_m, axis=0).T).sum())
+    if not SHORTEST_M <= length_m <= LONGEST_M:
+        raise InputError(f"{path}: {length_m:g} m long; between {SHORTEST_M:g} and {LONGEST_M:g} m can be followed")
+    beyond = np.argwhere(np.abs(found.places_m) > FARTHEST_M)
+    if beyond.size:
+        row, column = beyond[0].tolist()
+        raise InputError(
+            f"{path}: line {found.lines[row]}: {'xy'[column]}_m: {found.places_m[row, column]:g}, and poses go "
+            f"{FARTHEST_M:g} m from the origin at most; write way-points in the frame of the poses"
+        )
+
+
+def points_of(waypoints: Waypoints) -> tuple[Point, ...]:
+    """The places as plain numbers."""
+    return tuple((float(x), float(y)) for x, y in waypoints.places_m.tolist())
+
+
+def _number(path: Path, line: int, name: str, text: str | None) -> float:
+    try:
+        value = float(text or "")
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise InputError(f"{path}: line {line}: {name}: {text!r} is not a finite number; write one")
+    return value

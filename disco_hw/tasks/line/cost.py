@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.tasks.cost import Found, constant, helper, norm_and_inverse, norm_of_three, single
+from disco_hw.tasks.line import PathTable
 from disco_hw.tasks.line.course import stable_yaw
-from disco_hw.tasks.line.table import PathTable
 from disco_hw.tasks.task import Prepared
 
 SLOW_DOWN_S = 1.0

@@ -11,8 +11,8 @@ import disco_hw
 from disco_hw.control import CommandLimits, Disco, DiscoSettings, PlannerState
 from disco_hw.model import load_model
 from disco_hw.model.step import FreeRun
+from disco_hw.tasks.line import PathTable
 from disco_hw.tasks.line.cost import PathCost
-from disco_hw.tasks.line.table import PathTable
 from tools.bench_tracking import starts
 from tools.foreign_plant import NOMINAL, ForeignRobot
 from tools.tracking import disco, drive, tracks

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numba import njit
 
-from disco_hw.control.kernel.layout import BLOCK, U
+from disco_hw.control.kernel import BLOCK, U
 from disco_hw.control.kernel.sequences import row_sum
 
 B = int(BLOCK)

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from disco_hw.control.kernel import layout
-from disco_hw.control.kernel.layout import BLOCK, aligned_zeros, block_count
+from disco_hw.control import kernel as layout
+from disco_hw.control.kernel import BLOCK, aligned_zeros, block_count
 
 
 @pytest.mark.parametrize(("size", "dtype"), [(1, np.float32), (80, np.float32), (33, np.float64), (7, np.int64)])

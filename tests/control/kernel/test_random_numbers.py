@@ -5,7 +5,7 @@ import pytest
 from numba import njit
 from scipy import stats
 
-from disco_hw.control.kernel.layout import BLOCK, aligned_zeros
+from disco_hw.control.kernel import BLOCK, aligned_zeros
 from disco_hw.control.kernel.sequences import cos_sin_half_turns, fill_normal_block, philox
 
 

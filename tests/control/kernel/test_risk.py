@@ -5,8 +5,8 @@ import pytest
 from numba import njit
 
 from disco_hw.control import oracle
-from disco_hw.control.kernel.layout import BLOCK, aligned_zeros
-from disco_hw.control.kernel.weighting import mean_over_points, worst_over_points
+from disco_hw.control.kernel import BLOCK, aligned_zeros
+from disco_hw.control.kernel.step import mean_over_points, worst_over_points
 
 B = int(BLOCK)
 

@@ -6,7 +6,7 @@ import pytest
 from numba import njit
 from numba.core.errors import TypingError
 
-from disco_hw.control.kernel.layout import roll_block
+from disco_hw.control.kernel import roll_block
 
 
 class Nonsense(NamedTuple):

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numba import njit
 
 from disco_hw.control import oracle
-from disco_hw.control.kernel.layout import BLOCK, U, aligned_zeros
+from disco_hw.control.kernel import BLOCK, U, aligned_zeros
 from disco_hw.control.kernel.sequences import (
     Basis,
     Limits,

@@ -10,7 +10,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from disco_hw.control import CommandLimits, Disco, DiscoSettings, PlannerState, Sampler, SentCommand, oracle
-from disco_hw.control.kernel.layout import BLOCK
+from disco_hw.control.kernel import BLOCK
 from disco_hw.control.optimiser import spline_basis
 from disco_hw.control.parameter_points import unscented_points
 from disco_hw.control.plan import command_history
@@ -19,8 +19,8 @@ from disco_hw.model import EffectSetting, Gaussian, Model
 from disco_hw.model import plain as physics
 from disco_hw.model.disturbance import Disturbance
 from disco_hw.tasks.circle import CircleCost
+from disco_hw.tasks.line import Waypoints
 from disco_hw.tasks.line.cost import FARTHEST_STEP_M, PathCost
-from disco_hw.tasks.line.table import Waypoints
 from disco_hw.tasks.timed_path import TimedPathCost
 from tests.tasks.costs import circle_cost, path_along, path_cost, timed_path_cost
 

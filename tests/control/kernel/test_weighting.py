@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from numba import njit
 
 from disco_hw.control import oracle
-from disco_hw.control.kernel.layout import BLOCK, aligned_zeros
-from disco_hw.control.kernel.weighting import INVALID, exp_nonpositive, refuse_invalid, temperature_for, weigh
+from disco_hw.control.kernel import BLOCK, aligned_zeros
+from disco_hw.control.kernel.step import INVALID, exp_nonpositive, refuse_invalid, temperature_for, weigh
 
 B = int(BLOCK)
 

@@ -7,7 +7,7 @@ import pytest
 
 from disco_hw.gap.data.layout import BODY
 from disco_hw.gap.noise.channels import BodyChannel
-from disco_hw.gap.noise.sensor_noise import sensor_noise
+from disco_hw.gap.noise.noise_fit import sensor_noise
 from disco_hw.gap.search.channel_search import indices
 from disco_hw.gap.search.cross_validation import (
     Chain,

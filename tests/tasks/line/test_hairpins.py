@@ -7,8 +7,8 @@ import pytest
 
 from disco_hw.errors import InputError
 from disco_hw.runtime.robot_setup import load_setup
+from disco_hw.tasks.line import PathTable, load_waypoints
 from disco_hw.tasks.line.course import hairpin
-from disco_hw.tasks.line.table import PathTable, load_waypoints
 from tests.runtime.path_robot import ROBOTS, path_robot
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from disco_hw.tasks.lemniscate import LemniscateTask
-from disco_hw.tasks.line.table import PathTable
+from disco_hw.tasks.line import PathTable
 
 ANGLE = np.linspace(0.0, 2.0 * np.pi, 400)
 EIGHT = PathTable(np.column_stack([1.5 * np.sin(ANGLE), 0.75 * np.sin(2.0 * ANGLE)]))

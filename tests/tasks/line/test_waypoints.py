@@ -10,7 +10,7 @@ import firmware_protocol
 from disco_hw.config import Robot
 from disco_hw.errors import InputError
 from disco_hw.estimation.correction import MAX_POSITION_M
-from disco_hw.tasks.line.table import load_waypoints
+from disco_hw.tasks.line import load_waypoints
 from disco_hw.tasks.path import PathTask
 from disco_hw.tasks.task import FARTHEST_M
 from disco_hw.tasks.timed_path import TimedPathTask
