@@ -18,9 +18,9 @@ import msgspec
 import numpy as np
 
 import disco_hw
+from disco_hw.drive import ManualInput, RobotView
 from disco_hw.drive.coverage import Coverage
 from disco_hw.drive.hand_pilot import HandPilot, UntilHeading
-from disco_hw.drive.sources import ManualInput, RobotView
 from disco_hw.errors import WorkError
 from disco_hw.experiments.simulated_time import SimulatedRun, virtual_robot
 from disco_hw.experiments.virtual import true_parameters

@@ -20,9 +20,9 @@ import disco_hw
 from disco_hw.adaptation import Learnt, NoAdaptation
 from disco_hw.adaptation.adapter_link import NAMES
 from disco_hw.adaptation.guard import believed_geometry
+from disco_hw.drive import ManualInput
 from disco_hw.drive.coverage import Coverage
 from disco_hw.drive.hand_pilot import HandPilot
-from disco_hw.drive.sources import ManualInput
 from disco_hw.experiments.simulated_time import SimulatedRun, virtual_robot
 from disco_hw.log.messages import MODEL_TOML, ROBOT_TOML, Attachment, version
 from disco_hw.log.recorder import ProcessRecorder, RecordingSettings

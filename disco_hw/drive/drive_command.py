@@ -18,12 +18,12 @@ from disco_hw.daemon.client import socket_path
 from disco_hw.daemon.loop import MonotonicClock
 from disco_hw.daemon.process import STANDARD_ERROR, STANDARD_OUTPUT, AsyncPrinter
 from disco_hw.daemon.run import in_text, serve
+from disco_hw.drive import PAD_WORDS, GamepadSource, ManualSource, PageSource
 from disco_hw.drive.coverage import Coverage
 from disco_hw.drive.hand_pilot import HandPilot
 from disco_hw.drive.keyboard import HELP, Keyboard, KeyHold
 from disco_hw.drive.script import Script, ScriptSource, Unattended, in_table, room_needed
 from disco_hw.drive.scripts import make_script
-from disco_hw.drive.sources import PAD_WORDS, GamepadSource, ManualSource, PageSource
 from disco_hw.errors import InputError
 from disco_hw.runtime.robot_setup import load_setup
 from drivers.gamepad import Gamepad, GamepadError, GamepadMapping, open_gamepad

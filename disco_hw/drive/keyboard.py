@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from disco_hw.daemon.loop import Clock
-from disco_hw.drive.sources import INPUT_LIMIT_NS, ManualInput, RobotView, wheel_speeds
+from disco_hw.drive import INPUT_LIMIT_NS, ManualInput, RobotView, wheel_speeds
 from disco_hw.errors import InputError
 
 # A held key begins to repeat after 0.15 to 0.7 s, depending on the terminal.

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from statistics import median
 
 from disco_hw.config import Robot
-from disco_hw.drive.sources import ManualInput, ManualSource, RobotView
+from disco_hw.drive import ManualInput, ManualSource, RobotView
 from disco_hw.runtime.states import State
 
 Wheels = tuple[float, float]

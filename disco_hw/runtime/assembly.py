@@ -18,7 +18,7 @@ from disco_hw.adaptation.guard import (
     with_geometry,
 )
 from disco_hw.config import RobotConfig
-from disco_hw.control.fallback import LAWS, WithFallback
+from disco_hw.control.baselines import LAWS, WithFallback
 from disco_hw.errors import InputError
 from disco_hw.estimation import OdometryParameters, PoseFusion
 from disco_hw.estimation.disturbance_estimator import DisturbanceEstimator

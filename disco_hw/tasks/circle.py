@@ -13,7 +13,6 @@ import msgspec
 import numpy as np
 
 from disco_hw.errors import InputError
-from disco_hw.tasks.cost import Found, norm, norm_and_inverse, single
 from disco_hw.tasks.task import (
     CENTER_M,
     FARTHEST_M,
@@ -21,11 +20,15 @@ from disco_hw.tasks.task import (
     Array,
     Chassis,
     Editable,
+    Found,
     Point,
     Positive,
     Prepared,
     RobotTask,
     TaskFault,
+    norm,
+    norm_and_inverse,
+    single,
 )
 
 RADIUS_M = (0.1, 50.0)

@@ -16,9 +16,9 @@ from disco_hw.bridge.ros2_commands import Errands, SpeedInlet, refusal
 from disco_hw.bridge.ros2_inlets import PoseInlet, TransformInlet
 from disco_hw.config import Drive, PoseInput, Robot
 from disco_hw.config.robot import Ros2
+from disco_hw.drive import PageSource, RobotView, steering_from
 from disco_hw.drive.hand_pilot import Deadman
 from disco_hw.drive.keyboard import wheel_speeds
-from disco_hw.drive.sources import PageSource, RobotView, steering_from
 from disco_hw.estimation.odometry import OdometryParameters
 from disco_hw.runtime.robot_setup import load_setup
 from disco_hw.runtime.states import State

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from disco_hw.control import CommandLimits, NoValidControl, PlannerState
-from disco_hw.control.fallback import LAWS, WithFallback
+from disco_hw.control.baselines import LAWS, WithFallback
 from disco_hw.control.kernel.guide import SteeredChassis
 from disco_hw.control.plan import PlanOutcome, held_plan
 from disco_hw.tasks.circle import CircleCost

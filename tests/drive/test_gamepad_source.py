@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from disco_hw.drive import GamepadSource, RobotView
 from disco_hw.drive.hand_pilot import Deadman
-from disco_hw.drive.sources import GamepadSource, RobotView
 from disco_hw.runtime.states import State
 from drivers.gamepad import GamepadError, GamepadState
 

@@ -7,11 +7,11 @@ import re
 import numpy as np
 import pytest
 
+from disco_hw.drive import ManualInput
 from disco_hw.drive.coverage import Coverage
 from disco_hw.drive.hand_pilot import HandPilot
 from disco_hw.drive.script import ScriptSource, Unattended
 from disco_hw.drive.scripts import STEP_S, STEPS, make_script
-from disco_hw.drive.sources import ManualInput
 from disco_hw.log import records
 from disco_hw.runtime.pipeline import NoPlanner, Source
 from disco_hw.runtime.states import State

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from disco_hw.drive import ManualInput, RobotView
 from disco_hw.drive.script import Manoeuvre, Script, ScriptSource, Unattended
-from disco_hw.drive.sources import ManualInput, RobotView
 from disco_hw.runtime.states import State
 
 TICK = 20_000_000

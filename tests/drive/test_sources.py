@@ -2,9 +2,9 @@
 
 import pytest
 
+from disco_hw.drive import INPUT_LIMIT_NS, GamepadSource, ManualInput, ManualSource, PageSource, RobotView
 from disco_hw.drive.keyboard import Keyboard
 from disco_hw.drive.script import ScriptSource
-from disco_hw.drive.sources import INPUT_LIMIT_NS, GamepadSource, ManualInput, ManualSource, PageSource, RobotView
 from disco_hw.runtime.states import State
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import msgspec
 
 import disco_hw
-from disco_hw.drive.sources import ManualInput
+from disco_hw.drive import ManualInput
 from disco_hw.errors import WorkError
 from disco_hw.experiments.live_stack import with_device
 from disco_hw.experiments.simulated_time import SimulatedRun

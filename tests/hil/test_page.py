@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from disco_hw.daemon.client import send_request
-from disco_hw.drive.sources import INPUT_LIMIT_NS
+from disco_hw.drive import INPUT_LIMIT_NS
 from disco_hw.experiments.live_stack import disco_hw_process, running_stack, stands
 from disco_hw.log.reader import open_log
 from disco_hw.runtime.robot_setup import load_setup
