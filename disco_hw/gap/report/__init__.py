@@ -1,1 +1,0 @@
-"""What is said of it: findings, what a log could not show, the amended model, page and figures."""

@@ -1,1 +1,0 @@
-"""Which effects are missing: fits, evidence, selection, held-out predictions."""

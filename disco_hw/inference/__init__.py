@@ -1,1 +1,0 @@
-"""BayesSim: what a logged drive says about the robot's parameters."""
