@@ -169,6 +169,9 @@ def ask_on_line(port: str, driver: MotorDriver) -> Heard | None:
                     return None
                 connection = ExchangeConnection(line, TransportCounters(), exchange)
                 replies = [connection.exchange(frame) for frame in driver.questions.frames]
+                # A computer that was busy just then has missed a reply: who was silent is asked once more.
+                silent = [frame for frame, reply in zip(driver.questions.frames, replies, strict=True) if reply is None]
+                replies += [connection.exchange(frame) for frame in silent]
         except (serial.SerialException, OSError) as error:
             raise InputError(f"--link: {medium.explain(error)}") from None
         fields = driver.recognise([frame for frame in replies if frame is not None])

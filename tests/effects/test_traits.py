@@ -36,6 +36,7 @@ def turns_more(effect, rng):
         return abs(right - left) > most
     if effect.stage is Stage.RESPONSE and "end" not in asks_for(effect.plain):
         ends = {"end_left": left, "end_right": right, "mean_left": left, "mean_right": right}
+        ends |= {"left": left, "right": right}
         end_left, end_right, mean_left, mean_right = called(effect, values, **ends, **at_start)
         return max(abs(end_right - end_left), abs(mean_right - mean_left)) > most
     if effect.stage is Stage.RESPONSE:

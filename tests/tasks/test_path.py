@@ -10,7 +10,7 @@ import pytest
 from disco_hw.control import CommandLimits, Disco, DiscoSettings, PlannerState, PlanOutcome
 from disco_hw.experiments.circle import KinematicPlant
 from disco_hw.model import load_model
-from disco_hw.tasks.line import PathTable, Waypoints, sharp_turns
+from disco_hw.tasks.line import SPACING_M, PathTable, Waypoints, sharp_turns
 from tests.tasks.costs import path_along
 
 MODEL = load_model(Path(__file__).parents[2] / "disco_hw/robots/wombot_model.toml")
@@ -136,6 +136,16 @@ def test_sharp_turns_cut_a_path_into_pieces():
     assert task.place(1.16, 0.0, 0.0, 57.0) == 60.0
     assert task.place(0.03, 0.0, 0.0, 117.0) == 0.0
     assert PathTable(EIGHT.places_m).sharp_turns == PathTable(CORNER.places_m).sharp_turns == ()
+
+
+@pytest.mark.parametrize("half", [0.0, 0.5])
+def test_a_way_straight_back_has_a_direction_everywhere_and_reaches_its_turn(half):
+    # Where the turn lies half a piece beyond an entry, the entries before and behind it fall on the same place.
+    turn = np.array([(30.0 + half) * SPACING_M, 0.0])
+    table = PathTable(np.array([[0.0, 0.0], turn, [0.0, 0.0]])).table
+    np.testing.assert_allclose(np.hypot(*table[:, 2:4].T), 1.0)
+    assert np.hypot(*(table[:, :2] - turn).T).min() < 0.01 * SPACING_M
+    assert np.hypot(*np.diff(table[:, :2], axis=0).T).min() > 0.3 * SPACING_M
 
 
 def test_a_piece_of_a_closed_path_goes_on_past_the_first_way_point():

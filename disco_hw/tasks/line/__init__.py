@@ -18,6 +18,8 @@ from disco_hw.files import WAY_POINTS, read_lines
 from disco_hw.tasks.task import FARTHEST_M, Array, Point
 
 SPACING_M = 0.02
+# Entries closer than this part of the spacing lie on either side of a turn straight back.
+FOLDED = 0.01
 LOOK_BACK_M = 0.3
 LOOK_AHEAD_M = 1.0
 LOST_M = 1.0
@@ -56,6 +58,11 @@ class PathTable:
             raise ValueError(f"the path is {distance[-1]} m long; it must be longer than {SPACING_M} m")
         at = np.linspace(0.0, distance[-1], count + 1)
         x, y = np.interp(at, distance, places[:, 0]), np.interp(at, distance, places[:, 1])
+        # Where the way turns straight back between two entries they may coincide, and there would be no direction: the
+        # first of them moves out to the way-point at which it turns.
+        (folds,) = np.nonzero(np.hypot(np.diff(x), np.diff(y)) < FOLDED * distance[-1] / count)
+        turns = np.searchsorted(distance, at[folds], side="right")
+        x[folds], y[folds] = places[turns].T
         closed = bool(np.hypot(*(places[0] - places[-1])) < SPACING_M)
         spacing = float(distance[-1]) / count
         corners = sharp_turns(np.column_stack([x, y]), closed, max(1, round(TURN_M / spacing)))
