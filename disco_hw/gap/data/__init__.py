@@ -1,0 +1,1 @@
+"""What the search reads: a drive on an even grid, parameter vectors, free runs of the model."""

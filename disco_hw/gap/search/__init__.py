@@ -1,0 +1,1 @@
+"""Which effects are missing: fits, evidence, selection, held-out predictions."""

@@ -1,0 +1,1 @@
+"""BayesSim: what a logged drive says about the robot's parameters."""
