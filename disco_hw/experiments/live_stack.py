@@ -194,20 +194,25 @@ class Stack:
     _end: ExitStack = field(repr=False)
 
     def drive(self, until_rad_s: float = 6.0, timeout_s: float = 10.0) -> None:
-        """Arm, start, and wait until the faster wheel has come up to speed.
+        """Arm, start, and wait until the faster wheel has come up to speed."""
+        self.drive_until("at speed", partial(_faster_than, until_rad_s), timeout_s)
+
+    def drive_until(
+        self, what: str, reached: Callable[[Mapping[str, Any]], bool], timeout_s: float
+    ) -> Mapping[str, Any]:
+        """Arm, start, and wait until `reached` holds, called `what` in words; the status then.
 
         A robot that stops because this busy machine sent it nothing in time is started again, twice at most.
         """
-        fast = partial(_faster_than, until_rad_s)
         for _ in range(_STARTS - 1):
             self.start()
             status = self.operator.wait_until(
-                "at speed", lambda status: fast(status) or _stopped_for_this_host(status), timeout_s
+                what, lambda status: reached(status) or _stopped_for_this_host(status), timeout_s
             )
-            if fast(status):
-                return
+            if reached(status):
+                return status
         self.start()
-        self.operator.wait_until("at speed", fast, timeout_s)
+        return self.operator.wait_until(what, reached, timeout_s)
 
     def start(self) -> None:
         """Arm and start the task."""

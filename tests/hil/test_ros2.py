@@ -142,8 +142,8 @@ def assert_stops(stack):
 def test_it_drives_by_the_poses_of_a_node_that_hears_its_odometry_and_stops_when_the_node_dies(tmp_path, monkeypatch):
     said = tmp_path / "node.txt"
     with stack_with_bridge(tmp_path, monkeypatch) as (stack, _), node("echo", said) as process:
-        drive(stack)
-        status = stack.operator.wait_until("a metre further", lambda _: far(said) > 1.0, 30.0)
+        stack.operator.wait_until("a pose", lambda status: status["pose_ok"], live_stack.READY_TIMEOUT_S)
+        status = stack.drive_until("a metre further", lambda _: far(said) > 1.0, 30.0)
         assert status["pose_ok"]
         assert status["task"]["distance_m"] < 0.2
         process.kill()
@@ -161,8 +161,8 @@ def test_it_drives_by_the_transforms_of_a_localisation_and_stops_when_that_dies(
 
     monkeypatch.setitem(globals(), "with_poses_of_ros", by_transforms)
     with stack_with_bridge(tmp_path, monkeypatch) as (stack, _), node("tf", said) as process:
-        drive(stack)
-        status = stack.operator.wait_until("a metre further", lambda _: far(said) > 1.0, 30.0)
+        stack.operator.wait_until("a pose", lambda status: status["pose_ok"], live_stack.READY_TIMEOUT_S)
+        status = stack.drive_until("a metre further", lambda _: far(said) > 1.0, 30.0)
         assert status["task"]["distance_m"] < 0.2
         process.kill()
         assert_stops(stack)
