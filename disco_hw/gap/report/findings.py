@@ -11,7 +11,7 @@ from typing import Any
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.report.blind_spots import BlindSpot
 from disco_hw.gap.search.analysis import ParameterEstimate
-from disco_hw.gap.search.cross_validation import PredictionErrors
+from disco_hw.gap.search.cross_validation import PredictionErrors, beats, beats_throughout, stretches_telling
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GapSettings, PredictionSettings
 from disco_hw.model import Model
 
@@ -219,13 +219,26 @@ class GapReport:
         ]
         return {
             "horizon_s": self.horizon_s, "held_out": True, **stages, "offered": self.offered,
-            "amended_is_worse": self.amended_is_worse, "horizons": horizons,
+            "why_not_amended": self.why_not_amended, "horizons": horizons,
         }  # fmt: skip
 
     @property
-    def amended_is_worse(self) -> bool:
-        """Whether the amended model predicts held-out data no better than the timed one, which is offered then."""
-        return self.offered != "amended"
+    def why_not_amended(self) -> str | None:
+        """Why a plainer model is offered than the amended one, in a sentence; None if the amended one is."""
+        of, settings = self.gap or self.wheels, self.settings.prediction
+        if self.offered == "amended":
+            return None
+        plainer = of[self.offered if self.offered in of else "nominal"][self.horizon_s]
+        amended = of["amended"][self.horizon_s]
+        if not beats(plainer, amended, settings):
+            return "The amended model does not beat it."
+        if not beats_throughout(plainer, amended, settings):
+            return f"Without one stretch of {settings.fold_s:g} s the amended model does not beat it."
+        return (
+            f"That the amended model beats it is told by {stretches_telling(plainer):.1f} stretches of "
+            f"{settings.fold_s:g} s: with fewer than {settings.fewest_stretches:g} it has to err by "
+            f"{100.0 * (1.0 - settings.far_better):.0f} % less to be believed of another drive."
+        )
 
     @property
     def drive(self) -> str | None:

@@ -62,10 +62,10 @@ def _gap_line(report: GapReport) -> str:
         f"{off['amended']}, {'one with geometry, delay and' if report.gap else 'with a delay and a'} "
         f"lag alone (timed) by {off['timed']}; {last}."
     )
-    if report.offered == "amended":
+    if report.why_not_amended is None:
         return said
     offered = report.offered if report.gap or report.offered == "timed" else "given"
-    return f"{said} The amended model does not beat it: model.toml is the {offered} one; drive with that."
+    return f"{said} Drive with the {offered} one, which is in model.toml. {report.why_not_amended}"
 
 
 def as_text(report: GapReport) -> str:

@@ -54,7 +54,7 @@ def test_a_patch_that_is_left_for_good_is_told_with_the_change_it_looks_like():
     assert term.experiment == "drive again, later, where it was different"
     assert "confounded with surface_change" in as_text(report)
     # Half of the log says nothing about it: its prediction is that of the plain model, not worse.
-    assert not report.amended_is_worse
+    assert report.why_not_amended is None
 
 
 def test_what_holds_the_wheels_is_not_fitted_with_a_slow_response():

@@ -95,7 +95,7 @@ def test_a_log_without_poses_is_answered_with_the_way_that_its_wheels_make():
     line = answer(report)[1]
     assert line.startswith("2 s ahead on held-out data the amended wheels err by ")
     assert "with a delay and a lag alone (timed) by" in line
-    assert line.endswith("The amended model does not beat it: model.toml is the timed one; drive with that.")
+    assert line.endswith("Drive with the timed one, which is in model.toml. The amended model does not beat it.")
     assert "way and heading that the wheels make:" in as_text(report)
     assert "The wheels alone" in page(report)
     told = report.as_dict()
