@@ -2,14 +2,16 @@
 
 Wheel radius, axle and x_icr of every robot are off by up to 15 %, and nobody is told; the motors' lag and dead band are
 known to all. From rest on the line; figures are of 5 to 30 s, at 50 plans a second. The gains of the classical ones
-were found on robots 0 to 4 (`python -m tools.tune_baselines`); these are robots 1000 on. Names that begin with `mujoco`
-drive the robot of `tools/mujoco_plant.py`.
+were found on robots 0 to 4 (`python -m tools.tune_baselines`); these are robots 1000 on, or others with `--first`.
+Names that begin with `mujoco` drive the robot of `tools/mujoco_plant.py`.
 
 `python -m tools.bench_tracking disco_adapting circle,square 20` drives some of it; `... starts 20` begins anywhere.
+`... 20 --first 5000` drives robots that nothing was chosen on.
 """
 
 from __future__ import annotations
 
+import argparse
 import math
 import sys
 from collections.abc import Callable, Iterator
@@ -76,8 +78,10 @@ def _peer(robot: ForeignRobot, track: Track) -> Planner:
     return LawController(law, believed, track.task)
 
 
-def rows(count: int, names: tuple[str, ...], ways: tuple[str, ...]) -> Iterator[tuple[str, list[Drive]]]:
-    """The drives of these contenders, and what they are called, one way after the other."""
+def rows(
+    count: int, names: tuple[str, ...], ways: tuple[str, ...], first: int = FIRST
+) -> Iterator[tuple[str, list[Drive]]]:
+    """The drives of these contenders on robots `first` to `first + count` - 1, and what they are called, by way."""
     for name in names:
         made: Callable[[int, int], list[ForeignRobot]] = robots
         plant_of: Callable[..., ForeignPlant | MujocoPlant] = ForeignPlant
@@ -93,7 +97,7 @@ def rows(count: int, names: tuple[str, ...], ways: tuple[str, ...]) -> Iterator[
                     drive(
                         contenders()[name], robot, tracks(SPEED_M_S)[way], rate_hz=RATE_HZ, seed=seed, plant_of=plant_of
                     ).after()
-                    for seed, robot in enumerate(made(FIRST, count))
+                    for seed, robot in enumerate(made(first, count))
                 ],
             )
 
@@ -178,14 +182,19 @@ def _arrival_s(planner: Disco, robot: ForeignRobot, track: Track, seed: int) -> 
 
 def main(arguments: list[str]) -> None:
     """Print figures as they are found."""
-    if arguments[:1] == ["starts"]:
-        for way in arguments[2].split(",") if len(arguments) > 2 else STARTED_WAYS:
-            for key, value in starts(int(arguments[1]), (way,)).items():
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n", maxsplit=1)[0])
+    parser.add_argument("names", nargs="?", default=",".join(contenders()), help="contenders, or `starts COUNT [WAYS]`")
+    parser.add_argument("ways", nargs="?", default=",".join(tracks(SPEED_M_S)))
+    parser.add_argument("count", nargs="?", default="", help="robots of each row, 6 unless said")
+    parser.add_argument("--first", type=int, default=FIRST, help="the first robot's number")
+    options = parser.parse_args(arguments)
+    if options.names == "starts":
+        for way in options.count.split(",") if options.count else STARTED_WAYS:
+            for key, value in starts(int(options.ways), (way,)).items():
                 print(f"{key:60} {value:10.3g}", flush=True)
         return
-    names = tuple(arguments[0].split(",")) if arguments else tuple(contenders())
-    ways = tuple(arguments[1].split(",")) if len(arguments) > 1 else tuple(tracks(SPEED_M_S))
-    for key, drives in rows(int(arguments[2]) if len(arguments) > 2 else 6, names, ways):
+    names, ways = options.names.split(","), options.ways.split(",")
+    for key, drives in rows(int(options.count or 6), tuple(names), tuple(ways), options.first):
         found = figures_of(drives)
         print(f"{key:45}", *(f"{field} {value:.3g} " for field, value in found.items()), flush=True)
 

@@ -36,7 +36,7 @@ from disco_hw.effects.effect import Channel
 from disco_hw.effects.registry import DELAY
 from disco_hw.jit import compiled_for
 from disco_hw.model import Belief, Model
-from disco_hw.model.disturbance import NO_DISTURBANCE
+from disco_hw.model.disturbance import NO_DISTURBANCE, NO_SLIDE
 from disco_hw.model.model import BASE_PARAMETERS, X_ICR, coefficient_tables
 from disco_hw.model.step import FreeRun, integration_series
 from disco_hw.tasks import PlannedTask
@@ -77,7 +77,9 @@ class Disco:
         self._take_points(model, theta)
         self._start = np.zeros(11, np.float32)
         self._loss = WheelLoss()
-        self._disturbance = NO_DISTURBANCE
+        self._disturbance, self._slide = NO_DISTURBANCE, NO_SLIDE
+        # Whether wheels turn as the model says, and the robot with them.
+        self._turns_as_asked = True
         self._wheels = aligned_zeros(sampler.horizon * WHEEL_ROWS * int(BLOCK))
         self._optimiser = Optimiser(
             sampler,
@@ -250,20 +252,22 @@ class Disco:
         else:
             self._failing_since_ns = None
         self._planned_from, self._elapsed_s = start, elapsed_s
-        trajectory = self._trajectory(self._mean, self._optimiser.nominal(), 0)
+        nominal = self._optimiser.nominal()
+        trajectory = self._trajectory(self._mean, nominal, 0)
         if guided and self._is_to_be_guided(now_ns, system, trajectory):
             self._optimiser.take_guide()
-            trajectory = self._trajectory(self._mean, self._optimiser.nominal(), 0)
+            nominal = self._optimiser.nominal()
+            trajectory = self._trajectory(self._mean, nominal, 0)
         return WheelPlan(
             t0_ns=t0_ns,
             step_s=settings.step_s,
-            wheel_speeds=self._asked(self._optimiser.nominal()),
+            wheel_speeds=self._asked(nominal),
             trajectory=trajectory,
             diagnostics=self._diagnostics(retries, outcome),
         )
 
     def _diagnostics(self, retries: int, outcome: PlanOutcome) -> Diagnostics:
-        ess, temperature, least, mean, nominal, valid = self._optimiser.report().values()
+        ess, temperature, least, mean, nominal, valid = self._optimiser.work.report.tolist()
         collapsed = ess < self._settings.min_ess
         return Diagnostics(ess, temperature, least, mean, nominal, int(valid), retries, collapsed, outcome)
 
@@ -318,8 +322,9 @@ class Disco:
         horizon_s = settings.sampler.horizon * settings.step_s
         half = settings.sampler.horizon // 2
         way_m = system.task.way_ahead_m(half * settings.step_s)
-        moved_m = np.hypot(*(trajectory[1 : half + 1, :2] - trajectory[0, :2]).T).max()
-        if moved_m < NOWHERE * way_m:
+        # From the last place on: that of a plan which does not stand is far enough.
+        begin, *places = trajectory[: half + 1, :2].tolist()
+        if all(math.dist(begin, place) < NOWHERE * way_m for place in reversed(places)):
             self._guided_until_ns = now_ns + round(horizon_s * 1e9)
         return self._guided_until_ns is not None and now_ns < self._guided_until_ns
 
@@ -348,8 +353,10 @@ class Disco:
         left, right = self._turning(state.left_speed_rad_s, state.right_speed_rad_s)
         if not state.sent:
             return left, right
-        sent = np.array([[state.sent[-1].left_rad_s, state.sent[-1].right_rad_s]])
-        last_left, last_right = self._acting(sent)[0].tolist()
+        last = state.sent[-1]
+        last_left, last_right = last.left_rad_s, last.right_rad_s
+        if not self._turns_as_asked:
+            last_left, last_right = self._acting(np.array([[last_left, last_right]]))[0].tolist()
         slack = self._limits.acceleration_rad_s2 * (self._settings.step_s + self._response_s)
         return min(max(last_left, left - slack), left + slack), min(max(last_right, right - slack), right + slack)
 
@@ -363,15 +370,15 @@ class Disco:
         count = math.ceil(gap_s / self._settings.step_s)
         run = FreeRun(self._model, self._mean_theta, gap_s / count)
         past = self._acting(command_history(state.sent, t0_ns, gap_s / count, run.past_rows + count, wheels))
-        states = run.states(start, past, run.past_rows, elapsed_s - gap_s)
-        return np.asarray(self._disturbance.shifted(states, self._x_icr_m, gap_s / count)[-1])
+        return np.asarray(run.states(start, past, run.past_rows, elapsed_s - gap_s, 0, self._slide)[-1])
 
     def _follow_disturbance(self, now_ns: int, state: PlannerState) -> None:
         """Plan with this disturbance, and with what the wheels have lost of their commands since the last plan."""
         if not self._settings.offset_free:
             return
-        self._disturbance = state.disturbance
+        self._disturbance, self._slide = state.disturbance, state.disturbance.slides
         self._loss.step(now_ns, state, self._wheels_after)
+        self._turns_as_asked = self._disturbance.is_none and self._loss.is_none
 
     def _wheels_after(self, wheels: tuple[float, float], gap_s: float, state: PlannerState) -> tuple[float, float]:
         """Wheel speeds (rad/s) that the model makes of these and what was sent over so long up to the state."""
@@ -386,18 +393,20 @@ class Disco:
 
     def _turning(self, left_rad_s: float, right_rad_s: float) -> tuple[float, float]:
         """Wheel speeds of an undisturbed robot that turns as this one does with these."""
+        if self._turns_as_asked:
+            return left_rad_s, right_rad_s
         return self._disturbance.turning(left_rad_s, right_rad_s, self._chassis.axial_distance_m)
 
     def _acting(self, commands: Array) -> Array:
         """Commands (N, 2) to an undisturbed robot that turns as this one does with these."""
-        if self._disturbance.is_none and self._loss.is_none:
+        if self._turns_as_asked:
             return commands
         acting = self._loss.acting(commands)
         return np.column_stack(self._disturbance.turning(acting[:, 0], acting[:, 1], self._chassis.axial_distance_m))
 
     def _asked(self, commands: Array) -> Array:
         """The inverse of `_acting`."""
-        if self._disturbance.is_none and self._loss.is_none:
+        if self._turns_as_asked:
             return commands
         left, right = self._disturbance.asked(commands[:, 0], commands[:, 1], self._chassis.axial_distance_m)
         return self._loss.asked(np.column_stack([left, right]))
@@ -461,5 +470,4 @@ class Disco:
 
     def _trajectory(self, run: FreeRun, wheel_speeds: Array, point: int) -> Array:
         commands = self._with_past(wheel_speeds)
-        states = run.states(self._planned_from, commands, self._history, self._elapsed_s, point)
-        return self._disturbance.shifted(states, self._x_icr_m, self._settings.step_s)[:, :3]
+        return run.states(self._planned_from, commands, self._history, self._elapsed_s, point, self._slide)[:, :3]

@@ -103,7 +103,7 @@ class Optimiser:
             report=np.zeros(6),
         )
         self._sampler = sampler
-        self._valid = False
+        self._valid = self._with_guide = False
         self._replan: Callable[..., bool] | None = None
         # What `disco_step` was last called with, for whoever wants to repeat a step.
         self.arguments: tuple[object, ...] = ()
@@ -137,7 +137,8 @@ class Optimiser:
 
     def sample_guide(self, wanted: bool) -> None:
         """Whether sample 1 is the commands that stand in `work.guide` at a step, from the next one on."""
-        self._samplings["with_guide"] = wanted
+        if wanted != self._with_guide:
+            self._with_guide = self._samplings["with_guide"] = wanted
 
     @property
     def limits(self) -> Limits:
@@ -214,7 +215,7 @@ class Optimiser:
         block, lane = np.divmod(chosen, int(BLOCK))
         noise = work.noise.reshape(work.weights.size // int(BLOCK), -1, int(BLOCK))[block, :, lane]
         commands = self._applied(noise.astype(np.float64))
-        if self._samplings["with_guide"]:
+        if self._with_guide:
             commands[chosen == 1] = work.guide
         return commands, weights[chosen] / weights.sum()
 

@@ -51,16 +51,10 @@ class Disturbance(msgspec.Struct, frozen=True, gc=False):
         """How much the ground carries a robot whose wheels turn so fast: 0 to 1."""
         return min((abs(left_rad_s) + abs(right_rad_s)) / MOVES_RAD_S, 1.0)
 
-    def shifted(self, states: Array, x_icr_m: float, step_s: float) -> Array:
-        """States (N + 1, 5) of an undisturbed robot, with the way that this one slides beside them."""
-        found = states.copy()
-        axle = states[:, :2] + x_icr_m * np.column_stack([np.cos(states[:, 2]), np.sin(states[:, 2])])
-        middle = 0.5 * (states[1:, 3:] + states[:-1, 3:])
-        carried_s = np.minimum(np.abs(middle).sum(1) / MOVES_RAD_S, 1.0) * step_s
-        time_s = np.concatenate([[0.0], np.cumsum(carried_s)])
-        found[:, 0] += time_s * self.drift_x_m_s - self.left * (axle[:, 1] - axle[0, 1])
-        found[:, 1] += time_s * self.drift_y_m_s + self.left * (axle[:, 0] - axle[0, 0])
-        return found
+    @property
+    def slides(self) -> Array:
+        """What moves the robot aside, for `FreeRun`: `left`, `drift_x_m_s`, `drift_y_m_s`, (3,)."""
+        return np.array([self.left, self.drift_x_m_s, self.drift_y_m_s])
 
     def slide(self, distance_m: float, carried_s: float, yaw_rad: float) -> tuple[float, float]:
         """How far a robot of this heading slides forward and to the left of it over a short way (m)."""
@@ -70,3 +64,4 @@ class Disturbance(msgspec.Struct, frozen=True, gc=False):
 
 
 NO_DISTURBANCE = Disturbance()
+NO_SLIDE = NO_DISTURBANCE.slides

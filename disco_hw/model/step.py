@@ -22,6 +22,7 @@ from disco_hw.effects.effect import Effect, Stage, asks_for
 from disco_hw.effects.registry import DELAY, REGISTRY, in_stages
 from disco_hw.jit import cast_like, compiled_for, kernel_function, scalar_function
 from disco_hw.model.coefficients import Base, Coefficients, Integration, base_point, effect_point
+from disco_hw.model.disturbance import MOVES_RAD_S, NO_SLIDE
 from disco_hw.model.model import Model, coefficient_tables
 from disco_hw.model.terms import add_to_commands, add_to_velocity, terms_need_change
 
@@ -325,17 +326,20 @@ class FreeRun:
         self._run: Callable[..., None] | None = None
         self.past_rows = 0 if delay is None else int(delay[0].max()) + 1
 
-    def states(self, start: Array, commands: Array, history: int, time_s: float = 0.0, point: int = 0) -> Array:
+    def states(
+        self, start: Array, commands: Array, history: int, time_s: float = 0.0, point: int = 0, slide: Array = NO_SLIDE
+    ) -> Array:
         """States (N + 1, 5) from `start` (5,): x, y (m), yaw (rad, not wrapped), wheel speeds (rad/s).
 
         `commands` (history + N, 2) rad/s, each held for a step; the first `history` rows were sent before and must be
         at least `past_rows`. `time_s`: the time at the start, for effects that depend on it. `point`: which of theta.
+        `slide` (3,): how the robot slides beside its model, `Disturbance.slides`.
         """
         states = np.empty((commands.shape[0] - history + 1, 5))
         states[0] = start
         # A fresh copy, as a read-only array or a strided one is another type and would be compiled anew, in mid-loop.
         own = np.array(commands, dtype=np.float64, order="C")
-        arguments = states, own, history, float(time_s), point, self._base, self._effects, self._series
+        arguments = states, own, history, float(time_s), point, slide, self._base, self._effects, self._series
         if self._run is None:
             self._run = compiled_for(run_states, *arguments)
         self._run(*arguments)
@@ -364,8 +368,8 @@ def simulate(model: Model, commands: Array, step_s: float = 0.02, start: Array |
 
 @kernel_function
 def run_states(
-    states: Array, commands: Array, history: int, time_s: float, point: int, base: Base, effects: Coefficients,
-    series: NDArray[np.floating],
+    states: Array, commands: Array, history: int, time_s: float, point: int, slide: Array, base: Base,
+    effects: Coefficients, series: NDArray[np.floating],
 ) -> None:  # fmt: skip
     """Fill `states[1:]` from `states[0]`; as `FreeRun.states`."""
     integration = integration_from(series, True)
@@ -374,8 +378,10 @@ def run_states(
     wheel_left, wheel_right = states[0, 3], states[0, 4]
     cos_yaw, sin_yaw = math.cos(yaw), math.sin(yaw)
     axle_x, axle_y = axle_of(x, y, cos_yaw, sin_yaw, here)
+    begin_x, begin_y, carried_s = axle_x, axle_y, 0.0
     late = history - delay_steps(acting)
     for t in range(states.shape[0] - 1):
+        was_left, was_right = wheel_left, wheel_right
         recent, older = max(t + late, 0), max(t + late - 1, 0)
         left = in_force(commands[recent, 0], commands[older, 0], acting)
         right = in_force(commands[recent, 1], commands[older, 1], acting)
@@ -384,7 +390,11 @@ def run_states(
             time_s + t * integration.step_s, here, acting, integration,
         )  # fmt: skip
         yaw = yaw + (turn + turn) * integration.step_s
-        states[t + 1, 0], states[t + 1, 1] = tracked_of(axle_x, axle_y, cos_yaw, sin_yaw, here)
+        x, y = tracked_of(axle_x, axle_y, cos_yaw, sin_yaw, here)
+        turning = 0.5 * (abs(wheel_left + was_left) + abs(wheel_right + was_right))
+        carried_s += min(turning / MOVES_RAD_S, 1.0) * integration.step_s
+        states[t + 1, 0] = x + (carried_s * slide[1] - slide[0] * (axle_y - begin_y))
+        states[t + 1, 1] = y + (carried_s * slide[2] + slide[0] * (axle_x - begin_x))
         states[t + 1, 2] = yaw
         states[t + 1, 3] = wheel_left
         states[t + 1, 4] = wheel_right

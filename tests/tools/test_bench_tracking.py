@@ -7,9 +7,9 @@ import pytest
 
 from disco_hw.control.baselines import Kanayama
 from tools import bench_tracking
-from tools.foreign_plant import NOMINAL, ForeignPlant, ForeignRobot
+from tools.foreign_plant import NOMINAL, ForeignPlant, ForeignRobot, robots
 from tools.mujoco_plant import BEHIND_M, MujocoPlant, mujoco_robots
-from tools.tracking import classical, drive, tracks
+from tools.tracking import Drive, classical, drive, tracks
 
 
 def test_a_robot_in_mujoco_turns_about_the_point_that_it_is_said_to():
@@ -82,3 +82,17 @@ def test_a_drive_arrives_that_stays_on_the_line_and_one_in_reverse_is_seen(
     late_s, went_back = bench_tracking._arrival_s(Straight(wheels_rad_s), robot, track, 1)
     assert (late_s < bench_tracking.SPARE_S) == arrives
     assert went_back == backwards
+
+
+@pytest.mark.parametrize(("more", "first"), [((), bench_tracking.FIRST), (("--first", "5000"), 5000)])
+def test_the_robots_are_those_that_are_asked_for(monkeypatch, capsys, more, first):
+    driven = []
+
+    def driving(_contender, robot, _track, **_options):
+        driven.append(robot)
+        return Drive(np.array([6.0, 7.0]), np.zeros((2, 3)), np.zeros(2), np.zeros((2, 2)), np.zeros(2))
+
+    monkeypatch.setattr(bench_tracking, "drive", driving)
+    bench_tracking.main(["kanayama", "circle", "3", *more])
+    assert driven == robots(first, 3)
+    assert capsys.readouterr().out.startswith("tracking.kanayama.circle")
