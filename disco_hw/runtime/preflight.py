@@ -184,20 +184,26 @@ def check_realtime(priority: int, fifo_allowed: bool, memory_lock_allowed: bool,
 
 
 def check_round_trip(round_trips_s: Sequence[float], period_s: float) -> Check:
-    """Compare measured round trips to the robot and back (s) with the control period (s)."""
+    """Compare measured round trips to the robot and back (s) with the control period (s).
+
+    Refused if a quarter of them or more take a period: the link is slow then, and each sample comes a tick late. A
+    single one was held up by this computer or the bus; from such ones the robot's own watchdog protects.
+    """
     name = "round trip"
     if not round_trips_s:
         return Check(name, Level.FAIL, "the robot did not answer; check its power, the cable and the link's settings")
-    worst_s = max(round_trips_s)
-    found = (
-        f"median {statistics.median(round_trips_s) * 1e3:.2f} ms, worst {worst_s * 1e3:.2f} ms of {len(round_trips_s)}"
-    )
+    count, worst_s = len(round_trips_s), max(round_trips_s)
+    found = f"median {statistics.median(round_trips_s) * 1e3:.2f} ms, worst {worst_s * 1e3:.2f} ms of {count}"
+    period = f"a control period of {period_s * 1e3:g} ms"
     remedy = "look for a USB adapter without low-latency mode, or a loaded bus"
-    if worst_s >= period_s:
-        return Check(name, Level.FAIL, f"{found}, longer than a control period of {period_s * 1e3:g} ms; {remedy}")
-    if worst_s >= period_s / 2:
-        text = f"{found}, longer than half a control period of {period_s * 1e3:g} ms; {remedy}"
+    late = sum(round_trip_s >= period_s for round_trip_s in round_trips_s)
+    if 4 * late >= count:
+        return Check(name, Level.FAIL, f"{found}; {late} are longer than {period}; {remedy}")
+    if late:
+        text = f"{found}; {late} longer than {period}; see what else runs on this computer, and check again"
         return Check(name, Level.WARNING, text)
+    if worst_s >= period_s / 2:
+        return Check(name, Level.WARNING, f"{found}; the worst is longer than half of {period}; {remedy}")
     return Check(name, Level.OK, found)
 
 

@@ -144,6 +144,10 @@ def test_realtime_says_what_is_allowed_and_the_remedy_for_what_is_not():
         ([0.001, 0.0099], Level.OK),
         ([0.001, 0.011], Level.WARNING),
         ([0.001, 0.020], Level.FAIL),
+        ([0.001, 0.001, 0.001, 0.080], Level.FAIL),
+        (10 * [0.001] + [0.080], Level.WARNING),
+        (9 * [0.001] + 2 * [0.020], Level.WARNING),
+        (8 * [0.001] + 3 * [0.020], Level.FAIL),
         ([], Level.FAIL),
     ],
 )
@@ -155,6 +159,8 @@ def test_round_trip_gives_median_and_worst():
     text = check_round_trip([0.001, 0.002, 0.006], 0.02).text
     assert "median 2.00 ms" in text
     assert "worst 6.00 ms of 3" in text
+    held_up = check_round_trip(10 * [0.001] + [0.080], 0.02).text
+    assert "worst 80.00 ms of 11; 1 longer than a control period of 20 ms" in held_up
 
 
 def test_only_failures_keep_the_robot_from_being_armed():

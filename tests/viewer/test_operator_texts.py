@@ -152,6 +152,38 @@ def test_the_desk_looks_as_it_did(browser, daemon, name):
         assert not as_golden(screenshot(tab), kept)
 
 
+@pytest.mark.parametrize(("width", "height"), [(390, 844), (360, 640), (640, 900), (844, 390), (640, 360), (1400, 620)])
+def test_the_pad_lies_over_neither_the_e_stop_nor_on_a_small_screen_the_scene(browser, daemon, width, height):
+    daemon.status = {**WHOLE, **STATES["by hand"]}
+    with desk_at(daemon.server.path) as url, opened(browser, url, width, height, scene=False) as tab:
+        tab.locator("#drive").wait_for()
+        pad, card, scene, bar = (tab.locator(f"#{each}").bounding_box() for each in ("pad", "drive", "scene", "top"))
+        assert bar["y"] + bar["height"] <= card["y"] < card["y"] + card["height"] <= height
+        assert apart(card, scene)
+        assert scene["width"] > 0.5 * width
+        assert scene["height"] > 0.35 * height
+        assert pad["width"] >= 120.0
+        tab.mouse.move(pad["x"] + 0.5 * pad["width"], pad["y"] + 0.5 * pad["height"])
+        tab.mouse.down()
+        tab.mouse.move(pad["x"] + 0.5 * pad["width"], pad["y"] + 2.0)
+        tab.wait_for_timeout(300)
+        pulled = [arguments for action, arguments in daemon.asked if action == "drive" and arguments["held"]]
+        assert pulled[-1]["forward"] == pytest.approx(0.5)
+        tab.mouse.up()
+        said = "() => { at('padsays').textContent = 'no daemon hears the pad'; return (%s)(); }"
+        assert tab.evaluate(said % CUT_OFF) == []
+        keep(tab, f"pad-{width}-{height}")
+
+
+def apart(one, other):
+    """Whether two boxes share no pixel."""
+    return any(
+        low[edge] + low[size] <= high[edge]
+        for edge, size in (("x", "width"), ("y", "height"))
+        for low, high in ((one, other), (other, one))
+    )
+
+
 def test_what_is_dragged_in_the_scene_stands_in_the_form_and_escape_closes_it(browser, daemon):
     daemon.status = WHOLE
     desk = Desk(daemon.server.path, ROBOT_FILE)
