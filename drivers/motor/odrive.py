@@ -22,6 +22,7 @@ from drivers.motor.odrive_protocol import (
     AxisState,
     Generation,
     OdriveSettings,
+    Questions,
     cyclic_frames,
     error_words,
     recognise,
@@ -29,7 +30,6 @@ from drivers.motor.odrive_protocol import (
     stop_confirmation,
     stop_frames,
 )
-from drivers.motor.odrive_questions import Questions
 from drivers.motor.vendor_parts import Controllers, MotionPermit, Stage
 from drivers.types import (
     DriverState,
