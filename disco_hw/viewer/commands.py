@@ -18,11 +18,10 @@ from disco_hw.config import link_fields, load_robot_config
 from disco_hw.daemon.client import socket_path
 from disco_hw.daemon.process import StopSignals
 from disco_hw.errors import InputError
-from disco_hw.viewer.live import LivePage, run_live
 from disco_hw.viewer.operator_controls import Desk
 from disco_hw.viewer.page_process import DEFAULT_PORT, LOOPBACK
+from disco_hw.viewer.pages import LivePage, ReplayPage, run_live, run_replay
 from disco_hw.viewer.recording import Recording, stage_of_robot
-from disco_hw.viewer.replay import ReplayPage, run_replay
 from disco_hw.viewer.server import serving
 from disco_hw.viewer.timeline import marks_of
 

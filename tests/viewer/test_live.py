@@ -13,8 +13,8 @@ from disco_hw.drive.coverage import Coverage
 from disco_hw.log import records
 from disco_hw.runtime.task_change import asked_of
 from disco_hw.tasks.circle import CircleTask
-from disco_hw.viewer.live import KEEP_S, LivePage, _Due
 from disco_hw.viewer.operator_controls import Desk
+from disco_hw.viewer.pages import KEEP_S, LivePage, _Due
 from disco_hw.viewer.panel import live_summary
 from disco_hw.viewer.recording import stage_of_robot
 from disco_hw.viewer.scene import DARK

@@ -10,10 +10,9 @@ import pytest
 
 from disco_hw.viewer import scene
 from disco_hw.viewer.commands import export_log
-from disco_hw.viewer.live import LivePage, run_live
 from disco_hw.viewer.operator_controls import Desk
+from disco_hw.viewer.pages import LivePage, ReplayPage, run_live, run_replay
 from disco_hw.viewer.recording import stage_of_robot
-from disco_hw.viewer.replay import ReplayPage, run_replay
 from disco_hw.viewer.server import serving
 from tests.viewer.camera import as_golden, off_golden, project
 from tests.viewer.test_operator_controls import STATUS, Daemon

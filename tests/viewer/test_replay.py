@@ -1,6 +1,6 @@
 import pytest
 
-from disco_hw.viewer.replay import ReplayPage, _spread
+from disco_hw.viewer.pages import ReplayPage, _spread
 from disco_hw.viewer.server import serving
 from disco_hw.viewer.timeline import EVENT, GATED, Mark
 from tools.viewer_run import pose_at

@@ -12,9 +12,9 @@ from disco_hw.runtime.pipeline import Source
 from disco_hw.runtime.supervisor import UserRequest
 from disco_hw.viewer import operator_controls
 from disco_hw.viewer.operator_controls import shown
+from disco_hw.viewer.pages import ReplayPage
 from disco_hw.viewer.panel import escaped, replay_text
 from disco_hw.viewer.recording import Recording
-from disco_hw.viewer.replay import ReplayPage
 from disco_hw.viewer.server import serving
 from tests.runtime.simulated import simulated_stack
 

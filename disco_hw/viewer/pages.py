@@ -1,0 +1,348 @@
+"""The two pages: live, the feed of the daemon drawn some times a second beside the desk with its buttons; and replay.
+
+The replay shows one instant of a log at a time: by slider, by tick, by mark, or running.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import viser
+
+from disco_hw.daemon.page_feed import FeedSubscriber, feed_path
+from disco_hw.log.records import BeliefChange, Record
+from disco_hw.runtime.task_change import record_of, task_in_status
+from disco_hw.viewer.curves import Plots
+from disco_hw.viewer.operator_controls import Desk
+from disco_hw.viewer.panel import coverage_text, events_text, live_details, live_summary, replay_details, replay_text
+from disco_hw.viewer.recording import Recording, ShownRobot, Snapshot, snapshot_at
+from disco_hw.viewer.scene import DARK, Scene
+from disco_hw.viewer.timeline import KINDS, Excited, Items, Mark, Timeline, marks_of
+from disco_hw.viewer.views import ScrubBar, TaskEditor, Views, add_layers
+
+WAIT_S = 0.05
+LIVE_REDRAW_S = 0.5
+KEEP_S = 300.0
+_STATUS_OLDER_NS = 2_000_000_000
+
+
+@dataclass(slots=True)
+class _Due:
+    """Something to do every `period_s`."""
+
+    period_s: float
+    next_s: float = 0.0
+
+    def __call__(self, now_s: float) -> bool:
+        if now_s < self.next_s:
+            return False
+        self.next_s = now_s + self.period_s
+        return True
+
+
+class LivePage:
+    """Everything on the live page; `step` waits for the feed and draws what has come."""
+
+    def __init__(self, server: viser.ViserServer, stage: ShownRobot, socket: Path, desk: Desk) -> None:
+        self.timeline = Timeline()
+        self._server = server
+        self._stage = stage
+        self._desk = desk
+        self._subscriber = FeedSubscriber(feed_path(socket))
+        self._redraw = _Due(LIVE_REDRAW_S)
+        gui = server.gui
+        gui.main_panel.dock_right()
+        self._summary = gui.add_markdown("")
+        with gui.add_folder("Motions driven so far", visible=False) as self._excited:
+            self._coverage = gui.add_markdown("")
+        self._plots = Plots(gui, stage)
+        with gui.add_folder("Events"):
+            self._events = gui.add_markdown("nothing yet")
+        with gui.add_folder("All figures", expand_by_default=False):
+            self._details = gui.add_markdown("")
+        self.scene = Scene(server, stage)
+        self._views = Views(server, stage.task)
+        self.editor = TaskEditor(server, desk.drag)
+        add_layers(server, self.scene, self._shade)
+
+    def step(self) -> None:
+        """Wait at most a twentieth of a second for records, then draw: each batch of the feed moves the robot."""
+        self.take(self._subscriber.receive(WAIT_S))
+        if self._server.get_clients():
+            self.draw(self._redraw(time.monotonic()))
+
+    def take(self, received: list[tuple[int, Record]]) -> None:
+        """Take in records of the feed."""
+        for now_ns, record in received:
+            self.timeline.add(now_ns, record)
+        if received:
+            self.timeline.forget_before(received[-1][0] - round(KEEP_S * 1e9))
+
+    def draw(self, everything: bool) -> None:
+        """Draw the newest instant; the panel and long lines only if `everything`."""
+        status = self._desk.status
+        self._learn_task(status)
+        self._learn_belief(status)
+        snapshot = self._snapshot()
+        if snapshot is not None:
+            self.scene.show(snapshot, everything)
+            self._views.follow(snapshot.pose)
+        self.editor.show(self._stage.task_at(None if snapshot is None else snapshot.task), self._desk.draft)
+        if everything:
+            behind_ms = None if snapshot is None else (time.monotonic_ns() - snapshot.t_ns) * 1e-6
+            _set(self._summary, live_summary(status, snapshot, self.scene.knows_task))
+            _set(self._details, live_details(status, snapshot, self._subscriber.missed, behind_ms))
+            self._show_coverage(status)
+            _set(self._events, events_text(snapshot, self.timeline.first_ns))
+            if snapshot is not None:
+                task = self._stage.task_at(snapshot.task)
+                self._plots.show(self.timeline, snapshot.t_ns, task, snapshot.belief)
+
+    def _shade(self) -> None:
+        self._desk.dark = self.scene.background == DARK
+
+    def close(self) -> None:
+        """Leave the feed."""
+        self._subscriber.close()
+
+    def _snapshot(self) -> Snapshot | None:
+        newest = self.timeline.last_ns
+        return None if newest is None else snapshot_at(self.timeline, newest, self.timeline.plans.last(newest))
+
+    def _show_coverage(self, status: dict[str, Any] | None) -> None:
+        drive = (status or {}).get("drive")
+        if self._excited.visible != (drive is not None):
+            self._excited.visible = drive is not None
+        if drive is not None:
+            _set(self._coverage, coverage_text(drive["coverage"]["items"]))
+
+    def _learn_task(self, status: dict[str, Any] | None) -> None:
+        """Take over the daemon's task: it may have been changed before this page was opened."""
+        newest = self.timeline.last_ns
+        if newest is None or status is None or not status.get("ok"):
+            return
+        asked = task_in_status(status["task"]["asked"], self._stage.task)
+        self.scene.knows_task = asked is not None
+        if asked is None:
+            return
+        record = self.timeline.tasks.last(newest)
+        if record is not None and newest - record.t_ns < _STATUS_OLDER_NS:
+            return
+        if self._stage.task_at(record) != asked:
+            self.timeline.add(newest, record_of(newest, asked))
+
+    def _learn_belief(self, status: dict[str, Any] | None) -> None:
+        """Take over the belief in force: it may be from before this page was opened, or of a daemon that has gone."""
+        newest = self.timeline.last_ns
+        if newest is None or status is None or not status.get("ok"):
+            return
+        record = self.timeline.beliefs.last(newest)
+        if record is not None and newest - record.t_ns < _STATUS_OLDER_NS:
+            return
+        adaptation = status.get("adaptation")
+        if adaptation is None:
+            self.timeline.adaptations = Items()
+        in_force = _belief_in_force(newest, adaptation)
+        if _geometry(record) != _geometry(in_force):
+            self.timeline.add(newest, in_force)
+
+
+def _belief_in_force(now_ns: int, adaptation: Mapping[str, Any] | None) -> BeliefChange:
+    """The belief of a status."""
+    if adaptation is None or adaptation["belief"] != "adapted":
+        return BeliefChange(now_ns, "model")
+    mean = adaptation["mean"]
+    return BeliefChange(now_ns, "adapted", tuple(mean), tuple(mean.values()), tuple(adaptation["covariance"]))
+
+
+def _geometry(change: BeliefChange | None) -> tuple[tuple[float, ...], ...]:
+    """What distinguishes two beliefs; the model file's is empty."""
+    return () if change is None or change.source == "model" else (change.mean, change.covariance)
+
+
+def run_live(page: LivePage, should_stop: Callable[[], bool]) -> None:
+    """Draw until told to stop."""
+    try:
+        while not should_stop():
+            page.step()
+    finally:
+        page.close()
+
+
+def _set(element: viser.GuiMarkdownHandle, text: str) -> None:
+    """Send a text only when it has changed."""
+    if element.content != text:
+        element.content = text
+
+
+SPEEDS = {"1/4": 0.25, "1/2": 0.5, "1": 1.0, "2": 2.0, "4": 4.0, "8": 8.0}
+STEP_S = 0.05
+REPLAY_REDRAW_S = 0.4
+_SLIDER_MARKS = 40
+_LISTED_MARKS = 200
+_NO_MARK = "go to ..."
+
+
+class ReplayPage:
+    """Everything on the replay page, which opens where the task starts; `t_s`: where it is, from the first tick.
+
+    The buttons' callbacks run in threads of the page's server and only note what is asked; `step` acts on it.
+    """
+
+    def __init__(self, server: viser.ViserServer, recording: Recording) -> None:
+        self.t_s = recording.task_start_s
+        self.playing = False
+        self._recording = recording
+        self._speed = 1.0
+        self._lock = threading.Lock()
+        self._changed = True
+        self._next_redraw_s = 0.0
+        self._marks = marks_of(recording.timeline)
+        gui = server.gui
+        gui.main_panel.dock_right()
+        self._add_controls(gui)
+        self._bar = self._scrub_bar(server)
+        self._state = gui.add_markdown("")
+        stage = recording.stage
+        self._excited = Excited(recording.timeline, stage.drive_top_rad_s)
+        if self._excited.driven:
+            with gui.add_folder("Motions driven so far"):
+                self._coverage = gui.add_markdown("")
+        self._plots = Plots(gui, stage)
+        with gui.add_folder("Events"):
+            self._events = gui.add_markdown("")
+        with gui.add_folder("All figures", expand_by_default=False):
+            self._details = gui.add_markdown("")
+        self.scene = Scene(server, recording.stage)
+        self._views = Views(server, stage.task)
+        add_layers(server, self.scene, self._redraw)
+
+    def go_to(self, t_s: float) -> None:
+        """Go to a time, within the log."""
+        with self._lock:
+            self.t_s = min(max(t_s, 0.0), self._recording.duration_s)
+            self._changed = True
+
+    def step_ticks(self, count: int) -> None:
+        """Go this many ticks forward or back, and stay there."""
+        self._play(False)
+        self.go_to(self._recording.seconds_of(self._recording.tick_at(self.t_s) + count))
+
+    def step(self, passed_s: float) -> None:
+        """Advance by this much real time if playing, and draw if anything has changed."""
+        if self.playing:
+            self.go_to(self.t_s + passed_s * self._speed)
+            if self.t_s >= self._recording.duration_s:
+                self._play(False)
+        with self._lock:
+            changed, self._changed, t_s = self._changed, False, self.t_s
+        if changed:
+            self._draw(t_s)
+
+    def _draw(self, t_s: float) -> None:
+        now_s = time.monotonic()
+        snapshot = self._recording.at(t_s)
+        everything = not self.playing or now_s >= self._next_redraw_s
+        self.scene.show(snapshot, everything)
+        self._views.follow(snapshot.pose)
+        self._bar.show(t_s)
+        self._slider.value = round(t_s, 3)  # type: ignore[misc]
+        if everything:
+            self._next_redraw_s = now_s + REPLAY_REDRAW_S
+            first_ns = self._recording.first_ns
+            task = self._recording.stage.task_at(snapshot.task)
+            self._state.content = replay_text(snapshot, first_ns, task)
+            self._details.content = replay_details(snapshot)
+            if self._excited.driven:
+                self._coverage.content = coverage_text(self._excited.items(snapshot.t_ns))
+            self._events.content = events_text(snapshot, first_ns)
+            self._plots.show(self._recording.timeline, snapshot.t_ns, task, snapshot.belief)
+
+    def _redraw(self) -> None:
+        with self._lock:
+            self._changed = True
+
+    def _play(self, playing: bool) -> None:
+        self.playing = playing
+        self._play_button.label = "Pause" if playing else "Play"
+
+    def _add_controls(self, gui: viser.GuiApi) -> None:
+        duration_s = max(self._recording.duration_s, 0.001)
+        shown = [round(self._seconds(mark), 3) for mark in _spread(self._marks, _SLIDER_MARKS)]
+        self._slider = gui.add_slider("Time (s)", 0.0, duration_s, 0.001, round(self.t_s, 3), marks=tuple(shown))
+        self._play_button = gui.add_button("Play")
+        steps = gui.add_button_group("Step", ("-10", "-1", "+1", "+10"))
+        speed = gui.add_dropdown("Speed", tuple(SPEEDS), initial_value="1")
+        listed = {self._line(mark): mark for mark in _spread(self._marks, _LISTED_MARKS)}
+        marks = gui.add_dropdown("Marks", (_NO_MARK, *listed), initial_value=_NO_MARK)
+
+        @self._slider.on_update
+        def _(event: Any) -> None:
+            # Without a client it was moved from here.
+            if event.client is not None:
+                self._play(False)
+                self.go_to(float(event.target.value))
+
+        @self._play_button.on_click
+        def _(_: Any) -> None:
+            if not self.playing and self.t_s >= self._recording.duration_s:
+                self.go_to(0.0)
+            self._play(not self.playing)
+            self._redraw()
+
+        @steps.on_click
+        def _(event: Any) -> None:
+            self.step_ticks(int(event.target.value))
+
+        @speed.on_update
+        def _(event: Any) -> None:
+            self._speed = SPEEDS[event.target.value]
+
+        @marks.on_update
+        def _(event: Any) -> None:
+            mark = listed.get(event.target.value)
+            if mark is not None:
+                self._play(False)
+                self.go_to(self._seconds(mark))
+
+    def _scrub_bar(self, server: viser.ViserServer) -> ScrubBar:
+        def go_to(t_s: float) -> None:
+            self._play(False)
+            self.go_to(t_s)
+
+        shown = [round(self._seconds(mark), 3) for mark in _spread(self._marks, _SLIDER_MARKS)]
+        return ScrubBar(server, max(self._recording.duration_s, 0.001), shown, go_to)
+
+    def _seconds(self, mark: Mark) -> float:
+        return (mark.t_ns - self._recording.first_ns) * 1e-9
+
+    def _line(self, mark: Mark) -> str:
+        return f"{self._seconds(mark):.2f} s {mark.kind}: {mark.text}"
+
+
+def _spread(marks: tuple[Mark, ...], count: int) -> list[Mark]:
+    """At most `count` marks: the graver kinds first, then evenly picked; in order of time."""
+    kept: list[Mark] = []
+    for kind in KINDS:
+        of_kind = [mark for mark in marks if mark.kind == kind]
+        room = count - len(kept)
+        if room > 0 and of_kind:
+            picks = np.unique(np.linspace(0, len(of_kind) - 1, min(room, len(of_kind))).astype(int))
+            kept += [of_kind[pick] for pick in picks]
+    return sorted(kept, key=lambda mark: mark.t_ns)
+
+
+def run_replay(page: ReplayPage, should_stop: Callable[[], bool]) -> None:
+    """Draw until told to stop."""
+    before_s = time.monotonic()
+    while not should_stop():
+        now_s = time.monotonic()
+        page.step(now_s - before_s)
+        before_s = now_s
+        time.sleep(STEP_S)
