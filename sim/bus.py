@@ -13,13 +13,15 @@ from typing import Protocol
 import msgspec
 from msgspec.structs import replace
 
-from sim.bus_node import BusNode, ErrorState, TransmitOrder
-from sim.can_frame import (
+from sim.can_protocol import (
     ACK_AND_END_BITS,
     ERROR_DELIMITER_BITS,
     ERROR_FLAG_BITS,
     INTERFRAME_BITS,
+    BusNode,
     CanFrame,
+    ErrorState,
+    TransmitOrder,
     candump_line,
     frame_bits,
     protocol_error_frame,

@@ -18,8 +18,16 @@ from pathlib import Path
 
 from drivers.types import Frame, ReceivedFrame
 from sim.bus import BusFault, CanBus, DeliveredFrame
-from sim.bus_node import BusNode, TransmitOrder
-from sim.can_frame import ECHO_OWN_FRAMES, FRAME_BYTES, CanFrame, pack_frame, receive_overflow_frame, unpack_frame
+from sim.can_protocol import (
+    ECHO_OWN_FRAMES,
+    FRAME_BYTES,
+    BusNode,
+    CanFrame,
+    TransmitOrder,
+    pack_frame,
+    receive_overflow_frame,
+    unpack_frame,
+)
 from sim.process import SocketPathError, StopSignal, bind_private
 from sim.python_can_link import Guest, JoinError, joined
 from sim.robot_link import LinkFaultError, RobotNode

@@ -14,8 +14,7 @@ from drivers.types import Frame, LinkState, OutgoingFrame, ReceivedFrame, Transp
 from firmware_protocol.firmware_core import FirmwareConfig
 from sim.body_dynamics import BodyPose
 from sim.bus import BusFault, CanBus, DeliveredFrame
-from sim.bus_node import BusNode, ErrorState, TransmitOrder
-from sim.can_frame import CanFrame
+from sim.can_protocol import BusNode, CanFrame, ErrorState, TransmitOrder
 from sim.effects import hidden_effects
 from sim.plant import Plant, TrueState
 from sim.plant_parameters import PlantParameters

@@ -16,7 +16,7 @@ from msgspec.structs import replace
 
 from firmware_protocol.firmware_core import FirmwareInputs
 from sim.bus import UNHARMED, FrameFate
-from sim.can_frame import CanFrame
+from sim.can_protocol import CanFrame
 from sim.fault_schedule import FaultSchedule, ScheduledFault, Site
 from sim.robot_link import ROBOT_NODE
 from sim.sensors import PoseMeasurement

@@ -13,7 +13,7 @@ import can
 
 from drivers.types import Frame, ReceivedFrame
 from sim.bus import BusFault, CanBus, DeliveredFrame
-from sim.can_frame import CanFrame
+from sim.can_protocol import CanFrame
 from sim.robot_link import LinkFaultError
 
 RETRY_NS = 500_000_000

@@ -7,8 +7,7 @@ from typing import Protocol
 
 from drivers.types import Frame, ReceivedFrame
 from sim.bus import BusFault, CanBus, DeliveredFrame
-from sim.bus_node import ErrorState
-from sim.can_frame import CanFrame
+from sim.can_protocol import CanFrame, ErrorState
 
 ROBOT_NODE = "robot"
 ROBOT_QUEUE = 64

@@ -21,7 +21,7 @@ from pathlib import Path
 from drivers.types import Frame, ReceivedFrame
 from firmware_protocol.serial_framing import FrameDecoder, encode_frame
 from sim.bus import UNHARMED, BusFault, FrameFate
-from sim.can_frame import CanFrame, candump_line
+from sim.can_protocol import CanFrame, candump_line
 from sim.robot_link import ROBOT_NODE, LinkFaultError
 
 BITS_PER_BYTE = 10

@@ -10,7 +10,7 @@ from typing import Any
 
 import can
 
-from sim.can_frame import ECHO_OWN_FRAMES, FRAME_BYTES, CanFrame, pack_frame, unpack_frame
+from sim.can_protocol import ECHO_OWN_FRAMES, FRAME_BYTES, CanFrame, pack_frame, unpack_frame
 
 _SEND_BUFFER_BYTES = 16_384
 

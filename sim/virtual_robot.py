@@ -21,7 +21,7 @@ from firmware_protocol.firmware_core import (
     ResetCause,
     drawn_entropy,
 )
-from sim.can_frame import CanFrame
+from sim.can_protocol import CanFrame
 from sim.injected_faults import RobotFaults
 from sim.plant import Plant, TrueState
 from sim.process import TextRecord

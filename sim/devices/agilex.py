@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 
 from drivers.motor.agilex_protocol import AgilexSettings
 from firmware_protocol.firmware_core import FirmwareInputs
-from sim.can_frame import CanFrame
+from sim.can_protocol import CanFrame
 
 TIMEOUT_MS = 500
 STANDBY, CAN_MODE, UART_MODE, RC_MODE = range(4)

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from drivers.motor.odrive_protocol import OdriveSettings
 from drivers.motor.vendor_parts import sides_of
 from firmware_protocol.firmware_core import FirmwareInputs
-from sim.can_frame import CanFrame
+from sim.can_protocol import CanFrame
 
 CHECKS_PER_MS = 8
 IDLE, CLOSED_LOOP, POSITION_CONTROL, VELOCITY_CONTROL, PASSTHROUGH = 1, 8, 3, 2, 1

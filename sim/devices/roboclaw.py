@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 from drivers.motor.roboclaw_protocol import RoboclawSettings
 from firmware_protocol.firmware_core import FirmwareInputs
-from sim.can_frame import CanFrame
+from sim.can_protocol import CanFrame
 
 QUIET_US = 10_000
 

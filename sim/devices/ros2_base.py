@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from drivers.motor import ros2_base_wire as wire
 from drivers.types import Frame
 from firmware_protocol.firmware_core import FirmwareInputs
-from sim.can_frame import CanFrame
+from sim.can_protocol import CanFrame
 
 WHEELS_MS, STATE_MS, STEP_MS = 20, 50, 20
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from drivers.motor.vendor_parts import sides_of
 from drivers.motor.vesc_settings import VescSettings
 from firmware_protocol.firmware_core import FirmwareInputs
-from sim.can_frame import CanFrame
+from sim.can_protocol import CanFrame
 
 BUFFER = 520
 APPCONF_SIGNATURE = 3264926020

@@ -24,7 +24,7 @@ from drivers.transport import connect_pair
 from drivers.types import OutgoingFrame
 from firmware_protocol.firmware_core import FirmwareConfig
 from sim.body_dynamics import BodyPose
-from sim.can_frame import CanFrame
+from sim.can_protocol import CanFrame
 from sim.devices import find_controller
 from sim.effects import hidden_effects
 from sim.plant import Plant

@@ -9,7 +9,7 @@ from drivers.motor.reference_arming import cyclic_frames
 from drivers.types import CyclicFrame
 from firmware_protocol.codec import packaged_dbc
 from firmware_protocol.serial_framing import encode_frame
-from sim.can_frame import CanFrame, frame_bits
+from sim.can_protocol import CanFrame, frame_bits
 
 FRAMES = cyclic_frames(packaged_dbc(), 50.0)
 

@@ -3,8 +3,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sim.bus import CanBus, DeliveredFrame, FrameFate
-from sim.bus_node import ErrorState, TransmitOrder
-from sim.can_frame import CanFrame, frame_bits, stuffed_bits
+from sim.can_protocol import CanFrame, ErrorState, TransmitOrder, frame_bits, stuffed_bits
 
 BIT_NS = 2000  # 500 kbit/s
 LONG_NS = 10**10

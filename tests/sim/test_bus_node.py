@@ -1,7 +1,6 @@
 import pytest
 
-from sim.bus_node import BusNode, ErrorState, TransmitOrder
-from sim.can_frame import CanFrame
+from sim.can_protocol import BusNode, CanFrame, ErrorState, TransmitOrder
 
 
 @pytest.fixture

@@ -4,7 +4,7 @@ from can.interfaces.socketcan.socketcan import build_can_frame, dissect_can_fram
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim.can_frame import (
+from sim.can_protocol import (
     CanFrame,
     arbitration_key,
     bus_off_frame,

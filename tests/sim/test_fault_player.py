@@ -8,7 +8,7 @@ import pytest
 from drivers.types import Frame
 from firmware_protocol.firmware_core import FirmwareConfig
 from sim.app import OptionError, _check_faults
-from sim.bus_node import ErrorState
+from sim.can_protocol import ErrorState
 from sim.fault_player import COMMANDS, CpuHogs, FaultPlayer, Injection
 from sim.fault_schedule import KINDS, parse_schedule
 from sim.hub import HubLink

@@ -11,8 +11,7 @@ import pytest
 
 from drivers.types import Frame
 from sim.bus import FrameFate
-from sim.bus_node import ErrorState
-from sim.can_frame import ECHO_OWN_FRAMES, FRAME_BYTES, CanFrame, frame_bits, pack_frame, unpack_frame
+from sim.can_protocol import ECHO_OWN_FRAMES, FRAME_BYTES, CanFrame, ErrorState, frame_bits, pack_frame, unpack_frame
 from sim.hub import READER_QUEUE, READER_STALL_NS, Hub, HubLink
 from sim.process import SocketPathError
 from sim.robot_link import RESTART_DELAY_NS, LinkFaultError

@@ -5,7 +5,7 @@ import math
 import pytest
 
 from firmware_protocol.firmware_core import FirmwareInputs
-from sim.can_frame import CanFrame
+from sim.can_protocol import CanFrame
 from sim.fault_schedule import parse_schedule
 from sim.injected_faults import FaultTimeline, FrameFaults, RobotFaults
 from sim.sensors import PoseMeasurement

@@ -2,8 +2,7 @@
 
 from drivers.types import Frame
 from sim.bus import CanBus
-from sim.bus_node import ErrorState
-from sim.can_frame import CanFrame
+from sim.can_protocol import CanFrame, ErrorState
 from sim.robot_link import RESTART_DELAY_NS, RobotNode
 
 MS = 1_000_000

@@ -15,7 +15,7 @@ from contextlib import contextmanager
 import can
 import pytest
 
-from sim.can_frame import CanFrame, pack_frame
+from sim.can_protocol import CanFrame, pack_frame
 from sim.unixcan import UnixCanBus
 
 FLOOD = 20_000

@@ -10,7 +10,7 @@ from drivers.types import Frame
 from firmware_protocol.firmware_core import FirmwareConfig, ResetCause
 from sim.body_dynamics import BodyPose
 from sim.bus import CanBus
-from sim.can_frame import CanFrame
+from sim.can_protocol import CanFrame
 from sim.plant import Plant
 from sim.plant_parameters import PlantParameters
 from sim.process import TextRecord

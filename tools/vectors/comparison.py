@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from drivers.types import Frame
-from sim.can_frame import CanFrame
+from sim.can_protocol import CanFrame
 
 Case = Mapping[str, Any]
 _F32 = struct.Struct("<f")

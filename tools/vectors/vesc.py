@@ -7,7 +7,7 @@ from typing import Any
 
 from drivers.motor import vesc_codec as codec
 from drivers.types import Frame
-from sim.can_frame import CanFrame
+from sim.can_protocol import CanFrame
 from sim.devices.vesc import CHECK_MS, Vesc
 from tools.vectors.comparison import Case, Comparison, as_case, as_cases, of_driver, on_bus
 

@@ -9,7 +9,7 @@ import hashlib
 import pytest
 
 from drivers.types import DriverState, Request
-from sim.can_frame import CanFrame
+from sim.can_protocol import CanFrame
 from tests.drivers.motor.vendors import VENDORS
 
 FORWARD = (3.0, 2.0)

@@ -3,7 +3,7 @@
 import math
 
 from firmware_protocol.firmware_core import FirmwareInputs
-from sim.can_frame import CanFrame
+from sim.can_protocol import CanFrame
 
 TICKS_PER_REV = 4096
 COASTING_S = 0.5

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import msgspec
 
 from drivers.motor import find_driver, make_driver
-from sim.can_frame import CanFrame
+from sim.can_protocol import CanFrame
 from sim.devices import find_controller
 from tests.drivers.motor.bench import Bench
 from tests.drivers.motor.vendor_rig import TICKS_PER_REV, VendorRig
