@@ -10,7 +10,7 @@ import time
 
 from disco_hw import processes
 from disco_hw.daemon.loop import Loop, MonotonicClock
-from disco_hw.runtime.governor import Governor, WheelLimits
+from disco_hw.runtime.pipeline import Governor, WheelLimits
 from disco_hw.runtime.supervisor import Inputs, Supervisor, SupervisorSettings
 from drivers.types import DriverState, LinkState
 

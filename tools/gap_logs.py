@@ -8,7 +8,7 @@ import numpy as np
 
 from disco_hw.drive.script import Script
 from disco_hw.log.drive import Commands, DriveLog, Gyro, Poses, Wheels, differentiate_angle
-from disco_hw.runtime.governor import Governor, WheelLimits
+from disco_hw.runtime.pipeline import Governor, WheelLimits
 from sim.effects import EFFECTS, HiddenEffects, hidden_effects
 from sim.plant_parameters import PlantParameters
 from tools.simulated_drives import ScriptedDrive, make_drive

@@ -25,8 +25,7 @@ from disco_hw.estimation.disturbance_estimator import DisturbanceEstimator
 from disco_hw.model import Gaussian, Model
 from disco_hw.model.model import EffectSetting
 from disco_hw.runtime.assembly import put_in_force
-from disco_hw.runtime.governor import Governor, WheelLimits
-from disco_hw.runtime.pipeline import FollowTask, Pipeline, Planner
+from disco_hw.runtime.pipeline import FollowTask, Governor, Pipeline, Planner, WheelLimits
 from disco_hw.tasks.circle import CircleCost, CircleCourse
 from disco_hw.tasks.lemniscate import LemniscateTask
 from disco_hw.tasks.line import PathTable

@@ -25,8 +25,7 @@ from disco_hw.estimation.disturbance_estimator import DisturbanceEstimator
 from disco_hw.log.recorder import Recorder
 from disco_hw.model import Model
 from disco_hw.runtime.core import DaemonCore
-from disco_hw.runtime.governor import Governor, WheelLimits
-from disco_hw.runtime.pipeline import Pipeline, Planner
+from disco_hw.runtime.pipeline import Governor, Pipeline, Planner, WheelLimits
 from disco_hw.runtime.preflight import check_firmware_limits, check_task, failures
 from disco_hw.runtime.robot_setup import Setup, geometry
 from disco_hw.runtime.supervisor import Supervisor, SupervisorSettings

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from disco_hw.control import Rollouts
 from disco_hw.estimation import PoseUpdate
 from disco_hw.log import records
-from disco_hw.runtime.governor import Limited
-from disco_hw.runtime.pipeline import Source, Tick
+from disco_hw.runtime.pipeline import Limited, Source, Tick
 from drivers.types import Identity, Limits, OutgoingFrame, Readings, ReceivedFrame, SaidBy, WheelCommand, socketcan_id
 
 _NO_NUMBERS = (float("nan"),) * 3

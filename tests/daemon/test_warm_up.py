@@ -13,8 +13,7 @@ from disco_hw.config import Estimation
 from disco_hw.control import NoValidControl
 from disco_hw.daemon.run import warm_up
 from disco_hw.estimation import OdometryParameters, PoseFusion
-from disco_hw.runtime.governor import Governor, WheelLimits
-from disco_hw.runtime.pipeline import Pipeline
+from disco_hw.runtime.pipeline import Governor, Pipeline, WheelLimits
 
 
 class Refusing:

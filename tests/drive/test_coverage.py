@@ -13,7 +13,7 @@ import disco_hw
 from disco_hw.config import load_robot_config
 from disco_hw.drive.coverage import Coverage
 from disco_hw.drive.scripts import make_script
-from disco_hw.runtime.governor import Governor, WheelLimits
+from disco_hw.runtime.pipeline import Governor, WheelLimits
 
 CONFIG = load_robot_config(Path(disco_hw.__file__).parent / "robots" / "wombot.toml")
 TOP = 6.4

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from disco_hw.runtime.governor import Governed, Governor, Limited, WheelLimits
+from disco_hw.runtime.pipeline import Governed, Governor, Limited, WheelLimits
 
 LIMITS = WheelLimits(max_speed_rad_s=8.0, max_acceleration_rad_s2=20.0, max_deceleration_rad_s2=30.0)
 PERIOD_S = 0.02

@@ -6,7 +6,7 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
-from disco_hw.runtime.governor import Governor, Limited, WheelLimits
+from disco_hw.runtime.pipeline import Governor, Limited, WheelLimits
 
 SPEEDS = st.one_of(
     st.floats(-40.0, 40.0, allow_nan=False), st.sampled_from([0.0, -0.0, 8.0, -8.0, 1e-12, 1e300, -1e300, 5e-324])

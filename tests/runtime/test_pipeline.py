@@ -8,8 +8,7 @@ import pytest
 from disco_hw.config import Estimation
 from disco_hw.control import Diagnostics, NoValidControl
 from disco_hw.estimation import OdometryParameters, PoseFusion
-from disco_hw.runtime.governor import Governor, Limited, WheelLimits
-from disco_hw.runtime.pipeline import FollowTask, Manual, Off, Pipeline, Source, Stand
+from disco_hw.runtime.pipeline import FollowTask, Governor, Limited, Manual, Off, Pipeline, Source, Stand, WheelLimits
 from drivers.types import PoseSample, Readings, WheelSample
 
 PERIOD_NS = 20_000_000
