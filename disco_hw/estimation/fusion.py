@@ -12,7 +12,7 @@ from dataclasses import dataclass, fields
 import msgspec
 
 from disco_hw.config import Estimation
-from disco_hw.estimation.correction import Measurement, PoseReason, Triple, screen
+from disco_hw.estimation.correction import Measurement, PoseReason, PoseUpdate, screen
 from disco_hw.estimation.filter import FilterState, HeadingSearch, Judgement, PoseFilter
 from disco_hw.estimation.odometry import (
     FUTURE_TOLERANCE_NS,
@@ -72,28 +72,6 @@ class PoseEstimate(msgspec.Struct, frozen=True, gc=False):
     def ok(self) -> bool:
         """Whether it rests on fresh wheel samples and fresh poses."""
         return self.initialised and self.wheels_ok and self.pose_ok
-
-
-class PoseUpdate(msgspec.Struct, frozen=True, gc=False):
-    """What a measured pose did.
-
-    `innovation` is measured minus predicted (x m, y m, yaw rad), `innovation_variance` the diagonal of its covariance
-    S, `distance2` its squared Mahalanobis distance, `test_ratio` that over the gate's limit (above 1: outside). They
-    are None where there was nothing to compare with. `age_s` is how long ago the pose was true.
-    """
-
-    t_ns: int
-    age_s: float
-    reason: PoseReason
-    innovation: Triple | None = None
-    innovation_variance: Triple | None = None
-    distance2: float | None = None
-    test_ratio: float | None = None
-
-    @property
-    def accepted(self) -> bool:
-        """Whether the pose took part in the estimate."""
-        return self.reason.accepted
 
 
 @dataclass(frozen=True, slots=True)

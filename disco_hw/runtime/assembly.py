@@ -21,7 +21,7 @@ from disco_hw.config import RobotConfig
 from disco_hw.control.baselines import LAWS, WithFallback
 from disco_hw.errors import InputError
 from disco_hw.estimation import OdometryParameters, PoseFusion
-from disco_hw.estimation.disturbance_estimator import DisturbanceEstimator
+from disco_hw.estimation.correction import DisturbanceEstimator
 from disco_hw.log.recorder import Recorder
 from disco_hw.model import Model
 from disco_hw.runtime.core import DaemonCore

@@ -20,7 +20,7 @@ import msgspec
 
 from disco_hw.control import NoValidControl, PlannerState, PlanOutcome, Rollouts, SentCommand, WheelPlan
 from disco_hw.estimation import OdometryParameters, PoseEstimate, PoseFusion, PoseUpdate
-from disco_hw.estimation.disturbance_estimator import DisturbanceEstimator
+from disco_hw.estimation.correction import DisturbanceEstimator
 from disco_hw.model import Belief
 from disco_hw.model.disturbance import NO_DISTURBANCE, Disturbance
 from disco_hw.tasks import PlannedTask

@@ -8,7 +8,7 @@ import pytest
 
 from disco_hw.config import Estimation
 from disco_hw.estimation import OdometryParameters, PoseFusion
-from disco_hw.estimation.disturbance_estimator import LEFT, DisturbanceEstimator
+from disco_hw.estimation.correction import LARGEST_LEFT, DisturbanceEstimator
 from disco_hw.model.disturbance import NO_DISTURBANCE, Disturbance
 from drivers.types import PoseSample, WheelSample
 
@@ -61,7 +61,7 @@ def test_each_part_is_found_where_it_is_constant(true):
 
 def test_an_estimate_stays_within_its_bounds():
     estimator, _ = driven(Disturbance(left=0.8), 10.0)
-    assert abs(estimator.value.left) <= LEFT
+    assert abs(estimator.value.left) <= LARGEST_LEFT
 
 
 def test_a_robot_that_was_carried_begins_anew():
