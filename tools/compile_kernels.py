@@ -16,7 +16,7 @@ from disco_hw.control import CommandLimits, Disco, DiscoSettings
 from disco_hw.control.pendulum import PAPER_SAMPLER, PendulumPlanner, PendulumPoints
 from disco_hw.effects.registry import MOTION_EFFECTS, REGISTRY
 from disco_hw.experiments.circle import CircleOptions, run_circle
-from disco_hw.gap.find import missing_effects
+from disco_hw.gap import missing_effects
 from disco_hw.inference.estimates import estimates
 from disco_hw.inference.excitation import USUAL, excitation
 from disco_hw.inference.simulate import Simulator

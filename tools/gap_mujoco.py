@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
+from disco_hw.gap import model_of, offered_stage, search
 from disco_hw.gap.data.gridded_drive import grid_drive
-from disco_hw.gap.find import model_of, offered_stage, search
 from disco_hw.gap.report.judge import Measured, effect_findings, sort_out, unnamed_findings
 from disco_hw.gap.search.analysis import final_fit
 from disco_hw.gap.search.stages import joint_predictions

@@ -161,7 +161,7 @@ _WORK = (
     "disco_hw.experiments.adapt.run_adapt",
     "disco_hw.experiments.circle.run_circle",
     "disco_hw.experiments.gap._record",
-    "disco_hw.gap.find.find_gap",
+    "disco_hw.gap.find_gap",
     "disco_hw.viewer.commands.serving",
 )
 _ENDS_AFTER = (

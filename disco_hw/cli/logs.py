@@ -77,8 +77,8 @@ def gap(
 
     limit_thread_pools()
     check_named_files(robot, model, logs)
-    from disco_hw.gap.find import gap as find_gap
-    from disco_hw.gap.find import gap_fleet
+    from disco_hw.gap import gap as find_gap
+    from disco_hw.gap import gap_fleet
 
     if dask is not None:
         from disco_hw.inference.simulate import dask_workers

@@ -26,7 +26,7 @@ from disco_hw.experiments.simulated_time import SimulatedRun, virtual_robot
 from disco_hw.log import records
 from disco_hw.log.reader import open_log
 from disco_hw.log.recorder import MemoryRecorder
-from disco_hw.model.file import load_model, model_text
+from disco_hw.model import load_model, model_text
 from disco_hw.reports import write_pictures
 from disco_hw.runtime.assembly import make_planner
 from disco_hw.runtime.robot_setup import Setup

@@ -24,7 +24,7 @@ from disco_hw.errors import InputError, WorkError
 from disco_hw.experiments.virtual import true_parameters
 from disco_hw.log.messages import MODEL_TOML, Attachment
 from disco_hw.log.recorder import MemoryRecorder, ProcessRecorder, RecordingSettings
-from disco_hw.model.file import model_text
+from disco_hw.model import model_text
 from disco_hw.reports import refuse_file
 from disco_hw.runtime.assembly import (
     assemble_core,

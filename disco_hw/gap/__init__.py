@@ -1,6 +1,386 @@
-"""Where simulation and data disagree, which effect is missing, the amended model, and how far the gap shrinks."""
+"""Where simulation and data disagree, which effect is missing, the amended model, and how far the gap shrinks.
 
-from disco_hw.gap.find import find_gap
-from disco_hw.gap.report.findings import GapReport
+Here the analysis is one call: logs and a model in, the report out; and what `disco-hw gap` writes of it.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from disco_hw.config import load_robot_config
+from disco_hw.errors import LogError, WorkError
+from disco_hw.gap.data.gridded_drive import grid_drive
+from disco_hw.gap.data.layout import BASE_COUNT, BODY, DELAYED_BY, WHEEL, Layout
+from disco_hw.gap.report.amend import amended_model, at_joint_fit, carried_terms, channel_estimates, simple_model
+from disco_hw.gap.report.blind_spots import finder, proved
+from disco_hw.gap.report.findings import (
+    STAGES,
+    FleetResult,
+    FleetRow,
+    GapReport,
+    Provenance,
+    reached_horizon_s,
+)
+from disco_hw.gap.report.judge import (
+    Measured,
+    across_logs,
+    blind_spot_findings,
+    candidate_evidence,
+    channel_findings,
+    drifting_parameters,
+    effect_findings,
+    residue_sentences,
+    sort_out,
+    unnamed_findings,
+)
+from disco_hw.gap.report.page import as_text, page
+from disco_hw.gap.search.analysis import ChannelEstimates, FinalFit, GapAnalysis, final_fit
+from disco_hw.gap.search.channel_search import search_body, search_wheels
+from disco_hw.gap.search.cross_validation import (
+    PredictionErrors,
+    beats,
+    clearly_worse,
+    only_timed,
+    surely_beats,
+    wheel_table,
+    worse_by,
+)
+from disco_hw.gap.search.richest_model import LATE_COLUMNS, candidates_of
+from disco_hw.gap.search.stages import StagePredictions, joint_predictions, prune, stage_predictions
+from disco_hw.gap.search.unnamed_terms import with_known_terms
+from disco_hw.gap.settings import DEFAULT_SETTINGS, GapSettings
+from disco_hw.log.drive import DriveLog, concatenate
+from disco_hw.log.load import load_drive
+from disco_hw.log.messages import version
+from disco_hw.model import Model, load_model, save_model
+from disco_hw.reports import as_json, refuse_directory
 
 __all__ = ["GapReport", "find_gap"]
+
+
+Array = NDArray[np.float64]
+Progress = Callable[[str], None]
+
+
+def find_gap(
+    logs: DriveLog | Sequence[DriveLog],
+    model: Model,
+    progress: Progress | None = None,
+    pictures: bool = False,
+    prove: bool = False,
+    top_rad_s: float | None = None,
+    settings: GapSettings = DEFAULT_SETTINGS,
+) -> GapReport:
+    """Find where logs and model disagree, name what is missing, amend the model and show the gap shrink.
+
+    `logs`: one drive or several of one robot. `model`: nominal geometry, with the effects that are known already;
+    those are refitted, not reported. `progress` hears what is being done; `pictures` draws them too; `prove` puts
+    effects into the log to see whether those it is said to show are found. `top_rad_s`: the robot's largest wheel
+    speed, without which it is not known to which speed limits the logs are blind. `settings`: all thresholds. Raises
+    LogError if the logs hold too little to judge either channel.
+    """
+    began = time.perf_counter()
+    say = progress or (lambda text: None)
+    log = logs if isinstance(logs, DriveLog) else concatenate(logs)
+    analysis, notes = search(log, model, say, settings)
+    say("intervals, blind spots and the gap on held-out data")
+    final = final_fit(analysis)
+    named, unnamed = effect_findings(analysis, final), unnamed_findings(analysis)
+    geometry = final.final_body.vector if final.final_body is not None else analysis.nominal_body
+    effects, doubtful = sort_out(named, Measured(analysis.drive, (float(geometry[0]), float(geometry[1]))))
+    predictions = joint_predictions(analysis, final) if analysis.body is not None else None
+    gap = {} if predictions is None else predictions.table()
+    wheels = wheel_table(analysis)
+    # Without poses the wheels decide, where geometry says nothing: as given, timed or amended.
+    offered = offered_stage(gap or _of_wheels(wheels), bool(named or unnamed), settings)
+    spots = blind_spot_findings(analysis, named, top_rad_s)
+    if prove:
+        spots = proved(spots, finder(analysis, say), settings.report.proved_claims)
+    amended, remarks = model_of(offered, model, analysis, final, predictions)
+    return GapReport(
+        sources=log.sources,
+        channels=channel_findings(analysis, named, unnamed),
+        effects=effects,
+        unnamed=unnamed,
+        blind_spots=spots,
+        gap=gap,
+        model=amended,
+        offered=offered,
+        residue=(*residue_sentences(analysis), *drifting_parameters(analysis, final)),
+        doubtful=doubtful,
+        notes=(*log.notes, *analysis.drive.notes, *notes, *remarks),
+        candidates=candidate_evidence(analysis),
+        pictures=_drawn(analysis, gap) if pictures else {},
+        seconds=time.perf_counter() - began,
+        settings=settings,
+        wheels=wheels,
+        across=across_logs(analysis, log.begins_s),
+    )
+
+
+def _of_wheels(wheels: Mapping[str, Mapping[float, PredictionErrors]]) -> dict[str, Mapping[float, PredictionErrors]]:
+    return {**wheels, "refitted": wheels["nominal"]} if wheels else {}
+
+
+def offered_stage(gap: Mapping[str, Mapping[float, PredictionErrors]], found: bool, settings: GapSettings) -> str:
+    """The stage whose model is handed out: the amended one unless a plainer one predicts held-out data better.
+
+    Better too where the amended one is so by a single stretch only, or by little where few stretches tell: another
+    drive need not have their like. Where predictions cannot be compared it is the amended one too.
+    """
+    horizon_s, prediction = reached_horizon_s(gap, settings.prediction), settings.prediction
+    if not gap or not math.isfinite(gap["amended"][horizon_s].position_m):
+        return "amended"
+    refitted, timed, amended = (gap[stage][horizon_s] for stage in STAGES[1:4])
+    plainer, plain = ("refitted", refitted) if beats(timed, refitted, prediction) else ("timed", timed)
+    if surely_beats(plain, amended, prediction) or (not found and not clearly_worse(plain, amended, prediction)):
+        return "amended"
+    return plainer
+
+
+def model_of(
+    stage: str, model: Model, analysis: GapAnalysis, final: FinalFit, predictions: StagePredictions | None
+) -> tuple[Model, tuple[str, ...]]:
+    """The model of a stage with the joint Gaussian of its parameters, and notes."""
+    if predictions is not None and stage != "amended":
+        return simple_model(model, *predictions.joint[stage])
+    if analysis.body is None and analysis.wheels is not None and stage != "amended":
+        if stage == "refitted":
+            return model, ()
+        timed = replace(analysis, wheels=only_timed(analysis.wheels))
+        return model_of("amended", model, timed, final_fit(timed), None)
+    if predictions is not None:
+        of, joint = predictions.joint["amended"]
+
+        def moved(part: ChannelEstimates | None, channel: int) -> ChannelEstimates | None:
+            return None if part is None else at_joint_fit(part, of.parts[channel], of, joint)
+
+        final = replace(
+            final,
+            body_estimates=moved(final.body_estimates, 0),
+            wheel_estimates=moved(final.wheel_estimates, 1),
+            final_body_estimates=moved(final.final_body_estimates, 0),
+            final_body=None if final.final_body is None else replace(final.final_body, vector=joint.vectors[0]),
+        )
+    named = {effect.name: effect.parameters for effect in effect_findings(analysis, final, given=True)}
+    if final.wheel_estimates is not None:
+        values = final.wheel_estimates.by_name
+        for column in LATE_COLUMNS:
+            name, _, key = column.partition(".")
+            if name not in named and column in values:
+                named[name] = {key: values[column]}
+    return amended_model(model, named, carried_terms(analysis), channel_estimates(analysis, final))
+
+
+def _drawn(analysis: GapAnalysis, gap: dict[str, dict[float, PredictionErrors]]) -> dict[str, bytes]:
+    from disco_hw.gap.report import figures  # noqa: PLC0415  (matplotlib, slow to import)
+
+    return figures.pictures(analysis, gap)
+
+
+def missing_effects(log: DriveLog, model: Model) -> tuple[str, ...]:
+    """Only the names of what a log shows and a model lacks, the surest first; raises LogError as `find_gap`.
+
+    None where poses are predicted as well without them, from commands and with the geometry refitted: a log of two
+    minutes shows a delay of 2 ms, which nobody has to know to drive.
+    """
+    analysis, _ = search(log, model)
+    final = final_fit(analysis)
+    names = tuple(effect.name for effect in effect_findings(analysis, final))
+    if analysis.body is None or not names:
+        return names
+    stages = stage_predictions(analysis, final)
+    refitted, amended = (stages.errors(stage) for stage in ("refitted", "amended"))
+    return () if worse_by(amended, refitted) <= DEFAULT_SETTINGS.prediction.worse else names
+
+
+def search(
+    log: DriveLog,
+    model: Model,
+    say: Progress = lambda text: None,
+    settings: GapSettings = DEFAULT_SETTINGS,
+) -> tuple[GapAnalysis, list[str]]:
+    """Both channels searched, without what makes predictions worse; and notes on what could not be judged."""
+    drive = grid_drive(log, settings)
+    if not (drive.has_poses or drive.has_commands):
+        raise LogError(
+            f"{', '.join(log.sources)}: too little to judge: it needs wheel samples with poses, or with commands, "
+            "for at least some seconds of driving"
+        )
+    nominal_body, nominal_wheels = _vector(BODY, model), _vector(WHEEL, model)
+    drive = with_known_terms(drive, model.effects, nominal_body, WHEEL.at(nominal_wheels, DELAYED_BY))
+    geometry = nominal_body[:BASE_COUNT]
+    body = wheels = None
+    notes: list[str] = []
+    if drive.has_poses:
+        say("wheel to body: which effects are missing")
+        body = search_body(drive, nominal_body, _given(model, BODY))
+        geometry = body.fit.vector[:BASE_COUNT]
+    else:
+        notes.append("no poses: only the way from command to wheel is judged")
+    if drive.has_commands:
+        say("command to wheel: which effects are missing")
+        wheels = search_wheels(drive, geometry, nominal_wheels, _given(model, WHEEL))
+    else:
+        notes.append("no commands: the way from command to wheel is not judged")
+    return prune(GapAnalysis(drive, nominal_body, nominal_wheels, body, wheels)), notes
+
+
+def _vector(layout: Layout, model: Model) -> Array:
+    """The model's parameters as a channel's vector."""
+    vector = layout.neutral.copy()
+    for name, value in zip(model.parameter_names, model.point(), strict=True):
+        if name in layout.place:
+            vector[layout.place[name]] = value
+    return vector
+
+
+def _given(model: Model, layout: Layout) -> tuple[str, ...]:
+    """Effects of the model that compete in a channel."""
+    return tuple(setting.name for setting in model.effects if setting.name in candidates_of(layout))
+
+
+WRITTEN = ("report.json", "report.html", "model.toml")
+
+
+@dataclass(frozen=True)
+class GapResult:
+    """A report and the directory it was written to."""
+
+    report: GapReport
+    directory: Path
+
+    def as_dict(self) -> dict[str, Any]:
+        """The content of report.json."""
+        return self.report.as_dict()
+
+    def as_text(self) -> str:
+        """For a terminal."""
+        return f"{as_text(self.report)}\n\nwritten: {self.directory}/report.html, report.json, model.toml"
+
+
+def gap(
+    logs: Sequence[Path],
+    robot: Path,
+    out: Path,
+    model: Path | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> GapResult:
+    """Find what a model misses in logs and write everything to the directory `out`.
+
+    Raises InputError for files that cannot be used and for an `out` that cannot be written, or where an input would be
+    written over; WorkError if it cannot be written after all.
+    """
+    task, loaded = _prepared(logs, robot, out, model)
+    drive = loaded(list(logs))
+    return _written(task.report(drive, progress), robot, model, out, task.robot_name)
+
+
+@dataclass(frozen=True)
+class _Task:
+    """What every log of a robot is searched with."""
+
+    model: Model
+    top_rad_s: float
+    robot_name: str
+
+    def report(self, drive: DriveLog, progress: Progress | None = None) -> GapReport:
+        """What is missing in a drive, with pictures and proofs."""
+        return find_gap(drive, self.model, progress, pictures=True, prove=True, top_rad_s=self.top_rad_s)
+
+
+def _searched(task: _Task, drive: DriveLog) -> GapReport | str:
+    """The report of one log of a fleet, or in one line why there is none."""
+    try:
+        return task.report(drive)
+    except LogError as error:
+        return str(error)
+
+
+def _prepared(
+    logs: Sequence[Path], robot: Path, out: Path, model: Path | None, names: Sequence[str] = WRITTEN
+) -> tuple[_Task, Callable[[list[Path]], DriveLog]]:
+    """How to search logs of a robot, and what loads them; refuses what cannot be read or written."""
+    refuse_directory(out, names, [*logs, robot, *([model] if model is not None else [])])
+    config = load_robot_config(robot).robot
+    start = load_model(model) if model is not None else Model.nominal(config)
+
+    def loaded(paths: list[Path]) -> DriveLog:
+        return load_drive(paths, config.ticks_per_rev, config.wheel_radius_m)
+
+    return _Task(start, config.max_wheel_speed_rad_s, config.name), loaded
+
+
+def _written(report: GapReport, robot: Path, model: Path | None, out: Path, robot_name: str) -> GapResult:
+    made = datetime.now().astimezone().isoformat(timespec="minutes")
+    given = None if model is None else str(model)
+    report = replace(report, provenance=Provenance(robot_name, str(robot), given, made, version(), str(out)))
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        (out / "report.json").write_text(as_json(report.as_dict(), indent=1), encoding="utf-8")
+        (out / "report.html").write_text(page(report), encoding="utf-8")
+        save_model(report.model, out / "model.toml")
+        for name, picture in report.pictures.items():
+            (out / f"{name}.png").write_bytes(picture)
+    except OSError as error:
+        raise _unwritten(out, error) from None
+    return GapResult(report, out)
+
+
+def _unwritten(out: Path, error: OSError) -> WorkError:
+    return WorkError(f"{out}: cannot be written ({error.strerror}); give another directory")
+
+
+FLEET_WRITTEN = ("fleet.json", "fleet.txt")
+
+Spread = Callable[[Callable[[_Task, DriveLog], GapReport | str], _Task, Sequence[DriveLog]], Iterable[GapReport | str]]
+
+
+def gap_fleet(
+    logs: Sequence[Path],
+    robot: Path,
+    out: Path,
+    model: Path | None = None,
+    progress: Progress | None = None,
+    spread: Spread | None = None,
+) -> FleetResult:
+    """Search each log by itself, all of one kind of robot; a directory for each below `out`, and one table of all.
+
+    `spread` does the searches, in the order of the logs, in this process without it. A log that holds too little to be
+    judged gets a row that says so. Raises as `gap` does.
+    """
+    task, loaded = _prepared(logs, robot, out, model, FLEET_WRITTEN)
+    drives, say = [loaded([log]) for log in logs], progress or (lambda text: None)
+    # Logs of two directories may have one name.
+    stems = [log.stem for log in logs]
+    places = [
+        out / (stem if stems.count(stem) == 1 else f"{stem}-{1 + stems[:k].count(stem)}")
+        for k, stem in enumerate(stems)
+    ]
+    for place in places:
+        refuse_directory(place, WRITTEN, logs)
+    rows = []
+    done = (_searched(task, drive) for drive in drives) if spread is None else spread(_searched, task, drives)
+    for log, place, found in zip(logs, places, done, strict=True):
+        if isinstance(found, str):
+            rows.append(FleetRow(log, place, None, found))
+        else:
+            rows.append(FleetRow(log, place, _written(found, robot, model, place, task.robot_name).report))
+        say(f"{len(rows)} of {len(logs)}: {log}")
+    result = FleetResult(tuple(rows), out)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        (out / "fleet.json").write_text(as_json(result.as_dict(), indent=1), encoding="utf-8")
+        (out / "fleet.txt").write_text(f"{result.table()}\n", encoding="utf-8")
+    except OSError as error:
+        raise _unwritten(out, error) from None
+    return result

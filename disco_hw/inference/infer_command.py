@@ -40,7 +40,7 @@ class GapCheck:
 
 def gap_check(log: DriveLog, model: Model) -> GapCheck:
     """Search a log for effects that a model lacks."""
-    from disco_hw.gap.find import missing_effects  # noqa: PLC0415  (slow to import, needed only in that process)
+    from disco_hw.gap import missing_effects  # noqa: PLC0415  (slow to import, needed only in that process)
 
     try:
         return GapCheck(missing_effects(log, model))

@@ -12,10 +12,10 @@ import pytest
 from numba import njit
 
 import disco_hw
+from disco_hw import gap
 from disco_hw.cli import logs, robot
 from disco_hw.daemon import check, run
 from disco_hw.daemon.run import compile_beforehand, compile_progress
-from disco_hw.gap import find
 from disco_hw.inference import infer_command
 from disco_hw.model import EffectSetting, load_model, save_model
 
@@ -159,7 +159,7 @@ class Result:
 )
 def test_check_gap_and_infer_compile_for_the_model_that_they_read_or_wrote(tmp_path, monkeypatch, verb, model):
     asked = []
-    for module, name in ((check, "run_check"), (find, "gap"), (infer_command, "infer_command")):
+    for module, name in ((check, "run_check"), (gap, "gap"), (infer_command, "infer_command")):
         monkeypatch.setattr(module, name, lambda *_: Result())
     monkeypatch.setattr(run, "compile_beforehand", lambda robot_file, model, say: asked.append(model))
     verb(tmp_path)

@@ -8,7 +8,7 @@ from msgspec import inspect
 from disco_hw.config import RobotConfig, load_robot_config
 from disco_hw.errors import InputError
 from disco_hw.files import nearest
-from disco_hw.model.file import load_model
+from disco_hw.model import load_model
 from drivers.motor import motor_drivers
 from tests.config.test_robot import GOOD
 

@@ -7,9 +7,9 @@ from functools import cache
 import numpy as np
 import pytest
 
+from disco_hw import gap
 from disco_hw.errors import LogError
-from disco_hw.gap import find, find_gap
-from disco_hw.gap.find import missing_effects
+from disco_hw.gap import find_gap, missing_effects
 from disco_hw.gap.report.judge import effect_findings
 from disco_hw.gap.report.page import page
 from disco_hw.gap.search.analysis import final_fit
@@ -154,8 +154,8 @@ def searched(monkeypatch):
 
     def made(hidden, **drive):
         log = simulated_drive(hidden, **drive)
-        found = find.search(log, MODEL)
-        monkeypatch.setattr(find, "search", lambda given, model, *_: found if given is log and model is MODEL else None)
+        found = gap.search(log, MODEL)
+        monkeypatch.setattr(gap, "search", lambda given, model, *_: found if given is log and model is MODEL else None)
         return log
 
     return made
@@ -172,6 +172,6 @@ def test_the_names_alone_are_those_of_the_report(searched):
 )
 def test_what_the_log_shows_and_no_prediction_needs_is_not_missing(searched, delay_s, missing):
     log = searched({"command_delay": delay_s}, seed=903, drive="rich")
-    analysis, _ = find.search(log, MODEL)
+    analysis, _ = gap.search(log, MODEL)
     assert [effect.name for effect in effect_findings(analysis, final_fit(analysis))] == ["command_delay"]
     assert missing_effects(log, MODEL) == missing

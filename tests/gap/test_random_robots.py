@@ -7,8 +7,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from disco_hw.gap import find
-from disco_hw.gap.find import WRITTEN
+from disco_hw import gap
+from disco_hw.gap import WRITTEN
 from disco_hw.gap.search.analysis import final_fit
 from disco_hw.gap.search.stages import joint_predictions
 from disco_hw.model import Model, load_model
@@ -21,7 +21,7 @@ MODEL = Model(0.061, 0.415, 0.238)
 def searched():
     """A log in which something is hidden, what the search finds in it, and its predictions, each made once."""
     log = simulated_drive({"motor_lag": 0.15}, 1, "circle")
-    analysis, notes = find.search(log, MODEL)
+    analysis, notes = gap.search(log, MODEL)
     predictions = joint_predictions(analysis, final_fit(analysis))
     return log, analysis, notes, SimpleNamespace(table=predictions.table().copy, joint=predictions.joint)
 
@@ -51,18 +51,18 @@ def written(searched, monkeypatch, folder, seeds):
     """Whether each of some random robots is judged as slow to turn; the files of all were written and are sound."""
     log, analysis, notes, predictions = searched
     slow = []
-    monkeypatch.setattr(find, "load_drive", lambda *_: log)
+    monkeypatch.setattr(gap, "load_drive", lambda *_: log)
     # None depends on the robot's limits, and each takes long.
-    monkeypatch.setattr(find, "joint_predictions", lambda *_: predictions)
-    monkeypatch.setattr(find, "proved", lambda spots, *_: spots)
-    monkeypatch.setattr(find, "_drawn", lambda *_: {"picture": b"PNG"})
+    monkeypatch.setattr(gap, "joint_predictions", lambda *_: predictions)
+    monkeypatch.setattr(gap, "proved", lambda spots, *_: spots)
+    monkeypatch.setattr(gap, "_drawn", lambda *_: {"picture": b"PNG"})
     for seed in seeds:
         (radius_m, axial_m, fastest_rad_s), text = robot_toml(np.random.default_rng([23, seed]))
         robot, out = folder / f"{seed}.toml", folder / str(seed)
         robot.write_text(text)
         here = of_geometry(analysis, radius_m, axial_m)
-        monkeypatch.setattr(find, "search", lambda *_, here=here: (here, notes))
-        result = find.gap([], robot, out)
+        monkeypatch.setattr(gap, "search", lambda *_, here=here: (here, notes))
+        result = gap.gap([], robot, out)
         report = json.loads((out / "report.json").read_text())
         assert all(type(spot["blind"]) is bool for spot in report["blind_spots"])
         # What was asked of this robot's wheels is the same; a limit beyond it is one that the log is blind to.

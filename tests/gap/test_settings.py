@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from disco_hw.gap import find
+from disco_hw import gap
 from disco_hw.gap.data.gridded_drive import grid_drive
 from disco_hw.gap.search.channel_search import body_moves
 from disco_hw.gap.search.selection import Selector
@@ -30,7 +30,7 @@ def test_each_setting_says_where_it_comes_from(group):
 
 @pytest.mark.parametrize("group", GROUPS, ids=lambda group: group.__name__)
 def test_each_setting_is_used(group):
-    sources = "".join(path.read_text() for path in Path(find.__file__).parent.rglob("*.py"))
+    sources = "".join(path.read_text() for path in Path(gap.__file__).parent.rglob("*.py"))
     assert [field.name for field in fields(group) if not re.search(rf"\.{field.name}\b", sources)] == []
 
 

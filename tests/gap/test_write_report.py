@@ -9,11 +9,11 @@ import pytest
 from typer.testing import CliRunner
 
 import disco_hw
+from disco_hw import gap
 from disco_hw.cli.app import app
 from disco_hw.config import load_robot_config
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.errors import InputError, LogError
-from disco_hw.gap import find
 from disco_hw.gap.report.findings import STAGES, Doubt, EffectFinding, FleetRow, GapReport, UnnamedFinding
 from disco_hw.gap.search.analysis import ParameterEstimate
 from disco_hw.gap.search.cross_validation import PredictionErrors
@@ -36,11 +36,11 @@ def test_the_search_knows_what_the_robot_can_do(monkeypatch, tmp_path):
         vars(handed).update(options)
         raise EnoughError
 
-    monkeypatch.setattr(find, "load_drive", lambda *_: None)
-    monkeypatch.setattr(find, "find_gap", search)
+    monkeypatch.setattr(gap, "load_drive", lambda *_: None)
+    monkeypatch.setattr(gap, "find_gap", search)
     robot = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
     with pytest.raises(EnoughError):
-        find.gap([], robot, tmp_path)
+        gap.gap([], robot, tmp_path)
     assert handed.top_rad_s == load_robot_config(robot).robot.max_wheel_speed_rad_s
 
 
@@ -48,16 +48,16 @@ def test_a_directory_that_cannot_be_used_is_refused_before_the_search(monkeypatc
     def search(*_, **__):
         raise EnoughError
 
-    monkeypatch.setattr(find, "load_drive", search)
+    monkeypatch.setattr(gap, "load_drive", search)
     robot = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"
     given = tmp_path / "model.toml"
     given.write_bytes((robot.parent / "wombot_model.toml").read_bytes())
     with pytest.raises(InputError, match="is there and is no directory"):
-        find.gap([], robot, given)
+        gap.gap([], robot, given)
     with pytest.raises(InputError, match=r"model\.toml: would be written over, and is read here"):
-        find.gap([], robot, tmp_path, given)
+        gap.gap([], robot, tmp_path, given)
     with pytest.raises(EnoughError):
-        find.gap([], robot, tmp_path / "gap", given)
+        gap.gap([], robot, tmp_path / "gap", given)
 
 
 def report_of(name, timed_m, amended_m, offered="amended"):
@@ -92,15 +92,15 @@ def fleet(monkeypatch, tmp_path):
             raise LogError(f"{log}: too little to judge")
         return reports[log]
 
-    monkeypatch.setattr(find, "load_drive", lambda paths, *_: paths[0])
-    monkeypatch.setattr(find, "find_gap", search)
+    monkeypatch.setattr(gap, "load_drive", lambda paths, *_: paths[0])
+    monkeypatch.setattr(gap, "find_gap", search)
     return logs
 
 
 def test_a_fleet_ends_in_one_table_with_a_row_for_each_log(fleet, tmp_path):
     out = tmp_path / "out"
     said = []
-    result = find.gap_fleet(fleet, ROBOT, out, progress=said.append)
+    result = gap.gap_fleet(fleet, ROBOT, out, progress=said.append)
     head, monday, tuesday, short = (out / "fleet.txt").read_text().splitlines()
     assert head.split() == ["log", "found", "doubtful", "ahead", "timed", "offered", "floor", "model"]
     assert monday.split("  ")[0] == str(fleet[0])
@@ -155,7 +155,7 @@ def test_reports_of_a_fleet_are_written_over_no_log(fleet, tmp_path):
     inside.parent.mkdir(parents=True)
     inside.write_bytes(b"a log too")
     with pytest.raises(InputError, match="would be written over, and is read here"):
-        find.gap_fleet([fleet[0], inside], ROBOT, tmp_path / "out")
+        gap.gap_fleet([fleet[0], inside], ROBOT, tmp_path / "out")
 
 
 def test_a_log_of_a_fleet_without_poses_is_told_by_its_wheels():
@@ -187,7 +187,7 @@ def test_a_cluster_makes_the_same_table(tmp_path):
             app, ["gap", *map(str, logs), "--robot", str(ROBOT), "-o", str(tmp_path / "far"), *address]
         )
     assert answer.exit_code == 0, answer.output
-    here = find.gap_fleet(logs, ROBOT, tmp_path / "here")
+    here = gap.gap_fleet(logs, ROBOT, tmp_path / "here")
     assert (tmp_path / "far" / "fleet.txt").read_text() == (tmp_path / "here" / "fleet.txt").read_text()
     assert here.table() in answer.output
     assert (tmp_path / "far" / "drive2" / "report.html").stat().st_size > 10_000

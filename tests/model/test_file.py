@@ -11,8 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from disco_hw.errors import InputError
-from disco_hw.model import EffectSetting, Gaussian, Mixture, Model, Uniform, load_model, save_model
-from disco_hw.model.file import model_text
+from disco_hw.model import EffectSetting, Gaussian, Mixture, Model, Uniform, load_model, model_text, save_model
 
 SHIPPED = Path(__file__).parents[2] / "disco_hw/robots/wombot_model.toml"
 

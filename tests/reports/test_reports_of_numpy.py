@@ -19,7 +19,7 @@ from disco_hw.experiments.circle import CircleOptions, CircleResult, Run
 from disco_hw.experiments.circle_report import CircleReport
 from disco_hw.experiments.gap import RUNS, GapExperimentResult, Lap
 from disco_hw.experiments.pendulum import PendulumOptions, PendulumResult
-from disco_hw.gap.find import GapResult
+from disco_hw.gap import GapResult
 from disco_hw.gap.report.blind_spots import BlindSpot
 from disco_hw.gap.report.findings import (
     STAGES,

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from disco_hw.gap.find import offered_stage
+from disco_hw.gap import offered_stage
 from disco_hw.gap.report.blind_spots import BlindSpot
 from disco_hw.gap.report.findings import STAGES, AcrossLogs, EffectFinding, GapReport, Provenance, UnnamedFinding
 from disco_hw.gap.report.page import answer, as_text, page, sentence

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from disco_hw.gap import model_of, offered_stage
 from disco_hw.gap.data.free_runs import run_wheels
 from disco_hw.gap.data.layout import BODY, WHEEL
-from disco_hw.gap.find import model_of, offered_stage
 from disco_hw.gap.noise.channels import WheelChannel
 from disco_hw.gap.noise.wheel_noise import WheelNoise
 from disco_hw.gap.report.findings import GapReport
