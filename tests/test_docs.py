@@ -98,10 +98,11 @@ def test_a_wrong_command_would_be_seen():
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if not page.name.startswith("add-a")], ids=names)
-def test_every_tool_and_test_that_a_page_names_is_there(page):
+def test_every_file_tool_and_test_that_a_page_names_is_there(page):
     text = page.read_text(encoding="utf-8")
     paths = {f"{module.replace('.', '/')}.py" for module in re.findall(r"python -m (tools[.\w]+)\b", text)}
     paths |= set(re.findall(r"\btests/[\w/\-.]*\w", text))
+    paths |= set(re.findall(r"(?<![\w/])(?:disco_hw|drivers|sim|firmware_protocol)/[\w/\-.@]*\.[a-z]+\b", text))
     assert [path for path in paths if not (ROOT / path).exists()] == []
 
 
