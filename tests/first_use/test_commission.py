@@ -179,12 +179,14 @@ def sound_stages(tmp_path, number, driver):
 
 
 @pytest.mark.long
+@pytest.mark.timeout(1800)
 @pytest.mark.parametrize("number", range(20))
 def test_twenty_sound_robots_have_no_fault(tmp_path, number):
     assert sound_stages(tmp_path, number, DRIVERS[number % len(DRIVERS)]) == []
 
 
 @pytest.mark.long
+@pytest.mark.timeout(1800)
 @pytest.mark.parametrize("driver", DRIVERS)
 @pytest.mark.parametrize("wrong", WRONG)
 def test_every_fault_is_found_with_every_driver(tmp_path, driver, wrong):

@@ -49,7 +49,9 @@ class Reader:
         shutil.copytree(ROOT / "disco_hw" / "robots", robots)
         shipped = (robots / "wombot.toml").read_text("utf-8")
         (robots / "wombot.toml").write_text(shipped.replace("/tmp/disco-hw-wombot", str(directory / "wombot")))
-        self._environment = {**os.environ, "XDG_RUNTIME_DIR": str(directory)}
+        # The folder of the robots is named as the package, and must not be taken for it.
+        self._environment = {**os.environ, "XDG_RUNTIME_DIR": str(directory), "PYTHONPATH": str(ROOT)}
+        self._beside: list[subprocess.Popen] = []
 
     def _command(self, line: str, **placeholders: str) -> list[str]:
         program, *words = line.split()
@@ -82,9 +84,11 @@ class Reader:
             process = subprocess.Popen(
                 self._command(line), cwd=self._directory, env=self._environment, stdout=sink, stderr=sink
             )
+        self._beside.append(process)
         try:
             yield process
         finally:
+            self._beside.remove(process)
             if process.poll() is None:
                 process.send_signal(signal.SIGINT)
             try:
@@ -98,7 +102,7 @@ class Reader:
 
     def wait(self, what: str, condition, timeout_s: float = 1800.0) -> None:
         deadline_s, status = time.monotonic() + timeout_s, None
-        while time.monotonic() < deadline_s:
+        while time.monotonic() < deadline_s and all(process.poll() is None for process in self._beside):
             result = subprocess.run(
                 [sys.executable, "-m", "disco_hw", "ctl", ROBOT, "status", "--json"],
                 cwd=self._directory, env=self._environment, capture_output=True, text=True, timeout=60, check=False,
@@ -107,7 +111,8 @@ class Reader:
             if status is not None and condition(status):
                 return
             time.sleep(0.2)
-        raise AssertionError(f"not {what}: {status}")
+        ended = [process.args for process in self._beside if process.poll() is not None]
+        raise AssertionError(f"not {what}: {status}; ended: {ended}")
 
     def wait_for(self, state: str) -> None:
         self.wait(state, lambda status: status["state"] == state)
