@@ -12,8 +12,7 @@ from msgspec import Meta
 
 from disco_hw.errors import InputError
 from disco_hw.files import ROBOT_TOML, in_words, read_toml
-from drivers.motor import DriverFieldError, UnknownDriverError, find_driver, own_fields
-from drivers.motor.wiring import AS_TOLD, Wiring
+from drivers.motor import AS_TOLD, DriverFieldError, UnknownDriverError, Wiring, find_driver, own_fields
 from drivers.pose import DEFAULT, PoseConvention, PoseSourceError, find_pose_source, pose_sources
 from drivers.pose import own_fields as own_pose_fields
 

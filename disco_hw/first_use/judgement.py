@@ -25,7 +25,7 @@ from disco_hw.first_use.procedure import (
     Track,
     TurnsSeen,
 )
-from drivers.motor.wiring import Wiring
+from drivers.motor import Wiring
 from drivers.pose import PoseConvention
 from drivers.types import PoseSample
 

@@ -29,8 +29,7 @@ from disco_hw.runtime.pipeline import Governor, Pipeline, Planner, WheelLimits
 from disco_hw.runtime.preflight import check_firmware_limits, check_task, failures
 from disco_hw.runtime.robot_setup import Setup, geometry
 from disco_hw.runtime.supervisor import Supervisor, SupervisorSettings
-from drivers.motor import make_driver
-from drivers.motor.wiring import rewired
+from drivers.motor import make_driver, rewired
 from drivers.pose import PoseSourceError, SeveralPoses, converted, make_pose_source
 from drivers.transport import ReconnectingTransport, TransportSettingsError, make_transport
 from drivers.types import Driver, PoseSource, Transport

@@ -16,7 +16,7 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 
-from drivers.motor.wiring import Wiring
+from drivers.motor import Wiring
 from drivers.types import PoseSample, PowerSample, WheelCommand, WheelSample
 
 COMMANDS_OF_LATE_NS = 600_000_000

@@ -1,15 +1,36 @@
-"""Motor controllers, one file each, of which robot.toml's `link.driver` names one; see docs/add-a-motor-driver.md."""
+"""Motor controllers, one file each, of which robot.toml's `link.driver` names one; see docs/add-a-motor-driver.md.
+
+And how the wheels are wired to a controller's two sides, where that is not as it believes, for every driver: what its
+own fields in [link], or the controller's settings, have right needs nothing here.
+"""
 
 from __future__ import annotations
 
 import pkgutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache
 from importlib import import_module
 from types import MappingProxyType
-from typing import Any
+from typing import Annotated, Any, Literal
 
-from drivers.types import Driver, MotorDriver
+import msgspec
+from msgspec import Meta
+
+from drivers.types import (
+    Driver,
+    DriverState,
+    DriverStats,
+    Identity,
+    Limits,
+    MotorDriver,
+    MotorSample,
+    OutgoingFrame,
+    Readings,
+    ReceivedFrame,
+    Request,
+    WheelCommand,
+    WheelSample,
+)
 
 DEFAULT = "reference"
 
@@ -71,3 +92,133 @@ def own_fields(name: str | None, fields: Mapping[str, Any]) -> dict[str, Any]:
             if field in other.settings.__struct_fields__ and field not in own:
                 raise DriverFieldError(field, f"a field of the driver {other.name}, and link.driver is {found.name}")
     return own
+
+
+_Sign = Literal[-1, 1]
+
+
+class Wiring(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Left before right, of the robot's real sides.
+
+    `sides_swapped`: the controller's left drives the right wheels. `encoders_swapped`: the encoder of a wheel is on the
+    other side than its motor. `motor_direction`, `encoder_direction`: -1 where forward is backward. `turn_ratio`: true
+    turns of a wheel for each turn that the controller believes.
+    """
+
+    sides_swapped: bool = False
+    encoders_swapped: bool = False
+    motor_direction: tuple[_Sign, _Sign] = (1, 1)
+    encoder_direction: tuple[_Sign, _Sign] = (1, 1)
+    turn_ratio: Annotated[float, Meta(ge=0.01, le=100.0)] = 1.0
+
+
+AS_TOLD = Wiring()
+
+
+class RewiredDriver:
+    """A driver behind a wiring; satisfies `drivers.types.Driver`."""
+
+    def __init__(self, driver: Driver, wiring: Wiring) -> None:
+        self._driver = driver
+        self._wiring = wiring
+
+    @property
+    def state(self) -> DriverState:
+        """The driver's."""
+        return self._driver.state
+
+    @property
+    def detail(self) -> str:
+        """The driver's."""
+        return self._driver.detail
+
+    @property
+    def identity(self) -> Identity | None:
+        """The driver's."""
+        return self._driver.identity
+
+    @property
+    def limits(self) -> Limits | None:
+        """The driver's."""
+        return self._driver.limits
+
+    @property
+    def stats(self) -> DriverStats:
+        """The driver's."""
+        return self._driver.stats
+
+    @property
+    def clock_offset_ns(self) -> int | None:
+        """The driver's."""
+        return self._driver.clock_offset_ns
+
+    def link_up(self, now_ns: int) -> None:
+        """Pass on."""
+        self._driver.link_up(now_ns)
+
+    def link_down(self, now_ns: int) -> None:
+        """Pass on."""
+        self._driver.link_down(now_ns)
+
+    def request(self, request: Request) -> None:
+        """Pass on."""
+        self._driver.request(request)
+
+    def estop(self, now_ns: int) -> tuple[OutgoingFrame, ...]:
+        """Pass on: an e-stop knows no sides."""
+        return self._driver.estop(now_ns)
+
+    def receive(self, now_ns: int, frames: Sequence[ReceivedFrame]) -> Readings:
+        """What the frames meant, of the wheels as they are wired."""
+        readings = self._driver.receive(now_ns, frames)
+        return msgspec.structs.replace(
+            readings,
+            wheels=tuple(self._wheels(sample) for sample in readings.wheels),
+            motors=tuple(self._motors(sample) for sample in readings.motors),
+        )
+
+    def transmit(self, now_ns: int, command: WheelCommand | None) -> tuple[OutgoingFrame, ...]:
+        """Frames due now, with the command for the sides as they are wired."""
+        return self._driver.transmit(now_ns, None if command is None else self._command(command))
+
+    def _command(self, command: WheelCommand) -> WheelCommand:
+        wiring = self._wiring
+        left = wiring.motor_direction[0] * command.left_rad_s / wiring.turn_ratio
+        right = wiring.motor_direction[1] * command.right_rad_s / wiring.turn_ratio
+        if wiring.sides_swapped:
+            left, right = right, left
+        return WheelCommand(left, right, command.valid_for_s)
+
+    def _wheels(self, sample: WheelSample) -> WheelSample:
+        wiring = self._wiring
+        left, right = (
+            (sample.left_angle_rad, sample.left_speed_rad_s),
+            (sample.right_angle_rad, sample.right_speed_rad_s),
+        )
+        if wiring.sides_swapped != wiring.encoders_swapped:
+            left, right = right, left
+        on_left, on_right = (wiring.turn_ratio * direction for direction in wiring.encoder_direction)
+        return WheelSample(
+            sample.t_ns,
+            sample.received_ns,
+            on_left * left[0],
+            on_right * right[0],
+            on_left * left[1],
+            on_right * right[1],
+        )
+
+    def _motors(self, sample: MotorSample) -> MotorSample:
+        if not self._wiring.sides_swapped:
+            return sample
+        return MotorSample(
+            sample.t_ns,
+            sample.right_current_a,
+            sample.left_current_a,
+            sample.right_temperature_c,
+            sample.left_temperature_c,
+        )
+
+
+def rewired(driver: Driver, wiring: Wiring) -> Driver:
+    """The driver for wheels that are wired so; itself where nothing is to be changed."""
+    return driver if wiring == AS_TOLD else RewiredDriver(driver, wiring)

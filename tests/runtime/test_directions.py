@@ -9,7 +9,7 @@ import pytest
 from disco_hw.runtime.plausibility import Directions
 from disco_hw.runtime.states import State
 from disco_hw.runtime.supervisor import UserRequest
-from drivers.motor.wiring import AS_TOLD, Wiring, rewired
+from drivers.motor import AS_TOLD, Wiring, rewired
 from drivers.types import PoseSample, WheelCommand, WheelSample
 from sim.plant_parameters import PlantParameters
 from tests.drivers.motor.vendors import VENDORS

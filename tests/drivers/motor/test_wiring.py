@@ -6,8 +6,7 @@ import itertools
 
 import pytest
 
-from drivers.motor import make_driver
-from drivers.motor.wiring import AS_TOLD, Wiring, rewired
+from drivers.motor import AS_TOLD, Wiring, make_driver, rewired
 from drivers.types import DriverState, MotorSample, Readings, WheelCommand, WheelSample
 
 
