@@ -12,8 +12,18 @@ from dataclasses import dataclass
 
 from disco_hw.bridge import ros2_messages as msg
 from disco_hw.config import RobotConfig
-from disco_hw.estimation.odometry import Matrix3, OdometryParameters, Pose, WheelReading, WheelTracker, arc
-from disco_hw.estimation.pose_belief import PoseBelief, belief_at, motion_model, predict
+from disco_hw.estimation.odometry import (
+    Matrix3,
+    OdometryParameters,
+    Pose,
+    PoseBelief,
+    WheelReading,
+    WheelTracker,
+    arc,
+    belief_at,
+    motion_model,
+    predict,
+)
 from disco_hw.log import records
 from drivers.pose.ros2 import SOURCE as ROS2_POSES
 from drivers.types import WheelSample

@@ -22,8 +22,15 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.estimation.odometry import OdometryParameters, Pose, wrap
-from disco_hw.estimation.pose_belief import MAX_POSITION_VARIANCE, MAX_YAW_VARIANCE, Flat9, PoseBelief
+from disco_hw.estimation.odometry import (
+    MAX_POSITION_VARIANCE,
+    MAX_YAW_VARIANCE,
+    Flat9,
+    OdometryParameters,
+    Pose,
+    PoseBelief,
+    wrap,
+)
 from disco_hw.model.disturbance import NO_DISTURBANCE, Disturbance
 from drivers.types import PoseSample
 

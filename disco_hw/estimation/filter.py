@@ -12,8 +12,19 @@ import msgspec
 
 from disco_hw.config import Estimation
 from disco_hw.estimation.correction import Correction, Measurement, PoseCorrector, PoseReason, Triple, gate_limit
-from disco_hw.estimation.odometry import OdometryParameters, Pose, WheelReading, arc, wrap
-from disco_hw.estimation.pose_belief import MotionModel, PoseBelief, belief_at, motion_model, predict, rebased
+from disco_hw.estimation.odometry import (
+    MotionModel,
+    OdometryParameters,
+    Pose,
+    PoseBelief,
+    WheelReading,
+    arc,
+    belief_at,
+    motion_model,
+    predict,
+    rebased,
+    wrap,
+)
 from disco_hw.model.disturbance import NO_DISTURBANCE, Disturbance
 
 # Without newer samples the wheels are taken to keep their speeds for so long, then to stand.

@@ -16,6 +16,8 @@ from disco_hw.estimation.correction import Measurement, PoseReason, PoseUpdate, 
 from disco_hw.estimation.filter import FilterState, HeadingSearch, Judgement, PoseFilter
 from disco_hw.estimation.odometry import (
     FUTURE_TOLERANCE_NS,
+    MAX_POSITION_VARIANCE,
+    MAX_YAW_VARIANCE,
     Matrix3,
     OdometryParameters,
     Pose,
@@ -23,7 +25,6 @@ from disco_hw.estimation.odometry import (
     WheelReason,
     WheelTracker,
 )
-from disco_hw.estimation.pose_belief import MAX_POSITION_VARIANCE, MAX_YAW_VARIANCE
 from disco_hw.estimation.pose_sources import PoseSources
 from disco_hw.model.disturbance import Disturbance
 from drivers.types import PoseSample, WheelSample

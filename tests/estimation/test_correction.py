@@ -8,8 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from disco_hw.estimation.correction import FLOOR_VARIANCE, Measurement, PoseCorrector
-from disco_hw.estimation.odometry import Pose
-from disco_hw.estimation.pose_belief import PoseBelief
+from disco_hw.estimation.odometry import Pose, PoseBelief
 
 
 def belief_of(mean, covariance, sensitivity=None):

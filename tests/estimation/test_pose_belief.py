@@ -8,13 +8,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from disco_hw.config import Estimation
-from disco_hw.estimation.odometry import OdometryParameters, Pose, arc, moved
-from disco_hw.estimation.pose_belief import (
+from disco_hw.estimation.odometry import (
     MAX_POSITION_VARIANCE,
     MAX_YAW_VARIANCE,
+    OdometryParameters,
+    Pose,
     PoseBelief,
+    arc,
     belief_at,
     motion_model,
+    moved,
     predict,
 )
 

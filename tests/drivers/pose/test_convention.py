@@ -9,7 +9,7 @@ import pytest
 from disco_hw.config import load_robot_config
 from disco_hw.errors import InputError
 from disco_hw.runtime.assembly import driver_of, pose_source_of
-from drivers.motor.wiring import RewiredDriver
+from drivers.motor import RewiredDriver
 from drivers.pose import PoseConvention
 from drivers.types import PoseSample
 
