@@ -22,8 +22,8 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 
 from disco_hw.gap import model_of, offered_stage, search
+from disco_hw.gap.data import BODY, DELAYED_BY, WHEEL, Layout
 from disco_hw.gap.data.gridded_drive import GriddedDrive, grid_drive
-from disco_hw.gap.data.layout import BODY, DELAYED_BY, WHEEL, Layout
 from disco_hw.gap.noise.body_noise import BodyNoise
 from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
 from disco_hw.gap.noise.wheel_noise import WheelNoise

@@ -18,8 +18,8 @@ from pathlib import Path
 # Each process works alone on one log: a second thread for its small matrices would only be in another one's way.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+from disco_hw.gap.data import BODY, WHEEL
 from disco_hw.gap.data.gridded_drive import grid_drive
-from disco_hw.gap.data.layout import BODY, WHEEL
 from disco_hw.gap.search.channel_search import ChannelResult, search_body, search_wheels
 from disco_hw.gap.search.richest_model import LATE, LATE_COLUMNS, OLD_POSE_COLUMNS
 from disco_hw.log.drive import DriveLog

@@ -26,7 +26,7 @@ from disco_hw.experiments.circle_report import circle_figures
 from disco_hw.experiments.simulated_time import SimulatedRun, virtual_robot
 from disco_hw.experiments.virtual import true_parameters
 from disco_hw.gap import WRITTEN, gap
-from disco_hw.gap.report.findings import STAGES, GapReport
+from disco_hw.gap.report import STAGES, GapReport
 from disco_hw.gap.report.page import answer
 from disco_hw.model import EffectSetting, Gaussian, Model
 from disco_hw.model.model import BASE_PARAMETERS

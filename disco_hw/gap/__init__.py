@@ -18,11 +18,9 @@ from numpy.typing import NDArray
 
 from disco_hw.config import load_robot_config
 from disco_hw.errors import LogError, WorkError
+from disco_hw.gap.data import BASE_COUNT, BODY, DELAYED_BY, WHEEL, Layout
 from disco_hw.gap.data.gridded_drive import grid_drive
-from disco_hw.gap.data.layout import BASE_COUNT, BODY, DELAYED_BY, WHEEL, Layout
-from disco_hw.gap.report.amend import amended_model, at_joint_fit, carried_terms, channel_estimates, simple_model
-from disco_hw.gap.report.blind_spots import finder, proved
-from disco_hw.gap.report.findings import (
+from disco_hw.gap.report import (
     STAGES,
     FleetResult,
     FleetRow,
@@ -30,6 +28,8 @@ from disco_hw.gap.report.findings import (
     Provenance,
     reached_horizon_s,
 )
+from disco_hw.gap.report.amend import amended_model, at_joint_fit, carried_terms, channel_estimates, simple_model
+from disco_hw.gap.report.blind_spots import finder, proved
 from disco_hw.gap.report.judge import (
     Measured,
     across_logs,

@@ -43,7 +43,7 @@ import json, sys
 from pathlib import Path
 import numpy as np
 from disco_hw.effects.registry import REGISTRY
-from disco_hw.gap.data.layout import BODY, WHEEL, pose_sensor
+from disco_hw.gap.data import BODY, WHEEL, pose_sensor
 from disco_hw.gap.search.richest_model import candidates_of, smooth_of
 from disco_hw.gap.search.analysis import OUTSIDE_TESTS, confounded_with
 from disco_hw.gap.search.analysis import _OF_TURNING

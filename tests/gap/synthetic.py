@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from disco_hw.gap.data import BODY
 from disco_hw.gap.data.free_runs import read_angles
 from disco_hw.gap.data.gridded_drive import GriddedDrive, GridSamples
-from disco_hw.gap.data.layout import BODY
 from disco_hw.gap.noise.body_noise import BodyNoise
 from disco_hw.gap.noise.channels import BodyChannel
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S

@@ -20,8 +20,7 @@ from disco_hw.experiments.circle_report import CircleReport
 from disco_hw.experiments.gap import RUNS, GapExperimentResult, Lap
 from disco_hw.experiments.pendulum import PendulumOptions, PendulumResult
 from disco_hw.gap import GapResult
-from disco_hw.gap.report.blind_spots import BlindSpot
-from disco_hw.gap.report.findings import (
+from disco_hw.gap.report import (
     STAGES,
     CandidateEvidence,
     ChannelFinding,
@@ -29,6 +28,7 @@ from disco_hw.gap.report.findings import (
     GapReport,
     UnnamedFinding,
 )
+from disco_hw.gap.report.blind_spots import BlindSpot
 from disco_hw.gap.search.analysis import ParameterEstimate
 from disco_hw.gap.search.cross_validation import PredictionErrors
 from disco_hw.inference.checks import CHECKS, Predictive

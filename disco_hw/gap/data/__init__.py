@@ -1,1 +1,191 @@
-"""What the search reads: a drive on an even grid, parameter vectors, free runs of the model."""
+"""What the search reads: a drive on an even grid, parameter vectors, free runs of the model.
+
+Here is the parameter vector of each channel: every parameter of every effect in the registry, by full name. At its
+neutral value an effect changes nothing, so one vector and one compiled free run serve every set of effects.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from disco_hw.effects.effect import Channel, Effect, Parameter, Stage, asks_for
+from disco_hw.effects.registry import DELAY, MOTION_EFFECTS, REGISTRY, in_stages
+from disco_hw.gap.settings import GRID_STEP_S
+from disco_hw.model.coefficients import Base, Coefficients, Effects
+from disco_hw.model.model import BASE_PARAMETERS
+
+Array = NDArray[np.float64]
+
+BASE_COUNT = len(BASE_PARAMETERS)
+
+# Difference steps by unit: well above rounding, well below what a log resolves.
+_STEPS: Mapping[str, float] = {
+    "s": 2e-3,
+    "rad/s": 2e-2,
+    "rad/s^2": 1e-2,
+    "m": 1e-4,
+    "m/s": 1e-4,
+    "rad": 1e-3,
+    "1": 2e-4,
+}
+_OTHER_STEP = 1e-3
+_UNLIMITED = 1e6
+# Wheel speed (rad/s) at which whatever sets in with motion has set in.
+_FAST_RAD_S = 1e6
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Columns of a channel's vector, its neutral point, how each varies; `of_wheels`: which of the two channels.
+
+    `precision`: how surely an entry is near its neutral value before a log is looked at, mostly 0.
+    """
+
+    of_wheels: bool
+    columns: tuple[str, ...]
+    neutral: Array
+    step: Array
+    low: Array
+    high: Array
+    precision: Array
+    place: Mapping[str, int]
+
+    def at(self, p: Array, name: str) -> float:
+        """One entry of a vector."""
+        return float(p[self.place[name]])
+
+
+def _layout(parameters: Mapping[str, Parameter], base: int) -> Layout:
+    columns = tuple(parameters)
+    neutral = np.array([min(p.neutral, _UNLIMITED) for p in parameters.values()])
+    low = np.array([p.low if p.least_fitted is None else p.least_fitted for p in parameters.values()])
+    return Layout(
+        of_wheels=base == 0,
+        columns=columns,
+        neutral=neutral,
+        step=np.array(
+            [1e-4 if k < base else _STEPS.get(p.unit, _OTHER_STEP) for k, p in enumerate(parameters.values())]
+        ),
+        low=low,
+        high=np.array([max(p.high, p.neutral if p.neutral < np.inf else _UNLIMITED) for p in parameters.values()]),
+        precision=np.array([p.expected**-2.0 for p in parameters.values()]),
+        place=MappingProxyType({name: k for k, name in enumerate(columns)}),
+    )
+
+
+def _of_channels(*channels: Channel) -> dict[str, Parameter]:
+    return {
+        f"{name}.{parameter.name}": parameter
+        for name, effect in REGISTRY.items()
+        if effect.channel in channels or effect.stage is Stage.ENCODERS
+        for parameter in effect.parameters
+    }
+
+
+WHEEL = _layout(_of_channels(Channel.COMMAND_TO_WHEEL), 0)
+BODY = _layout(
+    {p.name: p for p in BASE_PARAMETERS} | _of_channels(Channel.WHEEL_TO_BODY, Channel.POSE_SENSOR), BASE_COUNT
+)
+
+
+def _spans(layout: Layout) -> Mapping[str, slice]:
+    """Where each effect's parameters lie, which follow each other."""
+    first: dict[str, int] = {}
+    count: dict[str, int] = {}
+    for k, column in enumerate(layout.columns):
+        name = column.partition(".")[0]
+        first.setdefault(name, k)
+        count[name] = count.get(name, 0) + 1
+    return MappingProxyType({name: slice(first[name], first[name] + count[name]) for name in first})
+
+
+_SPANS: Mapping[bool, Mapping[str, slice]] = MappingProxyType(
+    {layout.of_wheels: _spans(layout) for layout in (WHEEL, BODY)}
+)
+
+
+def _coefficients(layout: Layout, p: Array, name: str, base: tuple[float, ...]) -> tuple[float, ...]:
+    return _kept(name, tuple(p[_SPANS[layout.of_wheels][name]].tolist()), base)
+
+
+# From one free run to the next most effects stay as they are.
+@lru_cache(maxsize=512)
+def _kept(name: str, values: tuple[float, ...], base: tuple[float, ...]) -> tuple[float, ...]:
+    columns = REGISTRY[name].coefficients(np.array([values]), np.array([base]), GRID_STEP_S)
+    return tuple(float(column[0]) for column in columns)
+
+
+# The delay is the free run's own affair, what acts in the world that of who lays its path on poses.
+_IN_STEP = [name for name in MOTION_EFFECTS if REGISTRY[name].stage not in (Stage.DELAY, Stage.WORLD)]
+WHEEL_MOTION = tuple(name for name in _IN_STEP if REGISTRY[name].channel is Channel.COMMAND_TO_WHEEL)
+BODY_MOTION = tuple(name for name in _IN_STEP if REGISTRY[name].channel is Channel.WHEEL_TO_BODY)
+DELAYED_BY = DELAY.columns[0]
+# What the encoders count wrong, in either channel's vector.
+ENCODER_COLUMNS = tuple(column for effect in in_stages(Stage.ENCODERS) for column in effect.columns)
+
+
+class PoseSensor(NamedTuple):
+    """What a vector of the body channel says of the poses: how old they are (s), where the sensor sits ahead and to the
+    left of the tracked point (m), how far its yaw is off (rad), and the drift of a moving robot in the world (m/s).
+    """
+
+    late_s: float
+    forward_m: float
+    left_m: float
+    bias_rad: float
+    drift_x_m_s: float
+    drift_y_m_s: float
+
+
+def pose_sensor(p: Array) -> PoseSensor:
+    """The sensor of a vector in the order of `BODY.columns`."""
+    late_s = -sum(float(_plain(BODY, p, effect, time_s=0.0)) for effect in in_stages(Stage.POSE_TIME))
+    mount = 0.0, 0.0, 0.0
+    for effect in in_stages(Stage.POSE):
+        mount = _plain(BODY, p, effect, x=mount[0], y=mount[1], yaw=mount[2])
+    drift = 0.0, 0.0
+    for effect in in_stages(Stage.WORLD):
+        moving = {"wheel_sum": _FAST_RAD_S, "difference": 0.0, "time_s": 0.0}
+        drift = _plain(BODY, p, effect, x=drift[0], y=drift[1], **moving)
+    return PoseSensor(late_s, *(float(each) for each in (*mount, *drift)))
+
+
+def counted(layout: Layout, p: Array) -> tuple[float, float]:
+    """How many turns the left and right encoder count for one of their wheel."""
+    turns = 1.0, 1.0
+    for effect in in_stages(Stage.ENCODERS):
+        turns = _plain(layout, p, effect, left=turns[0], right=turns[1])
+    return float(turns[0]), float(turns[1])
+
+
+def _plain(layout: Layout, p: Array, effect: Effect, **motion: float) -> Any:
+    """What an effect makes of the motion in a second, at a vector."""
+    known = {"values": tuple(p[_SPANS[layout.of_wheels][effect.name]].tolist()), "step_s": 1.0, **motion}
+    known["geometry"] = tuple(p[:BASE_COUNT].tolist())
+    return effect.plain(**{name: known[name] for name in asks_for(effect.plain)})
+
+
+def wheel_effects(p: Array, geometry: Array) -> Coefficients:
+    """What the model's wheel step needs at a vector of the wheel channel; `geometry` (3,) serves yaw-rate limits."""
+    base = tuple(geometry[:BASE_COUNT].tolist())
+    given = {name: _coefficients(WHEEL, p, name, base) for name in WHEEL_MOTION}
+    made: Coefficients = Effects(**{name: given.get(name) for name in MOTION_EFFECTS})
+    return made
+
+
+def body_effects(p: Array) -> tuple[Base, Coefficients]:
+    """What the model's body velocity needs at a vector of the body channel."""
+    base = tuple(p[:BASE_COUNT].tolist())
+    given = {name: _coefficients(BODY, p, name, base) for name in BODY_MOTION}
+    radius, axial, x_icr = base
+    return (
+        Base(0.5 * radius, 0.5 * radius / axial, x_icr),
+        Effects(**{name: given.get(name) for name in MOTION_EFFECTS}),
+    )

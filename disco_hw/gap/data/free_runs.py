@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.gap.data.layout import BODY, DELAYED_BY, WHEEL, body_effects, counted, pose_sensor, wheel_effects
+from disco_hw.gap.data import BODY, DELAYED_BY, WHEEL, body_effects, counted, pose_sensor, wheel_effects
 from disco_hw.gap.settings import GRID_STEP_S, GridSettings
 from disco_hw.jit import kernel_function, scalar_function
 from disco_hw.model.step import body_velocity, wheel_step

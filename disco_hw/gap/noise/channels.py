@@ -12,9 +12,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from disco_hw.gap.data import BASE_COUNT, BODY, WHEEL, Layout
 from disco_hw.gap.data.free_runs import pose_residual, read_angles, run_body, run_wheels
 from disco_hw.gap.data.gridded_drive import GriddedDrive, GridSamples
-from disco_hw.gap.data.layout import BASE_COUNT, BODY, WHEEL, Layout
 from disco_hw.gap.noise.body_noise import BodyGains, BodyMotion, BodyNoise, body_gains, whiten_body
 from disco_hw.gap.noise.wheel_noise import (
     WheelGains,

@@ -1,1 +1,352 @@
-"""What is said of it: findings, what a log could not show, the amended model, page and figures."""
+"""What is said of it: findings, what a log could not show, the amended model, page and figures.
+
+Here is the answer as data: verdict, effects with intervals, what is unnamed, what could not be seen, the held-out gap.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from disco_hw.effects.registry import REGISTRY
+from disco_hw.gap.report.blind_spots import BlindSpot
+from disco_hw.gap.search.analysis import ParameterEstimate
+from disco_hw.gap.search.cross_validation import PredictionErrors, beats, beats_throughout, stretches_telling
+from disco_hw.gap.settings import DEFAULT_SETTINGS, GapSettings, PredictionSettings
+from disco_hw.model import Model
+
+STAGES = ("nominal", "refitted", "timed", "amended", "floor")
+ALL_IN_ONE = "separate"
+
+
+def reached_horizon_s(gap: Mapping[str, Mapping[float, PredictionErrors]], settings: PredictionSettings) -> float:
+    """How far ahead an answer looks: as the settings say, or the longest below that runs are long enough for."""
+    errors = gap.get("timed", {})
+    reached = [s for s, e in errors.items() if s <= settings.reported_horizon_s and math.isfinite(e.position_m)]
+    return max(reached, default=settings.reported_horizon_s)
+
+
+@dataclass(frozen=True, slots=True)
+class ChannelFinding:
+    """Whether simulation and data disagree in a channel, and in which regimes most."""
+
+    name: str
+    significant: bool
+    where: str
+
+
+@dataclass(frozen=True)
+class EffectFinding:
+    """An effect that is missing: its parameters, evidence (score), and what is confounded with it."""
+
+    name: str
+    channel: str
+    parameters: dict[str, ParameterEstimate]
+    evidence: float
+    indistinguishable_from: tuple[str, ...] = ()
+    experiment: str | None = None
+
+
+@dataclass(frozen=True)
+class UnnamedFinding:
+    """Something missing that is none of the named effects, as a term of the model, and what is confounded with it."""
+
+    channel: str
+    form: str
+    evidence: float
+    in_model: bool = True
+    indistinguishable_from: tuple[str, ...] = ()
+    experiment: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Doubt:
+    """An effect that fits and is not reported as found, and why."""
+
+    name: str
+    why: str
+
+
+@dataclass(frozen=True, slots=True)
+class AcrossLogs:
+    """A parameter in each of several logs of one robot, as (value, low, high), and whether they differ."""
+
+    name: str
+    values: tuple[tuple[float, float, float], ...]
+    differs: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Provenance:
+    """Whose logs were searched, with which files, when (ISO 8601) and by which version; where the answer lies."""
+
+    robot: str
+    robot_file: str
+    model_file: str | None
+    date: str
+    version: str
+    directory: str
+
+    @property
+    def go_on(self) -> str:
+        """The command that drives with the model that is handed out."""
+        return f"disco-hw run {self.robot_file} --model {self.directory}/model.toml"
+
+
+@dataclass(frozen=True, slots=True)
+class CandidateEvidence:
+    """What a candidate's fit promised on top of what was accepted, or, if accepted, is worth."""
+
+    channel: str
+    name: str
+    gain: float
+    score: float
+    verdict: str
+
+
+@dataclass(frozen=True)
+class GapReport:
+    """What `find_gap` returns; `model` is the one of the stage `offered`: the amended one, if it predicts best.
+
+    `gap` holds errors of poses by stage and horizon, `wheels` those of the wheels alone; either is empty where it could
+    not be judged. `across`: what several logs say of each parameter.
+    """
+
+    sources: tuple[str, ...]
+    channels: tuple[ChannelFinding, ...]
+    effects: tuple[EffectFinding, ...]
+    unnamed: tuple[UnnamedFinding, ...]
+    blind_spots: tuple[BlindSpot, ...]
+    gap: dict[str, dict[float, PredictionErrors]]
+    model: Model
+    seconds: float
+    offered: str = "amended"
+    residue: tuple[str, ...] = ()
+    doubtful: tuple[Doubt, ...] = ()
+    notes: tuple[str, ...] = ()
+    candidates: tuple[CandidateEvidence, ...] = ()
+    pictures: dict[str, bytes] = field(default_factory=dict, repr=False)
+    settings: GapSettings = DEFAULT_SETTINGS
+    wheels: dict[str, dict[float, PredictionErrors]] = field(default_factory=dict)
+    across: tuple[AcrossLogs, ...] = ()
+    provenance: Provenance | None = None
+
+    @property
+    def horizon_s(self) -> float:
+        """How far ahead the answer looks."""
+        return reached_horizon_s(self.gap or self.wheels, self.settings.prediction)
+
+    def at_horizon(self, stage: str) -> PredictionErrors:
+        """Errors of a stage as far ahead as the answer looks."""
+        return self.gap[stage][self.horizon_s]
+
+    @property
+    def verdict(self) -> str:
+        """`effects_found`, `nothing_missing` or `unexplained`."""
+        if self.effects:
+            return "effects_found"
+        return "unexplained" if self.unnamed or self.residue or self.doubtful else "nothing_missing"
+
+    def as_dict(self) -> dict[str, Any]:
+        """The content of report.json."""
+        return {
+            "verdict": self.verdict,
+            "channels": [
+                {"name": channel.name, "significant": channel.significant, "where": channel.where}
+                for channel in self.channels
+            ],
+            "effects": [
+                {
+                    "name": effect.name,
+                    "channel": effect.channel,
+                    "parameters": {
+                        name: {"value": e.value, "ci95": [e.low, e.high]} for name, e in effect.parameters.items()
+                    },
+                    "evidence": effect.evidence,
+                    "indistinguishable_from": list(effect.indistinguishable_from),
+                    "experiment": effect.experiment,
+                }
+                for effect in self.effects
+            ],
+            "unnamed": [
+                {
+                    "channel": term.channel,
+                    "form": term.form,
+                    "evidence": term.evidence,
+                    "in_model": term.in_model,
+                    "indistinguishable_from": list(term.indistinguishable_from),
+                    "experiment": term.experiment,
+                }
+                for term in self.unnamed
+            ],
+            "doubtful": [{"name": doubt.name, "why": doubt.why} for doubt in self.doubtful],
+            "residue": list(self.residue),
+            "blind_spots": [
+                {
+                    "name": spot.name,
+                    "parameter": spot.parameter,
+                    "unit": spot.unit,
+                    "smallest_visible": spot.smallest_visible,
+                    "blind": spot.blind,
+                    "experiment": spot.experiment,
+                    "proved": spot.proved,
+                }
+                for spot in self.blind_spots
+            ],
+            "drive": self.drive,
+            "gap": self._gap_dict(),
+            "wheels": [
+                {"horizon_s": horizon, **{stage: _errors_dict(of[horizon]) for stage, of in self.wheels.items()}}
+                for horizon in self.wheels.get("nominal", ())
+            ],
+            "offered": self.offered,
+            "across_logs": [
+                {"name": each.name, "values_ci95": [list(value) for value in each.values], "differs": each.differs}
+                for each in self.across
+            ],
+            "provenance": None if self.provenance is None else asdict(self.provenance),
+            "notes": list(self.notes),
+            "seconds": self.seconds,
+        }
+
+    def _gap_dict(self) -> dict[str, Any]:
+        if not self.gap:
+            return {"horizon_s": self.horizon_s, "held_out": True}
+        stages = {stage: _errors_dict(self.at_horizon(stage)) for stage in STAGES}
+        horizons = [
+            {"horizon_s": horizon, **{stage: _errors_dict(self.gap[stage][horizon]) for stage in STAGES}}
+            for horizon in self.gap["nominal"]
+        ]
+        return {
+            "horizon_s": self.horizon_s, "held_out": True, **stages, "offered": self.offered,
+            "why_not_amended": self.why_not_amended, "horizons": horizons,
+        }  # fmt: skip
+
+    @property
+    def why_not_amended(self) -> str | None:
+        """Why a plainer model is offered than the amended one, in a sentence; None if the amended one is."""
+        of, settings = self.gap or self.wheels, self.settings.prediction
+        if self.offered == "amended":
+            return None
+        plainer = of[self.offered if self.offered in of else "nominal"][self.horizon_s]
+        amended = of["amended"][self.horizon_s]
+        if not beats(plainer, amended, settings):
+            return "The amended model does not beat it."
+        if not beats_throughout(plainer, amended, settings):
+            return f"Without one stretch of {settings.fold_s:g} s the amended model does not beat it."
+        return (
+            f"That the amended model beats it is told by {stretches_telling(plainer):.1f} stretches of "
+            f"{settings.fold_s:g} s: with fewer than {settings.fewest_stretches:g} it has to err by "
+            f"{100.0 * (1.0 - settings.far_better):.0f} % less to be believed of another drive."
+        )
+
+    @property
+    def drive(self) -> str | None:
+        """The drive of at most a minute that shows what this log could not; None if there is nothing of that kind."""
+        scripts = {REGISTRY[spot.name].script for spot in self.blind_spots if spot.blind}
+        if not scripts:
+            return None
+        return f"disco-hw drive ROBOT.toml --script {scripts.pop() if len(scripts) == 1 else ALL_IN_ONE}"
+
+
+def _errors_dict(errors: PredictionErrors) -> dict[str, Any]:
+    return {
+        "position_rmse_m": errors.position_m,
+        "position_ci95_m": list(errors.position_ci),
+        "yaw_rmse_rad": errors.yaw_rad,
+        "yaw_ci95_rad": list(errors.yaw_ci),
+        "wheel_rmse_rad_s": errors.wheel_rad_s,
+        "by_regime_m": errors.by_regime_m,
+    }
+
+
+_COLUMNS = ("log", "found", "doubtful", "ahead", "timed", "offered", "floor", "model")
+
+
+@dataclass(frozen=True)
+class FleetRow:
+    """What one log of a fleet was found to lack, `directory` with its report, or why there is none."""
+
+    log: Path
+    directory: Path
+    report: GapReport | None
+    why_not: str = ""
+
+    def as_dict(self) -> dict[str, Any]:
+        """The row in fleet.json."""
+        report = self.report
+        if report is None:
+            return {"log": str(self.log), "verdict": "not_judged", "why_not": self.why_not}
+        errors = report.gap or report.wheels
+        return {
+            "log": str(self.log),
+            "verdict": report.verdict,
+            "effects": {
+                effect.name: {name: [e.value, e.low, e.high] for name, e in effect.parameters.items()}
+                for effect in report.effects
+            },
+            "unnamed": [term.form for term in report.unnamed],
+            "doubtful": [doubt.name for doubt in report.doubtful],
+            "offered": report.offered,
+            "horizon_s": report.horizon_s,
+            "held_out": {stage: _errors_dict(of[report.horizon_s]) for stage, of in errors.items()},
+            "judged_by": "poses" if report.gap else "wheels",
+            "directory": str(self.directory),
+        }  # fmt: skip
+
+    def cells(self) -> tuple[str, ...]:
+        """The row in words, by column."""
+        report = self.report
+        if report is None:
+            return (str(self.log), f"not judged: {self.why_not}", *[""] * (len(_COLUMNS) - 2))
+        values = [
+            f"{effect.name} {', '.join(f'{e.value:.3g}' for e in effect.parameters.values())}"
+            for effect in report.effects
+        ]
+        errors, horizon_s = report.gap or report.wheels, report.horizon_s
+
+        def cell(stage: str) -> str:
+            if stage not in errors or not math.isfinite(errors[stage][horizon_s].position_m):
+                return "-"
+            error = errors[stage][horizon_s]
+            return f"{1e3 * error.position_m:.1f} mm {1e3 * error.yaw_rad:.0f} mrad"
+
+        # Wheels without poses have no geometry to refit: as given is what they have in its place.
+        offered = report.offered if report.offered in errors else "nominal"
+        return (
+            str(self.log),
+            "; ".join([*values, *(term.form for term in report.unnamed)]) or "nothing",
+            ", ".join(doubt.name for doubt in report.doubtful) or "-",
+            f"{horizon_s:g} s",
+            cell("timed"),
+            cell(offered),
+            cell("floor"),
+            report.offered,
+        )
+
+
+@dataclass(frozen=True)
+class FleetResult:
+    """One row a log, and the directory that they were written to."""
+
+    rows: tuple[FleetRow, ...]
+    directory: Path
+
+    def as_dict(self) -> dict[str, Any]:
+        """The content of fleet.json."""
+        return {"logs": [row.as_dict() for row in self.rows]}
+
+    def table(self) -> str:
+        """One line a log under a line of headings; errors are held out, as far ahead as the row says."""
+        lines = [_COLUMNS, *(row.cells() for row in self.rows)]
+        judged = [line for row, line in zip((None, *self.rows), lines, strict=True) if row is None or row.report]
+        widths = [max(len(line[k]) for line in (lines if k == 0 else judged)) for k in range(len(_COLUMNS))]
+        padded = ("  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)) for line in lines)
+        return "\n".join(line.rstrip() for line in padded)
+
+    def as_text(self) -> str:
+        """For a terminal."""
+        return f"{self.table()}\n\nwritten: {self.directory}/fleet.txt, fleet.json, and a directory for each log"

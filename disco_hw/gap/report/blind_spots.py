@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from disco_hw.effects.effect import Effect, Parameter
 from disco_hw.effects.registry import REGISTRY
+from disco_hw.gap.data import BASE_COUNT, BODY, pose_sensor
 from disco_hw.gap.data.free_runs import read_angles
 from disco_hw.gap.data.gridded_drive import GriddedDrive
-from disco_hw.gap.data.layout import BASE_COUNT, BODY, pose_sensor
 from disco_hw.gap.data.timing import pose_delay_s
 from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
 from disco_hw.gap.search.analysis import GapAnalysis

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from disco_hw.gap.noise.channels import WheelChannel
-from disco_hw.gap.report.findings import STAGES, reached_horizon_s
+from disco_hw.gap.report import STAGES, reached_horizon_s
 from disco_hw.gap.report.judge import regimes_of
 from disco_hw.gap.report.misspecification import Regime
 from disco_hw.gap.search.analysis import GapAnalysis

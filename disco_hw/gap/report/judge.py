@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from disco_hw.effects.effect import Channel, Effect, Parameter
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.data.gridded_drive import GriddedDrive
-from disco_hw.gap.report.blind_spots import BlindSpot, blind_spots, experiment_of
-from disco_hw.gap.report.findings import (
+from disco_hw.gap.report import (
     AcrossLogs,
     CandidateEvidence,
     ChannelFinding,
@@ -21,6 +20,7 @@ from disco_hw.gap.report.findings import (
     EffectFinding,
     UnnamedFinding,
 )
+from disco_hw.gap.report.blind_spots import BlindSpot, blind_spots, experiment_of
 from disco_hw.gap.report.misspecification import (
     Regime,
     in_words,

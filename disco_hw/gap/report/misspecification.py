@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.effects.registry import REGISTRY
+from disco_hw.gap.data import BODY
 from disco_hw.gap.data.gridded_drive import GriddedDrive, GridSamples
-from disco_hw.gap.data.layout import BODY
 from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
 from disco_hw.gap.noise.noise_fit import largest_command_jitter_s
 from disco_hw.gap.search.channel_search import ChannelResult

@@ -8,7 +8,7 @@ from html import escape
 
 from disco_hw import reports
 from disco_hw.effects.registry import REGISTRY
-from disco_hw.gap.report.findings import STAGES, EffectFinding, GapReport, UnnamedFinding
+from disco_hw.gap.report import STAGES, EffectFinding, GapReport, UnnamedFinding
 from disco_hw.gap.search.cross_validation import PredictionErrors
 
 

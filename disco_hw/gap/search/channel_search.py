@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.effects.registry import REGISTRY
+from disco_hw.gap.data import BODY, DELAYED_BY, WHEEL
 from disco_hw.gap.data.free_runs import displacement, starts_as_far_as
 from disco_hw.gap.data.gridded_drive import GriddedDrive
-from disco_hw.gap.data.layout import BODY, DELAYED_BY, WHEEL
 from disco_hw.gap.noise.body_noise import BodyNoise
 from disco_hw.gap.noise.channels import BodyChannel, ResidualChannel, WheelChannel
 from disco_hw.gap.noise.noise_fit import learn_body_noise, learn_wheel_noise

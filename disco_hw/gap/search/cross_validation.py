@@ -12,8 +12,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from disco_hw.gap.data import BASE_COUNT, ENCODER_COLUMNS
 from disco_hw.gap.data.free_runs import displacement, read_angles, run_body, starts_of
-from disco_hw.gap.data.layout import BASE_COUNT, ENCODER_COLUMNS
 from disco_hw.gap.noise.channels import BodyChannel, WheelChannel, total_perturbation
 from disco_hw.gap.noise.noise_fit import SensorNoise
 from disco_hw.gap.search.analysis import GapAnalysis

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.optimize import least_squares
 
-from disco_hw.gap.data.layout import Layout
+from disco_hw.gap.data import Layout
 from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
 from disco_hw.gap.search.cross_validation import (
     Chain,

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.gap.data.layout import Layout
+from disco_hw.gap.data import Layout
 from disco_hw.gap.noise.channels import ResidualChannel
 from disco_hw.gap.settings import FitSettings
 

@@ -17,8 +17,8 @@ from scipy.signal import lfilter
 from disco_hw.effects.effect import Channel as Place
 from disco_hw.effects.effect import CommandedDrive, Effect, Stage
 from disco_hw.effects.registry import REGISTRY, in_stages
+from disco_hw.gap.data import DELAYED_BY, WHEEL, Layout
 from disco_hw.gap.data.free_runs import read_angles
-from disco_hw.gap.data.layout import DELAYED_BY, WHEEL, Layout
 from disco_hw.gap.noise.channels import BodyChannel, ResidualChannel, WheelChannel
 from disco_hw.gap.noise.noise_fit import learn_body_noise, learn_wheel_noise, wheel_misfit
 from disco_hw.gap.noise.wheel_noise import WheelNoise, whiten_wheels

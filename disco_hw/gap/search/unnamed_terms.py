@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from disco_hw.gap.data import Layout
 from disco_hw.gap.data.gridded_drive import GriddedDrive
-from disco_hw.gap.data.layout import Layout
 from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
 from disco_hw.gap.settings import GRID_STEP_S, GapSettings, TermSettings
 from disco_hw.model import EffectSetting

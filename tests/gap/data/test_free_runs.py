@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from disco_hw.gap.data import BODY, WHEEL
 from disco_hw.gap.data.free_runs import pose_residual, run_body, run_wheels
-from disco_hw.gap.data.layout import BODY, WHEEL
 from disco_hw.gap.settings import GRID_STEP_S
 from disco_hw.model import Model
 from disco_hw.model.step import FreeRun

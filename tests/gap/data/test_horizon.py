@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from disco_hw.gap.data import BODY
 from disco_hw.gap.data.free_runs import displacement, starts_as_far_as, starts_of
-from disco_hw.gap.data.layout import BODY
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S
 
 N = 1000

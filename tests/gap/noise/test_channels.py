@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from disco_hw.gap.data import BODY
 from disco_hw.gap.data.free_runs import read_angles
-from disco_hw.gap.data.layout import BODY
 from disco_hw.gap.noise.channels import BodyChannel
 from tests.gap.synthetic import GEOMETRY, NOISE, line_of
 

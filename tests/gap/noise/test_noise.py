@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from disco_hw.gap.data.layout import WHEEL
+from disco_hw.gap.data import WHEEL
 from disco_hw.gap.noise.body_noise import BodyMotion, BodyNoise, body_gains, body_likelihood, whiten_body
 from disco_hw.gap.noise.channels import WheelChannel
 from disco_hw.gap.noise.wheel_noise import WheelMotion, WheelNoise, wheel_gains, wheel_likelihood, whiten_wheels

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from disco_hw.effects.registry import REGISTRY
-from disco_hw.gap.data.layout import BODY, WHEEL
+from disco_hw.gap.data import BODY, WHEEL
 from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
 from disco_hw.gap.noise.wheel_noise import WheelNoise
 from disco_hw.gap.report.blind_spots import BlindSpot, blind_spots, proved, with_effect, with_size

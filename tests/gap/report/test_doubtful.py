@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from disco_hw.gap.report.findings import EffectFinding
+from disco_hw.gap.report import EffectFinding
 from disco_hw.gap.report.judge import Measured, doubt_of, sort_out
 from disco_hw.gap.search.analysis import ParameterEstimate
 from tests.gap.synthetic import line_of

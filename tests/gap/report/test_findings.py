@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from disco_hw.gap import offered_stage
+from disco_hw.gap.report import STAGES, AcrossLogs, EffectFinding, GapReport, Provenance, UnnamedFinding
 from disco_hw.gap.report.blind_spots import BlindSpot
-from disco_hw.gap.report.findings import STAGES, AcrossLogs, EffectFinding, GapReport, Provenance, UnnamedFinding
 from disco_hw.gap.report.page import answer, as_text, page, sentence
 from disco_hw.gap.search.analysis import ParameterEstimate
 from disco_hw.gap.search.cross_validation import PredictionErrors

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from disco_hw.gap.data.layout import BODY
+from disco_hw.gap.data import BODY
 from disco_hw.gap.report.misspecification import Regime, gain_by_block, in_words, masks_at_nodes, regimes
 from tests.gap.synthetic import body_channel, line_of
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from disco_hw.gap import find_gap
+from disco_hw.gap.data import BODY, WHEEL
 from disco_hw.gap.data.gridded_drive import grid_drive
-from disco_hw.gap.data.layout import BODY, WHEEL
 from disco_hw.gap.noise.channels import WheelChannel
 from disco_hw.gap.noise.wheel_noise import WheelNoise
 from disco_hw.gap.report.page import as_text

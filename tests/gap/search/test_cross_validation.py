@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from disco_hw.gap.data.layout import BODY
+from disco_hw.gap.data import BODY
 from disco_hw.gap.noise.channels import BodyChannel
 from disco_hw.gap.noise.noise_fit import sensor_noise
 from disco_hw.gap.search.channel_search import indices

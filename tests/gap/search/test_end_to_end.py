@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from disco_hw.gap import offered_stage
-from disco_hw.gap.data.layout import BODY, WHEEL
+from disco_hw.gap.data import BODY, WHEEL
 from disco_hw.gap.noise.channels import BodyChannel
 from disco_hw.gap.report.amend import at_joint_fit
 from disco_hw.gap.search.analysis import ChannelEstimates, ParameterEstimate

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from disco_hw.gap.data.layout import BODY, WHEEL
+from disco_hw.gap.data import BODY, WHEEL
 from disco_hw.gap.report.judge import across_logs, drifting_parameters
 from disco_hw.gap.search.analysis import (
     ChannelEstimates,

@@ -5,8 +5,8 @@ from functools import cache
 import numpy as np
 import pytest
 
+from disco_hw.gap.data import WHEEL
 from disco_hw.gap.data.gridded_drive import grid_drive
-from disco_hw.gap.data.layout import WHEEL
 from disco_hw.gap.noise.channels import WheelChannel
 from disco_hw.gap.noise.noise_fit import largest_command_jitter_s, learn_wheel_noise
 from disco_hw.gap.noise.wheel_noise import WheelNoise

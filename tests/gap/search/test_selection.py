@@ -8,7 +8,7 @@ import pytest
 from scipy.signal import lfilter
 
 from disco_hw.effects.registry import REGISTRY
-from disco_hw.gap.data.layout import BODY, WHEEL
+from disco_hw.gap.data import BODY, WHEEL
 from disco_hw.gap.noise.channels import WheelChannel
 from disco_hw.gap.noise.wheel_noise import WheelNoise
 from disco_hw.gap.search.channel_search import body_moves, wheel_moves

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from disco_hw.gap import model_of, offered_stage
+from disco_hw.gap.data import BODY, WHEEL
 from disco_hw.gap.data.free_runs import run_wheels
-from disco_hw.gap.data.layout import BODY, WHEEL
 from disco_hw.gap.noise.channels import WheelChannel
 from disco_hw.gap.noise.wheel_noise import WheelNoise
-from disco_hw.gap.report.findings import GapReport
+from disco_hw.gap.report import GapReport
 from disco_hw.gap.report.page import answer, as_text, page
 from disco_hw.gap.search.analysis import GapAnalysis, final_fit
 from disco_hw.gap.search.channel_search import ChannelResult, wheel_moves
