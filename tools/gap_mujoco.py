@@ -183,9 +183,8 @@ def work(hidden: str, seed: int) -> Result:
     began = time.process_time()
     analysis, _ = search(seen.as_drive(), nominal)
     final = final_fit(analysis)
-    geometry = analysis.nominal_body if final.final_body is None else final.final_body.vector
     fits, unnamed = effect_findings(analysis, final), unnamed_findings(analysis)
-    named, doubtful = sort_out(fits, Measured(analysis.drive, (float(geometry[0]), float(geometry[1]))))
+    named, doubtful = sort_out(fits, Measured.of(analysis, final))
     predictions = joint_predictions(analysis, final)
     table = predictions.table()
     offered = offered_stage(table, bool(fits or unnamed), DEFAULT_SETTINGS)

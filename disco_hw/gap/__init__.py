@@ -95,8 +95,7 @@ def find_gap(
     say("intervals, blind spots and the gap on held-out data")
     final = final_fit(analysis)
     named, unnamed = effect_findings(analysis, final), unnamed_findings(analysis)
-    geometry = final.final_body.vector if final.final_body is not None else analysis.nominal_body
-    effects, doubtful = sort_out(named, Measured(analysis.drive, (float(geometry[0]), float(geometry[1]))))
+    effects, doubtful = sort_out(named, Measured.of(analysis, final))
     predictions = joint_predictions(analysis, final) if analysis.body is not None else None
     gap = {} if predictions is None else predictions.table()
     wheels = wheel_table(analysis)

@@ -360,6 +360,20 @@ class ReportSettings:
     """For so long in all at least. Chosen."""
     beyond_share: float = 0.005
     """And for so much of the log. Chosen."""
+    taken_share: float = 0.1
+    """A name that takes less than this of what its channel lacks, where it still disagrees, is disputed. Chosen."""
+    times_unnamed: float = 3.0
+    """So is one that is worth less than so many times what a term without a name beside it is. Chosen: half an order of
+    magnitude."""
+    form_share: float = 0.5
+    """And one whose value differs from one regime to its opposite by this share of itself. Chosen: nobody who is told
+    the value expects it."""
+    form_apart_sigmas: float = 3.5
+    """By so many standard deviations. Chosen: of some twenty comparisons in a log one in a hundred logs by chance."""
+    regime_known_share: float = 0.05
+    """A regime that holds less of what is known of a value says nothing of it. Chosen."""
+    regime_blocks: int = 3
+    """Neighbouring blocks taken as one for the scatter of regimes. Chosen: 9 s."""
     compared_parts: tuple[int, ...] = (2, 4)
     """Into so many parts a log is divided to see how parameters wander. Chosen: halves, and what moves faster."""
     drift_sigmas: float = 3.0

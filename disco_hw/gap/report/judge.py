@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,7 @@ from disco_hw.gap.report import (
 from disco_hw.gap.report.blind_spots import BlindSpot, blind_spots, experiment_of
 from disco_hw.gap.report.misspecification import (
     Regime,
+    disputed_names,
     in_words,
     misspecified_effects,
     regimes,
@@ -217,10 +218,22 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Measured:
-    """What sentences are checked against: the drive, and its geometry (radius and axial distance, m)."""
+    """What sentences are checked against: the drive, its geometry (radius and axial distance, m), and names that the
+    residuals dispute, with the reason.
+    """
 
     drive: GriddedDrive
     geometry: tuple[float, float]
+    disputed: Mapping[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, analysis: GapAnalysis, final: FinalFit) -> Measured:
+        """What a searched drive says."""
+        vector = analysis.nominal_body if final.final_body is None else final.final_body.vector
+        disputed: dict[str, str] = {}
+        for found in (analysis.body, analysis.wheels):
+            disputed |= {} if found is None else disputed_names(found)
+        return cls(analysis.drive, (float(vector[0]), float(vector[1])), disputed)
 
 
 def sort_out(
@@ -247,7 +260,7 @@ def doubt_of(effect: EffectFinding, measured: Measured) -> str | None:
     if all(_unknown(parameter, estimate, settings) for parameter, estimate in pairs):
         said = " and ".join(_written(parameter, estimate) for parameter, estimate in pairs)
         return f"{said} is not known well enough to be distinguished from none"
-    return _exceeded(described, pairs[0][1], measured)
+    return _exceeded(described, pairs[0][1], measured) or measured.disputed.get(effect.name)
 
 
 def _at_end(parameter: Parameter, value: float, settings: ReportSettings) -> bool:

@@ -4,6 +4,9 @@ A stand-in of the right family and the wrong form leaves something. The accepted
 of its channel, from which the noise was learnt: where that one still gains far more than its many parameters buy, in
 several blocks of time, something is left. And a named effect of the body has to be as strong where little of it acts as
 where much: a slip that saturates passes for one that grows for ever.
+
+A name is disputed where it only acts like what is missing: it takes little of that, a form without a name beside it
+explains as much, or its value is another wherever the robot drives differently (parameter constancy; Hansen, 1992).
 """
 
 from __future__ import annotations
@@ -11,6 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,11 +25,11 @@ from disco_hw.gap.data.gridded_drive import GriddedDrive, GridSamples
 from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
 from disco_hw.gap.noise.noise_fit import largest_command_jitter_s
 from disco_hw.gap.search.channel_search import ChannelResult
-from disco_hw.gap.search.least_squares import fit
+from disco_hw.gap.search.least_squares import Fit, fit, inverse
 from disco_hw.gap.search.richest_model import CANDIDATES, indices
 from disco_hw.gap.search.selection import Split, inflation
 from disco_hw.gap.search.unnamed_terms import Term, WithTerms
-from disco_hw.gap.settings import GRID_STEP_S
+from disco_hw.gap.settings import GRID_STEP_S, ReportSettings
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -104,6 +108,102 @@ def _middle(perturbation: Array, lever_m: float) -> tuple[float, int]:
     if share[-1] <= 0.0:
         return 0.0, axis
     return float(size[np.searchsorted(share, 0.5 * share[-1])]), axis
+
+
+_OPPOSITES = (
+    ("slow", "fast"),
+    ("turning slowly", "turning fast"),
+    ("speeding up", "braking"),
+    ("turning left", "turning right"),
+    ("driving ahead", "driving back"),
+)
+
+
+def disputed_names(found: ChannelResult) -> dict[str, str]:
+    """Accepted effects that act like what is missing and cannot be it, each with the reason."""
+    out = {}
+    for name in found.names:
+        if name in found.selector.given:
+            continue
+        why = _takes_little(found, name) or _beside_as_much(found, name) or _changes_with_regime(found, name)
+        if why is not None:
+            out[name] = f"something acts like it and has another form: {why}"
+    return out
+
+
+def _gain(found: ChannelResult, name: str) -> float:
+    """What a name is worth in nats, the others kept."""
+    rest = tuple(other for other in found.names if other != name)
+    return found.selector.fit(rest).cost - found.fit.cost
+
+
+def _takes_little(found: ChannelResult, name: str) -> str | None:
+    """That a name leaves many times what it takes, where its channel still disagrees."""
+    settings = found.channel.settings.report
+    if found.richest is None or not loud_regimes(found):
+        return None
+    best = 0.5 * float(found.richest @ found.richest)
+    left = found.fit.cost - best - settings.nats_each * found.richest_parameters
+    taken = max(_gain(found, name), 0.0)
+    if taken > settings.taken_share * (taken + left):
+        return None
+    return f"it takes {100.0 * taken / (taken + left):.2g} % of what its channel lacks"
+
+
+def _beside_as_much(found: ChannelResult, name: str) -> str | None:
+    """That a term without a name, in the same channel, is worth about as much."""
+    settings, taken = found.channel.settings.report, _gain(found, name)
+    for one in found.unnamed:
+        if taken < settings.times_unnamed * one.evidence.gain:
+            return f"{one.form} beside it explains {one.evidence.gain / max(taken, 1e-9):.2g} times as much"
+    return None
+
+
+def _changes_with_regime(found: ChannelResult, name: str) -> str | None:
+    """That a value is another where the robot drives differently, by more than its noise and by much of itself."""
+    best, channel, settings = found.fit, found.selector.channel, found.channel.settings.report
+    layout, drive = channel.layout, found.channel.drive
+    columns = [column for column in CANDIDATES[name].columns if layout.place[column] in best.active]
+    sizes = [abs(best.vector[layout.place[column]] - layout.neutral[layout.place[column]]) for column in columns]
+    size = max((each for each in sizes if math.isfinite(each)), default=math.inf)
+    samples = drive.encoder if isinstance(found.channel, WheelChannel) else found.channel.samples
+    width = best.residual.size // samples.node.size
+    inside = {regime: np.repeat(mask, width) for regime, mask in masks(drive, samples).items()}
+    clearest: tuple[float, str] = (settings.form_apart_sigmas, "")
+    for column, (one, other) in product(columns, _OPPOSITES):
+        place, value = best.active.index(layout.place[column]), float(best.vector[layout.place[column]])
+        apart = _apart(best, channel.block, place, (inside[one], inside[other]), settings)
+        if apart is None:
+            continue
+        moved, moved_too, sigmas = apart
+        if abs(moved - moved_too) > settings.form_share * (abs(value) if math.isinf(size) else size):
+            said = f"{column} is {value + moved:.3g} {one} and {value + moved_too:.3g} {other}"
+            clearest = max(clearest, (abs(sigmas), said))
+    return clearest[1] or None
+
+
+def _apart(
+    best: Fit, block: Index, place: int, inside: tuple[Mask, Mask], settings: ReportSettings
+) -> tuple[float, float, float] | None:
+    """How far one of the active entries is from its value in each of two regimes, and standard deviations between
+    them, all others being fitted with it; None where either says little of it.
+    """
+    slope = best.jacobian[:, place]
+    own = float(slope @ slope)
+    parts = np.column_stack([np.where(mask, slope, 0.0) for mask in inside])
+    if min((parts**2).sum(axis=0)) < settings.regime_known_share * own:
+        return None
+    wide = np.column_stack([best.jacobian, parts])
+    covariance = inverse(wide.T @ wide)
+    step = -covariance @ (wide.T @ best.residual)
+    # Neighbouring blocks err together: a few are taken as one, and the larger of two variances counts.
+    group = np.unique(block // settings.regime_blocks, return_inverse=True)[1]
+    pulls = np.zeros((group.max() + 1, wide.shape[1]))
+    np.add.at(pulls, group, wide * (best.residual + wide @ step)[:, None])
+    contrast = covariance[-2] - covariance[-1]
+    variance = max(float(contrast[-2] - contrast[-1]), float(((pulls @ contrast) ** 2).sum()))
+    both = step[place] + step[-2:]
+    return float(both[0]), float(both[1]), float((both[0] - both[1]) / math.sqrt(variance))
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,6 @@
-"""A slip that saturates is called by its family's name, and said to be of another form; one that does not is not."""
+"""A slip that saturates is called by its family's name, and said to be of another form; one that does not is not.
+A name that only acts like what is missing is disputed, with the reason.
+"""
 
 from dataclasses import replace
 
@@ -8,11 +10,13 @@ import pytest
 from disco_hw.gap.data import BODY
 from disco_hw.gap.data.free_runs import read_angles
 from disco_hw.gap.noise.channels import BodyChannel
-from disco_hw.gap.report.misspecification import _perturbation_of, misspecified_effects
-from disco_hw.gap.search.channel_search import ChannelResult, body_moves
-from disco_hw.gap.search.selection import Selector
-from disco_hw.gap.search.unnamed_terms import motion
-from tests.gap.synthetic import GEOMETRY, NOISE, line_of
+from disco_hw.gap.report.misspecification import _apart, _perturbation_of, disputed_names, misspecified_effects
+from disco_hw.gap.search.channel_search import ChannelResult, UnnamedTerm, body_moves
+from disco_hw.gap.search.least_squares import Fit
+from disco_hw.gap.search.selection import EffectEvidence, Selector
+from disco_hw.gap.search.unnamed_terms import Term, motion
+from disco_hw.gap.settings import DEFAULT_SETTINGS
+from tests.gap.synthetic import GEOMETRY, NOISE, body_channel, line_of
 
 # Turns at four rates: at two of them a wrong axial distance makes up for any form.
 DRIVE = ((4, 4), (0, 0), (-1, 1), (1, -1), (-2, 2), (2, -2), (-3.5, 3.5), (3.5, -3.5), (-6, 6), (6, -6), (3, 6), (6, 3))
@@ -20,22 +24,33 @@ DRIVE = ((4, 4), (0, 0), (-1, 1), (1, -1), (-2, 2), (2, -2), (-3.5, 3.5), (3.5, 
 
 def slipping(k_s, saturates_at_rad_s=None):
     """What is found in a drive whose turns slip by k |omega|, or k |omega| / (1 + |omega| / saturates_at)."""
-    line = line_of(np.repeat(np.array(DRIVE * 3, dtype=float), 200, axis=0))
-    plain = BODY.neutral.copy()
-    plain[:3] = GEOMETRY
-    channel = BodyChannel.build(line, NOISE, plain)
-    truth, rate = plain.copy(), motion(line, plain)[1]
+    line, truth = driven()
+    rate = motion(line, truth)[1]
     perturbation = np.zeros((rate.size, 3))
     if saturates_at_rad_s is None:
         truth[BODY.place["turn_slip.k_s"]] = k_s
     else:
         perturbation[:, 2] = -k_s * rate * np.abs(rate) / (1.0 + np.abs(rate) / saturates_at_rad_s)
+    return found_of("turn_slip", truth, perturbation)
+
+
+def driven():
+    """The drive without poses, and the vector of a robot that is as drawn."""
+    plain = BODY.neutral.copy()
+    plain[:3] = GEOMETRY
+    return line_of(np.repeat(np.array(DRIVE * 3, dtype=float), 200, axis=0)), plain
+
+
+def found_of(name, truth, perturbation):
+    """What is found, by that name, in a drive of a robot with this vector and perturbation of its motion."""
+    line, plain = driven()
+    channel = BodyChannel.build(line, NOISE, plain)
     clean = np.empty((line.pose.t_s.size, 3))
     read_angles(channel.track(truth, perturbation), line.pose.node, line.pose.fraction, clean)
     noise = np.random.default_rng(5).standard_normal(clean.shape) * (0.004, 0.004, 0.006)
     channel = BodyChannel.build(replace(line, pose_values=clean + noise), NOISE, plain)
     selector = Selector(channel, body_moves(channel))
-    return ChannelResult(selector, ("turn_slip",), channel)
+    return ChannelResult(selector, (name,), channel)
 
 
 def test_slip_that_saturates_is_stronger_where_it_is_small():
@@ -60,3 +75,70 @@ def test_slip_that_does_not_is_of_its_form(k_s):
 def test_what_acts_nowhere_says_nothing():
     found = slipping(0.05)
     assert misspecified_effects(replace(found, names=("pose_latency",))) == []
+
+
+def aside(of_left_m, of_right_m):
+    """What is found of a robot that turns about a point so far to its left, in turns to the left and to the right."""
+    line, truth = driven()
+    rate = motion(line, truth)[1]
+    ahead = np.where(rate > 0.0, of_left_m, of_right_m) * rate
+    return found_of("lateral_icr", truth, np.column_stack([ahead, np.zeros((rate.size, 2))]))
+
+
+def test_a_name_whose_value_is_another_where_the_robot_drives_differently_is_disputed():
+    (why,) = disputed_names(aside(0.05, 0.0)).values()
+    assert why.startswith("something acts like it and has another form: lateral_icr.offset_m is ")
+    small, large = (float(part.split()[0]) for part in why.split(" is ")[1].split(" and "))
+    assert abs(large - small) > 0.02
+    # A third of it more on one side is the same name still.
+    assert disputed_names(aside(0.05, 0.035)) == {}
+    assert disputed_names(aside(0.05, 0.05)) == {}
+
+
+def test_what_the_model_has_is_not_disputed():
+    found = aside(0.05, 0.0)
+    assert disputed_names(replace(found, selector=replace(found.selector, given=("lateral_icr",)))) == {}
+
+
+@pytest.mark.parametrize(("times", "disputed"), [(0.3, False), (0.4, True), (5.0, True)])
+def test_a_name_beside_a_form_without_one_that_is_worth_a_third_of_it_is_disputed(times, disputed):
+    found = slipping(0.1)
+    gain = found.selector.fit(()).cost - found.fit.cost
+    evidence = EffectEvidence(times * gain, 1.0, 1.0, 1.0, 1.0)
+    beside = replace(found, unnamed=(UnnamedTerm("v_x += 0.1 v^3", evidence, Term("", np.zeros(0))),))
+    assert (disputed_names(beside) != {}) == disputed
+    assert not disputed or "v_x += 0.1 v^3 beside it explains" in disputed_names(beside)["turn_slip"]
+
+
+@pytest.mark.parametrize(("offset_m", "disputed"), [(0.0, False), (0.1, True)])
+def test_a_name_that_takes_little_of_what_its_channel_lacks_is_disputed(offset_m, disputed):
+    channel, _ = body_channel(turn_slip=0.02, lateral_icr=offset_m)
+    selector = Selector(channel, body_moves(channel))
+    richest = selector.fit(("turn_slip", "lateral_icr")).residual
+    found = ChannelResult(selector, ("turn_slip",), channel, richest=richest, richest_parameters=6)
+    why = disputed_names(found).get("turn_slip", "")
+    assert ("it takes " in why and " % of what its channel lacks" in why) == disputed
+    assert disputed or not why
+
+
+def test_a_value_in_two_regimes_is_what_each_says_and_as_far_apart_as_its_blocks_scatter():
+    generator, settings = np.random.default_rng(3), DEFAULT_SETTINGS.report
+    slope, block = generator.standard_normal((4000, 2)), np.repeat(np.arange(200), 20)
+    one = np.repeat(generator.random(200) < 0.4, 20)
+    noise = generator.standard_normal(4000)
+
+    def apart(true_shift, noise, inside=(one, ~one)):
+        # A residual is what was measured less what was predicted: a value that is larger by d leaves -d of its slope.
+        left = noise - slope[:, 0] * np.where(one, true_shift[0], true_shift[1])
+        best = Fit(np.zeros(2), (0, 1), 0.0, left - slope @ np.linalg.lstsq(slope, left, rcond=None)[0], slope)
+        return _apart(best, block, 0, inside, settings)
+
+    first, second, sigmas = apart((0.5, -0.5), noise)
+    assert first - second == pytest.approx(1.0, abs=0.1)
+    # 0.4 and 0.6 of 4000 samples of unit noise and slope.
+    assert sigmas == pytest.approx(1.0 / np.sqrt(1.0 / 1600 + 1.0 / 2400), rel=0.15)
+    assert abs(apart((0.2, 0.2), noise)[2]) < 3.0
+    # Noise that is as the slope in whole blocks at a time tells less than its samples seem to.
+    bursts = noise + 0.7 * slope[:, 0] * np.repeat(generator.standard_normal(200), 20)
+    assert abs(apart((0.5, -0.5), bursts)[2]) < 0.6 * abs(sigmas)
+    assert apart((0.5, -0.5), noise, (np.arange(4000) < 100, ~one)) is None
