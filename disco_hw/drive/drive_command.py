@@ -24,7 +24,8 @@ from disco_hw.drive.hand_pilot import HandPilot
 from disco_hw.drive.keyboard import HELP, Keyboard, KeyHold
 from disco_hw.drive.script import Script, ScriptSource, Unattended, in_table, room_needed
 from disco_hw.drive.scripts import make_script
-from disco_hw.errors import InputError
+from disco_hw.errors import InputError, LogError
+from disco_hw.log.reader import open_log
 from disco_hw.runtime.robot_setup import load_setup
 from drivers.gamepad import Gamepad, GamepadError, GamepadMapping, open_gamepad
 
@@ -67,7 +68,8 @@ class DriveOptions:
 class DriveResult:
     """How a drive went: its log, what was excited, why it ended, whether that was as wanted, what of the log was lost.
 
-    `recording_errors`: sentences; with any of them the drive is not `completed`, as it was made for its log.
+    `recording_errors`: sentences, if the log does not prove by its end that every tick is in it; with any of them the
+    drive is not `completed`, as it was made for its log.
     """
 
     log: Path
@@ -105,25 +107,37 @@ def run_drive(options: DriveOptions) -> DriveResult:
         if not options.as_json:
             print("\n".join(_announcement(options, config, script)), flush=True)
         coverage = Coverage(top_rad_s)
-        lost: list[str] = []
+        said: list[str] = []
         with _display(socket_path(config), shown=not options.as_json) as say:
 
             def report(topic: str, text: str) -> None:
                 if topic == "recording":
-                    lost.append(text)
+                    said.append(text)
                 say(topic, text)
 
             serve(setup, log_file, report, HandPilot(source, coverage, page))
     finally:
         source.close()
+    # A writer that was slow for a second and then wrote all that had waited has lost nothing.
+    lost = () if not said or _is_whole(log_file) else tuple(said)
     return DriveResult(
         log=log_file,
         ended=source.ended or "stopped on request",
         completed=source.completed and not lost,
         coverage=coverage.as_dict(),
         coverage_words=coverage.in_words(),
-        recording_errors=tuple(lost),
+        recording_errors=lost,
     )
+
+
+def _is_whole(log_file: Path) -> bool:
+    """Whether the log has the recorder's last word, and every tick up to it."""
+    try:
+        with open_log(log_file) as log:
+            summary = log.summary()
+    except (InputError, LogError):
+        return False
+    return summary.complete and summary.ended is True and not summary.missing_ticks
 
 
 def _script(options: DriveOptions, config: RobotConfig) -> Script | None:

@@ -12,6 +12,7 @@ import pytest
 from disco_hw.drive.drive_command import DriveOptions, DriveResult, run_drive
 from disco_hw.errors import InputError
 from disco_hw.experiments.live_stack import write_robot_file
+from tools.viewer_run import write_log
 
 
 @pytest.mark.parametrize(
@@ -91,3 +92,19 @@ def test_a_drive_whose_log_is_not_whole_is_not_completed(tmp_path, monkeypatch, 
     assert result.completed is whole
     assert ("NOT WHOLE: the log writer died" in result.as_text()) is not whole
     assert result.as_dict()["recording_errors"] == (() if whole else (said[1],))
+
+
+@pytest.mark.parametrize("cut_off", [0, 40])
+def test_a_writer_that_was_slow_has_lost_nothing_where_the_log_proves_it(tmp_path, monkeypatch, cut_off):
+    log = tmp_path / "drive.mcap"
+    pauses = "the log writer has not answered for 0.8 s; what comes is kept and waits"
+
+    def served(_setup, path, say, _pilot):
+        write_log(path, ticks=60)
+        os.truncate(path, path.stat().st_size - cut_off)
+        say("recording", pauses)
+
+    monkeypatch.setattr("disco_hw.drive.drive_command.serve", served)
+    result = run_drive(DriveOptions(write_robot_file(tmp_path), page=True, as_json=True, log_file=log))
+    assert result.completed is not bool(cut_off)
+    assert result.recording_errors == ((pauses,) if cut_off else ())
