@@ -142,3 +142,20 @@ def test_a_value_in_two_regimes_is_what_each_says_and_as_far_apart_as_its_blocks
     bursts = noise + 0.7 * slope[:, 0] * np.repeat(generator.standard_normal(200), 20)
     assert abs(apart((0.5, -0.5), bursts)[2]) < 0.6 * abs(sigmas)
     assert apart((0.5, -0.5), noise, (np.arange(4000) < 100, ~one)) is None
+    # Noise that happens to agree from block to block is no better known than samples of its size allow.
+    assert abs(apart((0.5, -0.5), 0.01 * noise)[2]) == pytest.approx(abs(sigmas), rel=0.15)
+
+
+def test_values_that_scatter_as_noise_does_are_not_called_different(monkeypatch):
+    found, asked = aside(0.05, 0.0), []
+
+    def apart(best, block, place, inside, settings):
+        asked.append(place)
+        return 0.02, -0.02, times * settings.form_apart_sigmas
+
+    monkeypatch.setattr("disco_hw.gap.report.misspecification._apart", apart)
+    times = 0.95
+    assert disputed_names(found) == {}
+    times = -1.05
+    assert disputed_names(found) != {}
+    assert asked
