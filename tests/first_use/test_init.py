@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import select
 import subprocess
 import sys
@@ -13,6 +14,7 @@ from pathlib import Path
 
 import pytest
 
+from disco_hw.adaptation.guard import choose_adaptation
 from disco_hw.config import load_robot_config
 from disco_hw.errors import InputError
 from disco_hw.experiments.live_stack import disco_hw_process, write_robot_file
@@ -50,6 +52,19 @@ def test_what_is_written_for_any_driver_is_accepted(tmp_path, driver):
     out = run_init(InitOptions(tmp_path / "robot.toml", driver=driver), None, quiet)
     assert load_robot_config(out).link.driver == driver
     assert "disco-hw commission" in out.read_text(encoding="utf-8")
+
+
+def test_the_robot_learns_once_its_poses_are_said_to_be_as_good_as_is_written(tmp_path):
+    out = run_init(InitOptions(tmp_path / "robot.toml", driver="reference"), None, quiet)
+    text = out.read_text(encoding="utf-8")
+
+    def chosen():
+        setup = load_setup(out)
+        return choose_adaptation(setup.config.control, setup.config.pose, setup.model).kind
+
+    assert chosen() == "off"
+    out.write_text(re.sub(r"^# (\w+ = )", r"\1", text, flags=re.MULTILINE), encoding="utf-8")
+    assert chosen() == "fast"
 
 
 def test_what_a_person_answers_stands_in_the_file(tmp_path):
