@@ -221,13 +221,15 @@ def test_from_the_link_of_a_virtual_robot_to_a_file_that_check_accepts(tmp_path,
                 "--listen-s",
                 "1",
             ]
-            done = subprocess.run([*command, *options], capture_output=True, text=True, timeout=60, check=False)
+            done = subprocess.run([*command, *options], capture_output=True, text=True, timeout=300, check=False)
             if done.returncode == 0:
                 break
         assert done.returncode == 0, done.stderr
         config = load_robot_config(out)
         assert config.link.driver == device
         assert {name: getattr(config.link.settings(), name) for name in shown} == shown
-        checked = subprocess.run([*command, "check", str(out)], capture_output=True, text=True, timeout=60, check=False)
+        checked = subprocess.run(
+            [*command, "check", str(out)], capture_output=True, text=True, timeout=300, check=False
+        )
     assert "FAIL  link" not in checked.stdout
     assert "FAIL  firmware" not in checked.stdout, checked.stdout
