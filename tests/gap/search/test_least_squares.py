@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from disco_hw.gap.search.least_squares import by_block, fit, inverse, solve
+from disco_hw.gap.search.least_squares import by_block, fit, inverse, jacobian, solve
 from disco_hw.gap.settings import DEFAULT_SETTINGS
 
 T = np.linspace(0.0, 4.0, 400)
@@ -56,3 +56,45 @@ def test_a_direction_without_information_gets_a_large_variance():
     assert inverse(matrix)[1, 1] > 1e8
     slope = np.eye(3)[:, :2]
     np.testing.assert_allclose(solve(slope, np.array([1.0, 2.0])), [1.0, 2.0])
+
+
+def test_the_variance_of_what_is_known_badly_is_exact():
+    # Two columns that are alike to a hundredth: their sum is known well, their difference badly.
+    matrix = np.array([[1.0, 0.9999], [0.9999, 1.0]])
+    np.testing.assert_allclose(inverse(matrix) @ matrix, np.eye(2), atol=1e-6)
+
+
+def test_the_derivative_is_taken_from_within_the_bounds():
+    asked = []
+
+    def residual(p):
+        asked.append(float(p[0]))
+        return np.array([3.0 * p[0]])
+
+    layout = SimpleNamespace(step=np.array([1e-3]), high=np.array([1.0]))
+    at = np.array([1.0])
+    np.testing.assert_allclose(jacobian(residual, at, (0,), layout, 3.0 * at), [[3.0]])
+    assert max(asked) < 1.0
+
+
+def test_a_step_that_overshoots_is_made_shorter_until_it_betters_the_fit():
+    # Newton's step on an arc tangent leads away from where it is zero if it begins far out.
+    layout = SimpleNamespace(
+        step=np.array([1e-6]), low=np.array([-1e3]), high=np.array([1e3]), neutral=np.zeros(1), precision=np.zeros(1)
+    )
+    bent = SimpleNamespace(settings=DEFAULT_SETTINGS, layout=layout, residual=lambda p: 100.0 * np.arctan(p))
+    assert fit(bent, np.array([2.0]), (0,), 30).vector[0] == pytest.approx(0.0, abs=1e-3)
+
+
+def test_blocks_in_any_order_are_each_their_own_and_may_be_taken_together():
+    found = fit(channel((2.0, 0.7), noise=0.1), np.array([1.0, 0.5]), (0, 1))
+    # Stretches that are left out in turn alternate along a log.
+    block = (np.arange(T.size) // 40) % 2
+    normal, gradient = by_block(found, block)
+    for part in (0, 1):
+        slope = found.jacobian[block == part]
+        np.testing.assert_allclose(normal[part], slope.T @ slope)
+        np.testing.assert_allclose(gradient[part], slope.T @ found.residual[block == part])
+    tens = np.arange(T.size) // 40
+    pairs = by_block(found, tens, 2)[0]
+    np.testing.assert_allclose(pairs, by_block(found, tens)[0].reshape(5, 2, 2, 2).sum(axis=1))
