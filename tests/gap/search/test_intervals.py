@@ -1,6 +1,7 @@
 """95 % intervals hold what is true about as often as they say, and are wider where the noise is more than thought."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,9 +18,11 @@ from disco_hw.gap.search.analysis import (
     in_logs,
     in_motion,
     in_thirds,
+    wandered,
 )
 from disco_hw.gap.search.channel_search import ChannelResult, body_moves
 from disco_hw.gap.search.selection import Selector
+from disco_hw.gap.settings import DEFAULT_SETTINGS
 from tests.gap.synthetic import body_channel
 
 
@@ -148,3 +151,16 @@ def test_logs_of_one_robot_differ_in_what_changed_between_them_alone():
         assert across_logs(analysis, (0.0,)) == ()
         for each in found:
             assert all(low < value < high for value, low, high in each.values)
+
+
+@pytest.mark.parametrize(("of_halves", "of_quarters"), [(0.3, 0.1), (0.1, 0.3)])
+def test_the_division_of_a_log_that_shows_most_says_how_far_a_parameter_wanders(monkeypatch, of_halves, of_quarters):
+    spread = {2: of_halves, 4: of_quarters}
+
+    def in_parts(found, parts):
+        return {"motor_lag.tau_s": SimpleNamespace(variance_between=spread[np.unique(parts).size])}
+
+    monkeypatch.setitem(wandered.__globals__, "in_parts", in_parts)
+    channel = SimpleNamespace(block=np.repeat(np.arange(12), 5), settings=DEFAULT_SETTINGS)
+    found = SimpleNamespace(channel=channel, selector=SimpleNamespace(channel=channel))
+    assert wandered(found) == {"motor_lag.tau_s": 0.3}
