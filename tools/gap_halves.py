@@ -21,7 +21,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 
-from disco_hw.gap import model_of, offered_stage, search
+from disco_hw.gap import model_of, offered_stage, search_log
 from disco_hw.gap.data import BODY, DELAYED_BY, WHEEL, Layout
 from disco_hw.gap.data.gridded_drive import GriddedDrive, grid_drive
 from disco_hw.gap.noise.body_noise import BodyNoise
@@ -128,7 +128,7 @@ class Part:
     def search(cls, name: str, log: DriveLog, nominal: Model) -> Part:
         """Search it."""
         began = time.process_time()
-        analysis, _ = search(log, nominal)
+        analysis, _ = search_log(log, nominal)
         return cls(name, log, analysis, time.process_time() - began)
 
 

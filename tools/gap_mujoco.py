@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
-from disco_hw.gap import model_of, offered_stage, search
+from disco_hw.gap import model_of, offered_stage, search_log
 from disco_hw.gap.data.gridded_drive import grid_drive
 from disco_hw.gap.report.judge import Measured, effect_findings, sort_out, unnamed_findings
 from disco_hw.gap.search.analysis import final_fit
@@ -181,7 +181,7 @@ def work(hidden: str, seed: int) -> Result:
     seen, kept_back = record(sizes, seed), record(sizes, seed + UNSEEN)
     nominal = Model(WHEEL_RADIUS_M, TRACK_M, 0.0)
     began = time.process_time()
-    analysis, _ = search(seen.as_drive(), nominal)
+    analysis, _ = search_log(seen.as_drive(), nominal)
     final = final_fit(analysis)
     fits, unnamed = effect_findings(analysis, final), unnamed_findings(analysis)
     named, doubtful = sort_out(fits, Measured.of(analysis, final))

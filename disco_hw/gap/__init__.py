@@ -91,7 +91,7 @@ def find_gap(
     began = time.perf_counter()
     say = progress or (lambda text: None)
     log = logs if isinstance(logs, DriveLog) else concatenate(logs)
-    analysis, notes = search(log, model, say, settings)
+    analysis, notes = search_log(log, model, say, settings)
     say("intervals, blind spots and the gap on held-out data")
     final = final_fit(analysis)
     named, unnamed = effect_findings(analysis, final), unnamed_findings(analysis)
@@ -192,7 +192,7 @@ def missing_effects(log: DriveLog, model: Model) -> tuple[str, ...]:
     None where poses are predicted as well without them, from commands and with the geometry refitted: a log of two
     minutes shows a delay of 2 ms, which nobody has to know to drive.
     """
-    analysis, _ = search(log, model)
+    analysis, _ = search_log(log, model)
     final = final_fit(analysis)
     names = tuple(effect.name for effect in effect_findings(analysis, final))
     if analysis.body is None or not names:
@@ -202,7 +202,7 @@ def missing_effects(log: DriveLog, model: Model) -> tuple[str, ...]:
     return () if worse_by(amended, refitted) <= DEFAULT_SETTINGS.prediction.worse else names
 
 
-def search(
+def search_log(
     log: DriveLog,
     model: Model,
     say: Progress = lambda text: None,

@@ -154,7 +154,7 @@ def searched(monkeypatch):
 
     def made(hidden, **drive):
         log = simulated_drive(hidden, **drive)
-        found = gap.search(log, MODEL)
+        found = gap.search_log(log, MODEL)
         monkeypatch.setattr(gap, "search", lambda given, model, *_: found if given is log and model is MODEL else None)
         return log
 
@@ -172,6 +172,6 @@ def test_the_names_alone_are_those_of_the_report(searched):
 )
 def test_what_the_log_shows_and_no_prediction_needs_is_not_missing(searched, delay_s, missing):
     log = searched({"command_delay": delay_s}, seed=903, drive="rich")
-    analysis, _ = gap.search(log, MODEL)
+    analysis, _ = gap.search_log(log, MODEL)
     assert [effect.name for effect in effect_findings(analysis, final_fit(analysis))] == ["command_delay"]
     assert missing_effects(log, MODEL) == missing

@@ -21,7 +21,7 @@ MODEL = Model(0.061, 0.415, 0.238)
 def searched():
     """A log in which something is hidden, what the search finds in it, and its predictions, each made once."""
     log = simulated_drive({"motor_lag": 0.15}, 1, "circle")
-    analysis, notes = gap.search(log, MODEL)
+    analysis, notes = gap.search_log(log, MODEL)
     predictions = joint_predictions(analysis, final_fit(analysis))
     return log, analysis, notes, SimpleNamespace(table=predictions.table().copy, joint=predictions.joint)
 
