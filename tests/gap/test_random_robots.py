@@ -61,7 +61,7 @@ def written(searched, monkeypatch, folder, seeds):
         robot, out = folder / f"{seed}.toml", folder / str(seed)
         robot.write_text(text)
         here = of_geometry(analysis, radius_m, axial_m)
-        monkeypatch.setattr(gap, "search", lambda *_, here=here: (here, notes))
+        monkeypatch.setattr(gap, "search_log", lambda *_, here=here: (here, notes))
         result = gap.gap([], robot, out)
         report = json.loads((out / "report.json").read_text())
         assert all(type(spot["blind"]) is bool for spot in report["blind_spots"])
