@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -132,6 +133,13 @@ def test_every_field_is_documented():
     for driver in motor_drivers().values():
         for field in driver.settings.__struct_fields__:
             assert f"\n{field} = " in text, f"{driver.name}: {field}"
+
+
+def test_the_page_on_controllers_has_a_link_for_each_that_loads(tmp_path):
+    page = (Path(__file__).parents[2] / "docs" / "controllers.md").read_text(encoding="utf-8")
+    links = re.findall(r"^```toml\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    drivers = [load(tmp_path, GOOD + link).link.driver for link in links]
+    assert sorted(drivers) == sorted(set(motor_drivers()) - {"reference"})
 
 
 def _fields_of(section: str) -> tuple[str, ...]:
