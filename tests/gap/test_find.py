@@ -155,7 +155,11 @@ def searched(monkeypatch):
     def made(hidden, **drive):
         log = simulated_drive(hidden, **drive)
         found = gap.search_log(log, MODEL)
-        monkeypatch.setattr(gap, "search_log", lambda given, model, *_: found if given is log and model is MODEL else None)
+
+        def again(given, model, *_):
+            return found if given is log and model is MODEL else None
+
+        monkeypatch.setattr(gap, "search_log", again)
         return log
 
     return made
