@@ -25,7 +25,8 @@ class UnknownEffectError(HiddenEffectError):
 class EffectValue:
     """One number of an effect.
 
-    `realistic` is the range of its magnitude seen on real robots, `bounds` what is physically possible (inclusive),
+    `realistic` is the range of its magnitude seen on real robots; the model's figures stand apart from it, so that a
+    search which knew them would gain nothing. `bounds` is what is physically possible (inclusive),
     `neutral` the value at which the effect does nothing, `default` what stands in when the number is left out (None:
     it must be given).
     """
@@ -51,8 +52,8 @@ class EffectSpec:
 
 _POSITIVE = (1e-6, math.inf)
 _NOT_NEGATIVE = (0.0, math.inf)
-_RATIO = (-0.9, 0.9)
-_FRACTION = (0.0, 0.9)
+_RATIO = (-0.95, 0.95)
+_FRACTION = (0.0, 0.95)
 
 _WHEEL = "command_to_wheel"
 _BODY = "wheel_to_body"
@@ -63,50 +64,50 @@ _SPECS = (
         "motor_lag",
         _WHEEL,
         "the wheel speed follows its command as a first-order lag of this time constant",
-        (EffectValue("tau_s", "s", (0.05, 0.2), _NOT_NEGATIVE),),
+        (EffectValue("tau_s", "s", (0.045, 0.22), _NOT_NEGATIVE),),
     ),
     EffectSpec(
         "command_delay",
         _WHEEL,
         "commands take effect this much later",
-        (EffectValue("delay_s", "s", (0.04, 0.2), _NOT_NEGATIVE),),
+        (EffectValue("delay_s", "s", (0.035, 0.22), _NOT_NEGATIVE),),
     ),
     EffectSpec(
         "deadband",
         _WHEEL,
         "u -> sign(u) max(|u| - width, 0)",
-        (EffectValue("width_rad_s", "rad/s", (0.25, 0.9), _NOT_NEGATIVE),),
+        (EffectValue("width_rad_s", "rad/s", (0.22, 0.95), _NOT_NEGATIVE),),
     ),
     EffectSpec(
         "stiction",
         _WHEEL,
         "a wheel at rest stays at rest until |u| exceeds this; a turning wheel feels nothing",
-        (EffectValue("threshold_rad_s", "rad/s", (0.5, 1.2), _NOT_NEGATIVE),),
+        (EffectValue("threshold_rad_s", "rad/s", (0.45, 1.3), _NOT_NEGATIVE),),
     ),
     EffectSpec(
         "speed_limit",
         _WHEEL,
         "each wheel's command is cut at +- this speed",
-        (EffectValue("limit_rad_s", "rad/s", (4.5, 7.0), _POSITIVE, neutral=math.inf),),
+        (EffectValue("limit_rad_s", "rad/s", (4.3, 7.1), _POSITIVE, neutral=math.inf),),
     ),
     EffectSpec(
         "yaw_rate_limit",
         _WHEEL,
         "the commanded yaw rate r (u_R - u_L) / a is cut at +- this, the mean wheel speed is kept",
-        (EffectValue("limit_rad_s", "rad/s", (0.7, 1.2), _POSITIVE, neutral=math.inf),),
+        (EffectValue("limit_rad_s", "rad/s", (0.65, 1.25), _POSITIVE, neutral=math.inf),),
     ),
     EffectSpec(
         "yaw_acceleration_limit",
         _WHEEL,
         "the yaw rate r (w_R - w_L) / a that the motors are asked for changes by at most this, their mean is kept",
-        (EffectValue("limit_rad_s2", "rad/s^2", (1.0, 3.0), _POSITIVE, neutral=math.inf),),
+        (EffectValue("limit_rad_s2", "rad/s^2", (0.9, 3.2), _POSITIVE, neutral=math.inf),),
     ),
     EffectSpec(
         "battery_sag",
         _WHEEL,
         "u -> u (1 - loss t / duration): wheel speed falls linearly with the time since start",
         (
-            EffectValue("loss", "1", (0.05, 0.15), _FRACTION),
+            EffectValue("loss", "1", (0.045, 0.17), _FRACTION),
             EffectValue("duration_s", "s", (150.0, 150.0), _POSITIVE, neutral=150.0, default=150.0),
         ),
     ),
@@ -115,8 +116,8 @@ _SPECS = (
         _WHEEL,
         "u -> u (1 + gain); one number: both wheels, two: left, right",
         (
-            EffectValue("left", "1", (0.02, 0.06), _RATIO),
-            EffectValue("right", "1", (0.02, 0.06), _RATIO),
+            EffectValue("left", "1", (0.018, 0.065), _RATIO),
+            EffectValue("right", "1", (0.018, 0.065), _RATIO),
         ),
         lone=(0, 1),
     ),
@@ -125,8 +126,8 @@ _SPECS = (
         _BODY,
         "the encoder counts (1 + scale) times the wheel's angle; one number: right wheel, two: left, right",
         (
-            EffectValue("left", "1", (0.015, 0.05), _RATIO, default=0.0),
-            EffectValue("right", "1", (0.015, 0.05), _RATIO),
+            EffectValue("left", "1", (0.013, 0.055), _RATIO, default=0.0),
+            EffectValue("right", "1", (0.013, 0.055), _RATIO),
         ),
         lone=(1,),
     ),
@@ -134,38 +135,38 @@ _SPECS = (
         "wheel_radius_asymmetry",
         _BODY,
         "r_R = r (1 + s), r_L = r (1 - s)",
-        (EffectValue("ratio", "1", (0.008, 0.03), _RATIO),),
+        (EffectValue("ratio", "1", (0.007, 0.035), _RATIO),),
     ),
     EffectSpec(
         "turn_slip",
         _BODY,
         "omega -> omega (1 - k |omega|), at most half of it lost",
-        (EffectValue("k_s", "s/rad", (0.04, 0.14)),),
+        (EffectValue("k_s", "s/rad", (0.035, 0.16)),),
     ),
     EffectSpec(
         "acceleration_slip",
         _BODY,
         "v -> v - k |v| dv/dt: wheels run ahead of the body when speeding up and behind it when braking",
-        (EffectValue("k_s2_m", "s^2/m", (0.08, 0.25)),),
+        (EffectValue("k_s2_m", "s^2/m", (0.07, 0.28)),),
     ),
     EffectSpec(
         "side_slip",
         _BODY,
         "v_y -> v_y - k v omega: the body is carried outwards in a turn",
-        (EffectValue("k_s", "s", (0.06, 0.2)),),
+        (EffectValue("k_s", "s", (0.055, 0.22)),),
     ),
     EffectSpec(
         "lateral_icr",
         _BODY,
         "the centre of rotation lies this far to the left: v_x -> v_x + offset omega",
-        (EffectValue("offset_m", "m", (0.015, 0.05)),),
+        (EffectValue("offset_m", "m", (0.013, 0.055)),),
     ),
     EffectSpec(
         "slope",
         _BODY,
         "a drift of this velocity in the world frame while the wheels turn; direction counter-clockwise from x",
         (
-            EffectValue("drift_m_s", "m/s", (0.008, 0.025)),
+            EffectValue("drift_m_s", "m/s", (0.007, 0.03)),
             EffectValue("direction_rad", "rad", (0.0, math.pi), default=0.0),
         ),
     ),
@@ -174,8 +175,8 @@ _SPECS = (
         _BODY,
         "from this time on the effective axial distance is (1 + track) and the wheel radius (1 + radius) times the old",
         (
-            EffectValue("track", "1", (0.06, 0.18), _RATIO),
-            EffectValue("time_s", "s", (40.0, 110.0), _NOT_NEGATIVE, neutral=math.inf, default=60.0),
+            EffectValue("track", "1", (0.055, 0.2), _RATIO),
+            EffectValue("time_s", "s", (35.0, 115.0), _NOT_NEGATIVE, neutral=math.inf, default=55.0),
             EffectValue("radius", "1", (0.0, 0.04), _RATIO, default=0.0),
         ),
     ),
@@ -183,15 +184,15 @@ _SPECS = (
         "pose_latency",
         _POSE,
         "a pose is what was true this long before its time stamp",
-        (EffectValue("latency_s", "s", (0.04, 0.2), _NOT_NEGATIVE),),
+        (EffectValue("latency_s", "s", (0.035, 0.22), _NOT_NEGATIVE),),
     ),
     EffectSpec(
         "pose_offset",
         _POSE,
         "the sensor sits beside the tracked point in the body frame; one number: to the left, two: forward, left",
         (
-            EffectValue("forward_m", "m", (0.015, 0.05), default=0.0),
-            EffectValue("left_m", "m", (0.015, 0.05)),
+            EffectValue("forward_m", "m", (0.013, 0.055), default=0.0),
+            EffectValue("left_m", "m", (0.013, 0.055)),
         ),
         lone=(1,),
     ),
@@ -199,7 +200,7 @@ _SPECS = (
         "heading_bias",
         _POSE,
         "the measured yaw is the true one plus this",
-        (EffectValue("bias_rad", "rad", (0.026, 0.087)),),
+        (EffectValue("bias_rad", "rad", (0.023, 0.095)),),
     ),
     EffectSpec(
         "x_second_order_motor",
@@ -220,7 +221,7 @@ _SPECS = (
         "x_smooth_deadband",
         _WHEEL,
         "u -> u - width tanh(u / width)",
-        (EffectValue("width_rad_s", "rad/s", (0.25, 0.9), _NOT_NEGATIVE),),
+        (EffectValue("width_rad_s", "rad/s", (0.22, 0.95), _NOT_NEGATIVE),),
     ),
     EffectSpec(
         "x_motor_droop",

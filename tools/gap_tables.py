@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from scipy.stats import binomtest
 
 from tools import strange_robot
-from tools.gap_jobs import FORMS, KINDS, NAMED, OUTSIDE, Result
+from tools.gap_jobs import FORMS, KINDS, MOTORS, NAMED, OUTSIDE, Result
 
 
 def wilson(right: int, count: int) -> tuple[float, float]:
@@ -105,7 +105,8 @@ def confusion(results: Sequence[Result]) -> tuple[list[str], list[str], np.ndarr
     counts = np.zeros((len(rows), len(columns)), dtype=int)
     for result in of:
         row = rows.index(result.hidden[0] if result.hidden else "nothing")
-        found = [*result.named, *(["unnamed"] if result.unnamed else [])] or ["nothing"]
+        named = [name for name in result.named if name in result.hidden or name not in MOTORS]
+        found = [*named, *(["unnamed"] if result.unnamed else [])] or ["nothing"]
         for name in found:
             counts[row, columns.index(name)] += 1
     return rows, columns, counts

@@ -1,9 +1,11 @@
 """Names, numbers and refusals of the hidden effects."""
 
 import math
+from itertools import chain
 
 import pytest
 
+from disco_hw.effects.registry import REGISTRY
 from sim.effects import (
     EFFECTS,
     HiddenEffectError,
@@ -109,3 +111,21 @@ def test_realistic_sizes_are_possible(name):
     spec = EFFECTS[name]
     for place in (0, 1):
         assert hidden_effects({name: [value.realistic[place] for value in spec.values]})
+
+
+def sizes_of(effect):
+    """Every number of an effect that is no mere neutral zero, or without end, without its sign."""
+    return {abs(number) for number in effect if number and math.isfinite(number)}
+
+
+@pytest.mark.parametrize("name", [name for name in EFFECTS if not name.startswith("x_")])
+def test_no_size_of_the_simulator_stands_in_the_model_too(name):
+    """A study on robots drawn from the search's own figures would prove nothing of it."""
+    simulated = [
+        (*value.realistic, *value.bounds, value.neutral, value.default or 0.0) for value in EFFECTS[name].values
+    ]
+    searched = [
+        (one.low, one.high, one.start, one.neutral, one.realistic or 0.0, one.expected, one.least_fitted or 0.0)
+        for one in REGISTRY[name].parameters
+    ]
+    assert not sizes_of(chain(*simulated)) & sizes_of(chain(*searched))

@@ -46,6 +46,10 @@ def test_what_counts_as_right_depends_on_the_kind():
     assert result().right
     assert not result(named=()).right
     assert not result(named=("motor_lag", "deadband")).right
+    # The motors of every robot of the study lag, hidden or not.
+    assert result(hidden=("deadband",), named=("motor_lag", "deadband")).right
+    assert result("none", (), ("motor_lag",)).right
+    assert not result("none", (), ("command_delay",)).right
     assert not result(unnamed=["v_x += 1 v"]).right
     assert result(hidden=("pose_offset",), named=("lateral_icr",)).right
     assert not result("outside", ("x_motor_droop",), ("wheel_gain",), unnamed=["u |u|"]).right
@@ -78,10 +82,11 @@ def test_a_miss_that_the_report_calls_too_small_is_counted_beside_and_never_as_r
     assert not gap_jobs.too_small(limit, 5.0)
 
 
-def test_the_gap_of_a_strange_robot_is_that_of_the_timed_model():
+def test_the_gap_to_close_is_that_of_the_timed_model_where_more_than_times_is_hidden():
     strange = result("strange", ("backlash",), (), timed_mm=24.0, amended_mm=19.0)
     assert strange.closed == pytest.approx(0.5)
     assert result(timed_mm=24.0).closed == pytest.approx(25.0 / 26.0)
+    assert result(hidden=("motor_lag", "deadband"), timed_mm=24.0).closed == pytest.approx(0.9)
     figures = gap_tables.summary([strange, result("strange", ("backlash",), (), timed_mm=24.0, amended_mm=20.0)])
     assert (figures["gap.strange.closed_by_half"], figures["gap.strange.closed_of"]) == (0.5, 2)
     assert any(line.startswith("| `backlash` |") for line in gap_tables.per_effect([strange]))
