@@ -11,6 +11,9 @@ from dataclasses import dataclass
 
 from firmware_protocol.codec import PROTOCOL
 
+THEN_RESET, THEN_RESTART, BY_ITSELF = "then reset", "then restart the controller", "it clears by itself"
+"""What ends a fault in the robot once its cause is gone: the last words of its advice."""
+
 _LATCHING = 0x0800
 _PERMANENT = 0x0400
 
@@ -104,8 +107,8 @@ class Fault:
     def ending(self) -> str:
         """What ends it once its cause is gone."""
         if self.permanent:
-            return "then restart the controller"
-        return "then reset" if self.latches else "it clears by itself"
+            return THEN_RESTART
+        return THEN_RESET if self.latches else BY_ITSELF
 
     @property
     def advice(self) -> str:

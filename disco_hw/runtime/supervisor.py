@@ -10,6 +10,7 @@ import msgspec
 
 from disco_hw.runtime.states import PROBLEM, Condition, State, Transition, connection, next_transition
 from drivers.types import DriverState, LinkState, Request
+from firmware_protocol.status_codes import BY_ITSELF, THEN_RESET, THEN_RESTART
 
 FIND_HEADING = "the poses have none: drive a metre straight on, by hand on the page, and it is found"
 _IDLE = frozenset({DriverState.STANDBY, DriverState.READY})
@@ -344,8 +345,12 @@ class Supervisor:
             self._events.append("task stopped: the path's end is reached")
 
     def _trouble_and_remedy(self, remedy: str) -> str:
-        """The trouble with its own remedy if it names one, else with this one."""
-        return self._trouble if self._trouble.endswith("then reset") else f"{self._trouble}; {remedy}"
+        """The trouble with its own remedy if it names one, else with this one; this host's reset always comes last."""
+        if self._trouble.endswith(THEN_RESET):
+            return self._trouble
+        if self._trouble.endswith((BY_ITSELF, THEN_RESTART)):
+            return f"{self._trouble}, {THEN_RESET}"
+        return f"{self._trouble}; {remedy}"
 
     def _words(self, inputs: Inputs) -> str:
         """Return what a person should know of the present state."""

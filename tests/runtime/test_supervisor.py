@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from disco_hw.runtime.states import TRANSITIONS, State
 from disco_hw.runtime.supervisor import Inputs, Supervisor, UserRequest
 from drivers.types import DriverState, LinkState, Request
+from firmware_protocol import status_codes
 from tests.runtime.supervisor_bench import ARM, DISARM, ESTOP, RESET, SETTINGS, START, STOP, TICK_NS, Bench
 
 
@@ -83,6 +84,21 @@ def test_a_fault_whose_words_end_with_the_remedy_has_it_once():
     assert out.detail == "node 3 fell silent; remove the cause, then reset"
     assert refusal(bench.tick(ARM)).count("reset") == 1
     assert bench.tick(daemon_error="it failed").detail.endswith("then reset")
+
+
+@pytest.mark.parametrize(
+    ("fault", "ending"),
+    [("OVER_TEMPERATURE_LEFT", "; it clears by itself, then reset"),
+     ("SELF_TEST_FAILED", "; then restart the controller, then reset"),
+     ("STALL_LEFT", "motor's cable; then reset")],
+)  # fmt: skip
+def test_a_fault_of_the_robot_is_followed_by_this_hosts_reset_without_another_remedy(fault, ending):
+    bench = Bench()
+    bench.running()
+    out = bench.tick(driver_state=DriverState.FAULT, driver_detail=status_codes.fault(fault))
+    assert out.detail.endswith(ending)
+    assert "mend it" not in out.detail
+    assert refusal(bench.tick(ARM)).endswith(ending)
 
 
 @pytest.mark.parametrize("start", ["ready", "armed", "running", "stopping"])
