@@ -142,7 +142,7 @@ class SimulatedRun:
             for reply in tick.replies:
                 if not reply.accepted:
                     raise WorkError(f"the virtual robot could not be armed: {reply.text}")
-        self.run(0.02, UserRequest.START)
+        self.run(self._period_us * 1e-6, UserRequest.START)
 
     def drive(self, limit_s: float, progress: Callable[[float], None] = lambda t_s: None) -> None:
         """Let the pilot drive to its end; raises WorkError if it takes longer. `progress` gets the time (s)."""
