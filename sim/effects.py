@@ -147,7 +147,7 @@ _SPECS = (
         "acceleration_slip",
         _BODY,
         "v -> v - k |v| dv/dt: wheels run ahead of the body when speeding up and behind it when braking",
-        (EffectValue("k_s2_m", "s^2/m", (0.073, 0.265)),),
+        (EffectValue("k_s2_m", "s^2/m", (0.0745, 0.265)),),
     ),
     EffectSpec(
         "side_slip",
