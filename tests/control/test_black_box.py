@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from disco_hw.control import NoValidControl, Sampler, oracle, pendulum
+from disco_hw.control import NoValidControl, Sampler, pendulum
 from disco_hw.control.black_box import BlackBoxDisco
 from disco_hw.control.parameter_points import drawn_points, unscented_points
 from disco_hw.control.pendulum import PAPER_SAMPLER
@@ -16,6 +16,7 @@ from disco_hw.experiments.pendulum import circle_cost, pendulum_cost, pendulum_t
 from disco_hw.model import load_model
 from disco_hw.model import plain as physics
 from disco_hw.tasks.circle import CircleCost
+from tests.control import oracle
 from tests.tasks import costs
 
 MODEL = load_model(Path(__file__).parents[2] / "disco_hw/robots/wombot_model.toml")

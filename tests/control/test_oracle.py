@@ -5,11 +5,12 @@ import math
 import numpy as np
 import pytest
 
-from disco_hw.control import oracle, pendulum
+from disco_hw.control import pendulum
 from disco_hw.model.plain import RobotState
 from disco_hw.tasks.circle import CircleCost
 from disco_hw.tasks.line import Waypoints
 from disco_hw.tasks.timed_path import TimedPathCost
+from tests.control import oracle
 from tests.tasks.costs import circle_cost, path_along, path_cost, timed_path_cost
 
 THETA = {"wheel_radius_m": 0.1, "axial_distance_m": 0.5, "x_icr_m": 0.0}

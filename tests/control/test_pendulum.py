@@ -8,9 +8,10 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from disco_hw.control import NoValidControl, oracle, pendulum
+from disco_hw.control import NoValidControl, pendulum
 from disco_hw.control.kernel import BLOCK
 from disco_hw.control.pendulum import PAPER_SAMPLER, PendulumPlanner, PendulumPoints
+from tests.control import oracle
 
 K, T = 160, 30
 SAMPLER = replace(PAPER_SAMPLER, samples=K)

@@ -6,7 +6,6 @@ import math
 
 import numpy as np
 
-from disco_hw.control.oracle import Array, SequenceCost
 from disco_hw.tasks import circle as circle_file
 from disco_hw.tasks.circle import MOST_TURNED, CircleCost
 from disco_hw.tasks.line import PathTable, Waypoints
@@ -22,6 +21,7 @@ from disco_hw.tasks.line.cost import (
 )
 from disco_hw.tasks.line.course import stable_yaw
 from disco_hw.tasks.timed_path import RESTS_M, TimedPathCost
+from tests.control.oracle import Array, SequenceCost
 
 
 def path_along(waypoints: Waypoints, speed_m_s: float = 0.2) -> PathCost:

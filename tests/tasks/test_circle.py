@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from disco_hw.control import oracle
 from disco_hw.control.disco import Disco
 from disco_hw.control.plan import PlannerState
 from disco_hw.control.settings import CommandLimits, DiscoSettings
@@ -14,6 +13,7 @@ from disco_hw.experiments.circle import KinematicPlant
 from disco_hw.model import load_model
 from disco_hw.model import plain as physics
 from disco_hw.tasks.circle import CircleCost, CircleTask
+from tests.control import oracle
 from tests.tasks.costs import circle_cost
 
 MODEL = load_model(Path(__file__).parents[2] / "disco_hw/robots/wombot_model.toml")

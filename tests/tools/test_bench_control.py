@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 import torch
 
-from disco_hw.control import DiscoSettings, PlannerState, oracle
+from disco_hw.control import DiscoSettings, PlannerState
 from disco_hw.control.parameter_points import unscented_points
 from disco_hw.model import load_model
 from disco_hw.model import plain as physics
 from disco_hw.tasks.circle import CircleCost
+from tests.control import oracle
 from tests.tasks import costs
 from tools.bench_control import ROBOTS, beside_peer, torch_times_ms
 from tools.step_times import summary, times_ms, undisturbed

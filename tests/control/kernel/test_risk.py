@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from numba import njit
 
-from disco_hw.control import oracle
 from disco_hw.control.kernel import BLOCK, aligned_zeros
 from disco_hw.control.kernel.step import mean_over_points, worst_over_points
+from tests.control import oracle
 
 B = int(BLOCK)
 

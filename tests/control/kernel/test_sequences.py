@@ -8,7 +8,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numba import njit
 
-from disco_hw.control import oracle
 from disco_hw.control.kernel import BLOCK, U, aligned_zeros
 from disco_hw.control.kernel.sequences import (
     Basis,
@@ -23,6 +22,7 @@ from disco_hw.control.kernel.sequences import (
     sum_lanes,
 )
 from disco_hw.control.optimiser import spline_basis
+from tests.control import oracle
 
 B, T, C, KNOTS, HISTORY = int(BLOCK), 12, 2, 5, 3
 FIRST, TAPS = spline_basis(KNOTS, T)

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from disco_hw.control import CommandLimits, Disco, DiscoSettings, PlannerState, Sampler, SentCommand, oracle
+from disco_hw.control import CommandLimits, Disco, DiscoSettings, PlannerState, Sampler, SentCommand
 from disco_hw.control.kernel import BLOCK
 from disco_hw.control.optimiser import spline_basis
 from disco_hw.control.parameter_points import unscented_points
@@ -22,6 +22,7 @@ from disco_hw.tasks.circle import CircleCost
 from disco_hw.tasks.line import PathTable, Waypoints
 from disco_hw.tasks.line.cost import FARTHEST_STEP_M, PathCost
 from disco_hw.tasks.timed_path import TimedPathCost
+from tests.control import oracle
 from tests.tasks.costs import circle_cost, path_along, path_cost, timed_path_cost
 
 SAMPLES, HORIZON, STEP_S = 160, 50, 0.1

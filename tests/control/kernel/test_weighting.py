@@ -6,9 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numba import njit
 
-from disco_hw.control import oracle
 from disco_hw.control.kernel import BLOCK, aligned_zeros
 from disco_hw.control.kernel.step import INVALID, exp_nonpositive, refuse_invalid, temperature_for, weigh
+from tests.control import oracle
 
 B = int(BLOCK)
 
