@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from disco_hw.adaptation.adapter_link import NAMES, Proposal
 from disco_hw.config import Control, PoseInput, Prior
-from disco_hw.effects.effect import Channel
+from disco_hw.effects import Channel
 from disco_hw.errors import InputError
 from disco_hw.log.records import BeliefChange
 from disco_hw.model import Gaussian, Model

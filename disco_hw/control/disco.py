@@ -32,7 +32,7 @@ from disco_hw.control.plan import (
 )
 from disco_hw.control.settings import CommandLimits, DiscoSettings
 from disco_hw.control.wheel_loss import WheelLoss
-from disco_hw.effects.effect import Channel
+from disco_hw.effects import Channel
 from disco_hw.effects.registry import DELAY
 from disco_hw.jit import compiled_for
 from disco_hw.model import Belief, Model

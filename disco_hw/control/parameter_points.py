@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.effects.effect import Channel
+from disco_hw.effects import Channel
 from disco_hw.effects.registry import DELAY
 from disco_hw.model import Belief, Mixture, Model
 from disco_hw.model.model import BASE_PARAMETERS, X_ICR

@@ -1,1 +1,299 @@
-"""The effects: each file holds all that anyone needs to know of one difference between ideal and real robots."""
+"""What an effect is: a named difference between the ideal robot and a real one, with its equations and its traits.
+
+Each file beside this one holds all that anyone needs to know of one of them.
+"""
+
+from __future__ import annotations
+
+import enum
+import inspect
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+# Of one state or of many at once.
+Value = float | Array
+Values = tuple[Value, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """One number of theta.
+
+    `low` and `high` bound what is physically possible; `start` is a plausible value to begin a fit from; `neutral` is
+    the value without any effect; `realistic` is the smallest size that real robots show (of a limit the largest), None
+    where that says nothing. `expected` is how far from neutral it lies as a rule, `least_fitted` a bound below `low`
+    that a fit may reach, so that a wrong clock shows.
+    """
+
+    name: str
+    unit: str
+    low: float
+    high: float
+    start: float
+    neutral: float = 0.0
+    realistic: float | None = None
+    expected: float = math.inf
+    least_fitted: float | None = None
+
+
+class Channel(enum.Enum):
+    """Where in the chain from command to measured pose an effect acts."""
+
+    COMMAND_TO_WHEEL = "command_to_wheel"
+    WHEEL_TO_BODY = "wheel_to_body"
+    POSE_SENSOR = "pose_sensor"
+
+
+class Stage(enum.Enum):
+    """What of a step an effect changes, that is what its `term` and `plain` return, in the order of a step.
+
+    Both ask by name for what they need: `left`, `right` (commands, rad/s), or `command` and the wheel's `speed` of one
+    wheel at a time; of the response `end_left`, `end_right`, `mean_left`, `mean_right` and `wheel_left`, `wheel_right`
+    (at the start), with `left` and `right` what is aimed for, or `end`, `mean` and `speed` of one wheel at a time; of
+    the body `wheel_sum`, `difference` (of right
+    and left, rad/s), `change` (of the sum over the step), `forward` (m/s), `turn` (half the yaw rate, rad/s), `x`, `y`;
+    and the time at the step's start, `time_s`.
+    """
+
+    DELAY = "mean command over a step, of the one in force after whole steps of delay and the older one"
+    COMMAND = "the commands left and right, or the one of a wheel"
+    RESPONSE = "wheel speed at the end of the step and its mean; of both wheels left and right, then the means"
+    ROLLING = "wheel_sum and difference"
+    VELOCITY = "forward and turn"
+    FORWARD = "forward"
+    TURN = "turn"
+    LATERAL = "lateral speed that comes on top (m/s), None where the effect is absent"
+    WORLD = "x and y (m) after the step"
+    ENCODERS = "angles or speeds of the wheels, left and right, as the encoders report them"
+    POSE = "x, y and yaw as the pose sensor reports them"
+    POSE_TIME = "when a pose with the time stamp time_s was true"
+    TERMS = "a command or a velocity of the body, by one of the terms without a name"
+
+
+# What only changes what is measured.
+_MEASURING = (Stage.ENCODERS, Stage.POSE, Stage.POSE_TIME)
+# Stages that act one after the other; those in one group by their `order`.
+STAGE_GROUPS = (
+    (Stage.DELAY,),
+    (Stage.COMMAND,),
+    (Stage.RESPONSE,),
+    (Stage.ROLLING,),
+    (Stage.VELOCITY, Stage.FORWARD, Stage.TURN, Stage.LATERAL),
+    (Stage.WORLD,),
+    (Stage.ENCODERS,),
+    (Stage.POSE_TIME,),
+    (Stage.POSE,),
+    (Stage.TERMS,),
+)
+
+_WHEELS = ("left", "right", "command", "speed", "wheel_left", "wheel_right", "time_s")
+_RESPONSE = (
+    "left", "right", "end_left", "end_right", "mean_left", "mean_right", "end", "mean", "speed", "wheel_left",
+    "wheel_right",
+)  # fmt: skip
+_ROLLING = ("wheel_sum", "difference", "change", "time_s")
+_BODY = (*_ROLLING, "forward", "turn")
+# What `term` and `plain` of a stage may ask for.
+INPUTS = {
+    Stage.DELAY: ("recent", "older"),
+    Stage.COMMAND: _WHEELS,
+    Stage.RESPONSE: (*_RESPONSE, "time_s"),
+    Stage.ROLLING: _ROLLING,
+    Stage.VELOCITY: _BODY,
+    Stage.FORWARD: _BODY,
+    Stage.TURN: _BODY,
+    Stage.LATERAL: _BODY,
+    Stage.WORLD: ("x", "y", "wheel_sum", "difference", "time_s"),
+    Stage.ENCODERS: ("left", "right"),
+    Stage.POSE: ("x", "y", "yaw"),
+    Stage.POSE_TIME: ("time_s",),
+}
+
+
+class Symptom(enum.Enum):
+    """A pattern that an effect leaves between measured wheels and poses when only the geometry is fitted."""
+
+    LATE_POSITIONS = "positions lag behind the wheels' motion"
+    SIDEWAYS_WITH_SPEED = "the robot moves sideways on straights"
+    SIDEWAYS_IN_FAST_TURNS = "the robot slides outwards the faster it turns"
+    FORWARD_WITH_TURNING = "turning shifts the robot forward or back"
+    DOWNHILL = "motion adds a drift in one direction of the floor"
+    SHORTER_AT_SPEED = "the distance per turn of the wheels changes with speed"
+    DISTANCE_CHANGES = "the distance per turn of the wheels changes during the drive"
+    TURNS_ON_STRAIGHTS = "the robot turns with equal wheel speeds"
+    LESS_TURN_AT_SPEED = "turning falls short the faster it is"
+    LATE_YAW = "yaw lags behind the wheels' turning"
+    LEFT_UNLIKE_RIGHT = "left and right turns differ"
+    TURNING_CHANGES = "turning per turn of the wheels changes during the drive"
+
+
+@dataclass(frozen=True, slots=True)
+class CommandedDrive:
+    """A drive as the search for an effect sees it: `commands` (N, 2) rad/s, known ones; wheel radius and axial distance
+    (m) of `geometry`; when its poses begin and end (s).
+    """
+
+    commands: Array
+    geometry: tuple[float, float]
+    first_s: float
+    last_s: float
+
+    @property
+    def largest_speed_rad_s(self) -> float:
+        """Largest wheel speed that was commanded."""
+        return float(np.abs(self.commands).max(initial=0.0))
+
+    @property
+    def largest_yaw_rate_rad_s(self) -> float:
+        """Largest yaw rate that was commanded."""
+        half = np.abs(0.5 * (self.commands[:, 1] - self.commands[:, 0]))
+        return float(half.max(initial=0.0)) * (2.0 * self.geometry[0] / self.geometry[1])
+
+
+@dataclass(frozen=True, slots=True)
+class Scan:
+    """A parameter in which the residual is not smooth, so that values are tried one by one: which ones for a drive, and
+    how close to the best to search on.
+    """
+
+    parameter: str
+    values: Callable[[CommandedDrive], tuple[float, ...]]
+    refine: float
+
+
+@dataclass(frozen=True, slots=True)
+class Mimicked:
+    """Another effect, by its module, confounded with this one in every drive, and what decides (`decided_by`).
+
+    `seen_too_as` is the effect of the other channel that the same cause shows as, if it shows in two; `seen_too` the
+    value that its first parameter then has, from the values of the mimicked effect.
+    """
+
+    module: Any
+    decided_by: str
+    seen_too_as: Any = None
+    seen_too: Callable[[Values], float] | None = None
+
+    @property
+    def effect(self) -> Effect:
+        """The other effect."""
+        found: Effect = self.module.EFFECT
+        return found
+
+
+def no_coefficients(values: Array, base: Array, step_s: float) -> tuple[Array, ...]:
+    """None: for what moves nothing."""
+    return ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Effect:
+    """One effect, as its file describes it; docs/add-an-effect.md shows a whole one.
+
+    What it does: `term` is the compiled scalar function that the step calls, with `coefficients`, None where the effect
+    is absent; `plain` is the same in float64 numpy, written for reading, with the parameters' `values`, the `geometry`
+    (wheel radius, axial distance, x_icr) and the step's length `step_s`. Both ask for what they need by name, see
+    `Stage`. `coefficients(values, base, step_s)` works out what `term` needs once for every parameter point: `values`
+    (L, P) in the order of `parameters`, `base` (L, 3) the geometry; arrays of shape (L,). `order` is the place among
+    the effects of a stage, ascending.
+
+    How it is reported: `sentence` for a report, with `{parameter}` fields; `excitation`, the manoeuvre that shows it,
+    and `script`, the one of `disco-hw drive --script` that drives it; `symptoms`.
+
+    Traits: `uses_geometry`, whether its coefficients depend on the geometry; `may_turn_more`, whether it can make the
+    robot turn faster than its wheels say; `late_by`, the parameter that is a time by which wheels are behind commands,
+    fitted from `late_starts`; `dead_by`, the parameter that is what a drive takes off a command;
+    `like_a_patch`, what decides between it and a patch of the floor if that leaves the same traces; `mimics`, an effect
+    that competes in its place.
+
+    How it is searched for: all parameters from neutral; or from the best of `starts` for a drive; or one by a `scan`.
+    `limited(commands, geometry)` is, for a limit, what it limits, (N,); `trials` are sizes to try in turn where it is
+    not smooth.
+
+    Raises ValueError for a description that contradicts itself.
+    """
+
+    name: str
+    channel: Channel
+    stage: Stage
+    parameters: tuple[Parameter, ...]
+    plain: Callable[..., Any]
+    sentence: str
+    excitation: str
+    script: str
+    term: Callable[..., Any] | None = None
+    coefficients: Callable[[Array, Array, float], tuple[Array, ...]] = no_coefficients
+    order: int = 0
+    symptoms: tuple[Symptom, ...] = ()
+    uses_geometry: bool = False
+    may_turn_more: bool = False
+    late_by: str | None = None
+    dead_by: str | None = None
+    late_starts: tuple[float, ...] = ()
+    like_a_patch: str | None = None
+    mimics: Mimicked | None = None
+    starts: Callable[[CommandedDrive], tuple[tuple[float, ...], ...]] | None = None
+    scan: Scan | None = None
+    limited: Callable[[Array, tuple[float, float]], Array] | None = None
+    trials: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        keys = [parameter.name for parameter in self.parameters]
+        for key in (self.late_by, self.dead_by, None if self.scan is None else self.scan.parameter):
+            if key is not None and key not in keys:
+                raise ValueError(f"{self.name}: has no parameter {key!r}, only {', '.join(keys)}")
+        try:
+            self.sentence.format(**{parameter.name: parameter.start for parameter in self.parameters})
+        except (KeyError, IndexError) as error:
+            raise ValueError(f"{self.name}: its sentence names {error}, which is no parameter") from None
+        if self.stage is Stage.TERMS:
+            return
+        if self.moves and self.term is None:
+            raise ValueError(f"{self.name}: changes {self.stage.value}; give the `term` that does")
+        inputs = INPUTS[self.stage]
+        self._check_inputs("term", self.term, (*inputs, "coefficients"))
+        self._check_inputs("plain", self.plain, (*inputs, "values", "geometry", "step_s"))
+        self._check_geometry()
+
+    def _check_inputs(self, what: str, function: Callable[..., Any] | None, known: tuple[str, ...]) -> None:
+        for asked in () if function is None else asks_for(function):
+            if asked not in known:
+                raise ValueError(f"{self.name}: its `{what}` asks for {asked!r}, but may for {', '.join(known)}")
+
+    def _check_geometry(self) -> None:
+        values = np.array([[parameter.start for parameter in self.parameters]])
+        one, other = (self.coefficients(values, np.array([base]), 0.1) for base in ((0.1, 0.5, 0.1), (0.2, 0.7, 0.3)))
+        differs = any(not np.array_equal(a, b) for a, b in zip(one, other, strict=True))
+        if differs and not self.uses_geometry:
+            raise ValueError(f"{self.name}: its coefficients depend on the geometry; say uses_geometry=True")
+
+    @property
+    def moves(self) -> bool:
+        """Whether it changes motion; if not, it only changes what is measured."""
+        return self.stage not in _MEASURING
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Full names of its parameters, as models and logs have them."""
+        return tuple(f"{self.name}.{parameter.name}" for parameter in self.parameters)
+
+    @property
+    def is_limit(self) -> bool:
+        """Whether it does nothing where its first parameter is large: the largest size is what a drive can show."""
+        return math.isinf(self.parameters[0].neutral)
+
+    @property
+    def smooth(self) -> bool:
+        """Whether a fit finds it from neutral."""
+        return self.scan is None and self.limited is None and not self.trials
+
+
+def asks_for(function: Callable[..., Any]) -> tuple[str, ...]:
+    """What a `term` or `plain` asks for, by name."""
+    return tuple(inspect.signature(getattr(function, "py_func", function)).parameters)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from disco_hw.effects import wheel_gain, wheel_radius_asymmetry
-from disco_hw.effects.effect import Channel, Effect, Mimicked, Parameter, Stage, Symptom, Value, Values
+from disco_hw.effects import Channel, Effect, Mimicked, Parameter, Stage, Symptom, Value, Values
 
 
 def plain(left: Value, right: Value, values: Values) -> tuple[Value, Value]:

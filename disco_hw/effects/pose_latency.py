@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from disco_hw.effects.effect import Channel, Effect, Parameter, Stage, Symptom, Value, Values
+from disco_hw.effects import Channel, Effect, Parameter, Stage, Symptom, Value, Values
 
 
 def plain(time_s: Value, values: Values) -> Value:

@@ -11,7 +11,7 @@ from importlib import import_module
 from types import MappingProxyType
 
 from disco_hw import effects
-from disco_hw.effects.effect import STAGE_GROUPS, Effect, Stage
+from disco_hw.effects import STAGE_GROUPS, Effect, Stage
 from disco_hw.errors import InputError
 from disco_hw.jit import plugin_modules
 

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from disco_hw.effects.effect import (
+from disco_hw.effects import (
     Array,
     Channel,
     CommandedDrive,

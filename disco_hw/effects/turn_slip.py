@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from disco_hw.effects.effect import Array, Channel, Effect, Parameter, Stage, Symptom, Value, Values
+from disco_hw.effects import Array, Channel, Effect, Parameter, Stage, Symptom, Value, Values
 from disco_hw.jit import cast_like, scalar_function
 
 LEAST_KEPT = 0.5

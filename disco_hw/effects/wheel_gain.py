@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from disco_hw.effects.effect import Array, Channel, Effect, Parameter, Stage, Value, Values
+from disco_hw.effects import Array, Channel, Effect, Parameter, Stage, Value, Values
 from disco_hw.jit import scalar_function
 
 

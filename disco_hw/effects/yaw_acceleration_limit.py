@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from disco_hw.effects.effect import Array, Channel, CommandedDrive, Effect, Parameter, Stage, Value, Values
+from disco_hw.effects import Array, Channel, CommandedDrive, Effect, Parameter, Stage, Value, Values
 from disco_hw.jit import cast_like, scalar_function
 
 # How long the fastest turn that was commanded takes to reach, where a fit begins (s).

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_banded
 from scipy.stats import kstest
 
-from disco_hw.effects.effect import Symptom
+from disco_hw.effects import Symptom
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.inference.density_network import Fitted, Simulate
 from disco_hw.inference.estimates import Estimates, Whitening, estimates

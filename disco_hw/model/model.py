@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw import config
-from disco_hw.effects.effect import Effect, Parameter
+from disco_hw.effects import Effect, Parameter
 from disco_hw.effects.registry import MOTION_EFFECTS, REGISTRY
 from disco_hw.files import nearest
 from disco_hw.model.coefficients import Base, Coefficients, Effects, TermCoefficients

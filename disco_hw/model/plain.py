@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from disco_hw.effects.effect import Array, Effect, Stage, Value, Values, asks_for
+from disco_hw.effects import Array, Effect, Stage, Value, Values, asks_for
 from disco_hw.effects.registry import DELAY, in_stages
 
 Theta = Mapping[str, Value]

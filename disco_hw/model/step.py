@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.effects.effect import Effect, Stage, asks_for
+from disco_hw.effects import Effect, Stage, asks_for
 from disco_hw.effects.registry import DELAY, REGISTRY, in_stages
 from disco_hw.jit import cast_like, compiled_for, kernel_function, scalar_function
 from disco_hw.model.coefficients import Base, Coefficients, Integration, base_point, effect_point

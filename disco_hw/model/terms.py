@@ -17,7 +17,7 @@ import numpy as np
 from numba import types
 from numpy.typing import NDArray
 
-from disco_hw.effects.effect import Channel, Effect, Parameter, Stage
+from disco_hw.effects import Channel, Effect, Parameter, Stage
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.jit import cast_like, scalar_function, specialise
 from disco_hw.model.coefficients import Base, TermCoefficients, Terms

@@ -1,7 +1,7 @@
 """An effect of the pose sensor that no drive tells from another one, as another package would bring it along."""
 
 from disco_hw.effects import lateral_icr
-from disco_hw.effects.effect import Channel, Effect, Mimicked, Parameter, Stage
+from disco_hw.effects import Channel, Effect, Mimicked, Parameter, Stage
 
 
 def plain(x, y, yaw, values):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from disco_hw.effects.effect import Stage, Symptom, asks_for
+from disco_hw.effects import Stage, Symptom, asks_for
 from disco_hw.effects.registry import REGISTRY, in_stages
 from disco_hw.inference.checks import CHECKS
 

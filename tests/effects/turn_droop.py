@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from disco_hw.effects.effect import Channel, Effect, Parameter, Stage
+from disco_hw.effects import Channel, Effect, Parameter, Stage
 from disco_hw.jit import cast_like, scalar_function
 
 

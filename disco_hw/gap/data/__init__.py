@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.effects.effect import Channel, Effect, Parameter, Stage, asks_for
+from disco_hw.effects import Channel, Effect, Parameter, Stage, asks_for
 from disco_hw.effects.registry import DELAY, MOTION_EFFECTS, REGISTRY, in_stages
 from disco_hw.gap.settings import GRID_STEP_S
 from disco_hw.model.coefficients import Base, Coefficients, Effects

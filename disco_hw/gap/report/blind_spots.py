@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.effects.effect import Effect, Parameter
+from disco_hw.effects import Effect, Parameter
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.data import BASE_COUNT, BODY, pose_sensor
 from disco_hw.gap.data.free_runs import read_angles

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.effects.effect import Channel, Effect, Parameter
+from disco_hw.effects import Channel, Effect, Parameter
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.data.gridded_drive import GriddedDrive
 from disco_hw.gap.report import (

@@ -13,7 +13,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.effects.effect import Channel
+from disco_hw.effects import Channel
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.data.gridded_drive import GriddedDrive
 from disco_hw.gap.search.channel_search import ChannelResult

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from disco_hw.effects.effect import Channel as Place
-from disco_hw.effects.effect import CommandedDrive, Effect, Stage
+from disco_hw.effects import Channel as Place
+from disco_hw.effects import CommandedDrive, Effect, Stage
 from disco_hw.effects.registry import REGISTRY, in_stages
 from disco_hw.gap.data import DELAYED_BY, WHEEL, Layout
 from disco_hw.gap.data.free_runs import read_angles
