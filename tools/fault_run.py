@@ -22,11 +22,11 @@ from disco_hw.daemon.loop import LoopStats
 from disco_hw.log import records
 from disco_hw.log.recorder import RecorderStats
 from disco_hw.model import Belief
+from disco_hw.runtime import State
 from disco_hw.runtime.assembly import assemble_core, make_pipeline
 from disco_hw.runtime.core import CoreTick, DaemonCore
 from disco_hw.runtime.pipeline import Planner
 from disco_hw.runtime.robot_setup import load_setup
-from disco_hw.runtime.states import State
 from disco_hw.runtime.supervisor import UserRequest
 from disco_hw.tasks import PlannedTask
 from disco_hw.tasks.circle import circle_task

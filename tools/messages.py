@@ -97,7 +97,7 @@ def _kind_in(name: str, kind: str) -> str:
         return kind
     if "/viewer/" in name:
         return "page"
-    return "fault" if name.endswith(("runtime/states.py", "firmware_protocol/status_codes.py")) else kind
+    return "fault" if name.endswith(("runtime/__init__.py", "firmware_protocol/status_codes.py")) else kind
 
 
 def as_text(node: ast.AST) -> str | None:

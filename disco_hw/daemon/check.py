@@ -18,6 +18,7 @@ from disco_hw.daemon.client import send_request, socket_path
 from disco_hw.errors import InputError, WorkError
 from disco_hw.estimation.pose_sources import APART_STDS
 from disco_hw.processes import can_lock_memory, can_use_fifo
+from disco_hw.runtime import connection
 from disco_hw.runtime.assembly import driver_of, make_link, pose_source_of
 from disco_hw.runtime.preflight import (
     Check,
@@ -32,7 +33,6 @@ from disco_hw.runtime.preflight import (
     check_watchdog,
 )
 from disco_hw.runtime.robot_setup import Setup, link_key, load_setup
-from disco_hw.runtime.states import connection
 from disco_hw.runtime.supervisor import FIND_HEADING
 from drivers.motor import find_driver
 from drivers.types import (

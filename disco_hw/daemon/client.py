@@ -21,7 +21,7 @@ from typing import Any
 
 from disco_hw.config import RobotConfig, load_daemon_address
 from disco_hw.errors import InputError, WorkError
-from disco_hw.runtime.states import advice, by_command, status_headline
+from disco_hw.runtime import advice, by_command, status_headline
 from drivers.private_files import placed_by, user_name, why_not_private
 from drivers.types import SAID_BY_WORDS, SaidBy
 from firmware_protocol import status_codes

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from types import FrameType, TracebackType
 from typing import Any
 
-from disco_hw.runtime.states import State
+from disco_hw.runtime import State
 
 # A terminal that closes must not end the process before it has stopped the wheels, hence SIGHUP.
 _STOP_SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)

@@ -40,6 +40,7 @@ from disco_hw.errors import InputError
 from disco_hw.log.messages import DBC, Attachment, version
 from disco_hw.log.recorder import NullRecorder, ProcessRecorder, Recorder, RecordingSettings
 from disco_hw.processes import end_with_parent
+from disco_hw.runtime import Ask, by_command
 from disco_hw.runtime.assembly import (
     assemble_core,
     driver_of,
@@ -53,7 +54,6 @@ from disco_hw.runtime.assembly import (
 from disco_hw.runtime.core import FindsWiring, Pilot, TaskPilot
 from disco_hw.runtime.pipeline import FollowTask, NoPlanner, Off, Pipeline, Planner, Stand
 from disco_hw.runtime.robot_setup import Setup, kept_files, link_key, load_setup, refuse_missing_effects, scene_of
-from disco_hw.runtime.states import Ask, by_command
 from drivers.kernel_cache import are_kernels_kept
 from drivers.types import PoseSample, Readings, Transport, WheelSample
 from firmware_protocol.codec import packaged_dbc

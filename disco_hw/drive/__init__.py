@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from disco_hw.runtime.states import State
+from disco_hw.runtime import State
 from drivers.gamepad import Gamepad, GamepadError
 
 INPUT_LIMIT_NS = 200_000_000

@@ -10,9 +10,9 @@ from typing import Any
 from disco_hw.config import RobotConfig
 from disco_hw.drive import INPUT_LIMIT_NS, ManualInput, ManualSource, PageSource, RobotView, steering_from
 from disco_hw.drive.coverage import Coverage
+from disco_hw.runtime import State
 from disco_hw.runtime.core import CoreTick, Pilot, PilotTick, TaskPilot
 from disco_hw.runtime.pipeline import Manual, Source, Stand
-from disco_hw.runtime.states import State
 from disco_hw.runtime.supervisor import Reply, UserRequest
 
 

@@ -14,7 +14,7 @@ from statistics import median
 
 from disco_hw.config import Robot
 from disco_hw.drive import ManualInput, ManualSource, RobotView
-from disco_hw.runtime.states import State
+from disco_hw.runtime import State
 
 Wheels = tuple[float, float]
 

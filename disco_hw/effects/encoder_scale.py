@@ -2,8 +2,18 @@
 
 from __future__ import annotations
 
-from disco_hw.effects import wheel_gain, wheel_radius_asymmetry
-from disco_hw.effects import Channel, Effect, Mimicked, Parameter, Stage, Symptom, Value, Values
+from disco_hw.effects import (
+    Channel,
+    Effect,
+    Mimicked,
+    Parameter,
+    Stage,
+    Symptom,
+    Value,
+    Values,
+    wheel_gain,
+    wheel_radius_asymmetry,
+)
 
 
 def plain(left: Value, right: Value, values: Values) -> tuple[Value, Value]:

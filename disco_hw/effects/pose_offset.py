@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from disco_hw.effects import lateral_icr
-from disco_hw.effects import Channel, Effect, Mimicked, Parameter, Stage, Symptom, Value, Values
+from disco_hw.effects import Channel, Effect, Mimicked, Parameter, Stage, Symptom, Value, Values, lateral_icr
 
 
 def plain(x: Value, y: Value, yaw: Value, values: Values) -> tuple[Value, Value, Value]:

@@ -16,9 +16,9 @@ from typing import Any
 from disco_hw.config import Robot
 from disco_hw.drive import ManualInput, ManualSource, RobotView
 from disco_hw.drive.hand_pilot import Deadman
+from disco_hw.runtime import State
 from disco_hw.runtime.core import CoreTick, PilotTick
 from disco_hw.runtime.pipeline import Manual, Motion, Silent, Source
-from disco_hw.runtime.states import State
 from disco_hw.runtime.supervisor import Reply, UserRequest
 from drivers.types import PoseSample, WheelSample
 

@@ -1,1 +1,219 @@
-"""One tick of the robot, without a clock, a thread or a file: pipeline, supervisor, governor, plausibility."""
+"""One tick of the robot, without a clock, a thread or a file; here the states that all of it is about.
+
+One table has every way between the states, and what each means for a person is in words. Rows are tried from top to
+bottom, one transition per step: what takes motion away stands above what gives it. `disco_hw.runtime.supervisor`
+computes the conditions and acts on the state. E-stop is shown in FAULT: the robot's firmware holds the latch, the
+supervisor repeats the request until the firmware shows it.
+"""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from drivers.types import DriverState, LinkState
+from firmware_protocol import status_codes
+
+
+class State(enum.Enum):
+    """Where the daemon is; the wheels can be driven in ARMED only."""
+
+    DISCONNECTED = "disconnected"
+    HANDSHAKE = "handshake"
+    READY = "ready"
+    ARMED = "armed"
+    STOPPING = "stopping"
+    FAULT = "fault"
+
+
+class Condition(enum.Flag):
+    """What is true now; the table is written in these."""
+
+    NONE = 0
+    LINK_UP = enum.auto()
+    LINK_RENEWED = enum.auto()  # the link was down since the last step, however short
+    ROBOT_TALKS = enum.auto()  # handshake complete, whatever the robot's state
+    ROBOT_IDLE = enum.auto()  # robot in standby or ready: it executes nothing
+    ROBOT_ARMED = enum.auto()
+    ROBOT_MAY_MOVE = enum.auto()  # robot arming, armed or stopping
+    ROBOT_REFUSED = enum.auto()
+    ROBOT_FAULT = enum.auto()
+    ROBOT_ESTOP = enum.auto()
+    TELEMETRY_FRESH = enum.auto()
+    TELEMETRY_LOST = enum.auto()
+    WHEELS_STILL = enum.auto()
+    ARM_PENDING = enum.auto()
+    DISARM_ASKED = enum.auto()
+    ESTOP_ASKED = enum.auto()  # held from the request until a reset is accepted
+    RESET_PENDING = enum.auto()
+    PREFLIGHT_ERROR = enum.auto()
+    DAEMON_ERROR = enum.auto()
+
+
+C = Condition
+PROBLEM = C.DAEMON_ERROR | C.ESTOP_ASKED | C.ROBOT_ESTOP | C.ROBOT_FAULT | C.ROBOT_REFUSED | C.PREFLIGHT_ERROR
+_CONNECTED = frozenset(State) - {State.DISCONNECTED}
+_UNTROUBLED = _CONNECTED - {State.FAULT}
+
+
+@dataclass(frozen=True, slots=True)
+class Transition:
+    """From any of `sources` to `target` when all of `needs` and none of `blocked_by` hold; `reason` is for a person."""
+
+    sources: frozenset[State]
+    target: State
+    needs: Condition
+    blocked_by: Condition
+    reason: str
+
+
+def _row(sources: frozenset[State], target: State, needs: Condition, blocked_by: Condition, reason: str) -> Transition:
+    return Transition(sources, target, needs, blocked_by, reason)
+
+
+def _from(*states: State) -> frozenset[State]:
+    return frozenset(states)
+
+
+S = State
+TRANSITIONS: tuple[Transition, ...] = (
+    # A lost link ends everything agreed with the robot.
+    _row(_CONNECTED, S.DISCONNECTED, C.NONE, C.LINK_UP, "the link is down"),
+    _row(_CONNECTED, S.DISCONNECTED, C.LINK_RENEWED, C.NONE, "the link was interrupted"),
+    # Problems latch until a reset.
+    _row(_UNTROUBLED, S.FAULT, C.DAEMON_ERROR, C.NONE, "the daemon failed"),
+    _row(_UNTROUBLED, S.FAULT, C.ESTOP_ASKED, C.NONE, "e-stop requested here"),
+    _row(_UNTROUBLED, S.FAULT, C.ROBOT_ESTOP, C.NONE, "the robot is in e-stop"),
+    _row(_UNTROUBLED, S.FAULT, C.ROBOT_FAULT, C.NONE, "the robot reports a fault"),
+    _row(_UNTROUBLED, S.FAULT, C.ROBOT_REFUSED, C.NONE, "the handshake was refused"),
+    _row(_UNTROUBLED, S.FAULT, C.PREFLIGHT_ERROR, C.NONE, "a preflight check failed"),
+    _row(_from(S.FAULT), S.HANDSHAKE, C.RESET_PENDING, PROBLEM, "reset"),
+    # Motion is taken away.
+    _row(_from(S.ARMED), S.STOPPING, C.DISARM_ASKED, C.NONE, "disarm requested"),
+    _row(_from(S.ARMED), S.STOPPING, C.TELEMETRY_LOST, C.NONE, "telemetry lost"),
+    _row(_from(S.ARMED), S.STOPPING, C.NONE, C.ROBOT_ARMED, "the robot is no longer armed"),
+    _row(_from(S.READY), S.STOPPING, C.ROBOT_MAY_MOVE, C.ARM_PENDING, "the robot armed without being asked"),
+    _row(_from(S.HANDSHAKE), S.STOPPING, C.ROBOT_MAY_MOVE, C.NONE, "the robot was found armed"),
+    # The robot restarted or fell silent.
+    _row(_from(S.READY, S.STOPPING), S.HANDSHAKE, C.NONE, C.ROBOT_TALKS, "the robot started a new handshake"),
+    _row(_from(S.READY), S.HANDSHAKE, C.TELEMETRY_LOST, C.NONE, "telemetry lost"),
+    # The way up.
+    _row(_from(S.DISCONNECTED), S.HANDSHAKE, C.LINK_UP, C.NONE, "the link is up"),
+    _row(_from(S.HANDSHAKE), S.READY, C.ROBOT_IDLE | C.TELEMETRY_FRESH, C.NONE, "handshake complete"),
+    _row(_from(S.READY), S.ARMED, C.ARM_PENDING | C.ROBOT_ARMED | C.TELEMETRY_FRESH, C.NONE, "armed on request"),
+    _row(_from(S.STOPPING), S.READY, C.ROBOT_IDLE | C.WHEELS_STILL | C.TELEMETRY_FRESH, C.NONE, "the wheels are still"),
+)
+
+
+# On the integers below the flags: this runs in every tick, and flags cost a microsecond an operation.
+_ROWS_FROM = {
+    state: tuple((row.needs.value, row.blocked_by.value, row) for row in TRANSITIONS if state in row.sources)
+    for state in State
+}
+
+
+def next_transition(state: State, held: int) -> Transition | None:
+    """Return the first row that leads out of `state`, or None to stay; `held` is the value of all that is true now."""
+    for needs, blocked_by, row in _ROWS_FROM[state]:
+        if held & needs == needs and not held & blocked_by:
+            return row
+    return None
+
+
+Ask = Callable[[str], str]
+"""How a person asks for an action, as "arm": in words that begin with a verb."""
+
+ESTOP_REMEDY = "The stop is latched. Make the place safe, release the robot's own button, then {reset}."
+_NEXT = {
+    "DISCONNECTED": "Check the robot's power and the cable to it.",
+    "HANDSHAKE": "The robot is being asked who it is; wait.",
+    "READY": "{arm}; nothing moves yet.",
+    "STOPPING": "Wait until the wheels stand still.",
+    "FAULT": "Mend what is said above, then {reset}.",
+}
+
+
+def by_button(action: str) -> str:
+    """How a person asks on the page."""
+    return f"press {action.capitalize()}"
+
+
+def by_command(robot: Path) -> Ask:
+    """How a person asks in a terminal."""
+    return lambda action: f"run `disco-hw ctl {robot} {action}`"
+
+
+def connection(link: LinkState, link_error: str | None, driver: DriverState, driver_detail: str) -> str:
+    """What stands between this host and a robot that answers, and what to do about it.
+
+    `link_error` is the link's newest, with its remedy, or None.
+    """
+    if link is not LinkState.UP:
+        return link_error or f"the link is {link.value}"
+    # A link that is open and brings nothing has said more than that there is no answer.
+    return link_error if link_error and driver is DriverState.HANDSHAKE else driver_detail
+
+
+def headline(state: str, detail: str, running: bool, estop: bool, by_hand: bool = False) -> tuple[str, str]:
+    """The state in a word or two, and the sentence after it."""
+    head = "E-STOP" if estop else f"{state} · running" if running else state
+    return head, "driven by hand" if by_hand else detail
+
+
+def status_headline(status: Mapping[str, Any]) -> tuple[str, str]:
+    """The same for a status of the daemon that is `ok`."""
+    by_hand = "drive" in status and bool(status["drive"]["driving"])
+    return headline(status["state"], status["detail"], status["running"], is_estop(status), by_hand)
+
+
+def is_estop(status: Mapping[str, Any]) -> bool:
+    """Whether a status is to be shown as an e-stop."""
+    return bool(status["estop"]) or status["robot_state"] == "ESTOP"
+
+
+def advice(status: Mapping[str, Any], ask: Ask = by_button) -> tuple[str, ...]:
+    """Sentences on what to do now, the most urgent first, for a status of the daemon that is `ok`."""
+    said = []
+    if is_estop(status):
+        said.append(f"E-STOP. {_asking(ESTOP_REMEDY, ask)}")
+    fault = str(status["fault"])
+    if fault not in {"NONE", "UNKNOWN"}:
+        said.append(fault_sentence(fault))
+    state = str(status["state"])
+    if said:
+        return tuple(said)
+    if "drive" in status and state in {"READY", "ARMED"}:
+        return (str(status["drive"]["words"]),)
+    if state == "ARMED":
+        sentence = "{stop} to hold still, or {disarm} to end." if status["running"] else "{start} to drive the task."
+        return (_asking(sentence, ask),)
+    return (_asking(_NEXT[state], ask),) if state in _NEXT else ()
+
+
+def fault_sentence(name: str) -> str:
+    """Return what a fault is and what to do about it."""
+    todo = status_codes.advice(name) or "not known here: look it up where the robot's firmware comes from"
+    return f"{in_words(name)}. {todo[0].upper()}{todo[1:]}."
+
+
+def next_step(status: Mapping[str, Any]) -> str:
+    """The action that leads on from here; empty where there is none."""
+    state = str(status["state"])
+    if "drive" in status and state in {"READY", "ARMED"}:
+        return ""
+    if state == "ARMED":
+        return "stop" if status["running"] else "start"
+    return {"READY": "arm", "FAULT": "reset"}.get(state, "")
+
+
+def in_words(code: str) -> str:
+    """A code of the protocol as a person reads it: STALL_LEFT becomes Stall left."""
+    return code.replace("_", " ").capitalize()
+
+
+def _asking(sentence: str, ask: Ask) -> str:
+    words = sentence.format(**{action: ask(action) for action in ("arm", "start", "stop", "disarm", "reset")})
+    return words[0].upper() + words[1:]

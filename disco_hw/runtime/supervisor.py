@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import msgspec
 
-from disco_hw.runtime.states import PROBLEM, Condition, State, Transition, connection, next_transition
+from disco_hw.runtime import PROBLEM, Condition, State, Transition, connection, next_transition
 from drivers.types import DriverState, LinkState, Request
 from firmware_protocol.status_codes import BY_ITSELF, THEN_RESET, THEN_RESTART
 

@@ -11,7 +11,7 @@ import msgspec
 
 from disco_hw.config import Robot
 from disco_hw.log import records
-from disco_hw.runtime.states import State
+from disco_hw.runtime import State
 from disco_hw.tasks import RobotTask, kind_of, task_from
 
 _FASTEST_M_S = 100.0

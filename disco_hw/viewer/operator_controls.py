@@ -21,7 +21,7 @@ from websockets.exceptions import ConnectionClosed
 from disco_hw.daemon.client import connect, send_request
 from disco_hw.daemon.emergency import stop_robot
 from disco_hw.errors import InputError, WorkError
-from disco_hw.runtime.states import advice, is_estop, next_step, status_headline
+from disco_hw.runtime import advice, is_estop, next_step, status_headline
 
 REQUESTS = ("arm", "start", "stop", "disarm", "reset", "task")
 STATUS_S = 0.25

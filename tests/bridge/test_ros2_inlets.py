@@ -20,8 +20,8 @@ from disco_hw.drive import PageSource, RobotView, steering_from
 from disco_hw.drive.hand_pilot import Deadman
 from disco_hw.drive.keyboard import wheel_speeds
 from disco_hw.estimation.odometry import OdometryParameters
+from disco_hw.runtime import State
 from disco_hw.runtime.robot_setup import load_setup
-from disco_hw.runtime.states import State
 from disco_hw.runtime.supervisor import UserRequest
 from drivers.pose.ros2 import make_pose_source
 from drivers.pose.udp import pose_of

@@ -1,5 +1,5 @@
 from disco_hw.daemon.process import Waiting
-from disco_hw.runtime.states import State
+from disco_hw.runtime import State
 
 
 def said(waiting, state, words, seconds):

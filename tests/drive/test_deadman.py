@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 
 from disco_hw.drive import ManualInput
 from disco_hw.drive.hand_pilot import Deadman
+from disco_hw.runtime import State
 from disco_hw.runtime.pipeline import Manual, Stand
-from disco_hw.runtime.states import State
 from disco_hw.runtime.supervisor import UserRequest
 
 MS = 1_000_000

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from disco_hw.drive import GamepadSource, RobotView
 from disco_hw.drive.hand_pilot import Deadman
-from disco_hw.runtime.states import State
+from disco_hw.runtime import State
 from drivers.gamepad import GamepadError, GamepadState
 
 MS = 1_000_000

@@ -13,8 +13,8 @@ from disco_hw.drive.hand_pilot import HandPilot
 from disco_hw.drive.script import ScriptSource, Unattended
 from disco_hw.drive.scripts import STEP_S, STEPS, make_script
 from disco_hw.log import records
+from disco_hw.runtime import State
 from disco_hw.runtime.pipeline import NoPlanner, Source
-from disco_hw.runtime.states import State
 from disco_hw.runtime.supervisor import Reply, UserRequest
 from tests.runtime.simulated import simulated_stack
 

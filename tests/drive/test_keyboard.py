@@ -13,7 +13,7 @@ import pytest
 from disco_hw.drive import RobotView
 from disco_hw.drive.keyboard import Keyboard, KeyHold
 from disco_hw.errors import InputError
-from disco_hw.runtime.states import State
+from disco_hw.runtime import State
 from tests.daemon.simulated_clock import SimulatedClock
 from tests.drivers.waiting import wait_until
 

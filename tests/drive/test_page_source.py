@@ -7,8 +7,8 @@ import pytest
 from disco_hw.drive import INPUT_LIMIT_NS, PageSource, RobotView, Steering, steering_from
 from disco_hw.drive.coverage import Coverage
 from disco_hw.drive.hand_pilot import HandPilot
+from disco_hw.runtime import State
 from disco_hw.runtime.pipeline import NoPlanner
-from disco_hw.runtime.states import State
 from tests.runtime.simulated import simulated_stack
 
 MS = 1_000_000

@@ -6,7 +6,7 @@ import pytest
 
 from disco_hw.drive import ManualInput, RobotView
 from disco_hw.drive.script import Manoeuvre, Script, ScriptSource, Unattended
-from disco_hw.runtime.states import State
+from disco_hw.runtime import State
 
 TICK = 20_000_000
 READY = RobotView(State.READY, driving=False)

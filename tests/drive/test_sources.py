@@ -5,7 +5,7 @@ import pytest
 from disco_hw.drive import INPUT_LIMIT_NS, GamepadSource, ManualInput, ManualSource, PageSource, RobotView
 from disco_hw.drive.keyboard import Keyboard
 from disco_hw.drive.script import ScriptSource
-from disco_hw.runtime.states import State
+from disco_hw.runtime import State
 
 
 def test_input_counts_for_200_ms():

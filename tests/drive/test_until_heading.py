@@ -9,9 +9,9 @@ import pytest
 
 from disco_hw.drive.coverage import Coverage
 from disco_hw.drive.hand_pilot import HandPilot, UntilHeading, task_pilot
+from disco_hw.runtime import State
 from disco_hw.runtime.core import TaskPilot
 from disco_hw.runtime.pipeline import FollowTask, NoPlanner
-from disco_hw.runtime.states import State
 from disco_hw.runtime.supervisor import UserRequest
 from tests.drive.test_hand_pilot import Hand
 from tests.runtime.simulated import simulated_stack

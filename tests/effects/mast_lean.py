@@ -1,7 +1,6 @@
 """An effect of the pose sensor that no drive tells from another one, as another package would bring it along."""
 
-from disco_hw.effects import lateral_icr
-from disco_hw.effects import Channel, Effect, Mimicked, Parameter, Stage
+from disco_hw.effects import Channel, Effect, Mimicked, Parameter, Stage, lateral_icr
 
 
 def plain(x, y, yaw, values):

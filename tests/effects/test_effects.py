@@ -5,8 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from disco_hw.effects import encoder_scale, heading_bias, pose_latency, pose_offset
-from disco_hw.effects import Channel
+from disco_hw.effects import Channel, encoder_scale, heading_bias, pose_latency, pose_offset
 from disco_hw.effects.registry import MOTION_EFFECTS, REGISTRY
 from disco_hw.model import EffectSetting, Model, plain
 from disco_hw.model.step import FreeRun

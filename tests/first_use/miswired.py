@@ -16,9 +16,9 @@ from disco_hw.experiments.live_stack import with_device
 from disco_hw.experiments.simulated_time import SimulatedRun
 from disco_hw.first_use.commission import as_sent, slowest_rad_s
 from disco_hw.first_use.procedure import Ask, CommissionPilot, DriveWheels, Procedure, speed_of
+from disco_hw.runtime import State
 from disco_hw.runtime.pipeline import NoPlanner
 from disco_hw.runtime.robot_setup import load_setup
-from disco_hw.runtime.states import State
 from drivers.motor import find_driver
 from drivers.transport import connect_pair
 from drivers.types import OutgoingFrame

@@ -14,9 +14,9 @@ from numba.core.dispatcher import Dispatcher
 import disco_hw
 from disco_hw.adaptation.guard import believed_geometry
 from disco_hw.daemon.run import warm_up
+from disco_hw.runtime import State
 from disco_hw.runtime.assembly import make_pipeline, make_planner, put_in_force
 from disco_hw.runtime.robot_setup import load_setup
-from disco_hw.runtime.states import State
 from disco_hw.runtime.supervisor import UserRequest
 from tests.runtime.simulated import simulated_stack
 

@@ -2,7 +2,7 @@
 
 from msgspec.structs import replace
 
-from disco_hw.runtime.states import State
+from disco_hw.runtime import State
 from disco_hw.runtime.supervisor import Inputs, Supervisor, SupervisorSettings, UserRequest
 from drivers.types import DriverState, LinkState, Request
 

@@ -17,11 +17,10 @@ from disco_hw.daemon.loop import LoopStats
 from disco_hw.experiments.circle_report import Path, circle_figures
 from disco_hw.log import records
 from disco_hw.log.recorder import RecorderStats
-from disco_hw.runtime import records_of_tick
+from disco_hw.runtime import State, records_of_tick
 from disco_hw.runtime.assembly import make_planner
 from disco_hw.runtime.pipeline import NoPlanner, Source
 from disco_hw.runtime.robot_setup import load_setup
-from disco_hw.runtime.states import State
 from disco_hw.runtime.supervisor import UserRequest
 from disco_hw.tasks.circle import CircleTask
 from drivers.types import Identity, Limit, Limits, WheelSample

@@ -9,10 +9,10 @@ from disco_hw.daemon.control_socket import loop_figures, status
 from disco_hw.daemon.loop import LoopStats
 from disco_hw.log.messages import Attachment
 from disco_hw.log.recorder import ProcessRecorder, RecorderStats, RecordingSettings
+from disco_hw.runtime import State
 from disco_hw.runtime.pipeline import Source
 from disco_hw.runtime.replay import replay
 from disco_hw.runtime.robot_setup import kept_files, load_setup
-from disco_hw.runtime.states import State
 from disco_hw.runtime.supervisor import UserRequest
 from disco_hw.tasks.path import PathTask
 from disco_hw.viewer.commands import snapshot_log

@@ -7,10 +7,10 @@ from dataclasses import replace
 import msgspec
 import pytest
 
+from disco_hw.runtime import State
 from disco_hw.runtime.core import PilotTick, TaskPilot
 from disco_hw.runtime.pipeline import FollowTask, Manual, NoPlanner, Source
 from disco_hw.runtime.robot_setup import load_setup
-from disco_hw.runtime.states import State
 from disco_hw.runtime.supervisor import UserRequest
 from tests.runtime import simulated
 from tests.runtime.simulated import simulated_stack

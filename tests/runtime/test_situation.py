@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from disco_hw.runtime.states import (
+from disco_hw.runtime import (
     State,
     advice,
     by_command,

@@ -2,7 +2,7 @@ import itertools
 
 import pytest
 
-from disco_hw.runtime.states import PROBLEM, TRANSITIONS, Condition, State, next_transition
+from disco_hw.runtime import PROBLEM, TRANSITIONS, Condition, State, next_transition
 
 C = Condition
 ROWS = [(row, source) for row in TRANSITIONS for source in sorted(row.sources, key=lambda state: state.value)]

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from disco_hw.runtime.states import TRANSITIONS, State
+from disco_hw.runtime import TRANSITIONS, State
 from disco_hw.runtime.supervisor import Inputs, Supervisor, UserRequest
 from drivers.types import DriverState, LinkState, Request
 from firmware_protocol import status_codes

@@ -9,7 +9,7 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, rule
 
-from disco_hw.runtime.states import State
+from disco_hw.runtime import State
 from disco_hw.runtime.supervisor import Inputs, Supervisor, SupervisorSettings, UserRequest
 from drivers.types import DriverState, LinkState, Request
 

@@ -9,8 +9,8 @@ import pytest
 
 from disco_hw.config import Robot
 from disco_hw.log import records
+from disco_hw.runtime import State
 from disco_hw.runtime.replay import replay
-from disco_hw.runtime.states import State
 from disco_hw.runtime.supervisor import UserRequest
 from disco_hw.runtime.task_change import (
     TaskRefused,

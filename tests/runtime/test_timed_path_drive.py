@@ -8,9 +8,9 @@ import pytest
 from disco_hw.daemon.control_socket import loop_figures, status
 from disco_hw.daemon.loop import LoopStats
 from disco_hw.log.recorder import RecorderStats
+from disco_hw.runtime import State
 from disco_hw.runtime.pipeline import Source
 from disco_hw.runtime.replay import replay
-from disco_hw.runtime.states import State
 from disco_hw.runtime.supervisor import UserRequest
 from disco_hw.tasks.timed_path import TimedPathTask
 from disco_hw.viewer.recording import Recording

@@ -11,9 +11,9 @@ from disco_hw.daemon.control_socket import loop_figures, status
 from disco_hw.daemon.loop import LoopStats
 from disco_hw.log import records
 from disco_hw.log.recorder import RecorderStats
+from disco_hw.runtime import State
 from disco_hw.runtime.replay import replay
 from disco_hw.runtime.robot_setup import load_setup
-from disco_hw.runtime.states import State
 from disco_hw.runtime.supervisor import UserRequest
 from disco_hw.runtime.task_change import TaskRefused, changed_task
 from disco_hw.viewer import curves

@@ -2,7 +2,7 @@
 
 import pytest
 
-from disco_hw.runtime.states import TRANSITIONS
+from disco_hw.runtime import TRANSITIONS
 from firmware_protocol import status_codes
 from tools.messages import in_html, in_python, messages
 
