@@ -152,7 +152,7 @@ _WORK = (
     "disco_hw.bridge.ros2.join_domain",
     "disco_hw.bridge.ros2_base.Clients",
     "disco_hw.daemon.check.refuse_beside_a_daemon",
-    "disco_hw.daemon.client.send_request",
+    "disco_hw.daemon.send_request",
     "disco_hw.daemon.run._make_recorder",
     "disco_hw.daemon.emergency.open_transport",
     "disco_hw.daemon.emergency.open_port",

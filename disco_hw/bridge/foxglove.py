@@ -16,7 +16,7 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from mcap_protobuf.schema import build_file_descriptor_set
 
 from disco_hw.config import RobotConfig, load_robot_config
-from disco_hw.daemon.client import socket_path
+from disco_hw.daemon import socket_path
 from disco_hw.daemon.page_feed import FeedSubscriber, feed_path
 from disco_hw.daemon.process import StopSignals
 from disco_hw.errors import InputError

@@ -26,7 +26,7 @@ from disco_hw.bridge import ros2_commands, ros2_inlets
 from disco_hw.bridge import ros2_messages as msg
 from disco_hw.bridge import ros2_outgoing as out
 from disco_hw.config import RobotConfig
-from disco_hw.daemon.client import send_request, socket_path
+from disco_hw.daemon import send_request, socket_path
 from disco_hw.daemon.page_feed import FeedSubscriber, tick_feed_path
 from disco_hw.daemon.process import StopSignals
 from disco_hw.errors import InputError, WorkError

@@ -29,7 +29,7 @@ from disco_hw.bridge import ros2_messages as msg
 from disco_hw.bridge.ros2 import RELIABLE, SENSOR, join_domain, wire_name
 from disco_hw.bridge.ros2_inlets import WheelInlet
 from disco_hw.config import RobotConfig, load_robot_config
-from disco_hw.daemon.client import peer_uid
+from disco_hw.daemon import peer_uid
 from disco_hw.daemon.process import StopSignals
 from disco_hw.errors import InputError
 from drivers.motor import ros2_base_wire as wire

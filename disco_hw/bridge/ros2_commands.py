@@ -21,7 +21,7 @@ import msgspec
 
 from disco_hw.bridge import ros2_messages as msg
 from disco_hw.config import Drive, Robot
-from disco_hw.daemon.client import ask, connect
+from disco_hw.daemon import ask, connect
 from disco_hw.daemon.emergency import stop_robot
 from disco_hw.drive import INPUT_LIMIT_NS
 from disco_hw.errors import InputError, WorkError

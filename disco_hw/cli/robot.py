@@ -203,7 +203,7 @@ def ctl(
     as_json: AsJson = False,
 ) -> None:
     """Send the running daemon a command, or ask for its status."""
-    from disco_hw.daemon.client import ask, in_words
+    from disco_hw.daemon import ask, in_words
 
     reply = ask(robot, do, changes or (), unrecorded)
     print_result(reply, as_json, in_words(reply, robot))

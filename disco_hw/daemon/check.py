@@ -14,7 +14,7 @@ from typing import Any
 
 from disco_hw.adaptation.guard import choose_adaptation
 from disco_hw.config import PoseInput, RobotConfig
-from disco_hw.daemon.client import send_request, socket_path
+from disco_hw.daemon import send_request, socket_path
 from disco_hw.errors import InputError, WorkError
 from disco_hw.estimation.pose_sources import APART_STDS
 from disco_hw.processes import can_lock_memory, can_use_fifo

@@ -21,7 +21,7 @@ import msgspec
 import numpy as np
 from msgspec.structs import asdict as asdict_of
 
-from disco_hw.daemon.client import REMEDY, peer_uid
+from disco_hw.daemon import REMEDY, peer_uid
 from disco_hw.daemon.loop import LoopStats
 from disco_hw.errors import InputError
 from disco_hw.log import records

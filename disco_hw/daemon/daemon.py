@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 from disco_hw import processes
-from disco_hw.daemon.client import ADAPT_ACTIONS, PAGE_ACTIONS, UNRECORDED_REMEDY
+from disco_hw.daemon import ADAPT_ACTIONS, PAGE_ACTIONS, UNRECORDED_REMEDY
 from disco_hw.daemon.control_socket import ControlMessage, ControlServer, counters, loop_figures, status
 from disco_hw.daemon.loop import Clock, Loop
 from disco_hw.daemon.page_feed import WatchedRecorder

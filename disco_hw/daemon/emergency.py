@@ -19,7 +19,7 @@ import msgspec
 import serial
 
 from disco_hw.config import Link, link_fields, link_of, names_address
-from disco_hw.daemon.client import believed_users, default_socket_path, passed_over, send_request
+from disco_hw.daemon import believed_users, default_socket_path, passed_over, send_request
 from disco_hw.errors import InputError
 from disco_hw.files import ROBOT_TOML, read_toml
 from drivers.motor import find_driver

@@ -14,7 +14,7 @@ from pathlib import Path
 import msgspec
 import zmq
 
-from disco_hw.daemon.client import believed_users
+from disco_hw.daemon import believed_users
 from disco_hw.errors import InputError, WorkError
 from disco_hw.log.messages import ENCODE_ERRORS, BatchDecoder, batch_encoder
 from disco_hw.log.recorder import Recorder, RecorderStats

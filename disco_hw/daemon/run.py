@@ -30,7 +30,7 @@ from disco_hw.adaptation.adapter_link import ProcessLink
 from disco_hw.adaptation.guard import check_adaptable, choose_adaptation
 from disco_hw.config import RobotConfig
 from disco_hw.control.plan import Law, LawController
-from disco_hw.daemon.client import SERVED, passed_over, recording_in_words, socket_path
+from disco_hw.daemon import SERVED, passed_over, recording_in_words, socket_path
 from disco_hw.daemon.control_socket import ControlServer
 from disco_hw.daemon.daemon import Daemon, Say
 from disco_hw.daemon.loop import MonotonicClock

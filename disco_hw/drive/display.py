@@ -16,7 +16,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from disco_hw.daemon.client import send_request
+from disco_hw.daemon import send_request
 from disco_hw.errors import WorkError
 
 _TABLE_PERIOD_S = 0.4

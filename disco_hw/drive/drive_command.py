@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from disco_hw.config import Link, RobotConfig
-from disco_hw.daemon.client import socket_path
+from disco_hw.daemon import socket_path
 from disco_hw.daemon.loop import MonotonicClock
 from disco_hw.daemon.process import STANDARD_ERROR, STANDARD_OUTPUT, AsyncPrinter
 from disco_hw.daemon.run import in_text, serve

@@ -21,7 +21,7 @@ from types import MappingProxyType
 from typing import Any
 
 import disco_hw
-from disco_hw.daemon.client import send_request
+from disco_hw.daemon import send_request
 from disco_hw.errors import WorkError
 from disco_hw.processes import PARENT_VARIABLE
 from drivers.motor import find_driver, motor_drivers

@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from disco_hw.config import link_fields, load_robot_config
-from disco_hw.daemon.client import socket_path
+from disco_hw.daemon import socket_path
 from disco_hw.daemon.process import StopSignals
 from disco_hw.errors import InputError
 from disco_hw.viewer.operator_controls import Desk

@@ -18,7 +18,7 @@ import msgspec
 from websockets.asyncio.server import ServerConnection
 from websockets.exceptions import ConnectionClosed
 
-from disco_hw.daemon.client import connect, send_request
+from disco_hw.daemon import connect, send_request
 from disco_hw.daemon.emergency import stop_robot
 from disco_hw.errors import InputError, WorkError
 from disco_hw.runtime import advice, is_estop, next_step, status_headline

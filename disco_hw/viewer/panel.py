@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from disco_hw.daemon.client import recording_in_words
+from disco_hw.daemon import recording_in_words
 from disco_hw.runtime import fault_sentence, headline, in_words
 from disco_hw.runtime.pipeline import Source
 from disco_hw.tasks import RobotTask

@@ -19,8 +19,7 @@ from websockets.asyncio.client import connect
 from disco_hw.bridge.foxglove import LAYOUT, Live
 from disco_hw.cli.app import app
 from disco_hw.config import load_robot_config
-from disco_hw.daemon import run
-from disco_hw.daemon.client import socket_path
+from disco_hw.daemon import run, socket_path
 from disco_hw.daemon.page_feed import ViewerFeed, feed_path
 from disco_hw.errors import InputError
 from disco_hw.experiments.live_stack import write_robot_file

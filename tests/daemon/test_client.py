@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 import disco_hw
-from disco_hw.daemon.client import ask, controller_in_words
+from disco_hw.daemon import ask, controller_in_words
 from disco_hw.errors import InputError, WorkError
 
 ROBOT = Path(disco_hw.__file__).parent / "robots" / "wombot.toml"

@@ -3,7 +3,7 @@ import threading
 
 import pytest
 
-from disco_hw.daemon.client import send_request
+from disco_hw.daemon import send_request
 from disco_hw.daemon.control_socket import ControlServer
 from disco_hw.errors import WorkError
 

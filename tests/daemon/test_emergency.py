@@ -15,8 +15,7 @@ import pytest
 
 import disco_hw
 from disco_hw.cli import stop_and_say
-from disco_hw.daemon import emergency
-from disco_hw.daemon.client import SERVED
+from disco_hw.daemon import SERVED, emergency
 from disco_hw.daemon.control_socket import ControlServer
 from disco_hw.daemon.emergency import stop_robot
 from disco_hw.errors import InputError

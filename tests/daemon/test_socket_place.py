@@ -14,9 +14,9 @@ from pathlib import Path
 import pytest
 
 import disco_hw
+from disco_hw import daemon as client
 from disco_hw.config import load_robot_config
-from disco_hw.daemon import client
-from disco_hw.daemon.client import ask, believed_users, default_socket_path, passed_over, send_request, socket_path
+from disco_hw.daemon import ask, believed_users, default_socket_path, passed_over, send_request, socket_path
 from disco_hw.daemon.control_socket import ControlServer
 from disco_hw.errors import WorkError
 

@@ -11,7 +11,7 @@ from threading import Timer
 
 import pytest
 
-from disco_hw.daemon.client import send_request
+from disco_hw.daemon import send_request
 from disco_hw.errors import WorkError
 from disco_hw.experiments import demo
 

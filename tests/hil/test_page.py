@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from disco_hw.daemon.client import send_request
+from disco_hw.daemon import send_request
 from disco_hw.drive import INPUT_LIMIT_NS
 from disco_hw.experiments.live_stack import disco_hw_process, running_stack, stands
 from disco_hw.log.reader import open_log

@@ -11,7 +11,7 @@ from msgspec.structs import replace
 
 import disco_hw
 from disco_hw.control import NoValidControl
-from disco_hw.daemon.client import in_words
+from disco_hw.daemon import in_words
 from disco_hw.daemon.control_socket import loop_figures, status
 from disco_hw.daemon.loop import LoopStats
 from disco_hw.experiments.circle_report import Path, circle_figures

@@ -21,7 +21,7 @@ PACKAGE = Path(disco_hw.__file__).parent
 ELSEWHERE = {
     "circle": ("experiments/", "drive/scripts.py"),
     # The word is the name of a field there: of the way-points' file, of a reply.
-    "path": ("daemon/client.py", "viewer/panel.py"),
+    "path": ("daemon/__init__.py", "viewer/panel.py"),
 }
 
 

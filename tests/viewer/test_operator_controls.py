@@ -13,7 +13,7 @@ import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
-from disco_hw.daemon.client import SERVED
+from disco_hw.daemon import SERVED
 from disco_hw.daemon.control_socket import ControlServer
 from disco_hw.viewer import operator_controls as desk_module
 from disco_hw.viewer.operator_controls import Desk, shown
