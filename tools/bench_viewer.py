@@ -29,8 +29,8 @@ from disco_hw.experiments.live_stack import disco_hw_process, running_stack
 from disco_hw.log.reader import open_log
 from disco_hw.log.records import Plan
 from disco_hw.processes import stolen_ms
+from disco_hw.viewer import TOKEN_VARIABLE, page_token
 from disco_hw.viewer.operator_controls import Desk
-from disco_hw.viewer.page_process import TOKEN_VARIABLE, page_token
 from disco_hw.viewer.pages import LivePage, ReplayPage, run_live
 from disco_hw.viewer.recording import Recording, Snapshot, stage_of_robot
 from disco_hw.viewer.server import serving

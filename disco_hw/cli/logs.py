@@ -19,7 +19,7 @@ from disco_hw.cli.options import (
 )
 from disco_hw.config import check_named_files
 from disco_hw.errors import InputError
-from disco_hw.viewer.page_process import DEFAULT_PORT, LOOPBACK
+from disco_hw.viewer import DEFAULT_PORT, LOOPBACK
 
 
 def infer(

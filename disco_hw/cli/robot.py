@@ -23,13 +23,13 @@ from disco_hw.cli.options import (
 )
 from disco_hw.config import check_named_files
 from disco_hw.errors import InputError
-from disco_hw.viewer.page_process import DEFAULT_PORT, LOOPBACK
+from disco_hw.viewer import DEFAULT_PORT, LOOPBACK
 
 PagePort = Annotated[int, typer.Option("--port", min=1, max=65535, help="Port of the page.")]
 
 
 def _page(view: bool, robot: Path, model: Path | None, port: int, link: str | None) -> AbstractContextManager[object]:
-    from disco_hw.viewer.page_process import page_beside
+    from disco_hw.viewer import page_beside
 
     return page_beside(robot, model, LOOPBACK, port, link) if view else nullcontext()
 

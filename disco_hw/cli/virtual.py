@@ -14,7 +14,7 @@ from disco_hw.config import check_named_files
 from disco_hw.errors import InputError
 from disco_hw.reports import as_json as json_of
 from disco_hw.reports import refuse_directory
-from disco_hw.viewer.page_process import DEFAULT_PORT
+from disco_hw.viewer import DEFAULT_PORT
 
 
 def demo(

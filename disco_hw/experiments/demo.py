@@ -48,7 +48,7 @@ from disco_hw.experiments.live_stack import (
 from disco_hw.processes import stolen_ms
 from disco_hw.runtime.robot_setup import Setup, geometry, load_setup
 from disco_hw.tasks.circle import CircleTask, circle_task, inwards_sine
-from disco_hw.viewer.page_process import DEFAULT_PORT, LOOPBACK, TOKEN_VARIABLE, page_address, page_token
+from disco_hw.viewer import DEFAULT_PORT, LOOPBACK, TOKEN_VARIABLE, page_address, page_token
 
 _START_TIMEOUT_S = READY_TIMEOUT_S
 _POLL_S = 0.1

@@ -6,8 +6,10 @@ What a page does not need is imported where it is used: the plotting library alo
 from __future__ import annotations
 
 import json
+import os
+import sys
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, redirect_stdout
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +20,8 @@ from disco_hw.config import link_fields, load_robot_config
 from disco_hw.daemon import socket_path
 from disco_hw.daemon.process import StopSignals
 from disco_hw.errors import InputError
+from disco_hw.viewer import DEFAULT_PORT, LOOPBACK
 from disco_hw.viewer.operator_controls import Desk
-from disco_hw.viewer.page_process import DEFAULT_PORT, LOOPBACK
 from disco_hw.viewer.pages import LivePage, ReplayPage, run_live, run_replay
 from disco_hw.viewer.recording import Recording, stage_of_robot
 from disco_hw.viewer.server import serving
@@ -131,3 +133,25 @@ def _progress(title: str) -> Iterator[Callable[[float], None]]:
     with Progress(console=Console(stderr=True), transient=True) as bars:
         task = bars.add_task(title, total=1.0)
         yield lambda part: bars.update(task, completed=part)
+
+
+def main(arguments: list[str]) -> int:
+    """Serve the page until told to stop or until the process with the first argument's number is not the parent."""
+    parent, host, port, robot, model, link = arguments
+    try:
+        with redirect_stdout(sys.stderr):
+            return view_live(
+                Path(robot),
+                Path(model) if model else None,
+                host,
+                int(port),
+                lambda: os.getppid() != int(parent),
+                link=link or None,
+            )
+    except InputError as error:
+        print(f"page: {error}", file=sys.stderr, flush=True)
+        return 2
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

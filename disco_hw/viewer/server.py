@@ -28,8 +28,8 @@ from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
 from disco_hw.errors import InputError
+from disco_hw.viewer import DEFAULT_PORT, LOOPBACK, page_address, page_token
 from disco_hw.viewer.operator_controls import Desk
-from disco_hw.viewer.page_process import DEFAULT_PORT, LOOPBACK, page_address, page_token
 
 _LOOPBACK_NAMES = frozenset({"127.0.0.1", "localhost"})
 _COOKIE = "disco-hw-token"

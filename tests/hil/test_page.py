@@ -280,6 +280,6 @@ def page_beside(pid):
     for each in Path("/proc").glob("[0-9]*"):
         with suppress(OSError):
             parent = (each / "stat").read_text().rpartition(")")[2].split()[1]
-            if int(parent) == pid and b"disco_hw.viewer.page_process" in (each / "cmdline").read_bytes():
+            if int(parent) == pid and b"disco_hw.viewer.commands" in (each / "cmdline").read_bytes():
                 return int(each.name)
     raise AssertionError("no page beside the drive")

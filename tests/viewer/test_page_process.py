@@ -7,14 +7,14 @@ from pathlib import Path
 
 import pytest
 
-from disco_hw.viewer.page_process import page_beside
+from disco_hw.viewer import page_beside
 from tests.drivers.waiting import free_port, wait_until
 from tools.viewer_run import ROBOT_FILE
 
 _PARENT = """
 import sys, time
 from pathlib import Path
-from disco_hw.viewer.page_process import page_beside
+from disco_hw.viewer import page_beside
 with page_beside(Path(sys.argv[1]), None, "127.0.0.1", int(sys.argv[2])) as page:
     print(page.pid, flush=True)
     time.sleep(60)
