@@ -8,7 +8,8 @@ from time import perf_counter_ns
 import numpy as np
 
 from disco_hw.config import Estimation
-from disco_hw.estimation import OdometryParameters, Pose, PoseFusion, advance
+from disco_hw.estimation import PoseFusion
+from disco_hw.estimation.odometry import OdometryParameters, Pose, advance
 from drivers.types import PoseSample, WheelSample
 
 PERIOD_NS = 10_000_000

@@ -20,8 +20,9 @@ from disco_hw.config import Estimation
 from disco_hw.control import CommandLimits, Disco, DiscoSettings
 from disco_hw.control.baselines import Follower, Law, NominalRobot, Reference
 from disco_hw.control.settings import ROTATION
-from disco_hw.estimation import OdometryParameters, PoseFusion
+from disco_hw.estimation import PoseFusion
 from disco_hw.estimation.correction import DisturbanceEstimator
+from disco_hw.estimation.odometry import OdometryParameters
 from disco_hw.model import Gaussian, Model
 from disco_hw.model.model import EffectSetting
 from disco_hw.runtime.assembly import put_in_force

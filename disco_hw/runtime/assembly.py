@@ -20,8 +20,9 @@ from disco_hw.adaptation.guard import (
 from disco_hw.config import RobotConfig
 from disco_hw.control.baselines import LAWS, WithFallback
 from disco_hw.errors import InputError
-from disco_hw.estimation import OdometryParameters, PoseFusion
+from disco_hw.estimation import PoseFusion
 from disco_hw.estimation.correction import DisturbanceEstimator
+from disco_hw.estimation.odometry import OdometryParameters
 from disco_hw.log.recorder import Recorder
 from disco_hw.model import Model
 from disco_hw.runtime.core import DaemonCore

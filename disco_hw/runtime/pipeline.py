@@ -19,8 +19,9 @@ from typing import Protocol
 import msgspec
 
 from disco_hw.control import NoValidControl, PlannerState, PlanOutcome, Rollouts, SentCommand, WheelPlan
-from disco_hw.estimation import OdometryParameters, PoseEstimate, PoseFusion, PoseUpdate
-from disco_hw.estimation.correction import DisturbanceEstimator
+from disco_hw.estimation import PoseEstimate, PoseFusion
+from disco_hw.estimation.correction import DisturbanceEstimator, PoseUpdate
+from disco_hw.estimation.odometry import OdometryParameters
 from disco_hw.model import Belief
 from disco_hw.model.disturbance import NO_DISTURBANCE, Disturbance
 from disco_hw.tasks import PlannedTask

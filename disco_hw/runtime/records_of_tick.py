@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.control import Rollouts
-from disco_hw.estimation import PoseUpdate
+from disco_hw.estimation.correction import PoseUpdate
 from disco_hw.log import records
 from disco_hw.runtime.pipeline import Limited, Source, Tick
 from drivers.types import Identity, Limits, OutgoingFrame, Readings, ReceivedFrame, SaidBy, WheelCommand, socketcan_id

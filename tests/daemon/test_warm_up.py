@@ -12,7 +12,8 @@ import pytest
 from disco_hw.config import Estimation
 from disco_hw.control import NoValidControl
 from disco_hw.daemon.run import warm_up
-from disco_hw.estimation import OdometryParameters, PoseFusion
+from disco_hw.estimation import PoseFusion
+from disco_hw.estimation.odometry import OdometryParameters
 from disco_hw.runtime.pipeline import Governor, Pipeline, WheelLimits
 
 

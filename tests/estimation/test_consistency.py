@@ -5,7 +5,9 @@ import pytest
 from scipy.stats import chi2
 
 from disco_hw.config import Estimation
-from disco_hw.estimation import OdometryParameters, PoseFusion, PoseReason
+from disco_hw.estimation import PoseFusion
+from disco_hw.estimation.correction import PoseReason
+from disco_hw.estimation.odometry import OdometryParameters
 from drivers.types import PoseSample
 from tests.estimation.truth import POSE_EVERY, WHEEL_PERIOD_NS, Geometry, Slip, drives, pose_error
 

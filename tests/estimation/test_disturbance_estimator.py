@@ -7,8 +7,9 @@ import math
 import pytest
 
 from disco_hw.config import Estimation
-from disco_hw.estimation import OdometryParameters, PoseFusion
+from disco_hw.estimation import PoseFusion
 from disco_hw.estimation.correction import LARGEST_LEFT, DisturbanceEstimator
+from disco_hw.estimation.odometry import OdometryParameters
 from disco_hw.model.disturbance import NO_DISTURBANCE, Disturbance
 from drivers.types import PoseSample, WheelSample
 

@@ -10,7 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from disco_hw.config import Estimation
-from disco_hw.estimation import OdometryParameters, PoseFusion, PoseReason, advance
+from disco_hw.estimation import PoseFusion
+from disco_hw.estimation.correction import PoseReason
+from disco_hw.estimation.odometry import OdometryParameters, advance
 from drivers.types import PoseSample, WheelSample
 
 MS = 1_000_000

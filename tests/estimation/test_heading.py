@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from disco_hw.config import Estimation
-from disco_hw.estimation import OdometryParameters, PoseFusion, PoseReason
+from disco_hw.estimation import PoseFusion
+from disco_hw.estimation.correction import PoseReason
+from disco_hw.estimation.odometry import OdometryParameters
 from drivers.types import PoseSample, WheelSample
 from tests.estimation.test_consistency import NOMINAL, assert_consistent, follow, mean_bounds, squared_error
 from tests.estimation.truth import POSE_EVERY, Geometry, drives

@@ -6,9 +6,9 @@ import random
 import pytest
 
 from disco_hw.config import Estimation
+from disco_hw.estimation import RewindBuffer
 from disco_hw.estimation.correction import Measurement, PoseReason
 from disco_hw.estimation.filter import Judgement, PoseFilter
-from disco_hw.estimation.fusion import RewindBuffer
 from disco_hw.estimation.odometry import OdometryParameters, Pose, WheelReading
 
 PARAMETERS = OdometryParameters(0.061, 0.415, 0.238)

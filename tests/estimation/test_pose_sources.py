@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 
 from disco_hw.config import Estimation
-from disco_hw.estimation import OdometryParameters, PoseFusion, PoseReason
+from disco_hw.estimation import PoseFusion
+from disco_hw.estimation.correction import PoseReason
+from disco_hw.estimation.odometry import OdometryParameters
 from drivers.types import PoseSample
 from tests.estimation.truth import drives, pose_error
 

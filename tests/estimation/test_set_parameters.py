@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from disco_hw.config import Estimation
-from disco_hw.estimation import OdometryParameters, PoseFusion
+from disco_hw.estimation import PoseFusion
+from disco_hw.estimation.odometry import OdometryParameters
 from drivers.types import PoseSample, WheelSample
 
 TICK_NS = 20_000_000

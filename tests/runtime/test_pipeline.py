@@ -7,7 +7,8 @@ import pytest
 
 from disco_hw.config import Estimation
 from disco_hw.control import Diagnostics, NoValidControl
-from disco_hw.estimation import OdometryParameters, PoseFusion
+from disco_hw.estimation import PoseFusion
+from disco_hw.estimation.odometry import OdometryParameters
 from disco_hw.runtime.pipeline import FollowTask, Governor, Limited, Manual, Off, Pipeline, Source, Stand, WheelLimits
 from drivers.types import PoseSample, Readings, WheelSample
 
