@@ -10,8 +10,8 @@ import msgspec
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 
+from disco_hw.log import Attachment, Start, batch_encoder
 from disco_hw.log.mcap_log import McapLog
-from disco_hw.log.messages import Attachment, Start, batch_encoder
 from disco_hw.log.records import TOPICS, Command, Counters, Estimate, Event, FrameIn, FrameOut, LoopTiming, Plan
 from drivers.types import PoseSample, WheelSample
 

@@ -24,7 +24,7 @@ from disco_hw.drive import ManualInput
 from disco_hw.drive.coverage import Coverage
 from disco_hw.drive.hand_pilot import HandPilot
 from disco_hw.experiments.simulated_time import SimulatedRun, virtual_robot
-from disco_hw.log.messages import MODEL_TOML, ROBOT_TOML, Attachment, version
+from disco_hw.log import MODEL_TOML, ROBOT_TOML, Attachment, version
 from disco_hw.log.recorder import ProcessRecorder, RecordingSettings
 from disco_hw.log.records import BeliefChange, FrameIn, FrameOut
 from disco_hw.runtime.assembly import make_planner, put_in_force

@@ -21,7 +21,7 @@ import typer.main
 
 import disco_hw
 from disco_hw import cli
-from disco_hw.log.messages import Attachment
+from disco_hw.log import Attachment
 from disco_hw.runtime.pipeline import NoPlanner
 from drivers.motor import find_driver
 from firmware_protocol.codec import Codec

@@ -6,8 +6,7 @@ from pathlib import Path
 import disco_hw
 from disco_hw.files import MODEL_TOML as MODEL_KIND
 from disco_hw.files import ROBOT_TOML as ROBOT_KIND
-from disco_hw.log import records
-from disco_hw.log.messages import MODEL_TOML, ROBOT_TOML, attachment
+from disco_hw.log import MODEL_TOML, ROBOT_TOML, attachment, records
 from disco_hw.log.recorder import ProcessRecorder, RecordingSettings
 from drivers.types import PoseSample, PowerSample, RobotLinkHealth, RobotStatus, WheelSample
 

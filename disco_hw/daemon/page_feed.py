@@ -16,7 +16,7 @@ import zmq
 
 from disco_hw.daemon import believed_users
 from disco_hw.errors import InputError, WorkError
-from disco_hw.log.messages import ENCODE_ERRORS, BatchDecoder, batch_encoder
+from disco_hw.log import ENCODE_ERRORS, BatchDecoder, batch_encoder
 from disco_hw.log.recorder import Recorder, RecorderStats
 from disco_hw.log.records import FrameIn, FrameOut, Plan, Record
 from drivers.types import WheelSample

@@ -37,7 +37,7 @@ from disco_hw.daemon.loop import MonotonicClock
 from disco_hw.daemon.page_feed import ViewerFeed, WatchedRecorder, feed_path, tick_feed_path
 from disco_hw.daemon.process import STANDARD_OUTPUT, AsyncPrinter, StopPath, StopSignals
 from disco_hw.errors import InputError
-from disco_hw.log.messages import DBC, Attachment, version
+from disco_hw.log import DBC, Attachment, version
 from disco_hw.log.recorder import NullRecorder, ProcessRecorder, Recorder, RecordingSettings
 from disco_hw.processes import end_with_parent
 from disco_hw.runtime import Ask, by_command

@@ -58,9 +58,9 @@ from disco_hw.gap.search.richest_model import LATE_COLUMNS, candidates_of
 from disco_hw.gap.search.stages import StagePredictions, joint_predictions, prune, stage_predictions
 from disco_hw.gap.search.unnamed_terms import with_known_terms
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GapSettings
+from disco_hw.log import version
 from disco_hw.log.drive import DriveLog, concatenate
 from disco_hw.log.load import load_drive
-from disco_hw.log.messages import version
 from disco_hw.model import Model, load_model, save_model
 from disco_hw.reports import as_json, refuse_directory
 

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from disco_hw.errors import InputError, LogError
 from disco_hw.files import LOG, begin_of, parse_toml
+from disco_hw.log import ROBOT_TOML
 from disco_hw.log.container import MAGIC
 from disco_hw.log.drive import Array, Commands, DriveLog, Gyro, Index, Poses, Wheels, concatenate
 from disco_hw.log.importing.csv_drive import read_csv
 from disco_hw.log.importing.rosbag_file import is_bag
-from disco_hw.log.messages import ROBOT_TOML
 from disco_hw.log.reader import Log, open_log
 
 Mask = NDArray[np.bool_]

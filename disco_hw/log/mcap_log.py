@@ -34,8 +34,8 @@ from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap.writer import CompressionType, Writer
 from mcap_protobuf.schema import build_file_descriptor_set
 
+from disco_hw.log import Batch, BatchDecoder, End, Start, TaskScene
 from disco_hw.log.encoding import encode_json, json_schema
-from disco_hw.log.messages import Batch, BatchDecoder, End, Start, TaskScene
 from disco_hw.log.records import TOPICS, Estimate, Event, Fan, Plan, Record
 from drivers.types import PoseSample
 

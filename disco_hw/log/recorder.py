@@ -19,7 +19,7 @@ from typing import Protocol
 import msgspec
 
 from disco_hw.errors import LogError
-from disco_hw.log.messages import (
+from disco_hw.log import (
     ENCODE_ERRORS,
     TICK,
     Attachment,

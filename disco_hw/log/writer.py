@@ -22,8 +22,8 @@ from typing import Literal
 
 import msgspec
 
+from disco_hw.log import END, End, Ended, Frames, Launch, Start, Started, WriterStatus
 from disco_hw.log.mcap_log import McapLog
-from disco_hw.log.messages import END, End, Ended, Frames, Launch, Start, Started, WriterStatus
 
 EXIT_CANNOT_CREATE = 73
 EXIT_CANNOT_WRITE = 74

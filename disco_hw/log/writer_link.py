@@ -17,7 +17,7 @@ from typing import NamedTuple
 import msgspec
 
 from disco_hw.errors import LogError
-from disco_hw.log.messages import END, Ended, Launch, Start, Started, WriterStatus, frame
+from disco_hw.log import END, Ended, Launch, Start, Started, WriterStatus, frame
 from disco_hw.processes import spawn_at_normal_priority
 
 _STATUS_BYTES = 65_536

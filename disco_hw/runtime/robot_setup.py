@@ -14,7 +14,7 @@ from disco_hw.errors import InputError
 from disco_hw.files import KEY, WAY_POINTS, read_bytes
 from disco_hw.files import MODEL_TOML as MODEL_KIND
 from disco_hw.files import ROBOT_TOML as ROBOT_KIND
-from disco_hw.log.messages import MODEL_TOML, PATH_CSV, ROBOT_TOML, Attachment, TaskScene, attachment
+from disco_hw.log import MODEL_TOML, PATH_CSV, ROBOT_TOML, Attachment, TaskScene, attachment
 from disco_hw.model import Model, load_model
 from drivers.private_files import KeyFileError, key_of_file
 

@@ -11,9 +11,8 @@ from mcap.opcode import Opcode
 from mcap.writer import CompressionType, Writer
 
 from disco_hw.errors import LogError
-from disco_hw.log import container
+from disco_hw.log import Attachment, container
 from disco_hw.log.container import MAGIC, DamagedError, messages, read_attachment, read_chunk, read_contents
-from disco_hw.log.messages import Attachment
 from tools.log_samples import ATTACHMENTS, drive_ticks, log_bytes
 
 WHOLE = log_bytes(drive_ticks(120), flush_every=10)

@@ -7,9 +7,9 @@ from mcap.reader import make_reader
 from msgspec import structs
 
 from disco_hw.errors import InputError, LogError
+from disco_hw.log import End
 from disco_hw.log.container import MAGIC
 from disco_hw.log.log_command import export, info, recover, recover_log
-from disco_hw.log.messages import End
 from disco_hw.log.reader import open_log
 from disco_hw.log.records import Controller
 from tools.log_samples import ATTACHMENTS, PERIOD_NS, bits, drive_ticks, log_bytes, tick, with_damaged_chunk, write_log

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from disco_hw.errors import LogError
+from disco_hw.log import Attachment
 from disco_hw.log.load import drive_from_log, ticks_per_rev
-from disco_hw.log.messages import Attachment
 from disco_hw.log.reader import open_log
 from disco_hw.log.records import Command, Event
 from drivers.types import PoseSample, WheelSample

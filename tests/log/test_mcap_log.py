@@ -9,9 +9,9 @@ import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
+from disco_hw.log import TaskScene, batch_encoder
 from disco_hw.log.log_command import recover_log
 from disco_hw.log.mcap_log import CHUNK_BYTES, METADATA, SCENE, McapLog, Metadata
-from disco_hw.log.messages import TaskScene, batch_encoder
 from disco_hw.log.reader import open_log
 from disco_hw.log.records import TOPIC_INDEX, TOPICS, Event, FrameIn
 from tools.log_samples import ATTACHMENTS, PERIOD_NS, WALL_OFFSET_NS, drive_ticks, log_bytes, start, tick

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from disco_hw.errors import InputError
 from disco_hw.files import MODEL_TOML, ROBOT_TOML
-from disco_hw.log.messages import ENCODE_ERRORS, BatchDecoder, Frames, attachment, batch_encoder, frame, version
+from disco_hw.log import ENCODE_ERRORS, BatchDecoder, Frames, attachment, batch_encoder, frame, version
 from disco_hw.log.records import TOPICS, Estimate, Event, Plan
 from tools.log_samples import ANY_RECORD, bits
 

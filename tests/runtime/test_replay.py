@@ -10,7 +10,7 @@ from msgspec import structs
 import disco_hw
 from disco_hw.control.optimiser import Optimiser
 from disco_hw.errors import InputError
-from disco_hw.log.messages import MODEL_TOML, ROBOT_TOML, Attachment
+from disco_hw.log import MODEL_TOML, ROBOT_TOML, Attachment
 from disco_hw.log.recorder import ProcessRecorder, RecordingSettings
 from disco_hw.log.records import UnexplainedMotion
 from disco_hw.runtime.pipeline import Source

@@ -7,7 +7,7 @@ import pytest
 import zmq
 
 from disco_hw.daemon.page_feed import FeedSubscriber
-from disco_hw.log.messages import batch_encoder
+from disco_hw.log import batch_encoder
 from disco_hw.log.records import Estimate
 from tools.viewer_run import tick_records
 

@@ -22,11 +22,11 @@ from disco_hw.config import RobotConfig, Ros2, load_robot_config
 from disco_hw.errors import InputError, LogError
 from disco_hw.files import LOG, begin_of
 from disco_hw.files import ROBOT_TOML as ROBOT_FILE
+from disco_hw.log import ROBOT_TOML, Attachment, End, Start, attachment, batch_encoder, version
 from disco_hw.log.container import MAGIC
 from disco_hw.log.drive import DriveLog
 from disco_hw.log.importing.rosbag_file import METADATA
 from disco_hw.log.mcap_log import McapLog
-from disco_hw.log.messages import ROBOT_TOML, Attachment, End, Start, attachment, batch_encoder, version
 from disco_hw.log.records import Command, Record
 from disco_hw.log.writer import LogFile
 from drivers.types import PoseSample, WheelSample

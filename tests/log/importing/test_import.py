@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from disco_hw.errors import InputError, LogError
+from disco_hw.log import ROBOT_TOML
 from disco_hw.log.importing import import_log
 from disco_hw.log.load import load_drive
-from disco_hw.log.messages import ROBOT_TOML
 from disco_hw.log.reader import open_log
 from disco_hw.runtime.replay import replay
 from disco_hw.runtime.robot_setup import setup_of_log
