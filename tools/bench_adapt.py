@@ -19,8 +19,8 @@ from disco_hw.adaptation.guard import Geometry, believed_geometry, possible_rang
 from disco_hw.adaptation.network import Training, train_network, training_range
 from disco_hw.adaptation.recursive import evidence
 from disco_hw.daemon.run import warm_up
+from disco_hw.experiments import FAST_START, FAST_TASK, running_stack
 from disco_hw.experiments.adapt import AdaptOptions, drive_through_change, run_adapt
-from disco_hw.experiments.live_stack import FAST_START, FAST_TASK, running_stack
 from disco_hw.inference.excitation import USUAL
 from disco_hw.runtime.assembly import make_adaptation, make_pipeline, make_planner, put_in_force
 from disco_hw.runtime.robot_setup import Setup, load_setup

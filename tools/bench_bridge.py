@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from disco_hw.daemon import send_request
-from disco_hw.experiments.live_stack import FAST_START, FAST_TASK, Operator, disco_hw_process, write_robot_file
+from disco_hw.experiments import FAST_START, FAST_TASK, Operator, disco_hw_process, write_robot_file
 from disco_hw.log.reader import open_log
 from tools.bench_latency import READY_TIMEOUT_S, WHEEL_COMMAND
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from disco_hw.experiments.live_stack import Operator, disco_hw_process, write_robot_file
+from disco_hw.experiments import Operator, disco_hw_process, write_robot_file
 from disco_hw.log.reader import open_log
 
 WHEEL_COMMAND, WHEEL_TICKS = 0x100, 0x111

@@ -25,7 +25,7 @@ from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Origin, Subprotocol
 
 from disco_hw.daemon.page_feed import FeedSubscriber, ViewerFeed, feed_path
-from disco_hw.experiments.live_stack import disco_hw_process, running_stack
+from disco_hw.experiments import disco_hw_process, running_stack
 from disco_hw.log.reader import open_log
 from disco_hw.log.records import Plan
 from disco_hw.processes import stolen_ms

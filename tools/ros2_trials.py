@@ -27,7 +27,7 @@ from typing import Any
 
 from disco_hw.config import load_robot_config
 from disco_hw.errors import WorkError
-from disco_hw.experiments.live_stack import FAST_START, FAST_TASK, Operator, disco_hw_process, stands, write_robot_file
+from disco_hw.experiments import FAST_START, FAST_TASK, Operator, disco_hw_process, stands, write_robot_file
 from tools.bench_latency import READY_TIMEOUT_S
 
 DOMAIN = 91

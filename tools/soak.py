@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from disco_hw.errors import WorkError
-from disco_hw.experiments.live_stack import Operator, disco_hw_process, write_robot_file
+from disco_hw.experiments import Operator, disco_hw_process, write_robot_file
 from disco_hw.processes import stolen_ms
 
 WANTED_P999_US = 1000.0

@@ -21,7 +21,7 @@ from disco_hw.adaptation.adapter import Adapter, InlineLink
 from disco_hw.adaptation.adapter_link import NAMES
 from disco_hw.adaptation.guard import Geometry, believed_geometry, with_geometry
 from disco_hw.effects import surface_change
-from disco_hw.experiments.live_stack import running_stack
+from disco_hw.experiments import running_stack
 from disco_hw.experiments.simulated_time import SimulatedRun, virtual_robot
 from disco_hw.log import records
 from disco_hw.log.reader import open_log

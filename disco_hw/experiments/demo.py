@@ -28,15 +28,7 @@ from rich.text import Text
 import disco_hw
 from disco_hw.config import load_robot_config
 from disco_hw.errors import InputError, WorkError
-from disco_hw.experiments.circle_report import (
-    NARROWEST,
-    CircleReport,
-    Point,
-    circle_points,
-    load_circle_report,
-    picture,
-)
-from disco_hw.experiments.live_stack import (
+from disco_hw.experiments import (
     DEVICES,
     READY_TIMEOUT_S,
     Operator,
@@ -44,6 +36,14 @@ from disco_hw.experiments.live_stack import (
     link_of_device,
     stands,
     with_device,
+)
+from disco_hw.experiments.circle_report import (
+    NARROWEST,
+    CircleReport,
+    Point,
+    circle_points,
+    load_circle_report,
+    picture,
 )
 from disco_hw.processes import stolen_ms
 from disco_hw.runtime.robot_setup import Setup, geometry, load_setup

@@ -22,7 +22,7 @@ from disco_hw.config import load_robot_config
 from disco_hw.daemon import run, socket_path
 from disco_hw.daemon.page_feed import ViewerFeed, feed_path
 from disco_hw.errors import InputError
-from disco_hw.experiments.live_stack import write_robot_file
+from disco_hw.experiments import write_robot_file
 from disco_hw.log.mcap_log import SCENE, VIEWS
 from disco_hw.log.records import TOPIC_BY_NAME, DaemonState, Estimate, Event
 from disco_hw.runtime.robot_setup import load_setup, scene_of

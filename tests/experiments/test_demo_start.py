@@ -11,10 +11,10 @@ from types import SimpleNamespace
 
 import pytest
 
+from disco_hw import experiments
 from disco_hw.errors import WorkError
-from disco_hw.experiments import live_stack
+from disco_hw.experiments import Operator
 from disco_hw.experiments.demo import start_pose
-from disco_hw.experiments.live_stack import Operator
 from disco_hw.runtime.robot_setup import load_setup
 from disco_hw.runtime.supervisor import UserRequest
 from sim.body_dynamics import BodyPose
@@ -53,7 +53,7 @@ class Compiling:
 def test_the_time_in_which_a_first_start_compiles_does_not_count(tmp_path, monkeypatch):
     clock = SimulatedClock()
     passing = SimpleNamespace(monotonic=lambda: clock.now_ns() * 1e-9, sleep=lambda s: clock.advance_ns(round(s * 1e9)))
-    monkeypatch.setattr(live_stack, "time", passing)
+    monkeypatch.setattr(experiments, "time", passing)
     daemon = Compiling(looks=20)
     with pytest.raises(WorkError, match=r"not READY within 0.2 s \(compiling: 7 functions, 3 s\)"):
         Operator(tmp_path / "none", (daemon,)).wait_for("READY", 0.2)

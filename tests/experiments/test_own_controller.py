@@ -15,7 +15,7 @@ import pytest
 import disco_hw
 from disco_hw import drive_virtual
 from disco_hw.errors import InputError
-from disco_hw.experiments.live_stack import with_device
+from disco_hw.experiments import with_device
 from disco_hw.log.reader import open_log
 
 ROOT = Path(disco_hw.__file__).parents[1]

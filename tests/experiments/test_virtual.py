@@ -11,8 +11,7 @@ from typer.testing import CliRunner
 import disco_hw
 from disco_hw.cli.app import app
 from disco_hw.errors import InputError
-from disco_hw.experiments import virtual
-from disco_hw.experiments.live_stack import with_device
+from disco_hw.experiments import virtual, with_device
 from disco_hw.experiments.virtual import SimOptions, run_sim, true_parameters
 from disco_hw.runtime.robot_setup import load_setup
 

@@ -187,7 +187,7 @@ OWN = {
     "disco_hw/experiments/adapt.py": {"np.genfromtxt", "open"},
     "disco_hw/experiments/circle_report.py": {"open"},
     "disco_hw/experiments/demo.py": {"read_text"},
-    "disco_hw/experiments/live_stack.py": {"open", "read_text"},
+    "disco_hw/experiments/__init__.py": {"open", "read_text"},
     "disco_hw/jit/__init__.py": {"read_bytes"},
     # This process's own memory.
     "disco_hw/log/importing/rosbag_file.py": {"read_text"},

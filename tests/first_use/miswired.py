@@ -12,7 +12,7 @@ import msgspec
 import disco_hw
 from disco_hw.drive import ManualInput
 from disco_hw.errors import WorkError
-from disco_hw.experiments.live_stack import with_device
+from disco_hw.experiments import with_device
 from disco_hw.experiments.simulated_time import SimulatedRun
 from disco_hw.first_use.commission import as_sent, slowest_rad_s
 from disco_hw.first_use.procedure import Ask, CommissionPilot, DriveWheels, Procedure, speed_of

@@ -5,7 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 
-from disco_hw.experiments.live_stack import TruthRow
+from disco_hw.experiments import TruthRow
 
 STILL_RAD_S = 0.05
 COMMAND_TIMEOUT_S = 0.1

@@ -7,7 +7,7 @@ import re
 
 import pytest
 
-from disco_hw.experiments.live_stack import READY_TIMEOUT_S, disco_hw_process, running_stack, write_robot_file
+from disco_hw.experiments import READY_TIMEOUT_S, disco_hw_process, running_stack, write_robot_file
 from tests.hil.stack import disco
 
 pytestmark = pytest.mark.hil

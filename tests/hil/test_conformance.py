@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from disco_hw.experiments.live_stack import DEVICES, READY_TIMEOUT_S, disco_hw_process, write_robot_file
+from disco_hw.experiments import DEVICES, READY_TIMEOUT_S, disco_hw_process, write_robot_file
 from tests.drivers.waiting import wait_until
 
 pytestmark = [pytest.mark.hil, pytest.mark.long, pytest.mark.timeout(300)]

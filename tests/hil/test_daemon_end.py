@@ -10,7 +10,7 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
-from disco_hw.experiments.live_stack import Child, running_stack
+from disco_hw.experiments import Child, running_stack
 from disco_hw.log.reader import open_log
 from tests.hil.stack import STILL_RAD_S
 
@@ -69,7 +69,7 @@ def daemon_that_fails(monkeypatch, error: str):
     import subprocess
     import sys
 
-    import disco_hw.experiments.live_stack as operator_module
+    import disco_hw.experiments as operator_module
 
     popen = subprocess.Popen
 

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from disco_hw.drive import INPUT_LIMIT_NS
-from disco_hw.experiments.live_stack import Operator, disco_hw_process, write_robot_file
+from disco_hw.experiments import Operator, disco_hw_process, write_robot_file
 from disco_hw.log.load import load_drive
 from disco_hw.log.reader import open_log
 from disco_hw.runtime.pipeline import NoPlanner

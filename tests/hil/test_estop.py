@@ -12,7 +12,7 @@ import time
 import pytest
 
 from disco_hw.errors import WorkError
-from disco_hw.experiments.live_stack import running_stack
+from disco_hw.experiments import running_stack
 from tests.hil.stack import STILL_RAD_S
 
 pytestmark = pytest.mark.hil
@@ -77,7 +77,7 @@ def test_estop_stops_and_latches(tmp_path, link, daemon):
 
 
 def test_estop_without_a_robot_says_so_and_fails(tmp_path):
-    from disco_hw.experiments.live_stack import write_robot_file
+    from disco_hw.experiments import write_robot_file
 
     code, output = estop(write_robot_file(tmp_path))
     assert code == 1

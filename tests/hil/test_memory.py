@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from disco_hw.experiments.live_stack import running_stack, write_robot_file
+from disco_hw.experiments import running_stack, write_robot_file
 from disco_hw.processes import can_lock_memory
 
 pytestmark = pytest.mark.hil

@@ -12,7 +12,7 @@ import pytest
 
 from disco_hw.daemon import send_request
 from disco_hw.drive import INPUT_LIMIT_NS
-from disco_hw.experiments.live_stack import disco_hw_process, running_stack, stands
+from disco_hw.experiments import disco_hw_process, running_stack, stands
 from disco_hw.log.reader import open_log
 from disco_hw.runtime.robot_setup import load_setup
 from disco_hw.viewer import scene

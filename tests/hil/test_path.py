@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from disco_hw.experiments.live_stack import READY_TIMEOUT_S, running_stack, write_robot_file
+from disco_hw.experiments import READY_TIMEOUT_S, running_stack, write_robot_file
 from tests.hil.stack import disco
 from tests.runtime.path_robot import ROBOTS
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from disco_hw.experiments.live_stack import running_stack
+from disco_hw.experiments import running_stack
 from tests.hil.test_page import assert_drawn, page_of
 from tests.runtime.path_robot import ROBOTS
 from tests.viewer.test_page import wait_for

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from disco_hw.errors import WorkError
-from disco_hw.experiments.live_stack import READY_TIMEOUT_S, Stack, running_stack
+from disco_hw.experiments import READY_TIMEOUT_S, Stack, running_stack
 from disco_hw.log.log_command import info
 from disco_hw.log.reader import open_log
 from tests.hil.stack import disco

@@ -18,7 +18,7 @@ import can
 import pytest
 
 from disco_hw.errors import WorkError
-from disco_hw.experiments.live_stack import (
+from disco_hw.experiments import (
     READY_TIMEOUT_S,
     Operator,
     disco_hw_process,

@@ -13,8 +13,8 @@ import pytest
 
 pytest.importorskip("cyclonedds", reason="cyclonedds is not installed: make venv")
 
-from disco_hw.experiments import live_stack
-from disco_hw.experiments.live_stack import FAST_START, disco_hw_process, stands
+from disco_hw import experiments
+from disco_hw.experiments import FAST_START, disco_hw_process, stands
 from tests.hil.test_drive import Bench
 
 pytestmark = [pytest.mark.hil, pytest.mark.timeout(400)]
@@ -51,9 +51,9 @@ def node(kind, output, start=FAST_START):
 
 @contextmanager
 def stack_with_bridge(directory, monkeypatch):
-    written = live_stack.write_robot_file
-    monkeypatch.setattr(live_stack, "write_robot_file", lambda *given: with_poses_of_ros(written(*given)))
-    with live_stack.running_stack(directory) as stack:
+    written = experiments.write_robot_file
+    monkeypatch.setattr(experiments, "write_robot_file", lambda *given: with_poses_of_ros(written(*given)))
+    with experiments.running_stack(directory) as stack:
         bridge = ["bridge", "ros2", str(stack.robot_file)]
         with disco_hw_process("bridge", bridge, directory / "bridge.txt") as child:
             yield stack, child.process
@@ -129,7 +129,7 @@ def test_real_ros_arms_and_drives_by_its_speeds(tmp_path):
 
 
 def drive(stack):
-    stack.operator.wait_until("a pose", lambda status: status["pose_ok"], live_stack.READY_TIMEOUT_S)
+    stack.operator.wait_until("a pose", lambda status: status["pose_ok"], experiments.READY_TIMEOUT_S)
     stack.drive()
 
 
@@ -142,7 +142,7 @@ def assert_stops(stack):
 def test_it_drives_by_the_poses_of_a_node_that_hears_its_odometry_and_stops_when_the_node_dies(tmp_path, monkeypatch):
     said = tmp_path / "node.txt"
     with stack_with_bridge(tmp_path, monkeypatch) as (stack, _), node("echo", said) as process:
-        stack.operator.wait_until("a pose", lambda status: status["pose_ok"], live_stack.READY_TIMEOUT_S)
+        stack.operator.wait_until("a pose", lambda status: status["pose_ok"], experiments.READY_TIMEOUT_S)
         status = stack.drive_until("a metre further", lambda _: far(said) > 1.0, 30.0)
         assert status["pose_ok"]
         assert status["task"]["distance_m"] < 0.2
@@ -161,7 +161,7 @@ def test_it_drives_by_the_transforms_of_a_localisation_and_stops_when_that_dies(
 
     monkeypatch.setitem(globals(), "with_poses_of_ros", by_transforms)
     with stack_with_bridge(tmp_path, monkeypatch) as (stack, _), node("tf", said) as process:
-        stack.operator.wait_until("a pose", lambda status: status["pose_ok"], live_stack.READY_TIMEOUT_S)
+        stack.operator.wait_until("a pose", lambda status: status["pose_ok"], experiments.READY_TIMEOUT_S)
         status = stack.drive_until("a metre further", lambda _: far(said) > 1.0, 30.0)
         assert status["task"]["distance_m"] < 0.2
         process.kill()

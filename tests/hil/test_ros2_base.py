@@ -12,8 +12,8 @@ import pytest
 pytest.importorskip("cyclonedds", reason="cyclonedds is not installed: make venv")
 
 from disco_hw.config import load_robot_config
-from disco_hw.experiments.live_stack import FAST_START, FAST_TASK, READY_TIMEOUT_S, Operator, stands, write_robot_file
-from disco_hw.experiments.live_stack import disco_hw_process as process_of
+from disco_hw.experiments import FAST_START, FAST_TASK, READY_TIMEOUT_S, Operator, stands, write_robot_file
+from disco_hw.experiments import disco_hw_process as process_of
 from tests.hil.test_ros2 import real_node, real_ros
 
 pytestmark = [pytest.mark.hil, pytest.mark.long, pytest.mark.timeout(400)]

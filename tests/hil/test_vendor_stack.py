@@ -9,7 +9,7 @@ import time
 
 import pytest
 
-from disco_hw.experiments.live_stack import DEVICES, running_stack
+from disco_hw.experiments import DEVICES, running_stack
 from tests.hil.stack import STILL_RAD_S, disco
 
 pytestmark = pytest.mark.hil

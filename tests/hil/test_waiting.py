@@ -5,7 +5,7 @@ import time
 
 import pytest
 
-from disco_hw.experiments.live_stack import disco_hw_process, write_robot_file
+from disco_hw.experiments import disco_hw_process, write_robot_file
 from tests.hil.stack import disco
 
 pytestmark = pytest.mark.hil

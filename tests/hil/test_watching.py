@@ -12,7 +12,7 @@ import time
 
 import pytest
 
-from disco_hw.experiments.live_stack import disco_hw_process, write_robot_file
+from disco_hw.experiments import disco_hw_process, write_robot_file
 from tests.drivers.waiting import wait_until
 from tests.hil.test_check import wait_for_line
 

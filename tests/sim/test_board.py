@@ -11,7 +11,7 @@ import tty
 
 import pytest
 
-from disco_hw.experiments.live_stack import write_robot_file
+from disco_hw.experiments import write_robot_file
 from drivers.transport import serial
 from drivers.types import Frame
 from firmware_protocol.serial_framing import encode_frame

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from disco_hw.errors import WorkError
-from disco_hw.experiments.live_stack import READY_TIMEOUT_S, Operator, disco_hw_process, write_robot_file
+from disco_hw.experiments import READY_TIMEOUT_S, Operator, disco_hw_process, write_robot_file
 from disco_hw.log.reader import open_log
 from disco_hw.processes import can_use_fifo
 from tools.emulated_board import build_board, missing, running_board
