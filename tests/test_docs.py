@@ -11,7 +11,7 @@ import click
 import pytest
 import typer
 
-from disco_hw.cli.app import app
+from disco_hw.cli import app
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")])
@@ -67,7 +67,7 @@ def commands_of(page: Path) -> list[str]:
 
 @cache
 def whole_command() -> click.Command:
-    return typer.main.get_command(app)
+    return typer.main.get_command(app())
 
 
 def wrong_in(line: str) -> str | None:

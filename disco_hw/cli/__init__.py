@@ -1,7 +1,8 @@
-"""The command `disco-hw`: a file for each group of verbs, gathered in `app`; here errors become an exit code.
+"""The command `disco-hw`: a file for each group of verbs, gathered here, where errors become an exit code.
 
-A stop that is written as in the documents goes past the command-line library, which takes as long to load and to list
-every verb as the stop itself.
+Verbs import what they need when they run, so that `--help` and `ctl` need nothing else to be healthy. A stop that is
+written as in the documents goes past the command-line library, which takes as long to load and to list every verb as
+the stop itself.
 """
 
 from __future__ import annotations
@@ -11,9 +12,13 @@ import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from disco_hw.errors import InputError, WorkError
 from disco_hw.processes import PARENT_VARIABLE, end_with_parent
+
+if TYPE_CHECKING:
+    import typer
 
 _YOUNG_OBJECTS = 50_000
 
@@ -28,10 +33,10 @@ def main() -> None:
     try:
         stop = plain_stop(sys.argv[1:])
         if stop is not None:
-            raise SystemExit(stop_and_say(*stop))
-        from disco_hw.cli.app import app
+            from disco_hw.daemon.emergency import stop_and_say
 
-        app(prog_name="disco-hw")
+            raise SystemExit(stop_and_say(*stop))
+        app()(prog_name="disco-hw")
     except InputError as error:
         print(f"disco-hw: {error}", file=sys.stderr)
         raise SystemExit(2) from None
@@ -63,11 +68,32 @@ def plain_stop(words: Sequence[str]) -> tuple[Path, str | None, bool] | None:
     return (Path(files[0]), link, as_json) if len(files) == 1 else None
 
 
-def stop_and_say(robot: Path, link: str | None, as_json: bool) -> int:
-    """Stop the robot, print the outcome, and return the exit code: 0 only if the robot confirmed that it is stopped."""
-    from disco_hw.daemon.emergency import stop_robot
-    from disco_hw.reports import as_json as json_of
+def app() -> typer.Typer:
+    """Every verb, with its options and its help."""
+    import typer
 
-    outcome = stop_robot(robot, link)
-    print(json_of(outcome.as_dict()) if as_json else outcome.as_text())
-    return 0 if outcome.confirmed else 1
+    from disco_hw.cli import logs, options, robot, virtual
+
+    gathered = typer.Typer(name="disco-hw", no_args_is_help=True, pretty_exceptions_enable=False)
+    for verb in (
+        virtual.demo,
+        robot.run,
+        robot.drive,
+        robot.ctl,
+        robot.check,
+        robot.init,
+        robot.commission,
+        robot.estop,
+        logs.infer,
+        logs.gap,
+        logs.view,
+        logs.replay,
+        virtual.sim,
+    ):
+        gathered.command()(verb)
+    gathered.add_typer(virtual.experiment_app, name="experiment")
+    gathered.add_typer(robot.bridge_app, name="bridge")
+    gathered.command("import")(logs.import_log)
+    gathered.add_typer(logs.log_app, name="log")
+    gathered.callback()(options.disco_hw)
+    return gathered

@@ -1,4 +1,4 @@
-"""What several verbs share: their arguments, and how they print."""
+"""What several verbs share: their arguments, and how they print; and what the command takes without a verb."""
 
 from __future__ import annotations
 
@@ -55,3 +55,19 @@ def progress_bar() -> Iterator[Callable[[str, float], None]]:
 def print_result(result: dict[str, Any], as_json: bool, text: str) -> None:
     """Print the result once: as one JSON object, or as text."""
     print(json_of(result) if as_json else text)
+
+
+def _version(asked: bool) -> None:
+    if asked:
+        from importlib import metadata
+
+        print(f"disco-hw {metadata.version('disco-hw')}")
+        raise typer.Exit
+
+
+def disco_hw(
+    _: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+) -> None:
+    """Driver stack for a skid-steer robot: fusion, DISCO stochastic MPC, virtual robot, recording."""

@@ -10,7 +10,6 @@ from typing import Annotated
 
 import typer
 
-from disco_hw.cli import stop_and_say
 from disco_hw.cli.options import (
     AsJson,
     LinkOption,
@@ -234,6 +233,8 @@ def estop(
     as_json: AsJson = False,
 ) -> None:
     """Stop the robot now, whatever state anything else is in."""
+    from disco_hw.daemon.emergency import stop_and_say
+
     raise typer.Exit(stop_and_say(robot, link, as_json))
 
 

@@ -22,6 +22,7 @@ from disco_hw.config import Link, link_fields, link_of, names_address
 from disco_hw.daemon import believed_users, default_socket_path, passed_over, send_request
 from disco_hw.errors import InputError
 from disco_hw.files import ROBOT_TOML, read_toml
+from disco_hw.reports import as_json as json_of
 from drivers.motor import find_driver
 from drivers.transport import SerialMedium, open_transport
 from drivers.transport.reconnecting import TransportCounters
@@ -275,3 +276,10 @@ def _ask_daemon(socket_path: Path | None) -> tuple[bool, str | None]:
     except Exception as error:  # a hung or dying daemon must not look like a failure of the link
         return False, str(error) or type(error).__name__
     return False, None
+
+
+def stop_and_say(robot: Path, link: str | None, as_json: bool) -> int:
+    """Stop the robot, print the outcome, and return the exit code: 0 only if the robot confirmed that it is stopped."""
+    outcome = stop_robot(robot, link)
+    print(json_of(outcome.as_dict()) if as_json else outcome.as_text())
+    return 0 if outcome.confirmed else 1

@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 from websockets.asyncio.client import connect
 
 from disco_hw.bridge.foxglove import LAYOUT, Live
-from disco_hw.cli.app import app
+from disco_hw.cli import app
 from disco_hw.config import load_robot_config
 from disco_hw.daemon import run, socket_path
 from disco_hw.daemon.page_feed import ViewerFeed, feed_path
@@ -102,7 +102,7 @@ def test_a_port_that_is_taken_is_refused_in_one_line(live, tmp_path):
 @pytest.mark.parametrize("words", [["run.mcap"], ["--live"], ["--live", "--robot", "r.toml", "--host", "0.0.0.0"]])
 def test_what_it_is_not_for_is_refused(words):
     with pytest.raises(InputError):
-        CliRunner().invoke(app, ["view", "--foxglove", *words], catch_exceptions=False)
+        CliRunner().invoke(app(), ["view", "--foxglove", *words], catch_exceptions=False)
 
 
 def test_the_layout_names_topics_and_fields_that_there_are():

@@ -10,8 +10,8 @@ from importlib import metadata
 import pytest
 from typer.testing import CliRunner
 
-from disco_hw.cli import plain_stop, robot
-from disco_hw.cli.app import app
+from disco_hw.cli import app, plain_stop
+from disco_hw.daemon import emergency
 
 VERBS = [
     *("demo", "run", "sim", "drive", "ctl", "check", "replay", "estop"),
@@ -122,8 +122,8 @@ def test_verbs_and_options_are_completed_and_nothing_heavy_is_loaded_for_it():
 )  # fmt: skip
 def test_a_stop_that_goes_past_the_library_is_read_as_the_library_reads_it(monkeypatch, words):
     asked = []
-    monkeypatch.setattr(robot, "stop_and_say", lambda *given: asked.append(given) or 0)
-    result = CliRunner().invoke(app, ["estop", *words.split()])
+    monkeypatch.setattr(emergency, "stop_and_say", lambda *given: asked.append(given) or 0)
+    result = CliRunner().invoke(app(), ["estop", *words.split()])
     plain = plain_stop(["estop", *words.split()])
     assert plain is None or asked == [plain]
     # What the library refuses, explains or reads in a way of its own is left to it.

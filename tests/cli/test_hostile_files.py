@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from disco_hw.cli.app import app
+from disco_hw.cli import app
 from disco_hw.files import LOG
 from tools.verb_calls import CALLS, call, good_files, without_work, write_good
 
@@ -86,7 +86,7 @@ def test_the_table_has_every_file_argument_of_every_verb():
         for group in group_app.registered_groups:
             walk(group.typer_instance, [*words, group.name])
 
-    walk(app, [])
+    walk(app(), [])
     assert found == READ | WRITTEN
     assert not READ & WRITTEN
     assert {verb for verb, _ in READ} == {one.verb for one in CALLS}

@@ -14,10 +14,9 @@ import can
 import pytest
 
 import disco_hw
-from disco_hw.cli import stop_and_say
 from disco_hw.daemon import SERVED, emergency
 from disco_hw.daemon.control_socket import ControlServer
-from disco_hw.daemon.emergency import stop_robot
+from disco_hw.daemon.emergency import stop_and_say, stop_robot
 from disco_hw.errors import InputError
 from drivers.motor import find_driver
 from drivers.types import Frame, LinkState, ReceivedFrame

@@ -29,10 +29,10 @@ def test_corners_that_are_one_are_refused():
 
 
 def test_the_end_says_what_to_type_and_every_verb_of_it_is_there(tmp_path):
-    from disco_hw.cli.app import app
+    from disco_hw.cli import app
 
-    verbs = {(command.name or command.callback.__name__).replace("_", "-") for command in app.registered_commands}
-    verbs |= {group.name for group in app.registered_groups}
+    verbs = {(command.name or command.callback.__name__).replace("_", "-") for command in app().registered_commands}
+    verbs |= {group.name for group in app().registered_groups}
     lines = what_next(DemoOptions(), tmp_path / "demo.mcap", tmp_path / "circle.png")
     typed = [line.split()[1] for line in lines if line.startswith("  disco-hw ")]
     assert set(typed) <= verbs

@@ -9,7 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 import disco_hw
-from disco_hw.cli.app import app
+from disco_hw.cli import app
 from disco_hw.errors import InputError
 from disco_hw.experiments import virtual, with_device
 from disco_hw.experiments.virtual import SimOptions, run_sim, true_parameters
@@ -65,14 +65,14 @@ def test_a_fractional_encoder_is_refused(tmp_path):
 
 @pytest.mark.parametrize("what", ["effects", "faults"])
 def test_what_can_be_hidden_or_go_wrong_is_listed_without_a_robot(what):
-    result = CliRunner().invoke(app, ["sim", f"--list-{what}"])
+    result = CliRunner().invoke(app(), ["sim", f"--list-{what}"])
     assert result.exit_code == 0
     assert {"effects": "motor_lag", "faults": "bus_off"}[what] in result.output
 
 
 def test_a_robot_is_needed_to_run():
     with pytest.raises(InputError, match=r"no ROBOT\.toml given; name one"):
-        CliRunner().invoke(app, ["sim"], catch_exceptions=False)
+        CliRunner().invoke(app(), ["sim"], catch_exceptions=False)
 
 
 def test_a_board_that_has_a_link_of_its_own_is_refused_what_the_simulators_link_does(tmp_path):

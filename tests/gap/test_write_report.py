@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 import disco_hw
 from disco_hw import gap
-from disco_hw.cli.app import app
+from disco_hw.cli import app
 from disco_hw.config import load_robot_config
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.errors import InputError, LogError
@@ -131,7 +131,7 @@ def test_a_fleet_ends_in_one_table_with_a_row_for_each_log(fleet, tmp_path):
 def test_a_fleet_s_json_has_the_numbers_and_every_log_its_report(fleet, tmp_path):
     out = tmp_path / "out"
     answer = CliRunner().invoke(
-        app, ["gap", *map(str, fleet), "--robot", str(ROBOT), "-o", str(out), "--fleet", "--json"]
+        app(), ["gap", *map(str, fleet), "--robot", str(ROBOT), "-o", str(out), "--fleet", "--json"]
     )
     assert answer.exit_code == 0, answer.output
     content = json.loads((out / "fleet.json").read_text())
@@ -184,7 +184,7 @@ def test_a_cluster_makes_the_same_table(tmp_path):
         cluster.wait_for_workers(2)
         address = ["--dask", cluster.scheduler_address]
         answer = CliRunner().invoke(
-            app, ["gap", *map(str, logs), "--robot", str(ROBOT), "-o", str(tmp_path / "far"), *address]
+            app(), ["gap", *map(str, logs), "--robot", str(ROBOT), "-o", str(tmp_path / "far"), *address]
         )
     assert answer.exit_code == 0, answer.output
     here = gap.gap_fleet(logs, ROBOT, tmp_path / "here")

@@ -5,7 +5,7 @@ import json
 import pytest
 from typer.testing import CliRunner
 
-from disco_hw.cli.app import app
+from disco_hw.cli import app
 from disco_hw.model import load_model
 
 # Compiling for two models takes most of it.
@@ -14,7 +14,7 @@ pytestmark = [pytest.mark.hil, pytest.mark.long, pytest.mark.timeout(900)]
 
 def test_what_is_found_in_a_minutes_log_makes_the_circle_better(tmp_path):
     arguments = ["experiment", "gap", "--hide", "deadband=0.8", "--script", "separate", "--laps", "0.6", "--json"]
-    done = CliRunner().invoke(app, [*arguments, "-o", str(tmp_path)], catch_exceptions=False)
+    done = CliRunner().invoke(app(), [*arguments, "-o", str(tmp_path)], catch_exceptions=False)
     assert done.exit_code == 0, done.output
     result = json.loads(done.stdout)
     assert "deadband" in result["found"]
@@ -29,5 +29,5 @@ def test_what_is_found_in_a_minutes_log_makes_the_circle_better(tmp_path):
 
 
 def test_an_effect_that_does_not_exist_is_refused_in_one_line(tmp_path):
-    done = CliRunner().invoke(app, ["experiment", "gap", "--hide", "rust=1", "-o", str(tmp_path)])
+    done = CliRunner().invoke(app(), ["experiment", "gap", "--hide", "rust=1", "-o", str(tmp_path)])
     assert done.exit_code != 0

@@ -7,7 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 import disco_hw
-from disco_hw.cli.app import app
+from disco_hw.cli import app
 from disco_hw.drive.coverage import Coverage
 from disco_hw.drive.hand_pilot import HandPilot
 from disco_hw.drive.script import ScriptSource, Unattended
@@ -43,7 +43,7 @@ def logs(tmp_path_factory):
 
 
 def call(*words):
-    done = CliRunner().invoke(app, [*map(str, words)], catch_exceptions=False)
+    done = CliRunner().invoke(app(), [*map(str, words)], catch_exceptions=False)
     assert done.exit_code == 0, done.output
     return done.stdout
 
