@@ -27,12 +27,12 @@ from disco_hw.model import Gaussian, Model
 from disco_hw.model.model import EffectSetting
 from disco_hw.runtime.assembly import put_in_force
 from disco_hw.runtime.pipeline import FollowTask, Governor, Pipeline, Planner, WheelLimits
+from disco_hw.tasks import PlannedTask
 from disco_hw.tasks.circle import CircleCost, CircleCourse
 from disco_hw.tasks.lemniscate import LemniscateTask
 from disco_hw.tasks.line import PathTable
 from disco_hw.tasks.line.cost import PathCost
 from disco_hw.tasks.line.course import LineCourse, line_course
-from disco_hw.tasks.task import PlannedTask
 from drivers.types import Readings
 from tools.foreign_plant import NOMINAL, ForeignPlant, ForeignRobot
 

@@ -12,7 +12,7 @@ from disco_hw.control.kernel.sequences import Basis, Limits
 from disco_hw.control.kernel.step import ESS, INVALID, SAMPLING, TEMPERATURE, Workspace, disco_step
 from disco_hw.control.settings import Sampler
 from disco_hw.jit import compiled_for
-from disco_hw.tasks.task import single
+from disco_hw.tasks import single
 
 DEGREE = 3
 

@@ -20,7 +20,7 @@ from disco_hw.control.optimiser import Optimiser
 from disco_hw.control.plan import NoValidControl
 from disco_hw.control.settings import Sampler
 from disco_hw.jit import block_function, cast_like, scalar_function, tune_loops
-from disco_hw.tasks.task import single
+from disco_hw.tasks import single
 
 Array = NDArray[np.float64]
 # Any: numbers or arrays of any shape, and the same come back.

@@ -1,35 +1,269 @@
-"""What the robot is to do: one file a kind of task (docs/add-a-task.md says what such a file holds).
+"""What a task is to everything else: the section of robot.toml, its line on the ground, its progress, its cost.
 
-Every module of this package with a `TASK` is a kind, and its name is the kind's. Only the module of the kind that is
-asked for is loaded, so that reading robot.toml stays quick.
+Every module of this package with a `TASK` is a kind, and its name is the kind's (docs/add-a-task.md says what such a
+file holds). Only the module of the kind that is asked for is loaded, so that reading robot.toml stays quick.
+
+A cost is written in plain functions of numbers, which the planner compiles.
+The terms of a task are a named tuple of float32 numbers and arrays with the functions of its cost. `stage` and
+`terminal` are the c and phi of the paper's Algorithm 1:
+
+    stage(self, memory, step, x_old, y_old, x, y, cos_yaw, sin_yaw, forward, found) -> cost, memory
+    terminal(self, memory, x, y, cos_yaw, sin_yaw, found) -> cost
+
+`step` is the index of the step; positions are relative to the task's origin (m), before and after it; `forward` is the
+longitudinal speed over it (m/s); `memory` is a number that a rollout carries along. No compiler makes vectors of
+looking numbers up in a table at a place of every sample's own. So terms with a `table`, rows of four float32, flat,
+have two functions more, and the look-up happens between `follow` and `stage`:
+
+    follow(self, memory, x, y, forward, found) -> memory, kept      where a sample is after the step
+    row_of(self, memory) -> int32                                   the row of the table for a memory, within it
+
+Terms of a task with a line may say it, for the planner to follow it by a steering law (control/kernel/guide.py):
+
+    place_of(self, place, x, y) -> place                            beside a position, from the one before
+    line_at(self, place, ahead_m) -> x, y, head_x, head_y, along, speed
+    way_ahead_m(self, time_s) -> m                                  not compiled
+
+the point so far on, the heading in which a robot stays on the line there, the cosine by which that is off the line,
+and the speed wanted; a place begins as a rollout's memory does. And how far a robot on the line goes in so long: the
+law has one whose plan stands.
+
+`found` holds what `follow` kept and the four numbers of that row; zeros without a table. Constants are made by
+`single`: any other number would pull the arithmetic up to double precision. Compiled, the functions below use estimates
+refined by a Newton step; as written here they are their oracle.
 """
 
 from __future__ import annotations
 
+import math
 import pkgutil
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from importlib import import_module
-from typing import Any
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, NamedTuple, Protocol, Self, TypeVar, cast
 
 import msgspec
+import numpy as np
+from msgspec import Meta
+from numpy.typing import NDArray
 
-from disco_hw.tasks.task import Course, PlannedTask, Prepared, Progress, RobotTask, TaskFault
+Array = NDArray[np.float64]
+Point = tuple[float, float]
+FARTHEST_M = 838.0
+"""How far from the origin a task may go: the frames of a pose hold 838.86 m along x and y (disco_robot.dbc)."""
+SLOWEST_M_S = 0.01
+CENTER_M = (-1000.0, 1000.0)
+"""The slowest speed, and the least and largest coordinate of a centre, that a person may change a task to."""
+Positive = Annotated[float, Meta(gt=0.0)]
 
-__all__ = [
-    "Course",
-    "PlannedTask",
-    "Prepared",
-    "Progress",
-    "ReadField",
-    "RobotTask",
-    "TaskFault",
-    "UnknownKind",
-    "default_task",
-    "kind_of",
-    "kinds",
-    "task_class",
-    "task_from",
-]
+
+class Chassis(Protocol):
+    """What a task asks of the robot: [robot] of robot.toml has it."""
+
+    @property
+    def wheel_radius_m(self) -> float:
+        """Nominal radius of the wheels."""
+
+    @property
+    def axial_distance_m(self) -> float:
+        """Nominal distance between left and right wheels."""
+
+    @property
+    def max_wheel_speed_rad_s(self) -> float:
+        """The fastest that a wheel may turn."""
+
+
+class Editable(NamedTuple):
+    """A field that a person may change while the robot is disarmed: least and largest value, and what it is called."""
+
+    low: float
+    high: float
+    label: str
+
+
+class TaskFault(NamedTuple):
+    """What is wrong with a task that no single field shows: the field to change, the fault, the remedy."""
+
+    field: str
+    fault: str
+    remedy: str
+
+
+class Course(Protocol):
+    """The line that a task follows: pure geometry for panels and pictures."""
+
+    @property
+    def noun(self) -> str:
+        """What it is called."""
+
+    @property
+    def middle_m(self) -> Point:
+        """The middle of the ground that it takes."""
+
+    @property
+    def reach_m(self) -> float:
+        """How far it goes from the middle along x or y."""
+
+    @property
+    def length_m(self) -> float:
+        """Length of the line, once round if it is closed."""
+
+    @property
+    def start(self) -> tuple[float, float, float]:
+        """Where to begin and which way to face: x, y (m), yaw (rad)."""
+
+    def outline_m(self) -> Array:
+        """The line as points (N, 2)."""
+
+    def off_m(self, places_m: Array) -> Array:
+        """Distance (N,) of positions (N, 2), positive to the right of the way: outside of a circle."""
+
+
+class Progress(Protocol):
+    """How far the task has been driven; follows the robot while the task runs."""
+
+    @property
+    def laps(self) -> float:
+        """Laps of the present run, or of the last one while paused; of a line with an end the part behind, 0 to 1."""
+
+    @property
+    def finished(self) -> bool:
+        """Whether there is nothing left to drive."""
+
+    def in_words(self) -> tuple[str, str]:
+        """What is counted, and how much of it, for a person."""
+
+    def add(self, now_ns: int, x_m: float, y_m: float, yaw_rad: float) -> None:
+        """Take in the pose of one tick; the first one after a pause begins anew."""
+
+    def pause(self) -> None:
+        """The task does not run in this tick."""
+
+
+class Prepared(NamedTuple):
+    """What a plan needs of its task.
+
+    `terms`: the compiled cost with its numbers in float32 (see above). `origin_m`: world position that
+    rollouts are relative to, so that single precision is fine anywhere; `begin`: the memory that they start with.
+    `memory`: to hand back at the next plan.
+    """
+
+    terms: tuple[Any, ...]  # Any: every kind has a named tuple of its own, which the compiler looks into.
+    origin_m: tuple[float, float]
+    begin: float = 0.0
+    memory: float = 0.0
+
+
+class PlannedTask(Protocol):
+    """A task as the planner takes it; immutable. The type of its terms decides which compiled cost is used."""
+
+    def prepare(
+        self, time_s: float, x_m: float, y_m: float, yaw_rad: float, memory: float | None, step_s: float, horizon: int,
+        x_icr_m: float,
+    ) -> Prepared:  # fmt: skip
+        """What a plan from here needs.
+
+        `time_s` since the planner's start, the pose in the world, the memory that the last plan handed back (None at
+        the first), the steps that will be planned, and how far ahead of the tracked point the robot turns.
+        """
+
+    def instant_cost(self, time_s: float, x_m: float, y_m: float, forward_m_s: float) -> float:
+        """Cost of being here at this time with this speed, for figures and displays."""
+
+
+class RobotTask(Protocol):
+    """A kind of task: a frozen msgspec struct whose fields are those of [task] in robot.toml."""
+
+    __struct_fields__: ClassVar[tuple[str, ...]]
+    implied_by: ClassVar[str | None]
+    """Field of [task] that says this kind where `kind` is not given; "" for the kind without one, else None."""
+    read_fields: ClassVar[tuple[str, ...]]
+    """Fields that are read from the file that `path` names, and are none of robot.toml's; () without a file."""
+
+    @property
+    def speed_m_s(self) -> float:
+        """The fastest that the task asks for."""
+
+    @property
+    def reference_speed_m_s(self) -> float:
+        """The one speed that is asked for throughout; NaN if there is none."""
+
+    @property
+    def file(self) -> str | None:
+        """The file that [task] names, relative to robot.toml."""
+
+    def with_file(self, file: Path, robot: Chassis, judged: bool) -> Self:
+        """The task with what its file holds, judged for what the robot cannot get past unless it was driven before.
+
+        Raises InputError naming file, line and remedy.
+        """
+
+    def fault(self) -> TaskFault | None:
+        """What is wrong with the fields of [task] taken together."""
+
+    def fastest_m_s(self, robot: Chassis) -> float:
+        """Speed at which a wheel of the nominal robot is at its limit on this task."""
+
+    def too_fast(self, robot: Chassis) -> str | None:
+        """Why the wheels of the nominal robot cannot do the task, and the remedy; None if they can."""
+
+    def editable(self, robot: Chassis) -> Mapping[str, Editable]:
+        """The fields that a person may change; the largest speed is that on the present line."""
+
+    def editing_note(self, robot: Chassis) -> str:
+        """What the page says below those fields, and why there are none where there are none."""
+
+    def in_words(self) -> str:
+        """The task for a person."""
+
+    def course(self) -> Course:
+        """Its line on the ground, the same one for every speed."""
+
+    def progress(self) -> Progress:
+        """The progress of the task as it begins."""
+
+    def planned(self, mode: str) -> PlannedTask:
+        """The task with the cost of the control mode, "default" or "paper"."""
+
+
+Found = tuple[float, float, float, float, float]
+
+
+def norm(x: float, y: float) -> float:
+    """Length of a vector."""
+    return math.hypot(x, y)
+
+
+def norm_and_inverse(x: float, y: float) -> tuple[float, float]:
+    """Length of a vector and its reciprocal; of zero, 1e-15 and 1e15."""
+    length = max(math.hypot(x, y), 1e-15)
+    return length, 1.0 / length
+
+
+def norm_of_three(x: float, y: float, z: float) -> float:
+    """Length of a vector of three."""
+    return math.hypot(x, y, z)
+
+
+def single(value: float) -> float:
+    """A number in single precision, for the terms of a cost and its constants."""
+    return cast(float, np.float32(value))
+
+
+def constant(value: float, like: float) -> float:
+    """A number in the precision of another one."""
+    return value
+
+
+Helper = TypeVar("Helper", bound=Callable[..., object])
+HELPERS: list[Callable[..., object]] = []
+"""Functions that costs call, for the planner to compile."""
+
+
+def helper(function: Helper) -> Helper:
+    """Let the functions of a cost call this one."""
+    HELPERS.append(function)
+    return function
 
 
 class UnknownKind(ValueError):  # noqa: N818

@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 
 from disco_hw.errors import InputError
-from disco_hw.tasks.task import (
+from disco_hw.tasks import (
     CENTER_M,
     FARTHEST_M,
     SLOWEST_M_S,

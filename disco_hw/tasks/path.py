@@ -11,6 +11,7 @@ import numpy as np
 from msgspec import Meta
 
 from disco_hw.errors import InputError
+from disco_hw.tasks import Chassis, Editable, Point, Positive, TaskFault
 from disco_hw.tasks.line import PathTable, check_size, load_waypoints, points_of
 from disco_hw.tasks.line.cost import PathCost
 from disco_hw.tasks.line.course import (
@@ -21,7 +22,6 @@ from disco_hw.tasks.line.course import (
     straight_fastest_m_s,
     straight_too_fast,
 )
-from disco_hw.tasks.task import Chassis, Editable, Point, Positive, TaskFault
 
 
 class PathTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -14,6 +14,7 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from disco_hw.errors import InputError
+from disco_hw.tasks import Array, Chassis, Editable, Found, Point, Prepared, TaskFault, norm, single
 from disco_hw.tasks.line import Waypoints, check_size, load_waypoints, points_of
 from disco_hw.tasks.line.cost import AGAINST_M
 from disco_hw.tasks.line.course import (
@@ -24,7 +25,6 @@ from disco_hw.tasks.line.course import (
     straight_fastest_m_s,
     straight_too_fast,
 )
-from disco_hw.tasks.task import Array, Chassis, Editable, Found, Point, Prepared, TaskFault, norm, single
 
 # A place that moves by less in a step has no direction.
 RESTS_M = 1e-6

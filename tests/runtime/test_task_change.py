@@ -21,9 +21,9 @@ from disco_hw.runtime.task_change import (
     task_in_status,
     task_of,
 )
+from disco_hw.tasks import CENTER_M, SLOWEST_M_S
 from disco_hw.tasks.circle import RADIUS_M, CircleTask
 from disco_hw.tasks.path import PathTask
-from disco_hw.tasks.task import CENTER_M, SLOWEST_M_S
 from disco_hw.tasks.timed_path import TimedPathTask
 from tests.runtime.simulated import simulated_stack
 from tests.runtime.test_replay import write_log

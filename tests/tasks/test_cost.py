@@ -7,8 +7,8 @@ import pytest
 from numba import njit
 from numba.core.errors import TypingError
 
+from disco_hw import tasks as task
 from disco_hw.control.kernel import follow, looks_up, row_of, stage_cost, terminal_cost
-from disco_hw.tasks import task
 from disco_hw.tasks.circle import CircleCost, CircleTask
 from disco_hw.tasks.path import PathTask
 

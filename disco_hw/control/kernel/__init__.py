@@ -4,7 +4,7 @@ That is a system's rollout of a block and a task's cost. Samples are the innermo
 BLOCK: every loop over them becomes vector instructions without a remainder, and a block's commands and state stay in
 the first-level cache.
 
-What the functions of a task are is written in disco_hw/tasks/task.py; they are chosen by the type of the task's terms.
+What the functions of a task are is written in disco_hw/tasks; they are chosen by the type of the task's terms.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from disco_hw import tasks
 from disco_hw.jit import cast_like, quick_length, quick_norm, quick_norm_and_inverse, specialise
-from disco_hw.tasks import task
-from disco_hw.tasks.task import Found
+from disco_hw.tasks import Found
 
 Floats: TypeAlias = NDArray[np.float32]
 # Any: the compiler takes any named tuple with the functions of its kind, which differ in their fields.
 Terms: TypeAlias = Any
-"""The terms of a task's cost (disco_hw/tasks/task.py)."""
+"""The terms of a task's cost (disco_hw/tasks)."""
 # Any: as above; SkidSteer and PendulumTerms are two.
 System: TypeAlias = Any
 """What is rolled out: a named tuple for which `roll_block` has a form."""
@@ -137,7 +137,7 @@ def looks_up(terms: object) -> bool | None:
 
 def _chosen(terms: Any, name: str) -> Callable[..., object] | None:
     """The function of that name of the terms whose numba type this is; None if they have none."""
-    for function in task.HELPERS:
+    for function in tasks.HELPERS:
         if function not in _registered:
             _registered.add(function)
             specialise(function)(lambda *_, _function=function: _function)
@@ -161,21 +161,21 @@ def _looks_up(terms: Any) -> Callable[[Any], bool | None] | None:
     return (lambda terms: True) if "table" in fields else (lambda terms: None)
 
 
-@specialise(task.norm)
+@specialise(tasks.norm)
 def _norm(x: Any, y: Any) -> Callable[..., float]:
     return lambda x, y: quick_norm(x, y)  # noqa: PLW0108 - the compiler wants Python code
 
 
-@specialise(task.norm_and_inverse)
+@specialise(tasks.norm_and_inverse)
 def _norm_and_inverse(x: Any, y: Any) -> Callable[..., tuple[float, float]]:
     return lambda x, y: quick_norm_and_inverse(x, y)  # noqa: PLW0108 - the compiler wants Python code
 
 
-@specialise(task.norm_of_three)
+@specialise(tasks.norm_of_three)
 def _norm_of_three(x: Any, y: Any, z: Any) -> Callable[..., float]:
     return lambda x, y, z: quick_length(x, y, z)  # noqa: PLW0108 - the compiler wants Python code
 
 
-@specialise(task.constant)
+@specialise(tasks.constant)
 def _constant(value: Any, like: Any) -> Callable[..., float]:
     return lambda value, like: cast_like(value, like)  # noqa: PLW0108 - the compiler wants Python code

@@ -71,7 +71,7 @@ from disco_hw.model.step import (
     wheel_step,
     wheels_follow,
 )
-from disco_hw.tasks.task import Found, constant
+from disco_hw.tasks import Found, constant
 
 Absent: TypeAlias = bool | None
 """None, or anything else: whether a part is there, known to the compiler."""

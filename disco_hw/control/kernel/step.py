@@ -36,7 +36,7 @@ from disco_hw.jit import (
     scalar_function,
     tune_loops,
 )
-from disco_hw.tasks.task import single
+from disco_hw.tasks import single
 
 ESS, TEMPERATURE, LEAST, MEAN, NOMINAL, VALID = range(6)
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from disco_hw.errors import InputError
 from disco_hw.files import WAY_POINTS, read_lines
-from disco_hw.tasks.task import FARTHEST_M, Array, Point
+from disco_hw.tasks import FARTHEST_M, Array, Point
 
 SPACING_M = 0.02
 # Entries closer than this part of the spacing lie on either side of a turn straight back.

@@ -11,9 +11,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from disco_hw.tasks import Found, Prepared, constant, helper, norm_and_inverse, norm_of_three, single
 from disco_hw.tasks.line import PathTable
 from disco_hw.tasks.line.course import stable_yaw
-from disco_hw.tasks.task import Found, Prepared, constant, helper, norm_and_inverse, norm_of_three, single
 
 SLOW_DOWN_S = 1.0
 FARTHEST_STEP_M = 0.5

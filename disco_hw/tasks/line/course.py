@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from disco_hw.errors import InputError
+from disco_hw.tasks import SLOWEST_M_S, Array, Chassis, Editable, Point
 from disco_hw.tasks.line import SHARP_RAD, PathTable, Waypoints
-from disco_hw.tasks.task import SLOWEST_M_S, Array, Chassis, Editable, Point
 
 if TYPE_CHECKING:
     from scipy.spatial import KDTree

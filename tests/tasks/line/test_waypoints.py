@@ -10,9 +10,9 @@ import firmware_protocol
 from disco_hw.config import Robot
 from disco_hw.errors import InputError
 from disco_hw.estimation.correction import MAX_POSITION_M
+from disco_hw.tasks import FARTHEST_M
 from disco_hw.tasks.line import load_waypoints
 from disco_hw.tasks.path import PathTask
-from disco_hw.tasks.task import FARTHEST_M
 from disco_hw.tasks.timed_path import TimedPathTask
 
 # Its wheels do 0.5 m/s.
