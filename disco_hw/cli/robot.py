@@ -145,7 +145,7 @@ def init(
     """Write a robot.toml from what is heard on the robot's link, and from what you say; nothing moves."""
     import sys
 
-    from disco_hw.first_use.init import InitOptions, run_init
+    from disco_hw.first_use import InitOptions, run_init
 
     measures = {
         "wheel_radius_m": wheel_radius_m,

@@ -1,1 +1,345 @@
-"""The first hour with a robot: what its robot.toml must say, and whether it does what it is told."""
+"""The first hour with a robot: what its robot.toml must say, and whether it does what it is told.
+
+Here the first step, `disco-hw init`: a robot.toml from what is heard on the link, or answers there, and what its owner
+says.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import serial
+
+from disco_hw.config import link_fields, load_robot_config, names_address
+from disco_hw.errors import InputError
+from disco_hw.files import parse_toml
+from disco_hw.reports import refuse_file
+from drivers.motor import DEFAULT, UnknownDriverError, find_driver, motor_drivers
+from drivers.pose import DEFAULT as POSE_SOURCE
+from drivers.transport import SerialMedium, TransportSettingsError, make_transport
+from drivers.transport.reconnecting import TransportCounters
+from drivers.transport.serial import ExchangeConnection, open_port
+from drivers.types import Frame, LinkState, MotorDriver
+
+_SECTION = re.compile(r"^\s*\[([^\[\]]+)\]\s*(#.*)?$")
+
+
+def in_toml(value: Any) -> str:
+    """A number, text, truth or list of them as TOML writes it."""
+    match value:
+        case bool():
+            return "true" if value else "false"
+        case str():
+            return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
+        case list() | tuple():
+            return f"[{', '.join(map(in_toml, value))}]"
+        case _:
+            return repr(value)
+
+
+def with_fields(text: str, fields: Mapping[tuple[str, str], Any]) -> str:
+    """The text with these fields, by section and name, set; what is not there yet is added to its section.
+
+    A field whose old value goes over several lines is not understood: look at the result before it is written.
+    """
+    lines = text.splitlines()
+    for (section, name), value in fields.items():
+        _set(lines, section, name, in_toml(value))
+    return "\n".join(lines) + "\n"
+
+
+def _set(lines: list[str], section: str, name: str, value: str) -> None:
+    begin = next((k for k, line in enumerate(lines) if _name_of(line) == section), None)
+    if begin is None:
+        lines += [*([""] if lines and lines[-1] else []), f"[{section}]", f"{name} = {value}"]
+        return
+    end = next((k for k in range(begin + 1, len(lines)) if _name_of(lines[k]) is not None), len(lines))
+    field = re.compile(rf"^(\s*{re.escape(name)}\s*=\s*)([^#]*?)(\s*#.*)?$")
+    for k in range(begin + 1, end):
+        found = field.match(lines[k])
+        if found is not None:
+            lines[k] = f"{found[1]}{value}{found[3] or ''}"
+            return
+    lines.insert(begin + 1, f"{name} = {value}")
+
+
+def _name_of(line: str) -> str | None:
+    found = _SECTION.match(line)
+    return None if found is None else found[1].strip()
+
+
+_POLL_S = 0.01
+_OPEN_S = 2.0
+_EXCHANGE_READ_S = 0.002
+_SILENT_S = 0.3
+_MOST_FRAMES = 20_000
+
+
+@dataclass(frozen=True, slots=True)
+class Question:
+    """A field of [robot]: what is asked of a person, the comment that is written beside it, and what is usual."""
+
+    name: str
+    asked: str
+    comment: str
+    usual: float
+
+
+QUESTIONS = (
+    Question("wheel_radius_m", "radius of a wheel, m", "nominal; `infer` learns what it really is", 0.06),
+    Question("axial_distance_m", "from left to right wheels, m", "nominal; a skid-steer seems wider", 0.31),
+    Question("ticks_per_rev", "encoder ticks a turn of a wheel", "what the controller counts in one turn", 2048.0),
+    Question("max_wheel_speed_rad_s", "fastest speed of a wheel, rad/s", "no command is ever faster than this", 8.0),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class InitOptions:
+    """What `disco-hw init` was asked; None of a field is asked for, or the usual where nobody is to be asked.
+
+    `may_ask`: whether a serial line may be asked for controllers that only answer; None asks the person.
+    """
+
+    out: Path
+    link: str | None = None
+    driver: str | None = None
+    name: str | None = None
+    measures: tuple[tuple[str, float], ...] = ()
+    listen_s: float = 3.0
+    pose_source: str | None = None
+    overwrite: bool = False
+    may_ask: bool | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Heard:
+    """What was recognised on a link: the driver, the fields in [link] that its frames show, a serial line's speed."""
+
+    driver: str
+    fields: dict[str, Any]
+    baud: int | None = None
+
+
+def recognised(frames: Sequence[Frame]) -> tuple[Heard, ...]:
+    """The controllers whose frames these are, by the drivers' own judgement."""
+    found = ((driver.name, driver.recognise(frames)) for driver in motor_drivers().values())
+    return tuple(Heard(name, fields) for name, fields in found if fields is not None)
+
+
+def listen(link: dict[str, Any], seconds: float) -> list[Frame]:
+    """The frames that come over a link by themselves; nothing is sent. Raises InputError for what cannot be opened."""
+    try:
+        transport = make_transport(**link)
+    except TransportSettingsError as error:
+        raise InputError(f"--link: {error}") from None
+    frames: list[Frame] = []
+    transport.open()
+    try:
+        deadline_s = time.monotonic() + _OPEN_S
+        while transport.state is not LinkState.UP:
+            if time.monotonic() > deadline_s:
+                raise InputError(f"--link: {transport.name} cannot be opened: {transport.last_error or 'no answer'}")
+            time.sleep(_POLL_S)
+        end_s = time.monotonic() + seconds
+        while time.monotonic() < end_s and len(frames) < _MOST_FRAMES:
+            frames += [received.frame for received in transport.receive()]
+            time.sleep(_POLL_S)
+    finally:
+        transport.close()
+    return frames
+
+
+def ask_on_line(port: str, driver: MotorDriver) -> Heard | None:
+    """Put a driver's questions, which move and write nothing, on a serial line; what the replies show.
+
+    Nothing is asked of a line on which anything speaks by itself. Raises InputError for a port that cannot be used.
+    """
+    assert driver.questions is not None
+    assert driver.exchange is not None
+    exchange = driver.exchange(driver_settings(driver, parse_toml(driver.example.encode(), driver.name)))
+    for baud in driver.questions.bauds:
+        medium = SerialMedium(port, baud)
+        try:
+            with open_port(medium, timeout_s=_EXCHANGE_READ_S, write_timeout_s=_OPEN_S, exclusive=True) as line:
+                time.sleep(_SILENT_S)
+                if line.in_waiting:
+                    return None
+                connection = ExchangeConnection(line, TransportCounters(), exchange)
+                replies = [connection.exchange(frame) for frame in driver.questions.frames]
+                # A computer that was busy just then has missed a reply: who was silent is asked once more.
+                silent = [frame for frame, reply in zip(driver.questions.frames, replies, strict=True) if reply is None]
+                replies += [connection.exchange(frame) for frame in silent]
+        except (serial.SerialException, OSError) as error:
+            raise InputError(f"--link: {medium.explain(error)}") from None
+        fields = driver.recognise([frame for frame in replies if frame is not None])
+        if fields is not None:
+            return Heard(driver.name, fields, baud)
+    return None
+
+
+def run_init(options: InitOptions, ask: Callable[[str], str] | None, say: Callable[[str], None]) -> Path:
+    """Listen, ask, and write a robot.toml that `check` reads; the file written.
+
+    `ask` puts a question to a person, None where there is none. Raises InputError for wrong options, for a file that is
+    there already or cannot be written, and where it is not known which controller the robot has.
+    """
+    refuse_file(options.out)
+    if os.path.lexists(options.out) and not options.overwrite:
+        raise InputError(f"{options.out}: is there already; name another file, or give --overwrite")
+    link = link_fields(options.link)
+    heard = _controller(options, link, ask, say)
+    text = robot_text(options, link, heard, _measures(options, ask))
+    trial = options.out.with_name(f".{options.out.name}.new")
+    try:
+        options.out.parent.mkdir(parents=True, exist_ok=True)
+        trial.write_text(text, encoding="utf-8")
+        load_robot_config(trial)
+        trial.replace(options.out)
+    except InputError as error:
+        trial.unlink()
+        raise InputError(str(error).replace(str(trial), str(options.out))) from None
+    except OSError as error:
+        raise InputError(f"{options.out}: cannot be written ({error.strerror}); give another path") from None
+    return options.out
+
+
+def _controller(
+    options: InitOptions, link: dict[str, Any], ask: Callable[[str], str] | None, say: Callable[[str], None]
+) -> Heard:
+    """The driver that was named, or the one whose frames are heard, or that answers on a line where nobody speaks."""
+    found: tuple[Heard, ...] = ()
+    if options.driver is not None:
+        try:
+            find_driver(options.driver)
+        except UnknownDriverError as error:
+            raise InputError(f"--driver: {error}") from None
+    if names_address(link) and options.listen_s > 0.0:
+        say(f"listening for {options.listen_s:g} s; nothing is sent")
+        frames = listen(link, options.listen_s)
+        found = recognised(frames)
+        said = ", ".join(f"{one.driver} {one.fields or ''}".strip() for one in found)
+        say(f"{len(frames)} frames heard: {said or 'no controller that is known by its own frames'}")
+        if not frames and "port" in link:
+            found = _answering(options, str(link["port"]), ask, say)
+    if options.driver is not None:
+        return next((one for one in found if one.driver == options.driver), Heard(options.driver, {}))
+    if len(found) == 1:
+        return found[0]
+    why = "several controllers were heard" if found else "no controller was heard"
+    known = ", ".join(motor_drivers())
+    raise InputError(
+        f"init: {why}; name it: --driver with one of {known}"
+        + ("; or give --ask, which asks on the line for one that only answers" if "port" in link else "")
+    )
+
+
+def _answering(
+    options: InitOptions, port: str, ask: Callable[[str], str] | None, say: Callable[[str], None]
+) -> tuple[Heard, ...]:
+    """The controllers that answer on a silent line: of the driver named, or of all once somebody has allowed it."""
+    drivers = [driver for driver in motor_drivers().values() if driver.questions is not None]
+    if options.driver is not None:
+        drivers = [driver for driver in drivers if driver.name == options.driver]
+    if not drivers:
+        return ()
+    names = ", ".join(driver.name for driver in drivers)
+    allowed = options.may_ask if options.driver is None else options.may_ask is not False
+    if allowed is None and ask is not None:
+        say("a controller that is set to take single bytes as speeds could move: lift the wheels, or cut motor power")
+        allowed = ask(f"nothing is sent here unasked; ask for {names} (its version, no more)? [y/n] ").strip() == "y"
+    if not allowed:
+        return ()
+    found = [heard for driver in drivers if (heard := ask_on_line(port, driver)) is not None]
+    for heard in found:
+        say(f"answers at {heard.baud} baud: {heard.driver} {heard.fields}")
+    if not found:
+        say(f"no answer from {names}; is it switched on, and set to answer (packet serial)?")
+    return tuple(found)
+
+
+def _measures(options: InitOptions, ask: Callable[[str], str] | None) -> dict[str, float]:
+    given = dict(options.measures)
+    return {one.name: given[one.name] if one.name in given else _asked(one, ask) for one in QUESTIONS}
+
+
+def _asked(question: Question, ask: Callable[[str], str] | None) -> float:
+    while ask is not None:
+        answer = ask(f"{question.asked} [{question.usual:g}]: ").strip()
+        if not answer:
+            break
+        try:
+            return float(answer)
+        except ValueError:
+            continue
+    return question.usual
+
+
+def robot_text(options: InitOptions, link: dict[str, Any], heard: Heard, measures: dict[str, float]) -> str:
+    """The text of a robot.toml, with a comment where somebody must look."""
+    driver = find_driver(heard.driver)
+    lines = [
+        "# Written by `disco-hw init`; docs/robot.md says what every field means and what else there is.",
+        "# Next: `disco-hw check` on this file (nothing moves), then `disco-hw commission` (wheels off the ground).",
+        "[robot]",
+        f"name = {in_toml(options.name or 'robot')}",
+    ]
+    for question in QUESTIONS:
+        value = measures[question.name]
+        written = in_toml(int(value)) if question.name == "ticks_per_rev" and value == int(value) else in_toml(value)
+        lines.append(f"{question.name} = {written:<12}  # {question.comment}")
+    kind = link.get("kind", driver.kinds[0])
+    lines += ["", "[link]", f"driver = {in_toml(heard.driver)}", f"kind = {in_toml(kind)}"]
+    lines += [f"{name} = {in_toml(link[name])}" for name in ("interface", "channel", "port") if name in link]
+    if kind == "can":
+        lines.append("bitrate = 500000               # as the bus is set")
+    elif driver.questions is not None:
+        baud = heard.baud or driver.questions.bauds[0]
+        lines.append(f"baud = {baud:<20}   # {'it answered at this' if heard.baud else 'as the controller is set'}")
+    fields = {**parse_toml(driver.example.encode(), driver.name), **heard.fields}
+    if "wheel_radius_m" in fields:
+        fields |= {"wheel_radius_m": measures["wheel_radius_m"], "track_m": measures["axial_distance_m"]}
+    if fields:
+        lines.append("# LOOK: what is not marked as heard is an example; write what your controller is set to.")
+    for name, value in fields.items():
+        note = "  # heard: see that left stands before right" if name in heard.fields else ""
+        lines.append(f"{name} = {in_toml(value)}{note}")
+    source = options.pose_source or (POSE_SOURCE if driver.name == DEFAULT else "udp")
+    lines += [
+        "",
+        "[pose]",
+        f"source = {in_toml(source)}               # where measured poses come from (docs/robot.md)",
+        "# Where they are this good, say so: the robot then learns wheels, axle and turning centre while it drives.",
+        "# rate_hz = 25.0",
+        "# position_std_m = 0.005",
+        "# yaw_std_rad = 0.009",
+        "",
+        "[task]",
+        'kind = "circle"',
+        "radius_m = 1.0",
+        f"speed_m_s = {_task_speed(driver.slowest_rad_s(driver_settings(driver, fields)), measures):.3g}",
+        "",
+        "[log]",
+        'directory = "logs"',
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def driver_settings(driver: Any, fields: dict[str, Any]) -> Any:
+    """The driver's settings of these fields; raises InputError where they are none."""
+    try:
+        return msgspec.convert(fields, driver.settings)
+    except msgspec.ValidationError as error:
+        raise InputError(f"init: link: {error}; write the file by hand (docs/robot.md)") from None
+
+
+def _task_speed(slowest_rad_s: float, measures: dict[str, float]) -> float:
+    """A quarter of what the wheels can do, at most 0.2 m/s, and not below what the controller holds."""
+    radius_m, top = measures["wheel_radius_m"], measures["max_wheel_speed_rad_s"]
+    return min(0.8 * top * radius_m, max(1.5 * slowest_rad_s * radius_m, min(0.2, 0.25 * top * radius_m)))

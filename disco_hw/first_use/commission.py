@@ -20,7 +20,7 @@ from disco_hw.daemon.run import in_text, serve
 from disco_hw.drive.keyboard import Keyboard, KeyHold
 from disco_hw.errors import InputError, WorkError
 from disco_hw.files import ROBOT_TOML, read_bytes
-from disco_hw.first_use.init import in_toml, with_fields
+from disco_hw.first_use import in_toml, with_fields
 from disco_hw.first_use.judgement import Findings, judge_floor, judge_sides, judge_turns
 from disco_hw.first_use.procedure import CommissionPilot, Procedure, Steps, floor, sides, turns
 from disco_hw.reports import refuse_directory

@@ -18,7 +18,7 @@ from disco_hw.adaptation.guard import choose_adaptation
 from disco_hw.config import load_robot_config
 from disco_hw.errors import InputError
 from disco_hw.experiments import disco_hw_process, write_robot_file
-from disco_hw.first_use.init import InitOptions, recognised, run_init
+from disco_hw.first_use import InitOptions, recognised, run_init
 from disco_hw.runtime.robot_setup import load_setup
 from drivers.motor import motor_drivers
 from drivers.motor.roboclaw_protocol import FIRST_ADDRESS, GETTERS, LAST_ADDRESS

@@ -5,7 +5,7 @@ import tomllib
 from hypothesis import given
 from hypothesis import strategies as st
 
-from disco_hw.first_use.init import in_toml, with_fields
+from disco_hw.first_use import in_toml, with_fields
 
 TEXT = """# a robot
 [robot]
