@@ -36,7 +36,7 @@ from disco_hw.effects import Channel
 from disco_hw.effects.registry import DELAY
 from disco_hw.jit import compiled_for
 from disco_hw.model import Belief, Model
-from disco_hw.model.disturbance import NO_DISTURBANCE, NO_SLIDE
+from disco_hw.model.coefficients import NO_DISTURBANCE, NO_SLIDE
 from disco_hw.model.model import BASE_PARAMETERS, X_ICR, coefficient_tables
 from disco_hw.model.step import FreeRun, integration_series
 from disco_hw.tasks import PlannedTask

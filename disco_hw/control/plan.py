@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.model import Belief, Model
-from disco_hw.model.disturbance import NO_DISTURBANCE, Disturbance
+from disco_hw.model.coefficients import NO_DISTURBANCE, Disturbance
 
 Array = NDArray[np.float64]
 

@@ -97,7 +97,7 @@ class DiscoSettings:
     a step. Then the plan changes as fast at any rate, and more plans a second average out noise instead of adding it.
     guide_below: where a steering law's commands cost less than this part of the plan, they take its place (tasks with
     a line; kernel/guide.py); for a horizon also where the plan stands, whatever they cost; 0 without a guide.
-    offset_free: whether rollouts move beside the model as the robot was found to (model/disturbance.py), and lose of a
+    offset_free: whether rollouts move beside the model as the robot was found to (model/coefficients.py), and lose of a
     command what its wheels were found to lose (wheel_loss.py).
     iterations_at_start: optimisation steps for the first plan after a reset.
     min_ess: effective sample size below which a step counts as collapsed: it is tried again, and reported.

@@ -26,7 +26,7 @@ from disco_hw.estimation.odometry import (
     WheelTracker,
 )
 from disco_hw.estimation.pose_sources import PoseSources
-from disco_hw.model.disturbance import Disturbance
+from disco_hw.model.coefficients import Disturbance
 from drivers.types import PoseSample, WheelSample
 
 GAP_INTERVALS = 3.0

@@ -31,7 +31,7 @@ from disco_hw.estimation.odometry import (
     PoseBelief,
     wrap,
 )
-from disco_hw.model.disturbance import NO_DISTURBANCE, Disturbance
+from disco_hw.model.coefficients import NO_DISTURBANCE, Disturbance
 from drivers.types import PoseSample
 
 

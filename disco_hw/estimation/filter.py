@@ -25,7 +25,7 @@ from disco_hw.estimation.odometry import (
     rebased,
     wrap,
 )
-from disco_hw.model.disturbance import NO_DISTURBANCE, Disturbance
+from disco_hw.model.coefficients import NO_DISTURBANCE, Disturbance
 
 # Without newer samples the wheels are taken to keep their speeds for so long, then to stand.
 MAX_EXTRAPOLATION_S = 0.2

@@ -255,7 +255,7 @@ class Controller(msgspec.Struct, frozen=True, gc=False):
 
 
 class UnexplainedMotion(msgspec.Struct, frozen=True, gc=False):
-    """How the robot moves beside its model, as found by this tick: the fields of `model.disturbance.Disturbance`."""
+    """How the robot moves beside its model, as found by this tick: the fields of `model.coefficients.Disturbance`."""
 
     t_ns: int
     forward: float

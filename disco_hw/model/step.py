@@ -21,8 +21,7 @@ from numpy.typing import NDArray
 from disco_hw.effects import Effect, Stage, asks_for
 from disco_hw.effects.registry import DELAY, REGISTRY, in_stages
 from disco_hw.jit import cast_like, compiled_for, kernel_function, scalar_function
-from disco_hw.model.coefficients import Base, Coefficients, Integration, base_point, effect_point
-from disco_hw.model.disturbance import MOVES_RAD_S, NO_SLIDE
+from disco_hw.model.coefficients import MOVES_RAD_S, NO_SLIDE, Base, Coefficients, Integration, base_point, effect_point
 from disco_hw.model.model import Model, coefficient_tables
 from disco_hw.model.terms import add_to_commands, add_to_velocity, terms_need_change
 

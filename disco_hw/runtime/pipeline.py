@@ -23,7 +23,7 @@ from disco_hw.estimation import PoseEstimate, PoseFusion
 from disco_hw.estimation.correction import DisturbanceEstimator, PoseUpdate
 from disco_hw.estimation.odometry import OdometryParameters
 from disco_hw.model import Belief
-from disco_hw.model.disturbance import NO_DISTURBANCE, Disturbance
+from disco_hw.model.coefficients import NO_DISTURBANCE, Disturbance
 from disco_hw.tasks import PlannedTask
 from drivers.types import PoseSample, Readings
 

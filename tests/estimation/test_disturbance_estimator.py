@@ -10,7 +10,7 @@ from disco_hw.config import Estimation
 from disco_hw.estimation import PoseFusion
 from disco_hw.estimation.correction import LARGEST_LEFT, DisturbanceEstimator
 from disco_hw.estimation.odometry import OdometryParameters
-from disco_hw.model.disturbance import NO_DISTURBANCE, Disturbance
+from disco_hw.model.coefficients import NO_DISTURBANCE, Disturbance
 from drivers.types import PoseSample, WheelSample
 
 PARAMETERS = OdometryParameters(0.06, 0.4, 0.2)

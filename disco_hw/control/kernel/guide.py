@@ -14,7 +14,7 @@ from typing import NamedTuple
 from disco_hw.control.kernel import Floats, Terms, line_at, place_of
 from disco_hw.control.kernel.sequences import Limits, clip
 from disco_hw.jit import kernel_function, scalar_function
-from disco_hw.model.disturbance import MOVES_RAD_S
+from disco_hw.model.coefficients import MOVES_RAD_S
 
 # The law's gains (1/m): of the heading, and of the distance, which the robot comes back from at this angle a metre.
 YAW_PER_M, ANGLE_PER_M = 9.0, 3.3

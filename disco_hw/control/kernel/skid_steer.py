@@ -51,6 +51,7 @@ from disco_hw.control.kernel import (
 )
 from disco_hw.jit import bits_of_float, block_function, cast_like, float_from_bits, scalar_function, tune_loops
 from disco_hw.model.coefficients import (
+    MOVES_RAD_S,
     Base,
     Coefficients,
     Integration,
@@ -59,7 +60,6 @@ from disco_hw.model.coefficients import (
     lane_base,
     lane_effects,
 )
-from disco_hw.model.disturbance import MOVES_RAD_S
 from disco_hw.model.step import (
     axle_of,
     body_step,
@@ -91,7 +91,7 @@ class SkidSteer(NamedTuple):
 
     `start` (11,): x, y relative to the task's origin (m), cos and sin of yaw, left and right wheel speed (rad/s), time
     (s), the task's memory; how far the ground carries the robot in a step along x and y (m), in proportion to the size
-    of equivalent points, and how far it slides to the left for each metre forward (`model/disturbance.py`).
+    of equivalent points, and how far it slides to the left for each metre forward (`model/coefficients.py`).
     `base`, `effects`: coefficient tables of L points; `each` is None, or anything else if the
     tables hold points for every sample, (L, K'). `ahead`, `scaled` (L, 2) int or None: pairs of points that
     share a point's rollout, as `parameter_points.equivalent_points` finds them. `skip_mean`: None, or anything else if

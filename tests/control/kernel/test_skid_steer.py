@@ -17,7 +17,7 @@ from disco_hw.control.plan import command_history
 from disco_hw.effects.registry import MOTION_EFFECTS
 from disco_hw.model import EffectSetting, Gaussian, Model
 from disco_hw.model import plain as physics
-from disco_hw.model.disturbance import Disturbance
+from disco_hw.model.coefficients import Disturbance
 from disco_hw.tasks.circle import CircleCost
 from disco_hw.tasks.line import PathTable, Waypoints
 from disco_hw.tasks.line.cost import FARTHEST_STEP_M, PathCost
