@@ -21,9 +21,9 @@ from disco_hw.daemon.run import in_text, serve
 from disco_hw.drive import PAD_WORDS, GamepadSource, ManualSource, PageSource
 from disco_hw.drive.coverage import Coverage
 from disco_hw.drive.hand_pilot import HandPilot
-from disco_hw.drive.keyboard import HELP, Keyboard, KeyHold
 from disco_hw.drive.script import Script, ScriptSource, Unattended, in_table, room_needed
 from disco_hw.drive.scripts import make_script
+from disco_hw.drive.terminal import HELP, Keyboard, KeyHold
 from disco_hw.errors import InputError, LogError
 from disco_hw.log.reader import open_log
 from disco_hw.runtime.robot_setup import load_setup
@@ -234,7 +234,7 @@ def _display(socket: Path, shown: bool) -> Iterator[Any]:
 
     # Started before the daemon takes on real time, and in a session of its own: Ctrl-C is for the daemon alone.
     process = subprocess.Popen(
-        [sys.executable, "-m", "disco_hw.drive.display", str(socket)], start_new_session=True, stdin=subprocess.DEVNULL
+        [sys.executable, "-m", "disco_hw.drive.terminal", str(socket)], start_new_session=True, stdin=subprocess.DEVNULL
     )
     try:
         if sys.stdout.isatty():

@@ -17,7 +17,7 @@ from disco_hw.config import Robot, load_robot_config
 from disco_hw.daemon.loop import MonotonicClock
 from disco_hw.daemon.process import STANDARD_ERROR, AsyncPrinter
 from disco_hw.daemon.run import in_text, serve
-from disco_hw.drive.keyboard import Keyboard, KeyHold
+from disco_hw.drive.terminal import Keyboard, KeyHold
 from disco_hw.errors import InputError, WorkError
 from disco_hw.files import ROBOT_TOML, read_bytes
 from disco_hw.first_use import in_toml, with_fields

@@ -18,7 +18,7 @@ from disco_hw.config import Drive, PoseInput, Robot
 from disco_hw.config.robot import Ros2
 from disco_hw.drive import PageSource, RobotView, steering_from
 from disco_hw.drive.hand_pilot import Deadman
-from disco_hw.drive.keyboard import wheel_speeds
+from disco_hw.drive.terminal import wheel_speeds
 from disco_hw.estimation.odometry import OdometryParameters
 from disco_hw.runtime import State
 from disco_hw.runtime.robot_setup import load_setup

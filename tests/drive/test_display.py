@@ -10,7 +10,7 @@ from rich.console import Console
 
 from disco_hw.daemon.control_socket import ControlServer
 from disco_hw.drive.coverage import Coverage
-from disco_hw.drive.display import line, show, table
+from disco_hw.drive.terminal import line, show, table
 
 COVERAGE = Coverage(8.0)
 for _tick in range(251):

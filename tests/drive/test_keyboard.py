@@ -11,7 +11,7 @@ import threading
 import pytest
 
 from disco_hw.drive import RobotView
-from disco_hw.drive.keyboard import Keyboard, KeyHold
+from disco_hw.drive.terminal import Keyboard, KeyHold
 from disco_hw.errors import InputError
 from disco_hw.runtime import State
 from tests.daemon.simulated_clock import SimulatedClock

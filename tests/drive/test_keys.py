@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from disco_hw.drive.keyboard import DIRECTIONS, KeyEvent, KeyHold, parse, wheel_speeds
+from disco_hw.drive.terminal import DIRECTIONS, KeyEvent, KeyHold, parse, wheel_speeds
 
 MS = 1_000_000
 UP, LEFT = b"\x1b[A", b"\x1b[D"

@@ -3,8 +3,8 @@
 import pytest
 
 from disco_hw.drive import INPUT_LIMIT_NS, GamepadSource, ManualInput, ManualSource, PageSource, RobotView
-from disco_hw.drive.keyboard import Keyboard
 from disco_hw.drive.script import ScriptSource
+from disco_hw.drive.terminal import Keyboard
 from disco_hw.runtime import State
 
 

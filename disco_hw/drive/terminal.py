@@ -1,7 +1,9 @@
-"""The keyboard of the terminal as a source: raw mode, a thread that reads, and the terminal put back at the end.
+"""Driving at a terminal: its keyboard as a source, and what is shown while driving.
 
 The loop itself must not touch the terminal: whoever writes to it at low priority holds its lock, and was seen to hold
-up the loop for 18 and 43 ms.
+up the loop for 18 and 43 ms. So a thread reads the keys, in raw mode, and puts the terminal back at the end; and a
+process of its own writes: `python -m disco_hw.drive.terminal SOCKET` asks the daemon for its status and shows a table,
+or a line a second where that is no terminal.
 
 A terminal reports a key when it goes down and while it repeats, never when it comes up. So a key is held while its
 repeats come, and each repeat carries deadman and direction at once: terminals repeat the last key pressed only.
@@ -13,15 +15,24 @@ import contextlib
 import enum
 import os
 import select
+import sys
 import termios
 import threading
+import time
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
+from disco_hw.daemon import send_request
 from disco_hw.daemon.loop import Clock
 from disco_hw.drive import INPUT_LIMIT_NS, ManualInput, RobotView, wheel_speeds
-from disco_hw.errors import InputError
+from disco_hw.errors import InputError, WorkError
+
+if TYPE_CHECKING:
+    # The process that drives does without it.
+    from rich.console import Console, Group
 
 # A held key begins to repeat after 0.15 to 0.7 s, depending on the terminal.
 _FIRST_REPEAT_NS = 1_000_000_000
@@ -264,3 +275,77 @@ class Keyboard:
             self._arrived.append((self._clock.now_ns(), data))
             if not data:
                 return
+
+
+_TABLE_PERIOD_S = 0.4
+_LINE_PERIOD_S = 1.0
+_START_TIMEOUT_S = 60.0
+
+
+def line(status: Mapping[str, Any]) -> str:
+    """The state of the drive in one line."""
+    drive = status["drive"]
+    return f"{status['state']}: {drive['words']} | {drive['coverage_words']}"
+
+
+def table(status: Mapping[str, Any]) -> Group:
+    """The state of the drive as a picture for the terminal."""
+    from rich.console import Group  # noqa: PLC0415
+    from rich.table import Table  # noqa: PLC0415
+    from rich.text import Text  # noqa: PLC0415
+
+    drive = status["drive"]
+    items = Table("", "excited", "of", "for", box=None, pad_edge=False)
+    for item in drive["coverage"]["items"]:
+        mark = Text("done", "green") if item["covered"] else Text("missing", "yellow" if item["found"] else "red")
+        unit = " s" if item["unit"] == "s" else ""
+        amounts = f"{item['found']:.0f}{unit}", f"{item['wanted']:.0f}{unit}"
+        items.add_row(mark, Text(f"{item['name']}  {amounts[0]}"), amounts[1], Text(item["purpose"]))
+    wheels, command = status["wheels"], status["command"]
+    measured = "none" if wheels is None else f"{wheels[0]:+.1f} {wheels[1]:+.1f}"
+    return Group(
+        Text(f"{status['state']}: {status['detail']}", "bold green" if drive["driving"] else "bold"),
+        Text(f"command {command[0]:+.1f} {command[1]:+.1f}  wheels {measured} rad/s"),
+        Text(drive["words"]),
+        Text(drive["task"]),
+        items,
+        Text(drive["coverage_words"]),
+        *(Text(message, "dim") for message in drive["messages"]),
+    )
+
+
+def show(socket: Path, console: Console) -> None:
+    """Show the drive until its daemon has gone."""
+    from rich.live import Live  # noqa: PLC0415
+
+    _wait_for(socket)
+    if not console.is_terminal:
+        while (status := _status(socket)) is not None:
+            console.out(line(status), highlight=False)
+            time.sleep(_LINE_PERIOD_S)
+        return
+    with Live(console=console, auto_refresh=False) as live:
+        while (status := _status(socket)) is not None:
+            live.update(table(status), refresh=True)
+            time.sleep(_TABLE_PERIOD_S)
+
+
+def _wait_for(socket: Path) -> None:
+    deadline_s = time.monotonic() + _START_TIMEOUT_S
+    while time.monotonic() < deadline_s and _status(socket) is None:
+        time.sleep(_TABLE_PERIOD_S)
+
+
+def _status(socket: Path) -> Mapping[str, Any] | None:
+    """The daemon's status; None without a daemon that is driven by hand."""
+    try:
+        status = send_request(socket, {"do": "status"})
+    except WorkError:
+        return None
+    return status if status.get("ok") and "drive" in status else None
+
+
+if __name__ == "__main__":
+    from rich.console import Console
+
+    show(Path(sys.argv[1]), Console())
