@@ -27,7 +27,7 @@ from disco_hw.errors import InputError
 from disco_hw.log import records
 from disco_hw.log.recorder import RecorderStats
 from disco_hw.runtime.core import DaemonCore
-from disco_hw.runtime.task_change import asked_of, limits
+from disco_hw.runtime.robot_setup import asked_of, limits
 from drivers.private_files import why_not_private
 from drivers.types import Driver
 

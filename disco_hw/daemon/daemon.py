@@ -15,8 +15,8 @@ from disco_hw.daemon.process import Notifier, StopSignals, Waiting
 from disco_hw.log import records
 from disco_hw.runtime import Ask, State, advice, headline, records_of_tick
 from disco_hw.runtime.core import CoreTick, DaemonCore, Pilot
+from disco_hw.runtime.robot_setup import TaskRefused, changed_task
 from disco_hw.runtime.supervisor import Reply, UserRequest
-from disco_hw.runtime.task_change import TaskRefused, changed_task
 from drivers.types import Request
 
 _SECOND_NS = 1_000_000_000

@@ -19,8 +19,8 @@ from disco_hw.log.recorder import Recorder
 from disco_hw.runtime import records_of_tick
 from disco_hw.runtime.pipeline import FollowTask, Motion, Off, Pipeline, Source, Stand, Tick, untimed
 from disco_hw.runtime.plausibility import Directions, Headway, Plausibility
+from disco_hw.runtime.robot_setup import record_of
 from disco_hw.runtime.supervisor import Inputs, Output, Reply, Supervisor, UserRequest
-from disco_hw.runtime.task_change import record_of
 from disco_hw.tasks import RobotTask
 from drivers.pose.robot import RobotPoses
 from drivers.types import (

@@ -19,8 +19,7 @@ from disco_hw.log.records import BeliefChange, Command, Estimate, Innovation, Pl
 from disco_hw.runtime import records_of_tick
 from disco_hw.runtime.assembly import make_pipeline, make_planner, put_in_force
 from disco_hw.runtime.pipeline import FollowTask, Manual, Motion, Off, Pipeline, Silent, Source, Stand
-from disco_hw.runtime.robot_setup import setup_of_log
-from disco_hw.runtime.task_change import task_of
+from disco_hw.runtime.robot_setup import setup_of_log, task_of
 from drivers.types import PoseSample, Readings, WheelSample
 
 _TOPICS = (

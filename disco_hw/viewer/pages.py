@@ -17,7 +17,7 @@ import viser
 
 from disco_hw.daemon.page_feed import FeedSubscriber, feed_path
 from disco_hw.log.records import BeliefChange, Record
-from disco_hw.runtime.task_change import record_of, task_in_status
+from disco_hw.runtime.robot_setup import record_of, task_in_status
 from disco_hw.viewer.curves import Plots
 from disco_hw.viewer.operator_controls import Desk
 from disco_hw.viewer.panel import coverage_text, events_text, live_details, live_summary, replay_details, replay_text

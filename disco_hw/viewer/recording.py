@@ -21,8 +21,7 @@ from disco_hw.log.records import TOPICS, BeliefChange, FrameIn, FrameOut, Plan, 
 from disco_hw.model import Model
 from disco_hw.model.plain import RobotState, delayed, step, theta_of
 from disco_hw.runtime.pipeline import Source
-from disco_hw.runtime.robot_setup import Setup, geometry, load_setup, setup_of_log
-from disco_hw.runtime.task_change import task_of
+from disco_hw.runtime.robot_setup import Setup, geometry, load_setup, setup_of_log, task_of
 from disco_hw.tasks import RobotTask
 from disco_hw.viewer.timeline import COVARIANCE, ESTIMATE, Timeline
 from drivers.types import MotorSample, RobotLinkHealth, RobotStatus

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import viser
 
-from disco_hw.runtime.task_change import with_values
+from disco_hw.runtime.robot_setup import with_values
 from disco_hw.tasks import RobotTask
 from disco_hw.viewer.scene import DARK, LAYER_COLOURS, LAYERS, LIGHT, Point, Scene, first_camera, segments
 

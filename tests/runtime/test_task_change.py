@@ -11,8 +11,7 @@ from disco_hw.config import Robot
 from disco_hw.log import records
 from disco_hw.runtime import State
 from disco_hw.runtime.replay import replay
-from disco_hw.runtime.supervisor import UserRequest
-from disco_hw.runtime.task_change import (
+from disco_hw.runtime.robot_setup import (
     TaskRefused,
     asked_of,
     changed_task,
@@ -21,6 +20,7 @@ from disco_hw.runtime.task_change import (
     task_in_status,
     task_of,
 )
+from disco_hw.runtime.supervisor import UserRequest
 from disco_hw.tasks import CENTER_M, SLOWEST_M_S
 from disco_hw.tasks.circle import RADIUS_M, CircleTask
 from disco_hw.tasks.path import PathTask

@@ -16,8 +16,7 @@ from disco_hw.errors import InputError
 from disco_hw.log import records
 from disco_hw.log.encoding import JsonDecoder, encode_json
 from disco_hw.runtime import State
-from disco_hw.runtime.robot_setup import load_setup
-from disco_hw.runtime.task_change import asked_of, changed_task, record_of, task_in_status, task_of
+from disco_hw.runtime.robot_setup import asked_of, changed_task, load_setup, record_of, task_in_status, task_of
 from disco_hw.tasks import RobotTask, kinds
 from disco_hw.viewer import curves
 from disco_hw.viewer.timeline import Timeline

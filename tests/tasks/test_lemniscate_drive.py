@@ -13,9 +13,8 @@ from disco_hw.log import records
 from disco_hw.log.recorder import RecorderStats
 from disco_hw.runtime import State
 from disco_hw.runtime.replay import replay
-from disco_hw.runtime.robot_setup import load_setup
+from disco_hw.runtime.robot_setup import TaskRefused, changed_task, load_setup
 from disco_hw.runtime.supervisor import UserRequest
-from disco_hw.runtime.task_change import TaskRefused, changed_task
 from disco_hw.viewer import curves
 from disco_hw.viewer.recording import Recording
 from sim.body_dynamics import BodyPose

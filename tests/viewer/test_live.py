@@ -11,7 +11,7 @@ from disco_hw.adaptation.adapter_link import NAMES
 from disco_hw.daemon.page_feed import ViewerFeed, feed_path
 from disco_hw.drive.coverage import Coverage
 from disco_hw.log import records
-from disco_hw.runtime.task_change import asked_of
+from disco_hw.runtime.robot_setup import asked_of
 from disco_hw.tasks.circle import CircleTask
 from disco_hw.viewer.operator_controls import Desk
 from disco_hw.viewer.pages import KEEP_S, LivePage, _Due

@@ -8,7 +8,7 @@ import pytest
 from viser.infra import WebsockServer
 
 from disco_hw.log import records
-from disco_hw.runtime.task_change import record_of
+from disco_hw.runtime.robot_setup import record_of
 from disco_hw.tasks.circle import CircleTask
 from disco_hw.viewer import scene as scene_module
 from disco_hw.viewer.recording import snapshot_at, stage_of_robot
