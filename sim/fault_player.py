@@ -6,12 +6,12 @@ import subprocess
 import sys
 from collections.abc import Callable
 from types import TracebackType
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 from drivers.types import Frame
 from firmware_protocol.firmware_core import ResetCause
 from sim.fault_schedule import FaultSchedule, ScheduledFault, Site
-from sim.injected_faults import FaultTimeline, FrameFaults, RobotFaults
+from sim.injected_faults import FrameFaults, RobotFaults
 from sim.robot_link import LinkFaultError, RobotLink
 from sim.virtual_robot import Robot, truth_row
 
@@ -30,6 +30,49 @@ _BABBLE_DATA = bytes(8)
 BUS_ONLY = ("bus_off", "babble")
 # A child of a real-time process would be one itself.
 _BUSY = "import os; os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))\nwhile True: pass"
+
+
+class FaultStep(NamedTuple):
+    """What changes at one instant."""
+
+    begun: tuple[ScheduledFault, ...]
+    ended: tuple[ScheduledFault, ...]
+
+
+_NOTHING = FaultStep((), ())
+
+
+class FaultTimeline:
+    """Walks a schedule; `active` holds the faults in force, `done` says that nothing more will happen."""
+
+    def __init__(self, schedule: FaultSchedule) -> None:
+        self.active: tuple[ScheduledFault, ...] = ()
+        self._coming = list(reversed(schedule.faults))
+        self._next_ns = self._find_next_ns()
+
+    @property
+    def done(self) -> bool:
+        """Whether all faults are over."""
+        return self._next_ns is None
+
+    def step(self, now_ns: int) -> FaultStep:
+        """Move on to `now_ns` of the schedule's time; a fault that lasts no time begins and ends in one step."""
+        if self._next_ns is None or now_ns < self._next_ns:
+            return _NOTHING
+        begun: list[ScheduledFault] = []
+        while self._coming and self._coming[-1].begin_ns <= now_ns:
+            begun.append(self._coming.pop())
+        held = (*self.active, *begun)
+        ended = tuple(fault for fault in held if fault.end_ns <= now_ns)
+        self.active = tuple(fault for fault in held if fault.end_ns > now_ns)
+        self._next_ns = self._find_next_ns()
+        return FaultStep(tuple(begun), ended)
+
+    def _find_next_ns(self) -> int | None:
+        times = [fault.end_ns for fault in self.active]
+        if self._coming:
+            times.append(self._coming[-1].begin_ns)
+        return min(times) if times else None
 
 
 class FaultPlayer:

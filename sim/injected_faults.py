@@ -1,6 +1,6 @@
-"""A fault schedule as it runs: the faults in force, and their effect on frames, sensors, motors and battery.
+"""The effect of the faults in force on frames, sensors, motors and battery.
 
-Pure: time enters through `FaultTimeline.step`, `FrameFaults.fate` and `RobotFaults`. `sim.fault_player` applies them.
+Pure: time enters through `FrameFaults.fate` and `RobotFaults`. `sim.fault_player` walks the schedule.
 """
 
 from __future__ import annotations
@@ -10,14 +10,13 @@ import random
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 from msgspec.structs import replace
 
 from firmware_protocol.firmware_core import FirmwareInputs
 from sim.bus import UNHARMED, FrameFate
 from sim.can_protocol import CanFrame
-from sim.fault_schedule import FaultSchedule, ScheduledFault, Site
+from sim.fault_schedule import ScheduledFault, Site
 from sim.robot_link import ROBOT_NODE
 from sim.sensors import PoseMeasurement
 
@@ -25,49 +24,6 @@ LONGEST_FRAME_BITS = 111
 STALL_CURRENT_A = 18.0
 _SIDES = ("left", "right")
 _OF_ONE_WHEEL = ("motor_stall", "encoder_stuck", "encoder_wrap", "encoder_reversed")
-
-
-class FaultStep(NamedTuple):
-    """What changes at one instant."""
-
-    begun: tuple[ScheduledFault, ...]
-    ended: tuple[ScheduledFault, ...]
-
-
-_NOTHING = FaultStep((), ())
-
-
-class FaultTimeline:
-    """Walks a schedule; `active` holds the faults in force, `done` says that nothing more will happen."""
-
-    def __init__(self, schedule: FaultSchedule) -> None:
-        self.active: tuple[ScheduledFault, ...] = ()
-        self._coming = list(reversed(schedule.faults))
-        self._next_ns = self._find_next_ns()
-
-    @property
-    def done(self) -> bool:
-        """Whether all faults are over."""
-        return self._next_ns is None
-
-    def step(self, now_ns: int) -> FaultStep:
-        """Move on to `now_ns` of the schedule's time; a fault that lasts no time begins and ends in one step."""
-        if self._next_ns is None or now_ns < self._next_ns:
-            return _NOTHING
-        begun: list[ScheduledFault] = []
-        while self._coming and self._coming[-1].begin_ns <= now_ns:
-            begun.append(self._coming.pop())
-        held = (*self.active, *begun)
-        ended = tuple(fault for fault in held if fault.end_ns <= now_ns)
-        self.active = tuple(fault for fault in held if fault.end_ns > now_ns)
-        self._next_ns = self._find_next_ns()
-        return FaultStep(tuple(begun), ended)
-
-    def _find_next_ns(self) -> int | None:
-        times = [fault.end_ns for fault in self.active]
-        if self._coming:
-            times.append(self._coming[-1].begin_ns)
-        return min(times) if times else None
 
 
 class FrameFaults:

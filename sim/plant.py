@@ -10,6 +10,7 @@ from __future__ import annotations
 import bisect
 import math
 from collections import deque
+from operator import attrgetter
 
 import msgspec
 import numpy as np
@@ -25,6 +26,7 @@ from sim.wheel_dynamics import WheelMotors
 CELLS = 1024
 Array = npt.NDArray[np.float64]
 ELECTRICS_STEP_US = 10_000
+_available_us = attrgetter("available_us")
 
 
 class TrueState(msgspec.Struct, frozen=True, gc=False):
@@ -179,10 +181,6 @@ class Plant:
         if until_us % ELECTRICS_STEP_US == 0:
             self._electrics.advance(until_us * 1e-6, ELECTRICS_STEP_US * 1e-6, wheels.torques_nm, wheels.speeds_rad_s)
         self._now_us = until_us
-
-
-def _available_us(measurement: PoseMeasurement) -> int:
-    return measurement.available_us
 
 
 class Disturbances:

@@ -210,13 +210,7 @@ def view(
 
 
 def _foxglove(
-    live: bool,
-    robot: Path | None,
-    log: Path | None,
-    others: tuple[object, ...],
-    host: str,
-    port: int,
-    as_json: bool,
+    live: bool, robot: Path | None, log: Path | None, others: tuple[object, ...], host: str, port: int, as_json: bool
 ) -> None:
     if not live or robot is None or log is not None or any(other is not None for other in others):
         raise InputError("view --foxglove: give --live and --robot ROBOT.toml, and of the rest --port alone")

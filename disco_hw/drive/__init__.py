@@ -82,8 +82,12 @@ class GamepadSource:
 
     A gamepad sends changes only: what the kernel holds is fresh as long as the device is there. But a pad whose radio
     fails silently would be held for ever, so input counts as new for `silence_s` after the last event only (0: for
-    ever, for pads on a cable). A device that is gone is looked for once a second, by `open_pad(now_ns)`.
+    ever, for pads on a cable). A device that is gone is looked for once a second, by `open_pad(now_ns)`. So it never
+    ends, and whenever the person ends the drive, it is complete.
     """
+
+    ended: str | None = None
+    completed, task = True, ""
 
     def __init__(
         self, pad: Gamepad, open_pad: Callable[[int], Gamepad], top_rad_s: float, turn_share: float, silence_s: float
@@ -97,26 +101,11 @@ class GamepadSource:
         self._name = pad.name
 
     @property
-    def ended(self) -> str | None:
-        """It never ends: a gamepad can come back."""
-        return None
-
-    @property
-    def completed(self) -> bool:
-        """Whenever the person ends the drive, it is complete."""
-        return True
-
-    @property
     def words(self) -> str:
         """What to hold, or to plug in."""
         if self._pad is None:
             return f"{self._name} is gone; plug it in again"
         return f"{self._name}: hold the deadman's button; Ctrl-C ends"
-
-    @property
-    def task(self) -> str:
-        """A person decides."""
-        return ""
 
     def poll(self, now_ns: int, _robot: RobotView) -> ManualInput | None:
         """The sticks now; None while the device is gone."""
@@ -187,8 +176,12 @@ class PageSource:
     """Drives as the page says that holds the pad; of several pages one at a time.
 
     A page must have been heard with its pad open, not longer ago than a hold may be silent, before its hold counts.
-    While one holds, the others are refused.
+    While one holds, the others are refused. It never ends, as a page can come back, and whenever the person ends the
+    drive, it is complete.
     """
+
+    ended: str | None = None
+    completed, task = True, ""
 
     def __init__(
         self, top_rad_s: float, turn_share: float, words: str = PAD_WORDS, limit_ns: int = INPUT_LIMIT_NS
@@ -202,24 +195,9 @@ class PageSource:
         self._newest: ManualInput | None = None
 
     @property
-    def ended(self) -> str | None:
-        """It never ends: a page can come back."""
-        return None
-
-    @property
-    def completed(self) -> bool:
-        """Whenever the person ends the drive, it is complete."""
-        return True
-
-    @property
     def words(self) -> str:
         """What to hold, and where."""
         return self._words
-
-    @property
-    def task(self) -> str:
-        """A person decides."""
-        return ""
 
     def steer(self, now_ns: int, page: int, wanted: Steering) -> str | None:
         """Take in what one page wants; returns why it does not count, in words."""

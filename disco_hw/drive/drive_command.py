@@ -31,6 +31,8 @@ from drivers.gamepad import Gamepad, GamepadError, GamepadMapping, open_gamepad
 
 _VIRTUAL_INTERFACES = ("unixcan", "virtual")
 _PSEUDO_TERMINALS = "/dev/pts/"
+_DISPLAY_TIMEOUT_S = 2.0
+_STANDARD_INPUT = 0
 
 
 def leads_to_virtual_robot(link: Link) -> bool:
@@ -40,10 +42,6 @@ def leads_to_virtual_robot(link: Link) -> bool:
     if link.interface == "socketcan":
         return link.channel.startswith("vcan")
     return link.interface in _VIRTUAL_INTERFACES
-
-
-_DISPLAY_TIMEOUT_S = 2.0
-_STANDARD_INPUT = 0
 
 
 @dataclass(frozen=True, slots=True)

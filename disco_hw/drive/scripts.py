@@ -200,47 +200,40 @@ def excite(top_rad_s: float) -> Script:
     """
 
     pieces = Pieces(top_rad_s)
-    play, hold = pieces.play, pieces.hold
     found: list[Manoeuvre] = [rest(2.0, "noise of the poses at standstill")]
-    radius = "wheel radius, and what grows with speed: gain, slip, pose latency"
-    for name, forward, duration_s in (
-        ("slow straight", 0.4, 4.0),
-        ("slow reverse", -0.4, 4.0),
-        ("fast straight", 0.95, 3.0),
-        ("fast reverse", -0.95, 3.0),
-    ):
-        found += [hold(name, radius, duration_s, forward, 0.0), rest()]
-    axle = "axial distance; two rates separate it from slip in turns, both ways separate latency from a heading bias"
-    for name, turn, duration_s in (
-        ("slow turn left", 0.3, 5.0),
-        ("slow turn right", -0.3, 5.0),
-        ("fast turn left", 0.75, 4.0),
-        ("fast turn right", -0.75, 4.0),
-    ):
-        found += [hold(name, axle, duration_s, 0.0, turn), rest()]
-    icr = "x_icr and side slip, which need speed and turning at once; latency changes sign with the side"
-    for name, forward, turn, duration_s in (
-        ("slow curve left", 0.3, 0.14, 6.0),
-        ("slow curve right", 0.3, -0.14, 6.0),
-        ("fast curve left", 0.65, 0.3, 5.0),
-        ("fast curve right", 0.65, -0.3, 5.0),
-        ("reverse curve left", -0.45, 0.2, 4.0),
-        ("reverse curve right", -0.45, -0.2, 4.0),
-    ):
-        found += [hold(name, icr, duration_s, forward, turn), rest()]
+    found += pieces.each(
+        "wheel radius, and what grows with speed: gain, slip, pose latency",
+        ("slow straight", 4.0, 0.4, 0.0),
+        ("slow reverse", 4.0, -0.4, 0.0),
+        ("fast straight", 3.0, 0.95, 0.0),
+        ("fast reverse", 3.0, -0.95, 0.0),
+    )
+    found += pieces.each(
+        "axial distance; two rates separate it from slip in turns, both ways separate latency from a heading bias",
+        ("slow turn left", 5.0, 0.0, 0.3),
+        ("slow turn right", 5.0, 0.0, -0.3),
+        ("fast turn left", 4.0, 0.0, 0.75),
+        ("fast turn right", 4.0, 0.0, -0.75),
+    )
+    found += pieces.each(
+        "x_icr and side slip, which need speed and turning at once; latency changes sign with the side",
+        ("slow curve left", 6.0, 0.3, 0.14),
+        ("slow curve right", 6.0, 0.3, -0.14),
+        ("fast curve left", 5.0, 0.65, 0.3),
+        ("fast curve right", 5.0, 0.65, -0.3),
+        ("reverse curve left", 4.0, -0.45, 0.2),
+        ("reverse curve right", 4.0, -0.45, -0.2),
+    )
     lag = "lag and delay from command to wheel, slip under acceleration"
     for number in range(8):
         forward = 0.7 if number % 2 == 0 else -0.7
-        found += [hold(f"start and stop {number + 1}", lag, 1.0, forward, 0.0), rest(0.8)]
+        found += [pieces.hold(f"start and stop {number + 1}", lag, 1.0, forward, 0.0), rest(0.8)]
     steering = "separates delay from lag, build-up of turning under load"
     found += [
-        play("steering at 0.5 Hz", steering, 12.0, lambda t_s: (0.4, 0.35 * math.cos(math.pi * t_s))),
+        pieces.play("steering at 0.5 Hz", steering, 12.0, lambda t_s: (0.4, 0.35 * math.cos(math.pi * t_s))),
         rest(),
-    ]
-    zero = "separates deadband from stiction, slowly through zero"
-    found += [
-        play("ramp through zero", zero, 10.0, lambda t_s: (0.25 * _triangle(t_s / 10.0), 0.0)),
-        play("turning ramp through zero", zero, 10.0, lambda t_s: (0.0, 0.25 * _triangle(t_s / 10.0))),
+        pieces.play("ramp through zero", _RAMP, 10.0, lambda t_s: (0.25 * _triangle(t_s / 10.0), 0.0)),
+        pieces.play("turning ramp through zero", _RAMP, 10.0, lambda t_s: (0.0, 0.25 * _triangle(t_s / 10.0))),
         rest(2.0, "noise of the poses at standstill, elsewhere"),
     ]
     return Script("excite", tuple(found))

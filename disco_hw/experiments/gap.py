@@ -37,7 +37,7 @@ from disco_hw.runtime.robot_setup import Setup, load_setup
 from disco_hw.tasks.circle import CircleTask, circle_task
 from sim.body_dynamics import BodyPose
 from sim.effects import HiddenEffectError, parse_hidden_effects
-from sim.in_process import RobotInProcess
+from sim.virtual_robot import RobotInProcess
 
 RUNS = ("given", "geometry refitted", "amended")
 _COLOURS = {"given": REFERENCE, "geometry refitted": BASELINE, "amended": MAIN}

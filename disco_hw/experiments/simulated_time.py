@@ -42,9 +42,8 @@ from disco_hw.runtime.supervisor import UserRequest
 from firmware_protocol.firmware_core import FirmwareConfig
 from sim.body_dynamics import BodyPose
 from sim.effects import HiddenEffectError
-from sim.in_process import RobotInProcess
 from sim.plant_parameters import PlantParameters
-from sim.virtual_robot import STEP_US
+from sim.virtual_robot import STEP_US, RobotInProcess
 
 _READY_S, _ARMED_S = 1.5, 0.5
 _CLOSING_S = 60.0

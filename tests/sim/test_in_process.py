@@ -4,9 +4,10 @@ from drivers.types import Frame, LinkState, OutgoingFrame
 from firmware_protocol.firmware_core import FirmwareConfig
 from sim.body_dynamics import BodyPose
 from sim.effects import HiddenEffectError
-from sim.in_process import REOPEN_NS, RobotInProcess, SimulatedCan
+from sim.in_process import REOPEN_NS, SimulatedCan
 from sim.plant_parameters import PlantParameters
 from sim.robot_link import LinkFaultError
+from sim.virtual_robot import RobotInProcess
 
 FIRMWARE = FirmwareConfig(ticks_per_rev=2048, max_wheel_speed_rad_s=8.0)
 

@@ -6,8 +6,9 @@ import pytest
 
 from firmware_protocol.firmware_core import FirmwareInputs
 from sim.can_protocol import CanFrame
+from sim.fault_player import FaultTimeline
 from sim.fault_schedule import parse_schedule
-from sim.injected_faults import FaultTimeline, FrameFaults, RobotFaults
+from sim.injected_faults import FrameFaults, RobotFaults
 from sim.sensors import PoseMeasurement
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -13,7 +12,7 @@ from numpy.typing import NDArray
 
 from disco_hw.tasks import Found, Prepared, constant, helper, norm_and_inverse, norm_of_three, single
 from disco_hw.tasks.line import PathTable
-from disco_hw.tasks.line.course import stable_yaw
+from disco_hw.tasks.line.course import turned_sines
 
 SLOW_DOWN_S = 1.0
 FARTHEST_STEP_M = 0.5
@@ -96,7 +95,7 @@ class PathTerms(NamedTuple):
 
     `table` (4 M,): for each piece between two entries, from one to the next, where it begins, x and y (m), and how far
     it goes in x and y (m). `turned` (2 M,): the sine by which a robot on the path is turned from each piece at its
-    begin, and by how much more at its end (`inverse.stable_yaw`). Places count in entries from where the robot is:
+    begin, and by how much more at its end (`course.turned_sines`). Places count in entries from where the robot is:
     `first` and `last` are the table's ends, `end` is where the robot stops, or infinite. `per_m`: entries a metre;
     `speed_m_s`; `speed_per_entry`: progress speed of one entry in a step (m/s); `slow_per_entry`: wanted speed for each
     entry left; `speed_weight`: of missing speed; `terminal_steps`: weight of the last distance; `turn_m`: what the last
@@ -218,27 +217,9 @@ def _nearby(path: PathTable, block: int, reach: int, x_icr_m: float) -> _Nearby:
     # An open path's last entry is one of its own: it is not the first.
     origin = table[block * NEAR % count if path.closed else block * NEAR, :2]
     pieces = np.hstack([here - origin, there - here]).astype(np.float32)
-    turned = _turned(path, x_icr_m)[at].astype(np.float32)
+    turned = turned_sines(path, x_icr_m)[at].astype(np.float32)
     x_m, y_m = origin.tolist()
     return _Nearby(pieces.reshape(-1), turned.reshape(-1), first, (x_m, y_m))
-
-
-@lru_cache(maxsize=8)
-def _turned(path: PathTable, x_icr_m: float) -> NDArray[np.float64]:
-    """Sine by which the robot is turned from every piece at its begin, and how much more at its end: (M, 2)."""
-    along = np.unwrap(np.arctan2(path.table[:-1, 3], path.table[:-1, 2]))
-    count = along.size
-    turned = np.empty((count, 2))
-    # A robot stops where the path turns sharply: what comes after says nothing of the heading before.
-    bounds = (
-        [*path.sharp_turns, path.sharp_turns[0] + count] if path.closed and path.ends else [0, *path.sharp_turns, count]
-    )
-    for begin, end in pairwise(bounds):
-        at = np.arange(begin, end) % count
-        yaw = stable_yaw(np.unwrap(along[at]), path.spacing_m, x_icr_m, path.closed and not path.ends)
-        turned[at] = np.column_stack([yaw[:-1], yaw[1:]]) - np.unwrap(along[at])[:, None]
-    sines = np.sin(np.clip(turned, -0.5 * math.pi, 0.5 * math.pi))
-    return np.column_stack([sines[:, 0], sines[:, 1] - sines[:, 0]])
 
 
 @lru_cache(maxsize=8)

@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -273,3 +274,21 @@ def stable_yaw(along_rad: Array, spacing_m: float, x_icr_m: float, closed: bool)
             yaw[at] = directions[at] + 2.0 * math.atan2(left * math.sin(half), math.cos(half))
         yaw[-1] = yaw[0] + turn if closed else yaw[-1]
     return np.array(yaw)
+
+
+@lru_cache(maxsize=8)
+def turned_sines(path: PathTable, x_icr_m: float) -> Array:
+    """Sine by which the robot is turned from every piece at its begin, and how much more at its end: (M, 2)."""
+    along = np.unwrap(np.arctan2(path.table[:-1, 3], path.table[:-1, 2]))
+    count = along.size
+    turned = np.empty((count, 2))
+    # A robot stops where the path turns sharply: what comes after says nothing of the heading before.
+    bounds = (
+        [*path.sharp_turns, path.sharp_turns[0] + count] if path.closed and path.ends else [0, *path.sharp_turns, count]
+    )
+    for begin, end in pairwise(bounds):
+        at = np.arange(begin, end) % count
+        yaw = stable_yaw(np.unwrap(along[at]), path.spacing_m, x_icr_m, path.closed and not path.ends)
+        turned[at] = np.column_stack([yaw[:-1], yaw[1:]]) - np.unwrap(along[at])[:, None]
+    sines = np.sin(np.clip(turned, -0.5 * math.pi, 0.5 * math.pi))
+    return np.column_stack([sines[:, 0], sines[:, 1] - sines[:, 0]])
