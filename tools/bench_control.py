@@ -23,7 +23,7 @@ from disco_hw.control.black_box import BlackBoxDisco
 from disco_hw.control.kernel.step import disco_step
 from disco_hw.control.parameter_points import sigma_points, unscented_points
 from disco_hw.control.pendulum import PendulumPlanner, PendulumPoints
-from disco_hw.control.settings import ROTATION
+from disco_hw.control.plan import ROTATION
 from disco_hw.experiments.circle import CircleOptions, CircleResult, Command, drive, planner_command, plants
 from disco_hw.experiments.pendulum import POSTERIOR, circle_cost, skid_steer_transition
 from disco_hw.jit import block_function, float32, tune_loops

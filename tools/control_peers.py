@@ -17,8 +17,7 @@ from torch import Tensor
 from disco_hw.control import pendulum
 from disco_hw.control.parameter_points import unscented_points
 from disco_hw.control.pendulum import PendulumPoints
-from disco_hw.control.plan import PlannerState
-from disco_hw.control.settings import DiscoSettings
+from disco_hw.control.plan import DiscoSettings, PlannerState
 from disco_hw.experiments.circle import Command
 from disco_hw.model import Model
 from disco_hw.tasks.circle import CircleCost

@@ -19,7 +19,7 @@ from disco_hw.adaptation.guard import believed_geometry
 from disco_hw.config import Estimation
 from disco_hw.control import CommandLimits, Disco, DiscoSettings
 from disco_hw.control.baselines import Follower, Law, NominalRobot, Reference
-from disco_hw.control.settings import ROTATION
+from disco_hw.control.plan import ROTATION
 from disco_hw.estimation import PoseFusion
 from disco_hw.estimation.correction import DisturbanceEstimator
 from disco_hw.estimation.odometry import OdometryParameters

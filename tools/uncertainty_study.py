@@ -21,7 +21,7 @@ from torch import Tensor
 
 from disco_hw.control.black_box import BlackBoxDisco
 from disco_hw.control.parameter_points import sigma_points
-from disco_hw.control.settings import Sampler
+from disco_hw.control.plan import Sampler
 
 Array = NDArray[np.float64]
 

@@ -2,15 +2,17 @@
 
 from disco_hw.control.disco import Disco
 from disco_hw.control.plan import (
+    CommandLimits,
     Diagnostics,
+    DiscoSettings,
     NoValidControl,
     PlannerState,
     PlanOutcome,
     Rollouts,
+    Sampler,
     SentCommand,
     WheelPlan,
 )
-from disco_hw.control.settings import CommandLimits, DiscoSettings, Sampler
 
 __all__ = [
     "CommandLimits",

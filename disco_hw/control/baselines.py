@@ -21,8 +21,16 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_continuous_are
 
 from disco_hw.control.kernel.guide import SteeredChassis
-from disco_hw.control.plan import NoValidControl, PlannerState, PlanOutcome, Rollouts, WheelPlan, held_plan, no_rollouts
-from disco_hw.control.settings import CommandLimits
+from disco_hw.control.plan import (
+    CommandLimits,
+    NoValidControl,
+    PlannerState,
+    PlanOutcome,
+    Rollouts,
+    WheelPlan,
+    held_plan,
+    no_rollouts,
+)
 from disco_hw.model import Belief
 from disco_hw.tasks import PlannedTask
 from disco_hw.tasks.line.course import SMALLEST_X_ICR_M, stable_yaw

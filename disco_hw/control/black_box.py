@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from disco_hw.control.optimiser import spline_basis
-from disco_hw.control.plan import NoValidControl
-from disco_hw.control.settings import Sampler
+from disco_hw.control.plan import NoValidControl, Sampler
 
 Transition = Callable[[Tensor, Tensor, Tensor], Tensor]
 StageCost = Callable[[Tensor, int], Tensor]

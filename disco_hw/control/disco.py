@@ -22,7 +22,9 @@ from disco_hw.control.parameter_points import (
 )
 from disco_hw.control.plan import (
     Array,
+    CommandLimits,
     Diagnostics,
+    DiscoSettings,
     NoValidControl,
     PlannerState,
     PlanOutcome,
@@ -30,7 +32,6 @@ from disco_hw.control.plan import (
     WheelPlan,
     command_history,
 )
-from disco_hw.control.settings import CommandLimits, DiscoSettings
 from disco_hw.control.wheel_loss import WheelLoss
 from disco_hw.effects import Channel
 from disco_hw.effects.registry import DELAY

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from disco_hw.control.kernel import BLOCK, STATE_ROWS, Floats, System, aligned_zeros, block_count
 from disco_hw.control.kernel.sequences import Basis, Limits
 from disco_hw.control.kernel.step import ESS, INVALID, SAMPLING, TEMPERATURE, Workspace, disco_step
-from disco_hw.control.settings import Sampler
+from disco_hw.control.plan import Sampler
 from disco_hw.jit import compiled_for
 from disco_hw.tasks import single
 

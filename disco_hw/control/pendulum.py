@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from disco_hw.control.kernel import BLOCK, Floats, U, rolls_out
 from disco_hw.control.kernel.sequences import cos_sin_half_turns
 from disco_hw.control.optimiser import Optimiser
-from disco_hw.control.plan import NoValidControl
-from disco_hw.control.settings import Sampler
+from disco_hw.control.plan import NoValidControl, Sampler
 from disco_hw.jit import block_function, cast_like, scalar_function, tune_loops
 from disco_hw.tasks import single
 

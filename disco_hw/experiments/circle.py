@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from disco_hw import config
 from disco_hw.control.disco import Disco
-from disco_hw.control.plan import PlannerState, SentCommand
-from disco_hw.control.settings import ROTATION, CommandLimits, DiscoSettings
+from disco_hw.control.plan import ROTATION, CommandLimits, DiscoSettings, PlannerState, SentCommand
 from disco_hw.errors import InputError
 from disco_hw.model import Gaussian, Model, Uniform
 from disco_hw.model.model import BASE_PARAMETERS

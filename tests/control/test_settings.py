@@ -6,7 +6,7 @@ import pytest
 
 from disco_hw.config import Control, Robot
 from disco_hw.control import CommandLimits, DiscoSettings, Sampler
-from disco_hw.control.settings import ROTATION
+from disco_hw.control.plan import ROTATION
 
 
 def test_paper_mode_is_the_appendix_table():

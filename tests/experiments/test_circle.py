@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from disco_hw.control.settings import ROTATION
+from disco_hw.control.plan import ROTATION
 from disco_hw.errors import InputError
 from disco_hw.experiments.circle import CURVES, CircleOptions, CircleResult, Run, drive, plants, run_circle
 from disco_hw.model import Gaussian, load_model

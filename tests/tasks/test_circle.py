@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from disco_hw.control.disco import Disco
-from disco_hw.control.plan import PlannerState
-from disco_hw.control.settings import CommandLimits, DiscoSettings
+from disco_hw.control.plan import CommandLimits, DiscoSettings, PlannerState
 from disco_hw.experiments.circle import KinematicPlant
 from disco_hw.model import load_model
 from disco_hw.model import plain as physics
