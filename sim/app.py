@@ -18,6 +18,7 @@ import serial
 
 from drivers.types import ReceivedFrame
 from firmware_protocol.firmware_core import FirmwareConfig
+from sim import RobotLink
 from sim.board import VERSION, BoardRobot, PlantLine
 from sim.body_dynamics import BodyPose
 from sim.effects import HiddenEffectError, hidden_effects
@@ -28,7 +29,6 @@ from sim.plant import Plant
 from sim.plant_parameters import PlantParameters
 from sim.process import CommandSocket, PoseSender, SocketPathError, StopSignal, TextRecord
 from sim.python_can_link import PythonCanLink
-from sim.robot_link import RobotLink
 from sim.serial_line import SerialLine, SerialPathError
 from sim.virtual_robot import STEP_US, Controller, ControllerClock, Robot, TruthRecorder, VendorRobot, VirtualRobot
 

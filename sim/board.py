@@ -1,7 +1,7 @@
 """A virtual robot around somebody's board: the plant here, the firmware there, and between them the plant's line.
 
 The other end is firmware_protocol/ports/plant_line.c. `BoardRobot` satisfies `sim.virtual_robot.Robot`, `PlantLine`
-`sim.robot_link.RobotLink`; the frames between them are those of this line, and the board's own link is not seen here.
+`sim.RobotLink`; the frames between them are those of this line, and the board's own link is not seen here.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from drivers.types import Frame, ReceivedFrame
 from firmware_protocol.codec import Codec
 from firmware_protocol.firmware_core import FirmwareInputs, FirmwareOutputs, ResetCause
 from firmware_protocol.serial_framing import FrameDecoder, encode_frame
+from sim import LinkFaultError
 from sim.bus import BusFault
 from sim.injected_faults import RobotFaults
 from sim.plant import Plant, TrueState
-from sim.robot_link import LinkFaultError
 from sim.sensors import PoseMeasurement
 
 WHEELS, POWER, POSITION, HEADING = 0x7E0, 0x7E1, 0x7E2, 0x7E3

@@ -10,9 +10,9 @@ from typing import NamedTuple, Protocol
 
 from drivers.types import Frame
 from firmware_protocol.firmware_core import ResetCause
+from sim import LinkFaultError, RobotLink
 from sim.fault_schedule import FaultSchedule, ScheduledFault, Site
 from sim.injected_faults import FrameFaults, RobotFaults
-from sim.robot_link import LinkFaultError, RobotLink
 from sim.virtual_robot import Robot, truth_row
 
 COMMANDS = """\

@@ -17,6 +17,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from drivers.types import Frame, ReceivedFrame
+from sim import LinkFaultError, RobotNode
 from sim.bus import BusFault, CanBus, DeliveredFrame
 from sim.can_protocol import (
     ECHO_OWN_FRAMES,
@@ -30,7 +31,6 @@ from sim.can_protocol import (
 )
 from sim.process import SocketPathError, StopSignal, bind_private
 from sim.python_can_link import Guest, JoinError, joined
-from sim.robot_link import LinkFaultError, RobotNode
 
 CLIENT_TRANSMIT_QUEUE = 32
 READER_QUEUE = 1024
@@ -286,7 +286,7 @@ class Hub:
 
 
 class HubLink:
-    """A hub at `path` with the robot as a node; satisfies `sim.robot_link.RobotLink`.
+    """A hub at `path` with the robot as a node; satisfies `sim.RobotLink`.
 
     `log` gets a line for every frame on the bus, as candump writes it. Raises SocketPathError if the hub cannot listen.
     """

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from dataclasses import asdict
 
 from drivers.types import Frame, LinkState, OutgoingFrame, ReceivedFrame, TransportStats
+from sim import LinkFaultError, RobotNode
 from sim.bus import BusFault, CanBus, DeliveredFrame
 from sim.can_protocol import BusNode, CanFrame, ErrorState, TransmitOrder
-from sim.robot_link import LinkFaultError, RobotNode
 
 HOST_QUEUE = 32
 _BUS_OFF = ErrorState.BUS_OFF
@@ -19,7 +19,7 @@ REOPEN_NS = 100_000_000
 
 
 class SimulatedCan:
-    """The robot's end satisfies `sim.robot_link.RobotLink`, and `host` is the `drivers.types.Transport` of the other.
+    """The robot's end satisfies `sim.RobotLink`, and `host` is the `drivers.types.Transport` of the other.
 
     Time is that of the last `advance`. A silent node acknowledges all frames, as the hub's does.
     """

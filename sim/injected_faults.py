@@ -14,10 +14,10 @@ from dataclasses import dataclass
 from msgspec.structs import replace
 
 from firmware_protocol.firmware_core import FirmwareInputs
+from sim import ROBOT_NODE
 from sim.bus import UNHARMED, FrameFate
 from sim.can_protocol import CanFrame
 from sim.fault_schedule import ScheduledFault, Site
-from sim.robot_link import ROBOT_NODE
 from sim.sensors import PoseMeasurement
 
 LONGEST_FRAME_BITS = 111

@@ -12,9 +12,9 @@ from typing import Any
 import can
 
 from drivers.types import Frame, ReceivedFrame
+from sim import LinkFaultError
 from sim.bus import BusFault, CanBus, DeliveredFrame
 from sim.can_protocol import CanFrame
-from sim.robot_link import LinkFaultError
 
 RETRY_NS = 500_000_000
 MAX_FRAMES_PER_READ = 64
@@ -22,7 +22,7 @@ GUEST_QUEUE = 64
 
 
 class PythonCanLink:
-    """A node on `interface` `channel`; satisfies `sim.robot_link.RobotLink`. It opens the bus again when that breaks.
+    """A node on `interface` `channel`; satisfies `sim.RobotLink`. It opens the bus again when that breaks.
 
     `options`: what else the interface takes.
     A frame counts as received when it is read. Raises `can.CanError`, OSError or ValueError if it cannot be opened.

@@ -20,9 +20,9 @@ from pathlib import Path
 
 from drivers.types import Frame, ReceivedFrame
 from firmware_protocol.serial_framing import FrameDecoder, encode_frame
+from sim import ROBOT_NODE, LinkFaultError
 from sim.bus import UNHARMED, BusFault, FrameFate
 from sim.can_protocol import CanFrame, candump_line
-from sim.robot_link import ROBOT_NODE, LinkFaultError
 
 BITS_PER_BYTE = 10
 BAUD_TOLERANCE = 0.03
@@ -50,7 +50,7 @@ class SerialLineStats:
 
 
 class SerialLine:
-    """The robot's end of the line; satisfies `sim.robot_link.RobotLink`.
+    """The robot's end of the line; satisfies `sim.RobotLink`.
 
     `path` becomes a symbolic link to the port that a host opens; None leaves the port under its own name (`port`).
     `baud` is the robot's rate in bit/s (8 data bits, no parity, 1 stop bit); `pacing` off makes bytes take no time.

@@ -9,9 +9,9 @@ import pytest
 
 from drivers.transport import can as can_transport
 from drivers.types import Frame
+from sim import LinkFaultError
 from sim.hub import Hub
 from sim.python_can_link import RETRY_NS, JoinError, PythonCanLink, joined
-from sim.robot_link import LinkFaultError
 from tests.firmware_protocol.other_end import LinkEnd
 from tests.firmware_protocol.ports.posix_board import build_board, prefer, running_board
 from tests.firmware_protocol.protocol_host import ProtocolHost

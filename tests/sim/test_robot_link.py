@@ -1,9 +1,9 @@
 """The robot's node: what it hears, its restart after bus-off, the babbler's."""
 
 from drivers.types import Frame
+from sim import RESTART_DELAY_NS, RobotNode
 from sim.bus import CanBus
 from sim.can_protocol import CanFrame, ErrorState
-from sim.robot_link import RESTART_DELAY_NS, RobotNode
 
 MS = 1_000_000
 

@@ -9,8 +9,8 @@ import serial
 
 from drivers.types import Frame
 from firmware_protocol.serial_framing import FrameDecoder, encode_frame
+from sim import LinkFaultError
 from sim.bus import FrameFate
-from sim.robot_link import LinkFaultError
 from sim.serial_line import SerialLine, SerialPathError
 from tests.drivers.waiting import wait_until
 
