@@ -22,21 +22,11 @@ from msgspec import inspect
 
 from disco_hw.errors import InputError
 
-LONGEST_LINE = 65_536
-DEEPEST_NESTING = 16
-LONGEST_WORD = 64
-LONGEST_STRING = 4096
-MOST_KEY_PARTS = 8
-
+LONGEST_LINE, LONGEST_WORD, LONGEST_STRING = 65_536, 64, 4096
+DEEPEST_NESTING, MOST_KEY_PARTS = 16, 8
 _KIB, _MIB = 1024, 1024 * 1024
 _FLAGS = os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOCTTY
-_NOT_REGULAR = (
-    (stat.S_ISDIR, "a directory"),
-    (stat.S_ISFIFO, "a pipe"),
-    (stat.S_ISSOCK, "a socket"),
-    (stat.S_ISCHR, "a device"),
-    (stat.S_ISBLK, "a device"),
-)
+_NOT_PLAIN = {stat.S_IFDIR: "a directory", stat.S_IFIFO: "a pipe", stat.S_IFSOCK: "a socket"}
 # Strings and comments whole, so that what is in them is not counted; one without its end goes on to the end.
 _TOML_TOKEN = re.compile(
     r'''(?P<string>"""(?:[^\\"]|\\.|"(?!""))*+(?:"{3,5}|\\?\Z)|"(?:[^"\\\n]|\\.)*+"?'''
@@ -177,7 +167,7 @@ def _refuse_hostile(text: str, name: str) -> None:
 
 def _refuse_unfit(path: Path, kind: FileKind, status: os.stat_result) -> None:
     if not stat.S_ISREG(status.st_mode):
-        found = next((words for is_one, words in _NOT_REGULAR if is_one(status.st_mode)), "something else")
+        found = _NOT_PLAIN.get(stat.S_IFMT(status.st_mode), "a device")
         raise InputError(f"{path}: cannot be read ({found}, not a plain file); {kind.remedy}")
     if status.st_size > kind.most_bytes:
         raise _too_large(path, kind)
@@ -215,9 +205,8 @@ def in_words(error: msgspec.ValidationError, kinds: Sequence[type], docs: str, w
         choices = _tags(here, name)
         add = f"add it: {_one_of(choices)}" if choices else "add it"
         return f"{section}{name}: missing; {add} ({docs} says what it means)"
-    near = nearest(
-        name, (one.encode_name for kind in here if isinstance(kind, inspect.StructType) for one in kind.fields)
-    )
+    fields = (one.encode_name for kind in here if isinstance(kind, inspect.StructType) for one in kind.fields)
+    near = nearest(name, fields)
     remedy = f"did you mean {near}?" if near else "check the spelling or remove it"
     return f"{section}{name}: no such field; {remedy} ({docs} lists every field)"
 

@@ -22,15 +22,8 @@ from pathlib import Path
 
 from disco_hw.errors import InputError, LogError
 
-_THREAD_COUNT_VARIABLES = (
-    "OMP_NUM_THREADS",
-    "OPENBLAS_NUM_THREADS",
-    "MKL_NUM_THREADS",
-    "NUMBA_NUM_THREADS",
-    "VECLIB_MAXIMUM_THREADS",
-)
-
-
+_COUNTED_BY = ("OMP_NUM", "OPENBLAS_NUM", "MKL_NUM", "NUMBA_NUM", "VECLIB_MAXIMUM")
+"""Of the environment, with _THREADS after each: how many threads a numeric library makes."""
 _LIBC = ctypes.CDLL(None)
 _PR_SET_PDEATHSIG = 1
 PARENT_VARIABLE = "DISCO_HW_ENDS_WITH"
@@ -66,14 +59,13 @@ def limit_thread_pools(environment: MutableMapping[str, str] = os.environ) -> St
     Torch and numba are also held if they are imported already; a BLAS that is loaded keeps the threads it has.
     """
     numpy_is_late = "numpy" in sys.modules and environment.get("OPENBLAS_NUM_THREADS") != "1"
-    for name in _THREAD_COUNT_VARIABLES:
+    for name in _COUNTED_BY:
         # Numba reads its variable again at each compilation and raises if it then differs from the threads it has.
         if not (name.startswith("NUMBA") and "numba" in sys.modules):
-            environment[name] = "1"
-    for module_name, function in (("torch", "set_num_threads"), ("numba", "set_num_threads")):
-        module = sys.modules.get(module_name)
-        if module is not None:
-            getattr(module, function)(1)
+            environment[f"{name}_THREADS"] = "1"
+    for name in ("torch", "numba"):
+        if (module := sys.modules.get(name)) is not None:
+            module.set_num_threads(1)
     if numpy_is_late:
         return Step("threads", False, "numpy was loaded before; start with OPENBLAS_NUM_THREADS=1 in the environment")
     return Step("threads", True, "numeric libraries use one thread")
@@ -98,11 +90,7 @@ def spawn_at_normal_priority(command: list[str], pass_fds: Sequence[int] = ()) -
         try:
             made.append(
                 subprocess.Popen(
-                    command,
-                    stdin=subprocess.DEVNULL,
-                    stdout=subprocess.PIPE,
-                    start_new_session=True,
-                    pass_fds=tuple(pass_fds),
+                    command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, start_new_session=True, pass_fds=pass_fds
                 )
             )
         except OSError as error:
@@ -147,14 +135,13 @@ def spare_memory() -> None:
             f"address space: limited to {limit_bytes / 1e6:.0f} MB, and compiling and driving take up to "
             f"{_LEAST_ADDRESS_SPACE_BYTES / 1e6:.0f} MB; raise it with `ulimit -v unlimited` or LimitAS= in the service"
         )
-    libc = ctypes.CDLL(None)
-    libc.mallopt(_M_ARENA_MAX, 1)
+    _LIBC.mallopt(_M_ARENA_MAX, 1)
     attributes = ctypes.create_string_buffer(_PTHREAD_ATTRIBUTES_BYTES)
-    libc.pthread_attr_init(attributes)
-    libc.pthread_attr_setstacksize(attributes, ctypes.c_size_t(_STACK_BYTES))
-    if hasattr(libc, "pthread_setattr_default_np"):
-        libc.pthread_setattr_default_np(attributes)
-    libc.pthread_attr_destroy(attributes)
+    _LIBC.pthread_attr_init(attributes)
+    _LIBC.pthread_attr_setstacksize(attributes, ctypes.c_size_t(_STACK_BYTES))
+    if hasattr(_LIBC, "pthread_setattr_default_np"):
+        _LIBC.pthread_setattr_default_np(attributes)
+    _LIBC.pthread_attr_destroy(attributes)
 
 
 def enter_real_time(priority: int, cpus: Collection[int] = ()) -> tuple[Step, ...]:
@@ -167,14 +154,8 @@ def enter_real_time(priority: int, cpus: Collection[int] = ()) -> tuple[Step, ..
     """
     steps = [_set_switch_interval(), _freeze_garbage()]
     if cpus:
-        steps.append(
-            _try(
-                "cpus",
-                lambda: os.sched_setaffinity(0, cpus),
-                f"runs on {sorted(cpus)}",
-                "name CPUs that this computer has",
-            )
-        )
+        done, remedy = f"runs on {sorted(cpus)}", "name CPUs that this computer has"
+        steps.append(_try("cpus", lambda: os.sched_setaffinity(0, cpus), done, remedy))
     if priority == 0:
         return (*steps, Step("scheduler", False, "left alone, as daemon.realtime_priority is 0"))
     steps.append(_lock_memory())
