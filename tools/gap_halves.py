@@ -27,9 +27,9 @@ from disco_hw.gap.data.gridded_drive import GriddedDrive, grid_drive
 from disco_hw.gap.noise.body_noise import BodyNoise
 from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
 from disco_hw.gap.noise.wheel_noise import WheelNoise
+from disco_hw.gap.search import joint_predictions
 from disco_hw.gap.search.analysis import FinalFit, GapAnalysis, estimate_parameters, final_fit
 from disco_hw.gap.search.cross_validation import Chain, PredictionErrors, errors_of, smoothed_poses
-from disco_hw.gap.search.stages import joint_predictions
 from disco_hw.gap.search.unnamed_terms import with_known_terms
 from disco_hw.gap.settings import DEFAULT_SETTINGS
 from disco_hw.log.drive import DriveLog

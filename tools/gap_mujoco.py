@@ -24,8 +24,8 @@ from scipy.signal import lfilter
 from disco_hw.gap import model_of, offered_stage, search_log
 from disco_hw.gap.data.gridded_drive import grid_drive
 from disco_hw.gap.report.judge import Measured, effect_findings, sort_out, unnamed_findings
+from disco_hw.gap.search import joint_predictions
 from disco_hw.gap.search.analysis import final_fit
-from disco_hw.gap.search.stages import joint_predictions
 from disco_hw.gap.settings import DEFAULT_SETTINGS
 from disco_hw.model import Model
 from disco_hw.model.terms import BODY_FEATURES

@@ -43,6 +43,7 @@ from disco_hw.gap.report.judge import (
     unnamed_findings,
 )
 from disco_hw.gap.report.page import as_text, page
+from disco_hw.gap.search import StagePredictions, joint_predictions, prune, stage_predictions
 from disco_hw.gap.search.analysis import ChannelEstimates, FinalFit, GapAnalysis, final_fit
 from disco_hw.gap.search.channel_search import search_body, search_wheels
 from disco_hw.gap.search.cross_validation import (
@@ -55,7 +56,6 @@ from disco_hw.gap.search.cross_validation import (
     worse_by,
 )
 from disco_hw.gap.search.richest_model import LATE_COLUMNS, candidates_of
-from disco_hw.gap.search.stages import StagePredictions, joint_predictions, prune, stage_predictions
 from disco_hw.gap.search.unnamed_terms import with_known_terms
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GapSettings
 from disco_hw.log import version

@@ -9,8 +9,8 @@ import pytest
 
 from disco_hw import gap
 from disco_hw.gap import WRITTEN
+from disco_hw.gap.search import joint_predictions
 from disco_hw.gap.search.analysis import final_fit
-from disco_hw.gap.search.stages import joint_predictions
 from disco_hw.model import Model, load_model
 from tools.gap_logs import simulated_drive
 

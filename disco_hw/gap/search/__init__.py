@@ -1,1 +1,349 @@
-"""Which effects are missing: fits, evidence, selection, held-out predictions."""
+"""Which effects are missing: fits, evidence, selection, held-out predictions.
+
+Here the gap by stage: what the model as given, refitted and amended predicts of data that it was not fitted to.
+
+The same predictions prune the names that make the whole worse, however well they fit their own channel: where the true
+form is none that is known, the best stand-in of one channel may lead the chain from command to pose astray. A name
+without which held-out predictions are clearly better goes; where they are worse than with the refitted geometry alone,
+one that harms them goes or another that would do as well takes its place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import chain
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import block_diag
+
+from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
+from disco_hw.gap.noise.noise_fit import sensor_noise
+from disco_hw.gap.search.analysis import GAIN, FinalFit, GapAnalysis, final_fit
+from disco_hw.gap.search.channel_search import ChannelResult
+from disco_hw.gap.search.cross_validation import (
+    Chain,
+    PredictionErrors,
+    clearly_worse,
+    errors_of,
+    floor_errors,
+    fold_vectors,
+    judged_horizon_s,
+    smoothed_poses,
+    worse_by,
+)
+from disco_hw.gap.search.end_to_end import Ahead, Freed, JointFit, Part
+from disco_hw.gap.search.least_squares import Fit, inverse
+from disco_hw.gap.search.richest_model import LATE_COLUMNS, LATE_STARTS_S, with_pose_delay
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class StagePredictions:
+    """For each stage the chains of the two folds, each fitted on the other one's data.
+
+    `poses` (M, 3) twice: smoothed, and of the nearest sample alone; `joint`: of stages that were fitted end to end,
+    what was freed and the fit on all data.
+    """
+
+    body: BodyChannel
+    wheels: WheelChannel | None
+    chains: Mapping[str, dict[int, Chain]]
+    poses: tuple[Array, Array]
+    joint: Mapping[str, tuple[Freed, JointFit]] = field(default_factory=dict)
+
+    @property
+    def judged_horizon_s(self) -> float:
+        """How far ahead stages are compared."""
+        return judged_horizon_s(self.body, self.poses)
+
+    def errors(self, stage: str, ahead_s: float | None = None) -> PredictionErrors:
+        """Errors of one stage on held-out data so far ahead, or as far as stages are compared."""
+        ahead_s = self.judged_horizon_s if ahead_s is None else ahead_s
+        return errors_of(self.body, self.wheels, self.chains[stage], ahead_s, self.poses)
+
+    def table(self) -> dict[str, dict[float, PredictionErrors]]:
+        """Errors by stage and horizon, with the floor, for which the wheels' path is that of the geometry alone."""
+        horizons = self.body.settings.prediction.horizons_s
+        table = {stage: {ahead_s: self.errors(stage, ahead_s) for ahead_s in horizons} for stage in self.chains}
+        noise = sensor_noise(self.body, with_pose_delay(self.body, self.chains["refitted"][0].body))
+        table["floor"] = {ahead_s: floor_errors(self.body, noise, ahead_s, self.poses) for ahead_s in horizons}
+        return table
+
+
+def stage_predictions(analysis: GapAnalysis, final: FinalFit | None = None) -> StagePredictions:
+    """Predictions of `refitted` and `amended`, the channels fitted apart: quick, for names that compete.
+
+    Of an analysis in which the body was judged; `final` is its final fit, if it is made already.
+    """
+    final = final_fit(analysis) if final is None else final
+    body, wheels = analysis.body, analysis.wheels
+    assert body is not None
+    assert final.final_body is not None
+    channel = body.channel
+    assert isinstance(channel, BodyChannel)
+    wheel_channel = None if wheels is None else wheels.channel
+    assert wheel_channel is None or isinstance(wheel_channel, WheelChannel)
+    chains = {
+        stage: _chains(analysis, final, _by_fold(analysis, fits))
+        for stage, fits in (("refitted", _base(analysis)), ("amended", _whole(analysis, final)))
+    }
+    poses = smoothed_poses(channel, final.final_body.vector)
+    return StagePredictions(channel, wheel_channel, chains, poses)
+
+
+@dataclass(frozen=True)
+class _Fitted:
+    """A stage that was fitted end to end: what was freed, the fit on all data, and those on the data of one fold."""
+
+    of: Freed
+    joint: JointFit
+    folds: Mapping[int, JointFit]
+
+    @classmethod
+    def to(cls, ahead: Ahead, of: Freed, folds: Mapping[int, Freed] | None = None) -> _Fitted:
+        """Fit all data, and each of the `folds` from where it begins; without them, from the fit of all data."""
+        joint = ahead.fit(of)
+        begin = dict.fromkeys((0, 1), of.at(joint.vectors)) if folds is None else folds
+        return cls(of, joint, {held: ahead.fit(begin[held], held) for held in (0, 1)})
+
+    def at(self, held: int | None = None) -> Freed:
+        """What was freed, around the fit of all data or around that without one fold."""
+        return self.of.at((self.joint if held is None else self.folds[held]).vectors)
+
+    @property
+    def chains(self) -> dict[int, Chain]:
+        """The chains of the two folds."""
+        return {held: self.of.chain(fitted.vectors) for held, fitted in self.folds.items()}
+
+
+def joint_predictions(analysis: GapAnalysis, final: FinalFit) -> StagePredictions:
+    """Predictions of every stage, each of which ends with a fit of the whole chain, from commands to poses.
+
+    `nominal`: the model as given; `refitted`: its geometry, and the effects that it had; `timed`: also what makes
+    wheels late; `amended`: all that was found, from where the channels apart have it or, if held-out data are predicted
+    better so, on top of `timed`.
+    """
+    apart = stage_predictions(analysis, final)
+    ahead = Ahead.of(apart.body, apart.wheels, apart.poses)
+    trust = apart.body.settings.prediction.joint_trust**-2.0
+    base, whole = _base(analysis), _whole(analysis, final)
+    nominal = [analysis.nominal_body, analysis.nominal_wheels][: len(base)]
+    chains = {"nominal": _chains(analysis, final, {0: nominal, 1: nominal})}
+
+    def chain(vectors: Sequence[Array]) -> Chain:
+        return _chain(analysis, final, vectors)
+
+    parts = tuple(
+        Part(channel.layout, one.vector, one.active, _roughly(channel, one))
+        for channel, one in zip((apart.body, apart.wheels), base, strict=False)
+        if channel is not None
+    )
+    refitted = _Fitted.to(
+        ahead, Freed(parts, lambda vectors: Chain(vectors[0], vectors[1] if len(vectors) > 1 else None))
+    )
+    timed = _Fitted.to(ahead, _timed(ahead, refitted.at()))
+    of_all = tuple(
+        Part(one.selector.channel.layout, fitted.vector, fitted.active, trust * fitted.information())
+        for one, fitted in zip((analysis.body, analysis.wheels), whole, strict=False)
+        if one is not None
+    )
+    by_fold = {}
+    for held, vectors in _by_fold(analysis, whole).items():
+        inside = zip(of_all, vectors, whole, (apart.body, apart.wheels), strict=False)
+        folded = tuple(
+            replace(part, vector=vector, information=trust * _information(one, channel, 1 - held))
+            for part, vector, one, channel in inside
+            if channel is not None
+        )
+        by_fold[held] = Freed(folded, chain)
+    options = [_Fitted.to(ahead, Freed(of_all, chain), by_fold)]
+    if analysis.found_any:
+        on_top = {held: _on_top(of, timed.at(held)) for held, of in by_fold.items()}
+        options.append(_Fitted.to(ahead, _on_top(options[0].of, timed.at()), on_top))
+
+    def size(option: _Fitted) -> float:
+        errors = errors_of(apart.body, apart.wheels, option.chains, apart.judged_horizon_s, apart.poses)
+        return errors.position_m * errors.yaw_rad
+
+    stages = {"refitted": refitted, "timed": timed, "amended": min(options, key=size)}
+    chains |= {name: stage.chains for name, stage in stages.items()}
+    joint = {name: (stage.of, stage.joint) for name, stage in stages.items()}
+    return StagePredictions(apart.body, apart.wheels, chains, apart.poses, joint)
+
+
+def _on_top(amended: Freed, timed: Freed) -> Freed:
+    """What was found freed on top of `timed`: its geometry and its lateness as free as there, the rest as trusted.
+
+    Where a channel's form is none of the known ones, its best fit may be far from what predicts best, and surer of it
+    than it should be.
+    """
+    parts = []
+    for own, plain in zip(amended.parts, timed.parts, strict=True):
+        active = (*plain.active, *(place for place in own.active if place not in plain.active))
+        others = [k for k, place in enumerate(own.active) if place not in plain.active]
+        trusted = inverse(inverse(own.information)[np.ix_(others, others)])
+        vector, low, both = own.vector.copy(), own.layout.low.copy(), list(plain.active)
+        vector[both], low[both] = plain.vector[both], plain.layout.low[both]
+        information = block_diag(plain.information, trusted) if others else plain.information
+        parts.append(Part(replace(own.layout, low=low), vector, active, information))
+    return replace(amended, parts=tuple(parts))
+
+
+def _information(found: Fit, channel: BodyChannel | WheelChannel, fold: int) -> Array:
+    """What the data of one fold say of the active entries of a fit, with what was expected of them, (A, A)."""
+    prediction, grid = channel.settings.prediction, channel.settings.grid
+    inside = (channel.block // round(prediction.fold_s / grid.block_s)) % 2 == fold
+    slope = found.jacobian[inside]
+    return np.asarray(slope.T @ slope) + (0.0 if found.precision is None else np.diag(found.precision))
+
+
+def _roughly(channel: BodyChannel | WheelChannel, found: Fit) -> Array:
+    """That the geometry is about what the body alone has it to be, for logs with few commands; of the rest nothing."""
+    known = np.zeros(len(found.active))
+    share = channel.settings.prediction.rough_geometry
+    known[: len(channel.free)] = (share * found.vector[[0, 1, 1]][: len(channel.free)]) ** -2.0
+    return np.diag(known)
+
+
+def _timed(ahead: Ahead, refitted: Freed) -> Freed:
+    """The same with what makes wheels late freed too, from the start that comes nearest; as it is without commands."""
+    if len(refitted.parts) == 1:
+        return refitted
+    body, wheels = refitted.parts
+    places = tuple(wheels.layout.place[column] for column in LATE_COLUMNS)
+    new = tuple(place for place in places if place not in wheels.active)
+    information = block_diag(wheels.information, np.zeros((len(new),) * 2))
+    # Wheels are never ahead of their command in a model that drives.
+    low = wheels.layout.low.copy()
+    low[list(places)] = np.maximum(low[list(places)], 0.0)
+    layout = replace(wheels.layout, low=low)
+    wider = replace(wheels, layout=layout, active=(*wheels.active, *new), information=information)
+    options = []
+    for late_s in LATE_STARTS_S:
+        vector = wider.vector.copy()
+        vector[list(places)] = late_s
+        options.append(replace(refitted, parts=(body, replace(wider, vector=vector))))
+    fitted = [option.at(ahead.fit(option).vectors) for option in options]
+    return min(fitted, key=lambda one: ahead.usual_cost(one.chain([part.vector for part in one.parts])))
+
+
+def _base(analysis: GapAnalysis) -> list[Fit]:
+    """Fits of both channels, or of the body, without anything that is missing."""
+    return [found.base for found in (analysis.body, analysis.wheels) if found is not None]
+
+
+def _whole(analysis: GapAnalysis, final: FinalFit) -> list[Fit]:
+    """Fits of both channels, or of the body, with all that was found."""
+    assert final.final_body is not None
+    return [final.final_body, *([] if analysis.wheels is None else [analysis.wheels.fit])]
+
+
+def _by_fold(analysis: GapAnalysis, fits: Sequence[Fit]) -> dict[int, list[Array]]:
+    """For each fold the vectors of the channels, fitted on the other one's data."""
+    channels = [found for found in (analysis.body, analysis.wheels) if found is not None]
+    settings = analysis.drive.settings
+    by_channel = [
+        fold_vectors(one, found.channel.block, found.selector.channel.neutral, settings)
+        for found, one in zip(channels, fits, strict=True)
+    ]
+    return {held: [vectors[held] for vectors in by_channel] for held in (0, 1)}
+
+
+def _chains(analysis: GapAnalysis, final: FinalFit, by_fold: Mapping[int, Sequence[Array]]) -> dict[int, Chain]:
+    return {held: _chain(analysis, final, vectors) for held, vectors in by_fold.items()}
+
+
+def _chain(analysis: GapAnalysis, final: FinalFit, vectors: Sequence[Array]) -> Chain:
+    """A chain of the channels' vectors; where it is the encoders that count wrong, the wheels turn as commanded."""
+    assert analysis.body is not None
+    core, perturbation = _split(analysis.body, vectors[0])
+    wheels = analysis.wheels
+    if wheels is None:
+        return Chain(core, None, perturbation)
+    wheels_core, wheels_perturbation = _split(wheels, vectors[1])
+    if final.encoder_is_cause:
+        places = [wheels.channel.layout.place[f"{GAIN}.{side}"] for side in ("left", "right")]
+        wheels_core = wheels_core.copy()
+        wheels_core[places] = 0.0
+    return Chain(core, wheels_core, perturbation, wheels_perturbation)
+
+
+def _split(found: ChannelResult, vector: Array) -> tuple[Array, Array | None]:
+    """Entries of effects and what terms add; a vector without terms is whole already."""
+    if vector.size == len(found.channel.layout.columns):
+        return vector, None
+    return found.selector.channel.split(vector)
+
+
+def prune(analysis: GapAnalysis) -> GapAnalysis:
+    """The analysis without what makes its held-out predictions worse."""
+    if analysis.body is None:
+        return analysis
+    settings = analysis.drive.settings.prediction
+    predictions = stage_predictions(analysis)
+    refitted = predictions.errors("refitted")
+    now = predictions.errors("amended")
+    for _ in range(settings.most_changes):
+        if clearly_worse(refitted, now, settings):
+            options = chain(_lacking_one(analysis), _swapped_one(analysis))
+            better = _best(refitted, worse_by(refitted, now), options)
+        else:
+            better = _best(now, 1.0 / settings.worse, _lacking_one(analysis))
+            if better is not None and not clearly_worse(better[1], now, settings):
+                better = None
+        if better is None:
+            break
+        analysis, now = better
+    return analysis
+
+
+def _best(
+    than: PredictionErrors, below: float, options: Iterable[GapAnalysis]
+) -> tuple[GapAnalysis, PredictionErrors] | None:
+    """Of some analyses the one that predicts best, if its errors are less than `below` times those of another."""
+    best, least = None, below
+    for option in options:
+        errors = stage_predictions(option).errors("amended")
+        ratio = worse_by(than, errors)
+        if ratio < least:
+            best, least = (option, errors), ratio
+    return best
+
+
+def _lacking_one(analysis: GapAnalysis) -> Iterator[GapAnalysis]:
+    """Analyses that lack one of the names, or the terms of a channel."""
+    for found in (analysis.wheels, analysis.body):
+        if found is None:
+            continue
+        for name, rest in _each(found):
+            yield _changed(analysis, found, replace(found, names=rest), (name,))
+        if found.unnamed and found.plain is not None:
+            bare = replace(found, selector=found.plain, unnamed=(), plain=None)
+            yield _changed(analysis, found, bare, tuple(term.form for term in found.unnamed))
+
+
+def _swapped_one(analysis: GapAnalysis) -> Iterator[GapAnalysis]:
+    """Analyses that have, in place of one of the names, another that would do as well."""
+    for found in (analysis.wheels, analysis.body):
+        if found is None:
+            continue
+        for name, rest in _each(found):
+            for rival in found.selector.rivals(found.names, name):
+                yield _changed(analysis, found, replace(found, names=(*rest, rival)), (name,))
+
+
+def _each(found: ChannelResult) -> Iterator[tuple[str, tuple[str, ...]]]:
+    """Every name that was found, and the others."""
+    for name in found.names:
+        if name not in found.selector.given:
+            yield name, tuple(other for other in found.names if other != name)
+
+
+def _changed(analysis: GapAnalysis, old: ChannelResult, new: ChannelResult, pruned: tuple[str, ...]) -> GapAnalysis:
+    pruned = (*analysis.pruned, *pruned)
+    if old is analysis.wheels:
+        return replace(analysis, wheels=new, pruned=pruned)
+    return replace(analysis, body=new, pruned=pruned)

@@ -9,10 +9,10 @@ from disco_hw.gap import offered_stage
 from disco_hw.gap.data import BODY, WHEEL
 from disco_hw.gap.noise.channels import BodyChannel
 from disco_hw.gap.report.amend import at_joint_fit
+from disco_hw.gap.search import _on_top
 from disco_hw.gap.search.analysis import ChannelEstimates, ParameterEstimate
 from disco_hw.gap.search.cross_validation import Chain, PredictionErrors, smoothed_poses
 from disco_hw.gap.search.end_to_end import Ahead, Freed, JointFit, Part
-from disco_hw.gap.search.stages import _on_top
 from disco_hw.gap.settings import DEFAULT_SETTINGS
 from tests.gap.synthetic import GEOMETRY, NOISE, body_channel
 

@@ -6,10 +6,10 @@ from types import SimpleNamespace
 import pytest
 
 from disco_hw.gap import find_gap
+from disco_hw.gap import search as stages
 from disco_hw.gap.report.judge import residue_sentences
-from disco_hw.gap.search import stages
+from disco_hw.gap.search import prune
 from disco_hw.gap.search.cross_validation import PredictionErrors
-from disco_hw.gap.search.stages import prune
 from disco_hw.gap.settings import DEFAULT_SETTINGS
 from disco_hw.model import Model
 from tools.gap_logs import simulated_drive
