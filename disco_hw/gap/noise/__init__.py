@@ -1,1 +1,250 @@
-"""What is left when the model is right: noise of the wheels and of the body, learnt from the log."""
+"""What is left when the model is right: noise of the wheels and of the body, learnt from the log.
+
+Here the noise of a channel, from what the richest model leaves of this log, then held for every comparison. And that of
+the sensors alone, from what needs no model: neighbouring samples, and poses of a robot that rests. A model's own
+residuals say how far it is off, not how well poses are measured: what is missing would count as noise.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from disco_hw.gap.data.gridded_drive import GriddedDrive
+from disco_hw.gap.noise.body_noise import BodyNoise, body_likelihood
+from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
+from disco_hw.gap.noise.wheel_noise import WheelNoise, wheel_likelihood, whiten_wheels
+from disco_hw.gap.settings import NoiseSettings
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+# A Gaussian's standard deviation over the median of its absolute values.
+_OF_MEDIAN = 1.4826
+# Values further out than so many standard deviations are single jumps, and count as that much.
+_CLIPPED_SIGMAS = 5.0
+# Samples next to each other are comparable where their distances in time differ by no more than this ratio.
+_UNEVEN = 2.0
+_FEWEST = 20
+_READING, _COMMAND_STAMP = 2, 4
+
+
+def _huber(white: Array, limit: float) -> float:
+    """Sum of squares of whitened residuals that grow linearly beyond `limit`."""
+    flat = white.ravel()
+    beyond = np.abs(flat)
+    beyond = beyond[beyond > limit] - limit
+    return float(flat @ flat - beyond @ beyond)
+
+
+def _minimise(objective, start: Array, low: Array, high: Array, most: int, step: float) -> Array:  # type: ignore[no-untyped-def]
+    def slope(logs: Array) -> Array:
+        # Central: a one-sided difference this wide would end the search some way off.
+        out = np.empty(logs.size)
+        for k in range(logs.size):
+            ahead, behind = logs.copy(), logs.copy()
+            ahead[k], behind[k] = min(logs[k] + step, high[k]), max(logs[k] - step, low[k])
+            out[k] = (objective(ahead) - objective(behind)) / max(ahead[k] - behind[k], 1e-9)
+        return out
+
+    bounds, options = list(zip(low, high, strict=True)), {"maxiter": most, "ftol": 3e-6}
+    found = minimize(objective, start, jac=slope, method="L-BFGS-B", bounds=bounds, options=options)
+    return np.asarray(found.x)
+
+
+def largest_command_jitter_s(drive: GriddedDrive) -> float:
+    """How far commands may plausibly come early or late, s, by how the encoder's time stamps scatter.
+
+    More than that is no jitter but a response that the model does not have, and must not pass for noise.
+    """
+    settings = drive.settings.noise
+    scattered_s = settings.command_jitter_ratio * drive.stamp_scatter_s
+    return settings.least_command_jitter_s + scattered_s + settings.command_jitter_share * drive.encoder_period_s
+
+
+def wheel_misfit(channel: WheelChannel, raw: Array) -> Callable[[Array], float]:
+    """Minus the robust log likelihood of what a model leaves of the angles (E, 2), by logarithms of the noise (7,)."""
+    motion, settings = channel.motion, channel.settings.noise
+    # A wheel at rest reads the same however coarse its encoder is, and would speak for readings without error.
+    counted = motion.use & ~motion.restart & (np.abs(motion.speed_rad_s).max(axis=1) > settings.rest_rad_s)
+    likelihood = wheel_likelihood(motion, counted, raw)
+
+    def misfit(logs: Array) -> float:
+        white, weight = likelihood(logs)
+        return 0.5 * _huber(white, settings.huber) - weight
+
+    return misfit
+
+
+def fit_wheel_noise(channel: WheelChannel, raw: Array) -> WheelNoise:
+    """Noise of the wheels by maximum likelihood of what a model leaves of the angles, (E, 2)."""
+    drive, settings = channel.drive, channel.settings.noise
+    start = channel.noise.vector()
+    misfit = wheel_misfit(channel, raw)
+
+    def objective(logs: Array) -> float:
+        return misfit(logs) + _pull(logs, start, settings.prior_sd)
+
+    # A speed that may be wrong by any amount for any time would explain wheels that do not turn at all.
+    most = np.minimum(start + 5.0, WheelNoise(*settings.largest_wheel_noise).vector())
+    most[_COMMAND_STAMP] = min(most[_COMMAND_STAMP], math.log(largest_command_jitter_s(drive)))
+    begin = np.minimum(start, most)
+    least = begin - 5.0
+    if drive.quantum_rad > 0.0:
+        least[_READING] = max(least[_READING], math.log(drive.quantum_rad / math.sqrt(12.0)))
+    return WheelNoise.from_vector(
+        _minimise(objective, np.maximum(begin, least), least, most, settings.wheel_iterations, settings.difference_step)
+    )
+
+
+def _pull(logs: Array, start: Array, prior_sd: float) -> float:
+    """A weak prior that keeps parameters the log says nothing about where they are."""
+    return 0.5 * float((((logs - start) / prior_sd) ** 2).sum())
+
+
+def fit_body_noise(channel: BodyChannel, p: Array, extra: Array | None = None, iterations: int = 15) -> BodyNoise:
+    """Noise of poses and body by maximum likelihood at a parameter vector and what unnamed terms add."""
+    settings = channel.settings.noise
+    raw = channel.raw_residual(p, extra)
+    rim = np.abs(channel.drive.speed_rad_s).max(axis=1) * channel.geometry[0]
+    motion = channel.motion(rim)
+    start = channel.noise.vector()
+    likelihood = body_likelihood(motion, raw)
+
+    def objective(logs: Array) -> float:
+        white, weight = likelihood(logs)
+        return 0.5 * _huber(white, settings.huber) - weight + _pull(logs, start, settings.prior_sd)
+
+    return BodyNoise.from_vector(
+        _minimise(objective, start, start - 5.0, start + 5.0, iterations, settings.difference_step)
+    )
+
+
+def without_outliers(channel: BodyChannel, p: Array, extra: Array | None = None) -> BodyChannel:
+    """The channel without poses that no noise of this size explains; found again until none is left."""
+    for _ in range(3):
+        white = channel.whitened(p, extra)
+        wild = channel.use & (np.abs(white).max(axis=1) > channel.settings.noise.outlier)
+        # A pose that jumps makes its successors look wild too: only the first of a row goes, then look again.
+        wild &= ~np.concatenate([[False], wild[:-1]])
+        if not wild.any() or wild.sum() > 0.1 * channel.use.sum():
+            break
+        channel = channel.with_noise(channel.noise, use=channel.use & ~wild)
+    return channel
+
+
+def local_weight(white: Array, use: NDArray[np.bool_], settings: NoiseSettings) -> Array:
+    """Weights that bring stretches and samples with larger residuals than the noise model's down to its size.
+
+    `white` (S, k) whitened, not weighted; the local scale is the mean square over `2 smooth_samples + 1` samples.
+    """
+    clipped = np.minimum(white**2, 16.0) * use[:, None]
+    window = np.ones(2 * settings.smooth_samples + 1)
+    amount = np.convolve(use.astype(float), window, "same")
+    weights = np.empty_like(white)
+    for side in range(white.shape[1]):
+        local = np.convolve(clipped[:, side], window, "same") / np.maximum(amount, 1.0)
+        weights[:, side] = 1.0 / np.sqrt(np.maximum(local / settings.local_excess, 1.0))
+    tamed = np.abs(white) * weights
+    return np.asarray(weights * np.minimum(1.0, settings.huber / np.maximum(tamed, 1e-9)))
+
+
+def learn_wheel_noise(channel: WheelChannel, raw: Array) -> WheelChannel:
+    """The channel with the noise of residuals `raw` (E, 2), and weights for what is noisier still."""
+    channel = channel.with_noise(fit_wheel_noise(channel, raw))
+    white = whiten_wheels(raw, channel.gains)
+    wild = channel.gains.use & (np.abs(white).max(axis=1) > 2.0 * channel.settings.noise.outlier)
+    if 0 < wild.sum() < 0.02 * wild.size:
+        channel = channel.with_noise(channel.noise, ~wild)
+        white = whiten_wheels(raw, channel.gains)
+    return channel.weighted(local_weight(white, channel.gains.use, channel.settings.noise))
+
+
+def learn_body_noise(channel: BodyChannel, p: Array, extra: Array | None = None, iterations: int = 15) -> BodyChannel:
+    """The channel with the noise that is left at `p`, without outliers, and weights for what is noisier still."""
+    geometry = p.copy()
+    channel = without_outliers(replace(channel, geometry=geometry).with_noise(channel.noise), p, extra)
+    channel = channel.with_noise(fit_body_noise(channel, p, extra, iterations))
+    channel = without_outliers(channel, p, extra)
+    return channel.weighted(local_weight(channel.whitened(p, extra), channel.use, channel.settings.noise))
+
+
+@dataclass(frozen=True, slots=True)
+class SensorNoise:
+    """Standard deviations of a single pose (m per axis, rad) and of a single wheel speed (rad/s)."""
+
+    position_m: float
+    yaw_rad: float
+    wheel_rad_s: float
+
+
+def sensor_noise(channel: BodyChannel, p: Array) -> SensorNoise:
+    """What single samples of a drive err by; `p`, a vector of the body, only says roughly where the wheels lead to.
+
+    Of moving robots the smaller of two bounds: second differences of what poses are off the wheels' path, and third
+    differences of the poses themselves, in which motion is nothing and noise is whole. Of resting ones the scatter
+    about the middle of a rest, which shows slow noise too; the larger of both.
+    """
+    beside, measured = channel.raw_residual(p), channel.measured
+    t_s, window, use = channel.samples.t_s, channel.window, channel.use
+    moving = [
+        _least(_second(t_s, beside[:, columns], window, use), _third(t_s, measured[:, columns], window, use))
+        for columns in (slice(0, 2), slice(2, 3))
+    ]
+    resting = (np.abs(channel.drive.speed_rad_s).max(axis=1) < channel.settings.noise.rest_rad_s)[channel.samples.node]
+    still = [
+        _scatter(measured[:, columns], np.cumsum(np.diff(window + 1e6 * ~resting, prepend=-1.0) != 0), resting & use)
+        for columns in (slice(0, 2), slice(2, 3))
+    ]
+    speed = channel.drive.speed_rad_s.mean(axis=1)[channel.samples.node]
+    of_speed = _second(t_s, speed[:, None], window, use & ~resting)
+    return SensorNoise(max(moving[0], still[0]), max(moving[1], still[1]), _sigma(of_speed))
+
+
+def _second(t_s: Array, values: Array, window: NDArray[np.int64], use: Mask) -> Array:
+    """What values (P, C) are off the line between their neighbours, in units of their own noise, (n, C)."""
+    before, after = t_s[1:-1] - t_s[:-2], t_s[2:] - t_s[1:-1]
+    good = (window[:-2] == window[2:]) & use[:-2] & use[1:-1] & use[2:] & (before > 0.0) & (after > 0.0)
+    good &= np.maximum(before, after) < _UNEVEN * np.minimum(before, after)
+    share = (after / np.maximum(before + after, 1e-9))[good, None]
+    low, mid, high = values[:-2][good], values[1:-1][good], values[2:][good]
+    return np.asarray((mid - share * low - (1.0 - share) * high) / np.sqrt(1.0 + share**2 + (1.0 - share) ** 2))
+
+
+def _third(t_s: Array, values: Array, window: NDArray[np.int64], use: Mask) -> Array:
+    """Third differences of evenly spaced values (P, C), in units of their own noise, (n, C)."""
+    step = np.diff(t_s)
+    spans = np.column_stack([step[:-2], step[1:-1], step[2:]])
+    good = (window[:-3] == window[3:]) & use[:-3] & use[1:-2] & use[2:-1] & use[3:]
+    good &= spans.max(axis=1) < 1.2 * np.maximum(spans.min(axis=1), 1e-9)
+    return np.asarray(np.diff(values, 3, axis=0)[good] / 20.0**0.5)
+
+
+def _least(*differences: Array) -> float:
+    """The smallest of some bounds that enough samples give; 0 where none does."""
+    return min((_sigma(each) for each in differences if each.shape[0] >= _FEWEST), default=0.0)
+
+
+def _scatter(values: Array, rest: NDArray[np.int64], inside: Mask) -> float:
+    """Standard deviation of values (P, C) about the middles of their rests; 0 where the robot hardly rests."""
+    off = []
+    for number in np.unique(rest[inside]):
+        chosen = values[inside & (rest == number)]
+        if chosen.shape[0] >= 5:
+            off.append((chosen - np.median(chosen, axis=0)) * (chosen.shape[0] / (chosen.shape[0] - 1.0)) ** 0.5)
+    stacked = np.concatenate(off) if off else np.empty((0, values.shape[1]))
+    return _sigma(stacked) if stacked.shape[0] >= _FEWEST else 0.0
+
+
+def _sigma(values: Array) -> float:
+    """Standard deviation of values about 0, single jumps clipped."""
+    if not values.size:
+        return 0.0
+    rough = _OF_MEDIAN * float(np.median(np.abs(values)))
+    largest = _CLIPPED_SIGMAS * rough if rough > 0.0 else float(np.abs(values).max())
+    return float(np.sqrt((np.clip(values, -largest, largest) ** 2).mean()))

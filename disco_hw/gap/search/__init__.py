@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
+from disco_hw.gap.noise import sensor_noise
 from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
-from disco_hw.gap.noise.noise_fit import sensor_noise
 from disco_hw.gap.search.analysis import GAIN, FinalFit, GapAnalysis, final_fit
 from disco_hw.gap.search.channel_search import ChannelResult
 from disco_hw.gap.search.cross_validation import (

@@ -14,9 +14,9 @@ from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.data import BODY, DELAYED_BY, WHEEL
 from disco_hw.gap.data.free_runs import displacement, starts_as_far_as
 from disco_hw.gap.data.gridded_drive import GriddedDrive
+from disco_hw.gap.noise import learn_body_noise, learn_wheel_noise
 from disco_hw.gap.noise.body_noise import BodyNoise
 from disco_hw.gap.noise.channels import BodyChannel, ResidualChannel, WheelChannel
-from disco_hw.gap.noise.noise_fit import learn_body_noise, learn_wheel_noise
 from disco_hw.gap.noise.wheel_noise import WheelNoise, whiten_wheels
 from disco_hw.gap.search.least_squares import Fit, fit, inverse
 from disco_hw.gap.search.richest_model import (

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from disco_hw.gap.data import BASE_COUNT, ENCODER_COLUMNS
 from disco_hw.gap.data.free_runs import displacement, read_angles, run_body, starts_of
+from disco_hw.gap.noise import SensorNoise
 from disco_hw.gap.noise.channels import BodyChannel, WheelChannel, total_perturbation
-from disco_hw.gap.noise.noise_fit import SensorNoise
 from disco_hw.gap.search.analysis import GapAnalysis
 from disco_hw.gap.search.channel_search import ChannelResult, responding
 from disco_hw.gap.search.least_squares import Fit, by_block, inverse, known

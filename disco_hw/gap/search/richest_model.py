@@ -19,8 +19,8 @@ from disco_hw.effects import CommandedDrive, Effect, Stage
 from disco_hw.effects.registry import REGISTRY, in_stages
 from disco_hw.gap.data import DELAYED_BY, WHEEL, Layout
 from disco_hw.gap.data.free_runs import read_angles
+from disco_hw.gap.noise import learn_body_noise, learn_wheel_noise, wheel_misfit
 from disco_hw.gap.noise.channels import BodyChannel, ResidualChannel, WheelChannel
-from disco_hw.gap.noise.noise_fit import learn_body_noise, learn_wheel_noise, wheel_misfit
 from disco_hw.gap.noise.wheel_noise import WheelNoise, whiten_wheels
 from disco_hw.gap.search.least_squares import sensitivity
 from disco_hw.gap.settings import GRID_STEP_S, FitSettings

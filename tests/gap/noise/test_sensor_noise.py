@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from disco_hw.gap.data import BODY
+from disco_hw.gap.noise import sensor_noise
 from disco_hw.gap.noise.channels import BodyChannel
-from disco_hw.gap.noise.noise_fit import sensor_noise
 from disco_hw.gap.search.cross_validation import Chain, errors_of, floor_errors, smoothed_poses
 from tests.gap.synthetic import NOISE, body_channel
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from disco_hw.gap.data import BODY
+from disco_hw.gap.noise import sensor_noise
 from disco_hw.gap.noise.channels import BodyChannel
-from disco_hw.gap.noise.noise_fit import sensor_noise
 from disco_hw.gap.search.channel_search import indices
 from disco_hw.gap.search.cross_validation import (
     Chain,

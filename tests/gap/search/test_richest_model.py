@@ -7,8 +7,8 @@ import pytest
 
 from disco_hw.gap.data import WHEEL
 from disco_hw.gap.data.gridded_drive import grid_drive
+from disco_hw.gap.noise import largest_command_jitter_s, learn_wheel_noise
 from disco_hw.gap.noise.channels import WheelChannel
-from disco_hw.gap.noise.noise_fit import largest_command_jitter_s, learn_wheel_noise
 from disco_hw.gap.noise.wheel_noise import WheelNoise
 from disco_hw.gap.search.richest_model import learn_saturated_wheels
 from tools.gap_logs import simulated_drive
