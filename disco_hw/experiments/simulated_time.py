@@ -121,7 +121,8 @@ class SimulatedRun:
         while self.now_us < end_us:
             self.now_us += STEP_US
             self.robot.advance(self.now_us)
-            if self.now_us % self._period_us:
+            # At rates whose period is no whole number of steps a tick comes with the first step that is due.
+            if self.now_us // self._period_us == (self.now_us - STEP_US) // self._period_us:
                 continue
             now_ns = self.now_us * 1000
             wanted = self.pilot.step(now_ns, self.core.last)

@@ -68,13 +68,13 @@ def test_the_pages_comparison_with_disco_is_as_it_says(tmp_path):
     agree(figures(printed(1)), figures(run(program(1), tmp_path)))
 
 
-@pytest.mark.parametrize("rate_hz", [20, 40, 100])
+@pytest.mark.parametrize("rate_hz", [20, 33, 60, 100])
 def test_the_robot_starts_at_every_control_rate(tmp_path, rate_hz):
     robot = tmp_path / "robot.toml"
     text = ROBOT.read_text("utf-8").replace("rate_hz = 50.0", f"rate_hz = {rate_hz}.0")
     robot.write_text(text.replace("wombot_model.toml", str(ROBOT.with_name("wombot_model.toml"))), encoding="utf-8")
     drive = drive_virtual(robot, lambda _state, _task, _model: (2.0, 2.0), 1.0)
-    assert drive.commands.shape[0] == rate_hz
+    assert abs(drive.commands.shape[0] - rate_hz) <= 1
     assert drive.speeds[-1] == pytest.approx(2.0 * 0.061, rel=0.1)
 
 
