@@ -201,7 +201,8 @@ def drive_virtual(
     """Drive the task of a robot.toml on a virtual robot, in simulated time, from the task's start; see `VirtualDrive`.
 
     The daemon's own tick: estimation, limits and supervision are those of the real robot. Its controller is the
-    reference firmware, which sends the poses, whatever [link], [wheels] and [pose] say. `law`: yours; DISCO if None.
+    reference firmware, which sends the poses, whatever [link], [wheels] and [pose] say; the geometry is learnt on the
+    way where the real robot would learn it. `law`: yours; DISCO if None.
     `hide`: effects that the plant has and the model lacks (`disco-hw sim --list-effects`). `log`: an MCAP file to
     write. Raises InputError for wrong files and effects, WorkError if the robot refuses to start.
     """
@@ -231,8 +232,14 @@ def drive_virtual(
 
 def _at_the_reference_controller(setup: Setup) -> Setup:
     usual = {field.name: field.default for field in msgspec.structs.fields(RobotConfig)}
-    kept = {section: usual[section] for section in ("link", "wheels", "pose")}
-    return replace(setup, config=msgspec.structs.replace(setup.config, **kept))
+    asked = choose_adaptation(setup.config.control, setup.config.pose, setup.model)
+    changed = {
+        "link": usual["link"],
+        "wheels": usual["wheels"],
+        "pose": usual["pose"],
+        "control": msgspec.structs.replace(setup.config.control, adaptation=asked.kind),
+    }
+    return replace(setup, config=msgspec.structs.replace(setup.config, **changed))
 
 
 def _planner(setup: Setup, law: Law | None) -> Planner:

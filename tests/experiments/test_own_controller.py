@@ -17,10 +17,12 @@ from disco_hw import drive_virtual
 from disco_hw.errors import InputError
 from disco_hw.experiments import with_device
 from disco_hw.log.reader import open_log
+from disco_hw.log.records import BeliefChange
 
 ROOT = Path(disco_hw.__file__).parents[1]
 PAGE = ROOT / "docs" / "my-controller.md"
 ROBOT = ROOT / "disco_hw" / "robots" / "wombot.toml"
+GOOD_POSES = "[pose]\nrate_hz = 25.0\nposition_std_m = 0.005\nyaw_std_rad = 0.01\n"
 
 
 def program(number):
@@ -92,6 +94,17 @@ def test_a_law_that_has_no_answer_for_a_while_stops_the_robot_until_it_has_one(t
     assert any("two finite wheel speeds" in event for event in drive.events)
     with open_log(tmp_path / "mine.mcap") as log:
         assert log.summary().missing_ticks == 0
+
+
+@pytest.mark.parametrize(("pose", "learnt"), [("", False), (GOOD_POSES, True)], ids=["unknown", "good poses"])
+def test_the_geometry_is_learnt_where_the_real_robot_would_learn_it(tmp_path, pose, learnt):
+    robot, log = tmp_path / "robot.toml", tmp_path / "log.mcap"
+    text = ROBOT.read_text("utf-8").replace("wombot_model.toml", str(ROBOT.with_name("wombot_model.toml")))
+    robot.write_text(f"{text}\n{pose}", encoding="utf-8")
+    drive_virtual(robot, lambda *_: (2.0, 4.0), 4.0, log=log)
+    with open_log(log) as opened:
+        sources = {record.source for *_, record in opened.records() if isinstance(record, BeliefChange)}
+    assert ("adapted" in sources) == learnt
 
 
 def test_a_robot_with_another_controller_and_other_poses_is_played_too(tmp_path):
