@@ -158,7 +158,11 @@ def refuse_beside_a_daemon(config: RobotConfig) -> None:
 
 def _model_check(setup: Setup) -> Check:
     if setup.model_file is None:
-        return Check("model", Level.WARNING, "none is named: plans use the nominal geometry and the whole prior")
+        text = (
+            "none is named: plans use the nominal geometry and the whole prior, so that the robot may go at half the "
+            "task's speed; `disco-hw infer` makes one of a log"
+        )
+        return Check("model", Level.WARNING, text)
     effects = ", ".join(effect.name for effect in setup.model.effects) or "none"
     return Check("model", Level.OK, f"{setup.model_file}, effects: {effects}")
 
