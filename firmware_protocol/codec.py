@@ -13,12 +13,12 @@ import zlib
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import msgspec
 
 from firmware_protocol import protection
-from firmware_protocol.protection import data_id
+from firmware_protocol.protection import EncodedFrame, data_id
 
 if TYPE_CHECKING:
     import cantools.database.can
@@ -178,13 +178,6 @@ _MAX_DATA = 8
 PROTOCOL = packaged_protocol()
 PROTOCOL_MAJOR = PROTOCOL.major
 PROTOCOL_MINOR = PROTOCOL.minor
-
-
-class EncodedFrame(NamedTuple):
-    """A frame ready for any medium."""
-
-    can_id: int
-    data: bytes
 
 
 class Decoded(msgspec.Struct, frozen=True, gc=False):

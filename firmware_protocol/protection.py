@@ -16,10 +16,7 @@ import binascii
 import enum
 import re
 import struct
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from firmware_protocol.codec import Codec, EncodedFrame
+from typing import NamedTuple, Protocol
 
 COUNTER_MODULUS = 16
 QUALIFY_AFTER = 3
@@ -33,6 +30,20 @@ MAC_LENGTH = 6
 REMEMBERED_NONCES = 8
 PROVED = ("WHEEL_COMMAND", "HOST_STATE", "PARAM_REQUEST")
 _KEY = re.compile(rf"[0-9a-fA-F]{{{2 * KEY_LENGTH}}}")
+
+
+class EncodedFrame(NamedTuple):
+    """A frame ready for any medium."""
+
+    can_id: int
+    data: bytes
+
+
+class MessageNames(Protocol):
+    """What proving frames needs of a codec."""
+
+    def can_id(self, name: str) -> int:
+        """The identifier of a message's frames."""
 
 
 def _crc_table() -> bytes:
@@ -171,7 +182,7 @@ def truncated_mac(key: bytes, nonce: bytes, freshness: int, frame: EncodedFrame)
 class Prover:
     """Proves frames to one robot; pure. Without a nonce from the robot nothing can be proved."""
 
-    def __init__(self, key: bytes, codec: Codec) -> None:
+    def __init__(self, key: bytes, codec: MessageNames) -> None:
         """`key`: 16 bytes."""
         # The library is loaded here, and not with the first command in the loop.
         aes_cmac(key, b"")

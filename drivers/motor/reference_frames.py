@@ -20,8 +20,8 @@ from drivers.types import (
     RobotLinkHealth,
     WheelSample,
 )
-from firmware_protocol.codec import PROTOCOL, Codec, Decoded, DecodeFault, EncodedFrame, FaultReason
-from firmware_protocol.protection import COUNTER_MODULUS, E2EReceiver, E2EStatus, Prover
+from firmware_protocol.codec import PROTOCOL, Codec, Decoded, DecodeFault, FaultReason
+from firmware_protocol.protection import COUNTER_MODULUS, E2EReceiver, E2EStatus, EncodedFrame, Prover
 
 TIMEOUT_NS = 500_000_000
 SLOW_TIMEOUT_NS = 5_000_000_000

@@ -5,8 +5,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from firmware_protocol import _firmware
-from firmware_protocol.codec import Codec, EncodedFrame
-from firmware_protocol.protection import PROVED, Prover, aes_cmac, parse_key, truncated_mac
+from firmware_protocol.codec import Codec
+from firmware_protocol.protection import PROVED, EncodedFrame, Prover, aes_cmac, parse_key, truncated_mac
 
 ffi, lib = _firmware.ffi, _firmware.lib
 CODEC = Codec()

@@ -7,8 +7,8 @@ import pytest
 
 from firmware_protocol import _firmware
 from firmware_protocol.build_firmware import PACKAGE
-from firmware_protocol.codec import PROTOCOL, Codec, EncodedFrame
-from firmware_protocol.protection import Prover, challenge_answer, crc8
+from firmware_protocol.codec import PROTOCOL, Codec
+from firmware_protocol.protection import EncodedFrame, Prover, challenge_answer, crc8
 from firmware_protocol.serial_framing import encode_frame
 from firmware_protocol.status_codes import FAULTS
 
