@@ -5,6 +5,7 @@ A search that begins without a delay of 0.3 s does not find it: it takes what th
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -12,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.gap.settings import GridSettings
+from disco_hw.jit import kernel_function, scalar_function
 from disco_hw.log.drive import Poses, Wheels
 
 Array = NDArray[np.float64]
@@ -20,6 +22,8 @@ Index = NDArray[np.int64]
 _ROUNDS = 4
 # Finer than any pose is measured; keeps a log without any noise finite.
 _LEAST_SQUARE = 1e-10
+# A column of which the other one leaves less than this share of its square says nothing of its own.
+_LEAST_OWN = 1e-12
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,16 +174,17 @@ def _misfits(wheels: Wheels, poses: Poses, delays: Array, settings: GridSettings
     way += (poses.y_m[after] - poses.y_m[before]) * np.sin(heading)
     begin, end = _bounds(wheels, poses.segment[before])
     for place, delay in enumerate(delays):
-        start, stop = poses.t_s[before] - delay, poses.t_s[after] - delay
-        known = (start >= begin) & (stop <= end)
+        t_s = poses.t_s - delay
+        known = (t_s[before] >= begin) & (t_s[after] <= end)
         if np.count_nonzero(known) < settings.fewest_poses:
             continue
+        first, last = before[known], after[known]
         left, right = (
-            np.interp(stop[known], wheels.t_s, angle) - np.interp(start[known], wheels.t_s, angle)
-            for angle in (wheels.left_angle_rad, wheels.right_angle_rad)
+            at[last] - at[first]
+            for at in (np.interp(t_s, wheels.t_s, angle) for angle in (wheels.left_angle_rad, wheels.right_angle_rad))
         )
-        columns = np.column_stack([right - left, right + left])
-        misfit[place] = _misfit(columns, turn[known]) + _misfit(columns, way[known])
+        difference, total = right - left, right + left
+        misfit[place] = sum(_misfit(difference, total, measured[known]) for measured in (turn, way))
     return misfit
 
 
@@ -204,16 +209,43 @@ def _bounds(wheels: Wheels, segment: Index) -> tuple[Array, Array]:
     return begin[at], end[at]
 
 
-def _misfit(columns: Array, measured: Array) -> float:
-    """Minus the log likelihood per sample of a robust regression whose variance is unknown."""
-    weight = np.ones(measured.size)
+@scalar_function
+def _projected(aa: float, ab: float, bb: float, ay: float, by: float) -> tuple[float, float]:
+    """Coefficients of two columns by normal equations, `aa` not the smaller; of the second 0 where they are alike."""
+    if aa == 0.0:
+        return 0.0, 0.0
+    own = bb - ab * ab / aa
+    second = (by - ab * ay / aa) / own if own > _LEAST_OWN * aa else 0.0
+    return (ay - ab * second) / aa, second
+
+
+@kernel_function
+def _misfit(difference: Array, total: Array, measured: Array) -> float:
+    """Minus the log likelihood per sample of a robust regression on two columns (n,) whose variance is unknown."""
+    count = measured.shape[0]
+    left = np.zeros(count)
+    limit = math.inf
     for _ in range(_ROUNDS):
-        fitted = np.linalg.lstsq(columns * weight[:, None], measured * weight, rcond=None)[0]
-        left = np.abs(measured - columns @ fitted)
-        limit = 2.0 * 1.4826 * float(np.median(left)) + 1e-9
-        weight = np.sqrt(np.minimum(1.0, limit / np.maximum(left, 1e-12)))
-    loss = np.where(left < limit, left**2, limit * (2.0 * left - limit))
-    return 0.5 * float(np.log(loss.mean() + _LEAST_SQUARE))
+        aa = ab = bb = ay = by = 0.0
+        for k in range(count):
+            a, b, y = difference[k], total[k], measured[k]
+            weight = min(1.0, limit / max(left[k], 1e-12))
+            aa += weight * a * a
+            ab += weight * a * b
+            bb += weight * b * b
+            ay += weight * a * y
+            by += weight * b * y
+        if aa >= bb:
+            of_a, of_b = _projected(aa, ab, bb, ay, by)
+        else:
+            of_b, of_a = _projected(bb, ab, aa, by, ay)
+        for k in range(count):
+            left[k] = abs(measured[k] - of_a * difference[k] - of_b * total[k])
+        limit = 2.0 * 1.4826 * np.median(left) + 1e-9
+    loss = 0.0
+    for k in range(count):
+        loss += left[k] * left[k] if left[k] < limit else limit * (2.0 * left[k] - limit)
+    return 0.5 * math.log(loss / count + _LEAST_SQUARE)
 
 
 def _vertex(values: Array, least: int) -> float:
