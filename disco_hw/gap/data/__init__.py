@@ -128,7 +128,16 @@ WHEEL_MOTION = tuple(name for name in _IN_STEP if REGISTRY[name].channel is Chan
 BODY_MOTION = tuple(name for name in _IN_STEP if REGISTRY[name].channel is Channel.WHEEL_TO_BODY)
 DELAYED_BY = DELAY.columns[0]
 # What the encoders count wrong, in either channel's vector.
-ENCODER_COLUMNS = tuple(column for effect in in_stages(Stage.ENCODERS) for column in effect.columns)
+_ENCODERS = in_stages(Stage.ENCODERS)
+ENCODER_COLUMNS = tuple(column for effect in _ENCODERS for column in effect.columns)
+_POSE_TIME, _POSE, _WORLD = in_stages(Stage.POSE_TIME), in_stages(Stage.POSE), in_stages(Stage.WORLD)
+_ASKED = {effect.name: asks_for(effect.plain) for effect in (*_ENCODERS, *_POSE_TIME, *_POSE, *_WORLD)}
+_SENSED = np.array(
+    [
+        *range(BASE_COUNT),
+        *(BODY.place[column] for effect in (*_POSE_TIME, *_POSE, *_WORLD) for column in effect.columns),
+    ]
+)
 
 
 class PoseSensor(NamedTuple):
@@ -146,12 +155,19 @@ class PoseSensor(NamedTuple):
 
 def pose_sensor(p: Array) -> PoseSensor:
     """The sensor of a vector in the order of `BODY.columns`."""
-    late_s = -sum(float(_plain(BODY, p, effect, time_s=0.0)) for effect in in_stages(Stage.POSE_TIME))
+    return _sensor(tuple(p[_SENSED].tolist()))
+
+
+@lru_cache(maxsize=512)
+def _sensor(values: tuple[float, ...]) -> PoseSensor:
+    p = BODY.neutral.copy()
+    p[_SENSED] = values
+    late_s = -sum(float(_plain(BODY, p, effect, time_s=0.0)) for effect in _POSE_TIME)
     mount = 0.0, 0.0, 0.0
-    for effect in in_stages(Stage.POSE):
+    for effect in _POSE:
         mount = _plain(BODY, p, effect, x=mount[0], y=mount[1], yaw=mount[2])
     drift = 0.0, 0.0
-    for effect in in_stages(Stage.WORLD):
+    for effect in _WORLD:
         moving = {"wheel_sum": _FAST_RAD_S, "difference": 0.0, "time_s": 0.0}
         drift = _plain(BODY, p, effect, x=drift[0], y=drift[1], **moving)
     return PoseSensor(late_s, *(float(each) for each in (*mount, *drift)))
@@ -160,7 +176,7 @@ def pose_sensor(p: Array) -> PoseSensor:
 def counted(layout: Layout, p: Array) -> tuple[float, float]:
     """How many turns the left and right encoder count for one of their wheel."""
     turns = 1.0, 1.0
-    for effect in in_stages(Stage.ENCODERS):
+    for effect in _ENCODERS:
         turns = _plain(layout, p, effect, left=turns[0], right=turns[1])
     return float(turns[0]), float(turns[1])
 
@@ -169,7 +185,7 @@ def _plain(layout: Layout, p: Array, effect: Effect, **motion: float) -> Any:
     """What an effect makes of the motion in a second, at a vector."""
     known = {"values": tuple(p[_SPANS[layout.of_wheels][effect.name]].tolist()), "step_s": 1.0, **motion}
     known["geometry"] = tuple(p[:BASE_COUNT].tolist())
-    return effect.plain(**{name: known[name] for name in asks_for(effect.plain)})
+    return effect.plain(**{name: known[name] for name in _ASKED[effect.name]})
 
 
 def wheel_effects(p: Array, geometry: Array) -> Coefficients:
