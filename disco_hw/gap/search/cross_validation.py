@@ -10,6 +10,7 @@ import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from disco_hw.gap.data import BASE_COUNT, ENCODER_COLUMNS
@@ -190,26 +191,24 @@ def judged_horizon_s(channel: BodyChannel, poses: tuple[Array, Array]) -> float:
 
 def regimes_driven(channel: BodyChannel | WheelChannel, node: Index, ahead: int) -> list[str]:
     """What the robot mostly does between start and end."""
+    if not node.size:
+        return []
     drive, p, settings = channel.drive, channel.geometry, channel.settings.prediction
     v = 0.5 * p[0] * drive.speed_rad_s.sum(axis=1)
     omega = p[0] / p[1] * (drive.speed_rad_s[:, 1] - drive.speed_rad_s[:, 0])
     size = np.concatenate([[0.0], np.cumsum(np.abs(v))])
     turn = np.concatenate([[0.0], np.cumsum(np.abs(omega))])
     signed = np.concatenate([[0.0], np.cumsum(v)])
-    out = []
-    for k in node:
-        mean, mean_turn = (size[k + ahead] - size[k]) / ahead, (turn[k + ahead] - turn[k]) / ahead
-        if mean < settings.standing_m_s and mean_turn < settings.standing_rad_s:
-            out.append("standstill")
-        elif mean < settings.standing_m_s * 3 and mean_turn > settings.spinning_rad_s:
-            out.append("turning on the spot")
-        elif float(np.ptp(v[k : k + ahead])) > settings.speeding_m_s2 * ahead * GRID_STEP_S * 0.5:
-            out.append("speeding up and braking")
-        elif mean_turn > settings.turning_rad_s:
-            out.append("curves")
-        else:
-            out.append("straight back" if signed[k + ahead] < signed[k] else "straight ahead")
-    return out
+    mean, mean_turn = (size[node + ahead] - size[node]) / ahead, (turn[node + ahead] - turn[node]) / ahead
+    changed = np.ptp(sliding_window_view(v, ahead)[node], axis=1)
+    regimes = {
+        "standstill": (mean < settings.standing_m_s) & (mean_turn < settings.standing_rad_s),
+        "turning on the spot": (mean < settings.standing_m_s * 3) & (mean_turn > settings.spinning_rad_s),
+        "speeding up and braking": changed > settings.speeding_m_s2 * ahead * GRID_STEP_S * 0.5,
+        "curves": mean_turn > settings.turning_rad_s,
+        "straight back": signed[node + ahead] < signed[node],
+    }
+    return [str(name) for name in np.select(list(regimes.values()), list(regimes), "straight ahead")]
 
 
 def chain_track(body: BodyChannel, wheels: WheelChannel | None, chain: Chain) -> tuple[Array, Array]:
