@@ -320,8 +320,7 @@ def best_term(small: Fit, channel: ResidualChannel, options: Iterator[Term]) -> 
     core, held = channel.split(small.vector)
     inner = channel.inner
     base = inner.residual(core, held)
-    normal, gradient = small.information(), small.jacobian.T @ small.residual
-    solved = inverse(normal)
+    solved, gradient = inverse(small.information()), small.gradient
     for term in options:
         tried += 1
         size = float(np.sqrt((term.perturbation**2).mean()))

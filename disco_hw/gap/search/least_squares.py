@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,21 +21,36 @@ Index = NDArray[np.int64]
 class Fit:
     """A fitted parameter vector.
 
-    `cost` is half the sum of squares; `jacobian` (n, A) over the `active` entries, derivative of the residual;
-    `precision` (A,) of what was expected of them, none if nothing was.
+    `cost` is half the sum of squares; `slope` (n, A) over the `active` entries, derivative of the residual, or what
+    gives it when it is asked for; `precision` (A,) of what was expected of them, none if nothing was.
     """
 
     vector: Array
     active: tuple[int, ...]
     cost: float
     residual: Array
-    jacobian: Array
+    slope: Array | Callable[[], Array]
     precision: Array | None = None
+
+    # Most fits only compete by their cost: nobody ever asks for their derivatives.
+    @cached_property
+    def jacobian(self) -> Array:
+        """Derivative of the residual with respect to the active entries, (n, A)."""
+        return self.slope() if callable(self.slope) else self.slope
+
+    @cached_property
+    def normal(self) -> Array:
+        """Normal matrix, (A, A), of the residuals alone."""
+        return np.asarray(self.jacobian.T @ self.jacobian)
+
+    @cached_property
+    def gradient(self) -> Array:
+        """Derivative of the cost, (A,)."""
+        return np.asarray(self.jacobian.T @ self.residual)
 
     def information(self) -> Array:
         """Normal matrix, (A, A), with what was expected."""
-        normal = np.asarray(self.jacobian.T @ self.jacobian)
-        return normal if self.precision is None else normal + np.diag(self.precision)
+        return self.normal if self.precision is None else self.normal + np.diag(self.precision)
 
     def covariance(self) -> Array:
         """Covariance of the active entries under the noise model, (A, A); pseudo-inverse where nothing is known."""
@@ -60,11 +76,22 @@ def known(part: Array, whole: Array, settings: FitSettings) -> NDArray[np.bool_]
 
 
 def jacobian(
-    residual: Callable[[Array], Array], vector: Array, active: tuple[int, ...], layout: Layout, base: Array
+    residual: Callable[[Array], Array],
+    vector: Array,
+    active: tuple[int, ...],
+    layout: Layout,
+    base: Array,
+    known: Mapping[int, Array] | None = None,
 ) -> Array:
-    """Derivative of the residual by differences within bounds, (n, A); `base` is the residual at `vector`."""
+    """Derivative of the residual by differences within bounds, (n, A); `base` is the residual at `vector`.
+
+    `known`: columns (n,) of entries for which they were taken before, at the same vector.
+    """
     out = np.empty((base.size, len(active)))
     for place, index in enumerate(active):
+        if known is not None and index in known:
+            out[:, place] = known[index]
+            continue
         moved = vector.copy()
         moved[index] += layout.step[index]
         if moved[index] > layout.high[index]:
@@ -85,11 +112,13 @@ def solve(slope: Array, gradient: Array) -> Array:
 
 def fit(
     channel: ResidualChannel,
-    start: Array,
+    start: Array | Fit,
     active: tuple[int, ...],
     iterations: int | None = None,
 ) -> Fit:
     """Fit the `active` entries from `start`; what a log does not determine stays near what is expected.
+
+    A start that is a fit of the same channel lends what it knows of where it ended.
 
     Levenberg-Marquardt within bounds (Marquardt, 1963); `iterations` as in the settings unless said.
     """
@@ -104,13 +133,17 @@ def fit(
         return cost + 0.5 * float(precision @ (vector[chosen] - expected) ** 2) if held else cost
 
     residual = channel.residual
-    vector = start.copy()
-    now = residual(vector)
+    if isinstance(start, Fit):
+        vector, now = start.vector, start.residual
+        known_columns = dict(zip(start.active, start.jacobian.T, strict=True))
+    else:
+        vector, now, known_columns = start.copy(), residual(start), {}
     cost = total(now, vector)
-    slope = jacobian(residual, vector, active, layout, now)
+    slope: Array | Callable[[], Array] = partial(jacobian, residual, vector, active, layout, now, known_columns)
     damping = 1e-3
     most = channel.settings.fit.iterations if iterations is None else iterations
     for _ in range(most if active else 0):
+        slope = slope() if callable(slope) else slope
         normal, gradient = slope.T @ slope, slope.T @ now
         if held:
             normal, gradient = normal + np.diag(precision), gradient + precision * (vector[chosen] - expected)
@@ -129,9 +162,10 @@ def fit(
                 damping = max(damping * 0.1, 1e-9)
                 break
             damping *= 10.0
-        if better or damping < 1.0:
-            slope = jacobian(residual, vector, active, layout, now)
-        if not better or gained < channel.settings.fit.enough_nats:
+        if not better:
+            break
+        slope = partial(jacobian, residual, vector, active, layout, now)
+        if gained < channel.settings.fit.enough_nats:
             break
     return Fit(vector, active, 0.5 * float(now @ now), now, slope, precision if held else None)
 

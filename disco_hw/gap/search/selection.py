@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.gap.noise.channels import ResidualChannel
-from disco_hw.gap.search.least_squares import Fit, by_block, fit, inverse, known, sensitivity, solve
+from disco_hw.gap.search.least_squares import Fit, by_block, fit, inverse, known, sensitivity
 from disco_hw.gap.search.richest_model import CANDIDATES, Candidate, candidates_of, indices, parameters_of
 from disco_hw.gap.settings import SelectionSettings
 
@@ -158,7 +158,7 @@ class Selector:
         if new.profile is not None:
             return self._profiled(parent, active, new)
         if new.starts is None:
-            return fit(channel, parent.vector, active)
+            return fit(channel, parent, active)
         tried = []
         places = [layout.place[column] for column in new.columns]
         for values in new.starts(channel):
@@ -166,15 +166,15 @@ class Selector:
             vector[places] = values
             tried.append(fit(channel, vector, active, 2))
         if not tried:
-            return fit(channel, parent.vector, active)
-        return fit(channel, min(tried, key=lambda option: option.cost).vector, active)
+            return fit(channel, parent, active)
+        return fit(channel, min(tried, key=lambda option: option.cost), active)
 
     def _profiled(self, parent: Fit, active: tuple[int, ...], new: Candidate) -> Fit:
         """Search the profiled entry by its linear gain, then closer around the best, then refit everything."""
         assert new.profile is not None
         values = new.profile.values(self.channel)
         if not values:
-            return fit(self.channel, parent.vector, active)
+            return fit(self.channel, parent, active)
         gains = {value: self._linear_gain(parent, new, value) for value in values}
         spacing = values[1] - values[0]
 
@@ -188,7 +188,7 @@ class Selector:
 
         closer(lambda value: self._linear_gain(parent, new, value), spacing)
         best = max(gains, key=gains.__getitem__)
-        found = self._at(parent.vector, active, new, best)
+        found = self._at(parent, active, new, best)
         if parent.cost - found.cost < self.settings.worth_fitting_nats:
             return found
         refined = {best: found}
@@ -201,11 +201,15 @@ class Selector:
         return min(refined.values(), key=lambda option: option.cost)
 
     def _at(
-        self, start: Array, active: tuple[int, ...], new: Candidate, value: float, iterations: int | None = None
+        self, start: Array | Fit, active: tuple[int, ...], new: Candidate, value: float, iterations: int | None = None
     ) -> Fit:
+        """Fit from a vector, or from the fit of a set without the new effect, with the profiled entry at a value."""
         assert new.profile is not None
-        vector = start.copy()
+        vector = (start.vector if isinstance(start, Fit) else start).copy()
         vector[self.channel.layout.place[new.profile.column]] = value
+        if isinstance(start, Fit) and self._neutral(start, new):
+            # When something that is not there begins does not matter.
+            return fit(self.channel, replace(start, vector=vector, slope=start.jacobian), active, iterations)
         return fit(self.channel, vector, active, iterations)
 
     def _linear_gain(self, parent: Fit, new: Candidate, value: float | None = None) -> float:
@@ -215,16 +219,15 @@ class Selector:
         if value is not None and new.profile is not None:
             vector = vector.copy()
             vector[layout.place[new.profile.column]] = value
-            # When something that is not there begins does not matter.
             if not self._neutral(parent, new):
                 residual = channel.residual(vector)
         places = tuple(layout.place[column] for column in new.columns)
         columns = sensitivity(channel, vector, places, residual)
-        slope = np.column_stack([parent.jacobian, columns])
-        if not slope.shape[1]:
-            return parent.cost - 0.5 * float(residual @ residual)
-        gradient = slope.T @ residual
-        return parent.cost - 0.5 * float(residual @ residual) + 0.5 * float(gradient @ solve(slope, gradient))
+        gradient = parent.gradient if residual is parent.residual else parent.jacobian.T @ residual
+        gradient = np.concatenate([gradient, columns.T @ residual])
+        across = parent.jacobian.T @ columns
+        normal = np.block([[parent.normal, across], [across.T, columns.T @ columns]])
+        return parent.cost - 0.5 * float(residual @ residual) + 0.5 * float(gradient @ inverse(normal) @ gradient)
 
     def _neutral(self, parent: Fit, new: Candidate) -> bool:
         """Whether an effect with other parameters than the profiled one does nothing at a fit."""

@@ -106,7 +106,7 @@ def test_what_a_fold_knows_nothing_about_is_not_in_its_prediction():
     elsewhere = (channel.block // round(DEFAULT_SETTINGS.prediction.fold_s / DEFAULT_SETTINGS.grid.block_s)) % 2 == 1
     slope = found.jacobian.copy()
     slope[elsewhere, column] *= 1e-6
-    vectors = fold_vectors(replace(found, jacobian=slope), channel.block, channel.neutral, DEFAULT_SETTINGS)
+    vectors = fold_vectors(replace(found, slope=slope), channel.block, channel.neutral, DEFAULT_SETTINGS)
     assert vectors[0][place] == 0.0
     assert vectors[1][place] == pytest.approx(0.1, rel=0.2)
 
