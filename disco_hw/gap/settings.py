@@ -138,6 +138,9 @@ class FitSettings:
     """Steps of Levenberg-Marquardt at most. Chosen: nearly all fits end before."""
     enough_nats: float = 0.02
     """A step that gains less is the last one. Chosen."""
+    promised_share: float = 0.25
+    """Of fits that only compete, a step that gains what was promised within this share takes the derivatives along.
+    Chosen: the next step then errs by about its square."""
     least_known_share: float = 1e-3
     """A part of a log with less of the information about a parameter says nothing of it. Chosen."""
     part_known_share: float = 0.2

@@ -130,7 +130,7 @@ def candidate_evidence(analysis: GapAnalysis) -> tuple[CandidateEvidence, ...]:
         for name in candidates_of(found.channel.layout):
             if name in found.names:
                 rest = tuple(other for other in found.names if other != name)
-                gain, verdict = selector.fit(rest).cost - found.fit.cost, "accepted"
+                gain, verdict = selector.exact(rest).cost - found.fit.cost, "accepted"
                 score = 0.0 if name in selector.given else selector.evidence(rest, found.names).score
             else:
                 price = 0.5 * parameters_of((name,)) * math.log(max(found.channel.count, 2))

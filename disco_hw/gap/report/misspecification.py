@@ -134,7 +134,7 @@ def disputed_names(found: ChannelResult) -> dict[str, str]:
 def _gain(found: ChannelResult, name: str) -> float:
     """What a name is worth in nats, the others kept."""
     rest = tuple(other for other in found.names if other != name)
-    return found.selector.fit(rest).cost - found.fit.cost
+    return found.selector.exact(rest).cost - found.fit.cost
 
 
 def _takes_little(found: ChannelResult, name: str) -> str | None:

@@ -66,13 +66,13 @@ class ChannelResult:
     @property
     def fit(self) -> Fit:
         """The fit of the accepted effects and terms."""
-        return self.selector.fit(self.names)
+        return self.selector.exact(self.names)
 
     @property
     def base(self) -> Fit:
         """The fit without anything that is missing."""
         selector = self.plain or self.selector
-        return selector.fit(selector.given)
+        return selector.exact(selector.given)
 
 
 def wheel_moves(channel: WheelChannel, geometry: Array) -> Callable[[Split, Split], float]:
@@ -298,7 +298,7 @@ def with_unnamed(found: ChannelResult, options: Callable[[ChannelResult], Iterat
         terms = (*terms, best)
         names = selector.select()
         proofs = (*proofs, proof)
-        coefficients = selector.fit(names).vector[-len(terms) :].tolist()
+        coefficients = selector.exact(names).vector[-len(terms) :].tolist()
         accepted = tuple(
             UnnamedTerm(term.form.format(coefficient), evidence, term)
             for term, coefficient, evidence in zip(terms, coefficients, proofs, strict=True)

@@ -22,7 +22,8 @@ class Fit:
     """A fitted parameter vector.
 
     `cost` is half the sum of squares; `slope` (n, A) over the `active` entries, derivative of the residual, or what
-    gives it when it is asked for; `precision` (A,) of what was expected of them, none if nothing was.
+    gives it when it is asked for; `precision` (A,) of what was expected of them, none if nothing was. `loose`: whether
+    it was fitted only as closely as it takes to compete.
     """
 
     vector: Array
@@ -31,6 +32,7 @@ class Fit:
     residual: Array
     slope: Array | Callable[[], Array]
     precision: Array | None = None
+    loose: bool = False
 
     # Most fits only compete by their cost: nobody ever asks for their derivatives.
     @cached_property
@@ -115,10 +117,13 @@ def fit(
     start: Array | Fit,
     active: tuple[int, ...],
     iterations: int | None = None,
+    loose: bool = False,
 ) -> Fit:
     """Fit the `active` entries from `start`; what a log does not determine stays near what is expected.
 
-    A start that is a fit of the same channel lends what it knows of where it ended.
+    A start that is a fit of the same channel lends what it knows of where it ended. A `loose` fit takes derivatives
+    along where a step gained what it promised, by the least change that agrees with it (Broyden, 1965); its cost is
+    good to a small part of a nat.
 
     Levenberg-Marquardt within bounds (Marquardt, 1963); `iterations` as in the settings unless said.
     """
@@ -140,9 +145,9 @@ def fit(
         vector, now, known_columns = start.copy(), residual(start), {}
     cost = total(now, vector)
     slope: Array | Callable[[], Array] = partial(jacobian, residual, vector, active, layout, now, known_columns)
-    damping = 1e-3
-    most = channel.settings.fit.iterations if iterations is None else iterations
-    for _ in range(most if active else 0):
+    damping, carried = 1e-3, False
+    settings = channel.settings.fit
+    for _ in range((settings.iterations if iterations is None else iterations) if active else 0):
         slope = slope() if callable(slope) else slope
         normal, gradient = slope.T @ slope, slope.T @ now
         if held:
@@ -150,6 +155,7 @@ def fit(
         scale = np.maximum(np.diag(normal), 1e-12 * max(float(np.max(np.diag(normal))), 1e-30))
         better = False
         gained = 0.0
+        before, was = vector, now
         for _ in range(6):
             step = -np.linalg.solve(normal + np.diag(damping * scale + 1e-300), gradient)
             trial = vector.copy()
@@ -162,12 +168,33 @@ def fit(
                 damping = max(damping * 0.1, 1e-9)
                 break
             damping *= 10.0
-        if not better:
+        if better:
+            step = (vector - before)[chosen]
+            carried = loose and _as_promised(gained, gradient, normal, step, settings)
+        elif carried:
+            # Derivatives that were taken along may lead nowhere.
+            carried, damping = False, 1e-3
+        else:
             break
+        taken = partial(jacobian, residual, vector, active, layout, now)
+        slope = _carried(slope, step, now - was, scale) if carried else taken
+        if better and gained < settings.enough_nats:
+            break
+    if carried:
         slope = partial(jacobian, residual, vector, active, layout, now)
-        if gained < channel.settings.fit.enough_nats:
-            break
-    return Fit(vector, active, 0.5 * float(now @ now), now, slope, precision if held else None)
+    return Fit(vector, active, 0.5 * float(now @ now), now, slope, precision if held else None, loose)
+
+
+def _as_promised(gained: float, gradient: Array, normal: Array, step: Array, settings: FitSettings) -> bool:
+    """Whether a step (A,) gained about what derivatives at its beginning promised, and so hardly changed them."""
+    promised = -float(gradient @ step + 0.5 * step @ normal @ step)
+    return abs(gained - promised) < settings.promised_share * promised
+
+
+def _carried(slope: Array, step: Array, change: Array, scale: Array) -> Array:
+    """Derivatives (n, A) that give the `change` (n,) of residuals over a step (A,), and are else as they were."""
+    along = scale * step
+    return np.asarray(slope + np.outer(change - slope @ step, along / float(along @ step)))
 
 
 def by_block(found: Fit, block: Index, blocks_each: int = 1) -> tuple[Array, Array]:

@@ -131,8 +131,15 @@ class Selector:
         """What decides between effects."""
         return self.channel.settings.selection
 
+    def exact(self, names: Names) -> Fit:
+        """The best fit of a set, as close as fits are made: what is told and proved rests on it."""
+        found = self.fit(names)
+        if found.loose:
+            found = self.fits[frozenset(names)] = fit(self.channel, found, found.active)
+        return found
+
     def fit(self, names: Names) -> Fit:
-        """The best fit of a set, started from the best smaller ones known."""
+        """The best fit of a set, started from the best smaller ones known; as close as it takes to compete."""
         key = frozenset(names)
         if key not in self.fits:
             if key <= frozenset(self.given):
@@ -149,7 +156,7 @@ class Selector:
 
     def split(self, names: Names) -> Split:
         """Vector of effects of a set's fit, and what its unnamed terms add."""
-        return self.channel.split(self.fit(names).vector)
+        return self.channel.split(self.exact(names).vector)
 
     def _with(self, parent: Fit, names: Names, new: Candidate) -> Fit:
         """Fit `names` from `parent`, which lacks `new`."""
@@ -158,23 +165,22 @@ class Selector:
         if new.profile is not None:
             return self._profiled(parent, active, new)
         if new.starts is None:
-            return fit(channel, parent, active)
+            return fit(channel, parent, active, loose=True)
         tried = []
         places = [layout.place[column] for column in new.columns]
         for values in new.starts(channel):
             vector = parent.vector.copy()
             vector[places] = values
-            tried.append(fit(channel, vector, active, 2))
-        if not tried:
-            return fit(channel, parent, active)
-        return fit(channel, min(tried, key=lambda option: option.cost), active)
+            tried.append(fit(channel, vector, active, 2, loose=True))
+        best = min(tried, key=lambda option: option.cost) if tried else parent
+        return fit(channel, best, active, loose=True)
 
     def _profiled(self, parent: Fit, active: tuple[int, ...], new: Candidate) -> Fit:
         """Search the profiled entry by its linear gain, then closer around the best, then refit everything."""
         assert new.profile is not None
         values = new.profile.values(self.channel)
         if not values:
-            return fit(self.channel, parent, active)
+            return fit(self.channel, parent, active, loose=True)
         gains = {value: self._linear_gain(parent, new, value) for value in values}
         spacing = values[1] - values[0]
 
@@ -209,8 +215,9 @@ class Selector:
         vector[self.channel.layout.place[new.profile.column]] = value
         if isinstance(start, Fit) and self._neutral(start, new):
             # When something that is not there begins does not matter.
-            return fit(self.channel, replace(start, vector=vector, slope=start.jacobian), active, iterations)
-        return fit(self.channel, vector, active, iterations)
+            begin = replace(start, vector=vector, slope=start.jacobian)
+            return fit(self.channel, begin, active, iterations, loose=True)
+        return fit(self.channel, vector, active, iterations, loose=True)
 
     def _linear_gain(self, parent: Fit, new: Candidate, value: float | None = None) -> float:
         """Gain in nats that the candidate promises to first order, from the parent's fit."""
@@ -240,7 +247,7 @@ class Selector:
         key = (frozenset(smaller), frozenset(larger))
         if key not in self.proofs:
             parameters = parameters_of(larger) - parameters_of(smaller)
-            self.proofs[key] = compare(self.fit(smaller), self.fit(larger), self.channel, parameters)
+            self.proofs[key] = compare(self.exact(smaller), self.exact(larger), self.channel, parameters)
         return self.proofs[key]
 
     def acceptable(self, smaller: Names, larger: Names) -> bool:
@@ -370,7 +377,7 @@ class Selector:
         columns = (*candidate.columns, *((candidate.profile.column,) if candidate.profile is not None else ()))
         places = [layout.place[column] for column in columns]
         vector[places] = layout.neutral[places]
-        option, key = fit(self.channel, vector, indices(self.channel, rest)), frozenset(rest)
+        option, key = fit(self.channel, vector, indices(self.channel, rest), loose=True), frozenset(rest)
         if option.cost < self.fit(rest).cost - self.settings.better_nats:
             self.fits[key] = option
             self.proofs = {pair: proof for pair, proof in self.proofs.items() if key not in pair}
