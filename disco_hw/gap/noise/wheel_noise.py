@@ -183,24 +183,31 @@ def _whiten(
     use: Array,
     out: Array,
 ) -> None:
-    for side in range(2):
-        drift = quick = slow = 0.0
-        for k in range(residual.shape[0]):
-            if restart[k]:
-                drift = quick = slow = 0.0
-            else:
-                drift += reach[k, side, 0] * quick + reach[k, side, 1] * slow
-                quick *= decay[k, 0]
-                slow *= decay[k, 1]
-            if not use[k]:
-                out[k, side] = 0.0
-                continue
-            surprise = residual[k, side] - drift
-            # The first sample after a restart only says where the angle starts.
-            out[k, side] = 0.0 if restart[k] else surprise * scale[k, side]
-            drift += gain[k, side, 0] * surprise
-            quick += gain[k, side, 1] * surprise
-            slow += gain[k, side, 2] * surprise
+    # Both wheels in one loop: each one's filter waits for itself, and neither for the other.
+    drift = quick = slow = other_drift = other_quick = other_slow = 0.0
+    for k in range(residual.shape[0]):
+        if restart[k]:
+            drift = quick = slow = other_drift = other_quick = other_slow = 0.0
+        else:
+            drift += reach[k, 0, 0] * quick + reach[k, 0, 1] * slow
+            other_drift += reach[k, 1, 0] * other_quick + reach[k, 1, 1] * other_slow
+            quick *= decay[k, 0]
+            slow *= decay[k, 1]
+            other_quick *= decay[k, 0]
+            other_slow *= decay[k, 1]
+        if not use[k]:
+            out[k, 0] = out[k, 1] = 0.0
+            continue
+        surprise, other = residual[k, 0] - drift, residual[k, 1] - other_drift
+        # The first sample after a restart only says where the angle starts.
+        out[k, 0] = 0.0 if restart[k] else surprise * scale[k, 0]
+        out[k, 1] = 0.0 if restart[k] else other * scale[k, 1]
+        drift += gain[k, 0, 0] * surprise
+        quick += gain[k, 0, 1] * surprise
+        slow += gain[k, 0, 2] * surprise
+        other_drift += gain[k, 1, 0] * other
+        other_quick += gain[k, 1, 1] * other
+        other_slow += gain[k, 1, 2] * other
 
 
 def calm_speeds(dt_s: Array, speed_rad_s: Array, settings: NoiseSettings) -> Array:
