@@ -126,6 +126,8 @@ def _kept(name: str, values: tuple[float, ...], base: tuple[float, ...]) -> tupl
 _IN_STEP = [name for name in MOTION_EFFECTS if REGISTRY[name].stage not in (Stage.DELAY, Stage.WORLD)]
 WHEEL_MOTION = tuple(name for name in _IN_STEP if REGISTRY[name].channel is Channel.COMMAND_TO_WHEEL)
 BODY_MOTION = tuple(name for name in _IN_STEP if REGISTRY[name].channel is Channel.WHEEL_TO_BODY)
+# What holds the response of one wheel to that of the other takes most of the time of a run, also where it is no limit.
+_HOLDING = tuple(name for name in WHEEL_MOTION if REGISTRY[name].stage is Stage.RESPONSE and REGISTRY[name].is_limit)
 DELAYED_BY = DELAY.columns[0]
 # What the encoders count wrong, in either channel's vector.
 _ENCODERS = in_stages(Stage.ENCODERS)
@@ -191,7 +193,8 @@ def _plain(layout: Layout, p: Array, effect: Effect, **motion: float) -> Any:
 def wheel_effects(p: Array, geometry: Array) -> Coefficients:
     """What the model's wheel step needs at a vector of the wheel channel; `geometry` (3,) serves yaw-rate limits."""
     base = tuple(geometry[:BASE_COUNT].tolist())
-    given = {name: _coefficients(WHEEL, p, name, base) for name in WHEEL_MOTION}
+    absent = [name for name in _HOLDING if (p[_SPANS[True][name]] == WHEEL.neutral[_SPANS[True][name]]).all()]
+    given = {name: _coefficients(WHEEL, p, name, base) for name in WHEEL_MOTION if name not in absent}
     made: Coefficients = Effects(**{name: given.get(name) for name in MOTION_EFFECTS})
     return made
 
