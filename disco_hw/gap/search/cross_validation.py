@@ -211,21 +211,33 @@ def regimes_driven(channel: BodyChannel | WheelChannel, node: Index, ahead: int)
     return [str(name) for name in np.select(list(regimes.values()), list(regimes), "straight ahead")]
 
 
-def chain_track(body: BodyChannel, wheels: WheelChannel | None, chain: Chain) -> tuple[Array, Array]:
-    """Free run from commands to the path (M, 3), and wheel speeds (M, 2) on the way."""
+def chain_wheels(body: BodyChannel, wheels: WheelChannel | None, chain: Chain) -> tuple[Array, Array]:
+    """Wheel angles and speeds (M, 2) of a free run from commands; without wheels the measured ones."""
     drive = body.drive
-    p = chain.body.copy()
-    scale = [body.layout.place[column] for column in ENCODER_COLUMNS]
-    perturbation = total_perturbation(drive, 3, drive.known_motion, chain.body_perturbation)
     if wheels is None or chain.wheels is None:
-        return run_body(p, drive.angle_rad, drive.speed_rad_s, perturbation, drive.first, drive.t_s), drive.speed_rad_s
+        return drive.angle_rad, drive.speed_rad_s
     q = chain.wheels.copy()
     q[[wheels.layout.place[column] for column in ENCODER_COLUMNS]] = 0.0
-    p[scale] = 0.0
     # Limits of turning are of the robot's motion: with other wheels they are reached at other wheel speeds.
-    angle = replace(wheels, geometry=p[:BASE_COUNT]).angles(q, chain.wheels_perturbation)
+    angle = replace(wheels, geometry=chain.body[:BASE_COUNT]).angles(q, chain.wheels_perturbation)
     speed = np.gradient(angle, GRID_STEP_S, axis=0)
     speed[drive.first] = 0.0
+    return angle, speed
+
+
+def chain_track(
+    body: BodyChannel, wheels: WheelChannel | None, chain: Chain, turned: tuple[Array, Array] | None = None
+) -> tuple[Array, Array]:
+    """Free run from commands to the path (M, 3), and wheel speeds (M, 2) on the way.
+
+    `turned`: what `chain_wheels` gives, if that is known.
+    """
+    drive = body.drive
+    p = chain.body.copy()
+    angle, speed = chain_wheels(body, wheels, chain) if turned is None else turned
+    if wheels is not None and chain.wheels is not None:
+        p[[body.layout.place[column] for column in ENCODER_COLUMNS]] = 0.0
+    perturbation = total_perturbation(drive, 3, drive.known_motion, chain.body_perturbation)
     return run_body(p, angle, speed, perturbation, drive.first, drive.t_s), speed
 
 

@@ -15,12 +15,13 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.optimize import least_squares
 
-from disco_hw.gap.data import Layout
+from disco_hw.gap.data import BASE_COUNT, Layout
 from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
 from disco_hw.gap.search.cross_validation import (
     Chain,
     Starts,
     chain_track,
+    chain_wheels,
     find_starts,
     judged_horizon_s,
     prediction_error,
@@ -117,9 +118,9 @@ class Ahead:
         every = [(ahead_s, find_starts(body, poses, ahead_s)) for ahead_s in horizons]
         return cls(body, wheels, tuple((ahead_s, starts) for ahead_s, starts in every if starts.node.size))
 
-    def errors(self, chain: Chain) -> list[Array]:
-        """Measured minus predicted poses (K, 3) by horizon."""
-        track, _ = chain_track(self.body, self.wheels, chain)
+    def errors(self, chain: Chain, turned: tuple[Array, Array] | None = None) -> list[Array]:
+        """Measured minus predicted poses (K, 3) by horizon; `turned`: what the wheels do, if that is known."""
+        track, _ = chain_track(self.body, self.wheels, chain, turned)
         return [prediction_error(self.body, starts, chain.body, track, ahead_s) for ahead_s, starts in self.starts]
 
     def usual_cost(self, chain: Chain) -> float:
@@ -139,6 +140,9 @@ class Ahead:
         start, step = of.joined(lambda part: part.vector), of.joined(lambda part: part.layout.step)
         low, high = of.joined(lambda part: part.layout.low), of.joined(lambda part: part.layout.high)
         precision = block_diag(*(part.information for part in of.parts))
+        # Effects of the body leave the wheels alone; its geometry may not.
+        first = np.array(of.parts[0].active)
+        of_body = np.concatenate([first >= BASE_COUNT, np.zeros(step.size - first.size, dtype=bool)])
         root = np.linalg.cholesky(precision + np.diag((_HARDLY / step) ** 2)).T
         values, cost, normal = np.clip(start, low + _INSIDE * step, high - _INSIDE * step), math.inf, root.T @ root
         for _ in range(settings.fit_rounds if any(mask.any() for mask in chosen) else 0):
@@ -147,18 +151,19 @@ class Ahead:
                 for error, mask, share in zip(self.errors(of.chain(of.vectors(values))), chosen, shares, strict=True)
             ]
 
-            def residual(at: Array, units: list[Array] = units) -> Array:
-                errors = zip(self.errors(of.chain(of.vectors(at))), chosen, units, strict=True)
+            def residual(at: Array, units: list[Array] = units, turned: tuple[Array, Array] | None = None) -> Array:
+                errors = zip(self.errors(of.chain(of.vectors(at)), turned), chosen, units, strict=True)
                 return np.asarray(
                     np.hstack([*((e[mask] / unit).ravel() for e, mask, unit in errors), root @ (at - start)])
                 )
 
-            def slope(at: Array, residual: Callable[[Array], Array] = residual) -> Array:
-                base, columns = residual(at), []
+            def slope(at: Array, residual: Callable[..., Array] = residual) -> Array:
+                turned = chain_wheels(self.body, self.wheels, of.chain(of.vectors(at)))
+                base, columns = residual(at, turned=turned), []
                 for place, size in enumerate(np.where(at + step <= high, step, -step)):
                     moved = at.copy()
                     moved[place] += size
-                    columns.append((residual(moved) - base) / size)
+                    columns.append((residual(moved, turned=turned if of_body[place] else None) - base) / size)
                 return np.asarray(np.column_stack(columns))
 
             found = least_squares(
