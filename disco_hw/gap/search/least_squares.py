@@ -23,7 +23,7 @@ class Fit:
 
     `cost` is half the sum of squares; `slope` (n, A) over the `active` entries, derivative of the residual, or what
     gives it when it is asked for; `precision` (A,) of what was expected of them, none if nothing was. `loose`: whether
-    it was fitted only as closely as it takes to compete.
+    it was fitted only as closely as it takes to compete; `carried`: whether its slope is that of a neighbour.
     """
 
     vector: Array
@@ -33,6 +33,7 @@ class Fit:
     slope: Array | Callable[[], Array]
     precision: Array | None = None
     loose: bool = False
+    carried: bool = False
 
     # Most fits only compete by their cost: nobody ever asks for their derivatives.
     @cached_property
@@ -145,7 +146,7 @@ def fit(
         vector, now, known_columns = start.copy(), residual(start), {}
     cost = total(now, vector)
     slope: Array | Callable[[], Array] = partial(jacobian, residual, vector, active, layout, now, known_columns)
-    damping, carried = 1e-3, False
+    damping, carried = 1e-3, isinstance(start, Fit) and start.carried
     settings = channel.settings.fit
     for _ in range((settings.iterations if iterations is None else iterations) if active else 0):
         slope = slope() if callable(slope) else slope

@@ -203,21 +203,25 @@ class Selector:
             centre = min(refined, key=lambda value: refined[value].cost)
             for value in (centre - step, centre + step):
                 if value not in refined:
-                    refined[value] = self._at(refined[centre].vector, active, new, value, 2)
+                    refined[value] = self._at(refined[centre], active, new, value, 2)
         return min(refined.values(), key=lambda option: option.cost)
 
     def _at(
-        self, start: Array | Fit, active: tuple[int, ...], new: Candidate, value: float, iterations: int | None = None
+        self, start: Fit, active: tuple[int, ...], new: Candidate, value: float, iterations: int | None = None
     ) -> Fit:
-        """Fit from a vector, or from the fit of a set without the new effect, with the profiled entry at a value."""
+        """Fit from another fit, with the profiled entry at a value."""
         assert new.profile is not None
-        vector = (start.vector if isinstance(start, Fit) else start).copy()
-        vector[self.channel.layout.place[new.profile.column]] = value
-        if isinstance(start, Fit) and self._neutral(start, new):
+        channel, vector = self.channel, start.vector.copy()
+        vector[channel.layout.place[new.profile.column]] = value
+        begin: Fit | Array = vector
+        if start.active == active:
+            # One of the same set, at a neighbouring value.
+            residual = channel.residual(vector)
+            begin = replace(start, vector=vector, residual=residual, slope=start.jacobian, carried=True)
+        elif self._neutral(start, new):
             # When something that is not there begins does not matter.
             begin = replace(start, vector=vector, slope=start.jacobian)
-            return fit(self.channel, begin, active, iterations, loose=True)
-        return fit(self.channel, vector, active, iterations, loose=True)
+        return fit(channel, begin, active, iterations, loose=True)
 
     def _linear_gain(self, parent: Fit, new: Candidate, value: float | None = None) -> float:
         """Gain in nats that the candidate promises to first order, from the parent's fit."""
