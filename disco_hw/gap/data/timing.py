@@ -215,7 +215,7 @@ def _projected(aa: float, ab: float, bb: float, ay: float, by: float) -> tuple[f
     if aa == 0.0:
         return 0.0, 0.0
     own = bb - ab * ab / aa
-    second = (by - ab * ay / aa) / own if own > _LEAST_OWN * aa else 0.0
+    second = (by - ab * ay / aa) / own if own > _LEAST_OWN * bb else 0.0
     return (ay - ab * second) / aa, second
 
 

@@ -114,3 +114,32 @@ def test_poses_are_compared_over_no_silence_and_no_segment():
     # The first that is 0.3 s later, where that is hardly more than 0.3 s.
     pairs = [each.tolist() for each in timing._pairs(poses, 0.3)]
     assert pairs == [[0, 1], [2, 3]]
+
+
+def by_decomposition(difference, total, measured):
+    """Minus the log likelihood of a sample, of a regression by Huber's weights whose steps are decompositions."""
+    columns, weight = np.column_stack([difference, total]), np.ones(measured.size)
+    for _ in range(4):
+        fitted = np.linalg.lstsq(columns * weight[:, None], measured * weight, rcond=None)[0]
+        left = np.abs(measured - columns @ fitted)
+        limit = 2.0 * 1.4826 * np.median(left) + 1e-9
+        weight = np.sqrt(np.minimum(1.0, limit / np.maximum(left, 1e-12)))
+    return 0.5 * np.log(np.where(left < limit, left**2, limit * (2.0 * left - limit)).mean() + 1e-10)
+
+
+@pytest.mark.parametrize("alike", [1.0, 1e-2, 1e-4, 0.0])
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
+def test_a_regression_by_normal_equations_fits_as_one_by_decomposition(alike, scale):
+    rng = np.random.default_rng(5)
+    total = rng.normal(2.0, 1.0, 300)
+    difference = scale * (0.4 * total + alike * rng.normal(0.0, 1.0, 300))
+    measured = 0.11 * total + 0.05 / scale * difference + 0.01 * rng.normal(0.0, 1.0, 300)
+    measured[::17] += 0.8
+    found = timing._misfit(difference, total, measured)
+    assert found == pytest.approx(by_decomposition(difference, total, measured), abs=1e-8)
+    assert timing._misfit(difference, total, measured + 0.1 * total**2) > found + 0.1
+
+
+def test_wheels_that_do_not_turn_leave_all_that_is_measured():
+    nothing, measured = np.zeros(100), np.random.default_rng(6).normal(0.0, 0.1, 100)
+    assert timing._misfit(nothing, nothing, measured) == pytest.approx(by_decomposition(nothing, nothing, measured))
