@@ -357,13 +357,9 @@ class BodyChannel:
 
 
 def total_perturbation(drive: GriddedDrive, width: int, *perturbations: Array | None) -> Array:
-    """Sum (M, width) of what is added at the nodes by those that are there."""
-    return np.asarray(
-        sum(
-            (perturbation for perturbation in perturbations if perturbation is not None),
-            np.zeros((drive.t_s.size, width)),
-        )
-    )
+    """Sum (M, width) of what is added at the nodes by those that are there; not to be written to."""
+    given = [perturbation for perturbation in perturbations if perturbation is not None]
+    return sum(given[1:], given[0]) if given else np.zeros((drive.t_s.size, width))
 
 
 def _windows(drive: GriddedDrive) -> tuple[Index, Mask]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -184,6 +184,8 @@ class WithTerms:
     inner: WheelChannel | BodyChannel
     terms: tuple[Term, ...]
     layout: Layout
+    # What the terms add with the coefficients that were asked for last.
+    kept: dict[bytes, Array] = field(default_factory=dict, repr=False, compare=False)
 
     @classmethod
     def of(cls, inner: WheelChannel | BodyChannel, terms: tuple[Term, ...]) -> WithTerms:
@@ -235,12 +237,17 @@ class WithTerms:
         return self.inner.trusted_blocks
 
     def split(self, p: Array) -> tuple[Array, Array | None]:
-        """The inner channel's vector, and what the terms add at the nodes."""
+        """The inner channel's vector, and what the terms add at the nodes, not to be written to."""
         width = len(self.inner.layout.columns)
-        perturbation = np.zeros_like(self.terms[0].perturbation)
-        for coefficient, term in zip(p[width:], self.terms, strict=True):
-            perturbation += coefficient * term.perturbation
-        return p[:width], perturbation
+        coefficients = p[width:]
+        key = coefficients.tobytes()
+        if key not in self.kept:
+            perturbation = np.zeros_like(self.terms[0].perturbation)
+            for coefficient, term in zip(coefficients, self.terms, strict=True):
+                perturbation += coefficient * term.perturbation
+            self.kept.clear()
+            self.kept[key] = perturbation
+        return p[:width], self.kept[key]
 
     def residual(self, p: Array) -> Array:
         """Whitened residuals."""
