@@ -141,6 +141,8 @@ class FitSettings:
     promised_share: float = 0.25
     """Of fits that only compete, a step that gains what was promised within this share takes the derivatives along.
     Chosen: the next step then errs by about its square."""
+    enough_carried_nats: float = 0.002
+    """A step with such derivatives that gains less is the last one. Chosen: they make the last steps shorter."""
     least_known_share: float = 1e-3
     """A part of a log with less of the information about a parameter says nothing of it. Chosen."""
     part_known_share: float = 0.2

@@ -135,7 +135,8 @@ def search_wheels(drive: GriddedDrive, geometry: Array, start: Array, given: Nam
     channel = WheelChannel.build(drive, WheelNoise(reading_rad=max(drive.quantum_rad, 2e-4)), geometry)
     moves = wheel_moves(channel, geometry)
     settings = drive.settings.selection
-    rough = Selector(channel, moves, Thresholds(settings.rough_score, 0.0), given=given, start=start)
+    # What is left of a rough fit becomes the noise of all that follow.
+    rough = Selector(channel, moves, Thresholds(settings.rough_score, 0.0), given=given, start=start, closely=True)
     begin = tuple(dict.fromkeys((*given, *LATE)))
     responding(rough, begin)
     names = rough.greedy(begin, responding)
@@ -189,7 +190,7 @@ def search_body(drive: GriddedDrive, start: Array, given: Names = ()) -> Channel
     channel = learn_body_noise(channel, min(nominal, delayed, key=lambda one: one.cost).vector, iterations=4)
     settings = drive.settings.selection
     limits = Thresholds(settings.rough_score, 0.0)
-    rough = Selector(channel, body_moves(channel), limits, given=given, start=nominal.vector)
+    rough = Selector(channel, body_moves(channel), limits, given=given, start=nominal.vector, closely=True)
     names = rough.greedy()
     rich = (*names, *(name for name in smooth_of(BODY) if name not in names))
     vector = fit(channel, rough.fit(names).vector, indices(channel, rich)).vector

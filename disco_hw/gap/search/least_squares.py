@@ -150,12 +150,12 @@ def fit(
     settings = channel.settings.fit
     for _ in range((settings.iterations if iterations is None else iterations) if active else 0):
         slope = slope() if callable(slope) else slope
+        enough_nats = settings.enough_carried_nats if carried else settings.enough_nats
         normal, gradient = slope.T @ slope, slope.T @ now
         if held:
             normal, gradient = normal + np.diag(precision), gradient + precision * (vector[chosen] - expected)
         scale = np.maximum(np.diag(normal), 1e-12 * max(float(np.max(np.diag(normal))), 1e-30))
-        better = False
-        gained = 0.0
+        better, gained = False, 0.0
         before, was = vector, now
         for _ in range(6):
             step = -np.linalg.solve(normal + np.diag(damping * scale + 1e-300), gradient)
@@ -170,16 +170,16 @@ def fit(
                 break
             damping *= 10.0
         if better:
-            step = (vector - before)[chosen]
-            carried = loose and _as_promised(gained, gradient, normal, step, settings)
+            moved = (vector - before)[chosen]
+            carried = loose and _as_promised(gained, gradient, normal, moved, settings)
         elif carried:
             # Derivatives that were taken along may lead nowhere.
             carried, damping = False, 1e-3
         else:
             break
         taken = partial(jacobian, residual, vector, active, layout, now)
-        slope = _carried(slope, step, now - was, scale) if carried else taken
-        if better and gained < settings.enough_nats:
+        slope = _carried(slope, moved, now - was, scale) if carried else taken
+        if better and gained < enough_nats:
             break
     if carried:
         slope = partial(jacobian, residual, vector, active, layout, now)

@@ -115,7 +115,8 @@ class Thresholds:
 class Selector:
     """Fits sets of effects of one channel, each once; `moves` gives how far a fit moves the prediction of another.
 
-    Effects `given` are in from the beginning, with values of `start`.
+    Effects `given` are in from the beginning, with values of `start`. `closely`: whether all sets are fitted as those
+    that are told, and not only as closely as it takes to compete.
     """
 
     channel: ResidualChannel
@@ -123,6 +124,7 @@ class Selector:
     thresholds: Thresholds = Thresholds()
     given: Names = ()
     start: Array | None = None
+    closely: bool = False
     fits: dict[frozenset[str], Fit] = field(default_factory=dict)
     proofs: dict[tuple[frozenset[str], frozenset[str]], EffectEvidence] = field(default_factory=dict)
 
@@ -165,22 +167,22 @@ class Selector:
         if new.profile is not None:
             return self._profiled(parent, active, new)
         if new.starts is None:
-            return fit(channel, parent, active, loose=True)
+            return fit(channel, parent, active, loose=not self.closely)
         tried = []
         places = [layout.place[column] for column in new.columns]
         for values in new.starts(channel):
             vector = parent.vector.copy()
             vector[places] = values
-            tried.append(fit(channel, vector, active, 2, loose=True))
+            tried.append(fit(channel, vector, active, 2, loose=not self.closely))
         best = min(tried, key=lambda option: option.cost) if tried else parent
-        return fit(channel, best, active, loose=True)
+        return fit(channel, best, active, loose=not self.closely)
 
     def _profiled(self, parent: Fit, active: tuple[int, ...], new: Candidate) -> Fit:
         """Search the profiled entry by its linear gain, then closer around the best, then refit everything."""
         assert new.profile is not None
         values = new.profile.values(self.channel)
         if not values:
-            return fit(self.channel, parent, active, loose=True)
+            return fit(self.channel, parent, active, loose=not self.closely)
         gains = {value: self._linear_gain(parent, new, value) for value in values}
         spacing = values[1] - values[0]
 
@@ -214,14 +216,14 @@ class Selector:
         channel, vector = self.channel, start.vector.copy()
         vector[channel.layout.place[new.profile.column]] = value
         begin: Fit | Array = vector
-        if start.active == active:
+        if start.active == active and not self.closely:
             # One of the same set, at a neighbouring value.
             residual = channel.residual(vector)
             begin = replace(start, vector=vector, residual=residual, slope=start.jacobian, carried=True)
         elif self._neutral(start, new):
             # When something that is not there begins does not matter.
             begin = replace(start, vector=vector, slope=start.jacobian)
-        return fit(channel, begin, active, iterations, loose=True)
+        return fit(channel, begin, active, iterations, loose=not self.closely)
 
     def _linear_gain(self, parent: Fit, new: Candidate, value: float | None = None) -> float:
         """Gain in nats that the candidate promises to first order, from the parent's fit."""
@@ -381,7 +383,7 @@ class Selector:
         columns = (*candidate.columns, *((candidate.profile.column,) if candidate.profile is not None else ()))
         places = [layout.place[column] for column in columns]
         vector[places] = layout.neutral[places]
-        option, key = fit(self.channel, vector, indices(self.channel, rest), loose=True), frozenset(rest)
+        option, key = fit(self.channel, vector, indices(self.channel, rest), loose=not self.closely), frozenset(rest)
         if option.cost < self.fit(rest).cost - self.settings.better_nats:
             self.fits[key] = option
             self.proofs = {pair: proof for pair, proof in self.proofs.items() if key not in pair}

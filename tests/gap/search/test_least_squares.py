@@ -1,5 +1,6 @@
 """Least squares within bounds, and normal equations by block."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -98,3 +99,62 @@ def test_blocks_in_any_order_are_each_their_own_and_may_be_taken_together():
     tens = np.arange(T.size) // 40
     pairs = by_block(found, tens, 2)[0]
     np.testing.assert_allclose(pairs, by_block(found, tens)[0].reshape(5, 2, 2, 2).sum(axis=1))
+
+
+def counted(of):
+    """A channel that keeps the vectors at which its residual is asked for."""
+    asked = []
+
+    def residual(p):
+        asked.append(p.copy())
+        return of.residual(p)
+
+    return SimpleNamespace(settings=of.settings, layout=of.layout, residual=residual), asked
+
+
+def test_derivatives_where_a_fit_ends_are_taken_when_they_are_asked_for_and_once():
+    curve, asked = counted(channel((2.0, 0.7), noise=0.1))
+    found = fit(curve, np.array([1.0, 0.5]), (0, 1))
+    before = len(asked)
+    slope = found.jacobian
+    assert len(asked) == before + 2
+    assert found.jacobian is slope
+    np.testing.assert_allclose(slope[:, 0], -np.exp(-found.vector[1] * T), rtol=1e-6)
+    np.testing.assert_allclose(found.gradient, slope.T @ found.residual)
+    assert len(asked) == before + 2
+
+
+def test_what_begins_where_a_fit_ended_asks_for_nothing_that_is_known_there():
+    curve, asked = counted(channel((2.0, 0.7), noise=0.1))
+    size = fit(curve, np.array([1.0, 0.5]), (0,))
+    assert size.jacobian.shape == (T.size, 1)
+    asked.clear()
+    plain = fit(curve, size.vector, (0, 1))
+    of_plain = len(asked)
+    begun = fit(curve, size, (0, 1))
+    # All but the residual at the start and the derivative by the size.
+    assert len(asked) - of_plain == of_plain - 2
+    np.testing.assert_array_equal(begun.vector, plain.vector)
+    assert begun.cost == plain.cost
+
+
+def test_a_loose_fit_comes_as_near_and_asks_for_less():
+    curve, asked = counted(channel((2.0, 0.7), noise=0.1))
+    exact = fit(curve, np.array([1.9, 0.65]), (0, 1))
+    of_exact = len(asked)
+    loose = fit(curve, np.array([1.9, 0.65]), (0, 1), loose=True)
+    assert len(asked) - of_exact < of_exact
+    assert exact.cost <= loose.cost < exact.cost + DEFAULT_SETTINGS.fit.enough_nats
+    assert loose.loose
+    assert not exact.loose
+    # Its derivatives are those where it ends, and not what it was fitted with.
+    np.testing.assert_allclose(loose.jacobian[:, 0], -np.exp(-loose.vector[1] * T), rtol=1e-6)
+
+
+def test_derivatives_that_lead_nowhere_are_taken_anew():
+    curve = channel((2.0, 0.7))
+    start = fit(curve, np.array([0.5, 0.1]), (0, 1), 0)
+    astray = replace(start, slope=-start.jacobian, loose=True, carried=True)
+    found = fit(curve, astray, (0, 1), loose=True)
+    np.testing.assert_allclose(found.vector, [2.0, 0.7], rtol=1e-2)
+    np.testing.assert_allclose(found.jacobian[:, 0], -np.exp(-found.vector[1] * T), rtol=1e-6)

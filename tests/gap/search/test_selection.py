@@ -12,8 +12,8 @@ from disco_hw.gap.data import BODY, WHEEL
 from disco_hw.gap.noise.channels import WheelChannel
 from disco_hw.gap.noise.wheel_noise import WheelNoise
 from disco_hw.gap.search.channel_search import body_moves, wheel_moves
-from disco_hw.gap.search.least_squares import Fit
-from disco_hw.gap.search.richest_model import LATE, Profile, candidates_of
+from disco_hw.gap.search.least_squares import Fit, fit
+from disco_hw.gap.search.richest_model import CANDIDATES, LATE, Profile, candidates_of, indices
 from disco_hw.gap.search.selection import EffectEvidence, Selector, Thresholds
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S
 from tests.gap.synthetic import GEOMETRY, body_channel, line_of
@@ -218,7 +218,7 @@ def test_a_set_is_fitted_again_from_the_larger_one_that_found_better():
     found = selector(turn_slip=0.08, side_slip=0.1)
     both, rest = ("turn_slip", "side_slip"), ("side_slip",)
     good = found.fit(rest)
-    poor = replace(good, cost=good.cost + 50.0)
+    poor = replace(good, cost=good.cost + 50.0, loose=False)
     found.fits[frozenset(rest)] = poor
     found.evidence(rest, both)
     found.evidence((), ("turn_slip",))
@@ -327,3 +327,27 @@ def test_a_set_is_settled_after_every_step_and_the_steps_end_where_nothing_is_ac
     assert found.greedy(settle=lambda of, names: settled.append(names)) == ("side_slip", "turn_slip")
     assert settled == [("side_slip",), ("side_slip", "turn_slip")]
     assert found.greedy(("turn_slip",)) == ("turn_slip", "side_slip")
+
+
+def test_what_is_proved_rests_on_exact_fits_and_what_competes_on_loose_ones():
+    found = selector(turn_slip=0.08)
+    loose = found.fit(("turn_slip",))
+    assert loose.loose
+    found.evidence((), ("turn_slip",))
+    exact = found.fit(("turn_slip",))
+    assert not exact.loose
+    assert found.exact(("turn_slip",)) is exact
+    assert abs(exact.cost - loose.cost) < DEFAULT_SETTINGS.fit.enough_nats
+    assert exact.vector == pytest.approx(loose.vector, rel=1e-3, abs=1e-5)
+
+
+def test_a_scanned_entry_is_fitted_at_a_neighbouring_value_as_from_anywhere():
+    found = selector(surface_change=0.1)
+    (candidate,) = (each for name, each in CANDIDATES.items() if name == "surface_change")
+    active = indices(found.channel, ("surface_change",))
+    near = found._at(found.fit(()), active, candidate, 30.0)
+    begun = found._at(near, active, candidate, 32.0)
+    vector = near.vector.copy()
+    vector[BODY.place["surface_change.time_s"]] = 32.0
+    assert begun.vector[BODY.place["surface_change.time_s"]] == 32.0
+    assert begun.cost == pytest.approx(fit(found.channel, vector, active).cost, abs=0.02)
