@@ -124,3 +124,21 @@ def test_poses_that_are_older_than_their_stamps_have_a_latency_above_zero(late_s
     np.testing.assert_allclose(residual(late_s), 0.0, atol=1e-9)
     assert np.abs(residual(0.0)).max() > 0.1 * abs(late_s)
     assert np.linalg.norm(residual(-late_s)) > 1.5 * np.linalg.norm(residual(0.0))
+
+
+def test_a_limit_that_nothing_comes_near_runs_as_one_that_is_not_there():
+    t_s = np.arange(N) * GRID_STEP_S
+    commands = np.column_stack([4 * np.sin(0.8 * t_s), 6 * np.sign(np.sin(0.5 * t_s)) + 1])
+    columns = ("turning_buildup.limit_rad_s2", "yaw_acceleration_limit.limit_rad_s2")
+
+    def turned(limit):
+        p = WHEEL.neutral.copy()
+        p[WHEEL.place["motor_lag.tau_s"]] = 0.1
+        for column in columns:
+            p[WHEEL.place[column]] = limit
+        geometry, still = np.array(BASE), np.zeros((N, 2))
+        return run_wheels(p, geometry, commands, still, t_s == 0.0, t_s, still)
+
+    absent = turned(WHEEL.neutral[WHEEL.place[columns[0]]])
+    np.testing.assert_allclose(turned(1e5), absent, atol=1e-7)
+    assert np.abs(turned(1.0) - absent).max() > 0.1

@@ -18,6 +18,7 @@ from disco_hw.gap.search.cross_validation import (
     floor_errors,
     fold_vectors,
     judged_horizon_s,
+    regimes_driven,
     smoothed_poses,
     stretches_telling,
     surely_beats,
@@ -172,3 +173,19 @@ def test_without_errors_by_stretch_the_whole_decides():
     # A single stretch has to be better by far.
     assert surely_beats(one, in_stretches([0.25], [0.25]), settings)
     assert not surely_beats(one, in_stretches([0.81], [0.81]), settings)
+
+
+def test_what_the_robot_did_is_told_of_every_start():
+    channel, line = body_channel()
+    node, ahead = np.arange(0, line.t_s.size - 200, 10), 150
+    told = dict(zip(node.tolist(), regimes_driven(channel, node, ahead), strict=True))
+    assert set(told.values()) == {
+        "standstill", "turning on the spot", "speeding up and braking", "curves", "straight ahead", "straight back",
+    }  # fmt: skip
+    # Two seconds each: straight ahead, rest, spin, spin, ahead, arc, arc, back.
+    expected = {
+        20: "straight ahead", 220: "standstill", 420: "turning on the spot", 820: "straight ahead", 1020: "curves",
+        1420: "straight back", 100: "speeding up and braking",
+    }  # fmt: skip
+    assert {start: told[start] for start in expected} == expected
+    assert regimes_driven(channel, node[:0], ahead) == []

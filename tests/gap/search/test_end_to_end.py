@@ -7,11 +7,12 @@ import pytest
 
 from disco_hw.gap import offered_stage
 from disco_hw.gap.data import BODY, WHEEL
-from disco_hw.gap.noise.channels import BodyChannel
+from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
+from disco_hw.gap.noise.wheel_noise import WheelNoise
 from disco_hw.gap.report.amend import at_joint_fit
 from disco_hw.gap.search import _on_top
 from disco_hw.gap.search.analysis import ChannelEstimates, ParameterEstimate
-from disco_hw.gap.search.cross_validation import Chain, PredictionErrors, smoothed_poses
+from disco_hw.gap.search.cross_validation import Chain, PredictionErrors, chain_wheels, smoothed_poses
 from disco_hw.gap.search.end_to_end import Ahead, Freed, JointFit, Part
 from disco_hw.gap.settings import DEFAULT_SETTINGS
 from tests.gap.synthetic import GEOMETRY, NOISE, body_channel
@@ -130,3 +131,24 @@ def test_a_term_of_the_wheels_keeps_its_number_though_the_body_has_one_of_the_sa
     before = ChannelEstimates({"term0": ParameterEstimate(0.1, 0.08, 0.12)}, ("term0",), np.array([[1e-4]]))
     moved = [at_joint_fit(before, part, of, joint).by_name["term0"].value for part in parts]
     assert moved == [0.38, 0.12]
+
+
+def test_derivatives_by_what_only_the_body_has_are_those_of_the_whole_chain():
+    channel, line = body_channel(turn_slip=0.08)
+    wheels = WheelChannel.build(line, WheelNoise(), np.array(GEOMETRY))
+    poses = smoothed_poses(channel, channel.neutral)
+    slip = BODY.place["turn_slip.k_s"]
+    parts = (
+        Part(BODY, channel.neutral, (0, 1, 2, slip), np.zeros((4, 4))),
+        Part(WHEEL, WHEEL.neutral, (WHEEL.place["motor_lag.tau_s"],), np.zeros((1, 1))),
+    )
+    of = Freed(parts, lambda vectors: Chain(*vectors))
+    ahead = Ahead.of(channel, wheels, poses)
+    vectors = of.vectors(of.joined(lambda part: part.vector))
+    turned = chain_wheels(channel, wheels, of.chain(vectors))
+    vectors[0][slip] += 0.01
+    for own, known in zip(ahead.errors(of.chain(vectors)), ahead.errors(of.chain(vectors), turned), strict=True):
+        np.testing.assert_array_equal(own, known)
+    joint = ahead.fit(of)
+    assert joint.vectors[0][slip] == pytest.approx(0.08, abs=0.01)
+    assert joint.vectors[0][:3] == pytest.approx(GEOMETRY, abs=4e-3)
