@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import asdict, dataclass, replace
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
@@ -238,13 +238,8 @@ def infer_command(
     return result
 
 
-@contextmanager
-def _workers(dask: str | None) -> Iterator[Workers]:
-    if dask is None:
-        yield LocalWorkers()
-        return
-    with dask_workers(dask) as workers:
-        yield workers
+def _workers(dask: str | None) -> AbstractContextManager[Workers]:
+    return nullcontext(LocalWorkers()) if dask is None else dask_workers(dask)
 
 
 def _write(path: Path, write: Callable[[], object]) -> None:
