@@ -74,7 +74,9 @@ class Disco:
         may_turn_more = settings.uncertainty in ("mc", "joint") or any(s.effect.may_turn_more for s in model.effects)
         self._wide = True if may_turn_more or self._largest_turn_rad(theta) > NARROW_TURN_RAD else None
         self._series = integration_series(step_s, self._wide is not None, np.float32)
-        self._pairs = shared_pairs(model, theta, step_s)
+        self._euler = True if settings.euler else None
+        # The axle's path under Euler steps depends on x_icr.
+        self._pairs = 0 if settings.euler else shared_pairs(model, theta, step_s)
         self._take_points(model, theta)
         self._start = np.zeros(11, np.float32)
         self._loss = WheelLoss()
@@ -434,7 +436,7 @@ class Disco:
         each = True if self._own_draws else None
         return SkidSteer(
             self._start, base, effects, each, self._ahead, self._scaled, self._skip_mean_cost, self._series, self._wide,
-            task, self._history, self._wheels, self._wheels_differ,
+            self._euler, task, self._history, self._wheels, self._wheels_differ,
         )  # fmt: skip
 
     def _draw_points(self) -> None:

@@ -109,6 +109,8 @@ class DiscoSettings:
     a step. Then the plan changes as fast at any rate, and more plans a second average out noise instead of adding it.
     guide_below: where a steering law's commands cost less than this part of the plan, they take its place (tasks with
     a line; kernel/guide.py); for a horizon also where the plan stands, whatever they cost; 0 without a guide.
+    euler: whether a step of a rollout goes straight along the heading that it begins with (explicit Euler), not along
+    the exact arc.
     offset_free: whether rollouts move beside the model as the robot was found to (model/coefficients.py), and lose of a
     command what its wheels were found to lose (wheel_loss.py).
     iterations_at_start: optimisation steps for the first plan after a reset.
@@ -126,6 +128,7 @@ class DiscoSettings:
     latency_s: float = 0.0
     gain_by_time: bool = True
     guide_below: float = 0.85
+    euler: bool = False
     offset_free: bool = False
     iterations_at_start: int = 5
     min_ess: float = 3.0
@@ -145,9 +148,8 @@ class DiscoSettings:
     def paper(cls, uncertainty: Uncertainty = "ut") -> DiscoSettings:
         """The paper's skid-steer experiment (appendix): white noise, control cost, UT with alpha = 0.5, Algorithm 1.
 
-        K = 400, T = 50, temperature 0.1, control authority 0.25 (rotations per second)^2. Within a step the robot moves
-        along the exact arc, as in every mode; the published code takes an Euler step, straight along the heading that
-        the step begins with.
+        K = 400, T = 50, temperature 0.1, control authority 0.25 (rotations per second)^2. Rollouts take Euler steps, as
+        those of the skid-steer robot in the code of the same author do (github.com/lubaroli/dust).
         """
         temperature = 0.1
         sampler = Sampler(
@@ -168,6 +170,7 @@ class DiscoSettings:
             ut_alpha=0.5,
             gain_by_time=False,
             guide_below=0.0,
+            euler=True,
             iterations_at_start=1,
             min_ess=0.0,
         )

@@ -56,7 +56,7 @@ def simulate_kernel(
     its direction for the correlation time. Every simulation has a noise of its own: `noise_scale` (7,) as
     `Noise.scales`, times exp(`noise_spread` (7, 7) z); the lever, last, plus that in its place.
     """
-    integration = integration_from(series, True)
+    integration = integration_from(series, True, None)
     root = math.sqrt(integration.step_s)
     unit, noise, wander = np.empty(7), np.empty(7), np.empty(3)
     for i in range(seeds.shape[0]):

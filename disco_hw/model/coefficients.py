@@ -65,7 +65,8 @@ class Integration(NamedTuple):
 
     With z = turn * step, step * sin(z) / z and cos(z) are polynomials in turn^2: `chord0` (the step) to `chord3`, 1 and
     `cos1` to `cos3`. They are good for 0.2 rad; `wide` is None, or anything else to work on a sixteenth of z
-    and double it four times, which is good for 4 rad.
+    and double it four times, which is good for 4 rad. `euler` is None, or anything else for steps straight along the
+    heading that they begin with, in place of the exact arc.
     """
 
     step_s: float
@@ -77,6 +78,7 @@ class Integration(NamedTuple):
     cos2: float
     cos3: float
     wide: object
+    euler: object
 
 
 @scalar_function

@@ -193,12 +193,13 @@ def body_velocity(
 
 
 def step(
-    theta: Theta, state: RobotState, left: Value, right: Value, step_s: float, time_s: float = 0.0
+    theta: Theta, state: RobotState, left: Value, right: Value, step_s: float, time_s: float = 0.0, euler: bool = False
 ) -> tuple[RobotState, Value, Value]:
     """One step of f_theta under the commands in force; also the forward speed over it (m/s) and the yaw rate (rad/s).
 
     The body keeps its velocity over the step, so the tracked point moves along an arc, which is exact: its chord lies
-    at half the turn and is shorter than the arc by sin(z) / z, z = omega step / 2. What acts in the world comes on top.
+    at half the turn and is shorter than the arc by sin(z) / z, z = omega step / 2. With `euler` it moves straight,
+    along the heading that the step begins with. What acts in the world comes on top.
     """
     left, right = wheel_targets(theta, state, left, right, time_s, step_s)
     end_left, end_right, mean_left, mean_right = responded(theta, state, left, right, time_s, step_s)
@@ -207,6 +208,8 @@ def step(
 
     middle = state.yaw + omega * step_s / 2.0
     chord = step_s * np.sinc(omega * step_s / 2.0 / np.pi)
+    if euler:
+        middle, chord = state.yaw, step_s
     x = state.x + chord * (v * np.cos(middle) - v_lateral * np.sin(middle))
     y = state.y + chord * (v * np.sin(middle) + v_lateral * np.cos(middle))
     for effect in _acting(theta, Stage.WORLD):

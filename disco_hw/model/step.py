@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,9 @@ from disco_hw.model.coefficients import MOVES_RAD_S, NO_SLIDE, Base, Coefficient
 from disco_hw.model.model import Model, coefficient_tables
 from disco_hw.model.terms import add_to_commands, add_to_velocity, terms_need_change
 
+Pose: TypeAlias = tuple[float, float, float, float]
+"""x, y (m), cosine and sine of yaw."""
+
 
 def integration_series(step_s: float, wide: bool, dtype: type = np.float64) -> NDArray[np.floating]:
     """Series of the exact arc for steps of `step_s`, (8,): to 1e-7 for turns of 0.4 rad a step, `wide` for 8."""
@@ -35,9 +38,11 @@ def integration_series(step_s: float, wide: bool, dtype: type = np.float64) -> N
 
 
 @scalar_function
-def integration_from(series: NDArray[np.floating], wide: object) -> Integration:
-    """What a step needs, from `integration_series`; `wide` is None or anything else."""
-    return Integration(series[0], series[1], series[2], series[3], series[4], series[5], series[6], series[7], wide)
+def integration_from(series: NDArray[np.floating], wide: object, euler: object) -> Integration:
+    """What a step needs, from `integration_series`; `wide` and `euler` are None or anything else."""
+    return Integration(
+        series[0], series[1], series[2], series[3], series[4], series[5], series[6], series[7], wide, euler
+    )
 
 
 @scalar_function
@@ -139,6 +144,27 @@ def tracked_of(axle_x: float, axle_y: float, cos_yaw: float, sin_yaw: float, bas
 
 
 @scalar_function
+def straight(
+    euler: object, arc: Pose, axle_x: float, axle_y: float, cos_yaw: float, sin_yaw: float, forward: float,
+    lateral: float | None, turn: float, base: Base, step_s: float,
+) -> Pose:  # fmt: skip
+    """Where an explicit Euler step of the tracked point takes the axle's point, with the heading after the `arc`.
+
+    The arc itself if `euler` is None. The tracked point moves along the heading that the step begins with, and with it
+    by -omega x_icr to the left of that; it takes the axle's point along, and this depends on x_icr then.
+    """
+    if euler is None:
+        return arc
+    _, _, cos_after, sin_after = arc
+    x, y = tracked_of(axle_x, axle_y, cos_yaw, sin_yaw, base)
+    along, across = forward * step_s, -(turn + turn) * step_s * base.x_icr_m
+    x, y = x + (along * cos_yaw - across * sin_yaw), y + (along * sin_yaw + across * cos_yaw)
+    x, y = sideways(lateral, step_s, x, y, cos_yaw, sin_yaw)
+    axle_x, axle_y = axle_of(x, y, cos_after, sin_after, base)
+    return axle_x, axle_y, cos_after, sin_after
+
+
+@scalar_function
 def body_step(
     axle_x: float, axle_y: float, cos_yaw: float, sin_yaw: float, wheel_sum: float, difference: float, change: float,
     time_s: float, base: Base, effects: Coefficients, integration: Integration,
@@ -147,7 +173,10 @@ def body_step(
     the yaw rate (rad/s) over it. Wheel speeds as for `body_velocity`.
     """
     forward, lateral, turn = body_velocity(wheel_sum, difference, change, time_s, base, effects)
-    axle_x, axle_y, cos_yaw, sin_yaw = move(axle_x, axle_y, cos_yaw, sin_yaw, forward, lateral, turn, integration)
+    arc = move(axle_x, axle_y, cos_yaw, sin_yaw, forward, lateral, turn, integration)
+    axle_x, axle_y, cos_yaw, sin_yaw = straight(
+        integration.euler, arc, axle_x, axle_y, cos_yaw, sin_yaw, forward, lateral, turn, base, integration.step_s
+    )
     axle_x, axle_y = world_terms(axle_x, axle_y, wheel_sum, difference, time_s, effects)
     return axle_x, axle_y, cos_yaw, sin_yaw, forward, turn
 
@@ -371,7 +400,7 @@ def run_states(
     effects: Coefficients, series: NDArray[np.floating],
 ) -> None:  # fmt: skip
     """Fill `states[1:]` from `states[0]`; as `FreeRun.states`."""
-    integration = integration_from(series, True)
+    integration = integration_from(series, True, None)
     here, acting = base_point(base, point), effect_point(effects, point)
     x, y, yaw = states[0, 0], states[0, 1], states[0, 2]
     wheel_left, wheel_right = states[0, 3], states[0, 4]

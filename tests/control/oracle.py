@@ -43,7 +43,7 @@ def pendulum_costs(length_m: float, mass_kg: float, angle_rad: float, speed_rad_
 
 def point_costs(
     theta: model.Theta, start: model.RobotState, commands: Array, past: Array, step_s: float, cost: SequenceCost,
-    time_s: float = 0.0,
+    time_s: float = 0.0, euler: bool = False,
 ) -> Array:  # fmt: skip
     """Costs (K,) of command sequences (K, T, 2) under one parameter point; `past` (H, 2) are the commands before."""
     count, horizon = commands.shape[:2]
@@ -52,7 +52,7 @@ def point_costs(
     states, speeds = [start], []
     for t in range(horizon):
         now_s = time_s + t * step_s
-        state, forward, _ = model.step(theta, states[-1], in_force[t, :, 0], in_force[t, :, 1], step_s, now_s)
+        state, forward, _ = model.step(theta, states[-1], in_force[t, :, 0], in_force[t, :, 1], step_s, now_s, euler)
         states.append(state)
         speeds.append(forward)
     x, y, yaw = (np.stack([np.broadcast_to(getattr(s, name), (count,)) for s in states]) for name in ("x", "y", "yaw"))

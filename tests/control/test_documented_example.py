@@ -31,9 +31,9 @@ def test_the_document_begins_with_the_oracle():
     assert text.index("oracle.py") < text.index("disco_hw.control.Disco")
 
 
-def test_it_is_said_that_paper_mode_moves_along_arcs():
-    assert "exact arc; the published code takes an Euler step" in DOCUMENT.read_text("utf-8")
-    assert "the published code takes an Euler step" in " ".join(str(DiscoSettings.paper.__doc__).split())
+def test_it_is_said_which_mode_takes_which_step():
+    assert "| exact arc | Euler step: straight along the heading" in DOCUMENT.read_text("utf-8")
+    assert (DiscoSettings().euler, DiscoSettings.paper().euler) == (False, True)
 
 
 @pytest.mark.parametrize("turn_rad_s", [0.0, 0.5, 2.0])

@@ -17,6 +17,7 @@ def test_paper_mode_is_the_appendix_table():
     assert sampler.control_cost_weight == sampler.temperature
     assert sampler.knots is None
     assert (sampler.update_from, sampler.beyond_end, sampler.with_nominal) == ("drawn", "zero", False)
+    assert settings.euler
 
 
 def test_from_config_takes_size_mode_and_uncertainty():

@@ -49,6 +49,16 @@ def test_euler_steps_converge_to_it():
     np.testing.assert_allclose(exact, [x, y, yaw], atol=1e-4)
 
 
+def test_an_euler_step_is_the_published_one():
+    theta = {"wheel_radius_m": 0.06, "axial_distance_m": 0.3, "x_icr_m": 0.15}
+    state = plain.RobotState(1.0, 2.0, 0.3, 2.0, 6.0)
+    after, v, omega = plain.step(theta, state, 2.0, 6.0, 0.1, euler=True)
+    assert (v, omega) == pytest.approx((0.06 * 4.0, 0.06 * 4.0 / 0.3))
+    assert after.x == pytest.approx(1.0 + 0.1 * (v * math.cos(0.3) + omega * 0.15 * math.sin(0.3)))
+    assert after.y == pytest.approx(2.0 + 0.1 * (v * math.sin(0.3) - omega * 0.15 * math.cos(0.3)))
+    assert after.yaw == pytest.approx(0.3 + 0.1 * omega)
+
+
 def test_fast_turns_of_several_radians_a_step_stay_exact():
     model = Model(0.5, 0.1, 0.0)
     states = run(model, (0.0, 0.0, 0.0, 0.0, 0.0), [(-4.0, 4.0), (-8.0, 7.0)] * 5)

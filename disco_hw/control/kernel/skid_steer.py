@@ -96,7 +96,7 @@ class SkidSteer(NamedTuple):
     tables hold points for every sample, (L, K'). `ahead`, `scaled` (L, 2) int or None: pairs of points that
     share a point's rollout, as `parameter_points.equivalent_points` finds them. `skip_mean`: None, or anything else if
     the first point has no weight, so that it is rolled out for its equivalent points alone and its cost is left as it
-    is. `series` (8,), `wide`: how a step is integrated.
+    is. `series` (8,), `wide`, `euler`: how a step is integrated; under Euler steps no points share a rollout.
     `history`: rows of commands from before the plan. `wheels`: buffer of the wheels' motion, T * WHEEL_ROWS * BLOCK;
     `wheels_differ`: whether the points differ in how the wheels turn.
     """
@@ -110,6 +110,7 @@ class SkidSteer(NamedTuple):
     skip_mean: Absent
     series: Floats
     wide: Absent
+    euler: Absent
     task: Terms
     history: int
     wheels: Floats
@@ -447,7 +448,7 @@ def _roll_points(
     each: Absent, skip_mean: Absent, ahead: Pairs, scaled: Pairs, system: SkidSteer, costs: Floats, points: int,
     padded: int, block: int, horizon: int, commands: Floats, state: Floats,
 ) -> None:  # fmt: skip
-    integration = integration_from(system.series, system.wide)
+    integration = integration_from(system.series, system.wide, system.euler)
     start, wheels, task = system.start, system.wheels, system.task
     lane = U(block) * BLOCK
     for i in range(points):

@@ -182,7 +182,14 @@ def check_against_reference(model, state, task, plan_settings, seed):
         return np.array(
             [
                 oracle.point_costs(
-                    physics.theta_of(names, point), begin, sequences, past, STEP_S, cost, time_s=state.elapsed_s
+                    physics.theta_of(names, point),
+                    begin,
+                    sequences,
+                    past,
+                    STEP_S,
+                    cost,
+                    time_s=state.elapsed_s,
+                    euler=plan_settings.euler,
                 )
                 for point in theta[weighed]
             ]
@@ -285,6 +292,22 @@ def test_costs_of_a_robot_that_slides_aside_and_drifts(base, values, commands, s
         expected = oracle.point_costs(named, start, commands, past, STEP_S, slid(cost, point, base, found))
         apart = ~np.isclose(costs, expected, atol=1e-3, rtol=RELATIVE)
         assert apart.mean() < FEW / 10
+
+
+@settings(max_examples=15)
+@given(SLOW_TURNING, STATES, COMMANDS, st.integers(0, 2**63 - 1))
+def test_costs_and_update_with_euler_steps(base, values, commands, seed):
+    check_against_reference(
+        model_of(base), state_of(values, commands), CIRCLE, replace(PLAN_SETTINGS, euler=True), seed
+    )
+
+
+@pytest.mark.long
+@settings(max_examples=15)
+@given(BASE, EFFECTS, STATES, COMMANDS, st.integers(0, 2**63 - 1))
+def test_costs_and_update_with_euler_steps_and_all_effects(base, effects, values, commands, seed):
+    plan_settings = replace(PLAN_SETTINGS, euler=True)
+    check_against_reference(model_of(base, effects), state_of(values, commands), CIRCLE, plan_settings, seed)
 
 
 @pytest.mark.long
