@@ -54,8 +54,14 @@ def plan_every_kind_of_task() -> None:
     Disco(lagging, CircleCost(), DiscoSettings(), CommandLimits(25.0, 40.0)).warm_up()
     late = replace(setup.model, belief=None, effects=(EffectSetting("command_delay", {"delay_s": 0.25}),))
     Disco(late, CircleCost(), DiscoSettings(), limits).warm_up()
-    for uncertainty in ("mc", "joint"):
-        Disco(setup.model, CircleCost(), DiscoSettings(uncertainty=uncertainty), limits).warm_up()
+    forms = (
+        DiscoSettings(uncertainty="mc"),
+        DiscoSettings(uncertainty="joint"),
+        DiscoSettings(offset_free=True),
+        DiscoSettings(euler=True),
+    )
+    for settings in forms:
+        Disco(setup.model, CircleCost(), settings, limits).warm_up()
     run_circle(setup.model, options=CircleOptions(seeds=1, duration_s=0.1, largest_rot_s2=3.0))
     PendulumPlanner(PendulumPoints(np.ones((5, 2)), np.full(5, 0.2)), PAPER_SAMPLER).plan(math.pi, 0.0)
 

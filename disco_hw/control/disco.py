@@ -79,6 +79,7 @@ class Disco:
         self._pairs = 0 if settings.euler else shared_pairs(model, theta, step_s)
         self._take_points(model, theta)
         self._start = np.zeros(11, np.float32)
+        self._slides = True if settings.offset_free else None
         self._loss = WheelLoss()
         self._disturbance, self._slide = NO_DISTURBANCE, NO_SLIDE
         # Whether wheels turn as the model says, and the robot with them.
@@ -435,8 +436,8 @@ class Disco:
         base, effects = self._tables
         each = True if self._own_draws else None
         return SkidSteer(
-            self._start, base, effects, each, self._ahead, self._scaled, self._skip_mean_cost, self._series, self._wide,
-            self._euler, task, self._history, self._wheels, self._wheels_differ,
+            self._start, self._slides, base, effects, each, self._ahead, self._scaled, self._skip_mean_cost,
+            self._series, self._wide, self._euler, task, self._history, self._wheels, self._wheels_differ,
         )  # fmt: skip
 
     def _draw_points(self) -> None:

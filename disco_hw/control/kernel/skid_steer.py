@@ -91,7 +91,8 @@ class SkidSteer(NamedTuple):
 
     `start` (11,): x, y relative to the task's origin (m), cos and sin of yaw, left and right wheel speed (rad/s), time
     (s), the task's memory; how far the ground carries the robot in a step along x and y (m), in proportion to the size
-    of equivalent points, and how far it slides to the left for each metre forward (`model/coefficients.py`).
+    of equivalent points, and how far it slides to the left for each metre forward (`model/coefficients.py`). `slides`:
+    None, or anything else if the last three count.
     `base`, `effects`: coefficient tables of L points; `each` is None, or anything else if the
     tables hold points for every sample, (L, K'). `ahead`, `scaled` (L, 2) int or None: pairs of points that
     share a point's rollout, as `parameter_points.equivalent_points` finds them. `skip_mean`: None, or anything else if
@@ -102,6 +103,7 @@ class SkidSteer(NamedTuple):
     """
 
     start: Floats
+    slides: Absent
     base: Base
     effects: Coefficients
     each: Absent
@@ -165,9 +167,22 @@ def _rolling(wheels: Floats, t: int, b: int, commands: Floats, late: int, horizo
 
 
 @scalar_function
+def _slid(
+    slides: Absent, x: float, y: float, step_x: float, step_y: float, wheel_sum: float, difference: float, start: Floats
+) -> tuple[float, float]:
+    """Where a robot is after this step that slides and is carried beside its model; x and y as they are without."""
+    if slides is None:
+        return x, y
+    # The larger of both is the sum of the wheels' sizes.
+    turned = max(abs(wheel_sum), abs(difference)) * constant(1.0 / MOVES_RAD_S, x)
+    carried = min(turned, constant(1.0, x))
+    return x + (carried * start[8] - start[10] * step_y), y + (carried * start[9] + start[10] * step_x)
+
+
+@scalar_function
 def _move(
     state: Floats, b: int, rolling: Place, time_s: float, base: Base, effects: Coefficients, integration: Integration,
-    start: Floats,
+    slides: Absent, start: Floats,
 ) -> None:  # fmt: skip
     """Move sample b on by one step."""
     wheel_sum, difference, change = rolling
@@ -175,12 +190,10 @@ def _move(
         state[AXLE_X + b], state[AXLE_Y + b], state[COS + b], state[SIN + b],
         wheel_sum, difference, change, time_s, base, effects, integration,
     )  # fmt: skip
-    # The larger of both is the sum of the wheels' sizes.
-    turned = max(abs(wheel_sum), abs(difference)) * constant(1.0 / MOVES_RAD_S, forward)
-    carried = min(turned, constant(1.0, forward))
     step_x, step_y = axle_x - state[AXLE_X + b], axle_y - state[AXLE_Y + b]
-    state[AXLE_X + b] = axle_x + (carried * start[8] - start[10] * step_y)
-    state[AXLE_Y + b] = axle_y + (carried * start[9] + start[10] * step_x)
+    axle_x, axle_y = _slid(slides, axle_x, axle_y, step_x, step_y, wheel_sum, difference, start)
+    state[AXLE_X + b] = axle_x
+    state[AXLE_Y + b] = axle_y
     state[COS + b] = cos_yaw
     state[SIN + b] = sin_yaw
     state[FORWARD + b] = forward
@@ -350,8 +363,12 @@ def _costs(
 
 
 @scalar_function
-def sliding_heading(cos_yaw: float, sin_yaw: float, forward_m: float, start: Floats) -> tuple[float, float]:
+def sliding_heading(
+    slides: Absent, cos_yaw: float, sin_yaw: float, forward_m: float, start: Floats
+) -> tuple[float, float]:
     """Heading of an undisturbed robot that would go where this one slides to, which goes so far forward in a step."""
+    if slides is None:
+        return cos_yaw, sin_yaw
     one = constant(1.0, forward_m)
     way = max(forward_m, constant(SLIDES_FROM_M, forward_m))
     aside = start[10] + (cos_yaw * start[9] - sin_yaw * start[8]) / way
@@ -361,11 +378,13 @@ def sliding_heading(cos_yaw: float, sin_yaw: float, forward_m: float, start: Flo
 
 
 @block_function
-def _end(costs: Floats, at: int, state: Floats, own: int, start: Floats, step_s: float, task: Terms) -> None:
+def _end(
+    costs: Floats, at: int, state: Floats, own: int, slides: Absent, start: Floats, step_s: float, task: Terms
+) -> None:
     """Write the costs of the rows from `own` on to `costs[at:at + BLOCK]`."""
     tune_loops()
     for b in range(BLOCK):
-        cos_yaw, sin_yaw = sliding_heading(state[COS + b], state[SIN + b], state[FORWARD + b] * step_s, start)
+        cos_yaw, sin_yaw = sliding_heading(slides, state[COS + b], state[SIN + b], state[FORWARD + b] * step_s, start)
         costs[at + b] = state[own + TOTAL + b] + terminal_cost(
             task, state[own + MEMORY + b], state[own + X + b], state[own + Y + b], cos_yaw, sin_yaw,
             _found(looks_up(task), state, own, b),
@@ -375,8 +394,8 @@ def _end(costs: Floats, at: int, state: Floats, own: int, start: Floats, step_s:
 @block_function
 def _roll(
     costs: Floats, at: int, ahead_at: CostPlaces, scaled_at: CostPlaces, horizon: int, commands: Floats, late: int,
-    wheels: Floats, state: Floats, start: Floats, base: Base, skip_mean: Absent, ahead: BasePair, scaled: BasePair,
-    effects: Coefficients, integration: Integration, task: Terms,
+    wheels: Floats, state: Floats, slides: Absent, start: Floats, base: Base, skip_mean: Absent, ahead: BasePair,
+    scaled: BasePair, effects: Coefficients, integration: Integration, task: Terms,
 ) -> None:  # fmt: skip
     """Roll the block out from `start` with its wheels turning as in `wheels`; writes `costs[at:at + BLOCK]`.
 
@@ -405,7 +424,7 @@ def _roll(
                 here, acting = lane_base(base, at + b), lane_effects(effects, at + b)
                 _move(
                     state, b, _rolling(wheels, t, b, commands, late, horizon, acting), time_s, here, acting,
-                    integration, start,
+                    integration, slides, start,
                 )  # fmt: skip
                 _follows(looks_up(task), state, b, here, skip_mean, ahead, scaled, start, task)
         else:
@@ -414,7 +433,7 @@ def _roll(
                 _costs(state, b, t - 1, here, skip_mean, ahead, scaled, start, task, None)
                 _move(
                     state, b, _rolling(wheels, t, b, commands, late, horizon, acting), time_s, here, acting,
-                    integration, start,
+                    integration, slides, start,
                 )  # fmt: skip
                 _follows(looks_up(task), state, b, here, skip_mean, ahead, scaled, start, task)
         _look_ups(looks_up(task), state, skip_mean, ahead, scaled, task)
@@ -422,13 +441,13 @@ def _roll(
         _costs(state, b, horizon - 1, lane_base(base, at + b), skip_mean, ahead, scaled, start, task, True)
     # One after the other: a loop that wrote to all at once would not be vectorised.
     if skip_mean is None:
-        _end(costs, at, state, OWN, start, integration.step_s, task)
+        _end(costs, at, state, OWN, slides, start, integration.step_s, task)
     if ahead_at is not None:
-        _end(costs, ahead_at[0], state, AHEAD0, start, integration.step_s, task)
-        _end(costs, ahead_at[1], state, AHEAD1, start, integration.step_s, task)
+        _end(costs, ahead_at[0], state, AHEAD0, slides, start, integration.step_s, task)
+        _end(costs, ahead_at[1], state, AHEAD1, slides, start, integration.step_s, task)
     if scaled_at is not None:
-        _end(costs, scaled_at[0], state, SCALED0, start, integration.step_s, task)
-        _end(costs, scaled_at[1], state, SCALED1, start, integration.step_s, task)
+        _end(costs, scaled_at[0], state, SCALED0, slides, start, integration.step_s, task)
+        _end(costs, scaled_at[1], state, SCALED1, slides, start, integration.step_s, task)
 
 
 @scalar_function
@@ -449,7 +468,7 @@ def _roll_points(
     padded: int, block: int, horizon: int, commands: Floats, state: Floats,
 ) -> None:  # fmt: skip
     integration = integration_from(system.series, system.wide, system.euler)
-    start, wheels, task = system.start, system.wheels, system.task
+    slides, start, wheels, task = system.slides, system.start, system.wheels, system.task
     lane = U(block) * BLOCK
     for i in range(points):
         at = U(i * padded) + lane
@@ -459,8 +478,8 @@ def _roll_points(
             if needs_change(acting) or not wheels_follow(acting):
                 _turn_wheels(wheels, at, horizon, commands, state, start, system.effects, late, integration.step_s)
             _roll(
-                costs, at, None, None, horizon, commands, late, wheels, state, start, system.base, None, None, None,
-                system.effects, integration, task,
+                costs, at, None, None, horizon, commands, late, wheels, state, slides, start, system.base, None, None,
+                None, system.effects, integration, task,
             )  # fmt: skip
         else:
             if (i == 0 or system.wheels_differ) and (needs_change(acting) or not wheels_follow(acting)):
@@ -473,18 +492,19 @@ def _roll_points(
                     if scaled is None:
                         _roll(
                             costs, at, _places(ahead[i], padded, lane), None, horizon, commands, late, wheels, state,
-                            start, here, skip_mean, _bases(system.base, ahead[i]), None, acting, integration, task,
+                            slides, start, here, skip_mean, _bases(system.base, ahead[i]), None, acting, integration,
+                            task,
                         )  # fmt: skip
                     else:
                         _roll(
                             costs, at, _places(ahead[i], padded, lane), _places(scaled[i], padded, lane), horizon,
-                            commands, late, wheels, state, start, here, skip_mean, _bases(system.base, ahead[i]),
-                            _bases(system.base, scaled[i]), acting, integration, task,
+                            commands, late, wheels, state, slides, start, here, skip_mean,
+                            _bases(system.base, ahead[i]), _bases(system.base, scaled[i]), acting, integration, task,
                         )  # fmt: skip
             if alone:
                 _roll(
-                    costs, at, None, None, horizon, commands, late, wheels, state, start, here, None, None, None,
-                    acting, integration, task,
+                    costs, at, None, None, horizon, commands, late, wheels, state, slides, start, here, None, None,
+                    None, acting, integration, task,
                 )  # fmt: skip
 
 
