@@ -111,29 +111,36 @@ class CircleResult:
     mode: str
     runs: dict[str, list[Run]]
 
+    def distances_m(self, name: str) -> Array:
+        """Distances from the circle (seeds, N) of a curve, positive outside of it."""
+        x, y, _ = np.array([run.poses for run in self.runs[name]]).transpose(2, 0, 1)
+        return np.asarray(np.hypot(x - self.circle.center_x_m, y - self.circle.center_y_m) - self.circle.radius_m)
+
     def costs(self, name: str) -> Array:
         """Instant costs (seeds, N) of a curve."""
-        x, y, _ = np.array([run.poses for run in self.runs[name]]).transpose(2, 0, 1)
         forward = np.array([run.forward_m_s for run in self.runs[name]])
-        distance = np.hypot(x - self.circle.center_x_m, y - self.circle.center_y_m) - self.circle.radius_m
-        return np.asarray(np.hypot(distance, forward - self.circle.speed_m_s))
+        return np.asarray(np.hypot(self.distances_m(name), forward - self.circle.speed_m_s))
 
     def rows(self) -> list[dict[str, float | str]]:
-        """For each curve: mean cost, its standard deviation over seeds, mean cost of the last half, command change.
+        """For each curve: mean cost, its spread over seeds, cost and distance of the last half, command change.
 
-        `command_change_rot_s` is the mean change of a wheel's command over 0.1 s.
+        `steady_rms_mm` is the root mean square of the distance over the last half and all seeds, `steady_worst_mm` the
+        largest of a seed; `command_change_rot_s` is the mean change of a wheel's command over 0.1 s.
         """
         apart = max(1, round(0.1 * self.options.rate_hz))
         found: list[dict[str, float | str]] = []
         for name, runs in self.runs.items():
-            costs = self.costs(name)
+            costs, half = self.costs(name), runs[0].forward_m_s.size // 2
+            square_mm2 = 1e6 * np.mean(self.distances_m(name)[:, half:] ** 2, axis=1)
             changes = [np.abs(run.commands_rad_s[apart:] - run.commands_rad_s[:-apart]) for run in runs]
             found.append(
                 {
                     "controller": name,
                     "mean_cost": float(costs.mean()),
                     "std_over_seeds": float(costs.mean(axis=1).std(ddof=1)) if len(runs) > 1 else math.nan,
-                    "steady_cost": float(costs[:, costs.shape[1] // 2 :].mean()),
+                    "steady_cost": float(costs[:, half:].mean()),
+                    "steady_rms_mm": math.sqrt(float(square_mm2.mean())),
+                    "steady_worst_mm": math.sqrt(float(square_mm2.max())),
                     "command_change_rot_s": float(np.mean(changes)) / ROTATION if costs.shape[1] > apart else math.nan,
                 }
             )
@@ -141,14 +148,19 @@ class CircleResult:
 
     def table(self) -> str:
         """The rows and the options as text."""
-        lines = [f"{'controller':18s} {'mean cost':>10s} {'std':>8s} {'steady cost':>12s} {'du (rot/s)':>11s}"]
+        lines = [
+            f"{'controller':18s} {'mean cost':>10s} {'std':>8s} {'steady cost':>12s} {'rms (mm)':>9s} {'worst':>6s} "
+            f"{'du (rot/s)':>11s}"
+        ]
         lines += [
             f"{row['controller']:18s} {row['mean_cost']:10.4f} {row['std_over_seeds']:8.4f} {row['steady_cost']:12.4f} "
-            f"{row['command_change_rot_s']:11.4f}"
+            f"{row['steady_rms_mm']:9.2f} {row['steady_worst_mm']:6.2f} {row['command_change_rot_s']:11.4f}"
             for row in self.rows()
         ]
         options = ", ".join(f"{key} = {value:g}" for key, value in asdict(self.options).items())
-        lines.append(f"mode {self.mode}; {options}; steady: last half; du: mean change of a command in 0.1 s")
+        lines.append(
+            f"mode {self.mode}; {options}; steady, rms: of the last half; du: mean change of a command in 0.1 s"
+        )
         return "\n".join(lines)
 
     def write_csv(self, path: Path) -> None:

@@ -32,6 +32,8 @@ def test_figures_of_runs_that_are_known():
     (row,) = result.rows()
     assert row["mean_cost"] == row["steady_cost"] == pytest.approx(0.225)
     assert row["std_over_seeds"] == pytest.approx(0.05 / math.sqrt(2.0))
+    assert row["steady_rms_mm"] == pytest.approx(150.0 / math.sqrt(2.0))
+    assert row["steady_worst_mm"] == pytest.approx(150.0)
     assert row["command_change_rot_s"] == pytest.approx(0.1 / 4.0)
     fast = CircleResult(CircleOptions(seeds=2, rate_hz=20.0), CircleCost(), "default", runs)
     assert fast.rows()[0]["command_change_rot_s"] == pytest.approx(0.0)
