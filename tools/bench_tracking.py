@@ -60,12 +60,14 @@ def contenders() -> dict[str, Contender]:
 
 
 def _peer(robot: ForeignRobot, track: Track) -> Planner:
-    """pytorch_mppi with the paper's gains, ten times a second; its commands are held in between."""
-    from tools.control_peers import circle_command, circle_mppi  # noqa: PLC0415  (of those who installed [bench])
+    """pytorch_mppi with the paper's gains and cost, ten times a second; its commands are held in between."""
+    from tools.control_peers import circle_command, circle_mppi, distance_map, line_mppi  # noqa: PLC0415  (of [bench])
 
     believed, settings = model(robot), DiscoSettings.paper()
-    assert isinstance(track.task, CircleCost)
-    mppi = circle_mppi(believed, track.task.paper(), settings, LIMITS.speed_rad_s)
+    if isinstance(track.task, CircleCost):
+        mppi = circle_mppi(believed, track.task, settings, LIMITS.speed_rad_s)
+    else:
+        mppi = line_mppi(believed, distance_map(track.points_m), SPEED_M_S, settings, LIMITS.speed_rad_s)
     command = circle_command(mppi, 1)
     held, due_ns = (0.0, 0.0), 0
 
@@ -88,9 +90,6 @@ def rows(
         if name.startswith(MUJOCO):
             made, plant_of = mujoco_robots, MujocoPlant
         for way in ways:
-            # The peer's cost is the circle's alone.
-            if way != "circle" and name == "pytorch_mppi":
-                continue
             yield (
                 f"tracking.{name}.{way}",
                 [

@@ -84,6 +84,24 @@ def test_a_drive_arrives_that_stays_on_the_line_and_one_in_reverse_is_seen(
     assert went_back == backwards
 
 
+def test_the_peers_distance_from_a_line_is_that_from_its_nearest_point():
+    peers = pytest.importorskip("tools.control_peers", reason="pytorch_mppi comes with the extra [bench]")
+    import torch
+
+    points = tracks()["eight"].points_m
+    places = np.random.default_rng(1).uniform(-3.0, 3.0, (500, 2))
+    begin, way = points[:-1], np.diff(points, axis=0)
+    part = np.einsum("pnc,nc->pn", places[:, None] - begin, way) / np.einsum("nc,nc->n", way, way)
+    nearest = begin + np.clip(part, 0.0, 1.0)[..., None] * way
+    expected = np.linalg.norm(places[:, None] - nearest, axis=2).min(axis=1)
+    found = peers.distance_map(points)(*torch.tensor(places.T, dtype=torch.float32)).numpy()
+    near = expected < 1.0
+    assert near.sum() > 100
+    np.testing.assert_allclose(found[near], expected[near], atol=2e-3)
+    # Further off it only has to grow on.
+    assert (found[~near] > 0.95).all()
+
+
 @pytest.mark.parametrize(("more", "first"), [((), bench_tracking.FIRST), (("--first", "5000"), 5000)])
 def test_the_robots_are_those_that_are_asked_for(monkeypatch, capsys, more, first):
     driven = []
